@@ -1,0 +1,36 @@
+"""tetopt: from a medical volume straight to an image-aligned tetrahedral mesh, without segmentation."""
+
+__version__ = "0.1.0"
+
+from tetopt.energy.discretization import E_D
+from tetopt.energy.geometric import E_G
+from tetopt.energy.sampling import cell_moments, cell_of_voxel
+from tetopt.errors import InputError
+from tetopt.geometry.quality import quality
+from tetopt.image import Image
+from tetopt.io.images import load_image, save_image
+from tetopt.io.meshes import cell_fields, load_mesh, save_mesh
+from tetopt.lattice import lattice
+from tetopt.mesh import Mesh
+from tetopt.optimize.paper import optimize
+from tetopt.phantom import load_phantom
+
+__all__ = [
+    "E_D",
+    "E_G",
+    "Image",
+    "InputError",
+    "Mesh",
+    "__version__",
+    "cell_fields",
+    "cell_moments",
+    "cell_of_voxel",
+    "lattice",
+    "load_image",
+    "load_mesh",
+    "load_phantom",
+    "optimize",
+    "quality",
+    "save_image",
+    "save_mesh",
+]

@@ -1,0 +1,491 @@
+"""The ``tetopt`` command: file in, file out. Thin: every number comes from the library."""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.util
+import logging
+import signal
+import sys
+import time
+import warnings
+from collections.abc import Callable, Iterator, Sequence
+from enum import Enum
+from pathlib import Path
+from types import FrameType
+from typing import Annotated, Any
+
+import numba
+import numpy as np
+import typer
+from rich.console import Console
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+from rich.table import Table
+
+import tetopt
+from tetopt import Image, InputError, Mesh, lattice, load_image, load_mesh, load_phantom, save_image, save_mesh
+from tetopt.geometry.quality import Quality, quality
+from tetopt.io.files import checked_output, save_json
+from tetopt.io.images import parse_crop, parse_slice, sha256
+from tetopt.io.meshes import cell_fields
+from tetopt.optimize.paper import Optimized, Record, optimize
+from tetopt.report.summary import run_summary
+
+DEFAULT_NODES = {2: 500, 3: 5000}
+
+log = Console(stderr=True, highlight=False, soft_wrap=True)
+out = Console(highlight=False, soft_wrap=True)
+app = typer.Typer(
+    name="tetopt",
+    help="From a medical volume straight to an image-aligned tetrahedral mesh, without segmentation.",
+    no_args_is_help=True,
+    add_completion=False,
+    pretty_exceptions_enable=False,
+    rich_markup_mode="rich",
+    context_settings={"help_option_names": ["-h", "--help"]},
+)
+
+
+class Lattice(str, Enum):  # noqa: D101
+    bcc = "bcc"
+    five_tet = "five-tet"
+    criss_cross = "criss-cross"
+
+
+class Method(str, Enum):  # noqa: D101
+    paper = "paper"
+
+
+class Boundary(str, Enum):  # noqa: D101
+    slide = "slide"
+    fixed = "fixed"
+
+
+class Retessellate(str, Enum):  # noqa: D101
+    first = "first"
+    accept = "accept"
+    never = "never"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command; the exit code: 0 done, 1 a promise of the mesh missed, 2 an input to mend, 130 Ctrl-C."""
+    with warnings.catch_warnings(), _silent_plot_fonts():
+        warnings.showwarning = _show_warning
+        try:
+            return app(args=list(sys.argv[1:] if argv is None else argv), standalone_mode=False) or 0
+        except InputError as error:
+            log.print(f"[bold red]tetopt:[/] {_escaped(str(error))}")
+            return 2
+        except typer.Exit as ended:
+            return ended.exit_code
+        except typer.Abort:
+            return 130
+        except KeyboardInterrupt:
+            log.print("tetopt: interrupted; nothing was written")
+            return 130
+        except Exception as error:
+            if type(error).__module__.split(".")[0] not in ("click", "typer") or not hasattr(error, "format_message"):
+                raise
+            log.print(f"[bold red]tetopt:[/] {_escaped(error.format_message())} (see --help)")
+            return 2
+
+
+def _escaped(text: str) -> str:
+    return text.replace("[", r"\[")
+
+
+def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
+    log.print(f"[yellow]tetopt: warning:[/] {_escaped(str(message))}")
+
+
+@contextlib.contextmanager
+def _silent_plot_fonts() -> Iterator[None]:
+    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # its font-cache notice is not the user's business
+    yield
+
+
+def _version(wanted: bool) -> None:
+    if wanted:
+        out.print(f"tetopt {tetopt.__version__}")
+        raise typer.Exit
+
+
+@app.callback()
+def _common(
+    version: Annotated[
+        bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")
+    ] = False,
+) -> None:
+    pass
+
+
+ImageArgument = Annotated[
+    Path, typer.Argument(metavar="IMAGE", help="NIfTI, MGZ, NRRD, MetaImage, a DICOM folder, or a 2-D picture.")
+]
+VolumeOption = Annotated[int | None, typer.Option("--volume", metavar="K", help="Volume of a 4-D file, from 0.")]
+CropOption = Annotated[
+    str | None, typer.Option("--crop", metavar="A:B,C:D,E:F", help="Keep these voxels, half open; an end may be empty.")
+]
+SliceOption = Annotated[
+    str | None, typer.Option("--slice", metavar="AXIS=INDEX", help="Mesh one slice in 2-D, for example k=90.")
+]
+JsonOption = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write every number here.")]
+ForceOption = Annotated[bool, typer.Option("--force", help="Replace existing outputs.")]
+ThreadsOption = Annotated[
+    int | None, typer.Option("--threads", metavar="N", help="Threads; the result is the same for any number.")
+]
+
+
+@app.command("mesh")
+def mesh_command(
+    image_path: ImageArgument,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="MESH.vtu", help="The mesh to write.")],
+    nodes: Annotated[
+        int | None, typer.Option(metavar="N", help="Wanted number of nodes (default 5000; 500 in 2-D).")
+    ] = None,
+    spacing: Annotated[float | None, typer.Option(metavar="MM", help="Wanted lattice spacing instead.")] = None,
+    lattice_kind: Annotated[
+        Lattice | None, typer.Option("--lattice", help="Initial mesh (default bcc; criss-cross in 2-D).")
+    ] = None,
+    k_D: Annotated[float, typer.Option("--k-d", metavar="K", help="Weight of the image, 0 to below 1.")] = 0.2,
+    iterations: Annotated[int, typer.Option(metavar="I", help="Sweeps over all nodes; 0 writes the lattice.")] = 20,
+    n_t: Annotated[
+        int | None,
+        typer.Option("--n-t", metavar="T", help="Connect anew in the first T iterations (default half; all for k_D = 0)."),
+    ] = None,
+    retessellate: Annotated[
+        Retessellate, typer.Option(help="In the first n_t iterations; only if E falls; or never.")
+    ] = Retessellate.first,
+    method: Annotated[Method, typer.Option(help="How the nodes move.")] = Method.paper,
+    boundary: Annotated[Boundary, typer.Option(help="What the box's nodes may do.")] = Boundary.slide,
+    threads: ThreadsOption = None,
+    max_seconds: Annotated[
+        float | None, typer.Option(metavar="S", help="Stop after S seconds with the mesh reached.")
+    ] = None,
+    volume: VolumeOption = None,
+    crop: CropOption = None,
+    slice_: SliceOption = None,
+    json_path: JsonOption = None,
+    force: ForceOption = False,
+) -> int:
+    """Mesh an image: lattice, optimisation, VTU file."""
+    begin = time.perf_counter()
+    output = checked_output(output, (".vtu",), force)
+    if json_path is not None:
+        json_path = checked_output(json_path, (".json",), force)
+    if nodes is not None and spacing is not None:
+        raise InputError("--nodes and --spacing: give one of them")
+    if max_seconds is not None and not max_seconds > 0.0:
+        raise InputError(f"--max-seconds: expected more than 0, got {max_seconds}")
+    _set_threads(threads)
+    image = load_image(
+        image_path,
+        volume=volume,
+        slice_=None if slice_ is None else parse_slice(slice_),
+        crop=None if crop is None else parse_crop(crop),
+    )
+    if nodes is None and spacing is None:
+        nodes = DEFAULT_NODES[image.ndim]
+    kind = None if lattice_kind is None else lattice_kind.value
+    initial = lattice(image, kind, nodes=nodes, spacing=spacing)
+    options = {
+        "k_D": k_D, "iterations": iterations, "n_t": n_t, "retessellate": retessellate.value,
+        "boundary": boundary.value,
+    }  # fmt: skip
+    source = {
+        "nodes": nodes, "spacing": spacing, "lattice": kind, "volume": volume, "crop": crop, "slice": slice_,
+        "method": method.value,
+    }  # fmt: skip
+    return _mesh_files(image_path, image, initial, options, source, output, json_path, begin, max_seconds)[1]
+
+
+def _mesh_files(
+    image_path: Path,
+    image: Image,
+    initial: Mesh,
+    options: dict[str, Any],
+    source: dict[str, Any],
+    output: Path,
+    json_path: Path | None,
+    begin: float,
+    max_seconds: float | None,
+) -> tuple[Optimized, int]:
+    """Optimise, write the mesh and the numbers, print the comparison; the result and the exit code."""
+    log.print(_escaped(_described(image_path, image, initial)))
+    loaded = time.perf_counter()
+    left = None if max_seconds is None else max(max_seconds - (loaded - begin), 1e-9)
+    result, is_interrupted = _optimized(image, initial, left, **options)
+    optimized = time.perf_counter()
+    about = {"image": image_path.name, "image_sha256": sha256(image_path), "options": options | source}
+    save_mesh(output, result.mesh, cell_fields(result.mesh, image), {"tetopt": tetopt.__version__, **about})
+    _print_comparison(initial, result)
+    out.print(_escaped(f"{output}: {len(result.mesh.points)} nodes, {len(result.mesh.cells)} cells"))
+    if json_path is not None:
+        seconds = {"load": loaded - begin, "optimize": optimized - loaded, "all": time.perf_counter() - begin}
+        save_json(json_path, run_summary(image, initial, result, about, seconds))
+        out.print(_escaped(f"{json_path}: every number of the run"))
+    return result, 130 if is_interrupted else _promises(image, result)
+
+
+def _set_threads(threads: int | None) -> None:
+    if threads is None:
+        return
+    most = numba.config.NUMBA_NUM_THREADS
+    if not 1 <= threads <= most:
+        raise InputError(f"--threads: expected 1 to {most} on this machine, got {threads}")
+    numba.set_num_threads(threads)
+
+
+def _described(path: Path, image: Image, initial: Mesh) -> str:
+    size = " x ".join(str(s) for s in image.shape)
+    spacing = " x ".join(f"{s:.4g}" for s in image.spacing)
+    return f"{path}: {size} voxels of {spacing} mm; lattice of {len(initial.points)} nodes, {len(initial.cells)} cells"
+
+
+def _promises(image: Image, result: Optimized) -> int:
+    """0 if the mesh covers the image's box and every voxel; else 1, said aloud."""
+    covered = quality(result.mesh.points, result.mesh.cells).volume
+    missed = image.data.size - result.history[-1].n_voxels
+    if missed == 0 and abs(covered / image.volume - 1.0) < 1e-9:
+        return 0
+    log.print(
+        f"[bold red]tetopt:[/] the mesh does not cover the image: {missed} voxels are outside, "
+        f"its volume is {covered:.9g} of {image.volume:.9g} mm^{image.ndim}; please report this"
+    )
+    return 1
+
+
+def _optimized(image: Image, initial: Mesh, max_seconds: float | None, **options: Any) -> tuple[Optimized, bool]:
+    """`optimize` with progress shown, ended in good order by Ctrl-C; whether it was."""
+    begin = time.perf_counter()
+    iterations = options["iterations"]
+    _prepare_kernels(image, options["k_D"])
+    if max_seconds is not None:
+        max_seconds = max(max_seconds - (time.perf_counter() - begin), 1e-9)
+    with _graceful_interrupt() as is_interrupted, _progress(iterations) as show:
+        result = optimize(image, initial, max_seconds=max_seconds, callback=show, stop=is_interrupted, **options)
+        was_interrupted = is_interrupted()
+    if iterations == 0:  # the lattice itself, not its nodes put on the sampling grid
+        result = result._replace(mesh=initial)
+    if result.ended != "iterations":
+        words = {
+            "converged": "converged: the nodes have stopped moving",
+            "max_seconds": "out of time: the mesh so far is kept",
+            "stopped": "interrupted: the mesh so far is kept",
+        }
+        log.print(f"{words[result.ended]} (iteration {result.history[-1].iteration} of {iterations})")
+    return result, was_interrupted
+
+
+def _prepare_kernels(image: Image, k_D: float) -> None:
+    """Load the compiled kernels, or compile them, before the clock of the first iteration starts."""
+    begin = time.perf_counter()
+    with log.status("preparing the kernels (the first run compiles them, about half a minute) ..."):
+        tiny = Image(np.zeros((2,) * image.ndim, dtype=image.data.dtype) + np.arange(2))
+        tiny = Image(tiny.data.astype(image.data.dtype)) if tiny.data.dtype != image.data.dtype else tiny
+        optimize(tiny, lattice(tiny, blocks=(1,) * image.ndim), k_D=k_D, iterations=1)
+    seconds = time.perf_counter() - begin
+    if seconds > 3.0:
+        log.print(f"kernels compiled in {seconds:.0f} s; later runs load them from the cache")
+
+
+@contextlib.contextmanager
+def _graceful_interrupt() -> Iterator[Callable[[], bool]]:
+    """The first Ctrl-C only raises a flag, which the returned function tells; the second ends the program."""
+    pressed: list[int] = []
+
+    def on_interrupt(number: int, frame: FrameType | None) -> None:
+        if pressed:
+            raise KeyboardInterrupt
+        pressed.append(number)
+        log.print("interrupted: finishing the current nodes, then writing the mesh (again to give up)")
+
+    try:
+        before = signal.signal(signal.SIGINT, on_interrupt)
+    except ValueError:  # not in the main thread, where signals do not arrive either
+        yield lambda: False
+        return
+    try:
+        yield lambda: bool(pressed)
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextlib.contextmanager
+def _progress(iterations: int) -> Iterator[Callable[[Record], None]]:
+    """A function that shows each record: a bar with the remaining time on a terminal, else a line."""
+    first: list[Record] = []
+
+    def words(row: Record) -> str:
+        first.append(row)
+        E_D = f"  E_D {row.E_D / first[0].E_D:.4f}" if first[0].E_D > 0.0 else ""
+        return f"E {row.E:.4f}  E_G {row.E_G / first[0].E_G:.4f}{E_D}"
+
+    if log.is_terminal:
+        columns = (
+            TextColumn("optimising"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
+            TextColumn("{task.fields[energies]}"),
+        )  # fmt: skip
+        with Progress(*columns, console=log, transient=True) as bar:
+            task = bar.add_task("", total=iterations, energies="")
+            yield lambda row: bar.update(task, completed=row.iteration, energies=words(row))
+    else:
+        yield lambda row: log.print(
+            f"iteration {row.iteration:3d}/{iterations}  {words(row)}  {row.n_cells} cells  {row.seconds:.1f} s"
+        )
+
+
+def _print_comparison(initial: Mesh, result: Optimized) -> None:
+    first, last = result.history[0], result.history[-1]
+    before = quality(initial.points, initial.cells)
+    after = quality(result.mesh.points, result.mesh.cells)
+    table = _table("", "lattice", "optimised")
+    table.add_row("E, combined", f"{first.E:.4f}", f"{last.E:.4f}")
+    table.add_row("E_G, of initial", "1", f"{last.E_G / first.E_G:.4f}")
+    if first.E_D > 0.0:
+        table.add_row("E_D, of initial", "1", f"{last.E_D / first.E_D:.4f}")
+    _add_quality(table, before, after)
+    out.print(table)
+
+
+def _table(*columns: str) -> Table:
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    for number, column in enumerate(columns):
+        table.add_column(column, justify="left" if number == 0 else "right")
+    return table
+
+
+def _add_quality(table: Table, *meshes: Quality) -> None:
+    rows: list[tuple[str, Callable[[Quality], str]]] = [
+        ("nodes", lambda q: str(q.n_nodes)),
+        ("cells", lambda q: str(q.n_cells)),
+        ("volume, mm^n", lambda q: f"{q.volume:.6g}"),
+        ("rho, mean", lambda q: f"{q.mean_rho:.4f}"),
+        ("rho, 1st percentile", lambda q: f"{q.p1_rho:.4f}"),
+        ("rho, smallest", lambda q: f"{q.min_rho:.4f}"),
+        ("rho error (i), mean", lambda q: f"{q.errors.mean:.4f}"),
+        ("rho error (ii), harmonic mean", lambda q: f"{q.errors.harmonic_mean:.4f}"),
+        ("rho error (iii), L2", lambda q: f"{q.errors.l2:.4f}"),
+        ("rho error (iv), worst", lambda q: f"{q.errors.worst:.4f}"),
+        ("smallest angle, degrees", lambda q: f"{q.min_dihedral:.2f}"),
+        ("largest angle, degrees", lambda q: f"{q.max_dihedral:.2f}"),
+        ("cells under 10 degrees", lambda q: str(q.n_under_10_degrees)),
+        *((f"bad cells: {kind}s", lambda q, kind=kind: str(q.kinds[kind])) for kind in meshes[0].kinds),
+    ]
+    for name, text in rows:
+        table.add_row(name, *(text(q) for q in meshes))
+
+
+@app.command("quality")
+def quality_command(
+    mesh_path: Annotated[Path, typer.Argument(metavar="MESH", help="VTU or VTK file of tetrahedra or triangles.")],
+    image_path: Annotated[
+        Path | None, typer.Option("--image", metavar="IMAGE", help="Measure E_D against this image, too.")
+    ] = None,
+    volume: VolumeOption = None,
+    json_path: JsonOption = None,
+    force: ForceOption = False,
+) -> int:
+    """Measure a mesh: shape, angles, bad cells, and how well its cells fit an image."""
+    if json_path is not None:
+        json_path = checked_output(json_path, (".json",), force)
+    loaded = load_mesh(mesh_path)
+    measured = quality(loaded.mesh.points, loaded.mesh.cells)
+    content: dict[str, Any] = {"mesh": mesh_path.name, "quality": measured, "n_turned": loaded.n_turned}
+    table = _table("", mesh_path.name)
+    _add_quality(table, measured)
+    if image_path is not None:
+        image = load_image(image_path, volume=volume)
+        fit = _fit(image, loaded.mesh)
+        content |= {"image": image_path.name, "fit": fit}
+        table.add_row("E_D", f"{fit['E_D']:.6g}")
+        if fit["E_D_share_of_variance"] is not None:
+            table.add_row("E_D, share of the variance inside", f"{fit['E_D_share_of_variance']:.5f}")
+        table.add_row("voxels inside", f"{fit['n_voxels']} of {image.data.size}")
+        table.add_row("cells without a voxel", str(fit["n_empty_cells"]))
+    if loaded.n_turned:
+        log.print(f"[yellow]tetopt: warning:[/] {loaded.n_turned} cells were inverted in the file and have been turned")
+    out.print(table)
+    if json_path is not None:
+        save_json(json_path, content)
+    return 0
+
+
+def _fit(image: Image, mesh: Mesh) -> dict[str, Any]:
+    """E_D of a mesh, absolute and as share of the variance of the voxels that it covers."""
+    moments = tetopt.cell_moments(image, mesh)
+    E_D = float((moments.n_voxels * moments.variance).sum()) * image.voxel_volume
+    n_voxels = int(moments.n_voxels.sum())
+    if n_voxels == 0:
+        raise InputError("mesh and image: no voxel centre lies inside the mesh; do both lie in the same world mm?")
+    mean = float((moments.n_voxels * moments.mean).sum()) / n_voxels
+    spread = E_D + float((moments.n_voxels * (moments.mean - mean) ** 2).sum()) * image.voxel_volume
+    return {
+        "E_D": E_D,
+        "E_D_share_of_variance": E_D / spread if spread > 0.0 else None,
+        "n_voxels": n_voxels,
+        "n_empty_cells": int((moments.n_voxels == 0).sum()),
+    }
+
+
+@app.command("phantom")
+def phantom_command(
+    name: Annotated[str, typer.Argument(metavar="NAME_OR_TOML", help="A phantom's name, or a TOML file of your own.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="IMAGE.nii.gz", help="The image to write.")],
+    voxel_mm: Annotated[float | None, typer.Option(metavar="MM", help="Voxel size instead of the phantom's.")] = None,
+    blur_mm: Annotated[float | None, typer.Option(metavar="MM", help="Standard deviation of a Gaussian blur.")] = None,
+    noise_sd: Annotated[float | None, typer.Option(metavar="SD", help="Standard deviation of added noise.")] = None,
+    seed: Annotated[int | None, typer.Option(metavar="N", help="Seed of the noise.")] = None,
+    labels: Annotated[
+        Path | None, typer.Option(metavar="LABELS.nii.gz", help="Write the label of each voxel's centre, too.")
+    ] = None,
+    force: ForceOption = False,
+) -> int:
+    """Write a phantom as an image: known shapes, known intensities."""
+    suffixes = (".nii", ".nii.gz")
+    output = checked_output(output, suffixes, force)
+    if labels is not None:
+        labels = checked_output(labels, suffixes, force)
+    phantom = load_phantom(name)
+    image = phantom.image(voxel_mm=voxel_mm, blur_mm=blur_mm, noise_sd=noise_sd, seed=seed)
+    save_image(output, image)
+    if labels is not None:
+        save_image(labels, phantom.label_image(voxel_mm=voxel_mm))
+    size = " x ".join(str(s) for s in image.shape)
+    out.print(_escaped(f"{output}: {phantom.name}, {size} voxels, {image.data.min():g} to {image.data.max():g}"))
+    return 0
+
+
+@app.command("demo")
+def demo_command(
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the results.")] = Path("demo"),
+    nodes: Annotated[int, typer.Option(metavar="N", help="Wanted number of nodes.")] = 5000,
+    iterations: Annotated[int, typer.Option(metavar="I", help="Sweeps over all nodes.")] = 20,
+    force: ForceOption = False,
+) -> int:
+    """Mesh the MNI152 T1 that nilearn's wheel carries; leave mesh, numbers and pictures in a folder."""
+    begin = time.perf_counter()
+    source = _nilearn_t1()
+    output.mkdir(parents=True, exist_ok=True)
+    mesh_path = checked_output(output / "mesh.vtu", (".vtu",), force)
+    json_path = checked_output(output / "run.json", (".json",), force)
+    figures = [checked_output(output / name, (".png",), force) for name in ("slice.png", "rho.png", "energies.png")]
+    image = load_image(source)
+    initial = lattice(image, nodes=nodes)
+    options = {"k_D": 0.2, "iterations": iterations}
+    result, code = _mesh_files(source, image, initial, options, {"nodes": nodes}, mesh_path, json_path, begin, None)
+    from tetopt.report.figures import save_run_figures  # matplotlib is slow to load, and only needed here
+
+    save_run_figures(figures, image, initial, result)
+    for path in figures:
+        out.print(_escaped(str(path)))
+    return code
+
+
+def _nilearn_t1() -> Path:
+    found = importlib.util.find_spec("nilearn")
+    name = "datasets/data/mni_icbm152_t1_tal_nlin_sym_09a_converted.nii.gz"
+    path = Path(found.origin).parent / name if found is not None and found.origin else Path(name)
+    if not path.is_file():
+        raise InputError('demo: needs the MNI152 T1 inside nilearn; pip install "tetopt[demo]"')
+    return path

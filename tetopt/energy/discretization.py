@@ -1,0 +1,45 @@
+"""The discretization energy E_D, Eq. (3), and the combined energy E, Eq. (4)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.energy.sampling import cell_moments
+from tetopt.image import Image
+from tetopt.mesh import Mesh
+
+
+def cell_E_D(image: Image, mesh: Mesh) -> NDArray[np.float64]:
+    """Each cell's share of E_D, (M,) float64, intensity^2 mm^n.
+
+    E_D = sum_j integral over cell j of (h - hbar_j)^2 with h constant on a voxel and each voxel counted whole in
+    the cell that holds its centre, hbar_j the cell's mean. So E_D lies between 0 and the image's own variance
+    times its volume, which is what one cell around everything would have. Cells without a voxel centre have 0.
+
+    Raises
+    ------
+    InputError
+        As `tetopt.energy.sampling.cell_moments`.
+    """
+    moments = cell_moments(image, mesh)
+    return moments.n_voxels * moments.variance * image.voxel_volume
+
+
+def E_D(image: Image, mesh: Mesh) -> float:
+    """The discretization energy of Eq. (3), intensity^2 mm^n."""
+    return float(cell_E_D(image, mesh).sum())
+
+
+def E_D_of_sums(sums: NDArray[np.float64], voxel_volume: float) -> NDArray[np.float64]:
+    """Each cell's E_D, (M,) float64, from the rows of `tetopt.energy.sampling.moment_sums`."""
+    within = sums[:, 2] - sums[:, 1] ** 2 / np.maximum(sums[:, 0], 1.0)
+    return np.maximum(within, 0.0) * voxel_volume
+
+
+def combined(E_G: float, E_D: float, E_G0: float, E_D0: float, k_D: float) -> float:
+    """E = (1 - k_D) E_G / E_G0 + k_D E_D / E_D0, Eq. (4) normalised by the initial mesh as in Section 4.
+
+    On a constant image E_D0 = 0; the second term is then 0.
+    """
+    return (1.0 - k_D) * E_G / E_G0 + (k_D * E_D / E_D0 if E_D0 > 0.0 else 0.0)

@@ -1,0 +1,1 @@
+"""Closed forms on arrays of points and simplices; knows nothing of images."""

@@ -1,0 +1,54 @@
+"""The polygons in which a plane cuts tetrahedra."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.geometry.simplex import Cells, Points
+
+
+class Cut(NamedTuple):
+    """Polygons of three or four corners; a triangle repeats its last corner."""
+
+    corners: NDArray[np.float64]  # (K, 4, 3)
+    cells: NDArray[np.int64]  # (K,) the cell each one comes from
+
+
+# Corners of the section as pairs of local nodes, in order around it, by which nodes lie above the plane
+# (bit k: node k). One node apart gives a triangle, two a quadrilateral.
+_SECTIONS = np.zeros((16, 4, 2), dtype=np.int64)
+for _alone in range(4):
+    _others = [k for k in range(4) if k != _alone]
+    _pairs = [(_alone, k) for k in (*_others, _others[-1])]
+    _SECTIONS[1 << _alone] = _SECTIONS[15 - (1 << _alone)] = _pairs
+for _a, _b in ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)):
+    _c, _d = (k for k in range(4) if k not in (_a, _b))
+    _SECTIONS[(1 << _a) + (1 << _b)] = [(_a, _c), (_a, _d), (_b, _d), (_b, _c)]
+
+
+def plane_cut(points: Points, cells: Cells, height: NDArray[np.float64]) -> Cut:
+    """Where the plane height = 0 cuts the cells.
+
+    Parameters
+    ----------
+    points : (N, 3) float64
+    cells : (M, 4) integer
+    height : (N,) float64
+        Signed distance of each node from the plane, in any unit; a node on the plane counts as above.
+
+    Returns
+    -------
+    Cut
+        One polygon for each cell that has nodes on both sides, in the cells' order.
+    """
+    is_above = height >= 0.0
+    pattern = (is_above[cells] << np.arange(4)).sum(axis=1)
+    cut = np.flatnonzero((pattern > 0) & (pattern < 15))
+    pairs = _SECTIONS[pattern[cut]]  # (K, 4, 2)
+    ends = np.take_along_axis(cells[cut][:, None, :], pairs, axis=2)
+    low, high = height[ends[..., 0]], height[ends[..., 1]]
+    share = (low / (low - high))[..., None]
+    return Cut(points[ends[..., 0]] * (1.0 - share) + points[ends[..., 1]] * share, cut)

@@ -1,0 +1,130 @@
+"""How good the cells are: the paper's four errors, histograms, angles and the kinds of bad cells."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.geometry.simplex import Cells, Points, dihedral_angles, rho, squared_edges, volumes
+
+BAD_SHAPE = 0.3  # n rho below which a cell counts as bad: 1 is the regular simplex
+SHORT_EDGE = 0.25  # of the longest: an edge shorter than this makes a flat cell a wedge
+NEAR_EDGE = 0.1  # barycentric: a projected node nearer to an edge than this makes a cap a spade
+
+
+class QualityErrors(NamedTuple):
+    """The four errors of Section 2.1; 0 for a mesh of regular simplices, smaller is better."""
+
+    mean: float  # (i)   mean of 1/n - rho
+    harmonic_mean: float  # (ii)  harmonic mean of 1/n - rho
+    l2: float  # (iii) sum of (1/n - rho)^2
+    worst: float  # (iv)  largest 1/n - rho
+
+
+def quality_errors(points: Points, cells: Cells) -> QualityErrors:
+    """The paper's four errors of the radius ratio rho.
+
+    (ii) is printed as 1 / sum(1 / err); Table 1 fits M / sum(1 / err), the harmonic mean, and that is taken: its
+    third row, 196 congruent triangles, has (ii) equal to (i). (iii) is the plain sum of squares. An error that
+    rounding made negative is 0, and (ii) is 0 where any error is.
+    """
+    error = np.maximum(1.0 / points.shape[1] - rho(points, cells), 0.0)
+    harmonic = 0.0 if (error == 0.0).any() else len(error) / float((1.0 / error).sum())
+    return QualityErrors(float(error.mean()), harmonic, float((error**2).sum()), float(error.max()))
+
+
+def rho_histogram(points: Points, cells: Cells, bins: int = 40) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Normalised histogram of rho over [0, 1/n] as in Fig. 1(d): share of cells, (bins,), and edges, (bins + 1,)."""
+    n = points.shape[1]
+    counts, edges = np.histogram(np.minimum(rho(points, cells), 1.0 / n), bins=bins, range=(0.0, 1.0 / n))
+    return counts / len(cells), edges
+
+
+def bad_kinds(points: Points, cells: Cells) -> NDArray[np.str_]:
+    """The kind of each cell, (M,) str: "good" where n rho >= 0.3, else how its shape fails.
+
+    Tetrahedra (after Cheng, Dey, Edelsbrunner, Facello and Teng 2000) are flat or thin as the spread of the four
+    nodes along its principal axes tells: thin, if the middle spread is nearer to the smallest than to the largest
+    (geometric mean), and flat otherwise. Flat ones are told apart by the projection onto their plane:
+
+    - ``needle``: thin; all nodes near a line, no angle needs to be bad.
+    - ``wedge``: flat with two nodes close together (an edge under 1/4 of the longest).
+    - ``cap``: flat, one node projected inside the triangle of the others.
+    - ``spade``: flat, one node projected (nearly) onto an edge of that triangle.
+    - ``sliver``: flat, the projections form a convex quadrilateral; no short edge, two angles near 180 degrees.
+
+    Triangles: ``needle`` has an edge under 1/4 of the longest, ``cap`` an angle near 180 degrees.
+    """
+    kinds = np.full(len(cells), "good", dtype="<U6")
+    is_bad = points.shape[1] * rho(points, cells) < BAD_SHAPE
+    if points.shape[1] == 2:
+        edges = squared_edges(points, cells[is_bad])
+        is_needle = edges.min(axis=1) < SHORT_EDGE**2 * edges.max(axis=1)
+        kinds[is_bad] = np.where(is_needle, "needle", "cap")
+    else:
+        kinds[is_bad] = [_tet_kind(corners) for corners in points[cells[is_bad]]]
+    return kinds
+
+
+def _tet_kind(corners: NDArray[np.float64]) -> str:
+    """Kind of one bad tetrahedron, corners (4, 3)."""
+    centred = corners - corners.mean(axis=0)
+    _, spread, axes = np.linalg.svd(centred)
+    if spread[1] ** 2 <= spread[0] * spread[2]:
+        return "needle"
+    flat = centred @ axes[:2].T
+    edges = squared_edges(corners, np.array([[0, 1, 2, 3]]))[0]
+    if edges.min() < SHORT_EDGE**2 * edges.max():
+        return "wedge"
+    # The affine dependence of four points in a plane, sum c_k = 0 and sum c_k x_k = 0: its signs are 3 + 1 if one
+    # point lies inside the triangle of the others, 2 + 2 for a convex quadrilateral; a 0 is a point on an edge.
+    dependence = np.linalg.svd(np.vstack([flat.T, np.ones(4)]))[2][-1]
+    if np.abs(dependence).min() < NEAR_EDGE * np.abs(dependence).max():
+        return "spade"
+    return "sliver" if np.sum(dependence > 0) == 2 else "cap"
+
+
+class Quality(NamedTuple):
+    """The shape of a mesh in numbers; angles in degrees, volumes in mm^n."""
+
+    n_nodes: int
+    n_cells: int
+    volume: float
+    smallest_volume: float
+    mean_rho: float
+    p1_rho: float
+    min_rho: float
+    errors: QualityErrors
+    min_dihedral: float
+    p1_dihedral: float  # 1st percentile of the cells' smallest angles
+    max_dihedral: float
+    n_under_10_degrees: int  # cells with a smallest angle below
+    kinds: dict[str, int]  # counts of bad cells by kind
+
+
+def quality(points: Points, cells: Cells) -> Quality:
+    """Everything about the shape of a mesh's cells; see `quality_errors`, `bad_kinds` and `dihedral_angles`."""
+    n = points.shape[1]
+    shape = rho(points, cells)
+    v = volumes(points, cells)
+    angles = dihedral_angles(points, cells)
+    smallest = angles.min(axis=1)
+    names = ("needle", "wedge", "cap", "spade", "sliver") if n == 3 else ("needle", "cap")
+    kinds = bad_kinds(points, cells)
+    return Quality(
+        n_nodes=len(points),
+        n_cells=len(cells),
+        volume=float(v.sum()),
+        smallest_volume=float(v.min()),
+        mean_rho=float(shape.mean()),
+        p1_rho=float(np.percentile(shape, 1)),
+        min_rho=float(shape.min()),
+        errors=quality_errors(points, cells),
+        min_dihedral=float(smallest.min()),
+        p1_dihedral=float(np.percentile(smallest, 1)),
+        max_dihedral=float(angles.max()),
+        n_under_10_degrees=int((smallest < 10.0).sum()),
+        kinds={name: int((kinds == name).sum()) for name in names},
+    )

@@ -1,0 +1,142 @@
+"""Closed forms for triangles and tetrahedra, one row a cell.
+
+Everywhere `points` is (N, n) float64 in mm and `cells` is (M, n+1) integer, n = 2 or 3.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations
+from math import factorial
+
+import numpy as np
+from numpy.typing import NDArray
+
+Points = NDArray[np.float64]
+Cells = NDArray[np.integer]
+
+
+def edge_pairs(n: int) -> list[tuple[int, int]]:
+    """Local node pairs of the n(n+1)/2 edges of an n-simplex, in lexicographic order."""
+    return list(combinations(range(n + 1), 2))
+
+
+def facet_nodes(n: int) -> list[tuple[int, ...]]:
+    """Local nodes of the n+1 facets of an n-simplex; facet i lies opposite node i."""
+    return [tuple(k for k in range(n + 1) if k != i) for i in range(n + 1)]
+
+
+def volumes(points: Points, cells: Cells) -> NDArray[np.float64]:
+    """Signed volumes (areas in 2-D), (M,) float64, mm^n; positive for a positively oriented cell."""
+    corners = points[cells]
+    frames = corners[:, 1:] - corners[:, :1]
+    return _determinants(frames) / factorial(points.shape[1])
+
+
+def _determinants(frames: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Determinants of (M, n, n) matrices, written out: exactly 0 where two rows are equal, unlike an LU's."""
+    if frames.shape[1] == 2:
+        return frames[:, 0, 0] * frames[:, 1, 1] - frames[:, 0, 1] * frames[:, 1, 0]
+    return np.einsum("ij,ij->i", frames[:, 0], np.cross(frames[:, 1], frames[:, 2]))
+
+
+def oriented(points: Points, cells: Cells) -> NDArray[np.int64]:
+    """Copy of `cells`, (M, n+1) int64, with the last two nodes swapped where the signed volume is negative."""
+    turned = np.array(cells, dtype=np.int64)
+    is_negative = volumes(points, cells) < 0.0
+    turned[is_negative, -2:] = turned[is_negative, :-3:-1]
+    return turned
+
+
+def centroids(points: Points, cells: Cells) -> NDArray[np.float64]:
+    """Mean of each cell's nodes, (M, n) float64, mm."""
+    return points[cells].mean(axis=1)
+
+
+def squared_edges(points: Points, cells: Cells) -> NDArray[np.float64]:
+    """Squared edge lengths, (M, n(n+1)/2) float64, mm^2, in the order of `edge_pairs`."""
+    corners = points[cells]
+    first, second = np.array(edge_pairs(points.shape[1])).T
+    return ((corners[:, second] - corners[:, first]) ** 2).sum(axis=2)
+
+
+def facet_areas(points: Points, cells: Cells) -> NDArray[np.float64]:
+    """Areas (edge lengths in 2-D) of each cell's facets, (M, n+1) float64, mm^(n-1); column i is opposite node i."""
+    return np.linalg.norm(_facet_normals(points, cells), axis=2)
+
+
+def _facet_normals(points: Points, cells: Cells) -> NDArray[np.float64]:
+    """Outward normals as long as their facet's area, (M, n+1, n) float64; the cells positively oriented."""
+    corners = points[cells]
+    if points.shape[1] == 2:
+        along = corners[:, [2, 0, 1]] - corners[:, [1, 2, 0]]
+        return np.stack([along[..., 1], -along[..., 0]], axis=-1)
+    # Facet opposite node i, its nodes in the order that turns the cross product outwards.
+    a, b, c = (corners[:, order] for order in ([1, 0, 0, 0], [2, 3, 1, 2], [3, 2, 3, 1]))
+    return 0.5 * np.cross(b - a, c - a)
+
+
+def volume_gradients(points: Points, cells: Cells) -> NDArray[np.float64]:
+    """Gradient of each cell's volume by each of its nodes, (M, n+1, n) float64, mm^(n-1).
+
+    Moving node i along a vector d changes the volume by (area of the opposite facet) x (height gained) / n,
+    so the gradient is minus the outward area normal over n.
+    """
+    return -_facet_normals(points, cells) / points.shape[1]
+
+
+def circumcentres(points: Points, cells: Cells) -> NDArray[np.float64]:
+    """Centres of the circumscribed spheres, (M, n) float64, mm; flat cells raise LinAlgError.
+
+    With the edges e_k from the first node as rows, the centre c relative to it solves 2 e_k . c = |e_k|^2.
+    """
+    corners = points[cells]
+    edges = corners[:, 1:] - corners[:, :1]
+    right = (edges**2).sum(axis=2)
+    return corners[:, 0] + np.linalg.solve(2.0 * edges, right[..., None])[..., 0]
+
+
+def rho(points: Points, cells: Cells) -> NDArray[np.float64]:
+    """Inradius over circumradius, (M,) float64 in [0, 1/n]: 1/n for the regular simplex, 0 for a flat one.
+
+    The shape measure of Section 2.1. The inradius is n v / (sum of facet areas). In 2-D the circumradius is
+    abc / 4v; in 3-D it is |a^2 (b x c) + b^2 (c x a) + c^2 (a x b)| / 12 v with the edges a, b, c from one node.
+    The quotient of both has v^2 above the line, so a flat cell needs no special case. Inverted cells get the
+    value of their mirror image.
+    """
+    v = volumes(points, cells)
+    if points.shape[1] == 2:
+        lengths = np.sqrt(squared_edges(points, cells))
+        below = lengths.sum(axis=1) * lengths.prod(axis=1)
+        above = 8.0 * v**2
+    else:
+        corners = points[cells]
+        a, b, c = (corners[:, k] - corners[:, 0] for k in (1, 2, 3))
+        aa, bb, cc = ((x**2).sum(axis=1, keepdims=True) for x in (a, b, c))
+        numerator = np.linalg.norm(aa * np.cross(b, c) + bb * np.cross(c, a) + cc * np.cross(a, b), axis=1)
+        below = facet_areas(points, cells).sum(axis=1) * numerator
+        above = 36.0 * v**2
+    return np.divide(above, below, out=np.zeros_like(v), where=below > 0.0)
+
+
+def dihedral_angles(points: Points, cells: Cells) -> NDArray[np.float64]:
+    """Angles between facets, degrees: (M, 6) float64 in 3-D, by `edge_pairs`; (M, 3) in 2-D, by node.
+
+    In 3-D entry k is the angle inside the cell at edge k; in 2-D entry i is the triangle's angle at node i.
+    Flat cells have angles 0 and 180.
+    """
+    n = points.shape[1]
+    normals = _facet_normals(points, cells)
+    if n == 2:
+        pairs = [(1, 2), (2, 0), (0, 1)]  # the two edges that meet in node i lie opposite the two others
+    else:
+        pairs = [tuple(k for k in range(4) if k not in edge) for edge in edge_pairs(3)]  # the facets at an edge
+    angles = np.empty((len(cells), len(pairs)))
+    for column, (i, j) in enumerate(pairs):
+        p, q = normals[:, i], normals[:, j]
+        cosine = -(p * q).sum(axis=1)
+        if n == 2:
+            sine = np.abs(p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0])
+        else:
+            sine = np.linalg.norm(np.cross(p, q), axis=1)
+        angles[:, column] = np.degrees(np.arctan2(sine, cosine))  # exact near 0 and 180, where arccos is not
+    return angles

@@ -1,0 +1,143 @@
+"""The image: a scalar field on voxels with its place in the world."""
+
+from __future__ import annotations
+
+import warnings
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tetopt.errors import InputError
+
+
+@dataclass(frozen=True, eq=False)
+class Image:
+    """Scalar intensities h on a grid of voxels, in two or three dimensions.
+
+    Voxel *centres* sit at the integer indices (the NIfTI convention), so the domain runs from index -0.5 to
+    ``shape - 0.5`` along every axis. The affine takes indices to world millimetres, RAS+ in 3-D; it may flip,
+    rotate, shear and scale each axis differently.
+
+    Parameters
+    ----------
+    data : (s_0, ..., s_{n-1}) array of real numbers
+        Intensities, n = 2 or 3. Held as float32 where that loses nothing, else as float64; read-only.
+    affine : (n+1, n+1) array, optional
+        Index -> world mm, homogeneous. The identity (1 mm voxels) by default. Held as float64; read-only.
+
+    Raises
+    ------
+    InputError
+        Wrong number of axes, an empty axis, complex, RGB or non-finite data, or an affine that is singular or
+        of another size.
+
+    Examples
+    --------
+    >>> image = Image(np.zeros((4, 5, 6)), np.diag([2.0, 2.0, 3.0, 1.0]))
+    >>> image.voxel_volume
+    12.0
+    >>> image.to_world(np.array([[0.0, 0.0, 1.0]]))
+    array([[0., 0., 3.]])
+    """
+
+    data: NDArray[np.floating]
+    affine: NDArray[np.float64]
+
+    def __init__(self, data: ArrayLike, affine: ArrayLike | None = None) -> None:
+        data = _checked_data(data)
+        affine = _checked_affine(np.eye(data.ndim + 1) if affine is None else affine, data.ndim)
+        object.__setattr__(self, "data", data)
+        object.__setattr__(self, "affine", affine)
+
+    @property
+    def ndim(self) -> int:
+        """Number of axes n, 2 or 3."""
+        return self.data.ndim
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Number of voxels along each axis."""
+        return self.data.shape
+
+    @property
+    def spacing(self) -> NDArray[np.float64]:
+        """Length of a voxel's edge along each axis, (n,) float64, mm."""
+        return np.linalg.norm(self.affine[:-1, :-1], axis=0)
+
+    @property
+    def voxel_volume(self) -> float:
+        """Volume of one voxel, mm^n."""
+        return float(abs(np.linalg.det(self.affine[:-1, :-1])))
+
+    @property
+    def volume(self) -> float:
+        """Volume of the domain, index -0.5 to shape - 0.5, mm^n."""
+        return self.voxel_volume * self.data.size
+
+    def to_world(self, index: ArrayLike) -> NDArray[np.float64]:
+        """World coordinates, (..., n) mm, of index coordinates (..., n)."""
+        return np.asarray(index, dtype=np.float64) @ self.affine[:-1, :-1].T + self.affine[:-1, -1]
+
+    def to_index(self, points: ArrayLike) -> NDArray[np.float64]:
+        """Index coordinates (..., n) of world points (..., n) in mm; the inverse of `to_world`."""
+        shifted = np.asarray(points, dtype=np.float64) - self.affine[:-1, -1]
+        return np.linalg.solve(self.affine[:-1, :-1], shifted[..., None])[..., 0]
+
+
+def _checked_data(data: ArrayLike) -> NDArray[np.floating]:
+    """A read-only float32 or float64 C-ordered copy of `data`; InputError for what cannot be an image."""
+    data = np.asarray(data)
+    if data.dtype.names is not None or data.dtype.kind == "O":
+        raise InputError(f"image data: expected one number a voxel, got {data.dtype}; convert RGB to grey first")
+    if data.dtype.kind == "c":
+        raise InputError("image data: expected real numbers, got complex ones; take the magnitude first")
+    if data.dtype.kind not in "buif":
+        raise InputError(f"image data: expected numbers, got dtype {data.dtype}")
+    if data.ndim not in (2, 3):
+        raise InputError(f"image data: expected 2 or 3 axes, got shape {data.shape}; pick one volume or slice")
+    if 0 in data.shape:
+        raise InputError(f"image data: every axis needs a voxel, got shape {data.shape}")
+    is_finite = np.isfinite(data)
+    if not is_finite.all():
+        first = tuple(int(i) for i in np.argwhere(~is_finite)[0])
+        raise InputError(
+            f"image data: {int(np.count_nonzero(~is_finite))} voxels are NaN or infinite, the first at index "
+            f"{first}; replace them (for example by the background's value) first"
+        )
+    held = _as_lossless_float(data)
+    held.setflags(write=False)
+    return held
+
+
+def _as_lossless_float(data: NDArray) -> NDArray[np.floating]:
+    """C-ordered copy as float32 if every value survives, else as float64."""
+    with np.errstate(over="ignore"), warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        single = np.array(data, dtype=np.float32, order="C")
+    if np.array_equal(single, data):
+        return single
+    return np.array(data, dtype=np.float64, order="C")
+
+
+def _checked_affine(affine: ArrayLike, n: int) -> NDArray[np.float64]:
+    """A read-only copy of the affine; InputError unless it is (n+1, n+1), finite, homogeneous and regular."""
+    try:
+        affine = np.array(affine, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"affine: expected a ({n + 1}, {n + 1}) array of numbers, got {affine!r}") from error
+    if affine.shape != (n + 1, n + 1):
+        raise InputError(f"affine: expected shape ({n + 1}, {n + 1}) for {n}-D data, got {affine.shape}")
+    if not np.isfinite(affine).all():
+        raise InputError(f"affine: every entry must be finite, got {affine.tolist()}")
+    if not np.array_equal(affine[-1], np.eye(n + 1)[-1]):
+        raise InputError(f"affine: the last row must be {np.eye(n + 1)[-1].tolist()}, got {affine[-1].tolist()}")
+    columns = affine[:-1, :-1]
+    lengths = np.linalg.norm(columns, axis=0)
+    if lengths.min() == 0.0 or abs(np.linalg.det(columns / lengths)) < 1e-6:
+        raise InputError(
+            f"affine: it is singular (voxel axes of lengths {lengths.tolist()} mm do not span {n}-D space); "
+            "mend the file's header"
+        )
+    affine.setflags(write=False)
+    return affine

@@ -1,0 +1,618 @@
+"""Images in: NIfTI, MGZ, NRRD, MetaImage, DICOM and 2-D pictures, each to an `Image` in RAS+ millimetres."""
+
+from __future__ import annotations
+
+import contextlib
+import gzip
+import hashlib
+import re
+import struct
+import warnings
+import zlib
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+from types import ModuleType
+from typing import Any
+
+import nibabel
+import numpy as np
+import PIL.Image
+from nibabel.filebasedimages import ImageFileError
+from nibabel.spatialimages import HeaderDataError, SpatialImage
+from nibabel.wrapstruct import WrapStructError
+from numpy.typing import NDArray
+
+from tetopt.errors import InputError
+from tetopt.image import Image
+from tetopt.io.files import written_whole
+
+Bounds = Sequence[tuple[int | None, int | None]]
+"""One half-open (start, stop) range of voxel indices for each axis; None is an open end."""
+
+_NIBABEL = (".nii.gz", ".nii", ".mgz", ".mgh")
+# ITK picks its reader by the name's case-sensitive ending; naming the reader also opens SCAN.MHA.
+_ITK = {
+    ".nrrd": "NrrdImageIO",
+    ".nhdr": "NrrdImageIO",
+    ".mha": "MetaImageIO",
+    ".mhd": "MetaImageIO",
+    ".dcm": "GDCMImageIO",
+}
+_PICTURES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp")
+_KNOWN = ", ".join((*_NIBABEL, *_ITK, *_PICTURES))
+
+_DAMAGED = "the file is truncated or damaged; copy it again"
+_UNREADABLE = "truncated or damaged, or not an image of this kind; copy it again, or check its name"
+_NIBABEL_HEADER_ERRORS = (
+    ImageFileError,
+    HeaderDataError,
+    WrapStructError,
+    OSError,
+    EOFError,
+    ValueError,
+    TypeError,
+    KeyError,
+    OverflowError,
+)
+_PILLOW_ERRORS = (
+    OSError,
+    EOFError,
+    SyntaxError,
+    ValueError,
+    TypeError,
+    KeyError,
+    struct.error,
+    zlib.error,
+    PIL.Image.DecompressionBombError,
+)
+_MM = {"meter": 1000.0, "micron": 0.001}
+_UNEVEN = 0.05
+"""DICOM slices may be off an even spacing by this fraction of it; positions are often rounded."""
+
+
+def load_image(
+    path: str | Path,
+    *,
+    volume: int | None = None,
+    slice_: tuple[int, int] | None = None,
+    crop: Bounds | None = None,
+) -> Image:
+    """The image in a file, or in a folder of DICOM slices, placed in RAS+ millimetres.
+
+    The suffix, in any case, decides the format: NIfTI and MGZ are read by nibabel; NRRD, MetaImage and DICOM
+    by SimpleITK (the extra ``tetopt[itk]``); 2-D pictures by Pillow. Axes of length 1 beyond the third are
+    dropped.
+
+    NIfTI's scaling, its sform (else qform) and its spatial unit are honoured. ITK's LPS world is turned to
+    RAS. A DICOM series takes its slice axis from the positions of its first and last slice, so a tilted
+    gantry's shear is kept. A picture has 1 mm pixels, index (row, column), world x to the right and y up, and
+    y = 0 at the centres of its bottom row.
+
+    Parameters
+    ----------
+    path : str or Path
+        File, or folder with one DICOM series.
+    volume : int, optional
+        Which volume of a 4-D file or frame of a picture, from 0; it is the only one held in memory. With more
+        than four axes the fourth runs fastest, as in the file.
+    slice_ : (axis, index), optional
+        Take one slice of a 3-D volume as a 2-D image, see `image_slice`.
+    crop : sequence of (start, stop), optional
+        Keep a box of voxels, see `cropped`; one range for each of the volume's axes.
+        Both `slice_` and `crop` count voxels of the uncropped volume, and the slice must lie inside the crop.
+
+    Returns
+    -------
+    Image
+        Two-dimensional for a picture, a 2-D file or with `slice_`; else three-dimensional.
+
+    Raises
+    ------
+    InputError
+        ``"<path>: ..."`` in one line: a file that is missing, unreadable, empty, of unknown kind, truncated
+        or damaged; SimpleITK needed and not installed; a folder without a DICOM series, with several, or with
+        uneven slices; several volumes and no `volume`, or one out of range; a bad `slice_` or `crop`; RGB,
+        complex, NaN or infinite values; an empty axis; a singular affine.
+
+    Warns
+    -----
+    UserWarning
+        The image is constant, so its discretization error is 0 on every mesh.
+    """
+    path = Path(path)
+    try:
+        data, affine = _read(path, volume)
+        image = _region(Image(data, affine), slice_, crop)
+    except InputError as error:
+        raise InputError(f"{path}: {_one_line(error)}") from error
+    low = image.data.min()
+    if low == image.data.max():
+        warnings.warn(f"{path}: the image is {low:g} everywhere, so E_D is 0 everywhere", stacklevel=2)
+    return image
+
+
+def save_image(path: str | Path, image: Image) -> None:
+    """Write a NIfTI file (.nii or .nii.gz), whole or not at all, with the full affine as sform, in mm.
+
+    A 2-D image becomes a 2-D file in the plane z = 0, which `load_image` reads back as it was. Replaces an
+    existing file; ask `tetopt.io.files.checked_output` first.
+    """
+    affine = np.eye(4)
+    affine[: image.ndim, : image.ndim] = image.affine[:-1, :-1]
+    affine[: image.ndim, 3] = image.affine[:-1, -1]
+    file = nibabel.Nifti1Image(image.data, affine)
+    file.header.set_xyzt_units("mm")
+    with written_whole(Path(path)) as temporary:
+        nibabel.save(file, temporary)
+
+
+def image_slice(image: Image, axis: int, index: int) -> Image:
+    """One slice of a 3-D image as a 2-D image, with every length and angle in the slice kept.
+
+    A slice in the plane of two world axes keeps those two of its world coordinates. Else the plane's own frame
+    is Q of the QR factorisation of the affine's two in-plane columns, each axis of Q turned so that its largest
+    component is positive; a voxel's 2-D coordinates are Q^T times its 3-D ones.
+
+    Parameters
+    ----------
+    image : Image
+        Three-dimensional.
+    axis : int
+        The array axis to drop: 0, 1 or 2.
+    index : int
+        Voxel index along `axis`, from 0.
+
+    Raises
+    ------
+    InputError
+        The image is 2-D, or `axis` or `index` is out of range.
+
+    Examples
+    --------
+    >>> image = Image(np.zeros((4, 5, 6)), np.diag([2.0, 2.0, 3.0, 1.0]))
+    >>> image_slice(image, 1, 0).affine
+    array([[2., 0., 0.],
+           [0., 3., 0.],
+           [0., 0., 1.]])
+    """
+    if image.ndim != 3:
+        raise InputError(
+            f"slice: only a 3-D image has slices, this one is {image.ndim}-D; leave the slice out"
+        )
+    if axis not in (0, 1, 2):
+        raise InputError(f"slice: the axis must be 0, 1 or 2, got {axis}")
+    size = image.shape[axis]
+    if not 0 <= index < size:
+        raise InputError(f"slice: index along axis {axis} must be from 0 to {size - 1}, got {index}")
+    corner = np.zeros(3)
+    corner[axis] = index
+    columns = np.delete(image.affine[:3, :3], axis, axis=1)
+    return Image(np.take(image.data, index, axis=axis), _plane_affine(columns, image.to_world(corner)))
+
+
+def cropped(image: Image, bounds: Bounds) -> Image:
+    """The voxels inside a box of indices; every voxel keeps its place in the world.
+
+    Parameters
+    ----------
+    image : Image
+        In n dimensions.
+    bounds : sequence of n (start, stop)
+        Half-open ranges of voxel indices, 0 <= start < stop <= size; None for an open end.
+
+    Raises
+    ------
+    InputError
+        Not n ranges, or a range that is empty or leaves the image.
+
+    Examples
+    --------
+    >>> small = cropped(Image(np.zeros((40, 50))), [(10, 30), (None, None)])
+    >>> small.shape, small.to_world([0, 0])
+    ((20, 50), array([10.,  0.]))
+    """
+    ranges = _checked_bounds(image.shape, bounds)
+    affine = image.affine.copy()
+    affine[:-1, -1] = image.to_world([start for start, _ in ranges])
+    return Image(image.data[tuple(slice(*r) for r in ranges)], affine)
+
+
+def parse_crop(text: str) -> list[tuple[int | None, int | None]]:
+    """Crop bounds as written on a command line, one start:stop for each axis, for `cropped`.
+
+    Raises
+    ------
+    InputError
+        The text is something else.
+
+    Examples
+    --------
+    >>> parse_crop("10:100,:,5:")
+    [(10, 100), (None, None), (5, None)]
+    """
+    bounds = []
+    for part in text.split(","):
+        match = re.fullmatch(r"\s*([0-9]*)\s*:\s*([0-9]*)\s*", part)
+        if match is None:
+            raise InputError(
+                'crop: expected start:stop in voxels for each axis, such as "10:100,:,5:", '
+                f'got "{_one_line(text)}"'
+            )
+        start, stop = (int(end) if end else None for end in match.groups())
+        bounds.append((start, stop))
+    return bounds
+
+
+def parse_slice(text: str) -> tuple[int, int]:
+    """Array axis (0, 1, 2 or i, j, k) and voxel index as written on a command line, for `image_slice`.
+
+    Raises
+    ------
+    InputError
+        The text is something else.
+
+    Examples
+    --------
+    >>> parse_slice("2=90"), parse_slice("k=90")
+    ((2, 90), (2, 90))
+    """
+    match = re.fullmatch(r"\s*([012ijk])\s*=\s*([0-9]+)\s*", text)
+    if match is None:
+        raise InputError(
+            "slice: expected an array axis (0, 1, 2 or i, j, k) and a voxel index, "
+            f'such as "2=90" or "k=90", got "{_one_line(text)}"'
+        )
+    axis, index = match.groups()
+    return "012ijk".index(axis) % 3, int(index)
+
+
+def sha256(path: str | Path) -> str:
+    """SHA-256 of a file, or of the contents of a folder's files joined in the order of their names.
+
+    Raises
+    ------
+    InputError
+        The file or folder is missing, or may not be read.
+    """
+    path = Path(path)
+    digest = hashlib.sha256()
+    with _os_errors_named(path):
+        # A DICOM series is read from the folder itself and not from folders in it; so is its checksum.
+        files = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
+        for file in files:
+            with file.open("rb") as stream:
+                while block := stream.read(1 << 20):
+                    digest.update(block)
+    return digest.hexdigest()
+
+
+# --------------------------------------------------------------------------------------------------
+# Choosing the reader
+
+
+def _read(path: Path, volume: int | None) -> tuple[NDArray, NDArray[np.float64]]:
+    """Data and affine of the file, 2-D or 3-D; `Image` checks them."""
+    with _os_errors_named():
+        if path.is_dir():
+            return _read_dicom_folder(path, volume)
+        with path.open("rb") as stream:
+            if not stream.read(1):
+                raise InputError("the file is empty; copy or export it again")
+    name = path.name.lower()
+    if name.endswith(_NIBABEL):
+        return _read_nibabel(path, volume)
+    if name.endswith(tuple(_ITK)):
+        return _read_itk(path, volume)
+    if name.endswith(_PICTURES):
+        return _read_picture(path, volume)
+    raise InputError(f"unknown kind of image file; expected {_KNOWN}, or a folder of DICOM files")
+
+
+@contextlib.contextmanager
+def _os_errors_named(path: Path | None = None) -> Iterator[None]:
+    """Turn the operating system's errors into InputErrors, after the path if given."""
+    prefix = "" if path is None else f"{path}: "
+    try:
+        yield
+    except FileNotFoundError as error:
+        raise InputError(f"{prefix}no such file or folder; check the path") from error
+    except PermissionError as error:
+        raise InputError(f"{prefix}permission denied; make the file readable for your user") from error
+    except OSError as error:
+        raise InputError(f"{prefix}cannot be opened ({error.strerror or error})") from error
+
+
+def _volume_index(trailing: tuple[int, ...], volume: int | None) -> tuple[int, ...]:
+    """Index into the axes beyond the third (or beyond a picture's two) of the volume asked for."""
+    count = int(np.prod(trailing, dtype=np.int64))
+    if count == 0:
+        raise InputError(f"every axis needs a voxel, got trailing axes of lengths {trailing}")
+    if volume is None and count > 1:
+        raise InputError(
+            f"the file holds {count} volumes; choose one with `volume=k` / `--volume K`, 0 to {count - 1}"
+        )
+    volume = 0 if volume is None else volume
+    if not 0 <= volume < count:
+        held = "one volume" if count == 1 else f"{count} volumes"
+        raise InputError(
+            f"volume {volume} asked for, but the file holds {held}; choose from 0 to {count - 1}"
+        )
+    return tuple(int(i) for i in np.unravel_index(volume, trailing, order="F"))
+
+
+def _one_line(words: object) -> str:
+    return " ".join(str(words).split())
+
+
+# --------------------------------------------------------------------------------------------------
+# NIfTI and MGZ
+
+
+def _read_nibabel(path: Path, volume: int | None) -> tuple[NDArray, NDArray[np.float64]]:
+    if path.name.lower().endswith((".gz", ".mgz")):
+        _check_gzip(path)
+    try:
+        file = nibabel.load(path)
+    except FileNotFoundError as error:
+        # The file is there: nibabel looked for another case of its ending.
+        raise InputError("nibabel cannot read an ending in mixed case; rename it to lower case") from error
+    except _NIBABEL_HEADER_ERRORS as error:
+        raise InputError(f"{_UNREADABLE} ({_one_line(error)})") from error
+    if not isinstance(file, SpatialImage):
+        raise InputError(f"expected an image on a grid of voxels, got a {type(file).__name__}")
+    affine = _affine_in_mm(file)
+    index = _volume_index(file.shape[3:], volume)
+    try:
+        data = np.asanyarray(file.dataobj[(slice(None),) * 3 + index] if index else file.dataobj)
+    except MemoryError as error:
+        raise InputError(f"its {file.shape} voxels do not fit into memory; resample it first") from error
+    except (OSError, EOFError, zlib.error, ValueError, TypeError, OverflowError) as error:
+        raise InputError(f"{_DAMAGED} ({_one_line(error)})") from error
+    if data.ndim == 2:
+        return data, _plane_affine(affine[:3, :2], affine[:3, 3])
+    return data, affine
+
+
+def _check_gzip(path: Path) -> None:
+    """Unpack the whole file once: nibabel stops before the checksum behind the last voxel."""
+    try:
+        with gzip.open(path) as stream:
+            while stream.read(1 << 20):
+                pass
+    except (OSError, EOFError, zlib.error) as error:
+        if "Not a gzipped file" in str(error):
+            raise InputError(
+                "not a gzip file; if it is not compressed, drop .gz (or z) from its name"
+            ) from error
+        raise InputError(f"{_DAMAGED} ({_one_line(error)})") from error
+
+
+def _affine_in_mm(file: SpatialImage) -> NDArray[np.float64]:
+    affine = np.array(file.affine, dtype=np.float64)
+    if isinstance(file, nibabel.Nifti1Pair):
+        # A code outside of the standard says nothing: mm, as for 'unknown'.
+        with contextlib.suppress(KeyError):
+            affine[:3] *= _MM.get(file.header.get_xyzt_units()[0], 1.0)
+    return affine
+
+
+# --------------------------------------------------------------------------------------------------
+# NRRD, MetaImage and DICOM
+
+
+def _read_itk(path: Path, volume: int | None) -> tuple[NDArray, NDArray[np.float64]]:
+    sitk = _simple_itk()
+    with _itk_errors(sitk):
+        reader = sitk.ImageFileReader()
+        reader.SetFileName(str(path))
+        reader.SetImageIO(_ITK[path.suffix.lower()])
+        reader.ReadImageInformation()
+        _check_components(reader.GetNumberOfComponents())
+        size = reader.GetSize()
+        index = _volume_index(size[3:], volume)
+        if index:
+            reader.SetExtractSize([*size[:3], *(0 for _ in index)])
+            reader.SetExtractIndex([0, 0, 0, *index])
+        return sitk.GetArrayFromImage(reader.Execute()).T, _ras_affine(reader)
+
+
+def _read_dicom_folder(path: Path, volume: int | None) -> tuple[NDArray, NDArray[np.float64]]:
+    sitk = _simple_itk()
+    with _itk_errors(sitk):
+        reader = sitk.ImageSeriesReader()
+        files = _series_files(path, reader)
+        reader.SetFileNames(files)
+        # Keeps each slice's own position readable.
+        reader.MetaDataDictionaryArrayUpdateOn()
+        image = reader.Execute()
+        _check_components(image.GetNumberOfComponentsPerPixel())
+        index = _volume_index(image.GetSize()[3:], volume)
+        affine = _ras_affine(image)
+        _place_slices(affine, reader, len(files))
+        return sitk.GetArrayFromImage(image).T[(..., *index)], affine
+
+
+def _series_files(path: Path, reader: Any) -> tuple[str, ...]:
+    """The files of the one DICOM series in a folder, in the order of their positions."""
+    files = sorted(file for file in path.iterdir() if file.is_file())
+    series = {
+        uid: reader.GetGDCMSeriesFileNames(str(path), uid) for uid in reader.GetGDCMSeriesIDs(str(path))
+    }
+    known = {Path(file).name for names in series.values() for file in names}
+    for file in files:
+        # GDCM passes over a damaged file in silence, which would shorten the volume.
+        if file.name not in known and file.name.upper() != "DICOMDIR" and _is_dicom(file):
+            raise InputError(f"the DICOM file {file.name} is truncated or damaged; copy it again")
+    if not series:
+        raise InputError("no DICOM series in this folder (folders in it are not searched)")
+    if len(series) > 1:
+        listed = ", ".join(f"{uid} ({len(names)} files)" for uid, names in series.items())
+        raise InputError(f"{len(series)} DICOM series in this folder, put one into its own folder: {listed}")
+    return next(iter(series.values()))
+
+
+def _is_dicom(path: Path) -> bool:
+    """Whether a DICOM file's mark follows its 128 bytes of preamble."""
+    with path.open("rb") as stream:
+        return stream.read(132)[128:] == b"DICM"
+
+
+def _place_slices(affine: NDArray[np.float64], reader: Any, n_slices: int) -> None:
+    """Write the slice axis into `affine` from the slices' own positions, where the files have them.
+
+    ITK squares a tilted gantry's axes and only warns of a missing slice; both would move anatomy unnoticed.
+    """
+    position, orientation = "0020|0032", "0020|0037"
+    slices = range(n_slices)
+    if n_slices < 2 or not all(
+        reader.HasMetaDataKey(i, tag) for i in slices for tag in (position, orientation)
+    ):
+        return
+    turns = np.array([_numbers(reader.GetMetaData(i, orientation), 6) for i in slices])
+    if not np.allclose(turns, turns[0], rtol=0.0, atol=1e-4):
+        raise InputError("the DICOM slices are not parallel (a localizer?); choose another series")
+    points = np.array([_numbers(reader.GetMetaData(i, position), 3) for i in slices]) * [-1.0, -1.0, 1.0]
+    step = (points[-1] - points[0]) / (n_slices - 1)
+    off = np.linalg.norm(points - points[0] - np.arange(n_slices)[:, None] * step, axis=1)
+    if off.max() > _UNEVEN * np.linalg.norm(step):
+        raise InputError(
+            f"the DICOM slices are not evenly spaced (slice {off.argmax()} is {off.max():.3g} mm off: one is "
+            "missing, or several volumes are mixed); export the series again, or resample it to NIfTI"
+        )
+    affine[:3, 2] = step
+
+
+def _numbers(value: str, count: int) -> list[float]:
+    """The numbers in a DICOM tag's text."""
+    try:
+        numbers = [float(number) for number in value.split("\\")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != count or not np.isfinite(numbers).all():
+        raise InputError(f'a DICOM slice\'s place should be {count} numbers, got "{value}"; export it again')
+    return numbers
+
+
+def _simple_itk() -> ModuleType:
+    try:
+        import SimpleITK
+    except ImportError as error:
+        raise InputError('NRRD, MetaImage and DICOM need SimpleITK; pip install "tetopt[itk]"') from error
+    return SimpleITK
+
+
+@contextlib.contextmanager
+def _itk_errors(sitk: ModuleType) -> Iterator[None]:
+    """Turn SimpleITK's errors into InputErrors, and keep ITK's own warnings off stderr."""
+    shown = sitk.ProcessObject.GetGlobalWarningDisplay()
+    sitk.ProcessObject.SetGlobalWarningDisplay(False)
+    try:
+        yield
+    except RuntimeError as error:
+        # The innermost cause stands last; the "Reason:" behind it is an unrelated errno.
+        words = re.split(r"ERROR: (?:\w+ ?\(0x[0-9a-f]+\): )?|\[nrrd\] ", _one_line(error))[-1]
+        words = words.split(" Reason: ")[0]
+        raise InputError(f"{_UNREADABLE} (SimpleITK: {words})") from error
+    finally:
+        sitk.ProcessObject.SetGlobalWarningDisplay(shown)
+
+
+def _check_components(count: int) -> None:
+    if count > 1:
+        raise InputError(
+            f"expected one number a voxel, got {count} (RGB or vectors); convert it to grey first"
+        )
+
+
+def _ras_affine(source: Any) -> NDArray[np.float64]:
+    """RAS affine of a SimpleITK image or reader (LPS), of its first three axes or of its two."""
+    n = min(source.GetDimension(), 3)
+    direction = np.reshape(source.GetDirection(), (source.GetDimension(),) * 2)
+    affine = np.eye(n + 1)
+    affine[:n, :n] = direction[:n, :n] * source.GetSpacing()[:n]
+    affine[:n, n] = source.GetOrigin()[:n]
+    affine[:2] *= -1.0
+    return affine
+
+
+# --------------------------------------------------------------------------------------------------
+# Pictures
+
+
+def _read_picture(path: Path, volume: int | None) -> tuple[NDArray, NDArray[np.float64]]:
+    try:
+        with PIL.Image.open(path) as picture:
+            (frame,) = _volume_index((getattr(picture, "n_frames", 1),), volume)
+            picture.seek(frame)
+            data = _grey(picture)
+    except InputError:
+        raise
+    except PIL.UnidentifiedImageError as error:
+        raise InputError(f"{_UNREADABLE} (Pillow knows no such picture)") from error
+    except _PILLOW_ERRORS as error:
+        raise InputError(f"{_DAMAGED} ({_one_line(error)})") from error
+    return data, np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, data.shape[0] - 1.0], [0.0, 0.0, 1.0]])
+
+
+def _grey(picture: PIL.Image.Image) -> NDArray:
+    """Grey values (rows, columns); of a colour picture only where it is grey and opaque throughout."""
+    values = np.asarray(picture)
+    if picture.mode in ("1", "L", "I", "F") or picture.mode.startswith("I;16"):
+        return values
+    if picture.mode in ("LA", "RGB", "RGBA"):
+        opaque = "A" not in picture.mode or bool((values[..., -1] == 255).all())
+        colours = values[..., :3] if picture.mode.startswith("RGB") else values[..., :1]
+        if opaque and bool((colours == colours[..., :1]).all()):
+            return values[..., 0]
+    raise InputError(f"a colour or transparent picture (mode {picture.mode}); convert it to grey first")
+
+
+# --------------------------------------------------------------------------------------------------
+# Geometry of parts
+
+
+def _region(image: Image, slice_: tuple[int, int] | None, crop: Bounds | None) -> Image:
+    """The crop and then the slice, done in the other order (it is the same) so that indices need no shift."""
+    if slice_ is None:
+        return image if crop is None else cropped(image, crop)
+    plane = image_slice(image, *slice_)
+    if crop is None:
+        return plane
+    axis, index = slice_
+    bounds = _checked_bounds(image.shape, crop)
+    start, stop = bounds.pop(axis)
+    if not start <= index < stop:
+        raise InputError(f"slice: index {index} along axis {axis} lies outside of the crop {start}:{stop}")
+    return cropped(plane, bounds)
+
+
+def _checked_bounds(shape: tuple[int, ...], bounds: Bounds) -> list[tuple[int, int]]:
+    """The bounds with their open ends filled in."""
+    if len(bounds) != len(shape):
+        raise InputError(f"crop: expected {len(shape)} ranges for shape {shape}, got {len(bounds)}")
+    ranges = []
+    for axis, ((start, stop), size) in enumerate(zip(bounds, shape, strict=True)):
+        start = 0 if start is None else start
+        stop = size if stop is None else stop
+        if not 0 <= start < stop <= size:
+            raise InputError(
+                f"crop: along axis {axis} expected 0 <= start < stop <= {size}, got {start}:{stop}"
+            )
+        ranges.append((start, stop))
+    return ranges
+
+
+def _plane_affine(columns: NDArray[np.float64], origin: NDArray[np.float64]) -> NDArray[np.float64]:
+    """2-D affine (3, 3) of a plane in 3-D: voxel steps `columns` (3, 2) and first voxel `origin` (3,), mm."""
+    if not np.isfinite(columns).all():
+        raise InputError(f"affine: every entry must be finite, got {columns.tolist()}")
+    spanned = np.flatnonzero(columns.any(axis=1))
+    if len(spanned) == 2:  # the plane of two world axes: keep their coordinates
+        frame = np.eye(3)[:, spanned]
+    else:
+        frame, _ = np.linalg.qr(columns)
+        frame *= np.sign(frame[np.abs(frame).argmax(axis=0), [0, 1]])
+    affine = np.eye(3)
+    affine[:2, :2] = frame.T @ columns
+    affine[:2, 2] = frame.T @ origin
+    return affine

@@ -1,0 +1,309 @@
+"""The paper's optimisation: re-tessellate, move every node, measure, repeat."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.energy.discretization import E_D_of_sums, combined
+from tetopt.energy.geometric import cell_E_G
+from tetopt.energy.sampling import (
+    SamplingGrid,
+    check_orientations,
+    from_ticks,
+    moment_sums,
+    orientations,
+    sampling_grid,
+    to_ticks,
+)
+from tetopt.errors import InputError
+from tetopt.geometry.topology import boundary_facets, facets, node_colours, rings
+from tetopt.image import Image
+from tetopt.mesh import Mesh
+from tetopt.optimize.descent import State, Weights, descend, relocate
+from tetopt.optimize.retessellate import delaunay
+
+Retessellate = Literal["first", "accept", "never"]
+Boundary = Literal["slide", "fixed"]
+
+
+class Record(NamedTuple):
+    """One row of the history; row 0 is the initial mesh."""
+
+    iteration: int
+    E: float  # normalised by the initial mesh, Eq. (4) and Section 4
+    E_G: float  # mm^(n+2)
+    E_D: float  # intensity^2 mm^n
+    movement: float  # |x^t - x^(t-1)| / |x^(t-1)|, x from the box's centre
+    is_retessellated: bool  # a new tessellation was taken in this iteration
+    n_cells: int
+    n_voxels: int  # voxel centres inside the cells; the same in every row
+    seconds: float  # since the start
+
+
+class Optimized(NamedTuple):
+    """What `optimize` returns."""
+
+    mesh: Mesh
+    history: list[Record]
+    ended: str  # "iterations", "converged", "max_seconds" or "stopped"
+
+
+def optimize(
+    image: Image,
+    mesh: Mesh,
+    *,
+    k_D: float = 0.2,
+    iterations: int = 20,
+    n_t: int | None = None,
+    retessellate: Retessellate = "first",
+    boundary: Boundary = "slide",
+    step_ratio: float = 0.25,
+    tolerance: float = 1e-5,
+    max_seconds: float | None = None,
+    callback: Callable[[Record], None] | None = None,
+    stop: Callable[[], bool] | None = None,
+) -> Optimized:
+    """Move the nodes of `mesh` to lower E = (1 - k_D) E_G + k_D E_D, Eq. (4), by the paper's scheme.
+
+    Parameters
+    ----------
+    image : Image
+        The intensities h.
+    mesh : Mesh
+        The initial mesh, which also normalises the two energies; for re-tessellation it must fill the image's
+        box, as `tetopt.lattice.lattice` does.
+    k_D : float
+        Weight of the image, 0 <= k_D < 1. With 0 a node moves to the minimiser of E_G (Lloyd's relaxation),
+        else by descent with numerical derivatives.
+    iterations : int
+        Number of sweeps over all nodes, at most.
+    n_t : int, optional
+        Re-tessellation happens in the first n_t iterations only. Default: all for k_D = 0, else half.
+    retessellate : {"first", "accept", "never"}
+        Take every Delaunay tessellation; only one that lowers E (Section 4); or none.
+    boundary : {"slide", "fixed"}
+        Boundary nodes move within the box's faces and edges, or not at all. Those not on the box are fixed.
+    step_ratio : float
+        Step of the numerical derivative over the distance to the nearest cell centroid.
+    tolerance : float
+        Converged when the relative movement of an iteration falls below it.
+    max_seconds : float, optional
+        Stop at the next colour of nodes after this time; the mesh is valid.
+    callback : callable, optional
+        Called with each `Record`.
+    stop : callable, optional
+        Asked between colours of nodes (several times a second on common meshes); True ends the run there.
+
+    Returns
+    -------
+    Optimized
+        Mesh, history and why it ended. The mesh covers the same domain and every cell is positively oriented.
+        With the connectivity fixed E never rises from one record to the next.
+
+    Raises
+    ------
+    InputError
+        An option out of range, or a mesh that the sampling cannot take (see `cell_moments`).
+    """
+    _check_options(k_D, iterations, n_t, retessellate, boundary, step_ratio)
+    if n_t is None:
+        n_t = iterations if k_D == 0.0 else (iterations + 1) // 2
+    begin = time.perf_counter()
+    is_over = _deadline(begin, max_seconds, stop)
+
+    grid = sampling_grid(image, mesh.points)
+    ticks = to_ticks(image.to_index(mesh.points), grid)
+    check_orientations(image, ticks, mesh.cells)
+    is_frozen = frozen_axes(image, ticks, mesh.cells, grid, boundary)
+    matrix = np.eye(3)
+    matrix[3 - image.ndim :, 3 - image.ndim :] = image.affine[:-1, :-1]
+    state = _state(image, grid, ticks, mesh.cells, is_frozen)
+    if retessellate != "never" and iterations > 0 and n_t > 0:
+        _check_fills_box(image, state.sums, state.E_G, mesh)
+    E_G0, E_D0 = _energies(state, image)
+    weights = Weights((1.0 - k_D) / E_G0, k_D * image.voxel_volume / E_D0 if E_D0 > 0.0 else 0.0, step_ratio)
+
+    history: list[Record] = []
+
+    def record(iteration: int, movement: float, is_retessellated: bool) -> None:
+        now_G, now_D = _energies(state, image)
+        E = combined(now_G, now_D, E_G0, E_D0, k_D)
+        n_voxels = int(state.sums[:, 0].sum())
+        seconds = time.perf_counter() - begin
+        history.append(
+            Record(iteration, E, now_G, now_D, movement, is_retessellated, len(state.cells), n_voxels, seconds)
+        )
+        if callback is not None:
+            callback(history[-1])
+
+    record(0, 0.0, False)
+    ended = "iterations"
+    for iteration in range(1, iterations + 1):
+        # 1. Connect the nodes anew.
+        is_new = False
+        if retessellate == "accept" or (retessellate == "first" and iteration <= n_t):
+            limit = history[-1].E if retessellate == "accept" else np.inf
+            candidate = _retessellated(image, grid, state)
+            if candidate is not None:
+                E = combined(*_energies(candidate, image), E_G0, E_D0, k_D)
+                if E < limit:
+                    is_new = not np.array_equal(candidate.cells, state.cells)
+                    state = candidate
+        # 2. Move the nodes, one colour at a time.
+        before = state.ticks.copy()
+        is_finished = _sweep(state, grid, matrix, weights, k_D, is_over)
+        # 3. Measure.
+        if k_D == 0.0:
+            state.sums[:] = moment_sums(grid, state.ticks, state.cells)
+        movement = _relative_movement(before, state.ticks, image, grid, matrix)
+        record(iteration, movement, is_new)
+        if not is_finished:
+            ended = "stopped" if stop is not None and stop() else "max_seconds"
+            break
+        if movement < tolerance and not is_new:
+            ended = "converged"
+            break
+    points = image.to_world(from_ticks(state.ticks, grid, image.ndim))
+    return Optimized(Mesh(points, state.cells), history, ended)
+
+
+def _check_options(
+    k_D: float, iterations: int, n_t: int | None, retessellate: str, boundary: str, step_ratio: float
+) -> None:
+    if not 0.0 <= k_D < 1.0:
+        raise InputError(f"k_D: expected 0 <= k_D < 1, got {k_D}")
+    if iterations < 0:
+        raise InputError(f"iterations: expected 0 or more, got {iterations}")
+    if n_t is not None and n_t < 0:
+        raise InputError(f"n_t: expected 0 or more, got {n_t}")
+    if retessellate not in ("first", "accept", "never"):
+        raise InputError(f"retessellate: expected first, accept or never, got {retessellate!r}")
+    if boundary not in ("slide", "fixed"):
+        raise InputError(f"boundary: expected slide or fixed, got {boundary!r}")
+    if not 0.0 < step_ratio < 1.0:
+        raise InputError(f"step_ratio: expected a number between 0 and 1, got {step_ratio}")
+
+
+def _deadline(begin: float, max_seconds: float | None, stop: Callable[[], bool] | None) -> Callable[[], bool]:
+    def is_over() -> bool:
+        if max_seconds is not None and time.perf_counter() - begin > max_seconds:
+            return True
+        return stop is not None and stop()
+
+    return is_over
+
+
+def frozen_axes(
+    image: Image, ticks: NDArray[np.int64], cells: NDArray[np.int64], grid: SamplingGrid, boundary: Boundary
+) -> NDArray[np.bool_]:
+    """Index axes along which each node must stay, (N, 3) bool; the leading axis of a 2-D image counts as free.
+
+    A node on a face of the box, index -0.5 or shape - 0.5, keeps its coordinate across it. A node of a boundary
+    facet that lies on no face of the box keeps all of them, as every boundary node does with "fixed".
+    """
+    n = image.ndim
+    is_frozen = np.zeros((len(ticks), 3), dtype=bool)
+    facets_out = boundary_facets(cells)
+    if boundary == "fixed":
+        is_frozen[facets_out.ravel()] = True
+        return is_frozen
+    half = 1 << (grid.bits - 1)
+    is_on_box = np.zeros(len(facets_out), dtype=bool)
+    for axis in range(3 - n, 3):
+        for side in (-half, (grid.volume.shape[axis] << grid.bits) - half):
+            is_there = ticks[:, axis] == side
+            facet_is_there = is_there[facets_out].all(axis=1)
+            is_on_box |= facet_is_there
+            is_frozen[facets_out[facet_is_there].ravel(), axis] = True
+    is_frozen[facets_out[~is_on_box].ravel()] = True
+    return is_frozen
+
+
+def _check_fills_box(image: Image, sums: NDArray[np.float64], E_G: NDArray[np.float64], mesh: Mesh) -> None:
+    """Delaunay fills the convex hull of the nodes: InputError for a mesh whose domain is not the image's box."""
+    index = image.to_index(mesh.points)
+    corners = np.array([index.min(axis=0) + 0.5, index.max(axis=0) + 0.5])
+    if sums[:, 0].sum() != image.data.size or np.abs(corners - [np.zeros(image.ndim), image.shape]).max() > 1e-6:
+        raise InputError(
+            "mesh: re-tessellation needs a mesh that fills the image's box exactly, as a lattice does; "
+            'pass retessellate="never" to keep the connectivity'
+        )
+
+
+def _state(
+    image: Image, grid: SamplingGrid, ticks: NDArray[np.int64], cells: NDArray[np.int64], is_frozen: NDArray[np.bool_]
+) -> State:
+    points = image.to_world(from_ticks(ticks, grid, image.ndim))
+    cells = np.ascontiguousarray(cells, dtype=np.int64)
+    sums = moment_sums(grid, ticks, cells)
+    return State(ticks, cells, rings(cells, len(ticks)), is_frozen, sums, cell_E_G(points, cells))
+
+
+def _energies(state: State, image: Image) -> tuple[float, float]:
+    return float(state.E_G.sum()), float(E_D_of_sums(state.sums, image.voxel_volume).sum())
+
+
+def _retessellated(image: Image, grid: SamplingGrid, state: State) -> State | None:
+    """The state with Delaunay's cells; None where they would not be a mesh of the same box.
+
+    Checked exactly: every cell oriented on the fixed-point grid, every facet in one or two cells, the boundary's
+    facets on the box, and every voxel in one cell.
+    """
+    index = from_ticks(state.ticks, grid, image.ndim)
+    cells = delaunay(index, image.affine)
+    if cells is None:
+        return None
+    hand = 1 if np.linalg.det(image.affine[:-1, :-1]) > 0 else -1
+    if (orientations(state.ticks, cells) != hand).any():
+        return None
+    shared = facets(cells)
+    if shared.n_cells.max() > 2:
+        return None
+    if not _is_on_box(state.ticks, shared.nodes[shared.n_cells == 1], grid, image.ndim):
+        return None
+    candidate = _state(image, grid, state.ticks, cells, state.is_frozen)
+    return candidate if candidate.sums[:, 0].sum() == image.data.size else None
+
+
+def _is_on_box(ticks: NDArray[np.int64], nodes: NDArray[np.int64], grid: SamplingGrid, n: int) -> bool:
+    half = 1 << (grid.bits - 1)
+    is_there = np.zeros(len(nodes), dtype=bool)
+    for axis in range(3 - n, 3):
+        for side in (-half, (grid.volume.shape[axis] << grid.bits) - half):
+            is_there |= (ticks[nodes, axis] == side).all(axis=1)
+    return bool(is_there.all())
+
+
+def _sweep(
+    state: State,
+    grid: SamplingGrid,
+    matrix: NDArray[np.float64],
+    weights: Weights,
+    k_D: float,
+    is_over: Callable[[], bool],
+) -> bool:
+    """Move every node once; False if `is_over` cut it short, between two colours."""
+    colours = node_colours(state.cells, state.rings)
+    for colour in range(colours.max() + 1):
+        if is_over():
+            return False
+        nodes = np.flatnonzero((colours == colour) & ~state.is_frozen[:, 3 - (state.cells.shape[1] - 1) :].all(axis=1))
+        if k_D == 0.0:
+            relocate(state, nodes, grid, matrix)
+        else:
+            descend(state, nodes, grid, matrix, weights)
+    return True
+
+
+def _relative_movement(
+    before: NDArray[np.int64], after: NDArray[np.int64], image: Image, grid: SamplingGrid, matrix: NDArray[np.float64]
+) -> float:
+    """|x^t - x^(t-1)| / |x^(t-1)| over all nodes, in mm, x from the box's centre; Fig. 1(c)."""
+    centre = np.array([(s - 1) * 0.5 for s in grid.volume.shape]) * 2.0**grid.bits
+    moved = (after - before) @ matrix.T
+    return float(np.linalg.norm(moved) / np.linalg.norm((before - centre) @ matrix.T))

@@ -1,0 +1,1 @@
+"""Tables and pictures of results; knows nothing of how the numbers came to be."""

@@ -1,0 +1,75 @@
+"""A run in numbers: what `run.json` holds."""
+
+from __future__ import annotations
+
+import hashlib
+import os
+import platform
+from importlib.metadata import version
+from typing import Any
+
+import numpy as np
+
+import tetopt
+from tetopt.geometry.quality import quality
+from tetopt.image import Image
+from tetopt.mesh import Mesh
+from tetopt.optimize.paper import Optimized
+
+SHOWN_VERSIONS = ("numpy", "scipy", "numba", "nibabel", "pyvista")
+
+
+def versions() -> dict[str, str]:
+    """Versions of tetopt, Python and the libraries that the numbers rest on."""
+    found = {"tetopt": tetopt.__version__, "python": platform.python_version()}
+    return found | {name: version(name) for name in SHOWN_VERSIONS}
+
+
+def mesh_hash(mesh: Mesh) -> str:
+    """SHA-256 over the bytes of points and cells: equal for meshes that are the same to the last bit."""
+    digest = hashlib.sha256(np.ascontiguousarray(mesh.points).tobytes())
+    digest.update(np.ascontiguousarray(mesh.cells).tobytes())
+    return digest.hexdigest()
+
+
+def image_summary(image: Image) -> dict[str, Any]:
+    """Shape, place and spread of an image; `total_variation` is E_D of one cell around everything."""
+    spread = float(np.var(image.data, dtype=np.float64)) * image.volume
+    return {
+        "shape": image.shape,
+        "spacing_mm": image.spacing,
+        "affine": image.affine,
+        "min": float(image.data.min()),
+        "max": float(image.data.max()),
+        "mean": float(image.data.mean(dtype=np.float64)),
+        "volume_mm": image.volume,
+        "total_variation": spread,
+    }
+
+
+def run_summary(
+    image: Image, initial: Mesh, result: Optimized, about: dict[str, Any], seconds: dict[str, float]
+) -> dict[str, Any]:
+    """Every number of a run: options and file (`about`), versions, energies by iteration, quality before and after."""
+    first, last = result.history[0], result.history[-1]
+    spread = image_summary(image)["total_variation"]
+    return {
+        **about,
+        "versions": versions(),
+        "machine": {"cores": os.cpu_count(), "system": platform.platform()},
+        "image_properties": image_summary(image),
+        "ended": result.ended,
+        "iterations_done": last.iteration,
+        "energies": {
+            "E": last.E,
+            "E_G_relative": last.E_G / first.E_G,
+            "E_D_relative": last.E_D / first.E_D if first.E_D > 0.0 else None,
+            "E_D_share_of_variance": last.E_D / spread if spread > 0.0 else None,
+            "E_D_share_of_variance_initial": first.E_D / spread if spread > 0.0 else None,
+        },
+        "quality_initial": quality(initial.points, initial.cells),
+        "quality": quality(result.mesh.points, result.mesh.cells),
+        "history": result.history,
+        "seconds": seconds,
+        "mesh_sha256": mesh_hash(result.mesh),
+    }
