@@ -114,9 +114,7 @@ def test_exact_intensities_at_points(made):
 
 def test_exact_intensities_in_3d(made):
     """A quarter turn about x, then one about y, takes the z axis to -y and leaves it there."""
-    phantom = made(
-        HEAD_3D + shape_text("box", center_mm=[0, 0, 0], size_mm=[2, 4, 8], rotation_deg=[90, 90, 0])
-    )
+    phantom = made(HEAD_3D + shape_text("box", center_mm=[0, 0, 0], size_mm=[2, 4, 8], rotation_deg=[90, 90, 0]))
     reach = np.array([2.0, 4.0, 1.0])  # half edges along the world's x, y and z
     for axis in range(3):
         inside, outside = np.zeros((2, 3))
@@ -322,9 +320,7 @@ def test_oblique_sheared_image_has_the_sphere_where_the_file_says(n, made):
     image = made(text + shape_text("ellipsoid", center_mm=place, radii_mm=5)).image()
     assert image.shape == (40, 29, 12)[:n]
     unit = axes / np.linalg.norm(axes, axis=1, keepdims=True)
-    np.testing.assert_allclose(
-        image.affine[:-1, :-1], unit.T * (20 / np.array(image.shape)), rtol=1e-14, atol=1e-15
-    )
+    np.testing.assert_allclose(image.affine[:-1, :-1], unit.T * (20 / np.array(image.shape)), rtol=1e-14, atol=1e-15)
     np.testing.assert_allclose(image.to_world((np.array(image.shape) - 1) / 2), world_center, rtol=1e-14)
     assert image.volume == pytest.approx(20**n * abs(np.linalg.det(unit)), rel=1e-13)
     weight = image.data.astype(np.float64) - 10
@@ -417,9 +413,7 @@ def test_file_options_are_the_defaults_and_arguments_win(made):
     text = HEAD_2D.replace("background", "blur_mm = 1\nnoise_sd = 2\nseed = 3\nbackground") + DISC
     phantom = made(text)
     plain = made(HEAD_2D + DISC)
-    np.testing.assert_array_equal(
-        phantom.image().data, plain.image(voxel_mm=1, blur_mm=1, noise_sd=2, seed=3).data
-    )
+    np.testing.assert_array_equal(phantom.image().data, plain.image(voxel_mm=1, blur_mm=1, noise_sd=2, seed=3).data)
     np.testing.assert_array_equal(phantom.image(blur_mm=0, noise_sd=0).data, plain.image().data)
     assert phantom.image(np.array([2, 5])).shape == (10, 4)
 

@@ -10,7 +10,7 @@ import sys
 import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
-from enum import Enum
+from enum import StrEnum
 from pathlib import Path
 from types import FrameType
 from typing import Annotated, Any
@@ -23,7 +23,17 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from rich.table import Table
 
 import tetopt
-from tetopt import Image, InputError, Mesh, lattice, load_image, load_mesh, load_phantom, save_image, save_mesh
+from tetopt import (
+    Image,
+    InputError,
+    Mesh,
+    lattice,
+    load_image,
+    load_mesh,
+    load_phantom,
+    save_image,
+    save_mesh,
+)
 from tetopt.geometry.quality import Quality, quality
 from tetopt.io.files import checked_output, save_json
 from tetopt.io.images import parse_crop, parse_slice, sha256
@@ -46,22 +56,22 @@ app = typer.Typer(
 )
 
 
-class Lattice(str, Enum):  # noqa: D101
+class Lattice(StrEnum):  # noqa: D101
     bcc = "bcc"
     five_tet = "five-tet"
     criss_cross = "criss-cross"
 
 
-class Method(str, Enum):  # noqa: D101
+class Method(StrEnum):  # noqa: D101
     paper = "paper"
 
 
-class Boundary(str, Enum):  # noqa: D101
+class Boundary(StrEnum):  # noqa: D101
     slide = "slide"
     fixed = "fixed"
 
 
-class Retessellate(str, Enum):  # noqa: D101
+class Retessellate(StrEnum):  # noqa: D101
     first = "first"
     accept = "accept"
     never = "never"
@@ -120,11 +130,13 @@ def _common(
 
 
 ImageArgument = Annotated[
-    Path, typer.Argument(metavar="IMAGE", help="NIfTI, MGZ, NRRD, MetaImage, a DICOM folder, or a 2-D picture.")
+    Path,
+    typer.Argument(metavar="IMAGE", help="NIfTI, MGZ, NRRD, MetaImage, a DICOM folder, or a 2-D picture."),
 ]
 VolumeOption = Annotated[int | None, typer.Option("--volume", metavar="K", help="Volume of a 4-D file, from 0.")]
 CropOption = Annotated[
-    str | None, typer.Option("--crop", metavar="A:B,C:D,E:F", help="Keep these voxels, half open; an end may be empty.")
+    str | None,
+    typer.Option("--crop", metavar="A:B,C:D,E:F", help="Keep these voxels, half open; an end may be empty."),
 ]
 SliceOption = Annotated[
     str | None, typer.Option("--slice", metavar="AXIS=INDEX", help="Mesh one slice in 2-D, for example k=90.")
@@ -151,7 +163,11 @@ def mesh_command(
     iterations: Annotated[int, typer.Option(metavar="I", help="Sweeps over all nodes; 0 writes the lattice.")] = 20,
     n_t: Annotated[
         int | None,
-        typer.Option("--n-t", metavar="T", help="Connect anew in the first T iterations (default half; all for k_D = 0)."),
+        typer.Option(
+            "--n-t",
+            metavar="T",
+            help="Connect anew in the first T iterations (default half; all for k_D = 0).",
+        ),
     ] = None,
     retessellate: Annotated[
         Retessellate, typer.Option(help="In the first n_t iterations; only if E falls; or never.")
@@ -230,7 +246,7 @@ def _mesh_files(
 def _set_threads(threads: int | None) -> None:
     if threads is None:
         return
-    most = numba.config.NUMBA_NUM_THREADS
+    most = int(numba.config.NUMBA_NUM_THREADS)
     if not 1 <= threads <= most:
         raise InputError(f"--threads: expected 1 to {most} on this machine, got {threads}")
     numba.set_num_threads(threads)
@@ -437,7 +453,8 @@ def phantom_command(
     noise_sd: Annotated[float | None, typer.Option(metavar="SD", help="Standard deviation of added noise.")] = None,
     seed: Annotated[int | None, typer.Option(metavar="N", help="Seed of the noise.")] = None,
     labels: Annotated[
-        Path | None, typer.Option(metavar="LABELS.nii.gz", help="Write the label of each voxel's centre, too.")
+        Path | None,
+        typer.Option(metavar="LABELS.nii.gz", help="Write the label of each voxel's centre, too."),
     ] = None,
     force: ForceOption = False,
 ) -> int:
@@ -458,7 +475,9 @@ def phantom_command(
 
 @app.command("demo")
 def demo_command(
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the results.")] = Path("demo"),
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the results.")] = Path(
+        "demo"
+    ),
     nodes: Annotated[int, typer.Option(metavar="N", help="Wanted number of nodes.")] = 5000,
     iterations: Annotated[int, typer.Option(metavar="I", help="Sweeps over all nodes.")] = 20,
     force: ForceOption = False,

@@ -61,9 +61,9 @@ class Image:
         return self.data.shape
 
     @property
-    def spacing(self) -> NDArray[np.float64]:
+    def spacing(self) -> NDArray[np.floating]:
         """Length of a voxel's edge along each axis, (n,) float64, mm."""
-        return np.linalg.norm(self.affine[:-1, :-1], axis=0)
+        return np.sqrt((self.affine[:-1, :-1] ** 2).sum(axis=0))
 
     @property
     def voxel_volume(self) -> float:

@@ -54,9 +54,7 @@ class Mesh:
             first = int(np.flatnonzero(~np.isfinite(points).all(axis=1))[0])
             raise InputError(f"mesh points: every coordinate must be finite, node {first} is {points[first].tolist()}")
         if cells.min() < 0 or cells.max() >= len(points):
-            raise InputError(
-                f"mesh cells: indices must lie in 0..{len(points) - 1}, got {cells.min()}..{cells.max()}"
-            )
+            raise InputError(f"mesh cells: indices must lie in 0..{len(points) - 1}, got {cells.min()}..{cells.max()}")
         v = volumes(points, cells)
         if (v <= 0.0).any():
             bad = np.flatnonzero(v <= 0.0)

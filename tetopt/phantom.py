@@ -33,7 +33,7 @@ Shapes
       normalised first).
 
     ``rotation_deg`` is in 2-D one angle, counter-clockwise; in 3-D three, about the fixed world axes x, then
-    y, then z. A shape contains its own surface (where rounding leaves a choice).
+    y, then z. A shape contains its own surface, up to rounding.
 """
 
 from __future__ import annotations
@@ -378,8 +378,7 @@ def load_phantom(name_or_path: str | Path) -> Phantom:
         table = tomllib.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError as error:
         raise InputError(
-            f"phantom {path}: no such file; give the path of one, or one of the names "
-            f"{', '.join(phantom_names())}"
+            f"phantom {path}: no such file; give the path of one, or one of the names {', '.join(phantom_names())}"
         ) from error
     except OSError as error:
         raise InputError(f"phantom {path}: cannot be read, {error.strerror}; give a .toml file") from error
@@ -496,9 +495,7 @@ def _index_block(start: int, stop: int, shape: tuple[int, ...]) -> NDArray[np.fl
     return np.stack(np.unravel_index(np.arange(start, stop), shape), axis=-1).astype(np.float64)
 
 
-def _voxel_centers(
-    shape: tuple[int, ...], affine: NDArray[np.float64]
-) -> Iterator[tuple[slice, NDArray[np.float64]]]:
+def _voxel_centers(shape: tuple[int, ...], affine: NDArray[np.float64]) -> Iterator[tuple[slice, NDArray[np.float64]]]:
     """Slices of the flattened grid with the world centres (M, n) of their voxels, in bounded pieces."""
     total = math.prod(shape)
     for start in range(0, total, _CHUNK):

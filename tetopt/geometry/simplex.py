@@ -129,7 +129,7 @@ def dihedral_angles(points: Points, cells: Cells) -> NDArray[np.float64]:
     if n == 2:
         pairs = [(1, 2), (2, 0), (0, 1)]  # the two edges that meet in node i lie opposite the two others
     else:
-        pairs = [tuple(k for k in range(4) if k not in edge) for edge in edge_pairs(3)]  # the facets at an edge
+        pairs = edge_pairs(3)[::-1]  # the facets at an edge lie opposite the two nodes it leaves out
     angles = np.empty((len(cells), len(pairs)))
     for column, (i, j) in enumerate(pairs):
         p, q = normals[:, i], normals[:, j]

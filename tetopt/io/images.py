@@ -176,9 +176,7 @@ def image_slice(image: Image, axis: int, index: int) -> Image:
            [0., 0., 1.]])
     """
     if image.ndim != 3:
-        raise InputError(
-            f"slice: only a 3-D image has slices, this one is {image.ndim}-D; leave the slice out"
-        )
+        raise InputError(f"slice: only a 3-D image has slices, this one is {image.ndim}-D; leave the slice out")
     if axis not in (0, 1, 2):
         raise InputError(f"slice: the axis must be 0, 1 or 2, got {axis}")
     size = image.shape[axis]
@@ -235,8 +233,7 @@ def parse_crop(text: str) -> list[tuple[int | None, int | None]]:
         match = re.fullmatch(r"\s*([0-9]*)\s*:\s*([0-9]*)\s*", part)
         if match is None:
             raise InputError(
-                'crop: expected start:stop in voxels for each axis, such as "10:100,:,5:", '
-                f'got "{_one_line(text)}"'
+                f'crop: expected start:stop in voxels for each axis, such as "10:100,:,5:", got "{_one_line(text)}"'
             )
         start, stop = (int(end) if end else None for end in match.groups())
         bounds.append((start, stop))
@@ -328,15 +325,11 @@ def _volume_index(trailing: tuple[int, ...], volume: int | None) -> tuple[int, .
     if count == 0:
         raise InputError(f"every axis needs a voxel, got trailing axes of lengths {trailing}")
     if volume is None and count > 1:
-        raise InputError(
-            f"the file holds {count} volumes; choose one with `volume=k` / `--volume K`, 0 to {count - 1}"
-        )
+        raise InputError(f"the file holds {count} volumes; choose one with `volume=k` / `--volume K`, 0 to {count - 1}")
     volume = 0 if volume is None else volume
     if not 0 <= volume < count:
         held = "one volume" if count == 1 else f"{count} volumes"
-        raise InputError(
-            f"volume {volume} asked for, but the file holds {held}; choose from 0 to {count - 1}"
-        )
+        raise InputError(f"volume {volume} asked for, but the file holds {held}; choose from 0 to {count - 1}")
     return tuple(int(i) for i in np.unravel_index(volume, trailing, order="F"))
 
 
@@ -381,9 +374,7 @@ def _check_gzip(path: Path) -> None:
                 pass
     except (OSError, EOFError, zlib.error) as error:
         if "Not a gzipped file" in str(error):
-            raise InputError(
-                "not a gzip file; if it is not compressed, drop .gz (or z) from its name"
-            ) from error
+            raise InputError("not a gzip file; if it is not compressed, drop .gz (or z) from its name") from error
         raise InputError(f"{_DAMAGED} ({_one_line(error)})") from error
 
 
@@ -435,9 +426,7 @@ def _read_dicom_folder(path: Path, volume: int | None) -> tuple[NDArray, NDArray
 def _series_files(path: Path, reader: Any) -> tuple[str, ...]:
     """The files of the one DICOM series in a folder, in the order of their positions."""
     files = sorted(file for file in path.iterdir() if file.is_file())
-    series = {
-        uid: reader.GetGDCMSeriesFileNames(str(path), uid) for uid in reader.GetGDCMSeriesIDs(str(path))
-    }
+    series = {uid: reader.GetGDCMSeriesFileNames(str(path), uid) for uid in reader.GetGDCMSeriesIDs(str(path))}
     known = {Path(file).name for names in series.values() for file in names}
     for file in files:
         # GDCM passes over a damaged file in silence, which would shorten the volume.
@@ -464,9 +453,7 @@ def _place_slices(affine: NDArray[np.float64], reader: Any, n_slices: int) -> No
     """
     position, orientation = "0020|0032", "0020|0037"
     slices = range(n_slices)
-    if n_slices < 2 or not all(
-        reader.HasMetaDataKey(i, tag) for i in slices for tag in (position, orientation)
-    ):
+    if n_slices < 2 or not all(reader.HasMetaDataKey(i, tag) for i in slices for tag in (position, orientation)):
         return
     turns = np.array([_numbers(reader.GetMetaData(i, orientation), 6) for i in slices])
     if not np.allclose(turns, turns[0], rtol=0.0, atol=1e-4):
@@ -519,9 +506,7 @@ def _itk_errors(sitk: ModuleType) -> Iterator[None]:
 
 def _check_components(count: int) -> None:
     if count > 1:
-        raise InputError(
-            f"expected one number a voxel, got {count} (RGB or vectors); convert it to grey first"
-        )
+        raise InputError(f"expected one number a voxel, got {count} (RGB or vectors); convert it to grey first")
 
 
 def _ras_affine(source: Any) -> NDArray[np.float64]:
@@ -595,9 +580,7 @@ def _checked_bounds(shape: tuple[int, ...], bounds: Bounds) -> list[tuple[int, i
         start = 0 if start is None else start
         stop = size if stop is None else stop
         if not 0 <= start < stop <= size:
-            raise InputError(
-                f"crop: along axis {axis} expected 0 <= start < stop <= {size}, got {start}:{stop}"
-            )
+            raise InputError(f"crop: along axis {axis} expected 0 <= start < stop <= {size}, got {start}:{stop}")
         ranges.append((start, stop))
     return ranges
 

@@ -55,7 +55,10 @@ def to_pyvista(mesh: Mesh, cell_data: dict[str, NDArray] | None = None) -> pyvis
 
 
 def save_mesh(
-    path: str | Path, mesh: Mesh, cell_data: dict[str, NDArray] | None = None, about: dict[str, Any] | None = None
+    path: str | Path,
+    mesh: Mesh,
+    cell_data: dict[str, NDArray] | None = None,
+    about: dict[str, Any] | None = None,
 ) -> None:
     """Write a VTU file, whole or not at all.
 
@@ -88,7 +91,7 @@ def load_mesh(path: str | Path) -> MeshFile:
         raise InputError(f"{path}: expected a mesh named .vtu or .vtk")
     grid = _read_quietly(path)
     n = _dimension(path, grid)
-    cells = grid.cells_dict[CELL_TYPES[n]].astype(np.int64)
+    cells = np.asarray(grid.cells_dict[np.uint8(CELL_TYPES[n])], dtype=np.int64)
     points = np.asarray(grid.points, dtype=np.float64)
     if n == 2 and np.any(points[:, 2] != 0.0):
         raise InputError(f"{path}: a mesh of triangles must lie in the plane z = 0; surfaces in space are not meshed")

@@ -79,15 +79,15 @@ def _free_projections(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @njit(cache=True)
-def _load(corner: NDArray, x: NDArray, ticks: NDArray, cells: NDArray, cell: int, matrix: NDArray, scale: float) -> None:
+def _load(
+    corner: NDArray, x: NDArray, ticks: NDArray, cells: NDArray, cell: int, matrix: NDArray, scale: float
+) -> None:
     """A cell's corners, in ticks and in mm."""
     for k in range(cells.shape[1]):
         for d in range(3):
             corner[k, d] = ticks[cells[cell, k], d]
         for d in range(3):
-            x[k, d] = scale * (
-                matrix[d, 0] * corner[k, 0] + matrix[d, 1] * corner[k, 1] + matrix[d, 2] * corner[k, 2]
-            )
+            x[k, d] = scale * (matrix[d, 0] * corner[k, 0] + matrix[d, 1] * corner[k, 1] + matrix[d, 2] * corner[k, 2])
 
 
 @njit(cache=True)

@@ -151,7 +151,7 @@ def optimize(
             candidate = _retessellated(image, grid, state)
             if candidate is not None:
                 E = combined(*_energies(candidate, image), E_G0, E_D0, k_D)
-                if E < limit:
+                if limit > E:
                     is_new = not np.array_equal(candidate.cells, state.cells)
                     state = candidate
         # 2. Move the nodes, one colour at a time.
@@ -236,7 +236,11 @@ def _check_fills_box(image: Image, sums: NDArray[np.float64], E_G: NDArray[np.fl
 
 
 def _state(
-    image: Image, grid: SamplingGrid, ticks: NDArray[np.int64], cells: NDArray[np.int64], is_frozen: NDArray[np.bool_]
+    image: Image,
+    grid: SamplingGrid,
+    ticks: NDArray[np.int64],
+    cells: NDArray[np.int64],
+    is_frozen: NDArray[np.bool_],
 ) -> State:
     points = image.to_world(from_ticks(ticks, grid, image.ndim))
     cells = np.ascontiguousarray(cells, dtype=np.int64)
@@ -301,7 +305,11 @@ def _sweep(
 
 
 def _relative_movement(
-    before: NDArray[np.int64], after: NDArray[np.int64], image: Image, grid: SamplingGrid, matrix: NDArray[np.float64]
+    before: NDArray[np.int64],
+    after: NDArray[np.int64],
+    image: Image,
+    grid: SamplingGrid,
+    matrix: NDArray[np.float64],
 ) -> float:
     """|x^t - x^(t-1)| / |x^(t-1)| over all nodes, in mm, x from the box's centre; Fig. 1(c)."""
     centre = np.array([(s - 1) * 0.5 for s in grid.volume.shape]) * 2.0**grid.bits

@@ -94,7 +94,7 @@ class _View:
         self.letters = [self.letters[nearest[a]] for a in self.axes]
         pixels = image.data if self.across is None else np.take(image.data, self.index, axis=self.across)
         pixels = pixels if self.axes == inside else pixels.T
-        self.pixels = np.flip(pixels, axis=[k for k in (0, 1) if self.flip[k]])
+        self.pixels = np.flip(pixels, axis=tuple(k for k in (0, 1) if self.flip[k]))
         self.size = [image.shape[a] * image.spacing[a] for a in self.axes]
         self.aspect = self.size[1] / self.size[0]
 
@@ -121,7 +121,9 @@ class _View:
         axes.set_aspect("equal")
         axes.set_xticks([])
         axes.set_yticks([])
-        for letter, place in zip("".join(self.letters), ((0.02, 0.5), (0.98, 0.5), (0.5, 0.02), (0.5, 0.98))):
+        for letter, place in zip(
+            "".join(self.letters), ((0.02, 0.5), (0.98, 0.5), (0.5, 0.02), (0.5, 0.98)), strict=False
+        ):
             axes.text(
                 *place, letter, transform=axes.transAxes, color="white", ha="center", va="center", fontsize=9,
                 bbox={"facecolor": "black", "alpha": 0.5, "linewidth": 0, "pad": 1.5},
@@ -143,7 +145,7 @@ def histogram_figure(meshes: Sequence[tuple[str, Mesh]]) -> Figure:
     """Normalised rho histograms of meshes over each other, as Fig. 1(d), with the paper's four errors."""
     figure = Figure(figsize=(7.5, 4.6), layout="constrained")
     axes = figure.subplots()
-    for colour, (title, mesh) in zip(COLOURS, meshes):
+    for colour, (title, mesh) in zip(COLOURS, meshes, strict=False):
         share, edges = rho_histogram(mesh.points, mesh.cells)
         errors = quality_errors(mesh.points, mesh.cells)
         mean = rho(mesh.points, mesh.cells).mean()
@@ -168,16 +170,25 @@ def energy_figure(history: Sequence[Record]) -> Figure:
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))
     iterations = [row.iteration for row in history]
     first = history[0]
-    curves = [("E, combined (Eq. 4)", [row.E for row in history]), ("E_G, shape", [row.E_G / first.E_G for row in history])]
+    curves = [
+        ("E, combined (Eq. 4)", [row.E for row in history]),
+        ("E_G, shape", [row.E_G / first.E_G for row in history]),
+    ]
     if first.E_D > 0.0:
         curves.append(("E_D, image", [row.E_D / first.E_D for row in history]))
-    for colour, (label, values) in zip(("black", *COLOURS[1:]), curves):
+    for colour, (label, values) in zip(("black", *COLOURS[1:]), curves, strict=False):
         top.plot(iterations, values, marker="o", markersize=3, color=colour, label=f"{label}: {values[-1]:.3f}")
     top.set_ylabel("relative to the initial mesh")
     top.set_ylim(bottom=0.0)
     top.legend(fontsize=9, frameon=False)
     if len(history) > 1:
-        bottom.semilogy(iterations[1:], [max(row.movement, 1e-16) for row in history[1:]], color="black", marker="o", markersize=3)
+        bottom.semilogy(
+            iterations[1:],
+            [max(row.movement, 1e-16) for row in history[1:]],
+            color="black",
+            marker="o",
+            markersize=3,
+        )
     bottom.set_ylabel("relative movement")
     bottom.set_xlabel("iteration (shaded: connected anew)")
     bottom.xaxis.get_major_locator().set_params(integer=True)

@@ -1,0 +1,51 @@
+# `make demo` and `make test` are all that a new machine with Python >= 3.11 needs.
+PYTHON ?= python3
+VENV := .venv
+BIN := $(VENV)/bin
+# numba does not see edits in imported files: the tests' cache of compiled kernels is keyed by all sources.
+NUMBA_CACHE = $(CURDIR)/.numba_cache/$(shell cat tetopt/*.py tetopt/*/*.py | cksum | cut -d' ' -f1)
+TESTED = NUMBA_CACHE_DIR=$(NUMBA_CACHE) MPLBACKEND=agg $(BIN)/python -m pytest
+
+.PHONY: demo test test-slow test-nojit test-onethread lint bench clean
+
+demo: $(VENV)/.demo
+	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt demo -o demo --force
+
+test: $(VENV)/.test
+	$(TESTED) -m "not slow"
+	$(MAKE) --no-print-directory test-onethread test-nojit
+
+# The small cases again on one thread, and with the kernels run as plain Python.
+test-onethread: $(VENV)/.test
+	NUMBA_NUM_THREADS=1 $(TESTED) -q -m kernel --durations=0 --no-header
+
+test-nojit: $(VENV)/.test
+	NUMBA_DISABLE_JIT=1 $(TESTED) -q -m kernel --durations=0 --no-header
+
+test-slow: $(VENV)/.test
+	$(TESTED) -m slow
+
+lint: $(VENV)/.test
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/mypy
+	$(BIN)/lint-imports
+
+bench: $(VENV)/.test
+	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python scripts/benchmark.py -o bench.json --force
+
+$(VENV)/bin/python:
+	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
+	  { echo "tetopt needs Python >= 3.11; name one with: make PYTHON=python3.12"; exit 2; }
+	$(PYTHON) -m venv $(VENV)
+
+$(VENV)/.demo: $(VENV)/bin/python pyproject.toml
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[demo]"
+	@touch $@
+
+$(VENV)/.test: $(VENV)/bin/python pyproject.toml
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check -e ".[test]"
+	@touch $@
+
+clean:
+	rm -rf $(VENV) .numba_cache demo bench.json
