@@ -17,7 +17,7 @@ Triangles go through the same code as prisms one voxel thick: a leading axis wit
 from __future__ import annotations
 
 from math import ceil, log2
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit, prange
@@ -251,7 +251,7 @@ def _is_past(normal: NDArray, face: int, corner: NDArray, a: int, bits: int, i: 
 def _exact_threshold(
     cut: float, error: float, normal: NDArray, face: int, corner: NDArray, a: int, bits: int, i: int, j: int,
     low: int, high: int,
-) -> int:  # fmt: skip
+) -> Any:  # fmt: skip
     """The first voxel in [low, high] of row (i, j) on or above the face; `cut` is where it is, give or take `error`."""
     if error < 0.25:
         if cut < low - 0.5:
@@ -328,7 +328,7 @@ def _prepare_cell(
 
 
 @njit(cache=True)
-def _row_range(corner: NDArray, n_corners: int, bits: int, i: int, low: int, high: int) -> tuple[int, int]:
+def _row_range(corner: NDArray, n_corners: int, bits: int, i: int, low: int, high: int) -> tuple:
     """Rows [low, high) that the cell can meet in the slice i, narrowed from its box by its edges; never too few.
 
     Half of the rows of a tetrahedron's box miss it; leaving them out took a sixth off a sweep of the descent.
@@ -360,7 +360,7 @@ def _float_run(
     high: float,
     i: int,
     j: int,
-) -> tuple[int, int]:
+) -> tuple:
     """The run [first, last) of row (i, j) as floats settle it; last < first where they cannot.
 
     Kept to one array and scalars so that it is inlined: with all the scratch passed, a call cost 40 ns a row,
@@ -390,7 +390,7 @@ def _float_run(
 def _exact_run(
     corner: NDArray, n_corners: int, bits: int, normal: NDArray, plane: NDArray, box: NDArray, order: NDArray,
     error: float, i: int, j: int,
-) -> tuple[int, int]:  # fmt: skip
+) -> tuple:  # fmt: skip
     """The run [low, high) of voxels of row (i, j) whose centres lie in the prepared cell, settled in integers."""
     low, high = box[2, 0], box[2, 1]
     for row in range(n_corners):
