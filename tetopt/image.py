@@ -61,7 +61,7 @@ class Image:
         return self.data.shape
 
     @property
-    def spacing(self) -> NDArray[np.floating]:
+    def spacing(self) -> NDArray[np.float64]:
         """Length of a voxel's edge along each axis, (n,) float64, mm."""
         return np.sqrt((self.affine[:-1, :-1] ** 2).sum(axis=0))
 
