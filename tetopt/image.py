@@ -77,12 +77,24 @@ class Image:
 
     def to_world(self, index: ArrayLike) -> NDArray[np.float64]:
         """World coordinates, (..., n) mm, of index coordinates (..., n)."""
-        return np.asarray(index, dtype=np.float64) @ self.affine[:-1, :-1].T + self.affine[:-1, -1]
+        return transformed(np.asarray(index, dtype=np.float64), self.affine[:-1, :-1]) + self.affine[:-1, -1]
 
     def to_index(self, points: ArrayLike) -> NDArray[np.float64]:
         """Index coordinates (..., n) of world points (..., n) in mm; the inverse of `to_world`."""
         shifted = np.asarray(points, dtype=np.float64) - self.affine[:-1, -1]
-        return np.linalg.solve(self.affine[:-1, :-1], shifted[..., None])[..., 0]
+        return transformed(shifted, np.asarray(np.linalg.inv(self.affine[:-1, :-1]), dtype=np.float64))
+
+
+def transformed(vectors: NDArray[np.float64], matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """`matrix` (n, n) times each of the vectors (..., n), term by term in the order of the columns.
+
+    Not by BLAS, whose rounding depends on the number of threads it finds: a mesh must come out the same to the
+    last bit on every machine.
+    """
+    product = vectors[..., :1] * matrix[:, 0]
+    for column in range(1, matrix.shape[1]):
+        product = product + vectors[..., column : column + 1] * matrix[:, column]
+    return product
 
 
 def _checked_data(data: ArrayLike) -> NDArray[np.floating]:

@@ -17,6 +17,7 @@ from tetopt.energy.geometric import volume_and_E_G
 from tetopt.energy.sampling import SamplingGrid, cell_orientation, sum_cell
 from tetopt.geometry.topology import Rings
 
+FLAT = 1e-7  # a cell's volume over (sum of squared edges)^(n/2); below, it counts as inverted: an angle of 1e-3 degrees
 HALVINGS = 4  # of a Lloyd step that inverts a cell or raises the ring's energy
 
 
@@ -99,6 +100,13 @@ def _image_energy(sums: NDArray) -> float:
 
 
 @njit(cache=True)
+def _is_flat(volume: float, E_G: float, n_corners: int) -> bool:
+    """Whether a cell is thinner than `FLAT` allows; E_G is volume times sum of squared edges over (n+1)(n+2)."""
+    edges = E_G * (n_corners * (n_corners + 1)) / max(volume, 1e-300)
+    return volume <= FLAT * edges ** (0.5 * (n_corners - 1))
+
+
+@njit(cache=True)
 def _ring_energy(
     limit: float,
     trial: NDArray,
@@ -123,7 +131,7 @@ def _ring_energy(
 ) -> float:
     """Energy of a node's ring as `ticks` stand; its cells' sums and E_G go to the rows of `trial` (R, 4).
 
-    Infinite if a cell is not oriented as `hand` says; abandoned, and infinite, once it is above `limit`.
+    Infinite if a cell is not oriented as `hand` says, or flat; abandoned, and infinite, once it is above `limit`.
     """
     n_corners = cells.shape[1]
     scale = 2.0**-bits
@@ -133,7 +141,9 @@ def _ring_energy(
         _load(corner, x, ticks, cells, ring[r], matrix, scale)
         if cell_orientation(corner, normal, n_corners) != hand:
             return np.inf
-        trial[r - first, 3] = volume_and_E_G(x, n_corners)[1]
+        cell_volume, trial[r - first, 3] = volume_and_E_G(x, n_corners)
+        if _is_flat(cell_volume, trial[r - first, 3], n_corners):
+            return np.inf
         energy += geometry * trial[r - first, 3]
     for r in range(first, start[node + 1]):
         if energy > limit:
@@ -325,7 +335,10 @@ def _relocate(
                 if cell_orientation(corner, normal, n_corners) != hand:
                     moved_energy = np.inf
                     break
-                trial[r - first] = volume_and_E_G(x, n_corners)[1]
+                cell_volume, trial[r - first] = volume_and_E_G(x, n_corners)
+                if _is_flat(cell_volume, trial[r - first], n_corners):
+                    moved_energy = np.inf
+                    break
                 moved_energy += trial[r - first]
             if moved_energy < energy:
                 is_moved = True

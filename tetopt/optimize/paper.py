@@ -21,10 +21,11 @@ from tetopt.energy.sampling import (
     to_ticks,
 )
 from tetopt.errors import InputError
+from tetopt.geometry.simplex import squared_edges, volumes
 from tetopt.geometry.topology import boundary_facets, facets, node_colours, rings
-from tetopt.image import Image
+from tetopt.image import Image, transformed
 from tetopt.mesh import Mesh
-from tetopt.optimize.descent import State, Weights, descend, relocate
+from tetopt.optimize.descent import FLAT, State, Weights, descend, relocate
 from tetopt.optimize.retessellate import delaunay
 
 Retessellate = Literal["first", "accept", "never"]
@@ -85,7 +86,8 @@ def optimize(
     n_t : int, optional
         Re-tessellation happens in the first n_t iterations only. Default: all for k_D = 0, else half.
     retessellate : {"first", "accept", "never"}
-        Take every Delaunay tessellation; only one that lowers E (Section 4); or none.
+        Take every Delaunay tessellation of the first n_t iterations; in all iterations those that lower E
+        (Section 4); or none.
     boundary : {"slide", "fixed"}
         Boundary nodes move within the box's faces and edges, or not at all. Those not on the box are fixed.
     step_ratio : float
@@ -124,7 +126,7 @@ def optimize(
     matrix[3 - image.ndim :, 3 - image.ndim :] = image.affine[:-1, :-1]
     state = _state(image, grid, ticks, mesh.cells, is_frozen)
     if retessellate != "never" and iterations > 0 and n_t > 0:
-        _check_fills_box(image, state.sums, state.E_G, mesh)
+        _check_fills_box(image, mesh)
     E_G0, E_D0 = _energies(state, image)
     weights = Weights((1.0 - k_D) / E_G0, k_D * image.voxel_volume / E_D0 if E_D0 > 0.0 else 0.0, step_ratio)
 
@@ -224,11 +226,12 @@ def frozen_axes(
     return is_frozen
 
 
-def _check_fills_box(image: Image, sums: NDArray[np.float64], E_G: NDArray[np.float64], mesh: Mesh) -> None:
+def _check_fills_box(image: Image, mesh: Mesh) -> None:
     """Delaunay fills the convex hull of the nodes: InputError for a mesh whose domain is not the image's box."""
     index = image.to_index(mesh.points)
     corners = np.array([index.min(axis=0) + 0.5, index.max(axis=0) + 0.5])
-    if sums[:, 0].sum() != image.data.size or np.abs(corners - [np.zeros(image.ndim), image.shape]).max() > 1e-6:
+    is_box = np.abs(corners - [np.zeros(image.ndim), image.shape]).max() < 1e-6
+    if not is_box or abs(volumes(mesh.points, mesh.cells).sum() / image.volume - 1.0) > 1e-9:
         raise InputError(
             "mesh: re-tessellation needs a mesh that fills the image's box exactly, as a lattice does; "
             'pass retessellate="never" to keep the connectivity'
@@ -263,7 +266,7 @@ def _retessellated(image: Image, grid: SamplingGrid, state: State) -> State | No
     if cells is None:
         return None
     hand = 1 if np.linalg.det(image.affine[:-1, :-1]) > 0 else -1
-    if (orientations(state.ticks, cells) != hand).any():
+    if (orientations(state.ticks, cells) != hand).any() or is_flat(image.to_world(index), cells).any():
         return None
     shared = facets(cells)
     if shared.n_cells.max() > 2:
@@ -272,6 +275,12 @@ def _retessellated(image: Image, grid: SamplingGrid, state: State) -> State | No
         return None
     candidate = _state(image, grid, state.ticks, cells, state.is_frozen)
     return candidate if candidate.sums[:, 0].sum() == image.data.size else None
+
+
+def is_flat(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Cells so thin that no optimisation may make them, (M,) bool; see `FLAT`."""
+    size = squared_edges(points, cells).sum(axis=1) ** (points.shape[1] / 2)
+    return volumes(points, cells) <= FLAT * size
 
 
 def _is_on_box(ticks: NDArray[np.int64], nodes: NDArray[np.int64], grid: SamplingGrid, n: int) -> bool:
@@ -313,5 +322,6 @@ def _relative_movement(
 ) -> float:
     """|x^t - x^(t-1)| / |x^(t-1)| over all nodes, in mm, x from the box's centre; Fig. 1(c)."""
     centre = np.array([(s - 1) * 0.5 for s in grid.volume.shape]) * 2.0**grid.bits
-    moved = (after - before) @ matrix.T
-    return float(np.linalg.norm(moved) / np.linalg.norm((before - centre) @ matrix.T))
+    moved = transformed((after - before).astype(np.float64), matrix)
+    place = transformed(before - centre, matrix)
+    return float(np.sqrt((moved**2).sum() / (place**2).sum()))

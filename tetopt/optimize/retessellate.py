@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 
 from tetopt.geometry.simplex import oriented
+from tetopt.image import transformed
 
 TIE_BREAK = 1e-7  # of the squared typical edge
 
@@ -35,7 +36,7 @@ def delaunay(index: NDArray[np.float64], affine: NDArray[np.float64]) -> NDArray
     """
     n = index.shape[1]
     centred = index - 0.5 * (index.min(axis=0) + index.max(axis=0))
-    world = centred @ affine[:-1, :-1].T
+    world = transformed(centred, affine[:-1, :-1])
     extent = float(np.abs(world).max())
     typical_edge = extent / len(index) ** (1.0 / n)
     weights = np.random.default_rng(len(index)).random(len(index)) * TIE_BREAK * typical_edge**2
