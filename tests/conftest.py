@@ -4,6 +4,12 @@ import os
 from pathlib import Path
 
 import pytest
+from hypothesis import settings
+from naive import IS_COMPILED
+
+# The same examples in every run; few where the kernels run as plain Python.
+settings.register_profile("tetopt", deadline=None, derandomize=True, max_examples=30 if IS_COMPILED else 4)
+settings.load_profile("tetopt")
 
 
 @pytest.fixture(scope="session")

@@ -484,7 +484,7 @@ def demo_command(
 ) -> int:
     """Mesh the MNI152 T1 that nilearn's wheel carries; leave mesh, numbers and pictures in a folder."""
     begin = time.perf_counter()
-    source = _nilearn_t1()
+    source = nilearn_t1()
     output.mkdir(parents=True, exist_ok=True)
     mesh_path = checked_output(output / "mesh.vtu", (".vtu",), force)
     json_path = checked_output(output / "run.json", (".json",), force)
@@ -501,7 +501,7 @@ def demo_command(
     return code
 
 
-def _nilearn_t1() -> Path:
+def nilearn_t1() -> Path:
     found = importlib.util.find_spec("nilearn")
     name = "datasets/data/mni_icbm152_t1_tal_nlin_sym_09a_converted.nii.gz"
     path = Path(found.origin).parent / name if found is not None and found.origin else Path(name)

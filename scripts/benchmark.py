@@ -1,0 +1,177 @@
+"""How fast tetopt is on this machine, beside the library call it replaces; a table and a JSON file.
+
+    python scripts/benchmark.py -o bench.json [IMAGE]
+
+IMAGE is the MNI152 T1 that nilearn carries unless another is named. Compare ratios within one run: absolute times
+depend on the machine and on what else it does.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import resource
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numba
+import numpy as np
+from scipy.spatial import Delaunay
+
+import tetopt
+from tetopt.cli import nilearn_t1
+from tetopt.energy.sampling import from_ticks, moment_sums, sampling_grid, to_ticks
+from tetopt.geometry.simplex import oriented, rho, volumes
+from tetopt.io.files import checked_output, save_json
+from tetopt.optimize.retessellate import delaunay
+from tetopt.report.summary import versions
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Measure, print, write."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("image", type=Path, nargs="?", help="volume to measure on")
+    parser.add_argument("-o", "--output", type=Path, required=True, help="JSON file")
+    parser.add_argument("--quick", action="store_true", help="small meshes, to try the script itself")
+    parser.add_argument("--force", action="store_true", help="replace an existing file")
+    options = parser.parse_args(argv)
+    try:
+        output = checked_output(options.output, (".json",), options.force)
+        path = nilearn_t1() if options.image is None else options.image
+        image = tetopt.load_image(path)
+    except tetopt.InputError as error:
+        print(f"benchmark: {error}", file=sys.stderr)
+        return 2
+    sizes = (300, 600) if options.quick else (5_000, 20_000)
+    rows: dict[str, Any] = {
+        "image": path.name,
+        "cores": os.cpu_count(),
+        "threads": numba.get_num_threads(),
+        "versions": versions(),
+    }
+    rows["compile_seconds"], rows["load_seconds"] = compile_seconds()
+    rows |= sampling(image, 2_000 if options.quick else 37_000)
+    rows["paper"] = [paper(image, nodes, iterations=2 if options.quick else 6) for nodes in sizes]
+    rows["bar"] = bar(image, 300 if options.quick else 5_000)
+    rows["peak_memory_gb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
+    save_json(output, rows)
+    show(rows)
+    print(f"\nall numbers in {output}")
+    return 0
+
+
+def best_seconds(task: Callable[[], Any], repeats: int = 5) -> float:
+    """Shortest wall time of several runs, after one that is not counted."""
+    task()
+    times = []
+    for _ in range(repeats):
+        begin = time.perf_counter()
+        task()
+        times.append(time.perf_counter() - begin)
+    return min(times)
+
+
+def compile_seconds() -> tuple[float, float]:
+    """Seconds of the first optimisation of a tiny image in a new process, without and with a cache of kernels."""
+    program = (
+        "import time, numpy as np, tetopt\n"
+        "image = tetopt.Image(np.arange(8.0).reshape(2, 2, 2))\n"
+        "mesh = tetopt.lattice(image, blocks=(1, 1, 1))\n"
+        "begin = time.perf_counter()\n"
+        "tetopt.optimize(image, mesh, k_D=0.2, iterations=1)\n"
+        "tetopt.optimize(image, mesh, k_D=0.0, iterations=1)\n"
+        "print(time.perf_counter() - begin)\n"
+    )
+    with tempfile.TemporaryDirectory() as cache:
+        environment = os.environ | {"NUMBA_CACHE_DIR": cache}
+        times = [
+            float(subprocess.run([sys.executable, "-c", program], env=environment, check=True, capture_output=True).stdout)
+            for _ in range(2)
+        ]
+    return times[0], times[1]
+
+
+def sampling(image: tetopt.Image, nodes: int) -> dict[str, Any]:
+    """Voxels per second of the sampler and of scipy's find_simplex, on the same tessellation and volume."""
+    lattice = tetopt.lattice(image, nodes=nodes)
+    index = image.to_index(lattice.points)
+    inside = (index > -0.5 + 1e-9) & (index < np.array(image.shape) - 0.5 - 1e-9)
+    shaken = image.to_world(index + inside * np.random.default_rng(0).normal(0.0, 0.3, index.shape))
+    tessellation = Delaunay(shaken)
+    cells = oriented(shaken, tessellation.simplices)
+    cells = cells[volumes(shaken, cells) > 1e-9]
+    grid = sampling_grid(image, shaken)
+    ticks = to_ticks(image.to_index(shaken), grid)
+    ours = best_seconds(lambda: moment_sums(grid, ticks, cells))
+
+    centres = image.to_world(np.stack(np.meshgrid(*map(np.arange, image.shape), indexing="ij"), -1).reshape(-1, 3))
+    begin = time.perf_counter()
+    tessellation.find_simplex(centres)
+    theirs = time.perf_counter() - begin
+    total = best_seconds(lambda: (image.data.sum(), (image.data * image.data).sum()))
+    return {
+        "sampling_cells": len(cells),
+        "sampling_voxels_per_second": image.data.size / ours,
+        "find_simplex_voxels_per_second": image.data.size / theirs,
+        "sampling_over_find_simplex": theirs / ours,
+        "sampling_over_numpy_sums": ours / total,
+    }
+
+
+def paper(image: tetopt.Image, nodes: int, iterations: int) -> dict[str, Any]:
+    """Seconds per iteration of the paper's scheme, and how much of one Delaunay takes."""
+    mesh = tetopt.lattice(image, nodes=nodes)
+    fixed = tetopt.optimize(image, mesh, k_D=0.2, iterations=iterations, retessellate="never")
+    per_iteration = (fixed.history[-1].seconds - fixed.history[0].seconds) / iterations
+    grid = sampling_grid(image, fixed.mesh.points)
+    index = from_ticks(to_ticks(image.to_index(fixed.mesh.points), grid), grid, image.ndim)
+    connect = best_seconds(lambda: delaunay(index, image.affine), repeats=2)
+    return {
+        "nodes": len(mesh.points),
+        "cells": len(mesh.cells),
+        "seconds_per_iteration": per_iteration + connect,
+        "delaunay_share": connect / (per_iteration + connect),
+    }
+
+
+def bar(image: tetopt.Image, nodes: int) -> dict[str, Any]:
+    """What 20 iterations at k_D = 0.2 reach."""
+    mesh = tetopt.lattice(image, nodes=nodes)
+    result = tetopt.optimize(image, mesh, k_D=0.2, iterations=20)
+    last = result.history[-1]
+    return {
+        "nodes": len(mesh.points),
+        "seconds": last.seconds,
+        "E_D_of_initial": last.E_D / result.history[0].E_D,
+        "mean_rho": float(rho(result.mesh.points, result.mesh.cells).mean()),
+    }
+
+
+def show(rows: dict[str, Any]) -> None:
+    """Print the table."""
+    print(f"{rows['image']}, {rows['cores']} cores, {rows['threads']} threads")
+    print(f"  first call (compiling)            {rows['compile_seconds']:10.1f} s")
+    print(f"  first call (cached kernels)       {rows['load_seconds']:10.1f} s")
+    print(f"  sampling, {rows['sampling_cells']:7d} tets          {rows['sampling_voxels_per_second'] / 1e6:10.1f} Mvoxel/s")
+    print(f"  scipy find_simplex, the same      {rows['find_simplex_voxels_per_second'] / 1e6:10.2f} Mvoxel/s")
+    print(f"  ratio                             {rows['sampling_over_find_simplex']:10.0f}")
+    for row in rows["paper"]:
+        print(
+            f"  --method paper, {row['nodes']:6d} nodes      {row['seconds_per_iteration']:10.2f} s an iteration, "
+            f"Delaunay {100 * row['delaunay_share']:.0f} % of it"
+        )
+    result = rows["bar"]
+    print(
+        f"  {result['nodes']} nodes, k_D = 0.2, 20 iterations: E_D {result['E_D_of_initial']:.3f} of initial, "
+        f"mean rho {result['mean_rho']:.4f}, {result['seconds']:.1f} s"
+    )
+    print(f"  peak memory                       {rows['peak_memory_gb']:10.2f} GB")
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,342 @@
+"""Volumes, radius ratios, circumcentres, angles and areas: closed forms first, then laws."""
+
+from itertools import permutations
+from math import acos, degrees, factorial, sqrt
+
+import naive
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from meshes import (
+    ALL_SMALL,
+    BAD_TETS,
+    CUBE_CORNER,
+    EQUILATERAL,
+    FIVE_TET_CUBE,
+    OBTUSE_TET,
+    OBTUSE_TRIANGLE,
+    REGULAR_TET,
+    RIGHT_TRIANGLE,
+    SINGLE,
+    TWO_TETS,
+    needle,
+    random_rotation,
+    single,
+    sliver,
+)
+
+from tetopt.geometry.simplex import (
+    centroids,
+    circumcentres,
+    dihedral_angles,
+    edge_pairs,
+    facet_areas,
+    facet_nodes,
+    oriented,
+    rho,
+    squared_edges,
+    volume_gradients,
+    volumes,
+)
+
+seeds = st.integers(0, 2**32 - 1)
+dimensions = st.sampled_from([2, 3])
+
+
+def random_cells(seed, n, count=20):
+    """`count` generic simplices, positively oriented, each on its own nodes."""
+    points = np.random.default_rng(seed).normal(size=(count * (n + 1), n))
+    return points, oriented(points, np.arange(len(points)).reshape(count, n + 1))
+
+
+# Volumes
+
+
+@pytest.mark.parametrize(
+    ("mesh", "volume"),
+    [
+        (EQUILATERAL, sqrt(3) / 4),
+        (RIGHT_TRIANGLE, 6),
+        (OBTUSE_TRIANGLE, sqrt(3) / 4),
+        (REGULAR_TET, 8 / 3),
+        (CUBE_CORNER, 1 / 6),
+        (OBTUSE_TET, 1 / 6),
+    ],
+)
+def test_volumes_of_single_cells(mesh, volume):
+    assert volumes(*mesh) == pytest.approx(volume, rel=1e-15)
+
+
+def test_volumes_of_the_five_cells_of_a_cube():
+    assert volumes(*FIVE_TET_CUBE) == pytest.approx(np.array([2, 1, 1, 1, 1]) / 6, rel=1e-15)
+
+
+@given(seeds, dimensions)
+def test_volumes_are_those_of_exact_arithmetic(seed, n):
+    points, cells = random_cells(seed, n)
+    exact = [float(naive.signed_volume([naive.exactly(points)[a] for a in cell])) for cell in cells]
+    np.testing.assert_allclose(volumes(points, cells), exact, rtol=1e-12, atol=1e-15)
+
+
+def test_volume_is_exactly_zero_with_a_node_twice():
+    points = np.random.default_rng(1).normal(size=(4, 3))
+    assert volumes(points, np.array([[0, 1, 2, 2], [0, 0, 1, 2], [3, 1, 3, 2]])).tolist() == [0, 0, 0]
+    assert volumes(points[:, :2], np.array([[0, 1, 1], [0, 0, 1], [2, 1, 2]])).tolist() == [0, 0, 0]
+
+
+@pytest.mark.parametrize("mesh", [*SINGLE[2], *SINGLE[3]])
+def test_volume_sign_is_the_parity_of_the_nodes_order(mesh):
+    points, cells = mesh
+    n = points.shape[1]
+    for order in permutations(range(n + 1)):
+        parity = round(np.linalg.det(np.eye(n + 1)[list(order)]))
+        assert volumes(points, cells[:, order]) == pytest.approx(parity * volumes(points, cells), rel=1e-14)
+
+
+@given(seeds, dimensions)
+def test_oriented_swaps_the_last_two_nodes_of_negative_cells_only(seed, n):
+    rng = np.random.default_rng(seed)
+    points = rng.normal(size=(30, n))
+    cells = np.array([rng.permutation(30)[: n + 1] for _ in range(20)])
+    given_cells = cells.copy()
+    turned = oriented(points, cells)
+    is_negative = volumes(points, cells) < 0
+    assert (volumes(points, turned) > 0).all()
+    np.testing.assert_array_equal(turned[~is_negative], cells[~is_negative])
+    np.testing.assert_array_equal(turned[is_negative, :-2], cells[is_negative, :-2])
+    np.testing.assert_array_equal(turned[is_negative, -2:], cells[is_negative][:, [-1, -2]])
+    np.testing.assert_array_equal(cells, given_cells)
+    assert turned.dtype == np.int64
+
+
+# Edges, facets, centroids
+
+
+def test_squared_edges_follow_edge_pairs():
+    assert edge_pairs(2) == [(0, 1), (0, 2), (1, 2)]
+    assert edge_pairs(3) == [(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]
+    assert squared_edges(*RIGHT_TRIANGLE).tolist() == [[9, 16, 25]]
+    assert squared_edges(*OBTUSE_TET).tolist() == [[1, 1, 3, 2, 6, 6]]
+    assert squared_edges(*REGULAR_TET).tolist() == [[8] * 6]
+
+
+def test_facet_areas_are_by_opposite_node():
+    assert facet_nodes(2) == [(1, 2), (0, 2), (0, 1)]
+    assert facet_nodes(3) == [(1, 2, 3), (0, 2, 3), (0, 1, 3), (0, 1, 2)]
+    assert facet_areas(*RIGHT_TRIANGLE).tolist() == [[5, 4, 3]]
+    assert facet_areas(*REGULAR_TET)[0] == pytest.approx([2 * sqrt(3)] * 4, rel=1e-15)
+    assert facet_areas(*CUBE_CORNER)[0] == pytest.approx([sqrt(3) / 2, 0.5, 0.5, 0.5], rel=1e-15)
+    assert facet_areas(*OBTUSE_TET)[0] == pytest.approx([sqrt(11) / 2, sqrt(0.5), sqrt(0.5), 0.5], rel=1e-15)
+
+
+def test_centroids():
+    assert centroids(*RIGHT_TRIANGLE)[0] == pytest.approx([1, 4 / 3])
+    assert centroids(*TWO_TETS) == pytest.approx(np.array([[0.3125, 0.3125, 0.25], [0.3125, 0.3125, -0.25]]))
+
+
+# Volume gradients
+
+
+@given(seeds, dimensions)
+def test_volume_gradients_are_central_differences(seed, n):
+    """Volume is linear in each coordinate of one node, so any step gives the exact derivative."""
+    points, cells = random_cells(seed, n, count=3)
+    gradients = volume_gradients(points, cells)
+    for cell in range(len(cells)):
+        for node in range(n + 1):
+            for axis in range(n):
+                step = np.zeros_like(points)
+                step[cells[cell, node], axis] = 0.5
+                difference = volumes(points + step, cells)[cell] - volumes(points - step, cells)[cell]
+                assert gradients[cell, node, axis] == pytest.approx(difference, abs=1e-13)
+
+
+@given(seeds, dimensions)
+def test_volume_gradients_of_a_cell_sum_to_zero_and_give_n_volumes(seed, n):
+    """Translation changes no volume; and Euler: sum_i x_i . dv/dx_i = n v."""
+    points, cells = random_cells(seed, n)
+    gradients = volume_gradients(points, cells)
+    np.testing.assert_allclose(gradients.sum(axis=1), 0, atol=1e-13)
+    euler = (gradients * points[cells]).sum(axis=(1, 2))
+    np.testing.assert_allclose(euler, n * volumes(points, cells), rtol=1e-11, atol=1e-13)
+    np.testing.assert_allclose(np.linalg.norm(gradients, axis=2) * n, facet_areas(points, cells), rtol=1e-13)
+
+
+# Circumcentres
+
+
+@pytest.mark.parametrize(
+    ("mesh", "centre"),
+    [
+        (EQUILATERAL, [0.5, sqrt(1 / 12)]),
+        (RIGHT_TRIANGLE, [1.5, 2]),
+        (OBTUSE_TRIANGLE, [0.5, sqrt(0.75)]),
+        (REGULAR_TET, [0, 0, 0]),
+        (CUBE_CORNER, [0.5, 0.5, 0.5]),
+        (OBTUSE_TET, [0.5, 0.5, 2.5]),
+    ],
+)
+def test_circumcentres_of_single_cells(mesh, centre):
+    assert circumcentres(*mesh)[0] == pytest.approx(centre, abs=1e-15)
+
+
+@given(seeds, dimensions)
+def test_circumcentres_are_as_far_from_every_node(seed, n):
+    points, cells = random_cells(seed, n)
+    distances = np.linalg.norm(points[cells] - circumcentres(points, cells)[:, None], axis=2)
+    np.testing.assert_allclose(distances, np.broadcast_to(distances[:, :1], distances.shape), rtol=1e-8)
+
+
+def test_circumcentre_of_a_flat_cell_is_refused():
+    with pytest.raises(np.linalg.LinAlgError):
+        circumcentres(np.array([[0.0, 0], [1, 0], [2, 0]]), np.array([[0, 1, 2]]))
+
+
+# rho
+
+
+@pytest.mark.parametrize(
+    ("mesh", "value"),
+    [
+        (EQUILATERAL, 1 / 2),
+        (RIGHT_TRIANGLE, 1 / 2.5),
+        (OBTUSE_TRIANGLE, sqrt(3) / 2 / (2 + sqrt(3))),  # r = 2 area / perimeter, R = 1
+        (REGULAR_TET, 1 / 3),
+        (CUBE_CORNER, 2 / (3 + 3 * sqrt(3))),  # r = 1/(3 + sqrt 3), R = sqrt(3)/2
+        (OBTUSE_TET, 2 / sqrt(27) / (1 + 2 * sqrt(2) + sqrt(11))),  # R = sqrt(27)/2
+    ],
+)
+def test_rho_of_single_cells(mesh, value):
+    assert rho(*mesh)[0] == pytest.approx(value, rel=2e-15)
+
+
+@given(seeds, dimensions)
+def test_rho_is_inradius_over_circumradius(seed, n):
+    points, cells = random_cells(seed, n)
+    inradius = n * volumes(points, cells) / facet_areas(points, cells).sum(axis=1)
+    circumradius = np.linalg.norm(points[cells[:, 0]] - circumcentres(points, cells), axis=1)
+    np.testing.assert_allclose(rho(points, cells), inradius / circumradius, rtol=1e-7)
+    assert (rho(points, cells) <= 1 / n + 1e-15).all()
+    np.testing.assert_allclose(rho(points, cells[:, ::-1]), rho(points, cells), rtol=1e-12)
+
+
+@pytest.mark.parametrize("kind", BAD_TETS)
+def test_rho_of_nearly_flat_cells_goes_to_zero_without_a_warning(kind):
+    with np.errstate(all="raise"):
+        values = [rho(*single(BAD_TETS[kind](t)))[0] for t in (1e-1, 1e-2, 1e-4, 1e-8, 1e-12)]
+        flat = rho(BAD_TETS[kind](0.0), np.array([[0, 1, 2, 3]]))
+    assert (np.diff(values) < 0).all()
+    assert 0 <= values[-1] < 1e-11
+    assert flat.tolist() == [0]
+
+
+def test_rho_of_flat_cells_is_zero():
+    on_a_line = np.array([[0.0, 0, 0], [1, 1, 1], [2, 2, 2], [3, 3, 3]])
+    with np.errstate(all="raise"):
+        assert rho(on_a_line, np.array([[0, 1, 2, 3], [0, 0, 0, 0]])).tolist() == [0, 0]
+        assert rho(on_a_line[:, :2], np.array([[0, 1, 2], [1, 1, 1]])).tolist() == [0, 0]
+
+
+# Angles
+
+
+@pytest.mark.parametrize(
+    ("mesh", "angles"),
+    [
+        (EQUILATERAL, [60, 60, 60]),
+        (RIGHT_TRIANGLE, [90, degrees(acos(3 / 5)), degrees(acos(4 / 5))]),
+        (OBTUSE_TRIANGLE, [120, 30, 30]),
+        (REGULAR_TET, [degrees(acos(1 / 3))] * 6),
+        (CUBE_CORNER, [90] * 3 + [degrees(acos(1 / sqrt(3)))] * 3),
+        # facet normals (0, 0, -1), (0, -1, -1), (-1, 0, -1), (1, 1, 3) opposite nodes 3, 2, 1, 0
+        (
+            OBTUSE_TET,
+            [135, 135, 60]
+            + [degrees(acos(3 / sqrt(11))), degrees(acos(4 / sqrt(22))), degrees(acos(4 / sqrt(22)))],
+        ),
+    ],
+)
+def test_dihedral_angles_of_single_cells(mesh, angles):
+    assert dihedral_angles(*mesh)[0] == pytest.approx(angles, rel=1e-14)
+
+
+@pytest.mark.parametrize("t", [0.3, 1e-3, 1e-9])
+def test_dihedral_angles_of_slivers_and_needles_are_accurate(t):
+    """By edges 01 02 03 12 13 23; arccos alone would give 0 for the sliver with t = 1e-9."""
+    around = np.degrees(2 * np.arcsin(sqrt(2) * t / sqrt(1 + 4 * t * t)))  # acos(1 / (1 + 4 t^2)), accurate
+    across = 180 - np.degrees(2 * np.arctan(2 * t))
+    expected = np.array([around, across, around, around, across, around])
+    np.testing.assert_allclose(np.sort(dihedral_angles(*single(sliver(t)))[0]), np.sort(expected), rtol=1e-6)
+    at_short = np.degrees(2 * np.arctan(t / 2))
+    angles = dihedral_angles(*single(needle(t)))[0]
+    assert angles[[0, 5]] == pytest.approx([at_short] * 2, rel=1e-6)
+    assert (angles[1:5] > 89.9).all() if t < 0.01 else True
+
+
+@given(seeds)
+def test_angles_of_a_triangle_sum_to_180(seed):
+    np.testing.assert_allclose(dihedral_angles(*random_cells(seed, 2)).sum(axis=1), 180, rtol=1e-13)
+
+
+@given(seeds)
+def test_cosines_of_a_tetrahedron_s_angles_make_a_singular_matrix(seed):
+    """The unit normals weighted by the areas sum to 0, so the Gram matrix -cos(angle between facets) is singular."""
+    points, cells = random_cells(seed, 3)
+    angles = np.radians(dihedral_angles(points, cells))
+    areas = facet_areas(points, cells)
+    gram = np.tile(np.eye(4), (len(cells), 1, 1))
+    for k, (i, j) in enumerate(edge_pairs(3)):  # the facets at edge i j lie opposite the two other nodes
+        p, q = (m for m in range(4) if m not in (i, j))
+        gram[:, p, q] = gram[:, q, p] = -np.cos(angles[:, k])
+    np.testing.assert_allclose(np.einsum("mij,mj->mi", gram, areas), 0, atol=1e-12 * areas.max())
+
+
+def test_angles_of_flat_cells_are_0_and_180():
+    flat = np.array([[0.0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]])
+    assert np.sort(dihedral_angles(flat, np.array([[0, 1, 2, 3]]))[0]).tolist() == [0, 0, 0, 0, 180, 180]
+
+
+# Laws
+
+
+@given(seeds, dimensions)
+def test_rotation_scaling_and_translation(seed, n):
+    rng = np.random.default_rng(seed)
+    points, cells = random_cells(seed, n)
+    rotation, scale, shift = random_rotation(rng, n), np.exp(rng.uniform(-3, 3)), rng.uniform(-10, 10, n)
+    moved = scale * points @ rotation.T + shift
+    np.testing.assert_allclose(volumes(moved, cells), scale**n * volumes(points, cells), rtol=1e-8, atol=1e-9)
+    np.testing.assert_allclose(facet_areas(moved, cells), scale ** (n - 1) * facet_areas(points, cells), rtol=1e-8)
+    np.testing.assert_allclose(rho(moved, cells), rho(points, cells), rtol=1e-6, atol=1e-9)
+    np.testing.assert_allclose(dihedral_angles(moved, cells), dihedral_angles(points, cells), atol=1e-6)
+    rotated = volume_gradients(points, cells) @ rotation.T * scale ** (n - 1)
+    np.testing.assert_allclose(volume_gradients(moved, cells), rotated, rtol=1e-7, atol=1e-9)
+
+
+@pytest.mark.parametrize("mesh", ALL_SMALL)
+def test_far_from_the_origin_nothing_is_lost(mesh):
+    """1e6 mm away coordinates are exact to 1e-10 mm; so is everything made of them, and no more is lost."""
+    points, cells = mesh
+    rng = np.random.default_rng(3)
+    shift = 2.0**20 * rng.choice([-1, 1], points.shape[1])
+    grid = np.round(points * 2.0**30) / 2.0**30  # exact after the shift
+    np.testing.assert_array_equal(volumes(grid + shift, cells), volumes(grid, cells))
+    np.testing.assert_array_equal(rho(grid + shift, cells), rho(grid, cells))
+    np.testing.assert_array_equal(dihedral_angles(grid + shift, cells), dihedral_angles(grid, cells))
+    np.testing.assert_array_equal(facet_areas(grid + shift, cells), facet_areas(grid, cells))
+    np.testing.assert_allclose(circumcentres(grid + shift, cells) - shift, circumcentres(grid, cells), atol=1e-9)
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_no_cells_give_no_rows(n):
+    points, cells = np.zeros((3, n)), np.empty((0, n + 1), dtype=np.int64)
+    assert volumes(points, cells).shape == (0,)
+    assert rho(points, cells).shape == (0,)
+    assert dihedral_angles(points, cells).shape == (0, n * (n + 1) // 2)
+    assert facet_areas(points, cells).shape == (0, n + 1)
+
+
+def test_unit_simplex_has_one_over_n_factorial():
+    for n in (2, 3):
+        assert volumes(np.vstack([np.zeros(n), np.eye(n)]), np.arange(n + 1)[None])[0] == 1 / factorial(n)

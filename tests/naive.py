@@ -1,0 +1,239 @@
+"""Slow, obvious twins of the package's kernels, in plain Python.
+
+Whatever the contract promises exactly is computed exactly here: with Fractions, or with whole numbers of any size.
+Nothing is imported from the package but the size of its fixed-point grid, which is part of the contract.
+"""
+
+from __future__ import annotations
+
+from fractions import Fraction
+from itertools import combinations, product
+from math import factorial
+
+import numba
+import numpy as np
+
+from tetopt.energy.sampling import sampling_grid
+
+IS_COMPILED = not numba.config.DISABLE_JIT
+
+
+# Linear algebra
+
+
+def determinant(rows):
+    """By expansion along the first row; exact for ints and Fractions."""
+    if len(rows) == 1:
+        return rows[0][0]
+    minors = ([row[:k] + row[k + 1 :] for row in rows[1:]] for k in range(len(rows)))
+    return sum((-1) ** k * rows[0][k] * determinant(minor) for k, minor in enumerate(minors))
+
+
+def sign(x):
+    return (x > 0) - (x < 0)
+
+
+def minus(p, q):
+    return [a - b for a, b in zip(p, q, strict=True)]
+
+
+def dot(p, q):
+    return sum(a * b for a, b in zip(p, q, strict=True))
+
+
+def exactly(points):
+    """The rows of a float array as lists of Fractions; no rounding."""
+    return [[Fraction(float(x)) for x in row] for row in points]
+
+
+def signed_volume(corners):
+    """Of one simplex, (n+1) rows of n numbers; exact for Fractions."""
+    edges = [minus(corner, corners[0]) for corner in corners[1:]]
+    return Fraction(determinant(edges)) / factorial(len(edges))
+
+
+def squared_lengths(corners):
+    """Of the edges of one simplex."""
+    return [dot(minus(p, q), minus(p, q)) for p, q in combinations(corners, 2)]
+
+
+# Energies
+
+
+def E_G_as_printed(points, cells):
+    """Eq. (1): 1/(n+1) sum_i x_i^2 |Omega_i| - integral of x^2, the origin at the mean of the points; exact.
+
+    The integral of x^2 over a simplex of volume v with the corners c_0 .. c_n is
+    v / ((n+1)(n+2)) (|sum of c_k|^2 + sum of |c_k|^2).
+    """
+    points = exactly(points)
+    n = len(points[0])
+    origin = [sum(axis) / len(points) for axis in zip(*points, strict=True)]
+    points = [minus(p, origin) for p in points]
+    ring_volume = [Fraction(0)] * len(points)
+    integral = Fraction(0)
+    for cell in cells:
+        corners = [points[a] for a in cell]
+        v = signed_volume(corners)
+        total = [sum(axis) for axis in zip(*corners, strict=True)]
+        integral += v * (dot(total, total) + sum(dot(c, c) for c in corners)) / ((n + 1) * (n + 2))
+        for a in cell:
+            ring_volume[a] += v
+    return float(sum(dot(p, p) * v for p, v in zip(points, ring_volume, strict=True)) / (n + 1) - integral)
+
+
+def volume_and_E_G(corners):
+    """Unsigned volume and E_G of one cell, (n+1) rows of n floats; exact up to the last rounding."""
+    corners = exactly(corners)
+    n = len(corners) - 1
+    v = abs(signed_volume(corners))
+    return float(v), float(v * sum(squared_lengths(corners)) / ((n + 1) * (n + 2)))
+
+
+# Sampling
+
+
+def ticks(image, points):
+    """Nodes on the sampling's fixed-point grid, as whole numbers of 2**-bits voxel, and bits."""
+    bits = sampling_grid(image, points).bits
+    return [[round(Fraction(float(x)) * 2**bits) for x in row] for row in image.to_index(points)], bits
+
+
+def orientations(corners_of_cells):
+    """Sign of each simplex's volume."""
+    return [sign(signed_volume(corners)) for corners in corners_of_cells]
+
+
+def barycentric_functions(corners):
+    """For each corner k the affine function (gradient, constant), up to a positive factor its barycentric coordinate.
+
+    It is the determinant of the simplex with corner k replaced by the point, times the simplex's orientation.
+    """
+    n = len(corners) - 1
+
+    def value(k, point):
+        moved = [point if i == k else corner for i, corner in enumerate(corners)]
+        return determinant([minus(corner, moved[0]) for corner in moved[1:]])
+
+    hand = sign(value(0, corners[0]))
+    functions = []
+    for k in range(n + 1):
+        constant = value(k, [0] * n)
+        steps = [value(k, [int(d == axis) for d in range(n)]) - constant for axis in range(n)]
+        functions.append(([hand * step for step in steps], hand * constant))
+    return functions
+
+
+def holds(functions, point):
+    """Whether the point, shifted by (eps^3, eps^2, eps) along the axes (2-D: (eps^2, eps)), is inside a simplex.
+
+    A barycentric coordinate that is 0 takes the sign of its change under the shift, the last axis first.
+    """
+    for gradient, constant in functions:
+        side = dot(gradient, point) + constant
+        for change in reversed(gradient):
+            side = side or change
+        if side <= 0:
+            return False
+    return True
+
+
+def owners(image, mesh):
+    """The cells that hold each voxel centre: a list for each voxel, by index. The contract says at most one."""
+    grid_points, bits = ticks(image, mesh.points)
+    held = {voxel: [] for voxel in product(*map(range, image.shape))}
+    for number, cell in enumerate(mesh.cells):
+        corners = [grid_points[a] for a in cell]
+        functions = barycentric_functions(corners)
+        ranges = []
+        for axis, size in zip(zip(*corners, strict=True), image.shape, strict=True):
+            ranges.append(range(max(0, min(axis) >> bits), min(size, (max(axis) >> bits) + 2)))
+        for voxel in product(*ranges):
+            if holds(functions, [i << bits for i in voxel]):
+                held[voxel].append(number)
+    return held
+
+
+def cell_of_voxel(image, mesh):
+    """`owners` as an array; fails where a voxel centre has two."""
+    owner = np.full(image.shape, -1)
+    for voxel, cells in owners(image, mesh).items():
+        assert len(cells) <= 1, f"voxel {voxel} belongs to the cells {cells}"
+        if cells:
+            owner[voxel] = cells[0]
+    return owner
+
+
+def moment_sums(image, owner, n_cells, shift):
+    """Count, sum of h - shift and sum of its square over each cell, from the cells of the voxels; exact inside."""
+    sums = [[Fraction(0)] * 3 for _ in range(n_cells)]
+    for voxel, cell in np.ndenumerate(owner):
+        if cell >= 0:
+            h = Fraction(float(image.data[voxel])) - Fraction(shift)
+            sums[cell] = [s + term for s, term in zip(sums[cell], (1, h, h * h), strict=True)]
+    return np.array(sums, dtype=np.float64)
+
+
+# Topology
+
+
+def rings(cells, n_nodes):
+    """The cells of each node, ascending."""
+    return [[number for number, cell in enumerate(cells) if node in cell] for node in range(n_nodes)]
+
+
+def facets(cells):
+    """From the sorted nodes of each distinct facet to the cells that share it, ascending."""
+    shared = {}
+    for number, cell in enumerate(cells):
+        for left_out in cell:
+            shared.setdefault(tuple(sorted(int(a) for a in cell if a != left_out)), []).append(number)
+    return shared
+
+
+def node_colours(cells, n_nodes):
+    """Greedy in node order: the least colour that no node in a common cell already has."""
+    colours = {}
+    for node in range(n_nodes):
+        seen = {colours.get(int(other)) for cell in cells if node in cell for other in cell}
+        colours[node] = min(set(range(n_nodes)) - seen)
+    return [colours[node] for node in range(n_nodes)]
+
+
+def components(cells):
+    """Number of the facet-connected set of each cell, by flooding from the first cell that has none."""
+    neighbours = {number: set() for number in range(len(cells))}
+    for shared in facets(cells).values():
+        for one in shared:
+            neighbours[one].update(shared)
+    number = [-1] * len(cells)
+    for first in range(len(cells)):
+        if number[first] < 0:
+            now = max(number) + 1
+            front = [first]
+            while front:
+                cell = front.pop()
+                if number[cell] < 0:
+                    number[cell] = now
+                    front += neighbours[cell]
+    return number
+
+
+# Cuts
+
+
+def plane_cut(points, cells, height):
+    """From each cell with nodes on both sides (height >= 0, height < 0) to the points where its edges cross 0."""
+    points, height = exactly(points), [Fraction(float(z)) for z in height]
+    crossings = {}
+    for number, cell in enumerate(cells):
+        found = []
+        for a, b in combinations(cell, 2):
+            if (height[a] >= 0) != (height[b] >= 0):
+                share = height[a] / (height[a] - height[b])
+                found.append(
+                    [float((1 - share) * p + share * q) for p, q in zip(points[a], points[b], strict=True)]
+                )
+        if found:
+            crossings[number] = found
+    return crossings
