@@ -3,12 +3,12 @@
 import os
 from pathlib import Path
 
+import numba
 import pytest
 from hypothesis import settings
-from naive import IS_COMPILED
 
 # The same examples in every run; few where the kernels run as plain Python.
-settings.register_profile("tetopt", deadline=None, derandomize=True, max_examples=30 if IS_COMPILED else 4)
+settings.register_profile("tetopt", deadline=None, derandomize=True, max_examples=4 if numba.config.DISABLE_JIT else 30)
 settings.load_profile("tetopt")
 
 

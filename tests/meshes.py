@@ -32,7 +32,7 @@ OBTUSE_TRIANGLE = (np.array([[0.0, 0.0], [1.0, 0.0], [-0.5, np.sqrt(0.75)]]), np
 #      \|/      obtuse: as the cube corner, but node 3 raised over (-1, -1), outside of the base
 #       1
 
-REGULAR_TET = (np.array([[1.0, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]), np.array([[0, 1, 2, 3]]))
+REGULAR_TET = (np.array([[1.0, 1, 1], [-1, 1, -1], [1, -1, -1], [-1, -1, 1]]), np.array([[0, 1, 2, 3]]))
 CUBE_CORNER = (np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]]), np.array([[0, 1, 2, 3]]))
 OBTUSE_TET = (np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [-1, -1, 1]]), np.array([[0, 1, 2, 3]]))
 
@@ -79,7 +79,7 @@ TWO_SQUARES = (
 
 FIVE_TET_CUBE = (
     np.array(list(product((0.0, 1.0), repeat=3))),
-    np.array([[0, 3, 6, 5], [1, 0, 5, 3], [2, 0, 3, 6], [4, 0, 6, 5], [7, 3, 5, 6]]),
+    np.array([[0, 3, 5, 6], [1, 0, 3, 5], [2, 0, 6, 3], [4, 0, 5, 6], [7, 3, 6, 5]]),
 )
 
 # Bad tetrahedra, each as (points, kind); t is small. In the drawings all four nodes lie (almost) in the page.

@@ -19,6 +19,7 @@ import numba
 import numpy as np
 import typer
 from rich.console import Console
+from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 from rich.table import Table
 
@@ -43,8 +44,8 @@ from tetopt.report.summary import run_summary
 
 DEFAULT_NODES = {2: 500, 3: 5000}
 
-log = Console(stderr=True, highlight=False, soft_wrap=True)
-out = Console(highlight=False, soft_wrap=True)
+log = Console(stderr=True, highlight=False, soft_wrap=True, emoji=False)
+out = Console(highlight=False, soft_wrap=True, emoji=False)
 app = typer.Typer(
     name="tetopt",
     help="From a medical volume straight to an image-aligned tetrahedral mesh, without segmentation.",
@@ -84,28 +85,25 @@ def main(argv: Sequence[str] | None = None) -> int:
         try:
             return app(args=list(sys.argv[1:] if argv is None else argv), standalone_mode=False) or 0
         except InputError as error:
-            log.print(f"[bold red]tetopt:[/] {_escaped(str(error))}")
+            log.print(f"[bold red]tetopt:[/] {escape(str(error))}")
             return 2
         except typer.Exit as ended:
             return ended.exit_code
-        except typer.Abort:
+        except (typer.Abort, KeyboardInterrupt):  # newer versions of typer return 130 themselves
             return 130
-        except KeyboardInterrupt:
-            log.print("tetopt: interrupted; nothing was written")
-            return 130
+        except OSError as error:  # a full disk, a folder that may not be written to
+            log.print(f"[bold red]tetopt:[/] {escape(str(error))}")
+            return 2
         except Exception as error:
             if type(error).__module__.split(".")[0] not in ("click", "typer") or not hasattr(error, "format_message"):
                 raise
-            log.print(f"[bold red]tetopt:[/] {_escaped(error.format_message())} (see --help)")
+            if error.format_message():  # empty after the help that a bare `tetopt` prints
+                log.print(f"[bold red]tetopt:[/] {escape(error.format_message())} (see --help)")
             return 2
 
 
-def _escaped(text: str) -> str:
-    return text.replace("[", r"\[")
-
-
 def _show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
-    log.print(f"[yellow]tetopt: warning:[/] {_escaped(str(message))}")
+    log.print(f"[yellow]tetopt: warning:[/] {escape(str(message))}")
 
 
 @contextlib.contextmanager
@@ -160,12 +158,15 @@ def mesh_command(
         Lattice | None, typer.Option("--lattice", help="Initial mesh (default bcc; criss-cross in 2-D).")
     ] = None,
     k_D: Annotated[float, typer.Option("--k-d", metavar="K", help="Weight of the image, 0 to below 1.")] = 0.2,
-    iterations: Annotated[int, typer.Option(metavar="I", help="Sweeps over all nodes; 0 writes the lattice.")] = 20,
+    iterations: Annotated[
+        int, typer.Option(metavar="I", min=0, help="Sweeps over all nodes; 0 writes the lattice.")
+    ] = 20,
     n_t: Annotated[
         int | None,
         typer.Option(
             "--n-t",
             metavar="T",
+            min=0,
             help="Connect anew in the first T iterations (default half; all for k_D = 0).",
         ),
     ] = None,
@@ -191,6 +192,8 @@ def mesh_command(
         json_path = checked_output(json_path, (".json",), force)
     if nodes is not None and spacing is not None:
         raise InputError("--nodes and --spacing: give one of them")
+    if not 0.0 <= k_D < 1.0:
+        raise InputError(f"--k-d: expected 0 <= k_D < 1, got {k_D}")
     if max_seconds is not None and not max_seconds > 0.0:
         raise InputError(f"--max-seconds: expected more than 0, got {max_seconds}")
     _set_threads(threads)
@@ -210,7 +213,7 @@ def mesh_command(
     }  # fmt: skip
     source = {
         "nodes": nodes, "spacing": spacing, "lattice": kind, "volume": volume, "crop": crop, "slice": slice_,
-        "method": method.value,
+        "method": method.value, "max_seconds": max_seconds,
     }  # fmt: skip
     return _mesh_files(image_path, image, initial, options, source, output, json_path, begin, max_seconds)[1]
 
@@ -227,19 +230,19 @@ def _mesh_files(
     max_seconds: float | None,
 ) -> tuple[Optimized, int]:
     """Optimise, write the mesh and the numbers, print the comparison; the result and the exit code."""
-    log.print(_escaped(_described(image_path, image, initial)))
+    about = {"image": image_path.name, "image_sha256": sha256(image_path), "options": options | source}
+    log.print(escape(_described(image_path, image, initial)))
     loaded = time.perf_counter()
     left = None if max_seconds is None else max(max_seconds - (loaded - begin), 1e-9)
     result, is_interrupted = _optimized(image, initial, left, **options)
     optimized = time.perf_counter()
-    about = {"image": image_path.name, "image_sha256": sha256(image_path), "options": options | source}
     save_mesh(output, result.mesh, cell_fields(result.mesh, image), {"tetopt": tetopt.__version__, **about})
     _print_comparison(initial, result)
-    out.print(_escaped(f"{output}: {len(result.mesh.points)} nodes, {len(result.mesh.cells)} cells"))
+    out.print(escape(f"{output}: {len(result.mesh.points)} nodes, {len(result.mesh.cells)} cells"))
     if json_path is not None:
         seconds = {"load": loaded - begin, "optimize": optimized - loaded, "all": time.perf_counter() - begin}
         save_json(json_path, run_summary(image, initial, result, about, seconds))
-        out.print(_escaped(f"{json_path}: every number of the run"))
+        out.print(escape(f"{json_path}: every number of the run"))
     return result, 130 if is_interrupted else _promises(image, result)
 
 
@@ -312,6 +315,7 @@ def _graceful_interrupt() -> Iterator[Callable[[], bool]]:
 
     def on_interrupt(number: int, frame: FrameType | None) -> None:
         if pressed:
+            log.print("interrupted again: no mesh is written")
             raise KeyboardInterrupt
         pressed.append(number)
         log.print("interrupted: finishing the current nodes, then writing the mesh (again to give up)")
@@ -408,7 +412,7 @@ def quality_command(
     loaded = load_mesh(mesh_path)
     measured = quality(loaded.mesh.points, loaded.mesh.cells)
     content: dict[str, Any] = {"mesh": mesh_path.name, "quality": measured, "n_turned": loaded.n_turned}
-    table = _table("", mesh_path.name)
+    table = _table("", escape(mesh_path.name))
     _add_quality(table, measured)
     if image_path is not None:
         image = load_image(image_path, volume=volume)
@@ -463,13 +467,15 @@ def phantom_command(
     output = checked_output(output, suffixes, force)
     if labels is not None:
         labels = checked_output(labels, suffixes, force)
+        if labels.resolve() == output.resolve():
+            raise InputError(f"{labels}: --labels and --output name the same file")
     phantom = load_phantom(name)
     image = phantom.image(voxel_mm=voxel_mm, blur_mm=blur_mm, noise_sd=noise_sd, seed=seed)
     save_image(output, image)
     if labels is not None:
         save_image(labels, phantom.label_image(voxel_mm=voxel_mm))
     size = " x ".join(str(s) for s in image.shape)
-    out.print(_escaped(f"{output}: {phantom.name}, {size} voxels, {image.data.min():g} to {image.data.max():g}"))
+    out.print(escape(f"{output}: {phantom.name}, {size} voxels, {image.data.min():g} to {image.data.max():g}"))
     return 0
 
 
@@ -479,12 +485,14 @@ def demo_command(
         "demo"
     ),
     nodes: Annotated[int, typer.Option(metavar="N", help="Wanted number of nodes.")] = 5000,
-    iterations: Annotated[int, typer.Option(metavar="I", help="Sweeps over all nodes.")] = 20,
+    iterations: Annotated[int, typer.Option(metavar="I", min=0, help="Sweeps over all nodes.")] = 20,
     force: ForceOption = False,
 ) -> int:
     """Mesh the MNI152 T1 that nilearn's wheel carries; leave mesh, numbers and pictures in a folder."""
     begin = time.perf_counter()
     source = nilearn_t1()
+    if output.exists() and not output.is_dir():
+        raise InputError(f"{output}: expected a folder for the results, found a file")
     output.mkdir(parents=True, exist_ok=True)
     mesh_path = checked_output(output / "mesh.vtu", (".vtu",), force)
     json_path = checked_output(output / "run.json", (".json",), force)
@@ -497,11 +505,12 @@ def demo_command(
 
     save_run_figures(figures, image, initial, result)
     for path in figures:
-        out.print(_escaped(str(path)))
+        out.print(escape(str(path)))
     return code
 
 
 def nilearn_t1() -> Path:
+    """The MNI152 T1 inside nilearn's wheel; InputError without it."""
     found = importlib.util.find_spec("nilearn")
     name = "datasets/data/mni_icbm152_t1_tal_nlin_sym_09a_converted.nii.gz"
     path = Path(found.origin).parent / name if found is not None and found.origin else Path(name)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import combinations
 from typing import NamedTuple
 
 import numba
@@ -24,11 +25,13 @@ class Rings(NamedTuple):
 
 
 class Facets(NamedTuple):
-    """The distinct facets of a mesh and the cells on their sides."""
+    """The distinct facets of a mesh and how the cells hold them."""
 
-    nodes: NDArray[np.int64]  # (F, n), each row ascending
+    nodes: NDArray[np.int64]  # (F, n), each row ascending; rows in lexicographic order
     cells: NDArray[np.int64]  # (F, 2), the second is -1 on the boundary
     n_cells: NDArray[np.int64]  # (F,), cells that share it: 1 or 2 in a conforming mesh
+    of_cell: NDArray[np.int64]  # (M, n+1), the facet opposite each local node
+    sign: NDArray[np.int64]  # (M, n+1), +1 where the facet's nodes as listed face out of the cell, else -1
 
 
 def rings(cells: NDArray[np.integer], n_nodes: int) -> Rings:
@@ -40,17 +43,68 @@ def rings(cells: NDArray[np.integer], n_nodes: int) -> Rings:
 
 
 def facets(cells: NDArray[np.integer]) -> Facets:
-    """Distinct facets of (M, n+1) cells, in lexicographic order of their sorted nodes."""
+    """Distinct facets of positively oriented cells (M, n+1).
+
+    A facet (a, b) faces the side to the right of a -> b in 2-D; (a, b, c) the side of (b - a) x (c - a) in 3-D.
+    """
     n = cells.shape[1] - 1
-    every = np.sort(cells[:, facet_nodes(n)].reshape(-1, n), axis=1).astype(np.int64)
+    every = cells[:, facet_nodes(n)].astype(np.int64)  # (M, n+1, n)
+    # Facet k of a positively oriented simplex, its nodes in local order, faces outwards for even k.
+    sign = np.where(np.arange(n + 1) % 2 == 0, 1, -1) * _permutation_sign(every)
+    every = np.sort(every, axis=2).reshape(-1, n)
     owner = np.repeat(np.arange(len(cells), dtype=np.int64), n + 1)
     order = np.lexsort(every.T[::-1])
-    every, owner = every[order], owner[order]
-    is_first = np.concatenate([[True], (every[1:] != every[:-1]).any(axis=1)])
+    ordered, owner = every[order], owner[order]
+    is_first = np.concatenate([[True], (ordered[1:] != ordered[:-1]).any(axis=1)])
+    of_cell = np.empty(len(every), dtype=np.int64)
+    of_cell[order] = np.cumsum(is_first) - 1
     first = np.flatnonzero(is_first)
     n_cells = np.diff(np.append(first, len(every)))
     second = np.where(n_cells > 1, owner[np.minimum(first + 1, len(owner) - 1)], -1)
-    return Facets(every[first], np.column_stack([owner[first], second]), n_cells)
+    sides = np.column_stack([owner[first], second])
+    return Facets(ordered[first], sides, n_cells, of_cell.reshape(cells.shape), sign)
+
+
+def _permutation_sign(nodes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """+1 where the last axis of two or three distinct numbers is an even permutation of ascending order, else -1."""
+    sign = np.ones(nodes.shape[:-1], dtype=np.int64)
+    for i, k in combinations(range(nodes.shape[-1]), 2):
+        sign *= np.where(nodes[..., i] < nodes[..., k], 1, -1)
+    return sign
+
+
+class Stars(NamedTuple):
+    """The facets around each node, as compressed rows, and where the ring's cells find theirs among them."""
+
+    start: NDArray[np.int64]  # (N+1,)
+    facets: NDArray[np.int64]  # (F * n,), those of node i at start[i]:start[i + 1], ascending
+    place: NDArray[np.int64]  # (M * (n+1), n+1), by entry of `Rings`: place in the node's row, -1 if not in it
+
+
+def stars(sides: Facets, around: Rings) -> Stars:
+    """The facets that contain each node; see `facets` and `rings`."""
+    n_nodes = len(around.start) - 1
+    n = sides.nodes.shape[1]
+    order = np.argsort(sides.nodes.ravel(), kind="stable")
+    counts = np.bincount(sides.nodes.ravel(), minlength=n_nodes)
+    start = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
+    place = np.empty((len(around.cells), n + 1), dtype=np.int64)
+    found = (order // n).astype(np.int64)
+    _fill_places(place, around.start, around.cells, sides.of_cell, start, found)
+    return Stars(start, found, place)
+
+
+@numba.njit(cache=True)
+def _fill_places(
+    place: NDArray, ring_start: NDArray, ring: NDArray, of_cell: NDArray, start: NDArray, found: NDArray
+) -> None:
+    for node in range(len(start) - 1):
+        row = found[start[node] : start[node + 1]]
+        for r in range(ring_start[node], ring_start[node + 1]):
+            for k in range(of_cell.shape[1]):
+                facet = of_cell[ring[r], k]
+                at = np.searchsorted(row, facet)
+                place[r, k] = at if at < len(row) and row[at] == facet else -1
 
 
 def boundary_facets(cells: NDArray[np.integer]) -> NDArray[np.int64]:
@@ -58,18 +112,14 @@ def boundary_facets(cells: NDArray[np.integer]) -> NDArray[np.int64]:
 
     For positively oriented cells the returned triangles (edges in 2-D) have their normal pointing out.
     """
-    n = cells.shape[1] - 1
-    every = cells[:, facet_nodes(n)].reshape(-1, n).astype(np.int64)
-    # Facet i of a positively oriented simplex, its nodes in ascending local order, faces outwards for even i in
-    # 2-D (node order then runs counter-clockwise) and for even i in 3-D; odd ones need two nodes swapped.
-    is_odd = np.tile(np.arange(n + 1) % 2 == 1, len(cells))
-    every[is_odd, :2] = every[is_odd, 1::-1]
-    key = np.sort(every, axis=1)
-    order = np.lexsort(key.T[::-1])
-    key = key[order]
-    same_as_next = np.concatenate([(key[1:] == key[:-1]).all(axis=1), [False]])
-    is_single = ~same_as_next & ~np.concatenate([[False], same_as_next[:-1]])
-    return every[np.sort(order[is_single])]
+    found = facets(cells)
+    is_outer = found.n_cells == 1
+    outer = found.nodes[is_outer]
+    sign = np.empty(len(found.nodes), dtype=np.int64)
+    sign[found.of_cell] = found.sign
+    is_inward = sign[is_outer] < 0
+    outer[is_inward, :2] = outer[is_inward, 1::-1]
+    return outer
 
 
 def node_colours(cells: NDArray[np.integer], around: Rings) -> NDArray[np.int64]:

@@ -44,7 +44,8 @@ def written_whole(path: Path) -> Iterator[Path]:
 
     Left behind by an error or an interruption is nothing but what was there before.
     """
-    handle, name = tempfile.mkstemp(prefix=f".{path.name[:40]}.", suffix="".join(path.suffixes[-2:]), dir=path.parent)
+    suffix = "".join(path.suffixes[-2:])[-20:]  # short, as the name of `path` may be as long as names can be
+    handle, name = tempfile.mkstemp(prefix=f".{path.name[:40]}.", suffix=suffix, dir=path.parent)
     os.close(handle)
     temporary = Path(name)
     try:

@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import contextlib
 import json
+import logging
+import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -25,7 +29,7 @@ class MeshFile(NamedTuple):
 
     mesh: Mesh
     cell_data: dict[str, NDArray]  # by name, one row a cell
-    field_data: dict[str, NDArray]  # by name, of any length
+    field_data: dict[str, NDArray]  # by name, of any length; bytes of UTF-8 have become one string
     n_turned: int  # cells that were oriented the other way in the file
 
 
@@ -63,12 +67,14 @@ def save_mesh(
     """Write a VTU file, whole or not at all.
 
     Points in world mm (RAS+), cells positively oriented, `cell_data` by name; each entry of `about` becomes a
-    field-data string, as JSON unless it is a string already. Replaces an existing file; ask
+    field-data text, as JSON unless it is a string already. Texts are held as bytes of UTF-8: meshio refuses files
+    with VTK's string arrays, and pyvista writes only ASCII into them. Replaces an existing file; ask
     `tetopt.io.files.checked_output` first.
     """
     grid = to_pyvista(mesh, cell_data)
     for name, value in (about or {}).items():
-        grid.field_data[name] = [value if isinstance(value, str) else json.dumps(value)]
+        text = value if isinstance(value, str) else json.dumps(value)
+        grid.field_data[name] = np.frombuffer(text.encode(), dtype=np.uint8)
     with written_whole(Path(path)) as temporary:
         grid.save(temporary)
 
@@ -95,6 +101,10 @@ def load_mesh(path: str | Path) -> MeshFile:
     points = np.asarray(grid.points, dtype=np.float64)
     if n == 2 and np.any(points[:, 2] != 0.0):
         raise InputError(f"{path}: a mesh of triangles must lie in the plane z = 0; surfaces in space are not meshed")
+    if cells.min() < 0 or cells.max() >= len(points):
+        raise InputError(
+            f"{path}: its cells use nodes {cells.min()}..{cells.max()}, it holds 0..{len(points) - 1}; damaged?"
+        )
     used, compact = np.unique(cells, return_inverse=True)
     points, cells = points[used, :n], compact.reshape(cells.shape)
     turned = oriented(points, cells)
@@ -103,20 +113,52 @@ def load_mesh(path: str | Path) -> MeshFile:
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     cell_data = {name: np.asarray(grid.cell_data[name]) for name in grid.cell_data}
-    field_data = {name: np.asarray(grid.field_data[name]) for name in grid.field_data}
+    field_data = {name: _decoded(np.asarray(grid.field_data[name])) for name in grid.field_data}
     return MeshFile(mesh, cell_data, field_data, int((turned != cells).any(axis=1).sum()))
+
+
+def _decoded(values: NDArray) -> NDArray:
+    """`values`; if they are bytes of UTF-8, as `save_mesh` writes texts, that text as an array of one string."""
+    if values.dtype != np.uint8:
+        return values
+    try:
+        return np.array([values.tobytes().decode()])
+    except UnicodeDecodeError:
+        return values
 
 
 def _read_quietly(path: Path) -> pyvista.UnstructuredGrid:
     """pyvista's reading, with VTK's complaints turned into one InputError."""
     try:
-        with pyvista.vtk_verbosity("off"):
+        with _vtk_errors() as errors:
             grid = pyvista.read(path)
     except Exception as error:  # VTK's readers raise whatever they please on damaged files
         raise InputError(f"{path}: cannot be read as a VTK mesh ({type(error).__name__})") from error
+    if errors:
+        raise InputError(f"{path}: damaged, or not a VTK mesh ({' '.join(errors[0].split())})")
     if not isinstance(grid, pyvista.UnstructuredGrid) or grid.n_cells == 0:
         raise InputError(f"{path}: expected an unstructured grid with cells, found {type(grid).__name__}; damaged?")
     return grid
+
+
+@contextlib.contextmanager
+def _vtk_errors() -> Iterator[list[str]]:
+    """VTK's errors, instead of on the screen: pyvista passes them to the root logger and on as warnings."""
+    errors: list[str] = []
+
+    def caught(record: logging.LogRecord) -> bool:
+        if record.levelno >= logging.ERROR:
+            errors.append(record.getMessage())
+        return False
+
+    root = logging.getLogger()
+    root.addFilter(caught)
+    try:
+        with warnings.catch_warnings(), pyvista.vtk_verbosity("off"):
+            warnings.simplefilter("ignore")
+            yield errors
+    finally:
+        root.removeFilter(caught)
 
 
 def _dimension(path: Path, grid: pyvista.UnstructuredGrid) -> int:

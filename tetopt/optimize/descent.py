@@ -14,22 +14,26 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from tetopt.energy.geometric import volume_and_E_G
-from tetopt.energy.sampling import SamplingGrid, cell_orientation, sum_cell
-from tetopt.geometry.topology import Rings
+from tetopt.energy.sampling import SamplingGrid, cell_orientation, facet_flux
+from tetopt.geometry.topology import Facets, Rings, Stars
 
 FLAT = 1e-7  # a cell's volume over (sum of squared edges)^(n/2); below, it counts as inverted: an angle of 1e-3 degrees
 HALVINGS = 4  # of a Lloyd step that inverts a cell or raises the ring's energy
 
 
 class State(NamedTuple):
-    """Everything a sweep reads and writes; the last two are kept in step with the nodes."""
+    """Everything a sweep reads and writes; `sums`, `E_G` and `fluxes` are kept in step with the nodes."""
 
     ticks: NDArray[np.int64]  # (N, 3) node positions on the sampling grid; written
     cells: NDArray[np.int64]  # (M, n+1)
     rings: Rings
+    sides: Facets
+    stars: Stars
     is_frozen: NDArray[np.bool_]  # (N, 3) index axes along which a node may not move
+    hand: int  # sign of the cells' volumes in index space
     sums: NDArray[np.float64]  # (M, 3) moment sums of each cell; written
     E_G: NDArray[np.float64]  # (M,) geometric energy of each cell, mm^(n+2); written
+    fluxes: NDArray[np.float64]  # (F, 3) flux of each facet; written
 
 
 class Weights(NamedTuple):
@@ -49,7 +53,11 @@ def descend(
     the nearest centroid of the ring's cells; the vertex of the parabola through the three values is tried as well;
     the best of them is taken if it lies below the present energy. `matrix` (3, 3) takes index vectors to mm.
     """
-    _descend(*state[:2], *state.rings, *state[3:], nodes, *grid, matrix, *weights)
+    _descend(
+        state.ticks, state.cells, *state.rings, state.sides.nodes, state.sides.of_cell, state.sides.sign, *state.stars,
+        state.is_frozen, state.hand, state.sums, state.E_G, state.fluxes, nodes, grid.prefix, grid.bits, matrix,
+        *weights,
+    )  # fmt: skip
 
 
 def relocate(
@@ -62,10 +70,13 @@ def relocate(
 
     Inside, that is the volume-weighted mean of the ring's circumcentres. A node on a face or an edge of the box
     goes to the minimiser within it. A step that inverts a cell or, by rounding, raises E_G is halved up to four
-    times, then left out. Moment sums are not kept: at k_D = 0 the image has no say.
+    times, then left out. Sums and fluxes are not kept up: at k_D = 0 the image has no say.
     """
     projections = _free_projections(matrix)
-    _relocate(*state[:2], *state.rings, state.is_frozen, state.E_G, nodes, grid.bits, matrix, projections)
+    _relocate(
+        state.ticks, state.cells, *state.rings, state.is_frozen, state.hand, state.E_G, nodes, grid.bits, matrix,
+        projections,
+    )  # fmt: skip
 
 
 def _free_projections(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -80,15 +91,14 @@ def _free_projections(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 @njit(cache=True)
-def _load(
-    corner: NDArray, x: NDArray, ticks: NDArray, cells: NDArray, cell: int, matrix: NDArray, scale: float
-) -> None:
-    """A cell's corners, in ticks and in mm."""
+def _load(x: NDArray, ticks: NDArray, cells: NDArray, cell: int, matrix: NDArray, scale: float) -> None:
+    """A cell's corners in mm."""
     for k in range(cells.shape[1]):
+        node = cells[cell, k]
         for d in range(3):
-            corner[k, d] = ticks[cells[cell, k], d]
-        for d in range(3):
-            x[k, d] = scale * (matrix[d, 0] * corner[k, 0] + matrix[d, 1] * corner[k, 1] + matrix[d, 2] * corner[k, 2])
+            x[k, d] = scale * (
+                matrix[d, 0] * ticks[node, 0] + matrix[d, 1] * ticks[node, 1] + matrix[d, 2] * ticks[node, 2]
+            )
 
 
 @njit(cache=True)
@@ -108,70 +118,61 @@ def _is_flat(volume: float, E_G: float, n_corners: int) -> bool:
 
 @njit(cache=True)
 def _ring_energy(
-    limit: float,
-    trial: NDArray,
-    node: int,
-    hand: int,
-    ticks: NDArray,
-    cells: NDArray,
-    start: NDArray,
-    ring: NDArray,
-    volume: NDArray,
-    bits: int,
-    shift: float,
-    matrix: NDArray,
-    geometry: float,
-    image: float,
-    corner: NDArray,
-    x: NDArray,
-    normal: NDArray,
-    plane: NDArray,
-    box: NDArray,
-    order: NDArray,
-) -> float:
-    """Energy of a node's ring as `ticks` stand; its cells' sums and E_G go to the rows of `trial` (R, 4).
+    limit: float, trial: NDArray, trial_fluxes: NDArray, x: NDArray, node: int, ticks: NDArray, cells: NDArray,
+    start: NDArray, ring: NDArray, nodes_of: NDArray, of_cell: NDArray, sign: NDArray, star_start: NDArray,
+    star: NDArray, place: NDArray, hand: int, fluxes: NDArray, prefix: NDArray, bits: int, matrix: NDArray,
+    geometry: float, image: float,
+) -> float:  # fmt: skip
+    """Energy of a node's ring as `ticks` stand.
 
-    Infinite if a cell is not oriented as `hand` says, or flat; abandoned, and infinite, once it is above `limit`.
+    Its cells' sums and E_G go to the rows of `trial` (R, 4), its facets' fluxes to `trial_fluxes`. Infinite if a
+    cell is flat or not oriented as `hand` says, or once the energy of the shapes alone is above `limit`.
     """
-    n_corners = cells.shape[1]
-    scale = 2.0**-bits
+    first, last = start[node], start[node + 1]
     energy = 0.0
-    first = start[node]
-    for r in range(first, start[node + 1]):  # cheap refusals before any voxel is read
-        _load(corner, x, ticks, cells, ring[r], matrix, scale)
-        if cell_orientation(corner, normal, n_corners) != hand:
+    for r in range(first, last):  # cheap refusals before any voxel is read
+        if cell_orientation(ticks, cells, ring[r]) != hand:
             return np.inf
-        cell_volume, trial[r - first, 3] = volume_and_E_G(x, n_corners)
-        if _is_flat(cell_volume, trial[r - first, 3], n_corners):
+        _load(x, ticks, cells, ring[r], matrix, 2.0**-bits)
+        cell_volume, trial[r - first, 3] = volume_and_E_G(x, cells.shape[1])
+        if _is_flat(cell_volume, trial[r - first, 3], cells.shape[1]):
             return np.inf
         energy += geometry * trial[r - first, 3]
-    for r in range(first, start[node + 1]):
-        if energy > limit:
-            return np.inf
-        _load(corner, x, ticks, cells, ring[r], matrix, scale)
-        sum_cell(trial[r - first], volume, shift, corner, n_corners, bits, normal, plane, box, order)
+    if energy > limit:
+        return np.inf
+    for s in range(star_start[node], star_start[node + 1]):
+        flux = facet_flux(ticks, nodes_of, star[s], bits, prefix, None, 0)
+        for d in range(3):
+            trial_fluxes[s - star_start[node], d] = flux[d]
+    for r in range(first, last):
+        for d in range(3):
+            total = 0.0
+            for k in range(cells.shape[1]):
+                if place[r, k] < 0:
+                    total += sign[ring[r], k] * fluxes[of_cell[ring[r], k], d]
+                else:
+                    total += sign[ring[r], k] * trial_fluxes[place[r, k], d]
+            trial[r - first, d] = hand * total
         energy += image * _image_energy(trial[r - first])
     return energy
 
 
 @njit(cache=True)
 def _nearest_centroid(
-    node: int, ticks: NDArray, cells: NDArray, start: NDArray, ring: NDArray, matrix: NDArray, scale: float,
-    corner: NDArray, x: NDArray,
-) -> float:  # fmt: skip
+    x: NDArray, node: int, ticks: NDArray, cells: NDArray, start: NDArray, ring: NDArray, matrix: NDArray, scale: float
+) -> float:
     """Distance in mm from a node to the nearest centroid of its ring's cells."""
-    n_corners = cells.shape[1]
     nearest = np.inf
     for r in range(start[node], start[node + 1]):
-        _load(corner, x, ticks, cells, ring[r], matrix, scale)
+        _load(x, ticks, cells, ring[r], matrix, scale)
         squared = 0.0
         for d in range(3):
             here = scale * (
                 matrix[d, 0] * ticks[node, 0] + matrix[d, 1] * ticks[node, 1] + matrix[d, 2] * ticks[node, 2]
             )
             mean = 0.0
-            for k in range(n_corners):
-                mean += x[k, d] / n_corners
+            for k in range(cells.shape[1]):
+                mean += x[k, d] / cells.shape[1]
             squared += (mean - here) ** 2
         nearest = min(nearest, squared)
     return np.sqrt(nearest)
@@ -179,42 +180,24 @@ def _nearest_centroid(
 
 @njit(cache=True, parallel=True)
 def _descend(
-    ticks: NDArray,
-    cells: NDArray,
-    start: NDArray,
-    ring: NDArray,
-    is_frozen: NDArray,
-    sums: NDArray,
-    E_G: NDArray,
-    nodes: NDArray,
-    volume: NDArray,
-    bits: int,
-    shift: float,
-    matrix: NDArray,
-    geometry: float,
-    image: float,
+    ticks: NDArray, cells: NDArray, start: NDArray, ring: NDArray, nodes_of: NDArray, of_cell: NDArray, sign: NDArray,
+    star_start: NDArray, star: NDArray, place: NDArray, is_frozen: NDArray, hand: int, sums: NDArray, E_G: NDArray,
+    fluxes: NDArray, nodes: NDArray, prefix: NDArray, bits: int, matrix: NDArray, geometry: float, image: float,
     step_ratio: float,
-) -> None:
-    n_corners = cells.shape[1]
+) -> None:  # fmt: skip
     scale = 2.0**-bits
     for number in prange(len(nodes)):
         node = nodes[number]
         first, last = start[node], start[node + 1]
-        corner = np.empty((4, 3), dtype=np.int64)
+        star_first, star_last = star_start[node], star_start[node + 1]
         x = np.empty((4, 3))
-        normal = np.empty((4, 3), dtype=np.int64)
-        plane = np.empty((4, 3))
-        box = np.empty((3, 2), dtype=np.int64)
-        order = np.empty(6, dtype=np.int64)
-        trial = np.empty((last - first, 4))
-        best_trial = np.empty((last - first, 4))
-        _load(corner, x, ticks, cells, ring[first], matrix, scale)
-        hand = cell_orientation(corner, normal, n_corners)
+        trial, best_trial = np.empty((last - first, 4)), np.empty((last - first, 4))
+        trial_fluxes, best_fluxes = np.empty((star_last - star_first, 3)), np.empty((star_last - star_first, 3))
         energy = 0.0
         for r in range(first, last):
             energy += geometry * E_G[ring[r]] + image * _image_energy(sums[ring[r]])
-        reach = step_ratio * _nearest_centroid(node, ticks, cells, start, ring, matrix, scale, corner, x)
-        for axis in range(4 - n_corners, 3):
+        reach = step_ratio * _nearest_centroid(x, node, ticks, cells, start, ring, matrix, scale)
+        for axis in range(4 - cells.shape[1], 3):
             if is_frozen[node, axis]:
                 continue
             length = np.sqrt(matrix[0, axis] ** 2 + matrix[1, axis] ** 2 + matrix[2, axis] ** 2)
@@ -222,41 +205,44 @@ def _descend(
             if step == 0:
                 continue
             here = ticks[node, axis]
-            best = energy
-            best_place = here
-            values = (np.inf, np.inf)
+            best, best_there = energy, here
+            forwards, backwards = np.inf, np.inf
             for attempt in range(3):
-                if attempt < 2:
-                    place = here + step * (1 - 2 * attempt)
+                if attempt < 2:  # the numerical derivative: one step forwards, one backwards
+                    there = here + step * (1 - 2 * attempt)
                     limit = np.inf  # the parabola needs both values whole
-                else:
-                    bend = values[0] + values[1] - 2.0 * energy
+                else:  # the vertex of the parabola through the three values
+                    bend = forwards + backwards - 2.0 * energy
                     if not (np.isfinite(bend) and bend > 0.0):
                         break
-                    vertex = 0.5 * (values[1] - values[0]) / bend
-                    place = here + np.int64(np.rint(min(max(vertex, -1.0), 1.0) * step))
+                    vertex = 0.5 * (backwards - forwards) / bend
+                    there = here + np.int64(np.rint(min(max(vertex, -1.0), 1.0) * step))
                     limit = best
-                    if place == here:
+                    if there == here:
                         break
-                ticks[node, axis] = place
+                ticks[node, axis] = there
                 value = _ring_energy(
-                    limit, trial, node, hand, ticks, cells, start, ring, volume, bits, shift, matrix, geometry,
-                    image, corner, x, normal, plane, box, order,
+                    limit, trial, trial_fluxes, x, node, ticks, cells, start, ring, nodes_of, of_cell, sign,
+                    star_start, star, place, hand, fluxes, prefix, bits, matrix, geometry, image,
                 )  # fmt: skip
                 if attempt == 0:
-                    values = (value, np.inf)
+                    forwards = value
                 elif attempt == 1:
-                    values = (values[0], value)
+                    backwards = value
                 if value < best:
-                    best, best_place = value, place
+                    best, best_there = value, there
                     trial, best_trial = best_trial, trial
-            ticks[node, axis] = best_place
-            if best_place != here:
+                    trial_fluxes, best_fluxes = best_fluxes, trial_fluxes
+            ticks[node, axis] = best_there
+            if best_there != here:
                 energy = best
                 for r in range(first, last):
-                    for k in range(3):
-                        sums[ring[r], k] = best_trial[r - first, k]
+                    for d in range(3):
+                        sums[ring[r], d] = best_trial[r - first, d]
                     E_G[ring[r]] = best_trial[r - first, 3]
+                for s in range(star_first, star_last):
+                    for d in range(3):
+                        fluxes[star[s], d] = best_fluxes[s - star_first, d]
 
 
 @njit(cache=True)
@@ -286,64 +272,46 @@ def _add_gradient(gradient: NDArray, x: NDArray, at: int, n_corners: int) -> flo
 
 @njit(cache=True, parallel=True)
 def _relocate(
-    ticks: NDArray,
-    cells: NDArray,
-    start: NDArray,
-    ring: NDArray,
-    is_frozen: NDArray,
-    E_G: NDArray,
-    nodes: NDArray,
-    bits: int,
-    matrix: NDArray,
-    projections: NDArray,
-) -> None:
+    ticks: NDArray, cells: NDArray, start: NDArray, ring: NDArray, is_frozen: NDArray, hand: int, E_G: NDArray,
+    nodes: NDArray, bits: int, matrix: NDArray, projections: NDArray,
+) -> None:  # fmt: skip
     n_corners = cells.shape[1]
     scale = 2.0**-bits
     for number in prange(len(nodes)):
         node = nodes[number]
         first, last = start[node], start[node + 1]
-        corner = np.empty((4, 3), dtype=np.int64)
         x = np.empty((4, 3))
-        normal = np.empty((4, 3), dtype=np.int64)
-        gradient = np.zeros(3)
-        step = np.empty(3)
+        gradient, step = np.zeros(3), np.empty(3)
         trial = np.empty(last - first)
-        _load(corner, x, ticks, cells, ring[first], matrix, scale)
-        hand = cell_orientation(corner, normal, n_corners)
-        energy = 0.0
-        ring_volume = 0.0
+        energy, ring_volume = 0.0, 0.0
         for r in range(first, last):
-            cell = ring[r]
-            energy += E_G[cell]
             at = 0
-            while cells[cell, at] != node:
+            while cells[ring[r], at] != node:
                 at += 1
-            _load(corner, x, ticks, cells, cell, matrix, scale)
+            _load(x, ticks, cells, ring[r], matrix, scale)
             ring_volume += _add_gradient(gradient, x, at, n_corners)
+            energy += E_G[ring[r]]
         project = projections[is_frozen[node, 0] + 2 * is_frozen[node, 1] + 4 * is_frozen[node, 2]]
         for d in range(3):  # E_G over the ring is |Omega| / (n+1) |x - minimiser|^2 + constant
             step[d] = -(project[d, 0] * gradient[0] + project[d, 1] * gradient[1] + project[d, 2] * gradient[2])
             step[d] *= n_corners / (2.0 * ring_volume)
         here = (ticks[node, 0], ticks[node, 1], ticks[node, 2])
-        is_moved = False
+        is_better = False
         for halving in range(HALVINGS + 1):
             for d in range(3):
                 ticks[node, d] = here[d] + np.int64(np.rint(step[d] * 0.5**halving / scale))
-            moved_energy = 0.0
+            moved = 0.0
             for r in range(first, last):
-                _load(corner, x, ticks, cells, ring[r], matrix, scale)
-                if cell_orientation(corner, normal, n_corners) != hand:
-                    moved_energy = np.inf
-                    break
+                _load(x, ticks, cells, ring[r], matrix, scale)
                 cell_volume, trial[r - first] = volume_and_E_G(x, n_corners)
-                if _is_flat(cell_volume, trial[r - first], n_corners):
-                    moved_energy = np.inf
+                if cell_orientation(ticks, cells, ring[r]) != hand or _is_flat(cell_volume, trial[r - first], n_corners):
+                    moved = np.inf
                     break
-                moved_energy += trial[r - first]
-            if moved_energy < energy:
-                is_moved = True
+                moved += trial[r - first]
+            is_better = moved < energy
+            if is_better:
                 break
-        if is_moved:
+        if is_better:
             for r in range(first, last):
                 E_G[ring[r]] = trial[r - first]
         else:

@@ -14,15 +14,17 @@ from tetopt.energy.geometric import cell_E_G
 from tetopt.energy.sampling import (
     SamplingGrid,
     check_orientations,
+    facet_fluxes,
     from_ticks,
     moment_sums,
     orientations,
     sampling_grid,
+    sums_of_fluxes,
     to_ticks,
 )
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import squared_edges, volumes
-from tetopt.geometry.topology import boundary_facets, facets, node_colours, rings
+from tetopt.geometry.topology import boundary_facets, facets, node_colours, rings, stars
 from tetopt.image import Image, transformed
 from tetopt.mesh import Mesh
 from tetopt.optimize.descent import FLAT, State, Weights, descend, relocate
@@ -161,7 +163,7 @@ def optimize(
         is_finished = _sweep(state, grid, matrix, weights, k_D, is_over)
         # 3. Measure.
         if k_D == 0.0:
-            state.sums[:] = moment_sums(grid, state.ticks, state.cells)
+            state.sums[:] = moment_sums(grid, state.ticks, state.cells, state.sides)
         movement = _relative_movement(before, state.ticks, image, grid, matrix)
         record(iteration, movement, is_new)
         if not is_finished:
@@ -217,7 +219,7 @@ def frozen_axes(
     half = 1 << (grid.bits - 1)
     is_on_box = np.zeros(len(facets_out), dtype=bool)
     for axis in range(3 - n, 3):
-        for side in (-half, (grid.volume.shape[axis] << grid.bits) - half):
+        for side in (-half, (grid.shape[axis] << grid.bits) - half):
             is_there = ticks[:, axis] == side
             facet_is_there = is_there[facets_out].all(axis=1)
             is_on_box |= facet_is_there
@@ -247,8 +249,13 @@ def _state(
 ) -> State:
     points = image.to_world(from_ticks(ticks, grid, image.ndim))
     cells = np.ascontiguousarray(cells, dtype=np.int64)
-    sums = moment_sums(grid, ticks, cells)
-    return State(ticks, cells, rings(cells, len(ticks)), is_frozen, sums, cell_E_G(points, cells))
+    around, sides = rings(cells, len(ticks)), facets(cells)
+    hand = 1 if np.linalg.det(image.affine[:-1, :-1]) > 0 else -1
+    fluxes = facet_fluxes(grid, ticks, sides.nodes)
+    sums = sums_of_fluxes(fluxes, sides, hand)
+    return State(
+        ticks, cells, around, sides, stars(sides, around), is_frozen, hand, sums, cell_E_G(points, cells), fluxes
+    )
 
 
 def _energies(state: State, image: Image) -> tuple[float, float]:
@@ -265,8 +272,7 @@ def _retessellated(image: Image, grid: SamplingGrid, state: State) -> State | No
     cells = delaunay(index, image.affine)
     if cells is None:
         return None
-    hand = 1 if np.linalg.det(image.affine[:-1, :-1]) > 0 else -1
-    if (orientations(state.ticks, cells) != hand).any() or is_flat(image.to_world(index), cells).any():
+    if (orientations(state.ticks, cells) != state.hand).any() or is_flat(image.to_world(index), cells).any():
         return None
     shared = facets(cells)
     if shared.n_cells.max() > 2:
@@ -287,7 +293,7 @@ def _is_on_box(ticks: NDArray[np.int64], nodes: NDArray[np.int64], grid: Samplin
     half = 1 << (grid.bits - 1)
     is_there = np.zeros(len(nodes), dtype=bool)
     for axis in range(3 - n, 3):
-        for side in (-half, (grid.volume.shape[axis] << grid.bits) - half):
+        for side in (-half, (grid.shape[axis] << grid.bits) - half):
             is_there |= (ticks[nodes, axis] == side).all(axis=1)
     return bool(is_there.all())
 
@@ -321,7 +327,7 @@ def _relative_movement(
     matrix: NDArray[np.float64],
 ) -> float:
     """|x^t - x^(t-1)| / |x^(t-1)| over all nodes, in mm, x from the box's centre; Fig. 1(c)."""
-    centre = np.array([(s - 1) * 0.5 for s in grid.volume.shape]) * 2.0**grid.bits
+    centre = np.array([(s - 1) * 0.5 for s in grid.shape]) * 2.0**grid.bits
     moved = transformed((after - before).astype(np.float64), matrix)
     place = transformed(before - centre, matrix)
     return float(np.sqrt((moved**2).sum() / (place**2).sum()))

@@ -35,7 +35,7 @@ def save_figure(figure: Figure, path: str | Path, dpi: int = 150) -> None:
 def save_run_figures(paths: Sequence[Path], image: Image, initial: Mesh, result: Optimized) -> None:
     """Three PNGs of a run: slice with mesh before and after, rho histograms before and after, energies."""
     first, last = result.history[0], result.history[-1]
-    fit = f"E_D {last.E_D / first.E_D:.3f} of it" if first.E_D > 0.0 else "constant image"
+    fit = f"{last.E_D / first.E_D:.3f} of its E_D" if first.E_D > 0.0 else "constant image"
     before = f"lattice, {len(initial.points)} nodes"
     after = f"optimised, {fit}"
     meshes = [(before, initial), (after, result.mesh)]
@@ -63,10 +63,12 @@ def slice_figure(
         over, flat = grid[:, column]
         view.show_pixels(over, limits)
         # Each line is shared by two polygons; drawn once a polygon it is simply drawn twice.
-        over.add_collection(PolyCollection(list(polygons), facecolors="none", edgecolors=MESH_LINE, linewidths=0.6))
+        width = min(0.6, 20.0 / np.sqrt(len(polygons)))  # points; thinner before the lines hide the image
+        over.add_collection(PolyCollection(list(polygons), facecolors="none", edgecolors=MESH_LINE, linewidths=width))
         over.set_title(title, fontsize=11)
         means = cell_moments(image, mesh).mean[cells]
-        painted = PolyCollection(list(polygons), array=means, cmap="gray", edgecolors="face", linewidths=0.3)
+        # Antialiased, each border would let the background shine through as a light seam.
+        painted = PolyCollection(list(polygons), array=means, cmap="gray", edgecolors="none", antialiaseds=False)
         painted.set_clim(*limits)
         flat.add_collection(painted)
         flat.set_title("mean of the image in each cell", fontsize=10)
@@ -160,7 +162,7 @@ def histogram_figure(meshes: Sequence[tuple[str, Mesh]]) -> Figure:
     axes.set_xlim(0.0, 1.0 / n * 1.02)
     axes.set_xlabel(f"rho = inradius / circumradius (1/{n} for a regular cell)")
     axes.set_ylabel("share of cells")
-    axes.legend(loc="upper left", fontsize=8, frameon=False)
+    figure.legend(loc="outside upper center", fontsize=8, frameon=False)  # above, where no bar can cross it
     return figure
 
 
@@ -191,6 +193,7 @@ def energy_figure(history: Sequence[Record]) -> Figure:
         )
     bottom.set_ylabel("relative movement")
     bottom.set_xlabel("iteration (shaded: connected anew)")
+    bottom.set_xlim(-0.5, iterations[-1] + 0.5)
     bottom.xaxis.get_major_locator().set_params(integer=True)
     for row in history:
         if row.is_retessellated:

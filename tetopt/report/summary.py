@@ -8,6 +8,7 @@ import platform
 from importlib.metadata import version
 from typing import Any
 
+import numba
 import numpy as np
 
 import tetopt
@@ -56,7 +57,7 @@ def run_summary(
     return {
         **about,
         "versions": versions(),
-        "machine": {"cores": os.cpu_count(), "system": platform.platform()},
+        "machine": {"cores": os.cpu_count(), "threads": numba.get_num_threads(), "system": platform.platform()},
         "image_properties": image_summary(image),
         "ended": result.ended,
         "iterations_done": last.iteration,

@@ -1,0 +1,211 @@
+"""Facets, rings, colours and components, against their twins and against the divergence theorem."""
+
+import naive
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from meshes import ALL_SMALL, FIVE_TET_CUBE, SQUARE, TWO_SQUARES, TWO_TETS, TWO_TRIANGLES, split_box
+
+from tetopt.geometry.simplex import volumes
+from tetopt.geometry.topology import boundary_facets, components, facets, largest_component, node_colours, rings
+
+pytestmark = pytest.mark.kernel
+
+seeds = st.integers(0, 2**32 - 1)
+dimensions = st.sampled_from([2, 3])
+
+
+def random_mesh(seed, n):
+    """A conforming mesh of a box, its nodes and cells in random order."""
+    rng = np.random.default_rng(seed)
+    points, cells = split_box(rng, (4,) * n, int(rng.integers(0, 12)))
+    order = rng.permutation(len(points))
+    place = np.argsort(order)
+    return points[order], rng.permutation(place[cells])
+
+
+# Rings
+
+
+@pytest.mark.parametrize("mesh", ALL_SMALL)
+def test_rings_of_small_meshes(mesh):
+    points, cells = mesh
+    around = rings(cells, len(points))
+    assert [around.cells[a:b].tolist() for a, b in zip(around.start, around.start[1:], strict=False)] == naive.rings(
+        cells, len(points)
+    )
+
+
+@given(seeds, dimensions)
+def test_rings_are_those_of_the_twin(seed, n):
+    points, cells = random_mesh(seed, n)
+    around = rings(cells, len(points) + 2)  # the last two nodes are in no cell
+    assert len(around.start) == len(points) + 3
+    listed = [around.cells[a:b].tolist() for a, b in zip(around.start, around.start[1:], strict=False)]
+    assert listed == naive.rings(cells, len(points) + 2)
+    assert listed[-2:] == [[], []]
+
+
+# Facets
+
+
+def test_facets_of_two_triangles():
+    found = facets(TWO_TRIANGLES[1])
+    assert found.nodes.tolist() == [[0, 1], [0, 2], [0, 3], [1, 2], [2, 3]]
+    assert found.cells.tolist() == [[1, -1], [0, 1], [0, -1], [1, -1], [0, -1]]
+    assert found.n_cells.tolist() == [1, 2, 1, 1, 1]
+
+
+@given(seeds, dimensions)
+def test_facets_are_those_of_the_twin(seed, n):
+    _, cells = random_mesh(seed, n)
+    found, twin = facets(cells), naive.facets(cells)
+    assert [tuple(row) for row in found.nodes.tolist()] == sorted(twin)
+    for nodes, sides, count in zip(found.nodes.tolist(), found.cells.tolist(), found.n_cells, strict=True):
+        assert [side for side in sides if side >= 0] == twin[tuple(nodes)]
+        assert count == len(twin[tuple(nodes)])
+
+
+def test_facets_of_cells_that_do_not_conform_are_counted():
+    """Three triangles on the edge 0 1."""
+    found = facets(np.array([[0, 1, 2], [0, 1, 3], [1, 0, 4]]))
+    assert found.nodes[0].tolist() == [0, 1]
+    assert found.n_cells.tolist() == [3, 1, 1, 1, 1, 1, 1]
+    assert found.cells[0].tolist() == [0, 1]
+    assert (found.cells[1:, 1] == -1).all()
+    assert [0, 1] not in np.sort(boundary_facets(np.array([[0, 1, 2], [0, 1, 3], [1, 0, 4]]))).tolist()
+
+
+# Boundary
+
+
+def enclosed_volume(points, outward):
+    """By the divergence theorem, 1/n times the integral of x . normal: sum of det(corners) / n!."""
+    n = points.shape[1]
+    return float(np.linalg.det(points[outward]).sum()) / (2 if n == 2 else 6)
+
+
+@pytest.mark.parametrize("mesh", ALL_SMALL)
+def test_boundary_facets_enclose_the_volume_of_small_meshes(mesh):
+    points, cells = mesh
+    assert enclosed_volume(points, boundary_facets(cells)) == pytest.approx(volumes(points, cells).sum(), rel=1e-14)
+
+
+@pytest.mark.parametrize("mesh", ALL_SMALL)
+def test_every_boundary_facet_has_its_cell_behind_it(mesh):
+    """Facet and opposite node make a simplex of negative volume, for every one: the node is on the inner side."""
+    points, cells = mesh
+    n = points.shape[1]
+    twin = naive.facets(cells)
+    outward = boundary_facets(cells)
+    assert sorted(tuple(sorted(row)) for row in outward.tolist()) == sorted(k for k in twin if len(twin[k]) == 1)
+    for facet in outward.tolist():
+        (cell,) = twin[tuple(sorted(facet))]
+        (opposite,) = set(cells[cell].tolist()) - set(facet)
+        # in 2-D the cell is to the left of its edge; in 3-D below a triangle seen counter-clockwise
+        side = naive.sign(naive.signed_volume(naive.exactly(points[[*facet, opposite]])))
+        assert side == (1 if n == 2 else -1)
+
+
+@given(seeds, dimensions)
+def test_boundary_facets_enclose_the_mesh(seed, n):
+    points, cells = random_mesh(seed, n)
+    outward = boundary_facets(cells)
+    assert enclosed_volume(points, outward) == pytest.approx(4.0**n, rel=1e-12)
+    twin = naive.facets(cells)
+    assert sorted(map(sorted, outward.tolist())) == sorted(list(k) for k, shared in twin.items() if len(shared) == 1)
+    # The boundary of a part of the mesh encloses that part.
+    part = cells[: max(1, len(cells) // 2)]
+    assert enclosed_volume(points, boundary_facets(part)) == pytest.approx(volumes(points, part).sum(), rel=1e-12)
+
+
+@given(seeds)
+def test_the_boundary_has_no_boundary(seed):
+    """Each edge of a closed surface is run through once in either direction."""
+    _, cells = random_mesh(seed, 3)
+    outward = boundary_facets(cells)
+    directed = {(a, b) for f in outward.tolist() for a, b in zip(f, f[1:] + f[:1], strict=True)}
+    assert len(directed) == 3 * len(outward)
+    assert directed == {(b, a) for a, b in directed}
+
+
+# Colours
+
+
+def test_colours_of_two_squares():
+    """Greedy by hand: 0 1 2 3 4 5 | 6 7."""
+    points, cells = TWO_SQUARES
+    assert node_colours(cells, rings(cells, len(points))).tolist() == [0, 1, 0, 1, 0, 1, 2, 2]
+
+
+@pytest.mark.parametrize("mesh", ALL_SMALL)
+def test_colours_of_small_meshes(mesh):
+    points, cells = mesh
+    assert node_colours(cells, rings(cells, len(points))).tolist() == naive.node_colours(cells, len(points))
+
+
+@given(seeds, dimensions)
+def test_colours_are_proper_and_those_of_the_twin(seed, n):
+    points, cells = random_mesh(seed, n)
+    around = rings(cells, len(points))
+    colours = node_colours(cells, around)
+    assert colours.tolist() == naive.node_colours(cells, len(points))
+    of_cells = np.sort(colours[cells], axis=1)
+    assert (np.diff(of_cells, axis=1) > 0).all()
+    neighbours = max(len({a for c in ring for a in cells[c].tolist()}) for ring in naive.rings(cells, len(points)))
+    assert colours.max() < neighbours
+    # Nodes of one colour have rings without a common cell.
+    for colour in range(colours.max() + 1):
+        touched = [cell for node in np.flatnonzero(colours == colour) for cell in naive.rings(cells, len(points))[node]]
+        assert len(touched) == len(set(touched))
+
+
+def test_a_node_without_cells_gets_colour_0():
+    assert node_colours(np.array([[0, 2, 3]]), rings(np.array([[0, 2, 3]]), 5)).tolist() == [0, 0, 1, 2, 0]
+
+
+def test_colours_take_32_bit_cells():
+    _, cells = SQUARE
+    small = cells.astype(np.int32)
+    np.testing.assert_array_equal(node_colours(small, rings(small, 5)), node_colours(cells, rings(cells, 5)))
+
+
+# Components
+
+
+def test_cells_that_share_only_a_node_are_not_connected():
+    assert components(np.array([[0, 1, 2], [2, 3, 4], [1, 2, 5]])).tolist() == [0, 1, 0]
+    # in 3-D an edge is not enough either
+    assert components(np.array([[0, 1, 2, 3], [2, 3, 4, 5]])).tolist() == [0, 1]
+    assert components(TWO_TETS[1]).tolist() == [0, 0]
+    assert components(FIVE_TET_CUBE[1]).tolist() == [0] * 5
+    assert components(FIVE_TET_CUBE[1][1:]).tolist() == [0, 1, 2, 3]
+
+
+@given(seeds, dimensions)
+def test_components_are_those_of_the_twin(seed, n):
+    _, cells = random_mesh(seed, n)
+    rng = np.random.default_rng(seed)
+    chosen = np.flatnonzero(rng.random(len(cells)) < 0.4)
+    chosen = chosen if len(chosen) else np.array([0])
+    assert components(cells[chosen]).tolist() == naive.components(cells[chosen])
+
+
+@given(seeds, dimensions)
+def test_largest_component_is_that_of_the_twin(seed, n):
+    _, cells = random_mesh(seed, n)
+    is_chosen = np.random.default_rng(seed).random(len(cells)) < 0.4
+    chosen = np.flatnonzero(is_chosen)
+    sets = {}
+    for cell, number in zip(chosen.tolist(), naive.components(cells[chosen]), strict=True):
+        sets.setdefault(number, []).append(cell)
+    expected = max(sets.values(), key=len, default=[])  # the first of equals
+    assert largest_component(cells, is_chosen).tolist() == expected
+
+
+def test_largest_component_of_nothing_is_empty_and_of_equals_the_first():
+    _, cells = FIVE_TET_CUBE
+    assert largest_component(cells, np.zeros(5, dtype=bool)).tolist() == []
+    assert largest_component(cells, np.array([False, True, True, True, True])).tolist() == [1]
+    assert largest_component(cells, np.array([True, False, True, False, True])).tolist() == [0, 2, 4]

@@ -1,0 +1,171 @@
+"""The image: its place in the world, what it holds, and every message."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from meshes import random_affine
+
+from tetopt import Image, InputError
+from tetopt.image import transformed
+
+seeds = st.integers(0, 2**32 - 1)
+dimensions = st.sampled_from([2, 3])
+
+OBLIQUE = np.array([[0.0, -2.0, 0.0, 10.0], [3.0, 0.0, 0.0, -20.0], [0.0, 0.0, -5.0, 30.0], [0, 0, 0, 1]])
+
+
+def test_sizes_of_a_flipped_and_turned_image():
+    image = Image(np.zeros((4, 5, 6)), OBLIQUE)
+    assert (image.ndim, image.shape) == (3, (4, 5, 6))
+    assert image.spacing.tolist() == [3, 2, 5]
+    assert image.voxel_volume == pytest.approx(30, rel=1e-15)
+    assert image.volume == pytest.approx(30 * 120, rel=1e-15)
+
+
+def test_sheared_voxels_have_the_parallelepiped_s_volume():
+    affine = np.array([[2.0, 1.0, 0], [0, 3.0, 0], [0, 0, 1]])
+    image = Image(np.zeros((2, 2)), affine)
+    assert image.voxel_volume == pytest.approx(6)
+    assert image.spacing == pytest.approx([2, np.sqrt(10)])
+
+
+def test_default_is_a_voxel_of_1_mm_with_its_centre_at_the_origin():
+    image = Image(np.zeros((3, 4)))
+    np.testing.assert_array_equal(image.affine, np.eye(3))
+    assert image.to_world([0, 0]).tolist() == [0, 0]
+    assert image.volume == 12
+
+
+def test_to_world_by_hand():
+    image = Image(np.zeros((4, 5, 6)), OBLIQUE)
+    assert image.to_world([1, 2, 3]).tolist() == [10 - 4, -20 + 3, 30 - 15]
+    assert image.to_index([6, -17, 15]).tolist() == [1, 2, 3]
+    assert image.to_world(np.zeros((2, 7, 3))).shape == (2, 7, 3)
+    assert image.to_index(np.zeros((0, 3))).shape == (0, 3)
+
+
+@given(seeds, dimensions)
+def test_to_index_inverts_to_world(seed, n):
+    rng = np.random.default_rng(seed)
+    image = Image(np.zeros((3,) * n), random_affine(rng, n))
+    index = rng.uniform(-50, 200, (20, n))
+    np.testing.assert_allclose(image.to_index(image.to_world(index)), index, atol=1e-10)
+    homogeneous = np.column_stack([index, np.ones(20)]) @ image.affine.T
+    np.testing.assert_allclose(image.to_world(index), homogeneous[:, :n], rtol=1e-12, atol=1e-12)
+
+
+@given(seeds, dimensions)
+def test_transformed_is_a_matrix_product_row_by_row(seed, n):
+    """To rounding; and a vector's result has the same bits alone and among others, which BLAS does not promise."""
+    rng = np.random.default_rng(seed)
+    matrix, vectors = rng.normal(size=(n, n)), rng.normal(size=(37, n))
+    product = transformed(vectors, matrix)
+    np.testing.assert_allclose(product, vectors @ matrix.T, rtol=1e-12, atol=1e-14)
+    for vector, row in zip(vectors, product, strict=True):
+        np.testing.assert_array_equal(transformed(vector, matrix), row)
+
+
+# What is held
+
+
+@pytest.mark.parametrize(
+    ("data", "held"),
+    [
+        (np.array([[0, 255]], dtype=np.uint8), np.float32),
+        (np.array([[-32768, 32767]], dtype=np.int16), np.float32),
+        (np.array([[True, False]]), np.float32),
+        (np.array([[0.5, 3e38]], dtype=np.float64), np.float64),  # 3e38 is not a float32
+        (np.array([[0.5, 2.0**120]], dtype=np.float64), np.float32),
+        (np.array([[2**24, 2**24 + 1]], dtype=np.int32), np.float64),
+        (np.array([[0.1, 0.2]], dtype=np.float64), np.float64),
+        (np.array([[0.1, 0.2]], dtype=np.float32), np.float32),
+        (np.array([[1e300, 0.0]], dtype=np.float64), np.float64),
+        (np.array([[0.5, 65504]], dtype=np.float16), np.float32),
+        (np.array([[1.0, 2.0]], dtype=">f4"), np.float32),
+        ([[1, 2], [3, 4]], np.float32),
+    ],
+)
+def test_values_are_kept_as_float32_where_that_loses_nothing(data, held):
+    image = Image(data)
+    assert image.data.dtype == held
+    assert image.data.dtype.isnative
+    np.testing.assert_array_equal(image.data, np.asarray(data))
+    assert image.data.flags.c_contiguous
+
+
+def test_arrays_are_copied_and_read_only():
+    data, affine = np.zeros((3, 3), dtype=np.float32), np.eye(3)
+    image = Image(data, affine)
+    data[:] = 7
+    affine[:] = 7
+    assert (image.data == 0).all()
+    np.testing.assert_array_equal(image.affine, np.eye(3))
+    with pytest.raises(ValueError, match="read-only"):
+        image.data[0, 0] = 1
+    with pytest.raises(ValueError, match="read-only"):
+        image.affine[0, 0] = 1
+    with pytest.raises(AttributeError):
+        image.data = data
+
+
+def test_fortran_order_and_negative_strides_are_read_right():
+    data = np.arange(24.0).reshape(2, 3, 4)
+    np.testing.assert_array_equal(Image(np.asfortranarray(data)).data, data)
+    np.testing.assert_array_equal(Image(data[::-1, :, ::-1]).data, data[::-1, :, ::-1])
+    np.testing.assert_array_equal(Image(data.T).data, data.T)
+
+
+# Messages
+
+
+@pytest.mark.parametrize(
+    ("data", "message"),
+    [
+        (np.zeros(5), "expected 2 or 3 axes"),
+        (np.float64(3), "expected 2 or 3 axes"),
+        (np.zeros((2, 2, 2, 2)), "expected 2 or 3 axes"),
+        (np.zeros((3, 0)), "every axis needs a voxel"),
+        (np.zeros((2, 2), dtype=complex), "magnitude"),
+        (np.zeros((2, 2), dtype=[("R", "u1"), ("G", "u1"), ("B", "u1")]), "RGB"),
+        (np.array([[None, 1], [2, 3]]), "one number a voxel"),
+        (np.array([["a", "b"]]), "expected numbers"),
+        (np.array([["2020-01-01"]], dtype="M8[D]"), "expected numbers"),
+    ],
+)
+def test_data_that_is_no_image_is_refused(data, message):
+    with pytest.raises(InputError, match=message):
+        Image(data)
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_the_first_voxel_that_is_not_finite_is_named(value):
+    data = np.zeros((3, 4))
+    data[1, 2] = data[2, 3] = value
+    with pytest.raises(InputError, match=r"2 voxels are NaN or infinite, the first at index \(1, 2\)"):
+        Image(data)
+
+
+@pytest.mark.parametrize(
+    ("affine", "message"),
+    [
+        (np.eye(4), r"expected shape \(3, 3\)"),
+        (np.eye(2), r"expected shape \(3, 3\)"),
+        (np.diag([1.0, np.nan, 1.0]), "finite"),
+        (np.diag([1.0, 2.0, 2.0]), "last row"),
+        (np.array([[1.0, 0, 0], [0, 1, 0], [0.1, 0, 1]]), "last row"),
+        (np.diag([1.0, 0.0, 1.0]), "singular"),
+        (np.array([[1.0, 2, 0], [2, 4, 0], [0, 0, 1]]), "singular"),
+        (np.array([[1.0, 1, 0], [1, 1 + 1e-7, 0], [0, 0, 1]]), "singular"),
+        ("affine", "array of numbers"),
+        ([[1, 2], [3]], "array of numbers"),
+    ],
+)
+def test_an_affine_that_places_nothing_is_refused(affine, message):
+    with pytest.raises(InputError, match=message):
+        Image(np.zeros((2, 2)), affine)
+
+
+def test_tiny_voxels_are_not_singular():
+    """Micrometres in metres: 1e-6 along every axis."""
+    assert Image(np.zeros((2, 2, 2)), np.diag([1e-6, 1e-6, 1e-6, 1.0])).voxel_volume == pytest.approx(1e-18)

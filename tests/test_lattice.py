@@ -1,0 +1,243 @@
+"""Lattices: the paper's counts, and what holds for every box and every affine."""
+
+from math import sqrt
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from meshes import random_affine
+
+from tetopt import Image, InputError, lattice
+from tetopt.geometry.simplex import dihedral_angles, rho, volumes
+from tetopt.geometry.topology import facets
+
+seeds = st.integers(0, 2**32 - 1)
+KINDS = [(2, "criss-cross"), (3, "bcc"), (3, "five-tet")]
+kinds = st.sampled_from(KINDS)
+BRAIN = Image(np.broadcast_to(np.float32(0), (182, 218, 182)), np.diag([1.0, 1.0, 1.0, 1.0]))
+
+
+def random_lattice(seed, n, kind):
+    rng = np.random.default_rng(seed)
+    shape = tuple(int(s) for s in rng.integers(1, 12, n))
+    image = Image(np.zeros(shape), random_affine(rng, n))
+    blocks = tuple(int(b) for b in rng.integers(1, 5, n))
+    return image, blocks, lattice(image, kind, blocks=blocks)
+
+
+# The paper's meshes
+
+
+def test_meshes_of_the_paper_s_figures():
+    """Fig. 2(a) and 3(c): 113 nodes, 196 triangles; Fig. 3(a): 128, 224; Fig. 3(e): 1078, 3900."""
+    for shape, blocks, kind, counts in [
+        ((70, 70), (7, 7), "criss-cross", (113, 196)),
+        ((80, 70), (8, 7), "criss-cross", (128, 224)),
+        ((130, 100, 60), (13, 10, 6), "five-tet", (1078, 3900)),
+    ]:
+        mesh = lattice(Image(np.zeros(shape, dtype=np.uint8)), kind, blocks=blocks)
+        assert (len(mesh.points), len(mesh.cells)) == counts
+
+
+@pytest.mark.parametrize(
+    ("shape", "kind", "nodes", "counts"),
+    [
+        ((70, 70), "criss-cross", 113, (113, 196)),
+        ((80, 70), "criss-cross", 128, (128, 224)),
+        ((130, 100, 60), "five-tet", 1078, (1078, 3900)),
+    ],
+)
+def test_the_paper_s_node_counts_find_its_meshes(shape, kind, nodes, counts):
+    mesh = lattice(Image(np.zeros(shape, dtype=np.uint8)), kind, nodes=nodes)
+    assert (len(mesh.points), len(mesh.cells)) == counts
+
+
+# Smallest lattices
+
+
+def test_one_square():
+    mesh = lattice(Image(np.zeros((3, 5))), blocks=(1, 1))
+    assert mesh.points.tolist() == [[-0.5, -0.5], [-0.5, 4.5], [2.5, -0.5], [2.5, 4.5], [1, 2]]
+    assert sorted(map(sorted, mesh.cells.tolist())) == [[0, 1, 4], [0, 2, 4], [1, 3, 4], [2, 3, 4]]
+    assert volumes(mesh.points, mesh.cells) == pytest.approx([15 / 4] * 4)
+
+
+def test_one_cube_in_five():
+    mesh = lattice(Image(np.zeros((2, 2, 2))), "five-tet", blocks=(1, 1, 1))
+    assert len(mesh.points) == 8
+    assert np.sort(volumes(mesh.points, mesh.cells)) == pytest.approx(8 * np.array([1, 1, 1, 1, 2]) / 6)
+
+
+def test_one_cube_of_bcc_is_twelve_congruent_cells():
+    mesh = lattice(Image(np.zeros((2, 2, 2))), "bcc", blocks=(1, 1, 1))
+    assert (len(mesh.points), len(mesh.cells)) == (9, 12)
+    assert volumes(mesh.points, mesh.cells) == pytest.approx([8 / 12] * 12)
+    angles = np.sort(dihedral_angles(mesh.points, mesh.cells), axis=1)
+    np.testing.assert_allclose(angles, np.broadcast_to(angles[0], angles.shape))
+
+
+# For every box
+
+
+@given(seeds, kinds)
+def test_every_lattice_is_a_mesh_of_its_box(seed, dimension_and_kind):
+    """Volume, conformity, boundary on the box, no unused node, no flat cell."""
+    n, kind = dimension_and_kind
+    image, blocks, mesh = random_lattice(seed, n, kind)
+    v = volumes(mesh.points, mesh.cells)
+    assert v.sum() == pytest.approx(image.volume, rel=1e-12)
+    per_block = {"criss-cross": 4, "five-tet": 5, "bcc": 12}[kind]
+    assert v.min() > 0.3 * image.volume / np.prod(blocks) / per_block
+    corners = np.prod(np.array(blocks) + 1)
+    assert len(mesh.points) == corners + (0 if kind == "five-tet" else np.prod(blocks))
+    if kind != "bcc":
+        assert len(mesh.cells) == per_block * np.prod(blocks)
+    assert np.unique(mesh.cells).tolist() == list(range(len(mesh.points)))
+    assert len(np.unique(np.sort(mesh.cells, axis=1), axis=0)) == len(mesh.cells)
+    found = facets(mesh.cells)
+    assert found.n_cells.max() <= 2
+    index = image.to_index(mesh.points)
+    of_boundary = index[found.nodes[found.n_cells == 1]]  # (B, n, n)
+    low, high = -0.5, np.array(image.shape) - 0.5
+    is_on_box = (np.abs(of_boundary - low) < 1e-9).all(axis=1) | (np.abs(of_boundary - high) < 1e-9).all(axis=1)
+    assert is_on_box.any(axis=1).all()
+    assert (index.min(axis=0) == pytest.approx([low] * n, abs=1e-9)) and index.max(axis=0) == pytest.approx(high)
+
+
+@given(seeds, kinds)
+def test_nodes_are_blocks_corners_and_centres(seed, dimension_and_kind):
+    n, kind = dimension_and_kind
+    image, blocks, mesh = random_lattice(seed, n, kind)
+    in_blocks = (image.to_index(mesh.points) + 0.5) / image.shape * blocks
+    doubled = np.round(2 * in_blocks)
+    np.testing.assert_allclose(2 * in_blocks, doubled, atol=1e-8)
+    is_corner, is_centre = (doubled % 2 == 0).all(axis=1), (doubled % 2 == 1).all(axis=1)
+    assert (is_corner | is_centre).all()
+    assert is_centre.sum() == (0 if kind == "five-tet" else np.prod(blocks))
+    assert len(np.unique(doubled, axis=0)) == len(doubled)
+
+
+# Shapes on cubes
+
+
+def test_shapes_of_bcc_on_cubes():
+    """Inside every cell has angles 60 (4) and 90 (2) and rho sqrt(10)/10; at the box none is under 45 degrees."""
+    mesh = lattice(Image(np.zeros((6, 4, 5)), np.diag([2.0, 2, 2, 1])), "bcc", blocks=(6, 4, 5))
+    is_centre = np.arange(len(mesh.points)) >= 7 * 5 * 6
+    is_inside = is_centre[mesh.cells].sum(axis=1) == 2
+    assert is_inside.sum() == 4 * (5 * 4 * 5 + 6 * 3 * 5 + 6 * 4 * 4)
+    assert len(mesh.cells) - is_inside.sum() == 2 * 2 * (6 * 4 + 4 * 5 + 5 * 6)
+    angles = np.sort(dihedral_angles(mesh.points, mesh.cells), axis=1)
+    np.testing.assert_allclose(angles[is_inside], np.tile([60.0] * 4 + [90.0] * 2, (is_inside.sum(), 1)), rtol=1e-13)
+    np.testing.assert_allclose(rho(mesh.points, mesh.cells)[is_inside], sqrt(10) / 10, rtol=1e-13)
+    assert round(sqrt(10) / 10, 4) == 0.3162
+    assert angles.min() == pytest.approx(45, rel=1e-13)
+    assert angles.max() == pytest.approx(120, rel=1e-13)
+
+
+def test_shapes_of_five_tet_on_cubes():
+    """A fifth of the cells is regular, the others are the cube's corners."""
+    mesh = lattice(Image(np.zeros((3, 2, 4))), "five-tet", blocks=(3, 2, 4))
+    found = np.sort(rho(mesh.points, mesh.cells))
+    assert found[:96] == pytest.approx([2 / (3 + 3 * sqrt(3))] * 96)
+    assert found[96:] == pytest.approx([1 / 3] * 24)
+
+
+def test_shapes_of_criss_cross_on_squares():
+    mesh = lattice(Image(np.zeros((3, 2))), blocks=(3, 2))
+    assert rho(mesh.points, mesh.cells) == pytest.approx([sqrt(2) - 1] * 24)
+
+
+# Sizes
+
+
+@pytest.mark.parametrize("kind", ["bcc", "five-tet"])
+@pytest.mark.parametrize(
+    ("nodes", "share"), [(100, 0.1), (250, 0.1), (500, 0.1), (1000, 0.06), (2048, 0.06), (5000, 0.03), (14000, 0.03)]
+)
+def test_node_counts_on_a_brain(kind, nodes, share):
+    """A few hundred nodes leave few lattices of cubes to choose from; from some thousands 3 % are kept."""
+    mesh = lattice(BRAIN, kind, nodes=nodes)
+    assert abs(len(mesh.points) - nodes) <= share * nodes
+
+
+@given(seeds, st.integers(1000, 6000), st.sampled_from(["bcc", "five-tet"]))
+def test_node_counts_on_boxes_like_brains(seed, nodes, kind):
+    """Voxels of unequal edges; counts within 6 %, and blocks stay near cubes."""
+    rng = np.random.default_rng(seed)
+    lengths = np.array([180.0, 218, 182]) * rng.uniform(0.85, 1.15, 3)
+    shape = rng.integers(20, 40, 3)
+    image = Image(np.zeros(shape, dtype=np.uint8), np.diag([*(lengths / shape), 1.0]))
+    mesh = lattice(image, kind, nodes=nodes)
+    assert abs(len(mesh.points) - nodes) <= 0.06 * nodes
+    number = len(mesh.points) if kind == "five-tet" else -(-len(mesh.points) // 2)
+    corners = mesh.points[: number + 1]  # all are corners, the last ones may be left out
+    edges = [np.diff(np.unique(np.round(corners[:, d], 6))).max() for d in range(3)]
+    assert max(edges) / min(edges) < 1.4
+
+
+@given(seeds, kinds)
+def test_the_count_asked_for_is_found_where_cubes_have_it(seed, dimension_and_kind):
+    """A box of b blocks that are exact cubes is cut into them when asked for their number of nodes."""
+    n, kind = dimension_and_kind
+    blocks = tuple(int(b) for b in np.random.default_rng(seed).integers(3, 12, n))
+    image = Image(np.zeros(tuple(2 * b for b in blocks), dtype=np.uint8))
+    wanted = lattice(image, kind, blocks=blocks)
+    found = lattice(image, kind, nodes=len(wanted.points))
+    assert abs(len(found.points) - len(wanted.points)) <= 0.03 * len(wanted.points)
+    np.testing.assert_array_equal(found.points, wanted.points)
+
+
+@pytest.mark.parametrize(("n", "kind"), KINDS)
+def test_fewest_nodes(n, kind):
+    image = Image(np.zeros((5,) * n))
+    fewest = {"criss-cross": 5, "bcc": 9, "five-tet": 8}[kind]
+    assert len(lattice(image, kind, nodes=fewest).points) == fewest
+    with pytest.raises(InputError, match=f"nodes must lie between {fewest} and 50000000"):
+        lattice(image, kind, nodes=fewest - 1)
+
+
+def test_spacing_is_in_mm_and_the_nearest_that_divides_the_box():
+    image = Image(np.zeros((10, 20, 6)), np.diag([-2.0, 0.5, 5.0, 1.0]))  # 20 x 10 x 30 mm
+    for spacing, blocks in [(5.0, (4, 2, 6)), (4.0, (5, 2, 8)), (7.0, (3, 1, 4)), (100.0, (1, 1, 1)), (9.9, (2, 1, 3))]:
+        mesh = lattice(image, "five-tet", spacing=spacing)
+        np.testing.assert_array_equal(mesh.points, lattice(image, "five-tet", blocks=blocks).points)
+
+
+def test_default_kinds():
+    cube, square = Image(np.zeros((4, 4, 4))), Image(np.zeros((4, 4)))
+    for image, kind in ((cube, "bcc"), (square, "criss-cross")):
+        blocks = (2,) * image.ndim
+        np.testing.assert_array_equal(lattice(image, blocks=blocks).cells, lattice(image, kind, blocks=blocks).cells)
+
+
+# Messages
+
+
+@pytest.mark.parametrize(
+    ("shape", "kind", "size", "message"),
+    [
+        ((4, 4), "bcc", {"nodes": 50}, "expected one of criss-cross in 2-D, got 'bcc'"),
+        ((4, 4, 4), "criss-cross", {"nodes": 50}, "expected one of bcc, five-tet in 3-D, got 'criss-cross'"),
+        ((4, 4, 4), "BCC", {"nodes": 50}, "got 'BCC'"),
+        ((4, 4, 4), None, {}, "exactly one of nodes, spacing and blocks"),
+        ((4, 4, 4), None, {"nodes": 50, "spacing": 1.0}, "exactly one"),
+        ((4, 4, 4), None, {"nodes": 50, "blocks": (1, 1, 1)}, "exactly one"),
+        ((4, 4, 4), None, {"nodes": 0}, "nodes must lie between 9"),
+        ((4, 4, 4), None, {"nodes": -5}, "nodes must lie between 9"),
+        ((4, 4, 4), None, {"nodes": 10**9}, "nodes must lie between 9"),
+        ((4, 4, 4), None, {"spacing": 0.0}, "spacing must be a length above 0 mm"),
+        ((4, 4, 4), None, {"spacing": -1.0}, "spacing must be a length above 0 mm"),
+        ((4, 4, 4), None, {"spacing": np.nan}, "spacing must be a length above 0 mm"),
+        ((4, 4, 4), None, {"spacing": np.inf}, "spacing must be a length above 0 mm"),
+        ((4, 4, 4), None, {"spacing": 1e-3}, "more than 50000000; ask for fewer"),
+        ((4, 4, 4), None, {"blocks": (2, 2)}, "blocks must be 3 whole numbers"),
+        ((4, 4, 4), None, {"blocks": (2, 2, 0)}, "blocks must be 3 whole numbers"),
+        ((4, 4, 4), None, {"blocks": (2, 2, 1.5)}, "blocks must be 3 whole numbers"),
+        ((4, 4, 4), None, {"blocks": (1000, 1000, 1000)}, "more than 50000000"),
+    ],
+)
+def test_sizes_and_kinds_that_no_lattice_has_are_refused(shape, kind, size, message):
+    with pytest.raises(InputError, match=message):
+        lattice(Image(np.zeros(shape)), kind, **size)

@@ -1,0 +1,77 @@
+"""The mesh: what is accepted, what is held, and every message."""
+
+import numpy as np
+import pytest
+from meshes import ALL_SMALL, BAD_TETS, REGULAR_TET, SQUARE, single
+
+from tetopt import InputError, Mesh
+
+TRIANGLE = [[0, 0], [1, 0], [0, 1]]
+
+
+@pytest.mark.parametrize("arrays", ALL_SMALL)
+def test_small_meshes_are_held_as_given(arrays):
+    points, cells = arrays
+    mesh = Mesh(points, cells)
+    assert mesh.ndim == points.shape[1]
+    np.testing.assert_array_equal(mesh.points, points)
+    np.testing.assert_array_equal(mesh.cells, cells)
+
+
+@pytest.mark.parametrize("kind", BAD_TETS)
+def test_very_thin_cells_are_a_mesh(kind):
+    assert len(Mesh(*single(BAD_TETS[kind](1e-9))).cells) == 1
+
+
+def test_lists_and_small_types_become_float64_and_int64():
+    mesh = Mesh(np.array(TRIANGLE, dtype=np.float32), np.array([[0, 1, 2]], dtype=np.uint8))
+    assert mesh.points.dtype == np.float64
+    assert mesh.cells.dtype == np.int64
+    assert Mesh(TRIANGLE, [[0, 1, 2]]).cells.tolist() == [[0, 1, 2]]
+
+
+def test_arrays_are_copied_contiguous_and_read_only():
+    points, cells = np.asfortranarray(SQUARE[0]), np.asfortranarray(SQUARE[1])
+    mesh = Mesh(points, cells)
+    points[:] = 0
+    cells[:] = 0
+    np.testing.assert_array_equal(mesh.points, SQUARE[0])
+    np.testing.assert_array_equal(mesh.cells, SQUARE[1])
+    assert mesh.points.flags.c_contiguous
+    assert mesh.cells.flags.c_contiguous
+    with pytest.raises(ValueError, match="read-only"):
+        mesh.points[0, 0] = 1
+    with pytest.raises(ValueError, match="read-only"):
+        mesh.cells[0, 0] = 1
+    with pytest.raises(AttributeError):
+        mesh.points = points
+
+
+def test_unused_nodes_are_allowed():
+    assert len(Mesh([*TRIANGLE, [5, 5]], [[0, 1, 2]]).points) == 4
+
+
+@pytest.mark.parametrize(
+    ("points", "cells", "message"),
+    [
+        (np.zeros((4, 4)), [[0, 1, 2, 3]], r"expected shape \(N, 2\) or \(N, 3\), got \(4, 4\)"),
+        (np.zeros(4), [[0, 1, 2]], r"expected shape \(N, 2\) or \(N, 3\), got \(4,\)"),
+        (TRIANGLE, [[0, 1]], r"expected shape \(M, 3\)"),
+        (TRIANGLE, [0, 1, 2], r"expected shape \(M, 3\)"),
+        (TRIANGLE, [[0, 1, 2, 2]], r"expected shape \(M, 3\)"),
+        (TRIANGLE, np.empty((0, 3), dtype=int), "M > 0"),
+        (TRIANGLE, [[0.0, 1.0, 2.0]], "expected integers, got float64"),
+        (TRIANGLE, [[True, False, True]], "expected integers, got bool"),
+        (TRIANGLE, [[0, 1, 3]], r"indices must lie in 0\.\.2, got 0\.\.3"),
+        (TRIANGLE, [[-1, 1, 2]], r"indices must lie in 0\.\.2, got -1\.\.2"),
+        ([[0, 0], [1, np.nan], [0, 1]], [[0, 1, 2]], r"node 1 is \[1\.0, nan\]"),
+        ([[0, 0], [1, 0], [np.inf, 1]], [[0, 1, 2]], r"node 2 is \[inf, 1\.0\]"),
+        (TRIANGLE, [[0, 1, 2], [0, 2, 1]], r"1 of 2 are flat or inverted, the first are \[1\]"),
+        (TRIANGLE, [[0, 1, 1]], "1 of 1 are flat or inverted"),
+        ([[0, 0], [1, 1], [2, 2]], [[0, 1, 2]], "1 of 1 are flat or inverted"),
+        (REGULAR_TET[0], [[1, 0, 2, 3]] * 7, r"7 of 7 are flat or inverted, the first are \[0, 1, 2, 3, 4\]"),
+    ],
+)
+def test_what_is_no_mesh_is_refused(points, cells, message):
+    with pytest.raises(InputError, match=message):
+        Mesh(points, cells)
