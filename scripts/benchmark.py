@@ -27,6 +27,7 @@ import tetopt
 from tetopt.cli import nilearn_t1
 from tetopt.energy.sampling import from_ticks, moment_sums, sampling_grid, to_ticks
 from tetopt.geometry.simplex import oriented, rho, volumes
+from tetopt.geometry.topology import facets
 from tetopt.io.files import checked_output, save_json
 from tetopt.optimize.retessellate import delaunay
 from tetopt.report.summary import versions
@@ -90,7 +91,9 @@ def compile_seconds() -> tuple[float, float]:
     with tempfile.TemporaryDirectory() as cache:
         environment = os.environ | {"NUMBA_CACHE_DIR": cache}
         times = [
-            float(subprocess.run([sys.executable, "-c", program], env=environment, check=True, capture_output=True).stdout)
+            float(
+                subprocess.run([sys.executable, "-c", program], env=environment, check=True, capture_output=True).stdout
+            )
             for _ in range(2)
         ]
     return times[0], times[1]
@@ -105,9 +108,13 @@ def sampling(image: tetopt.Image, nodes: int) -> dict[str, Any]:
     tessellation = Delaunay(shaken)
     cells = oriented(shaken, tessellation.simplices)
     cells = cells[volumes(shaken, cells) > 1e-9]
+    cells = cells[np.lexsort(np.sort(cells, axis=1).T[::-1])]  # as tetopt's own meshes are: neighbours near each other
+    sides = facets(cells)
     grid = sampling_grid(image, shaken)
     ticks = to_ticks(image.to_index(shaken), grid)
-    ours = best_seconds(lambda: moment_sums(grid, ticks, cells))
+    ours = best_seconds(lambda: moment_sums(grid, ticks, cells, sides))
+    ours_and_facets = best_seconds(lambda: moment_sums(grid, ticks, cells))
+    ours_at_once = best_seconds(lambda: tetopt.cell_moments(image, tetopt.Mesh(shaken, cells)))
 
     centres = image.to_world(np.stack(np.meshgrid(*map(np.arange, image.shape), indexing="ij"), -1).reshape(-1, 3))
     begin = time.perf_counter()
@@ -119,6 +126,8 @@ def sampling(image: tetopt.Image, nodes: int) -> dict[str, Any]:
         "sampling_voxels_per_second": image.data.size / ours,
         "find_simplex_voxels_per_second": image.data.size / theirs,
         "sampling_over_find_simplex": theirs / ours,
+        "sampling_and_facets_over_find_simplex": theirs / ours_and_facets,
+        "cell_moments_over_find_simplex": theirs / ours_at_once,
         "sampling_over_numpy_sums": ours / total,
     }
 
@@ -157,9 +166,13 @@ def show(rows: dict[str, Any]) -> None:
     print(f"{rows['image']}, {rows['cores']} cores, {rows['threads']} threads")
     print(f"  first call (compiling)            {rows['compile_seconds']:10.1f} s")
     print(f"  first call (cached kernels)       {rows['load_seconds']:10.1f} s")
-    print(f"  sampling, {rows['sampling_cells']:7d} tets          {rows['sampling_voxels_per_second'] / 1e6:10.1f} Mvoxel/s")
+    print(
+        f"  sampling, {rows['sampling_cells']:7d} tets          {rows['sampling_voxels_per_second'] / 1e6:10.1f} Mvoxel/s"
+    )
     print(f"  scipy find_simplex, the same      {rows['find_simplex_voxels_per_second'] / 1e6:10.2f} Mvoxel/s")
-    print(f"  ratio                             {rows['sampling_over_find_simplex']:10.0f}")
+    print(f"  ratio, facets known as in a run   {rows['sampling_over_find_simplex']:10.0f}")
+    print(f"  ratio, facets found anew          {rows['sampling_and_facets_over_find_simplex']:10.0f}")
+    print(f"  ratio, cell_moments from scratch  {rows['cell_moments_over_find_simplex']:10.0f}")
     for row in rows["paper"]:
         print(
             f"  --method paper, {row['nodes']:6d} nodes      {row['seconds_per_iteration']:10.2f} s an iteration, "

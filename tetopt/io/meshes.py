@@ -99,15 +99,16 @@ def load_mesh(path: str | Path) -> MeshFile:
     n = _dimension(path, grid)
     cells = np.asarray(grid.cells_dict[np.uint8(CELL_TYPES[n])], dtype=np.int64)
     points = np.asarray(grid.points, dtype=np.float64)
-    if n == 2 and np.any(points[:, 2] != 0.0):
-        raise InputError(f"{path}: a mesh of triangles must lie in the plane z = 0; surfaces in space are not meshed")
     if cells.min() < 0 or cells.max() >= len(points):
         raise InputError(
             f"{path}: its cells use nodes {cells.min()}..{cells.max()}, it holds 0..{len(points) - 1}; damaged?"
         )
     used, compact = np.unique(cells, return_inverse=True)
+    if n == 2 and np.any(points[used, 2] != 0.0):
+        raise InputError(f"{path}: a mesh of triangles must lie in the plane z = 0; surfaces in space are not meshed")
     points, cells = points[used, :n], compact.reshape(cells.shape)
-    turned = oriented(points, cells)
+    with np.errstate(invalid="ignore"):  # infinite coordinates, which Mesh refuses in words
+        turned = oriented(points, cells)
     try:
         mesh = Mesh(points, turned)
     except InputError as error:

@@ -304,7 +304,8 @@ def _relocate(
             for r in range(first, last):
                 _load(x, ticks, cells, ring[r], matrix, scale)
                 cell_volume, trial[r - first] = volume_and_E_G(x, n_corners)
-                if cell_orientation(ticks, cells, ring[r]) != hand or _is_flat(cell_volume, trial[r - first], n_corners):
+                is_flat = _is_flat(cell_volume, trial[r - first], n_corners)
+                if is_flat or cell_orientation(ticks, cells, ring[r]) != hand:
                     moved = np.inf
                     break
                 moved += trial[r - first]

@@ -1,0 +1,487 @@
+"""Voxels to cells: the contract to the last voxel, against rational arithmetic, and what follows from it."""
+
+from itertools import permutations
+
+import naive
+import numba
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from meshes import TWO_TRIANGLES, delaunay_box, random_affine, random_rotation, split_box
+
+from tetopt import Image, InputError, Mesh, cell_moments, cell_of_voxel, lattice
+from tetopt.energy.sampling import (
+    from_ticks,
+    moment_sums,
+    nearest_values,
+    orientations,
+    sampling_grid,
+    to_ticks,
+)
+from tetopt.geometry.simplex import oriented
+
+pytestmark = pytest.mark.kernel
+
+seeds = st.integers(0, 2**32 - 1)
+dimensions = st.sampled_from([2, 3])
+SMALL = 1.0 if naive.IS_COMPILED else 0.5  # of the sizes, where the kernels run as plain Python
+
+
+def random_image(rng, shape, affine=None):
+    """Noise around a large mean, in float32 or float64."""
+    data = rng.normal(1000.0, 50.0, shape)
+    return Image(data.astype(np.float32) if rng.random() < 0.5 else data, affine)
+
+
+def placed(image, index, cells):
+    """The mesh of nodes given in index coordinates, whatever the affine's hand."""
+    points = image.to_world(index)
+    return Mesh(points, oriented(points, cells))
+
+
+def random_case(seed, n, *, is_snapped):
+    """A random image and a conforming mesh of its box."""
+    rng = np.random.default_rng(seed)
+    shape = tuple(int(s) for s in rng.integers(1, 9 if n == 2 else 6, n))
+    image = random_image(rng, shape, random_affine(rng, n))
+    n_nodes = int(rng.integers(0, 16 if n == 2 else 8))
+    if is_snapped:
+        return image, placed(image, *split_box(rng, shape, n_nodes, rng.choice([0.5, 0.25])))
+    return image, placed(image, *delaunay_box(rng, shape, n_nodes))
+
+
+# The rule of ties, by hand
+
+
+@pytest.mark.parametrize("size", [1, 2, 5, 8])
+def test_centres_on_the_diagonal_of_a_square_go_up(size):
+    """TWO_TRIANGLES over the box, cell 0 where j > i: shifted by (eps^2, eps), centres with j = i join it."""
+    image = Image(np.zeros((size, size)))
+    mesh = placed(image, TWO_TRIANGLES[0] * size - 0.5, TWO_TRIANGLES[1])
+    i, j = np.indices((size, size))
+    np.testing.assert_array_equal(cell_of_voxel(image, mesh), np.where(j >= i, 0, 1))
+
+
+def test_centres_on_the_walls_of_a_cube_s_six_cells():
+    """The cell of axes (a, b, c) holds x_a > x_b > x_c; among equal indices the shift makes the last axis largest."""
+    image = Image(np.zeros((5, 5, 5)))
+    mesh = placed(image, *split_box(np.random.default_rng(0), (5, 5, 5), 0))
+    number = {axes: cell for cell, axes in enumerate(permutations(range(3)))}
+    owner = cell_of_voxel(image, mesh)
+    for voxel, cell in np.ndenumerate(owner):
+        assert cell == number[tuple(sorted(range(3), key=lambda axis: (voxel[axis], axis), reverse=True))]
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_a_centre_on_a_node_goes_to_one_of_its_cells(n):
+    """One voxel, one block of lattice, its middle node on the centre: the cell on the positive side of the last axis."""
+    image = Image(np.zeros((1,) * n))
+    mesh = lattice(image, blocks=(1,) * n)
+    counts = cell_moments(image, mesh).n_voxels
+    assert counts.sum() == 1
+    owner = int(cell_of_voxel(image, mesh).item())
+    assert counts[owner] == 1
+    corners = mesh.points[mesh.cells[owner]]
+    assert (corners[:, -1] >= 0).all()
+
+
+# The twin
+
+
+@given(seeds, dimensions)
+def test_owners_on_snapped_meshes_are_the_twin_s(seed, n):
+    """Nodes on centres, corners and halves of voxels: every kind of tie."""
+    image, mesh = random_case(seed, n, is_snapped=True)
+    np.testing.assert_array_equal(cell_of_voxel(image, mesh), naive.cell_of_voxel(image, mesh))
+
+
+@given(seeds, dimensions)
+def test_owners_on_random_meshes_are_the_twin_s(seed, n):
+    image, mesh = random_case(seed, n, is_snapped=False)
+    np.testing.assert_array_equal(cell_of_voxel(image, mesh), naive.cell_of_voxel(image, mesh))
+
+
+@pytest.mark.parametrize(
+    ("shape", "kind", "blocks"),
+    [
+        ((6, 6), "criss-cross", (3, 3)),
+        ((7, 5), "criss-cross", (2, 5)),
+        ((4, 4, 4), "bcc", (2, 2, 2)),
+        ((4, 4, 4), "five-tet", (2, 2, 2)),
+        ((5, 3, 4), "bcc", (1, 1, 2)),
+        ((3, 3, 3), "bcc", (3, 3, 3)),
+        ((3, 2, 3), "five-tet", (3, 2, 3)),
+        ((2, 2, 2), "bcc", (3, 3, 3)),  # blocks under a voxel
+    ],
+)
+def test_owners_on_lattices_are_the_twin_s(shape, kind, blocks):
+    image = Image(np.zeros(shape))
+    mesh = lattice(image, kind, blocks=blocks)
+    owner = cell_of_voxel(image, mesh)
+    np.testing.assert_array_equal(owner, naive.cell_of_voxel(image, mesh))
+    assert (owner >= 0).all()
+
+
+@given(seeds, dimensions)
+def test_owners_near_a_tie_are_the_twin_s(seed, n):
+    """Nodes a few ticks off the halves: floats cannot tell, integers must."""
+    rng = np.random.default_rng(seed)
+    shape = (4,) * n
+    image = Image(np.zeros(shape))
+    index, cells = split_box(rng, shape, 5)
+    bits = sampling_grid(image, index).bits
+    is_inside = ((index > -0.5) & (index < np.array(shape) - 0.5)).all(axis=1, keepdims=True)
+    index = index + is_inside * rng.integers(-2, 3, index.shape) * 2.0**-bits
+    ticks = to_ticks(index, sampling_grid(image, index))
+    cells = cells[orientations(ticks, cells) == 1]  # the shift may turn the thinnest cells over
+    mesh = placed(image, index, cells)
+    np.testing.assert_array_equal(
+        cell_of_voxel(image, mesh), painted(naive.owners(image, mesh), shape)
+    )
+
+
+def painted(owners, shape):
+    """The last of the cells that hold each voxel, as the package paints them; overlaps are the test's own doing."""
+    owner = np.full(shape, -1)
+    for voxel, cells in owners.items():
+        if cells:
+            owner[voxel] = cells[-1]
+    return owner
+
+
+@given(seeds, dimensions)
+def test_owners_in_cells_far_larger_than_the_image_are_the_twin_s(seed, n):
+    """A mesh that reaches 30,000 voxels around: fewer bits, faces almost parallel to rows, and still exact."""
+    rng = np.random.default_rng(seed)
+    image = random_image(rng, (5, 4, 3)[:n])
+    points = np.vstack([rng.uniform(-3e4, 3e4, (8, n)), rng.uniform(-1, 5, (4, n))])
+    try:
+        index, cells = points, delaunay_of(points)
+        mesh = placed(image, index, cells)
+        owner = cell_of_voxel(image, mesh)
+    except InputError:
+        return  # a cell flat to within a tick
+    np.testing.assert_array_equal(owner, naive.cell_of_voxel(image, mesh))
+
+
+def delaunay_of(points):
+    from scipy.spatial import Delaunay
+
+    return oriented(points, Delaunay(points).simplices)
+
+
+@given(seeds, dimensions)
+def test_orientations_are_exact(seed, n):
+    """Simplices of the largest coordinates, 2^28, and of volumes down to one unit, against whole numbers of any size."""
+    rng = np.random.default_rng(seed)
+    reach = 2 ** int(rng.integers(2, 29))
+    ticks = np.zeros((40, 3), dtype=np.int64)
+    ticks[:, 3 - n :] = rng.integers(-reach, reach, (40, n), endpoint=True)
+    ticks[:8] = reach * np.sign(ticks[:8])  # corners of the range
+    cells = np.array([rng.permutation(40)[: n + 1] for _ in range(30)])
+    for cell in cells[:20]:  # the last node all but on the plane of the others
+        flat = ticks[cell[:n]].astype(np.float64)
+        weights = rng.dirichlet(np.ones(n))
+        ticks[cell[n], 3 - n :] = np.rint(weights @ flat)[3 - n :] + rng.integers(-1, 2, n)
+    ticks = np.clip(ticks, -reach, reach)
+    expected = naive.orientations([ticks[cell, 3 - n :].tolist() for cell in cells])
+    assert orientations(ticks, cells).tolist() == expected
+
+
+def test_orientations_of_volumes_of_one_unit():
+    """p, q and r = p + q span the same plane with 2^28 as with 1; one tick off it is seen, by its sign."""
+    m = 2**28
+    ticks = np.array([[-m, -m, -m], [m, m - 1, m], [m, m, m - 1], [m, m, m], [m - 1, m, m]])
+    cells = np.array(list(permutations(range(5), 4)))
+    expected = naive.orientations([ticks[cell].tolist() for cell in cells])
+    assert orientations(ticks, cells).tolist() == expected
+    assert {-1, 1} <= set(expected)
+
+
+# Every voxel in one cell
+
+
+@given(seeds, dimensions, st.booleans())
+def test_counts_and_sums_are_the_image_s(seed, n, is_snapped):
+    image, mesh = random_case(seed, n, is_snapped=is_snapped)
+    moments = cell_moments(image, mesh)
+    owner = cell_of_voxel(image, mesh)
+    assert moments.n_voxels.sum() == image.data.size
+    assert (owner >= 0).all()
+    np.testing.assert_array_equal(np.bincount(owner.ravel(), minlength=len(mesh.cells)), moments.n_voxels)
+    data = image.data.astype(np.float64)
+    assert moments.n_voxels @ moments.mean == pytest.approx(data.sum(), rel=1e-12)
+    squares = moments.n_voxels @ (moments.variance + moments.mean**2)
+    assert squares == pytest.approx((data**2).sum(), rel=1e-12)
+
+
+@pytest.mark.parametrize(("n", "kind"), [(2, "criss-cross"), (3, "bcc"), (3, "five-tet")])
+@pytest.mark.parametrize("seed", range(3))
+def test_counts_on_jittered_lattices(n, kind, seed):
+    """Hundreds of cells, oblique voxels of unequal edges, interior nodes moved by up to a tenth of a block."""
+    rng = np.random.default_rng(seed)
+    shape = tuple(int(s * SMALL) for s in (40, 36, 50))[:n] if n == 2 else tuple(int(s * SMALL) for s in (20, 18, 26))
+    blocks = (6, 5) if n == 2 else (3, 3, 4)
+    image = random_image(rng, shape, random_affine(rng, n))
+    mesh = lattice(image, kind, blocks=blocks)
+    index = image.to_index(mesh.points)
+    is_inside = ((index > -0.4) & (index < np.array(shape) - 0.6)).all(axis=1, keepdims=True)
+    index = index + is_inside * rng.uniform(-0.1, 0.1, index.shape) * np.array(shape) / blocks
+    mesh = placed(image, index, mesh.cells)
+    assert cell_moments(image, mesh).n_voxels.sum() == image.data.size
+    assert (cell_of_voxel(image, mesh) >= 0).all()
+
+
+def test_counts_with_more_cells_than_voxels():
+    """Cells far below a voxel, thin ones among them."""
+    rng = np.random.default_rng(0)
+    image = random_image(rng, (2, 3, 2))
+    mesh = placed(image, *delaunay_box(rng, image.shape, 60))
+    moments = cell_moments(image, mesh)
+    assert moments.n_voxels.sum() == 12
+    assert (moments.n_voxels == 0).sum() >= len(mesh.cells) - 12
+    np.testing.assert_array_equal(cell_of_voxel(image, mesh), naive.cell_of_voxel(image, mesh))
+
+
+def test_counts_on_a_long_thin_image():
+    """100,000 voxels in a row leave 11 bits for the fraction."""
+    image = Image(np.zeros((2, 100_000 if naive.IS_COMPILED else 5_000), dtype=np.float32))
+    rng = np.random.default_rng(0)
+    mesh = placed(image, *delaunay_box(rng, image.shape, 40))
+    assert cell_moments(image, mesh).n_voxels.sum() == image.data.size
+    assert (cell_of_voxel(image, mesh) >= 0).all()
+
+
+# Moments
+
+
+@given(seeds, dimensions, st.booleans())
+def test_moment_sums_are_the_twin_s(seed, n, is_snapped):
+    image, mesh = random_case(seed, n, is_snapped=is_snapped)
+    grid = sampling_grid(image, mesh.points)
+    sums = moment_sums(grid, to_ticks(image.to_index(mesh.points), grid), mesh.cells)
+    twin = naive.moment_sums(image, naive.cell_of_voxel(image, mesh), len(mesh.cells), grid.shift)
+    np.testing.assert_array_equal(sums[:, 0], twin[:, 0])
+    np.testing.assert_allclose(sums[:, 1:], twin[:, 1:], rtol=1e-12, atol=1e-9)
+
+
+@given(seeds, dimensions, st.booleans())
+def test_moments_are_numpy_s_over_each_cell_s_voxels(seed, n, is_snapped):
+    image, mesh = random_case(seed, n, is_snapped=is_snapped)
+    moments = cell_moments(image, mesh)
+    owner = cell_of_voxel(image, mesh)
+    data = image.data.astype(np.float64)
+    for cell in np.flatnonzero(moments.n_voxels):
+        h = data[owner == cell]
+        assert moments.mean[cell] == pytest.approx(h.mean(), rel=1e-13)
+        assert moments.variance[cell] == pytest.approx(h.var(), rel=1e-10, abs=1e-9)
+
+
+def test_variance_of_a_small_contrast_on_a_large_mean():
+    """0 and 1 in turn on 1e8: the variance is 1/4 to many digits, which sums of h^2 would lose."""
+    data = 1e8 + np.indices((8, 8)).sum(axis=0) % 2
+    image = Image(data)
+    moments = cell_moments(image, lattice(image, blocks=(1, 1)))
+    exact = np.array([data[cell_of_voxel(image, lattice(image, blocks=(1, 1))) == c].var() for c in range(4)])
+    np.testing.assert_allclose(moments.variance, exact, rtol=1e-12)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_float32_and_float64_give_the_same(dtype):
+    """In float32 values are held, not summed."""
+    rng = np.random.default_rng(7)
+    data = rng.integers(0, 4096, (9, 9, 9)) / 16
+    image = Image(data.astype(dtype))
+    held = Image(data)
+    object.__setattr__(held, "data", data.astype(dtype))
+    mesh = placed(image, *split_box(rng, data.shape, 6))
+    owner = cell_of_voxel(held, mesh)
+    for cell, (count, mean, variance) in enumerate(zip(*cell_moments(held, mesh), strict=True)):
+        if count:
+            assert mean == pytest.approx(data[owner == cell].mean(), rel=1e-13)
+            assert variance == pytest.approx(data[owner == cell].var(), rel=1e-11, abs=1e-10)
+
+
+# Cells without a voxel, and voxels without a cell
+
+
+def test_a_cell_without_voxel_centre_takes_the_nearest_voxel_s_value():
+    data = np.array([[1.0, 2.0], [4.0, 8.0]])
+    image = Image(data)
+    tiny = np.array([[0.0, 0.0], [0.1, 0.0], [0.0, 0.1]])
+    for centre, value in [((0.2, 0.3), 1), ((0.2, 0.6), 2), ((0.8, 0.4), 4), ((1.4, 1.3), 8), ((7.0, -3.0), 4)]:
+        mesh = Mesh(tiny + centre, [[0, 1, 2]])
+        count, mean, variance = (column.item() for column in cell_moments(image, mesh))
+        assert (count, mean, variance) == (0, value, 0)
+
+
+@given(seeds, dimensions)
+def test_cells_without_voxel_centres_have_the_centroid_s_value(seed, n):
+    rng = np.random.default_rng(seed)
+    image = random_image(rng, (2,) * n, random_affine(rng, n))
+    mesh = placed(image, *delaunay_box(rng, image.shape, 20))
+    moments = cell_moments(image, mesh)
+    is_empty = moments.n_voxels == 0
+    assert is_empty.any()
+    index = image.to_index(mesh.points[mesh.cells].mean(axis=1))
+    nearest = np.clip(np.rint(index).astype(int), 0, np.array(image.shape) - 1)
+    expected = np.array([image.data[tuple(voxel)] for voxel in nearest], dtype=np.float64)
+    np.testing.assert_array_equal(moments.mean[is_empty], expected[is_empty])
+    assert (moments.variance[is_empty] == 0).all()
+
+
+def test_nearest_values_clip_to_the_border():
+    image = Image(np.arange(6.0).reshape(2, 3), np.diag([2.0, 3.0, 1.0]))
+    points = np.array([[0, 0], [0.9, 1.4], [1.1, 1.6], [-99, 99], [99, -99]])
+    assert nearest_values(image, points).tolist() == [0, 0, 4, 2, 3]
+    assert nearest_values(image, points).dtype == np.float64
+
+
+@given(seeds, dimensions)
+def test_a_mesh_partly_outside_counts_what_is_inside(seed, n):
+    rng = np.random.default_rng(seed)
+    image = random_image(rng, (5, 4, 4)[:n])
+    index, cells = split_box(rng, (5, 4, 4)[:n], 4)
+    shift = rng.integers(-6, 7, n) / 2
+    mesh = placed(image, index + shift, cells)
+    owner = cell_of_voxel(image, mesh)
+    np.testing.assert_array_equal(owner, naive.cell_of_voxel(image, mesh))
+    moments = cell_moments(image, mesh)
+    np.testing.assert_array_equal(moments.n_voxels, np.bincount(owner[owner >= 0], minlength=len(cells)))
+    # The box is shifted by halves, so its walls may run through centres: those in [low, high) are inside.
+    is_inside = np.ones(image.shape, dtype=bool)
+    for axis, centres in enumerate(np.indices(image.shape)):
+        low, high = shift[axis] - 0.5, shift[axis] - 0.5 + (5, 4, 4)[axis]
+        is_inside &= (centres >= low) & (centres < high)
+    np.testing.assert_array_equal(owner >= 0, is_inside)
+
+
+def test_a_mesh_beside_the_image_holds_nothing():
+    image = Image(np.arange(27.0).reshape(3, 3, 3))
+    mesh = lattice(image, blocks=(1, 1, 1))
+    moved = Mesh(mesh.points + [10, 0, 0], mesh.cells)
+    moments = cell_moments(image, moved)
+    assert moments.n_voxels.tolist() == [0] * 12
+    assert (moments.mean >= 18).all()  # the values at the border i = 2
+    assert (cell_of_voxel(image, moved) == -1).all()
+
+
+# Laws
+
+
+@given(seeds, dimensions)
+def test_order_of_cells_nodes_and_corners_changes_nothing(seed, n):
+    rng = np.random.default_rng(seed)
+    image, mesh = random_case(seed, n, is_snapped=True)
+    cells = rng.permutation(len(mesh.cells))
+    nodes = rng.permutation(len(mesh.points))
+    turned = np.roll(mesh.cells, 1, axis=1) if n == 2 else mesh.cells[:, [1, 2, 0, 3]]  # even permutations
+    other = Mesh(mesh.points[nodes], np.argsort(nodes)[turned][cells])
+    for ours, theirs in zip(cell_moments(image, mesh), cell_moments(image, other), strict=True):
+        np.testing.assert_array_equal(ours[cells], theirs)
+    np.testing.assert_array_equal(cells[cell_of_voxel(image, other)], cell_of_voxel(image, mesh))
+
+
+@given(seeds, dimensions)
+def test_the_world_s_frame_does_not_matter(seed, n):
+    """Affine and mesh turned, moved and reflected together: the same owners."""
+    rng = np.random.default_rng(seed)
+    image, mesh = random_case(seed, n, is_snapped=bool(seed % 2))
+    motion = np.eye(n + 1)
+    motion[:n, :n] = random_rotation(rng, n) * rng.choice([-1.0, 1.0], n)
+    motion[:n, n] = rng.uniform(-500, 500, n)
+    moved = Image(image.data, motion @ image.affine)
+    points = mesh.points @ motion[:n, :n].T + motion[:n, n]
+    np.testing.assert_array_equal(
+        cell_of_voxel(moved, Mesh(points, oriented(points, mesh.cells))), cell_of_voxel(image, mesh)
+    )
+
+
+def test_a_flip_of_the_array_flips_the_owners_of_a_generic_mesh():
+    rng = np.random.default_rng(4)
+    image = random_image(rng, (7, 6, 5))
+    mesh = placed(image, *delaunay_box(rng, image.shape, 10))
+    flip = np.diag([-1.0, 1, 1, 1])
+    flip[0, 3] = 6
+    flipped = Image(image.data[::-1], flip)
+    np.testing.assert_array_equal(cell_of_voxel(flipped, mesh)[::-1], cell_of_voxel(image, mesh))
+
+
+@pytest.mark.skipif(not naive.IS_COMPILED, reason="NUMBA_DISABLE_JIT is set: no threads")
+@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="NUMBA_NUM_THREADS is 1")
+def test_the_same_bits_on_one_and_two_threads():
+    rng = np.random.default_rng(0)
+    image = Image(rng.normal(size=(30, 31, 32)))
+    mesh = lattice(image, blocks=(6, 6, 6))
+    assert len(mesh.cells) > 1000
+    before = numba.get_num_threads()
+    found = []
+    try:
+        for threads in (1, 2, 1, 2):
+            numba.set_num_threads(threads)
+            found.append(b"".join(column.tobytes() for column in cell_moments(image, mesh)))
+    finally:
+        numba.set_num_threads(before)
+    assert len(set(found)) == 1
+
+
+# The fixed-point grid
+
+
+def test_the_grid_of_a_brain_is_a_millionth_of_a_voxel():
+    image = Image(np.broadcast_to(np.float32(0), (182, 218, 182)))
+    grid = sampling_grid(image, lattice(image, blocks=(1, 1, 1)).points)
+    assert grid.bits == 20
+
+
+@given(seeds, dimensions)
+def test_ticks_are_the_nearest_and_stay_below_2_to_the_28(seed, n):
+    rng = np.random.default_rng(seed)
+    reach = 2.0 ** rng.uniform(0, 19.5)
+    image = Image(np.zeros((3,) * n))
+    index = rng.uniform(-reach, reach, (20, n))
+    grid = sampling_grid(image, index)
+    ticks = to_ticks(index, grid)
+    assert ticks.shape == (20, 3)
+    assert np.abs(ticks).max() < 2**28
+    assert grid.bits >= 8
+    twin, bits = naive.ticks(image, index)
+    assert (bits, ticks[:, 3 - n :].tolist()) == (grid.bits, twin)
+    back = from_ticks(ticks, grid, n)
+    assert np.abs(back - index).max() <= 2.0 ** -(grid.bits + 1)
+    np.testing.assert_array_equal(to_ticks(back, grid), ticks)
+
+
+# Messages
+
+
+def test_mesh_and_image_of_different_dimension_are_refused():
+    square, cube = Image(np.zeros((3, 3))), Image(np.zeros((3, 3, 3)))
+    for of_image, of_mesh, message in [
+        (square, cube, "a 3-D mesh and a 2-D image"),
+        (cube, square, "a 2-D mesh and a 3-D image"),
+    ]:
+        mesh = lattice(of_mesh, blocks=(1,) * of_mesh.ndim)
+        for function in (cell_moments, cell_of_voxel):
+            with pytest.raises(InputError, match=message):
+                function(of_image, mesh)
+
+
+@pytest.mark.parametrize("function", [cell_moments, cell_of_voxel])
+@pytest.mark.parametrize("hand", [1.0, -1.0])
+def test_cells_flat_or_inverted_at_the_grid_s_resolution_are_refused(function, hand):
+    """A height of 1e-9 voxel is 0 ticks: positive in the world, flat in the grid."""
+    image = Image(np.zeros((4, 4)), np.diag([hand, 1.0, 1.0]))
+    flat = Mesh([[0, 0], [2, 0], [1, 1], [1, -1e-9]], [[0, 1, 2], [0, 3, 1]])
+    with pytest.raises(InputError, match=r"1 cells are flat or inverted to within a millionth .* first are \[1\]"):
+        function(image, flat)
+
+
+@pytest.mark.parametrize("function", [cell_moments, cell_of_voxel])
+def test_a_mesh_in_other_units_is_refused(function):
+    image = Image(np.zeros((4, 4, 4)))
+    mesh = lattice(image, blocks=(1, 1, 1))
+    assert function(image, Mesh(mesh.points + 2.0**20 - 8, mesh.cells)) is not None
+    with pytest.raises(InputError, match=r"the mesh reaches 2\.1e\+06 voxels .* in the same mm\?"):
+        function(image, Mesh(mesh.points + 2.0**21, mesh.cells))

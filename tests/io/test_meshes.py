@@ -1,0 +1,365 @@
+"""Meshes through VTU files: every bit comes back, other readers agree, and one line for every bad file."""
+
+import json
+import logging
+import os
+import re
+import subprocess
+import sys
+import warnings
+from pathlib import Path
+
+import meshio
+import numpy as np
+import pytest
+import pyvista
+from meshes import ALL_SMALL
+
+import tetopt
+from tetopt.errors import InputError
+from tetopt.geometry.simplex import volumes
+from tetopt.image import Image
+from tetopt.io.meshes import cell_fields, load_mesh, save_mesh, to_pyvista
+from tetopt.lattice import lattice
+from tetopt.mesh import Mesh
+
+OPTIONS = {"k_D": 0.2, "n_t": None, "crop": "ä"}
+ABOUT = {"tetopt": "0.1.0", "image": "Schädel [1].nii.gz", "image_sha256": "ab" * 32, "options": OPTIONS}
+FIELDS = ["mean", "variance", "n_voxels", "volume", "rho", "min_dihedral"]
+
+
+def image_of(n):
+    return Image(np.random.default_rng(0).normal(size=(5, 6, 7)[:n]), np.diag([*(0.7, 1.1, 2.3)[:n], 1.0]))
+
+
+def bent(n):
+    """A lattice with every node moved to coordinates that use all 53 bits."""
+    mesh = lattice(image_of(n), blocks=(2, 2, 2)[:n])
+    return Mesh(mesh.points + np.random.default_rng(1).normal(0.0, 0.05, mesh.points.shape), mesh.cells)
+
+
+def write_grid(path, cells, points):
+    """A VTU file of cells by VTK type, as another program might write it."""
+    pyvista.UnstructuredGrid({k: np.asarray(v) for k, v in cells.items()}, np.asarray(points, dtype=float)).save(path)
+
+
+# Node 4 makes one tetrahedron more on top of the first one; node 5 is used by no cell.
+POINTS = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1], [9, 9, 9]]
+TETRA, TRIANGLE, QUAD, HEXAHEDRON = 10, 5, 9, 12
+
+VTU = """<?xml version="1.0"?><VTKFile type="UnstructuredGrid" version="0.1" byte_order="LittleEndian">
+<UnstructuredGrid><Piece NumberOfPoints="5" NumberOfCells="1"><Points>
+<DataArray type="Float64" NumberOfComponents="3" format="ascii">0 0 0 1 0 0 0 1 0 0 0 {z} 5 5 5</DataArray></Points>
+<Cells><DataArray type="Int64" Name="connectivity" format="ascii">{nodes}</DataArray>
+<DataArray type="Int64" Name="offsets" format="ascii">4</DataArray>
+<DataArray type="UInt8" Name="types" format="ascii">10</DataArray></Cells></Piece></UnstructuredGrid></VTKFile>"""
+
+
+# --------------------------------------------------------------------------------------------------
+# There and back
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_every_bit_comes_back(tmp_path, n):
+    mesh, image = bent(n), image_of(n)
+    fields = cell_fields(mesh, image)
+    assert list(fields) == FIELDS
+    save_mesh(tmp_path / "a.vtu", mesh, fields, ABOUT)
+    back = load_mesh(tmp_path / "a.vtu")
+    assert back.mesh.points.tobytes() == mesh.points.tobytes()
+    np.testing.assert_array_equal(back.mesh.cells, mesh.cells)
+    assert back.n_turned == 0
+    assert list(back.cell_data) == FIELDS
+    for name, expected in fields.items():
+        assert back.cell_data[name].dtype == expected.dtype
+        assert back.cell_data[name].tobytes() == expected.tobytes()
+    assert [p.name for p in tmp_path.iterdir()] == ["a.vtu"]
+
+
+@pytest.mark.parametrize("case", range(len(ALL_SMALL)))
+def test_every_small_mesh_comes_back(tmp_path, case):
+    mesh = Mesh(*ALL_SMALL[case])
+    save_mesh(tmp_path / "a.vtu", mesh)
+    back = load_mesh(tmp_path / "a.vtu")
+    np.testing.assert_array_equal(back.mesh.points, mesh.points)
+    np.testing.assert_array_equal(back.mesh.cells, mesh.cells)
+    assert (back.n_turned, back.cell_data, back.field_data) == (0, {}, {})
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_field_data(tmp_path, n):
+    save_mesh(tmp_path / "a.vtu", bent(n), about=ABOUT)
+    back = load_mesh(tmp_path / "a.vtu").field_data
+    assert {name: text.tolist() for name, text in back.items() if name != "options"} == {
+        name: [text] for name, text in ABOUT.items() if name != "options"
+    }
+    assert json.loads(back["options"][0]) == OPTIONS
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_only_one_cell_type_and_positive_orientation(tmp_path, n):
+    save_mesh(tmp_path / "a.vtu", bent(n))
+    grid = pyvista.read(tmp_path / "a.vtu")
+    assert set(grid.celltypes) == {TRIANGLE if n == 2 else TETRA}
+    np.testing.assert_array_equal(np.unique(grid.cells_dict[grid.celltypes[0]]), np.arange(grid.n_points))
+    sizes = grid.compute_cell_sizes(length=False, area=n == 2, volume=n == 3)
+    signed = np.asarray(sizes["Area" if n == 2 else "Volume"])  # VTK's volumes of inverted tetrahedra are negative
+    np.testing.assert_allclose(signed, volumes(bent(n).points, bent(n).cells), rtol=1e-12)
+    if n == 2:
+        corners = np.asarray(grid.points)[grid.cells_dict[TRIANGLE]]
+        assert (np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])[:, 2] > 0.0).all()
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_meshio_reads_the_same(tmp_path, n):
+    mesh = bent(n)
+    fields = cell_fields(mesh, image_of(n))
+    save_mesh(tmp_path / "a.vtu", mesh, fields, ABOUT)
+    other = meshio.read(tmp_path / "a.vtu")
+    np.testing.assert_array_equal(other.points[:, :n], mesh.points)
+    np.testing.assert_array_equal(other.points[:, n:], 0.0)
+    assert [(block.type, len(block.data)) for block in other.cells] == [
+        ("triangle" if n == 2 else "tetra", len(mesh.cells))
+    ]
+    np.testing.assert_array_equal(other.cells[0].data, mesh.cells)
+    assert set(other.cell_data) == set(FIELDS)
+    for name, expected in fields.items():
+        np.testing.assert_array_equal(other.cell_data[name][0], expected)
+    assert other.field_data["image"].tobytes().decode() == ABOUT["image"]
+
+
+@pytest.mark.parametrize("file_format", ["vtu", "vtk"])
+def test_files_of_meshio(tmp_path, file_format):
+    mesh = bent(3)
+    path = tmp_path / f"a.{file_format}"
+    meshio.write(path, meshio.Mesh(mesh.points, [("tetra", mesh.cells)], cell_data={"k": [np.arange(len(mesh.cells))]}))
+    back = load_mesh(path)
+    assert back.mesh.points.tobytes() == mesh.points.tobytes()
+    np.testing.assert_array_equal(back.mesh.cells, mesh.cells)
+    np.testing.assert_array_equal(back.cell_data["k"], np.arange(len(mesh.cells)))
+
+
+def test_field_data_that_is_no_text_stays(tmp_path):
+    grid = to_pyvista(bent(3))
+    grid.field_data["numbers"] = np.array([1.5, 2.5])
+    grid.field_data["bytes"] = np.array([255, 254], dtype=np.uint8)
+    grid.field_data["string"] = ["of VTK"]
+    grid.save(tmp_path / "a.vtu")
+    back = load_mesh(tmp_path / "a.vtu").field_data
+    assert {name: values.tolist() for name, values in back.items()} == {
+        "numbers": [1.5, 2.5],
+        "bytes": [255, 254],
+        "string": ["of VTK"],
+    }
+
+
+def test_fields_of_a_mesh_without_an_image():
+    mesh = Mesh([[0, 0, 0], [2, 0, 0], [0, 2, 0], [0, 0, 2]], [[0, 1, 2, 3]])
+    fields = cell_fields(mesh)
+    assert list(fields) == ["volume", "rho", "min_dihedral"]
+    np.testing.assert_allclose(fields["volume"], [8 / 6])
+    np.testing.assert_allclose(fields["min_dihedral"], [np.degrees(np.arccos(1 / np.sqrt(3)))])  # 54.7 degrees
+    # Inradius 2 / (3 + sqrt 3), circumradius sqrt 3.
+    np.testing.assert_allclose(fields["rho"], [2 / (3 + np.sqrt(3)) / np.sqrt(3)])
+
+
+def test_fields_of_a_two_valued_image():
+    """A square of four voxels, cut along the diagonal; each half of a block of two values."""
+    data = np.array([[0.0, 0.0, 4.0, 4.0]] * 4).T  # 0 for x below 1.5, else 4
+    mesh = lattice(Image(data), blocks=(1, 1))
+    fields = cell_fields(mesh, Image(data))
+    assert fields["n_voxels"].sum() == 16
+    assert (fields["n_voxels"] * fields["mean"]).sum() == data.sum()
+    centroids = mesh.points[mesh.cells].mean(axis=1)
+    left, right = np.argmin(centroids[:, 0]), np.argmax(centroids[:, 0])
+    assert (fields["mean"][left], fields["variance"][left]) == (0.0, 0.0)
+    assert (fields["mean"][right], fields["variance"][right]) == (4.0, 0.0)
+    others = [k for k in range(4) if k not in (left, right)]
+    np.testing.assert_allclose(
+        fields["variance"][others], fields["mean"][others] * (4.0 - fields["mean"][others]), atol=1e-12
+    )
+
+
+def test_an_old_file_survives_a_failure(tmp_path, monkeypatch):
+    save_mesh(tmp_path / "a.vtu", bent(3))
+    before = (tmp_path / "a.vtu").read_bytes()
+
+    def interrupted(self, path):
+        path.write_bytes(b"half")
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(pyvista.UnstructuredGrid, "save", interrupted)
+    with pytest.raises(KeyboardInterrupt):
+        save_mesh(tmp_path / "a.vtu", bent(2))
+    assert (tmp_path / "a.vtu").read_bytes() == before
+    assert [p.name for p in tmp_path.iterdir()] == ["a.vtu"]
+
+
+# --------------------------------------------------------------------------------------------------
+# Files of other programs
+
+
+def test_unused_nodes_are_dropped(tmp_path):
+    write_grid(tmp_path / "a.vtu", {TETRA: [[1, 2, 3, 4]]}, POINTS)
+    back = load_mesh(tmp_path / "a.vtu")
+    np.testing.assert_array_equal(back.mesh.points, POINTS[1:5])
+    np.testing.assert_array_equal(back.mesh.cells, [[0, 1, 2, 3]])
+
+
+def test_inverted_cells_are_turned_and_counted(tmp_path):
+    cells = [[0, 1, 2, 3], [1, 2, 3, 4]]
+    expected = [volumes(np.array(POINTS, dtype=float), np.array([c]))[0] for c in cells]
+    assert min(expected) > 0.0
+    for turned in ([0], [1], [0, 1]):
+        swapped = [[c[1], c[0], *c[2:]] if k in turned else c for k, c in enumerate(cells)]
+        write_grid(tmp_path / "a.vtu", {TETRA: swapped}, POINTS)
+        back = load_mesh(tmp_path / "a.vtu")
+        assert back.n_turned == len(turned)
+        np.testing.assert_allclose(volumes(back.mesh.points, back.mesh.cells), expected)
+        np.testing.assert_array_equal(np.sort(back.mesh.cells, axis=1), np.sort(cells, axis=1))
+
+
+def test_inverted_triangles_are_turned_and_counted(tmp_path):
+    write_grid(tmp_path / "a.vtu", {TRIANGLE: [[0, 2, 1]]}, POINTS)
+    back = load_mesh(tmp_path / "a.vtu")
+    assert (back.mesh.ndim, back.n_turned, len(back.mesh.points)) == (2, 1, 3)
+    np.testing.assert_allclose(volumes(back.mesh.points, back.mesh.cells), [0.5])
+
+
+def test_a_file_in_single_precision(tmp_path):
+    grid = pyvista.UnstructuredGrid({TETRA: np.array([[0, 1, 2, 3]])}, np.array(POINTS[:4], dtype=np.float32) * 0.1)
+    grid.save(tmp_path / "a.vtu")
+    points = load_mesh(tmp_path / "a.vtu").mesh.points
+    assert points.dtype == np.float64
+    np.testing.assert_array_equal(points, np.float32(0.1) * np.array(POINTS[:4]))
+
+
+# --------------------------------------------------------------------------------------------------
+# Bad files
+
+
+@pytest.fixture
+def assert_refused(capfd, caplog):
+    """`load_mesh` raises InputError in one line, and neither VTK nor pyvista says a word of its own.
+
+    Under pytest what pyvista sends to the root logger is caught before it reaches the screen, so look there, too.
+    """
+
+    def check(path, match):
+        before = list(logging.getLogger().filters)
+        with warnings.catch_warnings(record=True) as warned, pytest.raises(InputError, match=match) as caught:
+            load_mesh(path)
+        assert warned == []
+        assert str(caught.value).startswith(f"{path}: ")
+        assert "\n" not in str(caught.value)
+        assert capfd.readouterr() == ("", "")
+        assert caplog.records == []
+        assert logging.getLogger().filters == before
+
+    return check
+
+
+def test_a_missing_file(tmp_path, assert_refused):
+    assert_refused(tmp_path / "no.vtu", "no such mesh file")
+    assert_refused(tmp_path, "no such mesh file")
+
+
+@pytest.mark.parametrize("name", ["a.stl", "a.nii.gz", "a.msh", "a"])
+def test_another_suffix(tmp_path, name, assert_refused):
+    (tmp_path / name).write_bytes(b"x")
+    assert_refused(tmp_path / name, r"named .vtu or .vtk")
+
+
+@pytest.mark.parametrize("name", ["a.vtu", "a.vtk"])
+@pytest.mark.parametrize(
+    "content",
+    [b"", b"\n", b"no mesh at all", bytes(range(256)) * 20, b"<?xml version='1.0'?><html></html>"],
+    ids=["empty", "newline", "words", "bytes", "html"],
+)
+def test_garbage(tmp_path, name, content, assert_refused):
+    (tmp_path / name).write_bytes(content)
+    assert_refused(tmp_path / name, "damaged|cannot be read")
+
+
+@pytest.mark.parametrize("share", [0.01, 0.1, 0.3, 0.5, 0.7, 0.9, 0.99])
+def test_truncated(tmp_path, share, assert_refused):
+    save_mesh(tmp_path / "a.vtu", bent(3), cell_fields(bent(3)), ABOUT)
+    whole = (tmp_path / "a.vtu").read_bytes()
+    (tmp_path / "a.vtu").write_bytes(whole[: int(len(whole) * share)])
+    assert_refused(tmp_path / "a.vtu", "damaged")
+
+
+@pytest.mark.parametrize("name", ["Points", "connectivity", "offsets", "types", "volume", "options"])
+def test_one_damaged_array(tmp_path, name, assert_refused):
+    save_mesh(tmp_path / "a.vtu", bent(3), cell_fields(bent(3)), ABOUT)
+    text = (tmp_path / "a.vtu").read_text()
+    block = re.search(rf'Name="{name}"[^>]*>\s*(\S+)\s*<', text)
+    middle = (block.start(1) + block.end(1)) // 2
+    (tmp_path / "a.vtu").write_text(text[: middle - 4] + "AAAAAAAA" + text[middle + 4 :])
+    assert_refused(tmp_path / "a.vtu", "damaged")
+
+
+def test_silent_outside_of_pytest(tmp_path):
+    """A program of its own has no log handlers, so pyvista would write VTK's errors on its stderr."""
+    (tmp_path / "a.vtu").write_text("no mesh at all")
+    program = (
+        "import sys\nfrom tetopt import InputError, load_mesh\n"
+        "try:\n    load_mesh(sys.argv[1])\nexcept InputError as error:\n    print(error)\n"
+    )
+    environment = os.environ | {"PYTHONPATH": str(Path(tetopt.__file__).parents[1])}
+    run = subprocess.run(
+        [sys.executable, "-c", program, tmp_path / "a.vtu"], capture_output=True, text=True, env=environment
+    )
+    assert run.stderr == ""
+    assert run.stdout.startswith(f"{tmp_path / 'a.vtu'}: damaged")
+    assert run.stdout.count("\n") == 1
+
+
+def test_another_vtk_data_set(tmp_path, assert_refused):
+    pyvista.Sphere().save(tmp_path / "a.vtk")
+    assert_refused(tmp_path / "a.vtk", "found PolyData")
+
+
+@pytest.mark.parametrize(
+    ("cells", "found"),
+    [
+        ({TETRA: [[0, 1, 2, 3]], TRIANGLE: [[0, 1, 2]]}, "found tetra, triangle"),
+        ({QUAD: [[0, 1, 4, 2]]}, "found quad"),
+        ({HEXAHEDRON: [[0, 1, 2, 3, 4, 5, 0, 1]]}, "found hexahedron"),
+    ],
+)
+def test_other_and_mixed_cells(tmp_path, cells, found, assert_refused):
+    write_grid(tmp_path / "a.vtu", cells, POINTS)
+    assert_refused(tmp_path / "a.vtu", found)
+
+
+def test_no_cells(tmp_path, assert_refused):
+    pyvista.UnstructuredGrid().save(tmp_path / "a.vtu")
+    assert_refused(tmp_path / "a.vtu", "expected an unstructured grid with cells")
+
+
+def test_triangles_out_of_the_plane(tmp_path, assert_refused):
+    write_grid(tmp_path / "a.vtu", {TRIANGLE: [[0, 1, 3]]}, POINTS)
+    assert_refused(tmp_path / "a.vtu", "plane z = 0")
+
+
+@pytest.mark.parametrize(
+    ("nodes", "z", "match"),
+    [
+        ("0 1 2 3", "0", "1 of 1 are flat"),
+        ("0 1 2 2", "1", "1 of 1 are flat"),
+        ("0 1 2 3", "nan", "must be finite, node 3"),
+        ("0 1 2 3", "inf", "must be finite, node 3"),
+        ("0 1 2 7", "1", "nodes 0..7, it holds 0..4"),
+        ("0 1 2 -1", "1", "nodes -1..2, it holds 0..4"),
+        ("0 1 2", "1", "damaged"),
+    ],
+)
+def test_bad_cells(tmp_path, nodes, z, match, assert_refused):
+    (tmp_path / "a.vtu").write_text(VTU.format(nodes=nodes, z=z))
+    assert_refused(tmp_path / "a.vtu", match)
+
+
+def test_the_text_of_the_bad_cells_is_else_good(tmp_path):
+    (tmp_path / "a.vtu").write_text(VTU.format(nodes="0 1 2 3", z="1"))
+    np.testing.assert_array_equal(load_mesh(tmp_path / "a.vtu").mesh.points, POINTS[:4])

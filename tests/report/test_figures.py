@@ -1,0 +1,369 @@
+"""Pictures, judged by what they hold before they become pixels: sides, places, sections, curves, titles."""
+
+from itertools import permutations, product
+
+import numpy as np
+import PIL.Image
+import pytest
+from matplotlib.collections import PolyCollection
+
+from tetopt.energy.sampling import cell_moments, cell_of_voxel
+from tetopt.geometry.quality import rho_histogram
+from tetopt.image import Image
+from tetopt.lattice import lattice
+from tetopt.mesh import Mesh
+from tetopt.optimize.paper import Optimized, Record, optimize
+from tetopt.report import figures
+from tetopt.report.figures import (
+    _View,
+    energy_figure,
+    histogram_figure,
+    save_figure,
+    save_run_figures,
+    slice_figure,
+)
+
+SHAPE = (5, 7, 9)
+SPACING = (2.0, 1.0, 3.0)
+OBLIQUE = np.array([[-0.75, 0.31, 1.1, 12.5], [0.12, 0.68, -0.9, -33.0], [0.05, -0.22, 5.1, 7.25], [0, 0, 0, 1.0]])
+WORLD_LETTERS = ["LR", "PA", "IS"]
+
+
+def oriented_image(worlds, signs):
+    """Noise whose voxel axis a runs along world axis worlds[a], in the direction signs[a]."""
+    affine = np.eye(4)
+    affine[:3, :3] = 0.0
+    for axis, (world, sign) in enumerate(zip(worlds, signs, strict=True)):
+        affine[world, axis] = sign * SPACING[axis]
+    affine[:3, 3] = [11.0, -22.0, 33.0]
+    return Image(np.random.default_rng(0).normal(size=SHAPE), affine)
+
+
+ORIENTATIONS = [(w, s) for w in permutations(range(3)) for s in product((1, -1), repeat=3)]
+
+
+def bent(image, blocks):
+    """A lattice of the image's box with its inner nodes moved; the box stays covered."""
+    mesh = lattice(image, blocks=blocks)
+    index = image.to_index(mesh.points)
+    is_inside = ((index > -0.4) & (index < np.array(image.shape) - 0.6)).all(axis=1)
+    index[is_inside] += np.random.default_rng(1).uniform(-0.2, 0.2, (is_inside.sum(), image.ndim))
+    return Mesh(image.to_world(index), mesh.cells)
+
+
+def areas(polygons):
+    """Of convex polygons (K, c, 2), by the shoelace formula."""
+    x, y = polygons[..., 0], polygons[..., 1]
+    return 0.5 * np.abs((x * np.roll(y, -1, axis=1) - y * np.roll(x, -1, axis=1)).sum(axis=1))
+
+
+def contains(polygon, point):
+    """Whether the convex polygon holds the point well inside."""
+    edges = np.roll(polygon, -1, axis=0) - polygon
+    to = point - polygon
+    side = (edges[:, 0] * to[:, 1] - edges[:, 1] * to[:, 0])[np.abs(edges).sum(axis=1) > 0.0]
+    return bool((side > 1e-9).all() or (side < -1e-9).all())
+
+
+# --------------------------------------------------------------------------------------------------
+# Sides and places
+
+
+@pytest.mark.parametrize(("worlds", "signs"), ORIENTATIONS)
+@pytest.mark.parametrize("normal", [0, 1, 2])
+def test_pixels_lie_where_the_letters_say(worlds, signs, normal):
+    """All 48 orientations, sagittal, coronal, axial: right of the patient's left, up from posterior or inferior."""
+    image = oriented_image(worlds, signs)
+    view = _View(image, axis=worlds.index(normal), index=3)
+    horizontal, vertical = (w for w in range(3) if w != normal)
+    assert view.letters == [WORLD_LETTERS[horizontal], WORLD_LETTERS[vertical]]
+    # The world place of every voxel in the slice, and its value, put in rising order of the two coordinates.
+    index = np.array([i for i in np.ndindex(SHAPE) if i[view.across] == 3])
+    place = image.to_world(index)
+    order = np.lexsort((place[:, vertical], place[:, horizontal]))
+    assert np.ptp(place[:, normal]) == 0.0
+    np.testing.assert_array_equal(view.pixels.ravel(), image.data[tuple(index[order].T)])
+    np.testing.assert_allclose(view.size, np.ptp(place[:, (horizontal, vertical)], axis=0) + image_steps(image, view))
+
+
+def image_steps(image, view):
+    return [image.spacing[a] for a in view.axes]
+
+
+@pytest.mark.parametrize(
+    ("name", "worlds", "signs"),
+    [
+        ("RAS", (0, 1, 2), (1, 1, 1)),
+        ("LAS", (0, 1, 2), (-1, 1, 1)),
+        ("LPS", (0, 1, 2), (-1, -1, 1)),
+        ("PIR", (1, 2, 0), (-1, -1, 1)),
+    ],
+)
+def test_a_bright_voxel_in_the_axial_picture(name, worlds, signs):
+    """It is in the patient's right front, so right and up in the picture."""
+    image = oriented_image(worlds, signs)
+    view = _View(image, None, None)
+    assert view.letters == ["LR", "PA"]
+    centre = image.to_world((np.array(SHAPE) - 1) / 2)
+    step = np.array([SPACING[worlds.index(w)] for w in range(2)])
+    index = np.rint(image.to_index(centre + [2 * step[0], step[1], 0.0])).astype(int)
+    data = np.zeros(SHAPE)
+    data[tuple(index)] = 1.0
+    bright = _View(Image(data, image.affine), None, index[view.across]).pixels
+    middle = (np.array(bright.shape) - 1) // 2
+    assert np.argwhere(bright == 1.0).tolist() == [[middle[0] + 2, middle[1] + 1]]
+
+
+@pytest.mark.parametrize(("worlds", "signs"), ORIENTATIONS)
+def test_the_default_slice_is_axial_and_in_the_middle(worlds, signs):
+    view = _View(oriented_image(worlds, signs), None, None)
+    assert view.across == worlds.index(2)
+    assert view.index == SHAPE[view.across] // 2
+
+
+def test_an_oblique_image_is_laid_out_by_its_nearest_axes():
+    image = Image(np.random.default_rng(0).normal(size=SHAPE), OBLIQUE)
+    view = _View(image, None, None)
+    assert (view.across, view.axes, view.letters) == (2, [0, 1], ["LR", "PA"])
+    np.testing.assert_array_equal(view.pixels, image.data[::-1, :, 4])  # the first axis runs to the left
+    np.testing.assert_allclose(view.size, image.spacing[:2] * SHAPE[:2])
+
+
+@pytest.mark.parametrize("signs", list(product((1, -1), repeat=2)))
+@pytest.mark.parametrize("worlds", [(0, 1), (1, 0)])
+def test_a_2d_image_has_x_to_the_right_and_y_up(worlds, signs):
+    affine = np.eye(3)
+    affine[:2, :2] = 0.0
+    for axis in range(2):
+        affine[worlds[axis], axis] = signs[axis] * SPACING[axis]
+    image = Image(np.random.default_rng(0).normal(size=(5, 7)), affine)
+    view = _View(image, None, None)
+    index = np.array(list(np.ndindex(5, 7)))
+    place = image.to_world(index)
+    order = np.lexsort((place[:, 1], place[:, 0]))
+    np.testing.assert_array_equal(view.pixels.ravel(), image.data[tuple(index[order].T)])
+    assert view.letters == ["", ""]
+
+
+@pytest.mark.parametrize(("worlds", "signs"), ORIENTATIONS[::3])
+def test_cells_and_pixels_share_their_places(worlds, signs):
+    """The polygon around a pixel's centre is of the cell that holds the voxel."""
+    image = oriented_image(worlds, signs)
+    mesh = bent(image, (2, 2, 2))
+    view = _View(image, None, None)
+    polygons, cells = view.section(mesh)
+    owner = np.take(cell_of_voxel(image, mesh), view.index, axis=view.across)
+    owner = _View(Image(image.data, image.affine), None, None) and oriented_like(view, owner)
+    steps = image_steps(image, view)
+    n_found = 0
+    for pixel in np.ndindex(owner.shape):
+        point = (np.array(pixel) + 0.5) * steps
+        found = [cell for polygon, cell in zip(polygons, cells, strict=True) if contains(polygon, point)]
+        assert len(found) <= 1
+        if found:
+            n_found += 1
+            assert found == [owner[pixel]]
+    assert n_found > 0.9 * owner.size
+
+
+def oriented_like(view, values):
+    """Values in the slice, in voxel order, laid out as the view's pixels; by where the pixels' values are."""
+    inside = np.take(view.image.data, view.index, axis=view.across)
+    place = {value: number for number, value in enumerate(inside.ravel())}
+    return np.array([[values.ravel()[place[v]] for v in row] for row in view.pixels])
+
+
+# --------------------------------------------------------------------------------------------------
+# Sections
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+@pytest.mark.parametrize("kind", ["bcc", "five-tet", "bent"])
+@pytest.mark.parametrize("affine", [np.eye(4), np.diag([-1.0, 2.0, 3.0, 1.0]), OBLIQUE], ids=["1mm", "flip", "oblique"])
+def test_a_section_tiles_the_slice(affine, kind, axis):
+    image = Image(np.random.default_rng(0).normal(size=(8, 9, 10)), affine)
+    # 9 voxels in 3 blocks: the planes of nodes at index 2.5 and 5.5; 8 and 10 in 2: at 3.5 and 4.5.
+    mesh = bent(image, (2, 3, 2)) if kind == "bent" else lattice(image, kind, blocks=(2, 3, 2))
+    for index in range(image.shape[axis]):
+        polygons, cells = _View(image, axis, index).section(mesh)
+        size = np.delete(image.spacing * image.shape, axis)
+        assert areas(polygons).sum() == pytest.approx(size.prod(), rel=1e-12)
+        assert polygons.min() >= -1e-9
+        assert (polygons.max(axis=(0, 1)) <= np.array(_View(image, axis, index).size) + 1e-9).all()
+        assert len(np.unique(cells)) == len(cells)
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_section_through_a_plane_of_nodes_tiles_it_once(axis):
+    """7 voxels in 2 blocks: the middle voxel's plane is a plane of nodes, and of facets."""
+    image = Image(np.random.default_rng(0).normal(size=(7, 7, 7)))
+    for kind in ("bcc", "five-tet"):
+        polygons, _ = _View(image, axis, 3).section(lattice(image, kind, blocks=(2, 2, 2)))
+        assert areas(polygons).sum() == pytest.approx(49.0, rel=1e-12)
+
+
+def test_a_2d_mesh_is_shown_whole():
+    image = Image(
+        np.random.default_rng(0).normal(size=(6, 7)), np.array([[-2.0, 0.5, 1.0], [0.3, 1.0, 5.0], [0, 0, 1]])
+    )
+    mesh = bent(image, (2, 3))
+    polygons, cells = _View(image, None, None).section(mesh)
+    np.testing.assert_array_equal(cells, np.arange(len(mesh.cells)))
+    assert areas(polygons).sum() == pytest.approx((image.spacing * image.shape).prod(), rel=1e-12)
+
+
+# --------------------------------------------------------------------------------------------------
+# The slice figure
+
+
+def collections(axes):
+    return [c for c in axes.collections if isinstance(c, PolyCollection)]
+
+
+def corners(collection):
+    """Sum over a collection of each polygon's corners; closing points left out."""
+    return np.array([path.vertices[:-1].mean(axis=0) for path in collection.get_paths()])
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_slice_figure_holds_each_mesh_under_its_title(n):
+    image = Image(np.random.default_rng(0).normal(size=SHAPE[:n]), np.diag([*SPACING[:n], 1.0]))
+    first, second = lattice(image, blocks=(2, 2, 2)[:n]), bent(image, (2, 3, 2)[:n])
+    figure = slice_figure(image, [("first", first), ("second", second)])
+    view = _View(image, None, None)
+    grid = np.array(figure.axes).reshape(2, 2)
+    for column, (title, mesh) in enumerate([("first", first), ("second", second)]):
+        over, flat = grid[:, column]
+        polygons, cells = view.section(mesh)
+        assert over.get_title() == title
+        np.testing.assert_array_equal(over.images[0].get_array(), view.pixels.T)
+        assert over.images[0].get_extent() == [0.0, view.size[0], 0.0, view.size[1]]
+        assert over.images[0].origin == "lower"
+        np.testing.assert_allclose(corners(collections(over)[0]), polygons.mean(axis=1))
+        np.testing.assert_allclose(corners(collections(flat)[0]), polygons.mean(axis=1))
+        np.testing.assert_array_equal(collections(flat)[0].get_array(), cell_moments(image, mesh).mean[cells])
+        assert collections(flat)[0].get_clim() == over.images[0].get_clim()
+
+
+def test_letters_stand_on_their_sides():
+    image = oriented_image((2, 0, 1), (-1, 1, -1))
+    axes = slice_figure(image, [("", lattice(image, blocks=(1, 1, 1)))]).axes[0]
+    sides = {text.get_text(): text.get_position() for text in axes.texts}
+    assert sides == {"L": (0.02, 0.5), "R": (0.98, 0.5), "P": (0.5, 0.02), "A": (0.5, 0.98)}
+    assert axes.get_xlim() == (0.0, 7.0)  # x is the second axis, of 1 mm; y the third, of 3
+    assert axes.get_ylim() == (0.0, 27.0)
+
+
+def test_a_constant_slice_can_be_drawn(tmp_path):
+    image = Image(np.full((6, 7), 3.0))
+    save_figure(slice_figure(image, [("", lattice(image, blocks=(2, 2)))]), tmp_path / "a.png", dpi=40)
+    assert np.asarray(PIL.Image.open(tmp_path / "a.png").convert("L")).std() > 5.0
+
+
+# --------------------------------------------------------------------------------------------------
+# Histograms and energies
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_histograms_are_shares(n):
+    image = Image(np.random.default_rng(0).normal(size=SHAPE[:n]), np.diag([*SPACING[:n], 1.0]))
+    meshes = [("first", lattice(image, blocks=(2, 2, 2)[:n])), ("second", bent(image, (2, 3, 2)[:n]))]
+    figure = histogram_figure(meshes)
+    outlines = [p for p in figure.axes[0].patches if p.get_label()[0] != "_"]
+    assert [p.get_label().split(":")[0] for p in outlines] == ["first", "second"]
+    for patch, (_, mesh) in zip(outlines, meshes, strict=True):
+        values, edges, _ = patch.get_data()
+        expected = rho_histogram(mesh.points, mesh.cells)
+        np.testing.assert_array_equal(values, expected[0])
+        assert values.sum() == pytest.approx(1.0, abs=1e-12)
+        assert (edges[0], edges[-1]) == (0.0, 1.0 / n)
+
+
+def history(*E_D):
+    return [
+        Record(k, 1.0 - 0.1 * k, 2.0 + 0.1 * k, value, 0.0 if k == 0 else 0.1**k, k == 2, 50, 99, float(k))
+        for k, value in enumerate(E_D)
+    ]
+
+
+def test_energy_lines_hold_the_history():
+    top, bottom = energy_figure(history(8.0, 4.0, 2.0, 1.0)).axes
+    curves = {line.get_label().split(",")[0]: line for line in top.lines}
+    assert list(curves) == ["E", "E_G", "E_D"]
+    np.testing.assert_allclose(curves["E"].get_ydata(), [1.0, 0.9, 0.8, 0.7])
+    np.testing.assert_allclose(curves["E_G"].get_ydata(), [1.0, 1.05, 1.1, 1.15])
+    np.testing.assert_allclose(curves["E_D"].get_ydata(), [1.0, 0.5, 0.25, 0.125])
+    for line in top.lines:
+        np.testing.assert_array_equal(line.get_xdata(), [0, 1, 2, 3])
+        assert line.get_label().endswith(f": {line.get_ydata()[-1]:.3f}")
+    np.testing.assert_array_equal(bottom.lines[0].get_xdata(), [1, 2, 3])
+    np.testing.assert_allclose(bottom.lines[0].get_ydata(), [0.1, 0.01, 0.001])
+    assert [(p.get_x(), p.get_x() + p.get_width()) for p in top.patches] == [(1.5, 2.5)]  # connected anew in 2
+
+
+def test_energies_of_a_constant_image_have_no_E_D():
+    top, _ = energy_figure(history(0.0, 0.0)).axes
+    assert [line.get_label().split(",")[0] for line in top.lines] == ["E", "E_G"]
+
+
+def test_energies_of_the_lattice_alone(tmp_path):
+    figure = energy_figure(history(8.0))
+    assert figure.axes[0].get_xlim() == (-0.5, 0.5)
+    save_figure(figure, tmp_path / "a.png", dpi=40)
+    assert (tmp_path / "a.png").stat().st_size > 0
+
+
+# --------------------------------------------------------------------------------------------------
+# A run's three pictures
+
+
+@pytest.fixture(scope="module")
+def run():
+    image = Image(np.where(np.arange(12) > 4, 9.0, 1.0)[:, None] + np.zeros((12, 11)))
+    initial = lattice(image, blocks=(3, 3))
+    return image, initial, optimize(image, initial, iterations=2)
+
+
+def test_before_is_left_and_after_is_right(monkeypatch, tmp_path, run):
+    image, initial, result = run
+    saved = {}
+    monkeypatch.setattr(figures, "save_figure", lambda figure, path: saved.update({path: figure}))
+    paths = [tmp_path / name for name in ("slice.png", "rho.png", "energies.png")]
+    save_run_figures(paths, image, initial, result)
+    assert list(saved) == paths
+    slice_axes = np.array(saved[paths[0]].axes).reshape(2, 2)
+    assert slice_axes[0, 0].get_title() == f"lattice, {len(initial.points)} nodes"
+    share = result.history[-1].E_D / result.history[0].E_D
+    assert share < 0.95
+    assert slice_axes[0, 1].get_title() == f"optimised, {share:.3f} of its E_D"
+    view = _View(image, None, None)
+    for column, mesh in enumerate((initial, result.mesh)):
+        for row in (0, 1):
+            drawn = corners(collections(slice_axes[row, column])[0])
+            np.testing.assert_allclose(drawn, view.section(mesh)[0].mean(axis=1))
+    outlines = [p for p in saved[paths[1]].axes[0].patches if p.get_label()[0] != "_"]
+    for patch, mesh, word in zip(outlines, (initial, result.mesh), ("lattice", "optimised"), strict=True):
+        assert patch.get_label().startswith(word)
+        np.testing.assert_array_equal(patch.get_data()[0], rho_histogram(mesh.points, mesh.cells)[0])
+    np.testing.assert_array_equal(saved[paths[2]].axes[0].lines[0].get_ydata(), [row.E for row in result.history])
+
+
+def test_pictures_are_written_and_not_blank(tmp_path, run):
+    image, initial, result = run
+    paths = [tmp_path / name for name in ("slice.png", "rho.png", "energies.png")]
+    save_run_figures(paths, image, initial, result)
+    for path in paths:
+        with PIL.Image.open(path) as picture:
+            assert picture.format == "PNG"
+            assert min(picture.size) > 500
+            assert np.asarray(picture.convert("L")).std() > 10.0
+    assert sorted(tmp_path.iterdir()) == sorted(paths)
+
+
+def test_a_constant_image_says_so(monkeypatch, tmp_path):
+    image = Image(np.full((8, 9), 7.0))
+    initial = lattice(image, blocks=(2, 2))
+    saved = []
+    monkeypatch.setattr(figures, "save_figure", lambda figure, path: saved.append(figure))
+    save_run_figures([tmp_path / k for k in "abc"], image, initial, Optimized(initial, history(0.0), "iterations"))
+    assert saved[0].axes[1].get_title() == "optimised, constant image"

@@ -1,0 +1,131 @@
+"""A run in numbers: each one recomputed from the meshes and the image."""
+
+import hashlib
+import json
+import platform
+
+import numpy as np
+import pytest
+
+import tetopt
+from tetopt.energy.discretization import E_D
+from tetopt.energy.geometric import E_G
+from tetopt.geometry.quality import quality
+from tetopt.image import Image
+from tetopt.io.files import save_json
+from tetopt.lattice import lattice
+from tetopt.mesh import Mesh
+from tetopt.optimize.paper import optimize
+from tetopt.report.summary import SHOWN_VERSIONS, image_summary, mesh_hash, run_summary, versions
+
+AFFINE = np.array([[0.0, 2.0, 5.0], [-1.5, 0.5, 7.0], [0.0, 0.0, 1.0]])  # 1.5 and sqrt(4.25) mm, 3 mm^2
+
+
+@pytest.fixture(scope="module")
+def image():
+    return Image(np.random.default_rng(0).normal(50.0, 9.0, (12, 15)) + 40.0 * (np.arange(12)[:, None] > 5), AFFINE)
+
+
+@pytest.fixture(scope="module")
+def initial(image):
+    return lattice(image, blocks=(3, 4))
+
+
+@pytest.fixture(scope="module")
+def result(image, initial):
+    return optimize(image, initial, iterations=3)
+
+
+@pytest.fixture(scope="module")
+def summary(image, initial, result):
+    about = {"image": "a.nii", "image_sha256": "00", "options": {"k_D": 0.2}}
+    return run_summary(image, initial, result, about, {"all": 1.5})
+
+
+def test_keys(summary):
+    assert list(summary) == [
+        *("image", "image_sha256", "options", "versions", "machine", "image_properties", "ended", "iterations_done"),
+        *("energies", "quality_initial", "quality", "history", "seconds", "mesh_sha256"),
+    ]
+    assert summary["options"] == {"k_D": 0.2}
+    assert summary["seconds"] == {"all": 1.5}
+
+
+def test_versions(summary):
+    assert summary["versions"] == versions()
+    assert list(versions()) == ["tetopt", "python", *SHOWN_VERSIONS]
+    assert versions()["tetopt"] == tetopt.__version__
+    assert versions()["python"] == platform.python_version()
+    assert versions()["numpy"] == np.__version__
+
+
+def test_energies_are_those_of_the_meshes(summary, image, initial, result):
+    energies = summary["energies"]
+    shape = E_G(result.mesh.points, result.mesh.cells) / E_G(initial.points, initial.cells)
+    fit, fit_initial = E_D(image, result.mesh), E_D(image, initial)
+    total = ((image.data - image.data.mean()) ** 2).sum() * 3.0
+    assert energies["E_G_relative"] == pytest.approx(shape, rel=1e-9)
+    assert energies["E_D_relative"] == pytest.approx(fit / fit_initial, rel=1e-9)
+    assert energies["E"] == pytest.approx(0.8 * shape + 0.2 * fit / fit_initial, rel=1e-9)
+    assert energies["E_D_share_of_variance"] == pytest.approx(fit / total, rel=1e-9)
+    assert energies["E_D_share_of_variance_initial"] == pytest.approx(fit_initial / total, rel=1e-9)
+    assert energies["E_D_relative"] < 0.9  # so that before and after differ
+
+
+def test_quality_before_and_after(summary, initial, result):
+    assert summary["quality_initial"] == quality(initial.points, initial.cells)
+    assert summary["quality"] == quality(result.mesh.points, result.mesh.cells)
+    assert summary["quality"].min_rho < summary["quality_initial"].min_rho
+
+
+def test_history_and_end(summary, result):
+    assert summary["history"] == result.history
+    assert summary["iterations_done"] == 3
+    assert summary["ended"] == "iterations"
+
+
+def test_image_properties(image):
+    found = image_summary(image)
+    assert found["shape"] == (12, 15)
+    np.testing.assert_allclose(found["spacing_mm"], [1.5, np.sqrt(4.25)])
+    np.testing.assert_array_equal(found["affine"], AFFINE)
+    assert found["volume_mm"] == pytest.approx(180 * 3.0)
+    assert (found["min"], found["max"]) == (image.data.min(), image.data.max())
+    assert found["mean"] == pytest.approx(image.data.mean())
+    assert found["total_variation"] == pytest.approx(((image.data - image.data.mean()) ** 2).sum() * 3.0)
+
+
+def test_total_variation_is_E_D_of_one_cell_around_everything():
+    image = Image(np.random.default_rng(0).normal(size=(5, 6, 7)), np.diag([0.5, 2.0, 3.0, 1.0]))
+    mesh = Mesh([[-99, -99, -99], [500, -99, -99], [-99, 500, -99], [-99, -99, 500]], [[0, 1, 2, 3]])
+    assert image_summary(image)["total_variation"] == pytest.approx(E_D(image, mesh), rel=1e-9)
+
+
+def test_a_constant_image_has_no_shares(tmp_path):
+    image = Image(np.full((8, 9), 7.0))
+    initial = lattice(image, blocks=(2, 2))
+    summary = run_summary(image, initial, optimize(image, initial, iterations=1), {}, {})
+    shares = ["E_D_relative", "E_D_share_of_variance", "E_D_share_of_variance_initial"]
+    assert [summary["energies"][name] for name in shares] == [None] * 3
+    save_json(tmp_path / "run.json", summary)
+    assert json.loads((tmp_path / "run.json").read_text())["energies"]["E_D_relative"] is None
+
+
+def test_the_summary_is_json(tmp_path, summary, result):
+    save_json(tmp_path / "run.json", summary)
+    back = json.loads((tmp_path / "run.json").read_text())
+    assert [row["E"] for row in back["history"]] == [row.E for row in result.history]
+    assert back["quality"]["errors"]["worst"] == summary["quality"].errors.worst
+    assert back["quality"]["kinds"] == summary["quality"].kinds
+    assert back["image_properties"]["affine"] == AFFINE.tolist()
+
+
+def test_hash_is_over_points_and_cells(result):
+    points, cells = result.mesh.points, result.mesh.cells
+    assert mesh_hash(result.mesh) == hashlib.sha256(points.tobytes() + cells.tobytes()).hexdigest()
+    assert mesh_hash(Mesh(points.copy(), cells.copy())) == mesh_hash(result.mesh)
+    moved = points.copy()
+    moved[0, 0] = np.nextafter(moved[0, 0], np.inf)
+    assert mesh_hash(Mesh(moved, cells)) != mesh_hash(result.mesh)
+    assert mesh_hash(Mesh(points, np.roll(cells, 1, axis=1))) != mesh_hash(result.mesh)
+    assert mesh_hash(Mesh(points, cells[::-1])) != mesh_hash(result.mesh)
