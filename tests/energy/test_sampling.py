@@ -9,6 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from meshes import TWO_TRIANGLES, delaunay_box, random_affine, random_rotation, split_box
+from scipy.spatial import Delaunay
 
 from tetopt import Image, InputError, Mesh, cell_moments, cell_of_voxel, lattice
 from tetopt.energy.sampling import (
@@ -125,29 +126,19 @@ def test_owners_on_lattices_are_the_twin_s(shape, kind, blocks):
 
 @given(seeds, dimensions)
 def test_owners_near_a_tie_are_the_twin_s(seed, n):
-    """Nodes a few ticks off the halves: floats cannot tell, integers must."""
+    """Inner nodes a few ticks off the halves, as far as no cell turns over: floats cannot tell, integers must."""
     rng = np.random.default_rng(seed)
-    shape = (4,) * n
-    image = Image(np.zeros(shape))
-    index, cells = split_box(rng, shape, 5)
-    bits = sampling_grid(image, index).bits
-    is_inside = ((index > -0.5) & (index < np.array(shape) - 0.5)).all(axis=1, keepdims=True)
-    index = index + is_inside * rng.integers(-2, 3, index.shape) * 2.0**-bits
-    ticks = to_ticks(index, sampling_grid(image, index))
-    cells = cells[orientations(ticks, cells) == 1]  # the shift may turn the thinnest cells over
+    image = Image(np.zeros((4,) * n))
+    index, cells = split_box(rng, image.shape, 5)
+    grid = sampling_grid(image, index)
+    is_inside = ((index > -0.5) & (index < 3.5)).all(axis=1)
+    for node in np.flatnonzero(is_inside):
+        moved = index.copy()
+        moved[node] += rng.integers(-2, 3, n) * 2.0**-grid.bits
+        if (orientations(to_ticks(moved, grid), cells) == 1).all():
+            index = moved
     mesh = placed(image, index, cells)
-    np.testing.assert_array_equal(
-        cell_of_voxel(image, mesh), painted(naive.owners(image, mesh), shape)
-    )
-
-
-def painted(owners, shape):
-    """The last of the cells that hold each voxel, as the package paints them; overlaps are the test's own doing."""
-    owner = np.full(shape, -1)
-    for voxel, cells in owners.items():
-        if cells:
-            owner[voxel] = cells[-1]
-    return owner
+    np.testing.assert_array_equal(cell_of_voxel(image, mesh), naive.cell_of_voxel(image, mesh))
 
 
 @given(seeds, dimensions)
@@ -157,18 +148,11 @@ def test_owners_in_cells_far_larger_than_the_image_are_the_twin_s(seed, n):
     image = random_image(rng, (5, 4, 3)[:n])
     points = np.vstack([rng.uniform(-3e4, 3e4, (8, n)), rng.uniform(-1, 5, (4, n))])
     try:
-        index, cells = points, delaunay_of(points)
-        mesh = placed(image, index, cells)
+        mesh = placed(image, points, Delaunay(points).simplices)
         owner = cell_of_voxel(image, mesh)
     except InputError:
         return  # a cell flat to within a tick
     np.testing.assert_array_equal(owner, naive.cell_of_voxel(image, mesh))
-
-
-def delaunay_of(points):
-    from scipy.spatial import Delaunay
-
-    return oriented(points, Delaunay(points).simplices)
 
 
 @given(seeds, dimensions)
@@ -378,8 +362,12 @@ def test_order_of_cells_nodes_and_corners_changes_nothing(seed, n):
     nodes = rng.permutation(len(mesh.points))
     turned = np.roll(mesh.cells, 1, axis=1) if n == 2 else mesh.cells[:, [1, 2, 0, 3]]  # even permutations
     other = Mesh(mesh.points[nodes], np.argsort(nodes)[turned][cells])
-    for ours, theirs in zip(cell_moments(image, mesh), cell_moments(image, other), strict=True):
-        np.testing.assert_array_equal(ours[cells], theirs)
+    ours, theirs = cell_moments(image, mesh), cell_moments(image, other)
+    np.testing.assert_array_equal(ours.n_voxels[cells], theirs.n_voxels)
+    np.testing.assert_array_equal(ours.variance[cells], theirs.variance)
+    # The centroid of an empty cell may lie half way between voxels, give or take the order of its sum.
+    is_full = theirs.n_voxels > 0
+    np.testing.assert_array_equal(ours.mean[cells][is_full], theirs.mean[is_full])
     np.testing.assert_array_equal(cells[cell_of_voxel(image, other)], cell_of_voxel(image, mesh))
 
 

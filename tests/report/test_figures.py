@@ -26,6 +26,7 @@ from tetopt.report.figures import (
 SHAPE = (5, 7, 9)
 SPACING = (2.0, 1.0, 3.0)
 OBLIQUE = np.array([[-0.75, 0.31, 1.1, 12.5], [0.12, 0.68, -0.9, -33.0], [0.05, -0.22, 5.1, 7.25], [0, 0, 0, 1.0]])
+SHEARED = np.array([[-2.0, 0.5, 1.0], [0.3, 1.0, 5.0], [0, 0, 1.0]])
 WORLD_LETTERS = ["LR", "PA", "IS"]
 
 
@@ -37,6 +38,11 @@ def oriented_image(worlds, signs):
         affine[world, axis] = sign * SPACING[axis]
     affine[:3, 3] = [11.0, -22.0, 33.0]
     return Image(np.random.default_rng(0).normal(size=SHAPE), affine)
+
+
+def image_steps(image, view):
+    """Size of the picture's pixels in mm."""
+    return image.spacing[view.axes]
 
 
 ORIENTATIONS = [(w, s) for w in permutations(range(3)) for s in product((1, -1), repeat=3)]
@@ -86,10 +92,6 @@ def test_pixels_lie_where_the_letters_say(worlds, signs, normal):
     np.testing.assert_allclose(view.size, np.ptp(place[:, (horizontal, vertical)], axis=0) + image_steps(image, view))
 
 
-def image_steps(image, view):
-    return [image.spacing[a] for a in view.axes]
-
-
 @pytest.mark.parametrize(
     ("name", "worlds", "signs"),
     [
@@ -106,7 +108,7 @@ def test_a_bright_voxel_in_the_axial_picture(name, worlds, signs):
     assert view.letters == ["LR", "PA"]
     centre = image.to_world((np.array(SHAPE) - 1) / 2)
     step = np.array([SPACING[worlds.index(w)] for w in range(2)])
-    index = np.rint(image.to_index(centre + [2 * step[0], step[1], 0.0])).astype(int)
+    index = np.rint(image.to_index(centre + np.array([2 * step[0], step[1], 0.0]))).astype(int)
     data = np.zeros(SHAPE)
     data[tuple(index)] = 1.0
     bright = _View(Image(data, image.affine), None, index[view.across]).pixels
@@ -149,11 +151,12 @@ def test_a_2d_image_has_x_to_the_right_and_y_up(worlds, signs):
 def test_cells_and_pixels_share_their_places(worlds, signs):
     """The polygon around a pixel's centre is of the cell that holds the voxel."""
     image = oriented_image(worlds, signs)
-    mesh = bent(image, (2, 2, 2))
+    mesh = bent(image, (3, 3, 2))
     view = _View(image, None, None)
     polygons, cells = view.section(mesh)
-    owner = np.take(cell_of_voxel(image, mesh), view.index, axis=view.across)
-    owner = _View(Image(image.data, image.affine), None, None) and oriented_like(view, owner)
+    is_wide = areas(polygons) > 1e-9
+    polygons, cells = polygons[is_wide], cells[is_wide]
+    owner = _View(Image(cell_of_voxel(image, mesh), image.affine), None, None).pixels
     steps = image_steps(image, view)
     n_found = 0
     for pixel in np.ndindex(owner.shape):
@@ -164,13 +167,6 @@ def test_cells_and_pixels_share_their_places(worlds, signs):
             n_found += 1
             assert found == [owner[pixel]]
     assert n_found > 0.9 * owner.size
-
-
-def oriented_like(view, values):
-    """Values in the slice, in voxel order, laid out as the view's pixels; by where the pixels' values are."""
-    inside = np.take(view.image.data, view.index, axis=view.across)
-    place = {value: number for number, value in enumerate(inside.ravel())}
-    return np.array([[values.ravel()[place[v]] for v in row] for row in view.pixels])
 
 
 # --------------------------------------------------------------------------------------------------
@@ -269,7 +265,7 @@ def test_histograms_are_shares(n):
     image = Image(np.random.default_rng(0).normal(size=SHAPE[:n]), np.diag([*SPACING[:n], 1.0]))
     meshes = [("first", lattice(image, blocks=(2, 2, 2)[:n])), ("second", bent(image, (2, 3, 2)[:n]))]
     figure = histogram_figure(meshes)
-    outlines = [p for p in figure.axes[0].patches if p.get_label()[0] != "_"]
+    outlines = [p for p in figure.axes[0].patches if p.get_label()]
     assert [p.get_label().split(":")[0] for p in outlines] == ["first", "second"]
     for patch, (_, mesh) in zip(outlines, meshes, strict=True):
         values, edges, _ = patch.get_data()
@@ -320,7 +316,7 @@ def test_energies_of_the_lattice_alone(tmp_path):
 @pytest.fixture(scope="module")
 def run():
     image = Image(np.where(np.arange(12) > 4, 9.0, 1.0)[:, None] + np.zeros((12, 11)))
-    initial = lattice(image, blocks=(3, 3))
+    initial = lattice(image, blocks=(4, 4))
     return image, initial, optimize(image, initial, iterations=2)
 
 
@@ -341,7 +337,7 @@ def test_before_is_left_and_after_is_right(monkeypatch, tmp_path, run):
         for row in (0, 1):
             drawn = corners(collections(slice_axes[row, column])[0])
             np.testing.assert_allclose(drawn, view.section(mesh)[0].mean(axis=1))
-    outlines = [p for p in saved[paths[1]].axes[0].patches if p.get_label()[0] != "_"]
+    outlines = [p for p in saved[paths[1]].axes[0].patches if p.get_label()]
     for patch, mesh, word in zip(outlines, (initial, result.mesh), ("lattice", "optimised"), strict=True):
         assert patch.get_label().startswith(word)
         np.testing.assert_array_equal(patch.get_data()[0], rho_histogram(mesh.points, mesh.cells)[0])

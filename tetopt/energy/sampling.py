@@ -22,7 +22,7 @@ The facets of triangles are segments and go the same way; a 2-D image is given a
 from __future__ import annotations
 
 from math import ceil, log2
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit, prange
@@ -264,7 +264,7 @@ def _orientations(ticks: NDArray, cells: NDArray) -> NDArray:
 
 
 @njit(cache=True)
-def _edge_threshold(p0: int, p1: int, q0: int, q1: int, slope: float, bits: int, i: int) -> int:
+def _edge_threshold(p0: int, p1: int, q0: int, q1: int, slope: float, bits: int, i: int) -> Any:
     """The first voxel along axis 1, on line i of axis 0, on or beyond the edge from p to q, p0 <= i < q0 (in voxels).
 
     On an edge the float's error is far below 1e-9 voxel, since i lies between the ends.
@@ -343,7 +343,7 @@ def _triangle_flux(
         for j in range(max(min(one, other), 0), min(max(one, other), n_j)):
             cut = line + slope1 * (j - at1)
             up = np.ceil(cut)
-            k = np.int64(up)
+            k: Any = np.int64(up)
             if abs(up - cut - 0.5) > margin:
                 k = _exact_facet_threshold(n0, n1, n2, a0, a1, a2, bits, i, j, lowest, highest)
             k = min(max(k, 0), n_k)
