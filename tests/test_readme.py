@@ -1,0 +1,53 @@
+"""The README's program runs as printed, and its commands exist."""
+
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+
+import tetopt
+from tetopt.cli import main
+
+ROOT = Path(__file__).resolve().parents[1]
+README = (ROOT / "README.md").read_text(encoding="utf-8")
+
+
+def test_program(tmp_path, monkeypatch, capsys):
+    """The Python program, in an empty folder; its numbers are what the text around it promises."""
+    (program,) = re.findall(r"```python\n(.*?)```", README, re.DOTALL)
+    monkeypatch.chdir(tmp_path)
+    names: dict = {}
+    exec(compile(program, "README.md", "exec"), names)
+    printed = capsys.readouterr().out.splitlines()
+    E_D, shape = re.fullmatch(r"E_D (\S+) of the lattice's, mean rho (\S+)", printed[0]).groups()
+    assert 0.05 < float(E_D) < 0.3
+    assert float(shape) > 0.28
+    written = tetopt.load_mesh("two_spheres.vtu")
+    assert len(written.mesh.cells) == len(names["result"].mesh.cells)
+    assert written.cell_data["mean"].max() == names["cells"].mean.max()
+
+
+def test_commands(tmp_path, monkeypatch):
+    """Each `tetopt` line of the README, on a phantom in the place of the T1 and with fewer nodes."""
+    lines = [line for line in README.splitlines() if re.match("tetopt (mesh|quality|phantom) ", line)]
+    assert len(lines) == 3
+    monkeypatch.chdir(tmp_path)
+    assert main(["phantom", "sphere", "-o", "T1.nii.gz", "--voxel-mm", "4"]) == 0
+    for line in lines:
+        words = shlex.split(line)[1:]
+        words = ["200" if before == "--nodes" else word for before, word in zip(["", *words], words, strict=False)]
+        assert main(words) == 0, line
+    assert {path.name for path in tmp_path.iterdir()} == {"T1.nii.gz", "brain.vtu", "run.json", "sphere.nii.gz"}
+
+
+@pytest.mark.parametrize("target", ["demo", "test", "bench", "lint"])
+def test_make_targets(target):
+    assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
+    assert target == "lint" or f"make {target}" in README
+
+
+def test_paths_named_exist():
+    """Every relative link and file of the README is there."""
+    for name in re.findall(r"\]\(([^)#:]+)\)|!\[[^\]]*\]\(([^)]+)\)", README):
+        assert (ROOT / (name[0] or name[1])).exists(), name

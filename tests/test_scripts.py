@@ -1,0 +1,84 @@
+"""The scripts, through their main, on small inputs."""
+
+import importlib.util
+import json
+from pathlib import Path
+
+import nibabel
+import numpy as np
+import PIL.Image
+import pytest
+import trimesh
+
+import tetopt
+from tetopt.geometry.topology import components
+
+SCRIPTS = Path(__file__).resolve().parents[1] / "scripts"
+
+
+def script(name):
+    spec = importlib.util.spec_from_file_location(name, SCRIPTS / f"{name}.py")
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def can_render():
+    """Whether VTK finds an OpenGL that draws without a display; asked in a child, since it may end the process."""
+    import subprocess
+    import sys
+
+    program = (
+        "import numpy as np, pyvista as p; q = p.Plotter(off_screen=True); q.add_mesh(p.Sphere()); "
+        "assert np.ptp(q.screenshot(return_img=True)) > 0"
+    )
+    return subprocess.run([sys.executable, "-c", program], capture_output=True, check=False).returncode == 0
+
+
+def test_ventricles_of_a_phantom(tmp_path, capsys):
+    """The dark structure inside a bright head is found, one connected set, near its true volume; the air is not."""
+    if not can_render():
+        pytest.skip("no OpenGL that renders off screen")
+    axis = np.arange(40) - 19.5
+    r = np.sqrt(axis[:, None, None] ** 2 + axis[None, :, None] ** 2 + axis[None, None, :] ** 2)
+    data = np.where(r < 6.0, 30.0, np.where(r < 17.0, 150.0, 0.0))
+    nibabel.save(nibabel.Nifti1Image(data.astype(np.float32), np.diag([2.0, 2.0, 2.0, 1.0])), tmp_path / "head.nii.gz")
+    out = tmp_path / "out"
+    code = script("mesh_brain_mr").main(
+        [str(tmp_path / "head.nii.gz"), "-o", str(out), "--nodes", "2500", "--iterations", "6", "--k-d", "0.5"]
+    )
+    assert code == 0
+    written = tetopt.load_mesh(out / "mesh.vtu")
+    inside = np.flatnonzero(written.cell_data["is_structure"])
+    assert components(written.mesh.cells[inside]).max() == 0
+    assert written.cell_data["mean"][inside].max() < json.loads((out / "run.json").read_text())["below"]
+    volume = written.cell_data["volume"][inside].sum()
+    assert volume == pytest.approx(4 / 3 * np.pi * 12.0**3, rel=0.25)
+    centre = (written.cell_data["volume"][inside, None] * written.mesh.points[written.mesh.cells[inside]].mean(1)).sum(
+        0
+    )
+    np.testing.assert_allclose(centre / volume, [39.0, 39.0, 39.0], atol=1.0)
+    surface = trimesh.load(out / "structure.stl")
+    assert surface.volume == pytest.approx(volume, rel=1e-4)  # STL holds float32
+    assert np.std(np.asarray(PIL.Image.open(out / "structure.png").convert("L"))) > 20.0
+    assert "structure below" in capsys.readouterr().out
+
+
+def test_mesh_brain_mr_bad_input(tmp_path, capsys):
+    main = script("mesh_brain_mr").main
+    assert main([str(tmp_path / "none.nii"), "-o", str(tmp_path / "out")]) == 2
+    assert "no such file" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
+
+
+def test_benchmark(tmp_path, capsys):
+    """It runs, and what it prints is what it writes."""
+    tetopt.save_image(tmp_path / "b.nii.gz", tetopt.load_phantom("sphere").image(voxel_mm=2.0))
+    code = script("benchmark").main([str(tmp_path / "b.nii.gz"), "-o", str(tmp_path / "b.json"), "--quick"])
+    assert code == 0
+    rows = json.loads((tmp_path / "b.json").read_text())
+    printed = capsys.readouterr().out
+    assert f"E_D {rows['bar']['E_D_of_initial']:.3f} of initial" in printed
+    assert rows["sampling_over_find_simplex"] > 0.0
+    assert [row["nodes"] for row in rows["paper"]] == sorted(row["nodes"] for row in rows["paper"])
+    assert all(0.0 < row["delaunay_share"] < 1.0 for row in rows["paper"])
