@@ -164,11 +164,6 @@ def box_corners(shape):
     return np.array(list(product(*[(-0.5, s - 0.5) for s in shape])))
 
 
-def box_corners(shape):
-    """Corners of the image's box in index coordinates, (2^n, n)."""
-    return np.array(list(product(*[(-0.5, s - 0.5) for s in shape])))
-
-
 def split_box(rng, shape, n_nodes, step=0.5):
     """A conforming mesh of an image's box in index space whose nodes are multiples of `step`, 1/2, 1/4 ... voxel.
 

@@ -231,9 +231,7 @@ def plane_cut(points, cells, height):
         for a, b in combinations(cell, 2):
             if (height[a] >= 0) != (height[b] >= 0):
                 share = height[a] / (height[a] - height[b])
-                found.append(
-                    [float((1 - share) * p + share * q) for p, q in zip(points[a], points[b], strict=True)]
-                )
+                found.append([float((1 - share) * p + share * q) for p, q in zip(points[a], points[b], strict=True)])
         if found:
             crossings[number] = found
     return crossings

@@ -102,7 +102,8 @@ def test_every_lattice_is_a_mesh_of_its_box(seed, dimension_and_kind):
     low, high = -0.5, np.array(image.shape) - 0.5
     is_on_box = (np.abs(of_boundary - low) < 1e-9).all(axis=1) | (np.abs(of_boundary - high) < 1e-9).all(axis=1)
     assert is_on_box.any(axis=1).all()
-    assert (index.min(axis=0) == pytest.approx([low] * n, abs=1e-9)) and index.max(axis=0) == pytest.approx(high)
+    assert index.min(axis=0) == pytest.approx([low] * n, abs=1e-9)
+    assert index.max(axis=0) == pytest.approx(high, abs=1e-9)
 
 
 @given(seeds, kinds)

@@ -166,10 +166,14 @@ def test_flat_cells_have_a_kind():
 
 
 def test_no_bad_cells_and_many():
-    points, cells = REGULAR_TET
+    points = REGULAR_TET[0]
     bad = BAD_TETS["sliver"](0.01)
     mixed = np.vstack([points, bad, points])
-    assert bad_kinds(mixed, np.array([[0, 1, 2, 3], [4, 5, 6, 7], [8, 9, 10, 11]])).tolist() == ["good", "sliver", "good"]
+    assert bad_kinds(mixed, np.array([[0, 1, 2, 3], [4, 5, 6, 7], [8, 9, 10, 11]])).tolist() == [
+        "good",
+        "sliver",
+        "good",
+    ]
 
 
 # Angles of the archetypes in closed form

@@ -252,8 +252,7 @@ def test_rho_of_flat_cells_is_zero():
         # facet normals (0, 0, -1), (0, -1, -1), (-1, 0, -1), (1, 1, 3) opposite nodes 3, 2, 1, 0
         (
             OBTUSE_TET,
-            [135, 135, 120]
-            + [degrees(acos(3 / sqrt(11))), degrees(acos(4 / sqrt(22))), degrees(acos(4 / sqrt(22)))],
+            [135, 135, 120, degrees(acos(3 / sqrt(11))), degrees(acos(4 / sqrt(22))), degrees(acos(4 / sqrt(22)))],
         ),
     ],
 )

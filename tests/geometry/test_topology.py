@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 from meshes import ALL_SMALL, FIVE_TET_CUBE, SQUARE, TWO_SQUARES, TWO_TETS, TWO_TRIANGLES, split_box
 
 from tetopt.geometry.simplex import volumes
-from tetopt.geometry.topology import boundary_facets, components, facets, largest_component, node_colours, rings
+from tetopt.geometry.topology import boundary_facets, components, facets, largest_component, node_colours, rings, stars
 
 pytestmark = pytest.mark.kernel
 
@@ -65,6 +65,47 @@ def test_facets_are_those_of_the_twin(seed, n):
     for nodes, sides, count in zip(found.nodes.tolist(), found.cells.tolist(), found.n_cells, strict=True):
         assert [side for side in sides if side >= 0] == twin[tuple(nodes)]
         assert count == len(twin[tuple(nodes)])
+
+
+@given(seeds, dimensions)
+def test_facets_know_where_each_cell_holds_them(seed, n):
+    """`of_cell` by the opposite node, `sign` by the exact side on which that node lies."""
+    points, cells = random_mesh(seed, n)
+    found = facets(cells)
+    exact = naive.exactly(points)
+    for cell, of_cell, signs in zip(cells.tolist(), found.of_cell, found.sign, strict=True):
+        for node, facet, side in zip(cell, of_cell, signs, strict=True):
+            nodes = found.nodes[facet].tolist()
+            assert nodes == sorted(set(cell) - {node})
+            behind = naive.sign(naive.signed_volume([exact[a] for a in [*nodes, node]]))
+            assert side == (behind if n == 2 else -behind)  # 2-D: left of the edge; 3-D: under the triangle
+
+
+@given(seeds, dimensions)
+def test_the_two_cells_of_a_facet_hold_it_with_opposite_signs(seed, n):
+    _, cells = random_mesh(seed, n)
+    found = facets(cells)
+    total = np.bincount(found.of_cell.ravel(), weights=found.sign.ravel())
+    np.testing.assert_array_equal(total[found.n_cells == 2], 0)
+    np.testing.assert_array_equal(np.abs(total[found.n_cells == 1]), 1)
+    np.testing.assert_array_equal(np.bincount(found.of_cell.ravel()), found.n_cells)
+
+
+@given(seeds, dimensions)
+def test_stars_are_the_facets_of_each_node(seed, n):
+    points, cells = random_mesh(seed, n)
+    sides, around = facets(cells), rings(cells, len(points))
+    star = stars(sides, around)
+    for node in range(len(points)):
+        row = star.facets[star.start[node] : star.start[node + 1]].tolist()
+        assert row == [f for f, nodes in enumerate(sides.nodes.tolist()) if node in nodes]
+        for entry in range(around.start[node], around.start[node + 1]):
+            cell = around.cells[entry]
+            for k, place in enumerate(star.place[entry].tolist()):
+                if cells[cell, k] == node:  # the facet opposite the node is the one not around it
+                    assert place == -1
+                else:
+                    assert row[place] == sides.of_cell[cell, k]
 
 
 def test_facets_of_cells_that_do_not_conform_are_counted():

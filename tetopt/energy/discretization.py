@@ -34,7 +34,7 @@ def E_D(image: Image, mesh: Mesh) -> float:
 def E_D_of_sums(sums: NDArray[np.float64], voxel_volume: float) -> NDArray[np.float64]:
     """Each cell's E_D, (M,) float64, from the rows of `tetopt.energy.sampling.moment_sums`."""
     within = sums[:, 2] - sums[:, 1] ** 2 / np.maximum(sums[:, 0], 1.0)
-    return np.maximum(within, 0.0) * voxel_volume
+    return np.where(sums[:, 0] > 0.0, np.maximum(within, 0.0), 0.0) * voxel_volume
 
 
 def combined(E_G: float, E_D: float, E_G0: float, E_D0: float, k_D: float) -> float:

@@ -65,6 +65,7 @@ def cell_moments(image: Image, mesh: Mesh) -> CellMoments:
     share = 1.0 / np.maximum(sums[:, 0], 1.0)
     mean = grid.shift + sums[:, 1] * share
     variance = np.maximum(sums[:, 2] * share - (sums[:, 1] * share) ** 2, 0.0)
+    variance[is_empty] = 0.0
     mean[is_empty] = nearest_values(image, mesh.points[mesh.cells[is_empty]].mean(axis=1))
     return CellMoments(n_voxels, mean, variance)
 
