@@ -1,0 +1,228 @@
+"""E_G: Eq. (1) as printed, its scaling, its gradient and the paper's minimiser."""
+
+from math import factorial, sqrt
+
+import naive
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from meshes import (
+    ALL_SMALL,
+    BAD_TETS,
+    CUBE_CORNER,
+    EQUILATERAL,
+    FIVE_TET_CUBE,
+    REGULAR_TET,
+    SQUARE,
+    random_rotation,
+    single,
+    split_box,
+)
+
+from tetopt import E_G, Image, lattice
+from tetopt.energy.geometric import E_G_gradient, cell_E_G, ring_volumes, volume_and_E_G
+from tetopt.geometry.simplex import circumcentres, oriented, volumes
+from tetopt.geometry.topology import boundary_facets, rings
+
+pytestmark = pytest.mark.kernel
+
+seeds = st.integers(0, 2**32 - 1)
+dimensions = st.sampled_from([2, 3])
+
+
+def random_mesh(seed, n):
+    rng = np.random.default_rng(seed)
+    points, cells = split_box(rng, (3,) * n, int(rng.integers(1, 8)))
+    return rng, points, cells
+
+
+# Closed forms
+
+
+@pytest.mark.parametrize(
+    ("mesh", "energy"),
+    [
+        (EQUILATERAL, sqrt(3) / 4 * 3 / 12),
+        (SQUARE, 4 * (1 / 4) * (1 + 0.5 + 0.5) / 12),
+        (REGULAR_TET, 8 / 3 * 6 * 8 / 20),
+        (CUBE_CORNER, 1 / 6 * (3 * 1 + 3 * 2) / 20),
+        (FIVE_TET_CUBE, (1 / 3 * 6 * 2 + 4 * 1 / 6 * 9) / 20),
+    ],
+)
+def test_E_G_of_small_meshes(mesh, energy):
+    assert E_G(*mesh) == pytest.approx(energy, rel=1e-14)
+    assert naive.E_G_as_printed(*mesh) == pytest.approx(energy, rel=1e-14)
+
+
+@pytest.mark.parametrize("mesh", ALL_SMALL)
+def test_E_G_is_eq_1_as_printed_on_small_meshes(mesh):
+    assert E_G(*mesh) == pytest.approx(naive.E_G_as_printed(*mesh), rel=1e-14)
+
+
+@given(seeds, dimensions)
+def test_E_G_is_eq_1_as_printed(seed, n):
+    _, points, cells = random_mesh(seed, n)
+    assert E_G(points, cells) == pytest.approx(naive.E_G_as_printed(points, cells), rel=1e-13)
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_E_G_is_the_interpolation_error_of_the_paraboloid(n):
+    """Eq. (1) is an integral: the mean over random points of the linear interpolant of x^2 minus x^2.
+
+    2e5 points of one cell, seeded; the standard error is a few thousandths.
+    """
+    rng = np.random.default_rng(0)
+    points, cells = single(rng.normal(size=(n + 1, n)))
+    weights = rng.dirichlet(np.ones(n + 1), 200_000)
+    x = weights @ points[cells[0]]
+    error = weights @ (points[cells[0]] ** 2).sum(axis=1) - (x**2).sum(axis=1)
+    assert cell_E_G(points, cells)[0] == pytest.approx(volumes(points, cells)[0] * error.mean(), rel=5e-3)
+
+
+def test_E_G_of_a_lattice_is_that_of_its_blocks():
+    """7 x 7 unit squares: 49 times SQUARE; halving the blocks divides the box's E_G by 4."""
+    image = Image(np.zeros((7, 7)))
+    mesh = lattice(image, blocks=(7, 7))
+    assert E_G(mesh.points, mesh.cells) == pytest.approx(49 * E_G(*SQUARE), rel=1e-13)
+    finer = lattice(image, blocks=(14, 14))
+    assert E_G(finer.points, finer.cells) == pytest.approx(49 * E_G(*SQUARE) / 4, rel=1e-13)
+
+
+# Laws
+
+
+@given(seeds, dimensions)
+def test_E_G_scales_and_does_not_see_motions(seed, n):
+    rng, points, cells = random_mesh(seed, n)
+    scale = np.exp(rng.uniform(-3, 3))
+    moved = scale * points @ random_rotation(rng, n).T + rng.uniform(-10, 10, n)
+    np.testing.assert_allclose(cell_E_G(moved, cells), scale ** (n + 2) * cell_E_G(points, cells), rtol=1e-10)
+
+
+@pytest.mark.parametrize("mesh", ALL_SMALL)
+def test_E_G_far_from_the_origin_loses_nothing(mesh):
+    """As printed it would: x^2 |Omega| is 1e12 times what is left."""
+    points, cells = mesh
+    grid = np.round(points * 2.0**30) / 2.0**30
+    np.testing.assert_array_equal(cell_E_G(grid + 2.0**20, cells), cell_E_G(grid, cells))
+    np.testing.assert_allclose(E_G_gradient(grid + 2.0**20, cells), E_G_gradient(grid, cells), atol=1e-9)
+
+
+@given(seeds, dimensions)
+def test_ring_volumes_add_up_to_n_plus_1_times_the_volume(seed, n):
+    _, points, cells = random_mesh(seed, n)
+    v = volumes(points, cells)
+    expected = [sum(v[c] for c in ring) for ring in naive.rings(cells, len(points) + 1)]
+    found = ring_volumes(np.vstack([points, points[:1]]), cells)  # the last node is in no cell
+    assert found == pytest.approx(expected)
+    assert found.sum() == pytest.approx((n + 1) * 3**n)
+
+
+# The gradient
+
+
+@given(seeds, dimensions)
+def test_gradient_is_that_of_central_differences(seed, n):
+    """E_G is a polynomial of degree 3 in one coordinate: the step's error is s^2 times a third derivative / 6."""
+    rng, points, cells = random_mesh(seed, n)
+    points = points + rng.normal(scale=0.02, size=points.shape)  # nothing is a stationary point
+    gradient = E_G_gradient(points, cells)
+    assert gradient.shape == points.shape
+    step = 1e-4
+    for node in rng.permutation(len(points))[:4]:
+        for axis in range(n):
+            shift = np.zeros_like(points)
+            shift[node, axis] = step
+            difference = (E_G(points + shift, cells) - E_G(points - shift, cells)) / (2 * step)
+            assert gradient[node, axis] == pytest.approx(difference, rel=1e-6, abs=1e-6)
+
+
+@given(seeds, dimensions)
+def test_gradient_at_inner_nodes_points_from_the_weighted_circumcentres(seed, n):
+    """dE_G/dx_i = 2 |Omega_i| / (n + 1) (x_i - c_i), c_i the volume-weighted mean of the ring's circumcentres."""
+    _, points, cells = random_mesh(seed, n)
+    v, centres = volumes(points, cells), circumcentres(points, cells)
+    gradient = E_G_gradient(points, cells)
+    around = rings(cells, len(points))
+    inner = np.setdiff1d(np.arange(len(points)), boundary_facets(cells))
+    for node in inner:
+        ring = around.cells[around.start[node] : around.start[node + 1]]
+        mean = v[ring] @ centres[ring] / v[ring].sum()
+        expected = 2 * v[ring].sum() / (n + 1) * (points[node] - mean)
+        np.testing.assert_allclose(gradient[node], expected, atol=1e-9 * (1 + np.abs(centres[ring]).max()))
+
+
+@pytest.mark.parametrize("kind", ["bcc", "five-tet", "criss-cross"])
+def test_inner_nodes_of_lattices_are_in_equilibrium(kind):
+    n = 2 if kind == "criss-cross" else 3
+    """All but those beside the box, where a lattice's cells are others."""
+    image = Image(np.zeros((5,) * n))
+    mesh = lattice(image, kind, blocks=(5,) * n)
+    gradient = E_G_gradient(mesh.points, mesh.cells)
+    inner = np.abs(mesh.points - 2).max(axis=1) < 1.8
+    assert inner.sum() >= 4**n
+    np.testing.assert_allclose(gradient[inner], 0, atol=1e-13)
+
+
+@given(seeds, dimensions)
+def test_moving_a_node_to_the_weighted_circumcentres_lowers_E_G(seed, n):
+    """It is the minimiser over one inner node, so the energy there is below that of any other place."""
+    rng = np.random.default_rng(seed)
+    image = Image(np.zeros((3,) * n))
+    mesh = lattice(image, blocks=(1,) * n)
+    node = len(mesh.points) - 1
+    start = mesh.points.copy()
+    start[node] += rng.uniform(-0.8, 0.8, n)
+    v, centres = volumes(start, mesh.cells), circumcentres(start, mesh.cells)
+    best = start.copy()
+    best[node] = v @ centres / v.sum()
+    assert E_G(best, mesh.cells) <= E_G(start, mesh.cells)
+    np.testing.assert_allclose(E_G_gradient(best, mesh.cells)[node], 0, atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", BAD_TETS)
+def test_gradient_of_flat_cells_is_finite(kind):
+    points, cells = BAD_TETS[kind](0.0), np.array([[0, 1, 2, 3]])
+    with np.errstate(all="raise"):
+        assert np.isfinite(E_G_gradient(points, cells)).all()
+        assert cell_E_G(points, cells).tolist() == [0]
+
+
+# The kernel
+
+
+def corners_of(points, cell):
+    """As the kernel takes them: (4, 3), a triangle in coordinates 1 and 2, the rest of the array never read."""
+    n = points.shape[1]
+    corners = np.full((4, 3), np.nan)
+    corners[: n + 1, 3 - n :] = points[cell]
+    return corners
+
+
+@given(seeds, dimensions)
+def test_volume_and_E_G_of_one_cell(seed, n):
+    rng = np.random.default_rng(seed)
+    points = rng.normal(size=(8, n)) * np.exp(rng.uniform(-3, 3)) + rng.uniform(-100, 100, n)
+    cells = oriented(points, np.array([rng.permutation(8)[: n + 1] for _ in range(5)]))
+    for cell, v, energy in zip(cells, volumes(points, cells), cell_E_G(points, cells), strict=True):
+        found = volume_and_E_G(corners_of(points, cell), n + 1)
+        assert found == pytest.approx((v, energy), rel=1e-8)
+        assert found == pytest.approx(naive.volume_and_E_G(points[cell]), rel=1e-9)
+        assert volume_and_E_G(corners_of(points, cell[::-1]), n + 1) == pytest.approx(found, rel=1e-9)
+
+
+@pytest.mark.parametrize("mesh", ALL_SMALL)
+def test_volume_and_E_G_of_small_meshes(mesh):
+    points, cells = mesh
+    for cell in cells:
+        found = volume_and_E_G(corners_of(points, cell), len(cell))
+        assert found == pytest.approx(naive.volume_and_E_G(points[cell]), rel=1e-14)
+
+
+def test_unit_simplices():
+    for n in (2, 3):
+        corners = corners_of(np.vstack([np.zeros(n), np.eye(n)]), np.arange(n + 1))
+        v = 1 / factorial(n)
+        squares = n + n * (n - 1)  # n edges of 1 and n (n-1) / 2 of sqrt 2
+        assert volume_and_E_G(corners, n + 1) == pytest.approx((v, v * squares / (n + 1) / (n + 2)), rel=1e-15)

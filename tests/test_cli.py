@@ -1,0 +1,773 @@
+"""The command, run as a user runs it: files in, files out, exit codes, one line for every bad input."""
+
+import hashlib
+import json
+import os
+import re
+import shutil
+import signal
+import subprocess
+import sys
+from itertools import product
+from pathlib import Path
+
+import meshio
+import nibabel
+import numba
+import numpy as np
+import PIL.Image
+import pytest
+
+import tetopt
+import tetopt.cli
+from tetopt import Image, Mesh, lattice, load_image, load_mesh, load_phantom, quality, save_image, save_mesh
+from tetopt.cli import main
+from tetopt.geometry.simplex import volumes
+from tetopt.phantom import phantom_names
+from tetopt.report.summary import mesh_hash
+
+OBLIQUE_TOML = """
+name = "oblique"
+description = "A sphere of 9 mm off the middle of thick, oblique, sheared, flipped slices"
+size_mm = [32, 36, 40]
+voxel_mm = [0.5, 0.5, 1.25]
+center_mm = [12, -8, 30]
+axes = [[-0.94, 0.34, 0.05], [0.34, 0.93, 0.17], [0.10, -0.40, 0.91]]
+background = { intensity = 20, label = 0 }
+
+[[shape]]
+kind = "ellipsoid"
+center_mm = [14.3, -10.1, 28.7]
+radii_mm = 9
+intensity = 100
+label = 1
+"""
+
+
+@pytest.fixture(autouse=True)
+def _same_threads_afterwards():
+    before = numba.get_num_threads()
+    yield
+    numba.set_num_threads(before)
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory):
+    """A folder with small images and a mesh."""
+    folder = tmp_path_factory.mktemp("inputs")
+    assert main(["phantom", "sphere", "-o", str(folder / "sphere.nii.gz"), "--voxel-mm", "4"]) == 0
+    assert main(["phantom", "disc_2d", "-o", str(folder / "disc.nii"), "--voxel-mm", "2"]) == 0
+    save_image(folder / "flat.nii", Image(np.full((5, 6, 7), 3.0)))
+    save_mesh(folder / "lattice.vtu", lattice(load_image(folder / "sphere.nii.gz"), nodes=60))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run(inputs, tmp_path_factory):
+    """One run in 3-D with all its outputs: folder, run.json, mesh file, image."""
+    folder = tmp_path_factory.mktemp("run")
+    command = ["mesh", str(inputs / "sphere.nii.gz"), "-o", str(folder / "mesh.vtu"), "--nodes", "150"]
+    command += ["--json", str(folder / "run.json"), "--iterations", "3", "--k-d", "0.3", "--n-t", "1"]
+    assert main(command) == 0
+    return (
+        folder,
+        json.loads((folder / "run.json").read_text()),
+        load_mesh(folder / "mesh.vtu"),
+        load_image(inputs / "sphere.nii.gz"),
+    )
+
+
+def box_corners(image):
+    return image.to_world(np.array(list(product(*[(-0.5, s - 0.5) for s in image.shape]))))
+
+
+def assert_covers(mesh, image):
+    """The mesh fills the image's box: its volume, and every corner is a node."""
+    v = volumes(mesh.points, mesh.cells)
+    assert v.min() > 0.0
+    assert v.sum() == pytest.approx(image.volume, rel=1e-9)
+    corners = box_corners(image)
+    distance = np.linalg.norm(mesh.points[:, None] - corners[None], axis=2).min(axis=0)
+    assert distance.max() < 1e-6
+    np.testing.assert_allclose(mesh.points.min(axis=0), corners.min(axis=0), atol=1e-6)
+    np.testing.assert_allclose(mesh.points.max(axis=0), corners.max(axis=0), atol=1e-6)
+
+
+def assert_round_trips(points, image):
+    """World -> voxel -> world within 1e-6 mm."""
+    assert np.abs(image.to_world(image.to_index(points)) - points).max() < 1e-6
+
+
+# --------------------------------------------------------------------------------------------------
+# mesh
+
+
+def test_mesh_in_3d(run):
+    folder, numbers, file, image = run
+    assert sorted(p.name for p in folder.iterdir()) == ["mesh.vtu", "run.json"]
+    assert_covers(file.mesh, image)
+    assert_round_trips(file.mesh.points, image)
+    assert file.n_turned == 0
+    assert file.mesh.ndim == 3
+    assert numbers["quality"]["n_nodes"] == len(file.mesh.points)
+    assert abs(len(file.mesh.points) - 150) <= 5
+    assert numbers["energies"]["E_D_relative"] < 0.5  # the sphere is found
+
+
+def test_json_of_a_run(run, inputs):
+    _, numbers, file, _ = run
+    assert numbers["image"] == "sphere.nii.gz"
+    assert numbers["image_sha256"] == hashlib.sha256((inputs / "sphere.nii.gz").read_bytes()).hexdigest()
+    assert numbers["options"] == {
+        **{"k_D": 0.3, "iterations": 3, "n_t": 1, "retessellate": "first", "boundary": "slide", "nodes": 150},
+        **{"spacing": None, "lattice": None, "volume": None, "crop": None, "slice": None, "method": "paper"},
+        "max_seconds": None,
+    }
+    assert numbers["versions"]["tetopt"] == tetopt.__version__
+    assert numbers["versions"]["numba"] == numba.__version__
+    assert numbers["machine"]["threads"] == numba.get_num_threads()
+    assert numbers["ended"] == "iterations"
+    assert numbers["iterations_done"] == 3
+    assert [row["iteration"] for row in numbers["history"]] == [0, 1, 2, 3]
+    assert [row["n_voxels"] for row in numbers["history"]] == [16**3] * 4
+    E = [row["E"] for row in numbers["history"]]
+    assert E[0] == 1.0
+    assert E[2] >= E[3]  # the connectivity is fixed from iteration 2 on
+    assert numbers["energies"]["E"] == E[-1]
+    assert numbers["mesh_sha256"] == mesh_hash(file.mesh)
+    measured = quality(file.mesh.points, file.mesh.cells)
+    assert numbers["quality"]["errors"] == measured.errors._asdict()
+    assert numbers["quality"]["min_dihedral"] == measured.min_dihedral
+    assert set(numbers["seconds"]) == {"load", "optimize", "all"}
+    assert numbers["seconds"]["all"] >= numbers["seconds"]["optimize"] > 0.0
+
+
+def test_mesh_file_of_a_run(run):
+    folder, numbers, file, image = run
+    assert list(file.cell_data) == ["mean", "variance", "n_voxels", "volume", "rho", "min_dihedral"]
+    moments = tetopt.cell_moments(image, file.mesh)
+    np.testing.assert_array_equal(file.cell_data["n_voxels"], moments.n_voxels)
+    np.testing.assert_array_equal(file.cell_data["mean"], moments.mean)
+    assert file.cell_data["n_voxels"].sum() == image.data.size
+    assert (file.cell_data["n_voxels"] * file.cell_data["mean"]).sum() == pytest.approx(image.data.sum(), rel=1e-12)
+    np.testing.assert_array_equal(file.cell_data["volume"], volumes(file.mesh.points, file.mesh.cells))
+    texts = {name: values[0] for name, values in file.field_data.items()}
+    assert texts["tetopt"] == tetopt.__version__
+    assert texts["image"] == "sphere.nii.gz"
+    assert texts["image_sha256"] == numbers["image_sha256"]
+    assert json.loads(texts["options"]) == numbers["options"]
+    other = meshio.read(folder / "mesh.vtu")
+    np.testing.assert_array_equal(other.points, file.mesh.points)
+    np.testing.assert_array_equal(other.cells_dict["tetra"], file.mesh.cells)
+
+
+def test_mesh_in_2d(tmp_path, inputs):
+    out = tmp_path / "disc.vtu"
+    assert main(["mesh", str(inputs / "disc.nii"), "-o", str(out), "--nodes", "80", "--iterations", "4"]) == 0
+    image, file = load_image(inputs / "disc.nii"), load_mesh(out)
+    assert_covers(file.mesh, image)
+    assert_round_trips(file.mesh.points, image)
+    assert file.cell_data["n_voxels"].sum() == image.data.size
+    # The disc of 20 mm, of intensity 100 on 20: what the cells hold of it lies in its place, (0, 0).
+    weight = file.cell_data["volume"] * (file.cell_data["mean"] - 20.0)
+    assert weight.sum() / 80.0 == pytest.approx(np.pi * 20.0**2, rel=0.05)
+    assert list(tmp_path.iterdir()) == [out]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        ["--method", "paper", "--boundary", "fixed", "--retessellate", "never"],
+        ["--retessellate", "accept", "--n-t", "0"],
+        ["--k-d", "0", "--lattice", "five-tet"],
+        ["--crop", "2:14,:,1:15"],
+    ],
+    ids=lambda options: options[0],
+)
+def test_other_options(tmp_path, inputs, options):
+    command = ["mesh", str(inputs / "sphere.nii.gz"), "-o", str(tmp_path / "a.vtu"), "--json", str(tmp_path / "a.json")]
+    assert main([*command, "--spacing", "16", "--iterations", "1", *options]) == 0
+    image = load_image(inputs / "sphere.nii.gz", crop=[(2, 14), (None, None), (1, 15)] if "--crop" in options else None)
+    file = load_mesh(tmp_path / "a.vtu")
+    assert_covers(file.mesh, image)
+    stated = json.loads((tmp_path / "a.json").read_text())["options"]
+    for name, value in zip(options[::2], options[1::2], strict=True):
+        key = {"--k-d": "k_D"}.get(name, name[2:].replace("-", "_"))
+        assert str(stated[key]) in (value, f"{value}.0")
+
+
+def test_a_slice_in_2d(tmp_path, inputs):
+    out = tmp_path / "a.vtu"
+    command = ["mesh", str(inputs / "sphere.nii.gz"), "-o", str(out), "--nodes", "60", "--iterations", "1"]
+    assert main([*command, "--slice", "k=8"]) == 0
+    file = load_mesh(out)
+    assert file.mesh.ndim == 2
+    assert_covers(file.mesh, load_image(inputs / "sphere.nii.gz", slice_=(2, 8)))
+
+
+@pytest.mark.parametrize(("name", "size"), [("sphere.nii.gz", ["--nodes", "100"]), ("disc.nii", ["--spacing", "9"])])
+def test_no_iterations_write_the_lattice_itself(tmp_path, inputs, name, size):
+    assert main(["mesh", str(inputs / name), "-o", str(tmp_path / "a.vtu"), *size, "--iterations", "0"]) == 0
+    expected = lattice(load_image(inputs / name), **{size[0][2:]: int(size[1])})
+    mesh = load_mesh(tmp_path / "a.vtu").mesh
+    assert mesh.points.tobytes() == expected.points.tobytes()
+    np.testing.assert_array_equal(mesh.cells, expected.cells)
+
+
+def test_an_output_is_replaced_with_force(tmp_path, inputs):
+    out, numbers = tmp_path / "a.vtu", tmp_path / "a.json"
+    out.write_text("old")
+    numbers.write_text("old")
+    command = ["mesh", str(inputs / "disc.nii"), "-o", str(out), "--json", str(numbers), "--nodes", "30"]
+    assert main([*command, "--iterations", "1", "--force"]) == 0
+    assert json.loads(numbers.read_text())["mesh_sha256"] == mesh_hash(load_mesh(out).mesh)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.json", "a.vtu"]
+
+
+def test_the_table_shows_before_and_after(tmp_path, inputs, capsys):
+    command = ["mesh", str(inputs / "sphere.nii.gz"), "-o", str(tmp_path / "a.vtu"), "--json", str(tmp_path / "a.json")]
+    assert main([*command, "--nodes", "150", "--iterations", "2"]) == 0
+    numbers = json.loads((tmp_path / "a.json").read_text())
+    lines = capsys.readouterr().out.splitlines()
+    table = {row[0]: row[1:] for row in (re.split(r"\s{2,}", line.strip()) for line in lines) if len(row) == 3}
+    first, last = numbers["quality_initial"], numbers["quality"]
+    assert lines[0].split() == ["lattice", "optimised"]
+    assert table["E, combined"] == ["1.0000", f"{numbers['energies']['E']:.4f}"]
+    assert table["E_D, of initial"] == ["1", f"{numbers['energies']['E_D_relative']:.4f}"]
+    assert table["E_G, of initial"] == ["1", f"{numbers['energies']['E_G_relative']:.4f}"]
+    assert table["rho, smallest"] == [f"{first['min_rho']:.4f}", f"{last['min_rho']:.4f}"]
+    assert table["smallest angle, degrees"] == [f"{first['min_dihedral']:.2f}", f"{last['min_dihedral']:.2f}"]
+    assert table["rho, smallest"][0] != table["rho, smallest"][1]
+    nodes, cells = last["n_nodes"], last["n_cells"]
+    assert lines[-2:] == [
+        f"{tmp_path / 'a.vtu'}: {nodes} nodes, {cells} cells",
+        f"{tmp_path / 'a.json'}: every number of the run",
+    ]
+
+
+def test_progress_in_lines(tmp_path, inputs, capsys):
+    command = ["mesh", str(inputs / "sphere.nii.gz"), "-o", str(tmp_path / "a.vtu"), "--json", str(tmp_path / "a.json")]
+    assert main([*command, "--nodes", "150", "--iterations", "3"]) == 0
+    history = json.loads((tmp_path / "a.json").read_text())["history"]
+    lines = capsys.readouterr().err.splitlines()
+    first = f"{inputs / 'sphere.nii.gz'}: 16 x 16 x 16 voxels of 4 x 4 x 4 mm; lattice of 148 nodes, 576 cells"
+    assert lines[0] == first
+    progress = [line for line in lines[1:] if not line.startswith("kernels compiled")]
+    assert len(progress) == 4
+    for k, (line, row) in enumerate(zip(progress, history, strict=True)):
+        E_D = row["E_D"] / history[0]["E_D"]
+        assert line.startswith(f"iteration   {k}/3  E {row['E']:.4f}  E_G ")
+        assert f"  E_D {E_D:.4f}  {row['n_cells']} cells  " in line
+    assert not any("\x1b" in line for line in lines)  # no colours, no cursor movements
+
+
+def test_a_constant_image_warns_and_works(tmp_path, inputs, capsys):
+    command = ["mesh", str(inputs / "flat.nii"), "-o", str(tmp_path / "a.vtu"), "--json", str(tmp_path / "a.json")]
+    assert main([*command, "--nodes", "50", "--iterations", "2"]) == 0
+    captured = capsys.readouterr()
+    warning = f"tetopt: warning: {inputs / 'flat.nii'}: the image is 3 everywhere, so E_D is 0 everywhere"
+    assert captured.err.splitlines()[0] == warning
+    assert captured.err.count("warning") == 1
+    assert "E_D" not in captured.out
+    assert json.loads((tmp_path / "a.json").read_text())["energies"]["E_D_relative"] is None
+    assert_covers(load_mesh(tmp_path / "a.vtu").mesh, load_image_quietly(inputs / "flat.nii"))
+
+
+def load_image_quietly(path):
+    with pytest.warns(UserWarning, match="everywhere"):
+        return load_image(path)
+
+
+def test_a_name_with_markup_and_letters(tmp_path, inputs, capsys):
+    """Rich would take [red] for a colour and :cat: for a picture."""
+    folder = tmp_path / "Schädel [red] :cat:"
+    folder.mkdir()
+    shutil.copy(inputs / "disc.nii", folder / "ä[1].nii")
+    command = ["mesh", str(folder / "ä[1].nii"), "-o", str(folder / "a[b].vtu"), "--nodes", "30", "--iterations", "1"]
+    assert main(command) == 0
+    captured = capsys.readouterr()
+    assert captured.err.startswith(f"{folder / 'ä[1].nii'}: 32 x 32 voxels")
+    assert f"{folder / 'a[b].vtu'}: " in captured.out
+    assert load_mesh(folder / "a[b].vtu").field_data["image"].tolist() == ["ä[1].nii"]
+    assert main(["quality", str(folder / "a[b].vtu")]) == 0
+    assert capsys.readouterr().out.splitlines()[0].strip() == "a[b].vtu"
+
+
+@pytest.mark.skipif(numba.config.NUMBA_NUM_THREADS < 2, reason="one core: there are no two thread counts to compare")
+def test_the_same_bits_for_any_number_of_threads(tmp_path, inputs):
+    hashes = []
+    for threads in ("1", "2"):
+        out = tmp_path / threads
+        command = ["mesh", str(inputs / "sphere.nii.gz"), "-o", f"{out}.vtu", "--json", f"{out}.json", "--nodes", "400"]
+        assert main([*command, "--iterations", "3", "--threads", threads]) == 0
+        numbers = json.loads(Path(f"{out}.json").read_text())
+        assert numbers["machine"]["threads"] == int(threads)
+        hashes.append(numbers["mesh_sha256"])
+        assert hashes[-1] == mesh_hash(load_mesh(f"{out}.vtu").mesh)
+    assert hashes[0] == hashes[1]
+    assert Path(tmp_path / "1.vtu").read_bytes() == Path(tmp_path / "2.vtu").read_bytes()
+
+
+def test_max_seconds_leaves_a_valid_mesh(tmp_path, inputs, capsys):
+    command = ["mesh", str(inputs / "sphere.nii.gz"), "-o", str(tmp_path / "a.vtu"), "--json", str(tmp_path / "a.json")]
+    assert main([*command, "--nodes", "400", "--iterations", "1000", "--max-seconds", "1e-6"]) == 0
+    numbers = json.loads((tmp_path / "a.json").read_text())
+    assert numbers["ended"] == "max_seconds"
+    assert numbers["options"]["max_seconds"] == 1e-6
+    assert numbers["iterations_done"] < 1000
+    mesh = load_mesh(tmp_path / "a.vtu").mesh
+    assert_covers(mesh, load_image(inputs / "sphere.nii.gz"))
+    assert numbers["mesh_sha256"] == mesh_hash(mesh)
+    assert "out of time: the mesh so far is kept" in capsys.readouterr().err
+
+
+def test_a_mesh_that_misses_voxels_is_told(run, capsys):
+    _, _, file, image = run
+    result = tetopt.optimize(image, file.mesh, iterations=0)
+    assert tetopt.cli._promises(image, result) == 0
+    assert capsys.readouterr().err == ""
+    row = result.history[-1]
+    fewer = result._replace(history=[row._replace(n_voxels=row.n_voxels - 1)])
+    assert tetopt.cli._promises(image, fewer) == 1
+    assert "1 voxels are outside" in capsys.readouterr().err
+    smaller = result._replace(mesh=Mesh(file.mesh.points * 0.999, file.mesh.cells))
+    assert tetopt.cli._promises(image, smaller) == 1
+    assert capsys.readouterr().err.count("\n") == 1
+
+
+# --------------------------------------------------------------------------------------------------
+# Ctrl-C
+
+
+def child(arguments, **options):
+    environment = os.environ | {"PYTHONPATH": str(Path(tetopt.__file__).parents[1])}
+    return subprocess.Popen(
+        [sys.executable, "-m", "tetopt", *map(str, arguments)], env=environment, text=True,
+        stdout=subprocess.PIPE, stderr=subprocess.PIPE, **options,
+    )  # fmt: skip
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows sends no SIGINT to one process")
+def test_ctrl_c_leaves_a_valid_mesh(tmp_path, inputs):
+    command = ["mesh", inputs / "sphere.nii.gz", "-o", tmp_path / "a.vtu", "--json", tmp_path / "a.json"]
+    process = child([*command, "--nodes", "400", "--iterations", "100000", "--k-d", "0.9"])
+    try:
+        for line in process.stderr:
+            if line.startswith("iteration   2/100000"):
+                break
+        process.send_signal(signal.SIGINT)
+        _, errors = process.communicate(timeout=60)
+    finally:
+        process.kill()
+    assert process.returncode == 130
+    assert "interrupted: the mesh so far is kept" in errors
+    assert "Traceback" not in errors
+    mesh = load_mesh(tmp_path / "a.vtu").mesh
+    assert_covers(mesh, load_image(inputs / "sphere.nii.gz"))
+    numbers = json.loads((tmp_path / "a.json").read_text())
+    assert numbers["ended"] == "stopped"
+    assert 2 <= numbers["iterations_done"] < 100000
+    assert numbers["mesh_sha256"] == mesh_hash(mesh)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.json", "a.vtu"]
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows sends no SIGINT to one process")
+def test_a_second_ctrl_c_gives_up(tmp_path, inputs, monkeypatch, capsys):
+    def impatient(*_, stop, **__):
+        signal.raise_signal(signal.SIGINT)
+        assert stop()
+        signal.raise_signal(signal.SIGINT)
+
+    monkeypatch.setattr(tetopt.cli, "_prepare_kernels", lambda *_: None)
+    monkeypatch.setattr(tetopt.cli, "optimize", impatient)
+    before = signal.getsignal(signal.SIGINT)
+    assert main(["mesh", str(inputs / "disc.nii"), "-o", str(tmp_path / "a.vtu")]) == 130
+    assert signal.getsignal(signal.SIGINT) is before
+    assert capsys.readouterr().err.splitlines()[-2:] == [
+        "interrupted: finishing the current nodes, then writing the mesh (again to give up)",
+        "interrupted again: no mesh is written",
+    ]
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_ctrl_c_while_reading(tmp_path, inputs, monkeypatch):
+    def interrupted(*_, **__):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(tetopt.cli, "load_image", interrupted)
+    assert main(["mesh", str(inputs / "disc.nii"), "-o", str(tmp_path / "a.vtu")]) == 130
+    assert list(tmp_path.iterdir()) == []
+
+
+# --------------------------------------------------------------------------------------------------
+# Inputs to mend
+
+
+def assert_refused(capfd, arguments, match, code=2):
+    assert main([str(a) for a in arguments]) == code
+    captured = capfd.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1, captured.err
+    assert captured.err.startswith("tetopt: ")
+    assert re.search(match, captured.err), captured.err
+
+
+BAD_OPTIONS = [
+    ("--nodes 100 --spacing 5", "--nodes and --spacing: give one of them"),
+    ("--nodes 2", "nodes must lie between 9 and"),
+    ("--nodes 99999999999", "nodes must lie between 9 and"),
+    ("--nodes -5", "nodes must lie between"),
+    ("--nodes 2.5", "--nodes"),
+    ("--spacing 0", "spacing must be a length above 0"),
+    ("--spacing nan", "spacing must be a length above 0"),
+    ("--k-d 1", "--k-d: expected 0 <= k_D < 1, got 1.0"),
+    ("--k-d -0.1", "--k-d: expected 0 <= k_D < 1, got -0.1"),
+    ("--k-d nan", "--k-d: expected 0 <= k_D < 1, got nan"),
+    ("--k-d abc", "--k-d"),
+    ("--iterations -1", "--iterations"),
+    ("--iterations 1.5", "--iterations"),
+    ("--n-t -1", "--n-t"),
+    ("--threads 0", "--threads: expected 1 to"),
+    ("--threads 10000", "--threads: expected 1 to .* got 10000"),
+    ("--max-seconds 0", "--max-seconds: expected more than 0"),
+    ("--max-seconds nan", "--max-seconds: expected more than 0"),
+    ("--lattice criss-cross", "expected one of bcc, five-tet in 3-D"),
+    ("--lattice fcc", "--lattice"),
+    ("--method fast", "--method"),
+    ("--boundary free", "--boundary"),
+    ("--retessellate always", "--retessellate"),
+    ("--slice z", 'slice: expected .* got "z"'),
+    ("--slice k=99", "slice: index along axis 2 must be from 0 to 15, got 99"),
+    ("--crop 0:100:5", 'crop: expected .* got "0:100:5"'),  # :100: is an emoji to rich
+    ("--crop 3:3,:,:", "crop"),
+    ("--crop 0:5,:", "crop"),
+    ("--crop 0:99,:,:", "crop"),
+    ("--volume 1", "volume 1 asked for"),
+    ("--json no/such/run.json", "folder does not exist"),
+    ("--json run.txt", "ends in .json"),
+    ("--unknown", "No such option: --unknown"),
+    ("second.nii", "second.nii"),
+]
+
+
+@pytest.mark.parametrize(("options", "match"), BAD_OPTIONS, ids=[options for options, _ in BAD_OPTIONS])
+def test_bad_options_of_mesh(tmp_path, inputs, monkeypatch, capfd, options, match):
+    monkeypatch.chdir(tmp_path)
+    assert_refused(capfd, ["mesh", inputs / "sphere.nii.gz", "-o", "a.vtu", *options.split()], match)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize(
+    ("arguments", "match"),
+    [
+        ("mesh no.nii -o a.vtu", "no.nii: no such file"),
+        ("mesh {disc} -o a.vtu --lattice bcc", "expected one of criss-cross in 2-D"),
+        ("mesh {disc} -o a.vtu --slice k=3", "slice"),
+        ("mesh {disc} -o a.vtu --crop 1:5,1:5,1:5", "crop"),
+        ("mesh {disc} -o a.vtk", "ends in .vtu"),
+        ("mesh {disc} -o no/a.vtu", "folder does not exist"),
+        ("mesh {disc}", "--output"),
+        ("mesh -o a.vtu", "Missing argument 'IMAGE'"),
+        ("mesh {lattice} -o a.vtu", "unknown kind of image"),
+        ("quality no.vtu", "no such mesh file"),
+        ("quality {disc}", "named .vtu or .vtk"),
+        ("quality {lattice} --image no.nii", "no such file"),
+        ("quality {lattice} --image {disc}", "3-D mesh and a 2-D image"),
+        ("quality {lattice} --json no/a.json", "folder does not exist"),
+        ("quality", "Missing argument 'MESH'"),
+        ("phantom nothing -o a.nii", "phantom 'nothing': no such phantom; give one of constant"),
+        ("phantom no.toml -o a.nii", "no.toml"),
+        ("phantom sphere -o a.png", "ends in .nii or .nii.gz"),
+        ("phantom sphere -o a.nii --labels b.png", "ends in .nii or .nii.gz"),
+        ("phantom sphere -o a.nii --labels ./a.nii", "name the same file"),
+        ("phantom sphere -o a.nii --voxel-mm 0", "voxel_mm"),
+        ("phantom sphere -o a.nii --voxel-mm 1e-9", "voxel_mm"),
+        ("phantom sphere -o a.nii --noise-sd -1", "noise_sd"),
+        ("phantom sphere -o a.nii --seed x", "--seed"),
+        ("segment", "No such command 'segment'"),
+        ("--unknown", "No such option: --unknown"),
+        ("demo -o {disc}", "expected a folder"),
+        ("demo --iterations -1", "--iterations"),
+    ],
+)
+def test_bad_inputs(tmp_path, inputs, monkeypatch, capfd, arguments, match):
+    if "{disc}" in arguments and arguments.startswith("demo"):
+        pytest.importorskip("nilearn", reason="the demo's image comes in nilearn's wheel")
+    monkeypatch.chdir(tmp_path)
+    paths = {"disc": inputs / "disc.nii", "lattice": inputs / "lattice.vtu"}
+    assert_refused(capfd, [a.format(**paths) for a in arguments.split()], match)
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["a.vtu", "a.json"])
+def test_existing_outputs_are_refused_before_the_work(tmp_path, inputs, monkeypatch, capfd, name):
+    monkeypatch.setattr(tetopt.cli, "load_image", None)  # a call would fail
+    (tmp_path / name).write_text("old")
+    command = ["mesh", inputs / "sphere.nii.gz", "-o", tmp_path / "a.vtu", "--json", tmp_path / "a.json"]
+    assert_refused(capfd, command, f"{name}: exists already; pass --force")
+    assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [(name, "old")]
+
+
+def test_existing_outputs_of_the_other_commands(tmp_path, inputs, capfd):
+    for name in ("a.nii", "b.nii", "a.json"):
+        (tmp_path / name).write_text("old")
+    new = tmp_path / "new.nii"
+    assert_refused(capfd, ["phantom", "sphere", "-o", tmp_path / "a.nii"], "exists already")
+    assert_refused(capfd, ["phantom", "sphere", "-o", new, "--labels", tmp_path / "b.nii"], "exists already")
+    assert_refused(capfd, ["quality", inputs / "lattice.vtu", "--json", tmp_path / "a.json"], "exists already")
+    assert {p.name: p.read_text() for p in tmp_path.iterdir()} == dict.fromkeys(("a.nii", "b.nii", "a.json"), "old")
+
+
+def test_a_damaged_mesh_is_refused_in_one_line(tmp_path, capfd):
+    (tmp_path / "a.vtu").write_text("no mesh at all")
+    assert_refused(capfd, ["quality", tmp_path / "a.vtu"], "a.vtu: damaged")
+
+
+def test_the_systems_errors_take_one_line(tmp_path, inputs, monkeypatch, capfd):
+    assert_refused(capfd, ["mesh", inputs / "disc.nii", "-o", tmp_path / f"{'a' * 300}.vtu"], "too long")
+
+    def full_disk(*_):
+        raise OSError(28, "No space left on device", "a[b].vtu")
+
+    monkeypatch.setattr(tetopt.cli, "save_image", full_disk)
+    command = ["phantom", "disc_2d", "-o", tmp_path / "a.nii", "--voxel-mm", "8"]
+    assert_refused(capfd, command, r"No space left on device: 'a\[b\].vtu'")
+
+
+def test_the_checksum_is_of_what_was_read(tmp_path, inputs, monkeypatch):
+    """The image may be gone, or another, when the optimisation ends."""
+    shutil.copy(inputs / "disc.nii", tmp_path / "disc.nii")
+
+    def slow(*arguments, **options):
+        (tmp_path / "disc.nii").unlink()
+        return tetopt.optimize(*arguments, **options)
+
+    monkeypatch.setattr(tetopt.cli, "_prepare_kernels", lambda *_: None)
+    monkeypatch.setattr(tetopt.cli, "optimize", slow)
+    command = ["mesh", str(tmp_path / "disc.nii"), "-o", str(tmp_path / "a.vtu"), "--nodes", "30", "--iterations", "1"]
+    assert main(command) == 0
+    expected = hashlib.sha256((inputs / "disc.nii").read_bytes()).hexdigest()
+    assert load_mesh(tmp_path / "a.vtu").field_data["image_sha256"].tolist() == [expected]
+
+
+# --------------------------------------------------------------------------------------------------
+# Help and version
+
+
+OPTIONS = {
+    "mesh": "-o --output --nodes --spacing --lattice --k-d --iterations --n-t --retessellate --method --boundary "
+    "--threads --max-seconds --volume --crop --slice --json --force",
+    "quality": "--image --volume --json --force",
+    "phantom": "-o --output --voxel-mm --blur-mm --noise-sd --seed --labels --force",
+    "demo": "-o --output --nodes --iterations --force",
+}
+
+
+@pytest.mark.parametrize("command", OPTIONS)
+@pytest.mark.parametrize("flag", ["--help", "-h"])
+def test_help_lists_the_options(monkeypatch, capsys, command, flag):
+    monkeypatch.setenv("COLUMNS", "200")
+    assert main([command, flag]) == 0
+    captured = capsys.readouterr()
+    words = set(re.findall(r"(?<!\w)--?[a-z-]+", captured.out))
+    assert words >= {*OPTIONS[command].split(), "--help", "-h"}
+    assert captured.err == ""
+
+
+def test_help_lists_the_commands(capsys):
+    assert main(["--help"]) == 0
+    captured = capsys.readouterr()
+    assert all(re.search(rf"\b{command}\b", captured.out) for command in OPTIONS)
+    assert main([]) == 2
+    bare = capsys.readouterr()
+    assert (bare.out + bare.err).strip() == captured.out.strip()  # the help, and no line of complaint
+
+
+def test_version(capsys):
+    assert main(["--version"]) == 0
+    assert capsys.readouterr() == (f"tetopt {tetopt.__version__}\n", "")
+
+
+def test_as_a_module():
+    process = child(["--version"])
+    assert process.communicate(timeout=60) == (f"tetopt {tetopt.__version__}\n", "")
+    assert process.returncode == 0
+
+
+# --------------------------------------------------------------------------------------------------
+# quality
+
+
+def test_quality_of_a_run(run, inputs, tmp_path, capsys):
+    folder, numbers, file, image = run
+    command = ["quality", str(folder / "mesh.vtu"), "--image", str(inputs / "sphere.nii.gz")]
+    assert main([*command, "--json", str(tmp_path / "q.json")]) == 0
+    found = json.loads((tmp_path / "q.json").read_text())
+    assert found["quality"] == numbers["quality"]
+    assert found["n_turned"] == 0
+    assert found["fit"]["E_D"] == pytest.approx(numbers["history"][-1]["E_D"], rel=1e-6)
+    assert found["fit"]["E_D_share_of_variance"] == pytest.approx(
+        numbers["energies"]["E_D_share_of_variance"], rel=1e-6
+    )
+    assert found["fit"]["n_voxels"] == image.data.size
+    assert found["fit"]["n_empty_cells"] == int((file.cell_data["n_voxels"] == 0).sum())
+    captured = capsys.readouterr()
+    assert captured.err == ""
+    assert re.search(rf"^voxels inside +{image.data.size} of {image.data.size}$", captured.out, re.M)
+    assert re.search(rf"^nodes +{len(file.mesh.points)}$", captured.out, re.M)
+
+
+def test_quality_tells_of_inverted_cells(run, tmp_path, capsys):
+    _, numbers, file, _ = run
+    cells = file.mesh.cells.copy()
+    cells[:3, :2] = cells[:3, 1::-1]
+    meshio.write(tmp_path / "a.vtu", meshio.Mesh(file.mesh.points, [("tetra", cells)]))
+    assert main(["quality", str(tmp_path / "a.vtu"), "--json", str(tmp_path / "q.json")]) == 0
+    found = json.loads((tmp_path / "q.json").read_text())
+    assert found["n_turned"] == 3
+    assert found["quality"]["errors"]["mean"] == pytest.approx(numbers["quality"]["errors"]["mean"], rel=1e-12)
+    assert "3 cells were inverted in the file and have been turned" in capsys.readouterr().err
+
+
+def test_quality_of_a_mesh_elsewhere(run, inputs, tmp_path, capfd):
+    _, _, file, _ = run
+    save_mesh(tmp_path / "far.vtu", Mesh(file.mesh.points + 1000.0, file.mesh.cells))
+    command = ["quality", tmp_path / "far.vtu", "--image", inputs / "sphere.nii.gz"]
+    assert_refused(capfd, command, "no voxel centre lies inside the mesh")
+
+
+def test_quality_of_triangles(inputs, tmp_path, capsys):
+    image = load_image(inputs / "disc.nii")
+    save_mesh(tmp_path / "a.vtu", lattice(image, nodes=60))
+    assert main(["quality", str(tmp_path / "a.vtu"), "--image", str(inputs / "disc.nii")]) == 0
+    assert re.search(r"^volume, mm\^n +4096$", capsys.readouterr().out, re.M)
+
+
+# --------------------------------------------------------------------------------------------------
+# phantom
+
+
+@pytest.mark.parametrize("name", phantom_names())
+def test_phantoms_with_labels(tmp_path, name, capsys):
+    phantom = load_phantom(name)
+    voxel = float(phantom.size_mm.max() / 16)
+    image_path, label_path = tmp_path / "a.nii.gz", tmp_path / "labels.nii.gz"
+    command = ["phantom", name, "-o", str(image_path), "--labels", str(label_path), "--voxel-mm", repr(voxel)]
+    assert main(command) == 0
+    expected, labels = phantom.image(voxel_mm=voxel), phantom.label_image(voxel_mm=voxel)
+    written = nibabel.load(image_path)
+    np.testing.assert_array_equal(written.get_fdata().reshape(expected.shape), expected.data)
+    np.testing.assert_array_equal(nibabel.load(label_path).get_fdata().reshape(labels.shape), labels.data)
+    n = expected.ndim
+    np.testing.assert_allclose(written.affine[:n, :n], expected.affine[:n, :n], rtol=1e-6)
+    captured = capsys.readouterr()
+    size = " x ".join(map(str, expected.shape))
+    assert captured.out.startswith(f"{image_path}: {name}, {size} voxels, ")
+    assert captured.err == ""
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.nii.gz", "labels.nii.gz"]
+
+
+def test_a_phantom_of_ones_own(tmp_path):
+    (tmp_path / "mine.toml").write_text(OBLIQUE_TOML)
+    command = ["phantom", str(tmp_path / "mine.toml"), "-o", str(tmp_path / "a.nii")]
+    assert main([*command, "--noise-sd", "2", "--seed", "7", "--blur-mm", "1.5"]) == 0
+    expected = load_phantom(str(tmp_path / "mine.toml")).image(noise_sd=2.0, seed=7, blur_mm=1.5)
+    np.testing.assert_array_equal(load_image(tmp_path / "a.nii").data, expected.data)
+    np.testing.assert_allclose(load_image(tmp_path / "a.nii").affine, expected.affine, rtol=1e-6)
+
+
+# --------------------------------------------------------------------------------------------------
+# Places in the world
+
+
+def test_a_sphere_keeps_its_place_in_an_oblique_sheared_world(tmp_path):
+    """Through the files: phantom -> image -> mesh -> where the cells' means say that the sphere is.
+
+    A cell weighs its volume, or its number of voxels, times its mean over the background; it stands at the mean
+    world place of the voxel centres that it holds.
+    """
+    (tmp_path / "sphere.toml").write_text(OBLIQUE_TOML)
+    assert main(["phantom", str(tmp_path / "sphere.toml"), "-o", str(tmp_path / "a.nii.gz")]) == 0
+    command = ["mesh", str(tmp_path / "a.nii.gz"), "-o", str(tmp_path / "a.vtu"), "--nodes", "600"]
+    assert main([*command, "--iterations", "4"]) == 0
+    image, file = load_image(tmp_path / "a.nii.gz"), load_mesh(tmp_path / "a.vtu")
+    assert_covers(file.mesh, image)
+    assert_round_trips(file.mesh.points, image)
+    owner = tetopt.cell_of_voxel(image, file.mesh).ravel()
+    place = image.to_world(np.indices(image.shape).reshape(3, -1).T)
+    counts = np.bincount(owner, minlength=len(file.mesh.cells))
+    np.testing.assert_array_equal(counts, file.cell_data["n_voxels"])
+    is_held = counts > 0
+    sums = np.stack([np.bincount(owner, place[:, k], minlength=len(counts)) for k in range(3)], axis=1)
+    centroids = sums[is_held] / counts[is_held, None]
+    true = image.to_index([14.3, -10.1, 28.7])
+    for name, allowed in (("volume", 0.05), ("n_voxels", 0.02)):  # voxels
+        weights = (file.cell_data[name] * (file.cell_data["mean"] - 20.0))[is_held]
+        found = (weights[:, None] * centroids).sum(axis=0) / weights.sum()
+        assert np.linalg.norm(image.to_index(found) - true) < allowed
+    contrast = (file.cell_data["volume"] * (file.cell_data["mean"] - 20.0)).sum()
+    assert contrast == pytest.approx(80.0 * 4 / 3 * np.pi * 9.0**3, rel=0.02)
+
+
+def test_an_oblique_anisotropic_volume(tmp_path, data_dir):
+    path = data_dir / "brain_flair_oblique_aniso.nii.gz"
+    command = ["mesh", str(path), "-o", str(tmp_path / "a.vtu"), "--nodes", "300", "--iterations", "1"]
+    assert main(command) == 0
+    image, mesh = load_image(path), load_mesh(tmp_path / "a.vtu").mesh
+    off_axis = image.affine[:3, :3] / image.spacing
+    assert np.abs(np.sort(np.abs(off_axis), axis=0)[1]).max() > 0.01  # oblique it is
+    assert image.spacing.max() / image.spacing.min() > 2.0  # and anisotropic
+    assert_covers(mesh, image)
+    assert_round_trips(mesh.points, image)
+    # The corners once more, by nibabel's affine and nothing of ours.
+    file = nibabel.load(path)
+    index = np.array(list(product(*[(-0.5, s - 0.5) for s in file.shape[:3]])))
+    corners = nibabel.affines.apply_affine(file.affine, index)
+    np.testing.assert_allclose(mesh.points.min(axis=0), corners.min(axis=0), atol=1e-6)
+    np.testing.assert_allclose(mesh.points.max(axis=0), corners.max(axis=0), atol=1e-6)
+
+
+def test_a_4d_file_needs_a_volume(tmp_path, data_dir, capfd):
+    path = data_dir / "example4d.nii.gz"
+    command = ["mesh", path, "-o", tmp_path / "a.vtu", "--nodes", "100", "--iterations", "1"]
+    assert_refused(capfd, command, "2 volumes; choose one")
+    assert_refused(capfd, [*command, "--volume", "2"], "volume 2 asked for")
+    assert list(tmp_path.iterdir()) == []
+    assert main([*map(str, command), "--volume", "1"]) == 0
+    file, image = load_mesh(tmp_path / "a.vtu"), load_image(path, volume=1)
+    assert_covers(file.mesh, image)
+    held = (file.cell_data["n_voxels"] * file.cell_data["mean"]).sum()
+    assert held == pytest.approx(image.data.sum(dtype=np.float64), rel=1e-9)
+    other = load_image(path, volume=0).data.sum(dtype=np.float64)
+    assert held != pytest.approx(other, rel=1e-6)
+    command = ["quality", str(tmp_path / "a.vtu"), "--image", str(path), "--volume", "1"]
+    assert main(command) == 0
+
+
+# --------------------------------------------------------------------------------------------------
+# demo
+
+
+def test_demo(tmp_path):
+    pytest.importorskip("nilearn", reason="the demo's image comes in nilearn's wheel")
+    folder = tmp_path / "new" / "demo"
+    assert main(["demo", "-o", str(folder), "--nodes", "300", "--iterations", "2"]) == 0
+    pictures = ["slice.png", "rho.png", "energies.png"]
+    assert sorted(p.name for p in folder.iterdir()) == sorted(["mesh.vtu", "run.json", *pictures])
+    for name in pictures:
+        with PIL.Image.open(folder / name) as picture:
+            assert np.asarray(picture.convert("L")).std() > 10.0
+    numbers, file = json.loads((folder / "run.json").read_text()), load_mesh(folder / "mesh.vtu")
+    assert numbers["mesh_sha256"] == mesh_hash(file.mesh)
+    assert numbers["energies"]["E_D_relative"] < 0.8
+    assert file.cell_data["n_voxels"].sum() == np.prod(numbers["image_properties"]["shape"])
+    assert file.cell_data["volume"].sum() == pytest.approx(numbers["image_properties"]["volume_mm"], rel=1e-9)
+    before = {p.name: p.read_bytes() for p in folder.iterdir()}
+    assert main(["demo", "-o", str(folder), "--nodes", "300", "--iterations", "2"]) == 2
+    assert {p.name: p.read_bytes() for p in folder.iterdir()} == before
+
+
+def test_demo_without_nilearn(tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr(tetopt.cli.importlib.util, "find_spec", lambda name: None)
+    assert_refused(capfd, ["demo", "-o", tmp_path / "demo"], r'pip install "tetopt\[demo\]"')
+    assert list(tmp_path.iterdir()) == []
