@@ -166,9 +166,8 @@ def show(rows: dict[str, Any]) -> None:
     print(f"{rows['image']}, {rows['cores']} cores, {rows['threads']} threads")
     print(f"  first call (compiling)            {rows['compile_seconds']:10.1f} s")
     print(f"  first call (cached kernels)       {rows['load_seconds']:10.1f} s")
-    print(
-        f"  sampling, {rows['sampling_cells']:7d} tets          {rows['sampling_voxels_per_second'] / 1e6:10.1f} Mvoxel/s"
-    )
+    per_second = rows["sampling_voxels_per_second"] / 1e6
+    print(f"  sampling, {rows['sampling_cells']:7d} tets          {per_second:10.1f} Mvoxel/s")
     print(f"  scipy find_simplex, the same      {rows['find_simplex_voxels_per_second'] / 1e6:10.2f} Mvoxel/s")
     print(f"  ratio, facets known as in a run   {rows['sampling_over_find_simplex']:10.0f}")
     print(f"  ratio, facets found anew          {rows['sampling_and_facets_over_find_simplex']:10.0f}")

@@ -165,14 +165,14 @@ def box_corners(shape):
 
 
 def split_box(rng, shape, n_nodes, step=0.5):
-    """A conforming mesh of an image's box in index space whose nodes are multiples of `step`, 1/2, 1/4 ... voxel.
+    """A conforming mesh of an image's box in index space; nodes put in are multiples of `step`, 1, 1/2, 1/4 voxel.
 
     The box cut along its diagonal, then nodes put in one by one: every cell that holds the new node, on its
     boundary too, is replaced by the cells that have the node in place of one corner. Barycentric coordinates are
     exact, so it is a tiling whatever the nodes, and it is full of thin cells and of ties.
     """
     n = len(shape)
-    scale = round(1 / step)
+    scale = max(round(1 / step), 2)
     low, high = -scale // 2, np.array(shape) * scale - scale // 2
     points, cells = [], []
     for axes in permutations(range(n)):
@@ -184,7 +184,8 @@ def split_box(rng, shape, n_nodes, step=0.5):
         cells.append(path)
     points = list(dict.fromkeys(p for cell in cells for p in cell))
     for _ in range(n_nodes):
-        node = tuple(rng.integers(low, high + 1).tolist())
+        node = rng.integers(low, high + 1)
+        node = tuple((node // scale * scale + scale if step == 1 else node).tolist())
         if node not in points:
             points.append(node)
             cells = [part for cell in cells for part in _split(cell, node)]

@@ -137,6 +137,21 @@ def test_shapes_of_bcc_on_cubes():
     assert angles.max() == pytest.approx(120, rel=1e-13)
 
 
+def test_diagonals_alternate_on_the_walls_of_bcc():
+    """A corner within a wall has diagonals to all four squares around it or to none: 8 or 4 triangles there."""
+    mesh = lattice(Image(np.zeros((4, 5, 6))), "bcc", blocks=(4, 5, 6))
+    found = facets(mesh.cells)
+    walls = found.nodes[found.n_cells == 1]
+    for axis in range(3):
+        for side in (mesh.points[:, axis].min(), mesh.points[:, axis].max()):
+            on_wall = walls[(mesh.points[walls, axis] == side).all(axis=1)]
+            others = np.delete(mesh.points, axis, axis=1)
+            is_within = ((others > -0.5) & (others < others.max(axis=0))).all(axis=1)
+            within = np.flatnonzero(is_within & (mesh.points[:, axis] == side))
+            triangles = np.bincount(on_wall.ravel(), minlength=len(mesh.points))[within]
+            assert set(triangles.tolist()) == {4, 8}
+
+
 def test_shapes_of_five_tet_on_cubes():
     """A fifth of the cells is regular, the others are the cube's corners."""
     mesh = lattice(Image(np.zeros((3, 2, 4))), "five-tet", blocks=(3, 2, 4))

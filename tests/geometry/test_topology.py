@@ -67,6 +67,17 @@ def test_facets_are_those_of_the_twin(seed, n):
         assert count == len(twin[tuple(nodes)])
 
 
+@pytest.mark.parametrize("mesh", ALL_SMALL)
+@pytest.mark.parametrize("offset", [1000, 3_000_000, 2**40])
+def test_facets_do_not_depend_on_how_large_the_node_numbers_are(mesh, offset):
+    """Three numbers over 2^21 do not fit one of 63 bits."""
+    _, cells = mesh
+    found, far = facets(cells), facets(cells + offset)
+    np.testing.assert_array_equal(far.nodes, found.nodes + offset)
+    for ours, theirs in zip(found[1:], far[1:], strict=True):
+        np.testing.assert_array_equal(ours, theirs)
+
+
 @given(seeds, dimensions)
 def test_facets_know_where_each_cell_holds_them(seed, n):
     """`of_cell` by the opposite node, `sign` by the exact side on which that node lies."""
@@ -250,3 +261,5 @@ def test_largest_component_of_nothing_is_empty_and_of_equals_the_first():
     assert largest_component(cells, np.zeros(5, dtype=bool)).tolist() == []
     assert largest_component(cells, np.array([False, True, True, True, True])).tolist() == [1]
     assert largest_component(cells, np.array([True, False, True, False, True])).tolist() == [0, 2, 4]
+    _, cells = TWO_SQUARES
+    assert largest_component(cells, np.isin(np.arange(8), [0, 4, 5])).tolist() == [4, 5]

@@ -243,11 +243,14 @@ def test_slice_figure_holds_each_mesh_under_its_title(n):
 
 def test_letters_stand_on_their_sides():
     image = oriented_image((2, 0, 1), (-1, 1, -1))
-    axes = slice_figure(image, [("", lattice(image, blocks=(1, 1, 1)))]).axes[0]
-    sides = {text.get_text(): text.get_position() for text in axes.texts}
-    assert sides == {"L": (0.02, 0.5), "R": (0.98, 0.5), "P": (0.5, 0.02), "A": (0.5, 0.98)}
-    assert axes.get_xlim() == (0.0, 7.0)  # x is the second axis, of 1 mm; y the third, of 3
-    assert axes.get_ylim() == (0.0, 27.0)
+    figure = slice_figure(image, [("", lattice(image, blocks=(1, 1, 1)))])
+    assert len(figure.axes) == 2
+    for axes in figure.axes:
+        sides = {text.get_text(): text.get_position() for text in axes.texts}
+        assert sides == {"L": (0.02, 0.5), "R": (0.98, 0.5), "P": (0.5, 0.02), "A": (0.5, 0.98)}
+        assert axes.get_xlim() == (0.0, 7.0)  # x is the second axis, of 1 mm; y the third, of 3
+        assert axes.get_ylim() == (0.0, 27.0)
+        assert axes.get_aspect() == 1.0
 
 
 def test_a_constant_slice_can_be_drawn(tmp_path):

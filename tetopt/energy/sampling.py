@@ -220,7 +220,7 @@ def _fill_prefix(prefix: NDArray, volume: NDArray, shift: float) -> None:
             for k in range(volume.shape[2]):
                 prefix[i, j, k, 0] = first
                 prefix[i, j, k, 1] = second
-                h = volume[i, j, k] - shift
+                h = float(volume[i, j, k]) - shift
                 first += h
                 second += h * h
             prefix[i, j, volume.shape[2], 0] = first
@@ -251,7 +251,7 @@ def cell_orientation(ticks: NDArray, cells: NDArray, cell: int) -> int:
     f0, f1, f2 = ticks[c, 0] - ticks[a, 0], ticks[c, 1] - ticks[a, 1], ticks[c, 2] - ticks[a, 2]
     n0, n1, n2 = e1 * f2 - e2 * f1, e2 * f0 - e0 * f2, e0 * f1 - e1 * f0
     if cells.shape[1] == 3:
-        return (n0 > 0) - (n0 < 0)
+        return 1 if n0 > 0 else (-1 if n0 < 0 else 0)
     d = cells[cell, 3]
     return _dot_sign(n0, n1, n2, ticks[d, 0] - ticks[a, 0], ticks[d, 1] - ticks[a, 1], ticks[d, 2] - ticks[a, 2])
 
@@ -412,7 +412,9 @@ def _fill_sums(sums: NDArray, fluxes: NDArray, of_cell: NDArray, sign: NDArray, 
                 total = 0.0
                 for k in range(of_cell.shape[1]):
                     total += sign[cell, k] * fluxes[of_cell[cell, k], d]
-                sums[cell, d] = hand * total
+                sums[cell, d] = (
+                    hand * total if d == 0 or sums[cell, 0] > 0.0 else 0.0
+                )  # no rounding left without voxels
 
 
 @njit(cache=True)
