@@ -136,15 +136,16 @@ def sampling_grid(image: Image, points: NDArray[np.float64]) -> SamplingGrid:
         )
     shape = (1,) * (3 - image.ndim) + image.shape
     low, high = float(image.data.min()), float(image.data.max())
-    # The mean as a whole number keeps whole numbers whole; a constant image becomes exactly 0.
-    shift = low if low == high else float(np.rint(np.mean(image.data, dtype=np.float64)))
+    is_whole = np.array_equal(np.rint(image.data), image.data)
+    mean = float(np.mean(image.data, dtype=np.float64))
+    shift = low if low == high else round(mean) if is_whole else mean  # constants become 0, whole numbers stay whole
     largest = max(high - shift, shift - low)
     # Whole numbers whose sums fit take half the memory, which is what the sampling of small cells waits for:
     # 1.4 times faster at 200 k tetrahedra.
-    is_short = shape[2] * max(largest, largest**2) < 2**31 and np.array_equal(np.rint(image.data), image.data)
+    is_short = is_whole and shape[2] * max(largest, largest**2) < 2**31
     prefix = np.empty((shape[0], shape[1], shape[2] + 1, 2), dtype=np.int32 if is_short else np.float64)
-    _fill_prefix(prefix, image.data.reshape(shape), shift)
-    return SamplingGrid(prefix, bits, shift)
+    _fill_prefix(prefix, image.data.reshape(shape), float(shift))
+    return SamplingGrid(prefix, bits, float(shift))
 
 
 def to_ticks(index: NDArray[np.float64], grid: SamplingGrid) -> NDArray[np.int64]:
