@@ -120,7 +120,7 @@ def test_json_of_a_run(run, inputs):
     assert numbers["image_sha256"] == hashlib.sha256((inputs / "sphere.nii.gz").read_bytes()).hexdigest()
     assert numbers["options"] == {
         **{"k_D": 0.3, "iterations": 3, "n_t": 1, "retessellate": "first", "boundary": "slide", "nodes": 150},
-        **{"spacing": None, "lattice": None, "volume": None, "crop": None, "slice": None, "method": "paper"},
+        **{"spacing": None, "lattice": "bcc", "volume": None, "crop": None, "slice": None, "method": "paper"},
         "max_seconds": None,
     }
     assert numbers["versions"]["tetopt"] == tetopt.__version__

@@ -39,7 +39,8 @@ from tetopt.geometry.quality import Quality, quality
 from tetopt.io.files import checked_output, save_json
 from tetopt.io.images import parse_crop, parse_slice, sha256
 from tetopt.io.meshes import cell_fields
-from tetopt.optimize.paper import Optimized, Record, optimize
+from tetopt.lattice import KINDS
+from tetopt.optimize.paper import Optimized, Record, default_n_t, optimize
 from tetopt.report.summary import run_summary
 
 DEFAULT_NODES = {2: 500, 3: 5000}
@@ -205,11 +206,11 @@ def mesh_command(
     )
     if nodes is None and spacing is None:
         nodes = DEFAULT_NODES[image.ndim]
-    kind = None if lattice_kind is None else lattice_kind.value
+    kind = KINDS[image.ndim][0] if lattice_kind is None else lattice_kind.value
     initial = lattice(image, kind, nodes=nodes, spacing=spacing)
     options = {
-        "k_D": k_D, "iterations": iterations, "n_t": n_t, "retessellate": retessellate.value,
-        "boundary": boundary.value,
+        "k_D": k_D, "iterations": iterations, "n_t": default_n_t(k_D, iterations) if n_t is None else n_t,
+        "retessellate": retessellate.value, "boundary": boundary.value,
     }  # fmt: skip
     source = {
         "nodes": nodes, "spacing": spacing, "lattice": kind, "volume": volume, "crop": crop, "slice": slice_,
@@ -499,8 +500,12 @@ def demo_command(
     figures = [checked_output(output / name, (".png",), force) for name in ("slice.png", "rho.png", "energies.png")]
     image = load_image(source)
     initial = lattice(image, nodes=nodes)
-    options = {"k_D": 0.2, "iterations": iterations}
-    result, code = _mesh_files(source, image, initial, options, {"nodes": nodes}, mesh_path, json_path, begin, None)
+    options = {
+        "k_D": 0.2, "iterations": iterations, "n_t": default_n_t(0.2, iterations), "retessellate": "first",
+        "boundary": "slide",
+    }  # fmt: skip
+    asked = {"nodes": nodes, "lattice": "bcc", "method": "paper"}
+    result, code = _mesh_files(source, image, initial, options, asked, mesh_path, json_path, begin, None)
     from tetopt.report.figures import save_run_figures  # matplotlib is slow to load, and only needed here
 
     save_run_figures(figures, image, initial, result)

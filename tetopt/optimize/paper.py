@@ -116,7 +116,7 @@ def optimize(
     """
     _check_options(k_D, iterations, n_t, retessellate, boundary, step_ratio)
     if n_t is None:
-        n_t = iterations if k_D == 0.0 else (iterations + 1) // 2
+        n_t = default_n_t(k_D, iterations)
     begin = time.perf_counter()
     is_over = _deadline(begin, max_seconds, stop)
 
@@ -174,6 +174,11 @@ def optimize(
             break
     points = image.to_world(from_ticks(state.ticks, grid, image.ndim))
     return Optimized(Mesh(points, state.cells), history, ended)
+
+
+def default_n_t(k_D: float, iterations: int) -> int:
+    """Number of first iterations that connect the nodes anew: all for k_D = 0 (Lloyd's alternation), else half."""
+    return iterations if k_D == 0.0 else (iterations + 1) // 2
 
 
 def _check_options(
