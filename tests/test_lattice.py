@@ -257,3 +257,18 @@ def test_default_kinds():
 def test_sizes_and_kinds_that_no_lattice_has_are_refused(shape, kind, size, message):
     with pytest.raises(InputError, match=message):
         lattice(Image(np.zeros(shape)), kind, **size)
+
+
+@pytest.mark.parametrize(
+    "size",
+    [
+        {"blocks": 7},
+        {"blocks": (1.5, 1, 1)},
+        {"blocks": (float("nan"), 1, 1)},
+        {"nodes": float("nan")},
+        {"spacing": 1e-320},
+    ],
+)
+def test_sizes_of_the_wrong_kind(size):
+    with pytest.raises(InputError, match=f"lattice: {next(iter(size))} must"):
+        lattice(Image(np.zeros((5, 6, 7))), **size)

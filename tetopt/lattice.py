@@ -13,6 +13,7 @@ the box allows:
 from __future__ import annotations
 
 from itertools import product
+from operator import index
 
 import numpy as np
 from numpy.typing import NDArray
@@ -79,15 +80,17 @@ def lattice(
         blocks = _blocks_for_spacing(lengths, spacing)
     blocks = _checked_blocks(kind, blocks, n)
     unit_points, cells = {"criss-cross": _criss_cross, "five-tet": _five_tet, "bcc": _bcc}[kind](blocks)
-    index = unit_points / np.array(blocks) * image.shape - 0.5
-    points = image.to_world(index)
+    points = image.to_world(unit_points / np.array(blocks) * image.shape - 0.5)
     return Mesh(points, oriented(points, cells))
 
 
-def _checked_blocks(kind: str, blocks: tuple[int, ...] | None, n: int) -> tuple[int, ...]:
-    if blocks is None or len(blocks) != n or any(int(b) != b or b < 1 for b in blocks):
-        raise InputError(f"lattice: blocks must be {n} whole numbers >= 1, got {blocks}")
-    blocks = tuple(int(b) for b in blocks)
+def _checked_blocks(kind: str, given: tuple[int, ...] | None, n: int) -> tuple[int, ...]:
+    try:
+        blocks = tuple(index(b) for b in (() if given is None else given))
+    except TypeError:
+        blocks = ()
+    if len(blocks) != n or min(blocks) < 1:
+        raise InputError(f"lattice: blocks must be {n} whole numbers >= 1, got {given!r}")
     if _node_count(kind, blocks) > MAX_NODES:
         raise InputError(
             f"lattice: {blocks} blocks have {_node_count(kind, blocks)} nodes, more than {MAX_NODES}; ask for fewer"
@@ -101,15 +104,19 @@ def _node_count(kind: str, blocks: tuple[int, ...]) -> int:
 
 
 def _blocks_for_spacing(lengths: NDArray[np.float64], spacing: float) -> tuple[int, ...]:
-    if not (np.isfinite(spacing) and spacing > 0.0):
+    if not (np.isfinite(spacing) and spacing > 1e-300):
         raise InputError(f"lattice: spacing must be a length above 0 mm, got {spacing}")
-    return tuple(max(1, round(length / spacing)) for length in lengths)
+    return tuple(max(1, round(min(length / spacing, MAX_NODES))) for length in lengths)
 
 
 def _blocks_for_nodes(kind: str, lengths: NDArray[np.float64], nodes: int) -> tuple[int, ...]:
-    """Blocks whose node count is within 3 % of `nodes` and that are the most cubic; else the nearest count."""
+    """Nearly cubic blocks whose node count is within 3 % of `nodes`, the most cubic; else those with the nearest.
+
+    On a brain's box every wish from 3000 on is met within 3 %; smaller ones are missed by up to a tenth, since only
+    blocks far from cubes would meet them.
+    """
     fewest = _node_count(kind, (1,) * len(lengths))
-    if nodes < fewest or nodes > MAX_NODES:
+    if not fewest <= nodes <= MAX_NODES:
         raise InputError(f"lattice: nodes must lie between {fewest} and {MAX_NODES} for {kind}, got {nodes}")
     per_block = 1 if kind == "five-tet" else 2
     edge = (np.prod(lengths) * per_block / nodes) ** (1.0 / len(lengths))

@@ -68,12 +68,12 @@ def test_facets_are_those_of_the_twin(seed, n):
 
 
 @pytest.mark.parametrize("mesh", ALL_SMALL)
-@pytest.mark.parametrize("offset", [1000, 3_000_000, 2**40])
-def test_facets_do_not_depend_on_how_large_the_node_numbers_are(mesh, offset):
+@pytest.mark.parametrize("factor", [10, 3_000_000, 2**40])
+def test_facets_do_not_depend_on_how_large_the_node_numbers_are(mesh, factor):
     """Three numbers over 2^21 do not fit one of 63 bits."""
     _, cells = mesh
-    found, far = facets(cells), facets(cells + offset)
-    np.testing.assert_array_equal(far.nodes, found.nodes + offset)
+    found, far = facets(cells), facets(cells * factor)
+    np.testing.assert_array_equal(far.nodes, found.nodes * factor)
     for ours, theirs in zip(found[1:], far[1:], strict=True):
         np.testing.assert_array_equal(ours, theirs)
 

@@ -32,7 +32,8 @@ def delaunay(index: NDArray[np.float64], affine: NDArray[np.float64]) -> NDArray
     Returns
     -------
     (M, n+1) int64 or None
-        Cells, positively oriented in the world; None where Qhull fails or leaves a node out or a hole.
+        Cells, positively oriented in the world; None where Qhull fails or leaves a node out. Whether
+        they fill the box is for the caller to check.
     """
     n = index.shape[1]
     centred = index - 0.5 * (index.min(axis=0) + index.max(axis=0))
