@@ -14,7 +14,7 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from tetopt.energy.geometric import volume_and_E_G
-from tetopt.energy.sampling import SamplingGrid, cell_orientation, facet_flux
+from tetopt.energy.sampling import SamplingGrid, cell_orientation, facet_flux, few_threads
 from tetopt.geometry.topology import Facets, Rings, Stars
 
 FLAT = 1e-7  # a cell's volume over (sum of squared edges)^(n/2); below, it counts as inverted: an angle of 1e-3 degrees
@@ -53,11 +53,10 @@ def descend(
     the nearest centroid of the ring's cells; the vertex of the parabola through the three values is tried as well;
     the best of them is taken if it lies below the present energy. `matrix` (3, 3) takes index vectors to mm.
     """
-    _descend(
-        state.ticks, state.cells, *state.rings, state.sides.nodes, state.sides.of_cell, state.sides.sign, *state.stars,
-        state.is_frozen, state.hand, state.sums, state.E_G, state.fluxes, nodes, grid.prefix, grid.bits, matrix,
-        *weights,
-    )  # fmt: skip
+    sides = (state.sides.nodes, state.sides.of_cell, state.sides.sign, *state.stars)
+    kept = (state.is_frozen, state.hand, state.sums, state.E_G, state.fluxes)
+    with few_threads(len(nodes) * 100):
+        _descend(state.ticks, state.cells, *state.rings, *sides, *kept, nodes, grid.prefix, grid.bits, matrix, *weights)
 
 
 def relocate(
@@ -65,21 +64,20 @@ def relocate(
     nodes: NDArray[np.int64],
     grid: SamplingGrid,
     matrix: NDArray[np.float64],
+    projections: NDArray[np.float64],
 ) -> None:
     """Move each of `nodes`, all of one colour, to the minimiser of E_G over its ring (Section 2.1).
 
     Inside, that is the volume-weighted mean of the ring's circumcentres. A node on a face or an edge of the box
     goes to the minimiser within it. A step that inverts a cell or, by rounding, raises E_G is halved up to four
-    times, then left out. Sums and fluxes are not kept up: at k_D = 0 the image has no say.
+    times, then left out. `projections` are `free_projections(matrix)`. Sums and fluxes are not kept up: at k_D = 0 the image has no say.
     """
-    projections = _free_projections(matrix)
-    _relocate(
-        state.ticks, state.cells, *state.rings, state.is_frozen, state.hand, state.E_G, nodes, grid.bits, matrix,
-        projections,
-    )  # fmt: skip
+    kept = (state.is_frozen, state.hand, state.E_G)
+    with few_threads(len(nodes) * 10):
+        _relocate(state.ticks, state.cells, *state.rings, *kept, nodes, grid.bits, matrix, projections)
 
 
-def _free_projections(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+def free_projections(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
     """For each set of frozen axes (bit d: axis d), the (3, 3) map from a vector in mm to the index vector along
     the free axes that comes nearest to it: least squares in mm, so right for oblique and sheared axes.
     """

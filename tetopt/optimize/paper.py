@@ -27,7 +27,7 @@ from tetopt.geometry.simplex import squared_edges, volumes
 from tetopt.geometry.topology import boundary_facets, facets, node_colours, rings, stars
 from tetopt.image import Image, transformed
 from tetopt.mesh import Mesh
-from tetopt.optimize.descent import FLAT, State, Weights, descend, relocate
+from tetopt.optimize.descent import FLAT, State, Weights, descend, free_projections, relocate
 from tetopt.optimize.retessellate import delaunay
 
 Retessellate = Literal["first", "accept", "never"]
@@ -126,6 +126,7 @@ def optimize(
     is_frozen = frozen_axes(image, ticks, mesh.cells, grid, boundary)
     matrix = np.eye(3)
     matrix[3 - image.ndim :, 3 - image.ndim :] = image.affine[:-1, :-1]
+    projections = free_projections(matrix)
     state = _state(image, grid, ticks, mesh.cells, is_frozen)
     if retessellate != "never" and iterations > 0 and n_t > 0:
         _check_fills_box(image, mesh)
@@ -160,7 +161,7 @@ def optimize(
                     state = candidate
         # 2. Move the nodes, one colour at a time.
         before = state.ticks.copy()
-        is_finished = _sweep(state, grid, matrix, weights, k_D, is_over)
+        is_finished = _sweep(state, grid, matrix, projections, weights, k_D, is_over)
         # 3. Measure.
         if k_D == 0.0:
             state.sums[:] = moment_sums(grid, state.ticks, state.cells, state.sides)
@@ -307,6 +308,7 @@ def _sweep(
     state: State,
     grid: SamplingGrid,
     matrix: NDArray[np.float64],
+    projections: NDArray[np.float64],
     weights: Weights,
     k_D: float,
     is_over: Callable[[], bool],
@@ -318,7 +320,7 @@ def _sweep(
             return False
         nodes = np.flatnonzero((colours == colour) & ~state.is_frozen[:, 3 - (state.cells.shape[1] - 1) :].all(axis=1))
         if k_D == 0.0:
-            relocate(state, nodes, grid, matrix)
+            relocate(state, nodes, grid, matrix, projections)
         else:
             descend(state, nodes, grid, matrix, weights)
     return True
