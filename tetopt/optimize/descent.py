@@ -70,7 +70,8 @@ def relocate(
 
     Inside, that is the volume-weighted mean of the ring's circumcentres. A node on a face or an edge of the box
     goes to the minimiser within it. A step that inverts a cell or, by rounding, raises E_G is halved up to four
-    times, then left out. `projections` are `free_projections(matrix)`. Sums and fluxes are not kept up: at k_D = 0 the image has no say.
+    times, then left out. `projections` are `free_projections(matrix)`. Sums and fluxes are not kept up: at k_D = 0
+    the image has no say.
     """
     kept = (state.is_frozen, state.hand, state.E_G)
     with few_threads(len(nodes) * 10):
