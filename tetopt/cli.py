@@ -480,6 +480,70 @@ def phantom_command(
     return 0
 
 
+@app.command("fem")
+def fem_command(
+    image_path: ImageArgument,
+    mesh_path: Annotated[Path, typer.Argument(metavar="MESH", help="VTU or VTK file that fills the image's box.")],
+    young: Annotated[
+        str | None,
+        typer.Option(metavar="H:KPA,...", help="Modulus by intensity, interpolated; default: the intensity, in kPa."),
+    ] = None,
+    nu: Annotated[float, typer.Option(metavar="NU", help="Poisson's ratio, above -1 and below 0.5.")] = 0.45,
+    compress: Annotated[float, typer.Option(metavar="PERCENT", help="How far the bottom is pushed in.")] = 1.0,
+    volume: VolumeOption = None,
+    json_path: JsonOption = None,
+    force: ForceOption = False,
+) -> int:
+    """Compress a mesh, one modulus a cell: conditioning of the stiffness matrix, strain energy, CG iterations."""
+    from tetopt.experiments.paper import simulate
+    from tetopt.fem.materials import parse_table
+
+    if json_path is not None:
+        json_path = checked_output(json_path, (".json",), force)
+    law = None if young is None else parse_table(young)
+    image = load_image(image_path, volume=volume)
+    loaded = load_mesh(mesh_path)
+    found = simulate(image, loaded.mesh, nu=nu, percent=compress, law=law)
+    table = _table("", mesh_path.name)
+    table.add_row("nodes", str(len(loaded.mesh.points)))
+    table.add_row("largest eigenvalue of the stiffness", f"{found.lambda_max:.6g}")
+    table.add_row("condition number, 2-norm", f"{found.cond:.6g}")
+    table.add_row("Jacobi CG iterations to 1e-10", str(found.cg_iterations))
+    table.add_row(f"strain energy at {compress:g} %, uJ", f"{found.strain_energy:.6g}")
+    out.print(table)
+    if json_path is not None:
+        options = {"young": law, "nu": nu, "compress_percent": compress, "volume": volume}
+        save_json(json_path, {"image": image_path.name, "mesh": mesh_path.name, "options": options, **found._asdict()})
+    return 0
+
+
+@app.command("paper")
+def paper_command(
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the results.")],
+    image_path: Annotated[
+        Path | None, typer.Option("--image", metavar="T1", help="Brain MR volume (default: nilearn's MNI152 T1).")
+    ] = None,
+    seeds: Annotated[int, typer.Option(metavar="N", help="Random meshes for Fig. 1.")] = 200,
+    force: ForceOption = False,
+) -> int:
+    """Run the paper's figures and table again: paper.json, pictures, and paper.html that sets them side by side."""
+    from tetopt.experiments import run_paper
+
+    if seeds < 1:
+        raise InputError(f"--seeds: expected 1 or more, got {seeds}")
+    image_path = nilearn_t1() if image_path is None else image_path
+    volume = load_image(image_path)
+    if volume.ndim != 3:
+        raise InputError(f"{image_path}: expected a volume, got a {volume.ndim}-D image")
+    if output.exists() and not output.is_dir():
+        raise InputError(f"{output}: expected a folder for the results, found a file")
+    output.mkdir(parents=True, exist_ok=True)
+    paths = run_paper.outputs(output, force)
+    results = run_paper.run(paths, volume, seeds, lambda text: log.print(escape(text)))
+    out.print(escape(f"{paths['paper.html']}: all figures beside the paper's, in {results['seconds']:.0f} s"))
+    return 0
+
+
 @app.command("demo")
 def demo_command(
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the results.")] = Path(

@@ -1,0 +1,158 @@
+"""Conditioning of the stiffness matrix: its extreme eigenvalues and what an iterative solver makes of them.
+
+Section 3 compares meshes by the largest eigenvalue lambda and the condition number k of their stiffness matrices.
+Both are of the matrix that is solved with, that of the free dofs: without boundary conditions the smallest
+eigenvalue is 0. So they depend on what is held, and meshes are comparable under the same conditions only.
+"""
+
+from __future__ import annotations
+
+import warnings
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import csr_array, diags_array
+from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, cg, eigsh, lobpcg
+
+from tetopt.errors import InputError
+from tetopt.fem.elasticity import RTOL, Method, System, factorized, is_direct, multigrid
+
+FEW = 32  # dofs: the Lanczos solver wants more than it can find; these are done as a full matrix
+
+
+class Conditioning(NamedTuple):
+    """What `conditioning` returns."""
+
+    lambda_max: float  # largest eigenvalue of K_ff, kPa mm^(n-2)
+    lambda_min: float  # smallest eigenvalue, above 0
+    cond: float  # the 2-norm condition number, their quotient
+    cg_iterations: int  # see `cg_iterations`, for the system's load
+
+
+def conditioning(system: System, *, method: Method = "auto") -> Conditioning:
+    """Extreme eigenvalues, condition number and iteration count of a constrained stiffness matrix.
+
+    Parameters
+    ----------
+    system : System
+        From `tetopt.fem.elasticity.constrained`, or the `system` of a `Compression`.
+    method : {"auto", "direct", "amg"}
+        For the smallest eigenvalue: by factorisation, which auto takes up to `DIRECT_DOFS` free dofs, or by
+        LOBPCG preconditioned by multigrid.
+
+    Returns
+    -------
+    Conditioning
+        Eigenvalues good to a relative 1e-7 or better; the same in every run.
+
+    Raises
+    ------
+    InputError
+        Another method, or no free dof: every node is held.
+    RuntimeError
+        An eigenvalue or the solution did not converge.
+    """
+    if len(system.free) == 0:
+        raise InputError("conditioning: every node is fixed or pushed, so there is nothing to solve; take a finer mesh")
+    largest = lambda_max(system.K_ff)
+    smallest = lambda_min(system.K_ff, None if is_direct(system, method) else multigrid(system))
+    return Conditioning(largest, smallest, largest / smallest, cg_iterations(system.K_ff, system.load))
+
+
+def lambda_max(K_ff: csr_array) -> float:
+    """Largest eigenvalue of a symmetric matrix, by Lanczos from a fixed start.
+
+    Raises
+    ------
+    RuntimeError
+        Not converged.
+    """
+    if K_ff.shape[0] <= FEW:
+        return float(np.linalg.eigvalsh(K_ff.toarray())[-1])
+    try:
+        values = eigsh(K_ff, k=1, which="LA", v0=_start(K_ff)[:, 0], tol=1e-10, return_eigenvectors=False)
+    except ArpackNoConvergence as error:
+        raise RuntimeError(f"conditioning: the largest eigenvalue did not converge ({error})") from error
+    return float(values[0])
+
+
+def lambda_min(K_ff: csr_array, preconditioner: LinearOperator | None = None) -> float:
+    """Smallest eigenvalue of a symmetric positive definite matrix.
+
+    Parameters
+    ----------
+    K_ff : (F, F) csr_array
+    preconditioner : (F, F) LinearOperator, optional
+        Near the inverse of K_ff, see `tetopt.fem.elasticity.multigrid`: LOBPCG is taken. Without it K_ff is
+        factorised and the largest eigenvalue of its inverse found by Lanczos.
+
+    Raises
+    ------
+    RuntimeError
+        Not converged.
+    """
+    if K_ff.shape[0] <= FEW:
+        return float(np.linalg.eigvalsh(K_ff.toarray())[0])
+    if preconditioner is not None:
+        return _by_lobpcg(K_ff, preconditioner)
+    inverse = LinearOperator(K_ff.shape, matvec=factorized(K_ff), dtype=np.float64)
+    try:
+        values = eigsh(K_ff, k=1, sigma=0.0, OPinv=inverse, v0=_start(K_ff)[:, 0], return_eigenvectors=False)
+    except ArpackNoConvergence as error:
+        raise RuntimeError(f"conditioning: the smallest eigenvalue did not converge ({error})") from error
+    return float(values[0])
+
+
+def _by_lobpcg(K_ff: csr_array, preconditioner: LinearOperator) -> float:
+    """Four vectors at a time, for the lowest eigenvalues of a body lie close together."""
+    vectors = _start(K_ff, 4)
+    vectors = np.column_stack([preconditioner @ vector for vector in vectors.T])  # smooth already: fewer steps
+    estimate = np.inf
+    for _ in range(5):
+        scale = estimate if np.isfinite(estimate) else float(K_ff.diagonal().mean())
+        with warnings.catch_warnings():
+            warnings.simplefilter("ignore", UserWarning)  # it warns of what is checked below
+            values, vectors = lobpcg(K_ff, vectors, M=preconditioner, largest=False, tol=1e-5 * scale, maxiter=60)
+        estimate, vector = float(values[0]), vectors[:, 0]
+        residual = float(np.linalg.norm(K_ff @ vector - estimate * vector) / np.linalg.norm(vector))
+        # The eigenvalue's error is about residual^2 over the gap to the next one.
+        if residual <= 1e-4 * estimate:
+            return estimate
+    raise RuntimeError(f"conditioning: the smallest eigenvalue, near {estimate:.3g}, did not converge")
+
+
+def cg_iterations(K_ff: csr_array, load: NDArray[np.float64], rtol: float = RTOL) -> int:
+    """Steps that conjugate gradients with the diagonal as preconditioner take to solve K_ff x = load from x = 0.
+
+    Parameters
+    ----------
+    K_ff : (F, F) csr_array
+        Symmetric, positive definite.
+    load : (F,) float64
+        In `conditioning` that of the system: the pull of the prescribed displacements. The count depends on it,
+        and may differ by one between machines.
+    rtol : float
+        Residual over load, 2-norms, at which it is solved.
+
+    Raises
+    ------
+    RuntimeError
+        Not solved after 10 F steps.
+    """
+    steps = 0
+
+    def count(_: NDArray[np.float64]) -> None:
+        nonlocal steps
+        steps += 1
+
+    jacobi = diags_array(1.0 / K_ff.diagonal())
+    _, failed = cg(K_ff, load, rtol=rtol, maxiter=10 * len(load), M=jacobi, callback=count)
+    if failed:
+        raise RuntimeError(f"conditioning: conjugate gradients did not reach {rtol:g} of the load in {steps} steps")
+    return steps
+
+
+def _start(K_ff: csr_array, n_vectors: int = 1) -> NDArray[np.float64]:
+    """Fixed start vectors, (F, n_vectors), with a share of every eigenvector."""
+    return np.random.default_rng(0).standard_normal((K_ff.shape[0], n_vectors))

@@ -1,0 +1,129 @@
+"""Rigid motions, and whether the held nodes stop all of them.
+
+The null space of a constrained stiffness matrix is known beforehand. Without strain, cells that share a facet move as
+one rigid body; so what can move without strain are the facet-connected sets of cells, each rigidly, as long as sets
+that share a node agree there and prescribed displacements are 0. That is a small eigenvalue problem, six unknowns a
+set, and its answer can say which cells hang loose, where a solver would only return large numbers.
+"""
+
+from __future__ import annotations
+
+from itertools import combinations
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.sparse import block_array, coo_array, csr_array
+from scipy.sparse.csgraph import connected_components
+from scipy.sparse.linalg import eigsh
+
+from tetopt.errors import InputError
+from tetopt.geometry.topology import components
+
+LOOSE = 1e-11  # squared violation, by a motion of size 1, below which nothing holds it
+
+
+def rigid_modes(points: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Rigid motions of the points (N, n) as dofs, (N*n, 3) in 2-D and (N*n, 6) in 3-D: shifts, then rotations.
+
+    Rotations are about the centre and as large as a shift by 1, in the root mean square.
+    """
+    n = points.shape[1]
+    arms = points - points.mean(axis=0)
+    size = np.sqrt((arms**2).sum(axis=1).mean())
+    return _rigid_rows(arms / (size if size > 0.0 else 1.0)).reshape(len(points) * n, -1)
+
+
+def _rigid_rows(arms: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Displacements (K, n, n(n+1)/2) of points with the given arms (K, n) under shifts and infinitesimal turns."""
+    n = arms.shape[1]
+    rows = np.zeros((len(arms), n, n * (n + 1) // 2))
+    rows[:, range(n), range(n)] = 1.0
+    for turn, (i, j) in enumerate(combinations(range(n), 2), start=n):
+        rows[:, i, turn] = -arms[:, j]
+        rows[:, j, turn] = arms[:, i]
+    return rows
+
+
+def check_held(points: NDArray[np.float64], cells: NDArray[np.int64], is_prescribed: NDArray[np.bool_]) -> None:
+    """InputError if some part of the mesh can move without strain, for then K_ff is singular.
+
+    Without strain, cells that share a facet move as one rigid body. So a motion without strain is one of each
+    facet-connected set of cells such that sets that share a node agree there, and prescribed dofs rest.
+    """
+    is_used = np.zeros(len(points), dtype=bool)
+    is_used[cells] = True
+    unused = np.flatnonzero(~is_used & ~is_prescribed.all(axis=1))
+    if len(unused):
+        raise InputError(
+            f"mesh: {len(unused)} nodes belong to no cell, the first {unused[:5].tolist()}; take them out of the mesh"
+        )
+    if not is_prescribed.any():
+        raise InputError("mesh: no displacement is prescribed, so it could fly away; fix some nodes")
+    body = components(cells)
+    _check_pieces(cells, body, is_prescribed)
+    weakest, loose = _weakest_hold(points, cells, body, is_prescribed)
+    if weakest < LOOSE:
+        inside = np.flatnonzero(body == loose)
+        raise InputError(
+            f"mesh: {len(inside)} cells around cell {inside[0]} (node {cells[inside[0], 0]}) can still turn or slide "
+            "as a whole, they hang by too few nodes; hold more nodes or keep the largest facet-connected set"
+        )
+
+
+def _check_pieces(cells: NDArray[np.int64], body: NDArray[np.int64], is_prescribed: NDArray[np.bool_]) -> None:
+    """InputError if a piece of the mesh, cells that hang together by nodes, has no prescribed dof."""
+    n_bodies = int(body.max()) + 1
+    touches = coo_array(
+        (np.ones(cells.size, dtype=np.int8), (cells.ravel(), np.repeat(body, cells.shape[1]) + len(is_prescribed))),
+        shape=(len(is_prescribed) + n_bodies,) * 2,
+    )
+    _, label = connected_components(touches, directed=False)
+    label = label[: len(is_prescribed)]
+    is_held = np.isin(label, label[is_prescribed.any(axis=1)])
+    loose = np.flatnonzero(~is_held[cells[:, 0]])
+    if len(loose):
+        piece = loose[label[cells[loose, 0]] == label[cells[loose[0], 0]]]
+        n_pieces = len(np.unique(label[cells[loose, 0]]))
+        raise InputError(
+            f"mesh: {n_pieces} pieces have no fixed or pushed node, the first has {len(piece)} cells around cell "
+            f"{piece[0]} (node {cells[piece[0], 0]}); hold it or take it out"
+        )
+
+
+def _weakest_hold(
+    points: NDArray[np.float64], cells: NDArray[np.int64], body: NDArray[np.int64], is_prescribed: NDArray[np.bool_]
+) -> tuple[float, int]:
+    """Smallest sum of squared violations by a rigid motion of the bodies of size 1, and the body that it moves most."""
+    n = points.shape[1]
+    incidence = np.unique(cells * (int(body.max()) + 1) + body[:, None])
+    node, of_body = np.divmod(incidence, int(body.max()) + 1)
+    # Arms about each body's centre, in units of its size.
+    count = np.bincount(of_body)
+    centre = np.column_stack([np.bincount(of_body, points[node, d]) / count for d in range(n)])
+    arms = points[node] - centre[of_body]
+    arms /= np.sqrt(np.bincount(of_body, (arms**2).sum(axis=1)) / count)[of_body, None]
+    rows = _rigid_rows(arms)
+    r = rows.shape[2]
+    is_first = np.concatenate([[True], node[1:] != node[:-1]])
+
+    def spread(which: NDArray[np.int64]) -> csr_array:
+        """One row for each component of the given incidences: its displacement by the bodies' motions."""
+        column = of_body[which, None, None] * r + np.arange(r)
+        at = (np.arange(len(which))[:, None] * n + np.arange(n))[:, :, None]
+        at, column = np.broadcast_arrays(at, column)
+        shape = (len(which) * n, len(count) * r)
+        return coo_array((rows[which].ravel(), (at.ravel(), column.ravel())), shape=shape).tocsr()
+
+    held = np.flatnonzero(is_first)
+    joint = np.flatnonzero(~is_first)
+    violations = block_array(
+        [[spread(held)[is_prescribed[node[held]].ravel()]], [spread(joint - 1) - spread(joint)]], format="csr"
+    )
+    gram = (violations.T @ violations).tocsc()
+    if gram.shape[0] <= 120:
+        values, vectors = np.linalg.eigh(gram.toarray())
+    else:
+        start = np.random.default_rng(0).standard_normal(gram.shape[0])
+        values, vectors = eigsh(gram, k=1, sigma=-1e-6, v0=start)
+    moved = (vectors[:, 0].reshape(-1, r) ** 2).sum(axis=1)
+    return float(values[0]), int(np.argmax(moved))
