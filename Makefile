@@ -17,10 +17,10 @@ test: $(VENV)/.test
 
 # The small cases again on one thread, and with the kernels run as plain Python.
 test-onethread: $(VENV)/.test
-	NUMBA_NUM_THREADS=1 $(TESTED) -q -m kernel --durations=0 --no-header
+	NUMBA_NUM_THREADS=1 $(TESTED) -q -m kernel --no-header --durations=3
 
 test-nojit: $(VENV)/.test
-	NUMBA_DISABLE_JIT=1 $(TESTED) -q -m kernel --durations=0 --no-header
+	NUMBA_DISABLE_JIT=1 $(TESTED) -q -m kernel --no-header --durations=3
 
 test-slow: $(VENV)/.test
 	$(TESTED) -m slow

@@ -233,8 +233,8 @@ def test_the_table_shows_before_and_after(tmp_path, inputs, capsys):
     first, last = numbers["quality_initial"], numbers["quality"]
     assert lines[0].split() == ["lattice", "optimised"]
     assert table["E, combined"] == ["1.0000", f"{numbers['energies']['E']:.4f}"]
-    assert table["E_D, of initial"] == ["1", f"{numbers['energies']['E_D_relative']:.4f}"]
-    assert table["E_G, of initial"] == ["1", f"{numbers['energies']['E_G_relative']:.4f}"]
+    assert table["E_D, of initial"] == ["1.0000", f"{numbers['energies']['E_D_relative']:.4f}"]
+    assert table["E_G, of initial"] == ["1.0000", f"{numbers['energies']['E_G_relative']:.4f}"]
     assert table["rho, smallest"] == [f"{first['min_rho']:.4f}", f"{last['min_rho']:.4f}"]
     assert table["smallest angle, degrees"] == [f"{first['min_dihedral']:.2f}", f"{last['min_dihedral']:.2f}"]
     assert table["rho, smallest"][0] != table["rho, smallest"][1]
@@ -640,7 +640,7 @@ def test_quality_of_triangles(inputs, tmp_path, capsys):
     image = load_image(inputs / "disc.nii")
     save_mesh(tmp_path / "a.vtu", lattice(image, nodes=60))
     assert main(["quality", str(tmp_path / "a.vtu"), "--image", str(inputs / "disc.nii")]) == 0
-    assert re.search(r"^volume, mm\^n +4096$", capsys.readouterr().out, re.M)
+    assert re.search(r"^area, mm2 +4096.00$", capsys.readouterr().out, re.M)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -771,3 +771,93 @@ def test_demo_without_nilearn(tmp_path, monkeypatch, capfd):
     monkeypatch.setattr(tetopt.cli.importlib.util, "find_spec", lambda name: None)
     assert_refused(capfd, ["demo", "-o", tmp_path / "demo"], r'pip install "tetopt\[demo\]"')
     assert list(tmp_path.iterdir()) == []
+
+
+# --------------------------------------------------------------------------------------------------
+# what is allowed but hardly meant
+
+
+def test_a_reader_that_goes_away_loses_no_file(tmp_path, inputs):
+    """`tetopt mesh ... | head -1`: mesh and numbers are written, and nothing complains."""
+    command = [sys.executable, "-m", "tetopt", "mesh", str(inputs / "sphere.nii.gz"), "-o", str(tmp_path / "a.vtu")]
+    command += ["--json", str(tmp_path / "a.json"), "--nodes", "60", "--iterations", "1"]
+    run = subprocess.run(
+        ["bash", "-c", '"$@" | true; exit "${PIPESTATUS[0]}"', "-", *command],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert run.returncode == 0
+    assert "Traceback" not in run.stderr
+    assert json.loads((tmp_path / "a.json").read_text())["quality"]["n_cells"] == len(
+        load_mesh(tmp_path / "a.vtu").mesh.cells
+    )
+
+
+def test_quality_of_overlapping_cells(tmp_path, inputs, capsys):
+    mesh = lattice(load_image(inputs / "sphere.nii.gz"), nodes=60)
+    save_mesh(tmp_path / "twice.vtu", Mesh(mesh.points, np.vstack([mesh.cells, mesh.cells[:9]])))
+    assert main(["quality", str(tmp_path / "twice.vtu"), "--image", str(inputs / "sphere.nii.gz")]) == 1
+    assert "cells overlap: together they hold" in capsys.readouterr().err
+
+
+def test_quality_with_another_image(tmp_path, inputs, capsys):
+    command = [
+        "mesh",
+        str(inputs / "sphere.nii.gz"),
+        "-o",
+        str(tmp_path / "a.vtu"),
+        "--nodes",
+        "60",
+        "--iterations",
+        "0",
+    ]
+    assert main(command) == 0
+    save_image(tmp_path / "other.nii", load_phantom("two_spheres").image(voxel_mm=8.0))
+    capsys.readouterr()
+    assert main(["quality", str(tmp_path / "a.vtu"), "--image", str(inputs / "sphere.nii.gz")]) == 0
+    assert capsys.readouterr().err == ""
+    assert main(["quality", str(tmp_path / "a.vtu"), "--image", str(tmp_path / "other.nii")]) == 0
+    assert "a.vtu was made from another image" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("part", [["--slice", "k=4"], ["--crop", "1:7,:,2:"]])
+def test_quality_of_a_part(tmp_path, inputs, part, capsys):
+    """A mesh of a slice or a crop is measured against the same part: every voxel is inside."""
+    image = ["--image", str(inputs / "sphere.nii.gz"), *part]
+    command = [
+        "mesh",
+        str(inputs / "sphere.nii.gz"),
+        "-o",
+        str(tmp_path / "a.vtu"),
+        "--nodes",
+        "60",
+        "--iterations",
+        "1",
+    ]
+    assert main([*command, *part]) == 0
+    capsys.readouterr()
+    assert main(["quality", str(tmp_path / "a.vtu"), *image]) == 0
+    inside, all_ = re.search(r"voxels inside +(\d+) of (\d+)", capsys.readouterr().out).groups()
+    assert inside == all_
+
+
+def test_figures(tmp_path, inputs):
+    command = [
+        "mesh",
+        str(inputs / "sphere.nii.gz"),
+        "-o",
+        str(tmp_path / "a.vtu"),
+        "--nodes",
+        "60",
+        "--iterations",
+        "1",
+    ]
+    assert main([*command, "--figures", str(tmp_path)]) == 0
+    assert {p.name for p in tmp_path.glob("*.png")} == {"slice.png", "rho.png", "energies.png"}
+
+
+def test_many_more_cells_than_voxels_are_said(tmp_path, capsys):
+    save_image(tmp_path / "few.nii", Image(np.arange(27.0).reshape(3, 3, 3)))
+    assert main(["mesh", str(tmp_path / "few.nii"), "-o", str(tmp_path / "a.vtu"), "--nodes", "500"]) == 0
+    assert "cells for 27 voxels" in capsys.readouterr().err

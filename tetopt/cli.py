@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import importlib.util
 import logging
+import os
 import signal
 import sys
 import time
@@ -45,8 +46,17 @@ from tetopt.report.summary import run_summary
 
 DEFAULT_NODES = {2: 500, 3: 5000}
 
-log = Console(stderr=True, highlight=False, soft_wrap=True, emoji=False)
-out = Console(highlight=False, soft_wrap=True, emoji=False)
+
+class _Console(Console):
+    """A console that falls silent when the reader of its pipe has gone, and lets the command end in its own way."""
+
+    def on_broken_pipe(self) -> None:
+        self.quiet = True
+        os.dup2(os.open(os.devnull, os.O_WRONLY), self.file.fileno())
+
+
+log = _Console(stderr=True, highlight=False, soft_wrap=True, emoji=False)
+out = _Console(highlight=False, soft_wrap=True, emoji=False)
 app = typer.Typer(
     name="tetopt",
     help="From a medical volume straight to an image-aligned tetrahedral mesh, without segmentation.",
@@ -158,7 +168,12 @@ def mesh_command(
     lattice_kind: Annotated[
         Lattice | None, typer.Option("--lattice", help="Initial mesh (default bcc; criss-cross in 2-D).")
     ] = None,
-    k_D: Annotated[float, typer.Option("--k-d", metavar="K", help="Weight of the image, 0 to below 1.")] = 0.2,
+    k_D: Annotated[
+        float,
+        typer.Option(
+            "--k-d", metavar="K", help="Weight of the image: 0 shape only; 0.2 to 0.5 usual; 0.9 image first."
+        ),
+    ] = 0.2,
     iterations: Annotated[
         int, typer.Option(metavar="I", min=0, help="Sweeps over all nodes; 0 writes the lattice.")
     ] = 20,
@@ -172,7 +187,8 @@ def mesh_command(
         ),
     ] = None,
     retessellate: Annotated[
-        Retessellate, typer.Option(help="In the first n_t iterations; only if E falls; or never.")
+        Retessellate,
+        typer.Option(help="Delaunay anew: first, in the first n_t iterations; accept, when it lowers E; never."),
     ] = Retessellate.first,
     method: Annotated[Method, typer.Option(help="How the nodes move.")] = Method.paper,
     boundary: Annotated[Boundary, typer.Option(help="What the box's nodes may do.")] = Boundary.slide,
@@ -184,6 +200,9 @@ def mesh_command(
     crop: CropOption = None,
     slice_: SliceOption = None,
     json_path: JsonOption = None,
+    figures: Annotated[
+        Path | None, typer.Option(metavar="DIR", help="Draw slice.png, rho.png and energies.png in this folder.")
+    ] = None,
     force: ForceOption = False,
 ) -> int:
     """Mesh an image: lattice, optimisation, VTU file."""
@@ -197,13 +216,10 @@ def mesh_command(
         raise InputError(f"--k-d: expected 0 <= k_D < 1, got {k_D}")
     if max_seconds is not None and not max_seconds > 0.0:
         raise InputError(f"--max-seconds: expected more than 0, got {max_seconds}")
+    names = ("slice.png", "rho.png", "energies.png")
+    pictures = [] if figures is None else [checked_output(figures / name, (".png",), force) for name in names]
     _set_threads(threads)
-    image = load_image(
-        image_path,
-        volume=volume,
-        slice_=None if slice_ is None else parse_slice(slice_),
-        crop=None if crop is None else parse_crop(crop),
-    )
+    image = _image(image_path, volume, crop, slice_)
     if nodes is None and spacing is None:
         nodes = DEFAULT_NODES[image.ndim]
     kind = KINDS[image.ndim][0] if lattice_kind is None else lattice_kind.value
@@ -216,7 +232,7 @@ def mesh_command(
         "nodes": nodes, "spacing": spacing, "lattice": kind, "volume": volume, "crop": crop, "slice": slice_,
         "method": method.value, "max_seconds": max_seconds,
     }  # fmt: skip
-    return _mesh_files(image_path, image, initial, options, source, output, json_path, begin, max_seconds)[1]
+    return _mesh_files(image_path, image, initial, options, source, output, json_path, pictures, begin)
 
 
 def _mesh_files(
@@ -227,24 +243,60 @@ def _mesh_files(
     source: dict[str, Any],
     output: Path,
     json_path: Path | None,
+    pictures: list[Path],
     begin: float,
-    max_seconds: float | None,
-) -> tuple[Optimized, int]:
-    """Optimise, write the mesh and the numbers, print the comparison; the result and the exit code."""
+) -> int:
+    """Optimise, write the mesh, the numbers and the pictures, print the comparison; the exit code."""
     about = {"image": image_path.name, "image_sha256": sha256(image_path), "options": options | source}
     log.print(escape(_described(image_path, image, initial)))
     loaded = time.perf_counter()
+    max_seconds = source["max_seconds"]
     left = None if max_seconds is None else max(max_seconds - (loaded - begin), 1e-9)
     result, is_interrupted = _optimized(image, initial, left, **options)
     optimized = time.perf_counter()
     save_mesh(output, result.mesh, cell_fields(result.mesh, image), {"tetopt": tetopt.__version__, **about})
-    _print_comparison(initial, result)
-    out.print(escape(f"{output}: {len(result.mesh.points)} nodes, {len(result.mesh.cells)} cells"))
     if json_path is not None:
         seconds = {"load": loaded - begin, "optimize": optimized - loaded, "all": time.perf_counter() - begin}
         save_json(json_path, run_summary(image, initial, result, about, seconds))
+    if pictures:
+        from tetopt.report.figures import save_run_figures  # matplotlib is slow to load, and only needed here
+
+        save_run_figures(pictures, image, initial, result)
+    # Everything is written; what is printed may go into a pipe that closes.
+    code = 130 if is_interrupted else _promises(image, result)
+    _warn(image, result)
+    _print_comparison(initial, result)
+    out.print(escape(f"{output}: {len(result.mesh.points)} nodes, {len(result.mesh.cells)} cells"))
+    if json_path is not None:
         out.print(escape(f"{json_path}: every number of the run"))
-    return result, 130 if is_interrupted else _promises(image, result)
+    for path in pictures:
+        out.print(escape(str(path)))
+    return code
+
+
+def _warn(image: Image, result: Optimized) -> None:
+    """Say what is allowed but hardly meant."""
+    lowest, last = min(row.E for row in result.history), result.history[-1].E
+    if last > lowest * (1.0 + 1e-3):
+        _show_warning(
+            f"E ended at {last:.4f}, above {lowest:.4f} on the way: a tessellation taken in the first n_t iterations "
+            "raised it; --retessellate accept takes only those that lower it"
+        )
+    if len(result.mesh.cells) > image.data.size:
+        _show_warning(
+            f"{len(result.mesh.cells)} cells for {image.data.size} voxels: most hold no voxel centre; "
+            "ask for fewer nodes"
+        )
+
+
+def _image(path: Path, volume: int | None, crop: str | None, slice_: str | None) -> Image:
+    """The image as the options ask for it."""
+    return load_image(
+        path,
+        volume=volume,
+        slice_=None if slice_ is None else parse_slice(slice_),
+        crop=None if crop is None else parse_crop(crop),
+    )
 
 
 def _set_threads(threads: int | None) -> None:
@@ -362,9 +414,9 @@ def _print_comparison(initial: Mesh, result: Optimized) -> None:
     after = quality(result.mesh.points, result.mesh.cells)
     table = _table("", "lattice", "optimised")
     table.add_row("E, combined", f"{first.E:.4f}", f"{last.E:.4f}")
-    table.add_row("E_G, of initial", "1", f"{last.E_G / first.E_G:.4f}")
+    table.add_row("E_G, of initial", "1.0000", f"{last.E_G / first.E_G:.4f}")
     if first.E_D > 0.0:
-        table.add_row("E_D, of initial", "1", f"{last.E_D / first.E_D:.4f}")
+        table.add_row("E_D, of initial", "1.0000", f"{last.E_D / first.E_D:.4f}")
     _add_quality(table, before, after)
     out.print(table)
 
@@ -380,13 +432,13 @@ def _add_quality(table: Table, *meshes: Quality) -> None:
     rows: list[tuple[str, Callable[[Quality], str]]] = [
         ("nodes", lambda q: str(q.n_nodes)),
         ("cells", lambda q: str(q.n_cells)),
-        ("volume, mm^n", lambda q: f"{q.volume:.6g}"),
+        ("volume, mm3" if meshes[0].ndim == 3 else "area, mm2", lambda q: f"{q.volume:.2f}"),
         ("rho, mean", lambda q: f"{q.mean_rho:.4f}"),
         ("rho, 1st percentile", lambda q: f"{q.p1_rho:.4f}"),
         ("rho, smallest", lambda q: f"{q.min_rho:.4f}"),
         ("rho error (i), mean", lambda q: f"{q.errors.mean:.4f}"),
         ("rho error (ii), harmonic mean", lambda q: f"{q.errors.harmonic_mean:.4f}"),
-        ("rho error (iii), L2", lambda q: f"{q.errors.l2:.4f}"),
+        ("rho error (iii), sum of squares", lambda q: f"{q.errors.l2:.4f}"),
         ("rho error (iv), worst", lambda q: f"{q.errors.worst:.4f}"),
         ("smallest angle, degrees", lambda q: f"{q.min_dihedral:.2f}"),
         ("largest angle, degrees", lambda q: f"{q.max_dihedral:.2f}"),
@@ -404,6 +456,8 @@ def quality_command(
         Path | None, typer.Option("--image", metavar="IMAGE", help="Measure E_D against this image, too.")
     ] = None,
     volume: VolumeOption = None,
+    crop: CropOption = None,
+    slice_: SliceOption = None,
     json_path: JsonOption = None,
     force: ForceOption = False,
 ) -> int:
@@ -416,19 +470,27 @@ def quality_command(
     table = _table("", escape(mesh_path.name))
     _add_quality(table, measured)
     if image_path is not None:
-        image = load_image(image_path, volume=volume)
+        image = _image(image_path, volume, crop, slice_)
         fit = _fit(image, loaded.mesh)
+        made_from = loaded.field_data.get("image_sha256")
+        if made_from is not None and str(made_from[0]) != sha256(image_path):
+            _show_warning(f"{mesh_path} was made from another image than {image_path}")
         content |= {"image": image_path.name, "fit": fit}
         table.add_row("E_D", f"{fit['E_D']:.6g}")
         if fit["E_D_share_of_variance"] is not None:
             table.add_row("E_D, share of the variance inside", f"{fit['E_D_share_of_variance']:.5f}")
         table.add_row("voxels inside", f"{fit['n_voxels']} of {image.data.size}")
         table.add_row("cells without a voxel", str(fit["n_empty_cells"]))
-    if loaded.n_turned:
-        log.print(f"[yellow]tetopt: warning:[/] {loaded.n_turned} cells were inverted in the file and have been turned")
-    out.print(table)
     if json_path is not None:
         save_json(json_path, content)
+    if loaded.n_turned:
+        _show_warning(f"{loaded.n_turned} cells were inverted in the file and have been turned")
+    out.print(table)
+    if image_path is not None and fit["n_voxels"] > image.data.size:
+        log.print(
+            f"[bold red]tetopt:[/] cells overlap: together they hold {fit['n_voxels']} voxels, more than there are"
+        )
+        return 1
     return 0
 
 
@@ -535,10 +597,7 @@ def paper_command(
     volume = load_image(image_path)
     if volume.ndim != 3:
         raise InputError(f"{image_path}: expected a volume, got a {volume.ndim}-D image")
-    if output.exists() and not output.is_dir():
-        raise InputError(f"{output}: expected a folder for the results, found a file")
-    output.mkdir(parents=True, exist_ok=True)
-    paths = run_paper.outputs(output, force)
+    paths = run_paper.outputs(_results_folder(output), force)
     results = run_paper.run(paths, volume, seeds, lambda text: log.print(escape(text)))
     out.print(escape(f"{paths['paper.html']}: all figures beside the paper's, in {results['seconds']:.0f} s"))
     return 0
@@ -554,28 +613,24 @@ def demo_command(
     force: ForceOption = False,
 ) -> int:
     """Mesh the MNI152 T1 that nilearn's wheel carries; leave mesh, numbers and pictures in a folder."""
-    begin = time.perf_counter()
     source = nilearn_t1()
-    if output.exists() and not output.is_dir():
-        raise InputError(f"{output}: expected a folder for the results, found a file")
-    output.mkdir(parents=True, exist_ok=True)
-    mesh_path = checked_output(output / "mesh.vtu", (".vtu",), force)
-    json_path = checked_output(output / "run.json", (".json",), force)
-    figures = [checked_output(output / name, (".png",), force) for name in ("slice.png", "rho.png", "energies.png")]
-    image = load_image(source)
-    initial = lattice(image, nodes=nodes)
-    options = {
-        "k_D": 0.2, "iterations": iterations, "n_t": default_n_t(0.2, iterations), "retessellate": "first",
-        "boundary": "slide",
-    }  # fmt: skip
-    asked = {"nodes": nodes, "lattice": "bcc", "method": "paper"}
-    result, code = _mesh_files(source, image, initial, options, asked, mesh_path, json_path, begin, None)
-    from tetopt.report.figures import save_run_figures  # matplotlib is slow to load, and only needed here
+    return mesh_command(
+        source,
+        _results_folder(output) / "mesh.vtu",
+        nodes=nodes,
+        iterations=iterations,
+        json_path=output / "run.json",
+        figures=output,
+        force=force,
+    )
 
-    save_run_figures(figures, image, initial, result)
-    for path in figures:
-        out.print(escape(str(path)))
-    return code
+
+def _results_folder(path: Path) -> Path:
+    """`path`, made if it is not there."""
+    if path.exists() and not path.is_dir():
+        raise InputError(f"{path}: expected a folder for the results, found a file")
+    path.mkdir(parents=True, exist_ok=True)
+    return path
 
 
 def nilearn_t1() -> Path:

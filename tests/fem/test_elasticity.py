@@ -377,7 +377,8 @@ def test_holding_more_and_stiffening_take_more_energy():
 # Refinement
 
 
-# A cell's children, each node as the middle of two of the cell's: its corners cut off and the middle, which in 3-D is an octahedron, cut in four around the diagonal from the midpoint of 0 1 to that of 2 3.
+# A cell's children, each node as the middle of two of the cell's: its corners cut off, and what is left; that is an
+# octahedron in 3-D, cut in four around the diagonal between the middles of 0 1 and 2 3.
 CHILDREN = {
     2: [[(0, 0), (0, 1), (0, 2)], [(0, 1), (1, 1), (1, 2)], [(0, 2), (1, 2), (2, 2)], [(0, 1), (1, 2), (0, 2)]],
     3: [[tuple(sorted((k, other))) for other in range(4)] for k in range(4)]
@@ -410,10 +411,10 @@ def refined(mesh, young):
 def test_energy_falls_to_its_limit_under_refinement(n, is_bonded):
     """Where displacements are prescribed, E_strain is the least over all the mesh can do: nested meshes only lower it.
 
-    A stiff inclusion in a soft block, nu 0.3, of which refinement keeps the moduli. Each level leaves less than
-    0.6 of the last one's excess over the finest mesh in 2-D; corners keep it from the 1/4 of smooth solutions.
+    A stiff inclusion in a soft block, nu 0.3, of which refinement keeps the moduli. Each halving gains less than
+    0.6 of the one before (0.7 in 3-D); corners keep it from the 1/4 of smooth solutions.
     """
-    image, mesh = block((1.0, 1.5, 1.0)[:n], (2, 3, 2)[:n])
+    image, mesh = block((1.0, 1.5, 1.0)[:n], (2, 3, 2)[:n], None if n == 2 else "five-tet")
     centre = mesh.points[mesh.cells].mean(axis=1)
     is_stiff = ((centre - np.array([0.5, 0.75, 0.5][:n])) ** 2).sum(axis=1) < 0.09
     young = np.where(is_stiff, 20.0, 1.0)
@@ -425,7 +426,7 @@ def test_energy_falls_to_its_limit_under_refinement(n, is_bonded):
     steps = -np.diff(energies)
     assert (steps > 0.0).all()
     assert (steps[1:] < (0.6 if n == 2 else 0.7) * steps[:-1]).all()
-    assert energies[0] < 1.5 * energies[-1]
+    assert energies[0] < 2.0 * energies[-1]
 
 
 # Solvers

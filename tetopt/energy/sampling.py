@@ -65,9 +65,10 @@ def cell_moments(image: Image, mesh: Mesh) -> CellMoments:
     sums = moment_sums(grid, ticks, mesh.cells)
     n_voxels = sums[:, 0].astype(np.int64)
     is_empty = n_voxels == 0
-    share = 1.0 / np.maximum(sums[:, 0], 1.0)
-    mean = grid.shift + sums[:, 1] * share
-    variance = np.maximum(sums[:, 2] * share - (sums[:, 1] * share) ** 2, 0.0)
+    held = np.maximum(sums[:, 0], 1.0)
+    offset = sums[:, 1] / held  # divided, not multiplied by 1 / held: the mean of equal whole numbers is that number
+    mean = grid.shift + offset
+    variance = np.maximum(sums[:, 2] / held - offset**2, 0.0)
     variance[is_empty] = 0.0
     mean[is_empty] = nearest_values(image, mesh.points[mesh.cells[is_empty]].mean(axis=1))
     return CellMoments(n_voxels, mean, variance)

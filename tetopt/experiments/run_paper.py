@@ -158,9 +158,9 @@ def _figure_3cd(paths: dict[str, Path]) -> dict[str, Any]:
         change = {name: getattr(after, name) / getattr(before, name) - 1.0 for name in after._fields}
         changes.append({"case": case.title, "before": before, "after": after, "change": change})
     text = (
-        "The elastography data are not published. A stiffness phantom, prostate_2d, is compressed by our plane-stress "
-        "solve, its axial strain gets noise, and 1/strain is the image. The printed initial errors are not quite those "
-        "of squares: the paper's box was a little longer than wide."
+        "The elastography data are not published. A phantom, prostate_2d, is compressed by our plane-stress solve, its "
+        "axial strain gets noise, and 1/strain is the image. The printed initial errors are not quite those of "
+        "squares: the paper's box was a little longer than wide."
     )
     return {
         "text": text, "errors": rows, "meshes": [_mesh_row("fig3c", shown.initial)], "simulation": changes,
@@ -178,7 +178,7 @@ def _figure_3ef(paths: dict[str, Path], volume: Image) -> dict[str, Any]:
     save_figure(slice_figure(case.image, [("initial", case.initial), ("optimised", mesh)]), paths["fig3e.png"])
     structure_picture(paths["fig3f.png"], case.image, mesh, inside)
     text = (
-        "The paper's volume is not published. Fig. 3(f) shows the largest connected set of tetrahedra with a mean below "
+        "The paper's volume is not published. Fig. 3(f) shows the largest connected set of tetrahedra of mean below "
         f"a threshold, here {below:.0f}, that does not reach the box."
     )
     return {

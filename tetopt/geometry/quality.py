@@ -89,6 +89,7 @@ def _tet_kind(corners: NDArray[np.float64]) -> str:
 class Quality(NamedTuple):
     """The shape of a mesh in numbers; angles in degrees, volumes in mm^n."""
 
+    ndim: int  # n, 2 or 3
     n_nodes: int
     n_cells: int
     volume: float
@@ -114,6 +115,7 @@ def quality(points: Points, cells: Cells) -> Quality:
     names = ("needle", "wedge", "cap", "spade", "sliver") if n == 3 else ("needle", "cap")
     kinds = bad_kinds(points, cells)
     return Quality(
+        ndim=n,
         n_nodes=len(points),
         n_cells=len(cells),
         volume=float(v.sum()),
