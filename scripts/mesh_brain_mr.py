@@ -19,6 +19,7 @@ import trimesh
 import tetopt
 from tetopt.geometry.topology import boundary_facets, components, facets
 from tetopt.io.files import checked_output, save_json, written_whole
+from tetopt.io.images import sha256
 from tetopt.optimize.paper import Record
 from tetopt.report.figures import save_run_figures
 from tetopt.report.scene import structure_picture
@@ -30,9 +31,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("image", type=Path, help="T1-weighted volume, CSF dark")
     parser.add_argument("-o", "--output", type=Path, required=True, help="folder for the results")
-    parser.add_argument("--nodes", type=int, default=10_000)
-    parser.add_argument("--k-d", type=float, default=0.3)
-    parser.add_argument("--iterations", type=int, default=15)
+    parser.add_argument("--nodes", type=int, default=10_000, help="wanted number of nodes (%(default)s)")
+    parser.add_argument("--k-d", type=float, default=0.3, help="weight of the image (%(default)s)")
+    parser.add_argument("--iterations", type=int, default=15, help="sweeps over all nodes (%(default)s)")
     parser.add_argument("--below", type=float, help="threshold; default: 0.7 x the median of the brighter half")
     parser.add_argument("--force", action="store_true", help="replace existing outputs")
     options = parser.parse_args(argv)
@@ -61,7 +62,8 @@ def _run(options: argparse.Namespace) -> int:
     structure = inner_structure(mesh, fields["mean"] < below)
     fields["is_structure"] = np.isin(np.arange(len(mesh.cells)), structure).astype(np.uint8)
 
-    about = {"image": options.image.name, "below": below, "k_D": options.k_d, "iterations": options.iterations}
+    used = {"nodes": options.nodes, "k_D": options.k_d, "iterations": options.iterations, "below": below}
+    about = {"image": options.image.name, "image_sha256": sha256(options.image), "options": used}
     tetopt.save_mesh(mesh_path, mesh, fields, about)
     surface = trimesh.Trimesh(mesh.points, boundary_facets(mesh.cells[structure]), process=True)
     with written_whole(surface_path) as temporary:
@@ -70,9 +72,17 @@ def _run(options: argparse.Namespace) -> int:
     structure_picture(picture_path, image, mesh, structure)
     volume = float(fields["volume"][structure].sum())
     summary = run_summary(image, initial, result, about, {"all": result.history[-1].seconds})
-    summary["structure"] = {"n_cells": len(structure), "volume_mm3": volume, "surface_mm2": float(surface.area)}
+    pinches = int((np.unique(surface.edges_sorted, axis=0, return_counts=True)[1] > 2).sum())
+    summary["structure"] = {
+        "n_cells": len(structure), "volume_mm3": volume, "surface_mm2": float(surface.area),
+        "is_watertight": surface.is_watertight, "n_edges_in_more_than_two_facets": pinches,
+    }  # fmt: skip
     save_json(json_path, summary)
     print(f"structure below {below:.4g}: {len(structure)} tets, {volume:.0f} mm^3; all in {folder}")
+    if pinches:
+        print(f"note: {pinches} edges of its surface lie in more than two facets, where tets touch along an edge only")
+    if len(structure) < 10:
+        print("note: that is hardly a structure; look at structure.png and choose --below")
     return 0
 
 

@@ -51,7 +51,7 @@ def test_ventricles_of_a_phantom(tmp_path, capsys):
     written = tetopt.load_mesh(out / "mesh.vtu")
     inside = np.flatnonzero(written.cell_data["is_structure"])
     assert components(written.mesh.cells[inside]).max() == 0
-    assert written.cell_data["mean"][inside].max() < json.loads((out / "run.json").read_text())["below"]
+    assert written.cell_data["mean"][inside].max() < json.loads((out / "run.json").read_text())["options"]["below"]
     volume = written.cell_data["volume"][inside].sum()
     assert volume == pytest.approx(4 / 3 * np.pi * 12.0**3, rel=0.25)
     centre = (written.cell_data["volume"][inside, None] * written.mesh.points[written.mesh.cells[inside]].mean(1)).sum(

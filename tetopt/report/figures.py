@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from tetopt.energy.sampling import cell_moments
 from tetopt.geometry.cut import plane_cut
-from tetopt.geometry.quality import quality_errors, rho_histogram
+from tetopt.geometry.quality import BAD_SHAPE, quality_errors, rho_histogram
 from tetopt.geometry.simplex import rho
 from tetopt.image import Image
 from tetopt.io.files import written_whole
@@ -150,10 +150,11 @@ def histogram_figure(meshes: Sequence[tuple[str, Mesh]]) -> Figure:
     for colour, (title, mesh) in zip(COLOURS, meshes, strict=False):
         share, edges = rho_histogram(mesh.points, mesh.cells)
         errors = quality_errors(mesh.points, mesh.cells)
-        mean = rho(mesh.points, mesh.cells).mean()
+        shape = rho(mesh.points, mesh.cells)
+        n_bad = int((mesh.ndim * shape < BAD_SHAPE).sum())  # too few for a bar to show
         label = (
-            f"{title}: mean {mean:.3f}; errors (i) {errors.mean:.4f}, (ii) {errors.harmonic_mean:.4f}, "
-            f"(iii) {errors.l2:.4g}, (iv) {errors.worst:.4f}"
+            f"{title}: mean {shape.mean():.3f}, {n_bad} bad cells; errors (i) {errors.mean:.4f}, "
+            f"(ii) {errors.harmonic_mean:.4f}, (iii) {errors.l2:.4g}, (iv) {errors.worst:.4f}"
         )
         axes.stairs(share, edges, fill=True, alpha=0.35, color=colour)
         axes.stairs(share, edges, color=colour, linewidth=1.6, label=label)

@@ -38,7 +38,7 @@ def structure_picture(path: str | Path, image: Image, mesh: Mesh, chosen: NDArra
             )
         plotter.add_mesh(surface, color=SURFACE, show_edges=True, edge_color="#402000", line_width=1, ambient=0.25)
         plotter.view_vector((0.9, 1.25, 0.7), viewup=(0.0, 0.0, 1.0))
-        plotter.camera.zoom(0.95)
+        plotter.camera.zoom(1.05)
         plotter.screenshot(temporary)
         plotter.close()
 
