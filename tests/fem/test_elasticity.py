@@ -521,6 +521,17 @@ def test_default_axis_is_the_one_along_z():
         assert mesh.points[low, world].max() < mesh.points[high, world].min()
 
 
+def test_top_is_up_even_where_the_upright_axis_leans_more_than_it_rises():
+    """Sheared: the third axis goes 0.9 to the left for every 0.4 up, and the others not up at all."""
+    affine = np.array([[1.0, 0, -0.9, 0], [0, 1, 0, 0], [0, 0, 0.4, 0], [0, 0, 0, 1]])
+    image = Image(np.zeros((3, 3, 3)), affine)
+    mesh = lattice(image, blocks=(1, 1, 1))
+    for axis in (None, 2):
+        low, high = box_faces(image, mesh, axis)
+        np.testing.assert_allclose(mesh.points[low, 2], -0.2, rtol=1e-12)
+        np.testing.assert_allclose(mesh.points[high, 2], 1.0, rtol=1e-12)
+
+
 def test_a_node_just_off_the_face_is_not_on_it():
     image, mesh = block((1.0, 1.0), (2, 2))
     points = mesh.points.copy()

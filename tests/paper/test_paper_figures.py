@@ -12,6 +12,7 @@ import pytest
 import tetopt
 from tetopt.experiments import paper
 from tetopt.geometry.simplex import volumes
+from tetopt.geometry.topology import largest_component
 
 PRINTED = paper.printed()
 
@@ -174,3 +175,21 @@ def test_figure_3e_volume(data_dir):
     assert case.result.history[-1].E_D < 0.7 * case.result.history[0].E_D
     v = volumes(case.result.mesh.points, case.result.mesh.cells)
     assert v.sum() == pytest.approx(case.image.volume, rel=1e-12)
+
+
+def test_figure_3f_ventricles(data_dir):
+    """The largest connected set of tetrahedra under a threshold is the lateral ventricles: on both sides of the middle
+    plane, above the anterior commissure (the MNI origin), where the tissue labels have CSF.
+    """
+    volume = tetopt.load_image(data_dir / "mni_icbm152_t1_tal_nlin_sym_09a_converted.nii.gz")
+    case = paper.figure_3ef(volume)
+    mesh = case.result.mesh
+    bright = np.median(case.image.data[case.image.data > case.image.data.mean()])
+    inside = largest_component(mesh.cells, tetopt.cell_moments(case.image, mesh).mean < 0.6 * bright)
+    centres = mesh.points[mesh.cells[inside]].mean(axis=1)
+    v = volumes(mesh.points, mesh.cells)[inside]
+    middle = (v[:, None] * centres).sum(axis=0) / v.sum()
+    assert abs(middle[0]) < 3.0
+    assert 8.0 < middle[2] < 22.0
+    assert centres[:, 0].min() < -20.0 < 20.0 < centres[:, 0].max()
+    assert 1.5e4 < v.sum() < 4.5e4  # lateral ventricles of the template, widened by cells of 10 mm

@@ -11,7 +11,7 @@ import numpy as np
 
 from tetopt.energy.sampling import cell_moments
 from tetopt.experiments import paper
-from tetopt.geometry.topology import components, facets
+from tetopt.geometry.topology import largest_component
 from tetopt.image import Image
 from tetopt.io.files import checked_output, save_json
 from tetopt.mesh import Mesh
@@ -173,13 +173,13 @@ def _figure_3ef(paths: dict[str, Path], volume: Image) -> dict[str, Any]:
     case = paper.figure_3ef(volume)
     mesh = case.result.mesh
     means = cell_moments(case.image, mesh).mean
-    below = 0.75 * float(np.median(case.image.data[case.image.data > case.image.data.mean()]))
-    inside = _inner_set(mesh, means < below)
+    below = 0.6 * float(np.median(case.image.data[case.image.data > case.image.data.mean()]))
+    inside = largest_component(mesh.cells, means < below)
     save_figure(slice_figure(case.image, [("initial", case.initial), ("optimised", mesh)]), paths["fig3e.png"])
     structure_picture(paths["fig3f.png"], case.image, mesh, inside)
     text = (
-        "The paper's volume is not published. Fig. 3(f) shows the largest connected set of tetrahedra of mean below "
-        f"a threshold, here {below:.0f}, that does not reach the box."
+        "The paper's volume is not published. Fig. 3(f) is the largest connected set of tetrahedra of mean below a "
+        f"threshold; here {below:.0f}, 0.6 x the median of the brighter voxels, which gives the lateral ventricles."
     )
     return {
         "text": text, "meshes": [_mesh_row("fig3e", case.initial)], "E_D_relative": {"k_D = 0.3": _E_D_relative(case)},
@@ -189,18 +189,6 @@ def _figure_3ef(paths: dict[str, Path], volume: Image) -> dict[str, Any]:
             ["fig3f.png", "Fig. 3(f): the structure below the threshold, before slices of the volume"],
         ],
     }  # fmt: skip
-
-
-def _inner_set(mesh: Mesh, is_chosen: np.ndarray) -> np.ndarray:
-    """Cells of the largest connected set among the chosen that does not touch the boundary; empty if there is none."""
-    chosen = np.flatnonzero(is_chosen)
-    if len(chosen) == 0:
-        return chosen
-    number = components(mesh.cells[chosen])
-    sides = facets(mesh.cells)
-    sizes = np.bincount(number)
-    sizes[number[np.isin(chosen, sides.cells[sides.n_cells == 1, 0])]] = 0
-    return chosen[number == sizes.argmax()] if sizes.max() > 0 else chosen[:0]
 
 
 def _write_page(paths: dict[str, Path], results: dict[str, Any]) -> None:
