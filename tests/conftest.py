@@ -1,6 +1,8 @@
 """Fixtures shared by all tests."""
 
 import os
+import subprocess
+import sys
 from pathlib import Path
 
 import numba
@@ -20,3 +22,14 @@ def data_dir() -> Path:
     if not folder.is_dir():
         pytest.skip(f"no real test volumes in {folder}; set TETOPT_DATA")
     return folder
+
+
+@pytest.fixture(scope="session")
+def opengl() -> None:
+    """Skips where VTK finds no OpenGL that draws without a display; asked in a child, since it may end the process."""
+    program = (
+        "import numpy as np, pyvista as p; q = p.Plotter(off_screen=True); q.add_mesh(p.Sphere()); "
+        "assert np.ptp(q.screenshot(return_img=True)) > 0"
+    )
+    if subprocess.run([sys.executable, "-c", program], capture_output=True, check=False).returncode != 0:
+        pytest.skip("no OpenGL that renders off screen")
