@@ -444,8 +444,6 @@ def test_multigrid_and_factorisation_agree(sides, is_bonded):
     assert len(amg.system.free) > 3000
     np.testing.assert_allclose(amg.u, direct.u, atol=1e-8 * np.abs(direct.u).max())
     assert amg.strain_energy == pytest.approx(direct.strain_energy, rel=1e-12)
-    again = squeezed(mesh, image, young, 0.45, is_bonded=is_bonded, method="amg")
-    np.testing.assert_array_equal(again.u, amg.u)
 
 
 @pytest.mark.parametrize("is_bonded", [True, False])

@@ -44,7 +44,7 @@ def conditioning(system: System, *, method: Method = "auto") -> Conditioning:
     Returns
     -------
     Conditioning
-        Eigenvalues good to a relative 1e-7 or better; the same in every run.
+        Eigenvalues good to a relative 1e-7 or better. Nothing is random: the same in every run, up to rounding.
 
     Raises
     ------

@@ -386,7 +386,7 @@ def factorized(K_ff: csr_array):  # type: ignore[no-untyped-def]
 
 
 def multigrid(system: System) -> LinearOperator:
-    """One V-cycle of smoothed aggregation on K_ff, (F, F): symmetric, and the same in every run.
+    """One V-cycle of smoothed aggregation on K_ff, (F, F): symmetric, and nothing about it is random.
 
     Aggregation is of nodes, not dofs, and reproduces the rigid motions. For that the prescribed dofs stay in as
     equations of their own, coupled to none.
