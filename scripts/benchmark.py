@@ -117,15 +117,18 @@ def sampling(image: tetopt.Image, nodes: int) -> dict[str, Any]:
     ours_at_once = best_seconds(lambda: tetopt.cell_moments(image, tetopt.Mesh(shaken, cells)))
 
     centres = image.to_world(np.stack(np.meshgrid(*map(np.arange, image.shape), indexing="ij"), -1).reshape(-1, 3))
-    begin = time.perf_counter()
-    tessellation.find_simplex(centres)
-    theirs = time.perf_counter() - begin
+    theirs = best_seconds(lambda: tessellation.find_simplex(centres), repeats=2)
+    # In raster order each search starts next to its end; in no order, as for scattered points, it walks far.
+    some = np.random.default_rng(0).permutation(centres)[:200_000]
+    scattered = best_seconds(lambda: tessellation.find_simplex(some), repeats=1) * len(centres) / len(some)
     total = best_seconds(lambda: (image.data.sum(), (image.data * image.data).sum()))
     return {
         "sampling_cells": len(cells),
         "sampling_voxels_per_second": image.data.size / ours,
         "find_simplex_voxels_per_second": image.data.size / theirs,
+        "find_simplex_scattered_voxels_per_second": image.data.size / scattered,
         "sampling_over_find_simplex": theirs / ours,
+        "sampling_over_find_simplex_scattered": scattered / ours,
         "sampling_and_facets_over_find_simplex": theirs / ours_and_facets,
         "cell_moments_over_find_simplex": theirs / ours_at_once,
         "sampling_over_numpy_sums": ours / total,
@@ -168,10 +171,14 @@ def show(rows: dict[str, Any]) -> None:
     print(f"  first call (cached kernels)       {rows['load_seconds']:10.1f} s")
     per_second = rows["sampling_voxels_per_second"] / 1e6
     print(f"  sampling, {rows['sampling_cells']:7d} tets          {per_second:10.1f} Mvoxel/s")
-    print(f"  scipy find_simplex, the same      {rows['find_simplex_voxels_per_second'] / 1e6:10.2f} Mvoxel/s")
-    print(f"  ratio, facets known as in a run   {rows['sampling_over_find_simplex']:10.0f}")
-    print(f"  ratio, facets found anew          {rows['sampling_and_facets_over_find_simplex']:10.0f}")
-    print(f"  ratio, cell_moments from scratch  {rows['cell_moments_over_find_simplex']:10.0f}")
+    raster, scattered = rows["find_simplex_voxels_per_second"], rows["find_simplex_scattered_voxels_per_second"]
+    print(f"  scipy find_simplex, raster order  {raster / 1e6:10.2f} Mvoxel/s")
+    print(f"  scipy find_simplex, random order  {scattered / 1e6:10.2f} Mvoxel/s")
+    print(f"  ratio to raster order             {rows['sampling_over_find_simplex']:10.0f}")
+    print(f"  ratio to random order             {rows['sampling_over_find_simplex_scattered']:10.0f}")
+    print(f"  to raster order, with facets      {rows['sampling_and_facets_over_find_simplex']:10.0f}")
+    print(f"  to raster order, cell_moments     {rows['cell_moments_over_find_simplex']:10.0f}")
+    print(f"  sampling over numpy's two sums    {rows['sampling_over_numpy_sums']:10.1f}")
     for row in rows["paper"]:
         print(
             f"  --method paper, {row['nodes']:6d} nodes      {row['seconds_per_iteration']:10.2f} s an iteration, "
