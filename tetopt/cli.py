@@ -353,7 +353,8 @@ def _prepare_kernels(image: Image, k_D: float) -> None:
     """Load the compiled kernels, or compile them, before the clock of the first iteration starts."""
     begin = time.perf_counter()
     with log.status("preparing the kernels (the first run compiles them, about half a minute) ..."):
-        tiny = Image(np.zeros((2,) * image.ndim, dtype=image.data.dtype) + np.arange(2))
+        is_whole = np.array_equal(np.rint(image.data), image.data)  # decides which kernels the sampling uses
+        tiny = Image(np.zeros((2,) * image.ndim, dtype=image.data.dtype) + np.arange(2) * (1.0 if is_whole else 0.5))
         tiny = Image(tiny.data.astype(image.data.dtype)) if tiny.data.dtype != image.data.dtype else tiny
         optimize(tiny, lattice(tiny, blocks=(1,) * image.ndim), k_D=k_D, iterations=1)
     seconds = time.perf_counter() - begin

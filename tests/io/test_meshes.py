@@ -19,6 +19,7 @@ import tetopt
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
 from tetopt.image import Image
+from tetopt.io.images import save_image
 from tetopt.io.meshes import cell_fields, load_mesh, save_mesh, to_pyvista
 from tetopt.lattice import lattice
 from tetopt.mesh import Mesh
@@ -184,11 +185,11 @@ def test_an_old_file_survives_a_failure(tmp_path, monkeypatch):
     save_mesh(tmp_path / "a.vtu", bent(3))
     before = (tmp_path / "a.vtu").read_bytes()
 
-    def interrupted(self, path):
-        path.write_bytes(b"half")
+    def interrupted(self, content):
+        self.write_text("half")
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(pyvista.UnstructuredGrid, "save", interrupted)
+    monkeypatch.setattr(Path, "write_bytes", interrupted)
     with pytest.raises(KeyboardInterrupt):
         save_mesh(tmp_path / "a.vtu", bent(2))
     assert (tmp_path / "a.vtu").read_bytes() == before
@@ -363,3 +364,21 @@ def test_bad_cells(tmp_path, nodes, z, match, assert_refused):
 def test_the_text_of_the_bad_cells_is_else_good(tmp_path):
     (tmp_path / "a.vtu").write_text(VTU.format(nodes="0 1 2 3", z="1"))
     np.testing.assert_array_equal(load_mesh(tmp_path / "a.vtu").mesh.points, POINTS[:4])
+
+
+def test_a_full_disk_keeps_the_old_file(tmp_path):
+    """A file-size limit in the place of a full disk: exit 2, one line, the old mesh as it was, nothing left beside."""
+    save_image(tmp_path / "a.nii", Image(np.arange(64.0).reshape(4, 4, 4)))
+    (tmp_path / "a.vtu").write_bytes(b"old")
+    program = (
+        "import resource, signal, sys; from tetopt.cli import main; signal.signal(signal.SIGXFSZ, signal.SIG_IGN); "
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000)); sys.exit(main(sys.argv[1:]))"
+    )
+    command = ["mesh", str(tmp_path / "a.nii"), "-o", str(tmp_path / "a.vtu"), "--nodes", "60", "--iterations", "0"]
+    run = subprocess.run(
+        [sys.executable, "-c", program, *command, "--force"], capture_output=True, text=True, check=False
+    )
+    assert run.returncode == 2, run.stderr
+    assert "File too large" in run.stderr
+    assert (tmp_path / "a.vtu").read_bytes() == b"old"
+    assert {path.name for path in tmp_path.iterdir()} == {"a.nii", "a.vtu"}

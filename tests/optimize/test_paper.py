@@ -1,5 +1,7 @@
 """The paper's optimisation: its laws on phantoms and real data, its options, its error messages."""
 
+import sys
+
 import numba
 import numpy as np
 import pytest
@@ -11,6 +13,7 @@ from tetopt.energy.sampling import sampling_grid, to_ticks
 from tetopt.geometry.simplex import circumcentres, oriented, rho, volumes
 from tetopt.geometry.topology import boundary_facets, facets, rings
 from tetopt.optimize.paper import frozen_axes, optimize
+from tetopt.optimize.retessellate import delaunay
 
 OBLIQUE = np.array([[0.9, 0.3, 0.2, -7.0], [-0.25, 1.1, 0.1, 3.0], [0.0, 0.4, -2.5, 11.0], [0.0, 0.0, 0.0, 1.0]])
 
@@ -343,3 +346,92 @@ def test_real_oblique_and_anisotropic(data_dir, name, nodes):
     assert {row.n_voxels for row in result.history} == {image.data.size}
     assert result.history[-1].E_D < 0.9 * result.history[0].E_D
     assert domain_problems(image, result.mesh) == []
+
+
+# After a hostile review.
+
+
+def test_rounding_is_no_unit_of_E_D():
+    """Every cell uniform, but of fractions that leave rounding in the sums: E_D0 is 0, as it is for whole numbers."""
+    data = np.where(np.arange(12) < 6, 0.1, 0.7)[:, None, None] * np.ones((12, 12, 12))
+    histories = []
+    for values in (data, np.where(data > 0.5, 7.0, 1.0)):
+        image = tetopt.Image(values)
+        histories.append(
+            optimize(image, tetopt.lattice(image, "five-tet", blocks=(2, 2, 2)), k_D=0.2, iterations=4).history
+        )
+    for fractions, whole in zip(*histories, strict=True):
+        assert fractions.E == pytest.approx(whole.E, rel=1e-9)
+    assert histories[0][0].E_D == 0.0
+    assert histories[0][0].E == 0.8
+
+
+def test_accept_takes_what_lowers_E():
+    """Moved nodes, connected as before, are not Delaunay: "accept" takes Delaunay's cells where "never" may not."""
+    image, blocks = CASES["3-D"]
+    mesh = tetopt.lattice(image, "five-tet", blocks=blocks)
+    result = optimize(image, mesh, k_D=0.05, iterations=6, retessellate="accept")
+    taken = [row.iteration for row in result.history if row.is_retessellated]
+    assert taken
+    assert result.history[-1].E < optimize(image, mesh, k_D=0.05, iterations=6, retessellate="never").history[-1].E
+
+
+def test_accept_needs_a_full_box_for_any_n_t():
+    image, blocks = CASES["3-D"]
+    mesh = tetopt.lattice(image, blocks=blocks)
+    inner = np.flatnonzero(
+        ~np.isin(np.arange(len(mesh.cells)), facets(mesh.cells).cells[facets(mesh.cells).n_cells == 1, 0])
+    )
+    holed = tetopt.Mesh(mesh.points, np.delete(mesh.cells, inner[0], axis=0))
+    for n_t in (0, 3):
+        with pytest.raises(tetopt.InputError, match="fills the image's box exactly"):
+            optimize(image, holed, iterations=2, retessellate="accept", n_t=n_t)
+
+
+def test_doubled_cells_are_refused():
+    image, blocks = CASES["2-D"]
+    mesh = tetopt.lattice(image, blocks=blocks)
+    with pytest.raises(tetopt.InputError, match="shared by more than two cells"):
+        optimize(image, tetopt.Mesh(mesh.points, np.vstack([mesh.cells, mesh.cells])), iterations=1)
+
+
+def missing_cell(cells):
+    return cells[1:]
+
+
+def doubled_cell(cells):
+    return np.vstack([cells, cells[:1]])
+
+
+def turned_cell(cells):
+    return np.vstack([cells[:1, [1, 0, *range(2, cells.shape[1])]], cells[1:]])
+
+
+@pytest.mark.parametrize("spoil", [missing_cell, doubled_cell, turned_cell])
+@pytest.mark.parametrize("name", CASES)
+def test_spoiled_tessellations_are_not_taken(name, spoil, monkeypatch):
+    """Delaunay cells with one left out, one twice or one turned: the old connectivity is kept."""
+    image, blocks = CASES[name]
+    mesh = tetopt.lattice(image, blocks=blocks)
+    good = delaunay(image.to_index(mesh.points), image.affine)
+    monkeypatch.setattr(sys.modules["tetopt.optimize.paper"], "delaunay", lambda *_: spoil(good))
+    result = optimize(image, mesh, k_D=0.3, iterations=1, n_t=1)
+    np.testing.assert_array_equal(result.mesh.cells, mesh.cells)
+    assert not any(row.is_retessellated for row in result.history)
+    monkeypatch.setattr(sys.modules["tetopt.optimize.paper"], "delaunay", lambda *_: good[::-1])
+    np.testing.assert_array_equal(optimize(image, mesh, k_D=0.3, iterations=1, n_t=1).mesh.cells, good[::-1])
+
+
+def test_step_length_is_a_ratio_of_the_nearest_centroid():
+    """One free node in a square of four triangles, pushed along one axis only: it moves by the step or the parabola's
+    part of it, never further, and the step is the ratio times the distance to the nearest of the four centroids.
+    """
+    size = 30
+    edge = tetopt.Image(np.where(np.arange(size)[:, None] < 18, 0.0, 100.0) * np.ones((size, size)))
+    points = np.array([[-0.5, -0.5], [29.5, -0.5], [29.5, 29.5], [-0.5, 29.5], [10.0, 14.5]])
+    mesh = tetopt.Mesh(points, [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
+    nearest = np.linalg.norm(points[mesh.cells].mean(axis=1) - points[4], axis=1).min()
+    for ratio in (0.1, 0.3):
+        result = optimize(edge, mesh, k_D=0.95, iterations=1, retessellate="never", boundary="fixed", step_ratio=ratio)
+        moved = result.mesh.points[4] - points[4]
+        assert moved[0] == pytest.approx(ratio * nearest, abs=1e-5)

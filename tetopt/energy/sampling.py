@@ -23,7 +23,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from math import ceil, log2
+from math import ceil, isfinite, log2
 from typing import Any, NamedTuple
 
 import numba
@@ -120,12 +120,14 @@ def sampling_grid(image: Image, points: NDArray[np.float64]) -> SamplingGrid:
     """The image and the fixed-point grid for nodes near `points`, (N, n) world mm.
 
     Differences of coordinates stay below 2**29 units, so that their products, areas and determinants are exact
-    in 64- and 128-bit integers. On an image of whole numbers every sum is exact, too.
+    in 64- and 128-bit integers. On an image of whole numbers whose sums of squares along a row stay below 2**31,
+    8-bit and most 16-bit images, every sum is exact, too; on others sums are as exact as float64 sums along a row.
 
     Raises
     ------
     InputError
-        Mesh and image differ in dimension, or the mesh reaches more than 2**20 voxels.
+        Mesh and image differ in dimension, the mesh reaches 2**20 voxels or more, or intensities whose squares
+        overflow.
     """
     if points.shape[1] != image.ndim:
         raise InputError(
@@ -144,9 +146,11 @@ def sampling_grid(image: Image, points: NDArray[np.float64]) -> SamplingGrid:
     mean = float(np.mean(image.data, dtype=np.float64))
     shift = low if low == high else round(mean) if is_whole else mean  # constants become 0, whole numbers stay whole
     largest = max(high - shift, shift - low)
+    if not isfinite(largest * largest * image.data.size):
+        raise InputError(f"image: squares of intensities from {low:g} to {high:g} overflow; rescale it first")
     # Whole numbers whose sums fit take half the memory, which is what the sampling of small cells waits for:
     # 1.4 times faster at 200 k tetrahedra.
-    is_short = is_whole and shape[2] * max(largest, largest**2) < 2**31
+    is_short = is_whole and shape[2] * max(largest, largest * largest) < 2**31
     prefix = np.empty((shape[0], shape[1], shape[2] + 1, 2), dtype=np.int32 if is_short else np.float64)
     with few_threads(image.data.size // 50):
         _fill_prefix(prefix, image.data.reshape(shape), float(shift))

@@ -33,7 +33,7 @@ def checked_output(path: str | Path, suffixes: tuple[str, ...], force: bool = Fa
         raise InputError(f"{path}: its folder does not exist; make it first")
     if not os.access(path.parent, os.W_OK):
         raise InputError(f"{path}: its folder cannot be written to")
-    if path.exists() and not force:
+    if os.path.lexists(path) and not force:
         raise InputError(f"{path}: exists already; pass --force (force=True) to replace it")
     return path
 

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import numpy as np
 import pyvista
 from numpy.typing import NDArray
+from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
 
 from tetopt.energy.sampling import cell_moments
 from tetopt.errors import InputError
@@ -75,8 +76,15 @@ def save_mesh(
     for name, value in (about or {}).items():
         text = value if isinstance(value, str) else json.dumps(value)
         grid.field_data[name] = np.frombuffer(text.encode(), dtype=np.uint8)
+    # VTK writes into memory and Python to the disk: on a full one VTK reports nothing, or ends the process.
+    writer = vtkXMLUnstructuredGridWriter()
+    writer.SetInputData(grid)
+    writer.SetDataModeToBinary()
+    writer.WriteToOutputStringOn()
+    if not writer.Write():
+        raise RuntimeError(f"{path}: VTK could not write the mesh")
     with written_whole(Path(path)) as temporary:
-        grid.save(temporary)
+        temporary.write_bytes(writer.GetOutputString().encode())
 
 
 def load_mesh(path: str | Path) -> MeshFile:

@@ -30,6 +30,8 @@ from tetopt.mesh import Mesh
 from tetopt.optimize.descent import FLAT, State, Weights, descend, free_projections, relocate
 from tetopt.optimize.retessellate import delaunay
 
+NOISE = 1e-12  # of the image's own variance x volume: less E_D than this is rounding
+
 Retessellate = Literal["first", "accept", "never"]
 Boundary = Literal["slide", "fixed"]
 
@@ -107,12 +109,13 @@ def optimize(
     -------
     Optimized
         Mesh, history and why it ended. The mesh covers the same domain and every cell is positively oriented.
-        With the connectivity fixed E never rises from one record to the next.
+        With the connectivity fixed E never rises, beyond rounding, from one record to the next.
 
     Raises
     ------
     InputError
-        An option out of range, or a mesh that the sampling cannot take (see `cell_moments`).
+        An option out of range, a mesh that the sampling cannot take (see `cell_moments`), with doubled cells, or,
+        unless `retessellate` is "never", one that does not fill the image's box.
     """
     _check_options(k_D, iterations, n_t, retessellate, boundary, step_ratio)
     if n_t is None:
@@ -128,15 +131,19 @@ def optimize(
     matrix[3 - image.ndim :, 3 - image.ndim :] = image.affine[:-1, :-1]
     projections = free_projections(matrix)
     state = _state(image, grid, ticks, mesh.cells, is_frozen)
-    if retessellate != "never" and iterations > 0 and n_t > 0:
+    if state.sides.n_cells.max() > 2:
+        raise InputError("mesh: a facet is shared by more than two cells; remove doubled or overlapping cells")
+    if iterations > 0 and (retessellate == "accept" or (retessellate == "first" and n_t > 0)):
         _check_fills_box(image, mesh)
-    E_G0, E_D0 = _energies(state, image)
+    # Where every cell is uniform, what rounding leaves of E_D must not become the unit that E_D is measured in.
+    noise = NOISE * float(np.var(image.data, dtype=np.float64)) * image.volume
+    E_G0, E_D0 = _energies(state, image, noise)
     weights = Weights((1.0 - k_D) / E_G0, k_D * image.voxel_volume / E_D0 if E_D0 > 0.0 else 0.0, step_ratio)
 
     history: list[Record] = []
 
     def record(iteration: int, movement: float, is_retessellated: bool) -> None:
-        now_G, now_D = _energies(state, image)
+        now_G, now_D = _energies(state, image, noise)
         E = combined(now_G, now_D, E_G0, E_D0, k_D)
         n_voxels = int(state.sums[:, 0].sum())
         seconds = time.perf_counter() - begin
@@ -155,7 +162,7 @@ def optimize(
             limit = history[-1].E if retessellate == "accept" else np.inf
             candidate = _retessellated(image, grid, state)
             if candidate is not None:
-                E = combined(*_energies(candidate, image), E_G0, E_D0, k_D)
+                E = combined(*_energies(candidate, image, noise), E_G0, E_D0, k_D)
                 if limit > E:
                     is_new = not np.array_equal(candidate.cells, state.cells)
                     state = candidate
@@ -264,8 +271,10 @@ def _state(
     )
 
 
-def _energies(state: State, image: Image) -> tuple[float, float]:
-    return float(state.E_G.sum()), float(E_D_of_sums(state.sums, image.voxel_volume).sum())
+def _energies(state: State, image: Image, noise: float) -> tuple[float, float]:
+    """E_G and E_D of the mesh; an E_D up to `noise` is 0."""
+    E_D = float(E_D_of_sums(state.sums, image.voxel_volume).sum())
+    return float(state.E_G.sum()), E_D if E_D > noise else 0.0
 
 
 def _retessellated(image: Image, grid: SamplingGrid, state: State) -> State | None:
