@@ -12,7 +12,7 @@ from tetopt.energy.geometric import E_G_gradient, ring_volumes
 from tetopt.energy.sampling import sampling_grid, to_ticks
 from tetopt.geometry.simplex import circumcentres, oriented, rho, volumes
 from tetopt.geometry.topology import boundary_facets, facets, rings
-from tetopt.optimize.paper import frozen_axes, optimize
+from tetopt.optimize.paper import default_n_t, frozen_axes, optimize
 from tetopt.optimize.retessellate import delaunay
 
 OBLIQUE = np.array([[0.9, 0.3, 0.2, -7.0], [-0.25, 1.1, 0.1, 3.0], [0.0, 0.4, -2.5, 11.0], [0.0, 0.0, 0.0, 1.0]])
@@ -435,3 +435,22 @@ def test_step_length_is_a_ratio_of_the_nearest_centroid():
         result = optimize(edge, mesh, k_D=0.95, iterations=1, retessellate="never", boundary="fixed", step_ratio=ratio)
         moved = result.mesh.points[4] - points[4]
         assert moved[0] == pytest.approx(ratio * nearest, abs=1e-5)
+
+
+def test_default_n_t():
+    """All iterations for Lloyd's alternation, half of them, rounded up, with an image; as with the number given."""
+    assert [default_n_t(0.0, 7), default_n_t(0.2, 7), default_n_t(0.2, 6), default_n_t(0.2, 0)] == [7, 4, 3, 0]
+    image, blocks = CASES["3-D"]
+    mesh = tetopt.lattice(image, blocks=blocks)
+    plain, given = optimize(image, mesh, k_D=0.4, iterations=6), optimize(image, mesh, k_D=0.4, iterations=6, n_t=3)
+    assert [row[:-1] for row in plain.history] == [row[:-1] for row in given.history]
+
+
+def test_movement_is_measured_from_the_middle_of_the_box():
+    """|x^t - x^(t-1)| / |x^(t-1)|, so the same wherever the image lies in the world."""
+    image, blocks = CASES["3-D"]
+    mesh = tetopt.lattice(image, blocks=blocks)
+    result = optimize(image, mesh, k_D=0.4, iterations=1, retessellate="never")
+    middle = image.to_world((np.array(image.shape) - 1.0) / 2.0)
+    moved = np.linalg.norm(result.mesh.points - mesh.points)
+    assert result.history[1].movement == pytest.approx(moved / np.linalg.norm(mesh.points - middle), rel=1e-5)
