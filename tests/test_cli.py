@@ -777,6 +777,11 @@ def test_demo_without_nilearn(tmp_path, monkeypatch, capfd):
 # what is allowed but hardly meant
 
 
+def small_run(inputs, folder, iterations):
+    command = ["mesh", str(inputs / "sphere.nii.gz"), "-o", str(folder / "a.vtu"), "--nodes", "60"]
+    return [*command, "--iterations", str(iterations)]
+
+
 def test_a_reader_that_goes_away_loses_no_file(tmp_path, inputs):
     """`tetopt mesh ... | head -1`: mesh and numbers are written, and nothing complains."""
     command = [sys.executable, "-m", "tetopt", "mesh", str(inputs / "sphere.nii.gz"), "-o", str(tmp_path / "a.vtu")]
@@ -802,16 +807,7 @@ def test_quality_of_overlapping_cells(tmp_path, inputs, capsys):
 
 
 def test_quality_with_another_image(tmp_path, inputs, capsys):
-    command = [
-        "mesh",
-        str(inputs / "sphere.nii.gz"),
-        "-o",
-        str(tmp_path / "a.vtu"),
-        "--nodes",
-        "60",
-        "--iterations",
-        "0",
-    ]
+    command = small_run(inputs, tmp_path, 0)
     assert main(command) == 0
     save_image(tmp_path / "other.nii", load_phantom("two_spheres").image(voxel_mm=8.0))
     capsys.readouterr()
@@ -825,16 +821,7 @@ def test_quality_with_another_image(tmp_path, inputs, capsys):
 def test_quality_of_a_part(tmp_path, inputs, part, capsys):
     """A mesh of a slice or a crop is measured against the same part: every voxel is inside."""
     image = ["--image", str(inputs / "sphere.nii.gz"), *part]
-    command = [
-        "mesh",
-        str(inputs / "sphere.nii.gz"),
-        "-o",
-        str(tmp_path / "a.vtu"),
-        "--nodes",
-        "60",
-        "--iterations",
-        "1",
-    ]
+    command = small_run(inputs, tmp_path, 1)
     assert main([*command, *part]) == 0
     capsys.readouterr()
     assert main(["quality", str(tmp_path / "a.vtu"), *image]) == 0
@@ -843,16 +830,7 @@ def test_quality_of_a_part(tmp_path, inputs, part, capsys):
 
 
 def test_figures(tmp_path, inputs):
-    command = [
-        "mesh",
-        str(inputs / "sphere.nii.gz"),
-        "-o",
-        str(tmp_path / "a.vtu"),
-        "--nodes",
-        "60",
-        "--iterations",
-        "1",
-    ]
+    command = small_run(inputs, tmp_path, 1)
     assert main([*command, "--figures", str(tmp_path)]) == 0
     assert {p.name for p in tmp_path.glob("*.png")} == {"slice.png", "rho.png", "energies.png"}
 

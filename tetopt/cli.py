@@ -37,6 +37,7 @@ from tetopt import (
     save_mesh,
 )
 from tetopt.geometry.quality import Quality, quality
+from tetopt.geometry.simplex import volumes
 from tetopt.io.files import checked_output, save_json
 from tetopt.io.images import parse_crop, parse_slice, sha256
 from tetopt.io.meshes import cell_fields
@@ -316,7 +317,7 @@ def _described(path: Path, image: Image, initial: Mesh) -> str:
 
 def _promises(image: Image, result: Optimized) -> int:
     """0 if the mesh covers the image's box and every voxel; else 1, said aloud."""
-    covered = quality(result.mesh.points, result.mesh.cells).volume
+    covered = float(volumes(result.mesh.points, result.mesh.cells).sum())
     missed = image.data.size - result.history[-1].n_voxels
     if missed == 0 and abs(covered / image.volume - 1.0) < 1e-9:
         return 0
@@ -354,8 +355,8 @@ def _prepare_kernels(image: Image, k_D: float) -> None:
     begin = time.perf_counter()
     with log.status("preparing the kernels (the first run compiles them, about half a minute) ..."):
         is_whole = np.array_equal(np.rint(image.data), image.data)  # decides which kernels the sampling uses
-        tiny = Image(np.zeros((2,) * image.ndim, dtype=image.data.dtype) + np.arange(2) * (1.0 if is_whole else 0.5))
-        tiny = Image(tiny.data.astype(image.data.dtype)) if tiny.data.dtype != image.data.dtype else tiny
+        step = 1.0 if is_whole else 0.5 if image.data.dtype == np.float32 else 0.1  # 0.1 is held as float64
+        tiny = Image(np.zeros((2,) * image.ndim) + step * np.arange(2))
         optimize(tiny, lattice(tiny, blocks=(1,) * image.ndim), k_D=k_D, iterations=1)
     seconds = time.perf_counter() - begin
     if seconds > 3.0:

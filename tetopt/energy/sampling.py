@@ -69,7 +69,6 @@ def cell_moments(image: Image, mesh: Mesh) -> CellMoments:
     offset = sums[:, 1] / held  # divided, not multiplied by 1 / held: the mean of equal whole numbers is that number
     mean = grid.shift + offset
     variance = np.maximum(sums[:, 2] / held - offset**2, 0.0)
-    variance[is_empty] = 0.0
     mean[is_empty] = nearest_values(image, mesh.points[mesh.cells[is_empty]].mean(axis=1))
     return CellMoments(n_voxels, mean, variance)
 

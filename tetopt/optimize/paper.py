@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -24,7 +24,7 @@ from tetopt.energy.sampling import (
 )
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import squared_edges, volumes
-from tetopt.geometry.topology import boundary_facets, facets, node_colours, rings, stars
+from tetopt.geometry.topology import Facets, boundary_facets, facets, node_colours, rings, stars
 from tetopt.image import Image, transformed
 from tetopt.mesh import Mesh
 from tetopt.optimize.descent import FLAT, State, Weights, descend, free_projections, relocate
@@ -229,14 +229,10 @@ def frozen_axes(
     if boundary == "fixed":
         is_frozen[facets_out.ravel()] = True
         return is_frozen
-    half = 1 << (grid.bits - 1)
     is_on_box = np.zeros(len(facets_out), dtype=bool)
-    for axis in range(3 - n, 3):
-        for side in (-half, (grid.shape[axis] << grid.bits) - half):
-            is_there = ticks[:, axis] == side
-            facet_is_there = is_there[facets_out].all(axis=1)
-            is_on_box |= facet_is_there
-            is_frozen[facets_out[facet_is_there].ravel(), axis] = True
+    for axis, is_there in _on_box_sides(ticks, facets_out, grid, n):
+        is_on_box |= is_there
+        is_frozen[facets_out[is_there].ravel(), axis] = True
     is_frozen[facets_out[~is_on_box].ravel()] = True
     return is_frozen
 
@@ -259,10 +255,12 @@ def _state(
     ticks: NDArray[np.int64],
     cells: NDArray[np.int64],
     is_frozen: NDArray[np.bool_],
+    sides: Facets | None = None,
 ) -> State:
+    """Everything a sweep needs, measured afresh; `sides` are the cells' facets where they are known already."""
     points = image.to_world(from_ticks(ticks, grid, image.ndim))
     cells = np.ascontiguousarray(cells, dtype=np.int64)
-    around, sides = rings(cells, len(ticks)), facets(cells)
+    around, sides = rings(cells, len(ticks)), facets(cells) if sides is None else sides
     hand = 1 if np.linalg.det(image.affine[:-1, :-1]) > 0 else -1
     fluxes = facet_fluxes(grid, ticks, sides.nodes)
     sums = sums_of_fluxes(fluxes, sides, hand)
@@ -292,9 +290,10 @@ def _retessellated(image: Image, grid: SamplingGrid, state: State) -> State | No
     shared = facets(cells)
     if shared.n_cells.max() > 2:
         return None
-    if not _is_on_box(state.ticks, shared.nodes[shared.n_cells == 1], grid, image.ndim):
+    outer = shared.nodes[shared.n_cells == 1]
+    if not np.any([there for _, there in _on_box_sides(state.ticks, outer, grid, image.ndim)], axis=0).all():
         return None
-    candidate = _state(image, grid, state.ticks, cells, state.is_frozen)
+    candidate = _state(image, grid, state.ticks, cells, state.is_frozen, shared)
     return candidate if candidate.sums[:, 0].sum() == image.data.size else None
 
 
@@ -304,13 +303,14 @@ def is_flat(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np
     return volumes(points, cells) <= FLAT * size
 
 
-def _is_on_box(ticks: NDArray[np.int64], nodes: NDArray[np.int64], grid: SamplingGrid, n: int) -> bool:
+def _on_box_sides(
+    ticks: NDArray[np.int64], nodes: NDArray[np.int64], grid: SamplingGrid, n: int
+) -> Iterator[tuple[int, NDArray[np.bool_]]]:
+    """For each side of the box, the axis across it and which of the facets `nodes` (F, n) lie on it."""
     half = 1 << (grid.bits - 1)
-    is_there = np.zeros(len(nodes), dtype=bool)
     for axis in range(3 - n, 3):
         for side in (-half, (grid.shape[axis] << grid.bits) - half):
-            is_there |= (ticks[nodes, axis] == side).all(axis=1)
-    return bool(is_there.all())
+            yield axis, (ticks[nodes, axis] == side).all(axis=1)
 
 
 def _sweep(
