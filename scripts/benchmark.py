@@ -24,11 +24,11 @@ import numpy as np
 from scipy.spatial import Delaunay
 
 import tetopt
-from tetopt.cli import nilearn_t1
 from tetopt.energy.sampling import from_ticks, moment_sums, sampling_grid, to_ticks
 from tetopt.geometry.simplex import oriented, rho, volumes
 from tetopt.geometry.topology import facets
 from tetopt.io.files import checked_output, save_json
+from tetopt.io.mni import mni_path
 from tetopt.optimize.retessellate import delaunay
 from tetopt.report.summary import versions
 
@@ -43,7 +43,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     options = parser.parse_args(argv)
     try:
         output = checked_output(options.output, (".json",), options.force)
-        path = nilearn_t1() if options.image is None else options.image
+        path = mni_path("t1") if options.image is None else options.image
         image = tetopt.load_image(path)
     except tetopt.InputError as error:
         print(f"benchmark: {error}", file=sys.stderr)

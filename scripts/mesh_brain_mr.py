@@ -22,7 +22,7 @@ from tetopt.io.files import checked_output, save_json, written_whole
 from tetopt.io.images import sha256
 from tetopt.optimize.paper import Record
 from tetopt.report.figures import save_run_figures
-from tetopt.report.scene import structure_picture
+from tetopt.report.scene import save_scenes, structure_before_slices
 from tetopt.report.summary import run_summary
 
 
@@ -69,7 +69,7 @@ def _run(options: argparse.Namespace) -> int:
     with written_whole(surface_path) as temporary:
         surface.export(temporary, file_type="stl")
     save_run_figures(figures, image, initial, result)
-    structure_picture(picture_path, image, mesh, structure)
+    save_scenes(picture_path, [("", structure_before_slices(image, mesh, structure))])
     volume = float(fields["volume"][structure].sum())
     summary = run_summary(image, initial, result, about, {"all": result.history[-1].seconds})
     pinches = int((np.unique(surface.edges_sorted, axis=0, return_counts=True)[1] > 2).sum())

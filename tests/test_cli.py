@@ -25,6 +25,7 @@ from tetopt.cli import main
 from tetopt.geometry.simplex import volumes
 from tetopt.phantom import phantom_names
 from tetopt.report.summary import mesh_hash
+from tetopt.segmentation import dice, segmented
 
 OBLIQUE_TOML = """
 name = "oblique"
@@ -484,7 +485,7 @@ def test_bad_options_of_mesh(tmp_path, inputs, monkeypatch, capfd, options, matc
         ("phantom sphere -o a.nii --voxel-mm 1e-9", "voxel_mm"),
         ("phantom sphere -o a.nii --noise-sd -1", "noise_sd"),
         ("phantom sphere -o a.nii --seed x", "--seed"),
-        ("segment", "No such command 'segment'"),
+        ("refine", "No such command 'refine'"),
         ("--unknown", "No such option: --unknown"),
         ("demo -o {disc}", "expected a folder"),
         ("demo --iterations -1", "--iterations"),
@@ -768,7 +769,7 @@ def test_demo(tmp_path):
 
 
 def test_demo_without_nilearn(tmp_path, monkeypatch, capfd):
-    monkeypatch.setattr(tetopt.cli.importlib.util, "find_spec", lambda name: None)
+    monkeypatch.setattr(tetopt.io.mni.importlib.util, "find_spec", lambda name: None)
     assert_refused(capfd, ["demo", "-o", tmp_path / "demo"], r'pip install "tetopt\[demo\]"')
     assert list(tmp_path.iterdir()) == []
 
@@ -839,3 +840,41 @@ def test_many_more_cells_than_voxels_are_said(tmp_path, capsys):
     save_image(tmp_path / "few.nii", Image(np.arange(27.0).reshape(3, 3, 3)))
     assert main(["mesh", str(tmp_path / "few.nii"), "-o", str(tmp_path / "a.vtu"), "--nodes", "500"]) == 0
     assert "cells for 27 voxels" in capsys.readouterr().err
+
+
+# --------------------------------------------------------------------------------------------------
+# segment
+
+
+def test_segment(tmp_path, inputs, capfd):
+    """The labels written are the library's; Dice with the truth is printed for mesh and voxels."""
+    phantom = tetopt.load_phantom("sphere")
+    tetopt.save_image(tmp_path / "image.nii.gz", phantom.image(voxel_mm=2.0))
+    tetopt.save_image(tmp_path / "truth.nii.gz", phantom.label_image(voxel_mm=2.0))
+    image = tetopt.load_image(tmp_path / "image.nii.gz")
+    mesh = tetopt.optimize(image, tetopt.lattice(image, nodes=400), k_D=0.5, iterations=4).mesh
+    tetopt.save_mesh(tmp_path / "mesh.vtu", mesh)
+    files = [str(tmp_path / name) for name in ("image.nii.gz", "mesh.vtu")]
+    options = ["-o", str(tmp_path / "labels.nii.gz"), "--classes", "2", "--json", str(tmp_path / "s.json")]
+    assert main(["segment", *files, *options, "--truth", str(tmp_path / "truth.nii.gz")]) == 0
+    labels = tetopt.load_image(tmp_path / "labels.nii.gz")
+    np.testing.assert_array_equal(labels.data, segmented(image, mesh, 2).data)
+    np.testing.assert_allclose(labels.affine, image.affine)
+    numbers = json.loads((tmp_path / "s.json").read_text())
+    found = dice(labels, tetopt.load_image(tmp_path / "truth.nii.gz"))
+    assert numbers["dice"]["mesh"] == {str(label): value for label, value in found.items()}
+    assert found[1] > 0.8
+    assert f"{found[1]:.4f}" in capfd.readouterr().out
+    assert main(["segment", *files, *options]) == 2
+    assert "exists" in capfd.readouterr().err
+
+
+def test_segment_refuses_other_labels(tmp_path, inputs, capfd):
+    command = ["segment", str(inputs / "sphere.nii.gz"), str(inputs / "lattice.vtu"), "-o", str(tmp_path / "l.nii")]
+    other = tetopt.load_phantom("sphere").label_image(voxel_mm=3.3)
+    tetopt.save_image(tmp_path / "other.nii", other)
+    assert main([*command, "--truth", str(tmp_path / "other.nii")]) == 2
+    assert "expected labels on the image's own voxels" in capfd.readouterr().err
+    assert main([*command, "--classes", "300"]) == 2
+    assert "classes: 300 asked for" in capfd.readouterr().err
+    assert not (tmp_path / "l.nii").exists()

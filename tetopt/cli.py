@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import importlib.util
 import logging
 import os
 import signal
@@ -40,7 +39,8 @@ from tetopt.geometry.quality import Quality, quality
 from tetopt.geometry.simplex import volumes
 from tetopt.io.files import checked_output, save_json
 from tetopt.io.images import parse_crop, parse_slice, sha256
-from tetopt.io.meshes import cell_fields
+from tetopt.io.meshes import MeshFile, cell_fields
+from tetopt.io.mni import mni_path, mni_tissue
 from tetopt.lattice import KINDS
 from tetopt.optimize.paper import Optimized, Record, default_n_t, optimize
 from tetopt.report.summary import run_summary
@@ -300,6 +300,14 @@ def _image(path: Path, volume: int | None, crop: str | None, slice_: str | None)
     )
 
 
+def _mesh_file(path: Path) -> MeshFile:
+    """A mesh of the user's, with a warning if its cells had to be turned."""
+    loaded = load_mesh(path)
+    if loaded.n_turned:
+        _show_warning(f"{path}: {loaded.n_turned} cells were inverted in the file and have been turned")
+    return loaded
+
+
 def _set_threads(threads: int | None) -> None:
     if threads is None:
         return
@@ -466,7 +474,7 @@ def quality_command(
     """Measure a mesh: shape, angles, bad cells, and how well its cells fit an image."""
     if json_path is not None:
         json_path = checked_output(json_path, (".json",), force)
-    loaded = load_mesh(mesh_path)
+    loaded = _mesh_file(mesh_path)
     measured = quality(loaded.mesh.points, loaded.mesh.cells)
     content: dict[str, Any] = {"mesh": mesh_path.name, "quality": measured, "n_turned": loaded.n_turned}
     table = _table("", escape(mesh_path.name))
@@ -485,8 +493,6 @@ def quality_command(
         table.add_row("cells without a voxel", str(fit["n_empty_cells"]))
     if json_path is not None:
         save_json(json_path, content)
-    if loaded.n_turned:
-        _show_warning(f"{loaded.n_turned} cells were inverted in the file and have been turned")
     out.print(table)
     if image_path is not None and fit["n_voxels"] > image.data.size:
         log.print(
@@ -550,7 +556,11 @@ def fem_command(
     mesh_path: Annotated[Path, typer.Argument(metavar="MESH", help="VTU or VTK file that fills the image's box.")],
     young: Annotated[
         str | None,
-        typer.Option(metavar="H:KPA,...", help="Modulus by intensity, interpolated; default: the intensity, in kPa."),
+        typer.Option(
+            metavar="LAW",
+            help='Modulus in kPa by intensity: a table "0:1,100:5", interpolated, or a formula of h, such as '
+            '"0.5 + 0.01*h" or "1/max(abs(h), 0.001)" of a strain image. Default: the intensity.',
+        ),
     ] = None,
     nu: Annotated[float, typer.Option(metavar="NU", help="Poisson's ratio, above -1 and below 0.5.")] = 0.45,
     compress: Annotated[float, typer.Option(metavar="PERCENT", help="How far the bottom is pushed in.")] = 1.0,
@@ -560,13 +570,13 @@ def fem_command(
 ) -> int:
     """Compress a mesh, one modulus a cell: conditioning of the stiffness matrix, strain energy, CG iterations."""
     from tetopt.experiments.paper import simulate
-    from tetopt.fem.materials import parse_table
+    from tetopt.fem.materials import parse_law
 
     if json_path is not None:
         json_path = checked_output(json_path, (".json",), force)
-    law = None if young is None else parse_table(young)
+    law = None if young is None else parse_law(young)
     image = load_image(image_path, volume=volume)
-    loaded = load_mesh(mesh_path)
+    loaded = _mesh_file(mesh_path)
     found = simulate(image, loaded.mesh, nu=nu, percent=compress, law=law)
     table = _table("", mesh_path.name)
     table.add_row("nodes", str(len(loaded.mesh.points)))
@@ -576,8 +586,56 @@ def fem_command(
     table.add_row(f"strain energy at {compress:g} %, uJ", f"{found.strain_energy:.6g}")
     out.print(table)
     if json_path is not None:
-        options = {"young": law, "nu": nu, "compress_percent": compress, "volume": volume}
+        options = {"young": young, "nu": nu, "compress_percent": compress, "volume": volume}
         save_json(json_path, {"image": image_path.name, "mesh": mesh_path.name, "options": options, **found._asdict()})
+    return 0
+
+
+@app.command("segment")
+def segment_command(
+    image_path: ImageArgument,
+    mesh_path: Annotated[Path, typer.Argument(metavar="MESH", help="VTU or VTK file over the image.")],
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="LABELS.nii.gz", help="The labels to write.")],
+    classes: Annotated[int, typer.Option(metavar="K", min=2, help="Number of classes, by rising mean.")] = 4,
+    truth_path: Annotated[
+        Path | None, typer.Option("--truth", metavar="LABELS", help="True labels: print the Dice overlap with them.")
+    ] = None,
+    volume: VolumeOption = None,
+    crop: CropOption = None,
+    slice_: SliceOption = None,
+    json_path: JsonOption = None,
+    force: ForceOption = False,
+) -> int:
+    """Segment an image by its mesh, fast and roughly: cells grouped by mean into K classes, painted to the voxels."""
+    from tetopt.segmentation import dice, segmented, thresholded
+
+    output = checked_output(output, (".nii", ".nii.gz"), force)
+    if json_path is not None:
+        json_path = checked_output(json_path, (".json",), force)
+    image = _image(image_path, volume, crop, slice_)
+    truth = None if truth_path is None else (truth_path.name, _labels(truth_path, image, crop, slice_))
+    loaded = _mesh_file(mesh_path)
+    labels = segmented(image, loaded.mesh, classes)
+    share = np.bincount(labels.data.ravel(), minlength=classes) / labels.data.size
+    content: dict[str, Any] = {
+        "image": image_path.name, "mesh": mesh_path.name, "classes": classes, "share_of_voxels": share
+    }  # fmt: skip
+    table = _table("class", "share of the voxels")
+    for number, part in enumerate(share):
+        table.add_row(str(number), f"{part:.4f}")
+    overlaps = _table("label", "Dice, mesh", "Dice, thresholded voxels")
+    if truth is not None:
+        by_mesh, by_voxels = dice(labels, truth[1]), dice(thresholded(image, classes), truth[1])
+        content |= {"truth": truth[0], "dice": {"mesh": by_mesh, "voxels": by_voxels}}
+        for label in by_mesh:
+            overlaps.add_row(str(label), f"{by_mesh[label]:.4f}", f"{by_voxels[label]:.4f}")
+    save_image(output, labels)
+    if json_path is not None:
+        save_json(json_path, content)
+    out.print(table)
+    if truth is not None:
+        out.print(overlaps)
+    out.print(escape(f"{output}: {classes} classes on {labels.data.size} voxels"))
     return 0
 
 
@@ -587,6 +645,9 @@ def paper_command(
     image_path: Annotated[
         Path | None, typer.Option("--image", metavar="T1", help="Brain MR volume (default: nilearn's MNI152 T1).")
     ] = None,
+    labels_path: Annotated[
+        Path | None, typer.Option("--labels", metavar="LABELS", help="Tissue labels of IMAGE, for Dice.")
+    ] = None,
     seeds: Annotated[int, typer.Option(metavar="N", help="Random meshes for Fig. 1.")] = 200,
     force: ForceOption = False,
 ) -> int:
@@ -595,14 +656,29 @@ def paper_command(
 
     if seeds < 1:
         raise InputError(f"--seeds: expected 1 or more, got {seeds}")
-    image_path = nilearn_t1() if image_path is None else image_path
-    volume = load_image(image_path)
+    volume = load_image(mni_path("t1") if image_path is None else image_path)
     if volume.ndim != 3:
         raise InputError(f"{image_path}: expected a volume, got a {volume.ndim}-D image")
+    tissue = None if labels_path is None else _labels(labels_path, volume)
+    if image_path is None and labels_path is None:
+        tissue = mni_tissue()
+    if tissue is None:
+        log.print("no --labels: the section on approximate segmentation is left out")
     paths = run_paper.outputs(_results_folder(output), force)
-    results = run_paper.run(paths, volume, seeds, lambda text: log.print(escape(text)))
+    results = run_paper.run(paths, volume, tissue, seeds, lambda text: log.print(escape(text)))
     out.print(escape(f"{paths['paper.html']}: all figures beside the paper's, in {results['seconds']:.0f} s"))
     return 0
+
+
+def _labels(path: Path, image: Image, crop: str | None = None, slice_: str | None = None) -> Image:
+    """A label image, cut as the image was; InputError unless it lies on the image's voxels."""
+    labels = _image(path, None, crop, slice_)
+    if labels.shape != image.shape or not np.allclose(labels.affine, image.affine, atol=1e-4):
+        raise InputError(
+            f"{path}: expected labels on the image's own voxels, {image.shape} with its affine, got {labels.shape}; "
+            "resample them to the image first"
+        )
+    return labels
 
 
 @app.command("demo")
@@ -615,7 +691,7 @@ def demo_command(
     force: ForceOption = False,
 ) -> int:
     """Mesh the MNI152 T1 that nilearn's wheel carries; leave mesh, numbers and pictures in a folder."""
-    source = nilearn_t1()
+    source = mni_path("t1")
     return mesh_command(
         source,
         _results_folder(output) / "mesh.vtu",
@@ -632,14 +708,4 @@ def _results_folder(path: Path) -> Path:
     if path.exists() and not path.is_dir():
         raise InputError(f"{path}: expected a folder for the results, found a file")
     path.mkdir(parents=True, exist_ok=True)
-    return path
-
-
-def nilearn_t1() -> Path:
-    """The MNI152 T1 inside nilearn's wheel; InputError without it."""
-    found = importlib.util.find_spec("nilearn")
-    name = "datasets/data/mni_icbm152_t1_tal_nlin_sym_09a_converted.nii.gz"
-    path = Path(found.origin).parent / name if found is not None and found.origin else Path(name)
-    if not path.is_file():
-        raise InputError('demo: needs the MNI152 T1 inside nilearn; pip install "tetopt[demo]"')
     return path

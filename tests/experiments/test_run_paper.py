@@ -5,6 +5,7 @@ import re
 import shutil
 import subprocess
 
+import meshio
 import numpy as np
 import PIL.Image
 import pytest
@@ -18,9 +19,12 @@ from tetopt.experiments.run_paper import PICTURES
 def run(tmp_path_factory, opengl):
     """The whole command, few seeds, on the head phantom in the place of a brain volume."""
     folder = tmp_path_factory.mktemp("paper")
-    tetopt.save_image(folder / "head.nii.gz", tetopt.load_phantom("ellipsoids_brain").image(voxel_mm=3.0))
+    phantom = tetopt.load_phantom("ellipsoids_brain")
+    tetopt.save_image(folder / "head.nii.gz", phantom.image(voxel_mm=3.0))
+    tetopt.save_image(folder / "tissue.nii.gz", phantom.label_image(voxel_mm=3.0))
     out = folder / "out"
-    assert main(["paper", "-o", str(out), "--image", str(folder / "head.nii.gz"), "--seeds", "3"]) == 0
+    inputs = ["--image", str(folder / "head.nii.gz"), "--labels", str(folder / "tissue.nii.gz")]
+    assert main(["paper", "-o", str(out), *inputs, "--seeds", "3"]) == 0
     return out
 
 
@@ -52,6 +56,16 @@ def test_counts_and_row_3(run):
     assert [round(value, 4) for value in row["ours"]] == row["errors"]
 
 
+def test_segmentation_improves_on_the_lattice(run):
+    """Every label's Dice against the truth is in the JSON, and the mean of an optimised mesh beats the lattice's."""
+    sections = json.loads((run / "paper.json").read_text())["sections"]
+    (overlaps,) = [s["dice"] for s in sections if s["title"].startswith("Section 5")]
+    labels = set(map(str, range(9)))  # of the phantom
+    assert all(set(row) == labels for row in overlaps.values())
+    mean = {name: np.mean(list(row.values())) for name, row in overlaps.items()}
+    assert mean["4 classes, lattice"] < mean["4 classes, optimised"] <= mean["4 classes, voxels"] + 1e-9
+
+
 def test_page_in_a_browser(run, tmp_path):
     """Headless Chromium draws the page and reports no script or image error."""
     browser = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
@@ -77,6 +91,12 @@ def test_paper_refuses(tmp_path, capsys):
     assert "expected a volume, got a 2-D image" in capsys.readouterr().err
     assert main(["paper", "-o", str(tmp_path / "o"), "--seeds", "0"]) == 2
     assert "--seeds: expected 1 or more, got 0" in capsys.readouterr().err
+    head, small = (tetopt.load_phantom("sphere").label_image(voxel_mm=size) for size in (4.0, 5.0))
+    tetopt.save_image(tmp_path / "head.nii", head)
+    tetopt.save_image(tmp_path / "small.nii", small)
+    inputs = ["--image", str(tmp_path / "head.nii"), "--labels", str(tmp_path / "small.nii")]
+    assert main(["paper", "-o", str(tmp_path / "o"), *inputs]) == 2
+    assert "expected labels on the image's own voxels" in capsys.readouterr().err
     assert not (tmp_path / "o").exists()
 
 
@@ -100,6 +120,8 @@ def test_fem(tmp_path, block, capsys):
         assert f"{numbers['cond']:.6g}" in capsys.readouterr().out
     assert energies["twice"] == pytest.approx(2.0 * energies["one"], rel=1e-9)
     assert energies["deep"] == pytest.approx(4.0 * energies["one"], rel=1e-9)
+    assert main(["fem", *block, "--nu", "0.3", "--json", str(tmp_path / "f.json"), "--young", "2*h"]) == 0
+    assert json.loads((tmp_path / "f.json").read_text())["strain_energy"] == energies["twice"]
     # Between free sides, 1/2 E strain^2 V, and no sideways strain at all, (1 - nu) / ((1 + nu)(1 - 2 nu)) times that.
     free = 0.5 * 50.0 * 0.01**2 * 512.0
     assert free < energies["one"] < free * 0.7 / (1.3 * 0.4)
@@ -108,7 +130,9 @@ def test_fem(tmp_path, block, capsys):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--young", "1;2"], "expected pairs intensity:kPa"),
+        (["--young", "1:2;3"], "expected pairs intensity:kPa"),
+        (["--young", "open('x')"], "cannot use"),
+        (["--young", "h - 100"], "the first -50 at intensity 50"),
         (["--young", "0:0"], "expected"),
         (["--nu", "0.5"], "nu"),
         (["--compress", "0"], "displacement"),
@@ -118,3 +142,43 @@ def test_fem_bad_input(block, options, words, capsys):
     assert main(["fem", *block, *options]) == 2
     err = capsys.readouterr().err.strip().splitlines()
     assert words in err[-1]
+
+
+def written(folder, points, cells):
+    """A mesh file with no checks between: what another program may have written."""
+    kind = meshio.CellBlock("tetra", np.asarray(cells))
+    meshio.Mesh(np.asarray(points, dtype=float), [kind]).write(folder / "other.vtu")
+    return str(folder / "other.vtu")
+
+
+def test_fem_bad_meshes(tmp_path, block, capsys):
+    """Each refusal names the first offenders."""
+    mesh = tetopt.load_mesh(block[1]).mesh
+    assert main(["fem", block[0], written(tmp_path, mesh.points * [1.0, 1.0, 0.5], mesh.cells)]) == 2
+    assert "no node lies on the box's face" in capsys.readouterr().err
+    loose = mesh.points[mesh.cells[0]] * 0.1 + 4.0
+    points = np.vstack([mesh.points, loose])
+    cells = np.vstack([mesh.cells, len(mesh.points) + np.arange(4)])
+    assert main(["fem", block[0], written(tmp_path, points, cells)]) == 2
+    assert f"node {len(mesh.points)}" in capsys.readouterr().err
+    flat = mesh.points.copy()
+    flat[mesh.cells[3, 3]] = flat[mesh.cells[3, :3]].mean(axis=0)
+    assert main(["fem", block[0], written(tmp_path, flat, mesh.cells)]) == 2
+    assert "flat or inverted, the first are [3, " in capsys.readouterr().err
+    folded = mesh.points.copy()
+    inner = np.flatnonzero(np.all(np.abs(folded - 3.5) < 3.9, axis=1))[0]
+    folded[inner] = folded[mesh.cells[0]].mean(axis=0)
+    assert main(["fem", block[0], written(tmp_path, folded, mesh.cells)]) == 2
+    assert "have cells that overlap there" in capsys.readouterr().err
+
+
+def test_fem_turns_inverted_cells_and_says_so(tmp_path, block, capsys):
+    """A file of left-handed cells is turned when it is read; the numbers are those of the mesh as it should be."""
+    mesh = tetopt.load_mesh(block[1]).mesh
+    assert main(["fem", *block, "--json", str(tmp_path / "a.json")]) == 0
+    capsys.readouterr()
+    inverted = written(tmp_path, mesh.points, mesh.cells[:, [1, 0, 2, 3]])
+    assert main(["fem", block[0], inverted, "--json", str(tmp_path / "b.json")]) == 0
+    assert f"{len(mesh.cells)} cells were inverted" in capsys.readouterr().err
+    a, b = (json.loads((tmp_path / name).read_text()) for name in ("a.json", "b.json"))
+    assert b["strain_energy"] == pytest.approx(a["strain_energy"], rel=1e-12)

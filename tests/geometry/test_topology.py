@@ -7,8 +7,18 @@ from hypothesis import given
 from hypothesis import strategies as st
 from meshes import ALL_SMALL, FIVE_TET_CUBE, SQUARE, TWO_SQUARES, TWO_TETS, TWO_TRIANGLES, split_box
 
+import tetopt
 from tetopt.geometry.simplex import volumes
-from tetopt.geometry.topology import boundary_facets, components, facets, largest_component, node_colours, rings, stars
+from tetopt.geometry.topology import (
+    boundary_facets,
+    components,
+    facets,
+    folded,
+    largest_component,
+    node_colours,
+    rings,
+    stars,
+)
 
 pytestmark = pytest.mark.kernel
 
@@ -263,3 +273,17 @@ def test_largest_component_of_nothing_is_empty_and_of_equals_the_first():
     assert largest_component(cells, np.array([True, False, True, False, True])).tolist() == [0, 2, 4]
     _, cells = TWO_SQUARES
     assert largest_component(cells, np.isin(np.arange(8), [0, 4, 5])).tolist() == [4, 5]
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_folded(n):
+    """A conforming mesh has no fold; a node pulled through its ring makes one; a third cell at a facet is one."""
+    mesh = tetopt.lattice(tetopt.Image(np.zeros((4,) * n)), blocks=(2,) * n)
+    assert folded(mesh.cells).shape == (0, 2)
+    first = mesh.cells[0]
+    flipped = mesh.cells.copy()
+    flipped[0] = first[[1, 0, *range(2, n + 1)]]
+    found = folded(flipped)
+    inner = [pair for pair in facets(mesh.cells).cells.tolist() if 0 in pair and -1 not in pair]
+    assert sorted(map(sorted, found.tolist())) == sorted(map(sorted, inner))
+    assert len(folded(np.vstack([mesh.cells, first]))) >= n

@@ -28,6 +28,7 @@ from scipy.sparse.linalg import LinearOperator, cg, splu
 from tetopt.errors import InputError
 from tetopt.fem.rigidity import check_held, rigid_modes
 from tetopt.geometry.simplex import volume_gradients, volumes
+from tetopt.geometry.topology import folded
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 
@@ -221,8 +222,9 @@ def constrained(
     Raises
     ------
     InputError
-        As `stiffness`; wrong shapes, displacements that are not finite; or a part of the mesh that could still
-        move without being strained: one without any prescribed node, or one that hangs by too few.
+        As `stiffness`; wrong shapes, displacements that are not finite; cells that overlap across the facet they
+        share; or a part of the mesh that could still move without being strained: one without any prescribed node,
+        or one that hangs by too few.
     """
     n = mesh.ndim
     frame = np.eye(n) if frame is None else frame
@@ -235,6 +237,12 @@ def constrained(
     if not np.isfinite(values).all():
         node = int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
         raise InputError(f"prescribed: displacements must be finite, node {node} has {values[node].tolist()}")
+    pairs = folded(mesh.cells)
+    if len(pairs):
+        raise InputError(
+            f"mesh: {len(pairs)} facets have cells that overlap there, as inverted ones do; the first are of cells "
+            f"{pairs[:3].tolist()}; mend the mesh"
+        )
     points = mesh.points @ frame
     check_held(points, mesh.cells, is_prescribed)
     K = _stiffness(mesh, young, nu, frame)

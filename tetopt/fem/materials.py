@@ -14,6 +14,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tetopt.energy.sampling import cell_moments
 from tetopt.errors import InputError
+from tetopt.fem.formula import parse_formula
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 
@@ -87,6 +88,17 @@ def parse_table(text: str) -> list[tuple[float, float]]:
     if not pairs or any(len(pair) != 2 for pair in pairs):
         raise InputError(f'modulus: expected pairs intensity:kPa, such as "0:1,100:5.5", got "{text}"')
     return [(pair[0], pair[1]) for pair in pairs]
+
+
+def parse_law(text: str) -> Law:
+    """A law from a command line: a table such as "0:1,100:5.5", or a formula of h, see `parse_formula`.
+
+    Raises
+    ------
+    InputError
+        As `parse_table` and `parse_formula`.
+    """
+    return parse_table(text) if ":" in text else parse_formula(text)
 
 
 def young_image(image: Image, law: Law) -> Image:

@@ -65,6 +65,17 @@ def facets(cells: NDArray[np.integer]) -> Facets:
     return Facets(ordered[first], sides, n_cells, of_cell.reshape(cells.shape), sign)
 
 
+def folded(cells: NDArray[np.integer]) -> NDArray[np.int64]:
+    """Groups of cells that do not lie on opposite sides of the facet they share, (K, 2) int64, by facet.
+
+    Of positively oriented cells: where the mesh folds over itself, or three cells and more share a facet. Empty for a
+    conforming mesh.
+    """
+    found = facets(cells)
+    sides = np.bincount(found.of_cell.ravel(), weights=found.sign.ravel(), minlength=len(found.nodes))
+    return found.cells[(found.n_cells > 2) | ((found.n_cells == 2) & (sides != 0.0))]
+
+
 def _lexicographic_order(rows: NDArray[np.int64]) -> NDArray[np.int64]:
     """Stable order of rows of node numbers (K, n): by one number a row where it fits, ten times faster."""
     base = int(rows.max()) + 1

@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 import numpy as np
 import pyvista
 from numpy.typing import NDArray
+from scipy import ndimage
 
 from tetopt.geometry.topology import boundary_facets
 from tetopt.image import Image
@@ -14,6 +16,8 @@ from tetopt.io.files import written_whole
 from tetopt.mesh import Mesh
 
 SURFACE = "#d95f02"
+VIEW = (0.9, 1.25, 0.7)  # from where a scene is seen: from the right, front and above in RAS
+Draw = Callable[[pyvista.Plotter], None]
 
 
 def facets_surface(points: NDArray[np.float64], triangles: NDArray[np.int64]) -> pyvista.PolyData:
@@ -21,35 +25,100 @@ def facets_surface(points: NDArray[np.float64], triangles: NDArray[np.int64]) ->
     return pyvista.PolyData.from_regular_faces(points, triangles)
 
 
-def structure_picture(path: str | Path, image: Image, mesh: Mesh, chosen: NDArray[np.int64]) -> None:
-    """PNG of the boundary of the chosen cells in front of three slices of the volume, as Fig. 3(e, f).
+def save_scenes(path: str | Path, scenes: Sequence[tuple[str, Draw]]) -> None:
+    """PNG of scenes side by side, each with a title, seen from the same side.
 
-    The slices pass through the middle of the box; edges of the structure's facets are drawn.
+    A scene is a function that adds its parts to a plotter, such as `structure_before_slices` returns.
     """
-    surface = facets_surface(mesh.points, boundary_facets(mesh.cells[chosen]))
-    limits = np.percentile(image.data, [0.5, 99.8])
     # Without a display VTK complains of the missing one before it renders off screen.
     with written_whole(Path(path)) as temporary, pyvista.vtk_verbosity("off"):
-        plotter = pyvista.Plotter(off_screen=True, window_size=(1100, 1000))
+        plotter = pyvista.Plotter(
+            off_screen=True, shape=(1, len(scenes)), border=False, window_size=(1100 * len(scenes), 1000)
+        )
         plotter.set_background("white")
-        for axis in range(3):
-            plotter.add_mesh(
-                _slice_sheet(image, axis), scalars="h", cmap="gray", clim=limits, show_scalar_bar=False, lighting=False
-            )
-        plotter.add_mesh(surface, color=SURFACE, show_edges=True, edge_color="#402000", line_width=1, ambient=0.25)
-        plotter.view_vector((0.9, 1.25, 0.7), viewup=(0.0, 0.0, 1.0))
-        plotter.camera.zoom(1.05)
+        for number, (title, draw) in enumerate(scenes):
+            plotter.subplot(0, number)
+            draw(plotter)
+            if title:
+                plotter.add_text(title, font_size=14, color="black", position="upper_edge")
+            plotter.view_vector(VIEW, viewup=(0.0, 0.0, 1.0))
+            plotter.camera.zoom(1.05)
         plotter.screenshot(temporary)
         plotter.close()
 
 
-def _slice_sheet(image: Image, axis: int) -> pyvista.StructuredGrid:
-    """The slice on the far side of the box across one index axis, in world mm, one facet a pixel."""
-    at = 0 if image.to_world(np.eye(3)[axis])[axis] > image.to_world(np.zeros(3))[axis] else image.shape[axis] - 1
-    middle = image.shape[axis] // 2
-    pixels = np.take(image.data, middle, axis=axis)
+def structure_before_slices(image: Image, mesh: Mesh, chosen: NDArray[np.int64]) -> Draw:
+    """The boundary of the chosen cells in front of the volume's middle slices, drawn on the box's far sides."""
+
+    def draw(plotter: pyvista.Plotter) -> None:
+        _add_slices(plotter, image, [_far_side(image, axis) for axis in range(3)])
+        surface = facets_surface(mesh.points, boundary_facets(mesh.cells[chosen]))
+        plotter.add_mesh(surface, color=SURFACE, show_edges=True, edge_color="#402000", line_width=1, ambient=0.25)
+
+    return draw
+
+
+def isosurface_before_slices(image: Image, surface: pyvista.PolyData) -> Draw:
+    """A surface taken from the voxels in front of the same slices."""
+
+    def draw(plotter: pyvista.Plotter) -> None:
+        _add_slices(plotter, image, [_far_side(image, axis) for axis in range(3)])
+        plotter.add_mesh(surface, color=SURFACE, smooth_shading=True, ambient=0.25)
+
+    return draw
+
+
+def slices_in_mesh(image: Image, mesh: Mesh) -> Draw:
+    """The volume's middle slices where they belong, and the edges of the cells under the level one."""
+    middle = image.to_world((np.array(image.shape) - 1.0) / 2.0)
+
+    def draw(plotter: pyvista.Plotter) -> None:
+        _add_slices(plotter, image, [image.shape[axis] // 2 for axis in range(3)])
+        part = mesh.cells[mesh.points[mesh.cells].mean(axis=1)[:, 2] < middle[2]]
+        edges = facets_surface(mesh.points, boundary_facets(part)).extract_all_edges()
+        plotter.add_mesh(edges, color="#2060c0", line_width=1.5)
+
+    return draw
+
+
+def dark_structure_surface(image: Image, below: float, near: NDArray[np.bool_]) -> pyvista.PolyData:
+    """Surface at level `below` of the dark structures that lie in the mask `near`, world mm.
+
+    Voxels under the level are eroded by one voxel, which parts the ventricles from the sulci. The piece with most
+    voxels in `near` and those with a tenth of that are grown back, and marching cubes run on the intensities of the
+    voxels in and next to them. Without such pieces: no points.
+    """
+    is_dark = image.data < below
+    pieces, _ = ndimage.label(ndimage.binary_erosion(is_dark))
+    votes = np.bincount(pieces[near & (pieces > 0)], minlength=2)
+    chosen = np.flatnonzero(votes > 0.1 * votes.max())
+    kept = ndimage.binary_dilation(np.isin(pieces, chosen), iterations=2, mask=is_dark)
+    h = np.where(ndimage.binary_dilation(kept) | ~is_dark, image.data, image.data.max())
+    grid = pyvista.ImageData(dimensions=image.shape)
+    grid.point_data["h"] = h.astype(np.float64).ravel(order="F")
+    return grid.contour([below], scalars="h", method="flying_edges").transform(image.affine, inplace=False)
+
+
+def _far_side(image: Image, axis: int) -> float:
+    """The index, along one axis, of the box's side that is farther from the viewer."""
+    outward = image.affine[:3, axis] @ np.asarray(VIEW)
+    return -0.5 if outward > 0.0 else image.shape[axis] - 0.5
+
+
+def _add_slices(plotter: pyvista.Plotter, image: Image, places: Sequence[float]) -> None:
+    """The middle slice across each index axis, drawn at the given index along that axis."""
+    limits = np.percentile(image.data, [0.5, 99.8])
+    for axis, at in enumerate(places):
+        plotter.add_mesh(
+            _slice_sheet(image, axis, at), scalars="h", cmap="gray", clim=limits, show_scalar_bar=False, lighting=False
+        )
+
+
+def _slice_sheet(image: Image, axis: int, at: float) -> pyvista.StructuredGrid:
+    """The middle slice across an index axis, placed at index `at` of it, in world mm, one facet a pixel."""
+    pixels = np.take(image.data, image.shape[axis] // 2, axis=axis)
     corners = [np.arange(s + 1) - 0.5 for s in image.shape]
-    corners[axis] = np.array([at + 0.0])
+    corners[axis] = np.array([at])
     index = np.stack(np.meshgrid(*corners, indexing="ij"), axis=-1)
     world = image.to_world(index)
     sheet = pyvista.StructuredGrid(world[..., 0], world[..., 1], world[..., 2])

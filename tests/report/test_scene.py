@@ -1,0 +1,52 @@
+"""Pictures in 3-D: what stands in them is where the image says it is."""
+
+import numpy as np
+import PIL.Image
+import pytest
+
+import tetopt
+from tetopt.report.scene import SURFACE, dark_structure_surface, save_scenes, slices_in_mesh, structure_before_slices
+
+TILTED = np.array([[1.8, -0.5, 0.0, 7.0], [0.5, 1.8, 0.0, -20.0], [0.0, 0.0, 2.5, 3.0], [0.0, 0.0, 0.0, 1.0]])
+
+
+def dark_ball(shape=(30, 32, 28), centre=(13.0, 15.0, 12.0), radius=7.0):
+    """A dark ball in a bright volume, and a thin dark sheet that touches it."""
+    index = np.stack(np.meshgrid(*(np.arange(s) for s in shape), indexing="ij"), axis=-1)
+    distance = np.linalg.norm(index - centre, axis=-1)
+    data = 100.0 / (1.0 + np.exp(-2.0 * (distance - radius)))
+    data[:, :, 12] = np.where(distance[:, :, 12] > radius, 20.0, data[:, :, 12])
+    return tetopt.Image(data, TILTED), distance < radius
+
+
+def test_dark_structure_surface_is_the_ball_without_the_sheet():
+    image, inside = dark_ball()
+    surface = dark_structure_surface(image, 50.0, inside)
+    distance = np.linalg.norm(image.to_index(np.asarray(surface.points)) - [13.0, 15.0, 12.0], axis=1)
+    assert np.median(np.abs(distance - 7.0)) < 0.05
+    assert distance.max() < 10.0  # two voxels of the sheet grow back, no more
+    assert surface.volume == pytest.approx(4 / 3 * np.pi * 7.0**3 * abs(np.linalg.det(TILTED[:3, :3])), rel=0.05)
+
+
+def test_no_structure_is_an_empty_surface():
+    image, inside = dark_ball()
+    assert dark_structure_surface(image, -1.0, inside).n_points == 0
+
+
+def test_scenes_are_drawn_side_by_side(tmp_path, opengl):
+    image, _ = dark_ball()
+    mesh = tetopt.lattice(image, nodes=300)
+    cells = np.flatnonzero(tetopt.cell_moments(image, mesh).mean < 50.0)
+    scenes = [("one", slices_in_mesh(image, mesh)), ("two", structure_before_slices(image, mesh, cells))]
+    save_scenes(tmp_path / "a.png", scenes)
+    pixels = np.asarray(PIL.Image.open(tmp_path / "a.png").convert("RGB")).astype(int)
+    left, right = pixels[:, :1100], pixels[:, 1100:]
+    colour = np.array([int(SURFACE[i : i + 2], 16) for i in (1, 3, 5)])
+
+    def orange(part):  # shaded: the colour's direction, any brightness
+        size = np.linalg.norm(part, axis=-1) + 1e-9
+        return ((part @ colour) / (size * np.linalg.norm(colour)) > 0.99).mean()
+
+    assert orange(right) > 0.01
+    assert orange(left) < 0.001
+    assert (left[..., 2] > left[..., 0] + 60).mean() > 0.005  # the blue edges

@@ -1,0 +1,91 @@
+"""Formulas of the intensity h, as written on a command line, without evaluating anyone's code."""
+
+from __future__ import annotations
+
+import ast
+import operator
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.errors import InputError
+
+FUNCTIONS: dict[str, tuple[Callable[..., Any], int]] = {
+    "abs": (np.abs, 1), "sqrt": (np.sqrt, 1), "exp": (np.exp, 1), "log": (np.log, 1),
+    "min": (np.minimum, 2), "max": (np.maximum, 2),
+}  # fmt: skip
+BINARY: dict[type[ast.operator], Callable[..., Any]] = {
+    ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: np.divide, ast.Pow: np.power,
+}  # fmt: skip
+UNARY: dict[type[ast.unaryop], Callable[..., Any]] = {ast.UAdd: operator.pos, ast.USub: operator.neg}
+ALLOWED = f"numbers, h, + - * / **, brackets and {', '.join(FUNCTIONS)}"
+
+
+def parse_formula(text: str) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
+    """A function of the intensities from a formula of h; operators and precedence are Python's.
+
+    Allowed are numbers, ``h``, ``+ - * / **``, brackets, ``abs``, ``sqrt``, ``exp`` and ``log`` of one argument,
+    ``min`` and ``max`` of two. Where a formula has no value (1/0, the logarithm of 0) the function returns inf or NaN.
+
+    Raises
+    ------
+    InputError
+        Anything else in the text.
+
+    Examples
+    --------
+    >>> parse_formula("1 / max(abs(h), 0.001)")(np.array([0.02, -0.01, 0.0]))
+    array([  50.,  100., 1000.])
+    """
+    try:
+        tree = ast.parse(text.strip(), mode="eval").body
+        _check(tree, text)
+    except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f'formula: expected {ALLOWED}, got "{text}"') from error
+
+    def law(h: NDArray[np.float64]) -> NDArray[np.float64]:
+        with np.errstate(all="ignore"):  # what has no value is refused where the modulus is used
+            return np.array(np.broadcast_to(_value(tree, h), h.shape), dtype=np.float64)
+
+    return law
+
+
+def _check(node: ast.expr, text: str) -> None:
+    """InputError unless the tree is made of what is allowed."""
+    match node:
+        case ast.Constant(value=float() | int() as value) if not isinstance(value, bool):
+            return
+        case ast.Name(id="h"):
+            return
+        case ast.BinOp(left=left, op=op, right=right) if type(op) in BINARY:
+            _check(left, text)
+            _check(right, text)
+        case ast.UnaryOp(op=op, operand=operand) if type(op) in UNARY:
+            _check(operand, text)
+        case ast.Call(func=ast.Name(id=name), args=args, keywords=[]) if name in FUNCTIONS:
+            if len(args) != FUNCTIONS[name][1]:
+                raise InputError(f'formula: {name} takes {FUNCTIONS[name][1]} arguments, got {len(args)} in "{text}"')
+            for arg in args:
+                _check(arg, text)
+        case _:
+            part = ast.get_source_segment(text.strip(), node) or text
+            raise InputError(f'formula: expected {ALLOWED}; cannot use "{part}"')
+
+
+def _value(node: ast.expr, h: NDArray[np.float64]) -> Any:
+    match node:
+        case ast.Constant(value=float() | int() as value):
+            return np.float64(value)
+        case ast.Name():
+            return h
+        case ast.BinOp(left=left, op=op, right=right):
+            return BINARY[type(op)](_value(left, h), _value(right, h))
+        case ast.UnaryOp(op=op, operand=operand):
+            return UNARY[type(op)](_value(operand, h))
+        case ast.Call(func=ast.Name(id=name), args=args):
+            return FUNCTIONS[name][0](*(_value(arg, h) for arg in args))
+    raise AssertionError("checked by parse_formula")
