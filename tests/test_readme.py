@@ -30,15 +30,24 @@ def test_program(tmp_path, monkeypatch, capsys):
 
 def test_commands(tmp_path, monkeypatch):
     """Each `tetopt` line of the README, on a phantom in the place of the T1 and with fewer nodes."""
-    lines = [line for line in README.splitlines() if re.match("tetopt (mesh|quality|phantom) ", line)]
-    assert len(lines) == 3
+    lines = [line for line in README.splitlines() if re.match("tetopt (mesh|quality|phantom|fem|segment) ", line)]
+    assert len(lines) == 5
     monkeypatch.chdir(tmp_path)
     assert main(["phantom", "sphere", "-o", "T1.nii.gz", "--voxel-mm", "4"]) == 0
     for line in lines:
-        words = shlex.split(line)[1:]
+        words = shlex.split(line, comments=True)[1:]
         words = ["200" if before == "--nodes" else word for before, word in zip(["", *words], words, strict=False)]
         assert main(words) == 0, line
-    files = {"T1.nii.gz", "brain.vtu", "run.json", "sphere.nii.gz", "slice.png", "rho.png", "energies.png"}
+    files = {
+        "T1.nii.gz",
+        "labels.nii.gz",
+        "brain.vtu",
+        "run.json",
+        "sphere.nii.gz",
+        "slice.png",
+        "rho.png",
+        "energies.png",
+    }
     assert {path.name for path in tmp_path.iterdir()} == files
 
 

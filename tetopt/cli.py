@@ -616,7 +616,7 @@ def segment_command(
     truth = None if truth_path is None else (truth_path.name, _labels(truth_path, image, crop, slice_))
     loaded = _mesh_file(mesh_path)
     labels = segmented(image, loaded.mesh, classes)
-    share = np.bincount(labels.data.ravel(), minlength=classes) / labels.data.size
+    share = np.bincount(labels.data.astype(np.int64).ravel(), minlength=classes) / labels.data.size
     content: dict[str, Any] = {
         "image": image_path.name, "mesh": mesh_path.name, "classes": classes, "share_of_voxels": share
     }  # fmt: skip

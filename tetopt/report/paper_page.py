@@ -75,14 +75,13 @@ def landscape_figure(
 def save_page(path: Path, title: str, sections: Sequence[dict[str, Any]]) -> None:
     """One HTML file without outside references, whole or not at all.
 
-    Each section has a `title`, a `text`, optionally a `table` (rows of cells, the first the heading) and `pictures`
+    Each section has a `title`, a `text`, optionally `tables` (rows of cells, the first the heading) and `pictures`
     (PNG paths with captions).
     """
     parts = [_HEAD.replace("TITLE", html.escape(title))]
     for section in sections:
         parts.append(f"<section><h2>{html.escape(section['title'])}</h2><p>{html.escape(section['text'])}</p>")
-        if section.get("table"):
-            parts.append(_table(section["table"]))
+        parts += [_table(rows) for rows in section.get("tables", ()) if rows]
         for picture, caption in section.get("pictures", ()):
             data = base64.b64encode(Path(picture).read_bytes()).decode("ascii")
             alt = html.escape(caption)
@@ -117,7 +116,7 @@ h1 { font-size: 1.6rem; } h2 { font-size: 1.2rem; margin-top: 2.2rem; border-top
 .wide { overflow-x: auto; }
 table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: 0.92rem; }
 th, td { padding: 0.25rem 0.7rem; text-align: right; border-bottom: 1px solid #eee; white-space: nowrap; }
-th:first-child, td:first-child { text-align: left; } td:last-child { text-align: left; white-space: normal; }
+th:first-child, td:first-child { text-align: left; } td:last-child { white-space: normal; }
 figure { margin: 1rem 0; } img { max-width: 100%; height: auto; } figcaption { color: #555; font-size: 0.9rem; }
 @media print { section { break-inside: avoid; } }
 </style></head><body><main><h1>TITLE</h1>"""
