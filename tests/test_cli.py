@@ -878,3 +878,34 @@ def test_segment_refuses_other_labels(tmp_path, inputs, capfd):
     assert main([*command, "--classes", "300"]) == 2
     assert "classes: 300 asked for" in capfd.readouterr().err
     assert not (tmp_path / "l.nii").exists()
+
+
+def test_segment_labels_must_lie_where_the_image_does(tmp_path, inputs, capfd):
+    """Truth of the same shape but elsewhere is refused; truth is cut as the image is; a foreign mesh is told."""
+    sphere = load_image(inputs / "sphere.nii.gz")
+    shifted = sphere.affine.copy()
+    shifted[0, 3] += 3.0
+    save_image(tmp_path / "shifted.nii", Image(sphere.data > 50, shifted))
+    save_image(tmp_path / "truth.nii", Image(sphere.data > 50, sphere.affine))
+    command = ["segment", str(inputs / "sphere.nii.gz"), str(inputs / "lattice.vtu"), "-o", str(tmp_path / "l.nii")]
+    assert main([*command, "--truth", str(tmp_path / "shifted.nii")]) == 2
+    capfd.readouterr()
+    save_image(tmp_path / "odd.nii", Image(np.where(sphere.data > 50, 1e30, 0.5), sphere.affine))
+    assert main([*command, "--truth", str(tmp_path / "odd.nii")]) == 2
+    assert "labels must be whole numbers" in capfd.readouterr().err
+    mesh = ["mesh", str(inputs / "sphere.nii.gz"), "--slice", "k=5", "-o", str(tmp_path / "s.vtu"), "--nodes", "40"]
+    assert main([*mesh, "--iterations", "0"]) == 0
+    cut = [
+        "segment",
+        str(inputs / "sphere.nii.gz"),
+        str(tmp_path / "s.vtu"),
+        "-o",
+        str(tmp_path / "l.nii"),
+        "--slice",
+        "k=5",
+    ]
+    assert main([*cut, "--truth", str(tmp_path / "truth.nii"), "--classes", "2"]) == 0
+    kept = (tmp_path / "truth.nii").read_bytes()
+    over = [*cut[:4], str(tmp_path / "truth.nii"), *cut[5:], "--truth", str(tmp_path / "truth.nii"), "--force"]
+    assert main(over) == 2
+    assert (tmp_path / "truth.nii").read_bytes() == kept

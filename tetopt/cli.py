@@ -5,6 +5,7 @@ from __future__ import annotations
 import contextlib
 import logging
 import os
+import shlex
 import signal
 import sys
 import time
@@ -43,7 +44,8 @@ from tetopt.io.meshes import MeshFile, cell_fields
 from tetopt.io.mni import mni_path, mni_tissue
 from tetopt.lattice import KINDS
 from tetopt.optimize.paper import Optimized, Record, default_n_t, optimize
-from tetopt.report.summary import run_summary
+from tetopt.report.summary import run_summary, versions
+from tetopt.segmentation import check_labels
 
 DEFAULT_NODES = {2: 500, 3: 5000}
 
@@ -79,6 +81,11 @@ class Method(StrEnum):  # noqa: D101
     paper = "paper"
 
 
+class Baseline(StrEnum):  # noqa: D101
+    pytetwild = "pytetwild"
+    cleaver = "cleaver"
+
+
 class Boundary(StrEnum):  # noqa: D101
     slide = "slide"
     fixed = "fixed"
@@ -95,7 +102,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     with warnings.catch_warnings(), _silent_plot_fonts():
         warnings.showwarning = _show_warning
         try:
-            return app(args=list(sys.argv[1:] if argv is None else argv), standalone_mode=False) or 0
+            arguments = list(sys.argv[1:] if argv is None else argv)
+            return app(args=arguments, obj=arguments, standalone_mode=False) or 0
         except InputError as error:
             log.print(f"[bold red]tetopt:[/] {escape(str(error))}")
             return 2
@@ -149,7 +157,7 @@ CropOption = Annotated[
     typer.Option("--crop", metavar="A:B,C:D,E:F", help="Keep these voxels, half open; an end may be empty."),
 ]
 SliceOption = Annotated[
-    str | None, typer.Option("--slice", metavar="AXIS=INDEX", help="Mesh one slice in 2-D, for example k=90.")
+    str | None, typer.Option("--slice", metavar="AXIS=INDEX", help="One slice, in 2-D; for example k=90.")
 ]
 JsonOption = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write every number here.")]
 ForceOption = Annotated[bool, typer.Option("--force", help="Replace existing outputs.")]
@@ -306,6 +314,19 @@ def _mesh_file(path: Path) -> MeshFile:
     if loaded.n_turned:
         _show_warning(f"{path}: {loaded.n_turned} cells were inverted in the file and have been turned")
     return loaded
+
+
+def _warn_of_other_image(loaded: MeshFile, mesh_path: Path, image_path: Path) -> None:
+    made_from = loaded.field_data.get("image_sha256")
+    if made_from is not None and str(made_from[0]) != sha256(image_path):
+        _show_warning(f"{mesh_path} was made from another image than {image_path}")
+
+
+def _check_no_input(output: Path, *inputs: Path | None) -> None:
+    """InputError if the output, which --force may replace, is one of the inputs."""
+    for path in inputs:
+        if path is not None and output.exists() and path.exists() and output.samefile(path):
+            raise InputError(f"{output}: is an input of this command too; write somewhere else")
 
 
 def _set_threads(threads: int | None) -> None:
@@ -482,9 +503,7 @@ def quality_command(
     if image_path is not None:
         image = _image(image_path, volume, crop, slice_)
         fit = _fit(image, loaded.mesh)
-        made_from = loaded.field_data.get("image_sha256")
-        if made_from is not None and str(made_from[0]) != sha256(image_path):
-            _show_warning(f"{mesh_path} was made from another image than {image_path}")
+        _warn_of_other_image(loaded, mesh_path, image_path)
         content |= {"image": image_path.name, "fit": fit}
         table.add_row("E_D", f"{fit['E_D']:.6g}")
         if fit["E_D_share_of_variance"] is not None:
@@ -564,30 +583,65 @@ def fem_command(
     ] = None,
     nu: Annotated[float, typer.Option(metavar="NU", help="Poisson's ratio, above -1 and below 0.5.")] = 0.45,
     compress: Annotated[float, typer.Option(metavar="PERCENT", help="How far the bottom is pushed in.")] = 1.0,
+    output: Annotated[
+        Path | None,
+        typer.Option("-o", "--output", metavar="PRESSED.vtu", help="Write the mesh with displacements and strains."),
+    ] = None,
     volume: VolumeOption = None,
+    crop: CropOption = None,
+    slice_: SliceOption = None,
     json_path: JsonOption = None,
     force: ForceOption = False,
 ) -> int:
-    """Compress a mesh, one modulus a cell: conditioning of the stiffness matrix, strain energy, CG iterations."""
+    """Compress a mesh, one modulus a cell: conditioning of the stiffness matrix, strain energy, CG iterations.
+
+    The face of the image's box with the largest z is held, the one opposite is pushed in along z; both are bonded:
+    their nodes cannot slide sideways. In 2-D y takes the place of z, in plane stress, 1 mm thick. Linear cells lock
+    near nu = 0.5: above 0.49 they are far too stiff.
+    """
     from tetopt.experiments.paper import simulate
+    from tetopt.fem.elasticity import strains
     from tetopt.fem.materials import parse_law
 
     if json_path is not None:
         json_path = checked_output(json_path, (".json",), force)
+    if output is not None:
+        output = checked_output(output, (".vtu",), force)
+        _check_no_input(output, mesh_path)
+    if not 0.0 < compress <= 50.0:
+        raise InputError(f"--compress: expected a percentage above 0 and up to 50, got {compress:g}")
     law = None if young is None else parse_law(young)
-    image = load_image(image_path, volume=volume)
+    image = _image(image_path, volume, crop, slice_)
     loaded = _mesh_file(mesh_path)
-    found = simulate(image, loaded.mesh, nu=nu, percent=compress, law=law)
-    table = _table("", mesh_path.name)
+    try:
+        found, pressed = simulate(image, loaded.mesh, nu=nu, percent=compress, law=law)
+    except RuntimeError as error:
+        raise InputError(f"{error}; the moduli differ too much, or nu is too near 0.5, for this mesh") from error
+    if output is not None:
+        fields = {"young": found.young, "strain": strains(loaded.mesh, pressed.u).reshape(len(found.young), -1)}
+        save_mesh(output, loaded.mesh, fields, {"tetopt": tetopt.__version__}, {"displacement": pressed.u})
+    table = _table("", escape(mesh_path.name))
     table.add_row("nodes", str(len(loaded.mesh.points)))
-    table.add_row("largest eigenvalue of the stiffness", f"{found.lambda_max:.6g}")
+    table.add_row("modulus of the cells, kPa", f"{found.young.min():.4g} to {found.young.max():.4g}")
+    unit = "mN/mm" if loaded.mesh.ndim == 3 else "mN/mm per mm of thickness"
+    table.add_row(f"largest eigenvalue of the stiffness, {unit}", f"{found.lambda_max:.6g}")
     table.add_row("condition number, 2-norm", f"{found.cond:.6g}")
     table.add_row("Jacobi CG iterations to 1e-10", str(found.cg_iterations))
     table.add_row(f"strain energy at {compress:g} %, uJ", f"{found.strain_energy:.6g}")
     out.print(table)
     if json_path is not None:
-        options = {"young": young, "nu": nu, "compress_percent": compress, "volume": volume}
-        save_json(json_path, {"image": image_path.name, "mesh": mesh_path.name, "options": options, **found._asdict()})
+        options = {
+            "young": young, "nu": nu, "compress_percent": compress, "volume": volume, "crop": crop, "slice": slice_
+        }  # fmt: skip
+        files = {"image": image_path.name, "image_sha256": sha256(image_path), "mesh": mesh_path.name}
+        size = {"n_nodes": len(loaded.mesh.points), "n_cells": len(loaded.mesh.cells)}
+        numbers = {key: value for key, value in found._asdict().items() if key != "young"}
+        moduli = {"young_kPa_min": found.young.min(), "young_kPa_max": found.young.max()}
+        units = {"lambda_max": "mN/mm", "strain_energy": "uJ"}
+        save_json(
+            json_path,
+            {**files, "versions": versions(), "options": options, **size, **moduli, **numbers, "units": units},
+        )
     return 0
 
 
@@ -607,26 +661,42 @@ def segment_command(
     force: ForceOption = False,
 ) -> int:
     """Segment an image by its mesh, fast and roughly: cells grouped by mean into K classes, painted to the voxels."""
-    from tetopt.segmentation import dice, segmented, thresholded
+    from tetopt.segmentation import dice, segmented, stands_for, thresholded
 
     output = checked_output(output, (".nii", ".nii.gz"), force)
+    _check_no_input(output, image_path, truth_path)
     if json_path is not None:
         json_path = checked_output(json_path, (".json",), force)
     image = _image(image_path, volume, crop, slice_)
     truth = None if truth_path is None else (truth_path.name, _labels(truth_path, image, crop, slice_))
     loaded = _mesh_file(mesh_path)
+    _warn_of_other_image(loaded, mesh_path, image_path)
+    if tetopt.cell_moments(image, loaded.mesh).n_voxels.sum() > image.data.size:
+        raise InputError(f"{mesh_path}: its cells overlap: together they hold more voxels than there are")
+    outside = int((tetopt.cell_of_voxel(image, loaded.mesh) < 0).sum())
+    if outside == image.data.size:
+        raise InputError(f"{mesh_path}: no voxel of {image_path} lies in it; was it made from another image?")
+    if outside:
+        _show_warning(f"{outside} of {image.data.size} voxels lie outside the mesh and get class 0")
     labels = segmented(image, loaded.mesh, classes)
     share = np.bincount(labels.data.astype(np.int64).ravel(), minlength=classes) / labels.data.size
     content: dict[str, Any] = {
         "image": image_path.name, "mesh": mesh_path.name, "classes": classes, "share_of_voxels": share
     }  # fmt: skip
-    table = _table("class", "share of the voxels")
+    means = [float(image.data[labels.data == number].mean()) if part else None for number, part in enumerate(share)]
+    content["mean_intensity"] = means
+    table = _table("class", "share of the voxels", "mean intensity", *([] if truth is None else ["stands for label"]))
+    meaning = {} if truth is None else stands_for(labels, truth[1])
     for number, part in enumerate(share):
-        table.add_row(str(number), f"{part:.4f}")
+        mean = "" if means[number] is None else f"{means[number]:.4g}"
+        table.add_row(str(number), f"{part:.4f}", mean, *([] if truth is None else [str(meaning.get(number, "none"))]))
     overlaps = _table("label", "Dice, mesh", "Dice, thresholded voxels")
     if truth is not None:
         by_mesh, by_voxels = dice(labels, truth[1]), dice(thresholded(image, classes), truth[1])
-        content |= {"truth": truth[0], "dice": {"mesh": by_mesh, "voxels": by_voxels}}
+        content |= {"truth": truth[0], "stands_for": meaning, "dice": {"mesh": by_mesh, "voxels": by_voxels}}
+        lost = [str(label) for label in by_mesh if label not in meaning.values()]
+        if lost:
+            _show_warning(f"no class stands for label {', '.join(lost)}: its Dice is 0; try more --classes")
         for label in by_mesh:
             overlaps.add_row(str(label), f"{by_mesh[label]:.4f}", f"{by_voxels[label]:.4f}")
     save_image(output, labels)
@@ -651,22 +721,29 @@ def paper_command(
     seeds: Annotated[int, typer.Option(metavar="N", help="Random meshes for Fig. 1.")] = 200,
     force: ForceOption = False,
 ) -> int:
-    """Run the paper's figures and table again: paper.json, pictures, and paper.html that sets them side by side."""
+    """Run the paper's figures and table again: paper.json, pictures, a page with each printed number beside ours."""
     from tetopt.experiments import run_paper
 
     if seeds < 1:
         raise InputError(f"--seeds: expected 1 or more, got {seeds}")
-    volume = load_image(mni_path("t1") if image_path is None else image_path)
-    if volume.ndim != 3:
-        raise InputError(f"{image_path}: expected a volume, got a {volume.ndim}-D image")
+    volume = _volume(mni_path("t1") if image_path is None else image_path, None, None)
     tissue = None if labels_path is None else _labels(labels_path, volume)
     if image_path is None and labels_path is None:
         tissue = mni_tissue()
+    run_paper.check_inputs(volume, tissue)
     if tissue is None:
         log.print("no --labels: the section on approximate segmentation is left out")
     paths = run_paper.outputs(_results_folder(output), force)
-    results = run_paper.run(paths, volume, tissue, seeds, lambda text: log.print(escape(text)))
-    out.print(escape(f"{paths['paper.html']}: all figures beside the paper's, in {results['seconds']:.0f} s"))
+    source = mni_path("t1") if image_path is None else image_path
+    about = {
+        "image": source.name,
+        "image_sha256": sha256(source),
+        "labels": None if tissue is None else "MNI152 tissue",
+    }
+    if labels_path is not None:
+        about["labels"] = labels_path.name
+    results = run_paper.run(paths, about, volume, tissue, seeds, lambda text: log.print(escape(text)))
+    out.print(escape(f"{paths['paper.html']}: the paper's numbers beside ours, in {results['seconds']:.0f} s"))
     return 0
 
 
@@ -678,7 +755,133 @@ def _labels(path: Path, image: Image, crop: str | None = None, slice_: str | Non
             f"{path}: expected labels on the image's own voxels, {image.shape} with its affine, got {labels.shape}; "
             "resample them to the image first"
         )
+    check_labels(str(path), labels)
     return labels
+
+
+@app.command("baseline")
+def baseline_command(
+    image_path: ImageArgument,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="MESH.vtu", help="The mesh to write.")],
+    pipeline: Annotated[Baseline, typer.Option(help="The mesher of the conventional pipeline.")] = Baseline.pytetwild,
+    nodes: Annotated[int, typer.Option(metavar="N", min=20, help="Wanted number of nodes.")] = 5000,
+    labels_path: Annotated[
+        Path | None, typer.Option("--labels", metavar="LABELS", help="Label image instead of a segmentation of IMAGE.")
+    ] = None,
+    classes: Annotated[int, typer.Option(metavar="K", min=2, help="Classes of the segmentation (multi-Otsu).")] = 4,
+    volume: VolumeOption = None,
+    crop: CropOption = None,
+    json_path: JsonOption = None,
+    force: ForceOption = False,
+) -> int:
+    """Mesh an image the conventional way, to compare with: segment, extract surfaces, tetrahedralise."""
+    from tetopt.baseline.pipelines import PIPELINES, Job
+
+    output = checked_output(output, (".vtu",), force)
+    if json_path is not None:
+        json_path = checked_output(json_path, (".json",), force)
+    image = _volume(image_path, volume, crop)
+    labels = None if labels_path is None else _labels(labels_path, image, crop)
+    made = PIPELINES[pipeline.value](Job(image, labels, nodes, classes))
+    measured = quality(made.mesh.points, made.mesh.cells)
+    options = {"pipeline": pipeline.value, "nodes": nodes, "classes": classes}
+    about = {"image": image_path.name, "image_sha256": sha256(image_path), "options": options}
+    save_mesh(output, made.mesh, cell_fields(made.mesh, image), {"tetopt": tetopt.__version__, **about})
+    if json_path is not None:
+        fit = _fit(image, made.mesh)
+        save_json(json_path, about | {"seconds": made.seconds, "notes": made.notes, "fit": fit, "quality": measured})
+    for note in made.notes:
+        log.print(escape(f"note: {note}"))
+    table = _table("", escape(output.name))
+    _add_quality(table, measured)
+    for step, seconds in made.seconds.items():
+        table.add_row(f"seconds, {step}", f"{seconds:.1f}")
+    out.print(table)
+    return 0
+
+
+@app.command("compare")
+def compare_command(
+    context: typer.Context,
+    image_path: ImageArgument,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the results.")],
+    nodes: Annotated[int, typer.Option(metavar="N", min=20, help="Wanted number of nodes, of every mesh.")] = 5000,
+    labels_path: Annotated[
+        Path | None,
+        typer.Option("--labels", metavar="LABELS", help="Label image for the pipelines that need a segmentation."),
+    ] = None,
+    repeats: Annotated[int, typer.Option(metavar="R", min=1, help="Runs of a mesher whose result varies.")] = 3,
+    pipelines: Annotated[
+        str, typer.Option(metavar="A,B,...", help="Which, in the report's order.")
+    ] = "tetopt,pytetwild,cleaver,bcc,odt",
+    k_D: Annotated[float, typer.Option("--k-d", metavar="K", help="tetopt's weight of the image.")] = 0.2,
+    classes: Annotated[int, typer.Option(metavar="K", min=2, help="Classes of the segmentation (multi-Otsu).")] = 4,
+    young: Annotated[
+        str | None,
+        typer.Option(metavar="LAW", help="Modulus by intensity, as for `fem`. Default: 1 to 10 kPa over its range."),
+    ] = None,
+    curve: Annotated[
+        str, typer.Option(metavar="F,...", help="Node counts of the error curves, as parts of N; empty for none.")
+    ] = "0.25,0.5,2",
+    reference_dofs: Annotated[
+        int, typer.Option(metavar="D", min=1000, help="Size of the voxel grid that is the truth of the simulation.")
+    ] = 300_000,
+    max_seconds: Annotated[float, typer.Option(metavar="S", help="Time limit of one run of a pipeline.")] = 3600.0,
+    max_gb: Annotated[float | None, typer.Option(metavar="GB", help="Memory limit of one run of a pipeline.")] = None,
+    volume: VolumeOption = None,
+    crop: CropOption = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Keep the finished runs of an interrupted comparison.")
+    ] = False,
+    force: ForceOption = False,
+) -> int:
+    """Set tetopt beside the conventional pipelines: fidelity, shape, simulation accuracy, time; report.html."""
+    from tetopt.experiments import compare, run_compare
+    from tetopt.fem.materials import parse_law
+
+    if not 0.0 <= k_D < 1.0:
+        raise InputError(f"--k-d: expected 0 <= k_D < 1, got {k_D}")
+    for name, limit in (("--max-seconds", max_seconds), ("--max-gb", max_gb)):
+        if limit is not None and not 0.0 < limit < float("inf"):
+            raise InputError(f"{name}: expected more than 0, got {limit}")
+    image = _volume(image_path, volume, crop)
+    labels = None if labels_path is None else _labels(labels_path, image, crop)
+    law, law_words = compare.default_law(image) if young is None else (parse_law(young), young)
+    settings = compare.Settings(
+        nodes=nodes, pipelines=tuple(name.strip() for name in pipelines.split(",")), repeats=repeats, classes=classes,
+        k_D=k_D, reference_dofs=reference_dofs, curve=_parse_curve(curve), max_seconds=max_seconds,
+        max_bytes=None if max_gb is None else int(max_gb * 1e9),
+    )  # fmt: skip
+    about = {
+        "command": f"tetopt {' '.join(map(shlex.quote, context.obj))}",
+        "image": {"name": image_path.name, "sha256": sha256(image_path), "volume": volume, "crop": crop},
+        "labels": None if labels_path is None else {"name": labels_path.name, "sha256": sha256(labels_path)},
+        "law": law_words,
+    }
+    paths = run_compare.outputs(_results_folder(output), force or resume)
+    results = run_compare.run(
+        paths, about, image, labels, law, settings, lambda text: log.print(escape(text)), resume=resume
+    )
+    out.print(escape(f"{paths['report.html']}: {len(settings.pipelines)} pipelines, in {results['seconds']:.0f} s"))
+    return 0
+
+
+def _volume(path: Path, volume: int | None, crop: str | None) -> Image:
+    """A 3-D image; InputError for a picture."""
+    image = _image(path, volume, crop, None)
+    if image.ndim != 3:
+        raise InputError(f"{path}: expected a volume, got a {image.ndim}-D image")
+    return image
+
+
+def _parse_curve(text: str) -> tuple[float, ...]:
+    try:
+        factors = tuple(float(part) for part in text.split(",") if part.strip())
+    except ValueError:
+        factors = (0.0,)
+    if any(not 0.0 < factor < 100.0 for factor in factors):
+        raise InputError(f'--curve: expected parts of the node count, such as "0.25,0.5,2", got "{text}"')
+    return factors
 
 
 @app.command("demo")

@@ -14,6 +14,7 @@ from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 
+LABELS = 32_767  # largest label
 BINS = 256  # of the histogram whose classes are found
 
 
@@ -100,27 +101,50 @@ def thresholded(image: Image, classes: int) -> Image:
     return Image(np.digitize(image.data, thresholds), image.affine)
 
 
+def stands_for(labels: Image, truth: Image) -> dict[int, int]:
+    """For each class the true label that most of its voxels carry; arguments as for `dice`."""
+    table = _table(labels, truth)
+    return {int(c): int(table[c].argmax()) for c in np.flatnonzero(table.sum(axis=1))}
+
+
 def dice(labels: Image, truth: Image) -> dict[int, float]:
     """Dice overlap of each true label with the classes that stand for it, 0 to 1.
 
-    A class stands for the true label that most of its voxels carry; a true label for which no class stands has 0.
+    A class stands for the true label that most of its voxels carry (`stands_for`); a true label for which no class
+    stands has 0. The truth chooses that, so more classes tend to overlap better.
 
     Raises
     ------
     InputError
         Images of different shapes, or labels that are not whole numbers from 0.
     """
+    table = _table(labels, truth)
+    chosen = table.argmax(axis=1)
+    overlaps = {}
+    for label in np.flatnonzero(table.sum(axis=0)):
+        rows = table[(chosen == label) & (table.sum(axis=1) > 0)]
+        overlaps[int(label)] = float(2 * rows[:, label].sum() / (rows.sum() + table[:, label].sum()))
+    return overlaps
+
+
+def _table(labels: Image, truth: Image) -> NDArray[np.int64]:
+    """Number of voxels of each class (rows) and true label (columns)."""
     if labels.shape != truth.shape:
         raise InputError(f"dice: expected images of one shape, got {labels.shape} and {truth.shape}")
     for name, image in (("labels", labels), ("truth", truth)):
-        if image.data.min() < 0 or not np.array_equal(np.rint(image.data), image.data):
-            raise InputError(f"dice: {name} must be whole numbers from 0")
+        check_labels(name, image)
     found, true = labels.data.astype(np.int64).ravel(), truth.data.astype(np.int64).ravel()
-    table = np.zeros((found.max() + 1, true.max() + 1), dtype=np.int64)
-    np.add.at(table, (found, true), 1)
-    stands_for = table.argmax(axis=1)
-    overlaps = {}
-    for label in np.flatnonzero(table.sum(axis=0)):
-        rows = table[(stands_for == label) & (table.sum(axis=1) > 0)]
-        overlaps[int(label)] = float(2 * rows[:, label].sum() / (rows.sum() + table[:, label].sum()))
-    return overlaps
+    shape = (int(found.max()) + 1, int(true.max()) + 1)
+    return np.bincount(found * shape[1] + true, minlength=shape[0] * shape[1]).reshape(shape)
+
+
+def check_labels(name: str, labels: Image) -> None:
+    """InputError unless the voxels are whole numbers from 0 to `LABELS`."""
+    data = labels.data
+    wrong = np.argwhere((data < 0) | (data > LABELS) | (np.rint(data) != data))
+    if len(wrong):
+        first = tuple(int(i) for i in wrong[0])
+        raise InputError(
+            f"{name}: labels must be whole numbers from 0 to {LABELS}, {len(wrong)} voxels have others, the first "
+            f"{data[first]:g} at {first}; is it a label image?"
+        )

@@ -41,12 +41,19 @@ def test_values(text, expected):
         "", "h +", "x", "__import__('os')", "h.size", "h[0]", "lambda: 1", "[h]", "'h'", "True", "1j", "h if h else 1",
         "h < 2", "h @ h", "h // 2", "h & 1", "~h", "not h", "sum(h)", "max(h)", "abs(h, 2)", "max(h, 1, 2)", "abs(x=h)",
         "min(*h)", "h; h", "h = 1", "(h := 2)", "f'{h}'", "abs", "...", "None", "(" * 300 + "h" + ")" * 300, "\0",
-        "h" + "+h" * 20000,
+        "h" + "+h" * 20000, "h" + "+h" * 983, "-" * 983 + "h", "1" + "0" * 400, "1if h else 2", "h +\n x",
     ],
 )  # fmt: skip
 def test_refuses(text):
-    with pytest.raises(tetopt.InputError, match="formula"):
+    with pytest.raises(tetopt.InputError, match="formula") as caught:
         parse_formula(text)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 300
+
+
+@pytest.mark.parametrize(("text", "value"), [("10**20", 1e20), ("9**9**9**9", np.inf)])
+def test_powers_are_floats(text, value):
+    assert parse_formula(text)(np.array([1.0])) == value
 
 
 @given(st.text(alphabet="h0123456789.+-*/()absqrtexplogminmax, ", max_size=24))

@@ -5,7 +5,14 @@ import PIL.Image
 import pytest
 
 import tetopt
-from tetopt.report.scene import SURFACE, dark_structure_surface, save_scenes, slices_in_mesh, structure_before_slices
+from tetopt.report.scene import (
+    SURFACE,
+    _slice_sheet,
+    dark_structure_surface,
+    save_scenes,
+    slices_in_mesh,
+    structure_before_slices,
+)
 
 TILTED = np.array([[1.8, -0.5, 0.0, 7.0], [0.5, 1.8, 0.0, -20.0], [0.0, 0.0, 2.5, 3.0], [0.0, 0.0, 0.0, 1.0]])
 
@@ -52,3 +59,15 @@ def test_scenes_are_drawn_side_by_side(tmp_path, opengl):
     assert orange(right) > 0.01
     assert orange(left) < 0.001
     assert (left[..., 2] > left[..., 0] + 60).mean() > 0.005  # the blue edges
+
+
+def test_slice_sheet_shows_the_middle_slice_where_it_is_asked():
+    rng = np.random.default_rng(0)
+    image = tetopt.Image(rng.normal(size=(5, 8, 6)), TILTED)
+    for axis, at in ((0, 4.5), (1, 3.0), (2, -0.5)):
+        sheet = _slice_sheet(image, axis, at)
+        centre = image.to_index(np.asarray(sheet.cell_centers().points))
+        np.testing.assert_allclose(centre[:, axis], at, atol=1e-4)
+        centre[:, axis] = image.shape[axis] // 2
+        where = tuple(np.rint(centre).astype(int).T)
+        np.testing.assert_allclose(sheet.cell_data["h"], image.data[where])

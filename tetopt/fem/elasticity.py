@@ -28,7 +28,7 @@ from scipy.sparse.linalg import LinearOperator, cg, splu
 from tetopt.errors import InputError
 from tetopt.fem.rigidity import check_held, rigid_modes
 from tetopt.geometry.simplex import volume_gradients, volumes
-from tetopt.geometry.topology import folded
+from tetopt.geometry.topology import boundary_facets, folded
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 
@@ -97,7 +97,7 @@ def _stiffness(mesh: Mesh, young: NDArray[np.float64], nu: float, frame: NDArray
     n, n_nodes = mesh.ndim, len(mesh.points)
     v, gradients = _gradients(mesh)
     gradients = gradients @ frame
-    lame, mu = (constant[:, None, None] * v[:, None, None] for constant in _lame(young, nu, n))
+    lame, mu = (constant[:, None, None] * v[:, None, None] for constant in lame_constants(young, nu, n))
     pairs, slot = np.unique(mesh.cells[:, :, None] * n_nodes + mesh.cells[:, None, :], return_inverse=True)
     slot = slot.ravel()
     blocks = np.empty((len(pairs), n, n))
@@ -123,7 +123,7 @@ def _gradients(mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     return v, volume_gradients(mesh.points, mesh.cells) / v[:, None, None]
 
 
-def _lame(young: NDArray[np.float64], nu: float, n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def lame_constants(young: NDArray[np.float64], nu: float, n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Lame's lambda (in 2-D that of plane stress) and mu, kPa."""
     narrowing = 1.0 - nu**2 if n == 2 else (1.0 + nu) * (1.0 - 2.0 * nu)
     return young * (nu / narrowing), young / (2.0 * (1.0 + nu))
@@ -144,7 +144,7 @@ def cell_energies(mesh: Mesh, young: ArrayLike, nu: float, u: NDArray[np.float64
         As `stiffness`.
     """
     strain = strains(mesh, u)
-    lame, mu = _lame(_checked_young(young, mesh), _checked_nu(nu), mesh.ndim)
+    lame, mu = lame_constants(_checked_young(young, mesh), _checked_nu(nu), mesh.ndim)
     spread = np.einsum("cii->c", strain) ** 2
     return volumes(mesh.points, mesh.cells) * (0.5 * lame * spread + mu * (strain**2).sum(axis=(1, 2)))
 
@@ -190,12 +190,48 @@ def box_faces(image: Image, mesh: Mesh, axis: int | None = None) -> tuple[NDArra
         sides.append(np.flatnonzero(np.abs(place - face) <= ON_FACE))
         if len(sides[-1]) == 0:
             raise InputError(
-                f"mesh: no node lies on the box's face at index {face:g} of axis {axis}, the mesh runs from "
-                f"{place.min():g} to {place.max():g}; name the nodes to fix and push yourself"
+                f"mesh: no node lies on the image's face at index {face:g} of axis {axis}, the mesh runs from "
+                f"{place.min():g} to {place.max():g}; it must fill the image's box: same image, --crop and --slice?"
             )
     world_axis = n - 1 if axis == upright else int(np.argmax(np.abs(directions[:, axis])))
     low, high = sides if directions[world_axis, axis] > 0.0 else sides[::-1]
     return low, high
+
+
+def push_of(image: Image, percent: float) -> NDArray[np.float64]:
+    """Displacement of the bottom in a compression by `percent`, (n,) mm: along the faces' normal, towards the top.
+
+    `percent` of the distance between the two faces that `box_faces` finds, so that an image turned in the world, or
+    an oblique one, is pressed by as much.
+    """
+    n = image.ndim
+    axis = int(np.argmax(np.abs(image.affine[n - 1, :n] / image.spacing)))
+    normal = np.linalg.inv(image.affine[:n, :n])[axis]  # of the faces; as long as one over a voxel's thickness
+    towards_top = 1.0 if image.affine[n - 1, axis] > 0.0 else -1.0
+    return 0.01 * percent * image.shape[axis] * towards_top * normal / float(normal @ normal)
+
+
+def check_fills_box(image: Image, mesh: Mesh) -> None:
+    """InputError unless every boundary facet of the mesh lies on a face of the image's box, and it is all filled.
+
+    So a mesh with a crack, of several pieces, laid over itself or joined without shared nodes is refused.
+    """
+    _check_unfolded(mesh)
+    outer = boundary_facets(mesh.cells)
+    index = image.to_index(mesh.points[outer])  # (B, n, n)
+    on_box = np.zeros(len(outer), dtype=bool)
+    for axis in range(mesh.ndim):
+        for face in (-0.5, image.shape[axis] - 0.5):
+            on_box |= (np.abs(index[:, :, axis] - face) <= ON_FACE).all(axis=1)
+    if not on_box.all():
+        inner = np.flatnonzero(~on_box)
+        raise InputError(
+            f"mesh: {len(inner)} of its boundary facets lie off the faces of the image's box, the first has nodes "
+            f"{outer[inner[0]].tolist()}: it has a crack, several pieces, or is not of this image (--crop, --slice?)"
+        )
+    filled = float(volumes(mesh.points, mesh.cells).sum()) / image.volume
+    if abs(filled - 1.0) > 1e-5:
+        raise InputError(f"mesh: its cells fill {filled:.6g} of the image's box; they overlap or leave parts out")
 
 
 def constrained(
@@ -237,12 +273,7 @@ def constrained(
     if not np.isfinite(values).all():
         node = int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
         raise InputError(f"prescribed: displacements must be finite, node {node} has {values[node].tolist()}")
-    pairs = folded(mesh.cells)
-    if len(pairs):
-        raise InputError(
-            f"mesh: {len(pairs)} facets have cells that overlap there, as inverted ones do; the first are of cells "
-            f"{pairs[:3].tolist()}; mend the mesh"
-        )
+    _check_unfolded(mesh)
     points = mesh.points @ frame
     check_held(points, mesh.cells, is_prescribed)
     K = _stiffness(mesh, young, nu, frame)
@@ -435,6 +466,15 @@ def _by_multigrid(system: System) -> NDArray[np.float64]:
 # Checks of the arguments
 
 
+def _check_unfolded(mesh: Mesh) -> None:
+    pairs = folded(mesh.cells)
+    if len(pairs):
+        raise InputError(
+            f"mesh: {len(pairs)} facets have cells that overlap there, as inverted ones do; the first are of cells "
+            f"{pairs[:3].tolist()}; mend the mesh"
+        )
+
+
 def _checked_young(young: ArrayLike, mesh: Mesh) -> NDArray[np.float64]:
     try:
         young = np.asarray(young, dtype=np.float64)
@@ -449,7 +489,7 @@ def _checked_young(young: ArrayLike, mesh: Mesh) -> NDArray[np.float64]:
         first = ", ".join(f"{young[j]:g} in cell {j}" for j in bad[:3])
         raise InputError(
             f"young: expected moduli above 0 kPa, got {len(bad)} others, the first {first}; "
-            "give empty space a small modulus or take its cells out"
+            'give empty space a small modulus too, as --young "0:0.1,255:6" does'
         )
     return young
 

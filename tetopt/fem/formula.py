@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import operator
+import warnings
 from collections.abc import Callable
 from typing import Any
 
@@ -12,6 +13,7 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 
+DEEPEST = 100  # operations within one another
 FUNCTIONS: dict[str, tuple[Callable[..., Any], int]] = {
     "abs": (np.abs, 1), "sqrt": (np.sqrt, 1), "exp": (np.exp, 1), "log": (np.log, 1),
     "min": (np.minimum, 2), "max": (np.maximum, 2),
@@ -40,12 +42,14 @@ def parse_formula(text: str) -> Callable[[NDArray[np.float64]], NDArray[np.float
     array([  50.,  100., 1000.])
     """
     try:
-        tree = ast.parse(text.strip(), mode="eval").body
-        _check(tree, text)
-    except (SyntaxError, ValueError, RecursionError, MemoryError) as error:
+        with warnings.catch_warnings():
+            warnings.simplefilter("error")  # "1if h" is a warning of Python's first
+            tree = ast.parse(text.strip(), mode="eval").body
+        _check(tree, text, 0)
+    except (SyntaxError, SyntaxWarning, ValueError, OverflowError, RecursionError, MemoryError) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f'formula: expected {ALLOWED}, got "{text}"') from error
+        raise InputError(f'formula: expected {ALLOWED}, got "{_shown(text)}"') from error
 
     def law(h: NDArray[np.float64]) -> NDArray[np.float64]:
         with np.errstate(all="ignore"):  # what has no value is refused where the modulus is used
@@ -54,26 +58,36 @@ def parse_formula(text: str) -> Callable[[NDArray[np.float64]], NDArray[np.float
     return law
 
 
-def _check(node: ast.expr, text: str) -> None:
-    """InputError unless the tree is made of what is allowed."""
+def _shown(text: str) -> str:
+    """A formula on one line, cut short."""
+    line = " ".join(text.split())
+    return line if len(line) <= 60 else f"{line[:57]}..."
+
+
+def _check(node: ast.expr, text: str, depth: int) -> None:
+    """InputError unless the tree is made of what is allowed, and no deeper than `DEEPEST`."""
+    if depth > DEEPEST:
+        raise InputError(f'formula: more than {DEEPEST} operations deep: "{_shown(text)}"')
     match node:
         case ast.Constant(value=float() | int() as value) if not isinstance(value, bool):
-            return
+            float(value)  # OverflowError for a whole number beyond 1e308
         case ast.Name(id="h"):
             return
         case ast.BinOp(left=left, op=op, right=right) if type(op) in BINARY:
-            _check(left, text)
-            _check(right, text)
+            _check(left, text, depth + 1)
+            _check(right, text, depth + 1)
         case ast.UnaryOp(op=op, operand=operand) if type(op) in UNARY:
-            _check(operand, text)
+            _check(operand, text, depth + 1)
         case ast.Call(func=ast.Name(id=name), args=args, keywords=[]) if name in FUNCTIONS:
             if len(args) != FUNCTIONS[name][1]:
-                raise InputError(f'formula: {name} takes {FUNCTIONS[name][1]} arguments, got {len(args)} in "{text}"')
+                raise InputError(
+                    f'formula: {name} takes {FUNCTIONS[name][1]} arguments, got {len(args)} in "{_shown(text)}"'
+                )
             for arg in args:
-                _check(arg, text)
+                _check(arg, text, depth + 1)
         case _:
             part = ast.get_source_segment(text.strip(), node) or text
-            raise InputError(f'formula: expected {ALLOWED}; cannot use "{part}"')
+            raise InputError(f'formula: expected {ALLOWED}; cannot use "{_shown(part)}"')
 
 
 def _value(node: ast.expr, h: NDArray[np.float64]) -> Any:

@@ -12,7 +12,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tetopt.energy.sampling import cell_moments
+from tetopt.energy.sampling import cell_of_voxel, nearest_values
 from tetopt.errors import InputError
 from tetopt.fem.formula import parse_formula
 from tetopt.image import Image
@@ -59,11 +59,12 @@ def young_from(law: Law, intensities: ArrayLike) -> NDArray[np.float64]:
         young = np.interp(intensities, table[:, 0], table[:, 1])
     is_bad = ~(np.isfinite(young) & (young >= 0.0))
     if is_bad.any():
-        pairs = zip(young[is_bad][:3], intensities[is_bad][:3], strict=True)
+        at, first_of = np.unique(intensities[is_bad], return_index=True)
+        pairs = zip(young[is_bad][first_of[:3]], at[:3], strict=True)
         first = ", ".join(f"{modulus:g} at intensity {intensity:g}" for modulus, intensity in pairs)
         raise InputError(
-            f"law: expected moduli of 0 kPa or more, got {int(is_bad.sum())} others, the first {first}; "
-            "give a law that is positive over the image's range"
+            f"modulus: expected 0 kPa or more, got {int(is_bad.sum())} others, such as {first}; "
+            "give a law (--young) that is positive over the image's range"
         )
     return young
 
@@ -122,9 +123,19 @@ def cell_young(image: Image, mesh: Mesh, law: Law = None) -> NDArray[np.float64]
     Raises
     ------
     InputError
-        As `young_from` and `cell_moments`.
+        As `young_from` and `tetopt.energy.sampling.cell_of_voxel`.
     """
-    return cell_moments(young_image(image, law), mesh).mean
+    field = young_image(image, law)
+    # Summed voxel by voxel. `cell_moments` takes differences of sums over rows, whose rounding would drown the soft
+    # cells of a field that spans ten orders of magnitude.
+    owner = cell_of_voxel(field, mesh).ravel()
+    inside = owner >= 0
+    n_voxels = np.bincount(owner[inside], minlength=len(mesh.cells))
+    total = np.bincount(owner[inside], weights=field.data.ravel()[inside], minlength=len(mesh.cells))
+    is_empty = n_voxels == 0
+    young = total / np.maximum(n_voxels, 1)
+    young[is_empty] = nearest_values(field, mesh.points[mesh.cells[is_empty]].mean(axis=1))
+    return young
 
 
 def inverse_strain(strain: ArrayLike, floor: float) -> NDArray[np.float64]:
@@ -173,6 +184,7 @@ def _checked_table(law: ArrayLike) -> NDArray[np.float64]:
     if len(falls):
         k = int(falls[0])
         raise InputError(
-            f"law: intensities must increase, got {table[k, 0]:g} and then {table[k + 1, 0]:g}; sort the pairs"
+            f"law: intensities must increase, got {table[k, 0]:g} and then {table[k + 1, 0]:g}; "
+            "sort the pairs and give each intensity once"
         )
     return table

@@ -134,16 +134,27 @@ def load_image(
 def save_image(path: str | Path, image: Image) -> None:
     """Write a NIfTI file (.nii or .nii.gz), whole or not at all, with the full affine as sform, in mm.
 
+    Whole numbers are held as 8- or 16-bit integers where they fit, others as float32 or float64.
+
     A 2-D image becomes a 2-D file in the plane z = 0, which `load_image` reads back as it was. Replaces an
     existing file; ask `tetopt.io.files.checked_output` first.
     """
     affine = np.eye(4)
     affine[: image.ndim, : image.ndim] = image.affine[:-1, :-1]
     affine[: image.ndim, 3] = image.affine[:-1, -1]
-    file = nibabel.Nifti1Image(image.data, affine)
+    file = nibabel.Nifti1Image(_for_file(image.data), affine)
     file.header.set_xyzt_units("mm")
     with written_whole(Path(path)) as temporary:
         nibabel.save(file, temporary)
+
+
+def _for_file(data: NDArray[np.floating]) -> NDArray:
+    """Whole numbers of few bits as integers, so that programs take labels for labels; other data as they are."""
+    low, high = data.min(), data.max()
+    for dtype in (np.uint8, np.int16):
+        if np.iinfo(dtype).min <= low and high <= np.iinfo(dtype).max and np.array_equal(np.rint(data), data):
+            return data.astype(dtype)
+    return data
 
 
 def image_slice(image: Image, axis: int, index: int) -> Image:

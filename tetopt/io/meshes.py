@@ -64,15 +64,18 @@ def save_mesh(
     mesh: Mesh,
     cell_data: dict[str, NDArray] | None = None,
     about: dict[str, Any] | None = None,
+    point_data: dict[str, NDArray] | None = None,
 ) -> None:
     """Write a VTU file, whole or not at all.
 
-    Points in world mm (RAS+), cells positively oriented, `cell_data` by name; each entry of `about` becomes a
-    field-data text, as JSON unless it is a string already. Texts are held as bytes of UTF-8: meshio refuses files
-    with VTK's string arrays, and pyvista writes only ASCII into them. Replaces an existing file; ask
+    Points in world mm (RAS+), cells positively oriented, `cell_data` and `point_data` by name; each entry of `about`
+    becomes a field-data text, as JSON unless it is a string already. Texts are held as bytes of UTF-8: meshio refuses
+    files with VTK's string arrays, and pyvista writes only ASCII into them. Replaces an existing file; ask
     `tetopt.io.files.checked_output` first.
     """
     grid = to_pyvista(mesh, cell_data)
+    for name, values in (point_data or {}).items():
+        grid.point_data[name] = values
     for name, value in (about or {}).items():
         text = value if isinstance(value, str) else json.dumps(value)
         grid.field_data[name] = np.frombuffer(text.encode(), dtype=np.uint8)

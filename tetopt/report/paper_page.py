@@ -1,12 +1,8 @@
-"""Pictures and the page of the reproduced paper: renderings of what `tetopt.experiments.paper` found."""
+"""Pictures of the reproduced paper: renderings of what `tetopt.experiments.paper` found."""
 
 from __future__ import annotations
 
-import base64
-import html
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 from matplotlib.collections import PolyCollection
@@ -15,7 +11,6 @@ from numpy.typing import NDArray
 
 from tetopt.geometry.quality import rho_histogram
 from tetopt.image import Image
-from tetopt.io.files import written_whole
 from tetopt.mesh import Mesh
 from tetopt.optimize.paper import Record
 
@@ -63,60 +58,12 @@ def landscape_figure(
         axes.plot([centre[0], x], [centre[1], y], color="#ffb000")
     axes.set_title("image and the four triangles", fontsize=10)
     for number, (k_D, places, E, found, E_found) in enumerate(rows):
-        axes = figure.add_subplot(1, len(rows) + 1, number + 2, projection="3d")
+        axes = figure.add_subplot(1, len(rows) + 1, number + 2, projection="3d", computed_zorder=False)
         x, y = np.meshgrid(places, places, indexing="ij")
-        axes.plot_surface(x, y, E, cmap="viridis", alpha=0.85, linewidth=0)
-        axes.scatter([found[0]], [found[1]], [E_found], color="red", s=45, depthshade=False, zorder=10)
+        axes.plot_surface(x, y, E, cmap="viridis", alpha=0.85, linewidth=0, zorder=1)
+        axes.scatter([found[0]], [found[1]], [E_found], color="red", s=60, depthshade=False, zorder=10)
+        axes.set_xlabel("x, mm")
+        axes.set_ylabel("y, mm")
         axes.set_title(f"k_D = {k_D:g}: lowest {E.min():.3f}, found {E_found:.3f}", fontsize=10)
         axes.view_init(elev=38, azim=-60)
     return figure
-
-
-def save_page(path: Path, title: str, sections: Sequence[dict[str, Any]]) -> None:
-    """One HTML file without outside references, whole or not at all.
-
-    Each section has a `title`, a `text`, optionally `tables` (rows of cells, the first the heading) and `pictures`
-    (PNG paths with captions).
-    """
-    parts = [_HEAD.replace("TITLE", html.escape(title))]
-    for section in sections:
-        parts.append(f"<section><h2>{html.escape(section['title'])}</h2><p>{html.escape(section['text'])}</p>")
-        parts += [_table(rows) for rows in section.get("tables", ()) if rows]
-        for picture, caption in section.get("pictures", ()):
-            data = base64.b64encode(Path(picture).read_bytes()).decode("ascii")
-            alt = html.escape(caption)
-            parts.append(
-                f'<figure><img alt="{alt}" src="data:image/png;base64,{data}"><figcaption>{alt}</figcaption></figure>'
-            )
-        parts.append("</section>")
-    parts.append("</main></body></html>\n")
-    with written_whole(path) as temporary:
-        temporary.write_text("\n".join(parts), encoding="utf-8")
-
-
-def _table(rows: Sequence[Sequence[str]]) -> str:
-    head, *body = rows
-    lines = [
-        "<div class='wide'><table><thead><tr>",
-        *(f"<th>{html.escape(c)}</th>" for c in head),
-        "</tr></thead><tbody>",
-    ]
-    for row in body:
-        lines += ["<tr>", *(f"<td>{html.escape(c)}</td>" for c in row), "</tr>"]
-    return "".join([*lines, "</tbody></table></div>"])
-
-
-_HEAD = """<!doctype html>
-<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<title>TITLE</title>
-<style>
-body { font: 16px/1.5 system-ui, sans-serif; color: #222; margin: 0; }
-main { max-width: 1100px; margin: 0 auto; padding: 1rem; }
-h1 { font-size: 1.6rem; } h2 { font-size: 1.2rem; margin-top: 2.2rem; border-top: 1px solid #ddd; padding-top: 1rem; }
-.wide { overflow-x: auto; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: 0.92rem; }
-th, td { padding: 0.25rem 0.7rem; text-align: right; border-bottom: 1px solid #eee; white-space: nowrap; }
-th:first-child, td:first-child { text-align: left; } td:last-child { white-space: normal; }
-figure { margin: 1rem 0; } img { max-width: 100%; height: auto; } figcaption { color: #555; font-size: 0.9rem; }
-@media print { section { break-inside: avoid; } }
-</style></head><body><main><h1>TITLE</h1>"""

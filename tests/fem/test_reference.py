@@ -1,0 +1,176 @@
+"""The voxel grid's solution: against scikit-fem, against closed forms, and against fine tetrahedral meshes."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+import skfem
+from skfem.models.elasticity import lame_parameters, linear_elasticity
+
+import tetopt
+from tetopt.fem.elasticity import box_faces, compression
+from tetopt.fem.materials import cell_young
+from tetopt.fem.reference import (
+    Reference,
+    averaged,
+    compare,
+    element_stiffness,
+    grid_stiffness,
+    near_interface,
+    nearest,
+    reference,
+)
+
+SHEARED = np.array([[1.5, 0.3, -0.2], [0.1, 2.0, 0.4], [0.2, -0.3, 0.8]])
+
+
+def affine_of(linear, shift):
+    n = len(linear)
+    affine = np.eye(n + 1)
+    affine[:n, :n], affine[:n, n] = linear, shift
+    return affine
+
+
+@pytest.mark.parametrize("nu", [0.0, 0.3, 0.49])
+def test_element_against_scikit_fem(nu):
+    """One sheared hexahedron, corner by corner."""
+    corners = np.array(list(product((0.0, 1.0), repeat=3)))
+    points = corners @ SHEARED.T
+    mesh = skfem.MeshHex().translated((0.0, 0.0, 0.0))
+    order = [int(np.flatnonzero((corners == p).all(axis=1))[0]) for p in mesh.p.T]
+    mesh = skfem.MeshHex(points[order].T, mesh.t)
+    basis = skfem.Basis(mesh, skfem.ElementVector(skfem.ElementHex1()), intorder=4)
+    K = linear_elasticity(*lame_parameters(1.0, nu)).assemble(basis).toarray()
+    ours = element_stiffness(SHEARED, nu)
+    dof = basis.nodal_dofs  # (3, 8)
+    for a, b in product(range(8), repeat=2):
+        np.testing.assert_allclose(ours[order[a], order[b]], K[np.ix_(dof[:, a], dof[:, b])], atol=1e-12)
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_grid_is_the_sum_of_its_elements(n):
+    rng = np.random.default_rng(n)
+    shape = (3, 2, 4)[:n]
+    image = tetopt.Image(np.ones(shape), affine_of(SHEARED[:n, :n], 0.0))
+    young = rng.uniform(1.0, 5.0, shape)
+    element = element_stiffness(SHEARED[:n, :n], 0.3)
+    nodes = tuple(s + 1 for s in shape)
+    K = np.zeros((np.prod(nodes) * n,) * 2)
+    for voxel in np.ndindex(*shape):
+        ids = [np.ravel_multi_index(np.add(voxel, c), nodes) for c in product((0, 1), repeat=n)]
+        for (a, i), (b, k) in product(enumerate(ids), repeat=2):
+            K[i * n : i * n + n, k * n : k * n + n] += young[voxel] * element[a, b]
+    np.testing.assert_allclose(grid_stiffness(image, young, 0.3).toarray(), K, atol=1e-12)
+
+
+@pytest.mark.parametrize("flip", [1.0, -1.0])
+@pytest.mark.parametrize("n", [2, 3])
+def test_bar_without_sideways_strain(n, flip):
+    """nu = 0: u is linear along the push, E_strain = 1/2 E strain^2 V; the top rests, whichever way the axis runs."""
+    linear = np.diag([1.5, 2.0, 0.5][3 - n :])
+    linear[-1, -1] *= flip
+    image = tetopt.Image(np.full((4, 3, 5)[:n], 7.0), affine_of(linear, 3.0))
+    found = reference(image, 0.0, percent=2.0)
+    assert found.strain_energy == pytest.approx(0.5 * 7.0 * 0.02**2 * image.volume, rel=1e-9)
+    expected = np.zeros((n, n))
+    expected[-1, -1] = -0.02
+    np.testing.assert_allclose(found.strain, np.broadcast_to(expected, found.strain.shape), atol=1e-9)
+    np.testing.assert_allclose(found.u, found.u_homogeneous, atol=1e-9)
+    index = np.stack(np.meshgrid(*map(np.arange, image.shape), indexing="ij"), axis=-1).reshape(-1, n)
+    along = image.to_world(index.astype(float))[:, -1]
+    top = along.max() + 0.5 * abs(linear[-1, -1])
+    np.testing.assert_allclose(found.u[:, -1], 0.02 * (top - along), atol=1e-9)
+
+
+def test_meshes_tend_to_it():
+    """A stiff ball in soft tissue: errors of ever finer lattices fall towards the voxel grid's solution."""
+    image = tetopt.load_phantom("sphere").image(voxel_mm=3.0)
+    image = tetopt.Image(1.0 + image.data.astype(float) / image.data.max() * 5.0, image.affine)
+    labels = tetopt.load_phantom("sphere").label_image(voxel_mm=3.0).data
+    found = reference(image, 0.3)
+    errors = []
+    for nodes in (100, 700, 5000):
+        mesh = tetopt.lattice(image, nodes=nodes)
+        bottom, top = box_faces(image, mesh)
+        push = [0.0, 0.0, 0.01 * np.ptp(mesh.points[:, 2])]
+        young = cell_young(image, mesh)
+        pressed = compression(mesh, young, 0.3, fixed_nodes=top, pushed_nodes=bottom, displacement=push)
+        errors.append(compare(found, mesh, pressed.u, pressed.strain_energy, labels))
+    energy, displacement, strain = (np.array(column) for column in zip(*errors, strict=True))
+    assert np.all(np.diff(energy) < 0)
+    assert np.all(np.diff(displacement) < 0)
+    assert np.all(np.diff(strain) < 0)
+    assert energy[-1] < 0.01
+
+
+def linear_reference(image, slope, shift):
+    """A made-up solution u = slope x + shift, against 0 for the homogeneous block."""
+    n = image.ndim
+    index = np.stack(np.meshgrid(*map(np.arange, image.shape), indexing="ij"), axis=-1).reshape(-1, n)
+    u = image.to_world(index.astype(float)) @ slope.T + shift
+    strain = np.broadcast_to(0.5 * (slope + slope.T), (len(u), n, n))
+    return Reference(image, 0.3, 2.0, u, np.zeros_like(u), strain, 0)
+
+
+def test_errors_of_a_known_field():
+    """The same linear field on the mesh has no error; one scaled by 1.1 has 0.1 in displacement and strain."""
+    rng = np.random.default_rng(0)
+    image = tetopt.Image(rng.uniform(1.0, 2.0, (7, 6, 5)), affine_of(SHEARED, 4.0))
+    mesh = tetopt.lattice(image, nodes=60)
+    slope, shift = rng.normal(size=(3, 3)), rng.normal(size=3)
+    labels = np.zeros(image.shape)
+    labels[:3] = 1
+    found = linear_reference(image, slope, shift)
+    u = mesh.points @ slope.T + shift
+    np.testing.assert_allclose(compare(found, mesh, u, 2.0, labels), 0.0, atol=1e-12)
+    np.testing.assert_allclose(compare(found, mesh, 1.1 * u, 1.8, labels), 0.1, rtol=1e-9)
+    assert compare(found, mesh, u, 2.0, np.zeros(image.shape)).interface_strain is None
+
+
+def test_near_interface_by_brute_force():
+    rng = np.random.default_rng(3)
+    labels = np.zeros((9, 8, 7), dtype=int)
+    labels[2:4, 3, 2:5] = 1
+    labels[7:, 6:, :] = 2
+    found = near_interface(labels)
+    edges = []
+    for voxel in np.ndindex(*labels.shape):
+        for axis in range(3):
+            for step in (-1, 1):
+                other = list(voxel)
+                other[axis] += step
+                if 0 <= other[axis] < labels.shape[axis] and labels[tuple(other)] != labels[voxel]:
+                    edges.append(voxel)
+    edges = np.array(edges)
+    for voxel in rng.permutation(list(np.ndindex(*labels.shape)))[:200]:
+        assert found[tuple(voxel)] == (np.linalg.norm(edges - voxel, axis=1).min() <= 1.5)
+
+
+def test_averaged_keeps_box_and_mean():
+    """Cut voxels count by their share; a linear image stays linear; the box stays the same."""
+    rng = np.random.default_rng(1)
+    image = tetopt.Image(rng.normal(size=(7, 10, 9)), affine_of(SHEARED, 2.0))
+    coarse = averaged(image, (3, 10, 4))
+    assert coarse.shape == (3, 10, 4)
+    assert coarse.data.mean() == pytest.approx(image.data.mean(), rel=1e-12)
+    for corner in product((0, 1), repeat=3):
+        ends = [np.where(corner, np.array(i.shape) - 0.5, -0.5) for i in (image, coarse)]
+        np.testing.assert_allclose(image.to_world(ends[0]), coarse.to_world(ends[1]), atol=1e-12)
+    by_hand = (image.data[0] + image.data[1] + image.data[2] / 3.0) / (7.0 / 3.0)
+    np.testing.assert_allclose(averaged(image, (3, 10, 9)).data[0], by_hand, rtol=1e-12)
+    np.testing.assert_array_equal(averaged(image, image.shape).data, image.data)
+    with pytest.raises(tetopt.InputError, match="averaged: expected up to"):
+        averaged(image, (8, 10, 9))
+
+
+def test_nearest_takes_the_voxel_around_the_centre():
+    image = tetopt.Image(np.arange(6.0).reshape(3, 2))
+    fine = tetopt.Image(np.zeros((9, 4)), np.diag([1 / 3, 1 / 2, 1.0]))
+    np.testing.assert_array_equal(nearest(image, fine).data, image.data.repeat(3, axis=0).repeat(2, axis=1))
+
+
+@pytest.mark.parametrize(("value", "nu", "words"), [(0.0, 0.3, "above 0 kPa"), (1.0, 0.5, "nu: expected")])
+def test_refuses(value, nu, words):
+    image = tetopt.Image(np.where(np.arange(8).reshape(2, 2, 2) == 3, value, 1.0))
+    with pytest.raises(tetopt.InputError, match=words):
+        reference(image, nu)
