@@ -254,7 +254,7 @@ def _fill_prefix(prefix: NDArray, volume: NDArray, shift: float) -> None:
 
 
 @njit(cache=True)
-def _dot_sign(n0: int, n1: int, n2: int, d0: int, d1: int, d2: int) -> int:
+def dot_sign(n0: int, n1: int, n2: int, d0: int, d1: int, d2: int) -> int:
     """Exact sign of n . d, with |n| < 2**60 and |d| < 2**30: the products need up to 90 bits.
 
     Each n is cut into a high part and 30 low bits, and the two dot products are added with carry.
@@ -279,7 +279,7 @@ def cell_orientation(ticks: NDArray, cells: NDArray, cell: int) -> int:
     if cells.shape[1] == 3:
         return 1 if n0 > 0 else (-1 if n0 < 0 else 0)
     d = cells[cell, 3]
-    return _dot_sign(n0, n1, n2, ticks[d, 0] - ticks[a, 0], ticks[d, 1] - ticks[a, 1], ticks[d, 2] - ticks[a, 2])
+    return dot_sign(n0, n1, n2, ticks[d, 0] - ticks[a, 0], ticks[d, 1] - ticks[a, 1], ticks[d, 2] - ticks[a, 2])
 
 
 @njit(cache=True)
@@ -315,7 +315,7 @@ def _exact_facet_threshold(
     d0, d1 = (i << bits) - a0, (j << bits) - a1
     while low < high:
         middle = (low + high) >> 1
-        if _dot_sign(n0, n1, n2, d0, d1, (middle << bits) - a2) >= 0:
+        if dot_sign(n0, n1, n2, d0, d1, (middle << bits) - a2) >= 0:
             high = middle
         else:
             low = middle + 1
@@ -323,7 +323,7 @@ def _exact_facet_threshold(
 
 
 @njit(cache=True)
-def _triangle_flux(
+def triangle_flux(
     a0: int, a1: int, a2: int, b0: int, b1: int, b2: int, c0: int, c1: int, c2: int, bits: int, prefix: NDArray,
     steps: NDArray | None, change: int,
 ) -> tuple:  # fmt: skip
@@ -384,10 +384,10 @@ def _triangle_flux(
 
 
 @njit(cache=True)
-def _segment_flux(
+def segment_flux(
     a1: int, a2: int, b1: int, b2: int, bits: int, prefix: NDArray, steps: NDArray | None, change: int
 ) -> tuple:
-    """Flux of the segment (a, b) of a 2-D mesh, coordinates along axes 1 and 2 in ticks; as `_triangle_flux`."""
+    """Flux of the segment (a, b) of a 2-D mesh, coordinates along axes 1 and 2 in ticks; as `triangle_flux`."""
     if a1 == b1:
         return 0.0, 0.0, 0.0
     sign = -1 if b1 > a1 else 1  # it faces to the right of a -> b
@@ -411,12 +411,12 @@ def _segment_flux(
 def facet_flux(
     ticks: NDArray, nodes: NDArray, facet: int, bits: int, prefix: NDArray, steps: NDArray | None, change: int
 ) -> tuple:
-    """Flux of one of the facets `nodes` (F, n); see `facet_fluxes` and `_triangle_flux`."""
+    """Flux of one of the facets `nodes` (F, n); see `facet_fluxes` and `triangle_flux`."""
     a, b = nodes[facet, 0], nodes[facet, 1]
     if nodes.shape[1] == 2:
-        return _segment_flux(ticks[a, 1], ticks[a, 2], ticks[b, 1], ticks[b, 2], bits, prefix, steps, change)
+        return segment_flux(ticks[a, 1], ticks[a, 2], ticks[b, 1], ticks[b, 2], bits, prefix, steps, change)
     c = nodes[facet, 2]
-    return _triangle_flux(
+    return triangle_flux(
         ticks[a, 0], ticks[a, 1], ticks[a, 2], ticks[b, 0], ticks[b, 1], ticks[b, 2],
         ticks[c, 0], ticks[c, 1], ticks[c, 2], bits, prefix, steps, change,
     )  # fmt: skip

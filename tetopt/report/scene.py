@@ -14,6 +14,7 @@ from tetopt.geometry.topology import boundary_facets
 from tetopt.image import Image
 from tetopt.io.files import written_whole
 from tetopt.mesh import Mesh
+from tetopt.report.viewer import View
 
 SURFACE = "#d95f02"
 VIEW = (0.9, 1.25, 0.7)  # from where a scene is seen: from the right, front and above in RAS
@@ -25,19 +26,21 @@ def facets_surface(points: NDArray[np.float64], triangles: NDArray[np.int64]) ->
     return pyvista.PolyData.from_regular_faces(points, triangles)
 
 
-def save_scenes(path: str | Path, scenes: Sequence[tuple[str, Draw]]) -> None:
-    """PNG of scenes side by side, each with a title, seen from the same side.
+def save_scenes(path: str | Path, scenes: Sequence[tuple[str, Draw]], columns: int | None = None) -> None:
+    """PNG of scenes side by side, each with a title, seen from the same side; in rows of `columns`, by default one.
 
     A scene is a function that adds its parts to a plotter, such as `structure_before_slices` returns.
     """
     # Without a display VTK complains of the missing one before it renders off screen.
     with written_whole(Path(path)) as temporary, pyvista.vtk_verbosity("off"):
+        columns = min(columns or len(scenes), len(scenes))
+        rows = -(-len(scenes) // columns)
         plotter = pyvista.Plotter(
-            off_screen=True, shape=(1, len(scenes)), border=False, window_size=(1100 * len(scenes), 1000)
+            off_screen=True, shape=(rows, columns), border=False, window_size=(1100 * columns, 1000 * rows)
         )
         plotter.set_background("white")
         for number, (title, draw) in enumerate(scenes):
-            plotter.subplot(0, number)
+            plotter.subplot(*divmod(number, columns))
             draw(plotter)
             if title:
                 plotter.add_text(title, font_size=14, color="black", position="upper_edge")
@@ -77,6 +80,22 @@ def slices_in_mesh(image: Image, mesh: Mesh) -> Draw:
         part = mesh.cells[mesh.points[mesh.cells].mean(axis=1)[:, 2] < middle[2]]
         edges = facets_surface(mesh.points, boundary_facets(part)).extract_all_edges()
         plotter.add_mesh(edges, color="#2060c0", line_width=1.5)
+
+    return draw
+
+
+def cutaway(view: View, limits: tuple[float, float]) -> Draw:
+    """The surface of an opened mesh, each cell in the grey of its value between `limits`, with the cells' edges."""
+    # The darkest is not quite black, on which no light would show how a facet lies.
+    shown = (limits[0] - 0.25 * (limits[1] - limits[0]), limits[1])
+
+    def draw(plotter: pyvista.Plotter) -> None:
+        surface = facets_surface(view.points, view.triangles)
+        surface.cell_data["h"] = view.values
+        plotter.add_mesh(
+            surface, scalars="h", cmap="gray", clim=shown, show_scalar_bar=False, show_edges=True,
+            edge_color="#ffb000", line_width=1, ambient=0.3,
+        )  # fmt: skip
 
     return draw
 

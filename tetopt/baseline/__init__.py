@@ -1,0 +1,1 @@
+"""The conventional way, for comparison: segment, extract surfaces, fill them with tetrahedra."""

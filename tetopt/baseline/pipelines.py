@@ -1,0 +1,149 @@
+"""Five ways from an image to a mesh of its box with a wanted number of nodes, under one signature."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import NamedTuple
+
+import numpy as np
+
+from tetopt.image import Image
+from tetopt.lattice import lattice
+from tetopt.mesh import Mesh
+from tetopt.optimize.paper import optimize
+
+
+class Job(NamedTuple):
+    """What every pipeline gets."""
+
+    image: Image  # 3-D
+    labels: Image | None  # a given segmentation, on the image's voxels; else it is made by thresholds
+    nodes: int  # wanted
+    classes: int = 4  # of the thresholds, without labels
+    k_D: float = 0.2
+    iterations: int = 20
+
+
+class Produced(NamedTuple):
+    """What every pipeline returns."""
+
+    mesh: Mesh  # fills the image's box, unless a note says otherwise
+    seconds: dict[str, float]  # by step, in their order
+    notes: list[str]
+
+
+class _Clock:
+    """Wall time by step."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def step(self, name: str) -> Iterator[None]:
+        begin = time.perf_counter()
+        yield
+        self.seconds[name] = time.perf_counter() - begin
+
+
+def bcc(job: Job) -> Produced:
+    """The body-centred cubic lattice, untouched.
+
+    Raises
+    ------
+    InputError
+        As `tetopt.lattice.lattice`.
+    """
+    clock = _Clock()
+    with clock.step("lattice"):
+        mesh = lattice(job.image, nodes=job.nodes)
+    return Produced(mesh, clock.seconds, [])
+
+
+def odt(job: Job) -> Produced:
+    """The lattice relaxed to the best shapes, whatever the image shows: `optimize` with k_D = 0.
+
+    Raises
+    ------
+    InputError
+        As `tetopt.lattice.lattice` and `tetopt.optimize.paper.optimize`.
+    """
+    return _optimized(job, 0.0)
+
+
+def tetopt(job: Job) -> Produced:
+    """The lattice and `optimize` with its defaults, no segmentation.
+
+    Raises
+    ------
+    InputError
+        As `tetopt.lattice.lattice` and `tetopt.optimize.paper.optimize`.
+    """
+    return _optimized(job, job.k_D)
+
+
+def pytetwild(job: Job) -> Produced:
+    """Interfaces of the classes or labels, and fTetWild with a sizing field around them; see `tetwild`.
+
+    Raises
+    ------
+    InputError
+        As `tetopt.baseline.surfaces.interfaces` and `tetopt.baseline.tetwild.filled`.
+    """
+    from tetopt.baseline.surfaces import interfaces
+    from tetopt.baseline.tetwild import filled, node_spacing
+
+    clock = _Clock()
+    with clock.step("surfaces"):
+        surfaces = interfaces(job.image, node_spacing(job.image, job.nodes), classes=job.classes, labels=job.labels)
+    with clock.step("tetrahedra"):
+        result = filled(job.image, surfaces, job.nodes)
+    return Produced(result.mesh, clock.seconds, [*surfaces.notes, f"{result.n_runs} runs", *result.notes])
+
+
+def cleaver(job: Job) -> Produced:
+    """Labels, given or by thresholds, and Cleaver's lattice stuffing; see `cleaver`.
+
+    Raises
+    ------
+    InputError
+        As `tetopt.baseline.cleaver.stuffed`.
+    """
+    from tetopt.baseline.cleaver import stuffed
+    from tetopt.baseline.surfaces import class_labels
+
+    clock = _Clock()
+    with clock.step("labels"):
+        labels = class_labels(job.image, job.classes) if job.labels is None else job.labels
+    with clock.step("tetrahedra"):
+        result = stuffed(job.image, labels, job.nodes)
+    return Produced(result.mesh, clock.seconds, [f"{result.n_runs} runs", *result.notes])
+
+
+def _optimized(job: Job, k_D: float) -> Produced:
+    clock = _Clock()
+    with clock.step("kernels"):
+        _load_kernels(job.image, k_D)
+    with clock.step("lattice"):
+        mesh = lattice(job.image, nodes=job.nodes)
+    with clock.step("optimize"):
+        result = optimize(job.image, mesh, k_D=k_D, iterations=job.iterations)
+    return Produced(result.mesh, clock.seconds, [f"ended by: {result.ended}"])
+
+
+def _load_kernels(image: Image, k_D: float) -> None:
+    """Load the compiled kernels, or compile them, in a step of its own, on an image that needs the same ones."""
+    is_whole = np.array_equal(np.rint(image.data), image.data)  # decides which kernels the sampling uses
+    step = 1.0 if is_whole else 0.5 if image.data.dtype == np.float32 else 0.1  # 0.1 is held as float64
+    tiny = Image(np.zeros((2,) * image.ndim) + step * np.arange(2))
+    optimize(tiny, lattice(tiny, blocks=(1,) * image.ndim), k_D=k_D, iterations=1)
+
+
+PIPELINES: dict[str, Callable[[Job], Produced]] = {
+    "tetopt": tetopt,
+    "pytetwild": pytetwild,
+    "cleaver": cleaver,
+    "bcc": bcc,
+    "odt": odt,
+}

@@ -1,0 +1,78 @@
+"""The comparison as files: `report.json`, the pictures' data and `report.html` made from them."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+from tetopt.energy.sampling import cell_moments
+from tetopt.errors import InputError
+from tetopt.experiments import compare
+from tetopt.fem.materials import Law
+from tetopt.image import Image
+from tetopt.io.files import checked_output, save_json
+from tetopt.mesh import Mesh
+from tetopt.report.compare_figures import curves_figure, cutaways, histograms_figure, slices_figure, timing_figure
+from tetopt.report.compare_page import save_compare_page
+from tetopt.report.figures import save_figure
+from tetopt.report.viewer import view_of
+from tetopt.segmentation import thresholded
+
+PICTURES = ("slices.png", "cutaways.png", "histograms.png", "curves.png", "timing.png")
+
+
+def outputs(folder: Path, force: bool) -> dict[str, Path]:
+    """The files that `run` writes, by name, each checked; InputError as `checked_output`."""
+    names = ("report.json", "report.html", *PICTURES)
+    return {name: checked_output(folder / name, (Path(name).suffix,), force) for name in names}
+
+
+def run(
+    paths: dict[str, Path], about: dict[str, Any], image: Image, labels: Image | None, law: Law,
+    settings: compare.Settings, say: compare.Say, *, resume: bool = False,
+) -> dict[str, Any]:  # fmt: skip
+    """Compare, write the files of `outputs`, return what `report.json` holds; arguments as `compare.run`.
+
+    Raises
+    ------
+    InputError
+        Not a volume, labels of another shape, pipelines that do not exist, or every pipeline failed.
+    """
+    if image.ndim != 3:
+        raise InputError(f"compare: expected a volume, got a {image.ndim}-D image")
+    unknown = [name for name in settings.pipelines if name not in compare.SHOWN]
+    if unknown or not settings.pipelines:
+        raise InputError(f"pipelines: expected some of {', '.join(compare.SHOWN)}, got {', '.join(unknown) or 'none'}")
+    classes = thresholded(image, settings.classes) if labels is None else labels
+    results, meshes = compare.run(
+        paths["report.json"].parent, about, image, labels, classes, law, settings, say, resume=resume
+    )
+    save_json(paths["report.json"], results)
+    if not meshes:
+        raise InputError(f"compare: every pipeline failed; {paths['report.json']} says how")
+    say("pictures and page")
+    _draw(paths, results, image, meshes)
+    return results
+
+
+def _draw(paths: dict[str, Path], results: dict[str, Any], image: Image, meshes: dict[str, Mesh]) -> None:
+    titled = [(compare.SHOWN[name].title, mesh) for name, mesh in meshes.items()]
+    means = [cell_moments(image, mesh).mean for mesh in meshes.values()]
+    save_figure(slices_figure(image, titled, means), paths["slices.png"])
+    cutaways(titled, means, paths["cutaways.png"])
+    save_figure(histograms_figure(results), paths["histograms.png"])
+    save_figure(curves_figure(results), paths["curves.png"])
+    save_figure(timing_figure(results), paths["timing.png"])
+    pictures = [
+        (
+            paths["slices.png"],
+            "The same slice through every mesh; the mean of the image in each cell; E_D of each cell",
+        ),
+        (paths["cutaways.png"], "Cut open, cells in the grey of their mean"),
+        (paths["histograms.png"], "Radius ratio rho and dihedral angles"),
+        (paths["curves.png"], "Error of the compression test against the number of nodes"),
+        (paths["timing.png"], "Seconds by step"),
+    ]
+    shown = [k for k, name in enumerate(meshes) if compare.SHOWN[name].kind != "control"] or [0]
+    views = [view_of(titled[k][1], means[k], titled[k][0]) for k in shown]
+    save_compare_page(paths["report.html"], results, pictures, views)

@@ -1,0 +1,411 @@
+"""One cell complex in plain arrays, kept whole while nodes move and cells are exchanged.
+
+A cell's facet k lies opposite its corner k. For each facet the complex holds the cell across it and the facet's flux
+(see `tetopt.energy.sampling`), turned outwards and multiplied by the sign of index space, so that a cell's moment
+sums are the plain sum over its facets and the two sides of a facet hold opposite numbers. Local operations then only
+measure the facets that are new.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numba
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from tetopt.energy.geometric import volume_and_E_G
+from tetopt.energy.sampling import SamplingGrid, cell_orientation, dot_sign, few_threads, segment_flux, triangle_flux
+
+CHUNK = 64
+FLAT = 1e-7  # a cell's volume over (sum of squared edges)^(n/2); below, it counts as inverted: an angle of 1e-3 degrees
+
+
+class Complex(NamedTuple):
+    """Nodes, cells, who touches whom, and what each cell holds. Rows from `n_cells` on are room for more cells."""
+
+    ticks: NDArray[np.int64]  # (N, 3) node positions on the sampling grid
+    cells: NDArray[np.int64]  # (C, n+1) corners, positively oriented in the world
+    across: NDArray[np.int64]  # (C, n+1) the cell beyond each facet; -1 outside
+    fluxes: NDArray[np.float64]  # (C, n+1, 3) of each facet, outwards
+    sums: NDArray[np.float64]  # (C, 3) moment sums: their sum over the facets
+    E_shape: NDArray[np.float64]  # (C,) shape energy, see `shape_energy`
+    n_cells: NDArray[np.int64]  # (1,) rows in use
+
+
+class Measure(NamedTuple):
+    """What turns a cell into an energy."""
+
+    prefix: NDArray  # of the sampling grid
+    bits: int
+    hand: int  # sign of the cells' volumes in index space
+    matrix: NDArray[np.float64]  # (3, 3) index vectors to mm
+    geometry: float  # weight of the shape energy: (1 - k_D) / E_G0
+    image: float  # weight of a cell's sum of squares: k_D x voxel volume / E_D0
+    power: float  # p of the shape energy
+
+
+def build(cells: NDArray[np.int64], ticks: NDArray[np.int64], measure: Measure) -> Complex:
+    """The complex of a conforming mesh, everything measured.
+
+    `ticks` is kept, not copied. The cells must be a mesh: at most two to a facet, see `tetopt.geometry.check`.
+    """
+    n_cells, n_corners = cells.shape
+    room = n_cells + n_cells // 4 + 64
+    held = Complex(
+        ticks,
+        np.full((room, n_corners), -1, dtype=np.int64),
+        np.full((room, n_corners), -1, dtype=np.int64),
+        np.zeros((room, n_corners, 3)),
+        np.zeros((room, 3)),
+        np.zeros(room),
+        np.array([n_cells]),
+    )
+    held.cells[:n_cells] = cells
+    fill_across(held.across, held.cells, n_cells, len(ticks))
+    with few_threads(n_cells * 4):
+        measure_all(held, measure)
+    return held
+
+
+def grown(held: Complex) -> Complex:
+    """The complex with room for a quarter more cells."""
+    more = held.n_cells[0] // 4 + 64
+    wider = [
+        np.concatenate([array, np.full((more, *array.shape[1:]), -1, dtype=array.dtype)])
+        for array in (held.cells, held.across, held.fluxes, held.sums, held.E_shape)
+    ]
+    return Complex(held.ticks, *wider, held.n_cells)
+
+
+@njit(cache=True)
+def fill_across(across: NDArray, cells: NDArray, n_cells: int, n_nodes: int) -> None:
+    """The cell beyond each facet, by counting sort over the facets' lowest nodes."""
+    n = cells.shape[1]
+    start = np.zeros(n_nodes + 1, dtype=np.int64)
+    for c in range(n_cells):
+        for k in range(n):
+            lowest = n_nodes
+            for m in range(n):
+                if m != k:
+                    lowest = min(lowest, cells[c, m])
+            start[lowest + 1] += 1
+    for i in range(n_nodes):
+        start[i + 1] += start[i]
+    fill = start.copy()
+    items = np.empty(start[n_nodes], dtype=np.int64)
+    for c in range(n_cells):
+        for k in range(n):
+            lowest = n_nodes
+            for m in range(n):
+                if m != k:
+                    lowest = min(lowest, cells[c, m])
+            items[fill[lowest]] = c * n + k
+            fill[lowest] += 1
+    for i in range(n_nodes):
+        for p in range(start[i], start[i + 1]):
+            c, k = items[p] // n, items[p] % n
+            if across[c, k] >= 0:
+                continue
+            for q in range(p + 1, start[i + 1]):
+                d, m = items[q] // n, items[q] % n
+                same = d != c
+                for s in range(n):
+                    if s != k and same:
+                        found = False
+                        for t in range(n):
+                            if t != m and cells[d, t] == cells[c, s]:
+                                found = True
+                        same = found
+                if same:
+                    across[c, k] = d
+                    across[d, m] = c
+                    break
+
+
+@njit(cache=True, inline="always")
+def facet_of(cells: NDArray, across: NDArray, cell: int, other: int) -> int:
+    """The facet of `cell` beyond which `other` lies."""
+    k = 0
+    while across[cell, k] != other:
+        k += 1
+    return k
+
+
+@njit(cache=True)
+def corner_of(cells: NDArray, cell: int, node: int) -> int:
+    """Which corner of `cell` is `node`."""
+    k = 0
+    while cells[cell, k] != node:
+        k += 1
+    return k
+
+
+@njit(cache=True)
+def flux_of(ticks: NDArray, a: int, b: int, c: int, measure: Measure) -> tuple:
+    """Flux of the facet (a, b, c), or (a, b) with c < 0, times the sign of index space."""
+    if c < 0:
+        f = segment_flux(ticks[a, 1], ticks[a, 2], ticks[b, 1], ticks[b, 2], measure.bits, measure.prefix, None, 0)
+    else:
+        f = triangle_flux(
+            ticks[a, 0], ticks[a, 1], ticks[a, 2], ticks[b, 0], ticks[b, 1], ticks[b, 2],
+            ticks[c, 0], ticks[c, 1], ticks[c, 2], measure.bits, measure.prefix, None, 0,
+        )  # fmt: skip
+    return measure.hand * f[0], measure.hand * f[1], measure.hand * f[2]
+
+
+@njit(cache=True)
+def outward(cells: NDArray, cell: int, k: int) -> tuple:
+    """Nodes of facet k of a cell, turned outwards; the third is -1 in 2-D."""
+    if cells.shape[1] == 3:
+        return cells[cell, (k + 1) % 3], cells[cell, (k + 2) % 3], -1
+    if k == 0:
+        return cells[cell, 1], cells[cell, 2], cells[cell, 3]
+    if k == 1:
+        return cells[cell, 0], cells[cell, 3], cells[cell, 2]
+    if k == 2:
+        return cells[cell, 0], cells[cell, 1], cells[cell, 3]
+    return cells[cell, 0], cells[cell, 2], cells[cell, 1]
+
+
+@njit(cache=True)
+def image_energy(count: float, first: float, second: float) -> float:
+    """Sum of squares around the mean of one cell, from its moment sums."""
+    if count <= 0.0:
+        return 0.0
+    return max(second - first * first / count, 0.0)
+
+
+@njit(cache=True)
+def shape_energy(volume: float, E_G: float, n_corners: int, power: float) -> float:
+    """E_G of one cell times eta^(p - 1); infinite for a flat one.
+
+    eta = S / (12 (3 v)^(2/3)) in 3-D, S / (4 sqrt(3) v) in 2-D, S the sum of the squared edges and v the volume: 1 on
+    the regular cell, infinite on a flat one. E_G,j is proportional to v^(5/3) eta, so it vanishes on a sliver; with
+    p = 1 the energy is the paper's, and for p > 2.5 it grows without bound as a cell goes flat.
+    """
+    S = E_G * (n_corners * (n_corners + 1)) / max(volume, 1e-300)
+    if n_corners == 4:
+        if volume <= FLAT * S * np.sqrt(S):
+            return np.inf
+        if power == 1.0:
+            return E_G
+        eta = S / (12.0 * np.cbrt(9.0 * volume * volume))
+    else:
+        if volume <= FLAT * S:
+            return np.inf
+        if power == 1.0:
+            return E_G
+        eta = S / (6.928203230275509 * volume)
+    if power == 3.0:  # the default: a fifth of the time of the general power
+        return E_G * eta * eta
+    return E_G * eta ** (power - 1.0)
+
+
+@njit(cache=True)
+def load(x: NDArray, row: int, ticks: NDArray, node: int, measure: Measure) -> None:
+    """A node's position in mm, to a row of x."""
+    scale = 2.0**-measure.bits
+    M = measure.matrix
+    for d in range(3):
+        x[row, d] = scale * (M[d, 0] * ticks[node, 0] + M[d, 1] * ticks[node, 1] + M[d, 2] * ticks[node, 2])
+
+
+@njit(cache=True)
+def shape_of_cell(x: NDArray, ticks: NDArray, cells: NDArray, cell: int, measure: Measure) -> float:
+    """Shape energy of a cell of the complex; `x` (4, 3) is room for its corners."""
+    n_corners = cells.shape[1]
+    for k in range(n_corners):
+        load(x, k, ticks, cells[cell, k], measure)
+    volume, E_G = volume_and_E_G(x, n_corners)
+    return shape_energy(volume, E_G, n_corners, measure.power)
+
+
+@njit(cache=True)
+def shape_of_tet(x: NDArray, ticks: NDArray, a: int, b: int, c: int, d: int, measure: Measure) -> float:
+    """Shape energy of the tetrahedron (a, b, c, d); infinite unless it is positively oriented, exactly."""
+    e0, e1, e2 = ticks[b, 0] - ticks[a, 0], ticks[b, 1] - ticks[a, 1], ticks[b, 2] - ticks[a, 2]
+    f0, f1, f2 = ticks[c, 0] - ticks[a, 0], ticks[c, 1] - ticks[a, 1], ticks[c, 2] - ticks[a, 2]
+    n0, n1, n2 = e1 * f2 - e2 * f1, e2 * f0 - e0 * f2, e0 * f1 - e1 * f0
+    side = dot_sign(n0, n1, n2, ticks[d, 0] - ticks[a, 0], ticks[d, 1] - ticks[a, 1], ticks[d, 2] - ticks[a, 2])
+    if side != measure.hand:
+        return np.inf
+    load(x, 0, ticks, a, measure)
+    load(x, 1, ticks, b, measure)
+    load(x, 2, ticks, c, measure)
+    load(x, 3, ticks, d, measure)
+    volume, E_G = volume_and_E_G(x, 4)
+    return shape_energy(volume, E_G, 4, measure.power)
+
+
+@njit(cache=True)
+def shape_of_triangle(x: NDArray, ticks: NDArray, a: int, b: int, c: int, measure: Measure) -> float:
+    """Shape energy of the triangle (a, b, c); infinite unless it is positively oriented, exactly."""
+    e1, e2 = ticks[b, 1] - ticks[a, 1], ticks[b, 2] - ticks[a, 2]
+    f1, f2 = ticks[c, 1] - ticks[a, 1], ticks[c, 2] - ticks[a, 2]
+    area = e1 * f2 - e2 * f1
+    if (1 if area > 0 else -1 if area < 0 else 0) != measure.hand:
+        return np.inf
+    load(x, 0, ticks, a, measure)
+    load(x, 1, ticks, b, measure)
+    load(x, 2, ticks, c, measure)
+    volume, E_G = volume_and_E_G(x, 3)
+    return shape_energy(volume, E_G, 3, measure.power)
+
+
+# numba (0.60 to 0.68) drops what the body of a prange writes through a NamedTuple: such bodies are functions.
+@njit(cache=True, parallel=True)
+def measure_all(held: Complex, measure: Measure) -> None:
+    """Fluxes, sums and shape energies of all cells, afresh. Each facet is measured once, by its lower cell."""
+    n_cells = held.n_cells[0]
+    for chunk in prange((n_cells + CHUNK - 1) // CHUNK):
+        _measure_chunk(held, measure, chunk * CHUNK, min((chunk + 1) * CHUNK, n_cells))
+    for chunk in prange((n_cells + CHUNK - 1) // CHUNK):
+        _sum_chunk(held, chunk * CHUNK, min((chunk + 1) * CHUNK, n_cells))
+
+
+@njit(cache=True)
+def _measure_chunk(held: Complex, measure: Measure, first: int, last: int) -> None:
+    x = np.empty((4, 3))
+    for cell in range(first, last):
+        held.E_shape[cell] = shape_of_cell(x, held.ticks, held.cells, cell, measure)
+        for k in range(held.cells.shape[1]):
+            other = held.across[cell, k]
+            if other > cell or other < 0:
+                a, b, c = outward(held.cells, cell, k)
+                f = flux_of(held.ticks, a, b, c, measure)
+                for d in range(3):
+                    held.fluxes[cell, k, d] = f[d]
+
+
+@njit(cache=True)
+def _sum_chunk(held: Complex, first: int, last: int) -> None:
+    for cell in range(first, last):
+        for k in range(held.cells.shape[1]):
+            other = held.across[cell, k]
+            if 0 <= other < cell:
+                m = facet_of(held.cells, held.across, other, cell)
+                for d in range(3):
+                    held.fluxes[cell, k, d] = -held.fluxes[other, m, d]
+        sum_up(held.sums, held.fluxes, cell)
+
+
+@njit(cache=True)
+def sum_up(sums: NDArray, fluxes: NDArray, cell: int) -> None:
+    """A cell's moment sums from its facets."""
+    for d in range(3):
+        total = 0.0
+        for k in range(fluxes.shape[1]):
+            total += fluxes[cell, k, d]
+        sums[cell, d] = total if d == 0 or sums[cell, 0] > 0.0 else 0.0  # no rounding left without voxels
+
+
+@njit(cache=True)
+def cell_energy(held: Complex, cell: int, measure: Measure) -> float:
+    """A cell's share of E, Eq. (4)."""
+    s = held.sums[cell]
+    return measure.geometry * held.E_shape[cell] + measure.image * image_energy(s[0], s[1], s[2])
+
+
+def energies(held: Complex) -> tuple[float, float]:
+    """Shape energy and sum of squares of the whole complex, summed in the order of the cells."""
+    n_cells = held.n_cells[0]
+    sums = held.sums[:n_cells]
+    within = sums[:, 2] - sums[:, 1] ** 2 / np.maximum(sums[:, 0], 1.0)
+    return float(held.E_shape[:n_cells].sum()), float(np.where(sums[:, 0] > 0.0, np.maximum(within, 0.0), 0.0).sum())
+
+
+# Rings: the cells around each node.
+
+
+class NodeRings(NamedTuple):
+    """The cells around each node, as compressed rows, and which of their facets are one and the same."""
+
+    start: NDArray[np.int64]  # (N+1,)
+    cells: NDArray[np.int64]  # (C(n+1),)
+    corner: NDArray[np.int64]  # (C(n+1),) which corner of the cell is the node
+    twin: NDArray[np.int64]  # (C(n+1), n+1) facet with the node: (entry in the row) (n+1) + its facet there; -1 outside
+
+
+def node_rings(held: Complex) -> NodeRings:
+    """The rings of a complex as it stands."""
+    n_cells, n_corners = int(held.n_cells[0]), held.cells.shape[1]
+    start = np.zeros(len(held.ticks) + 1, dtype=np.int64)
+    cells = np.empty(n_cells * n_corners, dtype=np.int64)
+    corner = np.empty(n_cells * n_corners, dtype=np.int64)
+    twin = np.empty((n_cells * n_corners, n_corners), dtype=np.int64)
+    _fill_rings(start, cells, corner, held.cells, n_cells)
+    with few_threads(n_cells):
+        _fill_twins(twin, start, cells, corner, held.cells, held.across)
+    return NodeRings(start, cells, corner, twin)
+
+
+@njit(cache=True)
+def _fill_rings(start: NDArray, ring: NDArray, corner: NDArray, cells: NDArray, n_cells: int) -> None:
+    n = cells.shape[1]
+    for c in range(n_cells):
+        for k in range(n):
+            start[cells[c, k] + 1] += 1
+    for i in range(len(start) - 1):
+        start[i + 1] += start[i]
+    fill = start.copy()
+    for c in range(n_cells):
+        for k in range(n):
+            node = cells[c, k]
+            ring[fill[node]] = c
+            corner[fill[node]] = k
+            fill[node] += 1
+
+
+@njit(cache=True, parallel=True)
+def _fill_twins(twin: NDArray, start: NDArray, ring: NDArray, corner: NDArray, cells: NDArray, across: NDArray) -> None:
+    n = cells.shape[1]
+    for chunk in prange((len(start) - 1 + CHUNK - 1) // CHUNK):
+        for node in range(chunk * CHUNK, min((chunk + 1) * CHUNK, len(start) - 1)):
+            for r in range(start[node], start[node + 1]):
+                for k in range(n):
+                    twin[r, k] = -1
+                    other = across[ring[r], k]
+                    if k == corner[r] or other < 0:
+                        continue
+                    s = start[node]
+                    while ring[s] != other:
+                        s += 1
+                    twin[r, k] = (s - start[node]) * n + facet_of(cells, across, other, ring[r])
+
+
+@njit(cache=True)
+def node_colours(start: NDArray, ring: NDArray, cells: NDArray) -> NDArray:
+    """Greedy colours, (N,) int64: nodes of one colour share no cell."""
+    colours = np.full(len(start) - 1, -1, dtype=np.int64)
+    taken = np.full(256, -1, dtype=np.int64)
+    for node in range(len(start) - 1):
+        for r in range(start[node], start[node + 1]):
+            for k in range(cells.shape[1]):
+                colour = colours[cells[ring[r], k]]
+                if colour >= 0:
+                    taken[colour] = node
+        colour = 0
+        while taken[colour] == node:
+            colour += 1
+        colours[node] = colour
+    return colours
+
+
+def is_oriented(held: Complex, measure: Measure) -> bool:
+    """Whether every cell is positively oriented, exactly; for tests."""
+    signs = [cell_orientation(held.ticks, held.cells, c) for c in range(int(held.n_cells[0]))]
+    return all(sign == measure.hand for sign in signs)
+
+
+def measure_of(
+    grid: SamplingGrid, hand: int, matrix: NDArray[np.float64], geometry: float, image: float, power: float
+) -> Measure:
+    """A `Measure` of plain numbers, as the kernels are compiled for."""
+    return Measure(grid.prefix, int(grid.bits), int(hand), matrix, float(geometry), float(image), float(power))
+
+
+def threads() -> int:
+    """Threads that kernels may use now."""
+    return int(numba.get_num_threads())

@@ -1,0 +1,627 @@
+"""Exchanging cells for others over the same cavity, where that lowers the combined energy.
+
+"Accept a tessellation only if it decreases the energy" (Section 4 of the paper), cell by cell. Two moves reach every
+tetrahedralization of a small cavity: the face flip, which replaces the two tetrahedra of a facet by three around a new
+edge (2-3), and the removal of an edge, which replaces the m tetrahedra around it by the 2 (m - 2) of the best
+triangulation of the polygon they leave (3-2, 4-4 and upwards), found by dynamic programming over the polygon's
+diagonals (Klincsek 1980; Shewchuk 2002). An edge in a face of the box has an open polygon, closed by a segment in that
+face. In 2-D the edge of two triangles is turned.
+
+What a move is worth is measured for all cells at once, each writing only its own row. Moves are then made one after
+the other, the most worth first, each only if no cell of its cavity has changed since; so the result does not depend on
+the threads, and E falls by what was measured.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from tetopt.energy.sampling import few_threads
+from tetopt.optimize.complex import (
+    Complex,
+    Measure,
+    cell_energy,
+    corner_of,
+    facet_of,
+    flux_of,
+    grown,
+    image_energy,
+    outward,
+    shape_of_tet,
+    shape_of_triangle,
+    sum_up,
+)
+
+MOST = 7  # corners of the largest polygon around an edge that is triangulated anew
+LEAST_GAIN = 1e-9  # of the cavity's energy: a smaller gain may be rounding
+EDGES = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
+CHUNK = 32
+
+
+def flip(held: Complex, measure: Measure, passes: int = 50) -> tuple[Complex, int]:
+    """Make every move that lowers E until none is left, or for some passes; the complex and the number of moves.
+
+    The complex returned may be a wider copy of the one given, which is then out of date.
+    """
+    is_dirty = np.ones(len(held.cells), dtype=np.bool_)
+    done = 0
+    for _ in range(passes):
+        if len(held.cells) - held.n_cells[0] < held.n_cells[0] // 8 + 32:
+            held = grown(held)
+            is_dirty = np.concatenate([is_dirty, np.zeros(len(held.cells) - len(is_dirty), dtype=np.bool_)])
+        n_cells = int(held.n_cells[0])
+        gain, move = np.zeros(n_cells), np.full(n_cells, -1, dtype=np.int64)
+        with few_threads(n_cells * 4):
+            _evaluate(gain, move, is_dirty, held, measure)
+        order = np.flatnonzero(move >= 0)
+        if len(order) == 0:
+            break
+        order = order[np.lexsort((order, -gain[order]))]
+        is_dirty[:] = False
+        made = _make(order, move, is_dirty, held, measure)
+        done += made
+        if made == 0:
+            break
+    return held, done
+
+
+@njit(cache=True, parallel=True)
+def _evaluate(gain: NDArray, move: NDArray, is_dirty: NDArray, held: Complex, measure: Measure) -> None:
+    n_cells = len(gain)
+    for chunk in prange((n_cells + CHUNK - 1) // CHUNK):
+        if held.cells.shape[1] == 3:
+            _evaluate_triangles(gain, move, is_dirty, held, measure, chunk * CHUNK, min((chunk + 1) * CHUNK, n_cells))
+        else:
+            _evaluate_cells(gain, move, is_dirty, held, measure, chunk * CHUNK, min((chunk + 1) * CHUNK, n_cells))
+
+
+@njit(cache=True)
+def _evaluate_cells(
+    gain: NDArray, move: NDArray, is_dirty: NDArray, held: Complex, measure: Measure, first: int, last: int
+) -> None:
+    """The move worth most of each cell: 0 to 3 flips that facet, 4 to 9 removes an edge of `EDGES`."""
+    x = np.empty((4, 3))
+    ring, around = np.empty(MOST, dtype=np.int64), np.empty(MOST, dtype=np.int64)
+    tables = (np.empty((MOST, MOST)), np.empty((MOST, MOST), dtype=np.int64), np.empty((MOST, MOST, MOST)))
+    fluxes = (np.empty((MOST, MOST, 3)), np.empty((MOST, MOST, 3)))
+    for cell in range(first, last):
+        for k in range(4):
+            other = held.across[cell, k]
+            if other > cell and (is_dirty[cell] or is_dirty[other]):
+                worth = _worth_of_face(x, held, cell, k, measure)
+                if worth > gain[cell]:
+                    gain[cell], move[cell] = worth, k
+        for e in range(6):
+            m, is_open = _ring_of_edge(ring, around, held, cell, EDGES[e, 0], EDGES[e, 1])
+            if m == 0:
+                continue
+            dirty = False
+            lowest = cell
+            for r in range(m - is_open):
+                lowest = min(lowest, around[r])
+                dirty = dirty or is_dirty[around[r]]
+            if lowest != cell or not dirty:
+                continue
+            a, b = held.cells[cell, EDGES[e, 0]], held.cells[cell, EDGES[e, 1]]
+            worth = _worth_of_edge(x, tables, fluxes, held, a, b, ring, around, m, is_open, measure)
+            if worth > gain[cell]:
+                gain[cell], move[cell] = worth, 4 + e
+
+
+@njit(cache=True)
+def _worth_of_face(x: NDArray, held: Complex, cell: int, k: int, measure: Measure) -> float:
+    """How much E falls if the facet's two cells become three; 0 or less, or -inf, if not."""
+    other = held.across[cell, k]
+    old = cell_energy(held, cell, measure) + cell_energy(held, other, measure)
+    u, v, w = outward(held.cells, cell, k)
+    p, q = held.cells[cell, k], held.cells[other, facet_of(held.cells, held.across, other, cell)]
+    limit = old * (1.0 - LEAST_GAIN)
+    new = 0.0
+    for a, b in ((u, v), (v, w), (w, u)):
+        new += measure.geometry * shape_of_tet(x, held.ticks, p, q, a, b, measure)
+        if not new < limit:
+            return -np.inf
+    if measure.image == 0.0:
+        return old - new
+    j_u, j_v, j_w = (
+        flux_of(held.ticks, p, q, u, measure), flux_of(held.ticks, p, q, v, measure), flux_of(held.ticks, p, q, w, measure)
+    )  # fmt: skip
+    for a, f_0, f_1 in ((w, j_u, j_v), (u, j_v, j_w), (v, j_w, j_u)):  # a: the corner of the facet that is left out
+        below = held.fluxes[cell, corner_of(held.cells, cell, a)]
+        above = held.fluxes[other, corner_of(held.cells, other, a)]
+        new += measure.image * image_energy(
+            below[0] + above[0] + f_1[0] - f_0[0], below[1] + above[1] + f_1[1] - f_0[1],
+            below[2] + above[2] + f_1[2] - f_0[2],
+        )  # fmt: skip
+        if not new < limit:
+            return -np.inf
+    return old - new
+
+
+@njit(cache=True)
+def _ring_of_edge(ring: NDArray, around: NDArray, held: Complex, cell: int, i: int, j: int) -> tuple:
+    """The cells around the edge of a cell between its corners i and j, and the polygon of their other corners.
+
+    Turning from a to b to the right: cell r holds a, b, ring[r] and ring[r + 1]. Returns the polygon's number of
+    corners, 0 if it is more than `MOST`, and 1 if it is open, that is if the edge is on the boundary; then there is
+    one cell less than corners.
+    """
+    a, b = held.cells[cell, i], held.cells[cell, j]
+    # The other two corners, so that (a, b, v, w) is positively oriented.
+    k, m = -1, -1
+    for c in range(4):
+        if c not in (i, j):
+            if k < 0:
+                k = c
+            else:
+                m = c
+    parity = (i > j) ^ ((i + j) % 2 == 0)  # whether (i, j, k, m), k < m, is an odd permutation
+    if parity:
+        k, m = m, k
+    v, w = held.cells[cell, k], held.cells[cell, m]
+    # Backwards to the first cell, if the boundary is met.
+    current, back = cell, v
+    front = w
+    steps = 0
+    while True:
+        before = held.across[current, corner_of(held.cells, current, front)]  # beyond the facet (a, b, back)
+        if before < 0 or before == cell:
+            break
+        steps += 1
+        if steps > MOST:
+            return 0, 0
+        other = 0
+        for c in range(4):
+            node = held.cells[before, c]
+            if node not in (a, b, back):
+                other = node
+        current, front, back = before, back, other
+    is_open = 1 if held.across[current, corner_of(held.cells, current, front)] < 0 else 0
+    if is_open == 0:
+        current, back, front = cell, v, w
+    first = current
+    count = 0
+    ring[0] = back
+    while True:
+        if count + 1 + is_open > MOST:
+            return 0, 0
+        around[count] = current
+        count += 1
+        after = held.across[current, corner_of(held.cells, current, back)]  # beyond the facet (a, b, front)
+        if after < 0:
+            ring[count] = front
+            return count + 1, 1
+        if after == first:
+            return count, 0
+        ring[count] = front
+        other = 0
+        for c in range(4):
+            node = held.cells[after, c]
+            if node not in (a, b, front):
+                other = node
+        current, back, front = after, front, other
+
+
+@njit(cache=True)
+def _in_one_face(held: Complex, a: int, b: int, c: int, d: int, measure: Measure) -> bool:
+    """Whether four boundary nodes have one index coordinate in common, so that they lie in one face of the box."""
+    t = held.ticks
+    for axis in range(3):
+        at = t[a, axis]
+        if t[b, axis] == at and t[c, axis] == at and t[d, axis] == at:
+            return True
+    return False
+
+
+@njit(cache=True)
+def _worth_of_edge(
+    x: NDArray, tables: tuple, fluxes: tuple, held: Complex, a: int, b: int, ring: NDArray, around: NDArray, m: int,
+    is_open: int, measure: Measure,
+) -> float:  # fmt: skip
+    """How much E falls if the edge (a, b) is removed, -inf if it cannot be; `tables[1]` then holds the diagonals.
+
+    tables[1][i, j] is the corner between i and j of the triangle on the diagonal (i, j), of the best triangulation.
+    """
+    cost, apex, shape = tables
+    side_a, side_b = fluxes
+    if m < 3 or (is_open == 1 and not _in_one_face(held, a, b, ring[0], ring[m - 1], measure)):
+        return -np.inf
+    old = 0.0
+    for r in range(m - is_open):
+        old += cell_energy(held, around[r], measure)
+    limit = old * (1.0 - LEAST_GAIN)
+    # A triangulation's shape energy alone is a lower bound, and cheap.
+    for i in range(m - 2):
+        for k in range(i + 1, m - 1):
+            for j in range(k + 1, m):
+                above = shape_of_tet(x, held.ticks, ring[i], ring[k], ring[j], b, measure)
+                if above < np.inf:
+                    above += shape_of_tet(x, held.ticks, ring[i], ring[j], ring[k], a, measure)
+                shape[i, k, j] = measure.geometry * above
+    if not _best_triangulation(cost, apex, shape, m) < limit:
+        return -np.inf
+    if measure.image == 0.0:
+        return old - cost[0, m - 1]
+    _fill_side_fluxes(side_a, side_b, held, a, b, ring, around, m, is_open, measure)
+    for i in range(m - 2):
+        for k in range(i + 1, m - 1):
+            for j in range(k + 1, m):
+                if shape[i, k, j] < limit:
+                    u = flux_of(held.ticks, ring[i], ring[k], ring[j], measure)
+                    of_b, of_a = side_b[i, k] + side_b[k, j] - side_b[i, j], side_a[i, k] + side_a[k, j] - side_a[i, j]
+                    shape[i, k, j] += measure.image * (
+                        image_energy(of_b[0] - u[0], of_b[1] - u[1], of_b[2] - u[2])
+                        + image_energy(of_a[0] + u[0], of_a[1] + u[1], of_a[2] + u[2])
+                    )
+    new = _best_triangulation(cost, apex, shape, m)
+    return old - new if new < limit else -np.inf
+
+
+@njit(cache=True)
+def _best_triangulation(cost: NDArray, apex: NDArray, triangle: NDArray, m: int) -> float:
+    """Least sum of `triangle[i, k, j]` over the triangulations of a polygon of m corners; `apex` is filled."""
+    for i in range(m - 1):
+        cost[i, i + 1] = 0.0
+    for length in range(2, m):
+        for i in range(m - length):
+            j = i + length
+            cost[i, j] = np.inf
+            apex[i, j] = -1
+            for k in range(i + 1, j):
+                total = cost[i, k] + cost[k, j] + triangle[i, k, j]
+                if total < cost[i, j]:
+                    cost[i, j] = total
+                    apex[i, j] = k
+    return cost[0, m - 1]
+
+
+@njit(cache=True)
+def _fill_side_fluxes(
+    side_a: NDArray, side_b: NDArray, held: Complex, a: int, b: int, ring: NDArray, around: NDArray, m: int,
+    is_open: int, measure: Measure,
+) -> None:  # fmt: skip
+    """Fluxes of the facets (v_i, v_j, b) and (v_j, v_i, a): from the old cells along the polygon, measured inside."""
+    for i in range(m - 1):
+        for j in range(i + 1, m):
+            if j == i + 1 or (i == 0 and j == m - 1 and is_open == 0):
+                r, sign = (i, 1.0) if j == i + 1 else (m - 1, -1.0)
+                cell = around[r]
+                for d in range(3):
+                    side_b[i, j, d] = sign * held.fluxes[cell, corner_of(held.cells, cell, a), d]
+                    side_a[i, j, d] = sign * held.fluxes[cell, corner_of(held.cells, cell, b), d]
+            else:
+                f, g = (
+                    flux_of(held.ticks, ring[i], ring[j], b, measure),
+                    flux_of(held.ticks, ring[j], ring[i], a, measure),
+                )
+                for d in range(3):
+                    side_b[i, j, d], side_a[i, j, d] = f[d], g[d]
+
+
+# Making the moves.
+
+
+@njit(cache=True)
+def _make(order: NDArray, move: NDArray, is_dirty: NDArray, held: Complex, measure: Measure) -> int:
+    """Make the moves of the cells in `order` whose cavities are as they were; the number made.
+
+    Cells of a cavity that changed are marked dirty, and those left over are taken out at the end.
+    """
+    x = np.empty((4, 3))
+    ring, around = np.empty(MOST, dtype=np.int64), np.empty(MOST, dtype=np.int64)
+    tables = (np.empty((MOST, MOST)), np.empty((MOST, MOST), dtype=np.int64), np.empty((MOST, MOST, MOST)))
+    fluxes = (np.empty((MOST, MOST, 3)), np.empty((MOST, MOST, 3)))
+    room = len(held.cells)
+    free = np.empty(room, dtype=np.int64)
+    n_free, made = 0, 0
+    new_cells = np.empty(2 * MOST, dtype=np.int64)
+    for number in range(len(order)):
+        cell = order[number]
+        if is_dirty[cell] or held.n_cells[0] + 2 * MOST > room:
+            continue
+        if held.cells.shape[1] == 3:
+            other = held.across[cell, move[cell]]
+            if not is_dirty[other]:
+                _turn_edge(held, cell, move[cell], measure)
+                is_dirty[cell] = is_dirty[other] = True
+                made += 1
+            continue
+        if move[cell] < 4:
+            other = held.across[cell, move[cell]]
+            if is_dirty[other]:
+                continue
+            n_free = _take(new_cells, 3, cell, other, free, n_free, held)
+            _flip_face(held, cell, move[cell], new_cells, measure, x)
+            for r in range(3):
+                is_dirty[new_cells[r]] = True
+        else:
+            e = move[cell] - 4
+            m, is_open = _ring_of_edge(ring, around, held, cell, EDGES[e, 0], EDGES[e, 1])
+            clean = m > 0
+            for r in range(m - is_open):
+                clean = clean and not is_dirty[around[r]]
+            if not clean:
+                continue
+            a, b = held.cells[cell, EDGES[e, 0]], held.cells[cell, EDGES[e, 1]]
+            _worth_of_edge(x, tables, fluxes, held, a, b, ring, around, m, is_open, measure)
+            n_old, n_new = m - is_open, 2 * (m - 2)
+            for r in range(n_old, n_new):  # more cells than before: from the pile, or from the end
+                if n_free > 0:
+                    n_free -= 1
+                    new_cells[r] = free[n_free]
+                else:
+                    new_cells[r] = held.n_cells[0]
+                    held.n_cells[0] += 1
+            for r in range(min(n_old, n_new)):
+                new_cells[r] = around[r]
+            _remove_edge(held, a, b, ring, around, m, is_open, tables[1], fluxes, new_cells, measure, x)
+            for r in range(n_new, n_old):
+                held.cells[around[r], 0] = -1
+                is_dirty[around[r]] = True
+                free[n_free] = around[r]
+                n_free += 1
+            for r in range(n_new):
+                is_dirty[new_cells[r]] = True
+        made += 1
+    _close_gaps(held, is_dirty)
+    return made
+
+
+@njit(cache=True)
+def _take(new_cells: NDArray, count: int, cell: int, other: int, free: NDArray, n_free: int, held: Complex) -> int:
+    """Numbers for the cells of a face flip: the two it replaces and one more."""
+    new_cells[0], new_cells[1] = cell, other
+    if n_free > 0:
+        new_cells[2] = free[n_free - 1]
+        return n_free - 1
+    new_cells[2] = held.n_cells[0]
+    held.n_cells[0] += 1
+    return n_free
+
+
+@njit(cache=True)
+def _link(held: Complex, cell: int, k: int, other: int, old: int) -> None:
+    """Let facet k of `cell` and the facet of `other` that led to `old` lead to one another."""
+    held.across[cell, k] = other
+    if other >= 0:
+        m = facet_of(held.cells, held.across, other, old)
+        held.across[other, m] = cell
+
+
+@njit(cache=True)
+def _finish(held: Complex, cell: int, measure: Measure, x: NDArray) -> None:
+    """Sums and shape of a cell whose corners and fluxes are set."""
+    c = held.cells[cell]
+    held.E_shape[cell] = shape_of_tet(x, held.ticks, c[0], c[1], c[2], c[3], measure)
+    sum_up(held.sums, held.fluxes, cell)
+
+
+@njit(cache=True)
+def _flip_face(held: Complex, cell: int, k: int, new: NDArray, measure: Measure, x: NDArray) -> None:
+    """Two cells become three around the edge (p, q) of the corners across their facet (u, v, w)."""
+    other = held.across[cell, k]
+    u, v, w = outward(held.cells, cell, k)
+    p, q = held.cells[cell, k], held.cells[other, facet_of(held.cells, held.across, other, cell)]
+    corner = np.array([u, v, w])
+    below, above = np.empty((3, 3)), np.empty((3, 3))  # fluxes of the facets opposite u, v, w
+    under, over = np.empty(3, dtype=np.int64), np.empty(3, dtype=np.int64)  # the cells beyond them
+    for r in range(3):
+        i, j = corner_of(held.cells, cell, corner[r]), corner_of(held.cells, other, corner[r])
+        under[r], over[r] = held.across[cell, i], held.across[other, j]
+        below[r], above[r] = held.fluxes[cell, i], held.fluxes[other, j]
+    spoke = np.zeros((3, 3))
+    if measure.image > 0.0:
+        for r in range(3):
+            f = flux_of(held.ticks, p, q, corner[r], measure)
+            for d in range(3):
+                spoke[r, d] = f[d]
+    # The facets of the neighbours that lead here, before anything is overwritten.
+    under_k, over_k = np.full(3, -1, dtype=np.int64), np.full(3, -1, dtype=np.int64)
+    for r in range(3):
+        if under[r] >= 0:
+            under_k[r] = facet_of(held.cells, held.across, under[r], cell)
+        if over[r] >= 0:
+            over_k[r] = facet_of(held.cells, held.across, over[r], other)
+    for r in range(3):  # cell r: (p, q, corner r, corner r + 1), opposite corner r + 2
+        s, t = (r + 1) % 3, (r + 2) % 3
+        c = new[r]
+        held.cells[c, 0], held.cells[c, 1], held.cells[c, 2], held.cells[c, 3] = p, q, corner[r], corner[s]
+        held.across[c, 0], held.across[c, 1], held.across[c, 2], held.across[c, 3] = over[t], under[t], new[s], new[t]
+        for d in range(3):
+            held.fluxes[c, 0, d], held.fluxes[c, 1, d] = above[t, d], below[t, d]
+            held.fluxes[c, 2, d], held.fluxes[c, 3, d] = spoke[s, d], -spoke[r, d]
+        if over[t] >= 0:
+            held.across[over[t], over_k[t]] = c
+        if under[t] >= 0:
+            held.across[under[t], under_k[t]] = c
+        _finish(held, c, measure, x)
+
+
+@njit(cache=True)
+def _remove_edge(
+    held: Complex, a: int, b: int, ring: NDArray, around: NDArray, m: int, is_open: int, apex: NDArray, fluxes: tuple,
+    new: NDArray, measure: Measure, x: NDArray,
+) -> None:  # fmt: skip
+    """The cells around (a, b) become pairs over the triangles of the polygon; see `_worth_of_edge`.
+
+    Over the triangle (i, k, j), i < k < j: (v_i, v_k, v_j, b) and (v_i, v_j, v_k, a).
+    """
+    side_a, side_b = fluxes
+    # What lies beyond the polygon's sides, and by which facet it leads here.
+    beyond_a, beyond_b = np.full((m, 2), -1, dtype=np.int64), np.full((m, 2), -1, dtype=np.int64)
+    for r in range(m - is_open):
+        cell = around[r]
+        for which in range(2):
+            k = corner_of(held.cells, cell, b if which == 0 else a)
+            other = held.across[cell, k]
+            if other >= 0:
+                facet = facet_of(held.cells, held.across, other, cell)
+                if which == 0:
+                    beyond_a[r, 0], beyond_a[r, 1] = other, facet
+                else:
+                    beyond_b[r, 0], beyond_b[r, 1] = other, facet
+    # The triangle under each diagonal (i, j), numbered; its two cells are new[2 t] and new[2 t + 1].
+    stack_i, stack_j = np.empty(2 * m, dtype=np.int64), np.empty(2 * m, dtype=np.int64)
+    stack_up = np.empty(2 * m, dtype=np.int64)  # (triangle above) * 4 + its facet towards this one
+    stack_i[0], stack_j[0], stack_up[0] = 0, m - 1, -1
+    height, count = 1, 0
+    while height > 0:
+        height -= 1
+        i, j, up = stack_i[height], stack_j[height], stack_up[height]
+        if j == i + 1:
+            continue
+        k = apex[i, j]
+        t = count
+        count += 1
+        top, low = new[2 * t], new[2 * t + 1]  # of b, of a
+        held.cells[top, 0], held.cells[top, 1], held.cells[top, 2], held.cells[top, 3] = ring[i], ring[k], ring[j], b
+        held.cells[low, 0], held.cells[low, 1], held.cells[low, 2], held.cells[low, 3] = ring[i], ring[j], ring[k], a
+        held.across[top, 3], held.across[low, 3] = low, top
+        u = (0.0, 0.0, 0.0)
+        if measure.image > 0.0:
+            u = flux_of(held.ticks, ring[i], ring[k], ring[j], measure)
+        for d in range(3):
+            held.fluxes[top, 3, d], held.fluxes[low, 3, d] = -u[d], u[d]
+            if measure.image > 0.0:
+                held.fluxes[top, 0, d], held.fluxes[low, 0, d] = side_b[k, j, d], side_a[k, j, d]
+                held.fluxes[top, 2, d], held.fluxes[low, 1, d] = side_b[i, k, d], side_a[i, k, d]
+                held.fluxes[top, 1, d], held.fluxes[low, 2, d] = -side_b[i, j, d], -side_a[i, j, d]
+        # The side (i, j): the triangle above, or beyond the closing side of the polygon.
+        if up >= 0:
+            held.across[top, 1], held.across[low, 2] = new[2 * (up // 4)], new[2 * (up // 4) + 1]
+        elif is_open == 1:
+            held.across[top, 1] = held.across[low, 2] = -1
+        else:
+            held.across[top, 1], held.across[low, 2] = beyond_b[m - 1, 0], beyond_a[m - 1, 0]
+            if beyond_b[m - 1, 0] >= 0:
+                held.across[beyond_b[m - 1, 0], beyond_b[m - 1, 1]] = top
+            if beyond_a[m - 1, 0] >= 0:
+                held.across[beyond_a[m - 1, 0], beyond_a[m - 1, 1]] = low
+        if up >= 0:  # and back: the facet of the cells above that this one lies beyond
+            facet = up % 4
+            held.across[new[2 * (up // 4)], facet] = top
+            held.across[new[2 * (up // 4) + 1], 0 if facet == 0 else 1] = low
+        # The sides (i, k) and (k, j): a side of the polygon, or a diagonal still to come.
+        for which in range(2):
+            p, q = (i, k) if which == 0 else (k, j)
+            facet_top, facet_low = (2, 1) if which == 0 else (0, 0)
+            if q == p + 1:
+                held.across[top, facet_top], held.across[low, facet_low] = beyond_b[p, 0], beyond_a[p, 0]
+                if beyond_b[p, 0] >= 0:
+                    held.across[beyond_b[p, 0], beyond_b[p, 1]] = top
+                if beyond_a[p, 0] >= 0:
+                    held.across[beyond_a[p, 0], beyond_a[p, 1]] = low
+            else:
+                stack_i[height], stack_j[height], stack_up[height] = p, q, 4 * t + facet_top
+                height += 1
+    for r in range(2 * count):
+        _finish(held, new[r], measure, x)
+
+
+@njit(cache=True)
+def _close_gaps(held: Complex, is_dirty: NDArray) -> None:
+    """Move the last cells into the places of those that were taken out."""
+    n = held.cells.shape[1]
+    last = held.n_cells[0] - 1
+    cell = 0
+    while cell <= last:
+        if held.cells[cell, 0] >= 0:
+            cell += 1
+            continue
+        while last > cell and held.cells[last, 0] < 0:
+            last -= 1
+        if last == cell:
+            last -= 1
+            break
+        held.cells[cell] = held.cells[last]
+        held.across[cell] = held.across[last]
+        held.fluxes[cell] = held.fluxes[last]
+        held.sums[cell] = held.sums[last]
+        held.E_shape[cell] = held.E_shape[last]
+        is_dirty[cell] = is_dirty[last]
+        for k in range(n):
+            other = held.across[cell, k]
+            if other >= 0:
+                held.across[other, facet_of(held.cells, held.across, other, last)] = cell
+        held.cells[last, 0] = -1
+        last -= 1
+    held.n_cells[0] = last + 1
+
+
+# Triangles.
+
+
+@njit(cache=True)
+def _evaluate_triangles(
+    gain: NDArray, move: NDArray, is_dirty: NDArray, held: Complex, measure: Measure, first: int, last: int
+) -> None:
+    x = np.empty((4, 3))
+    for cell in range(first, last):
+        for k in range(3):
+            other = held.across[cell, k]
+            if other > cell and (is_dirty[cell] or is_dirty[other]):
+                worth = _worth_of_turn(x, held, cell, k, measure)
+                if worth > gain[cell]:
+                    gain[cell], move[cell] = worth, k
+
+
+@njit(cache=True)
+def _worth_of_turn(x: NDArray, held: Complex, cell: int, k: int, measure: Measure) -> float:
+    """How much E falls if the edge (u, v) between two triangles is turned to (p, q); -inf if it cannot be."""
+    other = held.across[cell, k]
+    m = facet_of(held.cells, held.across, other, cell)
+    p, q = held.cells[cell, k], held.cells[other, m]
+    u, v = held.cells[cell, (k + 1) % 3], held.cells[cell, (k + 2) % 3]
+    old = cell_energy(held, cell, measure) + cell_energy(held, other, measure)
+    limit = old * (1.0 - LEAST_GAIN)
+    new = measure.geometry * shape_of_triangle(x, held.ticks, p, u, q, measure)
+    if new < limit:
+        new += measure.geometry * shape_of_triangle(x, held.ticks, p, q, v, measure)
+    if not new < limit:
+        return -np.inf
+    if measure.image > 0.0:
+        f = flux_of(held.ticks, p, q, -1, measure)
+        f_pu, f_uq = held.fluxes[cell, (k + 2) % 3], held.fluxes[other, (m + 1) % 3]
+        f_qv, f_vp = held.fluxes[other, (m + 2) % 3], held.fluxes[cell, (k + 1) % 3]
+        new += measure.image * (
+            image_energy(f_pu[0] + f_uq[0] - f[0], f_pu[1] + f_uq[1] - f[1], f_pu[2] + f_uq[2] - f[2])
+            + image_energy(f_qv[0] + f_vp[0] + f[0], f_qv[1] + f_vp[1] + f[1], f_qv[2] + f_vp[2] + f[2])
+        )
+    return old - new if new < limit else -np.inf
+
+
+@njit(cache=True)
+def _turn_edge(held: Complex, cell: int, k: int, measure: Measure) -> None:
+    """Triangles (p, u, v) and (q, v, u) become (p, u, q) and (p, q, v)."""
+    other = held.across[cell, k]
+    m = facet_of(held.cells, held.across, other, cell)
+    p, q = held.cells[cell, k], held.cells[other, m]
+    u, v = held.cells[cell, (k + 1) % 3], held.cells[cell, (k + 2) % 3]
+    # Facets by their edge: (p, u), (u, q), (q, v), (v, p), and the cells beyond.
+    at_pu, at_uq, at_qv, at_vp = (k + 2) % 3, (m + 1) % 3, (m + 2) % 3, (k + 1) % 3
+    f_pu, f_vp = held.fluxes[cell, at_pu].copy(), held.fluxes[cell, at_vp].copy()
+    f_uq, f_qv = held.fluxes[other, at_uq].copy(), held.fluxes[other, at_qv].copy()
+    n_pu, n_vp = held.across[cell, at_pu], held.across[cell, at_vp]
+    n_uq, n_qv = held.across[other, at_uq], held.across[other, at_qv]
+    if n_uq >= 0:
+        held.across[n_uq, facet_of(held.cells, held.across, n_uq, other)] = cell
+    if n_vp >= 0:
+        held.across[n_vp, facet_of(held.cells, held.across, n_vp, cell)] = other
+    f = (0.0, 0.0, 0.0)
+    if measure.image > 0.0:
+        f = flux_of(held.ticks, p, q, -1, measure)
+    held.cells[cell, 0], held.cells[cell, 1], held.cells[cell, 2] = p, u, q
+    held.cells[other, 0], held.cells[other, 1], held.cells[other, 2] = p, q, v
+    held.across[cell, 0], held.across[cell, 1], held.across[cell, 2] = n_uq, other, n_pu
+    held.across[other, 0], held.across[other, 1], held.across[other, 2] = n_qv, n_vp, cell
+    for d in range(3):
+        held.fluxes[cell, 0, d], held.fluxes[cell, 1, d], held.fluxes[cell, 2, d] = f_uq[d], -f[d], f_pu[d]
+        held.fluxes[other, 0, d], held.fluxes[other, 1, d], held.fluxes[other, 2, d] = f_qv[d], f_vp[d], f[d]
+    x = np.empty((4, 3))
+    for c in (cell, other):
+        held.E_shape[c] = shape_of_triangle(
+            x, held.ticks, held.cells[c, 0], held.cells[c, 1], held.cells[c, 2], measure
+        )
+        sum_up(held.sums, held.fluxes, c)

@@ -1,0 +1,337 @@
+"""Moving nodes along the analytic gradient of E, a colour at a time.
+
+The shape energy's derivative is in closed form. That of E_D, connectivity fixed, needs only the facets around the
+node: with hbar_j the mean of cell j, dE_D/dx_a is the sum over the cells of the integral of (h - hbar_j)^2 phi_a n
+over their facets, phi_a the node's hat function and n the outward normal; hbar's own change drops out, because it is
+the minimiser. Two cells share a facet with opposite normals, so what counts is (h - hbar_j)^2 - (h - hbar_i)^2.
+
+Nodes of one colour share no cell, so each is moved, and its ring rewritten, at the same time as the others; the result
+does not depend on the threads. A move is made only if no cell of the ring loses its orientation (exactly, in integers)
+and the ring's measured energy falls, so E never rises.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from tetopt.energy.geometric import volume_and_E_G
+from tetopt.energy.sampling import cell_orientation, few_threads
+from tetopt.optimize.complex import (
+    Complex,
+    Measure,
+    NodeRings,
+    cell_energy,
+    flux_of,
+    image_energy,
+    load,
+    outward,
+    shape_energy,
+    sum_up,
+)
+
+POINTS = 8  # most parts that a facet's edge is cut into when h is integrated over it
+SPACING = 2.0  # voxels between such points
+REACH = 0.5  # of the distance to the nearest centroid of the ring's cells: the longest first step
+TRIES = 3  # energies measured along the gradient, at most
+
+
+def sweep(
+    held: Complex, rings: NodeRings, nodes: NDArray[np.int64], is_frozen: NDArray[np.bool_], measure: Measure,
+    projections: NDArray[np.float64],
+) -> None:  # fmt: skip
+    """Move each of `nodes`, all of one colour; `projections` are `free_projections(matrix)`."""
+    inverse = np.linalg.inv(measure.matrix)
+    with few_threads(len(nodes) * 100):
+        _sweep(held, rings, nodes, is_frozen, measure, projections, inverse)
+
+
+def gradient(held: Complex, rings: NodeRings, measure: Measure) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Derivatives of the two weighted terms of E by every node's position, (N, 3) each, per mm: shape and image."""
+    shape, image = np.zeros((len(held.ticks), 3)), np.zeros((len(held.ticks), 3))
+    _gradients(shape, image, held, rings, measure, np.linalg.inv(measure.matrix))
+    return shape, image
+
+
+@njit(cache=True)
+def _facet_moments(ticks: NDArray, node: int, b: int, c: int, measure: Measure) -> tuple:
+    """Means of phi and h phi over the facet (node, b, c), or the segment (node, b), phi the node's hat function.
+
+    h is the voxel's value less the grid's shift; 1/3 (1/2 in 2-D) is the mean of phi itself.
+    """
+    prefix = measure.prefix
+    scale = 2.0**-measure.bits
+    a0, a1, a2 = ticks[node, 0] * scale, ticks[node, 1] * scale, ticks[node, 2] * scale
+    e0, e1, e2 = ticks[b, 0] * scale - a0, ticks[b, 1] * scale - a1, ticks[b, 2] * scale - a2
+    most_i, most_j, most_k = prefix.shape[0] - 1, prefix.shape[1] - 1, prefix.shape[2] - 2
+    weight, moment = 0.0, 0.0
+    if c < 0:
+        length = np.sqrt(e1 * e1 + e2 * e2)
+        parts = min(max(int(length / SPACING) + 1, 2), 4 * POINTS)
+        for p in range(parts):
+            s = (p + 0.5) / parts
+            j = min(max(int(np.rint(a1 + s * e1)), 0), most_j)
+            k = min(max(int(np.rint(a2 + s * e2)), 0), most_k)
+            phi = 1.0 - s
+            weight += phi
+            moment += phi * (prefix[0, j, k + 1, 0] - prefix[0, j, k, 0])
+        return weight / parts, moment / parts
+    f0, f1, f2 = ticks[c, 0] * scale - a0, ticks[c, 1] * scale - a1, ticks[c, 2] * scale - a2
+    longest = max(e0 * e0 + e1 * e1 + e2 * e2, f0 * f0 + f1 * f1 + f2 * f2)
+    parts = min(max(int(np.sqrt(longest) / SPACING) + 1, 2), POINTS)
+    for p in range(parts):
+        for q in range(parts - p):
+            for half in range(2):
+                if half == 1 and p + q == parts - 1:
+                    continue
+                s = (p + (1.0 + half) / 3.0) / parts
+                t = (q + (1.0 + half) / 3.0) / parts
+                i = min(max(int(np.rint(a0 + s * e0 + t * f0)), 0), most_i)
+                j = min(max(int(np.rint(a1 + s * e1 + t * f1)), 0), most_j)
+                k = min(max(int(np.rint(a2 + s * e2 + t * f2)), 0), most_k)
+                phi = 1.0 - s - t
+                weight += phi
+                moment += phi * (prefix[i, j, k + 1, 0] - prefix[i, j, k, 0])
+    return weight / (parts * parts), moment / (parts * parts)
+
+
+@njit(cache=True)
+def _add_image_gradient(
+    g: NDArray, held: Complex, rings: NodeRings, node: int, measure: Measure, inverse: NDArray
+) -> None:
+    """Add the derivative of the weighted E_D by a node's position to g (3,), per mm."""
+    n = held.cells.shape[1]
+    scale = 2.0**-measure.bits
+    first = rings.start[node]
+    t = held.ticks
+    g0, g1, g2 = 0.0, 0.0, 0.0
+    for r in range(first, rings.start[node + 1]):
+        cell = rings.cells[r]
+        for k in range(n):
+            twin = rings.twin[r, k]
+            if k == rings.corner[r] or twin < 0 or twin // n < r - first:
+                continue  # not a facet of the node; on the boundary, along which the node slides; or done
+            other = rings.cells[first + twin // n]
+            count_1, count_2 = held.sums[cell, 0], held.sums[other, 0]
+            if count_1 <= 0.0 or count_2 <= 0.0:
+                continue
+            mean_1, mean_2 = held.sums[cell, 1] / count_1, held.sums[other, 1] / count_2
+            a, b, c = outward(held.cells, cell, k)
+            if n == 3:  # the segment (a, b), its normal to the right; phi of `node`
+                far = b if a == node else a
+                weight, moment = _facet_moments(t, node, far, -1, measure)
+                n1, n2 = (t[b, 2] - t[a, 2]) * scale, -(t[b, 1] - t[a, 1]) * scale
+                n0 = 0.0
+            else:
+                if b == node:
+                    a, b, c = b, c, a
+                elif c == node:
+                    a, b, c = c, a, b
+                weight, moment = _facet_moments(t, node, b, c, measure)
+                e0, e1, e2 = (t[b, 0] - t[a, 0]) * scale, (t[b, 1] - t[a, 1]) * scale, (t[b, 2] - t[a, 2]) * scale
+                f0, f1, f2 = (t[c, 0] - t[a, 0]) * scale, (t[c, 1] - t[a, 1]) * scale, (t[c, 2] - t[a, 2]) * scale
+                n0, n1, n2 = 0.5 * (e1 * f2 - e2 * f1), 0.5 * (e2 * f0 - e0 * f2), 0.5 * (e0 * f1 - e1 * f0)
+            jump = (mean_2 - mean_1) * (2.0 * moment - (mean_1 + mean_2) * weight)
+            g0 += jump * n0
+            g1 += jump * n1
+            g2 += jump * n2
+    factor = measure.image * measure.hand
+    for d in range(3):
+        g[d] += factor * (inverse[0, d] * g0 + inverse[1, d] * g1 + inverse[2, d] * g2)
+
+
+@njit(cache=True)
+def _add_shape_gradient(g: NDArray, x: NDArray, held: Complex, rings: NodeRings, node: int, measure: Measure) -> float:
+    """Add the derivative of the weighted shape energy to g (3,), per mm; returns a bound of its curvature."""
+    n = held.cells.shape[1]
+    dim = n - 1
+    power = measure.power
+    curvature = 0.0
+    for r in range(rings.start[node], rings.start[node + 1]):
+        cell, at = rings.cells[r], rings.corner[r]
+        for k in range(n):
+            load(x, k, held.ticks, held.cells[cell, k], measure)
+        volume, E_G = volume_and_E_G(x, n)
+        W = held.E_shape[cell]
+        S = E_G * (n * (n + 1)) / volume
+        if n == 4:
+            a, b, c = (at + 1) & 3, (at + 2) & 3, (at + 3) & 3
+            u0, u1, u2 = x[b, 0] - x[a, 0], x[b, 1] - x[a, 1], x[b, 2] - x[a, 2]
+            w0, w1, w2 = x[c, 0] - x[a, 0], x[c, 1] - x[a, 1], x[c, 2] - x[a, 2]
+            v0, v1, v2 = (u1 * w2 - u2 * w1) / 6.0, (u2 * w0 - u0 * w2) / 6.0, (u0 * w1 - u1 * w0) / 6.0
+        else:
+            a, b = (at + 1) % 3, (at + 2) % 3
+            v0, v1, v2 = 0.0, (x[b, 2] - x[a, 2]) / 2.0, (x[a, 1] - x[b, 1]) / 2.0
+        side = v0 * (x[at, 0] - x[a, 0]) + v1 * (x[at, 1] - x[a, 1]) + v2 * (x[at, 2] - x[a, 2])
+        sign = 1.0 if side > 0.0 else -1.0
+        # W is proportional to v^alpha S^p with alpha = 1 - 2 (p - 1) / n.
+        of_volume = sign * (1.0 - 2.0 * (power - 1.0) / dim) / volume
+        of_edges = power / S
+        for d in range(3):
+            apart = 0.0
+            for k in range(n):
+                apart += x[at, d] - x[k, d]
+            g[d] += measure.geometry * W * (of_volume * (v0, v1, v2)[d] + of_edges * 2.0 * apart)
+        curvature += measure.geometry * W * of_edges * 2.0 * n
+    return curvature
+
+
+@njit(cache=True, parallel=True)
+def _gradients(
+    shape: NDArray, image: NDArray, held: Complex, rings: NodeRings, measure: Measure, inverse: NDArray
+) -> None:
+    for node in prange(len(shape)):
+        x = np.empty((4, 3))
+        _add_shape_gradient(shape[node], x, held, rings, node, measure)
+        _add_image_gradient(image[node], held, rings, node, measure, inverse)
+
+
+@njit(cache=True)
+def _ring_energy(
+    limit: float, trial: NDArray, fluxes: NDArray, x: NDArray, node: int, held: Complex, rings: NodeRings,
+    measure: Measure,
+) -> float:  # fmt: skip
+    """Energy of a node's ring as the ticks stand; shapes and facet fluxes go to `trial` (R,), `fluxes` (R, n+1, 3).
+
+    Infinite if a cell is flat or inverted, or once the shapes alone are above `limit`.
+    """
+    n = held.cells.shape[1]
+    first, last = rings.start[node], rings.start[node + 1]
+    energy = 0.0
+    for r in range(first, last):  # cheap refusals before any voxel is read
+        if cell_orientation(held.ticks, held.cells, rings.cells[r]) != measure.hand:
+            return np.inf
+        for k in range(n):
+            load(x, k, held.ticks, held.cells[rings.cells[r], k], measure)
+        volume, E_G = volume_and_E_G(x, n)
+        trial[r - first] = shape_energy(volume, E_G, n, measure.power)
+        energy += measure.geometry * trial[r - first]
+        if energy > limit:
+            return np.inf
+    if measure.image == 0.0:
+        return energy
+    for r in range(first, last):
+        cell = rings.cells[r]
+        s0, s1, s2 = 0.0, 0.0, 0.0
+        for k in range(n):
+            if k == rings.corner[r]:
+                f0, f1, f2 = held.fluxes[cell, k, 0], held.fluxes[cell, k, 1], held.fluxes[cell, k, 2]
+            else:
+                twin = rings.twin[r, k]
+                if 0 <= twin and twin // n < r - first:
+                    f0, f1, f2 = fluxes[r - first, k, 0], fluxes[r - first, k, 1], fluxes[r - first, k, 2]
+                else:
+                    a, b, c = outward(held.cells, cell, k)
+                    f0, f1, f2 = flux_of(held.ticks, a, b, c, measure)
+                    fluxes[r - first, k, 0], fluxes[r - first, k, 1], fluxes[r - first, k, 2] = f0, f1, f2
+                    if twin >= 0:
+                        s, m = twin // n, twin % n
+                        fluxes[s, m, 0], fluxes[s, m, 1], fluxes[s, m, 2] = -f0, -f1, -f2
+            s0 += f0
+            s1 += f1
+            s2 += f2
+        energy += measure.image * image_energy(s0, s1, s2)
+        if energy > limit:
+            return np.inf
+    return energy
+
+
+@njit(cache=True)
+def _nearest_centroid(x: NDArray, node: int, held: Complex, rings: NodeRings, measure: Measure) -> float:
+    """Distance in mm from a node to the nearest centroid of its ring's cells."""
+    n = held.cells.shape[1]
+    nearest = np.inf
+    for r in range(rings.start[node], rings.start[node + 1]):
+        squared = 0.0
+        for k in range(n):
+            load(x, k, held.ticks, held.cells[rings.cells[r], k], measure)
+        for d in range(3):
+            mean = 0.0
+            for k in range(n):
+                mean += x[k, d] / n
+            squared += (mean - x[rings.corner[r], d]) ** 2
+        nearest = min(nearest, squared)
+    return np.sqrt(nearest)
+
+
+@njit(cache=True, parallel=True)
+def _sweep(
+    held: Complex, rings: NodeRings, nodes: NDArray, is_frozen: NDArray, measure: Measure, projections: NDArray,
+    inverse: NDArray,
+) -> None:  # fmt: skip
+    for number in prange(len(nodes)):
+        _move(nodes[number], held, rings, is_frozen, measure, projections, inverse)
+
+
+@njit(cache=True)
+def _move(
+    node: int, held: Complex, rings: NodeRings, is_frozen: NDArray, measure: Measure, projections: NDArray,
+    inverse: NDArray,
+) -> None:  # fmt: skip
+    """Move one node down the gradient of its ring's energy, if that lowers it."""
+    n = held.cells.shape[1]
+    scale = 2.0**-measure.bits
+    M = measure.matrix
+    first, last = rings.start[node], rings.start[node + 1]
+    x, g = np.empty((4, 3)), np.zeros(3)
+    step, moved = np.empty(3), np.empty(3)
+    curvature = _add_shape_gradient(g, x, held, rings, node, measure)
+    if measure.image > 0.0:
+        _add_image_gradient(g, held, rings, node, measure, inverse)
+    P = projections[is_frozen[node, 0] + 2 * is_frozen[node, 1] + 4 * is_frozen[node, 2]]
+    for d in range(3):
+        step[d] = -(P[d, 0] * g[0] + P[d, 1] * g[1] + P[d, 2] * g[2])  # index units
+    for d in range(3):
+        moved[d] = M[d, 0] * step[0] + M[d, 1] * step[1] + M[d, 2] * step[2]  # mm
+    square = moved[0] * moved[0] + moved[1] * moved[1] + moved[2] * moved[2]
+    if not square > 0.0:
+        return
+    slope = -square
+    reach = REACH * _nearest_centroid(x, node, held, rings, measure)
+    t = min(1.0 / curvature, reach / np.sqrt(square))
+    energy = 0.0
+    for r in range(first, last):
+        energy += cell_energy(held, rings.cells[r], measure)
+    here0, here1, here2 = held.ticks[node, 0], held.ticks[node, 1], held.ticks[node, 2]
+    best, best_t = energy, 0.0
+    trial, best_trial = np.empty(last - first), np.empty(last - first)
+    fluxes, best_fluxes = np.empty((last - first, n, 3)), np.empty((last - first, n, 3))
+    for attempt in range(TRIES):
+        held.ticks[node, 0] = here0 + np.int64(np.rint(t * step[0] / scale))
+        held.ticks[node, 1] = here1 + np.int64(np.rint(t * step[1] / scale))
+        held.ticks[node, 2] = here2 + np.int64(np.rint(t * step[2] / scale))
+        limit = np.inf if attempt == 0 else best
+        value = _ring_energy(limit, trial, fluxes, x, node, held, rings, measure)
+        if value < best:
+            best, best_t = value, t
+            trial, best_trial = best_trial, trial
+            fluxes, best_fluxes = best_fluxes, fluxes
+        if attempt > 0 and best_t > 0.0:
+            break
+        if not np.isfinite(value):
+            t *= 0.35
+            continue
+        # The vertex of the parabola with the slope at 0 through this value.
+        bend = value - energy - slope * t
+        vertex = -0.5 * slope * t * t / bend if bend > 0.0 else 2.0 * t
+        if best_t > 0.0:
+            vertex = min(vertex, 2.0 * t)
+            if abs(vertex - t) < 0.25 * t:
+                break
+            t = vertex
+        else:
+            t = min(max(vertex, 0.1 * t), 0.5 * t)
+    held.ticks[node, 0] = here0 + np.int64(np.rint(best_t * step[0] / scale))
+    held.ticks[node, 1] = here1 + np.int64(np.rint(best_t * step[1] / scale))
+    held.ticks[node, 2] = here2 + np.int64(np.rint(best_t * step[2] / scale))
+    if best_t > 0.0:
+        for r in range(first, last):
+            cell = rings.cells[r]
+            held.E_shape[cell] = best_trial[r - first]
+            if measure.image > 0.0:
+                for k in range(n):
+                    if k != rings.corner[r]:
+                        for d in range(3):
+                            held.fluxes[cell, k, d] = best_fluxes[r - first, k, d]
+                sum_up(held.sums, held.fluxes, cell)

@@ -1,0 +1,99 @@
+"""A page of HTML in one file: sections, tables and pictures, without outside references."""
+
+from __future__ import annotations
+
+import base64
+import html
+import struct
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from tetopt.io.files import written_whole
+
+WIDE = 1.4  # a picture wider than this many times its height keeps a readable width on a phone, and scrolls
+
+
+def save_page(path: Path, title: str, sections: Sequence[dict[str, Any]]) -> None:
+    """One HTML file without outside references, whole or not at all.
+
+    Each section has a `title`, a `text`, optionally `tables` (rows of cells, the first the heading) and `pictures`
+    (PNG paths with captions).
+    """
+    parts = []
+    for section in sections:
+        tables = [table_html(rows) for rows in section.get("tables", ()) if rows]
+        pictures = [picture_html(picture, caption) for picture, caption in section.get("pictures", ())]
+        parts.append(section_html(section["title"], [paragraph_html(section["text"]), *tables, *pictures]))
+    write_page(path, title, parts)
+
+
+def write_page(path: Path, title: str, parts: Sequence[str], style: str = "") -> None:
+    """Write markup `parts` under a heading as one HTML file, whole or not at all.
+
+    `parts` and `style` (CSS after the page's own) go in as they are; `title` is text. The page forbids itself all
+    network access (Content-Security-Policy), so that a reference that slipped in is not followed.
+    """
+    head = _HEAD.replace("STYLE", style).replace("TITLE", html.escape(title))
+    with written_whole(path) as temporary:
+        temporary.write_text("\n".join([head, *parts, "</main></body></html>\n"]), encoding="utf-8")
+
+
+def section_html(title: str, parts: Sequence[str]) -> str:
+    """Markup of a section: `title` is text, `parts` are markup."""
+    return "\n".join([f"<section><h2>{html.escape(title)}</h2>", *parts, "</section>"])
+
+
+def paragraph_html(text: str) -> str:
+    """Markup of a paragraph of text."""
+    return f"<p>{html.escape(text)}</p>"
+
+
+def table_html(rows: Sequence[Sequence[str]], caption: str = "") -> str:
+    """Markup of a table of text, the first row its heading; it scrolls sideways on a narrow screen."""
+    head, *body = rows
+    title = f"<caption>{html.escape(caption)}</caption>" if caption else ""
+    lines = [
+        f"<div class='wide'><table>{title}<thead><tr>",
+        *(f"<th>{html.escape(c)}</th>" for c in head),
+        "</tr></thead><tbody>",
+    ]
+    for row in body:
+        lines += ["<tr>", *(f"<td>{html.escape(c)}</td>" for c in row), "</tr>"]
+    return "".join([*lines, "</tbody></table></div>"])
+
+
+def picture_html(path: str | Path, caption: str) -> str:
+    """Markup of a PNG, embedded, with its caption as text and as what a screen reader says."""
+    content = Path(path).read_bytes()
+    width, height = struct.unpack(">II", content[16:24])  # of the IHDR chunk, always the first
+    data = base64.b64encode(content).decode("ascii")
+    alt = html.escape(caption)
+    shape = "wide broad" if width > WIDE * height else "wide"
+    return (
+        f'<figure><div class="{shape}"><img alt="{alt}" width="{width}" height="{height}" '
+        f'src="data:image/png;base64,{data}"></div><figcaption>{alt}</figcaption></figure>'
+    )
+
+
+_HEAD = """<!doctype html>
+<html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
+<meta http-equiv="Content-Security-Policy"
+ content="default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'">
+<title>TITLE</title>
+<style>
+body { font: 16px/1.5 system-ui, sans-serif; color: #222; margin: 0; }
+main { max-width: 1100px; margin: 0 auto; padding: 1rem; }
+h1 { font-size: 1.6rem; } h2 { font-size: 1.2rem; margin-top: 2.2rem; border-top: 1px solid #ddd; padding-top: 1rem; }
+.wide { overflow-x: auto; }
+table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: 0.92rem; }
+caption { text-align: left; font-weight: 600; padding: 0.6rem 0 0.2rem; }
+th, td { padding: 0.25rem 0.7rem; text-align: right; border-bottom: 1px solid #eee; white-space: nowrap; }
+th:first-child, td:first-child { text-align: left; } td:last-child { white-space: normal; }
+figure { margin: 1rem 0; } img { max-width: 100%; height: auto; } figcaption { color: #555; font-size: 0.9rem; }
+@media screen and (max-width: 700px) { .broad img { max-width: none; width: 900px; } }
+@media print {
+  body { font-size: 10pt; } main { max-width: none; padding: 0; } h2 { break-after: avoid; }
+  figure, tr { break-inside: avoid; } img { max-height: 24cm; width: auto; }
+}
+STYLE</style></head><body><main><h1>TITLE</h1>"""

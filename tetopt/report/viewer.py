@@ -1,0 +1,137 @@
+"""A 3-D view that turns, embedded in a page: the opened meshes as data, drawn by `viewer.js` in the browser's WebGL."""
+
+from __future__ import annotations
+
+import base64
+import html
+import json
+from collections.abc import Sequence
+from importlib import resources
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.errors import InputError
+from tetopt.geometry.simplex import centroids
+from tetopt.geometry.topology import boundary_facets, facets
+from tetopt.mesh import Mesh
+
+STYLE = """
+.views { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 320px), 1fr)); gap: 1rem; }
+.views figure { margin: 0; break-inside: avoid; }
+.views canvas { width: 100%; aspect-ratio: 1; display: block; background: #fff; border: 1px solid #ccc;
+  cursor: grab; touch-action: pan-y; }
+.views canvas:focus { outline: 3px solid #0072b2; } .views .failure { color: #a00000; }
+.viewer-buttons button { font: inherit; min-width: 2.6rem; min-height: 2.6rem; margin: 0 0.3rem 0.6rem 0; }
+@media print { .viewer-buttons, .viewer-hint { display: none; }
+  .views { grid-template-columns: repeat(3, 1fr); } .views canvas { border: none; } }
+"""
+HINT = (
+    "Drag to turn; all views turn together. The wheel zooms once a view is clicked; on a touch screen begin sideways "
+    "to turn, and pinch to zoom. Keys: arrows, +, -, 0."
+)
+
+
+class View(NamedTuple):
+    """A surface of triangles to look at."""
+
+    title: str
+    points: NDArray[np.float64]  # (N, 3) world mm
+    triangles: NDArray[np.int64]  # (K, 3), normals pointing out
+    values: NDArray[np.float64]  # (K,) what each triangle's cell holds, drawn in grey
+
+
+def view_of(mesh: Mesh, means: NDArray[np.float64], title: str, centre: NDArray[np.float64] | None = None) -> View:
+    """The surface of a mesh with its right, front, upper octant taken away, so that the inside shows.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        Tetrahedra.
+    means : (M,) float64
+        The value of each cell; a triangle has that of its cell.
+    title : str
+    centre : (3,) float64, optional
+        Where the octant's corner is, world mm; the middle of the mesh's box by default. Whole cells go, those whose
+        centroids lie beyond it.
+
+    Raises
+    ------
+    InputError
+        A mesh of triangles, or another number of means than of cells.
+    """
+    if mesh.ndim != 3:
+        raise InputError(f"{title}: expected a mesh of tetrahedra, got one of triangles")
+    if len(means) != len(mesh.cells):
+        raise InputError(f"{title}: expected one mean for each of {len(mesh.cells)} cells, got {len(means)}")
+    if centre is None:
+        centre = (mesh.points.min(axis=0) + mesh.points.max(axis=0)) / 2.0
+    is_kept = (centroids(mesh.points, mesh.cells) <= centre).any(axis=1)
+    if not np.any(is_kept):
+        is_kept = np.full(len(mesh.cells), True)
+    cells, values = mesh.cells[is_kept], np.asarray(means, dtype=np.float64)[is_kept]
+    found = facets(cells)
+    is_outer = found.n_cells == 1
+    used, triangles = np.unique(boundary_facets(cells), return_inverse=True)
+    return View(title, mesh.points[used], triangles.reshape(-1, 3), values[found.cells[is_outer, 0]])
+
+
+def views_html(views: Sequence[View]) -> str:
+    """Markup of the views side by side, turned together; with their data and script, without outside references.
+
+    A browser without WebGL 2 or scripts says so in words.
+    """
+    if not views:
+        return ""
+    figures = [
+        f'<figure><canvas tabindex="0" role="img" aria-label="{html.escape(_label(view))}"></canvas>'
+        f"<figcaption>{html.escape(view.title)}</figcaption></figure>"
+        for view in views
+    ]
+    # An HTML parser ends a script at "</script" wherever it stands, also in a string.
+    data = json.dumps(_packed(views), allow_nan=False).replace("<", "\\u003c")
+    script = resources.files("tetopt.report").joinpath("viewer.js").read_text(encoding="utf-8")
+    return "\n".join(
+        [
+            f'<p class="viewer-hint">{html.escape(HINT)}</p><div class="viewer-buttons"></div>',
+            '<div class="views">', *figures, "</div>",
+            "<noscript><p>The 3-D views need JavaScript, which is off here.</p></noscript>",
+            f'<script type="application/json" id="views-data">{data}</script>',
+            f"<script>{script}</script>",
+        ]
+    )  # fmt: skip
+
+
+def _label(view: View) -> str:
+    return f"3-D view of {view.title}, opened; drag or press the arrow keys to turn it, plus and minus to zoom"
+
+
+def _packed(views: Sequence[View]) -> list[dict[str, Any]]:
+    """Views in one common box: places as 16-bit integers of its half diagonal, values as bytes of a common range."""
+    corners = np.concatenate([view.points for view in views])
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    radius = max(float(np.linalg.norm(high - low)) / 2.0, 1e-300)
+    darkest, brightest = grey_limits([view.values for view in views])
+    packed = []
+    for view in views:
+        places = np.rint((view.points - (low + high) / 2.0) / radius * 32767.0)
+        tones = np.clip((view.values - darkest) / (brightest - darkest), 0.0, 1.0) * 255.0
+        packed.append(
+            {
+                "points": _base64(places, "<i2"),
+                "triangles": _base64(view.triangles, "<u4"),
+                "tones": _base64(np.rint(tones), "u1"),
+            }
+        )
+    return packed
+
+
+def grey_limits(values: Sequence[NDArray[np.float64]]) -> tuple[float, float]:
+    """What is drawn black and white: close to the extremes of all `values`, and never the same."""
+    low, high = np.percentile(np.concatenate(values), [0.5, 99.5])
+    return (float(low), float(high)) if high > low else (float(low) - 0.5, float(low) + 0.5)
+
+
+def _base64(numbers: NDArray, kind: str) -> str:
+    return base64.b64encode(numbers.astype(kind).tobytes()).decode("ascii")
