@@ -44,6 +44,7 @@ class Measure(NamedTuple):
     geometry: float  # weight of the shape energy: (1 - k_D) / E_G0
     image: float  # weight of a cell's sum of squares: k_D x voxel volume / E_D0
     power: float  # p of the shape energy
+    floor: float  # minus the cosine of the smallest dihedral angle that a move may leave; -1 for none
 
 
 def build(cells: NDArray[np.int64], ticks: NDArray[np.int64], measure: Measure) -> Complex:
@@ -254,6 +255,57 @@ def shape_of_triangle(x: NDArray, ticks: NDArray, a: int, b: int, c: int, measur
     return shape_energy(volume, E_G, 3, measure.power)
 
 
+@njit(cache=True)
+def least_cosine(x: NDArray) -> float:
+    """Minus the cosine of the smallest dihedral angle of the tetrahedron x (4, 3): it grows with the angle; -1 if flat.
+
+    Between faces with outward normals p and q the angle's cosine is -p.q / (|p| |q|).
+    """
+    n = np.empty((4, 3))
+    for k in range(4):
+        a, b, c = (k + 1) & 3, (k + 2) & 3, (k + 3) & 3
+        u0, u1, u2 = x[b, 0] - x[a, 0], x[b, 1] - x[a, 1], x[b, 2] - x[a, 2]
+        w0, w1, w2 = x[c, 0] - x[a, 0], x[c, 1] - x[a, 1], x[c, 2] - x[a, 2]
+        n0, n1, n2 = u1 * w2 - u2 * w1, u2 * w0 - u0 * w2, u0 * w1 - u1 * w0
+        size = np.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
+        if size == 0.0:
+            return -1.0
+        sign = -1.0 if k & 1 else 1.0  # (k+1, k+2, k+3) turns outwards for even k of a positive cell, inwards for odd
+        n[k, 0], n[k, 1], n[k, 2] = sign * n0 / size, sign * n1 / size, sign * n2 / size
+    worst = 1.0
+    for i in range(3):
+        for k in range(i + 1, 4):
+            worst = min(worst, n[i, 0] * n[k, 0] + n[i, 1] * n[k, 1] + n[i, 2] * n[k, 2])
+    return worst
+
+
+@njit(cache=True)
+def cell_quality(x: NDArray, held: Complex, cell: int, measure: Measure) -> float:
+    for k in range(4):
+        load(x, k, held.ticks, held.cells[cell, k], measure)
+    return least_cosine(x)
+
+
+@njit(cache=True)
+def tet_quality(x: NDArray, held: Complex, a: int, b: int, c: int, d: int, measure: Measure) -> float:
+    """As `least_cosine`, of the tetrahedron (a, b, c, d); -2 if it is flat or inverted."""
+    load(x, 0, held.ticks, a, measure)
+    load(x, 1, held.ticks, b, measure)
+    load(x, 2, held.ticks, c, measure)
+    load(x, 3, held.ticks, d, measure)
+    u0, u1, u2 = x[1, 0] - x[0, 0], x[1, 1] - x[0, 1], x[1, 2] - x[0, 2]
+    v0, v1, v2 = x[2, 0] - x[0, 0], x[2, 1] - x[0, 1], x[2, 2] - x[0, 2]
+    w0, w1, w2 = x[3, 0] - x[0, 0], x[3, 1] - x[0, 1], x[3, 2] - x[0, 2]
+    signed = u0 * (v1 * w2 - v2 * w1) + u1 * (v2 * w0 - v0 * w2) + u2 * (v0 * w1 - v1 * w0)
+    volume, E_G = volume_and_E_G(x, 4)
+    S = 20.0 * E_G / max(volume, 1e-300)
+    # World and index space may be mirrored, but a positive cell is positive in the world. FLAT is far above the
+    # rounding of the sign and of the fixed-point grid.
+    if signed <= 0.0 or volume <= 10.0 * FLAT * S * np.sqrt(S):
+        return -2.0
+    return least_cosine(x)
+
+
 # numba (0.60 to 0.68) drops what the body of a prange writes through a NamedTuple: such bodies are functions.
 @njit(cache=True, parallel=True)
 def measure_all(held: Complex, measure: Measure) -> None:
@@ -400,10 +452,11 @@ def is_oriented(held: Complex, measure: Measure) -> bool:
 
 
 def measure_of(
-    grid: SamplingGrid, hand: int, matrix: NDArray[np.float64], geometry: float, image: float, power: float
-) -> Measure:
+    grid: SamplingGrid, hand: int, matrix: NDArray[np.float64], geometry: float, image: float, power: float,
+    min_dihedral: float = 0.0,
+) -> Measure:  # fmt: skip
     """A `Measure` of plain numbers, as the kernels are compiled for."""
-    return Measure(grid.prefix, int(grid.bits), int(hand), matrix, float(geometry), float(image), float(power))
+    return Measure(grid.prefix, int(grid.bits), int(hand), matrix, float(geometry), float(image), float(power), -float(np.cos(np.radians(min_dihedral))))
 
 
 def threads() -> int:

@@ -23,11 +23,13 @@ from tetopt.optimize.complex import (
     Complex,
     Measure,
     cell_energy,
+    cell_quality,
     corner_of,
     facet_of,
     flux_of,
     grown,
     image_energy,
+    least_cosine,
     outward,
     shape_of_tet,
     shape_of_triangle,
@@ -118,10 +120,13 @@ def _worth_of_face(x: NDArray, held: Complex, cell: int, k: int, measure: Measur
     u, v, w = outward(held.cells, cell, k)
     p, q = held.cells[cell, k], held.cells[other, facet_of(held.cells, held.across, other, cell)]
     limit = old * (1.0 - LEAST_GAIN)
+    least = measure.floor
+    if least > -1.0:
+        least = min(least, cell_quality(x, held, cell, measure), cell_quality(x, held, other, measure))
     new = 0.0
     for a, b in ((u, v), (v, w), (w, u)):
         new += measure.geometry * shape_of_tet(x, held.ticks, p, q, a, b, measure)
-        if not new < limit:
+        if not new < limit or (least > -1.0 and least_cosine(x) < least):
             return -np.inf
     if measure.image == 0.0:
         return old - new
@@ -228,17 +233,23 @@ def _worth_of_edge(
     side_a, side_b = fluxes
     if m < 3 or (is_open == 1 and not _in_one_face(held, a, b, ring[0], ring[m - 1], measure)):
         return -np.inf
-    old = 0.0
+    old, least = 0.0, measure.floor
     for r in range(m - is_open):
         old += cell_energy(held, around[r], measure)
+        if least > -1.0:
+            least = min(least, cell_quality(x, held, around[r], measure))
     limit = old * (1.0 - LEAST_GAIN)
     # A triangulation's shape energy alone is a lower bound, and cheap.
     for i in range(m - 2):
         for k in range(i + 1, m - 1):
             for j in range(k + 1, m):
                 above = shape_of_tet(x, held.ticks, ring[i], ring[k], ring[j], b, measure)
+                if least > -1.0 and above < np.inf and least_cosine(x) < least:
+                    above = np.inf
                 if above < np.inf:
                     above += shape_of_tet(x, held.ticks, ring[i], ring[j], ring[k], a, measure)
+                    if least > -1.0 and above < np.inf and least_cosine(x) < least:
+                        above = np.inf
                 shape[i, k, j] = measure.geometry * above
     if not _best_triangulation(cost, apex, shape, m) < limit:
         return -np.inf

@@ -23,8 +23,10 @@ from tetopt.optimize.complex import (
     Measure,
     NodeRings,
     cell_energy,
+    cell_quality,
     flux_of,
     image_energy,
+    least_cosine,
     load,
     outward,
     shape_energy,
@@ -189,12 +191,12 @@ def _gradients(
 
 @njit(cache=True)
 def _ring_energy(
-    limit: float, trial: NDArray, fluxes: NDArray, x: NDArray, node: int, held: Complex, rings: NodeRings,
-    measure: Measure,
+    limit: float, least: float, trial: NDArray, fluxes: NDArray, x: NDArray, node: int, held: Complex,
+    rings: NodeRings, measure: Measure,
 ) -> float:  # fmt: skip
     """Energy of a node's ring as the ticks stand; shapes and facet fluxes go to `trial` (R,), `fluxes` (R, n+1, 3).
 
-    Infinite if a cell is flat or inverted, or once the shapes alone are above `limit`.
+    Infinite if a cell is flat or inverted or has a quality under `least`, or once the energy is above `limit`.
     """
     n = held.cells.shape[1]
     first, last = rings.start[node], rings.start[node + 1]
@@ -204,6 +206,8 @@ def _ring_energy(
             return np.inf
         for k in range(n):
             load(x, k, held.ticks, held.cells[rings.cells[r], k], measure)
+        if least > -1.0 and least_cosine(x) < least:
+            return np.inf
         volume, E_G = volume_and_E_G(x, n)
         trial[r - first] = shape_energy(volume, E_G, n, measure.power)
         energy += measure.geometry * trial[r - first]
@@ -290,9 +294,11 @@ def _move(
     slope = -square
     reach = REACH * _nearest_centroid(x, node, held, rings, measure)
     t = min(1.0 / curvature, reach / np.sqrt(square))
-    energy = 0.0
+    energy, least = 0.0, measure.floor if n == 4 else -1.0
     for r in range(first, last):
         energy += cell_energy(held, rings.cells[r], measure)
+        if least > -1.0:  # a ring below the floor may stay as it is, but not get worse
+            least = min(least, cell_quality(x, held, rings.cells[r], measure))
     here0, here1, here2 = held.ticks[node, 0], held.ticks[node, 1], held.ticks[node, 2]
     best, best_t = energy, 0.0
     trial, best_trial = np.empty(last - first), np.empty(last - first)
@@ -302,7 +308,7 @@ def _move(
         held.ticks[node, 1] = here1 + np.int64(np.rint(t * step[1] / scale))
         held.ticks[node, 2] = here2 + np.int64(np.rint(t * step[2] / scale))
         limit = np.inf if attempt == 0 else best
-        value = _ring_energy(limit, trial, fluxes, x, node, held, rings, measure)
+        value = _ring_energy(limit, least, trial, fluxes, x, node, held, rings, measure)
         if value < best:
             best, best_t = value, t
             trial, best_trial = best_trial, trial
@@ -326,12 +332,21 @@ def _move(
     held.ticks[node, 1] = here1 + np.int64(np.rint(best_t * step[1] / scale))
     held.ticks[node, 2] = here2 + np.int64(np.rint(best_t * step[2] / scale))
     if best_t > 0.0:
-        for r in range(first, last):
-            cell = rings.cells[r]
-            held.E_shape[cell] = best_trial[r - first]
-            if measure.image > 0.0:
-                for k in range(n):
-                    if k != rings.corner[r]:
-                        for d in range(3):
-                            held.fluxes[cell, k, d] = best_fluxes[r - first, k, d]
-                sum_up(held.sums, held.fluxes, cell)
+        _store(held, rings, node, best_trial, best_fluxes, measure)
+
+
+@njit(cache=True)
+def _store(
+    held: Complex, rings: NodeRings, node: int, shapes: NDArray, fluxes: NDArray, measure: Measure
+) -> None:
+    """Write what `_ring_energy` found of a node's ring into the complex."""
+    first = rings.start[node]
+    for r in range(first, rings.start[node + 1]):
+        cell = rings.cells[r]
+        held.E_shape[cell] = shapes[r - first]
+        if measure.image > 0.0:
+            for k in range(held.cells.shape[1]):
+                if k != rings.corner[r]:
+                    for d in range(3):
+                        held.fluxes[cell, k, d] = fluxes[r - first, k, d]
+            sum_up(held.sums, held.fluxes, cell)

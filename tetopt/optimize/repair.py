@@ -1,0 +1,329 @@
+"""The floor on the dihedral angles: the worst cells mended one by one, whatever it does to E, within a budget.
+
+Moves are those of `tetopt.optimize.flips` and displacements of single nodes, but judged by the smallest dihedral angle
+of the cells they touch: a move is made only if that grows (Freitag and Ollivier-Gooch 1997). Of the moves that lift a
+cell over the floor the one is taken that costs least of E.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from tetopt.energy.sampling import cell_orientation
+from tetopt.optimize.complex import (
+    Complex,
+    Measure,
+    NodeRings,
+    cell_energy,
+    cell_quality,
+    facet_of,
+    grown,
+    load,
+    node_rings,
+    outward,
+    shape_of_cell,
+    tet_quality,
+)
+from tetopt.optimize.flips import (
+    EDGES,
+    MOST,
+    _best_triangulation,
+    _close_gaps,
+    _fill_side_fluxes,
+    _flip_face,
+    _in_one_face,
+    _remove_edge,
+    _ring_of_edge,
+)
+from tetopt.optimize.smooth import _ring_energy, _store
+
+ROUNDS = 40
+STEPS = 7  # halvings of a node's displacement
+
+
+class Repaired(NamedTuple):
+    """What `repair` returns."""
+
+    held: Complex
+    n_below: int  # cells still under the floor
+    n_moves: int
+
+
+def qualities(held: Complex, measure: Measure) -> NDArray[np.float64]:
+    """Minus the cosine of each cell's smallest dihedral angle."""
+    found = np.empty(int(held.n_cells[0]))
+    _fill_qualities(found, held, measure)
+    return found
+
+
+@njit(cache=True)
+def _fill_qualities(found: NDArray, held: Complex, measure: Measure) -> None:
+    x = np.empty((4, 3))
+    for cell in range(len(found)):
+        found[cell] = cell_quality(x, held, cell, measure)
+
+
+def repair(
+    held: Complex, is_frozen: NDArray[np.bool_], measure: Measure, projections: NDArray[np.float64], floor: float
+) -> Repaired:
+    """Lift every cell's smallest dihedral angle to `floor`, degrees, as far as moves can.
+
+    Rounds over the cells below, worst first: flips, then displacements of their nodes; until none is left, or a round
+    changes nothing.
+    """
+    target = -np.cos(np.radians(floor))
+    total = 0
+    for _ in range(ROUNDS):
+        bad = _worst_first(held, measure, target)
+        if len(bad) == 0:
+            break
+        if len(held.cells) - held.n_cells[0] < 4 * len(bad) + 64:
+            held = grown(held)
+        made = _reconnect(held, bad, measure, target)
+        bad = _worst_first(held, measure, target)
+        if len(bad):
+            made += _displace(held, node_rings(held), bad, is_frozen, measure, projections, target)
+        total += made
+        if made == 0:
+            break
+    return Repaired(held, len(_worst_first(held, measure, target)), total)
+
+
+def _worst_first(held: Complex, measure: Measure, target: float) -> NDArray[np.int64]:
+    quality = qualities(held, measure)
+    bad = np.flatnonzero(quality < target)
+    return bad[np.lexsort((bad, quality[bad]))]
+
+
+@njit(cache=True)
+def _reconnect(held: Complex, bad: NDArray, measure: Measure, target: float) -> int:
+    """For each bad cell the flip that leaves the best worst angle in its cavity, if it is better than before."""
+    x = np.empty((4, 3))
+    ring, around = np.empty(MOST, dtype=np.int64), np.empty(MOST, dtype=np.int64)
+    cost, apex = np.empty((MOST, MOST)), np.empty((MOST, MOST), dtype=np.int64)
+    shape = np.empty((MOST, MOST, MOST))
+    fluxes = (np.empty((MOST, MOST, 3)), np.empty((MOST, MOST, 3)))
+    room = len(held.cells)
+    is_changed = np.zeros(room, dtype=np.bool_)
+    free = np.empty(room, dtype=np.int64)
+    n_free, made = 0, 0
+    new_cells = np.empty(2 * MOST, dtype=np.int64)
+    for number in range(len(bad)):
+        cell = bad[number]
+        if is_changed[cell] or held.n_cells[0] + 2 * MOST > room:
+            continue
+        best, choice = 1e-4, -1  # the least gain
+        for k in range(4):
+            if held.across[cell, k] >= 0:
+                gain = _gain_of_face(x, held, cell, k, measure, target)
+                if gain > best:
+                    best, choice = gain, k
+        for e in range(6):
+            m, is_open = _ring_of_edge(ring, around, held, cell, EDGES[e, 0], EDGES[e, 1])
+            gain = _gain_of_edge(x, cost, apex, shape, held, cell, e, ring, around, m, is_open, measure, target)
+            if gain > best:
+                best, choice = gain, 4 + e
+        if choice < 0:
+            continue
+        if choice < 4:
+            other = held.across[cell, choice]
+            new_cells[0], new_cells[1] = cell, other
+            if n_free > 0:
+                n_free -= 1
+                new_cells[2] = free[n_free]
+            else:
+                new_cells[2] = held.n_cells[0]
+                held.n_cells[0] += 1
+            _flip_face(held, cell, choice, new_cells, measure, x)
+            for r in range(3):
+                is_changed[new_cells[r]] = True
+        else:
+            e = choice - 4
+            m, is_open = _ring_of_edge(ring, around, held, cell, EDGES[e, 0], EDGES[e, 1])
+            _gain_of_edge(x, cost, apex, shape, held, cell, e, ring, around, m, is_open, measure, target)
+            a, b = held.cells[cell, EDGES[e, 0]], held.cells[cell, EDGES[e, 1]]
+            if measure.image > 0.0:
+                _fill_side_fluxes(fluxes[0], fluxes[1], held, a, b, ring, around, m, is_open, measure)
+            n_old, n_new = m - is_open, 2 * (m - 2)
+            for r in range(n_new):
+                if r < n_old:
+                    new_cells[r] = around[r]
+                elif n_free > 0:
+                    n_free -= 1
+                    new_cells[r] = free[n_free]
+                else:
+                    new_cells[r] = held.n_cells[0]
+                    held.n_cells[0] += 1
+            _remove_edge(held, a, b, ring, around, m, is_open, apex, fluxes, new_cells, measure, x)
+            for r in range(n_new, n_old):
+                held.cells[around[r], 0] = -1
+                is_changed[around[r]] = True
+                free[n_free] = around[r]
+                n_free += 1
+            for r in range(n_new):
+                is_changed[new_cells[r]] = True
+        made += 1
+    _close_gaps(held, is_changed)
+    return made
+
+
+@njit(cache=True)
+def _gain_of_face(x: NDArray, held: Complex, cell: int, k: int, measure: Measure, target: float) -> float:
+    """By how much the worst angle of the cavity (its minus cosine, up to the target) grows in a face flip."""
+    other = held.across[cell, k]
+    old = min(cell_quality(x, held, cell, measure), cell_quality(x, held, other, measure))
+    u, v, w = outward(held.cells, cell, k)
+    p, q = held.cells[cell, k], held.cells[other, facet_of(held.cells, held.across, other, cell)]
+    new = target
+    for a, b in ((u, v), (v, w), (w, u)):
+        new = min(new, tet_quality(x, held, p, q, a, b, measure))
+        if new <= old:
+            return -1.0
+    return new - old
+
+
+@njit(cache=True)
+def _gain_of_edge(
+    x: NDArray, cost: NDArray, apex: NDArray, shape: NDArray, held: Complex, cell: int, e: int, ring: NDArray,
+    around: NDArray, m: int, is_open: int, measure: Measure, target: float,
+) -> float:  # fmt: skip
+    """The same for the removal of an edge; `apex` holds the triangulation."""
+    a, b = held.cells[cell, EDGES[e, 0]], held.cells[cell, EDGES[e, 1]]
+    if m < 3 or (is_open == 1 and not _in_one_face(held, a, b, ring[0], ring[m - 1], measure)):
+        return -1.0
+    old = 1.0
+    for r in range(m - is_open):
+        old = min(old, cell_quality(x, held, around[r], measure))
+    # A steep sum stands for the worst: exp(-40 q) of the worst cell outweighs all others that are 3 degrees better.
+    for i in range(m - 2):
+        for k in range(i + 1, m - 1):
+            for j in range(k + 1, m):
+                above = tet_quality(x, held, ring[i], ring[k], ring[j], b, measure)
+                below = tet_quality(x, held, ring[i], ring[j], ring[k], a, measure)
+                shape[i, k, j] = np.inf
+                if min(above, below) > old:
+                    shape[i, k, j] = np.exp(-40.0 * above) + np.exp(-40.0 * below)
+    if not np.isfinite(_best_triangulation(cost, apex, shape, m)):
+        return -1.0
+    new = target
+    stack = np.empty((2 * m, 2), dtype=np.int64)
+    stack[0, 0], stack[0, 1] = 0, m - 1
+    height = 1
+    while height > 0:
+        height -= 1
+        i, j = stack[height]
+        if j == i + 1:
+            continue
+        k = apex[i, j]
+        new = min(new, tet_quality(x, held, ring[i], ring[k], ring[j], b, measure))
+        new = min(new, tet_quality(x, held, ring[i], ring[j], ring[k], a, measure))
+        stack[height, 0], stack[height, 1] = i, k
+        stack[height + 1, 0], stack[height + 1, 1] = k, j
+        height += 2
+    return new - old
+
+
+@njit(cache=True)
+def _displace(
+    held: Complex, rings: NodeRings, bad: NDArray, is_frozen: NDArray, measure: Measure, projections: NDArray,
+    target: float,
+) -> int:  # fmt: skip
+    """Move the nodes of each bad cell so that the worst angle of their rings grows, up to the target."""
+    x = np.empty((4, 3))
+    made = 0
+    for number in range(len(bad)):
+        for k in range(4):
+            if cell_quality(x, held, bad[number], measure) >= target:
+                break
+            if _lift(x, held, rings, held.cells[bad[number], k], is_frozen, measure, projections, target):
+                made += 1
+    return made
+
+
+@njit(cache=True)
+def _ring_quality(x: NDArray, held: Complex, rings: NodeRings, node: int, measure: Measure, least: float) -> float:
+    """The worst of a ring's cells; -2 if one is flat or inverted, and anything below `least` once that is passed."""
+    worst = 1.0
+    for r in range(rings.start[node], rings.start[node + 1]):
+        if cell_orientation(held.ticks, held.cells, rings.cells[r]) != measure.hand:
+            return -2.0
+        c = held.cells[rings.cells[r]]
+        worst = min(worst, tet_quality(x, held, c[0], c[1], c[2], c[3], measure))
+        if worst < least:
+            return worst
+    return worst
+
+
+@njit(cache=True)
+def _lift(
+    x: NDArray, held: Complex, rings: NodeRings, node: int, is_frozen: NDArray, measure: Measure, projections: NDArray,
+    target: float,
+) -> bool:  # fmt: skip
+    """Search along 26 directions, with ever smaller steps, for a place where the ring's worst angle is larger."""
+    t = held.ticks
+    first, last = rings.start[node], rings.start[node + 1]
+    begin = _ring_quality(x, held, rings, node, measure, -3.0)
+    best = begin
+    start0, start1, start2 = t[node, 0], t[node, 1], t[node, 2]
+    if best >= target:
+        return False
+    # The first step: a fifth of the ring's mean edge.
+    edge, count = 0.0, 0
+    for r in range(first, last):
+        for k in range(4):
+            load(x, k, t, held.cells[rings.cells[r], k], measure)
+        at = rings.corner[r]
+        for k in range(4):
+            if k != at:
+                edge += np.sqrt((x[k, 0] - x[at, 0]) ** 2 + (x[k, 1] - x[at, 1]) ** 2 + (x[k, 2] - x[at, 2]) ** 2)
+                count += 1
+    step = 0.25 * edge / count
+    P = projections[is_frozen[node, 0] + 2 * is_frozen[node, 1] + 4 * is_frozen[node, 2]]
+    scale = 2.0**-measure.bits
+    for _ in range(STEPS):
+        improved = True
+        while improved and best < target:
+            improved = False
+            here0, here1, here2 = t[node, 0], t[node, 1], t[node, 2]
+            there0, there1, there2 = here0, here1, here2
+            for code in range(27):
+                if code == 13:
+                    continue
+                d0, d1, d2 = float(code // 9 - 1), float(code // 3 % 3 - 1), float(code % 3 - 1)
+                size = step / np.sqrt(d0 * d0 + d1 * d1 + d2 * d2) / scale
+                t[node, 0] = here0 + np.int64(np.rint(size * (P[0, 0] * d0 + P[0, 1] * d1 + P[0, 2] * d2)))
+                t[node, 1] = here1 + np.int64(np.rint(size * (P[1, 0] * d0 + P[1, 1] * d1 + P[1, 2] * d2)))
+                t[node, 2] = here2 + np.int64(np.rint(size * (P[2, 0] * d0 + P[2, 1] * d1 + P[2, 2] * d2)))
+                quality = _ring_quality(x, held, rings, node, measure, best)
+                if quality > best + 1e-4:
+                    best = quality
+                    there0, there1, there2 = t[node, 0], t[node, 1], t[node, 2]
+                    improved = True
+            t[node, 0], t[node, 1], t[node, 2] = there0, there1, there2
+        step *= 0.5
+    if best <= begin:
+        t[node, 0], t[node, 1], t[node, 2] = start0, start1, start2
+        return False
+    trial, fluxes = np.empty(last - first), np.empty((last - first, 4, 3))
+    if not np.isfinite(_ring_energy(np.inf, -1.0, trial, fluxes, x, node, held, rings, measure)):
+        t[node, 0], t[node, 1], t[node, 2] = start0, start1, start2
+        return False
+    _store(held, rings, node, trial, fluxes, measure)
+    return True
+
+
+def energy_of(held: Complex, cells: NDArray[np.int64], measure: Measure) -> float:
+    """E of some cells; for tests."""
+    return float(sum(cell_energy(held, int(cell), measure) for cell in cells))
+
+
+def shapes_are_kept(held: Complex, measure: Measure) -> bool:
+    """Whether the stored shape energies are those of the cells; for tests."""
+    x = np.empty((4, 3))
+    return all(
+        shape_of_cell(x, held.ticks, held.cells, c, measure) == held.E_shape[c] for c in range(int(held.n_cells[0]))
+    )
