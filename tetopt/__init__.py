@@ -12,7 +12,8 @@ from tetopt.io.images import load_image, save_image
 from tetopt.io.meshes import cell_fields, load_mesh, save_mesh
 from tetopt.lattice import lattice
 from tetopt.mesh import Mesh
-from tetopt.optimize.paper import optimize
+from tetopt.optimize.fast import optimize
+from tetopt.optimize.paper import optimize_paper
 from tetopt.phantom import load_phantom
 
 __all__ = [
@@ -30,6 +31,7 @@ __all__ = [
     "load_mesh",
     "load_phantom",
     "optimize",
+    "optimize_paper",
     "quality",
     "save_image",
     "save_mesh",

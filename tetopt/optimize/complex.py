@@ -15,8 +15,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from tetopt.energy.geometric import volume_and_E_G
-from tetopt.energy.sampling import SamplingGrid, cell_orientation, dot_sign, few_threads, segment_flux, triangle_flux
+from tetopt.energy.sampling import SamplingGrid, cell_orientation, few_threads, segment_flux, triangle_flux
 
 CHUNK = 64
 FLAT = 1e-7  # a cell's volume over (sum of squared edges)^(n/2); below, it counts as inverted: an angle of 1e-3 degrees
@@ -179,80 +178,90 @@ def image_energy(count: float, first: float, second: float) -> float:
 
 
 @njit(cache=True)
-def shape_energy(volume: float, E_G: float, n_corners: int, power: float) -> float:
-    """E_G of one cell times eta^(p - 1); infinite for a flat one.
+def shape_energy(x: NDArray, n_corners: int, power: float) -> float:
+    """E_G of the cell with corners x (4, 3) times eta^(p - 1); infinite for one that is flat or inverted.
 
     eta = S / (12 (3 v)^(2/3)) in 3-D, S / (4 sqrt(3) v) in 2-D, S the sum of the squared edges and v the volume: 1 on
     the regular cell, infinite on a flat one. E_G,j is proportional to v^(5/3) eta, so it vanishes on a sliver; with
     p = 1 the energy is the paper's, and for p > 2.5 it grows without bound as a cell goes flat.
+
+    Corners come from `load`, which subtracts in integers: rounding of the signed volume is far below `FLAT`, so a cell
+    that passes is positively oriented exactly.
     """
-    S = E_G * (n_corners * (n_corners + 1)) / max(volume, 1e-300)
-    if n_corners == 4:
-        if volume <= FLAT * S * np.sqrt(S):
-            return np.inf
-        if power == 1.0:
-            return E_G
-        eta = S / (12.0 * np.cbrt(9.0 * volume * volume))
-    else:
+    u1, u2 = x[1, 1] - x[0, 1], x[1, 2] - x[0, 2]
+    v1, v2 = x[2, 1] - x[0, 1], x[2, 2] - x[0, 2]
+    if n_corners == 3:
+        volume = 0.5 * (u1 * v2 - u2 * v1)
+        S = u1 * u1 + u2 * u2 + v1 * v1 + v2 * v2 + (u1 - v1) * (u1 - v1) + (u2 - v2) * (u2 - v2)
         if volume <= FLAT * S:
             return np.inf
-        if power == 1.0:
-            return E_G
-        eta = S / (6.928203230275509 * volume)
-    if power == 3.0:  # the default: a fifth of the time of the general power
-        return E_G * eta * eta
-    return E_G * eta ** (power - 1.0)
+        E_G = volume * S / 12.0
+        return E_G if power == 1.0 else E_G * (S / (6.928203230275509 * volume)) ** (power - 1.0)
+    u0, v0 = x[1, 0] - x[0, 0], x[2, 0] - x[0, 0]
+    w0, w1, w2 = x[3, 0] - x[0, 0], x[3, 1] - x[0, 1], x[3, 2] - x[0, 2]
+    volume = (u0 * (v1 * w2 - v2 * w1) + u1 * (v2 * w0 - v0 * w2) + u2 * (v0 * w1 - v1 * w0)) / 6.0
+    if volume <= 0.0:
+        return np.inf
+    # The sum over all pairs of four points is four times the sum over the points less that of their sum, squared.
+    s0, s1, s2 = u0 + v0 + w0, u1 + v1 + w1, u2 + v2 + w2
+    S = 4.0 * (u0 * u0 + u1 * u1 + u2 * u2 + v0 * v0 + v1 * v1 + v2 * v2 + w0 * w0 + w1 * w1 + w2 * w2)
+    S -= s0 * s0 + s1 * s1 + s2 * s2
+    if volume * volume <= FLAT * FLAT * S * S * S:
+        return np.inf
+    E_G = volume * S / 20.0
+    if power == 1.0:
+        return E_G
+    if power == 3.0:  # the default, without the cubic root of a square: eta^2 = S^2 / (144 (3 v)^(4/3))
+        t = 1.0 / np.cbrt(3.0 * volume)
+        t *= t
+        return E_G * S * S * t * t * (1.0 / 144.0)
+    return E_G * (S / (12.0 * np.cbrt(9.0 * volume * volume))) ** (power - 1.0)
+
+
+@njit(cache=True, inline="always")
+def load(x: NDArray, row: int, ticks: NDArray, node: int, base: int, measure: Measure) -> None:
+    """A node's position relative to the node `base`, in mm, to a row of x; subtracted in integers, exactly."""
+    scale = 2.0**-measure.bits
+    M = measure.matrix
+    t0 = scale * (ticks[node, 0] - ticks[base, 0])
+    t1 = scale * (ticks[node, 1] - ticks[base, 1])
+    t2 = scale * (ticks[node, 2] - ticks[base, 2])
+    x[row, 0] = M[0, 0] * t0 + M[0, 1] * t1 + M[0, 2] * t2
+    x[row, 1] = M[1, 0] * t0 + M[1, 1] * t1 + M[1, 2] * t2
+    x[row, 2] = M[2, 0] * t0 + M[2, 1] * t1 + M[2, 2] * t2
 
 
 @njit(cache=True)
-def load(x: NDArray, row: int, ticks: NDArray, node: int, measure: Measure) -> None:
-    """A node's position in mm, to a row of x."""
-    scale = 2.0**-measure.bits
-    M = measure.matrix
-    for d in range(3):
-        x[row, d] = scale * (M[d, 0] * ticks[node, 0] + M[d, 1] * ticks[node, 1] + M[d, 2] * ticks[node, 2])
+def load_cell(x: NDArray, ticks: NDArray, cells: NDArray, cell: int, measure: Measure) -> None:
+    """A cell's corners relative to its first, in mm."""
+    for k in range(cells.shape[1]):
+        load(x, k, ticks, cells[cell, k], cells[cell, 0], measure)
 
 
 @njit(cache=True)
 def shape_of_cell(x: NDArray, ticks: NDArray, cells: NDArray, cell: int, measure: Measure) -> float:
-    """Shape energy of a cell of the complex; `x` (4, 3) is room for its corners."""
-    n_corners = cells.shape[1]
-    for k in range(n_corners):
-        load(x, k, ticks, cells[cell, k], measure)
-    volume, E_G = volume_and_E_G(x, n_corners)
-    return shape_energy(volume, E_G, n_corners, measure.power)
+    """Shape energy of a cell of the complex; its corners are left in `x` (4, 3)."""
+    load_cell(x, ticks, cells, cell, measure)
+    return shape_energy(x, cells.shape[1], measure.power)
 
 
 @njit(cache=True)
 def shape_of_tet(x: NDArray, ticks: NDArray, a: int, b: int, c: int, d: int, measure: Measure) -> float:
-    """Shape energy of the tetrahedron (a, b, c, d); infinite unless it is positively oriented, exactly."""
-    e0, e1, e2 = ticks[b, 0] - ticks[a, 0], ticks[b, 1] - ticks[a, 1], ticks[b, 2] - ticks[a, 2]
-    f0, f1, f2 = ticks[c, 0] - ticks[a, 0], ticks[c, 1] - ticks[a, 1], ticks[c, 2] - ticks[a, 2]
-    n0, n1, n2 = e1 * f2 - e2 * f1, e2 * f0 - e0 * f2, e0 * f1 - e1 * f0
-    side = dot_sign(n0, n1, n2, ticks[d, 0] - ticks[a, 0], ticks[d, 1] - ticks[a, 1], ticks[d, 2] - ticks[a, 2])
-    if side != measure.hand:
-        return np.inf
-    load(x, 0, ticks, a, measure)
-    load(x, 1, ticks, b, measure)
-    load(x, 2, ticks, c, measure)
-    load(x, 3, ticks, d, measure)
-    volume, E_G = volume_and_E_G(x, 4)
-    return shape_energy(volume, E_G, 4, measure.power)
+    """Shape energy of the tetrahedron (a, b, c, d); infinite unless it is positively oriented."""
+    load(x, 0, ticks, a, a, measure)
+    load(x, 1, ticks, b, a, measure)
+    load(x, 2, ticks, c, a, measure)
+    load(x, 3, ticks, d, a, measure)
+    return shape_energy(x, 4, measure.power)
 
 
 @njit(cache=True)
 def shape_of_triangle(x: NDArray, ticks: NDArray, a: int, b: int, c: int, measure: Measure) -> float:
-    """Shape energy of the triangle (a, b, c); infinite unless it is positively oriented, exactly."""
-    e1, e2 = ticks[b, 1] - ticks[a, 1], ticks[b, 2] - ticks[a, 2]
-    f1, f2 = ticks[c, 1] - ticks[a, 1], ticks[c, 2] - ticks[a, 2]
-    area = e1 * f2 - e2 * f1
-    if (1 if area > 0 else -1 if area < 0 else 0) != measure.hand:
-        return np.inf
-    load(x, 0, ticks, a, measure)
-    load(x, 1, ticks, b, measure)
-    load(x, 2, ticks, c, measure)
-    volume, E_G = volume_and_E_G(x, 3)
-    return shape_energy(volume, E_G, 3, measure.power)
+    """Shape energy of the triangle (a, b, c); infinite unless it is positively oriented."""
+    load(x, 0, ticks, a, a, measure)
+    load(x, 1, ticks, b, a, measure)
+    load(x, 2, ticks, c, a, measure)
+    return shape_energy(x, 3, measure.power)
 
 
 @njit(cache=True)
@@ -281,27 +290,15 @@ def least_cosine(x: NDArray) -> float:
 
 @njit(cache=True)
 def cell_quality(x: NDArray, held: Complex, cell: int, measure: Measure) -> float:
-    for k in range(4):
-        load(x, k, held.ticks, held.cells[cell, k], measure)
+    """Minus the cosine of a cell's smallest dihedral angle."""
+    load_cell(x, held.ticks, held.cells, cell, measure)
     return least_cosine(x)
 
 
 @njit(cache=True)
 def tet_quality(x: NDArray, held: Complex, a: int, b: int, c: int, d: int, measure: Measure) -> float:
     """As `least_cosine`, of the tetrahedron (a, b, c, d); -2 if it is flat or inverted."""
-    load(x, 0, held.ticks, a, measure)
-    load(x, 1, held.ticks, b, measure)
-    load(x, 2, held.ticks, c, measure)
-    load(x, 3, held.ticks, d, measure)
-    u0, u1, u2 = x[1, 0] - x[0, 0], x[1, 1] - x[0, 1], x[1, 2] - x[0, 2]
-    v0, v1, v2 = x[2, 0] - x[0, 0], x[2, 1] - x[0, 1], x[2, 2] - x[0, 2]
-    w0, w1, w2 = x[3, 0] - x[0, 0], x[3, 1] - x[0, 1], x[3, 2] - x[0, 2]
-    signed = u0 * (v1 * w2 - v2 * w1) + u1 * (v2 * w0 - v0 * w2) + u2 * (v0 * w1 - v1 * w0)
-    volume, E_G = volume_and_E_G(x, 4)
-    S = 20.0 * E_G / max(volume, 1e-300)
-    # World and index space may be mirrored, but a positive cell is positive in the world. FLAT is far above the
-    # rounding of the sign and of the fixed-point grid.
-    if signed <= 0.0 or volume <= 10.0 * FLAT * S * np.sqrt(S):
+    if not shape_of_tet(x, held.ticks, a, b, c, d, measure) < np.inf:
         return -2.0
     return least_cosine(x)
 

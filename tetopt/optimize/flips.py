@@ -42,12 +42,17 @@ EDGES = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
 CHUNK = 32
 
 
-def flip(held: Complex, measure: Measure, passes: int = 50) -> tuple[Complex, int]:
+def flip(
+    held: Complex, measure: Measure, is_dirty: NDArray[np.bool_] | None = None, passes: int = 50
+) -> tuple[Complex, int]:
     """Make every move that lowers E until none is left, or for some passes; the complex and the number of moves.
 
-    The complex returned may be a wider copy of the one given, which is then out of date.
+    Only cavities with one of the cells marked in `is_dirty` (C,) are looked at; all of them by default. The complex
+    returned may be a wider copy of the one given, which is then out of date.
     """
-    is_dirty = np.ones(len(held.cells), dtype=np.bool_)
+    wanted = np.ones(int(held.n_cells[0]), dtype=np.bool_) if is_dirty is None else is_dirty
+    is_dirty = np.zeros(len(held.cells), dtype=np.bool_)
+    is_dirty[: len(wanted)] = wanted
     done = 0
     for _ in range(passes):
         if len(held.cells) - held.n_cells[0] < held.n_cells[0] // 8 + 32:
@@ -96,15 +101,11 @@ def _evaluate_cells(
                 if worth > gain[cell]:
                     gain[cell], move[cell] = worth, k
         for e in range(6):
-            m, is_open = _ring_of_edge(ring, around, held, cell, EDGES[e, 0], EDGES[e, 1])
-            if m == 0:
-                continue
+            m, is_open = _ring_of_edge(ring, around, held, cell, EDGES[e, 0], EDGES[e, 1], True)
             dirty = False
-            lowest = cell
             for r in range(m - is_open):
-                lowest = min(lowest, around[r])
                 dirty = dirty or is_dirty[around[r]]
-            if lowest != cell or not dirty:
+            if not dirty:
                 continue
             a, b = held.cells[cell, EDGES[e, 0]], held.cells[cell, EDGES[e, 1]]
             worth = _worth_of_edge(x, tables, fluxes, held, a, b, ring, around, m, is_open, measure)
@@ -146,11 +147,13 @@ def _worth_of_face(x: NDArray, held: Complex, cell: int, k: int, measure: Measur
 
 
 @njit(cache=True)
-def _ring_of_edge(ring: NDArray, around: NDArray, held: Complex, cell: int, i: int, j: int) -> tuple:
+def _ring_of_edge(
+    ring: NDArray, around: NDArray, held: Complex, cell: int, i: int, j: int, owned: bool = False
+) -> tuple:
     """The cells around the edge of a cell between its corners i and j, and the polygon of their other corners.
 
     Turning from a to b to the right: cell r holds a, b, ring[r] and ring[r + 1]. Returns the polygon's number of
-    corners, 0 if it is more than `MOST`, and 1 if it is open, that is if the edge is on the boundary; then there is
+    corners, 0 if it is more than `MOST` or, with `owned`, if `cell` is not the lowest of the cells, and 1 if it is open, that is if the edge is on the boundary; then there is
     one cell less than corners.
     """
     a, b = held.cells[cell, i], held.cells[cell, j]
@@ -175,7 +178,7 @@ def _ring_of_edge(ring: NDArray, around: NDArray, held: Complex, cell: int, i: i
         if before < 0 or before == cell:
             break
         steps += 1
-        if steps > MOST:
+        if steps > MOST or (owned and before < cell):
             return 0, 0
         other = 0
         for c in range(4):
@@ -200,6 +203,8 @@ def _ring_of_edge(ring: NDArray, around: NDArray, held: Complex, cell: int, i: i
             return count + 1, 1
         if after == first:
             return count, 0
+        if owned and after < cell:
+            return 0, 0
         ring[count] = front
         other = 0
         for c in range(4):
@@ -239,18 +244,23 @@ def _worth_of_edge(
         if least > -1.0:
             least = min(least, cell_quality(x, held, around[r], measure))
     limit = old * (1.0 - LEAST_GAIN)
-    # A triangulation's shape energy alone is a lower bound, and cheap.
+    # A triangulation's shape energy alone is a lower bound, and cheap; so are its two ears, triangles of three corners
+    # in a row: few edges get past them.
+    if m > 4:
+        low, lower = np.inf, np.inf  # the two cheapest ears
+        for k in range(m):
+            i, j = (k - 1) % m, (k + 1) % m
+            ear = _pair_shape(x, held, a, b, ring[i], ring[k], ring[j], limit, least, measure)
+            if ear < lower:
+                low, lower = lower, ear
+            elif ear < low:
+                low = ear
+        if not low + lower < limit:
+            return -np.inf
     for i in range(m - 2):
         for k in range(i + 1, m - 1):
             for j in range(k + 1, m):
-                above = shape_of_tet(x, held.ticks, ring[i], ring[k], ring[j], b, measure)
-                if least > -1.0 and above < np.inf and least_cosine(x) < least:
-                    above = np.inf
-                if above < np.inf:
-                    above += shape_of_tet(x, held.ticks, ring[i], ring[j], ring[k], a, measure)
-                    if least > -1.0 and above < np.inf and least_cosine(x) < least:
-                        above = np.inf
-                shape[i, k, j] = measure.geometry * above
+                shape[i, k, j] = _pair_shape(x, held, a, b, ring[i], ring[k], ring[j], limit, least, measure)
     if not _best_triangulation(cost, apex, shape, m) < limit:
         return -np.inf
     if measure.image == 0.0:
@@ -268,6 +278,20 @@ def _worth_of_edge(
                     )
     new = _best_triangulation(cost, apex, shape, m)
     return old - new if new < limit else -np.inf
+
+
+@njit(cache=True)
+def _pair_shape(
+    x: NDArray, held: Complex, a: int, b: int, u: int, v: int, w: int, limit: float, least: float, measure: Measure
+) -> float:
+    """Weighted shape energy of the two tetrahedra over a triangle (u, v, w) of the polygon; infinite if not allowed."""
+    above = measure.geometry * shape_of_tet(x, held.ticks, u, v, w, b, measure)
+    if not above < limit or (least > -1.0 and least_cosine(x) < least):
+        return np.inf
+    below = measure.geometry * shape_of_tet(x, held.ticks, u, w, v, a, measure)
+    if not below < limit or (least > -1.0 and least_cosine(x) < least):
+        return np.inf
+    return above + below
 
 
 @njit(cache=True)

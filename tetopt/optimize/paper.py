@@ -58,7 +58,7 @@ class Optimized(NamedTuple):
     ended: str  # "iterations", "converged", "max_seconds" or "stopped"
 
 
-def optimize(
+def optimize_paper(
     image: Image,
     mesh: Mesh,
     *,
@@ -121,7 +121,7 @@ def optimize(
     if n_t is None:
         n_t = default_n_t(k_D, iterations)
     begin = time.perf_counter()
-    is_over = _deadline(begin, max_seconds, stop)
+    is_over = deadline(begin, max_seconds, stop)
 
     grid = sampling_grid(image, mesh.points)
     ticks = to_ticks(image.to_index(mesh.points), grid)
@@ -172,7 +172,7 @@ def optimize(
         # 3. Measure.
         if k_D == 0.0:
             state.sums[:] = moment_sums(grid, state.ticks, state.cells, state.sides)
-        movement = _relative_movement(before, state.ticks, image, grid, matrix)
+        movement = relative_movement(before, state.ticks, image, grid, matrix)
         record(iteration, movement, is_new)
         if not is_finished:
             ended = "stopped" if stop is not None and stop() else "max_seconds"
@@ -206,7 +206,9 @@ def _check_options(
         raise InputError(f"step_ratio: expected a number between 0 and 1, got {step_ratio}")
 
 
-def _deadline(begin: float, max_seconds: float | None, stop: Callable[[], bool] | None) -> Callable[[], bool]:
+def deadline(begin: float, max_seconds: float | None, stop: Callable[[], bool] | None) -> Callable[[], bool]:
+    """A function that tells whether the time is over, or `stop` says so."""
+
     def is_over() -> bool:
         if max_seconds is not None and time.perf_counter() - begin > max_seconds:
             return True
@@ -335,7 +337,7 @@ def _sweep(
     return True
 
 
-def _relative_movement(
+def relative_movement(
     before: NDArray[np.int64],
     after: NDArray[np.int64],
     image: Image,

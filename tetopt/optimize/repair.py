@@ -13,7 +13,6 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
-from tetopt.energy.sampling import cell_orientation
 from tetopt.optimize.complex import (
     Complex,
     Measure,
@@ -22,7 +21,7 @@ from tetopt.optimize.complex import (
     cell_quality,
     facet_of,
     grown,
-    load,
+    load_cell,
     node_rings,
     outward,
     shape_of_cell,
@@ -91,6 +90,11 @@ def repair(
         if made == 0:
             break
     return Repaired(held, len(_worst_first(held, measure, target)), total)
+
+
+def worst_angles(held: Complex, measure: Measure, floor: float) -> int:
+    """How many cells have a smallest dihedral angle under `floor` degrees."""
+    return int((qualities(held, measure) < -np.cos(np.radians(floor))).sum())
 
 
 def _worst_first(held: Complex, measure: Measure, target: float) -> NDArray[np.int64]:
@@ -249,8 +253,6 @@ def _ring_quality(x: NDArray, held: Complex, rings: NodeRings, node: int, measur
     """The worst of a ring's cells; -2 if one is flat or inverted, and anything below `least` once that is passed."""
     worst = 1.0
     for r in range(rings.start[node], rings.start[node + 1]):
-        if cell_orientation(held.ticks, held.cells, rings.cells[r]) != measure.hand:
-            return -2.0
         c = held.cells[rings.cells[r]]
         worst = min(worst, tet_quality(x, held, c[0], c[1], c[2], c[3], measure))
         if worst < least:
@@ -274,8 +276,7 @@ def _lift(
     # The first step: a fifth of the ring's mean edge.
     edge, count = 0.0, 0
     for r in range(first, last):
-        for k in range(4):
-            load(x, k, t, held.cells[rings.cells[r], k], measure)
+        load_cell(x, t, held.cells, rings.cells[r], measure)
         at = rings.corner[r]
         for k in range(4):
             if k != at:

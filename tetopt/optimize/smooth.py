@@ -17,7 +17,7 @@ from numba import njit, prange
 from numpy.typing import NDArray
 
 from tetopt.energy.geometric import volume_and_E_G
-from tetopt.energy.sampling import cell_orientation, few_threads
+from tetopt.energy.sampling import few_threads
 from tetopt.optimize.complex import (
     Complex,
     Measure,
@@ -27,9 +27,9 @@ from tetopt.optimize.complex import (
     flux_of,
     image_energy,
     least_cosine,
-    load,
+    load_cell,
     outward,
-    shape_energy,
+    shape_of_cell,
     sum_up,
 )
 
@@ -152,8 +152,7 @@ def _add_shape_gradient(g: NDArray, x: NDArray, held: Complex, rings: NodeRings,
     curvature = 0.0
     for r in range(rings.start[node], rings.start[node + 1]):
         cell, at = rings.cells[r], rings.corner[r]
-        for k in range(n):
-            load(x, k, held.ticks, held.cells[cell, k], measure)
+        load_cell(x, held.ticks, held.cells, cell, measure)
         volume, E_G = volume_and_E_G(x, n)
         W = held.E_shape[cell]
         S = E_G * (n * (n + 1)) / volume
@@ -202,14 +201,9 @@ def _ring_energy(
     first, last = rings.start[node], rings.start[node + 1]
     energy = 0.0
     for r in range(first, last):  # cheap refusals before any voxel is read
-        if cell_orientation(held.ticks, held.cells, rings.cells[r]) != measure.hand:
+        trial[r - first] = shape_of_cell(x, held.ticks, held.cells, rings.cells[r], measure)
+        if least > -1.0 and (trial[r - first] == np.inf or least_cosine(x) < least):
             return np.inf
-        for k in range(n):
-            load(x, k, held.ticks, held.cells[rings.cells[r], k], measure)
-        if least > -1.0 and least_cosine(x) < least:
-            return np.inf
-        volume, E_G = volume_and_E_G(x, n)
-        trial[r - first] = shape_energy(volume, E_G, n, measure.power)
         energy += measure.geometry * trial[r - first]
         if energy > limit:
             return np.inf
@@ -248,8 +242,7 @@ def _nearest_centroid(x: NDArray, node: int, held: Complex, rings: NodeRings, me
     nearest = np.inf
     for r in range(rings.start[node], rings.start[node + 1]):
         squared = 0.0
-        for k in range(n):
-            load(x, k, held.ticks, held.cells[rings.cells[r], k], measure)
+        load_cell(x, held.ticks, held.cells, rings.cells[r], measure)
         for d in range(3):
             mean = 0.0
             for k in range(n):

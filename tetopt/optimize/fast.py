@@ -1,0 +1,232 @@
+"""The fast engine: the paper's energy, minimised by analytic gradients and energy-driven flips, with a floor on angles.
+
+Each iteration moves every node down the gradient of its ring's energy (`smooth`) and then exchanges cells wherever that
+lowers E (`flips`), which takes the place of Delaunay re-tessellation. Once E has almost stopped falling, the worst
+cells are lifted to the floor (`repair`), and the last iterations keep it.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.energy.sampling import check_orientations, from_ticks, sampling_grid, to_ticks
+from tetopt.errors import InputError
+from tetopt.geometry.topology import facets
+from tetopt.image import Image
+from tetopt.mesh import Mesh
+from tetopt.optimize.complex import (
+    Complex,
+    Measure,
+    build,
+    energies,
+    measure_of,
+    node_colours,
+    node_rings,
+)
+from tetopt.optimize.descent import free_projections
+from tetopt.optimize.flips import flip
+from tetopt.optimize.paper import NOISE, Boundary, Optimized, Record, deadline, frozen_axes, relative_movement
+from tetopt.optimize.repair import repair, worst_angles
+from tetopt.optimize.smooth import sweep
+
+SLACK = 0.5  # degrees over the floor that the repair aims for, so that the sweeps after it have room
+SETTLED = 3e-3  # relative fall of E in an iteration, below which the repair comes
+STILL = 0.02  # of the distance to the ring's nearest centroid: nodes that moved less since then need no new flips
+
+
+def optimize(
+    image: Image,
+    mesh: Mesh,
+    *,
+    k_D: float = 0.2,
+    iterations: int = 20,
+    shape_power: float = 3.0,
+    min_dihedral: float = 12.0,
+    boundary: Boundary = "slide",
+    tolerance: float = 5e-4,
+    max_seconds: float | None = None,
+    callback: Callable[[Record], None] | None = None,
+    stop: Callable[[], bool] | None = None,
+) -> Optimized:
+    """Move the nodes of `mesh`, and connect them anew, to lower E = (1 - k_D) E_G + k_D E_D, Eq. (4).
+
+    Parameters
+    ----------
+    image : Image
+        The intensities h.
+    mesh : Mesh
+        The initial mesh, which also normalises the two energies: any conforming mesh.
+    k_D : float
+        Weight of the image, 0 <= k_D < 1.
+    iterations : int
+        Sweeps over all nodes, at most.
+    shape_power : float
+        p >= 1: each cell's E_G is weighted by eta^(p - 1), eta >= 1 the cell's mean-edge shape measure (see
+        `tetopt.optimize.complex.shape_energy`). 1 is the paper's energy, which does not see slivers; above 2.5 it grows
+        without bound as a cell goes flat.
+    min_dihedral : float
+        The smallest dihedral angle that a tetrahedron may have at the end, degrees, 0 (no floor) to below 70. How many
+        cells miss it is for the caller to count (`tetopt.quality`); meshes of triangles have no floor.
+    boundary : {"slide", "fixed"}
+        Boundary nodes move within the box's faces and edges, or not at all. Those not on the box are fixed.
+    tolerance : float
+        Converged when E falls by less, relatively, in an iteration, and the floor has been seen to.
+    max_seconds : float, optional
+        Stop at the next colour of nodes after this time; the mesh is valid, and its floor is seen to.
+    callback : callable, optional
+        Called with each `Record`. Its E_G is the weighted one, its `is_retessellated` whether cells were exchanged.
+    stop : callable, optional
+        Asked between colours of nodes; True ends the run there.
+
+    Returns
+    -------
+    Optimized
+        Mesh, history and why it ended. The mesh covers the same domain, every cell is positively oriented. E never
+        rises from one record to the next but for the one in which the repair was made. The same bits on any number
+        of threads.
+
+    Raises
+    ------
+    InputError
+        An option out of range, or a mesh that the sampling cannot take (see `tetopt.cell_moments`) or whose facets are
+        shared by more than two cells.
+    """
+    _check_options(k_D, iterations, shape_power, min_dihedral, boundary)
+    begin = time.perf_counter()
+    is_over = deadline(begin, max_seconds, stop)
+    run = _Run(image, mesh, k_D, shape_power, boundary)
+    history: list[Record] = []
+
+    def record(iteration: int, movement: float, is_changed: bool) -> None:
+        history.append(run.record(iteration, movement, is_changed, time.perf_counter() - begin))
+        if callback is not None:
+            callback(history[-1])
+
+    record(0, 0.0, False)
+    ended = "iterations"
+    wants_floor = run.n == 3 and min_dihedral > 0.0
+    has_floor = not wants_floor
+    for iteration in range(1, iterations + 1):
+        before = run.held.ticks.copy()
+        is_finished = run.sweep(is_over)
+        is_changed = run.flip() > 0 if is_finished else False
+        fall = 1.0 - run.E() / history[-1].E if history[-1].E > 0.0 else 0.0
+        is_last = iteration >= iterations - 3 or not is_finished
+        if wants_floor and (is_last or fall < SETTLED) and (not has_floor or is_last):
+            is_changed = run.lift(min_dihedral) > 0 or is_changed
+            has_floor, fall = True, np.inf
+        record(iteration, relative_movement(before, run.held.ticks, image, run.grid, run.matrix), is_changed)
+        if not is_finished:
+            ended = "stopped" if stop is not None and stop() else "max_seconds"
+            break
+        if has_floor and fall < tolerance:
+            ended = "converged"
+            break
+    return Optimized(run.mesh(), history, ended)
+
+
+class _Run:
+    """What one optimisation works on, and its steps."""
+
+    def __init__(self, image: Image, mesh: Mesh, k_D: float, power: float, boundary: Boundary) -> None:
+        self.image, self.n = image, image.ndim
+        self.grid = sampling_grid(image, mesh.points)
+        ticks = to_ticks(image.to_index(mesh.points), self.grid)
+        check_orientations(image, ticks, mesh.cells)
+        if facets(mesh.cells).n_cells.max() > 2:
+            raise InputError("mesh: a facet is shared by more than two cells; remove doubled or overlapping cells")
+        self.is_frozen = frozen_axes(image, ticks, mesh.cells, self.grid, boundary)
+        self.is_still = self.is_frozen[:, 3 - self.n :].all(axis=1)
+        self.matrix = np.eye(3)
+        self.matrix[3 - self.n :, 3 - self.n :] = image.affine[:-1, :-1]
+        self.projections = free_projections(self.matrix)
+        hand = 1 if np.linalg.det(image.affine[:-1, :-1]) > 0 else -1
+        unit = measure_of(self.grid, hand, self.matrix, 1.0, 1.0, power)
+        self.held: Complex = build(mesh.cells, ticks, unit)
+        # Where every cell is uniform, what rounding leaves of E_D must not become the unit that E_D is measured in.
+        self.noise = NOISE * float(np.var(image.data, dtype=np.float64)) * image.data.size
+        self.E_G0, self.squares0 = self.energies()
+        weight = k_D / self.squares0 if self.squares0 > 0.0 else 0.0
+        self.measure: Measure = measure_of(self.grid, hand, self.matrix, (1.0 - k_D) / self.E_G0, weight, power)
+        self.fresh = np.ones(len(ticks), dtype=bool)  # nodes that moved since their flips were looked at
+        self.seen = ticks.copy()  # where they were then
+
+    def energies(self) -> tuple[float, float]:
+        """Shape energy and sum of squares; squares that are only rounding count as 0."""
+        E_G, squares = energies(self.held)
+        return E_G, squares if squares > self.noise else 0.0
+
+    def E(self) -> float:
+        E_G, squares = self.energies()
+        return self.measure.geometry * E_G + self.measure.image * squares
+
+    def sweep(self, is_over: Callable[[], bool]) -> bool:
+        """Move every node once; False if `is_over` cut it short, between two colours."""
+        rings = node_rings(self.held)
+        colours = node_colours(rings.start, rings.cells, self.held.cells)
+        for colour in range(colours.max() + 1):
+            if is_over():
+                return False
+            nodes = np.flatnonzero((colours == colour) & ~self.is_still)
+            sweep(self.held, rings, nodes, self.is_frozen, self.measure, self.projections)
+        return True
+
+    def flip(self) -> int:
+        """Exchange cells around the nodes that have moved; the number of exchanges."""
+        moved = (np.abs(self.held.ticks - self.seen) > STILL * self._spacing()).any(axis=1)
+        moved |= self.fresh
+        self.fresh = np.zeros(len(moved), dtype=bool)
+        self.seen[moved] = self.held.ticks[moved]
+        n_cells = int(self.held.n_cells[0])
+        is_dirty = moved[self.held.cells[:n_cells]].any(axis=1)
+        self.held, made = flip(self.held, self.measure, is_dirty)
+        return made
+
+    def _spacing(self) -> NDArray[np.float64]:
+        """A typical distance between nodes along each axis, in ticks, (3,)."""
+        size = np.array(self.grid.shape, dtype=np.float64) * 2.0**self.grid.bits
+        lengths = size * np.sqrt((self.matrix**2).sum(axis=0))
+        lengths = lengths[3 - self.n :]
+        spacing = (np.prod(lengths) / len(self.held.ticks)) ** (1.0 / self.n)
+        return spacing / np.sqrt((self.matrix**2).sum(axis=0))
+
+    def lift(self, min_dihedral: float) -> int:
+        """Lift the worst cells over the floor, which later moves keep; the number of moves."""
+        done = repair(self.held, self.is_frozen, self.measure, self.projections, min_dihedral + SLACK)
+        self.held = done.held
+        if worst_angles(self.held, self.measure, min_dihedral):  # not all could be lifted so far: to the floor itself
+            done = repair(self.held, self.is_frozen, self.measure, self.projections, min_dihedral)
+            self.held = done.held
+        self.measure = self.measure._replace(floor=-float(np.cos(np.radians(min_dihedral))))
+        self.fresh[:] = True
+        return done.n_moves
+
+    def record(self, iteration: int, movement: float, is_changed: bool, seconds: float) -> Record:
+        E_G, squares = self.energies()
+        n_cells = int(self.held.n_cells[0])
+        n_voxels = int(self.held.sums[:n_cells, 0].sum())
+        E_D = squares * self.image.voxel_volume
+        return Record(iteration, self.E(), E_G, E_D, movement, is_changed, n_cells, n_voxels, seconds)
+
+    def mesh(self) -> Mesh:
+        points = self.image.to_world(from_ticks(self.held.ticks, self.grid, self.n))
+        return Mesh(points, self.held.cells[: int(self.held.n_cells[0])].copy())
+
+
+def _check_options(k_D: float, iterations: int, shape_power: float, min_dihedral: float, boundary: str) -> None:
+    if not 0.0 <= k_D < 1.0:
+        raise InputError(f"k_D: expected 0 <= k_D < 1, got {k_D}")
+    if iterations < 0:
+        raise InputError(f"iterations: expected 0 or more, got {iterations}")
+    if not 1.0 <= shape_power <= 10.0:
+        raise InputError(f"shape_power: expected 1 (the paper's) to 10, got {shape_power}")
+    if not 0.0 <= min_dihedral < 70.0:
+        raise InputError(
+            f"min_dihedral: expected 0 to below 70 degrees, got {min_dihedral}; a regular tetrahedron has 70.5"
+        )
+    if boundary not in ("slide", "fixed"):
+        raise InputError(f"boundary: expected slide or fixed, got {boundary!r}")
