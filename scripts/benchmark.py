@@ -84,8 +84,8 @@ def compile_seconds() -> tuple[float, float]:
         "image = tetopt.Image(np.arange(8.0).reshape(2, 2, 2))\n"
         "mesh = tetopt.lattice(image, blocks=(1, 1, 1))\n"
         "begin = time.perf_counter()\n"
-        "tetopt.optimize(image, mesh, k_D=0.2, iterations=1)\n"
-        "tetopt.optimize(image, mesh, k_D=0.0, iterations=1)\n"
+        "tetopt.optimize_paper(image, mesh, k_D=0.2, iterations=1)\n"
+        "tetopt.optimize_paper(image, mesh, k_D=0.0, iterations=1)\n"
         "print(time.perf_counter() - begin)\n"
     )
     with tempfile.TemporaryDirectory() as cache:
@@ -138,7 +138,7 @@ def sampling(image: tetopt.Image, nodes: int) -> dict[str, Any]:
 def paper(image: tetopt.Image, nodes: int, iterations: int) -> dict[str, Any]:
     """Seconds per iteration of the paper's scheme, and how much of one Delaunay takes."""
     mesh = tetopt.lattice(image, nodes=nodes)
-    fixed = tetopt.optimize(image, mesh, k_D=0.2, iterations=iterations, retessellate="never")
+    fixed = tetopt.optimize_paper(image, mesh, k_D=0.2, iterations=iterations, retessellate="never")
     per_iteration = (fixed.history[-1].seconds - fixed.history[0].seconds) / iterations
     grid = sampling_grid(image, fixed.mesh.points)
     index = from_ticks(to_ticks(image.to_index(fixed.mesh.points), grid), grid, image.ndim)
@@ -154,7 +154,7 @@ def paper(image: tetopt.Image, nodes: int, iterations: int) -> dict[str, Any]:
 def bar(image: tetopt.Image, nodes: int) -> dict[str, Any]:
     """What 20 iterations at k_D = 0.2 reach."""
     mesh = tetopt.lattice(image, nodes=nodes)
-    result = tetopt.optimize(image, mesh, k_D=0.2, iterations=20)
+    result = tetopt.optimize_paper(image, mesh, k_D=0.2, iterations=20)
     last = result.history[-1]
     return {
         "nodes": len(mesh.points),

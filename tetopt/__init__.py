@@ -2,6 +2,7 @@
 
 __version__ = "0.1.0"
 
+from tetopt.check import check_mesh
 from tetopt.energy.discretization import E_D
 from tetopt.energy.geometric import E_G
 from tetopt.energy.sampling import cell_moments, cell_of_voxel
@@ -26,6 +27,7 @@ __all__ = [
     "cell_fields",
     "cell_moments",
     "cell_of_voxel",
+    "check_mesh",
     "lattice",
     "load_image",
     "load_mesh",

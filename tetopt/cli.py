@@ -37,13 +37,14 @@ from tetopt import (
     save_mesh,
 )
 from tetopt.geometry.quality import Quality, quality
-from tetopt.geometry.simplex import volumes
+from tetopt.geometry.simplex import dihedral_angles, volumes
 from tetopt.io.files import checked_output, save_json
 from tetopt.io.images import parse_crop, parse_slice, sha256
 from tetopt.io.meshes import MeshFile, cell_fields
 from tetopt.io.mni import mni_path, mni_tissue
 from tetopt.lattice import KINDS
-from tetopt.optimize.paper import Optimized, Record, default_n_t, optimize
+from tetopt.optimize.fast import optimize, prepare_kernels
+from tetopt.optimize.paper import Optimized, Record, default_n_t, optimize_paper
 from tetopt.report.summary import run_summary, versions
 from tetopt.segmentation import check_labels
 
@@ -78,6 +79,7 @@ class Lattice(StrEnum):  # noqa: D101
 
 
 class Method(StrEnum):  # noqa: D101
+    fast = "fast"
     paper = "paper"
 
 
@@ -192,14 +194,26 @@ def mesh_command(
             "--n-t",
             metavar="T",
             min=0,
-            help="Connect anew in the first T iterations (default half; all for k_D = 0).",
+            help="Paper's method: connect anew in the first T iterations (default half; all for k_D = 0).",
         ),
     ] = None,
     retessellate: Annotated[
-        Retessellate,
-        typer.Option(help="Delaunay anew: first, in the first n_t iterations; accept, when it lowers E; never."),
-    ] = Retessellate.first,
-    method: Annotated[Method, typer.Option(help="How the nodes move.")] = Method.paper,
+        Retessellate | None,
+        typer.Option(
+            help="Paper's method: Delaunay anew in the first n_t iterations (the default), whenever it lowers E, never."
+        ),
+    ] = None,
+    method: Annotated[
+        Method, typer.Option(help="fast: gradients, flips, a floor on angles; paper: the scheme of the paper.")
+    ] = Method.fast,
+    shape_power: Annotated[
+        float | None,
+        typer.Option(metavar="P", help="Fast method: 1 is the paper's E_G; more punish flat cells (default 3)."),
+    ] = None,
+    min_dihedral: Annotated[
+        float | None,
+        typer.Option(metavar="DEG", help="Fast method: smallest dihedral angle allowed, 0 for none (default 12)."),
+    ] = None,
     boundary: Annotated[Boundary, typer.Option(help="What the box's nodes may do.")] = Boundary.slide,
     threads: ThreadsOption = None,
     max_seconds: Annotated[
@@ -233,15 +247,27 @@ def mesh_command(
         nodes = DEFAULT_NODES[image.ndim]
     kind = KINDS[image.ndim][0] if lattice_kind is None else lattice_kind.value
     initial = lattice(image, kind, nodes=nodes, spacing=spacing)
-    options = {
-        "k_D": k_D, "iterations": iterations, "n_t": default_n_t(k_D, iterations) if n_t is None else n_t,
-        "retessellate": retessellate.value, "boundary": boundary.value,
-    }  # fmt: skip
+    options: dict[str, Any] = {"k_D": k_D, "iterations": iterations, "boundary": boundary.value}
+    _check_method(method, {"--n-t": n_t, "--retessellate": retessellate}, Method.paper)
+    _check_method(method, {"--shape-power": shape_power, "--min-dihedral": min_dihedral}, Method.fast)
+    if method is Method.paper:
+        options["n_t"] = default_n_t(k_D, iterations) if n_t is None else n_t
+        options["retessellate"] = Retessellate.first.value if retessellate is None else retessellate.value
+    else:
+        options["shape_power"] = 3.0 if shape_power is None else shape_power
+        options["min_dihedral"] = 12.0 if min_dihedral is None else min_dihedral
     source = {
         "nodes": nodes, "spacing": spacing, "lattice": kind, "volume": volume, "crop": crop, "slice": slice_,
         "method": method.value, "max_seconds": max_seconds,
     }  # fmt: skip
     return _mesh_files(image_path, image, initial, options, source, output, json_path, pictures, begin)
+
+
+def _check_method(method: Method, given: dict[str, Any], wanted: Method) -> None:
+    """InputError for an option of the other method."""
+    wrong = [name for name, value in given.items() if value is not None]
+    if wrong and method is not wanted:
+        raise InputError(f"{wrong[0]}: only with --method {wanted.value}, got --method {method.value}")
 
 
 def _mesh_files(
@@ -261,7 +287,7 @@ def _mesh_files(
     loaded = time.perf_counter()
     max_seconds = source["max_seconds"]
     left = None if max_seconds is None else max(max_seconds - (loaded - begin), 1e-9)
-    result, is_interrupted = _optimized(image, initial, left, **options)
+    result, is_interrupted = _optimized(image, initial, Method(source["method"]), left, **options)
     optimized = time.perf_counter()
     save_mesh(output, result.mesh, cell_fields(result.mesh, image), {"tetopt": tetopt.__version__, **about})
     if json_path is not None:
@@ -272,8 +298,8 @@ def _mesh_files(
 
         save_run_figures(pictures, image, initial, result)
     # Everything is written; what is printed may go into a pipe that closes.
-    code = 130 if is_interrupted else _promises(image, result)
-    _warn(image, result)
+    code = 130 if is_interrupted else _promises(image, result, options.get("min_dihedral", 0.0))
+    _warn(image, result, Method(source["method"]))
     _print_comparison(initial, result)
     out.print(escape(f"{output}: {len(result.mesh.points)} nodes, {len(result.mesh.cells)} cells"))
     if json_path is not None:
@@ -283,10 +309,10 @@ def _mesh_files(
     return code
 
 
-def _warn(image: Image, result: Optimized) -> None:
+def _warn(image: Image, result: Optimized, method: Method) -> None:
     """Say what is allowed but hardly meant."""
     lowest, last = min(row.E for row in result.history), result.history[-1].E
-    if last > lowest * (1.0 + 1e-3):
+    if last > lowest * (1.0 + 1e-3) and method is Method.paper:
         _show_warning(
             f"E ended at {last:.4f}, above {lowest:.4f} on the way: a tessellation taken in the first n_t iterations "
             "raised it; --retessellate accept takes only those that lower it"
@@ -344,12 +370,21 @@ def _described(path: Path, image: Image, initial: Mesh) -> str:
     return f"{path}: {size} voxels of {spacing} mm; lattice of {len(initial.points)} nodes, {len(initial.cells)} cells"
 
 
-def _promises(image: Image, result: Optimized) -> int:
-    """0 if the mesh covers the image's box and every voxel; else 1, said aloud."""
+def _promises(image: Image, result: Optimized, min_dihedral: float) -> int:
+    """0 if the mesh covers the image's box and every voxel, and keeps the floor on angles; else 1, said aloud."""
     covered = float(volumes(result.mesh.points, result.mesh.cells).sum())
     missed = image.data.size - result.history[-1].n_voxels
+    below = 0
+    if image.ndim == 3 and result.history[-1].iteration > 0:
+        angles = dihedral_angles(result.mesh.points, result.mesh.cells).min(axis=1)
+        below = int((angles < min_dihedral - 1e-6).sum())
+    if below:
+        log.print(
+            f"[bold red]tetopt:[/] {below} of {len(angles)} cells have a dihedral angle under {min_dihedral:g} degrees, "
+            f"down to {angles.min():.2f}; allow more nodes, a lower --k-d, or a lower --min-dihedral"
+        )
     if missed == 0 and abs(covered / image.volume - 1.0) < 1e-9:
-        return 0
+        return 1 if below else 0
     log.print(
         f"[bold red]tetopt:[/] the mesh does not cover the image: {missed} voxels are outside, "
         f"its volume is {covered:.9g} of {image.volume:.9g} mm^{image.ndim}; please report this"
@@ -357,15 +392,18 @@ def _promises(image: Image, result: Optimized) -> int:
     return 1
 
 
-def _optimized(image: Image, initial: Mesh, max_seconds: float | None, **options: Any) -> tuple[Optimized, bool]:
+def _optimized(
+    image: Image, initial: Mesh, method: Method, max_seconds: float | None, **options: Any
+) -> tuple[Optimized, bool]:
     """`optimize` with progress shown, ended in good order by Ctrl-C; whether it was."""
     begin = time.perf_counter()
     iterations = options["iterations"]
-    _prepare_kernels(image, options["k_D"])
+    _prepare_kernels(image, options["k_D"], method)
+    run = optimize if method is Method.fast else optimize_paper
     if max_seconds is not None:
         max_seconds = max(max_seconds - (time.perf_counter() - begin), 1e-9)
     with _graceful_interrupt() as is_interrupted, _progress(iterations) as show:
-        result = optimize(image, initial, max_seconds=max_seconds, callback=show, stop=is_interrupted, **options)
+        result = run(image, initial, max_seconds=max_seconds, callback=show, stop=is_interrupted, **options)
         was_interrupted = is_interrupted()
     if iterations == 0:  # the lattice itself, not its nodes put on the sampling grid
         result = result._replace(mesh=initial)
@@ -379,14 +417,11 @@ def _optimized(image: Image, initial: Mesh, max_seconds: float | None, **options
     return result, was_interrupted
 
 
-def _prepare_kernels(image: Image, k_D: float) -> None:
+def _prepare_kernels(image: Image, k_D: float, method: Method) -> None:
     """Load the compiled kernels, or compile them, before the clock of the first iteration starts."""
     begin = time.perf_counter()
     with log.status("preparing the kernels (the first run compiles them, about half a minute) ..."):
-        is_whole = np.array_equal(np.rint(image.data), image.data)  # decides which kernels the sampling uses
-        step = 1.0 if is_whole else 0.5 if image.data.dtype == np.float32 else 0.1  # 0.1 is held as float64
-        tiny = Image(np.zeros((2,) * image.ndim) + step * np.arange(2))
-        optimize(tiny, lattice(tiny, blocks=(1,) * image.ndim), k_D=k_D, iterations=1)
+        prepare_kernels(image, k_D, method.value)
     seconds = time.perf_counter() - begin
     if seconds > 3.0:
         log.print(f"kernels compiled in {seconds:.0f} s; later runs load them from the cache")
@@ -486,6 +521,9 @@ def quality_command(
     image_path: Annotated[
         Path | None, typer.Option("--image", metavar="IMAGE", help="Measure E_D against this image, too.")
     ] = None,
+    check: Annotated[
+        bool, typer.Option("--check", help="Check that it is a mesh; with --image, one that fills the image's box.")
+    ] = False,
     volume: VolumeOption = None,
     crop: CropOption = None,
     slice_: SliceOption = None,
@@ -510,9 +548,18 @@ def quality_command(
             table.add_row("E_D, share of the variance inside", f"{fit['E_D_share_of_variance']:.5f}")
         table.add_row("voxels inside", f"{fit['n_voxels']} of {image.data.size}")
         table.add_row("cells without a voxel", str(fit["n_empty_cells"]))
+    problems = tetopt.check_mesh(loaded.mesh, None if image_path is None else image) if check else []
+    if check:
+        content["problems"] = problems
     if json_path is not None:
         save_json(json_path, content)
     out.print(table)
+    for problem in problems:
+        log.print(f"[bold red]tetopt:[/] {escape(str(mesh_path))}: {escape(problem)}")
+    if check and not problems:
+        out.print("checked: conforming, oriented, in one piece" + ("" if image_path is None else ", fills the box"))
+    if problems:
+        return 1
     if image_path is not None and fit["n_voxels"] > image.data.size:
         log.print(
             f"[bold red]tetopt:[/] cells overlap: together they hold {fit['n_voxels']} voxels, more than there are"
@@ -813,7 +860,7 @@ def compare_command(
     repeats: Annotated[int, typer.Option(metavar="R", min=1, help="Runs of a mesher whose result varies.")] = 3,
     pipelines: Annotated[
         str, typer.Option(metavar="A,B,...", help="Which, in the report's order.")
-    ] = "tetopt,pytetwild,cleaver,bcc,odt",
+    ] = "tetopt,tetopt-paper,pytetwild,cleaver,bcc,odt",
     k_D: Annotated[float, typer.Option("--k-d", metavar="K", help="tetopt's weight of the image.")] = 0.2,
     classes: Annotated[int, typer.Option(metavar="K", min=2, help="Classes of the segmentation (multi-Otsu).")] = 4,
     young: Annotated[

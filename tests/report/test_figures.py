@@ -12,7 +12,7 @@ from tetopt.geometry.quality import rho_histogram
 from tetopt.image import Image
 from tetopt.lattice import lattice
 from tetopt.mesh import Mesh
-from tetopt.optimize.paper import Optimized, Record, optimize
+from tetopt.optimize.paper import Optimized, Record, optimize_paper
 from tetopt.report import figures
 from tetopt.report.figures import (
     _View,
@@ -320,7 +320,7 @@ def test_energies_of_the_lattice_alone(tmp_path):
 def run():
     image = Image(np.where(np.arange(12) > 4, 9.0, 1.0)[:, None] + np.zeros((12, 11)))
     initial = lattice(image, blocks=(4, 4))
-    return image, initial, optimize(image, initial, iterations=2)
+    return image, initial, optimize_paper(image, initial, iterations=2)
 
 
 def test_before_is_left_and_after_is_right(monkeypatch, tmp_path, run):

@@ -15,7 +15,7 @@ from tetopt.image import Image
 from tetopt.io.files import save_json
 from tetopt.lattice import lattice
 from tetopt.mesh import Mesh
-from tetopt.optimize.paper import optimize
+from tetopt.optimize.paper import optimize_paper
 from tetopt.report.summary import SHOWN_VERSIONS, image_summary, mesh_hash, run_summary, versions
 
 AFFINE = np.array([[0.0, 2.0, 5.0], [-1.5, 0.5, 7.0], [0.0, 0.0, 1.0]])  # 1.5 and sqrt(4.25) mm, 3 mm^2
@@ -33,7 +33,7 @@ def initial(image):
 
 @pytest.fixture(scope="module")
 def result(image, initial):
-    return optimize(image, initial, iterations=3)
+    return optimize_paper(image, initial, iterations=3)
 
 
 @pytest.fixture(scope="module")
@@ -104,7 +104,7 @@ def test_total_variation_is_E_D_of_one_cell_around_everything():
 def test_a_constant_image_has_no_shares(tmp_path):
     image = Image(np.full((8, 9), 7.0))
     initial = lattice(image, blocks=(2, 2))
-    summary = run_summary(image, initial, optimize(image, initial, iterations=1), {}, {})
+    summary = run_summary(image, initial, optimize_paper(image, initial, iterations=1), {}, {})
     shares = ["E_D_relative", "E_D_share_of_variance", "E_D_share_of_variance_initial"]
     assert [summary["energies"][name] for name in shares] == [None] * 3
     save_json(tmp_path / "run.json", summary)

@@ -7,12 +7,11 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import NamedTuple
 
-import numpy as np
-
 from tetopt.image import Image
 from tetopt.lattice import lattice
 from tetopt.mesh import Mesh
-from tetopt.optimize.paper import optimize
+from tetopt.optimize.fast import optimize, prepare_kernels
+from tetopt.optimize.paper import optimize_paper
 
 
 class Job(NamedTuple):
@@ -62,14 +61,14 @@ def bcc(job: Job) -> Produced:
 
 
 def odt(job: Job) -> Produced:
-    """The lattice relaxed to the best shapes, whatever the image shows: `optimize` with k_D = 0.
+    """The lattice relaxed to the best shapes, whatever the image shows: `optimize_paper` with k_D = 0.
 
     Raises
     ------
     InputError
-        As `tetopt.lattice.lattice` and `tetopt.optimize.paper.optimize`.
+        As `tetopt.lattice.lattice` and `tetopt.optimize.paper.optimize_paper`.
     """
-    return _optimized(job, 0.0)
+    return _by_the_paper(job, 0.0)
 
 
 def tetopt(job: Job) -> Produced:
@@ -78,9 +77,27 @@ def tetopt(job: Job) -> Produced:
     Raises
     ------
     InputError
-        As `tetopt.lattice.lattice` and `tetopt.optimize.paper.optimize`.
+        As `tetopt.lattice.lattice` and `tetopt.optimize.paper.optimize_paper`.
     """
-    return _optimized(job, job.k_D)
+    clock = _Clock()
+    with clock.step("kernels"):
+        prepare_kernels(job.image, job.k_D)
+    with clock.step("lattice"):
+        mesh = lattice(job.image, nodes=job.nodes)
+    with clock.step("optimize"):
+        result = optimize(job.image, mesh, k_D=job.k_D, iterations=job.iterations)
+    return Produced(result.mesh, clock.seconds, [f"ended by: {result.ended}"])
+
+
+def tetopt_paper(job: Job) -> Produced:
+    """The lattice and the paper's own scheme, as `tetopt mesh --method paper`.
+
+    Raises
+    ------
+    InputError
+        As `tetopt.lattice.lattice` and `tetopt.optimize.paper.optimize_paper`.
+    """
+    return _by_the_paper(job, job.k_D)
 
 
 def pytetwild(job: Job) -> Produced:
@@ -121,27 +138,20 @@ def cleaver(job: Job) -> Produced:
     return Produced(result.mesh, clock.seconds, [f"{result.n_runs} runs", *result.notes])
 
 
-def _optimized(job: Job, k_D: float) -> Produced:
+def _by_the_paper(job: Job, k_D: float) -> Produced:
     clock = _Clock()
     with clock.step("kernels"):
-        _load_kernels(job.image, k_D)
+        prepare_kernels(job.image, k_D, "paper")
     with clock.step("lattice"):
         mesh = lattice(job.image, nodes=job.nodes)
     with clock.step("optimize"):
-        result = optimize(job.image, mesh, k_D=k_D, iterations=job.iterations)
+        result = optimize_paper(job.image, mesh, k_D=k_D, iterations=job.iterations)
     return Produced(result.mesh, clock.seconds, [f"ended by: {result.ended}"])
-
-
-def _load_kernels(image: Image, k_D: float) -> None:
-    """Load the compiled kernels, or compile them, in a step of its own, on an image that needs the same ones."""
-    is_whole = np.array_equal(np.rint(image.data), image.data)  # decides which kernels the sampling uses
-    step = 1.0 if is_whole else 0.5 if image.data.dtype == np.float32 else 0.1  # 0.1 is held as float64
-    tiny = Image(np.zeros((2,) * image.ndim) + step * np.arange(2))
-    optimize(tiny, lattice(tiny, blocks=(1,) * image.ndim), k_D=k_D, iterations=1)
 
 
 PIPELINES: dict[str, Callable[[Job], Produced]] = {
     "tetopt": tetopt,
+    "tetopt-paper": tetopt_paper,
     "pytetwild": pytetwild,
     "cleaver": cleaver,
     "bcc": bcc,

@@ -47,7 +47,8 @@ class Pipeline(NamedTuple):
 
 
 SHOWN = {
-    "tetopt": Pipeline("tetopt", "tetopt", "tetopt mesh with its defaults: BCC lattice, optimised"),
+    "tetopt": Pipeline("tetopt", "tetopt", "tetopt mesh with its defaults: BCC lattice, fast engine"),
+    "tetopt-paper": Pipeline("tetopt, paper's scheme", "tetopt", "tetopt mesh --method paper"),
     "pytetwild": Pipeline(
         "pytetwild", "peer", "classes by multi-Otsu or the labels given, their surfaces, fTetWild sized by them", True
     ),

@@ -24,7 +24,7 @@ from tetopt.image import Image
 from tetopt.io.images import cropped, image_slice
 from tetopt.lattice import lattice
 from tetopt.mesh import Mesh
-from tetopt.optimize.paper import Optimized, optimize
+from tetopt.optimize.paper import Optimized, optimize_paper
 from tetopt.optimize.retessellate import delaunay
 from tetopt.phantom import load_phantom
 
@@ -78,7 +78,7 @@ def figure_1(seed: int) -> Case:
     if cells is None:
         raise RuntimeError(f"seed {seed}: the random nodes have no Delaunay tessellation")
     mesh = Mesh(points, cells)
-    result = optimize(image, mesh, k_D=0.0, iterations=200, boundary="fixed", tolerance=1e-4)
+    result = optimize_paper(image, mesh, k_D=0.0, iterations=200, boundary="fixed", tolerance=1e-4)
     return Case("61 random nodes", image, mesh, result)
 
 
@@ -103,7 +103,7 @@ def figure_2(k_D: float) -> Case:
     """
     image = load_phantom("fig2_2d").image()
     mesh = lattice(image, blocks=(7, 7))
-    return Case(f"k_D = {k_D:g}", image, mesh, optimize(image, mesh, k_D=k_D, iterations=20, boundary="fixed"))
+    return Case(f"k_D = {k_D:g}", image, mesh, optimize_paper(image, mesh, k_D=k_D, iterations=20, boundary="fixed"))
 
 
 class Landscape(NamedTuple):
@@ -136,7 +136,7 @@ def figure_2b(k_D: float, n_places: int = 41) -> Landscape:
             points[centre] = x, y
             moved = Mesh(points, mesh.cells)
             E[i, k] = combined(E_G(points, mesh.cells), E_D(image, moved), E_G0, E_D0, k_D)
-    result = optimize(
+    result = optimize_paper(
         image, mesh, k_D=k_D, iterations=100, retessellate="never", boundary="fixed", tolerance=1e-6, step_ratio=0.1
     )
     return Landscape(image, k_D, places, E, result.mesh.points[centre], result.history[-1].E)
@@ -152,7 +152,7 @@ def figure_3ab(volume: Image) -> Case:
     image = _cropped_to_content(middle, (8, 7) if middle.shape[0] > middle.shape[1] else (7, 8))
     blocks = (8, 7) if image.spacing[0] * image.shape[0] > image.spacing[1] * image.shape[1] else (7, 8)
     mesh = lattice(image, blocks=blocks)
-    result = optimize(image, mesh, k_D=0.2, iterations=20, boundary="fixed")
+    result = optimize_paper(image, mesh, k_D=0.2, iterations=20, boundary="fixed")
     return Case("brain MR slice", image, mesh, result)
 
 
@@ -195,7 +195,7 @@ def figure_3cd(snr_db: float | None) -> Case:
     """The approximate-stiffness image on 113 nodes, k_D = 0.3, 15 iterations (Fig. 3(c, d), Table 1 rows 6, 7)."""
     image = elastography(snr_db)
     mesh = lattice(image, blocks=(7, 7))
-    result = optimize(image, mesh, k_D=0.3, iterations=15, boundary="fixed")
+    result = optimize_paper(image, mesh, k_D=0.3, iterations=15, boundary="fixed")
     return Case("no noise" if snr_db is None else f"SNR {snr_db:g} dB", image, mesh, result)
 
 
@@ -214,7 +214,7 @@ def figure_3ef(volume: Image) -> Case:
     high = np.minimum(np.rint(centre + half), volume.shape)
     image = cropped(volume, [(int(a), int(b)) for a, b in zip(low, high, strict=True)])
     mesh = lattice(image, "five-tet", blocks=tuple(int(b) for b in blocks))
-    result = optimize(image, mesh, k_D=0.3, iterations=15, boundary="slide")
+    result = optimize_paper(image, mesh, k_D=0.3, iterations=15, boundary="slide")
     return Case("brain MR volume", image, mesh, result)
 
 
@@ -224,7 +224,7 @@ def figure_3ef(volume: Image) -> Case:
 def segmentation_case(volume: Image) -> Case:
     """The whole volume on about 5000 nodes, a cell to some 300 voxels; k_D = 0.3, 10 iterations."""
     mesh = lattice(volume, nodes=5000)
-    return Case("brain MR volume", volume, mesh, optimize(volume, mesh, k_D=0.3, iterations=10))
+    return Case("brain MR volume", volume, mesh, optimize_paper(volume, mesh, k_D=0.3, iterations=10))
 
 
 # Conditioning and strain energy, Section 3.

@@ -124,7 +124,7 @@ def fill_across(across: NDArray, cells: NDArray, n_cells: int, n_nodes: int) -> 
                     break
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def facet_of(cells: NDArray, across: NDArray, cell: int, other: int) -> int:
     """The facet of `cell` beyond which `other` lies."""
     k = 0
@@ -218,7 +218,7 @@ def shape_energy(x: NDArray, n_corners: int, power: float) -> float:
     return E_G * (S / (12.0 * np.cbrt(9.0 * volume * volume))) ** (power - 1.0)
 
 
-@njit(cache=True, inline="always")
+@njit(cache=True)
 def load(x: NDArray, row: int, ticks: NDArray, node: int, base: int, measure: Measure) -> None:
     """A node's position relative to the node `base`, in mm, to a row of x; subtracted in integers, exactly."""
     scale = 2.0**-measure.bits
@@ -453,7 +453,16 @@ def measure_of(
     min_dihedral: float = 0.0,
 ) -> Measure:  # fmt: skip
     """A `Measure` of plain numbers, as the kernels are compiled for."""
-    return Measure(grid.prefix, int(grid.bits), int(hand), matrix, float(geometry), float(image), float(power), -float(np.cos(np.radians(min_dihedral))))
+    return Measure(
+        grid.prefix,
+        int(grid.bits),
+        int(hand),
+        matrix,
+        float(geometry),
+        float(image),
+        float(power),
+        -float(np.cos(np.radians(min_dihedral))),
+    )
 
 
 def threads() -> int:

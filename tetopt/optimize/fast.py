@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,6 +18,7 @@ from tetopt.energy.sampling import check_orientations, from_ticks, sampling_grid
 from tetopt.errors import InputError
 from tetopt.geometry.topology import facets
 from tetopt.image import Image
+from tetopt.lattice import lattice
 from tetopt.mesh import Mesh
 from tetopt.optimize.complex import (
     Complex,
@@ -29,8 +31,17 @@ from tetopt.optimize.complex import (
 )
 from tetopt.optimize.descent import free_projections
 from tetopt.optimize.flips import flip
-from tetopt.optimize.paper import NOISE, Boundary, Optimized, Record, deadline, frozen_axes, relative_movement
-from tetopt.optimize.repair import repair, worst_angles
+from tetopt.optimize.paper import (
+    NOISE,
+    Boundary,
+    Optimized,
+    Record,
+    deadline,
+    frozen_axes,
+    optimize_paper,
+    relative_movement,
+)
+from tetopt.optimize.repair import repair, touch, worst_angles
 from tetopt.optimize.smooth import sweep
 
 SLACK = 0.5  # degrees over the floor that the repair aims for, so that the sweeps after it have room
@@ -127,6 +138,24 @@ def optimize(
             ended = "converged"
             break
     return Optimized(run.mesh(), history, ended)
+
+
+def prepare_kernels(image: Image, k_D: float, method: Literal["fast", "paper"] = "fast") -> None:
+    """Compile the kernels of a method for images of this kind, or load them, before a clock starts.
+
+    The sampling has kernels of its own for whole-number images whose sums fit 32 bits; see `sampling_grid`.
+    """
+    is_whole = np.array_equal(np.rint(image.data), image.data)
+    step = 1.0 if is_whole else 0.1
+    tiny = Image(np.zeros((3,) * image.ndim) + step * np.arange(3))
+    mesh = lattice(tiny, blocks=(1,) * image.ndim)
+    if method == "paper":
+        optimize_paper(tiny, mesh, k_D=k_D, iterations=1)
+        return
+    optimize(tiny, mesh, k_D=k_D, iterations=1)
+    if image.ndim == 3:
+        run = _Run(tiny, mesh, k_D, 3.0, "slide")
+        touch(run.held, run.is_frozen, run.measure, run.projections)
 
 
 class _Run:

@@ -92,6 +92,13 @@ def repair(
     return Repaired(held, len(_worst_first(held, measure, target)), total)
 
 
+def touch(held: Complex, is_frozen: NDArray[np.bool_], measure: Measure, projections: NDArray[np.float64]) -> None:
+    """Run the kernels over no cells, so that they are compiled."""
+    none = np.empty(0, dtype=np.int64)
+    _reconnect(held, none, measure, 0.0)
+    _displace(held, node_rings(held), none, is_frozen, measure, projections, 0.0)
+
+
 def worst_angles(held: Complex, measure: Measure, floor: float) -> int:
     """How many cells have a smallest dihedral angle under `floor` degrees."""
     return int((qualities(held, measure) < -np.cos(np.radians(floor))).sum())

@@ -329,9 +329,7 @@ def _move(
 
 
 @njit(cache=True)
-def _store(
-    held: Complex, rings: NodeRings, node: int, shapes: NDArray, fluxes: NDArray, measure: Measure
-) -> None:
+def _store(held: Complex, rings: NodeRings, node: int, shapes: NDArray, fluxes: NDArray, measure: Measure) -> None:
     """Write what `_ring_energy` found of a node's ring into the complex."""
     first = rings.start[node]
     for r in range(first, rings.start[node + 1]):

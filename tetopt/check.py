@@ -1,0 +1,106 @@
+"""Is it a mesh? Questions whose answers a solver takes for granted."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.geometry.simplex import volumes
+from tetopt.geometry.topology import components, facets, folded
+from tetopt.image import Image
+from tetopt.mesh import Mesh
+
+ON_FACE = 1e-6  # voxel
+
+
+def check_mesh(mesh: Mesh, image: Image | None = None) -> list[str]:
+    """What is wrong with a mesh, one line each, the first offenders named; an empty list if nothing is.
+
+    Asked are: every node used and none twice in the same place; every cell positively oriented, with distinct corners,
+    and none doubled; every facet in one or two cells, which lie on its two sides (so the mesh conforms and does not
+    fold); the boundary closed, and one piece. With an image also: the boundary's facets lie on the faces of its box,
+    and the cells' volumes add up to it.
+
+    Parameters
+    ----------
+    mesh : Mesh
+    image : Image, optional
+        The image whose box the mesh should fill.
+    """
+    found = [*_nodes(mesh), *_cells(mesh)]
+    if not found:  # what follows takes sound cells for granted
+        found = _facets(mesh)
+    if not found and image is not None:
+        found = _box(mesh, image)
+    return found
+
+
+def _first(numbers: NDArray) -> str:
+    return f"{len(numbers)}, the first {numbers[:5].tolist()}"
+
+
+def _nodes(mesh: Mesh) -> list[str]:
+    found = []
+    unused = np.flatnonzero(np.bincount(mesh.cells.ravel(), minlength=len(mesh.points)) == 0)
+    if len(unused):
+        found.append(f"nodes that no cell uses: {_first(unused)}")
+    order = np.lexsort(mesh.points.T)
+    same = (mesh.points[order[1:]] == mesh.points[order[:-1]]).all(axis=1)
+    if same.any():
+        pairs = np.column_stack([order[:-1], order[1:]])[same]
+        found.append(f"pairs of nodes in one place: {_first(np.sort(pairs, axis=1))}")
+    return found
+
+
+def _cells(mesh: Mesh) -> list[str]:
+    found = []
+    ordered = np.sort(mesh.cells, axis=1)
+    repeated = np.flatnonzero((ordered[:, 1:] == ordered[:, :-1]).any(axis=1))
+    if len(repeated):
+        found.append(f"cells with a corner twice: {_first(repeated)}")
+    flat = np.flatnonzero(~(volumes(mesh.points, mesh.cells) > 0.0))
+    if len(flat):
+        found.append(f"cells that are flat or inverted: {_first(flat)}")
+    _, index, counts = np.unique(ordered, axis=0, return_index=True, return_counts=True)
+    if (counts > 1).any():
+        found.append(f"cells that are there more than once: {_first(np.sort(index[counts > 1]))}")
+    return found
+
+
+def _facets(mesh: Mesh) -> list[str]:
+    found = []
+    pairs = folded(mesh.cells)
+    if len(pairs):
+        found.append(f"facets whose cells lie on one side of them, or of more than two cells; cells: {_first(pairs)}")
+    shared = facets(mesh.cells)
+    outer = shared.nodes[shared.n_cells == 1]
+    if mesh.ndim == 3:  # every edge of the boundary's triangles belongs to an even number of them
+        edges = np.sort(outer[:, [[0, 1], [1, 2], [0, 2]]].reshape(-1, 2), axis=1)
+        kinds, counts = np.unique(edges, axis=0, return_counts=True)
+    else:
+        kinds, counts = np.unique(outer, return_counts=True)
+        kinds = kinds[:, None]
+    if (counts % 2).any():
+        found.append(f"places where the boundary is open; nodes: {_first(kinds[counts % 2 == 1])}")
+    pieces = components(mesh.cells)
+    if pieces.max() > 0:
+        sizes = np.bincount(pieces)
+        found.append(f"pieces that share no facet: {len(sizes)}, of {np.sort(sizes)[::-1][:5].tolist()} cells")
+    return found
+
+
+def _box(mesh: Mesh, image: Image) -> list[str]:
+    found = []
+    shared = facets(mesh.cells)
+    outer = shared.nodes[shared.n_cells == 1]
+    index = image.to_index(mesh.points)[outer]
+    on_box = np.zeros(len(outer), dtype=bool)
+    for axis in range(mesh.ndim):
+        for face in (-0.5, image.shape[axis] - 0.5):
+            on_box |= (np.abs(index[:, :, axis] - face) <= ON_FACE).all(axis=1)
+    if not on_box.all():
+        found.append(f"boundary facets off the faces of the image's box; nodes: {_first(outer[~on_box])}")
+    filled = float(volumes(mesh.points, mesh.cells).sum()) / image.volume
+    if abs(filled - 1.0) > 1e-9:
+        found.append(f"volume: {filled:.12g} of the image's box")
+    return found
