@@ -68,7 +68,8 @@ def run(inputs, tmp_path_factory):
     """One run in 3-D with all its outputs: folder, run.json, mesh file, image."""
     folder = tmp_path_factory.mktemp("run")
     command = ["mesh", str(inputs / "sphere.nii.gz"), "-o", str(folder / "mesh.vtu"), "--nodes", "150"]
-    command += ["--json", str(folder / "run.json"), "--iterations", "3", "--k-d", "0.3", "--n-t", "1"]
+    command += ["--json", str(folder / "run.json"), "--iterations", "3", "--k-d", "0.3"]
+    command += ["--method", "paper", "--n-t", "1"]
     assert main(command) == 0
     return (
         folder,
@@ -179,7 +180,8 @@ def test_mesh_in_2d(tmp_path, inputs):
     "options",
     [
         ["--method", "paper", "--boundary", "fixed", "--retessellate", "never"],
-        ["--retessellate", "accept", "--n-t", "0"],
+        ["--retessellate", "accept", "--n-t", "0", "--method", "paper"],
+        ["--shape-power", "1", "--min-dihedral", "0"],
         ["--k-d", "0", "--lattice", "five-tet"],
         ["--crop", "2:14,:,1:15"],
     ],
@@ -325,14 +327,17 @@ def test_max_seconds_leaves_a_valid_mesh(tmp_path, inputs, capsys):
 def test_a_mesh_that_misses_voxels_is_told(run, capsys):
     _, _, file, image = run
     result = tetopt.optimize(image, file.mesh, iterations=0)
-    assert tetopt.cli._promises(image, result) == 0
+    assert tetopt.cli._promises(image, result, 0.0) == 0
     assert capsys.readouterr().err == ""
     row = result.history[-1]
     fewer = result._replace(history=[row._replace(n_voxels=row.n_voxels - 1)])
-    assert tetopt.cli._promises(image, fewer) == 1
+    assert tetopt.cli._promises(image, fewer, 0.0) == 1
     assert "1 voxels are outside" in capsys.readouterr().err
+    flat = result._replace(history=[row._replace(iteration=1)])
+    assert tetopt.cli._promises(image, flat, 60.0) == 1
+    assert re.search(r"tetopt: \d+ of \d+ cells have an angle under 60 degrees", capsys.readouterr().err)
     smaller = result._replace(mesh=Mesh(file.mesh.points * 0.999, file.mesh.cells))
-    assert tetopt.cli._promises(image, smaller) == 1
+    assert tetopt.cli._promises(image, smaller, 0.0) == 1
     assert capsys.readouterr().err.count("\n") == 1
 
 
@@ -434,7 +439,10 @@ BAD_OPTIONS = [
     ("--max-seconds nan", "--max-seconds: expected more than 0"),
     ("--lattice criss-cross", "expected one of bcc, five-tet in 3-D"),
     ("--lattice fcc", "--lattice"),
-    ("--method fast", "--method"),
+    ("--method fast --n-t 2", "--n-t: only with --method paper"),
+    ("--method paper --shape-power 3", "--shape-power: only with --method fast"),
+    ("--min-dihedral 80", "min_dihedral: expected 0 to below 70"),
+    ("--shape-power 0.5", "shape_power: expected 1"),
     ("--boundary free", "--boundary"),
     ("--retessellate always", "--retessellate"),
     ("--slice z", 'slice: expected .* got "z"'),

@@ -43,7 +43,7 @@ from tetopt.io.images import parse_crop, parse_slice, sha256
 from tetopt.io.meshes import MeshFile, cell_fields
 from tetopt.io.mni import mni_path, mni_tissue
 from tetopt.lattice import KINDS
-from tetopt.optimize.fast import optimize, prepare_kernels
+from tetopt.optimize.fast import check_options, optimize, prepare_kernels
 from tetopt.optimize.paper import Optimized, Record, default_n_t, optimize_paper
 from tetopt.report.summary import run_summary, versions
 from tetopt.segmentation import check_labels
@@ -239,14 +239,6 @@ def mesh_command(
         raise InputError(f"--k-d: expected 0 <= k_D < 1, got {k_D}")
     if max_seconds is not None and not max_seconds > 0.0:
         raise InputError(f"--max-seconds: expected more than 0, got {max_seconds}")
-    names = ("slice.png", "rho.png", "energies.png")
-    pictures = [] if figures is None else [checked_output(figures / name, (".png",), force) for name in names]
-    _set_threads(threads)
-    image = _image(image_path, volume, crop, slice_)
-    if nodes is None and spacing is None:
-        nodes = DEFAULT_NODES[image.ndim]
-    kind = KINDS[image.ndim][0] if lattice_kind is None else lattice_kind.value
-    initial = lattice(image, kind, nodes=nodes, spacing=spacing)
     options: dict[str, Any] = {"k_D": k_D, "iterations": iterations, "boundary": boundary.value}
     _check_method(method, {"--n-t": n_t, "--retessellate": retessellate}, Method.paper)
     _check_method(method, {"--shape-power": shape_power, "--min-dihedral": min_dihedral}, Method.fast)
@@ -256,6 +248,15 @@ def mesh_command(
     else:
         options["shape_power"] = 3.0 if shape_power is None else shape_power
         options["min_dihedral"] = 12.0 if min_dihedral is None else min_dihedral
+        check_options(**options)
+    names = ("slice.png", "rho.png", "energies.png")
+    pictures = [] if figures is None else [checked_output(figures / name, (".png",), force) for name in names]
+    _set_threads(threads)
+    image = _image(image_path, volume, crop, slice_)
+    if nodes is None and spacing is None:
+        nodes = DEFAULT_NODES[image.ndim]
+    kind = KINDS[image.ndim][0] if lattice_kind is None else lattice_kind.value
+    initial = lattice(image, kind, nodes=nodes, spacing=spacing)
     source = {
         "nodes": nodes, "spacing": spacing, "lattice": kind, "volume": volume, "crop": crop, "slice": slice_,
         "method": method.value, "max_seconds": max_seconds,
@@ -380,7 +381,7 @@ def _promises(image: Image, result: Optimized, min_dihedral: float) -> int:
         below = int((angles < min_dihedral - 1e-6).sum())
     if below:
         log.print(
-            f"[bold red]tetopt:[/] {below} of {len(angles)} cells have a dihedral angle under {min_dihedral:g} degrees, "
+            f"[bold red]tetopt:[/] {below} of {len(angles)} cells have an angle under {min_dihedral:g} degrees, "
             f"down to {angles.min():.2f}; allow more nodes, a lower --k-d, or a lower --min-dihedral"
         )
     if missed == 0 and abs(covered / image.volume - 1.0) < 1e-9:

@@ -455,7 +455,7 @@ def browser(folder, *arguments):
         pytest.skip("no Chromium on this machine")
     flags = ["--headless", "--no-sandbox", "--disable-background-networking", "--enable-unsafe-swiftshader"]
     flags += ["--use-gl=angle", "--use-angle=swiftshader", "--enable-logging=stderr", f"--user-data-dir={folder}"]
-    done = subprocess.run([program, *flags, *arguments], capture_output=True, text=True, check=True, timeout=120)
+    done = subprocess.run([program, *flags, *arguments], capture_output=True, encoding="utf-8", check=True, timeout=120)
     assert "CONSOLE" not in done.stderr, [line for line in done.stderr.splitlines() if "CONSOLE" in line]
     return done.stdout
 

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
@@ -72,11 +71,14 @@ def build(cells: NDArray[np.int64], ticks: NDArray[np.int64], measure: Measure) 
 def grown(held: Complex) -> Complex:
     """The complex with room for a quarter more cells."""
     more = held.n_cells[0] // 4 + 64
-    wider = [
-        np.concatenate([array, np.full((more, *array.shape[1:]), -1, dtype=array.dtype)])
-        for array in (held.cells, held.across, held.fluxes, held.sums, held.E_shape)
-    ]
-    return Complex(held.ticks, *wider, held.n_cells)
+
+    def wider(array: NDArray) -> NDArray:
+        return np.concatenate([array, np.full((more, *array.shape[1:]), -1, dtype=array.dtype)])
+
+    return Complex(
+        held.ticks, wider(held.cells), wider(held.across), wider(held.fluxes), wider(held.sums), wider(held.E_shape),
+        held.n_cells,
+    )  # fmt: skip
 
 
 @njit(cache=True)
@@ -463,8 +465,3 @@ def measure_of(
         float(power),
         -float(np.cos(np.radians(min_dihedral))),
     )
-
-
-def threads() -> int:
-    """Threads that kernels may use now."""
-    return int(numba.get_num_threads())

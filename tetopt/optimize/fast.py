@@ -14,7 +14,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.energy.sampling import check_orientations, from_ticks, sampling_grid, to_ticks
+from tetopt.energy.sampling import check_orientations, few_threads, from_ticks, sampling_grid, to_ticks
 from tetopt.errors import InputError
 from tetopt.geometry.topology import facets
 from tetopt.image import Image
@@ -25,6 +25,7 @@ from tetopt.optimize.complex import (
     Measure,
     build,
     energies,
+    measure_all,
     measure_of,
     node_colours,
     node_rings,
@@ -106,7 +107,7 @@ def optimize(
         An option out of range, or a mesh that the sampling cannot take (see `tetopt.cell_moments`) or whose facets are
         shared by more than two cells.
     """
-    _check_options(k_D, iterations, shape_power, min_dihedral, boundary)
+    check_options(k_D, iterations, shape_power, min_dihedral, boundary)
     begin = time.perf_counter()
     is_over = deadline(begin, max_seconds, stop)
     run = _Run(image, mesh, k_D, shape_power, boundary)
@@ -235,6 +236,9 @@ class _Run:
         return done.n_moves
 
     def record(self, iteration: int, movement: float, is_changed: bool, seconds: float) -> Record:
+        if self.measure.image == 0.0:  # the moves have left the sums alone
+            with few_threads(int(self.held.n_cells[0]) * 4):
+                measure_all(self.held, self.measure)
         E_G, squares = self.energies()
         n_cells = int(self.held.n_cells[0])
         n_voxels = int(self.held.sums[:n_cells, 0].sum())
@@ -246,7 +250,8 @@ class _Run:
         return Mesh(points, self.held.cells[: int(self.held.n_cells[0])].copy())
 
 
-def _check_options(k_D: float, iterations: int, shape_power: float, min_dihedral: float, boundary: str) -> None:
+def check_options(k_D: float, iterations: int, shape_power: float, min_dihedral: float, boundary: str) -> None:
+    """InputError for an option of `optimize` out of range."""
     if not 0.0 <= k_D < 1.0:
         raise InputError(f"k_D: expected 0 <= k_D < 1, got {k_D}")
     if iterations < 0:

@@ -131,9 +131,8 @@ def _worth_of_face(x: NDArray, held: Complex, cell: int, k: int, measure: Measur
             return -np.inf
     if measure.image == 0.0:
         return old - new
-    j_u, j_v, j_w = (
-        flux_of(held.ticks, p, q, u, measure), flux_of(held.ticks, p, q, v, measure), flux_of(held.ticks, p, q, w, measure)
-    )  # fmt: skip
+    j_u, j_v = flux_of(held.ticks, p, q, u, measure), flux_of(held.ticks, p, q, v, measure)
+    j_w = flux_of(held.ticks, p, q, w, measure)
     for a, f_0, f_1 in ((w, j_u, j_v), (u, j_v, j_w), (v, j_w, j_u)):  # a: the corner of the facet that is left out
         below = held.fluxes[cell, corner_of(held.cells, cell, a)]
         above = held.fluxes[other, corner_of(held.cells, other, a)]
@@ -153,8 +152,8 @@ def _ring_of_edge(
     """The cells around the edge of a cell between its corners i and j, and the polygon of their other corners.
 
     Turning from a to b to the right: cell r holds a, b, ring[r] and ring[r + 1]. Returns the polygon's number of
-    corners, 0 if it is more than `MOST` or, with `owned`, if `cell` is not the lowest of the cells, and 1 if it is open, that is if the edge is on the boundary; then there is
-    one cell less than corners.
+    corners, and 1 if it is open, that is if the edge is on the boundary; then there is one cell less than corners. The
+    number is 0 if it would be more than `MOST` or, with `owned`, if `cell` is not the lowest of the cells.
     """
     a, b = held.cells[cell, i], held.cells[cell, j]
     # The other two corners, so that (a, b, v, w) is positively oriented.
