@@ -145,7 +145,7 @@ def test_views_turn_together(page, tmp_path):
     """Drag, keys, wheel and buttons change every view; reset brings the first picture back."""
     copied = tmp_path / "copy.html"
     copied.write_text(page.read_text(encoding="utf-8").replace("</body>", PROBE + "</body>"), encoding="utf-8")
-    found = browser(tmp_path / "profile", "--virtual-time-budget=6000", "--dump-dom", copied.as_uri())
+    found = browser(tmp_path / "profile", "--virtual-time-budget=30000", "--dump-dom", copied.as_uri())
     assert found.count('data-drawn="1"') == 2
     said = re.search(r'data-said="([^"]*)"', found).group(1)
     assert said == ("drag true,true; reset false,false; key true,true; wheel unasked false,false; wheel true,true")

@@ -119,7 +119,24 @@ def _by_lobpcg(K_ff: csr_array, preconditioner: LinearOperator) -> float:
         # The eigenvalue's error is about residual^2 over the gap to the next one.
         if residual <= 1e-4 * estimate:
             return estimate
-    raise RuntimeError(f"conditioning: the smallest eigenvalue, near {estimate:.3g}, did not converge")
+    return _by_inverse(K_ff, preconditioner)  # slower, but where moduli differ a lot it comes through
+
+
+def _by_inverse(K_ff: csr_array, preconditioner: LinearOperator) -> float:
+    """Lanczos on the inverse of K_ff, each product a preconditioned solve."""
+
+    def solve(load: NDArray[np.float64]) -> NDArray[np.float64]:
+        found, failed = cg(K_ff, load.ravel(), rtol=1e-10, maxiter=3000, M=preconditioner)
+        if failed:
+            raise RuntimeError("conditioning: the smallest eigenvalue did not converge: a solve did not")
+        return found
+
+    inverse = LinearOperator(K_ff.shape, matvec=solve, dtype=np.float64)
+    try:
+        values = eigsh(K_ff, k=1, sigma=0.0, OPinv=inverse, v0=_start(K_ff)[:, 0], tol=1e-8, return_eigenvectors=False)
+    except ArpackNoConvergence as error:
+        raise RuntimeError(f"conditioning: the smallest eigenvalue did not converge ({error})") from error
+    return float(values[0])
 
 
 def cg_iterations(K_ff: csr_array, load: NDArray[np.float64], rtol: float = RTOL) -> int:

@@ -36,6 +36,7 @@ from tetopt.optimize.complex import (
 POINTS = 8  # most parts that a facet's edge is cut into when h is integrated over it
 SPACING = 2.0  # voxels between such points
 REACH = 0.5  # of the distance to the nearest centroid of the ring's cells: the longest first step
+PROBE = 0.3  # of that step: how far a stalled node looks along the axes
 TRIES = 3  # energies measured along the gradient, at most
 
 
@@ -321,9 +322,27 @@ def _move(
             t = vertex
         else:
             t = min(max(vertex, 0.1 * t), 0.5 * t)
-    held.ticks[node, 0] = here0 + np.int64(np.rint(best_t * step[0] / scale))
-    held.ticks[node, 1] = here1 + np.int64(np.rint(best_t * step[1] / scale))
-    held.ticks[node, 2] = here2 + np.int64(np.rint(best_t * step[2] / scale))
+    there0 = here0 + np.int64(np.rint(best_t * step[0] / scale))
+    there1 = here1 + np.int64(np.rint(best_t * step[1] / scale))
+    there2 = here2 + np.int64(np.rint(best_t * step[2] / scale))
+    if best_t == 0.0 and measure.image > 0.0:
+        # The gradient is of the continuous image, the energy of its voxels: where a node stalls, ask along the axes.
+        for axis in range(4 - n, 3):
+            if is_frozen[node, axis]:
+                continue
+            length = np.sqrt(M[0, axis] ** 2 + M[1, axis] ** 2 + M[2, axis] ** 2)
+            for sign in (1, -1):
+                shift = sign * np.int64(np.rint(PROBE * reach / (length * scale)))
+                held.ticks[node, 0] = here0 + (shift if axis == 0 else 0)
+                held.ticks[node, 1] = here1 + (shift if axis == 1 else 0)
+                held.ticks[node, 2] = here2 + (shift if axis == 2 else 0)
+                value = _ring_energy(best, least, trial, fluxes, x, node, held, rings, measure)
+                if value < best:
+                    best, best_t = value, 1.0
+                    there0, there1, there2 = held.ticks[node, 0], held.ticks[node, 1], held.ticks[node, 2]
+                    trial, best_trial = best_trial, trial
+                    fluxes, best_fluxes = best_fluxes, fluxes
+    held.ticks[node, 0], held.ticks[node, 1], held.ticks[node, 2] = there0, there1, there2
     if best_t > 0.0:
         _store(held, rings, node, best_trial, best_fluxes, measure)
 
