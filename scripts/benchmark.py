@@ -9,6 +9,7 @@ depend on the machine and on what else it does.
 from __future__ import annotations
 
 import argparse
+import json
 import os
 import resource
 import subprocess
@@ -29,6 +30,8 @@ from tetopt.geometry.simplex import oriented, rho, volumes
 from tetopt.geometry.topology import facets
 from tetopt.io.files import checked_output, save_json
 from tetopt.io.mni import mni_path
+from tetopt.optimize.fast import _Run, prepare_kernels
+from tetopt.optimize.flips import flip
 from tetopt.optimize.retessellate import delaunay
 from tetopt.report.summary import versions
 
@@ -59,6 +62,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     rows |= sampling(image, 2_000 if options.quick else 37_000)
     rows["paper"] = [paper(image, nodes, iterations=2 if options.quick else 6) for nodes in sizes]
     rows["bar"] = bar(image, 300 if options.quick else 5_000)
+    rows["engine"] = engine(image, path, (300, 500, 700, 900) if options.quick else (5_000, 14_000, 37_000, 145_000))
     rows["peak_memory_gb"] = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
     save_json(output, rows)
     show(rows)
@@ -164,6 +168,58 @@ def bar(image: tetopt.Image, nodes: int) -> dict[str, Any]:
     }
 
 
+def engine(image: tetopt.Image, path: Path, sizes: Sequence[int]) -> dict[str, Any]:
+    """The fast engine against the paper's scheme, at k_D = 0.5; how time and memory grow; a flip pass alone."""
+    mesh = tetopt.lattice(image, nodes=sizes[0])
+    prepare_kernels(image, 0.5)
+    reference = tetopt.optimize_paper(image, mesh, k_D=0.5, iterations=20).history
+    same = tetopt.optimize(image, mesh, k_D=0.5, iterations=20, shape_power=1.0, min_dihedral=0.0).history
+    reached = next((row.seconds for row in same if row.E <= reference[-1].E), None)
+    found: dict[str, Any] = {
+        "nodes": len(mesh.points), "paper_E": reference[-1].E, "paper_seconds": reference[-1].seconds,
+        "fast_E": same[-1].E, "fast_seconds": same[-1].seconds, "fast_seconds_to_paper_E": reached,
+        "faster_by": None if reached is None else reference[-1].seconds / reached,
+    }  # fmt: skip
+    found["runs"] = [in_a_child(path, nodes) for nodes in sizes[1:]]
+    first, last = found["runs"][1], found["runs"][-1]
+    found["time_grows_as_nodes_to_the"] = float(
+        np.log(last["seconds_per_iteration"] / first["seconds_per_iteration"]) / np.log(last["nodes"] / first["nodes"])
+    )
+    found["flip_seconds_per_mtet"] = flip_pass(image, sizes[1])
+    return found
+
+
+def in_a_child(path: Path, nodes: int) -> dict[str, Any]:
+    """Defaults at k_D = 0.5 in a process of its own, for its peak of memory."""
+    program = (
+        "import json, resource, sys, time, numpy as np, tetopt\n"
+        "from tetopt.optimize.fast import prepare_kernels\n"
+        "peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6\n"
+        "image = tetopt.load_image(sys.argv[1])\n"
+        "prepare_kernels(image, 0.5)\n"
+        "mesh = tetopt.lattice(image, nodes=int(sys.argv[2]))\n"
+        "before, begin = peak(), time.perf_counter()\n"
+        "result = tetopt.optimize(image, mesh, k_D=0.5)\n"
+        "seconds, after = time.perf_counter() - begin, peak()\n"
+        "first, last = result.history[0], result.history[-1]\n"
+        "q = tetopt.quality(result.mesh.points, result.mesh.cells)\n"
+        "print(json.dumps({'nodes': q.n_nodes, 'cells': q.n_cells, 'seconds': seconds, 'iterations': last.iteration,\n"
+        "    'seconds_per_iteration': (last.seconds - first.seconds) / last.iteration,\n"
+        "    'E_D_of_initial': last.E_D / first.E_D, 'mean_rho': q.mean_rho, 'min_dihedral': q.min_dihedral,\n"
+        "    'gb_more_per_mtet': (after - before) / q.n_cells * 1e6, 'peak_gb': after}))\n"
+    )
+    done = subprocess.run([sys.executable, "-c", program, str(path), str(nodes)], check=True, capture_output=True)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def flip_pass(image: tetopt.Image, nodes: int) -> float:
+    """Seconds per million tetrahedra to look at every facet and edge of a mesh that is good already."""
+    mesh = tetopt.optimize(image, tetopt.lattice(image, nodes=nodes), k_D=0.5).mesh
+    run = _Run(image, mesh, 0.5, 3.0, "slide")
+    run.held, _ = flip(run.held, run.measure)
+    return best_seconds(lambda: flip(run.held, run.measure)) / len(mesh.cells) * 1e6
+
+
 def show(rows: dict[str, Any]) -> None:
     """Print the table."""
     print(f"{rows['image']}, {rows['cores']} cores, {rows['threads']} threads")
@@ -189,6 +245,25 @@ def show(rows: dict[str, Any]) -> None:
         f"  {result['nodes']} nodes, k_D = 0.2, 20 iterations: E_D {result['E_D_of_initial']:.3f} of initial, "
         f"mean rho {result['mean_rho']:.4f}, {result['seconds']:.1f} s"
     )
+    fast = rows["engine"]
+    if fast["faster_by"] is not None:
+        print(
+            f"  --method fast, {fast['nodes']} nodes, k_D = 0.5, p = 1, to E {fast['paper_E']:.4f} of 20 paper "
+            "iterations: "
+            f"{fast['fast_seconds_to_paper_E']:.2f} s against {fast['paper_seconds']:.1f} s, {fast['faster_by']:.0f} "
+            "times "
+            f"faster; ends at {fast['fast_E']:.4f}"
+        )
+    for row in fast["runs"]:
+        print(
+            f"  --method fast, {row['nodes']} nodes, {row['cells']} tets, k_D = 0.5: {row['seconds']:.1f} s, "
+            f"{row['iterations']} iterations; E_D {row['E_D_of_initial']:.3f} of initial, mean rho "
+            f"{row['mean_rho']:.4f}, "
+            f"angles from {row['min_dihedral']:.1f}; {row['seconds'] / row['cells'] * 1e6:.0f} s and "
+            f"{row['gb_more_per_mtet']:.2f} GB per Mtet"
+        )
+    print(f"  time of an iteration grows as nodes^{fast['time_grows_as_nodes_to_the']:.2f}")
+    print(f"  flip pass over a good mesh        {fast['flip_seconds_per_mtet']:10.2f} s per Mtet")
     print(f"  peak memory                       {rows['peak_memory_gb']:10.2f} GB")
 
 

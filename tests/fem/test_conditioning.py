@@ -213,5 +213,7 @@ def test_no_convergence_is_an_error():
         cg_iterations(equations.K_ff, equations.load, 1e-300)
     # As bad a preconditioner as can be: the matrix itself.
     ill = system(2, (30, 30), contrast=1e6).K_ff
-    with pytest.raises(RuntimeError, match=r"^conditioning: the smallest eigenvalue did not converge: a solve did not$"):
+    with pytest.raises(
+        RuntimeError, match=r"^conditioning: the smallest eigenvalue did not converge: a solve did not$"
+    ):
         lambda_min(ill, ill)
