@@ -201,14 +201,18 @@ def shape_energy(x: NDArray, n_corners: int, power: float) -> float:
         return E_G if power == 1.0 else E_G * (S / (6.928203230275509 * volume)) ** (power - 1.0)
     u0, v0 = x[1, 0] - x[0, 0], x[2, 0] - x[0, 0]
     w0, w1, w2 = x[3, 0] - x[0, 0], x[3, 1] - x[0, 1], x[3, 2] - x[0, 2]
-    volume = (u0 * (v1 * w2 - v2 * w1) + u1 * (v2 * w0 - v0 * w2) + u2 * (v0 * w1 - v1 * w0)) / 6.0
-    if volume <= 0.0:
-        return np.inf
+    determinant = u0 * (v1 * w2 - v2 * w1) + u1 * (v2 * w0 - v0 * w2) + u2 * (v0 * w1 - v1 * w0)
     # The sum over all pairs of four points is four times the sum over the points less that of their sum, squared.
     s0, s1, s2 = u0 + v0 + w0, u1 + v1 + w1, u2 + v2 + w2
     S = 4.0 * (u0 * u0 + u1 * u1 + u2 * u2 + v0 * v0 + v1 * v1 + v2 * v2 + w0 * w0 + w1 * w1 + w2 * w2)
-    S -= s0 * s0 + s1 * s1 + s2 * s2
-    if volume * volume <= FLAT * FLAT * S * S * S:
+    return tet_energy(determinant, S - (s0 * s0 + s1 * s1 + s2 * s2), power)
+
+
+@njit(cache=True)
+def tet_energy(determinant: float, S: float, power: float) -> float:
+    """`shape_energy` of a tetrahedron from six times its volume and the sum of its squared edges."""
+    volume = determinant / 6.0
+    if volume <= 0.0 or volume * volume <= FLAT * FLAT * S * S * S:
         return np.inf
     E_G = volume * S / 20.0
     if power == 1.0:

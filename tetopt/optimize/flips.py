@@ -30,10 +30,12 @@ from tetopt.optimize.complex import (
     grown,
     image_energy,
     least_cosine,
+    load,
     outward,
     shape_of_tet,
     shape_of_triangle,
     sum_up,
+    tet_energy,
 )
 
 MOST = 7  # corners of the largest polygon around an edge that is triangulated anew
@@ -91,7 +93,10 @@ def _evaluate_cells(
     """The move worth most of each cell: 0 to 3 flips that facet, 4 to 9 removes an edge of `EDGES`."""
     x = np.empty((4, 3))
     ring, around = np.empty(MOST, dtype=np.int64), np.empty(MOST, dtype=np.int64)
-    tables = (np.empty((MOST, MOST)), np.empty((MOST, MOST), dtype=np.int64), np.empty((MOST, MOST, MOST)))
+    tables = (
+        np.empty((MOST, MOST)), np.empty((MOST, MOST), dtype=np.int64), np.empty((MOST, MOST, MOST)),
+        np.empty((MOST + 2, 3)),
+    )  # fmt: skip
     fluxes = (np.empty((MOST, MOST, 3)), np.empty((MOST, MOST, 3)))
     for cell in range(first, last):
         for k in range(4):
@@ -233,7 +238,7 @@ def _worth_of_edge(
 
     tables[1][i, j] is the corner between i and j of the triangle on the diagonal (i, j), of the best triangulation.
     """
-    cost, apex, shape = tables
+    cost, apex, shape, y = tables
     side_a, side_b = fluxes
     if m < 3 or (is_open == 1 and not _in_one_face(held, a, b, ring[0], ring[m - 1], measure)):
         return -np.inf
@@ -243,13 +248,18 @@ def _worth_of_edge(
         if least > -1.0:
             least = min(least, cell_quality(x, held, around[r], measure))
     limit = old * (1.0 - LEAST_GAIN)
+    for d in range(3):
+        y[0, d] = 0.0
+    load(y, 1, held.ticks, b, a, measure)
+    for r in range(m):
+        load(y, 2 + r, held.ticks, ring[r], a, measure)
     # A triangulation's shape energy alone is a lower bound, and cheap; so are its two ears, triangles of three corners
     # in a row: few edges get past them.
     if m > 4:
         low, lower = np.inf, np.inf  # the two cheapest ears
         for k in range(m):
             i, j = (k - 1) % m, (k + 1) % m
-            ear = _pair_shape(x, held, a, b, ring[i], ring[k], ring[j], limit, least, measure)
+            ear = _pair_shape(x, y, 2 + i, 2 + k, 2 + j, limit, least, measure)
             if ear < lower:
                 low, lower = lower, ear
             elif ear < low:
@@ -259,7 +269,7 @@ def _worth_of_edge(
     for i in range(m - 2):
         for k in range(i + 1, m - 1):
             for j in range(k + 1, m):
-                shape[i, k, j] = _pair_shape(x, held, a, b, ring[i], ring[k], ring[j], limit, least, measure)
+                shape[i, k, j] = _pair_shape(x, y, 2 + i, 2 + k, 2 + j, limit, least, measure)
     if not _best_triangulation(cost, apex, shape, m) < limit:
         return -np.inf
     if measure.image == 0.0:
@@ -280,17 +290,40 @@ def _worth_of_edge(
 
 
 @njit(cache=True)
-def _pair_shape(
-    x: NDArray, held: Complex, a: int, b: int, u: int, v: int, w: int, limit: float, least: float, measure: Measure
-) -> float:
-    """Weighted shape energy of the two tetrahedra over a triangle (u, v, w) of the polygon; infinite if not allowed."""
-    above = measure.geometry * shape_of_tet(x, held.ticks, u, v, w, b, measure)
-    if not above < limit or (least > -1.0 and least_cosine(x) < least):
+def _pair_shape(x: NDArray, y: NDArray, i: int, k: int, j: int, limit: float, least: float, measure: Measure) -> float:
+    """Weighted shape energy of the tetrahedra (i, k, j, b) and (i, j, k, a) over a triangle of the polygon.
+
+    Rows of `y`: a, b, then the polygon's corners. Infinite if one is inverted, flat, under the floor or above `limit`.
+    """
+    u0, u1, u2 = y[k, 0] - y[i, 0], y[k, 1] - y[i, 1], y[k, 2] - y[i, 2]
+    v0, v1, v2 = y[j, 0] - y[i, 0], y[j, 1] - y[i, 1], y[j, 2] - y[i, 2]
+    n0, n1, n2 = u1 * v2 - u2 * v1, u2 * v0 - u0 * v2, u0 * v1 - u1 * v0
+    b0, b1, b2 = y[1, 0] - y[i, 0], y[1, 1] - y[i, 1], y[1, 2] - y[i, 2]
+    above = n0 * b0 + n1 * b1 + n2 * b2
+    a0, a1, a2 = y[0, 0] - y[i, 0], y[0, 1] - y[i, 1], y[0, 2] - y[i, 2]
+    below = -(n0 * a0 + n1 * a1 + n2 * a2)
+    if above <= 0.0 or below <= 0.0:
         return np.inf
-    below = measure.geometry * shape_of_tet(x, held.ticks, u, w, v, a, measure)
-    if not below < limit or (least > -1.0 and least_cosine(x) < least):
+    base = u0 * u0 + u1 * u1 + u2 * u2 + v0 * v0 + v1 * v1 + v2 * v2
+    s0, s1, s2 = u0 + v0, u1 + v1, u2 + v2
+    S = 4.0 * (base + b0 * b0 + b1 * b1 + b2 * b2) - ((s0 + b0) ** 2 + (s1 + b1) ** 2 + (s2 + b2) ** 2)
+    energy = measure.geometry * tet_energy(above, S, measure.power)
+    if not energy < limit:
         return np.inf
-    return above + below
+    S = 4.0 * (base + a0 * a0 + a1 * a1 + a2 * a2) - ((s0 + a0) ** 2 + (s1 + a1) ** 2 + (s2 + a2) ** 2)
+    energy += measure.geometry * tet_energy(below, S, measure.power)
+    if not energy < limit:
+        return np.inf
+    if least > -1.0:
+        for d in range(3):
+            x[0, d], x[1, d], x[2, d], x[3, d] = y[i, d], y[k, d], y[j, d], y[1, d]
+        if least_cosine(x) < least:
+            return np.inf
+        for d in range(3):
+            x[1, d], x[2, d], x[3, d] = y[j, d], y[k, d], y[0, d]
+        if least_cosine(x) < least:
+            return np.inf
+    return energy
 
 
 @njit(cache=True)
@@ -345,7 +378,10 @@ def _make(order: NDArray, move: NDArray, is_dirty: NDArray, held: Complex, measu
     """
     x = np.empty((4, 3))
     ring, around = np.empty(MOST, dtype=np.int64), np.empty(MOST, dtype=np.int64)
-    tables = (np.empty((MOST, MOST)), np.empty((MOST, MOST), dtype=np.int64), np.empty((MOST, MOST, MOST)))
+    tables = (
+        np.empty((MOST, MOST)), np.empty((MOST, MOST), dtype=np.int64), np.empty((MOST, MOST, MOST)),
+        np.empty((MOST + 2, 3)),
+    )  # fmt: skip
     fluxes = (np.empty((MOST, MOST, 3)), np.empty((MOST, MOST, 3)))
     room = len(held.cells)
     free = np.empty(room, dtype=np.int64)
