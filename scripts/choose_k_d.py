@@ -20,6 +20,7 @@ import tetopt
 from tetopt.experiments.compare import Settings, default_law, measured, prepared
 from tetopt.fem.reference import averaged
 from tetopt.io.files import checked_output, save_json
+from tetopt.segmentation import thresholded
 
 PHANTOMS = ("sphere", "two_spheres", "ellipsoids_brain")
 ERRORS = ("strain_energy", "displacement", "interface_strain")
@@ -30,6 +31,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("images", type=Path, nargs="*", help="volumes, besides the phantoms")
     parser.add_argument("-o", "--output", type=Path, required=True, help="JSON file for every number")
+    parser.add_argument("--phantoms", nargs="*", default=PHANTOMS, help="phantoms to take (%(default)s)")
     parser.add_argument("--k-d", type=float, nargs="+", default=[0.0, 0.1, 0.2, 0.3, 0.5, 0.7, 0.85])
     parser.add_argument("--nodes", type=int, nargs="+", default=[1200, 5000])
     parser.add_argument("--dofs", type=int, default=300_000, help="size of the reference grid (%(default)s)")
@@ -46,7 +48,7 @@ def _run(options: argparse.Namespace) -> int:
     path = checked_output(options.output, (".json",), options.force)
     settings = Settings(nodes=0, reference_dofs=options.dofs)
     rows = []
-    for name, image, labels in _cases(options.images):
+    for name, image, labels in _cases(options.phantoms, options.images):
         law, _ = default_law(image)
         setting = prepared(image, labels, law, settings, lambda text, name=name: print(f"{name}: {text}", flush=True))
         for nodes in options.nodes:
@@ -63,17 +65,17 @@ def _run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _cases(paths: Sequence[Path]) -> list[tuple[str, tetopt.Image, tetopt.Image]]:
+def _cases(phantoms: Sequence[str], paths: Sequence[Path]) -> list[tuple[str, tetopt.Image, tetopt.Image]]:
     """Name, image and materials; a volume of the user's is averaged to 2 mm where it is finer."""
     cases = []
-    for name in PHANTOMS:
+    for name in phantoms:
         phantom = tetopt.load_phantom(name)
         cases.append((name, phantom.image(), phantom.label_image()))
     for path in paths:
         image = tetopt.load_image(path)
         shape = tuple(int(s) for s in np.maximum(1, np.rint(np.array(image.shape) * np.minimum(1, image.spacing / 2))))
         coarse = averaged(image, shape)
-        cases.append((path.name, coarse, tetopt.segmentation.thresholded(coarse, 4)))
+        cases.append((path.name, coarse, thresholded(coarse, 4)))
     return cases
 
 

@@ -903,7 +903,9 @@ def compare_command(
     about = {
         "command": f"tetopt {' '.join(map(shlex.quote, context.obj))}",
         "image": {"name": image_path.name, "sha256": sha256(image_path), "volume": volume, "crop": crop},
-        "labels": None if labels_path is None else {"name": labels_path.name, "sha256": sha256(labels_path)},
+        "labels": None
+        if labels_path is None
+        else {"name": labels_path.name, "kind": "given", "sha256": sha256(labels_path)},
         "law": law_words,
     }
     paths = run_compare.outputs(_results_folder(output), force or resume)
