@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import components, facets, folded
 from tetopt.image import Image
@@ -25,8 +26,17 @@ def check_mesh(mesh: Mesh, image: Image | None = None) -> list[str]:
     ----------
     mesh : Mesh
     image : Image, optional
-        The image whose box the mesh should fill.
+        The image whose box the mesh should fill. Without it overlaps of cells that share no facet are not found.
+
+    Raises
+    ------
+    InputError
+        Mesh and image of different dimension.
     """
+    if image is not None and image.ndim != mesh.ndim:
+        raise InputError(
+            f"mesh and image: expected the same dimension, got a {mesh.ndim}-D mesh and a {image.ndim}-D image"
+        )
     found = [*_nodes(mesh), *_cells(mesh)]
     if not found:  # what follows takes sound cells for granted
         found = _facets(mesh)

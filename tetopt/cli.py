@@ -208,11 +208,15 @@ def mesh_command(
     ] = Method.fast,
     shape_power: Annotated[
         float | None,
-        typer.Option(metavar="P", help="Fast method: 1 is the paper's E_G; more punish flat cells (default 3)."),
+        typer.Option(
+            metavar="P", help="Fast method: 1 is the paper's E_G; up to 10 punish flat cells more (default 3)."
+        ),
     ] = None,
     min_dihedral: Annotated[
         float | None,
-        typer.Option(metavar="DEG", help="Fast method: smallest dihedral angle allowed, 0 for none (default 12)."),
+        typer.Option(
+            metavar="DEG", help="Fast method, 3-D: smallest dihedral angle allowed, 0 (none) to 70 (default 12)."
+        ),
     ] = None,
     boundary: Annotated[Boundary, typer.Option(help="What the box's nodes may do.")] = Boundary.slide,
     threads: ThreadsOption = None,
@@ -410,7 +414,7 @@ def _optimized(
         result = result._replace(mesh=initial)
     if result.ended != "iterations":
         words = {
-            "converged": "converged: the nodes have stopped moving",
+            "converged": "converged: hardly anything changes any more",
             "max_seconds": "out of time: the mesh so far is kept",
             "stopped": "interrupted: the mesh so far is kept",
         }
@@ -523,7 +527,7 @@ def quality_command(
         Path | None, typer.Option("--image", metavar="IMAGE", help="Measure E_D against this image, too.")
     ] = None,
     check: Annotated[
-        bool, typer.Option("--check", help="Check that it is a mesh; with --image, one that fills the image's box.")
+        bool, typer.Option("--check", help="Is it a mesh? With --image, does it fill the box? Exit 1 if not.")
     ] = False,
     volume: VolumeOption = None,
     crop: CropOption = None,
@@ -860,7 +864,10 @@ def compare_command(
     ] = None,
     repeats: Annotated[int, typer.Option(metavar="R", min=1, help="Runs of a mesher whose result varies.")] = 3,
     pipelines: Annotated[
-        str, typer.Option(metavar="A,B,...", help="Which, in the report's order.")
+        str,
+        typer.Option(
+            metavar="A,B,...", help="Of tetopt, tetopt-paper, pytetwild, cleaver, bcc, odt: which, in this order."
+        ),
     ] = "tetopt,tetopt-paper,pytetwild,cleaver,bcc,odt",
     k_D: Annotated[float, typer.Option("--k-d", metavar="K", help="tetopt's weight of the image.")] = 0.2,
     classes: Annotated[int, typer.Option(metavar="K", min=2, help="Classes of the segmentation (multi-Otsu).")] = 4,
@@ -883,7 +890,7 @@ def compare_command(
     ] = False,
     force: ForceOption = False,
 ) -> int:
-    """Set tetopt beside the conventional pipelines: fidelity, shape, simulation accuracy, time; report.html."""
+    """Set tetopt beside the conventional pipelines on a volume: fidelity, shape, simulation accuracy, time."""
     from tetopt.experiments import compare, run_compare
     from tetopt.fem.materials import parse_law
 
@@ -909,10 +916,19 @@ def compare_command(
         "law": law_words,
     }
     paths = run_compare.outputs(_results_folder(output), force or resume)
-    results = run_compare.run(
-        paths, about, image, labels, law, settings, lambda text: log.print(escape(text)), resume=resume
-    )
-    out.print(escape(f"{paths['report.html']}: {len(settings.pipelines)} pipelines, in {results['seconds']:.0f} s"))
+    if (output / "runs").is_dir() and not (resume or force):
+        raise InputError(f"{output / 'runs'}: finished runs are there; --resume keeps them, --force starts over")
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that the child is ended with us
+    try:
+        results = run_compare.run(
+            paths, about, image, labels, law, settings, lambda text: log.print(escape(text)), resume=resume
+        )
+    except KeyboardInterrupt:
+        log.print(f"interrupted: {escape(str(output / 'runs'))} keeps the finished runs, --resume goes on from there")
+        return 130
+    failed = [p["title"] for p in results["pipelines"] if p["failure"] is not None]
+    words = f", of which failed: {', '.join(failed)}" if failed else ""
+    out.print(escape(f"{paths['report.html']}: {len(settings.pipelines)} pipelines{words}, {results['seconds']:.0f} s"))
     return 0
 
 

@@ -93,15 +93,32 @@ def test_resume_keeps_what_is_done(run, head, capsys):
     assert "exists already" in capsys.readouterr().err
 
 
-def test_a_failing_pipeline_is_a_row(head, opengl, capsys):
-    """No time at all: its row says so, the others stand, and the page is written."""
+def test_when_all_fail_nothing_is_replaced(head, opengl, capsys):
+    """No time at all for anything: one line, exit 2, no report."""
     out = head / "hurried"
     command = ["compare", str(head / "image.nii.gz"), "-o", str(out), *SMALL, "--curve", ""]
-    assert main([*command, "--pipelines", "bcc,tetopt", "--max-seconds", "0.4"]) in (0, 2)
-    report = json.loads((out / "report.json").read_text())
-    failures = {p["name"]: p["failure"] for p in report["pipelines"]}
-    assert failures["tetopt"] is not None
-    assert "0.4" in failures["tetopt"]
+    assert main([*command, "--pipelines", "bcc,tetopt", "--max-seconds", "0.1"]) == 2
+    assert "every pipeline failed" in capsys.readouterr().err
+    assert not (out / "report.json").exists()
+
+
+def test_a_mesh_that_cannot_be_measured_is_a_row(head, opengl, monkeypatch):
+    def breaks(system):
+        raise RuntimeError("no convergence")
+
+    out = head / "broken"
+    monkeypatch.setattr(compare, "conditioning", breaks)
+    command = ["compare", str(head / "image.nii.gz"), "-o", str(out), *SMALL, "--curve", "", "--pipelines", "bcc"]
+    assert main(command) == 2
+    assert not (out / "report.json").exists()
+
+
+def test_resume_refuses_another_comparison(run, head, capsys):
+    kept = (run / "report.json").read_bytes()
+    command = ["compare", str(head / "image.nii.gz"), "-o", str(run), "--nodes", "99", "--resume"]
+    assert main(command) == 2
+    assert "is of another comparison" in capsys.readouterr().err
+    assert (run / "report.json").read_bytes() == kept
 
 
 def test_pytetwild_in_the_comparison(head, opengl):
@@ -135,6 +152,7 @@ def test_baseline(head, tmp_path, capsys):
     [
         (["--pipelines", "tetopt,gmsh"], "pipelines: expected some of"),
         (["--pipelines", ""], "pipelines: expected some of"),
+        (["--pipelines", "bcc,bcc"], "each once"),
         (["--curve", "a"], "--curve: expected parts"),
         (["--k-d", "1"], "--k-d"),
         (["--max-seconds", "0"], "--max-seconds"),

@@ -174,3 +174,39 @@ def test_refuses(value, nu, words):
     image = tetopt.Image(np.where(np.arange(8).reshape(2, 2, 2) == 3, value, 1.0))
     with pytest.raises(tetopt.InputError, match=words):
         reference(image, nu)
+
+
+def test_homogeneous_block_has_no_displacement_error():
+    image = tetopt.Image(np.full((6, 5, 4), 3.0))
+    mesh = tetopt.lattice(image, nodes=40)
+    bottom, top = box_faces(image, mesh)
+    found = reference(image, 0.3)
+    pressed = compression(mesh, 3.0, 0.3, fixed_nodes=top, pushed_nodes=bottom, displacement=[0.0, 0.0, 0.04])
+    errors = compare(found, mesh, pressed.u, pressed.strain_energy, np.zeros(image.shape))
+    assert errors.displacement is None
+    assert errors.interface_strain is None
+
+
+def test_errors_are_relative_to_what_the_image_does():
+    """Displacement over what sets it apart from the homogeneous one; strain over that near the interfaces alone."""
+    rng = np.random.default_rng(4)
+    image = tetopt.Image(rng.uniform(1.0, 2.0, (12, 6, 5)))
+    mesh = tetopt.lattice(image, nodes=60)
+    found = linear_reference(image, rng.normal(size=(3, 3)), rng.normal(size=3))
+    strain = np.array(found.strain)
+    labels = np.zeros(image.shape)
+    labels[:3] = 1
+    strain[~near_interface(labels).ravel()] *= 5.0
+    found = found._replace(u_homogeneous=0.5 * found.u, strain=strain)
+    owner = tetopt.cell_of_voxel(image, mesh)
+    assert (owner >= 0).all()
+    u = np.zeros_like(mesh.points)
+    errors = compare(found, mesh, u, 2.0, labels)
+    assert errors.displacement == pytest.approx(2.0)
+    assert errors.interface_strain == pytest.approx(1.0)
+
+
+def test_nearest_to_a_coarser_grid():
+    image = tetopt.Image(np.arange(8.0)[:, None] * np.ones((1, 6)))
+    coarse = tetopt.Image(np.zeros((2, 3)))
+    np.testing.assert_array_equal(nearest(image, coarse).data[:, 0], [2.0, 6.0])

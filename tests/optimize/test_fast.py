@@ -294,7 +294,7 @@ def test_laws(name, k_D, boundary):
     assert tetopt.check_mesh(result.mesh, image) == []
     assert all(row.n_voxels == image.data.size for row in result.history)
     E = np.array([row.E for row in result.history])
-    assert (np.diff(E) > 1e-12).sum() <= 2
+    assert (np.diff(E) <= 1e-12).all()
     assert E[-1] < E[0]
     assert tetopt.E_D(image, result.mesh) == pytest.approx(result.history[-1].E_D, rel=1e-9, abs=1e-6)
     assert len(result.mesh.cells) == result.history[-1].n_cells
@@ -339,6 +339,155 @@ def test_floor():
         worst[floor] = dihedral_angles(made.points, made.cells).min()
     assert worst[0.0] < 12.0 <= worst[12.0] + 1e-6
     assert worst[20.0] >= 20.0 - 1e-6
+
+
+def squashed(image, blocks):
+    """A lattice some of whose cells have been pressed flat: angles of about 2 degrees, at inner nodes."""
+    mesh = tetopt.lattice(image, blocks=blocks)
+    points = mesh.points.copy()
+    index = image.to_index(points)
+    inner = ((index > 1.0) & (index < np.array(image.shape) - 2.0)).all(axis=1)
+    for node in np.flatnonzero(inner)[::9]:
+        cell = mesh.cells[(mesh.cells == node).any(axis=1)][0]
+        others = cell[cell != node]
+        points[node] += 0.8 * (points[others].mean(axis=0) - points[node])
+    return tetopt.Mesh(points, mesh.cells)
+
+
+@pytest.mark.parametrize("options", [{"iterations": 6}, {"max_seconds": 1e-9}])
+def test_a_bad_start_is_lifted_even_if_time_is_short(options):
+    """The floor is seen to at the end, whatever ends the run; where E rises, it is for that."""
+    image, _ = CASES["3-D"]
+    mesh = squashed(image, (5, 5, 5))
+    assert dihedral_angles(mesh.points, mesh.cells).min() < 9.0
+    result = tetopt.optimize(image, mesh, k_D=0.3, **options)
+    assert dihedral_angles(result.mesh.points, result.mesh.cells).min() >= 12.0 - 1e-6
+    assert tetopt.check_mesh(result.mesh, image) == []
+
+
+def test_flips_leave_nothing_to_gain():
+    """After `flip` no facet and no edge is worth a move, asked of each alone."""
+    held = random_case(17, 3)
+    held.flip()
+    assert held.flip() == 0
+    run = _Run(CASES["3-D"][0], tetopt.lattice(*[CASES["3-D"][0]], blocks=CASES["3-D"][1]), 0.5, 3.0, "slide")
+    for _ in range(4):  # asked only around the nodes that moved, little is left for a look at all of them
+        run.sweep(lambda: False)
+        run.flip()
+    run.held, left = flip(run.held, run.measure)
+    assert left <= 2
+
+
+def test_removing_an_edge_takes_the_best_triangulation():
+    """Every edge of random meshes against all triangulations of its polygon, each measured afresh."""
+    from tetopt.optimize import flips
+
+    def triangulations(i, j):
+        if j == i + 1:
+            yield ()
+        for k in range(i + 1, j):
+            for left in triangulations(i, k):
+                for right in triangulations(k, j):
+                    yield ((i, k, j), *left, *right)
+
+    held = random_case(23, 3)
+    x, ring, around = np.empty((4, 3)), np.empty(flips.MOST, dtype=np.int64), np.empty(flips.MOST, dtype=np.int64)
+    tables = (np.empty((7, 7)), np.empty((7, 7), dtype=np.int64), np.empty((7, 7, 7)), np.empty((9, 3)))
+    fluxes = (np.empty((7, 7, 3)), np.empty((7, 7, 3)))
+    asked = gained = 0
+    for cell in range(int(held.complex.n_cells[0])):
+        for i, j in flips.EDGES:
+            m, is_open = flips._ring_of_edge(ring, around, held.complex, cell, i, j, True)
+            if m < 3 or is_open:
+                continue
+            a, b = held.complex.cells[cell, i], held.complex.cells[cell, j]
+            worth = flips._worth_of_edge(x, tables, fluxes, held.complex, a, b, ring, around, m, is_open, held.measure)
+            old = sum(energy_of(held, held.complex.cells[around[:m]]))
+            best = np.inf
+            for triangles in triangulations(0, m - 1):
+                tets = []
+                for p, q, r in triangles:
+                    tets += [[ring[p], ring[q], ring[r], b], [ring[p], ring[r], ring[q], a]]
+                best = min(best, sum(energy_of(held, np.array(tets))))
+            asked += 1
+            if best < old * (1 - 1e-9):
+                gained += 1
+                assert worth == pytest.approx(old - best, rel=1e-6)
+            else:
+                assert worth == -np.inf
+    assert asked > 30
+    assert gained > 5
+
+
+def energy_of(held, tets):
+    """Energies of tetrahedra given by their corners, from the library's numpy functions; infinite if inverted."""
+    points = held.image.to_world(from_ticks(held.complex.ticks, held.grid, 3))
+    corners = points[tets]
+    v = np.linalg.det(corners[:, 1:] - corners[:, :1]) / 6.0
+    if (v <= 0).any():
+        return [np.inf]
+    mesh = tetopt.Mesh(points, tets)
+    E_G = cell_E_G(points, tets)
+    eta = E_G * 20 / v / (12 * (3 * v) ** (2 / 3))
+    squares = np.zeros(len(tets))
+    for k in range(len(tets)):
+        one = tetopt.Mesh(points[tets[k]], [[0, 1, 2, 3]])
+        try:
+            squares[k] = tetopt.E_D(held.image, one) / held.image.voxel_volume
+        except tetopt.InputError:  # too flat to be sampled
+            return [np.inf]
+    assert len(mesh.cells) == len(tets)
+    return list(held.measure.geometry * E_G * eta**2 + held.measure.image * squares)
+
+
+def test_edges_with_many_cells_are_left_alone():
+    """Twelve tetrahedra around one edge, closed and open: no polygon, and nothing written past its room."""
+    from tetopt.optimize import flips
+
+    for is_open in (False, True):
+        angles = np.linspace(0.0, np.pi if is_open else 2.0 * np.pi, 13)
+        rim = np.column_stack([3.0 * np.cos(angles), 3.0 * np.sin(angles), np.zeros(13)])
+        rim = rim if is_open else rim[:-1]
+        points = np.vstack([[[0, 0, -3.0], [0, 0, 3.0]], rim]) + 5.0
+        n = len(rim)
+        cells = np.array([[0, 1, 2 + k, 2 + (k + 1) % n] for k in range(12)])
+        held = Held(tetopt.Image(np.arange(1000.0).reshape(10, 10, 10)), tetopt.Mesh(points, cells))
+        room = np.full(flips.MOST + 5, -7)
+        ring, around = room[: flips.MOST], np.full(flips.MOST, -7)
+        for cell in range(12):
+            for i, j in flips.EDGES:
+                m, _ = flips._ring_of_edge(ring, around, held.complex, cell, i, j)
+                is_axis = set(held.complex.cells[cell, [i, j]].tolist()) == {0, 1}
+                assert m == 0 if is_axis else m in (2, 3)
+        assert (room[flips.MOST :] == -7).all()
+
+
+def test_refuses_flat_and_folded_starts():
+    image, blocks = CASES["3-D"]
+    mesh = tetopt.lattice(image, blocks=blocks)
+    a, b, c, d = mesh.cells[0]
+    points = np.vstack([mesh.points, mesh.points[[a, b, c]].mean(axis=0) * (1 - 1e-7) + 1e-7 * mesh.points[d]])
+    e = len(mesh.points)
+    flat = tetopt.Mesh(points, np.vstack([mesh.cells[1:], [[a, b, c, e], [a, b, e, d], [a, e, c, d], [e, b, c, d]]]))
+    with pytest.raises(tetopt.InputError, match=r"too flat|flat or inverted"):
+        tetopt.optimize(image, flat, iterations=1)
+    folded = mesh.points.copy()
+    index = image.to_index(folded)
+    inner = np.flatnonzero(((index > 1.0) & (index < np.array(image.shape) - 2.0)).all(axis=1))[0]
+    folded[inner] += 1.7 * (folded[mesh.cells[0]].mean(axis=0) - folded[inner])
+    cells = mesh.cells.copy()
+    wrong = np.linalg.det(folded[cells][:, 1:] - folded[cells][:, :1]) < 0
+    cells[wrong] = cells[wrong][:, [1, 0, 2, 3]]
+    if wrong.any():
+        with pytest.raises(tetopt.InputError, match="overlap there"):
+            tetopt.optimize(image, tetopt.Mesh(folded, cells), iterations=1)
+
+
+def test_refuses_energies_that_overflow():
+    image, blocks = CASES["3-D"]
+    far = tetopt.Image(image.data, np.diag([1e60, 1e60, 1e60, 1.0]))
+    with pytest.raises(tetopt.InputError, match=r"overflow|too flat"):
+        tetopt.optimize(far, tetopt.lattice(far, blocks=blocks), k_D=0.5, iterations=1)
 
 
 def test_stops_and_tells_why():
@@ -401,7 +550,7 @@ def test_refuses(options, words):
 def test_refuses_doubled_cells():
     image, blocks = CASES["3-D"]
     mesh = tetopt.lattice(image, blocks=blocks)
-    with pytest.raises(tetopt.InputError, match="more than two cells"):
+    with pytest.raises(tetopt.InputError, match="or more than two"):
         tetopt.optimize(image, tetopt.Mesh(mesh.points, np.vstack([mesh.cells, mesh.cells[:1]])))
 
 
@@ -412,8 +561,10 @@ def test_run_measures_what_it_holds():
     for _ in range(3):
         run.sweep(lambda: False)
         run.flip()
-    run.lift(12.0)
+    run.lift(20.0)
+    run.keep_floor(20.0)
     run.sweep(lambda: False)
+    run.flip()
     n_cells = int(run.held.n_cells[0])
     fresh = build(run.held.cells[:n_cells], run.held.ticks, run.measure)
     np.testing.assert_array_equal(run.held.sums[:n_cells], fresh.sums[:n_cells])

@@ -1,4 +1,4 @@
-"""Five ways from an image to a mesh of its box with a wanted number of nodes, under one signature."""
+"""Six ways from an image to a mesh of its box with a wanted number of nodes, under one signature."""
 
 from __future__ import annotations
 

@@ -6,12 +6,14 @@ by the same functions: the sampler, the shape measures, and the compression test
 
 from __future__ import annotations
 
+import contextlib
 import hashlib
 import json
 import os
 import platform
 import time
 from collections.abc import Callable, Sequence
+from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -229,9 +231,11 @@ def run(
     """
     begin = time.perf_counter()
     runs = folder / "runs"
+    key = _key(about, settings)
+    if resume:
+        _check_resumable(folder, about, settings)
     runs.mkdir(exist_ok=True)
     setting = prepared(image, classes, law, settings, say)
-    key = _key(about, settings)
     pipelines, meshes = [], {}
     for name in settings.pipelines:
         job = Job(image, labels, settings.nodes, settings.classes, settings.k_D, settings.iterations)
@@ -250,7 +254,7 @@ def run(
     curves = [_curve(pipeline, setting, settings, image, labels, runs, key, resume, say) for pipeline in pipelines]
     results = {
         **about,
-        "versions": versions(),
+        "versions": versions() | _peers(),
         "machine": {"cores": os.cpu_count(), "system": platform.platform()},
         "image": about["image"] | _image_words(image),
         "options": settings._asdict(),
@@ -262,22 +266,59 @@ def run(
     return results, meshes
 
 
+def _check_resumable(folder: Path, about: dict[str, Any], settings: Settings) -> None:
+    """InputError if the folder holds the report of another comparison, which resuming would replace."""
+    path = folder / "report.json"
+    if not path.is_file():
+        return
+    try:
+        before = json.loads(path.read_text(encoding="utf-8"))
+        same = before["options"]["nodes"] == settings.nodes and before["image"]["sha256"] == about["image"]["sha256"]
+    except (ValueError, KeyError, TypeError):
+        same = False
+    if not same:
+        raise InputError(f"{path}: is of another comparison (image or --nodes); take another folder, or --force")
+
+
+def _peers() -> dict[str, str]:
+    """Versions of the peers that are installed."""
+    found = {}
+    for name in ("pytetwild", "itk-cleaver"):
+        with contextlib.suppress(PackageNotFoundError):
+            found[name] = version(name)
+    return found
+
+
 def _key(about: dict[str, Any], settings: Settings) -> str:
     """Changes with everything that a finished run's numbers depend on, but not with what else is compared."""
     same = settings._replace(pipelines=(), repeats=0, curve=(), nodes=0, max_seconds=0.0, max_bytes=None)
     facts = {"image": about["image"], "labels": about["labels"], "law": about["law"]}
-    return hashlib.sha256(json.dumps([facts, same, versions()], sort_keys=True, default=str).encode()).hexdigest()
+    tools = versions() | _peers()
+    return hashlib.sha256(json.dumps([facts, same, tools], sort_keys=True, default=str).encode()).hexdigest()
+
+
+def _kept(path: Path, key: str) -> dict[str, Any] | None:
+    """A finished run's numbers, if they are whole, of the same key and of the mesh that lies beside them."""
+    try:
+        kept = json.loads(path.read_text(encoding="utf-8"))
+        mesh = path.with_suffix(".vtu").read_bytes()
+    except (OSError, ValueError):
+        return None
+    return kept if kept.get("key") == key and kept.get("mesh_file_sha256") == _sha256(mesh) else None
+
+
+def _sha256(content: bytes) -> str:
+    return hashlib.sha256(content).hexdigest()
 
 
 def _one_run(
     name: str, job: Job, setting: Setting, settings: Settings, path: Path, key: str, resume: bool, say: Say
 ) -> dict[str, Any]:
     """One pipeline once, from its file if that is finished and of the same key."""
-    if resume and path.is_file() and path.with_suffix(".vtu").is_file():
-        kept = json.loads(path.read_text(encoding="utf-8"))
-        if kept["key"] == key:
-            say(f"{SHOWN[name].title}, {job.nodes} nodes: kept from before")
-            return kept
+    kept = _kept(path, key) if resume else None
+    if kept is not None:
+        say(f"{SHOWN[name].title}, {job.nodes} nodes: kept from before")
+        return kept
     say(f"{SHOWN[name].title}, {job.nodes} nodes")
     outcome = run_in_child(name, job, max_seconds=settings.max_seconds, max_bytes=settings.max_bytes)
     row: dict[str, Any] = {
@@ -290,25 +331,24 @@ def _one_run(
         return row
     try:
         row |= measured(setting, outcome.mesh, settings.percent)
-    except InputError as error:
+    except (InputError, RuntimeError, ArithmeticError, np.linalg.LinAlgError) as error:
         row["failure"] = f"its mesh cannot be measured: {error}"
         say(f"{SHOWN[name].title}: {row['failure']}")
         return row
-    save_mesh(path.with_suffix(".vtu"), outcome.mesh, cell_fields(outcome.mesh, setting.image))
-    save_json(path, row)
-    kept = json.loads(path.read_text(encoding="utf-8"))
-    say(
-        f"{SHOWN[name].title}: {kept['n_nodes']} nodes, E_D share {kept['E_D_share']:.4f}, "
-        f"{kept['seconds_total']:.0f} s"
-    )
-    return kept
+    mesh_path = path.with_suffix(".vtu")
+    save_mesh(mesh_path, outcome.mesh, cell_fields(outcome.mesh, setting.image))
+    save_json(path, row | {"mesh_file_sha256": _sha256(mesh_path.read_bytes())})
+    done: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+    share = "none" if done["E_D_share"] is None else f"{done['E_D_share']:.4f}"
+    say(f"{SHOWN[name].title}: {done['n_nodes']} nodes, E_D share {share}, {done['seconds_total']:.0f} s")
+    return done
 
 
 def _summed_up(name: str, found: list[dict[str, Any]]) -> dict[str, Any]:
     """A pipeline's entry in the report."""
     shown = SHOWN[name]
     done = [
-        {k: v for k, v in row.items() if k not in ("key", "failure", "notes")}
+        {k: v for k, v in row.items() if k not in ("key", "failure", "notes", "mesh_file_sha256")}
         for row in found
         if row["failure"] is None
     ]
@@ -345,8 +385,8 @@ def _curve(
     """Errors against the number of nodes; one run a count besides the main one."""
     name = pipeline["name"]
     rows = [pipeline["median"]] if "median" in pipeline else []
-    for factor in settings.curve if rows else ():
-        nodes = max(round(factor * settings.nodes), 20)
+    counts = sorted({max(round(factor * settings.nodes), 20) for factor in settings.curve} - {settings.nodes})
+    for nodes in counts if rows else ():
         job = Job(image, labels, nodes, settings.classes, settings.k_D, settings.iterations)
         row = _one_run(name, job, setting, settings, runs / f"{name}-{nodes}-1.json", key, resume, say)
         if row["failure"] is None:

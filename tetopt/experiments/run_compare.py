@@ -40,16 +40,18 @@ def run(
     """
     if image.ndim != 3:
         raise InputError(f"compare: expected a volume, got a {image.ndim}-D image")
-    unknown = [name for name in settings.pipelines if name not in compare.SHOWN]
-    if unknown or not settings.pipelines:
-        raise InputError(f"pipelines: expected some of {', '.join(compare.SHOWN)}, got {', '.join(unknown) or 'none'}")
+    known, asked = ", ".join(compare.SHOWN), ",".join(settings.pipelines)
+    names = set(settings.pipelines)
+    if not names or not names <= set(compare.SHOWN) or len(names) < len(settings.pipelines):
+        raise InputError(f'pipelines: expected some of {known}, each once, got "{asked}"')
     classes = thresholded(image, settings.classes) if labels is None else labels
     results, meshes = compare.run(
         paths["report.json"].parent, about, image, labels, classes, law, settings, say, resume=resume
     )
-    save_json(paths["report.json"], results)
     if not meshes:
-        raise InputError(f"compare: every pipeline failed; {paths['report.json']} says how")
+        how = "; ".join(f"{p['title']}: {p['failure']}" for p in results["pipelines"])
+        raise InputError(f"compare: every pipeline failed, nothing is reported: {how}")
+    save_json(paths["report.json"], results)
     say("pictures and page")
     _draw(paths, results, image, meshes)
     return results

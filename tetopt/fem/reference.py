@@ -40,7 +40,7 @@ class Errors(NamedTuple):
     """How far a mesh's solution is from the reference's, each relative; 0 is best."""
 
     strain_energy: float  # |E_strain - E_ref| / E_ref
-    displacement: float  # RMS of u - u_ref, over RMS of u_ref - u_homogeneous
+    displacement: float | None  # RMS of u - u_ref, over RMS of u_ref - u_homogeneous; None if those two are the same
     interface_strain: float | None  # RMS of the strain's error near interfaces, over RMS of the strain there
 
 
@@ -100,15 +100,15 @@ def compare(found: Reference, mesh: Mesh, u: NDArray[np.float64], strain_energy:
     if len(inside) == 0:
         raise InputError("mesh: no voxel centre of the reference lies in it")
     here = _interpolated(found.modulus, mesh, u, owner, inside)
-    away = found.u[inside] - found.u_homogeneous[inside]
+    away = _rms(found.u[inside] - found.u_homogeneous[inside])
+    is_homogeneous = away <= 1e-7 * _rms(found.u[inside])  # all that is left is the solver's own
     is_near = near_interface(np.asarray(labels)).ravel()[inside]
     strain_error = None
     if is_near.any():
         voxels = inside[is_near]
         strain_error = _rms(strains(mesh, u)[owner[voxels]] - found.strain[voxels]) / _rms(found.strain[voxels])
-    return Errors(
-        abs(strain_energy / found.strain_energy - 1.0), _rms(here - found.u[inside]) / _rms(away), strain_error
-    )
+    energy_error = abs(strain_energy / found.strain_energy - 1.0)
+    return Errors(energy_error, None if is_homogeneous else _rms(here - found.u[inside]) / away, strain_error)
 
 
 def near_interface(labels: NDArray) -> NDArray[np.bool_]:

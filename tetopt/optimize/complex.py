@@ -81,7 +81,7 @@ def grown(held: Complex) -> Complex:
     )  # fmt: skip
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def fill_across(across: NDArray, cells: NDArray, n_cells: int, n_nodes: int) -> None:
     """The cell beyond each facet, by counting sort over the facets' lowest nodes."""
     n = cells.shape[1]
@@ -126,7 +126,7 @@ def fill_across(across: NDArray, cells: NDArray, n_cells: int, n_nodes: int) -> 
                     break
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def facet_of(cells: NDArray, across: NDArray, cell: int, other: int) -> int:
     """The facet of `cell` beyond which `other` lies."""
     k = 0
@@ -135,7 +135,7 @@ def facet_of(cells: NDArray, across: NDArray, cell: int, other: int) -> int:
     return k
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def corner_of(cells: NDArray, cell: int, node: int) -> int:
     """Which corner of `cell` is `node`."""
     k = 0
@@ -144,7 +144,7 @@ def corner_of(cells: NDArray, cell: int, node: int) -> int:
     return k
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def flux_of(ticks: NDArray, a: int, b: int, c: int, measure: Measure) -> tuple:
     """Flux of the facet (a, b, c), or (a, b) with c < 0, times the sign of index space."""
     if c < 0:
@@ -157,7 +157,7 @@ def flux_of(ticks: NDArray, a: int, b: int, c: int, measure: Measure) -> tuple:
     return measure.hand * f[0], measure.hand * f[1], measure.hand * f[2]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def outward(cells: NDArray, cell: int, k: int) -> tuple:
     """Nodes of facet k of a cell, turned outwards; the third is -1 in 2-D."""
     if cells.shape[1] == 3:
@@ -171,7 +171,7 @@ def outward(cells: NDArray, cell: int, k: int) -> tuple:
     return cells[cell, 0], cells[cell, 2], cells[cell, 1]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def image_energy(count: float, first: float, second: float) -> float:
     """Sum of squares around the mean of one cell, from its moment sums."""
     if count <= 0.0:
@@ -179,7 +179,7 @@ def image_energy(count: float, first: float, second: float) -> float:
     return max(second - first * first / count, 0.0)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def shape_energy(x: NDArray, n_corners: int, power: float) -> float:
     """E_G of the cell with corners x (4, 3) times eta^(p - 1); infinite for one that is flat or inverted.
 
@@ -208,7 +208,7 @@ def shape_energy(x: NDArray, n_corners: int, power: float) -> float:
     return tet_energy(determinant, S - (s0 * s0 + s1 * s1 + s2 * s2), power)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def tet_energy(determinant: float, S: float, power: float) -> float:
     """`shape_energy` of a tetrahedron from six times its volume and the sum of its squared edges."""
     volume = determinant / 6.0
@@ -224,7 +224,7 @@ def tet_energy(determinant: float, S: float, power: float) -> float:
     return E_G * (S / (12.0 * np.cbrt(9.0 * volume * volume))) ** (power - 1.0)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def load(x: NDArray, row: int, ticks: NDArray, node: int, base: int, measure: Measure) -> None:
     """A node's position relative to the node `base`, in mm, to a row of x; subtracted in integers, exactly."""
     scale = 2.0**-measure.bits
@@ -237,21 +237,21 @@ def load(x: NDArray, row: int, ticks: NDArray, node: int, base: int, measure: Me
     x[row, 2] = M[2, 0] * t0 + M[2, 1] * t1 + M[2, 2] * t2
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def load_cell(x: NDArray, ticks: NDArray, cells: NDArray, cell: int, measure: Measure) -> None:
     """A cell's corners relative to its first, in mm."""
     for k in range(cells.shape[1]):
         load(x, k, ticks, cells[cell, k], cells[cell, 0], measure)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def shape_of_cell(x: NDArray, ticks: NDArray, cells: NDArray, cell: int, measure: Measure) -> float:
     """Shape energy of a cell of the complex; its corners are left in `x` (4, 3)."""
     load_cell(x, ticks, cells, cell, measure)
     return shape_energy(x, cells.shape[1], measure.power)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def shape_of_tet(x: NDArray, ticks: NDArray, a: int, b: int, c: int, d: int, measure: Measure) -> float:
     """Shape energy of the tetrahedron (a, b, c, d); infinite unless it is positively oriented."""
     load(x, 0, ticks, a, a, measure)
@@ -261,7 +261,7 @@ def shape_of_tet(x: NDArray, ticks: NDArray, a: int, b: int, c: int, d: int, mea
     return shape_energy(x, 4, measure.power)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def shape_of_triangle(x: NDArray, ticks: NDArray, a: int, b: int, c: int, measure: Measure) -> float:
     """Shape energy of the triangle (a, b, c); infinite unless it is positively oriented."""
     load(x, 0, ticks, a, a, measure)
@@ -270,7 +270,7 @@ def shape_of_triangle(x: NDArray, ticks: NDArray, a: int, b: int, c: int, measur
     return shape_energy(x, 3, measure.power)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def least_cosine(x: NDArray) -> float:
     """Minus the cosine of the smallest dihedral angle of the tetrahedron x (4, 3): it grows with the angle; -1 if flat.
 
@@ -294,14 +294,14 @@ def least_cosine(x: NDArray) -> float:
     return worst
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def cell_quality(x: NDArray, held: Complex, cell: int, measure: Measure) -> float:
     """Minus the cosine of a cell's smallest dihedral angle."""
     load_cell(x, held.ticks, held.cells, cell, measure)
     return least_cosine(x)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def tet_quality(x: NDArray, held: Complex, a: int, b: int, c: int, d: int, measure: Measure) -> float:
     """As `least_cosine`, of the tetrahedron (a, b, c, d); -2 if it is flat or inverted."""
     if not shape_of_tet(x, held.ticks, a, b, c, d, measure) < np.inf:
@@ -310,7 +310,7 @@ def tet_quality(x: NDArray, held: Complex, a: int, b: int, c: int, d: int, measu
 
 
 # numba (0.60 to 0.68) drops what the body of a prange writes through a NamedTuple: such bodies are functions.
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=True, error_model="numpy")
 def measure_all(held: Complex, measure: Measure) -> None:
     """Fluxes, sums and shape energies of all cells, afresh. Each facet is measured once, by its lower cell."""
     n_cells = held.n_cells[0]
@@ -320,7 +320,7 @@ def measure_all(held: Complex, measure: Measure) -> None:
         _sum_chunk(held, chunk * CHUNK, min((chunk + 1) * CHUNK, n_cells))
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _measure_chunk(held: Complex, measure: Measure, first: int, last: int) -> None:
     x = np.empty((4, 3))
     for cell in range(first, last):
@@ -334,7 +334,7 @@ def _measure_chunk(held: Complex, measure: Measure, first: int, last: int) -> No
                     held.fluxes[cell, k, d] = f[d]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _sum_chunk(held: Complex, first: int, last: int) -> None:
     for cell in range(first, last):
         for k in range(held.cells.shape[1]):
@@ -346,7 +346,7 @@ def _sum_chunk(held: Complex, first: int, last: int) -> None:
         sum_up(held.sums, held.fluxes, cell)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def sum_up(sums: NDArray, fluxes: NDArray, cell: int) -> None:
     """A cell's moment sums from its facets."""
     for d in range(3):
@@ -356,7 +356,7 @@ def sum_up(sums: NDArray, fluxes: NDArray, cell: int) -> None:
         sums[cell, d] = total if d == 0 or sums[cell, 0] > 0.0 else 0.0  # no rounding left without voxels
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def cell_energy(held: Complex, cell: int, measure: Measure) -> float:
     """A cell's share of E, Eq. (4)."""
     s = held.sums[cell]
@@ -396,7 +396,7 @@ def node_rings(held: Complex) -> NodeRings:
     return NodeRings(start, cells, corner, twin)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _fill_rings(start: NDArray, ring: NDArray, corner: NDArray, cells: NDArray, n_cells: int) -> None:
     n = cells.shape[1]
     for c in range(n_cells):
@@ -413,7 +413,7 @@ def _fill_rings(start: NDArray, ring: NDArray, corner: NDArray, cells: NDArray, 
             fill[node] += 1
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=True, error_model="numpy")
 def _fill_twins(twin: NDArray, start: NDArray, ring: NDArray, corner: NDArray, cells: NDArray, across: NDArray) -> None:
     n = cells.shape[1]
     for chunk in prange((len(start) - 1 + CHUNK - 1) // CHUNK):
@@ -430,7 +430,7 @@ def _fill_twins(twin: NDArray, start: NDArray, ring: NDArray, corner: NDArray, c
                     twin[r, k] = (s - start[node]) * n + facet_of(cells, across, other, ring[r])
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def node_colours(start: NDArray, ring: NDArray, cells: NDArray) -> NDArray:
     """Greedy colours, (N,) int64: nodes of one colour share no cell."""
     colours = np.full(len(start) - 1, -1, dtype=np.int64)

@@ -1,8 +1,11 @@
 """The fast engine: the paper's energy, minimised by analytic gradients and energy-driven flips, with a floor on angles.
 
-Each iteration moves every node down the gradient of its ring's energy (`smooth`) and then exchanges cells wherever that
-lowers E (`flips`), which takes the place of Delaunay re-tessellation. Once E has almost stopped falling, the worst
-cells are lifted to the floor (`repair`), and the last iterations keep it.
+Each iteration moves every node down the gradient of its ring's energy (`smooth`) and then exchanges cells wherever
+that lowers E (`flips`), which takes the place of Delaunay re-tessellation. No move takes a dihedral angle under the
+floor, and a lattice starts far above it, so E falls from first to last. Cells of other initial meshes that are under
+the floor are mended at the end (`repair`), if nothing else has lifted them. Keeping the floor all along costs as much
+E_D as lifting the worst cells once E has settled (0.3587 of the initial one against 0.3560: MNI152 T1, 4,864 nodes,
+k_D = 0.5), and E need not rise for it.
 """
 
 from __future__ import annotations
@@ -16,7 +19,7 @@ from numpy.typing import NDArray
 
 from tetopt.energy.sampling import check_orientations, few_threads, from_ticks, sampling_grid, to_ticks
 from tetopt.errors import InputError
-from tetopt.geometry.topology import facets
+from tetopt.geometry.topology import folded
 from tetopt.image import Image
 from tetopt.lattice import lattice
 from tetopt.mesh import Mesh
@@ -42,11 +45,9 @@ from tetopt.optimize.paper import (
     optimize_paper,
     relative_movement,
 )
-from tetopt.optimize.repair import repair, touch, worst_angles
+from tetopt.optimize.repair import repair, worst_angles
 from tetopt.optimize.smooth import sweep
 
-SLACK = 0.5  # degrees over the floor that the repair aims for, so that the sweeps after it have room
-SETTLED = 3e-3  # relative fall of E in an iteration, below which the repair comes
 STILL = 0.02  # of the distance to the ring's nearest centroid: nodes that moved less since then need no new flips
 
 
@@ -86,9 +87,10 @@ def optimize(
     boundary : {"slide", "fixed"}
         Boundary nodes move within the box's faces and edges, or not at all. Those not on the box are fixed.
     tolerance : float
-        Converged when E falls by less, relatively, in an iteration, and the floor has been seen to.
+        Converged when E falls by less, relatively, in an iteration.
     max_seconds : float, optional
-        Stop at the next colour of nodes after this time; the mesh is valid, and its floor is seen to.
+        Stop at the next colour of nodes after this time; the mesh is valid, and its floor is seen to, which, like the
+        flips of an iteration, takes its time besides.
     callback : callable, optional
         Called with each `Record`. Its E_G is the weighted one, its `is_retessellated` whether cells were exchanged.
     stop : callable, optional
@@ -98,14 +100,14 @@ def optimize(
     -------
     Optimized
         Mesh, history and why it ended. The mesh covers the same domain, every cell is positively oriented. E never
-        rises from one record to the next but for the one in which the repair was made. The same bits on any number
-        of threads.
+        rises from one record to the next, unless cells of the initial mesh had to be lifted over the floor. The same
+        bits on any number of threads.
 
     Raises
     ------
     InputError
-        An option out of range, or a mesh that the sampling cannot take (see `tetopt.cell_moments`) or whose facets are
-        shared by more than two cells.
+        An option out of range; a mesh that the sampling cannot take (see `tetopt.cell_moments`), that is folded or
+        has a facet in more than two cells, or a cell too flat to have a shape energy; or energies that overflow.
     """
     check_options(k_D, iterations, shape_power, min_dihedral, boundary)
     begin = time.perf_counter()
@@ -120,22 +122,22 @@ def optimize(
 
     record(0, 0.0, False)
     ended = "iterations"
-    wants_floor = run.n == 3 and min_dihedral > 0.0
-    has_floor = not wants_floor
+    floor = min_dihedral if run.n == 3 else 0.0
+    if iterations > 0:
+        run.keep_floor(floor)
     for iteration in range(1, iterations + 1):
         before = run.held.ticks.copy()
         is_finished = run.sweep(is_over)
         is_changed = run.flip() > 0 if is_finished else False
         fall = 1.0 - run.E() / history[-1].E if history[-1].E > 0.0 else 0.0
-        is_last = iteration >= iterations - 3 or not is_finished
-        if wants_floor and (is_last or fall < SETTLED) and (not has_floor or is_last):
-            is_changed = run.lift(min_dihedral) > 0 or is_changed
-            has_floor, fall = True, np.inf
+        is_last = iteration == iterations or not is_finished or fall < tolerance
+        if is_last and run.n_below(floor) > 0 and run.lift(floor) > 0:
+            is_changed, fall = True, np.inf
         record(iteration, relative_movement(before, run.held.ticks, image, run.grid, run.matrix), is_changed)
         if not is_finished:
             ended = "stopped" if stop is not None and stop() else "max_seconds"
             break
-        if has_floor and fall < tolerance:
+        if fall < tolerance:
             ended = "converged"
             break
     return Optimized(run.mesh(), history, ended)
@@ -144,7 +146,8 @@ def optimize(
 def prepare_kernels(image: Image, k_D: float, method: Literal["fast", "paper"] = "fast") -> None:
     """Compile the kernels of a method for images of this kind, or load them, before a clock starts.
 
-    The sampling has kernels of its own for whole-number images whose sums fit 32 bits; see `sampling_grid`.
+    The sampling has kernels of its own for whole-number images whose sums fit 32 bits; see `sampling_grid`. The repair
+    is left to be compiled when a mesh wants it.
     """
     is_whole = np.array_equal(np.rint(image.data), image.data)
     step = 1.0 if is_whole else 0.1
@@ -154,9 +157,6 @@ def prepare_kernels(image: Image, k_D: float, method: Literal["fast", "paper"] =
         optimize_paper(tiny, mesh, k_D=k_D, iterations=1)
         return
     optimize(tiny, mesh, k_D=k_D, iterations=1)
-    if image.ndim == 3:
-        run = _Run(tiny, mesh, k_D, 3.0, "slide")
-        touch(run.held, run.is_frozen, run.measure, run.projections)
 
 
 class _Run:
@@ -167,8 +167,12 @@ class _Run:
         self.grid = sampling_grid(image, mesh.points)
         ticks = to_ticks(image.to_index(mesh.points), self.grid)
         check_orientations(image, ticks, mesh.cells)
-        if facets(mesh.cells).n_cells.max() > 2:
-            raise InputError("mesh: a facet is shared by more than two cells; remove doubled or overlapping cells")
+        pairs = folded(mesh.cells)
+        if len(pairs):
+            raise InputError(
+                f"mesh: {len(pairs)} facets have cells that overlap there, or more than two; the first are of cells "
+                f"{pairs[:3].tolist()}; mend the mesh"
+            )
         self.is_frozen = frozen_axes(image, ticks, mesh.cells, self.grid, boundary)
         self.is_still = self.is_frozen[:, 3 - self.n :].all(axis=1)
         self.matrix = np.eye(3)
@@ -177,9 +181,19 @@ class _Run:
         hand = 1 if np.linalg.det(image.affine[:-1, :-1]) > 0 else -1
         unit = measure_of(self.grid, hand, self.matrix, 1.0, 1.0, power)
         self.held: Complex = build(mesh.cells, ticks, unit)
+        flat = np.flatnonzero(~np.isfinite(self.held.E_shape[: len(mesh.cells)]))
+        if len(flat):
+            raise InputError(
+                f"mesh: {len(flat)} cells are too flat to be improved, the first are {flat[:5].tolist()}; "
+                "remove them or move their nodes apart"
+            )
         # Where every cell is uniform, what rounding leaves of E_D must not become the unit that E_D is measured in.
         self.noise = NOISE * float(np.var(image.data, dtype=np.float64)) * image.data.size
         self.E_G0, self.squares0 = self.energies()
+        if not (0.0 < self.E_G0 < np.inf and np.isfinite(self.squares0)):
+            raise InputError(
+                "mesh and image: their energies overflow; are lengths in mm and intensities of usual size?"
+            )
         weight = k_D / self.squares0 if self.squares0 > 0.0 else 0.0
         self.measure: Measure = measure_of(self.grid, hand, self.matrix, (1.0 - k_D) / self.E_G0, weight, power)
         self.fresh = np.ones(len(ticks), dtype=bool)  # nodes that moved since their flips were looked at
@@ -224,14 +238,18 @@ class _Run:
         spacing = (np.prod(lengths) / len(self.held.ticks)) ** (1.0 / self.n)
         return spacing / np.sqrt((self.matrix**2).sum(axis=0))
 
-    def lift(self, min_dihedral: float) -> int:
-        """Lift the worst cells over the floor, which later moves keep; the number of moves."""
-        done = repair(self.held, self.is_frozen, self.measure, self.projections, min_dihedral + SLACK)
+    def keep_floor(self, degrees: float) -> None:
+        """Let no move leave a dihedral angle under `degrees`, nor one that is under it already any smaller."""
+        self.measure = self.measure._replace(floor=-float(np.cos(np.radians(degrees))) if degrees > 0.0 else -1.0)
+
+    def n_below(self, degrees: float) -> int:
+        """Tetrahedra with an angle under `degrees`."""
+        return worst_angles(self.held, self.measure, degrees) if degrees > 0.0 else 0
+
+    def lift(self, degrees: float) -> int:
+        """Lift the worst cells over `degrees`, or as far as they go; the number of moves. It may raise E."""
+        done = repair(self.held, self.is_frozen, self.measure, self.projections, degrees)
         self.held = done.held
-        if worst_angles(self.held, self.measure, min_dihedral):  # not all could be lifted so far: to the floor itself
-            done = repair(self.held, self.is_frozen, self.measure, self.projections, min_dihedral)
-            self.held = done.held
-        self.measure = self.measure._replace(floor=-float(np.cos(np.radians(min_dihedral))))
         self.fresh[:] = True
         return done.n_moves
 

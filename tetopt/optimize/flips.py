@@ -76,7 +76,7 @@ def flip(
     return held, done
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=True, error_model="numpy")
 def _evaluate(gain: NDArray, move: NDArray, is_dirty: NDArray, held: Complex, measure: Measure) -> None:
     n_cells = len(gain)
     for chunk in prange((n_cells + CHUNK - 1) // CHUNK):
@@ -86,7 +86,7 @@ def _evaluate(gain: NDArray, move: NDArray, is_dirty: NDArray, held: Complex, me
             _evaluate_cells(gain, move, is_dirty, held, measure, chunk * CHUNK, min((chunk + 1) * CHUNK, n_cells))
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _evaluate_cells(
     gain: NDArray, move: NDArray, is_dirty: NDArray, held: Complex, measure: Measure, first: int, last: int
 ) -> None:
@@ -118,7 +118,7 @@ def _evaluate_cells(
                 gain[cell], move[cell] = worth, 4 + e
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _worth_of_face(x: NDArray, held: Complex, cell: int, k: int, measure: Measure) -> float:
     """How much E falls if the facet's two cells become three; 0 or less, or -inf, if not."""
     other = held.across[cell, k]
@@ -136,9 +136,12 @@ def _worth_of_face(x: NDArray, held: Complex, cell: int, k: int, measure: Measur
             return -np.inf
     if measure.image == 0.0:
         return old - new
-    j_u, j_v = flux_of(held.ticks, p, q, u, measure), flux_of(held.ticks, p, q, v, measure)
-    j_w = flux_of(held.ticks, p, q, w, measure)
-    for a, f_0, f_1 in ((w, j_u, j_v), (u, j_v, j_w), (v, j_w, j_u)):  # a: the corner of the facet that is left out
+    corner, spoke = (u, v, w), np.empty((3, 3))
+    for r in range(3):
+        f = flux_of(held.ticks, p, q, corner[r], measure)
+        spoke[r, 0], spoke[r, 1], spoke[r, 2] = f[0], f[1], f[2]
+    for r in range(3):
+        f_0, f_1, a = spoke[r], spoke[(r + 1) % 3], corner[(r + 2) % 3]  # a: the corner of the facet that is left out
         below = held.fluxes[cell, corner_of(held.cells, cell, a)]
         above = held.fluxes[other, corner_of(held.cells, other, a)]
         new += measure.image * image_energy(
@@ -150,7 +153,7 @@ def _worth_of_face(x: NDArray, held: Complex, cell: int, k: int, measure: Measur
     return old - new
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _ring_of_edge(
     ring: NDArray, around: NDArray, held: Complex, cell: int, i: int, j: int, owned: bool = False
 ) -> tuple:
@@ -207,7 +210,7 @@ def _ring_of_edge(
             return count + 1, 1
         if after == first:
             return count, 0
-        if owned and after < cell:
+        if count == MOST or (owned and after < cell):
             return 0, 0
         ring[count] = front
         other = 0
@@ -218,7 +221,7 @@ def _ring_of_edge(
         current, back, front = after, front, other
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _in_one_face(held: Complex, a: int, b: int, c: int, d: int, measure: Measure) -> bool:
     """Whether four boundary nodes have one index coordinate in common, so that they lie in one face of the box."""
     t = held.ticks
@@ -229,7 +232,7 @@ def _in_one_face(held: Complex, a: int, b: int, c: int, d: int, measure: Measure
     return False
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _worth_of_edge(
     x: NDArray, tables: tuple, fluxes: tuple, held: Complex, a: int, b: int, ring: NDArray, around: NDArray, m: int,
     is_open: int, measure: Measure,
@@ -289,7 +292,7 @@ def _worth_of_edge(
     return old - new if new < limit else -np.inf
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _pair_shape(x: NDArray, y: NDArray, i: int, k: int, j: int, limit: float, least: float, measure: Measure) -> float:
     """Weighted shape energy of the tetrahedra (i, k, j, b) and (i, j, k, a) over a triangle of the polygon.
 
@@ -326,7 +329,7 @@ def _pair_shape(x: NDArray, y: NDArray, i: int, k: int, j: int, limit: float, le
     return energy
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _best_triangulation(cost: NDArray, apex: NDArray, triangle: NDArray, m: int) -> float:
     """Least sum of `triangle[i, k, j]` over the triangulations of a polygon of m corners; `apex` is filled."""
     for i in range(m - 1):
@@ -344,7 +347,7 @@ def _best_triangulation(cost: NDArray, apex: NDArray, triangle: NDArray, m: int)
     return cost[0, m - 1]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _fill_side_fluxes(
     side_a: NDArray, side_b: NDArray, held: Complex, a: int, b: int, ring: NDArray, around: NDArray, m: int,
     is_open: int, measure: Measure,
@@ -359,18 +362,14 @@ def _fill_side_fluxes(
                     side_b[i, j, d] = sign * held.fluxes[cell, corner_of(held.cells, cell, a), d]
                     side_a[i, j, d] = sign * held.fluxes[cell, corner_of(held.cells, cell, b), d]
             else:
-                f, g = (
-                    flux_of(held.ticks, ring[i], ring[j], b, measure),
-                    flux_of(held.ticks, ring[j], ring[i], a, measure),
-                )
-                for d in range(3):
-                    side_b[i, j, d], side_a[i, j, d] = f[d], g[d]
+                for which in range(2):  # one place where the flux is measured: half the code to compile
+                    p, q, end = (ring[i], ring[j], b) if which == 0 else (ring[j], ring[i], a)
+                    f = flux_of(held.ticks, p, q, end, measure)
+                    side = side_b if which == 0 else side_a
+                    side[i, j, 0], side[i, j, 1], side[i, j, 2] = f[0], f[1], f[2]
 
 
-# Making the moves.
-
-
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _make(order: NDArray, move: NDArray, is_dirty: NDArray, held: Complex, measure: Measure) -> int:
     """Make the moves of the cells in `order` whose cavities are as they were; the number made.
 
@@ -439,7 +438,7 @@ def _make(order: NDArray, move: NDArray, is_dirty: NDArray, held: Complex, measu
     return made
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _take(new_cells: NDArray, count: int, cell: int, other: int, free: NDArray, n_free: int, held: Complex) -> int:
     """Numbers for the cells of a face flip: the two it replaces and one more."""
     new_cells[0], new_cells[1] = cell, other
@@ -451,7 +450,7 @@ def _take(new_cells: NDArray, count: int, cell: int, other: int, free: NDArray, 
     return n_free
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _link(held: Complex, cell: int, k: int, other: int, old: int) -> None:
     """Let facet k of `cell` and the facet of `other` that led to `old` lead to one another."""
     held.across[cell, k] = other
@@ -460,7 +459,7 @@ def _link(held: Complex, cell: int, k: int, other: int, old: int) -> None:
         held.across[other, m] = cell
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _finish(held: Complex, cell: int, measure: Measure, x: NDArray) -> None:
     """Sums and shape of a cell whose corners and fluxes are set."""
     c = held.cells[cell]
@@ -468,7 +467,7 @@ def _finish(held: Complex, cell: int, measure: Measure, x: NDArray) -> None:
     sum_up(held.sums, held.fluxes, cell)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _flip_face(held: Complex, cell: int, k: int, new: NDArray, measure: Measure, x: NDArray) -> None:
     """Two cells become three around the edge (p, q) of the corners across their facet (u, v, w)."""
     other = held.across[cell, k]
@@ -509,7 +508,7 @@ def _flip_face(held: Complex, cell: int, k: int, new: NDArray, measure: Measure,
         _finish(held, c, measure, x)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _remove_edge(
     held: Complex, a: int, b: int, ring: NDArray, around: NDArray, m: int, is_open: int, apex: NDArray, fluxes: tuple,
     new: NDArray, measure: Measure, x: NDArray,
@@ -590,7 +589,7 @@ def _remove_edge(
         _finish(held, new[r], measure, x)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _close_gaps(held: Complex, is_dirty: NDArray) -> None:
     """Move the last cells into the places of those that were taken out."""
     n = held.cells.shape[1]
@@ -623,7 +622,7 @@ def _close_gaps(held: Complex, is_dirty: NDArray) -> None:
 # Triangles.
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _evaluate_triangles(
     gain: NDArray, move: NDArray, is_dirty: NDArray, held: Complex, measure: Measure, first: int, last: int
 ) -> None:
@@ -637,7 +636,7 @@ def _evaluate_triangles(
                     gain[cell], move[cell] = worth, k
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _worth_of_turn(x: NDArray, held: Complex, cell: int, k: int, measure: Measure) -> float:
     """How much E falls if the edge (u, v) between two triangles is turned to (p, q); -inf if it cannot be."""
     other = held.across[cell, k]
@@ -662,7 +661,7 @@ def _worth_of_turn(x: NDArray, held: Complex, cell: int, k: int, measure: Measur
     return old - new if new < limit else -np.inf
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _turn_edge(held: Complex, cell: int, k: int, measure: Measure) -> None:
     """Triangles (p, u, v) and (q, v, u) become (p, u, q) and (p, q, v)."""
     other = held.across[cell, k]

@@ -59,7 +59,7 @@ def qualities(held: Complex, measure: Measure) -> NDArray[np.float64]:
     return found
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _fill_qualities(found: NDArray, held: Complex, measure: Measure) -> None:
     x = np.empty((4, 3))
     for cell in range(len(found)):
@@ -92,13 +92,6 @@ def repair(
     return Repaired(held, len(_worst_first(held, measure, target)), total)
 
 
-def touch(held: Complex, is_frozen: NDArray[np.bool_], measure: Measure, projections: NDArray[np.float64]) -> None:
-    """Run the kernels over no cells, so that they are compiled."""
-    none = np.empty(0, dtype=np.int64)
-    _reconnect(held, none, measure, 0.0)
-    _displace(held, node_rings(held), none, is_frozen, measure, projections, 0.0)
-
-
 def worst_angles(held: Complex, measure: Measure, floor: float) -> int:
     """How many cells have a smallest dihedral angle under `floor` degrees."""
     return int((qualities(held, measure) < -np.cos(np.radians(floor))).sum())
@@ -110,7 +103,7 @@ def _worst_first(held: Complex, measure: Measure, target: float) -> NDArray[np.i
     return bad[np.lexsort((bad, quality[bad]))]
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _reconnect(held: Complex, bad: NDArray, measure: Measure, target: float) -> int:
     """For each bad cell the flip that leaves the best worst angle in its cavity, if it is better than before."""
     x = np.empty((4, 3))
@@ -182,7 +175,7 @@ def _reconnect(held: Complex, bad: NDArray, measure: Measure, target: float) -> 
     return made
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _gain_of_face(x: NDArray, held: Complex, cell: int, k: int, measure: Measure, target: float) -> float:
     """By how much the worst angle of the cavity (its minus cosine, up to the target) grows in a face flip."""
     other = held.across[cell, k]
@@ -197,7 +190,7 @@ def _gain_of_face(x: NDArray, held: Complex, cell: int, k: int, measure: Measure
     return new - old
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _gain_of_edge(
     x: NDArray, cost: NDArray, apex: NDArray, shape: NDArray, held: Complex, cell: int, e: int, ring: NDArray,
     around: NDArray, m: int, is_open: int, measure: Measure, target: float,
@@ -238,7 +231,7 @@ def _gain_of_edge(
     return new - old
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _displace(
     held: Complex, rings: NodeRings, bad: NDArray, is_frozen: NDArray, measure: Measure, projections: NDArray,
     target: float,
@@ -255,7 +248,7 @@ def _displace(
     return made
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _ring_quality(x: NDArray, held: Complex, rings: NodeRings, node: int, measure: Measure, least: float) -> float:
     """The worst of a ring's cells; -2 if one is flat or inverted, and anything below `least` once that is passed."""
     worst = 1.0
@@ -267,7 +260,7 @@ def _ring_quality(x: NDArray, held: Complex, rings: NodeRings, node: int, measur
     return worst
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _lift(
     x: NDArray, held: Complex, rings: NodeRings, node: int, is_frozen: NDArray, measure: Measure, projections: NDArray,
     target: float,

@@ -57,7 +57,7 @@ def gradient(held: Complex, rings: NodeRings, measure: Measure) -> tuple[NDArray
     return shape, image
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _facet_moments(ticks: NDArray, node: int, b: int, c: int, measure: Measure) -> tuple:
     """Means of phi and h phi over the facet (node, b, c), or the segment (node, b), phi the node's hat function.
 
@@ -99,7 +99,7 @@ def _facet_moments(ticks: NDArray, node: int, b: int, c: int, measure: Measure) 
     return weight / (parts * parts), moment / (parts * parts)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _add_image_gradient(
     g: NDArray, held: Complex, rings: NodeRings, node: int, measure: Measure, inverse: NDArray
 ) -> None:
@@ -144,7 +144,7 @@ def _add_image_gradient(
         g[d] += factor * (inverse[0, d] * g0 + inverse[1, d] * g1 + inverse[2, d] * g2)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _add_shape_gradient(g: NDArray, x: NDArray, held: Complex, rings: NodeRings, node: int, measure: Measure) -> float:
     """Add the derivative of the weighted shape energy to g (3,), per mm; returns a bound of its curvature."""
     n = held.cells.shape[1]
@@ -179,7 +179,7 @@ def _add_shape_gradient(g: NDArray, x: NDArray, held: Complex, rings: NodeRings,
     return curvature
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=True, error_model="numpy")
 def _gradients(
     shape: NDArray, image: NDArray, held: Complex, rings: NodeRings, measure: Measure, inverse: NDArray
 ) -> None:
@@ -189,7 +189,7 @@ def _gradients(
         _add_image_gradient(image[node], held, rings, node, measure, inverse)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _ring_energy(
     limit: float, least: float, trial: NDArray, fluxes: NDArray, x: NDArray, node: int, held: Complex,
     rings: NodeRings, measure: Measure,
@@ -236,7 +236,7 @@ def _ring_energy(
     return energy
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _nearest_centroid(x: NDArray, node: int, held: Complex, rings: NodeRings, measure: Measure) -> float:
     """Distance in mm from a node to the nearest centroid of its ring's cells."""
     n = held.cells.shape[1]
@@ -253,7 +253,7 @@ def _nearest_centroid(x: NDArray, node: int, held: Complex, rings: NodeRings, me
     return np.sqrt(nearest)
 
 
-@njit(cache=True, parallel=True)
+@njit(cache=True, parallel=True, error_model="numpy")
 def _sweep(
     held: Complex, rings: NodeRings, nodes: NDArray, is_frozen: NDArray, measure: Measure, projections: NDArray,
     inverse: NDArray,
@@ -262,7 +262,7 @@ def _sweep(
         _move(nodes[number], held, rings, is_frozen, measure, projections, inverse)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _move(
     node: int, held: Complex, rings: NodeRings, is_frozen: NDArray, measure: Measure, projections: NDArray,
     inverse: NDArray,
@@ -347,7 +347,7 @@ def _move(
         _store(held, rings, node, best_trial, best_fluxes, measure)
 
 
-@njit(cache=True)
+@njit(cache=True, error_model="numpy")
 def _store(held: Complex, rings: NodeRings, node: int, shapes: NDArray, fluxes: NDArray, measure: Measure) -> None:
     """Write what `_ring_energy` found of a node's ring into the complex."""
     first = rings.start[node]
