@@ -429,7 +429,7 @@ def _prepare_kernels(image: Image, k_D: float, method: Method) -> None:
         prepare_kernels(image, k_D, method.value)
     seconds = time.perf_counter() - begin
     if seconds > 3.0:
-        log.print(f"kernels compiled in {seconds:.0f} s; later runs load them from the cache")
+        log.print(f"kernels compiled in {seconds:.0f} s; later runs on images of this kind load them from the cache")
 
 
 @contextlib.contextmanager
