@@ -261,7 +261,7 @@ def show(rows: dict[str, Any]) -> None:
             f"{row['iterations']} iterations; E_D {row['E_D_of_initial']:.3f} of initial, mean rho "
             f"{row['mean_rho']:.4f}, "
             f"angles from {row['min_dihedral']:.1f}; {row['seconds'] / row['cells'] * 1e6:.0f} s and "
-            f"{row['gb_more_per_mtet']:.2f} GB per Mtet"
+            f"{row['gb_more_per_mtet']:.2f} GB more per Mtet"
         )
     print(f"  time of an iteration grows as nodes^{fast['time_grows_as_nodes_to_the']:.2f}")
     print(f"  flip pass over a good mesh        {fast['flip_seconds_per_mtet']:10.2f} s per Mtet")

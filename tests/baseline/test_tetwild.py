@@ -54,7 +54,7 @@ def test_fills_the_box_with_the_wanted_nodes(image, capfd):
     produced = PIPELINES["pytetwild"](Job(image, None, 300, classes=2))
     assert_fills(image, produced.mesh)
     assert abs(len(produced.mesh.points) / 300 - 1.0) <= 0.05
-    assert list(produced.seconds) == ["surfaces", "tetrahedra"]
+    assert list(produced.seconds) == ["surfaces", "tetrahedra", "search"]
     assert capfd.readouterr().out == ""
 
 

@@ -144,7 +144,7 @@ def test_baseline(head, tmp_path, capsys):
     image = tetopt.load_image(head / "image.nii.gz")
     assert tetopt.check_mesh(mesh, image) == []
     assert numbers["fit"]["E_D"] == pytest.approx(tetopt.E_D(image, mesh), rel=1e-9)
-    assert set(numbers["seconds"]) == {"surfaces", "tetrahedra"}
+    assert set(numbers["seconds"]) == {"surfaces", "tetrahedra", "search"}
 
 
 @pytest.mark.parametrize(

@@ -145,10 +145,16 @@ def test_views_turn_together(page, tmp_path):
     """Drag, keys, wheel and buttons change every view; reset brings the first picture back."""
     copied = tmp_path / "copy.html"
     copied.write_text(page.read_text(encoding="utf-8").replace("</body>", PROBE + "</body>"), encoding="utf-8")
-    found = browser(tmp_path / "profile", "--virtual-time-budget=30000", "--dump-dom", copied.as_uri())
+    said = None
+    for attempt in range(4):  # on a loaded machine the browser's own time may end before the frames are drawn
+        found = browser(tmp_path / f"profile{attempt}", "--virtual-time-budget=30000", "--dump-dom", copied.as_uri())
+        said = re.search(r'data-said="([^"]*)"', found)
+        if said is not None:
+            break
     assert found.count('data-drawn="1"') == 2
-    said = re.search(r'data-said="([^"]*)"', found).group(1)
-    assert said == ("drag true,true; reset false,false; key true,true; wheel unasked false,false; wheel true,true")
+    assert said.group(1) == (
+        "drag true,true; reset false,false; key true,true; wheel unasked false,false; wheel true,true"
+    )
 
 
 def test_a_browser_draws_cells_and_edges(page, tmp_path):

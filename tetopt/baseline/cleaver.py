@@ -14,6 +14,7 @@ from __future__ import annotations
 import subprocess
 import sys
 import tempfile
+import time
 from importlib.util import find_spec
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -77,24 +78,27 @@ def stuffed(image: Image, labels: Image, nodes: int) -> Filled:
     _check(image, labels, nodes)
     cube = labels_in_cube(image, labels, node_spacing(image, nodes) / VOXELS_PER_SPACING)
     low, high = -0.5 * image.spacing, (np.array(image.shape) - 0.5) * image.spacing
-    runs: list[tuple[float, NDArray[np.float64], NDArray[np.int64], int]] = []
+    runs: list[tuple[float, NDArray[np.float64], NDArray[np.int64], int, float]] = []
+    begin_search = time.perf_counter()
     notes: list[str] = []
     factor = 2.0
     for _ in range(MAX_RUNS):
+        begin = time.perf_counter()
         try:
             points, cells = _run(cube, factor)
         except _RunError as error:
             notes.append(f"Cleaver, feature scaling {factor:.3g}: {error}")
             factor *= 0.83  # its crashes come with coarse meshes; another try beside
             continue
-        runs.append((factor, *_inside(points, cells, low, high)))
+        runs.append((factor, *_inside(points, cells, low, high), time.perf_counter() - begin))
         if abs(len(runs[-1][1]) / nodes - 1.0) <= TOLERANCE:
             break
         factor = next_factor([(run[0], len(run[1])) for run in runs], nodes)
     if not runs:
         raise InputError(f"itk-cleaver: no run gave a mesh ({notes[-1]}); ask for more nodes or {HINT}")
     runs.sort(key=lambda run: abs(np.log(len(run[1]) / nodes)))
-    _, points, cells, n_removed = runs[0]
+    _, points, cells, n_removed, seconds = runs[0]
+    search = time.perf_counter() - begin_search - seconds
     try:
         points, cells = put_on_box(points, cells, low, high)
     except InputError as error:
@@ -104,7 +108,7 @@ def stuffed(image: Image, labels: Image, nodes: int) -> Filled:
     if abs(len(points) / nodes - 1.0) > TOLERANCE:
         notes.append(f"{len(points)} nodes after {len(runs)} runs of Cleaver, {nodes} were asked for")
     world = image.to_world(points / image.spacing)
-    return Filled(Mesh(world, oriented(world, cells)), len(runs), notes)
+    return Filled(Mesh(world, oriented(world, cells)), len(runs), search, notes)
 
 
 def _check(image: Image, labels: Image, nodes: int) -> None:

@@ -19,6 +19,7 @@ from __future__ import annotations
 import importlib
 import os
 import sys
+import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import NamedTuple
@@ -51,6 +52,7 @@ class Filled(NamedTuple):
 
     mesh: Mesh
     n_runs: int  # of fTetWild
+    search_seconds: float  # of the runs whose mesh was not taken, made to meet the number of nodes
     notes: list[str]
 
 
@@ -90,17 +92,18 @@ def filled(image: Image, surfaces: Surfaces, nodes: int) -> Filled:
         raise InputError(f"nodes: a box needs 8 or more, got {nodes}")
     tetrahedralize = _tetrahedralize()
     spacing = node_spacing(image, nodes)
-    runs: list[tuple[float, NDArray[np.float64], NDArray[np.int64]]] = []
+    runs: list[tuple[float, NDArray[np.float64], NDArray[np.int64], float]] = []
     factor = 1.0
     while len(runs) < MAX_RUNS:
         envelope = ENVELOPE * spacing * factor**TIGHTENING
+        begin = time.perf_counter()
         points, cells = _run(tetrahedralize, surfaces, factor * spacing, envelope)
-        runs.append((factor, points, cells))
+        runs.append((factor, points, cells, time.perf_counter() - begin))
         if abs(len(points) / nodes - 1.0) <= TOLERANCE:
             break
-        factor = next_factor([(f, len(p)) for f, p, _ in runs], nodes)
+        factor = next_factor([(f, len(p)) for f, p, _, _ in runs], nodes)
     notes: list[str] = []
-    for _, points, cells in sorted(runs, key=lambda run: abs(np.log(len(run[1]) / nodes))):
+    for _, points, cells, seconds in sorted(runs, key=lambda run: abs(np.log(len(run[1]) / nodes))):
         try:
             points, cells = put_on_box(points, cells, surfaces.low, surfaces.high)
         except InputError as error:
@@ -109,7 +112,8 @@ def filled(image: Image, surfaces: Surfaces, nodes: int) -> Filled:
         world = image.to_world(points / image.spacing)
         if abs(len(points) / nodes - 1.0) > TOLERANCE:
             notes.append(f"{len(points)} nodes after {len(runs)} runs of fTetWild, {nodes} were asked for")
-        return Filled(Mesh(world, oriented(world, cells)), len(runs), notes)
+        search = sum(run[3] for run in runs) - seconds
+        return Filled(Mesh(world, oriented(world, cells)), len(runs), search, notes)
     raise InputError(f"pytetwild: none of {len(runs)} meshes could be made to fill the box; ask for more nodes")
 
 

@@ -9,8 +9,8 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tetopt.baseline.pipelines import UNTIMED
 from tetopt.report import viewer
-from tetopt.report.compare_figures import UNTIMED
 from tetopt.report.page import paragraph_html, picture_html, section_html, table_html, write_page
 from tetopt.report.viewer import View, views_html
 
@@ -400,7 +400,7 @@ def _seconds_html(results: dict[str, Any]) -> str:
         is_range = len(pipeline["runs"]) > 1
         for step, seconds in pipeline["median"]["seconds"].items():
             spread = f"{number_text(low.get(step))} to {number_text(high.get(step))}" if is_range else ""
-            remark = "loading compiled code, not in the total" if step == UNTIMED else ""
+            remark = UNTIMED.get(step, "")
             rows.append([pipeline["title"], step, number_text(seconds), spread, remark])
     return table_html(rows)
 
