@@ -397,7 +397,7 @@ def test_removing_an_edge_takes_the_best_triangulation():
     asked = gained = 0
     for cell in range(int(held.complex.n_cells[0])):
         for i, j in flips.EDGES:
-            m, is_open = flips._ring_of_edge(ring, around, held.complex, cell, i, j, True)
+            m, is_open = flips.ring_of_edge(ring, around, held.complex, cell, i, j, True)
             if m < 3 or is_open:
                 continue
             a, b = held.complex.cells[cell, i], held.complex.cells[cell, j]
@@ -456,7 +456,7 @@ def test_edges_with_many_cells_are_left_alone():
         ring, around = room[: flips.MOST], np.full(flips.MOST, -7)
         for cell in range(12):
             for i, j in flips.EDGES:
-                m, _ = flips._ring_of_edge(ring, around, held.complex, cell, i, j)
+                m, _ = flips.ring_of_edge(ring, around, held.complex, cell, i, j)
                 is_axis = set(held.complex.cells[cell, [i, j]].tolist()) == {0, 1}
                 assert m == 0 if is_axis else m in (2, 3)
         assert (room[flips.MOST :] == -7).all()

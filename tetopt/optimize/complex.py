@@ -14,7 +14,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from tetopt.energy.sampling import SamplingGrid, cell_orientation, few_threads, segment_flux, triangle_flux
+from tetopt.energy.sampling import SamplingGrid, few_threads, segment_flux, triangle_flux
 
 CHUNK = 64
 FLAT = 1e-7  # a cell's volume over (sum of squared edges)^(n/2); below, it counts as inverted: an angle of 1e-3 degrees
@@ -446,12 +446,6 @@ def node_colours(start: NDArray, ring: NDArray, cells: NDArray) -> NDArray:
             colour += 1
         colours[node] = colour
     return colours
-
-
-def is_oriented(held: Complex, measure: Measure) -> bool:
-    """Whether every cell is positively oriented, exactly; for tests."""
-    signs = [cell_orientation(held.ticks, held.cells, c) for c in range(int(held.n_cells[0]))]
-    return all(sign == measure.hand for sign in signs)
 
 
 def measure_of(

@@ -106,7 +106,7 @@ def _evaluate_cells(
                 if worth > gain[cell]:
                     gain[cell], move[cell] = worth, k
         for e in range(6):
-            m, is_open = _ring_of_edge(ring, around, held, cell, EDGES[e, 0], EDGES[e, 1], True)
+            m, is_open = ring_of_edge(ring, around, held, cell, EDGES[e, 0], EDGES[e, 1], True)
             dirty = False
             for r in range(m - is_open):
                 dirty = dirty or is_dirty[around[r]]
@@ -154,7 +154,7 @@ def _worth_of_face(x: NDArray, held: Complex, cell: int, k: int, measure: Measur
 
 
 @njit(cache=True, error_model="numpy")
-def _ring_of_edge(
+def ring_of_edge(
     ring: NDArray, around: NDArray, held: Complex, cell: int, i: int, j: int, owned: bool = False
 ) -> tuple:
     """The cells around the edge of a cell between its corners i and j, and the polygon of their other corners.
@@ -222,7 +222,7 @@ def _ring_of_edge(
 
 
 @njit(cache=True, error_model="numpy")
-def _in_one_face(held: Complex, a: int, b: int, c: int, d: int, measure: Measure) -> bool:
+def in_one_face(held: Complex, a: int, b: int, c: int, d: int, measure: Measure) -> bool:
     """Whether four boundary nodes have one index coordinate in common, so that they lie in one face of the box."""
     t = held.ticks
     for axis in range(3):
@@ -243,7 +243,7 @@ def _worth_of_edge(
     """
     cost, apex, shape, y = tables
     side_a, side_b = fluxes
-    if m < 3 or (is_open == 1 and not _in_one_face(held, a, b, ring[0], ring[m - 1], measure)):
+    if m < 3 or (is_open == 1 and not in_one_face(held, a, b, ring[0], ring[m - 1], measure)):
         return -np.inf
     old, least = 0.0, measure.floor
     for r in range(m - is_open):
@@ -273,11 +273,11 @@ def _worth_of_edge(
         for k in range(i + 1, m - 1):
             for j in range(k + 1, m):
                 shape[i, k, j] = _pair_shape(x, y, 2 + i, 2 + k, 2 + j, limit, least, measure)
-    if not _best_triangulation(cost, apex, shape, m) < limit:
+    if not best_triangulation(cost, apex, shape, m) < limit:
         return -np.inf
     if measure.image == 0.0:
         return old - cost[0, m - 1]
-    _fill_side_fluxes(side_a, side_b, held, a, b, ring, around, m, is_open, measure)
+    fill_side_fluxes(side_a, side_b, held, a, b, ring, around, m, is_open, measure)
     for i in range(m - 2):
         for k in range(i + 1, m - 1):
             for j in range(k + 1, m):
@@ -288,7 +288,7 @@ def _worth_of_edge(
                         image_energy(of_b[0] - u[0], of_b[1] - u[1], of_b[2] - u[2])
                         + image_energy(of_a[0] + u[0], of_a[1] + u[1], of_a[2] + u[2])
                     )
-    new = _best_triangulation(cost, apex, shape, m)
+    new = best_triangulation(cost, apex, shape, m)
     return old - new if new < limit else -np.inf
 
 
@@ -330,7 +330,7 @@ def _pair_shape(x: NDArray, y: NDArray, i: int, k: int, j: int, limit: float, le
 
 
 @njit(cache=True, error_model="numpy")
-def _best_triangulation(cost: NDArray, apex: NDArray, triangle: NDArray, m: int) -> float:
+def best_triangulation(cost: NDArray, apex: NDArray, triangle: NDArray, m: int) -> float:
     """Least sum of `triangle[i, k, j]` over the triangulations of a polygon of m corners; `apex` is filled."""
     for i in range(m - 1):
         cost[i, i + 1] = 0.0
@@ -348,7 +348,7 @@ def _best_triangulation(cost: NDArray, apex: NDArray, triangle: NDArray, m: int)
 
 
 @njit(cache=True, error_model="numpy")
-def _fill_side_fluxes(
+def fill_side_fluxes(
     side_a: NDArray, side_b: NDArray, held: Complex, a: int, b: int, ring: NDArray, around: NDArray, m: int,
     is_open: int, measure: Measure,
 ) -> None:  # fmt: skip
@@ -402,12 +402,12 @@ def _make(order: NDArray, move: NDArray, is_dirty: NDArray, held: Complex, measu
             if is_dirty[other]:
                 continue
             n_free = _take(new_cells, 3, cell, other, free, n_free, held)
-            _flip_face(held, cell, move[cell], new_cells, measure, x)
+            flip_face(held, cell, move[cell], new_cells, measure, x)
             for r in range(3):
                 is_dirty[new_cells[r]] = True
         else:
             e = move[cell] - 4
-            m, is_open = _ring_of_edge(ring, around, held, cell, EDGES[e, 0], EDGES[e, 1])
+            m, is_open = ring_of_edge(ring, around, held, cell, EDGES[e, 0], EDGES[e, 1])
             clean = m > 0
             for r in range(m - is_open):
                 clean = clean and not is_dirty[around[r]]
@@ -425,7 +425,7 @@ def _make(order: NDArray, move: NDArray, is_dirty: NDArray, held: Complex, measu
                     held.n_cells[0] += 1
             for r in range(min(n_old, n_new)):
                 new_cells[r] = around[r]
-            _remove_edge(held, a, b, ring, around, m, is_open, tables[1], fluxes, new_cells, measure, x)
+            remove_edge(held, a, b, ring, around, m, is_open, tables[1], fluxes, new_cells, measure, x)
             for r in range(n_new, n_old):
                 held.cells[around[r], 0] = -1
                 is_dirty[around[r]] = True
@@ -434,7 +434,7 @@ def _make(order: NDArray, move: NDArray, is_dirty: NDArray, held: Complex, measu
             for r in range(n_new):
                 is_dirty[new_cells[r]] = True
         made += 1
-    _close_gaps(held, is_dirty)
+    close_gaps(held, is_dirty)
     return made
 
 
@@ -468,7 +468,7 @@ def _finish(held: Complex, cell: int, measure: Measure, x: NDArray) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def _flip_face(held: Complex, cell: int, k: int, new: NDArray, measure: Measure, x: NDArray) -> None:
+def flip_face(held: Complex, cell: int, k: int, new: NDArray, measure: Measure, x: NDArray) -> None:
     """Two cells become three around the edge (p, q) of the corners across their facet (u, v, w)."""
     other = held.across[cell, k]
     u, v, w = outward(held.cells, cell, k)
@@ -509,7 +509,7 @@ def _flip_face(held: Complex, cell: int, k: int, new: NDArray, measure: Measure,
 
 
 @njit(cache=True, error_model="numpy")
-def _remove_edge(
+def remove_edge(
     held: Complex, a: int, b: int, ring: NDArray, around: NDArray, m: int, is_open: int, apex: NDArray, fluxes: tuple,
     new: NDArray, measure: Measure, x: NDArray,
 ) -> None:  # fmt: skip
@@ -590,7 +590,7 @@ def _remove_edge(
 
 
 @njit(cache=True, error_model="numpy")
-def _close_gaps(held: Complex, is_dirty: NDArray) -> None:
+def close_gaps(held: Complex, is_dirty: NDArray) -> None:
     """Move the last cells into the places of those that were taken out."""
     n = held.cells.shape[1]
     last = held.n_cells[0] - 1

@@ -1,8 +1,8 @@
-"""The floor on the dihedral angles: the worst cells mended one by one, whatever it does to E, within a budget.
+"""The floor on the dihedral angles: the worst cells mended one by one, whatever it does to E.
 
 Moves are those of `tetopt.optimize.flips` and displacements of single nodes, but judged by the smallest dihedral angle
-of the cells they touch: a move is made only if that grows (Freitag and Ollivier-Gooch 1997). Of the moves that lift a
-cell over the floor the one is taken that costs least of E.
+of the cells they touch: a move is made only if that grows (Freitag and Ollivier-Gooch 1997), and of the moves of a cell
+the one that leaves the best worst angle, up to the floor.
 """
 
 from __future__ import annotations
@@ -17,28 +17,26 @@ from tetopt.optimize.complex import (
     Complex,
     Measure,
     NodeRings,
-    cell_energy,
     cell_quality,
     facet_of,
     grown,
     load_cell,
     node_rings,
     outward,
-    shape_of_cell,
     tet_quality,
 )
 from tetopt.optimize.flips import (
     EDGES,
     MOST,
-    _best_triangulation,
-    _close_gaps,
-    _fill_side_fluxes,
-    _flip_face,
-    _in_one_face,
-    _remove_edge,
-    _ring_of_edge,
+    best_triangulation,
+    close_gaps,
+    fill_side_fluxes,
+    flip_face,
+    in_one_face,
+    remove_edge,
+    ring_of_edge,
 )
-from tetopt.optimize.smooth import _ring_energy, _store
+from tetopt.optimize.smooth import ring_energy, store
 
 ROUNDS = 40
 STEPS = 7  # halvings of a node's displacement
@@ -127,7 +125,7 @@ def _reconnect(held: Complex, bad: NDArray, measure: Measure, target: float) -> 
                 if gain > best:
                     best, choice = gain, k
         for e in range(6):
-            m, is_open = _ring_of_edge(ring, around, held, cell, EDGES[e, 0], EDGES[e, 1])
+            m, is_open = ring_of_edge(ring, around, held, cell, EDGES[e, 0], EDGES[e, 1])
             gain = _gain_of_edge(x, cost, apex, shape, held, cell, e, ring, around, m, is_open, measure, target)
             if gain > best:
                 best, choice = gain, 4 + e
@@ -142,16 +140,16 @@ def _reconnect(held: Complex, bad: NDArray, measure: Measure, target: float) -> 
             else:
                 new_cells[2] = held.n_cells[0]
                 held.n_cells[0] += 1
-            _flip_face(held, cell, choice, new_cells, measure, x)
+            flip_face(held, cell, choice, new_cells, measure, x)
             for r in range(3):
                 is_changed[new_cells[r]] = True
         else:
             e = choice - 4
-            m, is_open = _ring_of_edge(ring, around, held, cell, EDGES[e, 0], EDGES[e, 1])
+            m, is_open = ring_of_edge(ring, around, held, cell, EDGES[e, 0], EDGES[e, 1])
             _gain_of_edge(x, cost, apex, shape, held, cell, e, ring, around, m, is_open, measure, target)
             a, b = held.cells[cell, EDGES[e, 0]], held.cells[cell, EDGES[e, 1]]
             if measure.image > 0.0:
-                _fill_side_fluxes(fluxes[0], fluxes[1], held, a, b, ring, around, m, is_open, measure)
+                fill_side_fluxes(fluxes[0], fluxes[1], held, a, b, ring, around, m, is_open, measure)
             n_old, n_new = m - is_open, 2 * (m - 2)
             for r in range(n_new):
                 if r < n_old:
@@ -162,7 +160,7 @@ def _reconnect(held: Complex, bad: NDArray, measure: Measure, target: float) -> 
                 else:
                     new_cells[r] = held.n_cells[0]
                     held.n_cells[0] += 1
-            _remove_edge(held, a, b, ring, around, m, is_open, apex, fluxes, new_cells, measure, x)
+            remove_edge(held, a, b, ring, around, m, is_open, apex, fluxes, new_cells, measure, x)
             for r in range(n_new, n_old):
                 held.cells[around[r], 0] = -1
                 is_changed[around[r]] = True
@@ -171,7 +169,7 @@ def _reconnect(held: Complex, bad: NDArray, measure: Measure, target: float) -> 
             for r in range(n_new):
                 is_changed[new_cells[r]] = True
         made += 1
-    _close_gaps(held, is_changed)
+    close_gaps(held, is_changed)
     return made
 
 
@@ -197,7 +195,7 @@ def _gain_of_edge(
 ) -> float:  # fmt: skip
     """The same for the removal of an edge; `apex` holds the triangulation."""
     a, b = held.cells[cell, EDGES[e, 0]], held.cells[cell, EDGES[e, 1]]
-    if m < 3 or (is_open == 1 and not _in_one_face(held, a, b, ring[0], ring[m - 1], measure)):
+    if m < 3 or (is_open == 1 and not in_one_face(held, a, b, ring[0], ring[m - 1], measure)):
         return -1.0
     old = 1.0
     for r in range(m - is_open):
@@ -211,7 +209,7 @@ def _gain_of_edge(
                 shape[i, k, j] = np.inf
                 if min(above, below) > old:
                     shape[i, k, j] = np.exp(-40.0 * above) + np.exp(-40.0 * below)
-    if not np.isfinite(_best_triangulation(cost, apex, shape, m)):
+    if not np.isfinite(best_triangulation(cost, apex, shape, m)):
         return -1.0
     new = target
     stack = np.empty((2 * m, 2), dtype=np.int64)
@@ -310,21 +308,8 @@ def _lift(
         t[node, 0], t[node, 1], t[node, 2] = start0, start1, start2
         return False
     trial, fluxes = np.empty(last - first), np.empty((last - first, 4, 3))
-    if not np.isfinite(_ring_energy(np.inf, -1.0, trial, fluxes, x, node, held, rings, measure)):
+    if not np.isfinite(ring_energy(np.inf, -1.0, trial, fluxes, x, node, held, rings, measure)):
         t[node, 0], t[node, 1], t[node, 2] = start0, start1, start2
         return False
-    _store(held, rings, node, trial, fluxes, measure)
+    store(held, rings, node, trial, fluxes, measure)
     return True
-
-
-def energy_of(held: Complex, cells: NDArray[np.int64], measure: Measure) -> float:
-    """E of some cells; for tests."""
-    return float(sum(cell_energy(held, int(cell), measure) for cell in cells))
-
-
-def shapes_are_kept(held: Complex, measure: Measure) -> bool:
-    """Whether the stored shape energies are those of the cells; for tests."""
-    x = np.empty((4, 3))
-    return all(
-        shape_of_cell(x, held.ticks, held.cells, c, measure) == held.E_shape[c] for c in range(int(held.n_cells[0]))
-    )

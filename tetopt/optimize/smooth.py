@@ -190,7 +190,7 @@ def _gradients(
 
 
 @njit(cache=True, error_model="numpy")
-def _ring_energy(
+def ring_energy(
     limit: float, least: float, trial: NDArray, fluxes: NDArray, x: NDArray, node: int, held: Complex,
     rings: NodeRings, measure: Measure,
 ) -> float:  # fmt: skip
@@ -302,7 +302,7 @@ def _move(
         held.ticks[node, 1] = here1 + np.int64(np.rint(t * step[1] / scale))
         held.ticks[node, 2] = here2 + np.int64(np.rint(t * step[2] / scale))
         limit = np.inf if attempt == 0 else best
-        value = _ring_energy(limit, least, trial, fluxes, x, node, held, rings, measure)
+        value = ring_energy(limit, least, trial, fluxes, x, node, held, rings, measure)
         if value < best:
             best, best_t = value, t
             trial, best_trial = best_trial, trial
@@ -336,7 +336,7 @@ def _move(
                 held.ticks[node, 0] = here0 + (shift if axis == 0 else 0)
                 held.ticks[node, 1] = here1 + (shift if axis == 1 else 0)
                 held.ticks[node, 2] = here2 + (shift if axis == 2 else 0)
-                value = _ring_energy(best, least, trial, fluxes, x, node, held, rings, measure)
+                value = ring_energy(best, least, trial, fluxes, x, node, held, rings, measure)
                 if value < best:
                     best, best_t = value, 1.0
                     there0, there1, there2 = held.ticks[node, 0], held.ticks[node, 1], held.ticks[node, 2]
@@ -344,12 +344,12 @@ def _move(
                     fluxes, best_fluxes = best_fluxes, fluxes
     held.ticks[node, 0], held.ticks[node, 1], held.ticks[node, 2] = there0, there1, there2
     if best_t > 0.0:
-        _store(held, rings, node, best_trial, best_fluxes, measure)
+        store(held, rings, node, best_trial, best_fluxes, measure)
 
 
 @njit(cache=True, error_model="numpy")
-def _store(held: Complex, rings: NodeRings, node: int, shapes: NDArray, fluxes: NDArray, measure: Measure) -> None:
-    """Write what `_ring_energy` found of a node's ring into the complex."""
+def store(held: Complex, rings: NodeRings, node: int, shapes: NDArray, fluxes: NDArray, measure: Measure) -> None:
+    """Write what `ring_energy` found of a node's ring into the complex."""
     first = rings.start[node]
     for r in range(first, rings.start[node + 1]):
         cell = rings.cells[r]
