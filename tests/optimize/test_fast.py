@@ -272,7 +272,7 @@ def test_a_flip_is_worth_what_it_says():
     flips._evaluate(gain, move, np.ones(len(held.complex.cells), dtype=bool), held.complex, held.measure)
     best = int(np.argmax(gain))
     E = held.E
-    made = flips._make(
+    made = flips.make_moves(
         np.array([best]), move, np.zeros(len(held.complex.cells), dtype=bool), held.complex, held.measure
     )
     assert made == 1

@@ -34,7 +34,7 @@ from tetopt.optimize.complex import (
     node_rings,
 )
 from tetopt.optimize.descent import free_projections
-from tetopt.optimize.flips import flip
+from tetopt.optimize.flips import flip, make_moves
 from tetopt.optimize.paper import (
     NOISE,
     Boundary,
@@ -157,6 +157,9 @@ def prepare_kernels(image: Image, k_D: float, method: Literal["fast", "paper"] =
         optimize_paper(tiny, mesh, k_D=k_D, iterations=1)
         return
     optimize(tiny, mesh, k_D=k_D, iterations=1)
+    run = _Run(tiny, mesh, k_D, 3.0, "slide")
+    none = np.empty(0, dtype=np.int64)  # nothing can be gained on so small a mesh, so that no move is made of itself
+    make_moves(none, none, np.zeros(len(run.held.cells), dtype=np.bool_), run.held, run.measure)
 
 
 class _Run:

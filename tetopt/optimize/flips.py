@@ -69,7 +69,7 @@ def flip(
             break
         order = order[np.lexsort((order, -gain[order]))]
         is_dirty[:] = False
-        made = _make(order, move, is_dirty, held, measure)
+        made = make_moves(order, move, is_dirty, held, measure)
         done += made
         if made == 0:
             break
@@ -370,7 +370,7 @@ def fill_side_fluxes(
 
 
 @njit(cache=True, error_model="numpy")
-def _make(order: NDArray, move: NDArray, is_dirty: NDArray, held: Complex, measure: Measure) -> int:
+def make_moves(order: NDArray, move: NDArray, is_dirty: NDArray, held: Complex, measure: Measure) -> int:
     """Make the moves of the cells in `order` whose cavities are as they were; the number made.
 
     Cells of a cavity that changed are marked dirty, and those left over are taken out at the end.
