@@ -12,8 +12,8 @@ import tetopt
 from tetopt.energy.geometric import E_G_gradient, cell_E_G
 from tetopt.energy.sampling import from_ticks, sampling_grid, to_ticks
 from tetopt.geometry.simplex import dihedral_angles, oriented
-from tetopt.geometry.topology import boundary_facets
-from tetopt.optimize.complex import build, energies, measure_all, measure_of, node_colours, node_rings
+from tetopt.geometry.topology import boundary_facets, greedy_colours
+from tetopt.optimize.complex import build, energies, measure_all, measure_of, node_rings
 from tetopt.optimize.descent import free_projections
 from tetopt.optimize.fast import _Run
 from tetopt.optimize.flips import flip
@@ -75,7 +75,7 @@ class Held:
 
     def sweep(self):
         rings = node_rings(self.complex)
-        colours = node_colours(rings.start, rings.cells, self.complex.cells)
+        colours = greedy_colours(self.complex.cells, rings.start, rings.cells)
         for colour in range(colours.max() + 1):
             nodes = np.flatnonzero(colours == colour)
             sweep(self.complex, rings, nodes, self.is_frozen, self.measure, self.projections)

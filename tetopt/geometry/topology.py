@@ -150,11 +150,11 @@ def node_colours(cells: NDArray[np.integer], around: Rings) -> NDArray[np.int64]
     Greedy in node order, so the same mesh always gets the same colours. Nodes of one colour can move at the
     same time: their rings have no cell in common.
     """
-    return _greedy_colours(np.ascontiguousarray(cells, dtype=np.int64), around.start, around.cells)
+    return greedy_colours(np.ascontiguousarray(cells, dtype=np.int64), around.start, around.cells)
 
 
 @numba.njit(cache=True)
-def _greedy_colours(cells: NDArray, start: NDArray, ring_cells: NDArray) -> NDArray:
+def greedy_colours(cells: NDArray, start: NDArray, ring_cells: NDArray) -> NDArray:
     n_nodes = len(start) - 1
     colours = np.full(n_nodes, -1, dtype=np.int64)
     taken_by = np.full(n_nodes + 1, -1, dtype=np.int64)  # the last node that saw this colour beside it

@@ -430,24 +430,6 @@ def _fill_twins(twin: NDArray, start: NDArray, ring: NDArray, corner: NDArray, c
                     twin[r, k] = (s - start[node]) * n + facet_of(cells, across, other, ring[r])
 
 
-@njit(cache=True, error_model="numpy")
-def node_colours(start: NDArray, ring: NDArray, cells: NDArray) -> NDArray:
-    """Greedy colours, (N,) int64: nodes of one colour share no cell."""
-    colours = np.full(len(start) - 1, -1, dtype=np.int64)
-    taken = np.full(256, -1, dtype=np.int64)
-    for node in range(len(start) - 1):
-        for r in range(start[node], start[node + 1]):
-            for k in range(cells.shape[1]):
-                colour = colours[cells[ring[r], k]]
-                if colour >= 0:
-                    taken[colour] = node
-        colour = 0
-        while taken[colour] == node:
-            colour += 1
-        colours[node] = colour
-    return colours
-
-
 def measure_of(
     grid: SamplingGrid, hand: int, matrix: NDArray[np.float64], geometry: float, image: float, power: float,
     min_dihedral: float = 0.0,

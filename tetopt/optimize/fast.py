@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from tetopt.energy.sampling import check_orientations, few_threads, from_ticks, sampling_grid, to_ticks
 from tetopt.errors import InputError
-from tetopt.geometry.topology import folded
+from tetopt.geometry.topology import folded, greedy_colours
 from tetopt.image import Image
 from tetopt.lattice import lattice
 from tetopt.mesh import Mesh
@@ -30,7 +30,6 @@ from tetopt.optimize.complex import (
     energies,
     measure_all,
     measure_of,
-    node_colours,
     node_rings,
 )
 from tetopt.optimize.descent import free_projections
@@ -214,7 +213,7 @@ class _Run:
     def sweep(self, is_over: Callable[[], bool]) -> bool:
         """Move every node once; False if `is_over` cut it short, between two colours."""
         rings = node_rings(self.held)
-        colours = node_colours(rings.start, rings.cells, self.held.cells)
+        colours = greedy_colours(self.held.cells, rings.start, rings.cells)
         for colour in range(colours.max() + 1):
             if is_over():
                 return False

@@ -401,7 +401,7 @@ def make_moves(order: NDArray, move: NDArray, is_dirty: NDArray, held: Complex, 
             other = held.across[cell, move[cell]]
             if is_dirty[other]:
                 continue
-            n_free = _take(new_cells, 3, cell, other, free, n_free, held)
+            n_free = _take(new_cells, cell, other, free, n_free, held)
             flip_face(held, cell, move[cell], new_cells, measure, x)
             for r in range(3):
                 is_dirty[new_cells[r]] = True
@@ -439,7 +439,7 @@ def make_moves(order: NDArray, move: NDArray, is_dirty: NDArray, held: Complex, 
 
 
 @njit(cache=True, error_model="numpy")
-def _take(new_cells: NDArray, count: int, cell: int, other: int, free: NDArray, n_free: int, held: Complex) -> int:
+def _take(new_cells: NDArray, cell: int, other: int, free: NDArray, n_free: int, held: Complex) -> int:
     """Numbers for the cells of a face flip: the two it replaces and one more."""
     new_cells[0], new_cells[1] = cell, other
     if n_free > 0:
@@ -448,15 +448,6 @@ def _take(new_cells: NDArray, count: int, cell: int, other: int, free: NDArray, 
     new_cells[2] = held.n_cells[0]
     held.n_cells[0] += 1
     return n_free
-
-
-@njit(cache=True, error_model="numpy")
-def _link(held: Complex, cell: int, k: int, other: int, old: int) -> None:
-    """Let facet k of `cell` and the facet of `other` that led to `old` lead to one another."""
-    held.across[cell, k] = other
-    if other >= 0:
-        m = facet_of(held.cells, held.across, other, old)
-        held.across[other, m] = cell
 
 
 @njit(cache=True, error_model="numpy")
