@@ -155,6 +155,7 @@ def node_colours(cells: NDArray[np.integer], around: Rings) -> NDArray[np.int64]
 
 @numba.njit(cache=True)
 def greedy_colours(cells: NDArray, start: NDArray, ring_cells: NDArray) -> NDArray:
+    """`node_colours` from the rows of `Rings`, cells int64 and contiguous."""
     n_nodes = len(start) - 1
     colours = np.full(n_nodes, -1, dtype=np.int64)
     taken_by = np.full(n_nodes + 1, -1, dtype=np.int64)  # the last node that saw this colour beside it
