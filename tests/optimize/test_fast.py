@@ -12,14 +12,14 @@ import tetopt
 from tetopt.energy.geometric import E_G_gradient, cell_E_G
 from tetopt.energy.sampling import from_ticks, sampling_grid, to_ticks
 from tetopt.geometry.simplex import dihedral_angles, oriented
-from tetopt.geometry.topology import boundary_facets, greedy_colours
+from tetopt.geometry.topology import boundary_facets
 from tetopt.optimize.complex import build, energies, measure_all, measure_of, node_rings
 from tetopt.optimize.descent import free_projections
 from tetopt.optimize.fast import _Run
 from tetopt.optimize.flips import flip
 from tetopt.optimize.paper import frozen_axes
 from tetopt.optimize.repair import repair, worst_angles
-from tetopt.optimize.smooth import gradient, sweep
+from tetopt.optimize.smooth import blocks, gradient, sweep
 
 OBLIQUE = np.array([[0.9, 0.3, 0.2, -7.0], [-0.25, 1.1, 0.1, 3.0], [0.0, 0.4, -2.5, 11.0], [0.0, 0.0, 0.0, 1.0]])
 seeds = st.integers(0, 2**32 - 1)
@@ -74,11 +74,10 @@ class Held:
         return tetopt.Mesh(points, self.complex.cells[: int(self.complex.n_cells[0])])
 
     def sweep(self):
-        rings = node_rings(self.complex)
-        colours = greedy_colours(self.complex.cells, rings.start, rings.cells)
-        for colour in range(colours.max() + 1):
-            nodes = np.flatnonzero(colours == colour)
-            sweep(self.complex, rings, nodes, self.is_frozen, self.measure, self.projections)
+        ticks = self.complex.ticks
+        everyone = np.ones(len(ticks), dtype=bool)
+        rings, groups = node_rings(self.complex), blocks(ticks)
+        sweep(self.complex, rings, groups, everyone, self.is_frozen, self.measure, self.projections)
 
     def flip(self, passes=50):
         self.complex, made = flip(self.complex, self.measure, passes=passes)
@@ -391,9 +390,8 @@ def test_removing_an_edge_takes_the_best_triangulation():
                     yield ((i, k, j), *left, *right)
 
     held = random_case(23, 3)
-    x, ring, around = np.empty((4, 3)), np.empty(flips.MOST, dtype=np.int64), np.empty(flips.MOST, dtype=np.int64)
-    tables = (np.empty((7, 7)), np.empty((7, 7), dtype=np.int64), np.empty((7, 7, 7)), np.empty((9, 3)))
-    fluxes = (np.empty((7, 7, 3)), np.empty((7, 7, 3)))
+    work = flips.cavity(0)
+    ring, around = work.ring, work.around
     asked = gained = 0
     for cell in range(int(held.complex.n_cells[0])):
         for i, j in flips.EDGES:
@@ -401,7 +399,7 @@ def test_removing_an_edge_takes_the_best_triangulation():
             if m < 3 or is_open:
                 continue
             a, b = held.complex.cells[cell, i], held.complex.cells[cell, j]
-            worth = flips._worth_of_edge(x, tables, fluxes, held.complex, a, b, ring, around, m, is_open, held.measure)
+            worth = flips._worth_of_edge(work, held.complex, a, b, m, is_open, held.measure)
             old = sum(energy_of(held, held.complex.cells[around[:m]]))
             best = np.inf
             for triangles in triangulations(0, m - 1):

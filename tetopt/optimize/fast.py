@@ -17,9 +17,16 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.energy.sampling import check_orientations, few_threads, from_ticks, sampling_grid, to_ticks
+from tetopt.energy.sampling import (
+    check_orientations,
+    few_threads,
+    from_ticks,
+    sampling_grid,
+    to_ticks,
+)
 from tetopt.errors import InputError
-from tetopt.geometry.topology import folded, greedy_colours
+from tetopt.geometry.simplex import volumes
+from tetopt.geometry.topology import folded
 from tetopt.image import Image
 from tetopt.lattice import lattice
 from tetopt.mesh import Mesh
@@ -28,6 +35,7 @@ from tetopt.optimize.complex import (
     Measure,
     build,
     energies,
+    floor_of,
     measure_all,
     measure_of,
     node_rings,
@@ -45,9 +53,11 @@ from tetopt.optimize.paper import (
     relative_movement,
 )
 from tetopt.optimize.repair import repair, worst_angles
-from tetopt.optimize.smooth import sweep
+from tetopt.optimize.smooth import blocks, sweep
 
-STILL = 0.02  # of the distance to the ring's nearest centroid: nodes that moved less since then need no new flips
+STILL = 0.02  # of an edge: nodes that moved less need no new flips
+QUIET = 0.01  # of an edge: nodes around which none moved more are not moved again
+FAR = -(1 << 40)  # ticks from anywhere
 
 
 def optimize(
@@ -198,8 +208,10 @@ class _Run:
             )
         weight = k_D / self.squares0 if self.squares0 > 0.0 else 0.0
         self.measure: Measure = measure_of(self.grid, hand, self.matrix, (1.0 - k_D) / self.E_G0, weight, power)
-        self.fresh = np.ones(len(ticks), dtype=bool)  # nodes that moved since their flips were looked at
-        self.seen = ticks.copy()  # where they were then
+        self.groups = blocks(ticks)
+        self.edge = _edges(mesh)
+        self.seen = np.full_like(ticks, FAR)  # where nodes were when their flips were last looked at
+        self.tried = np.full_like(ticks, FAR)  # and when the nodes around them were moved because of it
 
     def energies(self) -> tuple[float, float]:
         """Shape energy and sum of squares; squares that are only rounding count as 0."""
@@ -211,38 +223,37 @@ class _Run:
         return self.measure.geometry * E_G + self.measure.image * squares
 
     def sweep(self, is_over: Callable[[], bool]) -> bool:
-        """Move every node once; False if `is_over` cut it short, between two colours."""
-        rings = node_rings(self.held)
-        colours = greedy_colours(self.held.cells, rings.start, rings.cells)
-        for colour in range(colours.max() + 1):
-            if is_over():
-                return False
-            nodes = np.flatnonzero((colours == colour) & ~self.is_still)
-            sweep(self.held, rings, nodes, self.is_frozen, self.measure, self.projections)
-        return True
+        """Move every node whose ring has changed since it was last moved; False if `is_over` cut it short."""
+        is_near = np.zeros(len(self.tried), dtype=bool)
+        cells = self.held.cells[: int(self.held.n_cells[0])]
+        is_near[cells[self._moved(self.tried, QUIET)[cells].any(axis=1)]] = True
+        return sweep(
+            self.held, node_rings(self.held), self.groups, is_near & ~self.is_still, self.is_frozen, self.measure,
+            self.projections, is_over,
+        )  # fmt: skip
 
     def flip(self) -> int:
         """Exchange cells around the nodes that have moved; the number of exchanges."""
-        moved = (np.abs(self.held.ticks - self.seen) > STILL * self._spacing()).any(axis=1)
-        moved |= self.fresh
-        self.fresh = np.zeros(len(moved), dtype=bool)
-        self.seen[moved] = self.held.ticks[moved]
-        n_cells = int(self.held.n_cells[0])
-        is_dirty = moved[self.held.cells[:n_cells]].any(axis=1)
-        self.held, made = flip(self.held, self.measure, is_dirty)
+        moved = self._moved(self.seen, STILL)
+        is_dirty = moved[self.held.cells[: int(self.held.n_cells[0])]].any(axis=1)
+        is_touched = np.zeros(len(moved), dtype=bool)
+        self.held, made = flip(self.held, self.measure, is_dirty, is_touched=is_touched)
+        self.tried[is_touched] = FAR
         return made
 
-    def _spacing(self) -> NDArray[np.float64]:
-        """A typical distance between nodes along each axis, in ticks, (3,)."""
-        size = np.array(self.grid.shape, dtype=np.float64) * 2.0**self.grid.bits
-        lengths = size * np.sqrt((self.matrix**2).sum(axis=0))
-        lengths = lengths[3 - self.n :]
-        spacing = (np.prod(lengths) / len(self.held.ticks)) ** (1.0 / self.n)
-        return spacing / np.sqrt((self.matrix**2).sum(axis=0))
+    def _moved(self, since: NDArray[np.int64], share: float) -> NDArray[np.bool_]:
+        """Nodes that are more than a share of an edge away from `since`, which is brought up to date for them."""
+        M = self.matrix * 2.0**-self.grid.bits
+        t = (self.held.ticks - since).astype(np.float64)
+        squares = sum((M[d, 0] * t[:, 0] + M[d, 1] * t[:, 1] + M[d, 2] * t[:, 2]) ** 2 for d in range(3))
+        moved = squares > (share * self.edge) ** 2
+        since[moved] = self.held.ticks[moved]
+        return moved
 
     def keep_floor(self, degrees: float) -> None:
         """Let no move leave a dihedral angle under `degrees`, nor one that is under it already any smaller."""
-        self.measure = self.measure._replace(floor=-float(np.cos(np.radians(degrees))) if degrees > 0.0 else -1.0)
+        floor, safe = floor_of(degrees)
+        self.measure = self.measure._replace(floor=floor, safe=safe)
 
     def n_below(self, degrees: float) -> int:
         """Tetrahedra with an angle under `degrees`."""
@@ -252,7 +263,7 @@ class _Run:
         """Lift the worst cells over `degrees`, or as far as they go; the number of moves. It may raise E."""
         done = repair(self.held, self.is_frozen, self.measure, self.projections, degrees)
         self.held = done.held
-        self.fresh[:] = True
+        self.tried[:] = FAR
         return done.n_moves
 
     def record(self, iteration: int, movement: float, is_changed: bool, seconds: float) -> Record:
@@ -268,6 +279,14 @@ class _Run:
     def mesh(self) -> Mesh:
         points = self.image.to_world(from_ticks(self.held.ticks, self.grid, self.n))
         return Mesh(points, self.held.cells[: int(self.held.n_cells[0])].copy())
+
+
+def _edges(mesh: Mesh) -> NDArray[np.float64]:
+    """Edge of the regular cell that has the mean volume of the cells around each node, (N,) mm."""
+    n, around = mesh.ndim, mesh.cells.ravel()
+    total = np.bincount(around, np.repeat(volumes(mesh.points, mesh.cells), n + 1), len(mesh.points))
+    mean = total / np.maximum(np.bincount(around, minlength=len(mesh.points)), 1)
+    return (2.0**0.5 * 6.0 * mean) ** (1 / 3) if n == 3 else (4.0 / 3.0**0.5 * mean) ** 0.5
 
 
 def check_options(k_D: float, iterations: int, shape_power: float, min_dihedral: float, boundary: str) -> None:

@@ -14,6 +14,8 @@ the threads, and E falls by what was measured.
 
 from __future__ import annotations
 
+from typing import NamedTuple
+
 import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
@@ -36,6 +38,7 @@ from tetopt.optimize.complex import (
     shape_of_triangle,
     sum_up,
     tet_energy,
+    tet_quality,
 )
 
 MOST = 7  # corners of the largest polygon around an edge that is triangulated anew
@@ -44,13 +47,58 @@ EDGES = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])
 CHUNK = 32
 
 
+class Cavity(NamedTuple):
+    """Room for one cavity at a time."""
+
+    x: NDArray[np.float64]  # (4, 3) corners of a cell
+    y: NDArray[np.float64]  # (MOST + 2, 3) corners of the cavity: of an edge a, b, then the polygon
+    ring: NDArray[np.int64]  # (MOST,) the polygon's nodes
+    around: NDArray[np.int64]  # (MOST,) the cells around the edge
+    cost: NDArray[np.float64]  # (MOST, MOST) of the best triangulation between two corners
+    apex: NDArray[np.int64]  # (MOST, MOST) the corner between them of its triangle
+    triangle: NDArray[np.float64]  # (MOST, MOST, MOST) energy of the two cells over each triangle
+    is_measured: NDArray[np.bool_]  # (MOST, MOST, MOST) whether the image is in it
+    side_a: NDArray[np.float64]  # (MOST, MOST, 3) fluxes of the facets (v_j, v_i, a)
+    side_b: NDArray[np.float64]  # and (v_i, v_j, b)
+    is_side: NDArray[np.bool_]  # (MOST, MOST) whether they are measured
+    stack: NDArray[np.int64]  # (2 MOST, 3)
+    new: NDArray[np.int64]  # (2 MOST,) the cells that will fill the cavity
+    free: NDArray[np.int64]  # (1 + R,) how many cells were left over, and which
+
+
+@njit(cache=True, error_model="numpy")
+def cavity(n_free: int) -> Cavity:
+    """Room for a cavity, and for the numbers of `n_free` cells left over."""
+    return Cavity(
+        np.empty((4, 3)),
+        np.empty((MOST + 2, 3)),
+        np.empty(MOST, dtype=np.int64),
+        np.empty(MOST, dtype=np.int64),
+        np.empty((MOST, MOST)),
+        np.empty((MOST, MOST), dtype=np.int64),
+        np.empty((MOST, MOST, MOST)),
+        np.empty((MOST, MOST, MOST), dtype=np.bool_),
+        np.empty((MOST, MOST, 3)),
+        np.empty((MOST, MOST, 3)),
+        np.empty((MOST, MOST), dtype=np.bool_),
+        np.empty((2 * MOST, 3), dtype=np.int64),
+        np.empty(2 * MOST, dtype=np.int64),
+        np.zeros(1 + n_free, dtype=np.int64),
+    )
+
+
 def flip(
-    held: Complex, measure: Measure, is_dirty: NDArray[np.bool_] | None = None, passes: int = 50
+    held: Complex,
+    measure: Measure,
+    is_dirty: NDArray[np.bool_] | None = None,
+    passes: int = 50,
+    is_touched: NDArray[np.bool_] | None = None,
 ) -> tuple[Complex, int]:
     """Make every move that lowers E until none is left, or for some passes; the complex and the number of moves.
 
-    Only cavities with one of the cells marked in `is_dirty` (C,) are looked at; all of them by default. The complex
-    returned may be a wider copy of the one given, which is then out of date.
+    Only cavities with one of the cells marked in `is_dirty` (C,) are looked at; all of them by default. Nodes of new
+    cells are marked in `is_touched` (N,). The complex returned may be a wider copy of the one given, which is then out
+    of date.
     """
     wanted = np.ones(int(held.n_cells[0]), dtype=np.bool_) if is_dirty is None else is_dirty
     is_dirty = np.zeros(len(held.cells), dtype=np.bool_)
@@ -73,6 +121,8 @@ def flip(
         done += made
         if made == 0:
             break
+        if is_touched is not None:
+            is_touched[held.cells[: held.n_cells[0]][is_dirty[: held.n_cells[0]]]] = True
     return held, done
 
 
@@ -91,49 +141,57 @@ def _evaluate_cells(
     gain: NDArray, move: NDArray, is_dirty: NDArray, held: Complex, measure: Measure, first: int, last: int
 ) -> None:
     """The move worth most of each cell: 0 to 3 flips that facet, 4 to 9 removes an edge of `EDGES`."""
-    x = np.empty((4, 3))
-    ring, around = np.empty(MOST, dtype=np.int64), np.empty(MOST, dtype=np.int64)
-    tables = (
-        np.empty((MOST, MOST)), np.empty((MOST, MOST), dtype=np.int64), np.empty((MOST, MOST, MOST)),
-        np.empty((MOST + 2, 3)),
-    )  # fmt: skip
-    fluxes = (np.empty((MOST, MOST, 3)), np.empty((MOST, MOST, 3)))
+    work = cavity(0)
     for cell in range(first, last):
         for k in range(4):
             other = held.across[cell, k]
             if other > cell and (is_dirty[cell] or is_dirty[other]):
-                worth = _worth_of_face(x, held, cell, k, measure)
+                worth = _worth_of_face(work, held, cell, k, measure)
                 if worth > gain[cell]:
                     gain[cell], move[cell] = worth, k
         for e in range(6):
-            m, is_open = ring_of_edge(ring, around, held, cell, EDGES[e, 0], EDGES[e, 1], True)
+            beyond, before = held.across[cell, EDGES[5 - e, 0]], held.across[cell, EDGES[5 - e, 1]]
+            if 0 <= beyond < cell or 0 <= before < cell:
+                continue  # a lower cell has the edge too, and looks at it
+            m, is_open = ring_of_edge(work.ring, work.around, held, cell, EDGES[e, 0], EDGES[e, 1], True)
             dirty = False
             for r in range(m - is_open):
-                dirty = dirty or is_dirty[around[r]]
+                dirty = dirty or is_dirty[work.around[r]]
             if not dirty:
                 continue
             a, b = held.cells[cell, EDGES[e, 0]], held.cells[cell, EDGES[e, 1]]
-            worth = _worth_of_edge(x, tables, fluxes, held, a, b, ring, around, m, is_open, measure)
+            worth = _worth_of_edge(work, held, a, b, m, is_open, measure)
             if worth > gain[cell]:
                 gain[cell], move[cell] = worth, 4 + e
 
 
 @njit(cache=True, error_model="numpy")
-def _worth_of_face(x: NDArray, held: Complex, cell: int, k: int, measure: Measure) -> float:
+def _worth_of_face(work: Cavity, held: Complex, cell: int, k: int, measure: Measure) -> float:
     """How much E falls if the facet's two cells become three; 0 or less, or -inf, if not."""
+    x, y = work.x, work.y
     other = held.across[cell, k]
-    old = cell_energy(held, cell, measure) + cell_energy(held, other, measure)
     u, v, w = outward(held.cells, cell, k)
     p, q = held.cells[cell, k], held.cells[other, facet_of(held.cells, held.across, other, cell)]
+    load(y, 0, held.ticks, q, p, measure)
+    load(y, 1, held.ticks, u, p, measure)
+    load(y, 2, held.ticks, v, p, measure)
+    load(y, 3, held.ticks, w, p, measure)
+    # Six times the volumes of the three cells (p, q, a, b): most facets fail here, before any root is drawn.
+    V_uv, V_vw, V_wu = _triple(y, 0, 1, 2), _triple(y, 0, 2, 3), _triple(y, 0, 3, 1)
+    if V_uv <= 0.0 or V_vw <= 0.0 or V_wu <= 0.0:
+        return -np.inf
+    old = cell_energy(held, cell, measure) + cell_energy(held, other, measure)
     limit = old * (1.0 - LEAST_GAIN)
-    least = measure.floor
-    if least > -1.0:
-        least = min(least, cell_quality(x, held, cell, measure), cell_quality(x, held, other, measure))
     new = 0.0
-    for a, b in ((u, v), (v, w), (w, u)):
-        new += measure.geometry * shape_of_tet(x, held.ticks, p, q, a, b, measure)
-        if not new < limit or (least > -1.0 and least_cosine(x) < least):
+    for volume, a, b in ((V_uv, 1, 2), (V_vw, 2, 3), (V_wu, 3, 1)):
+        new += measure.geometry * tet_energy(volume, _edge_squares(y, 0, a, b), measure.power)
+        if not new < limit:
             return -np.inf
+    if measure.floor > -1.0:
+        least = min(measure.floor, cell_quality(x, held, cell, measure), cell_quality(x, held, other, measure))
+        for a, b in ((u, v), (v, w), (w, u)):
+            if tet_quality(x, held, p, q, a, b, measure) < least:
+                return -np.inf
     if measure.image == 0.0:
         return old - new
     corner, spoke = (u, v, w), np.empty((3, 3))
@@ -151,6 +209,26 @@ def _worth_of_face(x: NDArray, held: Complex, cell: int, k: int, measure: Measur
         if not new < limit:
             return -np.inf
     return old - new
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _triple(y: NDArray, a: int, b: int, c: int) -> float:
+    """Triple product of three rows."""
+    return (
+        y[a, 0] * (y[b, 1] * y[c, 2] - y[b, 2] * y[c, 1])
+        + y[a, 1] * (y[b, 2] * y[c, 0] - y[b, 0] * y[c, 2])
+        + y[a, 2] * (y[b, 0] * y[c, 1] - y[b, 1] * y[c, 0])
+    )
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _edge_squares(y: NDArray, a: int, b: int, c: int) -> float:
+    """Sum of the six squared edges of the tetrahedron of the origin and three rows."""
+    S = 0.0
+    for d in range(3):
+        total = y[a, d] + y[b, d] + y[c, d]
+        S += 4.0 * (y[a, d] * y[a, d] + y[b, d] * y[b, d] + y[c, d] * y[c, d]) - total * total
+    return S
 
 
 @njit(cache=True, error_model="numpy")
@@ -233,23 +311,19 @@ def in_one_face(held: Complex, a: int, b: int, c: int, d: int, measure: Measure)
 
 
 @njit(cache=True, error_model="numpy")
-def _worth_of_edge(
-    x: NDArray, tables: tuple, fluxes: tuple, held: Complex, a: int, b: int, ring: NDArray, around: NDArray, m: int,
-    is_open: int, measure: Measure,
-) -> float:  # fmt: skip
-    """How much E falls if the edge (a, b) is removed, -inf if it cannot be; `tables[1]` then holds the diagonals.
+def _worth_of_edge(work: Cavity, held: Complex, a: int, b: int, m: int, is_open: int, measure: Measure) -> float:
+    """How much E falls if the edge (a, b) is removed, -inf if it cannot be; `work.apex` then holds the diagonals.
 
-    tables[1][i, j] is the corner between i and j of the triangle on the diagonal (i, j), of the best triangulation.
+    `ring_of_edge` has filled `work.ring` and `work.around`. apex[i, j] is the corner between i and j of the triangle on
+    the diagonal (i, j), of the best triangulation.
     """
-    cost, apex, shape, y = tables
-    side_a, side_b = fluxes
+    y, ring, around = work.y, work.ring, work.around
+    cost, apex, triangle = work.cost, work.apex, work.triangle
     if m < 3 or (is_open == 1 and not in_one_face(held, a, b, ring[0], ring[m - 1], measure)):
         return -np.inf
-    old, least = 0.0, measure.floor
+    old = 0.0
     for r in range(m - is_open):
         old += cell_energy(held, around[r], measure)
-        if least > -1.0:
-            least = min(least, cell_quality(x, held, around[r], measure))
     limit = old * (1.0 - LEAST_GAIN)
     for d in range(3):
         y[0, d] = 0.0
@@ -262,7 +336,7 @@ def _worth_of_edge(
         low, lower = np.inf, np.inf  # the two cheapest ears
         for k in range(m):
             i, j = (k - 1) % m, (k + 1) % m
-            ear = _pair_shape(x, y, 2 + i, 2 + k, 2 + j, limit, least, measure)
+            ear = _pair_shape(y, 2 + i, 2 + k, 2 + j, limit, measure)
             if ear < lower:
                 low, lower = lower, ear
             elif ear < low:
@@ -272,31 +346,68 @@ def _worth_of_edge(
     for i in range(m - 2):
         for k in range(i + 1, m - 1):
             for j in range(k + 1, m):
-                shape[i, k, j] = _pair_shape(x, y, 2 + i, 2 + k, 2 + j, limit, least, measure)
-    if not best_triangulation(cost, apex, shape, m) < limit:
+                triangle[i, k, j] = _pair_shape(y, 2 + i, 2 + k, 2 + j, limit, measure)
+    if not best_triangulation(cost, apex, triangle, m) < limit:
         return -np.inf
+    # The floor last: it is asked of few edges, and its angles cost more than energies (half of a pass, when first).
+    if measure.floor > -1.0:
+        least = measure.floor
+        for r in range(m - is_open):
+            least = min(least, cell_quality(work.x, held, around[r], measure))
+        for i in range(m - 2):
+            for k in range(i + 1, m - 1):
+                for j in range(k + 1, m):
+                    if triangle[i, k, j] < limit and _pair_quality(work.x, y, 2 + i, 2 + k, 2 + j) < least:
+                        triangle[i, k, j] = np.inf
+        if not best_triangulation(cost, apex, triangle, m) < limit:
+            return -np.inf
     if measure.image == 0.0:
         return old - cost[0, m - 1]
-    fill_side_fluxes(side_a, side_b, held, a, b, ring, around, m, is_open, measure)
-    for i in range(m - 2):
-        for k in range(i + 1, m - 1):
-            for j in range(k + 1, m):
-                if shape[i, k, j] < limit:
-                    u = flux_of(held.ticks, ring[i], ring[k], ring[j], measure)
-                    of_b, of_a = side_b[i, k] + side_b[k, j] - side_b[i, j], side_a[i, k] + side_a[k, j] - side_a[i, j]
-                    shape[i, k, j] += measure.image * (
-                        image_energy(of_b[0] - u[0], of_b[1] - u[1], of_b[2] - u[2])
-                        + image_energy(of_a[0] + u[0], of_a[1] + u[1], of_a[2] + u[2])
-                    )
-    new = best_triangulation(cost, apex, shape, m)
-    return old - new if new < limit else -np.inf
+    # Then the image, only for the triangles of the best triangulation, until it is the best with it: a triangle that
+    # is not measured has its least possible energy, so no better triangulation is passed over.
+    work.is_measured[:] = False
+    work.is_side[:] = False
+    while _measure_triangles(work, held, a, b, m, is_open, measure):
+        if not best_triangulation(cost, apex, triangle, m) < limit:
+            return -np.inf
+    return old - cost[0, m - 1]
 
 
 @njit(cache=True, error_model="numpy")
-def _pair_shape(x: NDArray, y: NDArray, i: int, k: int, j: int, limit: float, least: float, measure: Measure) -> float:
+def _measure_triangles(work: Cavity, held: Complex, a: int, b: int, m: int, is_open: int, measure: Measure) -> bool:
+    """Add their image energy to the triangles of the triangulation in `apex`; whether one had not had it."""
+    stack, side_a, side_b, ring = work.stack, work.side_a, work.side_b, work.ring
+    stack[0, 0], stack[0, 1] = 0, m - 1
+    height = 1
+    found = False
+    while height > 0:
+        height -= 1
+        i, j = stack[height, 0], stack[height, 1]
+        if j == i + 1:
+            continue
+        k = work.apex[i, j]
+        stack[height, 0], stack[height, 1] = i, k
+        stack[height + 1, 0], stack[height + 1, 1] = k, j
+        height += 2
+        if work.is_measured[i, k, j]:
+            continue
+        found = work.is_measured[i, k, j] = True
+        for p, q in ((i, k), (k, j), (i, j)):
+            fill_side(work, held, a, b, p, q, m, is_open, measure)
+        u = flux_of(held.ticks, ring[i], ring[k], ring[j], measure)
+        of_b, of_a = side_b[i, k] + side_b[k, j] - side_b[i, j], side_a[i, k] + side_a[k, j] - side_a[i, j]
+        work.triangle[i, k, j] += measure.image * (
+            image_energy(of_b[0] - u[0], of_b[1] - u[1], of_b[2] - u[2])
+            + image_energy(of_a[0] + u[0], of_a[1] + u[1], of_a[2] + u[2])
+        )
+    return found
+
+
+@njit(cache=True, error_model="numpy")
+def _pair_shape(y: NDArray, i: int, k: int, j: int, limit: float, measure: Measure) -> float:
     """Weighted shape energy of the tetrahedra (i, k, j, b) and (i, j, k, a) over a triangle of the polygon.
 
-    Rows of `y`: a, b, then the polygon's corners. Infinite if one is inverted, flat, under the floor or above `limit`.
+    Rows of `y`: a, b, then the polygon's corners. Infinite if one is inverted or flat or has more than `limit`.
     """
     u0, u1, u2 = y[k, 0] - y[i, 0], y[k, 1] - y[i, 1], y[k, 2] - y[i, 2]
     v0, v1, v2 = y[j, 0] - y[i, 0], y[j, 1] - y[i, 1], y[j, 2] - y[i, 2]
@@ -317,16 +428,18 @@ def _pair_shape(x: NDArray, y: NDArray, i: int, k: int, j: int, limit: float, le
     energy += measure.geometry * tet_energy(below, S, measure.power)
     if not energy < limit:
         return np.inf
-    if least > -1.0:
-        for d in range(3):
-            x[0, d], x[1, d], x[2, d], x[3, d] = y[i, d], y[k, d], y[j, d], y[1, d]
-        if least_cosine(x) < least:
-            return np.inf
-        for d in range(3):
-            x[1, d], x[2, d], x[3, d] = y[j, d], y[k, d], y[0, d]
-        if least_cosine(x) < least:
-            return np.inf
     return energy
+
+
+@njit(cache=True, error_model="numpy")
+def _pair_quality(x: NDArray, y: NDArray, i: int, k: int, j: int) -> float:
+    """`least_cosine` of the worse of the same two tetrahedra."""
+    for d in range(3):
+        x[0, d], x[1, d], x[2, d], x[3, d] = y[i, d], y[k, d], y[j, d], y[1, d]
+    above = least_cosine(x)
+    for d in range(3):
+        x[1, d], x[2, d], x[3, d] = y[j, d], y[k, d], y[0, d]
+    return min(above, least_cosine(x))
 
 
 @njit(cache=True, error_model="numpy")
@@ -348,25 +461,25 @@ def best_triangulation(cost: NDArray, apex: NDArray, triangle: NDArray, m: int) 
 
 
 @njit(cache=True, error_model="numpy")
-def fill_side_fluxes(
-    side_a: NDArray, side_b: NDArray, held: Complex, a: int, b: int, ring: NDArray, around: NDArray, m: int,
-    is_open: int, measure: Measure,
-) -> None:  # fmt: skip
-    """Fluxes of the facets (v_i, v_j, b) and (v_j, v_i, a): from the old cells along the polygon, measured inside."""
-    for i in range(m - 1):
-        for j in range(i + 1, m):
-            if j == i + 1 or (i == 0 and j == m - 1 and is_open == 0):
-                r, sign = (i, 1.0) if j == i + 1 else (m - 1, -1.0)
-                cell = around[r]
-                for d in range(3):
-                    side_b[i, j, d] = sign * held.fluxes[cell, corner_of(held.cells, cell, a), d]
-                    side_a[i, j, d] = sign * held.fluxes[cell, corner_of(held.cells, cell, b), d]
-            else:
-                for which in range(2):  # one place where the flux is measured: half the code to compile
-                    p, q, end = (ring[i], ring[j], b) if which == 0 else (ring[j], ring[i], a)
-                    f = flux_of(held.ticks, p, q, end, measure)
-                    side = side_b if which == 0 else side_a
-                    side[i, j, 0], side[i, j, 1], side[i, j, 2] = f[0], f[1], f[2]
+def fill_side(
+    work: Cavity, held: Complex, a: int, b: int, i: int, j: int, m: int, is_open: int, measure: Measure
+) -> None:
+    """Fluxes of the facets (v_i, v_j, b) and (v_j, v_i, a), unless known: on the polygon's sides the old cells'."""
+    if work.is_side[i, j]:
+        return
+    work.is_side[i, j] = True
+    if j == i + 1 or (i == 0 and j == m - 1 and is_open == 0):
+        r, sign = (i, 1.0) if j == i + 1 else (m - 1, -1.0)
+        cell = work.around[r]
+        for d in range(3):
+            work.side_b[i, j, d] = sign * held.fluxes[cell, corner_of(held.cells, cell, a), d]
+            work.side_a[i, j, d] = sign * held.fluxes[cell, corner_of(held.cells, cell, b), d]
+        return
+    for which in range(2):  # one place where the flux is measured: half the code to compile
+        p, q, end = (work.ring[i], work.ring[j], b) if which == 0 else (work.ring[j], work.ring[i], a)
+        f = flux_of(held.ticks, p, q, end, measure)
+        side = work.side_b if which == 0 else work.side_a
+        side[i, j, 0], side[i, j, 1], side[i, j, 2] = f[0], f[1], f[2]
 
 
 @njit(cache=True, error_model="numpy")
@@ -375,17 +488,9 @@ def make_moves(order: NDArray, move: NDArray, is_dirty: NDArray, held: Complex, 
 
     Cells of a cavity that changed are marked dirty, and those left over are taken out at the end.
     """
-    x = np.empty((4, 3))
-    ring, around = np.empty(MOST, dtype=np.int64), np.empty(MOST, dtype=np.int64)
-    tables = (
-        np.empty((MOST, MOST)), np.empty((MOST, MOST), dtype=np.int64), np.empty((MOST, MOST, MOST)),
-        np.empty((MOST + 2, 3)),
-    )  # fmt: skip
-    fluxes = (np.empty((MOST, MOST, 3)), np.empty((MOST, MOST, 3)))
     room = len(held.cells)
-    free = np.empty(room, dtype=np.int64)
-    n_free, made = 0, 0
-    new_cells = np.empty(2 * MOST, dtype=np.int64)
+    work = cavity(room)
+    made = 0
     for number in range(len(order)):
         cell = order[number]
         if is_dirty[cell] or held.n_cells[0] + 2 * MOST > room:
@@ -398,56 +503,48 @@ def make_moves(order: NDArray, move: NDArray, is_dirty: NDArray, held: Complex, 
                 made += 1
             continue
         if move[cell] < 4:
-            other = held.across[cell, move[cell]]
-            if is_dirty[other]:
+            if is_dirty[held.across[cell, move[cell]]]:
                 continue
-            n_free = _take(new_cells, cell, other, free, n_free, held)
-            flip_face(held, cell, move[cell], new_cells, measure, x)
-            for r in range(3):
-                is_dirty[new_cells[r]] = True
+            flip_face(work, held, cell, move[cell], is_dirty, measure)
         else:
-            e = move[cell] - 4
-            m, is_open = ring_of_edge(ring, around, held, cell, EDGES[e, 0], EDGES[e, 1])
+            i, j = EDGES[move[cell] - 4]
+            m, is_open = ring_of_edge(work.ring, work.around, held, cell, i, j)
             clean = m > 0
             for r in range(m - is_open):
-                clean = clean and not is_dirty[around[r]]
+                clean = clean and not is_dirty[work.around[r]]
             if not clean:
                 continue
-            a, b = held.cells[cell, EDGES[e, 0]], held.cells[cell, EDGES[e, 1]]
-            _worth_of_edge(x, tables, fluxes, held, a, b, ring, around, m, is_open, measure)
-            n_old, n_new = m - is_open, 2 * (m - 2)
-            for r in range(n_old, n_new):  # more cells than before: from the pile, or from the end
-                if n_free > 0:
-                    n_free -= 1
-                    new_cells[r] = free[n_free]
-                else:
-                    new_cells[r] = held.n_cells[0]
-                    held.n_cells[0] += 1
-            for r in range(min(n_old, n_new)):
-                new_cells[r] = around[r]
-            remove_edge(held, a, b, ring, around, m, is_open, tables[1], fluxes, new_cells, measure, x)
-            for r in range(n_new, n_old):
-                held.cells[around[r], 0] = -1
-                is_dirty[around[r]] = True
-                free[n_free] = around[r]
-                n_free += 1
-            for r in range(n_new):
-                is_dirty[new_cells[r]] = True
+            a, b = held.cells[cell, i], held.cells[cell, j]
+            _worth_of_edge(work, held, a, b, m, is_open, measure)
+            remove_edge(work, held, a, b, m, is_open, is_dirty, measure)
         made += 1
     close_gaps(held, is_dirty)
     return made
 
 
 @njit(cache=True, error_model="numpy")
-def _take(new_cells: NDArray, cell: int, other: int, free: NDArray, n_free: int, held: Complex) -> int:
-    """Numbers for the cells of a face flip: the two it replaces and one more."""
-    new_cells[0], new_cells[1] = cell, other
-    if n_free > 0:
-        new_cells[2] = free[n_free - 1]
-        return n_free - 1
-    new_cells[2] = held.n_cells[0]
-    held.n_cells[0] += 1
-    return n_free
+def take_cells(work: Cavity, held: Complex, n_old: int, n_new: int, is_dirty: NDArray) -> None:
+    """Numbers of the cells that fill a cavity, to `work.new`: first those that it had, `n_old` in `work.around`.
+
+    Further ones are of cells left over before, or from the end; those left over now are marked by a corner of -1. All
+    are marked dirty.
+    """
+    for r in range(max(n_old, n_new)):
+        if r < n_old:
+            cell = work.around[r]
+            if r >= n_new:
+                held.cells[cell, 0] = -1
+                work.free[0] += 1
+                work.free[work.free[0]] = cell
+        elif work.free[0] > 0:
+            cell = work.free[work.free[0]]
+            work.free[0] -= 1
+        else:
+            cell = held.n_cells[0]
+            held.n_cells[0] += 1
+        if r < n_new:
+            work.new[r] = cell
+        is_dirty[cell] = True
 
 
 @njit(cache=True, error_model="numpy")
@@ -459,7 +556,7 @@ def _finish(held: Complex, cell: int, measure: Measure, x: NDArray) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def flip_face(held: Complex, cell: int, k: int, new: NDArray, measure: Measure, x: NDArray) -> None:
+def flip_face(work: Cavity, held: Complex, cell: int, k: int, is_dirty: NDArray, measure: Measure) -> None:
     """Two cells become three around the edge (p, q) of the corners across their facet (u, v, w)."""
     other = held.across[cell, k]
     u, v, w = outward(held.cells, cell, k)
@@ -471,6 +568,9 @@ def flip_face(held: Complex, cell: int, k: int, new: NDArray, measure: Measure, 
         i, j = corner_of(held.cells, cell, corner[r]), corner_of(held.cells, other, corner[r])
         under[r], over[r] = held.across[cell, i], held.across[other, j]
         below[r], above[r] = held.fluxes[cell, i], held.fluxes[other, j]
+    work.around[0], work.around[1] = cell, other
+    take_cells(work, held, 2, 3, is_dirty)
+    new = work.new
     spoke = np.zeros((3, 3))
     if measure.image > 0.0:
         for r in range(3):
@@ -496,19 +596,20 @@ def flip_face(held: Complex, cell: int, k: int, new: NDArray, measure: Measure, 
             held.across[over[t], over_k[t]] = c
         if under[t] >= 0:
             held.across[under[t], under_k[t]] = c
-        _finish(held, c, measure, x)
+        _finish(held, c, measure, work.x)
 
 
 @njit(cache=True, error_model="numpy")
 def remove_edge(
-    held: Complex, a: int, b: int, ring: NDArray, around: NDArray, m: int, is_open: int, apex: NDArray, fluxes: tuple,
-    new: NDArray, measure: Measure, x: NDArray,
-) -> None:  # fmt: skip
-    """The cells around (a, b) become pairs over the triangles of the polygon; see `_worth_of_edge`.
+    work: Cavity, held: Complex, a: int, b: int, m: int, is_open: int, is_dirty: NDArray, measure: Measure
+) -> None:
+    """The cells around (a, b) become pairs over the triangles of the polygon in `work.apex`; see `_worth_of_edge`.
 
+    The sides of its triangles have their fluxes, if the image counts.
     Over the triangle (i, k, j), i < k < j: (v_i, v_k, v_j, b) and (v_i, v_j, v_k, a).
     """
-    side_a, side_b = fluxes
+    side_a, side_b, ring, around = work.side_a, work.side_b, work.ring, work.around
+    apex, new = work.apex, work.new
     # What lies beyond the polygon's sides, and by which facet it leads here.
     beyond_a, beyond_b = np.full((m, 2), -1, dtype=np.int64), np.full((m, 2), -1, dtype=np.int64)
     for r in range(m - is_open):
@@ -522,14 +623,14 @@ def remove_edge(
                     beyond_a[r, 0], beyond_a[r, 1] = other, facet
                 else:
                     beyond_b[r, 0], beyond_b[r, 1] = other, facet
+    take_cells(work, held, m - is_open, 2 * (m - 2), is_dirty)
     # The triangle under each diagonal (i, j), numbered; its two cells are new[2 t] and new[2 t + 1].
-    stack_i, stack_j = np.empty(2 * m, dtype=np.int64), np.empty(2 * m, dtype=np.int64)
-    stack_up = np.empty(2 * m, dtype=np.int64)  # (triangle above) * 4 + its facet towards this one
-    stack_i[0], stack_j[0], stack_up[0] = 0, m - 1, -1
+    stack = work.stack  # of i, j and (triangle above) * 4 + its facet towards this one
+    stack[0, 0], stack[0, 1], stack[0, 2] = 0, m - 1, -1
     height, count = 1, 0
     while height > 0:
         height -= 1
-        i, j, up = stack_i[height], stack_j[height], stack_up[height]
+        i, j, up = stack[height]
         if j == i + 1:
             continue
         k = apex[i, j]
@@ -574,10 +675,10 @@ def remove_edge(
                 if beyond_a[p, 0] >= 0:
                     held.across[beyond_a[p, 0], beyond_a[p, 1]] = low
             else:
-                stack_i[height], stack_j[height], stack_up[height] = p, q, 4 * t + facet_top
+                stack[height, 0], stack[height, 1], stack[height, 2] = p, q, 4 * t + facet_top
                 height += 1
     for r in range(2 * count):
-        _finish(held, new[r], measure, x)
+        _finish(held, new[r], measure, work.x)
 
 
 @njit(cache=True, error_model="numpy")

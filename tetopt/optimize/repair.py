@@ -28,9 +28,11 @@ from tetopt.optimize.complex import (
 from tetopt.optimize.flips import (
     EDGES,
     MOST,
+    Cavity,
     best_triangulation,
+    cavity,
     close_gaps,
-    fill_side_fluxes,
+    fill_side,
     flip_face,
     in_one_face,
     remove_edge,
@@ -104,16 +106,10 @@ def _worst_first(held: Complex, measure: Measure, target: float) -> NDArray[np.i
 @njit(cache=True, error_model="numpy")
 def _reconnect(held: Complex, bad: NDArray, measure: Measure, target: float) -> int:
     """For each bad cell the flip that leaves the best worst angle in its cavity, if it is better than before."""
-    x = np.empty((4, 3))
-    ring, around = np.empty(MOST, dtype=np.int64), np.empty(MOST, dtype=np.int64)
-    cost, apex = np.empty((MOST, MOST)), np.empty((MOST, MOST), dtype=np.int64)
-    shape = np.empty((MOST, MOST, MOST))
-    fluxes = (np.empty((MOST, MOST, 3)), np.empty((MOST, MOST, 3)))
     room = len(held.cells)
+    work = cavity(room)
     is_changed = np.zeros(room, dtype=np.bool_)
-    free = np.empty(room, dtype=np.int64)
-    n_free, made = 0, 0
-    new_cells = np.empty(2 * MOST, dtype=np.int64)
+    made = 0
     for number in range(len(bad)):
         cell = bad[number]
         if is_changed[cell] or held.n_cells[0] + 2 * MOST > room:
@@ -121,53 +117,29 @@ def _reconnect(held: Complex, bad: NDArray, measure: Measure, target: float) -> 
         best, choice = 1e-4, -1  # the least gain
         for k in range(4):
             if held.across[cell, k] >= 0:
-                gain = _gain_of_face(x, held, cell, k, measure, target)
+                gain = _gain_of_face(work.x, held, cell, k, measure, target)
                 if gain > best:
                     best, choice = gain, k
         for e in range(6):
-            m, is_open = ring_of_edge(ring, around, held, cell, EDGES[e, 0], EDGES[e, 1])
-            gain = _gain_of_edge(x, cost, apex, shape, held, cell, e, ring, around, m, is_open, measure, target)
+            m, is_open = ring_of_edge(work.ring, work.around, held, cell, EDGES[e, 0], EDGES[e, 1])
+            gain = _gain_of_edge(work, held, cell, e, m, is_open, measure, target)
             if gain > best:
                 best, choice = gain, 4 + e
         if choice < 0:
             continue
         if choice < 4:
-            other = held.across[cell, choice]
-            new_cells[0], new_cells[1] = cell, other
-            if n_free > 0:
-                n_free -= 1
-                new_cells[2] = free[n_free]
-            else:
-                new_cells[2] = held.n_cells[0]
-                held.n_cells[0] += 1
-            flip_face(held, cell, choice, new_cells, measure, x)
-            for r in range(3):
-                is_changed[new_cells[r]] = True
+            flip_face(work, held, cell, choice, is_changed, measure)
         else:
             e = choice - 4
-            m, is_open = ring_of_edge(ring, around, held, cell, EDGES[e, 0], EDGES[e, 1])
-            _gain_of_edge(x, cost, apex, shape, held, cell, e, ring, around, m, is_open, measure, target)
+            m, is_open = ring_of_edge(work.ring, work.around, held, cell, EDGES[e, 0], EDGES[e, 1])
+            _gain_of_edge(work, held, cell, e, m, is_open, measure, target)
             a, b = held.cells[cell, EDGES[e, 0]], held.cells[cell, EDGES[e, 1]]
             if measure.image > 0.0:
-                fill_side_fluxes(fluxes[0], fluxes[1], held, a, b, ring, around, m, is_open, measure)
-            n_old, n_new = m - is_open, 2 * (m - 2)
-            for r in range(n_new):
-                if r < n_old:
-                    new_cells[r] = around[r]
-                elif n_free > 0:
-                    n_free -= 1
-                    new_cells[r] = free[n_free]
-                else:
-                    new_cells[r] = held.n_cells[0]
-                    held.n_cells[0] += 1
-            remove_edge(held, a, b, ring, around, m, is_open, apex, fluxes, new_cells, measure, x)
-            for r in range(n_new, n_old):
-                held.cells[around[r], 0] = -1
-                is_changed[around[r]] = True
-                free[n_free] = around[r]
-                n_free += 1
-            for r in range(n_new):
-                is_changed[new_cells[r]] = True
+                work.is_side[:] = False
+                for i in range(m - 1):
+                    for j in range(i + 1, m):
+                        fill_side(work, held, a, b, i, j, m, is_open, measure)
+            remove_edge(work, held, a, b, m, is_open, is_changed, measure)
         made += 1
     close_gaps(held, is_changed)
     return made
@@ -190,10 +162,10 @@ def _gain_of_face(x: NDArray, held: Complex, cell: int, k: int, measure: Measure
 
 @njit(cache=True, error_model="numpy")
 def _gain_of_edge(
-    x: NDArray, cost: NDArray, apex: NDArray, shape: NDArray, held: Complex, cell: int, e: int, ring: NDArray,
-    around: NDArray, m: int, is_open: int, measure: Measure, target: float,
-) -> float:  # fmt: skip
-    """The same for the removal of an edge; `apex` holds the triangulation."""
+    work: Cavity, held: Complex, cell: int, e: int, m: int, is_open: int, measure: Measure, target: float
+) -> float:
+    """The same for the removal of an edge; `work.apex` holds the triangulation."""
+    x, ring, around, cost, apex, shape = work.x, work.ring, work.around, work.cost, work.apex, work.triangle
     a, b = held.cells[cell, EDGES[e, 0]], held.cells[cell, EDGES[e, 1]]
     if m < 3 or (is_open == 1 and not in_one_face(held, a, b, ring[0], ring[m - 1], measure)):
         return -1.0
@@ -212,12 +184,12 @@ def _gain_of_edge(
     if not np.isfinite(best_triangulation(cost, apex, shape, m)):
         return -1.0
     new = target
-    stack = np.empty((2 * m, 2), dtype=np.int64)
+    stack = work.stack
     stack[0, 0], stack[0, 1] = 0, m - 1
     height = 1
     while height > 0:
         height -= 1
-        i, j = stack[height]
+        i, j = stack[height, 0], stack[height, 1]
         if j == i + 1:
             continue
         k = apex[i, j]

@@ -1,16 +1,19 @@
-"""Moving nodes along the analytic gradient of E, a colour at a time.
+"""Moving nodes along the analytic gradient of E, groups of one colour at a time.
 
 The shape energy's derivative is in closed form. That of E_D, connectivity fixed, needs only the facets around the
 node: with hbar_j the mean of cell j, dE_D/dx_a is the sum over the cells of the integral of (h - hbar_j)^2 phi_a n
 over their facets, phi_a the node's hat function and n the outward normal; hbar's own change drops out, because it is
 the minimiser. Two cells share a facet with opposite normals, so what counts is (h - hbar_j)^2 - (h - hbar_i)^2.
 
-Nodes of one colour share no cell, so each is moved, and its ring rewritten, at the same time as the others; the result
-does not depend on the threads. A move is made only if no cell of the ring loses its orientation (exactly, in integers)
-and the ring's measured energy falls, so E never rises.
+Groups of nodes of one colour share no cell, so each is worked on, and its rings rewritten, at the same time as the
+others; the result does not depend on the threads. A move is made only if no cell of the ring loses its orientation
+(exactly, in integers) and the ring's measured energy falls, so E never rises.
 """
 
 from __future__ import annotations
+
+from collections.abc import Callable
+from typing import NamedTuple
 
 import numpy as np
 from numba import njit, prange
@@ -18,17 +21,17 @@ from numpy.typing import NDArray
 
 from tetopt.energy.geometric import volume_and_E_G
 from tetopt.energy.sampling import few_threads
+from tetopt.geometry.topology import greedy_colours
 from tetopt.optimize.complex import (
     Complex,
     Measure,
     NodeRings,
     cell_energy,
-    cell_quality,
     flux_of,
     image_energy,
-    least_cosine,
     load_cell,
     outward,
+    quality_up_to,
     shape_of_cell,
     sum_up,
 )
@@ -37,17 +40,69 @@ POINTS = 8  # most parts that a facet's edge is cut into when h is integrated ov
 SPACING = 2.0  # voxels between such points
 REACH = 0.5  # of the distance to the nearest centroid of the ring's cells: the longest first step
 PROBE = 0.3  # of that step: how far a stalled node looks along the axes
+BLOCK = 128  # nodes in a group, at most
 TRIES = 3  # energies measured along the gradient, at most
 
 
+class Blocks(NamedTuple):
+    """Nodes in groups that lie together."""
+
+    nodes: NDArray[np.int64]  # (N,) one group after the other
+    start: NDArray[np.int64]  # (B+1,) where each begins
+    of_node: NDArray[np.int64]  # (N,) the group of each node
+
+
+def blocks(ticks: NDArray[np.int64]) -> Blocks:
+    """Groups of nodes along a Z-order curve (Morton 1966), so that a graded mesh gets groups of equal number."""
+    size = max(1, min(BLOCK, len(ticks) // 64))
+    low, high = ticks.min(axis=0), ticks.max(axis=0)
+    cell = (ticks - low) * 1023 // np.maximum(high - low, 1)
+    code = np.zeros(len(ticks), dtype=np.int64)
+    for bit in range(10):
+        for axis in range(3):
+            code |= ((cell[:, axis] >> bit) & 1) << (3 * bit + axis)
+    nodes = np.argsort(code, kind="stable")
+    start = np.append(np.arange(0, len(nodes), size), len(nodes))
+    of_node = np.empty(len(nodes), dtype=np.int64)
+    of_node[nodes] = np.repeat(np.arange(len(start) - 1), np.diff(start))
+    return Blocks(nodes, start, of_node)
+
+
 def sweep(
-    held: Complex, rings: NodeRings, nodes: NDArray[np.int64], is_frozen: NDArray[np.bool_], measure: Measure,
-    projections: NDArray[np.float64],
-) -> None:  # fmt: skip
-    """Move each of `nodes`, all of one colour; `projections` are `free_projections(matrix)`."""
+    held: Complex, rings: NodeRings, groups: Blocks, is_wanted: NDArray[np.bool_], is_frozen: NDArray[np.bool_],
+    measure: Measure, projections: NDArray[np.float64], is_over: Callable[[], bool] = lambda: False,
+) -> bool:  # fmt: skip
+    """Move the nodes that are wanted, (N,); `projections` are `free_projections(matrix)`.
+
+    Groups of one colour share no cell, and are worked on at the same time, their nodes one after the other: those read
+    the same voxels, 1.5 to 2 times faster from the cache than nodes of one colour all over the volume. Returns False if
+    `is_over` cut it short, between two colours.
+    """
     inverse = np.linalg.inv(measure.matrix)
-    with few_threads(len(nodes) * 100):
-        _sweep(held, rings, nodes, is_frozen, measure, projections, inverse)
+    start, cells = _block_rings(groups.nodes, groups.start, rings.start, rings.cells)
+    colours = greedy_colours(groups.of_node[held.cells[: held.n_cells[0]]], start, cells)
+    for colour in range(int(colours.max()) + 1):
+        if is_over():
+            return False
+        chosen = np.flatnonzero(colours == colour)
+        with few_threads(len(chosen) * BLOCK * 100):
+            _sweep(held, rings, groups, chosen, is_wanted, is_frozen, measure, projections, inverse)
+    return True
+
+
+@njit(cache=True)
+def _block_rings(nodes: NDArray, start: NDArray, ring_start: NDArray, ring_cells: NDArray) -> tuple:
+    """The cells around the nodes of each group, as `Rings`; cells may be named several times."""
+    first = np.zeros(len(start), dtype=np.int64)
+    cells = np.empty(len(ring_cells), dtype=np.int64)
+    count = 0
+    for block in range(len(start) - 1):
+        for at in range(start[block], start[block + 1]):
+            for r in range(ring_start[nodes[at]], ring_start[nodes[at] + 1]):
+                cells[count] = ring_cells[r]
+                count += 1
+        first[block + 1] = count
+    return first, cells
 
 
 def gradient(held: Complex, rings: NodeRings, measure: Measure) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -145,12 +200,16 @@ def _add_image_gradient(
 
 
 @njit(cache=True, error_model="numpy")
-def _add_shape_gradient(g: NDArray, x: NDArray, held: Complex, rings: NodeRings, node: int, measure: Measure) -> float:
-    """Add the derivative of the weighted shape energy to g (3,), per mm; returns a bound of its curvature."""
+def _add_shape_gradient(g: NDArray, x: NDArray, held: Complex, rings: NodeRings, node: int, measure: Measure) -> tuple:
+    """Add the derivative of the weighted shape energy to g (3,), per mm.
+
+    Returns a bound of its curvature, the distance in mm to the nearest centroid of the ring's cells, and the ring's
+    worst quality, up to the floor.
+    """
     n = held.cells.shape[1]
     dim = n - 1
     power = measure.power
-    curvature = 0.0
+    curvature, nearest, least = 0.0, np.inf, measure.floor
     for r in range(rings.start[node], rings.start[node + 1]):
         cell, at = rings.cells[r], rings.corner[r]
         load_cell(x, held.ticks, held.cells, cell, measure)
@@ -170,13 +229,18 @@ def _add_shape_gradient(g: NDArray, x: NDArray, held: Complex, rings: NodeRings,
         # W is proportional to v^alpha S^p with alpha = 1 - 2 (p - 1) / n.
         of_volume = sign * (1.0 - 2.0 * (power - 1.0) / dim) / volume
         of_edges = power / S
+        squared = 0.0
         for d in range(3):
             apart = 0.0
             for k in range(n):
                 apart += x[at, d] - x[k, d]
+            squared += apart * apart
             g[d] += measure.geometry * W * (of_volume * (v0, v1, v2)[d] + of_edges * 2.0 * apart)
         curvature += measure.geometry * W * of_edges * 2.0 * n
-    return curvature
+        nearest = min(nearest, squared)
+        if n == 4 and least > -1.0:
+            least = min(least, quality_up_to(x, measure))
+    return curvature, np.sqrt(nearest) / n, least
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
@@ -203,7 +267,7 @@ def ring_energy(
     energy = 0.0
     for r in range(first, last):  # cheap refusals before any voxel is read
         trial[r - first] = shape_of_cell(x, held.ticks, held.cells, rings.cells[r], measure)
-        if least > -1.0 and (trial[r - first] == np.inf or least_cosine(x) < least):
+        if n == 4 and least > -1.0 and (trial[r - first] == np.inf or quality_up_to(x, measure) < least):
             return np.inf
         energy += measure.geometry * trial[r - first]
         if energy > limit:
@@ -236,30 +300,23 @@ def ring_energy(
     return energy
 
 
-@njit(cache=True, error_model="numpy")
-def _nearest_centroid(x: NDArray, node: int, held: Complex, rings: NodeRings, measure: Measure) -> float:
-    """Distance in mm from a node to the nearest centroid of its ring's cells."""
-    n = held.cells.shape[1]
-    nearest = np.inf
-    for r in range(rings.start[node], rings.start[node + 1]):
-        squared = 0.0
-        load_cell(x, held.ticks, held.cells, rings.cells[r], measure)
-        for d in range(3):
-            mean = 0.0
-            for k in range(n):
-                mean += x[k, d] / n
-            squared += (mean - x[rings.corner[r], d]) ** 2
-        nearest = min(nearest, squared)
-    return np.sqrt(nearest)
-
-
 @njit(cache=True, parallel=True, error_model="numpy")
 def _sweep(
-    held: Complex, rings: NodeRings, nodes: NDArray, is_frozen: NDArray, measure: Measure, projections: NDArray,
-    inverse: NDArray,
+    held: Complex, rings: NodeRings, groups: Blocks, chosen: NDArray, is_wanted: NDArray, is_frozen: NDArray,
+    measure: Measure, projections: NDArray, inverse: NDArray,
 ) -> None:  # fmt: skip
-    for number in prange(len(nodes)):
-        _move(nodes[number], held, rings, is_frozen, measure, projections, inverse)
+    for number in prange(len(chosen)):
+        _move_block(chosen[number], held, rings, groups, is_wanted, is_frozen, measure, projections, inverse)
+
+
+@njit(cache=True, error_model="numpy")
+def _move_block(
+    block: int, held: Complex, rings: NodeRings, groups: Blocks, is_wanted: NDArray, is_frozen: NDArray,
+    measure: Measure, projections: NDArray, inverse: NDArray,
+) -> None:  # fmt: skip
+    for at in range(groups.start[block], groups.start[block + 1]):
+        if is_wanted[groups.nodes[at]]:
+            _move(groups.nodes[at], held, rings, is_frozen, measure, projections, inverse)
 
 
 @njit(cache=True, error_model="numpy")
@@ -274,7 +331,7 @@ def _move(
     first, last = rings.start[node], rings.start[node + 1]
     x, g = np.empty((4, 3)), np.zeros(3)
     step, moved = np.empty(3), np.empty(3)
-    curvature = _add_shape_gradient(g, x, held, rings, node, measure)
+    curvature, nearest, least = _add_shape_gradient(g, x, held, rings, node, measure)
     if measure.image > 0.0:
         _add_image_gradient(g, held, rings, node, measure, inverse)
     P = projections[is_frozen[node, 0] + 2 * is_frozen[node, 1] + 4 * is_frozen[node, 2]]
@@ -286,13 +343,12 @@ def _move(
     if not square > 0.0:
         return
     slope = -square
-    reach = REACH * _nearest_centroid(x, node, held, rings, measure)
+    reach = REACH * nearest
     t = min(1.0 / curvature, reach / np.sqrt(square))
-    energy, least = 0.0, measure.floor if n == 4 else -1.0
+    energy = 0.0
     for r in range(first, last):
         energy += cell_energy(held, rings.cells[r], measure)
-        if least > -1.0:  # a ring below the floor may stay as it is, but not get worse
-            least = min(least, cell_quality(x, held, rings.cells[r], measure))
+    # A ring below the floor may stay as it is, but not get worse: hence the ring's own `least`.
     here0, here1, here2 = held.ticks[node, 0], held.ticks[node, 1], held.ticks[node, 2]
     best, best_t = energy, 0.0
     trial, best_trial = np.empty(last - first), np.empty(last - first)
