@@ -55,8 +55,8 @@ from tetopt.optimize.paper import (
 from tetopt.optimize.repair import repair, worst_angles
 from tetopt.optimize.smooth import blocks, sweep
 
-STILL = 0.02  # of an edge: nodes that moved less need no new flips
-QUIET = 0.01  # of an edge: nodes around which none moved more are not moved again
+STILL = 0.05  # of an edge: nodes that moved less need no new flips
+QUIET = 0.02  # of an edge: nodes around which none moved more are not moved again
 FAR = -(1 << 40)  # ticks from anywhere
 
 

@@ -175,6 +175,8 @@ def _add_image_gradient(
             if count_1 <= 0.0 or count_2 <= 0.0:
                 continue
             mean_1, mean_2 = held.sums[cell, 1] / count_1, held.sums[other, 1] / count_2
+            if mean_1 == mean_2:  # as between cells of the background
+                continue
             a, b, c = outward(held.cells, cell, k)
             if n == 3:  # the segment (a, b), its normal to the right; phi of `node`
                 far = b if a == node else a
