@@ -42,6 +42,7 @@ class Measure(NamedTuple):
     geometry: float  # weight of the shape energy: (1 - k_D) / E_G0
     image: float  # weight of a cell's sum of squares: k_D x voxel volume / E_D0
     power: float  # p of the shape energy
+    is_graded: bool  # whether every cell's shape counts the same, whatever its size
     floor: float  # minus the cosine of the smallest dihedral angle that a move may leave; -1 for none
     safe: float  # a tetrahedron whose S^3 is up to this times its squared determinant is above the floor
 
@@ -146,6 +147,15 @@ def corner_of(cells: NDArray, cell: int, node: int) -> int:
 
 
 @njit(cache=True, error_model="numpy")
+def has_node(cells: NDArray, cell: int, node: int) -> bool:
+    """Whether `node` is a corner of `cell`."""
+    found = False
+    for k in range(cells.shape[1]):
+        found = found or cells[cell, k] == node
+    return found
+
+
+@njit(cache=True, error_model="numpy")
 def flux_of(ticks: NDArray, a: int, b: int, c: int, measure: Measure) -> tuple:
     """Flux of the facet (a, b, c), or (a, b) with c < 0, times the sign of index space."""
     if c < 0:
@@ -181,12 +191,17 @@ def image_energy(count: float, first: float, second: float) -> float:
 
 
 @njit(cache=True, error_model="numpy")
-def shape_energy(x: NDArray, n_corners: int, power: float) -> float:
+def shape_energy(x: NDArray, n_corners: int, power: float, is_graded: bool) -> float:
     """E_G of the cell with corners x (4, 3) times eta^(p - 1); infinite for one that is flat or inverted.
 
     eta = S / (12 (3 v)^(2/3)) in 3-D, S / (4 sqrt(3) v) in 2-D, S the sum of the squared edges and v the volume: 1 on
     the regular cell, infinite on a flat one. E_G,j is proportional to v^(5/3) eta, so it vanishes on a sliver; with
     p = 1 the energy is the paper's, and for p > 2.5 it grows without bound as a cell goes flat.
+
+    On a graded mesh v^(5/3) would leave the shape to the largest cells: one of twice the edge weighs 32 times as much.
+    Section 4 of the paper asks for a weight by the local mesh size there. With E_G,j over h^5, h^3 proportional to the
+    cell's own volume, all sizes cancel, and what is left is eta^p: the same for every cell of that shape, so that the
+    shape term has no wish for any size and E_D alone says where cells are small.
 
     Corners come from `load`, which subtracts in integers: rounding of the signed volume is far below `FLAT`, so a cell
     that passes is positively oriented exactly.
@@ -198,23 +213,29 @@ def shape_energy(x: NDArray, n_corners: int, power: float) -> float:
         S = u1 * u1 + u2 * u2 + v1 * v1 + v2 * v2 + (u1 - v1) * (u1 - v1) + (u2 - v2) * (u2 - v2)
         if volume <= FLAT * S:
             return np.inf
+        eta = S / (6.928203230275509 * volume)
+        if is_graded:
+            return eta**power
         E_G = volume * S / 12.0
-        return E_G if power == 1.0 else E_G * (S / (6.928203230275509 * volume)) ** (power - 1.0)
+        return E_G if power == 1.0 else E_G * eta ** (power - 1.0)
     u0, v0 = x[1, 0] - x[0, 0], x[2, 0] - x[0, 0]
     w0, w1, w2 = x[3, 0] - x[0, 0], x[3, 1] - x[0, 1], x[3, 2] - x[0, 2]
     determinant = u0 * (v1 * w2 - v2 * w1) + u1 * (v2 * w0 - v0 * w2) + u2 * (v0 * w1 - v1 * w0)
     # The sum over all pairs of four points is four times the sum over the points less that of their sum, squared.
     s0, s1, s2 = u0 + v0 + w0, u1 + v1 + w1, u2 + v2 + w2
     S = 4.0 * (u0 * u0 + u1 * u1 + u2 * u2 + v0 * v0 + v1 * v1 + v2 * v2 + w0 * w0 + w1 * w1 + w2 * w2)
-    return tet_energy(determinant, S - (s0 * s0 + s1 * s1 + s2 * s2), power)
+    return tet_energy(determinant, S - (s0 * s0 + s1 * s1 + s2 * s2), power, is_graded)
 
 
 @njit(cache=True, error_model="numpy")
-def tet_energy(determinant: float, S: float, power: float) -> float:
+def tet_energy(determinant: float, S: float, power: float, is_graded: bool) -> float:
     """`shape_energy` of a tetrahedron from six times its volume and the sum of its squared edges."""
     volume = determinant / 6.0
     if volume <= 0.0 or volume * volume <= FLAT * FLAT * S * S * S:
         return np.inf
+    if is_graded:
+        cube = S * S * S / (432.0 * determinant * determinant)  # eta^3
+        return cube if power == 3.0 else cube ** (power / 3.0)
     E_G = volume * S / 20.0
     if power == 1.0:
         return E_G
@@ -249,7 +270,7 @@ def load_cell(x: NDArray, ticks: NDArray, cells: NDArray, cell: int, measure: Me
 def shape_of_cell(x: NDArray, ticks: NDArray, cells: NDArray, cell: int, measure: Measure) -> float:
     """Shape energy of a cell of the complex; its corners are left in `x` (4, 3)."""
     load_cell(x, ticks, cells, cell, measure)
-    return shape_energy(x, cells.shape[1], measure.power)
+    return shape_energy(x, cells.shape[1], measure.power, measure.is_graded)
 
 
 @njit(cache=True, error_model="numpy")
@@ -259,7 +280,7 @@ def shape_of_tet(x: NDArray, ticks: NDArray, a: int, b: int, c: int, d: int, mea
     load(x, 1, ticks, b, a, measure)
     load(x, 2, ticks, c, a, measure)
     load(x, 3, ticks, d, a, measure)
-    return shape_energy(x, 4, measure.power)
+    return shape_energy(x, 4, measure.power, measure.is_graded)
 
 
 @njit(cache=True, error_model="numpy")
@@ -268,7 +289,18 @@ def shape_of_triangle(x: NDArray, ticks: NDArray, a: int, b: int, c: int, measur
     load(x, 0, ticks, a, a, measure)
     load(x, 1, ticks, b, a, measure)
     load(x, 2, ticks, c, a, measure)
-    return shape_energy(x, 3, measure.power)
+    return shape_energy(x, 3, measure.power, measure.is_graded)
+
+
+@njit(cache=True, error_model="numpy")
+def content(x: NDArray, n_corners: int) -> float:
+    """Signed volume of the cell with corners x (4, 3), times n!."""
+    u0, u1, u2 = x[1, 0] - x[0, 0], x[1, 1] - x[0, 1], x[1, 2] - x[0, 2]
+    v0, v1, v2 = x[2, 0] - x[0, 0], x[2, 1] - x[0, 1], x[2, 2] - x[0, 2]
+    if n_corners == 3:
+        return u1 * v2 - u2 * v1
+    w0, w1, w2 = x[3, 0] - x[0, 0], x[3, 1] - x[0, 1], x[3, 2] - x[0, 2]
+    return u0 * (v1 * w2 - v2 * w1) + u1 * (v2 * w0 - v0 * w2) + u2 * (v0 * w1 - v1 * w0)
 
 
 @njit(cache=True, error_model="numpy")
@@ -448,9 +480,9 @@ def _fill_twins(twin: NDArray, start: NDArray, ring: NDArray, corner: NDArray, c
 
 def measure_of(
     grid: SamplingGrid, hand: int, matrix: NDArray[np.float64], geometry: float, image: float, power: float,
-    min_dihedral: float = 0.0,
+    is_graded: bool = False,
 ) -> Measure:  # fmt: skip
-    """A `Measure` of plain numbers, as the kernels are compiled for."""
+    """A `Measure` of plain numbers, as the kernels are compiled for, without a floor."""
     return Measure(
         grid.prefix,
         int(grid.bits),
@@ -459,7 +491,8 @@ def measure_of(
         float(geometry),
         float(image),
         float(power),
-        *floor_of(min_dihedral),
+        bool(is_graded),
+        *floor_of(0.0),
     )
 
 

@@ -184,7 +184,7 @@ def _worth_of_face(work: Cavity, held: Complex, cell: int, k: int, measure: Meas
     limit = old * (1.0 - LEAST_GAIN)
     new = 0.0
     for volume, a, b in ((V_uv, 1, 2), (V_vw, 2, 3), (V_wu, 3, 1)):
-        new += measure.geometry * tet_energy(volume, _edge_squares(y, 0, a, b), measure.power)
+        new += measure.geometry * tet_energy(volume, _edge_squares(y, 0, a, b), measure.power, measure.is_graded)
         if not new < limit:
             return -np.inf
     if measure.floor > -1.0:
@@ -421,11 +421,11 @@ def _pair_shape(y: NDArray, i: int, k: int, j: int, limit: float, measure: Measu
     base = u0 * u0 + u1 * u1 + u2 * u2 + v0 * v0 + v1 * v1 + v2 * v2
     s0, s1, s2 = u0 + v0, u1 + v1, u2 + v2
     S = 4.0 * (base + b0 * b0 + b1 * b1 + b2 * b2) - ((s0 + b0) ** 2 + (s1 + b1) ** 2 + (s2 + b2) ** 2)
-    energy = measure.geometry * tet_energy(above, S, measure.power)
+    energy = measure.geometry * tet_energy(above, S, measure.power, measure.is_graded)
     if not energy < limit:
         return np.inf
     S = 4.0 * (base + a0 * a0 + a1 * a1 + a2 * a2) - ((s0 + a0) ** 2 + (s1 + a1) ** 2 + (s2 + a2) ** 2)
-    energy += measure.geometry * tet_energy(below, S, measure.power)
+    energy += measure.geometry * tet_energy(below, S, measure.power, measure.is_graded)
     if not energy < limit:
         return np.inf
     return energy

@@ -28,6 +28,7 @@ from tetopt.optimize.complex import (
     NodeRings,
     cell_energy,
     flux_of,
+    has_node,
     image_energy,
     load_cell,
     outward,
@@ -79,15 +80,19 @@ def sweep(
     `is_over` cut it short, between two colours.
     """
     inverse = np.linalg.inv(measure.matrix)
-    start, cells = _block_rings(groups.nodes, groups.start, rings.start, rings.cells)
-    colours = greedy_colours(groups.of_node[held.cells[: held.n_cells[0]]], start, cells)
-    for colour in range(int(colours.max()) + 1):
+    for chosen in colours_of(held, rings, groups):
         if is_over():
             return False
-        chosen = np.flatnonzero(colours == colour)
         with few_threads(len(chosen) * BLOCK * 100):
             _sweep(held, rings, groups, chosen, is_wanted, is_frozen, measure, projections, inverse)
     return True
+
+
+def colours_of(held: Complex, rings: NodeRings, groups: Blocks) -> list[NDArray[np.int64]]:
+    """The groups of each colour: none shares a cell with another of its colour."""
+    start, cells = _block_rings(groups.nodes, groups.start, rings.start, rings.cells)
+    colours = greedy_colours(groups.of_node[held.cells[: held.n_cells[0]]], start, cells)
+    return [np.flatnonzero(colours == colour) for colour in range(int(colours.max()) + 1)]
 
 
 @njit(cache=True)
@@ -228,8 +233,9 @@ def _add_shape_gradient(g: NDArray, x: NDArray, held: Complex, rings: NodeRings,
             v0, v1, v2 = 0.0, (x[b, 2] - x[a, 2]) / 2.0, (x[a, 1] - x[b, 1]) / 2.0
         side = v0 * (x[at, 0] - x[a, 0]) + v1 * (x[at, 1] - x[a, 1]) + v2 * (x[at, 2] - x[a, 2])
         sign = 1.0 if side > 0.0 else -1.0
-        # W is proportional to v^alpha S^p with alpha = 1 - 2 (p - 1) / n.
-        of_volume = sign * (1.0 - 2.0 * (power - 1.0) / dim) / volume
+        # W is proportional to v^alpha S^p with alpha = 1 - 2 (p - 1) / n, on a graded mesh alpha = -2 p / n.
+        alpha = -2.0 * power / dim if measure.is_graded else 1.0 - 2.0 * (power - 1.0) / dim
+        of_volume = sign * alpha / volume
         of_edges = power / S
         squared = 0.0
         for d in range(3):
@@ -258,16 +264,20 @@ def _gradients(
 @njit(cache=True, error_model="numpy")
 def ring_energy(
     limit: float, least: float, trial: NDArray, fluxes: NDArray, x: NDArray, node: int, held: Complex,
-    rings: NodeRings, measure: Measure,
+    rings: NodeRings, measure: Measure, joined: int = -1,
 ) -> float:  # fmt: skip
     """Energy of a node's ring as the ticks stand; shapes and facet fluxes go to `trial` (R,), `fluxes` (R, n+1, 3).
 
-    Infinite if a cell is flat or inverted or has a quality under `least`, or once the energy is above `limit`.
+    Infinite if a cell is flat or inverted or has a quality under `least`, or once the energy is above `limit`. Cells
+    that have the node `joined`, at whose place the node is, count as gone; their shape is -1.
     """
     n = held.cells.shape[1]
     first, last = rings.start[node], rings.start[node + 1]
     energy = 0.0
     for r in range(first, last):  # cheap refusals before any voxel is read
+        if joined >= 0 and has_node(held.cells, rings.cells[r], joined):
+            trial[r - first] = -1.0
+            continue
         trial[r - first] = shape_of_cell(x, held.ticks, held.cells, rings.cells[r], measure)
         if n == 4 and least > -1.0 and (trial[r - first] == np.inf or quality_up_to(x, measure) < least):
             return np.inf
@@ -277,6 +287,8 @@ def ring_energy(
     if measure.image == 0.0:
         return energy
     for r in range(first, last):
+        if trial[r - first] < 0.0:
+            continue
         cell = rings.cells[r]
         s0, s1, s2 = 0.0, 0.0, 0.0
         for k in range(n):
@@ -284,7 +296,7 @@ def ring_energy(
                 f0, f1, f2 = held.fluxes[cell, k, 0], held.fluxes[cell, k, 1], held.fluxes[cell, k, 2]
             else:
                 twin = rings.twin[r, k]
-                if 0 <= twin and twin // n < r - first:
+                if 0 <= twin and twin // n < r - first and trial[twin // n] >= 0.0:
                     f0, f1, f2 = fluxes[r - first, k, 0], fluxes[r - first, k, 1], fluxes[r - first, k, 2]
                 else:
                     a, b, c = outward(held.cells, cell, k)

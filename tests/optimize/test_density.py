@@ -1,0 +1,194 @@
+"""Splits and collapses: each leaves a mesh, measured as if afresh, and changes E by what was said."""
+
+import numpy as np
+import pytest
+from hypothesis import assume, given, settings
+from hypothesis import strategies as st
+from test_fast import OBLIQUE, dimensions, random_case, seeds
+
+import tetopt
+from tetopt.optimize.complex import energies, floor_of, node_rings
+from tetopt.optimize.density import (
+    Sides,
+    best_collapses,
+    best_splits,
+    collapse_edge,
+    exchange,
+    make_exchanges,
+    roomy,
+)
+from tetopt.optimize.flips import close_gaps
+from tetopt.optimize.smooth import blocks
+
+
+def sides_of(held, is_fixed=False):
+    return Sides(held.complex.ticks.min(axis=0), held.complex.ticks.max(axis=0), is_fixed)
+
+
+def exchanged(held, n_nodes, most, is_fixed=False):
+    done = exchange(held.complex, held.is_frozen, held.measure, sides_of(held, is_fixed), n_nodes, most)
+    held.complex, held.is_frozen = done.held, done.is_frozen
+    return done
+
+
+@settings(max_examples=40, deadline=None)
+@given(seeds, dimensions, st.booleans(), st.booleans(), st.integers(-6, 12))
+def test_exchanges_leave_a_mesh(seed, n, turned, is_graded, more):
+    held = random_case(seed, n, OBLIQUE if turned and n == 3 else None, 3.0)
+    held.measure = held.measure._replace(is_graded=is_graded)
+    from tetopt.optimize.complex import measure_all
+
+    measure_all(held.complex, held.measure)
+    assume(np.isfinite(held.E))
+    for _ in range(3):
+        before, E = len(held.complex.ticks), held.E
+        done = exchanged(held, before + more, 5)
+        held.assert_sound()
+        assert len(held.complex.ticks) - before == done.n_split - done.n_collapsed
+        assert min(done.n_split, done.n_collapsed) <= 5
+        kept = done.source[done.source >= 0]
+        assert len(kept) == before - done.n_collapsed
+        assert (np.diff(kept) > 0).all()
+        if more == 0:
+            assert held.E <= E * (1 + 1e-12)
+        held.sweep()
+        held.flip()
+        held.assert_sound()
+
+
+@pytest.mark.parametrize("n", [2, 3])
+@pytest.mark.parametrize("is_fixed", [False, True])
+def test_worth_is_what_E_falls_by(n, is_fixed):
+    """Every node's best split, and every node's best collapse, made alone."""
+    count = 0
+    for node in range(40):
+        for kind in ("split", "collapse"):
+            held = random_case(7, n)
+            held.sweep()
+            N = len(held.complex.ticks)
+            if is_fixed:
+                held.is_frozen[held.is_frozen.any(axis=1)] = True
+            if node >= N:
+                continue
+            rings, groups, sides = node_rings(held.complex), blocks(held.complex.ticks), sides_of(held, is_fixed)
+            room = roomy(held.complex, N, 200)
+            is_frozen = np.concatenate([held.is_frozen, np.zeros_like(held.is_frozen)])
+            E = held.E
+            is_dirty = np.zeros(len(room.cells), dtype=np.bool_)
+            nobody = np.empty(0, dtype=np.int64)
+            if kind == "split":
+                gain, split = best_splits(room, rings, is_frozen, held.measure, sides, N)
+                if split[node] < 0:
+                    continue
+                done = make_exchanges(
+                    room,
+                    rings,
+                    is_frozen,
+                    held.measure,
+                    sides,
+                    np.array([node]),
+                    split,
+                    gain,
+                    nobody,
+                    nobody,
+                    gain,
+                    1,
+                    1,
+                    0.0,
+                    is_dirty,
+                )
+                assert done == (1, 0)
+                expected = gain[node]
+                was_on = held.is_frozen[[node, split[node]]]
+                assert (is_frozen[N] <= was_on.all(axis=0)).all()
+                if is_fixed and is_frozen[N].any():
+                    assert is_frozen[N].all()
+                held.complex = room._replace(ticks=room.ticks[: N + 1])
+            else:
+                cost, collapse = best_collapses(room, rings, groups, is_frozen, held.measure, np.inf)
+                if collapse[node] < 0:
+                    continue
+                collapse_edge(room, rings, node, collapse[node], is_dirty, held.measure)
+                close_gaps(room, is_dirty)
+                expected = -cost[node]
+                held.complex = room
+                assert not (held.complex.cells[: held.complex.n_cells[0]] == node).any()
+                held.complex.ticks[node] = held.complex.ticks[N - 1]  # out of the mesh: numbered away
+                cells = held.complex.cells
+                cells[cells == N - 1] = node
+                held.complex = held.complex._replace(ticks=held.complex.ticks[: N - 1])
+            count += 1
+            assert E - held.E == pytest.approx(expected, rel=1e-6, abs=1e-9)
+            held.assert_sound()
+    assert count > 20
+
+
+def test_collapses_are_the_best_of_all_neighbours():
+    """Against meshes in which each node is joined to each neighbour, measured from nothing."""
+    held = random_case(11, 3)
+    held.sweep()
+    N, cells = len(held.complex.ticks), held.mesh.cells
+    rings, groups = node_rings(held.complex), blocks(held.complex.ticks)
+    cost, collapse = best_collapses(held.complex, rings, groups, held.is_frozen, held.measure, np.inf)
+    size = np.linalg.det(held.mesh.points[cells[:, 1:]] - held.mesh.points[cells[:, :1]]).sum()
+    joined = 0
+    for a in range(N):
+        best = np.inf
+        for b in np.unique(cells[(cells == a).any(axis=1)]):
+            if b == a:
+                continue
+            new = np.where(cells == a, b, cells)[~((cells == a).any(axis=1) & (cells == b).any(axis=1))]
+            volume = np.linalg.det(held.mesh.points[new[:, 1:]] - held.mesh.points[new[:, :1]])
+            if (volume <= 1e-6).any() or abs(volume.sum() / size - 1) > 1e-9:
+                continue
+            if (held.is_frozen[a] & ~(held.is_frozen[b] & (held.complex.ticks[a] == held.complex.ticks[b]))).any():
+                continue
+            other = random_case(11, 3)
+            from tetopt.optimize.complex import build
+
+            fresh = build(new, held.complex.ticks, held.measure)
+            E_G, squares = energies(fresh)
+            del other
+            best = min(best, held.measure.geometry * E_G + held.measure.image * squares - held.E)
+        if best < np.inf:
+            joined += 1
+            assert cost[a] == pytest.approx(best, rel=1e-6, abs=1e-9)
+        else:
+            assert collapse[a] == -1
+    assert joined > 5
+
+
+def test_nodes_go_where_the_image_is():
+    """A ball in a large box, exchanged at the same number of nodes: more of them near its surface, and less E_D."""
+    index = np.stack(np.meshgrid(*[np.arange(32)] * 3, indexing="ij"), -1)
+    image = tetopt.Image(100.0 * (((index - 20) ** 2).sum(-1) < 49))
+    from test_fast import Held
+
+    held = Held(image, tetopt.lattice(image, blocks=(5, 5, 5)), 0.5)
+    floor, safe = floor_of(10.0)
+    held.measure = held.measure._replace(is_graded=True, floor=floor, safe=safe)
+    from tetopt.optimize.complex import build
+
+    unit = held.measure._replace(geometry=1.0, image=1.0)
+    held.complex = build(held.mesh.cells, held.complex.ticks, unit)
+    E_G, squares = energies(held.complex)
+    held.measure = held.measure._replace(geometry=0.5 / E_G, image=0.5 / squares)
+    N, E_D = len(held.complex.ticks), squares
+
+    def near():
+        distance = np.sqrt(((held.image.to_index(held.mesh.points) - 20) ** 2).sum(axis=1))
+        return int((np.abs(distance - 7) < 2.5).sum())
+
+    before = near()
+    for _ in range(6):
+        held.sweep()
+        held.flip()
+        E = held.E
+        exchanged(held, N, N // 10)
+        assert held.E <= E * (1 + 1e-12)
+    held.sweep()
+    held.assert_sound()
+    assert abs(len(held.complex.ticks) - N) <= 1
+    assert near() > 1.5 * before
+    assert energies(held.complex)[1] < 0.3 * E_D
+    assert tetopt.quality(held.mesh.points, held.mesh.cells).min_dihedral >= 10.0

@@ -1,0 +1,504 @@
+"""Nodes put in and taken out where that lowers E: edges split at their middle, edges collapsed into one of their ends.
+
+What a split or a collapse is worth is measured with the same energy as every other move. Splits always lower E_D and
+collapses raise it, so it takes a number of nodes to weigh one against the other: nodes are exchanged, the cheapest
+collapses for the splits that are worth more, at most as many as nodes are wanted. On a graded mesh (see
+`tetopt.optimize.complex.shape_energy`) a node's cells cost the same shape energy wherever it is, so that what is
+exchanged is error of the image.
+
+Each node looks at the edges to its neighbours and keeps its best split and its best collapse, all nodes at once; moves
+are then made one after the other, the most worth first, each only if no cell around it has changed since. A move works
+on a node's ring, so one code serves triangles and tetrahedra.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit, prange
+from numpy.typing import NDArray
+
+from tetopt.energy.sampling import few_threads
+from tetopt.optimize.complex import (
+    Complex,
+    Measure,
+    NodeRings,
+    cell_energy,
+    content,
+    corner_of,
+    energies,
+    facet_of,
+    flux_of,
+    grown,
+    has_node,
+    image_energy,
+    load,
+    load_cell,
+    node_rings,
+    outward,
+    quality_up_to,
+    shape_energy,
+    shape_of_cell,
+    sum_up,
+)
+from tetopt.optimize.flips import close_gaps
+from tetopt.optimize.smooth import Blocks, blocks, colours_of, ring_energy
+
+LEAST_GAIN = 1e-3  # of a node's mean share of E: an exchange of two nodes that is worth less is not made
+NEIGHBOURS = 128  # edges of a node that are looked at, at most
+
+
+class Exchanged(NamedTuple):
+    """What `exchange` returns."""
+
+    held: Complex
+    is_frozen: NDArray[np.bool_]  # (N', 3)
+    source: NDArray[np.int64]  # (N',) number of each node before; -1 for new ones
+    is_touched: NDArray[np.bool_]  # (N',) nodes with a cell that has changed
+    n_split: int
+    n_collapsed: int
+
+
+class Sides(NamedTuple):
+    """Where nodes may be put on the boundary."""
+
+    low: NDArray[np.int64]  # (3,) ticks of the box's sides
+    high: NDArray[np.int64]
+    is_fixed: bool  # whether boundary nodes stay where they are
+
+
+def exchange(
+    held: Complex, is_frozen: NDArray[np.bool_], measure: Measure, sides: Sides, n_nodes: int, most: int
+) -> Exchanged:
+    """One round of splits and collapses towards `n_nodes` nodes, and of exchanges of a node for another.
+
+    Beyond those that the number asks for, up to `most` nodes are exchanged, as far as each lowers E. `held` and
+    `is_frozen` (N, 3) are out of date afterwards.
+    """
+    n_before, more = len(held.ticks), n_nodes - len(held.ticks)
+    rings, groups = node_rings(held), blocks(held.ticks)
+    held = roomy(held, n_before, 16 * (max(more, 0) + most))
+    is_frozen = np.concatenate([is_frozen, np.zeros_like(is_frozen)])
+    gain, split = best_splits(held, rings, is_frozen, measure, sides, n_before)
+    dearest = np.inf if more < 0 else float(gain.max(initial=0.0))
+    cost, collapse = best_collapses(held, rings, groups, is_frozen, measure, dearest)
+    in_, out = np.lexsort((np.arange(n_before), -gain)), np.lexsort((np.arange(n_before), cost))
+    in_, out = in_[gain[in_] > -np.inf], out[cost[out] < np.inf]
+    E_G, squares = energies(held)
+    least = LEAST_GAIN * (measure.geometry * E_G + measure.image * squares) / n_before
+    is_dirty = np.zeros(len(held.cells), dtype=np.bool_)
+    n_split, n_collapsed = make_exchanges(
+        held, rings, is_frozen, measure, sides, in_, split, gain, out, collapse, cost, more, most, least, is_dirty
+    )
+    return _compacted(held, is_frozen, is_dirty, n_before, n_split, n_collapsed)
+
+
+def roomy(held: Complex, n_nodes: int, n_cells: int) -> Complex:
+    """The complex with room for that many more nodes and cells; further rows of `ticks` are not nodes yet."""
+    while len(held.cells) - held.n_cells[0] < n_cells:
+        held = grown(held)
+    more = np.zeros((n_nodes, 3), dtype=held.ticks.dtype)
+    return held._replace(ticks=np.concatenate([held.ticks, more]))
+
+
+def _compacted(
+    held: Complex, is_frozen: NDArray[np.bool_], is_dirty: NDArray[np.bool_], n_before: int, n_split: int,
+    n_collapsed: int,
+) -> Exchanged:  # fmt: skip
+    """Nodes without cells left out, and the others numbered anew in their order."""
+    n_cells = int(held.n_cells[0])
+    cells = held.cells[:n_cells]
+    is_used = np.zeros(n_before + n_split, dtype=bool)
+    is_used[cells] = True
+    number = np.cumsum(is_used) - 1
+    held.cells[:n_cells] = number[cells]
+    kept = np.flatnonzero(is_used)
+    is_touched = np.zeros(len(kept), dtype=bool)
+    is_touched[held.cells[:n_cells][is_dirty[:n_cells]]] = True
+    return Exchanged(
+        held._replace(ticks=held.ticks[kept]), is_frozen[kept], np.where(kept < n_before, kept, -1), is_touched,
+        n_split, n_collapsed,
+    )  # fmt: skip
+
+
+@njit(cache=True, error_model="numpy")
+def make_exchanges(
+    held: Complex, rings: NodeRings, is_frozen: NDArray, measure: Measure, sides: Sides, in_: NDArray, split: NDArray,
+    gain: NDArray, out: NDArray, collapse: NDArray, cost: NDArray, more: int, most: int, least: float,
+    is_dirty: NDArray,
+) -> tuple:  # fmt: skip
+    """Split edges of the nodes `in_`, or collapse the nodes `out`, until there are `more` nodes; then do both in pairs.
+
+    In their order, and each only if none of its cells has changed; at most `most` pairs, each of which lowers E by more
+    than `least`. Returns how many were split and collapsed.
+    """
+    n_nodes = len(rings.start) - 1
+    n_split, n_collapsed, s, c = 0, 0, 0, 0
+    while True:
+        is_pair = n_split - n_collapsed == more
+        if is_pair and min(n_split, n_collapsed) >= most:
+            break
+        does_split, does_collapse = is_pair or n_split - n_collapsed < more, is_pair or n_split - n_collapsed > more
+        if does_split:
+            while s < len(in_) and not _can_split(held, rings, in_[s], split[in_[s]], is_dirty):
+                s += 1
+            if s == len(in_):
+                break
+            _mark_edge(held, rings, in_[s], split[in_[s]], is_dirty, True)  # its partner is to be somewhere else
+        if does_collapse:
+            while c < len(out) and not _is_clean(rings, out[c], is_dirty):
+                c += 1
+        if does_collapse and (c == len(out) or (is_pair and gain[in_[s]] - cost[out[c]] <= least)):
+            if does_split:
+                _mark_edge(held, rings, in_[s], split[in_[s]], is_dirty, False)
+            break
+        if does_split:
+            a, b, p = in_[s], split[in_[s]], n_nodes + n_split
+            _put_middle(held, is_frozen, sides, a, b, p, _is_boundary_edge(held, rings, a, b))
+            split_edge(held, rings, a, b, p, is_dirty, measure)
+            n_split += 1
+        if does_collapse:
+            collapse_edge(held, rings, out[c], collapse[out[c]], is_dirty, measure)
+            n_collapsed += 1
+    close_gaps(held, is_dirty)
+    return n_split, n_collapsed
+
+
+@njit(cache=True, error_model="numpy")
+def _mark_edge(held: Complex, rings: NodeRings, a: int, b: int, is_dirty: NDArray, value: bool) -> None:
+    for r in range(rings.start[a], rings.start[a + 1]):
+        if has_node(held.cells, rings.cells[r], b):
+            is_dirty[rings.cells[r]] = value
+
+
+@njit(cache=True, error_model="numpy")
+def _is_clean(rings: NodeRings, node: int, is_dirty: NDArray) -> bool:
+    return not is_dirty[rings.cells[rings.start[node] : rings.start[node + 1]]].any()
+
+
+@njit(cache=True, error_model="numpy")
+def _can_split(held: Complex, rings: NodeRings, a: int, b: int, is_dirty: NDArray) -> bool:
+    """Whether the cells around a are as they were, and there is room for more."""
+    size = rings.start[a + 1] - rings.start[a]
+    return held.n_cells[0] + size <= len(held.cells) and _is_clean(rings, a, is_dirty)
+
+
+@njit(cache=True, error_model="numpy")
+def _is_boundary_edge(held: Complex, rings: NodeRings, a: int, b: int) -> bool:
+    for r in range(rings.start[a], rings.start[a + 1]):
+        cell = rings.cells[r]
+        if has_node(held.cells, cell, b):
+            for k in range(held.cells.shape[1]):
+                if held.across[cell, k] < 0 and held.cells[cell, k] not in (a, b):
+                    return True
+    return False
+
+
+@njit(cache=True, error_model="numpy")
+def _put_middle(held: Complex, is_frozen: NDArray, sides: Sides, a: int, b: int, p: int, is_boundary: bool) -> bool:
+    """Put the node p at the middle of an edge; False if that is on the boundary but in none of the box's sides."""
+    t, is_on_side = held.ticks, False
+    for d in range(3):
+        t[p, d] = (t[a, d] + t[b, d]) >> 1
+        is_same = t[a, d] == t[b, d] and (t[a, d] == sides.low[d] or t[a, d] == sides.high[d])
+        is_on_side = is_on_side or (is_same and is_frozen[a, d] and is_frozen[b, d])
+        is_frozen[p, d] = is_boundary and (sides.is_fixed or (is_same and is_frozen[a, d] and is_frozen[b, d]))
+    return is_on_side or not is_boundary
+
+
+# Splits.
+
+
+def best_splits(
+    held: Complex, rings: NodeRings, is_frozen: NDArray[np.bool_], measure: Measure, sides: Sides, n_nodes: int
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """How much E falls if the best edge from each node to a higher one is split, (N,), and where that leads, (N,).
+
+    -inf and -1 where none can be split above the floor. Rows N to 2 N of `held.ticks` and `is_frozen` are written to.
+    """
+    gain, split = np.full(n_nodes, -np.inf), np.full(n_nodes, -1, dtype=np.int64)
+    with few_threads(n_nodes * 20):
+        _fill_splits(gain, split, held, rings, is_frozen, measure, sides)
+    return gain, split
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def _fill_splits(
+    gain: NDArray, split: NDArray, held: Complex, rings: NodeRings, is_frozen: NDArray, measure: Measure, sides: Sides
+) -> None:
+    for node in prange(len(gain)):
+        _best_split(np.int64(node), gain, split, held, rings, is_frozen, measure, sides, len(gain))
+
+
+@njit(cache=True, error_model="numpy")
+def _best_split(
+    a: int, gain: NDArray, split: NDArray, held: Complex, rings: NodeRings, is_frozen: NDArray, measure: Measure,
+    sides: Sides, n_nodes: int,
+) -> None:  # fmt: skip
+    x, near = np.empty((4, 3)), np.empty(NEIGHBOURS, dtype=np.int64)
+    for number in range(_neighbours(near, held, rings, a)):
+        b, p = near[number], n_nodes + a
+        if b > a and _put_middle(held, is_frozen, sides, a, b, p, _is_boundary_edge(held, rings, a, b)):
+            worth = worth_of_split(x, held, rings, a, b, p, measure, gain[a])
+            if worth > gain[a]:
+                gain[a], split[a] = worth, b
+
+
+@njit(cache=True, error_model="numpy")
+def _neighbours(near: NDArray, held: Complex, rings: NodeRings, node: int) -> int:
+    """The nodes that share a cell with `node`, to `near`, as many as it takes; how many."""
+    count = 0
+    for r in range(rings.start[node], rings.start[node + 1]):
+        for k in range(held.cells.shape[1]):
+            other = held.cells[rings.cells[r], k]
+            is_new = other != node
+            for m in range(count):
+                is_new = is_new and near[m] != other
+            if is_new and count < len(near):
+                near[count] = other
+                count += 1
+    return count
+
+
+@njit(cache=True, error_model="numpy")
+def worth_of_split(
+    x: NDArray, held: Complex, rings: NodeRings, a: int, b: int, p: int, measure: Measure, least_gain: float
+) -> float:
+    """How much E falls if the edge (a, b) is split at p; -inf if it cannot be, or by less than `least_gain`."""
+    n = held.cells.shape[1]
+    old, shape = 0.0, 0.0
+    for r in range(rings.start[a], rings.start[a + 1]):
+        cell = rings.cells[r]
+        if not has_node(held.cells, cell, b):
+            continue
+        old += cell_energy(held, cell, measure)
+        least = measure.floor if n == 4 else -1.0
+        if least > -1.0:
+            shape_of_cell(x, held.ticks, held.cells, cell, measure)
+            least = min(least, quality_up_to(x, measure))
+        for node in (a, b):
+            shape += measure.geometry * _shape_with(x, held, cell, node, p, measure)
+            if not shape < np.inf:
+                return -np.inf
+            if least > -1.0 and quality_up_to(x, measure) < least:
+                return -np.inf
+    if old - shape <= least_gain:
+        return -np.inf
+    if measure.image == 0.0:
+        return old - shape
+    new = shape
+    for r in range(rings.start[a], rings.start[a + 1]):
+        cell = rings.cells[r]
+        if has_node(held.cells, cell, b):
+            i, j = corner_of(held.cells, cell, a), corner_of(held.cells, cell, b)
+            f = _flux_with(held, cell, i, b, p, measure)
+            with_a = (held.fluxes[cell, j, 0] + f[0], held.fluxes[cell, j, 1] + f[1], held.fluxes[cell, j, 2] + f[2])
+            with_b = (held.fluxes[cell, i, 0] - f[0], held.fluxes[cell, i, 1] - f[1], held.fluxes[cell, i, 2] - f[2])
+            for k in range(n):
+                if k not in (i, j):
+                    f = _flux_with(held, cell, k, b, p, measure)
+                    with_a = (with_a[0] + f[0], with_a[1] + f[1], with_a[2] + f[2])
+                    f = _flux_with(held, cell, k, a, p, measure)
+                    with_b = (with_b[0] + f[0], with_b[1] + f[1], with_b[2] + f[2])
+            new += measure.image * (
+                image_energy(with_a[0], with_a[1], with_a[2]) + image_energy(with_b[0], with_b[1], with_b[2])
+            )
+            if old - new <= least_gain:
+                return -np.inf
+    return old - new
+
+
+@njit(cache=True, error_model="numpy")
+def _shape_with(x: NDArray, held: Complex, cell: int, node: int, p: int, measure: Measure) -> float:
+    """Shape energy of a cell with p in the place of its corner `node`; the corners are left in x."""
+    k = corner_of(held.cells, cell, node)
+    held_node = held.cells[cell, 0] if k > 0 else p
+    for m in range(held.cells.shape[1]):
+        load(x, m, held.ticks, p if m == k else held.cells[cell, m], held_node, measure)
+    return shape_energy(x, held.cells.shape[1], measure.power, measure.is_graded)
+
+
+@njit(cache=True, error_model="numpy")
+def _flux_with(held: Complex, cell: int, k: int, node: int, p: int, measure: Measure) -> tuple:
+    """Flux of facet k of a cell with p in the place of `node`, outwards."""
+    a, b, c = outward(held.cells, cell, k)
+    return flux_of(held.ticks, p if a == node else a, p if b == node else b, p if c == node and c >= 0 else c, measure)
+
+
+@njit(cache=True, error_model="numpy")
+def split_edge(held: Complex, rings: NodeRings, a: int, b: int, p: int, is_dirty: NDArray, measure: Measure) -> None:
+    """Each cell of the edge (a, b) becomes two: it keeps a, with p for b; a new one has b, with p for a."""
+    n = held.cells.shape[1]
+    first, last = rings.start[a], rings.start[a + 1]
+    x, new = np.empty((4, 3)), np.full(last - first, -1, dtype=np.int64)
+    for r in range(first, last):
+        if has_node(held.cells, rings.cells[r], b):
+            new[r - first] = held.n_cells[0]
+            held.n_cells[0] += 1
+    for r in range(first, last):
+        cell, other = rings.cells[r], new[r - first]
+        if other < 0:
+            continue
+        i, j = corner_of(held.cells, cell, a), corner_of(held.cells, cell, b)
+        held.cells[other] = held.cells[cell]
+        held.across[other] = held.across[cell]
+        held.fluxes[other] = held.fluxes[cell]
+        held.cells[other, i] = p
+        beyond = held.across[cell, i]
+        if beyond >= 0:
+            held.across[beyond, facet_of(held.cells, held.across, beyond, cell)] = other
+        held.across[other, j] = cell
+        for k in range(n):
+            if k not in (i, j) and held.across[cell, k] >= 0:
+                for s in range(first, last):
+                    if rings.cells[s] == held.across[cell, k]:
+                        held.across[other, k] = new[s - first]
+    for r in range(first, last):  # only now: the old corners have told the new neighbours
+        cell, other = rings.cells[r], new[r - first]
+        if other < 0:
+            continue
+        i, j = corner_of(held.cells, cell, a), corner_of(held.cells, cell, b)
+        held.cells[cell, j] = p
+        held.across[cell, i] = other
+        for child, back in ((cell, i), (other, j)):
+            for k in range(n):
+                if measure.image > 0.0 and (k == back or k not in (i, j)):
+                    u, v, w = outward(held.cells, child, k)
+                    f = flux_of(held.ticks, u, v, w, measure)
+                    held.fluxes[child, k, 0], held.fluxes[child, k, 1], held.fluxes[child, k, 2] = f
+            held.E_shape[child] = shape_of_cell(x, held.ticks, held.cells, child, measure)
+            sum_up(held.sums, held.fluxes, child)
+            is_dirty[child] = True
+
+
+# Collapses.
+
+
+def best_collapses(
+    held: Complex, rings: NodeRings, groups: Blocks, is_frozen: NDArray[np.bool_], measure: Measure, dearest: float
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """How much E rises if each node is joined to its best neighbour, (N,), and which that is, (N,).
+
+    inf and -1 where there is none that leaves a mesh above the floor, or for `dearest` at most.
+    """
+    n_nodes = len(rings.start) - 1
+    cost, collapse = np.full(n_nodes, np.inf), np.full(n_nodes, -1, dtype=np.int64)
+    bare = measure._replace(image=0.0)
+    for chosen in colours_of(held, rings, groups):
+        with few_threads(len(chosen) * 10_000):
+            _fill_collapses(cost, collapse, held, rings, groups, chosen, is_frozen, measure, bare, dearest)
+    return cost, collapse
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def _fill_collapses(
+    cost: NDArray, collapse: NDArray, held: Complex, rings: NodeRings, groups: Blocks, chosen: NDArray,
+    is_frozen: NDArray, measure: Measure, bare: Measure, dearest: float,
+) -> None:  # fmt: skip
+    for number in prange(len(chosen)):
+        for at in range(groups.start[chosen[number]], groups.start[chosen[number] + 1]):
+            _best_collapse(groups.nodes[at], cost, collapse, held, rings, is_frozen, measure, bare, dearest)
+
+
+@njit(cache=True, error_model="numpy")
+def _best_collapse(
+    a: int, cost: NDArray, collapse: NDArray, held: Complex, rings: NodeRings, is_frozen: NDArray, measure: Measure,
+    bare: Measure, dearest: float,
+) -> None:  # fmt: skip
+    """The neighbour to which `a` is best joined. It is moved there and back: cells of other groups do not see it."""
+    if is_frozen[a].all():
+        return
+    n, t = held.cells.shape[1], held.ticks
+    first, last = rings.start[a], rings.start[a + 1]
+    x, near, shapes = np.empty((4, 3)), np.empty(NEIGHBOURS, dtype=np.int64), np.full(NEIGHBOURS, np.inf)
+    trial, fluxes = np.empty(last - first), np.empty((last - first, n, 3))
+    old, least, size = 0.0, measure.floor if n == 4 else -1.0, 0.0
+    for r in range(first, last):
+        old += cell_energy(held, rings.cells[r], measure)
+        load_cell(x, t, held.cells, rings.cells[r], measure)
+        size += content(x, n)
+        if least > -1.0:
+            least = min(least, quality_up_to(x, measure))
+    here0, here1, here2 = t[a, 0], t[a, 1], t[a, 2]
+    count = _neighbours(near, held, rings, a)
+    best = old + dearest
+    for number in range(count):  # shapes are cheap, and a lower bound
+        b = near[number]
+        if may_join(t, is_frozen, a, b):
+            t[a, 0], t[a, 1], t[a, 2] = t[b, 0], t[b, 1], t[b, 2]
+            shapes[number] = ring_energy(best, least, trial, fluxes, x, a, held, rings, bare, b)
+            if shapes[number] < np.inf and not _keeps_size(x, held, rings, a, b, size, measure):
+                shapes[number] = np.inf
+            t[a, 0], t[a, 1], t[a, 2] = here0, here1, here2
+    for _ in range(count):
+        number = np.argmin(shapes)
+        if not shapes[number] < best:
+            break
+        b, value = near[number], shapes[number]
+        shapes[number] = np.inf
+        if measure.image > 0.0:
+            t[a, 0], t[a, 1], t[a, 2] = t[b, 0], t[b, 1], t[b, 2]
+            value = ring_energy(best, least, trial, fluxes, x, a, held, rings, measure, b)
+            t[a, 0], t[a, 1], t[a, 2] = here0, here1, here2
+        if value < best:
+            best, cost[a], collapse[a] = value, value - old, b
+
+
+@njit(cache=True, error_model="numpy")
+def may_join(ticks: NDArray, is_frozen: NDArray, a: int, b: int) -> bool:
+    """Whether a may go where b is: it has to stay in the sides of the box that it is in."""
+    may = True
+    for d in range(3):
+        may = may and (not is_frozen[a, d] or (is_frozen[b, d] and ticks[a, d] == ticks[b, d]))
+    return may
+
+
+@njit(cache=True, error_model="numpy")
+def _keeps_size(x: NDArray, held: Complex, rings: NodeRings, a: int, b: int, size: float, measure: Measure) -> bool:
+    """Whether the cells around a, moved to b, fill what they filled: n! times their volume is `size`.
+
+    All cells positive, they fan out from b over the ring's hull; so this holds unless the domain itself is not convex
+    there.
+    """
+    total = 0.0
+    for r in range(rings.start[a], rings.start[a + 1]):
+        if not has_node(held.cells, rings.cells[r], b):
+            load_cell(x, held.ticks, held.cells, rings.cells[r], measure)
+            total += content(x, held.cells.shape[1])
+    return abs(total - size) <= 1e-9 * size
+
+
+@njit(cache=True, error_model="numpy")
+def collapse_edge(held: Complex, rings: NodeRings, a: int, b: int, is_dirty: NDArray, measure: Measure) -> None:
+    """Node a becomes b: cells with both go, and the others around a have b instead."""
+    n = held.cells.shape[1]
+    first, last = rings.start[a], rings.start[a + 1]
+    x = np.empty((4, 3))
+    for r in range(first, last):
+        cell = rings.cells[r]
+        is_dirty[cell] = True
+        if not has_node(held.cells, cell, b):
+            continue
+        # What lay beyond its facets opposite a and b are neighbours now.
+        i, j = corner_of(held.cells, cell, a), corner_of(held.cells, cell, b)
+        of_b, of_a = held.across[cell, i], held.across[cell, j]
+        if of_a >= 0:
+            k = facet_of(held.cells, held.across, of_a, cell)
+            held.across[of_a, k] = of_b
+        if of_b >= 0:
+            held.across[of_b, facet_of(held.cells, held.across, of_b, cell)] = of_a
+    for r in range(first, last):
+        cell = rings.cells[r]
+        if has_node(held.cells, cell, b):
+            held.cells[cell, 0] = -1
+            continue
+        i = corner_of(held.cells, cell, a)
+        held.cells[cell, i] = b
+        for k in range(n):
+            if measure.image > 0.0 and k != i:
+                u, v, w = outward(held.cells, cell, k)
+                f = flux_of(held.ticks, u, v, w, measure)
+                held.fluxes[cell, k, 0], held.fluxes[cell, k, 1], held.fluxes[cell, k, 2] = f
+        held.E_shape[cell] = shape_of_cell(x, held.ticks, held.cells, cell, measure)
+        sum_up(held.sums, held.fluxes, cell)
