@@ -14,6 +14,7 @@ from tetopt.energy.sampling import from_ticks, sampling_grid, to_ticks
 from tetopt.geometry.simplex import dihedral_angles, oriented
 from tetopt.geometry.topology import boundary_facets
 from tetopt.optimize.complex import build, energies, floor_of, measure_all, measure_of, node_rings, quality_up_to
+from tetopt.optimize.density import Sides
 from tetopt.optimize.descent import free_projections
 from tetopt.optimize.fast import _Run
 from tetopt.optimize.flips import flip
@@ -62,6 +63,7 @@ class Held:
         self.measure = measure_of(self.grid, hand, self.matrix, (1 - k_D) / E_G, k_D / squares if k_D else 0.0, power)
         self.is_frozen = frozen_axes(image, ticks, mesh.cells, self.grid, "slide")
         self.projections = free_projections(self.matrix)
+        self.sides = Sides(ticks.min(axis=0), ticks.max(axis=0), False)
 
     @property
     def E(self):
@@ -234,7 +236,8 @@ def test_thousands_of_moves_leave_a_mesh(seed, n, k_D, power, turned):
     held.assert_sound()
     if n == 3:
         before = worst_angles(held.complex, held.measure, 15.0)
-        done = repair(held.complex, held.is_frozen, held.measure, held.projections, 15.0)
+        done = repair(held.complex, held.is_frozen, held.measure, held.projections, held.sides, 15.0)
+        held.is_frozen = done.is_frozen
         held.complex = done.held
         assert done.n_below == worst_angles(held.complex, held.measure, 15.0) <= before
         if k_D == 0.0:

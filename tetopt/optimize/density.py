@@ -25,6 +25,7 @@ from tetopt.optimize.complex import (
     Measure,
     NodeRings,
     cell_energy,
+    cell_quality,
     content,
     corner_of,
     energies,
@@ -33,6 +34,7 @@ from tetopt.optimize.complex import (
     grown,
     has_node,
     image_energy,
+    least_cosine,
     load,
     load_cell,
     node_rings,
@@ -41,6 +43,7 @@ from tetopt.optimize.complex import (
     shape_energy,
     shape_of_cell,
     sum_up,
+    tet_quality,
 )
 from tetopt.optimize.flips import close_gaps
 from tetopt.optimize.smooth import Blocks, blocks, colours_of, ring_energy
@@ -205,6 +208,99 @@ def _put_middle(held: Complex, is_frozen: NDArray, sides: Sides, a: int, b: int,
         is_on_side = is_on_side or (is_same and is_frozen[a, d] and is_frozen[b, d])
         is_frozen[p, d] = is_boundary and (sides.is_fixed or (is_same and is_frozen[a, d] and is_frozen[b, d]))
     return is_on_side or not is_boundary
+
+
+def mend(
+    held: Complex, is_frozen: NDArray[np.bool_], measure: Measure, sides: Sides, bad: NDArray[np.int64], target: float
+) -> Exchanged:
+    """For each bad cell the collapse or split of one of its edges that leaves the best worst angle, if any is better.
+
+    Quality is minus the cosine of the smallest dihedral angle, counted up to `target`. Cells of `bad` come worst first.
+    """
+    n_before = len(held.ticks)
+    rings = node_rings(held)
+    held = roomy(held, len(bad), 16 * len(bad))
+    is_frozen = np.concatenate([is_frozen, np.zeros((len(bad), 3), dtype=bool)])
+    is_dirty = np.zeros(len(held.cells), dtype=np.bool_)
+    n_split, n_collapsed = _mend(held, rings, is_frozen, measure, sides, bad, target, is_dirty)
+    return _compacted(held, is_frozen, is_dirty, n_before, n_split, n_collapsed)
+
+
+@njit(cache=True, error_model="numpy")
+def _mend(
+    held: Complex, rings: NodeRings, is_frozen: NDArray, measure: Measure, sides: Sides, bad: NDArray, target: float,
+    is_dirty: NDArray,
+) -> tuple:  # fmt: skip
+    x = np.empty((4, 3))
+    n_split, n_collapsed, n_nodes = 0, 0, len(rings.start) - 1
+    for cell in bad:
+        best, best_a, best_b, is_split = 1e-4, -1, -1, False  # the least gain
+        for i in range(4):
+            a = held.cells[cell, i]
+            if is_dirty[cell] or not _is_clean(rings, a, is_dirty):
+                continue
+            for j in range(4):
+                b, p = held.cells[cell, j], n_nodes + n_split
+                if i == j:
+                    continue
+                gain = _lift_by_collapse(x, held, rings, is_frozen, a, b, measure, target)
+                if gain > best:
+                    best, best_a, best_b, is_split = gain, a, b, False
+                if i < j and _can_split(held, rings, a, b, is_dirty):
+                    is_inside = _put_middle(held, is_frozen, sides, a, b, p, _is_boundary_edge(held, rings, a, b))
+                    gain = _lift_by_split(x, held, rings, a, b, p, measure, target) if is_inside else -1.0
+                    if gain > best:
+                        best, best_a, best_b, is_split = gain, a, b, True
+        if best_a >= 0 and is_split:
+            p, is_boundary = n_nodes + n_split, _is_boundary_edge(held, rings, best_a, best_b)
+            _put_middle(held, is_frozen, sides, best_a, best_b, p, is_boundary)
+            split_edge(held, rings, best_a, best_b, p, is_dirty, measure)
+            n_split += 1
+        elif best_a >= 0:
+            collapse_edge(held, rings, best_a, best_b, is_dirty, measure)
+            n_collapsed += 1
+    close_gaps(held, is_dirty)
+    return n_split, n_collapsed
+
+
+@njit(cache=True, error_model="numpy")
+def _lift_by_collapse(
+    x: NDArray, held: Complex, rings: NodeRings, is_frozen: NDArray, a: int, b: int, measure: Measure, target: float
+) -> float:
+    """By how much the worst quality around a grows if a is joined to b."""
+    t = held.ticks
+    if is_frozen[a].all() or not may_join(t, is_frozen, a, b):
+        return -1.0
+    here0, here1, here2 = t[a, 0], t[a, 1], t[a, 2]
+    old, new, size = target, target, 0.0
+    for r in range(rings.start[a], rings.start[a + 1]):
+        old = min(old, cell_quality(x, held, rings.cells[r], measure))
+        size += content(x, 4)
+    t[a, 0], t[a, 1], t[a, 2] = t[b, 0], t[b, 1], t[b, 2]
+    for r in range(rings.start[a], rings.start[a + 1]):
+        if new > old and not has_node(held.cells, rings.cells[r], b):
+            c = held.cells[rings.cells[r]]
+            new = min(new, tet_quality(x, held, c[0], c[1], c[2], c[3], measure))
+    is_whole = new > old and _keeps_size(x, held, rings, a, b, size, measure)
+    t[a, 0], t[a, 1], t[a, 2] = here0, here1, here2
+    return new - old if is_whole else -1.0
+
+
+@njit(cache=True, error_model="numpy")
+def _lift_by_split(
+    x: NDArray, held: Complex, rings: NodeRings, a: int, b: int, p: int, measure: Measure, target: float
+) -> float:
+    """By how much the worst quality around the edge (a, b) grows if it is split at p."""
+    old, new = target, target
+    for r in range(rings.start[a], rings.start[a + 1]):
+        cell = rings.cells[r]
+        if has_node(held.cells, cell, b):
+            old = min(old, cell_quality(x, held, cell, measure))
+            for node in (a, b):
+                if not _shape_with(x, held, cell, node, p, measure) < np.inf:
+                    return -1.0
+                new = min(new, least_cosine(x))
+    return new - old
 
 
 # Splits.

@@ -40,6 +40,7 @@ from tetopt.optimize.complex import (
     measure_of,
     node_rings,
 )
+from tetopt.optimize.density import Sides
 from tetopt.optimize.descent import free_projections
 from tetopt.optimize.flips import flip, make_moves
 from tetopt.optimize.paper import (
@@ -109,8 +110,8 @@ def optimize(
     -------
     Optimized
         Mesh, history and why it ended. The mesh covers the same domain, every cell is positively oriented. E never
-        rises from one record to the next, unless cells of the initial mesh had to be lifted over the floor. The same
-        bits on any number of threads.
+        rises from one record to the next, unless cells of the initial mesh had to be lifted over the floor, for which
+        nodes may be put in or taken out. The same bits on any number of threads.
 
     Raises
     ------
@@ -138,11 +139,12 @@ def optimize(
         before = run.held.ticks.copy()
         is_finished = run.sweep(is_over)
         is_changed = run.flip() > 0 if is_finished else False
+        movement = relative_movement(before, run.held.ticks, image, run.grid, run.matrix)
         fall = 1.0 - run.E() / history[-1].E if history[-1].E > 0.0 else 0.0
         is_last = iteration == iterations or not is_finished or fall < tolerance
         if is_last and run.n_below(floor) > 0 and run.lift(floor) > 0:
             is_changed, fall = True, np.inf
-        record(iteration, relative_movement(before, run.held.ticks, image, run.grid, run.matrix), is_changed)
+        record(iteration, movement, is_changed)
         if not is_finished:
             ended = "stopped" if stop is not None and stop() else "max_seconds"
             break
@@ -186,6 +188,9 @@ class _Run:
                 f"{pairs[:3].tolist()}; mend the mesh"
             )
         self.is_frozen = frozen_axes(image, ticks, mesh.cells, self.grid, boundary)
+        low = np.array([-0.5] * 3) * 2.0**self.grid.bits
+        high = (np.array(self.grid.shape) - 0.5) * 2.0**self.grid.bits
+        self.sides = Sides(low.astype(np.int64), high.astype(np.int64), boundary == "fixed")
         self.is_still = self.is_frozen[:, 3 - self.n :].all(axis=1)
         self.matrix = np.eye(3)
         self.matrix[3 - self.n :, 3 - self.n :] = image.affine[:-1, :-1]
@@ -261,10 +266,18 @@ class _Run:
 
     def lift(self, degrees: float) -> int:
         """Lift the worst cells over `degrees`, or as far as they go; the number of moves. It may raise E."""
-        done = repair(self.held, self.is_frozen, self.measure, self.projections, degrees)
-        self.held = done.held
+        done = repair(self.held, self.is_frozen, self.measure, self.projections, self.sides, degrees)
+        self._renumber(done.held, done.is_frozen, done.source)
         self.tried[:] = FAR
         return done.n_moves
+
+    def _renumber(self, held: Complex, is_frozen: NDArray[np.bool_], source: NDArray[np.int64]) -> None:
+        """Take over a complex with other nodes: where each comes from, -1 for new ones."""
+        is_new = (source < 0)[:, None]
+        self.held, self.is_frozen = held, is_frozen
+        self.is_still = is_frozen[:, 3 - self.n :].all(axis=1)
+        self.seen, self.tried = (np.where(is_new, FAR, since[source]) for since in (self.seen, self.tried))
+        self.groups, self.edge = blocks(held.ticks), _edges(self.mesh())
 
     def record(self, iteration: int, movement: float, is_changed: bool, seconds: float) -> Record:
         if self.measure.image == 0.0:  # the moves have left the sums alone

@@ -1,8 +1,8 @@
 """The floor on the dihedral angles: the worst cells mended one by one, whatever it does to E.
 
-Moves are those of `tetopt.optimize.flips` and displacements of single nodes, but judged by the smallest dihedral angle
-of the cells they touch: a move is made only if that grows (Freitag and Ollivier-Gooch 1997), and of the moves of a cell
-the one that leaves the best worst angle, up to the floor.
+Moves are those of `tetopt.optimize.flips` and `tetopt.optimize.density` and displacements of single nodes, but judged
+by the smallest dihedral angle of the cells they touch: a move is made only if that grows (Freitag and Ollivier-Gooch
+1997), and of the moves of a cell the one that leaves the best worst angle, up to the floor.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ from tetopt.optimize.complex import (
     outward,
     tet_quality,
 )
+from tetopt.optimize.density import Sides, mend
 from tetopt.optimize.flips import (
     EDGES,
     MOST,
@@ -48,6 +49,8 @@ class Repaired(NamedTuple):
     """What `repair` returns."""
 
     held: Complex
+    is_frozen: NDArray[np.bool_]  # (N', 3)
+    source: NDArray[np.int64]  # (N',) number of each node before; -1 for new ones
     n_below: int  # cells still under the floor
     n_moves: int
 
@@ -67,15 +70,17 @@ def _fill_qualities(found: NDArray, held: Complex, measure: Measure) -> None:
 
 
 def repair(
-    held: Complex, is_frozen: NDArray[np.bool_], measure: Measure, projections: NDArray[np.float64], floor: float
-) -> Repaired:
+    held: Complex, is_frozen: NDArray[np.bool_], measure: Measure, projections: NDArray[np.float64], sides: Sides,
+    floor: float,
+) -> Repaired:  # fmt: skip
     """Lift every cell's smallest dihedral angle to `floor`, degrees, as far as moves can.
 
-    Rounds over the cells below, worst first: flips, then displacements of their nodes; until none is left, or a round
-    changes nothing.
+    Rounds over the cells below, worst first: flips, then displacements of their nodes, and where neither helps nodes
+    put in or taken out; until no cell is left, or a round changes nothing.
     """
     target = -np.cos(np.radians(floor))
     total = 0
+    source = np.arange(len(held.ticks))
     for _ in range(ROUNDS):
         bad = _worst_first(held, measure, target)
         if len(bad) == 0:
@@ -86,10 +91,15 @@ def repair(
         bad = _worst_first(held, measure, target)
         if len(bad):
             made += _displace(held, node_rings(held), bad, is_frozen, measure, projections, target)
+        bad = _worst_first(held, measure, target)
+        if made == 0 and len(bad):
+            done = mend(held, is_frozen, measure, sides, bad, target)
+            held, is_frozen, made = done.held, done.is_frozen, done.n_split + done.n_collapsed
+            source = np.where(done.source >= 0, source[done.source], -1)
         total += made
         if made == 0:
             break
-    return Repaired(held, len(_worst_first(held, measure, target)), total)
+    return Repaired(held, is_frozen, source, len(_worst_first(held, measure, target)), total)
 
 
 def worst_angles(held: Complex, measure: Measure, floor: float) -> int:
