@@ -75,7 +75,7 @@ def lattice(
         raise InputError("lattice: give exactly one of nodes, spacing and blocks")
     lengths = image.spacing * image.shape
     if nodes is not None:
-        blocks = _blocks_for_nodes(kind, lengths, nodes)
+        blocks = near_cubes(kind, lengths, nodes)
     elif spacing is not None:
         blocks = _blocks_for_spacing(lengths, spacing)
     blocks = _checked_blocks(kind, blocks, n)
@@ -109,7 +109,7 @@ def _blocks_for_spacing(lengths: NDArray[np.float64], spacing: float) -> tuple[i
     return tuple(max(1, round(min(length / spacing, MAX_NODES))) for length in lengths)
 
 
-def _blocks_for_nodes(kind: str, lengths: NDArray[np.float64], nodes: int) -> tuple[int, ...]:
+def near_cubes(kind: str, lengths: NDArray[np.float64], nodes: int) -> tuple[int, ...]:
     """Nearly cubic blocks whose node count is within 3 % of `nodes`, the most cubic; else those with the nearest.
 
     On a brain's box every wish from 3000 on is met within 3 %; smaller ones are missed by up to a tenth, since only

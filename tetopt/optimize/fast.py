@@ -40,7 +40,7 @@ from tetopt.optimize.complex import (
     measure_of,
     node_rings,
 )
-from tetopt.optimize.density import Sides
+from tetopt.optimize.density import Sides, exchange
 from tetopt.optimize.descent import free_projections
 from tetopt.optimize.flips import flip, make_moves
 from tetopt.optimize.paper import (
@@ -58,6 +58,9 @@ from tetopt.optimize.smooth import blocks, sweep
 
 STILL = 0.05  # of an edge: nodes that moved less need no new flips
 QUIET = 0.02  # of an edge: nodes around which none moved more are not moved again
+EXCHANGES = 0.7  # of the iterations: those after which nodes are exchanged
+EXCHANGED = 0.05  # of the nodes wanted: the most that are exchanged at once
+EAGER = 0.1  # see `_Run.exchange`
 FAR = -(1 << 40)  # ticks from anywhere
 
 
@@ -70,6 +73,7 @@ def optimize(
     shape_power: float = 3.0,
     min_dihedral: float = 12.0,
     boundary: Boundary = "slide",
+    nodes: int | None = None,
     tolerance: float = 5e-4,
     max_seconds: float | None = None,
     callback: Callable[[Record], None] | None = None,
@@ -96,6 +100,10 @@ def optimize(
         cells miss it is for the caller to count (`tetopt.quality`); meshes of triangles have no floor.
     boundary : {"slide", "fixed"}
         Boundary nodes move within the box's faces and edges, or not at all. Those not on the box are fixed.
+    nodes : int, optional
+        Put nodes where they lower E most, towards this number of them: on a graded mesh, such as `octree`. Every
+        cell's shape then counts the same, whatever its size (see `tetopt.optimize.complex.shape_energy`), and nodes
+        are exchanged in the first iterations. By default the nodes of `mesh` are kept, and the shape energy is Eq. 1's.
     tolerance : float
         Converged when E falls by less, relatively, in an iteration.
     max_seconds : float, optional
@@ -122,7 +130,7 @@ def optimize(
     check_options(k_D, iterations, shape_power, min_dihedral, boundary)
     begin = time.perf_counter()
     is_over = deadline(begin, max_seconds, stop)
-    run = _Run(image, mesh, k_D, shape_power, boundary)
+    run = _Run(image, mesh, k_D, shape_power, boundary, is_graded=nodes is not None)
     history: list[Record] = []
 
     def record(iteration: int, movement: float, is_changed: bool) -> None:
@@ -139,16 +147,19 @@ def optimize(
         before = run.held.ticks.copy()
         is_finished = run.sweep(is_over)
         is_changed = run.flip() > 0 if is_finished else False
+        may_exchange = nodes is not None and is_finished and iteration <= EXCHANGES * iterations
         movement = relative_movement(before, run.held.ticks, image, run.grid, run.matrix)
         fall = 1.0 - run.E() / history[-1].E if history[-1].E > 0.0 else 0.0
-        is_last = iteration == iterations or not is_finished or fall < tolerance
+        is_last = iteration == iterations or not is_finished or (fall < tolerance and not may_exchange)
+        if nodes is not None and may_exchange:
+            is_changed |= run.exchange(nodes) > 0
         if is_last and run.n_below(floor) > 0 and run.lift(floor) > 0:
             is_changed, fall = True, np.inf
         record(iteration, movement, is_changed)
         if not is_finished:
             ended = "stopped" if stop is not None and stop() else "max_seconds"
             break
-        if fall < tolerance:
+        if is_last and fall < tolerance:
             ended = "converged"
             break
     return Optimized(run.mesh(), history, ended)
@@ -176,7 +187,9 @@ def prepare_kernels(image: Image, k_D: float, method: Literal["fast", "paper"] =
 class _Run:
     """What one optimisation works on, and its steps."""
 
-    def __init__(self, image: Image, mesh: Mesh, k_D: float, power: float, boundary: Boundary) -> None:
+    def __init__(
+        self, image: Image, mesh: Mesh, k_D: float, power: float, boundary: Boundary, is_graded: bool = False
+    ) -> None:
         self.image, self.n = image, image.ndim
         self.grid = sampling_grid(image, mesh.points)
         ticks = to_ticks(image.to_index(mesh.points), self.grid)
@@ -196,7 +209,7 @@ class _Run:
         self.matrix[3 - self.n :, 3 - self.n :] = image.affine[:-1, :-1]
         self.projections = free_projections(self.matrix)
         hand = 1 if np.linalg.det(image.affine[:-1, :-1]) > 0 else -1
-        unit = measure_of(self.grid, hand, self.matrix, 1.0, 1.0, power)
+        unit = measure_of(self.grid, hand, self.matrix, 1.0, 1.0, power, is_graded)
         self.held: Complex = build(mesh.cells, ticks, unit)
         flat = np.flatnonzero(~np.isfinite(self.held.E_shape[: len(mesh.cells)]))
         if len(flat):
@@ -212,7 +225,9 @@ class _Run:
                 "mesh and image: their energies overflow; are lengths in mm and intensities of usual size?"
             )
         weight = k_D / self.squares0 if self.squares0 > 0.0 else 0.0
-        self.measure: Measure = measure_of(self.grid, hand, self.matrix, (1.0 - k_D) / self.E_G0, weight, power)
+        self.measure: Measure = measure_of(
+            self.grid, hand, self.matrix, (1.0 - k_D) / self.E_G0, weight, power, is_graded
+        )
         self.groups = blocks(ticks)
         self.edge = _edges(mesh)
         self.seen = np.full_like(ticks, FAR)  # where nodes were when their flips were last looked at
@@ -254,6 +269,19 @@ class _Run:
         moved = squares > (share * self.edge) ** 2
         since[moved] = self.held.ticks[moved]
         return moved
+
+    def exchange(self, nodes: int) -> int:
+        """Splits and collapses towards a number of nodes; how many nodes were put in or taken out.
+
+        A shape's cost is counted at a tenth: most of it goes when the nodes around move again.
+        """
+        eager = self.measure._replace(geometry=EAGER * self.measure.geometry)
+        most = int(EXCHANGED * nodes)
+        done = exchange(self.held, self.is_frozen, eager, self.sides, nodes, most)
+        self._renumber(done.held, done.is_frozen, done.source)
+        self.tried[done.is_touched] = FAR
+        self.seen[done.is_touched] = FAR
+        return done.n_split + done.n_collapsed
 
     def keep_floor(self, degrees: float) -> None:
         """Let no move leave a dihedral angle under `degrees`, nor one that is under it already any smaller."""

@@ -12,7 +12,9 @@ from tetopt.image import transformed
 TIE_BREAK = 1e-7  # of the squared typical edge
 
 
-def delaunay(index: NDArray[np.float64], affine: NDArray[np.float64]) -> NDArray[np.int64] | None:
+def delaunay(
+    index: NDArray[np.float64], affine: NDArray[np.float64], tie_break: float = TIE_BREAK
+) -> NDArray[np.int64] | None:
     """Delaunay cells of nodes given in index space, with cospherical ties broken so that no cell is flat.
 
     The Delaunay tessellation is the lower hull of the nodes lifted to (x, |x|^2) (Brown 1979). The lift is linear
@@ -28,6 +30,9 @@ def delaunay(index: NDArray[np.float64], affine: NDArray[np.float64]) -> NDArray
         Node positions, index coordinates; they fill their bounding box's corners.
     affine : (n+1, n+1) float64
         Index -> world mm.
+    tie_break : float
+        Largest weight, in units of the squared typical edge. Graded lattices want more of it: Qhull joins what it
+        cannot tell apart in the whole box, and cuts that up with flat cells.
 
     Returns
     -------
@@ -40,7 +45,7 @@ def delaunay(index: NDArray[np.float64], affine: NDArray[np.float64]) -> NDArray
     world = transformed(centred, affine[:-1, :-1])
     extent = float(np.abs(world).max())
     typical_edge = extent / len(index) ** (1.0 / n)
-    weights = np.random.default_rng(len(index)).random(len(index)) * TIE_BREAK * typical_edge**2
+    weights = np.random.default_rng(len(index)).random(len(index)) * tie_break * typical_edge**2
     height = (world**2).sum(axis=1) + weights
     height = (height - height.min()) / np.ptp(height)
     lifted = np.column_stack([centred / np.abs(centred).max(), height])
