@@ -77,7 +77,7 @@ def test_worth_is_what_E_falls_by(n, is_fixed):
             is_dirty = np.zeros(len(room.cells), dtype=np.bool_)
             nobody = np.empty(0, dtype=np.int64)
             if kind == "split":
-                gain, split = best_splits(room, rings, is_frozen, held.measure, sides, N)
+                gain, split = best_splits(room, rings, is_frozen, held.measure, sides, np.ones(N, dtype=bool))
                 if split[node] < 0:
                     continue
                 done = make_exchanges(
@@ -105,7 +105,9 @@ def test_worth_is_what_E_falls_by(n, is_fixed):
                     assert is_frozen[N].all()
                 held.complex = room._replace(ticks=room.ticks[: N + 1])
             else:
-                cost, collapse = best_collapses(room, rings, groups, is_frozen, held.measure, np.inf)
+                cost, collapse = best_collapses(
+                    room, rings, groups, is_frozen, held.measure, np.inf, np.ones(N, dtype=bool)
+                )
                 if collapse[node] < 0:
                     continue
                 collapse_edge(room, rings, node, collapse[node], is_dirty, held.measure)
@@ -129,7 +131,9 @@ def test_collapses_are_the_best_of_all_neighbours():
     held.sweep()
     N, cells = len(held.complex.ticks), held.mesh.cells
     rings, groups = node_rings(held.complex), blocks(held.complex.ticks)
-    cost, collapse = best_collapses(held.complex, rings, groups, held.is_frozen, held.measure, np.inf)
+    cost, collapse = best_collapses(
+        held.complex, rings, groups, held.is_frozen, held.measure, np.inf, np.ones(N, dtype=bool)
+    )
     size = np.linalg.det(held.mesh.points[cells[:, 1:]] - held.mesh.points[cells[:, :1]]).sum()
     joined = 0
     for a in range(N):

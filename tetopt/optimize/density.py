@@ -83,9 +83,15 @@ def exchange(
     rings, groups = node_rings(held), blocks(held.ticks)
     held = roomy(held, n_before, 16 * (max(more, 0) + most))
     is_frozen = np.concatenate([is_frozen, np.zeros_like(is_frozen)])
-    gain, split = best_splits(held, rings, is_frozen, measure, sides, n_before)
-    dearest = np.inf if more < 0 else float(gain.max(initial=0.0))
-    cost, collapse = best_collapses(held, rings, groups, is_frozen, measure, dearest)
+    # Splits pay where the error is, collapses where it is not: half of the nodes are asked for each, unless many more,
+    # or fewer, are wanted. It costs no E_D that could be measured, and half of the time.
+    error = _ring_errors(held, n_before)
+    middle = np.median(error)
+    may_split = (error >= middle) | (more > n_before // 8)
+    may_collapse = (error <= middle) | (more < -(n_before // 8))
+    gain, split = best_splits(held, rings, is_frozen, measure, sides, may_split)
+    dearest = np.inf if more < 0 else float(np.sort(gain)[-max(most // 4, 1)])
+    cost, collapse = best_collapses(held, rings, groups, is_frozen, measure, dearest, may_collapse)
     in_, out = np.lexsort((np.arange(n_before), -gain)), np.lexsort((np.arange(n_before), cost))
     in_, out = in_[gain[in_] > -np.inf], out[cost[out] < np.inf]
     E_G, squares = energies(held)
@@ -95,6 +101,14 @@ def exchange(
         held, rings, is_frozen, measure, sides, in_, split, gain, out, collapse, cost, more, most, least, is_dirty
     )
     return _compacted(held, is_frozen, is_dirty, n_before, n_split, n_collapsed)
+
+
+def _ring_errors(held: Complex, n_nodes: int) -> NDArray[np.float64]:
+    """Sum of squares around the cells' means over the cells around each node, (N,)."""
+    n_cells = int(held.n_cells[0])
+    sums, cells = held.sums[:n_cells], held.cells[:n_cells]
+    within = np.maximum(sums[:, 2] - sums[:, 1] ** 2 / np.maximum(sums[:, 0], 1.0), 0.0)
+    return np.bincount(cells.ravel(), np.repeat(within, cells.shape[1]), n_nodes)
 
 
 def roomy(held: Complex, n_nodes: int, n_cells: int) -> Complex:
@@ -307,35 +321,43 @@ def _lift_by_split(
 
 
 def best_splits(
-    held: Complex, rings: NodeRings, is_frozen: NDArray[np.bool_], measure: Measure, sides: Sides, n_nodes: int
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """How much E falls if the best edge from each node to a higher one is split, (N,), and where that leads, (N,).
+    held: Complex, rings: NodeRings, is_frozen: NDArray[np.bool_], measure: Measure, sides: Sides,
+    is_wanted: NDArray[np.bool_],
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:  # fmt: skip
+    """How much E falls if the best edge of each node that is wanted is split, (N,), and where that leads, (N,).
 
-    -inf and -1 where none can be split above the floor. Rows N to 2 N of `held.ticks` and `is_frozen` are written to.
+    -inf and -1 where none can be split above the floor; an edge of two nodes that are wanted counts for the lower one.
+    Rows N to 2 N of `held.ticks` and `is_frozen` are written to.
     """
+    n_nodes = len(is_wanted)
     gain, split = np.full(n_nodes, -np.inf), np.full(n_nodes, -1, dtype=np.int64)
     with few_threads(n_nodes * 20):
-        _fill_splits(gain, split, held, rings, is_frozen, measure, sides)
+        _fill_splits(gain, split, held, rings, is_frozen, measure, sides, is_wanted)
     return gain, split
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def _fill_splits(
-    gain: NDArray, split: NDArray, held: Complex, rings: NodeRings, is_frozen: NDArray, measure: Measure, sides: Sides
-) -> None:
+    gain: NDArray, split: NDArray, held: Complex, rings: NodeRings, is_frozen: NDArray, measure: Measure, sides: Sides,
+    is_wanted: NDArray,
+) -> None:  # fmt: skip
     for node in prange(len(gain)):
-        _best_split(np.int64(node), gain, split, held, rings, is_frozen, measure, sides, len(gain))
+        if is_wanted[node]:
+            _best_split(np.int64(node), gain, split, held, rings, is_frozen, measure, sides, is_wanted)
 
 
 @njit(cache=True, error_model="numpy")
 def _best_split(
     a: int, gain: NDArray, split: NDArray, held: Complex, rings: NodeRings, is_frozen: NDArray, measure: Measure,
-    sides: Sides, n_nodes: int,
+    sides: Sides, is_wanted: NDArray,
 ) -> None:  # fmt: skip
+    n_nodes = len(is_wanted)
     x, near = np.empty((4, 3)), np.empty(NEIGHBOURS, dtype=np.int64)
     for number in range(_neighbours(near, held, rings, a)):
         b, p = near[number], n_nodes + a
-        if b > a and _put_middle(held, is_frozen, sides, a, b, p, _is_boundary_edge(held, rings, a, b)):
+        if (b > a or not is_wanted[b]) and _put_middle(
+            held, is_frozen, sides, a, b, p, _is_boundary_edge(held, rings, a, b)
+        ):
             worth = worth_of_split(x, held, rings, a, b, p, measure, gain[a])
             if worth > gain[a]:
                 gain[a], split[a] = worth, b
@@ -472,9 +494,15 @@ def split_edge(held: Complex, rings: NodeRings, a: int, b: int, p: int, is_dirty
 
 
 def best_collapses(
-    held: Complex, rings: NodeRings, groups: Blocks, is_frozen: NDArray[np.bool_], measure: Measure, dearest: float
+    held: Complex,
+    rings: NodeRings,
+    groups: Blocks,
+    is_frozen: NDArray[np.bool_],
+    measure: Measure,
+    dearest: float,
+    is_wanted: NDArray[np.bool_],
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """How much E rises if each node is joined to its best neighbour, (N,), and which that is, (N,).
+    """How much E rises if each node that is wanted is joined to its best neighbour, (N,), and which that is, (N,).
 
     inf and -1 where there is none that leaves a mesh above the floor, or for `dearest` at most.
     """
@@ -483,18 +511,19 @@ def best_collapses(
     bare = measure._replace(image=0.0)
     for chosen in colours_of(held, rings, groups):
         with few_threads(len(chosen) * 10_000):
-            _fill_collapses(cost, collapse, held, rings, groups, chosen, is_frozen, measure, bare, dearest)
+            _fill_collapses(cost, collapse, held, rings, groups, chosen, is_frozen, measure, bare, dearest, is_wanted)
     return cost, collapse
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def _fill_collapses(
     cost: NDArray, collapse: NDArray, held: Complex, rings: NodeRings, groups: Blocks, chosen: NDArray,
-    is_frozen: NDArray, measure: Measure, bare: Measure, dearest: float,
+    is_frozen: NDArray, measure: Measure, bare: Measure, dearest: float, is_wanted: NDArray,
 ) -> None:  # fmt: skip
     for number in prange(len(chosen)):
         for at in range(groups.start[chosen[number]], groups.start[chosen[number] + 1]):
-            _best_collapse(groups.nodes[at], cost, collapse, held, rings, is_frozen, measure, bare, dearest)
+            if is_wanted[groups.nodes[at]]:
+                _best_collapse(groups.nodes[at], cost, collapse, held, rings, is_frozen, measure, bare, dearest)
 
 
 @njit(cache=True, error_model="numpy")

@@ -59,7 +59,7 @@ from tetopt.optimize.smooth import blocks, sweep
 STILL = 0.05  # of an edge: nodes that moved less need no new flips
 QUIET = 0.02  # of an edge: nodes around which none moved more are not moved again
 EXCHANGES = 0.7  # of the iterations: those after which nodes are exchanged
-EXCHANGED = 0.05  # of the nodes wanted: the most that are exchanged at once
+EXCHANGED = 0.1  # of the nodes wanted: the most that are exchanged at once
 EAGER = 0.1  # see `_Run.exchange`
 FAR = -(1 << 40)  # ticks from anywhere
 
@@ -147,10 +147,14 @@ def optimize(
         before = run.held.ticks.copy()
         is_finished = run.sweep(is_over)
         is_changed = run.flip() > 0 if is_finished else False
-        may_exchange = nodes is not None and is_finished and iteration <= EXCHANGES * iterations
+        may_exchange = nodes is not None and is_finished and iteration % 2 == 1 and iteration <= EXCHANGES * iterations
         movement = relative_movement(before, run.held.ticks, image, run.grid, run.matrix)
         fall = 1.0 - run.E() / history[-1].E if history[-1].E > 0.0 else 0.0
-        is_last = iteration == iterations or not is_finished or (fall < tolerance and not may_exchange)
+        is_last = (
+            iteration == iterations
+            or not is_finished
+            or (fall < tolerance and not (nodes and iteration <= EXCHANGES * iterations))
+        )
         if nodes is not None and may_exchange:
             is_changed |= run.exchange(nodes) > 0
         if is_last and run.n_below(floor) > 0 and run.lift(floor) > 0:
