@@ -13,7 +13,8 @@ from tetopt.io.images import load_image, save_image
 from tetopt.io.meshes import cell_fields, load_mesh, save_mesh
 from tetopt.lattice import lattice
 from tetopt.mesh import Mesh
-from tetopt.optimize.fast import optimize
+from tetopt.optimize.fast import mesh_image, optimize
+from tetopt.optimize.octree import octree
 from tetopt.optimize.paper import optimize_paper
 from tetopt.phantom import load_phantom
 
@@ -32,6 +33,8 @@ __all__ = [
     "load_image",
     "load_mesh",
     "load_phantom",
+    "mesh_image",
+    "octree",
     "optimize",
     "optimize_paper",
     "quality",

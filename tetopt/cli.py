@@ -43,7 +43,8 @@ from tetopt.io.images import parse_crop, parse_slice, sha256
 from tetopt.io.meshes import MeshFile, cell_fields
 from tetopt.io.mni import mni_path, mni_tissue
 from tetopt.lattice import KINDS
-from tetopt.optimize.fast import check_options, optimize, prepare_kernels
+from tetopt.optimize.fast import GRADED_K_D, check_options, optimize, prepare_kernels
+from tetopt.optimize.octree import octree
 from tetopt.optimize.paper import Optimized, Record, default_n_t, optimize_paper
 from tetopt.report.summary import run_summary, versions
 from tetopt.segmentation import check_labels
@@ -76,6 +77,7 @@ class Lattice(StrEnum):  # noqa: D101
     bcc = "bcc"
     five_tet = "five-tet"
     criss_cross = "criss-cross"
+    octree = "octree"
 
 
 class Method(StrEnum):  # noqa: D101
@@ -177,14 +179,20 @@ def mesh_command(
     ] = None,
     spacing: Annotated[float | None, typer.Option(metavar="MM", help="Wanted lattice spacing instead.")] = None,
     lattice_kind: Annotated[
-        Lattice | None, typer.Option("--lattice", help="Initial mesh (default bcc; criss-cross in 2-D).")
+        Lattice | None,
+        typer.Option(
+            "--lattice",
+            help="Initial mesh (default bcc; criss-cross in 2-D). octree puts nodes where the image has content.",
+        ),
     ] = None,
     k_D: Annotated[
-        float,
+        float | None,
         typer.Option(
-            "--k-d", metavar="K", help="Weight of the image: 0 shape only; 0.2 to 0.5 usual; 0.9 image first."
+            "--k-d",
+            metavar="K",
+            help="Weight of the image: 0 shape only; 0.9 image first (default 0.2; 0.75 with --lattice octree).",
         ),
-    ] = 0.2,
+    ] = None,
     iterations: Annotated[
         int, typer.Option(metavar="I", min=0, help="Sweeps over all nodes; 0 writes the lattice.")
     ] = 20,
@@ -239,6 +247,10 @@ def mesh_command(
         json_path = checked_output(json_path, (".json",), force)
     if nodes is not None and spacing is not None:
         raise InputError("--nodes and --spacing: give one of them")
+    is_graded = lattice_kind is Lattice.octree
+    if is_graded and (method is Method.paper or spacing is not None):
+        raise InputError("--lattice octree: goes with --nodes and --method fast only")
+    k_D = (GRADED_K_D if is_graded else 0.2) if k_D is None else k_D
     if not 0.0 <= k_D < 1.0:
         raise InputError(f"--k-d: expected 0 <= k_D < 1, got {k_D}")
     if max_seconds is not None and not max_seconds > 0.0:
@@ -260,7 +272,10 @@ def mesh_command(
     if nodes is None and spacing is None:
         nodes = DEFAULT_NODES[image.ndim]
     kind = KINDS[image.ndim][0] if lattice_kind is None else lattice_kind.value
-    initial = lattice(image, kind, nodes=nodes, spacing=spacing)
+    if is_graded and nodes is not None:
+        initial, options["nodes"] = octree(image, nodes), nodes
+    else:
+        initial = lattice(image, kind, nodes=nodes, spacing=spacing)
     source = {
         "nodes": nodes, "spacing": spacing, "lattice": kind, "volume": volume, "crop": crop, "slice": slice_,
         "method": method.value, "max_seconds": max_seconds,
@@ -403,7 +418,7 @@ def _optimized(
     """`optimize` with progress shown, ended in good order by Ctrl-C; whether it was."""
     begin = time.perf_counter()
     iterations = options["iterations"]
-    _prepare_kernels(image, options["k_D"], method)
+    _prepare_kernels(image, options["k_D"], method, "nodes" in options)
     run = optimize if method is Method.fast else optimize_paper
     if max_seconds is not None:
         max_seconds = max(max_seconds - (time.perf_counter() - begin), 1e-9)
@@ -422,11 +437,11 @@ def _optimized(
     return result, was_interrupted
 
 
-def _prepare_kernels(image: Image, k_D: float, method: Method) -> None:
+def _prepare_kernels(image: Image, k_D: float, method: Method, is_graded: bool) -> None:
     """Load the compiled kernels, or compile them, before the clock of the first iteration starts."""
     begin = time.perf_counter()
     with log.status("preparing the kernels (the first run compiles them, about half a minute) ..."):
-        prepare_kernels(image, k_D, method.value)
+        prepare_kernels(image, k_D, method.value, is_graded)
     seconds = time.perf_counter() - begin
     if seconds > 3.0:
         log.print(f"kernels compiled in {seconds:.0f} s; later runs on images of this kind load them from the cache")

@@ -108,7 +108,7 @@ def _ring_errors(held: Complex, n_nodes: int) -> NDArray[np.float64]:
     n_cells = int(held.n_cells[0])
     sums, cells = held.sums[:n_cells], held.cells[:n_cells]
     within = np.maximum(sums[:, 2] - sums[:, 1] ** 2 / np.maximum(sums[:, 0], 1.0), 0.0)
-    return np.bincount(cells.ravel(), np.repeat(within, cells.shape[1]), n_nodes)
+    return np.bincount(cells.ravel(), np.repeat(within, cells.shape[1]), n_nodes).astype(np.float64)
 
 
 def roomy(held: Complex, n_nodes: int, n_cells: int) -> Complex:
@@ -557,7 +557,7 @@ def _best_collapse(
                 shapes[number] = np.inf
             t[a, 0], t[a, 1], t[a, 2] = here0, here1, here2
     for _ in range(count):
-        number = np.argmin(shapes)
+        number = int(np.argmin(shapes))
         if not shapes[number] < best:
             break
         b, value = near[number], shapes[number]
