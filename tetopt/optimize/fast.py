@@ -299,7 +299,7 @@ class _Run:
         moved = self._moved(self.seen, STILL)
         is_dirty = moved[self.held.cells[: int(self.held.n_cells[0])]].any(axis=1)
         is_touched = np.zeros(len(moved), dtype=bool)
-        self.held, made = flip(self.held, self.measure, is_dirty, is_touched=is_touched)
+        self.held, made = flip(self.held, self.measure, np.asarray(is_dirty), is_touched=is_touched)
         self.tried[is_touched] = FAR
         return made
 

@@ -15,16 +15,21 @@ from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
 from tetopt.errors import InputError
+from tetopt.geometry.simplex import volumes
 from tetopt.image import Image
 from tetopt.lattice import near_cubes
 from tetopt.mesh import Mesh
 from tetopt.optimize.retessellate import delaunay
 
-ROOTS = 1 / 60  # nodes of the lattice of undivided blocks, of those wanted
+ROOTS = (1 / 60, 1 / 45, 1 / 30, 1 / 20, 1 / 12, 1 / 6, 1.0)  # undivided blocks' nodes, of those wanted: tried in turn
+ENOUGH = 0.02  # of the nodes wanted: a miss that ends the trials
 SMALLEST = 2.0  # voxels along a leaf's edge, at least, where voxels are smallest; a quarter where they are largest
 SPREAD = 1e-3  # of the image's variance: what every voxel counts besides, so that any number of nodes is reached
+SPREAD_OF_NOISE = 0.03  # of the noise's: so much that chance does not decide which noise is divided first
+MARGIN = 2.0  # standard deviations of a sum of squared noise that are not taken for content
 STEPS = 60  # of the bisection for the number of nodes
-TIE_BREAK = 1e-5  # see `delaunay`: with 1e-7, 2 of 88,661 cells were flat
+TIE_BREAKS = (1e-5, 1e-4, 1e-3)  # see `delaunay`, tried in turn: with 1e-7, 2 of 88,661 cells were flat
+FLAT = 1e-6  # of the mean volume: such a cell is flat
 NEAR = 0.002  # of the nodes wanted: a miss that is good enough
 
 
@@ -52,19 +57,19 @@ def octree(image: Image, nodes: int) -> Mesh:
     fewest = 2**n + 1
     if nodes < fewest:
         raise InputError(f"octree: expected {fewest} nodes or more in {n}-D, got {nodes}")
-    roots = near_cubes("bcc" if n == 3 else "criss-cross", image.spacing * image.shape, max(fewest, int(nodes * ROOTS)))
-    errors = _errors(image, roots)
-    count, divided = _nearest(errors, roots, nodes)
+    count, roots, divided = _closest(image, nodes, fewest)
     if count < 0.9 * nodes:
         raise InputError(
             f"octree: {nodes} nodes are more than the image is worth: leaves of {SMALLEST:g} voxels have {count}; "
             "ask for fewer, or for a uniform mesh"
         )
     index = _places(divided, roots) / np.array(roots) * image.shape - 0.5
-    cells = delaunay(index, image.affine, tie_break=TIE_BREAK)
-    if cells is None:
-        raise InputError(f"octree: Delaunay failed on {len(index)} nodes; ask for another number")
-    return Mesh(image.to_world(index), cells)
+    points = image.to_world(index)
+    for tie_break in TIE_BREAKS:
+        cells = delaunay(index, image.affine, tie_break)
+        if cells is not None and (size := volumes(points, cells)).min() > FLAT * size.mean():
+            return Mesh(points, cells)
+    raise InputError(f"octree: Delaunay left flat cells on {len(index)} nodes; ask for another number")
 
 
 def noise_level(image: Image) -> float:
@@ -96,13 +101,15 @@ def _errors(image: Image, roots: tuple[int, ...]) -> list[NDArray[np.float64]]:
         n_levels += 1
     variance = noise_level(image) ** 2
     data = image.data.astype(np.float64) - float(np.mean(image.data, dtype=np.float64))
-    spread = SPREAD * max(float(np.mean(data * data)), variance)
+    spread = SPREAD * float(np.mean(data * data)) + SPREAD_OF_NOISE * variance
     sums = [np.ones(image.shape), data, data * data]
     sums = [_blocks(total, np.array(roots) << n_levels) for total in sums]
     found = []
     for _ in range(n_levels + 1):
         count, first, second = sums
-        error = np.maximum(second - first**2 / np.maximum(count, 1.0) - np.maximum(count - 1.0, 0.0) * variance, 0.0)
+        free = np.maximum(count - 1.0, 0.0)
+        noise = variance * (free + MARGIN * np.sqrt(2.0 * free))  # a chi-squared sum, and deviations of it
+        error = np.maximum(second - first**2 / np.maximum(count, 1.0) - noise, 0.0)
         found.append(error + spread * count)
         if len(found) <= n_levels:
             sums = [_blocks(total, np.array(total.shape) // 2) for total in sums]
@@ -119,6 +126,28 @@ def _blocks(data: NDArray[np.float64], counts: NDArray[np.int64]) -> NDArray[np.
         is_empty = np.expand_dims(start == stop, [d for d in range(data.ndim) if d != axis])
         data = np.where(is_empty, 0.0, total)
     return data
+
+
+def _closest(image: Image, nodes: int, fewest: int) -> tuple[int, tuple[int, ...], list[NDArray[np.bool_]]]:
+    """Number of nodes, blocks undivided and those divided, of the octree that has nearly as many nodes as wanted.
+
+    Where many blocks are alike, they are all divided or none, and some numbers cannot be reached from one size of
+    undivided blocks: then others are tried, at last the lattice that has the number by itself.
+    """
+    best: tuple[int, tuple[int, ...], list[NDArray[np.bool_]]] | None = None
+    for share in ROOTS:
+        roots = near_cubes(
+            "bcc" if image.ndim == 3 else "criss-cross", image.spacing * image.shape, max(fewest, int(nodes * share))
+        )
+        if (np.array(image.shape) / roots).max() < SMALLEST and best is not None:
+            break
+        count, divided = _nearest(_errors(image, roots), roots, nodes)
+        if best is None or abs(count - nodes) < abs(best[0] - nodes):
+            best = count, roots, divided
+        if abs(count - nodes) <= ENOUGH * nodes:
+            break
+    assert best is not None
+    return best
 
 
 def _nearest(
