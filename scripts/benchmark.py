@@ -26,7 +26,7 @@ from scipy.spatial import Delaunay
 
 import tetopt
 from tetopt.energy.sampling import from_ticks, moment_sums, sampling_grid, to_ticks
-from tetopt.geometry.simplex import oriented, rho, volumes
+from tetopt.geometry.simplex import dihedral_angles, oriented, rho, volumes
 from tetopt.geometry.topology import facets
 from tetopt.io.files import checked_output, save_json
 from tetopt.io.mni import mni_path
@@ -60,6 +60,8 @@ def main(argv: Sequence[str] | None = None) -> int:
     }
     rows["compile_seconds"], rows["load_seconds"] = compile_seconds()
     rows |= sampling(image, 2_000 if options.quick else 37_000)
+    rows["sampling_by_size"] = [sampling_by_size(image, n) for n in ((300, 600) if options.quick else (4_000, 145_000))]
+    rows["graded"] = [graded(image, n) for n in ((400,) if options.quick else (5_000, 15_000, 40_000))]
     rows["paper"] = [paper(image, nodes, iterations=2 if options.quick else 6) for nodes in sizes]
     rows["bar"] = bar(image, 300 if options.quick else 5_000)
     rows["engine"] = engine(image, path, (300, 500, 700, 900) if options.quick else (5_000, 14_000, 37_000, 145_000))
@@ -137,6 +139,32 @@ def sampling(image: tetopt.Image, nodes: int) -> dict[str, Any]:
         "cell_moments_over_find_simplex": theirs / ours_at_once,
         "sampling_over_numpy_sums": ours / total,
     }
+
+
+def sampling_by_size(image: tetopt.Image, nodes: int) -> dict[str, float]:
+    """The sampler alone on a mesh of that many nodes: tetrahedra a second, and beside numpy's two sums."""
+    mesh = tetopt.optimize(image, tetopt.lattice(image, nodes=nodes), k_D=0.0, iterations=1).mesh
+    grid = sampling_grid(image, mesh.points)
+    ticks, sides = to_ticks(image.to_index(mesh.points), grid), facets(mesh.cells)
+    seconds = best_seconds(lambda: moment_sums(grid, ticks, mesh.cells, sides))
+    total = best_seconds(lambda: (image.data.sum(), (image.data * image.data).sum()))
+    return {"cells": len(mesh.cells), "cells_per_second": len(mesh.cells) / seconds, "over_numpy": seconds / total}
+
+
+def graded(image: tetopt.Image, nodes: int) -> dict[str, Any]:
+    """`tetopt.mesh_image` with its defaults."""
+    prepare_kernels(image, 0.75, is_graded=True)
+    begin = time.perf_counter()
+    mesh = tetopt.mesh_image(image, nodes).mesh
+    seconds = time.perf_counter() - begin
+    shape = tetopt.quality(mesh.points, mesh.cells)
+    smallest = dihedral_angles(mesh.points, mesh.cells).min(axis=1)
+    variance = float(np.var(image.data, dtype=np.float64)) * image.data.size * image.voxel_volume
+    return {
+        "nodes": shape.n_nodes, "cells": shape.n_cells, "seconds": seconds, "mean_rho": shape.mean_rho,
+        "E_D_share": tetopt.E_D(image, mesh) / variance, "min_dihedral": shape.min_dihedral,
+        "dihedral_1st_percentile": float(np.percentile(smallest, 1)),
+    }  # fmt: skip
 
 
 def paper(image: tetopt.Image, nodes: int, iterations: int) -> dict[str, Any]:
@@ -236,6 +264,17 @@ def show(rows: dict[str, Any]) -> None:
     print(f"  to raster order, with facets      {rows['sampling_and_facets_over_find_simplex']:10.0f}")
     print(f"  to raster order, cell_moments     {rows['cell_moments_over_find_simplex']:10.0f}")
     print(f"  sampling over numpy's two sums    {rows['sampling_over_numpy_sums']:10.1f}")
+    for row in rows["sampling_by_size"]:
+        print(
+            f"  sampling alone, {row['cells']} tets: {row['cells_per_second'] / 1e6:.1f} Mtet/s, "
+            f"{row['over_numpy']:.1f} times numpy's two sums"
+        )
+    for row in rows["graded"]:
+        print(
+            f"  mesh_image, {row['nodes']} nodes, {row['cells']} tets: {row['seconds']:.1f} s; E_D "
+            f"{row['E_D_share']:.5f} of the image's variance, mean rho {row['mean_rho']:.4f}, angles from "
+            f"{row['min_dihedral']:.1f}, 1st percentile {row['dihedral_1st_percentile']:.1f}"
+        )
     for row in rows["paper"]:
         print(
             f"  --method paper, {row['nodes']:6d} nodes      {row['seconds_per_iteration']:10.2f} s an iteration, "
