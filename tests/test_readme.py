@@ -31,7 +31,7 @@ def test_program(tmp_path, monkeypatch, capsys):
 def test_commands(tmp_path, monkeypatch):
     """Each `tetopt` line of the README, on a phantom in the place of the T1 and with fewer nodes."""
     lines = [line for line in README.splitlines() if re.match("tetopt (mesh|quality|phantom|fem|segment) ", line)]
-    assert len(lines) == 5
+    assert len(lines) == 6
     monkeypatch.chdir(tmp_path)
     assert main(["phantom", "sphere", "-o", "T1.nii.gz", "--voxel-mm", "4"]) == 0
     for line in lines:

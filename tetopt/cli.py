@@ -881,9 +881,10 @@ def compare_command(
     pipelines: Annotated[
         str,
         typer.Option(
-            metavar="A,B,...", help="Of tetopt, tetopt-paper, pytetwild, cleaver, bcc, odt: which, in this order."
+            metavar="A,B,...",
+            help="Of tetopt, tetopt-graded, tetopt-paper, pytetwild, cleaver, bcc, odt: which, in order.",
         ),
-    ] = "tetopt,tetopt-paper,pytetwild,cleaver,bcc,odt",
+    ] = "tetopt,tetopt-graded,tetopt-paper,pytetwild,cleaver,bcc,odt",
     k_D: Annotated[float, typer.Option("--k-d", metavar="K", help="tetopt's weight of the image.")] = 0.2,
     classes: Annotated[int, typer.Option(metavar="K", min=2, help="Classes of the segmentation (multi-Otsu).")] = 4,
     young: Annotated[

@@ -1,4 +1,4 @@
-"""Six ways from an image to a mesh of its box with a wanted number of nodes, under one signature."""
+"""Seven ways from an image to a mesh of its box with a wanted number of nodes, under one signature."""
 
 from __future__ import annotations
 
@@ -10,7 +10,8 @@ from typing import NamedTuple
 from tetopt.image import Image
 from tetopt.lattice import lattice
 from tetopt.mesh import Mesh
-from tetopt.optimize.fast import optimize, prepare_kernels
+from tetopt.optimize.fast import GRADED_K_D, optimize, prepare_kernels
+from tetopt.optimize.octree import octree
 from tetopt.optimize.paper import optimize_paper
 
 
@@ -95,6 +96,24 @@ def tetopt(job: Job) -> Produced:
     return Produced(result.mesh, clock.seconds, [f"ended by: {result.ended}"])
 
 
+def tetopt_graded(job: Job) -> Produced:
+    """Nodes where the image has content: the octree and `optimize`, as `tetopt.mesh_image`, which has its own k_D.
+
+    Raises
+    ------
+    InputError
+        As `tetopt.mesh_image`.
+    """
+    clock = _Clock()
+    with clock.step("kernels"):
+        prepare_kernels(job.image, GRADED_K_D, is_graded=True)
+    with clock.step("octree"):
+        mesh = octree(job.image, job.nodes)
+    with clock.step("optimize"):
+        result = optimize(job.image, mesh, k_D=GRADED_K_D, iterations=job.iterations, nodes=job.nodes)
+    return Produced(result.mesh, clock.seconds, [f"ended by: {result.ended}", f"k_D = {GRADED_K_D:g}"])
+
+
 def tetopt_paper(job: Job) -> Produced:
     """The lattice and the paper's own scheme, as `tetopt mesh --method paper`.
 
@@ -161,6 +180,7 @@ def _by_the_paper(job: Job, k_D: float) -> Produced:
 
 PIPELINES: dict[str, Callable[[Job], Produced]] = {
     "tetopt": tetopt,
+    "tetopt-graded": tetopt_graded,
     "tetopt-paper": tetopt_paper,
     "pytetwild": pytetwild,
     "cleaver": cleaver,
