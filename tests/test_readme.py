@@ -42,6 +42,7 @@ def test_commands(tmp_path, monkeypatch):
         "T1.nii.gz",
         "labels.nii.gz",
         "brain.vtu",
+        "graded.vtu",
         "run.json",
         "sphere.nii.gz",
         "slice.png",
