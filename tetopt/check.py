@@ -7,11 +7,11 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
-from tetopt.geometry.topology import components, facets, folded
+from tetopt.geometry.topology import boundary_facets, components, facets, folded
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 
-ON_FACE = 1e-6  # voxel
+ON_FACE = 1e-6  # voxel: as near as this to the box's face is on it
 
 
 def check_mesh(mesh: Mesh, image: Image | None = None) -> list[str]:
@@ -99,15 +99,36 @@ def _facets(mesh: Mesh) -> list[str]:
     return found
 
 
-def _box(mesh: Mesh, image: Image) -> list[str]:
-    found = []
-    shared = facets(mesh.cells)
-    outer = shared.nodes[shared.n_cells == 1]
-    index = image.to_index(mesh.points)[outer]
-    on_box = np.zeros(len(outer), dtype=bool)
+def check_unfolded(mesh: Mesh) -> None:
+    """InputError if cells overlap at a facet, or more than two share one.
+
+    Raises
+    ------
+    InputError
+        With the first cells that do.
+    """
+    pairs = folded(mesh.cells)
+    if len(pairs):
+        raise InputError(
+            f"mesh: {len(pairs)} facets have cells that overlap there, as inverted ones do, or more than two; the first "
+            f"are of cells {pairs[:3].tolist()}; mend the mesh"
+        )
+
+
+def facets_on_box(mesh: Mesh, image: Image) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Boundary facets, (B, n) nodes, and whether each lies on a face of the image's box, (B,)."""
+    outer = boundary_facets(mesh.cells)
+    index = image.to_index(mesh.points[outer])  # (B, n, n)
+    is_on_box = np.zeros(len(outer), dtype=bool)
     for axis in range(mesh.ndim):
         for face in (-0.5, image.shape[axis] - 0.5):
-            on_box |= (np.abs(index[:, :, axis] - face) <= ON_FACE).all(axis=1)
+            is_on_box |= (np.abs(index[:, :, axis] - face) <= ON_FACE).all(axis=1)
+    return outer, is_on_box
+
+
+def _box(mesh: Mesh, image: Image) -> list[str]:
+    found = []
+    outer, on_box = facets_on_box(mesh, image)
     if not on_box.all():
         found.append(f"boundary facets off the faces of the image's box; nodes: {_first(outer[~on_box])}")
     filled = float(volumes(mesh.points, mesh.cells).sum()) / image.volume

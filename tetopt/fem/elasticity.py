@@ -25,10 +25,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import bsr_array, bsr_matrix, csr_array, diags_array
 from scipy.sparse.linalg import LinearOperator, cg, splu
 
+from tetopt.check import ON_FACE, check_unfolded, facets_on_box
 from tetopt.errors import InputError
 from tetopt.fem.rigidity import check_held, rigid_modes
 from tetopt.geometry.simplex import volume_gradients, volumes
-from tetopt.geometry.topology import boundary_facets, folded
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 
@@ -38,7 +38,6 @@ Method = Literal["auto", "direct", "amg"]
 # 3 s and 57 k take 140 s and 4 GB, where multigrid takes 0.3 s and 2 s; in 2-D 100 k take 1 s.
 DIRECT_DOFS = {2: 200_000, 3: 10_000}
 RTOL = 1e-10  # of the iterative solution: residual over load
-ON_FACE = 1e-6  # voxel: as near as this to the box's face is on it
 
 
 class System(NamedTuple):
@@ -216,13 +215,8 @@ def check_fills_box(image: Image, mesh: Mesh) -> None:
 
     So a mesh with a crack, of several pieces, laid over itself or joined without shared nodes is refused.
     """
-    _check_unfolded(mesh)
-    outer = boundary_facets(mesh.cells)
-    index = image.to_index(mesh.points[outer])  # (B, n, n)
-    on_box = np.zeros(len(outer), dtype=bool)
-    for axis in range(mesh.ndim):
-        for face in (-0.5, image.shape[axis] - 0.5):
-            on_box |= (np.abs(index[:, :, axis] - face) <= ON_FACE).all(axis=1)
+    check_unfolded(mesh)
+    outer, on_box = facets_on_box(mesh, image)
     if not on_box.all():
         inner = np.flatnonzero(~on_box)
         raise InputError(
@@ -273,7 +267,7 @@ def constrained(
     if not np.isfinite(values).all():
         node = int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
         raise InputError(f"prescribed: displacements must be finite, node {node} has {values[node].tolist()}")
-    _check_unfolded(mesh)
+    check_unfolded(mesh)
     points = mesh.points @ frame
     check_held(points, mesh.cells, is_prescribed)
     K = _stiffness(mesh, young, nu, frame)
@@ -464,15 +458,6 @@ def _by_multigrid(system: System) -> NDArray[np.float64]:
 
 
 # Checks of the arguments
-
-
-def _check_unfolded(mesh: Mesh) -> None:
-    pairs = folded(mesh.cells)
-    if len(pairs):
-        raise InputError(
-            f"mesh: {len(pairs)} facets have cells that overlap there, as inverted ones do; the first are of cells "
-            f"{pairs[:3].tolist()}; mend the mesh"
-        )
 
 
 def _checked_young(young: ArrayLike, mesh: Mesh) -> NDArray[np.float64]:

@@ -17,6 +17,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt.check import check_unfolded
 from tetopt.energy.sampling import (
     check_orientations,
     few_threads,
@@ -26,7 +27,6 @@ from tetopt.energy.sampling import (
 )
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
-from tetopt.geometry.topology import folded
 from tetopt.image import Image, transformed
 from tetopt.lattice import lattice
 from tetopt.mesh import Mesh
@@ -236,12 +236,7 @@ class _Run:
         self.grid = sampling_grid(image, mesh.points)
         ticks = to_ticks(image.to_index(mesh.points), self.grid)
         check_orientations(image, ticks, mesh.cells)
-        pairs = folded(mesh.cells)
-        if len(pairs):
-            raise InputError(
-                f"mesh: {len(pairs)} facets have cells that overlap there, or more than two; the first are of cells "
-                f"{pairs[:3].tolist()}; mend the mesh"
-            )
+        check_unfolded(mesh)
         self.is_frozen = frozen_axes(image, ticks, mesh.cells, self.grid, boundary)
         low = np.array([-0.5] * 3) * 2.0**self.grid.bits
         high = (np.array(self.grid.shape) - 0.5) * 2.0**self.grid.bits
