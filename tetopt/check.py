@@ -110,8 +110,8 @@ def check_unfolded(mesh: Mesh) -> None:
     pairs = folded(mesh.cells)
     if len(pairs):
         raise InputError(
-            f"mesh: {len(pairs)} facets have cells that overlap there, as inverted ones do, or more than two; the first "
-            f"are of cells {pairs[:3].tolist()}; mend the mesh"
+            f"mesh: {len(pairs)} facets have cells that overlap there, as inverted ones do, or more than two; the "
+            f"first are of cells {pairs[:3].tolist()}; mend the mesh"
         )
 
 

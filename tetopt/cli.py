@@ -319,7 +319,7 @@ def _mesh_files(
         save_run_figures(pictures, image, initial, result)
     # Everything is written; what is printed may go into a pipe that closes.
     code = 130 if is_interrupted else _promises(image, result, options.get("min_dihedral", 0.0))
-    _warn(image, result, Method(source["method"]))
+    _warn(image, result, Method(source["method"]), options.get("nodes"))
     _print_comparison(initial, result)
     out.print(escape(f"{output}: {len(result.mesh.points)} nodes, {len(result.mesh.cells)} cells"))
     if json_path is not None:
@@ -329,8 +329,11 @@ def _mesh_files(
     return code
 
 
-def _warn(image: Image, result: Optimized, method: Method) -> None:
-    """Say what is allowed but hardly meant."""
+def _warn(image: Image, result: Optimized, method: Method, nodes: int | None) -> None:
+    """Say what is allowed but hardly meant; `nodes` are those that a graded mesh was to have."""
+    found = len(result.mesh.points)
+    if nodes is not None and abs(found - nodes) > 0.01 * nodes:
+        _show_warning(f"{found} nodes instead of {nodes}: more iterations, or a --k-d above 0, come nearer")
     lowest, last = min(row.E for row in result.history), result.history[-1].E
     if last > lowest * (1.0 + 1e-3) and method is Method.paper:
         _show_warning(

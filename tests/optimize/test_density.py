@@ -7,6 +7,7 @@ from hypothesis import strategies as st
 from test_fast import OBLIQUE, Held, dimensions, random_case, seeds
 
 import tetopt
+from tetopt.geometry.simplex import volumes
 from tetopt.optimize.complex import build, energies, floor_of, measure_all, node_rings
 from tetopt.optimize.density import (
     Sides,
@@ -210,3 +211,43 @@ def test_nodes_go_where_the_image_is():
         assert tetopt.quality(held.mesh.points, held.mesh.cells).min_dihedral >= 10.0
     assert nodes_near[True] > 1.3 * nodes_near[False]
     assert E_D[True] < 0.9 * E_D[False]
+
+
+@pytest.mark.parametrize("part", ["half", "slab", "no octant"])
+@pytest.mark.parametrize("boundary", ["slide", "fixed"])
+def test_a_part_of_the_box_stays_what_it_is(part, boundary):
+    """Its faces off the box meet the box's in creases: new nodes stay on both."""
+    index = np.stack(np.meshgrid(*[np.arange(24)] * 3, indexing="ij"), -1)
+    noise = np.random.default_rng(1).normal(size=(24,) * 3)
+    image = tetopt.Image(100.0 * (((index - 11) ** 2).sum(-1) < 50) + noise)
+    whole = tetopt.lattice(image, blocks=(4, 4, 4))
+    centre = whole.points[whole.cells].mean(axis=1)
+    kept = {
+        "half": centre[:, 0] < 11.5,
+        "slab": (centre[:, 0] > 5.5) & (centre[:, 0] < 17.5),
+        "no octant": ~(centre > 11.5).all(axis=1),
+    }[part]
+    used, cells = np.unique(whole.cells[kept], return_inverse=True)
+    start = tetopt.Mesh(whole.points[used], cells.reshape(-1, 4))
+    result = tetopt.optimize(image, start, k_D=0.75, nodes=3 * len(used), boundary=boundary, iterations=8)
+    assert len(result.mesh.points) > 1.5 * len(used)
+    assert tetopt.check_mesh(result.mesh) == []
+    assert volumes(result.mesh.points, result.mesh.cells).sum() == pytest.approx(
+        volumes(start.points, start.cells).sum(), rel=1e-9
+    )
+    assert result.history[-1].n_voxels == result.history[0].n_voxels
+
+
+@pytest.mark.parametrize("nodes", [0, -5, 189.5, "x"])
+def test_numbers_of_nodes_that_are_none(nodes):
+    image = tetopt.Image(np.random.default_rng(1).normal(size=(10, 10, 10)))
+    with pytest.raises(tetopt.InputError, match="nodes: expected a whole number"):
+        tetopt.optimize(image, tetopt.lattice(image, blocks=(2, 2, 2)), nodes=nodes)
+
+
+def test_far_more_nodes():
+    """From 35 nodes towards 8000: doubled at most at each exchange, none of them wrong."""
+    image = tetopt.Image(np.random.default_rng(1).normal(size=(20, 20, 20)))
+    result = tetopt.optimize(image, tetopt.lattice(image, blocks=(2, 2, 2)), k_D=0.9, nodes=8000, iterations=6)
+    assert 50 < len(result.mesh.points) < 8000
+    assert tetopt.check_mesh(result.mesh, image) == []

@@ -106,7 +106,7 @@ def test_nodes_do_not_follow_noise(monkeypatch):
         return float((index[:, 0] < 31.5).sum()) / len(index)
 
     known = share_in_wave()
-    monkeypatch.setattr(sys.modules["tetopt.optimize.octree"], "noise_level", lambda image: 0.0)
+    monkeypatch.setattr(sys.modules["tetopt.optimize.octree"], "noise_level", lambda data: 0.0)
     assert known > 0.75
     assert share_in_wave() < 0.7
 
@@ -128,16 +128,51 @@ def test_noise_level(shape, sigma):
     rng = np.random.default_rng(3)
     structure = 10.0 * sigma * np.sin(grid(*shape).sum(-1) / 6.0)
     noisy = structure + rng.normal(0.0, sigma, shape)
-    assert noise_level(tetopt.Image(noisy)) == pytest.approx(sigma, rel=0.08)
+    assert noise_level(noisy) == pytest.approx(sigma, rel=0.08)
     noisy[: shape[0] // 2] = 0.0
-    assert noise_level(tetopt.Image(noisy)) == pytest.approx(sigma, rel=0.08)
-    assert noise_level(tetopt.Image(np.zeros(shape))) == 0.0
+    assert noise_level(noisy) == pytest.approx(sigma, rel=0.08)
+    assert noise_level(np.zeros(shape)) == 0.0
 
 
-@pytest.mark.parametrize(("nodes", "words"), [(3, "9 nodes or more"), (500_000, "more than the image is worth")])
-def test_impossible_numbers_of_nodes(nodes, words):
+@pytest.mark.parametrize(
+    ("shape", "nodes", "words"),
+    [
+        ((30, 30, 30), 3, "9 or more in 3-D, got 3"),
+        ((30, 30, 30), 100.5, "whole number"),
+        ((30, 30, 30), 500_000, "the finest of this image has"),
+        ((200, 2, 2), 10, "the coarsest of this image has 89"),
+    ],
+)
+def test_impossible_numbers_of_nodes(shape, nodes, words):
     with pytest.raises(tetopt.InputError, match=words):
-        octree(ball(30, 30, 30), nodes)
+        octree(ball(*shape), nodes)
+
+
+@pytest.mark.parametrize("nodes", [50, 100, 200, 300, 500, 700, 1000, 1500, 2500])
+@pytest.mark.parametrize("kind", ["ball", "constant", "noise", "voxel"])
+def test_every_number_of_nodes(kind, nodes):
+    """Where many blocks are alike, too: a ball in the middle, nothing, noise, one bright voxel."""
+    shape = (32, 32, 32)
+    data = {
+        "ball": 100.0 * (((grid(*shape) - 15.5) ** 2).sum(-1) < 81),
+        "constant": np.ones(shape),
+        "noise": np.random.default_rng(0).normal(size=shape),
+        "voxel": np.where((grid(*shape) == 9).all(-1), 50.0, 0.0),
+    }[kind]
+    found = len(octree(tetopt.Image(data), nodes).points)
+    assert abs(found - nodes) <= max(0.07 * nodes, 30)
+
+
+@pytest.mark.parametrize("scale", [1e-150, 1e-30, 1e100])
+def test_scale_of_intensities(scale):
+    image = ball(30, 30, 30, noise=3.0)
+    expected = octree(image, 800).points
+    np.testing.assert_array_equal(octree(tetopt.Image(image.data * scale), 800).points, expected)
+
+
+def test_intensities_that_overflow():
+    with pytest.raises(tetopt.InputError, match="overflow"):
+        octree(tetopt.Image(ball(30, 30, 30, noise=1.0).data * 1e200), 800)
 
 
 def test_same_bits_for_any_number_of_threads():

@@ -70,9 +70,9 @@ def build(cells: NDArray[np.int64], ticks: NDArray[np.int64], measure: Measure) 
     return held
 
 
-def grown(held: Complex) -> Complex:
-    """The complex with room for a quarter more cells."""
-    more = held.n_cells[0] // 4 + 64
+def grown(held: Complex, least: int = 64) -> Complex:
+    """The complex with room for a quarter more cells, and for `least`."""
+    more = held.n_cells[0] // 4 + least
 
     def wider(array: NDArray) -> NDArray:
         return np.concatenate([array, np.full((more, *array.shape[1:]), -1, dtype=array.dtype)])

@@ -76,10 +76,11 @@ def exchange(
 ) -> Exchanged:
     """One round of splits and collapses towards `n_nodes` nodes, and of exchanges of a node for another.
 
-    Beyond those that the number asks for, up to `most` nodes are exchanged, as far as each lowers E. `held` and
-    `is_frozen` (N, 3) are out of date afterwards.
+    Beyond those that the number asks for, up to `most` nodes are exchanged, as far as each lowers E. One round doubles
+    the nodes at most. `held` and `is_frozen` (N, 3) are out of date afterwards.
     """
-    n_before, more = len(held.ticks), n_nodes - len(held.ticks)
+    n_before = len(held.ticks)
+    more, most = min(max(n_nodes - n_before, -n_before), n_before), min(most, n_before)
     rings, groups = node_rings(held), blocks(held.ticks)
     held = roomy(held, n_before, 16 * (max(more, 0) + most))
     is_frozen = np.concatenate([is_frozen, np.zeros_like(is_frozen)])
@@ -113,8 +114,8 @@ def _ring_errors(held: Complex, n_nodes: int) -> NDArray[np.float64]:
 
 def roomy(held: Complex, n_nodes: int, n_cells: int) -> Complex:
     """The complex with room for that many more nodes and cells; further rows of `ticks` are not nodes yet."""
-    while len(held.cells) - held.n_cells[0] < n_cells:
-        held = grown(held)
+    if len(held.cells) - held.n_cells[0] < n_cells:
+        held = grown(held, n_cells)
     more = np.zeros((n_nodes, 3), dtype=held.ticks.dtype)
     return held._replace(ticks=np.concatenate([held.ticks, more]))
 
@@ -172,7 +173,7 @@ def make_exchanges(
             break
         if does_split:
             a, b, p = in_[s], split[in_[s]], n_nodes + n_split
-            _put_middle(held, is_frozen, sides, a, b, p, _is_boundary_edge(held, rings, a, b))
+            _put_middle(held, rings, is_frozen, sides, a, b, p)
             split_edge(held, rings, a, b, p, is_dirty, measure)
             n_split += 1
         if does_collapse:
@@ -202,26 +203,41 @@ def _can_split(held: Complex, rings: NodeRings, a: int, b: int, is_dirty: NDArra
 
 
 @njit(cache=True, error_model="numpy")
-def _is_boundary_edge(held: Complex, rings: NodeRings, a: int, b: int) -> bool:
+def _sides_of_edge(held: Complex, rings: NodeRings, sides: Sides, a: int, b: int) -> int:
+    """The box's sides that an edge lies in, bit d for axis d; 0 inside, -1 if it is on the boundary elsewhere.
+
+    Asked are the boundary's facets at the edge, not its ends: they may lie in a side to which the edge is a crease.
+    """
+    found, t = 0, held.ticks
     for r in range(rings.start[a], rings.start[a + 1]):
         cell = rings.cells[r]
-        if has_node(held.cells, cell, b):
-            for k in range(held.cells.shape[1]):
-                if held.across[cell, k] < 0 and held.cells[cell, k] not in (a, b):
-                    return True
-    return False
+        if not has_node(held.cells, cell, b):
+            continue
+        for k in range(held.cells.shape[1]):
+            if held.across[cell, k] >= 0 or held.cells[cell, k] == a or held.cells[cell, k] == b:
+                continue
+            side = -1
+            for d in range(3):
+                at = t[a, d]
+                is_flat = at == sides.low[d] or at == sides.high[d]
+                for m in range(held.cells.shape[1]):
+                    is_flat = is_flat and (m == k or t[held.cells[cell, m], d] == at)
+                if is_flat:
+                    side = d
+            if side < 0:
+                return -1
+            found |= 1 << side
+    return found
 
 
 @njit(cache=True, error_model="numpy")
-def _put_middle(held: Complex, is_frozen: NDArray, sides: Sides, a: int, b: int, p: int, is_boundary: bool) -> bool:
-    """Put the node p at the middle of an edge; False if that is on the boundary but in none of the box's sides."""
-    t, is_on_side = held.ticks, False
+def _put_middle(held: Complex, rings: NodeRings, is_frozen: NDArray, sides: Sides, a: int, b: int, p: int) -> bool:
+    """Put the node p at the middle of an edge; False if that is on the boundary off the box's sides, which stays."""
+    found = _sides_of_edge(held, rings, sides, a, b)
     for d in range(3):
-        t[p, d] = (t[a, d] + t[b, d]) >> 1
-        is_same = t[a, d] == t[b, d] and (t[a, d] == sides.low[d] or t[a, d] == sides.high[d])
-        is_on_side = is_on_side or (is_same and is_frozen[a, d] and is_frozen[b, d])
-        is_frozen[p, d] = is_boundary and (sides.is_fixed or (is_same and is_frozen[a, d] and is_frozen[b, d]))
-    return is_on_side or not is_boundary
+        held.ticks[p, d] = (held.ticks[a, d] + held.ticks[b, d]) >> 1
+        is_frozen[p, d] = found > 0 and (sides.is_fixed or (found >> d) & 1 == 1)
+    return found >= 0
 
 
 def mend(
@@ -261,13 +277,13 @@ def _mend(
                 if gain > best:
                     best, best_a, best_b, is_split = gain, a, b, False
                 if i < j and _can_split(held, rings, a, b, is_dirty):
-                    is_inside = _put_middle(held, is_frozen, sides, a, b, p, _is_boundary_edge(held, rings, a, b))
-                    gain = _lift_by_split(x, held, rings, a, b, p, measure, target) if is_inside else -1.0
+                    may_split = _put_middle(held, rings, is_frozen, sides, a, b, p)
+                    gain = _lift_by_split(x, held, rings, a, b, p, measure, target) if may_split else -1.0
                     if gain > best:
                         best, best_a, best_b, is_split = gain, a, b, True
         if best_a >= 0 and is_split:
-            p, is_boundary = n_nodes + n_split, _is_boundary_edge(held, rings, best_a, best_b)
-            _put_middle(held, is_frozen, sides, best_a, best_b, p, is_boundary)
+            p = n_nodes + n_split
+            _put_middle(held, rings, is_frozen, sides, best_a, best_b, p)
             split_edge(held, rings, best_a, best_b, p, is_dirty, measure)
             n_split += 1
         elif best_a >= 0:
@@ -355,9 +371,7 @@ def _best_split(
     x, near = np.empty((4, 3)), np.empty(NEIGHBOURS, dtype=np.int64)
     for number in range(_neighbours(near, held, rings, a)):
         b, p = near[number], n_nodes + a
-        if (b > a or not is_wanted[b]) and _put_middle(
-            held, is_frozen, sides, a, b, p, _is_boundary_edge(held, rings, a, b)
-        ):
+        if (b > a or not is_wanted[b]) and _put_middle(held, rings, is_frozen, sides, a, b, p):
             worth = worth_of_split(x, held, rings, a, b, p, measure, gain[a])
             if worth > gain[a]:
                 gain[a], split[a] = worth, b

@@ -57,7 +57,7 @@ from tetopt.optimize.paper import (
 from tetopt.optimize.repair import repair, worst_angles
 from tetopt.optimize.smooth import blocks, sweep
 
-GRADED_K_D = 0.75  # on the MNI152 T1 with 15,000 nodes: E_D a fifth of the octree's, mean rho above 0.25
+GRADED_K_D = 0.75  # on the MNI152 T1 with 15,000 nodes: a third of the uniform mesh's E_D, mean rho above 0.25
 STILL = 0.05  # of an edge: nodes that moved less need no new flips
 QUIET = 0.02  # of an edge: nodes around which none moved more are not moved again
 EXCHANGES = 0.7  # of the iterations: those after which nodes are exchanged
@@ -105,8 +105,9 @@ def optimize(
     nodes : int, optional
         Put nodes where they lower E most, towards this number of them: on a graded mesh, such as `octree`. Every
         cell's shape then counts the same, whatever its size (see `tetopt.optimize.complex.shape_energy`), and nodes
-        are exchanged in the first iterations, if k_D > 0. By default the nodes of `mesh` are kept, and the shape energy
-        is that of Eq. (1).
+        are exchanged in the first iterations, if k_D > 0. An exchange doubles them at most, so that few iterations, or
+        a number far from that of `mesh`, may miss it; count them. By default the nodes of `mesh` are kept, and the
+        shape energy is that of Eq. (1).
     tolerance : float
         Converged when E falls by less, relatively, in an iteration.
     max_seconds : float, optional
@@ -130,7 +131,7 @@ def optimize(
         An option out of range; a mesh that the sampling cannot take (see `tetopt.cell_moments`), that is folded or
         has a facet in more than two cells, or a cell too flat to have a shape energy; or energies that overflow.
     """
-    check_options(k_D, iterations, shape_power, min_dihedral, boundary)
+    check_options(k_D, iterations, shape_power, min_dihedral, boundary, nodes)
     begin = time.perf_counter()
     is_over = deadline(begin, max_seconds, stop)
     run = _Run(image, mesh, k_D, shape_power, boundary, is_graded=nodes is not None)
@@ -176,7 +177,7 @@ def mesh_image(image: Image, nodes: int, *, k_D: float = GRADED_K_D, **options: 
     image : Image
         The intensities h.
     nodes : int
-        Number of nodes, met exactly or nearly so.
+        Number of nodes, met exactly unless the run is cut short, k_D is 0, or cells have to be lifted over the floor.
     k_D : float
         Weight of the image. Cells of all sizes share the shape energy, and the octree that normalises E_D has a small
         one already, so that more of it than on a uniform mesh is usual.
@@ -257,11 +258,11 @@ class _Run:
         # Where every cell is uniform, what rounding leaves of E_D must not become the unit that E_D is measured in.
         self.noise = NOISE * float(np.var(image.data, dtype=np.float64)) * image.data.size
         self.E_G0, self.squares0 = self.energies()
-        if not (0.0 < self.E_G0 < np.inf and np.isfinite(self.squares0)):
+        weight = k_D / self.squares0 if self.squares0 > 0.0 else 0.0
+        if not (0.0 < self.E_G0 < np.inf and np.isfinite(self.squares0) and np.isfinite(weight)):
             raise InputError(
                 "mesh and image: their energies overflow; are lengths in mm and intensities of usual size?"
             )
-        weight = k_D / self.squares0 if self.squares0 > 0.0 else 0.0
         self.measure: Measure = measure_of(
             self.grid, hand, self.matrix, (1.0 - k_D) / self.E_G0, weight, power, is_graded
         )
@@ -365,7 +366,9 @@ def _edges(mesh: Mesh) -> NDArray[np.float64]:
     return (2.0**0.5 * 6.0 * mean) ** (1 / 3) if n == 3 else (4.0 / 3.0**0.5 * mean) ** 0.5
 
 
-def check_options(k_D: float, iterations: int, shape_power: float, min_dihedral: float, boundary: str) -> None:
+def check_options(
+    k_D: float, iterations: int, shape_power: float, min_dihedral: float, boundary: str, nodes: int | None = None
+) -> None:
     """InputError for an option of `optimize` out of range."""
     if not 0.0 <= k_D < 1.0:
         raise InputError(f"k_D: expected 0 <= k_D < 1, got {k_D}")
@@ -377,5 +380,7 @@ def check_options(k_D: float, iterations: int, shape_power: float, min_dihedral:
         raise InputError(
             f"min_dihedral: expected 0 to below 70 degrees, got {min_dihedral}; a regular tetrahedron has 70.5"
         )
+    if nodes is not None and not (isinstance(nodes, int | np.integer) and nodes > 2):
+        raise InputError(f"nodes: expected a whole number above 2, or None to keep those of the mesh, got {nodes!r}")
     if boundary not in ("slide", "fixed"):
         raise InputError(f"boundary: expected slide or fixed, got {boundary!r}")

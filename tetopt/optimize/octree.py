@@ -30,6 +30,9 @@ MARGIN = 2.0  # standard deviations of a sum of squared noise that are not taken
 STEPS = 60  # of the bisection for the number of nodes
 TIE_BREAKS = (1e-5, 1e-4, 1e-3)  # see `delaunay`, tried in turn: with 1e-7, 2 of 88,661 cells were flat
 FLAT = 1e-6  # of the mean volume: such a cell is flat
+TIE = 0.05  # of a block's error: what decides between blocks that are alike
+MISS = 0.1  # of the nodes wanted: a larger miss is an error
+FEW = 40  # nodes, about what one block more or less makes
 NEAR = 0.002  # of the nodes wanted: a miss that is good enough
 
 
@@ -41,7 +44,7 @@ def octree(image: Image, nodes: int) -> Mesh:
     image : Image
         Its box, index -0.5 to shape - 0.5 along each axis, is covered exactly.
     nodes : int
-        Wanted number of nodes. The octree that comes nearest has a few per cent more or less.
+        Wanted number of nodes. The octree that comes nearest has a few per cent more or less, of few a few dozen.
 
     Returns
     -------
@@ -51,17 +54,18 @@ def octree(image: Image, nodes: int) -> Mesh:
     Raises
     ------
     InputError
-        More nodes than the smallest leaves have, or fewer than the largest.
+        More nodes than the smallest leaves have, or fewer than the largest; or intensities whose squares overflow.
     """
     n = image.ndim
     fewest = 2**n + 1
-    if nodes < fewest:
-        raise InputError(f"octree: expected {fewest} nodes or more in {n}-D, got {nodes}")
+    if not (isinstance(nodes, int | np.integer) and nodes >= fewest):
+        raise InputError(f"octree: expected a whole number of nodes, {fewest} or more in {n}-D, got {nodes!r}")
     count, roots, divided = _closest(image, nodes, fewest)
-    if count < 0.9 * nodes:
+    if abs(count - nodes) > max(MISS * nodes, FEW):
+        which = "finest" if count < nodes else "coarsest"
         raise InputError(
-            f"octree: {nodes} nodes are more than the image is worth: leaves of {SMALLEST:g} voxels have {count}; "
-            "ask for fewer, or for a uniform mesh"
+            f"octree: expected a number of nodes that its blocks can have, got {nodes}; the {which} of this image has "
+            f"{count}: ask for about as many, or for a uniform mesh"
         )
     index = _places(divided, roots) / np.array(roots) * image.shape - 0.5
     points = image.to_world(index)
@@ -72,22 +76,22 @@ def octree(image: Image, nodes: int) -> Mesh:
     raise InputError(f"octree: Delaunay left flat cells on {len(index)} nodes; ask for another number")
 
 
-def noise_level(image: Image) -> float:
-    """Standard deviation of the image's noise, from what is left of it by second differences along every axis.
+def noise_level(data: NDArray[np.floating]) -> float:
+    """Standard deviation of the noise in an image's data, from what second differences along every axis leave of it.
 
     Structure wider than a voxel cancels in (1, -2, 1) taken along all axes (Immerkaer 1996, here in n-D); the median of
     its size, over the voxels where it is not zero, is that of noise in most of the volume. Exact zeros are a background
     that was cut out, and have none. Noise that was smoothed is underestimated.
     """
-    rest = image.data.astype(np.float64)
-    for axis in range(image.ndim):
+    rest = data.astype(np.float64)
+    for axis in range(data.ndim):
         if rest.shape[axis] < 3:
             return 0.0
         rest = np.diff(rest, n=2, axis=axis)
     size = np.abs(rest[rest != 0.0])
     if len(size) == 0:
         return 0.0
-    return float(np.median(size) / 0.6745 / 6.0 ** (image.ndim / 2))
+    return float(np.median(size) / 0.6745 / 6.0 ** (data.ndim / 2))
 
 
 def _errors(image: Image, roots: tuple[int, ...]) -> list[NDArray[np.float64]]:
@@ -99,8 +103,12 @@ def _errors(image: Image, roots: tuple[int, ...]) -> list[NDArray[np.float64]]:
         edge / 2 ** (n_levels + 1) / image.spacing
     ).min() >= 0.25 * SMALLEST:
         n_levels += 1
-    variance = noise_level(image) ** 2
     data = image.data.astype(np.float64) - float(np.mean(image.data, dtype=np.float64))
+    scale = float(np.abs(data).max())
+    if not np.isfinite(scale * scale * data.size):
+        raise InputError(f"image: squares of deviations up to {scale:.3g} overflow; rescale it first")
+    data /= scale if scale > 0.0 else 1.0
+    variance = noise_level(data) ** 2
     spread = SPREAD * float(np.mean(data * data)) + SPREAD_OF_NOISE * variance
     sums = [np.ones(image.shape), data, data * data]
     sums = [_blocks(total, np.array(roots) << n_levels) for total in sums]
@@ -110,10 +118,21 @@ def _errors(image: Image, roots: tuple[int, ...]) -> list[NDArray[np.float64]]:
         free = np.maximum(count - 1.0, 0.0)
         noise = variance * (free + MARGIN * np.sqrt(2.0 * free))  # a chi-squared sum, and deviations of it
         error = np.maximum(second - first**2 / np.maximum(count, 1.0) - noise, 0.0)
-        found.append(error + spread * count)
+        found.append((error + spread * count) * _uneven(error.shape))
         if len(found) <= n_levels:
             sums = [_blocks(total, np.array(total.shape) // 2) for total in sums]
     return found[::-1]
+
+
+def _uneven(shape: tuple[int, ...]) -> NDArray[np.float64]:
+    """Factors 1 to 1 + `TIE`, all different: blocks that are alike are divided one after the other, here and there.
+
+    The fractional parts of multiples of the plastic number's powers fill any region evenly (Roberts 2018).
+    """
+    place = np.stack(np.meshgrid(*[np.arange(s) for s in shape], indexing="ij"), axis=-1)
+    return 1.0 + TIE * np.mod(
+        place @ np.array([0.8191725133961645, 0.6710436067037893, 0.5497004779019703])[: place.shape[-1]], 1.0
+    )
 
 
 def _blocks(data: NDArray[np.float64], counts: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -154,7 +173,9 @@ def _nearest(
     errors: list[NDArray[np.float64]], roots: tuple[int, ...], nodes: int
 ) -> tuple[int, list[NDArray[np.bool_]]]:
     """The threshold of error above which blocks are divided, by bisection: nodes, and the blocks divided."""
-    low, high = float(min(error.min() for error in errors)) * 0.5, float(errors[0].max()) * 2.0 + 1e-300
+    # A finer level may hold the largest error: noise is taken off the coarser ones, too.
+    low, high = (f([f(error) for error in errors]) for f in (np.min, np.max))
+    low, high = 0.5 * float(low), 2.0 * float(high) + 1e-300
     best, found = -1, []
     for _ in range(STEPS):
         middle = np.sqrt(max(low, 1e-300) * high)
