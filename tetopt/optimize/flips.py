@@ -14,7 +14,7 @@ the threads, and E falls by what was measured.
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit, prange
@@ -110,8 +110,7 @@ def flip(
             is_dirty = np.concatenate([is_dirty, np.zeros(len(held.cells) - len(is_dirty), dtype=np.bool_)])
         n_cells = int(held.n_cells[0])
         gain, move = np.zeros(n_cells), np.full(n_cells, -1, dtype=np.int64)
-        with few_threads(n_cells * 4):
-            _evaluate(gain, move, is_dirty, held, measure)
+        _evaluate(gain, move, is_dirty, held, measure)
         order = np.flatnonzero(move >= 0)
         if len(order) == 0:
             break
@@ -126,43 +125,41 @@ def flip(
     return held, done
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
 def _evaluate(gain: NDArray, move: NDArray, is_dirty: NDArray, held: Complex, measure: Measure) -> None:
-    n_cells = len(gain)
-    for chunk in prange((n_cells + CHUNK - 1) // CHUNK):
-        if held.cells.shape[1] == 3:
-            _evaluate_triangles(gain, move, is_dirty, held, measure, chunk * CHUNK, min((chunk + 1) * CHUNK, n_cells))
-        else:
-            _evaluate_cells(gain, move, is_dirty, held, measure, chunk * CHUNK, min((chunk + 1) * CHUNK, n_cells))
+    """The move worth most of each cell, and its worth, to `move` (C,) and `gain` (C,)."""
+    with few_threads(len(gain) * 4):
+        kernel = _evaluate_triangles if held.cells.shape[1] == 3 else _evaluate_cells
+        kernel(gain, move, is_dirty, held, measure)
 
 
-@njit(cache=True, error_model="numpy")
-def _evaluate_cells(
-    gain: NDArray, move: NDArray, is_dirty: NDArray, held: Complex, measure: Measure, first: int, last: int
-) -> None:
-    """The move worth most of each cell: 0 to 3 flips that facet, 4 to 9 removes an edge of `EDGES`."""
-    work = cavity(0)
-    for cell in range(first, last):
-        for k in range(4):
-            other = held.across[cell, k]
-            if other > cell and (is_dirty[cell] or is_dirty[other]):
-                worth = _worth_of_face(work, held, cell, k, measure)
+# Both loops are in the parallel function itself: each level of calls is optimised again, 3 s of compiling.
+@njit(cache=True, parallel=True, error_model="numpy")
+def _evaluate_cells(gain: NDArray, move: NDArray, is_dirty: NDArray, held: Complex, measure: Measure) -> None:
+    """Moves 0 to 3 flip that facet, 4 to 9 remove an edge of `EDGES`."""
+    for chunk in prange((len(gain) + CHUNK - 1) // CHUNK):
+        work = cavity(0)
+        first: Any = np.int64(chunk) * CHUNK
+        for cell in range(first, min(first + CHUNK, len(gain))):
+            for k in range(4):
+                other = held.across[cell, k]
+                if other > cell and (is_dirty[cell] or is_dirty[other]):
+                    worth = _worth_of_face(work, held, cell, k, measure)
+                    if worth > gain[cell]:
+                        gain[cell], move[cell] = worth, k
+            for e in range(6):
+                beyond, before = held.across[cell, EDGES[5 - e, 0]], held.across[cell, EDGES[5 - e, 1]]
+                if 0 <= beyond < cell or 0 <= before < cell:
+                    continue  # a lower cell has the edge too, and looks at it
+                m, is_open = ring_of_edge(work.ring, work.around, held, cell, EDGES[e, 0], EDGES[e, 1], True)
+                dirty = False
+                for r in range(m - is_open):
+                    dirty = dirty or is_dirty[work.around[r]]
+                if not dirty:
+                    continue
+                a, b = held.cells[cell, EDGES[e, 0]], held.cells[cell, EDGES[e, 1]]
+                worth = _worth_of_edge(work, held, a, b, m, is_open, measure)
                 if worth > gain[cell]:
-                    gain[cell], move[cell] = worth, k
-        for e in range(6):
-            beyond, before = held.across[cell, EDGES[5 - e, 0]], held.across[cell, EDGES[5 - e, 1]]
-            if 0 <= beyond < cell or 0 <= before < cell:
-                continue  # a lower cell has the edge too, and looks at it
-            m, is_open = ring_of_edge(work.ring, work.around, held, cell, EDGES[e, 0], EDGES[e, 1], True)
-            dirty = False
-            for r in range(m - is_open):
-                dirty = dirty or is_dirty[work.around[r]]
-            if not dirty:
-                continue
-            a, b = held.cells[cell, EDGES[e, 0]], held.cells[cell, EDGES[e, 1]]
-            worth = _worth_of_edge(work, held, a, b, m, is_open, measure)
-            if worth > gain[cell]:
-                gain[cell], move[cell] = worth, 4 + e
+                    gain[cell], move[cell] = worth, 4 + e
 
 
 @njit(cache=True, error_model="numpy")
@@ -714,18 +711,19 @@ def close_gaps(held: Complex, is_dirty: NDArray) -> None:
 # Triangles.
 
 
-@njit(cache=True, error_model="numpy")
-def _evaluate_triangles(
-    gain: NDArray, move: NDArray, is_dirty: NDArray, held: Complex, measure: Measure, first: int, last: int
-) -> None:
-    x = np.empty((4, 3))
-    for cell in range(first, last):
-        for k in range(3):
-            other = held.across[cell, k]
-            if other > cell and (is_dirty[cell] or is_dirty[other]):
-                worth = _worth_of_turn(x, held, cell, k, measure)
-                if worth > gain[cell]:
-                    gain[cell], move[cell] = worth, k
+@njit(cache=True, parallel=True, error_model="numpy")
+def _evaluate_triangles(gain: NDArray, move: NDArray, is_dirty: NDArray, held: Complex, measure: Measure) -> None:
+    """Moves 0 to 2 turn that edge."""
+    for chunk in prange((len(gain) + CHUNK - 1) // CHUNK):
+        x = np.empty((4, 3))
+        first: Any = np.int64(chunk) * CHUNK
+        for cell in range(first, min(first + CHUNK, len(gain))):
+            for k in range(3):
+                other = held.across[cell, k]
+                if other > cell and (is_dirty[cell] or is_dirty[other]):
+                    worth = _worth_of_turn(x, held, cell, k, measure)
+                    if worth > gain[cell]:
+                        gain[cell], move[cell] = worth, k
 
 
 @njit(cache=True, error_model="numpy")

@@ -320,17 +320,10 @@ def _sweep(
     measure: Measure, projections: NDArray, inverse: NDArray,
 ) -> None:  # fmt: skip
     for number in prange(len(chosen)):
-        _move_block(chosen[number], held, rings, groups, is_wanted, is_frozen, measure, projections, inverse)
-
-
-@njit(cache=True, error_model="numpy")
-def _move_block(
-    block: int, held: Complex, rings: NodeRings, groups: Blocks, is_wanted: NDArray, is_frozen: NDArray,
-    measure: Measure, projections: NDArray, inverse: NDArray,
-) -> None:  # fmt: skip
-    for at in range(groups.start[block], groups.start[block + 1]):
-        if is_wanted[groups.nodes[at]]:
-            _move(groups.nodes[at], held, rings, is_frozen, measure, projections, inverse)
+        block = np.int64(chosen[number])
+        for at in range(groups.start[block], groups.start[block + 1]):
+            if is_wanted[groups.nodes[at]]:
+                _move(groups.nodes[at], held, rings, is_frozen, measure, projections, inverse)
 
 
 @njit(cache=True, error_model="numpy")
