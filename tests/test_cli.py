@@ -847,7 +847,44 @@ def test_figures(tmp_path, inputs):
 def test_many_more_cells_than_voxels_are_said(tmp_path, capsys):
     save_image(tmp_path / "few.nii", Image(np.arange(27.0).reshape(3, 3, 3)))
     assert main(["mesh", str(tmp_path / "few.nii"), "-o", str(tmp_path / "a.vtu"), "--nodes", "500"]) == 0
-    assert "cells for 27 voxels" in capsys.readouterr().err
+    found = re.search(r"(\d+) of (\d+) cells hold no voxel centre", capsys.readouterr().err)
+    empty, n_cells = map(int, found.groups())
+    mesh = tetopt.load_mesh(tmp_path / "a.vtu")
+    assert (empty, n_cells) == ((mesh.cell_data["n_voxels"] == 0).sum(), len(mesh.mesh.cells))
+
+
+@pytest.mark.parametrize(
+    ("extra", "words"),
+    [
+        (["--method", "paper"], "only with --method fast"),
+        (["--spacing", "3"], "no one spacing"),
+        (["--nodes", "3"], "9 or more in 3-D, got 3"),
+        (["--nodes", "900000"], "too many for 16 x 16 x 16 voxels"),
+    ],
+)
+def test_octree_options(tmp_path, inputs, capsys, extra, words):
+    """What an octree cannot do is one line, exit 2, and no file."""
+    path = tmp_path / "a.vtu"
+    assert main(["mesh", str(inputs / "sphere.nii.gz"), "-o", str(path), "--lattice", "octree", *extra]) == 2
+    error = capsys.readouterr().err.strip().splitlines()[-1]
+    assert words in error
+    assert not path.exists()
+
+
+def test_octree_mesh(tmp_path, inputs, capsys):
+    """The number of nodes is met, and the terminal calls the start what it is."""
+    path = tmp_path / "a.vtu"
+    words = ["mesh", str(inputs / "sphere.nii.gz"), "-o", str(path), "--lattice", "octree", "--nodes", "400"]
+    assert main(words) == 0
+    printed = capsys.readouterr()
+    assert "octree of" in printed.err
+    assert printed.out.split()[0] == "octree"
+    loaded = tetopt.load_mesh(path)
+    assert len(loaded.mesh.points) == 400
+    assert main([*words, "--force", "--k-d", "0", "--iterations", "1"]) == 0
+    err = capsys.readouterr().err
+    missed = len(tetopt.load_mesh(path).mesh.points)
+    assert (f"{missed} nodes instead of 400" in err) == (abs(missed - 400) > 4)
 
 
 # --------------------------------------------------------------------------------------------------

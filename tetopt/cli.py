@@ -248,8 +248,10 @@ def mesh_command(
     if nodes is not None and spacing is not None:
         raise InputError("--nodes and --spacing: give one of them")
     is_graded = lattice_kind is Lattice.octree
-    if is_graded and (method is Method.paper or spacing is not None):
-        raise InputError("--lattice octree: goes with --nodes and --method fast only")
+    if is_graded and method is Method.paper:
+        raise InputError("--lattice octree: only with --method fast, got --method paper")
+    if is_graded and spacing is not None:
+        raise InputError("--lattice octree: has no one spacing; give --nodes instead of --spacing")
     k_D = (GRADED_K_D if is_graded else 0.2) if k_D is None else k_D
     if not 0.0 <= k_D < 1.0:
         raise InputError(f"--k-d: expected 0 <= k_D < 1, got {k_D}")
@@ -303,7 +305,7 @@ def _mesh_files(
 ) -> int:
     """Optimise, write the mesh, the numbers and the pictures, print the comparison; the exit code."""
     about = {"image": image_path.name, "image_sha256": sha256(image_path), "options": options | source}
-    log.print(escape(_described(image_path, image, initial)))
+    log.print(escape(_described(image_path, image, initial, options.get("nodes"))))
     loaded = time.perf_counter()
     max_seconds = source["max_seconds"]
     left = None if max_seconds is None else max(max_seconds - (loaded - begin), 1e-9)
@@ -320,7 +322,7 @@ def _mesh_files(
     # Everything is written; what is printed may go into a pipe that closes.
     code = 130 if is_interrupted else _promises(image, result, options.get("min_dihedral", 0.0))
     _warn(image, result, Method(source["method"]), options.get("nodes"))
-    _print_comparison(initial, result)
+    _print_comparison(initial, result, "lattice" if options.get("nodes") is None else "octree")
     out.print(escape(f"{output}: {len(result.mesh.points)} nodes, {len(result.mesh.cells)} cells"))
     if json_path is not None:
         out.print(escape(f"{json_path}: every number of the run"))
@@ -340,10 +342,11 @@ def _warn(image: Image, result: Optimized, method: Method, nodes: int | None) ->
             f"E ended at {last:.4f}, above {lowest:.4f} on the way: a tessellation taken in the first n_t iterations "
             "raised it; --retessellate accept takes only those that lower it"
         )
-    if len(result.mesh.cells) > image.data.size:
+    n_empty = int((tetopt.cell_moments(image, result.mesh).n_voxels == 0).sum())
+    if n_empty > 0.02 * len(result.mesh.cells) and image.data.min() < image.data.max():
         _show_warning(
-            f"{len(result.mesh.cells)} cells for {image.data.size} voxels: most hold no voxel centre; "
-            "ask for fewer nodes"
+            f"{n_empty} of {len(result.mesh.cells)} cells hold no voxel centre: E_D does not see them, and their "
+            "values are the nearest voxel's; ask for fewer nodes"
         )
 
 
@@ -387,10 +390,11 @@ def _set_threads(threads: int | None) -> None:
     numba.set_num_threads(threads)
 
 
-def _described(path: Path, image: Image, initial: Mesh) -> str:
+def _described(path: Path, image: Image, initial: Mesh, nodes: int | None) -> str:
+    kind = "lattice" if nodes is None else "octree"
     size = " x ".join(str(s) for s in image.shape)
     spacing = " x ".join(f"{s:.4g}" for s in image.spacing)
-    return f"{path}: {size} voxels of {spacing} mm; lattice of {len(initial.points)} nodes, {len(initial.cells)} cells"
+    return f"{path}: {size} voxels of {spacing} mm; {kind} of {len(initial.points)} nodes, {len(initial.cells)} cells"
 
 
 def _promises(image: Image, result: Optimized, min_dihedral: float) -> int:
@@ -497,11 +501,11 @@ def _progress(iterations: int) -> Iterator[Callable[[Record], None]]:
         )
 
 
-def _print_comparison(initial: Mesh, result: Optimized) -> None:
+def _print_comparison(initial: Mesh, result: Optimized, start: str) -> None:
     first, last = result.history[0], result.history[-1]
     before = quality(initial.points, initial.cells)
     after = quality(result.mesh.points, result.mesh.cells)
-    table = _table("", "lattice", "optimised")
+    table = _table("", start, "optimised")
     table.add_row("E, combined", f"{first.E:.4f}", f"{last.E:.4f}")
     table.add_row("E_G, of initial", "1.0000", f"{last.E_G / first.E_G:.4f}")
     if first.E_D > 0.0:

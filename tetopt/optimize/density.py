@@ -586,7 +586,10 @@ def _best_collapse(
 
 @njit(cache=True, error_model="numpy")
 def may_join(ticks: NDArray, is_frozen: NDArray, a: int, b: int) -> bool:
-    """Whether a may go where b is: it has to stay in the sides of the box that it is in."""
+    """Whether a may go where b is: it has to stay in the sides of the box that it is in.
+
+    The ring would lose volume otherwise (`_keeps_size`), which costs more to find out.
+    """
     may = True
     for d in range(3):
         may = may and (not is_frozen[a, d] or (is_frozen[b, d] and ticks[a, d] == ticks[b, d]))

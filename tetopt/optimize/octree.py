@@ -49,12 +49,13 @@ def octree(image: Image, nodes: int) -> Mesh:
     Returns
     -------
     Mesh
-        Conforming, positively oriented, every node used, its volume that of the box.
+        Triangles or tetrahedra: conforming, positively oriented, every node used, the volume that of the box.
 
     Raises
     ------
     InputError
-        More nodes than the smallest leaves have, or fewer than the largest; or intensities whose squares overflow.
+        More nodes than leaves of 2 voxels can have, or fewer than undivided blocks; or intensities whose squares
+        overflow.
     """
     n = image.ndim
     fewest = 2**n + 1
@@ -62,10 +63,10 @@ def octree(image: Image, nodes: int) -> Mesh:
         raise InputError(f"octree: expected a whole number of nodes, {fewest} or more in {n}-D, got {nodes!r}")
     count, roots, divided = _closest(image, nodes, fewest)
     if abs(count - nodes) > max(MISS * nodes, FEW):
-        which = "finest" if count < nodes else "coarsest"
+        shape, word = " x ".join(map(str, image.shape)), "many" if count < nodes else "few"
         raise InputError(
-            f"octree: expected a number of nodes that its blocks can have, got {nodes}; the {which} of this image has "
-            f"{count}: ask for about as many, or for a uniform mesh"
+            f"octree: {nodes} nodes are too {word} for {shape} voxels: the nearest octree found has {count}; ask for "
+            "about as many, or for a uniform mesh"
         )
     index = _places(divided, roots) / np.array(roots) * image.shape - 0.5
     points = image.to_world(index)
