@@ -311,7 +311,8 @@ def _mesh_files(
     left = None if max_seconds is None else max(max_seconds - (loaded - begin), 1e-9)
     result, is_interrupted = _optimized(image, initial, Method(source["method"]), left, **options)
     optimized = time.perf_counter()
-    save_mesh(output, result.mesh, cell_fields(result.mesh, image), {"tetopt": tetopt.__version__, **about})
+    fields = cell_fields(result.mesh, image)
+    save_mesh(output, result.mesh, fields, {"tetopt": tetopt.__version__, **about})
     if json_path is not None:
         seconds = {"load": loaded - begin, "optimize": optimized - loaded, "all": time.perf_counter() - begin}
         save_json(json_path, run_summary(image, initial, result, about, seconds))
@@ -321,7 +322,8 @@ def _mesh_files(
         save_run_figures(pictures, image, initial, result)
     # Everything is written; what is printed may go into a pipe that closes.
     code = 130 if is_interrupted else _promises(image, result, options.get("min_dihedral", 0.0))
-    _warn(image, result, Method(source["method"]), options.get("nodes"))
+    n_empty = 0 if image.data.min() == image.data.max() else int((fields["n_voxels"] == 0).sum())
+    _warn(result, Method(source["method"]), options.get("nodes"), n_empty)
     _print_comparison(initial, result, "lattice" if options.get("nodes") is None else "octree")
     out.print(escape(f"{output}: {len(result.mesh.points)} nodes, {len(result.mesh.cells)} cells"))
     if json_path is not None:
@@ -331,8 +333,8 @@ def _mesh_files(
     return code
 
 
-def _warn(image: Image, result: Optimized, method: Method, nodes: int | None) -> None:
-    """Say what is allowed but hardly meant; `nodes` are those that a graded mesh was to have."""
+def _warn(result: Optimized, method: Method, nodes: int | None, n_empty: int) -> None:
+    """Say what is allowed but hardly meant; `nodes` were asked of a graded mesh, `n_empty` cells hold no voxel centre."""
     found = len(result.mesh.points)
     if nodes is not None and abs(found - nodes) > 0.01 * nodes:
         _show_warning(f"{found} nodes instead of {nodes}: more iterations, or a --k-d above 0, come nearer")
@@ -342,8 +344,7 @@ def _warn(image: Image, result: Optimized, method: Method, nodes: int | None) ->
             f"E ended at {last:.4f}, above {lowest:.4f} on the way: a tessellation taken in the first n_t iterations "
             "raised it; --retessellate accept takes only those that lower it"
         )
-    n_empty = int((tetopt.cell_moments(image, result.mesh).n_voxels == 0).sum())
-    if n_empty > 0.02 * len(result.mesh.cells) and image.data.min() < image.data.max():
+    if n_empty > 0.02 * len(result.mesh.cells):
         _show_warning(
             f"{n_empty} of {len(result.mesh.cells)} cells hold no voxel centre: E_D does not see them, and their "
             "values are the nearest voxel's; ask for fewer nodes"

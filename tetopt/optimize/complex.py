@@ -206,9 +206,9 @@ def shape_energy(x: NDArray, n_corners: int, power: float, is_graded: bool) -> f
     Corners come from `load`, which subtracts in integers: rounding of the signed volume is far below `FLAT`, so a cell
     that passes is positively oriented exactly.
     """
-    u1, u2 = x[1, 1] - x[0, 1], x[1, 2] - x[0, 2]
-    v1, v2 = x[2, 1] - x[0, 1], x[2, 2] - x[0, 2]
     if n_corners == 3:
+        u1, u2 = x[1, 1] - x[0, 1], x[1, 2] - x[0, 2]
+        v1, v2 = x[2, 1] - x[0, 1], x[2, 2] - x[0, 2]
         volume = 0.5 * (u1 * v2 - u2 * v1)
         S = u1 * u1 + u2 * u2 + v1 * v1 + v2 * v2 + (u1 - v1) * (u1 - v1) + (u2 - v2) * (u2 - v2)
         if volume <= FLAT * S:
@@ -218,13 +218,21 @@ def shape_energy(x: NDArray, n_corners: int, power: float, is_graded: bool) -> f
             return eta**power
         E_G = volume * S / 12.0
         return E_G if power == 1.0 else E_G * eta ** (power - 1.0)
-    u0, v0 = x[1, 0] - x[0, 0], x[2, 0] - x[0, 0]
+    determinant, S = determinant_and_squares(x)
+    return tet_energy(determinant, S, power, is_graded)
+
+
+@njit(cache=True, error_model="numpy")
+def determinant_and_squares(x: NDArray) -> tuple:
+    """Six times the signed volume of the tetrahedron x (4, 3), and the sum of its squared edges."""
+    u0, u1, u2 = x[1, 0] - x[0, 0], x[1, 1] - x[0, 1], x[1, 2] - x[0, 2]
+    v0, v1, v2 = x[2, 0] - x[0, 0], x[2, 1] - x[0, 1], x[2, 2] - x[0, 2]
     w0, w1, w2 = x[3, 0] - x[0, 0], x[3, 1] - x[0, 1], x[3, 2] - x[0, 2]
     determinant = u0 * (v1 * w2 - v2 * w1) + u1 * (v2 * w0 - v0 * w2) + u2 * (v0 * w1 - v1 * w0)
     # The sum over all pairs of four points is four times the sum over the points less that of their sum, squared.
     s0, s1, s2 = u0 + v0 + w0, u1 + v1 + w1, u2 + v2 + w2
     S = 4.0 * (u0 * u0 + u1 * u1 + u2 * u2 + v0 * v0 + v1 * v1 + v2 * v2 + w0 * w0 + w1 * w1 + w2 * w2)
-    return tet_energy(determinant, S - (s0 * s0 + s1 * s1 + s2 * s2), power, is_graded)
+    return determinant, S - (s0 * s0 + s1 * s1 + s2 * s2)
 
 
 @njit(cache=True, error_model="numpy")
@@ -295,12 +303,9 @@ def shape_of_triangle(x: NDArray, ticks: NDArray, a: int, b: int, c: int, measur
 @njit(cache=True, error_model="numpy")
 def content(x: NDArray, n_corners: int) -> float:
     """Signed volume of the cell with corners x (4, 3), times n!."""
-    u0, u1, u2 = x[1, 0] - x[0, 0], x[1, 1] - x[0, 1], x[1, 2] - x[0, 2]
-    v0, v1, v2 = x[2, 0] - x[0, 0], x[2, 1] - x[0, 1], x[2, 2] - x[0, 2]
     if n_corners == 3:
-        return u1 * v2 - u2 * v1
-    w0, w1, w2 = x[3, 0] - x[0, 0], x[3, 1] - x[0, 1], x[3, 2] - x[0, 2]
-    return u0 * (v1 * w2 - v2 * w1) + u1 * (v2 * w0 - v0 * w2) + u2 * (v0 * w1 - v1 * w0)
+        return (x[1, 1] - x[0, 1]) * (x[2, 2] - x[0, 2]) - (x[1, 2] - x[0, 2]) * (x[2, 1] - x[0, 1])
+    return determinant_and_squares(x)[0]
 
 
 @njit(cache=True, error_model="numpy")
@@ -330,13 +335,7 @@ def least_cosine(x: NDArray) -> float:
 @njit(cache=True, error_model="numpy")
 def quality_up_to(x: NDArray, measure: Measure) -> float:
     """`least_cosine`, or just the floor for a tetrahedron that is above it by far: most are, and this costs a tenth."""
-    u0, u1, u2 = x[1, 0] - x[0, 0], x[1, 1] - x[0, 1], x[1, 2] - x[0, 2]
-    v0, v1, v2 = x[2, 0] - x[0, 0], x[2, 1] - x[0, 1], x[2, 2] - x[0, 2]
-    w0, w1, w2 = x[3, 0] - x[0, 0], x[3, 1] - x[0, 1], x[3, 2] - x[0, 2]
-    determinant = u0 * (v1 * w2 - v2 * w1) + u1 * (v2 * w0 - v0 * w2) + u2 * (v0 * w1 - v1 * w0)
-    s0, s1, s2 = u0 + v0 + w0, u1 + v1 + w1, u2 + v2 + w2
-    S = 4.0 * (u0 * u0 + u1 * u1 + u2 * u2 + v0 * v0 + v1 * v1 + v2 * v2 + w0 * w0 + w1 * w1 + w2 * w2)
-    S -= s0 * s0 + s1 * s1 + s2 * s2
+    determinant, S = determinant_and_squares(x)
     if determinant > 0.0 and S * S * S <= measure.safe * determinant * determinant:
         return measure.floor
     return least_cosine(x)
@@ -376,10 +375,15 @@ def _measure_chunk(held: Complex, measure: Measure, first: int, last: int) -> No
         for k in range(held.cells.shape[1]):
             other = held.across[cell, k]
             if other > cell or other < 0:
-                a, b, c = outward(held.cells, cell, k)
-                f = flux_of(held.ticks, a, b, c, measure)
-                for d in range(3):
-                    held.fluxes[cell, k, d] = f[d]
+                measure_facet(held, cell, k, measure)
+
+
+@njit(cache=True, error_model="numpy")
+def measure_facet(held: Complex, cell: int, k: int, measure: Measure) -> None:
+    """Flux of facet k of a cell, as the ticks stand."""
+    a, b, c = outward(held.cells, cell, k)
+    f = flux_of(held.ticks, a, b, c, measure)
+    held.fluxes[cell, k, 0], held.fluxes[cell, k, 1], held.fluxes[cell, k, 2] = f[0], f[1], f[2]
 
 
 @njit(cache=True, error_model="numpy")
@@ -411,12 +415,16 @@ def cell_energy(held: Complex, cell: int, measure: Measure) -> float:
     return measure.geometry * held.E_shape[cell] + measure.image * image_energy(s[0], s[1], s[2])
 
 
+def cell_squares(held: Complex) -> NDArray[np.float64]:
+    """Sum of squares around its mean of each cell, (n_cells,)."""
+    sums = held.sums[: held.n_cells[0]]
+    within = sums[:, 2] - sums[:, 1] ** 2 / np.maximum(sums[:, 0], 1.0)
+    return np.where(sums[:, 0] > 0.0, np.maximum(within, 0.0), 0.0)
+
+
 def energies(held: Complex) -> tuple[float, float]:
     """Shape energy and sum of squares of the whole complex, summed in the order of the cells."""
-    n_cells = held.n_cells[0]
-    sums = held.sums[:n_cells]
-    within = sums[:, 2] - sums[:, 1] ** 2 / np.maximum(sums[:, 0], 1.0)
-    return float(held.E_shape[:n_cells].sum()), float(np.where(sums[:, 0] > 0.0, np.maximum(within, 0.0), 0.0).sum())
+    return float(held.E_shape[: held.n_cells[0]].sum()), float(cell_squares(held).sum())
 
 
 # Rings: the cells around each node.

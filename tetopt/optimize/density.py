@@ -26,6 +26,7 @@ from tetopt.optimize.complex import (
     NodeRings,
     cell_energy,
     cell_quality,
+    cell_squares,
     content,
     corner_of,
     energies,
@@ -37,6 +38,7 @@ from tetopt.optimize.complex import (
     least_cosine,
     load,
     load_cell,
+    measure_facet,
     node_rings,
     outward,
     quality_up_to,
@@ -106,10 +108,8 @@ def exchange(
 
 def _ring_errors(held: Complex, n_nodes: int) -> NDArray[np.float64]:
     """Sum of squares around the cells' means over the cells around each node, (N,)."""
-    n_cells = int(held.n_cells[0])
-    sums, cells = held.sums[:n_cells], held.cells[:n_cells]
-    within = np.maximum(sums[:, 2] - sums[:, 1] ** 2 / np.maximum(sums[:, 0], 1.0), 0.0)
-    return np.bincount(cells.ravel(), np.repeat(within, cells.shape[1]), n_nodes).astype(np.float64)
+    cells = held.cells[: held.n_cells[0]]
+    return np.bincount(cells.ravel(), np.repeat(cell_squares(held), cells.shape[1]), n_nodes).astype(np.float64)
 
 
 def roomy(held: Complex, n_nodes: int, n_cells: int) -> Complex:
@@ -159,7 +159,7 @@ def make_exchanges(
             break
         does_split, does_collapse = is_pair or n_split - n_collapsed < more, is_pair or n_split - n_collapsed > more
         if does_split:
-            while s < len(in_) and not _can_split(held, rings, in_[s], split[in_[s]], is_dirty):
+            while s < len(in_) and not _can_split(held, rings, in_[s], is_dirty):
                 s += 1
             if s == len(in_):
                 break
@@ -196,7 +196,7 @@ def _is_clean(rings: NodeRings, node: int, is_dirty: NDArray) -> bool:
 
 
 @njit(cache=True, error_model="numpy")
-def _can_split(held: Complex, rings: NodeRings, a: int, b: int, is_dirty: NDArray) -> bool:
+def _can_split(held: Complex, rings: NodeRings, a: int, is_dirty: NDArray) -> bool:
     """Whether the cells around a are as they were, and there is room for more."""
     size = rings.start[a + 1] - rings.start[a]
     return held.n_cells[0] + size <= len(held.cells) and _is_clean(rings, a, is_dirty)
@@ -276,7 +276,7 @@ def _mend(
                 gain = _lift_by_collapse(x, held, rings, is_frozen, a, b, measure, target)
                 if gain > best:
                     best, best_a, best_b, is_split = gain, a, b, False
-                if i < j and _can_split(held, rings, a, b, is_dirty):
+                if i < j and _can_split(held, rings, a, is_dirty):
                     may_split = _put_middle(held, rings, is_frozen, sides, a, b, p)
                     gain = _lift_by_split(x, held, rings, a, b, p, measure, target) if may_split else -1.0
                     if gain > best:
@@ -445,9 +445,9 @@ def worth_of_split(
 def _shape_with(x: NDArray, held: Complex, cell: int, node: int, p: int, measure: Measure) -> float:
     """Shape energy of a cell with p in the place of its corner `node`; the corners are left in x."""
     k = corner_of(held.cells, cell, node)
-    held_node = held.cells[cell, 0] if k > 0 else p
+    base = held.cells[cell, 0] if k > 0 else p
     for m in range(held.cells.shape[1]):
-        load(x, m, held.ticks, p if m == k else held.cells[cell, m], held_node, measure)
+        load(x, m, held.ticks, p if m == k else held.cells[cell, m], base, measure)
     return shape_energy(x, held.cells.shape[1], measure.power, measure.is_graded)
 
 
@@ -496,9 +496,7 @@ def split_edge(held: Complex, rings: NodeRings, a: int, b: int, p: int, is_dirty
         for child, back in ((cell, i), (other, j)):
             for k in range(n):
                 if measure.image > 0.0 and (k == back or k not in (i, j)):
-                    u, v, w = outward(held.cells, child, k)
-                    f = flux_of(held.ticks, u, v, w, measure)
-                    held.fluxes[child, k, 0], held.fluxes[child, k, 1], held.fluxes[child, k, 2] = f
+                    measure_facet(held, child, k, measure)
             held.E_shape[child] = shape_of_cell(x, held.ticks, held.cells, child, measure)
             sum_up(held.sums, held.fluxes, child)
             is_dirty[child] = True
@@ -639,8 +637,6 @@ def collapse_edge(held: Complex, rings: NodeRings, a: int, b: int, is_dirty: NDA
         held.cells[cell, i] = b
         for k in range(n):
             if measure.image > 0.0 and k != i:
-                u, v, w = outward(held.cells, cell, k)
-                f = flux_of(held.ticks, u, v, w, measure)
-                held.fluxes[cell, k, 0], held.fluxes[cell, k, 1], held.fluxes[cell, k, 2] = f
+                measure_facet(held, cell, k, measure)
         held.E_shape[cell] = shape_of_cell(x, held.ticks, held.cells, cell, measure)
         sum_up(held.sums, held.fluxes, cell)

@@ -95,7 +95,18 @@ def noise_level(data: NDArray[np.floating]) -> float:
     return float(np.median(size) / 0.6745 / 6.0 ** (data.ndim / 2))
 
 
-def _errors(image: Image, roots: tuple[int, ...]) -> list[NDArray[np.float64]]:
+def _scaled(image: Image) -> NDArray[np.float64]:
+    """The image less its mean, at most 1: numbers of nodes do not depend on the unit of intensity."""
+    data = image.data.astype(np.float64) - float(np.mean(image.data, dtype=np.float64))
+    scale = float(np.abs(data).max())
+    if not np.isfinite(scale * scale * data.size):
+        raise InputError(f"image: squares of deviations up to {scale:.3g} overflow; rescale it first")
+    return data / scale if scale > 0.0 else data
+
+
+def _errors(
+    image: Image, data: NDArray[np.float64], variance: float, roots: tuple[int, ...]
+) -> list[NDArray[np.float64]]:
     """Of the blocks of each level, the coarsest first: sums of squared deviations less the noise's, and the spread."""
     shape = np.array(image.shape)
     edge = image.spacing * shape / np.array(roots)
@@ -104,12 +115,6 @@ def _errors(image: Image, roots: tuple[int, ...]) -> list[NDArray[np.float64]]:
         edge / 2 ** (n_levels + 1) / image.spacing
     ).min() >= 0.25 * SMALLEST:
         n_levels += 1
-    data = image.data.astype(np.float64) - float(np.mean(image.data, dtype=np.float64))
-    scale = float(np.abs(data).max())
-    if not np.isfinite(scale * scale * data.size):
-        raise InputError(f"image: squares of deviations up to {scale:.3g} overflow; rescale it first")
-    data /= scale if scale > 0.0 else 1.0
-    variance = noise_level(data) ** 2
     spread = SPREAD * float(np.mean(data * data)) + SPREAD_OF_NOISE * variance
     sums = [np.ones(image.shape), data, data * data]
     sums = [_blocks(total, np.array(roots) << n_levels) for total in sums]
@@ -155,13 +160,15 @@ def _closest(image: Image, nodes: int, fewest: int) -> tuple[int, tuple[int, ...
     undivided blocks: then others are tried, at last the lattice that has the number by itself.
     """
     best: tuple[int, tuple[int, ...], list[NDArray[np.bool_]]] | None = None
+    data = _scaled(image)
+    variance = noise_level(data) ** 2
     for share in ROOTS:
         roots = near_cubes(
             "bcc" if image.ndim == 3 else "criss-cross", image.spacing * image.shape, max(fewest, int(nodes * share))
         )
         if (np.array(image.shape) / roots).max() < SMALLEST and best is not None:
             break
-        count, divided = _nearest(_errors(image, roots), roots, nodes)
+        count, divided = _nearest(_errors(image, data, variance, roots), roots, nodes)
         if best is None or abs(count - nodes) < abs(best[0] - nodes):
             best = count, roots, divided
         if abs(count - nodes) <= ENOUGH * nodes:
