@@ -334,7 +334,7 @@ def _mesh_files(
 
 
 def _warn(result: Optimized, method: Method, nodes: int | None, n_empty: int) -> None:
-    """Say what is allowed but hardly meant; `nodes` were asked of a graded mesh, `n_empty` cells hold no voxel centre."""
+    """Say what is allowed but hardly meant; `nodes` were asked of a graded mesh, `n_empty` cells hold no voxel."""
     found = len(result.mesh.points)
     if nodes is not None and abs(found - nodes) > 0.01 * nodes:
         _show_warning(f"{found} nodes instead of {nodes}: more iterations, or a --k-d above 0, come nearer")
