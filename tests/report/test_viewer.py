@@ -146,9 +146,7 @@ def test_views_turn_together(page, tmp_path):
     copied = tmp_path / "copy.html"
     copied.write_text(page.read_text(encoding="utf-8").replace("</body>", PROBE + "</body>"), encoding="utf-8")
     said = None
-    for attempt in range(
-        6
-    ):  # on a loaded machine the browser's own time may end before the frames are drawn: more of it each time
+    for attempt in range(6):  # on a loaded machine the browser's own time may end before the frames are drawn
         budget = f"--virtual-time-budget={30_000 * (attempt + 1)}"
         found = browser(tmp_path / f"profile{attempt}", budget, "--dump-dom", copied.as_uri())
         said = re.search(r'data-said="([^"]*)"', found)
