@@ -16,6 +16,7 @@ from tetopt.mesh import Mesh
 from tetopt.optimize.fast import mesh_image, optimize
 from tetopt.optimize.octree import octree
 from tetopt.optimize.paper import optimize_paper
+from tetopt.optimize.sizes import Sizes
 from tetopt.phantom import load_phantom
 
 __all__ = [
@@ -24,6 +25,7 @@ __all__ = [
     "Image",
     "InputError",
     "Mesh",
+    "Sizes",
     "__version__",
     "cell_fields",
     "cell_moments",

@@ -43,7 +43,14 @@ from tetopt.io.images import parse_crop, parse_slice, sha256
 from tetopt.io.meshes import MeshFile, cell_fields
 from tetopt.io.mni import mni_path, mni_tissue
 from tetopt.lattice import KINDS
-from tetopt.optimize.fast import GRADED_K_D, check_options, optimize, prepare_kernels
+from tetopt.optimize.fast import (
+    GRADED_ITERATIONS,
+    GRADED_K_D,
+    check_options,
+    nodes_for_error,
+    optimize,
+    prepare_kernels,
+)
 from tetopt.optimize.octree import octree
 from tetopt.optimize.paper import Optimized, Record, default_n_t, optimize_paper
 from tetopt.report.summary import run_summary, versions
@@ -177,12 +184,30 @@ def mesh_command(
     nodes: Annotated[
         int | None, typer.Option(metavar="N", help="Wanted number of nodes (default 5000; 500 in 2-D).")
     ] = None,
-    spacing: Annotated[float | None, typer.Option(metavar="MM", help="Wanted lattice spacing instead.")] = None,
+    target_error: Annotated[
+        float | None,
+        typer.Option(metavar="T", help="As many nodes as leave this share of the image's variance in cells, instead."),
+    ] = None,
+    size_min: Annotated[float | None, typer.Option(metavar="MM", help="No edge is split into shorter halves.")] = None,
+    size_max: Annotated[
+        float | None,
+        typer.Option(metavar="MM", help="No cell is made with a longer edge (default 1.5 x a uniform mesh's)."),
+    ] = None,
+    gradation: Annotated[
+        float | None, typer.Option(metavar="G", help="Edges grow by G x distance at most, 0.05 to 1 (default 1).")
+    ] = None,
+    sizing: Annotated[
+        Path | None, typer.Option(metavar="SIZES.nii.gz", help="Longest edge by place, mm; 0 or less: as elsewhere.")
+    ] = None,
+    uniform: Annotated[
+        bool, typer.Option("--uniform", help="The paper's setting: a uniform lattice, bcc (criss-cross in 2-D).")
+    ] = False,
+    spacing: Annotated[float | None, typer.Option(metavar="MM", help="A uniform lattice of this spacing.")] = None,
     lattice_kind: Annotated[
         Lattice | None,
         typer.Option(
             "--lattice",
-            help="Initial mesh (default bcc; criss-cross in 2-D). octree puts nodes where the image has content.",
+            help="Initial mesh. octree, the default, puts nodes where the image has content; the others are uniform.",
         ),
     ] = None,
     k_D: Annotated[
@@ -190,12 +215,15 @@ def mesh_command(
         typer.Option(
             "--k-d",
             metavar="K",
-            help="Weight of the image: 0 shape only; 0.9 image first (default 0.2; 0.75 with --lattice octree).",
+            help="Weight of the image: 0 shape only; 0.9 image first (default 0.85; 0.2 on a uniform lattice).",
         ),
     ] = None,
     iterations: Annotated[
-        int, typer.Option(metavar="I", min=0, help="Sweeps over all nodes; 0 writes the lattice.")
-    ] = 20,
+        int | None,
+        typer.Option(
+            metavar="I", min=0, help="Sweeps over all nodes; 0 writes the initial mesh (default 16; 20 if uniform)."
+        ),
+    ] = None,
     n_t: Annotated[
         int | None,
         typer.Option(
@@ -245,14 +273,16 @@ def mesh_command(
     output = checked_output(output, (".vtu",), force)
     if json_path is not None:
         json_path = checked_output(json_path, (".json",), force)
-    if nodes is not None and spacing is not None:
-        raise InputError("--nodes and --spacing: give one of them")
-    is_graded = lattice_kind is Lattice.octree
-    if is_graded and method is Method.paper:
-        raise InputError("--lattice octree: only with --method fast, got --method paper")
-    if is_graded and spacing is not None:
-        raise InputError("--lattice octree: has no one spacing; give --nodes instead of --spacing")
+    wishes = {"--nodes": nodes, "--spacing": spacing, "--target-error": target_error}
+    if len(given := [name for name, value in wishes.items() if value is not None]) > 1:
+        raise InputError(f"{' and '.join(given)}: give one of them")
+    is_graded = _is_graded(lattice_kind, uniform, spacing, method)
+    limits = {"--size-min": size_min, "--size-max": size_max, "--gradation": gradation, "--sizing": sizing}
+    for name, value in {**limits, "--target-error": target_error}.items():
+        if value is not None and not is_graded:
+            raise InputError(f"{name}: only on a graded mesh; leave out --uniform, --spacing, --lattice and --method")
     k_D = (GRADED_K_D if is_graded else 0.2) if k_D is None else k_D
+    iterations = (GRADED_ITERATIONS if is_graded else 20) if iterations is None else iterations
     if not 0.0 <= k_D < 1.0:
         raise InputError(f"--k-d: expected 0 <= k_D < 1, got {k_D}")
     if max_seconds is not None and not max_seconds > 0.0:
@@ -271,18 +301,50 @@ def mesh_command(
     pictures = [] if figures is None else [checked_output(figures / name, (".png",), force) for name in names]
     _set_threads(threads)
     image = _image(image_path, volume, crop, slice_)
-    if nodes is None and spacing is None:
-        nodes = DEFAULT_NODES[image.ndim]
-    kind = KINDS[image.ndim][0] if lattice_kind is None else lattice_kind.value
-    if is_graded and nodes is not None:
-        initial, options["nodes"] = octree(image, nodes), nodes
+    if is_graded:
+        sizes = _sizes(size_min, size_max, gradation, sizing)
+        if target_error is not None:
+            nodes = nodes_for_error(image, target_error, sizes)
+        elif nodes is None:  # fewer on small images
+            nodes = int(np.clip(image.data.size // 8, 2 ** (image.ndim + 2), DEFAULT_NODES[image.ndim]))
+        initial, kind = octree(image, nodes, sizes), Lattice.octree.value
+        options |= {"nodes": nodes, "target_error": target_error, "sizes": sizes}
     else:
+        if nodes is None and spacing is None:
+            nodes = DEFAULT_NODES[image.ndim]
+        kind = KINDS[image.ndim][0] if lattice_kind is None else lattice_kind.value
         initial = lattice(image, kind, nodes=nodes, spacing=spacing)
     source = {
-        "nodes": nodes, "spacing": spacing, "lattice": kind, "volume": volume, "crop": crop, "slice": slice_,
-        "method": method.value, "max_seconds": max_seconds,
+        "nodes": nodes, "target_error": target_error, "spacing": spacing, "lattice": kind, "size_min": size_min,
+        "size_max": size_max, "gradation": gradation, "sizing": None if sizing is None else sizing.name,
+        "volume": volume, "crop": crop, "slice": slice_, "method": method.value, "max_seconds": max_seconds,
     }  # fmt: skip
     return _mesh_files(image_path, image, initial, options, source, output, json_path, pictures, begin)
+
+
+def _is_graded(kind: Lattice | None, uniform: bool, spacing: float | None, method: Method) -> bool:
+    """Whether the options ask for an octree; it is the default."""
+    if kind is not Lattice.octree:
+        return kind is None and not uniform and spacing is None and method is Method.fast
+    if uniform:
+        raise InputError("--uniform and --lattice octree: give one of them")
+    if method is Method.paper:
+        raise InputError("--lattice octree: only with --method fast, got --method paper")
+    if spacing is not None:
+        raise InputError("--lattice octree: has no one spacing; give --nodes instead of --spacing")
+    return True
+
+
+def _sizes(
+    size_min: float | None, size_max: float | None, gradation: float | None, sizing: Path | None
+) -> tetopt.Sizes | None:
+    """The limits on sizes as the options ask for them."""
+    if size_min is None and size_max is None and gradation is None and sizing is None:
+        return None
+    return tetopt.Sizes(
+        0.0 if size_min is None else size_min, size_max, 1.0 if gradation is None else gradation,
+        None if sizing is None else load_image(sizing),
+    )  # fmt: skip
 
 
 def _check_method(method: Method, given: dict[str, Any], wanted: Method) -> None:
@@ -304,8 +366,9 @@ def _mesh_files(
     begin: float,
 ) -> int:
     """Optimise, write the mesh, the numbers and the pictures, print the comparison; the exit code."""
-    about = {"image": image_path.name, "image_sha256": sha256(image_path), "options": options | source}
-    log.print(escape(_described(image_path, image, initial, options.get("nodes"))))
+    told = {name: value for name, value in options.items() if name != "sizes"} | source
+    about = {"image": image_path.name, "image_sha256": sha256(image_path), "options": told}
+    log.print(escape(_described(image_path, image, initial, source["lattice"])))
     loaded = time.perf_counter()
     max_seconds = source["max_seconds"]
     left = None if max_seconds is None else max(max_seconds - (loaded - begin), 1e-9)
@@ -321,10 +384,12 @@ def _mesh_files(
 
         save_run_figures(pictures, image, initial, result)
     # Everything is written; what is printed may go into a pipe that closes.
-    code = 130 if is_interrupted else _promises(image, result, options.get("min_dihedral", 0.0))
+    code = _promises(image, result, options.get("min_dihedral", 0.0), source["target_error"])
+    code = 130 if is_interrupted else code
     n_empty = 0 if image.data.min() == image.data.max() else int((fields["n_voxels"] == 0).sum())
-    _warn(result, Method(source["method"]), options.get("nodes"), n_empty)
-    _print_comparison(initial, result, "lattice" if options.get("nodes") is None else "octree")
+    wanted = options.get("nodes") if source["target_error"] is None else None
+    _warn(result, Method(source["method"]), wanted, n_empty)
+    _print_comparison(image, initial, result, _start_name(source["lattice"]))
     out.print(escape(f"{output}: {len(result.mesh.points)} nodes, {len(result.mesh.cells)} cells"))
     if json_path is not None:
         out.print(escape(f"{json_path}: every number of the run"))
@@ -391,15 +456,20 @@ def _set_threads(threads: int | None) -> None:
     numba.set_num_threads(threads)
 
 
-def _described(path: Path, image: Image, initial: Mesh, nodes: int | None) -> str:
-    kind = "lattice" if nodes is None else "octree"
+def _start_name(kind: str) -> str:
+    """What an initial mesh is called."""
+    return kind if kind == Lattice.octree.value else "lattice"
+
+
+def _described(path: Path, image: Image, initial: Mesh, kind: str) -> str:
     size = " x ".join(str(s) for s in image.shape)
     spacing = " x ".join(f"{s:.4g}" for s in image.spacing)
-    return f"{path}: {size} voxels of {spacing} mm; {kind} of {len(initial.points)} nodes, {len(initial.cells)} cells"
+    start = f"{_start_name(kind)} of {len(initial.points)} nodes, {len(initial.cells)} cells"
+    return f"{path}: {size} voxels of {spacing} mm; {start}"
 
 
-def _promises(image: Image, result: Optimized, min_dihedral: float) -> int:
-    """0 if the mesh covers the image's box and every voxel, and keeps the floor on angles; else 1, said aloud."""
+def _promises(image: Image, result: Optimized, min_dihedral: float, target_error: float | None = None) -> int:
+    """0 if the mesh fills the image's box, keeps the floor on angles and has the error asked; else 1, said aloud."""
     covered = float(volumes(result.mesh.points, result.mesh.cells).sum())
     missed = image.data.size - result.history[-1].n_voxels
     below = 0
@@ -411,8 +481,15 @@ def _promises(image: Image, result: Optimized, min_dihedral: float) -> int:
             f"[bold red]tetopt:[/] {below} of {len(angles)} cells have an angle under {min_dihedral:g} degrees, "
             f"down to {angles.min():.2f}; allow more nodes, a lower --k-d, or a lower --min-dihedral"
         )
+    share = result.history[-1].E_D / (float(np.var(image.data, dtype=np.float64)) * image.volume or 1.0)
+    is_above = target_error is not None and share > target_error
+    if is_above:
+        log.print(
+            f"[bold red]tetopt:[/] {share:.4g} of the image's variance is left in the cells, more than {target_error:g}; "
+            "allow more --iterations or smaller cells, or ask for --nodes"
+        )
     if missed == 0 and abs(covered / image.volume - 1.0) < 1e-9:
-        return 1 if below else 0
+        return 1 if below or is_above else 0
     log.print(
         f"[bold red]tetopt:[/] the mesh does not cover the image: {missed} voxels are outside, "
         f"its volume is {covered:.9g} of {image.volume:.9g} mm^{image.ndim}; please report this"
@@ -502,7 +579,7 @@ def _progress(iterations: int) -> Iterator[Callable[[Record], None]]:
         )
 
 
-def _print_comparison(initial: Mesh, result: Optimized, start: str) -> None:
+def _print_comparison(image: Image, initial: Mesh, result: Optimized, start: str) -> None:
     first, last = result.history[0], result.history[-1]
     before = quality(initial.points, initial.cells)
     after = quality(result.mesh.points, result.mesh.cells)
@@ -511,6 +588,8 @@ def _print_comparison(initial: Mesh, result: Optimized, start: str) -> None:
     table.add_row("E_G, of initial", "1.0000", f"{last.E_G / first.E_G:.4f}")
     if first.E_D > 0.0:
         table.add_row("E_D, of initial", "1.0000", f"{last.E_D / first.E_D:.4f}")
+        spread = float(np.var(image.data, dtype=np.float64)) * image.volume
+        table.add_row("E_D, share of the image's variance", f"{first.E_D / spread:.5f}", f"{last.E_D / spread:.5f}")
     _add_quality(table, before, after)
     out.print(table)
 

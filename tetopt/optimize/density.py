@@ -51,6 +51,7 @@ from tetopt.optimize.flips import close_gaps
 from tetopt.optimize.smooth import Blocks, blocks, colours_of, ring_energy
 
 LEAST_GAIN = 1e-3  # of a node's mean share of E: an exchange of two nodes that is worth less is not made
+LEAST_OVER_NOISE = 20.0  # of the noise's variance: likewise; about what the luckiest of thousands of edges wins in noise
 NEIGHBOURS = 128  # edges of a node that are looked at, at most
 
 
@@ -73,9 +74,18 @@ class Sides(NamedTuple):
     is_fixed: bool  # whether boundary nodes stay where they are
 
 
+class Limits(NamedTuple):
+    """On the edges that moves may make, mm."""
+
+    shortest: float
+    longest: NDArray[np.float64]  # (N,) at each node
+    noise: float  # variance of the image's noise: what chance alone wins is not worth a node
+
+
 def exchange(
-    held: Complex, is_frozen: NDArray[np.bool_], measure: Measure, sides: Sides, n_nodes: int, most: int
-) -> Exchanged:
+    held: Complex, is_frozen: NDArray[np.bool_], measure: Measure, sides: Sides, n_nodes: int, most: int,
+    limits: Limits,
+) -> Exchanged:  # fmt: skip
     """One round of splits and collapses towards `n_nodes` nodes, and of exchanges of a node for another.
 
     Beyond those that the number asks for, up to `most` nodes are exchanged, as far as each lowers E. One round doubles
@@ -92,13 +102,14 @@ def exchange(
     middle = np.median(error)
     may_split = (error >= middle) | (more > n_before // 8)
     may_collapse = (error <= middle) | (more < -(n_before // 8))
-    gain, split = best_splits(held, rings, is_frozen, measure, sides, may_split)
+    gain, split = best_splits(held, rings, is_frozen, measure, sides, may_split, limits.shortest)
     dearest = np.inf if more < 0 else float(np.sort(gain)[-max(most // 4, 1)])
-    cost, collapse = best_collapses(held, rings, groups, is_frozen, measure, dearest, may_collapse)
+    cost, collapse = best_collapses(held, rings, groups, is_frozen, measure, dearest, may_collapse, limits.longest)
     in_, out = np.lexsort((np.arange(n_before), -gain)), np.lexsort((np.arange(n_before), cost))
     in_, out = in_[gain[in_] > -np.inf], out[cost[out] < np.inf]
     E_G, squares = energies(held)
     least = LEAST_GAIN * (measure.geometry * E_G + measure.image * squares) / n_before
+    least = max(least, LEAST_OVER_NOISE * measure.image * limits.noise)
     is_dirty = np.zeros(len(held.cells), dtype=np.bool_)
     n_split, n_collapsed = make_exchanges(
         held, rings, is_frozen, measure, sides, in_, split, gain, out, collapse, cost, more, most, least, is_dirty
@@ -338,40 +349,42 @@ def _lift_by_split(
 
 def best_splits(
     held: Complex, rings: NodeRings, is_frozen: NDArray[np.bool_], measure: Measure, sides: Sides,
-    is_wanted: NDArray[np.bool_],
+    is_wanted: NDArray[np.bool_], shortest: float,
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:  # fmt: skip
     """How much E falls if the best edge of each node that is wanted is split, (N,), and where that leads, (N,).
 
-    -inf and -1 where none can be split above the floor; an edge of two nodes that are wanted counts for the lower one.
+    -inf and -1 where none can be split above the floor, into halves of `shortest` mm or more; an edge of two nodes that are wanted counts for the lower one.
     Rows N to 2 N of `held.ticks` and `is_frozen` are written to.
     """
     n_nodes = len(is_wanted)
     gain, split = np.full(n_nodes, -np.inf), np.full(n_nodes, -1, dtype=np.int64)
     with few_threads(n_nodes * 20):
-        _fill_splits(gain, split, held, rings, is_frozen, measure, sides, is_wanted)
+        _fill_splits(gain, split, held, rings, is_frozen, measure, sides, is_wanted, shortest)
     return gain, split
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def _fill_splits(
     gain: NDArray, split: NDArray, held: Complex, rings: NodeRings, is_frozen: NDArray, measure: Measure, sides: Sides,
-    is_wanted: NDArray,
+    is_wanted: NDArray, shortest: float,
 ) -> None:  # fmt: skip
     for node in prange(len(gain)):
         if is_wanted[node]:
-            _best_split(np.int64(node), gain, split, held, rings, is_frozen, measure, sides, is_wanted)
+            _best_split(np.int64(node), gain, split, held, rings, is_frozen, measure, sides, is_wanted, shortest)
 
 
 @njit(cache=True, error_model="numpy")
 def _best_split(
     a: int, gain: NDArray, split: NDArray, held: Complex, rings: NodeRings, is_frozen: NDArray, measure: Measure,
-    sides: Sides, is_wanted: NDArray,
+    sides: Sides, is_wanted: NDArray, shortest: float,
 ) -> None:  # fmt: skip
     n_nodes = len(is_wanted)
     x, near = np.empty((4, 3)), np.empty(NEIGHBOURS, dtype=np.int64)
     for number in range(_neighbours(near, held, rings, a)):
         b, p = near[number], n_nodes + a
-        if (b > a or not is_wanted[b]) and _put_middle(held, rings, is_frozen, sides, a, b, p):
+        if (b < a and is_wanted[b]) or squared_length(x, held, a, b, measure) < 4.0 * shortest * shortest:
+            continue
+        if _put_middle(held, rings, is_frozen, sides, a, b, p):
             worth = worth_of_split(x, held, rings, a, b, p, measure, gain[a])
             if worth > gain[a]:
                 gain[a], split[a] = worth, b
@@ -513,6 +526,7 @@ def best_collapses(
     measure: Measure,
     dearest: float,
     is_wanted: NDArray[np.bool_],
+    longest: NDArray[np.float64],
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """How much E rises if each node that is wanted is joined to its best neighbour, (N,), and which that is, (N,).
 
@@ -523,25 +537,25 @@ def best_collapses(
     bare = measure._replace(image=0.0)
     for chosen in colours_of(held, rings, groups):
         with few_threads(len(chosen) * 10_000):
-            _fill_collapses(cost, collapse, held, rings, groups, chosen, is_frozen, measure, bare, dearest, is_wanted)
+            _fill_collapses(cost, collapse, held, rings, groups, chosen, is_frozen, measure, bare, dearest, is_wanted, longest)
     return cost, collapse
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def _fill_collapses(
     cost: NDArray, collapse: NDArray, held: Complex, rings: NodeRings, groups: Blocks, chosen: NDArray,
-    is_frozen: NDArray, measure: Measure, bare: Measure, dearest: float, is_wanted: NDArray,
+    is_frozen: NDArray, measure: Measure, bare: Measure, dearest: float, is_wanted: NDArray, longest: NDArray,
 ) -> None:  # fmt: skip
     for number in prange(len(chosen)):
         for at in range(groups.start[chosen[number]], groups.start[chosen[number] + 1]):
             if is_wanted[groups.nodes[at]]:
-                _best_collapse(groups.nodes[at], cost, collapse, held, rings, is_frozen, measure, bare, dearest)
+                _best_collapse(groups.nodes[at], cost, collapse, held, rings, is_frozen, measure, bare, dearest, longest)
 
 
 @njit(cache=True, error_model="numpy")
 def _best_collapse(
     a: int, cost: NDArray, collapse: NDArray, held: Complex, rings: NodeRings, is_frozen: NDArray, measure: Measure,
-    bare: Measure, dearest: float,
+    bare: Measure, dearest: float, longest: NDArray,
 ) -> None:  # fmt: skip
     """The neighbour to which `a` is best joined. It is moved there and back: cells of other groups do not see it."""
     if is_frozen[a].all():
@@ -562,7 +576,7 @@ def _best_collapse(
     best = old + dearest
     for number in range(count):  # shapes are cheap, and a lower bound
         b = near[number]
-        if may_join(t, is_frozen, a, b):
+        if may_join(t, is_frozen, a, b) and _is_short(x, held, near, count, a, b, longest, measure):
             t[a, 0], t[a, 1], t[a, 2] = t[b, 0], t[b, 1], t[b, 2]
             shapes[number] = ring_energy(best, least, trial, fluxes, x, a, held, rings, bare, b)
             if shapes[number] < np.inf and not _keeps_size(x, held, rings, a, b, size, measure):
@@ -580,6 +594,28 @@ def _best_collapse(
             t[a, 0], t[a, 1], t[a, 2] = here0, here1, here2
         if value < best:
             best, cost[a], collapse[a] = value, value - old, b
+
+
+@njit(cache=True, error_model="numpy")
+def squared_length(x: NDArray, held: Complex, a: int, b: int, measure: Measure) -> float:
+    """Squared distance of two nodes, mm^2."""
+    load(x, 0, held.ticks, b, a, measure)
+    return x[0, 0] * x[0, 0] + x[0, 1] * x[0, 1] + x[0, 2] * x[0, 2]
+
+
+@njit(cache=True, error_model="numpy")
+def _is_short(
+    x: NDArray, held: Complex, near: NDArray, count: int, a: int, b: int, longest: NDArray, measure: Measure
+) -> bool:
+    """Whether no edge from b to a neighbour of a is longer than the bound at its ends, or than the longest was."""
+    old = 0.0
+    for m in range(count):
+        old = max(old, squared_length(x, held, a, near[m], measure))
+    for m in range(count):
+        square = squared_length(x, held, b, near[m], measure)
+        if square > old and square > min(longest[b], longest[near[m]]) ** 2:
+            return False
+    return True
 
 
 @njit(cache=True, error_model="numpy")

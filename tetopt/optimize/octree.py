@@ -5,10 +5,14 @@ those that hold the largest sum of squared deviations from their mean: that is t
 block, so what is left is spread evenly over the leaves. Noise has no say: of each block's sum, what noise of the
 image's own level would leave is taken off, so that a noisy but uniform region stays coarse. Neighbouring leaves differ
 by one level at most, also across edges and corners (2:1), and nodes are put at their corners and centres: a lattice of
-body-centred cubes that coarsens by steps of two, joined by Delaunay.
+body-centred cubes that coarsens by steps of two, joined by Delaunay. Limits on sizes (`tetopt.Sizes`) have the first
+say: blocks with longer edges are divided, whatever they hold, and those whose halves would be too short are not.
 """
 
 from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,8 +24,9 @@ from tetopt.image import Image
 from tetopt.lattice import near_cubes
 from tetopt.mesh import Mesh
 from tetopt.optimize.retessellate import delaunay
+from tetopt.optimize.sizes import NO_BOUND, Sizes
 
-ROOTS = (1 / 60, 1 / 45, 1 / 30, 1 / 20, 1 / 12, 1 / 6, 1.0)  # undivided blocks' nodes, of those wanted: tried in turn
+ROOTS = (1 / 60, 1 / 45, 1 / 30, 1 / 20, 1 / 12, 1 / 8, 1 / 6, 1 / 4, 1 / 2.5, 1 / 1.6, 1.0)  # undivided blocks' nodes, of those wanted: tried in turn
 ENOUGH = 0.02  # of the nodes wanted: a miss that ends the trials
 SMALLEST = 2.0  # voxels along a leaf's edge, at least, where voxels are smallest; a quarter where they are largest
 SPREAD = 1e-3  # of the image's variance: what every voxel counts besides, so that any number of nodes is reached
@@ -32,11 +37,12 @@ TIE_BREAKS = (1e-5, 1e-4, 1e-3)  # see `delaunay`, tried in turn: with 1e-7, 2 o
 FLAT = 1e-6  # of the mean volume: such a cell is flat
 TIE = 0.05  # of a block's error: what decides between blocks that are alike
 MISS = 0.1  # of the nodes wanted: a larger miss is an error
+SAMPLE = 100_000  # voxels, of which the most frequent value is taken for the background's
 FEW = 40  # nodes, about what one block more or less makes
 NEAR = 0.002  # of the nodes wanted: a miss that is good enough
 
 
-def octree(image: Image, nodes: int) -> Mesh:
+def octree(image: Image, nodes: int, sizes: Sizes | None = None) -> Mesh:
     """A graded mesh of the image's box.
 
     Parameters
@@ -45,6 +51,8 @@ def octree(image: Image, nodes: int) -> Mesh:
         Its box, index -0.5 to shape - 0.5 along each axis, is covered exactly.
     nodes : int
         Wanted number of nodes. The octree that comes nearest has a few per cent more or less, of few a few dozen.
+    sizes : Sizes, optional
+        Limits on the blocks' edges.
 
     Returns
     -------
@@ -54,19 +62,21 @@ def octree(image: Image, nodes: int) -> Mesh:
     Raises
     ------
     InputError
-        More nodes than leaves of 2 voxels can have, or fewer than undivided blocks; or intensities whose squares
-        overflow.
+        More nodes than leaves of 2 voxels, or of the smallest size, can have, or fewer than the largest sizes need; or
+        intensities whose squares overflow.
     """
     n = image.ndim
     fewest = 2**n + 1
     if not (isinstance(nodes, int | np.integer) and nodes >= fewest):
         raise InputError(f"octree: expected a whole number of nodes, {fewest} or more in {n}-D, got {nodes!r}")
-    count, roots, divided = _closest(image, nodes, fewest)
+    sizes = (Sizes() if sizes is None else sizes).prepared(n)
+    count, roots, divided = _closest(image, nodes, fewest, sizes)
     if abs(count - nodes) > max(MISS * nodes, FEW):
         shape, word = " x ".join(map(str, image.shape)), "many" if count < nodes else "few"
+        limits = "" if sizes == Sizes() else " and these limits on sizes"
         raise InputError(
-            f"octree: {nodes} nodes are too {word} for {shape} voxels: the nearest octree found has {count}; ask for "
-            "about as many, or for a uniform mesh"
+            f"octree: {nodes} nodes are too {word} for {shape} voxels{limits}: the nearest octree found has {count}; "
+            "ask for about as many, or for a uniform mesh"
         )
     index = _places(divided, roots) / np.array(roots) * image.shape - 0.5
     points = image.to_world(index)
@@ -81,16 +91,18 @@ def noise_level(data: NDArray[np.floating]) -> float:
     """Standard deviation of the noise in an image's data, from what second differences along every axis leave of it.
 
     Structure wider than a voxel cancels in (1, -2, 1) taken along all axes (Immerkaer 1996, here in n-D); the median of
-    its size, over the voxels where it is not zero, is that of noise in most of the volume. Exact zeros are a background
-    that was cut out, and have none. Noise that was smoothed is underestimated.
+    its size is that of noise in most of the volume. A background of one value, cut out, does not count, and what is
+    left in less than a tenth of the voxels are edges, not noise. Noise that was smoothed is underestimated.
     """
+    if min(data.shape) < 3:
+        return 0.0
     rest = data.astype(np.float64)
     for axis in range(data.ndim):
-        if rest.shape[axis] < 3:
-            return 0.0
         rest = np.diff(rest, n=2, axis=axis)
-    size = np.abs(rest[rest != 0.0])
-    if len(size) == 0:
+    values, often = np.unique(data.ravel()[:: max(data.size // SAMPLE, 1)], return_counts=True)
+    is_background = data[(slice(1, -1),) * data.ndim] == values[often.argmax()]
+    size = np.abs(rest[(rest != 0.0) | ~is_background])
+    if np.count_nonzero(size) < 0.1 * rest.size:
         return 0.0
     return float(np.median(size) / 0.6745 / 6.0 ** (data.ndim / 2))
 
@@ -104,30 +116,47 @@ def _scaled(image: Image) -> NDArray[np.float64]:
     return data / scale if scale > 0.0 else data
 
 
-def _errors(
-    image: Image, data: NDArray[np.float64], variance: float, roots: tuple[int, ...]
-) -> list[NDArray[np.float64]]:
-    """Of the blocks of each level, the coarsest first: sums of squared deviations less the noise's, and the spread."""
-    shape = np.array(image.shape)
-    edge = image.spacing * shape / np.array(roots)
+class _Blocks(NamedTuple):
+    """The blocks of one level."""
+
+    error: NDArray[np.float64]  # sums of squared deviations less the noise's, and the spread
+    is_too_large: NDArray[np.bool_]  # must be divided
+
+
+def _levels(
+    image: Image, data: NDArray[np.float64], variance: float, roots: tuple[int, ...], sizes: Sizes, most: float
+) -> list[_Blocks]:
+    """The blocks of each level, the coarsest first."""
+    edge = image.spacing * image.shape / np.array(roots)
     n_levels = 0
-    while (edge / 2 ** (n_levels + 1) / image.spacing).max() >= SMALLEST and (
-        edge / 2 ** (n_levels + 1) / image.spacing
-    ).min() >= 0.25 * SMALLEST:
+    while _may_be(edge / 2 ** (n_levels + 1), image.spacing, sizes.smallest):
         n_levels += 1
     spread = SPREAD * float(np.mean(data * data)) + SPREAD_OF_NOISE * variance
     sums = [np.ones(image.shape), data, data * data]
-    sums = [_blocks(total, np.array(roots) << n_levels) for total in sums]
+    sums = [_blocks(total, np.array(roots) << n_levels, np.add) for total in sums]
+    bound = sizes.on_voxels(image)
+    longest = np.full(sums[0].shape, most)
+    if bound is not None:
+        longest = np.minimum(most, _blocks(bound, np.array(roots) << n_levels, np.minimum, NO_BOUND))
     found = []
-    for _ in range(n_levels + 1):
+    for level in range(n_levels, -1, -1):
         count, first, second = sums
         free = np.maximum(count - 1.0, 0.0)
         noise = variance * (free + MARGIN * np.sqrt(2.0 * free))  # a chi-squared sum, and deviations of it
         error = np.maximum(second - first**2 / np.maximum(count, 1.0) - noise, 0.0)
-        found.append((error + spread * count) * _uneven(error.shape))
-        if len(found) <= n_levels:
-            sums = [_blocks(total, np.array(total.shape) // 2) for total in sums]
+        is_too_large = longest * (1.0 + 1e-9) < edge.max() / 2**level
+        found.append(_Blocks((error + spread * count) * _uneven(error.shape), is_too_large))
+        if level > 0:
+            half = np.array(count.shape) // 2
+            sums = [_blocks(total, half, np.add) for total in sums]
+            longest = _blocks(longest, half, np.minimum)
     return found[::-1]
+
+
+def _may_be(edge: NDArray[np.float64], spacing: NDArray[np.float64], smallest: float) -> bool:
+    """Whether blocks of these edges are not too small for the voxels, and as large as asked."""
+    voxels = edge / spacing
+    return bool(voxels.max() >= SMALLEST and voxels.min() >= 0.25 * SMALLEST and edge.min() >= smallest)
 
 
 def _uneven(shape: tuple[int, ...]) -> NDArray[np.float64]:
@@ -141,19 +170,21 @@ def _uneven(shape: tuple[int, ...]) -> NDArray[np.float64]:
     )
 
 
-def _blocks(data: NDArray[np.float64], counts: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Sums of voxels over equal blocks: a voxel counts where its centre is, and a block without centres has 0."""
+def _blocks(data: NDArray, counts: NDArray[np.int64], total_of: np.ufunc, empty: float = 0.0) -> NDArray:
+    """Sums, or minima, over equal blocks: a voxel counts where its centre is; a block without centres is `empty`."""
     for axis, count in enumerate(counts):
         size = data.shape[axis]
         start = np.ceil(np.arange(count) * (size / count) - 0.5).astype(np.int64)
         stop = np.append(start[1:], size)
-        total = np.add.reduceat(data, np.minimum(start, size - 1), axis=axis)
+        total = total_of.reduceat(data, np.minimum(start, size - 1), axis=axis)
         is_empty = np.expand_dims(start == stop, [d for d in range(data.ndim) if d != axis])
-        data = np.where(is_empty, 0.0, total)
+        data = np.where(is_empty, empty, total)
     return data
 
 
-def _closest(image: Image, nodes: int, fewest: int) -> tuple[int, tuple[int, ...], list[NDArray[np.bool_]]]:
+def _closest(
+    image: Image, nodes: int, fewest: int, sizes: Sizes
+) -> tuple[int, tuple[int, ...], list[NDArray[np.bool_]]]:
     """Number of nodes, blocks undivided and those divided, of the octree that has nearly as many nodes as wanted.
 
     Where many blocks are alike, they are all divided or none, and some numbers cannot be reached from one size of
@@ -162,13 +193,11 @@ def _closest(image: Image, nodes: int, fewest: int) -> tuple[int, tuple[int, ...
     best: tuple[int, tuple[int, ...], list[NDArray[np.bool_]]] | None = None
     data = _scaled(image)
     variance = noise_level(data) ** 2
-    for share in ROOTS:
-        roots = near_cubes(
-            "bcc" if image.ndim == 3 else "criss-cross", image.spacing * image.shape, max(fewest, int(nodes * share))
-        )
+    most, rings = sizes.at_most(image, nodes), int(np.ceil(1.0 / sizes.gradation - 1e-9))
+    for roots in _roots(image, nodes, fewest, most):
         if (np.array(image.shape) / roots).max() < SMALLEST and best is not None:
             break
-        count, divided = _nearest(_errors(image, data, variance, roots), roots, nodes)
+        count, divided = _nearest(_levels(image, data, variance, roots, sizes, most), roots, nodes, rings)
         if best is None or abs(count - nodes) < abs(best[0] - nodes):
             best = count, roots, divided
         if abs(count - nodes) <= ENOUGH * nodes:
@@ -177,17 +206,28 @@ def _closest(image: Image, nodes: int, fewest: int) -> tuple[int, tuple[int, ...
     return best
 
 
+def _roots(image: Image, nodes: int, fewest: int, most: float) -> Iterator[tuple[int, ...]]:
+    """Numbers of undivided blocks along each axis to try, of edges up to `most`: the largest blocks first."""
+    lengths = image.spacing * image.shape
+    kind = "bcc" if image.ndim == 3 else "criss-cross"
+    coarse = [near_cubes(kind, lengths, max(fewest, int(nodes * share))) for share in ROOTS]
+    coarse = [roots for roots in coarse if (lengths / roots).max() <= most * (1.0 + 1e-9)]
+    if len(coarse) < len(ROOTS):
+        yield tuple(int(c) for c in np.maximum(np.ceil(lengths / most - 1e-9), 1))
+    yield from coarse
+
+
 def _nearest(
-    errors: list[NDArray[np.float64]], roots: tuple[int, ...], nodes: int
+    levels: list[_Blocks], roots: tuple[int, ...], nodes: int, rings: int
 ) -> tuple[int, list[NDArray[np.bool_]]]:
     """The threshold of error above which blocks are divided, by bisection: nodes, and the blocks divided."""
     # A finer level may hold the largest error: noise is taken off the coarser ones, too.
-    low, high = (f([f(error) for error in errors]) for f in (np.min, np.max))
+    low, high = (f([f(blocks.error) for blocks in levels]) for f in (np.min, np.max))
     low, high = 0.5 * float(low), 2.0 * float(high) + 1e-300
     best, found = -1, []
     for _ in range(STEPS):
         middle = np.sqrt(max(low, 1e-300) * high)
-        divided = _divided(errors, middle)
+        divided = _divided(levels, middle, rings)
         count = len(_places(divided, roots))
         if best < 0 or abs(count - nodes) < abs(best - nodes):
             best, found = count, divided
@@ -197,11 +237,14 @@ def _nearest(
     return best, found
 
 
-def _divided(errors: list[NDArray[np.float64]], threshold: float) -> list[NDArray[np.bool_]]:
-    """Which blocks of each level are divided, if those above the threshold are, and neighbours stay within a level."""
-    divided = [error > threshold for error in errors[:-1]]
+def _divided(levels: list[_Blocks], threshold: float, rings: int) -> list[NDArray[np.bool_]]:
+    """Which blocks of each level are divided, if those above the threshold or too large are.
+
+    Around a divided block, `rings` blocks of its size exist in every direction: one keeps neighbours within a level.
+    """
+    divided = [(blocks.error > threshold) | blocks.is_too_large for blocks in levels[:-1]]
     for level in range(len(divided) - 1, 0, -1):
-        near = maximum_filter(divided[level], size=3, mode="nearest")  # these blocks have to exist
+        near = maximum_filter(divided[level], size=2 * rings + 1, mode="nearest")  # these blocks have to exist
         for axis in range(near.ndim):
             near = near.reshape(*near.shape[:axis], -1, 2, *near.shape[axis + 1 :]).any(axis=axis + 1)
         divided[level - 1] |= near
