@@ -47,7 +47,7 @@ from tetopt.optimize.fast import (
     GRADED_ITERATIONS,
     GRADED_K_D,
     check_options,
-    nodes_for_error,
+    meshed_to_error,
     optimize,
     prepare_kernels,
 )
@@ -191,7 +191,7 @@ def mesh_command(
     size_min: Annotated[float | None, typer.Option(metavar="MM", help="No edge is split into shorter halves.")] = None,
     size_max: Annotated[
         float | None,
-        typer.Option(metavar="MM", help="No cell is made with a longer edge (default 1.5 x a uniform mesh's)."),
+        typer.Option(metavar="MM", help="No cell is made with a longer edge (default 1.4 x a uniform mesh's)."),
     ] = None,
     gradation: Annotated[
         float | None, typer.Option(metavar="G", help="Edges grow by G x distance at most, 0.05 to 1 (default 1).")
@@ -303,12 +303,10 @@ def mesh_command(
     image = _image(image_path, volume, crop, slice_)
     if is_graded:
         sizes = _sizes(size_min, size_max, gradation, sizing)
-        if target_error is not None:
-            nodes = nodes_for_error(image, target_error, sizes)
-        elif nodes is None:  # fewer on small images
+        if nodes is None and target_error is None:  # fewer on small images
             nodes = int(np.clip(image.data.size // 8, 2 ** (image.ndim + 2), DEFAULT_NODES[image.ndim]))
-        initial, kind = octree(image, nodes, sizes), Lattice.octree.value
-        options |= {"nodes": nodes, "target_error": target_error, "sizes": sizes}
+        initial, kind = None if nodes is None else octree(image, nodes, sizes), Lattice.octree.value
+        options |= {"nodes": nodes, "sizes": sizes}
     else:
         if nodes is None and spacing is None:
             nodes = DEFAULT_NODES[image.ndim]
@@ -357,7 +355,7 @@ def _check_method(method: Method, given: dict[str, Any], wanted: Method) -> None
 def _mesh_files(
     image_path: Path,
     image: Image,
-    initial: Mesh,
+    initial: Mesh | None,
     options: dict[str, Any],
     source: dict[str, Any],
     output: Path,
@@ -366,14 +364,25 @@ def _mesh_files(
     begin: float,
 ) -> int:
     """Optimise, write the mesh, the numbers and the pictures, print the comparison; the exit code."""
-    told = {name: value for name, value in options.items() if name != "sizes"} | source
-    about = {"image": image_path.name, "image_sha256": sha256(image_path), "options": told}
-    log.print(escape(_described(image_path, image, initial, source["lattice"])))
     loaded = time.perf_counter()
-    max_seconds = source["max_seconds"]
-    left = None if max_seconds is None else max(max_seconds - (loaded - begin), 1e-9)
-    result, is_interrupted = _optimized(image, initial, Method(source["method"]), left, **options)
+    ends = None if source["max_seconds"] is None else begin + source["max_seconds"]
+    interrupted: list[bool] = []
+
+    def run(mesh: Mesh, nodes: int | None) -> Optimized:
+        log.print(escape(_described(image_path, image, mesh, source["lattice"])))
+        graded = {} if nodes is None else {"nodes": nodes}
+        result, is_interrupted = _optimized(image, mesh, Method(source["method"]), ends, **options | graded)
+        interrupted.append(is_interrupted)
+        return result
+
+    if initial is None:
+        options["nodes"], initial, result = meshed_to_error(image, source["target_error"], options["sizes"], run)
+    else:
+        result = run(initial, options.get("nodes"))
+    is_interrupted = any(interrupted)
     optimized = time.perf_counter()
+    told = {name: value for name, value in (source | options).items() if name != "sizes"}
+    about = {"image": image_path.name, "image_sha256": sha256(image_path), "options": told}
     fields = cell_fields(result.mesh, image)
     save_mesh(output, result.mesh, fields, {"tetopt": tetopt.__version__, **about})
     if json_path is not None:
@@ -382,7 +391,7 @@ def _mesh_files(
     if pictures:
         from tetopt.report.figures import save_run_figures  # matplotlib is slow to load, and only needed here
 
-        save_run_figures(pictures, image, initial, result)
+        save_run_figures(pictures, image, initial, result, _start_name(source["lattice"]))
     # Everything is written; what is printed may go into a pipe that closes.
     code = _promises(image, result, options.get("min_dihedral", 0.0), source["target_error"])
     code = 130 if is_interrupted else code
@@ -485,8 +494,8 @@ def _promises(image: Image, result: Optimized, min_dihedral: float, target_error
     is_above = target_error is not None and share > target_error
     if is_above:
         log.print(
-            f"[bold red]tetopt:[/] {share:.4g} of the image's variance is left in the cells, more than {target_error:g}; "
-            "allow more --iterations or smaller cells, or ask for --nodes"
+            f"[bold red]tetopt:[/] {share:.4g} of the image's variance is left in the cells, more than "
+            f"{target_error:g}; allow smaller cells or more --iterations, or ask for a number of --nodes"
         )
     if missed == 0 and abs(covered / image.volume - 1.0) < 1e-9:
         return 1 if below or is_above else 0
@@ -498,15 +507,13 @@ def _promises(image: Image, result: Optimized, min_dihedral: float, target_error
 
 
 def _optimized(
-    image: Image, initial: Mesh, method: Method, max_seconds: float | None, **options: Any
+    image: Image, initial: Mesh, method: Method, ends: float | None, **options: Any
 ) -> tuple[Optimized, bool]:
-    """`optimize` with progress shown, ended in good order by Ctrl-C; whether it was."""
-    begin = time.perf_counter()
+    """`optimize` with progress shown, ended in good order at a time or by Ctrl-C; whether by that."""
     iterations = options["iterations"]
     _prepare_kernels(image, options["k_D"], method, "nodes" in options)
     run = optimize if method is Method.fast else optimize_paper
-    if max_seconds is not None:
-        max_seconds = max(max_seconds - (time.perf_counter() - begin), 1e-9)
+    max_seconds = None if ends is None else max(ends - time.perf_counter(), 1e-9)
     with _graceful_interrupt() as is_interrupted, _progress(iterations) as show:
         result = run(image, initial, max_seconds=max_seconds, callback=show, stop=is_interrupted, **options)
         was_interrupted = is_interrupted()
@@ -969,9 +976,9 @@ def compare_command(
         str,
         typer.Option(
             metavar="A,B,...",
-            help="Of tetopt, tetopt-graded, tetopt-paper, pytetwild, cleaver, bcc, odt: which, in order.",
+            help="Of tetopt, tetopt-uniform, tetopt-paper, pytetwild, cleaver, bcc, odt: which, in order.",
         ),
-    ] = "tetopt,tetopt-graded,tetopt-paper,pytetwild,cleaver,bcc,odt",
+    ] = "tetopt,tetopt-uniform,tetopt-paper,pytetwild,cleaver,bcc,odt",
     k_D: Annotated[float, typer.Option("--k-d", metavar="K", help="tetopt's weight of the image.")] = 0.2,
     classes: Annotated[int, typer.Option(metavar="K", min=2, help="Classes of the segmentation (multi-Otsu).")] = 4,
     young: Annotated[

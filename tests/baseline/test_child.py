@@ -105,7 +105,7 @@ def test_interrupt_kills_the_child(tmp_path):
 
 
 def test_bad_requests():
-    with pytest.raises(tetopt.InputError, match="expected one of tetopt, tetopt-graded, tetopt-paper, pytetwild"):
+    with pytest.raises(tetopt.InputError, match="expected one of tetopt, tetopt-uniform, tetopt-paper, pytetwild"):
         run_in_child("tetwild", JOB, max_seconds=1.0)
     with pytest.raises(tetopt.InputError, match="more than 0 seconds"):
         run_in_child("bcc", JOB, max_seconds=0.0)

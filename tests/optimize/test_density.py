@@ -10,6 +10,7 @@ import tetopt
 from tetopt.geometry.simplex import volumes
 from tetopt.optimize.complex import build, energies, floor_of, measure_all, node_rings
 from tetopt.optimize.density import (
+    Limits,
     Sides,
     best_collapses,
     best_splits,
@@ -28,8 +29,13 @@ def sides_of(held, is_fixed=False):
     return Sides(held.complex.ticks.min(axis=0), held.complex.ticks.max(axis=0), is_fixed)
 
 
+def no_limits(n_nodes):
+    return Limits(0.0, np.full(n_nodes, np.inf), 0.0)
+
+
 def exchanged(held, n_nodes, most, is_fixed=False):
-    done = exchange(held.complex, held.is_frozen, held.measure, sides_of(held, is_fixed), n_nodes, most)
+    limits = no_limits(len(held.complex.ticks))
+    done = exchange(held.complex, held.is_frozen, held.measure, sides_of(held, is_fixed), n_nodes, most, limits)
     held.complex, held.is_frozen = done.held, done.is_frozen
     return done
 
@@ -78,7 +84,7 @@ def test_worth_is_what_E_falls_by(n, is_fixed):
             is_dirty = np.zeros(len(room.cells), dtype=np.bool_)
             nobody = np.empty(0, dtype=np.int64)
             if kind == "split":
-                gain, split = best_splits(room, rings, is_frozen, held.measure, sides, np.ones(N, dtype=bool))
+                gain, split = best_splits(room, rings, is_frozen, held.measure, sides, np.ones(N, dtype=bool), 0.0)
                 if split[node] < 0:
                     continue
                 done = make_exchanges(
@@ -107,7 +113,7 @@ def test_worth_is_what_E_falls_by(n, is_fixed):
                 held.complex = room._replace(ticks=room.ticks[: N + 1])
             else:
                 cost, collapse = best_collapses(
-                    room, rings, groups, is_frozen, held.measure, np.inf, np.ones(N, dtype=bool)
+                    room, rings, groups, is_frozen, held.measure, np.inf, np.ones(N, dtype=bool), np.full(N, np.inf)
                 )
                 if collapse[node] < 0:
                     continue
@@ -126,21 +132,31 @@ def test_worth_is_what_E_falls_by(n, is_fixed):
     assert count > 20
 
 
-def test_collapses_are_the_best_of_all_neighbours():
-    """Against meshes in which each node is joined to each neighbour, measured from nothing."""
+@pytest.mark.parametrize("is_bounded", [False, True])
+def test_collapses_are_the_best_of_all_neighbours(is_bounded):
+    """Against meshes in which each node is joined to each neighbour, measured from nothing.
+
+    Bounded: no new edge is longer than the bound at its ends, unless one as long was there.
+    """
     held = random_case(11, 3)
     held.sweep()
     N, cells = len(held.complex.ticks), held.mesh.cells
     rings, groups = node_rings(held.complex), blocks(held.complex.ticks)
+    points = held.mesh.points
+    longest = np.random.default_rng(0).uniform(8.0, 20.0, N) if is_bounded else np.full(N, np.inf)
     cost, collapse = best_collapses(
-        held.complex, rings, groups, held.is_frozen, held.measure, np.inf, np.ones(N, dtype=bool)
+        held.complex, rings, groups, held.is_frozen, held.measure, np.inf, np.ones(N, dtype=bool), longest
     )
     size = np.linalg.det(held.mesh.points[cells[:, 1:]] - held.mesh.points[cells[:, :1]]).sum()
-    joined = 0
+    joined, refused = 0, 0
     for a in range(N):
         best = np.inf
-        for b in np.unique(cells[(cells == a).any(axis=1)]):
-            if b == a:
+        near = np.setdiff1d(cells[(cells == a).any(axis=1)], [a])
+        old = np.linalg.norm(points[near] - points[a], axis=1).max()
+        for b in near:
+            new_edges = np.linalg.norm(points[near] - points[b], axis=1)
+            if (new_edges > np.maximum(np.minimum(longest[near], longest[b]), old)).any():
+                refused += 1
                 continue
             new = np.where(cells == a, b, cells)[~((cells == a).any(axis=1) & (cells == b).any(axis=1))]
             volume = np.linalg.det(held.mesh.points[new[:, 1:]] - held.mesh.points[new[:, :1]])
@@ -157,6 +173,7 @@ def test_collapses_are_the_best_of_all_neighbours():
         else:
             assert collapse[a] == -1
     assert joined > 5
+    assert (refused > 20) == is_bounded
 
 
 @settings(max_examples=25, deadline=None)
@@ -198,7 +215,7 @@ def test_nodes_go_where_the_image_is():
             held.flip()
             if does_exchange:  # most of a shape's cost goes when the nodes around move again
                 eager = held.measure._replace(geometry=0.1 * held.measure.geometry)
-                done = exchange(held.complex, held.is_frozen, eager, held.sides, N, N // 10)
+                done = exchange(held.complex, held.is_frozen, eager, held.sides, N, N // 10, no_limits(N))
                 held.complex, held.is_frozen = done.held, done.is_frozen
         for _ in range(3):
             held.sweep()

@@ -10,7 +10,7 @@ from typing import NamedTuple
 from tetopt.image import Image
 from tetopt.lattice import lattice
 from tetopt.mesh import Mesh
-from tetopt.optimize.fast import GRADED_K_D, optimize, prepare_kernels
+from tetopt.optimize.fast import GRADED_ITERATIONS, GRADED_K_D, optimize, prepare_kernels
 from tetopt.optimize.octree import octree
 from tetopt.optimize.paper import optimize_paper
 
@@ -22,8 +22,8 @@ class Job(NamedTuple):
     labels: Image | None  # a given segmentation, on the image's voxels; else it is made by thresholds
     nodes: int  # wanted
     classes: int = 4  # of the thresholds, without labels
-    k_D: float = 0.2
-    iterations: int = 20
+    k_D: float = 0.2  # of uniform meshes; the graded one has its own
+    iterations: int = 20  # likewise
 
 
 class Produced(NamedTuple):
@@ -79,7 +79,25 @@ def odt(job: Job) -> Produced:
 
 
 def tetopt(job: Job) -> Produced:
-    """The lattice and `optimize` with its defaults, no segmentation.
+    """`tetopt.mesh_image` with its defaults: nodes where the image has content, no segmentation.
+
+    Raises
+    ------
+    InputError
+        As `tetopt.mesh_image`.
+    """
+    clock = _Clock()
+    with clock.step("kernels"):
+        prepare_kernels(job.image, GRADED_K_D, is_graded=True)
+    with clock.step("octree"):
+        mesh = octree(job.image, job.nodes)
+    with clock.step("optimize"):
+        result = optimize(job.image, mesh, k_D=GRADED_K_D, iterations=GRADED_ITERATIONS, nodes=job.nodes)
+    return Produced(result.mesh, clock.seconds, [f"ended by: {result.ended}"])
+
+
+def tetopt_uniform(job: Job) -> Produced:
+    """The lattice and `optimize`, as `tetopt mesh --uniform`.
 
     Raises
     ------
@@ -94,24 +112,6 @@ def tetopt(job: Job) -> Produced:
     with clock.step("optimize"):
         result = optimize(job.image, mesh, k_D=job.k_D, iterations=job.iterations)
     return Produced(result.mesh, clock.seconds, [f"ended by: {result.ended}"])
-
-
-def tetopt_graded(job: Job) -> Produced:
-    """Nodes where the image has content: the octree and `optimize`, as `tetopt.mesh_image`, which has its own k_D.
-
-    Raises
-    ------
-    InputError
-        As `tetopt.mesh_image`.
-    """
-    clock = _Clock()
-    with clock.step("kernels"):
-        prepare_kernels(job.image, GRADED_K_D, is_graded=True)
-    with clock.step("octree"):
-        mesh = octree(job.image, job.nodes)
-    with clock.step("optimize"):
-        result = optimize(job.image, mesh, k_D=GRADED_K_D, iterations=job.iterations, nodes=job.nodes)
-    return Produced(result.mesh, clock.seconds, [f"ended by: {result.ended}", f"k_D = {GRADED_K_D:g}"])
 
 
 def tetopt_paper(job: Job) -> Produced:
@@ -180,7 +180,7 @@ def _by_the_paper(job: Job, k_D: float) -> Produced:
 
 PIPELINES: dict[str, Callable[[Job], Produced]] = {
     "tetopt": tetopt,
-    "tetopt-graded": tetopt_graded,
+    "tetopt-uniform": tetopt_uniform,
     "tetopt-paper": tetopt_paper,
     "pytetwild": pytetwild,
     "cleaver": cleaver,

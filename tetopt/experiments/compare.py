@@ -49,8 +49,8 @@ class Pipeline(NamedTuple):
 
 
 SHOWN = {
-    "tetopt": Pipeline("tetopt", "tetopt", "tetopt mesh with its defaults: BCC lattice, fast engine"),
-    "tetopt-graded": Pipeline("tetopt, graded", "tetopt", "tetopt mesh --lattice octree"),
+    "tetopt": Pipeline("tetopt", "tetopt", "tetopt mesh with its defaults: nodes where the image has content"),
+    "tetopt-uniform": Pipeline("tetopt, uniform", "tetopt", "tetopt mesh --uniform: BCC lattice, fast engine"),
     "tetopt-paper": Pipeline("tetopt, paper's scheme", "tetopt", "tetopt mesh --method paper"),
     "pytetwild": Pipeline(
         "pytetwild", "peer", "classes by multi-Otsu or the labels given, their surfaces, fTetWild sized by them", True

@@ -51,7 +51,9 @@ from tetopt.optimize.flips import close_gaps
 from tetopt.optimize.smooth import Blocks, blocks, colours_of, ring_energy
 
 LEAST_GAIN = 1e-3  # of a node's mean share of E: an exchange of two nodes that is worth less is not made
-LEAST_OVER_NOISE = 20.0  # of the noise's variance: likewise; about what the luckiest of thousands of edges wins in noise
+LEAST_OVER_NOISE = (
+    20.0  # of the noise's variance: likewise; about what the luckiest of thousands of edges wins in noise
+)
 NEIGHBOURS = 128  # edges of a node that are looked at, at most
 
 
@@ -353,7 +355,8 @@ def best_splits(
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:  # fmt: skip
     """How much E falls if the best edge of each node that is wanted is split, (N,), and where that leads, (N,).
 
-    -inf and -1 where none can be split above the floor, into halves of `shortest` mm or more; an edge of two nodes that are wanted counts for the lower one.
+    -inf and -1 where none can be split above the floor, into halves of `shortest` mm or more; an edge of two nodes that
+    are wanted counts for the lower one.
     Rows N to 2 N of `held.ticks` and `is_frozen` are written to.
     """
     n_nodes = len(is_wanted)
@@ -537,7 +540,9 @@ def best_collapses(
     bare = measure._replace(image=0.0)
     for chosen in colours_of(held, rings, groups):
         with few_threads(len(chosen) * 10_000):
-            _fill_collapses(cost, collapse, held, rings, groups, chosen, is_frozen, measure, bare, dearest, is_wanted, longest)
+            _fill_collapses(
+                cost, collapse, held, rings, groups, chosen, is_frozen, measure, bare, dearest, is_wanted, longest
+            )
     return cost, collapse
 
 
@@ -549,7 +554,9 @@ def _fill_collapses(
     for number in prange(len(chosen)):
         for at in range(groups.start[chosen[number]], groups.start[chosen[number] + 1]):
             if is_wanted[groups.nodes[at]]:
-                _best_collapse(groups.nodes[at], cost, collapse, held, rings, is_frozen, measure, bare, dearest, longest)
+                _best_collapse(
+                    groups.nodes[at], cost, collapse, held, rings, is_frozen, measure, bare, dearest, longest
+                )
 
 
 @njit(cache=True, error_model="numpy")

@@ -18,7 +18,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.check import check_unfolded
-from tetopt.energy.discretization import E_D
 from tetopt.energy.sampling import (
     check_orientations,
     few_threads,
@@ -66,9 +65,10 @@ QUIET = 0.02  # of an edge: nodes around which none moved more are not moved aga
 EXCHANGES = 0.7  # of the iterations: those after which nodes are exchanged
 EXCHANGED = 0.1  # of the nodes wanted: the most that are exchanged at once
 EAGER = 0.1  # see `_Run.exchange`
+FIRST = {2: 200, 3: 1500}  # nodes of the first run towards an error
 RATE = 0.7  # E_D falls with nodes^-0.7, on the MNI152 T1 from 5,000 to 40,000
-SETTLED = 0.45  # of a new octree's E_D is left in the end, there
-FIRST = {2: 200, 3: 1500}  # nodes from which the number for an error is guessed
+NEAR = 0.85  # of the error wanted: near enough
+RUNS = 6  # towards an error, at most
 FAR = -(1 << 40)  # ticks from anywhere
 
 
@@ -82,7 +82,6 @@ def optimize(
     min_dihedral: float = 12.0,
     boundary: Boundary = "slide",
     nodes: int | None = None,
-    target_error: float | None = None,
     sizes: Sizes | None = None,
     tolerance: float = 5e-4,
     max_seconds: float | None = None,
@@ -116,9 +115,6 @@ def optimize(
         are exchanged in the first iterations, if k_D > 0. An exchange doubles them at most, so that few iterations, or
         a number far from that of `mesh`, may miss it; count them. By default the nodes of `mesh` are kept, and the
         shape energy is that of Eq. (1).
-    target_error : float, optional
-        With `nodes`, which is a first guess then: put nodes in, or take them out, until E_D is this share of the
-        image's variance (times its volume). Look at `tetopt.E_D` of the result: few iterations may miss it.
     sizes : Sizes, optional
         Limits on the edges that exchanges make, with `nodes`.
     tolerance : float
@@ -144,7 +140,7 @@ def optimize(
         An option out of range; a mesh that the sampling cannot take (see `tetopt.cell_moments`), that is folded or
         has a facet in more than two cells, or a cell too flat to have a shape energy; or energies that overflow.
     """
-    check_options(k_D, iterations, shape_power, min_dihedral, boundary, nodes, target_error)
+    check_options(k_D, iterations, shape_power, min_dihedral, boundary, nodes)
     begin = time.perf_counter()
     is_over = deadline(begin, max_seconds, stop)
     sizes = (Sizes() if sizes is None else sizes).prepared(image.ndim)
@@ -170,8 +166,6 @@ def optimize(
         fall = 1.0 - run.E() / history[-1].E if history[-1].E > 0.0 else 0.0
         is_last = iteration == iterations or not is_finished or (fall < tolerance and not is_early)
         if nodes is not None and is_early and not is_last and iteration % 2 == 1:
-            if target_error is not None:
-                nodes = run.nodes_for(target_error)
             is_changed |= run.exchange(nodes, sizes) > 0
         if is_last and run.n_below(floor) > 0 and run.lift(floor) > 0:
             is_changed, fall = True, np.inf
@@ -212,7 +206,7 @@ def mesh_image(
     iterations : int
         As of `optimize`; nodes are exchanged in the first 0.7 of them.
     sizes : Sizes, optional
-        Limits on the cells' edges; by default up to 1.5 times a uniform mesh's.
+        Limits on the cells' edges; by default up to 1.4 times a uniform mesh's.
     **options
         Further ones of `optimize`.
 
@@ -236,24 +230,31 @@ def mesh_image(
     """
     if (nodes is None) == (target_error is None):
         raise InputError("mesh_image: give a number of nodes or a target_error, one of them")
-    if nodes is None:
-        assert target_error is not None
-        nodes = nodes_for_error(image, target_error, sizes)
-    return optimize(
-        image, octree(image, nodes, sizes), k_D=k_D, iterations=iterations, nodes=nodes, target_error=target_error,
-        sizes=sizes, **options,
-    )  # fmt: skip
+
+    def run(mesh: Mesh, nodes: int) -> Optimized:
+        return optimize(image, mesh, k_D=k_D, iterations=iterations, nodes=nodes, sizes=sizes, **options)
+
+    if target_error is not None:
+        return meshed_to_error(image, target_error, sizes, run)[2]
+    assert nodes is not None
+    return run(octree(image, nodes, sizes), nodes)
 
 
-def nodes_for_error(image: Image, target_error: float, sizes: Sizes | None = None) -> int:
-    """A first guess of the nodes that a graded mesh takes for a share of the image's variance; see `mesh_image`.
+def meshed_to_error(
+    image: Image, target_error: float, sizes: Sizes | None, run: Callable[[Mesh, int], Optimized]
+) -> tuple[int, Mesh, Optimized]:
+    """Run after run with other numbers of nodes, until the share of the image's variance is just below a target.
+
+    Returns the number of nodes, the octree and the result of the run with the fewest nodes that has the error, the last
+    if none has, or one that was cut short. The same as with that number of nodes from the start.
 
     Raises
     ------
     InputError
-        A share out of range, or one below that of the image's noise, which no mesh should follow.
+        A share out of range, or one below that of the image's noise, which no mesh should follow; as `octree`.
     """
-    check_options(0.0, 0, 3.0, 0.0, "slide", target_error=target_error)
+    if not 0.0 < target_error < 1.0:
+        raise InputError(f"target_error: expected a share of the image's variance, 0 to 1, got {target_error}")
     variance = float(np.var(image.data, dtype=np.float64))
     if variance == 0.0:
         raise InputError("target_error: the image is constant, every mesh has no error; give a number of nodes")
@@ -263,15 +264,42 @@ def nodes_for_error(image: Image, target_error: float, sizes: Sizes | None = Non
             f"target_error: {target_error:g} of the variance is below the noise's share, {noise:.3g}: "
             "cells would have to follow the noise; ask for more, or denoise the image"
         )
-    first = FIRST[image.ndim]
-    share = SETTLED * E_D(image, octree(image, first, sizes)) / (variance * image.volume)
-    return _scaled_nodes(image, first, share, target_error)
+    nodes, tried = FIRST[image.ndim], dict[int, float]()
+    best: tuple[int, Mesh, Optimized] | None = None
+    for _ in range(RUNS):
+        mesh = octree(image, nodes, sizes)
+        result = run(mesh, nodes)
+        tried[nodes] = share = result.history[-1].E_D / (variance * image.volume)
+        if best is None or _is_better(nodes, best[0], tried, target_error):
+            best = nodes, mesh, result
+        if result.ended in ("stopped", "max_seconds") or NEAR * target_error <= share <= target_error:
+            return nodes, mesh, result
+        if (nodes := _next_nodes(image, tried, target_error)) in tried:
+            break
+    assert best is not None
+    return best
 
 
-def _scaled_nodes(image: Image, nodes: int, share: float, target: float) -> int:
-    """The nodes that would have the target, if these have that share."""
-    most = max(image.data.size // 8, 64)
-    return int(np.clip(nodes * (share / target) ** (1.0 / RATE), 32, most))
+def _is_better(new: int, old: int, tried: dict[int, float], target: float) -> bool:
+    """Whether one number of nodes answers better than another: it has the error with fewer, or is nearer to it."""
+    if (tried[new] <= target) != (tried[old] <= target):
+        return tried[new] <= target
+    return new < old if tried[new] <= target else tried[new] < tried[old]
+
+
+def _next_nodes(image: Image, tried: dict[int, float], target: float) -> int:
+    """The number of nodes to try next: between the nearest two on either side, or beyond the nearest."""
+    aim = 0.5 * (1.0 + NEAR) * target
+    above = max((n for n, share in tried.items() if share > target), default=None)
+    below = min((n for n, share in tried.items() if share <= target), default=None)
+    least = 0.03 * aim  # there may be no error at all
+    if above is not None and below is not None and above < below:
+        part = np.log(tried[above] / aim) / np.log(tried[above] / max(tried[below], least))
+        return int(above * (below / above) ** part)
+    nearest = above if above is not None else below
+    assert nearest is not None
+    ratio = max(tried[nearest], least) / aim
+    return int(np.clip(nearest * ratio ** (1.0 / RATE), 2 ** (image.ndim + 2), max(image.data.size // 8, 64)))
 
 
 def prepare_kernels(
@@ -394,11 +422,6 @@ class _Run:
         self.seen[done.is_touched] = FAR
         return done.n_split + done.n_collapsed
 
-    def nodes_for(self, target_error: float) -> int:
-        """How many nodes the target takes, by what these have."""
-        share = self.energies()[1] / (float(np.var(self.image.data, dtype=np.float64)) * self.image.data.size)
-        return _scaled_nodes(self.image, len(self.held.ticks), share, target_error)
-
     def keep_floor(self, degrees: float) -> None:
         """Let no move leave a dihedral angle under `degrees`, nor one that is under it already any smaller."""
         floor, safe = floor_of(degrees)
@@ -447,9 +470,8 @@ def _edges(mesh: Mesh) -> NDArray[np.float64]:
 
 
 def check_options(
-    k_D: float, iterations: int, shape_power: float, min_dihedral: float, boundary: str, nodes: int | None = None,
-    target_error: float | None = None,
-) -> None:  # fmt: skip
+    k_D: float, iterations: int, shape_power: float, min_dihedral: float, boundary: str, nodes: int | None = None
+) -> None:
     """InputError for an option of `optimize` out of range."""
     if not 0.0 <= k_D < 1.0:
         raise InputError(f"k_D: expected 0 <= k_D < 1, got {k_D}")
@@ -463,7 +485,5 @@ def check_options(
         )
     if nodes is not None and not (isinstance(nodes, int | np.integer) and nodes > 2):
         raise InputError(f"nodes: expected a whole number above 2, or None to keep those of the mesh, got {nodes!r}")
-    if target_error is not None and not 0.0 < target_error < 1.0:
-        raise InputError(f"target_error: expected a share of the image's variance, 0 to 1, got {target_error}")
     if boundary not in ("slide", "fixed"):
         raise InputError(f"boundary: expected slide or fixed, got {boundary!r}")

@@ -24,10 +24,22 @@ from tetopt.image import Image
 from tetopt.lattice import near_cubes
 from tetopt.mesh import Mesh
 from tetopt.optimize.retessellate import delaunay
-from tetopt.optimize.sizes import NO_BOUND, Sizes
+from tetopt.optimize.sizes import DIAGONAL, NO_BOUND, Sizes
 
-ROOTS = (1 / 60, 1 / 45, 1 / 30, 1 / 20, 1 / 12, 1 / 8, 1 / 6, 1 / 4, 1 / 2.5, 1 / 1.6, 1.0)  # undivided blocks' nodes, of those wanted: tried in turn
-ENOUGH = 0.02  # of the nodes wanted: a miss that ends the trials
+ROOTS = (
+    1 / 60,
+    1 / 45,
+    1 / 30,
+    1 / 20,
+    1 / 12,
+    1 / 8,
+    1 / 6,
+    1 / 4,
+    1 / 2.5,
+    1 / 1.6,
+    1.0,
+)  # undivided blocks' nodes, of those wanted: tried in turn
+ENOUGH = 0.05  # of the nodes wanted: a miss that ends the trials
 SMALLEST = 2.0  # voxels along a leaf's edge, at least, where voxels are smallest; a quarter where they are largest
 SPREAD = 1e-3  # of the image's variance: what every voxel counts besides, so that any number of nodes is reached
 SPREAD_OF_NOISE = 0.03  # of the noise's: so much that chance does not decide which noise is divided first
@@ -128,15 +140,21 @@ def _levels(
 ) -> list[_Blocks]:
     """The blocks of each level, the coarsest first."""
     edge = image.spacing * image.shape / np.array(roots)
-    n_levels = 0
+    bound = sizes.on_voxels(image)
+    least = most if bound is None else min(most, float(bound.min()) / DIAGONAL[image.ndim])
+    n_levels, n_content = 0, 0  # levels of blocks that exist, and that content may ask for
     while _may_be(edge / 2 ** (n_levels + 1), image.spacing, sizes.smallest):
+        n_levels, n_content = n_levels + 1, n_content + 1
+    while (edge / 2**n_levels).max() > least * (1.0 + 1e-9) and (
+        edge / 2 ** (n_levels + 1) / image.spacing
+    ).max() >= 1.0:
         n_levels += 1
     spread = SPREAD * float(np.mean(data * data)) + SPREAD_OF_NOISE * variance
     sums = [np.ones(image.shape), data, data * data]
     sums = [_blocks(total, np.array(roots) << n_levels, np.add) for total in sums]
-    bound = sizes.on_voxels(image)
     longest = np.full(sums[0].shape, most)
     if bound is not None:
+        bound = bound / DIAGONAL[image.ndim]
         longest = np.minimum(most, _blocks(bound, np.array(roots) << n_levels, np.minimum, NO_BOUND))
     found = []
     for level in range(n_levels, -1, -1):
@@ -145,7 +163,7 @@ def _levels(
         noise = variance * (free + MARGIN * np.sqrt(2.0 * free))  # a chi-squared sum, and deviations of it
         error = np.maximum(second - first**2 / np.maximum(count, 1.0) - noise, 0.0)
         is_too_large = longest * (1.0 + 1e-9) < edge.max() / 2**level
-        found.append(_Blocks((error + spread * count) * _uneven(error.shape), is_too_large))
+        found.append(_Blocks((error + spread * count) * _uneven(error.shape) * (level < n_content), is_too_large))
         if level > 0:
             half = np.array(count.shape) // 2
             sums = [_blocks(total, half, np.add) for total in sums]
@@ -193,11 +211,17 @@ def _closest(
     best: tuple[int, tuple[int, ...], list[NDArray[np.bool_]]] | None = None
     data = _scaled(image)
     variance = noise_level(data) ** 2
-    most, rings = sizes.at_most(image, nodes), int(np.ceil(1.0 / sizes.gradation - 1e-9))
+    most, rings = sizes.at_most(image, nodes) / DIAGONAL[image.ndim], int(np.ceil(1.0 / sizes.gradation - 1e-9))
     for roots in _roots(image, nodes, fewest, most):
         if (np.array(image.shape) / roots).max() < SMALLEST and best is not None:
             break
-        count, divided = _nearest(_levels(image, data, variance, roots, sizes, most), roots, nodes, rings)
+        levels = _levels(image, data, variance, roots, sizes, most)
+        if levels[-1].is_too_large.any():
+            raise InputError(
+                f"sizes: edges are to be shorter than {(image.spacing * image.shape / roots).max() / 2 ** (len(levels) - 1):.3g} mm "
+                f"somewhere, but cells below a voxel ({image.spacing.max():.3g} mm) see nothing; allow longer ones"
+            )
+        count, divided = _nearest(levels, roots, nodes, rings)
         if best is None or abs(count - nodes) < abs(best[0] - nodes):
             best = count, roots, divided
         if abs(count - nodes) <= ENOUGH * nodes:
@@ -222,8 +246,8 @@ def _nearest(
 ) -> tuple[int, list[NDArray[np.bool_]]]:
     """The threshold of error above which blocks are divided, by bisection: nodes, and the blocks divided."""
     # A finer level may hold the largest error: noise is taken off the coarser ones, too.
-    low, high = (f([f(blocks.error) for blocks in levels]) for f in (np.min, np.max))
-    low, high = 0.5 * float(low), 2.0 * float(high) + 1e-300
+    above = np.concatenate([blocks.error[blocks.error > 0.0] for blocks in levels])
+    low, high = (0.5 * float(above.min()), 2.0 * float(above.max())) if len(above) else (0.5, 1.0)
     best, found = -1, []
     for _ in range(STEPS):
         middle = np.sqrt(max(low, 1e-300) * high)

@@ -32,11 +32,16 @@ def save_figure(figure: Figure, path: str | Path, dpi: int = 150) -> None:
         figure.savefig(temporary, dpi=dpi, format="png", bbox_inches="tight", facecolor="white")
 
 
-def save_run_figures(paths: Sequence[Path], image: Image, initial: Mesh, result: Optimized) -> None:
-    """Three PNGs of a run: slice with mesh before and after, rho histograms before and after, energies."""
+def save_run_figures(
+    paths: Sequence[Path], image: Image, initial: Mesh, result: Optimized, start: str = "lattice"
+) -> None:
+    """Three PNGs of a run: slice with mesh before and after, rho histograms before and after, energies.
+
+    `start` is what the initial mesh is called.
+    """
     first, last = result.history[0], result.history[-1]
     fit = f"{last.E_D / first.E_D:.3f} of its E_D" if first.E_D > 0.0 else "constant image"
-    before = f"lattice, {len(initial.points)} nodes"
+    before = f"{start}, {len(initial.points)} nodes"
     after = f"optimised, {fit}"
     meshes = [(before, initial), (after, result.mesh)]
     save_figure(slice_figure(image, meshes), paths[0])
