@@ -979,7 +979,7 @@ def compare_command(
             help="Of tetopt, tetopt-uniform, tetopt-paper, pytetwild, cleaver, bcc, odt: which, in order.",
         ),
     ] = "tetopt,tetopt-uniform,tetopt-paper,pytetwild,cleaver,bcc,odt",
-    k_D: Annotated[float, typer.Option("--k-d", metavar="K", help="tetopt's weight of the image.")] = 0.2,
+    k_D: Annotated[float, typer.Option("--k-d", metavar="K", help="Weight of the image on uniform meshes.")] = 0.2,
     classes: Annotated[int, typer.Option(metavar="K", min=2, help="Classes of the segmentation (multi-Otsu).")] = 4,
     young: Annotated[
         str | None,
@@ -988,6 +988,9 @@ def compare_command(
     curve: Annotated[
         str, typer.Option(metavar="F,...", help="Node counts of the error curves, as parts of N; empty for none.")
     ] = "0.25,0.5,2",
+    tradeoff: Annotated[
+        bool, typer.Option("--tradeoff", help="Sweep tetopt's options around its defaults: some 20 more runs.")
+    ] = False,
     reference_dofs: Annotated[
         int, typer.Option(metavar="D", min=1000, help="Size of the voxel grid that is the truth of the simulation.")
     ] = 300_000,
@@ -1014,7 +1017,7 @@ def compare_command(
     law, law_words = compare.default_law(image) if young is None else (parse_law(young), young)
     settings = compare.Settings(
         nodes=nodes, pipelines=tuple(name.strip() for name in pipelines.split(",")), repeats=repeats, classes=classes,
-        k_D=k_D, reference_dofs=reference_dofs, curve=_parse_curve(curve), max_seconds=max_seconds,
+        k_D=k_D, reference_dofs=reference_dofs, curve=_parse_curve(curve), tradeoff=tradeoff, max_seconds=max_seconds,
         max_bytes=None if max_gb is None else int(max_gb * 1e9),
     )  # fmt: skip
     about = {

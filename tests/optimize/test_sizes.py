@@ -141,7 +141,7 @@ def test_sizes_around_are_the_twin_s():
         (Sizes(gradation=2.0), "gradation: expected 0.05"),
         (Sizes(field=tetopt.Image(np.ones((4, 4)))), "sizing: expected a field in 3-D"),
         (Sizes(field=tetopt.Image(np.zeros((4, 4, 4)))), "sizing: no voxel is above 0"),
-        (Sizes(field=tetopt.Image(np.full((30, 30, 30), 0.5))), "cells below a voxel .1 mm. see nothing"),
+        (Sizes(field=tetopt.Image(np.full((30, 30, 30), 0.5))), "too short for a block to have a voxel's length"),
     ],
 )
 def test_limits_that_cannot_be(sizes, words):

@@ -24,6 +24,7 @@ from tetopt.baseline.child import run_in_child
 from tetopt.baseline.pipelines import UNTIMED, Job
 from tetopt.energy.sampling import cell_moments, cell_of_voxel
 from tetopt.errors import InputError
+from tetopt.experiments.tradeoff import tradeoff
 from tetopt.fem.conditioning import conditioning
 from tetopt.fem.elasticity import box_faces, compression, push_of
 from tetopt.fem.materials import Law, cell_young, young_image
@@ -74,6 +75,7 @@ class Settings(NamedTuple):
     percent: float = 1.0  # of compression
     reference_dofs: int = 300_000  # the voxel grid is averaged until it has no more
     curve: tuple[float, ...] = (0.25, 0.5, 2.0)  # node counts of the error curves, of `nodes`, besides `nodes` itself
+    tradeoff: bool = False  # whether tetopt's options are swept around its defaults
     max_seconds: float = 3600.0  # of one pipeline
     max_bytes: int | None = None
 
@@ -253,6 +255,11 @@ def run(
             meshes[name] = load_mesh(runs / f"{name}-{settings.nodes}-{first}.vtu").mesh
         pipelines.append(_summed_up(name, found))
     curves = [_curve(pipeline, setting, settings, image, labels, runs, key, resume, say) for pipeline in pipelines]
+    swept = (
+        tradeoff(image, settings.nodes, lambda mesh: measured(setting, mesh, settings.percent), say)
+        if settings.tradeoff
+        else []
+    )
     results = {
         **about,
         "versions": versions() | _peers(),
@@ -261,6 +268,7 @@ def run(
         "options": settings._asdict(),
         "reference": _reference_words(setting),
         "pipelines": pipelines,
+        "tradeoff": swept,
         "curves": [curve for curve in curves if curve["points"]],
         "seconds": time.perf_counter() - begin,
     }
@@ -292,7 +300,9 @@ def _peers() -> dict[str, str]:
 
 def _key(about: dict[str, Any], settings: Settings) -> str:
     """Changes with everything that a finished run's numbers depend on, but not with what else is compared."""
-    same = settings._replace(pipelines=(), repeats=0, curve=(), nodes=0, max_seconds=0.0, max_bytes=None)
+    same = settings._replace(
+        pipelines=(), repeats=0, curve=(), nodes=0, tradeoff=False, max_seconds=0.0, max_bytes=None
+    )
     facts = {"image": about["image"], "labels": about["labels"], "law": about["law"]}
     tools = versions() | _peers()
     return hashlib.sha256(json.dumps([facts, same, tools], sort_keys=True, default=str).encode()).hexdigest()

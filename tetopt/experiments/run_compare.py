@@ -12,13 +12,20 @@ from tetopt.fem.materials import Law
 from tetopt.image import Image
 from tetopt.io.files import checked_output, save_json
 from tetopt.mesh import Mesh
-from tetopt.report.compare_figures import curves_figure, cutaways, histograms_figure, slices_figure, timing_figure
+from tetopt.report.compare_figures import (
+    curves_figure,
+    cutaways,
+    histograms_figure,
+    slices_figure,
+    timing_figure,
+    tradeoff_figure,
+)
 from tetopt.report.compare_page import save_compare_page
 from tetopt.report.figures import save_figure
 from tetopt.report.viewer import view_of
 from tetopt.segmentation import thresholded
 
-PICTURES = ("slices.png", "cutaways.png", "histograms.png", "curves.png", "timing.png")
+PICTURES = ("slices.png", "cutaways.png", "histograms.png", "curves.png", "tradeoff.png", "timing.png")
 
 
 def outputs(folder: Path, force: bool) -> dict[str, Path]:
@@ -65,6 +72,8 @@ def _draw(paths: dict[str, Path], results: dict[str, Any], image: Image, meshes:
     save_figure(histograms_figure(results), paths["histograms.png"])
     save_figure(curves_figure(results), paths["curves.png"])
     save_figure(timing_figure(results), paths["timing.png"])
+    if results["tradeoff"]:
+        save_figure(tradeoff_figure(results), paths["tradeoff.png"])
     pictures = [
         (
             paths["slices.png"],
@@ -73,8 +82,14 @@ def _draw(paths: dict[str, Path], results: dict[str, Any], image: Image, meshes:
         (paths["cutaways.png"], "Cut open, cells in the grey of their mean"),
         (paths["histograms.png"], "Radius ratio rho and dihedral angles"),
         (paths["curves.png"], "Error of the compression test against the number of nodes"),
+        (
+            paths["tradeoff.png"],
+            "What tetopt's options trade, one at a time around the defaults (star): E_D against shape, the smallest "
+            "and the 1st percentile of the dihedral angles, and the errors of the compression test",
+        ),
         (paths["timing.png"], "Seconds by step"),
     ]
+    pictures = [each for each in pictures if results["tradeoff"] or each[0].stem != "tradeoff"]
     shown = [k for k, name in enumerate(meshes) if compare.SHOWN[name].kind != "control"] or [0]
     views = [view_of(titled[k][1], means[k], titled[k][0]) for k in shown]
     save_compare_page(paths["report.html"], results, pictures, views)

@@ -218,8 +218,8 @@ def _closest(
         levels = _levels(image, data, variance, roots, sizes, most)
         if levels[-1].is_too_large.any():
             raise InputError(
-                f"sizes: edges are to be shorter than {(image.spacing * image.shape / roots).max() / 2 ** (len(levels) - 1):.3g} mm "
-                f"somewhere, but cells below a voxel ({image.spacing.max():.3g} mm) see nothing; allow longer ones"
+                "sizes: somewhere edges are to be too short for a block to have a voxel's length "
+                f"({image.spacing.max():.3g} mm), and smaller cells see nothing; allow longer ones"
             )
         count, divided = _nearest(levels, roots, nodes, rings)
         if best is None or abs(count - nodes) < abs(best[0] - nodes):

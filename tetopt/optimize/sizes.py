@@ -30,9 +30,9 @@ class Sizes(NamedTuple):
     smallest : float
         No edge is split into halves under this, mm.
     largest : float, optional
-        No cell is made with an edge above this, mm. By default 1.4 times the longest edge of a uniform mesh with as many
-        nodes: cells in uniform regions do not represent the image any better if they are small, but the displacement.
-        `inf` for none.
+        No cell is made with an edge above this, mm. By default 1.4 times the longest edge of a uniform mesh with as
+        many nodes: smaller cells in uniform regions do not represent the image any better, but the displacement. `inf`
+        for none.
     gradation : float
         How fast edges may grow with the distance from smaller ones: from h to h + gradation x distance, in an octree's
         steps of two. 1 lets each size be one block wide, 0.2 five.

@@ -206,6 +206,76 @@ def _draw_curves(axes: Axes, results: dict[str, Any], value: Any) -> None:
     axes.grid(which="both", color="#e4e4e4", linewidth=0.6)
 
 
+def tradeoff_figure(results: dict[str, Any]) -> Figure:
+    """What each option of a graded mesh trades: E_D's share against mean rho, angles and, where simulated, errors.
+
+    A line for each option, its values along it, a star at the defaults; the other pipelines' medians as single points.
+    """
+    nus = sorted({nu for row in results["tradeoff"] for nu in row["measured"]["fem"]}, key=float)[:1]
+    panels = [
+        ("mean rho (1/3: regular)", lambda run: run["quality"]["mean_rho"]),
+        ("dihedral angles: smallest (filled), 1st percentile (open)", lambda run: run["quality"]["min_dihedral"]),
+        *(
+            (f"{title} error, ν = {nu}", lambda run, nu=nu, name=name: run["fem"][nu]["errors"][name])
+            for nu in nus
+            for name, title in ERRORS
+            if all(row["measured"]["fem"][nu]["errors"][name] for row in results["tradeoff"])
+        ),
+    ]
+    columns = 3 if len(panels) > 2 else len(panels)
+    rows = -(-len(panels) // columns)
+    figure = Figure(figsize=(4.9 * columns, 4.3 * rows + 0.6), layout="constrained")
+    grid = figure.subplots(rows, columns, squeeze=False).ravel()
+    for number, (axes, (title, value)) in enumerate(zip(grid, panels, strict=False)):
+        _draw_tradeoff(axes, results, value)
+        if number == 1:
+            _draw_tradeoff(axes, results, lambda run: run["quality"]["p1_dihedral"], is_open=True)
+            axes.set_ylim(bottom=0.0)
+        axes.set_title(title, fontsize=10)
+        axes.set_xscale("log")
+        axes.set_xlabel("E_D, share of the image's variance")
+        low, high = axes.get_xlim()
+        if high < 12.0 * low:
+            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0)))
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.grid(which="both", color="#e4e4e4", linewidth=0.6)
+    for axes in grid[len(panels) :]:
+        axes.set_axis_off()
+    _legend(figure, grid[: len(panels)])
+    return figure
+
+
+def _draw_tradeoff(axes: Axes, results: dict[str, Any], value: Any, is_open: bool = False) -> None:
+    """A line through the runs of each option, their values beside them; hollow and without words if open."""
+    options = list(dict.fromkeys(row["option"] for row in results["tradeoff"]))
+    for number, option in enumerate(options):
+        rows = [row for row in results["tradeoff"] if row["option"] == option]
+        points = [(row["measured"]["E_D_share"], value(row["measured"])) for row in rows]
+        style = _style(number) | ({"markerfacecolor": "white", "alpha": 0.6} if is_open else {"label": option})
+        axes.plot(*zip(*points, strict=True), marker=MARKERS[number], markersize=5, linewidth=1.2, **style)
+        for row, point in zip(rows, points, strict=True):
+            if not (is_open or row["is_default"]):
+                axes.annotate(
+                    f"{row['value']:.3g}", point, xytext=(4, 3), textcoords="offset points", fontsize=7,
+                    color=style["color"],
+                )  # fmt: skip
+    default = next(row["measured"] for row in results["tradeoff"] if row["is_default"])
+    axes.plot(
+        default["E_D_share"], value(default), marker="*", markersize=15, color="black", linestyle="none", zorder=5,
+        markerfacecolor="white" if is_open else "black", label=None if is_open else "default",
+    )  # fmt: skip
+    for pipeline in results["pipelines"]:
+        if "median" in pipeline and pipeline["kind"] != "tetopt" and pipeline["median"]["E_D_share"]:
+            run = pipeline["median"]
+            axes.plot(run["E_D_share"], value(run), marker="x", color="#666666", markersize=6, zorder=4)
+            if not is_open:
+                axes.annotate(
+                    pipeline["title"], (run["E_D_share"], value(run)), xytext=(5, -9), textcoords="offset points",
+                    fontsize=7, color="#444444",
+                )  # fmt: skip
+
+
 def timing_figure(results: dict[str, Any]) -> Figure:
     """Wall seconds of each pipeline's median run as a bar, stacked by step; a failed pipeline's bar is the word."""
     pipelines = results["pipelines"]

@@ -14,7 +14,7 @@ from tetopt.report import viewer
 from tetopt.report.page import paragraph_html, picture_html, section_html, table_html, write_page
 from tetopt.report.viewer import View, views_html
 
-PLOTS = ("histograms", "curves", "timing")  # stems of the pictures that come after the 3-D views
+PLOTS = ("histograms", "curves", "tradeoff", "timing")  # stems of the pictures that come after the 3-D views
 Run = dict[str, Any]
 
 
@@ -48,7 +48,7 @@ def save_compare_page(
         What `report.json` holds; every number on the page is one of these, rounded to four digits, or computed from
         them for the rows of label volumes, and nothing is measured here.
     pictures : sequence of (PNG path, caption)
-        Those named histograms, curves and timing come after the 3-D views, the others before.
+        Those named as in `PLOTS` come after the 3-D views, the others before.
     views : sequence of View
         Surfaces to turn; without any, the section is left out.
     """
