@@ -153,7 +153,7 @@ def sampling_by_size(image: tetopt.Image, nodes: int) -> dict[str, float]:
 
 def graded(image: tetopt.Image, nodes: int) -> dict[str, Any]:
     """`tetopt.mesh_image` with its defaults."""
-    prepare_kernels(image, 0.75, is_graded=True)
+    prepare_kernels(image, 0.85, is_graded=True)
     begin = time.perf_counter()
     mesh = tetopt.mesh_image(image, nodes).mesh
     seconds = time.perf_counter() - begin

@@ -123,7 +123,7 @@ def test_json_of_a_run(run, inputs):
     assert numbers["options"] == {
         **{"k_D": 0.3, "iterations": 3, "n_t": 1, "retessellate": "first", "boundary": "slide", "nodes": 150},
         **{"spacing": None, "lattice": "bcc", "volume": None, "crop": None, "slice": None, "method": "paper"},
-        "max_seconds": None,
+        **dict.fromkeys(("max_seconds", "target_error", "size_min", "size_max", "gradation", "sizing")),
     }
     assert numbers["versions"]["tetopt"] == tetopt.__version__
     assert numbers["versions"]["numba"] == numba.__version__
@@ -208,7 +208,9 @@ def test_a_slice_in_2d(tmp_path, inputs):
     assert_covers(file.mesh, load_image(inputs / "sphere.nii.gz", slice_=(2, 8)))
 
 
-@pytest.mark.parametrize(("name", "size"), [("sphere.nii.gz", ["--nodes", "100"]), ("disc.nii", ["--spacing", "9"])])
+@pytest.mark.parametrize(
+    ("name", "size"), [("sphere.nii.gz", ["--nodes", "100", "--uniform"]), ("disc.nii", ["--spacing", "9"])]
+)
 def test_no_iterations_write_the_lattice_itself(tmp_path, inputs, name, size):
     assert main(["mesh", str(inputs / name), "-o", str(tmp_path / "a.vtu"), *size, "--iterations", "0"]) == 0
     expected = lattice(load_image(inputs / name), **{size[0][2:]: int(size[1])})
@@ -234,7 +236,7 @@ def test_the_table_shows_before_and_after(tmp_path, inputs, capsys):
     lines = capsys.readouterr().out.splitlines()
     table = {row[0]: row[1:] for row in (re.split(r"\s{2,}", line.strip()) for line in lines) if len(row) == 3}
     first, last = numbers["quality_initial"], numbers["quality"]
-    assert lines[0].split() == ["lattice", "optimised"]
+    assert lines[0].split() == ["octree", "optimised"]
     assert table["E, combined"] == ["1.0000", f"{numbers['energies']['E']:.4f}"]
     assert table["E_D, of initial"] == ["1.0000", f"{numbers['energies']['E_D_relative']:.4f}"]
     assert table["E_G, of initial"] == ["1.0000", f"{numbers['energies']['E_G_relative']:.4f}"]
@@ -253,7 +255,7 @@ def test_progress_in_lines(tmp_path, inputs, capsys):
     assert main([*command, "--nodes", "150", "--iterations", "3"]) == 0
     history = json.loads((tmp_path / "a.json").read_text())["history"]
     lines = capsys.readouterr().err.splitlines()
-    first = f"{inputs / 'sphere.nii.gz'}: 16 x 16 x 16 voxels of 4 x 4 x 4 mm; lattice of 148 nodes, 576 cells"
+    first = f"{inputs / 'sphere.nii.gz'}: 16 x 16 x 16 voxels of 4 x 4 x 4 mm; octree of 148 nodes, 576 cells"
     assert lines[0] == first
     progress = [line for line in lines[1:] if not line.startswith("kernels compiled")]
     assert len(progress) == 4
@@ -420,9 +422,10 @@ def assert_refused(capfd, arguments, match, code=2):
 
 BAD_OPTIONS = [
     ("--nodes 100 --spacing 5", "--nodes and --spacing: give one of them"),
-    ("--nodes 2", "nodes must lie between 9 and"),
+    ("--nodes 2", "9 or more in 3-D, got 2"),
+    ("--uniform --nodes 2", "nodes must lie between 9 and"),
     ("--nodes 99999999999", "nodes must lie between 9 and"),
-    ("--nodes -5", "nodes must lie between"),
+    ("--nodes -5", "9 or more in 3-D, got -5"),
     ("--nodes 2.5", "--nodes"),
     ("--spacing 0", "spacing must be a length above 0"),
     ("--spacing nan", "spacing must be a length above 0"),
@@ -846,7 +849,7 @@ def test_figures(tmp_path, inputs):
 
 def test_many_more_cells_than_voxels_are_said(tmp_path, capsys):
     save_image(tmp_path / "few.nii", Image(np.arange(27.0).reshape(3, 3, 3)))
-    assert main(["mesh", str(tmp_path / "few.nii"), "-o", str(tmp_path / "a.vtu"), "--nodes", "500"]) == 0
+    assert main(["mesh", str(tmp_path / "few.nii"), "-o", str(tmp_path / "a.vtu"), "--nodes", "500", "--uniform"]) == 0
     found = re.search(r"(\d+) of (\d+) cells hold no voxel centre", capsys.readouterr().err)
     empty, n_cells = map(int, found.groups())
     mesh = tetopt.load_mesh(tmp_path / "a.vtu")
@@ -858,8 +861,16 @@ def test_many_more_cells_than_voxels_are_said(tmp_path, capsys):
     [
         (["--method", "paper"], "only with --method fast"),
         (["--spacing", "3"], "no one spacing"),
+        (["--uniform"], "--uniform and --lattice octree: give one of them"),
         (["--nodes", "3"], "9 or more in 3-D, got 3"),
         (["--nodes", "900000"], "too many for 16 x 16 x 16 voxels"),
+        (["--nodes", "500", "--target-error", "0.1"], "--nodes and --target-error: give one of them"),
+        (["--target-error", "1.5"], "expected a share of the image's variance, 0 to 1, got 1.5"),
+        (["--nodes", "100", "--size-max", "6"], "100 nodes are too few for 16 x 16 x 16 voxels and these limits"),
+        (["--size-max", "-1"], "size_max: expected a length above 0"),
+        (["--size-min", "9", "--size-max", "8"], "size_max: 8 mm is below the smallest size, 9 mm"),
+        (["--gradation", "3"], "gradation: expected 0.05 (nearly uniform) to 1, got 3"),
+        (["--sizing", "missing.nii"], "missing.nii"),
     ],
 )
 def test_octree_options(tmp_path, inputs, capsys, extra, words):
@@ -885,6 +896,60 @@ def test_octree_mesh(tmp_path, inputs, capsys):
     err = capsys.readouterr().err
     missed = len(tetopt.load_mesh(path).mesh.points)
     assert (f"{missed} nodes instead of 400" in err) == (abs(missed - 400) > 4)
+
+
+@pytest.mark.parametrize("word", ["--uniform", "--spacing 8", "--lattice five-tet", "--method paper"])
+@pytest.mark.parametrize("option", ["--target-error 0.1", "--size-min 1", "--size-max 9", "--gradation 0.5"])
+def test_limits_are_for_graded_meshes(tmp_path, inputs, capfd, word, option):
+    if word == "--spacing 8" and option.startswith("--target"):
+        option = "--size-max 9"
+    command = ["mesh", inputs / "sphere.nii.gz", "-o", tmp_path / "a.vtu", *word.split(), *option.split()]
+    assert_refused(capfd, command, f"{option.split()[0]}: only on a graded mesh")
+
+
+def test_mesh_with_limits(tmp_path, inputs):
+    """They reach the mesh, and the numbers tell them."""
+    image = load_image(inputs / "sphere.nii.gz")
+    field = np.where(np.arange(16)[:, None, None] < 5, 13.0, 0.0) * np.ones((1, 16, 16))
+    save_image(tmp_path / "sizes.nii.gz", Image(field, image.affine))
+    command = ["mesh", str(inputs / "sphere.nii.gz"), "-o", str(tmp_path / "a.vtu"), "--json", str(tmp_path / "a.json")]
+    words = ["--nodes", "900", "--size-max", "30", "--sizing", str(tmp_path / "sizes.nii.gz"), "--gradation", "0.5"]
+    assert main([*command, *words]) == 0
+    mesh = load_mesh(tmp_path / "a.vtu").mesh
+    assert len(mesh.points) == 900
+    size = volumes(mesh.points, mesh.cells)
+    is_fine = image.to_index(mesh.points[mesh.cells].mean(axis=1))[:, 0] < 4.0
+    assert size[is_fine].max() < 13.0**3 / 6.0
+    assert size[~is_fine].max() > 1.5 * size[is_fine].max()
+    options = json.loads((tmp_path / "a.json").read_text())["options"]
+    assert (options["size_max"], options["gradation"], options["sizing"]) == (30.0, 0.5, "sizes.nii.gz")
+
+
+def test_target_error(tmp_path, inputs, capfd):
+    """As many nodes as it takes, told in the numbers; the same as asking for that many. A miss exits 1."""
+    command = ["mesh", str(inputs / "sphere.nii.gz"), "-o", str(tmp_path / "a.vtu"), "--json", str(tmp_path / "a.json")]
+    assert main([*command, "--target-error", "0.2"]) == 0
+    numbers = json.loads((tmp_path / "a.json").read_text())
+    assert numbers["energies"]["E_D_share_of_variance"] <= 0.2
+    nodes = numbers["options"]["nodes"]
+    assert numbers["options"]["target_error"] == 0.2
+    assert main([*command, "--force", "--nodes", str(nodes)]) == 0
+    assert json.loads((tmp_path / "a.json").read_text())["mesh_sha256"] == numbers["mesh_sha256"]
+    capfd.readouterr()
+    assert main([*command, "--force", "--target-error", "0.02", "--iterations", "0"]) == 1
+    assert "left in the cells, more than 0.02" in capfd.readouterr().err
+    assert main([*command, "--force", "--target-error", "0.02", "--size-min", "20"]) == 2
+    assert re.search("nodes are too many for .* these limits on sizes", capfd.readouterr().err)
+
+
+def test_the_default_is_graded(tmp_path, inputs, capfd):
+    """And as many nodes as a small image is worth; --uniform is the lattice."""
+    command = ["mesh", str(inputs / "sphere.nii.gz"), "-o", str(tmp_path / "a.vtu"), "--iterations", "1"]
+    assert main(command) == 0
+    assert "octree of" in capfd.readouterr().err
+    assert abs(len(load_mesh(tmp_path / "a.vtu").mesh.points) - 512) <= 40
+    assert main([*command, "--uniform", "--nodes", "100", "--force"]) == 0
+    assert "lattice of" in capfd.readouterr().err
 
 
 # --------------------------------------------------------------------------------------------------

@@ -364,6 +364,7 @@ def _mesh_files(
     begin: float,
 ) -> int:
     """Optimise, write the mesh, the numbers and the pictures, print the comparison; the exit code."""
+    digest = sha256(image_path)  # now: the file may change while the nodes move
     loaded = time.perf_counter()
     ends = None if source["max_seconds"] is None else begin + source["max_seconds"]
     interrupted: list[bool] = []
@@ -382,7 +383,7 @@ def _mesh_files(
     is_interrupted = any(interrupted)
     optimized = time.perf_counter()
     told = {name: value for name, value in (source | options).items() if name != "sizes"}
-    about = {"image": image_path.name, "image_sha256": sha256(image_path), "options": told}
+    about = {"image": image_path.name, "image_sha256": digest, "options": told}
     fields = cell_fields(result.mesh, image)
     save_mesh(output, result.mesh, fields, {"tetopt": tetopt.__version__, **about})
     if json_path is not None:
@@ -1069,7 +1070,7 @@ def demo_command(
         "demo"
     ),
     nodes: Annotated[int, typer.Option(metavar="N", help="Wanted number of nodes.")] = 5000,
-    iterations: Annotated[int, typer.Option(metavar="I", min=0, help="Sweeps over all nodes.")] = 20,
+    iterations: Annotated[int | None, typer.Option(metavar="I", min=0, help="Sweeps over all nodes.")] = None,
     force: ForceOption = False,
 ) -> int:
     """Mesh the MNI152 T1 that nilearn's wheel carries; leave mesh, numbers and pictures in a folder."""

@@ -32,7 +32,7 @@ def run(head, opengl):
 
 
 def test_files(run):
-    assert {p.name for p in run.iterdir()} == {"report.json", "report.html", "runs", *PICTURES}
+    assert {p.name for p in run.iterdir()} == {"report.json", "report.html", "runs", *PICTURES} - {"tradeoff.png"}
     names = {p.stem for p in (run / "runs").iterdir()}
     assert names == {f"{name}-{nodes}-1" for name in ("tetopt", "bcc", "odt") for nodes in (150, 75)}
 
@@ -73,6 +73,30 @@ def test_the_image_helps_and_the_reference_is_one(run):
             energy = report["reference"][nu]["strain_energy"]
             assert fem["errors"]["strain_energy"] == pytest.approx(abs(fem["strain_energy"] / energy - 1.0), rel=1e-9)
     assert [len(curve["points"]) for curve in report["curves"]] == [2, 2, 2]
+
+
+def test_tradeoff(head, opengl, tmp_path):
+    """The defaults' row is the pipeline's own mesh; more of the image costs shape; the picture is on the page."""
+    out = tmp_path / "out"
+    words = [str(head / "image.nii.gz"), "-o", str(out), *SMALL, "--pipelines", "tetopt,bcc", "--curve", ""]
+    assert main(["compare", *words, "--tradeoff"]) == 0
+    report = json.loads((out / "report.json").read_text())
+    rows = report["tradeoff"]
+    defaults = [row["measured"] for row in rows if row["is_default"]]
+    assert len(defaults) == 4
+    assert all(measured == defaults[0] for measured in defaults)
+    own = report["pipelines"][0]["median"]
+    assert {k: own[k] for k in ("E_D_share", "quality", "fem")} == {
+        k: defaults[0][k] for k in ("E_D_share", "quality", "fem")
+    }
+    by_k_D = [row["measured"] for row in rows if row["option"] == "k_D"]
+    assert by_k_D[0]["E_D_share"] > by_k_D[-1]["E_D_share"]
+    assert by_k_D[0]["quality"]["mean_rho"] > by_k_D[-1]["quality"]["mean_rho"]
+    assert (out / "tradeoff.png").stat().st_size > 20_000
+    assert "What tetopt&#x27;s options trade" in (out / "report.html").read_text()
+    assert main(["compare", *words, "--force"]) == 0
+    assert not (out / "tradeoff.png").exists()
+    assert "options trade" not in (out / "report.html").read_text()
 
 
 def test_resume_keeps_what_is_done(run, head, capsys):

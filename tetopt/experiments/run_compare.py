@@ -74,6 +74,8 @@ def _draw(paths: dict[str, Path], results: dict[str, Any], image: Image, meshes:
     save_figure(timing_figure(results), paths["timing.png"])
     if results["tradeoff"]:
         save_figure(tradeoff_figure(results), paths["tradeoff.png"])
+    else:  # what lies there is of the report that this one replaces
+        paths["tradeoff.png"].unlink(missing_ok=True)
     pictures = [
         (
             paths["slices.png"],

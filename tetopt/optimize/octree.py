@@ -212,33 +212,34 @@ def _closest(
     data = _scaled(image)
     variance = noise_level(data) ** 2
     most, rings = sizes.at_most(image, nodes) / DIAGONAL[image.ndim], int(np.ceil(1.0 / sizes.gradation - 1e-9))
-    for roots in _roots(image, nodes, fewest, most):
+    for roots in _roots(image, nodes, fewest, most, sizes.smallest):
         if (np.array(image.shape) / roots).max() < SMALLEST and best is not None:
             break
         levels = _levels(image, data, variance, roots, sizes, most)
         if levels[-1].is_too_large.any():
-            raise InputError(
-                "sizes: somewhere edges are to be too short for a block to have a voxel's length "
-                f"({image.spacing.max():.3g} mm), and smaller cells see nothing; allow longer ones"
-            )
+            continue
         count, divided = _nearest(levels, roots, nodes, rings)
         if best is None or abs(count - nodes) < abs(best[0] - nodes):
             best = count, roots, divided
         if abs(count - nodes) <= ENOUGH * nodes:
             break
-    assert best is not None
+    if best is None:
+        raise InputError(
+            "sizes: somewhere edges are to be too short for a block to have a voxel's length "
+            f"({image.spacing.max():.3g} mm), and smaller cells see nothing; allow longer ones"
+        )
     return best
 
 
-def _roots(image: Image, nodes: int, fewest: int, most: float) -> Iterator[tuple[int, ...]]:
+def _roots(image: Image, nodes: int, fewest: int, most: float, smallest: float) -> Iterator[tuple[int, ...]]:
     """Numbers of undivided blocks along each axis to try, of edges up to `most`: the largest blocks first."""
     lengths = image.spacing * image.shape
     kind = "bcc" if image.ndim == 3 else "criss-cross"
     coarse = [near_cubes(kind, lengths, max(fewest, int(nodes * share))) for share in ROOTS]
     coarse = [roots for roots in coarse if (lengths / roots).max() <= most * (1.0 + 1e-9)]
     if len(coarse) < len(ROOTS):
-        yield tuple(int(c) for c in np.maximum(np.ceil(lengths / most - 1e-9), 1))
-    yield from coarse
+        yield tuple(int(c) for c in np.maximum(np.ceil(lengths / max(most, smallest) - 1e-9), 1))
+    yield from (roots for roots in coarse if (lengths / roots).min() >= smallest)
 
 
 def _nearest(
