@@ -53,11 +53,10 @@ def test_default_largest():
 def test_smallest():
     """No block is below it, and no edge is split below it."""
     image = ball(48, 40, 44)
-    free = edges(octree(image, 1500))[1].min()
-    mesh = octree(image, 1500, Sizes(smallest=1.6 * free))
-    assert edges(mesh)[1].min() > 1.3 * free  # blocks of 3 voxels' edges have cells of 0.87 of it and more
-    fine = edges(tetopt.mesh_image(image, 1500).mesh)[1]
-    coarse = edges(tetopt.mesh_image(image, 1500, sizes=Sizes(smallest=1.6 * free)).mesh)[1]
+    sizes = Sizes(smallest=1.6 * edges(octree(image, 1000))[1].min())
+    assert edges(octree(image, 1000, sizes))[1].min() > 0.85 * sizes.smallest  # from a block's corner to its centre
+    fine = edges(tetopt.mesh_image(image, 1000).mesh)[1]
+    coarse = edges(tetopt.mesh_image(image, 1000, sizes=sizes).mesh)[1]
     assert np.percentile(coarse, 2) > 1.2 * np.percentile(fine, 2)
 
 
