@@ -48,7 +48,7 @@ def _run(options: argparse.Namespace) -> int:
     path = checked_output(options.output, (".json",), options.force)
     settings = Settings(nodes=0, reference_dofs=options.dofs)
     rows = []
-    for name, image, labels in _cases(options.phantoms, options.images):
+    for name, image, labels in cases(options.phantoms, options.images):
         law, _ = default_law(image)
         setting = prepared(image, labels, law, settings, lambda text, name=name: print(f"{name}: {text}", flush=True))
         for nodes in options.nodes:
@@ -65,7 +65,7 @@ def _run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _cases(phantoms: Sequence[str], paths: Sequence[Path]) -> list[tuple[str, tetopt.Image, tetopt.Image]]:
+def cases(phantoms: Sequence[str], paths: Sequence[Path]) -> list[tuple[str, tetopt.Image, tetopt.Image]]:
     """Name, image and materials; a volume of the user's is averaged to 2 mm where it is finer."""
     cases = []
     for name in phantoms:

@@ -20,9 +20,9 @@ def test_program(tmp_path, monkeypatch, capsys):
     names: dict = {}
     exec(compile(program, "README.md", "exec"), names)
     printed = capsys.readouterr().out.splitlines()
-    E_D, shape = re.fullmatch(r"E_D (\S+) of the lattice's, mean rho (\S+)", printed[0]).groups()
-    assert 0.05 < float(E_D) < 0.3
-    assert float(shape) > 0.28
+    share, shape = re.fullmatch(r"(\S+) of the variance inside cells, mean rho (\S+)", printed[0]).groups()
+    assert 0.0001 < float(share) < 0.01
+    assert float(shape) > 0.24
     written = tetopt.load_mesh("two_spheres.vtu")
     assert len(written.mesh.cells) == len(names["result"].mesh.cells)
     assert written.cell_data["mean"].max() == names["cells"].mean.max()
@@ -31,9 +31,9 @@ def test_program(tmp_path, monkeypatch, capsys):
 def test_commands(tmp_path, monkeypatch):
     """Each `tetopt` line of the README, on a phantom in the place of the T1 and with fewer nodes."""
     lines = [line for line in README.splitlines() if re.match("tetopt (mesh|quality|phantom|fem|segment) ", line)]
-    assert len(lines) == 6
+    assert len(lines) == 7
     monkeypatch.chdir(tmp_path)
-    assert main(["phantom", "sphere", "-o", "T1.nii.gz", "--voxel-mm", "4"]) == 0
+    assert main(["phantom", "sphere", "-o", "T1.nii.gz", "--voxel-mm", "2"]) == 0
     for line in lines:
         words = shlex.split(line, comments=True)[1:]
         words = ["200" if before == "--nodes" else word for before, word in zip(["", *words], words, strict=False)]
@@ -42,7 +42,8 @@ def test_commands(tmp_path, monkeypatch):
         "T1.nii.gz",
         "labels.nii.gz",
         "brain.vtu",
-        "graded.vtu",
+        "fine.vtu",
+        "uniform.vtu",
         "run.json",
         "sphere.nii.gz",
         "slice.png",

@@ -68,3 +68,19 @@ def test_benchmark(tmp_path, capsys):
     assert rows["sampling_over_find_simplex"] > 0.0
     assert [row["nodes"] for row in rows["paper"]] == sorted(row["nodes"] for row in rows["paper"])
     assert all(0.0 < row["delaunay_share"] < 1.0 for row in rows["paper"])
+
+
+def test_choose_sizes(tmp_path, monkeypatch, capsys):
+    """Every mesh is measured; a tighter largest edge leaves more E_D and follows the displacement better."""
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    out = tmp_path / "sizes.json"
+    words = ["-o", str(out), "--phantoms", "two_spheres", "--nodes", "400", "--dofs", "20000", "--largest", "1", "inf"]
+    assert script("choose_sizes").main(words) == 0
+    rows = {row["mesh"]: row["measured"] for row in json.loads(out.read_text())["rows"]}
+    assert len(rows) == 2 + 2 + 5
+    tight, free = rows["graded, largest 1"], rows["graded, largest inf"]
+    assert free["E_D_share"] < tight["E_D_share"] < rows["uniform"]["E_D_share"]
+    displacement = {name: row["fem"]["0.3"]["errors"]["displacement"] for name, row in rows.items()}
+    assert displacement["graded, largest 1"] < displacement["graded, largest inf"]
+    assert script("choose_sizes").main(words) == 2
+    assert "exists" in capsys.readouterr().err

@@ -168,6 +168,18 @@ def test_target_error(shape, noise):
     assert tetopt.check_mesh(mesh, image) == []
 
 
+def test_target_error_within_limits():
+    """Limits on sizes that ask for more nodes than the error does, or for fewer, have the last word."""
+    image = ball(40, 40, 40)
+    total = float(np.var(image.data, dtype=np.float64)) * image.volume
+    fine = tetopt.mesh_image(image, target_error=0.5, sizes=Sizes(largest=9.0))
+    assert edges(fine.mesh)[1].max() < 11.0
+    assert fine.history[-1].E_D < 0.1 * total
+    coarse = tetopt.mesh_image(image, target_error=0.001, sizes=Sizes(smallest=9.0, largest=40.0))
+    assert edges(coarse.mesh)[1].mean() > 9.0
+    assert coarse.history[-1].E_D > 0.001 * total
+
+
 @pytest.mark.parametrize(
     ("image", "arguments", "words"),
     [

@@ -43,7 +43,7 @@ from tetopt.optimize.complex import (
 from tetopt.optimize.density import Limits, Sides, exchange
 from tetopt.optimize.descent import free_projections
 from tetopt.optimize.flips import flip, make_moves
-from tetopt.optimize.octree import noise_level, octree
+from tetopt.optimize.octree import OutOfReach, noise_level, octree
 from tetopt.optimize.paper import (
     NOISE,
     Boundary,
@@ -267,7 +267,12 @@ def meshed_to_error(
     nodes, tried = FIRST[image.ndim], dict[int, float]()
     best: tuple[int, Mesh, Optimized] | None = None
     for _ in range(RUNS):
-        mesh = octree(image, nodes, sizes)
+        try:
+            mesh = octree(image, nodes, sizes)
+        except OutOfReach as found:  # the limits on sizes ask for more nodes than the error, or allow fewer
+            if (nodes := found.nearest) in tried:
+                break
+            mesh = octree(image, nodes, sizes)
         result = run(mesh, nodes)
         tried[nodes] = share = result.history[-1].E_D / (variance * image.volume)
         if best is None or _is_better(nodes, best[0], tried, target_error):

@@ -54,6 +54,14 @@ FEW = 40  # nodes, about what one block more or less makes
 NEAR = 0.002  # of the nodes wanted: a miss that is good enough
 
 
+class OutOfReach(InputError):
+    """No octree has about as many nodes as asked for; `nearest` is the number of the one that comes nearest."""
+
+    def __init__(self, message: str, nearest: int) -> None:
+        super().__init__(message)
+        self.nearest = nearest
+
+
 def octree(image: Image, nodes: int, sizes: Sizes | None = None) -> Mesh:
     """A graded mesh of the image's box.
 
@@ -86,9 +94,10 @@ def octree(image: Image, nodes: int, sizes: Sizes | None = None) -> Mesh:
     if abs(count - nodes) > max(MISS * nodes, FEW):
         shape, word = " x ".join(map(str, image.shape)), "many" if count < nodes else "few"
         limits = "" if sizes == Sizes() else " and these limits on sizes"
-        raise InputError(
+        raise OutOfReach(
             f"octree: {nodes} nodes are too {word} for {shape} voxels{limits}: the nearest octree found has {count}; "
-            "ask for about as many, or for a uniform mesh"
+            "ask for about as many, or for a uniform mesh",
+            count,
         )
     index = _places(divided, roots) / np.array(roots) * image.shape - 0.5
     points = image.to_world(index)
