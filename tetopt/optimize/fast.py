@@ -43,7 +43,7 @@ from tetopt.optimize.complex import (
 from tetopt.optimize.density import Limits, Sides, exchange
 from tetopt.optimize.descent import free_projections
 from tetopt.optimize.flips import flip, make_moves
-from tetopt.optimize.octree import OutOfReach, noise_level, octree
+from tetopt.optimize.octree import is_near, nearest_octree, noise_level, octree
 from tetopt.optimize.paper import (
     NOISE,
     Boundary,
@@ -261,26 +261,24 @@ def meshed_to_error(
     noise = noise_level(image.data) ** 2 / variance
     if target_error <= noise:
         raise InputError(
-            f"target_error: {target_error:g} of the variance is below the noise's share, {noise:.3g}: "
+            f"target_error: {target_error:g} of the variance is below the share that the noise has by estimate, {noise:.3g}: "
             "cells would have to follow the noise; ask for more, or denoise the image"
         )
     nodes, tried = FIRST[image.ndim], dict[int, float]()
     best: tuple[int, Mesh, Optimized] | None = None
     for _ in range(RUNS):
-        try:
-            mesh = octree(image, nodes, sizes)
-        except OutOfReach as found:  # the limits on sizes ask for more nodes than the error, or allow fewer
-            if (nodes := found.nearest) in tried:
-                break
-            mesh = octree(image, nodes, sizes)
+        mesh = nearest_octree(image, nodes, sizes)
+        if not is_near(len(mesh.points), nodes):  # limits on sizes ask for more nodes than the error, or allow fewer
+            nodes = len(mesh.points)
+        if nodes in tried:
+            break
         result = run(mesh, nodes)
         tried[nodes] = share = result.history[-1].E_D / (variance * image.volume)
         if best is None or _is_better(nodes, best[0], tried, target_error):
             best = nodes, mesh, result
         if result.ended in ("stopped", "max_seconds") or NEAR * target_error <= share <= target_error:
             return nodes, mesh, result
-        if (nodes := _next_nodes(image, tried, target_error)) in tried:
-            break
+        nodes = _next_nodes(image, tried, target_error)
     assert best is not None
     return best
 

@@ -54,14 +54,6 @@ FEW = 40  # nodes, about what one block more or less makes
 NEAR = 0.002  # of the nodes wanted: a miss that is good enough
 
 
-class OutOfReach(InputError):
-    """No octree has about as many nodes as asked for; `nearest` is the number of the one that comes nearest."""
-
-    def __init__(self, message: str, nearest: int) -> None:
-        super().__init__(message)
-        self.nearest = nearest
-
-
 def octree(image: Image, nodes: int, sizes: Sizes | None = None) -> Mesh:
     """A graded mesh of the image's box.
 
@@ -85,20 +77,31 @@ def octree(image: Image, nodes: int, sizes: Sizes | None = None) -> Mesh:
         More nodes than leaves of 2 voxels, or of the smallest size, can have, or fewer than the largest sizes need; or
         intensities whose squares overflow.
     """
+    mesh = nearest_octree(image, nodes, sizes)
+    count = len(mesh.points)
+    if is_near(count, nodes):
+        return mesh
+    shape, word = " x ".join(map(str, image.shape)), "many" if count < nodes else "few"
+    limits = "" if sizes is None or sizes == Sizes() else " and these limits on sizes"
+    raise InputError(
+        f"octree: {nodes} nodes are too {word} for {shape} voxels{limits}: the nearest octree found has {count}; ask "
+        "for about as many, or for a uniform mesh"
+    )
+
+
+def is_near(count: int, nodes: int) -> bool:
+    """Whether a number of nodes is about the one wanted."""
+    return abs(count - nodes) <= max(MISS * nodes, FEW)
+
+
+def nearest_octree(image: Image, nodes: int, sizes: Sizes | None = None) -> Mesh:
+    """As `octree`, but with any number of nodes, if the image or the limits on sizes allow no nearer one."""
     n = image.ndim
     fewest = 2**n + 1
     if not (isinstance(nodes, int | np.integer) and nodes >= fewest):
         raise InputError(f"octree: expected a whole number of nodes, {fewest} or more in {n}-D, got {nodes!r}")
     sizes = (Sizes() if sizes is None else sizes).prepared(n)
-    count, roots, divided = _closest(image, nodes, fewest, sizes)
-    if abs(count - nodes) > max(MISS * nodes, FEW):
-        shape, word = " x ".join(map(str, image.shape)), "many" if count < nodes else "few"
-        limits = "" if sizes == Sizes() else " and these limits on sizes"
-        raise OutOfReach(
-            f"octree: {nodes} nodes are too {word} for {shape} voxels{limits}: the nearest octree found has {count}; "
-            "ask for about as many, or for a uniform mesh",
-            count,
-        )
+    roots, divided = _closest(image, nodes, fewest, sizes)
     index = _places(divided, roots) / np.array(roots) * image.shape - 0.5
     points = image.to_world(index)
     for tie_break in TIE_BREAKS:
@@ -111,9 +114,9 @@ def octree(image: Image, nodes: int, sizes: Sizes | None = None) -> Mesh:
 def noise_level(data: NDArray[np.floating]) -> float:
     """Standard deviation of the noise in an image's data, from what second differences along every axis leave of it.
 
-    Structure wider than a voxel cancels in (1, -2, 1) taken along all axes (Immerkaer 1996, here in n-D); the median of
-    its size is that of noise in most of the volume. A background of one value, cut out, does not count, and what is
-    left in less than a tenth of the voxels are edges, not noise. Noise that was smoothed is underestimated.
+    Structure wider than a voxel cancels in (1, -2, 1) taken along all axes (Immerkaer 1996, here in n-D); the lower
+    quartile of its size is that of noise in most of the volume. A background of one value, cut out, does not count, and
+    what is left in less than a tenth of the voxels are edges, not noise. Noise that was smoothed is underestimated.
     """
     if min(data.shape) < 3:
         return 0.0
@@ -125,7 +128,7 @@ def noise_level(data: NDArray[np.floating]) -> float:
     size = np.abs(rest[(rest != 0.0) | ~is_background])
     if np.count_nonzero(size) < 0.1 * rest.size:
         return 0.0
-    return float(np.median(size) / 0.6745 / 6.0 ** (data.ndim / 2))
+    return float(np.quantile(size, 0.25) / 0.31864 / 6.0 ** (data.ndim / 2))
 
 
 def _scaled(image: Image) -> NDArray[np.float64]:
@@ -209,10 +212,8 @@ def _blocks(data: NDArray, counts: NDArray[np.int64], total_of: np.ufunc, empty:
     return data
 
 
-def _closest(
-    image: Image, nodes: int, fewest: int, sizes: Sizes
-) -> tuple[int, tuple[int, ...], list[NDArray[np.bool_]]]:
-    """Number of nodes, blocks undivided and those divided, of the octree that has nearly as many nodes as wanted.
+def _closest(image: Image, nodes: int, fewest: int, sizes: Sizes) -> tuple[tuple[int, ...], list[NDArray[np.bool_]]]:
+    """Blocks undivided and those divided, of the octree that has nearly as many nodes as wanted.
 
     Where many blocks are alike, they are all divided or none, and some numbers cannot be reached from one size of
     undivided blocks: then others are tried, at last the lattice that has the number by itself.
@@ -237,7 +238,7 @@ def _closest(
             "sizes: somewhere edges are to be too short for a block to have a voxel's length "
             f"({image.spacing.max():.3g} mm), and smaller cells see nothing; allow longer ones"
         )
-    return best
+    return best[1:]
 
 
 def _roots(image: Image, nodes: int, fewest: int, most: float, smallest: float) -> Iterator[tuple[int, ...]]:
