@@ -936,8 +936,8 @@ def test_target_error(tmp_path, inputs, capfd):
     assert main([*command, "--force", "--nodes", str(nodes)]) == 0
     assert json.loads((tmp_path / "a.json").read_text())["mesh_sha256"] == numbers["mesh_sha256"]
     capfd.readouterr()
-    assert main([*command, "--force", "--target-error", "0.003", "--size-min", "20"]) == 1
-    assert "left in the cells, more than 0.003" in capfd.readouterr().err
+    assert main([*command, "--force", "--target-error", "0.01", "--size-min", "32"]) == 1
+    assert "left in the cells, more than 0.01" in capfd.readouterr().err
 
 
 def test_the_default_is_graded(tmp_path, inputs, capfd):

@@ -261,8 +261,8 @@ def meshed_to_error(
     noise = noise_level(image.data) ** 2 / variance
     if target_error <= noise:
         raise InputError(
-            f"target_error: {target_error:g} of the variance is below the share that the noise has by estimate, {noise:.3g}: "
-            "cells would have to follow the noise; ask for more, or denoise the image"
+            f"target_error: {target_error:g} of the variance is below the noise's share, by estimate {noise:.3g}: cells "
+            "would have to follow the noise; ask for more, or denoise the image"
         )
     nodes, tried = FIRST[image.ndim], dict[int, float]()
     best: tuple[int, Mesh, Optimized] | None = None

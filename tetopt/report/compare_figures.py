@@ -236,7 +236,7 @@ def tradeoff_figure(results: dict[str, Any]) -> Figure:
         axes.set_xlabel("E_D, share of the image's variance")
         low, high = axes.get_xlim()
         if high < 12.0 * low:
-            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0)))
+            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 1.5, 2.0, 3.0, 5.0, 7.0)))
         axes.xaxis.set_major_formatter("{x:g}")
         axes.xaxis.set_minor_formatter(NullFormatter())
         axes.grid(which="both", color="#e4e4e4", linewidth=0.6)
