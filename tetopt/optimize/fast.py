@@ -261,24 +261,27 @@ def meshed_to_error(
     noise = noise_level(image.data) ** 2 / variance
     if target_error <= noise:
         raise InputError(
-            f"target_error: {target_error:g} of the variance is below the noise's share, by estimate {noise:.3g}: cells "
-            "would have to follow the noise; ask for more, or denoise the image"
+            f"target_error: {target_error:g} of the variance is below the noise's share, by estimate {noise:.3g}: "
+            "cells would have to follow the noise; ask for more, or denoise the image"
         )
-    nodes, tried = FIRST[image.ndim], dict[int, float]()
+    nodes, tried = FIRST[image.ndim], dict[int, float]()  # shares by number of nodes
     best: tuple[int, Mesh, Optimized] | None = None
     for _ in range(RUNS):
         mesh = nearest_octree(image, nodes, sizes)
         if not is_near(len(mesh.points), nodes):  # limits on sizes ask for more nodes than the error, or allow fewer
             nodes = len(mesh.points)
-        if nodes in tried:
-            break
         result = run(mesh, nodes)
-        tried[nodes] = share = result.history[-1].E_D / (variance * image.volume)
-        if best is None or _is_better(nodes, best[0], tried, target_error):
+        found, share = len(result.mesh.points), result.history[-1].E_D / (variance * image.volume)
+        if found in tried:
+            break
+        tried[found] = share
+        if best is None or _is_better(found, len(best[2].mesh.points), tried, target_error):
             best = nodes, mesh, result
         if result.ended in ("stopped", "max_seconds") or NEAR * target_error <= share <= target_error:
             return nodes, mesh, result
         nodes = _next_nodes(image, tried, target_error)
+        if nodes in tried:
+            break
     assert best is not None
     return best
 

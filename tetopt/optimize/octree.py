@@ -153,7 +153,7 @@ def _levels(
     """The blocks of each level, the coarsest first."""
     edge = image.spacing * image.shape / np.array(roots)
     bound = sizes.on_voxels(image)
-    least = most if bound is None else min(most, float(bound.min()) / DIAGONAL[image.ndim])
+    least = most if bound is None else min(most, max(float(bound.min()) / DIAGONAL[image.ndim], sizes.smallest))
     n_levels, n_content = 0, 0  # levels of blocks that exist, and that content may ask for
     while _may_be(edge / 2 ** (n_levels + 1), image.spacing, sizes.smallest):
         n_levels, n_content = n_levels + 1, n_content + 1
@@ -166,7 +166,7 @@ def _levels(
     sums = [_blocks(total, np.array(roots) << n_levels, np.add) for total in sums]
     longest = np.full(sums[0].shape, most)
     if bound is not None:
-        bound = bound / DIAGONAL[image.ndim]
+        bound = np.maximum(bound / DIAGONAL[image.ndim], sizes.smallest)
         longest = np.minimum(most, _blocks(bound, np.array(roots) << n_levels, np.minimum, NO_BOUND))
     found = []
     for level in range(n_levels, -1, -1):

@@ -75,7 +75,7 @@ class Sizes(NamedTuple):
         lengths = image.spacing * image.shape
         kind, fewest = ("bcc", 9) if image.ndim == 3 else ("criss-cross", 5)
         uniform = float((lengths / near_cubes(kind, lengths, max(nodes, fewest))).max())
-        return COARSEST * DIAGONAL[image.ndim] * uniform
+        return DIAGONAL[image.ndim] * max(COARSEST * uniform, self.smallest)
 
     def on_voxels(self, image: Image) -> NDArray[np.float32] | None:
         """The field's value at each voxel's centre, of the image's shape; infinite where nothing holds."""
