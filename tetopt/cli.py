@@ -37,7 +37,7 @@ from tetopt import (
     save_mesh,
 )
 from tetopt.geometry.quality import Quality, quality
-from tetopt.geometry.simplex import dihedral_angles, volumes
+from tetopt.geometry.simplex import dihedral_angles, squared_edges, volumes
 from tetopt.io.files import checked_output, save_json
 from tetopt.io.images import parse_crop, parse_slice, sha256
 from tetopt.io.meshes import MeshFile, cell_fields
@@ -475,6 +475,7 @@ def _described(path: Path, image: Image, initial: Mesh, kind: str) -> str:
     size = " x ".join(str(s) for s in image.shape)
     spacing = " x ".join(f"{s:.4g}" for s in image.spacing)
     start = f"{_start_name(kind)} of {len(initial.points)} nodes, {len(initial.cells)} cells"
+    start += f", edges up to {np.sqrt(squared_edges(initial.points, initial.cells).max()):.3g} mm"
     return f"{path}: {size} voxels of {spacing} mm; {start}"
 
 
