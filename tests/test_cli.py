@@ -255,7 +255,8 @@ def test_progress_in_lines(tmp_path, inputs, capsys):
     assert main([*command, "--nodes", "150", "--iterations", "3"]) == 0
     history = json.loads((tmp_path / "a.json").read_text())["history"]
     lines = capsys.readouterr().err.splitlines()
-    first = f"{inputs / 'sphere.nii.gz'}: 16 x 16 x 16 voxels of 4 x 4 x 4 mm; octree of 148 nodes, 576 cells, edges up to 22.6 mm"
+    words = "16 x 16 x 16 voxels of 4 x 4 x 4 mm; octree of 148 nodes, 576 cells, edges up to 26.7 mm"
+    first = f"{inputs / 'sphere.nii.gz'}: {words}"
     assert lines[0] == first
     progress = [line for line in lines[1:] if not line.startswith("kernels compiled")]
     assert len(progress) == 4
