@@ -188,13 +188,14 @@ def mesh_command(
         float | None,
         typer.Option(metavar="T", help="As many nodes as leave this share of the image's variance in cells, instead."),
     ] = None,
-    size_min: Annotated[float | None, typer.Option(metavar="MM", help="No edge is split into shorter halves.")] = None,
+    size_min: Annotated[float | None, typer.Option(metavar="MM", help="No edge is split into shorter ones.")] = None,
     size_max: Annotated[
         float | None,
         typer.Option(metavar="MM", help="No cell is made with a longer edge (default 1.4 x a uniform mesh's)."),
     ] = None,
     gradation: Annotated[
-        float | None, typer.Option(metavar="G", help="Edges grow by G x distance at most, 0.05 to 1 (default 1).")
+        float | None,
+        typer.Option(metavar="G", help="How gently sizes change: each is 1/G blocks wide, 0.05 to 1 (default)."),
     ] = None,
     sizing: Annotated[
         Path | None, typer.Option(metavar="SIZES.nii.gz", help="Longest edge by place, mm; 0 or less: as elsewhere.")
@@ -268,7 +269,7 @@ def mesh_command(
     ] = None,
     force: ForceOption = False,
 ) -> int:
-    """Mesh an image: lattice, optimisation, VTU file."""
+    """Mesh an image: nodes where it has content (or a uniform lattice), optimised, as a VTU file."""
     begin = time.perf_counter()
     output = checked_output(output, (".vtu",), force)
     if json_path is not None:
@@ -305,6 +306,8 @@ def mesh_command(
         sizes = _sizes(size_min, size_max, gradation, sizing)
         if nodes is None and target_error is None:  # fewer on small images
             nodes = int(np.clip(image.data.size // 8, 2 ** (image.ndim + 2), DEFAULT_NODES[image.ndim]))
+        if size_max is None and nodes is not None:  # what holds then is told with the other numbers
+            size_max = (tetopt.Sizes() if sizes is None else sizes).at_most(image, nodes)
         initial, kind = None if nodes is None else octree(image, nodes, sizes), Lattice.octree.value
         options |= {"nodes": nodes, "sizes": sizes}
     else:
@@ -341,8 +344,15 @@ def _sizes(
         return None
     return tetopt.Sizes(
         0.0 if size_min is None else size_min, size_max, 1.0 if gradation is None else gradation,
-        None if sizing is None else load_image(sizing),
+        None if sizing is None else _field(sizing),
     )  # fmt: skip
+
+
+def _field(path: Path) -> Image:
+    """A file of sizes; what would be odd in an image, such as one value everywhere, is not in it."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return load_image(path)
 
 
 def _check_method(method: Method, given: dict[str, Any], wanted: Method) -> None:
@@ -624,6 +634,8 @@ def _add_quality(table: Table, *meshes: Quality) -> None:
         ("rho error (iv), worst", lambda q: f"{q.errors.worst:.4f}"),
         ("smallest angle, degrees", lambda q: f"{q.min_dihedral:.2f}"),
         ("largest angle, degrees", lambda q: f"{q.max_dihedral:.2f}"),
+        ("edges, shortest, mm", lambda q: f"{q.min_edge:.4g}"),
+        ("edges, longest, mm", lambda q: f"{q.max_edge:.4g}"),
         ("cells under 10 degrees", lambda q: str(q.n_under_10_degrees)),
         *((f"bad cells: {kind}s", lambda q, kind=kind: str(q.kinds[kind])) for kind in meshes[0].kinds),
     ]

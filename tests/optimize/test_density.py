@@ -132,6 +132,30 @@ def test_worth_is_what_E_falls_by(n, is_fixed):
     assert count > 20
 
 
+def test_splits_make_no_edge_shorter_than_asked():
+    """Of every node's best split, the halves and the edges to the other corners; some splits are refused for it."""
+    held = random_case(5, 3)
+    held.sweep()
+    N, everyone = len(held.complex.ticks), np.ones(len(held.complex.ticks), dtype=bool)
+    rings, sides = node_rings(held.complex), sides_of(held)
+    room = roomy(held.complex, N, 200)
+    is_frozen = np.concatenate([held.is_frozen, np.zeros_like(held.is_frozen)])
+    points, cells = held.mesh.points, held.mesh.cells
+    shortest = 0.45 * float(np.median(np.linalg.norm(points[cells[:, 0]] - points[cells[:, 1]], axis=1)))
+    made = []
+    for limit in (0.0, shortest):
+        _, split = best_splits(room, rings, is_frozen, held.measure, sides, everyone, limit)
+        lengths = []
+        for a in np.flatnonzero(split >= 0):
+            ring = cells[(cells == a).any(axis=1) & (cells == split[a]).any(axis=1)]
+            middle = (points[a] + points[split[a]]) / 2.0
+            lengths.append(np.linalg.norm(points[np.unique(ring)] - middle, axis=1).min())
+        made.append(np.array(lengths))
+    assert made[0].min() < 0.95 * shortest
+    assert len(made[1]) > 0
+    assert made[1].min() >= shortest * (1 - 1e-3)  # ticks round the middle
+
+
 @pytest.mark.parametrize("is_bounded", [False, True])
 def test_collapses_are_the_best_of_all_neighbours(is_bounded):
     """Against meshes in which each node is joined to each neighbour, measured from nothing.

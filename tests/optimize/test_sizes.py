@@ -140,7 +140,16 @@ def test_sizes_around_are_the_twin_s():
         (Sizes(gradation=2.0), "gradation: expected 0.05"),
         (Sizes(field=tetopt.Image(np.ones((4, 4)))), "sizing: expected a field in 3-D"),
         (Sizes(field=tetopt.Image(np.zeros((4, 4, 4)))), "sizing: no voxel is above 0"),
-        (Sizes(field=tetopt.Image(np.full((30, 30, 30), 0.5))), "too short for a block to have a voxel's length"),
+        (Sizes(field=tetopt.Image(np.full((30, 30, 30), 0.5))), "500 nodes are too few .* they need"),
+        (Sizes(smallest=100.0), "size_min: 100 mm is longer than the box, 30 mm"),
+        (Sizes(smallest=1e300), "longer than the box"),
+        (Sizes(largest=0.3), "500 nodes are too few .* they need"),
+        (Sizes(largest=1e-6), "500 nodes are too few .* they need"),
+        (Sizes(field=tetopt.Image(np.full((30, 30, 30), 1e-20))), "500 nodes are too few .* they need"),
+        (
+            Sizes(field=tetopt.Image(np.ones((9, 9, 9)), np.diag([1, 1, 1, 1]) + 99 * np.eye(4, k=3))),
+            "no voxel above 0",
+        ),
     ],
 )
 def test_limits_that_cannot_be(sizes, words):
@@ -151,7 +160,95 @@ def test_limits_that_cannot_be(sizes, words):
         tetopt.mesh_image(image, 500, sizes=sizes)
 
 
+def test_smallest_before_largest():
+    """Where not both can be, the smallest is kept."""
+    mesh = octree(ball(30, 30, 30), 320, Sizes(smallest=5.0, largest=5.0))
+    assert edges(mesh)[1].min() >= 5.0 * (1 - 1e-9)
+
+
+def waves_in_half():
+    """A box with content in half of it, for which nodes leave the other half."""
+    data = np.zeros((40, 40, 40))
+    data[:20] = 100.0 * np.sin(grid(20, 40, 40)[..., 1] / 2.0) * np.cos(grid(20, 40, 40)[..., 2] / 3.0)
+    return tetopt.Image(data)
+
+
+def test_runs_keep_to_the_largest():
+    """From a uniform mesh: exchanges make edges no longer than allowed, and would."""
+    image = waves_in_half()
+    start = tetopt.lattice(image, nodes=1000)
+    longest = edges(start)[1].max()
+    bounded, free = (
+        edges(tetopt.optimize(image, start, k_D=0.85, nodes=1000, iterations=10, sizes=Sizes(largest=largest)).mesh)[1]
+        for largest in (1.1 * longest, np.inf)
+    )
+    assert np.percentile(bounded, 99.5) < 1.1 * 1.05 * longest
+    assert np.percentile(free, 99.5) > 1.1 * np.percentile(bounded, 99.5)
+
+
+def test_runs_keep_to_the_smallest(monkeypatch):
+    """From a uniform mesh: edges whose halves would be shorter are not split, and would be."""
+    image = waves_in_half()
+    start = tetopt.lattice(image, nodes=1000)
+    fast = sys.modules["tetopt.optimize.fast"]
+    plain, made = fast.exchange, []
+
+    def counted(*arguments):
+        done = plain(*arguments)
+        made.append(done.n_split)
+        return done
+
+    monkeypatch.setattr(fast, "exchange", counted)
+    splits = []
+    for smallest in (0.0, 0.65 * edges(start)[1].max()):
+        made.clear()
+        sizes = Sizes(smallest=smallest, largest=np.inf)
+        tetopt.optimize(image, start, k_D=0.85, nodes=len(start.points), iterations=6, sizes=sizes)
+        splits.append(sum(made))
+    assert splits[0] > 100
+    assert splits[1] < 0.1 * splits[0]
+
+
+def test_longest_at_nodes():
+    """The least of the largest, the field's value, and what grows from the sizes around."""
+    image = ball(30, 30, 30)
+    mesh = octree(image, 300)
+    own = np.full(len(mesh.points), 100.0)
+    affine = np.diag([3.0, 3.0, 3.0, 1.0])
+    affine[:3, 3] = -1.0
+    field = tetopt.Image(np.where(grid(12, 12, 12)[..., 0] < 5, 7.0, 0.0), affine)
+    in_field = image.to_index(mesh.points)[:, 0] < 12.0
+    found = Sizes(largest=20.0, field=field).prepared(3).longest(image, 300, mesh.points, mesh.cells, own)
+    np.testing.assert_allclose(found[in_field], 7.0)
+    assert found.max() > 12.0  # grows from the field by gradation x distance
+    assert found.max() <= 20.0
+    own = np.linspace(1.0, 3.0, len(mesh.points))
+    sizes = Sizes(largest=np.inf, gradation=0.2)
+    found = sizes.longest(image, 300, mesh.points, mesh.cells, own)
+    np.testing.assert_allclose(found, 1.5 * _around(own, mesh.points, mesh.cells, 0.2))
+
+
 # As many nodes as an error takes.
+
+
+def test_a_stop_keeps_what_has_the_error():
+    """A run cut short does not replace a mesh that has the error already; without one it is what there is."""
+    image = ball(40, 40, 40)
+    fast = sys.modules["tetopt.optimize.fast"]
+    for stops_at, has_error in ((1, False), (3, True)):
+        count = []
+
+        def run(mesh, nodes, count=count, stops_at=stops_at):
+            count.append(nodes)
+            stop = (lambda: True) if len(count) >= stops_at else None
+            return tetopt.optimize(image, mesh, k_D=0.85, nodes=nodes, iterations=8, stop=stop)
+
+        nodes, _, result = fast.meshed_to_error(image, 0.0005, None, run)
+        assert len(count) == stops_at
+        share = result.history[-1].E_D / (float(np.var(image.data, dtype=np.float64)) * image.volume)
+        assert (share <= 0.0005) == has_error
+        assert (result.ended == "stopped") != has_error
+        assert nodes in count
 
 
 @pytest.mark.parametrize("noise", [0.0, 3.0])

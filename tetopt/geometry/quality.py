@@ -103,6 +103,8 @@ class Quality(NamedTuple):
     max_dihedral: float
     n_under_10_degrees: int  # cells with a smallest angle below
     kinds: dict[str, int]  # counts of bad cells by kind
+    min_edge: float  # mm
+    max_edge: float
 
 
 def quality(points: Points, cells: Cells) -> Quality:
@@ -114,6 +116,7 @@ def quality(points: Points, cells: Cells) -> Quality:
     smallest = angles.min(axis=1)
     names = ("needle", "wedge", "cap", "spade", "sliver") if n == 3 else ("needle", "cap")
     kinds = bad_kinds(points, cells)
+    squares = squared_edges(points, cells)
     return Quality(
         ndim=n,
         n_nodes=len(points),
@@ -129,4 +132,6 @@ def quality(points: Points, cells: Cells) -> Quality:
         max_dihedral=float(angles.max()),
         n_under_10_degrees=int((smallest < 10.0).sum()),
         kinds={name: int((kinds == name).sum()) for name in names},
+        min_edge=float(np.sqrt(squares.min())),
+        max_edge=float(np.sqrt(squares.max())),
     )

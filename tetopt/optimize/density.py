@@ -355,7 +355,7 @@ def best_splits(
 ) -> tuple[NDArray[np.float64], NDArray[np.int64]]:  # fmt: skip
     """How much E falls if the best edge of each node that is wanted is split, (N,), and where that leads, (N,).
 
-    -inf and -1 where none can be split above the floor, into halves of `shortest` mm or more; an edge of two nodes that
+    -inf and -1 where none can be split above the floor, without an edge under `shortest` mm; an edge of two nodes that
     are wanted counts for the lower one.
     Rows N to 2 N of `held.ticks` and `is_frozen` are written to.
     """
@@ -387,10 +387,26 @@ def _best_split(
         b, p = near[number], n_nodes + a
         if (b < a and is_wanted[b]) or squared_length(x, held, a, b, measure) < 4.0 * shortest * shortest:
             continue
-        if _put_middle(held, rings, is_frozen, sides, a, b, p):
+        if _put_middle(held, rings, is_frozen, sides, a, b, p) and _is_long(x, held, rings, a, b, p, shortest, measure):
             worth = worth_of_split(x, held, rings, a, b, p, measure, gain[a])
             if worth > gain[a]:
                 gain[a], split[a] = worth, b
+
+
+@njit(cache=True, error_model="numpy")
+def _is_long(
+    x: NDArray, held: Complex, rings: NodeRings, a: int, b: int, p: int, shortest: float, measure: Measure
+) -> bool:
+    """Whether no edge from p to the other corners of the cells around the edge (a, b) is shorter than that."""
+    if shortest <= 0.0:
+        return True
+    for r in range(rings.start[a], rings.start[a + 1]):
+        cell = rings.cells[r]
+        if has_node(held.cells, cell, b):
+            for k in range(held.cells.shape[1]):
+                if squared_length(x, held, p, held.cells[cell, k], measure) < shortest * shortest:
+                    return False
+    return True
 
 
 @njit(cache=True, error_model="numpy")

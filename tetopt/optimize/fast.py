@@ -196,10 +196,12 @@ def mesh_image(
     image : Image
         The intensities h.
     nodes : int
-        Number of nodes, met exactly unless the run is cut short, k_D is 0, or cells have to be lifted over the floor.
+        Number of nodes, met exactly unless the run is cut short, k_D is 0, cells have to be lifted over the floor, or
+        no more nodes can be taken out; count them.
     target_error : float
         Instead of `nodes`: the share of the image's variance that may be left within cells, 0 to 1; as many nodes as
-        that takes. A run that ends above it says so by its last record.
+        that takes, found in a few runs, each with its own `max_seconds`. A run that ends above it says so by its last
+        record.
     k_D : float
         Weight of the image. Cells of all sizes share the shape energy, and the octree that normalises E_D has a small
         one already, so that more of it than on a uniform mesh is usual.
@@ -245,8 +247,9 @@ def meshed_to_error(
 ) -> tuple[int, Mesh, Optimized]:
     """Run after run with other numbers of nodes, until the share of the image's variance is just below a target.
 
-    Returns the number of nodes, the octree and the result of the run with the fewest nodes that has the error, the last
-    if none has, or one that was cut short. The same as with that number of nodes from the start.
+    Returns the number of nodes, the octree and the result of the run with the fewest nodes that has the error; if none
+    has, of the one with the least, or of one that was cut short. It is the same as with that number of nodes from the
+    start, unless limits on sizes forbid that number. No fewer than 2^(n + 2) nodes are tried.
 
     Raises
     ------
@@ -266,18 +269,26 @@ def meshed_to_error(
         )
     nodes, tried = FIRST[image.ndim], dict[int, float]()  # shares by number of nodes
     best: tuple[int, Mesh, Optimized] | None = None
+    asked: set[int] = set()
     for _ in range(RUNS):
         mesh = nearest_octree(image, nodes, sizes)
         if not is_near(len(mesh.points), nodes):  # limits on sizes ask for more nodes than the error, or allow fewer
             nodes = len(mesh.points)
+        if nodes in asked:
+            break
+        asked.add(nodes)
         result = run(mesh, nodes)
         found, share = len(result.mesh.points), result.history[-1].E_D / (variance * image.volume)
-        if found in tried:
+        if result.ended in ("stopped", "max_seconds") and (
+            best is None or tried[len(best[2].mesh.points)] > target_error
+        ):
+            return nodes, mesh, result
+        if result.ended in ("stopped", "max_seconds") or found in tried:
             break
         tried[found] = share
         if best is None or _is_better(found, len(best[2].mesh.points), tried, target_error):
             best = nodes, mesh, result
-        if result.ended in ("stopped", "max_seconds") or NEAR * target_error <= share <= target_error:
+        if NEAR * target_error <= share <= target_error:
             return nodes, mesh, result
         nodes = _next_nodes(image, tried, target_error)
         if nodes in tried:

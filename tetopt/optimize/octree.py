@@ -24,7 +24,7 @@ from tetopt.image import Image
 from tetopt.lattice import near_cubes
 from tetopt.mesh import Mesh
 from tetopt.optimize.retessellate import delaunay
-from tetopt.optimize.sizes import DIAGONAL, NO_BOUND, Sizes
+from tetopt.optimize.sizes import DIAGONAL, NO_BOUND, SHORT, Sizes
 
 ROOTS = (
     1 / 60,
@@ -50,6 +50,8 @@ FLAT = 1e-6  # of the mean volume: such a cell is flat
 TIE = 0.05  # of a block's error: what decides between blocks that are alike
 MISS = 0.1  # of the nodes wanted: a larger miss is an error
 SAMPLE = 100_000  # voxels, of which the most frequent value is taken for the background's
+LABELS = 32  # values, at most, that an image of labels has
+MOST_ANYHOW = 5000  # nodes that even images of few voxels may get
 FEW = 40  # nodes, about what one block more or less makes
 NEAR = 0.002  # of the nodes wanted: a miss that is good enough
 
@@ -77,16 +79,57 @@ def octree(image: Image, nodes: int, sizes: Sizes | None = None) -> Mesh:
         More nodes than leaves of 2 voxels, or of the smallest size, can have, or fewer than the largest sizes need; or
         intensities whose squares overflow.
     """
+    shape = " x ".join(map(str, image.shape))
+    limits = "" if sizes is None or sizes == Sizes() else " and these limits on sizes"
+    needed = _needed(image, nodes, sizes)
+    if needed > (1.0 + MISS) * nodes + FEW:
+        raise InputError(
+            f"octree: {nodes} nodes are too few for {shape} voxels{limits}: they need {needed:.4g} or more; ask for as "
+            "many, or allow longer edges"
+        )
     mesh = nearest_octree(image, nodes, sizes)
     count = len(mesh.points)
     if is_near(count, nodes):
         return mesh
-    shape, word = " x ".join(map(str, image.shape)), "many" if count < nodes else "few"
-    limits = "" if sizes is None or sizes == Sizes() else " and these limits on sizes"
     raise InputError(
-        f"octree: {nodes} nodes are too {word} for {shape} voxels{limits}: the nearest octree found has {count}; ask "
-        "for about as many, or for a uniform mesh"
+        f"octree: {nodes} nodes are too {'many' if count < nodes else 'few'} for {shape} voxels{limits}: the nearest "
+        f"octree found has {count}; ask for about as many, or for a uniform mesh"
     )
+
+
+def _needed(image: Image, nodes: int, sizes: Sizes | None) -> float:
+    """A lower bound of the nodes that the limits on sizes ask for: two for each block as large as it may be."""
+    _check_nodes(image, nodes)
+    most, bound, _ = _limits(image, nodes, (Sizes() if sizes is None else sizes).prepared(image.ndim))
+    if bound is None:
+        return 2.0 * image.volume / most**image.ndim
+    with np.errstate(over="ignore"):
+        return 2.0 * image.voxel_volume * float((np.minimum(bound, most).astype(np.float64) ** -image.ndim).sum())
+
+
+def _check_nodes(image: Image, nodes: int) -> None:
+    n = image.ndim
+    fewest = 2**n + 1
+    if not (isinstance(nodes, int | np.integer) and nodes >= fewest):
+        raise InputError(f"octree: expected a whole number of nodes, {fewest} or more in {n}-D, got {nodes!r}")
+    if nodes > max(image.data.size, MOST_ANYHOW):
+        shape = " x ".join(map(str, image.shape))
+        raise InputError(f"octree: {nodes} nodes are too many for {shape} voxels; ask for fewer")
+
+
+def _limits(image: Image, nodes: int, sizes: Sizes) -> tuple[float, NDArray[np.float32] | None, float]:
+    """Of blocks' edges: the largest, the largest at each voxel, and the smallest, which has the last word."""
+    longest_side = float((image.spacing * image.shape).max())
+    if sizes.smallest > longest_side:
+        raise InputError(f"size_min: {sizes.smallest:g} mm is longer than the box, {longest_side:.4g} mm")
+    smallest = sizes.smallest / SHORT[image.ndim]
+    most = max(sizes.at_most(image, nodes) / DIAGONAL[image.ndim], smallest)
+    bound = sizes.on_voxels(image)
+    if bound is None:
+        return most, None, smallest
+    if bound.min() >= NO_BOUND:
+        raise InputError("sizing: no voxel above 0 lies in the image's box; do both lie in the same world mm?")
+    return most, np.maximum(bound / DIAGONAL[image.ndim], smallest).astype(np.float32), smallest
 
 
 def is_near(count: int, nodes: int) -> bool:
@@ -96,12 +139,12 @@ def is_near(count: int, nodes: int) -> bool:
 
 def nearest_octree(image: Image, nodes: int, sizes: Sizes | None = None) -> Mesh:
     """As `octree`, but with any number of nodes, if the image or the limits on sizes allow no nearer one."""
-    n = image.ndim
-    fewest = 2**n + 1
-    if not (isinstance(nodes, int | np.integer) and nodes >= fewest):
-        raise InputError(f"octree: expected a whole number of nodes, {fewest} or more in {n}-D, got {nodes!r}")
-    sizes = (Sizes() if sizes is None else sizes).prepared(n)
-    roots, divided = _closest(image, nodes, fewest, sizes)
+    sizes = (Sizes() if sizes is None else sizes).prepared(image.ndim)
+    if _needed(image, nodes, sizes) > max(image.data.size, MOST_ANYHOW):
+        raise InputError(
+            "sizes: so short edges are asked for that cells are below voxels, and see nothing; allow longer ones"
+        )
+    roots, divided = _closest(image, nodes, sizes)
     index = _places(divided, roots) / np.array(roots) * image.shape - 0.5
     points = image.to_world(index)
     for tie_break in TIE_BREAKS:
@@ -115,15 +158,19 @@ def noise_level(data: NDArray[np.floating]) -> float:
     """Standard deviation of the noise in an image's data, from what second differences along every axis leave of it.
 
     Structure wider than a voxel cancels in (1, -2, 1) taken along all axes (Immerkaer 1996, here in n-D); the lower
-    quartile of its size is that of noise in most of the volume. A background of one value, cut out, does not count, and
-    what is left in less than a tenth of the voxels are edges, not noise. Noise that was smoothed is underestimated.
+    quartile of its size is that of noise in most of the volume. A background of one value, cut out, does not count;
+    what is left in less than a tenth of the voxels are edges, not noise, and labels have none. Noise that was smoothed
+    is underestimated.
     """
     if min(data.shape) < 3:
         return 0.0
     rest = data.astype(np.float64)
     for axis in range(data.ndim):
         rest = np.diff(rest, n=2, axis=axis)
+    # Few values are labels, and have none.
     values, often = np.unique(data.ravel()[:: max(data.size // SAMPLE, 1)], return_counts=True)
+    if len(values) <= LABELS:
+        return 0.0
     is_background = data[(slice(1, -1),) * data.ndim] == values[often.argmax()]
     size = np.abs(rest[(rest != 0.0) | ~is_background])
     if np.count_nonzero(size) < 0.1 * rest.size:
@@ -148,25 +195,26 @@ class _Blocks(NamedTuple):
 
 
 def _levels(
-    image: Image, data: NDArray[np.float64], variance: float, roots: tuple[int, ...], sizes: Sizes, most: float
-) -> list[_Blocks]:
-    """The blocks of each level, the coarsest first."""
+    image: Image, data: NDArray[np.float64], variance: float, roots: tuple[int, ...], bound: NDArray | None,
+    most: float, smallest: float,
+) -> list[_Blocks]:  # fmt: skip
+    """The blocks of each level, the coarsest first; their edges are to be up to `bound` at each voxel, and `most`."""
     edge = image.spacing * image.shape / np.array(roots)
-    bound = sizes.on_voxels(image)
-    least = most if bound is None else min(most, max(float(bound.min()) / DIAGONAL[image.ndim], sizes.smallest))
+    least = most if bound is None else min(most, float(bound.min()))
     n_levels, n_content = 0, 0  # levels of blocks that exist, and that content may ask for
-    while _may_be(edge / 2 ** (n_levels + 1), image.spacing, sizes.smallest):
+    while _may_be(edge / 2 ** (n_levels + 1), image.spacing, smallest):
         n_levels, n_content = n_levels + 1, n_content + 1
-    while (edge / 2**n_levels).max() > least * (1.0 + 1e-9) and (
-        edge / 2 ** (n_levels + 1) / image.spacing
-    ).max() >= 1.0:
+    while (
+        (edge / 2**n_levels).max() > least * (1.0 + 1e-9)
+        and (half := edge / 2 ** (n_levels + 1)).min() >= smallest
+        and (half / image.spacing).max() >= 1.0
+    ):
         n_levels += 1
     spread = SPREAD * float(np.mean(data * data)) + SPREAD_OF_NOISE * variance
     sums = [np.ones(image.shape), data, data * data]
     sums = [_blocks(total, np.array(roots) << n_levels, np.add) for total in sums]
     longest = np.full(sums[0].shape, most)
     if bound is not None:
-        bound = np.maximum(bound / DIAGONAL[image.ndim], sizes.smallest)
         longest = np.minimum(most, _blocks(bound, np.array(roots) << n_levels, np.minimum, NO_BOUND))
     found = []
     for level in range(n_levels, -1, -1):
@@ -174,7 +222,8 @@ def _levels(
         free = np.maximum(count - 1.0, 0.0)
         noise = variance * (free + MARGIN * np.sqrt(2.0 * free))  # a chi-squared sum, and deviations of it
         error = np.maximum(second - first**2 / np.maximum(count, 1.0) - noise, 0.0)
-        is_too_large = longest * (1.0 + 1e-9) < edge.max() / 2**level
+        may_be_divided = edge.min() / 2 ** (level + 1) >= smallest
+        is_too_large = (longest * (1.0 + 1e-9) < edge.max() / 2**level) & may_be_divided
         found.append(_Blocks((error + spread * count) * _uneven(error.shape) * (level < n_content), is_too_large))
         if level > 0:
             half = np.array(count.shape) // 2
@@ -212,7 +261,7 @@ def _blocks(data: NDArray, counts: NDArray[np.int64], total_of: np.ufunc, empty:
     return data
 
 
-def _closest(image: Image, nodes: int, fewest: int, sizes: Sizes) -> tuple[tuple[int, ...], list[NDArray[np.bool_]]]:
+def _closest(image: Image, nodes: int, sizes: Sizes) -> tuple[tuple[int, ...], list[NDArray[np.bool_]]]:
     """Blocks undivided and those divided, of the octree that has nearly as many nodes as wanted.
 
     Where many blocks are alike, they are all divided or none, and some numbers cannot be reached from one size of
@@ -221,11 +270,12 @@ def _closest(image: Image, nodes: int, fewest: int, sizes: Sizes) -> tuple[tuple
     best: tuple[int, tuple[int, ...], list[NDArray[np.bool_]]] | None = None
     data = _scaled(image)
     variance = noise_level(data) ** 2
-    most, rings = sizes.at_most(image, nodes) / DIAGONAL[image.ndim], int(np.ceil(1.0 / sizes.gradation - 1e-9))
-    for roots in _roots(image, nodes, fewest, most, sizes.smallest):
+    most, bound, smallest = _limits(image, nodes, sizes)
+    rings = int(np.ceil(1.0 / sizes.gradation - 1e-9))
+    for roots in _roots(image, nodes, most, smallest):
         if (np.array(image.shape) / roots).max() < SMALLEST and best is not None:
             break
-        levels = _levels(image, data, variance, roots, sizes, most)
+        levels = _levels(image, data, variance, roots, bound, most, smallest)
         if levels[-1].is_too_large.any():
             continue
         count, divided = _nearest(levels, roots, nodes, rings)
@@ -234,22 +284,25 @@ def _closest(image: Image, nodes: int, fewest: int, sizes: Sizes) -> tuple[tuple
         if abs(count - nodes) <= ENOUGH * nodes:
             break
     if best is None:
+        least = DIAGONAL[image.ndim] * (most if bound is None else min(most, float(bound.min())))
         raise InputError(
-            "sizes: somewhere edges are to be too short for a block to have a voxel's length "
-            f"({image.spacing.max():.3g} mm), and smaller cells see nothing; allow longer ones"
+            f"sizes: edges of {least:.3g} mm are asked for, but blocks below a voxel ({image.spacing.max():.3g} mm) "
+            "see nothing; allow longer ones"
         )
     return best[1:]
 
 
-def _roots(image: Image, nodes: int, fewest: int, most: float, smallest: float) -> Iterator[tuple[int, ...]]:
+def _roots(image: Image, nodes: int, most: float, smallest: float) -> Iterator[tuple[int, ...]]:
     """Numbers of undivided blocks along each axis to try, of edges up to `most`: the largest blocks first."""
     lengths = image.spacing * image.shape
     kind = "bcc" if image.ndim == 3 else "criss-cross"
-    coarse = [near_cubes(kind, lengths, max(fewest, int(nodes * share))) for share in ROOTS]
-    coarse = [roots for roots in coarse if (lengths / roots).max() <= most * (1.0 + 1e-9)]
-    if len(coarse) < len(ROOTS):
-        yield tuple(int(c) for c in np.maximum(np.ceil(lengths / max(most, smallest) - 1e-9), 1))
-    yield from (roots for roots in coarse if (lengths / roots).min() >= smallest)
+    coarse = [near_cubes(kind, lengths, max(2**image.ndim + 1, int(nodes * share))) for share in ROOTS]
+    edges = [lengths / roots for roots in coarse]
+    fit = [e.max() <= most * (1.0 + 1e-9) and e.min() >= smallest for e in edges]
+    if not all(fit):
+        fewest, finest = np.ceil(lengths / most - 1e-9), lengths / max(smallest, 1e-300)
+        yield tuple(int(c) for c in np.maximum(np.minimum(fewest, np.floor(finest * (1.0 + 1e-9))), 1))
+    yield from (roots for roots, is_fit in zip(coarse, fit, strict=True) if is_fit)
 
 
 def _nearest(

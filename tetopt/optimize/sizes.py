@@ -14,6 +14,7 @@ from tetopt.image import Image
 from tetopt.lattice import near_cubes
 
 COARSEST = 1.4  # of a uniform mesh's longest edge: that of a graded one, if nothing else is asked for
+SHORT = {2: 0.5**0.5, 3: 0.75**0.5}  # the shortest: from a corner to the centre
 DIAGONAL = {2: 1.0, 3: 2.0**0.5}  # a block's longest edge of a cell, of its own: the diagonals of the box's faces
 NO_BOUND = 1e30  # mm
 UNEVEN = 1.5  # of the edge that gradation asks for: the longest; edges of a good cell differ by a third
@@ -22,20 +23,22 @@ UNEVEN = 1.5  # of the edge that gradation asks for: the longest; edges of a goo
 class Sizes(NamedTuple):
     """Limits on the edges of cells where `octree` and the exchanges of `optimize` put nodes in and take them out.
 
-    Nodes move in between, so that a few edges end above or below them: in the tests one in a hundred is more than 5 %
-    longer than the largest.
+    Nodes move in between, which makes some edges longer or shorter: in the tests one in a hundred is more than 5 %
+    longer than the largest. `quality` tells the longest and the shortest.
 
     Parameters
     ----------
     smallest : float
-        No edge is split into halves under this, mm.
+        No block and no split makes a shorter edge, mm. Where not both can be, this is kept rather than `largest`.
+        Nodes then move nearer: in one run a tenth of the edges ended shorter.
     largest : float, optional
-        No cell is made with an edge above this, mm. By default 1.4 times the longest edge of a uniform mesh with as
-        many nodes: smaller cells in uniform regions do not represent the image any better, but the displacement. `inf`
-        for none.
+        No block and no collapse makes a longer edge, mm. By default 1.4 times the longest edge of a uniform mesh with
+        as many nodes: smaller cells in uniform regions do not represent the image any better, but the displacement.
+        `inf` for none. Most edges are 0.6 times the longest, which are the diagonals of blocks on the box's faces.
     gradation : float
-        How fast edges may grow with the distance from smaller ones: from h to h + gradation x distance, in an octree's
-        steps of two. 1 lets each size be one block wide, 0.2 five.
+        How gently sizes change: each size of the octree, between the next smaller and the next larger one, is at least
+        1 / gradation blocks wide; 1 to 0.05. Collapses make no edge longer than 1.5 times the size that grows from its
+        surroundings by gradation x distance. Where there are hardly two sizes it changes little.
     field : Image, optional
         Longest edge, mm, by place: an image that need not lie on the voxels of the one to be meshed. Outside of it, and
         where it is 0 or below, nothing but `largest` holds.
@@ -61,7 +64,7 @@ class Sizes(NamedTuple):
         if self.largest is not None and self.largest < self.smallest:
             raise InputError(f"size_max: {self.largest:g} mm is below the smallest size, {self.smallest:g} mm")
         if not 0.05 <= self.gradation <= 1.0:
-            raise InputError(f"gradation: expected 0.05 (nearly uniform) to 1, got {self.gradation}")
+            raise InputError(f"gradation: expected 0.05 (gentle) to 1, got {self.gradation}")
         if self.field is not None and self.field.ndim != n:
             raise InputError(f"sizing: expected a field in {n}-D, as the image, got {self.field.ndim}-D")
         if self.field is not None and not (self.field.data > 0.0).any():
@@ -75,7 +78,7 @@ class Sizes(NamedTuple):
         lengths = image.spacing * image.shape
         kind, fewest = ("bcc", 9) if image.ndim == 3 else ("criss-cross", 5)
         uniform = float((lengths / near_cubes(kind, lengths, max(nodes, fewest))).max())
-        return DIAGONAL[image.ndim] * max(COARSEST * uniform, self.smallest)
+        return DIAGONAL[image.ndim] * max(COARSEST * uniform, self.smallest / SHORT[image.ndim])
 
     def on_voxels(self, image: Image) -> NDArray[np.float32] | None:
         """The field's value at each voxel's centre, of the image's shape; infinite where nothing holds."""
