@@ -870,7 +870,7 @@ def test_many_more_cells_than_voxels_are_said(tmp_path, capsys):
         (["--nodes", "100", "--size-max", "6"], "100 nodes are too few for 16 x 16 x 16 voxels and these limits"),
         (["--size-max", "-1"], "size_max: expected a length above 0"),
         (["--size-min", "9", "--size-max", "8"], "size_max: 8 mm is below the smallest size, 9 mm"),
-        (["--gradation", "3"], "gradation: expected 0.05 (nearly uniform) to 1, got 3"),
+        (["--gradation", "3"], "gradation: expected 0.05 (gentle) to 1, got 3"),
         (["--sizing", "missing.nii"], "missing.nii"),
     ],
 )
