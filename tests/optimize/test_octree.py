@@ -5,6 +5,7 @@ import sys
 import numba
 import numpy as np
 import pytest
+from scipy import ndimage
 
 import tetopt
 from tetopt.optimize.octree import noise_level, octree
@@ -132,6 +133,8 @@ def test_noise_level(shape, sigma):
     noisy[: shape[0] // 2] = 0.0
     assert noise_level(noisy) == pytest.approx(sigma, rel=0.08)
     assert noise_level(np.zeros(shape)) == 0.0
+    fine = ndimage.gaussian_filter(rng.normal(size=shape), 1.5)
+    assert noise_level(np.round(fine / fine.std())) == 0.0  # labels
 
 
 @pytest.mark.parametrize(

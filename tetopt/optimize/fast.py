@@ -279,11 +279,10 @@ def meshed_to_error(
         asked.add(nodes)
         result = run(mesh, nodes)
         found, share = len(result.mesh.points), result.history[-1].E_D / (variance * image.volume)
-        if result.ended in ("stopped", "max_seconds") and (
-            best is None or tried[len(best[2].mesh.points)] > target_error
-        ):
-            return nodes, mesh, result
-        if result.ended in ("stopped", "max_seconds") or found in tried:
+        if result.ended in ("stopped", "max_seconds"):
+            has_error = best is not None and tried[len(best[2].mesh.points)] <= target_error
+            return best if best is not None and has_error else (nodes, mesh, result)
+        if found in tried:
             break
         tried[found] = share
         if best is None or _is_better(found, len(best[2].mesh.points), tried, target_error):

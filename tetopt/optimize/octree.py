@@ -26,19 +26,8 @@ from tetopt.mesh import Mesh
 from tetopt.optimize.retessellate import delaunay
 from tetopt.optimize.sizes import DIAGONAL, NO_BOUND, SHORT, Sizes
 
-ROOTS = (
-    1 / 60,
-    1 / 45,
-    1 / 30,
-    1 / 20,
-    1 / 12,
-    1 / 8,
-    1 / 6,
-    1 / 4,
-    1 / 2.5,
-    1 / 1.6,
-    1.0,
-)  # undivided blocks' nodes, of those wanted: tried in turn
+# Undivided blocks' nodes, of those wanted: tried in turn.
+ROOTS = tuple(1.0 / k for k in (60, 45, 30, 20, 12, 8, 6, 4, 2.5, 1.6, 1))
 ENOUGH = 0.05  # of the nodes wanted: a miss that ends the trials
 SMALLEST = 2.0  # voxels along a leaf's edge, at least, where voxels are smallest; a quarter where they are largest
 SPREAD = 1e-3  # of the image's variance: what every voxel counts besides, so that any number of nodes is reached
