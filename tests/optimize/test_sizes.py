@@ -9,7 +9,7 @@ from scipy.sparse.csgraph import dijkstra
 from test_octree import OBLIQUE, ball, grid
 
 import tetopt
-from tetopt.optimize.octree import octree
+from tetopt.optimize.octree import _Blocks, _divided, octree
 from tetopt.optimize.sizes import Sizes, _around
 
 
@@ -96,6 +96,19 @@ def test_gradation():
         assert length[near].max() <= 3.0 + 2.5 * gradation * 12.0
         far[gradation] = float(length[near].mean())
     assert far[0.25] < 0.7 * far[1.0]
+
+
+@pytest.mark.parametrize("rings", [1, 2, 3])
+def test_blocks_around_a_divided_one(rings):
+    """As many of its size exist in every direction, that is, their parents are divided; and no other."""
+    sizes = [8, 16, 32]
+    error = [np.zeros((s, s)) for s in sizes]
+    error[1][7, 9] = 1.0
+    levels = [_Blocks(e, np.zeros(e.shape, dtype=bool)) for e in error]
+    divided = _divided(levels, 0.5, rings)
+    assert np.argwhere(divided[1]).tolist() == [[7, 9]]
+    parents = {(i // 2, j // 2) for i in range(7 - rings, 8 + rings) for j in range(9 - rings, 10 + rings)}
+    assert {(int(i), int(j)) for i, j in np.argwhere(divided[0])} == parents
 
 
 @pytest.mark.parametrize("shape", [(9, 8), (7, 6, 5)])
