@@ -53,7 +53,7 @@ from tetopt.optimize.fast import (
 )
 from tetopt.optimize.octree import octree
 from tetopt.optimize.paper import Optimized, Record, default_n_t, optimize_paper
-from tetopt.report.summary import run_summary, versions
+from tetopt.report.summary import image_summary, run_summary, versions
 from tetopt.segmentation import check_labels
 
 DEFAULT_NODES = {2: 500, 3: 5000}
@@ -502,7 +502,7 @@ def _promises(image: Image, result: Optimized, min_dihedral: float, target_error
             f"[bold red]tetopt:[/] {below} of {len(angles)} cells have an angle under {min_dihedral:g} degrees, "
             f"down to {angles.min():.2f}; allow more nodes, a lower --k-d, or a lower --min-dihedral"
         )
-    share = result.history[-1].E_D / (float(np.var(image.data, dtype=np.float64)) * image.volume or 1.0)
+    share = result.history[-1].E_D / (image_summary(image)["total_variation"] or 1.0)
     is_above = target_error is not None and share > target_error
     if is_above:
         log.print(
@@ -607,7 +607,7 @@ def _print_comparison(image: Image, initial: Mesh, result: Optimized, start: str
     table.add_row("E_G, of initial", "1.0000", f"{last.E_G / first.E_G:.4f}")
     if first.E_D > 0.0:
         table.add_row("E_D, of initial", "1.0000", f"{last.E_D / first.E_D:.4f}")
-        spread = float(np.var(image.data, dtype=np.float64)) * image.volume
+        spread = image_summary(image)["total_variation"]
         table.add_row("E_D, share of the image's variance", f"{first.E_D / spread:.5f}", f"{last.E_D / spread:.5f}")
     _add_quality(table, before, after)
     out.print(table)

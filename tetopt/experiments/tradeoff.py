@@ -31,18 +31,16 @@ def tradeoff(
     list of dict
         "option" and "value", whether all is as by default, and "measured".
     """
-    rows: list[dict[str, Any]] = []
-    default: dict[str, Any] | None = None
+    found: dict[tuple[str, float] | None, dict[str, Any]] = {}  # by what is changed; None: nothing
+    rows = []
     for option, values in SWEEPS.items():
         for value in values:
             is_default = (option, value) in DEFAULTS
-            if not (is_default and default is not None):
+            changed = None if is_default else (option, value)
+            if changed not in found:
                 say(f"trade-off: {option} = {value:g}")
-                found = measure(_made(image, nodes, option, value))
-                default = found if is_default else default
-            else:
-                found = default
-            rows.append({"option": option, "value": value, "is_default": is_default, "measured": found})
+                found[changed] = measure(_made(image, nodes, option, value))
+            rows.append({"option": option, "value": value, "is_default": is_default, "measured": found[changed]})
     return rows
 
 

@@ -70,13 +70,14 @@ def octree(image: Image, nodes: int, sizes: Sizes | None = None) -> Mesh:
     """
     shape = " x ".join(map(str, image.shape))
     limits = "" if sizes is None or sizes == Sizes() else " and these limits on sizes"
-    needed = _needed(image, nodes, sizes)
+    asked = _limits(image, nodes, sizes)
+    needed = _needed(image, asked)
     if needed > (1.0 + MISS) * nodes + FEW:
         raise InputError(
             f"octree: {nodes} nodes are too few for {shape} voxels{limits}: they need {needed:.4g} or more; ask for as "
             "many, or allow longer edges"
         )
-    mesh = nearest_octree(image, nodes, sizes)
+    mesh = _built(image, nodes, asked)
     count = len(mesh.points)
     if is_near(count, nodes):
         return mesh
@@ -86,17 +87,17 @@ def octree(image: Image, nodes: int, sizes: Sizes | None = None) -> Mesh:
     )
 
 
-def _needed(image: Image, nodes: int, sizes: Sizes | None) -> float:
-    """A lower bound of the nodes that the limits on sizes ask for: two for each block as large as it may be."""
-    _check_nodes(image, nodes)
-    most, bound, _ = _limits(image, nodes, (Sizes() if sizes is None else sizes).prepared(image.ndim))
-    if bound is None:
-        return 2.0 * image.volume / most**image.ndim
-    with np.errstate(over="ignore"):
-        return 2.0 * image.voxel_volume * float((np.minimum(bound, most).astype(np.float64) ** -image.ndim).sum())
+class _Limits(NamedTuple):
+    """On the blocks: edges, mm, and how many of a size lie beside one another."""
+
+    most: float
+    bound: NDArray[np.float32] | None  # the largest at each voxel
+    smallest: float  # has the last word
+    rings: int
 
 
-def _check_nodes(image: Image, nodes: int) -> None:
+def _limits(image: Image, nodes: int, sizes: Sizes | None) -> _Limits:
+    """What the number of nodes and the sizes ask for; InputError where they cannot be."""
     n = image.ndim
     fewest = 2**n + 1
     if not (isinstance(nodes, int | np.integer) and nodes >= fewest):
@@ -104,21 +105,27 @@ def _check_nodes(image: Image, nodes: int) -> None:
     if nodes > max(image.data.size, MOST_ANYHOW):
         shape = " x ".join(map(str, image.shape))
         raise InputError(f"octree: {nodes} nodes are too many for {shape} voxels; ask for fewer")
-
-
-def _limits(image: Image, nodes: int, sizes: Sizes) -> tuple[float, NDArray[np.float32] | None, float]:
-    """Of blocks' edges: the largest, the largest at each voxel, and the smallest, which has the last word."""
+    sizes = (Sizes() if sizes is None else sizes).prepared(n)
     longest_side = float((image.spacing * image.shape).max())
     if sizes.smallest > longest_side:
         raise InputError(f"size_min: {sizes.smallest:g} mm is longer than the box, {longest_side:.4g} mm")
-    smallest = sizes.smallest / SHORT[image.ndim]
-    most = max(sizes.at_most(image, nodes) / DIAGONAL[image.ndim], smallest)
+    smallest = sizes.smallest / SHORT[n]
+    most = max(sizes.at_most(image, nodes) / DIAGONAL[n], smallest)
     bound = sizes.on_voxels(image)
-    if bound is None:
-        return most, None, smallest
-    if bound.min() >= NO_BOUND:
-        raise InputError("sizing: no voxel above 0 lies in the image's box; do both lie in the same world mm?")
-    return most, np.maximum(bound / DIAGONAL[image.ndim], smallest).astype(np.float32), smallest
+    if bound is not None:
+        if bound.min() >= NO_BOUND:
+            raise InputError("sizing: no voxel above 0 lies in the image's box; do both lie in the same world mm?")
+        bound = np.maximum(bound / DIAGONAL[n], smallest).astype(np.float32)
+    return _Limits(most, bound, smallest, int(np.ceil(1.0 / sizes.gradation - 1e-9)))
+
+
+def _needed(image: Image, asked: _Limits) -> float:
+    """A lower bound of the nodes that the limits ask for: two for each block as large as it may be."""
+    if asked.bound is None:
+        return 2.0 * image.volume / asked.most**image.ndim
+    with np.errstate(over="ignore"):
+        edges = np.minimum(asked.bound, asked.most).astype(np.float64)
+        return 2.0 * image.voxel_volume * float((edges**-image.ndim).sum())
 
 
 def is_near(count: int, nodes: int) -> bool:
@@ -128,12 +135,16 @@ def is_near(count: int, nodes: int) -> bool:
 
 def nearest_octree(image: Image, nodes: int, sizes: Sizes | None = None) -> Mesh:
     """As `octree`, but with any number of nodes, if the image or the limits on sizes allow no nearer one."""
-    sizes = (Sizes() if sizes is None else sizes).prepared(image.ndim)
-    if _needed(image, nodes, sizes) > max(image.data.size, MOST_ANYHOW):
+    return _built(image, nodes, _limits(image, nodes, sizes))
+
+
+def _built(image: Image, nodes: int, asked: _Limits) -> Mesh:
+    """The octree within the limits that has nearly as many nodes as wanted."""
+    if _needed(image, asked) > max(image.data.size, MOST_ANYHOW):
         raise InputError(
             "sizes: so short edges are asked for that cells are below voxels, and see nothing; allow longer ones"
         )
-    roots, divided = _closest(image, nodes, sizes)
+    roots, divided = _closest(image, nodes, asked)
     index = _places(divided, roots) / np.array(roots) * image.shape - 0.5
     points = image.to_world(index)
     for tie_break in TIE_BREAKS:
@@ -250,7 +261,7 @@ def _blocks(data: NDArray, counts: NDArray[np.int64], total_of: np.ufunc, empty:
     return data
 
 
-def _closest(image: Image, nodes: int, sizes: Sizes) -> tuple[tuple[int, ...], list[NDArray[np.bool_]]]:
+def _closest(image: Image, nodes: int, asked: _Limits) -> tuple[tuple[int, ...], list[NDArray[np.bool_]]]:
     """Blocks undivided and those divided, of the octree that has nearly as many nodes as wanted.
 
     Where many blocks are alike, they are all divided or none, and some numbers cannot be reached from one size of
@@ -259,8 +270,7 @@ def _closest(image: Image, nodes: int, sizes: Sizes) -> tuple[tuple[int, ...], l
     best: tuple[int, tuple[int, ...], list[NDArray[np.bool_]]] | None = None
     data = _scaled(image)
     variance = noise_level(data) ** 2
-    most, bound, smallest = _limits(image, nodes, sizes)
-    rings = int(np.ceil(1.0 / sizes.gradation - 1e-9))
+    most, bound, smallest, rings = asked
     for roots in _roots(image, nodes, most, smallest):
         if (np.array(image.shape) / roots).max() < SMALLEST and best is not None:
             break
