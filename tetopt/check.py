@@ -14,7 +14,7 @@ from tetopt.mesh import Mesh
 ON_FACE = 1e-6  # voxel: as near as this to the box's face is on it
 
 
-def check_mesh(mesh: Mesh, image: Image | None = None) -> list[str]:
+def check_mesh(mesh: Mesh, image: Image | None = None, *, is_whole: bool = True) -> list[str]:
     """What is wrong with a mesh, one line each, the first offenders named; an empty list if nothing is.
 
     Asked are: every node used and none twice in the same place; every cell positively oriented, with distinct corners,
@@ -27,6 +27,8 @@ def check_mesh(mesh: Mesh, image: Image | None = None) -> list[str]:
     mesh : Mesh
     image : Image, optional
         The image whose box the mesh should fill. Without it overlaps of cells that share no facet are not found.
+    is_whole : bool
+        Whether it should be one piece; a mask may have several.
 
     Raises
     ------
@@ -39,7 +41,7 @@ def check_mesh(mesh: Mesh, image: Image | None = None) -> list[str]:
         )
     found = [*_nodes(mesh), *_cells(mesh)]
     if not found:  # what follows takes sound cells for granted
-        found = _facets(mesh)
+        found = _facets(mesh, is_whole)
     if not found and image is not None:
         found = _box(mesh, image)
     return found
@@ -77,7 +79,7 @@ def _cells(mesh: Mesh) -> list[str]:
     return found
 
 
-def _facets(mesh: Mesh) -> list[str]:
+def _facets(mesh: Mesh, is_whole: bool) -> list[str]:
     found = []
     pairs = folded(mesh.cells)
     if len(pairs):
@@ -93,7 +95,7 @@ def _facets(mesh: Mesh) -> list[str]:
     if (counts % 2).any():
         found.append(f"places where the boundary is open; nodes: {_first(kinds[counts % 2 == 1])}")
     pieces = components(mesh.cells)
-    if pieces.max() > 0:
+    if is_whole and pieces.max() > 0:
         sizes = np.bincount(pieces)
         found.append(f"pieces that share no facet: {len(sizes)}, of {np.sort(sizes)[::-1][:5].tolist()} cells")
     return found

@@ -14,11 +14,12 @@ from collections.abc import Callable, Iterator, Sequence
 from enum import StrEnum
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import numba
 import numpy as np
 import typer
+from numpy.typing import NDArray
 from rich.console import Console
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
@@ -29,13 +30,16 @@ from tetopt import (
     Image,
     InputError,
     Mesh,
-    lattice,
     load_image,
     load_mesh,
     load_phantom,
     save_image,
     save_mesh,
 )
+from tetopt.align import aligned_contrast, aligned_labels, aligned_mask, background_level, foreground
+from tetopt.content import Content, content, continued
+from tetopt.domain import lattice_within
+from tetopt.fidelity import cell_labels, label_fidelity, mask_fidelity
 from tetopt.geometry.quality import Quality, quality
 from tetopt.geometry.simplex import dihedral_angles, squared_edges, volumes
 from tetopt.io.files import checked_output, save_json
@@ -53,9 +57,10 @@ from tetopt.optimize.fast import (
 )
 from tetopt.optimize.octree import octree
 from tetopt.optimize.paper import Optimized, Record, default_n_t, optimize_paper
-from tetopt.report.summary import image_summary, run_summary, versions
+from tetopt.report.summary import run_summary, versions
 from tetopt.segmentation import check_labels
 
+LARGE = 200  # voxels: a label of more may not be without cells
 DEFAULT_NODES = {2: 500, 3: 5000}
 
 
@@ -162,6 +167,17 @@ ImageArgument = Annotated[
     Path,
     typer.Argument(metavar="IMAGE", help="NIfTI, MGZ, NRRD, MetaImage, a DICOM folder, or a 2-D picture."),
 ]
+ImagesArgument = Annotated[
+    list[Path],
+    typer.Argument(metavar="IMAGE...", help="As for the other commands; further contrasts go to the first one's grid."),
+]
+MaskOption = Annotated[
+    Path | None,
+    typer.Option(metavar="MASK", help="Mesh this region only (0/1, or 0 to 1), its boundary on the mask's surface."),
+]
+LabelsOption = Annotated[
+    Path | None, typer.Option("--labels", metavar="LABELS", help="Label image: each cell is to be of one label.")
+]
 VolumeOption = Annotated[int | None, typer.Option("--volume", metavar="K", help="Volume of a 4-D file, from 0.")]
 CropOption = Annotated[
     str | None,
@@ -179,7 +195,7 @@ ThreadsOption = Annotated[
 
 @app.command("mesh")
 def mesh_command(
-    image_path: ImageArgument,
+    image_paths: ImagesArgument,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="MESH.vtu", help="The mesh to write.")],
     nodes: Annotated[
         int | None, typer.Option(metavar="N", help="Wanted number of nodes (default 5000; 500 in 2-D).")
@@ -199,6 +215,18 @@ def mesh_command(
     ] = None,
     sizing: Annotated[
         Path | None, typer.Option(metavar="SIZES.nii.gz", help="Longest edge by place, mm; 0 or less: as elsewhere.")
+    ] = None,
+    mask: MaskOption = None,
+    background: Annotated[
+        str | None,
+        typer.Option(metavar="VALUE|auto", help="Leave out what is up to VALUE and reaches the box: the air."),
+    ] = None,
+    labels: LabelsOption = None,
+    weights: Annotated[
+        str | None, typer.Option(metavar="W,...", help="How much each IMAGE counts (default 1 each; 0: not at all).")
+    ] = None,
+    label_weight: Annotated[
+        float | None, typer.Option(metavar="W", help="How much the labels count beside the first IMAGE (default 1).")
     ] = None,
     uniform: Annotated[
         bool, typer.Option("--uniform", help="The paper's setting: a uniform lattice, bcc (criss-cross in 2-D).")
@@ -255,7 +283,7 @@ def mesh_command(
             metavar="DEG", help="Fast method, 3-D: smallest dihedral angle allowed, 0 (none) to 70 (default 12)."
         ),
     ] = None,
-    boundary: Annotated[Boundary, typer.Option(help="What the box's nodes may do.")] = Boundary.slide,
+    boundary: Annotated[Boundary, typer.Option(help="What the boundary's nodes may do.")] = Boundary.slide,
     threads: ThreadsOption = None,
     max_seconds: Annotated[
         float | None, typer.Option(metavar="S", help="Stop after S seconds with the mesh reached.")
@@ -300,27 +328,89 @@ def mesh_command(
         check_options(**options)
     names = ("slice.png", "rho.png", "energies.png")
     pictures = [] if figures is None else [checked_output(figures / name, (".png",), force) for name in names]
+    if method is Method.paper and (len(image_paths) > 1 or mask or background or labels):
+        raise InputError("--method paper: takes one IMAGE and its whole box; leave out mask, labels and further ones")
     _set_threads(threads)
-    image = _image(image_path, volume, crop, slice_)
+    source = _source(image_paths, volume, crop, slice_, mask, background, labels, weights, label_weight)
+    wanted = source.wanted
+    image = wanted.image
     if is_graded:
         sizes = _sizes(size_min, size_max, gradation, sizing)
         if nodes is None and target_error is None:  # fewer on small images
-            nodes = int(np.clip(image.data.size // 8, 2 ** (image.ndim + 2), DEFAULT_NODES[image.ndim]))
+            nodes = int(np.clip(wanted.n_voxels // 8, 2 ** (image.ndim + 2), DEFAULT_NODES[image.ndim]))
         if size_max is None and nodes is not None:  # what holds then is told with the other numbers
-            size_max = (tetopt.Sizes() if sizes is None else sizes).at_most(image, nodes)
-        initial, kind = None if nodes is None else octree(image, nodes, sizes), Lattice.octree.value
+            size_max = (tetopt.Sizes() if sizes is None else sizes).at_most(image, nodes, wanted.volume)
+        initial, kind = None if nodes is None else octree(wanted, nodes, sizes), Lattice.octree.value
         options |= {"nodes": nodes, "sizes": sizes}
     else:
         if nodes is None and spacing is None:
             nodes = DEFAULT_NODES[image.ndim]
         kind = KINDS[image.ndim][0] if lattice_kind is None else lattice_kind.value
-        initial = lattice(image, kind, nodes=nodes, spacing=spacing)
-    source = {
+        initial = lattice_within(image, wanted.region, kind, nodes=nodes, spacing=spacing)
+    settings = {
         "nodes": nodes, "target_error": target_error, "spacing": spacing, "lattice": kind, "size_min": size_min,
         "size_max": size_max, "gradation": gradation, "sizing": None if sizing is None else sizing.name,
         "volume": volume, "crop": crop, "slice": slice_, "method": method.value, "max_seconds": max_seconds,
     }  # fmt: skip
-    return _mesh_files(image_path, image, initial, options, source, output, json_path, pictures, begin)
+    return _mesh_files(source, initial, options, settings, output, json_path, pictures, begin)
+
+
+class _Source(NamedTuple):
+    """What is meshed, and the files that it comes from."""
+
+    paths: list[Path]  # of the contrasts
+    wanted: Content
+    contrasts: list[Image]  # on the first one's voxels
+    labels: Image | None  # likewise
+    mask: Image | None
+    about: dict[str, Any]  # names, checksums and weights
+
+
+def _source(
+    paths: list[Path], volume: int | None, crop: str | None, slice_: str | None, mask_path: Path | None,
+    background: str | None, labels_path: Path | None, weights: str | None, label_weight: float | None,
+) -> _Source:  # fmt: skip
+    """Images, labels and mask as the options ask for them, on the voxels of the first image."""
+    if mask_path is not None and background is not None:
+        raise InputError("--mask and --background: give one of them")
+    if label_weight is not None and labels_path is None:
+        raise InputError("--label-weight: there are no --labels")
+    image = _image(paths[0], volume, crop, slice_)
+
+    def beside(path: Path) -> Image:  # a slice is only found in an image of the same grid
+        return _image(path, None, crop, slice_) if slice_ is not None else load_quietly(path)
+
+    contrasts = [image, *(aligned_contrast(str(path), beside(path), image) for path in paths[1:])]
+    labels = None if labels_path is None else aligned_labels(str(labels_path), beside(labels_path), image)
+    mask = None if mask_path is None else aligned_mask(str(mask_path), beside(mask_path), image)
+    level = None
+    if background is not None:
+        level = background_level(image) if background == "auto" else _number("--background", background)
+        mask = foreground(image, level)
+    counts = [1.0] * len(paths) if weights is None else [_number("--weights", part) for part in weights.split(",")]
+    if weights is None and labels is not None and len(paths) == 1 and np.array_equal(labels.data, image.data):
+        log.print("the image is its own labels: only these count")
+        counts = [0.0]
+    wanted = content(
+        contrasts, labels, mask, weights=counts, label_weight=1.0 if label_weight is None else label_weight
+    )
+    about: dict[str, Any] = {"image": paths[0].name, "image_sha256": sha256(paths[0])}
+    files = [*paths[1:], *(path for path in (mask_path, labels_path) if path is not None)]
+    about["inputs"] = {
+        "images": [path.name for path in paths], "weights": counts,
+        "mask": None if mask_path is None else mask_path.name, "background": level,
+        "labels": None if labels_path is None else labels_path.name,
+        "label_weight": None if labels is None else label_weight,
+        "sha256": {path.name: sha256(path) for path in files},
+    }  # fmt: skip
+    return _Source(paths, wanted, contrasts, labels, mask, about)
+
+
+def _number(name: str, text: str) -> float:
+    try:
+        return float(text)
+    except ValueError:
+        raise InputError(f'{name}: expected a number, got "{text}"') from None
 
 
 def _is_graded(kind: Lattice | None, uniform: bool, spacing: float | None, method: Method) -> bool:
@@ -344,12 +434,12 @@ def _sizes(
         return None
     return tetopt.Sizes(
         0.0 if size_min is None else size_min, size_max, 1.0 if gradation is None else gradation,
-        None if sizing is None else _field(sizing),
+        None if sizing is None else load_quietly(sizing),
     )  # fmt: skip
 
 
-def _field(path: Path) -> Image:
-    """A file of sizes; what would be odd in an image, such as one value everywhere, is not in it."""
+def load_quietly(path: Path) -> Image:
+    """A file of sizes, labels or a mask; what would be odd in an image, such as one value everywhere, is not in it."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         return load_image(path)
@@ -363,59 +453,124 @@ def _check_method(method: Method, given: dict[str, Any], wanted: Method) -> None
 
 
 def _mesh_files(
-    image_path: Path,
-    image: Image,
+    source: _Source,
     initial: Mesh | None,
     options: dict[str, Any],
-    source: dict[str, Any],
+    settings: dict[str, Any],
     output: Path,
     json_path: Path | None,
     pictures: list[Path],
     begin: float,
 ) -> int:
     """Optimise, write the mesh, the numbers and the pictures, print the comparison; the exit code."""
-    digest = sha256(image_path)  # now: the file may change while the nodes move
+    wanted, image = source.wanted, source.wanted.image
     loaded = time.perf_counter()
-    ends = None if source["max_seconds"] is None else begin + source["max_seconds"]
+    ends = None if settings["max_seconds"] is None else begin + settings["max_seconds"]
     interrupted: list[bool] = []
 
     def run(mesh: Mesh, nodes: int | None) -> Optimized:
-        log.print(escape(_described(image_path, image, mesh, source["lattice"])))
+        log.print(escape(_described(source, mesh, settings["lattice"])))
         graded = {} if nodes is None else {"nodes": nodes}
-        result, is_interrupted = _optimized(image, mesh, Method(source["method"]), ends, **options | graded)
+        result, is_interrupted = _optimized(wanted, mesh, Method(settings["method"]), ends, **options | graded)
         interrupted.append(is_interrupted)
         return result
 
     if initial is None:
-        options["nodes"], initial, result = meshed_to_error(image, source["target_error"], options["sizes"], run)
+        options["nodes"], initial, result = meshed_to_error(wanted, settings["target_error"], options["sizes"], run)
     else:
         result = run(initial, options.get("nodes"))
     is_interrupted = any(interrupted)
     optimized = time.perf_counter()
-    told = {name: value for name, value in (source | options).items() if name != "sizes"}
-    about = {"image": image_path.name, "image_sha256": digest, "options": told}
-    fields = cell_fields(result.mesh, image)
+    told = {name: value for name, value in (settings | options).items() if name != "sizes"}
+    about = {**source.about, "options": told}
+    fields = _fields(source, result.mesh)
     save_mesh(output, result.mesh, fields, {"tetopt": tetopt.__version__, **about})
+    found = _fidelity(source.labels, source.mask, result.mesh, fields.get("label"))
+    if len(source.contrasts) > 1:
+        found["contrasts"] = _by_contrast(source, result.mesh, fields)
     if json_path is not None:
         seconds = {"load": loaded - begin, "optimize": optimized - loaded, "all": time.perf_counter() - begin}
-        save_json(json_path, run_summary(image, initial, result, about, seconds))
+        save_json(json_path, run_summary(wanted, initial, result, about, seconds) | found)
     if pictures:
         from tetopt.report.figures import save_run_figures  # matplotlib is slow to load, and only needed here
 
-        save_run_figures(pictures, image, initial, result, _start_name(source["lattice"]))
+        save_run_figures(pictures, image, initial, result, _start_name(settings["lattice"]))
     # Everything is written; what is printed may go into a pipe that closes.
-    code = _promises(image, result, options.get("min_dihedral", 0.0), source["target_error"])
+    code = _promises(wanted, result, options.get("min_dihedral", 0.0), settings["target_error"], found)
     code = 130 if is_interrupted else code
     n_empty = 0 if image.data.min() == image.data.max() else int((fields["n_voxels"] == 0).sum())
-    wanted = options.get("nodes") if source["target_error"] is None else None
-    _warn(result, Method(source["method"]), wanted, n_empty)
-    _print_comparison(image, initial, result, _start_name(source["lattice"]))
+    asked = options.get("nodes") if settings["target_error"] is None else None
+    _warn(result, Method(settings["method"]), asked, n_empty)
+    _print_comparison(wanted, initial, result, _start_name(settings["lattice"]))
+    _print_fidelity(found)
     out.print(escape(f"{output}: {len(result.mesh.points)} nodes, {len(result.mesh.cells)} cells"))
     if json_path is not None:
         out.print(escape(f"{json_path}: every number of the run"))
     for path in pictures:
         out.print(escape(str(path)))
     return code
+
+
+def _fields(source: _Source, mesh: Mesh) -> dict[str, NDArray]:
+    """What the file holds of each cell: as `cell_fields`, means of further contrasts, and the label."""
+    fields = cell_fields(mesh, source.wanted.image)
+    for number, contrast in enumerate(source.contrasts[1:], 2):
+        moments = tetopt.cell_moments(continued(contrast, source.mask), mesh)
+        fields |= {f"mean_{number}": moments.mean, f"variance_{number}": moments.variance}
+    if source.labels is not None:
+        fields["label"] = cell_labels(continued(source.labels, source.mask), mesh)
+    return fields
+
+
+def _by_contrast(source: _Source, mesh: Mesh, fields: dict[str, NDArray]) -> list[dict[str, Any]]:
+    """How well each contrast is represented: the share of its variance left within cells."""
+    rows = []
+    weights = source.about["inputs"]["weights"]
+    for number, (path, weight) in enumerate(zip(source.paths, weights, strict=True), 1):
+        mean, variance = (fields[name if number == 1 else f"{name}_{number}"] for name in ("mean", "variance"))
+        count = fields["n_voxels"]
+        within = float((count * variance).sum())
+        total = within + float((count * (mean - (count * mean).sum() / count.sum()) ** 2).sum())
+        rows.append(
+            {"image": path.name, "weight": weight, "E_D_share_of_variance": within / total if total > 0.0 else None}
+        )
+    return rows
+
+
+def _fidelity(labels: Image | None, mask: Image | None, mesh: Mesh, of_cell: NDArray | None) -> dict[str, Any]:
+    """How well a mesh represents labels and a mask."""
+    found: dict[str, Any] = {}
+    if mask is not None:
+        found["mask"] = mask_fidelity(mask, mesh)._asdict()
+    if labels is not None:
+        if mask is not None:  # what lies outside is not asked for
+            labels = Image(np.where(mask.data >= 0.5, labels.data, 0.0), labels.affine)
+        found["labels"] = [row._asdict() for row in label_fidelity(labels, mesh, of_cell)]
+    return found
+
+
+def _print_fidelity(found: dict[str, Any]) -> None:
+    for row in found.get("contrasts", []):
+        share = "constant" if row["E_D_share_of_variance"] is None else f"{row['E_D_share_of_variance']:.5f}"
+        out.print(escape(f"{row['image']}: weight {row['weight']:g}, share of its variance left in cells {share}"))
+    if "mask" in found:
+        mask = found["mask"]
+        out.print(
+            f"mask: Dice {mask['dice']:.4f}; boundary to its surface: mean {mask['distance_mean']:.3f}, 95 % within "
+            f"{mask['distance_p95']:.3f} voxels; pieces {mask['components']}, in the mesh {mask['mesh_components']}"
+        )
+    if "labels" in found:
+        table = _table(
+            "label", "voxels", "volume, mm", "in mesh, mm", "cells", "Dice", "surface, mean mm", "95th percentile",
+            "pieces", "in mesh",
+        )  # fmt: skip
+        for row in found["labels"]:
+            table.add_row(
+                str(row["label"]), str(row["voxels"]), f"{row['volume']:.1f}", f"{row['mesh_volume']:.1f}",
+                str(row["n_cells"]), f"{row['dice']:.4f}", f"{row['distance_mean']:.3f}", f"{row['distance_p95']:.3f}",
+                str(row["components"]), str(row["mesh_components"]),
+            )  # fmt: skip
+        out.print(table)
 
 
 def _warn(result: Optimized, method: Method, nodes: int | None, n_empty: int) -> None:
@@ -481,18 +636,23 @@ def _start_name(kind: str) -> str:
     return kind if kind == Lattice.octree.value else "lattice"
 
 
-def _described(path: Path, image: Image, initial: Mesh, kind: str) -> str:
+def _described(source: _Source, initial: Mesh, kind: str) -> str:
+    image = source.contrasts[0]
     size = " x ".join(str(s) for s in image.shape)
     spacing = " x ".join(f"{s:.4g}" for s in image.spacing)
     start = f"{_start_name(kind)} of {len(initial.points)} nodes, {len(initial.cells)} cells"
     start += f", edges up to {np.sqrt(squared_edges(initial.points, initial.cells).max()):.3g} mm"
-    return f"{path}: {size} voxels of {spacing} mm; {start}"
+    more = [f"and {len(source.paths) - 1} more"] if len(source.paths) > 1 else []
+    more += ["labels"] if source.labels is not None else []
+    more += [f"within a mask of {source.wanted.n_voxels} voxels"] if source.mask is not None else []
+    return ", ".join([f"{source.paths[0]}: {size} voxels of {spacing} mm", *more]) + f"; {start}"
 
 
-def _promises(image: Image, result: Optimized, min_dihedral: float, target_error: float | None = None) -> int:
-    """0 if the mesh fills the image's box, keeps the floor on angles and has the error asked; else 1, said aloud."""
-    covered = float(volumes(result.mesh.points, result.mesh.cells).sum())
-    missed = image.data.size - result.history[-1].n_voxels
+def _promises(
+    wanted: Content, result: Optimized, min_dihedral: float, target_error: float | None, found: dict[str, Any]
+) -> int:
+    """0 if the mesh covers what it should, keeps the floor on angles and has the error asked; else 1, said aloud."""
+    image = wanted.image
     below = 0
     if image.ndim == 3 and result.history[-1].iteration > 0:
         angles = dihedral_angles(result.mesh.points, result.mesh.cells).min(axis=1)
@@ -502,15 +662,20 @@ def _promises(image: Image, result: Optimized, min_dihedral: float, target_error
             f"[bold red]tetopt:[/] {below} of {len(angles)} cells have an angle under {min_dihedral:g} degrees, "
             f"down to {angles.min():.2f}; allow more nodes, a lower --k-d, or a lower --min-dihedral"
         )
-    share = result.history[-1].E_D / (image_summary(image)["total_variation"] or 1.0)
+    share = result.history[-1].E_D / (wanted.variance * wanted.volume or 1.0)
     is_above = target_error is not None and share > target_error
     if is_above:
         log.print(
             f"[bold red]tetopt:[/] {share:.4g} of the image's variance is left in the cells, more than "
             f"{target_error:g}; allow smaller cells or more --iterations, or ask for a number of --nodes"
         )
+    is_lost = _says_what_is_lost(found)
+    if wanted.region is not None:
+        return 1 if below or is_above or is_lost else 0
+    covered = float(volumes(result.mesh.points, result.mesh.cells).sum())
+    missed = image.data.size - result.history[-1].n_voxels
     if missed == 0 and abs(covered / image.volume - 1.0) < 1e-9:
-        return 1 if below or is_above else 0
+        return 1 if below or is_above or is_lost else 0
     log.print(
         f"[bold red]tetopt:[/] the mesh does not cover the image: {missed} voxels are outside, "
         f"its volume is {covered:.9g} of {image.volume:.9g} mm^{image.ndim}; please report this"
@@ -518,15 +683,36 @@ def _promises(image: Image, result: Optimized, min_dihedral: float, target_error
     return 1
 
 
+def _says_what_is_lost(found: dict[str, Any]) -> bool:
+    """Name labels of more than 200 voxels that no cell carries, and say where the mask is not met; whether any is."""
+    lost = [row for row in found.get("labels", []) if row["is_lost"]]
+    large = [str(row["label"]) for row in lost if row["voxels"] > LARGE]
+    if large:
+        log.print(
+            f"[bold red]tetopt:[/] no cell has label {', '.join(large)}, of more than {LARGE} voxels; allow more "
+            "nodes, or a higher --label-weight"
+        )
+    if small := [str(row["label"]) for row in lost if row["voxels"] <= LARGE]:
+        _show_warning(f"no cell has label {', '.join(small)}, of {LARGE} voxels or fewer")
+    mask = found.get("mask")
+    if mask is not None and mask["components"] != mask["mesh_components"]:
+        _show_warning(
+            f"the mask has {mask['components']} pieces, the mesh {mask['mesh_components']}: cells are as large "
+            "as parts, or gaps, of the mask; allow more nodes"
+        )
+    return bool(large)
+
+
 def _optimized(
-    image: Image, initial: Mesh, method: Method, ends: float | None, **options: Any
+    wanted: Content, initial: Mesh, method: Method, ends: float | None, **options: Any
 ) -> tuple[Optimized, bool]:
     """`optimize` with progress shown, ended in good order at a time or by Ctrl-C; whether by that."""
     iterations = options["iterations"]
-    _prepare_kernels(image, options["k_D"], method, "nodes" in options)
-    run = optimize if method is Method.fast else optimize_paper
+    _prepare_kernels(wanted, options["k_D"], method, "nodes" in options)
+    run: Callable[..., Optimized] = optimize if method is Method.fast else optimize_paper
     max_seconds = None if ends is None else max(ends - time.perf_counter(), 1e-9)
     with _graceful_interrupt() as is_interrupted, _progress(iterations) as show:
+        image = wanted if method is Method.fast else wanted.image
         result = run(image, initial, max_seconds=max_seconds, callback=show, stop=is_interrupted, **options)
         was_interrupted = is_interrupted()
     if iterations == 0:  # the lattice itself, not its nodes put on the sampling grid
@@ -541,7 +727,7 @@ def _optimized(
     return result, was_interrupted
 
 
-def _prepare_kernels(image: Image, k_D: float, method: Method, is_graded: bool) -> None:
+def _prepare_kernels(image: Content, k_D: float, method: Method, is_graded: bool) -> None:
     """Load the compiled kernels, or compile them, before the clock of the first iteration starts."""
     begin = time.perf_counter()
     with log.status("preparing the kernels (the first run compiles them, about a minute) ..."):
@@ -598,7 +784,7 @@ def _progress(iterations: int) -> Iterator[Callable[[Record], None]]:
         )
 
 
-def _print_comparison(image: Image, initial: Mesh, result: Optimized, start: str) -> None:
+def _print_comparison(wanted: Content, initial: Mesh, result: Optimized, start: str) -> None:
     first, last = result.history[0], result.history[-1]
     before = quality(initial.points, initial.cells)
     after = quality(result.mesh.points, result.mesh.cells)
@@ -607,7 +793,7 @@ def _print_comparison(image: Image, initial: Mesh, result: Optimized, start: str
     table.add_row("E_G, of initial", "1.0000", f"{last.E_G / first.E_G:.4f}")
     if first.E_D > 0.0:
         table.add_row("E_D, of initial", "1.0000", f"{last.E_D / first.E_D:.4f}")
-        spread = image_summary(image)["total_variation"]
+        spread = wanted.variance * wanted.volume
         table.add_row("E_D, share of the image's variance", f"{first.E_D / spread:.5f}", f"{last.E_D / spread:.5f}")
     _add_quality(table, before, after)
     out.print(table)
@@ -1089,7 +1275,7 @@ def demo_command(
     """Mesh the MNI152 T1 that nilearn's wheel carries; leave mesh, numbers and pictures in a folder."""
     source = mni_path("t1")
     return mesh_command(
-        source,
+        [source],
         _results_folder(output) / "mesh.vtu",
         nodes=nodes,
         iterations=iterations,

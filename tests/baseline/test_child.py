@@ -16,6 +16,7 @@ from tetopt.baseline.pipelines import PIPELINES, Job
 
 IMAGE = tetopt.load_phantom("sphere").image(voxel_mm=4.0)
 JOB = Job(IMAGE, None, 300, classes=2, iterations=3)
+LABELS = tetopt.Image((IMAGE.data > 50) + (np.indices(IMAGE.shape)[0] > 12), IMAGE.affine)
 
 
 @pytest.fixture(autouse=True)
@@ -23,10 +24,11 @@ def _pipes(monkeypatch):
     monkeypatch.syspath_prepend(str(Path(__file__).parent))
 
 
-@pytest.mark.parametrize("name", ["tetopt", "odt"])
-def test_same_bits_as_in_process(name):
-    outcome = run_in_child(name, JOB, max_seconds=300.0)
-    here = PIPELINES[name](JOB)
+@pytest.mark.parametrize(("name", "labels"), [("tetopt", LABELS), ("odt", None)])
+def test_same_bits_as_in_process(name, labels):
+    job = JOB._replace(labels=labels)
+    outcome = run_in_child(name, job, max_seconds=300.0)
+    here = PIPELINES[name](job)
     assert outcome.failure is None
     assert outcome.mesh.points.tobytes() == here.mesh.points.tobytes()
     assert outcome.mesh.cells.tobytes() == here.mesh.cells.tobytes()

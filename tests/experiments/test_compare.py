@@ -13,6 +13,13 @@ from tetopt.experiments.run_compare import PICTURES
 SMALL = ["--nodes", "150", "--repeats", "2", "--reference-dofs", "6000"]
 
 
+LABEL_KEYS = {  # of the report, and what the library calls it
+    "label": "label", "mesh_volume_mm3": "mesh_volume", "surface_mean_mm": "distance_mean",
+    "surface_p95_mm": "distance_p95", "components": "components", "mesh_components": "mesh_components",
+    "is_lost": "is_lost",
+}  # fmt: skip
+
+
 @pytest.fixture(scope="module")
 def head(tmp_path_factory):
     """A small two-sphere volume with its true labels."""
@@ -38,7 +45,7 @@ def test_files(run):
 
 
 def test_numbers_are_those_of_the_meshes(run, head):
-    """E_D's share, label volumes and Dice, recomputed voxel by voxel from the mesh file."""
+    """E_D's share and Dice, recomputed voxel by voxel from the mesh file, and the library's measures of its labels."""
     report = json.loads((run / "report.json").read_text())
     image, labels = (tetopt.load_image(head / name) for name in ("image.nii.gz", "labels.nii.gz"))
     h, true = image.data.astype(float).ravel(), labels.data.astype(int).ravel()
@@ -54,12 +61,16 @@ def test_numbers_are_those_of_the_meshes(run, head):
         votes = np.zeros((owner.max() + 1, true.max() + 1), dtype=int)
         np.add.at(votes, (owner, true), 1)
         painted = votes.argmax(axis=1)[owner]
-        for row in found["labels"]:
+        for row, of_label in zip(found["labels"], tetopt.fidelity.label_fidelity(labels, mesh), strict=True):
             k = row["label"]
             both = ((painted == k) & (true == k)).sum()
             assert row["voxels"] == (true == k).sum()
             assert row["mesh_voxels"] == (painted == k).sum()
             assert row["dice"] == pytest.approx(2 * both / (row["voxels"] + row["mesh_voxels"]))
+            assert row["volume_mm3"] == pytest.approx(row["voxels"] * 4.0**3)
+            assert [row[name] for name in LABEL_KEYS] == pytest.approx(
+                [getattr(of_label, k) for k in LABEL_KEYS.values()]
+            )
         assert sum(row["E_D_share"] for row in found["labels"]) == pytest.approx(found["E_D_share"], rel=1e-9)
 
 

@@ -11,7 +11,6 @@ from tetopt.geometry.simplex import volumes
 from tetopt.optimize.complex import build, energies, floor_of, measure_all, node_rings
 from tetopt.optimize.density import (
     Limits,
-    Sides,
     best_collapses,
     best_splits,
     collapse_edge,
@@ -26,7 +25,7 @@ from tetopt.optimize.smooth import blocks
 
 
 def sides_of(held, is_fixed=False):
-    return Sides(held.complex.ticks.min(axis=0), held.complex.ticks.max(axis=0), is_fixed)
+    return held.sides._replace(is_fixed=is_fixed)
 
 
 def no_limits(n_nodes):
@@ -74,7 +73,7 @@ def test_worth_is_what_E_falls_by(n, is_fixed):
             held.sweep()
             N = len(held.complex.ticks)
             if is_fixed:
-                held.is_frozen[held.is_frozen.any(axis=1)] = True
+                held.is_frozen[held.is_frozen.any(axis=1), :3] = True
             if node >= N:
                 continue
             rings, groups, sides = node_rings(held.complex), blocks(held.complex.ticks), sides_of(held, is_fixed)
@@ -109,11 +108,19 @@ def test_worth_is_what_E_falls_by(n, is_fixed):
                 was_on = held.is_frozen[[node, split[node]]]
                 assert (is_frozen[N] <= was_on.all(axis=0)).all()
                 if is_fixed and is_frozen[N].any():
-                    assert is_frozen[N].all()
+                    assert is_frozen[N, :3].all()
                 held.complex = room._replace(ticks=room.ticks[: N + 1])
             else:
                 cost, collapse = best_collapses(
-                    room, rings, groups, is_frozen, held.measure, np.inf, np.ones(N, dtype=bool), np.full(N, np.inf)
+                    room,
+                    rings,
+                    groups,
+                    is_frozen,
+                    held.measure,
+                    sides,
+                    np.inf,
+                    np.ones(N, dtype=bool),
+                    np.full(N, np.inf),
                 )
                 if collapse[node] < 0:
                     continue
@@ -169,7 +176,7 @@ def test_collapses_are_the_best_of_all_neighbours(is_bounded):
     points = held.mesh.points
     longest = np.random.default_rng(0).uniform(8.0, 20.0, N) if is_bounded else np.full(N, np.inf)
     cost, collapse = best_collapses(
-        held.complex, rings, groups, held.is_frozen, held.measure, np.inf, np.ones(N, dtype=bool), longest
+        held.complex, rings, groups, held.is_frozen, held.measure, held.sides, np.inf, np.ones(N, dtype=bool), longest
     )
     size = np.linalg.det(held.mesh.points[cells[:, 1:]] - held.mesh.points[cells[:, :1]]).sum()
     joined, refused = 0, 0
@@ -186,7 +193,9 @@ def test_collapses_are_the_best_of_all_neighbours(is_bounded):
             volume = np.linalg.det(held.mesh.points[new[:, 1:]] - held.mesh.points[new[:, :1]])
             if (volume <= 1e-6).any() or abs(volume.sum() / size - 1) > 1e-9:
                 continue
-            if (held.is_frozen[a] & ~(held.is_frozen[b] & (held.complex.ticks[a] == held.complex.ticks[b]))).any():
+            if (
+                held.is_frozen[a, :3] & ~(held.is_frozen[b, :3] & (held.complex.ticks[a] == held.complex.ticks[b]))
+            ).any():
                 continue
             fresh = build(new, held.complex.ticks, held.measure)
             E_G, squares = energies(fresh)

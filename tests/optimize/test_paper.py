@@ -105,7 +105,7 @@ def test_lloyd_reaches_a_stationary_mesh(name):
     rng = np.random.default_rng(3)
     mesh = tetopt.lattice(image, blocks=blocks)
     ticks = to_ticks(image.to_index(mesh.points), sampling_grid(image, mesh.points))
-    frozen = frozen_axes(image, ticks, mesh.cells, sampling_grid(image, mesh.points), "slide")[:, 3 - n :]
+    frozen = frozen_axes(image, ticks, mesh.cells, sampling_grid(image, mesh.points), "slide")[:, 3 - n : 3]
     step = 0.12 * np.array(image.shape) / np.array(blocks)
     start = image.to_world(image.to_index(mesh.points) + ~frozen * rng.uniform(-step, step, mesh.points.shape))
     mesh = tetopt.Mesh(start, mesh.cells)

@@ -104,7 +104,7 @@ def test_blocks_around_a_divided_one(rings):
     sizes = [8, 16, 32]
     error = [np.zeros((s, s)) for s in sizes]
     error[1][7, 9] = 1.0
-    levels = [_Blocks(e, np.zeros(e.shape, dtype=bool)) for e in error]
+    levels = [_Blocks(e, np.zeros(e.shape, dtype=bool), np.ones(e.shape, dtype=bool)) for e in error]
     divided = _divided(levels, 0.5, rings)
     assert np.argwhere(divided[1]).tolist() == [[7, 9]]
     parents = {(i // 2, j // 2) for i in range(7 - rings, 8 + rings) for j in range(9 - rings, 10 + rings)}
@@ -324,7 +324,7 @@ def test_exchanges_do_not_follow_noise(monkeypatch):
         with monkeypatch.context() as patched:
             patched.setattr(fast, "exchange", counted)
             if not known:
-                patched.setattr(fast, "noise_level", lambda data: 0.0)
+                patched.setattr(sys.modules["tetopt.content"], "noise_level", lambda data, inside: 0.0)
             tetopt.optimize(image, start, k_D=0.85, nodes=len(start.points), iterations=8)
         count[known] = sum(made)
     assert count[False] > 100

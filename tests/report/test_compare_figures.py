@@ -17,6 +17,7 @@ from tetopt.report.compare_figures import (
     curves_figure,
     cutaways,
     histograms_figure,
+    labels_figure,
     slices_figure,
     timing_figure,
 )
@@ -67,6 +68,23 @@ def test_slices_refuse_missing_means(small):
     image, both = small
     with pytest.raises(InputError, match="one array of means for each mesh"):
         slices_figure(image, both, [])
+
+
+def test_label_marks_are_those_of_the_report():
+    """A column for each label, the largest first; the lost have Dice 0 and no distance."""
+    results = fake_results()
+    done = [p for p in results["pipelines"] if "median" in p]
+    for pipeline in done:
+        pipeline["median"]["labels"].reverse()
+    dice, distance = labels_figure(results).axes
+    assert [text.get_text() for text in distance.get_xticklabels()] == ["0 (9000)", "1 (2250)", "2 (562)", "3 (140)"]
+    for axes, name, n in ((dice, "dice", 4), (distance, "surface_mean_mm", 3)):
+        marks = {line.get_label(): line.get_xydata() for line in axes.lines}
+        assert list(marks) == [p["title"] for p in done]
+        for pipeline in done:
+            values = {row["label"]: row[name] for row in pipeline["median"]["labels"]}
+            np.testing.assert_array_equal(marks[pipeline["title"]][:, 1], [values[k] for k in range(n)])
+            np.testing.assert_array_equal(np.rint(marks[pipeline["title"]][:, 0]), np.arange(n))
 
 
 def test_histograms_are_those_of_the_report():

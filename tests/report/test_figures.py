@@ -5,19 +5,26 @@ from itertools import permutations, product
 import numpy as np
 import PIL.Image
 import pytest
-from matplotlib.collections import PolyCollection
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.colors import to_rgb, to_rgba, to_rgba_array
 
 from tetopt.energy.sampling import cell_moments, cell_of_voxel
+from tetopt.errors import InputError
+from tetopt.fidelity import cell_labels
 from tetopt.geometry.quality import rho_histogram
 from tetopt.image import Image
 from tetopt.lattice import lattice
 from tetopt.mesh import Mesh
 from tetopt.optimize.paper import Optimized, Record, optimize_paper
 from tetopt.report import figures
+from tetopt.report.colours import BACKGROUND, LISTED, PALETTE, UNCOVERED, label_colours, legend_patches
 from tetopt.report.figures import (
+    DETAIL,
     _View,
+    boundary_figure,
     energy_figure,
     histogram_figure,
+    label_figure,
     save_figure,
     save_run_figures,
     slice_figure,
@@ -257,6 +264,230 @@ def test_a_constant_slice_can_be_drawn(tmp_path):
     image = Image(np.full((6, 7), 3.0))
     save_figure(slice_figure(image, [("", lattice(image, blocks=(2, 2)))]), tmp_path / "a.png", dpi=40)
     assert np.asarray(PIL.Image.open(tmp_path / "a.png").convert("L")).std() > 5.0
+
+
+def lower_part(image, axis, count):
+    """A lattice that covers the first `count` voxels along an axis only."""
+    part = np.take(image.data, range(count), axis=axis)
+    return lattice(Image(part, image.affine), blocks=(2, 2, 2)[: image.ndim])
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_nothing_is_drawn_where_a_mesh_leaves_the_image_uncovered(n):
+    image = Image(np.random.default_rng(0).normal(size=SHAPE[:n]), np.diag([*SPACING[:n], 1.0]))
+    figure = slice_figure(image, [("part", lower_part(image, 0, 2))])
+    for axes in figure.axes:
+        (drawn,) = collections(axes)
+        polygons = np.concatenate([path.vertices for path in drawn.get_paths()])
+        np.testing.assert_allclose([polygons.min(axis=0), polygons.max(axis=0)], [[0.0, 0.0], [4.0, 7.0]], atol=1e-9)
+        assert axes.get_xlim() == (0.0, 10.0)  # the whole image stays in view
+    assert figure.axes[1].get_facecolor() == to_rgba(UNCOVERED)
+
+
+def test_a_slice_beside_the_mesh_is_empty():
+    image = Image(np.random.default_rng(0).normal(size=SHAPE))
+    figure = slice_figure(image, [("part", lower_part(image, 2, 3))], axis=2, index=7)
+    assert [len(collections(axes)[0].get_paths()) for axes in figure.axes] == [0, 0]
+
+
+# --------------------------------------------------------------------------------------------------
+# Labels
+
+# What red, green and blue of light, linear, become without red and without green cones (Machado et al. 2009).
+NO_RED = [[0.152286, 1.052583, -0.204868], [0.114503, 0.786281, 0.099216], [-0.003882, -0.048116, 1.051998]]
+NO_GREEN = [[0.367322, 0.860646, -0.227968], [0.280085, 0.672501, 0.047413], [-0.011820, 0.042940, 0.968881]]
+TO_XYZ = [[0.4124564, 0.3575761, 0.1804375], [0.2126729, 0.7151522, 0.0721750], [0.0193339, 0.1191920, 0.9503041]]
+
+
+def cielab(colours, seen):
+    """CIELAB (K, 3) of sRGB colours as seen with given cones."""
+    linear = np.where(colours <= 0.04045, colours / 12.92, ((colours + 0.055) / 1.055) ** 2.4)
+    xyz = np.clip(linear @ np.transpose(seen), 0.0, 1.0) @ np.transpose(TO_XYZ) / [0.95047, 1.0, 1.08883]
+    x, y, z = np.where(xyz > 0.008856, np.cbrt(xyz), 7.787 * xyz + 16.0 / 116.0).T
+    return np.column_stack([116.0 * y - 16.0, 500.0 * (x - y), 200.0 * (y - z)])
+
+
+@pytest.mark.parametrize("seen", [np.eye(3), NO_RED, NO_GREEN], ids=["all cones", "no red", "no green"])
+def test_colours_are_told_apart_by_the_colour_blind(seen):
+    lab = cielab(to_rgba_array([*PALETTE, BACKGROUND])[:, :3], seen)
+    apart = np.linalg.norm(lab[:, None] - lab, axis=2) + np.where(np.eye(len(lab)), np.inf, 0.0)
+    assert apart[:-1, :-1].min() > 10.0
+    assert apart[:20, :20].min() > 14.0
+    assert apart[-1].min() > 20.0
+
+
+def test_the_largest_labels_have_the_first_colours():
+    colours = label_colours(Image(np.array([[7, 7, 7, 0], [2, 2, 5, 0], [0, 0, 0, 0]])))
+    assert colours.shape == (8, 3)
+    for label, colour in ((0, BACKGROUND), (7, PALETTE[0]), (2, PALETTE[1]), (5, PALETTE[2])):
+        np.testing.assert_array_equal(colours[label], to_rgb(colour))
+
+
+def test_colours_begin_again_after_the_last():
+    n = len(PALETTE)
+    colours = label_colours(Image(np.arange(n + 2)[:, None]))
+    np.testing.assert_array_equal(colours[n + 1], to_rgb(PALETTE[0]))
+    assert len(np.unique(colours[: n + 1], axis=0)) == n + 1
+    with pytest.raises(InputError, match="whole numbers"):
+        label_colours(Image(np.array([[0.5, 1.0]])))
+
+
+def test_a_legend_lists_the_largest_and_counts_the_others():
+    shown = np.array([50, 0, *range(1, LISTED + 2)])  # 0, 2 .. 14; the least are 2 and 3
+    colours = np.random.default_rng(0).uniform(size=(20, 3))
+    entries = legend_patches(colours, shown)
+    assert [entry.get_label() for entry in entries] == [*(str(k) for k in (0, *range(4, 15))), "and 2 more"]
+    assert entries[1].get_facecolor() == (*colours[4], 1.0)
+    entries = legend_patches(colours, shown[:-2])
+    assert [entry.get_label() for entry in entries] == [str(k) for k in (0, *range(2, 13))]
+
+
+def blocks_of_labels(n_labels, worlds=(0, 1, 2), signs=(1, 1, 1)):
+    """Labels 0 to n_labels - 1 in slabs along the first axis, two voxels thick, on the oriented image's voxels."""
+    affine = oriented_image(worlds, signs).affine
+    return Image(np.repeat(np.arange(n_labels), 2)[:, None, None] + np.zeros((1, 7, 9)), affine)
+
+
+@pytest.mark.parametrize(("worlds", "signs"), ORIENTATIONS[::7])
+def test_voxels_and_cells_have_the_same_colours(worlds, signs):
+    labels = blocks_of_labels(4, worlds, signs)
+    mesh = bent(labels, (3, 3, 2))
+    grid = np.array(label_figure(labels, mesh).axes).reshape(3, 2)
+    colours, of_cell = label_colours(labels), cell_labels(labels, mesh)
+    for (given, meshed), normal in zip(grid, (2, 1, 0), strict=True):
+        view = _View(labels, worlds.index(normal), None)
+        np.testing.assert_array_equal(given.images[0].get_array(), colours[view.pixels.T.astype(int)])
+        assert given.images[0].get_extent() == [0.0, view.size[0], 0.0, view.size[1]]
+        polygons, cells = view.section(mesh)
+        (drawn,) = collections(meshed)
+        np.testing.assert_allclose(corners(drawn), polygons.mean(axis=1))
+        np.testing.assert_array_equal(drawn.get_facecolors()[:, :3], colours[of_cell[cells]])
+        assert [text.get_text() for text in given.texts] == [text.get_text() for text in meshed.texts]  # sides alone
+        assert len(given.texts) == 4
+    (legend,) = given.figure.legends
+    assert [text.get_text() for text in legend.get_texts()] == ["0", "1", "2", "3"]
+
+
+def test_labels_of_a_part_and_of_a_plane():
+    labels = blocks_of_labels(4)
+    figure = label_figure(labels, lower_part(labels, 0, 4))
+    polygons = np.concatenate([path.vertices for path in collections(figure.axes[1])[0].get_paths()])
+    assert polygons[:, 0].max() == pytest.approx(8.0)  # of 16 mm
+    flat = Image(labels.data[:, :, 0], np.diag([2.0, 1.0, 1.0]))
+    assert len(label_figure(flat, lattice(flat, blocks=(2, 2))).axes) == 2
+
+
+def test_numbers_stand_in_their_labels_where_a_legend_is_too_short():
+    labels = blocks_of_labels(LISTED + 3)
+    figure = label_figure(labels, lattice(labels, blocks=(4, 2, 2)))
+    assert figure.legends[0].get_texts()[-1].get_text() == "and 3 more"
+    view, given = _View(labels, None, None), figure.axes[0]
+    numbers = [text for text in given.texts if text.get_text().isdigit()]
+    assert [text.get_text() for text in numbers] == [str(k) for k in range(1, LISTED + 3)]
+    for text in numbers:
+        pixel = (np.array(text.get_position()) / view.steps).astype(int)
+        assert view.pixels[tuple(pixel)] == int(text.get_text())
+    # In slabs of 0.1 mm, beside 7 mm, a number has no room.
+    thin = Image(labels.data[::2], labels.affine @ np.diag([0.05, 1.0, 1.0, 1.0]))
+    figure = label_figure(thin, lattice(thin, blocks=(4, 2, 2)))
+    found = [[text.get_text() for text in axes.texts if text.get_text().isdigit()] for axes in figure.axes]
+    assert found == [[], [], [], [], ["7"], []]  # the sagittal slice is one label alone
+
+
+# --------------------------------------------------------------------------------------------------
+# A mask's outline and a mesh's boundary
+
+
+def lines(axes):
+    """Segments of the outline, and of the boundary, each (K, 2, 2)."""
+    return [np.array(c.get_segments()) for c in axes.collections if isinstance(c, LineCollection)]
+
+
+@pytest.mark.parametrize(("worlds", "signs"), ORIENTATIONS[::5])
+def test_boundary_and_outline_lie_between_the_same_pixels(worlds, signs):
+    """The mesh covers just the voxels of the mask, which ends in a plane: both lines are where the pixels change."""
+    image = oriented_image(worlds, signs)
+    axis, normal = worlds.index(0), worlds.index(1)  # ends along the picture's horizontal, seen from the front
+    mask = Image(np.moveaxis(np.zeros(SHAPE), axis, 0).copy(), np.eye(4)).data.copy()
+    mask[:3] = 1.0
+    mask = Image(np.moveaxis(mask, 0, axis), image.affine)
+    figure = boundary_figure(image, mask, lower_part(image, axis, 3), axis=normal, index=2)
+    pixels = _View(mask, normal, 2).pixels
+    place = SPACING[axis] * (np.flatnonzero(np.diff(pixels[:, 0]))[0] + 1)
+    for axes in figure.axes:
+        np.testing.assert_array_equal(axes.images[0].get_array(), _View(image, normal, 2).pixels.T)
+        for drawn in lines(axes):
+            np.testing.assert_allclose(drawn[..., 0], place, atol=1e-4)
+            np.testing.assert_allclose([drawn[..., 1].min(), drawn[..., 1].max()], [0.0, figure.axes[0].get_ylim()[1]])
+            assert np.abs(np.diff(drawn[..., 1], axis=1)).sum() == pytest.approx(figure.axes[0].get_ylim()[1])
+
+
+def test_boundary_of_a_plane_mesh():
+    image = Image(np.random.default_rng(0).normal(size=(6, 7)))
+    mask = Image(np.arange(6)[:, None] < 4.0 + np.zeros(7), image.affine)
+    outline, boundary = lines(boundary_figure(image, mask, lower_part(image, 0, 4)).axes[0])
+    np.testing.assert_allclose(outline[..., 0], 4.0)
+    np.testing.assert_allclose(boundary[..., 0], 4.0)
+
+
+@pytest.mark.parametrize("index", range(7))
+def test_a_closed_boundary_is_closed_in_every_slice(index):
+    """Also where nodes lie on the plane, as at index 3; and it holds what the cells' polygons hold."""
+    image = Image(np.zeros((9, 9, 7)))
+    mesh = lattice(image, blocks=(3, 3, 2)) if index == 3 else bent(image, (3, 3, 2))
+    on_box = (np.abs(image.to_index(mesh.points) - [4.0, 4.0, 3.0]) > [4.4, 4.4, 3.4]).any(axis=1)
+    inner = Mesh(mesh.points, mesh.cells[~on_box[mesh.cells].any(axis=1)])
+    view = _View(image, 2, index)
+    segments = view.boundary(inner)
+    ends, times = np.unique(segments.reshape(-1, 2).round(7), axis=0, return_counts=True)
+    assert (times % 2 == 0).all()
+    polygons, _ = view.section(inner)
+    assert (len(segments) > 0) == (len(polygons) > 0) == (1 < index < 5)
+    if len(polygons):
+        np.testing.assert_allclose([ends.min(axis=0), ends.max(axis=0)], [polygons.min((0, 1)), polygons.max((0, 1))])
+
+
+def test_what_lies_on_the_box_is_no_boundary():
+    image = Image(np.random.default_rng(0).normal(size=SHAPE))
+    assert len(_View(image, None, None).boundary(lattice(image, blocks=(2, 2, 2)))) == 0
+
+
+def test_the_detail_is_where_the_outline_bends_most():
+    """A half plane with a slot: the square of 25 voxels around the slot, marked in the whole slice."""
+    image = Image(np.zeros((80, 90)), np.diag([2.0, 2.0, 1.0]))
+    mask = np.zeros((80, 90))
+    mask[:40] = 1.0
+    mask[28:40, 60:64] = 0.0
+    whole, detail = boundary_figure(image, Image(mask, image.affine), lower_part(image, 0, 40)).axes
+    low, high = np.transpose([detail.get_xlim(), detail.get_ylim()])
+    np.testing.assert_allclose(high - low, 2.0 * DETAIL)
+    assert (low <= [56.0, 120.0]).all()
+    assert (high >= [80.0, 128.0]).all()
+    (frame,) = whole.patches
+    np.testing.assert_allclose([*frame.get_xy(), frame.get_width()], [*low, 2.0 * DETAIL])
+    assert whole.get_xlim() == (0.0, 160.0)
+
+
+def test_the_slice_is_in_the_middle_of_the_mask():
+    image = Image(np.random.default_rng(0).normal(size=(6, 7, 20)))
+    mask = np.zeros(image.shape)
+    mask[1:4, 2:6, 12:17] = 1.0
+    figure = boundary_figure(image, Image(mask), lattice(image, blocks=(2, 2, 2)))
+    np.testing.assert_array_equal(figure.axes[0].images[0].get_array(), image.data[:, :, 14].T)
+
+
+@pytest.mark.parametrize("value", [0.0, 1.0])
+def test_a_mask_without_outline_can_be_drawn(tmp_path, value):
+    image = Image(np.random.default_rng(0).normal(size=SHAPE))
+    figure = boundary_figure(image, Image(np.full(SHAPE, value)), lattice(image, blocks=(1, 1, 1)))
+    assert [len(drawn) for drawn in lines(figure.axes[0])] == [0, 0]
+    save_figure(figure, tmp_path / "a.png", dpi=40)
+
+
+def test_a_mask_of_another_shape_is_refused():
+    image = Image(np.zeros(SHAPE))
+    with pytest.raises(InputError, match="mask: expected the image's shape"):
+        boundary_figure(image, Image(np.zeros((5, 7, 8))), lattice(image, blocks=(1, 1, 1)))
 
 
 # --------------------------------------------------------------------------------------------------

@@ -148,7 +148,9 @@ FRAMES = "<script>window.requestAnimationFrame = (draw) => setTimeout(() => draw
 def test_views_turn_together(page, tmp_path):
     """Drag, keys, wheel and buttons change every view; reset brings the first picture back."""
     copied = tmp_path / "copy.html"
-    text = page.read_text(encoding="utf-8").replace("<head>", "<head>" + FRAMES, 1).replace("</body>", PROBE + "</body>")
+    text = (
+        page.read_text(encoding="utf-8").replace("<head>", "<head>" + FRAMES, 1).replace("</body>", PROBE + "</body>")
+    )
     copied.write_text(text, encoding="utf-8")
     found = browser(tmp_path / "profile", "--virtual-time-budget=60000", "--dump-dom", copied.as_uri())
     said = re.search(r'data-said="([^"]*)"', found)

@@ -7,6 +7,9 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import NamedTuple
 
+import numpy as np
+
+from tetopt.content import Content, content
 from tetopt.image import Image
 from tetopt.lattice import lattice
 from tetopt.mesh import Mesh
@@ -19,7 +22,7 @@ class Job(NamedTuple):
     """What every pipeline gets."""
 
     image: Image  # 3-D
-    labels: Image | None  # a given segmentation, on the image's voxels; else it is made by thresholds
+    labels: Image | None  # a given segmentation, on the image's voxels; without one, those who need it make their own
     nodes: int  # wanted
     classes: int = 4  # of the thresholds, without labels
     k_D: float = 0.2  # of uniform meshes; the graded one has its own
@@ -79,39 +82,41 @@ def odt(job: Job) -> Produced:
 
 
 def tetopt(job: Job) -> Produced:
-    """`tetopt.mesh_image` with its defaults: nodes where the image has content, no segmentation.
+    """`tetopt.mesh_image` with its defaults: nodes where the image, and labels that are given, have content.
 
     Raises
     ------
     InputError
-        As `tetopt.mesh_image`.
+        As `tetopt.mesh_image` and `tetopt.content.content`.
     """
     clock = _Clock()
+    wanted, notes = _wanted(job, clock)
     with clock.step("kernels"):
-        prepare_kernels(job.image, GRADED_K_D, is_graded=True)
+        prepare_kernels(wanted, GRADED_K_D, is_graded=True)
     with clock.step("octree"):
-        mesh = octree(job.image, job.nodes)
+        mesh = octree(wanted, job.nodes)
     with clock.step("optimize"):
-        result = optimize(job.image, mesh, k_D=GRADED_K_D, iterations=GRADED_ITERATIONS, nodes=job.nodes)
-    return Produced(result.mesh, clock.seconds, [f"ended by: {result.ended}"])
+        result = optimize(wanted, mesh, k_D=GRADED_K_D, iterations=GRADED_ITERATIONS, nodes=job.nodes)
+    return Produced(result.mesh, clock.seconds, [f"ended by: {result.ended}", *notes])
 
 
 def tetopt_uniform(job: Job) -> Produced:
-    """The lattice and `optimize`, as `tetopt mesh --uniform`.
+    """The lattice and `optimize`, as `tetopt mesh --uniform`; labels that are given have their say too.
 
     Raises
     ------
     InputError
-        As `tetopt.lattice.lattice` and `tetopt.optimize.paper.optimize_paper`.
+        As `tetopt.lattice.lattice`, `tetopt.optimize.fast.optimize` and `tetopt.content.content`.
     """
     clock = _Clock()
+    wanted, notes = _wanted(job, clock)
     with clock.step("kernels"):
-        prepare_kernels(job.image, job.k_D)
+        prepare_kernels(wanted, job.k_D)
     with clock.step("lattice"):
         mesh = lattice(job.image, nodes=job.nodes)
     with clock.step("optimize"):
-        result = optimize(job.image, mesh, k_D=job.k_D, iterations=job.iterations)
-    return Produced(result.mesh, clock.seconds, [f"ended by: {result.ended}"])
+        result = optimize(wanted, mesh, k_D=job.k_D, iterations=job.iterations)
+    return Produced(result.mesh, clock.seconds, [f"ended by: {result.ended}", *notes])
 
 
 def tetopt_paper(job: Job) -> Produced:
@@ -165,6 +170,17 @@ def cleaver(job: Job) -> Produced:
     clock.seconds["tetrahedra"] -= result.search_seconds
     clock.seconds["search"] = result.search_seconds
     return Produced(result.mesh, clock.seconds, [f"{result.n_runs} runs", *result.notes])
+
+
+def _wanted(job: Job, clock: _Clock) -> tuple[Image | Content, list[str]]:
+    """What the mesh is to represent, and what to note of it: the image, with labels if they are given."""
+    if job.labels is None:
+        return job.image, []
+    with clock.step("labels"):
+        if np.array_equal(job.image.data, job.labels.data):
+            # As intensities the numbers of labels mean nothing: label 9 is no farther from 1 than 2 is.
+            return content(job.image, labels=job.labels, weights=[0.0]), ["the image is its labels: meshed as labels"]
+        return content(job.image, labels=job.labels), ["meshed from the image and the labels given, equally weighted"]
 
 
 def _by_the_paper(job: Job, k_D: float) -> Produced:

@@ -31,6 +31,7 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
+from tetopt.content import Content
 from tetopt.errors import InputError
 from tetopt.geometry.topology import Facets, facets
 from tetopt.image import Image
@@ -108,6 +109,7 @@ class SamplingGrid(NamedTuple):
     prefix: NDArray  # (s_0, s_1, s_2 + 1, 2) sums of h - shift and its square over a row's first k voxels
     bits: int  # node coordinates are integers in units of 2**-bits voxel
     shift: float  # taken off h before it is squared, so that sums of squares lose no digits
+    n_channels: int = 1  # see `channel_grid`
 
     @property
     def shape(self) -> tuple[int, int, int]:
@@ -154,6 +156,34 @@ def sampling_grid(image: Image, points: NDArray[np.float64]) -> SamplingGrid:
     with few_threads(image.data.size // 50):
         _fill_prefix(prefix, image.data.reshape(shape), float(shift))
     return SamplingGrid(prefix, bits, float(shift))
+
+
+def channel_grid(content: Content, points: NDArray[np.float64]) -> SamplingGrid:
+    """`sampling_grid` of all channels of a content: sums of the first, of all channels' squares, of the others.
+
+    With a region last those of 1 for each voxel outside of it and -1 for each inside.
+
+    Raises
+    ------
+    InputError
+        As `sampling_grid`.
+    """
+    grid = sampling_grid(content.image, points)
+    if content.is_plain and content.region is None:
+        return grid
+    if content.is_plain:
+        rows, shift, is_short = [], grid.shift, grid.prefix.dtype == np.int32
+    else:
+        square = sum(values.astype(np.float64) ** 2 for values in content.values)
+        rows, shift, is_short = [content.values[0], square, *content.values[1:]], 0.0, True
+    if content.region is not None:
+        rows.append(np.where(content.region.inside, -1, 1))
+    first = 2 if content.is_plain else 0
+    prefix = np.zeros((*grid.prefix.shape[:3], first + len(rows)), dtype=np.int32 if is_short else np.float64)
+    prefix[..., :first] = grid.prefix[..., :first]
+    for number, row in enumerate(rows, first):
+        np.cumsum(row.reshape(grid.shape), axis=2, out=prefix[:, :, 1:, number], dtype=prefix.dtype)
+    return SamplingGrid(prefix, grid.bits, shift, len(content.values))
 
 
 def to_ticks(index: NDArray[np.float64], grid: SamplingGrid) -> NDArray[np.int64]:
@@ -216,10 +246,10 @@ def facet_fluxes(grid: SamplingGrid, ticks: NDArray[np.int64], nodes: NDArray[np
 
     Positive where the facet, its nodes as listed, faces up the last axis.
     """
-    fluxes = np.empty((len(nodes), 3))
+    fluxes = np.empty((len(nodes), 1, 3))
     with few_threads(len(nodes)):
         _fill_fluxes(fluxes, ticks, np.ascontiguousarray(nodes), grid.bits, grid.prefix)
-    return fluxes
+    return fluxes[:, 0]
 
 
 def sums_of_fluxes(fluxes: NDArray[np.float64], sides: Facets, hand: int) -> NDArray[np.float64]:
@@ -325,17 +355,21 @@ def _exact_facet_threshold(
 @njit(cache=True)
 def triangle_flux(
     a0: int, a1: int, a2: int, b0: int, b1: int, b2: int, c0: int, c1: int, c2: int, bits: int, prefix: NDArray,
-    steps: NDArray | None, change: int,
-) -> tuple:  # fmt: skip
-    """Flux of the triangle (a, b, c), corners in ticks: sums of k, P_h(k), P_h2(k) over the rows that cross it.
+    steps: NDArray | None, change: int, out: NDArray, p: int, q: int,
+) -> None:  # fmt: skip
+    """Flux of the triangle (a, b, c), corners in ticks: sums of k and of each P(k) over the rows that cross it.
 
-    Or, where `steps` is an array, add `change`, signed as the flux, to it at each crossing.
+    It goes to out[p, q, :], one entry more than `prefix` has. Or, where `steps` is an array, add `change`, signed as
+    the flux, to it at each crossing.
     """
+    n_more = out.shape[2] - 3
+    for d in range(3 + n_more):
+        out[p, q, d] = 0.0
     e0, e1, e2 = b0 - a0, b1 - a1, b2 - a2
     f0, f1, f2 = c0 - a0, c1 - a1, c2 - a2
     n2 = e0 * f1 - e1 * f0
     if n2 == 0:  # it stands along the rows: none crosses it
-        return 0.0, 0.0, 0.0
+        return
     n0, n1 = e1 * f2 - e2 * f1, e2 * f0 - e0 * f2
     sign = 1 if n2 > 0 else -1
     n0, n1, n2 = sign * n0, sign * n1, sign * n2
@@ -378,18 +412,24 @@ def triangle_flux(
                 count += k
                 sum_1 += prefix[i, j, k, 0]
                 sum_2 += prefix[i, j, k, 1]
+                for d in range(n_more):
+                    out[p, q, 3 + d] += sign * prefix[i, j, k, 2 + d]
             else:
                 steps[i, j, k] += sign * change
-    return float(sign * count), sign * sum_1, sign * sum_2
+    out[p, q, 0], out[p, q, 1], out[p, q, 2] = float(sign * count), sign * sum_1, sign * sum_2
 
 
 @njit(cache=True)
 def segment_flux(
-    a1: int, a2: int, b1: int, b2: int, bits: int, prefix: NDArray, steps: NDArray | None, change: int
-) -> tuple:
+    a1: int, a2: int, b1: int, b2: int, bits: int, prefix: NDArray, steps: NDArray | None, change: int, out: NDArray,
+    p: int, q: int,
+) -> None:  # fmt: skip
     """Flux of the segment (a, b) of a 2-D mesh, coordinates along axes 1 and 2 in ticks; as `triangle_flux`."""
+    n_more = out.shape[2] - 3
+    for d in range(3 + n_more):
+        out[p, q, d] = 0.0
     if a1 == b1:
-        return 0.0, 0.0, 0.0
+        return
     sign = -1 if b1 > a1 else 1  # it faces to the right of a -> b
     if b1 < a1:
         a1, a2, b1, b2 = b1, b2, a1, a2
@@ -402,23 +442,27 @@ def segment_flux(
             count += k
             sum_1 += prefix[0, j, k, 0]
             sum_2 += prefix[0, j, k, 1]
+            for d in range(n_more):
+                out[p, q, 3 + d] += sign * prefix[0, j, k, 2 + d]
         else:
             steps[0, j, k] += sign * change
-    return float(sign * count), sign * sum_1, sign * sum_2
+    out[p, q, 0], out[p, q, 1], out[p, q, 2] = float(sign * count), sign * sum_1, sign * sum_2
 
 
 @njit(cache=True)
 def facet_flux(
-    ticks: NDArray, nodes: NDArray, facet: int, bits: int, prefix: NDArray, steps: NDArray | None, change: int
-) -> tuple:
-    """Flux of one of the facets `nodes` (F, n); see `facet_fluxes` and `triangle_flux`."""
+    ticks: NDArray, nodes: NDArray, facet: int, bits: int, prefix: NDArray, steps: NDArray | None, change: int,
+    out: NDArray, p: int,
+) -> None:  # fmt: skip
+    """Flux of one of the facets `nodes` (F, n) to out[p, 0, :]; see `facet_fluxes` and `triangle_flux`."""
     a, b = nodes[facet, 0], nodes[facet, 1]
     if nodes.shape[1] == 2:
-        return segment_flux(ticks[a, 1], ticks[a, 2], ticks[b, 1], ticks[b, 2], bits, prefix, steps, change)
+        segment_flux(ticks[a, 1], ticks[a, 2], ticks[b, 1], ticks[b, 2], bits, prefix, steps, change, out, p, 0)
+        return
     c = nodes[facet, 2]
-    return triangle_flux(
+    triangle_flux(
         ticks[a, 0], ticks[a, 1], ticks[a, 2], ticks[b, 0], ticks[b, 1], ticks[b, 2],
-        ticks[c, 0], ticks[c, 1], ticks[c, 2], bits, prefix, steps, change,
+        ticks[c, 0], ticks[c, 1], ticks[c, 2], bits, prefix, steps, change, out, p, 0,
     )  # fmt: skip
 
 
@@ -426,8 +470,7 @@ def facet_flux(
 def _fill_fluxes(fluxes: NDArray, ticks: NDArray, nodes: NDArray, bits: int, prefix: NDArray) -> None:
     for chunk in prange((len(nodes) + CHUNK - 1) // CHUNK):
         for facet in range(chunk * CHUNK, min((chunk + 1) * CHUNK, len(nodes))):
-            flux = facet_flux(ticks, nodes, facet, bits, prefix, None, 0)
-            fluxes[facet, 0], fluxes[facet, 1], fluxes[facet, 2] = flux
+            facet_flux(ticks, nodes, facet, bits, prefix, None, 0, fluxes, facet)
 
 
 @njit(cache=True, parallel=True)
@@ -447,5 +490,6 @@ def _fill_sums(sums: NDArray, fluxes: NDArray, of_cell: NDArray, sign: NDArray, 
 def _scatter_changes(
     steps: NDArray, change: NDArray, ticks: NDArray, nodes: NDArray, bits: int, prefix: NDArray
 ) -> None:
+    unused = np.empty((1, 1, 3))
     for facet in range(len(nodes)):
-        facet_flux(ticks, nodes, facet, bits, prefix, steps, change[facet])
+        facet_flux(ticks, nodes, facet, bits, prefix, steps, change[facet], unused, 0)

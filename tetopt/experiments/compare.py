@@ -29,6 +29,7 @@ from tetopt.fem.conditioning import conditioning
 from tetopt.fem.elasticity import box_faces, compression, push_of
 from tetopt.fem.materials import Law, cell_young, young_image
 from tetopt.fem.reference import Reference, averaged, compare, nearest, reference
+from tetopt.fidelity import cell_labels, label_fidelity
 from tetopt.geometry.quality import quality, rho_histogram
 from tetopt.geometry.simplex import dihedral_angles
 from tetopt.image import Image
@@ -50,9 +51,13 @@ class Pipeline(NamedTuple):
 
 
 SHOWN = {
-    "tetopt": Pipeline("tetopt", "tetopt", "tetopt mesh with its defaults: nodes where the image has content"),
-    "tetopt-uniform": Pipeline("tetopt, uniform", "tetopt", "tetopt mesh --uniform: BCC lattice, fast engine"),
-    "tetopt-paper": Pipeline("tetopt, paper's scheme", "tetopt", "tetopt mesh --method paper"),
+    "tetopt": Pipeline(
+        "tetopt", "tetopt", "tetopt mesh with its defaults: nodes where the image, or labels given, have content"
+    ),
+    "tetopt-uniform": Pipeline(
+        "tetopt, uniform", "tetopt", "tetopt mesh --uniform: BCC lattice, fast engine, with labels that are given"
+    ),
+    "tetopt-paper": Pipeline("tetopt, paper's scheme", "tetopt", "tetopt mesh --method paper, of the image alone"),
     "pytetwild": Pipeline(
         "pytetwild", "peer", "classes by multi-Otsu or the labels given, their surfaces, fTetWild sized by them", True
     ),
@@ -137,8 +142,9 @@ def prepared(image: Image, labels: Image, law: Law, settings: Settings, say: Say
 def measured(setting: Setting, mesh: Mesh, percent: float) -> dict[str, Any]:
     """Everything that is compared of a mesh, as `report.json` holds it of each run.
 
-    E_D and its share of the image's variance; shape; histograms; by label the voxels, those painted back by the cells,
-    Dice and E_D's share; and by nu what the compression test finds and its errors (`tetopt.fem.reference.Errors`).
+    E_D and its share of the image's variance; shape; histograms; by label how well the mesh shows it
+    (`tetopt.fidelity.label_fidelity`), the voxels painted back by its cells and E_D's share; and by nu what the
+    compression test finds and its errors (`tetopt.fem.reference.Errors`).
     """
     image = setting.image
     moments = cell_moments(image, mesh)
@@ -157,37 +163,32 @@ def measured(setting: Setting, mesh: Mesh, percent: float) -> dict[str, Any]:
         "quality": quality(mesh.points, mesh.cells)._asdict(),
         "rho_histogram": {"edges": edges, "share": share},
         "dihedral_histogram": {"edges": angle_edges, "share": angles / angles.sum()},
-        "labels": _by_label(setting, moments.mean, owner),
+        "labels": _by_label(setting, mesh, moments.mean, owner),
         "fem": {nu: _simulated(setting, mesh, found, percent) for nu, found in setting.references.items()},
     }
 
 
-def _by_label(setting: Setting, means: NDArray[np.float64], owner: NDArray[np.int64]) -> list[dict[str, Any]]:
-    """For each label: its voxels, those of the cells in which it is the most frequent, Dice, E_D's share."""
-    values, label = np.unique(setting.labels.data, return_inverse=True)
-    label = label.ravel()
-    inside = owner.ravel() >= 0
-    cell = owner.ravel()[inside]
-    table = np.bincount(cell * len(values) + label[inside], minlength=len(means) * len(values))
-    most = table.reshape(len(means), len(values)).argmax(axis=1)
-    painted = np.full(label.shape, -1)
-    painted[inside] = most[cell]
+def _by_label(
+    setting: Setting, mesh: Mesh, means: NDArray[np.float64], owner: NDArray[np.int64]
+) -> list[dict[str, Any]]:
+    """A row for each label of the image: `tetopt.fidelity.LabelFidelity`, the voxels of its cells, E_D's share."""
+    of_cell = cell_labels(setting.labels, mesh)
+    label = setting.labels.data.ravel().astype(np.int64)
+    # Outside of the mesh there is label 0, as `label_fidelity` has it.
+    shown = np.bincount(np.where(owner >= 0, of_cell[owner], 0).ravel(), minlength=int(label.max()) + 1)
     h = setting.image.data.ravel().astype(np.float64)
-    squares = np.where(inside, (h - means[owner.ravel()]) ** 2, 0.0)
+    squares = np.bincount(label, np.where(owner.ravel() >= 0, (h - means[owner.ravel()]) ** 2, 0.0))
     total = float(((h - h.mean()) ** 2).sum())
-    rows = []
-    for k, value in enumerate(values):
-        is_true, is_found = label == k, painted == k
-        both = int((is_true & is_found).sum())
-        rows.append(
-            {
-                "label": int(value), "voxels": int(is_true.sum()), "mesh_voxels": int(is_found.sum()),
-                "dice": 2.0 * both / float(is_true.sum() + is_found.sum()),
-                "E_D_share": float(squares[is_true].sum()) / total if total > 0.0 else None,
-                "is_lost": not is_found.any(),
-            }
-        )  # fmt: skip
-    return rows
+    return [
+        {
+            "label": row.label, "voxels": row.voxels, "mesh_voxels": int(shown[row.label]), "dice": row.dice,
+            "E_D_share": float(squares[row.label]) / total if total > 0.0 else None, "is_lost": row.is_lost,
+            "volume_mm3": row.volume, "mesh_volume_mm3": row.mesh_volume,
+            "surface_mean_mm": row.distance_mean, "surface_p95_mm": row.distance_p95,
+            "components": row.components, "mesh_components": row.mesh_components,
+        }
+        for row in label_fidelity(setting.labels, mesh, of_cell)
+    ]  # fmt: skip
 
 
 def _simulated(setting: Setting, mesh: Mesh, found: Reference, percent: float) -> dict[str, Any]:
@@ -221,7 +222,8 @@ def run(
         Of the report: "image", "labels", "law" and "command".
     image : Image
     labels : Image or None
-        Given to the pipelines that segment; None lets them find `settings.classes` classes.
+        Given to the pipelines that segment, and to tetopt's own besides the image; None lets the former find
+        `settings.classes` classes.
     classes : Image
         Materials for the rows by label and the interfaces: the labels given, or classes of the voxels.
     law : Law

@@ -16,6 +16,7 @@ from tetopt.report.compare_figures import (
     curves_figure,
     cutaways,
     histograms_figure,
+    labels_figure,
     slices_figure,
     timing_figure,
     tradeoff_figure,
@@ -25,7 +26,7 @@ from tetopt.report.figures import save_figure
 from tetopt.report.viewer import view_of
 from tetopt.segmentation import thresholded
 
-PICTURES = ("slices.png", "cutaways.png", "histograms.png", "curves.png", "tradeoff.png", "timing.png")
+PICTURES = ("slices.png", "cutaways.png", "labels.png", "histograms.png", "curves.png", "tradeoff.png", "timing.png")
 
 
 def outputs(folder: Path, force: bool) -> dict[str, Path]:
@@ -69,6 +70,7 @@ def _draw(paths: dict[str, Path], results: dict[str, Any], image: Image, meshes:
     means = [cell_moments(image, mesh).mean for mesh in meshes.values()]
     save_figure(slices_figure(image, titled, means), paths["slices.png"])
     cutaways(titled, means, paths["cutaways.png"])
+    save_figure(labels_figure(results), paths["labels.png"])
     save_figure(histograms_figure(results), paths["histograms.png"])
     save_figure(curves_figure(results), paths["curves.png"])
     save_figure(timing_figure(results), paths["timing.png"])
@@ -82,12 +84,17 @@ def _draw(paths: dict[str, Path], results: dict[str, Any], image: Image, meshes:
             "The same slice through every mesh; the mean of the image in each cell; E_D of each cell",
         ),
         (paths["cutaways.png"], "Cut open, cells in the grey of their mean"),
+        (
+            paths["labels.png"],
+            "Every label, by size: Dice, and mean distance between its surfaces in mesh and image; lost labels have "
+            "Dice 0 and no distance",
+        ),
         (paths["histograms.png"], "Radius ratio rho and dihedral angles"),
         (paths["curves.png"], "Error of the compression test against the number of nodes"),
         (
             paths["tradeoff.png"],
-            "What tetopt's options trade, one at a time around the defaults (star): E_D against shape, the smallest "
-            "and the 1st percentile of the dihedral angles, and the errors of the compression test",
+            "What tetopt's options trade, one at a time around the defaults (star), on the image alone: E_D against "
+            "shape, the smallest and the 1st percentile of the dihedral angles, and the errors of the compression test",
         ),
         (paths["timing.png"], "Seconds by step"),
     ]

@@ -4,6 +4,10 @@ A cell's facet k lies opposite its corner k. For each facet the complex holds th
 (see `tetopt.energy.sampling`), turned outwards and multiplied by the sign of index space, so that a cell's moment
 sums are the plain sum over its facets and the two sides of a facet hold opposite numbers. Local operations then only
 measure the facets that are new.
+
+The D sums of a cell are the number of its voxels, the sum of the first channel's values, that of the squares of all
+channels, the sums of the other channels' values and, if the mesh covers a mask only, the voxels outside of the mask
+less those inside.
 """
 
 from __future__ import annotations
@@ -26,8 +30,8 @@ class Complex(NamedTuple):
     ticks: NDArray[np.int64]  # (N, 3) node positions on the sampling grid
     cells: NDArray[np.int64]  # (C, n+1) corners, positively oriented in the world
     across: NDArray[np.int64]  # (C, n+1) the cell beyond each facet; -1 outside
-    fluxes: NDArray[np.float64]  # (C, n+1, 3) of each facet, outwards
-    sums: NDArray[np.float64]  # (C, 3) moment sums: their sum over the facets
+    fluxes: NDArray[np.float64]  # (C, n+1, D) of each facet, outwards
+    sums: NDArray[np.float64]  # (C, D) moment sums: their sum over the facets
     E_shape: NDArray[np.float64]  # (C,) shape energy, see `shape_energy`
     n_cells: NDArray[np.int64]  # (1,) rows in use
 
@@ -41,6 +45,8 @@ class Measure(NamedTuple):
     matrix: NDArray[np.float64]  # (3, 3) index vectors to mm
     geometry: float  # weight of the shape energy: (1 - k_D) / E_G0
     image: float  # weight of a cell's sum of squares: k_D x voxel volume / E_D0
+    surface: float  # weight of a voxel on the wrong side of the mask's surface; 0 without a mask
+    n_channels: int
     power: float  # p of the shape energy
     is_graded: bool  # whether every cell's shape counts the same, whatever its size
     floor: float  # minus the cosine of the smallest dihedral angle that a move may leave; -1 for none
@@ -58,8 +64,8 @@ def build(cells: NDArray[np.int64], ticks: NDArray[np.int64], measure: Measure) 
         ticks,
         np.full((room, n_corners), -1, dtype=np.int64),
         np.full((room, n_corners), -1, dtype=np.int64),
-        np.zeros((room, n_corners, 3)),
-        np.zeros((room, 3)),
+        np.zeros((room, n_corners, measure.prefix.shape[3] + 1)),
+        np.zeros((room, measure.prefix.shape[3] + 1)),
         np.zeros(room),
         np.array([n_cells]),
     )
@@ -156,16 +162,20 @@ def has_node(cells: NDArray, cell: int, node: int) -> bool:
 
 
 @njit(cache=True, error_model="numpy")
-def flux_of(ticks: NDArray, a: int, b: int, c: int, measure: Measure) -> tuple:
-    """Flux of the facet (a, b, c), or (a, b) with c < 0, times the sign of index space."""
+def put_flux(out: NDArray, p: int, q: int, ticks: NDArray, a: int, b: int, c: int, measure: Measure) -> None:
+    """Flux of the facet (a, b, c), or (a, b) with c < 0, times the sign of index space, to out[p, q, :]."""
     if c < 0:
-        f = segment_flux(ticks[a, 1], ticks[a, 2], ticks[b, 1], ticks[b, 2], measure.bits, measure.prefix, None, 0)
+        segment_flux(
+            ticks[a, 1], ticks[a, 2], ticks[b, 1], ticks[b, 2], measure.bits, measure.prefix, None, 0, out, p, q
+        )
     else:
-        f = triangle_flux(
+        triangle_flux(
             ticks[a, 0], ticks[a, 1], ticks[a, 2], ticks[b, 0], ticks[b, 1], ticks[b, 2],
-            ticks[c, 0], ticks[c, 1], ticks[c, 2], measure.bits, measure.prefix, None, 0,
+            ticks[c, 0], ticks[c, 1], ticks[c, 2], measure.bits, measure.prefix, None, 0, out, p, q,
         )  # fmt: skip
-    return measure.hand * f[0], measure.hand * f[1], measure.hand * f[2]
+    if measure.hand < 0:
+        for d in range(out.shape[2]):
+            out[p, q, d] = -out[p, q, d]
 
 
 @njit(cache=True, error_model="numpy")
@@ -183,11 +193,21 @@ def outward(cells: NDArray, cell: int, k: int) -> tuple:
 
 
 @njit(cache=True, error_model="numpy")
-def image_energy(count: float, first: float, second: float) -> float:
-    """Sum of squares around the mean of one cell, from its moment sums."""
+def image_energy(sums: NDArray, row: int, n_channels: int) -> float:
+    """Sum of squares around the mean of one cell, over all channels, from its moment sums, a row of `sums`."""
+    count = sums[row, 0]
     if count <= 0.0:
         return 0.0
-    return max(second - first * first / count, 0.0)
+    within = sums[row, 2] - sums[row, 1] * sums[row, 1] / count
+    for d in range(3, 2 + n_channels):
+        within -= sums[row, d] * sums[row, d] / count
+    return max(within, 0.0)
+
+
+@njit(cache=True, error_model="numpy")
+def wrong_side(sums: NDArray, row: int, measure: Measure) -> float:
+    """Weighted voxels outside of the mask less those inside, in one cell: what changes is the mask's misfit."""
+    return measure.surface * sums[row, sums.shape[1] - 1] if measure.surface > 0.0 else 0.0
 
 
 @njit(cache=True, error_model="numpy")
@@ -382,8 +402,7 @@ def _measure_chunk(held: Complex, measure: Measure, first: int, last: int) -> No
 def measure_facet(held: Complex, cell: int, k: int, measure: Measure) -> None:
     """Flux of facet k of a cell, as the ticks stand."""
     a, b, c = outward(held.cells, cell, k)
-    f = flux_of(held.ticks, a, b, c, measure)
-    held.fluxes[cell, k, 0], held.fluxes[cell, k, 1], held.fluxes[cell, k, 2] = f[0], f[1], f[2]
+    put_flux(held.fluxes, cell, k, held.ticks, a, b, c, measure)
 
 
 @njit(cache=True, error_model="numpy")
@@ -393,7 +412,7 @@ def _sum_chunk(held: Complex, first: int, last: int) -> None:
             other = held.across[cell, k]
             if 0 <= other < cell:
                 m = facet_of(held.cells, held.across, other, cell)
-                for d in range(3):
+                for d in range(held.fluxes.shape[2]):
                     held.fluxes[cell, k, d] = -held.fluxes[other, m, d]
         sum_up(held.sums, held.fluxes, cell)
 
@@ -401,7 +420,7 @@ def _sum_chunk(held: Complex, first: int, last: int) -> None:
 @njit(cache=True, error_model="numpy")
 def sum_up(sums: NDArray, fluxes: NDArray, cell: int) -> None:
     """A cell's moment sums from its facets."""
-    for d in range(3):
+    for d in range(fluxes.shape[2]):
         total = 0.0
         for k in range(fluxes.shape[1]):
             total += fluxes[cell, k, d]
@@ -411,20 +430,19 @@ def sum_up(sums: NDArray, fluxes: NDArray, cell: int) -> None:
 @njit(cache=True, error_model="numpy")
 def cell_energy(held: Complex, cell: int, measure: Measure) -> float:
     """A cell's share of E, Eq. (4)."""
-    s = held.sums[cell]
-    return measure.geometry * held.E_shape[cell] + measure.image * image_energy(s[0], s[1], s[2])
+    return measure.geometry * held.E_shape[cell] + measure.image * image_energy(held.sums, cell, measure.n_channels)
 
 
-def cell_squares(held: Complex) -> NDArray[np.float64]:
+def cell_squares(held: Complex, n_channels: int = 1) -> NDArray[np.float64]:
     """Sum of squares around its mean of each cell, (n_cells,)."""
     sums = held.sums[: held.n_cells[0]]
-    within = sums[:, 2] - sums[:, 1] ** 2 / np.maximum(sums[:, 0], 1.0)
+    within = sums[:, 2] - (sums[:, [1, *range(3, 2 + n_channels)]] ** 2).sum(axis=1) / np.maximum(sums[:, 0], 1.0)
     return np.where(sums[:, 0] > 0.0, np.maximum(within, 0.0), 0.0)
 
 
-def energies(held: Complex) -> tuple[float, float]:
+def energies(held: Complex, n_channels: int = 1) -> tuple[float, float]:
     """Shape energy and sum of squares of the whole complex, summed in the order of the cells."""
-    return float(held.E_shape[: held.n_cells[0]].sum()), float(cell_squares(held).sum())
+    return float(held.E_shape[: held.n_cells[0]].sum()), float(cell_squares(held, n_channels).sum())
 
 
 # Rings: the cells around each node.
@@ -488,7 +506,7 @@ def _fill_twins(twin: NDArray, start: NDArray, ring: NDArray, corner: NDArray, c
 
 def measure_of(
     grid: SamplingGrid, hand: int, matrix: NDArray[np.float64], geometry: float, image: float, power: float,
-    is_graded: bool = False,
+    is_graded: bool = False, surface: float = 0.0,
 ) -> Measure:  # fmt: skip
     """A `Measure` of plain numbers, as the kernels are compiled for, without a floor."""
     return Measure(
@@ -498,6 +516,8 @@ def measure_of(
         matrix,
         float(geometry),
         float(image),
+        float(surface),
+        int(grid.n_channels),
         float(power),
         bool(is_graded),
         *floor_of(0.0),

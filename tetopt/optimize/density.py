@@ -31,7 +31,6 @@ from tetopt.optimize.complex import (
     corner_of,
     energies,
     facet_of,
-    flux_of,
     grown,
     has_node,
     image_energy,
@@ -41,14 +40,17 @@ from tetopt.optimize.complex import (
     measure_facet,
     node_rings,
     outward,
+    put_flux,
     quality_up_to,
     shape_energy,
     shape_of_cell,
     sum_up,
     tet_quality,
+    wrong_side,
 )
 from tetopt.optimize.flips import close_gaps
 from tetopt.optimize.smooth import Blocks, blocks, colours_of, ring_energy
+from tetopt.optimize.surface import Sides, faces_up, put_on_surface, ring_faces_up, uphill_at
 
 LEAST_GAIN = 1e-3  # of a node's mean share of E: an exchange of two nodes that is worth less is not made
 LEAST_OVER_NOISE = (
@@ -61,19 +63,11 @@ class Exchanged(NamedTuple):
     """What `exchange` returns."""
 
     held: Complex
-    is_frozen: NDArray[np.bool_]  # (N', 3)
+    is_frozen: NDArray[np.bool_]  # (N', 4)
     source: NDArray[np.int64]  # (N',) number of each node before; -1 for new ones
     is_touched: NDArray[np.bool_]  # (N',) nodes with a cell that has changed
     n_split: int
     n_collapsed: int
-
-
-class Sides(NamedTuple):
-    """Where nodes may be put on the boundary."""
-
-    low: NDArray[np.int64]  # (3,) ticks of the box's sides
-    high: NDArray[np.int64]
-    is_fixed: bool  # whether boundary nodes stay where they are
 
 
 class Limits(NamedTuple):
@@ -91,7 +85,7 @@ def exchange(
     """One round of splits and collapses towards `n_nodes` nodes, and of exchanges of a node for another.
 
     Beyond those that the number asks for, up to `most` nodes are exchanged, as far as each lowers E. One round doubles
-    the nodes at most. `held` and `is_frozen` (N, 3) are out of date afterwards.
+    the nodes at most. `held` and `is_frozen` (N, 4) are out of date afterwards.
     """
     n_before = len(held.ticks)
     more, most = min(max(n_nodes - n_before, -n_before), n_before), min(most, n_before)
@@ -100,16 +94,18 @@ def exchange(
     is_frozen = np.concatenate([is_frozen, np.zeros_like(is_frozen)])
     # Splits pay where the error is, collapses where it is not: half of the nodes are asked for each, unless many more,
     # or fewer, are wanted. It costs no E_D that could be measured, and half of the time.
-    error = _ring_errors(held, n_before)
+    error = _ring_errors(held, n_before, measure.n_channels)
     middle = np.median(error)
     may_split = (error >= middle) | (more > n_before // 8)
     may_collapse = (error <= middle) | (more < -(n_before // 8))
     gain, split = best_splits(held, rings, is_frozen, measure, sides, may_split, limits.shortest)
     dearest = np.inf if more < 0 else float(np.sort(gain)[-max(most // 4, 1)])
-    cost, collapse = best_collapses(held, rings, groups, is_frozen, measure, dearest, may_collapse, limits.longest)
+    cost, collapse = best_collapses(
+        held, rings, groups, is_frozen, measure, sides, dearest, may_collapse, limits.longest
+    )
     in_, out = np.lexsort((np.arange(n_before), -gain)), np.lexsort((np.arange(n_before), cost))
     in_, out = in_[gain[in_] > -np.inf], out[cost[out] < np.inf]
-    E_G, squares = energies(held)
+    E_G, squares = energies(held, measure.n_channels)
     least = LEAST_GAIN * (measure.geometry * E_G + measure.image * squares) / n_before
     least = max(least, LEAST_OVER_NOISE * measure.image * limits.noise)
     is_dirty = np.zeros(len(held.cells), dtype=np.bool_)
@@ -119,10 +115,11 @@ def exchange(
     return _compacted(held, is_frozen, is_dirty, n_before, n_split, n_collapsed)
 
 
-def _ring_errors(held: Complex, n_nodes: int) -> NDArray[np.float64]:
+def _ring_errors(held: Complex, n_nodes: int, n_channels: int) -> NDArray[np.float64]:
     """Sum of squares around the cells' means over the cells around each node, (N,)."""
     cells = held.cells[: held.n_cells[0]]
-    return np.bincount(cells.ravel(), np.repeat(cell_squares(held), cells.shape[1]), n_nodes).astype(np.float64)
+    squares = np.repeat(cell_squares(held, n_channels), cells.shape[1])
+    return np.bincount(cells.ravel(), squares, n_nodes).astype(np.float64)
 
 
 def roomy(held: Complex, n_nodes: int, n_cells: int) -> Complex:
@@ -186,7 +183,7 @@ def make_exchanges(
             break
         if does_split:
             a, b, p = in_[s], split[in_[s]], n_nodes + n_split
-            _put_middle(held, rings, is_frozen, sides, a, b, p)
+            _put_middle(held, rings, is_frozen, sides, a, b, p, measure)
             split_edge(held, rings, a, b, p, is_dirty, measure)
             n_split += 1
         if does_collapse:
@@ -217,7 +214,7 @@ def _can_split(held: Complex, rings: NodeRings, a: int, is_dirty: NDArray) -> bo
 
 @njit(cache=True, error_model="numpy")
 def _sides_of_edge(held: Complex, rings: NodeRings, sides: Sides, a: int, b: int) -> int:
-    """The box's sides that an edge lies in, bit d for axis d; 0 inside, -1 if it is on the boundary elsewhere.
+    """The box's sides that an edge lies in, bit d for axis d, and bit 3 if it is on the boundary elsewhere.
 
     Asked are the boundary's facets at the edge, not its ends: they may lie in a side to which the edge is a crease.
     """
@@ -229,7 +226,7 @@ def _sides_of_edge(held: Complex, rings: NodeRings, sides: Sides, a: int, b: int
         for k in range(held.cells.shape[1]):
             if held.across[cell, k] >= 0 or held.cells[cell, k] == a or held.cells[cell, k] == b:
                 continue
-            side = -1
+            side = 3
             for d in range(3):
                 at = t[a, d]
                 is_flat = at == sides.low[d] or at == sides.high[d]
@@ -237,20 +234,40 @@ def _sides_of_edge(held: Complex, rings: NodeRings, sides: Sides, a: int, b: int
                     is_flat = is_flat and (m == k or t[held.cells[cell, m], d] == at)
                 if is_flat:
                     side = d
-            if side < 0:
-                return -1
             found |= 1 << side
     return found
 
 
 @njit(cache=True, error_model="numpy")
-def _put_middle(held: Complex, rings: NodeRings, is_frozen: NDArray, sides: Sides, a: int, b: int, p: int) -> bool:
-    """Put the node p at the middle of an edge; False if that is on the boundary off the box's sides, which stays."""
+def _put_middle(
+    held: Complex, rings: NodeRings, is_frozen: NDArray, sides: Sides, a: int, b: int, p: int, measure: Measure
+) -> bool:
+    """Put the node p at the middle of an edge, or on the surface beside it.
+
+    False if that is on the boundary elsewhere, which stays, or the surface is not found.
+    """
     found = _sides_of_edge(held, rings, sides, a, b)
     for d in range(3):
         held.ticks[p, d] = (held.ticks[a, d] + held.ticks[b, d]) >> 1
         is_frozen[p, d] = found > 0 and (sides.is_fixed or (found >> d) & 1 == 1)
-    return found >= 0
+    is_frozen[p, 3] = found >= 8
+    if found < 8:
+        return True
+    if not sides.has_surface or sides.is_fixed:
+        return False
+    x, uphill = np.empty((4, 3)), np.empty((2, 3))
+    if not put_on_surface(uphill, held.ticks, p, is_frozen, sides, measure):
+        return False
+    uphill_at(uphill, held.ticks, p, sides, measure)
+    for r in range(rings.start[a], rings.start[a + 1]):
+        cell = rings.cells[r]
+        for k in range(held.cells.shape[1]):
+            is_outer = held.across[cell, k] < 0 and held.cells[cell, k] not in (a, b)
+            if is_outer and has_node(held.cells, cell, b):
+                for node in (a, b):
+                    if not faces_up(x, held, cell, k, node, p, uphill, sides, measure):
+                        return False
+    return True
 
 
 def mend(
@@ -263,7 +280,7 @@ def mend(
     n_before = len(held.ticks)
     rings = node_rings(held)
     held = roomy(held, len(bad), 16 * len(bad))
-    is_frozen = np.concatenate([is_frozen, np.zeros((len(bad), 3), dtype=bool)])
+    is_frozen = np.concatenate([is_frozen, np.zeros((len(bad), 4), dtype=bool)])
     is_dirty = np.zeros(len(held.cells), dtype=np.bool_)
     n_split, n_collapsed = _mend(held, rings, is_frozen, measure, sides, bad, target, is_dirty)
     return _compacted(held, is_frozen, is_dirty, n_before, n_split, n_collapsed)
@@ -286,17 +303,17 @@ def _mend(
                 b, p = held.cells[cell, j], n_nodes + n_split
                 if i == j:
                     continue
-                gain = _lift_by_collapse(x, held, rings, is_frozen, a, b, measure, target)
+                gain = _lift_by_collapse(x, held, rings, is_frozen, sides, a, b, measure, target)
                 if gain > best:
                     best, best_a, best_b, is_split = gain, a, b, False
                 if i < j and _can_split(held, rings, a, is_dirty):
-                    may_split = _put_middle(held, rings, is_frozen, sides, a, b, p)
+                    may_split = _put_middle(held, rings, is_frozen, sides, a, b, p, measure)
                     gain = _lift_by_split(x, held, rings, a, b, p, measure, target) if may_split else -1.0
                     if gain > best:
                         best, best_a, best_b, is_split = gain, a, b, True
         if best_a >= 0 and is_split:
             p = n_nodes + n_split
-            _put_middle(held, rings, is_frozen, sides, best_a, best_b, p)
+            _put_middle(held, rings, is_frozen, sides, best_a, best_b, p, measure)
             split_edge(held, rings, best_a, best_b, p, is_dirty, measure)
             n_split += 1
         elif best_a >= 0:
@@ -308,11 +325,12 @@ def _mend(
 
 @njit(cache=True, error_model="numpy")
 def _lift_by_collapse(
-    x: NDArray, held: Complex, rings: NodeRings, is_frozen: NDArray, a: int, b: int, measure: Measure, target: float
-) -> float:
+    x: NDArray, held: Complex, rings: NodeRings, is_frozen: NDArray, sides: Sides, a: int, b: int, measure: Measure,
+    target: float,
+) -> float:  # fmt: skip
     """By how much the worst quality around a grows if a is joined to b."""
     t = held.ticks
-    if is_frozen[a].all() or not may_join(t, is_frozen, a, b):
+    if not may_join(t, is_frozen, a, b):
         return -1.0
     here0, here1, here2 = t[a, 0], t[a, 1], t[a, 2]
     old, new, size = target, target, 0.0
@@ -324,7 +342,7 @@ def _lift_by_collapse(
         if new > old and not has_node(held.cells, rings.cells[r], b):
             c = held.cells[rings.cells[r]]
             new = min(new, tet_quality(x, held, c[0], c[1], c[2], c[3], measure))
-    is_whole = new > old and _keeps_size(x, held, rings, a, b, size, measure)
+    is_whole = new > old and _keeps_domain(x, held, rings, is_frozen, a, b, size, sides, measure)
     t[a, 0], t[a, 1], t[a, 2] = here0, here1, here2
     return new - old if is_whole else -1.0
 
@@ -387,7 +405,8 @@ def _best_split(
         b, p = near[number], n_nodes + a
         if (b < a and is_wanted[b]) or squared_length(x, held, a, b, measure) < 4.0 * shortest * shortest:
             continue
-        if _put_middle(held, rings, is_frozen, sides, a, b, p) and _is_long(x, held, rings, a, b, p, shortest, measure):
+        is_there = _put_middle(held, rings, is_frozen, sides, a, b, p, measure)
+        if is_there and _is_long(x, held, rings, a, b, p, shortest, measure):
             worth = worth_of_split(x, held, rings, a, b, p, measure, gain[a])
             if worth > gain[a]:
                 gain[a], split[a] = worth, b
@@ -447,30 +466,34 @@ def worth_of_split(
                 return -np.inf
             if least > -1.0 and quality_up_to(x, measure) < least:
                 return -np.inf
-    if old - shape <= least_gain:
+    if old - shape <= least_gain and measure.surface == 0.0:
         return -np.inf
     if measure.image == 0.0:
         return old - shape
-    new = shape
+    new, misfit, D = shape, 0.0, held.sums.shape[1]
+    flux, sums = np.empty((1, 1, D)), np.empty((2, D))
     for r in range(rings.start[a], rings.start[a + 1]):
         cell = rings.cells[r]
         if has_node(held.cells, cell, b):
             i, j = corner_of(held.cells, cell, a), corner_of(held.cells, cell, b)
-            f = _flux_with(held, cell, i, b, p, measure)
-            with_a = (held.fluxes[cell, j, 0] + f[0], held.fluxes[cell, j, 1] + f[1], held.fluxes[cell, j, 2] + f[2])
-            with_b = (held.fluxes[cell, i, 0] - f[0], held.fluxes[cell, i, 1] - f[1], held.fluxes[cell, i, 2] - f[2])
+            _put_flux_with(flux, held, cell, i, b, p, measure)
+            for d in range(D):
+                sums[0, d] = held.fluxes[cell, j, d] + flux[0, 0, d]
+                sums[1, d] = held.fluxes[cell, i, d] - flux[0, 0, d]
             for k in range(n):
                 if k not in (i, j):
-                    f = _flux_with(held, cell, k, b, p, measure)
-                    with_a = (with_a[0] + f[0], with_a[1] + f[1], with_a[2] + f[2])
-                    f = _flux_with(held, cell, k, a, p, measure)
-                    with_b = (with_b[0] + f[0], with_b[1] + f[1], with_b[2] + f[2])
-            new += measure.image * (
-                image_energy(with_a[0], with_a[1], with_a[2]) + image_energy(with_b[0], with_b[1], with_b[2])
-            )
-            if old - new <= least_gain:
+                    for half, node in ((0, b), (1, a)):
+                        _put_flux_with(flux, held, cell, k, node, p, measure)
+                        for d in range(D):
+                            sums[half, d] += flux[0, 0, d]
+            for half in range(2):
+                new += measure.image * image_energy(sums, half, measure.n_channels)
+                misfit += wrong_side(sums, half, measure)
+            misfit -= wrong_side(held.sums, cell, measure)
+            if old - new <= least_gain and measure.surface == 0.0:  # else the misfit may fall yet
                 return -np.inf
-    return old - new
+    worth = old - new - misfit
+    return worth if worth > least_gain else -np.inf
 
 
 @njit(cache=True, error_model="numpy")
@@ -484,10 +507,11 @@ def _shape_with(x: NDArray, held: Complex, cell: int, node: int, p: int, measure
 
 
 @njit(cache=True, error_model="numpy")
-def _flux_with(held: Complex, cell: int, k: int, node: int, p: int, measure: Measure) -> tuple:
-    """Flux of facet k of a cell with p in the place of `node`, outwards."""
+def _put_flux_with(flux: NDArray, held: Complex, cell: int, k: int, node: int, p: int, measure: Measure) -> None:
+    """Flux of facet k of a cell with p in the place of `node`, outwards, to flux[0, 0, :]."""
     a, b, c = outward(held.cells, cell, k)
-    return flux_of(held.ticks, p if a == node else a, p if b == node else b, p if c == node and c >= 0 else c, measure)
+    a, b, c = p if a == node else a, p if b == node else b, p if c == node and c >= 0 else c
+    put_flux(flux, 0, 0, held.ticks, a, b, c, measure)
 
 
 @njit(cache=True, error_model="numpy")
@@ -543,6 +567,7 @@ def best_collapses(
     groups: Blocks,
     is_frozen: NDArray[np.bool_],
     measure: Measure,
+    sides: Sides,
     dearest: float,
     is_wanted: NDArray[np.bool_],
     longest: NDArray[np.float64],
@@ -557,7 +582,19 @@ def best_collapses(
     for chosen in colours_of(held, rings, groups):
         with few_threads(len(chosen) * 10_000):
             _fill_collapses(
-                cost, collapse, held, rings, groups, chosen, is_frozen, measure, bare, dearest, is_wanted, longest
+                cost,
+                collapse,
+                held,
+                rings,
+                groups,
+                chosen,
+                is_frozen,
+                measure,
+                bare,
+                sides,
+                dearest,
+                is_wanted,
+                longest,
             )
     return cost, collapse
 
@@ -565,28 +602,29 @@ def best_collapses(
 @njit(cache=True, parallel=True, error_model="numpy")
 def _fill_collapses(
     cost: NDArray, collapse: NDArray, held: Complex, rings: NodeRings, groups: Blocks, chosen: NDArray,
-    is_frozen: NDArray, measure: Measure, bare: Measure, dearest: float, is_wanted: NDArray, longest: NDArray,
+    is_frozen: NDArray, measure: Measure, bare: Measure, sides: Sides, dearest: float, is_wanted: NDArray,
+    longest: NDArray,
 ) -> None:  # fmt: skip
     for number in prange(len(chosen)):
         for at in range(groups.start[chosen[number]], groups.start[chosen[number] + 1]):
             if is_wanted[groups.nodes[at]]:
                 _best_collapse(
-                    groups.nodes[at], cost, collapse, held, rings, is_frozen, measure, bare, dearest, longest
+                    groups.nodes[at], cost, collapse, held, rings, is_frozen, measure, bare, sides, dearest, longest
                 )
 
 
 @njit(cache=True, error_model="numpy")
 def _best_collapse(
     a: int, cost: NDArray, collapse: NDArray, held: Complex, rings: NodeRings, is_frozen: NDArray, measure: Measure,
-    bare: Measure, dearest: float, longest: NDArray,
+    bare: Measure, sides: Sides, dearest: float, longest: NDArray,
 ) -> None:  # fmt: skip
     """The neighbour to which `a` is best joined. It is moved there and back: cells of other groups do not see it."""
-    if is_frozen[a].all():
+    if is_frozen[a, 0] and is_frozen[a, 1] and is_frozen[a, 2]:
         return
     n, t = held.cells.shape[1], held.ticks
     first, last = rings.start[a], rings.start[a + 1]
     x, near, shapes = np.empty((4, 3)), np.empty(NEIGHBOURS, dtype=np.int64), np.full(NEIGHBOURS, np.inf)
-    trial, fluxes = np.empty(last - first), np.empty((last - first, n, 3))
+    trial, fluxes = np.empty(last - first), np.empty((last - first, n, held.fluxes.shape[2]))
     old, least, size = 0.0, measure.floor if n == 4 else -1.0, 0.0
     for r in range(first, last):
         old += cell_energy(held, rings.cells[r], measure)
@@ -602,7 +640,7 @@ def _best_collapse(
         if may_join(t, is_frozen, a, b) and _is_short(x, held, near, count, a, b, longest, measure):
             t[a, 0], t[a, 1], t[a, 2] = t[b, 0], t[b, 1], t[b, 2]
             shapes[number] = ring_energy(best, least, trial, fluxes, x, a, held, rings, bare, b)
-            if shapes[number] < np.inf and not _keeps_size(x, held, rings, a, b, size, measure):
+            if shapes[number] < np.inf and not _keeps_domain(x, held, rings, is_frozen, a, b, size, sides, measure):
                 shapes[number] = np.inf
             t[a, 0], t[a, 1], t[a, 2] = here0, here1, here2
     for _ in range(count):
@@ -643,14 +681,64 @@ def _is_short(
 
 @njit(cache=True, error_model="numpy")
 def may_join(ticks: NDArray, is_frozen: NDArray, a: int, b: int) -> bool:
-    """Whether a may go where b is: it has to stay in the sides of the box that it is in.
+    """Whether a may go where b is: it has to stay in the sides of the box that it is in, and on the surface.
 
     The ring would lose volume otherwise (`_keeps_size`), which costs more to find out.
     """
-    may = True
+    may = not is_frozen[a, 3] or is_frozen[b, 3]
     for d in range(3):
         may = may and (not is_frozen[a, d] or (is_frozen[b, d] and ticks[a, d] == ticks[b, d]))
     return may
+
+
+@njit(cache=True, error_model="numpy")
+def _keeps_domain(
+    x: NDArray, held: Complex, rings: NodeRings, is_frozen: NDArray, a: int, b: int, size: float, sides: Sides,
+    measure: Measure,
+) -> bool:  # fmt: skip
+    """Whether the mesh still covers what it should with a at the place of b; `size` is n! times the ring's volume."""
+    if not is_frozen[a, 3]:
+        return _keeps_size(x, held, rings, a, b, size, measure)
+    return _is_linked(held, rings, a, b) and ring_faces_up(x, np.empty((2, 3)), held, rings, a, b, sides, measure)
+
+
+@njit(cache=True, error_model="numpy")
+def _is_linked(held: Complex, rings: NodeRings, a: int, b: int) -> bool:
+    """Whether a boundary edge may be collapsed without closing a hole or a gap (Dey et al. 1999).
+
+    It has to lie on the boundary, and a node next to both of its ends must be so by a cell with both, on the boundary
+    by a facet with both.
+    """
+    near, n = np.empty(NEIGHBOURS, dtype=np.int64), held.cells.shape[1]
+    edge = _is_outer(held, rings, a, b, -1)
+    for number in range(_neighbours(near, held, rings, a)):
+        c = near[number]
+        has_both, is_next = False, False
+        for r in range(rings.start[b], rings.start[b + 1]):
+            if has_node(held.cells, rings.cells[r], c):
+                is_next = True
+                has_both = has_both or has_node(held.cells, rings.cells[r], a)
+        if c == b or not is_next:
+            continue
+        if not has_both:
+            return False
+        are_outer = n == 4 and _is_outer(held, rings, a, c, -1) and _is_outer(held, rings, b, c, -1)
+        if are_outer and not _is_outer(held, rings, a, b, c):
+            return False
+    return edge
+
+
+@njit(cache=True, error_model="numpy")
+def _is_outer(held: Complex, rings: NodeRings, a: int, b: int, c: int) -> bool:
+    """Whether a facet of the boundary has the nodes a and b, and c unless that is -1."""
+    for r in range(rings.start[a], rings.start[a + 1]):
+        cell = rings.cells[r]
+        if has_node(held.cells, cell, b) and (c < 0 or has_node(held.cells, cell, c)):
+            for k in range(held.cells.shape[1]):
+                node = held.cells[cell, k]
+                if held.across[cell, k] < 0 and node not in (a, b, c):
+                    return True
+    return False
 
 
 @njit(cache=True, error_model="numpy")

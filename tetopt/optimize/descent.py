@@ -128,6 +128,7 @@ def _ring_energy(
     cell is flat or not oriented as `hand` says, or once the energy of the shapes alone is above `limit`.
     """
     first, last = start[node], start[node + 1]
+    flux = np.empty((1, 1, 3))
     energy = 0.0
     for r in range(first, last):  # cheap refusals before any voxel is read
         if cell_orientation(ticks, cells, ring[r]) != hand:
@@ -140,9 +141,9 @@ def _ring_energy(
     if energy > limit:
         return np.inf
     for s in range(star_start[node], star_start[node + 1]):
-        flux = facet_flux(ticks, nodes_of, star[s], bits, prefix, None, 0)
+        facet_flux(ticks, nodes_of, star[s], bits, prefix, None, 0, flux, 0)
         for d in range(3):
-            trial_fluxes[s - star_start[node], d] = flux[d]
+            trial_fluxes[s - star_start[node], d] = flux[0, 0, d]
     for r in range(first, last):
         for d in range(3):
             total = 0.0

@@ -18,11 +18,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.check import check_unfolded
+from tetopt.content import Content, plain
 from tetopt.energy.sampling import (
+    channel_grid,
     check_orientations,
     few_threads,
     from_ticks,
-    sampling_grid,
     to_ticks,
 )
 from tetopt.errors import InputError
@@ -40,10 +41,9 @@ from tetopt.optimize.complex import (
     measure_of,
     node_rings,
 )
-from tetopt.optimize.density import Limits, Sides, exchange
-from tetopt.optimize.descent import free_projections
+from tetopt.optimize.density import Limits, exchange
 from tetopt.optimize.flips import flip, make_moves
-from tetopt.optimize.octree import is_near, nearest_octree, noise_level, octree
+from tetopt.optimize.octree import is_near, nearest_octree, octree
 from tetopt.optimize.paper import (
     NOISE,
     Boundary,
@@ -57,6 +57,7 @@ from tetopt.optimize.paper import (
 from tetopt.optimize.repair import repair, worst_angles
 from tetopt.optimize.sizes import Sizes
 from tetopt.optimize.smooth import blocks, sweep
+from tetopt.optimize.surface import sides_of
 
 GRADED_K_D = 0.85  # on the MNI152 T1 with 15,000 nodes: a third of the uniform mesh's E_D, mean rho above 0.25
 GRADED_ITERATIONS = 16  # four more would lower E_D by 2 % there
@@ -73,7 +74,7 @@ FAR = -(1 << 40)  # ticks from anywhere
 
 
 def optimize(
-    image: Image,
+    image: Image | Content,
     mesh: Mesh,
     *,
     k_D: float = 0.2,
@@ -92,8 +93,8 @@ def optimize(
 
     Parameters
     ----------
-    image : Image
-        The intensities h.
+    image : Image or Content
+        The intensities h; or several channels, over which E_D is summed, and a mask (`tetopt.content`).
     mesh : Mesh
         The initial mesh, which also normalises the two energies: any conforming mesh.
     k_D : float
@@ -108,7 +109,8 @@ def optimize(
         The smallest dihedral angle that a tetrahedron may have at the end, degrees, 0 (no floor) to below 70. How many
         cells miss it is for the caller to count (`tetopt.quality`); meshes of triangles have no floor.
     boundary : {"slide", "fixed"}
-        Boundary nodes move within the box's faces and edges, or not at all. Those not on the box are fixed.
+        Boundary nodes move within the box's faces and edges, or not at all. Those not on the box are fixed or, with a
+        mask, whose surface they are taken to lie on, slide on that.
     nodes : int, optional
         Put nodes where they lower E most, towards this number of them: on a graded mesh, such as `octree`. Every
         cell's shape then counts the same, whatever its size (see `tetopt.optimize.complex.shape_energy`), and nodes
@@ -143,8 +145,10 @@ def optimize(
     check_options(k_D, iterations, shape_power, min_dihedral, boundary, nodes)
     begin = time.perf_counter()
     is_over = deadline(begin, max_seconds, stop)
+    wanted = plain(image)
+    image = wanted.image
     sizes = (Sizes() if sizes is None else sizes).prepared(image.ndim)
-    run = _Run(image, mesh, k_D, shape_power, boundary, is_graded=nodes is not None)
+    run = _Run(wanted, mesh, k_D, shape_power, boundary, is_graded=nodes is not None)
     history: list[Record] = []
 
     def record(iteration: int, movement: float, is_changed: bool) -> None:
@@ -180,7 +184,7 @@ def optimize(
 
 
 def mesh_image(
-    image: Image,
+    image: Image | Content,
     nodes: int | None = None,
     *,
     target_error: float | None = None,
@@ -193,8 +197,9 @@ def mesh_image(
 
     Parameters
     ----------
-    image : Image
-        The intensities h.
+    image : Image or Content
+        The intensities h; or several contrasts, labels, a mask, within which alone there will be cells
+        (`tetopt.content`).
     nodes : int
         Number of nodes, met exactly unless the run is cut short, k_D is 0, cells have to be lifted over the floor, or
         no more nodes can be taken out; count them.
@@ -243,7 +248,7 @@ def mesh_image(
 
 
 def meshed_to_error(
-    image: Image, target_error: float, sizes: Sizes | None, run: Callable[[Mesh, int], Optimized]
+    image: Image | Content, target_error: float, sizes: Sizes | None, run: Callable[[Mesh, int], Optimized]
 ) -> tuple[int, Mesh, Optimized]:
     """Run after run with other numbers of nodes, until the share of the image's variance is just below a target.
 
@@ -258,10 +263,11 @@ def meshed_to_error(
     """
     if not 0.0 < target_error < 1.0:
         raise InputError(f"target_error: expected a share of the image's variance, 0 to 1, got {target_error}")
-    variance = float(np.var(image.data, dtype=np.float64))
+    wanted = plain(image)
+    image, variance = wanted.image, wanted.variance
     if variance == 0.0:
         raise InputError("target_error: the image is constant, every mesh has no error; give a number of nodes")
-    noise = noise_level(image.data) ** 2 / variance
+    noise = wanted.noise * wanted.unit / variance
     if target_error <= noise:
         raise InputError(
             f"target_error: {target_error:g} of the variance is below the noise's share, by estimate {noise:.3g}: "
@@ -271,14 +277,15 @@ def meshed_to_error(
     best: tuple[int, Mesh, Optimized] | None = None
     asked: set[int] = set()
     for _ in range(RUNS):
-        mesh = nearest_octree(image, nodes, sizes)
-        if not is_near(len(mesh.points), nodes):  # limits on sizes ask for more nodes than the error, or allow fewer
+        mesh = nearest_octree(wanted, nodes, sizes)
+        # Limits on sizes may ask for more nodes than the error, or allow fewer; a mask's octree is near only roughly.
+        if wanted.region is None and not is_near(len(mesh.points), nodes):
             nodes = len(mesh.points)
         if nodes in asked:
             break
         asked.add(nodes)
         result = run(mesh, nodes)
-        found, share = len(result.mesh.points), result.history[-1].E_D / (variance * image.volume)
+        found, share = len(result.mesh.points), result.history[-1].E_D / (variance * wanted.volume)
         if result.ended in ("stopped", "max_seconds"):
             has_error = best is not None and tried[len(best[2].mesh.points)] <= target_error
             return best if best is not None and has_error else (nodes, mesh, result)
@@ -319,14 +326,16 @@ def _next_nodes(image: Image, tried: dict[int, float], target: float) -> int:
 
 
 def prepare_kernels(
-    image: Image, k_D: float, method: Literal["fast", "paper"] = "fast", is_graded: bool = False
+    image: Image | Content, k_D: float, method: Literal["fast", "paper"] = "fast", is_graded: bool = False
 ) -> None:
     """Compile the kernels of a method for images of this kind, or load them, before a clock starts.
 
     The sampling has kernels of its own for whole-number images whose sums fit 32 bits; see `sampling_grid`. The repair
     is left to be compiled when a mesh wants it.
     """
-    is_whole = np.array_equal(np.rint(image.data), image.data)
+    wanted = plain(image)
+    image = wanted.image
+    is_whole = not wanted.is_plain or np.array_equal(np.rint(image.data), image.data)
     step = 1.0 if is_whole else 0.1
     tiny = Image(np.zeros((3,) * image.ndim) + step * np.arange(3))
     mesh = lattice(tiny, blocks=(1,) * image.ndim)
@@ -334,7 +343,7 @@ def prepare_kernels(
         optimize_paper(tiny, mesh, k_D=k_D, iterations=1)
         return
     optimize(tiny, mesh, k_D=k_D, iterations=1)
-    run = _Run(tiny, mesh, k_D, 3.0, "slide")
+    run = _Run(plain(tiny), mesh, k_D, 3.0, "slide")
     none = np.empty(0, dtype=np.int64)  # nothing can be gained on so small a mesh, so that no move is made of itself
     make_moves(none, none, np.zeros(len(run.held.cells), dtype=np.bool_), run.held, run.measure)
     if is_graded:
@@ -345,21 +354,21 @@ class _Run:
     """What one optimisation works on, and its steps."""
 
     def __init__(
-        self, image: Image, mesh: Mesh, k_D: float, power: float, boundary: Boundary, is_graded: bool = False
+        self, wanted: Content, mesh: Mesh, k_D: float, power: float, boundary: Boundary, is_graded: bool = False
     ) -> None:
+        self.wanted, image = wanted, wanted.image
         self.image, self.n = image, image.ndim
-        self.grid = sampling_grid(image, mesh.points)
+        self.grid = channel_grid(wanted, mesh.points)
         ticks = to_ticks(image.to_index(mesh.points), self.grid)
         check_orientations(image, ticks, mesh.cells)
         check_unfolded(mesh)
-        self.is_frozen = frozen_axes(image, ticks, mesh.cells, self.grid, boundary)
-        low = np.array([-0.5] * 3) * 2.0**self.grid.bits
-        high = (np.array(self.grid.shape) - 0.5) * 2.0**self.grid.bits
-        self.sides = Sides(low.astype(np.int64), high.astype(np.int64), boundary == "fixed")
-        self.is_still = self.is_frozen[:, 3 - self.n :].all(axis=1)
+        region = wanted.region
+        self.is_frozen = frozen_axes(image, ticks, mesh.cells, self.grid, boundary, region is not None)
+        self.is_still = self.is_frozen[:, 3 - self.n : 3].all(axis=1)
         self.matrix = np.eye(3)
         self.matrix[3 - self.n :, 3 - self.n :] = image.affine[:-1, :-1]
-        self.projections = free_projections(self.matrix)
+        level = None if region is None else region.level
+        self.sides = sides_of(self.grid, self.matrix, boundary == "fixed", level)
         hand = 1 if np.linalg.det(image.affine[:-1, :-1]) > 0 else -1
         unit = measure_of(self.grid, hand, self.matrix, 1.0, 1.0, power, is_graded)
         self.held: Complex = build(mesh.cells, ticks, unit)
@@ -370,7 +379,7 @@ class _Run:
                 "remove them or move their nodes apart"
             )
         # Where every cell is uniform, what rounding leaves of E_D must not become the unit that E_D is measured in.
-        self.noise = NOISE * float(np.var(image.data, dtype=np.float64)) * image.data.size
+        self.noise = NOISE * wanted.variance / wanted.unit * wanted.n_voxels
         self.E_G0, self.squares0 = self.energies()
         weight = k_D / self.squares0 if self.squares0 > 0.0 else 0.0
         if not (0.0 < self.E_G0 < np.inf and np.isfinite(self.squares0) and np.isfinite(weight)):
@@ -378,8 +387,9 @@ class _Run:
                 "mesh and image: their energies overflow; are lengths in mm and intensities of usual size?"
             )
         self.measure: Measure = measure_of(
-            self.grid, hand, self.matrix, (1.0 - k_D) / self.E_G0, weight, power, is_graded
-        )
+            self.grid, hand, self.matrix, (1.0 - k_D) / self.E_G0, weight, power, is_graded,
+            0.0 if region is None else weight * wanted.wrong_side,
+        )  # fmt: skip
         self.groups = blocks(ticks)
         self.edge = _edges(mesh)
         self.image_noise: float | None = None  # its variance, found when it is wanted
@@ -387,9 +397,15 @@ class _Run:
         self.tried = np.full_like(ticks, FAR)  # and when the nodes around them were moved because of it
 
     def energies(self) -> tuple[float, float]:
-        """Shape energy and sum of squares; squares that are only rounding count as 0."""
-        E_G, squares = energies(self.held)
+        """Shape energy and sum of squares, with the mask's misfit; squares that are only rounding count as 0."""
+        E_G, squares = energies(self.held, self.grid.n_channels)
+        if self.wanted.region is not None:
+            squares += self.wanted.wrong_side * self.n_misfits()
         return E_G, squares if squares > self.noise else 0.0
+
+    def n_misfits(self) -> int:
+        """Voxels of the mask outside of the mesh, and others inside of it."""
+        return self.wanted.n_voxels + int(self.held.sums[: int(self.held.n_cells[0]), -1].sum())
 
     def E(self) -> float:
         E_G, squares = self.energies()
@@ -402,7 +418,7 @@ class _Run:
         is_near[cells[self._moved(self.tried, QUIET)[cells].any(axis=1)]] = True
         return sweep(
             self.held, node_rings(self.held), self.groups, is_near & ~self.is_still, self.is_frozen, self.measure,
-            self.projections, is_over,
+            self.sides, is_over,
         )  # fmt: skip
 
     def flip(self) -> int:
@@ -429,8 +445,8 @@ class _Run:
         eager = self.measure._replace(geometry=EAGER * self.measure.geometry)
         most, mesh = int(EXCHANGED * nodes), self.mesh()
         if self.image_noise is None:
-            self.image_noise = noise_level(self.image.data) ** 2
-        longest = sizes.longest(self.image, nodes, mesh.points, mesh.cells, self.edge)
+            self.image_noise = self.wanted.noise
+        longest = sizes.longest(self.image, nodes, mesh.points, mesh.cells, self.edge, self.wanted.volume)
         limits = Limits(float(sizes.smallest), longest, self.image_noise)
         done = exchange(self.held, self.is_frozen, eager, self.sides, nodes, most, limits)
         self._renumber(done.held, done.is_frozen, done.source)
@@ -449,7 +465,7 @@ class _Run:
 
     def lift(self, degrees: float) -> int:
         """Lift the worst cells over `degrees`, or as far as they go; the number of moves. It may raise E."""
-        done = repair(self.held, self.is_frozen, self.measure, self.projections, self.sides, degrees)
+        done = repair(self.held, self.is_frozen, self.measure, self.sides, degrees)
         self._renumber(done.held, done.is_frozen, done.source)
         self.tried[:] = FAR
         return done.n_moves
@@ -458,7 +474,7 @@ class _Run:
         """Take over a complex with other nodes: where each comes from, -1 for new ones."""
         is_new = (source < 0)[:, None]
         self.held, self.is_frozen = held, is_frozen
-        self.is_still = is_frozen[:, 3 - self.n :].all(axis=1)
+        self.is_still = is_frozen[:, 3 - self.n : 3].all(axis=1)
         self.seen, self.tried = (np.where(is_new, FAR, since[source]) for since in (self.seen, self.tried))
         self.groups, self.edge = blocks(held.ticks), _edges(self.mesh())
 
@@ -469,7 +485,7 @@ class _Run:
         E_G, squares = self.energies()
         n_cells = int(self.held.n_cells[0])
         n_voxels = int(self.held.sums[:n_cells, 0].sum())
-        error = squares * self.image.voxel_volume
+        error = squares * self.wanted.unit * self.image.voxel_volume
         return Record(iteration, self.E(), E_G, error, movement, is_changed, n_cells, n_voxels, seconds)
 
     def mesh(self) -> Mesh:

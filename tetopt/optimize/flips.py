@@ -28,12 +28,12 @@ from tetopt.optimize.complex import (
     cell_quality,
     corner_of,
     facet_of,
-    flux_of,
     grown,
     image_energy,
     least_cosine,
     load,
     outward,
+    put_flux,
     shape_of_tet,
     shape_of_triangle,
     sum_up,
@@ -58,8 +58,10 @@ class Cavity(NamedTuple):
     apex: NDArray[np.int64]  # (MOST, MOST) the corner between them of its triangle
     triangle: NDArray[np.float64]  # (MOST, MOST, MOST) energy of the two cells over each triangle
     is_measured: NDArray[np.bool_]  # (MOST, MOST, MOST) whether the image is in it
-    side_a: NDArray[np.float64]  # (MOST, MOST, 3) fluxes of the facets (v_j, v_i, a)
+    side_a: NDArray[np.float64]  # (MOST, MOST, D) fluxes of the facets (v_j, v_i, a)
     side_b: NDArray[np.float64]  # and (v_i, v_j, b)
+    flux: NDArray[np.float64]  # (3, 1, D) of facets inside the cavity
+    sums: NDArray[np.float64]  # (2, D) of two cells
     is_side: NDArray[np.bool_]  # (MOST, MOST) whether they are measured
     stack: NDArray[np.int64]  # (2 MOST, 3)
     new: NDArray[np.int64]  # (2 MOST,) the cells that will fill the cavity
@@ -67,8 +69,8 @@ class Cavity(NamedTuple):
 
 
 @njit(cache=True, error_model="numpy")
-def cavity(n_free: int) -> Cavity:
-    """Room for a cavity, and for the numbers of `n_free` cells left over."""
+def cavity(n_free: int, D: int) -> Cavity:
+    """Room for a cavity, and for the numbers of `n_free` cells left over; D numbers make a flux."""
     return Cavity(
         np.empty((4, 3)),
         np.empty((MOST + 2, 3)),
@@ -78,8 +80,10 @@ def cavity(n_free: int) -> Cavity:
         np.empty((MOST, MOST), dtype=np.int64),
         np.empty((MOST, MOST, MOST)),
         np.empty((MOST, MOST, MOST), dtype=np.bool_),
-        np.empty((MOST, MOST, 3)),
-        np.empty((MOST, MOST, 3)),
+        np.empty((MOST, MOST, D)),
+        np.empty((MOST, MOST, D)),
+        np.empty((3, 1, D)),
+        np.empty((2, D)),
         np.empty((MOST, MOST), dtype=np.bool_),
         np.empty((2 * MOST, 3), dtype=np.int64),
         np.empty(2 * MOST, dtype=np.int64),
@@ -137,7 +141,7 @@ def _evaluate(gain: NDArray, move: NDArray, is_dirty: NDArray, held: Complex, me
 def _evaluate_cells(gain: NDArray, move: NDArray, is_dirty: NDArray, held: Complex, measure: Measure) -> None:
     """Moves 0 to 3 flip that facet, 4 to 9 remove an edge of `EDGES`."""
     for chunk in prange((len(gain) + CHUNK - 1) // CHUNK):
-        work = cavity(0)
+        work = cavity(0, held.fluxes.shape[2])
         first: Any = np.int64(chunk) * CHUNK
         for cell in range(first, min(first + CHUNK, len(gain))):
             for k in range(4):
@@ -191,18 +195,15 @@ def _worth_of_face(work: Cavity, held: Complex, cell: int, k: int, measure: Meas
                 return -np.inf
     if measure.image == 0.0:
         return old - new
-    corner, spoke = (u, v, w), np.empty((3, 3))
+    corner, spoke, sums = (u, v, w), work.flux, work.sums
     for r in range(3):
-        f = flux_of(held.ticks, p, q, corner[r], measure)
-        spoke[r, 0], spoke[r, 1], spoke[r, 2] = f[0], f[1], f[2]
+        put_flux(spoke, r, 0, held.ticks, p, q, corner[r], measure)
     for r in range(3):
-        f_0, f_1, a = spoke[r], spoke[(r + 1) % 3], corner[(r + 2) % 3]  # a: the corner of the facet that is left out
-        below = held.fluxes[cell, corner_of(held.cells, cell, a)]
-        above = held.fluxes[other, corner_of(held.cells, other, a)]
-        new += measure.image * image_energy(
-            below[0] + above[0] + f_1[0] - f_0[0], below[1] + above[1] + f_1[1] - f_0[1],
-            below[2] + above[2] + f_1[2] - f_0[2],
-        )  # fmt: skip
+        s, a = (r + 1) % 3, corner[(r + 2) % 3]  # a: the corner of the facet that is left out
+        below, above = corner_of(held.cells, cell, a), corner_of(held.cells, other, a)
+        for d in range(sums.shape[1]):
+            sums[0, d] = (held.fluxes[cell, below, d] + held.fluxes[other, above, d]) + spoke[s, 0, d] - spoke[r, 0, d]
+        new += measure.image * image_energy(sums, 0, measure.n_channels)
         if not new < limit:
             return -np.inf
     return old - new
@@ -391,11 +392,13 @@ def _measure_triangles(work: Cavity, held: Complex, a: int, b: int, m: int, is_o
         found = work.is_measured[i, k, j] = True
         for p, q in ((i, k), (k, j), (i, j)):
             fill_side(work, held, a, b, p, q, m, is_open, measure)
-        u = flux_of(held.ticks, ring[i], ring[k], ring[j], measure)
-        of_b, of_a = side_b[i, k] + side_b[k, j] - side_b[i, j], side_a[i, k] + side_a[k, j] - side_a[i, j]
+        put_flux(work.flux, 0, 0, held.ticks, ring[i], ring[k], ring[j], measure)
+        for d in range(work.sums.shape[1]):
+            u = work.flux[0, 0, d]
+            work.sums[0, d] = side_b[i, k, d] + side_b[k, j, d] - side_b[i, j, d] - u
+            work.sums[1, d] = side_a[i, k, d] + side_a[k, j, d] - side_a[i, j, d] + u
         work.triangle[i, k, j] += measure.image * (
-            image_energy(of_b[0] - u[0], of_b[1] - u[1], of_b[2] - u[2])
-            + image_energy(of_a[0] + u[0], of_a[1] + u[1], of_a[2] + u[2])
+            image_energy(work.sums, 0, measure.n_channels) + image_energy(work.sums, 1, measure.n_channels)
         )
     return found
 
@@ -468,15 +471,14 @@ def fill_side(
     if j == i + 1 or (i == 0 and j == m - 1 and is_open == 0):
         r, sign = (i, 1.0) if j == i + 1 else (m - 1, -1.0)
         cell = work.around[r]
-        for d in range(3):
+        for d in range(held.fluxes.shape[2]):
             work.side_b[i, j, d] = sign * held.fluxes[cell, corner_of(held.cells, cell, a), d]
             work.side_a[i, j, d] = sign * held.fluxes[cell, corner_of(held.cells, cell, b), d]
         return
     for which in range(2):  # one place where the flux is measured: half the code to compile
         p, q, end = (work.ring[i], work.ring[j], b) if which == 0 else (work.ring[j], work.ring[i], a)
-        f = flux_of(held.ticks, p, q, end, measure)
         side = work.side_b if which == 0 else work.side_a
-        side[i, j, 0], side[i, j, 1], side[i, j, 2] = f[0], f[1], f[2]
+        put_flux(side, i, j, held.ticks, p, q, end, measure)
 
 
 @njit(cache=True, error_model="numpy")
@@ -486,7 +488,7 @@ def make_moves(order: NDArray, move: NDArray, is_dirty: NDArray, held: Complex, 
     Cells of a cavity that changed are marked dirty, and those left over are taken out at the end.
     """
     room = len(held.cells)
-    work = cavity(room)
+    work = cavity(room, held.fluxes.shape[2])
     made = 0
     for number in range(len(order)):
         cell = order[number]
@@ -558,8 +560,8 @@ def flip_face(work: Cavity, held: Complex, cell: int, k: int, is_dirty: NDArray,
     other = held.across[cell, k]
     u, v, w = outward(held.cells, cell, k)
     p, q = held.cells[cell, k], held.cells[other, facet_of(held.cells, held.across, other, cell)]
-    corner = np.array([u, v, w])
-    below, above = np.empty((3, 3)), np.empty((3, 3))  # fluxes of the facets opposite u, v, w
+    corner, D = np.array([u, v, w]), held.fluxes.shape[2]
+    below, above = np.empty((3, D)), np.empty((3, D))  # fluxes of the facets opposite u, v, w
     under, over = np.empty(3, dtype=np.int64), np.empty(3, dtype=np.int64)  # the cells beyond them
     for r in range(3):
         i, j = corner_of(held.cells, cell, corner[r]), corner_of(held.cells, other, corner[r])
@@ -568,12 +570,11 @@ def flip_face(work: Cavity, held: Complex, cell: int, k: int, is_dirty: NDArray,
     work.around[0], work.around[1] = cell, other
     take_cells(work, held, 2, 3, is_dirty)
     new = work.new
-    spoke = np.zeros((3, 3))
+    spoke = work.flux
+    spoke[:] = 0.0
     if measure.image > 0.0:
         for r in range(3):
-            f = flux_of(held.ticks, p, q, corner[r], measure)
-            for d in range(3):
-                spoke[r, d] = f[d]
+            put_flux(spoke, r, 0, held.ticks, p, q, corner[r], measure)
     # The facets of the neighbours that lead here, before anything is overwritten.
     under_k, over_k = np.full(3, -1, dtype=np.int64), np.full(3, -1, dtype=np.int64)
     for r in range(3):
@@ -586,9 +587,9 @@ def flip_face(work: Cavity, held: Complex, cell: int, k: int, is_dirty: NDArray,
         c = new[r]
         held.cells[c, 0], held.cells[c, 1], held.cells[c, 2], held.cells[c, 3] = p, q, corner[r], corner[s]
         held.across[c, 0], held.across[c, 1], held.across[c, 2], held.across[c, 3] = over[t], under[t], new[s], new[t]
-        for d in range(3):
+        for d in range(D):
             held.fluxes[c, 0, d], held.fluxes[c, 1, d] = above[t, d], below[t, d]
-            held.fluxes[c, 2, d], held.fluxes[c, 3, d] = spoke[s, d], -spoke[r, d]
+            held.fluxes[c, 2, d], held.fluxes[c, 3, d] = spoke[s, 0, d], -spoke[r, 0, d]
         if over[t] >= 0:
             held.across[over[t], over_k[t]] = c
         if under[t] >= 0:
@@ -637,11 +638,11 @@ def remove_edge(
         held.cells[top, 0], held.cells[top, 1], held.cells[top, 2], held.cells[top, 3] = ring[i], ring[k], ring[j], b
         held.cells[low, 0], held.cells[low, 1], held.cells[low, 2], held.cells[low, 3] = ring[i], ring[j], ring[k], a
         held.across[top, 3], held.across[low, 3] = low, top
-        u = (0.0, 0.0, 0.0)
+        work.flux[0] = 0.0
         if measure.image > 0.0:
-            u = flux_of(held.ticks, ring[i], ring[k], ring[j], measure)
-        for d in range(3):
-            held.fluxes[top, 3, d], held.fluxes[low, 3, d] = -u[d], u[d]
+            put_flux(work.flux, 0, 0, held.ticks, ring[i], ring[k], ring[j], measure)
+        for d in range(held.fluxes.shape[2]):
+            held.fluxes[top, 3, d], held.fluxes[low, 3, d] = -work.flux[0, 0, d], work.flux[0, 0, d]
             if measure.image > 0.0:
                 held.fluxes[top, 0, d], held.fluxes[low, 0, d] = side_b[k, j, d], side_a[k, j, d]
                 held.fluxes[top, 2, d], held.fluxes[low, 1, d] = side_b[i, k, d], side_a[i, k, d]
@@ -715,19 +716,19 @@ def close_gaps(held: Complex, is_dirty: NDArray) -> None:
 def _evaluate_triangles(gain: NDArray, move: NDArray, is_dirty: NDArray, held: Complex, measure: Measure) -> None:
     """Moves 0 to 2 turn that edge."""
     for chunk in prange((len(gain) + CHUNK - 1) // CHUNK):
-        x = np.empty((4, 3))
+        x, sums = np.empty((4, 3)), np.empty((2, held.sums.shape[1]))
         first: Any = np.int64(chunk) * CHUNK
         for cell in range(first, min(first + CHUNK, len(gain))):
             for k in range(3):
                 other = held.across[cell, k]
                 if other > cell and (is_dirty[cell] or is_dirty[other]):
-                    worth = _worth_of_turn(x, held, cell, k, measure)
+                    worth = _worth_of_turn(x, sums, held, cell, k, measure)
                     if worth > gain[cell]:
                         gain[cell], move[cell] = worth, k
 
 
 @njit(cache=True, error_model="numpy")
-def _worth_of_turn(x: NDArray, held: Complex, cell: int, k: int, measure: Measure) -> float:
+def _worth_of_turn(x: NDArray, sums: NDArray, held: Complex, cell: int, k: int, measure: Measure) -> float:
     """How much E falls if the edge (u, v) between two triangles is turned to (p, q); -inf if it cannot be."""
     other = held.across[cell, k]
     m = facet_of(held.cells, held.across, other, cell)
@@ -741,13 +742,12 @@ def _worth_of_turn(x: NDArray, held: Complex, cell: int, k: int, measure: Measur
     if not new < limit:
         return -np.inf
     if measure.image > 0.0:
-        f = flux_of(held.ticks, p, q, -1, measure)
-        f_pu, f_uq = held.fluxes[cell, (k + 2) % 3], held.fluxes[other, (m + 1) % 3]
-        f_qv, f_vp = held.fluxes[other, (m + 2) % 3], held.fluxes[cell, (k + 1) % 3]
-        new += measure.image * (
-            image_energy(f_pu[0] + f_uq[0] - f[0], f_pu[1] + f_uq[1] - f[1], f_pu[2] + f_uq[2] - f[2])
-            + image_energy(f_qv[0] + f_vp[0] + f[0], f_qv[1] + f_vp[1] + f[1], f_qv[2] + f_vp[2] + f[2])
-        )
+        flux = np.empty((1, 1, sums.shape[1]))
+        put_flux(flux, 0, 0, held.ticks, p, q, -1, measure)
+        for d in range(sums.shape[1]):  # over the edges (p, u), (u, q), and (q, v), (v, p)
+            sums[0, d] = held.fluxes[cell, (k + 2) % 3, d] + held.fluxes[other, (m + 1) % 3, d] - flux[0, 0, d]
+            sums[1, d] = held.fluxes[other, (m + 2) % 3, d] + held.fluxes[cell, (k + 1) % 3, d] + flux[0, 0, d]
+        new += measure.image * (image_energy(sums, 0, measure.n_channels) + image_energy(sums, 1, measure.n_channels))
     return old - new if new < limit else -np.inf
 
 
@@ -768,16 +768,16 @@ def _turn_edge(held: Complex, cell: int, k: int, measure: Measure) -> None:
         held.across[n_uq, facet_of(held.cells, held.across, n_uq, other)] = cell
     if n_vp >= 0:
         held.across[n_vp, facet_of(held.cells, held.across, n_vp, cell)] = other
-    f = (0.0, 0.0, 0.0)
+    f = np.zeros((1, 1, held.fluxes.shape[2]))
     if measure.image > 0.0:
-        f = flux_of(held.ticks, p, q, -1, measure)
+        put_flux(f, 0, 0, held.ticks, p, q, -1, measure)
     held.cells[cell, 0], held.cells[cell, 1], held.cells[cell, 2] = p, u, q
     held.cells[other, 0], held.cells[other, 1], held.cells[other, 2] = p, q, v
     held.across[cell, 0], held.across[cell, 1], held.across[cell, 2] = n_uq, other, n_pu
     held.across[other, 0], held.across[other, 1], held.across[other, 2] = n_qv, n_vp, cell
-    for d in range(3):
-        held.fluxes[cell, 0, d], held.fluxes[cell, 1, d], held.fluxes[cell, 2, d] = f_uq[d], -f[d], f_pu[d]
-        held.fluxes[other, 0, d], held.fluxes[other, 1, d], held.fluxes[other, 2, d] = f_qv[d], f_vp[d], f[d]
+    for d in range(held.fluxes.shape[2]):
+        held.fluxes[cell, 0, d], held.fluxes[cell, 1, d], held.fluxes[cell, 2, d] = f_uq[d], -f[0, 0, d], f_pu[d]
+        held.fluxes[other, 0, d], held.fluxes[other, 1, d], held.fluxes[other, 2, d] = f_qv[d], f_vp[d], f[0, 0, d]
     x = np.empty((4, 3))
     for c in (cell, other):
         held.E_shape[c] = shape_of_triangle(

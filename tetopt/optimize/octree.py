@@ -18,6 +18,8 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import maximum_filter
 
+from tetopt.content import Content, plain
+from tetopt.domain import clipped
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
 from tetopt.image import Image
@@ -38,20 +40,20 @@ TIE_BREAKS = (1e-5, 1e-4, 1e-3)  # see `delaunay`, tried in turn: with 1e-7, 2 o
 FLAT = 1e-6  # of the mean volume: such a cell is flat
 TIE = 0.05  # of a block's error: what decides between blocks that are alike
 MISS = 0.1  # of the nodes wanted: a larger miss is an error
-SAMPLE = 100_000  # voxels, of which the most frequent value is taken for the background's
-LABELS = 32  # values, at most, that an image of labels has
+AGAIN = 3  # octrees tried for the number of nodes within a mask
 MOST_ANYHOW = 5000  # nodes that even images of few voxels may get
 FEW = 40  # nodes, about what one block more or less makes
 NEAR = 0.002  # of the nodes wanted: a miss that is good enough
 
 
-def octree(image: Image, nodes: int, sizes: Sizes | None = None) -> Mesh:
-    """A graded mesh of the image's box.
+def octree(image: Image | Content, nodes: int, sizes: Sizes | None = None) -> Mesh:
+    """A graded mesh of the image's box, or of the mask's region.
 
     Parameters
     ----------
-    image : Image
-        Its box, index -0.5 to shape - 0.5 along each axis, is covered exactly.
+    image : Image or Content
+        Its box, index -0.5 to shape - 0.5 along each axis, is covered exactly; or, with a mask, its region up to the
+        surface, on which nodes are put.
     nodes : int
         Wanted number of nodes. The octree that comes nearest has a few per cent more or less, of few a few dozen.
     sizes : Sizes, optional
@@ -68,18 +70,19 @@ def octree(image: Image, nodes: int, sizes: Sizes | None = None) -> Mesh:
         More nodes than leaves of 2 voxels, or of the smallest size, can have, or fewer than the largest sizes need; or
         intensities whose squares overflow.
     """
-    shape = " x ".join(map(str, image.shape))
+    wanted = plain(image)
+    shape = " x ".join(map(str, wanted.image.shape))
     limits = "" if sizes is None or sizes == Sizes() else " and these limits on sizes"
-    asked = _limits(image, nodes, sizes)
-    needed = _needed(image, asked)
+    asked = _limits(wanted, nodes, sizes)
+    needed = _needed(wanted, asked)
     if needed > (1.0 + MISS) * nodes + FEW:
         raise InputError(
             f"octree: {nodes} nodes are too few for {shape} voxels{limits}: they need {needed:.4g} or more; ask for as "
             "many, or allow longer edges"
         )
-    mesh = _built(image, nodes, asked)
+    mesh = _built(wanted, nodes, asked)
     count = len(mesh.points)
-    if is_near(count, nodes):
+    if is_near(count, nodes) or (wanted.region is not None and 2 * count >= nodes):  # exchanges take care of the rest
         return mesh
     raise InputError(
         f"octree: {nodes} nodes are too {'many' if count < nodes else 'few'} for {shape} voxels{limits}: the nearest "
@@ -96,8 +99,9 @@ class _Limits(NamedTuple):
     rings: int
 
 
-def _limits(image: Image, nodes: int, sizes: Sizes | None) -> _Limits:
+def _limits(wanted: Content, nodes: int, sizes: Sizes | None) -> _Limits:
     """What the number of nodes and the sizes ask for; InputError where they cannot be."""
+    image = wanted.image
     n = image.ndim
     fewest = 2**n + 1
     if not (isinstance(nodes, int | np.integer) and nodes >= fewest):
@@ -110,7 +114,7 @@ def _limits(image: Image, nodes: int, sizes: Sizes | None) -> _Limits:
     if sizes.smallest > longest_side:
         raise InputError(f"size_min: {sizes.smallest:g} mm is longer than the box, {longest_side:.4g} mm")
     smallest = sizes.smallest / SHORT[n]
-    most = max(sizes.at_most(image, nodes) / DIAGONAL[n], smallest)
+    most = max(sizes.at_most(image, nodes, wanted.volume) / DIAGONAL[n], smallest)
     bound = sizes.on_voxels(image)
     if bound is not None:
         if bound.min() >= NO_BOUND:
@@ -119,13 +123,15 @@ def _limits(image: Image, nodes: int, sizes: Sizes | None) -> _Limits:
     return _Limits(most, bound, smallest, int(np.ceil(1.0 / sizes.gradation - 1e-9)))
 
 
-def _needed(image: Image, asked: _Limits) -> float:
+def _needed(wanted: Content, asked: _Limits) -> float:
     """A lower bound of the nodes that the limits ask for: two for each block as large as it may be."""
+    n = wanted.image.ndim
     if asked.bound is None:
-        return 2.0 * image.volume / asked.most**image.ndim
+        return 2.0 * wanted.volume / asked.most**n
     with np.errstate(over="ignore"):
-        edges = np.minimum(asked.bound, asked.most).astype(np.float64)
-        return 2.0 * image.voxel_volume * float((edges**-image.ndim).sum())
+        bound = asked.bound if wanted.region is None else asked.bound[wanted.region.inside]
+        edges = np.minimum(bound, asked.most).astype(np.float64)
+        return 2.0 * wanted.image.voxel_volume * float((edges**-n).sum())
 
 
 def is_near(count: int, nodes: int) -> bool:
@@ -133,18 +139,35 @@ def is_near(count: int, nodes: int) -> bool:
     return abs(count - nodes) <= max(MISS * nodes, FEW)
 
 
-def nearest_octree(image: Image, nodes: int, sizes: Sizes | None = None) -> Mesh:
+def nearest_octree(image: Image | Content, nodes: int, sizes: Sizes | None = None) -> Mesh:
     """As `octree`, but with any number of nodes, if the image or the limits on sizes allow no nearer one."""
-    return _built(image, nodes, _limits(image, nodes, sizes))
+    return _built(plain(image), nodes, _limits(plain(image), nodes, sizes))
 
 
-def _built(image: Image, nodes: int, asked: _Limits) -> Mesh:
-    """The octree within the limits that has nearly as many nodes as wanted."""
-    if _needed(image, asked) > max(image.data.size, MOST_ANYHOW):
+def _built(wanted: Content, nodes: int, asked: _Limits) -> Mesh:
+    """The octree within the limits that has nearly as many nodes as wanted, cut off at the mask's surface."""
+    mesh = _of_box(wanted, nodes, asked)
+    if wanted.region is None:
+        return mesh
+    asked_for, kept = nodes, clipped(mesh, wanted.image, wanted.region)
+    for _ in range(AGAIN):  # the surface takes away nodes and adds others, how many is seen afterwards
+        if abs(len(kept.points) - nodes) <= ENOUGH * nodes:
+            break
+        asked_for = max(int(asked_for * nodes / len(kept.points)), 2**wanted.image.ndim + 1)
+        new = clipped(_of_box(wanted, asked_for, asked), wanted.image, wanted.region)
+        if abs(len(new.points) - nodes) >= abs(len(kept.points) - nodes):
+            break
+        kept = new
+    return kept
+
+
+def _of_box(wanted: Content, nodes: int, asked: _Limits) -> Mesh:
+    image = wanted.image
+    if _needed(wanted, asked) > max(image.data.size, MOST_ANYHOW):
         raise InputError(
             "sizes: so short edges are asked for that cells are below voxels, and see nothing; allow longer ones"
         )
-    roots, divided = _closest(image, nodes, asked)
+    roots, divided = _closest(wanted, nodes, asked)
     index = _places(divided, roots) / np.array(roots) * image.shape - 0.5
     points = image.to_world(index)
     for tie_break in TIE_BREAKS:
@@ -154,37 +177,29 @@ def _built(image: Image, nodes: int, asked: _Limits) -> Mesh:
     raise InputError(f"octree: Delaunay left flat cells on {len(index)} nodes; ask for another number")
 
 
-def noise_level(data: NDArray[np.floating]) -> float:
-    """Standard deviation of the noise in an image's data, from what second differences along every axis leave of it.
+class _Voxels(NamedTuple):
+    """What blocks are summed over."""
 
-    Structure wider than a voxel cancels in (1, -2, 1) taken along all axes (Immerkaer 1996, here in n-D); the lower
-    quartile of its size is that of noise in most of the volume. A background of one value, cut out, does not count;
-    what is left in less than a tenth of the voxels are edges, not noise, and labels have none. Noise that was smoothed
-    is underestimated.
-    """
-    if min(data.shape) < 3:
-        return 0.0
-    rest = data.astype(np.float64)
-    for axis in range(data.ndim):
-        rest = np.diff(rest, n=2, axis=axis)
-    # Few values are labels, and have none.
-    values, often = np.unique(data.ravel()[:: max(data.size // SAMPLE, 1)], return_counts=True)
-    if len(values) <= LABELS:
-        return 0.0
-    is_background = data[(slice(1, -1),) * data.ndim] == values[often.argmax()]
-    size = np.abs(rest[(rest != 0.0) | ~is_background])
-    if np.count_nonzero(size) < 0.1 * rest.size:
-        return 0.0
-    return float(np.quantile(size, 0.25) / 0.31864 / 6.0 ** (data.ndim / 2))
+    sums: list[NDArray[np.float64]]  # of each voxel: 1, all channels' squares, and each channel; 0 outside of the mask
+    outside: NDArray[np.float64] | None  # 1 for each voxel outside of the mask
+    noise: float  # variance
+    step: float  # squared difference between the two sides of the mask's surface
 
 
-def _scaled(image: Image) -> NDArray[np.float64]:
-    """The image less its mean, at most 1: numbers of nodes do not depend on the unit of intensity."""
-    data = image.data.astype(np.float64) - float(np.mean(image.data, dtype=np.float64))
-    scale = float(np.abs(data).max())
-    if not np.isfinite(scale * scale * data.size):
+def _voxels(wanted: Content) -> _Voxels:
+    """The channels less their means, at most 1: numbers of nodes do not depend on the unit of intensity."""
+    channels = [v.astype(np.float64) - float(np.mean(v, dtype=np.float64)) for v in wanted.values]
+    scale = max(float(np.abs(channel).max()) for channel in channels)
+    if not np.isfinite(scale * scale * channels[0].size):
         raise InputError(f"image: squares of deviations up to {scale:.3g} overflow; rescale it first")
-    return data / scale if scale > 0.0 else data
+    scale = scale or 1.0
+    inside = np.ones(wanted.image.shape) if wanted.region is None else wanted.region.inside.astype(np.float64)
+    channels = [inside * channel / scale for channel in channels]
+    square = sum(channel * channel for channel in channels)
+    step = wanted.wrong_side / scale**2
+    # The noise is that of values at most 1, too: its estimate rounds differently otherwise.
+    noise = wanted._replace(values=np.stack(channels)).noise
+    return _Voxels([inside, square, *channels], None if wanted.region is None else 1.0 - inside, noise, step)
 
 
 class _Blocks(NamedTuple):
@@ -192,11 +207,11 @@ class _Blocks(NamedTuple):
 
     error: NDArray[np.float64]  # sums of squared deviations less the noise's, and the spread
     is_too_large: NDArray[np.bool_]  # must be divided
+    is_wanted: NDArray[np.bool_]  # whether it lies in the mask, in part at least
 
 
 def _levels(
-    image: Image, data: NDArray[np.float64], variance: float, roots: tuple[int, ...], bound: NDArray | None,
-    most: float, smallest: float,
+    image: Image, voxels: _Voxels, roots: tuple[int, ...], bound: NDArray | None, most: float, smallest: float
 ) -> list[_Blocks]:  # fmt: skip
     """The blocks of each level, the coarsest first; their edges are to be up to `bound` at each voxel, and `most`."""
     edge = image.spacing * image.shape / np.array(roots)
@@ -210,21 +225,27 @@ def _levels(
         and (half / image.spacing).max() >= 1.0
     ):
         n_levels += 1
-    spread = SPREAD * float(np.mean(data * data)) + SPREAD_OF_NOISE * variance
-    sums = [np.ones(image.shape), data, data * data]
-    sums = [_blocks(total, np.array(roots) << n_levels, np.add) for total in sums]
+    variance = voxels.noise
+    spread = SPREAD * float(voxels.sums[1].sum() / voxels.sums[0].sum()) + SPREAD_OF_NOISE * variance
+    every = voxels.sums if voxels.outside is None else [*voxels.sums, voxels.outside]
+    sums = [_blocks(total, np.array(roots) << n_levels, np.add) for total in every]
     longest = np.full(sums[0].shape, most)
     if bound is not None:
         longest = np.minimum(most, _blocks(bound, np.array(roots) << n_levels, np.minimum, NO_BOUND))
     found = []
     for level in range(n_levels, -1, -1):
-        count, first, second = sums
+        count, second, *firsts = sums[: len(voxels.sums)]
         free = np.maximum(count - 1.0, 0.0)
         noise = variance * (free + MARGIN * np.sqrt(2.0 * free))  # a chi-squared sum, and deviations of it
-        error = np.maximum(second - first**2 / np.maximum(count, 1.0) - noise, 0.0)
+        squares = sum(first**2 for first in firsts)
+        error = np.maximum(second - squares / np.maximum(count, 1.0) - noise, 0.0)
+        if voxels.outside is not None:
+            error += voxels.step * count * sums[-1] / np.maximum(count + sums[-1], 1.0)
         may_be_divided = edge.min() / 2 ** (level + 1) >= smallest
         is_too_large = (longest * (1.0 + 1e-9) < edge.max() / 2**level) & may_be_divided
-        found.append(_Blocks((error + spread * count) * _uneven(error.shape) * (level < n_content), is_too_large))
+        is_wanted = count > 0.0 if voxels.outside is not None else np.ones(count.shape, dtype=bool)
+        error = (error + spread * count) * _uneven(error.shape) * (level < n_content)
+        found.append(_Blocks(error, is_too_large & is_wanted, is_wanted))
         if level > 0:
             half = np.array(count.shape) // 2
             sums = [_blocks(total, half, np.add) for total in sums]
@@ -261,20 +282,19 @@ def _blocks(data: NDArray, counts: NDArray[np.int64], total_of: np.ufunc, empty:
     return data
 
 
-def _closest(image: Image, nodes: int, asked: _Limits) -> tuple[tuple[int, ...], list[NDArray[np.bool_]]]:
+def _closest(wanted: Content, nodes: int, asked: _Limits) -> tuple[tuple[int, ...], list[NDArray[np.bool_]]]:
     """Blocks undivided and those divided, of the octree that has nearly as many nodes as wanted.
 
     Where many blocks are alike, they are all divided or none, and some numbers cannot be reached from one size of
     undivided blocks: then others are tried, at last the lattice that has the number by itself.
     """
     best: tuple[int, tuple[int, ...], list[NDArray[np.bool_]]] | None = None
-    data = _scaled(image)
-    variance = noise_level(data) ** 2
+    image, voxels = wanted.image, _voxels(wanted)
     most, bound, smallest, rings = asked
     for roots in _roots(image, nodes, most, smallest):
         if (np.array(image.shape) / roots).max() < SMALLEST and best is not None:
             break
-        levels = _levels(image, data, variance, roots, bound, most, smallest)
+        levels = _levels(image, voxels, roots, bound, most, smallest)
         if levels[-1].is_too_large.any():
             continue
         count, divided = _nearest(levels, roots, nodes, rings)
@@ -315,7 +335,7 @@ def _nearest(
     for _ in range(STEPS):
         middle = np.sqrt(max(low, 1e-300) * high)
         divided = _divided(levels, middle, rings)
-        count = len(_places(divided, roots))
+        count = len(_places(divided, roots, [blocks.is_wanted for blocks in levels]))
         if best < 0 or abs(count - nodes) < abs(best - nodes):
             best, found = count, divided
         if abs(count - nodes) <= NEAR * nodes or high <= low * (1.0 + 1e-9):
@@ -338,8 +358,13 @@ def _divided(levels: list[_Blocks], threshold: float, rings: int) -> list[NDArra
     return divided
 
 
-def _places(divided: list[NDArray[np.bool_]], roots: tuple[int, ...]) -> NDArray[np.float64]:
-    """Corners and centres of the leaves, (N, n), in units of an undivided block; each once, in lexicographic order."""
+def _places(
+    divided: list[NDArray[np.bool_]], roots: tuple[int, ...], is_wanted: list[NDArray[np.bool_]] | None = None
+) -> NDArray[np.float64]:
+    """Corners and centres of the leaves, (N, n), in units of an undivided block; each once, in lexicographic order.
+
+    Only of those leaves that are wanted, by level, where that is given.
+    """
     n, depth = len(roots), len(divided)
     corner = np.stack(np.meshgrid(*[[0, 2]] * n, indexing="ij"), axis=-1).reshape(-1, n)
     of_leaf = np.vstack([corner, np.ones((1, n), dtype=np.int64)])  # in halves of a leaf
@@ -347,7 +372,8 @@ def _places(divided: list[NDArray[np.bool_]], roots: tuple[int, ...]) -> NDArray
     ticks = []  # in halves of the smallest leaves
     for level in range(depth + 1):
         is_divided = divided[level] if level < depth else np.zeros(exists.shape, dtype=bool)
-        leaves = np.argwhere(exists & ~is_divided)
+        is_leaf = exists & ~is_divided
+        leaves = np.argwhere(is_leaf if is_wanted is None else is_leaf & is_wanted[level])
         ticks.append(((2 * leaves[:, None, :] + of_leaf) << (depth - level)).reshape(-1, n))
         exists = is_divided
         for axis in range(n):

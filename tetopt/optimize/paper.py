@@ -218,24 +218,29 @@ def deadline(begin: float, max_seconds: float | None, stop: Callable[[], bool] |
 
 
 def frozen_axes(
-    image: Image, ticks: NDArray[np.int64], cells: NDArray[np.int64], grid: SamplingGrid, boundary: Boundary
-) -> NDArray[np.bool_]:
-    """Index axes along which each node must stay, (N, 3) bool; the leading axis of a 2-D image counts as free.
+    image: Image, ticks: NDArray[np.int64], cells: NDArray[np.int64], grid: SamplingGrid, boundary: Boundary,
+    has_surface: bool = False,
+) -> NDArray[np.bool_]:  # fmt: skip
+    """Index axes along which each node must stay, (N, 4) bool; the leading axis of a 2-D image counts as free.
 
     A node on a face of the box, index -0.5 or shape - 0.5, keeps its coordinate across it. A node of a boundary
-    facet that lies on no face of the box keeps all of them, as every boundary node does with "fixed".
+    facet that lies on no face of the box keeps all of them, as every boundary node does with "fixed"; or, with a
+    surface on which such nodes slide, is marked in the last column.
     """
     n = image.ndim
-    is_frozen = np.zeros((len(ticks), 3), dtype=bool)
+    is_frozen = np.zeros((len(ticks), 4), dtype=bool)
     facets_out = boundary_facets(cells)
     if boundary == "fixed":
-        is_frozen[facets_out.ravel()] = True
+        is_frozen[facets_out.ravel(), :3] = True
         return is_frozen
     is_on_box = np.zeros(len(facets_out), dtype=bool)
     for axis, is_there in _on_box_sides(ticks, facets_out, grid, n):
         is_on_box |= is_there
         is_frozen[facets_out[is_there].ravel(), axis] = True
-    is_frozen[facets_out[~is_on_box].ravel()] = True
+    if has_surface:
+        is_frozen[facets_out[~is_on_box].ravel(), 3] = True
+    else:
+        is_frozen[facets_out[~is_on_box].ravel(), :3] = True
     return is_frozen
 
 

@@ -25,7 +25,7 @@ from tetopt.optimize.complex import (
     outward,
     tet_quality,
 )
-from tetopt.optimize.density import Sides, mend
+from tetopt.optimize.density import mend
 from tetopt.optimize.flips import (
     EDGES,
     MOST,
@@ -39,7 +39,8 @@ from tetopt.optimize.flips import (
     remove_edge,
     ring_of_edge,
 )
-from tetopt.optimize.smooth import ring_energy, store
+from tetopt.optimize.smooth import ring_energy, slid, store
+from tetopt.optimize.surface import Sides
 
 ROUNDS = 40
 STEPS = 7  # halvings of a node's displacement
@@ -49,7 +50,7 @@ class Repaired(NamedTuple):
     """What `repair` returns."""
 
     held: Complex
-    is_frozen: NDArray[np.bool_]  # (N', 3)
+    is_frozen: NDArray[np.bool_]  # (N', 4)
     source: NDArray[np.int64]  # (N',) number of each node before; -1 for new ones
     n_below: int  # cells still under the floor
     n_moves: int
@@ -69,10 +70,7 @@ def _fill_qualities(found: NDArray, held: Complex, measure: Measure) -> None:
         found[cell] = cell_quality(x, held, cell, measure)
 
 
-def repair(
-    held: Complex, is_frozen: NDArray[np.bool_], measure: Measure, projections: NDArray[np.float64], sides: Sides,
-    floor: float,
-) -> Repaired:  # fmt: skip
+def repair(held: Complex, is_frozen: NDArray[np.bool_], measure: Measure, sides: Sides, floor: float) -> Repaired:
     """Lift every cell's smallest dihedral angle to `floor`, degrees, as far as moves can.
 
     Rounds over the cells below, worst first: flips, then displacements of their nodes, and where neither helps nodes
@@ -90,7 +88,7 @@ def repair(
         made = _reconnect(held, bad, measure, target)
         bad = _worst_first(held, measure, target)
         if len(bad):
-            made += _displace(held, node_rings(held), bad, is_frozen, measure, projections, target)
+            made += _displace(held, node_rings(held), bad, is_frozen, measure, sides, target)
         bad = _worst_first(held, measure, target)
         if made == 0 and len(bad):
             done = mend(held, is_frozen, measure, sides, bad, target)
@@ -117,7 +115,7 @@ def _worst_first(held: Complex, measure: Measure, target: float) -> NDArray[np.i
 def _reconnect(held: Complex, bad: NDArray, measure: Measure, target: float) -> int:
     """For each bad cell the flip that leaves the best worst angle in its cavity, if it is better than before."""
     room = len(held.cells)
-    work = cavity(room)
+    work = cavity(room, held.fluxes.shape[2])
     is_changed = np.zeros(room, dtype=np.bool_)
     made = 0
     for number in range(len(bad)):
@@ -213,9 +211,8 @@ def _gain_of_edge(
 
 @njit(cache=True, error_model="numpy")
 def _displace(
-    held: Complex, rings: NodeRings, bad: NDArray, is_frozen: NDArray, measure: Measure, projections: NDArray,
-    target: float,
-) -> int:  # fmt: skip
+    held: Complex, rings: NodeRings, bad: NDArray, is_frozen: NDArray, measure: Measure, sides: Sides, target: float
+) -> int:
     """Move the nodes of each bad cell so that the worst angle of their rings grows, up to the target."""
     x = np.empty((4, 3))
     made = 0
@@ -223,7 +220,7 @@ def _displace(
         for k in range(4):
             if cell_quality(x, held, bad[number], measure) >= target:
                 break
-            if _lift(x, held, rings, held.cells[bad[number], k], is_frozen, measure, projections, target):
+            if _lift(x, held, rings, held.cells[bad[number], k], is_frozen, measure, sides, target):
                 made += 1
     return made
 
@@ -242,7 +239,7 @@ def _ring_quality(x: NDArray, held: Complex, rings: NodeRings, node: int, measur
 
 @njit(cache=True, error_model="numpy")
 def _lift(
-    x: NDArray, held: Complex, rings: NodeRings, node: int, is_frozen: NDArray, measure: Measure, projections: NDArray,
+    x: NDArray, held: Complex, rings: NodeRings, node: int, is_frozen: NDArray, measure: Measure, sides: Sides,
     target: float,
 ) -> bool:  # fmt: skip
     """Search along 26 directions, with ever smaller steps, for a place where the ring's worst angle is larger."""
@@ -263,7 +260,8 @@ def _lift(
                 edge += np.sqrt((x[k, 0] - x[at, 0]) ** 2 + (x[k, 1] - x[at, 1]) ** 2 + (x[k, 2] - x[at, 2]) ** 2)
                 count += 1
     step = 0.25 * edge / count
-    P = projections[is_frozen[node, 0] + 2 * is_frozen[node, 1] + 4 * is_frozen[node, 2]]
+    P = sides.projections[is_frozen[node, 0] + 2 * is_frozen[node, 1] + 4 * is_frozen[node, 2]]
+    normal, slides = np.empty((2, 3)), is_frozen[node, 3]
     scale = 2.0**-measure.bits
     for _ in range(STEPS):
         improved = True
@@ -279,6 +277,8 @@ def _lift(
                 t[node, 0] = here0 + np.int64(np.rint(size * (P[0, 0] * d0 + P[0, 1] * d1 + P[0, 2] * d2)))
                 t[node, 1] = here1 + np.int64(np.rint(size * (P[1, 0] * d0 + P[1, 1] * d1 + P[1, 2] * d2)))
                 t[node, 2] = here2 + np.int64(np.rint(size * (P[2, 0] * d0 + P[2, 1] * d1 + P[2, 2] * d2)))
+                if slides and not slid(x, normal, held, rings, node, is_frozen, sides, measure):
+                    continue
                 quality = _ring_quality(x, held, rings, node, measure, best)
                 if quality > best + 1e-4:
                     best = quality
@@ -289,7 +289,7 @@ def _lift(
     if best <= begin:
         t[node, 0], t[node, 1], t[node, 2] = start0, start1, start2
         return False
-    trial, fluxes = np.empty(last - first), np.empty((last - first, 4, 3))
+    trial, fluxes = np.empty(last - first), np.empty((last - first, 4, held.fluxes.shape[2]))
     if not np.isfinite(ring_energy(np.inf, -1.0, trial, fluxes, x, node, held, rings, measure)):
         t[node, 0], t[node, 1], t[node, 2] = start0, start1, start2
         return False

@@ -71,12 +71,14 @@ class Sizes(NamedTuple):
             raise InputError("sizing: no voxel is above 0; give lengths in mm")
         return self if self.field is None else self._replace(field=_graded(self.field, self.gradation))
 
-    def at_most(self, image: Image, nodes: int) -> float:
-        """The longest edge of any cell, mm."""
+    def at_most(self, image: Image, nodes: int, volume: float | None = None) -> float:
+        """The longest edge of any cell, mm; `volume`, mm^n, is what the mesh covers, by default the image's box."""
         if self.largest is not None:
             return self.largest
         lengths = image.spacing * image.shape
         kind, fewest = ("bcc", 9) if image.ndim == 3 else ("criss-cross", 5)
+        if volume is not None:  # nodes of a lattice of the whole box
+            nodes = int(nodes * image.volume / volume)
         uniform = float((lengths / near_cubes(kind, lengths, max(nodes, fewest))).max())
         return DIAGONAL[image.ndim] * max(COARSEST * uniform, self.smallest / SHORT[image.ndim])
 
@@ -91,9 +93,11 @@ class Sizes(NamedTuple):
             )
         )
 
-    def longest(self, image: Image, nodes: int, points: NDArray, cells: NDArray, own: NDArray) -> NDArray[np.float64]:
+    def longest(
+        self, image: Image, nodes: int, points: NDArray, cells: NDArray, own: NDArray, volume: float | None = None
+    ) -> NDArray[np.float64]:
         """The longest edge that a cell at each node may be given, (N,) mm; `own` (N,) is the mean size there now."""
-        bound = np.full(len(points), self.at_most(image, nodes))
+        bound = np.full(len(points), self.at_most(image, nodes, volume))
         if self.field is not None:
             index, last = self.field.to_index(points), np.array(self.field.shape) - 1
             inside = ((index >= -0.5 - 1e-6) & (index <= last + 0.5 + 1e-6)).all(axis=1)

@@ -27,15 +27,17 @@ from tetopt.optimize.complex import (
     Measure,
     NodeRings,
     cell_energy,
-    flux_of,
     has_node,
     image_energy,
     load_cell,
     outward,
+    put_flux,
     quality_up_to,
     shape_of_cell,
     sum_up,
+    wrong_side,
 )
+from tetopt.optimize.surface import Sides, normal_at, put_on_surface, ring_faces_up
 
 POINTS = 8  # most parts that a facet's edge is cut into when h is integrated over it
 SPACING = 2.0  # voxels between such points
@@ -71,20 +73,19 @@ def blocks(ticks: NDArray[np.int64]) -> Blocks:
 
 def sweep(
     held: Complex, rings: NodeRings, groups: Blocks, is_wanted: NDArray[np.bool_], is_frozen: NDArray[np.bool_],
-    measure: Measure, projections: NDArray[np.float64], is_over: Callable[[], bool] = lambda: False,
+    measure: Measure, sides: Sides, is_over: Callable[[], bool] = lambda: False,
 ) -> bool:  # fmt: skip
-    """Move the nodes that are wanted, (N,); `projections` are `free_projections(matrix)`.
+    """Move the nodes that are wanted, (N,); `is_frozen` (N, 4): axes along which each stays, whether on the surface.
 
     Groups of one colour share no cell, and are worked on at the same time, their nodes one after the other: those read
     the same voxels, 1.5 to 2 times faster from the cache than nodes of one colour all over the volume. Returns False if
     `is_over` cut it short, between two colours.
     """
-    inverse = np.linalg.inv(measure.matrix)
     for chosen in colours_of(held, rings, groups):
         if is_over():
             return False
         with few_threads(len(chosen) * BLOCK * 100):
-            _sweep(held, rings, groups, chosen, is_wanted, is_frozen, measure, projections, inverse)
+            _sweep(held, rings, groups, chosen, is_wanted, is_frozen, measure, sides)
     return True
 
 
@@ -118,17 +119,21 @@ def gradient(held: Complex, rings: NodeRings, measure: Measure) -> tuple[NDArray
 
 
 @njit(cache=True, error_model="numpy")
-def _facet_moments(ticks: NDArray, node: int, b: int, c: int, measure: Measure) -> tuple:
+def _facet_moments(moment: NDArray, ticks: NDArray, node: int, b: int, c: int, measure: Measure) -> float:
     """Means of phi and h phi over the facet (node, b, c), or the segment (node, b), phi the node's hat function.
 
-    h is the voxel's value less the grid's shift; 1/3 (1/2 in 2-D) is the mean of phi itself.
+    Those of h phi go to `moment` (n_channels,), h a voxel's values less the grid's shift; 1/3 (1/2 in 2-D) is the mean
+    of phi itself.
     """
     prefix = measure.prefix
+    n_more = measure.n_channels - 1
+    for d in range(1 + n_more):
+        moment[d] = 0.0
     scale = 2.0**-measure.bits
     a0, a1, a2 = ticks[node, 0] * scale, ticks[node, 1] * scale, ticks[node, 2] * scale
     e0, e1, e2 = ticks[b, 0] * scale - a0, ticks[b, 1] * scale - a1, ticks[b, 2] * scale - a2
     most_i, most_j, most_k = prefix.shape[0] - 1, prefix.shape[1] - 1, prefix.shape[2] - 2
-    weight, moment = 0.0, 0.0
+    weight, first = 0.0, 0.0
     if c < 0:
         length = np.sqrt(e1 * e1 + e2 * e2)
         parts = min(max(int(length / SPACING) + 1, 2), 4 * POINTS)
@@ -138,8 +143,11 @@ def _facet_moments(ticks: NDArray, node: int, b: int, c: int, measure: Measure) 
             k = min(max(int(np.rint(a2 + s * e2)), 0), most_k)
             phi = 1.0 - s
             weight += phi
-            moment += phi * (prefix[0, j, k + 1, 0] - prefix[0, j, k, 0])
-        return weight / parts, moment / parts
+            first += phi * (prefix[0, j, k + 1, 0] - prefix[0, j, k, 0])
+            for d in range(n_more):
+                moment[1 + d] += phi * (prefix[0, j, k + 1, 2 + d] - prefix[0, j, k, 2 + d]) / parts
+        moment[0] = first / parts
+        return weight / parts
     f0, f1, f2 = ticks[c, 0] * scale - a0, ticks[c, 1] * scale - a1, ticks[c, 2] * scale - a2
     longest = max(e0 * e0 + e1 * e1 + e2 * e2, f0 * f0 + f1 * f1 + f2 * f2)
     parts = min(max(int(np.sqrt(longest) / SPACING) + 1, 2), POINTS)
@@ -155,8 +163,11 @@ def _facet_moments(ticks: NDArray, node: int, b: int, c: int, measure: Measure) 
                 k = min(max(int(np.rint(a2 + s * e2 + t * f2)), 0), most_k)
                 phi = 1.0 - s - t
                 weight += phi
-                moment += phi * (prefix[i, j, k + 1, 0] - prefix[i, j, k, 0])
-    return weight / (parts * parts), moment / (parts * parts)
+                first += phi * (prefix[i, j, k + 1, 0] - prefix[i, j, k, 0])
+                for d in range(n_more):
+                    moment[1 + d] += phi * (prefix[i, j, k + 1, 2 + d] - prefix[i, j, k, 2 + d]) / (parts * parts)
+    moment[0] = first / (parts * parts)
+    return weight / (parts * parts)
 
 
 @njit(cache=True, error_model="numpy")
@@ -168,6 +179,7 @@ def _add_image_gradient(
     scale = 2.0**-measure.bits
     first = rings.start[node]
     t = held.ticks
+    moment = np.empty(measure.n_channels)
     g0, g1, g2 = 0.0, 0.0, 0.0
     for r in range(first, rings.start[node + 1]):
         cell = rings.cells[r]
@@ -179,13 +191,16 @@ def _add_image_gradient(
             count_1, count_2 = held.sums[cell, 0], held.sums[other, 0]
             if count_1 <= 0.0 or count_2 <= 0.0:
                 continue
-            mean_1, mean_2 = held.sums[cell, 1] / count_1, held.sums[other, 1] / count_2
-            if mean_1 == mean_2:  # as between cells of the background
+            is_same = True  # as between cells of the background
+            for channel in range(measure.n_channels):
+                d = 1 if channel == 0 else 2 + channel
+                is_same = is_same and held.sums[cell, d] * count_2 == held.sums[other, d] * count_1
+            if is_same:
                 continue
             a, b, c = outward(held.cells, cell, k)
             if n == 3:  # the segment (a, b), its normal to the right; phi of `node`
                 far = b if a == node else a
-                weight, moment = _facet_moments(t, node, far, -1, measure)
+                weight = _facet_moments(moment, t, node, far, -1, measure)
                 n1, n2 = (t[b, 2] - t[a, 2]) * scale, -(t[b, 1] - t[a, 1]) * scale
                 n0 = 0.0
             else:
@@ -193,11 +208,15 @@ def _add_image_gradient(
                     a, b, c = b, c, a
                 elif c == node:
                     a, b, c = c, a, b
-                weight, moment = _facet_moments(t, node, b, c, measure)
+                weight = _facet_moments(moment, t, node, b, c, measure)
                 e0, e1, e2 = (t[b, 0] - t[a, 0]) * scale, (t[b, 1] - t[a, 1]) * scale, (t[b, 2] - t[a, 2]) * scale
                 f0, f1, f2 = (t[c, 0] - t[a, 0]) * scale, (t[c, 1] - t[a, 1]) * scale, (t[c, 2] - t[a, 2]) * scale
                 n0, n1, n2 = 0.5 * (e1 * f2 - e2 * f1), 0.5 * (e2 * f0 - e0 * f2), 0.5 * (e0 * f1 - e1 * f0)
-            jump = (mean_2 - mean_1) * (2.0 * moment - (mean_1 + mean_2) * weight)
+            jump = 0.0
+            for channel in range(measure.n_channels):
+                d = 1 if channel == 0 else 2 + channel
+                mean_1, mean_2 = held.sums[cell, d] / count_1, held.sums[other, d] / count_2
+                jump += (mean_2 - mean_1) * (2.0 * moment[channel] - (mean_1 + mean_2) * weight)
             g0 += jump * n0
             g1 += jump * n1
             g2 += jump * n2
@@ -266,14 +285,23 @@ def ring_energy(
     limit: float, least: float, trial: NDArray, fluxes: NDArray, x: NDArray, node: int, held: Complex,
     rings: NodeRings, measure: Measure, joined: int = -1,
 ) -> float:  # fmt: skip
-    """Energy of a node's ring as the ticks stand; shapes and facet fluxes go to `trial` (R,), `fluxes` (R, n+1, 3).
+    """Energy of a node's ring as the ticks stand; shapes and facet fluxes go to `trial` (R,), `fluxes` (R, n+1, D).
 
     Infinite if a cell is flat or inverted or has a quality under `least`, or once the energy is above `limit`. Cells
-    that have the node `joined`, at whose place the node is, count as gone; their shape is -1.
+    that have the node `joined`, at whose place the node is, count as gone; their shape is -1. What the ring's misfit
+    to the mask is more than it was is added.
     """
-    n = held.cells.shape[1]
+    n, D = held.cells.shape[1], held.sums.shape[1]
     first, last = rings.start[node], rings.start[node + 1]
-    energy = 0.0
+    energy, misfit, has_misfit = 0.0, 0.0, False
+    if measure.surface > 0.0:
+        for r in range(first, last):
+            misfit -= wrong_side(held.sums, rings.cells[r], measure)
+            for k in range(n):
+                has_misfit = has_misfit or (k != rings.corner[r] and rings.twin[r, k] < 0)
+    up_to = limit
+    if has_misfit:  # no sum says anything before all of the misfit is in it
+        limit = np.inf
     for r in range(first, last):  # cheap refusals before any voxel is read
         if joined >= 0 and has_node(held.cells, rings.cells[r], joined):
             trial[r - first] = -1.0
@@ -286,51 +314,50 @@ def ring_energy(
             return np.inf
     if measure.image == 0.0:
         return energy
+    sums = np.empty((1, D))
     for r in range(first, last):
         if trial[r - first] < 0.0:
             continue
         cell = rings.cells[r]
-        s0, s1, s2 = 0.0, 0.0, 0.0
+        for d in range(D):
+            sums[0, d] = 0.0
         for k in range(n):
             if k == rings.corner[r]:
-                f0, f1, f2 = held.fluxes[cell, k, 0], held.fluxes[cell, k, 1], held.fluxes[cell, k, 2]
-            else:
-                twin = rings.twin[r, k]
-                if 0 <= twin and twin // n < r - first and trial[twin // n] >= 0.0:
-                    f0, f1, f2 = fluxes[r - first, k, 0], fluxes[r - first, k, 1], fluxes[r - first, k, 2]
-                else:
-                    a, b, c = outward(held.cells, cell, k)
-                    f0, f1, f2 = flux_of(held.ticks, a, b, c, measure)
-                    fluxes[r - first, k, 0], fluxes[r - first, k, 1], fluxes[r - first, k, 2] = f0, f1, f2
-                    if twin >= 0:
-                        s, m = twin // n, twin % n
-                        fluxes[s, m, 0], fluxes[s, m, 1], fluxes[s, m, 2] = -f0, -f1, -f2
-            s0 += f0
-            s1 += f1
-            s2 += f2
-        energy += measure.image * image_energy(s0, s1, s2)
+                for d in range(D):
+                    sums[0, d] += held.fluxes[cell, k, d]
+                continue
+            twin = rings.twin[r, k]
+            if not (0 <= twin and twin // n < r - first and trial[twin // n] >= 0.0):
+                a, b, c = outward(held.cells, cell, k)
+                put_flux(fluxes, r - first, k, held.ticks, a, b, c, measure)
+                if twin >= 0:
+                    for d in range(D):
+                        fluxes[twin // n, twin % n, d] = -fluxes[r - first, k, d]
+            for d in range(D):
+                sums[0, d] += fluxes[r - first, k, d]
+        energy += measure.image * image_energy(sums, 0, measure.n_channels)
+        misfit += wrong_side(sums, 0, measure)
         if energy > limit:
             return np.inf
-    return energy
+    if has_misfit:
+        energy += misfit
+    return energy if energy <= up_to else np.inf
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def _sweep(
     held: Complex, rings: NodeRings, groups: Blocks, chosen: NDArray, is_wanted: NDArray, is_frozen: NDArray,
-    measure: Measure, projections: NDArray, inverse: NDArray,
+    measure: Measure, sides: Sides,
 ) -> None:  # fmt: skip
     for number in prange(len(chosen)):
         block = np.int64(chosen[number])
         for at in range(groups.start[block], groups.start[block + 1]):
             if is_wanted[groups.nodes[at]]:
-                _move(groups.nodes[at], held, rings, is_frozen, measure, projections, inverse)
+                _move(groups.nodes[at], held, rings, is_frozen, measure, sides)
 
 
 @njit(cache=True, error_model="numpy")
-def _move(
-    node: int, held: Complex, rings: NodeRings, is_frozen: NDArray, measure: Measure, projections: NDArray,
-    inverse: NDArray,
-) -> None:  # fmt: skip
+def _move(node: int, held: Complex, rings: NodeRings, is_frozen: NDArray, measure: Measure, sides: Sides) -> None:
     """Move one node down the gradient of its ring's energy, if that lowers it."""
     n = held.cells.shape[1]
     scale = 2.0**-measure.bits
@@ -340,10 +367,18 @@ def _move(
     step, moved = np.empty(3), np.empty(3)
     curvature, nearest, least = _add_shape_gradient(g, x, held, rings, node, measure)
     if measure.image > 0.0:
-        _add_image_gradient(g, held, rings, node, measure, inverse)
-    P = projections[is_frozen[node, 0] + 2 * is_frozen[node, 1] + 4 * is_frozen[node, 2]]
+        _add_image_gradient(g, held, rings, node, measure, sides.inverse)
+    P = sides.projections[is_frozen[node, 0] + 2 * is_frozen[node, 1] + 4 * is_frozen[node, 2]]
     for d in range(3):
         step[d] = -(P[d, 0] * g[0] + P[d, 1] * g[1] + P[d, 2] * g[2])  # index units
+    normal, slides = np.empty((2, 3)), is_frozen[node, 3]
+    if slides:  # along the surface
+        rise = normal_at(normal, held.ticks, node, is_frozen, sides, measure)
+        if not rise > 1e-12:
+            return
+        across = (normal[0, 0] * step[0] + normal[0, 1] * step[1] + normal[0, 2] * step[2]) / rise
+        for d in range(3):
+            step[d] -= across * normal[1, d]
     for d in range(3):
         moved[d] = M[d, 0] * step[0] + M[d, 1] * step[1] + M[d, 2] * step[2]  # mm
     square = moved[0] * moved[0] + moved[1] * moved[1] + moved[2] * moved[2]
@@ -357,17 +392,22 @@ def _move(
         energy += cell_energy(held, rings.cells[r], measure)
     # A ring below the floor may stay as it is, but not get worse: hence the ring's own `least`.
     here0, here1, here2 = held.ticks[node, 0], held.ticks[node, 1], held.ticks[node, 2]
+    there0, there1, there2 = here0, here1, here2
     best, best_t = energy, 0.0
     trial, best_trial = np.empty(last - first), np.empty(last - first)
-    fluxes, best_fluxes = np.empty((last - first, n, 3)), np.empty((last - first, n, 3))
+    D = held.fluxes.shape[2]
+    fluxes, best_fluxes = np.empty((last - first, n, D)), np.empty((last - first, n, D))
     for attempt in range(TRIES):
         held.ticks[node, 0] = here0 + np.int64(np.rint(t * step[0] / scale))
         held.ticks[node, 1] = here1 + np.int64(np.rint(t * step[1] / scale))
         held.ticks[node, 2] = here2 + np.int64(np.rint(t * step[2] / scale))
         limit = np.inf if attempt == 0 else best
-        value = ring_energy(limit, least, trial, fluxes, x, node, held, rings, measure)
+        value = np.inf
+        if not slides or slid(x, normal, held, rings, node, is_frozen, sides, measure):
+            value = ring_energy(limit, least, trial, fluxes, x, node, held, rings, measure)
         if value < best:
             best, best_t = value, t
+            there0, there1, there2 = held.ticks[node, 0], held.ticks[node, 1], held.ticks[node, 2]
             trial, best_trial = best_trial, trial
             fluxes, best_fluxes = best_fluxes, fluxes
         if attempt > 0 and best_t > 0.0:
@@ -385,9 +425,6 @@ def _move(
             t = vertex
         else:
             t = min(max(vertex, 0.1 * t), 0.5 * t)
-    there0 = here0 + np.int64(np.rint(best_t * step[0] / scale))
-    there1 = here1 + np.int64(np.rint(best_t * step[1] / scale))
-    there2 = here2 + np.int64(np.rint(best_t * step[2] / scale))
     if best_t == 0.0 and measure.image > 0.0:
         # The gradient is of the continuous image, the energy of its voxels: where a node stalls, ask along the axes.
         for axis in range(4 - n, 3):
@@ -399,6 +436,8 @@ def _move(
                 held.ticks[node, 0] = here0 + (shift if axis == 0 else 0)
                 held.ticks[node, 1] = here1 + (shift if axis == 1 else 0)
                 held.ticks[node, 2] = here2 + (shift if axis == 2 else 0)
+                if slides and not slid(x, normal, held, rings, node, is_frozen, sides, measure):
+                    continue
                 value = ring_energy(best, least, trial, fluxes, x, node, held, rings, measure)
                 if value < best:
                     best, best_t = value, 1.0
@@ -411,6 +450,17 @@ def _move(
 
 
 @njit(cache=True, error_model="numpy")
+def slid(
+    x: NDArray, normal: NDArray, held: Complex, rings: NodeRings, node: int, is_frozen: NDArray, sides: Sides,
+    measure: Measure,
+) -> bool:  # fmt: skip
+    """Bring a moved node back to the surface; whether it got there, and the facets around it face as they should."""
+    if not put_on_surface(normal, held.ticks, node, is_frozen, sides, measure):
+        return False
+    return ring_faces_up(x, normal, held, rings, node, -1, sides, measure)
+
+
+@njit(cache=True, error_model="numpy")
 def store(held: Complex, rings: NodeRings, node: int, shapes: NDArray, fluxes: NDArray, measure: Measure) -> None:
     """Write what `ring_energy` found of a node's ring into the complex."""
     first = rings.start[node]
@@ -420,6 +470,6 @@ def store(held: Complex, rings: NodeRings, node: int, shapes: NDArray, fluxes: N
         if measure.image > 0.0:
             for k in range(held.cells.shape[1]):
                 if k != rings.corner[r]:
-                    for d in range(3):
+                    for d in range(held.fluxes.shape[2]):
                         held.fluxes[cell, k, d] = fluxes[r - first, k, d]
             sum_up(held.sums, held.fluxes, cell)

@@ -156,6 +156,41 @@ def histograms_figure(results: dict[str, Any]) -> Figure:
     return figure
 
 
+def labels_figure(results: dict[str, Any]) -> Figure:
+    """Dice (top) and mean surface distance in mm (bottom) of each label, the largest on the left, a mark a pipeline.
+
+    Medians over the runs; a label that is lost has Dice 0 and no distance. Labels stand in grey bars to hold on to.
+    """
+    finished = _finished(results)
+    voxels = {row["label"]: row["voxels"] for _, p in finished for row in p["median"].get("labels") or ()}
+    order = sorted(voxels, key=lambda label: -voxels[label])
+    figure = Figure(figsize=(max(8.0, 2.0 + 0.32 * len(order)), 7.2), layout="constrained")
+    panels = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+    for axes, name in zip(panels, ("dice", "surface_mean_mm"), strict=True):
+        for k in range(0, len(order), 2):
+            axes.axvspan(k - 0.5, k + 0.5, color="#f1f1f1", zorder=0)
+        for place, (number, pipeline) in enumerate(finished):
+            rows = {row["label"]: row.get(name) for row in pipeline["median"].get("labels") or ()}
+            aside = 0.8 * ((place + 0.5) / len(finished) - 0.5)  # of a column, so that marks do not hide one another
+            points = [(k + aside, rows[label]) for k, label in enumerate(order) if rows.get(label) is not None]
+            axes.plot(
+                [x for x, _ in points], [y for _, y in points], linestyle="none", marker=MARKERS[number % len(MARKERS)],
+                markersize=5, color=PALETTE[number % len(PALETTE)], label=pipeline["title"],
+            )  # fmt: skip
+        axes.grid(axis="y", color="#dddddd", linewidth=0.6)
+    panels[0].set_ylabel("Dice")
+    panels[0].set_ylim(-0.03, 1.03)
+    panels[1].set_ylabel("mean surface distance, mm")
+    panels[1].set_ylim(bottom=0.0)
+    panels[1].set_xlim(-0.5, len(order) - 0.5)
+    panels[1].set_xticks(
+        range(len(order)), [f"{label:.0f} ({voxels[label]:.0f})" for label in order], rotation=90, fontsize=8
+    )
+    panels[1].set_xlabel("label (voxels)")
+    _legend(figure, panels)
+    return figure
+
+
 def curves_figure(results: dict[str, Any]) -> Figure:
     """Errors by number of nodes, logarithmic: a row for each Poisson's ratio, a column for each error.
 

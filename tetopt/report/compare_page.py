@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import html
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,6 +15,8 @@ from tetopt.report.page import paragraph_html, picture_html, section_html, table
 from tetopt.report.viewer import View, views_html
 
 PLOTS = ("histograms", "curves", "tradeoff", "timing")  # stems of the pictures that come after the 3-D views
+BIG = 500  # voxels: labels with more are judged; of smaller ones a mesh of few nodes can only keep some
+UNFOLDED = 12  # labels whose rows are open to see
 Run = dict[str, Any]
 
 
@@ -48,15 +50,16 @@ def save_compare_page(
         What `report.json` holds; every number on the page is one of these, rounded to four digits, or computed from
         them for the rows of label volumes, and nothing is measured here.
     pictures : sequence of (PNG path, caption)
-        Those named as in `PLOTS` come after the 3-D views, the others before.
+        Those named as in `PLOTS` come after the 3-D views, "labels" stands with the labels, the others before.
     views : sequence of View
         Surfaces to turn; without any, the section is left out.
     """
-    before = [picture_html(*each) for each in pictures if Path(each[0]).stem not in PLOTS]
+    of_labels = [picture_html(*each) for each in pictures if Path(each[0]).stem == "labels"]
+    before = [picture_html(*each) for each in pictures if Path(each[0]).stem not in (*PLOTS, "labels")]
     after = [picture_html(*each) for each in pictures if Path(each[0]).stem in PLOTS]
     sections = [
         ("Result", [*_sentences(results), _headline_html(results), *_failures(results)]),
-        ("Labels", _labels_html(results)),
+        ("Labels", _labels_html(results, of_labels)),
         ("The same slice through every mesh", before),
         ("Turn the meshes", [views_html(views)] if views else []),
         ("Shapes, errors by number of nodes, times", after),
@@ -90,10 +93,7 @@ def measures(results: dict[str, Any]) -> list[Measure]:
     ]
     kinds = ("sliver", "cap", "needle", "wedge", "spade")
     rows += [Measure("Shape", f"{kind}s", _at("quality", "kinds", kind), -1) for kind in kinds]
-    rows += [
-        Measure("Labels", "label volume error, largest", _worst_volume, -1, is_derived=True),
-        Measure("Labels", "labels lost", _n_lost, -1, is_derived=True),
-    ]
+    rows += _label_measures(results)
     for nu in _ratios(results):
         rows += _fem_measures(nu)
     return [
@@ -101,6 +101,64 @@ def measures(results: dict[str, Any]) -> list[Measure]:
         Measure("Cost", "wall time, s", _at("seconds_total"), -1),
         Measure("Cost", "peak memory, MB", lambda run: _scaled(run.get("peak_bytes"), 1e-6), -1),
     ]
+
+
+def _label_measures(results: dict[str, Any]) -> list[Measure]:
+    judged = _judged(results)
+
+    def over(of: Callable[[list[float]], float], value: Callable[[Run], Any]) -> Callable[[Run], Any]:
+        def found(run: Run) -> float | None:
+            values = [_number(value(row)) for row in run.get("labels") or () if row["label"] in judged]
+            known = [v for v in values if v is not None]
+            # Without a lost label, which has no surface, the mean over the others would flatter.
+            return of(known) if known and len(known) == len(values) else None
+
+        return found
+
+    def mean(values: list[float]) -> float:
+        return sum(values) / len(values)
+
+    def largest_error(values: list[float]) -> float:
+        return max(map(abs, values))
+
+    rows = [
+        ("mean label Dice", over(mean, _at("dice")), 1),
+        ("smallest label Dice", over(min, _at("dice")), 1),
+        ("mean label surface distance, mm", over(mean, _at("surface_mean_mm")), -1),
+        ("label surface distance p95, mm", over(mean, _at("surface_p95_mm")), -1),
+        ("largest label volume error", over(largest_error, _volume_error), -1),
+        ("labels in more or fewer pieces", over(sum, _is_in_other_pieces), -1),
+        ("labels lost (of any size)", _n_lost, -1),
+    ]
+    return [Measure(f"Labels {_which(results)}", *row, is_derived=True) for row in rows]
+
+
+def _judged(results: dict[str, Any]) -> dict[Any, int]:
+    """Voxels of the labels that are judged: more than `BIG` if any has, and not a given segmentation's background."""
+    voxels = _voxels_by_label(results)
+    if _has_background(results):
+        del voxels[0]
+    return {label: n for label, n in voxels.items() if n > BIG} or voxels
+
+
+def _is_given(results: dict[str, Any]) -> bool:
+    return (results.get("labels") or {}).get("kind") == "given"
+
+
+def _has_background(results: dict[str, Any]) -> bool:
+    return _is_given(results) and {0} < set(_voxels_by_label(results))
+
+
+def _which(results: dict[str, Any]) -> str:
+    """Which labels are judged, in words."""
+    is_big = any(n > BIG for n in _judged(results).values())
+    size = f"above {BIG} voxels" if is_big else "of any size"
+    return f"{size}, background 0 not counted" if _has_background(results) else size
+
+
+def _voxels_by_label(results: dict[str, Any]) -> dict[Any, int]:
+    runs = (run for pipeline in results["pipelines"] for run in pipeline["runs"])
+    return {row["label"]: row["voxels"] for run in runs for row in run.get("labels") or ()}
 
 
 def _fem_measures(nu: str) -> list[Measure]:
@@ -167,14 +225,15 @@ def _at(*keys: str) -> Callable[[Run], Any]:
     return value
 
 
-def _worst_volume(run: Run) -> float | None:
-    """The largest |1 - volume in the mesh / volume in the image| over the labels."""
-    ratios = [_volume_ratio(row) for row in run.get("labels") or ()]
-    return max((abs(ratio - 1.0) for ratio in ratios if ratio is not None), default=None)
+def _volume_error(row: dict[str, Any]) -> float | None:
+    """Of a label in the mesh, as a share of its volume in the image."""
+    found, given = row.get("mesh_volume_mm3"), row.get("volume_mm3")
+    return found / given - 1.0 if given and found is not None else None
 
 
-def _volume_ratio(row: dict[str, Any]) -> float | None:
-    return row["mesh_voxels"] / row["voxels"] if row.get("voxels") and row.get("mesh_voxels") is not None else None
+def _is_in_other_pieces(row: dict[str, Any]) -> bool | None:
+    found, given = row.get("mesh_components"), row.get("components")
+    return None if found is None or given is None else found != given
 
 
 def _n_lost(run: Run) -> int | None:
@@ -265,7 +324,7 @@ def _value_html(pipeline: dict[str, Any], each: Entry) -> str:
 def _sentences(results: dict[str, Any]) -> list[str]:
     """What to read first: where tetopt is best, where it loses and to whom, and what makes that uneven."""
     pipelines = results["pipelines"]
-    words = []
+    words = _label_sentences(results)
     for number, pipeline in enumerate(pipelines):
         if pipeline["kind"] == "tetopt":
             if "median" in pipeline:
@@ -301,7 +360,7 @@ def _verdict(results: dict[str, Any], number: int) -> list[str]:
         if not best:
             continue
         n_judged += 1
-        name = measure.title.removesuffix(", °").removesuffix(", s").removesuffix(", MB")
+        name = measure.title.removesuffix(", °").removesuffix(", s").removesuffix(", MB").removesuffix(", mm")
         if measure.group.startswith("Compression, "):
             name += f" ({measure.group.removeprefix('Compression, ')})"
         if number in best:
@@ -328,6 +387,44 @@ def _verdict(results: dict[str, Any], number: int) -> list[str]:
     return words
 
 
+def _label_sentences(results: dict[str, Any]) -> list[str]:
+    """Of labels that are given: on how many the first tetopt is no worse than each peer, and on which it is."""
+    done = [pipeline for pipeline in results["pipelines"] if "median" in pipeline]
+    ours = [pipeline for pipeline in done if pipeline["kind"] == "tetopt"][:1]
+    peers = [pipeline for pipeline in done if pipeline["kind"] == "peer"]
+    judged = _judged(results)
+    if not _is_given(results) or not judged:
+        return []
+    words = [line for own in ours for peer in peers for line in _label_verdict(own, peer, judged, _which(results))]
+    how = (
+        "tetopt's own meshes, but not those of the paper's scheme, are to show the labels besides the image; E_D and "
+        "the simulation judge the image alone."
+    )
+    return [*words, paragraph_html(how)] if ours else []
+
+
+def _label_verdict(ours: dict[str, Any], peer: dict[str, Any], judged: Iterable[Any], which: str) -> Iterator[str]:
+    pairs = {label: (_of_label(ours, label), _of_label(peer, label)) for label in judged}
+    dice = [(round(own.dice or 0.0, 4), round(other.dice or 0.0, 4), label) for label, (own, other) in pairs.items()]
+    worse = sorted((row for row in dice if row[0] < row[1]), key=lambda row: row[0] - row[1])
+    farther = [label for label, (own, other) in pairs.items() if _is_farther(own.surface_mean, other.surface_mean)]
+    title, other = html.escape(ours["title"]), html.escape(peer["title"])
+    yield (
+        f"<p><strong>Of {len(pairs)} labels {which}, {title}'s Dice is at least {other}'s on {len(pairs) - len(worse)}"
+        f"</strong>, and its mean surface distance no larger on {len(pairs) - len(farther)}.</p>"
+    )
+    if worse:
+        names = ", ".join(f"{_text(k)} ({number_text(a)} against {number_text(b)})" for a, b, k in worse)
+        yield f"<p>{title}'s Dice is below {other}'s on label {html.escape(names)}.</p>"
+    if farther:
+        yield f"<p>{title}'s mean surface distance is larger than {other}'s on label {html.escape(_text(farther))}.</p>"
+
+
+def _is_farther(value: float | None, other: float | None) -> bool:
+    """Whether a distance is above another; where there is no surface it is above all others."""
+    return other is not None and (value is None or value > other)
+
+
 def _list(names: Sequence[str]) -> str:
     return f": {html.escape(', '.join(names))}" if names else ""
 
@@ -344,46 +441,123 @@ def _failures(results: dict[str, Any]) -> Iterator[str]:
 # Labels, times, settings
 
 
-def _labels_html(results: dict[str, Any]) -> list[str]:
-    """Vanished structures by name, then a table for each of volume ratio, Dice and share of E_D."""
+class OfLabel(NamedTuple):
+    """What a pipeline's runs make of a label: medians, None where no run has a value."""
+
+    dice: float | None
+    surface_mean: float | None  # mm
+    surface_p95: float | None  # mm
+    volume_error: float | None  # share of the volume in the image
+    pieces: float | None
+    E_D_share: float | None
+    n_lost: int  # runs in which nothing carries it
+    n_runs: int
+
+
+def _of_label(pipeline: dict[str, Any], label: Any) -> OfLabel:
+    rows = [row for run in pipeline["runs"] for row in run.get("labels") or () if row["label"] == label]
+
+    def median(value: Callable[[dict[str, Any]], Any]) -> float | None:
+        known = [number for row in rows if (number := _number(value(row))) is not None]
+        return float(np.median(known)) if known else None
+
+    return OfLabel(
+        median(_at("dice")), median(_at("surface_mean_mm")), median(_at("surface_p95_mm")), median(_volume_error),
+        median(_at("mesh_components")), median(_at("E_D_share")), sum(bool(row["is_lost"]) for row in rows), len(rows),
+    )  # fmt: skip
+
+
+def _labels_html(results: dict[str, Any], pictures: Sequence[str]) -> list[str]:
+    """Vanished structures by name, the picture, then a row for each label, the worst first and the others folded."""
     done = [pipeline for pipeline in results["pipelines"] if "median" in pipeline]
-    by_label = {p["name"]: {row["label"]: row for row in p["median"].get("labels") or ()} for p in done}
-    voxels = {label: row["voxels"] for rows in by_label.values() for label, row in rows.items()}
+    voxels = _voxels_by_label(results)
     if not voxels:
         return []
-    source = results.get("labels") or {}
-    is_given = source.get("kind") == "given"
-    origin = f"The labels of {source.get('name')}." if is_given else "Classes of the voxels' intensities."
-    words = [paragraph_html(f"{origin} Each cell counts for the label that most of its voxels carry.")]
-    words.append(_vanished_html(done, by_label, voxels))
-    for caption, value in (
-        ("Volume in the mesh, of that in the image", _volume_ratio),
-        ("Dice", lambda row: row.get("dice")),
-        ("E_D in the label, share of the image's variance", lambda row: row.get("E_D_share")),
-    ):
-        rows = [["label", "voxels", *(pipeline["title"] for pipeline in done)]]
-        for label, count in voxels.items():
-            found = [by_label[pipeline["name"]].get(label) for pipeline in done]
-            rows.append([_text(label), number_text(count), *(_label_text(row, value) for row in found)])
-        words.append(table_html(rows, caption))
+    is_given = _is_given(results)
+    origin = f"The labels of {results['labels']['name']}." if is_given else "Classes of the voxels' intensities."
+    found = {label: [_of_label(pipeline, label) for pipeline in done] for label in voxels}
+    first = next((k for k, pipeline in enumerate(done) if pipeline["kind"] == "tetopt"), 0)
+    order = sorted(voxels, key=lambda label: (found[label][first].dice or 0.0, voxels[label]))
+    open_, folded = order[:UNFOLDED], order[UNFOLDED:]
+    how = (
+        f"{origin} Each cell counts for the label that most of its voxels carry. In the table, for each label and mesh:"
+        " Dice; mean and 95th percentile of the distance between the label's surfaces in mesh and image, both ways; "
+        f"error of its volume. Labels on which {done[first]['title']} has the lowest Dice come first."
+    )
+    words = [paragraph_html(how), _vanished_html(done, found, voxels), *pictures]
+    words.append(_label_table_html(done, found, voxels, open_))
+    if folded:
+        words.append(_folded(f"The other {len(folded)} labels", _label_table_html(done, found, voxels, folded)))
+    components = {
+        row["label"]: row.get("components")
+        for pipeline in done for run in pipeline["runs"] for row in run.get("labels") or ()
+    }  # fmt: skip
+    pieces = [["label", "in the image", *(pipeline["title"] for pipeline in done)]]
+    shares = [["label", "voxels", *(pipeline["title"] for pipeline in done)]]
+    for label in voxels:
+        given = number_text(_number(components[label]))
+        pieces.append([_text(label), given, *(number_text(each.pieces) for each in found[label])])
+        shares.append([_text(label), str(voxels[label]), *(number_text(each.E_D_share) for each in found[label])])
+    words.append(_folded("Connected pieces of each label", table_html(pieces)))
+    words.append(_folded("E_D in each label, share of the image's variance", table_html(shares)))
     return words
 
 
-def _label_text(row: dict[str, Any] | None, value: Callable[[dict[str, Any]], float | None]) -> str:
-    if row is None:
-        return "–"
-    return number_text(_number(value(row))) + (" (lost)" if row.get("is_lost") else "")
+def _folded(title: str, content: str) -> str:
+    return f"<details><summary>{html.escape(title)}</summary>{content}</details>"
 
 
-def _vanished_html(
-    done: Sequence[dict[str, Any]], by_label: dict[str, dict[Any, dict[str, Any]]], voxels: dict[Any, int]
+def _label_table_html(
+    done: Sequence[dict[str, Any]], found: dict[Any, list[OfLabel]], voxels: dict[Any, int], labels: Sequence[Any]
 ) -> str:
+    """A row for each of `labels`, a column for each pipeline; the best Dice of a row is marked."""
+    heads = "".join(_head_cell(pipeline) for pipeline in done)
+    lines = [
+        '<div class="wide"><table class="headline labels">',
+        f'<thead><tr><th scope="col">label</th>{heads}</tr></thead><tbody>',
+    ]
+    by_dice = Measure("", "", _at("dice"), 1)
+    for label in labels:
+        best = winners(by_dice, [Entry(each.dice, None, None) for each in found[label]])
+        cells = [
+            f'<td class="{html.escape(pipeline["kind"])}{" best" if number in best else ""}">{_label_cell(each)}</td>'
+            for number, (pipeline, each) in enumerate(zip(done, found[label], strict=True))
+        ]
+        head = f"{html.escape(_text(label))}<small>{_voxels_text(voxels[label])}</small>"
+        lines.append(f'<tr><th scope="row">{head}</th>{"".join(cells)}</tr>')
+    return "\n".join([*lines, "</tbody></table></div>"])
+
+
+def _voxels_text(count: float) -> str:
+    return f"{number_text(count)} voxel" + ("" if count == 1 else "s")
+
+
+def _label_cell(each: OfLabel) -> str:
+    if each.n_lost and each.n_lost == each.n_runs:
+        return '<span class="failed">lost</span>'
+    # The same number of decimals everywhere, so that those of a row and a column are compared at a glance.
+    parts = [f'<span class="value">{"–" if each.dice is None else f"{each.dice:.3f}"}</span>']
+    if each.surface_mean is not None and each.surface_p95 is not None:
+        parts.append(f"<small>{each.surface_mean:.2f} / {each.surface_p95:.2f} mm</small>")
+    if each.volume_error is not None:
+        percent = round(100.0 * each.volume_error, 1) + 0.0  # no -0.0
+        parts.append(f"<small>vol. {percent:+.1f} %</small>".replace("-", "−"))
+    if each.n_lost:
+        parts.append(f'<small class="failed">lost in {each.n_lost} of {each.n_runs} runs</small>')
+    return "".join(parts)
+
+
+def _vanished_html(done: Sequence[dict[str, Any]], found: dict[Any, list[OfLabel]], voxels: dict[Any, int]) -> str:
     """Which labels no cell stands for, by pipeline."""
     items = []
-    for pipeline in done:
-        lost = [label for label, row in by_label[pipeline["name"]].items() if row.get("is_lost")]
+    for number, pipeline in enumerate(done):
+        lost = [(label, found[label][number]) for label in voxels if found[label][number].n_lost]
         if lost:
-            names = ", ".join(f"label {_text(label)} ({number_text(voxels[label])} voxels)" for label in lost)
+            names = ", ".join(
+                f"label {_text(label)} ({_voxels_text(voxels[label])}"
+                + (")" if each.n_lost == each.n_runs else f", in {each.n_lost} of {each.n_runs} runs)")
+                for label, each in lost
+            )
             items.append(f"<li>{html.escape(pipeline['title'])}: {html.escape(names)}</li>")
     if not items:
         return "<p>No label vanished from any mesh.</p>"
@@ -466,6 +640,7 @@ _KEY = (
     "all are equal, or in which neither way is better, have no winner.</p>"
 )
 _STYLE = """
+h1, p, li { overflow-wrap: anywhere; }
 table.headline { border-collapse: separate; border-spacing: 0; width: 100%; }
 .headline th, .headline td { vertical-align: top; padding: 0.25rem 0.5rem; background: #fff; white-space: nowrap; }
 .headline thead th { border-bottom: 2px solid #444; white-space: normal; vertical-align: bottom; }
@@ -479,6 +654,10 @@ table.headline { border-collapse: separate; border-spacing: 0; width: 100%; }
 .headline td.best { background: #dcefe4; } td.best .value { font-weight: 700; }
 .best .mark, .key .mark { color: #00593f; }
 .headline td.lost { background: #fbe6dc; } .lost .mark { color: #a02c00; }
+.labels td, .labels thead th { text-align: center; } .labels th:first-child { min-width: 5rem; text-align: left; }
+.labels tbody tr > * { border-bottom: 1px solid #eee; } .labels small { line-height: 1.3; }
+.labels small.failed { color: #a00000; } details th { white-space: normal; vertical-align: bottom; }
+details { margin: 0.8rem 0; } summary { cursor: pointer; font-weight: 600; }
 .failed { color: #a00000; } .key { color: #555; font-size: 0.85rem; }
 pre { overflow-x: auto; background: #f4f4f4; padding: 0.7rem; white-space: pre-wrap; overflow-wrap: anywhere; }
 .settings td { white-space: normal; overflow-wrap: anywhere; text-align: left; vertical-align: top; }

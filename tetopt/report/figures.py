@@ -8,11 +8,16 @@ from pathlib import Path
 import matplotlib
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import PolyCollection
+from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
+from matplotlib.patches import Rectangle
 from numpy.typing import NDArray
+from scipy.ndimage import distance_transform_edt, uniform_filter
 
+from tetopt.check import facets_on_box
 from tetopt.energy.sampling import cell_moments
+from tetopt.errors import InputError
 from tetopt.geometry.cut import plane_cut
 from tetopt.geometry.quality import BAD_SHAPE, quality_errors, rho_histogram
 from tetopt.geometry.simplex import rho
@@ -20,10 +25,16 @@ from tetopt.image import Image
 from tetopt.io.files import written_whole
 from tetopt.mesh import Mesh
 from tetopt.optimize.paper import Optimized, Record
+from tetopt.report.colours import LISTED, UNCOVERED, label_colours, legend_patches
 
 matplotlib.use("agg")
 COLOURS = ("#7f7f7f", "#d95f02", "#1b9e77", "#7570b3")
 MESH_LINE = "#ffb000"
+MASK_LINE = "#1e90ff"
+DETAIL = 25  # voxels along the side of an enlarged region
+WIDEST = 4.2  # inches: the widest slice of a figure of several planes
+TALLEST = 12.0  # inches: all its planes over each other
+NUMBER_ROOM = 0.014  # of that width: the radius that a label's number takes
 
 
 def save_figure(figure: Figure, path: str | Path, dpi: int = 150) -> None:
@@ -55,31 +66,184 @@ def slice_figure(
     """A slice of the volume with each mesh cut through it, and below it the means the cells stand for.
 
     `axis` and `index` choose the slice in voxel indices; by default the axis nearest to the world's z (an axial
-    slice), at its middle. A 2-D image is shown whole.
+    slice), at its middle. A 2-D image is shown whole. Where a mesh leaves the image uncovered, the means' row is light
+    blue.
     """
     view = _View(image, axis, index)
     figure = Figure(figsize=(5.2 * len(meshes), 10.0 * view.aspect + 1.0), layout="constrained")
     grid = figure.subplots(2, len(meshes), squeeze=False)
-    limits = np.percentile(view.pixels, [0.5, 99.8])
-    if limits[0] == limits[1]:
-        limits = np.array([limits[0] - 0.5, limits[0] + 0.5])
+    limits = _grey_limits(view)
     for column, (title, mesh) in enumerate(meshes):
         polygons, cells = view.section(mesh)
         over, flat = grid[:, column]
         view.show_pixels(over, limits)
         # Each line is shared by two polygons; drawn once a polygon it is simply drawn twice.
-        width = min(0.6, 20.0 / np.sqrt(len(polygons)))  # points; thinner before the lines hide the image
+        width = min(0.6, 20.0 / np.sqrt(max(len(polygons), 1)))  # points; thinner before the lines hide the image
         over.add_collection(PolyCollection(list(polygons), facecolors="none", edgecolors=MESH_LINE, linewidths=width))
         over.set_title(title, fontsize=11)
         means = cell_moments(image, mesh).mean[cells]
         # Antialiased, each border would let the background shine through as a light seam.
         painted = PolyCollection(list(polygons), array=means, cmap="gray", edgecolors="none", antialiaseds=False)
         painted.set_clim(*limits)
+        flat.set_facecolor(UNCOVERED)
         flat.add_collection(painted)
         flat.set_title("mean of the image in each cell", fontsize=10)
         for axes in (over, flat):
             view.frame(axes)
     return figure
+
+
+def label_figure(labels: Image, mesh: Mesh) -> Figure:
+    """The labels of the voxels, and beside them those of the cells in the same colours, in three planes.
+
+    Parameters
+    ----------
+    labels : Image
+        Whole numbers from 0 to `tetopt.segmentation.LABELS`.
+    mesh : Mesh
+        Each cell has the label that most of its voxels have (`tetopt.fidelity.cell_labels`).
+
+    Returns
+    -------
+    Figure
+        The axial, coronal and sagittal slices through the middle of the volume over each other, in one scale; a 2-D
+        image whole. The legend lists the labels that fill most of them; if it cannot list all, the numbers stand in
+        the voxels' picture as well, where there is room.
+
+    Raises
+    ------
+    InputError
+        As `tetopt.fidelity.cell_labels`.
+    """
+    # This loads pyvista, which is slow to load, and the other flat pictures need it not.
+    from tetopt.fidelity import cell_labels
+
+    colours, of_cell = label_colours(labels), cell_labels(labels, mesh)
+    views = _middle_views(labels)
+    pixels = [view.pixels.astype(np.int64) for view in views]
+    cuts = [view.section(mesh) for view in views]
+    shown = _counted(pixels, len(colours)) + (_counted([of_cell[cells] for _, cells in cuts], len(colours)) > 0)
+    width, heights = max(view.size[0] for view in views), [view.size[1] for view in views]
+    inches = min(WIDEST / width, TALLEST / sum(heights))  # a mm
+    figure = Figure(figsize=(2.0 * inches * width + 1.4, inches * sum(heights) + 0.6), layout="constrained")
+    grid = figure.subplots(len(views), 2, squeeze=False, height_ratios=heights)
+    for (given, meshed), view, numbers, (polygons, cells) in zip(grid, views, pixels, cuts, strict=True):
+        given.imshow(colours[numbers.T], origin="lower", extent=view.extent, interpolation="nearest")
+        if np.count_nonzero(shown) > LISTED:
+            _write_numbers(given, view, numbers, colours, NUMBER_ROOM * width)
+        line = min(0.2, 10.0 / np.sqrt(max(len(polygons), 1)))  # points
+        meshed.add_collection(
+            PolyCollection(list(polygons), facecolors=colours[of_cell[cells]], edgecolors="black", linewidths=line)
+        )
+        for axes in (given, meshed):
+            view.frame(axes)
+    grid[0, 0].set_title("labels of the voxels", fontsize=11)
+    grid[0, 1].set_title(f"labels of the cells, {len(mesh.points)} nodes", fontsize=11)
+    handles = legend_patches(colours, shown)
+    figure.legend(handles=handles, loc="outside right upper", fontsize=9, frameon=False, title="label")
+    return figure
+
+
+def _counted(arrays: Sequence[NDArray[np.int64]], n: int) -> NDArray[np.int64]:
+    """How often each label 0 to n - 1 occurs in all arrays together."""
+    return np.bincount(np.concatenate([array.ravel() for array in arrays]), minlength=n)
+
+
+def _write_numbers(
+    axes: Axes, view: _View, pixels: NDArray[np.int64], colours: NDArray[np.float64], room: float
+) -> None:
+    """The number of each label in the slice but 0, where it is widest, if the circle of `room` mm fits in there."""
+    for label in np.unique(pixels[pixels > 0]):
+        # To the nearest centre outside, which lies half a pixel behind the border.
+        depth = distance_transform_edt(np.pad(pixels == label, 1), view.steps)[1:-1, 1:-1] - 0.5 * view.steps.min()
+        deepest = np.unravel_index(depth.argmax(), depth.shape)
+        if depth[deepest] >= room:
+            is_dark = colours[label] @ (0.299, 0.587, 0.114) < 0.5
+            x, y = (np.array(deepest) + 0.5) * view.steps
+            colour = "white" if is_dark else "black"
+            axes.text(x, y, f"{label}", color=colour, ha="center", va="center", fontsize=5)
+
+
+def boundary_figure(image: Image, mask: Image, mesh: Mesh, axis: int | None = None, index: int | None = None) -> Figure:
+    """The outline of a mask and the boundary of a mesh that follows it, over a slice and enlarged in a part of it.
+
+    Parameters
+    ----------
+    image : Image
+    mask : Image
+        From 0, outside, to 1, inside, on the image's voxels. Its outline is where it is 1/2, linear between the
+        voxels' centres.
+    mesh : Mesh
+        Its boundary is drawn without what lies on the faces of the image's box.
+    axis, index : int, optional
+        The slice, in voxel indices; by default the axial one in the middle of the mask.
+
+    Returns
+    -------
+    Figure
+        The slice, and the 25 voxels square of it in which the outline is longest, there with the cells' edges.
+
+    Raises
+    ------
+    InputError
+        A mask of another shape than the image's.
+    """
+    if mask.shape != image.shape:
+        raise InputError(f"mask: expected the image's shape {image.shape}, got {mask.shape}; resample it")
+    view = _View(image, axis, index)
+    if index is None and view.across is not None:
+        filled = np.unique(np.nonzero(mask.data >= 0.5)[view.across])
+        view = _View(image, axis, int(filled[len(filled) // 2]) if len(filled) else None)
+    outline = _half_level(_View(mask, view.across, view.index))
+    boundary = view.boundary(mesh)
+    low, high = _longest_part(outline, view)
+    figure = Figure(figsize=(5.2 + 5.2 * view.aspect, 5.2 * view.aspect + 0.7), layout="constrained")
+    whole, detail = figure.subplots(1, 2, width_ratios=(1.0, view.aspect))
+    limits = _grey_limits(view)
+    for axes, width in ((whole, 0.7), (detail, 1.8)):
+        view.show_pixels(axes, limits)
+        view.frame(axes)
+        # Wider, so that it shows on both sides where the boundary lies on it.
+        axes.add_collection(LineCollection(list(outline), colors=MASK_LINE, linewidths=2.0 * width))
+        axes.add_collection(LineCollection(list(boundary), colors=MESH_LINE, linewidths=width))
+    polygons, _ = view.section(mesh)
+    detail.add_collection(PolyCollection(list(polygons), facecolors="none", edgecolors=MESH_LINE, linewidths=0.4))
+    whole.add_patch(Rectangle((low[0], low[1]), *(high - low), fill=False, edgecolor="white", linewidth=1.2))
+    detail.set_xlim(low[0], high[0])
+    detail.set_ylim(low[1], high[1])
+    lines = ((MASK_LINE, "outline of the mask"), (MESH_LINE, "boundary of the mesh"))
+    handles = [Line2D([], [], color=colour, linewidth=2.0, label=label) for colour, label in lines]
+    figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=10, frameon=False)
+    return figure
+
+
+def _half_level(view: _View) -> NDArray[np.float64]:
+    """Segments (K, 2, 2), in picture mm, on which the pixels are 1/2 (`tetopt.fidelity.half_level_surface`)."""
+    from tetopt.fidelity import half_level_surface  # with pyvista, see `label_figure`
+
+    affine = np.diag([*view.steps, 1.0])
+    affine[:2, 2] = 0.5 * view.steps
+    outline = half_level_surface(view.pixels, affine)
+    return outline.points[outline.facets]
+
+
+def _longest_part(outline: NDArray[np.float64], view: _View) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Lower and upper corner, in picture mm, of the square of `DETAIL` voxels that holds most of the outline."""
+    length = np.zeros(view.pixels.shape)
+    pixel = (outline.mean(axis=1) / view.steps).astype(np.int64)
+    # Along the nearer axis: a straight line through the square counts the same however it runs, only bends more.
+    np.add.at(length, tuple(pixel.T), np.abs(outline[:, 1] - outline[:, 0]).max(axis=1))
+    side = np.minimum(DETAIL * view.steps.max(), view.size)
+    held = uniform_filter(length, np.rint(side / view.steps).astype(np.int64), mode="constant")
+    best = np.array(np.unravel_index(held.argmax(), held.shape)) if len(outline) else np.array(held.shape) // 2
+    low = np.clip((best + 0.5) * view.steps - 0.5 * side, 0.0, view.size - side)
+    return low, low + side
+
+
+def _grey_limits(view: _View) -> NDArray[np.float64]:
+    """What is drawn black and white in a slice, never the same."""
+    limits = np.percentile(view.pixels, [0.5, 99.8])
+    return limits if limits[0] < limits[1] else np.array([limits[0] - 0.5, limits[0] + 0.5])
 
 
 class _View:
@@ -102,12 +266,13 @@ class _View:
         pixels = image.data if self.across is None else np.take(image.data, self.index, axis=self.across)
         pixels = pixels if self.axes == inside else pixels.T
         self.pixels = np.flip(pixels, axis=tuple(k for k in (0, 1) if self.flip[k]))
+        self.steps = image.spacing[self.axes]  # mm, of a pixel
         self.size = [image.shape[a] * image.spacing[a] for a in self.axes]
+        self.extent = (0.0, self.size[0], 0.0, self.size[1])
         self.aspect = self.size[1] / self.size[0]
 
     def show_pixels(self, axes: Axes, limits: NDArray[np.float64]) -> None:
-        extent = (0.0, self.size[0], 0.0, self.size[1])
-        axes.imshow(self.pixels.T, origin="lower", extent=extent, cmap="gray", vmin=limits[0], vmax=limits[1])
+        axes.imshow(self.pixels.T, origin="lower", extent=self.extent, cmap="gray", vmin=limits[0], vmax=limits[1])
 
     def section(self, mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Polygons (K, 3 or 4, 2) of the mesh in the slice, in picture mm, and their cells (K,)."""
@@ -116,11 +281,23 @@ class _View:
             corners, cells = index[mesh.cells], np.arange(len(mesh.cells))
         else:
             corners, cells = plane_cut(index, mesh.cells, index[:, self.across] - self.index)
-        flat = (corners[..., self.axes] + 0.5) * self.image.spacing[self.axes]
+        return self._flat(corners), cells
+
+    def boundary(self, mesh: Mesh) -> NDArray[np.float64]:
+        """Segments (K, 2, 2), in picture mm, of the mesh's boundary in the slice, off the faces of the image's box."""
+        index = self.image.to_index(mesh.points)
+        outer, is_on_box = facets_on_box(mesh, self.image)
+        if self.across is None:
+            return self._flat(index[outer[~is_on_box]])
+        return self._flat(_triangle_cut(index, outer[~is_on_box], index[:, self.across] - self.index))
+
+    def _flat(self, index: NDArray[np.float64]) -> NDArray[np.float64]:
+        """Places in the picture (..., 2), mm, of index coordinates (..., n)."""
+        flat = (index[..., self.axes] + 0.5) * self.steps
         for k in (0, 1):
             if self.flip[k]:
                 flat[..., k] = self.size[k] - flat[..., k]
-        return flat, cells
+        return flat
 
     def frame(self, axes: Axes) -> None:
         axes.set_xlim(0.0, self.size[0])
@@ -135,6 +312,27 @@ class _View:
                 *place, letter, transform=axes.transAxes, color="white", ha="center", va="center", fontsize=9,
                 bbox={"facecolor": "black", "alpha": 0.5, "linewidth": 0, "pad": 1.5},
             )  # fmt: skip
+
+
+def _middle_views(image: Image) -> list[_View]:
+    """The axial, coronal and sagittal slice through the middle; a 2-D image whole."""
+    if image.ndim == 2:
+        return [_View(image, None, None)]
+    nearest = _nearest_axes(image.affine[:-1, :-1] / image.spacing)
+    return [_View(image, int(np.flatnonzero(nearest == world)[0]), None) for world in (2, 1, 0)]
+
+
+def _triangle_cut(
+    points: NDArray[np.float64], triangles: NDArray[np.int64], height: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Segments (K, 2, 3) in which the plane height = 0 cuts triangles; a node on the plane counts as above."""
+    is_above = height[triangles] >= 0.0
+    n_above = is_above.sum(axis=1)
+    alone = (is_above == (n_above == 1)[:, None]).argmax(axis=1)  # the node with no other on its side
+    turned = np.take_along_axis(triangles, (alone[:, None] + np.arange(3)) % 3, axis=1)[(n_above % 3) > 0]
+    one, others = turned[:, :1], turned[:, 1:]
+    share = (height[one] / (height[one] - height[others]))[..., None]
+    return points[one] * (1.0 - share) + points[others] * share
 
 
 def _nearest_axes(columns: NDArray[np.float64]) -> NDArray[np.int64]:

@@ -12,6 +12,7 @@ import numba
 import numpy as np
 
 import tetopt
+from tetopt.content import Content, plain
 from tetopt.geometry.quality import quality
 from tetopt.image import Image
 from tetopt.mesh import Mesh
@@ -49,16 +50,17 @@ def image_summary(image: Image) -> dict[str, Any]:
 
 
 def run_summary(
-    image: Image, initial: Mesh, result: Optimized, about: dict[str, Any], seconds: dict[str, float]
+    image: Image | Content, initial: Mesh, result: Optimized, about: dict[str, Any], seconds: dict[str, float]
 ) -> dict[str, Any]:
     """Every number of a run: options and file (`about`), versions, energies by iteration, quality before and after."""
     first, last = result.history[0], result.history[-1]
-    spread = image_summary(image)["total_variation"]
+    wanted = plain(image)
+    spread = wanted.variance * wanted.volume
     return {
         **about,
         "versions": versions(),
         "machine": {"cores": os.cpu_count(), "threads": numba.get_num_threads(), "system": platform.platform()},
-        "image_properties": image_summary(image),
+        "image_properties": image_summary(wanted.image),
         "ended": result.ended,
         "iterations_done": last.iteration,
         "energies": {
