@@ -2,11 +2,14 @@
 
 __version__ = "0.1.0"
 
+from tetopt.align import aligned_contrast, aligned_labels, aligned_mask, foreground
 from tetopt.check import check_mesh
+from tetopt.content import content
 from tetopt.energy.discretization import E_D
 from tetopt.energy.geometric import E_G
 from tetopt.energy.sampling import cell_moments, cell_of_voxel
 from tetopt.errors import InputError
+from tetopt.fidelity import cell_labels, label_fidelity, mask_fidelity
 from tetopt.geometry.quality import quality
 from tetopt.image import Image
 from tetopt.io.images import load_image, save_image
@@ -27,14 +30,22 @@ __all__ = [
     "Mesh",
     "Sizes",
     "__version__",
+    "aligned_contrast",
+    "aligned_labels",
+    "aligned_mask",
     "cell_fields",
+    "cell_labels",
     "cell_moments",
     "cell_of_voxel",
     "check_mesh",
+    "content",
+    "foreground",
+    "label_fidelity",
     "lattice",
     "load_image",
     "load_mesh",
     "load_phantom",
+    "mask_fidelity",
     "mesh_image",
     "octree",
     "optimize",

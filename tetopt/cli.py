@@ -60,6 +60,7 @@ from tetopt.optimize.paper import Optimized, Record, default_n_t, optimize_paper
 from tetopt.report.summary import run_summary, versions
 from tetopt.segmentation import check_labels
 
+COVERED = 0.95  # Dice of a mesh that represents its mask
 LARGE = 200  # voxels: a label of more may not be without cells
 DEFAULT_NODES = {2: 500, 3: 5000}
 
@@ -293,7 +294,8 @@ def mesh_command(
     slice_: SliceOption = None,
     json_path: JsonOption = None,
     figures: Annotated[
-        Path | None, typer.Option(metavar="DIR", help="Draw slice.png, rho.png and energies.png in this folder.")
+        Path | None,
+        typer.Option(metavar="DIR", help="Draw slice.png, rho.png, energies.png and others in this folder."),
     ] = None,
     force: ForceOption = False,
 ) -> int:
@@ -326,7 +328,9 @@ def mesh_command(
         options["shape_power"] = 3.0 if shape_power is None else shape_power
         options["min_dihedral"] = 12.0 if min_dihedral is None else min_dihedral
         check_options(**options)
-    names = ("slice.png", "rho.png", "energies.png")
+    names = ["slice.png", "rho.png", "energies.png"]
+    names += [] if mask is None and background is None else ["boundary.png"]
+    names += [] if labels is None else ["labels.png"]
     pictures = [] if figures is None else [checked_output(figures / name, (".png",), force) for name in names]
     if method is Method.paper and (len(image_paths) > 1 or mask or background or labels):
         raise InputError("--method paper: takes one IMAGE and its whole box; leave out mask, labels and further ones")
@@ -376,13 +380,9 @@ def _source(
     if label_weight is not None and labels_path is None:
         raise InputError("--label-weight: there are no --labels")
     image = _image(paths[0], volume, crop, slice_)
-
-    def beside(path: Path) -> Image:  # a slice is only found in an image of the same grid
-        return _image(path, None, crop, slice_) if slice_ is not None else load_quietly(path)
-
-    contrasts = [image, *(aligned_contrast(str(path), beside(path), image) for path in paths[1:])]
-    labels = None if labels_path is None else aligned_labels(str(labels_path), beside(labels_path), image)
-    mask = None if mask_path is None else aligned_mask(str(mask_path), beside(mask_path), image)
+    others = [aligned_contrast(str(path), _companion(path, crop, slice_), image) for path in paths[1:]]
+    contrasts = [image, *others]
+    labels, mask = _beside(image, labels_path, mask_path, crop, slice_)
     level = None
     if background is not None:
         level = background_level(image) if background == "auto" else _number("--background", background)
@@ -404,6 +404,27 @@ def _source(
         "sha256": {path.name: sha256(path) for path in files},
     }  # fmt: skip
     return _Source(paths, wanted, contrasts, labels, mask, about)
+
+
+def _companion(path: Path, crop: str | None, slice_: str | None) -> Image:
+    """A file that goes with the image; whole, unless a slice is meshed, which only an image of the same grid has."""
+    if slice_ is None:
+        return load_quietly(path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return _image(path, None, crop, slice_)
+
+
+def _beside(
+    image: Image, labels_path: Path | None, mask_path: Path | None, crop: str | None, slice_: str | None
+) -> tuple[Image | None, Image | None]:
+    """Labels and mask on the image's voxels."""
+    labels = mask = None
+    if labels_path is not None:
+        labels = aligned_labels(str(labels_path), _companion(labels_path, crop, slice_), image)
+    if mask_path is not None:
+        mask = aligned_mask(str(mask_path), _companion(mask_path, crop, slice_), image)
+    return labels, mask
 
 
 def _number(name: str, text: str) -> float:
@@ -492,9 +513,14 @@ def _mesh_files(
         seconds = {"load": loaded - begin, "optimize": optimized - loaded, "all": time.perf_counter() - begin}
         save_json(json_path, run_summary(wanted, initial, result, about, seconds) | found)
     if pictures:
-        from tetopt.report.figures import save_run_figures  # matplotlib is slow to load, and only needed here
+        from tetopt.report import figures  # matplotlib is slow to load, and only needed here
 
-        save_run_figures(pictures, image, initial, result, _start_name(settings["lattice"]))
+        figures.save_run_figures(pictures[:3], image, initial, result, _start_name(settings["lattice"]))
+        if source.mask is not None:
+            drawn = figures.boundary_figure(source.contrasts[0], source.mask, result.mesh)
+            figures.save_figure(drawn, pictures[3])
+        if source.labels is not None:
+            figures.save_figure(figures.label_figure(source.labels, result.mesh), pictures[-1])
     # Everything is written; what is printed may go into a pipe that closes.
     code = _promises(wanted, result, options.get("min_dihedral", 0.0), settings["target_error"], found)
     code = 130 if is_interrupted else code
@@ -545,7 +571,8 @@ def _fidelity(labels: Image | None, mask: Image | None, mesh: Mesh, of_cell: NDA
     if labels is not None:
         if mask is not None:  # what lies outside is not asked for
             labels = Image(np.where(mask.data >= 0.5, labels.data, 0.0), labels.affine)
-        found["labels"] = [row._asdict() for row in label_fidelity(labels, mesh, of_cell)]
+        rows = label_fidelity(labels, mesh, of_cell)
+        found["labels"] = [row._asdict() for row in rows if mask is None or row.label > 0]  # 0 is the outside, too
     return found
 
 
@@ -560,13 +587,11 @@ def _print_fidelity(found: dict[str, Any]) -> None:
             f"{mask['distance_p95']:.3f} voxels; pieces {mask['components']}, in the mesh {mask['mesh_components']}"
         )
     if "labels" in found:
-        table = _table(
-            "label", "voxels", "volume, mm", "in mesh, mm", "cells", "Dice", "surface, mean mm", "95th percentile",
-            "pieces", "in mesh",
-        )  # fmt: skip
+        out.print("labels: size in voxels and in cells, mm^n; surfaces apart, mm, mean and 95 % within; pieces of both")
+        table = _table("label", "voxels", "size", "of cells", "cells", "Dice", "mean", "95 %", "pieces", "of cells")
         for row in found["labels"]:
             table.add_row(
-                str(row["label"]), str(row["voxels"]), f"{row['volume']:.1f}", f"{row['mesh_volume']:.1f}",
+                str(row["label"]), str(row["voxels"]), f"{row['volume']:.7g}", f"{row['mesh_volume']:.7g}",
                 str(row["n_cells"]), f"{row['dice']:.4f}", f"{row['distance_mean']:.3f}", f"{row['distance_p95']:.3f}",
                 str(row["components"]), str(row["mesh_components"]),
             )  # fmt: skip
@@ -700,6 +725,11 @@ def _says_what_is_lost(found: dict[str, Any]) -> bool:
             f"the mask has {mask['components']} pieces, the mesh {mask['mesh_components']}: cells are as large "
             "as parts, or gaps, of the mask; allow more nodes"
         )
+    elif mask is not None and mask["dice"] < COVERED:
+        _show_warning(
+            f"the mesh and the mask overlap only by Dice {mask['dice']:.3f}: cells are larger than parts of the mask; "
+            "allow more nodes"
+        )
     return bool(large)
 
 
@@ -793,7 +823,7 @@ def _print_comparison(wanted: Content, initial: Mesh, result: Optimized, start: 
     table.add_row("E_G, of initial", "1.0000", f"{last.E_G / first.E_G:.4f}")
     if first.E_D > 0.0:
         table.add_row("E_D, of initial", "1.0000", f"{last.E_D / first.E_D:.4f}")
-        spread = wanted.variance * wanted.volume
+    if first.E_D > 0.0 and (spread := wanted.variance * wanted.volume) > 0.0:
         table.add_row("E_D, share of the image's variance", f"{first.E_D / spread:.5f}", f"{last.E_D / spread:.5f}")
     _add_quality(table, before, after)
     out.print(table)
@@ -835,6 +865,12 @@ def quality_command(
     image_path: Annotated[
         Path | None, typer.Option("--image", metavar="IMAGE", help="Measure E_D against this image, too.")
     ] = None,
+    mask_path: Annotated[
+        Path | None, typer.Option("--mask", metavar="MASK", help="How well the boundary follows it; with --image.")
+    ] = None,
+    labels_path: Annotated[
+        Path | None, typer.Option("--labels", metavar="LABELS", help="How well cells keep to them; with --image.")
+    ] = None,
     check: Annotated[
         bool, typer.Option("--check", help="Is it a mesh? With --image, does it fill the box? Exit 1 if not.")
     ] = False,
@@ -847,14 +883,20 @@ def quality_command(
     """Measure a mesh: shape, angles, bad cells, and how well its cells fit an image."""
     if json_path is not None:
         json_path = checked_output(json_path, (".json",), force)
+    if image_path is None and (mask_path is not None or labels_path is not None):
+        raise InputError("--mask and --labels: give the --image, too, on whose voxels they are compared")
     loaded = _mesh_file(mesh_path)
     measured = quality(loaded.mesh.points, loaded.mesh.cells)
+    found: dict[str, Any] = {}
     content: dict[str, Any] = {"mesh": mesh_path.name, "quality": measured, "n_turned": loaded.n_turned}
     table = _table("", escape(mesh_path.name))
     _add_quality(table, measured)
     if image_path is not None:
         image = _image(image_path, volume, crop, slice_)
-        fit = _fit(image, loaded.mesh)
+        labels, mask = _beside(image, labels_path, mask_path, crop, slice_)
+        fit = _fit(continued(image, mask), loaded.mesh)
+        found = _fidelity(labels, mask, loaded.mesh, loaded.cell_data.get("label"))
+        content |= found
         _warn_of_other_image(loaded, mesh_path, image_path)
         content |= {"image": image_path.name, "fit": fit}
         table.add_row("E_D", f"{fit['E_D']:.6g}")
@@ -862,16 +904,21 @@ def quality_command(
             table.add_row("E_D, share of the variance inside", f"{fit['E_D_share_of_variance']:.5f}")
         table.add_row("voxels inside", f"{fit['n_voxels']} of {image.data.size}")
         table.add_row("cells without a voxel", str(fit["n_empty_cells"]))
-    problems = tetopt.check_mesh(loaded.mesh, None if image_path is None else image) if check else []
+    is_box = image_path is not None and mask_path is None
+    problems = []
+    if check:
+        problems = tetopt.check_mesh(loaded.mesh, image if is_box else None, is_whole=mask_path is None)
     if check:
         content["problems"] = problems
     if json_path is not None:
         save_json(json_path, content)
     out.print(table)
+    _print_fidelity(found)
     for problem in problems:
         log.print(f"[bold red]tetopt:[/] {escape(str(mesh_path))}: {escape(problem)}")
     if check and not problems:
-        out.print("checked: conforming, oriented, in one piece" + ("" if image_path is None else ", fills the box"))
+        words = "" if mask_path is not None else ", in one piece, fills the box" if is_box else ", in one piece"
+        out.print(f"checked: conforming, oriented{words}")
     if problems:
         return 1
     if image_path is not None and fit["n_voxels"] > image.data.size:

@@ -111,16 +111,20 @@ def content(
         spread = _variance(data, region)
         if weight > 0.0 and spread > 0.0:
             found.append((np.sqrt(weight / spread) * data).astype(np.float32))
-    n_contrasts = len(found)
+    number, codes = np.zeros(first.shape, dtype=np.int64), np.zeros((0, 1))
     if labels is not None and label_weight > 0.0:
-        found += list(np.sqrt(label_weight) * _one_hot(_continued(labels, region).data.astype(np.int64), region))
-    if not found:
+        number, codes = _one_hot(_continued(labels, region).data.astype(np.int64), region)
+        codes = np.sqrt(label_weight) * codes
+    if len(found) + len(codes) == 0:
         raise InputError("weights: nothing that differs between voxels counts; give one above 0")
-    values = np.stack(found)
-    largest = [float(np.abs(v).max()) for v in values]
-    square = sum(v**2 for v in largest[:n_contrasts]) + max(largest[n_contrasts:], default=0.0) ** 2
+    square = sum(float(np.abs(v).max()) ** 2 for v in found) + float((codes**2).max(initial=0.0))
     scale = np.sqrt(0.9 * MOST / (first.shape[-1] * square))
-    return Content(first, np.rint(scale * values).astype(np.int32), n_contrasts, unit / scale**2, False, region)
+    values = np.empty((len(found) + len(codes), *first.shape), dtype=np.int32)
+    for row, data in zip(values, found, strict=False):
+        row[:] = np.rint(scale * data)
+    for row, code in zip(values[len(found) :], codes, strict=True):
+        row[:] = np.rint(scale * code).astype(np.int32)[number]
+    return Content(first, values, len(found), unit / scale**2, False, region)
 
 
 def plain(image: Image | Content) -> Content:
@@ -165,22 +169,23 @@ def _check(images: list[Image], others: list[Image], weights: list[float]) -> No
         raise InputError(f"weights: expected one of 0 or more for each of {len(images)} images, got {weights}")
 
 
-def _one_hot(labels: NDArray[np.int64], region: Domain | None) -> NDArray[np.float32]:
-    """Channels (C, *shape) that tell labels apart: each voxel has its label's value in one of them, 0 in the others.
+def _one_hot(labels: NDArray[np.int64], region: Domain | None) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Channels that tell K labels apart: each voxel's row, and the rows' values in C channels, (C, K).
 
-    Labels that come nowhere near one another share a channel. By voxel a label counts by its share of the voxels to
-    the power -`RARE`, so that small ones are not given up for the surfaces of large ones; the variance of all is 1.
+    Each label has its value in one channel and 0 in the others. Labels that come nowhere near one another share a
+    channel. By voxel a label counts by its share of the voxels to the power -`RARE`, so that small ones are not given
+    up for the surfaces of large ones; the variance of all is 1.
     """
-    _, number = np.unique(labels, return_inverse=True)
-    number = number.reshape(labels.shape)
-    share = np.bincount(number.ravel()) / number.size
+    counts = np.bincount(labels.ravel() if region is None else labels[region.inside])
+    there = np.flatnonzero(counts)
+    row = np.zeros(len(counts), dtype=np.int64)
+    row[there] = np.arange(len(there))
+    number, share = row[labels], counts[there] / counts.sum()
     size = share ** (-0.5 * RARE)
     channel = _colours(number, len(share))
-    values = np.zeros((int(channel.max()) + 1, *labels.shape), dtype=np.float32)
-    for c in range(len(values)):
-        values[c] = np.where(channel == c, size, 0.0)[number]
-    spread = sum(_variance(v, region) for v in values)
-    return (values / np.sqrt(spread)).astype(np.float32) if spread > 0.0 else values[:0]
+    codes = np.where(channel == np.arange(channel.max() + 1)[:, None], size, 0.0)
+    spread = float((codes**2 @ share - (codes @ share) ** 2).sum())
+    return number, (codes / np.sqrt(spread) if len(share) > 1 else codes[:0])
 
 
 def continued(image: Image, mask: Image | None) -> Image:

@@ -30,8 +30,8 @@ def test_labels_that_are_given_are_meshed(image, labels, wanted, notes):
 
 
 def test_the_graded_mesh_is_that_of_mesh_image():
-    made = PIPELINES["tetopt"](Job(IMAGE, LABELS, 200))
-    assert made.mesh.points.tobytes() == tetopt.mesh_image(BOTH, 200).mesh.points.tobytes()
+    made = PIPELINES["tetopt"](Job(IMAGE, LABELS, 300))
+    assert made.mesh.points.tobytes() == tetopt.mesh_image(BOTH, 300).mesh.points.tobytes()
     assert made.notes[1:] == [EQUAL]
 
 

@@ -232,7 +232,7 @@ def orientations(ticks: NDArray[np.int64], cells: NDArray[np.int64]) -> NDArray[
 def moment_sums(
     grid: SamplingGrid, ticks: NDArray[np.int64], cells: NDArray[np.int64], sides: Facets | None = None
 ) -> NDArray[np.float64]:
-    """Voxel count, sum of (h - shift) and sum of its square over each cell, (M, 3) float64.
+    """Voxel count, sum of (h - shift) and sum of its square over each cell, (M, 3) float64; of more channels, (M, D).
 
     They add up: the sums of a set of cells are the sum of their rows. Counts are whole numbers, exact. `sides` are
     the cells' facets where they are known already.
@@ -242,19 +242,19 @@ def moment_sums(
 
 
 def facet_fluxes(grid: SamplingGrid, ticks: NDArray[np.int64], nodes: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Flux of each facet (F, n), (F, 3) float64: sums of k, P_h(k) and P_h2(k) over the rows that cross it.
+    """Flux of each facet (F, n), (F, D) float64: sums of k and of each P(k) of the grid over the rows that cross it.
 
     Positive where the facet, its nodes as listed, faces up the last axis.
     """
-    fluxes = np.empty((len(nodes), 1, 3))
+    fluxes = np.empty((len(nodes), 1, grid.prefix.shape[3] + 1))
     with few_threads(len(nodes)):
         _fill_fluxes(fluxes, ticks, np.ascontiguousarray(nodes), grid.bits, grid.prefix)
     return fluxes[:, 0]
 
 
 def sums_of_fluxes(fluxes: NDArray[np.float64], sides: Facets, hand: int) -> NDArray[np.float64]:
-    """Moment sums of the cells, (M, 3), from their facets' fluxes; `hand` is the cells' sign in index space."""
-    sums = np.empty((len(sides.of_cell), 3))
+    """Moment sums of the cells, (M, D), from their facets' fluxes; `hand` is the cells' sign in index space."""
+    sums = np.empty((len(sides.of_cell), fluxes.shape[1]))
     with few_threads(len(sums)):
         _fill_sums(sums, fluxes, sides.of_cell, sides.sign, hand)
     return sums
@@ -477,7 +477,7 @@ def _fill_fluxes(fluxes: NDArray, ticks: NDArray, nodes: NDArray, bits: int, pre
 def _fill_sums(sums: NDArray, fluxes: NDArray, of_cell: NDArray, sign: NDArray, hand: int) -> None:
     for chunk in prange((len(sums) + CHUNK - 1) // CHUNK):
         for cell in range(chunk * CHUNK, min((chunk + 1) * CHUNK, len(sums))):
-            for d in range(3):
+            for d in range(sums.shape[1]):
                 total = 0.0
                 for k in range(of_cell.shape[1]):
                     total += sign[cell, k] * fluxes[of_cell[cell, k], d]

@@ -1,0 +1,189 @@
+"""The command with masks, backgrounds, labels and several contrasts."""
+
+import json
+
+import numpy as np
+import pytest
+from shapes import OBLIQUE, distance, grid, shaped
+
+import tetopt
+from tetopt.cli import main
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory):
+    """An image with a mask, labels and a contrast on grids of their own; and what goes wrong."""
+    folder = tmp_path_factory.mktemp("domains")
+    image, mask = shaped("ball", OBLIQUE)
+    tetopt.save_image(folder / "image.nii.gz", image)
+    tetopt.save_image(folder / "mask.nii.gz", mask)
+    labels = np.where(grid(image.shape)[..., 0] > 14, 4.0, 2.0)
+    labels[10, 10, 12] = 9.0
+    shift = OBLIQUE.copy()
+    shift[:3, 3] = image.to_world([2.0, 1.0, 3.0])
+    tetopt.save_image(folder / "labels.nii.gz", tetopt.Image(labels[2:, 1:, 3:], shift))
+    twice = OBLIQUE @ np.diag([0.5, 0.5, 0.5, 1.0])
+    twice[:3, 3] = image.to_world([-0.25, -0.25, -0.25])
+    fine = np.repeat(np.repeat(np.repeat(image.data**2, 2, 0), 2, 1), 2, 2)
+    tetopt.save_image(folder / "square.nii.gz", tetopt.Image(fine, twice))
+    head = np.where(distance(image.shape, 13, 14, 15) < 10, 500.0, 0.0) + 0.2 * image.data
+    head[10:14, 12:15, 12:15] = 0.0  # a dark cavity
+    tetopt.save_image(folder / "head.nii.gz", tetopt.Image(head))
+    far = OBLIQUE.copy()
+    far[:3, 3] += 500.0
+    tetopt.save_image(folder / "far.nii.gz", tetopt.Image(mask.data, far))
+    tetopt.save_image(folder / "empty.nii.gz", tetopt.Image(0.0 * mask.data, OBLIQUE))
+    tetopt.save_image(folder / "parts.nii.gz", tetopt.Image(labels, OBLIQUE))
+    tetopt.save_image(folder / "half.nii.gz", tetopt.Image(labels + 0.5, OBLIQUE))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run(inputs, tmp_path_factory):
+    out = tmp_path_factory.mktemp("run")
+    command = ["mesh", str(inputs / "image.nii.gz"), str(inputs / "square.nii.gz"), "--weights", "1,0.5"]
+    command += ["--mask", str(inputs / "mask.nii.gz"), "--labels", str(inputs / "labels.nii.gz"), "--nodes", "600"]
+    command += ["-o", str(out / "mesh.vtu"), "--json", str(out / "run.json"), "--figures", str(out)]
+    assert main(command) == 0
+    return out
+
+
+def test_the_mesh_file(run, inputs):
+    loaded = tetopt.load_mesh(run / "mesh.vtu")
+    image, mask = shaped("ball", OBLIQUE)
+    assert tetopt.check_mesh(loaded.mesh) == []
+    size = mask.data.sum() * image.voxel_volume
+    assert loaded.cell_data["volume"].sum() == pytest.approx(size, rel=0.04)
+    assert {"label", "mean", "variance", "mean_2", "variance_2"} <= set(loaded.cell_data)
+    assert set(loaded.cell_data["label"].tolist()) <= {2, 4, 9}
+    middle = image.to_index(loaded.mesh.points[loaded.mesh.cells].mean(axis=1))
+    far = np.abs(middle[:, 0] - 14.5) > 2.5
+    expected = np.where(middle[:, 0] > 14.5, 4, 2)
+    assert (loaded.cell_data["label"] == expected)[far].mean() > 0.99
+    # The second contrast is the first one's square, on voxels of half the size.
+    squares = loaded.cell_data["mean"] ** 2 + loaded.cell_data["variance"]
+    assert np.corrcoef(squares, loaded.cell_data["mean_2"])[0, 1] > 0.97
+
+
+def test_the_numbers(run):
+    numbers = json.loads((run / "run.json").read_text())
+    assert numbers["inputs"]["images"] == ["image.nii.gz", "square.nii.gz"]
+    assert numbers["inputs"]["weights"] == [1.0, 0.5]
+    assert numbers["inputs"]["mask"] == "mask.nii.gz"
+    assert set(numbers["inputs"]["sha256"]) == {"square.nii.gz", "mask.nii.gz", "labels.nii.gz"}
+    assert numbers["mask"]["voxels"] == shaped("ball")[1].data.sum()
+    assert numbers["mask"]["dice"] > 0.98
+    assert numbers["mask"]["distance_mean"] < 0.25
+    rows = {row["label"]: row for row in numbers["labels"]}
+    assert set(rows) == {2, 4, 9}
+    assert rows[2]["dice"] > 0.95
+    assert [row["weight"] for row in numbers["contrasts"]] == [1.0, 0.5]
+    assert 0.0 < numbers["contrasts"][1]["E_D_share_of_variance"] < 0.5
+    assert 0.0 < numbers["energies"]["E_D_share_of_variance"] < 0.5
+
+
+def test_the_pictures(run):
+    for name in ("slice", "rho", "energies", "boundary", "labels"):
+        assert (run / f"{name}.png").stat().st_size > 10_000
+
+
+def test_measured_again(run, inputs, tmp_path, capsys):
+    """`quality` finds the same of the file as the run of the mesh."""
+    command = ["quality", str(run / "mesh.vtu"), "--image", str(inputs / "image.nii.gz"), "--check"]
+    command += ["--mask", str(inputs / "mask.nii.gz"), "--labels", str(inputs / "labels.nii.gz")]
+    assert main([*command, "--json", str(tmp_path / "q.json")]) == 0
+    first, again = (json.loads(path.read_text()) for path in (run / "run.json", tmp_path / "q.json"))
+    assert again["mask"] == pytest.approx(first["mask"])
+    for one, other in zip(first["labels"], again["labels"], strict=True):
+        assert one == pytest.approx(other, nan_ok=True)
+    said = capsys.readouterr().out
+    assert "mask: Dice" in said
+    assert "labels: size in voxels and in cells" in said
+
+
+@pytest.mark.parametrize("background", ["auto", "60"])
+def test_background(inputs, tmp_path, background, capsys):
+    out = tmp_path / "a.vtu"
+    command = ["mesh", str(inputs / "head.nii.gz"), "--background", background, "--uniform", "--nodes", "400"]
+    assert main([*command, "--iterations", "2", "-o", str(out), "--json", str(tmp_path / "a.json")]) == 0
+    mesh = tetopt.load_mesh(out).mesh
+    ball = (distance((28, 30, 32), 13, 14, 15) < 10).sum()
+    numbers = json.loads((tmp_path / "a.json").read_text())
+    assert 0.0 < numbers["inputs"]["background"] < 400.0
+    assert tetopt.quality(mesh.points, mesh.cells).volume == pytest.approx(ball, rel=0.05)  # the cavity stays in
+
+
+def test_labels_alone(inputs, tmp_path, capsys):
+    """An image that is its own labels: whatever numbers they have, each counts as itself."""
+    path = str(inputs / "parts.nii.gz")
+    command = ["mesh", path, "--labels", path, "--nodes", "300", "--iterations", "3", "-o", str(tmp_path / "a.vtu")]
+    assert main([*command, "--json", str(tmp_path / "a.json")]) == 0
+    assert json.loads((tmp_path / "a.json").read_text())["inputs"]["weights"] == [0.0]
+    assert "only these count" in capsys.readouterr().err
+
+
+def test_a_label_never_vanishes_silently(tmp_path, capsys):
+    labels = np.zeros((30, 30, 30))
+    labels[10:20, 10:20, 14] = 1.0
+    labels[10:20, 10:20, 15] = 2.0
+    labels[10:20, 10:20, 16] = 1.0
+    labels[4:24, 4:24, 22] = 3.0
+    path = tmp_path / "labels.nii.gz"
+    tetopt.save_image(path, tetopt.Image(labels))
+    # The lattice itself, much coarser than the sheets.
+    command = ["mesh", str(path), "--labels", str(path), "--uniform", "--nodes", "60", "--iterations", "0"]
+    assert main([*command, "-o", str(tmp_path / "a.vtu")]) == 1
+    said = " ".join(capsys.readouterr().err.split())
+    assert "no cell has label 3, of more than 200 voxels; allow more nodes" in said
+    assert "no cell has label 1, 2, of 200 voxels or fewer" in said
+
+
+def test_pieces_that_the_cells_do_not_tell_apart(tmp_path, capsys):
+    mask = np.zeros((24, 24, 24))
+    mask[4:20, 4:20, 4:11] = mask[4:20, 4:20, 12:20] = 1.0
+    image = tmp_path / "image.nii.gz"
+    tetopt.save_image(image, tetopt.Image(mask))
+    command = ["mesh", str(image), "--mask", str(image), "--uniform", "--nodes", "40", "--iterations", "0"]
+    assert main([*command, "-o", str(tmp_path / "a.vtu")]) == 0
+    said = " ".join(capsys.readouterr().err.split())
+    assert "the mask has 2 pieces, the mesh 1" in said or "overlap only by Dice" in said
+
+
+def test_a_slice_of_all(inputs, tmp_path):
+    command = ["mesh", str(inputs / "image.nii.gz"), "--mask", str(inputs / "mask.nii.gz"), "--slice", "k=15"]
+    command += ["--labels", str(inputs / "parts.nii.gz"), "--nodes", "150", "-o", str(tmp_path / "a.vtu")]
+    assert main(command) == 0
+    mesh = tetopt.load_mesh(tmp_path / "a.vtu").mesh
+    assert mesh.ndim == 2
+    assert tetopt.check_mesh(mesh) == []
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ("--mask mask.nii.gz --background 3", "--mask and --background: give one of them"),
+        ("--background dark", '--background: expected a number, got "dark"'),
+        ("--label-weight 2", "--label-weight: there are no --labels"),
+        ("--weights 1,2", "weights: expected one of 0 or more for each of 1 images, got"),
+        ("--weights 1,x", '--weights: expected a number, got "x"'),
+        ("--mask empty.nii.gz", "empty.nii.gz: "),
+        ("--mask far.nii.gz", "far.nii.gz: "),
+        ("--mask parts.nii.gz", "parts.nii.gz: expected a mask"),
+        ("--labels half.nii.gz", "half.nii.gz: labels must be whole numbers"),
+        ("--labels far.nii.gz", "far.nii.gz: "),
+        ("--mask missing.nii.gz", "missing.nii.gz: "),
+        ("--method paper --mask mask.nii.gz", "--method paper: takes one IMAGE and its whole box"),
+        ("far.nii.gz", "far.nii.gz: "),
+    ],
+)
+def test_refused(inputs, tmp_path, monkeypatch, capfd, options, match):
+    """One line, exit 2, nothing written."""
+    monkeypatch.chdir(inputs)
+    out = tmp_path / "a.vtu"
+    assert main(["mesh", "image.nii.gz", *options.split(), "--nodes", "100", "-o", str(out)]) == 2
+    said = capfd.readouterr()
+    lines = [line for line in said.err.splitlines() if line.strip()]
+    assert len(lines) == 1
+    assert match in lines[0]
+    assert said.out == ""
+    assert not out.exists()
