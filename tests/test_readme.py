@@ -2,6 +2,7 @@
 
 import re
 import shlex
+import shutil
 from pathlib import Path
 
 import pytest
@@ -31,15 +32,23 @@ def test_program(tmp_path, monkeypatch, capsys):
 def test_commands(tmp_path, monkeypatch):
     """Each `tetopt` line of the README, on a phantom in the place of the T1 and with fewer nodes."""
     lines = [line for line in README.splitlines() if re.match("tetopt (mesh|quality|phantom|fem|segment) ", line)]
-    assert len(lines) == 7
+    assert len(lines) == 11
     monkeypatch.chdir(tmp_path)
-    assert main(["phantom", "sphere", "-o", "T1.nii.gz", "--voxel-mm", "2"]) == 0
+    assert main(["phantom", "sphere", "-o", "T1.nii.gz", "--voxel-mm", "2", "--labels", "mask.nii.gz"]) == 0
+    shutil.copy("T1.nii.gz", "T2.nii.gz")
+    shutil.copy("mask.nii.gz", "tissues.nii.gz")
     for line in lines:
         words = shlex.split(line, comments=True)[1:]
         words = ["200" if before == "--nodes" else word for before, word in zip(["", *words], words, strict=False)]
         assert main(words) == 0, line
     files = {
         "T1.nii.gz",
+        "T2.nii.gz",
+        "mask.nii.gz",
+        "tissues.nii.gz",
+        "organ.vtu",
+        "head.vtu",
+        "tissues.vtu",
         "labels.nii.gz",
         "brain.vtu",
         "fine.vtu",

@@ -1216,7 +1216,7 @@ def compare_command(
     nodes: Annotated[int, typer.Option(metavar="N", min=20, help="Wanted number of nodes, of every mesh.")] = 5000,
     labels_path: Annotated[
         Path | None,
-        typer.Option("--labels", metavar="LABELS", help="Label image for the pipelines that need a segmentation."),
+        typer.Option("--labels", metavar="LABELS", help="Label image, for tetopt and the pipelines that segment."),
     ] = None,
     repeats: Annotated[int, typer.Option(metavar="R", min=1, help="Runs of a mesher whose result varies.")] = 3,
     pipelines: Annotated[
