@@ -149,7 +149,12 @@ def test_float_labels_of_256_cubed():
         ({"weights": [1.0, -1.0, 1.0]}, "weights: expected one of 0 or more for each of 3 images, got"),
         ({"weights": [0.0, 0.0, 0.0]}, "weights: nothing that differs between voxels counts; give one above 0"),
         ({"mask": tetopt.Image(np.zeros((12, 13, 14)))}, "mask: no voxel has a half or more, there is nothing to mesh"),
-        ({"mask": tetopt.Image(np.ones((12, 13, 15)))}, "images: expected all of shape (12, 13, 14), got (12, 13, 15)"),
+        ({"mask": tetopt.Image(np.ones((12, 13, 15)))}, "mask: expected all of shape (12, 13, 14), got (12, 13, 15)"),
+        ({"images": contrasts()[0], "weights": [0.0]}, "weights: nothing that differs between voxels counts"),
+        ({"labels": tetopt.Image(np.ones((12, 13, 14)) + 0.5)}, "labels: labels must be whole numbers from 0"),
+        ({"label_weight": -1.0}, "label_weight: expected 0 or more, got -1.0"),
+        ({"images": [tetopt.Image(1e160 * i.data.astype(float)) for i in contrasts()]}, "image: squares of intensities overflow"),
+        ({"mask": tetopt.Image(np.ones((12, 13, 14)), OBLIQUE)}, "mask: expected voxels in the same place as the first"),
     ],
 )
 def test_refused(change, message):

@@ -12,9 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy import ndimage
 
+from tetopt.content import check_labels
 from tetopt.errors import InputError
 from tetopt.image import Image
-from tetopt.segmentation import check_labels, class_thresholds
+from tetopt.segmentation import class_thresholds
 
 SAME_GRID = 1e-4  # voxels by which two affines may differ and be the same: headers hold single precision
 HALF = 0.5  # the level of a probability map that counts as inside

@@ -37,7 +37,7 @@ from tetopt import (
     save_mesh,
 )
 from tetopt.align import aligned_contrast, aligned_labels, aligned_mask, background_level, foreground
-from tetopt.content import Content, content, continued
+from tetopt.content import Content, check_labels, content, continued
 from tetopt.domain import lattice_within
 from tetopt.fidelity import cell_labels, label_fidelity, mask_fidelity
 from tetopt.geometry.quality import Quality, quality
@@ -58,7 +58,6 @@ from tetopt.optimize.fast import (
 from tetopt.optimize.octree import octree
 from tetopt.optimize.paper import Optimized, Record, default_n_t, optimize_paper
 from tetopt.report.summary import run_summary, versions
-from tetopt.segmentation import check_labels
 
 COVERED = 0.95  # Dice of a mesh that represents its mask
 LARGE = 200  # voxels: a label of more may not be without cells

@@ -19,9 +19,11 @@ from tetopt.errors import InputError
 from tetopt.image import Image
 
 SAMPLE = 100_000  # voxels, of which the most frequent value is taken for the background's
-LABELS = 32  # values, at most, that an image of labels has
+FEW = 32  # values, at most, that an image of labels has
+LABELS = 32_767  # largest label
 REACH = 4  # voxels: labels that come no nearer may share a channel
 RARE = 0.5  # power of a label's share of voxels by which it counts less
+SAME_PLACE = 1e-2  # voxel: what lies no further away is in the same place
 MARGIN = 4  # voxels around a mask
 SURFACE = 4.0  # of the variance: what a voxel on the wrong side of the region's surface counts
 MOST = 2.0**31  # sums of squares along a row stay below, so that they are exact in 32 bits
@@ -93,38 +95,52 @@ def content(
     """
     images = [images] if isinstance(images, Image) else list(images)
     weights = [1.0] * len(images) if weights is None else [float(w) for w in weights]
-    _check(images, [image for image in (labels, mask) if image is not None], weights)
+    _check(images, {"labels": labels, "mask": mask}, weights, label_weight)
     region = None
     if mask is not None:
         part = _around(mask)
-        images = [_part(image, part) for image in images]
-        labels = None if labels is None else _part(labels, part)
         region = domain(_part(mask, part))
-        images = [_continued(image, region) for image in images]
-    first = images[0]
-    if len(images) == 1 and labels is None:
-        return plain(first)._replace(region=region)
-    unit = _variance(first.data, region) or 1.0
+        images = [_continued(_part(image, part), region) for image in images]
+        labels = None if labels is None else _continued(_part(labels, part), region)
+    if len(images) == 1 and labels is None and weights[0] > 0.0:
+        return plain(images[0])._replace(region=region)
+    contrasts = _scaled(images, weights, region)
+    number, codes = np.zeros(images[0].shape, dtype=np.int64), np.zeros((0, 1))
+    if labels is not None and label_weight > 0.0:
+        number, codes = _one_hot(labels.data.astype(np.int64), region)
+        codes = np.sqrt(label_weight) * codes
+    if len(contrasts) + len(codes) == 0:
+        raise InputError("weights: nothing that differs between voxels counts; give one above 0")
+    values, scale = _whole(contrasts, number, codes)
+    unit = _variance(images[0].data, region) or 1.0
+    return Content(images[0], values, len(contrasts), unit / scale**2, False, region)
+
+
+def _scaled(images: list[Image], weights: list[float], region: Domain | None) -> list[NDArray[np.float32]]:
+    """The contrasts that count less their means, of variance `weight` each."""
     found = []
     for image, weight in zip(images, weights, strict=True):
         data = image.data - np.mean(image.data, dtype=np.float64)
         spread = _variance(data, region)
+        if not np.isfinite(spread):
+            raise InputError("image: squares of intensities overflow; rescale it first")
         if weight > 0.0 and spread > 0.0:
             found.append((np.sqrt(weight / spread) * data).astype(np.float32))
-    number, codes = np.zeros(first.shape, dtype=np.int64), np.zeros((0, 1))
-    if labels is not None and label_weight > 0.0:
-        number, codes = _one_hot(_continued(labels, region).data.astype(np.int64), region)
-        codes = np.sqrt(label_weight) * codes
-    if len(found) + len(codes) == 0:
-        raise InputError("weights: nothing that differs between voxels counts; give one above 0")
-    square = sum(float(np.abs(v).max()) ** 2 for v in found) + float((codes**2).max(initial=0.0))
-    scale = np.sqrt(0.9 * MOST / (first.shape[-1] * square))
-    values = np.empty((len(found) + len(codes), *first.shape), dtype=np.int32)
-    for row, data in zip(values, found, strict=False):
+    return found
+
+
+def _whole(
+    contrasts: list[NDArray[np.float32]], number: NDArray[np.int64], codes: NDArray[np.float64]
+) -> tuple[NDArray[np.int32], float]:
+    """All channels, (C, *shape), as whole numbers whose sums of squares along a row fit 32 bits, and their scale."""
+    square = sum(float(np.abs(data).max()) ** 2 for data in contrasts) + float((codes**2).max(initial=0.0))
+    scale = float(np.sqrt(0.9 * MOST / (number.shape[-1] * square)))
+    values = np.empty((len(contrasts) + len(codes), *number.shape), dtype=np.int32)
+    for row, data in zip(values, contrasts, strict=False):
         row[:] = np.rint(scale * data)
-    for row, code in zip(values[len(found) :], codes, strict=True):
+    for row, code in zip(values[len(contrasts) :], codes, strict=True):
         row[:] = np.rint(scale * code).astype(np.int32)[number]
-    return Content(first, values, len(found), unit / scale**2, False, region)
+    return values, scale
 
 
 def plain(image: Image | Content) -> Content:
@@ -159,14 +175,37 @@ def _continued(image: Image, region: Domain | None) -> Image:
     return Image(image.data[tuple(nearest)], image.affine)
 
 
-def _check(images: list[Image], others: list[Image], weights: list[float]) -> None:
+def _check(images: list[Image], others: dict[str, Image | None], weights: list[float], label_weight: float) -> None:
     if not images:
         raise InputError("images: expected one or more, got none")
-    for image in [*images, *others]:
-        if image.shape != images[0].shape:
-            raise InputError(f"images: expected all of shape {images[0].shape}, got {image.shape}; resample them")
+    first = images[0]
+    named = [*(("images", image) for image in images), *((name, image) for name, image in others.items() if image)]
+    for name, image in named:
+        if image.shape != first.shape:
+            raise InputError(
+                f"{name}: expected all of shape {first.shape}, got {image.shape}; see tetopt.aligned_mask and the like"
+            )
+        last = np.array(first.shape) - 1
+        if np.abs(first.to_index(image.to_world([0 * last, last])) - [0 * last, last]).max() > SAME_PLACE:
+            raise InputError(f"{name}: expected voxels in the same place as the first image's; see tetopt.aligned_mask")
     if len(weights) != len(images) or not all(0.0 <= w < np.inf for w in weights):
         raise InputError(f"weights: expected one of 0 or more for each of {len(images)} images, got {weights}")
+    if not 0.0 <= label_weight < np.inf:
+        raise InputError(f"label_weight: expected 0 or more, got {label_weight}")
+    if others["labels"] is not None:
+        check_labels("labels", others["labels"])
+
+
+def check_labels(name: str, labels: Image) -> None:
+    """InputError unless the voxels are whole numbers from 0 to `LABELS`."""
+    data = labels.data
+    wrong = np.argwhere((data < 0) | (data > LABELS) | (np.rint(data) != data))
+    if len(wrong):
+        first = tuple(int(i) for i in wrong[0])
+        raise InputError(
+            f"{name}: labels must be whole numbers from 0 to {LABELS}, {len(wrong)} voxels have others, the first "
+            f"{data[first]:g} at {first}; is it a label image?"
+        )
 
 
 def _one_hot(labels: NDArray[np.int64], region: Domain | None) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
@@ -226,7 +265,7 @@ def noise_level(data: NDArray, inside: NDArray[np.bool_] | None = None) -> float
         rest = np.diff(rest, n=2, axis=axis)
     # Few values are labels, and have none.
     values, often = np.unique(data.ravel()[:: max(data.size // SAMPLE, 1)], return_counts=True)
-    if len(values) <= LABELS:
+    if len(values) <= FEW:
         return 0.0
     middle = (slice(1, -1),) * data.ndim
     is_asked = (rest != 0.0) | (data[middle] != values[often.argmax()])

@@ -20,13 +20,13 @@ from scipy.ndimage import find_objects
 from scipy.ndimage import label as voxel_components
 
 from tetopt.check import facets_on_box
+from tetopt.content import LABELS, check_labels
 from tetopt.energy.sampling import cell_of_voxel, nearest_values
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import centroids, volumes
 from tetopt.geometry.topology import components, facets
 from tetopt.image import Image, transformed
 from tetopt.mesh import Mesh
-from tetopt.segmentation import LABELS, check_labels
 
 POINTS = 20_000  # most points on a surface from which distances are measured
 FEWEST = 1_000  # the same on the larger of two surfaces, however small

@@ -9,12 +9,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt.content import check_labels
 from tetopt.energy.sampling import cell_moments, cell_of_voxel
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 
-LABELS = 32_767  # largest label
 BINS = 256  # of the histogram whose classes are found
 
 
@@ -136,15 +136,3 @@ def _table(labels: Image, truth: Image) -> NDArray[np.int64]:
     found, true = labels.data.astype(np.int64).ravel(), truth.data.astype(np.int64).ravel()
     shape = (int(found.max()) + 1, int(true.max()) + 1)
     return np.bincount(found * shape[1] + true, minlength=shape[0] * shape[1]).reshape(shape)
-
-
-def check_labels(name: str, labels: Image) -> None:
-    """InputError unless the voxels are whole numbers from 0 to `LABELS`."""
-    data = labels.data
-    wrong = np.argwhere((data < 0) | (data > LABELS) | (np.rint(data) != data))
-    if len(wrong):
-        first = tuple(int(i) for i in wrong[0])
-        raise InputError(
-            f"{name}: labels must be whole numbers from 0 to {LABELS}, {len(wrong)} voxels have others, the first "
-            f"{data[first]:g} at {first}; is it a label image?"
-        )

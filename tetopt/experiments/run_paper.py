@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from tetopt.content import check_labels
 from tetopt.energy.sampling import cell_moments, cell_of_voxel
 from tetopt.errors import InputError
 from tetopt.experiments import paper
@@ -29,7 +30,7 @@ from tetopt.report.scene import (
     structure_before_slices,
 )
 from tetopt.report.summary import versions
-from tetopt.segmentation import check_labels, dice, segmented, thresholded
+from tetopt.segmentation import dice, segmented, thresholded
 
 PICTURES = ("fig1.png", "fig2.png", "fig2b.png", "fig3ab.png", "fig3cd.png", "fig3e.png", "fig3f.png")
 SNR_DB = (None, 30.0, 20.0)

@@ -7,8 +7,8 @@ from matplotlib.colors import to_rgba_array
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
+from tetopt.content import check_labels
 from tetopt.image import Image
-from tetopt.segmentation import check_labels
 
 BACKGROUND = "#e6e6e6"  # of label 0
 UNCOVERED = "#cfe3f5"  # where a mesh leaves the image uncovered
