@@ -149,7 +149,8 @@ def plain(image: Image | Content) -> Content:
 
 
 def _variance(values: NDArray, region: Domain | None) -> float:
-    return float(np.var(values if region is None else values[region.inside], dtype=np.float64))
+    with np.errstate(over="ignore"):
+        return float(np.var(values if region is None else values[region.inside], dtype=np.float64))
 
 
 def _around(mask: Image) -> tuple[slice, ...]:
