@@ -2,6 +2,7 @@
 
 import json
 
+import nibabel
 import numpy as np
 import pytest
 from shapes import OBLIQUE, distance, grid, shaped
@@ -156,6 +157,21 @@ def test_a_slice_of_all(inputs, tmp_path):
     mesh = tetopt.load_mesh(tmp_path / "a.vtu").mesh
     assert mesh.ndim == 2
     assert tetopt.check_mesh(mesh) == []
+
+
+def test_a_volume_of_a_4d_file(inputs, tmp_path, capsys):
+    """FILE:K; without it the line says so."""
+    image, mask = shaped("ball", OBLIQUE)
+    both = np.stack([np.ones(image.shape), mask.data], axis=-1).astype(np.float32)
+    nibabel.Nifti1Image(both, OBLIQUE).to_filename(tmp_path / "four.nii.gz")
+    command = ["mesh", str(inputs / "image.nii.gz"), "--uniform", "--nodes", "300", "--iterations", "0"]
+    command += ["-o", str(tmp_path / "a.vtu"), "--json", str(tmp_path / "a.json"), "--mask"]
+    assert main([*command, str(tmp_path / "four.nii.gz")]) == 2
+    assert "the file holds 2 volumes; choose one, 0 to 1" in capsys.readouterr().err
+    assert main([*command, f"{tmp_path / 'four.nii.gz'}:1"]) == 0
+    assert json.loads((tmp_path / "a.json").read_text())["mask"]["voxels"] == mask.data.sum()
+    mesh = tetopt.load_mesh(tmp_path / "a.vtu").mesh
+    assert tetopt.quality(mesh.points, mesh.cells).volume < 0.3 * image.volume
 
 
 @pytest.mark.parametrize(

@@ -153,8 +153,11 @@ def test_float_labels_of_256_cubed():
         ({"images": contrasts()[0], "weights": [0.0]}, "weights: nothing that differs between voxels counts"),
         ({"labels": tetopt.Image(np.ones((12, 13, 14)) + 0.5)}, "labels: labels must be whole numbers from 0"),
         ({"label_weight": -1.0}, "label_weight: expected 0 or more, got -1.0"),
-        ({"images": [tetopt.Image(1e160 * i.data.astype(float)) for i in contrasts()]}, "image: squares of intensities overflow"),
-        ({"mask": tetopt.Image(np.ones((12, 13, 14)), OBLIQUE)}, "mask: expected voxels in the same place as the first"),
+        (
+            {"images": [tetopt.Image(1e160 * i.data.astype(float)) for i in contrasts()]},
+            "image: squares of intensities",
+        ),
+        ({"mask": tetopt.Image(np.ones((12, 13, 14)), OBLIQUE)}, "mask: expected voxels in the same place"),
     ],
 )
 def test_refused(change, message):

@@ -400,18 +400,9 @@ def _source(
         "mask": None if mask_path is None else mask_path.name, "background": level,
         "labels": None if labels_path is None else labels_path.name,
         "label_weight": None if labels is None else label_weight,
-        "sha256": {path.name: sha256(path) for path in files},
+        "sha256": {path.name: sha256(_file_and_volume(path)[0]) for path in files},
     }  # fmt: skip
     return _Source(paths, wanted, contrasts, labels, mask, about)
-
-
-def _companion(path: Path, crop: str | None, slice_: str | None) -> Image:
-    """A file that goes with the image; whole, unless a slice is meshed, which only an image of the same grid has."""
-    if slice_ is None:
-        return load_quietly(path)
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        return _image(path, None, crop, slice_)
 
 
 def _beside(
@@ -454,15 +445,27 @@ def _sizes(
         return None
     return tetopt.Sizes(
         0.0 if size_min is None else size_min, size_max, 1.0 if gradation is None else gradation,
-        None if sizing is None else load_quietly(sizing),
+        None if sizing is None else _companion(sizing),
     )  # fmt: skip
 
 
-def load_quietly(path: Path) -> Image:
-    """A file of sizes, labels or a mask; what would be odd in an image, such as one value everywhere, is not in it."""
+def _file_and_volume(path: Path) -> tuple[Path, int | None]:
+    """A file beside the first image, and the volume of it that `FILE:K` names."""
+    name, colon, volume = str(path).rpartition(":")
+    if colon and volume.isdecimal() and not path.exists():
+        return Path(name), int(volume)
+    return path, None
+
+
+def _companion(path: Path, crop: str | None = None, slice_: str | None = None) -> Image:
+    """A file that goes with the image; whole, unless a slice is meshed, which only an image of the same grid has.
+
+    What would be odd in an image, such as one value everywhere, is not in sizes, labels or a mask.
+    """
+    file, volume = _file_and_volume(path)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return load_image(path)
+        return _image(file, volume, None if slice_ is None else crop, slice_)
 
 
 def _check_method(method: Method, given: dict[str, Any], wanted: Method) -> None:

@@ -336,7 +336,10 @@ def _volume_index(trailing: tuple[int, ...], volume: int | None) -> tuple[int, .
     if count == 0:
         raise InputError(f"every axis needs a voxel, got trailing axes of lengths {trailing}")
     if volume is None and count > 1:
-        raise InputError(f"the file holds {count} volumes; choose one with `volume=k` / `--volume K`, 0 to {count - 1}")
+        raise InputError(
+            f"the file holds {count} volumes; choose one, 0 to {count - 1}: `volume=k`, "
+            "`--volume K` for the first image of a command, `FILE:K` for others"
+        )
     volume = 0 if volume is None else volume
     if not 0 <= volume < count:
         held = "one volume" if count == 1 else f"{count} volumes"
