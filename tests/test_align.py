@@ -72,6 +72,8 @@ def pair(which, values):
 
 
 def message(function, *args):
+    """What a function says of its arguments; a name that messages begin with may come first."""
+    args = (*args[1:], args[0]) if isinstance(args[0], str) else args
     with pytest.raises(tetopt.InputError) as caught:
         function(*args)
     assert "\n" not in str(caught.value)
@@ -84,21 +86,21 @@ def test_nearest_is_its_twin(which):
     image, labels = pair(which, lambda rng: rng.integers(1, 9, OTHER))
     expected = nearest_twin(labels, image)
     assert 0 < np.count_nonzero(expected == 0) < expected.size  # both inside and outside are tried
-    found = aligned_labels("l", labels, image)
+    found = aligned_labels(labels, image, "l")
     np.testing.assert_array_equal(found.data, expected)
     np.testing.assert_array_equal(found.affine, image.affine)
     mask = tetopt.Image(255 * (labels.data > 4), labels.affine)
-    found = aligned_mask("m", mask, image)
+    found = aligned_mask(mask, image, "m")
     np.testing.assert_array_equal(found.data, nearest_twin(mask, image) / 255)
     np.testing.assert_array_equal(found.affine, image.affine)
     chance = tetopt.Image(labels.data / 16, labels.affine)
-    np.testing.assert_array_equal(aligned_mask("m", chance, image).data, nearest_twin(chance, image))
+    np.testing.assert_array_equal(aligned_mask(chance, image, "m").data, nearest_twin(chance, image))
 
 
 @pytest.mark.parametrize("which", PAIRS)
 def test_linear_is_its_twin(which):
     image, other = pair(which, lambda rng: rng.normal(size=OTHER).astype(np.float32))
-    found = aligned_contrast("c", other, image)
+    found = aligned_contrast(other, image, "c")
     np.testing.assert_allclose(found.data, linear_twin(other, image), atol=1e-6)
     np.testing.assert_array_equal(found.affine, image.affine)
 
@@ -112,7 +114,7 @@ def test_linear_fields_survive_any_affine():
     other = tetopt.Image(other.to_world(grid) @ gradient, other.affine)
     image = tetopt.Image(np.zeros(SHAPE), image_affine)
     expected = image.to_world(np.moveaxis(np.indices(SHAPE), 0, -1)) @ gradient
-    np.testing.assert_allclose(aligned_contrast("c", other, image).data, expected, atol=1e-5)
+    np.testing.assert_allclose(aligned_contrast(other, image, "c").data, expected, atol=1e-5)
 
 
 def _translation(*shift):
@@ -126,12 +128,12 @@ def test_same_grid_is_taken_as_it_is():
     image = tetopt.Image(np.zeros(SHAPE), affine)
     data = rng.normal(size=SHAPE).astype(np.float32)
     near = tetopt.Image(data, affine @ _translation(9e-5, 0, 0))
-    np.testing.assert_array_equal(aligned_contrast("c", near, image).data, data)
-    np.testing.assert_array_equal(aligned_contrast("c", near, image).affine, affine)
+    np.testing.assert_array_equal(aligned_contrast(near, image, "c").data, data)
+    np.testing.assert_array_equal(aligned_contrast(near, image, "c").affine, affine)
     far = tetopt.Image(data, affine @ _translation(2e-3, 0, 0))
-    assert 1e-4 < np.abs(aligned_contrast("c", far, image).data - data).max() < 2e-2
+    assert 1e-4 < np.abs(aligned_contrast(far, image, "c").data - data).max() < 2e-2
     shape_only = tetopt.Image(np.arange(1, 1 + np.prod(SHAPE)).reshape(SHAPE), affine @ _translation(0, 2, 0))
-    moved = aligned_labels("l", shape_only, image).data
+    moved = aligned_labels(shape_only, image, "l").data
     np.testing.assert_array_equal(moved[:, 2:], shape_only.data[:, :-2])
     np.testing.assert_array_equal(moved[:, :2], 0)
 
@@ -144,7 +146,7 @@ def test_grid_shifted_by_half_a_voxel(spacing, sign):
     affine[:3, 3] = 17.3
     image = tetopt.Image(np.zeros((40, 3, 3)), affine)
     labels = tetopt.Image(np.arange(1, 361).reshape(40, 3, 3), affine @ _translation(-0.5 * sign, 0, 0))
-    found = aligned_labels("l", labels, image).data
+    found = aligned_labels(labels, image, "l").data
     if sign > 0:  # index i + 1/2: the upper is i + 1, the last is on the upper face, outside
         np.testing.assert_array_equal(found[:-1], labels.data[1:])
         np.testing.assert_array_equal(found[-1], 0)
@@ -157,11 +159,11 @@ def test_cropped_and_finer_masks():
     crop = tetopt.Image(np.ones((2, 3, 1)), image.affine @ _translation(1, 2, 5))
     expected = np.zeros(image.shape)
     expected[1:3, 2:5, 5] = 1
-    found = aligned_mask("m", crop, image).data
+    found = aligned_mask(crop, image, "m").data
     np.testing.assert_array_equal(found, expected)
     fine = tetopt.Image(expected.repeat(3, 0).repeat(3, 1).repeat(3, 2), np.diag([2 / 3] * 3 + [1.0]))
     fine = tetopt.Image(fine.data, fine.affine @ _translation(-1, -1, -1))
-    np.testing.assert_array_equal(aligned_mask("m", fine, image).data, expected)
+    np.testing.assert_array_equal(aligned_mask(fine, image, "m").data, expected)
 
 
 def test_two_dimensions():
@@ -171,8 +173,8 @@ def test_two_dimensions():
     other = tetopt.Image(rng.integers(1, 5, (6, 5)), affine)
     expected = nearest_twin(other, image)
     assert 0 < (expected == 0).sum() < expected.size
-    np.testing.assert_array_equal(aligned_labels("l", other, image).data, expected)
-    np.testing.assert_allclose(aligned_contrast("c", other, image).data, linear_twin(other, image), atol=1e-6)
+    np.testing.assert_array_equal(aligned_labels(other, image, "l").data, expected)
+    np.testing.assert_allclose(aligned_contrast(other, image, "c").data, linear_twin(other, image), atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -188,10 +190,10 @@ def test_two_dimensions():
 )
 def test_what_a_mask_may_hold(values, expected):
     mask = tetopt.Image(values)
-    found = aligned_mask("m", mask, tetopt.Image(np.zeros(mask.shape)))
+    found = aligned_mask(mask, tetopt.Image(np.zeros(mask.shape)), "m")
     np.testing.assert_array_equal(found.data, expected)
     assert found.data.dtype == np.float32
-    doubles = aligned_mask("m", tetopt.Image([[0.1, 0.7]]), tetopt.Image(np.zeros((1, 2)))).data
+    doubles = aligned_mask(tetopt.Image([[0.1, 0.7]]), tetopt.Image(np.zeros((1, 2))), "m").data
     assert doubles.dtype == np.float32
 
 
@@ -250,16 +252,16 @@ def test_labels_that_are_none():
 
 def test_label_files_of_floats():
     labels = tetopt.Image(np.array([[0.0, 32_767.0], [2.0, 1.0]], dtype=np.float64))
-    np.testing.assert_array_equal(aligned_labels("l", labels, tetopt.Image(np.zeros((2, 2)))).data, labels.data)
+    np.testing.assert_array_equal(aligned_labels(labels, tetopt.Image(np.zeros((2, 2))), "l").data, labels.data)
     # One value in its own box, but a box smaller than the image: label and background.
     crop = tetopt.Image([[4.0]])
-    np.testing.assert_array_equal(aligned_labels("l", crop, tetopt.Image(np.zeros((1, 2)))).data, [[4, 0]])
+    np.testing.assert_array_equal(aligned_labels(crop, tetopt.Image(np.zeros((1, 2))), "l").data, [[4, 0]])
 
 
 def test_a_contrast_covers_half_of_the_image():
     image = tetopt.Image(np.zeros((4, 3, 2)))
     other = np.arange(24.0).reshape(4, 3, 2)
-    found = aligned_contrast("t2", tetopt.Image(other, _translation(2, 0, 0)), image).data
+    found = aligned_contrast(tetopt.Image(other, _translation(2, 0, 0)), image, "t2").data
     np.testing.assert_array_equal(found, other[[0, 0, 0, 1]])  # the border goes on
     assert message(aligned_contrast, "t2", tetopt.Image(other, _translation(3, 0, 0)), image) == (
         "t2: expected to cover half of the image's voxels or more, got 25.0 %; it spans 2.5..6.5 x -0.5..2.5 x "

@@ -42,6 +42,22 @@ def test_contrasts_count_by_their_weights_not_their_scales(weights):
     assert np.issubdtype(found.values.dtype, np.integer)
 
 
+def test_a_rare_label_or_a_bright_voxel_leaves_the_image_its_levels():
+    """What is rounded away is far below what is represented."""
+    rng = np.random.default_rng(0)
+    data = rng.normal(size=(40, 40, 40))
+    labels = np.zeros(data.shape)
+    labels[20, 20, 20] = 1.0
+    data[5, 5, 5] = 1e4
+    found = content(tetopt.Image(data), tetopt.Image(labels))
+    rest = np.ones(data.shape, dtype=bool)
+    rest[5, 5, 5] = False
+    rounded = found.values[0][rest] * np.sqrt(found.unit) + data.mean()
+    off = float(np.std(rounded - data[rest]))
+    assert off < 0.01 * data.std()  # the image's, of which the one voxel makes nearly all
+    assert np.abs(found.values).max() < 2**31 - 1
+
+
 def labelled(shape=(24, 25, 26)):
     """Labels in slabs, of which only neighbours touch, and one voxel of another."""
     labels = (grid(shape)[..., 0] // 8).astype(int) * 3
@@ -145,14 +161,16 @@ def test_float_labels_of_256_cubed():
     ("change", "message"),
     [
         ({"images": []}, "images: expected one or more, got none"),
-        ({"weights": [1.0]}, "weights: expected one of 0 or more for each of 3 images, got [1.0]"),
-        ({"weights": [1.0, -1.0, 1.0]}, "weights: expected one of 0 or more for each of 3 images, got"),
+        ({"weights": [1.0]}, "weights: expected one for each of 3 images, 0 or 0.001 to 1000, got [1.0]"),
+        ({"weights": [1.0, -1.0, 1.0]}, "weights: expected one for each of 3 images, 0 or 0.001 to 1000, got"),
         ({"weights": [0.0, 0.0, 0.0]}, "weights: nothing that differs between voxels counts; give one above 0"),
         ({"mask": tetopt.Image(np.zeros((12, 13, 14)))}, "mask: no voxel has a half or more, there is nothing to mesh"),
         ({"mask": tetopt.Image(np.ones((12, 13, 15)))}, "mask: expected all of shape (12, 13, 14), got (12, 13, 15)"),
         ({"images": contrasts()[0], "weights": [0.0]}, "weights: nothing that differs between voxels counts"),
+        ({"weights": [1.0, 1e200, 1.0]}, "weights: expected one for each of 3 images"),
+        ({"labels": tetopt.Image(np.full((12, 13, 14), 3.0))}, "labels: the same everywhere in what is meshed"),
         ({"labels": tetopt.Image(np.ones((12, 13, 14)) + 0.5)}, "labels: labels must be whole numbers from 0"),
-        ({"label_weight": -1.0}, "label_weight: expected 0 or more, got -1.0"),
+        ({"label_weight": -1.0}, "label_weight: expected 0 or 0.001 to 1000, got -1.0"),
         (
             {"images": [tetopt.Image(1e160 * i.data.astype(float)) for i in contrasts()]},
             "image: squares of intensities",

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from scipy.ndimage import map_coordinates
+from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
 from shapes import OBLIQUE, grid, shaped
 
 import tetopt
@@ -36,6 +36,14 @@ def test_voxels_stay_on_their_side():
     region = domain(tetopt.Image(1.0 * mask))
     np.testing.assert_array_equal(region.level < 0.0, mask)
     np.testing.assert_array_equal(region.inside, mask)
+
+
+def test_smoothing_moves_no_voxel_by_more_than_a_third():
+    rng = np.random.default_rng(1)
+    inside = gaussian_filter(rng.normal(size=(24, 24, 24)), 2.0) > 0.0
+    raw = np.where(inside, 0.5 - distance_transform_edt(inside), distance_transform_edt(~inside) - 0.5)
+    moved = np.abs(domain(tetopt.Image(1.0 * inside)).level - raw)
+    assert 0.3 < moved.max() < 0.35 + 1e-5
 
 
 @pytest.mark.parametrize("is_gap", [False, True])

@@ -26,17 +26,17 @@ SMALL = 0.01  # pieces with less than this share of the largest one's voxels do 
 FEW = 0.001  # share of the voxels under which a background or foreground found by itself is none
 
 
-def aligned_mask(name: str, mask: Image, image: Image) -> Image:
+def aligned_mask(mask: Image, image: Image, name: str = "mask") -> Image:
     """The mask on the image's voxels; nearest neighbour by the affines where it is on another grid, 0 outside of it.
 
     Parameters
     ----------
-    name : str
-        What the mask is called in messages, for example its file.
     mask : Image
         Either two values, 0 and any other above it (bool, 0 and 255), or fractions in [0, 1], a probability map
         whose level 0.5 counts as the border. One value above 0 everywhere is a mask too: the whole box.
     image : Image
+    name : str, optional
+        What the mask is called in messages, for example its file.
 
     Returns
     -------
@@ -56,16 +56,16 @@ def aligned_mask(name: str, mask: Image, image: Image) -> Image:
     return Image(moved, image.affine)
 
 
-def aligned_labels(name: str, labels: Image, image: Image) -> Image:
+def aligned_labels(labels: Image, image: Image, name: str = "labels") -> Image:
     """The labels on the image's voxels; nearest neighbour by the affines where they are on another grid, 0 outside.
 
     Parameters
     ----------
-    name : str
-        What the labels are called in messages.
     labels : Image
         Whole numbers from 0 to `tetopt.segmentation.LABELS`, 0 the background.
     image : Image
+    name : str, optional
+        What the labels are called in messages.
 
     Returns
     -------
@@ -94,18 +94,18 @@ def aligned_labels(name: str, labels: Image, image: Image) -> Image:
     return Image(moved, image.affine)
 
 
-def aligned_contrast(name: str, other: Image, image: Image) -> Image:
+def aligned_contrast(other: Image, image: Image, name: str = "contrast") -> Image:
     """A further contrast on the image's voxels; linear by the affines where it is on another grid.
 
     Outside of its box the nearest value goes on.
 
     Parameters
     ----------
-    name : str
-        What the contrast is called in messages.
     other : Image
         Intensities.
     image : Image
+    name : str, optional
+        What the contrast is called in messages.
 
     Returns
     -------
@@ -118,7 +118,7 @@ def aligned_contrast(name: str, other: Image, image: Image) -> Image:
         Another number of axes than the image, or less than half of the image's voxel centres in its box.
     """
     _check_axes(name, other, image)
-    if _is_same_grid(other, image):
+    if is_same_grid(other, image):
         return Image(other.data, image.affine)
     share = float(_resampled(np.ones(other.shape, dtype=np.uint8), other, image, 0, "grid-constant").mean())
     if share < SHARE:
@@ -234,10 +234,11 @@ def _mask_values(name: str, data: NDArray[np.floating]) -> NDArray[np.float32]:
 
 def _moved(other: Image, image: Image) -> NDArray[np.floating]:
     """Values of `other` at the image's voxel centres: of the voxel around them, 0 outside."""
-    return other.data if _is_same_grid(other, image) else _resampled(other.data, other, image, 0, "grid-constant")
+    return other.data if is_same_grid(other, image) else _resampled(other.data, other, image, 0, "grid-constant")
 
 
-def _is_same_grid(other: Image, image: Image) -> bool:
+def is_same_grid(other: Image, image: Image) -> bool:
+    """Whether two images have the same voxels, to within 1e-4 voxel."""
     corners = _corners(image)
     return other.shape == image.shape and bool(
         np.abs(other.to_index(image.to_world(corners)) - corners).max() <= SAME_GRID

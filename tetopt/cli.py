@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import json
 import logging
 import os
 import shlex
@@ -36,14 +37,21 @@ from tetopt import (
     save_image,
     save_mesh,
 )
-from tetopt.align import aligned_contrast, aligned_labels, aligned_mask, background_level, foreground
+from tetopt.align import (
+    aligned_contrast,
+    aligned_labels,
+    aligned_mask,
+    background_level,
+    foreground,
+    is_same_grid,
+)
 from tetopt.content import Content, check_labels, content, continued
 from tetopt.domain import lattice_within
 from tetopt.fidelity import cell_labels, label_fidelity, mask_fidelity
 from tetopt.geometry.quality import Quality, quality
 from tetopt.geometry.simplex import dihedral_angles, squared_edges, volumes
 from tetopt.io.files import checked_output, save_json
-from tetopt.io.images import parse_crop, parse_slice, sha256
+from tetopt.io.images import parse_crop, parse_slice, part_of, sha256
 from tetopt.io.meshes import MeshFile, cell_fields
 from tetopt.io.mni import mni_path, mni_tissue
 from tetopt.lattice import KINDS
@@ -59,7 +67,9 @@ from tetopt.optimize.octree import octree
 from tetopt.optimize.paper import Optimized, Record, default_n_t, optimize_paper
 from tetopt.report.summary import run_summary, versions
 
-COVERED = 0.95  # Dice of a mesh that represents its mask
+MISSED = 0.9  # Dice of a mesh with its mask: below, the mesh is not of the mask
+POOR = 0.5  # Dice of a label that its cells hardly show
+INSIDE = 0.95  # of a mask or of labels that lies in the image, to expect
 LARGE = 200  # voxels: a label of more may not be without cells
 DEFAULT_NODES = {2: 500, 3: 5000}
 
@@ -378,14 +388,17 @@ def _source(
         raise InputError("--mask and --background: give one of them")
     if label_weight is not None and labels_path is None:
         raise InputError("--label-weight: there are no --labels")
-    image = _image(paths[0], volume, crop, slice_)
-    others = [aligned_contrast(str(path), _companion(path, crop, slice_), image) for path in paths[1:]]
-    contrasts = [image, *others]
-    labels, mask = _beside(image, labels_path, mask_path, crop, slice_)
+    image, beside = _image_and_others(paths[0], volume, crop, slice_)
+    contrasts = [image, *(beside(path, aligned_contrast) for path in paths[1:])]
+    labels = None if labels_path is None else beside(labels_path, aligned_labels)
+    mask = None if mask_path is None else beside(mask_path, aligned_mask)
     level = None
     if background is not None:
         level = background_level(image) if background == "auto" else _number("--background", background)
         mask = foreground(image, level)
+        log.print(
+            f"background: up to {level:g}, as far as it reaches the box; {mask.data.mean():.1%} of the voxels are left"
+        )
     counts = [1.0] * len(paths) if weights is None else [_number("--weights", part) for part in weights.split(",")]
     if weights is None and labels is not None and len(paths) == 1 and np.array_equal(labels.data, image.data):
         log.print("the image is its own labels: only these count")
@@ -405,16 +418,35 @@ def _source(
     return _Source(paths, wanted, contrasts, labels, mask, about)
 
 
-def _beside(
-    image: Image, labels_path: Path | None, mask_path: Path | None, crop: str | None, slice_: str | None
-) -> tuple[Image | None, Image | None]:
-    """Labels and mask on the image's voxels."""
-    labels = mask = None
-    if labels_path is not None:
-        labels = aligned_labels(str(labels_path), _companion(labels_path, crop, slice_), image)
-    if mask_path is not None:
-        mask = aligned_mask(str(mask_path), _companion(mask_path, crop, slice_), image)
-    return labels, mask
+def _image_and_others(
+    path: Path, volume: int | None, crop: str | None, slice_: str | None
+) -> tuple[Image, Callable[[Path, Callable[[Image, Image, str], Image]], Image]]:
+    """The image as the options ask for it, and a function that reads files beside it and aligns them to its voxels."""
+    image = _image(path, volume, crop, slice_)
+    # A slice has lost its place across it: what goes with it is aligned to the whole image and sliced like that.
+    whole = image if slice_ is None else _image(path, volume, None, None)
+
+    def beside(other: Path, aligned: Callable[[Image, Image, str], Image]) -> Image:
+        given = _companion(other)
+        moved = aligned(given, whole, str(other))
+        if not is_same_grid(given, whole):
+            _say_resampled(other, given, moved, is_contrast=aligned is aligned_contrast)
+        return (
+            moved if slice_ is None else part_of(moved, parse_slice(slice_), None if crop is None else parse_crop(crop))
+        )
+
+    return image, beside
+
+
+def _say_resampled(path: Path, given: Image, moved: Image, is_contrast: bool) -> None:
+    """That a file lay on another grid, and how much of a mask or of labels is in the image."""
+    if is_contrast:
+        log.print(escape(f"{path}: taken to the image's voxels, linearly"))
+        return
+    whole, there = (np.count_nonzero(each.data) * each.voxel_volume for each in (given, moved))
+    log.print(escape(f"{path}: taken to the image's voxels, nearest neighbour"))
+    if there < INSIDE * whole:
+        _show_warning(f"{path}: only {there / whole:.0%} of it lies in the image; is it of the same scan?")
 
 
 def _number(name: str, text: str) -> float:
@@ -457,15 +489,12 @@ def _file_and_volume(path: Path) -> tuple[Path, int | None]:
     return path, None
 
 
-def _companion(path: Path, crop: str | None = None, slice_: str | None = None) -> Image:
-    """A file that goes with the image; whole, unless a slice is meshed, which only an image of the same grid has.
-
-    What would be odd in an image, such as one value everywhere, is not in sizes, labels or a mask.
-    """
+def _companion(path: Path) -> Image:
+    """A file beside the image; one value everywhere, which would be odd in an image, is not in sizes or a mask."""
     file, volume = _file_and_volume(path)
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
-        return _image(file, volume, None if slice_ is None else crop, slice_)
+        return load_image(file, volume=volume)
 
 
 def _check_method(method: Method, given: dict[str, Any], wanted: Method) -> None:
@@ -509,7 +538,7 @@ def _mesh_files(
     fields = _fields(source, result.mesh)
     save_mesh(output, result.mesh, fields, {"tetopt": tetopt.__version__, **about})
     found = _fidelity(source.labels, source.mask, result.mesh, fields.get("label"))
-    if len(source.contrasts) > 1:
+    if not wanted.is_plain or wanted.region is not None:
         found["contrasts"] = _by_contrast(source, result.mesh, fields)
     if json_path is not None:
         seconds = {"load": loaded - begin, "optimize": optimized - loaded, "all": time.perf_counter() - begin}
@@ -517,12 +546,13 @@ def _mesh_files(
     if pictures:
         from tetopt.report import figures  # matplotlib is slow to load, and only needed here
 
-        figures.save_run_figures(pictures[:3], image, initial, result, _start_name(settings["lattice"]))
+        start = _start_name(settings["lattice"])
+        figures.save_run_figures(pictures[:3], image, initial, result, start, source.contrasts[0])
         if source.mask is not None:
             drawn = figures.boundary_figure(source.contrasts[0], source.mask, result.mesh)
             figures.save_figure(drawn, pictures[3])
         if source.labels is not None:
-            figures.save_figure(figures.label_figure(source.labels, result.mesh), pictures[-1])
+            figures.save_figure(figures.label_figure(source.labels, result.mesh, fields["label"]), pictures[-1])
     # Everything is written; what is printed may go into a pipe that closes.
     code = _promises(wanted, result, options.get("min_dihedral", 0.0), settings["target_error"], found)
     code = 130 if is_interrupted else code
@@ -581,23 +611,50 @@ def _fidelity(labels: Image | None, mask: Image | None, mesh: Mesh, of_cell: NDA
 def _print_fidelity(found: dict[str, Any]) -> None:
     for row in found.get("contrasts", []):
         share = "constant" if row["E_D_share_of_variance"] is None else f"{row['E_D_share_of_variance']:.5f}"
-        out.print(escape(f"{row['image']}: weight {row['weight']:g}, share of its variance left in cells {share}"))
+        out.print(escape(f"{row['image']}: weight {row['weight']:g}, share of its own variance in cells {share}"))
     if "mask" in found:
-        mask = found["mask"]
-        out.print(
-            f"mask: Dice {mask['dice']:.4f}; boundary to its surface: mean {mask['distance_mean']:.3f}, 95 % within "
-            f"{mask['distance_p95']:.3f} voxels; pieces {mask['components']}, in the mesh {mask['mesh_components']}"
-        )
+        _print_wide(_mask_table(found["mask"]))
     if "labels" in found:
-        out.print("labels: size in voxels and in cells, mm^n; surfaces apart, mm, mean and 95 % within; pieces of both")
-        table = _table("label", "voxels", "size", "of cells", "cells", "Dice", "mean", "95 %", "pieces", "of cells")
-        for row in found["labels"]:
-            table.add_row(
-                str(row["label"]), str(row["voxels"]), f"{row['volume']:.7g}", f"{row['mesh_volume']:.7g}",
-                str(row["n_cells"]), f"{row['dice']:.4f}", f"{row['distance_mean']:.3f}", f"{row['distance_p95']:.3f}",
-                str(row["components"]), str(row["mesh_components"]),
-            )  # fmt: skip
-        out.print(table)
+        _print_wide(_label_table(found["labels"]))
+
+
+def _print_wide(table: Table) -> None:
+    """A table as wide as it is, also where a pipe has no width."""
+    _Console(file=out.file, width=max(out.width, 120), highlight=False, emoji=False).print(table)
+
+
+def _mask_table(mask: dict[str, Any]) -> Table:
+    table = _table("mask", "in voxels", "in the mesh")
+    change = 100.0 * (mask["mesh_volume"] / mask["volume"] - 1.0)
+    table.add_row("size, mm^n", f"{mask['volume']:.1f}", f"{mask['mesh_volume']:.1f} ({change:+.1f} %)")
+    table.add_row("Dice, by voxels", "", f"{mask['dice']:.4f}")
+    for name, words in (
+        ("distance", "boundary to the mask's surface"),
+        ("reverse", "the mask's surface to the boundary"),
+    ):
+        table.add_row(
+            f"{words}, mean, 95 %", f"{mask[f'{name}_mean']:.3f}, {mask[f'{name}_p95']:.3f} voxels",
+            f"{mask[f'{name}_mean_mm']:.3f}, {mask[f'{name}_p95_mm']:.3f} mm",
+        )  # fmt: skip
+    table.add_row("pieces", str(mask["components"]), str(mask["mesh_components"]))
+    table.add_row("Euler number of the surface", str(mask["euler"]), str(mask["mesh_euler"]))
+    return table
+
+
+def _label_table(rows: list[dict[str, Any]]) -> Table:
+    table = _table(
+        "label", "voxels", "size, mm^n", "cells", "their size", "more, %", "Dice", "by volume", "apart, mm", "95 %",
+        "pieces", "of cells",
+    )  # fmt: skip
+    for row in rows:
+        change = 100.0 * (row["mesh_volume"] / row["volume"] - 1.0)
+        apart = (f"{row[name]:.3f}" if np.isfinite(row[name]) else "-" for name in ("distance_mean", "distance_p95"))
+        table.add_row(
+            str(row["label"]), str(row["voxels"]), f"{row['volume']:.1f}", str(row["n_cells"]),
+            f"{row['mesh_volume']:.1f}", f"{change:+.1f}", f"{row['dice']:.4f}", f"{row['volume_dice']:.4f}", *apart,
+            str(row["components"]), str(row["mesh_components"]),
+        )  # fmt: skip
+    return table
 
 
 def _warn(result: Optimized, method: Method, nodes: int | None, n_empty: int) -> None:
@@ -698,7 +755,14 @@ def _promises(
         )
     is_lost = _says_what_is_lost(found)
     if wanted.region is not None:
-        return 1 if below or is_above or is_lost else 0
+        n_voxels = result.history[-1].n_voxels
+        overlapping = n_voxels - int((tetopt.cell_of_voxel(image, result.mesh) >= 0).sum())
+        if overlapping:
+            log.print(
+                f"[bold red]tetopt:[/] cells overlap: together they hold {overlapping} voxels twice; allow more nodes, "
+                "and please report this"
+            )
+        return 1 if below or is_above or is_lost or overlapping else 0
     covered = float(volumes(result.mesh.points, result.mesh.cells).sum())
     missed = image.data.size - result.history[-1].n_voxels
     if missed == 0 and abs(covered / image.volume - 1.0) < 1e-9:
@@ -711,7 +775,10 @@ def _promises(
 
 
 def _says_what_is_lost(found: dict[str, Any]) -> bool:
-    """Name labels of more than 200 voxels that no cell carries, and say where the mask is not met; whether any is."""
+    """Name labels of more than 200 voxels that no cell carries, or hardly any, and say where a mask is not met.
+
+    Whether a promise is missed: such a label is lost, or the mesh has little in common with the mask.
+    """
     lost = [row for row in found.get("labels", []) if row["is_lost"]]
     large = [str(row["label"]) for row in lost if row["voxels"] > LARGE]
     if large:
@@ -721,16 +788,21 @@ def _says_what_is_lost(found: dict[str, Any]) -> bool:
         )
     if small := [str(row["label"]) for row in lost if row["voxels"] <= LARGE]:
         _show_warning(f"no cell has label {', '.join(small)}, of {LARGE} voxels or fewer")
+    poor = [str(row["label"]) for row in found.get("labels", []) if row["voxels"] > LARGE and row["dice"] < POOR]
+    if poor := [label for label in poor if label not in large]:
+        first = ", ".join(poor[:5]) + (f" and {len(poor) - 5} more" if len(poor) > 5 else "")
+        _show_warning(f"Dice below {POOR} for label {first}: cells are too large for them, or these are no labels")
     mask = found.get("mask")
+    if mask is not None and mask["dice"] < MISSED:
+        log.print(
+            f"[bold red]tetopt:[/] the mesh and the mask overlap only by Dice {mask['dice']:.3f}: cells are larger "
+            "than parts of the mask; allow more nodes"
+        )
+        return True
     if mask is not None and mask["components"] != mask["mesh_components"]:
         _show_warning(
             f"the mask has {mask['components']} pieces, the mesh {mask['mesh_components']}: cells are as large "
             "as parts, or gaps, of the mask; allow more nodes"
-        )
-    elif mask is not None and mask["dice"] < COVERED:
-        _show_warning(
-            f"the mesh and the mask overlap only by Dice {mask['dice']:.3f}: cells are larger than parts of the mask; "
-            "allow more nodes"
         )
     return bool(large)
 
@@ -826,7 +898,8 @@ def _print_comparison(wanted: Content, initial: Mesh, result: Optimized, start: 
     if first.E_D > 0.0:
         table.add_row("E_D, of initial", "1.0000", f"{last.E_D / first.E_D:.4f}")
     if first.E_D > 0.0 and (spread := wanted.variance * wanted.volume) > 0.0:
-        table.add_row("E_D, share of the image's variance", f"{first.E_D / spread:.5f}", f"{last.E_D / spread:.5f}")
+        whose = "the image's variance" if wanted.is_plain and wanted.region is None else "all channels' variance"
+        table.add_row(f"E_D, share of {whose}", f"{first.E_D / spread:.5f}", f"{last.E_D / spread:.5f}")
     _add_quality(table, before, after)
     out.print(table)
 
@@ -894,8 +967,9 @@ def quality_command(
     table = _table("", escape(mesh_path.name))
     _add_quality(table, measured)
     if image_path is not None:
-        image = _image(image_path, volume, crop, slice_)
-        labels, mask = _beside(image, labels_path, mask_path, crop, slice_)
+        image, beside = _image_and_others(image_path, volume, crop, slice_)
+        labels = None if labels_path is None else beside(labels_path, aligned_labels)
+        mask = None if mask_path is None else beside(mask_path, aligned_mask)
         fit = _fit(continued(image, mask), loaded.mesh)
         found = _fidelity(labels, mask, loaded.mesh, loaded.cell_data.get("label"))
         content |= found
@@ -906,10 +980,11 @@ def quality_command(
             table.add_row("E_D, share of the variance inside", f"{fit['E_D_share_of_variance']:.5f}")
         table.add_row("voxels inside", f"{fit['n_voxels']} of {image.data.size}")
         table.add_row("cells without a voxel", str(fit["n_empty_cells"]))
-    is_box = image_path is not None and mask_path is None
+    is_masked = mask_path is not None or _was_masked(loaded)
+    is_box = image_path is not None and not is_masked
     problems = []
     if check:
-        problems = tetopt.check_mesh(loaded.mesh, image if is_box else None, is_whole=mask_path is None)
+        problems = tetopt.check_mesh(loaded.mesh, image if is_box else None, is_whole=not is_masked)
     if check:
         content["problems"] = problems
     if json_path is not None:
@@ -919,7 +994,8 @@ def quality_command(
     for problem in problems:
         log.print(f"[bold red]tetopt:[/] {escape(str(mesh_path))}: {escape(problem)}")
     if check and not problems:
-        words = "" if mask_path is not None else ", in one piece, fills the box" if is_box else ", in one piece"
+        words = ", in one piece, fills the box" if is_box else ", in one piece"
+        words = "; made within a mask, which may have pieces" if is_masked else words
         out.print(f"checked: conforming, oriented{words}")
     if problems:
         return 1
@@ -929,6 +1005,14 @@ def quality_command(
         )
         return 1
     return 0
+
+
+def _was_masked(loaded: MeshFile) -> bool:
+    """Whether the file says that it was made within a mask or without a background."""
+    if "inputs" not in loaded.field_data:
+        return False
+    inputs = json.loads(str(loaded.field_data["inputs"][0]))
+    return inputs.get("mask") is not None or inputs.get("background") is not None
 
 
 def _fit(image: Image, mesh: Mesh) -> dict[str, Any]:

@@ -24,6 +24,8 @@ LABELS = 32_767  # largest label
 REACH = 4  # voxels: labels that come no nearer may share a channel
 RARE = 0.5  # power of a label's share of voxels by which it counts less
 SAME_PLACE = 1e-2  # voxel: what lies no further away is in the same place
+LEVELS = 256.0  # into which a contrast's standard deviation is divided, at least
+WEIGHTS = 1e-3, 1e3  # the least and the largest, besides 0
 MARGIN = 4  # voxels around a mask
 SURFACE = 4.0  # of the variance: what a voxel on the wrong side of the region's surface counts
 MOST = 2.0**31  # sums of squares along a row stay below, so that they are exact in 32 bits
@@ -83,8 +85,8 @@ def content(
         region's surface (`tetopt.domain`). Outside, images and labels are continued by the nearest value inside, so
         that what lies beyond the surface has no say.
     weights : sequence of float, optional
-        One for each image, 0 or more, 1 by default: with 1 an image's variance counts as much as the first's, whatever
-        its scale. 0 leaves an image out.
+        One for each image, 1 by default: with 1 an image's variance counts as much as the first's, whatever its scale.
+        0.001 to 1000, or 0, which leaves an image out.
     label_weight : float
         Likewise for the labels altogether. Of the labels the rarer count more by voxel.
 
@@ -109,6 +111,10 @@ def content(
     if labels is not None and label_weight > 0.0:
         number, codes = _one_hot(labels.data.astype(np.int64), region)
         codes = np.sqrt(label_weight) * codes
+        if len(codes) == 0:
+            raise InputError(
+                "labels: the same everywhere in what is meshed, there is nothing to tell apart; leave them out"
+            )
     if len(contrasts) + len(codes) == 0:
         raise InputError("weights: nothing that differs between voxels counts; give one above 0")
     values, scale = _whole(contrasts, number, codes)
@@ -120,7 +126,7 @@ def _scaled(images: list[Image], weights: list[float], region: Domain | None) ->
     """The contrasts that count less their means, of variance `weight` each."""
     found = []
     for image, weight in zip(images, weights, strict=True):
-        data = image.data - np.mean(image.data, dtype=np.float64)
+        data = image.data - np.mean(image.data if region is None else image.data[region.inside], dtype=np.float64)
         spread = _variance(data, region)
         if not np.isfinite(spread):
             raise InputError("image: squares of intensities overflow; rescale it first")
@@ -132,9 +138,16 @@ def _scaled(images: list[Image], weights: list[float], region: Domain | None) ->
 def _whole(
     contrasts: list[NDArray[np.float32]], number: NDArray[np.int64], codes: NDArray[np.float64]
 ) -> tuple[NDArray[np.int32], float]:
-    """All channels, (C, *shape), as whole numbers whose sums of squares along a row fit 32 bits, and their scale."""
+    """All channels, (C, *shape), as whole numbers, and their scale.
+
+    If it can be, their sums of squares along a row fit 32 bits.
+    """
     square = sum(float(np.abs(data).max()) ** 2 for data in contrasts) + float((codes**2).max(initial=0.0))
-    scale = float(np.sqrt(0.9 * MOST / (number.shape[-1] * square)))
+    fitting = float(np.sqrt(0.9 * MOST / (number.shape[-1] * square)))
+    # Where one voxel, or a rare label, is much larger than the rest, sums are of 64 bits rather than levels few.
+    steps = [LEVELS / float(np.std(data, dtype=np.float64)) for data in contrasts]
+    largest = max([float(np.abs(data).max()) for data in contrasts] + [float(codes.max(initial=0.0))])
+    scale = min(max([fitting, *steps]), 2.0**30 / largest)
     values = np.empty((len(contrasts) + len(codes), *number.shape), dtype=np.int32)
     for row, data in zip(values, contrasts, strict=False):
         row[:] = np.rint(scale * data)
@@ -189,10 +202,13 @@ def _check(images: list[Image], others: dict[str, Image | None], weights: list[f
         last = np.array(first.shape) - 1
         if np.abs(first.to_index(image.to_world([0 * last, last])) - [0 * last, last]).max() > SAME_PLACE:
             raise InputError(f"{name}: expected voxels in the same place as the first image's; see tetopt.aligned_mask")
-    if len(weights) != len(images) or not all(0.0 <= w < np.inf for w in weights):
-        raise InputError(f"weights: expected one of 0 or more for each of {len(images)} images, got {weights}")
-    if not 0.0 <= label_weight < np.inf:
-        raise InputError(f"label_weight: expected 0 or more, got {label_weight}")
+    low, high = WEIGHTS
+    if len(weights) != len(images) or not all(w == 0.0 or low <= w <= high for w in weights):
+        raise InputError(
+            f"weights: expected one for each of {len(images)} images, 0 or {low:g} to {high:g}, got {weights}"
+        )
+    if not (label_weight == 0.0 or low <= label_weight <= high):
+        raise InputError(f"label_weight: expected 0 or {low:g} to {high:g}, got {label_weight}")
     if others["labels"] is not None:
         check_labels("labels", others["labels"])
 

@@ -28,6 +28,7 @@ from tetopt.geometry.topology import components, facets
 from tetopt.image import Image, transformed
 from tetopt.mesh import Mesh
 
+IN_A_CELL = 24  # points in each cell, at which it is compared with the voxels
 POINTS = 20_000  # most points on a surface from which distances are measured
 FEWEST = 1_000  # the same on the larger of two surfaces, however small
 FLAT = 1e-6  # triangles with less area than this on the square of their size are flat
@@ -52,6 +53,7 @@ class LabelFidelity(NamedTuple):
     mesh_volume: float  # of the cells that carry it, mm^n
     n_cells: int  # that carry it
     dice: float  # of the painted voxels with the given ones, 0 to 1
+    volume_dice: float  # of the cells with the voxels as boxes: what cells as small as voxels cannot get around
     distance_mean: float  # between its surface in the mesh and in the image, both ways, mm; nan without one of them
     distance_p95: float  # 95th percentile of the same, mm
     components: int  # pieces of its voxels that hang together by faces
@@ -162,6 +164,7 @@ def label_fidelity(labels: Image, mesh: Mesh, of_cell: ArrayLike | None = None) 
     given, shown = labels.data.astype(np.int32), np.maximum(_painted(owner, carried), 0)
     n_given, n_shown, n_both = (_counts(v.ravel()) for v in (given, shown, given[given == shown]))
     n_cells, mesh_volume = _counts(carried), _counts(carried, volumes(mesh.points, mesh.cells))
+    overlap, beyond = _overlaps(labels, mesh, carried, len(n_given))
     boxes = find_objects(given + 1)
     nodes, sides = _labels_beside_facets(labels, mesh, carried)
     face = _face(labels.voxel_volume, labels.ndim)
@@ -180,6 +183,11 @@ def label_fidelity(labels: Image, mesh: Mesh, of_cell: ArrayLike | None = None) 
                 float(mesh_volume[label]),
                 int(n_cells[label]),
                 _dice(n_both[label], n_given[label], n_shown[label]),
+                _dice(
+                    overlap[label] + (label == 0) * beyond[0],
+                    n_given[label] * labels.voxel_volume,
+                    mesh_volume[label] + (label == 0) * beyond[1],
+                ),
                 *_mean_and_p95(distances),
                 int(voxel_components(part == label)[1]),
                 _n_components(mesh.cells[carried == label]),
@@ -187,6 +195,27 @@ def label_fidelity(labels: Image, mesh: Mesh, of_cell: ArrayLike | None = None) 
             )
         )
     return rows
+
+
+def _overlaps(
+    labels: Image, mesh: Mesh, carried: NDArray[np.int64], n_labels: int
+) -> tuple[NDArray[np.float64], tuple[float, float]]:
+    """Volume of each label's voxels within the cells that carry it, and outside of the mesh: of label 0, of anything.
+
+    From points that fill each cell evenly, `IN_A_CELL` of them.
+    """
+    n, size = mesh.ndim, volumes(mesh.points, mesh.cells)
+    steps = np.sort(np.mod(0.5 + np.outer(np.arange(1, IN_A_CELL + 1), STEPS[3][:n]), 1.0), axis=1)
+    weights = np.diff(steps, axis=1, prepend=0.0, append=1.0)  # gaps between sorted numbers are even in a simplex
+    own, none = np.zeros(len(size)), np.zeros(len(size))
+    for weight in weights:
+        found = nearest_values(labels, np.einsum("k,mkn->mn", weight, mesh.points[mesh.cells]))
+        own += found == carried
+        none += found == 0
+    overlap = np.bincount(carried, own * size / IN_A_CELL, n_labels)[:n_labels].astype(np.float64)
+    rest = max(labels.volume - float(size.sum()), 0.0)
+    background = float((labels.data == 0).sum()) * labels.voxel_volume - float((none * size).sum() / IN_A_CELL)
+    return overlap, (min(max(background, 0.0), rest), rest)
 
 
 def mask_fidelity(mask: Image, mesh: Mesh) -> MaskFidelity:

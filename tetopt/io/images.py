@@ -122,7 +122,7 @@ def load_image(
     path = Path(path)
     try:
         data, affine = _read(path, volume)
-        image = _region(Image(data, affine), slice_, crop)
+        image = part_of(Image(data, affine), slice_, crop)
     except InputError as error:
         raise InputError(f"{path}: {_one_line(error)}") from error
     low = image.data.min()
@@ -570,7 +570,7 @@ def _grey(picture: PIL.Image.Image) -> NDArray:
 # Geometry of parts
 
 
-def _region(image: Image, slice_: tuple[int, int] | None, crop: Bounds | None) -> Image:
+def part_of(image: Image, slice_: tuple[int, int] | None, crop: Bounds | None) -> Image:
     """The crop and then the slice, done in the other order (it is the same) so that indices need no shift."""
     if slice_ is None:
         return image if crop is None else cropped(image, crop)

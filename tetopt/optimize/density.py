@@ -56,6 +56,7 @@ LEAST_GAIN = 1e-3  # of a node's mean share of E: an exchange of two nodes that 
 LEAST_OVER_NOISE = (
     20.0  # of the noise's variance: likewise; about what the luckiest of thousands of edges wins in noise
 )
+SHIFT = 0.1  # of the ring's volume: what a collapse on a mask's surface may add or take
 NEIGHBOURS = 128  # edges of a node that are looked at, at most
 
 
@@ -699,7 +700,11 @@ def _keeps_domain(
     """Whether the mesh still covers what it should with a at the place of b; `size` is n! times the ring's volume."""
     if not is_frozen[a, 3]:
         return _keeps_size(x, held, rings, a, b, size, measure)
-    return _is_linked(held, rings, a, b) and ring_faces_up(x, np.empty((2, 3)), held, rings, a, b, sides, measure)
+    return (
+        _keeps_size(x, held, rings, a, b, size, measure, SHIFT)
+        and _is_linked(held, rings, a, b)
+        and ring_faces_up(x, np.empty((2, 3)), held, rings, a, b, sides, measure)
+    )
 
 
 @njit(cache=True, error_model="numpy")
@@ -742,7 +747,9 @@ def _is_outer(held: Complex, rings: NodeRings, a: int, b: int, c: int) -> bool:
 
 
 @njit(cache=True, error_model="numpy")
-def _keeps_size(x: NDArray, held: Complex, rings: NodeRings, a: int, b: int, size: float, measure: Measure) -> bool:
+def _keeps_size(
+    x: NDArray, held: Complex, rings: NodeRings, a: int, b: int, size: float, measure: Measure, part: float = 1e-9
+) -> bool:
     """Whether the cells around a, moved to b, fill what they filled: n! times their volume is `size`.
 
     All cells positive, they fan out from b over the ring's hull; so this holds unless the domain itself is not convex
@@ -753,7 +760,7 @@ def _keeps_size(x: NDArray, held: Complex, rings: NodeRings, a: int, b: int, siz
         if not has_node(held.cells, rings.cells[r], b):
             load_cell(x, held.ticks, held.cells, rings.cells[r], measure)
             total += content(x, held.cells.shape[1])
-    return abs(total - size) <= 1e-9 * size
+    return abs(total - size) <= part * size
 
 
 @njit(cache=True, error_model="numpy")

@@ -40,7 +40,7 @@ TIE_BREAKS = (1e-5, 1e-4, 1e-3)  # see `delaunay`, tried in turn: with 1e-7, 2 o
 FLAT = 1e-6  # of the mean volume: such a cell is flat
 TIE = 0.05  # of a block's error: what decides between blocks that are alike
 MISS = 0.1  # of the nodes wanted: a larger miss is an error
-AGAIN = 3  # octrees tried for the number of nodes within a mask
+AGAIN = 5  # octrees tried for the number of nodes within a mask
 MOST_ANYHOW = 5000  # nodes that even images of few voxels may get
 FEW = 40  # nodes, about what one block more or less makes
 NEAR = 0.002  # of the nodes wanted: a miss that is good enough
@@ -82,7 +82,7 @@ def octree(image: Image | Content, nodes: int, sizes: Sizes | None = None) -> Me
         )
     mesh = _built(wanted, nodes, asked)
     count = len(mesh.points)
-    if is_near(count, nodes) or (wanted.region is not None and 2 * count >= nodes):  # exchanges take care of the rest
+    if is_near(count, nodes) or wanted.region is not None:  # exchanges take care of the rest
         return mesh
     raise InputError(
         f"octree: {nodes} nodes are too {'many' if count < nodes else 'few'} for {shape} voxels{limits}: the nearest "
@@ -146,19 +146,26 @@ def nearest_octree(image: Image | Content, nodes: int, sizes: Sizes | None = Non
 
 def _built(wanted: Content, nodes: int, asked: _Limits) -> Mesh:
     """The octree within the limits that has nearly as many nodes as wanted, cut off at the mask's surface."""
-    mesh = _of_box(wanted, nodes, asked)
     if wanted.region is None:
-        return mesh
-    asked_for, kept = nodes, clipped(mesh, wanted.image, wanted.region)
-    for _ in range(AGAIN):  # the surface takes away nodes and adds others, how many is seen afterwards
-        if abs(len(kept.points) - nodes) <= ENOUGH * nodes:
+        return _of_box(wanted, nodes, asked)
+    # The surface takes away nodes and adds others; how many is seen afterwards.
+    best, asked_for, fewest = None, nodes, 2**wanted.image.ndim + 1
+    for attempt in range(AGAIN):
+        try:
+            mesh = clipped(_of_box(wanted, asked_for, asked), wanted.image, wanted.region)
+        except InputError:  # thinner than the cells
+            if best is None and attempt == AGAIN - 1:
+                raise
+            asked_for *= 2
+            continue
+        count = len(mesh.points)
+        if best is None or abs(count - nodes) < abs(len(best.points) - nodes):
+            best = mesh
+        if abs(count - nodes) <= ENOUGH * nodes:
             break
-        asked_for = max(int(asked_for * nodes / len(kept.points)), 2**wanted.image.ndim + 1)
-        new = clipped(_of_box(wanted, asked_for, asked), wanted.image, wanted.region)
-        if abs(len(new.points) - nodes) >= abs(len(kept.points) - nodes):
-            break
-        kept = new
-    return kept
+        asked_for = int(np.clip(asked_for * nodes / count, max(fewest, asked_for / 2), 2 * asked_for))
+    assert best is not None
+    return best
 
 
 def _of_box(wanted: Content, nodes: int, asked: _Limits) -> Mesh:

@@ -44,25 +44,27 @@ def save_figure(figure: Figure, path: str | Path, dpi: int = 150) -> None:
 
 
 def save_run_figures(
-    paths: Sequence[Path], image: Image, initial: Mesh, result: Optimized, start: str = "lattice"
-) -> None:
+    paths: Sequence[Path], image: Image, initial: Mesh, result: Optimized, start: str = "lattice",
+    whole: Image | None = None,
+) -> None:  # fmt: skip
     """Three PNGs of a run: slice with mesh before and after, rho histograms before and after, energies.
 
-    `start` is what the initial mesh is called.
+    `start` is what the initial mesh is called. Where `image` is continued beyond a mask, `whole` is the one to show.
     """
     first, last = result.history[0], result.history[-1]
     fit = f"{last.E_D / first.E_D:.3f} of its E_D" if first.E_D > 0.0 else "constant image"
     before = f"{start}, {len(initial.points)} nodes"
     after = f"optimised, {fit}"
     meshes = [(before, initial), (after, result.mesh)]
-    save_figure(slice_figure(image, meshes), paths[0])
+    save_figure(slice_figure(image if whole is None else whole, meshes, means_of=image), paths[0])
     save_figure(histogram_figure(meshes), paths[1])
     save_figure(energy_figure(result.history), paths[2])
 
 
 def slice_figure(
-    image: Image, meshes: Sequence[tuple[str, Mesh]], axis: int | None = None, index: int | None = None
-) -> Figure:
+    image: Image, meshes: Sequence[tuple[str, Mesh]], axis: int | None = None, index: int | None = None,
+    means_of: Image | None = None,
+) -> Figure:  # fmt: skip
     """A slice of the volume with each mesh cut through it, and below it the means the cells stand for.
 
     `axis` and `index` choose the slice in voxel indices; by default the axis nearest to the world's z (an axial
@@ -81,7 +83,7 @@ def slice_figure(
         width = min(0.6, 20.0 / np.sqrt(max(len(polygons), 1)))  # points; thinner before the lines hide the image
         over.add_collection(PolyCollection(list(polygons), facecolors="none", edgecolors=MESH_LINE, linewidths=width))
         over.set_title(title, fontsize=11)
-        means = cell_moments(image, mesh).mean[cells]
+        means = cell_moments(image if means_of is None else means_of, mesh).mean[cells]
         # Antialiased, each border would let the background shine through as a light seam.
         painted = PolyCollection(list(polygons), array=means, cmap="gray", edgecolors="none", antialiaseds=False)
         painted.set_clim(*limits)
@@ -93,7 +95,7 @@ def slice_figure(
     return figure
 
 
-def label_figure(labels: Image, mesh: Mesh) -> Figure:
+def label_figure(labels: Image, mesh: Mesh, of_cell: NDArray[np.int64] | None = None) -> Figure:
     """The labels of the voxels, and beside them those of the cells in the same colours, in three planes.
 
     Parameters
@@ -101,7 +103,8 @@ def label_figure(labels: Image, mesh: Mesh) -> Figure:
     labels : Image
         Whole numbers from 0 to `tetopt.segmentation.LABELS`.
     mesh : Mesh
-        Each cell has the label that most of its voxels have (`tetopt.fidelity.cell_labels`).
+    of_cell : (M,) int64, optional
+        Each cell's label; by default that of most of its voxels (`tetopt.fidelity.cell_labels`).
 
     Returns
     -------
@@ -118,7 +121,8 @@ def label_figure(labels: Image, mesh: Mesh) -> Figure:
     # This loads pyvista, which is slow to load, and the other flat pictures need it not.
     from tetopt.fidelity import cell_labels
 
-    colours, of_cell = label_colours(labels), cell_labels(labels, mesh)
+    colours = label_colours(labels)
+    of_cell = cell_labels(labels, mesh) if of_cell is None else of_cell
     views = _middle_views(labels)
     pixels = [view.pixels.astype(np.int64) for view in views]
     cuts = [view.section(mesh) for view in views]
