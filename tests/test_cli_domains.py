@@ -160,6 +160,54 @@ def test_a_slice_of_all(inputs, tmp_path):
     assert tetopt.check_mesh(mesh) == []
 
 
+def test_a_slice_of_a_mask_that_is_stored_upside_down(inputs, tmp_path):
+    """The same mask in the same place of the world, its last axis turned: the same slice of it."""
+    image, mask = shaped("touching", OBLIQUE)
+    turned = OBLIQUE.copy()
+    turned[:3, 3] = image.to_world([0.0, 0.0, image.shape[2] - 1.0])
+    turned[:3, 2] *= -1.0
+    tetopt.save_image(tmp_path / "turned.nii.gz", tetopt.Image(mask.data[..., ::-1], turned))
+    command = ["mesh", str(inputs / "image.nii.gz"), "--slice", "k=12", "--mask", str(tmp_path / "turned.nii.gz")]
+    command += ["--nodes", "60", "--iterations", "0", "--json", str(tmp_path / "a.json"), "-o", str(tmp_path / "a.vtu")]
+    assert main(command) == 0
+    assert json.loads((tmp_path / "a.json").read_text())["mask"]["voxels"] == mask.data[..., 12].sum()
+
+
+def test_files_on_other_grids_are_told(inputs, tmp_path, capsys):
+    """And so is a mask of which half lies elsewhere."""
+    image, mask = shaped("ball", OBLIQUE)
+    moved = OBLIQUE.copy()
+    moved[:3, 3] = image.to_world([14.0, 0.0, 0.0])
+    tetopt.save_image(tmp_path / "half.nii.gz", tetopt.Image(mask.data, moved))
+    command = [
+        "mesh",
+        str(inputs / "image.nii.gz"),
+        str(inputs / "square.nii.gz"),
+        "--mask",
+        str(tmp_path / "half.nii.gz"),
+    ]
+    assert main([*command, "--nodes", "300", "--iterations", "0", "-o", str(tmp_path / "a.vtu")]) in (0, 1)
+    said = " ".join(capsys.readouterr().err.split())
+    assert "square.nii.gz: taken to the image's voxels, linearly" in said
+    assert "half.nii.gz: taken to the image's voxels, nearest neighbour" in said
+    assert "% of it lies in the image; is it of the same scan?" in said
+
+
+def test_a_mesh_of_a_mask_is_checked_as_one(run, inputs, capsys):
+    """Without the mask at hand, too: the file says that there was one."""
+    assert main(["quality", str(run / "mesh.vtu"), "--image", str(inputs / "image.nii.gz"), "--check"]) == 0
+    assert "checked: conforming, oriented; made within a mask" in capsys.readouterr().out
+
+
+def test_intensities_are_no_labels(inputs, tmp_path, capsys):
+    path = str(inputs / "noise.nii.gz")
+    rng = np.random.default_rng(0)
+    tetopt.save_image(path, tetopt.Image(np.rint(3.0 * rng.random((24, 24, 24)))))
+    command = ["mesh", path, "--labels", path, "--nodes", "200", "--iterations", "0", "-o", str(tmp_path / "a.vtu")]
+    main(command)
+    assert "cells are too large for them, or these are no labels" in " ".join(capsys.readouterr().err.split())
+
+
 def test_a_volume_of_a_4d_file(inputs, tmp_path, capsys):
     """FILE:K; without it the line says so."""
     image, mask = shaped("ball", OBLIQUE)

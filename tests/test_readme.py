@@ -24,6 +24,7 @@ def test_program(tmp_path, monkeypatch, capsys):
     share, shape = re.fullmatch(r"(\S+) of the variance inside cells, mean rho (\S+)", printed[0]).groups()
     assert 0.0001 < float(share) < 0.01
     assert float(shape) > 0.24
+    assert float(re.fullmatch(r"the stiffer sphere alone: Dice (\S+)", printed[2]).group(1)) > 0.97
     written = tetopt.load_mesh("two_spheres.vtu")
     assert len(written.mesh.cells) == len(names["result"].mesh.cells)
     assert written.cell_data["mean"].max() == names["cells"].mean.max()

@@ -14,6 +14,7 @@ from tetopt.energy.sampling import cell_of_voxel, channel_grid, moment_sums, to_
 from tetopt.fidelity import cell_labels, label_fidelity, mask_fidelity
 from tetopt.geometry.topology import boundary_facets
 from tetopt.optimize.complex import measure_of
+from tetopt.optimize.fast import _Run
 from tetopt.optimize.surface import level_at, put_on_surface, sides_of
 
 
@@ -128,6 +129,21 @@ def test_same_bits_on_any_number_of_threads():
         numba.set_num_threads(most)
     np.testing.assert_array_equal(found[0].points, found[1].points)
     np.testing.assert_array_equal(found[0].cells, found[1].cells)
+
+
+def test_a_lift_that_lays_cells_over_one_another_is_undone(monkeypatch):
+    """The floor is missed then, and told; the mesh is the one before the lift."""
+    image, mask = shaped("handle")
+    wanted = content(image, mask=mask)
+    start = lattice_within(wanted.image, wanted.region, nodes=150)
+    lifted = tetopt.optimize(wanted, start, iterations=2, min_dihedral=35.0)
+    monkeypatch.setattr(_Run, "_overlaps", lambda self, held: True)
+    kept = tetopt.optimize(wanted, start, iterations=2, min_dihedral=35.0)
+    angles = [tetopt.quality(each.mesh.points, each.mesh.cells).min_dihedral for each in (lifted, kept)]
+    assert angles[1] < angles[0]
+    assert all(later <= earlier for earlier, later in pairwise(row.E for row in kept.history))
+    assert kept.history[-1].E_D == pytest.approx(hard_E_D(wanted, kept.mesh), rel=1e-9)
+    assert tetopt.check_mesh(kept.mesh) == []
 
 
 # Labels.

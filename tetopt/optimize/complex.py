@@ -76,6 +76,14 @@ def build(cells: NDArray[np.int64], ticks: NDArray[np.int64], measure: Measure) 
     return held
 
 
+def copied(held: Complex) -> Complex:
+    """The complex in arrays of its own."""
+    return Complex(
+        held.ticks.copy(), held.cells.copy(), held.across.copy(), held.fluxes.copy(), held.sums.copy(),
+        held.E_shape.copy(), held.n_cells.copy(),
+    )  # fmt: skip
+
+
 def grown(held: Complex, least: int = 64) -> Complex:
     """The complex with room for a quarter more cells, and for `least`."""
     more = held.n_cells[0] // 4 + least

@@ -56,6 +56,7 @@ LEAST_GAIN = 1e-3  # of a node's mean share of E: an exchange of two nodes that 
 LEAST_OVER_NOISE = (
     20.0  # of the noise's variance: likewise; about what the luckiest of thousands of edges wins in noise
 )
+ASTRAY = 0.25  # of an edge on a mask's surface: the furthest from its middle that a node is put
 SHIFT = 0.1  # of the ring's volume: what a collapse on a mask's surface may add or take
 NEIGHBOURS = 128  # edges of a node that are looked at, at most
 
@@ -257,7 +258,12 @@ def _put_middle(
     if not sides.has_surface or sides.is_fixed:
         return False
     x, uphill = np.empty((4, 3)), np.empty((2, 3))
+    load(x, 1, held.ticks, p, a, measure)
     if not put_on_surface(uphill, held.ticks, p, is_frozen, sides, measure):
+        return False
+    load(x, 2, held.ticks, p, a, measure)
+    away = (x[2, 0] - x[1, 0]) ** 2 + (x[2, 1] - x[1, 1]) ** 2 + (x[2, 2] - x[1, 2]) ** 2
+    if away > ASTRAY * ASTRAY * squared_length(x, held, a, b, measure):
         return False
     uphill_at(uphill, held.ticks, p, sides, measure)
     for r in range(rings.start[a], rings.start[a + 1]):

@@ -20,6 +20,8 @@ from numpy.typing import NDArray
 from tetopt.check import check_unfolded
 from tetopt.content import Content, plain
 from tetopt.energy.sampling import (
+    cell_moments,
+    cell_of_voxel,
     channel_grid,
     check_orientations,
     few_threads,
@@ -35,6 +37,7 @@ from tetopt.optimize.complex import (
     Complex,
     Measure,
     build,
+    copied,
     energies,
     floor_of,
     measure_all,
@@ -464,11 +467,26 @@ class _Run:
         return worst_angles(self.held, self.measure, degrees) if degrees > 0.0 else 0
 
     def lift(self, degrees: float) -> int:
-        """Lift the worst cells over `degrees`, or as far as they go; the number of moves. It may raise E."""
+        """Lift the worst cells over `degrees`, or as far as they go; the number of moves. It may raise E.
+
+        On the surface of a mask whose details are as small as the cells it may lay cells over one another; then none
+        of it is done, and the floor is missed.
+        """
+        before = self.held if self.wanted.region is None else copied(self.held)
         done = repair(self.held, self.is_frozen, self.measure, self.sides, degrees)
+        if self.wanted.region is not None and self._overlaps(done.held):
+            self.held = before
+            return 0
         self._renumber(done.held, done.is_frozen, done.source)
         self.tried[:] = FAR
         return done.n_moves
+
+    def _overlaps(self, held: Complex) -> bool:
+        """Whether a voxel centre lies in two cells."""
+        points = self.image.to_world(from_ticks(held.ticks, self.grid, self.n))
+        mesh = Mesh(points, held.cells[: int(held.n_cells[0])].copy())
+        covered = int((cell_of_voxel(self.image, mesh) >= 0).sum())
+        return int(cell_moments(self.image, mesh).n_voxels.sum()) != covered
 
     def _renumber(self, held: Complex, is_frozen: NDArray[np.bool_], source: NDArray[np.int64]) -> None:
         """Take over a complex with other nodes: where each comes from, -1 for new ones."""
