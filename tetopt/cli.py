@@ -47,8 +47,8 @@ from tetopt.align import (
 )
 from tetopt.content import Content, check_labels, content, continued
 from tetopt.domain import lattice_within
-from tetopt.fidelity import cell_labels, label_fidelity, mask_fidelity
-from tetopt.geometry.quality import Quality, quality
+from tetopt.fidelity import cell_labels
+from tetopt.geometry.quality import quality
 from tetopt.geometry.simplex import dihedral_angles, squared_edges, volumes
 from tetopt.io.files import checked_output, save_json
 from tetopt.io.images import parse_crop, parse_slice, part_of, sha256
@@ -65,7 +65,8 @@ from tetopt.optimize.fast import (
 )
 from tetopt.optimize.octree import octree
 from tetopt.optimize.paper import Optimized, Record, default_n_t, optimize_paper
-from tetopt.report.summary import run_summary, versions
+from tetopt.report.summary import fidelity, run_summary, versions
+from tetopt.report.tables import add_quality, label_table, mask_table, new_table
 
 MISSED = 0.9  # Dice of a mesh with its mask: below, the mesh is not of the mask
 POOR = 0.5  # Dice of a label that its cells hardly show
@@ -537,7 +538,7 @@ def _mesh_files(
     about = {**source.about, "options": told}
     fields = _fields(source, result.mesh)
     save_mesh(output, result.mesh, fields, {"tetopt": tetopt.__version__, **about})
-    found = _fidelity(source.labels, source.mask, result.mesh, fields.get("label"))
+    found = fidelity(source.labels, source.mask, result.mesh, fields.get("label"))
     if not wanted.is_plain or wanted.region is not None:
         found["contrasts"] = _by_contrast(source, result.mesh, fields)
     if json_path is not None:
@@ -595,66 +596,19 @@ def _by_contrast(source: _Source, mesh: Mesh, fields: dict[str, NDArray]) -> lis
     return rows
 
 
-def _fidelity(labels: Image | None, mask: Image | None, mesh: Mesh, of_cell: NDArray | None) -> dict[str, Any]:
-    """How well a mesh represents labels and a mask."""
-    found: dict[str, Any] = {}
-    if mask is not None:
-        found["mask"] = mask_fidelity(mask, mesh)._asdict()
-    if labels is not None:
-        if mask is not None:  # what lies outside is not asked for
-            labels = Image(np.where(mask.data >= 0.5, labels.data, 0.0), labels.affine)
-        rows = label_fidelity(labels, mesh, of_cell)
-        found["labels"] = [row._asdict() for row in rows if mask is None or row.label > 0]  # 0 is the outside, too
-    return found
-
-
 def _print_fidelity(found: dict[str, Any]) -> None:
     for row in found.get("contrasts", []):
         share = "constant" if row["E_D_share_of_variance"] is None else f"{row['E_D_share_of_variance']:.5f}"
         out.print(escape(f"{row['image']}: weight {row['weight']:g}, share of its own variance in cells {share}"))
     if "mask" in found:
-        _print_wide(_mask_table(found["mask"]))
+        _print_wide(mask_table(found["mask"]))
     if "labels" in found:
-        _print_wide(_label_table(found["labels"]))
+        _print_wide(label_table(found["labels"]))
 
 
 def _print_wide(table: Table) -> None:
     """A table as wide as it is, also where a pipe has no width."""
     _Console(file=out.file, width=max(out.width, 120), highlight=False, emoji=False).print(table)
-
-
-def _mask_table(mask: dict[str, Any]) -> Table:
-    table = _table("mask", "in voxels", "in the mesh")
-    change = 100.0 * (mask["mesh_volume"] / mask["volume"] - 1.0)
-    table.add_row("size, mm^n", f"{mask['volume']:.1f}", f"{mask['mesh_volume']:.1f} ({change:+.1f} %)")
-    table.add_row("Dice, by voxels", "", f"{mask['dice']:.4f}")
-    for name, words in (
-        ("distance", "boundary to the mask's surface"),
-        ("reverse", "the mask's surface to the boundary"),
-    ):
-        table.add_row(
-            f"{words}, mean, 95 %", f"{mask[f'{name}_mean']:.3f}, {mask[f'{name}_p95']:.3f} voxels",
-            f"{mask[f'{name}_mean_mm']:.3f}, {mask[f'{name}_p95_mm']:.3f} mm",
-        )  # fmt: skip
-    table.add_row("pieces", str(mask["components"]), str(mask["mesh_components"]))
-    table.add_row("Euler number of the surface", str(mask["euler"]), str(mask["mesh_euler"]))
-    return table
-
-
-def _label_table(rows: list[dict[str, Any]]) -> Table:
-    table = _table(
-        "label", "voxels", "size, mm^n", "cells", "their size", "more, %", "Dice", "by volume", "apart, mm", "95 %",
-        "pieces", "of cells",
-    )  # fmt: skip
-    for row in rows:
-        change = 100.0 * (row["mesh_volume"] / row["volume"] - 1.0)
-        apart = (f"{row[name]:.3f}" if np.isfinite(row[name]) else "-" for name in ("distance_mean", "distance_p95"))
-        table.add_row(
-            str(row["label"]), str(row["voxels"]), f"{row['volume']:.1f}", str(row["n_cells"]),
-            f"{row['mesh_volume']:.1f}", f"{change:+.1f}", f"{row['dice']:.4f}", f"{row['volume_dice']:.4f}", *apart,
-            str(row["components"]), str(row["mesh_components"]),
-        )  # fmt: skip
-    return table
 
 
 def _warn(result: Optimized, method: Method, nodes: int | None, n_empty: int) -> None:
@@ -892,7 +846,7 @@ def _print_comparison(wanted: Content, initial: Mesh, result: Optimized, start: 
     first, last = result.history[0], result.history[-1]
     before = quality(initial.points, initial.cells)
     after = quality(result.mesh.points, result.mesh.cells)
-    table = _table("", start, "optimised")
+    table = new_table("", start, "optimised")
     table.add_row("E, combined", f"{first.E:.4f}", f"{last.E:.4f}")
     table.add_row("E_G, of initial", "1.0000", f"{last.E_G / first.E_G:.4f}")
     if first.E_D > 0.0:
@@ -900,38 +854,8 @@ def _print_comparison(wanted: Content, initial: Mesh, result: Optimized, start: 
     if first.E_D > 0.0 and (spread := wanted.variance * wanted.volume) > 0.0:
         whose = "the image's variance" if wanted.is_plain and wanted.region is None else "all channels' variance"
         table.add_row(f"E_D, share of {whose}", f"{first.E_D / spread:.5f}", f"{last.E_D / spread:.5f}")
-    _add_quality(table, before, after)
+    add_quality(table, before, after)
     out.print(table)
-
-
-def _table(*columns: str) -> Table:
-    table = Table(box=None, header_style="bold", pad_edge=False)
-    for number, column in enumerate(columns):
-        table.add_column(column, justify="left" if number == 0 else "right")
-    return table
-
-
-def _add_quality(table: Table, *meshes: Quality) -> None:
-    rows: list[tuple[str, Callable[[Quality], str]]] = [
-        ("nodes", lambda q: str(q.n_nodes)),
-        ("cells", lambda q: str(q.n_cells)),
-        ("volume, mm3" if meshes[0].ndim == 3 else "area, mm2", lambda q: f"{q.volume:.2f}"),
-        ("rho, mean", lambda q: f"{q.mean_rho:.4f}"),
-        ("rho, 1st percentile", lambda q: f"{q.p1_rho:.4f}"),
-        ("rho, smallest", lambda q: f"{q.min_rho:.4f}"),
-        ("rho error (i), mean", lambda q: f"{q.errors.mean:.4f}"),
-        ("rho error (ii), harmonic mean", lambda q: f"{q.errors.harmonic_mean:.4f}"),
-        ("rho error (iii), sum of squares", lambda q: f"{q.errors.l2:.4f}"),
-        ("rho error (iv), worst", lambda q: f"{q.errors.worst:.4f}"),
-        ("smallest angle, degrees", lambda q: f"{q.min_dihedral:.2f}"),
-        ("largest angle, degrees", lambda q: f"{q.max_dihedral:.2f}"),
-        ("edges, shortest, mm", lambda q: f"{q.min_edge:.4g}"),
-        ("edges, longest, mm", lambda q: f"{q.max_edge:.4g}"),
-        ("cells under 10 degrees", lambda q: str(q.n_under_10_degrees)),
-        *((f"bad cells: {kind}s", lambda q, kind=kind: str(q.kinds[kind])) for kind in meshes[0].kinds),
-    ]
-    for name, text in rows:
-        table.add_row(name, *(text(q) for q in meshes))
 
 
 @app.command("quality")
@@ -964,14 +888,14 @@ def quality_command(
     measured = quality(loaded.mesh.points, loaded.mesh.cells)
     found: dict[str, Any] = {}
     content: dict[str, Any] = {"mesh": mesh_path.name, "quality": measured, "n_turned": loaded.n_turned}
-    table = _table("", escape(mesh_path.name))
-    _add_quality(table, measured)
+    table = new_table("", escape(mesh_path.name))
+    add_quality(table, measured)
     if image_path is not None:
         image, beside = _image_and_others(image_path, volume, crop, slice_)
         labels = None if labels_path is None else beside(labels_path, aligned_labels)
         mask = None if mask_path is None else beside(mask_path, aligned_mask)
         fit = _fit(continued(image, mask), loaded.mesh)
-        found = _fidelity(labels, mask, loaded.mesh, loaded.cell_data.get("label"))
+        found = fidelity(labels, mask, loaded.mesh, loaded.cell_data.get("label"))
         content |= found
         _warn_of_other_image(loaded, mesh_path, image_path)
         content |= {"image": image_path.name, "fit": fit}
@@ -1114,7 +1038,7 @@ def fem_command(
     if output is not None:
         fields = {"young": found.young, "strain": strains(loaded.mesh, pressed.u).reshape(len(found.young), -1)}
         save_mesh(output, loaded.mesh, fields, {"tetopt": tetopt.__version__}, {"displacement": pressed.u})
-    table = _table("", escape(mesh_path.name))
+    table = new_table("", escape(mesh_path.name))
     table.add_row("nodes", str(len(loaded.mesh.points)))
     table.add_row("modulus of the cells, kPa", f"{found.young.min():.4g} to {found.young.max():.4g}")
     unit = "mN/mm" if loaded.mesh.ndim == 3 else "mN/mm per mm of thickness"
@@ -1179,12 +1103,14 @@ def segment_command(
     }  # fmt: skip
     means = [float(image.data[labels.data == number].mean()) if part else None for number, part in enumerate(share)]
     content["mean_intensity"] = means
-    table = _table("class", "share of the voxels", "mean intensity", *([] if truth is None else ["stands for label"]))
+    table = new_table(
+        "class", "share of the voxels", "mean intensity", *([] if truth is None else ["stands for label"])
+    )
     meaning = {} if truth is None else stands_for(labels, truth[1])
     for number, part in enumerate(share):
         mean = "" if means[number] is None else f"{means[number]:.4g}"
         table.add_row(str(number), f"{part:.4f}", mean, *([] if truth is None else [str(meaning.get(number, "none"))]))
-    overlaps = _table("label", "Dice, mesh", "Dice, thresholded voxels")
+    overlaps = new_table("label", "Dice, mesh", "Dice, thresholded voxels")
     if truth is not None:
         by_mesh, by_voxels = dice(labels, truth[1]), dice(thresholded(image, classes), truth[1])
         content |= {"truth": truth[0], "stands_for": meaning, "dice": {"mesh": by_mesh, "voxels": by_voxels}}
@@ -1286,8 +1212,8 @@ def baseline_command(
         save_json(json_path, about | {"seconds": made.seconds, "notes": made.notes, "fit": fit, "quality": measured})
     for note in made.notes:
         log.print(escape(f"note: {note}"))
-    table = _table("", escape(output.name))
-    _add_quality(table, measured)
+    table = new_table("", escape(output.name))
+    add_quality(table, measured)
     for step, seconds in made.seconds.items():
         table.add_row(f"seconds, {step}", f"{seconds:.1f}")
     out.print(table)

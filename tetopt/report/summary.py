@@ -10,9 +10,11 @@ from typing import Any
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 
 import tetopt
 from tetopt.content import Content, plain
+from tetopt.fidelity import label_fidelity, mask_fidelity
 from tetopt.geometry.quality import quality
 from tetopt.image import Image
 from tetopt.mesh import Mesh
@@ -76,3 +78,16 @@ def run_summary(
         "seconds": seconds,
         "mesh_sha256": mesh_hash(result.mesh),
     }
+
+
+def fidelity(labels: Image | None, mask: Image | None, mesh: Mesh, of_cell: NDArray | None) -> dict[str, Any]:
+    """How well a mesh represents labels and a mask."""
+    found: dict[str, Any] = {}
+    if mask is not None:
+        found["mask"] = mask_fidelity(mask, mesh)._asdict()
+    if labels is not None:
+        if mask is not None:  # what lies outside is not asked for
+            labels = Image(np.where(mask.data >= 0.5, labels.data, 0.0), labels.affine)
+        rows = label_fidelity(labels, mesh, of_cell)
+        found["labels"] = [row._asdict() for row in rows if mask is None or row.label > 0]  # 0 is the outside, too
+    return found

@@ -1,0 +1,79 @@
+"""Tables of numbers for a terminal."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from rich.table import Table
+
+from tetopt.geometry.quality import Quality
+
+
+def new_table(*columns: str) -> Table:
+    """A table with these heads: names to the left, numbers to the right."""
+    table = Table(box=None, header_style="bold", pad_edge=False)
+    for number, column in enumerate(columns):
+        table.add_column(column, justify="left" if number == 0 else "right")
+    return table
+
+
+def add_quality(table: Table, *meshes: Quality) -> None:
+    """Rows of the shape of one or several meshes, a column each."""
+    rows: list[tuple[str, Callable[[Quality], str]]] = [
+        ("nodes", lambda q: str(q.n_nodes)),
+        ("cells", lambda q: str(q.n_cells)),
+        ("volume, mm3" if meshes[0].ndim == 3 else "area, mm2", lambda q: f"{q.volume:.2f}"),
+        ("rho, mean", lambda q: f"{q.mean_rho:.4f}"),
+        ("rho, 1st percentile", lambda q: f"{q.p1_rho:.4f}"),
+        ("rho, smallest", lambda q: f"{q.min_rho:.4f}"),
+        ("rho error (i), mean", lambda q: f"{q.errors.mean:.4f}"),
+        ("rho error (ii), harmonic mean", lambda q: f"{q.errors.harmonic_mean:.4f}"),
+        ("rho error (iii), sum of squares", lambda q: f"{q.errors.l2:.4f}"),
+        ("rho error (iv), worst", lambda q: f"{q.errors.worst:.4f}"),
+        ("smallest angle, degrees", lambda q: f"{q.min_dihedral:.2f}"),
+        ("largest angle, degrees", lambda q: f"{q.max_dihedral:.2f}"),
+        ("edges, shortest, mm", lambda q: f"{q.min_edge:.4g}"),
+        ("edges, longest, mm", lambda q: f"{q.max_edge:.4g}"),
+        ("cells under 10 degrees", lambda q: str(q.n_under_10_degrees)),
+        *((f"bad cells: {kind}s", lambda q, kind=kind: str(q.kinds[kind])) for kind in meshes[0].kinds),
+    ]
+    for name, text in rows:
+        table.add_row(name, *(text(q) for q in meshes))
+
+
+def mask_table(mask: dict[str, Any]) -> Table:
+    """`tetopt.fidelity.MaskFidelity`, as a dict."""
+    table = new_table("mask", "in voxels", "in the mesh")
+    change = 100.0 * (mask["mesh_volume"] / mask["volume"] - 1.0)
+    table.add_row("size, mm^n", f"{mask['volume']:.1f}", f"{mask['mesh_volume']:.1f} ({change:+.1f} %)")
+    table.add_row("Dice, by voxels", "", f"{mask['dice']:.4f}")
+    for name, words in (
+        ("distance", "boundary to the mask's surface"),
+        ("reverse", "the mask's surface to the boundary"),
+    ):
+        table.add_row(
+            f"{words}, mean, 95 %", f"{mask[f'{name}_mean']:.3f}, {mask[f'{name}_p95']:.3f} voxels",
+            f"{mask[f'{name}_mean_mm']:.3f}, {mask[f'{name}_p95_mm']:.3f} mm",
+        )  # fmt: skip
+    table.add_row("pieces", str(mask["components"]), str(mask["mesh_components"]))
+    table.add_row("Euler number of the surface", str(mask["euler"]), str(mask["mesh_euler"]))
+    return table
+
+
+def label_table(rows: list[dict[str, Any]]) -> Table:
+    """One row for each `tetopt.fidelity.LabelFidelity`, as a dict."""
+    table = new_table(
+        "label", "voxels", "size, mm^n", "cells", "their size", "more, %", "Dice", "by volume", "apart, mm", "95 %",
+        "pieces", "of cells",
+    )  # fmt: skip
+    for row in rows:
+        change = 100.0 * (row["mesh_volume"] / row["volume"] - 1.0)
+        apart = (f"{row[name]:.3f}" if np.isfinite(row[name]) else "-" for name in ("distance_mean", "distance_p95"))
+        table.add_row(
+            str(row["label"]), str(row["voxels"]), f"{row['volume']:.1f}", str(row["n_cells"]),
+            f"{row['mesh_volume']:.1f}", f"{change:+.1f}", f"{row['dice']:.4f}", f"{row['volume_dice']:.4f}", *apart,
+            str(row["components"]), str(row["mesh_components"]),
+        )  # fmt: skip
+    return table
