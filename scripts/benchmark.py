@@ -25,6 +25,7 @@ import numpy as np
 from scipy.spatial import Delaunay
 
 import tetopt
+from tetopt.content import plain
 from tetopt.energy.sampling import from_ticks, moment_sums, sampling_grid, to_ticks
 from tetopt.geometry.simplex import dihedral_angles, oriented, rho, volumes
 from tetopt.geometry.topology import facets
@@ -267,7 +268,7 @@ def in_a_child(path: Path, nodes: int) -> dict[str, Any]:
 def flip_pass(image: tetopt.Image, nodes: int) -> float:
     """Seconds per million tetrahedra to look at every facet and edge of a mesh that is good already."""
     mesh = tetopt.optimize(image, tetopt.lattice(image, nodes=nodes), k_D=0.5).mesh
-    run = _Run(image, mesh, 0.5, 3.0, "slide")
+    run = _Run(plain(image), mesh, 0.5, 3.0, "slide")
     run.held, _ = flip(run.held, run.measure)
     return best_seconds(lambda: flip(run.held, run.measure)) / len(mesh.cells) * 1e6
 

@@ -330,17 +330,17 @@ def test_max_seconds_leaves_a_valid_mesh(tmp_path, inputs, capsys):
 def test_a_mesh_that_misses_voxels_is_told(run, capsys):
     _, _, file, image = run
     result = tetopt.optimize(image, file.mesh, iterations=0)
-    assert tetopt.cli._promises(image, result, 0.0) == 0
+    assert tetopt.cli._promises(tetopt.content(image), result, 0.0, None, {}) == 0
     assert capsys.readouterr().err == ""
     row = result.history[-1]
     fewer = result._replace(history=[row._replace(n_voxels=row.n_voxels - 1)])
-    assert tetopt.cli._promises(image, fewer, 0.0) == 1
+    assert tetopt.cli._promises(tetopt.content(image), fewer, 0.0, None, {}) == 1
     assert "1 voxels are outside" in capsys.readouterr().err
     flat = result._replace(history=[row._replace(iteration=1)])
-    assert tetopt.cli._promises(image, flat, 60.0) == 1
+    assert tetopt.cli._promises(tetopt.content(image), flat, 60.0, None, {}) == 1
     assert re.search(r"tetopt: \d+ of \d+ cells have an angle under 60 degrees", capsys.readouterr().err)
     smaller = result._replace(mesh=Mesh(file.mesh.points * 0.999, file.mesh.cells))
-    assert tetopt.cli._promises(image, smaller, 0.0) == 1
+    assert tetopt.cli._promises(tetopt.content(image), smaller, 0.0, None, {}) == 1
     assert capsys.readouterr().err.count("\n") == 1
 
 
@@ -480,7 +480,7 @@ def test_bad_options_of_mesh(tmp_path, inputs, monkeypatch, capfd, options, matc
         ("mesh {disc} -o a.vtk", "ends in .vtu"),
         ("mesh {disc} -o no/a.vtu", "folder does not exist"),
         ("mesh {disc}", "--output"),
-        ("mesh -o a.vtu", "Missing argument 'IMAGE'"),
+        ("mesh -o a.vtu", r"Missing argument 'IMAGE\.\.\.'"),
         ("mesh {lattice} -o a.vtu", "unknown kind of image"),
         ("quality no.vtu", "no such mesh file"),
         ("quality {disc}", "named .vtu or .vtk"),
