@@ -57,6 +57,7 @@ def test_mesh_brain_mr_bad_input(tmp_path, capsys):
     assert not (tmp_path / "out").exists()
 
 
+@pytest.mark.slow
 def test_benchmark(tmp_path, capsys):
     """It runs, and what it prints is what it writes."""
     tetopt.save_image(tmp_path / "b.nii.gz", tetopt.load_phantom("sphere").image(voxel_mm=2.0))
