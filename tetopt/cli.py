@@ -788,7 +788,7 @@ def _optimized(
 def _prepare_kernels(image: Content, k_D: float, method: Method, is_graded: bool) -> None:
     """Load the compiled kernels, or compile them, before the clock of the first iteration starts."""
     begin = time.perf_counter()
-    with log.status("preparing the kernels (the first run compiles them, about a minute) ..."):
+    with log.status("preparing the kernels (the first run compiles them, one to two minutes) ..."):
         prepare_kernels(image, k_D, method.value, is_graded)
     seconds = time.perf_counter() - begin
     if seconds > 3.0:
