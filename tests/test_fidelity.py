@@ -451,3 +451,15 @@ def test_bad_mask():
         mask_fidelity(tetopt.Image(image.data - 1), mesh)
     with pytest.raises(tetopt.InputError, match="same dimension"):
         mask_fidelity(image, slabs(3)[1])
+
+
+def test_volume_dice_does_not_depend_on_the_unit():
+    """A thousandth of a cubic millimetre overlaps as well as a litre."""
+    labels = np.zeros((12, 12, 12))
+    labels[4:8, 4:8, 4:8] = 1.0
+    found = []
+    for voxel in (1.0, 0.01):
+        image = tetopt.Image(labels, np.diag([voxel] * 3 + [1.0]))
+        found.append([row.volume_dice for row in label_fidelity(image, tetopt.lattice(image, blocks=(6, 6, 6)))])
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-6)
+    assert 0.5 < found[0][1] < 1.0

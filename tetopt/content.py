@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.ndimage import binary_erosion, distance_transform_edt, find_objects, maximum_filter
 
-from tetopt.domain import Domain, domain
+from tetopt.domain import HALF, Domain, domain
 from tetopt.errors import InputError
 from tetopt.image import Image
 
@@ -102,8 +102,8 @@ def content(
     if mask is not None:
         part = _around(mask)
         region = domain(_part(mask, part))
-        images = [_continued(_part(image, part), region) for image in images]
-        labels = None if labels is None else _continued(_part(labels, part), region)
+        images = [_continued(_part(image, part), region.inside) for image in images]
+        labels = None if labels is None else _continued(_part(labels, part), region.inside)
     if len(images) == 1 and labels is None and weights[0] > 0.0:
         return plain(images[0])._replace(region=region)
     contrasts = _scaled(images, weights, region)
@@ -168,7 +168,7 @@ def _variance(values: NDArray, region: Domain | None) -> float:
 
 def _around(mask: Image) -> tuple[slice, ...]:
     """The voxels around a mask, with a margin: what lies further away takes only time."""
-    inside = mask.data >= 0.5
+    inside = mask.data >= HALF
     if not inside.any():
         raise InputError("mask: no voxel has a half or more, there is nothing to mesh")
     box = find_objects(inside.astype(np.int8))[0]
@@ -181,11 +181,11 @@ def _part(image: Image, part: tuple[slice, ...]) -> Image:
     return Image(image.data[part], affine)
 
 
-def _continued(image: Image, region: Domain | None) -> Image:
-    """The image with the nearest value inside the region wherever it is outside."""
-    if region is None or region.inside.all():
+def _continued(image: Image, inside: NDArray[np.bool_]) -> Image:
+    """The image with the nearest value of those inside wherever it is outside."""
+    if inside.all():
         return image
-    nearest = distance_transform_edt(~region.inside, image.spacing, return_distances=False, return_indices=True)
+    nearest = distance_transform_edt(~inside, image.spacing, return_distances=False, return_indices=True)
     return Image(image.data[tuple(nearest)], image.affine)
 
 
@@ -249,7 +249,7 @@ def continued(image: Image, mask: Image | None) -> Image:
     if mask is None:
         return image
     part = _around(mask)
-    return _continued(_part(image, part), domain(_part(mask, part)))
+    return _continued(_part(image, part), mask.data[part] >= HALF)
 
 
 def _colours(number: NDArray[np.int64], n_labels: int) -> NDArray[np.int64]:

@@ -23,6 +23,7 @@ from tetopt.image import Image
 from tetopt.lattice import lattice
 from tetopt.mesh import Mesh
 
+HALF = 0.5  # of a mask: what is inside
 SIGMA = 1.0  # voxels, of the Gaussian that takes the stairs
 ASTRAY = 0.35  # voxels: the furthest that smoothing moves the surface
 SNAP = 0.3  # of an edge: a node as near to the surface along it is put on the surface
@@ -43,11 +44,11 @@ class Domain(NamedTuple):
 def domain(mask: Image) -> Domain:
     """The region where a mask of values 0 to 1 is a half or more.
 
-    A mask of two values is smoothed, except where it, or the gap beside it, is one voxel thick; one of fractions has
-    its own surface between the voxels, and keeps it.
+    A mask of two values is smoothed, except where it, or the gap beside it, is one or two voxels thick; one of
+    fractions has its own surface between the voxels, and keeps it.
     """
     data = mask.data.astype(np.float64)
-    inside = data >= 0.5
+    inside = data >= HALF
     if inside.all():
         return Domain(inside, np.full(inside.shape, -float(max(inside.shape)), dtype=np.float32))
     within, without = distance_transform_edt(inside), distance_transform_edt(~inside)

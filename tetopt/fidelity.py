@@ -436,8 +436,8 @@ def _mean_and_p95(distances: NDArray[np.float64]) -> tuple[float, float]:
     return float(distances.mean()), float(np.percentile(distances, 95.0))
 
 
-def _dice(both: int, one: int, other: int) -> float:
-    return float(2 * both / max(one + other, 1))
+def _dice(both: float, one: float, other: float) -> float:
+    return float(2 * both / (one + other)) if one + other > 0 else 0.0
 
 
 def _n_components(cells: NDArray[np.int64]) -> int:
