@@ -330,17 +330,17 @@ def test_max_seconds_leaves_a_valid_mesh(tmp_path, inputs, capsys):
 def test_a_mesh_that_misses_voxels_is_told(run, capsys):
     _, _, file, image = run
     result = tetopt.optimize(image, file.mesh, iterations=0)
-    assert tetopt.cli._promises(tetopt.content(image), result, 0.0, None, {}) == 0
+    assert tetopt.cli.promises.check_promises(tetopt.content(image), result, 0.0, None, {}) == 0
     assert capsys.readouterr().err == ""
     row = result.history[-1]
     fewer = result._replace(history=[row._replace(n_voxels=row.n_voxels - 1)])
-    assert tetopt.cli._promises(tetopt.content(image), fewer, 0.0, None, {}) == 1
+    assert tetopt.cli.promises.check_promises(tetopt.content(image), fewer, 0.0, None, {}) == 1
     assert "1 voxels are outside" in capsys.readouterr().err
     flat = result._replace(history=[row._replace(iteration=1)])
-    assert tetopt.cli._promises(tetopt.content(image), flat, 60.0, None, {}) == 1
+    assert tetopt.cli.promises.check_promises(tetopt.content(image), flat, 60.0, None, {}) == 1
     assert re.search(r"tetopt: \d+ of \d+ cells have an angle under 60 degrees", capsys.readouterr().err)
     smaller = result._replace(mesh=Mesh(file.mesh.points * 0.999, file.mesh.cells))
-    assert tetopt.cli._promises(tetopt.content(image), smaller, 0.0, None, {}) == 1
+    assert tetopt.cli.promises.check_promises(tetopt.content(image), smaller, 0.0, None, {}) == 1
     assert capsys.readouterr().err.count("\n") == 1
 
 
@@ -387,8 +387,8 @@ def test_a_second_ctrl_c_gives_up(tmp_path, inputs, monkeypatch, capsys):
         assert stop()
         signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(tetopt.cli, "_prepare_kernels", lambda *_: None)
-    monkeypatch.setattr(tetopt.cli, "optimize", impatient)
+    monkeypatch.setattr(tetopt.cli.run, "_prepare_kernels", lambda *_: None)
+    monkeypatch.setattr(tetopt.cli.run, "optimize", impatient)
     before = signal.getsignal(signal.SIGINT)
     assert main(["mesh", str(inputs / "disc.nii"), "-o", str(tmp_path / "a.vtu")]) == 130
     assert signal.getsignal(signal.SIGINT) is before
@@ -403,7 +403,7 @@ def test_ctrl_c_while_reading(tmp_path, inputs, monkeypatch):
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(tetopt.cli, "load_image", interrupted)
+    monkeypatch.setattr(tetopt.cli.inputs, "load_image", interrupted)
     assert main(["mesh", str(inputs / "disc.nii"), "-o", str(tmp_path / "a.vtu")]) == 130
     assert list(tmp_path.iterdir()) == []
 
@@ -514,7 +514,7 @@ def test_bad_inputs(tmp_path, inputs, monkeypatch, capfd, arguments, match):
 
 @pytest.mark.parametrize("name", ["a.vtu", "a.json"])
 def test_existing_outputs_are_refused_before_the_work(tmp_path, inputs, monkeypatch, capfd, name):
-    monkeypatch.setattr(tetopt.cli, "load_image", None)  # a call would fail
+    monkeypatch.setattr(tetopt.cli.inputs, "load_image", None)  # a call would fail
     (tmp_path / name).write_text("old")
     command = ["mesh", inputs / "sphere.nii.gz", "-o", tmp_path / "a.vtu", "--json", tmp_path / "a.json"]
     assert_refused(capfd, command, f"{name}: exists already; pass --force")
@@ -542,7 +542,7 @@ def test_the_systems_errors_take_one_line(tmp_path, inputs, monkeypatch, capfd):
     def full_disk(*_):
         raise OSError(28, "No space left on device", "a[b].vtu")
 
-    monkeypatch.setattr(tetopt.cli, "save_image", full_disk)
+    monkeypatch.setattr(tetopt.cli.phantom, "save_image", full_disk)
     command = ["phantom", "disc_2d", "-o", tmp_path / "a.nii", "--voxel-mm", "8"]
     assert_refused(capfd, command, r"No space left on device: 'a\[b\].vtu'")
 
@@ -555,8 +555,8 @@ def test_the_checksum_is_of_what_was_read(tmp_path, inputs, monkeypatch):
         (tmp_path / "disc.nii").unlink()
         return tetopt.optimize(*arguments, **options)
 
-    monkeypatch.setattr(tetopt.cli, "_prepare_kernels", lambda *_: None)
-    monkeypatch.setattr(tetopt.cli, "optimize", slow)
+    monkeypatch.setattr(tetopt.cli.run, "_prepare_kernels", lambda *_: None)
+    monkeypatch.setattr(tetopt.cli.run, "optimize", slow)
     command = ["mesh", str(tmp_path / "disc.nii"), "-o", str(tmp_path / "a.vtu"), "--nodes", "30", "--iterations", "1"]
     assert main(command) == 0
     expected = hashlib.sha256((inputs / "disc.nii").read_bytes()).hexdigest()

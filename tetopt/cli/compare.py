@@ -1,0 +1,200 @@
+"""``tetopt baseline``, ``compare`` and ``paper``: beside the conventional pipelines, and beside the paper."""
+
+from __future__ import annotations
+
+import shlex
+import signal
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+import tetopt
+from tetopt import InputError, save_mesh
+from tetopt.cli.console import log, out
+from tetopt.cli.inputs import read_labels, read_volume, results_folder
+from tetopt.cli.options import CropOption, ForceOption, ImageArgument, JsonOption, VolumeOption
+from tetopt.cli.quality import image_fit
+from tetopt.geometry.quality import quality
+from tetopt.io.files import checked_output, save_json
+from tetopt.io.images import sha256
+from tetopt.io.meshes import cell_fields
+from tetopt.io.mni import mni_path, mni_tissue
+from tetopt.report.tables import add_quality, new_table
+
+
+class Baseline(StrEnum):  # noqa: D101
+    pytetwild = "pytetwild"
+    cleaver = "cleaver"
+
+
+def paper_command(
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the results.")],
+    image_path: Annotated[
+        Path | None, typer.Option("--image", metavar="T1", help="Brain MR volume (default: nilearn's MNI152 T1).")
+    ] = None,
+    labels_path: Annotated[
+        Path | None, typer.Option("--labels", metavar="LABELS", help="Tissue labels of IMAGE, for Dice.")
+    ] = None,
+    seeds: Annotated[int, typer.Option(metavar="N", help="Random meshes for Fig. 1.")] = 200,
+    force: ForceOption = False,
+) -> int:
+    """Run the paper's figures and table again: paper.json, pictures, a page with each printed number beside ours."""
+    from tetopt.experiments import run_paper
+
+    if seeds < 1:
+        raise InputError(f"--seeds: expected 1 or more, got {seeds}")
+    volume = read_volume(mni_path("t1") if image_path is None else image_path, None, None)
+    tissue = None if labels_path is None else read_labels(labels_path, volume)
+    if image_path is None and labels_path is None:
+        tissue = mni_tissue()
+    run_paper.check_inputs(volume, tissue)
+    if tissue is None:
+        log.print("no --labels: the section on approximate segmentation is left out")
+    paths = run_paper.outputs(results_folder(output), force)
+    source = mni_path("t1") if image_path is None else image_path
+    about = {
+        "image": source.name,
+        "image_sha256": sha256(source),
+        "labels": None if tissue is None else "MNI152 tissue",
+    }
+    if labels_path is not None:
+        about["labels"] = labels_path.name
+    results = run_paper.run(paths, about, volume, tissue, seeds, lambda text: log.print(escape(text)))
+    out.print(escape(f"{paths['paper.html']}: the paper's numbers beside ours, in {results['seconds']:.0f} s"))
+    return 0
+
+
+def baseline_command(
+    image_path: ImageArgument,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="MESH.vtu", help="The mesh to write.")],
+    pipeline: Annotated[Baseline, typer.Option(help="The mesher of the conventional pipeline.")] = Baseline.pytetwild,
+    nodes: Annotated[int, typer.Option(metavar="N", min=20, help="Wanted number of nodes.")] = 5000,
+    labels_path: Annotated[
+        Path | None, typer.Option("--labels", metavar="LABELS", help="Label image instead of a segmentation of IMAGE.")
+    ] = None,
+    classes: Annotated[int, typer.Option(metavar="K", min=2, help="Classes of the segmentation (multi-Otsu).")] = 4,
+    volume: VolumeOption = None,
+    crop: CropOption = None,
+    json_path: JsonOption = None,
+    force: ForceOption = False,
+) -> int:
+    """Mesh an image the conventional way, to compare with: segment, extract surfaces, tetrahedralise."""
+    from tetopt.baseline.pipelines import PIPELINES, Job
+
+    output = checked_output(output, (".vtu",), force)
+    if json_path is not None:
+        json_path = checked_output(json_path, (".json",), force)
+    image = read_volume(image_path, volume, crop)
+    labels = None if labels_path is None else read_labels(labels_path, image, crop)
+    made = PIPELINES[pipeline.value](Job(image, labels, nodes, classes))
+    measured = quality(made.mesh.points, made.mesh.cells)
+    options = {"pipeline": pipeline.value, "nodes": nodes, "classes": classes}
+    about = {"image": image_path.name, "image_sha256": sha256(image_path), "options": options}
+    save_mesh(output, made.mesh, cell_fields(made.mesh, image), {"tetopt": tetopt.__version__, **about})
+    if json_path is not None:
+        fit = image_fit(image, made.mesh)
+        save_json(json_path, about | {"seconds": made.seconds, "notes": made.notes, "fit": fit, "quality": measured})
+    for note in made.notes:
+        log.print(escape(f"note: {note}"))
+    table = new_table("", escape(output.name))
+    add_quality(table, measured)
+    for step, seconds in made.seconds.items():
+        table.add_row(f"seconds, {step}", f"{seconds:.1f}")
+    out.print(table)
+    return 0
+
+
+def compare_command(
+    context: typer.Context,
+    image_path: ImageArgument,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the results.")],
+    nodes: Annotated[int, typer.Option(metavar="N", min=20, help="Wanted number of nodes, of every mesh.")] = 5000,
+    labels_path: Annotated[
+        Path | None,
+        typer.Option("--labels", metavar="LABELS", help="Label image, for tetopt and the pipelines that segment."),
+    ] = None,
+    repeats: Annotated[int, typer.Option(metavar="R", min=1, help="Runs of a mesher whose result varies.")] = 3,
+    pipelines: Annotated[
+        str,
+        typer.Option(
+            metavar="A,B,...",
+            help="Of tetopt, tetopt-uniform, tetopt-paper, pytetwild, cleaver, bcc, odt: which, in order.",
+        ),
+    ] = "tetopt,tetopt-uniform,tetopt-paper,pytetwild,cleaver,bcc,odt",
+    k_D: Annotated[float, typer.Option("--k-d", metavar="K", help="Weight of the image on uniform meshes.")] = 0.2,
+    classes: Annotated[int, typer.Option(metavar="K", min=2, help="Classes of the segmentation (multi-Otsu).")] = 4,
+    young: Annotated[
+        str | None,
+        typer.Option(metavar="LAW", help="Modulus by intensity, as for `fem`. Default: 1 to 10 kPa over its range."),
+    ] = None,
+    curve: Annotated[
+        str, typer.Option(metavar="F,...", help="Node counts of the error curves, as parts of N; empty for none.")
+    ] = "0.25,0.5,2",
+    tradeoff: Annotated[
+        bool, typer.Option("--tradeoff", help="Sweep tetopt's options around its defaults: some 20 more runs.")
+    ] = False,
+    reference_dofs: Annotated[
+        int, typer.Option(metavar="D", min=1000, help="Size of the voxel grid that is the truth of the simulation.")
+    ] = 300_000,
+    max_seconds: Annotated[float, typer.Option(metavar="S", help="Time limit of one run of a pipeline.")] = 3600.0,
+    max_gb: Annotated[float | None, typer.Option(metavar="GB", help="Memory limit of one run of a pipeline.")] = None,
+    volume: VolumeOption = None,
+    crop: CropOption = None,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Keep the finished runs of an interrupted comparison.")
+    ] = False,
+    force: ForceOption = False,
+) -> int:
+    """Set tetopt beside the conventional pipelines on a volume: fidelity, shape, simulation accuracy, time."""
+    from tetopt.experiments import compare, run_compare
+    from tetopt.fem.materials import parse_law
+
+    if not 0.0 <= k_D < 1.0:
+        raise InputError(f"--k-d: expected 0 <= k_D < 1, got {k_D}")
+    for name, limit in (("--max-seconds", max_seconds), ("--max-gb", max_gb)):
+        if limit is not None and not 0.0 < limit < float("inf"):
+            raise InputError(f"{name}: expected more than 0, got {limit}")
+    image = read_volume(image_path, volume, crop)
+    labels = None if labels_path is None else read_labels(labels_path, image, crop)
+    law, law_words = compare.default_law(image) if young is None else (parse_law(young), young)
+    settings = compare.Settings(
+        nodes=nodes, pipelines=tuple(name.strip() for name in pipelines.split(",")), repeats=repeats, classes=classes,
+        k_D=k_D, reference_dofs=reference_dofs, curve=_parse_curve(curve), tradeoff=tradeoff, max_seconds=max_seconds,
+        max_bytes=None if max_gb is None else int(max_gb * 1e9),
+    )  # fmt: skip
+    about = {
+        "command": f"tetopt {' '.join(map(shlex.quote, context.obj))}",
+        "image": {"name": image_path.name, "sha256": sha256(image_path), "volume": volume, "crop": crop},
+        "labels": None
+        if labels_path is None
+        else {"name": labels_path.name, "kind": "given", "sha256": sha256(labels_path)},
+        "law": law_words,
+    }
+    paths = run_compare.outputs(results_folder(output), force or resume)
+    if (output / "runs").is_dir() and not (resume or force):
+        raise InputError(f"{output / 'runs'}: finished runs are there; --resume keeps them, --force starts over")
+    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that the child is ended with us
+    try:
+        results = run_compare.run(
+            paths, about, image, labels, law, settings, lambda text: log.print(escape(text)), resume=resume
+        )
+    except KeyboardInterrupt:
+        log.print(f"interrupted: {escape(str(output / 'runs'))} keeps the finished runs, --resume goes on from there")
+        return 130
+    failed = [p["title"] for p in results["pipelines"] if p["failure"] is not None]
+    words = f", of which failed: {', '.join(failed)}" if failed else ""
+    out.print(escape(f"{paths['report.html']}: {len(settings.pipelines)} pipelines{words}, {results['seconds']:.0f} s"))
+    return 0
+
+
+def _parse_curve(text: str) -> tuple[float, ...]:
+    try:
+        factors = tuple(float(part) for part in text.split(",") if part.strip())
+    except ValueError:
+        factors = (0.0,)
+    if any(not 0.0 < factor < 100.0 for factor in factors):
+        raise InputError(f'--curve: expected parts of the node count, such as "0.25,0.5,2", got "{text}"')
+    return factors

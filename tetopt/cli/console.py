@@ -1,0 +1,45 @@
+"""What the commands say: `log` on standard error, `out`, the result, on standard output."""
+
+from __future__ import annotations
+
+import os
+from typing import Any
+
+from rich.console import Console
+from rich.markup import escape
+from rich.table import Table
+
+from tetopt.report.tables import label_table, mask_table
+
+
+class _Console(Console):
+    """A console that falls silent when the reader of its pipe has gone, and lets the command end in its own way."""
+
+    def on_broken_pipe(self) -> None:
+        self.quiet = True
+        os.dup2(os.open(os.devnull, os.O_WRONLY), self.file.fileno())
+
+
+log = _Console(stderr=True, highlight=False, soft_wrap=True, emoji=False)
+out = _Console(highlight=False, soft_wrap=True, emoji=False)
+
+
+def show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
+    """Say a warning on one line; also in place of `warnings.showwarning`."""
+    log.print(f"[yellow]tetopt: warning:[/] {escape(str(message))}")
+
+
+def print_fidelity(found: dict[str, Any]) -> None:
+    """How well contrasts, mask and labels are met, as far as each was given; `found` as of `report.summary`."""
+    for row in found.get("contrasts", []):
+        share = "constant" if row["E_D_share_of_variance"] is None else f"{row['E_D_share_of_variance']:.5f}"
+        out.print(escape(f"{row['image']}: weight {row['weight']:g}, share of its own variance in cells {share}"))
+    if "mask" in found:
+        _print_wide(mask_table(found["mask"]))
+    if "labels" in found:
+        _print_wide(label_table(found["labels"]))
+
+
+def _print_wide(table: Table) -> None:
+    """A table as wide as it is, also where a pipe has no width."""
+    _Console(file=out.file, width=max(out.width, 120), highlight=False, emoji=False).print(table)

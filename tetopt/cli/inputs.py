@@ -1,0 +1,137 @@
+"""Read the files that a command is given; refuse or tell what is wrong with them."""
+
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable
+from pathlib import Path
+
+import numba
+import numpy as np
+from rich.markup import escape
+
+from tetopt import Image, InputError, load_image, load_mesh
+from tetopt.align import aligned_contrast, is_same_grid
+from tetopt.cli.console import log, show_warning
+from tetopt.content import check_labels
+from tetopt.io.images import parse_crop, parse_slice, part_of, sha256
+from tetopt.io.meshes import MeshFile
+
+INSIDE = 0.95  # of a mask or of labels that lies in the image, to expect
+
+
+def read_image(path: Path, volume: int | None, crop: str | None, slice_: str | None) -> Image:
+    """The image as the options ask for it."""
+    return load_image(
+        path,
+        volume=volume,
+        slice_=None if slice_ is None else parse_slice(slice_),
+        crop=None if crop is None else parse_crop(crop),
+    )
+
+
+def read_volume(path: Path, volume: int | None, crop: str | None) -> Image:
+    """A 3-D image; InputError for a picture."""
+    image = read_image(path, volume, crop, None)
+    if image.ndim != 3:
+        raise InputError(f"{path}: expected a volume, got a {image.ndim}-D image")
+    return image
+
+
+def read_labels(path: Path, image: Image, crop: str | None = None, slice_: str | None = None) -> Image:
+    """A label image, cut as the image was; InputError unless it lies on the image's voxels."""
+    labels = read_image(path, None, crop, slice_)
+    if labels.shape != image.shape or not np.allclose(labels.affine, image.affine, atol=1e-4):
+        raise InputError(
+            f"{path}: expected labels on the image's own voxels, {image.shape} with its affine, got {labels.shape}; "
+            "resample them to the image first"
+        )
+    check_labels(str(path), labels)
+    return labels
+
+
+def image_and_others(
+    path: Path, volume: int | None, crop: str | None, slice_: str | None
+) -> tuple[Image, Callable[[Path, Callable[[Image, Image, str], Image]], Image]]:
+    """The image as the options ask for it, and a function that reads files beside it and aligns them to its voxels."""
+    image = read_image(path, volume, crop, slice_)
+    # A slice has lost its place across it: what goes with it is aligned to the whole image and sliced like that.
+    whole = image if slice_ is None else read_image(path, volume, None, None)
+
+    def beside(other: Path, aligned: Callable[[Image, Image, str], Image]) -> Image:
+        given = read_companion(other)
+        moved = aligned(given, whole, str(other))
+        if not is_same_grid(given, whole):
+            _say_resampled(other, given, moved, is_contrast=aligned is aligned_contrast)
+        return (
+            moved if slice_ is None else part_of(moved, parse_slice(slice_), None if crop is None else parse_crop(crop))
+        )
+
+    return image, beside
+
+
+def _say_resampled(path: Path, given: Image, moved: Image, is_contrast: bool) -> None:
+    """That a file lay on another grid, and how much of a mask or of labels is in the image."""
+    if is_contrast:
+        log.print(escape(f"{path}: taken to the image's voxels, linearly"))
+        return
+    whole, there = (np.count_nonzero(each.data) * each.voxel_volume for each in (given, moved))
+    log.print(escape(f"{path}: taken to the image's voxels, nearest neighbour"))
+    if there < INSIDE * whole:
+        show_warning(f"{path}: only {there / whole:.0%} of it lies in the image; is it of the same scan?")
+
+
+def read_companion(path: Path) -> Image:
+    """A file beside the image; one value everywhere, which would be odd in an image, is not in sizes or a mask."""
+    file, volume = file_and_volume(path)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        return load_image(file, volume=volume)
+
+
+def file_and_volume(path: Path) -> tuple[Path, int | None]:
+    """A file beside the first image, and the volume of it that `FILE:K` names."""
+    name, colon, volume = str(path).rpartition(":")
+    if colon and volume.isdecimal() and not path.exists():
+        return Path(name), int(volume)
+    return path, None
+
+
+def read_mesh(path: Path) -> MeshFile:
+    """A mesh of the user's, with a warning if its cells had to be turned."""
+    loaded = load_mesh(path)
+    if loaded.n_turned:
+        show_warning(f"{path}: {loaded.n_turned} cells were inverted in the file and have been turned")
+    return loaded
+
+
+def warn_of_other_image(loaded: MeshFile, mesh_path: Path, image_path: Path) -> None:
+    """A warning if the mesh's file names another image than this one as its source."""
+    made_from = loaded.field_data.get("image_sha256")
+    if made_from is not None and str(made_from[0]) != sha256(image_path):
+        show_warning(f"{mesh_path} was made from another image than {image_path}")
+
+
+def check_no_input(output: Path, *inputs: Path | None) -> None:
+    """InputError if the output, which --force may replace, is one of the inputs."""
+    for path in inputs:
+        if path is not None and output.exists() and path.exists() and output.samefile(path):
+            raise InputError(f"{output}: is an input of this command too; write somewhere else")
+
+
+def results_folder(path: Path) -> Path:
+    """`path`, made if it is not there."""
+    if path.exists() and not path.is_dir():
+        raise InputError(f"{path}: expected a folder for the results, found a file")
+    path.mkdir(parents=True, exist_ok=True)
+    return path
+
+
+def set_threads(threads: int | None) -> None:
+    """Compute on so many threads, or as before; InputError for more than there are."""
+    if threads is None:
+        return
+    most = int(numba.config.NUMBA_NUM_THREADS)
+    if not 1 <= threads <= most:
+        raise InputError(f"--threads: expected 1 to {most} on this machine, got {threads}")
+    numba.set_num_threads(threads)

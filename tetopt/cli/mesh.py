@@ -1,0 +1,408 @@
+"""``tetopt mesh`` and ``tetopt demo``."""
+
+from __future__ import annotations
+
+import time
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+from rich.markup import escape
+
+import tetopt
+from tetopt import InputError, Mesh, save_mesh
+from tetopt.cli.console import log, out, print_fidelity
+from tetopt.cli.inputs import read_companion, results_folder, set_threads
+from tetopt.cli.options import (
+    CropOption,
+    ForceOption,
+    ImagesArgument,
+    JsonOption,
+    LabelsOption,
+    MaskOption,
+    Method,
+    SliceOption,
+    ThreadsOption,
+    VolumeOption,
+)
+from tetopt.cli.promises import check_promises, warn_of_result
+from tetopt.cli.run import watched_optimize
+from tetopt.cli.source import Source, read_source
+from tetopt.content import Content, continued
+from tetopt.domain import lattice_within
+from tetopt.fidelity import cell_labels
+from tetopt.geometry.quality import quality
+from tetopt.geometry.simplex import squared_edges
+from tetopt.io.files import checked_output, save_json
+from tetopt.io.meshes import cell_fields
+from tetopt.io.mni import mni_path
+from tetopt.lattice import KINDS
+from tetopt.optimize.fast import GRADED_ITERATIONS, GRADED_K_D, check_options, meshed_to_error
+from tetopt.optimize.octree import octree
+from tetopt.optimize.paper import Optimized, default_n_t
+from tetopt.report.summary import fidelity, run_summary
+from tetopt.report.tables import add_quality, new_table
+
+DEFAULT_NODES = {2: 500, 3: 5000}
+
+
+class Lattice(StrEnum):  # noqa: D101
+    bcc = "bcc"
+    five_tet = "five-tet"
+    criss_cross = "criss-cross"
+    octree = "octree"
+
+
+class Boundary(StrEnum):  # noqa: D101
+    slide = "slide"
+    fixed = "fixed"
+
+
+class Retessellate(StrEnum):  # noqa: D101
+    first = "first"
+    accept = "accept"
+    never = "never"
+
+
+def mesh_command(
+    image_paths: ImagesArgument,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="MESH.vtu", help="The mesh to write.")],
+    nodes: Annotated[
+        int | None, typer.Option(metavar="N", help="Wanted number of nodes (default 5000; 500 in 2-D).")
+    ] = None,
+    target_error: Annotated[
+        float | None,
+        typer.Option(metavar="T", help="As many nodes as leave this share of the image's variance in cells, instead."),
+    ] = None,
+    size_min: Annotated[float | None, typer.Option(metavar="MM", help="No edge is split into shorter ones.")] = None,
+    size_max: Annotated[
+        float | None,
+        typer.Option(metavar="MM", help="No cell is made with a longer edge (default 1.4 x a uniform mesh's)."),
+    ] = None,
+    gradation: Annotated[
+        float | None,
+        typer.Option(metavar="G", help="How gently sizes change: each is 1/G blocks wide, 0.05 to 1 (default)."),
+    ] = None,
+    sizing: Annotated[
+        Path | None, typer.Option(metavar="SIZES.nii.gz", help="Longest edge by place, mm; 0 or less: as elsewhere.")
+    ] = None,
+    mask: MaskOption = None,
+    background: Annotated[
+        str | None,
+        typer.Option(metavar="VALUE|auto", help="Leave out what is up to VALUE and reaches the box: the air."),
+    ] = None,
+    labels: LabelsOption = None,
+    weights: Annotated[
+        str | None, typer.Option(metavar="W,...", help="How much each IMAGE counts (default 1 each; 0: not at all).")
+    ] = None,
+    label_weight: Annotated[
+        float | None, typer.Option(metavar="W", help="How much the labels count beside the first IMAGE (default 1).")
+    ] = None,
+    uniform: Annotated[
+        bool, typer.Option("--uniform", help="The paper's setting: a uniform lattice, bcc (criss-cross in 2-D).")
+    ] = False,
+    spacing: Annotated[float | None, typer.Option(metavar="MM", help="A uniform lattice of this spacing.")] = None,
+    lattice_kind: Annotated[
+        Lattice | None,
+        typer.Option(
+            "--lattice",
+            help="Initial mesh. octree, the default, puts nodes where the image has content; the others are uniform.",
+        ),
+    ] = None,
+    k_D: Annotated[
+        float | None,
+        typer.Option(
+            "--k-d",
+            metavar="K",
+            help="Weight of the image: 0 shape only; 0.9 image first (default 0.85; 0.2 on a uniform lattice).",
+        ),
+    ] = None,
+    iterations: Annotated[
+        int | None,
+        typer.Option(
+            metavar="I", min=0, help="Sweeps over all nodes; 0 writes the initial mesh (default 16; 20 if uniform)."
+        ),
+    ] = None,
+    n_t: Annotated[
+        int | None,
+        typer.Option(
+            "--n-t",
+            metavar="T",
+            min=0,
+            help="Paper's method: connect anew in the first T iterations (default half; all for k_D = 0).",
+        ),
+    ] = None,
+    retessellate: Annotated[
+        Retessellate | None,
+        typer.Option(
+            help="Paper's method: Delaunay anew in the first n_t iterations (the default), whenever it lowers E, never."
+        ),
+    ] = None,
+    method: Annotated[
+        Method, typer.Option(help="fast: gradients, flips, a floor on angles; paper: the scheme of the paper.")
+    ] = Method.fast,
+    shape_power: Annotated[
+        float | None,
+        typer.Option(
+            metavar="P", help="Fast method: 1 is the paper's E_G; up to 10 punish flat cells more (default 3)."
+        ),
+    ] = None,
+    min_dihedral: Annotated[
+        float | None,
+        typer.Option(
+            metavar="DEG", help="Fast method, 3-D: smallest dihedral angle allowed, 0 (none) to 70 (default 12)."
+        ),
+    ] = None,
+    boundary: Annotated[Boundary, typer.Option(help="What the boundary's nodes may do.")] = Boundary.slide,
+    threads: ThreadsOption = None,
+    max_seconds: Annotated[
+        float | None, typer.Option(metavar="S", help="Stop after S seconds with the mesh reached.")
+    ] = None,
+    volume: VolumeOption = None,
+    crop: CropOption = None,
+    slice_: SliceOption = None,
+    json_path: JsonOption = None,
+    figures: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Draw slice.png, rho.png, energies.png and others in this folder."),
+    ] = None,
+    force: ForceOption = False,
+) -> int:
+    """Mesh an image: nodes where it has content (or a uniform lattice), optimised, as a VTU file."""
+    begin = time.perf_counter()
+    output = checked_output(output, (".vtu",), force)
+    if json_path is not None:
+        json_path = checked_output(json_path, (".json",), force)
+    wishes = {"--nodes": nodes, "--spacing": spacing, "--target-error": target_error}
+    if len(given := [name for name, value in wishes.items() if value is not None]) > 1:
+        raise InputError(f"{' and '.join(given)}: give one of them")
+    is_graded = _is_graded(lattice_kind, uniform, spacing, method)
+    limits = {"--size-min": size_min, "--size-max": size_max, "--gradation": gradation, "--sizing": sizing}
+    for name, value in {**limits, "--target-error": target_error}.items():
+        if value is not None and not is_graded:
+            raise InputError(f"{name}: only on a graded mesh; leave out --uniform, --spacing, --lattice and --method")
+    k_D = (GRADED_K_D if is_graded else 0.2) if k_D is None else k_D
+    iterations = (GRADED_ITERATIONS if is_graded else 20) if iterations is None else iterations
+    if not 0.0 <= k_D < 1.0:
+        raise InputError(f"--k-d: expected 0 <= k_D < 1, got {k_D}")
+    if max_seconds is not None and not max_seconds > 0.0:
+        raise InputError(f"--max-seconds: expected more than 0, got {max_seconds}")
+    options: dict[str, Any] = {"k_D": k_D, "iterations": iterations, "boundary": boundary.value}
+    _check_method(method, {"--n-t": n_t, "--retessellate": retessellate}, Method.paper)
+    _check_method(method, {"--shape-power": shape_power, "--min-dihedral": min_dihedral}, Method.fast)
+    if method is Method.paper:
+        options["n_t"] = default_n_t(k_D, iterations) if n_t is None else n_t
+        options["retessellate"] = Retessellate.first.value if retessellate is None else retessellate.value
+    else:
+        options["shape_power"] = 3.0 if shape_power is None else shape_power
+        options["min_dihedral"] = 12.0 if min_dihedral is None else min_dihedral
+        check_options(**options)
+    names = ["slice.png", "rho.png", "energies.png"]
+    names += [] if mask is None and background is None else ["boundary.png"]
+    names += [] if labels is None else ["labels.png"]
+    pictures = [] if figures is None else [checked_output(figures / name, (".png",), force) for name in names]
+    if method is Method.paper and (len(image_paths) > 1 or mask or background or labels):
+        raise InputError("--method paper: takes one IMAGE and its whole box; leave out mask, labels and further ones")
+    set_threads(threads)
+    source = read_source(image_paths, volume, crop, slice_, mask, background, labels, weights, label_weight)
+    wanted = source.wanted
+    image = wanted.image
+    if is_graded:
+        sizes = _sizes(size_min, size_max, gradation, sizing)
+        if nodes is None and target_error is None:  # fewer on small images
+            nodes = int(np.clip(wanted.n_voxels // 8, 2 ** (image.ndim + 2), DEFAULT_NODES[image.ndim]))
+        if size_max is None and nodes is not None:  # what holds then is told with the other numbers
+            size_max = (tetopt.Sizes() if sizes is None else sizes).at_most(image, nodes, wanted.volume)
+        initial, kind = None if nodes is None else octree(wanted, nodes, sizes), Lattice.octree.value
+        options |= {"nodes": nodes, "sizes": sizes}
+    else:
+        if nodes is None and spacing is None:
+            nodes = DEFAULT_NODES[image.ndim]
+        kind = KINDS[image.ndim][0] if lattice_kind is None else lattice_kind.value
+        initial = lattice_within(image, wanted.region, kind, nodes=nodes, spacing=spacing)
+    settings = {
+        "nodes": nodes, "target_error": target_error, "spacing": spacing, "lattice": kind, "size_min": size_min,
+        "size_max": size_max, "gradation": gradation, "sizing": None if sizing is None else sizing.name,
+        "volume": volume, "crop": crop, "slice": slice_, "method": method.value, "max_seconds": max_seconds,
+    }  # fmt: skip
+    return _mesh_files(source, initial, options, settings, output, json_path, pictures, begin)
+
+
+def _check_method(method: Method, given: dict[str, Any], wanted: Method) -> None:
+    """InputError for an option of the other method."""
+    wrong = [name for name, value in given.items() if value is not None]
+    if wrong and method is not wanted:
+        raise InputError(f"{wrong[0]}: only with --method {wanted.value}, got --method {method.value}")
+
+
+def _is_graded(kind: Lattice | None, uniform: bool, spacing: float | None, method: Method) -> bool:
+    """Whether the options ask for an octree; it is the default."""
+    if kind is not Lattice.octree:
+        return kind is None and not uniform and spacing is None and method is Method.fast
+    if uniform:
+        raise InputError("--uniform and --lattice octree: give one of them")
+    if method is Method.paper:
+        raise InputError("--lattice octree: only with --method fast, got --method paper")
+    if spacing is not None:
+        raise InputError("--lattice octree: has no one spacing; give --nodes instead of --spacing")
+    return True
+
+
+def _sizes(
+    size_min: float | None, size_max: float | None, gradation: float | None, sizing: Path | None
+) -> tetopt.Sizes | None:
+    """The limits on sizes as the options ask for them."""
+    if size_min is None and size_max is None and gradation is None and sizing is None:
+        return None
+    return tetopt.Sizes(
+        0.0 if size_min is None else size_min, size_max, 1.0 if gradation is None else gradation,
+        None if sizing is None else read_companion(sizing),
+    )  # fmt: skip
+
+
+def _mesh_files(
+    source: Source,
+    initial: Mesh | None,
+    options: dict[str, Any],
+    settings: dict[str, Any],
+    output: Path,
+    json_path: Path | None,
+    pictures: list[Path],
+    begin: float,
+) -> int:
+    """Optimise, write the mesh, the numbers and the pictures, print the comparison; the exit code."""
+    wanted, image = source.wanted, source.wanted.image
+    loaded = time.perf_counter()
+    ends = None if settings["max_seconds"] is None else begin + settings["max_seconds"]
+    interrupted: list[bool] = []
+
+    def run(mesh: Mesh, nodes: int | None) -> Optimized:
+        log.print(escape(_described(source, mesh, settings["lattice"])))
+        graded = {} if nodes is None else {"nodes": nodes}
+        result, is_interrupted = watched_optimize(wanted, mesh, Method(settings["method"]), ends, **options | graded)
+        interrupted.append(is_interrupted)
+        return result
+
+    if initial is None:
+        options["nodes"], initial, result = meshed_to_error(wanted, settings["target_error"], options["sizes"], run)
+    else:
+        result = run(initial, options.get("nodes"))
+    is_interrupted = any(interrupted)
+    optimized = time.perf_counter()
+    told = {name: value for name, value in (settings | options).items() if name != "sizes"}
+    about = {**source.about, "options": told}
+    fields = _fields(source, result.mesh)
+    save_mesh(output, result.mesh, fields, {"tetopt": tetopt.__version__, **about})
+    found = fidelity(source.labels, source.mask, result.mesh, fields.get("label"))
+    if not wanted.is_plain or wanted.region is not None:
+        found["contrasts"] = _by_contrast(source, result.mesh, fields)
+    if json_path is not None:
+        seconds = {"load": loaded - begin, "optimize": optimized - loaded, "all": time.perf_counter() - begin}
+        save_json(json_path, run_summary(wanted, initial, result, about, seconds) | found)
+    if pictures:
+        from tetopt.report import figures  # matplotlib is slow to load, and only needed here
+
+        start = _start_name(settings["lattice"])
+        figures.save_run_figures(pictures[:3], image, initial, result, start, source.contrasts[0])
+        if source.mask is not None:
+            drawn = figures.boundary_figure(source.contrasts[0], source.mask, result.mesh)
+            figures.save_figure(drawn, pictures[3])
+        if source.labels is not None:
+            figures.save_figure(figures.label_figure(source.labels, result.mesh, fields["label"]), pictures[-1])
+    # Everything is written; what is printed may go into a pipe that closes.
+    code = check_promises(wanted, result, options.get("min_dihedral", 0.0), settings["target_error"], found)
+    code = 130 if is_interrupted else code
+    n_empty = 0 if image.data.min() == image.data.max() else int((fields["n_voxels"] == 0).sum())
+    asked = options.get("nodes") if settings["target_error"] is None else None
+    warn_of_result(result, Method(settings["method"]), asked, n_empty)
+    _print_comparison(wanted, initial, result, _start_name(settings["lattice"]))
+    print_fidelity(found)
+    out.print(escape(f"{output}: {len(result.mesh.points)} nodes, {len(result.mesh.cells)} cells"))
+    if json_path is not None:
+        out.print(escape(f"{json_path}: every number of the run"))
+    for path in pictures:
+        out.print(escape(str(path)))
+    return code
+
+
+def _described(source: Source, initial: Mesh, kind: str) -> str:
+    image = source.contrasts[0]
+    size = " x ".join(str(s) for s in image.shape)
+    spacing = " x ".join(f"{s:.4g}" for s in image.spacing)
+    start = f"{_start_name(kind)} of {len(initial.points)} nodes, {len(initial.cells)} cells"
+    start += f", edges up to {np.sqrt(squared_edges(initial.points, initial.cells).max()):.3g} mm"
+    more = [f"and {len(source.paths) - 1} more"] if len(source.paths) > 1 else []
+    more += ["labels"] if source.labels is not None else []
+    more += [f"within a mask of {source.wanted.n_voxels} voxels"] if source.mask is not None else []
+    return ", ".join([f"{source.paths[0]}: {size} voxels of {spacing} mm", *more]) + f"; {start}"
+
+
+def _start_name(kind: str) -> str:
+    """What an initial mesh is called."""
+    return kind if kind == Lattice.octree.value else "lattice"
+
+
+def _fields(source: Source, mesh: Mesh) -> dict[str, NDArray]:
+    """What the file holds of each cell: as `cell_fields`, means of further contrasts, and the label."""
+    fields = cell_fields(mesh, source.wanted.image)
+    for number, contrast in enumerate(source.contrasts[1:], 2):
+        moments = tetopt.cell_moments(continued(contrast, source.mask), mesh)
+        fields |= {f"mean_{number}": moments.mean, f"variance_{number}": moments.variance}
+    if source.labels is not None:
+        fields["label"] = cell_labels(continued(source.labels, source.mask), mesh)
+    return fields
+
+
+def _by_contrast(source: Source, mesh: Mesh, fields: dict[str, NDArray]) -> list[dict[str, Any]]:
+    """How well each contrast is represented: the share of its variance left within cells."""
+    rows = []
+    weights = source.about["inputs"]["weights"]
+    for number, (path, weight) in enumerate(zip(source.paths, weights, strict=True), 1):
+        mean, variance = (fields[name if number == 1 else f"{name}_{number}"] for name in ("mean", "variance"))
+        count = fields["n_voxels"]
+        within = float((count * variance).sum())
+        total = within + float((count * (mean - (count * mean).sum() / count.sum()) ** 2).sum())
+        rows.append(
+            {"image": path.name, "weight": weight, "E_D_share_of_variance": within / total if total > 0.0 else None}
+        )
+    return rows
+
+
+def _print_comparison(wanted: Content, initial: Mesh, result: Optimized, start: str) -> None:
+    first, last = result.history[0], result.history[-1]
+    before = quality(initial.points, initial.cells)
+    after = quality(result.mesh.points, result.mesh.cells)
+    table = new_table("", start, "optimised")
+    table.add_row("E, combined", f"{first.E:.4f}", f"{last.E:.4f}")
+    table.add_row("E_G, of initial", "1.0000", f"{last.E_G / first.E_G:.4f}")
+    if first.E_D > 0.0:
+        table.add_row("E_D, of initial", "1.0000", f"{last.E_D / first.E_D:.4f}")
+    if first.E_D > 0.0 and (spread := wanted.variance * wanted.volume) > 0.0:
+        whose = "the image's variance" if wanted.is_plain and wanted.region is None else "all channels' variance"
+        table.add_row(f"E_D, share of {whose}", f"{first.E_D / spread:.5f}", f"{last.E_D / spread:.5f}")
+    add_quality(table, before, after)
+    out.print(table)
+
+
+def demo_command(
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the results.")] = Path(
+        "demo"
+    ),
+    nodes: Annotated[int, typer.Option(metavar="N", help="Wanted number of nodes.")] = 5000,
+    iterations: Annotated[int | None, typer.Option(metavar="I", min=0, help="Sweeps over all nodes.")] = None,
+    force: ForceOption = False,
+) -> int:
+    """Mesh the MNI152 T1 that nilearn's wheel carries; leave mesh, numbers and pictures in a folder."""
+    source = mni_path("t1")
+    return mesh_command(
+        [source],
+        results_folder(output) / "mesh.vtu",
+        nodes=nodes,
+        iterations=iterations,
+        json_path=output / "run.json",
+        figures=output,
+        force=force,
+    )

@@ -1,0 +1,100 @@
+"""One optimisation as a terminal shows it: kernels made ready, progress, Ctrl-C and the clock."""
+
+from __future__ import annotations
+
+import contextlib
+import signal
+import time
+from collections.abc import Callable, Iterator
+from types import FrameType
+from typing import Any
+
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
+
+from tetopt import Mesh
+from tetopt.cli.console import log
+from tetopt.cli.options import Method
+from tetopt.content import Content
+from tetopt.optimize.fast import optimize, prepare_kernels
+from tetopt.optimize.paper import Optimized, Record, optimize_paper
+
+
+def watched_optimize(
+    wanted: Content, initial: Mesh, method: Method, ends: float | None, **options: Any
+) -> tuple[Optimized, bool]:
+    """`optimize` with progress shown, ended in good order at a time or by Ctrl-C; whether by that."""
+    iterations = options["iterations"]
+    _prepare_kernels(wanted, options["k_D"], method, "nodes" in options)
+    run: Callable[..., Optimized] = optimize if method is Method.fast else optimize_paper
+    max_seconds = None if ends is None else max(ends - time.perf_counter(), 1e-9)
+    with _graceful_interrupt() as is_interrupted, _progress(iterations) as show:
+        image = wanted if method is Method.fast else wanted.image
+        result = run(image, initial, max_seconds=max_seconds, callback=show, stop=is_interrupted, **options)
+        was_interrupted = is_interrupted()
+    if iterations == 0:  # the lattice itself, not its nodes put on the sampling grid
+        result = result._replace(mesh=initial)
+    if result.ended != "iterations":
+        words = {
+            "converged": "converged: hardly anything changes any more",
+            "max_seconds": "out of time: the mesh so far is kept",
+            "stopped": "interrupted: the mesh so far is kept",
+        }
+        log.print(f"{words[result.ended]} (iteration {result.history[-1].iteration} of {iterations})")
+    return result, was_interrupted
+
+
+def _prepare_kernels(image: Content, k_D: float, method: Method, is_graded: bool) -> None:
+    """Load the compiled kernels, or compile them, before the clock of the first iteration starts."""
+    begin = time.perf_counter()
+    with log.status("preparing the kernels (the first run compiles them, one to two minutes) ..."):
+        prepare_kernels(image, k_D, method.value, is_graded)
+    seconds = time.perf_counter() - begin
+    if seconds > 3.0:
+        log.print(f"kernels compiled in {seconds:.0f} s; later runs on images of this kind load them from the cache")
+
+
+@contextlib.contextmanager
+def _graceful_interrupt() -> Iterator[Callable[[], bool]]:
+    """The first Ctrl-C only raises a flag, which the returned function tells; the second ends the program."""
+    pressed: list[int] = []
+
+    def on_interrupt(number: int, frame: FrameType | None) -> None:
+        if pressed:
+            log.print("interrupted again: no mesh is written")
+            raise KeyboardInterrupt
+        pressed.append(number)
+        log.print("interrupted: finishing the current nodes, then writing the mesh (again to give up)")
+
+    try:
+        before = signal.signal(signal.SIGINT, on_interrupt)
+    except ValueError:  # not in the main thread, where signals do not arrive either
+        yield lambda: False
+        return
+    try:
+        yield lambda: bool(pressed)
+    finally:
+        signal.signal(signal.SIGINT, before)
+
+
+@contextlib.contextmanager
+def _progress(iterations: int) -> Iterator[Callable[[Record], None]]:
+    """A function that shows each record: a bar with the remaining time on a terminal, else a line."""
+    first: list[Record] = []
+
+    def words(row: Record) -> str:
+        first.append(row)
+        E_D = f"  E_D {row.E_D / first[0].E_D:.4f}" if first[0].E_D > 0.0 else ""
+        return f"E {row.E:.4f}  E_G {row.E_G / first[0].E_G:.4f}{E_D}"
+
+    if log.is_terminal:
+        columns = (
+            TextColumn("optimising"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn(),
+            TextColumn("{task.fields[energies]}"),
+        )  # fmt: skip
+        with Progress(*columns, console=log, transient=True) as bar:
+            task = bar.add_task("", total=iterations, energies="")
+            yield lambda row: bar.update(task, completed=row.iteration, energies=words(row))
+    else:
+        yield lambda row: log.print(
+            f"iteration {row.iteration:3d}/{iterations}  {words(row)}  {row.n_cells} cells  {row.seconds:.1f} s"
+        )
