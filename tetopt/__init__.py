@@ -13,9 +13,10 @@ from tetopt.fidelity import cell_labels, label_fidelity, mask_fidelity
 from tetopt.geometry.quality import quality
 from tetopt.image import Image
 from tetopt.io.images import load_image, save_image
-from tetopt.io.meshes import cell_fields, load_mesh, save_mesh
+from tetopt.io.meshes import load_mesh, save_mesh
 from tetopt.lattice import lattice
 from tetopt.mesh import Mesh
+from tetopt.model.fields import cell_fields
 from tetopt.optimize.fast import mesh_image, optimize
 from tetopt.optimize.octree import octree
 from tetopt.optimize.paper import optimize_paper

@@ -20,13 +20,15 @@ from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
 from tetopt.image import Image
 from tetopt.io.images import save_image
-from tetopt.io.meshes import cell_fields, load_mesh, save_mesh, to_pyvista
+from tetopt.io.meshes import load_mesh, save_mesh
+from tetopt.io.vtk import to_pyvista
 from tetopt.lattice import lattice
 from tetopt.mesh import Mesh
+from tetopt.model.fields import cell_fields
 
 OPTIONS = {"k_D": 0.2, "n_t": None, "crop": "ä"}
 ABOUT = {"tetopt": "0.1.0", "image": "Schädel [1].nii.gz", "image_sha256": "ab" * 32, "options": OPTIONS}
-FIELDS = ["mean", "variance", "n_voxels", "volume", "rho", "min_dihedral"]
+FIELDS = ["mean", "variance", "n_voxels", "min", "max", "volume", "rho", "min_dihedral"]
 
 
 def image_of(n):
@@ -46,7 +48,7 @@ def write_grid(path, cells, points):
 
 # Node 4 makes one tetrahedron more on top of the first one; node 5 is used by no cell.
 POINTS = [[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1], [1, 1, 1], [9, 9, 9]]
-TETRA, TRIANGLE, QUAD, HEXAHEDRON = 10, 5, 9, 12
+LINE, TRIANGLE, QUAD, TETRA, HEXAHEDRON, QUADRATIC = 3, 5, 9, 10, 12, 24
 
 VTU = """<?xml version="1.0"?><VTKFile type="UnstructuredGrid" version="0.1" byte_order="LittleEndian">
 <UnstructuredGrid><Piece NumberOfPoints="5" NumberOfCells="1"><Points>
@@ -265,10 +267,10 @@ def test_a_missing_file(tmp_path, assert_refused):
     assert_refused(tmp_path, "no such mesh file")
 
 
-@pytest.mark.parametrize("name", ["a.stl", "a.nii.gz", "a.msh", "a"])
+@pytest.mark.parametrize("name", ["a.stl", "a.nii.gz", "a.inp", "a"])
 def test_another_suffix(tmp_path, name, assert_refused):
     (tmp_path / name).write_bytes(b"x")
-    assert_refused(tmp_path / name, r"named .vtu or .vtk")
+    assert_refused(tmp_path / name, r"named \.vtu, \.vtk or \.msh")
 
 
 @pytest.mark.parametrize("name", ["a.vtu", "a.vtk"])
@@ -324,7 +326,9 @@ def test_another_vtk_data_set(tmp_path, assert_refused):
 @pytest.mark.parametrize(
     ("cells", "found"),
     [
-        ({TETRA: [[0, 1, 2, 3]], TRIANGLE: [[0, 1, 2]]}, "found tetra, triangle"),
+        ({TETRA: [[0, 1, 2, 3]], QUAD: [[0, 1, 4, 2]]}, "found quad"),
+        ({QUADRATIC: [[0, 1, 2, 3, 4, 5, 0, 1, 2, 3]]}, "expected linear tetrahedra.*found quadratic_tetra"),
+        ({LINE: [[0, 1]]}, "found line"),
         ({QUAD: [[0, 1, 4, 2]]}, "found quad"),
         ({HEXAHEDRON: [[0, 1, 2, 3, 4, 5, 0, 1]]}, "found hexahedron"),
     ],
@@ -332,6 +336,18 @@ def test_another_vtk_data_set(tmp_path, assert_refused):
 def test_other_and_mixed_cells(tmp_path, cells, found, assert_refused):
     write_grid(tmp_path / "a.vtu", cells, POINTS)
     assert_refused(tmp_path / "a.vtu", found)
+
+
+def test_triangles_on_tetrahedra_are_left_out_and_counted(tmp_path):
+    grid = pyvista.UnstructuredGrid(
+        {TRIANGLE: np.array([[0, 1, 2], [1, 2, 3]]), TETRA: np.array([[0, 1, 2, 3]])}, np.array(POINTS[:5], dtype=float)
+    )
+    grid.cell_data["k"] = np.array([7.0, 8.0, 9.0])  # in the order of the file, which pyvista has sorted
+    kinds = grid.celltypes.tolist()
+    grid.save(tmp_path / "a.vtu")
+    back = load_mesh(tmp_path / "a.vtu")
+    assert (len(back.mesh.cells), len(back.mesh.points), back.n_left) == (1, 4, 2)
+    assert back.cell_data["k"].tolist() == [[7.0, 8.0, 9.0][kinds.index(TETRA)]]
 
 
 def test_no_cells(tmp_path, assert_refused):

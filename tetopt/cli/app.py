@@ -16,11 +16,13 @@ import tetopt
 from tetopt import InputError
 from tetopt.cli.compare import baseline_command, compare_command, paper_command
 from tetopt.cli.console import log, out, show_warning
+from tetopt.cli.convert import convert_command
 from tetopt.cli.fem import fem_command
 from tetopt.cli.mesh import demo_command, mesh_command
 from tetopt.cli.phantom import phantom_command
 from tetopt.cli.quality import quality_command
 from tetopt.cli.segment import segment_command
+from tetopt.cli.surface import surface_command
 
 app = typer.Typer(
     name="tetopt",
@@ -34,6 +36,8 @@ app = typer.Typer(
 COMMANDS: dict[str, Callable[..., int]] = {  # in the order of the help
     "mesh": mesh_command,
     "quality": quality_command,
+    "convert": convert_command,
+    "surface": surface_command,
     "phantom": phantom_command,
     "fem": fem_command,
     "segment": segment_command,

@@ -20,8 +20,8 @@ from tetopt.cli.quality import image_fit
 from tetopt.geometry.quality import quality
 from tetopt.io.files import checked_output, save_json
 from tetopt.io.images import sha256
-from tetopt.io.meshes import cell_fields
 from tetopt.io.mni import mni_path, mni_tissue
+from tetopt.model.fields import cell_fields
 from tetopt.report.tables import add_quality, new_table
 
 

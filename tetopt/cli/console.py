@@ -35,11 +35,11 @@ def print_fidelity(found: dict[str, Any]) -> None:
         share = "constant" if row["E_D_share_of_variance"] is None else f"{row['E_D_share_of_variance']:.5f}"
         out.print(escape(f"{row['image']}: weight {row['weight']:g}, share of its own variance in cells {share}"))
     if "mask" in found:
-        _print_wide(mask_table(found["mask"]))
+        print_wide(mask_table(found["mask"]))
     if "labels" in found:
-        _print_wide(label_table(found["labels"]))
+        print_wide(label_table(found["labels"]))
 
 
-def _print_wide(table: Table) -> None:
+def print_wide(table: Table) -> None:
     """A table as wide as it is, also where a pipe has no width."""
     _Console(file=out.file, width=max(out.width, 120), highlight=False, emoji=False).print(table)

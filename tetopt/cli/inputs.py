@@ -8,6 +8,7 @@ from pathlib import Path
 
 import numba
 import numpy as np
+from numpy.typing import NDArray
 from rich.markup import escape
 
 from tetopt import Image, InputError, load_image, load_mesh
@@ -135,3 +136,11 @@ def set_threads(threads: int | None) -> None:
     if not 1 <= threads <= most:
         raise InputError(f"--threads: expected 1 to {most} on this machine, got {threads}")
     numba.set_num_threads(threads)
+
+
+def cell_field(loaded: MeshFile, path: Path, name: str) -> NDArray:
+    """A field of a mesh's file, one number a cell; InputError, with those that there are, if it is not there."""
+    known = [each for each, values in loaded.cell_data.items() if values.ndim == 1]
+    if name not in known:
+        raise InputError(f'{path}: has no "{name}" on its cells; it has {", ".join(known) or "nothing"}')
+    return loaded.cell_data[name]

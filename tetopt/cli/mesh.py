@@ -13,37 +13,51 @@ from numpy.typing import NDArray
 from rich.markup import escape
 
 import tetopt
-from tetopt import InputError, Mesh, save_mesh
-from tetopt.cli.console import log, out, print_fidelity
-from tetopt.cli.inputs import read_companion, results_folder, set_threads
+from tetopt import Image, InputError, Mesh
+from tetopt.cli.console import log, out, print_fidelity, show_warning
+from tetopt.cli.inputs import check_no_input, read_companion, read_mesh, results_folder, set_threads
 from tetopt.cli.options import (
+    BinsOption,
     CropOption,
     ForceOption,
     ImagesArgument,
     JsonOption,
     LabelsOption,
+    LoadOption,
     MaskOption,
     Method,
+    NuOption,
+    OrderOption,
+    SetOption,
     SliceOption,
+    SpaceOption,
     ThreadsOption,
+    UnitsOption,
     VolumeOption,
+    YoungOption,
 )
 from tetopt.cli.promises import check_promises, warn_of_result
 from tetopt.cli.run import watched_optimize
+from tetopt.cli.solver import Wishes, built, checked_wishes, print_model, save_wished
 from tetopt.cli.source import Source, read_source
 from tetopt.content import Content, continued
 from tetopt.domain import lattice_within
 from tetopt.fidelity import cell_labels
 from tetopt.geometry.quality import quality
-from tetopt.geometry.simplex import squared_edges
+from tetopt.geometry.simplex import centroids, squared_edges
 from tetopt.io.files import checked_output, save_json
-from tetopt.io.meshes import cell_fields
+from tetopt.io.formats import FORMATS, format_of
+from tetopt.io.meshes import MeshFile
 from tetopt.io.mni import mni_path
+from tetopt.io.vtk import box_text
 from tetopt.lattice import KINDS
+from tetopt.model.fields import cell_fields
+from tetopt.model.model import Model
+from tetopt.model.sets import box_of, standard_sets, with_carried
 from tetopt.optimize.fast import GRADED_ITERATIONS, GRADED_K_D, check_options, meshed_to_error
 from tetopt.optimize.octree import octree
 from tetopt.optimize.paper import Optimized, default_n_t
-from tetopt.report.summary import fidelity, run_summary
+from tetopt.report.summary import fidelity, model_summary, run_summary
 from tetopt.report.tables import add_quality, new_table
 
 DEFAULT_NODES = {2: 500, 3: 5000}
@@ -69,7 +83,9 @@ class Retessellate(StrEnum):  # noqa: D101
 
 def mesh_command(
     image_paths: ImagesArgument,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="MESH.vtu", help="The mesh to write.")],
+    output: Annotated[
+        Path, typer.Option("-o", "--output", metavar="MESH", help=f"The mesh to write: {', '.join(FORMATS)}.")
+    ],
     nodes: Annotated[
         int | None, typer.Option(metavar="N", help="Wanted number of nodes (default 5000; 500 in 2-D).")
     ] = None,
@@ -85,6 +101,10 @@ def mesh_command(
     gradation: Annotated[
         float | None,
         typer.Option(metavar="G", help="How gently sizes change: each is 1/G blocks wide, 0.05 to 1 (default)."),
+    ] = None,
+    start: Annotated[
+        Path | None,
+        typer.Option(metavar="MESH", help="Improve this mesh, its boundary kept, instead of making a new one."),
     ] = None,
     sizing: Annotated[
         Path | None, typer.Option(metavar="SIZES.nii.gz", help="Longest edge by place, mm; 0 or less: as elsewhere.")
@@ -156,7 +176,9 @@ def mesh_command(
             metavar="DEG", help="Fast method, 3-D: smallest dihedral angle allowed, 0 (none) to 70 (default 12)."
         ),
     ] = None,
-    boundary: Annotated[Boundary, typer.Option(help="What the boundary's nodes may do.")] = Boundary.slide,
+    boundary: Annotated[
+        Boundary | None, typer.Option(help="What the boundary's nodes may do (default slide; with --start fixed).")
+    ] = None,
     threads: ThreadsOption = None,
     max_seconds: Annotated[
         float | None, typer.Option(metavar="S", help="Stop after S seconds with the mesh reached.")
@@ -169,27 +191,46 @@ def mesh_command(
         Path | None,
         typer.Option(metavar="DIR", help="Draw slice.png, rho.png, energies.png and others in this folder."),
     ] = None,
+    young: YoungOption = None,
+    nu: NuOption = None,
+    bins: BinsOption = None,
+    sets: SetOption = None,
+    loads: LoadOption = None,
+    order: OrderOption = 1,
+    units: UnitsOption = "kPa",
+    space: SpaceOption = "ras",
     force: ForceOption = False,
 ) -> int:
-    """Mesh an image: nodes where it has content (or a uniform lattice), optimised, as a VTU file."""
+    """Mesh an image: nodes where it has content (or a uniform lattice), optimised, for a solver or as VTU."""
     begin = time.perf_counter()
-    output = checked_output(output, (".vtu",), force)
+    format_of(output)
+    output = checked_output(output, tuple(FORMATS), force)
+    wishes = Wishes(young, nu, bins, list(sets or []), list(loads or []), order, units, space)
+    checked_wishes(output, wishes)
     if json_path is not None:
         json_path = checked_output(json_path, (".json",), force)
-    wishes = {"--nodes": nodes, "--spacing": spacing, "--target-error": target_error}
-    if len(given := [name for name, value in wishes.items() if value is not None]) > 1:
+    numbers = {"--nodes": nodes, "--spacing": spacing, "--target-error": target_error}
+    if len(given := [name for name, value in numbers.items() if value is not None]) > 1:
         raise InputError(f"{' and '.join(given)}: give one of them")
-    is_graded = _is_graded(lattice_kind, uniform, spacing, method)
+    is_graded = _is_graded(lattice_kind, uniform, spacing, method) and start is None
+    if start is not None:
+        others = {**numbers, "--lattice": lattice_kind, "--mask": mask, "--background": background}
+        _check_start(start, others, uniform, method)
+        check_no_input(output, start)
     limits = {"--size-min": size_min, "--size-max": size_max, "--gradation": gradation, "--sizing": sizing}
     for name, value in {**limits, "--target-error": target_error}.items():
         if value is not None and not is_graded:
-            raise InputError(f"{name}: only on a graded mesh; leave out --uniform, --spacing, --lattice and --method")
+            raise InputError(
+                f"{name}: only on a graded mesh; leave out --uniform, --spacing, --lattice, --method, --start"
+            )
     k_D = (GRADED_K_D if is_graded else 0.2) if k_D is None else k_D
     iterations = (GRADED_ITERATIONS if is_graded else 20) if iterations is None else iterations
     if not 0.0 <= k_D < 1.0:
         raise InputError(f"--k-d: expected 0 <= k_D < 1, got {k_D}")
     if max_seconds is not None and not max_seconds > 0.0:
         raise InputError(f"--max-seconds: expected more than 0, got {max_seconds}")
+    if boundary is None:
+        boundary = Boundary.slide if start is None else Boundary.fixed
     options: dict[str, Any] = {"k_D": k_D, "iterations": iterations, "boundary": boundary.value}
     _check_method(method, {"--n-t": n_t, "--retessellate": retessellate}, Method.paper)
     _check_method(method, {"--shape-power": shape_power, "--min-dihedral": min_dihedral}, Method.fast)
@@ -210,7 +251,12 @@ def mesh_command(
     source = read_source(image_paths, volume, crop, slice_, mask, background, labels, weights, label_weight)
     wanted = source.wanted
     image = wanted.image
-    if is_graded:
+    started = None if start is None else read_mesh(start)
+    initial: Mesh | None
+    if started is not None:
+        initial, kind = started.mesh, "start"
+        _check_place(started.mesh, source.contrasts[0], str(start))
+    elif is_graded:
         sizes = _sizes(size_min, size_max, gradation, sizing)
         if nodes is None and target_error is None:  # fewer on small images
             nodes = int(np.clip(wanted.n_voxels // 8, 2 ** (image.ndim + 2), DEFAULT_NODES[image.ndim]))
@@ -227,8 +273,42 @@ def mesh_command(
         "nodes": nodes, "target_error": target_error, "spacing": spacing, "lattice": kind, "size_min": size_min,
         "size_max": size_max, "gradation": gradation, "sizing": None if sizing is None else sizing.name,
         "volume": volume, "crop": crop, "slice": slice_, "method": method.value, "max_seconds": max_seconds,
+        "start": None if start is None else start.name,
     }  # fmt: skip
-    return _mesh_files(source, initial, options, settings, output, json_path, pictures, begin)
+    source.about["box"] = box_text(box_of(source.contrasts[0]))
+    if initial is not None and (young is not None or loads) and not sets:
+        _model(source, initial, started, wishes, {})  # to refuse now what would be refused after the optimisation
+    return _mesh_files(source, initial, started, options, settings, wishes, output, json_path, pictures, begin)
+
+
+def _check_start(start: Path, others: dict[str, Any], uniform: bool, method: Method) -> None:
+    """InputError for options that ask for another mesh than the given one."""
+    given = [name for name, value in (others | {"--uniform": uniform or None}).items() if value is not None]
+    if given:
+        raise InputError(f"--start and {given[0]}: {start} has its nodes and its boundary already; leave one out")
+    if method is Method.paper:
+        raise InputError("--start: only with --method fast, whose moves keep a boundary that is not convex")
+
+
+def _check_place(mesh: Mesh, image: Image, path: str) -> None:
+    """InputError for a mesh off the image, a warning for one that lies partly beside it."""
+    if mesh.ndim != image.ndim:
+        raise InputError(f"{path}: expected a {image.ndim}-D mesh, as the image is, got a {mesh.ndim}-D one")
+    index = image.to_index(centroids(mesh.points, mesh.cells))
+    is_in = ((index >= -0.5) & (index <= np.array(image.shape) - 0.5)).all(axis=1)
+    if not is_in.any():
+        raise InputError(f"{path}: lies beside the image; do both lie in the same world mm (RAS+)?")
+    if not is_in.all():
+        show_warning(f"{path}: {np.mean(~is_in):.1%} of its cells lie beside the image, where it has no say")
+
+
+def _model(source: Source, mesh: Mesh, started: MeshFile | None, wishes: Wishes, about: dict[str, Any]) -> Model:
+    """The mesh with all that the options say of it."""
+    fields = _fields(source, mesh)
+    known = standard_sets(mesh, box_of(source.contrasts[0]), fields.get("label"))
+    if started is not None:
+        known = with_carried(known, started.mesh, started.sets, mesh)
+    return built(mesh, source.wanted.image, wishes, fields, about, known_sets=known)
 
 
 def _check_method(method: Method, given: dict[str, Any], wanted: Method) -> None:
@@ -266,8 +346,10 @@ def _sizes(
 def _mesh_files(
     source: Source,
     initial: Mesh | None,
+    started: MeshFile | None,
     options: dict[str, Any],
     settings: dict[str, Any],
+    wishes: Wishes,
     output: Path,
     json_path: Path | None,
     pictures: list[Path],
@@ -294,14 +376,15 @@ def _mesh_files(
     optimized = time.perf_counter()
     told = {name: value for name, value in (settings | options).items() if name != "sizes"}
     about = {**source.about, "options": told}
-    fields = _fields(source, result.mesh)
-    save_mesh(output, result.mesh, fields, {"tetopt": tetopt.__version__, **about})
+    model = _model(source, result.mesh, started, wishes, about)
+    fields = model.cell_data
+    save_wished(output, model, wishes)
     found = fidelity(source.labels, source.mask, result.mesh, fields.get("label"))
     if not wanted.is_plain or wanted.region is not None:
         found["contrasts"] = _by_contrast(source, result.mesh, fields)
     if json_path is not None:
         seconds = {"load": loaded - begin, "optimize": optimized - loaded, "all": time.perf_counter() - begin}
-        save_json(json_path, run_summary(wanted, initial, result, about, seconds) | found)
+        save_json(json_path, run_summary(wanted, initial, result, about, seconds) | found | model_summary(model))
     if pictures:
         from tetopt.report import figures  # matplotlib is slow to load, and only needed here
 
@@ -313,14 +396,18 @@ def _mesh_files(
         if source.labels is not None:
             figures.save_figure(figures.label_figure(source.labels, result.mesh, fields["label"]), pictures[-1])
     # Everything is written; what is printed may go into a pipe that closes.
-    code = check_promises(wanted, result, options.get("min_dihedral", 0.0), settings["target_error"], found)
+    floor = options.get("min_dihedral", 0.0)
+    code = check_promises(wanted, result, floor, settings["target_error"], found, started and started.mesh)
     code = 130 if is_interrupted else code
     n_empty = 0 if image.data.min() == image.data.max() else int((fields["n_voxels"] == 0).sum())
     asked = options.get("nodes") if settings["target_error"] is None else None
     warn_of_result(result, Method(settings["method"]), asked, n_empty)
     _print_comparison(wanted, initial, result, _start_name(settings["lattice"]))
     print_fidelity(found)
-    out.print(escape(f"{output}: {len(result.mesh.points)} nodes, {len(result.mesh.cells)} cells"))
+    if wishes.are_any() or output.suffix.lower() != ".vtu":
+        print_model(output, model, wishes)
+    else:
+        out.print(escape(f"{output}: {len(result.mesh.points)} nodes, {len(result.mesh.cells)} cells"))
     if json_path is not None:
         out.print(escape(f"{json_path}: every number of the run"))
     for path in pictures:
@@ -342,7 +429,7 @@ def _described(source: Source, initial: Mesh, kind: str) -> str:
 
 def _start_name(kind: str) -> str:
     """What an initial mesh is called."""
-    return kind if kind == Lattice.octree.value else "lattice"
+    return kind if kind in (Lattice.octree.value, "start") else "lattice"
 
 
 def _fields(source: Source, mesh: Mesh) -> dict[str, NDArray]:

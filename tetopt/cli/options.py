@@ -22,6 +22,9 @@ ImagesArgument = Annotated[
     list[Path],
     typer.Argument(metavar="IMAGE...", help="As for the other commands; further contrasts go to the first one's grid."),
 ]
+MeshArgument = Annotated[
+    Path, typer.Argument(metavar="MESH", help="VTU, VTK or gmsh MSH file of tetrahedra or triangles.")
+]
 MaskOption = Annotated[
     Path | None,
     typer.Option(metavar="MASK", help="Mesh this region only (0/1, or 0 to 1), its boundary on the mask's surface."),
@@ -42,3 +45,35 @@ ForceOption = Annotated[bool, typer.Option("--force", help="Replace existing out
 ThreadsOption = Annotated[
     int | None, typer.Option("--threads", metavar="N", help="Threads; the result is the same for any number.")
 ]
+YoungOption = Annotated[
+    str | None,
+    typer.Option(
+        metavar="LAW",
+        help='Young\'s modulus, kPa: a number, a formula of the intensity, "0.5 + 0.01*h", a table "0:1,100:5", '
+        'by label "1=2.1,2=1.9", or a file .toml or .csv of such columns.',
+    ),
+]
+NuOption = Annotated[str | None, typer.Option(metavar="LAW", help="Poisson's ratio, likewise (default 0.45).")]
+BinsOption = Annotated[
+    str | None,
+    typer.Option(metavar="K[:quantile|:log]", help="Group cells into K materials, of equal width, by number, or log."),
+]
+SetOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--set",
+        metavar="NAME=...",
+        help="A set more: NAME=below:T, NAME=point:X,Y,Z:D, NAME=plane:X,Y,Z:NX,NY,NZ:D (mm, RAS+). May be repeated.",
+    ),
+]
+LoadOption = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--load",
+        metavar="...",
+        help="A step to run: compress:5%, or hold:SET and move:SET:X,Y,Z. May be repeated.",
+    ),
+]
+OrderOption = Annotated[int, typer.Option(metavar="1|2", help="2: quadratic cells, straight-edged (.inp, .feb).")]
+UnitsOption = Annotated[str, typer.Option(metavar="kPa|MPa", help="Unit of stress in the file; --young is in kPa.")]
+SpaceOption = Annotated[str, typer.Option(metavar="ras|lps", help="Convention of the file's coordinates.")]

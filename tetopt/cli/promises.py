@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 import tetopt
+from tetopt import Mesh
 from tetopt.cli.console import log, show_warning
 from tetopt.cli.options import Method
 from tetopt.content import Content
@@ -17,9 +18,17 @@ LARGE = 200  # voxels: a label of more may not be without cells
 
 
 def check_promises(
-    wanted: Content, result: Optimized, min_dihedral: float, target_error: float | None, found: dict[str, Any]
+    wanted: Content,
+    result: Optimized,
+    min_dihedral: float,
+    target_error: float | None,
+    found: dict[str, Any],
+    start: Mesh | None = None,
 ) -> int:
-    """0 if the mesh covers what it should, keeps the floor on angles and has the error asked; else 1, said aloud."""
+    """0 if the mesh covers what it should, keeps the floor on angles and has the error asked; else 1, said aloud.
+
+    It should cover the mask, or what the user's own mesh `start` did, or the image's box.
+    """
     image = wanted.image
     below = 0
     if image.ndim == 3 and result.history[-1].iteration > 0:
@@ -47,6 +56,16 @@ def check_promises(
                 "and please report this"
             )
         return 1 if below or is_above or is_lost or overlapping else 0
+    if start is not None:
+        before, after = (float(volumes(mesh.points, mesh.cells).sum()) for mesh in (start, result.mesh))
+        gained = result.history[-1].n_voxels - result.history[0].n_voxels
+        if gained or abs(after / before - 1.0) > 1e-6:
+            log.print(
+                f"[bold red]tetopt:[/] the mesh no longer covers what it did: {gained:+d} voxels, its volume is "
+                f"{after:.9g} of {before:.9g} mm^{image.ndim}; please report this"
+            )
+            return 1
+        return 1 if below or is_lost else 0
     covered = float(volumes(result.mesh.points, result.mesh.cells).sum())
     missed = image.data.size - result.history[-1].n_voxels
     if missed == 0 and abs(covered / image.volume - 1.0) < 1e-9:

@@ -96,6 +96,26 @@ def cell_of_voxel(image: Image, mesh: Mesh) -> NDArray[np.int64]:
     return (np.cumsum(steps, axis=2)[..., :-1] - 1).reshape(image.shape)
 
 
+def cell_ranges(image: Image, mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """The least and the greatest intensity among the voxels whose centres lie in each cell, (M,) float64 each.
+
+    In a cell without any both are the nearest voxel's, as in `cell_moments`.
+
+    Raises
+    ------
+    InputError
+        As `cell_moments`.
+    """
+    owner = cell_of_voxel(image, mesh).ravel()
+    inside = owner >= 0
+    low, high = np.full(len(mesh.cells), np.inf), np.full(len(mesh.cells), -np.inf)
+    np.minimum.at(low, owner[inside], image.data.ravel()[inside])
+    np.maximum.at(high, owner[inside], image.data.ravel()[inside])
+    is_empty = low > high
+    low[is_empty] = high[is_empty] = nearest_values(image, mesh.points[mesh.cells[is_empty]].mean(axis=1))
+    return low, high
+
+
 def nearest_values(image: Image, points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Value of the voxel nearest to each world point, (K,) float64; points outside take the border's."""
     index = np.rint(image.to_index(points)).astype(np.int64)

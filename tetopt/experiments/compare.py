@@ -34,8 +34,9 @@ from tetopt.geometry.quality import quality, rho_histogram
 from tetopt.geometry.simplex import dihedral_angles
 from tetopt.image import Image
 from tetopt.io.files import save_json
-from tetopt.io.meshes import cell_fields, load_mesh, save_mesh
+from tetopt.io.meshes import load_mesh, save_mesh
 from tetopt.mesh import Mesh
+from tetopt.model.fields import cell_fields
 from tetopt.report.summary import image_summary, versions
 
 Say = Callable[[str], None]

@@ -27,6 +27,7 @@ from scipy.sparse.linalg import LinearOperator, cg, splu
 
 from tetopt.check import ON_FACE, check_unfolded, facets_on_box
 from tetopt.errors import InputError
+from tetopt.fem.materials import checked_young
 from tetopt.fem.rigidity import check_held, rigid_modes
 from tetopt.geometry.simplex import volume_gradients, volumes
 from tetopt.image import Image
@@ -469,14 +470,7 @@ def _checked_young(young: ArrayLike, mesh: Mesh) -> NDArray[np.float64]:
         young = np.full(len(mesh.cells), float(young))
     if young.shape != (len(mesh.cells),):
         raise InputError(f"young: expected one modulus for each of {len(mesh.cells)} cells, got shape {young.shape}")
-    bad = np.flatnonzero(~(np.isfinite(young) & (young > 0.0)))
-    if len(bad):
-        first = ", ".join(f"{young[j]:g} in cell {j}" for j in bad[:3])
-        raise InputError(
-            f"young: expected moduli above 0 kPa, got {len(bad)} others, the first {first}; "
-            'give empty space a small modulus too, as --young "0:0.1,255:6" does'
-        )
-    return young
+    return checked_young(young)
 
 
 def _checked_nu(nu: float) -> float:

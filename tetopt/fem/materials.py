@@ -7,7 +7,11 @@ number wherever the law is curved and the cell is not uniform.
 
 from __future__ import annotations
 
+import csv
+import tomllib
 from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -21,23 +25,50 @@ from tetopt.mesh import Mesh
 Law = Callable[[NDArray[np.float64]], ArrayLike] | Sequence[Sequence[float]] | NDArray[np.floating] | None
 
 
-def young_from(law: Law, intensities: ArrayLike) -> NDArray[np.float64]:
-    """Young's modulus of each intensity, float64 of the same shape, kPa.
+class ByLabel(NamedTuple):
+    """A value for each label instead of a law of the intensity."""
+
+    values: dict[int, float]
+
+
+def law_values(law: Law, intensities: ArrayLike) -> NDArray[np.float64]:
+    """What a law makes of each intensity, float64 of the same shape.
 
     Parameters
     ----------
     law : callable, (K, 2) table or None
-        A function of a float64 array; or pairs (intensity, kPa), the intensities strictly increasing, between
-        which the modulus is linear and beyond which it keeps the last pair's; or None: the intensity is the
-        modulus.
+        A function of a float64 array; or pairs (intensity, value), the intensities strictly increasing, between
+        which the value is linear and beyond which it keeps the last pair's; or None: the intensity itself.
     intensities : array of real numbers
 
     Raises
     ------
     InputError
-        A table that is not of that kind, a function that returns another shape, or a modulus that is negative or
-        not finite. A modulus of 0 is let through, as empty space inside a cell; a cell of nothing else is refused
-        when the stiffness matrix is built.
+        A table that is not of that kind, or a function that returns another shape.
+    """
+    intensities = np.asarray(intensities, dtype=np.float64)
+    if law is None:
+        return intensities.copy()
+    if not callable(law):
+        table = _checked_table(law)
+        return np.interp(intensities, table[:, 0], table[:, 1])
+    values = np.asarray(law(intensities), dtype=np.float64)
+    if values.shape != intensities.shape:
+        raise InputError(
+            f"law: expected a function that returns one modulus for each intensity, got shape {values.shape} "
+            f"for shape {intensities.shape}"
+        )
+    return values
+
+
+def young_from(law: Law, intensities: ArrayLike) -> NDArray[np.float64]:
+    """Young's modulus of each intensity, float64 of the same shape, kPa: `law_values`, none of them negative.
+
+    Raises
+    ------
+    InputError
+        As `law_values`, or a modulus that is negative or not finite. A modulus of 0 is let through, as empty space
+        inside a cell; a cell of nothing else is refused when the stiffness matrix is built.
 
     Examples
     --------
@@ -45,18 +76,7 @@ def young_from(law: Law, intensities: ArrayLike) -> NDArray[np.float64]:
     array([1., 3., 5., 5.])
     """
     intensities = np.asarray(intensities, dtype=np.float64)
-    if law is None:
-        young = intensities.copy()
-    elif callable(law):
-        young = np.asarray(law(intensities), dtype=np.float64)
-        if young.shape != intensities.shape:
-            raise InputError(
-                f"law: expected a function that returns one modulus for each intensity, got shape {young.shape} "
-                f"for shape {intensities.shape}"
-            )
-    else:
-        table = _checked_table(law)
-        young = np.interp(intensities, table[:, 0], table[:, 1])
+    young = law_values(law, intensities)
     is_bad = ~(np.isfinite(young) & (young >= 0.0))
     if is_bad.any():
         at, first_of = np.unique(intensities[is_bad], return_index=True)
@@ -91,15 +111,123 @@ def parse_table(text: str) -> list[tuple[float, float]]:
     return [(pair[0], pair[1]) for pair in pairs]
 
 
-def parse_law(text: str) -> Law:
-    """A law from a command line: a table such as "0:1,100:5.5", or a formula of h, see `parse_formula`.
+def parse_labels(text: str) -> ByLabel:
+    """Values by label as written on a command line.
 
     Raises
     ------
     InputError
-        As `parse_table` and `parse_formula`.
+        The text is something else, or names a label twice.
+
+    Examples
+    --------
+    >>> parse_labels("1=2.1, 2=1.9").values
+    {1: 2.1, 2: 1.9}
     """
-    return parse_table(text) if ":" in text else parse_formula(text)
+    values: dict[int, float] = {}
+    for pair in text.split(","):
+        label, _, value = pair.partition("=")
+        try:
+            number, worth = int(label), float(value)
+        except ValueError:
+            raise InputError(f'law by label: expected pairs label=value, such as "1=2.1,2=1.9", got "{text}"') from None
+        if number in values:
+            raise InputError(f"law by label: label {number} has two values; give each once")
+        values[number] = worth
+    return ByLabel(values)
+
+
+def parse_law(text: str) -> Law:
+    """A law of the intensity from a command line, see `parse_any_law`.
+
+    Raises
+    ------
+    InputError
+        As `parse_any_law`, and for values by label.
+    """
+    law = parse_any_law(text)
+    if isinstance(law, ByLabel):
+        raise InputError(f'law: expected one of the intensity, got values by label, "{text}"')
+    return law
+
+
+def parse_any_law(text: str, quantity: str = "young") -> Law | ByLabel:
+    """A law from a command line.
+
+    Parameters
+    ----------
+    text : str
+        A table of intensities, "0:1,100:5.5"; values by label, "1=2.1,2=1.9"; a formula of h (`parse_formula`), of
+        which a number is one; or a file named .toml or .csv (`load_law`).
+    quantity : str
+        The file's column.
+
+    Raises
+    ------
+    InputError
+        As `parse_table`, `parse_labels`, `parse_formula` and `load_law`.
+    """
+    if text.lower().endswith((".toml", ".csv")):
+        return load_law(Path(text), quantity)
+    if "=" in text:
+        return parse_labels(text)
+    return _checked_pairs(parse_table(text)) if ":" in text else parse_formula(text)
+
+
+def load_law(path: Path, quantity: str = "young") -> Law | ByLabel:
+    """A law from a file: two columns, or more, as lists in TOML or under names in the first row of CSV.
+
+    One column is "intensity", or "label", and one the quantity, such as "young" (kPa) or "nu".
+
+    Raises
+    ------
+    InputError
+        No such file, another format, columns that are missing, of different length or not of numbers, or
+        intensities that do not increase.
+    """
+    if not path.is_file():
+        raise InputError(f"{path}: no such file of a law")
+    try:
+        columns = _toml_columns(path) if path.suffix.lower() == ".toml" else _csv_columns(path)
+        keys = [name for name in ("intensity", "label") if name in columns]
+        if len(keys) != 1 or quantity not in columns:
+            raise InputError(
+                f'{path}: expected columns "{quantity}" and one of "intensity" and "label", found '
+                f"{', '.join(map(str, columns)) or 'none'}"
+            )
+        if len(columns[keys[0]]) != len(columns[quantity]):
+            counts = f"{len(columns[keys[0]])} of {keys[0]} and {len(columns[quantity])} of {quantity}"
+            raise InputError(f"{path}: {counts}; give one for each")
+        pairs = list(zip(map(float, columns[keys[0]]), map(float, columns[quantity]), strict=True))
+    except InputError:
+        raise
+    except (ValueError, TypeError, csv.Error) as error:
+        raise InputError(f"{path}: expected columns of numbers ({' '.join(str(error).split())})") from error
+    if keys == ["intensity"]:
+        return _checked_pairs(pairs)
+    if any(label != int(label) for label, _ in pairs) or len({label for label, _ in pairs}) != len(pairs):
+        raise InputError(f"{path}: labels must be whole numbers, each once, got {[label for label, _ in pairs]}")
+    return ByLabel({int(label): value for label, value in pairs})
+
+
+def _toml_columns(path: Path) -> dict[str, list[Any]]:
+    columns = tomllib.loads(path.read_text(encoding="utf-8"))
+    if wrong := [name for name, column in columns.items() if not isinstance(column, list)]:
+        raise InputError(f'{path}: expected lists of numbers, "{wrong[0]}" is {type(columns[wrong[0]]).__name__}')
+    return columns
+
+
+def _csv_columns(path: Path) -> dict[str, list[Any]]:
+    rows = [row for row in csv.reader(path.read_text(encoding="utf-8-sig").splitlines()) if row]
+    if not rows or any(len(row) != len(rows[0]) for row in rows):
+        raise InputError(f"{path}: expected a row of names and then rows of as many numbers")
+    names = [name.strip() for name in rows[0]]
+    return {name: [row[number] for row in rows[1:]] for number, name in enumerate(names)}
+
+
+def _checked_pairs(pairs: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    _checked_table(pairs)
+    return pairs
 
 
 def young_image(image: Image, law: Law) -> Image:
@@ -125,7 +253,25 @@ def cell_young(image: Image, mesh: Mesh, law: Law = None) -> NDArray[np.float64]
     InputError
         As `young_from` and `tetopt.energy.sampling.cell_of_voxel`.
     """
-    field = young_image(image, law)
+    return _cell_means(young_image(image, law), mesh)
+
+
+def cell_values(image: Image, mesh: Mesh, law: Law) -> NDArray[np.float64]:
+    """`cell_young` of any quantity, which may be negative, such as Poisson's ratio.
+
+    Raises
+    ------
+    InputError
+        As `law_values` and `tetopt.energy.sampling.cell_of_voxel`; values that are not finite.
+    """
+    values = law_values(law, image.data)
+    if not np.isfinite(values).all():
+        at = image.data[~np.isfinite(values)].ravel()[0]
+        raise InputError(f"law: it has no value at intensity {at:g}; give one that has over the image's range")
+    return _cell_means(Image(values, image.affine), mesh)
+
+
+def _cell_means(field: Image, mesh: Mesh) -> NDArray[np.float64]:
     # Summed voxel by voxel. `cell_moments` takes differences of sums over rows, whose rounding would drown the soft
     # cells of a field that spans ten orders of magnitude.
     owner = cell_of_voxel(field, mesh).ravel()
@@ -133,8 +279,20 @@ def cell_young(image: Image, mesh: Mesh, law: Law = None) -> NDArray[np.float64]
     n_voxels = np.bincount(owner[inside], minlength=len(mesh.cells))
     total = np.bincount(owner[inside], weights=field.data.ravel()[inside], minlength=len(mesh.cells))
     is_empty = n_voxels == 0
-    young = total / np.maximum(n_voxels, 1)
-    young[is_empty] = nearest_values(field, mesh.points[mesh.cells[is_empty]].mean(axis=1))
+    means = total / np.maximum(n_voxels, 1)
+    means[is_empty] = nearest_values(field, mesh.points[mesh.cells[is_empty]].mean(axis=1))
+    return means
+
+
+def checked_young(young: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The moduli of cells, (M,); InputError unless all are above 0."""
+    bad = np.flatnonzero(~(np.isfinite(young) & (young > 0.0)))
+    if len(bad):
+        first = ", ".join(f"{young[j]:g} in cell {j}" for j in bad[:3])
+        raise InputError(
+            f"young: expected moduli above 0 kPa, got {len(bad)} others, the first {first}; "
+            'give empty space a small modulus too, as --young "0:0.1,255:6" does'
+        )
     return young
 
 

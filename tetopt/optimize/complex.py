@@ -49,6 +49,7 @@ class Measure(NamedTuple):
     n_channels: int
     power: float  # p of the shape energy
     is_graded: bool  # whether every cell's shape counts the same, whatever its size
+    is_kept: bool  # whether the boundary's facets stay as they are
     floor: float  # minus the cosine of the smallest dihedral angle that a move may leave; -1 for none
     safe: float  # a tetrahedron whose S^3 is up to this times its squared determinant is above the floor
 
@@ -514,7 +515,7 @@ def _fill_twins(twin: NDArray, start: NDArray, ring: NDArray, corner: NDArray, c
 
 def measure_of(
     grid: SamplingGrid, hand: int, matrix: NDArray[np.float64], geometry: float, image: float, power: float,
-    is_graded: bool = False, surface: float = 0.0,
+    is_graded: bool = False, surface: float = 0.0, is_kept: bool = False,
 ) -> Measure:  # fmt: skip
     """A `Measure` of plain numbers, as the kernels are compiled for, without a floor."""
     return Measure(
@@ -528,6 +529,7 @@ def measure_of(
         int(grid.n_channels),
         float(power),
         bool(is_graded),
+        bool(is_kept),
         *floor_of(0.0),
     )
 

@@ -251,11 +251,13 @@ def _put_middle(
     found = _sides_of_edge(held, rings, sides, a, b)
     for d in range(3):
         held.ticks[p, d] = (held.ticks[a, d] + held.ticks[b, d]) >> 1
-        is_frozen[p, d] = found > 0 and (sides.is_fixed or (found >> d) & 1 == 1)
+        is_frozen[p, d] = (found >> d) & 1 == 1
     is_frozen[p, 3] = found >= 8
+    if found > 0 and sides.is_fixed:
+        return False
     if found < 8:
         return True
-    if not sides.has_surface or sides.is_fixed:
+    if not sides.has_surface:
         return False
     x, uphill = np.empty((4, 3)), np.empty((2, 3))
     load(x, 1, held.ticks, p, a, measure)

@@ -112,8 +112,9 @@ def optimize(
         The smallest dihedral angle that a tetrahedron may have at the end, degrees, 0 (no floor) to below 70. How many
         cells miss it is for the caller to count (`tetopt.quality`); meshes of triangles have no floor.
     boundary : {"slide", "fixed"}
-        Boundary nodes move within the box's faces and edges, or not at all. Those not on the box are fixed or, with a
-        mask, whose surface they are taken to lie on, slide on that.
+        Boundary nodes move within the box's faces and edges, those not on the box are fixed or, with a mask, whose
+        surface they are taken to lie on, slide on that; or the boundary stays as it is, node for node and facet for
+        facet, to the last bit.
     nodes : int, optional
         Put nodes where they lower E most, towards this number of them: on a graded mesh, such as `octree`. Every
         cell's shape then counts the same, whatever its size (see `tetopt.optimize.complex.shape_energy`), and nodes
@@ -368,6 +369,8 @@ class _Run:
         region = wanted.region
         self.is_frozen = frozen_axes(image, ticks, mesh.cells, self.grid, boundary, region is not None)
         self.is_still = self.is_frozen[:, 3 - self.n : 3].all(axis=1)
+        is_kept = self.is_still if boundary == "fixed" else np.zeros(len(ticks), dtype=bool)
+        self.kept = dict(zip(map(tuple, ticks[is_kept].tolist()), mesh.points[is_kept], strict=True))
         self.matrix = np.eye(3)
         self.matrix[3 - self.n :, 3 - self.n :] = image.affine[:-1, :-1]
         level = None if region is None else region.level
@@ -391,7 +394,7 @@ class _Run:
             )
         self.measure: Measure = measure_of(
             self.grid, hand, self.matrix, (1.0 - k_D) / self.E_G0, weight, power, is_graded,
-            0.0 if region is None else weight * wanted.wrong_side,
+            0.0 if region is None else weight * wanted.wrong_side, boundary == "fixed",
         )  # fmt: skip
         self.groups = blocks(ticks)
         self.edge = _edges(mesh)
@@ -508,6 +511,9 @@ class _Run:
 
     def mesh(self) -> Mesh:
         points = self.image.to_world(from_ticks(self.held.ticks, self.grid, self.n))
+        if self.kept:  # nodes that may not move come back to the last bit, not rounded to ticks
+            for node, place in enumerate(self.held.ticks.tolist()):
+                points[node] = self.kept.get(tuple(place), points[node])
         return Mesh(points, self.held.cells[: int(self.held.n_cells[0])].copy())
 
 

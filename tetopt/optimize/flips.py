@@ -299,11 +299,14 @@ def ring_of_edge(
 
 @njit(cache=True, error_model="numpy")
 def in_one_face(held: Complex, a: int, b: int, c: int, d: int, measure: Measure) -> bool:
-    """Whether four boundary nodes have one index coordinate in common, so that they lie in one face of the box."""
+    """Whether four boundary nodes have one index coordinate in common, so that they lie in one face of the box.
+
+    Not if the boundary is to be kept: their facets are not to be exchanged then.
+    """
     t = held.ticks
     for axis in range(3):
         at = t[a, axis]
-        if t[b, axis] == at and t[c, axis] == at and t[d, axis] == at:
+        if not measure.is_kept and t[b, axis] == at and t[c, axis] == at and t[d, axis] == at:
             return True
     return False
 

@@ -18,6 +18,7 @@ from tetopt.fidelity import label_fidelity, mask_fidelity
 from tetopt.geometry.quality import quality
 from tetopt.image import Image
 from tetopt.mesh import Mesh
+from tetopt.model.model import Model
 from tetopt.optimize.paper import Optimized
 
 SHOWN_VERSIONS = ("numpy", "scipy", "numba", "nibabel", "pyvista")
@@ -78,6 +79,17 @@ def run_summary(
         "seconds": seconds,
         "mesh_sha256": mesh_hash(result.mesh),
     }
+
+
+def model_summary(model: Model) -> dict[str, Any]:
+    """How large the sets are, and what the cells are made of, moduli in kPa."""
+    of_facets = {name: len(rows) for name, rows in model.sets.facets.items()}
+    found: dict[str, Any] = {"sets": {"facets": of_facets, "cells": {k: len(v) for k, v in model.sets.cells.items()}}}
+    if (made := model.materials) is not None:
+        found["materials"] = {"count": len(made.young), "young_kPa": made.young, "nu": made.nu, "binning": made.binning}
+    if model.loads:
+        found["loads"] = {load.set_name: load.displacement for load in model.loads}
+    return found
 
 
 def fidelity(labels: Image | None, mask: Image | None, mesh: Mesh, of_cell: NDArray | None) -> dict[str, Any]:

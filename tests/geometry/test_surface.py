@@ -1,0 +1,303 @@
+"""Surfaces of sets of tetrahedra: closed and manifold whatever the set, around the same volume, crossing nothing."""
+
+from itertools import product
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from meshes import CUBE_CORNER, FIVE_TET_CUBE, REGULAR_TET, TWO_TETS
+
+from tetopt.errors import InputError
+from tetopt.geometry.simplex import facet_areas, oriented, volumes
+from tetopt.geometry.surface import STEP, n_pieces, surface_of, volume_and_area
+from tetopt.geometry.topology import boundary_facets
+from tetopt.image import Image
+from tetopt.lattice import lattice
+
+# Cells 0 1 2 3 and 0 1 4 5 share the edge 0 1, on either side of the plane x = 0; the third shares the node 3 alone.
+TOUCHING = (
+    np.array(
+        [[0, -1, 0], [0, 1, 0], [1, 0, -1], [1, 0, 1], [-1, 0, -1], [-1, 0, 1], [1, 1, 3], [2, 0, 3], [1, -1, 3.0]]
+    ),
+    np.array([[0, 1, 2, 3], [0, 1, 5, 4], [3, 6, 7, 8]]),
+)
+
+
+def grid(blocks, kind="five-tet", noise=0.0, seed=0):
+    """A lattice of unit cubes, its nodes moved a little, so that neighbouring facets lie in no common plane."""
+    mesh = lattice(Image(np.zeros([2 * b for b in blocks]), np.diag([0.5, 0.5, 0.5, 1.0])), kind, blocks=blocks)
+    points = mesh.points + np.random.default_rng(seed).normal(0.0, noise, mesh.points.shape)
+    return points - points.min(axis=0), mesh.cells
+
+
+def edges_of(triangles):
+    """Directed edges, (3K, 2), three in a row for each triangle."""
+    return np.stack([triangles, np.roll(triangles, -1, axis=1)], axis=-1).reshape(-1, 2)
+
+
+def assert_manifold(surface):
+    """Each directed edge once, and once the other way; the triangles around each node are one cycle."""
+    edges = [tuple(edge) for edge in edges_of(surface.triangles).tolist()]
+    assert len(set(edges)) == len(edges)
+    assert {(b, a) for a, b in edges} == set(edges)
+    assert set(surface.triangles.ravel().tolist()) == set(range(len(surface.points)))
+    opposite = {}
+    for a, b, c in surface.triangles.tolist():
+        for node, start, end in ((a, b, c), (b, c, a), (c, a, b)):
+            opposite.setdefault(node, {})[start] = end
+    for ring in opposite.values():
+        first = at = next(iter(ring))
+        length = 0
+        while length == 0 or at != first:
+            at, length = ring[at], length + 1
+        assert length == len(ring)
+
+
+def assert_surface_of(surface, points, cells):
+    """Manifold, distinct nodes even in float32, and the cells' volume, but for what the copies' shifts sweep."""
+    assert_manifold(surface)
+    assert len(np.unique(surface.points.astype(np.float32), axis=0)) == len(surface.points)
+    volume, area = volume_and_area(surface)
+    expected = volumes(points, cells).sum()
+    assert volume == pytest.approx(expected, abs=1.01 * surface.largest_shift * area + 1e-12 * expected)
+    assert area > 0.0
+    assert (surface.n_parted == 0) == (surface.largest_shift == 0.0)
+
+
+def euler(surface):
+    return len(surface.points) - len(surface.triangles) // 2  # V - E + F with E = 3 F / 2
+
+
+def n_crossings(surface):
+    """Pairs of an edge and a triangle without a common node that cut each other, by brute force."""
+    points, triangles = surface.points, surface.triangles
+    edges = edges_of(triangles)
+    edges = edges[edges[:, 0] < edges[:, 1]]
+    found = 0
+    a, b, c = points[triangles.T]
+    normal = np.cross(b - a, c - a)
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    for edge in edges:
+        u, v = points[edge]
+        over_u, over_v = ((u - a) * normal).sum(axis=1), ((v - a) * normal).sum(axis=1)
+        # Parts of one facet that was cut are flat, and their distances 1e-16, of either sign.
+        may = (over_u * over_v < 0.0) & (np.maximum(abs(over_u), abs(over_v)) > 1e-9)
+        may &= ~(triangles[:, :, None] == edge).any(axis=(1, 2))
+        sides = [((np.cross(p - u, q - u))[may] @ (v - u)) > 0.0 for p, q in ((a, b), (b, c), (c, a))]
+        found += int(((sides[0] == sides[1]) & (sides[1] == sides[2])).sum())
+    return found
+
+
+# --------------------------------------------------------------------------------------------------
+# Where nothing touches
+
+
+@pytest.mark.parametrize("mesh", [CUBE_CORNER, REGULAR_TET])
+def test_a_single_cell_has_its_four_facets_turned_out(mesh):
+    points, cells = mesh
+    surface = surface_of(points, cells, [0])
+    assert_surface_of(surface, points, cells)
+    assert surface.triangles.shape == (4, 3)
+    assert surface.triangles.dtype == np.int64
+    corners = surface.points[surface.triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    assert (((corners.mean(axis=1) - points.mean(axis=0)) * normals).sum(axis=1) > 0.0).all()
+    assert volume_and_area(surface) == pytest.approx((volumes(points, cells)[0], facet_areas(points, cells).sum()))
+
+
+@pytest.mark.parametrize("mesh", [FIVE_TET_CUBE, TWO_TETS, grid((3, 2, 2), "bcc")])
+def test_a_whole_mesh_has_its_boundary_facets(mesh):
+    points, cells = mesh
+    surface = surface_of(points, cells, np.ones(len(cells), dtype=bool))
+    assert_manifold(surface)
+
+    def listed(places, triangles):  # by the places of their corners, the lowest first
+        rows = [[tuple(p) for p in places[t].tolist()] for t in triangles]
+        return sorted(min(row, row[1:] + row[:1], row[2:] + row[:2]) for row in rows)
+
+    assert listed(surface.points, surface.triangles) == listed(points, boundary_facets(cells))
+    assert (surface.n_parted, surface.largest_shift, n_pieces(surface)) == (0, 0.0, 1)
+
+
+def test_volume_and_area_far_from_the_origin():
+    points, cells = FIVE_TET_CUBE
+    assert volume_and_area(surface_of(points, cells, range(5))) == pytest.approx((1.0, 6.0), rel=1e-14)
+    moved = points * 0.7 + 1e7 / 3.0
+    volume, area = volume_and_area(surface_of(moved, cells, range(5)))
+    assert volume == pytest.approx(volumes(moved, cells).sum(), rel=1e-13)
+    assert area == pytest.approx(6.0 * 0.7**2, rel=1e-8)
+
+
+def test_mask_and_indices_in_any_order_mean_the_same():
+    points, cells = grid((2, 2, 2))
+    mask = np.arange(len(cells)) % 3 == 0
+    one = surface_of(points, cells, mask)
+    other = surface_of(points, cells, np.append(np.flatnonzero(mask)[::-1], 0))
+    for a, b in zip(one, other, strict=True):
+        np.testing.assert_array_equal(a, b)
+
+
+def test_the_wall_of_a_cavity_is_turned_into_it():
+    points, cells = grid((3, 3, 3), "bcc")
+    middle = np.abs(points[cells].mean(axis=1) - 1.5).max(axis=1).argmin()
+    surface = surface_of(points, cells, np.delete(np.arange(len(cells)), middle))
+    assert_surface_of(surface, points, np.delete(cells, middle, axis=0))
+    assert (n_pieces(surface), surface.n_parted) == (2, 0)
+    is_wall = np.isin(surface.points, points[cells[middle]]).all(axis=1)[surface.triangles].all(axis=1)
+    wall = surface._replace(triangles=surface.triangles[is_wall])
+    assert volume_and_area(wall)[0] == pytest.approx(-volumes(points, cells)[middle])
+
+
+# --------------------------------------------------------------------------------------------------
+# Where cells touch
+
+
+@pytest.mark.parametrize(("chosen", "shared"), [([0, 1], [0, 1]), ([0, 2], [3])])
+def test_cells_that_share_an_edge_or_a_node_come_apart(chosen, shared):
+    points, cells = TOUCHING
+    cells = oriented(points, cells)
+    surface = surface_of(points, cells, chosen)
+    assert_surface_of(surface, points, cells[chosen])
+    assert (len(surface.points), len(surface.triangles)) == (8, 8)
+    assert (surface.n_parted, n_pieces(surface)) == (len(shared), 2)
+    heights = 3.0 * volumes(points, cells) / facet_areas(points, cells).max(axis=1)
+    assert surface.largest_shift == pytest.approx(STEP * heights[chosen].min())
+    for node in shared:  # one copy keeps its place
+        away = np.sort(np.linalg.norm(surface.points - points[node], axis=1))
+        np.testing.assert_allclose(away[:2], [0.0, surface.largest_shift], atol=1e-15)
+    # Into the solid: no piece grows.
+    assert volume_and_area(surface)[0] < volumes(points, cells[chosen]).sum()
+    assert n_crossings(surface) == 0
+
+
+@pytest.mark.parametrize(("cubes", "characteristic", "parted"), [(8, 0, 0), (7, 2, 2)])
+def test_a_ring_that_closes_in_an_edge_alone_opens(cubes, characteristic, parted):
+    """Eight cubes around a hole are a ring. Without one at a corner its two neighbours share an edge, one cube long."""
+    points, cells = grid((3, 3, 1))
+    x, y, _ = np.floor(points[cells].mean(axis=1)).T
+    is_chosen = ((x != 1) | (y != 1)) & ((x != 0) | (y != 0) | (cubes == 8))
+    surface = surface_of(points, cells, is_chosen)
+    assert_surface_of(surface, points, cells[is_chosen])
+    assert (euler(surface), n_pieces(surface), surface.n_parted) == (characteristic, 1, parted)
+
+
+def edge_star(cells, a, b):
+    """Cells around the edge a b in turn, each sharing a facet with the next."""
+    left = [k for k, cell in enumerate(cells) if a in cell and b in cell]
+    star = [left.pop(0)]
+    while left:
+        star.append(left.pop(next(i for i, k in enumerate(left) if len(set(cells[k]) & set(cells[star[-1]])) == 3)))
+    return star
+
+
+def test_an_edge_closed_at_both_ends_gets_two_middles():
+    """Two cavities that share an edge become one: at neither end does the surface have several fans."""
+    points, cells = grid((3, 3, 3), "bcc", noise=0.02)
+    cell = cells[np.abs(points[cells].mean(axis=1) - points.mean(axis=0)).max(axis=1).argmin()]
+    star = edge_star(cells.tolist(), *cell[:2].tolist())
+    is_chosen = ~np.isin(np.arange(len(cells)), [star[0], star[2]])
+    surface = surface_of(points, cells, is_chosen)
+    assert_surface_of(surface, points, cells[is_chosen])
+    outside = len(boundary_facets(cells))
+    # Of the cavities' eight facets four are at the edge, each cut from its centroid into four.
+    assert (len(surface.triangles) - outside, surface.n_parted, n_pieces(surface)) == (4 + 4 * 4, 1, 2)
+    assert euler(surface) == 4  # two spheres
+    assert n_crossings(surface) == 0
+
+
+def test_cavities_that_share_a_node_part_into_themselves():
+    """The solid between them does not vanish: it grows into the narrower cavity."""
+    points, cells = grid((3, 3, 3), "bcc", noise=0.02)
+    cell = np.abs(points[cells].mean(axis=1) - points.mean(axis=0)).max(axis=1).argmin()
+    common = np.array([len(set(c) & set(cells[cell])) for c in cells.tolist()])
+    inner = ~np.isin(cells, boundary_facets(cells)).any(axis=1)
+    for other in np.flatnonzero((common == 1) & inner):
+        is_chosen = ~np.isin(np.arange(len(cells)), [cell, other])
+        surface = surface_of(points, cells, is_chosen)
+        assert_surface_of(surface, points, cells[is_chosen])
+        assert (surface.n_parted, n_pieces(surface), euler(surface)) == (1, 3, 6)
+        assert volume_and_area(surface)[0] > volumes(points, cells[is_chosen]).sum()
+        assert n_crossings(surface) == 0
+
+
+def test_many_cells_that_share_one_node_all_come_apart():
+    """Every second octant around a node, and the narrowest moves farthest."""
+    corners = [np.diag(signs) for signs in product((1.0, -1.0), repeat=3) if np.prod(signs) > 0]
+    points = np.vstack(
+        [np.zeros((1, 3)), *[corner * scale for corner, scale in zip(corners, range(1, 5), strict=True)]]
+    )
+    cells = oriented(points, np.array([[0, 3 * k + 1, 3 * k + 2, 3 * k + 3] for k in range(4)]))
+    surface = surface_of(points, cells, range(4))
+    assert_surface_of(surface, points, cells)
+    assert (surface.n_parted, n_pieces(surface)) == (1, 4)
+    near = np.sort(np.linalg.norm(surface.points, axis=1))[:4]
+    np.testing.assert_allclose(near, surface.largest_shift * np.arange(4) / 3.0, atol=1e-15)
+
+
+def test_the_shift_is_felt_in_float32_and_turns_no_cell():
+    points, cells = TOUCHING
+    cells = oriented(points, cells)
+    for scale, place in ((1e-2, 500.0), (1e-3, 500.0), (1.0, 1e4)):
+        moved = points * scale + place
+        surface = surface_of(moved, cells, [0, 1])
+        assert len(np.unique(surface.points.astype(np.float32), axis=0)) == 8
+        assert 16 * np.spacing(np.float32(place)) * 0.999 <= surface.largest_shift or scale == 1e-3
+        heights = 3.0 * volumes(moved, cells[:2]) / facet_areas(moved, cells[:2]).max(axis=1)
+        assert surface.largest_shift <= 0.1001 * heights.min()
+        assert volume_and_area(surface)[0] > 0.7 * volumes(moved, cells[:2]).sum()
+
+
+# --------------------------------------------------------------------------------------------------
+# Any set
+
+
+@given(st.integers(0, 2**32 - 1), st.sampled_from(["five-tet", "bcc"]), st.sampled_from([0.1, 0.5, 0.9]))
+def test_any_cells_of_a_lattice(seed, kind, share):
+    points, cells = grid((3, 3, 2), kind, noise=0.05, seed=seed)
+    is_chosen = np.random.default_rng(seed).random(len(cells)) < share
+    is_chosen[0] = True
+    surface = surface_of(points, cells, is_chosen)
+    assert_surface_of(surface, points, cells[is_chosen])
+    again = surface_of(points, cells, is_chosen)
+    assert surface.points.tobytes() == again.points.tobytes()
+
+
+@pytest.mark.parametrize("kind", ["five-tet", "bcc"])
+@pytest.mark.parametrize("share", [0.1, 0.3, 0.9])
+@pytest.mark.parametrize("seed", [0, 1])
+def test_parted_sheets_do_not_cross(kind, share, seed):
+    """Nor do they in 999 of 1000 places of larger random sets; where fans wind around one another they may."""
+    points, cells = grid((4, 4, 3), kind, noise=0.05, seed=seed)
+    surface = surface_of(points, cells, np.random.default_rng(seed).random(len(cells)) < share)
+    assert surface.n_parted > 8
+    assert n_crossings(surface) == 0
+
+
+# --------------------------------------------------------------------------------------------------
+# What cannot be done
+
+
+@pytest.mark.parametrize(
+    ("chosen", "words"),
+    [
+        ([], "no cell is chosen"),
+        (np.zeros(5, dtype=bool), "no cell is chosen"),
+        (np.ones(4, dtype=bool), r"expected a mask of 5 cells, got shape \(4,\)"),
+        ([0, 5], r"must lie in 0..4, got 0..5"),
+        ([-1], r"must lie in 0..4, got -1..-1"),
+        ([0.5], "got float64"),
+    ],
+)
+def test_cells_that_cannot_be_chosen(chosen, words):
+    with pytest.raises(InputError, match=words):
+        surface_of(*FIVE_TET_CUBE, chosen)
+
+
+def test_triangles_and_folded_cells_are_refused():
+    with pytest.raises(InputError, match="expected tetrahedra in space, got cells of 3 nodes"):
+        surface_of(np.eye(3)[:, :2], np.array([[0, 1, 2]]), [0])
+    points = np.vstack([CUBE_CORNER[0], [0.2, 0.2, 2.0], [0.1, 0.1, 3.0]])
+    for cells in ([[0, 1, 2, 3], [0, 1, 2, 4]], [[0, 1, 2, 3], [0, 1, 2, 4], [0, 1, 2, 5]]):
+        with pytest.raises(InputError, match="fold over one another"):
+            surface_of(points, np.array(cells), range(len(cells)))

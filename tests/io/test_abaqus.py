@@ -1,0 +1,213 @@
+"""Abaqus input files: read back by meshio, and by a parser of the manual's rules where meshio skips."""
+
+import io
+import re
+from collections import Counter
+
+import meshio
+import numpy as np
+import pytest
+from models import sample_model
+
+from tetopt import InputError, Mesh
+from tetopt.io.abaqus import abaqus
+from tetopt.model.loads import Load
+from tetopt.model.materials import materials
+from tetopt.model.model import Model, in_space, in_units
+from tetopt.model.sets import Sets, facet_triples, nodes_of
+
+# The manual's "Element node ordering" and "Element faces" of tetrahedra.
+MIDPOINTS = [(1, 2), (2, 3), (3, 1), (1, 4), (2, 4), (3, 4)]  # nodes 5 to 10 of C3D10
+FACES = {"S1": (1, 2, 3), "S2": (1, 4, 2), "S3": (2, 4, 3), "S4": (3, 4, 1)}
+
+VARIANTS = {
+    "bins": sample_model(),
+    "a material a cell": sample_model(bins=None),
+    "LPS": in_space(sample_model(), "lps"),
+    "MPa": in_units(sample_model(), "MPa"),
+    "quadratic": sample_model()._replace(order=2),
+}
+
+
+@pytest.fixture(params=VARIANTS)
+def model(request):
+    return VARIANTS[request.param]
+
+
+def read_by_meshio(content):
+    return meshio.abaqus._abaqus.read_buffer(io.StringIO(content.decode()))
+
+
+def blocks_of(content):
+    """(keyword, parameters, data lines split at commas) of each keyword, by the manual's syntax rules."""
+    found = []
+    for line in content.decode().splitlines():
+        if line.startswith("**"):
+            continue
+        words = [word.strip() for word in line.split(",")]
+        if line.startswith("*"):
+            parameters = dict((part.strip() for part in word.split("=")) for word in words[1:])
+            found.append((words[0], parameters, []))
+        else:
+            found[-1][2].append(words)
+    return found
+
+
+def named(content, keyword):
+    """Data lines of each block of a keyword, by the value of its first parameter."""
+    return {next(iter(given.values())): data for word, given, data in blocks_of(content) if word == keyword}
+
+
+def test_meshio_reads_points_and_cells_back(model):
+    found = read_by_meshio(abaqus(model))
+    (block,) = found.cells
+    n_nodes, n_cells = len(model.mesh.points), len(model.mesh.cells)
+    np.testing.assert_array_equal(found.points[:n_nodes], model.mesh.points)
+    np.testing.assert_array_equal(block.data[:, :4], model.mesh.cells)
+    if model.order == 1:
+        assert block.type == "tetra"
+        assert len(found.points) == n_nodes
+        return
+    assert block.type == "tetra10"
+    assert block.data.shape == (n_cells, 10)
+    ends = found.points[block.data[:, np.array(MIDPOINTS) - 1]]
+    np.testing.assert_allclose(found.points[block.data[:, 4:]], ends.mean(axis=2), rtol=1e-15, atol=1e-17)
+    assert len(np.unique(block.data)) == len(found.points)
+    assert len(np.unique(found.points, axis=0)) == len(found.points)
+
+
+def test_meshio_reads_node_and_cell_sets_back(model):
+    found = read_by_meshio(abaqus(model))
+    assert list(found.point_sets) == list(model.sets.facets)
+    for name, rows in model.sets.facets.items():
+        nodes = found.point_sets[name]
+        assert len(np.unique(nodes)) == len(nodes)
+        is_corner = nodes < len(model.mesh.points)
+        np.testing.assert_array_equal(nodes[is_corner], nodes_of(model.mesh, rows))
+        corners = np.sort(facet_triples(model.mesh.cells, rows), axis=1)
+        edges = np.unique(np.concatenate([corners[:, pair] for pair in ([0, 1], [1, 2], [0, 2])]), axis=0)
+        middles = model.mesh.points[edges].mean(axis=1) if model.order == 2 else np.empty((0, 3))
+        np.testing.assert_allclose(
+            np.unique(found.points[nodes[~is_corner]], axis=0), np.unique(middles, axis=0), rtol=1e-15, atol=1e-17
+        )
+    own = {name for name in found.cell_sets if name == "all_cells" or name.startswith("material_")}
+    assert [name for name in found.cell_sets if name not in own] == list(model.sets.cells)
+    for name, cells in {**model.sets.cells, "all_cells": np.arange(len(model.mesh.cells))}.items():
+        np.testing.assert_array_equal(found.cell_sets[name][0], cells)
+
+
+def test_surfaces_are_the_facets_by_the_manual_s_faces(model):
+    surfaces = named(abaqus(model), "*SURFACE")
+    assert list(surfaces) == list(model.sets.facets)
+    for name, rows in model.sets.facets.items():
+        found = [[model.mesh.cells[int(cell) - 1][k - 1] for k in FACES[face]] for cell, face in surfaces[name]]
+        np.testing.assert_array_equal([int(cell) - 1 for cell, _ in surfaces[name]], rows[:, 0])
+        # Faces are listed as seen from outside, clockwise: the same nodes, turned the other way.
+        expected = facet_triples(model.mesh.cells, rows)
+        np.testing.assert_array_equal(np.sort(found, axis=1), np.sort(expected, axis=1))
+    assert {face for data in surfaces.values() for _, face in data} == set(FACES)
+
+
+def test_each_cell_has_its_material_and_no_other(model):
+    content = abaqus(model)
+    elements, sections = named(content, "*ELSET"), named(content, "*SOLID SECTION")
+    words = blocks_of(content)
+    elastic = {words[k - 1][1]["NAME"]: data for k, (word, _, data) in enumerate(words) if word == "*ELASTIC"}
+    assert list(elastic) == list(sections) == [f"material_{k + 1}" for k in range(len(model.materials.young))]
+    links = [given for word, given, _ in words if word == "*SOLID SECTION"]
+    assert all(given["ELSET"] == given["MATERIAL"] for given in links)
+    constants = np.full((len(model.mesh.cells), 2), np.nan)
+    for name, ((young, nu),) in elastic.items():
+        cells = [int(cell) - 1 for line in elements[name] for cell in line]
+        assert np.isnan(constants[cells]).all()
+        constants[cells] = float(young), float(nu)
+    np.testing.assert_array_equal(constants[:, 0], model.materials.young[model.materials.of_cell])
+    np.testing.assert_array_equal(constants[:, 1], model.materials.nu[model.materials.of_cell])
+
+
+def test_the_step_holds_and_moves_all_three_components():
+    model = sample_model()
+    moved = model._replace(loads=(Load("superior", np.zeros(3)), Load("inferior", np.array([0.5, -0.25, 1.0]))))
+    words = blocks_of(abaqus(moved))
+    order = [word for word, _, _ in words]
+    assert order[order.index("*STEP") :] == [
+        *("*STEP", "*STATIC", "*BOUNDARY", "*NODE FILE", "*EL FILE", "*EL PRINT", "*NODE PRINT", "*NODE PRINT"),
+        "*END STEP",
+    ]
+    (held,) = (data for word, _, data in words if word == "*BOUNDARY")
+    expected = [["superior", d, d, "0.0"] for d in "123"]
+    expected += [["inferior", d, d, value] for d, value in zip("123", ("0.5", "-0.25", "1.0"), strict=True)]
+    assert held == expected
+    assert [given["NSET"] for word, given, _ in words if word == "*NODE PRINT"] == ["superior", "inferior"]
+
+
+def test_without_loads_no_step_and_without_materials_no_sections():
+    model = sample_model()._replace(loads=())
+    words = {word for word, _, _ in blocks_of(abaqus(model))}
+    mesh_only = {"*HEADING", "*NODE", "*NSET", "*ELEMENT", "*ELSET", "*SURFACE"}
+    assert words == {*mesh_only, "*MATERIAL", "*ELASTIC", "*SOLID SECTION"}
+    assert {word for word, _, _ in blocks_of(abaqus(model._replace(materials=None)))} == mesh_only
+
+
+def test_head_states_coordinates_units_and_image():
+    name = f"Kopf\n*STEP ü & <more> {'x' * 300}.nii"
+    model = in_units(in_space(sample_model(), "lps"), "MPa")
+    lines = abaqus(model._replace(about={**model.about, "image": name})).decode().splitlines()
+    start = lines.index("*HEADING")
+    assert all(line.startswith("** ") and len(line) <= 256 for line in lines[:start])
+    head = "".join(line[2:] for line in lines[:start])
+    for text in ("LPS+, mm", "mm, MPa, N, mJ, t, s", "Kopf *STEP ü & <more>", "ab" * 32, ", ".join(model.cell_data)):
+        assert text.replace(" ", "") in head.replace(" ", "")
+    assert lines[start + 1] == "tetopt 0.1.0; coordinates: LPS+, mm; units: mm, MPa, N, mJ, t, s"
+    assert [line for line in lines[start:] if line.startswith("*STEP")] == ["*STEP"]
+
+
+def test_lines_keep_to_the_manual_s_limits(model):
+    """256 characters a line, 16 entries, names of up to 80, told apart whatever their case; ASCII beside comments."""
+    content = abaqus(model)
+    assert content.endswith(b"\n")
+    assert max(map(len, content.splitlines())) <= 256
+    names = Counter()
+    for word, given, data in blocks_of(content):
+        assert re.fullmatch(r"\*[A-Z ]+", word)
+        assert all(len(line) <= 16 for line in data)
+        if word == "*HEADING":
+            continue
+        names.update((word, key, value.lower()) for key, value in given.items() if key in ("NSET", "ELSET", "NAME"))
+        assert all(re.fullmatch(r"[A-Za-z0-9_.+-]{1,80}", text) for line in data for text in line)
+        numbers = [text for line in data for text in line if re.match(r"[-0-9]", text)]
+        assert max(map(len, numbers), default=0) <= 20
+    assert max(names.values()) == 1
+
+
+AWKWARD = [-1.2345678901234567e-05, -1.23456789012345e-05, -0.012345678901234567, -1.2345678901234567e-101, -1.5e17 / 7]
+
+
+@pytest.mark.parametrize("value", AWKWARD)
+def test_numbers_of_more_than_twenty_characters_are_rounded_to_fit(value):
+    """Wherever they stand; CalculiX would stop or, worse, lose the last digit of an exponent."""
+    size = abs(value)
+    mesh = Mesh(np.array([[value, 0, 0], [size, 0, 0], [0, size, 0], [0, 0, size]]), [[0, 1, 2, 3]])
+    side = np.array([[0, 3]])
+    loads = (Load("side", np.full(3, value)),)
+    model = Model(mesh, {}, Sets({"side": side}, {}), materials(-11.0 * value, 1.0 / 30.0, 1), loads)
+    content = abaqus(model)
+    written = {text for word, _, data in blocks_of(content) if word != "*HEADING" for line in data for text in line}
+    assert max(map(len, written)) <= 20
+    np.testing.assert_allclose(read_by_meshio(content).points, mesh.points, rtol=5e-13, atol=0.0)
+    ((young, nu),) = next(data for word, _, data in blocks_of(content) if word == "*ELASTIC")
+    np.testing.assert_allclose([float(young), float(nu)], [-11.0 * value, 1.0 / 30.0], rtol=5e-13)
+    (held,) = (data for word, _, data in blocks_of(content) if word == "*BOUNDARY")
+    np.testing.assert_allclose([float(line[3]) for line in held], value, rtol=5e-13)
+
+
+def test_what_the_format_cannot_carry_is_refused():
+    model = sample_model()
+    with pytest.raises(InputError, match="expected a mesh of tetrahedra, got triangles"):
+        abaqus(sample_model(2))
+    with pytest.raises(InputError, match="loads, but no materials"):
+        abaqus(model._replace(materials=None))
+    for name in ("all_cells", "Material_2"):
+        sets = Sets(model.sets.facets, {**model.sets.cells, name: np.array([0])})
+        with pytest.raises(InputError, match=f'the file has a set "{name.lower()}" of its own'):
+            abaqus(model._replace(sets=sets))

@@ -1,0 +1,252 @@
+"""FEBio files read back as XML by the rules of FEBio 4's own reader, and checked against pyfebio's models of the spec.
+
+No FEBio is at hand to run them.
+"""
+
+import xml.etree.ElementTree as ET
+
+import numpy as np
+import pytest
+from models import sample_model
+
+from tetopt.errors import InputError
+from tetopt.io.febio import MOST_PARTS, febio
+from tetopt.model.materials import materials
+from tetopt.model.model import described, in_space, in_units, quadratic, quadratic_facet_nodes
+from tetopt.model.sets import facet_triples, nodes_of
+
+
+def with_moduli(nu):
+    """A model with more materials than become parts: one for each cell."""
+    model = sample_model()
+    n_cells = len(model.mesh.cells)
+    assert n_cells > MOST_PARTS
+    return model._replace(materials=materials(1.0 + np.arange(n_cells)[::-1] / 7.0, nu, n_cells))
+
+
+def sample(kind):
+    """Few materials, or one for each cell and ratios that vary, too."""
+    return sample_model() if kind == "parts" else with_moduli(np.linspace(0.1, 0.45, len(sample_model().mesh.cells)))
+
+
+KINDS = ["parts", "maps"]
+
+
+def rows_of(section, tag, number="id"):
+    """Ids and rows of the children, every one of which has this tag."""
+    assert {child.tag for child in section} == {tag}
+    table = np.array([[float(x) for x in child.text.split(",")] for child in section])
+    return np.array([int(child.get(number)) for child in section]), table
+
+
+def listed(element):
+    return np.array([int(x) for x in element.text.split(",")])
+
+
+class Feb:
+    """What FEBio holds after reading."""
+
+    def __init__(self, content):
+        self.root = ET.fromstring(content)
+        mesh = self.root.find("Mesh")
+        self.node_ids, self.points = rows_of(mesh.find("Nodes"), "node")
+        self.parts, nodes_of_id = {}, {}
+        for part in mesh.findall("Elements"):
+            self.type = part.get("type")
+            self.parts[part.get("name")], table = rows_of(part, "elem")
+            nodes_of_id |= dict(zip(self.parts[part.get("name")].tolist(), table.astype(np.int64), strict=True))
+        self.cells = np.array([nodes_of_id[k + 1] for k in range(len(nodes_of_id))]) - 1
+        self.surfaces = {
+            surface.get("name"): rows_of(surface, surface[0].tag)[1].astype(np.int64) - 1
+            for surface in mesh.findall("Surface")
+        }
+        self.node_sets = {element.get("name"): listed(element) - 1 for element in mesh.findall("NodeSet")}
+        self.cell_sets = {element.get("name"): listed(element) - 1 for element in mesh.findall("ElementSet")}
+        self.data = {}
+        for found in self.root.findall("MeshData/ElementData"):
+            lid, values = rows_of(found, "elem", "lid")
+            of_cell = self.data.setdefault(found.get("name"), np.full(len(self.cells), np.inf))
+            of_cell[self.parts[found.get("elem_set")][lid - 1] - 1] = values[:, 0]
+
+    def moduli(self, tag):
+        """A parameter of every cell, from its material or through the map that it names."""
+        material_of = {m.get("name"): m for m in self.root.find("Material")}
+        result = np.full(len(self.cells), np.nan)
+        for domain in self.root.find("MeshDomains"):
+            found, ids = material_of[domain.get("mat")].find(tag), self.parts[domain.get("name")]
+            result[ids - 1] = self.data[found.text][ids - 1] if found.get("type") == "map" else float(found.text)
+        return result
+
+
+def assert_same(feb, model):
+    mesh, sets, given = model.mesh, model.sets, model.materials
+    assert feb.type == "tet4"
+    np.testing.assert_array_equal(feb.node_ids, np.arange(1, len(mesh.points) + 1))
+    assert feb.points.tobytes() == mesh.points.tobytes()
+    np.testing.assert_array_equal(feb.cells, mesh.cells)
+    assert list(feb.surfaces) == list(feb.node_sets) == list(sets.facets)
+    for name, found in sets.facets.items():
+        np.testing.assert_array_equal(feb.surfaces[name], facet_triples(mesh.cells, found))
+        np.testing.assert_array_equal(feb.node_sets[name], nodes_of(mesh, found))
+    assert list(feb.cell_sets) == list(sets.cells)
+    for name, cells in sets.cells.items():
+        np.testing.assert_array_equal(feb.cell_sets[name], cells)
+    np.testing.assert_array_equal(feb.moduli("E"), given.young[given.of_cell])
+    np.testing.assert_array_equal(feb.moduli("v"), given.nu[given.of_cell])
+    for name, values in model.cell_data.items():
+        np.testing.assert_array_equal(feb.data[name], values)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("space", ["ras", "lps"])
+def test_everything_comes_back(kind, space):
+    model = in_space(sample(kind), space)
+    content = febio(model)
+    feb = Feb(content)
+    assert_same(feb, model)
+    assert len(feb.parts) == (len(model.materials.young) if kind == "parts" else 1)
+    head = content.decode().split("-->")[0]
+    assert [line for line in head.splitlines() if line][2:] == described(model)
+
+
+def test_as_many_materials_as_the_sample_has_cells_with_other_means():
+    model = sample_model(3, None)
+    feb = Feb(febio(model))
+    assert_same(feb, model)
+    assert len(feb.parts) == len(model.materials.young) > 50
+
+
+def test_no_name_is_taken_twice():
+    """FEBio refuses a second node or element set of a name, and Nodes and Elements make one each."""
+    for kind in KINDS:
+        mesh = ET.fromstring(febio(sample(kind))).find("Mesh")
+        for tags in (("Nodes", "NodeSet"), ("Elements", "ElementSet"), ("Surface",)):
+            names = [element.get("name").lower() for element in mesh if element.tag in tags]
+            assert len(set(names)) == len(names) > 0
+
+
+def test_quadratic():
+    model = sample_model()._replace(order=2)
+    feb = Feb(febio(model))
+    points, cells = quadratic(model.mesh)
+    assert feb.type == "tet10"
+    assert feb.points.tobytes() == points.tobytes()
+    np.testing.assert_array_equal(feb.cells, cells)
+    for name, found in model.sets.facets.items():
+        nodes = quadratic_facet_nodes(cells, found)
+        np.testing.assert_array_equal(feb.surfaces[name], nodes)
+        np.testing.assert_array_equal(feb.node_sets[name], np.unique(nodes))
+
+
+def test_one_ratio_is_no_map():
+    model = with_moduli(0.4)
+    feb = Feb(febio(model))
+    assert_same(feb, model)
+    assert feb.root.find("Material/material/v").attrib == {}
+    assert "v" not in feb.data
+
+
+def test_conditions_move_each_node_of_each_load():
+    model = sample_model()
+    root = ET.fromstring(febio(model))
+    prescribed = {}
+    for bc in root.find("Boundary"):
+        if bc.get("type") == "zero displacement":
+            assert [(dof.tag, dof.text) for dof in bc] == [("x_dof", "1"), ("y_dof", "1"), ("z_dof", "1")]
+            prescribed[bc.get("node_set")] = [0.0, 0.0, 0.0]
+        else:
+            assert bc.get("type") == "prescribed displacement"
+            assert bc.find("value").get("lc") == "1" == root.find("LoadData/load_controller").get("id")
+            assert bc.find("dof").text == "xyz"[len(prescribed.setdefault(bc.get("node_set"), []))]
+            prescribed[bc.get("node_set")].append(float(bc.find("value").text))
+    assert prescribed == {load.set_name: load.displacement.tolist() for load in model.loads}
+    assert [pt.text for pt in root.iter("pt")] == ["0,0", "1,1"]
+    steps = root.find("Control")
+    assert int(steps.find("time_steps").text) * float(steps.find("step_size").text) == 1.0
+
+
+def test_without_loads_there_is_no_step():
+    tags = [section.tag for section in ET.fromstring(febio(sample_model()._replace(loads=())))]
+    assert tags == ["Module", "Globals", "Material", "Mesh", "MeshDomains", "MeshData", "Output"]
+
+
+def test_sections_are_those_of_pyfebio():
+    """Sections, parameters, types and the forms of numbers, none unknown to the spec as pyfebio models it.
+
+    pyfebio knows neither <units> nor names of conditions, which FEBio Studio writes, and reads no 0 or 1 back: what has
+    them is compared with what it writes.
+    """
+    pyfebio = pytest.importorskip("pyfebio")
+    for kind in KINDS:
+        model = sample(kind)
+        root = ET.fromstring(febio(model))
+        root.find("Module").remove(root.find("Module/units"))
+        control, boundary = (root.find(tag) for tag in ("Control", "Boundary"))
+        root.remove(control)
+        root.remove(boundary)
+        read = pyfebio.model.Model.from_xml(ET.tostring(root))
+        assert len(read.mesh_.elements) == len(read.meshdomains_.solid_domains) == len(read.material_.all_materials)
+        assert read.mesh_.nodes[0].all_nodes[-1].id == len(model.mesh.points)
+        known = ET.fromstring(pyfebio.control.Control().to_xml())
+        assert {e.tag for e in control.iter()} <= {e.tag for e in known.iter()}
+        assert {e.tag: e.text for e in known if len(e) == 0}.items() >= {
+            e.tag: e.text for e in control if len(e) == 0
+        }.items()
+        for bc in boundary:
+            del bc.attrib["name"]
+            bc.text = bc[0].tail = None
+            for child in bc:
+                child.tail = None
+        expected = []
+        for load in model.loads:
+            if not load.displacement.any():
+                held = pyfebio.boundary.BCZeroDisplacement(node_set=load.set_name, x_dof=1, y_dof=1, z_dof=1)
+                expected.append(held.to_xml())
+                continue
+            for dof, value in zip("xyz", load.displacement.tolist(), strict=True):
+                moved = pyfebio.boundary.Value(lc=1, text=value)
+                expected.append(
+                    pyfebio.boundary.BCPrescribedDisplacement(node_set=load.set_name, dof=dof, value=moved).to_xml()
+                )
+        assert [ET.canonicalize(ET.tostring(bc, encoding="unicode").strip()) for bc in boundary] == [
+            ET.canonicalize(text.decode()) for text in expected
+        ]
+
+
+def test_units_are_consistent_with_mm():
+    for units, name, density in (("kPa", "mm-kg-s", 1e-6), ("MPa", "mm-N-s", 1e-9)):
+        model = in_units(sample_model(), units)
+        feb = Feb(febio(model))
+        assert_same(feb, model)
+        assert feb.root.find("Module/units").text == name
+        assert {float(found.text) for found in feb.root.iter("density")} == {density}
+
+
+def test_awkward_names():
+    model = sample_model()._replace(
+        about={"tetopt": "0.1.0", "image": "a---b-- <é> & 'c'.nii"},
+        cell_data={
+            'a "b" <c> & d': np.arange(len(sample_model().mesh.cells)),
+            "rgb": np.eye(3)[sample_model().materials.of_cell % 3],
+        },
+    )
+    content = febio(model)
+    feb = Feb(content)
+    assert "image: a- - -b- - <é> & 'c'.nii" in content.decode().split("\n-->")[0]
+    assert list(feb.data) == ['a "b" <c> & d', "rgb_0", "rgb_1", "rgb_2"]
+    np.testing.assert_array_equal(np.column_stack([feb.data[f"rgb_{k}"] for k in range(3)]), model.cell_data["rgb"])
+    assert "MeshData" not in febio(model._replace(cell_data={})).decode()
+
+
+@pytest.mark.parametrize(
+    ("model", "message"),
+    [
+        (sample_model(2), "tetrahedra, got triangles"),
+        (sample_model()._replace(materials=None, loads=()), "needs a material"),
+        (sample_model()._replace(cell_data={"v": np.zeros(3)}), 'is called "v"'),
+    ],
+)
+def test_what_it_cannot_carry(model, message):
+    with pytest.raises(InputError, match=message) as caught:
+        febio(model)
+    assert "\n" not in str(caught.value)

@@ -1,0 +1,458 @@
+"""gmsh files: read by a parser after gmsh's manual, by meshio and by gmsh; all of the model is there, bit by bit."""
+
+import importlib.util
+import json
+import re
+import subprocess
+import sys
+from itertools import chain
+
+import meshio
+import numpy as np
+import pytest
+from models import ABOUT, sample_model
+
+import tetopt.io.gmsh
+from tetopt.errors import InputError
+from tetopt.io.gmsh import gmsh22, gmsh41
+from tetopt.model.model import in_space, in_units, quadratic
+from tetopt.model.sets import Sets, facet_triples, nodes_of
+
+WRITERS = {"4.1": gmsh41, "2.2": gmsh22}
+MODELS = [(3, 3), (3, None), (2, 3), (2, None)]
+NODES_OF_TYPE = {1: 2, 2: 3, 4: 4, 9: 6, 11: 10}
+DIM_OF_TYPE = {1: 1, 2: 2, 4: 3, 9: 2, 11: 3}
+
+# Reading, after the chapters "MSH file format" and "MSH file format version 2" of gmsh's manual
+
+
+class Read:
+    """What a file holds: points; elements by number; groups by dimension and name; views."""
+
+    def __init__(self, content):
+        self.sections = [block.split("\n$End")[0].split("\n") for block in f"\n{content.decode()}".split("\n$")[1:]]
+        self.sections = [lines for lines in self.sections if not lines[0].startswith("End")]
+        (self.version, is_binary, size), *_ = self.section("MeshFormat")
+        assert (is_binary, size) == ("0", "8")
+        (self.n_names,), *names = self.section("PhysicalNames")
+        assert int(self.n_names) == len(names)
+        self.names = {(int(dim), int(tag)): name.strip('"') for dim, tag, name in names}
+        self.elements = {}  # number -> (type, entity, nodes from 0)
+        self.groups = {(dim, name): [] for (dim, _), name in self.names.items()}
+        (self.read_41 if self.version == "4.1" else self.read_22)()
+        self.views = {}
+        for lines in self.sections:
+            if lines[0] == "ElementData":
+                self.read_view(lines[1:])
+
+    def section(self, name):
+        (found,) = [lines[1:] for lines in self.sections if lines[0] == name]
+        return [line.split() for line in found]
+
+    @property
+    def comments(self):
+        (found,) = [lines[1:] for lines in self.sections if lines[0] == "Comments"]
+        return found
+
+    def add(self, kind, number, entity, groups, nodes):
+        assert number not in self.elements
+        assert len(nodes) == NODES_OF_TYPE[kind]
+        self.elements[number] = (kind, entity, [int(node) - 1 for node in nodes])
+        for tag in groups:
+            self.groups[DIM_OF_TYPE[kind], self.names[DIM_OF_TYPE[kind], tag]].append(number)
+
+    def read_41(self):
+        counts, *lines = self.section("Entities")
+        self.entities = {}  # (dim, tag) -> (box, groups)
+        for dim in range(4):
+            for _ in range(int(counts[dim])):
+                tag, *rest = lines.pop(0)
+                n_groups = int(rest[6])
+                groups = [int(group) for group in rest[7 : 7 + n_groups]]
+                assert rest[7 + n_groups :] == ["0"]
+                self.entities[dim, int(tag)] = (np.array(rest[:6], dtype=float), groups)
+        assert not lines
+
+        head, block, *lines = self.section("Nodes")
+        n_points = int(head[1])
+        assert head == ["1", str(n_points), "1", str(n_points)]
+        assert tuple(map(int, block[:2])) in self.entities
+        assert block[2:] == ["0", str(n_points)]
+        assert len(lines) == 2 * n_points
+        assert [int(line[0]) for line in lines[:n_points]] == list(range(1, n_points + 1))
+        self.points = np.array(lines[n_points:], dtype=float)
+
+        head, *lines = self.section("Elements")
+        for _ in range(int(head[0])):
+            dim, entity, kind, count = map(int, lines.pop(0))
+            assert DIM_OF_TYPE[kind] == dim
+            for number, *nodes in lines[:count]:
+                self.add(kind, int(number), entity, self.entities[dim, entity][1], nodes)
+            del lines[:count]
+        assert not lines
+        assert [int(x) for x in head[1:]] == [len(self.elements), min(self.elements), max(self.elements)]
+
+    def read_22(self):
+        (count,), *lines = self.section("Nodes")
+        assert [int(line[0]) for line in lines] == list(range(1, int(count) + 1))
+        self.points = np.array([line[1:] for line in lines], dtype=float)
+        (count,), *lines = self.section("Elements")
+        assert int(count) == len(lines)
+        for number, kind, n_tags, group, entity, *nodes in lines:
+            assert n_tags == "2"
+            self.add(int(kind), int(number), int(entity), [int(group)], nodes)
+
+    def read_view(self, lines):
+        assert [lines[0], *lines[2:7]] == ["1", "1", "0.0", "3", "0", "1"]
+        assert int(lines[7]) == len(lines[8:])
+        pairs = [line.split() for line in lines[8:]]
+        self.views[lines[1].strip('"')] = {int(number): float(value) for number, value in pairs}
+
+    def nodes(self, numbers):
+        return np.array([self.elements[number][2] for number in numbers])
+
+    def cells_of_set(self, name):
+        """The cells that the comments say a set is made up of, by their entities."""
+        lines = [re.fullmatch(r"entity of cells (\d+): (.*)", line) for line in self.comments]
+        entities = {int(line[1]) for line in lines if line and name in line[2].split()}
+        n = max(dim for dim, _ in self.groups)
+        return [
+            k - 1 for k, (kind, entity, _) in self.elements.items() if DIM_OF_TYPE[kind] == n and entity in entities
+        ]
+
+
+def cell_numbers(model):
+    return list(range(1, len(model.mesh.cells) + 1))
+
+
+def each_once(nodes):
+    """Rows of nodes without their order."""
+    return sorted(map(tuple, np.sort(nodes, axis=1).tolist()))
+
+
+# Everything, exactly
+
+
+@pytest.mark.parametrize("version", WRITERS)
+@pytest.mark.parametrize(("n", "bins"), MODELS)
+def test_points_and_cells_are_those_of_the_mesh(version, n, bins):
+    model = sample_model(n, bins)
+    read = Read(WRITERS[version](model))
+    assert read.version == version
+    assert np.array_equal(read.points[:, :n], model.mesh.points)
+    assert not read.points[:, n:].any()
+    assert np.array_equal(read.nodes(cell_numbers(model)), model.mesh.cells)
+    assert {read.elements[number][0] for number in cell_numbers(model)} == {2 if n == 2 else 4}
+
+
+@pytest.mark.parametrize("version", WRITERS)
+@pytest.mark.parametrize(("n", "bins"), MODELS)
+def test_each_cell_is_in_the_one_group_of_its_material(version, n, bins):
+    model = sample_model(n, bins)
+    read = Read(WRITERS[version](model))
+    found = {name: members for (dim, name), members in read.groups.items() if dim == n}
+    of_cell = model.materials.of_cell
+    assert {name: sorted(members) for name, members in found.items()} == {
+        f"material_{k + 1}": (np.flatnonzero(of_cell == k) + 1).tolist() for k in range(len(model.materials.young))
+    }
+    assert [read.names[n, k + 1] for k in range(len(found))] == [f"material_{k + 1}" for k in range(len(found))]
+
+
+@pytest.mark.parametrize("version", WRITERS)
+@pytest.mark.parametrize(("n", "bins"), MODELS)
+def test_facet_sets_are_groups_numbered_from_the_smallest(version, n, bins):
+    model = sample_model(n, bins)
+    read = Read(WRITERS[version](model))
+    sets = model.sets.facets
+    assert {name for dim, name in read.groups if dim == n - 1} == set(sets)
+    for name, rows in sets.items():
+        expected = facet_triples(model.mesh.cells, rows)
+        nodes = read.nodes(read.groups[n - 1, name])
+        assert each_once(nodes) == each_once(expected)
+        assert np.array_equal(np.unique(nodes), nodes_of(model.mesh, rows))
+        if version == "2.2":
+            assert np.array_equal(nodes, expected)  # facing out, too
+    counts = [len(sets[read.names[n - 1, tag]]) for tag in range(1, len(sets) + 1)]
+    assert counts == sorted(counts)
+    assert len(read.names) == len(sets) + len(model.materials.young)
+
+
+@pytest.mark.parametrize("n", [3, 2])
+def test_41_has_each_facet_once_and_22_once_for_each_set(n):
+    model = sample_model(n)
+    sets = [each_once(facet_triples(model.mesh.cells, rows)) for rows in model.sets.facets.values()]
+    for writer, expected in ((gmsh41, sorted(set().union(*sets))), (gmsh22, sorted(chain(*sets)))):
+        read = Read(writer(model))
+        first = len(model.mesh.cells) + 1
+        assert sorted(read.elements) == list(range(1, first + len(expected)))
+        assert each_once(read.nodes(range(first, first + len(expected)))) == expected
+
+
+@pytest.mark.parametrize("n", [3, 2])
+def test_41_facets_face_out_of_the_cell_of_the_first_set(n):
+    model = sample_model(n)
+    faces = {tuple(nodes) for nodes in facet_triples(model.mesh.cells, model.sets.facets["boundary"]).tolist()}
+    read = Read(gmsh41(model))
+    assert {tuple(nodes) for nodes in read.nodes(read.groups[n - 1, "boundary"]).tolist()} == faces
+
+    a = model.sets.facets["interface_0_1"]
+    inner = each_once(facet_triples(model.mesh.cells, a))
+    every = np.argwhere(np.ones(model.mesh.cells.shape))
+    is_inner = [nodes in inner for nodes in map(tuple, np.sort(facet_triples(model.mesh.cells, every)).tolist())]
+    both = every[is_inner]
+    b = both[~(both[:, None] == a).all(axis=2).any(axis=1)]  # the same facets from the other side
+    assert len(b) == len(a)
+    for first, second in ((a, b), (b, a)):
+        turned = model._replace(sets=Sets({"first": first, "second": second}, {}))
+        read = Read(gmsh41(turned))
+        expected = sorted(facet_triples(model.mesh.cells, first).tolist())
+        for name in ("first", "second"):
+            assert sorted(read.nodes(read.groups[n - 1, name]).tolist()) == expected
+
+
+@pytest.mark.parametrize("version", WRITERS)
+@pytest.mark.parametrize(("n", "bins"), MODELS)
+def test_cell_sets_are_in_the_comments(version, n, bins):
+    model = sample_model(n, bins)
+    read = Read(WRITERS[version](model))
+    for name, members in model.sets.cells.items():
+        assert sorted(read.cells_of_set(name)) == members.tolist()
+
+
+@pytest.mark.parametrize(("n", "bins"), MODELS)
+def test_views_hold_cell_data_materials_and_cell_sets(n, bins):
+    model = sample_model(n, bins)
+    several = np.random.default_rng(0).normal(size=(len(model.mesh.cells), 2))
+    model = model._replace(cell_data={**model.cell_data, "contrast": several})
+    read = Read(gmsh41(model))
+    made, numbers = model.materials, cell_numbers(model)
+    expected = {name: values for name, values in model.cell_data.items() if name != "contrast"}
+    expected |= {"contrast_0": several[:, 0], "contrast_1": several[:, 1]}
+    expected |= {"young": made.young[made.of_cell], "nu": made.nu[made.of_cell]}
+    expected |= {name: np.isin(np.arange(len(numbers)), members) for name, members in model.sets.cells.items()}
+    assert set(read.views) == set(expected)
+    for name, values in expected.items():
+        assert [read.views[name][number] for number in numbers] == values.tolist()
+        assert list(read.views[name]) == list(read.elements)  # in their order, as meshio wants it
+    of_facet = {tuple(sorted(nodes)): number for number, (_, _, nodes) in read.elements.items() if len(nodes) == n}
+    for name in set(model.sets.facets) - {"dark_surface"}:  # whose facets within are held by other sets before
+        rows = model.sets.facets[name]
+        values = [
+            read.views["mean"][of_facet[nodes]]
+            for nodes in map(tuple, np.sort(facet_triples(model.mesh.cells, rows)).tolist())
+        ]
+        assert values == model.cell_data["mean"][rows[:, 0]].tolist()
+
+
+@pytest.mark.parametrize("version", WRITERS)
+def test_comments_tell_image_units_constants_and_loads(version):
+    model = in_units(sample_model(), "MPa")
+    comments = Read(WRITERS[version](model)).comments
+    assert "coordinates: RAS+, mm" in comments
+    assert f"image: {ABOUT['image']}, sha256 {ABOUT['image_sha256']}" in comments
+    for k, (young, nu) in enumerate(zip(model.materials.young.tolist(), model.materials.nu.tolist(), strict=True), 1):
+        assert f"material_{k}: young {young!r} MPa, nu {nu!r}" in comments
+    for load in model.loads:
+        vector = " ".join(map(repr, load.displacement.tolist()))
+        assert any(line.endswith(f"nodes of {load.set_name} displaced by {vector} mm") for line in comments)
+    left_out = [line for line in comments if "cell data" in line]
+    assert [line.endswith(", ".join(model.cell_data)) for line in left_out] == ([True] if version == "2.2" else [])
+
+
+def test_boxes_of_entities_hold_their_elements():
+    model = sample_model()
+    read = Read(gmsh41(model))
+    for (dim, tag), (box, _) in read.entities.items():
+        numbers = [k for k, (kind, e, _) in read.elements.items() if (DIM_OF_TYPE[kind], e) == (dim, tag)]
+        corners = read.points[np.unique(read.nodes(numbers))]
+        assert np.array_equal(box, [*corners.min(axis=0), *corners.max(axis=0)])
+
+
+@pytest.mark.parametrize("version", WRITERS)
+def test_lps(version):
+    model = in_space(sample_model(), "lps")
+    read = Read(WRITERS[version](model))
+    assert np.array_equal(read.points, sample_model().mesh.points * [-1, -1, 1])
+    assert "coordinates: LPS+, mm" in read.comments
+
+
+@pytest.mark.parametrize("version", WRITERS)
+def test_quadratic_cells(version):
+    """Each midpoint is where gmsh's manual has it: edges 01 12 02 03 23 13 of a tetrahedron, 01 12 20 of a triangle."""
+    model = sample_model()._replace(order=2)
+    read = Read(WRITERS[version](model))
+    points, cells = quadratic(model.mesh)
+    assert np.array_equal(read.points, points)
+    found = read.nodes(cell_numbers(model))
+    assert np.array_equal(np.sort(found), np.sort(cells))
+    assert np.array_equal(found[:, :4], model.mesh.cells)
+    ends = [(0, 1), (1, 2), (0, 2), (0, 3), (2, 3), (1, 3)]
+    for at, edge in enumerate(ends, 4):
+        assert np.array_equal(points[found[:, at]], points[found[:, edge]].mean(axis=1))
+    sides = read.nodes(read.groups[2, "left"])
+    assert each_once(sides[:, :3]) == each_once(facet_triples(model.mesh.cells, model.sets.facets["left"]))
+    for at, edge in enumerate([(0, 1), (1, 2), (2, 0)], 3):
+        assert np.array_equal(points[sides[:, at]], points[sides[:, edge]].mean(axis=1))
+
+
+# Other models
+
+
+@pytest.mark.parametrize("version", WRITERS)
+def test_without_materials_disjoint_cell_sets_are_groups(version):
+    model = sample_model()._replace(materials=None)
+    read = Read(WRITERS[version](model))
+    found = {name: sorted(members) for (dim, name), members in read.groups.items() if dim == 3}
+    assert found == {name: (model.sets.cells[name] + 1).tolist() for name in ("label_0", "label_1")}
+    assert sorted(read.cells_of_set("dark")) == model.sets.cells["dark"].tolist()
+    assert "young" not in read.views
+
+
+@pytest.mark.parametrize("version", WRITERS)
+def test_cells_of_no_set_are_unnamed(version):
+    sets = Sets({"a": np.array([[0, 0]])}, {"a": np.array([5]), "b": np.array([7, 9]), "c": np.array([9])})
+    model = sample_model()._replace(materials=None, sets=sets)
+    read = Read(WRITERS[version](model))
+    found = {name: sorted(members) for (dim, name), members in read.groups.items() if dim == 3}
+    assert found.pop("b") == [8, 10]
+    assert found == {"unnamed": [k for k in cell_numbers(model) if k not in (8, 10)]}
+    assert [read.cells_of_set(name) for name in "ac"] == [[5], [9]]
+
+
+@pytest.mark.parametrize("version", WRITERS)
+def test_a_mesh_alone(version):
+    model = sample_model()._replace(materials=None, sets=Sets({}, {}), loads=(), cell_data={}, about={})
+    read = Read(WRITERS[version](model))
+    assert read.groups == {(3, "unnamed"): cell_numbers(model)}
+    assert read.views == {}
+
+
+def test_many_materials_are_views_only(monkeypatch):
+    monkeypatch.setattr(tetopt.io.gmsh, "MOST_MATERIALS", 3)
+    model = sample_model()
+    read = Read(gmsh41(model))
+    assert {name for dim, name in read.groups if dim == 3} == {"label_0", "label_1"}
+    young = model.materials.young[model.materials.of_cell].tolist()
+    assert [read.views["young"][number] for number in cell_numbers(model)] == young
+    assert "4 materials: in the views young, kPa, and nu; not groups" in read.comments
+    with pytest.raises(InputError, match="at most 3 materials, as each becomes a group, got 4; put them into bins"):
+        gmsh22(model)
+
+
+@pytest.mark.parametrize("version", WRITERS)
+@pytest.mark.parametrize("kind", ["facets", "cells"])
+def test_names_that_are_taken(version, kind):
+    model = sample_model()
+    members = next(iter(getattr(model.sets, kind).values()))
+    model = model._replace(sets=model.sets._replace(**{kind: {"Material_2": members}}))
+    with pytest.raises(InputError, match=r'^set Material_2: the file calls something else "Material_2"; call the set'):
+        WRITERS[version](model)
+
+
+def test_a_set_cannot_be_called_unnamed_where_cells_are():
+    model = sample_model()._replace(materials=None, sets=Sets({"unnamed": np.array([[0, 0]])}, {"a": np.array([5])}))
+    with pytest.raises(InputError, match=r"^set unnamed: "):
+        gmsh41(model)
+
+
+def test_names_that_cell_data_have():
+    model = sample_model()
+    model = model._replace(sets=model.sets._replace(cells={"mean": np.array([1])}))
+    with pytest.raises(InputError, match=r"^set mean: "):
+        gmsh41(model)
+
+
+@pytest.mark.parametrize("version", WRITERS)
+def test_quadratic_triangles_are_refused(version):
+    with pytest.raises(InputError, match=r"^order 2: only of tetrahedra"):
+        WRITERS[version](sample_model(2)._replace(order=2))
+
+
+# Others' readers
+
+
+@pytest.mark.parametrize("version", WRITERS)
+@pytest.mark.parametrize(("n", "bins"), [(3, 3), (2, None)])
+def test_meshio_reads_it(version, n, bins, tmp_path):
+    model = sample_model(n, bins)
+    path = tmp_path / "model.msh"
+    path.write_bytes(WRITERS[version](model))
+    read = meshio.read(path)
+    assert np.array_equal(read.points[:, :n], model.mesh.points)
+    kind = {2: "triangle", 3: "tetra"}[n]
+    blocks = [k for k, block in enumerate(read.cells) if block.type == kind]
+    cells = np.concatenate([read.cells[k].data for k in blocks])
+    material = np.concatenate([read.cell_data["gmsh:physical"][k] for k in blocks]) - 1
+    order = np.lexsort(model.mesh.cells.T), np.lexsort(cells.T)  # meshio drops the numbers of elements
+    assert np.array_equal(cells[order[1]], model.mesh.cells[order[0]])
+    assert np.array_equal(material[order[1]], model.materials.of_cell[order[0]])
+    if version == "2.2":
+        assert np.array_equal(cells, model.mesh.cells)
+        return
+    for name in ("mean", "young", "dark"):
+        assert len(read.cell_data[name]) == len(read.cells)
+    mean = np.concatenate([read.cell_data["mean"][k] for k in blocks])
+    assert np.array_equal(mean[order[1]], model.cell_data["mean"][order[0]])
+    for name, rows in model.sets.facets.items():
+        members = [block.data[chosen] for block, chosen in zip(read.cells, read.cell_sets[name], strict=True)]
+        found = np.concatenate([nodes for nodes in members if len(nodes)])
+        assert each_once(found) == each_once(facet_triples(model.mesh.cells, rows))
+
+
+# gmsh is GPL: its library is loaded by a process of its own
+GMSH = """
+import json, sys
+import gmsh
+gmsh.initialize()
+gmsh.option.setNumber("General.Terminal", 0)
+gmsh.logger.start()
+gmsh.open(sys.argv[1])
+mesh = gmsh.model.mesh
+order, points, _ = mesh.getNodes()
+groups, nodes = {}, {}
+for dim, tag in gmsh.model.getPhysicalGroups():
+    name = f"{dim} {gmsh.model.getPhysicalName(dim, tag)}"
+    groups[name] = [
+        (int(number), mesh.getElement(number)[1].tolist())
+        for entity in gmsh.model.getEntitiesForPhysicalGroup(dim, tag)
+        for number in mesh.getElements(dim, entity)[1][0]
+    ]
+    nodes[name] = mesh.getNodesForPhysicalGroup(dim, tag)[0].tolist()
+views = {}
+for view in gmsh.view.getTags():
+    _, numbers, values, _, _ = gmsh.view.getModelData(view, 0)
+    name = gmsh.option.getString(f"View[{gmsh.view.getIndex(view)}].Name")
+    views[name] = list(zip(numbers.tolist(), [value[0] for value in values]))
+said = [line for line in gmsh.logger.get() if not line.startswith("Info")]
+print(json.dumps([order.tolist(), points.tolist(), groups, nodes, views, said]))
+"""
+
+
+@pytest.mark.skipif(importlib.util.find_spec("gmsh") is None, reason="no gmsh (pip install gmsh)")
+@pytest.mark.parametrize("version", WRITERS)
+@pytest.mark.parametrize(("n", "bins"), [(3, 3), (2, None)])
+def test_gmsh_reads_it(version, n, bins, tmp_path):
+    model = sample_model(n, bins)
+    path = tmp_path / "model.msh"
+    path.write_bytes(WRITERS[version](model))
+    child = subprocess.run([sys.executable, "-c", GMSH, str(path)], capture_output=True, text=True, check=True)
+    order, points, groups, nodes, views, said = json.loads(child.stdout.splitlines()[-1])
+    assert said == []
+    points = np.array(points).reshape(-1, 3)[np.argsort(order)]
+    assert np.array_equal(points[:, :n], model.mesh.points)
+    for name, rows in model.sets.facets.items():
+        found = np.array([each for _, each in groups.pop(f"{n - 1} {name}")]) - 1
+        assert each_once(found) == each_once(facet_triples(model.mesh.cells, rows))
+        assert sorted(nodes[f"{n - 1} {name}"]) == (nodes_of(model.mesh, rows) + 1).tolist()
+    for k in range(len(model.materials.young)):
+        members = np.flatnonzero(model.materials.of_cell == k)
+        found = sorted(groups.pop(f"{n} material_{k + 1}"))
+        assert [number for number, _ in found] == (members + 1).tolist()
+        assert np.array_equal(np.array([each for _, each in found]) - 1, model.mesh.cells[members])
+    assert groups == {}
+    assert ("young" in views) == (version == "4.1")
+    if version == "4.1":
+        for name in ("mean", "label"):
+            assert dict(views[name])[7] == model.cell_data[name][6]
+        young = model.materials.young[model.materials.of_cell]
+        assert [dict(views["young"])[number] for number in cell_numbers(model)] == young.tolist()

@@ -1,0 +1,182 @@
+"""medit files: read by a parser after INRIA's description, by meshio and by gmsh; points bit by bit."""
+
+import importlib.util
+import json
+import re
+import subprocess
+import sys
+
+import meshio
+import numpy as np
+import pytest
+from models import ABOUT, sample_model
+
+from tetopt.errors import InputError
+from tetopt.io.medit import medit
+from tetopt.model.model import in_space, in_units
+from tetopt.model.sets import Sets, facet_triples
+
+MODELS = [(3, 3), (3, None), (2, 3), (2, None)]
+WIDTH = {"Edges": 2, "Triangles": 3, "Tetrahedra": 4}
+KEYWORD = {1: "Edges", 2: "Triangles", 3: "Tetrahedra"}
+
+
+class Read:
+    """What a file holds: words parted by any space; # begins a comment; entities end with a reference."""
+
+    def __init__(self, content):
+        lines = content.decode().split("\n")
+        self.comments = [line.removeprefix("# ") for line in lines if line.startswith("#")]
+        words = " ".join(line for line in lines if not line.startswith("#")).split()
+        assert words[:3] == ["MeshVersionFormatted", "2", "Dimension"]  # 2: double precision
+        self.n = int(words[3])
+        self.points, self.nodes, self.refs = None, {}, {}
+        at = 4
+        while words[at] != "End":
+            keyword, count = words[at], int(words[at + 1])
+            width = (self.n if keyword == "Vertices" else WIDTH[keyword]) + 1
+            table = np.array(words[at + 2 : at + 2 + count * width]).reshape(count, width)
+            if keyword == "Vertices":
+                self.points = table[:, :-1].astype(float)
+            else:
+                self.nodes[keyword] = table[:, :-1].astype(int) - 1
+            self.refs[keyword] = table[:, -1].astype(int)
+            at += 2 + count * width
+        assert words[at:] == ["End"]
+
+    def refs_of(self, keyword, name):
+        """The references that the comments give a name."""
+        lines = [re.fullmatch(rf"{keyword} ref (\d+): (.*)", line) for line in self.comments]
+        return [int(line[1]) for line in lines if line and name in line[2].split()]
+
+    def cells_of(self, name):
+        keyword = KEYWORD[self.n]
+        return np.flatnonzero(np.isin(self.refs[keyword], self.refs_of(keyword, name)))
+
+    def facets_of(self, name):
+        keyword = KEYWORD[self.n - 1]
+        return self.nodes[keyword][np.isin(self.refs[keyword], self.refs_of(keyword, name))]
+
+
+def each_once(nodes):
+    """Rows of nodes without their order."""
+    return sorted(map(tuple, np.sort(nodes, axis=1).tolist()))
+
+
+@pytest.mark.parametrize(("n", "bins"), MODELS)
+def test_all_of_the_model_is_there(n, bins):
+    model = sample_model(n, bins)
+    read = Read(medit(model))
+    assert read.n == n
+    assert set(read.nodes) == {KEYWORD[n], KEYWORD[n - 1]}
+    assert np.array_equal(read.points, model.mesh.points)
+    assert not read.refs["Vertices"].any()
+    assert np.array_equal(read.nodes[KEYWORD[n]], model.mesh.cells)
+    for name, members in model.sets.cells.items():
+        assert np.array_equal(read.cells_of(name), members)
+    for k in range(len(model.materials.young)):
+        assert np.array_equal(read.cells_of(f"material_{k + 1}"), np.flatnonzero(model.materials.of_cell == k))
+    facets = read.nodes[KEYWORD[n - 1]]
+    for name, rows in model.sets.facets.items():
+        assert each_once(read.facets_of(name)) == each_once(facet_triples(model.mesh.cells, rows))
+    assert len(set(each_once(facets))) == len(facets)  # each once
+
+
+@pytest.mark.parametrize("n", [3, 2])
+def test_boundary_faces_out(n):
+    model = sample_model(n)
+    faces = facet_triples(model.mesh.cells, model.sets.facets["boundary"])
+    assert sorted(Read(medit(model)).facets_of("boundary").tolist()) == sorted(faces.tolist())
+
+
+def test_references_are_the_materials_where_no_set_divides_one():
+    model = sample_model()
+    read = Read(medit(model._replace(sets=model.sets._replace(cells={}))))
+    assert np.array_equal(read.refs["Tetrahedra"], model.materials.of_cell + 1)
+
+
+def test_constants_image_and_loads_are_in_comments():
+    model = in_units(sample_model(), "MPa")
+    read = Read(medit(model))
+    young, nu = np.zeros(len(model.mesh.cells)), np.zeros(len(model.mesh.cells))
+    for line in read.comments:
+        if found := re.fullmatch(r"(material_\d+): young (\S+) MPa, nu (\S+)", line):
+            young[read.cells_of(found[1])], nu[read.cells_of(found[1])] = float(found[2]), float(found[3])
+    assert np.array_equal(young, model.materials.young[model.materials.of_cell])
+    assert np.array_equal(nu, model.materials.nu[model.materials.of_cell])
+    assert f"image: {ABOUT['image']}, sha256 {ABOUT['image_sha256']}" in read.comments
+    assert any(line.endswith("nodes of superior displaced by 0.0 0.0 0.0 mm") for line in read.comments)
+    assert any(line.startswith("cell data") and line.endswith(", ".join(model.cell_data)) for line in read.comments)
+
+
+def test_lps():
+    read = Read(medit(in_space(sample_model(), "lps")))
+    assert np.array_equal(read.points, sample_model().mesh.points * [-1, -1, 1])
+    assert "coordinates: LPS+, mm" in read.comments
+
+
+def test_a_mesh_alone():
+    model = sample_model()._replace(materials=None, sets=Sets({}, {}), loads=(), cell_data={}, about={})
+    read = Read(medit(model))
+    assert (read.refs["Tetrahedra"] == 1).all()
+    assert len(read.nodes["Triangles"]) == 0
+    assert read.comments == ["tetopt", "coordinates: RAS+, mm", "units: mm, kPa, mN, uJ, kg, s"]
+
+
+def test_refused():
+    model = sample_model()
+    with pytest.raises(InputError, match=r"^order 2: .*; leave out --order$"):
+        medit(model._replace(order=2))
+    with pytest.raises(InputError, match=r'^set material_1: the file calls something else "material_1"; call the set'):
+        medit(model._replace(sets=Sets({}, {"material_1": np.array([0])})))
+
+
+# Others' readers
+
+
+@pytest.mark.parametrize(("n", "bins"), [(3, 3), (2, None)])
+def test_meshio_reads_it(n, bins, tmp_path):
+    model = sample_model(n, bins)
+    path = tmp_path / "model.mesh"
+    path.write_bytes(medit(model))
+    read, ours = meshio.read(path), Read(path.read_bytes())
+    assert np.array_equal(read.points, model.mesh.points)
+    cells, sides = read.cells
+    assert np.array_equal(cells.data, model.mesh.cells)
+    assert np.array_equal(sides.data, ours.nodes[KEYWORD[n - 1]])
+    for found, keyword in zip(read.cell_data["medit:ref"], (KEYWORD[n], KEYWORD[n - 1]), strict=True):
+        assert np.array_equal(found, ours.refs[keyword])
+
+
+# gmsh is GPL: its library is loaded by a process of its own
+GMSH = """
+import json, sys
+import gmsh
+gmsh.initialize()
+gmsh.option.setNumber("General.Terminal", 0)
+gmsh.logger.start()
+gmsh.open(sys.argv[1])
+mesh = gmsh.model.mesh
+order, points, _ = mesh.getNodes()
+elements = {str(entity): mesh.getElements(*entity)[2][0].tolist() for entity in gmsh.model.getEntities()}
+said = [line for line in gmsh.logger.get() if not line.startswith("Info")]
+print(json.dumps([order.tolist(), points.tolist(), elements, said]))
+"""
+
+
+@pytest.mark.skipif(importlib.util.find_spec("gmsh") is None, reason="no gmsh (pip install gmsh)")
+@pytest.mark.parametrize("n", [3, 2])
+def test_gmsh_reads_it(n, tmp_path):
+    path = tmp_path / "model.mesh"
+    path.write_bytes(medit(sample_model(n)))
+    child = subprocess.run([sys.executable, "-c", GMSH, str(path)], capture_output=True, text=True, check=True)
+    order, points, elements, said = json.loads(child.stdout.splitlines()[-1])
+    assert said == []
+    points = np.array(points).reshape(-1, 3)[np.argsort(order)]
+    assert np.array_equal(points[:, :n], sample_model(n).mesh.points)
+    read, expected = Read(path.read_bytes()), {}
+    for dim in (n - 1, n):
+        nodes, refs = read.nodes[KEYWORD[dim]], read.refs[KEYWORD[dim]]
+        for ref in np.unique(refs):
+            expected[str((dim, int(ref)))] = (nodes[refs == ref] + 1).ravel().tolist()
+    assert elements == expected

@@ -1,0 +1,177 @@
+"""MFEM files: read by a parser after MFEM's documentation and by PyMFEM; all of the model is there, bit by bit."""
+
+import re
+
+import numpy as np
+import pytest
+from models import ABOUT, sample_model
+
+from tetopt.errors import InputError
+from tetopt.io.mfem import mfem
+from tetopt.model.model import in_space, in_units
+from tetopt.model.sets import Sets, facet_triples
+
+MODELS = [(3, 3), (3, None), (2, 3), (2, None)]
+GEOMETRY = {1: "1", 2: "2", 3: "4"}  # segment, triangle, tetrahedron
+
+
+class Read:
+    """What a file holds; see https://mfem.org/mesh-format-v1.0 and Mesh::Printer."""
+
+    def __init__(self, content):
+        lines = [line for line in content.decode().split("\n") if line]
+        self.comments = [line.removeprefix("# ") for line in lines if line.startswith("#")]
+        self.lines = [line for line in lines if not line.startswith("#")]
+        assert self.lines.pop(0) == "MFEM mesh v1.3"
+        self.expect("dimension")
+        self.n = int(self.lines.pop(0))
+        self.attributes, self.cells = self.elements("elements", self.n)
+        self.cell_sets = self.sets("attribute_sets")
+        self.facet_attributes, self.facets = self.elements("boundary", self.n - 1)
+        self.facet_sets = self.sets("bdr_attribute_sets")
+        self.expect("vertices")
+        count = int(self.lines.pop(0))
+        assert int(self.lines.pop(0)) == self.n
+        self.points = np.array([self.lines.pop(0).split() for _ in range(count)], dtype=float)
+        assert self.lines == ["mfem_mesh_end"]
+
+    def expect(self, keyword):
+        assert self.lines.pop(0) == keyword
+
+    def elements(self, keyword, dim):
+        self.expect(keyword)
+        rows = [self.lines.pop(0).split() for _ in range(int(self.lines.pop(0)))]
+        assert {row[1] for row in rows} <= {GEOMETRY[dim]}
+        table = np.array(rows, dtype=int).reshape(-1, dim + 3)
+        return table[:, 0], table[:, 2:]
+
+    def sets(self, keyword):
+        """Attributes by name: a name in quotes, how many, and which on any number of lines."""
+        self.expect(keyword)
+        found = {}
+        for _ in range(int(self.lines.pop(0))):
+            name, count, attributes = self.lines.pop(0).strip('"'), int(self.lines.pop(0)), []
+            while len(attributes) < count:
+                attributes += map(int, self.lines.pop(0).split())
+            assert len(attributes) == count
+            found[name] = attributes
+        return found
+
+    def cells_of(self, name):
+        return np.flatnonzero(np.isin(self.attributes, self.cell_sets[name]))
+
+    def facets_of(self, name):
+        return self.facets[np.isin(self.facet_attributes, self.facet_sets[name])]
+
+
+def each_once(nodes):
+    """Rows of nodes without their order."""
+    return sorted(map(tuple, np.sort(nodes, axis=1).tolist()))
+
+
+@pytest.mark.parametrize(("n", "bins"), MODELS)
+def test_all_of_the_model_is_there(n, bins):
+    model = sample_model(n, bins)
+    read = Read(mfem(model))
+    assert read.n == n
+    assert np.array_equal(read.points, model.mesh.points)
+    assert np.array_equal(read.cells, model.mesh.cells)
+    made = model.materials
+    assert set(read.cell_sets) == {*model.sets.cells, *(f"material_{k + 1}" for k in range(len(made.young)))}
+    for name, members in model.sets.cells.items():
+        assert np.array_equal(read.cells_of(name), members)
+    for k in range(len(made.young)):
+        assert np.array_equal(read.cells_of(f"material_{k + 1}"), np.flatnonzero(made.of_cell == k))
+    assert list(read.facet_sets) == list(model.sets.facets)
+    for name, rows in model.sets.facets.items():
+        assert each_once(read.facets_of(name)) == each_once(facet_triples(model.mesh.cells, rows))
+    assert len(set(each_once(read.facets))) == len(read.facets)  # each once
+
+
+@pytest.mark.parametrize("n", [3, 2])
+def test_boundary_elements_face_out(n):
+    model = sample_model(n)
+    faces = facet_triples(model.mesh.cells, model.sets.facets["boundary"])
+    assert sorted(Read(mfem(model)).facets_of("boundary").tolist()) == sorted(faces.tolist())
+
+
+def test_attributes_are_the_materials_where_no_set_divides_one():
+    model = sample_model()
+    read = Read(mfem(model._replace(sets=model.sets._replace(cells={}))))
+    assert np.array_equal(read.attributes, model.materials.of_cell + 1)
+
+
+def test_attributes_run_from_one_by_material():
+    model = sample_model()
+    read = Read(mfem(model))
+    found, first = np.unique(read.attributes, return_index=True)
+    assert found.tolist() == list(range(1, len(found) + 1))
+    assert (np.diff(model.materials.of_cell[first]) >= 0).all()
+    assert len(found) > len(model.materials.young)  # or else the sets divide none
+
+
+def test_constants_and_what_attributes_mean_are_in_comments():
+    model = in_units(sample_model(), "MPa")
+    read = Read(mfem(model))
+    young, nu = np.zeros(len(model.mesh.cells)), np.zeros(len(model.mesh.cells))
+    for line in read.comments:
+        if found := re.fullmatch(r"(material_\d+): young (\S+) MPa, nu (\S+)", line):
+            young[read.cells_of(found[1])], nu[read.cells_of(found[1])] = float(found[2]), float(found[3])
+    assert np.array_equal(young, model.materials.young[model.materials.of_cell])
+    assert np.array_equal(nu, model.materials.nu[model.materials.of_cell])
+    for what, sets in (("attribute", read.cell_sets), ("boundary attribute", read.facet_sets)):
+        for attribute in {k for attributes in sets.values() for k in attributes}:
+            names = [name for name, attributes in sets.items() if attribute in attributes]
+            assert f"{what} {attribute}: {' '.join(names)}" in read.comments
+    assert f"image: {ABOUT['image']}, sha256 {ABOUT['image_sha256']}" in read.comments
+    assert any(line.endswith("nodes of superior displaced by 0.0 0.0 0.0 mm") for line in read.comments)
+    assert any(line.startswith("cell data") and line.endswith(", ".join(model.cell_data)) for line in read.comments)
+
+
+def test_lps():
+    read = Read(mfem(in_space(sample_model(), "lps")))
+    assert np.array_equal(read.points, sample_model().mesh.points * [-1, -1, 1])
+    assert "coordinates: LPS+, mm" in read.comments
+
+
+def test_a_mesh_alone():
+    model = sample_model()._replace(materials=None, sets=Sets({}, {}), loads=(), cell_data={}, about={})
+    read = Read(mfem(model))
+    assert (read.attributes == 1).all()
+    assert (len(read.facets), read.cell_sets, read.facet_sets) == (0, {}, {})
+    assert read.comments == ["tetopt", "coordinates: RAS+, mm", "units: mm, kPa, mN, uJ, kg, s"]
+
+
+def test_refused():
+    model = sample_model()
+    with pytest.raises(InputError, match=r"^order 2: .*; leave out --order$"):
+        mfem(model._replace(order=2))
+    with pytest.raises(InputError, match=r'^set material_1: the file calls something else "material_1"; call the set'):
+        mfem(model._replace(sets=Sets({}, {"material_1": np.array([0])})))
+
+
+@pytest.mark.parametrize(("n", "bins"), [(3, 3), (2, None)])
+def test_pymfem_reads_it(n, bins, tmp_path):
+    ser = pytest.importorskip("mfem.ser", reason="no PyMFEM (pip install mfem)")
+    model = sample_model(n, bins)
+    path = tmp_path / "model.mfem"
+    path.write_bytes(mfem(model))
+    read = ser.Mesh(str(path), 1, 0)  # with edges; not turned for refinement
+    assert np.array_equal(np.array(read.GetVertexArray()), model.mesh.points)
+    cells = [read.GetElementVertices(k) for k in range(read.GetNE())]
+    assert np.array_equal(cells, model.mesh.cells)
+    attributes = np.array([read.GetAttribute(k) for k in range(read.GetNE())])
+    in_set = {name: read.attribute_sets.GetAttributeSet(name).ToList() for name in model.sets.cells}
+    for name, members in model.sets.cells.items():
+        assert np.array_equal(np.flatnonzero(np.isin(attributes, in_set[name])), members)
+    for k in range(len(model.materials.young)):
+        chosen = read.attribute_sets.GetAttributeSet(f"material_{k + 1}").ToList()
+        assert np.array_equal(np.flatnonzero(np.isin(attributes, chosen)), np.flatnonzero(model.materials.of_cell == k))
+    sides = np.array([read.GetBdrElementVertices(k) for k in range(read.GetNBE())])
+    attributes = np.array([read.GetBdrAttribute(k) for k in range(read.GetNBE())])
+    assert set(read.bdr_attribute_sets.GetAttributeSetNames()) == set(model.sets.facets)
+    for name, rows in model.sets.facets.items():
+        chosen = np.isin(attributes, read.bdr_attribute_sets.GetAttributeSet(name).ToList())
+        assert each_once(sides[chosen]) == each_once(facet_triples(model.mesh.cells, rows))
+    # Nothing had to be turned, and the faces of each boundary element are those of the cells
+    assert (read.CheckElementOrientation(False), read.CheckBdrElementOrientation(False)) == (0, 0)

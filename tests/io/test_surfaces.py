@@ -1,0 +1,151 @@
+"""Surfaces through STL and PLY files: closed for a reader that welds by place, every bit in PLY, RAS in the header."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import trimesh
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+from meshes import CUBE_CORNER, TWO_TETS
+from vtkmodules.vtkIOGeometry import vtkSTLReader
+from vtkmodules.vtkIOPLY import vtkPLYReader
+
+from tetopt.errors import InputError
+from tetopt.geometry.simplex import volumes
+from tetopt.geometry.surface import Surface, n_pieces, surface_of, volume_and_area
+from tetopt.geometry.topology import boundary_facets
+from tetopt.image import Image
+from tetopt.io.surfaces import checked_surface, save_surface
+from tetopt.lattice import lattice
+
+# Two cells that share the edge 0 1, far from the origin
+EDGE = (
+    np.array([[0, 0, 0], [0, 0, 1], [1, 0, 0], [1, 1, 0], [-1, 0, 0], [-1, -1, 0]]) + np.array([150.1, -230.2, 310.3]),
+    np.array([[0, 2, 3, 1], [0, 4, 5, 1]]),
+)
+SUFFIXES = pytest.mark.parametrize("suffix", [".stl", ".ply", ".STL"])
+
+
+def some_surface(seed, share=0.5):
+    """The surface of some cells of a lattice out where coordinates have few bits left, and the cells' volume."""
+    mesh = lattice(Image(np.zeros((7, 8, 9)), np.diag([1.1, 0.9, 1.3, 1.0])), nodes=100)
+    rng = np.random.default_rng(seed)
+    points = mesh.points + rng.normal(0.0, 0.05, mesh.points.shape) + rng.uniform(-400.0, 400.0, 3)
+    chosen = np.append(np.flatnonzero(rng.random(len(mesh.cells)) < share), 0)
+    return surface_of(points, mesh.cells, chosen), volumes(points, mesh.cells[np.unique(chosen)]).sum()
+
+
+@SUFFIXES
+@settings(suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(seed=st.integers(0, 2**32 - 1), share=st.sampled_from([0.05, 0.3, 0.6, 0.9]))
+def test_any_surface_is_closed_when_read_back(tmp_path, suffix, seed, share):
+    surface, expected = some_surface(seed, share)
+    save_surface(tmp_path / f"a{suffix}", surface)
+    found = checked_surface(tmp_path / f"a{suffix}")
+    volume, area = volume_and_area(surface)
+    assert found[:2] == (True, True)
+    assert found.n_pieces == n_pieces(surface)
+    # STL's float32 moves a node by 1.5e-5 mm in each direction at 400 mm.
+    places = 3e-5 * area if suffix != ".ply" else 1e-9
+    assert found.volume == pytest.approx(volume, abs=places)
+    assert found.area == pytest.approx(area, rel=1e-4 if suffix != ".ply" else 1e-9)
+    assert found.volume == pytest.approx(expected, abs=1.01 * surface.largest_shift * area + places)
+    assert found.volume > 0.0
+
+
+@SUFFIXES
+def test_cells_that_touch_are_closed_only_once_they_are_parted(tmp_path, suffix):
+    points, cells = EDGE
+    save_surface(tmp_path / f"raw{suffix}", Surface(points, boundary_facets(cells), 0, 0.0))
+    assert not checked_surface(tmp_path / f"raw{suffix}").is_watertight
+    save_surface(tmp_path / f"a{suffix}", surface_of(points, cells, [0, 1]))
+    found = checked_surface(tmp_path / f"a{suffix}")
+    assert (found.is_watertight, found.is_winding_consistent, found.n_pieces) == (True, True, 2)
+    assert found.volume == pytest.approx(1 / 3, rel=3e-3)
+
+
+@SUFFIXES
+def test_a_triangle_turned_over_or_left_out_is_seen(tmp_path, suffix):
+    surface = surface_of(*TWO_TETS, [0, 1])
+    turned = surface.triangles.copy()
+    turned[0] = turned[0, ::-1]
+    save_surface(tmp_path / f"turned{suffix}", surface._replace(triangles=turned))
+    assert checked_surface(tmp_path / f"turned{suffix}")[:2] == (True, False)
+    save_surface(tmp_path / f"open{suffix}", surface._replace(triangles=surface.triangles[1:]))
+    assert not checked_surface(tmp_path / f"open{suffix}").is_watertight
+
+
+def test_every_bit_and_the_order_come_back_from_ply(tmp_path):
+    surface, _ = some_surface(3)
+    save_surface(tmp_path / "a.ply", surface)
+    back = trimesh.load_mesh(tmp_path / "a.ply", process=False)
+    assert np.asarray(back.vertices, dtype=np.float64).tobytes() == surface.points.tobytes()
+    np.testing.assert_array_equal(back.faces, surface.triangles)
+    assert [p.name for p in tmp_path.iterdir()] == ["a.ply"]
+
+
+def test_stl_holds_the_nearest_float32_and_unit_normals(tmp_path):
+    surface, _ = some_surface(3)
+    save_surface(tmp_path / "a.stl", surface)
+    back = trimesh.load_mesh(tmp_path / "a.stl", process=False)
+    np.testing.assert_array_equal(
+        np.asarray(back.vertices, dtype=np.float32), surface.points[surface.triangles].reshape(-1, 3).astype(np.float32)
+    )
+    corners = surface.points[surface.triangles]
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    stored = np.frombuffer((tmp_path / "a.stl").read_bytes()[84:], np.uint8).reshape(-1, 50)[:, :12].copy().view("<f4")
+    np.testing.assert_allclose(np.linalg.norm(stored, axis=1), 1.0, rtol=1e-6)
+    np.testing.assert_allclose((stored * normals).sum(axis=1), np.linalg.norm(normals, axis=1), rtol=1e-6)
+
+
+def test_the_header_says_ras_where_slicer_looks(tmp_path):
+    """3D Slicer reads both with these classes of VTK, and looks in the STL's header and in each PLY comment."""
+    surface = surface_of(*CUBE_CORNER, [0])
+    about = "solid.nii\nmean below 43, Schädel " + "x" * 90
+    save_surface(tmp_path / "a.stl", surface, about)
+    save_surface(tmp_path / "a.ply", surface, about)
+    assert (tmp_path / "a.stl").stat().st_size == 84 + 4 * 50
+    assert not (tmp_path / "a.stl").read_bytes().startswith(b"solid")
+
+    stl, ply = vtkSTLReader(), vtkPLYReader()
+    for reader, name in ((stl, "a.stl"), (ply, "a.ply")):
+        reader.SetFileName(str(tmp_path / name))
+        reader.Update()
+        assert reader.GetOutput().GetNumberOfCells() == 4
+    said = "solid.nii mean below 43, Sch?del " + "x" * 90
+    assert stl.GetHeader() == f"tetopt SPACE=RAS mm {said}"[:80]
+    comments = ply.GetComments()
+    assert [comments.GetValue(k) for k in range(comments.GetNumberOfValues())] == ["SPACE=RAS", f"tetopt; mm; {said}"]
+
+
+def test_whole_or_not_at_all(tmp_path, monkeypatch):
+    (tmp_path / "a.stl").write_text("before")
+
+    def half(path, content):
+        with path.open("wb") as file:
+            file.write(content[:50])
+        raise OSError("disk full")
+
+    monkeypatch.setattr(Path, "write_bytes", half)
+    with pytest.raises(OSError, match="disk full"):
+        save_surface(tmp_path / "a.stl", surface_of(*CUBE_CORNER, [0]))
+    assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [("a.stl", "before")]
+
+
+def test_one_line_for_every_bad_file(tmp_path):
+    with pytest.raises(InputError, match=r"a\.obj: expected a surface named \.stl or \.ply"):
+        save_surface(tmp_path / "a.obj", surface_of(*CUBE_CORNER, [0]))
+    with pytest.raises(InputError, match="no such surface file"):
+        checked_surface(tmp_path / "none.stl")
+    save_surface(tmp_path / "a.ply", surface_of(*CUBE_CORNER, [0]))
+    whole = (tmp_path / "a.ply").read_bytes()
+    for name, content in {
+        "cut.ply": whole[:-20],
+        "noise.stl": b"\x93" * 300,
+        "empty.stl": b"",
+        "0.stl": bytes(84),
+    }.items():
+        (tmp_path / name).write_bytes(content)
+        with pytest.raises(InputError, match=f"{name}: .*damaged\\?$"):
+            checked_surface(tmp_path / name)

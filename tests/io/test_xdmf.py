@@ -1,0 +1,222 @@
+"""XDMF files: read back by an XML parser and by VTK, every number and every set the same; dolfinx has its own test."""
+
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+import pyvista
+from models import ABOUT, sample_model
+
+from tetopt.errors import InputError
+from tetopt.io.xdmf import xdmf
+from tetopt.model.model import in_space, in_units
+from tetopt.model.sets import Sets, around, facet_triples, standard_sets
+
+
+def with_two_sides(model):
+    """The model with the interface also as a set that holds it from its other side."""
+    bright = around(model.mesh, model.sets.cells["label_1"])
+    return model._replace(sets=Sets(model.sets.facets | {"bright": bright}, model.sets.cells))
+
+
+MODELS = {
+    "3-D": sample_model,
+    "2-D": lambda: sample_model(2),
+    "two sides": lambda: with_two_sides(sample_model()),
+    "two sides, 2-D": lambda: with_two_sides(sample_model(2)),
+    "as many materials as cells": lambda: sample_model(3, None),
+    "LPS, MPa": lambda: in_units(in_space(sample_model(), "lps"), "MPa"),
+    "label sets only": lambda: sample_model()._replace(
+        sets=standard_sets(sample_model().mesh, labels=sample_model().cell_data["label"]), loads=()
+    ),
+    "bare": lambda: sample_model()._replace(cell_data={}, sets=Sets({}, {}), materials=None, loads=(), about={}),
+}
+
+
+@pytest.fixture(params=list(MODELS))
+def model(request):
+    return MODELS[request.param]()
+
+
+def item(node):
+    """A DataItem's array."""
+    shape = [int(size) for size in node.get("Dimensions").split()]
+    assert (node.get("Format"), node.get("Precision")) == ("XML", "8")
+    kind = {"Float": np.float64, "Int": np.int64}[node.get("NumberType")]
+    return np.array([kind(word) for word in node.text.split()], dtype=kind).reshape(shape)
+
+
+def named(node):
+    """What a node's Information tells, lists of words by name."""
+    return {each.get("Name"): each.get("Value").split() for each in node.findall("Information")}
+
+
+def grids(model):
+    """The file's grids by name."""
+    root = ElementTree.fromstring(xdmf(model))
+    return {grid.get("Name"): grid for grid in root.findall("./Domain/Grid")}
+
+
+def fields(grid):
+    return {each.get("Name"): item(each.find("DataItem")) for each in grid.findall("Attribute")}
+
+
+def sorted_rows(rows):
+    return rows[np.lexsort(rows.T[::-1])]
+
+
+def turned_over(triples):
+    return np.concatenate([triples[:, 1::-1], triples[:, 2:]], axis=1)
+
+
+def from_smallest(triples):
+    """The facets with their smallest node first and the same side out."""
+    if triples.shape[1] == 2:
+        return triples
+    start = triples.argmin(axis=1)[:, None]
+    return np.take_along_axis(triples, (start + np.arange(3)) % 3, axis=1)
+
+
+def facet_set(grid, name):
+    """A set's facets from its tags, facing out of its own cells."""
+    nodes, tags = item(grid.find("Topology/DataItem")), fields(grid)["facets"]
+    tags_of = {each: np.array(words, dtype=int) for each, words in named(grid).items()}
+    is_in = np.isin(tags, tags_of[name])
+    is_turned = np.isin(tags, tags_of.get(f"{name} turned", []))
+    return np.where(is_turned[:, None], turned_over(nodes), nodes)[is_in]
+
+
+def test_mesh_and_cell_data_are_the_models_own(model):
+    mesh = grids(model)["mesh"]
+    assert np.array_equal(item(mesh.find("Geometry/DataItem")), model.mesh.points)
+    assert np.array_equal(item(mesh.find("Topology/DataItem")), model.mesh.cells)
+    assert mesh.find("Topology").get("TopologyType") == {2: "Triangle", 3: "Tetrahedron"}[model.mesh.ndim]
+    found, made = fields(mesh), model.materials
+    if made is not None:
+        assert next(iter(found)) == "material"  # the one that dolfinx reads as tags
+        assert np.array_equal(found.pop("material"), made.of_cell + 1)
+        assert np.array_equal(found.pop("young"), made.young[made.of_cell])
+        assert np.array_equal(found.pop("nu"), made.nu[made.of_cell])
+        assert {name: [float(word) for word in words] for name, words in named(mesh).items()} == {
+            "young": made.young.tolist(),
+            "nu": made.nu.tolist(),
+        }
+    assert list(found) == list(model.cell_data)
+    for name, values in model.cell_data.items():
+        assert np.array_equal(found[name], values), name
+        assert found[name].dtype.kind == values.dtype.kind, name
+
+
+def test_every_facet_set_comes_back_with_its_side(model):
+    found = grids(model)
+    assert ("facets" in found) == bool(model.sets.facets)
+    if not model.sets.facets:
+        return
+    triples = item(found["facets"].find("Topology/DataItem"))
+    assert len(np.unique(np.sort(triples, axis=1), axis=0)) == len(triples)  # dolfinx knows one tag a facet
+    assert {name for name in named(found["facets"]) if not name.endswith(" turned")} == set(model.sets.facets)
+    for name, rows in model.sets.facets.items():
+        expected = facet_triples(model.mesh.cells, rows)
+        got = facet_set(found["facets"], name)
+        assert np.array_equal(sorted_rows(from_smallest(got)), sorted_rows(from_smallest(expected))), name
+
+
+def test_a_side_is_told_only_where_two_sets_differ():
+    turned = {
+        n: [name for name in named(grids(made)["facets"]) if "turned" in name]
+        for n, made in enumerate([sample_model(), with_two_sides(sample_model())])
+    }
+    assert turned == {0: [], 1: ["bright turned"]}
+
+
+def test_every_cell_set_comes_back(model):
+    found = grids(model)
+    assert ("cells" in found) == bool(model.sets.cells)
+    if not model.sets.cells:
+        return
+    grid = found["cells"]
+    tags, tags_of = fields(grid)["cells"], named(grid)
+    assert list(tags_of) == list(model.sets.cells)
+    members = item(grid.find("Topology/DataItem"))
+    for name, cells in model.sets.cells.items():
+        assert np.array_equal(members[np.isin(tags, np.array(tags_of[name], dtype=int))], model.mesh.cells[cells]), name
+
+
+def test_loads_and_origin_are_told():
+    model = sample_model()
+    head = ElementTree.fromstring(xdmf(model)).findall("./Domain/Information")
+    loads = [each.get("Value").split() for each in head if each.get("Name") == "load"]
+    assert [(name, [float(x) for x in vector]) for name, *vector in loads] == [
+        (load.set_name, load.displacement.tolist()) for load in model.loads
+    ]
+    about = [each.get("Value") for each in head if each.get("Name") == "about"]
+    assert about[1:] == [
+        "coordinates: RAS+, mm",
+        "units: mm, kPa, mN, uJ, kg, s",
+        f"image: {ABOUT['image']}, sha256 {ABOUT['image_sha256']}",
+    ]
+
+
+def test_vtk_reads_the_same(model, tmp_path):
+    path = tmp_path / "model.xdmf"
+    path.write_bytes(xdmf(model))
+    read = pyvista.get_reader(path).read()
+    if not isinstance(read, pyvista.MultiBlock):  # of one grid
+        read = pyvista.MultiBlock({"mesh": read})
+    assert read.keys() == ["mesh", *(["facets"] if model.sets.facets else []), *(["cells"] if model.sets.cells else [])]
+    for name in read.keys():  # noqa: SIM118 - iterating over blocks gives the blocks
+        assert np.array_equal(read[name].points[:, : model.mesh.ndim], model.mesh.points)
+    n = model.mesh.ndim
+    assert np.array_equal(read["mesh"].cells.reshape(-1, n + 2)[:, 1:], model.mesh.cells)
+    for name, values in fields(grids(model)["mesh"]).items():
+        assert np.array_equal(read["mesh"].cell_data[name], values), name
+    if model.sets.facets:
+        grid = grids(model)["facets"]
+        assert np.array_equal(read["facets"].cells.reshape(-1, n + 1)[:, 1:], item(grid.find("Topology/DataItem")))
+        assert np.array_equal(read["facets"].cell_data["facets"], fields(grid)["facets"])
+
+
+def test_cell_data_of_any_name_shape_and_kind(tmp_path):
+    model = sample_model()
+    rng, count = np.random.default_rng(0), len(model.mesh.cells)
+    data = {
+        'a "b" <c> & ä': rng.normal(size=count).astype(np.float32),
+        "direction": rng.normal(size=(count, 3)),
+        "pair": rng.normal(size=(count, 2)),
+        "is_in": rng.random(count) < 0.5,
+        "large": rng.integers(-(2**52), 2**52, count),
+        "young": np.zeros(count),
+    }
+    made = model._replace(cell_data=data)
+    found = fields(grids(made)["mesh"])
+    expected = {name: data[name] for name in list(data)[:2]}
+    expected |= {f"pair_{k}": data["pair"][:, k] for k in range(2)} | {name: data[name] for name in ("is_in", "large")}
+    assert list(found) == ["material", "young", "nu", *expected]
+    assert (found["young"] > 0.0).all()
+    (tmp_path / "model.xdmf").write_bytes(xdmf(made))
+    read = pyvista.get_reader(tmp_path / "model.xdmf").read()["mesh"].cell_data
+    for name, values in expected.items():
+        assert np.array_equal(found[name], values), name
+        assert np.array_equal(read[name], values), name
+
+
+def test_names_that_xml_cannot_carry_are_mended():
+    model = sample_model()._replace(about={"tetopt": "0.1.0", "image": "a\x01\udc80 -- ]]>.nii"})
+    head = ElementTree.fromstring(xdmf(model)).findall("./Domain/Information[@Name='about']")
+    assert head[3].get("Value") == "image: a?? -- ]]>.nii, sha256 unknown"
+
+
+def test_quadratic_cells_are_refused():
+    expected = r"^xdmf: expected linear cells, got order 2; .* P2 elements in FEniCSx$"
+    with pytest.raises(InputError, match=expected):
+        xdmf(sample_model()._replace(order=2))
+
+
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_values_that_vtk_cannot_read_are_refused(value):
+    model = sample_model()
+    data = {"mean": model.cell_data["mean"], "odd": np.array([value] + [1.0] * (len(model.mesh.cells) - 1))}
+    with pytest.raises(
+        InputError, match=r'^xdmf: expected finite cell data, got 1 values of "odd" that are not; take .vtu$'
+    ):
+        xdmf(model._replace(cell_data=data))

@@ -1,0 +1,217 @@
+"""Materials of cells, bins and their error; laws from text and files."""
+
+import numpy as np
+import pytest
+from models import sample_image, sample_model
+
+from tetopt.errors import InputError
+from tetopt.fem.materials import ByLabel, cell_values, load_law, parse_any_law, parse_law
+from tetopt.geometry.simplex import volumes
+from tetopt.model.build import model_of
+from tetopt.model.materials import binned, by_label, materials
+
+YOUNG = np.array([3.0, 1.0, 3.0, 2.0, 8.0])
+
+
+def test_equal_pairs_are_one_material():
+    made = materials(YOUNG, [0.3, 0.3, 0.4, 0.3, 0.3], 5)
+    assert made.young.tolist() == [1.0, 2.0, 3.0, 3.0, 8.0]
+    assert made.nu.tolist() == [0.3, 0.3, 0.3, 0.4, 0.3]
+    assert made.of_cell.tolist() == [2, 0, 3, 1, 4]
+    assert made.binning is None
+    assert materials(2.0, 0.3, 4).of_cell.tolist() == [0, 0, 0, 0]
+
+
+@pytest.mark.parametrize(
+    ("young", "nu", "match"),
+    [
+        ([1.0, 0.0, 2.0], 0.3, "above 0 kPa, got 1 others, the first 0 in cell 1"),
+        ([1.0, np.nan, 2.0], 0.3, "above 0 kPa"),
+        ([1.0, np.inf, 2.0], 0.3, "above 0 kPa"),
+        (1.0, 0.5, "-1 < nu < 0.5, got 3 cells"),
+        (1.0, [0.3, -1.0, 0.3], "got 1 cells with others, the first -1 in cell 1"),
+        (1.0, [0.3, np.nan, 0.3], "-1 < nu < 0.5"),
+        ([1.0, 2.0], 0.3, "expected one value for each of 3 cells"),
+    ],
+)
+def test_values_out_of_range(young, nu, match):
+    with pytest.raises(InputError, match=match):
+        materials(young, nu, 3)
+
+
+def test_bins_of_equal_width_hold_the_mean_by_volume():
+    size = np.array([1.0, 1.0, 3.0, 1.0, 1.0])
+    made = binned(materials([1.0, 2.0, 3.0, 7.0, 9.0], 0.3, 5), size, 2)  # halves: 1 to 5, 5 to 9
+    assert made.young.tolist() == [(1.0 + 2.0 + 9.0) / 5.0, 8.0]
+    assert made.of_cell.tolist() == [0, 0, 0, 1, 1]
+    off = np.abs(made.young[made.of_cell] / [1.0, 2.0, 3.0, 7.0, 9.0] - 1.0)
+    assert made.binning.largest == pytest.approx(off.max())
+    assert made.binning.mean == pytest.approx((off * size).sum() / 7.0)
+    # As stiff altogether as before.
+    assert (made.young[made.of_cell] * size).sum() == pytest.approx(1.0 + 2.0 + 9.0 + 7.0 + 9.0)
+
+
+def test_bins_by_number_and_by_logarithm():
+    given = materials([1.0, 2.0, 4.0, 8.0, 1024.0, 512.0], 0.3, 6)
+    by_number = binned(given, np.ones(6), 2, "quantile")
+    assert by_number.of_cell.tolist() == [0, 0, 0, 1, 1, 1]
+    by_log = binned(given, np.ones(6), 2, "log")  # halves at 2^5
+    assert by_log.of_cell.tolist() == [0, 0, 0, 0, 1, 1]
+    assert by_log.young.tolist() == [3.75, 768.0]
+    equal = binned(given, np.ones(6), 4)  # the third quarter is empty
+    assert equal.young.tolist() == [3.75, 512.0, 1024.0]
+
+
+def test_enough_bins_change_nothing():
+    given = materials(YOUNG, 0.3, 5)
+    made = binned(given, np.ones(5), 4)
+    np.testing.assert_array_equal(made.young, given.young)
+    assert made.binning == (0.0, 0.0)
+
+
+def test_more_bins_err_less():
+    model = sample_model(3, None)
+    size = volumes(model.mesh.points, model.mesh.cells)
+    errors = [binned(model.materials, size, count).binning.mean for count in (1, 2, 8, 64)]
+    assert errors == sorted(errors, reverse=True)
+    assert errors[0] > 10 * errors[-1] > 0.0
+
+
+def test_ratios_by_label_are_not_blended():
+    made = binned(materials(np.arange(1.0, 11.0), np.repeat([0.3, 0.45], 5), 10), np.ones(10), 3)
+    assert set(made.nu) == {0.3, 0.45}
+    np.testing.assert_array_equal(made.nu[made.of_cell], np.repeat([0.3, 0.45], 5))
+    many = binned(materials(1.0, np.linspace(0.0, 0.4, 9), 9), np.ones(9), 2)
+    assert len(many.nu) == 2
+
+
+@pytest.mark.parametrize(
+    ("count", "spacing", "match"), [(0, "equal", "1 or more"), (3, "cubic", "equal, quantile, log")]
+)
+def test_bins_that_are_none(count, spacing, match):
+    with pytest.raises(InputError, match=match):
+        binned(materials(YOUNG, 0.3, 5), np.ones(5), count, spacing)
+
+
+# Laws
+
+
+def test_values_by_label():
+    assert by_label(ByLabel({1: 2.5, 0: 1.0}), np.array([0, 1, 1])).tolist() == [1.0, 2.5, 2.5]
+    with pytest.raises(InputError, match="given for 1, the mesh also has 0, 3"):
+        by_label(ByLabel({1: 2.5}), np.array([0, 1, 3]))
+    with pytest.raises(InputError, match="has no labels"):
+        by_label(ByLabel({1: 2.5}), None)
+
+
+@pytest.mark.parametrize("text", ["1=", "=2", "1=2,1=3", "1=2;2=3", "a=1", "1.5=2", "1=x"])
+def test_labels_that_are_none(text):
+    with pytest.raises(InputError, match="by label"):
+        parse_any_law(text)
+
+
+def test_a_law_of_the_intensity_alone():
+    with pytest.raises(InputError, match="expected one of the intensity"):
+        parse_law("1=2")
+
+
+TOML = "intensity = [0, 50, 200]\nyoung = [0.5, 1, 6.0]\nnu = [0.45, 0.4, 0.49]\n"
+CSV = "intensity, young, nu\n0,0.5,0.45\n50,1,0.4\n200,6.0,0.49\n"
+
+
+@pytest.mark.parametrize(("name", "text"), [("a.toml", TOML), ("a.csv", CSV), ("A.CSV", "\ufeff" + CSV + "\n")])
+def test_tables_from_files(tmp_path, name, text):
+    path = tmp_path / name
+    path.write_text(text, encoding="utf-8")
+    assert parse_any_law(str(path)) == [(0.0, 0.5), (50.0, 1.0), (200.0, 6.0)]
+    assert load_law(path, "nu") == [(0.0, 0.45), (50.0, 0.4), (200.0, 0.49)]
+
+
+def test_labels_from_a_file(tmp_path):
+    (tmp_path / "a.csv").write_text("label,young\n3,2.5\n0,1\n")
+    assert load_law(tmp_path / "a.csv") == ByLabel({3: 2.5, 0: 1.0})
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "match"),
+    [
+        ("a.toml", "intensity = [0, 50]\nyoung = [1]", "2 of intensity and 1 of young"),
+        ("a.toml", "intensity = [0, 50, 50]\nyoung = [1, 2, 3]", "must increase"),
+        ("a.toml", "intensity = [50, 0]\nyoung = [1, 2]", "must increase"),
+        ("a.toml", "intensity = [0, 'x']\nyoung = [1, 2]", "columns of numbers"),
+        ("a.toml", "intensity = 3\nyoung = [1]", "expected lists"),
+        ("a.toml", "not toml", "columns of numbers"),
+        (
+            "a.toml",
+            "h = [1]\nyoung = [1]",
+            'expected columns "young" and one of "intensity" and "label", found h, young',
+        ),
+        ("a.csv", "intensity,nu\n1,2\n", "found intensity, nu"),
+        ("a.csv", "intensity,young\n", "got an array of shape|expected pairs"),
+        ("a.csv", "", "row of names"),
+        ("a.csv", "intensity,young\n1,2,3\n", "row of names"),
+        ("a.csv", "intensity,young\n1,x\n", "columns of numbers"),
+        ("a.csv", "intensity,young\n1,nan\n", "must be finite"),
+        ("a.csv", "label,young\n1,2\n1,3\n", "whole numbers, each once"),
+        ("a.csv", "label,young\n1.5,2\n", "whole numbers, each once"),
+        ("a.csv", "label,intensity,young\n1,2,3\n", "one of"),
+    ],
+)
+def test_files_that_are_none(tmp_path, name, text, match):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputError, match=match) as caught:
+        load_law(tmp_path / name)
+    assert "\n" not in str(caught.value)
+    with pytest.raises(InputError, match="no such file"):
+        load_law(tmp_path / "no.csv")
+
+
+def test_a_table_must_increase():
+    with pytest.raises(InputError, match="must increase, got 5 and then 3"):
+        parse_any_law("5:1,3:2")
+
+
+def test_other_names_than_h():
+    with pytest.raises(InputError, match='cannot use "x"'):
+        parse_any_law("1 + x")
+
+
+# From an image or from means
+
+
+def test_the_mean_of_the_law_and_the_law_of_the_mean():
+    image, mesh = sample_image(3), sample_model(3).mesh
+    fields = sample_model(3).cell_data
+    by_image = model_of(mesh, image, young="1 + h**2")
+    by_mean = model_of(mesh, young="1 + h**2", cell_data=fields)
+    young = by_image.materials.young[by_image.materials.of_cell]
+    np.testing.assert_allclose(young, cell_values(image, mesh, lambda h: 1.0 + h**2), rtol=1e-14)
+    np.testing.assert_allclose(young, 1.0 + fields["mean"] ** 2 + fields["variance"], rtol=1e-9)
+    flat = by_mean.materials.young[by_mean.materials.of_cell]
+    np.testing.assert_allclose(flat, 1.0 + fields["mean"] ** 2, rtol=1e-14)
+    assert (young > flat + 1.0).any()
+
+
+def test_ratios_may_be_negative_and_laws():
+    image, mesh = sample_image(3), sample_model(3).mesh
+    made = model_of(mesh, image, young=2.0, nu="-0.3 + h / 100").materials
+    assert made.nu.min() < 0.0 < made.nu.max()
+    with pytest.raises(InputError, match=r"-1 < nu < 0\.5"):
+        model_of(mesh, image, young=2.0, nu="h")
+    with pytest.raises(InputError, match="no value at intensity 0"):
+        model_of(mesh, image, young=2.0, nu="1 / h")
+    with pytest.raises(InputError, match="expected 0 kPa or more"):
+        model_of(mesh, image, young="h - 10")
+    with pytest.raises(InputError, match="the mesh has no means"):
+        model_of(mesh, young="h")
+
+
+def test_one_law_for_each_label_and_one_number_a_cell():
+    model = sample_model(3)
+    labels = model.cell_data["label"]
+    made = model_of(model.mesh, young="0=1.5,1=4", nu="0=0.45,1=0.3", cell_data=model.cell_data).materials
+    np.testing.assert_array_equal(made.young[made.of_cell], np.where(labels == 1, 4.0, 1.5))
+    np.testing.assert_array_equal(made.nu[made.of_cell], np.where(labels == 1, 0.3, 0.45))
+    given = np.linspace(1.0, 2.0, len(labels))
+    made = model_of(model.mesh, young=given).materials
+    np.testing.assert_array_equal(made.young[made.of_cell], given)

@@ -1,0 +1,278 @@
+"""Named sets: the box's faces by their anatomical names, interfaces, what is asked for in words, tags."""
+
+from itertools import permutations, product
+
+import numpy as np
+import pytest
+from models import sample_image, sample_model
+
+import tetopt
+from tetopt.errors import InputError
+from tetopt.geometry.simplex import volumes
+from tetopt.mesh import Mesh
+from tetopt.model.sets import (
+    Box,
+    Sets,
+    around,
+    boundary_rows,
+    box_of,
+    facet_triples,
+    nodes_of,
+    rows_of,
+    standard_sets,
+    tagged,
+    with_asked,
+    with_carried,
+    world_axes,
+)
+
+NAMES = (("left", "right"), ("posterior", "anterior"), ("inferior", "superior"))
+CUBE = np.array(list(product((0.0, 1.0), repeat=3)))
+
+
+def outward_areas(mesh, rows):
+    """Area vectors of facets, from their nodes as listed."""
+    a, b, c = np.moveaxis(mesh.points[facet_triples(mesh.cells, rows)], 1, 0)
+    return np.cross(b - a, c - a) / 2.0
+
+
+def test_facets_face_out_of_their_cell():
+    for n in (2, 3):
+        mesh = sample_model(n).mesh
+        every = np.argwhere(np.ones(mesh.cells.shape, dtype=bool))
+        nodes = facet_triples(mesh.cells, every)
+        opposite = mesh.cells[every[:, 0], every[:, 1]]
+        assert (np.sort(np.column_stack([nodes, opposite])) == np.sort(mesh.cells[every[:, 0]])).all()
+        if n == 3:
+            inward = mesh.points[opposite] - mesh.points[nodes[:, 0]]
+            assert ((inward * outward_areas(mesh, every)).sum(axis=1) < 0.0).all()
+        else:
+            a, b = np.moveaxis(mesh.points[nodes], 1, 0)
+            right = np.column_stack([(b - a)[:, 1], -(b - a)[:, 0]])
+            assert (((mesh.points[opposite] - a) * right).sum(axis=1) < 0.0).all()
+
+
+def test_normals_of_a_tetrahedron_point_out():
+    mesh = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 2, 3]])
+    rows = boundary_rows(mesh)
+    centres = mesh.points[facet_triples(mesh.cells, rows)].mean(axis=1)
+    assert rows.tolist() == [[0, 0], [0, 1], [0, 2], [0, 3]]
+    assert ((centres - mesh.points.mean(axis=0)) * outward_areas(mesh, rows)).sum(axis=1).min() > 0.0
+
+
+@pytest.mark.parametrize("order", list(permutations(range(3))))
+@pytest.mark.parametrize("signs", [(1, 1, 1), (-1, 1, -1)])
+def test_faces_are_named_by_the_world(order, signs):
+    """Whatever index axis runs from left to right, and which way: "left" is where x is smallest."""
+    affine = np.eye(4)
+    affine[:3, :3] = 0.0
+    for axis, (world, sign) in enumerate(zip(order, signs, strict=True)):
+        affine[world, axis] = 2.0 * sign
+    affine[:3, 3] = (10.0, -20.0, 30.0)
+    image = tetopt.Image(np.zeros((3, 4, 5)), affine)
+    mesh = tetopt.lattice(image, blocks=(2, 2, 2))
+    sets = standard_sets(mesh, box_of(image)).facets
+    assert world_axes(affine) == order
+    for axis, (low, high) in enumerate(NAMES):
+        assert (mesh.points[nodes_of(mesh, sets[low])][:, axis] == mesh.points[:, axis].min()).all()
+        assert (mesh.points[nodes_of(mesh, sets[high])][:, axis] == mesh.points[:, axis].max()).all()
+        size = np.ptp(mesh.points, axis=0)
+        for name, sign in ((low, -1.0), (high, 1.0)):
+            area = np.zeros(3)
+            area[axis] = sign * np.prod(size) / size[axis]
+            np.testing.assert_allclose(outward_areas(mesh, sets[name]).sum(axis=0), area, atol=1e-9)
+    assert len(sets["boundary"]) == sum(len(sets[name]) for pair in NAMES for name in pair)
+    assert "mask_surface" not in sets
+    assert [name for name in standard_sets(mesh).facets] == ["boundary", *(name for pair in NAMES for name in pair)]
+
+
+def test_axes_turned_by_45_degrees_still_have_six_different_names():
+    c = 0.5**0.5
+    affine = np.array([[c, -c, 0, 0], [c, c, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]])
+    assert sorted(world_axes(affine)) == [0, 1, 2]
+
+
+def test_an_oblique_box_is_known_by_its_affine_alone():
+    image, mesh = sample_image(3), sample_model(3).mesh
+    with_box = standard_sets(mesh, box_of(image)).facets
+    assert sum(len(with_box[name]) for pair in NAMES for name in pair) == len(with_box["boundary"])
+    without = standard_sets(mesh).facets  # turned about z, so that only those two faces lie in planes of the world
+    assert set(without) == {"boundary", "inferior", "superior"}
+    for name in ("inferior", "superior"):
+        np.testing.assert_array_equal(without[name], with_box[name])
+
+
+def test_the_surface_of_a_mask_is_the_boundary_off_the_box():
+    image = tetopt.Image(np.zeros((4, 4, 4)))
+    mesh = tetopt.lattice(image, blocks=(2, 2, 2))
+    is_low = mesh.points[mesh.cells].mean(axis=1)[:, 2] < 1.5
+    used, cells = np.unique(mesh.cells[is_low], return_inverse=True)
+    lower = Mesh(mesh.points[used], cells.reshape(-1, 4))
+    sets = standard_sets(lower, box_of(image)).facets
+    assert "superior" not in sets
+    assert (lower.points[nodes_of(lower, sets["mask_surface"])][:, 2] > -0.5).all()
+    np.testing.assert_allclose(outward_areas(lower, sets["inferior"]).sum(axis=0), [0.0, 0.0, -16.0])
+    assert len(sets["boundary"]) == sum(len(rows) for name, rows in sets.items() if name != "boundary")
+
+
+def test_interfaces_are_held_by_the_smaller_label():
+    for n in (2, 3):
+        model = sample_model(n)
+        labels = model.cell_data["label"]
+        rows = model.sets.facets["interface_0_1"]
+        assert (labels[rows[:, 0]] == 0).all()
+        nodes = np.sort(facet_triples(model.mesh.cells, rows), axis=1).tolist()
+        zero, one = (
+            {
+                tuple(sorted(set(cell) - {cell[k]}))
+                for cell in model.mesh.cells[labels == label].tolist()
+                for k in range(n + 1)
+            }
+            for label in (0, 1)
+        )
+        assert {tuple(row) for row in nodes} == zero & one
+        assert len(nodes) == len(zero & one)
+        for label in (0, 1):
+            np.testing.assert_array_equal(model.sets.cells[f"label_{label}"], np.flatnonzero(labels == label))
+
+
+def test_three_labels_have_an_interface_for_each_pair_that_touches():
+    mesh = tetopt.lattice(tetopt.Image(np.zeros((6, 4))), blocks=(3, 1))
+    labels = np.floor((mesh.points[mesh.cells].mean(axis=1)[:, 0] + 0.5) / 2.0).astype(int) * 5
+    sets = standard_sets(mesh, labels=labels)
+    assert [name for name in sets.facets if "interface" in name] == ["interface_0_5", "interface_5_10"]
+    assert list(sets.cells) == ["label_0", "label_5", "label_10"]
+
+
+@pytest.mark.parametrize("labels", [[0.5] * 192, [-1] * 192, [1] * 191])
+def test_labels_that_are_none(labels):
+    with pytest.raises(InputError, match="labels: expected"):
+        standard_sets(sample_model(3).mesh, labels=np.array(labels))
+
+
+# Asked for in words
+
+
+def asked(text, n=3, mean=None):
+    model = sample_model(n)
+    base = standard_sets(model.mesh)
+    return model.mesh, with_asked(model.mesh, base, [text], model.cell_data["mean"] if mean is None else mean)
+
+
+def test_below_is_the_largest_connected_part_and_its_surface():
+    mesh, sets = asked("dark=below:12")
+    mean = sample_model(3).cell_data["mean"]
+    chosen = tetopt.geometry.topology.largest_component(mesh.cells, mean < 12)
+    np.testing.assert_array_equal(sets.cells["dark"], chosen)
+    rows = sets.facets["dark_surface"]
+    assert set(rows[:, 0]) <= set(chosen.tolist())
+    np.testing.assert_allclose(outward_areas(mesh, rows).sum(axis=0), 0.0, atol=1e-9)  # closed
+    centres = mesh.points[facet_triples(mesh.cells, rows)].mean(axis=1)
+    enclosed = (centres * outward_areas(mesh, rows)).sum() / 3.0
+    np.testing.assert_allclose(enclosed, volumes(mesh.points, mesh.cells[chosen]).sum())
+    np.testing.assert_array_equal(rows, around(mesh, chosen))
+
+
+def test_near_a_point_and_a_plane():
+    model = sample_model(3)
+    mesh, points = model.mesh, model.mesh.points
+    every = boundary_rows(mesh)
+    here = points[0]
+    text = ",".join(map(str, here.tolist()))
+    for words, distance in (
+        (f"p=point:{text}:12", np.linalg.norm(points - here, axis=1)),
+        (f"p=plane:{text}:0,0,-2:1.5", np.abs(points[:, 2] - here[2])),
+    ):
+        _, sets = asked(words)
+        reach = float(words.rpartition(":")[2])
+        expected = every[(distance[facet_triples(mesh.cells, every)] <= reach).all(axis=1)]
+        assert 0 < len(expected) < len(every)
+        np.testing.assert_array_equal(sets.facets["p"], expected)
+        assert "p" not in sets.cells
+
+
+@pytest.mark.parametrize(
+    ("text", "match"),
+    [
+        ("dark", "expected NAME=below:T"),
+        ("dark=above:3", "expected NAME=below:T"),
+        ("dark=below:x", "expected 1 number"),
+        ("dark=below:nan", "expected 1 number"),
+        ("dark=below:-5", "no cell has a mean below -5"),
+        ("1a=below:12", "a name is a letter"),
+        ("a b=below:12", "a name is a letter"),
+        ("=below:12", "a name is a letter"),
+        ("LEFT=point:0,0,0:1", r'there is a set "left" already|no facet'),
+        ("Boundary=below:12", 'there is a set "boundary" already'),
+        ("p=point:0,0:1", "expected 3 numbers"),
+        ("p=point:0,0,0", "expected X,Y,Z:D"),
+        ("p=plane:0,0,0:1", "expected X,Y,Z:NX,NY,NZ:D"),
+        ("p=plane:0,0,0:0,0,0:1", "normal must not be 0"),
+        ("p=point:0,0,0:0.1", "the nearest does within"),
+    ],
+)
+def test_words_that_are_refused(text, match):
+    with pytest.raises(InputError, match=match) as caught:
+        asked(text)
+    assert "\n" not in str(caught.value)
+
+
+def test_a_surface_takes_its_name_too():
+    model = sample_model(3)
+    with pytest.raises(InputError, match='"dark_surface" already'):
+        with_asked(
+            model.mesh,
+            Sets({"dark_surface": boundary_rows(model.mesh)}, {}),
+            ["dark=below:12"],
+            model.cell_data["mean"],
+        )
+
+
+def test_below_needs_means():
+    mesh = sample_model(3).mesh
+    with pytest.raises(InputError, match="has no means"):
+        with_asked(mesh, Sets({}, {}), ["dark=below:12"], None)
+
+
+# Tags, and sets of other meshes
+
+
+def test_tags_say_which_sets_an_item_is_in():
+    for sets in (sample_model(3).sets.facets, sample_model(3).sets.cells):
+        found = tagged(sets)
+        assert found.tags.min() == 1
+        assert len(np.unique(found.items, axis=0)) == len(found.items)
+        for name, members in sets.items():
+            chosen = found.items[np.isin(found.tags, found.tags_of[name])]
+            np.testing.assert_array_equal(chosen, members)
+        together = {tuple(name for name in sets if tag in found.tags_of[name]) for tag in np.unique(found.tags)}
+        assert len(together) == found.tags.max()  # no two tags for one combination
+    assert tagged({}).tags_of == {}
+
+
+def test_rows_of_nodes_in_any_order():
+    mesh = sample_model(3).mesh
+    rows = boundary_rows(mesh)
+    nodes = facet_triples(mesh.cells, rows)[:, [2, 0, 1]]
+    np.testing.assert_array_equal(rows_of(mesh, nodes[::-1]), rows)
+    assert len(rows_of(mesh, np.array([[0, 0, 1], [-1, 2, 3]]))) == 0
+
+
+def test_sets_on_the_boundary_are_carried_to_an_improved_mesh():
+    model = sample_model(3)
+    image = sample_image(3)
+    after = tetopt.optimize(image, model.mesh, boundary="fixed", iterations=3).mesh
+    assert (after.points != model.mesh.points).any()
+    given = Sets({"skin": boundary_rows(model.mesh), "inner": model.sets.facets["interface_0_1"]}, {})
+    found = with_carried(standard_sets(after), model.mesh, given, after).facets
+    assert "inner" not in found
+    places = [
+        {frozenset(map(tuple, corners)) for corners in mesh.points[facet_triples(mesh.cells, rows)].tolist()}
+        for mesh, rows in ((model.mesh, given.facets["skin"]), (after, found["skin"]))
+    ]
+    assert places[0] == places[1]
+
+
+def test_box_without_voxels():
+    image = sample_image(3)
+    assert box_of(image) == Box(image.shape, image.affine)

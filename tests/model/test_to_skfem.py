@@ -1,0 +1,101 @@
+"""The mesh in scikit-fem: the same nodes, cells and sets, and the side of every facet."""
+
+import sys
+
+import numpy as np
+import pytest
+from models import sample_model
+
+from tetopt.errors import InputError
+from tetopt.geometry.topology import facets
+from tetopt.model.model import in_space
+from tetopt.model.sets import Sets, around, facet_triples
+from tetopt.model.skfem import to_skfem
+
+skfem = pytest.importorskip("skfem", reason="no scikit-fem (pip install scikit-fem)")
+
+
+def with_two_sides(model):
+    """The model with the interface also as a set that holds it from its other side."""
+    bright = around(model.mesh, model.sets.cells["label_1"])
+    return model._replace(sets=Sets(model.sets.facets | {"bright": bright}, model.sets.cells))
+
+
+MODELS = {
+    "3-D": lambda: with_two_sides(sample_model()),
+    "2-D": lambda: with_two_sides(sample_model(2)),
+    "LPS": lambda: in_space(with_two_sides(sample_model()), "lps"),
+}
+
+
+@pytest.fixture(params=list(MODELS))
+def model(request):
+    return MODELS[request.param]()
+
+
+def outward(model, rows):
+    """Unit normals of the facets (K, 2) out of their cells, (K, n)."""
+    corners = model.mesh.points[facet_triples(model.mesh.cells, rows)]
+    edges = corners[:, 1:] - corners[:, :1]
+    normals = np.cross(edges[:, 0], edges[:, 1]) if model.mesh.ndim == 3 else edges[:, 0, ::-1] * [1.0, -1.0]
+    return normals / np.linalg.norm(normals, axis=1, keepdims=True)
+
+
+def test_nodes_and_cells_are_the_same_in_the_same_order(model):
+    mesh = to_skfem(model)
+    assert isinstance(mesh, skfem.MeshTet if model.mesh.ndim == 3 else skfem.MeshTri)
+    assert np.array_equal(mesh.p.T, model.mesh.points)
+    cells = model.mesh.cells if model.mesh.ndim == 3 else np.sort(model.mesh.cells, axis=1)
+    assert np.array_equal(mesh.t.T, cells)
+
+
+def test_sets_are_boundaries_and_subdomains_of_their_names(model):
+    mesh = to_skfem(model)
+    assert list(mesh.boundaries) == list(model.sets.facets)
+    for name, rows in model.sets.facets.items():
+        found = mesh.facets[:, mesh.boundaries[name]].T
+        assert np.array_equal(np.sort(found, axis=1), np.sort(facet_triples(model.mesh.cells, rows), axis=1)), name
+    assert list(mesh.subdomains) == list(model.sets.cells)
+    for name, cells in model.sets.cells.items():
+        assert np.array_equal(mesh.subdomains[name], cells), name
+
+
+def test_a_facet_between_two_cells_is_held_by_the_sets_own(model):
+    mesh = to_skfem(model)
+    shared = facets(model.mesh.cells)
+    element = skfem.ElementTetP1() if model.mesh.ndim == 3 else skfem.ElementTriP1()
+    for name, rows in model.sets.facets.items():
+        is_inner = shared.n_cells[shared.of_cell[rows[:, 0], rows[:, 1]]] == 2
+        side = getattr(mesh.boundaries[name], "ori", np.zeros(len(rows), dtype=int))
+        assert hasattr(mesh.boundaries[name], "ori") == is_inner.any()
+        assert np.array_equal(mesh.f2t[side, mesh.boundaries[name]], rows[:, 0]), name
+        normals = skfem.FacetBasis(mesh, element, facets=name).normals[:, :, 0].T
+        assert np.abs(normals - outward(model, rows)).max() < 1e-12, name
+    there, back = (mesh.boundaries[name] for name in ("interface_0_1", "bright"))
+    assert set(there) <= set(back)
+    assert (np.unique(there.ori) == [0, 1]).all()  # or else the sides were never asked for
+
+
+def test_a_model_without_sets_has_none():
+    model = sample_model()
+    mesh = to_skfem(model._replace(sets=Sets({}, {}), loads=()))
+    assert not mesh.boundaries
+    assert not mesh.subdomains
+
+
+def test_what_cannot_be_had_is_said(monkeypatch):
+    with pytest.raises(
+        InputError, match=r"^to_skfem: expected linear cells, got order 2; .*P2 elements in scikit-fem$"
+    ):
+        to_skfem(sample_model()._replace(order=2))
+    monkeypatch.setitem(sys.modules, "skfem", None)
+    with pytest.raises(InputError, match=r"^to_skfem: scikit-fem is not installed; pip install scikit-fem$"):
+        to_skfem(sample_model())
+
+
+def test_nothing_is_shared_with_the_model():
+    model = sample_model()
+    before = model.sets.cells["label_0"].copy()
+    found = to_skfem(model)
+    found.subdomains["label_0"][:] = 7
+    assert np.array_equal(model.sets.cells["label_0"], before)

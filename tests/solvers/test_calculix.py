@@ -1,0 +1,235 @@
+"""CalculiX runs what `tetopt.io.abaqus` writes, and finds what our own elements and scikit-fem find."""
+
+import re
+import shutil
+import subprocess
+from functools import cache
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import skfem
+from models import sample_model
+from scipy.sparse.linalg import spsolve
+from skfem.helpers import ddot, sym_grad, trace
+
+import tetopt
+from tetopt import Mesh
+from tetopt.fem.elasticity import cell_energies, constrained, lame_constants, solved, stiffness
+from tetopt.geometry.simplex import volumes
+from tetopt.io.abaqus import abaqus
+from tetopt.model.loads import parse_loads
+from tetopt.model.materials import binned, materials
+from tetopt.model.model import Model, in_space, in_units, quadratic, quadratic_facet_nodes
+from tetopt.model.sets import box_of, facet_triples, nodes_of, standard_sets, with_asked
+
+CCX = shutil.which("ccx")
+pytestmark = pytest.mark.skipif(CCX is None, reason="no CalculiX: ccx is not on the PATH (apt install calculix-ccx)")
+
+NU = 0.45
+PRINTED = 6e-7  # half a unit of the seventh digit, which is the last that CalculiX prints, at most
+LOADS = {"compression": ["compress:5%"], "shear": ["hold:superior", "move:inferior:1.7,-0.9,2.3"]}
+
+
+class Answer(NamedTuple):
+    """What CalculiX printed."""
+
+    tables: dict[tuple[str, str], np.ndarray]  # by quantity and set: rows of item and values; of sums, one row
+    u: np.ndarray  # (N, 3) of the .frd file
+    output: str
+
+
+def answer(content, folder):
+    """Runs CalculiX on an input file; any error or warning that it prints fails the test."""
+    (folder / "job.inp").write_bytes(content)
+    run = subprocess.run([CCX, "job"], cwd=folder, capture_output=True, text=True, timeout=120, check=False)
+    output = run.stdout + run.stderr
+    assert run.returncode == 0, output
+    assert "Job finished" in output, output
+    assert not re.search("error|warning", output, re.IGNORECASE), output
+    return Answer(tables((folder / "job.dat").read_text()), displacements((folder / "job.frd").read_text()), output)
+
+
+def tables(text):
+    """The blocks of a .dat file; of several steps with the same requests, the last."""
+    found = {}
+    for part in re.split(r"\n(?= [a-z])", text)[1:]:
+        head, _, body = part.partition("\n")
+        quantity, name = re.match(r" (.*?) (?:\(.*\) )?for set (\S+)", head).groups()
+        found[quantity, name.lower()] = np.array([line.split() for line in body.split("\n") if line], dtype=float)
+    return found
+
+
+def displacements(text):
+    """Node lines of the block DISP of an .frd file: -1, node, three numbers, in fixed columns."""
+    block = text[text.rindex("DISP ") :]
+    lines = [line for line in block[: block.index("\n -3")].splitlines() if line.startswith(" -1")]
+    return np.array([[float(line[k : k + 12]) for k in (13, 25, 37)] for line in lines])
+
+
+@cache
+def pressed_model(loading="compression"):
+    """Two stiff spheres in a soft block: some hundred nodes, 16 materials of one ratio."""
+    image = tetopt.load_phantom("two_spheres").image(voxel_mm=4.0)
+    mesh = tetopt.lattice(image, nodes=400)
+    fields = tetopt.cell_fields(mesh, image)
+    sets = standard_sets(mesh, box_of(image), (fields["mean"] > 15.0).astype(np.int64))
+    sets = with_asked(mesh, sets, ["dark-cells=below:20", "Patch=point:40,0,0:15"], fields["mean"])
+    made = binned(materials(0.5 + fields["mean"] / 7.0, NU, len(mesh.cells)), volumes(mesh.points, mesh.cells), 16)
+    return Model(mesh, fields, sets, made, parse_loads(LOADS[loading], mesh, sets), about={"image": "two spheres & ü"})
+
+
+def young_of(model):
+    return model.materials.young[model.materials.of_cell]
+
+
+def prescribed(model, n_nodes, nodes_of_rows):
+    """Which dofs are given, and their values, (n_nodes, 3) each."""
+    is_given, values = np.zeros((n_nodes, 3), dtype=bool), np.zeros((n_nodes, 3))
+    for load in model.loads:
+        nodes = nodes_of_rows(model.sets.facets[load.set_name])
+        is_given[nodes], values[nodes] = True, load.displacement
+    return is_given, values
+
+
+def ours(model):
+    """Displacement and energy by tetopt's elements."""
+    is_given, values = prescribed(model, len(model.mesh.points), lambda rows: nodes_of(model.mesh, rows))
+    system = constrained(model.mesh, young_of(model), NU, is_given, values)
+    u = solved(system)
+    return u, 0.5 * float(u.ravel() @ (system.K @ u.ravel())), (system.K @ u.ravel()).reshape(-1, 3)
+
+
+def energy(found):
+    return float(found.tables["total internal energy", "all_cells"].squeeze())
+
+
+def assert_printed(found, expected, digits=PRINTED):
+    """Equal as far as printed: relative to the largest."""
+    np.testing.assert_allclose(found, expected, rtol=0.0, atol=digits * np.abs(expected).max())
+
+
+@pytest.mark.parametrize("loading", LOADS)
+def test_energy_displacement_and_reactions_are_our_own(loading, tmp_path):
+    model = pressed_model(loading)
+    found = answer(abaqus(model), tmp_path)
+    u, total, force = ours(model)
+    np.testing.assert_allclose(energy(found), total, rtol=PRINTED)
+    assert_printed(found.u, u, 6e-6)  # .frd has a digit less
+    by_cell = found.tables["internal energy", "all_cells"]
+    np.testing.assert_array_equal(by_cell[:, 0], np.arange(1, len(model.mesh.cells) + 1))
+    assert_printed(by_cell[:, 1], cell_energies(model.mesh, young_of(model), NU, u))
+    for name in ("superior", "inferior"):
+        nodes = nodes_of(model.mesh, model.sets.facets[name])
+        np.testing.assert_array_equal(found.tables["forces", name][:, 0], nodes + 1)
+        assert_printed(found.tables["forces", name][:, 1:], force[nodes])
+        assert_printed(found.tables["total force", name].ravel(), force[nodes].sum(axis=0))
+
+
+def test_a_ratio_and_a_material_for_each_cell(tmp_path):
+    """All of a model's moduli and ratios reach their cells; ours as the sum of two matrices of one ratio each."""
+    model = sample_model(bins=None)
+    found = answer(abaqus(model), tmp_path)
+    assert len(model.materials.young) > 50
+    ratios = model.materials.nu[model.materials.of_cell]
+    assert len(np.unique(ratios)) == 2
+    parts = [(ratios == nu, nu) for nu in np.unique(ratios)]
+    young, mesh = young_of(model), model.mesh
+    K = sum(stiffness(Mesh(mesh.points, mesh.cells[is_in]), young[is_in], nu) for is_in, nu in parts).tocsr()
+    is_given, values = prescribed(model, len(mesh.points), lambda rows: nodes_of(mesh, rows))
+    free, u = np.flatnonzero(~is_given), values.ravel()
+    u[free] = spsolve(K[free][:, free], -(K @ u)[free])
+    np.testing.assert_allclose(energy(found), 0.5 * u @ (K @ u), rtol=PRINTED)
+    for is_in, nu in parts:
+        cells = Mesh(mesh.points, mesh.cells[is_in])
+        expected = cell_energies(cells, young[is_in], nu, u.reshape(-1, 3))
+        assert_printed(found.tables["internal energy", "all_cells"][is_in, 1], expected)
+
+
+def test_megapascals_give_millijoules_and_lps_turns_the_displacement(tmp_path):
+    model = pressed_model("shear")
+    found = answer(abaqus(model), tmp_path)
+    in_mpa = answer(abaqus(in_units(model, "MPa")), tmp_path)
+    np.testing.assert_allclose(1e3 * energy(in_mpa), energy(found), rtol=2.0 * PRINTED)
+    assert_printed(in_mpa.u, found.u, 1e-5)
+    turned = answer(abaqus(in_space(model, "lps")), tmp_path)
+    np.testing.assert_allclose(energy(turned), energy(found), rtol=2.0 * PRINTED)
+    assert_printed(turned.u * [-1.0, -1.0, 1.0], found.u, 1e-5)
+
+
+def second_order(model):
+    """scikit-fem's quadratic solution on the same tetrahedra: displacement at the model's nodes, energy."""
+    mesh = skfem.MeshTet(model.mesh.points.T.copy(), model.mesh.cells.T.copy())
+    basis = skfem.Basis(mesh, skfem.ElementVector(skfem.ElementTetP2()), intorder=2)
+    lame, mu = lame_constants(young_of(model), NU, 3)
+
+    @skfem.BilinearForm
+    def form(u, v, w):
+        return w.lame * trace(sym_grad(u)) * trace(sym_grad(v)) + 2.0 * w.mu * ddot(sym_grad(u), sym_grad(v))
+
+    by_cell = basis.with_element(skfem.ElementTetP0())
+    K = form.assemble(basis, lame=by_cell.interpolate(lame), mu=by_cell.interpolate(mu))
+    u, given = np.zeros(basis.N), []
+    for load, side in zip(model.loads, (30.0, -30.0), strict=True):  # z of the block's faces, held first
+        for d in range(3):
+            dofs = np.flatnonzero(np.abs(basis.doflocs[2] - side) < 1e-9)
+            dofs = np.intersect1d(dofs, np.concatenate([basis.nodal_dofs[d], basis.edge_dofs[d]]))
+            u[dofs] = load.displacement[d]
+            given.append(dofs)
+    u = skfem.solve(*skfem.condense(K, x=u, D=np.concatenate(given)))
+    return u[basis.nodal_dofs].T, 0.5 * float(u @ (K @ u))
+
+
+def test_quadratic_cells_are_scikit_fem_s(tmp_path):
+    model = pressed_model("shear")
+    found = answer(abaqus(model._replace(order=2)), tmp_path)
+    u, total = second_order(model)
+    np.testing.assert_allclose(energy(found), total, rtol=PRINTED)
+    assert_printed(found.u[: len(u)], u, 6e-6)
+    linear = ours(model)[1]
+    assert 0.8 * linear < energy(found) < 0.99 * linear  # less stiff
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_every_set_arrives(order, tmp_path):
+    """Asked for by name, CalculiX lists the members of node and element sets, though surfaces share their names."""
+    model = pressed_model()._replace(order=order)
+    cells = quadratic(model.mesh)[1] if order == 2 else model.mesh.cells
+    requests = [f"*NODE PRINT, NSET={name}\nU\n" for name in model.sets.facets]
+    requests += [f"*EL PRINT, ELSET={name}\nELSE\n" for name in model.sets.cells]
+    content = abaqus(model).replace(b"*END STEP", "".join([*requests, "*END STEP"]).encode())
+    found = answer(content, tmp_path).tables
+    for name, rows in model.sets.facets.items():
+        nodes = np.unique((quadratic_facet_nodes if order == 2 else facet_triples)(cells, rows))
+        np.testing.assert_array_equal(found["displacements", name.lower()][:, 0], nodes + 1)
+    for name, members in model.sets.cells.items():
+        np.testing.assert_array_equal(found["internal energy", name.lower()][:, 0], members + 1)
+
+
+def test_pressure_on_each_surface_pushes_its_facets_inwards(tmp_path):
+    """Of 1 kPa on a facet, each of its nodes takes a third; nodes on a held side also bear what holds them."""
+    model = pressed_model()
+    mesh, every = model.mesh, f"*NSET, NSET=every, GENERATE\n1, {len(model.mesh.points)}\n"
+    for name, rows in model.sets.facets.items():
+        side = "superior" if name == "inferior" else "inferior"
+        step = f"*STEP\n*STATIC\n*BOUNDARY\n{side}, 1, 3\n*DSLOAD\n{name}, P, 1.0\n"
+        requests = "*NODE FILE\nU\n*NODE PRINT, NSET=every\nRF\n*END STEP\n"
+        content = abaqus(model._replace(loads=())) + f"{every}{step}{requests}".encode()
+        found = answer(content, tmp_path).tables["forces", "every"][:, 1:]
+        triples = facet_triples(mesh.cells, rows)
+        a, b, c = np.moveaxis(mesh.points[triples], 1, 0)
+        expected = np.zeros_like(mesh.points)
+        np.add.at(expected, triples, -np.cross(b - a, c - a)[:, None] / 6.0)
+        is_free = ~np.isin(np.arange(len(expected)), nodes_of(mesh, model.sets.facets[side]))
+        assert np.abs(expected[is_free]).max() > 1.0
+        assert_printed(found[is_free], expected[is_free], 1e-5)
+
+
+def test_numbers_of_full_length_arrive(tmp_path):
+    """A mesh near 0, where 17 digits and an exponent would be cut off: as stiff as it is without rounding."""
+    model = pressed_model()
+    shrunk = Mesh(model.mesh.points * (np.pi * 1e-6), model.mesh.cells)
+    assert max(len(repr(x)) for x in shrunk.points.ravel().tolist()) > 20
+    loads = tuple(load._replace(displacement=load.displacement * (np.pi * 1e-6)) for load in model.loads)
+    small = model._replace(mesh=shrunk, loads=loads)
+    np.testing.assert_allclose(energy(answer(abaqus(small), tmp_path)), ours(small)[1], rtol=PRINTED)

@@ -1,0 +1,297 @@
+"""`tetopt convert`, `tetopt surface`, `tetopt mesh` for solvers and from a mesh of the user's, as a user types them."""
+
+import json
+
+import meshio
+import numpy as np
+import pytest
+import trimesh
+from models import sample_image
+
+import tetopt
+from tetopt.cli import main
+from tetopt.geometry.topology import boundary_facets, largest_component
+from tetopt.io.formats import FORMATS
+
+LAW = "1 + h/7"
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    """An image, its labels, a lattice of 60 nodes with both, and the same mesh as gmsh's and LPS files."""
+    path = tmp_path_factory.mktemp("convert")
+    image = sample_image(3)
+    tetopt.save_image(path / "a.nii.gz", image)
+    tetopt.save_image(path / "l.nii.gz", tetopt.Image(1.0 * (image.data > 30), image.affine))
+    mesh = ["mesh", path / "a.nii.gz", "--labels", path / "l.nii.gz", "--spacing", "8", "--iterations", "0"]
+    assert run(*mesh, "-o", path / "a.vtu") == 0
+    return path
+
+
+def run(*arguments):
+    return main([str(argument) for argument in arguments])
+
+
+def test_a_mesh_s_file_has_its_sets_and_its_box(folder):
+    loaded = tetopt.load_mesh(folder / "a.vtu")
+    image = tetopt.load_image(folder / "a.nii.gz")
+    assert loaded.box.shape == image.shape
+    np.testing.assert_array_equal(loaded.box.affine, image.affine)
+    assert set(loaded.sets.facets) == {
+        "boundary", "left", "right", "posterior", "anterior", "inferior", "superior", "interface_0_1"
+    }  # fmt: skip
+    assert set(loaded.sets.cells) == {"label_0", "label_1"}
+    np.testing.assert_array_equal(loaded.sets.cells["label_1"], np.flatnonzero(loaded.cell_data["label"] == 1))
+    low, high = loaded.cell_data["min"], loaded.cell_data["max"]
+    assert (low <= loaded.cell_data["mean"] + 1e-9).all()
+    assert (high >= loaded.cell_data["mean"] - 1e-9).all()
+    assert (low < high).any()
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_every_format_is_written(folder, tmp_path, suffix, capsys):
+    out = tmp_path / f"out{suffix}"
+    more = [] if FORMATS[suffix].is_surface else ["--young", LAW, "--bins", "3", "--set", "dark=below:20"]
+    assert run("convert", folder / "a.vtu", out, *more, "--space", "lps") == 0
+    assert out.stat().st_size > 1000
+    said = capsys.readouterr().out
+    assert f"{out}: {FORMATS[suffix].what}, LPS+ mm, kPa, " in said
+    if more:
+        assert "3 materials" in said or "6 materials" in said or "4 materials" in said
+        assert "off by" in said
+        assert "dark_surface" in said
+    assert [path.name for path in tmp_path.iterdir()] == [out.name]
+    assert run("convert", folder / "a.vtu", out) == 2  # is there already
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_mesh_writes_every_format(folder, tmp_path, suffix):
+    out = tmp_path / f"out{suffix}"
+    more = [] if FORMATS[suffix].is_surface else ["--young", "2.5"]
+    assert run("mesh", folder / "a.nii.gz", "-o", out, "--spacing", "8", "--iterations", "0", *more) == 0
+    assert out.stat().st_size > 1000
+
+
+def test_vtu_there_and_back_with_materials_sets_and_loads(folder, tmp_path):
+    options = ["--young", LAW, "--nu", "0=0.45,1=0.3", "--load", "compress:5%", "--set", "dark=below:20"]
+    assert run("convert", folder / "a.vtu", tmp_path / "b.vtu", *options, "--units", "MPa", "--space", "lps") == 0
+    first, found = tetopt.load_mesh(folder / "a.vtu"), tetopt.load_mesh(tmp_path / "b.vtu")
+    assert found.space == "lps"
+    assert found.mesh.points.tobytes() == first.mesh.points.tobytes()  # turned back
+    np.testing.assert_array_equal(found.mesh.cells, first.mesh.cells)
+    means = first.cell_data["mean"]
+    np.testing.assert_allclose(found.cell_data["young"], (1.0 + means / 7.0) / 1000.0, rtol=1e-15)
+    np.testing.assert_array_equal(found.cell_data["nu"], np.where(first.cell_data["label"] == 1, 0.3, 0.45))
+    for kind in (0, 1):
+        for name, members in first.sets[kind].items():
+            np.testing.assert_array_equal(found.sets[kind][name], members)
+    np.testing.assert_array_equal(found.sets.cells["dark"], largest_component(first.mesh.cells, means < 20))
+    assert str(found.field_data["units"][0]) == "MPa"
+    loads = json.loads(str(found.field_data["loads"][0]))
+    assert [name for name, _ in loads] == ["superior", "inferior"]
+    # And on, in kPa again, what was painted kept.
+    assert run("convert", tmp_path / "b.vtu", tmp_path / "c.vtu") == 0
+    again = tetopt.load_mesh(tmp_path / "c.vtu")
+    np.testing.assert_allclose(again.cell_data["young"], 1.0 + means / 7.0, rtol=1e-14)
+    assert again.space == "ras"
+    assert list(again.sets.cells) == list(found.sets.cells)
+    assert again.box.shape == first.box.shape
+
+
+def test_an_image_gives_the_mean_of_the_law(folder, tmp_path):
+    """Of a curved law, which is not the law of the mean."""
+    for name, more in (("mean", []), ("image", ["--image", folder / "a.nii.gz"])):
+        assert run("convert", folder / "a.vtu", tmp_path / f"{name}.vtu", "--young", "1 + h**2", *more) == 0
+    young = {name: tetopt.load_mesh(tmp_path / f"{name}.vtu").cell_data["young"] for name in ("mean", "image")}
+    fields = tetopt.load_mesh(folder / "a.vtu").cell_data
+    np.testing.assert_allclose(young["image"] - young["mean"], fields["variance"], atol=1e-9)
+    assert fields["variance"].max() > 10
+
+
+def test_a_mesh_of_gmsh_s_is_measured_and_painted(folder, tmp_path, capsys):
+    first = tetopt.load_mesh(folder / "a.vtu").mesh
+    skin = boundary_facets(first.cells)
+    other = meshio.Mesh(
+        first.points,
+        [("triangle", skin), ("tetra", first.cells)],
+        cell_data={"gmsh:physical": [np.full(len(skin), 7), np.full(len(first.cells), 8)],
+                   "gmsh:geometrical": [np.full(len(skin), 7), np.full(len(first.cells), 8)]},
+        field_data={"skin": np.array([7, 2]), "tissue": np.array([8, 3])},
+    )  # fmt: skip
+    meshio.gmsh.write(tmp_path / "g.msh", other, fmt_version="2.2", binary=True)
+    loaded = tetopt.load_mesh(tmp_path / "g.msh")
+    assert loaded.mesh.points.tobytes() == first.points.tobytes()
+    assert loaded.n_left == len(skin)
+    assert len(loaded.sets.facets["skin"]) == len(skin)
+    assert len(loaded.sets.cells["tissue"]) == len(first.cells)
+    assert run("quality", tmp_path / "g.msh", "--image", folder / "a.nii.gz", "--check") == 0
+    assert "fills the box" in capsys.readouterr().out
+    assert run("convert", tmp_path / "g.msh", tmp_path / "g.inp", "--young", LAW) == 2
+    assert "the mesh has no means; give the image (--image)" in capsys.readouterr().err
+    assert not (tmp_path / "g.inp").exists()
+    options = ["--image", folder / "a.nii.gz", "--young", LAW, "--load", "compress:1%"]
+    assert run("convert", tmp_path / "g.msh", tmp_path / "g.inp", *options) == 0
+    text = (tmp_path / "g.inp").read_text()
+    assert "*STATIC" in text
+
+
+# From a mesh of the user's
+
+
+def test_a_mesh_is_improved_and_its_boundary_kept(folder, tmp_path, capsys):
+    assert run("convert", folder / "a.vtu", tmp_path / "a.vtu", "--set", "top=plane:0,0,118:0,0,1:5") == 0
+    options = ["--start", tmp_path / "a.vtu", "--iterations", "4", "--json", tmp_path / "b.json"]
+    assert run("mesh", folder / "a.nii.gz", "-o", tmp_path / "b.vtu", *options) == 0
+    assert "start of" in capsys.readouterr().err
+    before, after = (tetopt.load_mesh(tmp_path / name) for name in ("a.vtu", "b.vtu"))
+    sides = [
+        {frozenset(map(tuple, corners)) for corners in mesh.points[boundary_facets(mesh.cells)].tolist()}
+        for mesh in (before.mesh, after.mesh)
+    ]
+    assert sides[0] == sides[1]  # to the last bit
+    assert len(after.sets.facets["top"]) == len(before.sets.facets["top"]) > 0
+    image = sample_image(3)
+    assert tetopt.E_D(image, after.mesh) < 0.95 * tetopt.E_D(image, before.mesh)
+    told = json.loads((tmp_path / "b.json").read_text())
+    assert told["options"]["start"] == "a.vtu"
+    assert told["options"]["boundary"] == "fixed"
+    assert told["sets"]["facets"]["top"] == len(after.sets.facets["top"])
+
+
+@pytest.mark.parametrize(
+    ("more", "match"),
+    [
+        (["--nodes", "100"], "--start and --nodes"),
+        (["--mask", "l.nii.gz"], "--start and --mask"),
+        (["--uniform"], "--start and --uniform"),
+        (["--lattice", "bcc"], "--start and --lattice"),
+        (["--size-max", "3"], "--size-max: only on a graded mesh"),
+        (["--method", "paper"], "only with --method fast"),
+    ],
+)
+def test_options_that_ask_for_another_mesh(folder, tmp_path, more, match, capsys):
+    more = [folder / each if each.endswith(".gz") else each for each in more]
+    assert run("mesh", folder / "a.nii.gz", "-o", tmp_path / "b.vtu", "--start", folder / "a.vtu", *more) == 2
+    assert match in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_mesh_beside_the_image(folder, tmp_path, capsys):
+    image = sample_image(3)
+    away = image.affine.copy()
+    away[:3, 3] += 500.0
+    tetopt.save_image(tmp_path / "away.nii.gz", tetopt.Image(image.data, away))
+    assert run("mesh", tmp_path / "away.nii.gz", "-o", tmp_path / "b.vtu", "--start", folder / "a.vtu") == 2
+    assert "lies beside the image" in capsys.readouterr().err
+
+
+# Bad input: one line, exit 2, nothing left behind
+
+
+@pytest.mark.parametrize(
+    ("out", "more", "match"),
+    [
+        ("a.foo", [], "unknown suffix; known are .vtu (VTK, ParaView), .vtk"),
+        ("a", [], "unknown suffix"),
+        ("a.inp", ["--young", "1 + x"], 'cannot use "x"'),
+        ("a.inp", ["--young", "__import__('os')"], "cannot use"),
+        ("a.inp", ["--young", "0:1,100:5,50:3"], "must increase, got 100 and then 50"),
+        ("a.inp", ["--young", "no.toml"], "no such file"),
+        ("a.inp", ["--young", "0"], "young: expected moduli above 0 kPa"),
+        ("a.inp", ["--young", "-h"], "expected 0 kPa or more"),
+        ("a.inp", ["--young", "2", "--nu", "0.5"], "-1 < nu < 0.5"),
+        ("a.inp", ["--young", "2", "--nu", "-1"], "-1 < nu < 0.5"),
+        ("a.inp", ["--young", "2", "--nu", "x"], 'cannot use "x"'),
+        ("a.inp", ["--nu", "0.3"], "--nu: there is no --young"),
+        ("a.inp", ["--young", "1=2"], "the mesh also has 0"),
+        ("a.inp", ["--bins", "4"], "no moduli to group"),
+        ("a.inp", ["--young", "h+1", "--bins", "0"], "--bins: expected K"),
+        ("a.inp", ["--young", "h+1", "--bins", "4:cubic"], "--bins: expected K"),
+        ("a.inp", ["--units", "Pa"], "--units: expected kPa or MPa"),
+        ("a.inp", ["--space", "xyz"], "--space: expected ras or lps"),
+        ("a.inp", ["--order", "3"], "--order: expected 1 or 2"),
+        ("a.vtu", ["--order", "2"], "--order 2 is for .inp, .feb only"),
+        ("a.inp", ["--load", "compress:5%"], "loads, but no materials"),
+        ("a.inp", ["--young", "2", "--load", "compress:5"], "a percentage"),
+        ("a.inp", ["--young", "2", "--load", "hold:skin"], 'no set of facets "skin"'),
+        ("a.inp", ["--set", "x=above:3"], "expected NAME=below:T"),
+        ("a.feb", [], "needs a material; give a law of the modulus (--young)"),
+        ("a.scn", [], "--young"),
+        ("a.stl", ["--young", "2"], "holds the boundary alone"),
+        ("a.inp", ["--mask", "m.nii.gz"], "--mask: there is no --image"),
+        ("no/a.inp", [], "folder does not exist"),
+    ],
+)
+def test_conversions_that_are_refused(folder, tmp_path, out, more, match, capsys):
+    assert run("convert", folder / "a.vtu", tmp_path / out, *more) == 2
+    said = capsys.readouterr().err
+    assert match in said
+    assert said.count("\n") == 1
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_what_will_not_do_is_said_before_the_optimisation(folder, tmp_path, capsys):
+    for more in (["--young", "h - 20"], ["--young", "2", "--load", "hold:skin"]):
+        assert run("mesh", folder / "a.nii.gz", "-o", tmp_path / "a.inp", "--spacing", "8", *more) == 2
+        said = capsys.readouterr().err
+        assert said.count("\n") == 1, said
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_mesh_s_file_is_not_replaced_by_itself(folder, capsys):
+    before = (folder / "a.vtu").read_bytes()
+    assert run("convert", folder / "a.vtu", folder / "a.vtu", "--force") == 2
+    assert "is an input of this command too" in capsys.readouterr().err
+    assert (folder / "a.vtu").read_bytes() == before
+
+
+# Surfaces
+
+
+@pytest.mark.parametrize(("what", "suffix"), [("below", "stl"), ("label", "ply"), ("set", "stl")])
+def test_the_surface_of_a_structure(folder, tmp_path, what, suffix, capsys):
+    loaded = tetopt.load_mesh(folder / "a.vtu")
+    chosen = {
+        "below": largest_component(loaded.mesh.cells, loaded.cell_data["mean"] < 12),
+        "label": np.flatnonzero(loaded.cell_data["label"] == 1),
+        "set": loaded.sets.cells["label_0"],
+    }[what]
+    value = {"below": "12", "label": "1", "set": "label_0"}[what]
+    out = tmp_path / f"s.{suffix}"
+    assert run("surface", folder / "a.vtu", f"--{what}", value, "-o", out, "--json", tmp_path / "s.json") == 0
+    said = capsys.readouterr().out
+    assert "watertight, normals out" in said
+    found = trimesh.load_mesh(out)
+    assert found.is_watertight
+    assert found.volume == pytest.approx(loaded.cell_data["volume"][chosen].sum(), rel=1e-3)
+    told = json.loads((tmp_path / "s.json").read_text())
+    assert told["volume"] == pytest.approx(found.volume)
+    assert told["area"] == pytest.approx(found.area)
+    assert f"{found.volume:.6g}" in said
+    assert f"{found.area:.6g}" in said
+
+
+@pytest.mark.parametrize(
+    ("more", "match"),
+    [
+        ([], "one of --below, --label and --set"),
+        (["--below", "3", "--label", "1"], "one of --below, --label and --set"),
+        (["--below", "-3"], "no cell has a mean below -3"),
+        (["--label", "7"], "no cell has label 7; there are 0, 1"),
+        (["--set", "skin"], 'no set of cells "skin"; it has label_0, label_1'),
+        (["--label", "1", "--space", "x"], "expected ras or lps"),
+    ],
+)
+def test_surfaces_that_are_refused(folder, tmp_path, more, match, capsys):
+    assert run("surface", folder / "a.vtu", "-o", tmp_path / "s.stl", *more) == 2
+    assert match in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_field_that_is_not_there(folder, tmp_path, capsys):
+    tetopt.save_mesh(tmp_path / "bare.vtu", tetopt.load_mesh(folder / "a.vtu").mesh)
+    for more in (["--below", "3"], ["--label", "1"]):
+        assert run("surface", tmp_path / "bare.vtu", "-o", tmp_path / "s.stl", *more) == 2
+        assert "on its cells; it has nothing" in capsys.readouterr().err
+    assert run("surface", folder / "a.vtu", "-o", tmp_path / "s.obj", "--label", "1") == 2
+    assert "ends in .stl or .ply" in capsys.readouterr().err

@@ -1,0 +1,109 @@
+"""``tetopt surface``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import typer
+from numpy.typing import NDArray
+from rich.markup import escape
+
+from tetopt import InputError
+from tetopt.cli.console import log, out, show_warning
+from tetopt.cli.inputs import cell_field, check_no_input, read_mesh
+from tetopt.cli.options import ForceOption, JsonOption, MeshArgument, SpaceOption
+from tetopt.geometry.simplex import volumes
+from tetopt.geometry.surface import surface_of
+from tetopt.geometry.topology import largest_component
+from tetopt.io.files import checked_output, save_json
+from tetopt.io.meshes import MeshFile
+from tetopt.io.surfaces import SUFFIXES, checked_surface, save_surface
+from tetopt.model.model import SPACES
+from tetopt.report.tables import new_table
+
+
+def surface_command(
+    mesh_path: MeshArgument,
+    output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT.stl", help="Surface to write, STL or PLY.")],
+    below: Annotated[
+        float | None, typer.Option(metavar="T", help="Of the largest connected set of cells with a mean below T.")
+    ] = None,
+    label: Annotated[int | None, typer.Option(metavar="L", help="Of all cells with this label.")] = None,
+    cell_set: Annotated[str | None, typer.Option("--set", metavar="NAME", help="Of a named set of cells.")] = None,
+    space: SpaceOption = "ras",
+    json_path: JsonOption = None,
+    force: ForceOption = False,
+) -> int:
+    """Write the boundary of a structure in a mesh, watertight; print its volume and area."""
+    output = checked_output(output, SUFFIXES, force)
+    if json_path is not None:
+        json_path = checked_output(json_path, (".json",), force)
+    check_no_input(output, mesh_path)
+    if sum(wish is not None for wish in (below, label, cell_set)) != 1:
+        raise InputError("surface: give one of --below, --label and --set")
+    if space not in SPACES:
+        raise InputError(f"--space: expected {' or '.join(SPACES)}, got {space}")
+    loaded = read_mesh(mesh_path)
+    if loaded.mesh.ndim != 3:
+        raise InputError(f"{mesh_path}: expected tetrahedra, whose boundary is a surface, found triangles")
+    chosen = _chosen(loaded, mesh_path, below, label, cell_set)
+    surface = surface_of(loaded.mesh.points, loaded.mesh.cells, chosen)
+    save_surface(output, surface, mesh_path.name, space)
+    found = checked_surface(output)
+    table = new_table("", escape(output.name))
+    table.add_row("cells", str(len(chosen)))
+    table.add_row("triangles", str(len(surface.triangles)))
+    table.add_row("closed surfaces", str(found.n_pieces))
+    table.add_row("volume, mm3", f"{found.volume:.6g}")
+    table.add_row("of the cells, mm3", f"{volumes(loaded.mesh.points, loaded.mesh.cells[chosen]).sum():.6g}")
+    table.add_row("area, mm2", f"{found.area:.6g}")
+    if surface.n_parted:
+        log.print(
+            f"{surface.n_parted} nodes where the structure touches itself were parted, by "
+            f"{surface.largest_shift:.2g} mm at most, so that each edge is in two triangles"
+        )
+    if json_path is not None:
+        save_json(
+            json_path,
+            {
+                "mesh": mesh_path.name,
+                "surface": output.name,
+                **found._asdict(),
+                "n_parted": surface.n_parted,
+                "largest_shift_mm": surface.largest_shift,
+            },
+        )
+    out.print(table)
+    if not (found.is_watertight and found.is_winding_consistent and found.volume > 0.0):
+        log.print(f"[bold red]tetopt:[/] {escape(str(output))}: not watertight, by trimesh; please report this")
+        return 1
+    out.print("checked with trimesh: watertight, normals out")
+    return 0
+
+
+def _chosen(
+    loaded: MeshFile, path: Path, below: float | None, label: int | None, cell_set: str | None
+) -> NDArray[np.int64]:
+    """Numbers of the cells that make up the structure."""
+    if cell_set is not None:
+        if cell_set not in loaded.sets.cells:
+            known = ", ".join(loaded.sets.cells) or "none"
+            raise InputError(f'{path}: has no set of cells "{cell_set}"; it has {known}')
+        return loaded.sets.cells[cell_set]
+    if label is not None:
+        labels = cell_field(loaded, path, "label")
+        chosen = np.flatnonzero(labels == label)
+        if len(chosen) == 0:
+            known = ", ".join(f"{each:g}" for each in np.unique(labels)[:20])
+            raise InputError(f"{path}: no cell has label {label}; there are {known}")
+        return chosen
+    assert below is not None
+    mean = cell_field(loaded, path, "mean")
+    chosen = largest_component(loaded.mesh.cells, mean < below)
+    if len(chosen) == 0:
+        raise InputError(f"{path}: no cell has a mean below {below:g}, they go from {mean.min():g} up")
+    if len(chosen) == len(mean):
+        show_warning(f"every cell has a mean below {below:g}: this is the mesh's own boundary")
+    return chosen

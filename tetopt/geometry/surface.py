@@ -1,0 +1,353 @@
+"""The boundary of a set of tetrahedra as a watertight triangle surface.
+
+Cells of the set that touch only in an edge or a node leave an edge with four triangles, or a node with several fans of
+triangles. They are parted here: each sheet of the surface gets its own copy, and copies are moved apart a little,
+since readers of surface files weld nodes by their place.
+
+Half-edge 3 t + k runs from corner k of triangle t to the next one; it and the corner it leaves share that number.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from tetopt.errors import InputError
+from tetopt.geometry.simplex import edge_pairs, facet_areas, volumes
+from tetopt.geometry.topology import Facets, facets
+
+# The facet opposite each local node, its nodes turned to face out of a positively oriented cell.
+OUTWARD = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
+
+# Copies are moved by this part of the smallest height of the cells around,
+STEP = 2e-3
+# or by so many float32 spacings, as binary STL is in float32,
+N_SPACINGS = 16
+# but never by more than this part of that height, so that no cell turns inside out.
+MOST = 0.1
+
+# Steps of the search for a way that is inwards of a whole fan: with the mean of the normals instead, sheets of random
+# sets of cells cross fifteen times as often, with three steps about as seldom.
+N_SEARCH = 20
+
+FOLDED = "surface: expected a conforming mesh, some of the chosen cells fold over one another; see `tetopt check`"
+
+
+class Surface(NamedTuple):
+    """Closed triangle surfaces in space."""
+
+    points: NDArray[np.float64]  # (N, 3), world mm
+    triangles: NDArray[np.int64]  # (K, 3), normals out of the solid
+    n_parted: int  # nodes that have several copies, and edges that have several middles
+    largest_shift: float  # mm, the farthest that a copy was moved; 0 where nothing was parted
+
+
+class _Skin(NamedTuple):
+    """The boundary as it is in the mesh, and which half-edges belong together."""
+
+    points: NDArray[np.float64]  # (N, 3), all nodes of the mesh
+    triangles: NDArray[np.int64]  # (K, 3)
+    normals: NDArray[np.float64]  # (K, 3), unit vectors, outwards
+    partner: NDArray[np.int64]  # (3K,), the half-edge on the other side, met by walking through the solid
+    angle: NDArray[np.float64]  # (3K,), radians, 0 to 2 pi, between the two triangles through the solid
+    height: NDArray[np.float64]  # (N,), mm, the smallest height of the chosen cells around each node
+
+
+class _Sheets(NamedTuple):
+    """Fans or edges of which several lie in the same place and have to be moved apart."""
+
+    points: NDArray[np.float64]  # (S, 3), equal where `place` is
+    place: NDArray[np.int64]  # (S,)
+    inside: NDArray[np.float64]  # (S,), the share of all directions that go into the solid, 0 to 1
+    height: NDArray[np.float64]  # (S,), mm, of the cells around
+    normals: NDArray[np.float64]  # (C, 3), unit vectors, of the triangles of all sheets
+    sheet: NDArray[np.int64]  # (C,), whose normal it is, ascending
+
+
+def surface_of(points: NDArray[np.float64], cells: NDArray[np.integer], chosen: ArrayLike) -> Surface:
+    """The boundary of the chosen tetrahedra: closed, two triangles at each edge, one fan at each node.
+
+    Where chosen cells touch only in a node or an edge, the sheets of the surface are parted: the flattest keeps its
+    place, the others move into the narrower of their two sides, the narrowest farthest, by a five-hundredth of the
+    smallest height of the cells around, or what float32 needs. So the solid comes apart there, and a ring closed by an
+    edge alone opens. A cavity's wall is a surface of its own, with normals into the cavity.
+
+    Parameters
+    ----------
+    points : (N, 3) array of float64
+        Nodes in world mm.
+    cells : (M, 4) array of int
+        Positively oriented tetrahedra of a conforming mesh.
+    chosen : (M,) array of bool, or (C,) array of int
+        The cells, as a mask or as indices.
+
+    Raises
+    ------
+    InputError
+        Triangles in the plane, no cell chosen, a mask of another length, indices out of range or no integers, cells
+        that fold over one another.
+
+    Examples
+    --------
+    >>> surface = surface_of(np.vstack([np.zeros(3), np.eye(3)]), np.array([[0, 1, 2, 3]]), [True])
+    >>> surface.triangles.shape, surface.n_parted
+    ((4, 3), 0)
+    """
+    skin = _skin(points, _chosen_cells(points, cells, chosen))
+    fan = _fans(skin.partner)
+    at = np.empty((fan.max() + 1, 3))
+    at[fan] = points[skin.triangles.ravel()]
+
+    copies, nodes = _split_nodes(skin, fan)
+    at[copies], shift = _moved_apart(nodes)
+    doubled, edges = _split_edges(skin, fan)
+    middles, edge_shift = _moved_apart(edges)
+    at, triangles = _with_middles(at, fan.reshape(-1, 3), doubled, skin.partner[doubled], middles)
+
+    n_parted = len(np.unique(nodes.place)) + len(np.unique(edges.place))
+    return Surface(at, triangles, n_parted, float(np.append(shift, edge_shift).max(initial=0.0)))
+
+
+def volume_and_area(surface: Surface) -> tuple[float, float]:
+    """Enclosed volume in mm^3, cavities left out, by the divergence theorem, and area in mm^2 with their walls."""
+    centred = surface.points - surface.points.mean(axis=0)  # far from the origin its digits would cancel
+    a, b, c = centred[surface.triangles.T]
+    across = np.cross(b - a, c - a)
+    return float((a * across).sum() / 6.0), float(np.linalg.norm(across, axis=1).sum() / 2.0)
+
+
+def n_pieces(surface: Surface) -> int:
+    """Number of closed surfaces that are not connected; a cavity's wall counts as one."""
+    first, second, third = surface.triangles.T
+    number = _connected(np.append(first, first), np.append(second, third), len(surface.points))
+    return len(np.unique(number[first]))
+
+
+def _chosen_cells(points: NDArray, cells: NDArray, chosen: ArrayLike) -> NDArray[np.int64]:
+    if points.shape[1] != 3 or cells.shape[1] != 4:
+        raise InputError(
+            f"surface: expected tetrahedra in space, got cells of {cells.shape[1]} nodes; mesh a 3-D image"
+        )
+    chosen = np.asarray(chosen)
+    if chosen.dtype == np.bool_:
+        if chosen.shape != (len(cells),):
+            raise InputError(f"surface: expected a mask of {len(cells)} cells, got shape {chosen.shape}")
+        chosen = np.flatnonzero(chosen)
+    if chosen.size == 0:
+        raise InputError("surface: no cell is chosen, expected at least one; choose another threshold or label")
+    if not np.issubdtype(chosen.dtype, np.integer):
+        raise InputError(f"surface: expected cells as a mask or as indices, got {chosen.dtype}")
+    if chosen.min() < 0 or chosen.max() >= len(cells):
+        raise InputError(f"surface: cell indices must lie in 0..{len(cells) - 1}, got {chosen.min()}..{chosen.max()}")
+    is_chosen = np.zeros(len(cells), dtype=bool)
+    is_chosen[chosen] = True
+    return cells[is_chosen].astype(np.int64)
+
+
+def _skin(points: NDArray[np.float64], cells: NDArray[np.int64]) -> _Skin:
+    found = facets(cells)
+    if (found.n_cells > 2).any():
+        raise InputError(FOLDED)
+    owner, opposite = np.nonzero(found.n_cells[found.of_cell] == 1)
+    triangles = cells[owner[:, None], OUTWARD[opposite]]
+    a, b, c = points[triangles.T]
+    normals = np.cross(b - a, c - a)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    partner = _partners(cells, found, triangles, found.of_cell[owner, opposite])
+    angle = _inner_angles(points, triangles, normals, partner)
+    return _Skin(points, triangles, normals, partner, angle, _smallest_heights(points, cells))
+
+
+def _partners(
+    cells: NDArray[np.int64], found: Facets, triangles: NDArray[np.int64], facet: NDArray[np.int64]
+) -> NDArray[np.int64]:
+    """The half-edge that each one meets, (3K,); `facet` is each triangle's number among the facets found."""
+    start, end = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
+    n_nodes = int(cells.max()) + 1
+    key, edge, count = np.unique(_pair_key(start, end, n_nodes), return_inverse=True, return_counts=True)
+    walk = np.zeros(len(start), dtype=np.int64)
+    is_crowded = count[edge] > 2
+    if is_crowded.any():
+        crowded = np.flatnonzero(count > 2)
+        where = np.searchsorted(crowded, edge[is_crowded])
+        walk[is_crowded] = _walks(cells, found, key[crowded], n_nodes, np.repeat(facet, 3)[is_crowded], where)
+    one, other = np.lexsort((walk, edge)).reshape(-1, 2).T
+    partner = np.empty(len(start), dtype=np.int64)
+    partner[one], partner[other] = other, one
+    if (start[partner] != end).any():
+        raise InputError(FOLDED)
+    return partner
+
+
+def _walks(
+    cells: NDArray[np.int64],
+    found: Facets,
+    crowded: NDArray[np.int64],
+    n_nodes: int,
+    facet: NDArray[np.int64],
+    edge: NDArray[np.int64],
+) -> NDArray[np.int64]:
+    """Number of the walk around an edge, from cell to cell through their facets, that ends in each facet asked for.
+
+    `crowded` are the edges' keys, ascending, and `edge` are indices into it. Every walk has two ends.
+    """
+    is_end = np.zeros(n_nodes, dtype=bool)
+    is_end[crowded // n_nodes] = is_end[crowded % n_nodes] = True
+    steps = []
+    # A cell leads from one facet at its edge to the other: they lie opposite the two nodes that the edge leaves out.
+    for (i, j), (k, m) in zip(edge_pairs(3), reversed(edge_pairs(3)), strict=True):
+        near = np.flatnonzero(is_end[cells[:, i]] & is_end[cells[:, j]])
+        key = _pair_key(cells[near, i], cells[near, j], n_nodes)
+        at = np.minimum(np.searchsorted(crowded, key), len(crowded) - 1)
+        is_at, near = crowded[at] == key, near[crowded[at] == key]
+        steps.append(found.of_cell[near][:, [k, m]] * len(crowded) + at[is_at, None])
+    state, step = np.unique(np.vstack(steps), return_inverse=True)
+    one, other = step.reshape(-1, 2).T
+    return _connected(one, other, len(state))[np.searchsorted(state, facet * len(crowded) + edge)]
+
+
+def _inner_angles(
+    points: NDArray[np.float64], triangles: NDArray[np.int64], normals: NDArray[np.float64], partner: NDArray[np.int64]
+) -> NDArray[np.float64]:
+    """`_Skin.angle`: pi where flat, less where the edge is convex."""
+    along = (points[np.roll(triangles, -1, axis=1)] - points[triangles]).reshape(-1, 3)
+    one, other = np.repeat(normals, 3, axis=0), normals[partner // 3]
+    sine = (np.cross(one, other) * along).sum(axis=1) / np.linalg.norm(along, axis=1)
+    return np.pi - np.arctan2(sine, (one * other).sum(axis=1))
+
+
+def _smallest_heights(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.float64]:
+    """`_Skin.height`; infinite at nodes of no cell."""
+    smallest = np.full(len(points), np.inf)
+    of_cell = 3.0 * volumes(points, cells) / facet_areas(points, cells).max(axis=1)
+    np.minimum.at(smallest, cells.ravel(), np.repeat(of_cell, 4))
+    return smallest
+
+
+def _fans(partner: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The fan of each corner, (3K,), numbered from 0: the corners that one meets turning about a node."""
+    corner = np.arange(len(partner))
+    before = corner - corner % 3 + (corner + 2) % 3
+    return _connected(corner, partner[before], len(corner))
+
+
+def _split_nodes(skin: _Skin, fan: NDArray[np.int64]) -> tuple[NDArray[np.int64], _Sheets]:
+    """The fans at nodes that have several, (S,), ascending, and these fans as sheets."""
+    node = np.empty(fan.max() + 1, dtype=np.int64)
+    node[fan] = skin.triangles.ravel()
+    is_split = np.bincount(node)[node] > 1
+    copies = np.flatnonzero(is_split)
+    corners = np.flatnonzero(is_split[fan])
+    corners = corners[np.argsort(fan[corners], kind="stable")]
+    # Girard: the solid angle of a cone is the sum of the angles at its edges, less (edges - 2) pi.
+    solid = np.asarray(np.bincount(fan, weights=skin.angle - np.pi), dtype=np.float64)[copies] + 2.0 * np.pi
+    place = node[copies]
+    sheet = np.searchsorted(copies, fan[corners])
+    return copies, _Sheets(
+        skin.points[place], place, solid / (4.0 * np.pi), skin.height[place], skin.normals[corners // 3], sheet
+    )
+
+
+def _split_edges(skin: _Skin, fan: NDArray[np.int64]) -> tuple[NDArray[np.int64], _Sheets]:
+    """Half-edges, one of each pair, whose two ends are joined by another pair as well, (S,), and these as sheets.
+
+    Where a ring of cells closes in an edge, but cells around each end of the edge close it too, neither end has
+    several fans, and still four triangles share the edge. A middle of its own for either pair parts them.
+    """
+    half = np.flatnonzero(np.arange(len(fan)) < skin.partner)
+    key = _pair_key(fan[half], fan[skin.partner[half]], fan.max() + 1)
+    _, place, count = np.unique(key, return_inverse=True, return_counts=True)
+    is_doubled = count[place] > 1
+    doubled, place = half[is_doubled], place[is_doubled]
+    both = np.column_stack([doubled, skin.partner[doubled]])
+    ends = skin.triangles.ravel()[both]
+    return doubled, _Sheets(
+        skin.points[ends].mean(axis=1),
+        place,
+        skin.angle[doubled] / (2.0 * np.pi),
+        skin.height[ends].min(axis=1),
+        skin.normals[both.ravel() // 3],
+        np.repeat(np.arange(len(doubled)), 2),
+    )
+
+
+def _moved_apart(sheets: _Sheets) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """New places of the sheets, (S, 3), and by how much they moved, (S,), mm.
+
+    Of two sheets that do not cross, the narrower sides lie apart or one within the other. So each may move into its
+    own, if those within others move farther; and the widest need not move at all.
+    """
+    if len(sheets.place) == 0:
+        return sheets.points, np.zeros(0)
+    narrow = np.minimum(sheets.inside, 1.0 - sheets.inside)
+    order = np.lexsort((-narrow, sheets.place))
+    _, first, count = np.unique(sheets.place[order], return_index=True, return_counts=True)
+    rank, last = np.empty((2, len(order)), dtype=np.int64)
+    rank[order] = np.arange(len(order)) - np.repeat(first, count)
+    last[order] = np.repeat(count - 1, count)
+    spacing = np.spacing(np.abs(sheets.points).max(axis=1).astype(np.float32)).astype(np.float64)
+    farthest = np.minimum(np.maximum(STEP * sheets.height, N_SPACINGS * last * spacing), MOST * sheets.height)
+    shift = farthest * rank / last
+    sign = np.where(sheets.inside <= 0.5, -1.0, 1.0)
+    return sheets.points + (sign * shift)[:, None] * _outwards(sheets.normals, sheets.sheet), shift
+
+
+def _outwards(normals: NDArray[np.float64], sheet: NDArray[np.int64]) -> NDArray[np.float64]:
+    """For each sheet a unit vector whose smallest product with its normals is the greatest, (S, 3).
+
+    That is the direction of the point of their convex hull next to the origin; Frank and Wolfe's steps go there.
+    """
+    start = np.flatnonzero(np.diff(sheet, prepend=-1))
+    nearest = np.add.reduceat(normals, start) / np.diff(start, append=len(sheet))[:, None]
+    lowest = np.empty(len(start), dtype=np.int64)
+    for _ in range(N_SEARCH):
+        product = np.einsum("ij,ij->i", normals, nearest[sheet])
+        is_lowest = product == np.minimum.reduceat(product, start)[sheet]
+        lowest[sheet[is_lowest]] = np.flatnonzero(is_lowest)
+        towards = normals[lowest] - nearest
+        square = (towards**2).sum(axis=1)
+        way = np.divide(-(nearest * towards).sum(axis=1), square, out=np.zeros_like(square), where=square > 0.0)
+        nearest += np.clip(way, 0.0, 1.0)[:, None] * towards
+    length = np.linalg.norm(nearest, axis=1, keepdims=True)
+    # No direction is outwards of all where the origin is in the hull; any will do then.
+    nearest = np.where(length > 1e-9, nearest, normals[start])
+    return nearest / np.linalg.norm(nearest, axis=1, keepdims=True)
+
+
+def _with_middles(
+    points: NDArray[np.float64],
+    triangles: NDArray[np.int64],
+    half: NDArray[np.int64],
+    partner: NDArray[np.int64],
+    middles: NDArray[np.float64],
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Points and triangles with these middles of half-edges and their partners put in.
+
+    Their triangles are cut from the centroid to every corner and middle, which is the same for one, two or three.
+    """
+    of_half = np.full(triangles.size, -1, dtype=np.int64)
+    of_half[half] = of_half[partner] = len(points) + np.arange(len(middles))
+    is_cut = (of_half.reshape(-1, 3) >= 0).any(axis=1)
+    corner, middle = triangles[is_cut], of_half.reshape(-1, 3)[is_cut]
+    after = np.roll(corner, -1, axis=1)
+    centre = np.broadcast_to(len(points) + len(middles) + np.arange(len(corner))[:, None], corner.shape)
+    has_middle = middle >= 0
+    parts = np.stack([corner, np.where(has_middle, middle, after), centre], axis=-1).reshape(-1, 3)
+    more = np.stack([middle, after, centre], axis=-1)[has_middle]
+    centres = points[corner].mean(axis=1)
+    return np.vstack([points, middles, centres]), np.vstack([triangles[~is_cut], parts, more])
+
+
+def _pair_key(one: NDArray[np.int64], other: NDArray[np.int64], base: int) -> NDArray[np.int64]:
+    """One number for two numbers below `base`, whatever their order."""
+    return np.minimum(one, other) * base + np.maximum(one, other)
+
+
+def _connected(one: NDArray[np.int64], other: NDArray[np.int64], n: int) -> NDArray[np.int64]:
+    """Number of the connected set of each of n things, (n,), where one[i] and other[i] are linked."""
+    graph = coo_array((np.ones(len(one), dtype=np.int8), (one, other)), shape=(n, n))
+    return connected_components(graph, directed=False)[1].astype(np.int64)

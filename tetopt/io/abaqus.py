@@ -1,0 +1,151 @@
+"""Abaqus input files, which CalculiX reads, too: mesh, sets, materials and a static step."""
+
+from __future__ import annotations
+
+import textwrap
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.errors import InputError
+from tetopt.io.text import blocks, rows
+from tetopt.model.model import Model, described, quadratic, quadratic_facet_nodes
+from tetopt.model.sets import nodes_of
+
+ALL = "all_cells"
+FACES = np.array([3, 4, 2, 1])  # number of the face opposite each local node: S1 = 1-2-3, 1-4-2, 2-4-3, S4 = 3-4-1
+# Characters of a number. Abaqus takes no more, and CalculiX reads the first 20: 1.234567890123456e-05 becomes 1.23.
+WIDTH = 20
+COMMENT = 120  # characters of a comment line; Abaqus reads lines of 256
+
+# Requests that both solvers know. CalculiX alone has TOTALS=ONLY, which would leave out the energy of each cell.
+REQUESTS = f"""\
+** Displacement, stress and strain (CalculiX .frd, Abaqus .fil)
+*NODE FILE
+U
+*EL FILE
+S, E
+** Strain energy of each cell and their total (.dat)
+*EL PRINT, ELSET={ALL}, TOTALS=YES
+ELSE
+"""
+
+
+def abaqus(model: Model) -> bytes:
+    """The content of an Abaqus input file (.inp), for Abaqus/Standard and CalculiX.
+
+    Linear (C3D4) or quadratic (C3D10) tetrahedra. Each facet set is a surface and a node set of its name, the latter
+    with midside nodes if there are; each cell set is an element set. "all_cells" are all elements, "material_1", ...
+    those of each material. With loads there is a linear static step, whose strain energy and reaction forces both
+    solvers print. Cell data has no place in such a file; a comment names what is left out.
+
+    Numbers read back the same, but for those that take more than 20 characters, which neither solver reads: they are
+    rounded to the 13 to 16 digits that fit. Of coordinates these are some of those within 0.1 mm of 0.
+
+    Raises
+    ------
+    InputError
+        A 2-D model, loads without materials, or a cell set with the name of one of the file's own.
+    """
+    _check(model)
+    parts = [_head(model), *_mesh(model)]
+    parts += [f"*ELSET, ELSET={name}\n{_list(cells)}" for name, cells in model.sets.cells.items()]
+    parts += [f"*SURFACE, NAME={name}, TYPE=ELEMENT\n{_faces(found)}" for name, found in model.sets.facets.items()]
+    parts += _materials(model)
+    if model.loads:
+        parts += _step(model)
+    return "".join(parts).encode("utf-8", "replace")
+
+
+def _check(model: Model) -> None:
+    if model.mesh.ndim == 2:
+        raise InputError("abaqus: expected a mesh of tetrahedra, got triangles; .vtu holds them")
+    if model.loads and model.materials is None:
+        raise InputError(
+            "abaqus: loads, but no materials to press on; give a law of the modulus (--young) or leave out the loads"
+        )
+    own = {ALL, *_material_names(model)}
+    if taken := [name for name in model.sets.cells if name.lower() in own]:
+        raise InputError(f'abaqus: the file has a set "{taken[0].lower()}" of its own; call yours otherwise')
+
+
+def _head(model: Model) -> str:
+    lines = described(model)
+    if model.cell_data:
+        lines.append(f"cell data that this format has no place for: {', '.join(model.cell_data)}")
+    comments = [f"** {part}\n" for line in lines for part in textwrap.wrap(line, COMMENT)]
+    return "".join([*comments, "*HEADING\n", "; ".join(lines[:3]), "\n"])
+
+
+def _mesh(model: Model) -> list[str]:
+    """Nodes, node sets and elements."""
+    if model.order == 2:
+        points, cells = quadratic(model.mesh)
+        node_sets = {n: np.unique(quadratic_facet_nodes(cells, found)) for n, found in model.sets.facets.items()}
+    else:
+        points, cells = model.mesh.points, model.mesh.cells
+        node_sets = {n: nodes_of(model.mesh, found) for n, found in model.sets.facets.items()}
+    return [
+        f"*NODE\n{_numbered(_fitting(points))}",
+        *(f"*NSET, NSET={name}\n{_list(nodes)}" for name, nodes in node_sets.items()),
+        f"*ELEMENT, TYPE=C3D{cells.shape[1]}, ELSET={ALL}\n{_numbered(cells + 1)}",
+    ]
+
+
+def _materials(model: Model) -> list[str]:
+    if model.materials is None:
+        return []
+    young, nu, of_cell = model.materials[:3]
+    cells = np.split(np.argsort(of_cell, kind="stable"), np.cumsum(np.bincount(of_cell, minlength=len(young)))[:-1])
+    constants = rows(_fitting(young), _fitting(nu), separator=", ").splitlines()
+    return [
+        f"*ELSET, ELSET={name}\n{_list(members)}"
+        f"*MATERIAL, NAME={name}\n*ELASTIC\n{pair}\n*SOLID SECTION, ELSET={name}, MATERIAL={name}\n"
+        for name, members, pair in zip(_material_names(model), cells, constants, strict=True)
+    ]
+
+
+def _material_names(model: Model) -> list[str]:
+    return [] if model.materials is None else [f"material_{k + 1}" for k in range(len(model.materials.young))]
+
+
+def _step(model: Model) -> list[str]:
+    dofs = np.arange(1, 4)
+    held = [
+        f"{load.set_name}, {line}\n"
+        for load in model.loads
+        for line in rows(dofs, dofs, _fitting(load.displacement), separator=", ").splitlines()
+    ]
+    reactions = [f"*NODE PRINT, NSET={load.set_name}, TOTALS=YES\nRF\n" for load in model.loads]
+    return [
+        "*STEP\n*STATIC\n*BOUNDARY\n",
+        *held,
+        REQUESTS,
+        "** Reaction forces and their sums\n",
+        *reactions,
+        "*END STEP\n",
+    ]
+
+
+def _list(numbers: NDArray[np.int64]) -> str:
+    return blocks(numbers + 1, separator=", ")
+
+
+def _numbered(array: NDArray) -> str:
+    return rows(np.arange(1, len(array) + 1), array, separator=", ")
+
+
+def _faces(found: NDArray[np.int64]) -> str:
+    return "".join(f"{cell}, S{face}\n" for cell, face in zip(found[:, 0] + 1, FACES[found[:, 1]], strict=True))
+
+
+def _fitting(values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """`values`, each rounded so that it is not longer than `WIDTH` characters."""
+    return np.array([_shortened(x) for x in values.ravel().tolist()]).reshape(values.shape)
+
+
+def _shortened(value: float) -> float:
+    if len(repr(value)) <= WIDTH:
+        return value
+    texts = (f"{value:.{digits}g}" for digits in range(16, 0, -1))
+    return float(next(text for text in texts if len(text) <= WIDTH))

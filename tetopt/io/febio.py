@@ -1,0 +1,245 @@
+"""FEBio input files, febio_spec 4.0: mesh, sets, materials, cell data and a static step.
+
+Written from the sources of FEBio 4 and FEBio Studio 2 and read back with pyfebio; no FEBio has run one of them here.
+"""
+
+from __future__ import annotations
+
+import re
+from typing import NamedTuple
+from xml.sax.saxutils import escape
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.errors import InputError
+from tetopt.io.text import rows
+from tetopt.model.loads import Load
+from tetopt.model.materials import Materials
+from tetopt.model.model import UNITS, Model, described, quadratic, quadratic_facet_nodes
+from tetopt.model.sets import facet_triples
+
+MOST_PARTS = 100  # materials that become parts; of more, FEBio Studio's list is no use
+STUDIO_UNITS = {"kPa": "mm-kg-s", "MPa": "mm-N-s"}  # FEBio's own words for what is consistent with them
+# A set's name has no spaces, hence these names and those of parts ("material 1") are never a set's.
+NODES, CELLS = "all nodes", "all cells"
+YOUNG, NU = "E", "v"  # maps of the moduli, named as the parameters they stand for
+
+# What FEBio Studio writes, too, but for the equal steps up to the whole displacement, which the solver may halve.
+CONTROL = """\
+<Control>
+<analysis>STATIC</analysis>
+<time_steps>10</time_steps>
+<step_size>0.1</step_size>
+<time_stepper type="default">
+<max_retries>5</max_retries>
+<opt_iter>11</opt_iter>
+<dtmin>0</dtmin>
+<dtmax>0.1</dtmax>
+</time_stepper>
+<solver type="solid">
+<symmetric_stiffness>symmetric</symmetric_stiffness>
+</solver>
+</Control>
+"""
+RAMP = """\
+<LoadData>
+<load_controller id="1" type="loadcurve">
+<interpolate>LINEAR</interpolate>
+<extend>CONSTANT</extend>
+<points>
+<pt>0,0</pt>
+<pt>1,1</pt>
+</points>
+</load_controller>
+</LoadData>
+"""
+PLOTTED = ("displacement", "stress", "Lagrange strain", "strain energy density", "reaction forces")
+
+
+class _Part(NamedTuple):
+    """Cells that are of one material."""
+
+    name: str  # the material's, too
+    young: str  # a number, or the name of a map of it
+    nu: str
+    cells: NDArray[np.int64]
+
+
+def febio(model: Model) -> bytes:
+    """The content of an FEBio input file (.feb), febio_spec 4.0.
+
+    Linear (tet4) or quadratic (tet10) tetrahedra. Each facet set is a surface and a node set of its name, the latter
+    with midside nodes if there are; each cell set is an element set. A cell's id is its number in the mesh plus 1.
+
+    Up to 100 materials are parts of their own, "material 1", ..., whose cells come one part after the other. More are
+    one part, "all cells", with E, and v where it varies, mapped by element data. Cell data are element data, too, for
+    FEBio Studio to show or parameters to be mapped from.
+
+    The material is neo-Hookean: at small strains it is linear elasticity of these moduli, as `tetopt fem` solves it,
+    and it withstands large compression, where FEBio's "isotropic elastic" (St. Venant-Kirchhoff) softens until cells
+    collapse. With loads there is a static step of ten increments from 0 to the whole displacement. It plots the density
+    of the strain energy, whose integral over the undeformed volume is the total. Without loads, the step is left to
+    FEBio Studio.
+
+    Raises
+    ------
+    InputError
+        A 2-D model, no materials, or cell data named like the map of a modulus.
+    """
+    parts = _parts(_checked(model))
+    sections = [
+        _head(model),
+        "<Globals>\n<Constants>\n<T>0</T>\n<P>0</P>\n<R>0</R>\n<Fc>0</Fc>\n</Constants>\n</Globals>\n",
+        CONTROL if model.loads else "",
+        _materials(parts, UNITS[model.units][4]),
+        *_mesh(model, parts),
+        "<MeshDomains>\n",
+        *(f'<SolidDomain name="{part.name}" mat="{part.name}"/>\n' for part in parts),
+        "</MeshDomains>\n",
+        *_mesh_data(model, parts),
+        *_loads(model.loads),
+        '<Output>\n<plotfile type="febio">\n',
+        *(f'<var type="{name}"/>\n' for name in PLOTTED),
+        "</plotfile>\n</Output>\n</febio_spec>\n",
+    ]
+    return "".join(sections).encode("utf-8", "replace")
+
+
+def _checked(model: Model) -> Materials:
+    if model.mesh.ndim == 2:
+        raise InputError("febio: expected a mesh of tetrahedra, got triangles; .vtu holds them")
+    if model.materials is None:
+        raise InputError("febio: a part needs a material; give a law of the modulus (--young)")
+    if taken := {YOUNG, NU} & model.cell_data.keys():
+        raise InputError(f'febio: the file\'s map of a modulus is called "{min(taken)}"; call the cell data otherwise')
+    return model.materials
+
+
+def _parts(given: Materials) -> list[_Part]:
+    young, nu, of_cell = given.young, given.nu, given.of_cell
+    if len(young) > MOST_PARTS:
+        return [_Part(CELLS, YOUNG, NU if np.ptp(nu) > 0.0 else repr(float(nu[0])), np.arange(len(of_cell)))]
+    cells = np.split(np.argsort(of_cell, kind="stable"), np.cumsum(np.bincount(of_cell, minlength=len(young)))[:-1])
+    return [
+        _Part(f"material {k + 1}", repr(float(young[k])), repr(float(nu[k])), members)
+        for k, members in enumerate(cells)
+        if len(members)
+    ]
+
+
+def _head(model: Model) -> str:
+    lines = re.sub("-(?=-)", "- ", "\n".join(described(model)))  # XML has no two hyphens in a comment
+    return (
+        f'<?xml version="1.0" encoding="UTF-8"?>\n<!--\n{lines}\n-->\n<febio_spec version="4.0">\n'
+        f'<Module type="solid">\n<units>{STUDIO_UNITS[model.units]}</units>\n</Module>\n'
+    )
+
+
+def _materials(parts: list[_Part], density: float) -> str:
+    return "".join(
+        [
+            "<Material>\n",
+            *(
+                f'<material id="{k}" name="{part.name}" type="neo-Hookean">\n<density>{density!r}</density>\n'
+                f"{_parameter('E', part.young, YOUNG)}{_parameter('v', part.nu, NU)}</material>\n"
+                for k, part in enumerate(parts, start=1)
+            ),
+            "</Material>\n",
+        ]
+    )
+
+
+def _parameter(tag: str, value: str, map_name: str) -> str:
+    kind = ' type="map"' if value == map_name else ""
+    return f"<{tag}{kind}>{value}</{tag}>\n"
+
+
+def _mesh(model: Model, parts: list[_Part]) -> list[str]:
+    facets = model.sets.facets
+    if model.order == 2:
+        points, cells = quadratic(model.mesh)
+        surfaces = {name: quadratic_facet_nodes(cells, found) for name, found in facets.items()}
+    else:
+        points, cells = model.mesh.points, model.mesh.cells
+        surfaces = {name: facet_triples(cells, found) for name, found in facets.items()}
+    return [
+        f'<Mesh>\n<Nodes name="{NODES}">\n{_items("node", points)}</Nodes>\n',
+        *(
+            f'<Elements type="tet{cells.shape[1]}" name="{part.name}">\n'
+            f"{_items('elem', cells[part.cells] + 1, part.cells + 1)}</Elements>\n"
+            for part in parts
+        ),
+        *(
+            f'<Surface name="{name}">\n{_items(f"tri{nodes.shape[1]}", nodes + 1)}</Surface>\n'
+            for name, nodes in surfaces.items()
+        ),
+        *(f'<ElementSet name="{name}">{_list(found)}</ElementSet>\n' for name, found in model.sets.cells.items()),
+        *(f'<NodeSet name="{name}">{_list(np.unique(nodes))}</NodeSet>\n' for name, nodes in surfaces.items()),
+        "</Mesh>\n",
+    ]
+
+
+def _mesh_data(model: Model, parts: list[_Part]) -> list[str]:
+    """Element data of each part, joined by their name when read: `lid` counts in the order of the part's cells.
+
+    A set of all cells would not do: FEBio takes one across parts in their order, and not in the set's.
+    """
+    found = dict(_columns(model.cell_data))
+    if model.materials is not None and parts[0].young == YOUNG:
+        found[YOUNG] = model.materials.young[model.materials.of_cell]
+        if parts[0].nu == NU:
+            found[NU] = model.materials.nu[model.materials.of_cell]
+    if not found:
+        return []
+    data = [
+        f'<ElementData name="{_attribute(name)}" elem_set="{part.name}" data_type="scalar">\n'
+        f"{_items('elem', values[part.cells], number='lid')}</ElementData>\n"
+        for name, values in found.items()
+        for part in parts
+    ]
+    return ["<MeshData>\n", *data, "</MeshData>\n"]
+
+
+def _columns(cell_data: dict[str, NDArray]) -> list[tuple[str, NDArray[np.float64]]]:
+    """Scalars of each cell by name; the components of what has several are numbered from 0."""
+    tables = {name: values.reshape(len(values), -1).astype(np.float64) for name, values in cell_data.items()}
+    return [
+        (name if table.shape[1] == 1 else f"{name}_{k}", column)
+        for name, table in tables.items()
+        for k, column in enumerate(table.T)
+    ]
+
+
+def _loads(loads: tuple[Load, ...]) -> list[str]:
+    if not loads:
+        return []
+    return [RAMP, "<Boundary>\n", *(_condition(load) for load in loads), "</Boundary>\n"]
+
+
+def _condition(load: Load) -> str:
+    if not load.displacement.any():
+        return (
+            f'<bc name="hold {load.set_name}" type="zero displacement" node_set="{load.set_name}">\n'
+            "<x_dof>1</x_dof>\n<y_dof>1</y_dof>\n<z_dof>1</z_dof>\n</bc>\n"
+        )
+    return "".join(
+        f'<bc name="move {load.set_name} {dof}" type="prescribed displacement" node_set="{load.set_name}">\n'
+        f'<dof>{dof}</dof>\n<value lc="1">{value!r}</value>\n<relative>0</relative>\n</bc>\n'
+        for dof, value in zip("xyz", load.displacement.tolist(), strict=True)
+    )
+
+
+def _items(tag: str, array: NDArray, ids: NDArray[np.int64] | None = None, number: str = "id") -> str:
+    """A line for each row of an array, numbered from 1 or by `ids`."""
+    lines = rows(array, separator=",").splitlines()
+    numbers = range(1, len(lines) + 1) if ids is None else ids.tolist()
+    return "".join(f'<{tag} {number}="{k}">{line}</{tag}>\n' for k, line in zip(numbers, lines, strict=True))
+
+
+def _attribute(text: str) -> str:
+    return escape(text, {'"': "&quot;"})
+
+
+def _list(numbers: NDArray[np.int64]) -> str:
+    return ",".join(map(str, (numbers + 1).tolist()))

@@ -1,0 +1,91 @@
+"""Every format that a model can be written in, by the suffix of the file."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from pathlib import Path
+from typing import NamedTuple
+
+from tetopt.errors import InputError
+from tetopt.io.abaqus import abaqus
+from tetopt.io.febio import febio
+from tetopt.io.files import written_whole
+from tetopt.io.gmsh import gmsh22, gmsh41
+from tetopt.io.medit import medit
+from tetopt.io.mfem import mfem
+from tetopt.io.sofa import sofa
+from tetopt.io.surfaces import boundary_ply, boundary_stl
+from tetopt.io.vtk import vtk, vtu
+from tetopt.io.xdmf import xdmf
+from tetopt.model.model import Model, in_space, in_units
+
+
+class Format(NamedTuple):
+    """What a suffix stands for."""
+
+    what: str
+    write: Callable[[Model], bytes]
+    has_quadratic: bool = False
+    runs: bool = False  # whether loads become a step that the solver runs; else they are words in the file
+    is_surface: bool = False  # holds the boundary alone
+
+
+FORMATS = {
+    ".vtu": Format("VTK, ParaView", vtu),
+    ".vtk": Format("legacy VTK, 3D Slicer", vtk),
+    ".xdmf": Format("XDMF with tags, FEniCSx", xdmf),
+    ".msh": Format("gmsh 4.1", gmsh41),
+    ".msh2": Format("gmsh 2.2", gmsh22),
+    ".inp": Format("Abaqus, CalculiX", abaqus, has_quadratic=True, runs=True),
+    ".feb": Format("FEBio 4.0", febio, has_quadratic=True, runs=True),
+    ".scn": Format("SOFA scene", sofa, runs=True),
+    ".mfem": Format("MFEM mesh", mfem),
+    ".mesh": Format("medit", medit),
+    ".stl": Format("the boundary as STL", boundary_stl, is_surface=True),
+    ".ply": Format("the boundary as PLY", boundary_ply, is_surface=True),
+}
+
+
+def format_of(path: Path) -> Format:
+    """The format that a file's suffix asks for.
+
+    Raises
+    ------
+    InputError
+        An unknown suffix, with the known ones.
+    """
+    suffix = path.suffix.lower()
+    if suffix not in FORMATS:
+        known = ", ".join(f"{name} ({found.what})" for name, found in FORMATS.items())
+        raise InputError(f"{path}: unknown suffix; known are {known}")
+    return FORMATS[suffix]
+
+
+def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str = "kPa") -> None:
+    """Write a model in the format of the file's suffix, whole or not at all.
+
+    Replaces an existing file; ask `tetopt.io.files.checked_output` first.
+
+    Parameters
+    ----------
+    path : str or Path
+        See `FORMATS`.
+    model : Model
+    space : {"ras", "lps"}
+        Convention of the file's coordinates; NIfTI's is RAS+, DICOM's, ITK's and 3D Slicer's files' LPS+.
+    units : {"kPa", "MPa"}
+        Unit of stress in the file; with mm, forces are then in mN or N.
+
+    Raises
+    ------
+    InputError
+        An unknown suffix, or what the format cannot carry.
+    """
+    path = Path(path)
+    found = format_of(path)
+    if model.order != 1 and not found.has_quadratic:
+        able = ", ".join(name for name, other in FORMATS.items() if other.has_quadratic)
+        raise InputError(f"{path}: only {able} take quadratic cells; leave out --order 2")
+    content = found.write(in_units(in_space(model, space), units))
+    with written_whole(path) as temporary:
+        temporary.write_bytes(content)

@@ -1,0 +1,55 @@
+"""Meshes for medit (INRIA) and what reads its files: FreeFEM, Mmg, SfePy, libMeshb.
+
+A tetrahedron (in 2-D a triangle) has one reference. So there is one for each combination of a material and cell sets,
+by material: the material's number from 1 where no set divides one. A triangle's (in 2-D an edge's) stands in the same
+way for a combination of facet sets, inside the mesh, too; a facet that two sets hold from opposite sides is turned as
+in the first of them. Comments at the head tell the names that each reference stands for, coordinates, units, each
+material's constants, and the loads. Vertices have the reference 0.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.errors import InputError
+from tetopt.io.tags import cell_tags, facet_tags, remarks, tag_lines, without_cell_data
+from tetopt.io.text import rows
+from tetopt.model.model import Model
+from tetopt.model.sets import facet_triples
+
+KEYWORDS = {1: "Edges", 2: "Triangles", 3: "Tetrahedra"}
+
+
+def medit(model: Model) -> bytes:
+    """A .mesh file in double precision; see the module for what is where.
+
+    Nodes, elements and their order are those of the mesh. There is no cell data.
+
+    Raises
+    ------
+    InputError
+        A cell set that is called as a material is, or order 2.
+    """
+    if model.order != 1:
+        raise InputError("order 2: few programs read it from a medit file; leave out --order")
+    mesh = model.mesh
+    in_cells, on_facets = cell_tags(model), facet_tags(mesh, model.sets.facets)
+    cells, sides = KEYWORDS[mesh.ndim], KEYWORDS[mesh.ndim - 1]
+    comments = [*remarks(model), *without_cell_data(model)]
+    comments += tag_lines(in_cells.tags_of, f"{cells} ref") + tag_lines(on_facets.tags_of, f"{sides} ref")
+    return "".join(
+        [
+            "MeshVersionFormatted 2\n\n",
+            *(f"# {line}\n" for line in comments),
+            f"\nDimension {mesh.ndim}\n",
+            _section("Vertices", mesh.points, np.zeros(len(mesh.points), dtype=np.int64)),
+            _section(cells, mesh.cells + 1, in_cells.tags),
+            _section(sides, facet_triples(mesh.cells, on_facets.items) + 1, on_facets.tags),
+            "\nEnd\n",
+        ]
+    ).encode()
+
+
+def _section(keyword: str, values: NDArray, refs: NDArray[np.int64]) -> str:
+    return f"\n{keyword}\n{len(values)}\n{rows(values, refs)}"

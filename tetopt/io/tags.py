@@ -1,0 +1,97 @@
+"""What mesh formats share that know numbers for materials and sets, and comments for the rest."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.errors import InputError
+from tetopt.geometry.topology import facets
+from tetopt.mesh import Mesh
+from tetopt.model.model import Model, described
+from tetopt.model.sets import Tagged, tagged
+
+
+class CellTags(NamedTuple):
+    """One tag a cell that tells its material and all of its sets."""
+
+    tags: NDArray[np.int64]  # (M,) 1 to T, by material; the material's number from 1 where no set divides one
+    material: NDArray[np.int64]  # (T,) of each tag, from 0; 0 without materials
+    tags_of: dict[str, list[int]]  # the tags that make up each material ("material_1", ...) and each cell set
+
+
+def cell_tags(model: Model) -> CellTags:
+    """One tag for each combination of a material and cell sets.
+
+    Raises
+    ------
+    InputError
+        A cell set that is called as a material is.
+    """
+    names = material_names(model, model.sets.cells)
+    found = tagged(model.sets.cells)
+    combination = np.zeros(len(model.mesh.cells), dtype=np.int64)
+    combination[found.items] = found.tags
+    material = np.zeros_like(combination) if model.materials is None else model.materials.of_cell
+    kinds, which = np.unique(np.column_stack([material, combination]), axis=0, return_inverse=True)
+    ends = np.searchsorted(kinds[:, 0], np.arange(len(names) + 1))
+    tags_of = {name: list(range(ends[k] + 1, ends[k + 1] + 1)) for k, name in enumerate(names)}
+    for name, tags in found.tags_of.items():
+        tags_of[name] = (np.flatnonzero(np.isin(kinds[:, 1], tags)) + 1).tolist()
+    return CellTags(which.ravel() + 1, kinds[:, 0], tags_of)
+
+
+def facet_tags(mesh: Mesh, sets: dict[str, NDArray[np.int64]]) -> Tagged:
+    """`tagged` of facet sets, where a facet that sets hold from both of its sides is one item.
+
+    It is held as by the first set that has it; items are in the order of the facets' nodes.
+    """
+    of_cell = facets(mesh.cells).of_cell
+    numbers = {name: of_cell[rows[:, 0], rows[:, 1]] for name, rows in sets.items()}
+    found = tagged(numbers)
+    if not sets:
+        return found._replace(items=np.empty((0, 2), dtype=np.int64))
+    _, first = np.unique(np.concatenate(list(numbers.values())), return_index=True)
+    return found._replace(items=np.concatenate(list(sets.values()))[first])
+
+
+def material_names(model: Model, taken: dict[str, NDArray[np.int64]]) -> list[str]:
+    """ "material_1", ... of the model's materials; InputError if a set among `taken` is called that."""
+    names = [] if model.materials is None else [f"material_{k + 1}" for k in range(len(model.materials.young))]
+    check_apart(names, taken)
+    return names
+
+
+def check_apart(names: list[str], taken: dict[str, NDArray[np.int64]]) -> None:
+    """InputError if a set is called as something else in the file is."""
+    lower = {name.lower() for name in names}
+    if both := [name for name in taken if name.lower() in lower]:
+        raise InputError(f'set {both[0]}: the file calls something else "{both[0]}"; call the set otherwise')
+
+
+def remarks(model: Model) -> list[str]:
+    """Lines for the head of a mesh file: `described`, each material's constants, the loads."""
+    lines = described(model)
+    if model.materials is not None:
+        pairs = zip(model.materials.young.tolist(), model.materials.nu.tolist(), strict=True)
+        lines += [f"material_{k}: young {young!r} {model.units}, nu {nu!r}" for k, (young, nu) in enumerate(pairs, 1)]
+    for load in model.loads:
+        vector = " ".join(map(repr, load.displacement.tolist()))
+        lines.append(f"load, which this format has no place for: nodes of {load.set_name} displaced by {vector} mm")
+    return lines
+
+
+def without_cell_data(model: Model) -> list[str]:
+    """A line for the head of a file whose format has no place for cell data."""
+    return [f"cell data, which this format has no place for: {', '.join(model.cell_data)}"] if model.cell_data else []
+
+
+def tag_lines(tags_of: dict[str, list[int]], what: str) -> list[str]:
+    """What each tag stands for, one line a tag."""
+    names: dict[int, list[str]] = {}
+    for name, tags in tags_of.items():
+        for tag in tags:
+            names.setdefault(tag, []).append(name)
+    return [f"{what} {tag}: {' '.join(names[tag])}" for tag in sorted(names)]

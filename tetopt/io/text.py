@@ -1,0 +1,27 @@
+"""Arrays as the lines of a text file, fast and without loss."""
+
+from __future__ import annotations
+
+from numpy.typing import NDArray
+
+
+def rows(*columns: NDArray, separator: str = " ") -> str:
+    """One line for each row of the arrays side by side, each (K,) or (K, w); floats so that they read back the same.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> print(rows(np.array([7, 8]), np.array([[0.1, 2.0], [1e-9, -3.5]])), end="")
+    7 0.1 2.0
+    8 1e-09 -3.5
+    """
+    single = [each for column in columns for each in ([column] if column.ndim == 1 else column.T)]
+    texts = [map(repr, column.tolist()) for column in single]
+    return "".join(f"{separator.join(row)}\n" for row in zip(*texts, strict=True))
+
+
+def blocks(numbers: NDArray, per_line: int = 16, separator: str = " ") -> str:
+    """A list of numbers in lines of so many."""
+    texts = list(map(repr, numbers.tolist()))
+    lines = (separator.join(texts[start : start + per_line]) for start in range(0, len(texts), per_line))
+    return "".join(f"{line}\n" for line in lines)

@@ -1,0 +1,186 @@
+"""XDMF for FEniCSx (dolfinx) and ParaView: one file of text with the mesh, its moduli and tags of its sets.
+
+There are three grids: "mesh" with what is on each cell, first `material` from 1, then `young` and `nu`; "facets" and
+"cells", if there are such sets, with one integer for each facet or cell that is in any set. A tag stands for one
+combination of sets, so a set is several tags: <Information Name="superior" Value="2 5"/> in the grid names them. This
+reads all of it, on any number of processes::
+
+    from xml.etree import ElementTree
+
+    import numpy as np
+    from dolfinx import fem
+    from dolfinx.io import XDMFFile
+    from mpi4py import MPI
+
+    with XDMFFile(MPI.COMM_WORLD, "model.xdmf", "r", encoding=XDMFFile.Encoding.ASCII) as file:
+        mesh = file.read_mesh(name="mesh")
+        dim = mesh.topology.dim
+        mesh.topology.create_connectivity(dim - 1, dim)
+        facet_tags = file.read_meshtags(mesh, name="facets")
+        cell_tags = file.read_meshtags(mesh, name="cells")
+        material_tags = file.read_meshtags(mesh, name="mesh")
+
+    root = ElementTree.parse("model.xdmf").getroot()
+
+    def members(tags, grid, name):  # facets or cells of a set, as dolfinx numbers them
+        of_set = root.find(f".//Grid[@Name='{grid}']/Information[@Name='{name}']").get("Value")
+        return tags.indices[np.isin(tags.values, np.array(of_set.split(), dtype=int))]
+
+    def on_cells(name):  # a field that is constant in each cell; dolfinx has changed the cells' order
+        text = root.find(f".//Grid[@Name='mesh']/Attribute[@Name='{name}']/DataItem").text
+        field = fem.Function(fem.functionspace(mesh, ("DG", 0)))
+        field.x.array[:] = np.array(text.split(), dtype=float)[mesh.topology.original_cell_index]
+        return field
+
+    young, nu = on_cells("young"), on_cells("nu")
+    superior = members(facet_tags, "facets", "superior")
+
+Before 0.7 `fem.functionspace` was `fem.FunctionSpace`; with that, 0.5.2 runs it, too. `read_meshtags` takes the first
+attribute of a grid, which `material` is for that reason. The encoding must be given, or dolfinx looks for an HDF5 file
+beside this one. It reads no floating point numbers of cells from XDMF, hence the parsing. Quadratic elements are chosen
+there, on these same cells.
+
+In the grid "mesh" <Information Name="young"/> and <Information Name="nu"/> list what the materials 1, 2, ... have. In
+the domain <Information Name="load" Value="superior 0.0 0.0 0.0"/> is a facet set and its nodes' displacement, mm, and
+<Information Name="about"/> says where the file comes from, in what coordinates and units.
+
+VTK, and with it pyvista and ParaView, reads the grids as blocks, as long as no list is longer than 10 MB, which that of
+the cells is from some 400 000 tetrahedra on: take .vtu for those. meshio 5.3.5 reads no XDMF with more than one grid.
+"""
+
+from __future__ import annotations
+
+from xml.sax.saxutils import quoteattr
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.errors import InputError
+from tetopt.geometry.topology import facets
+from tetopt.io.text import rows
+from tetopt.model.model import Model, described
+from tetopt.model.sets import facet_triples, tagged
+
+# By number of nodes; lines need theirs stated.
+TOPOLOGIES = {2: '"PolyLine" NodesPerElement="2"', 3: '"Triangle"', 4: '"Tetrahedron"'}
+GEOMETRIES = {2: "XY", 3: "XYZ"}
+# Not by XInclude, as dolfinx writes it: VTK 9.7 crashes on the address that dolfinx gives for that.
+POINTS_OF_MESH = '<DataItem Reference="XML">/Xdmf/Domain/Grid[@Name="mesh"]/Geometry/DataItem</DataItem>\n'
+TIME = '<Time Value="0"/>\n'  # pyvista 0.49 reads no XDMF without
+
+
+def xdmf(model: Model) -> bytes:
+    """The content of an XDMF file (.xdmf): mesh, cell data, materials, tags of facets and cells, and the loads as text.
+
+    A facet is listed once, its nodes facing out of the cell that the first of its sets holds it by; where a set holds
+    it by the other one, its tag is also in <Information Name="NAME turned"/>. dolfinx itself gives facets no side.
+    Cell data of 3 columns is written as vectors, of other numbers of columns as that many fields NAME_0, NAME_1, ...;
+    materials replace cell data of the names material, young and nu.
+
+    Raises
+    ------
+    InputError
+        A quadratic model, since elements of any order are chosen in FEniCSx; or cell data that is not finite, since VTK
+        stops reading there and makes up the rest.
+    """
+    _check(model)
+    parts = [_information("about", line) for line in described(model)]
+    parts += [_information("load", f"{load.set_name} {_listed(load.displacement)}") for load in model.loads]
+    parts.append(_mesh_grid(model))
+    if model.sets.facets:
+        parts.append(_facet_grid(model))
+    if model.sets.cells:
+        found = tagged(model.sets.cells)
+        parts.append(_tag_grid("cells", model, model.mesh.cells[found.items], found.tags, found.tags_of))
+    text = "".join(parts)
+    return (
+        f'<?xml version="1.0" encoding="utf-8"?>\n<Xdmf Version="3.0">\n<Domain>\n{text}</Domain>\n</Xdmf>\n'.encode()
+    )
+
+
+def _check(model: Model) -> None:
+    if model.order != 1:
+        raise InputError(
+            "xdmf: expected linear cells, got order 2; leave out the order and take P2 elements in FEniCSx"
+        )
+    for name, values in model.cell_data.items():
+        if bad := int((~np.isfinite(values)).sum()):
+            raise InputError(f'xdmf: expected finite cell data, got {bad} values of "{name}" that are not; take .vtu')
+
+
+def _mesh_grid(model: Model) -> str:
+    fields, table = model.cell_data, ""
+    if model.materials is not None:
+        young, nu, of_cell = model.materials.young, model.materials.nu, model.materials.of_cell
+        own = {"material": of_cell + 1, "young": young[of_cell], "nu": nu[of_cell]}
+        fields = own | {name: values for name, values in fields.items() if name not in own}
+        table = _information("young", _listed(young)) + _information("nu", _listed(nu))
+    columns = {part: values for name in fields for part, values in _columns(name, np.asarray(fields[name])).items()}
+    points = _item(model.mesh.points)
+    return _grid("mesh", model, model.mesh.cells, points, columns, table)
+
+
+def _facet_grid(model: Model) -> str:
+    sets, of_cell = model.sets.facets, facets(model.mesh.cells).of_cell
+    number = {name: of_cell[members[:, 0], members[:, 1]] for name, members in sets.items()}
+    numbers, first = np.unique(np.concatenate(list(number.values())), return_index=True)
+    listed = np.concatenate(list(sets.values()))[first]  # the row that each facet is listed by
+    turned = {
+        f"{name} turned": number[name][listed[np.searchsorted(numbers, number[name]), 0] != members[:, 0]]
+        for name, members in sets.items()
+    }
+    found = tagged(number | {name: those for name, those in turned.items() if len(those)})
+    return _tag_grid("facets", model, facet_triples(model.mesh.cells, listed), found.tags, found.tags_of)
+
+
+def _tag_grid(
+    name: str, model: Model, nodes: NDArray[np.int64], tags: NDArray[np.int64], tags_of: dict[str, list[int]]
+) -> str:
+    named = "".join(_information(each, " ".join(map(str, those))) for each, those in tags_of.items())
+    return _grid(name, model, nodes, POINTS_OF_MESH, {name: tags}, named)
+
+
+def _grid(
+    name: str, model: Model, nodes: NDArray[np.int64], points: str, columns: dict[str, NDArray], named: str
+) -> str:
+    attributes = [
+        f'<Attribute Name={_quoted(each)} AttributeType="{"Scalar" if values.ndim == 1 else "Vector"}" Center="Cell">\n'
+        f"{_item(values)}</Attribute>\n"
+        for each, values in columns.items()
+    ]
+    return (
+        f'<Grid Name="{name}" GridType="Uniform">\n{named}{TIME}'
+        f'<Topology TopologyType={TOPOLOGIES[nodes.shape[1]]} NumberOfElements="{len(nodes)}">\n'
+        f"{_item(nodes)}</Topology>\n"
+        f'<Geometry GeometryType="{GEOMETRIES[model.mesh.ndim]}">\n{points}</Geometry>\n'
+        f"{''.join(attributes)}</Grid>\n"
+    )
+
+
+def _columns(name: str, values: NDArray) -> dict[str, NDArray]:
+    """Scalars and vectors; VTK takes no other matrices for what they are."""
+    if values.ndim == 1 or values.shape[1:] == (3,):
+        return {name: values}
+    return {f"{name}_{k}": column for k, column in enumerate(values.reshape(len(values), -1).T)}
+
+
+def _item(values: NDArray) -> str:
+    is_float = values.dtype.kind == "f"
+    exact = values.astype(np.float64 if is_float else np.int64)
+    return (
+        f'<DataItem Dimensions="{" ".join(map(str, values.shape))}" NumberType="{"Float" if is_float else "Int"}" '
+        f'Precision="8" Format="XML">\n{rows(exact)}</DataItem>\n'
+    )
+
+
+def _information(name: str, value: str) -> str:
+    return f"<Information Name={_quoted(name)} Value={_quoted(value)}/>\n"
+
+
+def _quoted(text: str) -> str:
+    """An attribute's value; XML has no place for control characters, nor UTF-8 for bytes that were none."""
+    return quoteattr("".join(letter if letter.isprintable() else "?" for letter in text))
+
+
+def _listed(values: NDArray[np.float64]) -> str:
+    return " ".join(map(repr, values.tolist()))

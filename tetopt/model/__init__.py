@@ -1,0 +1,1 @@
+"""What a solver is told beside the mesh: named sets, materials, loads, units."""

@@ -1,0 +1,114 @@
+"""A model from a mesh and what a user says of it."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import Any
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tetopt.errors import InputError
+from tetopt.fem.materials import ByLabel, Law, cell_values, cell_young, law_values, parse_any_law, young_from
+from tetopt.geometry.simplex import volumes
+from tetopt.image import Image
+from tetopt.mesh import Mesh
+from tetopt.model.fields import cell_fields
+from tetopt.model.loads import parse_loads
+from tetopt.model.materials import Materials, Spacing, binned, by_label, materials
+from tetopt.model.model import Model
+from tetopt.model.sets import Box, Sets, box_of, standard_sets, with_asked
+
+NU = 0.45  # soft tissue that linear cells can still follow: they lock nearer to 0.5
+
+
+def model_of(
+    mesh: Mesh,
+    image: Image | None = None,
+    *,
+    young: str | Law | ByLabel | ArrayLike = None,
+    nu: str | Law | ByLabel | ArrayLike = NU,
+    sets: Iterable[str] = (),
+    loads: Iterable[str] = (),
+    bins: int | None = None,
+    spacing: Spacing = "equal",
+    order: int = 1,
+    cell_data: dict[str, NDArray] | None = None,
+    known_sets: Sets | None = None,
+    box: Box | None = None,
+    about: dict[str, Any] | None = None,
+) -> Model:
+    """All that a solver is told of a mesh, for `tetopt.save_model` and `Model.to_skfem`.
+
+    Parameters
+    ----------
+    mesh : Mesh
+    image : Image, optional
+        Its intensities are what laws are of, and its box's faces become sets.
+    young, nu : number, (M,) array, law or text, optional
+        Young's modulus, kPa, above 0, and Poisson's ratio, above -1 and below 0.5: one for all cells, one for each, or
+        a law of the intensity or of the label (`tetopt.fem.materials.parse_any_law`), of which with an image the mean
+        over the voxels of the cell is taken, Eq. (2), and else its value at the cell's "mean". Without `young` the
+        model has no materials.
+    sets : iterable of str
+        Further sets, see `tetopt.model.sets.with_asked`.
+    loads : iterable of str
+        See `tetopt.model.loads.parse_loads`.
+    bins : int, optional
+        Group cells into so many materials, by `spacing`: "equal", "quantile" or "log"; the error that this makes is in
+        the materials. See `tetopt.model.materials.binned`.
+    order : {1, 2}
+        2: straight-edged quadratic cells in the file, where a format has them.
+    cell_data : dict, optional
+        What is known of each cell, by name; "mean" and "label" are used. By default `tetopt.cell_fields`.
+    known_sets : Sets, optional
+        Sets that came with the mesh, instead of the standard ones.
+    box : Box, optional
+        Of the image that the mesh was made from; by default of `image`.
+    about : dict, optional
+        Texts for the file's head.
+
+    Raises
+    ------
+    InputError
+        As the functions named above; a dimension or an order that there is not.
+    """
+    if order not in (1, 2):
+        raise InputError(f"order: expected 1 or 2, got {order}")
+    if order == 2 and mesh.ndim == 2:
+        raise InputError("order: quadratic cells are tetrahedra here, got a mesh of triangles")
+    cell_data = cell_fields(mesh, image) if cell_data is None else dict(cell_data)
+    mean, labels = cell_data.get("mean"), cell_data.get("label")
+    if known_sets is None:
+        box = box_of(image) if box is None and image is not None else box
+        known_sets = standard_sets(mesh, box, labels)
+    found = with_asked(mesh, known_sets, sets, mean)
+    made: Materials | None = None
+    if young is not None:
+        made = materials(
+            _values(young, "young", mesh, image, mean, labels),
+            _values(nu, "nu", mesh, image, mean, labels),
+            len(mesh.cells),
+        )
+        if bins is not None:
+            made = binned(made, volumes(mesh.points, mesh.cells), bins, spacing)
+    elif bins is not None:
+        raise InputError("bins: there are no moduli to group; give --young")
+    return Model(mesh, cell_data, found, made, parse_loads(loads, mesh, found), order, about=dict(about or {}))
+
+
+def _values(
+    given: Any, name: str, mesh: Mesh, image: Image | None, mean: NDArray[np.float64] | None, labels: NDArray | None
+) -> ArrayLike:
+    """The value of each cell, or one for all."""
+    law = parse_any_law(given, name) if isinstance(given, str) else given
+    if isinstance(law, int | float | np.number) or (isinstance(law, np.ndarray) and law.ndim == 1):
+        return law
+    if isinstance(law, ByLabel):
+        return by_label(law, labels)
+    if image is not None:  # the law of each voxel, and then the mean, as Eq. (2) wants it
+        return cell_young(image, mesh, law) if name == "young" else cell_values(image, mesh, law)
+    if mean is None:
+        raise InputError(f"{name}: a law of the intensity, but the mesh has no means; give the image (--image)")
+    # The law of each cell's mean: the same only where the law is linear over the cell.
+    return young_from(law, mean) if name == "young" else law_values(law, mean)

@@ -1,0 +1,105 @@
+"""Loads as written on a command line: sets that are held or moved, their nodes bonded."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.errors import InputError
+from tetopt.mesh import Mesh
+from tetopt.model.sets import FACES, Sets, facet_triples, nodes_of
+
+MOST = 50.0  # per cent: a linear step presses no further
+
+
+class Load(NamedTuple):
+    """The nodes of a facet set are displaced by so much, in all directions: 0 holds them."""
+
+    set_name: str
+    displacement: NDArray[np.float64]  # (n,) mm
+
+
+def parse_loads(texts: Iterable[str], mesh: Mesh, sets: Sets) -> tuple[Load, ...]:
+    """Loads from words.
+
+    Parameters
+    ----------
+    texts : iterable of str
+        "hold:SET"; "move:SET:X,Y,Z", mm; or "compress:5%", which holds the face of the box with the largest z and moves
+        the opposite one towards it by 5 % of the distance between the two, as `tetopt fem` does.
+    mesh : Mesh
+    sets : Sets
+
+    Raises
+    ------
+    InputError
+        Other words, a set that is not there, or a node that would go two ways.
+    """
+    loads = tuple(load for text in texts for load in _parsed(text, mesh, sets))
+    if loads and not any(load.displacement.any() for load in loads):
+        raise InputError("load: everything is held and nothing moves; add move:SET:X,Y,Z")
+    is_held = np.zeros(len(mesh.points), dtype=bool)
+    for load in loads:
+        nodes = nodes_of(mesh, sets.facets[load.set_name])
+        if is_held[nodes].any():
+            raise InputError(
+                f'load: {int(is_held[nodes].sum())} nodes of set "{load.set_name}" are in another loaded set, too; '
+                "they cannot go both ways"
+            )
+        is_held[nodes] = True
+    return loads
+
+
+def _parsed(text: str, mesh: Mesh, sets: Sets) -> list[Load]:
+    kind, _, rest = text.partition(":")
+    n = mesh.ndim
+    if kind == "compress":
+        return _compression(rest, mesh, sets)
+    if kind == "hold":
+        return [Load(_known(rest, sets), np.zeros(n))]
+    if kind == "move":
+        name, _, vector = rest.rpartition(":")
+        try:
+            displacement = np.array([float(part) for part in vector.split(",")])
+        except ValueError:
+            displacement = np.empty(0)
+        if displacement.shape != (n,) or not np.isfinite(displacement).all():
+            raise InputError(f'load: expected move:SET: and {n} numbers in mm, got "{text}"')
+        return [Load(_known(name, sets), displacement)]
+    raise InputError(f'load: expected compress:5%, hold:SET or move:SET:X,Y,Z, got "{text}"')
+
+
+def _known(name: str, sets: Sets) -> str:
+    if name not in sets.facets:
+        raise InputError(f'load: there is no set of facets "{name}"; there are {", ".join(sets.facets)}')
+    return name
+
+
+def _compression(text: str, mesh: Mesh, sets: Sets) -> list[Load]:
+    try:
+        percent = float(text.removesuffix("%"))
+    except ValueError:
+        percent = -1.0
+    if not text.endswith("%") or not 0.0 < percent <= MOST:
+        raise InputError(f'load: expected compress: and a percentage above 0 and up to {MOST:g}, got "{text}"')
+    low, high = FACES[mesh.ndim][-1]
+    if missing := [name for name in (low, high) if name not in sets.facets]:
+        raise InputError(
+            f"load: the mesh has no facets on the box's face {' and '.join(missing)}; give hold:SET and move:SET:X,Y,Z "
+            f"of {', '.join(sets.facets)}"
+        )
+    return [Load(high, np.zeros(mesh.ndim)), Load(low, 0.01 * percent * _thickness(mesh, sets, low, high))]
+
+
+def _thickness(mesh: Mesh, sets: Sets, low: str, high: str) -> NDArray[np.float64]:
+    """From one of two parallel faces to the other along their normal, (n,) mm."""
+    corners = mesh.points[facet_triples(mesh.cells, sets.facets[low])]
+    edges = corners[:, 1:] - corners[:, :1]
+    areas = np.cross(edges[:, 0], edges[:, 1]) if mesh.ndim == 3 else edges[:, 0, ::-1] * np.array([1.0, -1.0])
+    inward = -areas.sum(axis=0)
+    inward /= np.sqrt((inward**2).sum())
+    across = mesh.points[nodes_of(mesh, sets.facets[high])[0]] - corners[0, 0]
+    return inward * float((across * inward).sum()) + 0.0  # + 0.0: no -0

@@ -1,0 +1,146 @@
+"""Materials: Young's modulus and Poisson's ratio of each cell, and few materials that stand for them.
+
+Isotropic linear elasticity at the undeformed state, which is what one modulus a cell, Eq. (2), can say.
+"""
+
+from __future__ import annotations
+
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tetopt.errors import InputError
+from tetopt.fem.materials import ByLabel, checked_young
+
+Spacing = Literal["equal", "quantile", "log"]
+SPACINGS = ("equal", "quantile", "log")
+
+
+class BinningError(NamedTuple):
+    """How far the modulus of the bins is from that of the cells, relative to the latter."""
+
+    mean: float  # by volume
+    largest: float
+
+
+class Materials(NamedTuple):
+    """The distinct materials, softest first, and which one each cell is made of."""
+
+    young: NDArray[np.float64]  # (K,) Young's modulus, in the model's unit of stress
+    nu: NDArray[np.float64]  # (K,) Poisson's ratio
+    of_cell: NDArray[np.int64]  # (M,) 0 to K - 1
+    binning: BinningError | None = None  # if they stand for more moduli
+
+
+def materials(young: ArrayLike, nu: ArrayLike, n_cells: int) -> Materials:
+    """Cells of equal modulus and ratio are of one material.
+
+    Parameters
+    ----------
+    young, nu : (M,) arrays, or one number for all
+        Above 0; above -1 and below 0.5.
+    n_cells : int
+
+    Raises
+    ------
+    InputError
+        Values out of range, or not one for each cell.
+    """
+    pairs = np.column_stack([_of_cells("young", young, n_cells), _of_cells("nu", nu, n_cells)])
+    checked_young(pairs[:, 0])
+    outside = np.flatnonzero(~((pairs[:, 1] > -1.0) & (pairs[:, 1] < 0.5)))
+    if len(outside):
+        raise InputError(
+            f"nu: expected -1 < nu < 0.5, got {len(outside)} cells with others, the first {pairs[outside[0], 1]:g} in "
+            f"cell {outside[0]}; for nearly incompressible tissue take 0.45 to 0.49"
+        )
+    kinds, of_cell = np.unique(pairs, axis=0, return_inverse=True)
+    return Materials(kinds[:, 0].copy(), kinds[:, 1].copy(), of_cell.ravel().astype(np.int64))
+
+
+def _of_cells(name: str, values: ArrayLike, n_cells: int) -> NDArray[np.float64]:
+    array = np.asarray(values, dtype=np.float64)
+    if array.ndim == 0:
+        return np.full(n_cells, float(array))
+    if array.shape != (n_cells,):
+        raise InputError(f"{name}: expected one value for each of {n_cells} cells, got shape {array.shape}")
+    return array
+
+
+def by_label(law: ByLabel, labels: NDArray[np.integer] | None) -> NDArray[np.float64]:
+    """The value that each cell's label has, (M,) float64.
+
+    Raises
+    ------
+    InputError
+        No labels, or one that has no value.
+    """
+    if labels is None:
+        raise InputError("values by label: the mesh has no labels; mesh it with --labels")
+    found, which = np.unique(labels, return_inverse=True)
+    if missing := [f"{label:g}" for label in found if label not in law.values]:
+        raise InputError(
+            f"values by label: given for {', '.join(map(str, law.values))}, the mesh also has "
+            f"{', '.join(missing[:10])}; give these, too"
+        )
+    return np.array([law.values[int(label)] for label in found])[which.ravel()]
+
+
+def binned(given: Materials, volumes: NDArray[np.float64], count: int, spacing: Spacing = "equal") -> Materials:
+    """At most `count` moduli instead of all.
+
+    The modulus of a bin is the mean by volume of its cells'. Ratios are kept as they are while there are at most
+    `count` of them, else put into bins in the same way; a material is a pair of bins.
+
+    Parameters
+    ----------
+    given : Materials
+    volumes : (M,) float64
+        Of the cells.
+    count : int
+    spacing : {"equal", "quantile", "log"}
+        Bins of equal width; with equally many cells; of equal width of the logarithm.
+
+    Raises
+    ------
+    InputError
+        No bins, or another word.
+    """
+    if count < 1:
+        raise InputError(f"bins: expected 1 or more, got {count}")
+    if spacing not in SPACINGS:
+        raise InputError(f"bins: expected {', '.join(SPACINGS)}, got {spacing}")
+    young, nu = given.young[given.of_cell], given.nu[given.of_cell]
+    fewer = _bin_means(young, volumes, count, spacing)
+    ratios = (
+        nu
+        if len(np.unique(nu)) <= count
+        else _bin_means(nu, volumes, count, "quantile" if spacing == "quantile" else "equal")
+    )
+    off = np.abs(fewer - young) / young
+    error = BinningError(float((off * volumes).sum() / volumes.sum()), float(off.max()))
+    return materials(fewer, ratios, len(young))._replace(binning=error)
+
+
+def _bin_means(
+    values: NDArray[np.float64], volumes: NDArray[np.float64], count: int, spacing: Spacing
+) -> NDArray[np.float64]:
+    """Each value replaced by the mean of its bin; up to `count` distinct values are left as they are."""
+    if len(np.unique(values)) <= count:
+        return values
+    scaled = np.log(values) if spacing == "log" else values
+    if spacing == "quantile":
+        inner = np.quantile(scaled, np.arange(1, count) / count)
+    else:
+        inner = np.linspace(scaled.min(), scaled.max(), count + 1)[1:-1]
+    which = np.searchsorted(inner, scaled, side="right")
+    held = np.bincount(which, weights=volumes, minlength=count)
+    total = np.bincount(which, weights=volumes * values, minlength=count)
+    # Rounding may take a mean out of its bin by a bit where all of its values are equal.
+    low = np.full(count, np.inf)
+    high = np.full(count, -np.inf)
+    np.minimum.at(low, which, values)
+    np.maximum.at(high, which, values)
+    with np.errstate(invalid="ignore"):  # bins without cells
+        return np.clip(total / held, low, high)[which]

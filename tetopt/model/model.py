@@ -1,0 +1,128 @@
+"""The model: a mesh with all that a solver is told of it."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.errors import InputError
+from tetopt.mesh import Mesh
+from tetopt.model.loads import Load
+from tetopt.model.materials import Materials
+from tetopt.model.sets import Sets, outward_facet_nodes
+
+if TYPE_CHECKING:
+    import skfem
+
+# What is consistent with mm: stress unit -> kPa in one of it, force, energy, mass, density of water.
+UNITS = {"kPa": (1.0, "mN", "uJ", "kg", 1e-6), "MPa": (1e3, "N", "mJ", "t", 1e-9)}
+SPACES = ("ras", "lps")
+# Local nodes of the edges whose midpoints are the quadratic tetrahedron's nodes 5 to 10, as in VTK, Abaqus and FEBio.
+EDGES = np.array([(0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)])
+
+
+class Model(NamedTuple):
+    """What is written for a solver. Lengths in mm; moduli in `units`."""
+
+    mesh: Mesh
+    cell_data: dict[str, NDArray]  # by name, one row a cell
+    sets: Sets
+    materials: Materials | None = None
+    loads: tuple[Load, ...] = ()
+    order: int = 1  # 2: straight-edged quadratic cells, see `quadratic`
+    units: str = "kPa"
+    space: str = "ras"  # "lps": x and y have changed sign
+    about: dict[str, Any] = {}  # noqa: RUF012 - a default that nobody changes; name -> text, or what JSON can hold
+
+    def to_skfem(self) -> skfem.Mesh:
+        """The mesh for scikit-fem, with the sets; see `tetopt.model.skfem.to_skfem`."""
+        from tetopt.model.skfem import to_skfem  # which imports this module
+
+        return to_skfem(self)
+
+
+def in_space(model: Model, space: str) -> Model:
+    """The model in another convention of world axes: "ras" (NIfTI) or "lps" (DICOM, ITK), a half turn about z.
+
+    Raises
+    ------
+    InputError
+        Another word, or a 2-D model, whose plane may be any.
+    """
+    if space not in SPACES:
+        raise InputError(f"space: expected ras or lps, got {space}")
+    if space == model.space:
+        return model
+    if model.mesh.ndim == 2:
+        raise InputError("space: a mesh of triangles has coordinates in its own plane; leave out --space")
+    turn = np.array([-1.0, -1.0, 1.0])
+    loads = tuple(Load(load.set_name, load.displacement * turn + 0.0) for load in model.loads)
+    mesh = Mesh(model.mesh.points * turn + 0.0, model.mesh.cells)  # + 0.0: no -0
+    return model._replace(mesh=mesh, loads=loads, space=space)
+
+
+def in_units(model: Model, units: str) -> Model:
+    """The model with its moduli in another unit of stress, kPa or MPa.
+
+    Raises
+    ------
+    InputError
+        Another word.
+    """
+    if units not in UNITS:
+        raise InputError(f"units: expected {' or '.join(UNITS)}, got {units}")
+    if model.materials is None or units == model.units:
+        return model._replace(units=units)
+    scale = UNITS[model.units][0] / UNITS[units][0]
+    return model._replace(materials=model.materials._replace(young=model.materials.young * scale), units=units)
+
+
+def units_text(model: Model) -> str:
+    """The consistent units of a file in words."""
+    _, force, energy, mass, _ = UNITS[model.units]
+    return f"mm, {model.units}, {force}, {energy}, {mass}, s"
+
+
+def described(model: Model) -> list[str]:
+    """Lines for a file's head: who wrote it, in what coordinates and units, and from what."""
+    lines = [
+        f"tetopt {model.about.get('tetopt', '')}".strip(),
+        f"coordinates: {model.space.upper()}+, mm" if model.mesh.ndim == 3 else "coordinates: of the slice's plane, mm",
+        f"units: {units_text(model)}",
+    ]
+    if "image" in model.about:
+        lines.append(f"image: {model.about['image']}, sha256 {model.about.get('image_sha256', 'unknown')}")
+    if model.materials is not None and (error := model.materials.binning) is not None:
+        lines.append(
+            f"materials: bins, modulus off by {error.mean:.3%} in the mean by volume, {error.largest:.3%} at most"
+        )
+    # A line break in a file's name would end a comment.
+    return [" ".join(line.split()) for line in lines]
+
+
+def quadratic(mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Points (N + E, 3) and cells (M, 10) of straight-edged quadratic tetrahedra; the mesh's own nodes come first.
+
+    Nodes 5 to 10 of a cell are the midpoints of `EDGES`.
+    """
+    ends = np.sort(mesh.cells[:, EDGES], axis=2)  # (M, 6, 2)
+    edges, number = np.unique(ends.reshape(-1, 2), axis=0, return_inverse=True)
+    points = np.concatenate([mesh.points, mesh.points[edges].mean(axis=1)])
+    return points, np.column_stack([mesh.cells, len(mesh.points) + number.reshape(-1, 6)])
+
+
+def quadratic_facet_nodes(cells: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Nodes (K, 6) of the facets (K, 2) of quadratic cells (M, 10): three corners facing out, then their midpoints.
+
+    The midpoints are of the first two corners, of the second and third, and of the third and first.
+    """
+    of_edge = {frozenset(edge): 4 + number for number, edge in enumerate(EDGES.tolist())}
+    local = np.array(
+        [
+            [*corners, *(of_edge[frozenset((corners[k], corners[(k + 1) % 3]))] for k in range(3))]
+            for corners in outward_facet_nodes(3).tolist()
+        ]
+    )
+    return cells[rows[:, :1], local[rows[:, 1]]]

@@ -1,0 +1,329 @@
+"""Named sets of facets and cells, which boundary conditions and materials are given to.
+
+A facet is a row (cell, k): the facet of that cell opposite its local node k, so that its outer side is known, and with
+it which side of an interface is meant. Nodes need no sets of their own: those of a facet set are `nodes_of` it.
+"""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Iterable
+from itertools import permutations
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tetopt.check import ON_FACE
+from tetopt.errors import InputError
+from tetopt.geometry.simplex import facet_nodes
+from tetopt.geometry.topology import facets, largest_component
+from tetopt.image import Image, transformed
+from tetopt.mesh import Mesh
+
+BOUNDARY = "boundary"  # every facet of one cell only
+MASK_SURFACE = "mask_surface"  # those of them off the faces of the image's box
+# By RAS+: the side of smaller and of larger world coordinate. A slice's two axes may be any of the three.
+FACES: dict[int, tuple[tuple[str, str], ...]] = {
+    2: (("x_min", "x_max"), ("y_min", "y_max")),
+    3: (("left", "right"), ("posterior", "anterior"), ("inferior", "superior")),
+}
+NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,39}")  # what every format can carry
+
+
+class Sets(NamedTuple):
+    """Sets by name; all names differ, and by more than case, as some formats have one list of names for everything."""
+
+    facets: dict[str, NDArray[np.int64]]  # (K, 2) rows (cell, local node opposite), ascending
+    cells: dict[str, NDArray[np.int64]]  # (K,) ascending
+
+
+class Box(NamedTuple):
+    """An image's domain without its voxels: from index -0.5 to shape - 0.5."""
+
+    shape: tuple[int, ...]
+    affine: NDArray[np.float64]  # (n+1, n+1)
+
+
+class Tagged(NamedTuple):
+    """Overlapping sets as tags, one an item, for formats that know no more: an item's tag tells all of its sets."""
+
+    items: NDArray[np.int64]  # (T,) or (T, 2): every cell or facet that is in any set, ascending
+    tags: NDArray[np.int64]  # (T,) from 1
+    tags_of: dict[str, list[int]]  # the tags that make up each set
+
+
+def facet_triples(cells: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Nodes of the facets (K, 2), (K, n) int64, turned to face out of their cell.
+
+    In 3-D the normal (b - a) x (c - a) of a row (a, b, c) points out; in 2-D the right side of a -> b lies outside.
+    """
+    return cells[rows[:, :1], outward_facet_nodes(cells.shape[1] - 1)[rows[:, 1]]]
+
+
+def outward_facet_nodes(n: int) -> NDArray[np.int64]:
+    """Local nodes of each facet, facing out: facets of a positively oriented simplex do for even k as they stand."""
+    return np.array(
+        [nodes if k % 2 == 0 else (nodes[1], nodes[0], *nodes[2:]) for k, nodes in enumerate(facet_nodes(n))]
+    )
+
+
+def nodes_of(mesh: Mesh, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The nodes of a facet set, (P,) int64, ascending."""
+    return np.unique(facet_triples(mesh.cells, rows))
+
+
+def boundary_rows(mesh: Mesh) -> NDArray[np.int64]:
+    """Every facet that belongs to one cell only, (B, 2) int64, ascending."""
+    found = facets(mesh.cells)
+    return np.argwhere(found.n_cells[found.of_cell] == 1)
+
+
+def standard_sets(mesh: Mesh, box: Box | None = None, labels: NDArray[np.integer] | None = None) -> Sets:
+    """The sets that every mesh comes with.
+
+    Parameters
+    ----------
+    mesh : Mesh
+    box : Box, optional
+        The box of the image that the mesh was made from, whose faces are named by the world axis that each is nearest
+        to: "left" is the side of smaller x in RAS+. By default the box along the world's axes around the mesh.
+    labels : (M,) integers, optional
+        Label of each cell.
+
+    Returns
+    -------
+    Sets
+        Facets "boundary", "left", "right", "posterior", "anterior", "inferior", "superior" (in 2-D "x_min", "x_max",
+        "y_min", "y_max"), and, with a box, "mask_surface" for the boundary off its faces; sets without facets are
+        left out. With labels also cells "label_1", ... and facets "interface_1_2", ..., of the cells of the smaller
+        label.
+
+    Raises
+    ------
+    InputError
+        Labels that are not one whole number from 0 for each cell.
+    """
+    boundary = boundary_rows(mesh)
+    named = {BOUNDARY: boundary, **_face_sets(mesh, boundary, box)}
+    cell_sets = {}
+    if labels is not None:
+        labels = _checked_labels(labels, mesh)
+        cell_sets = {f"label_{label}": np.flatnonzero(labels == label) for label in np.unique(labels)}
+        named |= _interfaces(mesh, labels)
+    return Sets({name: rows for name, rows in named.items() if len(rows)}, cell_sets)
+
+
+def _face_sets(mesh: Mesh, boundary: NDArray[np.int64], box: Box | None) -> dict[str, NDArray[np.int64]]:
+    n = mesh.ndim
+    corners = mesh.points[facet_triples(mesh.cells, boundary)]  # (B, n, n)
+    if box is None:
+        low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
+        index, ends, near = corners, np.column_stack([low, high]), ON_FACE * (high - low).max()
+        axes, directions = tuple(range(n)), np.ones(n)
+    else:
+        inverse = np.asarray(np.linalg.inv(box.affine[:n, :n]), dtype=np.float64)
+        index, near = transformed(corners - box.affine[:n, n], inverse), ON_FACE
+        ends = np.column_stack([np.full(n, -0.5), np.array(box.shape) - 0.5])
+        axes = world_axes(box.affine)
+        directions = box.affine[list(axes), range(n)]
+    found, is_on_any = {}, np.zeros(len(boundary), dtype=bool)
+    for axis in range(n):
+        names = FACES[n][axes[axis]]
+        for end, name in zip(ends[axis], names if directions[axis] > 0.0 else names[::-1], strict=True):
+            is_on = (np.abs(index[:, :, axis] - end) <= near).all(axis=1)
+            is_on_any |= is_on
+            found[name] = boundary[is_on]
+    ordered = {name: found[name] for pair in FACES[n] for name in pair}
+    return ordered if box is None else {**ordered, MASK_SURFACE: boundary[~is_on_any]}
+
+
+def world_axes(affine: NDArray[np.float64]) -> tuple[int, ...]:
+    """The world axis that each index axis stands for, each one once: those that the axes lie nearest to together."""
+    n = len(affine) - 1
+    cosines = np.abs(affine[:n, :n]) / np.linalg.norm(affine[:n, :n], axis=0)
+    return max(permutations(range(n)), key=lambda order: float(np.prod(cosines[list(order), range(n)])))
+
+
+def _interfaces(mesh: Mesh, labels: NDArray[np.int64]) -> dict[str, NDArray[np.int64]]:
+    """Facets between two labels, held by the cell of the smaller one."""
+    found = facets(mesh.cells)
+    of_cell = found.cells[found.of_cell]  # (M, n+1, 2)
+    own = np.arange(len(mesh.cells))[:, None]
+    other = np.where(of_cell[..., 0] == own, of_cell[..., 1], of_cell[..., 0])
+    there = np.where(other >= 0, labels[other], -1)
+    rows = np.argwhere(there > labels[:, None])
+    pairs = np.column_stack([labels[rows[:, 0]], there[rows[:, 0], rows[:, 1]]])
+    kinds, which = np.unique(pairs, axis=0, return_inverse=True)
+    return {f"interface_{a}_{b}": rows[which.ravel() == k] for k, (a, b) in enumerate(kinds)}
+
+
+def _checked_labels(labels: ArrayLike, mesh: Mesh) -> NDArray[np.int64]:
+    array = np.asarray(labels)
+    if array.shape != (len(mesh.cells),):
+        raise InputError(f"labels: expected one for each of {len(mesh.cells)} cells, got shape {array.shape}")
+    whole = array.astype(np.int64)
+    if (whole != array).any() or whole.min() < 0:
+        raise InputError(f"labels: expected whole numbers from 0, got {array.min():g} to {array.max():g}")
+    return whole
+
+
+# Sets that a user asks for
+
+
+def with_asked(mesh: Mesh, sets: Sets, asked: Iterable[str], mean: NDArray[np.float64] | None) -> Sets:
+    """`sets` and those that are asked for in words.
+
+    Parameters
+    ----------
+    mesh : Mesh
+    sets : Sets
+    asked : iterable of str
+        "NAME=below:T", the cells of the largest facet-connected set with a mean below T (Fig. 3(f) of the paper), with
+        the facets around them, "NAME_surface"; "NAME=point:X,Y,Z:D" and "NAME=plane:X,Y,Z:NX,NY,NZ:D", boundary facets
+        all of whose nodes lie within D mm of a point, or of a plane through a point with a normal; world mm, RAS+.
+    mean : (M,) float64, optional
+        Mean intensity of each cell.
+
+    Raises
+    ------
+    InputError
+        Other words, a name that is taken or that a format cannot carry, no means, or a set without members.
+    """
+    for text in asked:
+        name, equals, what = text.partition("=")
+        kind, _, rest = what.partition(":")
+        if not equals or kind not in ("below", "point", "plane"):
+            raise InputError(
+                f'set: expected NAME=below:T, NAME=point:X,Y,Z:D or NAME=plane:X,Y,Z:NX,NY,NZ:D, got "{text}"'
+            )
+        for each in (name, f"{name}_surface") if kind == "below" else (name,):
+            _check_name(each, sets)
+        if kind == "below":
+            chosen = _below(mesh, name, rest, mean)
+            sets = Sets(sets.facets | {f"{name}_surface": around(mesh, chosen)}, sets.cells | {name: chosen})
+        else:
+            sets = Sets(sets.facets | {name: _near(mesh, name, kind, rest)}, sets.cells)
+    return sets
+
+
+def around(mesh: Mesh, chosen: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The facets between chosen cells and all else, held by the chosen, (K, 2) int64."""
+    part = Mesh(mesh.points, mesh.cells[chosen])
+    rows = boundary_rows(part)
+    return np.column_stack([chosen[rows[:, 0]], rows[:, 1]])
+
+
+def _check_name(name: str, sets: Sets) -> None:
+    if not NAME.fullmatch(name):
+        raise InputError(f'set: a name is a letter, then up to 39 letters, digits, _ and -, got "{name}"')
+    taken = {other.lower(): other for other in (*sets.facets, *sets.cells)}
+    if name.lower() in taken:
+        raise InputError(f'set: there is a set "{taken[name.lower()]}" already; call it otherwise than "{name}"')
+
+
+def _below(mesh: Mesh, name: str, text: str, mean: NDArray[np.float64] | None) -> NDArray[np.int64]:
+    (threshold,) = _numbers(name, text, 1)
+    if mean is None:
+        raise InputError(f"set {name}: the mesh has no means; give the image they come from (--image)")
+    chosen = largest_component(mesh.cells, mean < threshold)
+    if len(chosen) == 0:
+        raise InputError(f"set {name}: no cell has a mean below {threshold:g}, they go from {mean.min():g} up")
+    return chosen
+
+
+def _near(mesh: Mesh, name: str, kind: str, text: str) -> NDArray[np.int64]:
+    """Boundary facets all of whose nodes are near."""
+    n = mesh.ndim
+    vectors = text.split(":")
+    if len(vectors) != (2 if kind == "point" else 3):
+        raise InputError(f'set {name}: expected {"X,Y,Z:D" if kind == "point" else "X,Y,Z:NX,NY,NZ:D"}, got "{text}"')
+    offset = mesh.points - _numbers(name, vectors[0], n)
+    if kind == "point":
+        distance = np.sqrt((offset**2).sum(axis=1))
+    else:
+        normal = _numbers(name, vectors[1], n)
+        if not normal.any():
+            raise InputError(f"set {name}: the plane's normal must not be 0")
+        distance = np.abs((offset * (normal / np.linalg.norm(normal))).sum(axis=1))
+    (reach,) = _numbers(name, vectors[-1], 1)
+    rows = boundary_rows(mesh)
+    farthest = distance[facet_triples(mesh.cells, rows)].max(axis=1)
+    if not (farthest <= reach).any():
+        raise InputError(
+            f"set {name}: no facet of the boundary lies within {reach:g} mm; the nearest does within "
+            f"{farthest.min():.4g} mm"
+        )
+    return rows[farthest <= reach]
+
+
+def _numbers(name: str, text: str, count: int) -> NDArray[np.float64]:
+    try:
+        numbers = np.array([float(part) for part in text.split(",")])
+    except ValueError:
+        numbers = np.empty(0)
+    if len(numbers) != count or not np.isfinite(numbers).all():
+        raise InputError(f'set {name}: expected {count} number{"s" * (count > 1)}, got "{text}"')
+    return numbers
+
+
+# For formats that know one tag an item
+
+
+def tagged(sets: dict[str, NDArray[np.int64]]) -> Tagged:
+    """One tag for each combination of sets that some item is in, from 1 in the order of the first such items.
+
+    Examples
+    --------
+    >>> found = tagged({"a": np.array([4, 7]), "b": np.array([7, 9])})
+    >>> found.items.tolist(), found.tags.tolist(), found.tags_of
+    ([4, 7, 9], [1, 2, 3], {'a': [1, 2], 'b': [2, 3]})
+    """
+    if not sets:
+        return Tagged(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), {})
+    items, which = np.unique(np.concatenate(list(sets.values())), axis=0, return_inverse=True)
+    of_set = np.repeat(np.arange(len(sets)), [len(members) for members in sets.values()])
+    is_in = np.zeros((len(items), len(sets)), dtype=bool)
+    is_in[which.ravel(), of_set] = True
+    kinds, first, kind = np.unique(is_in, axis=0, return_index=True, return_inverse=True)
+    rank = np.empty(len(kinds), dtype=np.int64)
+    rank[np.argsort(first)] = np.arange(1, len(kinds) + 1)
+    tags_of = {name: np.sort(rank[kinds[:, k]]).tolist() for k, name in enumerate(sets)}
+    return Tagged(items, rank[kind.ravel()], tags_of)
+
+
+def rows_of(mesh: Mesh, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Rows (cell, k), ascending, of facets given by their nodes (K, n) in any order; what is no facet is left out.
+
+    A facet between two cells is held by the first of them.
+    """
+    found = facets(mesh.cells)
+    every, which = np.unique(np.concatenate([found.nodes, np.sort(nodes, axis=1)]), axis=0, return_inverse=True)
+    place = np.full(len(every), -1)
+    place[which.ravel()[: len(found.nodes)]] = np.arange(len(found.nodes))
+    number = np.unique(place[which.ravel()[len(found.nodes) :]])
+    number = number[number >= 0]
+    cell = found.cells[number, 0]
+    rows = np.column_stack([cell, (found.of_cell[cell] == number[:, None]).argmax(axis=1)])
+    return rows[np.lexsort(rows.T[::-1])]
+
+
+def with_carried(sets: Sets, before: Mesh, given: Sets, mesh: Mesh) -> Sets:
+    """`sets`, and those facet sets of a mesh as it was before that it still has all of, node for node.
+
+    Of an optimised mesh with its boundary kept these are the sets on the boundary; names that are taken are left out.
+    """
+    place = {point.tobytes(): number for number, point in enumerate(mesh.points)}
+    now = np.array([place.get(point.tobytes(), -1) for point in before.points])
+    carried = {}
+    taken = {name.lower() for name in (*sets.facets, *sets.cells)}
+    for name, rows in given.facets.items():
+        found = rows_of(mesh, now[facet_triples(before.cells, rows)])
+        if name.lower() not in taken and len(found) == len(rows):
+            carried[name] = found
+    return Sets(sets.facets | carried, sets.cells)
+
+
+def box_of(image: Image) -> Box:
+    """The box that an image fills."""
+    return Box(image.shape, image.affine)

@@ -1,0 +1,69 @@
+"""Models in scikit-fem, without a file."""
+
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.errors import InputError
+from tetopt.model.model import Model
+
+if TYPE_CHECKING:
+    import skfem  # type: ignore[import-untyped]
+
+
+def to_skfem(model: Model) -> skfem.Mesh:
+    """The model's mesh with its sets, as scikit-fem has them.
+
+    Nodes and cells keep their order, so that what is on each cell stays as it is, such as `young[of_cell]` of the
+    materials; scikit-fem sorts the three nodes of a triangle, though. Facet sets are `boundaries`, those with facets
+    between two cells as `OrientedBoundary`, whose normals point out of the cells that the set holds them by; cell sets
+    are `subdomains`. A 2-D model is a `MeshTri`, a 3-D one a `MeshTet`.
+
+    Raises
+    ------
+    InputError
+        scikit-fem is not installed, or the model is quadratic: elements of any order are chosen in scikit-fem.
+
+    Examples
+    --------
+    >>> import numpy as np
+    >>> from tetopt import Mesh
+    >>> from tetopt.model.model import Model
+    >>> from tetopt.model.sets import standard_sets
+    >>> mesh = Mesh([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]])
+    >>> found = to_skfem(Model(mesh, {}, standard_sets(mesh, labels=np.array([7]))))
+    >>> found.p[:, found.facets[:, found.boundaries["x_min"]]].tolist()
+    [[[0.0], [0.0]], [[0.0], [1.0]]]
+    >>> found.subdomains["label_7"].tolist()
+    [0]
+    """
+    try:
+        import skfem
+    except ImportError as error:
+        raise InputError("to_skfem: scikit-fem is not installed; pip install scikit-fem") from error
+    if model.order != 1:
+        raise InputError(
+            "to_skfem: expected linear cells, got order 2; leave out the order and take P2 elements in scikit-fem"
+        )
+    kind = skfem.MeshTet if model.mesh.ndim == 3 else skfem.MeshTri
+    # Contiguous, or scikit-fem warns of making them so.
+    mesh = kind(np.ascontiguousarray(model.mesh.points.T), np.ascontiguousarray(model.mesh.cells.T))
+    boundaries = {name: _boundary(mesh, model.mesh.cells, rows) for name, rows in model.sets.facets.items()}
+    subdomains = {name: cells.copy() for name, cells in model.sets.cells.items()}
+    return mesh.with_boundaries(boundaries).with_subdomains(subdomains)
+
+
+def _boundary(mesh: skfem.Mesh, cells: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.integer]:
+    """scikit-fem's numbers of the facets (K, 2)."""
+    from skfem.generic_utils import OrientedBoundary  # type: ignore[import-untyped]
+
+    cell, node = rows[:, 0], cells[rows[:, 0], rows[:, 1]]
+    of_cell = mesh.t2f[:, cell]  # (n+1, K)
+    is_opposite = (mesh.facets[:, of_cell] != node).all(axis=0)
+    numbers = of_cell[is_opposite.argmax(axis=0), np.arange(len(rows))]
+    if (mesh.f2t[1, numbers] < 0).all():
+        return numbers
+    return OrientedBoundary(numbers, (mesh.f2t[0, numbers] != cell).astype(np.int64))
