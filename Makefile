@@ -6,7 +6,9 @@ BIN := $(VENV)/bin
 NUMBA_CACHE = $(CURDIR)/.numba_cache/$(shell cat tetopt/*.py tetopt/*/*.py | cksum | cut -d' ' -f1)
 TESTED = NUMBA_CACHE_DIR=$(NUMBA_CACHE) MPLBACKEND=agg $(BIN)/python -m pytest
 
-.PHONY: demo test test-slow test-nojit test-onethread lint bench clean
+SOLVERS = calculix-ccx python3-dolfinx
+
+.PHONY: demo test test-slow test-solvers test-nojit test-onethread lint bench clean
 
 demo: $(VENV)/.demo
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt demo -o demo --force
@@ -24,6 +26,14 @@ test-nojit: $(VENV)/.test
 
 test-slow: $(VENV)/.test
 	$(TESTED) -m slow
+
+# CalculiX and dolfinx from Debian, MFEM, gmsh (run beside the tests, never imported by tetopt) and pyfebio from PyPI.
+test-solvers: $(VENV)/.test
+	@command -v apt-get >/dev/null || { echo "needs Debian's apt-get; install CalculiX (ccx) and dolfinx, then run: $(BIN)/python -m pytest tests/solvers"; exit 2; }
+	dpkg -s $(SOLVERS) >/dev/null 2>&1 || { apt-get update -qq && apt-get install -y -qq --no-install-recommends $(SOLVERS); }
+	$(BIN)/python -m pip install --quiet --disable-pip-version-check mfem gmsh pyfebio
+	$(TESTED) tests/solvers tests/model tests/io/test_abaqus.py tests/io/test_febio.py tests/io/test_gmsh.py \
+	  tests/io/test_medit.py tests/io/test_mfem.py tests/io/test_sofa.py tests/io/test_vtk.py tests/io/test_xdmf.py
 
 lint: $(VENV)/.test
 	$(BIN)/ruff check .

@@ -122,7 +122,15 @@ def test_json_of_a_run(run, inputs):
     assert numbers["image_sha256"] == hashlib.sha256((inputs / "sphere.nii.gz").read_bytes()).hexdigest()
     assert numbers["options"] == {
         **{"k_D": 0.3, "iterations": 3, "n_t": 1, "retessellate": "first", "boundary": "slide", "nodes": 150},
-        **{"spacing": None, "lattice": "bcc", "volume": None, "crop": None, "slice": None, "method": "paper"},
+        **{
+            "spacing": None,
+            "lattice": "bcc",
+            "volume": None,
+            "crop": None,
+            "slice": None,
+            "method": "paper",
+            "start": None,
+        },
         **dict.fromkeys(("max_seconds", "target_error", "size_min", "size_max", "gradation", "sizing")),
     }
     assert numbers["versions"]["tetopt"] == tetopt.__version__
@@ -146,7 +154,7 @@ def test_json_of_a_run(run, inputs):
 
 def test_mesh_file_of_a_run(run):
     folder, numbers, file, image = run
-    assert list(file.cell_data) == ["mean", "variance", "n_voxels", "volume", "rho", "min_dihedral"]
+    assert list(file.cell_data) == ["mean", "variance", "n_voxels", "min", "max", "volume", "rho", "min_dihedral"]
     moments = tetopt.cell_moments(image, file.mesh)
     np.testing.assert_array_equal(file.cell_data["n_voxels"], moments.n_voxels)
     np.testing.assert_array_equal(file.cell_data["mean"], moments.mean)
@@ -477,13 +485,13 @@ def test_bad_options_of_mesh(tmp_path, inputs, monkeypatch, capfd, options, matc
         ("mesh {disc} -o a.vtu --lattice bcc", "expected one of criss-cross in 2-D"),
         ("mesh {disc} -o a.vtu --slice k=3", "slice"),
         ("mesh {disc} -o a.vtu --crop 1:5,1:5,1:5", "crop"),
-        ("mesh {disc} -o a.vtk", "ends in .vtu"),
+        ("mesh {disc} -o a.obj", "unknown suffix; known are .vtu"),
         ("mesh {disc} -o no/a.vtu", "folder does not exist"),
         ("mesh {disc}", "--output"),
         ("mesh -o a.vtu", r"Missing argument 'IMAGE\.\.\.'"),
         ("mesh {lattice} -o a.vtu", "unknown kind of image"),
         ("quality no.vtu", "no such mesh file"),
-        ("quality {disc}", "named .vtu or .vtk"),
+        ("quality {disc}", "named .vtu, .vtk or .msh"),
         ("quality {lattice} --image no.nii", "no such file"),
         ("quality {lattice} --image {disc}", "3-D mesh and a 2-D image"),
         ("quality {lattice} --json no/a.json", "folder does not exist"),

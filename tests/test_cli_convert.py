@@ -1,6 +1,7 @@
 """`tetopt convert`, `tetopt surface`, `tetopt mesh` for solvers and from a mesh of the user's, as a user types them."""
 
 import json
+import re
 
 import meshio
 import numpy as np
@@ -210,7 +211,7 @@ def test_a_mesh_beside_the_image(folder, tmp_path, capsys):
         ("a.inp", ["--units", "Pa"], "--units: expected kPa or MPa"),
         ("a.inp", ["--space", "xyz"], "--space: expected ras or lps"),
         ("a.inp", ["--order", "3"], "--order: expected 1 or 2"),
-        ("a.vtu", ["--order", "2"], "--order 2 is for .inp, .feb only"),
+        ("a.vtu", ["--order", "2"], "--order 2 is for .msh, .msh2, .inp, .feb only"),
         ("a.inp", ["--load", "compress:5%"], "loads, but no materials"),
         ("a.inp", ["--young", "2", "--load", "compress:5"], "a percentage"),
         ("a.inp", ["--young", "2", "--load", "hold:skin"], 'no set of facets "skin"'),
@@ -295,3 +296,24 @@ def test_a_field_that_is_not_there(folder, tmp_path, capsys):
         assert "on its cells; it has nothing" in capsys.readouterr().err
     assert run("surface", folder / "a.vtu", "-o", tmp_path / "s.obj", "--label", "1") == 2
     assert "ends in .stl or .ply" in capsys.readouterr().err
+
+
+# Looking
+
+
+def test_a_page_to_look_at(folder, tmp_path, capsys):
+    options = ["--image", folder / "a.nii.gz", "--html", tmp_path / "a.html"]
+    assert run("view", folder / "a.vtu", *options) == 0
+    page = (tmp_path / "a.html").read_text()
+    assert "needs nothing else" in capsys.readouterr().out
+    assert "interface_0_1" in page
+    assert "min_dihedral" in page
+    assert not re.search(r'(src|href)="(?!data:|#)', page)
+    assert run("view", folder / "a.vtu", "--html", tmp_path / "a.html") == 2
+    assert run("view", folder / "a.vtu", "--html", tmp_path / "a.png") == 2
+
+
+def test_no_window_without_a_display(folder, monkeypatch, capsys):
+    monkeypatch.setattr("tetopt.report.window.has_display", lambda: False)
+    assert run("view", folder / "a.vtu") == 2
+    assert "use --html" in capsys.readouterr().err

@@ -25,6 +25,10 @@ def test_program(tmp_path, monkeypatch, capsys):
     assert 0.0001 < float(share) < 0.01
     assert float(shape) > 0.24
     assert float(re.fullmatch(r"the stiffer sphere alone: Dice (\S+)", printed[2]).group(1)) > 0.97
+    n_materials, error = re.fullmatch(r"(\d+) materials, modulus off by (\S+)% in the mean", printed[3]).groups()
+    assert 8 <= int(n_materials) <= 16
+    assert 0.0 < float(error) < 5.0
+    assert "*MATERIAL" in Path("two_spheres.inp").read_text()
     written = tetopt.load_mesh("two_spheres.vtu")
     assert len(written.mesh.cells) == len(names["result"].mesh.cells)
     assert written.cell_data["mean"].max() == names["cells"].mean.max()
@@ -32,8 +36,12 @@ def test_program(tmp_path, monkeypatch, capsys):
 
 def test_commands(tmp_path, monkeypatch):
     """Each `tetopt` line of the README, on a phantom in the place of the T1 and with fewer nodes."""
-    lines = [line for line in README.splitlines() if re.match("tetopt (mesh|quality|phantom|fem|segment) ", line)]
-    assert len(lines) == 11
+    lines = [
+        line
+        for line in README.splitlines()
+        if re.match("tetopt (mesh|quality|phantom|fem|segment|convert|surface|view) ", line)
+    ]
+    assert len(lines) == 17
     monkeypatch.chdir(tmp_path)
     assert main(["phantom", "sphere", "-o", "T1.nii.gz", "--voxel-mm", "2", "--labels", "mask.nii.gz"]) == 0
     shutil.copy("T1.nii.gz", "T2.nii.gz")
@@ -54,6 +62,12 @@ def test_commands(tmp_path, monkeypatch):
         "brain.vtu",
         "fine.vtu",
         "uniform.vtu",
+        "tissues.inp",
+        "tissues.feb",
+        "T1.xdmf",
+        "better.vtu",
+        "dark.stl",
+        "look.html",
         "run.json",
         "sphere.nii.gz",
         "slice.png",

@@ -12,10 +12,12 @@ from tetopt.errors import InputError
 from tetopt.fidelity import cell_labels, label_fidelity, mask_fidelity
 from tetopt.geometry.quality import quality
 from tetopt.image import Image
+from tetopt.io.formats import save_model
 from tetopt.io.images import load_image, save_image
 from tetopt.io.meshes import load_mesh, save_mesh
 from tetopt.lattice import lattice
 from tetopt.mesh import Mesh
+from tetopt.model.build import model_of
 from tetopt.model.fields import cell_fields
 from tetopt.optimize.fast import mesh_image, optimize
 from tetopt.optimize.octree import octree
@@ -48,10 +50,12 @@ __all__ = [
     "load_phantom",
     "mask_fidelity",
     "mesh_image",
+    "model_of",
     "octree",
     "optimize",
     "optimize_paper",
     "quality",
     "save_image",
     "save_mesh",
+    "save_model",
 ]

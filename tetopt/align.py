@@ -62,7 +62,7 @@ def aligned_labels(labels: Image, image: Image, name: str = "labels") -> Image:
     Parameters
     ----------
     labels : Image
-        Whole numbers from 0 to `tetopt.segmentation.LABELS`, 0 the background.
+        Whole numbers from 0 to `tetopt.content.LABELS`, 0 the background.
     image : Image
     name : str, optional
         What the labels are called in messages.

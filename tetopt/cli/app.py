@@ -23,6 +23,7 @@ from tetopt.cli.phantom import phantom_command
 from tetopt.cli.quality import quality_command
 from tetopt.cli.segment import segment_command
 from tetopt.cli.surface import surface_command
+from tetopt.cli.view import view_command
 
 app = typer.Typer(
     name="tetopt",
@@ -38,6 +39,7 @@ COMMANDS: dict[str, Callable[..., int]] = {  # in the order of the help
     "quality": quality_command,
     "convert": convert_command,
     "surface": surface_command,
+    "view": view_command,
     "phantom": phantom_command,
     "fem": fem_command,
     "segment": segment_command,

@@ -19,7 +19,6 @@ from tetopt.geometry.simplex import oriented
 from tetopt.io.files import written_whole
 from tetopt.io.vtk import add_texts, box_in, sets_in, to_pyvista, vtu_bytes
 from tetopt.mesh import Mesh
-from tetopt.model.fields import cell_fields  # noqa: F401 - TEMPORARY
 from tetopt.model.sets import NAME, Box, Sets, rows_of
 
 SUFFIXES = (".vtu", ".vtk", ".msh")

@@ -11,7 +11,7 @@ from tetopt.errors import InputError
 from tetopt.model.model import Model
 
 if TYPE_CHECKING:
-    import skfem  # type: ignore[import-untyped]
+    import skfem
 
 
 def to_skfem(model: Model) -> skfem.Mesh:
@@ -58,7 +58,7 @@ def to_skfem(model: Model) -> skfem.Mesh:
 
 def _boundary(mesh: skfem.Mesh, cells: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.integer]:
     """scikit-fem's numbers of the facets (K, 2)."""
-    from skfem.generic_utils import OrientedBoundary  # type: ignore[import-untyped]
+    from skfem.generic_utils import OrientedBoundary
 
     cell, node = rows[:, 0], cells[rows[:, 0], rows[:, 1]]
     of_cell = mesh.t2f[:, cell]  # (n+1, K)

@@ -33,7 +33,7 @@ def label_colours(labels: Image) -> NDArray[np.float64]:
     Parameters
     ----------
     labels : Image
-        Whole numbers from 0 to `tetopt.segmentation.LABELS`.
+        Whole numbers from 0 to `tetopt.content.LABELS`.
 
     Returns
     -------

@@ -101,7 +101,7 @@ def label_figure(labels: Image, mesh: Mesh, of_cell: NDArray[np.int64] | None = 
     Parameters
     ----------
     labels : Image
-        Whole numbers from 0 to `tetopt.segmentation.LABELS`.
+        Whole numbers from 0 to `tetopt.content.LABELS`.
     mesh : Mesh
     of_cell : (M,) int64, optional
         Each cell's label; by default that of most of its voxels (`tetopt.fidelity.cell_labels`).

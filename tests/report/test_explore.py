@@ -1,0 +1,396 @@
+"""The page to explore a mesh with: its data are the mesh's, and a browser shows what numpy says is there."""
+
+import base64
+import html
+import json
+import re
+
+import numpy as np
+import pytest
+from test_compare_page import browser
+
+import tetopt
+from tetopt.errors import InputError
+from tetopt.geometry.cut import plane_cut
+from tetopt.geometry.simplex import centroids, volumes
+from tetopt.geometry.topology import boundary_facets, facets
+from tetopt.report import explore
+from tetopt.report.explore import colour_table, explorer_html, save_explorer, scalar_fields
+
+# Neither upright nor right-angled, one axis flipped: what is not taken through the affine comes out elsewhere.
+TILTED = np.array([[-1.9, 0.5, 0.3, 40.0], [0.4, 1.8, -0.5, -20.0], [0.3, 0.4, 2.6, 3.0], [0.0, 0.0, 0.0, 1.0]])
+
+
+@pytest.fixture(scope="module")
+def image():
+    return tetopt.Image(np.random.default_rng(0).integers(0, 200, (16, 18, 14)).astype(float), TILTED)
+
+
+@pytest.fixture(scope="module")
+def mesh(image):
+    return tetopt.lattice(image, nodes=300)
+
+
+@pytest.fixture(scope="module")
+def cell_data(mesh):
+    random = np.random.default_rng(1)
+    mean = random.normal(50.0, 20.0, len(mesh.cells))
+    mean[::9] = np.nan
+    return {"mean": mean, "strain": np.zeros((len(mesh.cells), 6)), "label": random.integers(0, 4, len(mesh.cells))}
+
+
+def packed(page):
+    return json.loads(re.search(r'id="data">(.*?)</script>', page, re.DOTALL).group(1))
+
+
+def array(text, kind):
+    return np.frombuffer(base64.b64decode(text), kind)
+
+
+def test_fields_are_labels_or_quantities(mesh, cell_data):
+    mean, label = scalar_fields(mesh, cell_data)
+    assert (mean.name, mean.unit, mean.categories) == ("mean", "intensity", [])
+    np.testing.assert_allclose(mean.limits, np.nanpercentile(cell_data["mean"].astype(np.float32), [1, 99]), rtol=1e-6)
+    assert [value for value, _ in label.categories] == [0, 1, 2, 3]
+    assert len({colour for _, colour in label.categories}) == 4
+    # Not all whole numbers are labels.
+    n = len(mesh.cells)
+    for name, values in (("n_voxels", np.full(n, 8)), ("depth", np.full(n, -1)), ("many", np.arange(n))):
+        assert scalar_fields(mesh, {name: values})[0].categories == []
+
+
+def test_a_field_without_range_or_values_has_limits(mesh):
+    n = len(mesh.cells)
+    constant, none, infinite = scalar_fields(
+        mesh, {"a": np.full(n, 0.5), "b": np.full(n, np.nan), "c": np.append(np.arange(n - 1) + 0.5, np.inf)}
+    )
+    assert constant.limits[0] < 0.5 < constant.limits[1]
+    assert none.limits == (0.0, 1.0)
+    assert infinite.limits[1] < n
+    assert np.isnan(infinite.values[-1])
+
+
+def test_without_fields_there_are_those_of_the_mesh(mesh, image):
+    names = [field.name for field in scalar_fields(mesh, {"strain": np.zeros((len(mesh.cells), 6))}, image)]
+    assert names == list(tetopt.cell_fields(mesh, image))
+
+
+def test_the_data_are_the_meshs(mesh, cell_data, image):
+    top = boundary_facets(mesh.cells)[:5]
+    data = packed(explorer_html(mesh, cell_data, image, facet_sets={"top": top}))
+    points = array(data["points"], "<f4").reshape(-1, 3) + data["centre"]
+    np.testing.assert_allclose(points, mesh.points, atol=1e-5)
+    np.testing.assert_array_equal(array(data["cells"], "<u4").reshape(-1, 4), mesh.cells)
+    assert [field["name"] for field in data["fields"]] == ["mean", "label"]
+    np.testing.assert_allclose(array(data["fields"][0]["values"], "<f4"), cell_data["mean"], rtol=1e-6)
+    assert data["skipped"] == ["strain"]
+    np.testing.assert_array_equal(array(data["sets"][0]["triangles"], "<u4").reshape(-1, 3), top)
+
+
+def test_the_image_is_where_its_affine_puts_it(mesh, image):
+    data = packed(explorer_html(mesh, {}, image))
+    found = data["image"]
+    index = np.random.default_rng(0).uniform(0, 13, (9, 3))
+    relative = np.append(image.to_world(index) - data["centre"], np.ones((9, 1)), axis=1)
+    np.testing.assert_allclose((relative @ np.reshape(found["toIndex"], (4, 4)))[:, :3], index, atol=1e-9)
+    low, high = np.percentile(image.data, [0.5, 99.5])
+    greys = array(found["voxels"], "u1").reshape(image.shape, order="F")
+    np.testing.assert_allclose(greys, np.clip((image.data - low) / (high - low), 0, 1) * 255, atol=0.51)
+
+
+def test_a_large_image_is_averaged_over_the_same_box(mesh, image, monkeypatch):
+    monkeypatch.setattr(explore, "MAX_VOXELS", 600)
+    whole = packed(explorer_html(mesh, {}, image))["image"]
+    assert np.prod(whole["shape"]) <= 600
+    assert whole["original"] == list(image.shape)
+    monkeypatch.undo()
+    np.testing.assert_allclose(whole["box"], packed(explorer_html(mesh, {}, image))["image"]["box"], atol=1e-9)
+
+
+def test_the_page_is_one_file(mesh, cell_data, tmp_path):
+    labels = {"</script>": cell_data["label"]}
+    save_explorer(tmp_path / "a.html", mesh, labels, title='</script><b>"$DATA')
+    text = (tmp_path / "a.html").read_text(encoding="utf-8")
+    assert not re.search(r"https?://|src=|href=|url\(|import ", text)
+    assert "default-src 'none'" in text
+    assert packed(text)["fields"][0]["name"] == "</script>"
+    assert "<title>&lt;/script&gt;&lt;b&gt;&quot;$DATA</title>" in text
+    assert "needs JavaScript" in text
+    with pytest.raises(InputError):
+        save_explorer(tmp_path / "b.html", mesh, {"mean": np.zeros(3)})
+    assert [path.name for path in tmp_path.iterdir()] == ["a.html"]
+
+
+def test_refusals(mesh, image):
+    plane = tetopt.Mesh([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]])
+    with pytest.raises(InputError, match="expected a mesh of tetrahedra, got one of triangles"):
+        explorer_html(plane, {})
+    with pytest.raises(InputError, match=f"'mean' for each of {len(mesh.cells)} cells, got 3"):
+        explorer_html(mesh, {"mean": np.zeros(3)})
+    with pytest.raises(InputError, match="3-D image beside a mesh of tetrahedra, got a 2-D one"):
+        explorer_html(mesh, {}, tetopt.Image(np.eye(3)))
+    for nodes in (np.zeros((2, 4), dtype=int), np.zeros((2, 3)), np.zeros(3, dtype=int)):
+        with pytest.raises(InputError, match="'top': expected \\(K, 3\\) whole numbers"):
+            explorer_html(mesh, {}, facet_sets={"top": nodes})
+    for node in (-1, len(mesh.points)):
+        with pytest.raises(InputError, match=f"'top': expected nodes 0..{len(mesh.points) - 1}, got"):
+            explorer_html(mesh, {}, facet_sets={"top": np.full((1, 3), node)})
+
+
+def test_the_colour_map_is_even():
+    """Its lightness rises by equal steps, as Y^(1/3) of its luminance says."""
+    linear = np.where(colour_table() / 255 <= 0.04045, colour_table() / 255 / 12.92, 0)
+    linear = np.where(linear > 0, linear, ((colour_table() / 255 + 0.055) / 1.055) ** 2.4)
+    lightness = np.cbrt(linear @ [0.2126, 0.7152, 0.0722])
+    steps = np.diff(lightness[::15])
+    assert steps.min() > 0.6 * steps.mean()
+
+
+# What a user does, and what the page then says or shows. Frames by timers: on a loaded machine a headless browser may
+# never get to a frame before its own time ends.
+FRAMES = "<script>window.requestAnimationFrame = (draw) => setTimeout(() => draw(performance.now()), 0)</script>"
+BLIND = "<script>HTMLCanvasElement.prototype.getContext = () => null;</script>"
+PROBE = """<script>
+const said = {};
+const $ = (id) => document.getElementById(id);
+const canvas = document.querySelector("canvas");
+const press = (group, value) => [...$(group).children].find((b) => b.dataset.value === String(value)).click();
+const put = (id, value) => { $(id).value = value; $(id).dispatchEvent(new Event("change")); };
+const slide = (id, value) => { $(id).value = value; $(id).dispatchEvent(new Event("input")); };
+const frame = () => new Promise((done) => setTimeout(done, 60));
+const grid = () => {  // every ninth pixel
+  const [width, height] = [canvas.width, canvas.height];
+  const copy = Object.assign(document.createElement("canvas"), { width, height });
+  const context = copy.getContext("2d");
+  context.drawImage(canvas, 0, 0);
+  const all = context.getImageData(0, 0, width, height).data;
+  const found = [];
+  for (let y = 3; y < height; y += 9) {
+    for (let x = 3; x < width; x += 9) found.push([x, y, ...all.subarray(4 * (y * width + x)).slice(0, 3)]);
+  }
+  return found;
+};
+const send = (type, x, y) => canvas.dispatchEvent(
+  new PointerEvent(type, { pointerId: 1, clientX: x, clientY: y, bubbles: true }));
+const steps = {
+  first() {}, whole() { press("style", true); put("at-number", AT_0); }, turned() { press("side", true); },
+  uncut() { press("axis", -1); },
+  within() { put("low-number", 45); put("high-number", 60); }, crossed() { put("low-number", 70); },
+  cut() { put("low-number", 45); put("high-number", 60); press("style", false); press("axis", 1);
+    put("at-number", AT_1); },
+  label() { slide("low", 0); slide("high", 1000); put("field", 1); put("low-number", 2); },
+};
+const run = async () => {
+  if (!canvas.isConnected) return { words: document.body.innerText };
+  said.over = document.documentElement.scrollWidth - document.documentElement.clientWidth;
+  if (document.title === "narrow") return said;
+  canvas.setPointerCapture = () => {};
+  for (const [name, act] of Object.entries(steps)) {
+    act();
+    await frame();
+    said[name] = [$("count").textContent, Number(canvas.dataset.surface), Number(canvas.dataset.section),
+      $("low-number").value, $("high-number").value];
+  }
+  said.labels = [...$("labels").children].map((entry) => [entry.textContent, entry.firstChild.style.background]);
+  slide("low", 0); put("field", 0); press("side", false); press("axis", 2); put("at-number", AT_2);
+  press("from", "S");
+  await frame();
+  said.size = [canvas.width, canvas.height];
+  said.cells = grid();
+  press("inside", "image");
+  await frame();
+  said.slice = grid();
+  said.picked = [];
+  for (const [x, y] of CLICKS) {
+    send("pointerdown", x, y);
+    send("pointerup", x, y);
+    said.picked.push($("picked").innerText);
+  }
+  send("pointerdown", 2, 2);
+  send("pointerup", 2, 2);
+  await frame();
+  const before = canvas.toDataURL();
+  const changes = {
+    drag() { send("pointerdown", 100, 100); send("pointermove", 160, 120); send("pointerup", 160, 120); },
+    back() { press("from", "S"); },
+    wheel() { canvas.dispatchEvent(new WheelEvent("wheel", { deltaY: 200, cancelable: true })); },
+    backAgain() { press("from", "S"); },
+    key() { canvas.dispatchEvent(new KeyboardEvent("keydown", { key: "ArrowLeft" })); },
+    backOnceMore() { press("from", "S"); },
+    set() { put("set", 0); },
+    insideSet() { put("set", 1); },
+  };
+  said.changed = [];
+  for (const act of Object.values(changes)) {
+    act();
+    await frame();
+    said.changed.push(canvas.toDataURL() !== before);
+  }
+  return said;
+};
+addEventListener("load", () => setTimeout(async () => {
+  const found = await run().catch((error) => ({ error: String(error) }));
+  parent.postMessage({ name: document.title, found }, "*");
+}, 400));
+</script>"""
+FRAME = """<body><script>addEventListener("message", (event) => {
+  document.documentElement.dataset[event.data.name] = JSON.stringify(event.data.found);
+});</script>
+<iframe src="page.html" width="1000" height="700"></iframe><iframe src="blind.html"></iframe>
+<iframe src="narrow.html" width="380" height="600"></iframe></body>"""
+AT = (0.23, -1.37, 3.1)  # mm from the middle: the coronal cut, the axial one, and the one the page begins with
+CLICKS = [[300, 300], [340, 390], [420, 280]]
+
+
+def inner_facets(mesh, below):
+    """Facets without a node on the surface and under a level: from above, other cells hide them all."""
+    nodes = facets(mesh.cells).nodes
+    is_outer = np.isin(nodes, boundary_facets(mesh.cells)).any(axis=1)
+    return nodes[~is_outer & (mesh.points[nodes][..., 2].max(axis=1) < below)]
+
+
+@pytest.fixture(scope="module")
+def shown(tmp_path_factory, mesh, cell_data, image):
+    """What the page says and shows, in one run of a browser: as it is, without WebGL, and in a narrow window."""
+    folder = tmp_path_factory.mktemp("explore")
+    middle = (mesh.points.min(axis=0) + mesh.points.max(axis=0)) / 2
+    thin = np.argmin(np.ptp(mesh.points, axis=0))
+    words = {"AT_0": middle[thin] + AT[2], "AT_1": middle[1] + AT[0], "AT_2": middle[2] + AT[1], "CLICKS": CLICKS}
+    probe = PROBE
+    for word, value in words.items():
+        probe = probe.replace(word, str(value))
+    for title in ("page", "blind", "narrow"):
+        sets = {"outer": boundary_facets(mesh.cells), "inner": inner_facets(mesh, below=middle[2] + AT[1] - 5.0)}
+        text = explorer_html(mesh, cell_data, image, title, sets)
+        start = FRAMES + BLIND if title == "blind" else FRAMES
+        text = text.replace("<head>", "<head>" + start, 1).replace("</body>", probe + "</body>")
+        (folder / f"{title}.html").write_text(text, encoding="utf-8")
+    (folder / "frame.html").write_text(FRAME, encoding="utf-8")
+    flags = ["--window-size=1500,1500", "--virtual-time-budget=60000", "--dump-dom"]
+    found = browser(folder / "profile", *flags, (folder / "frame.html").as_uri())
+    said = re.findall(r'data-(page|blind|narrow)="([^"]*)"', found)
+    return {name: json.loads(html.unescape(text)) for name, text in said}
+
+
+def test_counts_and_surfaces(shown, mesh, cell_data):
+    """Cells and volume within the limits, facets of what is left and polygons of the cut are those numpy finds."""
+    page, mean, label = shown["page"], cell_data["mean"], cell_data["label"]
+    middle = (mesh.points.min(axis=0) + mesh.points.max(axis=0)) / 2
+    extent = np.ptp(mesh.points, axis=0)
+    thin = int(np.argmin(extent))
+    beyond = centroids(mesh.points, mesh.cells)[:, thin] - middle[thin]
+    every = np.full(len(mesh.cells), True)
+    within = (mean >= 45) & (mean <= 60)
+
+    def expected(is_counted, is_drawn, axis=None, at=0.0):
+        volume = volumes(mesh.points, mesh.cells)[is_counted].sum()
+        height = mesh.points[:, 0 if axis is None else axis] - (0.0 if axis is None else middle[axis] + at)
+        assert np.abs(height).min() > 1e-4 or axis is None  # else single precision decides
+        n_polygons = 0 if axis is None else len(plane_cut(mesh.points, mesh.cells[is_counted], height).cells)
+        return is_counted.sum(), volume, len(boundary_facets(mesh.cells[is_drawn])), n_polygons
+
+    for name, (count, volume, n_facets, n_polygons) in {
+        "first": expected(every, every, thin),
+        "whole": expected(every, beyond <= AT[2]),
+        "turned": expected(every, beyond >= AT[2]),
+        "uncut": expected(every, every),
+        "within": expected(within, within),
+        "cut": expected(within, within, 1, AT[0]),
+        "label": expected(label >= 2, label >= 2, 1, AT[0]),
+    }.items():
+        text, found_facets, found_polygons, *_ = page[name]
+        found = re.fullmatch(r"([\d,]+) of ([\d,]+) cells, ([\d,.]+)\u00a0mm³", text).groups()
+        found_count, all_cells, found_volume = (float(part.replace(",", "")) for part in found)
+        assert (found_count, all_cells) == (count, len(mesh.cells)), name
+        assert found_volume == pytest.approx(volume, rel=2e-6), name
+        assert (found_facets, found_polygons) == (n_facets, n_polygons), name
+    assert page["crossed"][3:] == ["70", "70"]  # the upper limit went along
+
+
+def places_of(found, mesh):
+    """World x and y (K, 2), mm, of the pixels seen from above, and how many mm a pixel is."""
+    width, height = found["size"]
+    extent = np.ptp(mesh.points, axis=0)
+    middle = (mesh.points.min(axis=0) + mesh.points.max(axis=0)) / 2
+    mm = np.linalg.norm(extent) / min(width, height)
+    x, y = np.array(found["cells"])[:, :2].T
+    return np.column_stack([x + 0.5 - width / 2, height / 2 - y - 0.5]) * mm + middle[:2], mm
+
+
+def cells_at(mesh, xyz):
+    """The cell around each place (K, 3), -1 for none, and how far the nearest of its facets is in the axial plane."""
+    corners = mesh.points[mesh.cells]
+    inverse = np.linalg.inv(corners[:, 1:] - corners[:, :1])  # columns are the gradients of three barycentric functions
+    gradients = np.concatenate([-inverse.sum(axis=2, keepdims=True), inverse], axis=2)  # (M, 3, 4)
+    cells, distances = np.full(len(xyz), -1), np.zeros(len(xyz))
+    for k, place in enumerate(xyz):
+        share = np.einsum("mij,mi->mj", gradients, place - corners[:, 0]) + np.eye(4)[0]
+        inside = share.min(axis=1)
+        if inside.max() > 0:
+            cells[k] = inside.argmax()
+            slopes = np.linalg.norm(gradients[cells[k], :2], axis=0)
+            distances[k] = (share[cells[k]] / slopes).min()
+    return cells, distances
+
+
+def test_the_section_shows_the_cells_it_cuts(shown, mesh, cell_data):
+    page = shown["page"]
+    xy, mm = places_of(page, mesh)
+    z = (mesh.points.min(axis=0) + mesh.points.max(axis=0))[2] / 2 + AT[1]
+    cells, distances = cells_at(mesh, np.column_stack([xy, np.full(len(xy), z)]))
+    clear = (distances > 2.5 * mm) & (cells >= 0)  # of lines
+    assert clear.sum() > 400
+    (field, _) = scalar_fields(mesh, cell_data)
+    low, high = field.limits
+    step = np.rint(255 * np.clip((field.values[cells] - low) / (high - low), 0, 1))
+    expected = np.where(np.isnan(step)[:, None], 0xAA, colour_table()[np.nan_to_num(step).astype(int)].astype(int))
+    np.testing.assert_allclose(np.array(page["cells"])[clear, 2:], expected[clear], atol=2)
+
+
+def test_the_slice_shows_the_voxel_at_every_place(shown, mesh, image):
+    page = shown["page"]
+    xy, _ = places_of(page, mesh)
+    z = (mesh.points.min(axis=0) + mesh.points.max(axis=0))[2] / 2 + AT[1]
+    index = image.to_index(np.column_stack([xy, np.full(len(xy), z)])) + 0.5
+    is_clear = (np.abs(index - np.rint(index)) > 0.02).all(axis=1)  # of voxels' sides, where rounding decides
+    is_inside = ((index > 0.15) & (index < np.array(image.shape) - 0.15)).all(axis=1)  # clear of smoothed outlines
+    inside = np.flatnonzero(is_clear & is_inside)
+    assert len(inside) > 800
+    low, high = np.percentile(image.data, [0.5, 99.5])
+    expected = np.clip((image.data[tuple(index[inside].astype(int).T)] - low) / (high - low), 0, 1) * 255
+    found = np.array(page["slice"])[inside, 2:]
+    np.testing.assert_allclose(found, np.repeat(expected[:, None], 3, axis=1), atol=1.01)
+
+
+def test_a_click_reads_a_cell(shown, mesh, cell_data):
+    page = shown["page"]
+    width, height = page["size"]
+    mm = places_of(page, mesh)[1]
+    middle = (mesh.points.min(axis=0) + mesh.points.max(axis=0)) / 2
+    xy = (np.array(CLICKS) + 0.5 - [width / 2, height / 2]) * [mm, -mm]
+    cells, _ = cells_at(mesh, np.column_stack([xy, np.full(3, AT[1])]) + middle)
+    for cell, text in zip(cells, page["picked"], strict=True):
+        assert text.startswith(f"Cell {cell}\n")
+        assert re.search(rf"label\t{cell_data['label'][cell]}\n", text)
+        assert float(re.search(r"mean \(intensity\)\t(\S+)", text)[1]) == pytest.approx(
+            cell_data["mean"][cell], rel=1e-5
+        )
+
+
+def test_labels_have_a_legend(shown, mesh, cell_data):
+    _, field = scalar_fields(mesh, cell_data)
+    rgb = [tuple(int(colour[i : i + 2], 16) for i in (1, 3, 5)) for _, colour in field.categories]
+    assert shown["page"]["labels"] == [[str(k), f"rgb{colour}"] for k, colour in enumerate(rgb)]
+
+
+def test_the_view_turns_and_zooms(shown):
+    assert shown["page"]["changed"] == [True, False, True, False, True, False, True, True]
+
+
+def test_it_fits_a_narrow_window(shown):
+    assert shown["narrow"] == {"over": 0}
+    assert shown["page"]["over"] == 0
+
+
+def test_without_webgl_it_is_said(shown):
+    assert "This browser has no WebGL 2, so the mesh cannot be shown" in shown["blind"]["words"]

@@ -1,0 +1,175 @@
+"""The window to explore a mesh with, off screen: what its sliders and keys leave to be seen is what numpy finds."""
+
+import os
+import sys
+
+import numpy as np
+import pytest
+
+import tetopt
+from tetopt.errors import InputError
+from tetopt.geometry.cut import plane_cut
+from tetopt.geometry.simplex import volumes
+from tetopt.geometry.topology import boundary_facets
+from tetopt.report.window import has_display, plane_slice, plotter, show
+
+TILTED = np.array([[-1.9, 0.5, 0.3, 40.0], [0.4, 1.8, -0.5, -20.0], [0.3, 0.4, 2.6, 3.0], [0.0, 0.0, 0.0, 1.0]])
+
+
+@pytest.fixture(scope="module")
+def image():
+    return tetopt.Image(np.random.default_rng(0).integers(0, 200, (16, 18, 14)).astype(float), TILTED)
+
+
+@pytest.fixture(scope="module")
+def mesh(image):
+    return tetopt.lattice(image, nodes=300)
+
+
+@pytest.fixture(scope="module")
+def cell_data(mesh):
+    random = np.random.default_rng(1)
+    return {"mean": random.normal(50.0, 20.0, len(mesh.cells)), "label": random.integers(0, 4, len(mesh.cells))}
+
+
+@pytest.fixture
+def window(opengl, mesh, cell_data, image):
+    made = plotter(mesh, cell_data, image, off_screen=True, facet_sets={"outside": boundary_facets(mesh.cells)})
+    yield made
+    made.close()
+
+
+def slide(window, number, value):
+    slider = window.widgets.slider_widgets[number]
+    slider.GetRepresentation().SetValue(value)
+    slider.InvokeEvent("InteractionEvent")
+
+
+def press(window, key):
+    window.iren.interactor.SetKeySym(key)
+    window.iren.interactor.InvokeEvent("KeyPressEvent")
+
+
+def drawn(window, name):
+    mapper = window.actors[name].mapper
+    mapper.GetInputAlgorithm().Update()  # as a frame would, which are not drawn before the window is shown
+    return mapper.dataset
+
+
+def section_area(mesh, cells, axis, at):
+    corners = plane_cut(mesh.points, cells, mesh.points[:, axis] - at).corners
+    diagonals = np.cross(corners[:, 2] - corners[:, 0], corners[:, 3] - corners[:, 1])
+    return np.linalg.norm(diagonals, axis=1).sum() / 2
+
+
+def test_limits_leave_the_cells_within(window, mesh, cell_data):
+    """Their number, their volume, and the part of their surface that the plane leaves."""
+    slide(window, 1, 45.0)
+    slide(window, 2, 60.0)
+    within = (cell_data["mean"] >= 45) & (cell_data["mean"] <= 60)
+    volume = volumes(mesh.points, mesh.cells)[within].sum()
+    text = window.actors["count"].get_text(2)
+    assert text == f"{within.sum():,} of {len(mesh.cells):,} cells, {volume:,.7g} mm³; world RAS, mm"
+    slide(window, 0, mesh.points.max(axis=0)[np.argmin(np.ptp(mesh.points, axis=0))])
+    surface = drawn(window, "surface")
+    assert surface.n_cells == len(boundary_facets(mesh.cells[within]))
+    assert within[surface.cell_data["cell"]].all()
+    slide(window, 1, 70.0)  # takes the upper one along
+    assert window.actors["count"].get_text(2).startswith("0 of ")
+    assert "surface" not in window.actors
+    assert window.widgets.slider_widgets[2].GetRepresentation().GetValue() == pytest.approx(70.0)
+
+
+def test_the_plane_cuts_and_its_keys_turn_it(window, mesh):
+    middle = (mesh.points.min(axis=0) + mesh.points.max(axis=0)) / 2
+    for axis, key in enumerate("xyz"):
+        press(window, key)
+        slide(window, 0, middle[axis] + 1.3)
+        section = drawn(window, "section")
+        np.testing.assert_allclose(section.points[:, axis], middle[axis] + 1.3)
+        assert section.area == pytest.approx(section_area(mesh, mesh.cells, axis, middle[axis] + 1.3))
+        assert drawn(window, "surface").points[:, axis].max() == pytest.approx(middle[axis] + 1.3, abs=1e-4)
+        press(window, "k")
+        assert drawn(window, "surface").points[:, axis].min() == pytest.approx(middle[axis] + 1.3, abs=1e-4)
+        press(window, "k")
+
+
+def test_a_field_colours_the_cells(window, mesh, cell_data):
+    surface = drawn(window, "surface")
+    of_cell = surface.cell_data["cell"]
+    np.testing.assert_allclose(surface.cell_data["value"], cell_data["mean"][of_cell], rtol=1e-6)
+    assert list(window.scalar_bars.keys()) == ["mean\n(intensity)\n"]
+    slide(window, 3, 1.0)
+    surface = drawn(window, "surface")
+    colours = {(k, *c) for k, c in zip(cell_data["label"][of_cell], surface.cell_data["colour"], strict=True)}
+    assert len(colours) == len({c[1:] for c in colours}) == 4
+    assert len(window.scalar_bars.keys()) == 0
+    assert window.legend.GetNumberOfEntries() == 4
+    low = window.widgets.slider_widgets[1].GetRepresentation()
+    assert (low.GetMinimumValue(), low.GetMaximumValue(), low.GetValue()) == (0.0, 3.0, 0.0)
+    press(window, "n")
+    assert "value" in drawn(window, "surface").cell_data
+
+
+def test_the_plane_shows_mesh_image_or_both(window):
+    def seen():
+        return {name for name in ("section", "lines", "slice", "set") if name in window.actors}
+
+    assert seen() == {"section", "lines", "slice"}
+    press(window, "m")
+    assert seen() == {"section"}
+    press(window, "m")
+    assert seen() == {"slice"}
+    press(window, "h")
+    assert seen() == {"slice", "set"}
+    press(window, "h")
+    assert seen() == {"slice"}
+
+
+def test_it_draws(window):
+    first = window.screenshot(return_img=True)
+    press(window, "m")
+    second = window.screenshot(return_img=True)
+    assert (np.ptp(first.astype(int), axis=2) > 60).mean() > 0.02  # colours and orange lines
+    assert (first != second).any(axis=2).mean() > 0.05
+
+
+@pytest.mark.parametrize("axis", [0, 1, 2])
+def test_a_slice_has_the_voxel_at_every_place(image, axis):
+    middle = image.to_world((np.array(image.shape) - 1) / 2)
+    sheet = plane_slice(image, axis, middle[axis] + 0.7)
+    places = sheet.cell_centers().points
+    np.testing.assert_allclose(places[:, axis], middle[axis] + 0.7)
+    index = image.to_index(places)
+    nearest = np.rint(index).astype(int)
+    inside = ((nearest >= 0) & (nearest < image.shape)).all(axis=1)
+    np.testing.assert_array_equal(np.isnan(sheet.cell_data["h"]), ~inside)
+    np.testing.assert_array_equal(sheet.cell_data["h"][inside], image.data[tuple(nearest[inside].T)])
+    assert inside.sum() * sheet.spacing[0] ** 2 > 200  # mm^2
+
+
+def test_without_an_image_or_a_second_field(opengl, mesh):
+    window = plotter(mesh, {"rho": np.linspace(0, 0.3, len(mesh.cells))}, off_screen=True)
+    press(window, "m")
+    press(window, "n")
+    press(window, "h")
+    assert "section" in window.actors
+    assert len(window.widgets.slider_widgets) == 3
+    window.close()
+
+
+@pytest.mark.skipif(not sys.platform.startswith("linux"), reason="only X says whether there is a display")
+@pytest.mark.parametrize("display", [None, ":7654"])
+def test_without_a_display_it_is_said(monkeypatch, mesh, display):
+    if display is None:
+        monkeypatch.delenv("DISPLAY", raising=False)
+    else:
+        monkeypatch.setenv("DISPLAY", display)
+    with pytest.raises(InputError, match="no display to open a window on; use --html") as caught:
+        show(mesh, {})
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.skipif(not os.environ.get("DISPLAY"), reason="no display to be found")
+def test_a_display_is_found():
+    assert has_display()

@@ -1,0 +1,54 @@
+"""``tetopt view``."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+from rich.markup import escape
+
+from tetopt.cli.console import out
+from tetopt.cli.inputs import check_no_input, image_and_others, read_mesh, warn_of_other_image
+from tetopt.cli.options import CropOption, ForceOption, MeshArgument, VolumeOption
+from tetopt.io.files import checked_output
+from tetopt.model.fields import cell_fields
+from tetopt.model.sets import facet_triples, standard_sets
+
+
+def view_command(
+    mesh_path: MeshArgument,
+    image_path: Annotated[
+        Path | None, typer.Option("--image", metavar="IMAGE", help="Show its slice behind the mesh's section.")
+    ] = None,
+    html: Annotated[
+        Path | None, typer.Option("--html", metavar="OUT.html", help="Write one page for a browser, open no window.")
+    ] = None,
+    volume: VolumeOption = None,
+    crop: CropOption = None,
+    force: ForceOption = False,
+) -> int:
+    """Look at a mesh: cut it, colour it by any field, hide cells under a threshold; in a window or a page."""
+    if html is not None:
+        html = checked_output(html, (".html",), force)
+        check_no_input(html, mesh_path, image_path)
+    loaded = read_mesh(mesh_path)
+    mesh, fields = loaded.mesh, dict(loaded.cell_data)
+    image = None
+    if image_path is not None:
+        image = image_and_others(image_path, volume, crop, None)[0]
+        warn_of_other_image(loaded, mesh_path, image_path)
+        if "mean" not in fields:
+            fields = cell_fields(mesh, image) | fields
+    sets = loaded.sets.facets or standard_sets(mesh, loaded.box, fields.get("label")).facets
+    triples = {name: facet_triples(mesh.cells, rows) for name, rows in sets.items()}
+    if html is None:
+        from tetopt.report.window import show
+
+        show(mesh, fields, image, mesh_path.name, triples)
+        return 0
+    from tetopt.report.explore import save_explorer
+
+    save_explorer(html, mesh, fields, image, mesh_path.name, triples)
+    out.print(escape(f"{html}: open it in a browser; {html.stat().st_size / 1e6:.1f} MB, needs nothing else"))
+    return 0

@@ -1,0 +1,475 @@
+// The page: shows the mesh in #data cut by a plane, coloured by a field, within limits, beside its image. Places are in
+// mm relative to the middle of the mesh; only what is printed is in world coordinates. Runs after explore_mesh.js and
+// explore_gl.js in one scope.
+
+const SIDES = ["RL", "AP", "SI"];  // at the upper and the lower end of each axis
+const FROM = { R: [0, 0], L: [2, 0], A: [1, 0], P: [-1, 0], S: [-1, 1], I: [-1, -1] };  // yaw and pitch, quarters
+const WHOLE = { zoom: 1, shift: [0, 0] };
+
+const $ = (id) => document.getElementById(id);
+const canvas = document.querySelector("canvas");
+const number = (value, digits = 5) => value.toLocaleString("en-US", {
+  maximumSignificantDigits: digits, notation: value !== 0 && Math.abs(value) < 1e-3 ? "scientific" : "standard",
+});
+const whole = (value) => value.toLocaleString("en-US");
+
+function say(words) {
+  $("busy").textContent = words;
+  $("busy").hidden = false;
+}
+
+function start() {
+  const data = JSON.parse($("data").textContent);
+  // A kept buffer, so that the view is also there when the page is printed.
+  const gl = canvas.getContext("webgl2", { alpha: false, antialias: true, preserveDrawingBuffer: true });
+  if (!gl) {
+    canvas.remove();
+    say("This browser has no WebGL 2, so the mesh cannot be shown; try another browser or machine.");
+    return;
+  }
+  const notes = data.skipped.length ? [`Not one number a cell, so not shown: ${data.skipped.join(", ")}.`] : [];
+  const most = gl.getParameter(gl.MAX_3D_TEXTURE_SIZE);
+  if (data.image && Math.max(...data.image.shape) > most) {
+    notes.push(`This machine's graphics take up to ${most} voxels along an axis, so the image is not shown.`);
+    data.image = null;
+  }
+  explore(gl, data, notes);
+  $("busy").hidden = true;
+}
+
+function explore(gl, data, notes) {
+  const { image, centre } = data;
+  const mesh = unpackedMesh(data);
+  const fields = data.fields.map(unpackedField);
+  const table = new Uint8Array(bytes(data.colours));
+  const sets = data.sets.map((set) => ({ ...set, triangles: new Uint32Array(bytes(set.triangles)) }));
+  const size = [0, 1, 2].map((k) => mesh.high[k] - mesh.low[k]);
+  const radius = Math.hypot(...size) / 2;
+  const far = image ? Math.hypot(...[0, 1, 2].map((k) => Math.max(-image.box[0][k], image.box[1][k]))) : 0;
+  const drawn = renderer(gl, image, radius, 1.05 * Math.max(radius, far));
+
+  const thin = size.indexOf(Math.min(...size));  // so that the section one begins with is the largest
+  const state = {
+    field: 0, by: 0, low: fields[0].min, high: fields[0].max, axis: thin, at: 0, isTurned: false, isWhole: false,
+    inside: "cells", share: 0.35, set: -1, picked: -1,
+  };
+  const camera = { ...facing(), ...WHOLE };
+  const isWithin = new Uint8Array(mesh.count).fill(1);
+
+  // From where the cut is seen, slantwise.
+  function facing() {
+    const { axis, isTurned } = state;
+    if (axis === 2) return { yaw: -1.2, pitch: isTurned ? -0.85 : 0.85 };
+    if (axis === 1) return { yaw: isTurned ? -1.0 : 1.0, pitch: 0.4 };
+    return { yaw: isTurned && axis === 0 ? Math.PI - 0.6 : 0.6, pitch: 0.35 };
+  }
+
+  // -- what is drawn
+
+  const way = () => (state.isTurned ? -1 : 1);  // beyond the plane, along its axis, nothing is shown
+
+  function plane() {
+    const found = [0, 0, 0, 1];
+    if (state.axis < 0 || state.isWhole) return found;
+    found[state.axis] = way();
+    found[3] = way() * state.at;
+    return found;
+  }
+
+  function within() {
+    const { values, min, max } = fields[state.by];
+    const isAll = state.low <= min && state.high >= max;  // then also cells without a value
+    let count = 0, volume = 0;
+    for (let cell = 0; cell < mesh.count; cell++) {
+      isWithin[cell] = isAll || (values[cell] >= state.low && values[cell] <= state.high) ? 1 : 0;
+      count += isWithin[cell];
+      volume += isWithin[cell] * mesh.volumes[cell];
+    }
+    $("count").textContent = `${whole(count)} of ${whole(mesh.count)} cells, ${number(volume, 7)}\u00a0mm³`;
+  }
+
+  function shown() {
+    if (state.axis < 0 || !state.isWhole) return isWithin;
+    return isWithin.map((is, cell) => (
+      is && way() * mesh.centroids[3 * cell + state.axis] <= way() * state.at ? 1 : 0
+    ));
+  }
+
+  function build() {
+    const { axis, at } = state;
+    const nothing = new Triangles(0);
+    const hasSlice = axis >= 0 && image && state.inside !== "cells";
+    const outside = surface(mesh, shown());
+    // The cells of the section are also there, unseen, where only the image is shown: to be clicked on.
+    const cut = axis >= 0 && (hasSlice || !state.isWhole) ? section(mesh, isWithin, axis, at) : nothing;
+    drawn.parts.surface.fill(outside);
+    drawn.parts.section.fill(cut);
+    drawn.parts.slice.fill(hasSlice ? slice(image.box, axis, at) : nothing);
+    drawn.parts.set.fill(state.set < 0 ? nothing : setTriangles(mesh, sets[state.set].triangles));
+    canvas.dataset.surface = outside.count;
+    canvas.dataset.section = cut.nPolygons || 0;
+    redraw();
+  }
+
+  function pixels() {
+    const dense = Math.min(window.devicePixelRatio || 1, 2);
+    return [canvas.clientWidth, canvas.clientHeight].map((length) => Math.max(1, Math.round(length * dense)));
+  }
+
+  let isWaiting = false;
+  function redraw() {
+    if (isWaiting) return;
+    isWaiting = true;
+    requestAnimationFrame(() => {
+      isWaiting = false;
+      const size = pixels();
+      if (canvas.width !== size[0] || canvas.height !== size[1]) [canvas.width, canvas.height] = size;
+      const share = state.inside === "image" ? -1 : state.inside === "cells" || !image ? 1 : state.share;
+      drawn.frame(size, camera, plane(), share, state.picked, false);
+      drawTriad();
+      canvas.dataset.drawn = "1";
+    });
+  }
+
+  // -- the axes' letters
+
+  function drawTriad() {
+    const turn = turned(camera);
+    const lines = [], letters = [];
+    for (const axis of [0, 1, 2]) {
+      const [x, y, z] = turn.slice(3 * axis, 3 * axis + 3);
+      const colour = ["#c0392b", "#1e8449", "#1f5fbf"][axis];
+      lines.push(`<line x1="${-30 * x}" y1="${30 * y}" x2="${30 * x}" y2="${-30 * y}" stroke="${colour}"
+        stroke-width="2"/>`);
+      for (const [sign, letter] of [[1, SIDES[axis][0]], [-1, SIDES[axis][1]]]) {
+        letters.push([sign * z, `<text x="${43 * sign * x}" y="${-43 * sign * y}" fill="${colour}"
+          opacity="${(0.75 + 0.25 * sign * z).toFixed(2)}">${letter}</text>`]);
+      }
+    }
+    letters.sort((a, b) => a[0] - b[0]);
+    $("triad").innerHTML = lines.join("") + letters.map(([, text]) => text).join("");
+  }
+
+  // -- the key to the colours
+
+  function showKey() {
+    const field = fields[state.field];
+    const [low, high] = field.limits;
+    document.querySelector("#key b").textContent = field.unit ? `${field.name} (${field.unit})` : field.name;
+    $("scale").hidden = field.categories.length > 0;
+    $("labels").hidden = !field.categories.length;
+    const stops = Array.from({ length: 18 }, (_, i) => `rgb(${table.subarray(45 * i, 45 * i + 3).join()})`);
+    $("bar").style.background = `linear-gradient(to right, ${stops.join()})`;
+    const texts = [low, (low + high) / 2, high].map((value) => number(value, 3));
+    if (field.min < low) texts[0] = `≤ ${texts[0]}`;
+    if (field.max > high) texts[2] = `≥ ${texts[2]}`;
+    $("ticks").replaceChildren(...texts.map((text) => element("span", text)));
+    $("labels").replaceChildren(...field.categories.map(([value, colour]) => {
+      const entry = element("span", "");
+      const swatch = element("i", "");
+      swatch.style.background = colour;
+      entry.append(swatch, String(value));
+      return entry;
+    }));
+    const hasNone = !(field.min <= field.max) || field.values.some(Number.isNaN);
+    const range = field.min <= field.max ? `least ${number(field.min)}, most ${number(field.max)}` : "";
+    $("extremes").textContent = [range, hasNone ? "grey: no value" : ""].filter(Boolean).join("; ");
+  }
+
+  // -- controls
+
+  function element(kind, text) {
+    const made = document.createElement(kind);
+    made.textContent = text;
+    return made;
+  }
+
+  function choose(place, options, act) {
+    $(place).replaceChildren(...options.map(([text, value, title]) => {
+      const button = element("button", text);
+      Object.assign(button, { type: "button", title: title || "" });
+      button.dataset.value = value;
+      button.addEventListener("click", () => act(value));
+      return button;
+    }));
+  }
+
+  function press(place, value) {
+    for (const button of $(place).children) {
+      button.setAttribute("aria-pressed", button.dataset.value === String(value));
+    }
+  }
+
+  function fill(place, names, act) {
+    $(place).replaceChildren(...names.map(([text, value]) => Object.assign(element("option", text), { value })));
+    $(place).addEventListener("change", () => act(Number($(place).value)));
+  }
+
+  // A slider of 1000 steps between two ends, and the number beside it, which takes any value between.
+  function couple(name, act) {
+    const [slider, box] = [$(name), $(`${name}-number`)];
+    Object.assign(slider, { min: 0, max: 1000, step: 1 });
+    let ends = [0, 1];
+    slider.addEventListener("input", () => {
+      const part = slider.value / 1000;
+      act(part === 1 ? ends[1] : ends[0] + part * (ends[1] - ends[0]));
+    });
+    box.addEventListener("change", () => {
+      const value = box.value === "" ? NaN : Number(box.value);
+      if (Number.isFinite(value)) act(Math.max(ends[0], Math.min(ends[1], value)));
+      else act(null);
+    });
+    return (value, low, high) => {
+      ends = [low, high];
+      slider.value = high > low ? 1000 * (value - low) / (high - low) : 0;
+      slider.disabled = box.disabled = !(high > low);
+      box.value = Number.isFinite(value) ? Number(value.toPrecision(6)) : "";
+    };
+  }
+
+  const showAt = couple("at", (value) => cutAt(value === null ? state.at : value - centre[state.axis]));
+  const showLow = couple("low", (value) => limit(value === null ? state.low : value, null));
+  const showHigh = couple("high", (value) => limit(null, value === null ? state.high : value));
+
+  function cutAt(at) {
+    state.at = Math.max(mesh.low[state.axis], Math.min(mesh.high[state.axis], at));
+    showCut();
+    build();
+  }
+
+  function limit(low, high) {
+    const { min, max, categories } = fields[state.by];
+    const near = (value) => (categories.length && value > min && value < max ? Math.round(value) : value);
+    if (low !== null) state.low = near(low);
+    if (high !== null) state.high = near(high);
+    if (low !== null) state.high = Math.max(state.low, state.high);
+    else state.low = Math.min(state.low, state.high);
+    showLimits();
+    within();
+    build();
+  }
+
+  function showLimits() {
+    const { min, max } = fields[state.by];
+    showLow(state.low, min, max);
+    showHigh(state.high, min, max);
+    $("by").value = state.by;
+  }
+
+  function chooseBy(by) {
+    Object.assign(state, { by, low: fields[by].min, high: fields[by].max });
+    showLimits();
+    within();
+    build();
+  }
+
+  function chooseField(field) {
+    const { min, max } = fields[state.by];
+    state.field = field;
+    $("field").value = field;
+    drawn.paint(cellColours(fields[field], table, hex(data.noValue)));
+    showKey();
+    // Limits that leave nothing out go along with the field one looks at.
+    if (state.low <= min && state.high >= max) chooseBy(field);
+    redraw();
+  }
+
+  function showCut() {
+    const { axis, at } = state;
+    press("axis", axis);
+    $("cutting").hidden = axis < 0;
+    if (axis < 0) return;
+    const [upper, lower] = SIDES[axis];
+    showAt(at + centre[axis], mesh.low[axis] + centre[axis], mesh.high[axis] + centre[axis]);
+    $("at-name").textContent = `${upper}, mm`;
+    [lower, upper].forEach((letter, i) => { $("side").children[i].textContent = `keep ${letter}`; });
+    press("side", state.isTurned);
+    press("style", state.isWhole);
+    press("inside", state.inside);
+    $("sharing").hidden = state.inside !== "both";
+    $("share").value = state.share;
+    $("share-text").textContent = `${Math.round(100 * state.share)} %`;
+  }
+
+  function change(changes) {
+    const { axis, isTurned } = state;
+    Object.assign(state, changes);
+    if (state.axis >= 0 && state.axis !== axis) state.at = 0;
+    if (state.axis >= 0 && (state.axis !== axis || state.isTurned !== isTurned)) Object.assign(camera, facing());
+    showCut();
+    build();
+  }
+
+  function showPicked() {
+    const { picked } = state;
+    const legend = element("legend", picked < 0 ? "Cell" : `Cell ${picked}`);
+    if (picked < 0) {
+      const hint = element("div", "Click on a cell to read its values.");
+      hint.className = "quiet";
+      $("picked").replaceChildren(legend, hint);
+      return;
+    }
+    const table = element("table", "");
+    const middle = [0, 1, 2].map((k) => (mesh.centroids[3 * picked + k] + centre[k]).toFixed(1)).join(", ");
+    const rows = fields.map((field) => [
+      field.unit ? `${field.name} (${field.unit})` : field.name,
+      Number.isNaN(field.values[picked]) ? "no value" : number(field.values[picked], 6),
+    ]);
+    const nodes = [...mesh.cells.subarray(4 * picked, 4 * picked + 4)].join(", ");
+    for (const texts of [...rows, ["centroid (RAS, mm)", middle], ["nodes", nodes]]) {
+      const row = element("tr", "");
+      row.append(...texts.map((text) => element("td", text)));
+      table.append(row);
+    }
+    $("picked").replaceChildren(legend, table);
+  }
+
+  function pick(x, y) {
+    const size = pixels();
+    const dense = size[0] / canvas.clientWidth;
+    state.picked = drawn.cellAt(Math.floor(x * dense), size[1] - 1 - Math.floor(y * dense), size, camera, plane());
+    showPicked();
+    redraw();
+  }
+
+  // -- the camera
+
+  function turn(right, up) {
+    camera.yaw -= right;
+    camera.pitch = Math.max(-Math.PI / 2, Math.min(Math.PI / 2, camera.pitch + up));
+    redraw();
+  }
+
+  const perPixel = () => 2 * radius / (camera.zoom * Math.min(canvas.clientWidth, canvas.clientHeight));
+
+  // About the pixel (x, y) from the view's middle, which stays where it is.
+  function zoom(factor, x = 0, y = 0) {
+    const before = perPixel();
+    camera.zoom = Math.max(0.3, Math.min(100, camera.zoom * factor));
+    move(x * (1 - before / perPixel()), y * (1 - before / perPixel()));
+  }
+
+  function move(x, y) {
+    camera.shift = [camera.shift[0] + x * perPixel(), camera.shift[1] - y * perPixel()];
+    redraw();
+  }
+
+  function look(from) {
+    Object.assign(camera, WHOLE, from);
+    redraw();
+  }
+
+  function step(share) {
+    if (state.axis >= 0) cutAt(state.at + share * size[state.axis]);
+  }
+
+  const KEYS = {
+    ArrowLeft: () => turn(-0.1, 0), ArrowRight: () => turn(0.1, 0),
+    ArrowUp: () => turn(0, -0.1), ArrowDown: () => turn(0, 0.1),
+    "+": () => zoom(1.15), "=": () => zoom(1.15), "-": () => zoom(1 / 1.15),
+    "0": () => look(facing()), PageUp: () => step(0.01), PageDown: () => step(-0.01),
+  };
+
+  function listen() {
+    const fingers = new Map();
+    const spread = () => {
+      const [a, b] = [...fingers.values()];
+      return Math.hypot(a.x - b.x, a.y - b.y);
+    };
+    let travelled = 0;
+    canvas.addEventListener("pointerdown", (event) => {
+      canvas.setPointerCapture(event.pointerId);
+      canvas.focus();
+      travelled = fingers.size ? Infinity : 0;
+      fingers.set(event.pointerId, { x: event.clientX, y: event.clientY });
+    });
+    canvas.addEventListener("pointermove", (event) => {
+      const last = fingers.get(event.pointerId);
+      if (!last) return;
+      const before = fingers.size === 2 ? spread() : 0;
+      const [x, y] = [event.clientX - last.x, event.clientY - last.y];
+      fingers.set(event.pointerId, { x: event.clientX, y: event.clientY });
+      travelled += Math.hypot(x, y);
+      if (fingers.size === 2) {
+        zoom(spread() / Math.max(before, 1));
+        move(x / 2, y / 2);
+      } else if (event.shiftKey || event.buttons === 2) {
+        move(x, y);
+      } else {
+        const length = Math.min(canvas.clientWidth, canvas.clientHeight);
+        turn(x / length * 4, y / length * 4);
+      }
+    });
+    canvas.addEventListener("pointerup", (event) => {
+      const box = canvas.getBoundingClientRect();
+      if (fingers.size === 1 && travelled < 4 && event.button === 0) {
+        pick(event.clientX - box.left, event.clientY - box.top);
+      }
+    });
+    for (const end of ["pointerup", "pointercancel", "lostpointercapture"]) {
+      canvas.addEventListener(end, (event) => fingers.delete(event.pointerId));
+    }
+    canvas.addEventListener("contextmenu", (event) => event.preventDefault());
+    canvas.addEventListener("wheel", (event) => {
+      event.preventDefault();
+      const box = canvas.getBoundingClientRect();
+      zoom(Math.exp(-0.0015 * event.deltaY * (event.deltaMode ? 30 : 1)),
+        event.clientX - box.left - box.width / 2, event.clientY - box.top - box.height / 2);
+    }, { passive: false });
+    canvas.addEventListener("keydown", (event) => {
+      if (!(event.key in KEYS) || event.ctrlKey || event.metaKey) return;
+      event.preventDefault();
+      KEYS[event.key]();
+    });
+  }
+
+  // -- all of it
+
+  function about() {
+    const volume = mesh.volumes.reduce((sum, one) => sum + one, 0);
+    const said = [`World coordinates: RAS, mm. Mesh: ${whole(mesh.points.length / 3)} nodes,
+      ${whole(mesh.count)} cells, ${number(volume, 7)} mm³.`];
+    if (image) {
+      const coarser = image.shape.join() === image.original.join() ? "" : `, averaged to ${image.shape.join(" × ")}`;
+      said.push(`Image: ${image.original.join(" × ")} voxels${coarser}; black is ${number(image.limits[0])},
+        white ${number(image.limits[1])}.`);
+    }
+    $("about").textContent = [...said, ...notes].join(" ");
+  }
+
+  const options = fields.map((field, i) => [field.unit ? `${field.name} (${field.unit})` : field.name, i]);
+  fill("field", options, chooseField);
+  fill("by", options, chooseBy);
+  fill("set", [["none", -1], ...sets.map((set, i) => [`${set.name} (${set.triangles.length / 3})`, i])],
+    (set) => change({ set }));
+  $("marking").hidden = !sets.length;
+  $("imaging").hidden = !image;
+  choose("axis", [["none", -1], ["sagittal", 0, "across R-L"], ["coronal", 1, "across A-P"],
+    ["axial", 2, "across S-I"]], (axis) => change({ axis }));
+  choose("side", [["", false], ["", true]], (isTurned) => change({ isTurned }));
+  choose("style", [["through cells", false], ["whole cells", true, "cells whose centroids are beyond are hidden"]],
+    (isWhole) => change({ isWhole }));
+  choose("inside", [["mesh", "cells"], ["image", "image"], ["both", "both"]], (inside) => change({ inside }));
+  $("share").addEventListener("input", () => change({ share: Number($("share").value) }));
+  choose("from", Object.keys(FROM).map((letter) => [letter, letter]), (letter) => {
+    const [yaw, pitch] = FROM[letter].map((quarters) => quarters * Math.PI / 2);
+    look({ yaw, pitch });
+  });
+  about();
+  chooseField(0);
+  showCut();
+  showPicked();
+  listen();
+  new ResizeObserver(redraw).observe(canvas);
+  $("controls").hidden = false;
+}
+
+// After the first paint, so that the page says what it is at: a large mesh takes seconds.
+setTimeout(() => {
+  try {
+    start();
+  } catch (error) {
+    console.error(error);
+    say(`The mesh cannot be shown: ${error.message}`);
+  }
+}, 30);

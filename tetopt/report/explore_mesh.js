@@ -1,0 +1,183 @@
+// The mesh of the page: who touches whom, what is its surface and what a plane cuts. Places are in mm relative to its
+// middle, in single precision.
+
+const FACETS = [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]];  // facet k of a cell lies opposite its node k
+
+function bytes(text) {
+  const letters = atob(text);
+  const found = new Uint8Array(letters.length);
+  for (let i = 0; i < found.length; i++) found[i] = letters.charCodeAt(i);
+  return found.buffer;
+}
+
+// Of each cell and each of its nodes the cell beyond the facet opposite, -1 on the boundary: (4 M).
+function neighbours(cells, nNodes) {
+  const first = new Int32Array(nNodes).fill(-1);  // half facets, chained by their smallest node
+  const next = new Int32Array(cells.length).fill(-1);
+  const middle = new Uint32Array(cells.length);
+  const largest = new Uint32Array(cells.length);
+  const found = new Int32Array(cells.length).fill(-1);
+  for (let half = 0; half < cells.length; half++) {
+    const start = half - half % 4;
+    const [i, j, k] = FACETS[half % 4];
+    const a = cells[start + i], b = cells[start + j], c = cells[start + k];
+    const low = Math.min(a, b, c), high = Math.max(a, b, c);
+    const between = a + b + c - low - high;
+    let other = first[low];
+    while (other >= 0 && (middle[other] !== between || largest[other] !== high)) other = next[other];
+    if (other >= 0) {
+      found[half] = other >> 2;
+      found[other] = half >> 2;
+    } else {
+      middle[half] = between;
+      largest[half] = high;
+      next[half] = first[low];
+      first[low] = half;
+    }
+  }
+  return found;
+}
+
+function centroidsAndVolumes(points, cells) {
+  const n = cells.length / 4;
+  const centroids = new Float32Array(3 * n), volumes = new Float64Array(n);
+  for (let cell = 0; cell < n; cell++) {
+    const start = 4 * cell;
+    const p = 3 * cells[start], q = 3 * cells[start + 1], r = 3 * cells[start + 2], s = 3 * cells[start + 3];
+    const ax = points[q] - points[p], ay = points[q + 1] - points[p + 1], az = points[q + 2] - points[p + 2];
+    const bx = points[r] - points[p], by = points[r + 1] - points[p + 1], bz = points[r + 2] - points[p + 2];
+    const cx = points[s] - points[p], cy = points[s + 1] - points[p + 1], cz = points[s + 2] - points[p + 2];
+    volumes[cell] = (ax * (by * cz - bz * cy) + ay * (bz * cx - bx * cz) + az * (bx * cy - by * cx)) / 6;
+    for (let i = 0; i < 3; i++) {
+      centroids[3 * cell + i] = (points[p + i] + points[q + i] + points[r + i] + points[s + i]) / 4;
+    }
+  }
+  return { centroids, volumes };
+}
+
+function unpackedField(packed) {
+  const values = new Float32Array(bytes(packed.values));
+  let min = Infinity, max = -Infinity;
+  for (const value of values) {
+    if (value < min) min = value;
+    if (value > max) max = value;
+  }
+  return { ...packed, values, min, max };
+}
+
+function unpackedMesh(data) {
+  const points = new Float32Array(bytes(data.points));
+  const cells = new Uint32Array(bytes(data.cells));
+  const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
+  points.forEach((value, i) => {
+    low[i % 3] = Math.min(low[i % 3], value);
+    high[i % 3] = Math.max(high[i % 3], value);
+  });
+  return {
+    points, cells, low, high, count: cells.length / 4, neighbours: neighbours(cells, points.length / 3),
+    ...centroidsAndVolumes(points, cells),
+  };
+}
+
+// Triangles with their own three corners each; a tag is the cell's number and which of the sides are drawn.
+class Triangles {
+  constructor(capacity) {
+    this.places = new Float32Array(9 * capacity);
+    this.tags = new Uint32Array(3 * capacity);
+    this.count = 0;
+  }
+  add(cell, sides, ...corners) {
+    if (3 * this.count === this.tags.length) this.grow();
+    corners.forEach(([x, y, z], k) => this.set(3 * this.count + k, cell, sides, x, y, z));
+    this.count++;
+  }
+  set(vertex, cell, sides, x, y, z) {
+    this.places[3 * vertex] = x;
+    this.places[3 * vertex + 1] = y;
+    this.places[3 * vertex + 2] = z;
+    this.tags[vertex] = cell * 8 + sides;
+  }
+  grow() {
+    const more = new Triangles(Math.max(64, 2 * this.count));
+    more.places.set(this.places);
+    more.tags.set(this.tags);
+    [this.places, this.tags] = [more.places, more.tags];
+  }
+}
+
+// The facets that exactly one shown cell has.
+function surface(mesh, isShown) {
+  const { points, cells } = mesh;
+  const isOuter = (half) => isShown[half >> 2] && !(mesh.neighbours[half] >= 0 && isShown[mesh.neighbours[half]]);
+  let count = 0;
+  for (let half = 0; half < cells.length; half++) if (isOuter(half)) count++;
+  const made = new Triangles(count);
+  for (let half = 0; half < cells.length; half++) {
+    if (!isOuter(half)) continue;
+    const start = half - half % 4;
+    for (let k = 0; k < 3; k++) {
+      const node = 3 * cells[start + FACETS[half % 4][k]];
+      made.set(3 * made.count + k, half >> 2, 7, points[node], points[node + 1], points[node + 2]);
+    }
+    made.count++;
+  }
+  return made;
+}
+
+// The polygons in which the plane axis = at cuts the shown cells: triangles, or quadrilaterals in two triangles.
+function section(mesh, isShown, axis, at) {
+  const { points, cells } = mesh;
+  const made = new Triangles(64);
+  const between = (i, j) => {
+    const share = (at - points[3 * i + axis]) / (points[3 * j + axis] - points[3 * i + axis]);
+    const place = [0, 0, 0];
+    for (let k = 0; k < 3; k++) place[k] = points[3 * i + k] + share * (points[3 * j + k] - points[3 * i + k]);
+    place[axis] = at;
+    return place;
+  };
+  let nPolygons = 0;
+  for (let cell = 0; cell < mesh.count; cell++) {
+    if (!isShown[cell]) continue;
+    let above = 0;
+    for (let k = 0; k < 4; k++) if (points[3 * cells[4 * cell + k] + axis] >= at) above++;
+    if (above === 0 || above === 4) continue;
+    nPolygons++;
+    const up = [], down = [];
+    for (let k = 0; k < 4; k++) {
+      const node = cells[4 * cell + k];
+      (points[3 * node + axis] >= at ? up : down).push(node);
+    }
+    if (up.length === 2) {
+      const [a, b, c, d] = [[0, 0], [0, 1], [1, 1], [1, 0]].map(([i, j]) => between(up[i], down[j]));
+      made.add(cell, 0b101, a, b, c);  // the diagonal from a to c is no edge of the cell
+      made.add(cell, 0b011, a, c, d);
+    } else {
+      const [alone, others] = up.length === 1 ? [up[0], down] : [down[0], up];
+      made.add(cell, 0b111, ...others.map((node) => between(alone, node)));
+    }
+  }
+  made.nPolygons = nPolygons;
+  return made;
+}
+
+// The rectangle of the plane over the image's box.
+function slice(box, axis, at) {
+  const made = new Triangles(2);
+  const [u, v] = [0, 1, 2].filter((k) => k !== axis);
+  const corner = (i, j) => {
+    const place = [at, at, at];
+    [place[u], place[v]] = [box[i][u], box[j][v]];
+    return place;
+  };
+  made.add(0, 0, corner(0, 0), corner(1, 0), corner(1, 1));
+  made.add(0, 0, corner(0, 0), corner(1, 1), corner(0, 1));
+  return made;
+}
+
+function setTriangles(mesh, nodes) {
+  const made = new Triangles(nodes.length / 3);
+  for (let i = 0; i < nodes.length; i += 3) {
+    made.add(0, 7, ...[0, 1, 2].map((k) => mesh.points.subarray(3 * nodes[i + k], 3 * nodes[i + k] + 3)));
+  }
+  return made;
+}

@@ -1,0 +1,407 @@
+"""A window to explore a mesh with, beside its image: what `tetopt.report.explore` puts into a page, by pyvista."""
+
+from __future__ import annotations
+
+import ctypes
+import ctypes.util
+import os
+import sys
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pyvista
+from matplotlib.colors import to_rgb
+from numpy.typing import NDArray
+
+from tetopt.errors import InputError
+from tetopt.geometry.cut import plane_cut
+from tetopt.geometry.simplex import volumes
+from tetopt.geometry.topology import facets
+from tetopt.image import Image
+from tetopt.mesh import Mesh
+from tetopt.report.colours import LISTED
+from tetopt.report.explore import COLOUR_MAP, NO_VALUE, Field, checked_sets, scalar_fields
+from tetopt.report.scene import facets_surface
+from tetopt.report.viewer import grey_limits
+
+KEYS = "x y z: plane   k: side kept   m: mesh, image, both   n: next field   h: next set of facets   q: close"
+INSIDE = ("mesh", "image", "both")  # what the plane shows
+LETTERS = "RAS"
+VIEWS = ((1.6, 0.9, 0.7), (0.9, 1.6, 0.7), (0.4, -1.0, 1.6))  # from where the cut across each axis is seen at first
+SHARE = 0.35  # of the cells' colours where they lie on the image
+MAX_PIXELS = 1024  # of the image's slice along either side
+
+
+def show(
+    mesh: Mesh,
+    cell_data: dict[str, NDArray],
+    image: Image | None = None,
+    title: str = "mesh",
+    facet_sets: dict[str, NDArray] | None = None,
+) -> None:
+    """Open the window of `plotter` and return when it is closed.
+
+    Raises
+    ------
+    InputError
+        No display to open it on, or as `plotter`.
+    """
+    if not has_display():
+        raise InputError("view: no display to open a window on; use --html to write the same view as a page")
+    plotter(mesh, cell_data, image, title=title, facet_sets=facet_sets).show()
+
+
+def has_display() -> bool:
+    """Whether VTK can open a window: on Linux, whether the X server in DISPLAY answers; elsewhere taken as given."""
+    if not sys.platform.startswith("linux"):
+        return True
+    library = ctypes.util.find_library("X11")
+    if not os.environ.get("DISPLAY") or library is None:
+        return False
+    # As VTK asks itself, which then goes on without a window, or ends the process.
+    x11 = ctypes.CDLL(library)
+    x11.XOpenDisplay.restype = ctypes.c_void_p
+    x11.XCloseDisplay.argtypes = [ctypes.c_void_p]
+    connection = x11.XOpenDisplay(None)
+    if connection is None:
+        return False
+    x11.XCloseDisplay(connection)
+    return True
+
+
+def plotter(
+    mesh: Mesh,
+    cell_data: dict[str, NDArray],
+    image: Image | None = None,
+    off_screen: bool = False,
+    title: str = "mesh",
+    facet_sets: dict[str, NDArray] | None = None,
+) -> pyvista.Plotter:
+    """The window, not yet shown: the mesh cut by a plane, coloured by a field within limits, the image in the plane.
+
+    Sliders move the plane (world mm) and the limits, and choose the field; the keys in `KEYS` the rest.
+
+    Parameters
+    ----------
+    mesh, cell_data, image, title, facet_sets
+        As in `tetopt.report.explore.explorer_html`.
+    off_screen : bool
+        To be photographed instead of shown.
+
+    Raises
+    ------
+    InputError
+        As `tetopt.report.explore.explorer_html`.
+    """
+    fields = scalar_fields(mesh, cell_data, image)
+    with pyvista.vtk_verbosity("off"):
+        window = pyvista.Plotter(off_screen=off_screen, window_size=(1280, 850), title=f"tetopt: {title}")
+        window.set_background("white")
+        _Scene(window, mesh, fields, image, checked_sets(mesh, facet_sets)).open()
+    return window
+
+
+class _Scene:
+    """What the window shows, and the actors that show it."""
+
+    def __init__(
+        self,
+        window: pyvista.Plotter,
+        mesh: Mesh,
+        fields: list[Field],
+        image: Image | None,
+        sets: dict[str, NDArray],
+    ) -> None:
+        self.window, self.mesh, self.fields, self.image, self.sets = window, mesh, fields, image, sets
+        self.sides = facets(mesh.cells)
+        self.volumes = volumes(mesh.points, mesh.cells)
+        self.low, self.high = mesh.points.min(axis=0), mesh.points.max(axis=0)
+        self.greys = (0.0, 1.0) if image is None else grey_limits([image.data.ravel().astype(np.float64)])
+        self.axis = int(np.argmin(self.high - self.low))  # so that the section one begins with is the largest
+        self.at = float((self.low + self.high)[self.axis] / 2.0)
+        self.is_turned = False
+        self.inside = INSIDE[0] if image is None else INSIDE[2]
+        self.set = 0  # none, then those in `sets`
+        self.number = 0  # of the field
+        self.limits = self._range()
+        self.sliders: dict[str, Any] = {}  # of VTK
+        self.is_open = False  # a slider calls back as soon as it is added
+
+    @property
+    def field(self) -> Field:
+        return self.fields[self.number]
+
+    def _range(self) -> tuple[float, float]:
+        """The field's least and largest value, apart so that a slider can go from one to the other."""
+        values = self.field.values[np.isfinite(self.field.values)].astype(np.float64)
+        if len(values) == 0:
+            return 0.0, 1.0
+        low, high = float(values.min()), float(values.max())
+        return (low, high) if high > low else grey_limits([values])
+
+    # -- actors
+
+    def open(self) -> None:
+        self._add_sliders()
+        self.window.add_text(KEYS, name="keys", font_size=8, color="#555555", position="lower_left")
+        self.window.add_axes(xlabel="R", ylabel="A", zlabel="S", color="black", viewport=(0.0, 0.2, 0.15, 0.4))
+        for key, act in (
+            ("x", lambda: self.cut_across(0)), ("y", lambda: self.cut_across(1)), ("z", lambda: self.cut_across(2)),
+            ("k", self.turn), ("m", self.next_inside), ("n", self.next_field), ("h", self.next_set),
+        ):  # fmt: skip
+            self.window.add_key_event(key, act)
+        self.is_open = True
+        self._add_key()
+        self._changed()
+        self.window.enable_parallel_projection()
+        self.window.view_vector(VIEWS[self.axis], viewup=(0.0, 0.0, 1.0))
+        self.window.camera.zoom(0.95)
+        self.window.camera.SetWindowCenter(0.0, -0.1)  # above the sliders
+
+    def draw(self) -> None:
+        """Everything that depends on the plane, the limits and the field."""
+        is_within = self.is_within()
+        origin = np.where(np.arange(3) == self.axis, self.at, 0.0)
+        normal = np.eye(3)[self.axis] * (-1.0 if self.is_turned else 1.0)
+        surface, of_cell = self._surface(is_within)
+        surface.cell_data["cell"] = of_cell
+        clipped = surface.clip(normal=normal, origin=origin, invert=True) if surface.n_cells else surface
+        self._add_cells("surface", clipped, lighting=True)
+        self._add_section(is_within)
+        self._add_slice()
+        marked = self._marked()
+        if marked.n_cells:
+            marked = marked.clip(normal=normal, origin=origin, invert=True)
+        self._add("set", marked, color="#ff00c0", show_edges=True, ambient=0.3)
+        count, volume = int(np.count_nonzero(is_within)), float(self.volumes[is_within].sum())
+        text = f"{count:,} of {len(self.mesh.cells):,} cells, {volume:,.7g} mm³; world RAS, mm"
+        self.window.add_text(text, name="count", font_size=10, color="black", position="upper_left", render=False)
+        self.window.render()
+
+    def is_within(self) -> NDArray[np.bool_]:
+        """Cells whose value lies within the limits; with the full range also those without a value, (M,)."""
+        # Sliders hold single precision: the ends are the field's own.
+        low, high = self._range()
+        slack = 1e-6 * (high - low)
+        if self.limits[0] <= low + slack and self.limits[1] >= high - slack:
+            return np.full(len(self.mesh.cells), True)
+        return (self.field.values >= self.limits[0] - slack) & (self.field.values <= self.limits[1] + slack)
+
+    def _surface(self, is_within: NDArray[np.bool_]) -> tuple[pyvista.PolyData, NDArray[np.int64]]:
+        """The facets that exactly one shown cell has, and that cell."""
+        first, second = self.sides.cells.T
+        is_first, is_second = is_within[first], (second >= 0) & is_within[second]
+        is_outer = is_first != is_second
+        of_cell = np.where(is_first, first, second)[is_outer]
+        return facets_surface(self.mesh.points, self.sides.nodes[is_outer]), of_cell
+
+    def _add_section(self, is_within: NDArray[np.bool_]) -> None:
+        """The polygons in which the plane cuts the shown cells; on the image as through glass, with lines on top."""
+        polygons = pyvista.PolyData()
+        if self.inside != "image":
+            shown = np.flatnonzero(is_within)
+            cut = plane_cut(self.mesh.points, self.mesh.cells[shown], self.mesh.points[:, self.axis] - self.at)
+            corners = np.arange(4 * len(cut.cells)).reshape(-1, 4)
+            if len(corners):
+                polygons = pyvista.PolyData.from_regular_faces(cut.corners.reshape(-1, 3), corners)
+                polygons.cell_data["cell"] = shown[cut.cells]
+        is_glass = self.inside == "both"
+        lines = polygons.extract_all_edges() if is_glass and polygons.n_cells else pyvista.PolyData()
+        self._add_cells(
+            "section", polygons, lighting=False, show_edges=not is_glass, opacity=SHARE if is_glass else 1.0
+        )
+        self._add("lines", lines, color="#ffb000", line_width=1, lighting=False)
+
+    def _add_slice(self) -> None:
+        sheet = pyvista.PolyData()
+        if self.image is not None and self.inside != "mesh":
+            sheet = plane_slice(self.image, self.axis, self.at)
+            # Behind the cells' edges, which lie in the same plane.
+            behind = np.zeros(3)
+            behind[self.axis] = (1.0 if self.is_turned else -1.0) * 2e-4 * float(np.linalg.norm(self.high - self.low))
+            sheet.origin = np.asarray(sheet.origin) + behind
+        self._add(
+            "slice", sheet, scalars="h", cmap="gray", clim=self.greys, nan_opacity=0.0,
+            show_scalar_bar=False, lighting=False,
+        )  # fmt: skip
+
+    def _marked(self) -> pyvista.PolyData:
+        if self.set == 0:
+            return pyvista.PolyData()
+        return facets_surface(self.mesh.points, list(self.sets.values())[self.set - 1])
+
+    def _add_cells(self, name: str, polygons: pyvista.PolyData, **drawn: Any) -> None:
+        """Facets or polygons in the colours of their cells."""
+        if polygons.n_cells == 0:
+            self._add(name, polygons)
+            return
+        drawn = {"show_edges": True, "edge_color": "#303030", "ambient": 0.3, "show_scalar_bar": False} | drawn
+        values = self.field.values[np.asarray(polygons.cell_data["cell"])]
+        if self.field.categories:
+            polygons.cell_data["colour"] = _label_colours(self.field, values)
+            self._add(name, polygons, scalars="colour", rgb=True, **drawn)
+            return
+        polygons.cell_data["value"] = values
+        limits = self.field.limits
+        self._add(name, polygons, scalars="value", cmap=COLOUR_MAP, clim=limits, nan_color=NO_VALUE, **drawn)
+
+    def _add(self, name: str, data: pyvista.DataSet, **drawn: Any) -> None:
+        """In place of what had this name; nothing if there is nothing to draw."""
+        if data.n_cells:
+            self.window.add_mesh(data, name=name, reset_camera=False, render=False, **drawn)
+        else:
+            self.window.remove_actor(name, reset_camera=False, render=False)
+
+    def _add_key(self) -> None:
+        """The colour bar of a quantity, or the colours of labels."""
+        field = self.field
+        for title in list(self.window.scalar_bars.keys()):
+            self.window.remove_scalar_bar(title, render=False)
+        self.window.remove_legend(render=False)
+        if field.categories:
+            # As in the pictures' legends: those of most cells, ascending.
+            by_size = sorted(field.categories, key=lambda entry: -np.count_nonzero(field.values == entry[0]))
+            entries = [[f" {label}", colour] for label, colour in sorted(by_size[:LISTED])]
+            if len(field.categories) > LISTED:
+                entries.append([f" and {len(field.categories) - LISTED} more", "#555555"])
+            height = 0.03 * len(entries)
+            legend = self.window.add_legend(entries, bcolor="white", face="rectangle", size=(0.11, height))
+            legend.SetPosition(0.88, 0.95 - height)
+            return
+        mapper = pyvista.DataSetMapper()
+        mapper.lookup_table = pyvista.LookupTable(COLOUR_MAP, scalar_range=field.limits)
+        self.window.add_scalar_bar(
+            title=f"{field.name}\n({field.unit})\n" if field.unit else field.name, mapper=mapper, color="black",
+            vertical=True, position_x=0.89, position_y=0.35, height=0.5, width=0.06, title_font_size=16,
+            label_font_size=14, fmt="%.4g", render=False,
+        )  # fmt: skip
+
+    # -- what sliders and keys do
+
+    def _add_sliders(self) -> None:
+        along = (self.low[self.axis], self.high[self.axis])
+        self._add_slider("at", self.cut_at, along, self.at, (0.03, 0.23))
+        self._add_slider("low", lambda value: self.limit(low=value), self._range(), self.limits[0], (0.28, 0.48))
+        self._add_slider("high", lambda value: self.limit(high=value), self._range(), self.limits[1], (0.53, 0.73))
+        if len(self.fields) > 1:
+            last = float(len(self.fields) - 1)
+            self._add_slider("field", lambda value: self.colour_by(round(value)), (0.0, last), 0.0, (0.78, 0.97))
+            self.sliders["field"].GetRepresentation().ShowSliderLabelOff()
+
+    def _add_slider(
+        self, name: str, act: Callable[[float], None], ends: tuple[float, float], value: float, x: tuple[float, float]
+    ) -> None:
+        self.sliders[name] = self.window.add_slider_widget(
+            act, rng=ends, value=value, title=name, pointa=(x[0], 0.1), pointb=(x[1], 0.1), color="#333333",
+            style="modern", interaction_event="always", title_height=0.02, fmt="%.5g",
+        )  # fmt: skip
+
+    def _set_slider(self, name: str, title: str, value: float, ends: tuple[float, float]) -> None:
+        if name not in self.sliders:
+            return
+        slider = self.sliders[name].GetRepresentation()
+        # An end that passes the other one would be refused.
+        slider.SetMinimumValue(min(ends[0], slider.GetMinimumValue()))
+        slider.SetMaximumValue(ends[1])
+        slider.SetMinimumValue(ends[0])
+        slider.SetValue(value)
+        slider.SetTitleText(title)
+
+    def _set_sliders(self) -> None:
+        letter = LETTERS[self.axis]
+        self._set_slider("at", f"plane at {letter}, mm", self.at, (self.low[self.axis], self.high[self.axis]))
+        self._set_slider("low", f"{self.field.name} from", self.limits[0], self._range())
+        self._set_slider("high", f"{self.field.name} to", self.limits[1], self._range())
+        self._set_slider("field", f"field: {self.field.name}", self.number, (0, len(self.fields) - 1))
+
+    def _changed(self) -> None:
+        if self.is_open:
+            self._set_sliders()
+            self.draw()
+
+    def cut_at(self, at: float) -> None:
+        self.at = float(at)
+        self._changed()
+
+    def cut_across(self, axis: int) -> None:
+        self.axis, self.at = axis, float((self.low + self.high)[axis] / 2.0)
+        self._changed()
+
+    def limit(self, low: float | None = None, high: float | None = None) -> None:
+        """A limit that passes the other takes it along."""
+        if low is not None:
+            self.limits = (low, max(low, self.limits[1]))
+        if high is not None:
+            self.limits = (min(high, self.limits[0]), high)
+        self._changed()
+
+    def colour_by(self, number: int) -> None:
+        if number == self.number:
+            return
+        self.number = number
+        self.limits = self._range()
+        self._add_key()
+        self._changed()
+
+    def turn(self) -> None:
+        self.is_turned = not self.is_turned
+        self._changed()
+
+    def next_inside(self) -> None:
+        if self.image is not None:
+            self.inside = INSIDE[(INSIDE.index(self.inside) + 1) % len(INSIDE)]
+            self._changed()
+
+    def next_field(self) -> None:
+        self.colour_by((self.number + 1) % len(self.fields))
+
+    def next_set(self) -> None:
+        self.set = (self.set + 1) % (len(self.sets) + 1)
+        self._changed()
+
+
+def _label_colours(field: Field, values: NDArray[np.float32]) -> NDArray[np.uint8]:
+    """(K, 3) red, green and blue of labels; `NO_VALUE` for what is none."""
+    found = np.tile(np.rint(255.0 * np.array(to_rgb(NO_VALUE))), (len(values), 1))
+    for label, colour in field.categories:
+        found[values == label] = np.rint(255.0 * np.array(to_rgb(colour)))
+    return found.astype(np.uint8)
+
+
+def plane_slice(image: Image, axis: int, at: float) -> pyvista.ImageData:
+    """The image in a world plane, in pixels of half the voxels' shortest edge: each has the voxel around its centre.
+
+    Parameters
+    ----------
+    image : Image
+        Three-dimensional.
+    axis : int
+        World axis across the plane, 0 for R-L, 1 for A-P, 2 for S-I.
+    at : float
+        Where the plane crosses it, mm.
+
+    Returns
+    -------
+    pyvista.ImageData
+        One layer of cells with data `h`, float64, NaN outside of the image; up to `MAX_PIXELS` along a side.
+    """
+    corners = np.stack(np.meshgrid(*([-0.5, size - 0.5] for size in image.shape), indexing="ij"), axis=-1)
+    world = image.to_world(corners.reshape(-1, 3))
+    low, high = world.min(axis=0), world.max(axis=0)
+    pixel = max(float(image.spacing.min()) / 2.0, float(np.delete(high - low, axis).max()) / MAX_PIXELS)
+    counts = np.maximum(np.ceil((high - low) / pixel - 1e-9).astype(np.int64), 1)
+    counts[axis] = 1
+    low[axis] = at
+    centres = [low[k] + pixel * (np.arange(counts[k]) + 0.5) for k in range(3)]
+    centres[axis] = np.array([at])
+    index = image.to_index(np.stack(np.meshgrid(*centres, indexing="ij"), axis=-1))
+    voxel = np.floor(index + 0.5).astype(np.int64)
+    is_inside = ((voxel >= 0) & (voxel < image.shape)).all(axis=-1)
+    h = np.full(voxel.shape[:3], np.nan)
+    h[is_inside] = image.data[tuple(voxel[is_inside].T)]
+    dimensions = counts + 1
+    dimensions[axis] = 1
+    sheet = pyvista.ImageData(dimensions=dimensions, spacing=(pixel,) * 3, origin=low)
+    sheet.cell_data["h"] = h.ravel(order="F")
+    return sheet
