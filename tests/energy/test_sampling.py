@@ -13,6 +13,7 @@ from scipy.spatial import Delaunay
 
 from tetopt import Image, InputError, Mesh, cell_moments, cell_of_voxel, lattice
 from tetopt.energy.sampling import (
+    cell_ranges,
     from_ticks,
     moment_sums,
     nearest_values,
@@ -301,6 +302,10 @@ def test_moments_are_numpy_s_over_each_cell_s_voxels(seed, n, is_snapped):
         h = data[owner == cell]
         assert moments.mean[cell] == pytest.approx(h.mean(), rel=1e-13)
         assert moments.variance[cell] == pytest.approx(h.var(), rel=1e-10, abs=1e-9)
+    low, high = cell_ranges(image, mesh)
+    for cell, n_voxels in enumerate(moments.n_voxels):
+        h = data[owner == cell] if n_voxels else moments.mean[cell]
+        assert (low[cell], high[cell]) == (np.min(h), np.max(h))
 
 
 @pytest.mark.parametrize(("offset", "contrast"), [(1e8, 1.0), (-1e8, 1.0), (0.4, 1e-6)])

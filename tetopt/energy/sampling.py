@@ -106,11 +106,14 @@ def cell_ranges(image: Image, mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[
     InputError
         As `cell_moments`.
     """
-    owner = cell_of_voxel(image, mesh).ravel()
-    inside = owner >= 0
+    owner, h = cell_of_voxel(image, mesh).ravel(), image.data.ravel()
+    # Runs of voxels of one cell first: `ufunc.at` on each voxel takes twice as long (MNI152 T1, 15,000 nodes).
+    start = np.flatnonzero(np.concatenate([[True], owner[1:] != owner[:-1]]))
+    inside = owner[start] >= 0
+    cell = owner[start][inside]
     low, high = np.full(len(mesh.cells), np.inf), np.full(len(mesh.cells), -np.inf)
-    np.minimum.at(low, owner[inside], image.data.ravel()[inside])
-    np.maximum.at(high, owner[inside], image.data.ravel()[inside])
+    np.minimum.at(low, cell, np.minimum.reduceat(h, start)[inside])
+    np.maximum.at(high, cell, np.maximum.reduceat(h, start)[inside])
     is_empty = low > high
     low[is_empty] = high[is_empty] = nearest_values(image, mesh.points[mesh.cells[is_empty]].mean(axis=1))
     return low, high

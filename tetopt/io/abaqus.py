@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
+from tetopt.io.tags import check_apart, material_names, without_cell_data
 from tetopt.io.text import blocks, rows
 from tetopt.model.model import Model, described, quadratic, quadratic_facet_nodes
 from tetopt.model.sets import nodes_of
@@ -64,15 +65,11 @@ def _check(model: Model) -> None:
         raise InputError(
             "abaqus: loads, but no materials to press on; give a law of the modulus (--young) or leave out the loads"
         )
-    own = {ALL, *_material_names(model)}
-    if taken := [name for name in model.sets.cells if name.lower() in own]:
-        raise InputError(f'abaqus: the file has a set "{taken[0].lower()}" of its own; call yours otherwise')
+    check_apart([ALL, *material_names(model, {})], model.sets.cells)
 
 
 def _head(model: Model) -> str:
-    lines = described(model)
-    if model.cell_data:
-        lines.append(f"cell data that this format has no place for: {', '.join(model.cell_data)}")
+    lines = described(model) + without_cell_data(model)
     comments = [f"** {part}\n" for line in lines for part in textwrap.wrap(line, COMMENT)]
     return "".join([*comments, "*HEADING\n", "; ".join(lines[:3]), "\n"])
 
@@ -101,12 +98,8 @@ def _materials(model: Model) -> list[str]:
     return [
         f"*ELSET, ELSET={name}\n{_list(members)}"
         f"*MATERIAL, NAME={name}\n*ELASTIC\n{pair}\n*SOLID SECTION, ELSET={name}, MATERIAL={name}\n"
-        for name, members, pair in zip(_material_names(model), cells, constants, strict=True)
+        for name, members, pair in zip(material_names(model, {}), cells, constants, strict=True)
     ]
-
-
-def _material_names(model: Model) -> list[str]:
-    return [] if model.materials is None else [f"material_{k + 1}" for k in range(len(model.materials.young))]
 
 
 def _step(model: Model) -> list[str]:
