@@ -75,8 +75,15 @@ def test_mesh_writes_every_format(folder, tmp_path, suffix):
 
 def test_vtu_there_and_back_with_materials_sets_and_loads(folder, tmp_path):
     options = ["--young", LAW, "--nu", "0=0.45,1=0.3", "--load", "compress:5%", "--set", "dark=below:20"]
+    options += ["--json", tmp_path / "b.json"]
     assert run("convert", folder / "a.vtu", tmp_path / "b.vtu", *options, "--units", "MPa", "--space", "lps") == 0
     first, found = tetopt.load_mesh(folder / "a.vtu"), tetopt.load_mesh(tmp_path / "b.vtu")
+    told = json.loads((tmp_path / "b.json").read_text())
+    assert told["materials"]["count"] == len(
+        np.unique(np.column_stack([found.cell_data[k] for k in ("young", "nu")]), axis=0)
+    )
+    assert told["sets"]["cells"]["dark"] == len(found.sets.cells["dark"])
+    assert told["loads"]["superior"] == [0.0, 0.0, 0.0]
     assert found.space == "lps"
     assert found.mesh.points.tobytes() == first.mesh.points.tobytes()  # turned back
     np.testing.assert_array_equal(found.mesh.cells, first.mesh.cells)

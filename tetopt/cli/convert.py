@@ -15,6 +15,7 @@ from tetopt.cli.options import (
     BinsOption,
     CropOption,
     ForceOption,
+    JsonOption,
     LoadOption,
     MeshArgument,
     NuOption,
@@ -28,13 +29,14 @@ from tetopt.cli.options import (
 )
 from tetopt.cli.solver import Wishes, built, checked_wishes, print_model, save_wished
 from tetopt.content import continued
-from tetopt.io.files import checked_output
+from tetopt.io.files import checked_output, save_json
 from tetopt.io.formats import FORMATS, format_of
 from tetopt.io.images import sha256
 from tetopt.io.meshes import MeshFile
 from tetopt.model.fields import cell_fields
 from tetopt.model.model import UNITS
 from tetopt.model.sets import box_of
+from tetopt.report.summary import model_summary, versions
 
 TEXTS = ("image", "image_sha256", "inputs", "options", "box")  # of a mesh's file that go on into the new one
 
@@ -62,11 +64,14 @@ def convert_command(
     volume: VolumeOption = None,
     crop: CropOption = None,
     slice_: SliceOption = None,
+    json_path: JsonOption = None,
     force: ForceOption = False,
 ) -> int:
     """Write a mesh for a solver: materials, named sets, loads, in the format of OUT's suffix."""
     format_of(output)
     output = checked_output(output, tuple(FORMATS), force)
+    if json_path is not None:
+        json_path = checked_output(json_path, (".json",), force)
     check_no_input(output, mesh_path, image_path, mask_path)
     wishes = Wishes(young, nu, bins, list(sets or []), list(loads or []), order, units, space)
     if mask_path is not None and image_path is None:
@@ -88,6 +93,9 @@ def convert_command(
         known["known_sets"] = loaded.sets
     model = built(loaded.mesh, image, wishes, fields, about, **known)
     save_wished(output, model, wishes)
+    if json_path is not None:
+        files = {"mesh": mesh_path.name, "output": output.name, "units": units, "space": space}
+        save_json(json_path, files | {"versions": versions()} | model_summary(model))
     print_model(output, model, wishes)
     return 0
 
