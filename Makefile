@@ -14,7 +14,7 @@ demo: $(VENV)/.demo
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt demo -o demo --force
 
 test: $(VENV)/.test
-	$(TESTED) -m "not slow"
+	$(TESTED) -m "not slow" -n auto --dist loadfile
 	$(MAKE) --no-print-directory test-onethread test-nojit
 
 # The small cases again on one thread, and with the kernels run as plain Python.

@@ -11,6 +11,7 @@ from models import sample_image
 
 import tetopt
 from tetopt.cli import main
+from tetopt.cli.promises import check_promises
 from tetopt.geometry.topology import boundary_facets, largest_component
 from tetopt.io.formats import FORMATS
 
@@ -56,7 +57,8 @@ def test_every_format_is_written(folder, tmp_path, suffix, capsys):
     assert run("convert", folder / "a.vtu", out, *more, "--space", "lps") == 0
     assert out.stat().st_size > 1000
     said = capsys.readouterr().out
-    assert f"{out}: {FORMATS[suffix].what}, LPS+ mm, kPa, " in said
+    units = "" if FORMATS[suffix].is_surface else ", kPa"
+    assert f"{out}: {FORMATS[suffix].what}, LPS+ mm{units}, " in said
     if more:
         assert "3 materials" in said or "6 materials" in said or "4 materials" in said
         assert "off by" in said
@@ -97,10 +99,13 @@ def test_vtu_there_and_back_with_materials_sets_and_loads(folder, tmp_path):
     assert str(found.field_data["units"][0]) == "MPa"
     loads = json.loads(str(found.field_data["loads"][0]))
     assert [name for name, _ in loads] == ["superior", "inferior"]
-    # And on, in kPa again, what was painted kept.
+    # And on, in kPa and RAS again, what was painted, set and loaded kept.
     assert run("convert", tmp_path / "b.vtu", tmp_path / "c.vtu") == 0
     again = tetopt.load_mesh(tmp_path / "c.vtu")
     np.testing.assert_allclose(again.cell_data["young"], 1.0 + means / 7.0, rtol=1e-14)
+    np.testing.assert_array_equal(again.cell_data["nu"], found.cell_data["nu"])
+    kept = json.loads(again.text("loads"))
+    assert kept == [[name, [-x + 0.0, -y + 0.0, z]] for name, (x, y, z) in loads]
     assert again.space == "ras"
     assert list(again.sets.cells) == list(found.sets.cells)
     assert again.box.shape == first.box.shape
@@ -137,10 +142,14 @@ def test_a_mesh_of_gmsh_s_is_measured_and_painted(folder, tmp_path, capsys):
     assert run("convert", tmp_path / "g.msh", tmp_path / "g.inp", "--young", LAW) == 2
     assert "the mesh has no means; give the image (--image)" in capsys.readouterr().err
     assert not (tmp_path / "g.inp").exists()
+    assert run("convert", tmp_path / "g.msh", tmp_path / "c.inp", "--young", "3") == 0  # which needs none
+    assert "1 material, Young's modulus 3 to 3 kPa" in capsys.readouterr().out
     options = ["--image", folder / "a.nii.gz", "--young", LAW, "--load", "compress:1%"]
     assert run("convert", tmp_path / "g.msh", tmp_path / "g.inp", *options) == 0
     text = (tmp_path / "g.inp").read_text()
     assert "*STATIC" in text
+    for name in ("*NSET, NSET=skin", "*ELSET, ELSET=tissue", "*NSET, NSET=left", "*SURFACE, NAME=boundary"):
+        assert f"{name}\n" in text or f"{name}," in text
 
 
 # From a mesh of the user's
@@ -193,6 +202,50 @@ def test_a_mesh_beside_the_image(folder, tmp_path, capsys):
     assert "lies beside the image" in capsys.readouterr().err
 
 
+def test_a_mask_keeps_what_lies_outside_out_of_the_means(folder, tmp_path):
+    image = tetopt.load_image(folder / "a.nii.gz")
+    tetopt.save_image(tmp_path / "m.nii.gz", tetopt.Image(1.0 * (image.data < 30), image.affine))
+    means = []
+    for name, more in (("all", []), ("part", ["--mask", tmp_path / "m.nii.gz"])):
+        assert run("convert", folder / "a.vtu", tmp_path / f"{name}.vtu", "--image", folder / "a.nii.gz", *more) == 0
+        means.append(tetopt.load_mesh(tmp_path / f"{name}.vtu").cell_data["mean"])
+    assert means[0].max() > 40
+    assert means[1].max() < 30
+
+
+def test_an_optimised_mesh_is_kept_whatever_is_refused_after_it(folder, tmp_path, capsys):
+    options = ["--spacing", "8", "--iterations", "1", "--young", "3", "--set", "p=point:0,0,0:0.01"]
+    assert run("mesh", folder / "a.nii.gz", "-o", tmp_path / "a.inp", *options) == 2
+    said = capsys.readouterr().err.splitlines()
+    assert "no facet of the boundary lies within 0.01 mm" in said[-1]
+    assert f"the optimised mesh is in {tmp_path / 'a.vtu'}" in said[-1]
+    assert len(tetopt.load_mesh(tmp_path / "a.vtu").mesh.cells) > 100
+    assert not (tmp_path / "a.inp").exists()
+
+
+def test_a_promise_is_broken_where_a_start_covers_less(folder):
+    image = sample_image(3)
+    start = tetopt.load_mesh(folder / "a.vtu").mesh
+    result = tetopt.optimize(image, start, boundary="fixed", iterations=1)
+    content = tetopt.content(image)
+    assert check_promises(content, result, 0.0, None, {}, start) == 0
+    smaller = result._replace(mesh=tetopt.Mesh(start.points * 0.999, start.cells))
+    assert check_promises(content, smaller, 0.0, None, {}, start) == 1
+    last = result.history[-1]
+    fewer = result._replace(history=[*result.history, last._replace(n_voxels=last.n_voxels - 1)])
+    assert check_promises(content, fewer, 0.0, None, {}, start) == 1
+
+
+def test_loads_run_or_are_said_to_be_in_comments(folder, tmp_path, capsys):
+    for suffix in FORMATS:
+        if FORMATS[suffix].is_surface:
+            continue
+        options = ["--young", "3", "--load", "compress:5%"]
+        assert run("convert", folder / "a.vtu", tmp_path / f"a{suffix}", *options) == 0
+        is_said = "no place for loads: they are in its comments" in capsys.readouterr().out
+        assert is_said == (suffix not in (".inp", ".feb", ".scn")), suffix
+
+
 # Bad input: one line, exit 2, nothing left behind
 
 
@@ -211,7 +264,9 @@ def test_a_mesh_beside_the_image(folder, tmp_path, capsys):
         ("a.inp", ["--young", "2", "--nu", "-1"], "-1 < nu < 0.5"),
         ("a.inp", ["--young", "2", "--nu", "x"], 'cannot use "x"'),
         ("a.inp", ["--nu", "0.3"], "--nu: there is no --young"),
-        ("a.inp", ["--young", "1=2"], "the mesh also has 0"),
+        ("a.inp", ["--young", "1=2"], "the mesh also has 1 others, 0"),
+        ("a.inp", ["--crop", "1:3,:,:"], "--crop: there is no --image"),
+        ("a.inp", ["--young", "2", "--load", "move:left:0,0,1"], 'nothing but "left" is loaded'),
         ("a.inp", ["--bins", "4"], "no moduli to group"),
         ("a.inp", ["--young", "h+1", "--bins", "0"], "--bins: expected K"),
         ("a.inp", ["--young", "h+1", "--bins", "4:cubic"], "--bins: expected K"),
@@ -220,7 +275,7 @@ def test_a_mesh_beside_the_image(folder, tmp_path, capsys):
         ("a.inp", ["--order", "3"], "--order: expected 1 or 2"),
         ("a.vtu", ["--order", "2"], "--order 2 is for .msh, .msh2, .inp, .feb only"),
         ("a.inp", ["--load", "compress:5%"], "loads, but no materials"),
-        ("a.inp", ["--young", "2", "--load", "compress:5"], "a percentage"),
+        ("a.inp", ["--young", "2", "--load", "compress:5"], "expected compress:P%"),
         ("a.inp", ["--young", "2", "--load", "hold:skin"], 'no set of facets "skin"'),
         ("a.inp", ["--set", "x=above:3"], "expected NAME=below:T"),
         ("a.feb", [], "needs a material; give a law of the modulus (--young)"),
@@ -239,10 +294,25 @@ def test_conversions_that_are_refused(folder, tmp_path, out, more, match, capsys
 
 
 def test_what_will_not_do_is_said_before_the_optimisation(folder, tmp_path, capsys):
-    for more in (["--young", "h - 20"], ["--young", "2", "--load", "hold:skin"]):
-        assert run("mesh", folder / "a.nii.gz", "-o", tmp_path / "a.inp", "--spacing", "8", *more) == 2
+    for out, more in (
+        ("a.inp", ["--young", "h - 20"]),
+        ("a.inp", ["--young", "2", "--load", "hold:skin"]),
+        ("a.inp", ["--load", "compress:5%"]),
+        ("a.feb", []),
+        ("a.scn", ["--young", "2", "--nu", "-0.2"]),
+        ("a.inp", ["--set", "foo"]),
+        ("a.inp", ["--set", "low=below:-5"]),
+        ("a.inp", ["--set", "low=below:20", "--young", "h - 20"]),
+    ):
+        assert run("mesh", folder / "a.nii.gz", "-o", tmp_path / out, "--spacing", "8", *more) == 2
         said = capsys.readouterr().err
         assert said.count("\n") == 1, said
+    for out in ("a.inp", "a.feb", "a.scn", "a.stl"):
+        more = [] if out == "a.stl" else ["--young", "2"]
+        assert run("mesh", folder / "a.nii.gz", "--slice", "k=3", "-o", tmp_path / out, "--nodes", "60", *more) == 2
+        assert "triangles" in capsys.readouterr().err
+    assert run("mesh", folder / "a.nii.gz", "--target-error", "0.3", "-o", tmp_path / "a.inp", "--load", "foo") == 2
+    assert capsys.readouterr().err.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
 
 

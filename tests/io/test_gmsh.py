@@ -14,7 +14,10 @@ from models import ABOUT, sample_model
 
 import tetopt.io.gmsh
 from tetopt.errors import InputError
-from tetopt.io.gmsh import gmsh22, gmsh41
+from tetopt.io.formats import save_model
+from tetopt.io.gmsh import gmsh22, gmsh41, told
+from tetopt.io.meshes import load_mesh
+from tetopt.model.materials import materials
 from tetopt.model.model import in_space, in_units, quadratic
 from tetopt.model.sets import Sets, facet_triples, nodes_of
 
@@ -366,6 +369,91 @@ def test_names_that_cell_data_have():
 def test_quadratic_triangles_are_refused(version):
     with pytest.raises(InputError, match=r"^order 2: only of tetrahedra"):
         WRITERS[version](sample_model(2)._replace(order=2))
+
+
+# Our own reader
+
+SUFFIX = {"4.1": ".msh", "2.2": ".msh2"}
+
+
+@pytest.mark.parametrize("version", WRITERS)
+@pytest.mark.parametrize(("n", "space"), [(2, "ras"), (3, "ras"), (3, "lps")])
+@pytest.mark.parametrize("bins", [3, "none", "many"])
+def test_our_reader_finds_the_model(version, n, space, bins, tmp_path, monkeypatch):
+    """Points, cells, sets, moduli in their units, where the file came from; in 4.1 in another order of cells."""
+    model, path = sample_model(n), tmp_path / f"a{SUFFIX[version]}"
+    if bins == "none":
+        model = model._replace(materials=None)
+    if bins == "many" and version == "4.1":  # then they are no groups
+        monkeypatch.setattr(tetopt.io.gmsh, "MOST_MATERIALS", 2)
+    save_model(path, model, space=space, units="MPa")
+    back = load_mesh(path)
+    assert (back.space, back.n_turned, back.notes) == (space, 0, ())
+    assert back.mesh.points.tobytes() == model.mesh.points.tobytes()
+    assert {name: values.tolist() for name, values in back.field_data.items()} == {
+        "units": ["MPa"], "image": [ABOUT["image"]], "image_sha256": [ABOUT["image_sha256"]]
+    }  # fmt: skip
+    place = {tuple(cell): k for k, cell in enumerate(model.mesh.cells.tolist())}
+    of_cell = np.array([place[tuple(cell)] for cell in back.mesh.cells.tolist()])
+    assert sorted(of_cell) == list(range(len(place)))
+    expected = dict(model.cell_data) if version == "4.1" else {}
+    if bins != "none":
+        scaled = in_units(model, "MPa").materials
+        expected |= {"young": scaled.young[scaled.of_cell], "nu": scaled.nu[scaled.of_cell]}
+    assert set(back.cell_data) == set(expected)
+    for name, values in expected.items():
+        np.testing.assert_array_equal(back.cell_data[name], values[of_cell])
+    assert set(back.sets.cells) == set(model.sets.cells)
+    for name, members in model.sets.cells.items():
+        np.testing.assert_array_equal(back.sets.cells[name], np.flatnonzero(np.isin(of_cell, members)))
+    assert set(back.sets.facets) == set(model.sets.facets)
+    for name, rows in model.sets.facets.items():
+        found = facet_triples(back.mesh.cells, back.sets.facets[name])
+        assert each_once(found) == each_once(facet_triples(model.mesh.cells, rows))
+
+
+def test_what_was_read_can_be_written_again(tmp_path):
+    save_model(tmp_path / "a.msh", sample_model(3))
+    back = load_mesh(tmp_path / "a.msh")
+    again = sample_model(3)._replace(mesh=back.mesh, cell_data=back.cell_data, sets=back.sets)
+    made = materials(back.cell_data["young"], back.cell_data["nu"], len(back.mesh.cells))
+    save_model(tmp_path / "b.msh", again._replace(materials=made, loads=()))
+    for name in ("young", "nu"):
+        np.testing.assert_array_equal(
+            np.sort(load_mesh(tmp_path / "b.msh").cell_data[name]), np.sort(back.cell_data[name])
+        )
+
+
+def test_comments_that_gmsh_has_put_at_the_end(tmp_path):
+    """As it does when it writes a file again; and here an entity is gone that they tell of."""
+    model = sample_model(3)
+    before, _, rest = gmsh22(in_space(model, "lps")).decode().partition("$Comments\n")
+    comments, _, after = rest.partition("$EndComments\n")
+    more = comments + "entity of cells 999: dark\nentity of cells 998: gone\nmaterial_9: young 1.0 kPa, nu 0.3\n"
+    (tmp_path / "a.msh").write_text(f"{before}{after}$Comments\n{more}$EndComments\n")
+    back = load_mesh(tmp_path / "a.msh")
+    assert back.space == "lps"
+    assert set(back.sets.cells) == set(model.sets.cells)
+    np.testing.assert_array_equal(back.sets.cells["dark"], model.sets.cells["dark"])
+    np.testing.assert_array_equal(back.cell_data["young"], model.materials.young[model.materials.of_cell])
+    # Without the constants of a material there are no moduli: what is left are the groups' names.
+    without = "".join(f"{line}\n" for line in more.splitlines() if not line.startswith("material_1:"))
+    (tmp_path / "a.msh").write_text(f"{before}{after}$Comments\n{without}$EndComments\n")
+    back = load_mesh(tmp_path / "a.msh")
+    assert "young" not in back.cell_data
+    for k in (0, 1):
+        np.testing.assert_array_equal(
+            back.sets.cells[f"material_{k + 1}"], np.flatnonzero(model.materials.of_cell == k)
+        )
+
+
+def test_comments_of_others_are_not_ours():
+    assert told([]) is None
+    assert told(["made by hand", "coordinates: LPS+, mm"]) is None
+    assert told(["tetopt was here"]) is None
+    assert told(["tetopt", "coordinates: of the slice's plane, mm", "image: a, b.nii, sha256 unknown"]) == (
+        "ras", {"image": "a, b.nii"}, {}, {}
+    )  # fmt: skip
 
 
 # Others' readers

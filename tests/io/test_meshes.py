@@ -238,6 +238,131 @@ def test_a_file_in_single_precision(tmp_path):
 
 
 # --------------------------------------------------------------------------------------------------
+# gmsh's physical groups
+
+
+LONG = "x" * 45
+NAMES = {
+    (2, 1): "my left", (2, 2): "Skin", (2, 5): f"{LONG}a", (2, 6): f"{LONG}b", (2, 8): "1st", (2, 9): "nothing",
+    (2, 10): "my_left",
+    (3, 2): "skin", (3, 3): "Skin", (3, 8): "Höhle", (3, 9): "ok-1",
+}  # fmt: skip
+TRIANGLES = [[0, 1, 2], [1, 2, 4]]  # opposite local node 3 of cell 0 and local node 2 of cell 1
+TETRAHEDRA = [[0, 1, 2, 3], [1, 2, 3, 4]]
+# Of each triangle, and of each tetrahedron, which are an entity each; the sign is an orientation. 4 and 7 have no name.
+GROUPS = {2: [[1, 2, -4, 5], [2, 6, 8, 10]], 3: [[2, 3, 9], [7, 8]]}
+
+
+def write_msh41(path, is_binary):
+    """The two tetrahedra and triangles of these groups, and a point with its own, after gmsh's manual."""
+    size, integer, real = np.uint64, np.int32, np.float64
+    parts = []
+
+    def add(dtype, *values):
+        array = np.array(values, dtype=dtype)
+        parts.append(array.tobytes() if is_binary else (" ".join(map(repr, array.tolist())) + "\n").encode())
+
+    def text(words):
+        parts.append(words.encode())
+
+    text(f"$MeshFormat\n4.1 {int(is_binary)} 8\n")
+    if is_binary:
+        add(integer, 1)
+    text("\n$EndMeshFormat\n$PhysicalNames\n")
+    text(f"{len(NAMES)}\n" + "".join(f'{dim} {tag} "{name}"\n' for (dim, tag), name in NAMES.items()))
+    text("$EndPhysicalNames\n$Entities\n")
+    add(size, 1, 0, 2, 2)
+    for dim, tag, groups in [(0, 1, [1]), *((dim, k + 1, GROUPS[dim][k]) for dim in (2, 3) for k in (0, 1))]:
+        add(integer, tag)
+        add(real, *([0.5, 1e300, 0.0] if dim == 0 else [0.5, -2.5, 0.0, 1e300, 1.0, 1.0]))
+        add(size, len(groups))
+        add(integer, *groups)
+        if dim:
+            add(size, 2)
+            add(integer, 7, -8)
+    text("\n$EndEntities\n$Nodes\n")
+    add(size, 1, 5, 1, 5)
+    add(integer, 3, 1, 0)
+    add(size, 5, 1, 2, 3, 4, 5)
+    add(real, *np.ravel(POINTS[:5]))
+    text("\n$EndNodes\n$Elements\n")
+    add(size, 4, 4, 1, 4)
+    for dim, kind, elements in ((2, 2, TRIANGLES), (3, 4, TETRAHEDRA)):
+        for k, nodes in enumerate(elements):
+            add(integer, dim, k + 1, kind)
+            add(size, 1, 10 * dim + k, *(node + 1 for node in nodes))
+    text("\n$EndElements\n")
+    path.write_bytes(b"".join(parts))
+
+
+@pytest.mark.parametrize("is_binary", [False, True])
+def test_every_physical_group_becomes_a_set_of_a_valid_name(tmp_path, is_binary):
+    write_msh41(tmp_path / "a.msh", is_binary)
+    back = load_mesh(tmp_path / "a.msh")
+    np.testing.assert_array_equal(back.mesh.cells, TETRAHEDRA)
+    first, second = [0, 3], [1, 2]  # rows of the triangles
+    assert {name: rows.tolist() for name, rows in back.sets.facets.items()} == {
+        "Skin": [first, second], "surface_4": [first], "my_left": [second], "my_left_2": [first], "x" * 40: [first],
+        f"{'x' * 38}_2": [second], "set_1st": [second],
+    }  # fmt: skip
+    assert {name: members.tolist() for name, members in back.sets.cells.items()} == {
+        "skin_2": [0], "Skin_3": [0], "ok-1": [0], "volume_7": [1], "H_hle": [1]
+    }  # fmt: skip
+    assert set(back.notes) == {
+        '"my left" is the set my_left_2 here',
+        f'"{LONG}a" is the set {"x" * 40} here',
+        f'"{LONG}b" is the set {"x" * 38}_2 here',
+        '"1st" is the set set_1st here',
+        '"skin" is the set skin_2 here',
+        '"Skin" is the set Skin_3 here',
+        '"Höhle" is the set H_hle here',
+    }
+
+
+MSH22 = """$MeshFormat
+2.2 0 8
+$EndMeshFormat
+{names}$Nodes
+4
+1 0 0 0
+2 1 0 0
+3 0 1 0
+4 1 1 0
+$EndNodes
+$Elements
+{n}
+{elements}
+$EndElements
+"""
+
+
+def write_msh22(path, elements, names=""):
+    path.write_text(MSH22.format(names=names, n=len(elements), elements="\n".join(elements)))
+
+
+def test_groups_without_a_name_in_2d(tmp_path):
+    """A path of three boundary edges and one that is none, two triangles, one of them in no group."""
+    edges = ["1 1 2 3 1 1 2", "2 1 2 3 1 2 4", "3 1 2 0 1 4 3", "4 1 2 6 1 1 4"]
+    write_msh22(tmp_path / "a.msh2", [*edges, "5 2 2 0 1 1 2 3", "6 2 2 4 1 2 4 3"])
+    back = load_mesh(tmp_path / "a.msh2")
+    assert {name: rows.tolist() for name, rows in back.sets.facets.items()} == {"edge_3": [[0, 2], [1, 2]]}
+    assert {name: members.tolist() for name, members in back.sets.cells.items()} == {"surface_4": [1]}
+    assert back.notes == ('"edge_6" is left out: none of it is a facet of a cell',)
+
+
+def test_groups_of_materials_give_way_to_moduli(tmp_path):
+    """Of a file of ours that gmsh has written again, without the comments but with the views."""
+    names = '$PhysicalNames\n2\n2 1 "material_1"\n2 2 "left"\n$EndPhysicalNames\n'
+    write_msh22(tmp_path / "a.msh", ["1 2 2 1 1 1 2 3", "2 2 2 2 1 2 4 3"], names)
+    assert set(load_mesh(tmp_path / "a.msh").sets.cells) == {"material_1", "left"}
+    with (tmp_path / "a.msh").open("a") as file:
+        file.write('$ElementData\n1\n"young"\n1\n0.0\n3\n0\n1\n2\n1 2.5\n2 3.5\n$EndElementData\n')
+    back = load_mesh(tmp_path / "a.msh")
+    assert back.cell_data["young"].tolist() == [2.5, 3.5]
+    assert set(back.sets.cells) == {"left"}
+
+
+# --------------------------------------------------------------------------------------------------
 # Bad files
 
 
@@ -270,7 +395,7 @@ def test_a_missing_file(tmp_path, assert_refused):
 @pytest.mark.parametrize("name", ["a.stl", "a.nii.gz", "a.inp", "a"])
 def test_another_suffix(tmp_path, name, assert_refused):
     (tmp_path / name).write_bytes(b"x")
-    assert_refused(tmp_path / name, r"named \.vtu, \.vtk or \.msh")
+    assert_refused(tmp_path / name, r"named \.vtu, \.vtk, \.msh or \.msh2$")
 
 
 @pytest.mark.parametrize("name", ["a.vtu", "a.vtk"])

@@ -10,6 +10,7 @@ from models import ABOUT, sample_model
 
 from tetopt.io.formats import save_model
 from tetopt.io.meshes import load_mesh
+from tetopt.io.vtk import to_pyvista
 from tetopt.model.sets import nodes_of
 
 
@@ -21,7 +22,7 @@ def test_every_bit_comes_back(tmp_path, suffix, space, n):
     back = load_mesh(path)
     assert back.mesh.points.tobytes() == model.mesh.points.tobytes()
     np.testing.assert_array_equal(back.mesh.cells, model.mesh.cells)
-    assert (back.n_turned, back.n_left, back.space) == (0, 0, space)
+    assert (back.n_turned, back.n_left, back.space, back.notes) == (0, 0, space, ())
     for kind in (0, 1):
         assert set(back.sets[kind]) == set(model.sets[kind])
         for name, members in model.sets[kind].items():
@@ -80,16 +81,153 @@ def test_a_file_of_3d_slicer_s_in_lps_is_turned(tmp_path, suffix):
     np.testing.assert_allclose(back.mesh.points, model.mesh.points, rtol=1e-9)
 
 
-def test_sets_of_a_file_whose_cells_had_to_be_turned_are_not_trusted(tmp_path):
-    """A row (cell, k) means another facet once two nodes of its cell are exchanged."""
+def turned(grid):
+    """Mirrored: a row (cell, k) means another facet once two nodes of its cell are exchanged."""
+    grid.points[:, 0] *= -1.0
+    return grid
+
+
+def without_checksum(grid):
+    del grid.field_data["cells_sha256"]
+    return grid
+
+
+def no_text(grid):
+    grid.field_data["cells_sha256"] = np.array([1.5])
+    return grid
+
+
+CHANGES = {
+    "turned": turned,
+    "fewer": lambda grid: grid.threshold(20, scalars="mean"),
+    "reordered": lambda grid: with_cells(grid, grid.cells_dict[10][::-1]),
+    "no checksum": without_checksum,
+    "no text": no_text,
+}
+
+
+def with_cells(grid, cells):
+    """Other cells, all else as it was."""
+    made = pyvista.UnstructuredGrid({10: cells}, grid.points)
+    made.field_data.update({name: grid.field_data[name] for name in grid.field_data})
+    return made
+
+
+@pytest.mark.parametrize("suffix", ["vtu", "vtk"])
+@pytest.mark.parametrize("change", CHANGES)
+def test_sets_are_dropped_unless_the_cells_are_those_they_were_written_for(tmp_path, change, suffix):
+    save_model(tmp_path / f"a.{suffix}", sample_model(3))
+    grid = CHANGES[change](pyvista.read(tmp_path / f"a.{suffix}"))
+    assert "facets:left" in grid.field_data
+    grid.save(tmp_path / f"b.{suffix}")
+    back = load_mesh(tmp_path / f"b.{suffix}")
+    assert back.sets == ({}, {})
+    (note,) = back.notes
+    assert note.startswith("sets left out, as the file does not tell that its cells are still those that they were wr")
+    assert set(note.split(": ")[1].split(", ")) == {*sample_model(3).sets.facets, *sample_model(3).sets.cells}
+
+
+def test_a_file_that_another_program_has_only_saved_keeps_its_sets(tmp_path):
+    save_model(tmp_path / "a.vtu", sample_model(3))
+    pyvista.read(tmp_path / "a.vtu").save(tmp_path / "b.vtu")
+    back = load_mesh(tmp_path / "b.vtu")
+    np.testing.assert_array_equal(back.sets.facets["left"], sample_model(3).sets.facets["left"])
+    assert back.notes == ()
+
+
+@pytest.mark.parametrize(
+    ("name", "values"),
+    [
+        ("facets:odd", np.array([1, 2, 3])),
+        ("facets:fifth", np.array([[0, 4]])),
+        ("facets:floats", np.array([[0.0, 1.0]])),
+        ("facets:backwards", np.array([[3, 1], [3, 0]])),
+        ("cells:beyond", np.array([0, 10**6])),
+        ("cells:negative", np.array([-1, 3])),
+        ("cells:twice", np.array([3, 3])),
+        ("cells:text", ["3"]),
+        ("cells:bytes", np.frombuffer(b"3", dtype=np.uint8)),  # which is text
+        ("cells:has space", np.array([1, 2])),
+        ("cells:LEFT", np.array([1, 2])),
+    ],
+)
+def test_sets_that_cannot_be_ours_are_dropped(tmp_path, name, values):
     save_model(tmp_path / "a.vtu", sample_model(3))
     grid = pyvista.read(tmp_path / "a.vtu")
-    grid.points[:, 0] *= -1.0
+    grid.field_data[name] = values
     grid.save(tmp_path / "b.vtu")
     back = load_mesh(tmp_path / "b.vtu")
-    assert back.n_turned == len(back.mesh.cells)
-    assert back.sets.facets == {}
     assert set(back.sets.cells) == set(sample_model(3).sets.cells)
+    assert set(back.sets.facets) == set(sample_model(3).sets.facets)
+    assert [note.split(": ")[1] for note in back.notes] == [name.partition(":")[2]]
+
+
+BOX = {"shape": [9, 8, 7], "affine": np.diag([2.0, 2.0, 3.0, 1.0]).tolist()}
+
+
+@pytest.mark.parametrize(
+    "box",
+    [
+        np.array([0.0, 1.0, 0.0, 1.0]),
+        np.empty(0),
+        ["no JSON"],
+        *(
+            [json.dumps(each)]
+            for each in (
+                [1, 2], 3, None, {"shape": [9, 8, 7]}, BOX | {"shape": 9}, BOX | {"shape": [9, 8]},
+                BOX | {"shape": [9, 8, 0]}, BOX | {"shape": [9.5, 8, 7]}, BOX | {"shape": ["9", "8", "7"]},
+                BOX | {"affine": None}, BOX | {"affine": "x"}, BOX | {"affine": [[1.0]]},
+                BOX | {"affine": np.diag([1.0, 0.0, 1.0, 1.0]).tolist()}, BOX | {"affine": [[10**400] * 4] * 4},
+                {"shape": [9, 8], "affine": np.eye(3).tolist()},
+            )
+        ),
+    ],
+)  # fmt: skip
+def test_a_box_of_another_program_s_is_none(tmp_path, box):
+    grid = to_pyvista(sample_model(3).mesh)
+    grid.field_data["box"] = box
+    grid.save(tmp_path / "a.vtu")
+    assert load_mesh(tmp_path / "a.vtu").box is None
+
+
+def test_the_box_of_ours_comes_back(tmp_path):
+    save_model(tmp_path / "a.vtu", sample_model(3)._replace(about={"box": BOX}))
+    box = load_mesh(tmp_path / "a.vtu").box
+    assert box.shape == (9, 8, 7)
+    np.testing.assert_array_equal(box.affine, BOX["affine"])
+
+
+def test_meshio_reads_a_legacy_file_of_data_that_came_from_a_vtu_file(tmp_path):
+    """What VTK has read are "long long", which it writes as "vtktypeint64", unknown to meshio 5.3.5."""
+    big = {"big": np.array([2**40, -1] * len(sample_model(3).mesh.cells))[: len(sample_model(3).mesh.cells)]}
+    save_model(tmp_path / "a.vtu", sample_model(3)._replace(cell_data=sample_model(3).cell_data | big))
+    fields = load_mesh(tmp_path / "a.vtu").cell_data
+    assert fields["n_voxels"].dtype == np.int64
+    save_model(tmp_path / "b.vtk", sample_model(3)._replace(cell_data=fields, materials=None))
+    assert b"vtktypeint64" not in (tmp_path / "b.vtk").read_bytes()
+    other = meshio.read(tmp_path / "b.vtk")
+    assert set(other.cell_data) == set(fields)
+    for name, values in fields.items():
+        np.testing.assert_array_equal(other.cell_data[name][0].ravel(), values)
+        kind = np.int32 if name in ("n_voxels", "label", "material") else np.float64
+        assert other.cell_data[name][0].dtype.newbyteorder("=") == kind
+
+
+def test_cell_data_other_than_numbers_are_left_out(tmp_path):
+    grid = to_pyvista(sample_model(3).mesh, {"k": np.ones(len(sample_model(3).mesh.cells))})
+    grid.cell_data["names"] = np.array(["a"] * grid.n_cells)
+    grid.save(tmp_path / "a.vtu")
+    back = load_mesh(tmp_path / "a.vtu")
+    assert list(back.cell_data) == ["k"]
+    assert back.notes == ("cell data left out, as they are no numbers: names",)
+
+
+@pytest.mark.parametrize("values", [np.array([1.5]), np.empty(0)])
+def test_a_space_that_is_no_text_is_not_looked_at(tmp_path, values):
+    grid = to_pyvista(sample_model(3).mesh)
+    grid.field_data["space"] = values
+    grid.save(tmp_path / "a.vtu")
+    assert load_mesh(tmp_path / "a.vtu").space == "ras"
 
 
 def test_without_materials_and_loads(tmp_path):

@@ -5,9 +5,11 @@ from itertools import permutations, product
 import numpy as np
 import pytest
 from models import sample_image, sample_model
+from scipy.spatial.transform import Rotation
 
 import tetopt
 from tetopt.errors import InputError
+from tetopt.fem.elasticity import box_faces
 from tetopt.geometry.simplex import volumes
 from tetopt.mesh import Mesh
 from tetopt.model.sets import (
@@ -16,13 +18,14 @@ from tetopt.model.sets import (
     around,
     boundary_rows,
     box_of,
+    carried,
     facet_triples,
+    joined,
     nodes_of,
     rows_of,
     standard_sets,
     tagged,
     with_asked,
-    with_carried,
     world_axes,
 )
 
@@ -205,8 +208,8 @@ def test_near_a_point_and_a_plane():
         ("LEFT=point:0,0,0:1", r'there is a set "left" already|no facet'),
         ("Boundary=below:12", 'there is a set "boundary" already'),
         ("p=point:0,0:1", "expected 3 numbers"),
-        ("p=point:0,0,0", "expected X,Y,Z:D"),
-        ("p=plane:0,0,0:1", "expected X,Y,Z:NX,NY,NZ:D"),
+        ("p=point:0,0,0", "expected point:X,Y,Z:D"),
+        ("p=plane:0,0,0:1", "expected plane:X,Y,Z:NX,NY,NZ:D"),
         ("p=plane:0,0,0:0,0,0:1", "normal must not be 0"),
         ("p=point:0,0,0:0.1", "the nearest does within"),
     ],
@@ -263,14 +266,47 @@ def test_sets_on_the_boundary_are_carried_to_an_improved_mesh():
     image = sample_image(3)
     after = tetopt.optimize(image, model.mesh, boundary="fixed", iterations=3).mesh
     assert (after.points != model.mesh.points).any()
-    given = Sets({"skin": boundary_rows(model.mesh), "inner": model.sets.facets["interface_0_1"]}, {})
-    found = with_carried(standard_sets(after), model.mesh, given, after).facets
+    given = Sets(
+        {"skin": boundary_rows(model.mesh), "inner": model.sets.facets["interface_0_1"]}, {"all": np.arange(9)}
+    )
+    found = carried(model.mesh, given, after).facets
     assert "inner" not in found
+    assert carried(model.mesh, given, after).cells == {}
     places = [
         {frozenset(map(tuple, corners)) for corners in mesh.points[facet_triples(mesh.cells, rows)].tolist()}
         for mesh, rows in ((model.mesh, given.facets["skin"]), (after, found["skin"]))
     ]
     assert places[0] == places[1]
+
+
+def test_sets_of_a_mesh_join_the_standard_ones():
+    mesh = sample_model(3).mesh
+    standard = standard_sets(mesh, box_of(sample_image(3)))
+    some = standard.facets["left"][:3]
+    given = Sets({"left": some, "right": standard.facets["right"], "skin": some}, {"Boundary": np.arange(4)})
+    found, renamed = joined(standard, given)
+    assert renamed == {"left": "left_2", "Boundary": "Boundary_2"}
+    assert set(found.facets) == {*standard.facets, "left_2", "skin"}
+    np.testing.assert_array_equal(found.facets["left"], standard.facets["left"])
+    np.testing.assert_array_equal(found.facets["left_2"], some)
+    np.testing.assert_array_equal(found.cells["Boundary_2"], np.arange(4))
+    assert "left_2" not in standard.facets  # which are left as they were
+
+
+@pytest.mark.parametrize("tilt", [0.0, 30.0, 50.0, 70.0])
+def test_top_and_bottom_are_those_of_fem(tilt):
+    """Also where a box is tilted so far that another axis would do as well."""
+    rng = np.random.default_rng(int(tilt))
+    axis = rng.normal(size=3)
+    turn = Rotation.from_rotvec(np.radians(tilt) * axis / np.linalg.norm(axis)).as_matrix()
+    affine = np.eye(4)
+    affine[:3, :3] = turn @ np.diag([1.0, 1.5, 2.0])
+    image = tetopt.Image(np.zeros((4, 5, 6)), affine)
+    mesh = tetopt.lattice(image, blocks=(2, 2, 2))
+    low, high = box_faces(image, mesh)
+    sets = standard_sets(mesh, box_of(image)).facets
+    np.testing.assert_array_equal(nodes_of(mesh, sets["inferior"]), low)
+    np.testing.assert_array_equal(nodes_of(mesh, sets["superior"]), high)
 
 
 def test_box_without_voxels():

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -27,18 +28,19 @@ from tetopt.cli.options import (
     VolumeOption,
     YoungOption,
 )
-from tetopt.cli.solver import Wishes, built, checked_wishes, print_model, save_wished
+from tetopt.cli.solver import Wishes, all_sets, built, checked_wishes, print_model, save_wished
 from tetopt.content import continued
 from tetopt.io.files import checked_output, save_json
 from tetopt.io.formats import FORMATS, format_of
 from tetopt.io.images import sha256
 from tetopt.io.meshes import MeshFile
+from tetopt.io.vtk import box_text
 from tetopt.model.fields import cell_fields
 from tetopt.model.model import UNITS
 from tetopt.model.sets import box_of
 from tetopt.report.summary import model_summary, versions
 
-TEXTS = ("image", "image_sha256", "inputs", "options", "box")  # of a mesh's file that go on into the new one
+TEXTS = ("image", "image_sha256", "inputs", "options")  # of a mesh's file that go on into the new one
 
 
 def convert_command(
@@ -74,24 +76,34 @@ def convert_command(
         json_path = checked_output(json_path, (".json",), force)
     check_no_input(output, mesh_path, image_path, mask_path)
     wishes = Wishes(young, nu, bins, list(sets or []), list(loads or []), order, units, space)
-    if mask_path is not None and image_path is None:
-        raise InputError("--mask: there is no --image")
+    given = {"--mask": mask_path, "--volume": volume, "--crop": crop, "--slice": slice_}
+    if image_path is None and (lost := [name for name, value in given.items() if value is not None]):
+        raise InputError(f"{lost[0]}: there is no --image")
     loaded = read_mesh(mesh_path)
     checked_wishes(output, wishes, has_materials="young" in loaded.cell_data)
+    if not wishes.loads:
+        wishes = wishes._replace(loads=_loads_of(loaded))
     fields = _in_kPa(loaded)
-    about: dict[str, Any] = {name: str(loaded.field_data[name][0]) for name in TEXTS if name in loaded.field_data}
-    known: dict[str, Any] = {"box": loaded.box}
+    about: dict[str, Any] = {name: text for name in TEXTS if (text := loaded.text(name)) is not None}
+    box = loaded.box
     image: Image | None = None
     if image_path is not None:
         whole, beside = image_and_others(image_path, volume, crop, slice_)
+        if whole.ndim != loaded.mesh.ndim:
+            raise InputError(
+                f"{image_path}: expected a {loaded.mesh.ndim}-D image, as the mesh is, got a {whole.ndim}-D one"
+            )
         image = continued(whole, None if mask_path is None else beside(mask_path, aligned_mask))
-        warn_of_other_image(loaded, mesh_path, image_path)
+        if warn_of_other_image(loaded, mesh_path, image_path):
+            about = {}
         fields |= cell_fields(loaded.mesh, image)
-        known["box"] = box_of(whole)
+        box = box_of(whole) if box is None else box
         about |= {"image": image_path.name, "image_sha256": sha256(image_path)}
-    if image_path is None and (loaded.sets.facets or loaded.sets.cells):
-        known["known_sets"] = loaded.sets
-    model = built(loaded.mesh, image, wishes, fields, about, **known)
+    if box is not None:
+        about["box"] = box_text(box)
+    if format_of(output).is_surface:  # which holds no materials
+        fields = {name: values for name, values in fields.items() if name not in ("young", "nu")}
+    model = built(loaded.mesh, image, wishes, fields, about, all_sets(loaded.mesh, box, fields, loaded.sets))
     save_wished(output, model, wishes)
     if json_path is not None:
         files = {"mesh": mesh_path.name, "output": output.name, "units": units, "space": space}
@@ -100,10 +112,24 @@ def convert_command(
     return 0
 
 
+def _loads_of(loaded: MeshFile) -> list[str]:
+    """The loads that a file of ours holds, in the words of --load and in RAS+."""
+    turn = np.array([-1.0, -1.0, 1.0]) if loaded.space == "lps" else 1.0
+    try:
+        pairs = [
+            (str(name), np.array(vector, dtype=np.float64) * turn)
+            for name, vector in json.loads(loaded.text("loads") or "[]")
+        ]
+    except (ValueError, TypeError):  # another program's
+        return []
+    words = (f"move:{name}:{','.join(repr(float(x)) for x in vector)}" for name, vector in pairs)
+    return list(words)
+
+
 def _in_kPa(loaded: MeshFile) -> dict[str, Any]:
     """The file's cell data, moduli in kPa."""
     fields = dict(loaded.cell_data)
-    units = str(loaded.field_data["units"][0]) if "units" in loaded.field_data else "kPa"
+    units = loaded.text("units") or "kPa"
     if "young" in fields:
         if units not in UNITS:
             raise InputError(f'units of the mesh\'s moduli: expected {" or ".join(UNITS)}, found "{units}"')

@@ -103,14 +103,18 @@ def read_mesh(path: Path) -> MeshFile:
     loaded = load_mesh(path)
     if loaded.n_turned:
         show_warning(f"{path}: {loaded.n_turned} cells were inverted in the file and have been turned")
+    for note in loaded.notes:
+        log.print(escape(f"{path}: {note}"))
     return loaded
 
 
-def warn_of_other_image(loaded: MeshFile, mesh_path: Path, image_path: Path) -> None:
-    """A warning if the mesh's file names another image than this one as its source."""
-    made_from = loaded.field_data.get("image_sha256")
-    if made_from is not None and str(made_from[0]) != sha256(image_path):
+def warn_of_other_image(loaded: MeshFile, mesh_path: Path, image_path: Path) -> bool:
+    """A warning if the mesh's file names another image than this one as its source; whether it does."""
+    made_from = loaded.text("image_sha256")
+    is_other = made_from is not None and made_from != sha256(image_path)
+    if is_other:
         show_warning(f"{mesh_path} was made from another image than {image_path}")
+    return is_other
 
 
 def check_no_input(output: Path, *inputs: Path | None) -> None:

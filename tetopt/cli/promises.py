@@ -35,9 +35,10 @@ def check_promises(
         angles = dihedral_angles(result.mesh.points, result.mesh.cells).min(axis=1)
         below = int((angles < min_dihedral - 1e-6).sum())
     if below:
+        remedy = "" if start is not None else "more nodes, "
         log.print(
             f"[bold red]tetopt:[/] {below} of {len(angles)} cells have an angle under {min_dihedral:g} degrees, "
-            f"down to {angles.min():.2f}; allow more nodes, a lower --k-d, or a lower --min-dihedral"
+            f"down to {angles.min():.2f}; allow {remedy}a lower --k-d, or a lower --min-dihedral"
         )
     share = result.history[-1].E_D / (wanted.variance * wanted.volume or 1.0)
     is_above = target_error is not None and share > target_error

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple, cast, get_args
 
@@ -14,11 +14,11 @@ import tetopt
 from tetopt import Image, InputError, Mesh
 from tetopt.cli.console import log, out, print_wide
 from tetopt.fem.materials import parse_any_law
-from tetopt.io.formats import FORMATS, format_of, save_model
-from tetopt.model.build import NU, model_of
+from tetopt.io.formats import FORMATS, content_of, format_of, save_model
+from tetopt.model.build import labels_of, model_of
 from tetopt.model.materials import Spacing
 from tetopt.model.model import SPACES, UNITS, Model
-from tetopt.model.sets import nodes_of
+from tetopt.model.sets import Box, Sets, joined, nodes_of, parse_set, standard_sets
 from tetopt.report.tables import new_table
 
 MANY = 30_000  # materials: CalculiX takes three times as long with as many as there are cells (tests/benchmarks)
@@ -38,7 +38,10 @@ class Wishes(NamedTuple):
 
     def are_any(self) -> bool:
         """Whether more is asked than the mesh."""
-        return self != Wishes(None, None, None, [], [], 1, "kPa", "ras")
+        return self != NOTHING
+
+
+NOTHING = Wishes(None, None, None, [], [], 1, "kPa", "ras")
 
 
 def checked_wishes(output: Path, wishes: Wishes, has_materials: bool = False) -> None:
@@ -82,20 +85,49 @@ def parsed_bins(text: str | None) -> tuple[int | None, Spacing]:
 
 
 def built(
-    mesh: Mesh, image: Image | None, wishes: Wishes, cell_data: dict[str, NDArray], about: dict[str, Any], **known: Any
+    mesh: Mesh, image: Image | None, wishes: Wishes, cell_data: dict[str, NDArray], about: dict[str, Any], known: Sets
 ) -> Model:
-    """The model that the options ask for; `known` as of `tetopt.model.build.model_of`."""
+    """The model that the options ask for, of a mesh with the sets `known`."""
     young: Any = wishes.young
-    nu: Any = NU if wishes.nu is None else wishes.nu
+    nu: Any = wishes.nu
     if young is None and "young" in cell_data:  # painted before
         young = np.asarray(cell_data["young"], dtype=np.float64)
-        nu = np.asarray(cell_data.get("nu", np.full(len(young), NU))) if wishes.nu is None else nu
+        nu = np.asarray(cell_data["nu"], dtype=np.float64) if nu is None and "nu" in cell_data else nu
     fields = {name: values for name, values in cell_data.items() if name not in ("young", "nu", "material")}
     bins, spacing = parsed_bins(wishes.bins)
     return model_of(
         mesh, image, young=young, nu=nu, sets=wishes.sets, loads=wishes.loads, bins=bins, spacing=spacing,
-        order=wishes.order, cell_data=fields, about={"tetopt": tetopt.__version__, **about}, **known,
+        order=wishes.order, cell_data=fields, about={"tetopt": tetopt.__version__, **about}, known_sets=known,
     )  # fmt: skip
+
+
+def all_sets(mesh: Mesh, box: Box | None, fields: dict[str, NDArray], given: Sets, is_told: bool = True) -> Sets:
+    """The standard sets and those that came with the mesh; told is which of the latter had to be called otherwise."""
+    found, renamed = joined(standard_sets(mesh, box, labels_of(fields, len(mesh.cells))), given)
+    if is_told:
+        for old, new in renamed.items():
+            log.print(f'the mesh came with a set "{old}" of its own: it is {new} here')
+    return found
+
+
+def check_early(output: Path, wishes: Wishes, image: Image, build: Callable[[Wishes], Model]) -> None:
+    """InputError for what would be refused after the optimisation, as far as the initial mesh can tell.
+
+    `build` makes a model of that. Further sets may have members in the final mesh alone: of them, and of loads on them,
+    only the words are looked at.
+    """
+    asked = [parse_set(text, image.ndim) for text in wishes.sets]
+    for wish in asked:
+        if wish.kind == "below" and wish.vectors[0][0] <= image.data.min():
+            raise InputError(
+                f"set {wish.name}: no cell can have a mean below {wish.vectors[0][0]:g}, the image begins at "
+                f"{image.data.min():g}"
+            )
+    names = {name for wish in asked for name in wish.names()}
+    is_on_asked = any(name in load.split(":") for load in wishes.loads for name in names)
+    model = build(wishes._replace(sets=[], loads=[] if is_on_asked else wishes.loads))
+    if output.suffix.lower() != ".vtu":
+        content_of(output, model, space=wishes.space, units=wishes.units)
 
 
 def save_wished(output: Path, model: Model, wishes: Wishes) -> None:
@@ -103,6 +135,15 @@ def save_wished(output: Path, model: Model, wishes: Wishes) -> None:
     if model.materials is not None and len(model.materials.young) > MANY and output.suffix.lower() == ".inp":
         log.print(f"{len(model.materials.young)} materials, as many as cells have moduli; --bins 32 groups them")
     save_model(output, model, space=wishes.space, units=wishes.units)
+
+
+def save_anyway(output: Path, model: Model, error: InputError) -> InputError:
+    """Keep an optimised mesh whose model was refused, as VTU; the error to raise, which says where it is."""
+    kept = output.with_suffix(".vtu")
+    if kept.exists():
+        kept = output.with_name(f"{output.stem}_optimised.vtu")
+    save_model(kept, model)
+    return InputError(f"{error}; the optimised mesh is in {kept}, go on from there with tetopt convert")
 
 
 def print_model(output: Path, model: Model, wishes: Wishes) -> None:
@@ -124,7 +165,8 @@ def _lines(output: Path, model: Model, wishes: Wishes) -> Iterator[str]:
     if made is not None:
         young, nu = made.young, made.nu
         ratios = f"{nu.min():.4g}" if nu.min() == nu.max() else f"{nu.min():.4g} to {nu.max():.4g}"
-        yield f"{len(young)} materials, Young's modulus {young.min():.4g} to {young.max():.4g} kPa, nu {ratios}"
+        count = f"{len(young)} material{'s' * (len(young) > 1)}"
+        yield f"{count}, Young's modulus {young.min():.4g} to {young.max():.4g} kPa, nu {ratios}"
     if made is not None and made.binning is not None:
         yield f"bins: modulus off by {made.binning.mean:.2%} in the mean by volume, {made.binning.largest:.2%} at most"
     for load in model.loads:
@@ -132,7 +174,10 @@ def _lines(output: Path, model: Model, wishes: Wishes) -> Iterator[str]:
         yield f"load: {load.set_name} {'held' if not load.displacement.any() else f'moved by {where} mm'}"
     if model.loads and not format_of(output).runs:
         yield "the format has no place for loads: they are in its comments"
-    yield (
-        f"{output}: {format_of(output).what}, {wishes.space.upper()}+ mm, {wishes.units}, "
-        f"{len(model.mesh.points)} nodes, {len(model.mesh.cells)} cells"
-    )
+    low, high = model.mesh.points.min(axis=0), model.mesh.points.max(axis=0)
+    ranges = zip("xyz", low, high, strict=False)
+    yield "the mesh lies at " + ", ".join(f"{axis} {a:.6g} to {b:.6g}" for axis, a, b in ranges) + " mm (RAS)"
+    space = f"{wishes.space.upper()}+ mm" if model.mesh.ndim == 3 else "mm"
+    units = "" if format_of(output).is_surface else f", {wishes.units}"
+    size = f"{len(model.mesh.points)} nodes, {len(model.mesh.cells)} cells"
+    yield f"{output}: {format_of(output).what}, {space}{units}, {size}"

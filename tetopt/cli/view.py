@@ -8,16 +8,18 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
+from tetopt import InputError
 from tetopt.cli.console import out
 from tetopt.cli.inputs import check_no_input, image_and_others, read_mesh, warn_of_other_image
-from tetopt.cli.options import CropOption, ForceOption, MeshArgument, VolumeOption
+from tetopt.cli.options import CropOption, ForceOption, VolumeOption
 from tetopt.io.files import checked_output
+from tetopt.model.build import labels_of
 from tetopt.model.fields import cell_fields
-from tetopt.model.sets import facet_triples, standard_sets
+from tetopt.model.sets import facet_triples, joined, standard_sets
 
 
 def view_command(
-    mesh_path: MeshArgument,
+    mesh_path: Annotated[Path, typer.Argument(metavar="MESH", help="VTU, VTK or gmsh MSH file of tetrahedra.")],
     image_path: Annotated[
         Path | None, typer.Option("--image", metavar="IMAGE", help="Show its slice behind the mesh's section.")
     ] = None,
@@ -37,10 +39,12 @@ def view_command(
     image = None
     if image_path is not None:
         image = image_and_others(image_path, volume, crop, None)[0]
+        if image.ndim != mesh.ndim:
+            raise InputError(f"{image_path}: expected a {mesh.ndim}-D image, as the mesh is, got a {image.ndim}-D one")
         warn_of_other_image(loaded, mesh_path, image_path)
         if "mean" not in fields:
             fields = cell_fields(mesh, image) | fields
-    sets = loaded.sets.facets or standard_sets(mesh, loaded.box, fields.get("label")).facets
+    sets = joined(standard_sets(mesh, loaded.box, labels_of(fields, len(mesh.cells))), loaded.sets)[0].facets
     triples = {name: facet_triples(mesh.cells, rows) for name, rows in sets.items()}
     if html is None:
         from tetopt.report.window import show

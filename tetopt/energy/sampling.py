@@ -106,16 +106,23 @@ def cell_ranges(image: Image, mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[
     InputError
         As `cell_moments`.
     """
-    owner, h = cell_of_voxel(image, mesh).ravel(), image.data.ravel()
+    low, high = ranges_of(cell_of_voxel(image, mesh).ravel(), image.data.ravel(), len(mesh.cells))
+    is_empty = low > high
+    low[is_empty] = high[is_empty] = nearest_values(image, mesh.points[mesh.cells[is_empty]].mean(axis=1))
+    return low, high
+
+
+def ranges_of(
+    owner: NDArray[np.int64], h: NDArray[np.floating], n_cells: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Least and greatest of the values (K,) that each cell owns, inf and -inf where it owns none, (M,) float64."""
     # Runs of voxels of one cell first: `ufunc.at` on each voxel takes twice as long (MNI152 T1, 15,000 nodes).
     start = np.flatnonzero(np.concatenate([[True], owner[1:] != owner[:-1]]))
     inside = owner[start] >= 0
     cell = owner[start][inside]
-    low, high = np.full(len(mesh.cells), np.inf), np.full(len(mesh.cells), -np.inf)
+    low, high = np.full(n_cells, np.inf), np.full(n_cells, -np.inf)
     np.minimum.at(low, cell, np.minimum.reduceat(h, start)[inside])
     np.maximum.at(high, cell, np.maximum.reduceat(h, start)[inside])
-    is_empty = low > high
-    low[is_empty] = high[is_empty] = nearest_values(image, mesh.points[mesh.cells[is_empty]].mean(axis=1))
     return low, high
 
 

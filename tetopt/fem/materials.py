@@ -7,6 +7,7 @@ number wherever the law is curved and the cell is not uniform.
 
 from __future__ import annotations
 
+import contextlib
 import csv
 import tomllib
 from collections.abc import Callable, Sequence
@@ -16,7 +17,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tetopt.energy.sampling import cell_of_voxel, nearest_values
+from tetopt.energy.sampling import cell_of_voxel, nearest_values, ranges_of
 from tetopt.errors import InputError
 from tetopt.fem.formula import parse_formula
 from tetopt.image import Image
@@ -29,6 +30,7 @@ class ByLabel(NamedTuple):
     """A value for each label instead of a law of the intensity."""
 
     values: dict[int, float]
+    rest: float | None = None  # of all labels that are not named
 
 
 def law_values(law: Law, intensities: ArrayLike) -> NDArray[np.float64]:
@@ -112,7 +114,7 @@ def parse_table(text: str) -> list[tuple[float, float]]:
 
 
 def parse_labels(text: str) -> ByLabel:
-    """Values by label as written on a command line.
+    """Values by label as written on a command line, `*` for all others.
 
     Raises
     ------
@@ -121,20 +123,31 @@ def parse_labels(text: str) -> ByLabel:
 
     Examples
     --------
-    >>> parse_labels("1=2.1, 2=1.9").values
-    {1: 2.1, 2: 1.9}
+    >>> parse_labels("1=2.1, 2=1.9, *=0.5")
+    ByLabel(values={1: 2.1, 2: 1.9}, rest=0.5)
     """
+    pairs = [pair.partition("=") for pair in text.split(",")]
+    try:
+        return _by_label([(label, float(value)) for label, _, value in pairs])
+    except ValueError as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f'values by label: expected pairs such as "1=2.1,2=1.9,*=0.5", got "{text}"') from None
+
+
+def _by_label(pairs: list[tuple[str, float]]) -> ByLabel:
+    """Values by label from pairs; ValueError for a label that is no whole number, InputError for one named twice."""
     values: dict[int, float] = {}
-    for pair in text.split(","):
-        label, _, value = pair.partition("=")
-        try:
-            number, worth = int(label), float(value)
-        except ValueError:
-            raise InputError(f'law by label: expected pairs label=value, such as "1=2.1,2=1.9", got "{text}"') from None
-        if number in values:
-            raise InputError(f"law by label: label {number} has two values; give each once")
-        values[number] = worth
-    return ByLabel(values)
+    rest: float | None = None
+    for label, value in pairs:
+        is_rest = label.strip() == "*"
+        if (rest is not None) if is_rest else (int(label) in values):
+            raise InputError(f"values by label: label {label.strip()} has two values; give each once")
+        if is_rest:
+            rest = value
+        else:
+            values[int(label)] = value
+    return ByLabel(values, rest)
 
 
 def parse_law(text: str) -> Law:
@@ -148,17 +161,17 @@ def parse_law(text: str) -> Law:
     law = parse_any_law(text)
     if isinstance(law, ByLabel):
         raise InputError(f'law: expected one of the intensity, got values by label, "{text}"')
-    return law
+    return parse_formula(text) if isinstance(law, float) else law
 
 
-def parse_any_law(text: str, quantity: str = "young") -> Law | ByLabel:
+def parse_any_law(text: str, quantity: str = "young") -> Law | ByLabel | float:
     """A law from a command line.
 
     Parameters
     ----------
     text : str
-        A table of intensities, "0:1,100:5.5"; values by label, "1=2.1,2=1.9"; a formula of h (`parse_formula`), of
-        which a number is one; or a file named .toml or .csv (`load_law`).
+        A number; a table of intensities, "0:1,100:5.5"; values by label, "1=2.1,2=1.9,*=0.5"; a formula of h
+        (`parse_formula`); or a file named .toml or .csv (`load_law`).
     quantity : str
         The file's column.
 
@@ -171,13 +184,17 @@ def parse_any_law(text: str, quantity: str = "young") -> Law | ByLabel:
         return load_law(Path(text), quantity)
     if "=" in text:
         return parse_labels(text)
+    with contextlib.suppress(ValueError):
+        if np.isfinite(value := float(text)):
+            return value
     return _checked_pairs(parse_table(text)) if ":" in text else parse_formula(text)
 
 
 def load_law(path: Path, quantity: str = "young") -> Law | ByLabel:
     """A law from a file: two columns, or more, as lists in TOML or under names in the first row of CSV.
 
-    One column is "intensity", or "label", and one the quantity, such as "young" (kPa) or "nu".
+    One column is "intensity", or "label" ("*" for all that are not named), and one the quantity, such as "young" (kPa)
+    or "nu".
 
     Raises
     ------
@@ -185,10 +202,8 @@ def load_law(path: Path, quantity: str = "young") -> Law | ByLabel:
         No such file, another format, columns that are missing, of different length or not of numbers, or
         intensities that do not increase.
     """
-    if not path.is_file():
-        raise InputError(f"{path}: no such file of a law")
     try:
-        columns = _toml_columns(path) if path.suffix.lower() == ".toml" else _csv_columns(path)
+        columns = _columns(path)
         keys = [name for name in ("intensity", "label") if name in columns]
         if len(keys) != 1 or quantity not in columns:
             raise InputError(
@@ -198,16 +213,36 @@ def load_law(path: Path, quantity: str = "young") -> Law | ByLabel:
         if len(columns[keys[0]]) != len(columns[quantity]):
             counts = f"{len(columns[keys[0]])} of {keys[0]} and {len(columns[quantity])} of {quantity}"
             raise InputError(f"{path}: {counts}; give one for each")
-        pairs = list(zip(map(float, columns[keys[0]]), map(float, columns[quantity]), strict=True))
-    except InputError:
-        raise
-    except (ValueError, TypeError, csv.Error) as error:
+        values = [float(value) for value in columns[quantity]]
+        if keys == ["label"]:
+            return _by_label([(str(label), value) for label, value in zip(columns["label"], values, strict=True)])
+        return _checked_pairs([(float(h), value) for h, value in zip(columns["intensity"], values, strict=True)])
+    except InputError as error:
+        raise error if str(error).startswith(str(path)) else InputError(f"{path}: {error}") from error
+    except (ValueError, TypeError, csv.Error, RecursionError) as error:
         raise InputError(f"{path}: expected columns of numbers ({' '.join(str(error).split())})") from error
-    if keys == ["intensity"]:
-        return _checked_pairs(pairs)
-    if any(label != int(label) for label, _ in pairs) or len({label for label, _ in pairs}) != len(pairs):
-        raise InputError(f"{path}: labels must be whole numbers, each once, got {[label for label, _ in pairs]}")
-    return ByLabel({int(label): value for label, value in pairs})
+
+
+def has_column(text: str, name: str) -> bool:
+    """Whether a law's text names a file that has such a column.
+
+    Raises
+    ------
+    InputError
+        As `load_law`, of files.
+    """
+    if not text.lower().endswith((".toml", ".csv")):
+        return False
+    try:
+        return name in _columns(Path(text))
+    except (ValueError, RecursionError):  # said when the file is read for what it must have
+        return False
+
+
+def _columns(path: Path) -> dict[str, list[Any]]:
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; a law's text that ends in .toml or .csv names one")
+    return _toml_columns(path) if path.suffix.lower() == ".toml" else _csv_columns(path)
 
 
 def _toml_columns(path: Path) -> dict[str, list[Any]]:
@@ -221,7 +256,9 @@ def _csv_columns(path: Path) -> dict[str, list[Any]]:
     rows = [row for row in csv.reader(path.read_text(encoding="utf-8-sig").splitlines()) if row]
     if not rows or any(len(row) != len(rows[0]) for row in rows):
         raise InputError(f"{path}: expected a row of names and then rows of as many numbers")
-    names = [name.strip() for name in rows[0]]
+    names = [name.strip().lower() for name in rows[0]]
+    if len(set(names)) != len(names):
+        raise InputError(f"{path}: expected each column once, found {', '.join(names)}")
     return {name: [row[number] for row in rows[1:]] for number, name in enumerate(names)}
 
 
@@ -280,6 +317,9 @@ def _cell_means(field: Image, mesh: Mesh) -> NDArray[np.float64]:
     total = np.bincount(owner[inside], weights=field.data.ravel()[inside], minlength=len(mesh.cells))
     is_empty = n_voxels == 0
     means = total / np.maximum(n_voxels, 1)
+    # So that a cell of equal values has exactly that value: constants stay one material.
+    low, high = ranges_of(owner, field.data.ravel(), len(mesh.cells))
+    means = np.clip(means, low, high, where=~is_empty, out=means)
     means[is_empty] = nearest_values(field, mesh.points[mesh.cells[is_empty]].mean(axis=1))
     return means
 

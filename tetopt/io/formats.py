@@ -82,10 +82,21 @@ def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str
         An unknown suffix, or what the format cannot carry.
     """
     path = Path(path)
+    content = content_of(path, model, space=space, units=units)
+    with written_whole(path) as temporary:
+        temporary.write_bytes(content)
+
+
+def content_of(path: Path, model: Model, *, space: str = "ras", units: str = "kPa") -> bytes:
+    """What `save_model` writes.
+
+    Raises
+    ------
+    InputError
+        As `save_model`.
+    """
     found = format_of(path)
     if model.order != 1 and not found.has_quadratic:
         able = ", ".join(name for name, other in FORMATS.items() if other.has_quadratic)
         raise InputError(f"{path}: only {able} take quadratic cells; leave out --order 2")
-    content = found.write(in_units(in_space(model, space), units))
-    with written_whole(path) as temporary:
-        temporary.write_bytes(content)
+    return found.write(in_units(in_space(model, space), units))

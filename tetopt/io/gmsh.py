@@ -18,11 +18,13 @@ they are held by, since meshio takes no view that leaves elements out. Data of s
 
 More than 1000 materials are no groups, only views; in 2.2 they are refused.
 
-The $Comments also tell coordinates, units, each material's constants, and the loads, which MSH has no place for.
+The $Comments also tell coordinates, units, each material's constants, and the loads, which MSH has no place for. Our
+own reader goes by them, see `told`.
 """
 
 from __future__ import annotations
 
+import re
 from itertools import pairwise
 from typing import NamedTuple
 
@@ -60,6 +62,36 @@ class Part(NamedTuple):
     groups_of: list[list[int]]  # the physical groups of each entity, ascending
     names: list[str]  # of the groups, from 1
     sets: dict[str, list[int]]  # the entities that make up each set
+
+
+class Told(NamedTuple):
+    """What the comments of a file of ours tell."""
+
+    space: str
+    texts: dict[str, str]  # "units", "image", "image_sha256", as far as known
+    constants: dict[str, tuple[float, float]]  # young and nu of each material that is a group
+    entities: dict[str, list[int]]  # those that make up each of these materials and each cell set
+
+
+def told(comments: list[str]) -> Told | None:
+    """What `gmsh41` and `gmsh22` wrote into the comments; None if others wrote them."""
+    coordinates = [line for line in comments if line.startswith("coordinates: ")]
+    if not coordinates or not comments[0].startswith("tetopt"):
+        return None
+    texts: dict[str, str] = {}
+    constants: dict[str, tuple[float, float]] = {}
+    entities: dict[str, list[int]] = {}
+    for line in comments:
+        if found := re.fullmatch(r"units: mm, (\w+), .*", line):
+            texts["units"] = found[1]
+        elif found := re.fullmatch(r"image: (.*), sha256 (\w+)", line):
+            texts |= {"image": found[1]} | ({} if found[2] == "unknown" else {"image_sha256": found[2]})
+        elif found := re.fullmatch(r"(material_\d+): young (\S+) \w+, nu (\S+)", line):
+            constants[found[1]] = float(found[2]), float(found[3])
+        elif found := re.fullmatch(r"entity of cells (\d+): (.*)", line):
+            for name in found[2].split():
+                entities.setdefault(name, []).append(int(found[1]))
+    return Told("lps" if coordinates[0].startswith("coordinates: LPS") else "ras", texts, constants, entities)
 
 
 def gmsh41(model: Model) -> bytes:

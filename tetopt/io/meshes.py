@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import contextlib
 import logging
+import re
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -17,13 +19,15 @@ from numpy.typing import NDArray
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import oriented
 from tetopt.io.files import written_whole
-from tetopt.io.vtk import add_texts, box_in, sets_in, to_pyvista, vtu_bytes
+from tetopt.io.gmsh import Told, told
+from tetopt.io.vtk import add_texts, box_in, sets_in, text_in, to_pyvista, vtu_bytes
 from tetopt.mesh import Mesh
 from tetopt.model.sets import NAME, Box, Sets, rows_of
 
-SUFFIXES = (".vtu", ".vtk", ".msh")
+SUFFIXES = (".vtu", ".vtk", ".msh", ".msh2")
 # Cells that a mesh is made of, or that may lie on it.
 DIMENSIONS = {"vertex": 0, "poly_vertex": 0, "line": 1, "poly_line": 1, "triangle": 2, "tetra": 3}
+UNNAMED = {1: "edge", 2: "surface", 3: "volume"}  # what gmsh's groups without a name are called, with their number
 
 
 class MeshFile(NamedTuple):
@@ -37,6 +41,20 @@ class MeshFile(NamedTuple):
     sets: Sets = Sets({}, {})
     box: Box | None = None  # of the image that the mesh was made from
     space: str = "ras"  # of the file: from "lps" the mesh has been turned to RAS+
+    notes: tuple[str, ...] = ()  # what was left out or renamed, a line each
+
+    def text(self, name: str) -> str | None:
+        """A text among the field data, if it is there."""
+        values = self.field_data.get(name, np.empty(0)).ravel()
+        return str(values[0]) if len(values) else None
+
+
+class _Group(NamedTuple):
+    """Cells of one kind that gmsh's file calls by a name."""
+
+    label: str  # in the file
+    kind: str
+    members: NDArray[np.int64]  # ascending
 
 
 class _Raw(NamedTuple):
@@ -46,7 +64,7 @@ class _Raw(NamedTuple):
     cells: dict[str, NDArray[np.int64]]
     cell_data: dict[str, dict[str, NDArray]]  # by name, then kind
     field_data: dict[str, NDArray]
-    groups: dict[str, tuple[str, NDArray[np.int64]]]  # named cells: their kind, which ones
+    groups: list[_Group]
     space: str
 
 
@@ -77,7 +95,11 @@ def load_mesh(path: str | Path) -> MeshFile:
     Cells oriented the other way are turned and counted; cells of lower dimension are left out and counted, and so are
     nodes that no cell uses. Without tetrahedra, a file of triangles is 2-D and must lie in the plane z = 0. Coordinates
     are taken for RAS+ unless the file says LPS, as those of `tetopt convert --space lps` and of 3D Slicer do; these are
-    turned. Physical groups of gmsh's become sets.
+    turned. Cell data other than numbers are left out.
+
+    The sets of a VTU or VTK file of ours are taken if its cells are still those that they were written for. gmsh's
+    physical groups (files named .msh or .msh2) become sets, with names that every format can carry; in files of ours
+    the cell sets are those that were written.
 
     Raises
     ------
@@ -89,7 +111,7 @@ def load_mesh(path: str | Path) -> MeshFile:
         raise InputError(f"{path}: no such mesh file")
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{path}: expected a mesh named {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")
-    raw = _read_msh(path) if path.suffix.lower() == ".msh" else _read_vtk(path)
+    raw = _read_msh(path) if path.suffix.lower() in (".msh", ".msh2") else _read_vtk(path)
     kind = _kind_of_cells(path, raw)
     n = DIMENSIONS[kind]
     cells, points = raw.cells[kind], raw.points
@@ -110,15 +132,18 @@ def load_mesh(path: str | Path) -> MeshFile:
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
     is_turned = (turned != cells).any(axis=1)
+    cell_data, notes = _cell_data(raw, kind)
+    sets, of_sets = _sets_of_groups(raw, mesh, kind, used) if raw.groups else sets_in(raw.field_data, mesh)
     return MeshFile(
         mesh,
-        {name: values[kind] for name, values in raw.cell_data.items() if kind in values},
+        cell_data,
         raw.field_data,
         int(is_turned.sum()),
         sum(len(others) for name, others in raw.cells.items() if name != kind),
-        _sets(raw, mesh, kind, used, bool(is_turned.any())),
-        box_in(raw.field_data),
+        sets,
+        box_in(raw.field_data, n),
         raw.space,
+        notes + of_sets,
     )
 
 
@@ -133,26 +158,52 @@ def _kind_of_cells(path: Path, raw: _Raw) -> str:
     return kind
 
 
-def _sets(raw: _Raw, mesh: Mesh, kind: str, used: NDArray[np.int64], is_any_turned: bool) -> Sets:
-    """The sets of a file of ours, or gmsh's named groups of cells and of facets."""
-    own = sets_in(raw.field_data)
-    if own.facets or own.cells:
-        if is_any_turned:  # then the file has been changed, and a row's local node may be another
-            return Sets({}, own.cells)
-        return own
+def _cell_data(raw: _Raw, kind: str) -> tuple[dict[str, NDArray], tuple[str, ...]]:
+    """What is on the cells of this kind, and a note on what is no numbers."""
+    values_of = {name: values[kind] for name, values in raw.cell_data.items() if kind in values}
+    found = {name: values for name, values in values_of.items() if values.dtype.kind in "biuf"}
+    others = ", ".join(name for name in values_of if name not in found)
+    return found, (f"cell data left out, as they are no numbers: {others}",) if others else ()
+
+
+def _sets_of_groups(raw: _Raw, mesh: Mesh, kind: str, used: NDArray[np.int64]) -> tuple[Sets, tuple[str, ...]]:
+    """gmsh's groups of cells and of facets, and notes on those whose names had to change."""
     place = np.full(len(raw.points), -1)
     place[used] = np.arange(len(used))
-    sets = Sets({}, {})
-    for name, (group_kind, members) in raw.groups.items():
-        if not NAME.fullmatch(name):
-            continue
-        if group_kind == kind:
-            sets.cells[name] = np.sort(members)
-        elif DIMENSIONS[group_kind] == DIMENSIONS[kind] - 1:
-            rows = rows_of(mesh, place[raw.cells[group_kind][members]])
-            if len(rows):
-                sets.facets[name] = rows
-    return sets
+    sets, notes = Sets({}, {}), []
+    taken: set[str] = set()
+    n = DIMENSIONS[kind]
+    groups = [group for group in raw.groups if n - 1 <= DIMENSIONS[group.kind] <= n]
+    if "young" in raw.cell_data:  # which tells materials better than their groups do, with which they would be written
+        groups = [group for group in groups if re.fullmatch(r"material_\d+", group.label) is None]
+    for group in sorted(groups, key=lambda group: NAME.fullmatch(group.label) is None):  # who can keep his name does
+        name = _free_name(group.label, taken)
+        if group.kind == kind:
+            sets.cells[name] = group.members
+        else:
+            rows = rows_of(mesh, place[raw.cells[group.kind][group.members]])
+            if len(rows) == 0:
+                notes.append(f'"{group.label}" is left out: none of it is a facet of a cell')
+                continue
+            sets.facets[name] = rows
+        taken.add(name.lower())
+        if name != group.label:
+            notes.append(f'"{group.label}" is the set {name} here')
+    return sets, tuple(notes)
+
+
+def _free_name(label: str, taken: set[str]) -> str:
+    """A name like `label` that every format can carry and that differs from those taken by more than case."""
+    name = re.sub(r"[^A-Za-z0-9_-]", "_", label)
+    stem = (name if name[0].isalpha() else f"set_{name}")[:40]
+    name, number = stem, 1
+    while name.lower() in taken:
+        number += 1
+        name = f"{stem[: 39 - len(str(number))]}_{number}"
+    return name
+
+
+# gmsh's files
 
 
 def _read_msh(path: Path) -> _Raw:
@@ -161,8 +212,13 @@ def _read_msh(path: Path) -> _Raw:
         with warnings.catch_warnings(), contextlib.redirect_stdout(None), contextlib.redirect_stderr(None):
             warnings.simplefilter("ignore")
             found = meshio.gmsh.read(path)
+        return _msh(found, path.read_bytes())
     except Exception as error:  # meshio raises whatever it stumbles over
         raise InputError(f"{path}: cannot be read as a gmsh mesh ({type(error).__name__})") from error
+
+
+def _msh(found: meshio.Mesh, content: bytes) -> _Raw:
+    """A file as meshio has read it, with its groups, of which meshio loses some."""
     kinds = list(dict.fromkeys(block.type for block in found.cells))
     of_kind = {kind: [k for k, block in enumerate(found.cells) if block.type == kind] for kind in kinds}
     cells = {
@@ -172,26 +228,119 @@ def _read_msh(path: Path) -> _Raw:
         name: {kind: np.concatenate([values[k] for k in blocks]) for kind, blocks in of_kind.items()}
         for name, values in found.cell_data.items()
     }
-    groups: dict[str, tuple[str, NDArray[np.int64]]] = {}
-    for name, (tag, dimension) in found.field_data.items():
-        for kind, blocks in of_kind.items():
-            if DIMENSIONS.get(kind) == dimension:
-                chosen = np.concatenate([_in_group(found, name, int(tag), k) for k in blocks])
-                groups[name] = kind, np.flatnonzero(chosen)
     points = np.zeros((len(found.points), 3))
     points[:, : found.points.shape[1]] = found.points
-    return _Raw(points, cells, cell_data, {}, groups, "ras")
+    groups = _groups(cells, cell_data, _physical_names(content), _groups_of_entities(content))
+    raw = _Raw(points, cells, cell_data, {}, groups, "ras")
+    comments = told(_section(content, "Comments").decode("utf-8", "replace").splitlines())
+    return raw if comments is None else _of_ours(raw, comments)
 
 
-def _in_group(found: meshio.Mesh, name: str, tag: int, block: int) -> NDArray[np.bool_]:
-    """Which cells of a block belong to a physical group."""
-    is_in = np.zeros(len(found.cells[block].data), dtype=bool)
-    members = found.cell_sets.get(name)
-    if members is not None and members[block] is not None:  # version 4, where a cell may be in several
-        is_in[np.asarray(members[block], dtype=np.int64)] = True
-    elif "gmsh:physical" in found.cell_data:
-        is_in = np.asarray(found.cell_data["gmsh:physical"][block]) == tag
-    return is_in
+def _of_ours(raw: _Raw, comments: Told) -> _Raw:
+    """A file of ours with what its comments tell: cell sets and materials are no longer groups and views."""
+    kind = max(raw.cells, key=lambda name: DIMENSIONS.get(name, -1))
+    entity = _by_value(raw.cell_data["gmsh:geometrical"][kind])
+    found = {  # gmsh keeps our comments and entities when it writes a file again, if not all of their cells
+        name: [entity[number] for number in numbers if number in entity] for name, numbers in comments.entities.items()
+    }
+    members = {name: np.sort(np.concatenate(parts)) for name, parts in found.items() if parts}
+    constants = np.full((2, len(raw.cells[kind])), np.nan)
+    for name in comments.constants.keys() & members.keys():
+        constants[:, members[name]] = np.array(comments.constants[name])[:, None]
+    is_painted = bool(comments.constants) and np.isfinite(constants).all()
+    painted = {"young": {kind: constants[0]}, "nu": {kind: constants[1]}} if is_painted else {}
+    sets = [_Group(name, kind, of_set) for name, of_set in members.items()]
+    dropped = {*members, "gmsh:physical", "gmsh:geometrical"}
+    return raw._replace(
+        cell_data={name: values for name, values in (painted | raw.cell_data).items() if name not in dropped},
+        field_data={name: np.array([text]) for name, text in comments.texts.items()},
+        groups=[group for group in raw.groups if group.kind != kind] + sets,
+        space=comments.space,
+    )
+
+
+def _groups(
+    cells: dict[str, NDArray[np.int64]],
+    cell_data: dict[str, dict[str, NDArray]],
+    names: dict[tuple[int, int], str],
+    groups_of: dict[tuple[int, int], list[int]] | None,
+) -> list[_Group]:
+    """Physical groups with members, named or not."""
+    tags = cell_data.get("gmsh:physical" if groups_of is None else "gmsh:geometrical", {})
+    groups = []
+    for kind, dim in DIMENSIONS.items():
+        if dim not in UNNAMED or len(tags.get(kind, ())) != len(cells.get(kind, ())):
+            continue
+        parts: dict[int, list[NDArray[np.int64]]] = {}
+        for value, members in _by_value(tags.get(kind, np.empty(0))).items():
+            for group in [value] if groups_of is None else groups_of.get((dim, value), []):
+                parts.setdefault(abs(group), []).append(members)  # a sign tells orientation
+        parts.pop(0, None)  # which stands for no group
+        for tag, found in sorted(parts.items()):
+            label = names.get((dim, tag)) or f"{UNNAMED[dim]}_{tag}"
+            groups.append(_Group(label, kind, np.sort(np.concatenate(found))))
+    return groups
+
+
+def _by_value(tags: NDArray) -> dict[int, NDArray[np.int64]]:
+    """Where each value stands, ascending."""
+    order = np.argsort(tags, kind="stable")
+    values, starts = np.unique(tags[order], return_index=True)
+    return dict(zip(values.tolist(), np.split(order, starts[1:]), strict=False))  # split makes one part of nothing
+
+
+def _section(content: bytes, name: str) -> bytes:
+    """What stands between $NAME and $EndNAME, first of all."""
+    start = content.find(f"${name}".encode())
+    return b"" if start < 0 else content[content.index(b"\n", start) + 1 : content.find(f"$End{name}".encode(), start)]
+
+
+def _physical_names(content: bytes) -> dict[tuple[int, int], str]:
+    """The names of physical groups by dimension and number: a name may be that of several."""
+    lines = _section(content, "PhysicalNames").decode("utf-8", "replace").splitlines()
+    found = [re.fullmatch(r'\s*(\d+)\s+(-?\d+)\s+"?(.*?)"?\s*', line) for line in lines]
+    return {(int(line[1]), abs(int(line[2]))): line[3] for line in found if line is not None}
+
+
+def _groups_of_entities(content: bytes) -> dict[tuple[int, int], list[int]] | None:
+    """The physical groups of each entity, by dimension and number, of a file from version 4.1 on."""
+    version, is_binary, size = _section(content, "MeshFormat").split(maxsplit=3)[:3]
+    if not version.startswith(b"4") or version == b"4.0":
+        return None
+    section = _section(content, "Entities")
+    take = _numbers(section) if is_binary == b"1" else _words(section)
+    n_bytes = f"<u{int(size)}"
+    groups_of = {}
+    for dim, count in enumerate(take(n_bytes, 4) if section else []):
+        for _ in range(count):
+            (tag,) = take("<i4", 1)
+            take("<f8", 3 if dim == 0 else 6)  # a point, or a box
+            groups_of[dim, tag] = take("<i4", take(n_bytes, 1)[0])
+            if dim > 0:
+                take("<i4", take(n_bytes, 1)[0])  # the entities around it
+    return groups_of
+
+
+def _numbers(section: bytes) -> Callable[[str, int], list[int]]:
+    """A function that reads on: so many numbers of this dtype."""
+    at = 0
+
+    def take(dtype: str, count: int) -> list[int]:
+        nonlocal at
+        values = np.frombuffer(section, dtype, count, at)
+        at += values.nbytes
+        return values.tolist()
+
+    return take
+
+
+def _words(section: bytes) -> Callable[[str, int], list[int]]:
+    """As `_numbers`, of a text."""
+    words = iter(section.split())
+    return lambda dtype, count: [int(float(word)) for word in islice(words, count)]
+
+
+# VTK's files
 
 
 def _read_vtk(path: Path) -> _Raw:
@@ -206,12 +355,12 @@ def _read_vtk(path: Path) -> _Raw:
         for name in grid.cell_data
     }
     field_data = {name: _decoded(np.asarray(grid.field_data[name])) for name in grid.field_data}
-    return _Raw(np.asarray(grid.points, dtype=np.float64), cells, cell_data, field_data, {}, _space(path, field_data))
+    return _Raw(np.asarray(grid.points, dtype=np.float64), cells, cell_data, field_data, [], _space(path, field_data))
 
 
 def _space(path: Path, field_data: dict[str, NDArray]) -> str:
     """Whether a file says that its coordinates are LPS: in our words, or in 3D Slicer's."""
-    words = " ".join(str(field_data[name].ravel()[0]) for name in ("space", "SPACE") if name in field_data)
+    words = " ".join(text_in(field_data, name) or "" for name in ("space", "SPACE"))
     if path.suffix.lower() == ".vtk":
         with path.open("rb") as file:
             words += (

@@ -5,7 +5,8 @@ Points in world mm, cells positively oriented, of one type. What is on each cell
 string arrays, and pyvista writes only ASCII into them.
 
 A facet set is field data "facets:NAME", rows (cell, local node opposite), and its nodes are point data "on_NAME", 1 or
-0, to be seen in ParaView; a cell set is field data "cells:NAME", cell numbers from 0.
+0, to be seen in ParaView; a cell set is field data "cells:NAME", cell numbers from 0. Other programs keep field data
+when they change the cells: "cells_sha256" beside them tells the cells that the sets were written for.
 
 3D Slicer (`vtkMRMLModelStorageNode`) takes coordinates for LPS unless the head of a .vtk file says "SPACE=RAS", as ours
 does, or a .vtu file has a string array SPACE, which ours cannot have: take .vtk there, or LPS.
@@ -13,6 +14,7 @@ does, or a .vtu file has a string array SPACE, which ours cannot have: take .vtk
 
 from __future__ import annotations
 
+import hashlib
 import json
 from typing import Any
 
@@ -22,12 +24,13 @@ from numpy.typing import NDArray
 from vtkmodules.vtkIOLegacy import vtkUnstructuredGridWriter
 from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
 
+from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.model.model import Model
-from tetopt.model.sets import Box, Sets, nodes_of
+from tetopt.model.sets import NAME, Box, Sets, nodes_of
 
 CELL_TYPES = {2: pyvista.CellType.TRIANGLE, 3: pyvista.CellType.TETRA}
-FACETS, CELLS, ON = "facets:", "cells:", "on_"
+FACETS, CELLS, ON, CHECKSUM = "facets:", "cells:", "on_", "cells_sha256"
 LEGACY = 42  # version 4.2: 5.1 is not read by older programs, 3D Slicer among them
 
 
@@ -49,14 +52,27 @@ def vtu(model: Model) -> bytes:
 def vtk(model: Model) -> bytes:
     """A legacy VTK file, binary, since VTK rounds ASCII to eleven digits."""
     grid = model_grid(model)
-    for name in grid.field_data:
-        if np.asarray(grid.field_data[name]).dtype == np.int64:  # else "long", which is not the same everywhere
-            grid.field_data[name] = np.asarray(grid.field_data[name]).astype(np.int32)
+    for data in (grid.point_data, grid.cell_data, grid.field_data):
+        for name in data:
+            data[name] = _without_int64(np.asarray(data[name]))
     writer = vtkUnstructuredGridWriter()
     writer.SetHeader(f"tetopt, mm, SPACE={model.space.upper()}")
     writer.SetFileVersion(LEGACY)
     writer.SetFileTypeToBinary()
     return _written(writer, grid)
+
+
+def _without_int64(values: NDArray) -> NDArray:
+    """Integers of 64 bits as ones of 32, or as floats if they do not fit.
+
+    VTK writes them as "long", which is not the same everywhere, or, when they are a "long long" (as those that it has
+    read from a VTU file are), as "vtktypeint64", which meshio does not know.
+    """
+    if values.dtype.kind not in "iu" or values.dtype.itemsize < 8:
+        return values
+    range_ = np.iinfo(np.int32)
+    fits = values.size == 0 or (values.min() >= range_.min and values.max() <= range_.max)
+    return values.astype(np.int32 if fits else np.float64)
 
 
 def vtu_bytes(grid: pyvista.UnstructuredGrid) -> bytes:
@@ -95,7 +111,7 @@ def model_grid(model: Model) -> pyvista.UnstructuredGrid:
     if model.loads:
         texts["loads"] = [[load.set_name, load.displacement.tolist()] for load in model.loads]
     add_texts(grid, texts)
-    add_sets(grid, model.sets)
+    add_sets(grid, model.mesh, model.sets)
     return grid
 
 
@@ -106,36 +122,69 @@ def add_texts(grid: pyvista.UnstructuredGrid, texts: dict[str, Any]) -> None:
         grid.field_data[name] = np.frombuffer(text.encode(), dtype=np.uint8)
 
 
-def add_sets(grid: pyvista.UnstructuredGrid, sets: Sets) -> None:
-    """The sets as field data."""
+def add_sets(grid: pyvista.UnstructuredGrid, mesh: Mesh, sets: Sets) -> None:
+    """The sets as field data, with the checksum of the cells that they are of."""
     for name, rows in sets.facets.items():
         grid.field_data[f"{FACETS}{name}"] = rows
     for name, members in sets.cells.items():
         grid.field_data[f"{CELLS}{name}"] = members
+    if sets.facets or sets.cells:
+        add_texts(grid, {CHECKSUM: _checksum(mesh)})
 
 
-def sets_in(field_data: dict[str, NDArray]) -> Sets:
-    """The sets among a file's field data."""
-    return Sets(
-        {
-            name.removeprefix(FACETS): values.reshape(-1, 2).astype(np.int64)
-            for name, values in field_data.items()
-            if name.startswith(FACETS)
-        },
-        {
-            name.removeprefix(CELLS): values.ravel().astype(np.int64)
-            for name, values in field_data.items()
-            if name.startswith(CELLS)
-        },
-    )
+def sets_in(field_data: dict[str, NDArray], mesh: Mesh) -> tuple[Sets, tuple[str, ...]]:
+    """The sets among a file's field data, if they were written for these cells; and what is left out, in words."""
+    names = [name for name in field_data if name.startswith((FACETS, CELLS))]
+    sets = Sets({}, {})
+    if not names:
+        return sets, ()
+    if text_in(field_data, CHECKSUM) != _checksum(mesh):
+        words = "sets left out, as the file does not tell that its cells are still those that they were written for"
+        return sets, (f"{words}: {', '.join(name.partition(':')[2] for name in names)}",)
+    unfit = []
+    for key in names:
+        prefix, name = key[: key.index(":") + 1], key.partition(":")[2]
+        ends = (len(mesh.cells), mesh.ndim + 1) if prefix == FACETS else (len(mesh.cells),)
+        is_free = name.lower() not in {each.lower() for part in sets for each in part}
+        if not NAME.fullmatch(name) or not is_free or not _is_set(field_data[key], ends):
+            unfit.append(name)
+        elif prefix == FACETS:
+            sets.facets[name] = field_data[key].reshape(-1, 2).astype(np.int64)
+        else:
+            sets.cells[name] = field_data[key].ravel().astype(np.int64)
+    words = "sets left out, as they are no ascending cells or facets, or have no name of their own"
+    return sets, (f"{words}: {', '.join(unfit)}",) if unfit else ()
 
 
-def box_in(field_data: dict[str, NDArray]) -> Box | None:
-    """The box of the image that a mesh was made from, if its file tells."""
-    if "box" not in field_data:
+def _is_set(values: NDArray, ends: tuple[int, ...]) -> bool:
+    """Whether these are rows of integers from 0 up to `ends`, ascending."""
+    try:
+        numbers = np.ravel_multi_index(tuple(values.reshape(-1, len(ends)).T), ends)
+    except (TypeError, ValueError):
+        return False
+    return bool((np.diff(numbers) > 0).all())
+
+
+def _checksum(mesh: Mesh) -> str:
+    return hashlib.sha256(np.ascontiguousarray(mesh.cells, dtype="<i8").tobytes()).hexdigest()
+
+
+def text_in(field_data: dict[str, NDArray], name: str) -> str | None:
+    """A text among a file's field data."""
+    values = field_data.get(name, np.empty(0))
+    return str(values.ravel()[0]) if values.dtype.kind == "U" and values.size else None
+
+
+def box_in(field_data: dict[str, NDArray], ndim: int) -> Box | None:
+    """The box of the image that a mesh of so many dimensions was made from, if its file tells."""
+    try:
+        box = json.loads(text_in(field_data, "box") or "")
+        shape = tuple(box["shape"])
+        affine = Image(np.zeros((1,) * ndim), np.array(box["affine"], dtype=np.float64)).affine  # which checks it
+    except (TypeError, ValueError, KeyError, OverflowError, RecursionError):  # another program's "box"
         return None
-    box = json.loads(str(field_data["box"][0]))
-    return Box(tuple(box["shape"]), np.array(box["affine"]))
+    is_shape = len(shape) == ndim and all(type(size) is int and size > 0 for size in shape)
+    return Box(shape, affine) if is_shape else None
 
 
 def box_text(box: Box) -> dict[str, Any]:

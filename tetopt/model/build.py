@@ -9,7 +9,16 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tetopt.errors import InputError
-from tetopt.fem.materials import ByLabel, Law, cell_values, cell_young, law_values, parse_any_law, young_from
+from tetopt.fem.materials import (
+    ByLabel,
+    Law,
+    cell_values,
+    cell_young,
+    has_column,
+    law_values,
+    parse_any_law,
+    young_from,
+)
 from tetopt.geometry.simplex import volumes
 from tetopt.image import Image
 from tetopt.mesh import Mesh
@@ -27,7 +36,7 @@ def model_of(
     image: Image | None = None,
     *,
     young: str | Law | ByLabel | ArrayLike = None,
-    nu: str | Law | ByLabel | ArrayLike = NU,
+    nu: str | Law | ByLabel | ArrayLike = None,
     sets: Iterable[str] = (),
     loads: Iterable[str] = (),
     bins: int | None = None,
@@ -49,7 +58,7 @@ def model_of(
         Young's modulus, kPa, above 0, and Poisson's ratio, above -1 and below 0.5: one for all cells, one for each, or
         a law of the intensity or of the label (`tetopt.fem.materials.parse_any_law`), of which with an image the mean
         over the voxels of the cell is taken, Eq. (2), and else its value at the cell's "mean". Without `young` the
-        model has no materials.
+        model has no materials; without `nu` it is the column "nu" of the file that `young` names, or 0.45.
     sets : iterable of str
         Further sets, see `tetopt.model.sets.with_asked`.
     loads : iterable of str
@@ -77,8 +86,14 @@ def model_of(
         raise InputError(f"order: expected 1 or 2, got {order}")
     if order == 2 and mesh.ndim == 2:
         raise InputError("order: quadratic cells are tetrahedra here, got a mesh of triangles")
+    if image is not None and image.ndim != mesh.ndim:
+        raise InputError(f"image: expected a {mesh.ndim}-D one, as the mesh is, got a {image.ndim}-D one")
     cell_data = cell_fields(mesh, image) if cell_data is None else dict(cell_data)
-    mean, labels = cell_data.get("mean"), cell_data.get("label")
+    mean = cell_data.get("mean")
+    mean = mean if mean is not None and mean.ndim == 1 else None
+    labels = labels_of(cell_data, len(mesh.cells))
+    if nu is None:
+        nu = young if isinstance(young, str) and has_column(young, "nu") else NU
     if known_sets is None:
         box = box_of(image) if box is None and image is not None else box
         known_sets = standard_sets(mesh, box, labels)
@@ -95,6 +110,15 @@ def model_of(
     elif bins is not None:
         raise InputError("bins: there are no moduli to group; give --young")
     return Model(mesh, cell_data, found, made, parse_loads(loads, mesh, found), order, about=dict(about or {}))
+
+
+def labels_of(cell_data: dict[str, NDArray], n_cells: int) -> NDArray[np.int64] | None:
+    """The field "label", (M,) int64, if it is there and holds whole numbers from 0, as other programs' may not."""
+    labels = cell_data.get("label")
+    if labels is None or labels.shape != (n_cells,) or not np.isfinite(labels).all():
+        return None
+    whole = labels.astype(np.int64)
+    return whole if (whole == labels).all() and whole.min() >= 0 else None
 
 
 def _values(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import difflib
 from collections.abc import Iterable
 from typing import NamedTuple
 
@@ -41,13 +42,15 @@ def parse_loads(texts: Iterable[str], mesh: Mesh, sets: Sets) -> tuple[Load, ...
     loads = tuple(load for text in texts for load in _parsed(text, mesh, sets))
     if loads and not any(load.displacement.any() for load in loads):
         raise InputError("load: everything is held and nothing moves; add move:SET:X,Y,Z")
+    if len(loads) == 1:
+        raise InputError(f'load: nothing but "{loads[0].set_name}" is loaded, and all would move along; add hold:SET')
     is_held = np.zeros(len(mesh.points), dtype=bool)
     for load in loads:
         nodes = nodes_of(mesh, sets.facets[load.set_name])
         if is_held[nodes].any():
             raise InputError(
-                f'load: {int(is_held[nodes].sum())} nodes of set "{load.set_name}" are in another loaded set, too; '
-                "they cannot go both ways"
+                f'load: {int(is_held[nodes].sum())} nodes of set "{load.set_name}" are in another loaded set, too, and '
+                "cannot go both ways; take sets apart, such as --set NAME=plane:X,Y,Z:NX,NY,NZ:D"
             )
         is_held[nodes] = True
     return loads
@@ -73,9 +76,17 @@ def _parsed(text: str, mesh: Mesh, sets: Sets) -> list[Load]:
 
 
 def _known(name: str, sets: Sets) -> str:
-    if name not in sets.facets:
-        raise InputError(f'load: there is no set of facets "{name}"; there are {", ".join(sets.facets)}')
-    return name
+    if name in sets.facets:
+        return name
+    if name in sets.cells:
+        raise InputError(
+            f'load: "{name}" is a set of cells; give one of facets, such as {", ".join(list(sets.facets)[:8])}'
+        )
+    near = difflib.get_close_matches(name, sets.facets, 1) or [
+        each for each in sets.facets if each.lower() == name.lower()
+    ]
+    hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(sets.facets)}"
+    raise InputError(f'load: there is no set of facets "{name}"; {hint}')
 
 
 def _compression(text: str, mesh: Mesh, sets: Sets) -> list[Load]:
@@ -84,7 +95,7 @@ def _compression(text: str, mesh: Mesh, sets: Sets) -> list[Load]:
     except ValueError:
         percent = -1.0
     if not text.endswith("%") or not 0.0 < percent <= MOST:
-        raise InputError(f'load: expected compress: and a percentage above 0 and up to {MOST:g}, got "{text}"')
+        raise InputError(f'load: expected compress:P% with P above 0 and up to {MOST:g}, got "compress:{text}"')
     low, high = FACES[mesh.ndim][-1]
     if missing := [name for name in (low, high) if name not in sets.facets]:
         raise InputError(

@@ -79,12 +79,13 @@ def by_label(law: ByLabel, labels: NDArray[np.integer] | None) -> NDArray[np.flo
     if labels is None:
         raise InputError("values by label: the mesh has no labels; mesh it with --labels")
     found, which = np.unique(labels, return_inverse=True)
-    if missing := [f"{label:g}" for label in found if label not in law.values]:
+    missing = [f"{label:g}" for label in found if label not in law.values]
+    if missing and law.rest is None:
         raise InputError(
-            f"values by label: given for {', '.join(map(str, law.values))}, the mesh also has "
-            f"{', '.join(missing[:10])}; give these, too"
+            f"values by label: given for {', '.join(map(str, law.values))}, the mesh also has {len(missing)} others, "
+            f"{', '.join(missing)}; give these, too, or all of them as *=VALUE"
         )
-    return np.array([law.values[int(label)] for label in found])[which.ravel()]
+    return np.array([law.values.get(int(label), law.rest) for label in found], dtype=np.float64)[which.ravel()]
 
 
 def binned(given: Materials, volumes: NDArray[np.float64], count: int, spacing: Spacing = "equal") -> Materials:

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
+from tetopt.fem.materials import checked_young
 from tetopt.mesh import Mesh
 from tetopt.model.loads import Load
 from tetopt.model.materials import Materials
@@ -75,8 +76,9 @@ def in_units(model: Model, units: str) -> Model:
         raise InputError(f"units: expected {' or '.join(UNITS)}, got {units}")
     if model.materials is None or units == model.units:
         return model._replace(units=units)
-    scale = UNITS[model.units][0] / UNITS[units][0]
-    return model._replace(materials=model.materials._replace(young=model.materials.young * scale), units=units)
+    scaled = model.materials.young * (UNITS[model.units][0] / UNITS[units][0])
+    checked_young(scaled)  # which may have underflowed
+    return model._replace(materials=model.materials._replace(young=scaled), units=units)
 
 
 def units_text(model: Model) -> str:

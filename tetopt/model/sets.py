@@ -139,10 +139,18 @@ def _face_sets(mesh: Mesh, boundary: NDArray[np.int64], box: Box | None) -> dict
 
 
 def world_axes(affine: NDArray[np.float64]) -> tuple[int, ...]:
-    """The world axis that each index axis stands for, each one once: those that the axes lie nearest to together."""
+    """The world axis that each index axis stands for, each one once.
+
+    The last world axis goes to the index axis nearest to it, as in `tetopt.fem.elasticity.box_faces`, the others to
+    those that they lie nearest to together.
+    """
     n = len(affine) - 1
     cosines = np.abs(affine[:n, :n]) / np.linalg.norm(affine[:n, :n], axis=0)
-    return max(permutations(range(n)), key=lambda order: float(np.prod(cosines[list(order), range(n)])))
+
+    def nearness(order: tuple[int, ...]) -> tuple[float, float]:
+        return float(cosines[n - 1, order.index(n - 1)]), float(np.prod(cosines[list(order), range(n)]))
+
+    return max(permutations(range(n)), key=nearness)
 
 
 def _interfaces(mesh: Mesh, labels: NDArray[np.int64]) -> dict[str, NDArray[np.int64]]:
@@ -191,20 +199,52 @@ def with_asked(mesh: Mesh, sets: Sets, asked: Iterable[str], mean: NDArray[np.fl
         Other words, a name that is taken or that a format cannot carry, no means, or a set without members.
     """
     for text in asked:
-        name, equals, what = text.partition("=")
-        kind, _, rest = what.partition(":")
-        if not equals or kind not in ("below", "point", "plane"):
-            raise InputError(
-                f'set: expected NAME=below:T, NAME=point:X,Y,Z:D or NAME=plane:X,Y,Z:NX,NY,NZ:D, got "{text}"'
-            )
-        for each in (name, f"{name}_surface") if kind == "below" else (name,):
-            _check_name(each, sets)
-        if kind == "below":
-            chosen = _below(mesh, name, rest, mean)
-            sets = Sets(sets.facets | {f"{name}_surface": around(mesh, chosen)}, sets.cells | {name: chosen})
+        wish = parse_set(text, mesh.ndim)
+        for each in wish.names():
+            _check_free(each, sets)
+        if wish.kind == "below":
+            chosen = _below(mesh, wish, mean)
+            sets = Sets(sets.facets | {f"{wish.name}_surface": around(mesh, chosen)}, sets.cells | {wish.name: chosen})
         else:
-            sets = Sets(sets.facets | {name: _near(mesh, name, kind, rest)}, sets.cells)
+            sets = Sets(sets.facets | {wish.name: _near(mesh, wish)}, sets.cells)
     return sets
+
+
+class Wish(NamedTuple):
+    """A set that is asked for."""
+
+    name: str
+    kind: str
+    vectors: list[NDArray[np.float64]]  # the numbers between the colons
+
+    def names(self) -> tuple[str, ...]:
+        """The names that it takes."""
+        return (self.name, f"{self.name}_surface") if self.kind == "below" else (self.name,)
+
+
+def parse_set(text: str, ndim: int) -> Wish:
+    """A set from words, see `with_asked`.
+
+    Raises
+    ------
+    InputError
+        Other words, other numbers, or a name that a format cannot carry.
+    """
+    name, equals, what = text.partition("=")
+    kind, _, rest = what.partition(":")
+    shapes = {"below": ("T", [1]), "point": ("X,Y,Z:D", [ndim, 1]), "plane": ("X,Y,Z:NX,NY,NZ:D", [ndim, ndim, 1])}
+    if not equals or kind not in shapes:
+        raise InputError(f'set: expected NAME=below:T, NAME=point:X,Y,Z:D or NAME=plane:X,Y,Z:NX,NY,NZ:D, got "{text}"')
+    if not NAME.fullmatch(name):
+        raise InputError(f'set: a name is a letter, then up to 39 letters, digits, _ and -, got "{name}"')
+    form, counts = shapes[kind]
+    parts = rest.split(":")
+    if len(parts) != len(counts):
+        raise InputError(f'set {name}: expected {kind}:{form}, got "{rest}"')
+    vectors = [_numbers(name, part, count) for part, count in zip(parts, counts, strict=True)]
+    if kind == "plane" and not vectors[1].any():
+        raise InputError(f"set {name}: the plane's normal must not be 0")
+    return Wish(name, kind, vectors)
 
 
 def around(mesh: Mesh, chosen: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -214,16 +254,14 @@ def around(mesh: Mesh, chosen: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.column_stack([chosen[rows[:, 0]], rows[:, 1]])
 
 
-def _check_name(name: str, sets: Sets) -> None:
-    if not NAME.fullmatch(name):
-        raise InputError(f'set: a name is a letter, then up to 39 letters, digits, _ and -, got "{name}"')
+def _check_free(name: str, sets: Sets) -> None:
     taken = {other.lower(): other for other in (*sets.facets, *sets.cells)}
     if name.lower() in taken:
         raise InputError(f'set: there is a set "{taken[name.lower()]}" already; call it otherwise than "{name}"')
 
 
-def _below(mesh: Mesh, name: str, text: str, mean: NDArray[np.float64] | None) -> NDArray[np.int64]:
-    (threshold,) = _numbers(name, text, 1)
+def _below(mesh: Mesh, wish: Wish, mean: NDArray[np.float64] | None) -> NDArray[np.int64]:
+    name, threshold = wish.name, float(wish.vectors[0][0])
     if mean is None:
         raise InputError(f"set {name}: the mesh has no means; give the image they come from (--image)")
     chosen = largest_component(mesh.cells, mean < threshold)
@@ -232,26 +270,20 @@ def _below(mesh: Mesh, name: str, text: str, mean: NDArray[np.float64] | None) -
     return chosen
 
 
-def _near(mesh: Mesh, name: str, kind: str, text: str) -> NDArray[np.int64]:
+def _near(mesh: Mesh, wish: Wish) -> NDArray[np.int64]:
     """Boundary facets all of whose nodes are near."""
-    n = mesh.ndim
-    vectors = text.split(":")
-    if len(vectors) != (2 if kind == "point" else 3):
-        raise InputError(f'set {name}: expected {"X,Y,Z:D" if kind == "point" else "X,Y,Z:NX,NY,NZ:D"}, got "{text}"')
-    offset = mesh.points - _numbers(name, vectors[0], n)
-    if kind == "point":
+    offset = mesh.points - wish.vectors[0]
+    if wish.kind == "point":
         distance = np.sqrt((offset**2).sum(axis=1))
     else:
-        normal = _numbers(name, vectors[1], n)
-        if not normal.any():
-            raise InputError(f"set {name}: the plane's normal must not be 0")
+        normal = wish.vectors[1] / np.abs(wish.vectors[1]).max()  # whose square neither overflows nor vanishes
         distance = np.abs((offset * (normal / np.linalg.norm(normal))).sum(axis=1))
-    (reach,) = _numbers(name, vectors[-1], 1)
+    reach = float(wish.vectors[-1][0])
     rows = boundary_rows(mesh)
     farthest = distance[facet_triples(mesh.cells, rows)].max(axis=1)
     if not (farthest <= reach).any():
         raise InputError(
-            f"set {name}: no facet of the boundary lies within {reach:g} mm; the nearest does within "
+            f"set {wish.name}: no facet of the boundary lies within {reach:g} mm; the nearest does within "
             f"{farthest.min():.4g} mm"
         )
     return rows[farthest <= reach]
@@ -308,20 +340,37 @@ def rows_of(mesh: Mesh, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
     return rows[np.lexsort(rows.T[::-1])]
 
 
-def with_carried(sets: Sets, before: Mesh, given: Sets, mesh: Mesh) -> Sets:
-    """`sets`, and those facet sets of a mesh as it was before that it still has all of, node for node.
+def carried(before: Mesh, given: Sets, mesh: Mesh) -> Sets:
+    """Those facet sets of a mesh as it was before that it still has all of, node for node, in new rows.
 
-    Of an optimised mesh with its boundary kept these are the sets on the boundary; names that are taken are left out.
+    Of an optimised mesh with its boundary kept these are the sets on the boundary. Its cells are others: no cell set is
+    carried.
     """
     place = {point.tobytes(): number for number, point in enumerate(mesh.points)}
     now = np.array([place.get(point.tobytes(), -1) for point in before.points])
-    carried = {}
-    taken = {name.lower() for name in (*sets.facets, *sets.cells)}
-    for name, rows in given.facets.items():
-        found = rows_of(mesh, now[facet_triples(before.cells, rows)])
-        if name.lower() not in taken and len(found) == len(rows):
-            carried[name] = found
-    return Sets(sets.facets | carried, sets.cells)
+    found = {name: rows_of(mesh, now[facet_triples(before.cells, rows)]) for name, rows in given.facets.items()}
+    return Sets({name: rows for name, rows in found.items() if len(rows) == len(given.facets[name])}, {})
+
+
+def joined(standard: Sets, given: Sets) -> tuple[Sets, dict[str, str]]:
+    """The standard sets and those that came with a mesh; and the new names of given ones whose names were taken.
+
+    A given set that is the same as the standard one of its name is that one.
+    """
+    parts: tuple[dict[str, NDArray[np.int64]], ...] = (dict(standard.facets), dict(standard.cells))
+    renamed = {}
+    for kind, sets in enumerate((given.facets, given.cells)):
+        for name, members in sets.items():
+            if np.array_equal(standard[kind].get(name, np.empty(0)), members):
+                continue
+            free, number = name, 1
+            while free.lower() in {each.lower() for part in parts for each in part}:
+                number += 1
+                free = f"{name}_{number}"
+            parts[kind][free] = members
+            if free != name:
+                renamed[name] = free
+    return Sets(*parts), renamed
 
 
 def box_of(image: Image) -> Box:

@@ -5,7 +5,7 @@ import pytest
 from models import sample_image, sample_model
 
 from tetopt.errors import InputError
-from tetopt.fem.materials import ByLabel, cell_values, load_law, parse_any_law, parse_law
+from tetopt.fem.materials import ByLabel, cell_values, has_column, load_law, parse_any_law, parse_law
 from tetopt.geometry.simplex import volumes
 from tetopt.model.build import model_of
 from tetopt.model.materials import binned, by_label, materials
@@ -58,6 +58,8 @@ def test_bins_by_number_and_by_logarithm():
     by_log = binned(given, np.ones(6), 2, "log")  # halves at 2^5
     assert by_log.of_cell.tolist() == [0, 0, 0, 0, 1, 1]
     assert by_log.young.tolist() == [3.75, 768.0]
+    wide = materials([1.0, 9.0, 30.0, 100.0], 0.3, 4)
+    assert binned(wide, np.ones(4), 2, "log").of_cell.tolist() == [0, 0, 1, 1]  # at 10; at 30.25 of square roots
     equal = binned(given, np.ones(6), 4)  # the third quarter is empty
     assert equal.young.tolist() == [3.75, 512.0, 1024.0]
 
@@ -98,13 +100,14 @@ def test_bins_that_are_none(count, spacing, match):
 
 def test_values_by_label():
     assert by_label(ByLabel({1: 2.5, 0: 1.0}), np.array([0, 1, 1])).tolist() == [1.0, 2.5, 2.5]
-    with pytest.raises(InputError, match="given for 1, the mesh also has 0, 3"):
+    assert by_label(ByLabel({1: 2.5}, 7.0), np.array([0, 1, 9])).tolist() == [7.0, 2.5, 7.0]
+    with pytest.raises(InputError, match="given for 1, the mesh also has 2 others, 0, 3; give these"):
         by_label(ByLabel({1: 2.5}), np.array([0, 1, 3]))
     with pytest.raises(InputError, match="has no labels"):
         by_label(ByLabel({1: 2.5}), None)
 
 
-@pytest.mark.parametrize("text", ["1=", "=2", "1=2,1=3", "1=2;2=3", "a=1", "1.5=2", "1=x"])
+@pytest.mark.parametrize("text", ["1=", "=2", "1=2,1=3", "1=2;2=3", "a=1", "1.5=2", "1=x", "*=1,*=2"])
 def test_labels_that_are_none(text):
     with pytest.raises(InputError, match="by label"):
         parse_any_law(text)
@@ -130,6 +133,12 @@ def test_tables_from_files(tmp_path, name, text):
 def test_labels_from_a_file(tmp_path):
     (tmp_path / "a.csv").write_text("label,young\n3,2.5\n0,1\n")
     assert load_law(tmp_path / "a.csv") == ByLabel({3: 2.5, 0: 1.0})
+    (tmp_path / "b.csv").write_text("Label,Young,Nu\n3,2.5,0.3\n*,1,0.45\n")
+    assert load_law(tmp_path / "b.csv") == ByLabel({3: 2.5}, 1.0)
+    assert has_column(str(tmp_path / "b.csv"), "nu")
+    assert not has_column(str(tmp_path / "a.csv"), "nu")
+    made = model_of(sample_model(3).mesh, young=str(tmp_path / "b.csv"), cell_data={"label": np.full(192, 3)}).materials
+    assert (made.young.tolist(), made.nu.tolist()) == ([2.5], [0.3])
 
 
 @pytest.mark.parametrize(
@@ -152,8 +161,12 @@ def test_labels_from_a_file(tmp_path):
         ("a.csv", "intensity,young\n1,2,3\n", "row of names"),
         ("a.csv", "intensity,young\n1,x\n", "columns of numbers"),
         ("a.csv", "intensity,young\n1,nan\n", "must be finite"),
-        ("a.csv", "label,young\n1,2\n1,3\n", "whole numbers, each once"),
-        ("a.csv", "label,young\n1.5,2\n", "whole numbers, each once"),
+        ("a.csv", "label,young\n1,2\n1,3\n", "label 1 has two values"),
+        ("a.csv", "label,young\n1.5,2\n", "columns of numbers"),
+        ("a.csv", "label,young,young\n1,2,3\n", "each column once"),
+        ("a.toml", "label = [1, nan]\nyoung = [1, 2]", "columns of numbers"),
+        ("a.toml", "label = [1, inf]\nyoung = [1, 2]", "columns of numbers"),
+        ("a.toml", "young = " + 3000 * "[" + 3000 * "]", "columns of numbers"),
         ("a.csv", "label,intensity,young\n1,2,3\n", "one of"),
     ],
 )
@@ -190,6 +203,16 @@ def test_the_mean_of_the_law_and_the_law_of_the_mean():
     flat = by_mean.materials.young[by_mean.materials.of_cell]
     np.testing.assert_allclose(flat, 1.0 + fields["mean"] ** 2, rtol=1e-14)
     assert (young > flat + 1.0).any()
+
+
+def test_constants_are_one_material():
+    """Whatever the means over many voxels would round to; also where a law is constant in a cell."""
+    image, mesh = sample_image(3), sample_model(3).mesh
+    for young, nu in (("0.7", "0.49"), (0.7, 0.49), ("0.7 + 0*h", "0.49 + 0*h"), ([(0, 0.7), (1, 0.7)], 0.49)):
+        made = model_of(mesh, image, young=young, nu=nu).materials
+        assert (made.young.tolist(), made.nu.tolist()) == ([0.7], [0.49])
+    assert model_of(mesh, young="3").materials.young.tolist() == [3.0]  # needs no image
+    assert len(model_of(mesh, image, young="1 + h/7", nu="0.49", bins=4).materials.young) == 4
 
 
 def test_ratios_may_be_negative_and_laws():
