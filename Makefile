@@ -4,7 +4,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 # numba does not see edits in imported files: the tests' cache of compiled kernels is keyed by all sources.
 NUMBA_CACHE = $(CURDIR)/.numba_cache/$(shell cat tetopt/*.py tetopt/*/*.py | cksum | cut -d' ' -f1)
-TESTED = NUMBA_CACHE_DIR=$(NUMBA_CACHE) MPLBACKEND=agg $(BIN)/python -m pytest
+# UTF-8, as Python chooses it by itself, but not in the processes that pytest-xdist starts.
+TESTED = PYTHONUTF8=1 NUMBA_CACHE_DIR=$(NUMBA_CACHE) MPLBACKEND=agg $(BIN)/python -m pytest
 
 SOLVERS = calculix-ccx python3-dolfinx
 
