@@ -311,6 +311,9 @@ def test_what_will_not_do_is_said_before_the_optimisation(folder, tmp_path, caps
         more = [] if out == "a.stl" else ["--young", "2"]
         assert run("mesh", folder / "a.nii.gz", "--slice", "k=3", "-o", tmp_path / out, "--nodes", "60", *more) == 2
         assert "triangles" in capsys.readouterr().err
+    flat = ["mesh", folder / "a.nii.gz", "--slice", "k=3", "-o", tmp_path / "a.vtu", "--nodes", "60"]
+    assert run(*flat, "--space", "lps") == 2
+    assert "leave out --space" in capsys.readouterr().err
     assert run("mesh", folder / "a.nii.gz", "--target-error", "0.3", "-o", tmp_path / "a.inp", "--load", "foo") == 2
     assert capsys.readouterr().err.count("\n") == 1
     assert list(tmp_path.iterdir()) == []

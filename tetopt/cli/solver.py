@@ -126,8 +126,7 @@ def check_early(output: Path, wishes: Wishes, image: Image, build: Callable[[Wis
     names = {name for wish in asked for name in wish.names()}
     is_on_asked = any(name in load.split(":") for load in wishes.loads for name in names)
     model = build(wishes._replace(sets=[], loads=[] if is_on_asked else wishes.loads))
-    if output.suffix.lower() != ".vtu":
-        content_of(output, model, space=wishes.space, units=wishes.units)
+    content_of(output, model, space=wishes.space, units=wishes.units)
 
 
 def save_wished(output: Path, model: Model, wishes: Wishes) -> None:

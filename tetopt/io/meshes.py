@@ -1,4 +1,4 @@
-"""Meshes from files and into them: VTU and VTK through pyvista, gmsh's MSH through meshio."""
+"""Meshes from files and into them: VTU and VTK through pyvista, and gmsh's MSH."""
 
 from __future__ import annotations
 
@@ -6,12 +6,10 @@ import contextlib
 import logging
 import re
 import warnings
-from collections.abc import Callable, Iterator
-from itertools import islice
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import meshio
 import numpy as np
 import pyvista
 from numpy.typing import NDArray
@@ -19,15 +17,13 @@ from numpy.typing import NDArray
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import oriented
 from tetopt.io.files import written_whole
-from tetopt.io.gmsh import Told, told
+from tetopt.io.raw import DIMENSIONS, Raw
+from tetopt.io.read_gmsh import read_msh
 from tetopt.io.vtk import add_texts, box_in, sets_in, text_in, to_pyvista, vtu_bytes
 from tetopt.mesh import Mesh
 from tetopt.model.sets import NAME, Box, Sets, rows_of
 
 SUFFIXES = (".vtu", ".vtk", ".msh", ".msh2")
-# Cells that a mesh is made of, or that may lie on it.
-DIMENSIONS = {"vertex": 0, "poly_vertex": 0, "line": 1, "poly_line": 1, "triangle": 2, "tetra": 3}
-UNNAMED = {1: "edge", 2: "surface", 3: "volume"}  # what gmsh's groups without a name are called, with their number
 
 
 class MeshFile(NamedTuple):
@@ -47,25 +43,6 @@ class MeshFile(NamedTuple):
         """A text among the field data, if it is there."""
         values = self.field_data.get(name, np.empty(0)).ravel()
         return str(values[0]) if len(values) else None
-
-
-class _Group(NamedTuple):
-    """Cells of one kind that gmsh's file calls by a name."""
-
-    label: str  # in the file
-    kind: str
-    members: NDArray[np.int64]  # ascending
-
-
-class _Raw(NamedTuple):
-    """A file's cells by kind, before any question is asked."""
-
-    points: NDArray[np.float64]  # (N, 3)
-    cells: dict[str, NDArray[np.int64]]
-    cell_data: dict[str, dict[str, NDArray]]  # by name, then kind
-    field_data: dict[str, NDArray]
-    groups: list[_Group]
-    space: str
 
 
 def save_mesh(
@@ -111,7 +88,7 @@ def load_mesh(path: str | Path) -> MeshFile:
         raise InputError(f"{path}: no such mesh file")
     if path.suffix.lower() not in SUFFIXES:
         raise InputError(f"{path}: expected a mesh named {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")
-    raw = _read_msh(path) if path.suffix.lower() in (".msh", ".msh2") else _read_vtk(path)
+    raw = read_msh(path) if path.suffix.lower() in (".msh", ".msh2") else _read_vtk(path)
     kind = _kind_of_cells(path, raw)
     n = DIMENSIONS[kind]
     cells, points = raw.cells[kind], raw.points
@@ -147,7 +124,7 @@ def load_mesh(path: str | Path) -> MeshFile:
     )
 
 
-def _kind_of_cells(path: Path, raw: _Raw) -> str:
+def _kind_of_cells(path: Path, raw: Raw) -> str:
     if unknown := sorted(set(raw.cells) - set(DIMENSIONS)):
         raise InputError(f"{path}: expected linear tetrahedra, or triangles, found {', '.join(unknown)}")
     kind = max(raw.cells, key=lambda name: DIMENSIONS[name], default="none")
@@ -158,7 +135,7 @@ def _kind_of_cells(path: Path, raw: _Raw) -> str:
     return kind
 
 
-def _cell_data(raw: _Raw, kind: str) -> tuple[dict[str, NDArray], tuple[str, ...]]:
+def _cell_data(raw: Raw, kind: str) -> tuple[dict[str, NDArray], tuple[str, ...]]:
     """What is on the cells of this kind, and a note on what is no numbers."""
     values_of = {name: values[kind] for name, values in raw.cell_data.items() if kind in values}
     found = {name: values for name, values in values_of.items() if values.dtype.kind in "biuf"}
@@ -166,7 +143,7 @@ def _cell_data(raw: _Raw, kind: str) -> tuple[dict[str, NDArray], tuple[str, ...
     return found, (f"cell data left out, as they are no numbers: {others}",) if others else ()
 
 
-def _sets_of_groups(raw: _Raw, mesh: Mesh, kind: str, used: NDArray[np.int64]) -> tuple[Sets, tuple[str, ...]]:
+def _sets_of_groups(raw: Raw, mesh: Mesh, kind: str, used: NDArray[np.int64]) -> tuple[Sets, tuple[str, ...]]:
     """gmsh's groups of cells and of facets, and notes on those whose names had to change."""
     place = np.full(len(raw.points), -1)
     place[used] = np.arange(len(used))
@@ -203,147 +180,7 @@ def _free_name(label: str, taken: set[str]) -> str:
     return name
 
 
-# gmsh's files
-
-
-def _read_msh(path: Path) -> _Raw:
-    """gmsh's file through meshio, whose complaints become one InputError."""
-    try:
-        with warnings.catch_warnings(), contextlib.redirect_stdout(None), contextlib.redirect_stderr(None):
-            warnings.simplefilter("ignore")
-            found = meshio.gmsh.read(path)
-        return _msh(found, path.read_bytes())
-    except Exception as error:  # meshio raises whatever it stumbles over
-        raise InputError(f"{path}: cannot be read as a gmsh mesh ({type(error).__name__})") from error
-
-
-def _msh(found: meshio.Mesh, content: bytes) -> _Raw:
-    """A file as meshio has read it, with its groups, of which meshio loses some."""
-    kinds = list(dict.fromkeys(block.type for block in found.cells))
-    of_kind = {kind: [k for k, block in enumerate(found.cells) if block.type == kind] for kind in kinds}
-    cells = {
-        kind: np.concatenate([found.cells[k].data for k in blocks]).astype(np.int64) for kind, blocks in of_kind.items()
-    }
-    cell_data = {
-        name: {kind: np.concatenate([values[k] for k in blocks]) for kind, blocks in of_kind.items()}
-        for name, values in found.cell_data.items()
-    }
-    points = np.zeros((len(found.points), 3))
-    points[:, : found.points.shape[1]] = found.points
-    groups = _groups(cells, cell_data, _physical_names(content), _groups_of_entities(content))
-    raw = _Raw(points, cells, cell_data, {}, groups, "ras")
-    comments = told(_section(content, "Comments").decode("utf-8", "replace").splitlines())
-    return raw if comments is None else _of_ours(raw, comments)
-
-
-def _of_ours(raw: _Raw, comments: Told) -> _Raw:
-    """A file of ours with what its comments tell: cell sets and materials are no longer groups and views."""
-    kind = max(raw.cells, key=lambda name: DIMENSIONS.get(name, -1))
-    entity = _by_value(raw.cell_data["gmsh:geometrical"][kind])
-    found = {  # gmsh keeps our comments and entities when it writes a file again, if not all of their cells
-        name: [entity[number] for number in numbers if number in entity] for name, numbers in comments.entities.items()
-    }
-    members = {name: np.sort(np.concatenate(parts)) for name, parts in found.items() if parts}
-    constants = np.full((2, len(raw.cells[kind])), np.nan)
-    for name in comments.constants.keys() & members.keys():
-        constants[:, members[name]] = np.array(comments.constants[name])[:, None]
-    is_painted = bool(comments.constants) and np.isfinite(constants).all()
-    painted = {"young": {kind: constants[0]}, "nu": {kind: constants[1]}} if is_painted else {}
-    sets = [_Group(name, kind, of_set) for name, of_set in members.items()]
-    dropped = {*members, "gmsh:physical", "gmsh:geometrical"}
-    return raw._replace(
-        cell_data={name: values for name, values in (painted | raw.cell_data).items() if name not in dropped},
-        field_data={name: np.array([text]) for name, text in comments.texts.items()},
-        groups=[group for group in raw.groups if group.kind != kind] + sets,
-        space=comments.space,
-    )
-
-
-def _groups(
-    cells: dict[str, NDArray[np.int64]],
-    cell_data: dict[str, dict[str, NDArray]],
-    names: dict[tuple[int, int], str],
-    groups_of: dict[tuple[int, int], list[int]] | None,
-) -> list[_Group]:
-    """Physical groups with members, named or not."""
-    tags = cell_data.get("gmsh:physical" if groups_of is None else "gmsh:geometrical", {})
-    groups = []
-    for kind, dim in DIMENSIONS.items():
-        if dim not in UNNAMED or len(tags.get(kind, ())) != len(cells.get(kind, ())):
-            continue
-        parts: dict[int, list[NDArray[np.int64]]] = {}
-        for value, members in _by_value(tags.get(kind, np.empty(0))).items():
-            for group in [value] if groups_of is None else groups_of.get((dim, value), []):
-                parts.setdefault(abs(group), []).append(members)  # a sign tells orientation
-        parts.pop(0, None)  # which stands for no group
-        for tag, found in sorted(parts.items()):
-            label = names.get((dim, tag)) or f"{UNNAMED[dim]}_{tag}"
-            groups.append(_Group(label, kind, np.sort(np.concatenate(found))))
-    return groups
-
-
-def _by_value(tags: NDArray) -> dict[int, NDArray[np.int64]]:
-    """Where each value stands, ascending."""
-    order = np.argsort(tags, kind="stable")
-    values, starts = np.unique(tags[order], return_index=True)
-    return dict(zip(values.tolist(), np.split(order, starts[1:]), strict=False))  # split makes one part of nothing
-
-
-def _section(content: bytes, name: str) -> bytes:
-    """What stands between $NAME and $EndNAME, first of all."""
-    start = content.find(f"${name}".encode())
-    return b"" if start < 0 else content[content.index(b"\n", start) + 1 : content.find(f"$End{name}".encode(), start)]
-
-
-def _physical_names(content: bytes) -> dict[tuple[int, int], str]:
-    """The names of physical groups by dimension and number: a name may be that of several."""
-    lines = _section(content, "PhysicalNames").decode("utf-8", "replace").splitlines()
-    found = [re.fullmatch(r'\s*(\d+)\s+(-?\d+)\s+"?(.*?)"?\s*', line) for line in lines]
-    return {(int(line[1]), abs(int(line[2]))): line[3] for line in found if line is not None}
-
-
-def _groups_of_entities(content: bytes) -> dict[tuple[int, int], list[int]] | None:
-    """The physical groups of each entity, by dimension and number, of a file from version 4.1 on."""
-    version, is_binary, size = _section(content, "MeshFormat").split(maxsplit=3)[:3]
-    if not version.startswith(b"4") or version == b"4.0":
-        return None
-    section = _section(content, "Entities")
-    take = _numbers(section) if is_binary == b"1" else _words(section)
-    n_bytes = f"<u{int(size)}"
-    groups_of = {}
-    for dim, count in enumerate(take(n_bytes, 4) if section else []):
-        for _ in range(count):
-            (tag,) = take("<i4", 1)
-            take("<f8", 3 if dim == 0 else 6)  # a point, or a box
-            groups_of[dim, tag] = take("<i4", take(n_bytes, 1)[0])
-            if dim > 0:
-                take("<i4", take(n_bytes, 1)[0])  # the entities around it
-    return groups_of
-
-
-def _numbers(section: bytes) -> Callable[[str, int], list[int]]:
-    """A function that reads on: so many numbers of this dtype."""
-    at = 0
-
-    def take(dtype: str, count: int) -> list[int]:
-        nonlocal at
-        values = np.frombuffer(section, dtype, count, at)
-        at += values.nbytes
-        return values.tolist()
-
-    return take
-
-
-def _words(section: bytes) -> Callable[[str, int], list[int]]:
-    """As `_numbers`, of a text."""
-    words = iter(section.split())
-    return lambda dtype, count: [int(float(word)) for word in islice(words, count)]
-
-
-# VTK's files
-
-
-def _read_vtk(path: Path) -> _Raw:
+def _read_vtk(path: Path) -> Raw:
     grid = _read_quietly(path)
     names = {int(kind): pyvista.CellType(kind).name.lower() for kind in np.unique(grid.celltypes)}
     if set(names.values()) <= set(DIMENSIONS):  # pyvista takes other kinds apart only if they have fixed sizes
@@ -355,7 +192,7 @@ def _read_vtk(path: Path) -> _Raw:
         for name in grid.cell_data
     }
     field_data = {name: _decoded(np.asarray(grid.field_data[name])) for name in grid.field_data}
-    return _Raw(np.asarray(grid.points, dtype=np.float64), cells, cell_data, field_data, [], _space(path, field_data))
+    return Raw(np.asarray(grid.points, dtype=np.float64), cells, cell_data, field_data, [], _space(path, field_data))
 
 
 def _space(path: Path, field_data: dict[str, NDArray]) -> str:

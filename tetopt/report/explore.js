@@ -223,7 +223,8 @@ function explore(gl, data, notes) {
       ends = [low, high];
       slider.value = high > low ? 1000 * (value - low) / (high - low) : 0;
       slider.disabled = box.disabled = !(high > low);
-      box.value = Number.isFinite(value) ? Number(value.toPrecision(6)) : "";
+      const digits = high > low ? Math.min(20, Math.max(0, 4 - Math.floor(Math.log10(high - low)))) : 6;
+      box.value = Number.isFinite(value) ? Number(value.toFixed(digits)) : "";
     };
   }
 

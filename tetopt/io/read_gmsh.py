@@ -1,0 +1,154 @@
+"""gmsh's files as they are read: through meshio, which loses groups that are looked up here."""
+
+from __future__ import annotations
+
+import contextlib
+import re
+import warnings
+from collections.abc import Callable
+from itertools import islice
+from pathlib import Path
+
+import meshio
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.errors import InputError
+from tetopt.io.gmsh import Told, told
+from tetopt.io.raw import DIMENSIONS, Group, Raw
+
+UNNAMED = {1: "edge", 2: "surface", 3: "volume"}  # what gmsh's groups without a name are called, with their number
+
+
+def read_msh(path: Path) -> Raw:
+    """gmsh's file through meshio, whose complaints become one InputError."""
+    try:
+        with warnings.catch_warnings(), contextlib.redirect_stdout(None), contextlib.redirect_stderr(None):
+            warnings.simplefilter("ignore")
+            found = meshio.gmsh.read(path)
+        return _msh(found, path.read_bytes())
+    except Exception as error:  # meshio raises whatever it stumbles over
+        raise InputError(f"{path}: cannot be read as a gmsh mesh ({type(error).__name__})") from error
+
+
+def _msh(found: meshio.Mesh, content: bytes) -> Raw:
+    """A file as meshio has read it, with its groups, of which meshio loses some."""
+    kinds = list(dict.fromkeys(block.type for block in found.cells))
+    of_kind = {kind: [k for k, block in enumerate(found.cells) if block.type == kind] for kind in kinds}
+    cells = {
+        kind: np.concatenate([found.cells[k].data for k in blocks]).astype(np.int64) for kind, blocks in of_kind.items()
+    }
+    cell_data = {
+        name: {kind: np.concatenate([values[k] for k in blocks]) for kind, blocks in of_kind.items()}
+        for name, values in found.cell_data.items()
+    }
+    points = np.zeros((len(found.points), 3))
+    points[:, : found.points.shape[1]] = found.points
+    groups = _groups(cells, cell_data, _physical_names(content), _groups_of_entities(content))
+    raw = Raw(points, cells, cell_data, {}, groups, "ras")
+    comments = told(_section(content, "Comments").decode("utf-8", "replace").splitlines())
+    return raw if comments is None else _of_ours(raw, comments)
+
+
+def _of_ours(raw: Raw, comments: Told) -> Raw:
+    """A file of ours with what its comments tell: cell sets and materials are no longer groups and views."""
+    kind = max(raw.cells, key=lambda name: DIMENSIONS.get(name, -1))
+    entity = _by_value(raw.cell_data["gmsh:geometrical"][kind])
+    found = {  # gmsh keeps our comments and entities when it writes a file again, if not all of their cells
+        name: [entity[number] for number in numbers if number in entity] for name, numbers in comments.entities.items()
+    }
+    members = {name: np.sort(np.concatenate(parts)) for name, parts in found.items() if parts}
+    constants = np.full((2, len(raw.cells[kind])), np.nan)
+    for name in comments.constants.keys() & members.keys():
+        constants[:, members[name]] = np.array(comments.constants[name])[:, None]
+    is_painted = bool(comments.constants) and np.isfinite(constants).all()
+    painted = {"young": {kind: constants[0]}, "nu": {kind: constants[1]}} if is_painted else {}
+    sets = [Group(name, kind, of_set) for name, of_set in members.items()]
+    dropped = {*members, "gmsh:physical", "gmsh:geometrical"}
+    return raw._replace(
+        cell_data={name: values for name, values in (painted | raw.cell_data).items() if name not in dropped},
+        field_data={name: np.array([text]) for name, text in comments.texts.items()},
+        groups=[group for group in raw.groups if group.kind != kind] + sets,
+        space=comments.space,
+    )
+
+
+def _groups(
+    cells: dict[str, NDArray[np.int64]],
+    cell_data: dict[str, dict[str, NDArray]],
+    names: dict[tuple[int, int], str],
+    groups_of: dict[tuple[int, int], list[int]] | None,
+) -> list[Group]:
+    """Physical groups with members, named or not."""
+    tags = cell_data.get("gmsh:physical" if groups_of is None else "gmsh:geometrical", {})
+    groups = []
+    for kind, dim in DIMENSIONS.items():
+        if dim not in UNNAMED or len(tags.get(kind, ())) != len(cells.get(kind, ())):
+            continue
+        parts: dict[int, list[NDArray[np.int64]]] = {}
+        for value, members in _by_value(tags.get(kind, np.empty(0))).items():
+            for group in [value] if groups_of is None else groups_of.get((dim, value), []):
+                parts.setdefault(abs(group), []).append(members)  # a sign tells orientation
+        parts.pop(0, None)  # which stands for no group
+        for tag, found in sorted(parts.items()):
+            label = names.get((dim, tag)) or f"{UNNAMED[dim]}_{tag}"
+            groups.append(Group(label, kind, np.sort(np.concatenate(found))))
+    return groups
+
+
+def _by_value(tags: NDArray) -> dict[int, NDArray[np.int64]]:
+    """Where each value stands, ascending."""
+    order = np.argsort(tags, kind="stable")
+    values, starts = np.unique(tags[order], return_index=True)
+    return dict(zip(values.tolist(), np.split(order, starts[1:]), strict=False))  # split makes one part of nothing
+
+
+def _section(content: bytes, name: str) -> bytes:
+    """What stands between $NAME and $EndNAME, first of all."""
+    start = content.find(f"${name}".encode())
+    return b"" if start < 0 else content[content.index(b"\n", start) + 1 : content.find(f"$End{name}".encode(), start)]
+
+
+def _physical_names(content: bytes) -> dict[tuple[int, int], str]:
+    """The names of physical groups by dimension and number: a name may be that of several."""
+    lines = _section(content, "PhysicalNames").decode("utf-8", "replace").splitlines()
+    found = [re.fullmatch(r'\s*(\d+)\s+(-?\d+)\s+"?(.*?)"?\s*', line) for line in lines]
+    return {(int(line[1]), abs(int(line[2]))): line[3] for line in found if line is not None}
+
+
+def _groups_of_entities(content: bytes) -> dict[tuple[int, int], list[int]] | None:
+    """The physical groups of each entity, by dimension and number, of a file from version 4.1 on."""
+    version, is_binary, size = _section(content, "MeshFormat").split(maxsplit=3)[:3]
+    if not version.startswith(b"4") or version == b"4.0":
+        return None
+    section = _section(content, "Entities")
+    take = _numbers(section) if is_binary == b"1" else _words(section)
+    n_bytes = f"<u{int(size)}"
+    groups_of = {}
+    for dim, count in enumerate(take(n_bytes, 4) if section else []):
+        for _ in range(count):
+            (tag,) = take("<i4", 1)
+            take("<f8", 3 if dim == 0 else 6)  # a point, or a box
+            groups_of[dim, tag] = take("<i4", take(n_bytes, 1)[0])
+            if dim > 0:
+                take("<i4", take(n_bytes, 1)[0])  # the entities around it
+    return groups_of
+
+
+def _numbers(section: bytes) -> Callable[[str, int], list[int]]:
+    """A function that reads on: so many numbers of this dtype."""
+    at = 0
+
+    def take(dtype: str, count: int) -> list[int]:
+        nonlocal at
+        values = np.frombuffer(section, dtype, count, at)
+        at += values.nbytes
+        return values.tolist()
+
+    return take
+
+
+def _words(section: bytes) -> Callable[[str, int], list[int]]:
+    """As `_numbers`, of a text."""
+    words = iter(section.split())
+    return lambda dtype, count: [int(float(word)) for word in islice(words, count)]
