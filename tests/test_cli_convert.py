@@ -6,6 +6,7 @@ import re
 import meshio
 import numpy as np
 import pytest
+import pyvista
 import trimesh
 from models import sample_image
 
@@ -57,8 +58,8 @@ def test_every_format_is_written(folder, tmp_path, suffix, capsys):
     assert run("convert", folder / "a.vtu", out, *more, "--space", "lps") == 0
     assert out.stat().st_size > 1000
     said = capsys.readouterr().out
-    units = "" if FORMATS[suffix].is_surface else ", kPa"
-    assert f"{out}: {FORMATS[suffix].what}, LPS+ mm{units}, " in said
+    units = "" if FORMATS[suffix].is_surface else ", kPa, "
+    assert f"{out}: {FORMATS[suffix].what}, LPS+ mm{units}" in said
     if more:
         assert "3 materials" in said or "6 materials" in said or "4 materials" in said
         assert "off by" in said
@@ -90,7 +91,9 @@ def test_vtu_there_and_back_with_materials_sets_and_loads(folder, tmp_path):
     assert found.mesh.points.tobytes() == first.mesh.points.tobytes()  # turned back
     np.testing.assert_array_equal(found.mesh.cells, first.mesh.cells)
     means = first.cell_data["mean"]
-    np.testing.assert_allclose(found.cell_data["young"], (1.0 + means / 7.0) / 1000.0, rtol=1e-15)
+    np.testing.assert_allclose(found.cell_data["young"], 1.0 + means / 7.0, rtol=1e-14)  # in kPa again
+    raw = pyvista.read(tmp_path / "b.vtu").cell_data["young"]
+    np.testing.assert_allclose(raw, (1.0 + means / 7.0) / 1000.0, rtol=1e-15)
     np.testing.assert_array_equal(found.cell_data["nu"], np.where(first.cell_data["label"] == 1, 0.3, 0.45))
     for kind in (0, 1):
         for name, members in first.sets[kind].items():
@@ -221,6 +224,34 @@ def test_an_optimised_mesh_is_kept_whatever_is_refused_after_it(folder, tmp_path
     assert f"the optimised mesh is in {tmp_path / 'a.vtu'}" in said[-1]
     assert len(tetopt.load_mesh(tmp_path / "a.vtu").mesh.cells) > 100
     assert not (tmp_path / "a.inp").exists()
+    before = (tmp_path / "a.vtu").read_bytes()
+    for number in (1, 2):  # and nothing is ever replaced by such a mesh, with --force neither
+        assert run("mesh", folder / "a.nii.gz", "-o", tmp_path / "a.inp", *options, "--force") == 2
+        assert str(tmp_path / f"a_optimised_{number}.vtu") in capsys.readouterr().err
+    assert (tmp_path / "a.vtu").read_bytes() == before
+
+
+def test_loads_on_what_only_the_final_mesh_may_have_are_no_early_error(folder, tmp_path):
+    """On an interface of labels, or a set that is asked for; but a set that can never be is one."""
+    base = ["mesh", folder / "a.nii.gz", "--labels", folder / "l.nii.gz", "--young", "2", "--iterations", "1"]
+    loads = ["--load", "hold:interface_0_1", "--load", "move:inferior:1,0,0"]
+    assert run(*base, "--nodes", "300", "-o", tmp_path / "a.inp", *loads) == 0
+    loads = ["--set", "top=plane:0,0,118:0,0,1:9", "--load", "hold:top", "--load", "move:inferior:1,0,0"]
+    assert run(*base, "--nodes", "90", "-o", tmp_path / "b.inp", *loads) == 0
+    for wrong in (["--load", "move:nosuch:1,0,0"], ["--load", "compress:99%"], ["--set", "left=below:20"]):
+        assert run(*base, "--nodes", "90", "-o", tmp_path / "c.inp", *loads, *wrong) == 2
+    assert {path.name for path in tmp_path.iterdir()} == {"a.inp", "b.inp"}
+
+
+@pytest.mark.parametrize(
+    "text", ['[["left", null]]', '[["left", [[1,2,3]]]]', "[" * 100_000, "{}", "3", '[["gone", [0,0,1]]]']
+)
+def test_loads_of_another_kind_in_a_file_are_left(folder, tmp_path, text):
+    grid = pyvista.read(folder / "a.vtu")
+    grid.field_data["loads"] = np.frombuffer(text.encode(), dtype=np.uint8)
+    grid.save(tmp_path / "a.vtu")
+    assert run("convert", tmp_path / "a.vtu", tmp_path / "b.inp", "--young", "2") == 0
+    assert "*STEP" not in (tmp_path / "b.inp").read_text()
 
 
 def test_a_promise_is_broken_where_a_start_covers_less(folder):
@@ -242,7 +273,7 @@ def test_loads_run_or_are_said_to_be_in_comments(folder, tmp_path, capsys):
             continue
         options = ["--young", "3", "--load", "compress:5%"]
         assert run("convert", folder / "a.vtu", tmp_path / f"a{suffix}", *options) == 0
-        is_said = "no place for loads: they are in its comments" in capsys.readouterr().out
+        is_said = "the format runs no step: the loads are in the file as text" in capsys.readouterr().out
         assert is_said == (suffix not in (".inp", ".feb", ".scn")), suffix
 
 
@@ -264,7 +295,7 @@ def test_loads_run_or_are_said_to_be_in_comments(folder, tmp_path, capsys):
         ("a.inp", ["--young", "2", "--nu", "-1"], "-1 < nu < 0.5"),
         ("a.inp", ["--young", "2", "--nu", "x"], 'cannot use "x"'),
         ("a.inp", ["--nu", "0.3"], "--nu: there is no --young"),
-        ("a.inp", ["--young", "1=2"], "the mesh also has 1 others, 0"),
+        ("a.inp", ["--young", "1=2"], "the mesh also has 0 (1 more)"),
         ("a.inp", ["--crop", "1:3,:,:"], "--crop: there is no --image"),
         ("a.inp", ["--young", "2", "--load", "move:left:0,0,1"], 'nothing but "left" is loaded'),
         ("a.inp", ["--bins", "4"], "no moduli to group"),
@@ -346,8 +377,8 @@ def test_the_surface_of_a_structure(folder, tmp_path, what, suffix, capsys):
     assert found.is_watertight
     assert found.volume == pytest.approx(loaded.cell_data["volume"][chosen].sum(), rel=1e-3)
     told = json.loads((tmp_path / "s.json").read_text())
-    assert told["volume"] == pytest.approx(found.volume)
-    assert told["area"] == pytest.approx(found.area)
+    assert told["volume_mm3"] == pytest.approx(found.volume)
+    assert told["area_mm2"] == pytest.approx(found.area)
     assert f"{found.volume:.6g}" in said
     assert f"{found.area:.6g}" in said
 

@@ -101,7 +101,7 @@ def test_bins_that_are_none(count, spacing, match):
 def test_values_by_label():
     assert by_label(ByLabel({1: 2.5, 0: 1.0}), np.array([0, 1, 1])).tolist() == [1.0, 2.5, 2.5]
     assert by_label(ByLabel({1: 2.5}, 7.0), np.array([0, 1, 9])).tolist() == [7.0, 2.5, 7.0]
-    with pytest.raises(InputError, match="given for 1, the mesh also has 2 others, 0, 3; give these"):
+    with pytest.raises(InputError, match=r"given for 1, the mesh also has 0, 3 \(2 more\); give these"):
         by_label(ByLabel({1: 2.5}), np.array([0, 1, 3]))
     with pytest.raises(InputError, match="has no labels"):
         by_label(ByLabel({1: 2.5}), None)
@@ -236,5 +236,7 @@ def test_one_law_for_each_label_and_one_number_a_cell():
     np.testing.assert_array_equal(made.young[made.of_cell], np.where(labels == 1, 4.0, 1.5))
     np.testing.assert_array_equal(made.nu[made.of_cell], np.where(labels == 1, 0.3, 0.45))
     given = np.linspace(1.0, 2.0, len(labels))
-    made = model_of(model.mesh, young=given).materials
-    np.testing.assert_array_equal(made.young[made.of_cell], given)
+    for values in (given, given.tolist()):
+        made = model_of(model.mesh, young=values, nu=np.float32(0.25)).materials
+        np.testing.assert_array_equal(made.young[made.of_cell], given)
+        assert set(made.nu) == {0.25}

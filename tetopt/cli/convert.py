@@ -8,9 +8,11 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
+from rich.markup import escape
 
 from tetopt import Image, InputError
 from tetopt.align import aligned_mask
+from tetopt.cli.console import log
 from tetopt.cli.inputs import check_no_input, image_and_others, read_mesh, warn_of_other_image
 from tetopt.cli.options import (
     BinsOption,
@@ -36,7 +38,6 @@ from tetopt.io.images import sha256
 from tetopt.io.meshes import MeshFile
 from tetopt.io.vtk import box_text
 from tetopt.model.fields import cell_fields
-from tetopt.model.model import UNITS
 from tetopt.model.sets import box_of
 from tetopt.report.summary import model_summary, versions
 
@@ -82,8 +83,8 @@ def convert_command(
     loaded = read_mesh(mesh_path)
     checked_wishes(output, wishes, has_materials="young" in loaded.cell_data)
     if not wishes.loads:
-        wishes = wishes._replace(loads=_loads_of(loaded))
-    fields = _in_kPa(loaded)
+        wishes = wishes._replace(loads=_loads_of(loaded, output))
+    fields = dict(loaded.cell_data)
     about: dict[str, Any] = {name: text for name in TEXTS if (text := loaded.text(name)) is not None}
     box = loaded.box
     image: Image | None = None
@@ -112,26 +113,18 @@ def convert_command(
     return 0
 
 
-def _loads_of(loaded: MeshFile) -> list[str]:
-    """The loads that a file of ours holds, in the words of --load and in RAS+."""
-    turn = np.array([-1.0, -1.0, 1.0]) if loaded.space == "lps" else 1.0
+def _loads_of(loaded: MeshFile, output: Path) -> list[str]:
+    """The loads that a file of ours holds, in the words of --load and in RAS+, if their sets are there still."""
+    turn = np.array([-1.0, -1.0, 1.0]) if loaded.space == "lps" else np.ones(loaded.mesh.ndim)
     try:
-        pairs = [
-            (str(name), np.array(vector, dtype=np.float64) * turn)
-            for name, vector in json.loads(loaded.text("loads") or "[]")
-        ]
-    except (ValueError, TypeError):  # another program's
+        loads = json.loads(loaded.text("loads") or "[]")
+        vectors = {str(name): (np.array(vector, dtype=np.float64) * turn + 0.0).tolist() for name, vector in loads}
+        words = [f"move:{name}:{','.join(repr(float(x)) for x in vector)}" for name, vector in vectors.items()]
+    except (ValueError, TypeError, RecursionError):  # another program's
         return []
-    words = (f"move:{name}:{','.join(repr(float(x)) for x in vector)}" for name, vector in pairs)
-    return list(words)
-
-
-def _in_kPa(loaded: MeshFile) -> dict[str, Any]:
-    """The file's cell data, moduli in kPa."""
-    fields = dict(loaded.cell_data)
-    units = loaded.text("units") or "kPa"
-    if "young" in fields:
-        if units not in UNITS:
-            raise InputError(f'units of the mesh\'s moduli: expected {" or ".join(UNITS)}, found "{units}"')
-        fields["young"] = np.asarray(fields["young"], dtype=np.float64) * UNITS[units][0]
-    return fields
+    if not words or format_of(output).is_surface or not np.isfinite(list(vectors.values())).all():
+        return []
+    if lost := [name for name in vectors if name not in loaded.sets.facets]:
+        log.print(escape(f"the file's loads are left out: it no longer has the sets {', '.join(lost)}"))
+        return []
+    return words

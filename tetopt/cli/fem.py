@@ -21,7 +21,7 @@ from tetopt.report.tables import new_table
 
 def fem_command(
     image_path: ImageArgument,
-    mesh_path: Annotated[Path, typer.Argument(metavar="MESH", help="VTU or VTK file that fills the image's box.")],
+    mesh_path: Annotated[Path, typer.Argument(metavar="MESH", help="VTU, VTK or MSH file that fills the image's box.")],
     young: Annotated[
         str | None,
         typer.Option(

@@ -326,11 +326,12 @@ def _model(
     given = Sets({}, {}) if started is None else carried(started.mesh, started.sets, mesh)
     if started is not None and is_told:
         lost = [name for kind in (0, 1) for name in started.sets[kind] if name not in given[kind]]
-        own = [
-            name for name in lost if not name.startswith(("label_", "interface_"))
-        ]  # which are made anew of --labels
-        if own:
-            log.print(escape(f"not on the boundary, and so not kept: the sets {', '.join(own)}"))
+        if source.labels is not None:  # of which these are made anew
+            lost = [name for name in lost if not name.startswith(("label_", "interface_"))]
+        if lost:
+            log.print(escape(f"not kept, as their cells or facets are others now: the sets {', '.join(lost)}"))
+        if "young" in started.cell_data or started.text("loads") is not None:
+            log.print("moduli and loads of the mesh that is improved are not kept; give --young and --load")
     known = all_sets(mesh, box_of(source.contrasts[0]), fields, given, is_told)
     return built(mesh, source.wanted.image, wishes, fields, about, known)
 

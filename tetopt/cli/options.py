@@ -74,6 +74,8 @@ LoadOption = Annotated[
         help="A step to run: compress:5%, or hold:SET and move:SET:X,Y,Z. May be repeated.",
     ),
 ]
-OrderOption = Annotated[int, typer.Option(metavar="1|2", help="2: quadratic cells, straight-edged (.inp, .feb, .msh).")]
+OrderOption = Annotated[
+    int, typer.Option(metavar="1|2", help="2: quadratic cells, straight-edged (.inp, .feb, .msh, .msh2).")
+]
 UnitsOption = Annotated[str, typer.Option(metavar="kPa|MPa", help="Unit of stress in the file; --young is in kPa.")]
 SpaceOption = Annotated[str, typer.Option(metavar="ras|lps", help="Convention of the file's coordinates.")]

@@ -24,7 +24,7 @@ from tetopt.report.tables import add_quality, new_table
 
 
 def quality_command(
-    mesh_path: Annotated[Path, typer.Argument(metavar="MESH", help="VTU or VTK file of tetrahedra or triangles.")],
+    mesh_path: Annotated[Path, typer.Argument(metavar="MESH", help="VTU, VTK or MSH file of tetrahedra or triangles.")],
     image_path: Annotated[
         Path | None, typer.Option("--image", metavar="IMAGE", help="Measure E_D against this image, too.")
     ] = None,
@@ -97,10 +97,11 @@ def quality_command(
 
 def _was_masked(loaded: MeshFile) -> bool:
     """Whether the file says that it was made within a mask or without a background."""
-    if "inputs" not in loaded.field_data:
+    try:
+        inputs = json.loads(loaded.text("inputs") or "{}")
+        return inputs.get("mask") is not None or inputs.get("background") is not None
+    except (ValueError, AttributeError, RecursionError):  # another program's
         return False
-    inputs = json.loads(str(loaded.field_data["inputs"][0]))
-    return inputs.get("mask") is not None or inputs.get("background") is not None
 
 
 def image_fit(image: Image, mesh: Mesh) -> dict[str, Any]:

@@ -20,7 +20,7 @@ from tetopt.report.tables import new_table
 
 def segment_command(
     image_path: ImageArgument,
-    mesh_path: Annotated[Path, typer.Argument(metavar="MESH", help="VTU or VTK file over the image.")],
+    mesh_path: Annotated[Path, typer.Argument(metavar="MESH", help="VTU, VTK or MSH file over the image.")],
     output: Annotated[Path, typer.Option("-o", "--output", metavar="LABELS.nii.gz", help="The labels to write.")],
     classes: Annotated[int, typer.Option(metavar="K", min=2, help="Number of classes, by rising mean.")] = 4,
     truth_path: Annotated[

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator
+from itertools import chain, count
 from pathlib import Path
 from typing import Any, NamedTuple, cast, get_args
 
@@ -16,9 +17,10 @@ from tetopt.cli.console import log, out, print_wide
 from tetopt.fem.materials import parse_any_law
 from tetopt.io.formats import FORMATS, content_of, format_of, save_model
 from tetopt.model.build import labels_of, model_of
+from tetopt.model.loads import known_set, parse_load
 from tetopt.model.materials import Spacing
 from tetopt.model.model import SPACES, UNITS, Model
-from tetopt.model.sets import Box, Sets, joined, nodes_of, parse_set, standard_sets
+from tetopt.model.sets import Box, Sets, check_free, joined, nodes_of, parse_set, standard_sets
 from tetopt.report.tables import new_table
 
 MANY = 30_000  # materials: CalculiX takes three times as long with as many as there are cells (tests/benchmarks)
@@ -93,6 +95,8 @@ def built(
     if young is None and "young" in cell_data:  # painted before
         young = np.asarray(cell_data["young"], dtype=np.float64)
         nu = np.asarray(cell_data["nu"], dtype=np.float64) if nu is None and "nu" in cell_data else nu
+    elif nu is None and "nu" in cell_data:
+        log.print("nu: of --young or 0.45; what the mesh's file has is left")
     fields = {name: values for name, values in cell_data.items() if name not in ("young", "nu", "material")}
     bins, spacing = parsed_bins(wishes.bins)
     return model_of(
@@ -113,8 +117,8 @@ def all_sets(mesh: Mesh, box: Box | None, fields: dict[str, NDArray], given: Set
 def check_early(output: Path, wishes: Wishes, image: Image, build: Callable[[Wishes], Model]) -> None:
     """InputError for what would be refused after the optimisation, as far as the initial mesh can tell.
 
-    `build` makes a model of that. Further sets may have members in the final mesh alone: of them, and of loads on them,
-    only the words are looked at.
+    `build` makes a model of the initial mesh. Further sets, and interfaces, may have members in the final one alone: of
+    them, and of loads on them, only the words and names are looked at.
     """
     asked = [parse_set(text, image.ndim) for text in wishes.sets]
     for wish in asked:
@@ -123,26 +127,33 @@ def check_early(output: Path, wishes: Wishes, image: Image, build: Callable[[Wis
                 f"set {wish.name}: no cell can have a mean below {wish.vectors[0][0]:g}, the image begins at "
                 f"{image.data.min():g}"
             )
-    names = {name for wish in asked for name in wish.names()}
-    is_on_asked = any(name in load.split(":") for load in wishes.loads for name in names)
-    model = build(wishes._replace(sets=[], loads=[] if is_on_asked else wishes.loads))
+    taken = {name for wish in asked for name in wish.names()}
+    on = [parse_load(text, image.ndim).name for text in wishes.loads]
+    is_certain = not any(name in taken or name.startswith("interface_") for name in on)
+    model = build(wishes._replace(sets=[], loads=wishes.loads if is_certain else []))
+    for wish in asked:
+        check_free(wish, model.sets)
+    for name in on:
+        if name and name not in taken and not name.startswith("interface_"):
+            known_set(name, model.sets)
     content_of(output, model, space=wishes.space, units=wishes.units)
 
 
 def save_wished(output: Path, model: Model, wishes: Wishes) -> None:
     """Write the file."""
     if model.materials is not None and len(model.materials.young) > MANY and output.suffix.lower() == ".inp":
-        log.print(f"{len(model.materials.young)} materials, as many as cells have moduli; --bins 32 groups them")
+        log.print(
+            f"{len(model.materials.young)} materials make CalculiX some three times slower; --bins 32 groups them"
+        )
     save_model(output, model, space=wishes.space, units=wishes.units)
 
 
 def save_anyway(output: Path, model: Model, error: InputError) -> InputError:
     """Keep an optimised mesh whose model was refused, as VTU; the error to raise, which says where it is."""
-    kept = output.with_suffix(".vtu")
-    if kept.exists():
-        kept = output.with_name(f"{output.stem}_optimised.vtu")
+    names = chain([output.stem], (f"{output.stem}_optimised_{number}" for number in count(1)))
+    kept = next(path for name in names if not (path := output.with_name(f"{name}.vtu")).exists())
     save_model(kept, model)
-    return InputError(f"{error}; the optimised mesh is in {kept}, go on from there with tetopt convert")
+    return InputError(f"{error}; the optimised mesh is in {kept}: go on from there with tetopt convert")
 
 
 def print_model(output: Path, model: Model, wishes: Wishes) -> None:
@@ -168,15 +179,21 @@ def _lines(output: Path, model: Model, wishes: Wishes) -> Iterator[str]:
         yield f"{count}, Young's modulus {young.min():.4g} to {young.max():.4g} kPa, nu {ratios}"
     if made is not None and made.binning is not None:
         yield f"bins: modulus off by {made.binning.mean:.2%} in the mean by volume, {made.binning.largest:.2%} at most"
-    for load in model.loads:
+    for load in () if format_of(output).is_surface else model.loads:
         where = ", ".join(f"{x:.6g}" for x in load.displacement)
         yield f"load: {load.set_name} {'held' if not load.displacement.any() else f'moved by {where} mm'}"
-    if model.loads and not format_of(output).runs:
-        yield "the format has no place for loads: they are in its comments"
+    if model.loads and not (format_of(output).runs or format_of(output).is_surface):
+        yield "the format runs no step: the loads are in the file as text"
     low, high = model.mesh.points.min(axis=0), model.mesh.points.max(axis=0)
     ranges = zip("xyz", low, high, strict=False)
-    yield "the mesh lies at " + ", ".join(f"{axis} {a:.6g} to {b:.6g}" for axis, a, b in ranges) + " mm (RAS)"
+    yield (
+        "the mesh lies at "
+        + ", ".join(f"{axis} {a:.6g} to {b:.6g}" for axis, a, b in ranges)
+        + (" mm (RAS)" if model.mesh.ndim == 3 else " mm in its plane")
+    )
     space = f"{wishes.space.upper()}+ mm" if model.mesh.ndim == 3 else "mm"
-    units = "" if format_of(output).is_surface else f", {wishes.units}"
+    if format_of(output).is_surface:
+        yield f"{output}: {format_of(output).what}, {space}"
+        return
     size = f"{len(model.mesh.points)} nodes, {len(model.mesh.cells)} cells"
-    yield f"{output}: {format_of(output).what}, {space}{units}, {size}"
+    yield f"{output}: {format_of(output).what}, {space}, {wishes.units}, {size}"

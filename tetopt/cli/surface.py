@@ -61,20 +61,14 @@ def surface_command(
     table.add_row("area, mm2", f"{found.area:.6g}")
     if surface.n_parted:
         log.print(
-            f"{surface.n_parted} nodes where the structure touches itself were parted, by "
+            f"{surface.n_parted} nodes and edges where the structure touches itself were parted, by "
             f"{surface.largest_shift:.2g} mm at most, so that each edge is in two triangles"
         )
     if json_path is not None:
-        save_json(
-            json_path,
-            {
-                "mesh": mesh_path.name,
-                "surface": output.name,
-                **found._asdict(),
-                "n_parted": surface.n_parted,
-                "largest_shift_mm": surface.largest_shift,
-            },
-        )
+        measured = {"volume_mm3": found.volume, "area_mm2": found.area, "n_pieces": found.n_pieces}
+        parted = {"n_parted": surface.n_parted, "largest_shift_mm": surface.largest_shift}
+        files = {"mesh": mesh_path.name, "surface": output.name}
+        save_json(json_path, files | {"is_watertight": found.is_watertight} | measured | parted)
     out.print(table)
     if not (found.is_watertight and found.is_winding_consistent and found.volume > 0.0):
         log.print(f"[bold red]tetopt:[/] {escape(str(output))}: not watertight, by trimesh; please report this")

@@ -57,7 +57,7 @@ def law_values(law: Law, intensities: ArrayLike) -> NDArray[np.float64]:
     values = np.asarray(law(intensities), dtype=np.float64)
     if values.shape != intensities.shape:
         raise InputError(
-            f"law: expected a function that returns one modulus for each intensity, got shape {values.shape} "
+            f"law: expected a function that returns one value for each intensity, got shape {values.shape} "
             f"for shape {intensities.shape}"
         )
     return values
@@ -109,7 +109,7 @@ def parse_table(text: str) -> list[tuple[float, float]]:
     except ValueError:
         pairs = []
     if not pairs or any(len(pair) != 2 for pair in pairs):
-        raise InputError(f'modulus: expected pairs intensity:kPa, such as "0:1,100:5.5", got "{text}"')
+        raise InputError(f'law: expected pairs intensity:value, such as "0:1,100:5.5", got "{text}"')
     return [(pair[0], pair[1]) for pair in pairs]
 
 
@@ -304,7 +304,7 @@ def cell_values(image: Image, mesh: Mesh, law: Law) -> NDArray[np.float64]:
     values = law_values(law, image.data)
     if not np.isfinite(values).all():
         at = image.data[~np.isfinite(values)].ravel()[0]
-        raise InputError(f"law: it has no value at intensity {at:g}; give one that has over the image's range")
+        raise InputError(f"law: it has no value at intensity {at:g}; give one defined over the image's whole range")
     return _cell_means(Image(values, image.affine), mesh)
 
 

@@ -34,7 +34,9 @@ MOST = 0.1
 # sets of cells cross fifteen times as often, with three steps about as seldom.
 N_SEARCH = 20
 
-FOLDED = "surface: expected a conforming mesh, some of the chosen cells fold over one another; see `tetopt check`"
+FOLDED = (
+    "surface: expected a conforming mesh, some of the chosen cells fold over one another; see `tetopt quality --check`"
+)
 
 
 class Surface(NamedTuple):

@@ -92,7 +92,7 @@ def febio(model: Model) -> bytes:
         _head(model),
         "<Globals>\n<Constants>\n<T>0</T>\n<P>0</P>\n<R>0</R>\n<Fc>0</Fc>\n</Constants>\n</Globals>\n",
         CONTROL if model.loads else "",
-        _materials(parts, UNITS[model.units][4]),
+        _materials(parts, UNITS[model.units].water),
         *_mesh(model, parts),
         "<MeshDomains>\n",
         *(f'<SolidDomain name="{part.name}" mat="{part.name}"/>\n' for part in parts),

@@ -95,7 +95,7 @@ def told(comments: list[str]) -> Told | None:
 
 
 def gmsh41(model: Model) -> bytes:
-    """A MSH 4.1 file; see the module for what is where.
+    """An MSH 4.1 file; see the module for what is where.
 
     Elements 1 to M are the cells in their order; they stand entity by entity.
 
@@ -152,7 +152,7 @@ def gmsh22(model: Model) -> bytes:
     if _n_materials(model) > MOST_MATERIALS:
         raise InputError(
             f"gmsh 2.2: expected at most {MOST_MATERIALS} materials, as each becomes a group, got "
-            f"{_n_materials(model)}; put them into bins, or write gmsh 4.1"
+            f"{_n_materials(model)}; group them with --bins 32, or name the file .msh"
         )
     points, cells = _geometry(model)
     parts = [part for part in (_cells(model), _facets_each(model)) if len(part.numbers)]
@@ -321,8 +321,8 @@ def _fields(model: Model) -> dict[str, NDArray[np.float64]]:
     if model.materials is not None:
         of_cell = model.materials.of_cell
         fields |= {"young": model.materials.young[of_cell], "nu": model.materials.nu[of_cell]}
+    check_apart(list(fields), model.sets.cells)
     for name, members in model.sets.cells.items():
-        check_apart([name], fields)
         fields[name] = np.isin(np.arange(len(model.mesh.cells)), members)
     columns: dict[str, NDArray[np.float64]] = {}
     for name, values in fields.items():

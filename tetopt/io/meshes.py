@@ -21,7 +21,8 @@ from tetopt.io.raw import DIMENSIONS, Raw
 from tetopt.io.read_gmsh import read_msh
 from tetopt.io.vtk import add_texts, box_in, sets_in, text_in, to_pyvista, vtu_bytes
 from tetopt.mesh import Mesh
-from tetopt.model.sets import NAME, Box, Sets, rows_of
+from tetopt.model.model import UNITS
+from tetopt.model.sets import NAME, Box, Sets, free_name, rows_of
 
 SUFFIXES = (".vtu", ".vtk", ".msh", ".msh2")
 
@@ -30,7 +31,7 @@ class MeshFile(NamedTuple):
     """A mesh read from a file and what came with it."""
 
     mesh: Mesh  # RAS+ mm
-    cell_data: dict[str, NDArray]  # by name, one row a cell
+    cell_data: dict[str, NDArray]  # by name, one row a cell; "young", if the file has it, in kPa
     field_data: dict[str, NDArray]  # by name, of any length; bytes of UTF-8 have become one string
     n_turned: int  # cells that were oriented the other way in the file
     n_left: int = 0  # cells of lower dimension, triangles on tetrahedra among them, that were left out
@@ -41,8 +42,7 @@ class MeshFile(NamedTuple):
 
     def text(self, name: str) -> str | None:
         """A text among the field data, if it is there."""
-        values = self.field_data.get(name, np.empty(0)).ravel()
-        return str(values[0]) if len(values) else None
+        return text_in(self.field_data, name)
 
 
 def save_mesh(
@@ -72,7 +72,7 @@ def load_mesh(path: str | Path) -> MeshFile:
     Cells oriented the other way are turned and counted; cells of lower dimension are left out and counted, and so are
     nodes that no cell uses. Without tetrahedra, a file of triangles is 2-D and must lie in the plane z = 0. Coordinates
     are taken for RAS+ unless the file says LPS, as those of `tetopt convert --space lps` and of 3D Slicer do; these are
-    turned. Cell data other than numbers are left out.
+    turned, and moduli that it holds in MPa taken to kPa. Cell data other than numbers are left out.
 
     The sets of a VTU or VTK file of ours are taken if its cells are still those that they were written for. gmsh's
     physical groups (files named .msh or .msh2) become sets, with names that every format can carry; in files of ours
@@ -110,6 +110,7 @@ def load_mesh(path: str | Path) -> MeshFile:
         raise InputError(f"{path}: {error}") from error
     is_turned = (turned != cells).any(axis=1)
     cell_data, notes = _cell_data(raw, kind)
+    cell_data, of_moduli = _in_kPa(cell_data, text_in(raw.field_data, "units") or "kPa")
     sets, of_sets = _sets_of_groups(raw, mesh, kind, used) if raw.groups else sets_in(raw.field_data, mesh)
     return MeshFile(
         mesh,
@@ -120,8 +121,18 @@ def load_mesh(path: str | Path) -> MeshFile:
         sets,
         box_in(raw.field_data, n),
         raw.space,
-        notes + of_sets,
+        notes + of_moduli + of_sets,
     )
+
+
+def _in_kPa(cell_data: dict[str, NDArray], units: str) -> tuple[dict[str, NDArray], tuple[str, ...]]:
+    """Cell data with the moduli in kPa; without them, and a note, if their unit is not known."""
+    if "young" not in cell_data:
+        return cell_data, ()
+    if units in UNITS:
+        return cell_data | {"young": cell_data["young"] * UNITS[units].kPa}, ()
+    others = {name: values for name, values in cell_data.items() if name not in ("young", "nu", "material")}
+    return others, (f'moduli left out, as their unit is neither {" nor ".join(UNITS)}: "{units}"',)
 
 
 def _kind_of_cells(path: Path, raw: Raw) -> str:
@@ -154,7 +165,7 @@ def _sets_of_groups(raw: Raw, mesh: Mesh, kind: str, used: NDArray[np.int64]) ->
     if "young" in raw.cell_data:  # which tells materials better than their groups do, with which they would be written
         groups = [group for group in groups if re.fullmatch(r"material_\d+", group.label) is None]
     for group in sorted(groups, key=lambda group: NAME.fullmatch(group.label) is None):  # who can keep his name does
-        name = _free_name(group.label, taken)
+        name = free_name(group.label, taken)
         if group.kind == kind:
             sets.cells[name] = group.members
         else:
@@ -167,17 +178,6 @@ def _sets_of_groups(raw: Raw, mesh: Mesh, kind: str, used: NDArray[np.int64]) ->
         if name != group.label:
             notes.append(f'"{group.label}" is the set {name} here')
     return sets, tuple(notes)
-
-
-def _free_name(label: str, taken: set[str]) -> str:
-    """A name like `label` that every format can carry and that differs from those taken by more than case."""
-    name = re.sub(r"[^A-Za-z0-9_-]", "_", label)
-    stem = (name if name[0].isalpha() else f"set_{name}")[:40]
-    name, number = stem, 1
-    while name.lower() in taken:
-        number += 1
-        name = f"{stem[: 39 - len(str(number))]}_{number}"
-    return name
 
 
 def _read_vtk(path: Path) -> Raw:
@@ -200,9 +200,8 @@ def _space(path: Path, field_data: dict[str, NDArray]) -> str:
     words = " ".join(text_in(field_data, name) or "" for name in ("space", "SPACE"))
     if path.suffix.lower() == ".vtk":
         with path.open("rb") as file:
-            words += (
-                file.read(600).partition(b"\n")[2].partition(b"\n")[0].partition(b"SPACE=")[2][:3].decode("latin-1")
-            )
+            file.readline()
+            words += file.readline(256).partition(b"SPACE=")[2][:3].decode("latin-1")
     return "lps" if "lps" in words.lower() else "ras"
 
 

@@ -26,7 +26,7 @@ GEOMETRIES = {1: SEGMENT, 2: TRIANGLE, 3: TETRAHEDRON}
 
 
 def mfem(model: Model) -> bytes:
-    """A MFEM mesh file; see the module for what is where.
+    """An MFEM mesh file; see the module for what is where.
 
     Nodes, elements and their order are those of the mesh. There is no cell data.
 

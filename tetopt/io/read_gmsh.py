@@ -27,7 +27,7 @@ def read_msh(path: Path) -> Raw:
             warnings.simplefilter("ignore")
             found = meshio.gmsh.read(path)
         return _msh(found, path.read_bytes())
-    except Exception as error:  # meshio raises whatever it stumbles over
+    except Exception as error:  # meshio raises whatever it stumbles over, and so do damaged sections of a file
         raise InputError(f"{path}: cannot be read as a gmsh mesh ({type(error).__name__})") from error
 
 

@@ -67,7 +67,7 @@ def sofa(model: Model) -> bytes:
         f'tetrahedra="\n{rows(mesh.cells)}"/>\n',
         '<TetrahedronSetGeometryAlgorithms template="Vec3"/>\n',
         '<MechanicalObject name="dofs" template="Vec3" position="@mesh.position"/>\n',
-        f'<DiagonalMass massDensity="{UNITS[model.units][4]!r}" topology="@mesh"/>\n',
+        f'<DiagonalMass massDensity="{UNITS[model.units].water!r}" topology="@mesh"/>\n',
         _force_field(materials),
         *(_constraint(load, nodes_of(mesh, model.sets.facets[load.set_name])) for load in model.loads),
         *_sets(model),

@@ -108,6 +108,8 @@ def model_grid(model: Model) -> pyvista.UnstructuredGrid:
         grid.cell_data["nu"] = model.materials.nu[of_cell]
         grid.cell_data["material"] = of_cell + 1
         texts["units"] = model.units
+        if model.materials.binning is not None:
+            texts["binning"] = model.materials.binning._asdict()
     if model.loads:
         texts["loads"] = [[load.set_name, load.displacement.tolist()] for load in model.loads]
     add_texts(grid, texts)

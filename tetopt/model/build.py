@@ -6,7 +6,7 @@ from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.fem.materials import (
@@ -35,8 +35,8 @@ def model_of(
     mesh: Mesh,
     image: Image | None = None,
     *,
-    young: str | Law | ByLabel | ArrayLike = None,
-    nu: str | Law | ByLabel | ArrayLike = None,
+    young: str | float | NDArray[np.float64] | Law | ByLabel = None,
+    nu: str | float | NDArray[np.float64] | Law | ByLabel = None,
     sets: Iterable[str] = (),
     loads: Iterable[str] = (),
     bins: int | None = None,
@@ -123,11 +123,11 @@ def labels_of(cell_data: dict[str, NDArray], n_cells: int) -> NDArray[np.int64] 
 
 def _values(
     given: Any, name: str, mesh: Mesh, image: Image | None, mean: NDArray[np.float64] | None, labels: NDArray | None
-) -> ArrayLike:
+) -> NDArray[np.float64]:
     """The value of each cell, or one for all."""
-    law = parse_any_law(given, name) if isinstance(given, str) else given
-    if isinstance(law, int | float | np.number) or (isinstance(law, np.ndarray) and law.ndim == 1):
-        return law
+    law: Any = parse_any_law(given, name) if isinstance(given, str) else given
+    if not callable(law) and not isinstance(law, ByLabel) and np.ndim(law) < 2:
+        return np.asarray(law, dtype=np.float64)
     if isinstance(law, ByLabel):
         return by_label(law, labels)
     if image is not None:  # the law of each voxel, and then the mean, as Eq. (2) wants it

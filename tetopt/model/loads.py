@@ -39,7 +39,7 @@ def parse_loads(texts: Iterable[str], mesh: Mesh, sets: Sets) -> tuple[Load, ...
     InputError
         Other words, a set that is not there, or a node that would go two ways.
     """
-    loads = tuple(load for text in texts for load in _parsed(text, mesh, sets))
+    loads = tuple(load for text in texts for load in _loads(text, mesh, sets))
     if loads and not any(load.displacement.any() for load in loads):
         raise InputError("load: everything is held and nothing moves; add move:SET:X,Y,Z")
     if len(loads) == 1:
@@ -56,56 +56,85 @@ def parse_loads(texts: Iterable[str], mesh: Mesh, sets: Sets) -> tuple[Load, ...
     return loads
 
 
-def _parsed(text: str, mesh: Mesh, sets: Sets) -> list[Load]:
+class Words(NamedTuple):
+    """A load as it is asked for."""
+
+    kind: str  # "hold", "move" or "compress"
+    name: str  # of the set; "" of a compression
+    numbers: NDArray[np.float64]  # displacement, mm, or per cent
+
+
+def parse_load(text: str, ndim: int) -> Words:
+    """A load from words, see `parse_loads`, before any set is looked for.
+
+    Raises
+    ------
+    InputError
+        Other words or numbers.
+    """
     kind, _, rest = text.partition(":")
-    n = mesh.ndim
-    if kind == "compress":
-        return _compression(rest, mesh, sets)
     if kind == "hold":
-        return [Load(_known(rest, sets), np.zeros(n))]
+        return Words(kind, rest, np.zeros(ndim))
     if kind == "move":
         name, _, vector = rest.rpartition(":")
-        try:
-            displacement = np.array([float(part) for part in vector.split(",")])
-        except ValueError:
-            displacement = np.empty(0)
-        if displacement.shape != (n,) or not np.isfinite(displacement).all():
-            raise InputError(f'load: expected move:SET: and {n} numbers in mm, got "{text}"')
-        return [Load(_known(name, sets), displacement)]
+        numbers = _numbers(vector)
+        if numbers.shape != (ndim,):
+            raise InputError(f'load: expected move:SET: and {ndim} numbers in mm, got "{text}"')
+        return Words(kind, name, numbers)
+    if kind == "compress":
+        percent = _numbers(rest.removesuffix("%"))
+        if not rest.endswith("%") or len(percent) != 1 or not 0.0 < percent[0] <= MOST:
+            raise InputError(f'load: expected compress:P% with P above 0 and up to {MOST:g}, got "{text}"')
+        return Words(kind, "", percent)
     raise InputError(f'load: expected compress:5%, hold:SET or move:SET:X,Y,Z, got "{text}"')
 
 
-def _known(name: str, sets: Sets) -> str:
+def _numbers(text: str) -> NDArray[np.float64]:
+    """Finite numbers between commas; none if there is anything else."""
+    try:
+        numbers = np.array([float(part) for part in text.split(",")])
+    except ValueError:
+        return np.empty(0)
+    return numbers if np.isfinite(numbers).all() else np.empty(0)
+
+
+def _loads(text: str, mesh: Mesh, sets: Sets) -> list[Load]:
+    words = parse_load(text, mesh.ndim)
+    if words.kind == "compress":
+        return _compression(float(words.numbers[0]), mesh, sets)
+    return [Load(known_set(words.name, sets), words.numbers)]
+
+
+def known_set(name: str, sets: Sets) -> str:
+    """The name of a facet set.
+
+    Raises
+    ------
+    InputError
+        There is none of that name.
+    """
     if name in sets.facets:
         return name
     if name in sets.cells:
-        raise InputError(
-            f'load: "{name}" is a set of cells; give one of facets, such as {", ".join(list(sets.facets)[:8])}'
-        )
-    near = difflib.get_close_matches(name, sets.facets, 1) or [
-        each for each in sets.facets if each.lower() == name.lower()
-    ]
+        first = ", ".join(list(sets.facets)[:8])
+        raise InputError(f'load: "{name}" is a set of cells; give one of facets, such as {first}')
+    near = [each for each in sets.facets if each.lower() == name.lower()]
+    near = near or difflib.get_close_matches(name, sets.facets, 1)
     hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(sets.facets)}"
     raise InputError(f'load: there is no set of facets "{name}"; {hint}')
 
 
-def _compression(text: str, mesh: Mesh, sets: Sets) -> list[Load]:
-    try:
-        percent = float(text.removesuffix("%"))
-    except ValueError:
-        percent = -1.0
-    if not text.endswith("%") or not 0.0 < percent <= MOST:
-        raise InputError(f'load: expected compress:P% with P above 0 and up to {MOST:g}, got "compress:{text}"')
+def _compression(percent: float, mesh: Mesh, sets: Sets) -> list[Load]:
     low, high = FACES[mesh.ndim][-1]
     if missing := [name for name in (low, high) if name not in sets.facets]:
         raise InputError(
             f"load: the mesh has no facets on the box's face {' and '.join(missing)}; give hold:SET and move:SET:X,Y,Z "
             f"of {', '.join(sets.facets)}"
         )
-    return [Load(high, np.zeros(mesh.ndim)), Load(low, 0.01 * percent * _thickness(mesh, sets, low, high))]
+    return [Load(high, np.zeros(mesh.ndim)), Load(low, 0.01 * percent * _across(mesh, sets, low, high))]
 
 
-def _thickness(mesh: Mesh, sets: Sets, low: str, high: str) -> NDArray[np.float64]:
+def _across(mesh: Mesh, sets: Sets, low: str, high: str) -> NDArray[np.float64]:
     """From one of two parallel faces to the other along their normal, (n,) mm."""
     corners = mesh.points[facet_triples(mesh.cells, sets.facets[low])]
     edges = corners[:, 1:] - corners[:, :1]

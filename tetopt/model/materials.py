@@ -5,7 +5,7 @@ Isotropic linear elasticity at the undeformed state, which is what one modulus a
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -14,7 +14,7 @@ from tetopt.errors import InputError
 from tetopt.fem.materials import ByLabel, checked_young
 
 Spacing = Literal["equal", "quantile", "log"]
-SPACINGS = ("equal", "quantile", "log")
+SPACINGS = get_args(Spacing)
 
 
 class BinningError(NamedTuple):
@@ -82,8 +82,8 @@ def by_label(law: ByLabel, labels: NDArray[np.integer] | None) -> NDArray[np.flo
     missing = [f"{label:g}" for label in found if label not in law.values]
     if missing and law.rest is None:
         raise InputError(
-            f"values by label: given for {', '.join(map(str, law.values))}, the mesh also has {len(missing)} others, "
-            f"{', '.join(missing)}; give these, too, or all of them as *=VALUE"
+            f"values by label: given for {', '.join(map(str, law.values))}, the mesh also has {', '.join(missing)} "
+            f"({len(missing)} more); give these, too, or all of them as *=VALUE"
         )
     return np.array([law.values.get(int(label), law.rest) for label in found], dtype=np.float64)[which.ravel()]
 

@@ -8,7 +8,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
-from tetopt.fem.materials import checked_young
 from tetopt.mesh import Mesh
 from tetopt.model.loads import Load
 from tetopt.model.materials import Materials
@@ -17,8 +16,18 @@ from tetopt.model.sets import Sets, outward_facet_nodes
 if TYPE_CHECKING:
     import skfem
 
-# What is consistent with mm: stress unit -> kPa in one of it, force, energy, mass, density of water.
-UNITS = {"kPa": (1.0, "mN", "uJ", "kg", 1e-6), "MPa": (1e3, "N", "mJ", "t", 1e-9)}
+
+class Units(NamedTuple):
+    """What is consistent with mm, s and a unit of stress."""
+
+    kPa: float  # in one of the unit
+    force: str
+    energy: str
+    mass: str
+    water: float  # density
+
+
+UNITS = {"kPa": Units(1.0, "mN", "uJ", "kg", 1e-6), "MPa": Units(1e3, "N", "mJ", "t", 1e-9)}
 SPACES = ("ras", "lps")
 # Local nodes of the edges whose midpoints are the quadratic tetrahedron's nodes 5 to 10, as in VTK, Abaqus and FEBio.
 EDGES = np.array([(0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)])
@@ -76,15 +85,14 @@ def in_units(model: Model, units: str) -> Model:
         raise InputError(f"units: expected {' or '.join(UNITS)}, got {units}")
     if model.materials is None or units == model.units:
         return model._replace(units=units)
-    scaled = model.materials.young * (UNITS[model.units][0] / UNITS[units][0])
-    checked_young(scaled)  # which may have underflowed
+    scaled = model.materials.young * (UNITS[model.units].kPa / UNITS[units].kPa)
     return model._replace(materials=model.materials._replace(young=scaled), units=units)
 
 
 def units_text(model: Model) -> str:
     """The consistent units of a file in words."""
-    _, force, energy, mass, _ = UNITS[model.units]
-    return f"mm, {model.units}, {force}, {energy}, {mass}, s"
+    units = UNITS[model.units]
+    return f"mm, {model.units}, {units.force}, {units.energy}, {units.mass}, s"
 
 
 def described(model: Model) -> list[str]:

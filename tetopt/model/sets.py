@@ -200,8 +200,7 @@ def with_asked(mesh: Mesh, sets: Sets, asked: Iterable[str], mean: NDArray[np.fl
     """
     for text in asked:
         wish = parse_set(text, mesh.ndim)
-        for each in wish.names():
-            _check_free(each, sets)
+        check_free(wish, sets)
         if wish.kind == "below":
             chosen = _below(mesh, wish, mean)
             sets = Sets(sets.facets | {f"{wish.name}_surface": around(mesh, chosen)}, sets.cells | {wish.name: chosen})
@@ -242,6 +241,8 @@ def parse_set(text: str, ndim: int) -> Wish:
     if len(parts) != len(counts):
         raise InputError(f'set {name}: expected {kind}:{form}, got "{rest}"')
     vectors = [_numbers(name, part, count) for part, count in zip(parts, counts, strict=True)]
+    if kind != "below" and vectors[-1][0] < 0.0:
+        raise InputError(f"set {name}: expected a distance of 0 or more, got {vectors[-1][0]:g}")
     if kind == "plane" and not vectors[1].any():
         raise InputError(f"set {name}: the plane's normal must not be 0")
     return Wish(name, kind, vectors)
@@ -254,10 +255,12 @@ def around(mesh: Mesh, chosen: NDArray[np.int64]) -> NDArray[np.int64]:
     return np.column_stack([chosen[rows[:, 0]], rows[:, 1]])
 
 
-def _check_free(name: str, sets: Sets) -> None:
+def check_free(wish: Wish, sets: Sets) -> None:
+    """InputError if a set that is asked for takes a name that there is."""
     taken = {other.lower(): other for other in (*sets.facets, *sets.cells)}
-    if name.lower() in taken:
-        raise InputError(f'set: there is a set "{taken[name.lower()]}" already; call it otherwise than "{name}"')
+    for name in wish.names():
+        if name.lower() in taken:
+            raise InputError(f'set: there is a set "{taken[name.lower()]}" already; call it otherwise than "{name}"')
 
 
 def _below(mesh: Mesh, wish: Wish, mean: NDArray[np.float64] | None) -> NDArray[np.int64]:
@@ -352,6 +355,17 @@ def carried(before: Mesh, given: Sets, mesh: Mesh) -> Sets:
     return Sets({name: rows for name, rows in found.items() if len(rows) == len(given.facets[name])}, {})
 
 
+def free_name(label: str, taken: set[str]) -> str:
+    """A name like `label` that every format can carry and that differs from those taken by more than case."""
+    name = re.sub(r"[^A-Za-z0-9_-]", "_", label)
+    stem = (name if name[0].isalpha() else f"set_{name}")[:40]
+    name, number = stem, 1
+    while name.lower() in taken:
+        number += 1
+        name = f"{stem[: 39 - len(str(number))]}_{number}"
+    return name
+
+
 def joined(standard: Sets, given: Sets) -> tuple[Sets, dict[str, str]]:
     """The standard sets and those that came with a mesh; and the new names of given ones whose names were taken.
 
@@ -363,10 +377,7 @@ def joined(standard: Sets, given: Sets) -> tuple[Sets, dict[str, str]]:
         for name, members in sets.items():
             if np.array_equal(standard[kind].get(name, np.empty(0)), members):
                 continue
-            free, number = name, 1
-            while free.lower() in {each.lower() for part in parts for each in part}:
-                number += 1
-                free = f"{name}_{number}"
+            free = free_name(name, {each.lower() for part in parts for each in part})
             parts[kind][free] = members
             if free != name:
                 renamed[name] = free

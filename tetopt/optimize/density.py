@@ -246,7 +246,7 @@ def _put_middle(
 ) -> bool:
     """Put the node p at the middle of an edge, or on the surface beside it.
 
-    False if that is on the boundary elsewhere, which stays, or the surface is not found.
+    False if that is on a boundary that is to stay, or the surface is not found.
     """
     found = _sides_of_edge(held, rings, sides, a, b)
     for d in range(3):
