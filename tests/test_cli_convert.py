@@ -141,7 +141,9 @@ def test_a_mesh_of_gmsh_s_is_measured_and_painted(folder, tmp_path, capsys):
     assert len(loaded.sets.facets["skin"]) == len(skin)
     assert len(loaded.sets.cells["tissue"]) == len(first.cells)
     assert run("quality", tmp_path / "g.msh", "--image", folder / "a.nii.gz", "--check") == 0
-    assert "fills the box" in capsys.readouterr().out
+    said = capsys.readouterr()
+    assert "fills the box" in said.out
+    assert f"{len(skin)} cells of lower dimension are left out" in said.err
     assert run("convert", tmp_path / "g.msh", tmp_path / "g.inp", "--young", LAW) == 2
     assert "the mesh has no means; give the image (--image)" in capsys.readouterr().err
     assert not (tmp_path / "g.inp").exists()

@@ -166,7 +166,7 @@ def test_fem(tmp_path, block, capsys):
 @pytest.mark.parametrize(
     ("options", "words"),
     [
-        (["--young", "1:2;3"], "expected pairs intensity:kPa"),
+        (["--young", "1:2;3"], "expected pairs intensity:value"),
         (["--young", "open('x')"], "cannot use"),
         (["--young", "h - 100"], "such as -50 at intensity 50"),
         (["--young", "0:1,100:1", "--compress", "200"], "--compress: expected a percentage"),

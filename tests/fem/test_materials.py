@@ -133,7 +133,7 @@ def test_inverse_strain_is_a_law():
         ),
         (
             lambda h: h.sum(),
-            "law: expected a function that returns one modulus for each intensity, got shape () for shape (3,)",
+            "law: expected a function that returns one value for each intensity, got shape () for shape (3,)",
         ),
     ],
 )

@@ -99,10 +99,12 @@ def file_and_volume(path: Path) -> tuple[Path, int | None]:
 
 
 def read_mesh(path: Path) -> MeshFile:
-    """A mesh of the user's, with a warning if its cells had to be turned."""
+    """A mesh of the user's; what had to be turned, left out or renamed is said."""
     loaded = load_mesh(path)
     if loaded.n_turned:
         show_warning(f"{path}: {loaded.n_turned} cells were inverted in the file and have been turned")
+    if loaded.n_left:
+        log.print(escape(f"{path}: {loaded.n_left} cells of lower dimension are left out"))
     for note in loaded.notes:
         log.print(escape(f"{path}: {note}"))
     return loaded

@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from numpy.typing import NDArray
 
+PER_LINE = 16  # more Abaqus does not take
+
 
 def rows(*columns: NDArray, separator: str = " ") -> str:
     """One line for each row of the arrays side by side, each (K,) or (K, w); floats so that they read back the same.
@@ -20,8 +22,8 @@ def rows(*columns: NDArray, separator: str = " ") -> str:
     return "".join(f"{separator.join(row)}\n" for row in zip(*texts, strict=True))
 
 
-def blocks(numbers: NDArray, per_line: int = 16, separator: str = " ") -> str:
-    """A list of numbers in lines of so many."""
+def blocks(numbers: NDArray, separator: str = " ") -> str:
+    """A list of numbers, `PER_LINE` in a line."""
     texts = list(map(repr, numbers.tolist()))
-    lines = (separator.join(texts[start : start + per_line]) for start in range(0, len(texts), per_line))
+    lines = (separator.join(texts[start : start + PER_LINE]) for start in range(0, len(texts), PER_LINE))
     return "".join(f"{line}\n" for line in lines)
