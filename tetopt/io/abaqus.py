@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from tetopt.errors import InputError
 from tetopt.io.tags import check_apart, material_names, without_cell_data
 from tetopt.io.text import blocks, rows
+from tetopt.model.materials import cells_of
 from tetopt.model.model import Model, described, quadratic, quadratic_facet_nodes
 from tetopt.model.sets import nodes_of
 
@@ -92,13 +93,12 @@ def _mesh(model: Model) -> list[str]:
 def _materials(model: Model) -> list[str]:
     if model.materials is None:
         return []
-    young, nu, of_cell = model.materials[:3]
-    cells = np.split(np.argsort(of_cell, kind="stable"), np.cumsum(np.bincount(of_cell, minlength=len(young)))[:-1])
-    constants = rows(_fitting(young), _fitting(nu), separator=", ").splitlines()
+    made = model.materials
+    constants = rows(_fitting(made.young), _fitting(made.nu), separator=", ").splitlines()
     return [
         f"*ELSET, ELSET={name}\n{_list(members)}"
         f"*MATERIAL, NAME={name}\n*ELASTIC\n{pair}\n*SOLID SECTION, ELSET={name}, MATERIAL={name}\n"
-        for name, members, pair in zip(material_names(model, {}), cells, constants, strict=True)
+        for name, members, pair in zip(material_names(model, {}), cells_of(made), constants, strict=True)
     ]
 
 

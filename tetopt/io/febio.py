@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from tetopt.errors import InputError
 from tetopt.io.text import rows
 from tetopt.model.loads import Load
-from tetopt.model.materials import Materials
+from tetopt.model.materials import Materials, cells_of
 from tetopt.model.model import UNITS, Model, described, quadratic, quadratic_facet_nodes
 from tetopt.model.sets import facet_triples
 
@@ -120,10 +120,9 @@ def _parts(given: Materials) -> list[_Part]:
     young, nu, of_cell = given.young, given.nu, given.of_cell
     if len(young) > MOST_PARTS:
         return [_Part(CELLS, YOUNG, NU if np.ptp(nu) > 0.0 else repr(float(nu[0])), np.arange(len(of_cell)))]
-    cells = np.split(np.argsort(of_cell, kind="stable"), np.cumsum(np.bincount(of_cell, minlength=len(young)))[:-1])
     return [
         _Part(f"material {k + 1}", repr(float(young[k])), repr(float(nu[k])), members)
-        for k, members in enumerate(cells)
+        for k, members in enumerate(cells_of(given))
         if len(members)
     ]
 

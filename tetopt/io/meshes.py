@@ -21,7 +21,7 @@ from tetopt.io.raw import DIMENSIONS, Raw
 from tetopt.io.read_gmsh import read_msh
 from tetopt.io.vtk import add_texts, box_in, sets_in, text_in, to_pyvista, vtu_bytes
 from tetopt.mesh import Mesh
-from tetopt.model.model import UNITS
+from tetopt.model.model import UNITS, half_turn
 from tetopt.model.sets import NAME, Box, Sets, free_name, rows_of
 
 SUFFIXES = (".vtu", ".vtk", ".msh", ".msh2")
@@ -100,7 +100,7 @@ def load_mesh(path: str | Path) -> MeshFile:
     if n == 2 and np.any(points[used, 2] != 0.0):
         raise InputError(f"{path}: a mesh of triangles must lie in the plane z = 0; surfaces in space are not meshed")
     if n == 3 and raw.space == "lps":
-        points = points * np.array([-1.0, -1.0, 1.0]) + 0.0  # + 0.0: no -0
+        points = half_turn(points)
     corners, cells = points[used, :n], compact.reshape(cells.shape)
     with np.errstate(invalid="ignore"):  # infinite coordinates, which Mesh refuses in words
         turned = oriented(corners, cells)

@@ -10,7 +10,7 @@ import numpy as np
 from tetopt.errors import InputError
 from tetopt.geometry.surface import Surface, surface_of
 from tetopt.io.files import written_whole
-from tetopt.model.model import Model
+from tetopt.model.model import Model, half_turn
 
 SUFFIXES = (".stl", ".ply")
 
@@ -51,7 +51,7 @@ def save_surface(path: str | Path, surface: Surface, about: str = "", space: str
     if path.suffix.lower() not in writers:
         raise InputError(f"{path}: expected a surface named {' or '.join(SUFFIXES)}")
     if space == "lps":
-        surface = surface._replace(points=surface.points * np.array([-1.0, -1.0, 1.0]) + 0.0)  # + 0.0: no -0
+        surface = surface._replace(points=half_turn(surface.points))
     content = writers[path.suffix.lower()](surface, about, space)
     with written_whole(path) as temporary:
         temporary.write_bytes(content)

@@ -68,6 +68,12 @@ def _of_cells(name: str, values: ArrayLike, n_cells: int) -> NDArray[np.float64]
     return array
 
 
+def cells_of(made: Materials) -> list[NDArray[np.int64]]:
+    """The cells of each material, ascending."""
+    ends = np.cumsum(np.bincount(made.of_cell, minlength=len(made.young)))
+    return np.split(np.argsort(made.of_cell, kind="stable"), ends[:-1])
+
+
 def by_label(law: ByLabel, labels: NDArray[np.integer] | None) -> NDArray[np.float64]:
     """The value that each cell's label has, (M,) float64.
 

@@ -67,10 +67,14 @@ def in_space(model: Model, space: str) -> Model:
         return model
     if model.mesh.ndim == 2:
         raise InputError("space: a mesh of triangles has coordinates in its own plane; leave out --space")
-    turn = np.array([-1.0, -1.0, 1.0])
-    loads = tuple(Load(load.set_name, load.displacement * turn + 0.0) for load in model.loads)
-    mesh = Mesh(model.mesh.points * turn + 0.0, model.mesh.cells)  # + 0.0: no -0
+    loads = tuple(Load(load.set_name, half_turn(load.displacement)) for load in model.loads)
+    mesh = Mesh(half_turn(model.mesh.points), model.mesh.cells)
     return model._replace(mesh=mesh, loads=loads, space=space)
+
+
+def half_turn(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Vectors (..., 3) turned about z: from RAS+ to LPS+ or back."""
+    return vectors * np.array([-1.0, -1.0, 1.0]) + 0.0  # + 0.0: no -0
 
 
 def in_units(model: Model, units: str) -> Model:
