@@ -25,16 +25,16 @@ import numpy as np
 from scipy.spatial import Delaunay
 
 import tetopt
-from tetopt.content import plain
 from tetopt.energy.sampling import from_ticks, moment_sums, sampling_grid, to_ticks
+from tetopt.engine.fast import GRADED_K_D, _Run, prepare_kernels
+from tetopt.engine.flips import flip
 from tetopt.geometry.simplex import dihedral_angles, oriented, rho, volumes
 from tetopt.geometry.topology import facets
 from tetopt.io.files import checked_output, save_json
 from tetopt.io.mni import mni_path
-from tetopt.optimize.fast import GRADED_K_D, _Run, prepare_kernels
-from tetopt.optimize.flips import flip
-from tetopt.optimize.retessellate import delaunay
 from tetopt.report.summary import versions
+from tetopt.start.delaunay import delaunay
+from tetopt.target.content import plain
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -173,7 +173,7 @@ def graded_large(path: Path, nodes: int) -> dict[str, Any]:
     """The same in a process of its own on a volume of 256^3 voxels, padded by zeros and cut: loading, time, memory."""
     program = (
         "import json, resource, sys, time, numpy as np, tetopt\n"
-        "from tetopt.optimize.fast import GRADED_K_D, prepare_kernels\n"
+        "from tetopt.engine.fast import GRADED_K_D, prepare_kernels\n"
         "image = tetopt.load_image(sys.argv[1])\n"
         "data = np.pad(image.data, [(0, max(256 - s, 0)) for s in image.shape])[:256, :256, :256]\n"
         "image = tetopt.Image(data, image.affine)\n"
@@ -245,7 +245,7 @@ def in_a_child(path: Path, nodes: int) -> dict[str, Any]:
     """Defaults at k_D = 0.5 in a process of its own, for its peak of memory."""
     program = (
         "import json, resource, sys, time, numpy as np, tetopt\n"
-        "from tetopt.optimize.fast import prepare_kernels\n"
+        "from tetopt.engine.fast import prepare_kernels\n"
         "peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6\n"
         "image = tetopt.load_image(sys.argv[1])\n"
         "prepare_kernels(image, 0.5)\n"

@@ -17,10 +17,10 @@ from typing import Any
 import numpy as np
 
 import tetopt
-from tetopt.experiments.compare import Settings, default_law, measured, prepared
 from tetopt.fem.reference import averaged
 from tetopt.io.files import checked_output, save_json
-from tetopt.segmentation import thresholded
+from tetopt.measure.segmentation import thresholded
+from tetopt.study.compare import Settings, default_law, measured, prepared
 
 PHANTOMS = ("sphere", "two_spheres", "ellipsoids_brain")
 ERRORS = ("strain_energy", "displacement", "interface_strain")

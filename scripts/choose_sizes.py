@@ -19,9 +19,9 @@ import numpy as np
 from choose_k_d import ERRORS, PHANTOMS, cases
 
 import tetopt
-from tetopt.experiments.compare import Setting, Settings, default_law, measured, prepared
 from tetopt.io.files import checked_output, save_json
-from tetopt.optimize.sizes import COARSEST
+from tetopt.start.sizes import COARSEST
+from tetopt.study.compare import Setting, Settings, default_law, measured, prepared
 
 NU = "0.3"
 

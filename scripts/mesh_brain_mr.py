@@ -17,10 +17,10 @@ import numpy as np
 import trimesh
 
 import tetopt
+from tetopt.engine.loop import Record
 from tetopt.geometry.topology import boundary_facets, components, facets
 from tetopt.io.files import checked_output, save_json, written_whole
 from tetopt.io.images import sha256
-from tetopt.optimize.paper import Record
 from tetopt.report.figures import save_run_figures
 from tetopt.report.scene import save_scenes, structure_before_slices
 from tetopt.report.summary import run_summary

@@ -23,9 +23,9 @@ import tetopt.cli
 from tetopt import Image, Mesh, lattice, load_image, load_mesh, load_phantom, quality, save_image, save_mesh
 from tetopt.cli import main
 from tetopt.geometry.simplex import volumes
+from tetopt.measure.segmentation import dice, segmented
 from tetopt.phantom import phantom_names
 from tetopt.report.summary import mesh_hash
-from tetopt.segmentation import dice, segmented
 
 OBLIQUE_TOML = """
 name = "oblique"

@@ -2,28 +2,28 @@
 
 __version__ = "0.1.0"
 
-from tetopt.align import aligned_contrast, aligned_labels, aligned_mask, foreground
 from tetopt.check import check_mesh
-from tetopt.content import content
 from tetopt.energy.discretization import E_D
 from tetopt.energy.geometric import E_G
 from tetopt.energy.sampling import cell_moments, cell_of_voxel
+from tetopt.engine.fast import mesh_image, optimize
+from tetopt.engine.paper import optimize_paper
 from tetopt.errors import InputError
-from tetopt.fidelity import cell_labels, label_fidelity, mask_fidelity
-from tetopt.geometry.quality import quality
 from tetopt.image import Image
 from tetopt.io.formats import save_model
 from tetopt.io.images import load_image, save_image
 from tetopt.io.meshes import load_mesh, save_mesh
-from tetopt.lattice import lattice
+from tetopt.measure.fidelity import cell_labels, label_fidelity, mask_fidelity
+from tetopt.measure.quality import quality
 from tetopt.mesh import Mesh
 from tetopt.model.build import model_of
 from tetopt.model.fields import cell_fields
-from tetopt.optimize.fast import mesh_image, optimize
-from tetopt.optimize.octree import octree
-from tetopt.optimize.paper import optimize_paper
-from tetopt.optimize.sizes import Sizes
 from tetopt.phantom import load_phantom
+from tetopt.start.lattice import lattice
+from tetopt.start.octree import octree
+from tetopt.start.sizes import Sizes
+from tetopt.target.align import aligned_contrast, aligned_labels, aligned_mask, foreground
+from tetopt.target.content import content
 
 __all__ = [
     "E_D",

@@ -9,7 +9,6 @@ from skfem.models.elasticity import lame_parameters, linear_elasticity
 
 import tetopt
 from tetopt.fem.elasticity import box_faces, compression
-from tetopt.fem.materials import cell_young
 from tetopt.fem.reference import (
     Reference,
     averaged,
@@ -20,6 +19,7 @@ from tetopt.fem.reference import (
     nearest,
     reference,
 )
+from tetopt.model.laws import cell_young
 
 SHEARED = np.array([[1.5, 0.3, -0.2], [0.1, 2.0, 0.4], [0.2, -0.3, 0.8]])
 

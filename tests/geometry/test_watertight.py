@@ -13,7 +13,7 @@ from tetopt.geometry.simplex import facet_areas, oriented, volumes
 from tetopt.geometry.surface import STEP, n_pieces, surface_of, volume_and_area
 from tetopt.geometry.topology import boundary_facets
 from tetopt.image import Image
-from tetopt.lattice import lattice
+from tetopt.start.lattice import lattice
 
 # Cells 0 1 2 3 and 0 1 4 5 share the edge 0 1, on either side of the plane x = 0; the third shares the node 3 alone.
 TOUCHING = (

@@ -22,9 +22,9 @@ from tetopt.image import Image
 from tetopt.io.images import save_image
 from tetopt.io.meshes import load_mesh, save_mesh
 from tetopt.io.vtk import to_pyvista
-from tetopt.lattice import lattice
 from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields
+from tetopt.start.lattice import lattice
 
 OPTIONS = {"k_D": 0.2, "n_t": None, "crop": "ä"}
 ABOUT = {"tetopt": "0.1.0", "image": "Schädel [1].nii.gz", "image_sha256": "ab" * 32, "options": OPTIONS}

@@ -17,7 +17,7 @@ from tetopt.geometry.surface import Surface, n_pieces, surface_of, volume_and_ar
 from tetopt.geometry.topology import boundary_facets
 from tetopt.image import Image
 from tetopt.io.surfaces import checked_surface, save_surface
-from tetopt.lattice import lattice
+from tetopt.start.lattice import lattice
 
 # Two cells that share the edge 0 1, far from the origin
 EDGE = (

@@ -10,7 +10,6 @@ from tetopt.errors import InputError
 from tetopt.geometry.topology import facets
 from tetopt.model.model import in_space
 from tetopt.model.sets import Sets, around, facet_triples
-from tetopt.model.skfem import to_skfem
 
 skfem = pytest.importorskip("skfem", reason="no scikit-fem (pip install scikit-fem)")
 
@@ -42,7 +41,7 @@ def outward(model, rows):
 
 
 def test_nodes_and_cells_are_the_same_in_the_same_order(model):
-    mesh = to_skfem(model)
+    mesh = model.to_skfem()
     assert isinstance(mesh, skfem.MeshTet if model.mesh.ndim == 3 else skfem.MeshTri)
     assert np.array_equal(mesh.p.T, model.mesh.points)
     cells = model.mesh.cells if model.mesh.ndim == 3 else np.sort(model.mesh.cells, axis=1)
@@ -50,7 +49,7 @@ def test_nodes_and_cells_are_the_same_in_the_same_order(model):
 
 
 def test_sets_are_boundaries_and_subdomains_of_their_names(model):
-    mesh = to_skfem(model)
+    mesh = model.to_skfem()
     assert list(mesh.boundaries) == list(model.sets.facets)
     for name, rows in model.sets.facets.items():
         found = mesh.facets[:, mesh.boundaries[name]].T
@@ -61,7 +60,7 @@ def test_sets_are_boundaries_and_subdomains_of_their_names(model):
 
 
 def test_a_facet_between_two_cells_is_held_by_the_sets_own(model):
-    mesh = to_skfem(model)
+    mesh = model.to_skfem()
     shared = facets(model.mesh.cells)
     element = skfem.ElementTetP1() if model.mesh.ndim == 3 else skfem.ElementTriP1()
     for name, rows in model.sets.facets.items():
@@ -78,7 +77,7 @@ def test_a_facet_between_two_cells_is_held_by_the_sets_own(model):
 
 def test_a_model_without_sets_has_none():
     model = sample_model()
-    mesh = to_skfem(model._replace(sets=Sets({}, {}), loads=()))
+    mesh = model._replace(sets=Sets({}, {}), loads=()).to_skfem()
     assert not mesh.boundaries
     assert not mesh.subdomains
 
@@ -87,15 +86,15 @@ def test_what_cannot_be_had_is_said(monkeypatch):
     with pytest.raises(
         InputError, match=r"^to_skfem: expected linear cells, got order 2; .*P2 elements in scikit-fem$"
     ):
-        to_skfem(sample_model()._replace(order=2))
+        sample_model()._replace(order=2).to_skfem()
     monkeypatch.setitem(sys.modules, "skfem", None)
     with pytest.raises(InputError, match=r"^to_skfem: scikit-fem is not installed; pip install scikit-fem$"):
-        to_skfem(sample_model())
+        sample_model().to_skfem()
 
 
 def test_nothing_is_shared_with_the_model():
     model = sample_model()
     before = model.sets.cells["label_0"].copy()
-    found = to_skfem(model)
+    found = model.to_skfem()
     found.subdomains["label_0"][:] = 7
     assert np.array_equal(model.sets.cells["label_0"], before)

@@ -9,13 +9,13 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_rgb, to_rgba, to_rgba_array
 
 from tetopt.energy.sampling import cell_moments, cell_of_voxel
+from tetopt.engine.loop import Optimized, Record
+from tetopt.engine.paper import optimize_paper
 from tetopt.errors import InputError
-from tetopt.fidelity import cell_labels
-from tetopt.geometry.quality import rho_histogram
 from tetopt.image import Image
-from tetopt.lattice import lattice
+from tetopt.measure.fidelity import cell_labels
+from tetopt.measure.quality import rho_histogram
 from tetopt.mesh import Mesh
-from tetopt.optimize.paper import Optimized, Record, optimize_paper
 from tetopt.report import figures
 from tetopt.report.colours import BACKGROUND, LISTED, PALETTE, UNCOVERED, label_colours, legend_patches
 from tetopt.report.figures import (
@@ -29,6 +29,7 @@ from tetopt.report.figures import (
     save_run_figures,
     slice_figure,
 )
+from tetopt.start.lattice import lattice
 
 SHAPE = (5, 7, 9)
 SPACING = (2.0, 1.0, 3.0)

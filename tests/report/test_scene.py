@@ -5,7 +5,7 @@ import PIL.Image
 import pytest
 
 import tetopt
-from tetopt.fidelity import cell_labels
+from tetopt.measure.fidelity import cell_labels
 from tetopt.report import scene
 from tetopt.report.colours import label_colours
 from tetopt.report.scene import (

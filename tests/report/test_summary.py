@@ -10,13 +10,13 @@ import pytest
 import tetopt
 from tetopt.energy.discretization import E_D
 from tetopt.energy.geometric import E_G
-from tetopt.geometry.quality import quality
+from tetopt.engine.paper import optimize_paper
 from tetopt.image import Image
 from tetopt.io.files import save_json
-from tetopt.lattice import lattice
+from tetopt.measure.quality import quality
 from tetopt.mesh import Mesh
-from tetopt.optimize.paper import optimize_paper
 from tetopt.report.summary import SHOWN_VERSIONS, image_summary, mesh_hash, run_summary, versions
+from tetopt.start.lattice import lattice
 
 AFFINE = np.array([[0.0, 2.0, 5.0], [-1.5, 0.5, 7.0], [0.0, 0.0, 1.0]])  # 1.5 and sqrt(4.25) mm, 3 mm^2
 

@@ -7,7 +7,7 @@ import re
 import numpy as np
 import PIL.Image
 import pytest
-from test_compare_page import browser
+from browser import browser
 
 import tetopt
 from tetopt.errors import InputError

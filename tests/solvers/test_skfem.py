@@ -8,7 +8,6 @@ from tetopt.fem.elasticity import compression
 from tetopt.model.materials import materials
 from tetopt.model.model import in_space, in_units
 from tetopt.model.sets import nodes_of
-from tetopt.model.skfem import to_skfem
 
 skfem = pytest.importorskip("skfem", reason="no scikit-fem (pip install scikit-fem)")
 elasticity = pytest.importorskip("skfem.models.elasticity")
@@ -23,7 +22,7 @@ def with_one_ratio(model):
 
 def pressed(model):
     """Displacement (N, n) and strain energy by scikit-fem, loads as in the model."""
-    mesh, n = to_skfem(model), model.mesh.ndim
+    mesh, n = model.to_skfem(), model.mesh.ndim
     linear, constant = {
         2: (skfem.ElementTriP1(), skfem.ElementTriP0()),
         3: (skfem.ElementTetP1(), skfem.ElementTetP0()),

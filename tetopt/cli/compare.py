@@ -17,10 +17,10 @@ from tetopt.cli.console import log, out
 from tetopt.cli.inputs import read_labels, read_volume, results_folder
 from tetopt.cli.options import CropOption, ForceOption, ImageArgument, JsonOption, VolumeOption
 from tetopt.cli.quality import image_fit
-from tetopt.geometry.quality import quality
 from tetopt.io.files import checked_output, save_json
 from tetopt.io.images import sha256
 from tetopt.io.mni import mni_path, mni_tissue
+from tetopt.measure.quality import quality
 from tetopt.model.fields import cell_fields
 from tetopt.report.tables import add_quality, new_table
 
@@ -42,7 +42,7 @@ def paper_command(
     force: ForceOption = False,
 ) -> int:
     """Run the paper's figures and table again: paper.json, pictures, a page with each printed number beside ours."""
-    from tetopt.experiments import run_paper
+    from tetopt.study import paper_files
 
     if seeds < 1:
         raise InputError(f"--seeds: expected 1 or more, got {seeds}")
@@ -50,10 +50,10 @@ def paper_command(
     tissue = None if labels_path is None else read_labels(labels_path, volume)
     if image_path is None and labels_path is None:
         tissue = mni_tissue()
-    run_paper.check_inputs(volume, tissue)
+    paper_files.check_inputs(volume, tissue)
     if tissue is None:
         log.print("no --labels: the section on approximate segmentation is left out")
-    paths = run_paper.outputs(results_folder(output), force)
+    paths = paper_files.outputs(results_folder(output), force)
     source = mni_path("t1") if image_path is None else image_path
     about = {
         "image": source.name,
@@ -62,7 +62,7 @@ def paper_command(
     }
     if labels_path is not None:
         about["labels"] = labels_path.name
-    results = run_paper.run(paths, about, volume, tissue, seeds, lambda text: log.print(escape(text)))
+    results = paper_files.run(paths, about, volume, tissue, seeds, lambda text: log.print(escape(text)))
     out.print(escape(f"{paths['paper.html']}: the paper's numbers beside ours, in {results['seconds']:.0f} s"))
     return 0
 
@@ -82,7 +82,7 @@ def baseline_command(
     force: ForceOption = False,
 ) -> int:
     """Mesh an image the conventional way, to compare with: segment, extract surfaces, tetrahedralise."""
-    from tetopt.baseline.pipelines import PIPELINES, Job
+    from tetopt.study.pipelines import PIPELINES, Job
 
     output = checked_output(output, (".vtu",), force)
     if json_path is not None:
@@ -149,8 +149,8 @@ def compare_command(
     force: ForceOption = False,
 ) -> int:
     """Set tetopt beside the conventional pipelines on a volume: fidelity, shape, simulation accuracy, time."""
-    from tetopt.experiments import compare, run_compare
-    from tetopt.fem.materials import parse_law
+    from tetopt.model.laws import parse_law
+    from tetopt.study import compare, compare_files
 
     if not 0.0 <= k_D < 1.0:
         raise InputError(f"--k-d: expected 0 <= k_D < 1, got {k_D}")
@@ -173,12 +173,12 @@ def compare_command(
         else {"name": labels_path.name, "kind": "given", "sha256": sha256(labels_path)},
         "law": law_words,
     }
-    paths = run_compare.outputs(results_folder(output), force or resume)
+    paths = compare_files.outputs(results_folder(output), force or resume)
     if (output / "runs").is_dir() and not (resume or force):
         raise InputError(f"{output / 'runs'}: finished runs are there; --resume keeps them, --force starts over")
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that the child is ended with us
     try:
-        results = run_compare.run(
+        results = compare_files.run(
             paths, about, image, labels, law, settings, lambda text: log.print(escape(text)), resume=resume
         )
     except KeyboardInterrupt:

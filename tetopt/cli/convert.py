@@ -11,7 +11,6 @@ import typer
 from rich.markup import escape
 
 from tetopt import Image, InputError
-from tetopt.align import aligned_mask
 from tetopt.cli.console import log
 from tetopt.cli.inputs import check_no_input, image_and_others, read_mesh, warn_of_other_image
 from tetopt.cli.options import (
@@ -31,7 +30,6 @@ from tetopt.cli.options import (
     YoungOption,
 )
 from tetopt.cli.solver import Wishes, all_sets, built, checked_wishes, print_model, save_wished
-from tetopt.content import continued
 from tetopt.io.files import checked_output, save_json
 from tetopt.io.formats import FORMATS, format_of
 from tetopt.io.images import sha256
@@ -40,6 +38,8 @@ from tetopt.io.vtk import box_text
 from tetopt.model.fields import cell_fields
 from tetopt.model.sets import box_of
 from tetopt.report.summary import model_summary, versions
+from tetopt.target.align import aligned_mask
+from tetopt.target.content import continued
 
 TEXTS = ("image", "image_sha256", "inputs", "options")  # of a mesh's file that go on into the new one
 

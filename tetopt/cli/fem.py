@@ -48,9 +48,9 @@ def fem_command(
     their nodes cannot slide sideways. In 2-D y takes the place of z, in plane stress, 1 mm thick. Linear cells lock
     near nu = 0.5: above 0.49 they are far too stiff.
     """
-    from tetopt.experiments.paper import simulate
     from tetopt.fem.elasticity import strains
-    from tetopt.fem.materials import parse_law
+    from tetopt.model.laws import parse_law
+    from tetopt.study.paper import simulate
 
     if json_path is not None:
         json_path = checked_output(json_path, (".json",), force)

@@ -12,11 +12,11 @@ from numpy.typing import NDArray
 from rich.markup import escape
 
 from tetopt import Image, InputError, load_image, load_mesh
-from tetopt.align import aligned_contrast, is_same_grid
 from tetopt.cli.console import log, show_warning
-from tetopt.content import check_labels
 from tetopt.io.images import parse_crop, parse_slice, part_of, sha256
 from tetopt.io.meshes import MeshFile
+from tetopt.target.align import aligned_contrast, is_same_grid
+from tetopt.target.content import check_labels
 
 INSIDE = 0.95  # of a mask or of labels that lies in the image, to expect
 

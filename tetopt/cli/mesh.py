@@ -50,25 +50,26 @@ from tetopt.cli.solver import (
     save_wished,
 )
 from tetopt.cli.source import Source, read_source
-from tetopt.content import Content, continued
-from tetopt.domain import lattice_within
-from tetopt.fidelity import cell_labels
-from tetopt.geometry.quality import quality
+from tetopt.engine.fast import FIRST, GRADED_ITERATIONS, GRADED_K_D, check_options, meshed_to_error
+from tetopt.engine.loop import Optimized
+from tetopt.engine.paper import default_n_t
 from tetopt.geometry.simplex import centroids, squared_edges
 from tetopt.io.files import checked_output, save_json
 from tetopt.io.formats import FORMATS, format_of
 from tetopt.io.meshes import MeshFile
 from tetopt.io.mni import mni_path
 from tetopt.io.vtk import box_text
-from tetopt.lattice import KINDS
+from tetopt.measure.fidelity import cell_labels
+from tetopt.measure.quality import quality
 from tetopt.model.fields import cell_fields
 from tetopt.model.model import Model
 from tetopt.model.sets import Sets, box_of, carried
-from tetopt.optimize.fast import FIRST, GRADED_ITERATIONS, GRADED_K_D, check_options, meshed_to_error
-from tetopt.optimize.octree import nearest_octree, octree
-from tetopt.optimize.paper import Optimized, default_n_t
 from tetopt.report.summary import fidelity, model_summary, run_summary
 from tetopt.report.tables import add_quality, new_table
+from tetopt.start.clip import lattice_within
+from tetopt.start.lattice import KINDS
+from tetopt.start.octree import nearest_octree, octree
+from tetopt.target.content import Content, continued
 
 DEFAULT_NODES = {2: 500, 3: 5000}
 UNIFORM_K_D = 0.2

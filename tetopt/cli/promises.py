@@ -8,9 +8,9 @@ import tetopt
 from tetopt import Mesh
 from tetopt.cli.console import log, show_warning
 from tetopt.cli.options import Method
-from tetopt.content import Content
+from tetopt.engine.loop import Optimized
 from tetopt.geometry.simplex import dihedral_angles, volumes
-from tetopt.optimize.paper import Optimized
+from tetopt.target.content import Content
 
 MISSED = 0.9  # Dice of a mesh with its mask: below, the mesh is not of the mask
 POOR = 0.5  # Dice of a label that its cells hardly show

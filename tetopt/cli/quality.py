@@ -11,16 +11,16 @@ from rich.markup import escape
 
 import tetopt
 from tetopt import Image, InputError, Mesh
-from tetopt.align import aligned_labels, aligned_mask
 from tetopt.cli.console import log, out, print_fidelity
 from tetopt.cli.inputs import image_and_others, read_mesh, warn_of_other_image
 from tetopt.cli.options import CropOption, ForceOption, JsonOption, SliceOption, VolumeOption
-from tetopt.content import continued
-from tetopt.geometry.quality import quality
 from tetopt.io.files import checked_output, save_json
 from tetopt.io.meshes import MeshFile
+from tetopt.measure.quality import quality
 from tetopt.report.summary import fidelity
 from tetopt.report.tables import add_quality, new_table
+from tetopt.target.align import aligned_labels, aligned_mask
+from tetopt.target.content import continued
 
 
 def quality_command(

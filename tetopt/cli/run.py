@@ -14,9 +14,10 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, T
 from tetopt import Mesh
 from tetopt.cli.console import log
 from tetopt.cli.options import Method
-from tetopt.content import Content
-from tetopt.optimize.fast import optimize, prepare_kernels
-from tetopt.optimize.paper import Optimized, Record, optimize_paper
+from tetopt.engine.fast import optimize, prepare_kernels
+from tetopt.engine.loop import Optimized, Record
+from tetopt.engine.paper import optimize_paper
+from tetopt.target.content import Content
 
 
 def watched_optimize(

@@ -33,7 +33,7 @@ def segment_command(
     force: ForceOption = False,
 ) -> int:
     """Segment an image by its mesh, fast and roughly: cells grouped by mean into K classes, painted to the voxels."""
-    from tetopt.segmentation import dice, segmented, stands_for, thresholded
+    from tetopt.measure.segmentation import dice, segmented, stands_for, thresholded
 
     output = checked_output(output, (".nii", ".nii.gz"), force)
     check_no_input(output, image_path, truth_path)

@@ -14,9 +14,9 @@ from rich.markup import escape
 import tetopt
 from tetopt import Image, InputError, Mesh
 from tetopt.cli.console import log, out, print_wide
-from tetopt.fem.materials import parse_any_law
 from tetopt.io.formats import FORMATS, content_of, format_of, save_model
 from tetopt.model.build import labels_of, model_of
+from tetopt.model.laws import parse_any_law
 from tetopt.model.loads import known_set, parse_load
 from tetopt.model.materials import Spacing
 from tetopt.model.model import SPACES, UNITS, Model

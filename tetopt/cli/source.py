@@ -8,11 +8,11 @@ from typing import Any, NamedTuple
 import numpy as np
 
 from tetopt import Image, InputError
-from tetopt.align import aligned_contrast, aligned_labels, aligned_mask, background_level, foreground
 from tetopt.cli.console import log
 from tetopt.cli.inputs import file_and_volume, image_and_others
-from tetopt.content import Content, content
 from tetopt.io.images import sha256
+from tetopt.target.align import aligned_contrast, aligned_labels, aligned_mask, background_level, foreground
+from tetopt.target.content import Content, content
 
 
 class Source(NamedTuple):

@@ -31,11 +31,11 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from tetopt.content import Content
 from tetopt.errors import InputError
 from tetopt.geometry.topology import Facets, facets
 from tetopt.image import Image
 from tetopt.mesh import Mesh
+from tetopt.target.content import Content
 
 CHUNK = 64  # facets or cells that a parallel task takes at once
 

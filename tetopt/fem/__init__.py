@@ -1,1 +1,1 @@
-"""Finite elements on the mesh: elastic moduli from intensities, linear elasticity, strain energy, conditioning."""
+"""Finite elements on the mesh: linear elasticity, strain energy, conditioning, the voxel reference."""

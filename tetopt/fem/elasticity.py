@@ -27,11 +27,11 @@ from scipy.sparse.linalg import LinearOperator, cg, splu
 
 from tetopt.check import ON_FACE, check_unfolded, facets_on_box
 from tetopt.errors import InputError
-from tetopt.fem.materials import checked_young
 from tetopt.fem.rigidity import check_held, rigid_modes
 from tetopt.geometry.simplex import volume_gradients, volumes
 from tetopt.image import Image
 from tetopt.mesh import Mesh
+from tetopt.model.laws import checked_young
 
 Method = Literal["auto", "direct", "amg"]
 

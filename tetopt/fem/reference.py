@@ -45,7 +45,7 @@ class Errors(NamedTuple):
 
 
 def reference(modulus: Image, nu: float, percent: float = 1.0) -> Reference:
-    """Hold the box's top, push its bottom in, both bonded: `tetopt.experiments.paper.simulate` on the voxels.
+    """Hold the box's top, push its bottom in, both bonded: `tetopt.study.paper.simulate` on the voxels.
 
     Parameters
     ----------

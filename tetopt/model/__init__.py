@@ -1,1 +1,1 @@
-"""What a solver is told beside the mesh: named sets, materials, loads, units."""
+"""What a solver is told beside the mesh: named sets, laws and materials, loads, units."""

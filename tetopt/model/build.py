@@ -9,7 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
-from tetopt.fem.materials import (
+from tetopt.geometry.simplex import volumes
+from tetopt.image import Image
+from tetopt.mesh import Mesh
+from tetopt.model.fields import cell_fields
+from tetopt.model.laws import (
     ByLabel,
     Law,
     cell_values,
@@ -19,10 +23,6 @@ from tetopt.fem.materials import (
     parse_any_law,
     young_from,
 )
-from tetopt.geometry.simplex import volumes
-from tetopt.image import Image
-from tetopt.mesh import Mesh
-from tetopt.model.fields import cell_fields
 from tetopt.model.loads import parse_loads
 from tetopt.model.materials import Materials, Spacing, binned, by_label, materials
 from tetopt.model.model import Model
@@ -56,7 +56,7 @@ def model_of(
         Its intensities are what laws are of, and its box's faces become sets.
     young, nu : number, (M,) array, law or text, optional
         Young's modulus, kPa, above 0, and Poisson's ratio, above -1 and below 0.5: one for all cells, one for each, or
-        a law of the intensity or of the label (`tetopt.fem.materials.parse_any_law`), of which with an image the mean
+        a law of the intensity or of the label (`tetopt.model.laws.parse_any_law`), of which with an image the mean
         over the voxels of the cell is taken, Eq. (2), and else its value at the cell's "mean". Without `young` the
         model has no materials; without `nu` it is the column "nu" of the file that `young` names, or 0.45.
     sets : iterable of str

@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tetopt.errors import InputError
-from tetopt.fem.materials import ByLabel, checked_young
+from tetopt.model.laws import ByLabel, checked_young
 
 Spacing = Literal["equal", "quantile", "log"]
 SPACINGS = get_args(Spacing)

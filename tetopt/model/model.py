@@ -12,6 +12,7 @@ from tetopt.mesh import Mesh
 from tetopt.model.loads import Load
 from tetopt.model.materials import Materials
 from tetopt.model.sets import Sets, outward_facet_nodes
+from tetopt.model.skfem import skfem_mesh
 
 if TYPE_CHECKING:
     import skfem
@@ -47,10 +48,18 @@ class Model(NamedTuple):
     about: dict[str, Any] = {}  # noqa: RUF012 - a default that nobody changes; name -> text, or what JSON can hold
 
     def to_skfem(self) -> skfem.Mesh:
-        """The mesh for scikit-fem, with the sets; see `tetopt.model.skfem.to_skfem`."""
-        from tetopt.model.skfem import to_skfem  # which imports this module
+        """The mesh for scikit-fem, with the sets; see `tetopt.model.skfem.skfem_mesh`.
 
-        return to_skfem(self)
+        Raises
+        ------
+        InputError
+            The model is quadratic: elements of any order are chosen in scikit-fem; or scikit-fem is not installed.
+        """
+        if self.order != 1:
+            raise InputError(
+                "to_skfem: expected linear cells, got order 2; leave out the order and take P2 elements in scikit-fem"
+            )
+        return skfem_mesh(self.mesh, self.sets)
 
 
 def in_space(model: Model, space: str) -> Model:

@@ -1,4 +1,4 @@
-"""Models in scikit-fem, without a file."""
+"""Meshes with their sets in scikit-fem, without a file."""
 
 from __future__ import annotations
 
@@ -8,33 +8,33 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
-from tetopt.model.model import Model
+from tetopt.mesh import Mesh
+from tetopt.model.sets import Sets
 
 if TYPE_CHECKING:
     import skfem
 
 
-def to_skfem(model: Model) -> skfem.Mesh:
-    """The model's mesh with its sets, as scikit-fem has them.
+def skfem_mesh(mesh: Mesh, sets: Sets) -> skfem.Mesh:
+    """A mesh with its sets, as scikit-fem has them.
 
     Nodes and cells keep their order, so that what is on each cell stays as it is, such as `young[of_cell]` of the
     materials; scikit-fem sorts the three nodes of a triangle, though. Facet sets are `boundaries`, those with facets
     between two cells as `OrientedBoundary`, whose normals point out of the cells that the set holds them by; cell sets
-    are `subdomains`. A 2-D model is a `MeshTri`, a 3-D one a `MeshTet`.
+    are `subdomains`. A 2-D mesh is a `MeshTri`, a 3-D one a `MeshTet`.
 
     Raises
     ------
     InputError
-        scikit-fem is not installed, or the model is quadratic: elements of any order are chosen in scikit-fem.
+        scikit-fem is not installed.
 
     Examples
     --------
     >>> import numpy as np
     >>> from tetopt import Mesh
-    >>> from tetopt.model.model import Model
     >>> from tetopt.model.sets import standard_sets
     >>> mesh = Mesh([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]])
-    >>> found = to_skfem(Model(mesh, {}, standard_sets(mesh, labels=np.array([7]))))
+    >>> found = skfem_mesh(mesh, standard_sets(mesh, labels=np.array([7])))
     >>> found.p[:, found.facets[:, found.boundaries["x_min"]]].tolist()
     [[[0.0], [0.0]], [[0.0], [1.0]]]
     >>> found.subdomains["label_7"].tolist()
@@ -44,16 +44,12 @@ def to_skfem(model: Model) -> skfem.Mesh:
         import skfem
     except ImportError as error:
         raise InputError("to_skfem: scikit-fem is not installed; pip install scikit-fem") from error
-    if model.order != 1:
-        raise InputError(
-            "to_skfem: expected linear cells, got order 2; leave out the order and take P2 elements in scikit-fem"
-        )
-    kind = skfem.MeshTet if model.mesh.ndim == 3 else skfem.MeshTri
+    kind = skfem.MeshTet if mesh.ndim == 3 else skfem.MeshTri
     # Contiguous, or scikit-fem warns of making them so.
-    mesh = kind(np.ascontiguousarray(model.mesh.points.T), np.ascontiguousarray(model.mesh.cells.T))
-    boundaries = {name: _boundary(mesh, model.mesh.cells, rows) for name, rows in model.sets.facets.items()}
-    subdomains = {name: cells.copy() for name, cells in model.sets.cells.items()}
-    return mesh.with_boundaries(boundaries).with_subdomains(subdomains)
+    made = kind(np.ascontiguousarray(mesh.points.T), np.ascontiguousarray(mesh.cells.T))
+    boundaries = {name: _boundary(made, mesh.cells, rows) for name, rows in sets.facets.items()}
+    subdomains = {name: cells.copy() for name, cells in sets.cells.items()}
+    return made.with_boundaries(boundaries).with_subdomains(subdomains)
 
 
 def _boundary(mesh: skfem.Mesh, cells: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.integer]:

@@ -7,8 +7,8 @@ from matplotlib.colors import to_rgba_array
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
-from tetopt.content import check_labels
 from tetopt.image import Image
+from tetopt.target.content import check_labels
 
 BACKGROUND = "#e6e6e6"  # of label 0
 UNCOVERED = "#cfe3f5"  # where a mesh leaves the image uncovered
@@ -33,7 +33,7 @@ def label_colours(labels: Image) -> NDArray[np.float64]:
     Parameters
     ----------
     labels : Image
-        Whole numbers from 0 to `tetopt.content.LABELS`.
+        Whole numbers from 0 to `tetopt.target.content.LABELS`.
 
     Returns
     -------

@@ -19,7 +19,6 @@ import numpy as np
 from matplotlib.colors import to_hex
 from numpy.typing import NDArray
 
-from tetopt.content import LABELS
 from tetopt.errors import InputError
 from tetopt.fem.reference import averaged
 from tetopt.image import Image
@@ -28,6 +27,7 @@ from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields
 from tetopt.report.colours import label_colours
 from tetopt.report.viewer import grey_limits
+from tetopt.target.content import LABELS
 
 MAX_VOXELS = 2**24  # of an image in the page, a byte each; beyond, neighbours are averaged
 MAX_SIDE = 2048  # voxels along an axis of it: what nearly every graphics card takes

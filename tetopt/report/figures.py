@@ -17,14 +17,14 @@ from scipy.ndimage import distance_transform_edt, uniform_filter
 
 from tetopt.check import facets_on_box
 from tetopt.energy.sampling import cell_moments
+from tetopt.engine.loop import Optimized, Record
 from tetopt.errors import InputError
 from tetopt.geometry.cut import plane_cut
-from tetopt.geometry.quality import BAD_SHAPE, quality_errors, rho_histogram
 from tetopt.geometry.simplex import rho
 from tetopt.image import Image
 from tetopt.io.files import written_whole
+from tetopt.measure.quality import BAD_SHAPE, quality_errors, rho_histogram
 from tetopt.mesh import Mesh
-from tetopt.optimize.paper import Optimized, Record
 from tetopt.report.colours import LISTED, UNCOVERED, label_colours, legend_patches
 
 matplotlib.use("agg")
@@ -101,10 +101,10 @@ def label_figure(labels: Image, mesh: Mesh, of_cell: NDArray[np.int64] | None = 
     Parameters
     ----------
     labels : Image
-        Whole numbers from 0 to `tetopt.content.LABELS`.
+        Whole numbers from 0 to `tetopt.target.content.LABELS`.
     mesh : Mesh
     of_cell : (M,) int64, optional
-        Each cell's label; by default that of most of its voxels (`tetopt.fidelity.cell_labels`).
+        Each cell's label; by default that of most of its voxels (`tetopt.measure.fidelity.cell_labels`).
 
     Returns
     -------
@@ -116,10 +116,10 @@ def label_figure(labels: Image, mesh: Mesh, of_cell: NDArray[np.int64] | None = 
     Raises
     ------
     InputError
-        As `tetopt.fidelity.cell_labels`.
+        As `tetopt.measure.fidelity.cell_labels`.
     """
     # This loads pyvista, which is slow to load, and the other flat pictures need it not.
-    from tetopt.fidelity import cell_labels
+    from tetopt.measure.fidelity import cell_labels
 
     colours = label_colours(labels)
     of_cell = cell_labels(labels, mesh) if of_cell is None else of_cell
@@ -222,8 +222,8 @@ def boundary_figure(image: Image, mask: Image, mesh: Mesh, axis: int | None = No
 
 
 def _half_level(view: _View) -> NDArray[np.float64]:
-    """Segments (K, 2, 2), in picture mm, on which the pixels are 1/2 (`tetopt.fidelity.half_level_surface`)."""
-    from tetopt.fidelity import half_level_surface  # with pyvista, see `label_figure`
+    """Segments (K, 2, 2), in picture mm, on which the pixels are 1/2 (`tetopt.measure.fidelity.half_level_surface`)."""
+    from tetopt.measure.fidelity import half_level_surface  # with pyvista, see `label_figure`
 
     affine = np.diag([*view.steps, 1.0])
     affine[:2, 2] = 0.5 * view.steps

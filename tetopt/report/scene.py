@@ -13,10 +13,10 @@ from scipy import ndimage
 
 from tetopt.energy.sampling import cell_moments
 from tetopt.errors import InputError
-from tetopt.fidelity import cell_labels
 from tetopt.geometry.topology import boundary_facets
 from tetopt.image import Image
 from tetopt.io.files import written_whole
+from tetopt.measure.fidelity import cell_labels
 from tetopt.mesh import Mesh
 from tetopt.report.colours import label_colours, legend_patches
 from tetopt.report.figures import save_figure

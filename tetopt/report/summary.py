@@ -13,13 +13,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 import tetopt
-from tetopt.content import Content, plain
-from tetopt.fidelity import label_fidelity, mask_fidelity
-from tetopt.geometry.quality import quality
+from tetopt.engine.loop import Optimized
 from tetopt.image import Image
+from tetopt.measure.fidelity import label_fidelity, mask_fidelity
+from tetopt.measure.quality import quality
 from tetopt.mesh import Mesh
 from tetopt.model.model import Model
-from tetopt.optimize.paper import Optimized
+from tetopt.target.content import Content, plain
 
 SHOWN_VERSIONS = ("numpy", "scipy", "numba", "nibabel", "pyvista")
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from rich.table import Table
 
-from tetopt.geometry.quality import Quality
+from tetopt.measure.quality import Quality
 
 
 def new_table(*columns: str) -> Table:
@@ -44,7 +44,7 @@ def add_quality(table: Table, *meshes: Quality) -> None:
 
 
 def mask_table(mask: dict[str, Any]) -> Table:
-    """`tetopt.fidelity.MaskFidelity`, as a dict."""
+    """`tetopt.measure.fidelity.MaskFidelity`, as a dict."""
     table = new_table("mask", "in voxels", "in the mesh")
     change = 100.0 * (mask["mesh_volume"] / mask["volume"] - 1.0)
     table.add_row("size, mm^n", f"{mask['volume']:.1f}", f"{mask['mesh_volume']:.1f} ({change:+.1f} %)")
@@ -63,7 +63,7 @@ def mask_table(mask: dict[str, Any]) -> Table:
 
 
 def label_table(rows: list[dict[str, Any]]) -> Table:
-    """One row for each `tetopt.fidelity.LabelFidelity`, as a dict."""
+    """One row for each `tetopt.measure.fidelity.LabelFidelity`, as a dict."""
     table = new_table(
         "label", "voxels", "size, mm^n", "cells", "their size", "more, %", "Dice", "by volume", "apart, mm", "95 %",
         "pieces", "of cells",

@@ -1,0 +1,465 @@
+"""Fidelity to labels and masks: against cases whose numbers are known, and slow twins."""
+
+from collections import Counter
+
+import numpy as np
+import pytest
+import pyvista
+from meshes import random_affine, random_rotation
+
+import tetopt
+from tetopt.geometry.simplex import centroids, oriented, volumes
+from tetopt.measure.fidelity import (
+    POINTS,
+    Surface,
+    _distances,
+    _face,
+    _mean_and_p95,
+    cell_labels,
+    euler_characteristic,
+    evenly_spread,
+    half_level_surface,
+    label_fidelity,
+    mask_fidelity,
+    painted,
+    surface_distances,
+)
+
+
+def blocky(image, blocks):
+    """A lattice whose blocks' faces are planes of facets."""
+    return tetopt.lattice(image, "criss-cross" if image.ndim == 2 else "five-tet", blocks=blocks)
+
+
+def slabs(n, affine=None):
+    """An image of 8^n voxels, label 0 in its half of x < 3.5, else 1; a lattice, a plane of facets at each 1/2 of x."""
+    labels = np.zeros((8,) * n)
+    labels[4:] = 1
+    image = tetopt.Image(labels, affine)
+    mesh = blocky(image, (8, 3, 2)[:n])
+    return image, mesh, image.to_index(centroids(mesh.points, mesh.cells))[:, 0]
+
+
+def shift_affine(rng, n, spacing):
+    """Voxels of unequal size, rotated, flipped and moved."""
+    affine = np.eye(n + 1)
+    affine[:n, :n] = random_rotation(rng, n) @ np.diag(spacing[:n])
+    affine[:n, n] = rng.uniform(-100.0, 100.0, n)
+    return affine
+
+
+def ball(n, radius, centre):
+    """Cones from the centre over a polygon or polyhedron with its corners on the sphere."""
+    if n == 2:
+        turn = np.linspace(0.0, 2.0 * np.pi, 200, endpoint=False)
+        around = np.column_stack([np.cos(turn), np.sin(turn)])
+        facets = np.column_stack([np.arange(200), np.roll(np.arange(200), -1)])
+    else:
+        sphere = pyvista.Icosphere(radius=1.0, nsub=4)
+        around, facets = np.asarray(sphere.points, dtype=np.float64), sphere.regular_faces
+    points = np.vstack([around * radius, np.zeros(n)]) + centre
+    cells = np.column_stack([facets, np.full(len(facets), len(around))])
+    return points, cells
+
+
+def ball_field(n, size, radius, centre):
+    """1 inside, 0 outside, linear over four voxels across the sphere, on which it is 1/2."""
+    r = np.sqrt(((np.indices((size,) * n).T - centre) ** 2).sum(axis=-1)).T
+    return np.clip((radius - r) / 4.0 + 0.5, 0.0, 1.0)
+
+
+# Cells' labels
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_cell_labels_against_twin(n):
+    """Counted voxel by voxel, on a mesh that leaves voxels out and has cells without voxels, and with many ties."""
+    rng = np.random.default_rng(n)
+    labels = tetopt.Image(rng.choice([0, 2, 7], (9, 8, 7)[:n]), random_affine(rng, n))
+    whole = tetopt.lattice(labels, blocks=((5, 4, 4) if n == 3 else (6, 5))[:n])
+    mesh = tetopt.Mesh(whole.points, whole.cells[len(whole.cells) // 4 :])
+    owner = tetopt.cell_of_voxel(labels, mesh)
+    found = cell_labels(labels, mesh)
+    n_ties = n_empty = 0
+    for cell in range(len(mesh.cells)):
+        count = Counter(labels.data[owner == cell].astype(int).tolist())
+        if count:
+            most = [label for label, c in count.items() if c == max(count.values())]
+            n_ties += len(most) > 1
+            expected = min(most)
+        else:
+            n_empty += 1
+            expected = labels.data[
+                tuple(np.rint(labels.to_index(mesh.points[mesh.cells[cell]].mean(axis=0))).astype(int))
+            ]
+        assert found[cell] == expected
+    assert found.dtype == np.int64
+    assert n_ties > 3
+    assert n_empty > 3
+    shown = painted(labels, mesh, found)
+    assert (shown == -1).any()
+    for voxel in np.ndindex(labels.shape):
+        assert shown[voxel] == (-1 if owner[voxel] < 0 else found[owner[voxel]])
+
+
+# Surfaces
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_half_level_of_a_plane(n):
+    """It runs from face to face of the box, has no part on them, and lies where the field is 1/2."""
+    image, _, _ = slabs(n, random_affine(np.random.default_rng(n), n))
+    flat = np.eye(n + 1)
+    for level, place in (
+        (image.data == 1, 3.5),
+        (np.indices(image.shape)[0] / 8.0 + 0.0625, 3.5),
+        (image.data * 0.8, 3.625),
+    ):
+        points, facets = half_level_surface(level, flat)
+        assert facets.shape[1] == n
+        np.testing.assert_allclose(points[:, 0], place, atol=1e-5)
+        np.testing.assert_array_equal(points[:, 1:].min(axis=0), -0.5)
+        np.testing.assert_array_equal(points[:, 1:].max(axis=0), 7.5)
+        edges = points[facets[:, 1:]] - points[facets[:, :1]]
+        area = np.linalg.norm(edges[:, 0] if n == 2 else np.cross(edges[:, 0], edges[:, 1]) / 2, axis=-1).sum()
+        assert area == pytest.approx(8.0 ** (n - 1), rel=1e-6)
+        in_world = half_level_surface(level, image.affine)
+        np.testing.assert_allclose(image.to_index(in_world.points), points, atol=1e-9)
+        np.testing.assert_array_equal(in_world.facets, facets)
+
+
+@pytest.mark.parametrize("n", [2, 3])
+@pytest.mark.parametrize("value", [0.0, 1.0])
+def test_no_half_level(n, value):
+    points, facets = half_level_surface(np.full((3,) * n, value), np.eye(n + 1))
+    assert points.shape == (0, n)
+    assert facets.shape == (0, n)
+
+
+def test_half_level_of_a_ball():
+    points, facets = half_level_surface(ball_field(3, 24, 8.0, 11.3), np.diag([0.5, 0.5, 0.5, 1.0]))
+    np.testing.assert_allclose(np.linalg.norm(points - 0.5 * 11.3, axis=1), 4.0, atol=0.02)
+    assert euler_characteristic(facets) == 2
+
+
+def test_euler_characteristic():
+    assert euler_characteristic(pyvista.Icosphere(nsub=1).regular_faces) == 2
+    torus = np.zeros((9, 9, 5), dtype=bool)
+    torus[1:8, 1:8, 1:4] = True
+    torus[3:6, 3:6] = False
+    assert euler_characteristic(half_level_surface(torus, np.eye(4)).facets) == 0
+    assert euler_characteristic(np.array([[0, 1], [1, 2], [2, 0], [3, 4]])) == 0 + 1
+    assert euler_characteristic(np.empty((0, 3), dtype=np.int64)) == 0
+
+
+def naive_distance(p, corners):
+    """From a point to a segment, or a triangle: at its foot if that is inside, else to the nearest edge."""
+    if len(corners) == 2:
+        a, b = corners
+        along = b - a
+        t = np.clip((p - a) @ along / max(along @ along, 1e-300), 0.0, 1.0)
+        return np.linalg.norm(p - a - t * along)
+    nearest = min(naive_distance(p, corners[[i, k]]) for i, k in ((0, 1), (1, 2), (2, 0)))
+    frame = (corners[1:] - corners[0]).T
+    if np.linalg.matrix_rank(frame, tol=1e-7) < 2:
+        return nearest
+    u, v = np.linalg.lstsq(frame, p - corners[0], rcond=None)[0]
+    if min(u, v, 1.0 - u - v) < 0.0:
+        return nearest
+    return np.linalg.norm(p - corners[0] - frame @ [u, v])
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_distances_against_twin(n):
+    """Large, small and flat facets; points near and far."""
+    rng = np.random.default_rng(n)
+    sizes = 10.0 ** rng.uniform(-2.0, 1.0, (25, 1, 1))
+    corners = rng.normal(size=(25, n, n)) * sizes + rng.normal(0.0, 10.0, (25, 1, n))
+    corners[0, 1] = corners[0, 0]
+    corners[1, -1] = 0.25 * corners[1, 0] + 0.75 * corners[1, -2]
+    corners[2, 1:] = corners[2, 0]
+    facets = np.arange(25 * n).reshape(25, n)
+    points = np.vstack([rng.normal(0.0, 20.0, (60, n)), corners[:, 0] + rng.normal(0.0, 0.1, (25, n))])
+    found = surface_distances(points, corners.reshape(-1, n), facets)
+    expected = [min(naive_distance(p, c) for c in corners) for p in points]
+    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+
+
+def test_distances_need_a_surface():
+    with pytest.raises(tetopt.InputError, match="expected one facet or more, got none"):
+        surface_distances(np.zeros((1, 3)), np.empty((0, 3)), np.empty((0, 3), dtype=np.int64))
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_points_are_spread_evenly(n):
+    """Each facet has its share of the points to within two, uniformly dense by their mean and covariance."""
+    corners = np.random.default_rng(n).normal(size=(3, n, n)) + 10.0 * np.arange(3)[:, None, None]
+    surface = Surface(corners.reshape(-1, n), np.arange(3 * n).reshape(3, n))
+    points = evenly_spread(surface, 3000)
+    apart = np.array([surface_distances(points, *Surface(surface.points, surface.facets[k : k + 1])) for k in range(3)])
+    assert apart.min(axis=0).max() < 1e-9
+    edges = corners[:, 1:] - corners[:, :1]
+    areas = np.linalg.norm(edges[:, 0] if n == 2 else np.cross(edges[:, 0], edges[:, 1]), axis=-1)
+    counts = np.bincount(apart.argmin(axis=0), minlength=3)
+    assert np.abs(counts - 3000 * areas / areas.sum()).max() < 2.0
+    for k in range(3):
+        inside = points[apart.argmin(axis=0) == k]
+        np.testing.assert_allclose(inside.mean(axis=0), corners[k].mean(axis=0), atol=0.02)
+        spread = np.cov((inside - inside.mean(axis=0)).T, bias=True)  # of a uniform density on a simplex
+        offset = corners[k] - corners[k].mean(axis=0)
+        np.testing.assert_allclose(spread, offset.T @ offset / (n * (n + 1)), atol=0.03)
+    np.testing.assert_array_equal(points, evenly_spread(surface, 3000))
+
+
+def test_no_side_of_a_plate_is_left_out():
+    """Its equal facets come in turn from one side and the other, two for each point."""
+    level = np.zeros((65, 3))
+    level[:, 1] = 1.0
+    curve = half_level_surface(level, np.eye(3))
+    side = evenly_spread(curve, len(curve.facets) // 2)[:, 1] > 1.0
+    assert 0.45 < side.mean() < 0.55
+
+
+def test_no_more_points_than_allowed():
+    image = slabs(3)[0]
+    plane = half_level_surface(image.data == 1, image.affine)
+    there, back = _distances(plane, Surface(plane.points, plane.facets[: len(plane.facets) // 2]), 1e-9)
+    assert len(there) == POINTS
+    assert POINTS / 2 - 1 <= len(back) <= POINTS / 2 + 1
+    assert sum(len(d) for d in _distances(plane, plane, 1e9)) == 2000
+
+
+def test_summary_and_face():
+    assert _mean_and_p95(np.arange(101.0) ** 2) == (3350.0, 9025.0)
+    assert (_face(8.0, 3), _face(9.0, 2)) == (pytest.approx(4.0), 3.0)
+
+
+# Labels
+
+
+@pytest.mark.parametrize("n", [2, 3])
+@pytest.mark.parametrize("shift", [0, 1, -2])
+def test_shifted_plane(n, shift):
+    """Every number by hand; the box's faces, which both surfaces end at, count for nothing."""
+    rng = np.random.default_rng(n)
+    image, mesh, x = slabs(n, shift_affine(rng, n, [1.5, 0.5, -3.0]))
+    of_cell = (x > 3.5 + shift).astype(int)
+    layer, voxel = 8 ** (n - 1), image.voxel_volume
+    assert voxel == pytest.approx([0.75, 2.25][n - 2])
+    for row in label_fidelity(image, mesh, of_cell):
+        layers = 4 + (shift if row.label == 0 else -shift)
+        assert row.label in (0, 1)
+        assert row.voxels == 4 * layer
+        assert row.volume == pytest.approx(4 * layer * voxel)
+        assert row.mesh_volume == pytest.approx(layers * layer * voxel)
+        assert row.n_cells == (of_cell == row.label).sum()
+        assert row.dice == pytest.approx(2 * min(layers, 4) / (layers + 4))
+        assert row.distance_mean == pytest.approx(1.5 * abs(shift), abs=1e-9)
+        assert row.distance_p95 == pytest.approx(1.5 * abs(shift), abs=1e-9)
+        assert (row.components, row.mesh_components, row.is_lost) == (1, 1, False)
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_distances_are_pooled_by_area(n):
+    """A stripe with two sides of which the mesh has one: of three equal areas one is 4 voxels away."""
+    image, mesh, x = slabs(n)
+    stripe = np.zeros(image.shape)
+    stripe[2:6] = 3
+    row = label_fidelity(tetopt.Image(stripe), mesh, np.where(x > 1.5, 3, 0))[1]
+    assert row.distance_mean == pytest.approx(4 / 3, rel=6e-3)
+    assert row.distance_p95 == 4.0
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_labels_that_meet(n):
+    """Three labels side by side, whose planes the mesh has: all is exact, without a label given to any cell."""
+    labels = np.zeros((9, 6, 6)[:n])
+    labels[3:6], labels[6:] = 5, 2
+    image = tetopt.Image(labels, shift_affine(np.random.default_rng(n), n, [2.0, 1.0, 0.7]))
+    rows = label_fidelity(image, blocky(image, (9, 3, 3)[:n]))
+    assert [row.label for row in rows] == [0, 2, 5]
+    for row in rows:
+        assert row.dice == 1.0
+        assert row.mesh_volume == pytest.approx(row.volume)
+        assert row.distance_p95 == pytest.approx(0.0, abs=1e-9)
+        assert (row.components, row.mesh_components) == (1, 1)
+
+
+def test_lost_label():
+    """A voxel that no cell is small enough for."""
+    labels = np.zeros((8, 8, 8))
+    labels[4, 4, 4] = 1
+    image = tetopt.Image(labels)
+    background, speck = label_fidelity(image, blocky(image, (1, 1, 1)))
+    assert speck.is_lost
+    assert (speck.n_cells, speck.mesh_volume, speck.dice, speck.voxels, speck.components) == (0, 0.0, 0.0, 1, 1)
+    assert speck.mesh_components == 0
+    assert np.isnan(speck.distance_mean)
+    assert np.isnan(speck.distance_p95)
+    assert not background.is_lost
+    assert background.dice == 2 * 511 / (511 + 512)
+
+
+def test_label_that_fills_the_box_has_no_distance():
+    (row,) = label_fidelity(tetopt.Image(np.ones((4, 4))), tetopt.lattice(tetopt.Image(np.ones((4, 4))), nodes=20))
+    assert np.isnan(row.distance_mean)
+    assert (row.label, row.dice, row.is_lost) == (1, 1.0, False)
+
+
+def test_outside_of_the_mesh_is_background():
+    """The mesh of a mask: label 0 has no cell, and yet is where it should be."""
+    image, mesh, x = slabs(3)
+    half = tetopt.Mesh(mesh.points, mesh.cells[x > 2.5])
+    background, inside = label_fidelity(image, half, np.ones(len(half.cells)))
+    assert background.n_cells == 0
+    assert not background.is_lost
+    assert background.dice == pytest.approx(2 * 3 / (3 + 4))
+    assert inside.dice == pytest.approx(2 * 4 / (4 + 5))
+    assert background.distance_mean == inside.distance_mean == pytest.approx(1.0)
+    assert label_fidelity(image, mesh, np.ones(len(mesh.cells)))[0].is_lost
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_components(n):
+    """Voxels that meet at an edge or corner only are apart; so are cells."""
+    labels = np.zeros((6,) * n)
+    labels[(0,) * n] = labels[(1,) * n] = labels[(3,) * n] = labels[(4,) + (3,) * (n - 1)] = 1
+    image = tetopt.Image(labels)
+    background, spots = label_fidelity(image, blocky(image, (6,) * n))
+    assert (spots.components, spots.mesh_components) == (3, 3)
+    assert (background.components, background.mesh_components) == (1, 1)
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_ball_of_labels(n):
+    """A ball of radius 10, a mesh of radius 12 in the world, rotated: by its volumes and the distance of 2 voxels."""
+    spacing = 0.5
+    centre = np.full(n, 15.2)
+    affine = shift_affine(np.random.default_rng(n), n, [spacing] * n)
+    image = tetopt.Image(ball_field(n, 32, 10.0, 15.2) >= 0.5, affine)
+    points, cells = ball(n, 12.0, centre)
+    points = image.to_world(points)
+    mesh = tetopt.Mesh(points, oriented(points, cells))
+    row = label_fidelity(image, mesh, np.ones(len(cells)))[1]
+    area = {2: np.pi, 3: 4 / 3 * np.pi}[n] * spacing**n
+    assert row.volume == pytest.approx(area * 10.0**n, rel=0.02)
+    assert row.mesh_volume == pytest.approx(area * 12.0**n, rel=0.01)
+    assert row.dice == pytest.approx(2 / (1 + 1.2**n), rel=0.02)
+    assert row.distance_mean == pytest.approx(2 * spacing, abs=0.1 * spacing)
+    assert 2 * spacing < row.distance_p95 < 2.7 * spacing  # the half level of voxels is a staircase
+
+
+@pytest.mark.parametrize(
+    ("of_cell", "words"),
+    [
+        (np.zeros(3), r"one label for each of the mesh's 8 cells, got shape \(3,\)"),
+        (np.full(8, 0.5), "whole numbers from 0 to 32767, got 0.5 to 0.5"),
+        (np.full(8, -1), "got -1 to -1"),
+        (np.full(8, 40_000), "got 40000 to 40000"),
+        (np.full(8, np.nan), "got nan to nan"),
+    ],
+)
+def test_bad_cell_labels(of_cell, words):
+    image = tetopt.Image(np.zeros((4, 2)))
+    mesh = tetopt.lattice(image, blocks=(2, 1))
+    for function in (label_fidelity, painted):
+        with pytest.raises(tetopt.InputError, match=words):
+            function(image, mesh, of_cell)
+
+
+def test_bad_labels():
+    image = tetopt.Image(np.full((4, 2), 0.5))
+    mesh = tetopt.lattice(image, blocks=(2, 1))
+    for function in (cell_labels, label_fidelity):
+        with pytest.raises(tetopt.InputError, match="is it a label image"):
+            function(image, mesh)
+
+
+# Masks
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_mask_of_a_shifted_plane(n):
+    """2 voxels of 1.5 mm; faces of the box count on neither side; the plane ends at the box, as a disc does."""
+    image, mesh, x = slabs(n, shift_affine(np.random.default_rng(n), n, [1.5, 0.5, -3.0]))
+    found = mask_fidelity(image, tetopt.Mesh(mesh.points, mesh.cells[x > 1.5]))
+    layer = 8 ** (n - 1)
+    assert found.voxels == 4 * layer
+    assert found.volume == pytest.approx(4 * layer * image.voxel_volume)
+    assert found.mesh_volume == pytest.approx(6 * layer * image.voxel_volume)
+    assert found.dice == pytest.approx(2 * 4 / (4 + 6))
+    np.testing.assert_allclose(found[4:8], 2.0, atol=1e-9)
+    np.testing.assert_allclose(found[8:12], 3.0, atol=1e-9)
+    assert found[12:] == (1, 1, 1, 1)
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_mask_of_a_ball(n):
+    """Its half level is a sphere of radius 10 voxels; the mesh's of 11.5; in voxels of unequal size, sheared."""
+    rng = np.random.default_rng(n)
+    image = tetopt.Image(ball_field(n, 32, 10.0, 15.2), random_affine(rng, n))
+    points, cells = ball(n, 11.5, np.full(n, 15.2))
+    points = image.to_world(points)
+    mesh = tetopt.Mesh(points, oriented(points, cells))
+    found = mask_fidelity(image, mesh)
+    assert found.mesh_volume == pytest.approx(volumes(points, mesh.cells).sum())
+    np.testing.assert_allclose(found[4:8], 1.5, atol=0.03)
+    factors = np.linalg.svd(image.affine[:n, :n])[1]
+    assert factors[-1] * 1.5 < found.distance_mean_mm < factors[0] * 1.5
+    assert factors[-1] * 1.5 < found.reverse_p95_mm < factors[0] * 1.55
+    euler = {2: 0, 3: 2}[n]
+    assert found[12:] == (1, 1, euler, euler)
+
+
+def test_mask_reverse_is_another_distance():
+    """Half a mask without a mesh: far from it, while the mesh is near the mask."""
+    level = np.zeros((20, 8))
+    level[2:5] = level[12:15] = 1.0
+    image = tetopt.Image(level, np.diag([2.0, 2.0, 1.0]))
+    mesh = blocky(image, (20, 4))
+    x = image.to_index(centroids(mesh.points, mesh.cells))[:, 0]
+    found = mask_fidelity(image, tetopt.Mesh(mesh.points, mesh.cells[(x > 1.5) & (x < 4.5)]))
+    assert found.distance_p95 == pytest.approx(0.0, abs=1e-9)
+    assert found.reverse_mean == pytest.approx((0 + 0 + 7 + 10) / 4, rel=6e-3)
+    assert found.reverse_p95 == pytest.approx(10.0)
+    assert (found.distance_p95_mm, found.reverse_p95_mm) == (pytest.approx(0.0, abs=1e-9), pytest.approx(20.0))
+    assert (found.components, found.mesh_components) == (2, 1)
+    assert (found.euler, found.mesh_euler) == (4, 2)
+
+
+def test_mesh_of_the_whole_box_has_no_boundary():
+    image, mesh, _ = slabs(2)
+    found = mask_fidelity(image, mesh)
+    assert np.isnan(found[4:12]).all()
+    assert found.dice == pytest.approx(2 * 4 / (4 + 8))
+    assert found.mesh_euler == 0
+
+
+def test_half_counts_as_inside():
+    """In voxels as in Dice; empty masks overlap with nothing."""
+    image, mesh, _ = slabs(2)
+    assert mask_fidelity(tetopt.Image(image.data * 0.5), mesh).voxels == 32
+    empty = mask_fidelity(tetopt.Image(image.data * 0.4), mesh)
+    assert (empty.voxels, empty.dice, empty.components) == (0, 0.0, 0)
+
+
+def test_bad_mask():
+    image, mesh, _ = slabs(2)
+    with pytest.raises(tetopt.InputError, match="values from 0 to 1, got 0 to 255"):
+        mask_fidelity(tetopt.Image(image.data * 255), mesh)
+    with pytest.raises(tetopt.InputError, match="got -1 to 0"):
+        mask_fidelity(tetopt.Image(image.data - 1), mesh)
+    with pytest.raises(tetopt.InputError, match="same dimension"):
+        mask_fidelity(image, slabs(3)[1])
+
+
+def test_volume_dice_does_not_depend_on_the_unit():
+    """A thousandth of a cubic millimetre overlaps as well as a litre."""
+    labels = np.zeros((12, 12, 12))
+    labels[4:8, 4:8, 4:8] = 1.0
+    found = []
+    for voxel in (1.0, 0.01):
+        image = tetopt.Image(labels, np.diag([voxel] * 3 + [1.0]))
+        found.append([row.volume_dice for row in label_fidelity(image, tetopt.lattice(image, blocks=(6, 6, 6)))])
+    np.testing.assert_allclose(found[0], found[1], rtol=1e-6)
+    assert 0.5 < found[0][1] < 1.0

@@ -1,0 +1,244 @@
+"""The paper's four errors to the digits of Table 1, histograms, kinds of bad cells, and the summary."""
+
+from math import acos, atan, degrees, sqrt
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from meshes import (
+    ALL_SMALL,
+    BAD_TETS,
+    CUBE_CORNER,
+    EQUILATERAL,
+    FIVE_TET_CUBE,
+    OBTUSE_TRIANGLE,
+    REGULAR_TET,
+    RIGHT_TRIANGLE,
+    SINGLE,
+    SQUARE,
+    TWO_TETS,
+    TWO_TRIANGLES,
+    random_rotation,
+    single,
+)
+
+from tetopt import Image, lattice
+from tetopt.geometry.simplex import dihedral_angles, rho, volumes
+from tetopt.measure.quality import bad_kinds, quality, quality_errors, rho_histogram
+
+seeds = st.integers(0, 2**32 - 1)
+
+
+# The four errors
+
+
+def test_third_row_of_table_1():
+    """Fig. 2(a): 7 x 7 squares cut into four, 113 nodes and 196 triangles; every digit of the row."""
+    mesh = lattice(Image(np.zeros((70, 70))), blocks=(7, 7))
+    assert (len(mesh.points), len(mesh.cells)) == (113, 196)
+    errors = quality_errors(mesh.points, mesh.cells)
+    assert [round(error, 4) for error in errors] == [0.0858, 0.0858, 1.4424, 0.0858]
+
+
+def test_errors_of_right_isosceles_triangles():
+    """rho = sqrt 2 - 1: r = 1 - 1/sqrt 2, R = 1/sqrt 2 for legs of 1."""
+    error = 1.5 - sqrt(2)
+    assert quality_errors(*SQUARE) == pytest.approx((error, error, 4 * error**2, error), rel=1e-13)
+    assert quality_errors(*TWO_TRIANGLES) == pytest.approx((error, error, 2 * error**2, error), rel=1e-13)
+
+
+def test_errors_of_two_different_cells():
+    """3-4-5 and isosceles right triangle: errors 0.1 and 1.5 - sqrt 2."""
+    points = np.vstack([RIGHT_TRIANGLE[0], [[0.0, 0], [1, 0], [0, 1]]])
+    cells = np.array([[0, 1, 2], [3, 4, 5]])
+    a, b = 0.1, 1.5 - sqrt(2)
+    expected = ((a + b) / 2, 2 * a * b / (a + b), a * a + b * b, a)
+    assert quality_errors(points, cells) == pytest.approx(expected, rel=1e-12)
+
+
+@pytest.mark.parametrize("mesh", [EQUILATERAL, REGULAR_TET])
+def test_regular_cells_have_no_error_and_none_below_0(mesh):
+    rng = np.random.default_rng(0)
+    points, cells = mesh
+    for _ in range(50):
+        turned = points @ random_rotation(rng, points.shape[1]).T * rng.uniform(0.1, 10)
+        errors = quality_errors(turned, cells)
+        assert min(errors) >= 0
+        assert errors == pytest.approx((0, 0, 0, 0), abs=1e-14)
+
+
+def test_harmonic_mean_is_0_when_one_error_is():
+    """REGULAR_TET has whole coordinates, and rho a rounding above 1/3."""
+    assert rho(*REGULAR_TET)[0] >= 1 / 3
+    points = np.vstack([REGULAR_TET[0], CUBE_CORNER[0]])
+    with np.errstate(all="raise"):
+        errors = quality_errors(points, np.array([[0, 1, 2, 3], [4, 5, 6, 7]]))
+    assert errors.harmonic_mean == 0
+    assert errors.worst == pytest.approx(1 / 3 - rho(*CUBE_CORNER)[0])
+    assert errors.mean == pytest.approx(errors.worst / 2)
+
+
+def test_order_of_the_errors():
+    """Harmonic mean <= mean <= worst, and the sum of squares between M mean^2 and M worst^2."""
+    rng = np.random.default_rng(5)
+    points = rng.normal(size=(400, 3))
+    errors = quality_errors(points, np.arange(400).reshape(100, 4))
+    assert errors.harmonic_mean < errors.mean < errors.worst
+    assert 100 * errors.mean**2 < errors.l2 < 100 * errors.worst**2
+
+
+# Histogram
+
+
+def test_histogram_is_shares_over_0_to_1_over_n():
+    share, edges = rho_histogram(*FIVE_TET_CUBE, bins=3)
+    assert edges == pytest.approx([0, 1 / 9, 2 / 9, 1 / 3])
+    assert share.tolist() == [0, 0, 1]
+    share, edges = rho_histogram(*FIVE_TET_CUBE, bins=30)  # rho 1/3 once, 0.2440 four times
+    assert share[29] == pytest.approx(0.2)
+    assert share[int(0.2440 * 90)] == pytest.approx(0.8)
+    share, edges = rho_histogram(*EQUILATERAL)
+    assert (share[-1], share.sum(), edges[-1], len(share), len(edges)) == (1, 1, 0.5, 40, 41)
+
+
+def test_histogram_counts_regular_cells_that_rounding_put_above():
+    rng = np.random.default_rng(0)
+    for _ in range(50):
+        points = REGULAR_TET[0] @ random_rotation(rng, 3).T
+        assert rho_histogram(points, REGULAR_TET[1])[0][-1] == 1
+
+
+# Kinds
+
+
+@pytest.mark.parametrize("kind", BAD_TETS)
+@pytest.mark.parametrize("t", [0.1, 0.03, 1e-3, 1e-6])
+def test_kind_of_each_archetype(kind, t):
+    assert bad_kinds(*single(BAD_TETS[kind](t))).tolist() == [kind]
+
+
+@pytest.mark.parametrize("mesh", [*SINGLE[2], *SINGLE[3][:2], TWO_TETS, FIVE_TET_CUBE, TWO_TRIANGLES])
+def test_good_cells_are_good(mesh):
+    assert set(bad_kinds(*mesh)) == {"good"}
+
+
+def test_kinds_of_triangles():
+    points = np.array([[0.0, 0], [1, 0], [0.5, 0.05], [1, 0.1], [0.5, 0.5]])
+    cells = np.array([[0, 1, 2], [0, 1, 3], [0, 1, 4]])
+    assert bad_kinds(points, cells).tolist() == ["cap", "needle", "good"]
+
+
+def test_the_bound_of_good_is_n_rho_of_0_3():
+    """Isosceles triangles of base 2, the height at the bound found by bisection, and crossed."""
+
+    def triangle(height):
+        return np.array([[-1.0, 0], [1, 0], [0, height]]), np.array([[0, 1, 2]])
+
+    low, high = 0.01, 1.0
+    for _ in range(60):
+        middle = (low + high) / 2
+        low, high = (middle, high) if 2 * rho(*triangle(middle))[0] < 0.3 else (low, middle)
+    assert bad_kinds(*triangle(low * (1 - 1e-9))).tolist() == ["cap"]
+    assert bad_kinds(*triangle(high * (1 + 1e-9))).tolist() == ["good"]
+    # r = h / (1 + l) and R = l^2 / 2 h with l^2 = 1 + h^2
+    length = sqrt(1 + high**2)
+    assert 2 * (high / (1 + length)) / (length**2 / (2 * high)) == pytest.approx(0.3)
+
+
+@given(seeds, st.sampled_from(sorted(BAD_TETS)))
+def test_kind_does_not_change_with_rotation_scale_reflection_or_order(seed, kind):
+    rng = np.random.default_rng(seed)
+    shape = BAD_TETS[kind](np.exp(rng.uniform(np.log(1e-4), np.log(0.1))))
+    shape = shape + rng.normal(scale=1e-6, size=(4, 3))
+    points, cells = single(shape)
+    assert bad_kinds(points, cells).tolist() == [kind]
+    moved = np.exp(rng.uniform(-5, 5)) * (rng.choice([-1, 1]) * points @ random_rotation(rng, 3).T) + rng.normal(size=3)
+    assert bad_kinds(moved, rng.permuted(cells, axis=1)).tolist() == [kind]
+
+
+def test_flat_cells_have_a_kind():
+    flat = np.array([[0, 1, 2, 3]])
+    assert {kind: bad_kinds(BAD_TETS[kind](0.0), flat)[0] for kind in ("sliver", "cap", "spade")} == {
+        kind: kind for kind in ("sliver", "cap", "spade")
+    }
+    assert bad_kinds(np.array([[0.0, 0, 0], [1, 1, 1], [2, 2, 2], [3, 3, 3]]), flat)[0] == "needle"
+
+
+def test_no_bad_cells_and_many():
+    points = REGULAR_TET[0]
+    bad = BAD_TETS["sliver"](0.01)
+    mixed = np.vstack([points, bad, points])
+    assert bad_kinds(mixed, np.array([[0, 1, 2, 3], [4, 5, 6, 7], [8, 9, 10, 11]])).tolist() == [
+        "good",
+        "sliver",
+        "good",
+    ]
+
+
+# Angles of the archetypes in closed form
+
+
+def test_smallest_angles_of_the_archetypes():
+    t = 0.05
+    smallest = {kind: dihedral_angles(*single(make(t))).min() for kind, make in BAD_TETS.items()}
+    assert smallest == pytest.approx(
+        {
+            "sliver": degrees(acos(1 / (1 + 4 * t * t))),
+            "cap": degrees(atan(t)),
+            "spade": degrees(atan(t * sqrt(5) / 2)),
+            "wedge": degrees(2 * atan(t / 2 / sqrt(3))),
+            "needle": degrees(2 * atan(t / 2)),
+        },
+        rel=1e-12,
+    )
+
+
+# The summary
+
+
+def test_quality_of_the_cube_of_five():
+    found = quality(*FIVE_TET_CUBE)
+    corner_rho, corner_angle = 2 / (3 + 3 * sqrt(3)), degrees(acos(1 / sqrt(3)))
+    assert (found.n_nodes, found.n_cells) == (8, 5)
+    assert found.volume == pytest.approx(1)
+    assert found.smallest_volume == pytest.approx(1 / 6)
+    assert found.mean_rho == pytest.approx((1 / 3 + 4 * corner_rho) / 5)
+    assert found.min_rho == pytest.approx(corner_rho)
+    assert found.p1_rho == pytest.approx(corner_rho)
+    assert found.min_dihedral == pytest.approx(corner_angle)
+    assert found.p1_dihedral == pytest.approx(corner_angle)
+    assert found.max_dihedral == pytest.approx(90)
+    assert found.n_under_10_degrees == 0
+    assert found.errors == quality_errors(*FIVE_TET_CUBE)
+    assert found.kinds == {"needle": 0, "wedge": 0, "cap": 0, "spade": 0, "sliver": 0}
+
+
+def test_quality_of_good_and_bad_cells():
+    """99 cube corners and one of each archetype: percentiles between the best and the worst."""
+    shapes = [CUBE_CORNER[0]] * 99 + [make(0.02) for make in BAD_TETS.values()]
+    points = np.vstack(shapes)
+    cells = np.array([row + 4 * k for k, shape in enumerate(shapes) for row in single(shape)[1]])
+    found = quality(points, cells)
+    assert found.kinds == {kind: 1 for kind in BAD_TETS}
+    assert found.n_under_10_degrees == 5
+    angles = dihedral_angles(points, cells)
+    assert found.min_dihedral == angles.min() == pytest.approx(degrees(2 * atan(0.01 / sqrt(3))))
+    assert found.max_dihedral == angles.max() > 170
+    assert found.p1_dihedral == np.percentile(angles.min(axis=1), 1)
+    assert found.p1_rho == np.percentile(rho(points, cells), 1)
+    assert found.smallest_volume == volumes(points, cells).min()
+
+
+@pytest.mark.parametrize("mesh", ALL_SMALL)
+def test_kinds_are_named_by_dimension(mesh):
+    found = quality(*mesh)
+    names = {"needle", "cap"} if mesh[0].shape[1] == 2 else {"needle", "wedge", "cap", "spade", "sliver"}
+    assert set(found.kinds) == names
+    assert sum(found.kinds.values()) == (bad_kinds(*mesh) != "good").sum()
+
+
+def test_quality_of_an_obtuse_triangle():
+    found = quality(*OBTUSE_TRIANGLE)
+    assert found.max_dihedral == pytest.approx(120)
+    assert found.min_dihedral == pytest.approx(30)

@@ -1,0 +1,85 @@
+"""Approximate segmentation: the classes are optimal, and painted back where they belong."""
+
+from itertools import combinations
+
+import numpy as np
+import pytest
+
+import tetopt
+from tetopt.measure.segmentation import dice, segmented, thresholded
+from tetopt.target.otsu import class_thresholds
+
+
+def within(values, weights, thresholds):
+    group = np.digitize(values, thresholds)
+    total = 0.0
+    for g in np.unique(group):
+        v, w = values[group == g], weights[group == g]
+        total += (w * (v - (w * v).sum() / w.sum()) ** 2).sum()
+    return total
+
+
+@pytest.mark.parametrize("classes", [2, 3, 4])
+def test_thresholds_leave_the_least_variance(classes):
+    """Against every way to cut 9 different values, each in a bin of its own."""
+    rng = np.random.default_rng(classes)
+    for _ in range(10):
+        values = np.sort(rng.choice(256, 9, replace=False)).astype(float)
+        values[0], values[-1] = 0.0, 255.0
+        weights = rng.uniform(0.1, 5.0, 9)
+        best = min(within(values, weights, values[list(cut)]) for cut in combinations(range(1, 9), classes - 1))
+        found = class_thresholds(values, classes, weights)
+        assert np.all(np.diff(found) > 0.0)
+        assert within(values, weights, found) == pytest.approx(best, rel=0.03)  # a bin's centre stands for its values
+
+
+def test_clear_clusters_are_found():
+    values = np.repeat([10.0, 12.0, 50.0, 90.0, 91.0], [5, 5, 7, 3, 9])
+    found = class_thresholds(values, 3)
+    assert 12.0 < found[0] < 50.0 < found[1] < 90.0
+
+
+@pytest.mark.parametrize(
+    ("values", "classes", "words"),
+    [([1.0, 2.0], 1, "2 or more, got 1"), ([1.0, 2.0], 3, "3 asked for, but the values fill only 2")],
+)
+def test_bad_classes(values, classes, words):
+    with pytest.raises(tetopt.InputError, match=words):
+        class_thresholds(np.array(values), classes)
+
+
+def test_optimising_the_mesh_improves_the_segmentation():
+    """On the sphere phantom the painted classes come nearer to the true labels, in both label and background."""
+    phantom = tetopt.load_phantom("sphere")
+    image, truth = phantom.image(voxel_mm=2.0), phantom.label_image(voxel_mm=2.0)
+    mesh = tetopt.lattice(image, nodes=800)
+    better = tetopt.optimize(image, mesh, k_D=0.5, iterations=8).mesh
+    before, after = (dice(segmented(image, m, 2), truth) for m in (mesh, better))
+    assert after[1] > before[1] + 0.03
+    assert after[0] > before[0]
+    assert after[1] > 0.9
+    assert dice(thresholded(image, 2), truth)[1] > after[1]  # the voxels themselves know more
+
+
+def test_mesh_that_resolves_every_voxel_thresholds_it():
+    """Cells that each hold one voxel give the voxels' own classes."""
+    rng = np.random.default_rng(0)
+    image = tetopt.Image(rng.integers(0, 4, (6, 5)) * 10.0)
+    mesh = tetopt.lattice(image, blocks=(24, 20))
+    np.testing.assert_array_equal(segmented(image, mesh, 4).data, image.data / 10.0)
+
+
+def test_dice_by_hand():
+    truth = tetopt.Image([[0, 0, 1], [0, 1, 1]])
+    labels = tetopt.Image([[0, 0, 0], [0, 2, 2]])
+    assert dice(labels, truth) == {0: pytest.approx(6 / 7), 1: pytest.approx(4 / 5)}
+    assert dice(truth, truth) == {0: 1.0, 1: 1.0}
+    assert dice(tetopt.Image(np.zeros((2, 3))), truth) == {0: pytest.approx(6 / 9), 1: 0.0}
+
+
+def test_dice_bad_input():
+    one = tetopt.Image(np.zeros((2, 2)))
+    with pytest.raises(tetopt.InputError, match=r"one shape, got \(2, 2\) and \(3, 2\)"):
+        dice(one, tetopt.Image(np.zeros((3, 2))))
+    with pytest.raises(tetopt.InputError, match="truth: labels must be whole numbers"):
+        dice(one, tetopt.Image(np.full((2, 2), 0.5)))

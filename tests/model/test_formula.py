@@ -1,0 +1,80 @@
+"""Formulas of h: the arithmetic of Python and numpy, and nothing else let in."""
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+import tetopt
+from tetopt.model.formula import parse_formula
+from tetopt.model.laws import inverse_strain, parse_law, young_from
+
+H = np.array([[0.5, 1.0, 2.0], [3.0, 10.0, 250.0]])
+
+
+@pytest.mark.parametrize(
+    ("text", "expected"),
+    [
+        ("h", H),
+        (" 3 ", np.full_like(H, 3.0)),
+        ("0.5 + 0.01*h", 0.5 + 0.01 * H),
+        ("-h**2 / 4 - +1", -(H**2) / 4 - 1),
+        ("2**-h", 2.0**-H),
+        ("(1 + h) * exp(-h/10)", (1 + H) * np.exp(-H / 10)),
+        (
+            "max(min(h, 5), abs(h - 3)) + sqrt(h) * log(h)",
+            np.maximum(np.minimum(H, 5), abs(H - 3)) + H**0.5 * np.log(H),
+        ),
+        ("1/2*h", 0.5 * H),
+    ],
+)
+def test_values(text, expected):
+    found = parse_formula(text)(H)
+    assert found.shape == H.shape
+    assert found.dtype == np.float64
+    np.testing.assert_allclose(found, expected, rtol=1e-15)
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        "", "h +", "x", "__import__('os')", "h.size", "h[0]", "lambda: 1", "[h]", "'h'", "True", "1j", "h if h else 1",
+        "h < 2", "h @ h", "h // 2", "h & 1", "~h", "not h", "sum(h)", "max(h)", "abs(h, 2)", "max(h, 1, 2)", "abs(x=h)",
+        "min(*h)", "h; h", "h = 1", "(h := 2)", "f'{h}'", "abs", "...", "None", "(" * 300 + "h" + ")" * 300, "\0",
+        "h" + "+h" * 20000, "h" + "+h" * 983, "-" * 983 + "h", "1" + "0" * 400, "1if h else 2", "h +\n x",
+    ],
+)  # fmt: skip
+def test_refuses(text):
+    with pytest.raises(tetopt.InputError, match="formula") as caught:
+        parse_formula(text)
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 300
+
+
+@pytest.mark.parametrize(("text", "value"), [("10**20", 1e20), ("9**9**9**9", np.inf)])
+def test_powers_are_floats(text, value):
+    assert parse_formula(text)(np.array([1.0])) == value
+
+
+@given(st.text(alphabet="h0123456789.+-*/()absqrtexplogminmax, ", max_size=24))
+def test_any_text_is_a_law_or_an_input_error(text):
+    try:
+        law = parse_formula(text)
+    except tetopt.InputError:
+        return
+    assert law(H).shape == H.shape
+
+
+def test_no_value_is_refused_with_the_intensity():
+    with pytest.raises(tetopt.InputError, match="inf at intensity 0"):
+        young_from(parse_formula("1/h"), np.array([0.0, 1.0]))
+
+
+def test_one_over_strain_is_the_papers_law():
+    strain = np.array([0.02, -0.01, 0.0, 0.3])
+    np.testing.assert_array_equal(young_from(parse_law("1/max(abs(h), 0.001)"), strain), inverse_strain(strain, 0.001))
+
+
+def test_law_is_a_table_or_a_formula():
+    np.testing.assert_array_equal(young_from(parse_law("0:1,100:5"), [50.0]), [3.0])
+    np.testing.assert_array_equal(young_from(parse_law("max(h, 60)"), [50.0]), [60.0])

@@ -1,0 +1,194 @@
+"""Graded starts: where the nodes are, how many, and the hard cases; and the mesh that comes of them."""
+
+import sys
+
+import numba
+import numpy as np
+import pytest
+from scipy import ndimage
+
+import tetopt
+from tetopt.start.octree import octree
+from tetopt.target.content import noise_level
+
+OBLIQUE = np.array([[0.9, 0.3, 0.2, -7.0], [-0.25, 1.1, 0.1, 3.0], [0.0, 0.4, -1.5, 11.0], [0.0, 0.0, 0.0, 1.0]])
+
+
+def grid(*shape):
+    return np.stack(np.meshgrid(*[np.arange(float(s)) for s in shape], indexing="ij"), -1)
+
+
+def ball(*shape, affine=None, noise=0.0):
+    place = grid(*shape) - 0.4 * np.array(shape)
+    data = 100.0 * ((place**2).sum(-1) < (0.2 * shape[0]) ** 2)
+    return tetopt.Image(data + np.random.default_rng(0).normal(0.0, noise, shape), affine)
+
+
+def sheet():
+    data = np.zeros((48, 40, 40))
+    data[24] = 100.0
+    return tetopt.Image(data)
+
+
+def close_surfaces():
+    data = np.zeros((48, 40, 40))
+    data[:20], data[21:] = 60.0, 120.0
+    return tetopt.Image(data)
+
+
+def touching():
+    return tetopt.Image(100.0 * (grid(40, 40, 40).sum(-1) < 30.0))
+
+
+IMAGES = {
+    "ball": (ball(48, 40, 44), 1500),
+    "noisy ball": (ball(48, 40, 44, noise=10.0), 1500),
+    "oblique": (ball(48, 40, 30, affine=OBLIQUE), 1500),
+    "one-voxel sheet": (sheet(), 1500),
+    "surfaces a voxel apart": (close_surfaces(), 1500),
+    "touching the box": (touching(), 1500),
+    "noise only": (tetopt.Image(np.random.default_rng(1).normal(0, 10, (40, 40, 40))), 1500),
+    "constant": (tetopt.Image(np.full((40, 40, 40), 7.0)), 1500),
+    "0.5 x 0.5 x 5 mm": (ball(80, 80, 16, affine=np.diag([0.5, 0.5, 5.0, 1.0])), 1500),
+    "2-D": (ball(90, 70), 500),
+    "2-D noise": (tetopt.Image(np.random.default_rng(1).normal(0, 10, (90, 70))), 500),
+}
+
+
+@pytest.mark.parametrize("name", IMAGES)
+def test_octree_is_a_good_mesh_of_the_box(name):
+    image, nodes = IMAGES[name]
+    mesh = octree(image, nodes)
+    assert tetopt.check_mesh(mesh, image) == []
+    assert abs(len(mesh.points) - nodes) <= 0.08 * nodes
+    shape = tetopt.quality(mesh.points, mesh.cells)
+    if image.ndim == 3:
+        assert shape.min_dihedral > 10.0
+    again = octree(image, nodes)
+    np.testing.assert_array_equal(again.points, mesh.points)
+    np.testing.assert_array_equal(again.cells, mesh.cells)
+
+
+@pytest.mark.parametrize("name", IMAGES)
+def test_mesh_image(name):
+    """The whole way: a mesh above the floor with that many nodes, every voxel in one cell, no more E_D than before."""
+    image, nodes = IMAGES[name]
+    result = tetopt.mesh_image(image, nodes, iterations=10)
+    first, last = result.history[0], result.history[-1]
+    assert tetopt.check_mesh(result.mesh, image) == []
+    assert abs(len(result.mesh.points) - nodes) <= 0.01 * nodes or first.E_D == 0.0
+    assert last.n_voxels == image.data.size
+    assert last.E_D == pytest.approx(tetopt.E_D(image, result.mesh), rel=1e-9, abs=1e-6)
+    assert last.E_D <= first.E_D
+    if "nois" not in name and name != "constant":
+        assert last.E_D < 0.6 * first.E_D
+    if image.ndim == 3:
+        assert tetopt.quality(result.mesh.points, result.mesh.cells).min_dihedral >= 12.0 * (1 - 1e-9)
+
+
+def test_less_error_than_a_uniform_mesh():
+    """At the same number of nodes, from start to end, and at a comparable shape."""
+    image = ball(60, 56, 52, noise=2.0)
+    uniform = tetopt.optimize(image, tetopt.lattice(image, nodes=2000), k_D=0.5).mesh
+    graded = tetopt.mesh_image(image, len(uniform.points)).mesh
+    assert abs(len(graded.points) - len(uniform.points)) <= 2
+    assert tetopt.E_D(image, graded) < 0.6 * tetopt.E_D(image, uniform)
+    assert tetopt.quality(graded.points, graded.cells).mean_rho > 0.23
+
+
+def test_nodes_do_not_follow_noise(monkeypatch):
+    """Noise everywhere, a wave in half of the box: more nodes go to the wave if noise is known for what it is."""
+    rng = np.random.default_rng(2)
+    data = rng.normal(0.0, 20.0, (64, 40, 40))
+    data[:32] += 30.0 * np.sin(grid(64, 40, 40)[:32, ..., 1] / 3.0)
+
+    def share_in_wave():
+        image = tetopt.Image(data)
+        index = image.to_index(octree(image, 2000, tetopt.Sizes(largest=np.inf)).points)
+        return float((index[:, 0] < 31.5).sum()) / len(index)
+
+    known = share_in_wave()
+    monkeypatch.setattr(sys.modules["tetopt.content"], "noise_level", lambda data, inside: 0.0)
+    assert known > 0.75
+    assert share_in_wave() < 0.7
+
+
+def test_noise_alone_gets_a_uniform_mesh():
+    """Two sizes of blocks at most, and as many nodes in each half of the box."""
+    image = IMAGES["noise only"][0]
+    mesh = octree(image, 1500)
+    volume = np.abs(np.linalg.det(mesh.points[mesh.cells[:, 1:]] - mesh.points[mesh.cells[:, :1]]))
+    assert volume.max() < 17.0 * np.median(volume)  # 8 times for a level; a block's corner is cut into unequal cells
+    halves = (image.to_index(mesh.points) < 19.5).mean(axis=0)
+    assert (np.abs(halves - 0.5) < 0.1).all()
+
+
+@pytest.mark.parametrize("shape", [(60, 60), (40, 40, 40)])
+@pytest.mark.parametrize("sigma", [0.5, 5.0])
+def test_noise_level(shape, sigma):
+    """Found within 8 %, beside structure ten times as strong, and with a background cut out."""
+    rng = np.random.default_rng(3)
+    structure = 10.0 * sigma * np.sin(grid(*shape).sum(-1) / 6.0)
+    noisy = structure + rng.normal(0.0, sigma, shape)
+    assert noise_level(noisy) == pytest.approx(sigma, rel=0.08)
+    noisy[: shape[0] // 2] = 0.0
+    assert noise_level(noisy) == pytest.approx(sigma, rel=0.08)
+    assert noise_level(np.zeros(shape)) == 0.0
+    fine = ndimage.gaussian_filter(rng.normal(size=shape), 1.5)
+    assert noise_level(np.round(fine / fine.std())) == 0.0  # labels
+
+
+@pytest.mark.parametrize(
+    ("shape", "nodes", "words"),
+    [
+        ((30, 30, 30), 3, "9 or more in 3-D, got 3"),
+        ((30, 30, 30), 100.5, "whole number"),
+        ((30, 30, 30), 500_000, "too many for 30 x 30 x 30 voxels; ask for fewer"),
+        ((200, 2, 2), 10, "too few for 200 x 2 x 2 voxels: the nearest octree found has 89"),
+    ],
+)
+def test_impossible_numbers_of_nodes(shape, nodes, words):
+    with pytest.raises(tetopt.InputError, match=words):
+        octree(ball(*shape), nodes)
+
+
+@pytest.mark.parametrize("nodes", [50, 100, 200, 300, 500, 700, 1000, 1500, 2500])
+@pytest.mark.parametrize("kind", ["ball", "constant", "noise", "voxel"])
+def test_every_number_of_nodes(kind, nodes):
+    """Where many blocks are alike, too: a ball in the middle, nothing, noise, one bright voxel."""
+    shape = (32, 32, 32)
+    data = {
+        "ball": 100.0 * (((grid(*shape) - 15.5) ** 2).sum(-1) < 81),
+        "constant": np.ones(shape),
+        "noise": np.random.default_rng(0).normal(size=shape),
+        "voxel": np.where((grid(*shape) == 9).all(-1), 50.0, 0.0),
+    }[kind]
+    found = len(octree(tetopt.Image(data), nodes).points)
+    assert abs(found - nodes) <= max(0.07 * nodes, 30)
+
+
+@pytest.mark.parametrize("scale", [1e-150, 1e-30, 1e100])
+def test_scale_of_intensities(scale):
+    image = ball(30, 30, 30, noise=3.0)
+    expected = octree(image, 800).points
+    np.testing.assert_array_equal(octree(tetopt.Image(image.data * scale), 800).points, expected)
+
+
+def test_intensities_that_overflow():
+    with pytest.raises(tetopt.InputError, match="overflow"):
+        octree(tetopt.Image(ball(30, 30, 30, noise=1.0).data * 1e200), 800)
+
+
+def test_same_bits_for_any_number_of_threads():
+    image = ball(48, 40, 44, noise=3.0)
+    threads = numba.get_num_threads()
+    results = []
+    try:
+        for count in {1, min(2, numba.config.NUMBA_NUM_THREADS)}:
+            numba.set_num_threads(count)
+            results.append(tetopt.mesh_image(image, 3000, iterations=6).mesh)
+    finally:
+        numba.set_num_threads(threads)
+    for other in results[1:]:
+        np.testing.assert_array_equal(other.points, results[0].points)
+        np.testing.assert_array_equal(other.cells, results[0].cells)

@@ -1,0 +1,331 @@
+"""Limits on sizes: kept by the octree to the letter and by the run but for a few edges; what they are made of."""
+
+import sys
+
+import numpy as np
+import pytest
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import dijkstra
+from test_octree import OBLIQUE, ball, grid
+
+import tetopt
+from tetopt.start.octree import _Blocks, _divided, octree
+from tetopt.start.sizes import Sizes, _around
+
+
+def edges(mesh):
+    """Ends and lengths of a mesh's edges."""
+    n = mesh.cells.shape[1]
+    pairs = np.vstack([mesh.cells[:, [i, j]] for i in range(n) for j in range(i)])
+    ends = np.unique(np.sort(pairs, axis=1), axis=0)
+    return ends, np.linalg.norm(mesh.points[ends[:, 0]] - mesh.points[ends[:, 1]], axis=1)
+
+
+@pytest.mark.parametrize("affine", [None, OBLIQUE])
+@pytest.mark.parametrize("shape", [(48, 40, 44), (90, 70)])
+def test_largest(shape, affine):
+    """No edge of the octree is longer; of the run's, one in a hundred by 5 %. It holds cells back that would grow."""
+    if affine is not None and len(shape) == 2:
+        affine = OBLIQUE[:3, :3].copy()
+        affine[2] = 0, 0, 1
+    image, nodes = ball(*shape, affine=affine), 1500 if len(shape) == 3 else 500
+    free = octree(image, nodes, Sizes(largest=np.inf))
+    largest = 0.65 * edges(free)[1].max()
+    sizes = Sizes(largest=largest)
+    mesh = octree(image, nodes, sizes)
+    slant = 1.3 if affine is not None else 1.0  # blocks are parallelepipeds, whose diagonals are longer
+    assert edges(mesh)[1].max() <= largest * slant * (1 + 1e-9)
+    assert edges(mesh)[1].max() > 0.6 * largest
+    after = edges(tetopt.mesh_image(image, nodes, sizes=sizes).mesh)[1]
+    assert np.percentile(after, 99) <= 1.05 * slant * largest
+    unbounded = edges(tetopt.mesh_image(image, nodes, sizes=Sizes(largest=np.inf)).mesh)[1]
+    assert unbounded.max() > 1.1 * after.max()
+
+
+def test_default_largest():
+    """1.4 times the edges of a uniform mesh; larger where more nodes are not wanted."""
+    image = ball(48, 40, 44)
+    uniform = edges(tetopt.lattice(image, nodes=1500))[1].max()
+    assert Sizes().at_most(image, 1500) == pytest.approx(1.4 * uniform, rel=0.05)
+    assert edges(octree(image, 1500))[1].max() <= 1.4 * 1.05 * uniform
+
+
+def test_smallest():
+    """No block is below it, and no edge is split below it."""
+    image = ball(48, 40, 44)
+    sizes = Sizes(smallest=1.6 * edges(octree(image, 1000))[1].min())
+    assert edges(octree(image, 1000, sizes))[1].min() > 0.85 * sizes.smallest  # from a block's corner to its centre
+    fine = edges(tetopt.mesh_image(image, 1000).mesh)[1]
+    coarse = edges(tetopt.mesh_image(image, 1000, sizes=sizes).mesh)[1]
+    assert np.percentile(coarse, 2) > 1.2 * np.percentile(fine, 2)
+
+
+@pytest.mark.parametrize("field_affine", [np.diag([2.0, 2.0, 2.0, 1.0]), np.diag([-4.0, 1.0, 8.0, 1.0])])
+def test_field(field_affine):
+    """A field on another grid: fine where it says so, free elsewhere."""
+    image = ball(48, 40, 44)
+    corners = np.array([[-1.0, -1.0, -1.0], [48.0, 40.0, 44.0]])
+    at = (corners @ np.linalg.inv(field_affine[:3, :3]).T).round()
+    affine = field_affine.copy()
+    affine[:3, 3] = field_affine[:3, :3] @ at.min(axis=0)
+    shape = tuple((at.max(axis=0) - at.min(axis=0) + 1).astype(int))
+    place = tetopt.Image(np.zeros(shape), affine).to_world(grid(*shape))
+    field = tetopt.Image(np.where(place[..., 0] < 12.0, 6.0, 0.0), affine)
+    sizes = Sizes(largest=20.0, field=field)
+    for mesh in (octree(image, 3000, sizes), tetopt.mesh_image(image, 3000, sizes=sizes).mesh):
+        ends, length = edges(mesh)
+        middle = mesh.points[ends].mean(axis=1)[:, 0]
+        assert np.percentile(length[middle < 9.0], 99) <= 6.3
+        assert np.percentile(length[middle > 24.0], 90) > 6.3
+    with pytest.raises(tetopt.InputError, match=r"300 nodes are too few for 48 x 40 x 44 voxels and these limits"):
+        octree(image, 300, sizes)
+
+
+def test_gradation():
+    """From one small spot in an empty box sizes grow, and slowly if they are asked to."""
+    shape = (64, 64, 64)
+    image = tetopt.Image(np.zeros(shape))
+    spot = tetopt.Image(np.where(((grid(*shape) - 31.5) ** 2).sum(-1) < 9.0, 3.0, 0.0))
+    far = {}
+    for gradation in (1.0, 0.25):
+        mesh = octree(image, 3000 if gradation == 1.0 else 11000, Sizes(largest=40.0, gradation=gradation, field=spot))
+        ends, length = edges(mesh)
+        distance = np.linalg.norm(mesh.points[ends].mean(axis=1) - 31.5, axis=1)
+        assert length[distance < 2.0].max() <= 3.0
+        near = (distance > 8.0) & (distance < 12.0)
+        assert length[near].max() <= 3.0 + 2.5 * gradation * 12.0
+        far[gradation] = float(length[near].mean())
+    assert far[0.25] < 0.7 * far[1.0]
+
+
+@pytest.mark.parametrize("rings", [1, 2, 3])
+def test_blocks_around_a_divided_one(rings):
+    """As many of its size exist in every direction, that is, their parents are divided; and no other."""
+    sizes = [8, 16, 32]
+    error = [np.zeros((s, s)) for s in sizes]
+    error[1][7, 9] = 1.0
+    levels = [_Blocks(e, np.zeros(e.shape, dtype=bool), np.ones(e.shape, dtype=bool)) for e in error]
+    divided = _divided(levels, 0.5, rings)
+    assert np.argwhere(divided[1]).tolist() == [[7, 9]]
+    parents = {(i // 2, j // 2) for i in range(7 - rings, 8 + rings) for j in range(9 - rings, 10 + rings)}
+    assert {(int(i), int(j)) for i, j in np.argwhere(divided[0])} == parents
+
+
+@pytest.mark.parametrize("shape", [(9, 8), (7, 6, 5)])
+def test_field_is_lowered_to_its_gradation(shape):
+    """Against shortest ways over the faces of voxels, found for every pair."""
+    rng = np.random.default_rng(0)
+    data = rng.uniform(1.0, 30.0, shape)
+    data[data > 28.0] = 0.0
+    spacing = np.arange(1.0, len(shape) + 1.0)
+    field = tetopt.Image(data, np.diag([*spacing, 1.0]))
+    found = Sizes(gradation=0.3, field=field).prepared(len(shape)).field.data
+    place = grid(*shape).reshape(-1, len(shape)) * spacing
+    ways = 0.3 * np.abs(place[:, None] - place[None]).sum(-1)
+    value = np.where(data > 0.0, data, np.inf).ravel()
+    np.testing.assert_allclose(found.ravel(), (value[None] + ways).min(axis=1), rtol=1e-5)
+
+
+def test_sizes_around_are_the_twin_s():
+    """The least of the other nodes' sizes + gradation x way along edges: against Dijkstra's algorithm."""
+    mesh = octree(ball(30, 30, 30), 300)
+    ends, length = edges(mesh)
+    n = len(mesh.points)
+    own = np.random.default_rng(1).uniform(1.0, 10.0, n)
+    graph = coo_array((0.3 * length, tuple(ends.T)), shape=(n, n)).tocsr()
+    ways = dijkstra(graph, directed=False)
+    np.fill_diagonal(ways, np.inf)
+    # A way may lead away from a node and back to it: twice the shortest edge.
+    back = np.full(n, np.inf)
+    np.minimum.at(back, ends.ravel(), np.repeat(0.6 * length, 2))
+    expected = np.minimum((own[None] + ways).min(axis=1), own + back)
+    np.testing.assert_allclose(_around(own, mesh.points, mesh.cells, 0.3), expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("sizes", "words"),
+    [
+        (Sizes(smallest=-1.0), "size_min: expected 0 mm or more, got -1"),
+        (Sizes(smallest=float("nan")), "size_min"),
+        (Sizes(largest=0.0), "size_max: expected a length above 0 mm"),
+        (Sizes(smallest=5.0, largest=4.0), "size_max: 4 mm is below the smallest size, 5 mm"),
+        (Sizes(gradation=0.0), "gradation: expected 0.05"),
+        (Sizes(gradation=2.0), "gradation: expected 0.05"),
+        (Sizes(field=tetopt.Image(np.ones((4, 4)))), "sizing: expected a field in 3-D"),
+        (Sizes(field=tetopt.Image(np.zeros((4, 4, 4)))), "sizing: no voxel is above 0"),
+        (Sizes(field=tetopt.Image(np.full((30, 30, 30), 0.5))), "500 nodes are too few .* they need"),
+        (Sizes(smallest=100.0), "size_min: 100 mm is longer than the box, 30 mm"),
+        (Sizes(smallest=1e300), "longer than the box"),
+        (Sizes(largest=0.3), "500 nodes are too few .* they need"),
+        (Sizes(largest=1e-6), "500 nodes are too few .* they need"),
+        (Sizes(field=tetopt.Image(np.full((30, 30, 30), 1e-20))), "500 nodes are too few .* they need"),
+        (
+            Sizes(field=tetopt.Image(np.ones((9, 9, 9)), np.diag([1, 1, 1, 1]) + 99 * np.eye(4, k=3))),
+            "no voxel above 0",
+        ),
+    ],
+)
+def test_limits_that_cannot_be(sizes, words):
+    image = ball(30, 30, 30)
+    with pytest.raises(tetopt.InputError, match=words):
+        octree(image, 500, sizes)
+    with pytest.raises(tetopt.InputError, match=words):
+        tetopt.mesh_image(image, 500, sizes=sizes)
+
+
+def test_smallest_before_largest():
+    """Where not both can be, the smallest is kept."""
+    mesh = octree(ball(30, 30, 30), 320, Sizes(smallest=5.0, largest=5.0))
+    assert edges(mesh)[1].min() >= 5.0 * (1 - 1e-9)
+
+
+def waves_in_half():
+    """A box with content in half of it, for which nodes leave the other half."""
+    data = np.zeros((40, 40, 40))
+    data[:20] = 100.0 * np.sin(grid(20, 40, 40)[..., 1] / 2.0) * np.cos(grid(20, 40, 40)[..., 2] / 3.0)
+    return tetopt.Image(data)
+
+
+def test_runs_keep_to_the_largest():
+    """From a uniform mesh: exchanges make edges no longer than allowed, and would."""
+    image = waves_in_half()
+    start = tetopt.lattice(image, nodes=1000)
+    longest = edges(start)[1].max()
+    bounded, free = (
+        edges(tetopt.optimize(image, start, k_D=0.85, nodes=1000, iterations=10, sizes=Sizes(largest=largest)).mesh)[1]
+        for largest in (1.1 * longest, np.inf)
+    )
+    assert np.percentile(bounded, 99.5) < 1.1 * 1.05 * longest
+    assert np.percentile(free, 99.5) > 1.1 * np.percentile(bounded, 99.5)
+
+
+def test_runs_keep_to_the_smallest(monkeypatch):
+    """From a uniform mesh: edges whose halves would be shorter are not split, and would be."""
+    image = waves_in_half()
+    start = tetopt.lattice(image, nodes=1000)
+    fast = sys.modules["tetopt.engine.fast"]
+    plain, made = fast.exchange, []
+
+    def counted(*arguments):
+        done = plain(*arguments)
+        made.append(done.n_split)
+        return done
+
+    monkeypatch.setattr(fast, "exchange", counted)
+    splits = []
+    for smallest in (0.0, 0.65 * edges(start)[1].max()):
+        made.clear()
+        sizes = Sizes(smallest=smallest, largest=np.inf)
+        tetopt.optimize(image, start, k_D=0.85, nodes=len(start.points), iterations=6, sizes=sizes)
+        splits.append(sum(made))
+    assert splits[0] > 100
+    assert splits[1] < 0.1 * splits[0]
+
+
+def test_longest_at_nodes():
+    """The least of the largest, the field's value, and what grows from the sizes around."""
+    image = ball(30, 30, 30)
+    mesh = octree(image, 300)
+    own = np.full(len(mesh.points), 100.0)
+    affine = np.diag([3.0, 3.0, 3.0, 1.0])
+    affine[:3, 3] = -1.0
+    field = tetopt.Image(np.where(grid(12, 12, 12)[..., 0] < 5, 7.0, 0.0), affine)
+    in_field = image.to_index(mesh.points)[:, 0] < 12.0
+    found = Sizes(largest=20.0, field=field).prepared(3).longest(image, 300, mesh.points, mesh.cells, own)
+    np.testing.assert_allclose(found[in_field], 7.0)
+    assert found.max() > 12.0  # grows from the field by gradation x distance
+    assert found.max() <= 20.0
+    own = np.linspace(1.0, 3.0, len(mesh.points))
+    sizes = Sizes(largest=np.inf, gradation=0.2)
+    found = sizes.longest(image, 300, mesh.points, mesh.cells, own)
+    np.testing.assert_allclose(found, 1.5 * _around(own, mesh.points, mesh.cells, 0.2))
+
+
+# As many nodes as an error takes.
+
+
+def test_a_stop_keeps_what_has_the_error():
+    """A run cut short does not replace a mesh that has the error already; without one it is what there is."""
+    image = ball(40, 40, 40)
+    fast = sys.modules["tetopt.engine.fast"]
+    for stops_at, has_error in ((1, False), (3, True)):
+        count = []
+
+        def run(mesh, nodes, count=count, stops_at=stops_at):
+            count.append(nodes)
+            stop = (lambda: True) if len(count) >= stops_at else None
+            return tetopt.optimize(image, mesh, k_D=0.85, nodes=nodes, iterations=8, stop=stop)
+
+        nodes, _, result = fast.meshed_to_error(image, 0.0005, None, run)
+        assert len(count) == stops_at
+        share = result.history[-1].E_D / (float(np.var(image.data, dtype=np.float64)) * image.volume)
+        assert (share <= 0.0005) == has_error
+        assert (result.ended == "stopped") != has_error
+        assert nodes in count
+
+
+@pytest.mark.parametrize("noise", [0.0, 3.0])
+@pytest.mark.parametrize("shape", [(60, 56, 52), (120, 100)])
+def test_target_error(shape, noise):
+    """Reached, without far more nodes than it takes."""
+    image = ball(*shape, noise=noise)
+    target = 0.06 if len(shape) == 3 else 0.03
+    mesh = tetopt.mesh_image(image, target_error=target).mesh
+    total = float(np.var(image.data, dtype=np.float64)) * image.volume
+    assert tetopt.E_D(image, mesh) <= target * total
+    fewer = tetopt.mesh_image(image, len(mesh.points) // 2).mesh
+    assert tetopt.E_D(image, fewer) > 1.05 * target * total
+    assert tetopt.check_mesh(mesh, image) == []
+
+
+def test_target_error_within_limits():
+    """Limits on sizes that ask for more nodes than the error does, or for fewer, have the last word."""
+    image = ball(40, 40, 40)
+    total = float(np.var(image.data, dtype=np.float64)) * image.volume
+    fine = tetopt.mesh_image(image, target_error=0.5, sizes=Sizes(largest=9.0))
+    assert edges(fine.mesh)[1].max() < 11.0
+    assert fine.history[-1].E_D < 0.1 * total
+    coarse = tetopt.mesh_image(image, target_error=0.001, sizes=Sizes(smallest=9.0, largest=40.0))
+    assert edges(coarse.mesh)[1].mean() > 9.0
+    assert coarse.history[-1].E_D > 0.001 * total
+
+
+@pytest.mark.parametrize(
+    ("image", "arguments", "words"),
+    [
+        (ball(30, 30, 30), {}, "one of them"),
+        (ball(30, 30, 30), {"nodes": 100, "target_error": 0.1}, "one of them"),
+        (ball(30, 30, 30), {"target_error": 1.0}, "expected a share of the image's variance, 0 to 1"),
+        (ball(30, 30, 30), {"target_error": float("nan")}, "expected a share"),
+        (tetopt.Image(np.ones((30, 30, 30))), {"target_error": 0.1}, "the image is constant"),
+        (ball(30, 30, 30, noise=20.0), {"target_error": 0.1}, "below the noise's share"),
+    ],
+)
+def test_targets_that_cannot_be(image, arguments, words):
+    with pytest.raises(tetopt.InputError, match=words):
+        tetopt.mesh_image(image, **arguments)
+
+
+def test_exchanges_do_not_follow_noise(monkeypatch):
+    """In noise alone hardly a node is exchanged, if its level is known."""
+    image = tetopt.Image(np.random.default_rng(1).normal(0.0, 10.0, (40, 40, 40)))
+    fast = sys.modules["tetopt.engine.fast"]
+    start = octree(image, 1500)
+    count = {}
+    for known in (True, False):
+        made = []
+        plain = fast.exchange
+
+        def counted(*arguments, made=made, plain=plain):
+            done = plain(*arguments)
+            made.append(min(done.n_split, done.n_collapsed))
+            return done
+
+        with monkeypatch.context() as patched:
+            patched.setattr(fast, "exchange", counted)
+            if not known:
+                patched.setattr(sys.modules["tetopt.content"], "noise_level", lambda data, inside: 0.0)
+            tetopt.optimize(image, start, k_D=0.85, nodes=len(start.points), iterations=8)
+        count[known] = sum(made)
+    assert count[False] > 100
+    assert count[True] < 0.1 * count[False]

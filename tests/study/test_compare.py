@@ -1,0 +1,216 @@
+"""`tetopt compare` and `tetopt baseline`: files, numbers recomputed, failures, resuming, one line for bad input."""
+
+import json
+
+import numpy as np
+import pytest
+
+import tetopt
+from tetopt.cli import main
+from tetopt.study import compare
+from tetopt.study.compare_files import PICTURES
+
+SMALL = ["--nodes", "150", "--repeats", "2", "--reference-dofs", "6000"]
+
+
+LABEL_KEYS = {  # of the report, and what the library calls it
+    "label": "label", "mesh_volume_mm3": "mesh_volume", "surface_mean_mm": "distance_mean",
+    "surface_p95_mm": "distance_p95", "components": "components", "mesh_components": "mesh_components",
+    "is_lost": "is_lost",
+}  # fmt: skip
+
+
+@pytest.fixture(scope="module")
+def head(tmp_path_factory):
+    """A small two-sphere volume with its true labels."""
+    folder = tmp_path_factory.mktemp("compare")
+    phantom = tetopt.load_phantom("two_spheres")
+    tetopt.save_image(folder / "image.nii.gz", phantom.image(voxel_mm=4.0))
+    tetopt.save_image(folder / "labels.nii.gz", phantom.label_image(voxel_mm=4.0))
+    return folder
+
+
+@pytest.fixture(scope="module")
+def run(head, opengl):
+    out = head / "out"
+    inputs = [str(head / "image.nii.gz"), "--labels", str(head / "labels.nii.gz")]
+    assert main(["compare", *inputs, "-o", str(out), *SMALL, "--pipelines", "tetopt,bcc,odt", "--curve", "0.5"]) == 0
+    return out
+
+
+def test_files(run):
+    assert {p.name for p in run.iterdir()} == {"report.json", "report.html", "runs", *PICTURES} - {"tradeoff.png"}
+    names = {p.stem for p in (run / "runs").iterdir()}
+    assert names == {f"{name}-{nodes}-1" for name in ("tetopt", "bcc", "odt") for nodes in (150, 75)}
+
+
+def test_numbers_are_those_of_the_meshes(run, head):
+    """E_D's share and Dice, recomputed voxel by voxel from the mesh file, and the library's measures of its labels."""
+    report = json.loads((run / "report.json").read_text())
+    image, labels = (tetopt.load_image(head / name) for name in ("image.nii.gz", "labels.nii.gz"))
+    h, true = image.data.astype(float).ravel(), labels.data.astype(int).ravel()
+    for pipeline in report["pipelines"]:
+        mesh = tetopt.load_mesh(run / "runs" / f"{pipeline['name']}-150-1.vtu").mesh
+        owner = tetopt.cell_of_voxel(image, mesh).ravel()
+        assert (owner >= 0).all()
+        means = np.bincount(owner, weights=h) / np.maximum(np.bincount(owner), 1)
+        within = ((h - means[owner]) ** 2).sum()
+        found = pipeline["median"]
+        assert found["E_D_share"] == pytest.approx(within / ((h - h.mean()) ** 2).sum(), rel=1e-9)
+        assert found["n_missed_voxels"] == 0
+        votes = np.zeros((owner.max() + 1, true.max() + 1), dtype=int)
+        np.add.at(votes, (owner, true), 1)
+        painted = votes.argmax(axis=1)[owner]
+        for row, of_label in zip(found["labels"], tetopt.measure.fidelity.label_fidelity(labels, mesh), strict=True):
+            k = row["label"]
+            both = ((painted == k) & (true == k)).sum()
+            assert row["voxels"] == (true == k).sum()
+            assert row["mesh_voxels"] == (painted == k).sum()
+            assert row["dice"] == pytest.approx(2 * both / (row["voxels"] + row["mesh_voxels"]))
+            assert row["volume_mm3"] == pytest.approx(row["voxels"] * 4.0**3)
+            assert [row[name] for name in LABEL_KEYS] == pytest.approx(
+                [getattr(of_label, k) for k in LABEL_KEYS.values()]
+            )
+        assert sum(row["E_D_share"] for row in found["labels"]) == pytest.approx(found["E_D_share"], rel=1e-9)
+
+
+def test_the_image_helps_and_the_reference_is_one(run):
+    """tetopt has less E_D than both controls; all are judged by one reference; curves have two points."""
+    report = json.loads((run / "report.json").read_text())
+    share = {p["name"]: p["median"]["E_D_share"] for p in report["pipelines"]}
+    assert share["tetopt"] < 0.5 * min(share["bcc"], share["odt"])
+    for pipeline in report["pipelines"]:
+        for nu, fem in pipeline["median"]["fem"].items():
+            energy = report["reference"][nu]["strain_energy"]
+            assert fem["errors"]["strain_energy"] == pytest.approx(abs(fem["strain_energy"] / energy - 1.0), rel=1e-9)
+    assert [len(curve["points"]) for curve in report["curves"]] == [2, 2, 2]
+
+
+def test_tradeoff(head, opengl, tmp_path):
+    """The defaults' row is the pipeline's own mesh; more of the image costs shape; the picture is on the page."""
+    out = tmp_path / "out"
+    words = [str(head / "image.nii.gz"), "-o", str(out), *SMALL, "--pipelines", "tetopt,bcc", "--curve", ""]
+    assert main(["compare", *words, "--tradeoff"]) == 0
+    report = json.loads((out / "report.json").read_text())
+    rows = report["tradeoff"]
+    defaults = [row["measured"] for row in rows if row["is_default"]]
+    assert len(defaults) == 4
+    assert all(measured == defaults[0] for measured in defaults)
+    own = report["pipelines"][0]["median"]
+    assert {k: own[k] for k in ("E_D_share", "quality", "fem")} == {
+        k: defaults[0][k] for k in ("E_D_share", "quality", "fem")
+    }
+    by_k_D = [row["measured"] for row in rows if row["option"] == "k_D"]
+    assert by_k_D[0]["E_D_share"] > by_k_D[-1]["E_D_share"]
+    assert by_k_D[0]["quality"]["mean_rho"] > by_k_D[-1]["quality"]["mean_rho"]
+    assert (out / "tradeoff.png").stat().st_size > 20_000
+    assert "What tetopt&#x27;s options trade" in (out / "report.html").read_text()
+    assert main(["compare", *words, "--force"]) == 0
+    assert not (out / "tradeoff.png").exists()
+    assert "options trade" not in (out / "report.html").read_text()
+
+
+def test_resume_keeps_what_is_done(run, head, capsys):
+    """Finished runs of the same settings are kept; a run taken away, or other settings, are run again."""
+    inputs = [str(head / "image.nii.gz"), "--labels", str(head / "labels.nii.gz")]
+    again = ["compare", *inputs, "-o", str(run), *SMALL, "--pipelines", "tetopt,bcc,odt", "--curve", "0.5", "--resume"]
+    before = json.loads((run / "report.json").read_text())
+    (run / "runs" / "bcc-150-1.json").unlink()
+    capsys.readouterr()
+    assert main(again) == 0
+    err = capsys.readouterr().err
+    assert err.count("kept from before") == 5
+    after = json.loads((run / "report.json").read_text())
+    assert [p["median"]["E_D"] for p in after["pipelines"]] == [p["median"]["E_D"] for p in before["pipelines"]]
+    assert main([*again, "--k-d", "0.3", "--pipelines", "bcc"]) == 0
+    assert "kept from before" not in capsys.readouterr().err
+    assert main([word for word in again if word != "--resume"]) == 2
+    assert "exists already" in capsys.readouterr().err
+
+
+def test_when_all_fail_nothing_is_replaced(head, opengl, capsys):
+    """No time at all for anything: one line, exit 2, no report."""
+    out = head / "hurried"
+    command = ["compare", str(head / "image.nii.gz"), "-o", str(out), *SMALL, "--curve", ""]
+    assert main([*command, "--pipelines", "bcc,tetopt", "--max-seconds", "0.1"]) == 2
+    assert "every pipeline failed" in capsys.readouterr().err
+    assert not (out / "report.json").exists()
+
+
+def test_a_mesh_that_cannot_be_measured_is_a_row(head, opengl, monkeypatch):
+    def breaks(system):
+        raise RuntimeError("no convergence")
+
+    out = head / "broken"
+    monkeypatch.setattr(compare, "conditioning", breaks)
+    command = ["compare", str(head / "image.nii.gz"), "-o", str(out), *SMALL, "--curve", "", "--pipelines", "bcc"]
+    assert main(command) == 2
+    assert not (out / "report.json").exists()
+
+
+def test_resume_refuses_another_comparison(run, head, capsys):
+    kept = (run / "report.json").read_bytes()
+    command = ["compare", str(head / "image.nii.gz"), "-o", str(run), "--nodes", "99", "--resume"]
+    assert main(command) == 2
+    assert "is of another comparison" in capsys.readouterr().err
+    assert (run / "report.json").read_bytes() == kept
+
+
+def test_pytetwild_in_the_comparison(head, opengl):
+    """The conventional pipeline beside ours, two repeats: node counts near the wish, the range in the report."""
+    pytest.importorskip("pytetwild", reason="the conventional pipeline needs pytetwild")
+    out = head / "peer"
+    command = ["compare", str(head / "image.nii.gz"), "-o", str(out), *SMALL, "--curve", "", "--classes", "3"]
+    assert main([*command, "--pipelines", "tetopt,pytetwild"]) == 0
+    ours, theirs = json.loads((out / "report.json").read_text())["pipelines"]
+    assert len(ours["runs"]) == 1
+    assert len(theirs["runs"]) == 2
+    assert theirs["low"]["E_D"] <= theirs["median"]["E_D"] <= theirs["high"]["E_D"]
+    assert abs(theirs["median"]["n_nodes"] / 150 - 1) < 0.15
+    assert (out / "report.html").read_text(encoding="utf-8").count("pytetwild") > 3
+
+
+def test_baseline(head, tmp_path, capsys):
+    pytest.importorskip("pytetwild", reason="the conventional pipeline needs pytetwild")
+    command = ["baseline", str(head / "image.nii.gz"), "-o", str(tmp_path / "b.vtu"), "--nodes", "150"]
+    assert main([*command, "--classes", "3", "--json", str(tmp_path / "b.json")]) == 0
+    numbers = json.loads((tmp_path / "b.json").read_text())
+    mesh = tetopt.load_mesh(tmp_path / "b.vtu").mesh
+    image = tetopt.load_image(head / "image.nii.gz")
+    assert tetopt.check_mesh(mesh, image) == []
+    assert numbers["fit"]["E_D"] == pytest.approx(tetopt.E_D(image, mesh), rel=1e-9)
+    assert set(numbers["seconds"]) == {"surfaces", "tetrahedra", "search"}
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--pipelines", "tetopt,gmsh"], "pipelines: expected some of"),
+        (["--pipelines", ""], "pipelines: expected some of"),
+        (["--pipelines", "bcc,bcc"], "each once"),
+        (["--curve", "a"], "--curve: expected parts"),
+        (["--k-d", "1"], "--k-d"),
+        (["--max-seconds", "0"], "--max-seconds"),
+        (["--young", "h-1000"], "modulus: expected 0 kPa or more"),
+    ],
+)
+def test_bad_input(head, tmp_path, options, words, capsys):
+    assert main(["compare", str(head / "image.nii.gz"), "-o", str(tmp_path / "o"), *SMALL, *options]) == 2
+    err = capsys.readouterr().err.strip().splitlines()
+    assert words in err[-1]
+
+
+def test_reference_shape_is_as_fine_as_allowed():
+    """No more dofs than allowed, no finer than the image, nearly cubic."""
+    for shape, spacing, dofs in (((60, 50, 40), (1.0, 1.0, 1.0), 30_000), ((200, 180, 20), (0.5, 0.5, 5.0), 90_000)):
+        found = compare.reference_shape(shape, np.array(spacing), dofs)
+        assert 3 * np.prod(np.array(found) + 1) <= dofs
+        assert all(f <= s for f, s in zip(found, shape, strict=True))
+        assert 3 * np.prod(np.array(found) + 1) > 0.7 * dofs
+    assert compare.reference_shape((9, 8, 7), np.ones(3), 10**9) == (9, 8, 7)
+
+
+def test_elementwise():
+    rows = [{"a": 1, "b": [1.0, 4.0], "c": "x", "d": None}, {"a": 2, "b": [3.0, 4.0], "c": "y", "d": None}]
+    assert compare._elementwise(rows, np.median) == {"a": 1.5, "b": [2.0, 4.0], "c": "x", "d": None}
+    assert compare._elementwise(rows, np.max)["a"] == 2

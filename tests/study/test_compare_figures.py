@@ -1,0 +1,162 @@
+"""Pictures of a comparison, judged by what they hold."""
+
+import copy
+
+import numpy as np
+import PIL.Image
+import pytest
+from matplotlib.collections import PolyCollection
+from test_compare_page import fake_results, meshes_of
+
+import tetopt
+from tetopt.energy.discretization import cell_E_D
+from tetopt.errors import InputError
+from tetopt.geometry.simplex import volumes
+from tetopt.report.figures import _View, save_figure
+from tetopt.study.compare_figures import (
+    ERRORS,
+    curves_figure,
+    cutaways,
+    histograms_figure,
+    labels_figure,
+    slices_figure,
+    timing_figure,
+)
+
+
+@pytest.fixture(scope="module")
+def small():
+    image = tetopt.load_phantom("two_spheres").image(voxel_mm=4.0)
+    return image, meshes_of(image, nodes=200, iterations=2)
+
+
+def painted(axes):
+    return next(c for c in axes.collections if isinstance(c, PolyCollection))
+
+
+@pytest.mark.parametrize("n_meshes", [1, 2, 6])
+def test_slices_hold_means_and_losses(small, n_meshes):
+    image, both = small
+    meshes = [(f"mesh {k}", both[k % 2][1]) for k in range(n_meshes)]
+    means = [tetopt.cell_moments(image, mesh).mean + k for k, (_, mesh) in enumerate(meshes)]
+    figure = slices_figure(image, meshes, means)
+    grid = np.array(figure.axes[: 3 * (n_meshes + 1)]).reshape(3, n_meshes + 1)
+    view = _View(image, None, None)
+    np.testing.assert_array_equal(grid[0, 0].images[0].get_array(), view.pixels.T)
+    for column, ((title, mesh), mean) in enumerate(zip(meshes, means, strict=True), 1):
+        polygons, cells = view.section(mesh)
+        assert grid[0, column].get_title() == title
+        assert len(painted(grid[0, column]).get_paths()) == len(polygons)
+        np.testing.assert_array_equal(painted(grid[1, column]).get_array(), mean[cells])
+        density = cell_E_D(image, mesh) / volumes(mesh.points, mesh.cells)
+        np.testing.assert_array_equal(painted(grid[2, column]).get_array(), density[cells])
+    assert len({painted(grid[2, column]).get_clim() for column in range(1, n_meshes + 1)}) == 1  # one scale for all
+    assert {painted(grid[1, c]).get_clim() for c in range(1, n_meshes + 1)} == {grid[0, 0].images[0].get_clim()}
+
+
+def test_a_mesh_beside_the_slice_can_be_drawn(small, tmp_path):
+    """It covers nothing of the slice: the column shows the colour of what is left uncovered."""
+    image, both = small
+    mesh = both[0][1]
+    low = tetopt.Mesh(mesh.points * 0.2 + image.to_world(np.zeros(3)) * 0.8, mesh.cells)
+    figure = slices_figure(image, [("corner", low)], [np.zeros(len(low.cells))])
+    save_figure(figure, tmp_path / "a.png", dpi=40)
+    assert (tmp_path / "a.png").stat().st_size > 0
+
+
+def test_slices_refuse_missing_means(small):
+    image, both = small
+    with pytest.raises(InputError, match="one array of means for each mesh"):
+        slices_figure(image, both, [])
+
+
+def test_label_marks_are_those_of_the_report():
+    """A column for each label, the largest first; the lost have Dice 0 and no distance."""
+    results = fake_results()
+    done = [p for p in results["pipelines"] if "median" in p]
+    for pipeline in done:
+        pipeline["median"]["labels"].reverse()
+    dice, distance = labels_figure(results).axes
+    assert [text.get_text() for text in distance.get_xticklabels()] == ["0 (9000)", "1 (2250)", "2 (562)", "3 (140)"]
+    for axes, name, n in ((dice, "dice", 4), (distance, "surface_mean_mm", 3)):
+        marks = {line.get_label(): line.get_xydata() for line in axes.lines}
+        assert list(marks) == [p["title"] for p in done]
+        for pipeline in done:
+            values = {row["label"]: row[name] for row in pipeline["median"]["labels"]}
+            np.testing.assert_array_equal(marks[pipeline["title"]][:, 1], [values[k] for k in range(n)])
+            np.testing.assert_array_equal(np.rint(marks[pipeline["title"]][:, 0]), np.arange(n))
+
+
+def test_histograms_are_those_of_the_report():
+    results = fake_results()
+    for axes, name in zip(histograms_figure(results).axes, ("rho_histogram", "dihedral_histogram"), strict=True):
+        outlines = {p.get_label(): p.get_data() for p in axes.patches if p.get_label()}
+        done = [p for p in results["pipelines"] if "median" in p]
+        assert list(outlines) == [p["title"] for p in done]
+        for pipeline in done:
+            np.testing.assert_array_equal(outlines[pipeline["title"]].values, pipeline["median"][name]["share"])
+            np.testing.assert_array_equal(outlines[pipeline["title"]].edges, pipeline["median"][name]["edges"])
+
+
+def test_curves_are_those_of_the_report():
+    results = fake_results()
+    results["curves"][1]["points"][0]["errors"]["0.3"]["displacement"] = None
+    panels = np.array(curves_figure(results).axes).reshape(2, 3)
+    for row, nu in enumerate(("0.3", "0.45")):
+        for axes, (name, _) in zip(panels[row], ERRORS, strict=True):
+            assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
+            lines = {line.get_label(): line for line in axes.lines}
+            assert list(lines) == [curve["title"] for curve in results["curves"]]
+            for curve in results["curves"]:
+                expected = [(p["n_nodes"], p["errors"][nu][name]) for p in curve["points"]]
+                shown = list(zip(*lines[curve["title"]].get_data(), strict=True))
+                assert shown == [pair for pair in expected if pair[1] is not None]
+    markers = [line.get_marker() for line in panels[0, 0].lines]
+    assert len(set(markers)) == len(markers)
+
+
+def test_curves_without_finite_elements_show_E_D(tmp_path):
+    results = fake_results()
+    for curve in results["curves"]:
+        for point in curve["points"]:
+            point["errors"] = {}
+    (axes,) = curves_figure(results).axes
+    first = results["curves"][0]["points"]
+    np.testing.assert_array_equal(axes.lines[0].get_ydata(), [p["E_D_share"] for p in first])
+    save_figure(curves_figure(results | {"curves": []}), tmp_path / "a.png", dpi=40)
+
+
+def test_bars_are_the_steps():
+    results = fake_results()
+    (axes,) = timing_figure(results).axes
+    assert [tick.get_text() for tick in axes.get_yticklabels()] == [p["title"] for p in results["pipelines"]]
+    texts = {round(text.get_position()[1]): text.get_text().strip() for text in axes.texts}
+    for row, pipeline in enumerate(results["pipelines"]):
+        bars = [b for b in axes.patches if round(b.get_y() + b.get_height() / 2) == row]
+        if "median" not in pipeline:
+            assert not bars
+            assert texts[row] == "failed"
+            continue
+        seconds = pipeline["median"]["seconds"]
+        assert [b.get_width() for b in bars] == pytest.approx([seconds["lattice"], seconds["optimise"]])
+        assert texts[row] == f"{pipeline['median']['seconds_total']:.3g} s"
+
+
+def test_colours_do_not_depend_on_what_failed():
+    """A pipeline keeps its colour in every picture, whichever others have no line."""
+    results = fake_results()
+    fewer = copy.deepcopy(results)
+    del fewer["pipelines"][0]["median"]
+    fewer["curves"] = fewer["curves"][1:]
+    whole, part = curves_figure(results).axes[0].lines, curves_figure(fewer).axes[0].lines
+    assert [line.get_color() for line in whole[1:]] == [line.get_color() for line in part]
+
+
+def test_cutaways_are_drawn(small, tmp_path, opengl):
+    image, both = small
+    meshes = [both[0], both[1], both[0], both[1]]
+    cutaways(meshes, [tetopt.cell_moments(image, mesh).mean for _, mesh in meshes], tmp_path / "a.png")
+    pixels = np.asarray(PIL.Image.open(tmp_path / "a.png").convert("L"))
+    assert pixels.shape == (2000, 2200)
+    for part in (pixels[:1000, :1100], pixels[:1000, 1100:], pixels[1000:, :1100], pixels[1000:, 1100:]):
+        assert part[200:800, 200:900].std() > 15.0

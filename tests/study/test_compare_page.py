@@ -1,0 +1,559 @@
+"""The comparison's page: its numbers are the report's, winners and losses are right, failures are named."""
+
+import html
+import json
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+from browser import browser
+
+import tetopt
+from tetopt.report.figures import save_figure
+from tetopt.report.viewer import view_of
+from tetopt.study.compare_figures import curves_figure, histograms_figure, slices_figure, timing_figure
+from tetopt.study.compare_page import Entry, Measure, entry, measures, number_text, save_compare_page, winners
+
+PIPELINES = (
+    ("tetopt", "tetopt", "tetopt"),
+    ("pytetwild", "pytetwild", "peer"),
+    ("cleaver", "itk-cleaver", "peer"),
+    ("bcc", "BCC lattice", "control"),
+    ("odt", "ODT, image-blind", "control"),
+)
+
+
+def fake_run(seed, scale):
+    """A run of plausible numbers; errors go with `scale`."""
+    random = np.random.default_rng(seed)
+
+    def some(low, high):
+        return float(random.uniform(low, high))
+
+    rho, angles = random.dirichlet(np.arange(1, 21)), random.dirichlet(np.bincount(range(36)) + 3)
+    errors = ("mean", "harmonic_mean", "l2", "worst")
+    quality = {
+        "mean_rho": some(0.2, 0.3), "p1_rho": some(0.05, 0.2), "min_rho": some(0.001, 0.1),
+        "errors": {name: some(0.1, 3.0) for name in errors},
+        "min_dihedral": some(1.0, 30.0), "p1_dihedral": some(10.0, 40.0), "max_dihedral": some(110.0, 178.0),
+        "n_under_10_degrees": int(random.integers(0, 50)),
+        "kinds": {"needle": 0, "wedge": 1, "cap": 0, "spade": 2, "sliver": int(random.integers(0, 9))},
+    }  # fmt: skip
+    labels = [
+        {"label": k, "voxels": 9000 // (4**k), "mesh_voxels": round(9000 // 4**k * some(0.8, 1.1)) * (k < 3),
+         "dice": some(0.7, 0.98) * (k < 3), "E_D_share": 0.02 * scale, "is_lost": k == 3,
+         "volume_mm3": 72000.0 / 4**k, "mesh_volume_mm3": 72000.0 / 4**k * some(0.8, 1.1) * (k < 3),
+         "surface_mean_mm": some(0.4, 2.0) if k < 3 else None, "surface_p95_mm": some(3.0, 5.0) if k < 3 else None,
+         "components": 1, "mesh_components": int(random.integers(1, 4)) * (k < 3)}
+        for k in range(4)
+    ]  # fmt: skip
+    fem = {
+        nu: {"lambda_max": some(1e2, 1e3), "cond": some(1e3, 1e5), "cg_iterations": int(random.integers(80, 300)),
+             "strain_energy": some(1.0, 2.0), "errors": fake_errors(scale)}
+        for nu in ("0.3", "0.45")
+    }  # fmt: skip
+    seconds = {"lattice": some(0.1, 1.0), "optimise": some(1.0, 20.0)}
+    return {
+        "n_nodes": 5000 + seed, "n_cells": 27000 + 5 * seed, "E_D": 1e9 * scale, "E_D_share": 0.04 * scale,
+        "seconds": {"kernels": 3.0, **seconds}, "seconds_total": sum(seconds.values()), "peak_bytes": 9e8 * scale,
+        "n_missed_voxels": 0, "quality": quality, "labels": labels, "fem": fem,
+        "rho_histogram": {"edges": np.linspace(0, 1 / 3, 21).tolist(), "share": rho.tolist()},
+        "dihedral_histogram": {"edges": list(range(0, 181, 5)), "share": angles.tolist()},
+    }  # fmt: skip
+
+
+def fake_errors(scale):
+    return {"strain_energy": 0.03 * scale, "displacement": 0.1 * scale, "interface_strain": 0.2 * scale}
+
+
+def over(runs, of):
+    """Numbers of nested runs made one."""
+    if isinstance(runs[0], dict):
+        return {key: over([run[key] for run in runs], of) for key in runs[0]}
+    if isinstance(runs[0], list):
+        return [over(list(parts), of) for parts in zip(*runs, strict=True)]
+    return runs[0] if isinstance(runs[0], bool) or runs[0] is None else float(of(runs))
+
+
+def fake_results():
+    """Five pipelines: the second of three runs, the third failed."""
+    pipelines = []
+    for number, (name, title, kind) in enumerate(PIPELINES):
+        runs = [fake_run(10 * number + k, 1.0 + 0.3 * number) for k in range(3 if number == 1 else 1)]
+        pipeline = {
+            "name": name, "title": title, "kind": kind, "about": f"{title}, its options", "failure": None,
+            "notes": [f"a note on {title}"], "runs": runs,
+        }  # fmt: skip
+        if number == 2:
+            pipeline |= {"failure": "crashed: signal 11 after 3 s", "runs": []}
+        else:
+            pipeline |= {word: over(runs, of) for word, of in (("median", np.median), ("low", min), ("high", max))}
+        pipelines.append(pipeline)
+    curves = [
+        {"name": p["name"], "title": p["title"], "points": [
+            {"n_nodes": nodes, "E_D_share": 0.04 * scale,
+             "errors": {nu: fake_errors(scale * (1.0 + k * 0.4)) for nu in ("0.3", "0.45")}}
+            for nodes, scale in ((1250, 2.2), (2500, 1.5), (5000, 1.0), (10000, 0.7))
+        ]}
+        for k, p in enumerate(pipelines) if "median" in p
+    ]  # fmt: skip
+    results = {
+        "versions": {"tetopt": "0.1.0", "numpy": "2.0"}, "command": "tetopt compare T1.nii.gz -o out --nodes 5000",
+        "machine": {"cores": 2, "system": "Linux"}, "seconds": 812.0,
+        "image": {"name": "T1.nii.gz", "shape": [197, 233, 189], "spacing_mm": [1, 1, 1], "sha256": "ab" * 32,
+                  "variance": 2841.2},
+        "labels": {"name": "labels.nii.gz", "kind": "given"}, "options": {"nodes": 5000, "repeats": 3, "k_D": 0.2},
+        "law": "1 kPa at 0, 10 kPa at 255",
+        "reference": {"shape": [49, 58, 47], "n_dofs": 435000, "note": "averaged", "0.3": {"strain_energy": 1.234}},
+        "pipelines": pipelines, "curves": curves,
+    }  # fmt: skip
+    return json.loads(json.dumps(results))
+
+
+def meshes_of(image, nodes, iterations):
+    """A lattice and an optimised mesh of the image."""
+    lattice = tetopt.lattice(image, nodes=nodes)
+    mesh = tetopt.optimize(image, lattice, k_D=0.3, iterations=iterations).mesh
+    return [("tetopt", mesh), ("BCC lattice", lattice)]
+
+
+class Tables(HTMLParser):
+    """Rows of every table: for each cell its classes and its text, parts that stand apart divided by |."""
+
+    def __init__(self, page):
+        super().__init__()
+        self.tables, self.cell = [], None
+        self.feed(page)
+
+    def handle_starttag(self, tag, attrs):
+        if tag == "table":
+            self.tables.append([])
+        if tag == "tr":
+            self.tables[-1].append([])
+        if tag in ("td", "th"):
+            self.cell = [set((dict(attrs).get("class") or "").split()), []]
+            self.tables[-1][-1].append(self.cell)
+
+    def handle_endtag(self, tag):
+        if tag in ("td", "th"):
+            self.cell = None
+
+    def handle_data(self, data):
+        if self.cell is not None:
+            self.cell[1].append(data.strip())
+
+
+def page_of(tmp_path, results, pictures=(), views=()):
+    save_compare_page(tmp_path / "report.html", results, pictures, views)
+    return (tmp_path / "report.html").read_text(encoding="utf-8")
+
+
+def headline(page):
+    """Rows of the headline table by the row's title; each cell (classes, texts)."""
+    rows = Tables(page).tables[0]
+    groups, found = "", {}
+    for row in rows[1:]:
+        if len(row) == 1:
+            groups = "".join(row[0][1])
+        else:
+            found[groups, row[0][1][0].rstrip(" ↓↑")] = row[1:]
+    return found
+
+
+# --------------------------------------------------------------------------------------------------
+# Numbers
+
+
+# Where report.json holds what a row shows, written down here once more.
+PATHS = {
+    ("Image", "E_D, share of the image's variance"): ("E_D_share",),
+    ("Image", "voxels outside the mesh"): ("n_missed_voxels",),
+    ("Size", "nodes"): ("n_nodes",),
+    ("Size", "tetrahedra"): ("n_cells",),
+    ("Shape", "mean rho"): ("quality", "mean_rho"),
+    ("Shape", "p1 rho"): ("quality", "p1_rho"),
+    ("Shape", "min rho"): ("quality", "min_rho"),
+    ("Shape", "error (i) mean"): ("quality", "errors", "mean"),
+    ("Shape", "error (ii) harmonic mean"): ("quality", "errors", "harmonic_mean"),
+    ("Shape", "error (iii) L2"): ("quality", "errors", "l2"),
+    ("Shape", "error (iv) worst"): ("quality", "errors", "worst"),
+    ("Shape", "smallest dihedral angle, °"): ("quality", "min_dihedral"),
+    ("Shape", "dihedral angle p1, °"): ("quality", "p1_dihedral"),
+    ("Shape", "largest dihedral angle, °"): ("quality", "max_dihedral"),
+    ("Shape", "cells under 10°"): ("quality", "n_under_10_degrees"),
+    **{("Shape", f"{kind}s"): ("quality", "kinds", kind) for kind in ("sliver", "cap", "needle", "wedge", "spade")},
+    **{
+        (f"Compression, ν = {nu}", title): ("fem", nu, *keys)
+        for nu in ("0.3", "0.45")
+        for title, keys in (
+            ("strain-energy error", ("errors", "strain_energy")),
+            ("displacement error", ("errors", "displacement")),
+            ("interface-strain error", ("errors", "interface_strain")),
+            ("λ max", ("lambda_max",)),
+            ("condition number", ("cond",)),
+            ("CG iterations", ("cg_iterations",)),
+        )
+    },
+    ("Cost", "wall time, s"): ("seconds_total",),
+    ("Cost", "peak memory, MB"): ("peak_bytes",),
+}
+JUDGED = "Labels above 500 voxels, background 0 not counted"  # of the fake ones 1 and 2
+DERIVED = {
+    (JUDGED, "mean label Dice"): lambda rows: np.mean([r["dice"] for r in rows[1:3]]),
+    (JUDGED, "smallest label Dice"): lambda rows: min(r["dice"] for r in rows[1:3]),
+    (JUDGED, "mean label surface distance, mm"): lambda rows: np.mean([r["surface_mean_mm"] for r in rows[1:3]]),
+    (JUDGED, "label surface distance p95, mm"): lambda rows: np.mean([r["surface_p95_mm"] for r in rows[1:3]]),
+    (JUDGED, "largest label volume error"): lambda rows: max(
+        abs(r["mesh_volume_mm3"] / r["volume_mm3"] - 1) for r in rows[1:3]
+    ),
+    (JUDGED, "labels in more or fewer pieces"): lambda rows: sum(r["mesh_components"] != 1 for r in rows[1:3]),
+    (JUDGED, "labels lost (of any size)"): lambda rows: 1,
+}
+
+
+def dug(run, keys):
+    for key in keys:
+        run = run[key]
+    return run / 1e6 if keys == ("peak_bytes",) else run
+
+
+def close(text, value):
+    """Whether the printed number is the value, to four digits."""
+    return abs(float(text) - value) <= 5.1e-4 * abs(value)
+
+
+def test_every_number_is_the_reports(tmp_path):
+    results = fake_results()
+    rows = headline(page_of(tmp_path, results))
+    assert set(rows) == set(PATHS) | set(DERIVED)
+    for title, keys in PATHS.items():
+        for pipeline, (_, texts) in zip(results["pipelines"], rows[title], strict=True):
+            if "median" not in pipeline:
+                assert texts == ["failed"]
+                continue
+            assert close(texts[0], dug(pipeline["median"], keys)), title
+            if len(pipeline["runs"]) > 1:
+                low, high = texts[1].split(" to ")
+                assert close(low, dug(pipeline["low"], keys))
+                assert close(high, dug(pipeline["high"], keys))
+            else:
+                assert not any(" to " in text for text in texts)
+
+
+def test_label_rows_are_computed_from_the_runs(tmp_path):
+    results = fake_results()
+    rows = headline(page_of(tmp_path, results))
+    for title, value in DERIVED.items():
+        for pipeline, (_, texts) in zip(results["pipelines"], rows[title], strict=True):
+            if "median" in pipeline:
+                found = [value(run["labels"]) for run in pipeline["runs"]]
+                assert close(texts[0], np.median(found)), title
+
+
+def test_a_lost_label_is_not_averaged_away(tmp_path):
+    """Its surface has no distance: the mean over the other labels would make losing it pay."""
+    results = fake_results()
+    lose(results["pipelines"][0]["runs"][0]["labels"][2])
+    cell = headline(page_of(tmp_path, results))[JUDGED, "mean label surface distance, mm"][0]
+    assert cell == [{"tetopt", "lost"}, ["–", "loses: no value"]]
+
+
+def lose(row):
+    row |= {"is_lost": True, "dice": 0.0, "surface_mean_mm": None, "surface_p95_mm": None, "mesh_volume_mm3": 0.0}
+
+
+def test_labels_are_tabled_and_the_vanished_named(tmp_path):
+    """A row a label, the one on which tetopt is worst first; Dice, distances and volume of each pipeline."""
+    results = fake_results()
+    lose(results["pipelines"][1]["runs"][2]["labels"][1])
+    page = page_of(tmp_path, results)
+    assert "<li>tetopt: label 3 (140 voxels)</li>" in page
+    assert "<li>pytetwild: label 1 (2250 voxels, in 1 of 3 runs), label 3 (140 voxels)</li>" in page
+    head, *rows = Tables(page).tables[1]
+    done = [p for p in results["pipelines"] if "median" in p]
+    assert [cell[1][0] for cell in head] == ["label", *(p["title"] for p in done)]
+    own = {row["label"]: row["dice"] for row in done[0]["median"]["labels"]}
+    assert [int(row[0][1][0]) for row in rows] == sorted(own, key=own.get)
+    for label, *cells in rows:
+        k = int(label[1][0])
+        dice = []
+        for pipeline, (_, texts) in zip(done, cells, strict=True):
+            of_runs = [run["labels"][k] for run in pipeline["runs"]]
+            if k == 3:
+                assert texts == ["lost"]
+                continue
+            known = [row for row in of_runs if not row["is_lost"]]
+            dice.append(np.median([row["dice"] for row in of_runs]))
+            mean, p95 = (np.median([row[f"surface_{name}_mm"] for row in known]) for name in ("mean", "p95"))
+            percent = 100 * np.median([row["mesh_volume_mm3"] / row["volume_mm3"] - 1 for row in of_runs])
+            expected = [f"{dice[-1]:.3f}", f"{mean:.2f} / {p95:.2f} mm", f"vol. {percent:+.1f} %".replace("-", "−")]
+            assert texts == expected + ["lost in 1 of 3 runs"] * (len(known) == 2)
+        if dice:
+            assert [("best" in classes) for classes, _ in cells] == [d == max(dice) for d in dice]
+    pieces, shares = Tables(page).tables[2:4]  # folded
+    for k in range(4):
+        for column, pipeline in enumerate(done, 2):
+            of_runs = [run["labels"][k] for run in pipeline["runs"]]
+            assert float(pieces[k + 1][column][1][0]) == np.median([row["mesh_components"] for row in of_runs])
+            assert close(shares[k + 1][column][1][0], np.median([row["E_D_share"] for row in of_runs]))
+
+
+def test_most_of_many_labels_are_folded(tmp_path):
+    """Forty labels: a dozen open to see, the rest behind a line, every one once."""
+    results = fake_results()
+    for pipeline in results["pipelines"]:
+        for run in pipeline["runs"]:
+            run["labels"] = [run["labels"][1] | {"label": k, "dice": 0.9 - 0.01 * k} for k in range(40)]
+    page = page_of(tmp_path, results)
+    open_, folded = ([int(row[0][1][0]) for row in table[1:]] for table in Tables(page).tables[1:3])
+    assert open_ == list(range(39, 27, -1))
+    assert folded == list(range(27, -1, -1))
+    assert "<details><summary>The other 28 labels</summary>" in page
+
+
+def with_dice(ours, theirs):
+    """Results in which tetopt and pytetwild have these Dice on labels 0, 1, ...; one surface is as far as the other."""
+    results = fake_results()
+    for number, values in ((0, ours), (1, theirs)):
+        for run in results["pipelines"][number]["runs"]:
+            for row, dice in zip(run["labels"], values, strict=False):
+                row |= {"dice": dice, "surface_mean_mm": 2.0 - dice}
+    return results
+
+
+def test_who_keeps_the_labels_is_said(tmp_path):
+    """Of the labels above 500 voxels, and without the background; those on which tetopt is worse are named."""
+    page = page_of(tmp_path, with_dice((0.1, 0.9, 0.61), (0.99, 0.8, 0.62)))
+    assert f"Of 2 {JUDGED[0].lower()}{JUDGED[1:]}, tetopt's Dice is at least pytetwild's on 1</strong>" in page
+    assert "and its mean surface distance no larger on 1." in page
+    assert "tetopt's Dice is below pytetwild's on label 2 (0.61 against 0.62)." in page
+    assert "tetopt's mean surface distance is larger than pytetwild's on label 2." in page
+    page = page_of(tmp_path, with_dice((0.1, 0.9, 0.62), (0.99, 0.8, 0.62)))
+    assert "Dice is at least pytetwild's on 2<" in page
+    assert "is below" not in page
+    assert "is larger than" not in page
+    results = with_dice((0.1, 0.9, 0.62), (0.99, 0.8, 0.62)) | {"labels": None}
+    page = page_of(tmp_path, results)
+    assert "Dice is at least" not in page
+    assert "background 0 not counted" not in page
+
+
+@pytest.mark.parametrize(
+    ("value", "text"),
+    [(None, "–"), (0.0, "0"), (5012.0, "5012"), (0.0421234, "0.04212"), (123456.7, "123457"), (3.2e12, "3.2e+12")],
+)
+def test_number_text(value, text):
+    assert number_text(value) == text
+
+
+# --------------------------------------------------------------------------------------------------
+# Winners
+
+
+def entries(*values):
+    return [Entry(value, value, value) for value in values]
+
+
+@pytest.mark.parametrize(
+    ("better", "values", "expected"),
+    [
+        (-1, (3.0, 1.0, 2.0), [1]),
+        (1, (3.0, 1.0, 2.0), [0]),
+        (0, (3.0, 1.0, 2.0), []),
+        (-1, (1.0, 1.0, 2.0), [0, 1]),
+        (-1, (1.00001, 1.00002, 2.0), [0, 1]),  # equal as printed
+        (-1, (0.0, 0.0, 0.0), []),
+        (-1, (None, 1.0, 2.0), [1]),
+        (-1, (None, 1.0, None), []),  # nothing to be better than
+        (1, (-2.0, -1.0), [1]),
+        (-1, (0.0, 5.0), [0]),
+    ],
+)
+def test_winners(better, values, expected):
+    assert winners(Measure("", "", lambda run: None, better), entries(*values)) == expected
+
+
+def with_values(**shares):
+    """Results in which the named pipelines have these shares of E_D."""
+    results = fake_results()
+    for pipeline in results["pipelines"]:
+        if pipeline["name"] in shares:
+            value = shares[pipeline["name"]]
+            for word in ("median", "low", "high"):
+                pipeline[word]["E_D_share"] = value
+    return results
+
+
+E_D_ROW = ("Image", "E_D, share of the image's variance")
+
+
+def test_a_loss_is_marked_and_said(tmp_path):
+    page = page_of(tmp_path, with_values(tetopt=0.07, pytetwild=0.05, bcc=0.09, odt=0.08))
+    (tetopt_cell, peer, failed, control, _) = headline(page)[E_D_ROW]
+    assert tetopt_cell == [{"tetopt", "lost"}, ["0.07", "loses: 1.4× best"]]
+    assert peer == [{"peer", "best"}, ["0.05", "0.05 to 0.05", "best"]]
+    assert failed[0] == {"peer"}
+    assert control == [{"control"}, ["0.09"]]
+    assert re.search(r"<li>to pytetwild: [^<]*E_D, share of the image&#x27;s variance", page)
+    assert '<tr class="loses"><th scope="row">E_D' in page
+
+
+def test_a_control_can_win(tmp_path):
+    page = page_of(tmp_path, with_values(tetopt=0.07, pytetwild=0.09, bcc=0.01, odt=0.08))
+    row = headline(page)[E_D_ROW]
+    assert [("best" in classes) for classes, _ in row] == [False, False, False, True, False]
+    assert re.search(r"<li>to BCC lattice: [^<]*E_D, share", page)
+
+
+def test_a_tie_is_shared(tmp_path):
+    row = headline(page_of(tmp_path, with_values(tetopt=0.05, pytetwild=0.05, bcc=0.09, odt=0.08)))[E_D_ROW]
+    assert [texts[-1] for classes, texts in row if "best" in classes] == ["best, tied", "best, tied"]
+    assert "lost" not in row[0][0]
+
+
+def test_no_value_loses(tmp_path):
+    row = headline(page_of(tmp_path, with_values(tetopt=None)))[E_D_ROW]
+    assert row[0] == [{"tetopt", "lost"}, ["–", "loses: no value"]]
+
+
+def test_a_loss_to_zero_and_a_narrow_one(tmp_path):
+    row = headline(page_of(tmp_path, with_values(tetopt=0.07, pytetwild=0.0)))[E_D_ROW]
+    assert row[0][1] == ["0.07", "loses: 0.07 from best"]
+    row = headline(page_of(tmp_path, with_values(tetopt=0.05004, pytetwild=0.05)))[E_D_ROW]
+    assert row[0][1] == ["0.05004", "loses: within 0.1% of best"]
+
+
+def test_the_sentence_counts_what_the_table_marks(tmp_path):
+    page = page_of(tmp_path, fake_results())
+    cells = [row[0] for row in headline(page).values()]
+    n_best, n_lost = (sum(mark in classes for classes, _ in cells) for mark in ("best", "lost"))
+    assert f"tetopt is best in {n_best} of {n_best + n_lost} measures" in page
+    assert f"It loses in {n_lost}:" in page
+    assert n_best > 0 < n_lost
+    titles = {measure.title for measure in measures(fake_results()) if measure.better == 0}
+    assert titles == {"nodes", "tetrahedra", "λ max"}
+
+
+def test_different_sizes_are_said(tmp_path):
+    assert "meshes differ in nodes" not in page_of(tmp_path, fake_results())
+    results = fake_results()
+    results["pipelines"][1]["median"]["n_nodes"] = 9000
+    assert "meshes differ in nodes (tetopt 5000, pytetwild 9000" in page_of(tmp_path, results)
+
+
+# --------------------------------------------------------------------------------------------------
+# Failures
+
+
+def test_a_failed_pipeline_is_named(tmp_path):
+    page = page_of(tmp_path, fake_results())
+    assert "<strong>itk-cleaver failed:</strong> crashed: signal 11 after 3 s" in page
+    assert all(row[2][1] == ["failed"] for row in headline(page).values())
+    assert "Failed, see under the table: itk-cleaver." in page
+
+
+def test_tetopt_can_fail(tmp_path):
+    results = fake_results()
+    for word in ("median", "low", "high"):
+        del results["pipelines"][0][word]
+    results["pipelines"][0] |= {"failure": "timed out", "runs": []}
+    page = page_of(tmp_path, results)
+    assert "<strong>tetopt failed.</strong>" in page
+    assert "<strong>tetopt failed:</strong> timed out" in page
+
+
+def test_a_failed_repeat_is_named_beside_its_numbers(tmp_path):
+    results = fake_results()
+    results["pipelines"][1]["failure"] = "timed out after 3600 s"
+    page = page_of(tmp_path, results)
+    assert "<strong>pytetwild, a run failed:</strong> timed out after 3600 s" in page
+    assert headline(page)[E_D_ROW][1][1][0] == number_text(results["pipelines"][1]["median"]["E_D_share"])
+
+
+def test_without_labels_and_finite_elements(tmp_path):
+    results = fake_results() | {"labels": None, "reference": None}
+    for pipeline in results["pipelines"]:
+        for run in [*pipeline["runs"], *(pipeline.get(word, {}) for word in ("median", "low", "high"))]:
+            run |= {"labels": [], "fem": {}}
+    rows = headline(page_of(tmp_path, results))
+    assert set(rows) == {title for title in PATHS if not title[0].startswith("Compression")}
+    assert entry(measures(results)[0], {"runs": []}) == Entry(None, None, None)
+
+
+# --------------------------------------------------------------------------------------------------
+# The page as a file
+
+
+def test_names_are_escaped(tmp_path):
+    results = fake_results()
+    evil = "<script>alert(1)</script>\"'&"
+    results["image"]["name"] = results["command"] = results["law"] = evil
+    results["labels"]["name"] = results["options"]["k_D"] = evil
+    for pipeline in results["pipelines"]:
+        pipeline |= {"title": evil, "about": evil, "notes": [evil], "failure": evil}
+    page = page_of(tmp_path, results)
+    assert "<script>alert" not in page
+    assert html.escape(evil) in page
+
+
+def test_settings_are_shown(tmp_path):
+    results = fake_results()
+    page = page_of(tmp_path, results)
+    words = [results["command"], "a note on tetopt", "197 × 233 × 189", "ab" * 32, results["law"], "0.1.0", "435000"]
+    for word in [*words, *(p["about"] for p in results["pipelines"])]:
+        assert html.escape(word) in page
+
+
+@pytest.fixture(scope="module")
+def whole(tmp_path_factory):
+    """A page with pictures and 3-D views of real meshes."""
+    folder = tmp_path_factory.mktemp("compare")
+    image = tetopt.load_phantom("two_spheres").image(voxel_mm=2.0)
+    meshes = meshes_of(image, nodes=800, iterations=5)
+    means = [tetopt.cell_moments(image, mesh).mean for _, mesh in meshes]
+    results = fake_results()
+    figures = {
+        "slices": slices_figure(image, meshes, means), "histograms": histograms_figure(results),
+        "curves": curves_figure(results), "timing": timing_figure(results),
+    }  # fmt: skip
+    for name, figure in figures.items():
+        save_figure(figure, folder / f"{name}.png", dpi=80)
+    views = [view_of(mesh, mean, title) for (title, mesh), mean in zip(meshes, means, strict=True)]
+    save_compare_page(folder / "report.html", results, [(folder / f"{name}.png", name) for name in figures], views)
+    return folder / "report.html"
+
+
+def test_nothing_points_outside(whole):
+    page = whole.read_text(encoding="utf-8")
+    assert not re.search(r"(src|href|url)\s*[=(]\s*[\"']?(?!data:)[a-z./]+", re.sub(r"base64,[^\"]*", "", page))
+    assert "http:" not in page
+    assert "https:" not in page
+    order = [page.index(f'alt="{name}"') for name in ("slices", "histograms", "curves", "timing")]
+    assert order == sorted(order)
+    assert order[0] < page.index("<canvas") < order[1]
+
+
+@pytest.mark.parametrize("width", [1150, 500])  # Chromium has no narrower window
+def test_the_page_in_a_browser(whole, tmp_path, width):
+    """Pictures load, views draw, and the page itself never scrolls sideways."""
+    probe = (
+        "<script>addEventListener('load', () => setTimeout(() => { const d = document.documentElement; "
+        "d.dataset.images = [...document.images].map((i) => i.naturalWidth).join(); "
+        "d.dataset.drawn = [...document.querySelectorAll('canvas')].map((c) => c.dataset.drawn).join(); "
+        "d.dataset.over = d.scrollWidth - d.clientWidth; }, 300))</script>"
+    )
+    copied = tmp_path / "copy.html"
+    copied.write_text(whole.read_text(encoding="utf-8").replace("</body>", probe + "</body>"), encoding="utf-8")
+    flags = [f"--window-size={width},900", "--virtual-time-budget=4000", "--dump-dom", copied.as_uri()]
+    page = browser(tmp_path / "profile", *flags)
+    data = dict(re.findall(r'data-(images|drawn|over)="([^"]*)"', page[:400]))
+    assert len(data["images"].split(",")) == 4
+    assert all(int(size) > 100 for size in data["images"].split(","))
+    assert data["drawn"] == "1,1"
+    assert int(data["over"]) <= 0
+
+
+def test_it_can_be_printed(whole, tmp_path):
+    browser(tmp_path / "profile", f"--print-to-pdf={tmp_path / 'a.pdf'}", whole.as_uri())
+    assert (tmp_path / "a.pdf").read_bytes()[:5] == b"%PDF-"

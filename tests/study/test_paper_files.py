@@ -1,0 +1,295 @@
+"""`tetopt paper` and `tetopt fem`: files, numbers, page, and one line for bad input."""
+
+import json
+import re
+import shutil
+import subprocess
+
+import meshio
+import numpy as np
+import PIL.Image
+import pytest
+
+import tetopt
+from tetopt.cli import main
+from tetopt.study import paper
+from tetopt.study.paper_files import PICTURES
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory, opengl):
+    """The whole command, few seeds, on the head phantom in the place of a brain volume."""
+    folder = tmp_path_factory.mktemp("paper")
+    phantom = tetopt.load_phantom("ellipsoids_brain")
+    tetopt.save_image(folder / "head.nii.gz", phantom.image(voxel_mm=3.0))
+    tetopt.save_image(folder / "tissue.nii.gz", phantom.label_image(voxel_mm=3.0))
+    out = folder / "out"
+    inputs = ["--image", str(folder / "head.nii.gz"), "--labels", str(folder / "tissue.nii.gz")]
+    assert main(["paper", "-o", str(out), *inputs, "--seeds", "3"]) == 0
+    return out
+
+
+def test_files(run):
+    assert {path.name for path in run.iterdir()} == {"paper.json", "paper.html", *PICTURES}
+    for name in PICTURES:
+        assert np.std(np.asarray(PIL.Image.open(run / name).convert("L"))) > 10.0, name
+
+
+def test_page_holds_every_number(run):
+    """Each printed number and each of ours stands in the page as the JSON has it; nothing points outside."""
+    numbers = json.loads((run / "paper.json").read_text())
+    page = (run / "paper.html").read_text(encoding="utf-8")
+    rows = [row for section in numbers["sections"] for row in section.get("errors", ())]
+    assert len(rows) == 9  # rows 1 to 7, the last at three noise levels
+    assert json.loads((run / "paper.json").read_text())["image"] == "head.nii.gz"
+    assert "head.nii.gz" in page
+    for row in rows:
+        assert f"<td>{row['errors'][1]:.4f}</td><td>{row['geometric_mean']:.4f}</td>" in page
+    for row in rows:
+        for printed, ours in zip(row["errors"], row["ours"], strict=True):
+            difference = f"{ours - printed:+.4f}".replace("-0.0000", "+0.0000")
+            assert f"<td>{printed:.4f}</td><td>{ours:.4f}</td><td>{difference}</td>" in page
+    assert page.count("data:image/png;base64,") == len(PICTURES)
+    assert not re.search(r"(src|href)=[\"'](?!data:)", page)
+
+
+def test_every_other_number_is_on_the_page(run):
+    """E_D, minima, Dice and changes of the JSON are in the page; changes are after over before; rows are their own."""
+    sections = {s["title"]: s for s in json.loads((run / "paper.json").read_text())["sections"]}
+    page = (run / "paper.html").read_text(encoding="utf-8")
+    printed = paper.printed()["change"]
+    for section in sections.values():
+        for value in section.get("E_D_relative", {}).values():
+            assert f"<td>{value:.4f}</td>" in page
+        for row in section.get("minima", ()):
+            assert f"<td>{row['lowest']:.4f}</td><td>{row['found']:.4f}</td>" in page
+        for overlaps in section.get("dice", {}).values():
+            assert "".join(f"<td>{value:.3f}</td>" for value in overlaps.values()) in page
+        for case in section.get("simulation", ()):
+            for name, change in case["change"].items():
+                assert change == pytest.approx(case["after"][name] / case["before"][name] - 1.0)
+                if name in printed:
+                    points = f"{100 * (change - printed[name]):+.1f} points"
+                    assert (
+                        f"<td>{100 * printed[name]:+.0f} %</td><td>{100 * change:+.1f} %</td><td>{points}</td>" in page
+                    )
+    (figure_2,) = [s for title, s in sections.items() if title == "Fig. 2: synthetic phantom"]
+    for row, k_D in zip(figure_2["errors"][1:], (0.05, 0.3), strict=True):
+        assert row["ours"] == pytest.approx(paper.errors_of(paper.figure_2(k_D).result.mesh))
+    assert figure_2["dice"]["initial mesh"]["3"] < figure_2["dice"]["k_D = 0.3"]["3"] - 0.2
+    (figure_1,) = [s for title, s in sections.items() if title.startswith("Fig. 1")]
+    spread = paper.figure_1_spread(3)
+    for row in figure_1["errors"]:
+        np.testing.assert_allclose([row["p5"], row["p95"]], np.percentile(spread[row["name"]], [5, 95], axis=0))
+
+
+def test_counts_and_row_3(run):
+    numbers = json.loads((run / "paper.json").read_text())
+    meshes = [row for section in numbers["sections"] for row in section.get("meshes", ())]
+    assert [row["name"] for row in meshes] == ["fig2a", "fig3a", "fig3c", "fig3e"]
+    assert all(row["paper"] == row["ours"] for row in meshes)
+    (row,) = [r for section in numbers["sections"] for r in section.get("errors", ()) if r["name"] == "fig2a"]
+    assert [round(value, 4) for value in row["ours"]] == row["errors"]
+
+
+def test_segmentation_improves_on_the_lattice(run):
+    """Every label's Dice against the truth is in the JSON, and the mean of an optimised mesh beats the lattice's."""
+    sections = json.loads((run / "paper.json").read_text())["sections"]
+    (overlaps,) = [s["dice"] for s in sections if s["title"].startswith("Section 5")]
+    labels = set(map(str, range(9)))  # of the phantom
+    assert all(set(row) == labels for row in overlaps.values())
+    mean = {name: np.mean(list(row.values())) for name, row in overlaps.items()}
+    assert mean["4 classes, lattice"] < mean["4 classes, optimised"] <= mean["4 classes, voxels"] + 1e-9
+
+
+def test_page_in_a_browser(run, tmp_path):
+    """Headless Chromium draws the page and reports no script or image error."""
+    browser = shutil.which("chromium") or shutil.which("chromium-browser") or shutil.which("google-chrome")
+    if browser is None:
+        pytest.skip("no Chromium on this machine")
+    flags = [
+        "--headless",
+        "--no-sandbox",
+        "--disable-gpu",
+        "--disable-background-networking",
+        "--enable-logging=stderr",
+    ]
+    command = [browser, *flags, f"--user-data-dir={tmp_path}", "--window-size=1000,3000"]
+    command += [f"--screenshot={tmp_path / 'page.png'}", (run / "paper.html").as_uri()]
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=120)
+    assert "CONSOLE" not in done.stderr
+    assert np.std(np.asarray(PIL.Image.open(tmp_path / "page.png").convert("L"))) > 20.0
+
+
+def test_paper_refuses(tmp_path, capsys):
+    tetopt.save_image(tmp_path / "flat.nii", tetopt.load_phantom("disc_2d").image(voxel_mm=4.0))
+    assert main(["paper", "-o", str(tmp_path / "o"), "--image", str(tmp_path / "flat.nii")]) == 2
+    assert "expected a volume, got a 2-D image" in capsys.readouterr().err
+    assert main(["paper", "-o", str(tmp_path / "o"), "--seeds", "0"]) == 2
+    assert "--seeds: expected 1 or more, got 0" in capsys.readouterr().err
+    head, small = (tetopt.load_phantom("sphere").label_image(voxel_mm=size) for size in (4.0, 5.0))
+    tetopt.save_image(tmp_path / "head.nii", head)
+    tetopt.save_image(tmp_path / "small.nii", small)
+    inputs = ["--image", str(tmp_path / "head.nii"), "--labels", str(tmp_path / "small.nii")]
+    assert main(["paper", "-o", str(tmp_path / "o"), *inputs]) == 2
+    assert "expected labels on the image's own voxels" in capsys.readouterr().err
+    assert not (tmp_path / "o").exists()
+
+
+@pytest.fixture
+def block(tmp_path):
+    """A uniform block of intensity 50 and its mesh."""
+    tetopt.save_image(tmp_path / "block.nii", tetopt.Image(np.full((8, 8, 8), 50.0)))
+    with pytest.warns(UserWarning, match="everywhere"):
+        image = tetopt.load_image(tmp_path / "block.nii")
+    tetopt.save_mesh(tmp_path / "block.vtu", tetopt.lattice(image, blocks=(2, 2, 2)))
+    return [str(tmp_path / "block.nii"), str(tmp_path / "block.vtu")]
+
+
+def test_fem(tmp_path, block, capsys):
+    """The strain energy scales with the modulus and the square of the compression; the printed is the written."""
+    energies = {}
+    for name, options in (("one", []), ("twice", ["--young", "0:0,50:100"]), ("deep", ["--compress", "2"])):
+        assert main(["fem", *block, "--nu", "0.3", "--json", str(tmp_path / f"{name}.json"), *options]) == 0
+        numbers = json.loads((tmp_path / f"{name}.json").read_text())
+        energies[name] = numbers["strain_energy"]
+        assert f"{numbers['cond']:.6g}" in capsys.readouterr().out
+    assert energies["twice"] == pytest.approx(2.0 * energies["one"], rel=1e-9)
+    assert energies["deep"] == pytest.approx(4.0 * energies["one"], rel=1e-9)
+    assert main(["fem", *block, "--nu", "0.3", "--json", str(tmp_path / "f.json"), "--young", "2*h"]) == 0
+    assert json.loads((tmp_path / "f.json").read_text())["strain_energy"] == energies["twice"]
+    # Between free sides, 1/2 E strain^2 V, and no sideways strain at all, (1 - nu) / ((1 + nu)(1 - 2 nu)) times that.
+    free = 0.5 * 50.0 * 0.01**2 * 512.0
+    assert free < energies["one"] < free * 0.7 / (1.3 * 0.4)
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--young", "1:2;3"], "expected pairs intensity:value"),
+        (["--young", "open('x')"], "cannot use"),
+        (["--young", "h - 100"], "such as -50 at intensity 50"),
+        (["--young", "0:1,100:1", "--compress", "200"], "--compress: expected a percentage"),
+        (["--young", "0:0"], "expected"),
+        (["--nu", "0.5"], "nu"),
+        (["--compress", "0"], "--compress"),
+    ],
+)
+def test_fem_bad_input(block, options, words, capsys):
+    assert main(["fem", *block, *options]) == 2
+    err = capsys.readouterr().err.strip().splitlines()
+    assert words in err[-1]
+
+
+def written(folder, points, cells):
+    """A mesh file with no checks between: what another program may have written."""
+    kind = meshio.CellBlock("tetra", np.asarray(cells))
+    meshio.Mesh(np.asarray(points, dtype=float), [kind]).write(folder / "other.vtu")
+    return str(folder / "other.vtu")
+
+
+def test_fem_bad_meshes(tmp_path, block, capsys):
+    """Each refusal names the first offenders."""
+    mesh = tetopt.load_mesh(block[1]).mesh
+    assert main(["fem", block[0], written(tmp_path, mesh.points * [1.0, 1.0, 0.5], mesh.cells)]) == 2
+    assert "no node lies on the image's face" in capsys.readouterr().err
+    loose = mesh.points[mesh.cells[0]] * 0.1 + 4.0
+    points = np.vstack([mesh.points, loose])
+    cells = np.vstack([mesh.cells, len(mesh.points) + np.arange(4)])
+    assert main(["fem", block[0], written(tmp_path, points, cells)]) == 2
+    assert f"the first has nodes [{len(mesh.points) + 1}, " in capsys.readouterr().err
+    half = mesh.points[mesh.cells].mean(axis=1)[:, 2] < 3.5
+    cells = np.where(half[:, None], mesh.cells, mesh.cells + len(mesh.points))  # a crack: doubled nodes
+    assert main(["fem", block[0], written(tmp_path, np.vstack([mesh.points] * 2), cells)]) == 2
+    assert "a crack, several pieces" in capsys.readouterr().err
+    assert main(["fem", block[0], written(tmp_path, mesh.points, np.vstack([mesh.cells] * 2))]) == 2
+    assert "overlap" in capsys.readouterr().err
+    assert main(["fem", block[0], written(tmp_path, mesh.points + np.array([1.0, 0.0, 0.0]), mesh.cells)]) == 2
+    assert "lie off the faces" in capsys.readouterr().err
+    flat = mesh.points.copy()
+    flat[mesh.cells[3, 3]] = flat[mesh.cells[3, :3]].mean(axis=0)
+    assert main(["fem", block[0], written(tmp_path, flat, mesh.cells)]) == 2
+    assert "flat or inverted, the first are [3, " in capsys.readouterr().err
+    folded = mesh.points.copy()
+    inner = np.flatnonzero(np.all(np.abs(folded - 3.5) < 3.9, axis=1))[0]
+    folded[inner] = folded[mesh.cells[0]].mean(axis=0)
+    assert main(["fem", block[0], written(tmp_path, folded, mesh.cells)]) == 2
+    assert "have cells that overlap there" in capsys.readouterr().err
+
+
+def test_fem_turns_inverted_cells_and_says_so(tmp_path, block, capsys):
+    """A file of left-handed cells is turned when it is read; the numbers are those of the mesh as it should be."""
+    mesh = tetopt.load_mesh(block[1]).mesh
+    assert main(["fem", *block, "--json", str(tmp_path / "a.json")]) == 0
+    capsys.readouterr()
+    inverted = written(tmp_path, mesh.points, mesh.cells[:, [1, 0, 2, 3]])
+    assert main(["fem", block[0], inverted, "--json", str(tmp_path / "b.json")]) == 0
+    assert f"{len(mesh.cells)} cells were inverted" in capsys.readouterr().err
+    a, b = (json.loads((tmp_path / name).read_text()) for name in ("a.json", "b.json"))
+    assert b["strain_energy"] == pytest.approx(a["strain_energy"], rel=1e-12)
+
+
+def test_fem_of_a_crop_and_its_output(tmp_path, capsys):
+    """A mesh of a crop is pressed with the same --crop; the file written holds the displacements that were solved."""
+    tetopt.save_image(tmp_path / "a.nii", tetopt.load_phantom("sphere").image(voxel_mm=4.0))
+    box = ["--crop", "2:14,2:14,2:14"]
+    a, mesh = str(tmp_path / "a.nii"), str(tmp_path / "m.vtu")
+    assert main(["mesh", a, "-o", mesh, *box, "--nodes", "80", "--iterations", "1"]) == 0
+    assert main(["fem", a, mesh]) == 2
+    assert "same image, --crop and --slice?" in capsys.readouterr().err
+    assert main(["fem", a, mesh, *box, "--compress", "2", "-o", str(tmp_path / "p.vtu")]) == 0
+    grid = meshio.read(tmp_path / "p.vtu")
+    u, z = grid.point_data["displacement"], grid.points[:, 2]
+    np.testing.assert_allclose(u[np.isclose(z, z.max())], 0.0, atol=1e-12)
+    bottom = u[np.isclose(z, z.min())]
+    np.testing.assert_allclose(bottom, np.tile([0.0, 0.0, 0.02 * np.ptp(z)], (len(bottom), 1)), atol=1e-12)
+    assert (grid.cell_data["young"][0] > 0).all()
+    assert grid.cell_data["strain"][0].shape == (len(grid.cells[0].data), 9)
+    assert main(["fem", a, mesh, *box, "-o", mesh, "--force"]) == 2
+    assert "is an input of this command too" in capsys.readouterr().err
+
+
+def test_fem_says_when_it_cannot_solve(tmp_path, capsys):
+    tetopt.save_image(tmp_path / "a.nii", tetopt.load_phantom("sphere").image(voxel_mm=4.0))
+    a, mesh = str(tmp_path / "a.nii"), str(tmp_path / "m.vtu")
+    assert main(["mesh", a, "-o", mesh, "--nodes", "300", "--iterations", "1"]) == 0
+    capsys.readouterr()
+    assert main(["fem", a, mesh, "--young", "20:1e-5,100:1e6"]) == 2
+    err = capsys.readouterr().err.strip().splitlines()
+    assert len(err) == 1
+    assert "the moduli differ too much" in err[0]
+
+
+@pytest.mark.parametrize("turn", [0.0, 0.3])
+def test_simulate_is_the_compression_it_says(turn):
+    """Eq. (2): the mean of the law, not the law of the mean; the high face held, the low one pushed, by the height."""
+    rng = np.random.default_rng(1)
+    affine = np.diag([2.0, 1.0, 1.5, 1.0])
+    c, s = np.cos(turn), np.sin(turn)
+    affine = np.array([[1, 0, 0, 0], [0, c, -s, 0], [0, s, c, 0], [0, 0, 0, 1.0]]) @ affine
+    image = tetopt.Image(rng.uniform(1.0, 5.0, (6, 9, 8)), affine)
+    mesh = tetopt.lattice(image, nodes=60)
+    found, pressed = paper.simulate(image, mesh, nu=0.3, percent=2.0, law=lambda h: h**2)
+    owner = tetopt.cell_of_voxel(image, mesh)
+    means = [(image.data[owner == cell] ** 2).mean() for cell in range(len(mesh.cells)) if (owner == cell).any()]
+    np.testing.assert_allclose(
+        np.sort(found.young[np.bincount(owner.ravel(), minlength=len(mesh.cells)) > 0]), np.sort(means)
+    )
+    k = image.to_index(mesh.points)[:, 2]
+    normal = affine[:3, 2] / 1.5
+    np.testing.assert_allclose(pressed.u[k > 7.4], 0.0, atol=1e-12)
+    low = pressed.u[k < -0.4]
+    np.testing.assert_allclose(low, np.tile(0.02 * 12.0 * normal, (len(low), 1)), atol=1e-12)
+
+
+def test_turning_the_world_changes_nothing():
+    """A body pressed along its own axis: conditioning and energy are the same however it lies in the scanner."""
+    rng = np.random.default_rng(2)
+    data = rng.uniform(1.0, 5.0, (6, 5, 7))
+    energies = []
+    for turn in (0.0, 0.2, 0.7):
+        affine = np.eye(4)
+        affine[1:3, 1:3] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
+        image = tetopt.Image(data, affine)
+        energies.append(paper.simulate(image, tetopt.lattice(image, blocks=(3, 3, 3)))[0].strain_energy)
+    np.testing.assert_allclose(energies, energies[0], rtol=1e-9)

@@ -1,0 +1,126 @@
+"""fTetWild's meshes fill the image's box exactly, with the wanted number of nodes, in any orientation."""
+
+from importlib.util import find_spec
+
+import numpy as np
+import pytest
+
+import tetopt
+from tetopt.geometry.simplex import volumes
+from tetopt.geometry.topology import boundary_facets
+from tetopt.study import tetwild
+from tetopt.study.interfaces import interfaces
+from tetopt.study.pipelines import PIPELINES, Job
+
+needs_pytetwild = pytest.mark.skipif(
+    find_spec("pytetwild") is None, reason="pytetwild is not installed: pip install 'pytetwild>=0.4'"
+)
+PHANTOM = tetopt.load_phantom("sphere")
+IMAGE = PHANTOM.image(voxel_mm=4.0)
+
+
+def oblique(data, spacing, flip=1.0):
+    """A rotation about no axis in particular, another voxel edge along each axis, and a mirror if asked."""
+    q, _ = np.linalg.qr(np.random.default_rng(3).normal(size=(3, 3)))
+    affine = np.eye(4)
+    affine[:3, :3] = q * np.sign(np.linalg.det(q)) * np.array(spacing) * [flip, 1.0, 1.0]
+    affine[:3, 3] = [10.0, -70.0, 33.0]
+    return tetopt.Image(data, affine)
+
+
+def assert_fills(image, mesh):
+    """Volume, voxels, boundary: the box's, exactly."""
+    assert volumes(mesh.points, mesh.cells).min() > 0.0
+    assert volumes(mesh.points, mesh.cells).sum() == pytest.approx(image.volume, rel=1e-9)
+    assert tetopt.cell_moments(image, mesh).n_voxels.sum() == image.data.size
+    off = np.abs(
+        image.to_index(mesh.points)[boundary_facets(mesh.cells)][:, :, None] - [[-0.5] * 3, np.array(image.shape) - 0.5]
+    )
+    assert off.max(axis=1).reshape(-1, 6).min(axis=1).max() < 1e-9  # every boundary facet lies on one face
+    assert len(np.unique(mesh.cells)) == len(mesh.points)
+
+
+@needs_pytetwild
+@pytest.mark.parametrize(
+    "image",
+    [
+        oblique(IMAGE.data, (4.0, 4.0, 4.0), flip=-1.0),
+        oblique(PHANTOM.image(voxel_mm=[3.0, 4.0, 6.0]).data, (3.0, 4.0, 6.0)),
+        tetopt.Image(IMAGE.data, np.array([[4.0, 0.8, 0, 1], [0, 4.0, -0.6, 2], [0, 0, 4.0, 3], [0, 0, 0, 1]])),
+    ],
+    ids=["flipped and oblique", "anisotropic and oblique", "sheared"],
+)
+def test_fills_the_box_with_the_wanted_nodes(image, capfd):
+    produced = PIPELINES["pytetwild"](Job(image, None, 300, classes=2))
+    assert_fills(image, produced.mesh)
+    assert abs(len(produced.mesh.points) / 300 - 1.0) <= 0.05
+    assert list(produced.seconds) == ["surfaces", "tetrahedra", "search"]
+    assert capfd.readouterr().out == ""
+
+
+@needs_pytetwild
+def test_facets_follow_the_interface():
+    """A better E_D than the lattice with as many nodes, by far, on a sphere that cells can follow."""
+    labels = PHANTOM.label_image(voxel_mm=4.0)
+    mesh = PIPELINES["pytetwild"](Job(IMAGE, labels, 600)).mesh
+    assert_fills(IMAGE, mesh)
+    assert tetopt.E_D(IMAGE, mesh) < 0.6 * tetopt.E_D(IMAGE, tetopt.lattice(IMAGE, nodes=600))
+
+
+@needs_pytetwild
+def test_missed_count_is_told(monkeypatch):
+    """Where no factor changes the number of nodes: all runs are made, the mesh is given, with a note."""
+    mesh = tetopt.lattice(IMAGE, nodes=600)
+    points = IMAGE.to_index(mesh.points) * IMAGE.spacing
+    monkeypatch.setattr(tetwild, "_run", lambda *_: (points, mesh.cells))
+    result = tetwild.filled(IMAGE, interfaces(IMAGE, 8.0, classes=2), 900)
+    assert_fills(IMAGE, result.mesh)
+    assert result.n_runs == tetwild.MAX_RUNS
+    assert result.notes == [f"{len(points)} nodes after 6 runs of fTetWild, 900 were asked for"]
+
+
+@needs_pytetwild
+def test_too_few_nodes():
+    with pytest.raises(tetopt.InputError, match="nodes: a box needs 8 or more, got 7"):
+        tetwild.filled(IMAGE, interfaces(IMAGE, 8.0, classes=2), 7)
+
+
+def test_missing_package(monkeypatch):
+    monkeypatch.setitem(__import__("sys").modules, "pytetwild", None)
+    with pytest.raises(tetopt.InputError, match=r"pytetwild: not usable .* pip install"):
+        PIPELINES["pytetwild"](Job(IMAGE, None, 300, classes=2))
+
+
+def test_shaken_boundary_is_put_back():
+    """A lattice whose boundary nodes were moved off the faces, in and out: the box again, all cells positive."""
+    mesh = tetopt.lattice(IMAGE, nodes=600)
+    low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
+    rng = np.random.default_rng(0)
+    shaken = mesh.points + rng.uniform(-0.4, 0.4, mesh.points.shape)
+    points, cells = tetwild.put_on_box(shaken, mesh.cells, low, high)
+    v = volumes(points, cells)
+    assert v.min() > 0.0
+    assert v.sum() == pytest.approx(IMAGE.volume, rel=1e-12)
+    assert np.array_equal(points.min(axis=0), low)
+    assert np.array_equal(points.max(axis=0), high)
+
+
+def test_hole_is_refused():
+    mesh = tetopt.lattice(IMAGE, nodes=600)
+    low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
+    middle = np.linalg.norm(mesh.points[mesh.cells].mean(axis=1) - 0.5 * (low + high), axis=1).argmin()
+    with pytest.raises(tetopt.InputError, match=r"turn inside out|fill 0"):
+        tetwild.put_on_box(mesh.points, np.delete(mesh.cells, middle, axis=0), low, high)
+
+
+@pytest.mark.parametrize(("power", "first"), [(-3.0, 4000), (-6.0, 300), (-9.0, 700)])
+def test_secant_search(power, first):
+    """On a power law the second step is exact; the wanted 1000 are reached in a few steps."""
+    tried = [(1.0, first)]
+    for _ in range(5):
+        factor = tetwild.next_factor(tried, 1000)
+        tried.append((factor, round(first * factor**power)))
+        if abs(tried[-1][1] / 1000 - 1.0) < 0.05:
+            break
+    assert abs(tried[-1][1] / 1000 - 1.0) < 0.05
+    assert len(tried) <= 5

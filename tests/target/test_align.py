@@ -1,0 +1,352 @@
+"""Masks, labels and contrasts land on the image's voxels by the affines; the foreground is what it should be."""
+
+import re
+
+import numpy as np
+import pytest
+
+import tetopt
+from tetopt.target.align import aligned_contrast, aligned_labels, aligned_mask, background_level, foreground
+
+SHAPE, OTHER = (7, 9, 6), (8, 6, 7)
+
+
+def turned(spacing, angles=(0, 0, 0), flips=(1, 1, 1)):
+    """Affine of voxels of that spacing, turned about each axis and flipped; the grids' middles are close."""
+    linear = np.eye(3)
+    for axis, angle in enumerate(angles):
+        i, k = (a for a in range(3) if a != axis)
+        turn = np.eye(3)
+        turn[i, i] = turn[k, k] = np.cos(angle)
+        turn[i, k], turn[k, i] = -np.sin(angle), np.sin(angle)
+        linear = turn @ linear
+    return centred(linear * np.multiply(spacing, flips))
+
+
+def centred(linear):
+    affine = np.eye(4)
+    affine[:3, :3] = linear
+    affine[:3, 3] = np.array([3.3, 3.6, 2.7]) - linear @ ((np.array(OTHER) - 1) / 2)
+    return affine
+
+
+# Affines of the image and of the other.
+PAIRS = {
+    "shifted": (np.eye(4), turned((1, 1, 1))),
+    "anisotropic": (np.diag([1.0, 0.9, 1.1, 1.0]), turned((0.8, 1.3, 0.7))),
+    "flipped": (np.eye(4), turned((1.1, 1.1, 1.1), flips=(-1, 1, -1))),
+    "oblique": (np.eye(4), turned((1.2, 1.0, 1.3), (-0.2, 0.4, 0.3), (1, -1, 1))),
+    "permuted": (np.eye(4), centred(np.array([[0, 0, -1.0], [1.1, 0, 0], [0, 1.2, 0]]))),
+}
+MOVE = turned((0.7, 1.6, 1.2), (0.3, -0.5, 0.8))  # both at once: the image is oblique as well
+PAIRS["both oblique"] = (MOVE @ PAIRS["oblique"][0], MOVE @ PAIRS["oblique"][1])
+
+
+def nearest_twin(other, image):
+    """Voxel by voxel: through the world, into the box around the voxel it falls in, lower face included."""
+    found = np.zeros(image.shape)
+    for voxel in np.ndindex(image.shape):
+        index = np.floor(other.to_index(image.to_world(voxel)) + 0.5 + 1e-6).astype(int)  # ties go up
+        if (index >= 0).all() and (index < other.shape).all():
+            found[voxel] = other.data[tuple(index)]
+    return found
+
+
+def linear_twin(other, image):
+    """Voxel by voxel: the eight (four) voxels around, the index held to the centres of the border."""
+    found = np.zeros(image.shape)
+    for voxel in np.ndindex(image.shape):
+        index = np.clip(other.to_index(image.to_world(voxel)), 0, np.array(other.shape) - 1)
+        low = np.minimum(np.floor(index).astype(int), np.array(other.shape) - 2)
+        part = index - low
+        for corner in np.ndindex((2,) * image.ndim):
+            weight = np.prod(np.where(corner, part, 1 - part))
+            found[voxel] += weight * other.data[tuple(low + corner)]
+    return found
+
+
+def pair(which, values):
+    image_affine, affine = PAIRS[which]
+    rng = np.random.default_rng(3)
+    return tetopt.Image(np.zeros(SHAPE), image_affine), tetopt.Image(values(rng), affine)
+
+
+def message(function, *args):
+    """What a function says of its arguments; a name that messages begin with may come first."""
+    args = (*args[1:], args[0]) if isinstance(args[0], str) else args
+    with pytest.raises(tetopt.InputError) as caught:
+        function(*args)
+    assert "\n" not in str(caught.value)
+    return str(caught.value)
+
+
+@pytest.mark.parametrize("which", PAIRS)
+def test_nearest_is_its_twin(which):
+    """Labels, a 0/255 mask and a probability map, each voxel the one whose box it lies in, 0 outside all of them."""
+    image, labels = pair(which, lambda rng: rng.integers(1, 9, OTHER))
+    expected = nearest_twin(labels, image)
+    assert 0 < np.count_nonzero(expected == 0) < expected.size  # both inside and outside are tried
+    found = aligned_labels(labels, image, "l")
+    np.testing.assert_array_equal(found.data, expected)
+    np.testing.assert_array_equal(found.affine, image.affine)
+    mask = tetopt.Image(255 * (labels.data > 4), labels.affine)
+    found = aligned_mask(mask, image, "m")
+    np.testing.assert_array_equal(found.data, nearest_twin(mask, image) / 255)
+    np.testing.assert_array_equal(found.affine, image.affine)
+    chance = tetopt.Image(labels.data / 16, labels.affine)
+    np.testing.assert_array_equal(aligned_mask(chance, image, "m").data, nearest_twin(chance, image))
+
+
+@pytest.mark.parametrize("which", PAIRS)
+def test_linear_is_its_twin(which):
+    image, other = pair(which, lambda rng: rng.normal(size=OTHER).astype(np.float32))
+    found = aligned_contrast(other, image, "c")
+    np.testing.assert_allclose(found.data, linear_twin(other, image), atol=1e-6)
+    np.testing.assert_array_equal(found.affine, image.affine)
+
+
+def test_linear_fields_survive_any_affine():
+    """Within the box of its voxel centres, a field linear in the world has the world's own values."""
+    image_affine, affine = PAIRS["both oblique"]
+    other = tetopt.Image(np.zeros((40, 40, 40)), affine @ np.array(_translation(-20, -20, -20)))
+    gradient = np.array([2.0, -1.0, 0.5])
+    grid = np.moveaxis(np.indices(other.shape), 0, -1)
+    other = tetopt.Image(other.to_world(grid) @ gradient, other.affine)
+    image = tetopt.Image(np.zeros(SHAPE), image_affine)
+    expected = image.to_world(np.moveaxis(np.indices(SHAPE), 0, -1)) @ gradient
+    np.testing.assert_allclose(aligned_contrast(other, image, "c").data, expected, atol=1e-5)
+
+
+def _translation(*shift):
+    return np.vstack([np.column_stack([np.eye(3), shift]), [0, 0, 0, 1]])
+
+
+def test_same_grid_is_taken_as_it_is():
+    """Up to 1e-4 voxel, and not beyond: there a value near a voxel's border comes from its neighbour."""
+    rng = np.random.default_rng(0)
+    affine = PAIRS["both oblique"][0]
+    image = tetopt.Image(np.zeros(SHAPE), affine)
+    data = rng.normal(size=SHAPE).astype(np.float32)
+    near = tetopt.Image(data, affine @ _translation(9e-5, 0, 0))
+    np.testing.assert_array_equal(aligned_contrast(near, image, "c").data, data)
+    np.testing.assert_array_equal(aligned_contrast(near, image, "c").affine, affine)
+    far = tetopt.Image(data, affine @ _translation(2e-3, 0, 0))
+    assert 1e-4 < np.abs(aligned_contrast(far, image, "c").data - data).max() < 2e-2
+    shape_only = tetopt.Image(np.arange(1, 1 + np.prod(SHAPE)).reshape(SHAPE), affine @ _translation(0, 2, 0))
+    moved = aligned_labels(shape_only, image, "l").data
+    np.testing.assert_array_equal(moved[:, 2:], shape_only.data[:, :-2])
+    np.testing.assert_array_equal(moved[:, :2], 0)
+
+
+@pytest.mark.parametrize("spacing", [1.0, 0.1, 0.7])
+@pytest.mark.parametrize("sign", [1, -1])
+def test_grid_shifted_by_half_a_voxel(spacing, sign):
+    """Every centre lies halfway between two voxels: all take the upper one, and the box is half open."""
+    affine = np.diag([spacing] * 3 + [1.0])
+    affine[:3, 3] = 17.3
+    image = tetopt.Image(np.zeros((40, 3, 3)), affine)
+    labels = tetopt.Image(np.arange(1, 361).reshape(40, 3, 3), affine @ _translation(-0.5 * sign, 0, 0))
+    found = aligned_labels(labels, image, "l").data
+    if sign > 0:  # index i + 1/2: the upper is i + 1, the last is on the upper face, outside
+        np.testing.assert_array_equal(found[:-1], labels.data[1:])
+        np.testing.assert_array_equal(found[-1], 0)
+    else:  # index i - 1/2: the upper is i, the first on the lower face, inside
+        np.testing.assert_array_equal(found, labels.data)
+
+
+def test_cropped_and_finer_masks():
+    image = tetopt.Image(np.zeros((6, 6, 6)), np.diag([2.0, 2.0, 2.0, 1.0]))
+    crop = tetopt.Image(np.ones((2, 3, 1)), image.affine @ _translation(1, 2, 5))
+    expected = np.zeros(image.shape)
+    expected[1:3, 2:5, 5] = 1
+    found = aligned_mask(crop, image, "m").data
+    np.testing.assert_array_equal(found, expected)
+    fine = tetopt.Image(expected.repeat(3, 0).repeat(3, 1).repeat(3, 2), np.diag([2 / 3] * 3 + [1.0]))
+    fine = tetopt.Image(fine.data, fine.affine @ _translation(-1, -1, -1))
+    np.testing.assert_array_equal(aligned_mask(fine, image, "m").data, expected)
+
+
+def test_two_dimensions():
+    affine = np.array([[0.0, -2.0, 9.3], [1.0, 0.0, 0.8], [0, 0, 1]])
+    image = tetopt.Image(np.zeros((8, 5)))
+    rng = np.random.default_rng(1)
+    other = tetopt.Image(rng.integers(1, 5, (6, 5)), affine)
+    expected = nearest_twin(other, image)
+    assert 0 < (expected == 0).sum() < expected.size
+    np.testing.assert_array_equal(aligned_labels(other, image, "l").data, expected)
+    np.testing.assert_allclose(aligned_contrast(other, image, "c").data, linear_twin(other, image), atol=1e-6)
+
+
+@pytest.mark.parametrize(
+    ("values", "expected"),
+    [
+        ([[True, False]], [[1, 0]]),
+        ([[0, 255]], [[0, 1]]),
+        ([[0, 0.25]], [[0, 1]]),  # two values, whatever the other is
+        ([[3, 3]], [[1, 1]]),  # the whole box
+        ([[0.25, 0.5]], [[0.25, 0.5]]),
+        ([[0.0, 0.25, 1.0]], [[0.0, 0.25, 1.0]]),
+    ],
+)
+def test_what_a_mask_may_hold(values, expected):
+    mask = tetopt.Image(values)
+    found = aligned_mask(mask, tetopt.Image(np.zeros(mask.shape)), "m")
+    np.testing.assert_array_equal(found.data, expected)
+    assert found.data.dtype == np.float32
+    doubles = aligned_mask(tetopt.Image([[0.1, 0.7]]), tetopt.Image(np.zeros((1, 2))), "m").data
+    assert doubles.dtype == np.float32
+
+
+def test_masks_that_are_none():
+    image = tetopt.Image(np.zeros((4, 3, 2)), np.diag([2.0, 1.0, 1.0, 1.0]))
+
+    def said(data, affine=image.affine):
+        return message(aligned_mask, "m.nii", tetopt.Image(data, affine), image)
+
+    assert message(aligned_mask, "m.nii", tetopt.Image(np.ones((4, 3))), image) == (
+        "m.nii: expected 3 axes like the image's (4, 3, 2), got shape (4, 3); pick one volume or slice"
+    )
+    labels = np.arange(24).reshape(4, 3, 2)
+    what = "m.nii: expected a mask, 0 and one other value or fractions from 0 to 1, got "
+    todo = "; choose one label of it, or a threshold"
+    assert said(labels) == what + "24 values from 0 to 23 (0, 1, 2, 3, 4, ...)" + todo
+    assert said(labels % 2 - 1) == what + "2 values from -1 to 0 (-1, 0)" + todo
+    assert said(labels % 2 + 1) == what + "2 values from 1 to 2 (1, 2)" + todo
+    assert said(labels * 0 - 1) == what + "1 values from -1 to -1 (-1)" + todo
+    empty = "m.nii: the mask is empty, expected voxels of 0.5 or more, got "
+    assert said(labels * 0) == empty + "0 in every voxel"
+    assert said(labels / 64) == empty + "fractions up to 0.359375"
+    away = image.affine @ _translation(10, 0, 0)
+    assert said(labels % 2, away) == (
+        "m.nii: nothing of the mask lies in the image's box; it spans 19.0..27.0 x -0.5..2.5 x -0.5..1.5 mm, the "
+        "image -1.0..7.0 x -0.5..2.5 x -0.5..1.5 mm: do both lie in the same world mm?"
+    )
+    # The boxes overlap, but only where the mask is 0, or a fraction under the half.
+    half = image.affine @ _translation(2, 0, 0)
+    assert said((labels >= 12) * 1, half).startswith("m.nii: nothing of the mask lies in")
+    assert said(np.where(labels >= 12, 1.0, 0.25), half).startswith("m.nii: nothing of the mask lies in")
+
+
+def test_labels_that_are_none():
+    image = tetopt.Image(np.zeros((4, 3, 2)))
+
+    def said(data, affine=None):
+        return message(aligned_labels, "l.nrrd", tetopt.Image(data, affine), image)
+
+    labels = np.arange(24).reshape(4, 3, 2)
+    assert said(labels[0]) == (
+        "l.nrrd: expected 3 axes like the image's (4, 3, 2), got shape (3, 2); pick one volume or slice"
+    )
+    for bad, value in ((labels + 0.5, "0.5"), (labels - 1, "-1"), (labels + 32_768, "32768")):
+        assert re.match(rf"l\.nrrd: labels must be whole numbers from 0 to 32767, .* the first {value} at", said(bad))
+    assert said(labels * 0) == "l.nrrd: expected labels above 0, got 0 in every voxel; is it the right file?"
+    assert said(labels, _translation(0, 3, 0)) == (
+        "l.nrrd: no label above 0 lies in the image's box; it spans -0.5..3.5 x 2.5..5.5 x -0.5..1.5 mm, the image "
+        "-0.5..3.5 x -0.5..2.5 x -0.5..1.5 mm: do both lie in the same world mm?"
+    )
+    assert said(labels * 0 + 7) == (
+        "l.nrrd: expected two or more labels, got 7 in every voxel of the image; there is nothing to tell apart, "
+        "leave it out or take another file"
+    )
+
+
+def test_label_files_of_floats():
+    labels = tetopt.Image(np.array([[0.0, 32_767.0], [2.0, 1.0]], dtype=np.float64))
+    np.testing.assert_array_equal(aligned_labels(labels, tetopt.Image(np.zeros((2, 2))), "l").data, labels.data)
+    # One value in its own box, but a box smaller than the image: label and background.
+    crop = tetopt.Image([[4.0]])
+    np.testing.assert_array_equal(aligned_labels(crop, tetopt.Image(np.zeros((1, 2))), "l").data, [[4, 0]])
+
+
+def test_a_contrast_covers_half_of_the_image():
+    image = tetopt.Image(np.zeros((4, 3, 2)))
+    other = np.arange(24.0).reshape(4, 3, 2)
+    found = aligned_contrast(tetopt.Image(other, _translation(2, 0, 0)), image, "t2").data
+    np.testing.assert_array_equal(found, other[[0, 0, 0, 1]])  # the border goes on
+    assert message(aligned_contrast, "t2", tetopt.Image(other, _translation(3, 0, 0)), image) == (
+        "t2: expected to cover half of the image's voxels or more, got 25.0 %; it spans 2.5..6.5 x -0.5..2.5 x "
+        "-0.5..1.5 mm, the image -0.5..3.5 x -0.5..2.5 x -0.5..1.5 mm: do both lie in the same world mm?"
+    )
+    assert message(aligned_contrast, "t2", tetopt.Image(other[0]), image) == (
+        "t2: expected 3 axes like the image's (4, 3, 2), got shape (3, 2); pick one volume or slice"
+    )
+
+
+def ball(shape, radius, centre=None):
+    centre = (np.array(shape) - 1) / 2 if centre is None else np.array(centre)
+    return ((np.moveaxis(np.indices(shape), 0, -1) - centre) ** 2).sum(axis=-1) <= radius**2
+
+
+@pytest.mark.parametrize("shape", [(30, 32), (30, 32, 28)])
+def test_foreground_by_hand(shape):
+    """A ball with a dark cavity, a speck dropped, a piece kept, and a dark pocket cut by the box kept inside."""
+    n = len(shape)
+    body = ball(shape, 10)
+    piece, speck = ball(shape, 3, [5] * n), np.zeros(shape, dtype=bool)
+    speck[(-2,) * n] = True
+    slab, pocket = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
+    slab[-5:, 8:-8] = body[-5:, 8:-8] = True
+    pocket[(-1, 15, *[14] * (n - 2))] = True
+    bright = (body | piece | speck) & ~ball(shape, 4) & ~pocket
+    image = tetopt.Image(np.where(bright, 50.0, 3.0), np.diag([2.0] * n + [1.0]))
+    found = foreground(image, 3.0)
+    np.testing.assert_array_equal(found.data, body | piece)
+    np.testing.assert_array_equal(found.affine, image.affine)
+    np.testing.assert_array_equal(foreground(image).data, body | piece)
+    assert background_level(image) == 3.0
+    # A channel to the cavity: face neighbours leak, voxels that touch in an edge do not.
+    channel = image.data.copy()
+    middle = tuple((s - 1) // 2 for s in shape)
+    channel[(slice(0, middle[0]), *middle[1:])] = 3.0
+    leaking = foreground(tetopt.Image(channel), 3.0).data
+    np.testing.assert_array_equal(leaking, (body | piece) & ~ball(shape, 4) & (channel > 3.0) | pocket)
+    assert leaking[middle] == 0
+    diagonal = tetopt.Image([[9.0, 9, 9, 9], [9, 9, 9, 9], [9, 9, 1, 9], [9, 9, 9, 1]])
+    np.testing.assert_array_equal(foreground(diagonal, 1.0).data == 0, np.diag([0, 0, 0, 1]))
+
+
+@pytest.mark.parametrize("air", [-1000.0, 0.0, 20.0])
+def test_level_of_noisy_air(air):
+    """Median and 4 sigma of the air, though body and faint rods lie on the faces; the outline is the body's."""
+    shape = (40, 40, 20)
+    rng = np.random.default_rng(5)
+    body = np.broadcast_to(ball(shape[:2], 14)[:, :, None], shape)
+    data = np.where(body, air + 500.0, air) + rng.normal(0.0, 10.0, shape)
+    for start in (3, 15, 27):
+        data[0, start : start + 5] = air + 150.0  # all three 6 % of the dark voxels on the faces
+    image = tetopt.Image(data)
+    assert background_level(image) == pytest.approx(air + 42.0, abs=4.0)
+    np.testing.assert_array_equal(foreground(image).data, body)
+
+
+def test_background_of_one_value_is_exact():
+    """As around an extracted brain: the faintest voxel beside it is foreground."""
+    data = np.zeros((20, 20, 20))
+    body = ball(data.shape, 7)
+    data[body] = np.random.default_rng(2).uniform(1e-3, 100.0, body.sum())
+    assert background_level(tetopt.Image(data)) == 0.0
+    np.testing.assert_array_equal(foreground(tetopt.Image(data)).data, body)
+
+
+def test_images_without_background():
+    rng = np.random.default_rng(7)
+    auto, todo = r"^--background auto: no background found, ", "; give a value, or leave it out$"
+    for image, words in (
+        (rng.normal(100.0, 20.0, (20, 20, 20)), r"the dark voxels on the faces of the box spread up to .*, not under"),
+        (np.full((5, 5), 4.0), "every voxel has the value 4"),
+        (np.where(ball((20, 20), 5), 0.0, 9.0), "no voxel on the faces of the box is among the dark ones, up to 4.5"),
+        (np.where(np.arange(8000).reshape(20, 20, 20) == 0, 0.0, 9.0), r"99\.99 % of the voxels would be foreground"),
+        (np.where(np.arange(8000).reshape(20, 20, 20) == 3790, 9.0, 0.0), r"0\.0125 % of the voxels would be foreg"),
+    ):
+        assert re.search(auto + words + ".*" + todo, message(foreground, tetopt.Image(image)))
+
+
+def test_levels_that_leave_nothing():
+    image = tetopt.Image(np.where(ball((20, 20), 5), 90.0, 10.0))
+    todo = "; give a level between the background's and the tissue's values, the image holds 10 to 90"
+    assert message(foreground, image, 5) == "--background 5: every voxel is foreground" + todo
+    assert message(foreground, image, 90) == "--background 90: nothing is left" + todo
+    # A level given is taken at its word, however little it leaves.
+    data = np.zeros((40, 40))
+    data[20, 20] = 1.0
+    np.testing.assert_array_equal(foreground(tetopt.Image(data), 0.0).data, data)

@@ -1,0 +1,185 @@
+import numpy as np
+import pytest
+from shapes import OBLIQUE, grid, shaped
+
+import tetopt
+from tetopt.energy.sampling import cell_of_voxel, channel_grid, moment_sums, to_ticks
+from tetopt.target.content import content, continued, noise_level, plain
+
+
+def contrasts(shape=(12, 13, 14)):
+    """Three of different scales: two of noise, one of blocks."""
+    rng = np.random.default_rng(0)
+    blocks = np.kron(rng.integers(0, 5, (3, 4, 4)), np.ones((4, 4, 4)))[: shape[0], : shape[1], : shape[2]]
+    return [
+        tetopt.Image(1000.0 + 300.0 * rng.normal(size=shape)),
+        tetopt.Image(1e-3 * rng.normal(size=shape)),
+        tetopt.Image(blocks),
+    ]
+
+
+def test_an_image_alone_is_itself():
+    image = contrasts()[0]
+    for found in (content(image), content([image]), plain(image), plain(content(image))):
+        assert found.is_plain
+        assert found.image is image
+        assert np.shares_memory(found.values, image.data)
+        assert found.variance == pytest.approx(float(np.var(image.data, dtype=np.float64)), rel=1e-12)
+        assert (found.n_voxels, found.volume) == (image.data.size, image.volume)
+
+
+@pytest.mark.parametrize("weights", [None, [1.0, 1.0, 1.0], [1.0, 4.0, 0.25], [0.0, 2.0, 1.0]])
+def test_contrasts_count_by_their_weights_not_their_scales(weights):
+    images = contrasts()
+    found = content(images, weights=weights)
+    wanted = [1.0, 1.0, 1.0] if weights is None else weights
+    unit = float(np.var(images[0].data, dtype=np.float64))
+    variances = [found.unit * float(np.var(v, dtype=np.float64)) for v in found.values]
+    np.testing.assert_allclose(variances, [w * unit for w in wanted if w > 0.0], rtol=2e-3)
+    kept = [image for image, w in zip(images, wanted, strict=True) if w > 0.0]
+    for values, image in zip(found.values, kept, strict=True):
+        assert np.corrcoef(values.ravel(), image.data.ravel())[0, 1] > 0.99999
+    assert np.issubdtype(found.values.dtype, np.integer)
+
+
+def test_a_rare_label_or_a_bright_voxel_leaves_the_image_its_levels():
+    """What is rounded away is far below what is represented."""
+    rng = np.random.default_rng(0)
+    data = rng.normal(size=(40, 40, 40))
+    labels = np.zeros(data.shape)
+    labels[20, 20, 20] = 1.0
+    data[5, 5, 5] = 1e4
+    found = content(tetopt.Image(data), tetopt.Image(labels))
+    rest = np.ones(data.shape, dtype=bool)
+    rest[5, 5, 5] = False
+    rounded = found.values[0][rest] * np.sqrt(found.unit) + data.mean()
+    off = float(np.std(rounded - data[rest]))
+    assert off < 0.01 * data.std()  # the image's, of which the one voxel makes nearly all
+    assert np.abs(found.values).max() < 2**31 - 1
+
+
+def labelled(shape=(24, 25, 26)):
+    """Labels in slabs, of which only neighbours touch, and one voxel of another."""
+    labels = (grid(shape)[..., 0] // 8).astype(int) * 3
+    labels[12, 12, 12] = 17
+    return tetopt.Image(labels.astype(float))
+
+
+def test_labels_are_one_hot():
+    labels = labelled()
+    found = content(labels, labels, weights=[0.0])
+    assert found.n_contrasts == 0
+    codes = {}
+    for label in np.unique(labels.data):
+        rows = found.values[:, labels.data == label]
+        assert (rows == rows[:, :1]).all()  # the same everywhere
+        assert np.count_nonzero(rows[:, 0]) == 1  # in one channel
+        codes[int(label)] = rows[:, 0]
+    assert found.unit * sum(np.var(v, dtype=np.float64) for v in found.values) == pytest.approx(
+        float(np.var(labels.data, dtype=np.float64)), rel=2e-3
+    )
+    # 0 and 6 are 8 voxels apart and share a channel; those that touch have different ones.
+    assert np.argmax(codes[0]) == np.argmax(codes[6])
+    assert len({int(np.argmax(codes[k])) for k in (0, 3, 17)}) == 3
+    assert codes[17].max() > 3.0 * codes[3].max()  # by the voxel the rare one counts more
+
+
+def test_labels_that_touch_only_in_a_point_are_told_apart():
+    labels = np.zeros((8, 8, 8))
+    labels[:4, :4, :4], labels[4:, 4:, 4:] = 1, 2
+    found = content(tetopt.Image(labels), tetopt.Image(labels), weights=[0.0])
+    assert len({tuple(found.values[:, labels == k][:, 0]) for k in (0, 1, 2)}) == 3
+    assert len(found.values) == 3
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_sums_of_channels(n):
+    """Counts, sums and the squares of all channels against those over the voxels of each cell."""
+    shape = (11, 12, 13)[:n]
+    rng = np.random.default_rng(3)
+    images = [tetopt.Image(rng.normal(size=shape)) for _ in range(3)]
+    mask = np.zeros(shape)
+    mask[2:9, 2:10] = 1.0
+    wanted = content(images, mask=tetopt.Image(mask))._replace(region=None)
+    region = content(images, mask=tetopt.Image(mask)).region
+    mesh = tetopt.lattice(wanted.image, nodes=120)
+    for wanted_ in (wanted, wanted._replace(region=region)):
+        grid_ = channel_grid(wanted_, mesh.points)
+        sums = moment_sums(grid_, to_ticks(wanted.image.to_index(mesh.points), grid_), mesh.cells)
+        assert grid_.n_channels == 3
+        owner = cell_of_voxel(wanted.image, mesh).ravel()
+        flat = wanted.values.reshape(3, -1).astype(float)
+        rows = [np.ones(len(owner)), flat[0], (flat**2).sum(axis=0), flat[1], flat[2]]
+        if wanted_.region is not None:
+            rows.append(np.where(region.inside.ravel(), -1.0, 1.0))
+        expected = np.stack([np.bincount(owner, row, len(mesh.cells)) for row in rows], axis=1)
+        np.testing.assert_array_equal(sums, expected[:, : sums.shape[1]])
+        assert sums.shape[1] == len(rows)
+
+
+def test_beyond_a_mask_the_nearest_value_inside_counts():
+    image, mask = shaped("ball", OBLIQUE)
+    far = tetopt.Image(np.where(mask.data > 0, image.data, -1e6), image.affine)
+    found = content(far, mask=mask)
+    assert found.image.data.min() > -1e3
+    whole = continued(far, mask)
+    np.testing.assert_array_equal(whole.data, found.image.data)
+    # The same place in the world, and the same voxels inside.
+    index = image.to_index(found.image.to_world(grid(found.image.shape)))
+    start = np.rint(index[0, 0, 0]).astype(int)
+    np.testing.assert_allclose(index - start, grid(found.image.shape), atol=1e-9)
+    part = tuple(slice(s, s + n) for s, n in zip(start, found.image.shape, strict=True))
+    inside = mask.data[part] > 0
+    assert inside.sum() == mask.data.sum() == found.n_voxels
+    np.testing.assert_array_equal(found.image.data[inside], image.data[part][inside])
+    np.testing.assert_array_equal(found.region.inside, inside)
+    assert found.variance == pytest.approx(float(np.var(image.data[mask.data > 0], dtype=np.float64)), rel=1e-9)
+    assert found.volume == pytest.approx(mask.data.sum() * image.voxel_volume)
+
+
+def test_noise_within_a_mask():
+    rng = np.random.default_rng(0)
+    inside = np.zeros((40, 40, 40), dtype=bool)
+    inside[10:30, 8:32, 8:32] = True
+    data = np.where(inside, rng.normal(0.0, 3.0, inside.shape), 0.0)
+    data[~inside] += 40.0 * rng.random((~inside).sum())
+    assert noise_level(data, inside) == pytest.approx(3.0, rel=0.1)
+
+
+def test_float_labels_of_256_cubed():
+    """Whole numbers in float32, as many tools write them: a few seconds, and no more than some bytes a voxel."""
+    data = np.zeros((256, 256, 256), dtype=np.float32)
+    data[40:200, 40:200, 40:120] = 3.0
+    data[40:200, 40:200, 120:200] = 7.0
+    labels = tetopt.Image(data)
+    found = content(labels, labels, weights=[0.0])
+    assert found.values.shape == (3, 256, 256, 256)
+    assert found.values.nbytes <= 12 * data.size
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"images": []}, "images: expected one or more, got none"),
+        ({"weights": [1.0]}, "weights: expected one for each of 3 images, 0 or 0.001 to 1000, got [1.0]"),
+        ({"weights": [1.0, -1.0, 1.0]}, "weights: expected one for each of 3 images, 0 or 0.001 to 1000, got"),
+        ({"weights": [0.0, 0.0, 0.0]}, "weights: nothing that differs between voxels counts; give one above 0"),
+        ({"mask": tetopt.Image(np.zeros((12, 13, 14)))}, "mask: no voxel has a half or more, there is nothing to mesh"),
+        ({"mask": tetopt.Image(np.ones((12, 13, 15)))}, "mask: expected all of shape (12, 13, 14), got (12, 13, 15)"),
+        ({"images": contrasts()[0], "weights": [0.0]}, "weights: nothing that differs between voxels counts"),
+        ({"weights": [1.0, 1e200, 1.0]}, "weights: expected one for each of 3 images"),
+        ({"labels": tetopt.Image(np.full((12, 13, 14), 3.0))}, "labels: the same everywhere in what is meshed"),
+        ({"labels": tetopt.Image(np.ones((12, 13, 14)) + 0.5)}, "labels: labels must be whole numbers from 0"),
+        ({"label_weight": -1.0}, "label_weight: expected 0 or 0.001 to 1000, got -1.0"),
+        (
+            {"images": [tetopt.Image(1e160 * i.data.astype(float)) for i in contrasts()]},
+            "image: squares of intensities",
+        ),
+        ({"mask": tetopt.Image(np.ones((12, 13, 14)), OBLIQUE)}, "mask: expected voxels in the same place"),
+    ],
+)
+def test_refused(change, message):
+    given = {"images": contrasts()} | change
+    with pytest.raises(tetopt.InputError) as error:
+        content(**given)
+    assert str(error.value).startswith(message)

@@ -1,0 +1,139 @@
+import numpy as np
+import pytest
+from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
+from shapes import OBLIQUE, grid, shaped
+
+import tetopt
+from tetopt.geometry.topology import boundary_facets
+from tetopt.measure.fidelity import mask_fidelity
+from tetopt.start.clip import clipped, lattice_within, onto_surface
+from tetopt.target.domain import Domain, domain, levels
+
+
+def test_a_sphere_has_no_stairs():
+    """Twice as near to the true sphere as the surface halfway between voxels, and nowhere far from that."""
+    centre, radius = np.array([14.3, 15.1, 14.7]), 9.0
+    r = np.linalg.norm(grid((30, 30, 30)) - centre, axis=-1)
+    region = domain(tetopt.Image(1.0 * (r < radius)))
+    way = np.random.default_rng(0).normal(size=(4000, 3))
+    way /= np.linalg.norm(way, axis=1)[:, None]
+
+    def off(level):  # where each ray meets the zero level
+        steps = np.linspace(-1.5, 1.5, 301)
+        values = np.stack([levels(level, centre + (radius + s) * way) for s in steps])
+        return steps[np.argmax(values > 0.0, axis=0)]
+
+    raw = np.where(r < radius, -0.5, 0.5).astype(np.float32)
+    smooth, stairs = off(region.level), off(raw)
+    assert np.abs(smooth).mean() < 0.1
+    assert np.abs(smooth).mean() < 0.5 * np.abs(stairs).mean()
+    assert abs(smooth.mean()) < 0.03  # neither grown nor shrunk
+    assert np.abs(smooth - stairs).max() < 0.75
+
+
+def test_voxels_stay_on_their_side():
+    rng = np.random.default_rng(1)
+    mask = rng.random((12, 13, 14)) < 0.4
+    region = domain(tetopt.Image(1.0 * mask))
+    np.testing.assert_array_equal(region.level < 0.0, mask)
+    np.testing.assert_array_equal(region.inside, mask)
+
+
+def test_smoothing_moves_no_voxel_by_more_than_a_third():
+    rng = np.random.default_rng(1)
+    inside = gaussian_filter(rng.normal(size=(24, 24, 24)), 2.0) > 0.0
+    raw = np.where(inside, 0.5 - distance_transform_edt(inside), distance_transform_edt(~inside) - 0.5)
+    moved = np.abs(domain(tetopt.Image(1.0 * inside)).level - raw)
+    assert 0.3 < moved.max() < 0.35 + 1e-5
+
+
+@pytest.mark.parametrize("is_gap", [False, True])
+def test_a_sheet_of_one_voxel_keeps_its_thickness(is_gap):
+    mask = np.zeros((21, 21, 21), dtype=bool)
+    mask[3:18, 3:18, 10] = True
+    level = domain(tetopt.Image(1.0 * (mask ^ is_gap))).level * (-1.0 if is_gap else 1.0)
+    along = levels(level, np.array([[10.0, 10.0, z] for z in np.linspace(8.0, 12.0, 401)]))
+    assert (along < 0.0).mean() * 4.0 == pytest.approx(1.0, abs=0.02)
+
+
+def test_fractions_have_their_own_surface():
+    z = np.arange(20.0)
+    part = np.clip(12.7 - z, 0.0, 1.0)  # 0.7 at 12, 0 at 13: a half in between at 12 + 2 / 7
+    mask = tetopt.Image(np.broadcast_to(part, (6, 7, 20)))
+    region = domain(mask)
+    at = np.array([[2.0, 3.0, 12.0 + 2.0 / 7.0]])
+    assert levels(region.level, at) == pytest.approx(0.0, abs=1e-6)
+    assert levels(region.level, at + np.array([0, 0, 3.0])) > 1.0
+    assert levels(region.level, at - np.array([0, 0, 3.0])) < -1.0
+
+
+def test_all_inside_has_no_surface():
+    image = tetopt.Image(np.ones((6, 7, 8)))
+    region = domain(image)
+    mesh = tetopt.lattice(image, nodes=100)
+    assert clipped(mesh, image, region).cells.tolist() == mesh.cells.tolist()
+
+
+def test_levels_are_linear_between_centres():
+    level = np.random.default_rng(0).normal(size=(5, 6, 7)).astype(np.float32)
+    at = np.random.default_rng(1).uniform(-0.5, 6.0, size=(50, 3))
+    np.testing.assert_allclose(levels(level, at), map_coordinates(level.astype(float), at.T, order=1, mode="nearest"))
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_the_way_onto_the_surface_is_the_shortest_in_mm(n):
+    affine = OBLIQUE if n == 3 else OBLIQUE[np.ix_([0, 2, 3], [0, 2, 3])]
+    image = tetopt.Image(np.zeros((20,) * n), affine)
+    normal = np.array([1.0, 2.0, -0.5])[:n]  # of a plane, in index space
+    level = (grid(image.shape) - 9.3) @ normal
+    at = np.random.default_rng(0).uniform(6.0, 12.0, size=(40, n))
+    there, is_there = onto_surface(at, image, Domain(level < 0, level.astype(np.float32)))
+    assert is_there.all()
+    # In the world the normal of the plane is the index normal by the inverse transposed; the way is along it.
+    world = normal @ np.linalg.inv(affine[:-1, :-1])
+    way = (there - at) @ affine[:-1, :-1].T
+    side = way - np.outer(way @ world, world) / (world @ world)
+    assert np.abs(side).max() < 1e-3 * np.abs(way).max()
+    np.testing.assert_allclose((there - 9.3) @ normal, 0.0, atol=2e-3)
+
+
+def test_nodes_on_the_box_stay_on_it():
+    image, mask = shaped("touching")
+    mesh = clipped(tetopt.lattice(image, nodes=900), image, domain(mask))
+    index = image.to_index(mesh.points)
+    assert (index >= -0.5).all()
+    assert (index[:, 0] == -0.5).sum() > 20
+    outer = boundary_facets(mesh.cells)
+    on_box = (index[outer][:, :, 0] == -0.5).all(axis=1)
+    level = np.abs(levels(domain(mask).level, index))
+    assert on_box.any()
+    assert level[np.unique(outer[~on_box])].max() < 0.35  # the rest lies on the surface, or as good as
+
+
+@pytest.mark.parametrize("kind", ["ball", "pieces", "hole", "handle", "touching"])
+def test_clipped(kind):
+    image, mask = shaped(kind)
+    mesh = lattice_within(image, domain(mask), spacing=2.5)
+    assert tetopt.check_mesh(mesh, is_whole=False) == []
+    assert tetopt.quality(mesh.points, mesh.cells).min_dihedral > 1.0
+    found = mask_fidelity(mask, mesh)
+    assert found.dice > 0.97
+    assert found.mesh_components == found.components
+    assert found.mesh_euler == found.euler
+    assert found.distance_mean < 0.25
+
+
+def test_wanted_nodes_within_a_mask():
+    image, mask = shaped("ball")
+    for nodes in (200, 600, 1500):
+        assert len(lattice_within(image, domain(mask), nodes=nodes).points) == pytest.approx(nodes, rel=0.1)
+
+
+def test_too_thin_for_its_cells():
+    mask = np.zeros((30, 30, 30))
+    mask[15, 15, 15] = 1.0
+    image = tetopt.Image(mask)
+    mesh = tetopt.lattice(image, blocks=(1, 1, 1))
+    moved = tetopt.Mesh(mesh.points + np.where(mesh.points == 14.5, 3.0, 0.0), mesh.cells)
+    with pytest.raises(tetopt.InputError, match="thinner than the cells, none is left inside; ask for more nodes"):
+        clipped(moved, image, domain(image))

@@ -1,1 +1,0 @@
-"""The conventional way, for comparison: segment, extract surfaces, fill them with tetrahedra."""

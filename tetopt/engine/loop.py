@@ -1,0 +1,103 @@
+"""What both engines share: the history of a run, its clock, which nodes may move, and how far they moved."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from typing import Literal, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.energy.sampling import SamplingGrid
+from tetopt.geometry.topology import boundary_facets
+from tetopt.image import Image, transformed
+from tetopt.mesh import Mesh
+
+NOISE = 1e-12  # of the image's own variance x volume: less E_D than this is rounding
+
+Boundary = Literal["slide", "fixed"]
+
+
+class Record(NamedTuple):
+    """One row of the history; row 0 is the initial mesh."""
+
+    iteration: int
+    E: float  # normalised by the initial mesh, Eq. (4) and Section 4
+    E_G: float  # mm^(n+2)
+    E_D: float  # intensity^2 mm^n
+    movement: float  # |x^t - x^(t-1)| / |x^(t-1)|, x from the box's centre
+    is_retessellated: bool  # a new tessellation was taken in this iteration
+    n_cells: int
+    n_voxels: int  # voxel centres inside the cells; the same in every row
+    seconds: float  # since the start
+
+
+class Optimized(NamedTuple):
+    """What `optimize` returns."""
+
+    mesh: Mesh
+    history: list[Record]
+    ended: str  # "iterations", "converged", "max_seconds" or "stopped"
+
+
+def deadline(begin: float, max_seconds: float | None, stop: Callable[[], bool] | None) -> Callable[[], bool]:
+    """A function that tells whether the time is over, or `stop` says so."""
+
+    def is_over() -> bool:
+        if max_seconds is not None and time.perf_counter() - begin > max_seconds:
+            return True
+        return stop is not None and stop()
+
+    return is_over
+
+
+def frozen_axes(
+    image: Image, ticks: NDArray[np.int64], cells: NDArray[np.int64], grid: SamplingGrid, boundary: Boundary,
+    has_surface: bool = False,
+) -> NDArray[np.bool_]:  # fmt: skip
+    """Index axes along which each node must stay, (N, 4) bool; the leading axis of a 2-D image counts as free.
+
+    A node on a face of the box, index -0.5 or shape - 0.5, keeps its coordinate across it. A node of a boundary
+    facet that lies on no face of the box keeps all of them, as every boundary node does with "fixed"; or, with a
+    surface on which such nodes slide, is marked in the last column.
+    """
+    n = image.ndim
+    is_frozen = np.zeros((len(ticks), 4), dtype=bool)
+    facets_out = boundary_facets(cells)
+    if boundary == "fixed":
+        is_frozen[facets_out.ravel(), :3] = True
+        return is_frozen
+    is_on_box = np.zeros(len(facets_out), dtype=bool)
+    for axis, is_there in on_box_sides(ticks, facets_out, grid, n):
+        is_on_box |= is_there
+        is_frozen[facets_out[is_there].ravel(), axis] = True
+    if has_surface:
+        is_frozen[facets_out[~is_on_box].ravel(), 3] = True
+    else:
+        is_frozen[facets_out[~is_on_box].ravel(), :3] = True
+    return is_frozen
+
+
+def on_box_sides(
+    ticks: NDArray[np.int64], nodes: NDArray[np.int64], grid: SamplingGrid, n: int
+) -> Iterator[tuple[int, NDArray[np.bool_]]]:
+    """For each side of the box, the axis across it and which of the facets `nodes` (F, n) lie on it."""
+    half = 1 << (grid.bits - 1)
+    for axis in range(3 - n, 3):
+        for side in (-half, (grid.shape[axis] << grid.bits) - half):
+            yield axis, (ticks[nodes, axis] == side).all(axis=1)
+
+
+def relative_movement(
+    before: NDArray[np.int64],
+    after: NDArray[np.int64],
+    image: Image,
+    grid: SamplingGrid,
+    matrix: NDArray[np.float64],
+) -> float:
+    """|x^t - x^(t-1)| / |x^(t-1)| over all nodes, in mm, x from the box's centre; Fig. 1(c)."""
+    centre = np.array([(s - 1) * 0.5 for s in grid.shape]) * 2.0**grid.bits
+    moved = transformed((after - before).astype(np.float64), matrix)
+    place = transformed(before - centre, matrix)
+    return float(np.sqrt((moved**2).sum() / (place**2).sum()))

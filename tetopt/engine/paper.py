@@ -1,0 +1,279 @@
+"""The paper's optimisation: re-tessellate, move every node, measure, repeat."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Literal
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.energy.discretization import E_D_of_sums, combined
+from tetopt.energy.geometric import cell_E_G
+from tetopt.energy.sampling import (
+    SamplingGrid,
+    check_orientations,
+    facet_fluxes,
+    from_ticks,
+    moment_sums,
+    orientations,
+    sampling_grid,
+    sums_of_fluxes,
+    to_ticks,
+)
+from tetopt.engine.descent import FLAT, State, Weights, descend, free_projections, relocate
+from tetopt.engine.loop import (
+    NOISE,
+    Boundary,
+    Optimized,
+    Record,
+    deadline,
+    frozen_axes,
+    on_box_sides,
+    relative_movement,
+)
+from tetopt.errors import InputError
+from tetopt.geometry.simplex import squared_edges, volumes
+from tetopt.geometry.topology import Facets, facets, node_colours, rings, stars
+from tetopt.image import Image
+from tetopt.mesh import Mesh
+from tetopt.start.delaunay import delaunay
+
+Retessellate = Literal["first", "accept", "never"]
+
+
+def optimize_paper(
+    image: Image,
+    mesh: Mesh,
+    *,
+    k_D: float = 0.2,
+    iterations: int = 20,
+    n_t: int | None = None,
+    retessellate: Retessellate = "first",
+    boundary: Boundary = "slide",
+    step_ratio: float = 0.25,
+    tolerance: float = 1e-5,
+    max_seconds: float | None = None,
+    callback: Callable[[Record], None] | None = None,
+    stop: Callable[[], bool] | None = None,
+) -> Optimized:
+    """Move the nodes of `mesh` to lower E = (1 - k_D) E_G + k_D E_D, Eq. (4), by the paper's scheme.
+
+    Parameters
+    ----------
+    image : Image
+        The intensities h.
+    mesh : Mesh
+        The initial mesh, which also normalises the two energies; for re-tessellation it must fill the image's
+        box, as `tetopt.start.lattice.lattice` does.
+    k_D : float
+        Weight of the image, 0 <= k_D < 1. With 0 a node moves to the minimiser of E_G (Lloyd's relaxation),
+        else by descent with numerical derivatives.
+    iterations : int
+        Number of sweeps over all nodes, at most.
+    n_t : int, optional
+        Re-tessellation happens in the first n_t iterations only. Default: all for k_D = 0, else half.
+    retessellate : {"first", "accept", "never"}
+        Take every Delaunay tessellation of the first n_t iterations; in all iterations those that lower E
+        (Section 4); or none.
+    boundary : {"slide", "fixed"}
+        Boundary nodes move within the box's faces and edges, or not at all. Those not on the box are fixed.
+    step_ratio : float
+        Step of the numerical derivative over the distance to the nearest cell centroid.
+    tolerance : float
+        Converged when the relative movement of an iteration falls below it.
+    max_seconds : float, optional
+        Stop at the next colour of nodes after this time; the mesh is valid.
+    callback : callable, optional
+        Called with each `Record`.
+    stop : callable, optional
+        Asked between colours of nodes (several times a second on common meshes); True ends the run there.
+
+    Returns
+    -------
+    Optimized
+        Mesh, history and why it ended. The mesh covers the same domain and every cell is positively oriented.
+        With the connectivity fixed E never rises, beyond rounding, from one record to the next.
+
+    Raises
+    ------
+    InputError
+        An option out of range, a mesh that the sampling cannot take (see `cell_moments`), with doubled cells, or,
+        unless `retessellate` is "never", one that does not fill the image's box.
+    """
+    _check_options(k_D, iterations, n_t, retessellate, boundary, step_ratio)
+    if n_t is None:
+        n_t = default_n_t(k_D, iterations)
+    begin = time.perf_counter()
+    is_over = deadline(begin, max_seconds, stop)
+
+    grid = sampling_grid(image, mesh.points)
+    ticks = to_ticks(image.to_index(mesh.points), grid)
+    check_orientations(image, ticks, mesh.cells)
+    is_frozen = frozen_axes(image, ticks, mesh.cells, grid, boundary)
+    matrix = np.eye(3)
+    matrix[3 - image.ndim :, 3 - image.ndim :] = image.affine[:-1, :-1]
+    projections = free_projections(matrix)
+    state = _state(image, grid, ticks, mesh.cells, is_frozen)
+    if state.sides.n_cells.max() > 2:
+        raise InputError("mesh: a facet is shared by more than two cells; remove doubled or overlapping cells")
+    if iterations > 0 and (retessellate == "accept" or (retessellate == "first" and n_t > 0)):
+        _check_fills_box(image, mesh)
+    # Where every cell is uniform, what rounding leaves of E_D must not become the unit that E_D is measured in.
+    noise = NOISE * float(np.var(image.data, dtype=np.float64)) * image.volume
+    E_G0, E_D0 = _energies(state, image, noise)
+    weights = Weights((1.0 - k_D) / E_G0, k_D * image.voxel_volume / E_D0 if E_D0 > 0.0 else 0.0, step_ratio)
+
+    history: list[Record] = []
+
+    def record(iteration: int, movement: float, is_retessellated: bool) -> None:
+        now_G, now_D = _energies(state, image, noise)
+        E = combined(now_G, now_D, E_G0, E_D0, k_D)
+        n_voxels = int(state.sums[:, 0].sum())
+        seconds = time.perf_counter() - begin
+        history.append(
+            Record(iteration, E, now_G, now_D, movement, is_retessellated, len(state.cells), n_voxels, seconds)
+        )
+        if callback is not None:
+            callback(history[-1])
+
+    record(0, 0.0, False)
+    ended = "iterations"
+    for iteration in range(1, iterations + 1):
+        # 1. Connect the nodes anew.
+        is_new = False
+        if retessellate == "accept" or (retessellate == "first" and iteration <= n_t):
+            limit = history[-1].E if retessellate == "accept" else np.inf
+            candidate = _retessellated(image, grid, state)
+            if candidate is not None:
+                E = combined(*_energies(candidate, image, noise), E_G0, E_D0, k_D)
+                if limit > E:
+                    is_new = not np.array_equal(candidate.cells, state.cells)
+                    state = candidate
+        # 2. Move the nodes, one colour at a time.
+        before = state.ticks.copy()
+        is_finished = _sweep(state, grid, matrix, projections, weights, k_D, is_over)
+        # 3. Measure.
+        if k_D == 0.0:
+            state.sums[:] = moment_sums(grid, state.ticks, state.cells, state.sides)
+        movement = relative_movement(before, state.ticks, image, grid, matrix)
+        record(iteration, movement, is_new)
+        if not is_finished:
+            ended = "stopped" if stop is not None and stop() else "max_seconds"
+            break
+        if movement < tolerance and not is_new:
+            ended = "converged"
+            break
+    points = image.to_world(from_ticks(state.ticks, grid, image.ndim))
+    return Optimized(Mesh(points, state.cells), history, ended)
+
+
+def default_n_t(k_D: float, iterations: int) -> int:
+    """Number of first iterations that connect the nodes anew: all for k_D = 0 (Lloyd's alternation), else half."""
+    return iterations if k_D == 0.0 else (iterations + 1) // 2
+
+
+def _check_options(
+    k_D: float, iterations: int, n_t: int | None, retessellate: str, boundary: str, step_ratio: float
+) -> None:
+    if not 0.0 <= k_D < 1.0:
+        raise InputError(f"k_D: expected 0 <= k_D < 1, got {k_D}")
+    if iterations < 0:
+        raise InputError(f"iterations: expected 0 or more, got {iterations}")
+    if n_t is not None and n_t < 0:
+        raise InputError(f"n_t: expected 0 or more, got {n_t}")
+    if retessellate not in ("first", "accept", "never"):
+        raise InputError(f"retessellate: expected first, accept or never, got {retessellate!r}")
+    if boundary not in ("slide", "fixed"):
+        raise InputError(f"boundary: expected slide or fixed, got {boundary!r}")
+    if not 0.0 < step_ratio < 1.0:
+        raise InputError(f"step_ratio: expected a number between 0 and 1, got {step_ratio}")
+
+
+def _check_fills_box(image: Image, mesh: Mesh) -> None:
+    """Delaunay fills the convex hull of the nodes: InputError for a mesh whose domain is not the image's box."""
+    index = image.to_index(mesh.points)
+    corners = np.array([index.min(axis=0) + 0.5, index.max(axis=0) + 0.5])
+    is_box = np.abs(corners - [np.zeros(image.ndim), image.shape]).max() < 1e-6
+    if not is_box or abs(volumes(mesh.points, mesh.cells).sum() / image.volume - 1.0) > 1e-9:
+        raise InputError(
+            "mesh: re-tessellation needs a mesh that fills the image's box exactly, as a lattice does; "
+            'pass retessellate="never" to keep the connectivity'
+        )
+
+
+def _state(
+    image: Image,
+    grid: SamplingGrid,
+    ticks: NDArray[np.int64],
+    cells: NDArray[np.int64],
+    is_frozen: NDArray[np.bool_],
+    sides: Facets | None = None,
+) -> State:
+    """Everything a sweep needs, measured afresh; `sides` are the cells' facets where they are known already."""
+    points = image.to_world(from_ticks(ticks, grid, image.ndim))
+    cells = np.ascontiguousarray(cells, dtype=np.int64)
+    around, sides = rings(cells, len(ticks)), facets(cells) if sides is None else sides
+    hand = 1 if np.linalg.det(image.affine[:-1, :-1]) > 0 else -1
+    fluxes = facet_fluxes(grid, ticks, sides.nodes)
+    sums = sums_of_fluxes(fluxes, sides, hand)
+    return State(
+        ticks, cells, around, sides, stars(sides, around), is_frozen, hand, sums, cell_E_G(points, cells), fluxes
+    )
+
+
+def _energies(state: State, image: Image, noise: float) -> tuple[float, float]:
+    """E_G and E_D of the mesh; an E_D up to `noise` is 0."""
+    E_D = float(E_D_of_sums(state.sums, image.voxel_volume).sum())
+    return float(state.E_G.sum()), E_D if E_D > noise else 0.0
+
+
+def _retessellated(image: Image, grid: SamplingGrid, state: State) -> State | None:
+    """The state with Delaunay's cells; None where they would not be a mesh of the same box.
+
+    Checked exactly: every cell oriented on the fixed-point grid, every facet in one or two cells, the boundary's
+    facets on the box, and every voxel in one cell.
+    """
+    index = from_ticks(state.ticks, grid, image.ndim)
+    cells = delaunay(index, image.affine)
+    if cells is None:
+        return None
+    if (orientations(state.ticks, cells) != state.hand).any() or is_flat(image.to_world(index), cells).any():
+        return None
+    shared = facets(cells)
+    if shared.n_cells.max() > 2:
+        return None
+    outer = shared.nodes[shared.n_cells == 1]
+    if not np.any([there for _, there in on_box_sides(state.ticks, outer, grid, image.ndim)], axis=0).all():
+        return None
+    candidate = _state(image, grid, state.ticks, cells, state.is_frozen, shared)
+    return candidate if candidate.sums[:, 0].sum() == image.data.size else None
+
+
+def is_flat(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Cells so thin that no optimisation may make them, (M,) bool; see `FLAT`."""
+    size = squared_edges(points, cells).sum(axis=1) ** (points.shape[1] / 2)
+    return volumes(points, cells) <= FLAT * size
+
+
+def _sweep(
+    state: State,
+    grid: SamplingGrid,
+    matrix: NDArray[np.float64],
+    projections: NDArray[np.float64],
+    weights: Weights,
+    k_D: float,
+    is_over: Callable[[], bool],
+) -> bool:
+    """Move every node once; False if `is_over` cut it short, between two colours."""
+    colours = node_colours(state.cells, state.rings)
+    for colour in range(colours.max() + 1):
+        if is_over():
+            return False
+        nodes = np.flatnonzero((colours == colour) & ~state.is_frozen[:, 3 - (state.cells.shape[1] - 1) :].all(axis=1))
+        if k_D == 0.0:
+            relocate(state, nodes, grid, matrix, projections)
+        else:
+            descend(state, nodes, grid, matrix, weights)
+    return True

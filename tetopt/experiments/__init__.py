@@ -1,1 +1,0 @@
-"""Whole experiments over the public API; nothing else in the package knows of them."""

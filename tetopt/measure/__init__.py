@@ -1,0 +1,1 @@
+"""What came of it: quality, fidelity to masks and labels, segmentation."""

@@ -1,0 +1,77 @@
+"""Approximate segmentation by an optimised mesh: cells grouped by their means, painted back to voxels.
+
+Section 5 of the paper: "such an optimized discretization can further be used for a fast approximate segmentation since
+optimized elements represent an image using far fewer degrees-of-freedom than the underlying pixels".
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.energy.sampling import cell_moments, cell_of_voxel
+from tetopt.errors import InputError
+from tetopt.image import Image
+from tetopt.mesh import Mesh
+from tetopt.target.content import check_labels
+from tetopt.target.otsu import class_thresholds
+
+
+def segmented(image: Image, mesh: Mesh, classes: int) -> Image:
+    """Label image, 0 to classes - 1 by rising mean: the cells' classes painted back to their voxels.
+
+    Cells are grouped by their means, each weighted by its number of voxels; voxels outside the mesh get class 0.
+
+    Raises
+    ------
+    InputError
+        As `class_thresholds` and `tetopt.energy.sampling.cell_moments`.
+    """
+    moments = cell_moments(image, mesh)
+    thresholds = class_thresholds(moments.mean, classes, moments.n_voxels)
+    class_of_cell = np.digitize(moments.mean, thresholds)
+    owner = cell_of_voxel(image, mesh)
+    return Image(np.where(owner >= 0, class_of_cell[owner], 0), image.affine)
+
+
+def thresholded(image: Image, classes: int) -> Image:
+    """Label image, 0 to classes - 1: the same classes from the voxels themselves, no mesh between."""
+    thresholds = class_thresholds(image.data.ravel(), classes)
+    return Image(np.digitize(image.data, thresholds), image.affine)
+
+
+def stands_for(labels: Image, truth: Image) -> dict[int, int]:
+    """For each class the true label that most of its voxels carry; arguments as for `dice`."""
+    table = _table(labels, truth)
+    return {int(c): int(table[c].argmax()) for c in np.flatnonzero(table.sum(axis=1))}
+
+
+def dice(labels: Image, truth: Image) -> dict[int, float]:
+    """Dice overlap of each true label with the classes that stand for it, 0 to 1.
+
+    A class stands for the true label that most of its voxels carry (`stands_for`); a true label for which no class
+    stands has 0. The truth chooses that, so more classes tend to overlap better.
+
+    Raises
+    ------
+    InputError
+        Images of different shapes, or labels that are not whole numbers from 0.
+    """
+    table = _table(labels, truth)
+    chosen = table.argmax(axis=1)
+    overlaps = {}
+    for label in np.flatnonzero(table.sum(axis=0)):
+        rows = table[(chosen == label) & (table.sum(axis=1) > 0)]
+        overlaps[int(label)] = float(2 * rows[:, label].sum() / (rows.sum() + table[:, label].sum()))
+    return overlaps
+
+
+def _table(labels: Image, truth: Image) -> NDArray[np.int64]:
+    """Number of voxels of each class (rows) and true label (columns)."""
+    if labels.shape != truth.shape:
+        raise InputError(f"dice: expected images of one shape, got {labels.shape} and {truth.shape}")
+    for name, image in (("labels", labels), ("truth", truth)):
+        check_labels(name, image)
+    found, true = labels.data.astype(np.int64).ravel(), truth.data.astype(np.int64).ravel()
+    shape = (int(found.max()) + 1, int(true.max()) + 1)
+    return np.bincount(found * shape[1] + true, minlength=shape[0] * shape[1]).reshape(shape)

@@ -1,0 +1,388 @@
+"""From intensities to Young's moduli.
+
+Eq. (2) wants the *mean of the modulus field* over each cell. A law from intensity to modulus is therefore applied to
+the voxels first and the mean taken afterwards (`young_image`, `cell_young`); the law of the mean intensity is another
+number wherever the law is curved and the cell is not uniform.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import csv
+import tomllib
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tetopt.energy.sampling import cell_of_voxel, nearest_values, ranges_of
+from tetopt.errors import InputError
+from tetopt.image import Image
+from tetopt.mesh import Mesh
+from tetopt.model.formula import parse_formula
+
+Law = Callable[[NDArray[np.float64]], ArrayLike] | Sequence[Sequence[float]] | NDArray[np.floating] | None
+
+
+class ByLabel(NamedTuple):
+    """A value for each label instead of a law of the intensity."""
+
+    values: dict[int, float]
+    rest: float | None = None  # of all labels that are not named
+
+
+def law_values(law: Law, intensities: ArrayLike) -> NDArray[np.float64]:
+    """What a law makes of each intensity, float64 of the same shape.
+
+    Parameters
+    ----------
+    law : callable, (K, 2) table or None
+        A function of a float64 array; or pairs (intensity, value), the intensities strictly increasing, between
+        which the value is linear and beyond which it keeps the last pair's; or None: the intensity itself.
+    intensities : array of real numbers
+
+    Raises
+    ------
+    InputError
+        A table that is not of that kind, or a function that returns another shape.
+    """
+    intensities = np.asarray(intensities, dtype=np.float64)
+    if law is None:
+        return intensities.copy()
+    if not callable(law):
+        table = _checked_table(law)
+        return np.interp(intensities, table[:, 0], table[:, 1])
+    values = np.asarray(law(intensities), dtype=np.float64)
+    if values.shape != intensities.shape:
+        raise InputError(
+            f"law: expected a function that returns one value for each intensity, got shape {values.shape} "
+            f"for shape {intensities.shape}"
+        )
+    return values
+
+
+def young_from(law: Law, intensities: ArrayLike) -> NDArray[np.float64]:
+    """Young's modulus of each intensity, float64 of the same shape, kPa: `law_values`, none of them negative.
+
+    Raises
+    ------
+    InputError
+        As `law_values`, or a modulus that is negative or not finite. A modulus of 0 is let through, as empty space
+        inside a cell; a cell of nothing else is refused when the stiffness matrix is built.
+
+    Examples
+    --------
+    >>> young_from([(0, 1.0), (100, 5.0)], [-10, 50, 100, 300])
+    array([1., 3., 5., 5.])
+    """
+    intensities = np.asarray(intensities, dtype=np.float64)
+    young = law_values(law, intensities)
+    is_bad = ~(np.isfinite(young) & (young >= 0.0))
+    if is_bad.any():
+        at, first_of = np.unique(intensities[is_bad], return_index=True)
+        pairs = zip(young[is_bad][first_of[:3]], at[:3], strict=True)
+        first = ", ".join(f"{modulus:g} at intensity {intensity:g}" for modulus, intensity in pairs)
+        raise InputError(
+            f"modulus: expected 0 kPa or more, got {int(is_bad.sum())} others, such as {first}; "
+            "give a law (--young) that is positive over the image's range"
+        )
+    return young
+
+
+def parse_table(text: str) -> list[tuple[float, float]]:
+    """Pairs of intensity and modulus as written on a command line, for `young_from`.
+
+    Raises
+    ------
+    InputError
+        The text is something else.
+
+    Examples
+    --------
+    >>> parse_table("0:1, 100:5.5")
+    [(0.0, 1.0), (100.0, 5.5)]
+    """
+    try:
+        pairs = [tuple(float(number) for number in pair.split(":")) for pair in text.split(",")]
+    except ValueError:
+        pairs = []
+    if not pairs or any(len(pair) != 2 for pair in pairs):
+        raise InputError(f'law: expected pairs intensity:value, such as "0:1,100:5.5", got "{text}"')
+    return [(pair[0], pair[1]) for pair in pairs]
+
+
+def parse_labels(text: str) -> ByLabel:
+    """Values by label as written on a command line, `*` for all others.
+
+    Raises
+    ------
+    InputError
+        The text is something else, or names a label twice.
+
+    Examples
+    --------
+    >>> parse_labels("1=2.1, 2=1.9, *=0.5")
+    ByLabel(values={1: 2.1, 2: 1.9}, rest=0.5)
+    """
+    pairs = [pair.partition("=") for pair in text.split(",")]
+    try:
+        return _by_label([(label, float(value)) for label, _, value in pairs])
+    except ValueError as error:
+        if isinstance(error, InputError):
+            raise
+        raise InputError(f'values by label: expected pairs such as "1=2.1,2=1.9,*=0.5", got "{text}"') from None
+
+
+def _by_label(pairs: list[tuple[str, float]]) -> ByLabel:
+    """Values by label from pairs; ValueError for a label that is no whole number, InputError for one named twice."""
+    values: dict[int, float] = {}
+    rest: float | None = None
+    for label, value in pairs:
+        is_rest = label.strip() == "*"
+        if (rest is not None) if is_rest else (int(label) in values):
+            raise InputError(f"values by label: label {label.strip()} has two values; give each once")
+        if is_rest:
+            rest = value
+        else:
+            values[int(label)] = value
+    return ByLabel(values, rest)
+
+
+def parse_law(text: str) -> Law:
+    """A law of the intensity from a command line, see `parse_any_law`.
+
+    Raises
+    ------
+    InputError
+        As `parse_any_law`, and for values by label.
+    """
+    law = parse_any_law(text)
+    if isinstance(law, ByLabel):
+        raise InputError(f'law: expected one of the intensity, got values by label, "{text}"')
+    return parse_formula(text) if isinstance(law, float) else law
+
+
+def parse_any_law(text: str, quantity: str = "young") -> Law | ByLabel | float:
+    """A law from a command line.
+
+    Parameters
+    ----------
+    text : str
+        A number; a table of intensities, "0:1,100:5.5"; values by label, "1=2.1,2=1.9,*=0.5"; a formula of h
+        (`parse_formula`); or a file named .toml or .csv (`load_law`).
+    quantity : str
+        The file's column.
+
+    Raises
+    ------
+    InputError
+        As `parse_table`, `parse_labels`, `parse_formula` and `load_law`.
+    """
+    if text.lower().endswith((".toml", ".csv")):
+        return load_law(Path(text), quantity)
+    if "=" in text:
+        return parse_labels(text)
+    with contextlib.suppress(ValueError):
+        if np.isfinite(value := float(text)):
+            return value
+    return _checked_pairs(parse_table(text)) if ":" in text else parse_formula(text)
+
+
+def load_law(path: Path, quantity: str = "young") -> Law | ByLabel:
+    """A law from a file: two columns, or more, as lists in TOML or under names in the first row of CSV.
+
+    One column is "intensity", or "label" ("*" for all that are not named), and one the quantity, such as "young" (kPa)
+    or "nu".
+
+    Raises
+    ------
+    InputError
+        No such file, another format, columns that are missing, of different length or not of numbers, or
+        intensities that do not increase.
+    """
+    try:
+        columns = _columns(path)
+        keys = [name for name in ("intensity", "label") if name in columns]
+        if len(keys) != 1 or quantity not in columns:
+            raise InputError(
+                f'{path}: expected columns "{quantity}" and one of "intensity" and "label", found '
+                f"{', '.join(map(str, columns)) or 'none'}"
+            )
+        if len(columns[keys[0]]) != len(columns[quantity]):
+            counts = f"{len(columns[keys[0]])} of {keys[0]} and {len(columns[quantity])} of {quantity}"
+            raise InputError(f"{path}: {counts}; give one for each")
+        values = [float(value) for value in columns[quantity]]
+        if keys == ["label"]:
+            return _by_label([(str(label), value) for label, value in zip(columns["label"], values, strict=True)])
+        return _checked_pairs([(float(h), value) for h, value in zip(columns["intensity"], values, strict=True)])
+    except InputError as error:
+        raise error if str(error).startswith(str(path)) else InputError(f"{path}: {error}") from error
+    except (ValueError, TypeError, csv.Error, RecursionError) as error:
+        raise InputError(f"{path}: expected columns of numbers ({' '.join(str(error).split())})") from error
+
+
+def has_column(text: str, name: str) -> bool:
+    """Whether a law's text names a file that has such a column.
+
+    Raises
+    ------
+    InputError
+        As `load_law`, of files.
+    """
+    if not text.lower().endswith((".toml", ".csv")):
+        return False
+    try:
+        return name in _columns(Path(text))
+    except (ValueError, RecursionError):  # said when the file is read for what it must have
+        return False
+
+
+def _columns(path: Path) -> dict[str, list[Any]]:
+    if not path.is_file():
+        raise InputError(f"{path}: no such file; a law's text that ends in .toml or .csv names one")
+    return _toml_columns(path) if path.suffix.lower() == ".toml" else _csv_columns(path)
+
+
+def _toml_columns(path: Path) -> dict[str, list[Any]]:
+    columns = tomllib.loads(path.read_text(encoding="utf-8"))
+    if wrong := [name for name, column in columns.items() if not isinstance(column, list)]:
+        raise InputError(f'{path}: expected lists of numbers, "{wrong[0]}" is {type(columns[wrong[0]]).__name__}')
+    return columns
+
+
+def _csv_columns(path: Path) -> dict[str, list[Any]]:
+    rows = [row for row in csv.reader(path.read_text(encoding="utf-8-sig").splitlines()) if row]
+    if not rows or any(len(row) != len(rows[0]) for row in rows):
+        raise InputError(f"{path}: expected a row of names and then rows of as many numbers")
+    names = [name.strip().lower() for name in rows[0]]
+    if len(set(names)) != len(names):
+        raise InputError(f"{path}: expected each column once, found {', '.join(names)}")
+    return {name: [row[number] for row in rows[1:]] for number, name in enumerate(names)}
+
+
+def _checked_pairs(pairs: list[tuple[float, float]]) -> list[tuple[float, float]]:
+    _checked_table(pairs)
+    return pairs
+
+
+def young_image(image: Image, law: Law) -> Image:
+    """The modulus field: `young_from` of every voxel, kPa, at the image's place in the world.
+
+    It can be meshed in place of the image, so that the cells follow the moduli.
+
+    Raises
+    ------
+    InputError
+        As `young_from`.
+    """
+    return Image(young_from(law, image.data), image.affine)
+
+
+def cell_young(image: Image, mesh: Mesh, law: Law = None) -> NDArray[np.float64]:
+    """Modulus of each cell, (M,) float64, kPa: the mean of the modulus field over it, Eq. (2).
+
+    A cell without voxel centre gets the modulus at its centroid, see `tetopt.energy.sampling.cell_moments`.
+
+    Raises
+    ------
+    InputError
+        As `young_from` and `tetopt.energy.sampling.cell_of_voxel`.
+    """
+    return _cell_means(young_image(image, law), mesh)
+
+
+def cell_values(image: Image, mesh: Mesh, law: Law) -> NDArray[np.float64]:
+    """`cell_young` of any quantity, which may be negative, such as Poisson's ratio.
+
+    Raises
+    ------
+    InputError
+        As `law_values` and `tetopt.energy.sampling.cell_of_voxel`; values that are not finite.
+    """
+    values = law_values(law, image.data)
+    if not np.isfinite(values).all():
+        at = image.data[~np.isfinite(values)].ravel()[0]
+        raise InputError(f"law: it has no value at intensity {at:g}; give one defined over the image's whole range")
+    return _cell_means(Image(values, image.affine), mesh)
+
+
+def _cell_means(field: Image, mesh: Mesh) -> NDArray[np.float64]:
+    # Summed voxel by voxel. `cell_moments` takes differences of sums over rows, whose rounding would drown the soft
+    # cells of a field that spans ten orders of magnitude.
+    owner = cell_of_voxel(field, mesh).ravel()
+    inside = owner >= 0
+    n_voxels = np.bincount(owner[inside], minlength=len(mesh.cells))
+    total = np.bincount(owner[inside], weights=field.data.ravel()[inside], minlength=len(mesh.cells))
+    is_empty = n_voxels == 0
+    means = total / np.maximum(n_voxels, 1)
+    # So that a cell of equal values has exactly that value: constants stay one material.
+    low, high = ranges_of(owner, field.data.ravel(), len(mesh.cells))
+    means = np.clip(means, low, high, where=~is_empty, out=means)
+    means[is_empty] = nearest_values(field, mesh.points[mesh.cells[is_empty]].mean(axis=1))
+    return means
+
+
+def checked_young(young: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The moduli of cells, (M,); InputError unless all are above 0."""
+    bad = np.flatnonzero(~(np.isfinite(young) & (young > 0.0)))
+    if len(bad):
+        first = ", ".join(f"{young[j]:g} in cell {j}" for j in bad[:3])
+        raise InputError(
+            f"young: expected moduli above 0 kPa, got {len(bad)} others, the first {first}; "
+            'give empty space a small modulus too, as --young "0:0.1,255:6" does'
+        )
+    return young
+
+
+def inverse_strain(strain: ArrayLike, floor: float) -> NDArray[np.float64]:
+    """1 / strain, an approximation of the elastic modulus from a strain map (Section 3), float64.
+
+    It is the modulus in units of the stress, if that were the same everywhere: in kPa under a stress of 1 kPa.
+
+    Parameters
+    ----------
+    strain : array of real numbers
+        Compression and extension alike: the absolute value counts.
+    floor : float
+        Strains smaller than this, noise among them, count as this one, so the modulus is at most 1 / floor.
+
+    Raises
+    ------
+    InputError
+        A strain that is not finite, or a floor that is not above 0.
+
+    Examples
+    --------
+    >>> inverse_strain([0.02, -0.01, 0.0], floor=0.001)
+    array([  50.,  100., 1000.])
+    """
+    strain = np.asarray(strain, dtype=np.float64)
+    if not (np.isfinite(floor) and floor > 0.0):
+        raise InputError(f"floor: expected a strain above 0, such as 0.001, got {floor}")
+    if not np.isfinite(strain).all():
+        raise InputError(
+            f"strain: {int((~np.isfinite(strain)).sum())} values are NaN or infinite; replace them, 0 stands for stiff"
+        )
+    return 1.0 / np.maximum(np.abs(strain), floor)
+
+
+def _checked_table(law: ArrayLike) -> NDArray[np.float64]:
+    """The (K, 2) table as float64; InputError unless finite and increasing."""
+    try:
+        table = np.asarray(law, dtype=np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"law: expected pairs (intensity, kPa), got {law!r}") from error
+    if table.ndim != 2 or table.shape[1] != 2 or len(table) == 0:
+        raise InputError(f"law: expected pairs (intensity, kPa), got an array of shape {table.shape}")
+    if not np.isfinite(table).all():
+        raise InputError(f"law: every intensity and modulus must be finite, got {table.tolist()}")
+    falls = np.flatnonzero(np.diff(table[:, 0]) <= 0.0)
+    if len(falls):
+        k = int(falls[0])
+        raise InputError(
+            f"law: intensities must increase, got {table[k, 0]:g} and then {table[k + 1, 0]:g}; "
+            "sort the pairs and give each intensity once"
+        )
+    return table

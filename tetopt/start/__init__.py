@@ -1,0 +1,1 @@
+"""The first mesh: lattices, octree, sizes, clipping at a mask, Delaunay."""

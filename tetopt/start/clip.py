@@ -1,0 +1,194 @@
+"""A mesh of an image's box cut off at the surface of a mask's region.
+
+Nodes near the surface are put on it, then the edges that still cross it are split there, so that every cell lies on
+one side (after the isosurface stuffing of Labelle and Shewchuk 2007, for any mesh).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.errors import InputError
+from tetopt.geometry.simplex import squared_edges, volumes
+from tetopt.image import Image
+from tetopt.mesh import Mesh
+from tetopt.start.lattice import lattice
+from tetopt.target.domain import NEAR, Domain, levels
+
+SNAP = 0.3  # of an edge: a node as near to the surface along it is put on the surface
+TOUCH = 0.15  # of an edge: a node as near to the surface that cannot be put there counts as on it
+SHRINK = 0.2  # of the regular cell's volume for its edges: a cell has to keep as much when nodes are put there
+AGAIN = 4  # lattices tried for a number of nodes
+STEPS = 8  # towards the surface
+
+
+def clipped(mesh: Mesh, image: Image, region: Domain) -> Mesh:
+    """The part of a mesh of the image's box that lies within the region, nodes on its surface, all cells whole.
+
+    Raises
+    ------
+    InputError
+        No cell is left: the region is thinner than the cells.
+    """
+    index = image.to_index(mesh.points)
+    level = levels(region.level, index)
+    level[np.abs(level) < NEAR] = 0.0
+    index, level = _snapped(index, level, mesh.cells, image, region)
+    index, level, cells = _cut(index, level, mesh.cells, region)
+    side = np.sign(level)[cells].sum(axis=1)
+    is_flat = (level[cells] == 0.0).all(axis=1)
+    side[is_flat] = levels(region.level, index[cells[is_flat]].mean(axis=1))
+    kept = cells[side < 0.0]
+    if len(kept) == 0:
+        raise InputError("mask: it is thinner than the cells, none is left inside; ask for more nodes")
+    used, compact = np.unique(kept, return_inverse=True)
+    return Mesh(image.to_world(index[used]), compact.reshape(kept.shape))
+
+
+def lattice_within(
+    image: Image, region: Domain | None, kind: str | None = None, *, nodes: int | None = None,
+    spacing: float | None = None,
+) -> Mesh:  # fmt: skip
+    """`tetopt.lattice` of the image's box, cut off at the region's surface, with about `nodes` nodes in it.
+
+    Raises
+    ------
+    InputError
+        As `tetopt.lattice` and `clipped`.
+    """
+    if region is None or nodes is None:
+        mesh = lattice(image, kind, nodes=nodes, spacing=spacing)
+        return mesh if region is None else clipped(mesh, image, region)
+    asked, best = nodes * region.inside.size / region.inside.sum(), None
+    for _ in range(AGAIN):
+        mesh = clipped(lattice(image, kind, nodes=int(asked)), image, region)
+        if best is None or abs(len(mesh.points) - nodes) < abs(len(best.points) - nodes):
+            best = mesh
+        asked *= nodes / len(mesh.points)
+    assert best is not None
+    return best
+
+
+def _edges(cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The cells' edges, (M, E, 2), each with the lower node first."""
+    pairs = np.array([(i, j) for i in range(cells.shape[1]) for j in range(i)])
+    return np.sort(cells[:, pairs], axis=2)
+
+
+def _snapped(
+    index: NDArray[np.float64], level: NDArray[np.float64], cells: NDArray[np.int64], image: Image, region: Domain
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Nodes that are near to the surface along an edge put on it, unless that flattens a cell."""
+    edge = _edges(cells).reshape(-1, 2)
+    a, b = level[edge].T
+    crosses = a * b < 0.0
+    edge, part = edge[crosses], a[crosses] / (a[crosses] - b[crosses])
+    wishes = np.zeros(len(level), dtype=bool)
+    wishes[edge[part < SNAP, 0]] = True
+    wishes[edge[part > 1.0 - SNAP, 1]] = True
+    chosen = np.flatnonzero(wishes)
+    there, is_there = onto_surface(index[chosen], image, region)
+    # Where a node cannot get there on a short way, its edges are split instead.
+    length = np.full(len(level), np.inf)
+    np.minimum.at(length, edge.ravel(), np.repeat(np.linalg.norm(np.diff(index[edge], axis=1)[:, 0], axis=1), 2))
+    way = np.zeros(len(level))
+    way[chosen] = np.linalg.norm(there - index[chosen], axis=1) / length[chosen]
+    is_there &= way[chosen] < 2.0 * SNAP
+    moved = index.copy()
+    moved[chosen[is_there]] = there[is_there]
+    way[chosen[~is_there]] = 0.0
+    while True:
+        flat = cells[_fullness(image.to_world(moved), cells) < SHRINK]
+        furthest = flat[np.arange(len(flat)), way[flat].argmax(axis=1)]
+        back = np.unique(furthest[way[furthest] > 0.0])
+        if len(back) == 0:
+            break
+        moved[back], way[back] = index[back], 0.0
+    level = np.where(way > 0.0, 0.0, level)
+    # What is left very near to a crossing counts as on the surface; it gets there as soon as it moves.
+    edge = edge[level[edge].prod(axis=1) < 0.0]
+    a, b = np.abs(level[edge].T)
+    level[edge[a < TOUCH * (a + b), 0]] = 0.0
+    level[edge[b < TOUCH * (a + b), 1]] = 0.0
+    return moved, level
+
+
+def _fullness(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Volume over that of the regular cell with the same sum of squared edges, (M,): 1 to 0, below 0 if inverted."""
+    n = points.shape[1]
+    regular = 2.0**0.5 / 12.0 / 6.0**1.5 if n == 3 else 3.0**0.5 / 4.0 / 3.0
+    return volumes(points, cells) / (regular * squared_edges(points, cells).sum(axis=1) ** (0.5 * n))
+
+
+def onto_surface(
+    index: NDArray[np.float64], image: Image, region: Domain
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Points (K, n) moved to the surface, nearly the shortest way in mm, and whether they got there, (K,).
+
+    Those on the box's faces stay on them.
+    """
+    low, high = -0.5, np.array(image.shape) - 0.5
+    is_free = ~((index == low) | (index == high))
+    metric = np.linalg.inv(image.affine[:-1, :-1].T @ image.affine[:-1, :-1])
+    metric = metric / np.trace(metric)
+    at = index.copy()
+    for _ in range(STEPS):
+        value = levels(region.level, at)
+        slope = np.stack([_slope(region.level, at, axis) for axis in range(at.shape[1])], axis=1) * is_free
+        way = (slope @ metric) * is_free
+        rate = (way * slope).sum(axis=1)
+        step = np.divide(value, rate, out=np.zeros_like(value), where=rate > 1e-12)
+        at = np.clip(at - step[:, None] * way, low, high)
+    return at, np.abs(levels(region.level, at)) < NEAR
+
+
+def _slope(level: NDArray, index: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
+    """Derivative of the level function along an axis."""
+    ahead, behind = index.copy(), index.copy()
+    ahead[:, axis] += 0.25
+    behind[:, axis] -= 0.25
+    return 2.0 * (levels(level, ahead) - levels(level, behind))
+
+
+def _cut(
+    index: NDArray[np.float64], level: NDArray[np.float64], cells: NDArray[np.int64], region: Domain
+) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
+    """Every edge that crosses the surface split there.
+
+    In each round every cell is split at the first of its crossing edges, in an order that is the same for all cells,
+    so that two of them always cut the facet between them alike.
+    """
+    edge = _edges(cells).reshape(-1, 2)
+    edge = np.unique(edge[level[edge].prod(axis=1) < 0.0], axis=0)
+    if len(edge) == 0:
+        return index, level, cells
+    n_nodes = len(index)
+    index = np.vstack([index, _crossings(index[edge[:, 0]], index[edge[:, 1]], region)])
+    level = np.append(level, np.zeros(len(edge)))
+    code = edge[:, 0] * n_nodes + edge[:, 1]
+    while True:
+        of_cell = _edges(cells)
+        crosses = level[of_cell].prod(axis=2) < 0.0
+        is_cut = crosses.any(axis=1)
+        if not is_cut.any():
+            return index, level, cells
+        cut, of_cell = cells[is_cut], of_cell[is_cut]
+        codes = np.where(crosses[is_cut], of_cell[..., 0] * n_nodes + of_cell[..., 1], n_nodes * n_nodes)
+        first = codes.min(axis=1)
+        node = n_nodes + np.searchsorted(code, first)
+        one, other = cut.copy(), cut.copy()
+        one[cut == (first // n_nodes)[:, None]] = node
+        other[cut == (first % n_nodes)[:, None]] = node
+        cells = np.concatenate([cells[~is_cut], one, other])
+
+
+def _crossings(a: NDArray[np.float64], b: NDArray[np.float64], region: Domain) -> NDArray[np.float64]:
+    """Where the surface crosses the edges from a to b, (K, n), by bisection."""
+    low, high = np.zeros(len(a)), np.ones(len(a))
+    sign = np.sign(levels(region.level, a))
+    for _ in range(20):
+        middle = 0.5 * (low + high)
+        is_before = np.sign(levels(region.level, a + middle[:, None] * (b - a))) == sign
+        low, high = np.where(is_before, middle, low), np.where(is_before, high, middle)
+    return a + (0.5 * (low + high))[:, None] * (b - a)

@@ -1,0 +1,220 @@
+"""A pipeline in a process of its own: its memory is its own, and when it crashes or runs wild, only it ends.
+
+The child is ``python -m tetopt.study.child FOLDER``; job and result are files in a temporary folder. Its memory,
+with that of the processes it starts, is watched from the parent as resident pages (VmRSS in /proc), not limited by
+RLIMIT_AS: numba, VTK and the allocators
+reserve far more address space than they ever touch, so a limit on that would end runs that need little.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import json
+import os
+import resource
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+import traceback
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tetopt.errors import InputError
+from tetopt.image import Image
+from tetopt.mesh import Mesh
+from tetopt.study.pipelines import PIPELINES, Job, Produced
+
+POLL_SECONDS = 0.05
+MAXRSS_UNIT = 1 if sys.platform == "darwin" else 1024  # bytes in a unit of ru_maxrss
+
+
+class Outcome(NamedTuple):
+    """What became of a run."""
+
+    mesh: Mesh | None  # None after a failure
+    seconds: dict[str, float]  # by step, in their order; empty after a failure
+    peak_bytes: int  # largest resident memory of the child, interpreter and libraries included
+    notes: list[str]
+    failure: str | None  # one line, None if all went well
+
+
+def run_in_child(pipeline: str, job: Job, *, max_seconds: float, max_bytes: int | None = None) -> Outcome:
+    """Run a pipeline in a child process, within limits; the mesh has the same bits as in this process.
+
+    Parameters
+    ----------
+    pipeline : str
+        A name of `tetopt.study.pipelines.PIPELINES`, or "module:function" for any other importable one.
+    job : Job
+    max_seconds : float
+        Wall time, the child's start included, after which its process group is killed.
+    max_bytes : int, optional
+        Resident memory at which it is killed. It is looked at twenty times a second (Linux only: elsewhere there is
+        no limit), so a fast run may pass it by a little.
+
+    Returns
+    -------
+    Outcome
+        A crash, the time or memory limit, an exception and a missing package are a `failure`, not an exception.
+
+    Raises
+    ------
+    InputError
+        An unknown pipeline, or a limit that is not above 0.
+    """
+    if pipeline not in PIPELINES and ":" not in pipeline:
+        raise InputError(f"pipeline: expected one of {', '.join(PIPELINES)} or module:function, got {pipeline!r}")
+    if not max_seconds > 0.0 or (max_bytes is not None and max_bytes <= 0):
+        raise InputError(f"limits: expected more than 0 seconds and bytes, got {max_seconds} s and {max_bytes} bytes")
+    with tempfile.TemporaryDirectory(prefix="tetopt-") as name:
+        folder = Path(name)
+        _write_job(folder, pipeline, job)
+        with open(folder / "stderr.txt", "wb") as errors:
+            child = subprocess.Popen(
+                [sys.executable, "-m", "tetopt.study.child", str(folder)],
+                stdin=subprocess.DEVNULL,
+                stdout=subprocess.DEVNULL,
+                stderr=errors,
+                env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},  # same modules as here
+                start_new_session=True,  # a group of its own, killed as a whole
+            )
+        try:
+            peak, failure = _watched(child, max_seconds, max_bytes)
+        finally:  # also on Ctrl-C, which the child's own group does not get
+            _kill_group(child)
+        return _outcome(folder, child.returncode, peak, failure)
+
+
+def _watched(child: subprocess.Popen, max_seconds: float, max_bytes: int | None) -> tuple[int, str | None]:
+    """Wait for the child; the largest resident memory seen, bytes, and the limit that it passed, if any."""
+    deadline = time.monotonic() + max_seconds
+    peak = 0
+    while True:
+        left = deadline - time.monotonic()
+        try:
+            child.wait(max(min(POLL_SECONDS, left), 0.0))
+        except subprocess.TimeoutExpired:
+            peak = max(peak, _group_bytes(child.pid))
+        else:
+            return peak, None
+        if max_bytes is not None and peak > max_bytes:
+            return peak, f"too much memory: {peak / 1e6:.0f} MB resident, {max_bytes / 1e6:.0f} MB allowed"
+        if left <= 0.0:
+            return peak, f"out of time: killed after {max_seconds:g} s"
+
+
+def _group_bytes(group: int) -> int:
+    """Resident memory of all processes of a group; 0 where the system has no /proc."""
+    total = 0
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            # After the name in brackets, which may hold anything: state, parent, group.
+            if int((folder / "stat").read_text().rpartition(")")[2].split()[2]) == group:
+                total += _status_bytes(folder, "VmRSS")
+        except OSError:
+            continue  # it ended while we looked
+    return total
+
+
+def _status_bytes(folder: Path, name: str) -> int:
+    """An entry of a process's status in bytes, e.g. VmRSS; 0 if it has ended."""
+    lines = (folder / "status").read_text().splitlines()
+    return next((int(line.split()[1]) * 1024 for line in lines if line.startswith(f"{name}:")), 0)
+
+
+def _own_peak_bytes() -> int:
+    """Largest resident memory of this process or of one it has waited for.
+
+    On Linux VmHWM, not ru_maxrss: the latter begins at the resident memory of the parent that started the process.
+    """
+    waited = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * MAXRSS_UNIT
+    own = Path("/proc/self")
+    if own.exists():
+        return max(waited, _status_bytes(own, "VmHWM"))
+    return max(waited, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * MAXRSS_UNIT)
+
+
+def _kill_group(child: subprocess.Popen) -> None:
+    """End whatever is left of the child's process group, and collect the child."""
+    with contextlib.suppress(ProcessLookupError):  # raised where it ended by itself and left nothing behind
+        os.killpg(child.pid, signal.SIGKILL)
+    child.wait()
+
+
+def _outcome(folder: Path, code: int, peak: int, failure: str | None) -> Outcome:
+    if failure is None and code == 0:
+        report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
+        with np.load(folder / "mesh.npz") as arrays:
+            mesh = Mesh(arrays["points"], arrays["cells"])
+        return Outcome(mesh, report["seconds"], max(peak, report["peak_bytes"]), report["notes"], None)
+    return Outcome(None, {}, peak, [], failure or _failure(code, folder / "stderr.txt"))
+
+
+def _failure(code: int, errors: Path) -> str:
+    """One line on a child that ended by itself, without a result."""
+    if code < 0:
+        try:
+            name = signal.Signals(-code).name
+        except ValueError:
+            name = f"signal {-code}"
+        return f"crashed: {name}"
+    lines = errors.read_text(encoding="utf-8", errors="replace").strip().splitlines()
+    return lines[-1] if lines else f"ended with exit code {code} and no message"
+
+
+def _write_job(folder: Path, pipeline: str, job: Job) -> None:
+    arrays: dict[str, Any] = {"image": job.image.data, "image_affine": job.image.affine}
+    if job.labels is not None:
+        arrays |= {"labels": job.labels.data, "labels_affine": job.labels.affine}
+    np.savez(folder / "job.npz", **arrays)
+    options = {name: getattr(job, name) for name in ("nodes", "classes", "k_D", "iterations")}
+    (folder / "job.json").write_text(json.dumps({"pipeline": pipeline, "options": options}), encoding="utf-8")
+
+
+def _read_job(folder: Path) -> tuple[str, Job]:
+    with np.load(folder / "job.npz") as arrays:
+        image = Image(arrays["image"], arrays["image_affine"])
+        labels = Image(arrays["labels"], arrays["labels_affine"]) if "labels" in arrays else None
+    asked = json.loads((folder / "job.json").read_text(encoding="utf-8"))
+    return asked["pipeline"], Job(image, labels, **asked["options"])
+
+
+def _pipeline(name: str) -> Callable[[Job], Produced]:
+    if name in PIPELINES:
+        return PIPELINES[name]
+    module, function = name.split(":", 1)
+    return getattr(importlib.import_module(module), function)
+
+
+def _write_result(folder: Path, produced: Produced) -> None:
+    np.savez(folder / "mesh.npz", points=produced.mesh.points, cells=produced.mesh.cells)
+    report = {"seconds": produced.seconds, "notes": produced.notes, "peak_bytes": _own_peak_bytes()}
+    (folder / "report.json").write_text(json.dumps(report), encoding="utf-8")
+
+
+def main(folder: Path) -> int:
+    """Run the job in the folder; exit code 0 with a result there, 2 for bad input, 1 for any other exception.
+
+    The last line on stderr says what went wrong.
+    """
+    try:
+        name, job = _read_job(folder)
+        _write_result(folder, _pipeline(name)(job))
+    except InputError as error:
+        print(" ".join(str(error).split()), file=sys.stderr)
+        return 2
+    except Exception as error:
+        traceback.print_exc()
+        print(f"{type(error).__name__}: {' '.join(str(error).split())}", file=sys.stderr)
+        return 1
+    return 0
+
+
+if __name__ == "__main__":
+    sys.exit(main(Path(sys.argv[1])))

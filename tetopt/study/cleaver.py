@@ -1,0 +1,178 @@
+"""Cleaver's lattice stuffing (Bronson, Levine, Whitaker 2014) through itk-cleaver, on the same labels.
+
+Cleaver meshes a cube of 2^k voxels. The labels are put into the smallest such cube, isotropic, continued by their
+border values, so that the box's faces are no interfaces and cost no nodes. Cells with their centroid outside the box
+are removed, and the boundary that this leaves is put on the box's faces as fTetWild's is (`tetwild.put_on_box`).
+
+Each run is a process of its own, because Cleaver ends it on inputs it does not like ("Degenerate Tet found"), and
+itk-cleaver 1.3.1 ends it on import with every ITK 5.4 tried (5.4.0, 5.4.2, 5.4.7); with ITK 5.3.0, which needs
+numpy < 2, it works.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import time
+from importlib.util import find_spec
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.errors import InputError
+from tetopt.geometry.simplex import oriented
+from tetopt.image import Image
+from tetopt.mesh import Mesh
+from tetopt.study.tetwild import Filled, next_factor, node_spacing, put_on_box
+
+TOLERANCE = 0.05  # of the wanted number of nodes
+MAX_RUNS = 8
+VOXELS_PER_SPACING = 3.0  # of the cube that Cleaver gets, at least, unless the image itself is coarser
+MAX_VOXELS = 256  # along an edge of the cube
+LIPSCHITZ = 0.5  # how fast its cells may grow away from the interfaces
+HINT = "install it with: python -m pip install itk-cleaver 'itk==5.3.0' 'numpy<2'"
+
+
+class Cube(NamedTuple):
+    """Labels in Cleaver's cube, and its place in the box frame."""
+
+    labels: NDArray[np.int16]  # (n, n, n), from 0
+    voxel: float  # edge length of its voxels, mm
+    origin: NDArray[np.float64]  # (3,) mm, its corner
+
+
+class _RunError(RuntimeError):
+    """Cleaver's process ended without a mesh; the text says how."""
+
+
+def stuffed(image: Image, labels: Image, nodes: int) -> Filled:
+    """Cleaver's tetrahedra in the image's box, with about `nodes` nodes.
+
+    Its feature scaling is searched until the number of nodes is within 5 % of the wanted one; at most 8 runs, of
+    which the nearest that can be put on the box is taken.
+
+    Parameters
+    ----------
+    image : Image
+        3-D; its box is to be filled.
+    labels : Image
+        Whole numbers, on the image's voxels.
+    nodes : int
+        Wanted number of nodes, 8 or more.
+
+    Returns
+    -------
+    Filled
+        Mesh in the world, positively oriented. Notes tell of cells removed outside the box, of runs that crashed, of
+        a number of nodes that could not be met, and of a box that could not be filled exactly.
+
+    Raises
+    ------
+    InputError
+        itk-cleaver is missing or cannot be loaded, labels that do not fit the image or hold one value only, fewer
+        than 8 nodes, or no run that gave a mesh.
+    """
+    _check(image, labels, nodes)
+    cube = labels_in_cube(image, labels, node_spacing(image, nodes) / VOXELS_PER_SPACING)
+    low, high = -0.5 * image.spacing, (np.array(image.shape) - 0.5) * image.spacing
+    runs: list[tuple[float, NDArray[np.float64], NDArray[np.int64], int, float]] = []
+    begin_search = time.perf_counter()
+    notes: list[str] = []
+    factor = 2.0
+    for _ in range(MAX_RUNS):
+        begin = time.perf_counter()
+        try:
+            points, cells = _run(cube, factor)
+        except _RunError as error:
+            notes.append(f"Cleaver, feature scaling {factor:.3g}: {error}")
+            factor *= 0.83  # its crashes come with coarse meshes; another try beside
+            continue
+        runs.append((factor, *_inside(points, cells, low, high), time.perf_counter() - begin))
+        if abs(len(runs[-1][1]) / nodes - 1.0) <= TOLERANCE:
+            break
+        factor = next_factor([(run[0], len(run[1])) for run in runs], nodes)
+    if not runs:
+        raise InputError(f"itk-cleaver: no run gave a mesh ({notes[-1]}); ask for more nodes or {HINT}")
+    runs.sort(key=lambda run: abs(np.log(len(run[1]) / nodes)))
+    _, points, cells, n_removed, seconds = runs[0]
+    search = time.perf_counter() - begin_search - seconds
+    try:
+        points, cells = put_on_box(points, cells, low, high)
+    except InputError as error:
+        notes.append(f"its boundary is not on the box's faces: {error}")
+    if n_removed:
+        notes.append(f"{n_removed} cells outside the box removed")
+    if abs(len(points) / nodes - 1.0) > TOLERANCE:
+        notes.append(f"{len(points)} nodes after {len(runs)} runs of Cleaver, {nodes} were asked for")
+    world = image.to_world(points / image.spacing)
+    return Filled(Mesh(world, oriented(world, cells)), len(runs), search, notes)
+
+
+def _check(image: Image, labels: Image, nodes: int) -> None:
+    if find_spec("itk") is None or find_spec("itk.CleaverPython") is None:
+        raise InputError(f"itk-cleaver: not installed; {HINT}")
+    if image.ndim != 3 or labels.shape != image.shape:
+        raise InputError(f"labels: expected 3 axes and the image's shape {image.shape}, got {labels.shape}")
+    if not np.array_equal(np.rint(labels.data), labels.data):
+        raise InputError("labels: expected whole numbers, got fractions; is this the label volume?")
+    if labels.data.min() == labels.data.max():
+        raise InputError("labels: expected two or more, got one; there is no interface to mesh")
+    if nodes < 8:
+        raise InputError(f"nodes: a box needs 8 or more, got {nodes}")
+    probe = _python("from itk import CleaverImageToMeshFilter")
+    if probe.returncode != 0:
+        raise InputError(f"itk-cleaver: its import ends Python ({_ending(probe)}); {HINT}")
+
+
+def labels_in_cube(image: Image, labels: Image, voxel: float) -> Cube:
+    """Labels sampled (nearest voxel) on a cube of 2^k isotropic voxels around the box, of about `voxel` mm or less."""
+    lengths = image.spacing * image.shape
+    wanted = lengths.max() / max(voxel, image.spacing.min())
+    n = int(min(2 ** np.ceil(np.log2(max(wanted, 16.0))), MAX_VOXELS))
+    edge = float(lengths.max() / n)
+    origin = -0.5 * image.spacing + 0.5 * (lengths - lengths.max())
+    index = [
+        np.clip(np.rint((origin[axis] + (np.arange(n) + 0.5) * edge) / image.spacing[axis]), 0, image.shape[axis] - 1)
+        for axis in range(3)
+    ]
+    numbered = np.unique(labels.data, return_inverse=True)[1].reshape(labels.shape).astype(np.int16)
+    return Cube(numbered[np.ix_(*[i.astype(int) for i in index])], edge, origin)
+
+
+def _inside(
+    points: NDArray[np.float64], cells: NDArray[np.int64], low: NDArray[np.float64], high: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64], int]:
+    """The cells with their centroid in the box, their nodes, and how many were removed."""
+    centroids = points[cells].mean(axis=1)
+    is_inside = ((centroids > low) & (centroids < high)).all(axis=1)
+    used, compact = np.unique(cells[is_inside], return_inverse=True)
+    return points[used], compact.reshape(-1, 4), int((~is_inside).sum())
+
+
+def _run(cube: Cube, feature_scaling: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """One run of Cleaver in a process of its own; points in the box frame, and cells."""
+    with tempfile.TemporaryDirectory(prefix="tetopt-") as name:
+        folder = Path(name)
+        np.savez(folder / "job.npz", labels=cube.labels, feature_scaling=feature_scaling, lipschitz=LIPSCHITZ)
+        # The script itself, not the package: ITK 5.3 and tetopt need not share their numpy's habits.
+        done = _python(Path(__file__).with_name("cleaver_run.py").read_text(encoding="utf-8"), str(folder))
+        if not (folder / "mesh.npz").is_file():
+            raise _RunError(_ending(done))
+        with np.load(folder / "mesh.npz") as arrays:
+            points, cells = arrays["points"].astype(np.float64), arrays["cells"].astype(np.int64)
+    points = cube.origin + points * cube.voxel
+    cells = oriented(points, cells)
+    return points, cells
+
+
+def _python(program: str, *arguments: str) -> subprocess.CompletedProcess[Any]:
+    return subprocess.run([sys.executable, "-c", program, *arguments], capture_output=True, text=True, check=False)
+
+
+def _ending(done: subprocess.CompletedProcess[Any]) -> str:
+    """How a process ended, in a few words: its last line, or its signal."""
+    lines = (done.stderr.strip() or done.stdout.strip()).splitlines()
+    return f"signal {-done.returncode}" if done.returncode < 0 else lines[-1] if lines else "no message"

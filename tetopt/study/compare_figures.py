@@ -1,0 +1,363 @@
+"""Pictures of a comparison of pipelines: slices through every mesh, histograms, curves, times, cutaways."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.collections import PolyCollection
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogFormatterSciNotation, LogLocator, NullFormatter
+from numpy.typing import NDArray
+
+from tetopt.energy.discretization import cell_E_D
+from tetopt.errors import InputError
+from tetopt.geometry.simplex import volumes
+from tetopt.image import Image
+from tetopt.mesh import Mesh
+from tetopt.report.figures import MESH_LINE, _View
+from tetopt.report.viewer import grey_limits, view_of
+from tetopt.study.pipelines import UNTIMED
+
+# Okabe and Ito's palette, told apart by the colour-blind, without its yellow, which vanishes on white.
+PALETTE = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000")
+MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (8, 2)), (0, (1, 2)))
+HATCHES = ("", "//", "..", "xx", "\\\\", "oo", "--")
+ERRORS = (
+    ("strain_energy", "strain energy"),
+    ("displacement", "displacement"),
+    ("interface_strain", "strain at interfaces"),
+)
+UNCOVERED = "#cfe3f5"  # where a mesh leaves the image uncovered
+
+
+def slices_figure(image: Image, meshes: Sequence[tuple[str, Mesh]], means: Sequence[NDArray[np.float64]]) -> Figure:
+    """The image's middle axial slice and, beside it, each mesh in that slice: its edges, its means, its E_D.
+
+    Parameters
+    ----------
+    image : Image
+    meshes : sequence of (title, Mesh)
+        One column each.
+    means : sequence of (M,) float64
+        What each mesh's cells are filled with, in the image's own grey range.
+
+    Returns
+    -------
+    Figure
+        Three rows: edges over the image; cells filled with their means; E_D per mm^3 of each cell (the variance of
+        the image inside it) on one scale for all, so that a dark map is a good fit whatever the cells' sizes. Where a
+        mesh leaves the image uncovered, the lower rows are light blue.
+
+    Raises
+    ------
+    InputError
+        No meshes, or another number of means than of meshes.
+    """
+    if not meshes or len(meshes) != len(means):
+        raise InputError(f"slices_figure: expected one array of means for each mesh, got {len(means)}, {len(meshes)}")
+    view = _View(image, None, None)
+    width = 3.3 if len(meshes) > 2 else 4.6
+    figure = Figure(figsize=(width * (len(meshes) + 1), 3.0 * width * view.aspect + 1.0), layout="constrained")
+    grid = figure.subplots(3, len(meshes) + 1, squeeze=False)
+    limits = grey_limits([np.asarray(view.pixels, dtype=np.float64).ravel()])
+    cuts = [view.section(mesh) for _, mesh in meshes]
+    losses = [cell_E_D(image, mesh) / volumes(mesh.points, mesh.cells) for _, mesh in meshes]
+    shown = np.concatenate([loss[cells] for loss, (_, cells) in zip(losses, cuts, strict=True)])
+    brightest = float(np.percentile(shown, 99.0)) if len(shown) else 0.0
+    for row in (0, 1):
+        view.show_pixels(grid[row, 0], np.array(limits))
+        view.frame(grid[row, 0])
+        grid[row, 0].set_title("image", fontsize=11)
+    for column, ((title, _), cut, mean, loss) in enumerate(zip(meshes, cuts, means, losses, strict=True), 1):
+        over, filled, mapped = grid[:, column]
+        view.show_pixels(over, np.array(limits))
+        _outline(over, cut[0])
+        over.set_title(title, fontsize=11)
+        _fill(filled, cut, np.asarray(mean), "gray", limits)
+        painted = _fill(mapped, cut, loss, "magma", (0.0, brightest or 1.0))
+        for axes in (over, filled, mapped):
+            view.frame(axes)
+    grid[1, 1].set_ylabel("mean in each cell")
+    grid[2, 1].set_ylabel("E_D per mm³")
+    grid[2, 0].set_axis_off()
+    bar = figure.colorbar(painted, cax=grid[2, 0].inset_axes((0.62, 0.08, 0.1, 0.84)), extend="max")
+    bar.set_label("E_D per mm³ of the cell (intensity²)", fontsize=9)
+    bar.ax.yaxis.set_ticks_position("left")
+    bar.ax.yaxis.set_label_position("left")
+    return figure
+
+
+def _outline(axes: Axes, polygons: NDArray[np.float64]) -> None:
+    width = min(0.6, 20.0 / np.sqrt(max(len(polygons), 1)))  # points; thinner before the lines hide the image
+    axes.add_collection(PolyCollection(list(polygons), facecolors="none", edgecolors=MESH_LINE, linewidths=width))
+
+
+def _fill(
+    axes: Axes,
+    cut: tuple[NDArray[np.float64], NDArray[np.int64]],
+    values: NDArray[np.float64],
+    colours: str,
+    limits: tuple[float, float],
+) -> PolyCollection:
+    polygons, cells = cut
+    # Antialiased, each border would let the background shine through as a light seam.
+    painted = PolyCollection(list(polygons), array=values[cells], cmap=colours, edgecolors="none", antialiaseds=False)
+    painted.set_clim(*limits)
+    axes.set_facecolor(UNCOVERED)
+    axes.add_collection(painted)
+    return painted
+
+
+def cutaways(meshes: Sequence[tuple[str, Mesh]], means: Sequence[NDArray[np.float64]], path: str | Path) -> None:
+    """PNG of every mesh, its right, front, upper octant taken away, cells in the grey of their means, with edges.
+
+    All are opened at the middle of the first mesh's box, up to three in a row. `means` as in `slices_figure`.
+    """
+    # pyvista is slow to load, and the flat pictures need it not.
+    from tetopt.report.scene import cutaway, save_scenes
+
+    points = meshes[0][1].points
+    centre = (points.min(axis=0) + points.max(axis=0)) / 2.0
+    views = [view_of(mesh, mean, title, centre) for (title, mesh), mean in zip(meshes, means, strict=True)]
+    limits = grey_limits([view.values for view in views])
+    save_scenes(path, [(view.title, cutaway(view, limits)) for view in views], columns=3 if len(views) != 4 else 2)
+
+
+def histograms_figure(results: dict[str, Any]) -> Figure:
+    """Shares of cells by rho (left) and of dihedral angles (right), the pipelines' median runs over each other."""
+    figure = Figure(figsize=(11.0, 4.4), layout="constrained")
+    panels = figure.subplots(1, 2)
+    names = (
+        ("rho_histogram", "rho = inradius / circumradius (1/3 for a regular cell)", "share of cells"),
+        ("dihedral_histogram", "dihedral angle, degrees (70.5 in a regular cell)", "share of angles"),
+    )
+    for axes, (name, across, up) in zip(panels, names, strict=True):
+        for number, pipeline in _finished(results):
+            histogram = pipeline["median"].get(name)
+            if histogram is None:
+                continue
+            share, edges = np.asarray(histogram["share"], dtype=np.float64), np.asarray(histogram["edges"])
+            style = _style(number)
+            if pipeline["kind"] == "tetopt":
+                axes.stairs(share, edges, fill=True, alpha=0.18, color=style["color"])
+            axes.stairs(share, edges, label=pipeline["title"], linewidth=1.8, **style)
+        axes.set_xlabel(across)
+        axes.set_ylabel(up)
+        axes.set_ylim(bottom=0.0)
+    panels[0].axvline(1.0 / 3.0, color="black", linewidth=0.8, linestyle=":")
+    panels[1].axvline(np.degrees(np.arccos(1.0 / 3.0)), color="black", linewidth=0.8, linestyle=":")
+    panels[1].set_xticks(range(0, 181, 30))
+    _legend(figure, panels)
+    return figure
+
+
+def labels_figure(results: dict[str, Any]) -> Figure:
+    """Dice (top) and mean surface distance in mm (bottom) of each label, the largest on the left, a mark a pipeline.
+
+    Medians over the runs; a label that is lost has Dice 0 and no distance. Labels stand in grey bars to hold on to.
+    """
+    finished = _finished(results)
+    voxels = {row["label"]: row["voxels"] for _, p in finished for row in p["median"].get("labels") or ()}
+    order = sorted(voxels, key=lambda label: -voxels[label])
+    figure = Figure(figsize=(max(8.0, 2.0 + 0.32 * len(order)), 7.2), layout="constrained")
+    panels = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
+    for axes, name in zip(panels, ("dice", "surface_mean_mm"), strict=True):
+        for k in range(0, len(order), 2):
+            axes.axvspan(k - 0.5, k + 0.5, color="#f1f1f1", zorder=0)
+        for place, (number, pipeline) in enumerate(finished):
+            rows = {row["label"]: row.get(name) for row in pipeline["median"].get("labels") or ()}
+            aside = 0.8 * ((place + 0.5) / len(finished) - 0.5)  # of a column, so that marks do not hide one another
+            points = [(k + aside, rows[label]) for k, label in enumerate(order) if rows.get(label) is not None]
+            axes.plot(
+                [x for x, _ in points], [y for _, y in points], linestyle="none", marker=MARKERS[number % len(MARKERS)],
+                markersize=5, color=PALETTE[number % len(PALETTE)], label=pipeline["title"],
+            )  # fmt: skip
+        axes.grid(axis="y", color="#dddddd", linewidth=0.6)
+    panels[0].set_ylabel("Dice")
+    panels[0].set_ylim(-0.03, 1.03)
+    panels[1].set_ylabel("mean surface distance, mm")
+    panels[1].set_ylim(bottom=0.0)
+    panels[1].set_xlim(-0.5, len(order) - 0.5)
+    panels[1].set_xticks(
+        range(len(order)), [f"{label:.0f} ({voxels[label]:.0f})" for label in order], rotation=90, fontsize=8
+    )
+    panels[1].set_xlabel("label (voxels)")
+    _legend(figure, panels)
+    return figure
+
+
+def curves_figure(results: dict[str, Any]) -> Figure:
+    """Errors by number of nodes, logarithmic: a row for each Poisson's ratio, a column for each error.
+
+    Without any finite-element result: E_D as a share of the image's variance instead.
+    """
+    curves = results.get("curves") or []
+    ratios = sorted(
+        {nu for curve in curves for point in curve["points"] for nu in point.get("errors") or {}}, key=float
+    )
+    rows = max(len(ratios), 1)
+    columns = len(ERRORS) if ratios else 1
+    figure = Figure(figsize=(13.0 if ratios else 6.5, 3.9 * rows + 0.5), layout="constrained")
+    grid = figure.subplots(rows, columns, squeeze=False)
+    for row, nu in enumerate(ratios):
+        for axes, (name, title) in zip(grid[row], ERRORS, strict=True):
+            _draw_curves(axes, results, lambda point, nu=nu, name=name: (point["errors"].get(nu) or {}).get(name))
+            axes.set_title(f"{title}, ν = {nu}", fontsize=11)
+        grid[row, 0].set_ylabel("relative error")
+    if not ratios:
+        _draw_curves(grid[0, 0], results, lambda point: point.get("E_D_share"))
+        grid[0, 0].set_ylabel("E_D, share of the image's variance")
+    for axes in grid[-1]:
+        axes.set_xlabel("nodes")
+    _legend(figure, grid.ravel())
+    return figure
+
+
+def _draw_curves(axes: Axes, results: dict[str, Any], value: Any) -> None:
+    """One line a pipeline, of `value(point)`; what has no logarithm is left out."""
+    order = {pipeline["name"]: number for number, pipeline in enumerate(results["pipelines"])}
+    for curve in results.get("curves") or []:
+        points = [(point["n_nodes"], value(point)) for point in curve["points"]]
+        points = sorted((nodes, error) for nodes, error in points if nodes and error is not None and error > 0.0)
+        if points:
+            number = order.get(curve["name"], len(order))
+            marker = MARKERS[number % len(MARKERS)]
+            axes.plot(*zip(*points, strict=True), label=curve["title"], marker=marker, markersize=6, **_style(number))
+    axes.set_xscale("log")
+    axes.set_yscale("log")
+    for axis in (axes.xaxis, axes.yaxis):
+        low, high = axis.get_view_interval()
+        if high < 12.0 * low:  # hardly a decade: its powers of ten alone would say too little
+            axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0)))
+            axis.set_major_formatter("{x:g}")
+        else:
+            axis.set_major_formatter(LogFormatterSciNotation())
+        axis.set_minor_formatter(NullFormatter())
+    axes.grid(which="both", color="#e4e4e4", linewidth=0.6)
+
+
+def tradeoff_figure(results: dict[str, Any]) -> Figure:
+    """What each option of a graded mesh trades: E_D's share against mean rho, angles and, where simulated, errors.
+
+    A line for each option, its values along it, a star at the defaults; the other pipelines' medians as single points.
+    """
+    nus = sorted({nu for row in results["tradeoff"] for nu in row["measured"]["fem"]}, key=float)[:1]
+    panels = [
+        ("mean rho (1/3: regular)", lambda run: run["quality"]["mean_rho"]),
+        ("dihedral angles: smallest (filled), 1st percentile (open)", lambda run: run["quality"]["min_dihedral"]),
+        *(
+            (f"{title} error, ν = {nu}", lambda run, nu=nu, name=name: run["fem"][nu]["errors"][name])
+            for nu in nus
+            for name, title in ERRORS
+            if all(row["measured"]["fem"][nu]["errors"][name] for row in results["tradeoff"])
+        ),
+    ]
+    columns = 3 if len(panels) > 2 else len(panels)
+    rows = -(-len(panels) // columns)
+    figure = Figure(figsize=(4.9 * columns, 4.3 * rows + 0.6), layout="constrained")
+    grid = figure.subplots(rows, columns, squeeze=False).ravel()
+    for number, (axes, (title, value)) in enumerate(zip(grid, panels, strict=False)):
+        _draw_tradeoff(axes, results, value)
+        if number == 1:
+            _draw_tradeoff(axes, results, lambda run: run["quality"]["p1_dihedral"], is_open=True)
+            axes.set_ylim(bottom=0.0)
+        axes.set_title(title, fontsize=10)
+        axes.set_xscale("log")
+        axes.set_xlabel("E_D, share of the image's variance")
+        low, high = axes.get_xlim()
+        if high < 12.0 * low:
+            axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 1.5, 2.0, 3.0, 5.0, 7.0)))
+        axes.xaxis.set_major_formatter("{x:g}")
+        axes.xaxis.set_minor_formatter(NullFormatter())
+        axes.grid(which="both", color="#e4e4e4", linewidth=0.6)
+    for axes in grid[len(panels) :]:
+        axes.set_axis_off()
+    _legend(figure, grid[: len(panels)])
+    return figure
+
+
+def _draw_tradeoff(axes: Axes, results: dict[str, Any], value: Any, is_open: bool = False) -> None:
+    """A line through the runs of each option, their values beside them; hollow and without words if open."""
+    options = list(dict.fromkeys(row["option"] for row in results["tradeoff"]))
+    for number, option in enumerate(options):
+        rows = [row for row in results["tradeoff"] if row["option"] == option]
+        points = [(row["measured"]["E_D_share"], value(row["measured"])) for row in rows]
+        style = _style(number) | ({"markerfacecolor": "white", "alpha": 0.6} if is_open else {"label": option})
+        axes.plot(*zip(*points, strict=True), marker=MARKERS[number], markersize=5, linewidth=1.2, **style)
+        for row, point in zip(rows, points, strict=True):
+            if not (is_open or row["is_default"]):
+                axes.annotate(
+                    f"{row['value']:.3g}", point, xytext=(4, 3), textcoords="offset points", fontsize=7,
+                    color=style["color"],
+                )  # fmt: skip
+    default = next(row["measured"] for row in results["tradeoff"] if row["is_default"])
+    axes.plot(
+        default["E_D_share"], value(default), marker="*", markersize=15, color="black", linestyle="none", zorder=5,
+        markerfacecolor="white" if is_open else "black", label=None if is_open else "default",
+    )  # fmt: skip
+    for pipeline in results["pipelines"]:
+        if "median" in pipeline and pipeline["kind"] != "tetopt" and pipeline["median"]["E_D_share"]:
+            run = pipeline["median"]
+            axes.plot(run["E_D_share"], value(run), marker="x", color="#666666", markersize=6, zorder=4)
+            if not is_open:
+                axes.annotate(
+                    pipeline["title"], (run["E_D_share"], value(run)), xytext=(5, -9), textcoords="offset points",
+                    fontsize=7, color="#444444",
+                )  # fmt: skip
+
+
+def timing_figure(results: dict[str, Any]) -> Figure:
+    """Wall seconds of each pipeline's median run as a bar, stacked by step; a failed pipeline's bar is the word."""
+    pipelines = results["pipelines"]
+    steps = list(dict.fromkeys(step for _, pipeline in _finished(results) for step in pipeline["median"]["seconds"]))
+    steps = [step for step in steps if step not in UNTIMED]
+    figure = Figure(figsize=(10.0, 0.62 * len(pipelines) + 1.6), layout="constrained")
+    axes = figure.subplots()
+    for row, pipeline in enumerate(pipelines):
+        left = 0.0
+        if "median" not in pipeline:
+            axes.text(0.0, row, " failed", va="center", color="#a00000")
+            continue
+        for step, seconds in pipeline["median"]["seconds"].items():
+            if step in UNTIMED:
+                continue
+            number = steps.index(step)
+            axes.barh(
+                row, seconds or 0.0, 0.62, left=left, color=PALETTE[(number + 1) % len(PALETTE)], edgecolor="white",
+                hatch=HATCHES[number % len(HATCHES)], label=step,
+            )  # fmt: skip
+            left += seconds or 0.0
+        axes.text(left, row, f" {pipeline['median']['seconds_total']:.3g} s", va="center", fontsize=10)
+    axes.set_yticks(range(len(pipelines)), [pipeline["title"] for pipeline in pipelines])
+    axes.set_ylim(len(pipelines) - 0.4, -0.6)  # the first on top
+    axes.margins(x=0.12)
+    axes.set_xlim(left=0.0)
+    axes.set_xlabel("wall seconds, median run")
+    axes.spines[["top", "right"]].set_visible(False)
+    _legend(figure, [axes])
+    return figure
+
+
+def _finished(results: dict[str, Any]) -> list[tuple[int, dict[str, Any]]]:
+    """The pipelines with a mesh and their places in the list, which give them their colours."""
+    return [(number, each) for number, each in enumerate(results["pipelines"]) if "median" in each]
+
+
+def _style(number: int) -> dict[str, Any]:
+    return {"color": PALETTE[number % len(PALETTE)], "linestyle": DASHES[number % len(DASHES)]}
+
+
+def _legend(figure: Figure, panels: Iterable[Axes]) -> None:
+    """One legend above all panels, each label once."""
+    handles = {
+        label: handle for axes in panels for handle, label in zip(*axes.get_legend_handles_labels(), strict=True)
+    }
+    if handles:
+        figure.legend(
+            list(handles.values()), list(handles), loc="outside upper center", ncols=min(len(handles), 6), frameon=False
+        )

@@ -1,0 +1,676 @@
+"""The page of `tetopt compare`: report.json rendered, winners marked, losses said, with pictures and 3-D views."""
+
+from __future__ import annotations
+
+import html
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tetopt.report import viewer
+from tetopt.report.page import paragraph_html, picture_html, section_html, table_html, write_page
+from tetopt.report.viewer import View, views_html
+from tetopt.study.pipelines import UNTIMED
+
+PLOTS = ("histograms", "curves", "tradeoff", "timing")  # stems of the pictures that come after the 3-D views
+BIG = 500  # voxels: labels with more are judged; of smaller ones a mesh of few nodes can only keep some
+UNFOLDED = 12  # labels whose rows are open to see
+Run = dict[str, Any]
+
+
+class Measure(NamedTuple):
+    """A row of the headline table."""
+
+    group: str
+    title: str
+    value: Callable[[Run], Any]  # of a run; None if it has none
+    better: int  # -1 if smaller is better, +1 if larger, 0 if neither
+    is_derived: bool = False  # not in report.json itself: computed for each run
+
+
+class Entry(NamedTuple):
+    """What a pipeline has for a measure."""
+
+    value: float | None  # median
+    low: float | None
+    high: float | None
+
+
+def save_compare_page(
+    path: Path, results: dict[str, Any], pictures: Sequence[tuple[Path, str]], views: Sequence[View]
+) -> None:
+    """Write the comparison as one HTML file without outside references, whole or not at all.
+
+    Parameters
+    ----------
+    path : Path
+    results : dict
+        What `report.json` holds; every number on the page is one of these, rounded to four digits, or computed from
+        them for the rows of label volumes, and nothing is measured here.
+    pictures : sequence of (PNG path, caption)
+        Those named as in `PLOTS` come after the 3-D views, "labels" stands with the labels, the others before.
+    views : sequence of View
+        Surfaces to turn; without any, the section is left out.
+    """
+    of_labels = [picture_html(*each) for each in pictures if Path(each[0]).stem == "labels"]
+    before = [picture_html(*each) for each in pictures if Path(each[0]).stem not in (*PLOTS, "labels")]
+    after = [picture_html(*each) for each in pictures if Path(each[0]).stem in PLOTS]
+    sections = [
+        ("Result", [*_sentences(results), _headline_html(results), *_failures(results)]),
+        ("Labels", _labels_html(results, of_labels)),
+        ("The same slice through every mesh", before),
+        ("Turn the meshes", [views_html(views)] if views else []),
+        ("Shapes, errors by number of nodes, times", after),
+        ("Seconds by step", [_seconds_html(results)]),
+        ("Settings, versions and how to run it again", _settings_html(results)),
+    ]
+    parts = [section_html(title, content) for title, content in sections if content]
+    write_page(path, f"tetopt compared on {results['image']['name']}", parts, _STYLE + viewer.STYLE)
+
+
+# --------------------------------------------------------------------------------------------------
+# Measures and winners
+
+
+def measures(results: dict[str, Any]) -> list[Measure]:
+    """The rows of the headline table, in order."""
+    rows = [
+        Measure("Image", "E_D, share of the image's variance", _at("E_D_share"), -1),
+        Measure("Image", "voxels outside the mesh", _at("n_missed_voxels"), -1),
+        Measure("Size", "nodes", _at("n_nodes"), 0),
+        Measure("Size", "tetrahedra", _at("n_cells"), 0),
+        *(Measure("Shape", f"{word} rho", _at("quality", f"{word}_rho"), 1) for word in ("mean", "p1", "min")),
+    ]
+    errors = {"mean": "(i) mean", "harmonic_mean": "(ii) harmonic mean", "l2": "(iii) L2", "worst": "(iv) worst"}
+    rows += [Measure("Shape", f"error {title}", _at("quality", "errors", name), -1) for name, title in errors.items()]
+    rows += [
+        Measure("Shape", "smallest dihedral angle, °", _at("quality", "min_dihedral"), 1),
+        Measure("Shape", "dihedral angle p1, °", _at("quality", "p1_dihedral"), 1),
+        Measure("Shape", "largest dihedral angle, °", _at("quality", "max_dihedral"), -1),
+        Measure("Shape", "cells under 10°", _at("quality", "n_under_10_degrees"), -1),
+    ]
+    kinds = ("sliver", "cap", "needle", "wedge", "spade")
+    rows += [Measure("Shape", f"{kind}s", _at("quality", "kinds", kind), -1) for kind in kinds]
+    rows += _label_measures(results)
+    for nu in _ratios(results):
+        rows += _fem_measures(nu)
+    return [
+        *rows,
+        Measure("Cost", "wall time, s", _at("seconds_total"), -1),
+        Measure("Cost", "peak memory, MB", lambda run: _scaled(run.get("peak_bytes"), 1e-6), -1),
+    ]
+
+
+def _label_measures(results: dict[str, Any]) -> list[Measure]:
+    judged = _judged(results)
+
+    def over(of: Callable[[list[float]], float], value: Callable[[Run], Any]) -> Callable[[Run], Any]:
+        def found(run: Run) -> float | None:
+            values = [_number(value(row)) for row in run.get("labels") or () if row["label"] in judged]
+            known = [v for v in values if v is not None]
+            # Without a lost label, which has no surface, the mean over the others would flatter.
+            return of(known) if known and len(known) == len(values) else None
+
+        return found
+
+    def mean(values: list[float]) -> float:
+        return sum(values) / len(values)
+
+    def largest_error(values: list[float]) -> float:
+        return max(map(abs, values))
+
+    rows = [
+        ("mean label Dice", over(mean, _at("dice")), 1),
+        ("smallest label Dice", over(min, _at("dice")), 1),
+        ("mean label surface distance, mm", over(mean, _at("surface_mean_mm")), -1),
+        ("label surface distance p95, mm", over(mean, _at("surface_p95_mm")), -1),
+        ("largest label volume error", over(largest_error, _volume_error), -1),
+        ("labels in more or fewer pieces", over(sum, _is_in_other_pieces), -1),
+        ("labels lost (of any size)", _n_lost, -1),
+    ]
+    return [Measure(f"Labels {_which(results)}", *row, is_derived=True) for row in rows]
+
+
+def _judged(results: dict[str, Any]) -> dict[Any, int]:
+    """Voxels of the labels that are judged: more than `BIG` if any has, and not a given segmentation's background."""
+    voxels = _voxels_by_label(results)
+    if _has_background(results):
+        del voxels[0]
+    return {label: n for label, n in voxels.items() if n > BIG} or voxels
+
+
+def _is_given(results: dict[str, Any]) -> bool:
+    return (results.get("labels") or {}).get("kind") == "given"
+
+
+def _has_background(results: dict[str, Any]) -> bool:
+    return _is_given(results) and {0} < set(_voxels_by_label(results))
+
+
+def _which(results: dict[str, Any]) -> str:
+    """Which labels are judged, in words."""
+    is_big = any(n > BIG for n in _judged(results).values())
+    size = f"above {BIG} voxels" if is_big else "of any size"
+    return f"{size}, background 0 not counted" if _has_background(results) else size
+
+
+def _voxels_by_label(results: dict[str, Any]) -> dict[Any, int]:
+    runs = (run for pipeline in results["pipelines"] for run in pipeline["runs"])
+    return {row["label"]: row["voxels"] for run in runs for row in run.get("labels") or ()}
+
+
+def _fem_measures(nu: str) -> list[Measure]:
+    group = f"Compression, ν = {nu}"
+    rows = [
+        ("strain-energy error", _at("fem", nu, "errors", "strain_energy"), -1),
+        ("displacement error", _at("fem", nu, "errors", "displacement"), -1),
+        ("interface-strain error", _at("fem", nu, "errors", "interface_strain"), -1),
+        ("λ max", _at("fem", nu, "lambda_max"), 0),
+        ("condition number", _at("fem", nu, "cond"), -1),
+        ("CG iterations", _at("fem", nu, "cg_iterations"), -1),
+    ]
+    return [Measure(group, title, value, better) for title, value, better in rows]
+
+
+def entry(measure: Measure, pipeline: dict[str, Any]) -> Entry:
+    """Median and range of a measure over a pipeline's runs; without a run that ended, all None."""
+    if "median" not in pipeline:
+        return Entry(None, None, None)
+    if not measure.is_derived:
+        return Entry(*(_number(measure.value(pipeline.get(word, {}))) for word in ("median", "low", "high")))
+    values = [number for run in pipeline["runs"] if (number := _number(measure.value(run))) is not None]
+    if not values:
+        return Entry(None, None, None)
+    return Entry(float(np.median(values)), min(values), max(values))
+
+
+def winners(measure: Measure, entries: Sequence[Entry]) -> list[int]:
+    """Places of the best medians, equal ones as printed included; none if fewer than two differ."""
+    known = [(number, each.value) for number, each in enumerate(entries) if each.value is not None]
+    if measure.better == 0 or len({number_text(value) for _, value in known}) < 2:
+        return []
+    best = max(known, key=lambda pair: measure.better * pair[1])[1]
+    return [number for number, value in known if number_text(value) == number_text(best)]
+
+
+def number_text(value: float | None) -> str:
+    """A number as the page prints it: whole ones in full, others to four digits; "–" for none."""
+    if value is None:
+        return "–"
+    if float(value).is_integer() and abs(value) < 1e9:
+        return str(int(value))
+    return f"{value:.0f}" if 1e4 <= abs(value) < 1e9 else f"{value:.4g}"
+
+
+def _loss(measure: Measure, value: float | None, best: float) -> str:
+    """How far tetopt is from the best, in words."""
+    if value is None:
+        return "no value"
+    if best > 0.0 and value > 0.0:
+        ratio = value / best
+        # 1.0 and 0.99 of the best would hide which way a narrow loss goes.
+        return f"{ratio:.3g}× best" if abs(ratio - 1.0) > 0.005 else f"within {max(abs(ratio - 1), 1e-4):.1%} of best"
+    return f"{number_text(abs(value - best))} from best"
+
+
+def _at(*keys: str) -> Callable[[Run], Any]:
+    def value(run: Run) -> Any:
+        found: Any = run
+        for key in keys:
+            found = found.get(key) if isinstance(found, dict) else None
+        return found
+
+    return value
+
+
+def _volume_error(row: dict[str, Any]) -> float | None:
+    """Of a label in the mesh, as a share of its volume in the image."""
+    found, given = row.get("mesh_volume_mm3"), row.get("volume_mm3")
+    return found / given - 1.0 if given and found is not None else None
+
+
+def _is_in_other_pieces(row: dict[str, Any]) -> bool | None:
+    found, given = row.get("mesh_components"), row.get("components")
+    return None if found is None or given is None else found != given
+
+
+def _n_lost(run: Run) -> int | None:
+    rows = run.get("labels") or ()
+    return sum(bool(row["is_lost"]) for row in rows) if rows else None
+
+
+def _number(value: Any) -> float | None:
+    return float(value) if value is not None and np.isfinite(value) else None
+
+
+def _scaled(value: float | None, factor: float) -> float | None:
+    return None if value is None else value * factor
+
+
+def _ratios(results: dict[str, Any]) -> list[str]:
+    """Poisson's ratios of which any pipeline has a result."""
+    found = {nu for pipeline in results["pipelines"] for nu in pipeline.get("median", {}).get("fem") or {}}
+    return sorted(found, key=float)
+
+
+# --------------------------------------------------------------------------------------------------
+# The headline
+
+
+def _headline_html(results: dict[str, Any]) -> str:
+    pipelines = results["pipelines"]
+    heads = "".join(_head_cell(pipeline) for pipeline in pipelines)
+    lines = [
+        '<div class="wide"><table class="headline">',
+        f'<thead><tr><th scope="col">median of the runs</th>{heads}</tr></thead>',
+    ]
+    group = None
+    for measure in measures(results):
+        entries = [entry(measure, pipeline) for pipeline in pipelines]
+        if all(each.value is None for each in entries):
+            continue
+        if measure.group != group:
+            group = measure.group
+            head = f'<th scope="rowgroup" colspan="{len(pipelines) + 1}"><span>{html.escape(group)}</span></th>'
+            lines.append(f'<tbody><tr class="group">{head}</tr>')
+        lines.append(_row_html(measure, pipelines, entries))
+    return "\n".join([*lines, "</table></div>", _KEY])
+
+
+def _head_cell(pipeline: dict[str, Any]) -> str:
+    n_runs = len(pipeline.get("runs") or ())
+    notes = [pipeline["kind"]] if pipeline["kind"] != "tetopt" else []
+    if "median" not in pipeline:
+        notes = [*notes, "failed"]
+    elif pipeline.get("failure"):
+        notes = [*notes, "a run failed"]
+    if n_runs > 1:
+        notes = [*notes, f"{n_runs} runs"]
+    note = f"<small>{html.escape(', '.join(notes))}</small>" if notes else ""
+    return f'<th scope="col" class="{html.escape(pipeline["kind"])}">{html.escape(pipeline["title"])}{note}</th>'
+
+
+def _row_html(measure: Measure, pipelines: Sequence[dict[str, Any]], entries: Sequence[Entry]) -> str:
+    best = winners(measure, entries)
+    cells = []
+    is_lost = False
+    for number, (pipeline, each) in enumerate(zip(pipelines, entries, strict=True)):
+        kinds, mark = [pipeline["kind"]], ""
+        if number in best:
+            kinds.append("best")
+            mark = '<b class="mark">best</b>' if len(best) == 1 else '<b class="mark">best, tied</b>'
+        elif best and pipeline["kind"] == "tetopt":
+            is_lost = True
+            kinds.append("lost")
+            top = entries[best[0]].value
+            assert top is not None, "a winner has a value"
+            mark = f'<b class="mark">loses: {html.escape(_loss(measure, each.value, top))}</b>'
+        cells.append(f'<td class="{html.escape(" ".join(kinds))}">{_value_html(pipeline, each)}{mark}</td>')
+    arrow = {-1: " ↓", 1: " ↑", 0: ""}[measure.better]
+    row = '<tr class="loses">' if is_lost else "<tr>"
+    return f'{row}<th scope="row">{html.escape(measure.title)}{arrow}</th>{"".join(cells)}</tr>'
+
+
+def _value_html(pipeline: dict[str, Any], each: Entry) -> str:
+    if "median" not in pipeline:
+        return '<span class="failed">failed</span>'
+    text = f'<span class="value">{number_text(each.value)}</span>'
+    is_range = each.low is not None and each.high is not None and len(pipeline["runs"]) > 1
+    return text + f"<small>{number_text(each.low)} to {number_text(each.high)}</small>" if is_range else text
+
+
+def _sentences(results: dict[str, Any]) -> list[str]:
+    """What to read first: where tetopt is best, where it loses and to whom, and what makes that uneven."""
+    pipelines = results["pipelines"]
+    words = _label_sentences(results)
+    for number, pipeline in enumerate(pipelines):
+        if pipeline["kind"] == "tetopt":
+            if "median" in pipeline:
+                words += _verdict(results, number)
+            else:
+                words.append(f"<p><strong>{html.escape(pipeline['title'])} failed.</strong></p>")
+    failed = [each["title"] for each in pipelines if "median" not in each and each["kind"] != "tetopt"]
+    if failed:
+        words.append(paragraph_html(f"Failed, see under the table: {', '.join(failed)}."))
+    sizes = {each["title"]: each["median"].get("n_nodes") for each in pipelines if "median" in each}
+    known = {title: nodes for title, nodes in sizes.items() if nodes}
+    if known and max(known.values()) > 1.1 * min(known.values()):
+        counts = ", ".join(f"{title} {number_text(nodes)}" for title, nodes in known.items())
+        words.append(
+            paragraph_html(
+                f"The meshes differ in nodes ({counts}), and more nodes alone make E_D and the errors smaller; "
+                "the curves below compare at equal nodes."
+            )
+        )
+    return words
+
+
+def _verdict(results: dict[str, Any], number: int) -> list[str]:
+    """Where the pipeline at this place of the list is best and where it loses, as two or three paragraphs."""
+    pipelines = results["pipelines"]
+    title = html.escape(pipelines[number]["title"])
+    won: list[str] = []
+    lost: dict[str, list[str]] = {}
+    n_judged = n_lost_to_peers = 0
+    for measure in measures(results):
+        entries = [entry(measure, pipeline) for pipeline in pipelines]
+        best = winners(measure, entries)
+        if not best:
+            continue
+        n_judged += 1
+        name = measure.title.removesuffix(", °").removesuffix(", s").removesuffix(", MB").removesuffix(", mm")
+        if measure.group.startswith("Compression, "):
+            name += f" ({measure.group.removeprefix('Compression, ')})"
+        if number in best:
+            won.append(name)
+            continue
+        lost.setdefault(" and ".join(pipelines[k]["title"] for k in best), []).append(name)
+        rest = [
+            each if pipeline["kind"] != "control" else Entry(None, None, None)
+            for pipeline, each in zip(pipelines, entries, strict=True)
+        ]
+        best_of_peers = winners(measure, rest)
+        n_lost_to_peers += bool(best_of_peers) and number not in best_of_peers
+    if not n_judged:
+        return [f"<p>Nothing to compare {title} with.</p>"]
+    words = [f"<p><strong>{title} is best in {len(won)} of {n_judged} measures</strong>{_list(won)}.</p>"]
+    if lost:
+        items = "".join(f"<li>to {html.escape(to)}{_list(names)}</li>" for to, names in lost.items())
+        n_lost = sum(len(names) for names in lost.values())
+        words.append(f"<p><strong>It loses in {n_lost}:</strong></p><ul>{items}</ul>")
+    if lost and any(each["kind"] == "control" for each in pipelines):
+        words.append(
+            f"<p>Without the controls, which do not see the image, it would lose in {n_lost_to_peers} of them.</p>"
+        )
+    return words
+
+
+def _label_sentences(results: dict[str, Any]) -> list[str]:
+    """Of labels that are given: on how many the first tetopt is no worse than each peer, and on which it is."""
+    done = [pipeline for pipeline in results["pipelines"] if "median" in pipeline]
+    ours = [pipeline for pipeline in done if pipeline["kind"] == "tetopt"][:1]
+    peers = [pipeline for pipeline in done if pipeline["kind"] == "peer"]
+    judged = _judged(results)
+    if not _is_given(results) or not judged:
+        return []
+    words = [line for own in ours for peer in peers for line in _label_verdict(own, peer, judged, _which(results))]
+    how = (
+        "tetopt's own meshes, but not those of the paper's scheme, are to show the labels besides the image; E_D and "
+        "the simulation judge the image alone."
+    )
+    return [*words, paragraph_html(how)] if ours else []
+
+
+def _label_verdict(ours: dict[str, Any], peer: dict[str, Any], judged: Iterable[Any], which: str) -> Iterator[str]:
+    pairs = {label: (_of_label(ours, label), _of_label(peer, label)) for label in judged}
+    dice = [(round(own.dice or 0.0, 4), round(other.dice or 0.0, 4), label) for label, (own, other) in pairs.items()]
+    worse = sorted((row for row in dice if row[0] < row[1]), key=lambda row: row[0] - row[1])
+    farther = [label for label, (own, other) in pairs.items() if _is_farther(own.surface_mean, other.surface_mean)]
+    title, other = html.escape(ours["title"]), html.escape(peer["title"])
+    yield (
+        f"<p><strong>Of {len(pairs)} labels {which}, {title}'s Dice is at least {other}'s on {len(pairs) - len(worse)}"
+        f"</strong>, and its mean surface distance no larger on {len(pairs) - len(farther)}.</p>"
+    )
+    if worse:
+        names = ", ".join(f"{_text(k)} ({number_text(a)} against {number_text(b)})" for a, b, k in worse)
+        yield f"<p>{title}'s Dice is below {other}'s on label {html.escape(names)}.</p>"
+    if farther:
+        yield f"<p>{title}'s mean surface distance is larger than {other}'s on label {html.escape(_text(farther))}.</p>"
+
+
+def _is_farther(value: float | None, other: float | None) -> bool:
+    """Whether a distance is above another; where there is no surface it is above all others."""
+    return other is not None and (value is None or value > other)
+
+
+def _list(names: Sequence[str]) -> str:
+    return f": {html.escape(', '.join(names))}" if names else ""
+
+
+def _failures(results: dict[str, Any]) -> Iterator[str]:
+    for pipeline in results["pipelines"]:
+        if pipeline.get("failure"):
+            what = ", a run failed" if "median" in pipeline else " failed"
+            title, failure = html.escape(pipeline["title"]), html.escape(pipeline["failure"])
+            yield f'<p class="failed"><strong>{title}{what}:</strong> {failure}</p>'
+
+
+# --------------------------------------------------------------------------------------------------
+# Labels, times, settings
+
+
+class OfLabel(NamedTuple):
+    """What a pipeline's runs make of a label: medians, None where no run has a value."""
+
+    dice: float | None
+    surface_mean: float | None  # mm
+    surface_p95: float | None  # mm
+    volume_error: float | None  # share of the volume in the image
+    pieces: float | None
+    E_D_share: float | None
+    n_lost: int  # runs in which nothing carries it
+    n_runs: int
+
+
+def _of_label(pipeline: dict[str, Any], label: Any) -> OfLabel:
+    rows = [row for run in pipeline["runs"] for row in run.get("labels") or () if row["label"] == label]
+
+    def median(value: Callable[[dict[str, Any]], Any]) -> float | None:
+        known = [number for row in rows if (number := _number(value(row))) is not None]
+        return float(np.median(known)) if known else None
+
+    return OfLabel(
+        median(_at("dice")), median(_at("surface_mean_mm")), median(_at("surface_p95_mm")), median(_volume_error),
+        median(_at("mesh_components")), median(_at("E_D_share")), sum(bool(row["is_lost"]) for row in rows), len(rows),
+    )  # fmt: skip
+
+
+def _labels_html(results: dict[str, Any], pictures: Sequence[str]) -> list[str]:
+    """Vanished structures by name, the picture, then a row for each label, the worst first and the others folded."""
+    done = [pipeline for pipeline in results["pipelines"] if "median" in pipeline]
+    voxels = _voxels_by_label(results)
+    if not voxels:
+        return []
+    is_given = _is_given(results)
+    origin = f"The labels of {results['labels']['name']}." if is_given else "Classes of the voxels' intensities."
+    found = {label: [_of_label(pipeline, label) for pipeline in done] for label in voxels}
+    first = next((k for k, pipeline in enumerate(done) if pipeline["kind"] == "tetopt"), 0)
+    order = sorted(voxels, key=lambda label: (found[label][first].dice or 0.0, voxels[label]))
+    open_, folded = order[:UNFOLDED], order[UNFOLDED:]
+    how = (
+        f"{origin} Each cell counts for the label that most of its voxels carry. In the table, for each label and mesh:"
+        " Dice; mean and 95th percentile of the distance between the label's surfaces in mesh and image, both ways; "
+        f"error of its volume. Labels on which {done[first]['title']} has the lowest Dice come first."
+    )
+    words = [paragraph_html(how), _vanished_html(done, found, voxels), *pictures]
+    words.append(_label_table_html(done, found, voxels, open_))
+    if folded:
+        words.append(_folded(f"The other {len(folded)} labels", _label_table_html(done, found, voxels, folded)))
+    components = {
+        row["label"]: row.get("components")
+        for pipeline in done for run in pipeline["runs"] for row in run.get("labels") or ()
+    }  # fmt: skip
+    pieces = [["label", "in the image", *(pipeline["title"] for pipeline in done)]]
+    shares = [["label", "voxels", *(pipeline["title"] for pipeline in done)]]
+    for label in voxels:
+        given = number_text(_number(components[label]))
+        pieces.append([_text(label), given, *(number_text(each.pieces) for each in found[label])])
+        shares.append([_text(label), str(voxels[label]), *(number_text(each.E_D_share) for each in found[label])])
+    words.append(_folded("Connected pieces of each label", table_html(pieces)))
+    words.append(_folded("E_D in each label, share of the image's variance", table_html(shares)))
+    return words
+
+
+def _folded(title: str, content: str) -> str:
+    return f"<details><summary>{html.escape(title)}</summary>{content}</details>"
+
+
+def _label_table_html(
+    done: Sequence[dict[str, Any]], found: dict[Any, list[OfLabel]], voxels: dict[Any, int], labels: Sequence[Any]
+) -> str:
+    """A row for each of `labels`, a column for each pipeline; the best Dice of a row is marked."""
+    heads = "".join(_head_cell(pipeline) for pipeline in done)
+    lines = [
+        '<div class="wide"><table class="headline labels">',
+        f'<thead><tr><th scope="col">label</th>{heads}</tr></thead><tbody>',
+    ]
+    by_dice = Measure("", "", _at("dice"), 1)
+    for label in labels:
+        best = winners(by_dice, [Entry(each.dice, None, None) for each in found[label]])
+        cells = [
+            f'<td class="{html.escape(pipeline["kind"])}{" best" if number in best else ""}">{_label_cell(each)}</td>'
+            for number, (pipeline, each) in enumerate(zip(done, found[label], strict=True))
+        ]
+        head = f"{html.escape(_text(label))}<small>{_voxels_text(voxels[label])}</small>"
+        lines.append(f'<tr><th scope="row">{head}</th>{"".join(cells)}</tr>')
+    return "\n".join([*lines, "</tbody></table></div>"])
+
+
+def _voxels_text(count: float) -> str:
+    return f"{number_text(count)} voxel" + ("" if count == 1 else "s")
+
+
+def _label_cell(each: OfLabel) -> str:
+    if each.n_lost and each.n_lost == each.n_runs:
+        return '<span class="failed">lost</span>'
+    # The same number of decimals everywhere, so that those of a row and a column are compared at a glance.
+    parts = [f'<span class="value">{"–" if each.dice is None else f"{each.dice:.3f}"}</span>']
+    if each.surface_mean is not None and each.surface_p95 is not None:
+        parts.append(f"<small>{each.surface_mean:.2f} / {each.surface_p95:.2f} mm</small>")
+    if each.volume_error is not None:
+        percent = round(100.0 * each.volume_error, 1) + 0.0  # no -0.0
+        parts.append(f"<small>vol. {percent:+.1f} %</small>".replace("-", "−"))
+    if each.n_lost:
+        parts.append(f'<small class="failed">lost in {each.n_lost} of {each.n_runs} runs</small>')
+    return "".join(parts)
+
+
+def _vanished_html(done: Sequence[dict[str, Any]], found: dict[Any, list[OfLabel]], voxels: dict[Any, int]) -> str:
+    """Which labels no cell stands for, by pipeline."""
+    items = []
+    for number, pipeline in enumerate(done):
+        lost = [(label, found[label][number]) for label in voxels if found[label][number].n_lost]
+        if lost:
+            names = ", ".join(
+                f"label {_text(label)} ({_voxels_text(voxels[label])}"
+                + (")" if each.n_lost == each.n_runs else f", in {each.n_lost} of {each.n_runs} runs)")
+                for label, each in lost
+            )
+            items.append(f"<li>{html.escape(pipeline['title'])}: {html.escape(names)}</li>")
+    if not items:
+        return "<p>No label vanished from any mesh.</p>"
+    return f"<p><strong>Vanished from the mesh:</strong></p><ul>{''.join(items)}</ul>"
+
+
+def _seconds_html(results: dict[str, Any]) -> str:
+    rows = [["pipeline", "step", "seconds", "low to high", "remark"]]
+    for pipeline in results["pipelines"]:
+        if "median" not in pipeline:
+            rows.append([pipeline["title"], "–", "–", "", "failed"])
+            continue
+        low, high = (pipeline.get(word, {}).get("seconds", {}) for word in ("low", "high"))
+        is_range = len(pipeline["runs"]) > 1
+        for step, seconds in pipeline["median"]["seconds"].items():
+            spread = f"{number_text(low.get(step))} to {number_text(high.get(step))}" if is_range else ""
+            remark = UNTIMED.get(step, "")
+            rows.append([pipeline["title"], step, number_text(seconds), spread, remark])
+    return table_html(rows)
+
+
+def _settings_html(results: dict[str, Any]) -> list[str]:
+    image, machine = results["image"], results.get("machine") or {}
+    labels = results.get("labels")
+    rows = [
+        ["what", "value"],
+        ["image", f"{image['name']}, {_text(image['shape'], ' × ')} voxels of {_text(image['spacing_mm'], ' × ')} mm"],
+        ["image's variance", number_text(image.get("variance"))],
+        ["image's SHA-256", str(image.get("sha256"))],
+        ["labels", f"{labels['name']} ({labels['kind']})" if labels else "none given"],
+        ["modulus", str(results.get("law"))],
+        ["reference", _reference_text(results.get("reference"))],
+        ["machine", ", ".join(f"{key} {_text(value)}" for key, value in machine.items())],
+        ["whole comparison, s", number_text(results.get("seconds"))],
+    ]
+    abouts = [["pipeline", "what it is"]] + [[p["title"], str(p.get("about"))] for p in results["pipelines"]]
+    options = [["option", "value"]] + [[str(k), _text(v)] for k, v in (results.get("options") or {}).items()]
+    versions = [["package", "version"]] + [[str(k), _text(v)] for k, v in (results.get("versions") or {}).items()]
+    notes = [f"{p['title']}: {note}" for p in results["pipelines"] for note in p.get("notes") or ()]
+    items = "".join(f"<li>{html.escape(note)}</li>" for note in notes)
+    return [
+        f"<p>To run it again:</p><pre>{html.escape(str(results.get('command')))}</pre>",
+        '<div class="settings">',
+        *(
+            table_html(each, caption)
+            for each, caption in (
+                (abouts, "Pipelines"), (rows, "Data and machine"), (options, "Options"), (versions, "Versions"),
+            )
+        ),
+        "</div>",
+        f"<h3>Notes</h3><ul>{items}</ul>" if notes else "",
+    ]  # fmt: skip
+
+
+def _reference_text(reference: dict[str, Any] | None) -> str:
+    if not reference:
+        return "none: no finite-element errors"
+    shape = _text(reference["shape"], " × ")
+    text = f"{shape} hexahedra, {number_text(reference.get('n_dofs'))} unknowns; {reference.get('note')}"
+    energies = [f"ν {nu}: {number_text(row.get('strain_energy'))}" for nu, row in reference.items() if _is_nu(nu, row)]
+    return f"{text}; strain energy {', '.join(energies)}" if energies else text
+
+
+def _is_nu(key: str, row: Any) -> bool:
+    return isinstance(row, dict) and key.replace(".", "", 1).isdigit()
+
+
+def _text(value: Any, between: str = ", ") -> str:
+    """Any setting as text; sequences and arrays joined."""
+    if isinstance(value, list | tuple | np.ndarray):
+        return between.join(_text(item) for item in value)
+    if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+        return "none" if value is None else str(value)
+    return f"{value:.10g}"
+
+
+_KEY = (
+    '<p class="key">↓ smaller is better, ↑ larger is better; <b class="mark">best</b> marks the winner of a row and '
+    "<b>loses</b> a tetopt that is not. Under a median of several runs its range, lowest to highest. Rows in which "
+    "all are equal, or in which neither way is better, have no winner.</p>"
+)
+_STYLE = """
+h1, p, li { overflow-wrap: anywhere; }
+table.headline { border-collapse: separate; border-spacing: 0; width: 100%; }
+.headline th, .headline td { vertical-align: top; padding: 0.25rem 0.5rem; background: #fff; white-space: nowrap; }
+.headline thead th { border-bottom: 2px solid #444; white-space: normal; vertical-align: bottom; }
+.headline th[scope=row] { font-weight: 400; }
+.headline th:first-child { position: sticky; left: 0; z-index: 1; min-width: 9rem; white-space: normal; }
+.headline .group th { padding-top: 1rem; color: #555; font-size: 0.85rem; border-bottom: 1px solid #999; }
+.headline .group span { position: sticky; left: 0.5rem; }
+.headline small { display: block; font-weight: 400; font-size: 0.75rem; color: #666; }
+.headline .mark { display: block; font-size: 0.75rem; }
+.headline td.tetopt { background: #f6f6f6; }
+.headline td.best { background: #dcefe4; } td.best .value { font-weight: 700; }
+.best .mark, .key .mark { color: #00593f; }
+.headline td.lost { background: #fbe6dc; } .lost .mark { color: #a02c00; }
+.labels td, .labels thead th { text-align: center; } .labels th:first-child { min-width: 5rem; text-align: left; }
+.labels tbody tr > * { border-bottom: 1px solid #eee; } .labels small { line-height: 1.3; }
+.labels small.failed { color: #a00000; } details th { white-space: normal; vertical-align: bottom; }
+details { margin: 0.8rem 0; } summary { cursor: pointer; font-weight: 600; }
+.failed { color: #a00000; } .key { color: #555; font-size: 0.85rem; }
+pre { overflow-x: auto; background: #f4f4f4; padding: 0.7rem; white-space: pre-wrap; overflow-wrap: anywhere; }
+.settings td { white-space: normal; overflow-wrap: anywhere; text-align: left; vertical-align: top; }
+.settings th { text-align: left; } .settings td:first-child { overflow-wrap: normal; white-space: nowrap; }
+@media screen and (max-width: 700px) {
+  .headline th, .headline td { padding: 0.25rem 0.35rem; font-size: 0.85rem; }
+  .headline th:first-child { min-width: 6.5rem; max-width: 7.5rem; }
+}
+@media print {
+  .headline { font-size: 7.5pt; } .headline th, .headline td { padding: 0.08rem 0.3rem; }
+  .headline small, .headline .mark { font-size: 6.5pt; }
+  .headline .group th { padding-top: 0.3rem; } .headline td, .mark { print-color-adjust: exact; }
+  .wide { overflow: visible; } thead { display: table-header-group; }
+  .headline th:first-child, .headline .group span { position: static; }
+}
+"""

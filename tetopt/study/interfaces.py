@@ -1,0 +1,227 @@
+"""Interfaces between the classes of an image, cleaned for a mesher of surfaces, in the closed box of the image.
+
+Everything here lives in the *box frame*: x = index * spacing, in mm, in which the box is axis-aligned, from
+-spacing/2 to (shape - 1/2) * spacing. Without shear in the affine, lengths and angles are those of the world. A
+sheared image is treated in the same frame and mapped by its affine afterwards, so its cells are sheared along.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import pyvista
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter
+
+from tetopt.errors import InputError
+from tetopt.image import Image
+from tetopt.target.otsu import class_thresholds
+
+SIGMA_VOXELS = 0.75  # of the Gaussian before thresholding: takes the noise, moves no interface wider than a voxel
+SPECK = 3.0  # pieces of surface with less area than this many size^2 are dropped: no cell of that size shows them
+EDGE = 0.7  # of a surface triangle over `size`; coarser ones round the folds off, finer ones only take time
+SMOOTHINGS = 30  # iterations of the windowed sinc
+PASS_BAND = 0.05
+PAD = 4  # voxels by which the volume is continued, so that neither smoothing nor decimation frays at the box's faces
+
+
+class Surfaces(NamedTuple):
+    """A soup of triangles in the box frame: the interfaces, cut off at the box, and the box's own 12 triangles."""
+
+    points: NDArray[np.float64]  # (P, 3) mm
+    triangles: NDArray[np.int64]  # (T, 3), the box's last
+    n_box: int  # how many of them are the box's
+    low: NDArray[np.float64]  # (3,) mm, the box's corner at index -0.5
+    high: NDArray[np.float64]  # (3,) mm, at index shape - 0.5
+    notes: list[str]  # what was dropped
+
+
+def interfaces(image: Image, size: float, *, classes: int = 4, labels: Image | None = None) -> Surfaces:
+    """All interfaces between the classes of an image, or between given labels, and the box around them.
+
+    Without labels: the volume is smoothed by a Gaussian of 0.75 voxel, exact multi-Otsu gives the thresholds of the
+    classes, and each threshold's isosurface is an interface. They are level sets of one field, so they nest. With
+    labels: one conforming surface on which three and more labels may meet (surface nets). Either way small pieces
+    are dropped, then come smoothing by a windowed sinc and quadric decimation to triangles of about 0.7 `size`.
+
+    Parameters
+    ----------
+    image : Image
+        3-D.
+    size : float
+        Wanted edge length of the mesh in mm, near the interfaces.
+    classes : int
+        Number of classes without labels, 2 or more.
+    labels : Image, optional
+        Whole numbers, on the image's voxels.
+
+    Returns
+    -------
+    Surfaces
+
+    Raises
+    ------
+    InputError
+        An image that is not 3-D, labels of another shape or that are not whole numbers, a size that is not above 0,
+        or classes that the intensities do not have (see `tetopt.target.otsu.class_thresholds`).
+    """
+    _check(image, size, labels)
+    if labels is None:
+        pieces, notes = _isosurfaces(image, size, classes)
+    else:
+        pieces, notes = _label_surface(labels.data, image.spacing, size)
+    low, high = -0.5 * image.spacing, (np.array(image.shape) - 0.5) * image.spacing
+    cut = [_cut_by_box(_decimated(piece, size), low, high) for piece in pieces]
+    soup = [(points, triangles) for points, triangles in cut if len(triangles)]
+    if not soup:
+        notes.append("no interface is left: only the box is meshed")
+    points, triangles = _stacked([*soup, _box(low, high)])
+    return Surfaces(points, triangles, 12, low, high, notes)
+
+
+def class_labels(image: Image, classes: int) -> Image:
+    """Label image, 0 to classes - 1: the classes whose interfaces `interfaces` extracts, voxel by voxel.
+
+    Raises
+    ------
+    InputError
+        As `tetopt.target.otsu.class_thresholds`.
+    """
+    smooth, thresholds = _classes(image, classes)
+    return Image(np.digitize(smooth, thresholds), image.affine)
+
+
+def _classes(image: Image, classes: int) -> tuple[NDArray[np.floating], NDArray[np.float64]]:
+    """The smoothed volume and the thresholds between its classes."""
+    smooth = gaussian_filter(image.data, SIGMA_VOXELS, mode="nearest")
+    return smooth, class_thresholds(smooth.ravel(), classes)
+
+
+def _check(image: Image, size: float, labels: Image | None) -> None:
+    if image.ndim != 3:
+        raise InputError(f"image: surfaces need 3 axes, got shape {image.shape}; pick a volume")
+    if not (np.isfinite(size) and size > 0.0):
+        raise InputError(f"size: expected a length above 0 mm, got {size}")
+    if labels is None:
+        return
+    if labels.shape != image.shape:
+        raise InputError(f"labels: expected the image's shape {image.shape}, got {labels.shape}; resample them")
+    if not np.array_equal(np.rint(labels.data), labels.data):
+        raise InputError("labels: expected whole numbers, got fractions; is this the label volume?")
+
+
+def _isosurfaces(image: Image, size: float, classes: int) -> tuple[list[pyvista.PolyData], list[str]]:
+    smooth, thresholds = _classes(image, classes)
+    grid = _padded_grid(smooth, image.spacing, size)
+    pieces, notes = [], []
+    for threshold in thresholds:
+        surface = grid.contour([threshold], method="flying_edges", compute_normals=False, compute_gradients=False)
+        large, n_dropped = _without_specks(surface, size)
+        if n_dropped:
+            notes.append(f"threshold {threshold:.4g}: {n_dropped} specks of surface dropped")
+        if large.n_cells == 0:
+            notes.append(f"threshold {threshold:.4g}: its surface vanishes, every piece is a speck")
+            continue
+        pieces.append(_smoothed(large))
+    return pieces, notes
+
+
+def _label_surface(
+    data: NDArray[np.floating], spacing: NDArray[np.float64], size: float
+) -> tuple[list[pyvista.PolyData], list[str]]:
+    values, numbered = np.unique(data, return_inverse=True)
+    if len(values) == 1:
+        return [], []
+    # Numbers from 1: 0 would be the filter's background, at which it draws no internal boundary.
+    grid = _padded_grid((numbered.reshape(data.shape) + 1).astype(np.int16), spacing, size)
+    surface = grid.contour_labels(
+        "internal", background_value=0, pad_background=False, smoothing=True, output_mesh_type="triangles"
+    )
+    large, n_dropped = _without_specks(surface, size)
+    notes = [f"labels: {n_dropped} specks of surface dropped"] if n_dropped else []
+    seen = np.unique(large.cell_data["boundary_labels"]) if large.n_cells else np.array([], dtype=int)
+    lost = [f"{value:g}" for number, value in enumerate(values, 1) if number not in seen]
+    if lost and n_dropped:
+        notes.append(f"labels that vanish, every piece of their surface is a speck: {', '.join(lost)}")
+    return ([_smoothed(large)] if large.n_cells else []), notes
+
+
+def _padded_grid(volume: NDArray, spacing: NDArray[np.float64], size: float) -> pyvista.ImageData:
+    """The volume on its voxel centres, continued by its border values past the box's faces."""
+    pad = np.maximum(PAD, np.ceil(size / spacing)).astype(int)
+    padded = np.pad(volume, [(p, p) for p in pad], mode="edge")
+    grid = pyvista.ImageData(dimensions=padded.shape, spacing=spacing, origin=-pad * spacing)
+    grid.point_data["h"] = padded.ravel(order="F")
+    return grid
+
+
+def _without_specks(surface: pyvista.PolyData, size: float) -> tuple[pyvista.PolyData, int]:
+    """The pieces of at least `SPECK` size^2, and how many were dropped."""
+    if surface.n_cells == 0:
+        return surface, 0
+    triangles = surface.regular_faces
+    region = surface.connectivity(largest=False).cell_data["RegionId"]
+    a, b, c = np.asarray(surface.points, dtype=np.float64)[triangles.T]
+    areas = np.bincount(region, 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
+    is_large = areas >= SPECK * size**2
+    kept = is_large[region]
+    points, triangles = _compacted(surface.points, triangles[kept])
+    large = pyvista.PolyData.from_regular_faces(points, triangles)
+    if "boundary_labels" in surface.cell_data:
+        large.cell_data["boundary_labels"] = surface.cell_data["boundary_labels"][kept]
+    return large, int((~is_large).sum())
+
+
+def _smoothed(surface: pyvista.PolyData) -> pyvista.PolyData:
+    return surface.smooth_taubin(
+        n_iter=SMOOTHINGS, pass_band=PASS_BAND, boundary_smoothing=False, non_manifold_smoothing=True
+    )
+
+
+def _decimated(surface: pyvista.PolyData, size: float) -> pyvista.PolyData:
+    wanted = surface.area / (np.sqrt(3.0) / 4.0 * (EDGE * size) ** 2)
+    reduction = 1.0 - max(wanted, 4.0) / surface.n_cells
+    bare = pyvista.PolyData.from_regular_faces(surface.points, surface.regular_faces)
+    return bare.decimate(reduction, volume_preservation=True) if reduction > 0.0 else bare
+
+
+def _cut_by_box(
+    surface: pyvista.PolyData, low: NDArray[np.float64], high: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """The part of a surface inside the box; its rim lies exactly on the box's faces."""
+    surface = pyvista.PolyData.from_regular_faces(np.asarray(surface.points, dtype=np.float64), surface.regular_faces)
+    for axis in range(3):
+        for place, sign in ((low, 1.0), (high, -1.0)):
+            if surface.n_cells:
+                normal = sign * np.eye(3)[axis]
+                surface = surface.clip(normal, origin=place, invert=False).triangulate()
+    if surface.n_cells == 0:
+        return np.empty((0, 3)), np.empty((0, 3), dtype=np.int64)
+    points, triangles = _compacted(np.asarray(surface.points, dtype=np.float64), surface.regular_faces)
+    near = 1e-6 * (high - low)
+    for face in (low, high):
+        points = np.where(np.abs(points - face) < near, face, points)
+    return points, triangles
+
+
+def _box(low: NDArray[np.float64], high: NDArray[np.float64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    box = pyvista.Box(np.stack([low, high], axis=1).ravel(), quads=False)
+    corners, triangles = np.unique(np.asarray(box.points, dtype=np.float64), axis=0, return_inverse=True)
+    # pyvista's points are single precision: each coordinate is put back to the nearer of the two faces.
+    corners = np.where(corners < 0.5 * (low + high), low, high)
+    return corners, triangles.reshape(-1)[box.regular_faces].astype(np.int64)
+
+
+def _stacked(
+    parts: list[tuple[NDArray[np.float64], NDArray[np.int64]]],
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    offsets = np.cumsum([0] + [len(points) for points, _ in parts])
+    points = np.vstack([points for points, _ in parts])
+    return points, np.vstack([triangles + offset for (_, triangles), offset in zip(parts, offsets, strict=False)])
+
+
+def _compacted(points: NDArray, triangles: NDArray) -> tuple[NDArray, NDArray[np.int64]]:
+    """Without the points that no triangle uses."""
+    used, compact = np.unique(triangles, return_inverse=True)
+    return points[used], compact.reshape(triangles.shape).astype(np.int64)

@@ -1,0 +1,205 @@
+"""Seven ways from an image to a mesh of its box with a wanted number of nodes, under one signature."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from typing import NamedTuple
+
+import numpy as np
+
+from tetopt.engine.fast import GRADED_ITERATIONS, GRADED_K_D, optimize, prepare_kernels
+from tetopt.engine.paper import optimize_paper
+from tetopt.image import Image
+from tetopt.mesh import Mesh
+from tetopt.start.lattice import lattice
+from tetopt.start.octree import octree
+from tetopt.target.content import Content, content
+
+
+class Job(NamedTuple):
+    """What every pipeline gets."""
+
+    image: Image  # 3-D
+    labels: Image | None  # a given segmentation, on the image's voxels; without one, those who need it make their own
+    nodes: int  # wanted
+    classes: int = 4  # of the thresholds, without labels
+    k_D: float = 0.2  # of uniform meshes; the graded one has its own
+    iterations: int = 20  # likewise
+
+
+class Produced(NamedTuple):
+    """What every pipeline returns."""
+
+    mesh: Mesh  # fills the image's box, unless a note says otherwise
+    seconds: dict[str, float]  # by step, in their order
+    notes: list[str]
+
+
+UNTIMED = {  # steps that a run's total does not count, and why
+    "kernels": "loading compiled code, not in the total",
+    "search": "other runs, made to meet the number of nodes; not in the total",
+}
+
+
+class _Clock:
+    """Wall time by step."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def step(self, name: str) -> Iterator[None]:
+        begin = time.perf_counter()
+        yield
+        self.seconds[name] = time.perf_counter() - begin
+
+
+def bcc(job: Job) -> Produced:
+    """The body-centred cubic lattice, untouched.
+
+    Raises
+    ------
+    InputError
+        As `tetopt.start.lattice.lattice`.
+    """
+    clock = _Clock()
+    with clock.step("lattice"):
+        mesh = lattice(job.image, nodes=job.nodes)
+    return Produced(mesh, clock.seconds, [])
+
+
+def odt(job: Job) -> Produced:
+    """The lattice relaxed to the best shapes, whatever the image shows: `optimize_paper` with k_D = 0.
+
+    Raises
+    ------
+    InputError
+        As `tetopt.start.lattice.lattice` and `tetopt.engine.paper.optimize_paper`.
+    """
+    return _by_the_paper(job, 0.0)
+
+
+def tetopt(job: Job) -> Produced:
+    """`tetopt.mesh_image` with its defaults: nodes where the image, and labels that are given, have content.
+
+    Raises
+    ------
+    InputError
+        As `tetopt.mesh_image` and `tetopt.target.content.content`.
+    """
+    clock = _Clock()
+    wanted, notes = _wanted(job, clock)
+    with clock.step("kernels"):
+        prepare_kernels(wanted, GRADED_K_D, is_graded=True)
+    with clock.step("octree"):
+        mesh = octree(wanted, job.nodes)
+    with clock.step("optimize"):
+        result = optimize(wanted, mesh, k_D=GRADED_K_D, iterations=GRADED_ITERATIONS, nodes=job.nodes)
+    return Produced(result.mesh, clock.seconds, [f"ended by: {result.ended}", *notes])
+
+
+def tetopt_uniform(job: Job) -> Produced:
+    """The lattice and `optimize`, as `tetopt mesh --uniform`; labels that are given have their say too.
+
+    Raises
+    ------
+    InputError
+        As `tetopt.start.lattice.lattice`, `tetopt.engine.fast.optimize` and `tetopt.target.content.content`.
+    """
+    clock = _Clock()
+    wanted, notes = _wanted(job, clock)
+    with clock.step("kernels"):
+        prepare_kernels(wanted, job.k_D)
+    with clock.step("lattice"):
+        mesh = lattice(job.image, nodes=job.nodes)
+    with clock.step("optimize"):
+        result = optimize(wanted, mesh, k_D=job.k_D, iterations=job.iterations)
+    return Produced(result.mesh, clock.seconds, [f"ended by: {result.ended}", *notes])
+
+
+def tetopt_paper(job: Job) -> Produced:
+    """The lattice and the paper's own scheme, as `tetopt mesh --method paper`.
+
+    Raises
+    ------
+    InputError
+        As `tetopt.start.lattice.lattice` and `tetopt.engine.paper.optimize_paper`.
+    """
+    return _by_the_paper(job, job.k_D)
+
+
+def pytetwild(job: Job) -> Produced:
+    """Interfaces of the classes or labels, and fTetWild with a sizing field around them; see `tetwild`.
+
+    Raises
+    ------
+    InputError
+        As `tetopt.study.interfaces.interfaces` and `tetopt.study.tetwild.filled`.
+    """
+    from tetopt.study.interfaces import interfaces
+    from tetopt.study.tetwild import filled, node_spacing
+
+    clock = _Clock()
+    with clock.step("surfaces"):
+        surfaces = interfaces(job.image, node_spacing(job.image, job.nodes), classes=job.classes, labels=job.labels)
+    with clock.step("tetrahedra"):
+        result = filled(job.image, surfaces, job.nodes)
+    clock.seconds["tetrahedra"] -= result.search_seconds
+    clock.seconds["search"] = result.search_seconds
+    return Produced(result.mesh, clock.seconds, [*surfaces.notes, f"{result.n_runs} runs", *result.notes])
+
+
+def cleaver(job: Job) -> Produced:
+    """Labels, given or by thresholds, and Cleaver's lattice stuffing; see `cleaver`.
+
+    Raises
+    ------
+    InputError
+        As `tetopt.study.cleaver.stuffed`.
+    """
+    from tetopt.study.cleaver import stuffed
+    from tetopt.study.interfaces import class_labels
+
+    clock = _Clock()
+    with clock.step("labels"):
+        labels = class_labels(job.image, job.classes) if job.labels is None else job.labels
+    with clock.step("tetrahedra"):
+        result = stuffed(job.image, labels, job.nodes)
+    clock.seconds["tetrahedra"] -= result.search_seconds
+    clock.seconds["search"] = result.search_seconds
+    return Produced(result.mesh, clock.seconds, [f"{result.n_runs} runs", *result.notes])
+
+
+def _wanted(job: Job, clock: _Clock) -> tuple[Image | Content, list[str]]:
+    """What the mesh is to represent, and what to note of it: the image, with labels if they are given."""
+    if job.labels is None:
+        return job.image, []
+    with clock.step("labels"):
+        if np.array_equal(job.image.data, job.labels.data):
+            # As intensities the numbers of labels mean nothing: label 9 is no farther from 1 than 2 is.
+            return content(job.image, labels=job.labels, weights=[0.0]), ["the image is its labels: meshed as labels"]
+        return content(job.image, labels=job.labels), ["meshed from the image and the labels given, equally weighted"]
+
+
+def _by_the_paper(job: Job, k_D: float) -> Produced:
+    clock = _Clock()
+    with clock.step("kernels"):
+        prepare_kernels(job.image, k_D, "paper")
+    with clock.step("lattice"):
+        mesh = lattice(job.image, nodes=job.nodes)
+    with clock.step("optimize"):
+        result = optimize_paper(job.image, mesh, k_D=k_D, iterations=job.iterations)
+    return Produced(result.mesh, clock.seconds, [f"ended by: {result.ended}"])
+
+
+PIPELINES: dict[str, Callable[[Job], Produced]] = {
+    "tetopt": tetopt,
+    "tetopt-uniform": tetopt_uniform,
+    "tetopt-paper": tetopt_paper,
+    "pytetwild": pytetwild,
+    "cleaver": cleaver,
+    "bcc": bcc,
+    "odt": odt,
+}

@@ -1,0 +1,66 @@
+"""What each option of a graded mesh trades: runs around the defaults, one option at a time."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any
+
+from tetopt.engine.fast import GRADED_K_D, mesh_image, optimize
+from tetopt.image import Image
+from tetopt.mesh import Mesh
+from tetopt.start.lattice import lattice
+from tetopt.start.sizes import COARSEST, Sizes
+
+SHAPE_POWER = 3.0
+SWEEPS: dict[str, tuple[float, ...]] = {
+    "k_D": (0.3, 0.5, 0.7, GRADED_K_D, 0.93),
+    "shape power p": (2.0, SHAPE_POWER, 4.0, 6.0),
+    "gradation": (0.2, 0.5, 1.0),
+    "largest edge, of a uniform mesh's": (1.0, 1.15, COARSEST, 2.0, 3.0),
+    "uniform, k_D": (0.0, 0.2, 0.5, 0.8),
+}
+
+
+def tradeoff(
+    image: Image, nodes: int, measure: Callable[[Mesh], dict[str, Any]], say: Callable[[str], None]
+) -> list[dict[str, Any]]:
+    """Meshes of about `nodes` nodes over `SWEEPS`, each with what `measure` finds; the default's are made once.
+
+    Returns
+    -------
+    list of dict
+        "option" and "value", whether all is as by default, and "measured".
+    """
+    found: dict[tuple[str, float] | None, dict[str, Any]] = {}  # by what is changed; None: nothing
+    rows = []
+    for option, values in SWEEPS.items():
+        for value in values:
+            is_default = (option, value) in DEFAULTS
+            changed = None if is_default else (option, value)
+            if changed not in found:
+                say(f"trade-off: {option} = {value:g}")
+                found[changed] = measure(_made(image, nodes, option, value))
+            rows.append({"option": option, "value": value, "is_default": is_default, "measured": found[changed]})
+    return rows
+
+
+DEFAULTS = {
+    ("k_D", GRADED_K_D),
+    ("shape power p", SHAPE_POWER),
+    ("gradation", 1.0),
+    ("largest edge, of a uniform mesh's", COARSEST),
+}
+
+
+def _made(image: Image, nodes: int, option: str, value: float) -> Mesh:
+    """The mesh with one option changed."""
+    if option == "uniform, k_D":
+        return optimize(image, lattice(image, nodes=nodes), k_D=value).mesh
+    largest = Sizes().at_most(image, nodes) / COARSEST
+    changed: dict[str, dict[str, Any]] = {
+        "k_D": {"k_D": value},
+        "shape power p": {"shape_power": value},
+        "gradation": {"sizes": Sizes(gradation=value)},
+        "largest edge, of a uniform mesh's": {"sizes": Sizes(largest=largest * value)},
+    }
+    return mesh_image(image, nodes, **changed[option]).mesh

@@ -1,0 +1,289 @@
+"""What belongs to an image, brought onto its voxels: masks, labels, further contrasts; and what is not background.
+
+Two files of one patient need not share their voxels, only the world: they are matched by their affines, never by
+their shapes. The domain of a grid is the box of its voxels, index -0.5 to shape - 0.5, as everywhere here.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy import ndimage
+
+from tetopt.errors import InputError
+from tetopt.image import Image
+from tetopt.target.content import check_labels
+from tetopt.target.otsu import class_thresholds
+
+SAME_GRID = 1e-4  # voxels by which two affines may differ and be the same: headers hold single precision
+HALF = 0.5  # the level of a probability map that counts as inside
+SHARE = 0.5  # of the image's voxel centres that a further contrast must cover
+SIGMAS = 4.0  # of the background's noise that still count as background
+MAD_TO_SIGMA = 1.4826  # of a normal distribution: its sigma over its median absolute deviation
+SMALL = 0.01  # pieces with less than this share of the largest one's voxels do not count
+FEW = 0.001  # share of the voxels under which a background or foreground found by itself is none
+
+
+def aligned_mask(mask: Image, image: Image, name: str = "mask") -> Image:
+    """The mask on the image's voxels; nearest neighbour by the affines where it is on another grid, 0 outside of it.
+
+    Parameters
+    ----------
+    mask : Image
+        Either two values, 0 and any other above it (bool, 0 and 255), or fractions in [0, 1], a probability map
+        whose level 0.5 counts as the border. One value above 0 everywhere is a mask too: the whole box.
+    image : Image
+    name : str, optional
+        What the mask is called in messages, for example its file.
+
+    Returns
+    -------
+    Image
+        float32; 0 and 1 for a mask of two values, fractions for a probability map. The image's shape and affine.
+
+    Raises
+    ------
+    InputError
+        Another number of axes than the image, other values, nothing inside, or nothing of it in the image's box.
+    """
+    _check_axes(name, mask, image)
+    inside = _mask_values(name, mask.data)
+    moved = _moved(Image(inside, mask.affine), image)
+    if not (moved >= HALF).any():
+        raise InputError(f"{name}: nothing of the mask lies in the image's box; {_both_boxes(mask, image)}")
+    return Image(moved, image.affine)
+
+
+def aligned_labels(labels: Image, image: Image, name: str = "labels") -> Image:
+    """The labels on the image's voxels; nearest neighbour by the affines where they are on another grid, 0 outside.
+
+    Parameters
+    ----------
+    labels : Image
+        Whole numbers from 0 to `tetopt.target.content.LABELS`, 0 the background.
+    image : Image
+    name : str, optional
+        What the labels are called in messages.
+
+    Returns
+    -------
+    Image
+        Whole numbers as float32, the image's shape and affine.
+
+    Raises
+    ------
+    InputError
+        Another number of axes than the image, values that are not such numbers, no label above 0 in the image's box,
+        or one value everywhere in it.
+    """
+    _check_axes(name, labels, image)
+    check_labels(name, labels)
+    moved = _moved(labels, image)
+    top = moved.max()
+    if labels.data.max() == 0:
+        raise InputError(f"{name}: expected labels above 0, got 0 in every voxel; is it the right file?")
+    if top == 0:
+        raise InputError(f"{name}: no label above 0 lies in the image's box; {_both_boxes(labels, image)}")
+    if moved.min() == top:
+        raise InputError(
+            f"{name}: expected two or more labels, got {top:g} in every voxel of the image; there is nothing to tell "
+            "apart, leave it out or take another file"
+        )
+    return Image(moved, image.affine)
+
+
+def aligned_contrast(other: Image, image: Image, name: str = "contrast") -> Image:
+    """A further contrast on the image's voxels; linear by the affines where it is on another grid.
+
+    Outside of its box the nearest value goes on.
+
+    Parameters
+    ----------
+    other : Image
+        Intensities.
+    image : Image
+    name : str, optional
+        What the contrast is called in messages.
+
+    Returns
+    -------
+    Image
+        The image's shape and affine.
+
+    Raises
+    ------
+    InputError
+        Another number of axes than the image, or less than half of the image's voxel centres in its box.
+    """
+    _check_axes(name, other, image)
+    if is_same_grid(other, image):
+        return Image(other.data, image.affine)
+    share = float(_resampled(np.ones(other.shape, dtype=np.uint8), other, image, 0, "grid-constant").mean())
+    if share < SHARE:
+        raise InputError(
+            f"{name}: expected to cover half of the image's voxels or more, got {100 * share:.1f} %; "
+            f"{_both_boxes(other, image)}"
+        )
+    return Image(_resampled(other.data, other, image, 1, "nearest"), image.affine)
+
+
+def foreground(image: Image, level: float | None = None) -> Image:
+    """0/1 mask of what is not background.
+
+    Background are the voxels not above the level that hang together, face to face, with the border of the box: dark
+    cavities inside stay in. Pieces of it with less than a hundredth of the largest one's voxels are not background:
+    vessels, bone and gas that a face of the box cuts through. Likewise pieces of the foreground that small are
+    dropped: noise, tubes.
+
+    Parameters
+    ----------
+    image : Image
+        Brighter than its background.
+    level : float, optional
+        `background_level` by default.
+
+    Returns
+    -------
+    Image
+        float32, 0 and 1, the image's shape and affine.
+
+    Raises
+    ------
+    InputError
+        No background (see `background_level`), or no foreground.
+    """
+    limit = background_level(image) if level is None else float(level)
+    is_outside = _large_pieces(image.data <= limit, at_border=True)
+    is_inside = _large_pieces(~is_outside)
+    share, few = float(is_inside.mean()), FEW if level is None else 0.0
+    if few < share < 1.0 - few:
+        return Image(is_inside, image.affine)
+    if level is None:
+        raise _no_background(f"{100 * share:.4g} % of the voxels would be foreground at level {limit:.4g}")
+    low, high = float(image.data.min()), float(image.data.max())
+    found = "every voxel is foreground" if share > HALF else "nothing is left"
+    raise InputError(
+        f"--background {limit:g}: {found}; give a level between the background's and the tissue's values, the image "
+        f"holds {low:g} to {high:g}"
+    )
+
+
+def background_level(image: Image) -> float:
+    """The highest intensity of the background, from what lies on the faces of the box.
+
+    Of the voxels on the faces the darker ones by Otsu's threshold of the whole image are background, most of them at
+    least: a face may cut the body. Its level is their median and 4 sigma, sigma from the median absolute deviation,
+    to which body on the faces does little (Hampel, The influence curve and its role in robust estimation, JASA 69,
+    1974). A background of one value, as around an extracted brain, has that value for level.
+
+    Raises
+    ------
+    InputError
+        No dark voxels on the faces, or such as do not stand apart: a level not under Otsu's threshold.
+    """
+    data = image.data
+    if data.min() == data.max():
+        raise _no_background(f"every voxel has the value {data.flat[0]:g}")
+    (threshold,) = class_thresholds(data.ravel(), 2)
+    values = _on_faces(data)
+    dark = values[values <= threshold].astype(np.float64)
+    if len(dark) == 0:
+        raise _no_background(f"no voxel on the faces of the box is among the dark ones, up to {threshold:.4g}")
+    middle = np.median(dark)
+    level = float(middle + SIGMAS * MAD_TO_SIGMA * np.median(np.abs(dark - middle)))
+    if level >= threshold:
+        raise _no_background(
+            f"the dark voxels on the faces of the box spread up to {level:.4g}, not under the {threshold:.4g} that "
+            "parts dark from bright"
+        )
+    return level
+
+
+def _no_background(reason: str) -> InputError:
+    return InputError(f"--background auto: no background found, {reason}; give a value, or leave it out")
+
+
+def _check_axes(name: str, other: Image, image: Image) -> None:
+    if other.ndim != image.ndim:
+        raise InputError(
+            f"{name}: expected {image.ndim} axes like the image's {image.shape}, got shape {other.shape}; pick one "
+            "volume or slice"
+        )
+
+
+def _mask_values(name: str, data: NDArray[np.floating]) -> NDArray[np.float32]:
+    """0 and 1, or fractions, as float32; InputError for what is no mask or an empty one."""
+    top = data.max()
+    is_top = data == top
+    if top > 0 and (is_top | (data == 0)).all():
+        return is_top.astype(np.float32)
+    if data.min() < 0 or top > 1:
+        values = np.unique(data)
+        some = ", ".join(f"{value:g}" for value in values[:5]) + (", ..." if len(values) > 5 else "")
+        raise InputError(
+            f"{name}: expected a mask, 0 and one other value or fractions from 0 to 1, got {len(values)} values from "
+            f"{values[0]:g} to {values[-1]:g} ({some}); choose one label of it, or a threshold"
+        )
+    if top < HALF:
+        found = "0 in every voxel" if top == 0 else f"fractions up to {top:g}"
+        raise InputError(f"{name}: the mask is empty, expected voxels of {HALF} or more, got {found}")
+    return data.astype(np.float32)
+
+
+def _moved(other: Image, image: Image) -> NDArray[np.floating]:
+    """Values of `other` at the image's voxel centres: of the voxel around them, 0 outside."""
+    return other.data if is_same_grid(other, image) else _resampled(other.data, other, image, 0, "grid-constant")
+
+
+def is_same_grid(other: Image, image: Image) -> bool:
+    """Whether two images have the same voxels, to within 1e-4 voxel."""
+    corners = _corners(image)
+    return other.shape == image.shape and bool(
+        np.abs(other.to_index(image.to_world(corners)) - corners).max() <= SAME_GRID
+    )
+
+
+def _resampled(data: NDArray, other: Image, image: Image, order: int, mode: str) -> NDArray:
+    """`data`, on the grid of `other`, at the image's voxel centres.
+
+    Of scipy's modes `grid-constant` fills a grid's outer half voxels from their own voxels, `constant` leaves them out.
+    """
+    n = image.ndim
+    corner = other.to_index(image.to_world(np.vstack([np.zeros(n), np.eye(n)])))
+    matrix, offset = (corner[1:] - corner[0]).T, corner[0]
+    if order == 0:  # centres halfway between two voxels, on a grid shifted by half a voxel, all go to the upper one
+        offset = offset + SAME_GRID
+    return ndimage.affine_transform(data, matrix, offset, image.shape, data.dtype, order=order, mode=mode)
+
+
+def _corners(image: Image) -> NDArray[np.float64]:
+    """The corners of the image's box, (2^n, n) indices."""
+    return np.array(list(product(*((-0.5, s - 0.5) for s in image.shape))))
+
+
+def _both_boxes(other: Image, image: Image) -> str:
+    return f"it spans {_extent(other)} mm, the image {_extent(image)} mm: do both lie in the same world mm?"
+
+
+def _extent(image: Image) -> str:
+    world = image.to_world(_corners(image))
+    return " x ".join(f"{a:.1f}..{b:.1f}" for a, b in zip(world.min(axis=0), world.max(axis=0), strict=True))
+
+
+def _on_faces(data: NDArray) -> NDArray:
+    """The values on all faces of the box, one after the other."""
+    return np.concatenate([data.take(end, axis).ravel() for axis in range(data.ndim) for end in (0, -1)])
+
+
+def _large_pieces(is_in: NDArray[np.bool_], at_border: bool = False) -> NDArray[np.bool_]:
+    """Pieces, connected face to face, of at least `SMALL` of the largest; with `at_border` of those that touch it."""
+    pieces, _ = ndimage.label(is_in)
+    sizes = np.bincount(pieces.ravel())
+    sizes[0] = 0
+    if at_border:
+        is_inner = np.ones(len(sizes), dtype=np.bool_)
+        is_inner[_on_faces(pieces)] = False
+        sizes[is_inner] = 0
+    return (sizes >= max(1.0, SMALL * sizes.max()))[pieces]

@@ -1,0 +1,294 @@
+"""What a mesh is to represent: one or several contrasts, labels, a mask, on the voxels of one image.
+
+E_D of Eq. (3) is summed over channels: for each contrast its intensities, for labels one channel each that is 1 where
+the label is (one-hot), so that a cell of one value in all channels is one tissue. How much each counts is stated by
+weights: with weight 1 a channel's variance over the domain counts as much as the first image's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.ndimage import binary_erosion, distance_transform_edt, find_objects, maximum_filter
+
+from tetopt.errors import InputError
+from tetopt.image import Image
+from tetopt.target.domain import HALF, Domain, domain
+
+SAMPLE = 100_000  # voxels, of which the most frequent value is taken for the background's
+FEW = 32  # values, at most, that an image of labels has
+LABELS = 32_767  # largest label
+REACH = 4  # voxels: labels that come no nearer may share a channel
+RARE = 0.5  # power of a label's share of voxels by which it counts less
+SAME_PLACE = 1e-2  # voxel: what lies no further away is in the same place
+LEVELS = 256.0  # into which a contrast's standard deviation is divided, at least
+WEIGHTS = 1e-3, 1e3  # the least and the largest, besides 0
+MARGIN = 4  # voxels around a mask
+SURFACE = 4.0  # of the variance: what a voxel on the wrong side of the region's surface counts
+MOST = 2.0**31  # sums of squares along a row stay below, so that they are exact in 32 bits
+
+
+class Content(NamedTuple):
+    """What a mesh is to represent; made by `content`."""
+
+    image: Image  # the voxels, and the first contrast; only those around the mask, where there is one
+    values: NDArray  # (C, *image.shape) what is to be one value in a cell, in one unit
+    n_contrasts: int  # the first of them: images, not labels
+    unit: float  # squared intensity of the image for 1 squared of `values`
+    is_plain: bool  # whether `values` is the image's own data, else whole numbers
+    region: Domain | None  # what is to be covered; None for the image's box
+
+    @property
+    def n_voxels(self) -> int:
+        """Voxels to be covered."""
+        return self.image.data.size if self.region is None else int(self.region.inside.sum())
+
+    @property
+    def volume(self) -> float:
+        """What they fill, mm^n."""
+        return self.n_voxels * self.image.voxel_volume
+
+    @property
+    def variance(self) -> float:
+        """Variance over the voxels to be covered, of all channels, intensity^2; times `volume`: E_D of one cell."""
+        return self.unit * sum(_variance(values, self.region) for values in self.values)
+
+    @property
+    def wrong_side(self) -> float:
+        """What a voxel on the wrong side of the region's surface counts, in squared units of `values`."""
+        return SURFACE * (self.variance / self.unit or 1.0)
+
+    @property
+    def noise(self) -> float:
+        """Variance of the contrasts' noise, in the unit of `values`; labels have none."""
+        inside = None if self.region is None else self.region.inside
+        return float(sum(noise_level(v, inside) ** 2 for v in self.values[: self.n_contrasts]))
+
+
+def content(
+    images: Image | Sequence[Image], labels: Image | None = None, mask: Image | None = None, *,
+    weights: Sequence[float] | None = None, label_weight: float = 1.0,
+) -> Content:  # fmt: skip
+    """Contrasts, labels and a mask on the voxels of the first image, for `mesh_image`, `octree` or `optimize`.
+
+    Parameters
+    ----------
+    images : Image or sequence of Image
+        Contrasts, all on the voxels of the first (`tetopt.target.align` puts them there).
+    labels : Image, optional
+        Whole numbers from 0, on the same voxels.
+    mask : Image, optional
+        0 to 1 on the same voxels: the mesh covers the region where it is a half or more, and its boundary follows that
+        region's surface (`tetopt.target.domain`). Outside, images and labels are continued by the nearest value inside,
+        so that what lies beyond the surface has no say.
+    weights : sequence of float, optional
+        One for each image, 1 by default: with 1 an image's variance counts as much as the first's, whatever its scale.
+        0.001 to 1000, or 0, which leaves an image out.
+    label_weight : float
+        Likewise for the labels altogether. Of the labels the rarer count more by voxel.
+
+    Raises
+    ------
+    InputError
+        Images of different shapes, wrong weights, labels that are not whole numbers from 0, nothing that counts.
+    """
+    images = [images] if isinstance(images, Image) else list(images)
+    weights = [1.0] * len(images) if weights is None else [float(w) for w in weights]
+    _check(images, {"labels": labels, "mask": mask}, weights, label_weight)
+    region = None
+    if mask is not None:
+        part = _around(mask)
+        region = domain(_part(mask, part))
+        images = [_continued(_part(image, part), region.inside) for image in images]
+        labels = None if labels is None else _continued(_part(labels, part), region.inside)
+    if len(images) == 1 and labels is None and weights[0] > 0.0:
+        return plain(images[0])._replace(region=region)
+    contrasts = _scaled(images, weights, region)
+    number, codes = np.zeros(images[0].shape, dtype=np.int64), np.zeros((0, 1))
+    if labels is not None and label_weight > 0.0:
+        number, codes = _one_hot(labels.data.astype(np.int64), region)
+        codes = np.sqrt(label_weight) * codes
+        if len(codes) == 0:
+            raise InputError(
+                "labels: the same everywhere in what is meshed, there is nothing to tell apart; leave them out"
+            )
+    if len(contrasts) + len(codes) == 0:
+        raise InputError("weights: nothing that differs between voxels counts; give one above 0")
+    values, scale = _whole(contrasts, number, codes)
+    unit = _variance(images[0].data, region) or 1.0
+    return Content(images[0], values, len(contrasts), unit / scale**2, False, region)
+
+
+def _scaled(images: list[Image], weights: list[float], region: Domain | None) -> list[NDArray[np.float32]]:
+    """The contrasts that count less their means, of variance `weight` each."""
+    found = []
+    for image, weight in zip(images, weights, strict=True):
+        data = image.data - np.mean(image.data if region is None else image.data[region.inside], dtype=np.float64)
+        spread = _variance(data, region)
+        if not np.isfinite(spread):
+            raise InputError("image: squares of intensities overflow; rescale it first")
+        if weight > 0.0 and spread > 0.0:
+            found.append((np.sqrt(weight / spread) * data).astype(np.float32))
+    return found
+
+
+def _whole(
+    contrasts: list[NDArray[np.float32]], number: NDArray[np.int64], codes: NDArray[np.float64]
+) -> tuple[NDArray[np.int32], float]:
+    """All channels, (C, *shape), as whole numbers, and their scale.
+
+    If it can be, their sums of squares along a row fit 32 bits.
+    """
+    square = sum(float(np.abs(data).max()) ** 2 for data in contrasts) + float((codes**2).max(initial=0.0))
+    fitting = float(np.sqrt(0.9 * MOST / (number.shape[-1] * square)))
+    # Where one voxel, or a rare label, is much larger than the rest, sums are of 64 bits rather than levels few.
+    steps = [LEVELS / float(np.std(data, dtype=np.float64)) for data in contrasts]
+    largest = max([float(np.abs(data).max()) for data in contrasts] + [float(codes.max(initial=0.0))])
+    scale = min(max([fitting, *steps]), 2.0**30 / largest)
+    values = np.empty((len(contrasts) + len(codes), *number.shape), dtype=np.int32)
+    for row, data in zip(values, contrasts, strict=False):
+        row[:] = np.rint(scale * data)
+    for row, code in zip(values[len(contrasts) :], codes, strict=True):
+        row[:] = np.rint(scale * code).astype(np.int32)[number]
+    return values, scale
+
+
+def plain(image: Image | Content) -> Content:
+    """An image by itself; a content is returned as it is."""
+    return image if isinstance(image, Content) else Content(image, image.data[None], 1, 1.0, True, None)
+
+
+def _variance(values: NDArray, region: Domain | None) -> float:
+    with np.errstate(over="ignore"):
+        return float(np.var(values if region is None else values[region.inside], dtype=np.float64))
+
+
+def _around(mask: Image) -> tuple[slice, ...]:
+    """The voxels around a mask, with a margin: what lies further away takes only time."""
+    inside = mask.data >= HALF
+    if not inside.any():
+        raise InputError("mask: no voxel has a half or more, there is nothing to mesh")
+    box = find_objects(inside.astype(np.int8))[0]
+    return tuple(slice(max(s.start - MARGIN, 0), min(s.stop + MARGIN, n)) for s, n in zip(box, mask.shape, strict=True))
+
+
+def _part(image: Image, part: tuple[slice, ...]) -> Image:
+    affine = image.affine.copy()
+    affine[:-1, -1] = image.to_world([s.start for s in part])
+    return Image(image.data[part], affine)
+
+
+def _continued(image: Image, inside: NDArray[np.bool_]) -> Image:
+    """The image with the nearest value of those inside wherever it is outside."""
+    if inside.all():
+        return image
+    nearest = distance_transform_edt(~inside, image.spacing, return_distances=False, return_indices=True)
+    return Image(image.data[tuple(nearest)], image.affine)
+
+
+def _check(images: list[Image], others: dict[str, Image | None], weights: list[float], label_weight: float) -> None:
+    if not images:
+        raise InputError("images: expected one or more, got none")
+    first = images[0]
+    named = [*(("images", image) for image in images), *((name, image) for name, image in others.items() if image)]
+    for name, image in named:
+        if image.shape != first.shape:
+            raise InputError(
+                f"{name}: expected all of shape {first.shape}, got {image.shape}; see tetopt.aligned_mask and the like"
+            )
+        last = np.array(first.shape) - 1
+        if np.abs(first.to_index(image.to_world([0 * last, last])) - [0 * last, last]).max() > SAME_PLACE:
+            raise InputError(f"{name}: expected voxels in the same place as the first image's; see tetopt.aligned_mask")
+    low, high = WEIGHTS
+    if len(weights) != len(images) or not all(w == 0.0 or low <= w <= high for w in weights):
+        raise InputError(
+            f"weights: expected one for each of {len(images)} images, 0 or {low:g} to {high:g}, got {weights}"
+        )
+    if not (label_weight == 0.0 or low <= label_weight <= high):
+        raise InputError(f"label_weight: expected 0 or {low:g} to {high:g}, got {label_weight}")
+    if others["labels"] is not None:
+        check_labels("labels", others["labels"])
+
+
+def check_labels(name: str, labels: Image) -> None:
+    """InputError unless the voxels are whole numbers from 0 to `LABELS`."""
+    data = labels.data
+    wrong = np.argwhere((data < 0) | (data > LABELS) | (np.rint(data) != data))
+    if len(wrong):
+        first = tuple(int(i) for i in wrong[0])
+        raise InputError(
+            f"{name}: labels must be whole numbers from 0 to {LABELS}, {len(wrong)} voxels have others, the first "
+            f"{data[first]:g} at {first}; is it a label image?"
+        )
+
+
+def _one_hot(labels: NDArray[np.int64], region: Domain | None) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Channels that tell K labels apart: each voxel's row, and the rows' values in C channels, (C, K).
+
+    Each label has its value in one channel and 0 in the others. Labels that come nowhere near one another share a
+    channel. By voxel a label counts by its share of the voxels to the power -`RARE`, so that small ones are not given
+    up for the surfaces of large ones; the variance of all is 1.
+    """
+    counts = np.bincount(labels.ravel() if region is None else labels[region.inside])
+    there = np.flatnonzero(counts)
+    row = np.zeros(len(counts), dtype=np.int64)
+    row[there] = np.arange(len(there))
+    number, share = row[labels], counts[there] / counts.sum()
+    size = share ** (-0.5 * RARE)
+    channel = _colours(number, len(share))
+    codes = np.where(channel == np.arange(channel.max() + 1)[:, None], size, 0.0)
+    spread = float((codes**2 @ share - (codes @ share) ** 2).sum())
+    return number, (codes / np.sqrt(spread) if len(share) > 1 else codes[:0])
+
+
+def continued(image: Image, mask: Image | None) -> Image:
+    """An image with the nearest value within a mask wherever it is outside: what cells at the boundary stand for."""
+    if mask is None:
+        return image
+    part = _around(mask)
+    return _continued(_part(image, part), mask.data[part] >= HALF)
+
+
+def _colours(number: NDArray[np.int64], n_labels: int) -> NDArray[np.int64]:
+    """A channel for each label: labels within `REACH` voxels of one another have different ones."""
+    shape = tuple(-(-s // REACH) for s in number.shape)
+    block = np.ravel_multi_index(np.meshgrid(*[np.arange(s) // REACH for s in number.shape], indexing="ij"), shape)
+    is_there = np.zeros((n_labels, int(np.prod(shape))), dtype=bool)
+    is_there[number.ravel(), block.ravel()] = True
+    near = np.stack([maximum_filter(row.reshape(shape), size=3).ravel() for row in is_there])
+    touches = near.astype(np.float32) @ is_there.T.astype(np.float32) > 0.0
+    channel = np.full(n_labels, -1, dtype=np.int64)
+    for label in np.argsort(-touches.sum(axis=1), kind="stable"):
+        taken = set(channel[touches[label]].tolist())
+        channel[label] = next(c for c in range(n_labels) if c not in taken)
+    return channel
+
+
+def noise_level(data: NDArray, inside: NDArray[np.bool_] | None = None) -> float:
+    """Standard deviation of the noise in an image's data, from what second differences along every axis leave of it.
+
+    Structure wider than a voxel cancels in (1, -2, 1) taken along all axes (Immerkaer 1996, here in n-D); the lower
+    quartile of its size is that of noise in most of the volume. A background of one value, cut out, does not count;
+    what is left in less than a tenth of the voxels are edges, not noise, and labels have none. Noise that was smoothed
+    is underestimated. With `inside` only the voxels there, and not beside others, are asked.
+    """
+    if min(data.shape) < 3:
+        return 0.0
+    rest = data.astype(np.float64)
+    for axis in range(data.ndim):
+        rest = np.diff(rest, n=2, axis=axis)
+    # Few values are labels, and have none.
+    values, often = np.unique(data.ravel()[:: max(data.size // SAMPLE, 1)], return_counts=True)
+    if len(values) <= FEW:
+        return 0.0
+    middle = (slice(1, -1),) * data.ndim
+    is_asked = (rest != 0.0) | (data[middle] != values[often.argmax()])
+    if inside is not None:
+        is_asked &= binary_erosion(inside, np.ones((3,) * data.ndim), border_value=1)[middle]
+    size = np.abs(rest[is_asked])
+    if np.count_nonzero(size) < 0.1 * (rest.size if inside is None else inside.sum()):
+        return 0.0
+    return float(np.quantile(size, 0.25) / 0.31864 / 6.0 ** (data.ndim / 2))

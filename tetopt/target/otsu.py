@@ -1,0 +1,70 @@
+"""Thresholds between the classes of an image: Otsu's method (1979), for any number of classes."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.errors import InputError
+
+BINS = 256  # of the histogram whose classes are found
+
+
+def class_thresholds(values: NDArray, classes: int, weights: NDArray | None = None) -> NDArray[np.float64]:
+    """Thresholds between the classes that leave the least variance within them (Otsu 1979, for any number).
+
+    Exact on a histogram of 256 bins, by dynamic programming over the last bin of each class (Fisher 1958).
+
+    Parameters
+    ----------
+    values : (K,) float
+        Intensities.
+    classes : int
+        Number of classes, 2 or more.
+    weights : (K,) float, optional
+        Weight of each value, 1 by default.
+
+    Returns
+    -------
+    (classes - 1,) float64
+        Ascending; class c holds the values v with ``np.digitize(v, thresholds) == c``.
+
+    Raises
+    ------
+    InputError
+        Fewer than 2 classes, or fewer different bins than classes.
+    """
+    if classes < 2:
+        raise InputError(f"classes: expected 2 or more, got {classes}")
+    counts, edges = np.histogram(values, bins=BINS, weights=weights)
+    is_filled = counts > 0
+    if is_filled.sum() < classes:
+        raise InputError(f"classes: {classes} asked for, but the values fill only {is_filled.sum()} of {BINS} bins")
+    centres = 0.5 * (edges[1:] + edges[:-1])[is_filled]
+    counts = counts[is_filled].astype(np.float64)
+    within = _within_class_sums(counts, centres - centres.mean())
+    n = len(counts)
+    cost = within[0, 1:]  # of one class over bins 0 .. b
+    last_cut = []
+    for _ in range(classes - 1):
+        candidates = np.full((n, n), np.inf)  # [first bin of the last class, its last bin]
+        candidates[1:] = cost[:-1, None] + within[1:n, 1:]
+        last_cut.append(candidates.argmin(axis=0))
+        cost = candidates.min(axis=0)
+    cuts, end = [], n - 1
+    for cut in reversed(last_cut):
+        cuts.append(cut[end])
+        end = cut[end] - 1
+    first = np.array(cuts[::-1])
+    # Halfway between the last filled bin of one class and the first of the next.
+    return 0.5 * (centres[first - 1] + centres[first])
+
+
+def _within_class_sums(counts: NDArray[np.float64], centres: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Sum of squares around the mean over bins a .. b-1, entry [a, b]; infinite for empty runs, (n, n+1)."""
+    n = len(counts)
+    sums = [np.concatenate([[0.0], np.cumsum(counts * centres**power)]) for power in range(3)]
+    weight, first, second = (s[None, :] - s[:-1, None] for s in sums)
+    is_run = np.arange(n + 1)[None, :] > np.arange(n)[:, None]
+    spread = second - np.divide(first**2, weight, out=np.zeros_like(first), where=is_run)
+    return np.where(is_run, np.maximum(spread, 0.0), np.inf)
