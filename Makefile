@@ -9,7 +9,7 @@ TESTED = PYTHONUTF8=1 NUMBA_CACHE_DIR=$(NUMBA_CACHE) MPLBACKEND=agg $(BIN)/pytho
 
 SOLVERS = calculix-ccx python3-dolfinx
 
-.PHONY: demo test test-slow test-solvers test-nojit test-onethread lint bench clean
+.PHONY: demo test test-slow test-solvers test-nojit test-onethread lint bench fingerprints clean
 
 demo: $(VENV)/.demo
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt demo -o demo --force
@@ -45,6 +45,10 @@ lint: $(VENV)/.test
 bench: $(VENV)/.test
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python scripts/benchmark.py -o bench.json --force
 
+# Whether meshes are still those of the version that wrote tests/fingerprints.json, to the last bit.
+fingerprints: $(VENV)/.test
+	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python scripts/fingerprints.py -o fingerprints.json --against tests/fingerprints.json --force
+
 $(VENV)/bin/python:
 	@$(PYTHON) -c 'import sys; sys.exit(sys.version_info < (3, 11))' || \
 	  { echo "tetopt needs Python >= 3.11; name one with: make PYTHON=python3.12"; exit 2; }
@@ -59,4 +63,4 @@ $(VENV)/.test: $(VENV)/bin/python pyproject.toml
 	@touch $@
 
 clean:
-	rm -rf $(VENV) .numba_cache demo bench.json
+	rm -rf $(VENV) .numba_cache demo bench.json fingerprints.json

@@ -71,6 +71,21 @@ def test_benchmark(tmp_path, capsys):
     assert all(0.0 < row["delaunay_share"] < 1.0 for row in rows["paper"])
 
 
+def test_fingerprints(tmp_path, capsys):
+    """The same run has the same checksums; another one is named, and is exit code 1."""
+    main, first, second = script("fingerprints").main, tmp_path / "first.json", tmp_path / "second.json"
+    assert main(["-o", str(first), "--only", "oblique_paper"]) == 0
+    assert main(["-o", str(second), "--only", "oblique_paper", "--against", str(first)]) == 0
+    assert "1 of 1 runs as in" in capsys.readouterr().out
+    written = json.loads(first.read_text())
+    written["runs"]["oblique_paper"]["mesh"] = "0" * 64
+    first.write_text(json.dumps(written))
+    assert main(["-o", str(second), "--only", "oblique_paper", "--against", str(first), "--force"]) == 1
+    assert "differs: oblique_paper: mesh\n" in capsys.readouterr().out
+    assert main(["-o", str(second), "--only", "oblique_paper"]) == 2
+    assert "exists" in capsys.readouterr().err
+
+
 def test_choose_sizes(tmp_path, monkeypatch, capsys):
     """Every mesh is measured; a tighter largest edge leaves more E_D and follows the displacement better."""
     monkeypatch.syspath_prepend(str(SCRIPTS))
