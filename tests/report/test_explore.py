@@ -99,7 +99,7 @@ def test_the_image_is_where_its_affine_puts_it(mesh, image):
 
 
 def test_a_large_image_is_averaged_over_the_same_box(mesh, image, monkeypatch):
-    monkeypatch.setattr(explore, "MAX_VOXELS", 600)
+    monkeypatch.setattr(explore, "PAGE_IMAGE_VOXELS", 600)
     whole = packed(explorer_html(mesh, {}, image))["image"]
     assert np.prod(whole["shape"]) <= 600
     assert whole["original"] == list(image.shape)

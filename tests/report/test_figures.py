@@ -17,9 +17,16 @@ from tetopt.measure.fidelity import cell_labels
 from tetopt.measure.quality import rho_histogram
 from tetopt.mesh import Mesh
 from tetopt.report import figures
-from tetopt.report.colours import BACKGROUND, LISTED, PALETTE, UNCOVERED, label_colours, legend_patches
+from tetopt.report.colours import (
+    BACKGROUND_COLOUR,
+    LABEL_PALETTE,
+    LISTED_LABELS,
+    UNCOVERED_COLOUR,
+    label_colours,
+    legend_patches,
+)
 from tetopt.report.figures import (
-    DETAIL,
+    DETAIL_VOXELS,
     _View,
     boundary_figure,
     energy_figure,
@@ -282,7 +289,7 @@ def test_nothing_is_drawn_where_a_mesh_leaves_the_image_uncovered(n):
         polygons = np.concatenate([path.vertices for path in drawn.get_paths()])
         np.testing.assert_allclose([polygons.min(axis=0), polygons.max(axis=0)], [[0.0, 0.0], [4.0, 7.0]], atol=1e-9)
         assert axes.get_xlim() == (0.0, 10.0)  # the whole image stays in view
-    assert figure.axes[1].get_facecolor() == to_rgba(UNCOVERED)
+    assert figure.axes[1].get_facecolor() == to_rgba(UNCOVERED_COLOUR)
 
 
 def test_a_slice_beside_the_mesh_is_empty():
@@ -310,7 +317,7 @@ def cielab(colours, seen):
 
 @pytest.mark.parametrize("seen", [np.eye(3), NO_RED, NO_GREEN], ids=["all cones", "no red", "no green"])
 def test_colours_are_told_apart_by_the_colour_blind(seen):
-    lab = cielab(to_rgba_array([*PALETTE, BACKGROUND])[:, :3], seen)
+    lab = cielab(to_rgba_array([*LABEL_PALETTE, BACKGROUND_COLOUR])[:, :3], seen)
     apart = np.linalg.norm(lab[:, None] - lab, axis=2) + np.where(np.eye(len(lab)), np.inf, 0.0)
     assert apart[:-1, :-1].min() > 10.0
     assert apart[:20, :20].min() > 14.0
@@ -320,21 +327,21 @@ def test_colours_are_told_apart_by_the_colour_blind(seen):
 def test_the_largest_labels_have_the_first_colours():
     colours = label_colours(Image(np.array([[7, 7, 7, 0], [2, 2, 5, 0], [0, 0, 0, 0]])))
     assert colours.shape == (8, 3)
-    for label, colour in ((0, BACKGROUND), (7, PALETTE[0]), (2, PALETTE[1]), (5, PALETTE[2])):
+    for label, colour in ((0, BACKGROUND_COLOUR), (7, LABEL_PALETTE[0]), (2, LABEL_PALETTE[1]), (5, LABEL_PALETTE[2])):
         np.testing.assert_array_equal(colours[label], to_rgb(colour))
 
 
 def test_colours_begin_again_after_the_last():
-    n = len(PALETTE)
+    n = len(LABEL_PALETTE)
     colours = label_colours(Image(np.arange(n + 2)[:, None]))
-    np.testing.assert_array_equal(colours[n + 1], to_rgb(PALETTE[0]))
+    np.testing.assert_array_equal(colours[n + 1], to_rgb(LABEL_PALETTE[0]))
     assert len(np.unique(colours[: n + 1], axis=0)) == n + 1
     with pytest.raises(InputError, match="whole numbers"):
         label_colours(Image(np.array([[0.5, 1.0]])))
 
 
 def test_a_legend_lists_the_largest_and_counts_the_others():
-    shown = np.array([50, 0, *range(1, LISTED + 2)])  # 0, 2 .. 14; the least are 2 and 3
+    shown = np.array([50, 0, *range(1, LISTED_LABELS + 2)])  # 0, 2 .. 14; the least are 2 and 3
     colours = np.random.default_rng(0).uniform(size=(20, 3))
     entries = legend_patches(colours, shown)
     assert [entry.get_label() for entry in entries] == [*(str(k) for k in (0, *range(4, 15))), "and 2 more"]
@@ -379,12 +386,12 @@ def test_labels_of_a_part_and_of_a_plane():
 
 
 def test_numbers_stand_in_their_labels_where_a_legend_is_too_short():
-    labels = blocks_of_labels(LISTED + 3)
+    labels = blocks_of_labels(LISTED_LABELS + 3)
     figure = label_figure(labels, lattice(labels, blocks=(4, 2, 2)))
     assert figure.legends[0].get_texts()[-1].get_text() == "and 3 more"
     view, given = _View(labels, None, None), figure.axes[0]
     numbers = [text for text in given.texts if text.get_text().isdigit()]
-    assert [text.get_text() for text in numbers] == [str(k) for k in range(1, LISTED + 3)]
+    assert [text.get_text() for text in numbers] == [str(k) for k in range(1, LISTED_LABELS + 3)]
     for text in numbers:
         pixel = (np.array(text.get_position()) / view.steps).astype(int)
         assert view.pixels[tuple(pixel)] == int(text.get_text())
@@ -461,11 +468,11 @@ def test_the_detail_is_where_the_outline_bends_most():
     mask[28:40, 60:64] = 0.0
     whole, detail = boundary_figure(image, Image(mask, image.affine), lower_part(image, 0, 40)).axes
     low, high = np.transpose([detail.get_xlim(), detail.get_ylim()])
-    np.testing.assert_allclose(high - low, 2.0 * DETAIL)
+    np.testing.assert_allclose(high - low, 2.0 * DETAIL_VOXELS)
     assert (low <= [56.0, 120.0]).all()
     assert (high >= [80.0, 128.0]).all()
     (frame,) = whole.patches
-    np.testing.assert_allclose([*frame.get_xy(), frame.get_width()], [*low, 2.0 * DETAIL])
+    np.testing.assert_allclose([*frame.get_xy(), frame.get_width()], [*low, 2.0 * DETAIL_VOXELS])
     assert whole.get_xlim() == (0.0, 160.0)
 
 

@@ -9,7 +9,7 @@ from tetopt.measure.fidelity import cell_labels
 from tetopt.report import scene
 from tetopt.report.colours import label_colours
 from tetopt.report.scene import (
-    SURFACE,
+    STRUCTURE_COLOUR,
     _slice_sheet,
     dark_structure_surface,
     save_cutaway,
@@ -54,7 +54,7 @@ def test_scenes_are_drawn_side_by_side(tmp_path, opengl):
     save_scenes(tmp_path / "a.png", scenes)
     pixels = np.asarray(PIL.Image.open(tmp_path / "a.png").convert("RGB")).astype(int)
     left, right = pixels[:, :1100], pixels[:, 1100:]
-    colour = np.array([int(SURFACE[i : i + 2], 16) for i in (1, 3, 5)])
+    colour = np.array([int(STRUCTURE_COLOUR[i : i + 2], 16) for i in (1, 3, 5)])
 
     def orange(part):  # shaded: the colour's direction, any brightness
         size = np.linalg.norm(part, axis=-1) + 1e-9

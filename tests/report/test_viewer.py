@@ -12,7 +12,7 @@ from browser import browser
 import tetopt
 from tetopt.errors import InputError
 from tetopt.report.page import write_page
-from tetopt.report.viewer import STYLE, View, grey_limits, view_of, views_html
+from tetopt.report.viewer import VIEWS_STYLE, View, grey_limits, view_of, views_html
 
 
 @pytest.fixture(scope="module")
@@ -106,7 +106,9 @@ def test_size(opened):
 def page(tmp_path_factory, opened):
     folder = tmp_path_factory.mktemp("viewer")
     mesh, _, view = opened
-    write_page(folder / "a.html", "t", [views_html([view, view_of(mesh, np.zeros(len(mesh.cells)), "flat")])], STYLE)
+    write_page(
+        folder / "a.html", "t", [views_html([view, view_of(mesh, np.zeros(len(mesh.cells)), "flat")])], VIEWS_STYLE
+    )
     return folder / "a.html"
 
 

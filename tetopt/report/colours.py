@@ -10,13 +10,13 @@ from numpy.typing import NDArray
 from tetopt.image import Image
 from tetopt.target.content import check_labels
 
-BACKGROUND = "#e6e6e6"  # of label 0
-UNCOVERED = "#cfe3f5"  # where a mesh leaves the image uncovered
-LISTED = 12  # labels in a legend; more would not be told apart by their colours alone
+BACKGROUND_COLOUR = "#e6e6e6"  # of label 0
+UNCOVERED_COLOUR = "#cfe3f5"  # where a mesh leaves the image uncovered
+LISTED_LABELS = 12  # labels in a legend: more would not be told apart by their colours alone
 # Okabe and Ito's, then always the colour farthest in CIELAB from all before, and twice as far from the background,
 # black and white, as seen with normal, no red or no green cones (Machado et al. 2009): any two are 10 or more apart, of
 # the first 20 any two 14, and all are 20 from the background.
-PALETTE = (
+LABEL_PALETTE = (
     "#0072b2", "#e69f00", "#009e73", "#d55e00", "#56b4e9", "#cc79a7", "#f0e442", "#0000ff", "#6969ff", "#5a00b4",
     "#963c1e", "#87d269", "#781e78", "#7896ff", "#f02d5a", "#a51e69", "#d200b4", "#004bff", "#b40f4b", "#f07887",
     "#e15a3c", "#690f96", "#3cf096", "#f0964b", "#1e4b2d", "#2d6978", "#c32d00", "#a52dd2", "#3c00d2", "#e178d2",
@@ -27,8 +27,8 @@ PALETTE = (
 def label_colours(labels: Image) -> NDArray[np.float64]:
     """Colour of each label, so that ``label_colours(labels)[label]`` paints an array of labels.
 
-    The labels with most voxels have the colours that are told apart best; those after the 40th begin again. 0 is the
-    background, in light grey.
+    The labels with most voxels have the colours that are told apart best; after the palette's last they begin again.
+    0 is the background, in light grey.
 
     Parameters
     ----------
@@ -49,13 +49,13 @@ def label_colours(labels: Image) -> NDArray[np.float64]:
     counts = np.bincount(labels.data.astype(np.int64).ravel())
     by_size = np.argsort(-counts[1:], kind="stable") + 1
     colours = np.empty((len(counts), 3))
-    colours[0] = to_rgba_array(BACKGROUND)[0, :3]
-    colours[by_size] = to_rgba_array(PALETTE)[np.arange(len(by_size)) % len(PALETTE), :3]
+    colours[0] = to_rgba_array(BACKGROUND_COLOUR)[0, :3]
+    colours[by_size] = to_rgba_array(LABEL_PALETTE)[np.arange(len(by_size)) % len(LABEL_PALETTE), :3]
     return colours
 
 
 def legend_patches(colours: NDArray[np.float64], shown: NDArray[np.integer]) -> list[Patch]:
-    """A legend's entries: the `LISTED` labels of which most is shown, ascending, then how many more there are.
+    """A legend's entries: the `LISTED_LABELS` labels of which most is shown, ascending, then how many more there are.
 
     Parameters
     ----------
@@ -67,8 +67,8 @@ def legend_patches(colours: NDArray[np.float64], shown: NDArray[np.integer]) -> 
     by_size = np.argsort(-shown, kind="stable")[: np.count_nonzero(shown)]
     entries = [
         Patch(facecolor=colours[label], edgecolor="black", linewidth=0.5, label=f"{label}")
-        for label in np.sort(by_size[:LISTED])
+        for label in np.sort(by_size[:LISTED_LABELS])
     ]
-    if len(by_size) > LISTED:
-        entries.append(Patch(facecolor="none", label=f"and {len(by_size) - LISTED} more"))
+    if len(by_size) > LISTED_LABELS:
+        entries.append(Patch(facecolor="none", label=f"and {len(by_size) - LISTED_LABELS} more"))
     return entries

@@ -29,15 +29,15 @@ from tetopt.report.colours import label_colours
 from tetopt.report.viewer import grey_limits
 from tetopt.target.content import LABELS
 
-MAX_VOXELS = 2**24  # of an image in the page, a byte each; beyond, neighbours are averaged
-MAX_SIDE = 2048  # voxels along an axis of it: what nearly every graphics card takes
+PAGE_IMAGE_VOXELS = 2**24  # 16 MB, a byte each: an image with more is averaged
+PAGE_SIDE_VOXELS = 2048  # along an axis of it: what nearly every graphics card takes
 COLOUR_MAP = "viridis"  # perceptually even
-MAX_LABELS = 128  # whole numbers of more values than this are a quantity
+MAX_LABELS = 128  # Whole numbers with more values than this are a quantity: no list of colours that long is read.
 NO_VALUE = "#aaaaaa"  # of cells whose value is not a number
-LEFT_OUT = 1.0  # percent of the cells at either end of a field whose values do not stretch its colours
+OUTLIERS_PERCENT = 1.0  # of the cells, at either end of a field: their values do not stretch its colours
 _FILES = ("explore.html", "explore_mesh.js", "explore_gl.js", "explore.js")
 # Of the fields that tetopt writes, which are quantities even where they are whole numbers.
-UNITS = {
+FIELD_UNITS = {
     "mean": "intensity", "variance": "intensity²", "n_voxels": "voxels", "min": "intensity", "max": "intensity",
     "volume": "mm³", "rho": "0 to 1/3", "min_dihedral": "degrees", "young": "kPa",
 }  # fmt: skip
@@ -89,11 +89,13 @@ def _field(name: str, values: NDArray) -> Field:
     found = np.where(np.isfinite(values), values, np.nan).astype(np.float32)
     finite = found[np.isfinite(found)].astype(np.float64)
     if len(finite) == 0:
-        return Field(name, UNITS.get(name, ""), found, (0.0, 1.0), [])
-    low, high = (float(limit) for limit in np.percentile(finite, [LEFT_OUT, 100.0 - LEFT_OUT]))
+        return Field(name, FIELD_UNITS.get(name, ""), found, (0.0, 1.0), [])
+    low, high = (float(limit) for limit in np.percentile(finite, [OUTLIERS_PERCENT, 100.0 - OUTLIERS_PERCENT]))
     if high <= low:
         low, high = grey_limits([finite])
-    return Field(name, UNITS.get(name, ""), found, (low, high), [] if name in UNITS else _categories(finite))
+    return Field(
+        name, FIELD_UNITS.get(name, ""), found, (low, high), [] if name in FIELD_UNITS else _categories(finite)
+    )
 
 
 def _categories(values: NDArray[np.float64]) -> list[tuple[int, str]]:
@@ -150,7 +152,7 @@ def explorer_html(
         has, the fields of `tetopt.cell_fields` are.
     image : Image, optional
         Shown in the plane of the cut, in grey from its 0.5 to its 99.5 percentile, each voxel where its affine puts
-        it. Above `MAX_VOXELS` neighbours are averaged, which the page says.
+        it. Above `PAGE_IMAGE_VOXELS` neighbours are averaged, which the page says.
     title : str
     facet_sets : dict of (K, 3) integer, optional
         Triples of nodes to be highlighted, by name.
@@ -210,9 +212,9 @@ def _packed_image(image: Image, centre: NDArray[np.float64]) -> dict[str, Any]:
 
 def _shown_shape(shape: tuple[int, ...]) -> tuple[int, ...]:
     """The shape itself, or, of an image too large for the page, a coarser one: the longest axes are divided first."""
-    sizes = np.minimum(shape, MAX_SIDE)
+    sizes = np.minimum(shape, PAGE_SIDE_VOXELS)
     longest = int(sizes.max())
-    while np.prod(np.minimum(sizes, longest), dtype=np.int64) > MAX_VOXELS:
+    while np.prod(np.minimum(sizes, longest), dtype=np.int64) > PAGE_IMAGE_VOXELS:
         longest -= 1
     return tuple(np.minimum(sizes, longest).tolist())
 

@@ -25,16 +25,17 @@ from tetopt.image import Image
 from tetopt.io.files import written_whole
 from tetopt.measure.quality import BAD_SHAPE, quality_errors, rho_histogram
 from tetopt.mesh import Mesh
-from tetopt.report.colours import LISTED, UNCOVERED, label_colours, legend_patches
+from tetopt.report.colours import LISTED_LABELS, UNCOVERED_COLOUR, label_colours, legend_patches
 
 matplotlib.use("agg")
-COLOURS = ("#7f7f7f", "#d95f02", "#1b9e77", "#7570b3")
-MESH_LINE = "#ffb000"
-MASK_LINE = "#1e90ff"
-DETAIL = 25  # voxels along the side of an enlarged region
-WIDEST = 4.2  # inches: the widest slice of a figure of several planes
-TALLEST = 12.0  # inches: all its planes over each other
-NUMBER_ROOM = 0.014  # of that width: the radius that a label's number takes
+# Grey before, then ColorBrewer's Dark2, which the colour-blind tell apart: of histograms and curves.
+CURVE_COLOURS = ("#7f7f7f", "#d95f02", "#1b9e77", "#7570b3")
+MESH_LINE = "#ffb000"  # orange: it shows on every grey
+MASK_LINE = "#1e90ff"  # blue: the colour-blind tell it from the orange
+DETAIL_VOXELS = 25  # along the side of an enlarged region: single voxels are still seen in 5 inches
+SLICE_WIDTH_INCHES = 4.2  # of the widest slice of a figure of several planes: two fill a page
+SLICES_HEIGHT_INCHES = 12.0  # of all its planes over each other, which one page can hold
+NUMBER_RADIUS_SHARE = 0.014  # of that width: the radius that a label's number takes in 5 points
 
 
 def save_figure(figure: Figure, path: str | Path, dpi: int = 150) -> None:
@@ -87,7 +88,7 @@ def slice_figure(
         # Antialiased, each border would let the background shine through as a light seam.
         painted = PolyCollection(list(polygons), array=means, cmap="gray", edgecolors="none", antialiaseds=False)
         painted.set_clim(*limits)
-        flat.set_facecolor(UNCOVERED)
+        flat.set_facecolor(UNCOVERED_COLOUR)
         flat.add_collection(painted)
         flat.set_title("mean of the image in each cell", fontsize=10)
         for axes in (over, flat):
@@ -128,13 +129,13 @@ def label_figure(labels: Image, mesh: Mesh, of_cell: NDArray[np.int64] | None = 
     cuts = [view.section(mesh) for view in views]
     shown = _counted(pixels, len(colours)) + (_counted([of_cell[cells] for _, cells in cuts], len(colours)) > 0)
     width, heights = max(view.size[0] for view in views), [view.size[1] for view in views]
-    inches = min(WIDEST / width, TALLEST / sum(heights))  # a mm
+    inches = min(SLICE_WIDTH_INCHES / width, SLICES_HEIGHT_INCHES / sum(heights))  # a mm
     figure = Figure(figsize=(2.0 * inches * width + 1.4, inches * sum(heights) + 0.6), layout="constrained")
     grid = figure.subplots(len(views), 2, squeeze=False, height_ratios=heights)
     for (given, meshed), view, numbers, (polygons, cells) in zip(grid, views, pixels, cuts, strict=True):
         given.imshow(colours[numbers.T], origin="lower", extent=view.extent, interpolation="nearest")
-        if np.count_nonzero(shown) > LISTED:
-            _write_numbers(given, view, numbers, colours, NUMBER_ROOM * width)
+        if np.count_nonzero(shown) > LISTED_LABELS:
+            _write_numbers(given, view, numbers, colours, NUMBER_RADIUS_SHARE * width)
         line = min(0.2, 10.0 / np.sqrt(max(len(polygons), 1)))  # points
         meshed.add_collection(
             PolyCollection(list(polygons), facecolors=colours[of_cell[cells]], edgecolors="black", linewidths=line)
@@ -232,12 +233,12 @@ def _half_level(view: _View) -> NDArray[np.float64]:
 
 
 def _longest_part(outline: NDArray[np.float64], view: _View) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Lower and upper corner, in picture mm, of the square of `DETAIL` voxels that holds most of the outline."""
+    """Lower and upper corner, in picture mm, of the square of `DETAIL_VOXELS` voxels that holds most of the outline."""
     length = np.zeros(view.pixels.shape)
     pixel = (outline.mean(axis=1) / view.steps).astype(np.int64)
     # Along the nearer axis: a straight line through the square counts the same however it runs, only bends more.
     np.add.at(length, tuple(pixel.T), np.abs(outline[:, 1] - outline[:, 0]).max(axis=1))
-    side = np.minimum(DETAIL * view.steps.max(), view.size)
+    side = np.minimum(DETAIL_VOXELS * view.steps.max(), view.size)
     held = uniform_filter(length, np.rint(side / view.steps).astype(np.int64), mode="constant")
     best = np.array(np.unravel_index(held.argmax(), held.shape)) if len(outline) else np.array(held.shape) // 2
     low = np.clip((best + 0.5) * view.steps - 0.5 * side, 0.0, view.size - side)
@@ -354,7 +355,7 @@ def histogram_figure(meshes: Sequence[tuple[str, Mesh]]) -> Figure:
     """Normalised rho histograms of meshes over each other, as Fig. 1(d), with the paper's four errors."""
     figure = Figure(figsize=(7.5, 4.6), layout="constrained")
     axes = figure.subplots()
-    for colour, (title, mesh) in zip(COLOURS, meshes, strict=False):
+    for colour, (title, mesh) in zip(CURVE_COLOURS, meshes, strict=False):
         share, edges = rho_histogram(mesh.points, mesh.cells)
         errors = quality_errors(mesh.points, mesh.cells)
         shape = rho(mesh.points, mesh.cells)
@@ -386,7 +387,7 @@ def energy_figure(history: Sequence[Record]) -> Figure:
     ]
     if first.E_D > 0.0:
         curves.append(("E_D, image", [row.E_D / first.E_D for row in history]))
-    for colour, (label, values) in zip(("black", *COLOURS[1:]), curves, strict=False):
+    for colour, (label, values) in zip(("black", *CURVE_COLOURS[1:]), curves, strict=False):
         top.plot(iterations, values, marker="o", markersize=3, color=colour, label=f"{label}: {values[-1]:.3f}")
     top.set_ylabel("relative to the initial mesh")
     top.set_ylim(bottom=0.0)

@@ -11,7 +11,7 @@ from typing import Any
 
 from tetopt.io.files import written_whole
 
-WIDE = 1.4  # a picture wider than this many times its height keeps a readable width on a phone, and scrolls
+BROAD_RATIO = 1.4  # A picture wider than this many times its height keeps a readable width on a phone, and scrolls.
 
 
 def save_page(path: Path, title: str, sections: Sequence[dict[str, Any]]) -> None:
@@ -69,7 +69,7 @@ def picture_html(path: str | Path, caption: str) -> str:
     width, height = struct.unpack(">II", content[16:24])  # of the IHDR chunk, always the first
     data = base64.b64encode(content).decode("ascii")
     alt = html.escape(caption)
-    shape = "wide broad" if width > WIDE * height else "wide"
+    shape = "wide broad" if width > BROAD_RATIO * height else "wide"
     return (
         f'<figure><div class="{shape}"><img alt="{alt}" width="{width}" height="{height}" '
         f'src="data:image/png;base64,{data}"></div><figcaption>{alt}</figcaption></figure>'

@@ -22,8 +22,8 @@ from tetopt.report.colours import label_colours, legend_patches
 from tetopt.report.figures import save_figure
 from tetopt.report.viewer import View, grey_limits, view_of
 
-SURFACE = "#d95f02"
-VIEW = (0.9, 1.25, 0.7)  # from where a scene is seen: from the right, front and above in RAS
+STRUCTURE_COLOUR = "#d95f02"  # orange: it stands out from the grey slices behind it
+SCENE_VIEWPOINT = (0.9, 1.25, 0.7)  # where the eye is, RAS: on the right, in front and above
 Draw = Callable[[pyvista.Plotter], None]
 
 
@@ -57,7 +57,7 @@ def save_scenes(path: str | Path, scenes: Sequence[tuple[str, Draw]], columns: i
 def _place(plotter: pyvista.Plotter, draw: Draw) -> None:
     """A scene in the plotter's present part, and the camera where all scenes are seen from."""
     draw(plotter)
-    plotter.view_vector(VIEW, viewup=(0.0, 0.0, 1.0))
+    plotter.view_vector(SCENE_VIEWPOINT, viewup=(0.0, 0.0, 1.0))
     plotter.camera.zoom(1.05)
 
 
@@ -80,7 +80,9 @@ def structure_before_slices(image: Image, mesh: Mesh, chosen: NDArray[np.int64])
     def draw(plotter: pyvista.Plotter) -> None:
         _add_slices(plotter, image, [_far_side(image, axis) for axis in range(3)])
         surface = facets_surface(mesh.points, boundary_facets(mesh.cells[chosen]))
-        plotter.add_mesh(surface, color=SURFACE, show_edges=True, edge_color="#402000", line_width=1, ambient=0.25)
+        plotter.add_mesh(
+            surface, color=STRUCTURE_COLOUR, show_edges=True, edge_color="#402000", line_width=1, ambient=0.25
+        )
 
     return draw
 
@@ -90,7 +92,7 @@ def isosurface_before_slices(image: Image, surface: pyvista.PolyData) -> Draw:
 
     def draw(plotter: pyvista.Plotter) -> None:
         _add_slices(plotter, image, [_far_side(image, axis) for axis in range(3)])
-        plotter.add_mesh(surface, color=SURFACE, smooth_shading=True, ambient=0.25)
+        plotter.add_mesh(surface, color=STRUCTURE_COLOUR, smooth_shading=True, ambient=0.25)
 
     return draw
 
@@ -203,7 +205,7 @@ def dark_structure_surface(image: Image, below: float, near: NDArray[np.bool_]) 
 
 def _far_side(image: Image, axis: int) -> float:
     """The index, along one axis, of the box's side that is farther from the viewer."""
-    outward = image.affine[:3, axis] @ np.asarray(VIEW)
+    outward = image.affine[:3, axis] @ np.asarray(SCENE_VIEWPOINT)
     return -0.5 if outward > 0.0 else image.shape[axis] - 0.5
 
 

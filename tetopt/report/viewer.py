@@ -17,7 +17,7 @@ from tetopt.geometry.simplex import centroids
 from tetopt.geometry.topology import boundary_facets, facets
 from tetopt.mesh import Mesh
 
-STYLE = """
+VIEWS_STYLE = """
 .views { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 320px), 1fr)); gap: 1rem; }
 .views figure { margin: 0; break-inside: avoid; }
 .views canvas { width: 100%; aspect-ratio: 1; display: block; background: #fff; border: 1px solid #ccc;
@@ -27,7 +27,7 @@ STYLE = """
 @media print { .viewer-buttons, .viewer-hint { display: none; }
   .views { grid-template-columns: repeat(3, 1fr); } .views canvas { border: none; } }
 """
-HINT = (
+TURNING_HINT = (
     "Drag to turn; all views turn together. The wheel zooms once a view is clicked; on a touch screen begin sideways "
     "to turn, and pinch to zoom. Keys: arrows, +, -, 0."
 )
@@ -94,7 +94,7 @@ def views_html(views: Sequence[View]) -> str:
     script = resources.files("tetopt.report").joinpath("viewer.js").read_text(encoding="utf-8")
     return "\n".join(
         [
-            f'<p class="viewer-hint">{html.escape(HINT)}</p><div class="viewer-buttons"></div>',
+            f'<p class="viewer-hint">{html.escape(TURNING_HINT)}</p><div class="viewer-buttons"></div>',
             '<div class="views">', *figures, "</div>",
             "<noscript><p>The 3-D views need JavaScript, which is off here.</p></noscript>",
             f'<script type="application/json" id="views-data">{data}</script>',

@@ -20,17 +20,18 @@ from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import facets
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.report.colours import LISTED
+from tetopt.report.colours import LISTED_LABELS
 from tetopt.report.explore import COLOUR_MAP, NO_VALUE, Field, checked_sets, scalar_fields
 from tetopt.report.scene import facets_surface
 from tetopt.report.viewer import grey_limits
 
-KEYS = "x y z: plane   k: side kept   m: mesh, image, both   n: next field   h: next set of facets   q: close"
-INSIDE = ("mesh", "image", "both")  # what the plane shows
-LETTERS = "RAS"
-VIEWS = ((1.6, 0.9, 0.7), (0.9, 1.6, 0.7), (0.4, -1.0, 1.6))  # from where the cut across each axis is seen at first
-SHARE = 0.35  # of the cells' colours where they lie on the image
-MAX_PIXELS = 1024  # of the image's slice along either side
+KEYS_TEXT = "x y z: plane   k: side kept   m: mesh, image, both   n: next field   h: next set of facets   q: close"
+PLANE_CHOICES = ("mesh", "image", "both")  # what the plane shows
+AXIS_LETTERS = "RAS"  # the sides to which the world's axes run
+# Where the eye is at first, RAS, for the cut across each axis: before the cut, a little aside.
+CUT_VIEWPOINTS = ((1.6, 0.9, 0.7), (0.9, 1.6, 0.7), (0.4, -1.0, 1.6))
+GLASS_OPACITY = 0.35  # of the cells' colours over the image: enough to tell them, and the voxels show through
+MAX_PIXELS = 1024  # of the image's slice along either side: about the window's
 
 
 def show(
@@ -80,7 +81,7 @@ def plotter(
 ) -> pyvista.Plotter:
     """The window, not yet shown: the mesh cut by a plane, coloured by a field within limits, the image in the plane.
 
-    Sliders move the plane (world mm) and the limits, and choose the field; the keys in `KEYS` the rest.
+    Sliders move the plane (world mm) and the limits, and choose the field; the keys in `KEYS_TEXT` the rest.
 
     Parameters
     ----------
@@ -121,7 +122,7 @@ class _Scene:
         self.axis = int(np.argmin(self.high - self.low))  # so that the section one begins with is the largest
         self.at = float((self.low + self.high)[self.axis] / 2.0)
         self.is_turned = False
-        self.inside = INSIDE[0] if image is None else INSIDE[2]
+        self.inside = PLANE_CHOICES[0] if image is None else PLANE_CHOICES[2]
         self.set = 0  # none, then those in `sets`
         self.number = 0  # of the field
         self.limits = self._range()
@@ -144,7 +145,7 @@ class _Scene:
 
     def open(self) -> None:
         self._add_sliders()
-        self.window.add_text(KEYS, name="keys", font_size=8, color="#555555", position="lower_left")
+        self.window.add_text(KEYS_TEXT, name="keys", font_size=8, color="#555555", position="lower_left")
         self.window.add_axes(xlabel="R", ylabel="A", zlabel="S", color="black", viewport=(0.0, 0.2, 0.15, 0.4))
         for key, act in (
             ("x", lambda: self.cut_across(0)), ("y", lambda: self.cut_across(1)), ("z", lambda: self.cut_across(2)),
@@ -155,7 +156,7 @@ class _Scene:
         self._add_key()
         self._changed()
         self.window.enable_parallel_projection()
-        self.window.view_vector(VIEWS[self.axis], viewup=(0.0, 0.0, 1.0))
+        self.window.view_vector(CUT_VIEWPOINTS[self.axis], viewup=(0.0, 0.0, 1.0))
         self.window.camera.zoom(0.95)
         self.window.camera.SetWindowCenter(0.0, -0.1)  # above the sliders
 
@@ -209,7 +210,7 @@ class _Scene:
         is_glass = self.inside == "both"
         lines = polygons.extract_all_edges() if is_glass and polygons.n_cells else pyvista.PolyData()
         self._add_cells(
-            "section", polygons, lighting=False, show_edges=not is_glass, opacity=SHARE if is_glass else 1.0
+            "section", polygons, lighting=False, show_edges=not is_glass, opacity=GLASS_OPACITY if is_glass else 1.0
         )
         self._add("lines", lines, color="#ffb000", line_width=1, lighting=False)
 
@@ -262,9 +263,9 @@ class _Scene:
         if field.categories:
             # As in the pictures' legends: those of most cells, ascending.
             by_size = sorted(field.categories, key=lambda entry: -np.count_nonzero(field.values == entry[0]))
-            entries = [[f" {label}", colour] for label, colour in sorted(by_size[:LISTED])]
-            if len(field.categories) > LISTED:
-                entries.append([f" and {len(field.categories) - LISTED} more", "#555555"])
+            entries = [[f" {label}", colour] for label, colour in sorted(by_size[:LISTED_LABELS])]
+            if len(field.categories) > LISTED_LABELS:
+                entries.append([f" and {len(field.categories) - LISTED_LABELS} more", "#555555"])
             height = 0.03 * len(entries)
             legend = self.window.add_legend(entries, bcolor="white", face="rectangle", size=(0.11, height))
             legend.SetPosition(0.88, 0.95 - height)
@@ -309,7 +310,7 @@ class _Scene:
         slider.SetTitleText(title)
 
     def _set_sliders(self) -> None:
-        letter = LETTERS[self.axis]
+        letter = AXIS_LETTERS[self.axis]
         self._set_slider("at", f"plane at {letter}, mm", self.at, (self.low[self.axis], self.high[self.axis]))
         self._set_slider("low", f"{self.field.name} from", self.limits[0], self._range())
         self._set_slider("high", f"{self.field.name} to", self.limits[1], self._range())
@@ -350,7 +351,7 @@ class _Scene:
 
     def next_inside(self) -> None:
         if self.image is not None:
-            self.inside = INSIDE[(INSIDE.index(self.inside) + 1) % len(INSIDE)]
+            self.inside = PLANE_CHOICES[(PLANE_CHOICES.index(self.inside) + 1) % len(PLANE_CHOICES)]
             self._changed()
 
     def next_field(self) -> None:

@@ -67,7 +67,7 @@ def save_compare_page(
         ("Settings, versions and how to run it again", _settings_html(results)),
     ]
     parts = [section_html(title, content) for title, content in sections if content]
-    write_page(path, f"tetopt compared on {results['image']['name']}", parts, _STYLE + viewer.STYLE)
+    write_page(path, f"tetopt compared on {results['image']['name']}", parts, _STYLE + viewer.VIEWS_STYLE)
 
 
 # --------------------------------------------------------------------------------------------------
