@@ -11,8 +11,9 @@ from browser import browser
 
 import tetopt
 from tetopt.errors import InputError
+from tetopt.report.colours import grey_limits
 from tetopt.report.page import write_page
-from tetopt.report.viewer import VIEWS_STYLE, View, grey_limits, view_of, views_html
+from tetopt.report.viewer import VIEWS_STYLE, View, view_of, views_html
 
 
 @pytest.fixture(scope="module")

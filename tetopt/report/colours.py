@@ -1,6 +1,8 @@
-"""One colour for each label, the same in every picture of a volume, also for readers who are colour-blind."""
+"""Colours of labels, the same in every picture of a volume, also for the colour-blind; greys of intensities."""
 
 from __future__ import annotations
+
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.colors import to_rgba_array
@@ -52,6 +54,12 @@ def label_colours(labels: Image) -> NDArray[np.float64]:
     colours[0] = to_rgba_array(BACKGROUND_COLOUR)[0, :3]
     colours[by_size] = to_rgba_array(LABEL_PALETTE)[np.arange(len(by_size)) % len(LABEL_PALETTE), :3]
     return colours
+
+
+def grey_limits(values: Sequence[NDArray], brightest: float = 99.5) -> tuple[float, float]:
+    """What is drawn black and white: the 0.5 and the `brightest` percentile of all `values`, and never the same."""
+    low, high = np.percentile(np.concatenate([part.ravel() for part in values]), [0.5, brightest])
+    return (float(low), float(high)) if high > low else (float(low) - 0.5, float(low) + 0.5)
 
 
 def legend_patches(colours: NDArray[np.float64], shown: NDArray[np.integer]) -> list[Patch]:

@@ -1,6 +1,6 @@
 // The page: shows the mesh in #data cut by a plane, coloured by a field, within limits, beside its image. Places are in
-// mm relative to the middle of the mesh; only what is printed is in world coordinates. Runs after explore_mesh.js and
-// explore_gl.js in one scope.
+// mm relative to the middle of the mesh; only what is printed is in world coordinates. Runs after webgl.js,
+// explore_mesh.js and explore_gl.js in one scope.
 
 const SIDES = ["RL", "AP", "SI"];  // at the upper and the lower end of each axis
 const FROM = { R: [0, 0], L: [2, 0], A: [1, 0], P: [-1, 0], S: [-1, 1], I: [-1, -1] };  // yaw and pitch, quarters
@@ -20,8 +20,7 @@ function say(words) {
 
 function start() {
   const data = JSON.parse($("data").textContent);
-  // A kept buffer, so that the view is also there when the page is printed.
-  const gl = canvas.getContext("webgl2", { alpha: false, antialias: true, preserveDrawingBuffer: true });
+  const gl = webgl(canvas);
   if (!gl) {
     canvas.remove();
     say("This browser has no WebGL 2, so the mesh cannot be shown; try another browser or machine.");
@@ -111,25 +110,12 @@ function explore(gl, data, notes) {
     redraw();
   }
 
-  function pixels() {
-    const dense = Math.min(window.devicePixelRatio || 1, 2);
-    return [canvas.clientWidth, canvas.clientHeight].map((length) => Math.max(1, Math.round(length * dense)));
-  }
-
-  let isWaiting = false;
-  function redraw() {
-    if (isWaiting) return;
-    isWaiting = true;
-    requestAnimationFrame(() => {
-      isWaiting = false;
-      const size = pixels();
-      if (canvas.width !== size[0] || canvas.height !== size[1]) [canvas.width, canvas.height] = size;
-      const share = state.inside === "image" ? -1 : state.inside === "cells" || !image ? 1 : state.share;
-      drawn.frame(size, camera, plane(), share, state.picked, false);
-      drawTriad();
-      canvas.dataset.drawn = "1";
-    });
-  }
+  const redraw = redrawing(() => {
+    const share = state.inside === "image" ? -1 : state.inside === "cells" || !image ? 1 : state.share;
+    drawn.frame(fitted(canvas), camera, plane(), share, state.picked, false);
+    drawTriad();
+    canvas.dataset.drawn = "1";
+  });
 
   // -- the axes' letters
 
@@ -326,7 +312,7 @@ function explore(gl, data, notes) {
   }
 
   function pick(x, y) {
-    const size = pixels();
+    const size = pixels(canvas);
     const dense = size[0] / canvas.clientWidth;
     state.picked = drawn.cellAt(Math.floor(x * dense), size[1] - 1 - Math.floor(y * dense), size, camera, plane());
     showPicked();
@@ -335,12 +321,7 @@ function explore(gl, data, notes) {
 
   // -- the camera
 
-  function turn(right, up) {
-    camera.yaw -= right;
-    camera.pitch = Math.max(-Math.PI / 2, Math.min(Math.PI / 2, camera.pitch + up));
-    redraw();
-  }
-
+  const turn = turning(camera, redraw);
   const perPixel = () => 2 * radius / (camera.zoom * Math.min(canvas.clientWidth, canvas.clientHeight));
 
   // About the pixel (x, y) from the view's middle, which stays where it is.
@@ -364,65 +345,10 @@ function explore(gl, data, notes) {
     if (state.axis >= 0) cutAt(state.at + share * size[state.axis]);
   }
 
-  const KEYS = {
-    ArrowLeft: () => turn(-0.1, 0), ArrowRight: () => turn(0.1, 0),
-    ArrowUp: () => turn(0, -0.1), ArrowDown: () => turn(0, 0.1),
-    "+": () => zoom(1.15), "=": () => zoom(1.15), "-": () => zoom(1 / 1.15),
+  const keys = {
+    ...cameraKeys(turn, zoom),
     "0": () => look(facing()), PageUp: () => step(0.01), PageDown: () => step(-0.01),
   };
-
-  function listen() {
-    const fingers = new Map();
-    const spread = () => {
-      const [a, b] = [...fingers.values()];
-      return Math.hypot(a.x - b.x, a.y - b.y);
-    };
-    let travelled = 0;
-    canvas.addEventListener("pointerdown", (event) => {
-      canvas.setPointerCapture(event.pointerId);
-      canvas.focus();
-      travelled = fingers.size ? Infinity : 0;
-      fingers.set(event.pointerId, { x: event.clientX, y: event.clientY });
-    });
-    canvas.addEventListener("pointermove", (event) => {
-      const last = fingers.get(event.pointerId);
-      if (!last) return;
-      const before = fingers.size === 2 ? spread() : 0;
-      const [x, y] = [event.clientX - last.x, event.clientY - last.y];
-      fingers.set(event.pointerId, { x: event.clientX, y: event.clientY });
-      travelled += Math.hypot(x, y);
-      if (fingers.size === 2) {
-        zoom(spread() / Math.max(before, 1));
-        move(x / 2, y / 2);
-      } else if (event.shiftKey || event.buttons === 2) {
-        move(x, y);
-      } else {
-        const length = Math.min(canvas.clientWidth, canvas.clientHeight);
-        turn(x / length * 4, y / length * 4);
-      }
-    });
-    canvas.addEventListener("pointerup", (event) => {
-      const box = canvas.getBoundingClientRect();
-      if (fingers.size === 1 && travelled < 4 && event.button === 0) {
-        pick(event.clientX - box.left, event.clientY - box.top);
-      }
-    });
-    for (const end of ["pointerup", "pointercancel", "lostpointercapture"]) {
-      canvas.addEventListener(end, (event) => fingers.delete(event.pointerId));
-    }
-    canvas.addEventListener("contextmenu", (event) => event.preventDefault());
-    canvas.addEventListener("wheel", (event) => {
-      event.preventDefault();
-      const box = canvas.getBoundingClientRect();
-      zoom(Math.exp(-0.0015 * event.deltaY * (event.deltaMode ? 30 : 1)),
-        event.clientX - box.left - box.width / 2, event.clientY - box.top - box.height / 2);
-    }, { passive: false });
-    canvas.addEventListener("keydown", (event) => {
-      if (!(event.key in KEYS) || event.ctrlKey || event.metaKey) return;
-      event.preventDefault();
-      KEYS[event.key]();
-    });
-  }
 
   // -- all of it
 
@@ -460,7 +386,9 @@ function explore(gl, data, notes) {
   chooseField(0);
   showCut();
   showPicked();
-  listen();
+  listen(canvas, { turn, zoom, move, pick, keys });
+  canvas.addEventListener("pointerdown", () => canvas.focus());
+  canvas.addEventListener("contextmenu", (event) => event.preventDefault());
   new ResizeObserver(redraw).observe(canvas);
   $("controls").hidden = false;
 }

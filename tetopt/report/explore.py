@@ -6,9 +6,7 @@ pyvista's window.
 
 from __future__ import annotations
 
-import base64
 import html
-import json
 import string
 from importlib import resources
 from pathlib import Path
@@ -25,8 +23,8 @@ from tetopt.image import Image
 from tetopt.io.files import written_whole
 from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields
-from tetopt.report.colours import label_colours
-from tetopt.report.viewer import grey_limits
+from tetopt.report.colours import grey_limits, label_colours
+from tetopt.report.page import data_html, packed, script_html
 from tetopt.target.content import LABELS
 
 PAGE_IMAGE_VOXELS = 2**24  # 16 MB, a byte each: an image with more is averaged
@@ -35,7 +33,6 @@ COLOUR_MAP = "viridis"  # perceptually even
 MAX_LABELS = 128  # Whole numbers with more values than this are a quantity: no list of colours that long is read.
 NO_VALUE = "#aaaaaa"  # of cells whose value is not a number
 OUTLIERS_PERCENT = 1.0  # of the cells, at either end of a field: their values do not stretch its colours
-_FILES = ("explore.html", "explore_mesh.js", "explore_gl.js", "explore.js")
 # Of the fields that tetopt writes, which are quantities even where they are whole numbers.
 FIELD_UNITS = {
     "mean": "intensity", "variance": "intensity²", "n_voxels": "voxels", "min": "intensity", "max": "intensity",
@@ -173,28 +170,26 @@ def explorer_html(
     centre = (mesh.points.min(axis=0) + mesh.points.max(axis=0)) / 2.0
     data = {
         "centre": centre.tolist(),
-        "points": _base64(mesh.points - centre, "<f4"),
-        "cells": _base64(mesh.cells, "<u4"),
-        "fields": [{**field._asdict(), "values": _base64(field.values, "<f4")} for field in fields],
+        "points": packed(mesh.points - centre, "<f4"),
+        "cells": packed(mesh.cells, "<u4"),
+        "fields": [{**field._asdict(), "values": packed(field.values, "<f4")} for field in fields],
         "skipped": skipped,
-        "colours": _base64(colour_table(), "u1"),
+        "colours": packed(colour_table(), "u1"),
         "image": None if image is None else _packed_image(image, centre),
         "sets": [
-            {"name": name, "triangles": _base64(nodes, "<u4")} for name, nodes in checked_sets(mesh, facet_sets).items()
+            {"name": name, "triangles": packed(nodes, "<u4")} for name, nodes in checked_sets(mesh, facet_sets).items()
         ],
         "noValue": NO_VALUE,
     }
-    # An HTML parser ends a script at "</script" wherever it stands, also in a string.
-    text = json.dumps(data, allow_nan=False).replace("<", "\\u003c")
-    page, *scripts = (resources.files("tetopt.report").joinpath(name).read_text(encoding="utf-8") for name in _FILES)
-    script = "\n".join(['"use strict";', "(() => {", *scripts, "})();"])
-    return string.Template(page).substitute(TITLE=html.escape(title), DATA=text, SCRIPT=script)
+    page = resources.files("tetopt.report").joinpath("explore.html").read_text(encoding="utf-8")
+    script = script_html("webgl.js", "explore_mesh.js", "explore_gl.js", "explore.js")
+    return string.Template(page).substitute(TITLE=html.escape(title), DATA=data_html("data", data), SCRIPT=script)
 
 
 def _packed_image(image: Image, centre: NDArray[np.float64]) -> dict[str, Any]:
     """The image as bytes, the first axis fastest, with what takes a place relative to `centre` to its index."""
     shown = averaged(image, _shown_shape(image.shape)) if _shown_shape(image.shape) != image.shape else image
-    low, high = grey_limits([shown.data.ravel().astype(np.float64)])
+    low, high = grey_limits([shown.data.astype(np.float64)])
     greys = np.rint(255.0 * np.clip((shown.data - low) / (high - low), 0.0, 1.0)).astype(np.uint8)
     to_index = np.linalg.inv(shown.affine)
     to_index[:3, 3] = shown.to_index(centre)
@@ -203,7 +198,7 @@ def _packed_image(image: Image, centre: NDArray[np.float64]) -> dict[str, Any]:
     return {
         "shape": shown.shape,
         "original": image.shape,
-        "voxels": _base64(greys.ravel(order="F"), "u1"),
+        "voxels": packed(greys.ravel(order="F"), "u1"),
         "toIndex": to_index.T.ravel().tolist(),  # by columns, as WebGL takes it
         "box": [world.min(axis=0).tolist(), world.max(axis=0).tolist()],
         "limits": [low, high],
@@ -235,7 +230,3 @@ def checked_sets(mesh: Mesh, facet_sets: dict[str, NDArray] | None) -> dict[str,
                 "this mesh"
             )
     return sets
-
-
-def _base64(numbers: NDArray, kind: str) -> str:
-    return base64.b64encode(numbers.astype(kind).tobytes()).decode("ascii")

@@ -1,42 +1,17 @@
-// Draws lists of triangles in WebGL 2, in the colours of their cells or the image's greys.
+// Draws the mesh's parts in the colours of their cells or the image's greys, and says which cell is in a pixel.
 
-const VERTEX = `#version 300 es
-  precision highp float; precision highp int;
-  in vec3 place; in uint tag;
-  uniform mat3 turn; uniform vec3 scale; uniform vec2 shift;
-  out vec3 world; out vec3 seen; out vec3 corner; flat out uint cell; flat out uint sides;
-  void main() {
-    int k = gl_VertexID % 3;  // vertices are not shared, so this is the corner's number in its triangle
-    corner = vec3(k == 0, k == 1, k == 2);
-    world = place;
-    seen = turn * place;
-    cell = tag >> 3;
-    sides = tag & 7u;
-    gl_Position = vec4((seen.xy + shift) * scale.xy, -seen.z * scale.z, 1.0);
-  }`;
-const FRAGMENT = `#version 300 es
-  precision highp float; precision highp int; precision highp sampler3D;
-  in vec3 world; in vec3 seen; in vec3 corner; flat in uint cell; flat in uint sides;
+const FRAGMENT = `${SHADING}
   uniform int kind; uniform vec4 plane; uniform float share; uniform bool isPicking; uniform uint picked;
   uniform sampler2D colours; uniform sampler3D voxels; uniform mat4 toIndex; uniform vec3 shape;
-  out vec4 colour;
   const int SURFACE = 0, SECTION = 1, SLICE = 2, SET = 3;
   vec4 grey() {  // of the voxel around this place; nothing outside of the image
     vec3 index = (toIndex * vec4(world, 1.0)).xyz + 0.5;
     if (any(lessThan(index, vec3(0.0))) || any(greaterThanEqual(index, shape))) return vec4(0.0);
     return vec4(vec3(texelFetch(voxels, ivec3(index), 0).r), 1.0);
   }
-  float edge() {
-    vec3 step = fwidth(corner);
-    vec3 away = smoothstep(vec3(0.0), 1.3 * step, corner);
-    for (int k = 0; k < 3; k++) if ((sides & (1u << k)) == 0u) away[k] = 1.0;
-    // Where a triangle is only a few pixels wide, lines would cover it: they fade.
-    return (1.0 - min(min(away.x, away.y), away.z)) * clamp(0.25 / max(max(step.x, step.y), step.z), 0.0, 1.0);
-  }
   void main() {
     float line = edge();  // before any pixel is discarded: its neighbours' slopes need it
-    vec3 normal = normalize(cross(dFdx(seen), dFdy(seen)));
-    float light = kind == SECTION ? 1.0 : 0.55 + 0.45 * max(dot(normal, normalize(vec3(-0.35, 0.5, 0.8))), 0.0);
+    float lit = kind == SECTION ? 1.0 : light(0.55);
     if (kind != SECTION && kind != SLICE && dot(plane.xyz, world) > plane.w) discard;
     if (kind == SLICE) {
       colour = grey();
@@ -49,13 +24,13 @@ const FRAGMENT = `#version 300 es
       return;
     }
     if (kind == SET) {
-      colour = vec4(mix(vec3(1.0, 0.0, 0.75) * light, vec3(0.35, 0.0, 0.25), 0.6 * line), 0.3);
+      colour = vec4(mix(vec3(1.0, 0.0, 0.75) * lit, vec3(0.35, 0.0, 0.25), 0.6 * line), 0.3);
       return;
     }
     vec3 own = texelFetch(colours, ivec2(cell % 2048u, cell / 2048u), 0).rgb;
     vec4 below = kind == SECTION ? grey() : vec4(0.0);
     float seenOwn = mix(1.0, share, below.a);
-    vec3 fill = mix(below.rgb, own, seenOwn) * light;
+    vec3 fill = mix(below.rgb, own, seenOwn) * lit;
     // Lines that show on any cell: dark, on dark cells light, over the image orange.
     vec3 ink = mix(vec3(0.5), vec3(0.05), smoothstep(0.1, 0.3, dot(fill, vec3(0.3, 0.6, 0.1))));
     ink = mix(vec3(1.0, 0.69, 0.0), ink, smoothstep(0.4, 0.6, seenOwn));
@@ -68,7 +43,7 @@ const WIDE = 2048;  // cells in a row of the texture of their colours
 const hex = (text) => [1, 3, 5].map((i) => parseInt(text.slice(i, i + 2), 16));
 
 function cellColours(field, table, noValue) {
-  const found = new Uint8Array(4 * WIDE * Math.ceil(field.values.length / WIDE));
+  const colours = new Uint8Array(4 * WIDE * Math.ceil(field.values.length / WIDE));
   const ofLabel = new Map(field.categories.map(([value, colour]) => [value, hex(colour)]));
   const [low, high] = field.limits;
   field.values.forEach((value, cell) => {
@@ -79,53 +54,10 @@ function cellColours(field, table, noValue) {
       const step = Math.round(255 * Math.max(0, Math.min(1, (value - low) / (high - low))));
       colour = table.subarray(3 * step, 3 * step + 3);
     }
-    found.set(colour, 4 * cell);
-    found[4 * cell + 3] = 255;
+    colours.set(colour, 4 * cell);
+    colours[4 * cell + 3] = 255;
   });
-  return found;
-}
-
-function program(gl) {
-  const made = gl.createProgram();
-  for (const [kind, source] of [[gl.VERTEX_SHADER, VERTEX], [gl.FRAGMENT_SHADER, FRAGMENT]]) {
-    const shader = gl.createShader(kind);
-    gl.shaderSource(shader, source);
-    gl.compileShader(shader);
-    if (!gl.getShaderParameter(shader, gl.COMPILE_STATUS)) throw new Error(gl.getShaderInfoLog(shader));
-    gl.attachShader(made, shader);
-  }
-  gl.linkProgram(made);
-  if (!gl.getProgramParameter(made, gl.LINK_STATUS)) throw new Error(gl.getProgramInfoLog(made));
-  return made;
-}
-
-// A list of triangles on the graphics card.
-function part(gl, made) {
-  const array = gl.createVertexArray();
-  const [places, tags] = [gl.createBuffer(), gl.createBuffer()];
-  gl.bindVertexArray(array);
-  for (const [name, buffer] of [["place", places], ["tag", tags]]) {
-    const at = gl.getAttribLocation(made, name);
-    gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
-    gl.enableVertexAttribArray(at);
-    if (name === "tag") gl.vertexAttribIPointer(at, 1, gl.UNSIGNED_INT, 0, 0);
-    else gl.vertexAttribPointer(at, 3, gl.FLOAT, false, 0, 0);
-  }
-  let count = 0;
-  return {
-    fill(triangles) {
-      count = triangles.count;
-      gl.bindBuffer(gl.ARRAY_BUFFER, places);
-      gl.bufferData(gl.ARRAY_BUFFER, triangles.places.subarray(0, 9 * count), gl.DYNAMIC_DRAW);
-      gl.bindBuffer(gl.ARRAY_BUFFER, tags);
-      gl.bufferData(gl.ARRAY_BUFFER, triangles.tags.subarray(0, 3 * count), gl.DYNAMIC_DRAW);
-    },
-    draw() {
-      if (!count) return;
-      gl.bindVertexArray(array);
-      gl.drawArrays(gl.TRIANGLES, 0, 3 * count);
-    },
-  };
+  return colours;
 }
 
 function nearestTexture(gl, unit, target) {
@@ -137,13 +69,9 @@ function nearestTexture(gl, unit, target) {
 
 // What draws the view; asked again for every change, it keeps on the card only what `fill` and `paint` gave it.
 function renderer(gl, image, radius, depth) {
-  const made = program(gl);
-  const at = (name) => gl.getUniformLocation(made, name);
-  const parts = Object.fromEntries(Object.keys(KINDS).map((name) => [name, part(gl, made)]));
-  gl.useProgram(made);
-  gl.enable(gl.DEPTH_TEST);
+  const { at, part, clear } = painter(gl, FRAGMENT);
+  const parts = Object.fromEntries(Object.keys(KINDS).map((name) => [name, part()]));
   gl.blendFuncSeparate(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA, gl.ONE, gl.ONE);
-  gl.clearColor(1, 1, 1, 1);
   nearestTexture(gl, 0, gl.TEXTURE_2D);
   nearestTexture(gl, 1, gl.TEXTURE_3D);
   gl.uniform1i(at("colours"), 0);
@@ -155,13 +83,8 @@ function renderer(gl, image, radius, depth) {
   if (image) gl.uniformMatrix4fv(at("toIndex"), false, image.toIndex);
 
   const frame = (size, camera, plane, share, picked, isPicking) => {
-    gl.viewport(0, 0, ...size);
     gl.clearColor(...(isPicking ? [0, 0, 0, 0] : [1, 1, 1, 1]));
-    gl.clear(gl.COLOR_BUFFER_BIT | gl.DEPTH_BUFFER_BIT);
-    const zoom = camera.zoom * Math.min(...size) / radius;
-    gl.uniformMatrix3fv(at("turn"), false, turned(camera));
-    gl.uniform3f(at("scale"), zoom / size[0], zoom / size[1], 1 / depth);
-    gl.uniform2fv(at("shift"), camera.shift);
+    clear(size, camera, radius, depth);
     gl.uniform4fv(at("plane"), plane);
     gl.uniform1f(at("share"), share);
     gl.uniform1ui(at("picked"), picked + 1);
@@ -216,11 +139,4 @@ function renderer(gl, image, radius, depth) {
       return pixel[0] + 256 * pixel[1] + 65536 * pixel[2] + 16777216 * pixel[3] - 1;
     },
   };
-}
-
-// World axes to the screen's right, up and towards the eye; column by column, as WebGL takes it.
-function turned(camera) {
-  const [cy, sy] = [Math.cos(camera.yaw), Math.sin(camera.yaw)];
-  const [cp, sp] = [Math.cos(camera.pitch), Math.sin(camera.pitch)];
-  return [-sy, -sp * cy, cp * cy, cy, -sp * sy, cp * sy, 0, cp, sp];
 }

@@ -3,13 +3,6 @@
 
 const FACETS = [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]];  // facet k of a cell lies opposite its node k
 
-function bytes(text) {
-  const letters = atob(text);
-  const found = new Uint8Array(letters.length);
-  for (let i = 0; i < found.length; i++) found[i] = letters.charCodeAt(i);
-  return found.buffer;
-}
-
 // Of each cell and each of its nodes the cell beyond the facet opposite, -1 on the boundary: (4 M).
 function neighbours(cells, nNodes) {
   const first = new Int32Array(nNodes).fill(-1);  // half facets, chained by their smallest node
@@ -77,32 +70,6 @@ function unpackedMesh(data) {
     points, cells, low, high, count: cells.length / 4, neighbours: neighbours(cells, points.length / 3),
     ...centroidsAndVolumes(points, cells),
   };
-}
-
-// Triangles with their own three corners each; a tag is the cell's number and which of the sides are drawn.
-class Triangles {
-  constructor(capacity) {
-    this.places = new Float32Array(9 * capacity);
-    this.tags = new Uint32Array(3 * capacity);
-    this.count = 0;
-  }
-  add(cell, sides, ...corners) {
-    if (3 * this.count === this.tags.length) this.grow();
-    corners.forEach(([x, y, z], k) => this.set(3 * this.count + k, cell, sides, x, y, z));
-    this.count++;
-  }
-  set(vertex, cell, sides, x, y, z) {
-    this.places[3 * vertex] = x;
-    this.places[3 * vertex + 1] = y;
-    this.places[3 * vertex + 2] = z;
-    this.tags[vertex] = cell * 8 + sides;
-  }
-  grow() {
-    const more = new Triangles(Math.max(64, 2 * this.count));
-    more.places.set(this.places);
-    more.tags.set(this.tags);
-    [this.places, this.tags] = [more.places, more.tags];
-  }
 }
 
 // The facets that exactly one shown cell has.

@@ -25,7 +25,7 @@ from tetopt.image import Image
 from tetopt.io.files import written_whole
 from tetopt.measure.quality import BAD_SHAPE, quality_errors, rho_histogram
 from tetopt.mesh import Mesh
-from tetopt.report.colours import LISTED_LABELS, UNCOVERED_COLOUR, label_colours, legend_patches
+from tetopt.report.colours import LISTED_LABELS, UNCOVERED_COLOUR, grey_limits, label_colours, legend_patches
 
 matplotlib.use("agg")
 # Grey before, then ColorBrewer's Dark2, which the colour-blind tell apart: of histograms and curves.
@@ -75,7 +75,7 @@ def slice_figure(
     view = _View(image, axis, index)
     figure = Figure(figsize=(5.2 * len(meshes), 10.0 * view.aspect + 1.0), layout="constrained")
     grid = figure.subplots(2, len(meshes), squeeze=False)
-    limits = _grey_limits(view)
+    limits = grey_limits([view.pixels], brightest=99.8)
     for column, (title, mesh) in enumerate(meshes):
         polygons, cells = view.section(mesh)
         over, flat = grid[:, column]
@@ -204,7 +204,7 @@ def boundary_figure(image: Image, mask: Image, mesh: Mesh, axis: int | None = No
     low, high = _longest_part(outline, view)
     figure = Figure(figsize=(5.2 + 5.2 * view.aspect, 5.2 * view.aspect + 0.7), layout="constrained")
     whole, detail = figure.subplots(1, 2, width_ratios=(1.0, view.aspect))
-    limits = _grey_limits(view)
+    limits = grey_limits([view.pixels], brightest=99.8)
     for axes, width in ((whole, 0.7), (detail, 1.8)):
         view.show_pixels(axes, limits)
         view.frame(axes)
@@ -245,12 +245,6 @@ def _longest_part(outline: NDArray[np.float64], view: _View) -> tuple[NDArray[np
     return low, low + side
 
 
-def _grey_limits(view: _View) -> NDArray[np.float64]:
-    """What is drawn black and white in a slice, never the same."""
-    limits = np.percentile(view.pixels, [0.5, 99.8])
-    return limits if limits[0] < limits[1] else np.array([limits[0] - 0.5, limits[0] + 0.5])
-
-
 class _View:
     """One slice of an image laid out for the eye: right, front and top of the patient on fixed sides."""
 
@@ -276,7 +270,7 @@ class _View:
         self.extent = (0.0, self.size[0], 0.0, self.size[1])
         self.aspect = self.size[1] / self.size[0]
 
-    def show_pixels(self, axes: Axes, limits: NDArray[np.float64]) -> None:
+    def show_pixels(self, axes: Axes, limits: tuple[float, float]) -> None:
         axes.imshow(self.pixels.T, origin="lower", extent=self.extent, cmap="gray", vmin=limits[0], vmax=limits[1])
 
     def section(self, mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.int64]]:

@@ -1,13 +1,17 @@
-"""A page of HTML in one file: sections, tables and pictures, without outside references."""
+"""A page of HTML in one file: sections, tables, pictures, data and scripts, without outside references."""
 
 from __future__ import annotations
 
 import base64
 import html
+import json
 import struct
 from collections.abc import Sequence
+from importlib import resources
 from pathlib import Path
 from typing import Any
+
+from numpy.typing import NDArray
 
 from tetopt.io.files import written_whole
 
@@ -74,6 +78,24 @@ def picture_html(path: str | Path, caption: str) -> str:
         f'<figure><div class="{shape}"><img alt="{alt}" width="{width}" height="{height}" '
         f'src="data:image/png;base64,{data}"></div><figcaption>{alt}</figcaption></figure>'
     )
+
+
+def packed(numbers: NDArray, kind: str) -> str:
+    """Base64 of an array's bytes, as numbers of a `kind` such as "<f4"."""
+    return base64.b64encode(numbers.astype(kind).tobytes()).decode("ascii")
+
+
+def data_html(name: str, data: Any) -> str:
+    """Markup of data for a script, as JSON in the element `name`."""
+    # An HTML parser ends a script at "</script" wherever it stands, also in a string.
+    text = json.dumps(data, allow_nan=False).replace("<", "\\u003c")
+    return f'<script type="application/json" id="{name}">{text}</script>'
+
+
+def script_html(*names: str) -> str:
+    """Markup of one script in a scope of its own: files beside this one, one after the other."""
+    texts = [resources.files("tetopt.report").joinpath(name).read_text(encoding="utf-8") for name in names]
+    return "\n".join(["<script>", '"use strict";', "(() => {", *texts, "})();", "</script>"])
 
 
 _HEAD = """<!doctype html>

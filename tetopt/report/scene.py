@@ -18,9 +18,9 @@ from tetopt.image import Image
 from tetopt.io.files import written_whole
 from tetopt.measure.fidelity import cell_labels
 from tetopt.mesh import Mesh
-from tetopt.report.colours import label_colours, legend_patches
+from tetopt.report.colours import grey_limits, label_colours, legend_patches
 from tetopt.report.figures import save_figure
-from tetopt.report.viewer import View, grey_limits, view_of
+from tetopt.report.viewer import View, view_of
 
 STRUCTURE_COLOUR = "#d95f02"  # orange: it stands out from the grey slices behind it
 SCENE_VIEWPOINT = (0.9, 1.25, 0.7)  # where the eye is, RAS: on the right, in front and above
@@ -211,7 +211,7 @@ def _far_side(image: Image, axis: int) -> float:
 
 def _add_slices(plotter: pyvista.Plotter, image: Image, places: Sequence[float]) -> None:
     """The middle slice across each index axis, drawn at the given index along that axis."""
-    limits = np.percentile(image.data, [0.5, 99.8])
+    limits = grey_limits([image.data], brightest=99.8)
     for axis, at in enumerate(places):
         plotter.add_mesh(
             _slice_sheet(image, axis, at), scalars="h", cmap="gray", clim=limits, show_scalar_bar=False, lighting=False

@@ -2,11 +2,8 @@
 
 from __future__ import annotations
 
-import base64
 import html
-import json
 from collections.abc import Sequence
-from importlib import resources
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -16,6 +13,8 @@ from tetopt.errors import InputError
 from tetopt.geometry.simplex import centroids
 from tetopt.geometry.topology import boundary_facets, facets
 from tetopt.mesh import Mesh
+from tetopt.report.colours import grey_limits
+from tetopt.report.page import data_html, packed, script_html
 
 VIEWS_STYLE = """
 .views { display: grid; grid-template-columns: repeat(auto-fit, minmax(min(100%, 320px), 1fr)); gap: 1rem; }
@@ -89,16 +88,13 @@ def views_html(views: Sequence[View]) -> str:
         f"<figcaption>{html.escape(view.title)}</figcaption></figure>"
         for view in views
     ]
-    # An HTML parser ends a script at "</script" wherever it stands, also in a string.
-    data = json.dumps(_packed(views), allow_nan=False).replace("<", "\\u003c")
-    script = resources.files("tetopt.report").joinpath("viewer.js").read_text(encoding="utf-8")
     return "\n".join(
         [
             f'<p class="viewer-hint">{html.escape(TURNING_HINT)}</p><div class="viewer-buttons"></div>',
             '<div class="views">', *figures, "</div>",
             "<noscript><p>The 3-D views need JavaScript, which is off here.</p></noscript>",
-            f'<script type="application/json" id="views-data">{data}</script>',
-            f"<script>{script}</script>",
+            data_html("views-data", _packed(views)),
+            script_html("webgl.js", "viewer.js"),
         ]
     )  # fmt: skip
 
@@ -113,25 +109,11 @@ def _packed(views: Sequence[View]) -> list[dict[str, Any]]:
     low, high = corners.min(axis=0), corners.max(axis=0)
     radius = max(float(np.linalg.norm(high - low)) / 2.0, 1e-300)
     darkest, brightest = grey_limits([view.values for view in views])
-    packed = []
+    data = []
     for view in views:
         places = np.rint((view.points - (low + high) / 2.0) / radius * 32767.0)
-        tones = np.clip((view.values - darkest) / (brightest - darkest), 0.0, 1.0) * 255.0
-        packed.append(
-            {
-                "points": _base64(places, "<i2"),
-                "triangles": _base64(view.triangles, "<u4"),
-                "tones": _base64(np.rint(tones), "u1"),
-            }
+        tones = np.rint(np.clip((view.values - darkest) / (brightest - darkest), 0.0, 1.0) * 255.0)
+        data.append(
+            {"points": packed(places, "<i2"), "triangles": packed(view.triangles, "<u4"), "tones": packed(tones, "u1")}
         )
-    return packed
-
-
-def grey_limits(values: Sequence[NDArray[np.float64]]) -> tuple[float, float]:
-    """What is drawn black and white: close to the extremes of all `values`, and never the same."""
-    low, high = np.percentile(np.concatenate(values), [0.5, 99.5])
-    return (float(low), float(high)) if high > low else (float(low) - 0.5, float(low) + 0.5)
-
-
-def _base64(numbers: NDArray, kind: str) -> str:
-    return base64.b64encode(numbers.astype(kind).tobytes()).decode("ascii")
+    return data

@@ -20,10 +20,9 @@ from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import facets
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.report.colours import LISTED_LABELS
+from tetopt.report.colours import LISTED_LABELS, grey_limits
 from tetopt.report.explore import COLOUR_MAP, NO_VALUE, Field, checked_sets, scalar_fields
 from tetopt.report.scene import facets_surface
-from tetopt.report.viewer import grey_limits
 
 KEYS_TEXT = "x y z: plane   k: side kept   m: mesh, image, both   n: next field   h: next set of facets   q: close"
 PLANE_CHOICES = ("mesh", "image", "both")  # what the plane shows
@@ -118,7 +117,7 @@ class _Scene:
         self.sides = facets(mesh.cells)
         self.volumes = volumes(mesh.points, mesh.cells)
         self.low, self.high = mesh.points.min(axis=0), mesh.points.max(axis=0)
-        self.greys = (0.0, 1.0) if image is None else grey_limits([image.data.ravel().astype(np.float64)])
+        self.greys = (0.0, 1.0) if image is None else grey_limits([image.data.astype(np.float64)])
         self.axis = int(np.argmin(self.high - self.low))  # so that the section one begins with is the largest
         self.at = float((self.low + self.high)[self.axis] / 2.0)
         self.is_turned = False

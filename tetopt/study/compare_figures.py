@@ -18,8 +18,9 @@ from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
 from tetopt.image import Image
 from tetopt.mesh import Mesh
+from tetopt.report.colours import grey_limits
 from tetopt.report.figures import MESH_LINE, _View
-from tetopt.report.viewer import grey_limits, view_of
+from tetopt.report.viewer import view_of
 from tetopt.study.pipelines import UNTIMED
 
 # Okabe and Ito's palette, told apart by the colour-blind, without its yellow, which vanishes on white.
@@ -64,18 +65,18 @@ def slices_figure(image: Image, meshes: Sequence[tuple[str, Mesh]], means: Seque
     width = 3.3 if len(meshes) > 2 else 4.6
     figure = Figure(figsize=(width * (len(meshes) + 1), 3.0 * width * view.aspect + 1.0), layout="constrained")
     grid = figure.subplots(3, len(meshes) + 1, squeeze=False)
-    limits = grey_limits([np.asarray(view.pixels, dtype=np.float64).ravel()])
+    limits = grey_limits([np.asarray(view.pixels, dtype=np.float64)])
     cuts = [view.section(mesh) for _, mesh in meshes]
     losses = [cell_E_D(image, mesh) / volumes(mesh.points, mesh.cells) for _, mesh in meshes]
     shown = np.concatenate([loss[cells] for loss, (_, cells) in zip(losses, cuts, strict=True)])
     brightest = float(np.percentile(shown, 99.0)) if len(shown) else 0.0
     for row in (0, 1):
-        view.show_pixels(grid[row, 0], np.array(limits))
+        view.show_pixels(grid[row, 0], limits)
         view.frame(grid[row, 0])
         grid[row, 0].set_title("image", fontsize=11)
     for column, ((title, _), cut, mean, loss) in enumerate(zip(meshes, cuts, means, losses, strict=True), 1):
         over, filled, mapped = grid[:, column]
-        view.show_pixels(over, np.array(limits))
+        view.show_pixels(over, limits)
         _outline(over, cut[0])
         over.set_title(title, fontsize=11)
         _fill(filled, cut, np.asarray(mean), "gray", limits)
