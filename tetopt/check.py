@@ -6,12 +6,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
+from tetopt.geometry.box import box_sides, facets_on_sides
 from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import boundary_facets, components, facets, folded
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-
-ON_FACE = 1e-6  # voxel: as near as this to the box's face is on it
 
 
 def check_mesh(mesh: Mesh, image: Image | None = None, *, is_whole: bool = True) -> list[str]:
@@ -120,12 +119,13 @@ def check_unfolded(mesh: Mesh) -> None:
 def facets_on_box(mesh: Mesh, image: Image) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
     """Boundary facets, (B, n) nodes, and whether each lies on a face of the image's box, (B,)."""
     outer = boundary_facets(mesh.cells)
-    index = image.to_index(mesh.points[outer])  # (B, n, n)
-    is_on_box = np.zeros(len(outer), dtype=bool)
-    for axis in range(mesh.ndim):
-        for face in (-0.5, image.shape[axis] - 0.5):
-            is_on_box |= (np.abs(index[:, :, axis] - face) <= ON_FACE).all(axis=1)
-    return outer, is_on_box
+    is_on = facets_on_sides(image.to_index(mesh.points), outer, box_sides(image.shape))
+    return outer, np.any(is_on, axis=(1, 2))
+
+
+def filled_share(mesh: Mesh, image: Image) -> float:
+    """The volume of the cells over that of the image's box; 1 where they fill it without overlaps."""
+    return float(volumes(mesh.points, mesh.cells).sum()) / image.volume
 
 
 def _box(mesh: Mesh, image: Image) -> list[str]:
@@ -133,7 +133,7 @@ def _box(mesh: Mesh, image: Image) -> list[str]:
     outer, on_box = facets_on_box(mesh, image)
     if not on_box.all():
         found.append(f"boundary facets off the faces of the image's box; nodes: {_first(outer[~on_box])}")
-    filled = float(volumes(mesh.points, mesh.cells).sum()) / image.volume
+    filled = filled_share(mesh, image)
     if abs(filled - 1.0) > 1e-9:
         found.append(f"volume: {filled:.12g} of the image's box")
     return found

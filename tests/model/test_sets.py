@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 import tetopt
 from tetopt.errors import InputError
 from tetopt.fem.elasticity import box_faces
+from tetopt.geometry.box import world_axes
 from tetopt.geometry.simplex import volumes
 from tetopt.mesh import Mesh
 from tetopt.model.sets import (
@@ -26,7 +27,6 @@ from tetopt.model.sets import (
     standard_sets,
     tagged,
     with_asked,
-    world_axes,
 )
 
 NAMES = (("left", "right"), ("posterior", "anterior"), ("inferior", "superior"))

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.energy.sampling import SamplingGrid
+from tetopt.geometry.box import facets_on_sides
 from tetopt.geometry.topology import boundary_facets
 from tetopt.image import Image, transformed
 from tetopt.mesh import Mesh
@@ -62,31 +63,26 @@ def frozen_axes(
     facet that lies on no face of the box keeps all of them, as every boundary node does with "fixed"; or, with a
     surface on which such nodes slide, is marked in the last column.
     """
-    n = image.ndim
     is_frozen = np.zeros((len(ticks), 4), dtype=bool)
     facets_out = boundary_facets(cells)
     if boundary == "fixed":
         is_frozen[facets_out.ravel(), :3] = True
         return is_frozen
-    is_on_box = np.zeros(len(facets_out), dtype=bool)
-    for axis, is_there in on_box_sides(ticks, facets_out, grid, n):
-        is_on_box |= is_there
-        is_frozen[facets_out[is_there].ravel(), axis] = True
+    is_across = np.any(facets_on_sides(ticks, facets_out, side_ticks(grid), tolerance=0), axis=2)  # (B, 3)
+    for axis in range(3):
+        is_frozen[facets_out[is_across[:, axis]].ravel(), axis] = True
+    elsewhere = facets_out[~np.any(is_across, axis=1)].ravel()
     if has_surface:
-        is_frozen[facets_out[~is_on_box].ravel(), 3] = True
+        is_frozen[elsewhere, 3] = True
     else:
-        is_frozen[facets_out[~is_on_box].ravel(), :3] = True
+        is_frozen[elsewhere, :3] = True
     return is_frozen
 
 
-def on_box_sides(
-    ticks: NDArray[np.int64], nodes: NDArray[np.int64], grid: SamplingGrid, n: int
-) -> Iterator[tuple[int, NDArray[np.bool_]]]:
-    """For each side of the box, the axis across it and which of the facets `nodes` (F, n) lie on it."""
+def side_ticks(grid: SamplingGrid) -> NDArray[np.int64]:
+    """`tetopt.geometry.box.box_sides` in ticks, (3, 2), where they are whole numbers; a slice is one voxel thick."""
     half = 1 << (grid.bits - 1)
-    for axis in range(3 - n, 3):
-        for side in (-half, (grid.shape[axis] << grid.bits) - half):
-            yield axis, (ticks[nodes, axis] == side).all(axis=1)
+    return np.array([(-half, (size << grid.bits) - half) for size in grid.shape], dtype=np.int64)
 
 
 def relative_movement(

@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt.check import filled_share
 from tetopt.energy.discretization import E_D_of_sums, combined
 from tetopt.energy.geometric import cell_E_G
 from tetopt.energy.sampling import (
@@ -30,10 +31,11 @@ from tetopt.engine.loop import (
     Record,
     deadline,
     frozen_axes,
-    on_box_sides,
     relative_movement,
+    side_ticks,
 )
 from tetopt.errors import InputError
+from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides, facets_on_sides
 from tetopt.geometry.simplex import squared_edges, volumes
 from tetopt.geometry.topology import Facets, facets, node_colours, rings, stars
 from tetopt.image import Image
@@ -194,9 +196,9 @@ def _check_options(
 def _check_fills_box(image: Image, mesh: Mesh) -> None:
     """Delaunay fills the convex hull of the nodes: InputError for a mesh whose domain is not the image's box."""
     index = image.to_index(mesh.points)
-    corners = np.array([index.min(axis=0) + 0.5, index.max(axis=0) + 0.5])
-    is_box = np.abs(corners - [np.zeros(image.ndim), image.shape]).max() < 1e-6
-    if not is_box or abs(volumes(mesh.points, mesh.cells).sum() / image.volume - 1.0) > 1e-9:
+    extent = np.column_stack([index.min(axis=0), index.max(axis=0)])
+    is_box = np.abs(extent - box_sides(image.shape)).max() <= ON_SIDE_VOXELS
+    if not is_box or abs(filled_share(mesh, image) - 1.0) > 1e-9:
         raise InputError(
             "mesh: re-tessellation needs a mesh that fills the image's box exactly, as a lattice does; "
             'pass retessellate="never" to keep the connectivity'
@@ -245,7 +247,7 @@ def _retessellated(image: Image, grid: SamplingGrid, state: State) -> State | No
     if shared.n_cells.max() > 2:
         return None
     outer = shared.nodes[shared.n_cells == 1]
-    if not np.any([there for _, there in on_box_sides(state.ticks, outer, grid, image.ndim)], axis=0).all():
+    if not facets_on_sides(state.ticks, outer, side_ticks(grid), tolerance=0).any(axis=(1, 2)).all():
         return None
     candidate = _state(image, grid, state.ticks, cells, state.is_frozen, shared)
     return candidate if candidate.sums[:, 0].sum() == image.data.size else None

@@ -25,9 +25,10 @@ from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import bsr_array, bsr_matrix, csr_array, diags_array
 from scipy.sparse.linalg import LinearOperator, cg, splu
 
-from tetopt.check import ON_FACE, check_unfolded, facets_on_box
+from tetopt.check import check_unfolded, facets_on_box, filled_share
 from tetopt.errors import InputError
 from tetopt.fem.rigidity import check_held, rigid_modes
+from tetopt.geometry.box import box_sides, is_on_sides, upright_axis
 from tetopt.geometry.simplex import volume_gradients, volumes
 from tetopt.image import Image
 from tetopt.mesh import Mesh
@@ -179,22 +180,22 @@ def box_faces(image: Image, mesh: Mesh, axis: int | None = None) -> tuple[NDArra
     n = image.ndim
     if mesh.ndim != n:
         raise InputError(f"mesh and image: expected the same dimension, got a {mesh.ndim}-D mesh and a {n}-D image")
-    directions = image.affine[:-1, :-1] / image.spacing
-    upright = int(np.argmax(np.abs(directions[-1])))
+    upright = upright_axis(image.affine)
     axis = upright if axis is None else axis
     if axis not in range(n):
         raise InputError(f"axis: expected one of 0 to {n - 1} in {n}-D, got {axis!r}")
-    place = image.to_index(mesh.points)[:, axis]
-    sides = []
-    for face in (-0.5, image.shape[axis] - 0.5):
-        sides.append(np.flatnonzero(np.abs(place - face) <= ON_FACE))
-        if len(sides[-1]) == 0:
+    index, sides = image.to_index(mesh.points), box_sides(image.shape)
+    is_on = is_on_sides(index, sides)[:, axis].T  # (2, N)
+    place = index[:, axis]
+    for side, is_there in zip(sides[axis], is_on, strict=True):
+        if not is_there.any():
             raise InputError(
-                f"mesh: no node lies on the image's face at index {face:g} of axis {axis}, the mesh runs from "
+                f"mesh: no node lies on the image's face at index {side:g} of axis {axis}, the mesh runs from "
                 f"{place.min():g} to {place.max():g}; it must fill the image's box: same image, --crop and --slice?"
             )
-    world_axis = n - 1 if axis == upright else int(np.argmax(np.abs(directions[:, axis])))
-    low, high = sides if directions[world_axis, axis] > 0.0 else sides[::-1]
+    direction = image.affine[:n, axis]
+    runs_up = direction[n - 1 if axis == upright else np.argmax(np.abs(direction))] > 0.0
+    low, high = (np.flatnonzero(is_there) for is_there in (is_on if runs_up else is_on[::-1]))
     return low, high
 
 
@@ -205,7 +206,7 @@ def push_of(image: Image, percent: float) -> NDArray[np.float64]:
     an oblique one, is pressed by as much.
     """
     n = image.ndim
-    axis = int(np.argmax(np.abs(image.affine[n - 1, :n] / image.spacing)))
+    axis = upright_axis(image.affine)
     normal = np.linalg.inv(image.affine[:n, :n])[axis]  # of the faces; as long as one over a voxel's thickness
     towards_top = 1.0 if image.affine[n - 1, axis] > 0.0 else -1.0
     return 0.01 * percent * image.shape[axis] * towards_top * normal / float(normal @ normal)
@@ -224,7 +225,7 @@ def check_fills_box(image: Image, mesh: Mesh) -> None:
             f"mesh: {len(inner)} of its boundary facets lie off the faces of the image's box, the first has nodes "
             f"{outer[inner[0]].tolist()}: it has a crack, several pieces, or is not of this image (--crop, --slice?)"
         )
-    filled = float(volumes(mesh.points, mesh.cells).sum()) / image.volume
+    filled = filled_share(mesh, image)
     if abs(filled - 1.0) > 1e-5:
         raise InputError(f"mesh: its cells fill {filled:.6g} of the image's box; they overlap or leave parts out")
 

@@ -18,6 +18,7 @@ from tetopt.energy.sampling import cell_of_voxel
 from tetopt.errors import InputError
 from tetopt.fem.elasticity import System, lame_constants, push_of, solved, strains
 from tetopt.fem.rigidity import rigid_modes
+from tetopt.geometry.box import box_sides, is_on_sides, upright_axis
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 
@@ -168,9 +169,9 @@ def _compressed(
     K = grid_stiffness(image, young, nu)
     index = np.stack(np.meshgrid(*(np.arange(s) - 0.5 for s in shape), indexing="ij"), axis=-1).reshape(-1, n)
     points = image.to_world(index)
-    axis = int(np.argmax(np.abs(image.affine[n - 1, :n] / image.spacing)))  # as `box_faces` chooses it
-    low, high = index[:, axis] == -0.5, index[:, axis] == image.shape[axis] - 0.5
-    bottom, top = (low, high) if image.affine[n - 1, axis] > 0.0 else (high, low)
+    axis = upright_axis(image.affine)
+    is_on = is_on_sides(index, box_sides(image.shape))[:, axis].T
+    bottom, top = is_on if image.affine[n - 1, axis] > 0.0 else is_on[::-1]
     prescribed = np.zeros((len(points), n))
     prescribed[bottom] = push_of(image, percent)
     is_free = np.repeat(~(bottom | top), n)

@@ -8,14 +8,13 @@ from __future__ import annotations
 
 import re
 from collections.abc import Iterable
-from itertools import permutations
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tetopt.check import ON_FACE
 from tetopt.errors import InputError
+from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides, facets_on_sides, world_axes
 from tetopt.geometry.simplex import facet_nodes
 from tetopt.geometry.topology import facets, largest_component
 from tetopt.image import Image, transformed
@@ -115,42 +114,25 @@ def standard_sets(mesh: Mesh, box: Box | None = None, labels: NDArray[np.integer
 
 
 def _face_sets(mesh: Mesh, boundary: NDArray[np.int64], box: Box | None) -> dict[str, NDArray[np.int64]]:
+    """The boundary's facets on each face of the box, and, of a box that is given, those on none of them."""
     n = mesh.ndim
-    corners = mesh.points[facet_triples(mesh.cells, boundary)]  # (B, n, n)
     if box is None:
         low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
-        index, ends, near = corners, np.column_stack([low, high]), ON_FACE * (high - low).max()
+        places, faces, tolerance = mesh.points, np.column_stack([low, high]), ON_SIDE_VOXELS * (high - low).max()
         axes, directions = tuple(range(n)), np.ones(n)
     else:
         inverse = np.asarray(np.linalg.inv(box.affine[:n, :n]), dtype=np.float64)
-        index, near = transformed(corners - box.affine[:n, n], inverse), ON_FACE
-        ends = np.column_stack([np.full(n, -0.5), np.array(box.shape) - 0.5])
+        places = transformed(mesh.points - box.affine[:n, n], inverse)
+        faces, tolerance = box_sides(box.shape), ON_SIDE_VOXELS
         axes = world_axes(box.affine)
         directions = box.affine[list(axes), range(n)]
-    found, is_on_any = {}, np.zeros(len(boundary), dtype=bool)
-    for axis in range(n):
-        names = FACES[n][axes[axis]]
-        for end, name in zip(ends[axis], names if directions[axis] > 0.0 else names[::-1], strict=True):
-            is_on = (np.abs(index[:, :, axis] - end) <= near).all(axis=1)
-            is_on_any |= is_on
-            found[name] = boundary[is_on]
-    ordered = {name: found[name] for pair in FACES[n] for name in pair}
-    return ordered if box is None else {**ordered, MASK_SURFACE: boundary[~is_on_any]}
-
-
-def world_axes(affine: NDArray[np.float64]) -> tuple[int, ...]:
-    """The world axis that each index axis stands for, each one once.
-
-    The last world axis goes to the index axis nearest to it, as in `tetopt.fem.elasticity.box_faces`, the others to
-    those that they lie nearest to together.
-    """
-    n = len(affine) - 1
-    cosines = np.abs(affine[:n, :n]) / np.linalg.norm(affine[:n, :n], axis=0)
-
-    def nearness(order: tuple[int, ...]) -> tuple[float, float]:
-        return float(cosines[n - 1, order.index(n - 1)]), float(np.prod(cosines[list(order), range(n)]))
-
-    return max(permutations(range(n)), key=nearness)
+    is_on = facets_on_sides(places, facet_triples(mesh.cells, boundary), faces, tolerance)  # (B, n, 2)
+    sets: dict[str, NDArray[np.int64]] = {}
+    for name_pair in FACES[n]:
+        axis = axes.index(FACES[n].index(name_pair))
+        sides = is_on[:, axis].T if directions[axis] > 0.0 else is_on[:, axis, ::-1].T
+        sets |= {name: boundary[side] for name, side in zip(name_pair, sides, strict=True)}
+    return sets if box is None else {**sets, MASK_SURFACE: boundary[~np.any(is_on, axis=(1, 2))]}
 
 
 def _interfaces(mesh: Mesh, labels: NDArray[np.int64]) -> dict[str, NDArray[np.int64]]:

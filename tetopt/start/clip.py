@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
+from tetopt.geometry.box import box_sides, is_on_sides
 from tetopt.geometry.simplex import squared_edges, volumes
 from tetopt.image import Image
 from tetopt.mesh import Mesh
@@ -128,8 +129,8 @@ def onto_surface(
 
     Those on the box's faces stay on them.
     """
-    low, high = -0.5, np.array(image.shape) - 0.5
-    is_free = ~((index == low) | (index == high))
+    sides = box_sides(image.shape)
+    is_free = ~is_on_sides(index, sides, tolerance=0.0).any(axis=2)
     metric = np.linalg.inv(image.affine[:-1, :-1].T @ image.affine[:-1, :-1])
     metric = metric / np.trace(metric)
     at = index.copy()
@@ -139,7 +140,7 @@ def onto_surface(
         way = (slope @ metric) * is_free
         rate = (way * slope).sum(axis=1)
         step = np.divide(value, rate, out=np.zeros_like(value), where=rate > 1e-12)
-        at = np.clip(at - step[:, None] * way, low, high)
+        at = np.clip(at - step[:, None] * way, *sides.T)
     return at, np.abs(levels(region.level, at)) < NEAR
 
 
