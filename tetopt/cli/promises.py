@@ -83,29 +83,29 @@ def _says_what_is_lost(found: dict[str, Any]) -> bool:
 
     Whether a promise is missed: such a label is lost, or the mesh has little in common with the mask.
     """
-    lost = [row for row in found.get("labels", []) if row["is_lost"]]
-    large = [str(row["label"]) for row in lost if row["voxels"] > LARGE]
+    lost = [row for row in found.get("labels", []) if row.is_lost]
+    large = [str(row.label) for row in lost if row.voxels > LARGE]
     if large:
         log.print(
             f"[bold red]tetopt:[/] no cell has label {', '.join(large)}, of more than {LARGE} voxels; allow more "
             "nodes, or a higher --label-weight"
         )
-    if small := [str(row["label"]) for row in lost if row["voxels"] <= LARGE]:
+    if small := [str(row.label) for row in lost if row.voxels <= LARGE]:
         show_warning(f"no cell has label {', '.join(small)}, of {LARGE} voxels or fewer")
-    poor = [str(row["label"]) for row in found.get("labels", []) if row["voxels"] > LARGE and row["dice"] < POOR]
+    poor = [str(row.label) for row in found.get("labels", []) if row.voxels > LARGE and row.dice < POOR]
     if poor := [label for label in poor if label not in large]:
         first = ", ".join(poor[:5]) + (f" and {len(poor) - 5} more" if len(poor) > 5 else "")
         show_warning(f"Dice below {POOR} for label {first}: cells are too large for them, or these are no labels")
     mask = found.get("mask")
-    if mask is not None and mask["dice"] < MISSED:
+    if mask is not None and mask.dice < MISSED:
         log.print(
-            f"[bold red]tetopt:[/] the mesh and the mask overlap only by Dice {mask['dice']:.3f}: cells are larger "
+            f"[bold red]tetopt:[/] the mesh and the mask overlap only by Dice {mask.dice:.3f}: cells are larger "
             "than parts of the mask; allow more nodes"
         )
         return True
-    if mask is not None and mask["components"] != mask["mesh_components"]:
+    if mask is not None and mask.components != mask.mesh_components:
         show_warning(
-            f"the mask has {mask['components']} pieces, the mesh {mask['mesh_components']}: cells are as large "
+            f"the mask has {mask.components} pieces, the mesh {mask.mesh_components}: cells are as large "
             "as parts, or gaps, of the mask; allow more nodes"
         )
     return bool(large)

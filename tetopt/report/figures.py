@@ -23,6 +23,7 @@ from tetopt.geometry.cut import plane_cut
 from tetopt.geometry.simplex import rho
 from tetopt.image import Image
 from tetopt.io.files import written_whole
+from tetopt.measure.fidelity import cell_labels, half_level_surface
 from tetopt.measure.quality import BAD_SHAPE, quality_errors, rho_histogram
 from tetopt.mesh import Mesh
 from tetopt.report.colours import LISTED_LABELS, UNCOVERED_COLOUR, grey_limits, label_colours, legend_patches
@@ -119,9 +120,6 @@ def label_figure(labels: Image, mesh: Mesh, of_cell: NDArray[np.int64] | None = 
     InputError
         As `tetopt.measure.fidelity.cell_labels`.
     """
-    # This loads pyvista, which is slow to load, and the other flat pictures need it not.
-    from tetopt.measure.fidelity import cell_labels
-
     colours = label_colours(labels)
     of_cell = cell_labels(labels, mesh) if of_cell is None else of_cell
     views = _middle_views(labels)
@@ -224,8 +222,6 @@ def boundary_figure(image: Image, mask: Image, mesh: Mesh, axis: int | None = No
 
 def _half_level(view: _View) -> NDArray[np.float64]:
     """Segments (K, 2, 2), in picture mm, on which the pixels are 1/2 (`tetopt.measure.fidelity.half_level_surface`)."""
-    from tetopt.measure.fidelity import half_level_surface  # with pyvista, see `label_figure`
-
     affine = np.diag([*view.steps, 1.0])
     affine[:2, 2] = 0.5 * view.steps
     outline = half_level_surface(view.pixels, affine)

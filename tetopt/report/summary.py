@@ -26,8 +26,8 @@ SHOWN_VERSIONS = ("numpy", "scipy", "numba", "nibabel", "pyvista")
 
 def versions() -> dict[str, str]:
     """Versions of tetopt, Python and the libraries that the numbers rest on."""
-    found = {"tetopt": tetopt.__version__, "python": platform.python_version()}
-    return found | {name: version(name) for name in SHOWN_VERSIONS}
+    ours = {"tetopt": tetopt.__version__, "python": platform.python_version()}
+    return ours | {name: version(name) for name in SHOWN_VERSIONS}
 
 
 def mesh_hash(mesh: Mesh) -> str:
@@ -39,7 +39,6 @@ def mesh_hash(mesh: Mesh) -> str:
 
 def image_summary(image: Image) -> dict[str, Any]:
     """Shape, place and spread of an image; `total_variation` is E_D of one cell around everything."""
-    spread = float(np.var(image.data, dtype=np.float64)) * image.volume
     return {
         "shape": image.shape,
         "spacing_mm": image.spacing,
@@ -48,7 +47,7 @@ def image_summary(image: Image) -> dict[str, Any]:
         "max": float(image.data.max()),
         "mean": float(image.data.mean(dtype=np.float64)),
         "volume_mm": image.volume,
-        "total_variation": spread,
+        "total_variation": float(np.var(image.data, dtype=np.float64)) * image.volume,
     }
 
 
@@ -57,13 +56,13 @@ def run_summary(
 ) -> dict[str, Any]:
     """Every number of a run: options and file (`about`), versions, energies by iteration, quality before and after."""
     first, last = result.history[0], result.history[-1]
-    wanted = plain(image)
-    spread = wanted.variance * wanted.volume
+    content = plain(image)
+    spread = content.variance * content.volume
     return {
         **about,
         "versions": versions(),
         "machine": {"cores": os.cpu_count(), "threads": numba.get_num_threads(), "system": platform.platform()},
-        "image_properties": image_summary(wanted.image),
+        "image_properties": image_summary(content.image),
         "ended": result.ended,
         "iterations_done": last.iteration,
         "energies": {
@@ -84,22 +83,28 @@ def run_summary(
 def model_summary(model: Model) -> dict[str, Any]:
     """How large the sets are, and what the cells are made of, moduli in kPa."""
     of_facets = {name: len(rows) for name, rows in model.sets.facets.items()}
-    found: dict[str, Any] = {"sets": {"facets": of_facets, "cells": {k: len(v) for k, v in model.sets.cells.items()}}}
-    if (made := model.materials) is not None:
-        found["materials"] = {"count": len(made.young), "young_kPa": made.young, "nu": made.nu, "binning": made.binning}
+    of_cells = {name: len(cells) for name, cells in model.sets.cells.items()}
+    summary: dict[str, Any] = {"sets": {"facets": of_facets, "cells": of_cells}}
+    if (table := model.materials) is not None:
+        young, nu = table.young, table.nu
+        summary["materials"] = {"count": len(young), "young_kPa": young, "nu": nu, "binning": table.binning}
     if model.loads:
-        found["loads"] = {load.set_name: load.displacement for load in model.loads}
-    return found
+        summary["loads"] = {load.set_name: load.displacement for load in model.loads}
+    return summary
 
 
 def fidelity(labels: Image | None, mask: Image | None, mesh: Mesh, of_cell: NDArray | None) -> dict[str, Any]:
-    """How well a mesh represents labels and a mask."""
-    found: dict[str, Any] = {}
+    """How well a mesh represents a mask and labels: a `MaskFidelity` in `mask` and `LabelFidelity` rows in `labels`.
+
+    Each is there only if the image is. With a mask, labels count inside of it alone, and label 0, which is the outside
+    as well, is left out. `of_cell` (M,) is each cell's label, by default that of most of its voxels.
+    """
+    measured: dict[str, Any] = {}
     if mask is not None:
-        found["mask"] = mask_fidelity(mask, mesh)._asdict()
+        measured["mask"] = mask_fidelity(mask, mesh)
     if labels is not None:
-        if mask is not None:  # what lies outside is not asked for
+        if mask is not None:
             labels = Image(np.where(mask.data >= 0.5, labels.data, 0.0), labels.affine)
         rows = label_fidelity(labels, mesh, of_cell)
-        found["labels"] = [row._asdict() for row in rows if mask is None or row.label > 0]  # 0 is the outside, too
-    return found
+        measured["labels"] = [row for row in rows if mask is None or row.label > 0]
+    return measured

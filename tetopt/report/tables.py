@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from typing import Any
+from collections.abc import Callable, Sequence
 
 import numpy as np
 from rich.table import Table
 
+from tetopt.measure.fidelity import LabelFidelity, MaskFidelity
 from tetopt.measure.quality import Quality
 
 
@@ -43,37 +43,37 @@ def add_quality(table: Table, *meshes: Quality) -> None:
         table.add_row(name, *(text(q) for q in meshes))
 
 
-def mask_table(mask: dict[str, Any]) -> Table:
-    """`tetopt.measure.fidelity.MaskFidelity`, as a dict."""
+def mask_table(mask: MaskFidelity) -> Table:
+    """How well a mesh fills its mask."""
     table = new_table("mask", "in voxels", "in the mesh")
-    change = 100.0 * (mask["mesh_volume"] / mask["volume"] - 1.0)
-    table.add_row("size, mm^n", f"{mask['volume']:.1f}", f"{mask['mesh_volume']:.1f} ({change:+.1f} %)")
-    table.add_row("Dice, by voxels", "", f"{mask['dice']:.4f}")
-    for name, words in (
-        ("distance", "boundary to the mask's surface"),
-        ("reverse", "the mask's surface to the boundary"),
-    ):
-        table.add_row(
-            f"{words}, mean, 95 %", f"{mask[f'{name}_mean']:.3f}, {mask[f'{name}_p95']:.3f} voxels",
-            f"{mask[f'{name}_mean_mm']:.3f}, {mask[f'{name}_p95_mm']:.3f} mm",
-        )  # fmt: skip
-    table.add_row("pieces", str(mask["components"]), str(mask["mesh_components"]))
-    table.add_row("Euler number of the surface", str(mask["euler"]), str(mask["mesh_euler"]))
+    change = 100.0 * (mask.mesh_volume / mask.volume - 1.0)
+    table.add_row("size, mm^n", f"{mask.volume:.1f}", f"{mask.mesh_volume:.1f} ({change:+.1f} %)")
+    table.add_row("Dice, by voxels", "", f"{mask.dice:.4f}")
+    table.add_row(
+        "boundary to the mask's surface, mean, 95 %", f"{mask.distance_mean:.3f}, {mask.distance_p95:.3f} voxels",
+        f"{mask.distance_mean_mm:.3f}, {mask.distance_p95_mm:.3f} mm",
+    )  # fmt: skip
+    table.add_row(
+        "the mask's surface to the boundary, mean, 95 %", f"{mask.reverse_mean:.3f}, {mask.reverse_p95:.3f} voxels",
+        f"{mask.reverse_mean_mm:.3f}, {mask.reverse_p95_mm:.3f} mm",
+    )  # fmt: skip
+    table.add_row("pieces", str(mask.components), str(mask.mesh_components))
+    table.add_row("Euler number of the surface", str(mask.euler), str(mask.mesh_euler))
     return table
 
 
-def label_table(rows: list[dict[str, Any]]) -> Table:
-    """One row for each `tetopt.measure.fidelity.LabelFidelity`, as a dict."""
+def label_table(rows: Sequence[LabelFidelity]) -> Table:
+    """How well a mesh represents labels, a row for each."""
     table = new_table(
         "label", "voxels", "size, mm^n", "cells", "their size", "more, %", "Dice", "by volume", "apart, mm", "95 %",
         "pieces", "of cells",
     )  # fmt: skip
     for row in rows:
-        change = 100.0 * (row["mesh_volume"] / row["volume"] - 1.0)
-        apart = (f"{row[name]:.3f}" if np.isfinite(row[name]) else "-" for name in ("distance_mean", "distance_p95"))
+        change = 100.0 * (row.mesh_volume / row.volume - 1.0)
+        apart = (f"{mm:.3f}" if np.isfinite(mm) else "-" for mm in (row.distance_mean, row.distance_p95))
         table.add_row(
-            str(row["label"]), str(row["voxels"]), f"{row['volume']:.1f}", str(row["n_cells"]),
-            f"{row['mesh_volume']:.1f}", f"{change:+.1f}", f"{row['dice']:.4f}", f"{row['volume_dice']:.4f}", *apart,
-            str(row["components"]), str(row["mesh_components"]),
+            str(row.label), str(row.voxels), f"{row.volume:.1f}", str(row.n_cells), f"{row.mesh_volume:.1f}",
+            f"{change:+.1f}", f"{row.dice:.4f}", f"{row.volume_dice:.4f}", *apart, str(row.components),
+            str(row.mesh_components),
         )  # fmt: skip
     return table
