@@ -26,8 +26,9 @@ from scipy.spatial import Delaunay
 
 import tetopt
 from tetopt.energy.sampling import from_ticks, moment_sums, sampling_grid, to_ticks
-from tetopt.engine.fast import GRADED_K_D, _Run, prepare_kernels
+from tetopt.engine.fast import _Run, prepare_kernels
 from tetopt.engine.flips import flip
+from tetopt.engine.loop import GRADED_K_D, SHAPE_POWER
 from tetopt.geometry.simplex import dihedral_angles, oriented, rho, volumes
 from tetopt.geometry.topology import facets
 from tetopt.io.files import checked_output, save_json
@@ -173,7 +174,8 @@ def graded_large(path: Path, nodes: int) -> dict[str, Any]:
     """The same in a process of its own on a volume of 256^3 voxels, padded by zeros and cut: loading, time, memory."""
     program = (
         "import json, resource, sys, time, numpy as np, tetopt\n"
-        "from tetopt.engine.fast import GRADED_K_D, prepare_kernels\n"
+        "from tetopt.engine.fast import prepare_kernels\n"
+        "from tetopt.engine.loop import GRADED_K_D\n"
         "image = tetopt.load_image(sys.argv[1])\n"
         "data = np.pad(image.data, [(0, max(256 - s, 0)) for s in image.shape])[:256, :256, :256]\n"
         "image = tetopt.Image(data, image.affine)\n"
@@ -268,7 +270,7 @@ def in_a_child(path: Path, nodes: int) -> dict[str, Any]:
 def flip_pass(image: tetopt.Image, nodes: int) -> float:
     """Seconds per million tetrahedra to look at every facet and edge of a mesh that is good already."""
     mesh = tetopt.optimize(image, tetopt.lattice(image, nodes=nodes), k_D=0.5).mesh
-    run = _Run(plain(image), mesh, 0.5, 3.0, "slide")
+    run = _Run(plain(image), mesh, 0.5, SHAPE_POWER, "slide")
     run.held, _ = flip(run.held, run.measure)
     return best_seconds(lambda: flip(run.held, run.measure)) / len(mesh.cells) * 1e6
 

@@ -6,7 +6,8 @@ from tetopt.check import check_mesh
 from tetopt.energy.discretization import E_D
 from tetopt.energy.geometric import E_G
 from tetopt.energy.sampling import cell_moments, cell_of_voxel
-from tetopt.engine.fast import mesh_image, optimize
+from tetopt.engine.fast import optimize
+from tetopt.engine.meshing import mesh_image
 from tetopt.engine.paper import optimize_paper
 from tetopt.errors import InputError
 from tetopt.image import Image

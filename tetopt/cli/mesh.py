@@ -50,8 +50,18 @@ from tetopt.cli.solver import (
     save_wished,
 )
 from tetopt.cli.source import Source, read_source
-from tetopt.engine.fast import FIRST, GRADED_ITERATIONS, GRADED_K_D, check_options, meshed_to_error
-from tetopt.engine.loop import Optimized
+from tetopt.engine.fast import check_options
+from tetopt.engine.loop import (
+    GRADED_ITERATIONS,
+    GRADED_K_D,
+    MIN_DIHEDRAL,
+    SHAPE_POWER,
+    START_K_D,
+    UNIFORM_ITERATIONS,
+    UNIFORM_K_D,
+    Optimized,
+)
+from tetopt.engine.meshing import FIRST_NODES, meshed_to_error
 from tetopt.engine.paper import default_n_t
 from tetopt.geometry.simplex import centroids, squared_edges
 from tetopt.io.files import checked_output, save_json
@@ -72,10 +82,6 @@ from tetopt.start.octree import nearest_octree, octree
 from tetopt.target.content import Content, continued
 
 DEFAULT_NODES = {2: 500, 3: 5000}
-UNIFORM_K_D = 0.2
-# A mesh that follows the image already has a small E_D to be measured by. With 0.02 pytetwild's of MNI152 and of a CT
-# get better in E_D, mean and 1st percentile of rho and smallest angle alike; with 0.05 MNI152's 165 slivers become 552.
-START_K_D = 0.02
 
 
 class Lattice(StrEnum):  # noqa: D101
@@ -240,7 +246,7 @@ def mesh_command(
             )
     if k_D is None:
         k_D = GRADED_K_D if is_graded else UNIFORM_K_D if start is None else START_K_D
-    iterations = (GRADED_ITERATIONS if is_graded else 20) if iterations is None else iterations
+    iterations = (GRADED_ITERATIONS if is_graded else UNIFORM_ITERATIONS) if iterations is None else iterations
     if not 0.0 <= k_D < 1.0:
         raise InputError(f"--k-d: expected 0 <= k_D < 1, got {k_D}")
     if max_seconds is not None and not max_seconds > 0.0:
@@ -254,8 +260,8 @@ def mesh_command(
         options["n_t"] = default_n_t(k_D, iterations) if n_t is None else n_t
         options["retessellate"] = Retessellate.first.value if retessellate is None else retessellate.value
     else:
-        options["shape_power"] = 3.0 if shape_power is None else shape_power
-        options["min_dihedral"] = 12.0 if min_dihedral is None else min_dihedral
+        options["shape_power"] = SHAPE_POWER if shape_power is None else shape_power
+        options["min_dihedral"] = MIN_DIHEDRAL if min_dihedral is None else min_dihedral
         check_options(**options)
     names = ["slice.png", "rho.png", "energies.png"]
     names += [] if mask is None and background is None else ["boundary.png"]
@@ -293,7 +299,7 @@ def mesh_command(
     }  # fmt: skip
     source.about["box"] = box_text(box_of(source.contrasts[0]))
     if wishes.are_any() or output.suffix.lower() != ".vtu":
-        probe = nearest_octree(wanted, FIRST[image.ndim], sizes) if initial is None else initial
+        probe = nearest_octree(wanted, FIRST_NODES[image.ndim], sizes) if initial is None else initial
         check_early(output, wishes, image, lambda early: _model(source, probe, started, early, {}, is_told=False))
     return _mesh_files(source, initial, started, options, settings, wishes, output, json_path, pictures, begin)
 
@@ -395,7 +401,9 @@ def _mesh_files(
         return result
 
     if initial is None:
-        options["nodes"], initial, result = meshed_to_error(wanted, settings["target_error"], options["sizes"], run)
+        result = meshed_to_error(wanted, settings["target_error"], options["sizes"], run)
+        options["nodes"], initial = result.nodes, result.initial
+        assert initial is not None
     else:
         result = run(initial, options.get("nodes"))
     is_interrupted = any(interrupted)

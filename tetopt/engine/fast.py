@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,7 +40,19 @@ from tetopt.engine.complex import (
 )
 from tetopt.engine.density import Limits, exchange
 from tetopt.engine.flips import flip, make_moves
-from tetopt.engine.loop import NOISE, Boundary, Optimized, Record, deadline, frozen_axes, relative_movement
+from tetopt.engine.loop import (
+    MIN_DIHEDRAL,
+    NOISE,
+    SHAPE_POWER,
+    UNIFORM_ITERATIONS,
+    UNIFORM_K_D,
+    Boundary,
+    Optimized,
+    Record,
+    deadline,
+    frozen_axes,
+    relative_movement,
+)
 from tetopt.engine.paper import optimize_paper
 from tetopt.engine.repair import repair, worst_angles
 from tetopt.engine.smooth import blocks, sweep
@@ -50,21 +62,14 @@ from tetopt.geometry.simplex import volumes
 from tetopt.image import Image, transformed
 from tetopt.mesh import Mesh
 from tetopt.start.lattice import lattice
-from tetopt.start.octree import is_near, nearest_octree, octree
 from tetopt.start.sizes import Sizes
 from tetopt.target.content import Content, plain
 
-GRADED_K_D = 0.85  # on the MNI152 T1 with 15,000 nodes: a third of the uniform mesh's E_D, mean rho above 0.25
-GRADED_ITERATIONS = 16  # four more would lower E_D by 2 % there
 STILL = 0.05  # of an edge: nodes that moved less need no new flips
 QUIET = 0.02  # of an edge: nodes around which none moved more are not moved again
 EXCHANGES = 0.7  # of the iterations: those after which nodes are exchanged
 EXCHANGED = 0.1  # of the nodes wanted: the most that are exchanged at once
 EAGER = 0.1  # see `_Run.exchange`
-FIRST = {2: 200, 3: 1500}  # nodes of the first run towards an error
-RATE = 0.7  # E_D falls with nodes^-0.7, on the MNI152 T1 from 5,000 to 40,000
-NEAR = 0.85  # of the error wanted: near enough
-RUNS = 6  # towards an error, at most
 FAR = -(1 << 40)  # ticks from anywhere
 
 
@@ -72,10 +77,10 @@ def optimize(
     image: Image | Content,
     mesh: Mesh,
     *,
-    k_D: float = 0.2,
-    iterations: int = 20,
-    shape_power: float = 3.0,
-    min_dihedral: float = 12.0,
+    k_D: float = UNIFORM_K_D,
+    iterations: int = UNIFORM_ITERATIONS,
+    shape_power: float = SHAPE_POWER,
+    min_dihedral: float = MIN_DIHEDRAL,
     boundary: Boundary = "slide",
     nodes: int | None = None,
     sizes: Sizes | None = None,
@@ -179,148 +184,6 @@ def optimize(
     return Optimized(run.mesh(), history, ended)
 
 
-def mesh_image(
-    image: Image | Content,
-    nodes: int | None = None,
-    *,
-    target_error: float | None = None,
-    k_D: float = GRADED_K_D,
-    iterations: int = GRADED_ITERATIONS,
-    sizes: Sizes | None = None,
-    **options: Any,
-) -> Optimized:
-    """A mesh of the image's box with its nodes where the image has content: `octree`, then `optimize`.
-
-    Parameters
-    ----------
-    image : Image or Content
-        The intensities h; or several contrasts, labels, a mask, within which alone there will be cells
-        (`tetopt.content`).
-    nodes : int
-        Number of nodes, met exactly unless the run is cut short, k_D is 0, cells have to be lifted over the floor, or
-        no more nodes can be taken out; count them.
-    target_error : float
-        Instead of `nodes`: the share of the image's variance that may be left within cells, 0 to 1; as many nodes as
-        that takes, found in a few runs, each with its own `max_seconds`. A run that ends above it says so by its last
-        record.
-    k_D : float
-        Weight of the image. Cells of all sizes share the shape energy, and the octree that normalises E_D has a small
-        one already, so that more of it than on a uniform mesh is usual.
-    iterations : int
-        As of `optimize`; nodes are exchanged in the first 0.7 of them.
-    sizes : Sizes, optional
-        Limits on the cells' edges; by default up to 1.4 times a uniform mesh's.
-    **options
-        Further ones of `optimize`.
-
-    Returns
-    -------
-    Optimized
-        As `optimize`; its first record is of the octree.
-
-    Raises
-    ------
-    InputError
-        As `optimize`; neither or both of `nodes` and `target_error`; a number of nodes that the image is not worth
-        (see `octree`), or an error that its noise does not allow.
-
-    Examples
-    --------
-    >>> ball = np.fromfunction(lambda i, j, k: 100.0 * ((i - 20)**2 + (j - 20)**2 + (k - 20)**2 < 90), (41, 41, 41))
-    >>> result = mesh_image(Image(ball), 800)
-    >>> len(result.mesh.points)
-    800
-    """
-    if (nodes is None) == (target_error is None):
-        raise InputError("mesh_image: give a number of nodes or a target_error, one of them")
-
-    def run(mesh: Mesh, nodes: int) -> Optimized:
-        return optimize(image, mesh, k_D=k_D, iterations=iterations, nodes=nodes, sizes=sizes, **options)
-
-    if target_error is not None:
-        return meshed_to_error(image, target_error, sizes, run)[2]
-    assert nodes is not None
-    return run(octree(image, nodes, sizes), nodes)
-
-
-def meshed_to_error(
-    image: Image | Content, target_error: float, sizes: Sizes | None, run: Callable[[Mesh, int], Optimized]
-) -> tuple[int, Mesh, Optimized]:
-    """Run after run with other numbers of nodes, until the share of the image's variance is just below a target.
-
-    Returns the number of nodes, the octree and the result of the run with the fewest nodes that has the error; if none
-    has, of the one with the least, or of one that was cut short. It is the same as with that number of nodes from the
-    start, unless limits on sizes forbid that number. No fewer than 2^(n + 2) nodes are tried.
-
-    Raises
-    ------
-    InputError
-        A share out of range, or one below that of the image's noise, which no mesh should follow; as `octree`.
-    """
-    if not 0.0 < target_error < 1.0:
-        raise InputError(f"target_error: expected a share of the image's variance, 0 to 1, got {target_error}")
-    wanted = plain(image)
-    image, variance = wanted.image, wanted.variance
-    if variance == 0.0:
-        raise InputError("target_error: the image is constant, every mesh has no error; give a number of nodes")
-    noise = wanted.noise * wanted.unit / variance
-    if target_error <= noise:
-        raise InputError(
-            f"target_error: {target_error:g} of the variance is below the noise's share, by estimate {noise:.3g}: "
-            "cells would have to follow the noise; ask for more, or denoise the image"
-        )
-    nodes, tried = FIRST[image.ndim], dict[int, float]()  # shares by number of nodes
-    best: tuple[int, Mesh, Optimized] | None = None
-    asked: set[int] = set()
-    for _ in range(RUNS):
-        mesh = nearest_octree(wanted, nodes, sizes)
-        # Limits on sizes may ask for more nodes than the error, or allow fewer; a mask's octree is near only roughly.
-        if wanted.region is None and not is_near(len(mesh.points), nodes):
-            nodes = len(mesh.points)
-        if nodes in asked:
-            break
-        asked.add(nodes)
-        result = run(mesh, nodes)
-        found, share = len(result.mesh.points), result.history[-1].E_D / (variance * wanted.volume)
-        if result.ended in ("stopped", "max_seconds"):
-            has_error = best is not None and tried[len(best[2].mesh.points)] <= target_error
-            return best if best is not None and has_error else (nodes, mesh, result)
-        if found in tried:
-            break
-        tried[found] = share
-        if best is None or _is_better(found, len(best[2].mesh.points), tried, target_error):
-            best = nodes, mesh, result
-        if NEAR * target_error <= share <= target_error:
-            return nodes, mesh, result
-        nodes = _next_nodes(image, tried, target_error)
-        if nodes in tried:
-            break
-    assert best is not None
-    return best
-
-
-def _is_better(new: int, old: int, tried: dict[int, float], target: float) -> bool:
-    """Whether one number of nodes answers better than another: it has the error with fewer, or is nearer to it."""
-    if (tried[new] <= target) != (tried[old] <= target):
-        return tried[new] <= target
-    return new < old if tried[new] <= target else tried[new] < tried[old]
-
-
-def _next_nodes(image: Image, tried: dict[int, float], target: float) -> int:
-    """The number of nodes to try next: between the nearest two on either side, or beyond the nearest."""
-    aim = 0.5 * (1.0 + NEAR) * target
-    above = max((n for n, share in tried.items() if share > target), default=None)
-    below = min((n for n, share in tried.items() if share <= target), default=None)
-    least = 0.03 * aim  # there may be no error at all
-    if above is not None and below is not None and above < below:
-        part = np.log(tried[above] / aim) / np.log(tried[above] / max(tried[below], least))
-        return int(above * (below / above) ** part)
-    nearest = above if above is not None else below
-    assert nearest is not None
-    ratio = max(tried[nearest], least) / aim
-    return int(np.clip(nearest * ratio ** (1.0 / RATE), 2 ** (image.ndim + 2), max(image.data.size // 8, 64)))
-
-
 def prepare_kernels(
     image: Image | Content, k_D: float, method: Literal["fast", "paper"] = "fast", is_graded: bool = False
 ) -> None:
@@ -339,7 +202,7 @@ def prepare_kernels(
         optimize_paper(tiny, mesh, k_D=k_D, iterations=1)
         return
     optimize(tiny, mesh, k_D=k_D, iterations=1)
-    run = _Run(plain(tiny), mesh, k_D, 3.0, "slide")
+    run = _Run(plain(tiny), mesh, k_D, SHAPE_POWER, "slide")
     none = np.empty(0, dtype=np.int64)  # nothing can be gained on so small a mesh, so that no move is made of itself
     make_moves(none, none, np.zeros(len(run.held.cells), dtype=np.bool_), run.held, run.measure)
     if is_graded:

@@ -26,6 +26,8 @@ from tetopt.energy.sampling import (
 from tetopt.engine.descent import FLAT, State, Weights, descend, free_projections, relocate
 from tetopt.engine.loop import (
     NOISE,
+    UNIFORM_ITERATIONS,
+    UNIFORM_K_D,
     Boundary,
     Optimized,
     Record,
@@ -49,8 +51,8 @@ def optimize_paper(
     image: Image,
     mesh: Mesh,
     *,
-    k_D: float = 0.2,
-    iterations: int = 20,
+    k_D: float = UNIFORM_K_D,
+    iterations: int = UNIFORM_ITERATIONS,
     n_t: int | None = None,
     retessellate: Retessellate = "first",
     boundary: Boundary = "slide",

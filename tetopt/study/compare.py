@@ -21,6 +21,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.energy.sampling import cell_moments, cell_of_voxel
+from tetopt.engine.loop import UNIFORM_ITERATIONS, UNIFORM_K_D
 from tetopt.errors import InputError
 from tetopt.fem.conditioning import conditioning
 from tetopt.fem.elasticity import box_faces, compression, push_of
@@ -75,8 +76,8 @@ class Settings(NamedTuple):
     pipelines: tuple[str, ...] = tuple(SHOWN)
     repeats: int = 3  # of pipelines whose result changes from run to run
     classes: int = 4  # of the multi-Otsu segmentation, without labels
-    k_D: float = 0.2
-    iterations: int = 20
+    k_D: float = UNIFORM_K_D
+    iterations: int = UNIFORM_ITERATIONS
     nus: tuple[float, ...] = (0.3, 0.45)
     percent: float = 1.0  # of compression
     reference_dofs: int = 300_000  # the voxel grid is averaged until it has no more

@@ -9,7 +9,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tetopt.engine.fast import GRADED_ITERATIONS, GRADED_K_D, optimize, prepare_kernels
+from tetopt.engine.fast import optimize, prepare_kernels
+from tetopt.engine.loop import GRADED_ITERATIONS, GRADED_K_D, UNIFORM_ITERATIONS, UNIFORM_K_D
 from tetopt.engine.paper import optimize_paper
 from tetopt.image import Image
 from tetopt.mesh import Mesh
@@ -25,8 +26,8 @@ class Job(NamedTuple):
     labels: Image | None  # a given segmentation, on the image's voxels; without one, those who need it make their own
     nodes: int  # wanted
     classes: int = 4  # of the thresholds, without labels
-    k_D: float = 0.2  # of uniform meshes; the graded one has its own
-    iterations: int = 20  # likewise
+    k_D: float = UNIFORM_K_D  # of uniform meshes; the graded one has its own
+    iterations: int = UNIFORM_ITERATIONS  # likewise
 
 
 class Produced(NamedTuple):

@@ -5,13 +5,14 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from tetopt.engine.fast import GRADED_K_D, mesh_image, optimize
+from tetopt.engine.fast import optimize
+from tetopt.engine.loop import GRADED_K_D, SHAPE_POWER
+from tetopt.engine.meshing import mesh_image
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.start.lattice import lattice
 from tetopt.start.sizes import COARSEST, Sizes
 
-SHAPE_POWER = 3.0
 SWEEPS: dict[str, tuple[float, ...]] = {
     "k_D": (0.3, 0.5, 0.7, GRADED_K_D, 0.93),
     "shape power p": (2.0, SHAPE_POWER, 4.0, 6.0),

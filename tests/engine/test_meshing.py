@@ -1,0 +1,87 @@
+"""The front door: each mode is what its parts make, and watching changes nothing."""
+
+import numpy as np
+import pytest
+
+import tetopt
+from tetopt.start.clip import lattice_within
+
+IMAGE = tetopt.load_phantom("sphere").image(voxel_mm=4.0)
+MASK = tetopt.Image((IMAGE.data > 50).astype(np.uint8), IMAGE.affine)
+
+
+def assert_same(result, expected):
+    assert result.mesh.points.tobytes() == expected.mesh.points.tobytes()
+    assert result.mesh.cells.tobytes() == expected.mesh.cells.tobytes()
+    assert result.ended == expected.ended
+
+
+def test_graded():
+    result, initial = tetopt.mesh_image(IMAGE, 200, iterations=4), tetopt.octree(IMAGE, 200)
+    assert_same(result, tetopt.optimize(IMAGE, initial, nodes=200, k_D=0.85, iterations=4))
+    assert result.initial.points.tobytes() == initial.points.tobytes()
+    assert result.nodes == 200
+    assert min(result.seconds_start, result.seconds_run) > 0.0
+
+
+@pytest.mark.parametrize("mask", [None, MASK])
+def test_uniform(mask):
+    image = IMAGE if mask is None else tetopt.content(IMAGE, mask=mask)
+    result = tetopt.mesh_image(image, 150, mode="uniform", kind="five-tet", iterations=2, shape_power=2.0)
+    region = None if mask is None else image.region
+    initial = lattice_within(IMAGE if mask is None else image.image, region, "five-tet", nodes=150)
+    assert_same(result, tetopt.optimize(image, initial, k_D=0.2, iterations=2, shape_power=2.0))
+
+
+def test_by_the_paper():
+    result = tetopt.mesh_image(IMAGE, mode="paper", spacing=16.0, iterations=2, n_t=1)
+    lattice = tetopt.lattice(IMAGE, spacing=16.0)
+    assert_same(result, tetopt.optimize_paper(IMAGE, lattice, k_D=0.2, iterations=2, n_t=1))
+
+
+def test_a_mesh_to_start_from():
+    """Its boundary stays, unless it is told to slide."""
+    start = tetopt.lattice(IMAGE, nodes=100)
+    assert_same(
+        tetopt.mesh_image(IMAGE, start=start, iterations=2),
+        tetopt.optimize(IMAGE, start, k_D=0.02, iterations=2, boundary="fixed"),
+    )
+    slid = tetopt.mesh_image(IMAGE, start=start, k_D=0.5, iterations=2, boundary="slide")
+    assert_same(slid, tetopt.optimize(IMAGE, start, k_D=0.5, iterations=2))
+
+
+def test_runs_are_watched():
+    """Each run towards an error is shown its initial mesh, and what it returns is what counts."""
+    starts, rows = [], []
+
+    def watch(initial, run):
+        starts.append(initial)
+        return run(callback=rows.append)
+
+    result = tetopt.mesh_image(IMAGE, target_error=0.2, iterations=4, watch=watch)
+    assert_same(result, tetopt.mesh_image(IMAGE, target_error=0.2, iterations=4))
+    assert sum(row.iteration == 0 for row in rows) == len(starts) > 1
+    assert any(initial is result.initial for initial in starts)
+    assert_same(result, tetopt.mesh_image(IMAGE, result.nodes, iterations=4))
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"mode": "coarse"}, "expected a mode of graded, uniform, paper, start, got 'coarse'"),
+        ({"nodes": 100, "kind": "bcc"}, "takes nodes, target_error, sizes, but no kind"),
+        ({"nodes": 100, "mode": "uniform", "sizes": tetopt.Sizes()}, "takes nodes, spacing, kind, but no sizes"),
+        ({"nodes": 100, "start": tetopt.lattice(IMAGE, nodes=60)}, "takes start, but no nodes"),
+        ({"mode": "uniform"}, "a number of nodes or a spacing, one of them"),
+        ({"mode": "paper", "nodes": 100, "spacing": 5.0}, "a number of nodes or a spacing, one of them"),
+        ({"mode": "start"}, "needs a mesh to start from"),
+    ],
+)
+def test_contradictions(arguments, words):
+    with pytest.raises(tetopt.InputError, match=words):
+        tetopt.mesh_image(IMAGE, **arguments)
+
+
+def test_the_paper_takes_one_image():
+    with pytest.raises(tetopt.InputError, match="one image and its whole box"):
+        tetopt.mesh_image(tetopt.content(IMAGE, mask=MASK), 100, mode="paper")

@@ -1,0 +1,259 @@
+"""The front door: from an image to an optimised mesh, whatever the mesh begins with and which engine moves it.
+
+graded   an octree of the image's content, then the fast engine with nodes exchanged
+uniform  a lattice, then the fast engine
+paper    a lattice, then the paper's scheme
+start    a mesh of the user's own, improved by the fast engine within its boundary
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any, Literal
+
+import numpy as np
+
+from tetopt.engine.fast import optimize
+from tetopt.engine.loop import (
+    GRADED_ITERATIONS,
+    GRADED_K_D,
+    START_K_D,
+    UNIFORM_ITERATIONS,
+    UNIFORM_K_D,
+    Optimized,
+)
+from tetopt.engine.paper import optimize_paper
+from tetopt.errors import InputError
+from tetopt.image import Image
+from tetopt.mesh import Mesh
+from tetopt.start.clip import lattice_within
+from tetopt.start.octree import is_near, nearest_octree, octree
+from tetopt.start.sizes import Sizes
+from tetopt.target.content import Content, plain
+
+Mode = Literal["graded", "uniform", "paper", "start"]
+Run = Callable[..., Optimized]  # an optimisation that is ready to begin; takes further options of `optimize`
+
+DEFAULTS: dict[Mode, tuple[float, int]] = {  # k_D and iterations
+    "graded": (GRADED_K_D, GRADED_ITERATIONS),
+    "uniform": (UNIFORM_K_D, UNIFORM_ITERATIONS),
+    "paper": (UNIFORM_K_D, UNIFORM_ITERATIONS),
+    "start": (START_K_D, UNIFORM_ITERATIONS),
+}
+TAKES: dict[Mode, tuple[str, ...]] = {  # what says which mesh a run begins with
+    "graded": ("nodes", "target_error", "sizes"),
+    "uniform": ("nodes", "spacing", "kind"),
+    "paper": ("nodes", "spacing", "kind"),
+    "start": ("start",),
+}
+FIRST_NODES = {2: 200, 3: 1500}  # of the first run towards an error, by dimension: so few that it takes no time
+ERROR_RATE = 0.7  # E_D falls with nodes^-0.7, on the MNI152 T1 from 5,000 to 40,000 nodes
+ERROR_REACHED = 0.85  # of the target error: from here to all of it a run is near enough, and the search ends
+ERROR_RUNS = 6  # towards an error, at most
+
+
+def mesh_image(
+    image: Image | Content,
+    nodes: int | None = None,
+    *,
+    target_error: float | None = None,
+    mode: Mode | None = None,
+    start: Mesh | None = None,
+    spacing: float | None = None,
+    kind: str | None = None,
+    k_D: float | None = None,
+    iterations: int | None = None,
+    sizes: Sizes | None = None,
+    watch: Callable[[Mesh, Run], Optimized] | None = None,
+    **options: Any,
+) -> Optimized:
+    """A mesh of the image's box with its nodes where the image has content; or a uniform one, or yours made better.
+
+    Parameters
+    ----------
+    image : Image or Content
+        The intensities h; or several contrasts, labels, a mask, within which alone there will be cells
+        (`tetopt.content`).
+    nodes : int
+        Number of nodes. A graded mesh meets it exactly unless the run is cut short, k_D is 0, cells have to be lifted
+        over the floor, or no more nodes can be taken out; count them.
+    target_error : float
+        Instead of `nodes`, of a graded mesh: the share of the image's variance that may be left within cells, 0 to 1;
+        as many nodes as that takes, found in a few runs, each with its own `max_seconds`. A run that ends above it
+        says so by its last record.
+    mode : {"graded", "uniform", "paper", "start"}
+        "graded", the default: `octree`, then `optimize` with exchanges of nodes. "uniform": `lattice`, cut off at a
+        mask, then `optimize`. "paper": `lattice`, then `optimize_paper`; of one image and its whole box. "start", the
+        default with a mesh to start from: `optimize` of that.
+    start : Mesh
+        The mesh to improve. Its boundary stays as it is, unless `boundary="slide"`.
+    spacing : float
+        Instead of `nodes`, of a lattice: edge length of a block, mm.
+    kind : str
+        Of the lattice, as of `tetopt.lattice`.
+    k_D : float
+        Weight of the image; by default 0.85 on a graded mesh, 0.2 on a uniform one, 0.02 on one to start from. On a
+        graded mesh cells of all sizes share the shape energy, and the octree that normalises E_D has a small one
+        already, so that more of it than on a uniform mesh is usual.
+    iterations : int
+        As of `optimize`, by default 16 on a graded mesh, else 20; nodes are exchanged in the first 0.7 of them.
+    sizes : Sizes
+        Limits on the edges of a graded mesh's cells; by default up to 1.4 times a uniform mesh's.
+    watch : callable
+        Called for each run with its initial mesh and a function that does it; returns the run's result. It may set up
+        what watches a run: `lambda initial, run: run(callback=print)`.
+    **options
+        Further ones of `optimize` or `optimize_paper`.
+
+    Returns
+    -------
+    Optimized
+        As `optimize`; its first record is of the initial mesh, which it holds, too.
+
+    Raises
+    ------
+    InputError
+        As `optimize` or `optimize_paper`; options that do not belong to the mode; neither or both of `nodes` and
+        `target_error`, or `spacing`; a number of nodes that the image is not worth (see `octree`), or an error that
+        its noise does not allow.
+
+    Examples
+    --------
+    >>> ball = np.fromfunction(lambda i, j, k: 100.0 * ((i - 20)**2 + (j - 20)**2 + (k - 20)**2 < 90), (41, 41, 41))
+    >>> result = mesh_image(Image(ball), 800)
+    >>> len(result.mesh.points)
+    800
+    """
+    if mode is None:
+        mode = "graded" if start is None else "start"
+    content = plain(image)
+    values = {"nodes": nodes, "target_error": target_error, "spacing": spacing, "kind": kind, "start": start}
+    _check_mode(mode, content, values | {"sizes": sizes})
+    default_k_D, default_iterations = DEFAULTS[mode]
+    options["k_D"] = default_k_D if k_D is None else k_D
+    options["iterations"] = default_iterations if iterations is None else iterations
+    if mode == "start":
+        options.setdefault("boundary", "fixed")
+
+    seconds: list[float] = []
+
+    def run(initial: Mesh, nodes: int | None) -> Optimized:
+        def optimized(**more: Any) -> Optimized:
+            if mode == "paper":
+                return optimize_paper(content.image, initial, **options, **more)
+            exchanged = nodes if mode == "graded" else None
+            return optimize(content, initial, nodes=exchanged, sizes=sizes, **options, **more)
+
+        begin = time.perf_counter()
+        result = optimized() if watch is None else watch(initial, optimized)
+        seconds.append(time.perf_counter() - begin)
+        return result._replace(initial=initial, nodes=nodes)
+
+    begin = time.perf_counter()
+    if target_error is not None:
+        result = meshed_to_error(content, target_error, sizes, run)
+    elif mode == "graded":
+        assert nodes is not None
+        result = run(octree(content, nodes, sizes), nodes)
+    elif mode == "start":
+        assert start is not None
+        result = run(start, None)
+    else:
+        result = run(lattice_within(content.image, content.region, kind, nodes=nodes, spacing=spacing), nodes)
+    seconds_run = sum(seconds)
+    return result._replace(seconds_start=time.perf_counter() - begin - seconds_run, seconds_run=seconds_run)
+
+
+def _check_mode(mode: Mode, content: Content, values: dict[str, Any]) -> None:
+    """InputError for a mode that there is not, and for what does not belong to it."""
+    if mode not in DEFAULTS:
+        raise InputError(f"mesh_image: expected a mode of {', '.join(DEFAULTS)}, got {mode!r}")
+    given = [name for name, value in values.items() if value is not None]
+    if strange := [name for name in given if name not in TAKES[mode]]:
+        raise InputError(f"mesh_image: a mesh of mode {mode!r} takes {', '.join(TAKES[mode])}, but no {strange[0]}")
+    if mode == "graded" and ("nodes" in given) == ("target_error" in given):
+        raise InputError("mesh_image: give a number of nodes or a target_error, one of them")
+    if mode in ("uniform", "paper") and ("nodes" in given) == ("spacing" in given):
+        raise InputError("mesh_image: give a number of nodes or a spacing, one of them")
+    if mode == "start" and not given:
+        raise InputError("mesh_image: mode 'start' needs a mesh to start from")
+    if mode == "paper" and not (content.is_plain and content.region is None):
+        raise InputError("mesh_image: the paper's scheme takes one image and its whole box")
+
+
+def meshed_to_error(
+    image: Image | Content, target_error: float, sizes: Sizes | None, run: Callable[[Mesh, int], Optimized]
+) -> Optimized:
+    """Run after run with other numbers of nodes, until the share of the image's variance is just below a target.
+
+    Returns the result, with the octree and the number of nodes, of the run with the fewest nodes that has the error; if
+    none has, of the one with the least, or of one that was cut short. It is the same as with that number of nodes from
+    the start, unless limits on sizes forbid that number. No fewer than 2^(n + 2) nodes are tried.
+
+    Raises
+    ------
+    InputError
+        A share out of range, or one below that of the image's noise, which no mesh should follow; as `octree`.
+    """
+    if not 0.0 < target_error < 1.0:
+        raise InputError(f"target_error: expected a share of the image's variance, 0 to 1, got {target_error}")
+    content = plain(image)
+    variance = content.variance
+    if variance == 0.0:
+        raise InputError("target_error: the image is constant, every mesh has no error; give a number of nodes")
+    noise = content.noise * content.unit / variance
+    if target_error <= noise:
+        raise InputError(
+            f"target_error: {target_error:g} of the variance is below the noise's share, by estimate {noise:.3g}: "
+            "cells would have to follow the noise; ask for more, or denoise the image"
+        )
+    nodes, shares = FIRST_NODES[content.image.ndim], dict[int, float]()  # what is left, by number of nodes
+    best: Optimized | None = None
+    requests: set[int] = set()
+    for _ in range(ERROR_RUNS):
+        initial = nearest_octree(content, nodes, sizes)
+        # Limits on sizes may ask for more nodes than the error, or allow fewer; a mask's octree is near only roughly.
+        if content.region is None and not is_near(len(initial.points), nodes):
+            nodes = len(initial.points)
+        if nodes in requests:
+            break
+        requests.add(nodes)
+        result = run(initial, nodes)._replace(initial=initial, nodes=nodes)
+        count, share = len(result.mesh.points), result.history[-1].E_D / (variance * content.volume)
+        if result.ended in ("stopped", "max_seconds"):
+            return best if best is not None and shares[len(best.mesh.points)] <= target_error else result
+        if count in shares:
+            break
+        shares[count] = share
+        if best is None or _is_better(count, len(best.mesh.points), shares, target_error):
+            best = result
+        if ERROR_REACHED * target_error <= share <= target_error:
+            return result
+        nodes = _next_nodes(content.image, shares, target_error)
+        if nodes in shares:
+            break
+    assert best is not None
+    return best
+
+
+def _is_better(new: int, old: int, shares: dict[int, float], target: float) -> bool:
+    """Whether one number of nodes answers better than another: it has the error with fewer, or is nearer to it."""
+    if (shares[new] <= target) != (shares[old] <= target):
+        return shares[new] <= target
+    return new < old if shares[new] <= target else shares[new] < shares[old]
+
+
+def _next_nodes(image: Image, shares: dict[int, float], target: float) -> int:
+    """The number of nodes to try next: between the nearest two on either side, or beyond the nearest."""
+    aim = 0.5 * (1.0 + ERROR_REACHED) * target
+    above = max((n for n, share in shares.items() if share > target), default=None)
+    below = min((n for n, share in shares.items() if share <= target), default=None)
+    least = 0.03 * aim  # there may be no error at all
+    if above is not None and below is not None and above < below:
+        part = np.log(shares[above] / aim) / np.log(shares[above] / max(shares[below], least))
+        return int(above * (below / above) ** part)
+    nearest = above if above is not None else below
+    assert nearest is not None
+    ratio = max(shares[nearest], least) / aim
+    return int(np.clip(nearest * ratio ** (1.0 / ERROR_RATE), 2 ** (image.ndim + 2), max(image.data.size // 8, 64)))
