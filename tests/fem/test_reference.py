@@ -19,7 +19,7 @@ from tetopt.fem.reference import (
     nearest,
     reference,
 )
-from tetopt.model.laws import cell_young
+from tetopt.model.averages import cell_young
 
 SHEARED = np.array([[1.5, 0.3, -0.2], [0.1, 2.0, 0.4], [0.2, -0.3, 0.8]])
 

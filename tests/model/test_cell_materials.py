@@ -6,8 +6,9 @@ from models import sample_image, sample_model
 
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
+from tetopt.model.averages import cell_values
 from tetopt.model.build import model_of
-from tetopt.model.laws import ByLabel, cell_values, has_column, load_law, parse_any_law, parse_law
+from tetopt.model.laws import ByLabel, has_column, load_law, parse_any_law, parse_law
 from tetopt.model.materials import binned, by_label, materials
 
 YOUNG = np.array([3.0, 1.0, 3.0, 2.0, 8.0])

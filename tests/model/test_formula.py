@@ -7,7 +7,8 @@ from hypothesis import strategies as st
 
 import tetopt
 from tetopt.model.formula import parse_formula
-from tetopt.model.laws import inverse_strain, parse_law, young_from
+from tetopt.model.laws import parse_law, young_from
+from tetopt.study.paper import inverse_strain
 
 H = np.array([[0.5, 1.0, 2.0], [3.0, 10.0, 250.0]])
 

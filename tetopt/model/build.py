@@ -12,17 +12,9 @@ from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
 from tetopt.image import Image
 from tetopt.mesh import Mesh
+from tetopt.model.averages import cell_values, cell_young
 from tetopt.model.fields import cell_fields
-from tetopt.model.laws import (
-    ByLabel,
-    Law,
-    cell_values,
-    cell_young,
-    has_column,
-    law_values,
-    parse_any_law,
-    young_from,
-)
+from tetopt.model.laws import ByLabel, Law, has_column, law_values, parse_any_law, young_from
 from tetopt.model.loads import parse_loads
 from tetopt.model.materials import Materials, Spacing, binned, by_label, materials
 from tetopt.model.model import Model

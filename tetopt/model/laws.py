@@ -1,9 +1,4 @@
-"""From intensities to Young's moduli.
-
-Eq. (2) wants the *mean of the modulus field* over each cell. A law from intensity to modulus is therefore applied to
-the voxels first and the mean taken afterwards (`young_image`, `cell_young`); the law of the mean intensity is another
-number wherever the law is curved and the cell is not uniform.
-"""
+"""Laws: from an intensity, or a label, to a value such as Young's modulus; in words, in files, of arrays."""
 
 from __future__ import annotations
 
@@ -17,10 +12,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tetopt.energy.sampling import cell_of_voxel, nearest_values, ranges_of
 from tetopt.errors import InputError
-from tetopt.image import Image
-from tetopt.mesh import Mesh
 from tetopt.model.formula import parse_formula
 
 Law = Callable[[NDArray[np.float64]], ArrayLike] | Sequence[Sequence[float]] | NDArray[np.floating] | None
@@ -267,63 +259,6 @@ def _checked_pairs(pairs: list[tuple[float, float]]) -> list[tuple[float, float]
     return pairs
 
 
-def young_image(image: Image, law: Law) -> Image:
-    """The modulus field: `young_from` of every voxel, kPa, at the image's place in the world.
-
-    It can be meshed in place of the image, so that the cells follow the moduli.
-
-    Raises
-    ------
-    InputError
-        As `young_from`.
-    """
-    return Image(young_from(law, image.data), image.affine)
-
-
-def cell_young(image: Image, mesh: Mesh, law: Law = None) -> NDArray[np.float64]:
-    """Modulus of each cell, (M,) float64, kPa: the mean of the modulus field over it, Eq. (2).
-
-    A cell without voxel centre gets the modulus at its centroid, see `tetopt.energy.sampling.cell_moments`.
-
-    Raises
-    ------
-    InputError
-        As `young_from` and `tetopt.energy.sampling.cell_of_voxel`.
-    """
-    return _cell_means(young_image(image, law), mesh)
-
-
-def cell_values(image: Image, mesh: Mesh, law: Law) -> NDArray[np.float64]:
-    """`cell_young` of any quantity, which may be negative, such as Poisson's ratio.
-
-    Raises
-    ------
-    InputError
-        As `law_values` and `tetopt.energy.sampling.cell_of_voxel`; values that are not finite.
-    """
-    values = law_values(law, image.data)
-    if not np.isfinite(values).all():
-        at = image.data[~np.isfinite(values)].ravel()[0]
-        raise InputError(f"law: it has no value at intensity {at:g}; give one defined over the image's whole range")
-    return _cell_means(Image(values, image.affine), mesh)
-
-
-def _cell_means(field: Image, mesh: Mesh) -> NDArray[np.float64]:
-    # Summed voxel by voxel. `cell_moments` takes differences of sums over rows, whose rounding would drown the soft
-    # cells of a field that spans ten orders of magnitude.
-    owner = cell_of_voxel(field, mesh).ravel()
-    inside = owner >= 0
-    n_voxels = np.bincount(owner[inside], minlength=len(mesh.cells))
-    total = np.bincount(owner[inside], weights=field.data.ravel()[inside], minlength=len(mesh.cells))
-    is_empty = n_voxels == 0
-    means = total / np.maximum(n_voxels, 1)
-    # So that a cell of equal values has exactly that value: constants stay one material.
-    low, high = ranges_of(owner, field.data.ravel(), len(mesh.cells))
-    means = np.clip(means, low, high, where=~is_empty, out=means)
-    means[is_empty] = nearest_values(field, mesh.points[mesh.cells[is_empty]].mean(axis=1))
-    return means
-
-
 def checked_young(young: NDArray[np.float64]) -> NDArray[np.float64]:
     """The moduli of cells, (M,); InputError unless all are above 0."""
     bad = np.flatnonzero(~(np.isfinite(young) & (young > 0.0)))
@@ -334,38 +269,6 @@ def checked_young(young: NDArray[np.float64]) -> NDArray[np.float64]:
             'give empty space a small modulus too, as --young "0:0.1,255:6" does'
         )
     return young
-
-
-def inverse_strain(strain: ArrayLike, floor: float) -> NDArray[np.float64]:
-    """1 / strain, an approximation of the elastic modulus from a strain map (Section 3), float64.
-
-    It is the modulus in units of the stress, if that were the same everywhere: in kPa under a stress of 1 kPa.
-
-    Parameters
-    ----------
-    strain : array of real numbers
-        Compression and extension alike: the absolute value counts.
-    floor : float
-        Strains smaller than this, noise among them, count as this one, so the modulus is at most 1 / floor.
-
-    Raises
-    ------
-    InputError
-        A strain that is not finite, or a floor that is not above 0.
-
-    Examples
-    --------
-    >>> inverse_strain([0.02, -0.01, 0.0], floor=0.001)
-    array([  50.,  100., 1000.])
-    """
-    strain = np.asarray(strain, dtype=np.float64)
-    if not (np.isfinite(floor) and floor > 0.0):
-        raise InputError(f"floor: expected a strain above 0, such as 0.001, got {floor}")
-    if not np.isfinite(strain).all():
-        raise InputError(
-            f"strain: {int((~np.isfinite(strain)).sum())} values are NaN or infinite; replace them, 0 stands for stiff"
-        )
-    return 1.0 / np.maximum(np.abs(strain), floor)
 
 
 def _checked_table(law: ArrayLike) -> NDArray[np.float64]:

@@ -33,8 +33,9 @@ from tetopt.io.meshes import load_mesh, save_mesh
 from tetopt.measure.fidelity import cell_labels, label_fidelity
 from tetopt.measure.quality import quality, rho_histogram
 from tetopt.mesh import Mesh
+from tetopt.model.averages import cell_young, young_image
 from tetopt.model.fields import cell_fields
-from tetopt.model.laws import Law, cell_young, young_image
+from tetopt.model.laws import Law
 from tetopt.report.summary import image_summary, versions
 from tetopt.study.child import run_in_child
 from tetopt.study.pipelines import UNTIMED, Job

@@ -11,12 +11,13 @@ from importlib.resources import files
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from tetopt.energy.discretization import E_D, combined
 from tetopt.energy.geometric import E_G
 from tetopt.engine.loop import Optimized
 from tetopt.engine.paper import optimize_paper
+from tetopt.errors import InputError
 from tetopt.fem.conditioning import conditioning
 from tetopt.fem.elasticity import Compression, box_faces, check_fills_box, compression, push_of, strains
 from tetopt.geometry.simplex import rho
@@ -24,7 +25,8 @@ from tetopt.image import Image
 from tetopt.io.images import cropped, image_slice
 from tetopt.measure.quality import QualityErrors, quality_errors
 from tetopt.mesh import Mesh
-from tetopt.model.laws import Law, cell_young, inverse_strain
+from tetopt.model.averages import cell_young
+from tetopt.model.laws import Law
 from tetopt.phantom import load_phantom
 from tetopt.start.delaunay import delaunay
 from tetopt.start.lattice import lattice
@@ -166,6 +168,38 @@ def _cropped_to_content(image: Image, proportions: tuple[int, ...]) -> Image:
     grow = (block * np.array(proportions) - size) / image.spacing / 2.0
     low, high = np.maximum(np.rint(low - grow), 0), np.minimum(np.rint(high + grow), image.shape)
     return cropped(image, [(int(a), int(b)) for a, b in zip(low, high, strict=True)])
+
+
+def inverse_strain(strain: ArrayLike, floor: float) -> NDArray[np.float64]:
+    """1 / strain, an approximation of the elastic modulus from a strain map (Section 3), float64.
+
+    It is the modulus in units of the stress, if that were the same everywhere: in kPa under a stress of 1 kPa.
+
+    Parameters
+    ----------
+    strain : array of real numbers
+        Compression and extension alike: the absolute value counts.
+    floor : float
+        Strains smaller than this, noise among them, count as this one, so the modulus is at most 1 / floor.
+
+    Raises
+    ------
+    InputError
+        A strain that is not finite, or a floor that is not above 0.
+
+    Examples
+    --------
+    >>> inverse_strain([0.02, -0.01, 0.0], floor=0.001)
+    array([  50.,  100., 1000.])
+    """
+    strain = np.asarray(strain, dtype=np.float64)
+    if not (np.isfinite(floor) and floor > 0.0):
+        raise InputError(f"floor: expected a strain above 0, such as 0.001, got {floor}")
+    if not np.isfinite(strain).all():
+        raise InputError(
+            f"strain: {int((~np.isfinite(strain)).sum())} values are NaN or infinite; replace them, 0 stands for stiff"
+        )
+    return 1.0 / np.maximum(np.abs(strain), floor)
 
 
 def elastography(snr_db: float | None, nu: float = 0.45) -> Image:
