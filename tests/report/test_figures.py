@@ -27,7 +27,7 @@ from tetopt.report.colours import (
 )
 from tetopt.report.figures import (
     DETAIL_VOXELS,
-    _View,
+    SliceView,
     boundary_figure,
     energy_figure,
     histogram_figure,
@@ -95,7 +95,7 @@ def contains(polygon, point):
 def test_pixels_lie_where_the_letters_say(worlds, signs, normal):
     """All 48 orientations, sagittal, coronal, axial: right of the patient's left, up from posterior or inferior."""
     image = oriented_image(worlds, signs)
-    view = _View(image, axis=worlds.index(normal), index=3)
+    view = SliceView(image, axis=worlds.index(normal), index=3)
     horizontal, vertical = (w for w in range(3) if w != normal)
     assert view.letters == [WORLD_LETTERS[horizontal], WORLD_LETTERS[vertical]]
     # The world place of every voxel in the slice, and its value, put in rising order of the two coordinates.
@@ -119,28 +119,28 @@ def test_pixels_lie_where_the_letters_say(worlds, signs, normal):
 def test_a_bright_voxel_in_the_axial_picture(name, worlds, signs):
     """It is in the patient's right front, so right and up in the picture."""
     image = oriented_image(worlds, signs)
-    view = _View(image, None, None)
+    view = SliceView(image, None, None)
     assert view.letters == ["LR", "PA"]
     centre = image.to_world((np.array(SHAPE) - 1) / 2)
     step = np.array([SPACING[worlds.index(w)] for w in range(2)])
     index = np.rint(image.to_index(centre + np.array([2 * step[0], step[1], 0.0]))).astype(int)
     data = np.zeros(SHAPE)
     data[tuple(index)] = 1.0
-    bright = _View(Image(data, image.affine), None, index[view.across]).pixels
+    bright = SliceView(Image(data, image.affine), None, index[view.across]).pixels
     middle = (np.array(bright.shape) - 1) // 2
     assert np.argwhere(bright == 1.0).tolist() == [[middle[0] + 2, middle[1] + 1]]
 
 
 @pytest.mark.parametrize(("worlds", "signs"), ORIENTATIONS)
 def test_the_default_slice_is_axial_and_in_the_middle(worlds, signs):
-    view = _View(oriented_image(worlds, signs), None, None)
+    view = SliceView(oriented_image(worlds, signs), None, None)
     assert view.across == worlds.index(2)
     assert view.index == SHAPE[view.across] // 2
 
 
 def test_an_oblique_image_is_laid_out_by_its_nearest_axes():
     image = Image(np.random.default_rng(0).normal(size=SHAPE), OBLIQUE)
-    view = _View(image, None, None)
+    view = SliceView(image, None, None)
     assert (view.across, view.axes, view.letters) == (2, [0, 1], ["LR", "PA"])
     np.testing.assert_array_equal(view.pixels, image.data[::-1, :, 4])  # the first axis runs to the left
     np.testing.assert_allclose(view.size, image.spacing[:2] * SHAPE[:2])
@@ -154,7 +154,7 @@ def test_a_2d_image_has_x_to_the_right_and_y_up(worlds, signs):
     for axis in range(2):
         affine[worlds[axis], axis] = signs[axis] * SPACING[axis]
     image = Image(np.random.default_rng(0).normal(size=(5, 7)), affine)
-    view = _View(image, None, None)
+    view = SliceView(image, None, None)
     index = np.array(list(np.ndindex(5, 7)))
     place = image.to_world(index)
     order = np.lexsort((place[:, 1], place[:, 0]))
@@ -167,11 +167,11 @@ def test_cells_and_pixels_share_their_places(worlds, signs):
     """The polygon around a pixel's centre is of the cell that holds the voxel."""
     image = oriented_image(worlds, signs)
     mesh = bent(image, (3, 3, 2))
-    view = _View(image, None, None)
+    view = SliceView(image, None, None)
     polygons, cells = view.section(mesh)
     is_wide = areas(polygons) > 1e-9
     polygons, cells = polygons[is_wide], cells[is_wide]
-    owner = _View(Image(cell_of_voxel(image, mesh), image.affine), None, None).pixels
+    owner = SliceView(Image(cell_of_voxel(image, mesh), image.affine), None, None).pixels
     steps = image_steps(image, view)
     n_found = 0
     for pixel in np.ndindex(owner.shape):
@@ -196,11 +196,11 @@ def test_a_section_tiles_the_slice(affine, kind, axis):
     # 9 voxels in 3 blocks: the planes of nodes at index 2.5 and 5.5; 8 and 10 in 2: at 3.5 and 4.5.
     mesh = bent(image, (2, 3, 2)) if kind == "bent" else lattice(image, kind, blocks=(2, 3, 2))
     for index in range(image.shape[axis]):
-        polygons, cells = _View(image, axis, index).section(mesh)
+        polygons, cells = SliceView(image, axis, index).section(mesh)
         size = np.delete(image.spacing * image.shape, axis)
         assert areas(polygons).sum() == pytest.approx(size.prod(), rel=1e-12)
         assert polygons.min() >= -1e-9
-        assert (polygons.max(axis=(0, 1)) <= np.array(_View(image, axis, index).size) + 1e-9).all()
+        assert (polygons.max(axis=(0, 1)) <= np.array(SliceView(image, axis, index).size) + 1e-9).all()
         assert len(np.unique(cells)) == len(cells)
 
 
@@ -209,7 +209,7 @@ def test_a_section_through_a_plane_of_nodes_tiles_it_once(axis):
     """7 voxels in 2 blocks: the middle voxel's plane is a plane of nodes, and of facets."""
     image = Image(np.random.default_rng(0).normal(size=(7, 7, 7)))
     for kind in ("bcc", "five-tet"):
-        polygons, _ = _View(image, axis, 3).section(lattice(image, kind, blocks=(2, 2, 2)))
+        polygons, _ = SliceView(image, axis, 3).section(lattice(image, kind, blocks=(2, 2, 2)))
         assert areas(polygons).sum() == pytest.approx(49.0, rel=1e-12)
 
 
@@ -218,7 +218,7 @@ def test_a_2d_mesh_is_shown_whole():
         np.random.default_rng(0).normal(size=(6, 7)), np.array([[-2.0, 0.5, 1.0], [0.3, 1.0, 5.0], [0, 0, 1]])
     )
     mesh = bent(image, (2, 3))
-    polygons, cells = _View(image, None, None).section(mesh)
+    polygons, cells = SliceView(image, None, None).section(mesh)
     np.testing.assert_array_equal(cells, np.arange(len(mesh.cells)))
     assert areas(polygons).sum() == pytest.approx((image.spacing * image.shape).prod(), rel=1e-12)
 
@@ -241,7 +241,7 @@ def test_slice_figure_holds_each_mesh_under_its_title(n):
     image = Image(np.random.default_rng(0).normal(size=SHAPE[:n]), np.diag([*SPACING[:n], 1.0]))
     first, second = lattice(image, blocks=(2, 2, 2)[:n]), bent(image, (2, 3, 2)[:n])
     figure = slice_figure(image, [("first", first), ("second", second)])
-    view = _View(image, None, None)
+    view = SliceView(image, None, None)
     grid = np.array(figure.axes).reshape(2, 2)
     for column, (title, mesh) in enumerate([("first", first), ("second", second)]):
         over, flat = grid[:, column]
@@ -362,17 +362,17 @@ def test_voxels_and_cells_have_the_same_colours(worlds, signs):
     mesh = bent(labels, (3, 3, 2))
     grid = np.array(label_figure(labels, mesh).axes).reshape(3, 2)
     colours, of_cell = label_colours(labels), cell_labels(labels, mesh)
-    for (given, meshed), normal in zip(grid, (2, 1, 0), strict=True):
-        view = _View(labels, worlds.index(normal), None)
-        np.testing.assert_array_equal(given.images[0].get_array(), colours[view.pixels.T.astype(int)])
-        assert given.images[0].get_extent() == [0.0, view.size[0], 0.0, view.size[1]]
+    for (left, right), normal in zip(grid, (2, 1, 0), strict=True):
+        view = SliceView(labels, worlds.index(normal), None)
+        np.testing.assert_array_equal(left.images[0].get_array(), colours[view.pixels.T.astype(int)])
+        assert left.images[0].get_extent() == [0.0, view.size[0], 0.0, view.size[1]]
         polygons, cells = view.section(mesh)
-        (drawn,) = collections(meshed)
+        (drawn,) = collections(right)
         np.testing.assert_allclose(corners(drawn), polygons.mean(axis=1))
         np.testing.assert_array_equal(drawn.get_facecolors()[:, :3], colours[of_cell[cells]])
-        assert [text.get_text() for text in given.texts] == [text.get_text() for text in meshed.texts]  # sides alone
-        assert len(given.texts) == 4
-    (legend,) = given.figure.legends
+        assert [text.get_text() for text in left.texts] == [text.get_text() for text in right.texts]  # sides alone
+        assert len(left.texts) == 4
+    (legend,) = left.figure.legends
     assert [text.get_text() for text in legend.get_texts()] == ["0", "1", "2", "3"]
 
 
@@ -389,8 +389,8 @@ def test_numbers_stand_in_their_labels_where_a_legend_is_too_short():
     labels = blocks_of_labels(LISTED_LABELS + 3)
     figure = label_figure(labels, lattice(labels, blocks=(4, 2, 2)))
     assert figure.legends[0].get_texts()[-1].get_text() == "and 3 more"
-    view, given = _View(labels, None, None), figure.axes[0]
-    numbers = [text for text in given.texts if text.get_text().isdigit()]
+    view, left = SliceView(labels, None, None), figure.axes[0]
+    numbers = [text for text in left.texts if text.get_text().isdigit()]
     assert [text.get_text() for text in numbers] == [str(k) for k in range(1, LISTED_LABELS + 3)]
     for text in numbers:
         pixel = (np.array(text.get_position()) / view.steps).astype(int)
@@ -420,10 +420,10 @@ def test_boundary_and_outline_lie_between_the_same_pixels(worlds, signs):
     mask[:3] = 1.0
     mask = Image(np.moveaxis(mask, 0, axis), image.affine)
     figure = boundary_figure(image, mask, lower_part(image, axis, 3), axis=normal, index=2)
-    pixels = _View(mask, normal, 2).pixels
+    pixels = SliceView(mask, normal, 2).pixels
     place = SPACING[axis] * (np.flatnonzero(np.diff(pixels[:, 0]))[0] + 1)
     for axes in figure.axes:
-        np.testing.assert_array_equal(axes.images[0].get_array(), _View(image, normal, 2).pixels.T)
+        np.testing.assert_array_equal(axes.images[0].get_array(), SliceView(image, normal, 2).pixels.T)
         for drawn in lines(axes):
             np.testing.assert_allclose(drawn[..., 0], place, atol=1e-4)
             np.testing.assert_allclose([drawn[..., 1].min(), drawn[..., 1].max()], [0.0, figure.axes[0].get_ylim()[1]])
@@ -445,7 +445,7 @@ def test_a_closed_boundary_is_closed_in_every_slice(index):
     mesh = lattice(image, blocks=(3, 3, 2)) if index == 3 else bent(image, (3, 3, 2))
     on_box = (np.abs(image.to_index(mesh.points) - [4.0, 4.0, 3.0]) > [4.4, 4.4, 3.4]).any(axis=1)
     inner = Mesh(mesh.points, mesh.cells[~on_box[mesh.cells].any(axis=1)])
-    view = _View(image, 2, index)
+    view = SliceView(image, 2, index)
     segments = view.boundary(inner)
     ends, times = np.unique(segments.reshape(-1, 2).round(7), axis=0, return_counts=True)
     assert (times % 2 == 0).all()
@@ -457,7 +457,7 @@ def test_a_closed_boundary_is_closed_in_every_slice(index):
 
 def test_what_lies_on_the_box_is_no_boundary():
     image = Image(np.random.default_rng(0).normal(size=SHAPE))
-    assert len(_View(image, None, None).boundary(lattice(image, blocks=(2, 2, 2)))) == 0
+    assert len(SliceView(image, None, None).boundary(lattice(image, blocks=(2, 2, 2)))) == 0
 
 
 def test_the_detail_is_where_the_outline_bends_most():
@@ -574,7 +574,7 @@ def test_before_is_left_and_after_is_right(monkeypatch, tmp_path, run):
     share = result.history[-1].E_D / result.history[0].E_D
     assert share < 0.95
     assert slice_axes[0, 1].get_title() == f"optimised, {share:.3f} of its E_D"
-    view = _View(image, None, None)
+    view = SliceView(image, None, None)
     for column, mesh in enumerate((initial, result.mesh)):
         for row in (0, 1):
             drawn = corners(collections(slice_axes[row, column])[0])

@@ -12,7 +12,7 @@ import tetopt
 from tetopt.energy.discretization import cell_E_D
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
-from tetopt.report.figures import _View, save_figure
+from tetopt.report.figures import SliceView, save_figure
 from tetopt.study.compare_figures import (
     ERRORS,
     curves_figure,
@@ -41,7 +41,7 @@ def test_slices_hold_means_and_losses(small, n_meshes):
     means = [tetopt.cell_moments(image, mesh).mean + k for k, (_, mesh) in enumerate(meshes)]
     figure = slices_figure(image, meshes, means)
     grid = np.array(figure.axes[: 3 * (n_meshes + 1)]).reshape(3, n_meshes + 1)
-    view = _View(image, None, None)
+    view = SliceView(image, None, None)
     np.testing.assert_array_equal(grid[0, 0].images[0].get_array(), view.pixels.T)
     for column, ((title, mesh), mean) in enumerate(zip(meshes, means, strict=True), 1):
         polygons, cells = view.section(mesh)

@@ -45,7 +45,7 @@ def label_colours(labels: Image) -> NDArray[np.float64]:
     Raises
     ------
     InputError
-        Labels that are none.
+        Labels that are not whole numbers in this range.
     """
     check_labels("labels", labels)
     counts = np.bincount(labels.data.astype(np.int64).ravel())

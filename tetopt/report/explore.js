@@ -12,6 +12,7 @@ const number = (value, digits = 5) => value.toLocaleString("en-US", {
   maximumSignificantDigits: digits, notation: value !== 0 && Math.abs(value) < 1e-3 ? "scientific" : "standard",
 });
 const whole = (value) => value.toLocaleString("en-US");
+const heading = (field) => (field.unit ? `${field.name} (${field.unit})` : field.name);
 
 function say(words) {
   $("busy").textContent = words;
@@ -55,7 +56,7 @@ function explore(gl, data, notes) {
   const camera = { ...facing(), ...WHOLE };
   const isWithin = new Uint8Array(mesh.count).fill(1);
 
-  // From where the cut is seen, slantwise.
+  // From where the cut is seen at first, slantwise.
   function facing() {
     const { axis, isTurned } = state;
     if (axis === 2) return { yaw: -1.2, pitch: isTurned ? -0.85 : 0.85 };
@@ -67,17 +68,15 @@ function explore(gl, data, notes) {
 
   const way = () => (state.isTurned ? -1 : 1);  // beyond the plane, along its axis, nothing is shown
 
+  // The half space that is hidden: where the product of a place with the first three numbers is above the fourth.
   function plane() {
-    const found = [0, 0, 0, 1];
-    if (state.axis < 0 || state.isWhole) return found;
-    found[state.axis] = way();
-    found[3] = way() * state.at;
-    return found;
+    if (state.axis < 0 || state.isWhole) return [0, 0, 0, 1];
+    return [...[0, 1, 2].map((k) => (k === state.axis ? way() : 0)), way() * state.at];
   }
 
   function within() {
     const { values, min, max } = fields[state.by];
-    const isAll = state.low <= min && state.high >= max;  // then also cells without a value
+    const isAll = state.low <= min && state.high >= max;  // then cells without a value are shown, too
     let count = 0, volume = 0;
     for (let cell = 0; cell < mesh.count; cell++) {
       isWithin[cell] = isAll || (values[cell] >= state.low && values[cell] <= state.high) ? 1 : 0;
@@ -99,7 +98,7 @@ function explore(gl, data, notes) {
     const nothing = new Triangles(0);
     const hasSlice = axis >= 0 && image && state.inside !== "cells";
     const outside = surface(mesh, shown());
-    // The cells of the section are also there, unseen, where only the image is shown: to be clicked on.
+    // Where only the image is shown, the cells of the section are there as well, unseen, to be clicked on.
     const cut = axis >= 0 && (hasSlice || !state.isWhole) ? section(mesh, isWithin, axis, at) : nothing;
     drawn.parts.surface.fill(outside);
     drawn.parts.section.fill(cut);
@@ -141,7 +140,7 @@ function explore(gl, data, notes) {
   function showKey() {
     const field = fields[state.field];
     const [low, high] = field.limits;
-    document.querySelector("#key b").textContent = field.unit ? `${field.name} (${field.unit})` : field.name;
+    document.querySelector("#key b").textContent = heading(field);
     $("scale").hidden = field.categories.length > 0;
     $("labels").hidden = !field.categories.length;
     const stops = Array.from({ length: 18 }, (_, i) => `rgb(${table.subarray(45 * i, 45 * i + 3).join()})`);
@@ -151,8 +150,7 @@ function explore(gl, data, notes) {
     if (field.max > high) texts[2] = `≥ ${texts[2]}`;
     $("ticks").replaceChildren(...texts.map((text) => element("span", text)));
     $("labels").replaceChildren(...field.categories.map(([value, colour]) => {
-      const entry = element("span", "");
-      const swatch = element("i", "");
+      const [entry, swatch] = [element("span", ""), element("i", "")];
       swatch.style.background = colour;
       entry.append(swatch, String(value));
       return entry;
@@ -165,9 +163,7 @@ function explore(gl, data, notes) {
   // -- controls
 
   function element(kind, text) {
-    const made = document.createElement(kind);
-    made.textContent = text;
-    return made;
+    return Object.assign(document.createElement(kind), { textContent: text });
   }
 
   function choose(place, options, act) {
@@ -299,7 +295,7 @@ function explore(gl, data, notes) {
     const table = element("table", "");
     const middle = [0, 1, 2].map((k) => (mesh.centroids[3 * picked + k] + centre[k]).toFixed(1)).join(", ");
     const rows = fields.map((field) => [
-      field.unit ? `${field.name} (${field.unit})` : field.name,
+      heading(field),
       Number.isNaN(field.values[picked]) ? "no value" : number(field.values[picked], 6),
     ]);
     const nodes = [...mesh.cells.subarray(4 * picked, 4 * picked + 4)].join(", ");
@@ -354,17 +350,17 @@ function explore(gl, data, notes) {
 
   function about() {
     const volume = mesh.volumes.reduce((sum, one) => sum + one, 0);
-    const said = [`World coordinates: RAS, mm. Mesh: ${whole(mesh.points.length / 3)} nodes,
+    const words = [`World coordinates: RAS, mm. Mesh: ${whole(mesh.points.length / 3)} nodes,
       ${whole(mesh.count)} cells, ${number(volume, 7)} mm³.`];
     if (image) {
       const coarser = image.shape.join() === image.original.join() ? "" : `, averaged to ${image.shape.join(" × ")}`;
-      said.push(`Image: ${image.original.join(" × ")} voxels${coarser}; black is ${number(image.limits[0])},
+      words.push(`Image: ${image.original.join(" × ")} voxels${coarser}; black is ${number(image.limits[0])},
         white ${number(image.limits[1])}.`);
     }
-    $("about").textContent = [...said, ...notes].join(" ");
+    $("about").textContent = [...words, ...notes].join(" ");
   }
 
-  const options = fields.map((field, i) => [field.unit ? `${field.name} (${field.unit})` : field.name, i]);
+  const options = fields.map((field, i) => [heading(field), i]);
   fill("field", options, chooseField);
   fill("by", options, chooseBy);
   fill("set", [["none", -1], ...sets.map((set, i) => [`${set.name} (${set.triangles.length / 3})`, i])],
@@ -393,7 +389,7 @@ function explore(gl, data, notes) {
   $("controls").hidden = false;
 }
 
-// After the first paint, so that the page says what it is at: a large mesh takes seconds.
+// It begins after the first paint, so that the page says what it is doing: a large mesh takes seconds.
 setTimeout(() => {
   try {
     start();

@@ -33,7 +33,7 @@ COLOUR_MAP = "viridis"  # perceptually even
 MAX_LABELS = 128  # Whole numbers with more values than this are a quantity: no list of colours that long is read.
 NO_VALUE = "#aaaaaa"  # of cells whose value is not a number
 OUTLIERS_PERCENT = 1.0  # of the cells, at either end of a field: their values do not stretch its colours
-# Of the fields that tetopt writes, which are quantities even where they are whole numbers.
+# The fields that tetopt writes: they are quantities, even where their values are whole numbers.
 FIELD_UNITS = {
     "mean": "intensity", "variance": "intensity²", "n_voxels": "voxels", "min": "intensity", "max": "intensity",
     "volume": "mm³", "rho": "0 to 1/3", "min_dihedral": "degrees", "young": "kPa",
@@ -83,20 +83,17 @@ def _is_scalar(values: NDArray) -> bool:
 def _field(name: str, values: NDArray) -> Field:
     with np.errstate(over="ignore"):
         values = values.astype(np.float32)
-    found = np.where(np.isfinite(values), values, np.nan).astype(np.float32)
-    finite = found[np.isfinite(found)].astype(np.float64)
+    values = np.where(np.isfinite(values), values, np.nan).astype(np.float32)
+    finite = values[np.isfinite(values)].astype(np.float64)
     if len(finite) == 0:
-        return Field(name, FIELD_UNITS.get(name, ""), found, (0.0, 1.0), [])
+        return Field(name, FIELD_UNITS.get(name, ""), values, (0.0, 1.0), [])
     low, high = (float(limit) for limit in np.percentile(finite, [OUTLIERS_PERCENT, 100.0 - OUTLIERS_PERCENT]))
-    if high <= low:
-        low, high = grey_limits([finite])
-    return Field(
-        name, FIELD_UNITS.get(name, ""), found, (low, high), [] if name in FIELD_UNITS else _categories(finite)
-    )
+    limits = (low, high) if high > low else grey_limits([finite])
+    return Field(name, FIELD_UNITS.get(name, ""), values, limits, [] if name in FIELD_UNITS else _categories(finite))
 
 
 def _categories(values: NDArray[np.float64]) -> list[tuple[int, str]]:
-    """Labels and their colours; none if the values are not whole, negative or too many to be told apart."""
+    """Labels and their colours; none if values are not whole, or negative, or too many for a list of colours."""
     if (values != np.rint(values)).any() or values.min() < 0 or values.max() > LABELS:
         return []
     labels = np.unique(values).astype(np.int64)
@@ -188,7 +185,8 @@ def explorer_html(
 
 def _packed_image(image: Image, centre: NDArray[np.float64]) -> dict[str, Any]:
     """The image as bytes, the first axis fastest, with what takes a place relative to `centre` to its index."""
-    shown = averaged(image, _shown_shape(image.shape)) if _shown_shape(image.shape) != image.shape else image
+    shape = _shown_shape(image.shape)
+    shown = image if shape == image.shape else averaged(image, shape)
     low, high = grey_limits([shown.data.astype(np.float64)])
     greys = np.rint(255.0 * np.clip((shown.data - low) / (high - low), 0.0, 1.0)).astype(np.uint8)
     to_index = np.linalg.inv(shown.affine)
@@ -206,7 +204,7 @@ def _packed_image(image: Image, centre: NDArray[np.float64]) -> dict[str, Any]:
 
 
 def _shown_shape(shape: tuple[int, ...]) -> tuple[int, ...]:
-    """The shape itself, or, of an image too large for the page, a coarser one: the longest axes are divided first."""
+    """The image's own shape or, if it is too large for the page, a coarser one: the longest axes are divided first."""
     sizes = np.minimum(shape, PAGE_SIDE_VOXELS)
     longest = int(sizes.max())
     while np.prod(np.minimum(sizes, longest), dtype=np.int64) > PAGE_IMAGE_VOXELS:

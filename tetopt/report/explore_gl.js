@@ -37,6 +37,7 @@ const FRAGMENT = `${SHADING}
     if (cell + 1u == picked) fill = mix(fill, vec3(1.0, 0.1, 0.1), 0.7);
     colour = vec4(mix(fill, ink, mix(0.5, 0.65, seenOwn) * line), 1.0);
   }`;
+// The parts in the order in which they are drawn, with the shader's numbers of them.
 const KINDS = { surface: 0, section: 1, slice: 2, set: 3 };
 const WIDE = 2048;  // cells in a row of the texture of their colours
 
@@ -67,7 +68,7 @@ function nearestTexture(gl, unit, target) {
   for (const name of [gl.TEXTURE_MIN_FILTER, gl.TEXTURE_MAG_FILTER]) gl.texParameteri(target, name, gl.NEAREST);
 }
 
-// What draws the view; asked again for every change, it keeps on the card only what `fill` and `paint` gave it.
+// What draws the view. It draws all of it for every change; only what `fill` and `paint` take stays on the card.
 function renderer(gl, image, radius, depth) {
   const { at, part, clear } = painter(gl, FRAGMENT);
   const parts = Object.fromEntries(Object.keys(KINDS).map((name) => [name, part()]));

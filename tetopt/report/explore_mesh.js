@@ -1,15 +1,15 @@
-// The mesh of the page: who touches whom, what is its surface and what a plane cuts. Places are in mm relative to its
+// The mesh of the page: which cells touch, what its surface is and what a plane cuts. Places are in mm relative to its
 // middle, in single precision.
 
 const FACETS = [[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]];  // facet k of a cell lies opposite its node k
 
-// Of each cell and each of its nodes the cell beyond the facet opposite, -1 on the boundary: (4 M).
+// For each node of each cell the cell on the other side of the facet opposite, -1 on the boundary: (4 M).
 function neighbours(cells, nNodes) {
   const first = new Int32Array(nNodes).fill(-1);  // half facets, chained by their smallest node
   const next = new Int32Array(cells.length).fill(-1);
   const middle = new Uint32Array(cells.length);
   const largest = new Uint32Array(cells.length);
-  const found = new Int32Array(cells.length).fill(-1);
+  const across = new Int32Array(cells.length).fill(-1);
   for (let half = 0; half < cells.length; half++) {
     const start = half - half % 4;
     const [i, j, k] = FACETS[half % 4];
@@ -19,8 +19,8 @@ function neighbours(cells, nNodes) {
     let other = first[low];
     while (other >= 0 && (middle[other] !== between || largest[other] !== high)) other = next[other];
     if (other >= 0) {
-      found[half] = other >> 2;
-      found[other] = half >> 2;
+      across[half] = other >> 2;
+      across[other] = half >> 2;
     } else {
       middle[half] = between;
       largest[half] = high;
@@ -28,7 +28,7 @@ function neighbours(cells, nNodes) {
       first[low] = half;
     }
   }
-  return found;
+  return across;
 }
 
 function centroidsAndVolumes(points, cells) {
@@ -78,23 +78,23 @@ function surface(mesh, isShown) {
   const isOuter = (half) => isShown[half >> 2] && !(mesh.neighbours[half] >= 0 && isShown[mesh.neighbours[half]]);
   let count = 0;
   for (let half = 0; half < cells.length; half++) if (isOuter(half)) count++;
-  const made = new Triangles(count);
+  const triangles = new Triangles(count);
   for (let half = 0; half < cells.length; half++) {
     if (!isOuter(half)) continue;
     const start = half - half % 4;
     for (let k = 0; k < 3; k++) {
       const node = 3 * cells[start + FACETS[half % 4][k]];
-      made.set(3 * made.count + k, half >> 2, 7, points[node], points[node + 1], points[node + 2]);
+      triangles.set(3 * triangles.count + k, half >> 2, 7, points[node], points[node + 1], points[node + 2]);
     }
-    made.count++;
+    triangles.count++;
   }
-  return made;
+  return triangles;
 }
 
 // The polygons in which the plane axis = at cuts the shown cells: triangles, or quadrilaterals in two triangles.
 function section(mesh, isShown, axis, at) {
   const { points, cells } = mesh;
-  const made = new Triangles(64);
+  const triangles = new Triangles(64);
   const between = (i, j) => {
     const share = (at - points[3 * i + axis]) / (points[3 * j + axis] - points[3 * i + axis]);
     const place = [0, 0, 0];
@@ -116,35 +116,35 @@ function section(mesh, isShown, axis, at) {
     }
     if (up.length === 2) {
       const [a, b, c, d] = [[0, 0], [0, 1], [1, 1], [1, 0]].map(([i, j]) => between(up[i], down[j]));
-      made.add(cell, 0b101, a, b, c);  // the diagonal from a to c is no edge of the cell
-      made.add(cell, 0b011, a, c, d);
+      triangles.add(cell, 0b101, a, b, c);  // the diagonal from a to c is no edge of the cell
+      triangles.add(cell, 0b011, a, c, d);
     } else {
       const [alone, others] = up.length === 1 ? [up[0], down] : [down[0], up];
-      made.add(cell, 0b111, ...others.map((node) => between(alone, node)));
+      triangles.add(cell, 0b111, ...others.map((node) => between(alone, node)));
     }
   }
-  made.nPolygons = nPolygons;
-  return made;
+  triangles.nPolygons = nPolygons;
+  return triangles;
 }
 
 // The rectangle of the plane over the image's box.
 function slice(box, axis, at) {
-  const made = new Triangles(2);
+  const triangles = new Triangles(2);
   const [u, v] = [0, 1, 2].filter((k) => k !== axis);
   const corner = (i, j) => {
     const place = [at, at, at];
     [place[u], place[v]] = [box[i][u], box[j][v]];
     return place;
   };
-  made.add(0, 0, corner(0, 0), corner(1, 0), corner(1, 1));
-  made.add(0, 0, corner(0, 0), corner(1, 1), corner(0, 1));
-  return made;
+  triangles.add(0, 0, corner(0, 0), corner(1, 0), corner(1, 1));
+  triangles.add(0, 0, corner(0, 0), corner(1, 1), corner(0, 1));
+  return triangles;
 }
 
 function setTriangles(mesh, nodes) {
-  const made = new Triangles(nodes.length / 3);
+  const triangles = new Triangles(nodes.length / 3);
   for (let i = 0; i < nodes.length; i += 3) {
-    made.add(0, 7, ...[0, 1, 2].map((k) => mesh.points.subarray(3 * nodes[i + k], 3 * nodes[i + k] + 3)));
+    triangles.add(0, 7, ...[0, 1, 2].map((k) => mesh.points.subarray(3 * nodes[i + k], 3 * nodes[i + k] + 3)));
   }
-  return made;
+  return triangles;
 }

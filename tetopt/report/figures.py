@@ -19,6 +19,7 @@ from tetopt.check import facets_on_box
 from tetopt.energy.sampling import cell_moments
 from tetopt.engine.loop import Optimized, Record
 from tetopt.errors import InputError
+from tetopt.geometry.box import world_axes
 from tetopt.geometry.cut import plane_cut
 from tetopt.geometry.simplex import rho
 from tetopt.image import Image
@@ -51,7 +52,8 @@ def save_run_figures(
 ) -> None:  # fmt: skip
     """Three PNGs of a run: slice with mesh before and after, rho histograms before and after, energies.
 
-    `start` is what the initial mesh is called. Where `image` is continued beyond a mask, `whole` is the one to show.
+    `paths` are theirs, and `start` is what the initial mesh is called. If `image` is continued beyond a mask, `whole`
+    is the one to show.
     """
     first, last = result.history[0], result.history[-1]
     fit = f"{last.E_D / first.E_D:.3f} of its E_D" if first.E_D > 0.0 else "constant image"
@@ -67,13 +69,13 @@ def slice_figure(
     image: Image, meshes: Sequence[tuple[str, Mesh]], axis: int | None = None, index: int | None = None,
     means_of: Image | None = None,
 ) -> Figure:  # fmt: skip
-    """A slice of the volume with each mesh cut through it, and below it the means the cells stand for.
+    """A slice of the volume with each mesh cut through it, and below it the means that the cells stand for.
 
-    `axis` and `index` choose the slice in voxel indices; by default the axis nearest to the world's z (an axial
-    slice), at its middle. A 2-D image is shown whole. Where a mesh leaves the image uncovered, the means' row is light
-    blue.
+    `axis` and `index` choose the slice in voxel indices; by default it is across the axis nearest to the world's z (an
+    axial slice), at its middle. A 2-D image is shown whole. The means are those of `means_of`, by default of the image
+    itself. Where a mesh leaves the image uncovered, their row is light blue.
     """
-    view = _View(image, axis, index)
+    view = SliceView(image, axis, index)
     figure = Figure(figsize=(5.2 * len(meshes), 10.0 * view.aspect + 1.0), layout="constrained")
     grid = figure.subplots(2, len(meshes), squeeze=False)
     limits = grey_limits([view.pixels], brightest=99.8)
@@ -81,12 +83,13 @@ def slice_figure(
         polygons, cells = view.section(mesh)
         over, flat = grid[:, column]
         view.show_pixels(over, limits)
-        # Each line is shared by two polygons; drawn once a polygon it is simply drawn twice.
-        width = min(0.6, 20.0 / np.sqrt(max(len(polygons), 1)))  # points; thinner before the lines hide the image
+        # Each line belongs to two polygons and is drawn twice. Where there are many, lines of full width, in points,
+        # would hide the image.
+        width = min(0.6, 20.0 / np.sqrt(max(len(polygons), 1)))
         over.add_collection(PolyCollection(list(polygons), facecolors="none", edgecolors=MESH_LINE, linewidths=width))
         over.set_title(title, fontsize=11)
         means = cell_moments(image if means_of is None else means_of, mesh).mean[cells]
-        # Antialiased, each border would let the background shine through as a light seam.
+        # If they were antialiased, the background would shine through along each border as a light seam.
         painted = PolyCollection(list(polygons), array=means, cmap="gray", edgecolors="none", antialiaseds=False)
         painted.set_clim(*limits)
         flat.set_facecolor(UNCOVERED_COLOUR)
@@ -130,15 +133,15 @@ def label_figure(labels: Image, mesh: Mesh, of_cell: NDArray[np.int64] | None = 
     inches = min(SLICE_WIDTH_INCHES / width, SLICES_HEIGHT_INCHES / sum(heights))  # a mm
     figure = Figure(figsize=(2.0 * inches * width + 1.4, inches * sum(heights) + 0.6), layout="constrained")
     grid = figure.subplots(len(views), 2, squeeze=False, height_ratios=heights)
-    for (given, meshed), view, numbers, (polygons, cells) in zip(grid, views, pixels, cuts, strict=True):
-        given.imshow(colours[numbers.T], origin="lower", extent=view.extent, interpolation="nearest")
+    for (left, right), view, numbers, (polygons, cells) in zip(grid, views, pixels, cuts, strict=True):
+        left.imshow(colours[numbers.T], origin="lower", extent=view.extent, interpolation="nearest")
         if np.count_nonzero(shown) > LISTED_LABELS:
-            _write_numbers(given, view, numbers, colours, NUMBER_RADIUS_SHARE * width)
+            _write_numbers(left, view, numbers, colours, NUMBER_RADIUS_SHARE * width)
         line = min(0.2, 10.0 / np.sqrt(max(len(polygons), 1)))  # points
-        meshed.add_collection(
+        right.add_collection(
             PolyCollection(list(polygons), facecolors=colours[of_cell[cells]], edgecolors="black", linewidths=line)
         )
-        for axes in (given, meshed):
+        for axes in (left, right):
             view.frame(axes)
     grid[0, 0].set_title("labels of the voxels", fontsize=11)
     grid[0, 1].set_title(f"labels of the cells, {len(mesh.points)} nodes", fontsize=11)
@@ -153,11 +156,11 @@ def _counted(arrays: Sequence[NDArray[np.int64]], n: int) -> NDArray[np.int64]:
 
 
 def _write_numbers(
-    axes: Axes, view: _View, pixels: NDArray[np.int64], colours: NDArray[np.float64], room: float
+    axes: Axes, view: SliceView, pixels: NDArray[np.int64], colours: NDArray[np.float64], room: float
 ) -> None:
-    """The number of each label in the slice but 0, where it is widest, if the circle of `room` mm fits in there."""
+    """Write the number of each label in the slice but 0 where it is widest, if a circle of `room` mm fits in there."""
     for label in np.unique(pixels[pixels > 0]):
-        # To the nearest centre outside, which lies half a pixel behind the border.
+        # The transform measures to the nearest centre outside, which lies half a pixel behind the border.
         depth = distance_transform_edt(np.pad(pixels == label, 1), view.steps)[1:-1, 1:-1] - 0.5 * view.steps.min()
         deepest = np.unravel_index(depth.argmax(), depth.shape)
         if depth[deepest] >= room:
@@ -193,11 +196,11 @@ def boundary_figure(image: Image, mask: Image, mesh: Mesh, axis: int | None = No
     """
     if mask.shape != image.shape:
         raise InputError(f"mask: expected the image's shape {image.shape}, got {mask.shape}; resample it")
-    view = _View(image, axis, index)
+    view = SliceView(image, axis, index)
     if index is None and view.across is not None:
         filled = np.unique(np.nonzero(mask.data >= 0.5)[view.across])
-        view = _View(image, axis, int(filled[len(filled) // 2]) if len(filled) else None)
-    outline = _half_level(_View(mask, view.across, view.index))
+        view = SliceView(image, axis, int(filled[len(filled) // 2]) if len(filled) else None)
+    outline = _half_level(SliceView(mask, view.across, view.index))
     boundary = view.boundary(mesh)
     low, high = _longest_part(outline, view)
     figure = Figure(figsize=(5.2 + 5.2 * view.aspect, 5.2 * view.aspect + 0.7), layout="constrained")
@@ -206,7 +209,7 @@ def boundary_figure(image: Image, mask: Image, mesh: Mesh, axis: int | None = No
     for axes, width in ((whole, 0.7), (detail, 1.8)):
         view.show_pixels(axes, limits)
         view.frame(axes)
-        # Wider, so that it shows on both sides where the boundary lies on it.
+        # The outline is wider, so that it shows on both sides where the boundary lies on it.
         axes.add_collection(LineCollection(list(outline), colors=MASK_LINE, linewidths=2.0 * width))
         axes.add_collection(LineCollection(list(boundary), colors=MESH_LINE, linewidths=width))
     polygons, _ = view.section(mesh)
@@ -220,7 +223,7 @@ def boundary_figure(image: Image, mask: Image, mesh: Mesh, axis: int | None = No
     return figure
 
 
-def _half_level(view: _View) -> NDArray[np.float64]:
+def _half_level(view: SliceView) -> NDArray[np.float64]:
     """Segments (K, 2, 2), in picture mm, on which the pixels are 1/2 (`tetopt.measure.fidelity.half_level_surface`)."""
     affine = np.diag([*view.steps, 1.0])
     affine[:2, 2] = 0.5 * view.steps
@@ -228,36 +231,35 @@ def _half_level(view: _View) -> NDArray[np.float64]:
     return outline.points[outline.facets]
 
 
-def _longest_part(outline: NDArray[np.float64], view: _View) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _longest_part(outline: NDArray[np.float64], view: SliceView) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Lower and upper corner, in picture mm, of the square of `DETAIL_VOXELS` voxels that holds most of the outline."""
     length = np.zeros(view.pixels.shape)
     pixel = (outline.mean(axis=1) / view.steps).astype(np.int64)
-    # Along the nearer axis: a straight line through the square counts the same however it runs, only bends more.
+    # Lengths are measured along the nearer axis, by which a straight line through the square counts the same however it
+    # runs, and only a bent one more.
     np.add.at(length, tuple(pixel.T), np.abs(outline[:, 1] - outline[:, 0]).max(axis=1))
     side = np.minimum(DETAIL_VOXELS * view.steps.max(), view.size)
-    held = uniform_filter(length, np.rint(side / view.steps).astype(np.int64), mode="constant")
-    best = np.array(np.unravel_index(held.argmax(), held.shape)) if len(outline) else np.array(held.shape) // 2
+    around = uniform_filter(length, np.rint(side / view.steps).astype(np.int64), mode="constant")
+    best = np.array(np.unravel_index(around.argmax(), around.shape)) if len(outline) else np.array(around.shape) // 2
     low = np.clip((best + 0.5) * view.steps - 0.5 * side, 0.0, view.size - side)
     return low, low + side
 
 
-class _View:
+class SliceView:
     """One slice of an image laid out for the eye: right, front and top of the patient on fixed sides."""
 
     def __init__(self, image: Image, axis: int | None, index: int | None) -> None:
         self.image = image
-        columns = image.affine[:-1, :-1] / image.spacing
-        nearest = _nearest_axes(columns)
+        nearest = world_axes(image.affine)
         if image.ndim == 2:
             self.across, self.index = None, 0
         else:
-            self.across = int(np.flatnonzero(nearest == 2)[0]) if axis is None else axis
+            self.across = nearest.index(2) if axis is None else axis
             self.index = image.shape[self.across] // 2 if index is None else index
         inside = [a for a in range(image.ndim) if a != self.across]
         self.axes = sorted(inside, key=lambda a: nearest[a])  # horizontal, vertical
-        self.flip = [columns[nearest[a], a] < 0 for a in self.axes]
-        self.letters = ["LR", "PA", "IS"] if image.ndim == 3 else ["", ""]
-        self.letters = [self.letters[nearest[a]] for a in self.axes]
+        self.flip = [image.affine[nearest[a], a] < 0 for a in self.axes]
+        self.letters = [("LR", "PA", "IS")[nearest[a]] if image.ndim == 3 else "" for a in self.axes]
         pixels = image.data if self.across is None else np.take(image.data, self.index, axis=self.across)
         pixels = pixels if self.axes == inside else pixels.T
         self.pixels = np.flip(pixels, axis=tuple(k for k in (0, 1) if self.flip[k]))
@@ -267,6 +269,7 @@ class _View:
         self.aspect = self.size[1] / self.size[0]
 
     def show_pixels(self, axes: Axes, limits: tuple[float, float]) -> None:
+        """The pixels in grey, black and white at the `limits`."""
         axes.imshow(self.pixels.T, origin="lower", extent=self.extent, cmap="gray", vmin=limits[0], vmax=limits[1])
 
     def section(self, mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
@@ -295,32 +298,31 @@ class _View:
         return flat
 
     def frame(self, axes: Axes) -> None:
+        """The whole slice in one scale, with the patient's sides as letters in place of ticks."""
         axes.set_xlim(0.0, self.size[0])
         axes.set_ylim(0.0, self.size[1])
         axes.set_aspect("equal")
         axes.set_xticks([])
         axes.set_yticks([])
-        for letter, place in zip(
-            "".join(self.letters), ((0.02, 0.5), (0.98, 0.5), (0.5, 0.02), (0.5, 0.98)), strict=False
-        ):
+        places = ((0.02, 0.5), (0.98, 0.5), (0.5, 0.02), (0.5, 0.98))
+        for letter, place in zip("".join(self.letters), places, strict=False):
             axes.text(
                 *place, letter, transform=axes.transAxes, color="white", ha="center", va="center", fontsize=9,
                 bbox={"facecolor": "black", "alpha": 0.5, "linewidth": 0, "pad": 1.5},
             )  # fmt: skip
 
 
-def _middle_views(image: Image) -> list[_View]:
+def _middle_views(image: Image) -> list[SliceView]:
     """The axial, coronal and sagittal slice through the middle; a 2-D image whole."""
     if image.ndim == 2:
-        return [_View(image, None, None)]
-    nearest = _nearest_axes(image.affine[:-1, :-1] / image.spacing)
-    return [_View(image, int(np.flatnonzero(nearest == world)[0]), None) for world in (2, 1, 0)]
+        return [SliceView(image, None, None)]
+    return [SliceView(image, world_axes(image.affine).index(world), None) for world in (2, 1, 0)]
 
 
 def _triangle_cut(
     points: NDArray[np.float64], triangles: NDArray[np.int64], height: NDArray[np.float64]
 ) -> NDArray[np.float64]:
-    """Segments (K, 2, 3) in which the plane height = 0 cuts triangles; a node on the plane counts as above."""
+    """Segments (K, 2, 3) in which the plane height = 0 cuts triangles; a node on the plane counts as above it."""
     is_above = height[triangles] >= 0.0
     n_above = is_above.sum(axis=1)
     alone = (is_above == (n_above == 1)[:, None]).argmax(axis=1)  # the node with no other on its side
@@ -328,17 +330,6 @@ def _triangle_cut(
     one, others = turned[:, :1], turned[:, 1:]
     share = (height[one] / (height[one] - height[others]))[..., None]
     return points[one] * (1.0 - share) + points[others] * share
-
-
-def _nearest_axes(columns: NDArray[np.float64]) -> NDArray[np.int64]:
-    """The world axis nearest to each voxel axis, each taken once, the clearest first."""
-    cosine = np.abs(columns)
-    nearest = np.full(len(columns), -1)
-    for _ in range(len(columns)):
-        world, voxel = np.unravel_index(np.argmax(cosine), cosine.shape)
-        nearest[voxel] = world
-        cosine[world, :] = cosine[:, voxel] = -1.0
-    return nearest
 
 
 def histogram_figure(meshes: Sequence[tuple[str, Mesh]]) -> Figure:
@@ -349,7 +340,7 @@ def histogram_figure(meshes: Sequence[tuple[str, Mesh]]) -> Figure:
         share, edges = rho_histogram(mesh.points, mesh.cells)
         errors = quality_errors(mesh.points, mesh.cells)
         shape = rho(mesh.points, mesh.cells)
-        n_bad = int((mesh.ndim * shape < BAD_SHAPE).sum())  # too few for a bar to show
+        n_bad = int((mesh.ndim * shape < BAD_SHAPE).sum())  # often too few for a bar to be seen
         label = (
             f"{title}: mean {shape.mean():.3f}, {n_bad} bad cells; errors (i) {errors.mean:.4f}, "
             f"(ii) {errors.harmonic_mean:.4f}, (iii) {errors.l2:.4g}, (iv) {errors.worst:.4f}"
@@ -361,7 +352,7 @@ def histogram_figure(meshes: Sequence[tuple[str, Mesh]]) -> Figure:
     axes.set_xlim(0.0, 1.0 / n * 1.02)
     axes.set_xlabel(f"rho = inradius / circumradius (1/{n} for a regular cell)")
     axes.set_ylabel("share of cells")
-    figure.legend(loc="outside upper center", fontsize=8, frameon=False)  # above, where no bar can cross it
+    figure.legend(loc="outside upper center", fontsize=8, frameon=False)  # no bar can cross it there
     return figure
 
 
@@ -383,13 +374,8 @@ def energy_figure(history: Sequence[Record]) -> Figure:
     top.set_ylim(bottom=0.0)
     top.legend(fontsize=9, frameon=False)
     if len(history) > 1:
-        bottom.semilogy(
-            iterations[1:],
-            [max(row.movement, 1e-16) for row in history[1:]],
-            color="black",
-            marker="o",
-            markersize=3,
-        )
+        movements = [max(row.movement, 1e-16) for row in history[1:]]  # above 0, which has no logarithm
+        bottom.semilogy(iterations[1:], movements, color="black", marker="o", markersize=3)
     bottom.set_ylabel("relative movement")
     bottom.set_xlabel("iteration (shaded: connected anew)")
     bottom.set_xlim(-0.5, iterations[-1] + 0.5)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pyvista
@@ -19,12 +20,12 @@ from tetopt.io.files import written_whole
 from tetopt.measure.fidelity import cell_labels
 from tetopt.mesh import Mesh
 from tetopt.report.colours import grey_limits, label_colours, legend_patches
-from tetopt.report.figures import save_figure
+from tetopt.report.figures import MESH_LINE, save_figure
 from tetopt.report.viewer import View, view_of
 
 STRUCTURE_COLOUR = "#d95f02"  # orange: it stands out from the grey slices behind it
 SCENE_VIEWPOINT = (0.9, 1.25, 0.7)  # where the eye is, RAS: on the right, in front and above
-Draw = Callable[[pyvista.Plotter], None]
+Draw = Callable[[pyvista.Plotter], object]  # adds a scene's parts to a plotter
 
 
 def facets_surface(points: NDArray[np.float64], triangles: NDArray[np.int64]) -> pyvista.PolyData:
@@ -76,23 +77,19 @@ def _photograph(draw: Draw) -> NDArray[np.uint8]:
 
 def structure_before_slices(image: Image, mesh: Mesh, chosen: NDArray[np.int64]) -> Draw:
     """The boundary of the chosen cells in front of the volume's middle slices, drawn on the box's far sides."""
-
-    def draw(plotter: pyvista.Plotter) -> None:
-        _add_slices(plotter, image, [_far_side(image, axis) for axis in range(3)])
-        surface = facets_surface(mesh.points, boundary_facets(mesh.cells[chosen]))
-        plotter.add_mesh(
-            surface, color=STRUCTURE_COLOUR, show_edges=True, edge_color="#402000", line_width=1, ambient=0.25
-        )
-
-    return draw
+    surface = facets_surface(mesh.points, boundary_facets(mesh.cells[chosen]))
+    return _before_slices(image, surface, show_edges=True, edge_color="#402000", line_width=1)
 
 
 def isosurface_before_slices(image: Image, surface: pyvista.PolyData) -> Draw:
     """A surface taken from the voxels in front of the same slices."""
+    return _before_slices(image, surface, smooth_shading=True)
 
+
+def _before_slices(image: Image, surface: pyvista.PolyData, **look: Any) -> Draw:
     def draw(plotter: pyvista.Plotter) -> None:
         _add_slices(plotter, image, [_far_side(image, axis) for axis in range(3)])
-        plotter.add_mesh(surface, color=STRUCTURE_COLOUR, smooth_shading=True, ambient=0.25)
+        plotter.add_mesh(surface, color=STRUCTURE_COLOUR, ambient=0.25, **look)
 
     return draw
 
@@ -114,16 +111,12 @@ def cutaway(view: View, limits: tuple[float, float]) -> Draw:
     """The surface of an opened mesh, each cell in the grey of its value between `limits`, with the cells' edges."""
     # The darkest is not quite black, on which no light would show how a facet lies.
     shown = (limits[0] - 0.25 * (limits[1] - limits[0]), limits[1])
-
-    def draw(plotter: pyvista.Plotter) -> None:
-        surface = facets_surface(view.points, view.triangles)
-        surface.cell_data["h"] = view.values
-        plotter.add_mesh(
-            surface, scalars="h", cmap="gray", clim=shown, show_scalar_bar=False, show_edges=True,
-            edge_color="#ffb000", line_width=1, ambient=0.3,
-        )  # fmt: skip
-
-    return draw
+    surface = facets_surface(view.points, view.triangles)
+    surface.cell_data["h"] = view.values
+    return lambda plotter: plotter.add_mesh(
+        surface, scalars="h", cmap="gray", clim=shown, show_scalar_bar=False, show_edges=True, edge_color=MESH_LINE,
+        line_width=1, ambient=0.3,
+    )  # fmt: skip
 
 
 def labelled_cutaway(view: View, colours: NDArray[np.float64]) -> Draw:
@@ -131,19 +124,17 @@ def labelled_cutaway(view: View, colours: NDArray[np.float64]) -> Draw:
 
     The view's values are labels; `colours` (largest label + 1, 3) as of `tetopt.report.colours.label_colours`.
     """
-
-    def draw(plotter: pyvista.Plotter) -> None:
-        surface = facets_surface(view.points, view.triangles)
-        surface.cell_data["colour"] = np.rint(255.0 * colours[view.values.astype(np.int64)]).astype(np.uint8)
-        plotter.add_mesh(
-            surface, scalars="colour", rgb=True, show_edges=True, edge_color="#202020", line_width=1, ambient=0.35
-        )
-
-    return draw
+    surface = facets_surface(view.points, view.triangles)
+    surface.cell_data["colour"] = np.rint(255.0 * colours[view.values.astype(np.int64)]).astype(np.uint8)
+    return lambda plotter: plotter.add_mesh(
+        surface, scalars="colour", rgb=True, show_edges=True, edge_color="#202020", line_width=1, ambient=0.35
+    )
 
 
 def save_cutaway(path: str | Path, image: Image, mesh: Mesh, labels: Image | None = None) -> None:
     """PNG of a mesh with its right, front, upper octant taken away: cells in the grey of their means, with edges.
+
+    The README's picture of a brain, `docs/organ.png`, is one.
 
     Parameters
     ----------
@@ -158,7 +149,7 @@ def save_cutaway(path: str | Path, image: Image, mesh: Mesh, labels: Image | Non
     Raises
     ------
     InputError
-        A mesh of triangles, labels that are none or all 0, or as `tetopt.energy.sampling.cell_moments`.
+        A mesh of triangles, labels that are not whole numbers or all 0, or as `tetopt.energy.sampling.cell_moments`.
     """
     of_cell = np.ones(len(mesh.cells), dtype=np.int64) if labels is None else cell_labels(labels, mesh)
     chosen = of_cell > 0
@@ -204,13 +195,13 @@ def dark_structure_surface(image: Image, below: float, near: NDArray[np.bool_]) 
 
 
 def _far_side(image: Image, axis: int) -> float:
-    """The index, along one axis, of the box's side that is farther from the viewer."""
+    """The index along one axis at which the box's side lies that is farther from the eye."""
     outward = image.affine[:3, axis] @ np.asarray(SCENE_VIEWPOINT)
     return -0.5 if outward > 0.0 else image.shape[axis] - 0.5
 
 
 def _add_slices(plotter: pyvista.Plotter, image: Image, places: Sequence[float]) -> None:
-    """The middle slice across each index axis, drawn at the given index along that axis."""
+    """Add the middle slice across each index axis, drawn at an index of `places` along that axis."""
     limits = grey_limits([image.data], brightest=99.8)
     for axis, at in enumerate(places):
         plotter.add_mesh(
@@ -219,7 +210,7 @@ def _add_slices(plotter: pyvista.Plotter, image: Image, places: Sequence[float])
 
 
 def _slice_sheet(image: Image, axis: int, at: float) -> pyvista.StructuredGrid:
-    """The middle slice across an index axis, placed at index `at` of it, in world mm, one facet a pixel."""
+    """The middle slice across an index axis, placed at index `at` of that axis, in world mm, one facet a pixel."""
     pixels = np.take(image.data, image.shape[axis] // 2, axis=axis)
     corners = [np.arange(s + 1) - 0.5 for s in image.shape]
     corners[axis] = np.array([at])

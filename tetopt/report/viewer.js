@@ -26,13 +26,13 @@ const keys = { ...cameraKeys(turn, zoom), "0": reset };
 function surface(view) {
   const points = new Int16Array(bytes(view.points));
   const tones = new Uint8Array(bytes(view.tones));
-  const made = new Triangles(tones.length);
+  const triangles = new Triangles(tones.length);
   new Uint32Array(bytes(view.triangles)).forEach((node, i) => {
     const [x, y, z] = [0, 1, 2].map((k) => points[3 * node + k] / 32767);
-    made.set(i, tones[Math.floor(i / 3)], 7, x, y, z);
+    triangles.set(i, tones[Math.floor(i / 3)], 7, x, y, z);
   });
-  made.count = tones.length;
-  return made;
+  triangles.count = tones.length;
+  return triangles;
 }
 
 function drawer(canvas, view) {

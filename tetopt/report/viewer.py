@@ -38,7 +38,7 @@ class View(NamedTuple):
     title: str
     points: NDArray[np.float64]  # (N, 3) world mm
     triangles: NDArray[np.int64]  # (K, 3), normals pointing out
-    values: NDArray[np.float64]  # (K,) what each triangle's cell holds, drawn in grey
+    values: NDArray[np.float64]  # (K,) of each triangle's cell, drawn in grey
 
 
 def view_of(mesh: Mesh, means: NDArray[np.float64], title: str, centre: NDArray[np.float64] | None = None) -> View:
@@ -52,8 +52,8 @@ def view_of(mesh: Mesh, means: NDArray[np.float64], title: str, centre: NDArray[
         The value of each cell; a triangle has that of its cell.
     title : str
     centre : (3,) float64, optional
-        Where the octant's corner is, world mm; the middle of the mesh's box by default. Whole cells go, those whose
-        centroids lie beyond it.
+        Where the octant's corner is, world mm; the middle of the mesh's box by default. Whole cells are taken away,
+        those whose centroids lie beyond it; if that is all of them, none is.
 
     Raises
     ------
@@ -70,10 +70,9 @@ def view_of(mesh: Mesh, means: NDArray[np.float64], title: str, centre: NDArray[
     if not np.any(is_kept):
         is_kept = np.full(len(mesh.cells), True)
     cells, values = mesh.cells[is_kept], np.asarray(means, dtype=np.float64)[is_kept]
-    found = facets(cells)
-    is_outer = found.n_cells == 1
+    sides = facets(cells)
     used, triangles = np.unique(boundary_facets(cells), return_inverse=True)
-    return View(title, mesh.points[used], triangles.reshape(-1, 3), values[found.cells[is_outer, 0]])
+    return View(title, mesh.points[used], triangles.reshape(-1, 3), values[sides.cells[sides.n_cells == 1, 0]])
 
 
 def views_html(views: Sequence[View]) -> str:
@@ -93,7 +92,7 @@ def views_html(views: Sequence[View]) -> str:
             f'<p class="viewer-hint">{html.escape(TURNING_HINT)}</p><div class="viewer-buttons"></div>',
             '<div class="views">', *figures, "</div>",
             "<noscript><p>The 3-D views need JavaScript, which is off here.</p></noscript>",
-            data_html("views-data", _packed(views)),
+            data_html("views-data", _views_data(views)),
             script_html("webgl.js", "viewer.js"),
         ]
     )  # fmt: skip
@@ -103,7 +102,7 @@ def _label(view: View) -> str:
     return f"3-D view of {view.title}, opened; drag or press the arrow keys to turn it, plus and minus to zoom"
 
 
-def _packed(views: Sequence[View]) -> list[dict[str, Any]]:
+def _views_data(views: Sequence[View]) -> list[dict[str, Any]]:
     """Views in one common box: places as 16-bit integers of its half diagonal, values as bytes of a common range."""
     corners = np.concatenate([view.points for view in views])
     low, high = corners.min(axis=0), corners.max(axis=0)

@@ -22,6 +22,7 @@ from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.report.colours import LISTED_LABELS, grey_limits
 from tetopt.report.explore import COLOUR_MAP, NO_VALUE, Field, checked_sets, scalar_fields
+from tetopt.report.figures import MESH_LINE
 from tetopt.report.scene import facets_surface
 
 KEYS_TEXT = "x y z: plane   k: side kept   m: mesh, image, both   n: next field   h: next set of facets   q: close"
@@ -53,13 +54,13 @@ def show(
 
 
 def has_display() -> bool:
-    """Whether VTK can open a window: on Linux, whether the X server in DISPLAY answers; elsewhere taken as given."""
+    """Whether VTK can open a window: on Linux, whether the X server in DISPLAY answers; elsewhere it is assumed."""
     if not sys.platform.startswith("linux"):
         return True
     library = ctypes.util.find_library("X11")
     if not os.environ.get("DISPLAY") or library is None:
         return False
-    # As VTK asks itself, which then goes on without a window, or ends the process.
+    # VTK asks the same; without an answer it goes on without a window, or ends the process.
     x11 = ctypes.CDLL(library)
     x11.XOpenDisplay.restype = ctypes.c_void_p
     x11.XCloseDisplay.argtypes = [ctypes.c_void_p]
@@ -211,7 +212,7 @@ class _Scene:
         self._add_cells(
             "section", polygons, lighting=False, show_edges=not is_glass, opacity=GLASS_OPACITY if is_glass else 1.0
         )
-        self._add("lines", lines, color="#ffb000", line_width=1, lighting=False)
+        self._add("lines", lines, color=MESH_LINE, line_width=1, lighting=False)
 
     def _add_slice(self) -> None:
         sheet = pyvista.PolyData()
@@ -362,11 +363,11 @@ class _Scene:
 
 
 def _label_colours(field: Field, values: NDArray[np.float32]) -> NDArray[np.uint8]:
-    """(K, 3) red, green and blue of labels; `NO_VALUE` for what is none."""
-    found = np.tile(np.rint(255.0 * np.array(to_rgb(NO_VALUE))), (len(values), 1))
+    """Red, green and blue of labels (K, 3); `NO_VALUE` for values that are no label."""
+    colours = np.tile(np.rint(255.0 * np.array(to_rgb(NO_VALUE))), (len(values), 1))
     for label, colour in field.categories:
-        found[values == label] = np.rint(255.0 * np.array(to_rgb(colour)))
-    return found.astype(np.uint8)
+        colours[values == label] = np.rint(255.0 * np.array(to_rgb(colour)))
+    return colours.astype(np.uint8)
 
 
 def plane_slice(image: Image, axis: int, at: float) -> pyvista.ImageData:

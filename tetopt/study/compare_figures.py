@@ -19,7 +19,7 @@ from tetopt.geometry.simplex import volumes
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.report.colours import grey_limits
-from tetopt.report.figures import MESH_LINE, _View
+from tetopt.report.figures import MESH_LINE, SliceView
 from tetopt.report.viewer import view_of
 from tetopt.study.pipelines import UNTIMED
 
@@ -61,7 +61,7 @@ def slices_figure(image: Image, meshes: Sequence[tuple[str, Mesh]], means: Seque
     """
     if not meshes or len(meshes) != len(means):
         raise InputError(f"slices_figure: expected one array of means for each mesh, got {len(means)}, {len(meshes)}")
-    view = _View(image, None, None)
+    view = SliceView(image, None, None)
     width = 3.3 if len(meshes) > 2 else 4.6
     figure = Figure(figsize=(width * (len(meshes) + 1), 3.0 * width * view.aspect + 1.0), layout="constrained")
     grid = figure.subplots(3, len(meshes) + 1, squeeze=False)
