@@ -9,7 +9,7 @@ from tetopt.geometry.simplex import volumes
 from tetopt.model.loads import parse_loads
 from tetopt.model.materials import binned, materials
 from tetopt.model.model import Model
-from tetopt.model.sets import box_of, standard_sets, with_asked
+from tetopt.model.sets import box_of, standard_sets, with_requested
 
 ABOUT = {"tetopt": "0.1.0", "image": "two spheres & <more>.nii.gz", "image_sha256": "ab" * 32}
 
@@ -37,7 +37,7 @@ def sample_model(n=3, bins=3):
     fields["label"] = labels
     sets = standard_sets(mesh, box_of(image), labels)
     corner = ",".join(str(x) for x in mesh.points[0])
-    sets = with_asked(mesh, sets, ["dark=below:20", f"corner=point:{corner}:12"], fields["mean"])
+    sets = with_requested(mesh, sets, ["dark=below:20", f"corner=point:{corner}:12"], fields["mean"])
     made = materials(1.0 + fields["mean"] / 7.0, np.where(labels == 1, 0.3, 0.45), len(mesh.cells))
     if bins is not None:
         made = binned(made, volumes(mesh.points, mesh.cells), bins)

@@ -10,7 +10,7 @@ import pytest
 from models import sample_model
 
 from tetopt.errors import InputError
-from tetopt.io.febio import MOST_PARTS, febio
+from tetopt.io.febio import MOST_MATERIAL_PARTS, febio
 from tetopt.model.materials import materials
 from tetopt.model.model import described, in_space, in_units, quadratic, quadratic_facet_nodes
 from tetopt.model.sets import facet_triples, nodes_of
@@ -20,7 +20,7 @@ def with_moduli(nu):
     """A model with more materials than become parts: one for each cell."""
     model = sample_model()
     n_cells = len(model.mesh.cells)
-    assert n_cells > MOST_PARTS
+    assert n_cells > MOST_MATERIAL_PARTS
     return model._replace(materials=materials(1.0 + np.arange(n_cells)[::-1] / 7.0, nu, n_cells))
 
 

@@ -15,7 +15,7 @@ from models import ABOUT, sample_model
 import tetopt.io.gmsh
 from tetopt.errors import InputError
 from tetopt.io.formats import save_model
-from tetopt.io.gmsh import gmsh22, gmsh41, told
+from tetopt.io.gmsh import gmsh22, gmsh41, own_comments
 from tetopt.io.meshes import load_mesh
 from tetopt.model.materials import materials
 from tetopt.model.model import in_space, in_units, quadratic
@@ -331,7 +331,7 @@ def test_a_mesh_alone(version):
 
 
 def test_many_materials_are_views_only(monkeypatch):
-    monkeypatch.setattr(tetopt.io.gmsh, "MOST_MATERIALS", 3)
+    monkeypatch.setattr(tetopt.io.gmsh, "MOST_MATERIAL_GROUPS", 3)
     model = sample_model()
     read = Read(gmsh41(model))
     assert {name for dim, name in read.groups if dim == 3} == {"label_0", "label_1"}
@@ -387,7 +387,7 @@ def test_our_reader_finds_the_model(version, n, space, bins, tmp_path, monkeypat
     if bins == "none":
         model = model._replace(materials=None)
     if bins == "many" and version == "4.1":  # then they are no groups
-        monkeypatch.setattr(tetopt.io.gmsh, "MOST_MATERIALS", 2)
+        monkeypatch.setattr(tetopt.io.gmsh, "MOST_MATERIAL_GROUPS", 2)
     save_model(path, model, space=space, units="MPa")
     back = load_mesh(path)
     assert (back.space, back.n_turned, back.notes) == (space, 0, ())
@@ -450,10 +450,10 @@ def test_comments_that_gmsh_has_put_at_the_end(tmp_path):
 
 
 def test_comments_of_others_are_not_ours():
-    assert told([]) is None
-    assert told(["made by hand", "coordinates: LPS+, mm"]) is None
-    assert told(["tetopt was here"]) is None
-    assert told(["tetopt", "coordinates: of the slice's plane, mm", "image: a, b.nii, sha256 unknown"]) == (
+    assert own_comments([]) is None
+    assert own_comments(["made by hand", "coordinates: LPS+, mm"]) is None
+    assert own_comments(["tetopt was here"]) is None
+    assert own_comments(["tetopt", "coordinates: of the slice's plane, mm", "image: a, b.nii, sha256 unknown"]) == (
         "ras", {"image": "a, b.nii"}, {}, {}
     )  # fmt: skip
 

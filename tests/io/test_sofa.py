@@ -8,7 +8,7 @@ import pytest
 from models import sample_model
 
 from tetopt.errors import InputError
-from tetopt.io.sofa import PLUGINS, sofa
+from tetopt.io.sofa import REQUIRED_PLUGINS, sofa
 from tetopt.model.materials import materials
 from tetopt.model.model import described, in_space, in_units
 from tetopt.model.sets import facet_triples, nodes_of
@@ -79,7 +79,7 @@ def test_every_component_has_its_plugin():
     root = ET.fromstring(sofa(sample_model()))
     needed = {PLUGIN_OF[element.tag] for element in root.iter()} - {None}
     asked = [element.get("name") for element in root.iter("RequiredPlugin")]
-    assert sorted(needed) == sorted(asked) == sorted(PLUGINS)
+    assert sorted(needed) == sorted(asked) == sorted(REQUIRED_PLUGINS)
     tags = [element.tag for element in root]
     assert max(k for k, tag in enumerate(tags) if tag == "RequiredPlugin") < tags.index("VisualStyle")
 

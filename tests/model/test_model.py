@@ -9,7 +9,15 @@ from tetopt.errors import InputError
 from tetopt.fem.elasticity import box_faces, push_of
 from tetopt.model.build import model_of
 from tetopt.model.loads import parse_loads
-from tetopt.model.model import EDGES, described, in_space, in_units, quadratic, quadratic_facet_nodes, units_text
+from tetopt.model.model import (
+    QUADRATIC_EDGES,
+    described,
+    in_space,
+    in_units,
+    quadratic,
+    quadratic_facet_nodes,
+    units_text,
+)
 from tetopt.model.sets import box_of, facet_triples, nodes_of, standard_sets
 
 
@@ -132,8 +140,10 @@ def test_quadratic_cells_have_their_nodes_in_the_middle_of_edges():
     points, cells = quadratic(mesh)
     np.testing.assert_array_equal(points[: len(mesh.points)], mesh.points)
     np.testing.assert_array_equal(cells[:, :4], mesh.cells)
-    np.testing.assert_allclose(points[cells[:, 4:]], mesh.points[mesh.cells[:, EDGES]].mean(axis=2), rtol=1e-15)
-    edges = {tuple(sorted(edge)) for cell in mesh.cells.tolist() for edge in np.array(cell)[EDGES].tolist()}
+    np.testing.assert_allclose(
+        points[cells[:, 4:]], mesh.points[mesh.cells[:, QUADRATIC_EDGES]].mean(axis=2), rtol=1e-15
+    )
+    edges = {tuple(sorted(edge)) for cell in mesh.cells.tolist() for edge in np.array(cell)[QUADRATIC_EDGES].tolist()}
     assert len(points) == len(mesh.points) + len(edges)  # each once
     rows = sample_model(3).sets.facets["boundary"]
     facets = quadratic_facet_nodes(cells, rows)

@@ -16,17 +16,17 @@ from tetopt.mesh import Mesh
 from tetopt.model.sets import (
     Box,
     Sets,
-    around,
     boundary_rows,
     box_of,
-    carried,
+    enclosing_facets,
     facet_triples,
-    joined,
+    merged_sets,
     nodes_of,
     rows_of,
     standard_sets,
+    surviving_sets,
     tagged,
-    with_asked,
+    with_requested,
 )
 
 NAMES = (("left", "right"), ("posterior", "anterior"), ("inferior", "superior"))
@@ -159,7 +159,7 @@ def test_labels_that_are_none(labels):
 def asked(text, n=3, mean=None):
     model = sample_model(n)
     base = standard_sets(model.mesh)
-    return model.mesh, with_asked(model.mesh, base, [text], model.cell_data["mean"] if mean is None else mean)
+    return model.mesh, with_requested(model.mesh, base, [text], model.cell_data["mean"] if mean is None else mean)
 
 
 def test_below_is_the_largest_connected_part_and_its_surface():
@@ -173,7 +173,7 @@ def test_below_is_the_largest_connected_part_and_its_surface():
     centres = mesh.points[facet_triples(mesh.cells, rows)].mean(axis=1)
     enclosed = (centres * outward_areas(mesh, rows)).sum() / 3.0
     np.testing.assert_allclose(enclosed, volumes(mesh.points, mesh.cells[chosen]).sum())
-    np.testing.assert_array_equal(rows, around(mesh, chosen))
+    np.testing.assert_array_equal(rows, enclosing_facets(mesh, chosen))
 
 
 def test_near_a_point_and_a_plane():
@@ -223,7 +223,7 @@ def test_words_that_are_refused(text, match):
 def test_a_surface_takes_its_name_too():
     model = sample_model(3)
     with pytest.raises(InputError, match='"dark_surface" already'):
-        with_asked(
+        with_requested(
             model.mesh,
             Sets({"dark_surface": boundary_rows(model.mesh)}, {}),
             ["dark=below:12"],
@@ -234,7 +234,7 @@ def test_a_surface_takes_its_name_too():
 def test_below_needs_means():
     mesh = sample_model(3).mesh
     with pytest.raises(InputError, match="has no means"):
-        with_asked(mesh, Sets({}, {}), ["dark=below:12"], None)
+        with_requested(mesh, Sets({}, {}), ["dark=below:12"], None)
 
 
 # Tags, and sets of other meshes
@@ -269,9 +269,9 @@ def test_sets_on_the_boundary_are_carried_to_an_improved_mesh():
     given = Sets(
         {"skin": boundary_rows(model.mesh), "inner": model.sets.facets["interface_0_1"]}, {"all": np.arange(9)}
     )
-    found = carried(model.mesh, given, after).facets
+    found = surviving_sets(model.mesh, given, after).facets
     assert "inner" not in found
-    assert carried(model.mesh, given, after).cells == {}
+    assert surviving_sets(model.mesh, given, after).cells == {}
     places = [
         {frozenset(map(tuple, corners)) for corners in mesh.points[facet_triples(mesh.cells, rows)].tolist()}
         for mesh, rows in ((model.mesh, given.facets["skin"]), (after, found["skin"]))
@@ -284,7 +284,7 @@ def test_sets_of_a_mesh_join_the_standard_ones():
     standard = standard_sets(mesh, box_of(sample_image(3)))
     some = standard.facets["left"][:3]
     given = Sets({"left": some, "right": standard.facets["right"], "skin": some}, {"Boundary": np.arange(4)})
-    found, renamed = joined(standard, given)
+    found, renamed = merged_sets(standard, given)
     assert renamed == {"left": "left_2", "Boundary": "Boundary_2"}
     assert set(found.facets) == {*standard.facets, "left_2", "skin"}
     np.testing.assert_array_equal(found.facets["left"], standard.facets["left"])

@@ -21,7 +21,7 @@ from tetopt.io.abaqus import abaqus
 from tetopt.model.loads import parse_loads
 from tetopt.model.materials import binned, materials
 from tetopt.model.model import Model, in_space, in_units, quadratic, quadratic_facet_nodes
-from tetopt.model.sets import box_of, facet_triples, nodes_of, standard_sets, with_asked
+from tetopt.model.sets import box_of, facet_triples, nodes_of, standard_sets, with_requested
 
 CCX = shutil.which("ccx")
 pytestmark = pytest.mark.skipif(CCX is None, reason="no CalculiX: ccx is not on the PATH (apt install calculix-ccx)")
@@ -74,7 +74,7 @@ def pressed_model(loading="compression"):
     mesh = tetopt.lattice(image, nodes=400)
     fields = tetopt.cell_fields(mesh, image)
     sets = standard_sets(mesh, box_of(image), (fields["mean"] > 15.0).astype(np.int64))
-    sets = with_asked(mesh, sets, ["dark-cells=below:20", "Patch=point:40,0,0:15"], fields["mean"])
+    sets = with_requested(mesh, sets, ["dark-cells=below:20", "Patch=point:40,0,0:15"], fields["mean"])
     made = binned(materials(0.5 + fields["mean"] / 7.0, NU, len(mesh.cells)), volumes(mesh.points, mesh.cells), 16)
     return Model(mesh, fields, sets, made, parse_loads(LOADS[loading], mesh, sets), about={"image": "two spheres & ü"})
 

@@ -13,7 +13,7 @@ import tetopt.io.xdmf
 from tetopt.fem.elasticity import compression
 from tetopt.io.xdmf import xdmf
 from tetopt.model.materials import materials
-from tetopt.model.sets import Sets, around, facet_triples, nodes_of
+from tetopt.model.sets import Sets, enclosing_facets, facet_triples, nodes_of
 
 NU = 0.4
 
@@ -89,7 +89,9 @@ np.savez("read.npz", **read)
 def with_two_sides(model):
     """The model with one ratio for all cells, and the interface also as a set that holds it from its other side."""
     cells = model.sets.cells["label_1"]
-    sets = Sets(model.sets.facets | {"bright": around(model.mesh, cells)}, model.sets.cells | {"bright_cells": cells})
+    sets = Sets(
+        model.sets.facets | {"bright": enclosing_facets(model.mesh, cells)}, model.sets.cells | {"bright_cells": cells}
+    )
     young = model.materials.young[model.materials.of_cell]
     return model._replace(sets=sets, materials=materials(young, NU, len(young)))
 

@@ -73,7 +73,7 @@ from tetopt.measure.fidelity import cell_labels
 from tetopt.measure.quality import quality
 from tetopt.model.fields import cell_fields
 from tetopt.model.model import Model
-from tetopt.model.sets import Sets, box_of, carried
+from tetopt.model.sets import Sets, box_of, surviving_sets
 from tetopt.report.summary import fidelity, model_summary, run_summary
 from tetopt.report.tables import add_quality, new_table
 from tetopt.start.clip import lattice_within
@@ -330,7 +330,7 @@ def _model(
 ) -> Model:
     """The mesh with all that the options say of it."""
     fields = _fields(source, mesh)
-    given = Sets({}, {}) if started is None else carried(started.mesh, started.sets, mesh)
+    given = Sets({}, {}) if started is None else surviving_sets(started.mesh, started.sets, mesh)
     if started is not None and is_told:
         lost = [name for kind in (0, 1) for name in started.sets[kind] if name not in given[kind]]
         if source.labels is not None:  # of which these are made anew

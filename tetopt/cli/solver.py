@@ -14,13 +14,13 @@ from rich.markup import escape
 import tetopt
 from tetopt import Image, InputError, Mesh
 from tetopt.cli.console import log, out, print_wide
-from tetopt.io.formats import FORMATS, content_of, format_of, save_model
+from tetopt.io.formats import FORMATS, file_bytes, format_of, save_model
 from tetopt.model.build import labels_of, model_of
 from tetopt.model.laws import parse_any_law
 from tetopt.model.loads import known_set, parse_load
 from tetopt.model.materials import Spacing
-from tetopt.model.model import SPACES, UNITS, Model
-from tetopt.model.sets import Box, Sets, check_free, joined, nodes_of, parse_set, standard_sets
+from tetopt.model.model import SPACES, STRESS_UNITS, Model
+from tetopt.model.sets import Box, Sets, check_free_names, merged_sets, nodes_of, parse_set, standard_sets
 from tetopt.report.tables import new_table
 
 MANY = 30_000  # materials: CalculiX takes three times as long with as many as there are cells (tests/benchmarks)
@@ -63,8 +63,8 @@ def checked_wishes(output: Path, wishes: Wishes, has_materials: bool = False) ->
     if wishes.nu is not None and wishes.young is None and not has_materials:
         raise InputError("--nu: there is no --young")
     parsed_bins(wishes.bins)
-    if wishes.units not in UNITS:
-        raise InputError(f"--units: expected {' or '.join(UNITS)}, got {wishes.units}")
+    if wishes.units not in STRESS_UNITS:
+        raise InputError(f"--units: expected {' or '.join(STRESS_UNITS)}, got {wishes.units}")
     if wishes.space not in SPACES:
         raise InputError(f"--space: expected {' or '.join(SPACES)}, got {wishes.space}")
     if wishes.order not in (1, 2):
@@ -107,7 +107,7 @@ def built(
 
 def all_sets(mesh: Mesh, box: Box | None, fields: dict[str, NDArray], given: Sets, is_told: bool = True) -> Sets:
     """The standard sets and those that came with the mesh; told is which of the latter had to be called otherwise."""
-    found, renamed = joined(standard_sets(mesh, box, labels_of(fields, len(mesh.cells))), given)
+    found, renamed = merged_sets(standard_sets(mesh, box, labels_of(fields, len(mesh.cells))), given)
     if is_told:
         for old, new in renamed.items():
             log.print(f'the mesh came with a set "{old}" of its own: it is {new} here')
@@ -132,11 +132,11 @@ def check_early(output: Path, wishes: Wishes, image: Image, build: Callable[[Wis
     is_certain = not any(name in taken or name.startswith("interface_") for name in on)
     model = build(wishes._replace(sets=[], loads=wishes.loads if is_certain else []))
     for wish in asked:
-        check_free(wish, model.sets)
+        check_free_names(wish, model.sets)
     for name in on:
         if name and name not in taken and not name.startswith("interface_"):
             known_set(name, model.sets)
-    content_of(output, model, space=wishes.space, units=wishes.units)
+    file_bytes(output, model, space=wishes.space, units=wishes.units)
 
 
 def save_wished(output: Path, model: Model, wishes: Wishes) -> None:

@@ -19,7 +19,7 @@ from tetopt.geometry.surface import surface_of
 from tetopt.geometry.topology import largest_component
 from tetopt.io.files import checked_output, save_json
 from tetopt.io.meshes import MeshFile
-from tetopt.io.surfaces import SUFFIXES, checked_surface, save_surface
+from tetopt.io.surfaces import SURFACE_SUFFIXES, checked_surface, save_surface
 from tetopt.model.model import SPACES
 from tetopt.report.tables import new_table
 
@@ -37,7 +37,7 @@ def surface_command(
     force: ForceOption = False,
 ) -> int:
     """Write the boundary of a structure in a mesh, watertight; print its volume and area."""
-    output = checked_output(output, SUFFIXES, force)
+    output = checked_output(output, SURFACE_SUFFIXES, force)
     if json_path is not None:
         json_path = checked_output(json_path, (".json",), force)
     check_no_input(output, mesh_path)

@@ -15,7 +15,7 @@ from tetopt.cli.options import CropOption, ForceOption, VolumeOption
 from tetopt.io.files import checked_output
 from tetopt.model.build import labels_of
 from tetopt.model.fields import cell_fields
-from tetopt.model.sets import facet_triples, joined, standard_sets
+from tetopt.model.sets import facet_triples, merged_sets, standard_sets
 
 
 def view_command(
@@ -44,7 +44,7 @@ def view_command(
         warn_of_other_image(loaded, mesh_path, image_path)
         if "mean" not in fields:
             fields = cell_fields(mesh, image) | fields
-    sets = joined(standard_sets(mesh, loaded.box, labels_of(fields, len(mesh.cells))), loaded.sets)[0].facets
+    sets = merged_sets(standard_sets(mesh, loaded.box, labels_of(fields, len(mesh.cells))), loaded.sets)[0].facets
     triples = {name: facet_triples(mesh.cells, rows) for name, rows in sets.items()}
     if html is None:
         from tetopt.report.window import show

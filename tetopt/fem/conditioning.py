@@ -16,9 +16,9 @@ from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, cg, eigsh, lobpcg
 
 from tetopt.errors import InputError
-from tetopt.fem.elasticity import RTOL, Method, System, factorized, is_direct, multigrid
+from tetopt.fem.elasticity import RESIDUAL_SHARE, Method, System, factorized, is_direct, multigrid
 
-FEW = 32  # dofs: the Lanczos solver wants more than it can find; these are done as a full matrix
+DENSE_DOFS = 32  # up to so many a full matrix is taken: the Lanczos solver wants more dofs than it finds eigenvalues
 
 
 class Conditioning(NamedTuple):
@@ -68,7 +68,7 @@ def lambda_max(K_ff: csr_array) -> float:
     RuntimeError
         Not converged.
     """
-    if K_ff.shape[0] <= FEW:
+    if K_ff.shape[0] <= DENSE_DOFS:
         return float(np.linalg.eigvalsh(K_ff.toarray())[-1])
     try:
         values = eigsh(K_ff, k=1, which="LA", v0=_start(K_ff)[:, 0], tol=1e-10, return_eigenvectors=False)
@@ -92,7 +92,7 @@ def lambda_min(K_ff: csr_array, preconditioner: LinearOperator | None = None) ->
     RuntimeError
         Not converged.
     """
-    if K_ff.shape[0] <= FEW:
+    if K_ff.shape[0] <= DENSE_DOFS:
         return float(np.linalg.eigvalsh(K_ff.toarray())[0])
     if preconditioner is not None:
         return _by_lobpcg(K_ff, preconditioner)
@@ -126,10 +126,10 @@ def _by_inverse(K_ff: csr_array, preconditioner: LinearOperator) -> float:
     """Lanczos on the inverse of K_ff, each product a preconditioned solve."""
 
     def solve(load: NDArray[np.float64]) -> NDArray[np.float64]:
-        found, failed = cg(K_ff, load.ravel(), rtol=1e-10, maxiter=3000, M=preconditioner)
-        if failed:
+        solution, failure = cg(K_ff, load.ravel(), rtol=1e-10, maxiter=3000, M=preconditioner)
+        if failure:
             raise RuntimeError("conditioning: the smallest eigenvalue did not converge: a solve did not")
-        return found
+        return solution
 
     inverse = LinearOperator(K_ff.shape, matvec=solve, dtype=np.float64)
     try:
@@ -139,7 +139,7 @@ def _by_inverse(K_ff: csr_array, preconditioner: LinearOperator) -> float:
     return float(values[0])
 
 
-def cg_iterations(K_ff: csr_array, load: NDArray[np.float64], rtol: float = RTOL) -> int:
+def cg_iterations(K_ff: csr_array, load: NDArray[np.float64], rtol: float = RESIDUAL_SHARE) -> int:
     """Steps that conjugate gradients with the diagonal as preconditioner take to solve K_ff x = load from x = 0.
 
     Parameters

@@ -22,7 +22,7 @@ from tetopt.geometry.box import box_sides, is_on_sides, upright_axis
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 
-BAND = 2.0  # voxels: how near to an interface its strain is judged
+INTERFACE_BAND_VOXELS = 2.0  # how near to an interface the strain there is judged
 
 
 class Reference(NamedTuple):
@@ -79,41 +79,41 @@ def reference(modulus: Image, nu: float, percent: float = 1.0) -> Reference:
     return Reference(modulus, nu, 0.5 * float(dofs @ (K @ dofs)), centre, even, strain, len(dofs))
 
 
-def compare(found: Reference, mesh: Mesh, u: NDArray[np.float64], strain_energy: float, labels: ArrayLike) -> Errors:
+def compare(exact: Reference, mesh: Mesh, u: NDArray[np.float64], strain_energy: float, labels: ArrayLike) -> Errors:
     """Errors of a mesh's displacements `u` (N, n) and energy against the reference, over voxel centres in the mesh.
 
     Parameters
     ----------
-    found : Reference
+    exact : Reference
     mesh, u, strain_energy
         As `tetopt.fem.elasticity.compression` solved it, with the same `nu` and push.
     labels : array of the image's shape
         Materials: an interface is where a voxel's neighbour has another one. Its strain is measured at voxel centres
-        up to `BAND` voxels away; the error is None where there is no interface.
+        up to `INTERFACE_BAND_VOXELS` away; the error is None where there is no interface.
 
     Raises
     ------
     InputError
         A mesh without any voxel centre.
     """
-    owner = cell_of_voxel(found.modulus, mesh).ravel()
+    owner = cell_of_voxel(exact.modulus, mesh).ravel()
     inside = np.flatnonzero(owner >= 0)
     if len(inside) == 0:
         raise InputError("mesh: no voxel centre of the reference lies in it")
-    here = _interpolated(found.modulus, mesh, u, owner, inside)
-    away = _rms(found.u[inside] - found.u_homogeneous[inside])
-    is_homogeneous = away <= 1e-7 * _rms(found.u[inside])  # all that is left is the solver's own
+    ours = _interpolated(exact.modulus, mesh, u, owner, inside)
+    scale = _rms(exact.u[inside] - exact.u_homogeneous[inside])
+    is_homogeneous = scale <= 1e-7 * _rms(exact.u[inside])  # all that is left is the solver's own
     is_near = near_interface(np.asarray(labels)).ravel()[inside]
     strain_error = None
     if is_near.any():
         voxels = inside[is_near]
-        strain_error = _rms(strains(mesh, u)[owner[voxels]] - found.strain[voxels]) / _rms(found.strain[voxels])
-    energy_error = abs(strain_energy / found.strain_energy - 1.0)
-    return Errors(energy_error, None if is_homogeneous else _rms(here - found.u[inside]) / away, strain_error)
+        strain_error = _rms(strains(mesh, u)[owner[voxels]] - exact.strain[voxels]) / _rms(exact.strain[voxels])
+    energy_error = abs(strain_energy / exact.strain_energy - 1.0)
+    return Errors(energy_error, None if is_homogeneous else _rms(ours - exact.u[inside]) / scale, strain_error)
 
 
 def near_interface(labels: NDArray) -> NDArray[np.bool_]:
-    """Voxels whose centre is within `BAND` voxels of a facet between two labels, along the axes' metric of voxels."""
+    """Voxels whose centre is within `INTERFACE_BAND_VOXELS` of a facet between two labels, distances in voxels."""
     is_edge = np.zeros(labels.shape, dtype=bool)
     for axis in range(labels.ndim):
         differs = np.diff(labels, axis=axis) != 0
@@ -124,7 +124,7 @@ def near_interface(labels: NDArray) -> NDArray[np.bool_]:
     if not is_edge.any():
         return is_edge
     # A voxel at an interface has its centre half a voxel away from it.
-    return ndimage.distance_transform_edt(~is_edge) <= BAND - 0.5
+    return ndimage.distance_transform_edt(~is_edge) <= INTERFACE_BAND_VOXELS - 0.5
 
 
 def averaged(image: Image, shape: tuple[int, ...]) -> Image:

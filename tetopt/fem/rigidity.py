@@ -19,7 +19,8 @@ from scipy.sparse.linalg import eigsh
 from tetopt.errors import InputError
 from tetopt.geometry.topology import components
 
-LOOSE = 1e-11  # squared violation, by a motion of size 1, below which nothing holds it
+# The squared violation of all holds by a rigid motion of size 1: below this, which is rounding, nothing holds it.
+LOOSE_VIOLATION = 1e-11
 
 
 def rigid_modes(points: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -62,7 +63,7 @@ def check_held(points: NDArray[np.float64], cells: NDArray[np.int64], is_prescri
     body = components(cells)
     _check_pieces(cells, body, is_prescribed)
     weakest, loose = _weakest_hold(points, cells, body, is_prescribed)
-    if weakest < LOOSE:
+    if weakest < LOOSE_VIOLATION:
         inside = np.flatnonzero(body == loose)
         raise InputError(
             f"mesh: {len(inside)} cells around cell {inside[0]} (node {cells[inside[0], 0]}) can still turn or slide "
@@ -114,10 +115,10 @@ def _weakest_hold(
         shape = (len(which) * n, len(count) * r)
         return coo_array((rows[which].ravel(), (at.ravel(), column.ravel())), shape=shape).tocsr()
 
-    held = np.flatnonzero(is_first)
+    leading = np.flatnonzero(is_first)
     joint = np.flatnonzero(~is_first)
     violations = block_array(
-        [[spread(held)[is_prescribed[node[held]].ravel()]], [spread(joint - 1) - spread(joint)]], format="csr"
+        [[spread(leading)[is_prescribed[node[leading]].ravel()]], [spread(joint - 1) - spread(joint)]], format="csr"
     )
     gram = (violations.T @ violations).tocsc()
     if gram.shape[0] <= 120:

@@ -14,21 +14,22 @@ from tetopt.model.materials import cells_of
 from tetopt.model.model import Model, described, quadratic, quadratic_facet_nodes
 from tetopt.model.sets import nodes_of
 
-ALL = "all_cells"
-FACES = np.array([3, 4, 2, 1])  # number of the face opposite each local node: S1 = 1-2-3, 1-4-2, 2-4-3, S4 = 3-4-1
-# Characters of a number. Abaqus takes no more, and CalculiX reads the first 20: 1.234567890123456e-05 becomes 1.23.
-WIDTH = 20
-COMMENT = 120  # characters of a comment line; Abaqus reads lines of 256
+ALL_ELEMENTS = "all_cells"
+# The number of the face opposite each local node: S1 is 1-2-3, S2 is 1-4-2, S3 is 2-4-3, S4 is 3-4-1.
+FACE_NUMBERS = np.array([3, 4, 2, 1])
+# Of a number: Abaqus takes no more, and CalculiX reads the first 20, so that 1.234567890123456e-05 becomes 1.23.
+NUMBER_CHARACTERS = 20
+COMMENT_CHARACTERS = 120  # of a comment line; Abaqus reads lines of up to 256
 
 # Requests that both solvers know. CalculiX alone has TOTALS=ONLY, which would leave out the energy of each cell.
-REQUESTS = f"""\
+OUTPUT_REQUESTS = f"""\
 ** Displacement, stress and strain (CalculiX .frd, Abaqus .fil)
 *NODE FILE
 U
 *EL FILE
 S, E
 ** Strain energy of each cell and their total (.dat)
-*EL PRINT, ELSET={ALL}, TOTALS=YES
+*EL PRINT, ELSET={ALL_ELEMENTS}, TOTALS=YES
 ELSE
 """
 
@@ -52,7 +53,7 @@ def abaqus(model: Model) -> bytes:
     _check(model)
     parts = [_head(model), *_mesh(model)]
     parts += [f"*ELSET, ELSET={name}\n{_list(cells)}" for name, cells in model.sets.cells.items()]
-    parts += [f"*SURFACE, NAME={name}, TYPE=ELEMENT\n{_faces(found)}" for name, found in model.sets.facets.items()]
+    parts += [f"*SURFACE, NAME={name}, TYPE=ELEMENT\n{_faces(members)}" for name, members in model.sets.facets.items()]
     parts += _materials(model)
     if model.loads:
         parts += _step(model)
@@ -66,12 +67,12 @@ def _check(model: Model) -> None:
         raise InputError(
             "abaqus: loads, but no materials to press on; give a law of the modulus (--young) or leave out the loads"
         )
-    check_apart([ALL, *material_names(model, {})], model.sets.cells)
+    check_apart([ALL_ELEMENTS, *material_names(model, {})], model.sets.cells)
 
 
 def _head(model: Model) -> str:
     lines = described(model) + without_cell_data(model)
-    comments = [f"** {part}\n" for line in lines for part in textwrap.wrap(line, COMMENT)]
+    comments = [f"** {part}\n" for line in lines for part in textwrap.wrap(line, COMMENT_CHARACTERS)]
     return "".join([*comments, "*HEADING\n", "; ".join(lines[:3]), "\n"])
 
 
@@ -79,32 +80,32 @@ def _mesh(model: Model) -> list[str]:
     """Nodes, node sets and elements."""
     if model.order == 2:
         points, cells = quadratic(model.mesh)
-        node_sets = {n: np.unique(quadratic_facet_nodes(cells, found)) for n, found in model.sets.facets.items()}
+        node_sets = {n: np.unique(quadratic_facet_nodes(cells, members)) for n, members in model.sets.facets.items()}
     else:
         points, cells = model.mesh.points, model.mesh.cells
-        node_sets = {n: nodes_of(model.mesh, found) for n, found in model.sets.facets.items()}
+        node_sets = {n: nodes_of(model.mesh, members) for n, members in model.sets.facets.items()}
     return [
         f"*NODE\n{_numbered(_fitting(points))}",
         *(f"*NSET, NSET={name}\n{_list(nodes)}" for name, nodes in node_sets.items()),
-        f"*ELEMENT, TYPE=C3D{cells.shape[1]}, ELSET={ALL}\n{_numbered(cells + 1)}",
+        f"*ELEMENT, TYPE=C3D{cells.shape[1]}, ELSET={ALL_ELEMENTS}\n{_numbered(cells + 1)}",
     ]
 
 
 def _materials(model: Model) -> list[str]:
     if model.materials is None:
         return []
-    made = model.materials
-    constants = rows(_fitting(made.young), _fitting(made.nu), separator=", ").splitlines()
+    materials = model.materials
+    constants = rows(_fitting(materials.young), _fitting(materials.nu), separator=", ").splitlines()
     return [
         f"*ELSET, ELSET={name}\n{_list(members)}"
         f"*MATERIAL, NAME={name}\n*ELASTIC\n{pair}\n*SOLID SECTION, ELSET={name}, MATERIAL={name}\n"
-        for name, members, pair in zip(material_names(model, {}), cells_of(made), constants, strict=True)
+        for name, members, pair in zip(material_names(model, {}), cells_of(materials), constants, strict=True)
     ]
 
 
 def _step(model: Model) -> list[str]:
     dofs = np.arange(1, 4)
-    held = [
+    conditions = [
         f"{load.set_name}, {line}\n"
         for load in model.loads
         for line in rows(dofs, dofs, _fitting(load.displacement), separator=", ").splitlines()
@@ -112,8 +113,8 @@ def _step(model: Model) -> list[str]:
     reactions = [f"*NODE PRINT, NSET={load.set_name}, TOTALS=YES\nRF\n" for load in model.loads]
     return [
         "*STEP\n*STATIC\n*BOUNDARY\n",
-        *held,
-        REQUESTS,
+        *conditions,
+        OUTPUT_REQUESTS,
         "** Reaction forces and their sums\n",
         *reactions,
         "*END STEP\n",
@@ -128,17 +129,18 @@ def _numbered(array: NDArray) -> str:
     return rows(np.arange(1, len(array) + 1), array, separator=", ")
 
 
-def _faces(found: NDArray[np.int64]) -> str:
-    return "".join(f"{cell}, S{face}\n" for cell, face in zip(found[:, 0] + 1, FACES[found[:, 1]], strict=True))
+def _faces(members: NDArray[np.int64]) -> str:
+    numbers, faces = members[:, 0] + 1, FACE_NUMBERS[members[:, 1]]
+    return "".join(f"{cell}, S{face}\n" for cell, face in zip(numbers, faces, strict=True))
 
 
 def _fitting(values: NDArray[np.float64]) -> NDArray[np.float64]:
-    """`values`, each rounded so that it is not longer than `WIDTH` characters."""
+    """`values`, each rounded so that it is not longer than `NUMBER_CHARACTERS`."""
     return np.array([_shortened(x) for x in values.ravel().tolist()]).reshape(values.shape)
 
 
 def _shortened(value: float) -> float:
-    if len(repr(value)) <= WIDTH:
+    if len(repr(value)) <= NUMBER_CHARACTERS:
         return value
     texts = (f"{value:.{digits}g}" for digits in range(16, 0, -1))
-    return float(next(text for text in texts if len(text) <= WIDTH))
+    return float(next(text for text in texts if len(text) <= NUMBER_CHARACTERS))

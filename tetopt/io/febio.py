@@ -16,17 +16,17 @@ from tetopt.errors import InputError
 from tetopt.io.text import rows
 from tetopt.model.loads import Load
 from tetopt.model.materials import Materials, cells_of
-from tetopt.model.model import UNITS, Model, described, quadratic, quadratic_facet_nodes
+from tetopt.model.model import STRESS_UNITS, Model, described, quadratic, quadratic_facet_nodes
 from tetopt.model.sets import facet_triples
 
-MOST_PARTS = 100  # materials that become parts; of more, FEBio Studio's list is no use
+MOST_MATERIAL_PARTS = 100  # with more, FEBio Studio's list of parts is no use
 STUDIO_UNITS = {"kPa": "mm-kg-s", "MPa": "mm-N-s"}  # FEBio's own words for what is consistent with them
-# A set's name has no spaces, hence these names and those of parts ("material 1") are never a set's.
-NODES, CELLS = "all nodes", "all cells"
-YOUNG, NU = "E", "v"  # maps of the moduli, named as the parameters they stand for
+# A set's name has no spaces, so that neither these nor the names of parts ("material 1") are ever a set's.
+ALL_NODES, ALL_CELLS = "all nodes", "all cells"
+YOUNG_MAP, NU_MAP = "E", "v"  # maps of the moduli, named as the parameters they stand for
 
 # What FEBio Studio writes, too, but for the equal steps up to the whole displacement, which the solver may halve.
-CONTROL = """\
+CONTROL_SECTION = """\
 <Control>
 <analysis>STATIC</analysis>
 <time_steps>10</time_steps>
@@ -42,7 +42,7 @@ CONTROL = """\
 </solver>
 </Control>
 """
-RAMP = """\
+RAMP_SECTION = """\
 <LoadData>
 <load_controller id="1" type="loadcurve">
 <interpolate>LINEAR</interpolate>
@@ -54,7 +54,7 @@ RAMP = """\
 </load_controller>
 </LoadData>
 """
-PLOTTED = ("displacement", "stress", "Lagrange strain", "strain energy density", "reaction forces")
+PLOT_VARIABLES = ("displacement", "stress", "Lagrange strain", "strain energy density", "reaction forces")
 
 
 class _Part(NamedTuple):
@@ -91,8 +91,8 @@ def febio(model: Model) -> bytes:
     sections = [
         _head(model),
         "<Globals>\n<Constants>\n<T>0</T>\n<P>0</P>\n<R>0</R>\n<Fc>0</Fc>\n</Constants>\n</Globals>\n",
-        CONTROL if model.loads else "",
-        _materials(parts, UNITS[model.units].water),
+        CONTROL_SECTION if model.loads else "",
+        _materials(parts, STRESS_UNITS[model.units].water),
         *_mesh(model, parts),
         "<MeshDomains>\n",
         *(f'<SolidDomain name="{part.name}" mat="{part.name}"/>\n' for part in parts),
@@ -100,7 +100,7 @@ def febio(model: Model) -> bytes:
         *_mesh_data(model, parts),
         *_loads(model.loads),
         '<Output>\n<plotfile type="febio">\n',
-        *(f'<var type="{name}"/>\n' for name in PLOTTED),
+        *(f'<var type="{name}"/>\n' for name in PLOT_VARIABLES),
         "</plotfile>\n</Output>\n</febio_spec>\n",
     ]
     return "".join(sections).encode("utf-8", "replace")
@@ -111,18 +111,19 @@ def _checked(model: Model) -> Materials:
         raise InputError("febio: expected a mesh of tetrahedra, got triangles; .vtu holds them")
     if model.materials is None:
         raise InputError("febio: a part needs a material; give a law of the modulus (--young)")
-    if taken := {YOUNG, NU} & model.cell_data.keys():
+    if taken := {YOUNG_MAP, NU_MAP} & model.cell_data.keys():
         raise InputError(f'febio: the file\'s map of a modulus is called "{min(taken)}"; call the cell data otherwise')
     return model.materials
 
 
-def _parts(given: Materials) -> list[_Part]:
-    young, nu, of_cell = given.young, given.nu, given.of_cell
-    if len(young) > MOST_PARTS:
-        return [_Part(CELLS, YOUNG, NU if np.ptp(nu) > 0.0 else repr(float(nu[0])), np.arange(len(of_cell)))]
+def _parts(materials: Materials) -> list[_Part]:
+    young, nu, of_cell = materials.young, materials.nu, materials.of_cell
+    if len(young) > MOST_MATERIAL_PARTS:
+        ratio = NU_MAP if np.ptp(nu) > 0.0 else repr(float(nu[0]))
+        return [_Part(ALL_CELLS, YOUNG_MAP, ratio, np.arange(len(of_cell)))]
     return [
         _Part(f"material {k + 1}", repr(float(young[k])), repr(float(nu[k])), members)
-        for k, members in enumerate(cells_of(given))
+        for k, members in enumerate(cells_of(materials))
         if len(members)
     ]
 
@@ -141,7 +142,7 @@ def _materials(parts: list[_Part], density: float) -> str:
             "<Material>\n",
             *(
                 f'<material id="{k}" name="{part.name}" type="neo-Hookean">\n<density>{density!r}</density>\n'
-                f"{_parameter('E', part.young, YOUNG)}{_parameter('v', part.nu, NU)}</material>\n"
+                f"{_parameter('E', part.young, YOUNG_MAP)}{_parameter('v', part.nu, NU_MAP)}</material>\n"
                 for k, part in enumerate(parts, start=1)
             ),
             "</Material>\n",
@@ -158,12 +159,12 @@ def _mesh(model: Model, parts: list[_Part]) -> list[str]:
     facets = model.sets.facets
     if model.order == 2:
         points, cells = quadratic(model.mesh)
-        surfaces = {name: quadratic_facet_nodes(cells, found) for name, found in facets.items()}
+        surfaces = {name: quadratic_facet_nodes(cells, members) for name, members in facets.items()}
     else:
         points, cells = model.mesh.points, model.mesh.cells
-        surfaces = {name: facet_triples(cells, found) for name, found in facets.items()}
+        surfaces = {name: facet_triples(cells, members) for name, members in facets.items()}
     return [
-        f'<Mesh>\n<Nodes name="{NODES}">\n{_items("node", points)}</Nodes>\n',
+        f'<Mesh>\n<Nodes name="{ALL_NODES}">\n{_items("node", points)}</Nodes>\n',
         *(
             f'<Elements type="tet{cells.shape[1]}" name="{part.name}">\n'
             f"{_items('elem', cells[part.cells] + 1, part.cells + 1)}</Elements>\n"
@@ -173,7 +174,7 @@ def _mesh(model: Model, parts: list[_Part]) -> list[str]:
             f'<Surface name="{name}">\n{_items(f"tri{nodes.shape[1]}", nodes + 1)}</Surface>\n'
             for name, nodes in surfaces.items()
         ),
-        *(f'<ElementSet name="{name}">{_list(found)}</ElementSet>\n' for name, found in model.sets.cells.items()),
+        *(f'<ElementSet name="{name}">{_list(members)}</ElementSet>\n' for name, members in model.sets.cells.items()),
         *(f'<NodeSet name="{name}">{_list(np.unique(nodes))}</NodeSet>\n' for name, nodes in surfaces.items()),
         "</Mesh>\n",
     ]
@@ -184,17 +185,17 @@ def _mesh_data(model: Model, parts: list[_Part]) -> list[str]:
 
     A set of all cells would not do: FEBio takes one across parts in their order, and not in the set's.
     """
-    found = dict(_columns(model.cell_data))
-    if model.materials is not None and parts[0].young == YOUNG:
-        found[YOUNG] = model.materials.young[model.materials.of_cell]
-        if parts[0].nu == NU:
-            found[NU] = model.materials.nu[model.materials.of_cell]
-    if not found:
+    fields = dict(_columns(model.cell_data))
+    if model.materials is not None and parts[0].young == YOUNG_MAP:
+        fields[YOUNG_MAP] = model.materials.young[model.materials.of_cell]
+        if parts[0].nu == NU_MAP:
+            fields[NU_MAP] = model.materials.nu[model.materials.of_cell]
+    if not fields:
         return []
     data = [
         f'<ElementData name="{_attribute(name)}" elem_set="{part.name}" data_type="scalar">\n'
         f"{_items('elem', values[part.cells], number='lid')}</ElementData>\n"
-        for name, values in found.items()
+        for name, values in fields.items()
         for part in parts
     ]
     return ["<MeshData>\n", *data, "</MeshData>\n"]
@@ -213,7 +214,7 @@ def _columns(cell_data: dict[str, NDArray]) -> list[tuple[str, NDArray[np.float6
 def _loads(loads: tuple[Load, ...]) -> list[str]:
     if not loads:
         return []
-    return [RAMP, "<Boundary>\n", *(_condition(load) for load in loads), "</Boundary>\n"]
+    return [RAMP_SECTION, "<Boundary>\n", *(_condition(load) for load in loads), "</Boundary>\n"]
 
 
 def _condition(load: Load) -> str:

@@ -56,7 +56,7 @@ def format_of(path: Path) -> Format:
     """
     suffix = path.suffix.lower()
     if suffix not in FORMATS:
-        known = ", ".join(f"{name} ({found.what})" for name, found in FORMATS.items())
+        known = ", ".join(f"{name} ({kind.what})" for name, kind in FORMATS.items())
         raise InputError(f"{path}: unknown suffix; known are {known}")
     return FORMATS[suffix]
 
@@ -82,12 +82,12 @@ def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str
         An unknown suffix, or what the format cannot carry.
     """
     path = Path(path)
-    content = content_of(path, model, space=space, units=units)
+    content = file_bytes(path, model, space=space, units=units)
     with written_whole(path) as temporary:
         temporary.write_bytes(content)
 
 
-def content_of(path: Path, model: Model, *, space: str = "ras", units: str = "kPa") -> bytes:
+def file_bytes(path: Path, model: Model, *, space: str = "ras", units: str = "kPa") -> bytes:
     """What `save_model` writes.
 
     Raises
@@ -95,8 +95,8 @@ def content_of(path: Path, model: Model, *, space: str = "ras", units: str = "kP
     InputError
         As `save_model`.
     """
-    found = format_of(path)
-    if model.order != 1 and not found.has_quadratic:
+    kind = format_of(path)
+    if model.order != 1 and not kind.has_quadratic:
         able = ", ".join(name for name, other in FORMATS.items() if other.has_quadratic)
         raise InputError(f"{path}: only {able} take quadratic cells; leave out --order 2")
-    return found.write(in_units(in_space(model, space), units))
+    return kind.write(in_units(in_space(model, space), units))

@@ -19,7 +19,7 @@ they are held by, since meshio takes no view that leaves elements out. Data of s
 More than 1000 materials are no groups, only views; in 2.2 they are refused.
 
 The $Comments also tell coordinates, units, each material's constants, and the loads, which MSH has no place for. Our
-own reader goes by them, see `told`.
+own reader goes by them, see `own_comments`.
 """
 
 from __future__ import annotations
@@ -45,11 +45,11 @@ from tetopt.io.text import rows
 from tetopt.model.model import Model, quadratic, quadratic_facet_nodes
 from tetopt.model.sets import facet_triples
 
-LINE, TRIANGLE, TETRAHEDRON, TRIANGLE_6, TETRAHEDRON_10 = 1, 2, 4, 9, 11  # gmsh's numbers of element types
-TYPES = {(1, 1): LINE, (2, 1): TRIANGLE, (3, 1): TETRAHEDRON, (2, 2): TRIANGLE_6, (3, 2): TETRAHEDRON_10}
-NODES_10 = np.array([0, 1, 2, 3, 4, 5, 6, 7, 9, 8])  # gmsh has the midpoint of edge (2, 3) before that of (1, 3)
-UNNAMED = "unnamed"  # group of cells without one
-MOST_MATERIALS = 1000  # as groups: gmsh takes minutes to open a 2.2 file with 200,000, meshio hours for a 4.1
+# gmsh's numbers for elements of a dimension and an order: line, triangle, tetrahedron; triangle and tetrahedron again.
+ELEMENT_TYPES = {(1, 1): 1, (2, 1): 2, (3, 1): 4, (2, 2): 9, (3, 2): 11}
+TET10_ORDER = np.array([0, 1, 2, 3, 4, 5, 6, 7, 9, 8])  # gmsh has the midpoint of edge (2, 3) before that of (1, 3)
+UNNAMED_GROUP = "unnamed"  # the group of cells that are in no other
+MOST_MATERIAL_GROUPS = 1000  # gmsh takes minutes to open a 2.2 file with 200,000, meshio hours for a 4.1
 
 
 class Part(NamedTuple):
@@ -64,7 +64,7 @@ class Part(NamedTuple):
     sets: dict[str, list[int]]  # the entities that make up each set
 
 
-class Told(NamedTuple):
+class OwnComments(NamedTuple):
     """What the comments of a file of ours tell."""
 
     space: str
@@ -73,25 +73,25 @@ class Told(NamedTuple):
     entities: dict[str, list[int]]  # those that make up each of these materials and each cell set
 
 
-def told(comments: list[str]) -> Told | None:
+def own_comments(lines: list[str]) -> OwnComments | None:
     """What `gmsh41` and `gmsh22` wrote into the comments; None if others wrote them."""
-    coordinates = [line for line in comments if line.startswith("coordinates: ")]
-    if not coordinates or not comments[0].startswith("tetopt"):
+    coordinates = [line for line in lines if line.startswith("coordinates: ")]
+    if not coordinates or not lines[0].startswith("tetopt"):
         return None
     texts: dict[str, str] = {}
     constants: dict[str, tuple[float, float]] = {}
     entities: dict[str, list[int]] = {}
-    for line in comments:
-        if found := re.fullmatch(r"units: mm, (\w+), .*", line):
-            texts["units"] = found[1]
-        elif found := re.fullmatch(r"image: (.*), sha256 (\w+)", line):
-            texts |= {"image": found[1]} | ({} if found[2] == "unknown" else {"image_sha256": found[2]})
-        elif found := re.fullmatch(r"(material_\d+): young (\S+) \w+, nu (\S+)", line):
-            constants[found[1]] = float(found[2]), float(found[3])
-        elif found := re.fullmatch(r"entity of cells (\d+): (.*)", line):
-            for name in found[2].split():
-                entities.setdefault(name, []).append(int(found[1]))
-    return Told("lps" if coordinates[0].startswith("coordinates: LPS") else "ras", texts, constants, entities)
+    for line in lines:
+        if match := re.fullmatch(r"units: mm, (\w+), .*", line):
+            texts["units"] = match[1]
+        elif match := re.fullmatch(r"image: (.*), sha256 (\w+)", line):
+            texts |= {"image": match[1]} | ({} if match[2] == "unknown" else {"image_sha256": match[2]})
+        elif match := re.fullmatch(r"(material_\d+): young (\S+) \w+, nu (\S+)", line):
+            constants[match[1]] = float(match[2]), float(match[3])
+        elif match := re.fullmatch(r"entity of cells (\d+): (.*)", line):
+            for name in match[2].split():
+                entities.setdefault(name, []).append(int(match[1]))
+    return OwnComments("lps" if coordinates[0].startswith("coordinates: LPS") else "ras", texts, constants, entities)
 
 
 def gmsh41(model: Model) -> bytes:
@@ -105,7 +105,7 @@ def gmsh41(model: Model) -> bytes:
         A set that is called as a group of cells or as cell data are, or a 2-D model of order 2.
     """
     grouped, comments = model, []
-    if _n_materials(model) > MOST_MATERIALS:
+    if _n_materials(model) > MOST_MATERIAL_GROUPS:
         grouped = model._replace(materials=None)
         comments = [f"{_n_materials(model)} materials: in the views young, {model.units}, and nu; not groups"]
     points, cells = _geometry(model)
@@ -149,9 +149,9 @@ def gmsh22(model: Model) -> bytes:
     InputError
         As `gmsh41`, or more than 1000 materials.
     """
-    if _n_materials(model) > MOST_MATERIALS:
+    if _n_materials(model) > MOST_MATERIAL_GROUPS:
         raise InputError(
-            f"gmsh 2.2: expected at most {MOST_MATERIALS} materials, as each becomes a group, got "
+            f"gmsh 2.2: expected at most {MOST_MATERIAL_GROUPS} materials, as each becomes a group, got "
             f"{_n_materials(model)}; group them with --bins 32, or name the file .msh"
         )
     points, cells = _geometry(model)
@@ -201,7 +201,7 @@ def _geometry(model: Model) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
 def _nodes(model: Model, cells: NDArray[np.int64], part: Part) -> NDArray[np.int64]:
     """The nodes of each element, from 0, in gmsh's order."""
     if part.rows.ndim == 1:
-        return cells[part.rows][:, NODES_10] if model.order == 2 else cells[part.rows]
+        return cells[part.rows][:, TET10_ORDER] if model.order == 2 else cells[part.rows]
     return (quadratic_facet_nodes if model.order == 2 else facet_triples)(cells, part.rows)
 
 
@@ -210,15 +210,15 @@ def _nodes(model: Model, cells: NDArray[np.int64], part: Part) -> NDArray[np.int
 
 def _cells(model: Model) -> Part:
     """Every cell; an entity is what is of the same material and in the same sets."""
-    found = cell_tags(model)
+    tagged = cell_tags(model)
     if model.materials is None:
         names, group = _disjoint_sets(model)
     else:
         names, group = material_names(model, model.sets.facets), model.materials.of_cell + 1
-    _, first = np.unique(found.tags, return_index=True)
+    _, first = np.unique(tagged.tags, return_index=True)
     groups_of = [[number] for number in group[first].tolist()]
     cells = np.arange(len(model.mesh.cells))
-    return Part(model.mesh.ndim, cells + 1, cells, found.tags, groups_of, names, found.tags_of)
+    return Part(model.mesh.ndim, cells + 1, cells, tagged.tags, groups_of, names, tagged.tags_of)
 
 
 def _disjoint_sets(model: Model) -> tuple[list[str], NDArray[np.int64]]:
@@ -230,8 +230,8 @@ def _disjoint_sets(model: Model) -> tuple[list[str], NDArray[np.int64]]:
             names.append(name)
             number[members] = len(names)
     if (number == 0).any():
-        check_apart([UNNAMED], {**model.sets.facets, **model.sets.cells})
-        names.append(UNNAMED)
+        check_apart([UNNAMED_GROUP], {**model.sets.facets, **model.sets.cells})
+        names.append(UNNAMED_GROUP)
         number[number == 0] = len(names)
     return names, number
 
@@ -239,13 +239,13 @@ def _disjoint_sets(model: Model) -> tuple[list[str], NDArray[np.int64]]:
 def _facets_once(model: Model) -> Part:
     """Every facet of a set; an entity is what is in the same sets."""
     names = list(_from_smallest(model))
-    found = facet_tags(model.mesh, model.sets.facets)
-    groups_of: list[list[int]] = [[] for _ in range(found.tags.max(initial=0))]
+    tagged = facet_tags(model.mesh, model.sets.facets)
+    groups_of: list[list[int]] = [[] for _ in range(tagged.tags.max(initial=0))]
     for group, name in enumerate(names, 1):
-        for tag in found.tags_of[name]:
+        for tag in tagged.tags_of[name]:
             groups_of[tag - 1].append(group)
-    numbers = len(model.mesh.cells) + 1 + np.arange(len(found.items))
-    return Part(model.mesh.ndim - 1, numbers, found.items, found.tags, groups_of, names, found.tags_of)
+    numbers = len(model.mesh.cells) + 1 + np.arange(len(tagged.items))
+    return Part(model.mesh.ndim - 1, numbers, tagged.items, tagged.tags, groups_of, names, tagged.tags_of)
 
 
 def _facets_each(model: Model) -> Part:
@@ -291,7 +291,7 @@ def _entity_lines(model: Model, part: Part) -> str:
 def _element_blocks(model: Model, cells: NDArray[np.int64], part: Part) -> str:
     lines = rows(part.numbers, _nodes(model, cells, part) + 1).splitlines(keepends=True)
     ends = np.append(_starts(part), len(lines)).tolist()
-    kind = TYPES[part.dim, model.order]
+    kind = ELEMENT_TYPES[part.dim, model.order]
     return "".join(
         f"{part.dim} {k + 1} {kind} {stop - start}\n{''.join(lines[start:stop])}"
         for k, (start, stop) in enumerate(pairwise(ends))
@@ -300,7 +300,7 @@ def _element_blocks(model: Model, cells: NDArray[np.int64], part: Part) -> str:
 
 def _element_lines(model: Model, cells: NDArray[np.int64], part: Part) -> str:
     """Number, type, two tags: group, entity; nodes."""
-    kind = np.full(len(part.numbers), TYPES[part.dim, model.order])
+    kind = np.full(len(part.numbers), ELEMENT_TYPES[part.dim, model.order])
     group = np.array([groups[0] for groups in part.groups_of])[part.entities - 1]
     return rows(part.numbers, kind, np.full_like(kind, 2), group, part.entities, _nodes(model, cells, part) + 1)
 

@@ -29,20 +29,20 @@ from tetopt.io.files import written_whole
 Bounds = Sequence[tuple[int | None, int | None]]
 """One half-open (start, stop) range of voxel indices for each axis; None is an open end."""
 
-_NIBABEL = (".nii.gz", ".nii", ".mgz", ".mgh")
+_NIBABEL_SUFFIXES = (".nii.gz", ".nii", ".mgz", ".mgh")
 # ITK picks its reader by the name's case-sensitive ending; naming the reader also opens SCAN.MHA.
-_ITK = {
+_ITK_READERS = {
     ".nrrd": "NrrdImageIO",
     ".nhdr": "NrrdImageIO",
     ".mha": "MetaImageIO",
     ".mhd": "MetaImageIO",
     ".dcm": "GDCMImageIO",
 }
-_PICTURES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp")
-_KNOWN = ", ".join((*_NIBABEL, *_ITK, *_PICTURES))
+_PICTURE_SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp")
+_KNOWN_SUFFIXES = ", ".join((*_NIBABEL_SUFFIXES, *_ITK_READERS, *_PICTURE_SUFFIXES))
 
-_DAMAGED = "the file is truncated or damaged; copy it again"
-_UNREADABLE = "truncated or damaged, or not an image of this kind; copy it again, or check its name"
+_DAMAGED_FILE = "the file is truncated or damaged; copy it again"
+_UNREADABLE_FILE = "truncated or damaged, or not an image of this kind; copy it again, or check its name"
 _NIBABEL_HEADER_ERRORS = (
     ImageFileError,
     HeaderDataError,
@@ -65,9 +65,9 @@ _PILLOW_ERRORS = (
     zlib.error,
     PIL.Image.DecompressionBombError,
 )
-_MM = {"meter": 1000.0, "micron": 0.001}
-_UNEVEN = 0.05
-"""DICOM slices may be off an even spacing by this fraction of it; positions are often rounded."""
+_MM_PER_UNIT = {"meter": 1000.0, "micron": 0.001}
+# DICOM slices may be off an even spacing by this share of it, since positions are often rounded.
+_UNEVEN_SHARE = 0.05
 
 
 def load_image(
@@ -307,13 +307,13 @@ def _read(path: Path, volume: int | None) -> tuple[NDArray, NDArray[np.float64]]
             if not stream.read(1):
                 raise InputError("the file is empty; copy or export it again")
     name = path.name.lower()
-    if name.endswith(_NIBABEL):
+    if name.endswith(_NIBABEL_SUFFIXES):
         return _read_nibabel(path, volume)
-    if name.endswith(tuple(_ITK)):
+    if name.endswith(tuple(_ITK_READERS)):
         return _read_itk(path, volume)
-    if name.endswith(_PICTURES):
+    if name.endswith(_PICTURE_SUFFIXES):
         return _read_picture(path, volume)
-    raise InputError(f"unknown kind of image file; expected {_KNOWN}, or a folder of DICOM files")
+    raise InputError(f"unknown kind of image file; expected {_KNOWN_SUFFIXES}, or a folder of DICOM files")
 
 
 @contextlib.contextmanager
@@ -342,8 +342,8 @@ def _volume_index(trailing: tuple[int, ...], volume: int | None) -> tuple[int, .
         )
     volume = 0 if volume is None else volume
     if not 0 <= volume < count:
-        held = "one volume" if count == 1 else f"{count} volumes"
-        raise InputError(f"volume {volume} asked for, but the file holds {held}; choose from 0 to {count - 1}")
+        volumes = "one volume" if count == 1 else f"{count} volumes"
+        raise InputError(f"volume {volume} asked for, but the file holds {volumes}; choose from 0 to {count - 1}")
     return tuple(int(i) for i in np.unravel_index(volume, trailing, order="F"))
 
 
@@ -364,7 +364,7 @@ def _read_nibabel(path: Path, volume: int | None) -> tuple[NDArray, NDArray[np.f
         # The file is there: nibabel looked for another case of its ending.
         raise InputError("nibabel cannot read an ending in mixed case; rename it to lower case") from error
     except _NIBABEL_HEADER_ERRORS as error:
-        raise InputError(f"{_UNREADABLE} ({_one_line(error)})") from error
+        raise InputError(f"{_UNREADABLE_FILE} ({_one_line(error)})") from error
     if not isinstance(file, SpatialImage):
         raise InputError(f"expected an image on a grid of voxels, got a {type(file).__name__}")
     affine = _affine_in_mm(file)
@@ -374,7 +374,7 @@ def _read_nibabel(path: Path, volume: int | None) -> tuple[NDArray, NDArray[np.f
     except MemoryError as error:
         raise InputError(f"its {file.shape} voxels do not fit into memory; resample it first") from error
     except (OSError, EOFError, zlib.error, ValueError, TypeError, OverflowError) as error:
-        raise InputError(f"{_DAMAGED} ({_one_line(error)})") from error
+        raise InputError(f"{_DAMAGED_FILE} ({_one_line(error)})") from error
     if data.ndim == 2:
         return data, _plane_affine(affine[:3, :2], affine[:3, 3])
     return data, affine
@@ -389,7 +389,7 @@ def _check_gzip(path: Path) -> None:
     except (OSError, EOFError, zlib.error) as error:
         if "Not a gzipped file" in str(error):
             raise InputError("not a gzip file; if it is not compressed, drop .gz (or z) from its name") from error
-        raise InputError(f"{_DAMAGED} ({_one_line(error)})") from error
+        raise InputError(f"{_DAMAGED_FILE} ({_one_line(error)})") from error
 
 
 def _affine_in_mm(file: SpatialImage) -> NDArray[np.float64]:
@@ -397,7 +397,7 @@ def _affine_in_mm(file: SpatialImage) -> NDArray[np.float64]:
     if isinstance(file, nibabel.Nifti1Pair):
         # A code outside of the standard says nothing: mm, as for 'unknown'.
         with contextlib.suppress(KeyError):
-            affine[:3] *= _MM.get(file.header.get_xyzt_units()[0], 1.0)
+            affine[:3] *= _MM_PER_UNIT.get(file.header.get_xyzt_units()[0], 1.0)
     return affine
 
 
@@ -410,7 +410,7 @@ def _read_itk(path: Path, volume: int | None) -> tuple[NDArray, NDArray[np.float
     with _itk_errors(sitk):
         reader = sitk.ImageFileReader()
         reader.SetFileName(str(path))
-        reader.SetImageIO(_ITK[path.suffix.lower()])
+        reader.SetImageIO(_ITK_READERS[path.suffix.lower()])
         reader.ReadImageInformation()
         _check_components(reader.GetNumberOfComponents())
         size = reader.GetSize()
@@ -475,7 +475,7 @@ def _place_slices(affine: NDArray[np.float64], reader: Any, n_slices: int) -> No
     points = np.array([_numbers(reader.GetMetaData(i, position), 3) for i in slices]) * [-1.0, -1.0, 1.0]
     step = (points[-1] - points[0]) / (n_slices - 1)
     off = np.linalg.norm(points - points[0] - np.arange(n_slices)[:, None] * step, axis=1)
-    if off.max() > _UNEVEN * np.linalg.norm(step):
+    if off.max() > _UNEVEN_SHARE * np.linalg.norm(step):
         raise InputError(
             f"the DICOM slices are not evenly spaced (slice {off.argmax()} is {off.max():.3g} mm off: one is "
             "missing, or several volumes are mixed); export the series again, or resample it to NIfTI"
@@ -513,7 +513,7 @@ def _itk_errors(sitk: ModuleType) -> Iterator[None]:
         # The innermost cause stands last; the "Reason:" behind it is an unrelated errno.
         words = re.split(r"ERROR: (?:\w+ ?\(0x[0-9a-f]+\): )?|\[nrrd\] ", _one_line(error))[-1]
         words = words.split(" Reason: ")[0]
-        raise InputError(f"{_UNREADABLE} (SimpleITK: {words})") from error
+        raise InputError(f"{_UNREADABLE_FILE} (SimpleITK: {words})") from error
     finally:
         sitk.ProcessObject.SetGlobalWarningDisplay(shown)
 
@@ -547,9 +547,9 @@ def _read_picture(path: Path, volume: int | None) -> tuple[NDArray, NDArray[np.f
     except InputError:
         raise
     except PIL.UnidentifiedImageError as error:
-        raise InputError(f"{_UNREADABLE} (Pillow knows no such picture)") from error
+        raise InputError(f"{_UNREADABLE_FILE} (Pillow knows no such picture)") from error
     except _PILLOW_ERRORS as error:
-        raise InputError(f"{_DAMAGED} ({_one_line(error)})") from error
+        raise InputError(f"{_DAMAGED_FILE} ({_one_line(error)})") from error
     return data, np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, data.shape[0] - 1.0], [0.0, 0.0, 1.0]])
 
 

@@ -18,7 +18,7 @@ from tetopt.io.text import rows
 from tetopt.model.model import Model
 from tetopt.model.sets import facet_triples
 
-KEYWORDS = {1: "Edges", 2: "Triangles", 3: "Tetrahedra"}
+ELEMENT_KEYWORDS = {1: "Edges", 2: "Triangles", 3: "Tetrahedra"}
 
 
 def medit(model: Model) -> bytes:
@@ -35,7 +35,7 @@ def medit(model: Model) -> bytes:
         raise InputError("order 2: few programs read it from a medit file; leave out --order")
     mesh = model.mesh
     in_cells, on_facets = cell_tags(model), facet_tags(mesh, model.sets.facets)
-    cells, sides = KEYWORDS[mesh.ndim], KEYWORDS[mesh.ndim - 1]
+    cells, sides = ELEMENT_KEYWORDS[mesh.ndim], ELEMENT_KEYWORDS[mesh.ndim - 1]
     comments = [*remarks(model), *without_cell_data(model)]
     comments += tag_lines(in_cells.tags_of, f"{cells} ref") + tag_lines(on_facets.tags_of, f"{sides} ref")
     return "".join(

@@ -17,14 +17,14 @@ from numpy.typing import NDArray
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import oriented
 from tetopt.io.files import written_whole
-from tetopt.io.raw import DIMENSIONS, Raw
+from tetopt.io.raw import CELL_DIMENSIONS, Raw
 from tetopt.io.read_gmsh import read_msh
 from tetopt.io.vtk import add_texts, box_in, sets_in, text_in, to_pyvista, vtu_bytes
 from tetopt.mesh import Mesh
-from tetopt.model.model import UNITS, half_turn
-from tetopt.model.sets import NAME, Box, Sets, free_name, rows_of
+from tetopt.model.model import STRESS_UNITS, half_turn
+from tetopt.model.sets import SET_NAME, Box, Sets, free_name, rows_of
 
-SUFFIXES = (".vtu", ".vtk", ".msh", ".msh2")
+MESH_SUFFIXES = (".vtu", ".vtk", ".msh", ".msh2")
 
 
 class MeshFile(NamedTuple):
@@ -86,11 +86,11 @@ def load_mesh(path: str | Path) -> MeshFile:
     path = Path(path)
     if not path.is_file():
         raise InputError(f"{path}: no such mesh file")
-    if path.suffix.lower() not in SUFFIXES:
-        raise InputError(f"{path}: expected a mesh named {', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}")
+    if path.suffix.lower() not in MESH_SUFFIXES:
+        raise InputError(f"{path}: expected a mesh named {', '.join(MESH_SUFFIXES[:-1])} or {MESH_SUFFIXES[-1]}")
     raw = read_msh(path) if path.suffix.lower() in (".msh", ".msh2") else _read_vtk(path)
     kind = _kind_of_cells(path, raw)
-    n = DIMENSIONS[kind]
+    n = CELL_DIMENSIONS[kind]
     cells, points = raw.cells[kind], raw.points
     if cells.min() < 0 or cells.max() >= len(points):
         raise InputError(
@@ -129,16 +129,16 @@ def _in_kPa(cell_data: dict[str, NDArray], units: str) -> tuple[dict[str, NDArra
     """Cell data with the moduli in kPa; without them, and a note, if their unit is not known."""
     if "young" not in cell_data:
         return cell_data, ()
-    if units in UNITS:
-        return cell_data | {"young": cell_data["young"] * UNITS[units].kPa}, ()
+    if units in STRESS_UNITS:
+        return cell_data | {"young": cell_data["young"] * STRESS_UNITS[units].kPa}, ()
     others = {name: values for name, values in cell_data.items() if name not in ("young", "nu", "material")}
-    return others, (f'moduli left out, as their unit is neither {" nor ".join(UNITS)}: "{units}"',)
+    return others, (f'moduli left out, as their unit is neither {" nor ".join(STRESS_UNITS)}: "{units}"',)
 
 
 def _kind_of_cells(path: Path, raw: Raw) -> str:
-    if unknown := sorted(set(raw.cells) - set(DIMENSIONS)):
+    if unknown := sorted(set(raw.cells) - set(CELL_DIMENSIONS)):
         raise InputError(f"{path}: expected linear tetrahedra, or triangles, found {', '.join(unknown)}")
-    kind = max(raw.cells, key=lambda name: DIMENSIONS[name], default="none")
+    kind = max(raw.cells, key=lambda name: CELL_DIMENSIONS[name], default="none")
     if kind not in ("tetra", "triangle"):
         raise InputError(
             f"{path}: expected tetrahedra or triangles, found {', '.join(sorted(raw.cells)) or 'no cells'}"
@@ -149,9 +149,9 @@ def _kind_of_cells(path: Path, raw: Raw) -> str:
 def _cell_data(raw: Raw, kind: str) -> tuple[dict[str, NDArray], tuple[str, ...]]:
     """What is on the cells of this kind, and a note on what is no numbers."""
     values_of = {name: values[kind] for name, values in raw.cell_data.items() if kind in values}
-    found = {name: values for name, values in values_of.items() if values.dtype.kind in "biuf"}
-    others = ", ".join(name for name in values_of if name not in found)
-    return found, (f"cell data left out, as they are no numbers: {others}",) if others else ()
+    numbers = {name: values for name, values in values_of.items() if values.dtype.kind in "biuf"}
+    others = ", ".join(name for name in values_of if name not in numbers)
+    return numbers, (f"cell data left out, as they are no numbers: {others}",) if others else ()
 
 
 def _sets_of_groups(raw: Raw, mesh: Mesh, kind: str, used: NDArray[np.int64]) -> tuple[Sets, tuple[str, ...]]:
@@ -160,11 +160,12 @@ def _sets_of_groups(raw: Raw, mesh: Mesh, kind: str, used: NDArray[np.int64]) ->
     place[used] = np.arange(len(used))
     sets, notes = Sets({}, {}), []
     taken: set[str] = set()
-    n = DIMENSIONS[kind]
-    groups = [group for group in raw.groups if n - 1 <= DIMENSIONS[group.kind] <= n]
+    n = CELL_DIMENSIONS[kind]
+    groups = [group for group in raw.groups if n - 1 <= CELL_DIMENSIONS[group.kind] <= n]
     if "young" in raw.cell_data:  # which tells materials better than their groups do, with which they would be written
         groups = [group for group in groups if re.fullmatch(r"material_\d+", group.label) is None]
-    for group in sorted(groups, key=lambda group: NAME.fullmatch(group.label) is None):  # who can keep his name does
+    # Groups that can keep their names come first, so that they do.
+    for group in sorted(groups, key=lambda group: SET_NAME.fullmatch(group.label) is None):
         name = free_name(group.label, taken)
         if group.kind == kind:
             sets.cells[name] = group.members
@@ -183,7 +184,7 @@ def _sets_of_groups(raw: Raw, mesh: Mesh, kind: str, used: NDArray[np.int64]) ->
 def _read_vtk(path: Path) -> Raw:
     grid = _read_quietly(path)
     names = {int(kind): pyvista.CellType(kind).name.lower() for kind in np.unique(grid.celltypes)}
-    if set(names.values()) <= set(DIMENSIONS):  # pyvista takes other kinds apart only if they have fixed sizes
+    if set(names.values()) <= set(CELL_DIMENSIONS):  # pyvista takes other kinds apart only if they have fixed sizes
         cells = {names[int(kind)]: np.asarray(nodes, dtype=np.int64) for kind, nodes in grid.cells_dict.items()}
     else:
         cells = {name: np.empty((0, 1), dtype=np.int64) for name in names.values()}

@@ -21,8 +21,7 @@ from tetopt.io.text import blocks, rows
 from tetopt.model.model import Model
 from tetopt.model.sets import facet_triples
 
-SEGMENT, TRIANGLE, TETRAHEDRON = 1, 2, 4  # MFEM's numbers of geometries
-GEOMETRIES = {1: SEGMENT, 2: TRIANGLE, 3: TETRAHEDRON}
+ELEMENT_GEOMETRIES = {1: 1, 2: 2, 3: 4}  # MFEM's numbers for the simplex of a dimension: segment, triangle, tetrahedron
 
 
 def mfem(model: Model) -> bytes:
@@ -64,7 +63,7 @@ def mfem(model: Model) -> bytes:
 
 
 def _elements(attributes: NDArray[np.int64], dim: int, nodes: NDArray[np.int64]) -> str:
-    return f"{len(nodes)}\n" + rows(attributes, np.full(len(nodes), GEOMETRIES[dim]), nodes)
+    return f"{len(nodes)}\n" + rows(attributes, np.full(len(nodes), ELEMENT_GEOMETRIES[dim]), nodes)
 
 
 def _sets(tags_of: dict[str, list[int]]) -> str:

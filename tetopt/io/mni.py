@@ -15,9 +15,9 @@ from tetopt.io.images import load_image
 
 def mni_path(contrast: Literal["t1", "gm", "wm"]) -> Path:
     """File of the T1, or of the grey or white matter's probability times 255; InputError without nilearn."""
-    found = importlib.util.find_spec("nilearn")
+    package = importlib.util.find_spec("nilearn")
     name = f"datasets/data/mni_icbm152_{contrast}_tal_nlin_sym_09a_converted.nii.gz"
-    path = Path(found.origin).parent / name if found is not None and found.origin else Path(name)
+    path = Path(package.origin).parent / name if package is not None and package.origin else Path(name)
     if not path.is_file():
         raise InputError('the MNI152 brain is in nilearn\'s wheel: pip install "tetopt[demo]", or give an image')
     return path

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 # Cells that a mesh is made of, or that may lie on it.
-DIMENSIONS = {"vertex": 0, "poly_vertex": 0, "line": 1, "poly_line": 1, "triangle": 2, "tetra": 3}
+CELL_DIMENSIONS = {"vertex": 0, "poly_vertex": 0, "line": 1, "poly_line": 1, "triangle": 2, "tetra": 3}
 
 
 class Group(NamedTuple):

@@ -14,10 +14,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
-from tetopt.io.gmsh import Told, told
-from tetopt.io.raw import DIMENSIONS, Group, Raw
+from tetopt.io.gmsh import OwnComments, own_comments
+from tetopt.io.raw import CELL_DIMENSIONS, Group, Raw
 
-UNNAMED = {1: "edge", 2: "surface", 3: "volume"}  # what gmsh's groups without a name are called, with their number
+# What groups without a name are called here, by their dimension; their number follows.
+DEFAULT_LABELS = {1: "edge", 2: "surface", 3: "volume"}
 
 
 def read_msh(path: Path) -> Raw:
@@ -25,39 +26,39 @@ def read_msh(path: Path) -> Raw:
     try:
         with warnings.catch_warnings(), contextlib.redirect_stdout(None), contextlib.redirect_stderr(None):
             warnings.simplefilter("ignore")
-            found = meshio.gmsh.read(path)
-        return _msh(found, path.read_bytes())
+            file = meshio.gmsh.read(path)
+        return _msh(file, path.read_bytes())
     except Exception as error:  # meshio raises whatever it stumbles over, and so do damaged sections of a file
         raise InputError(f"{path}: cannot be read as a gmsh mesh ({type(error).__name__})") from error
 
 
-def _msh(found: meshio.Mesh, content: bytes) -> Raw:
+def _msh(file: meshio.Mesh, content: bytes) -> Raw:
     """A file as meshio has read it, with its groups, of which meshio loses some."""
-    kinds = list(dict.fromkeys(block.type for block in found.cells))
-    of_kind = {kind: [k for k, block in enumerate(found.cells) if block.type == kind] for kind in kinds}
+    kinds = list(dict.fromkeys(block.type for block in file.cells))
+    of_kind = {kind: [k for k, block in enumerate(file.cells) if block.type == kind] for kind in kinds}
     cells = {
-        kind: np.concatenate([found.cells[k].data for k in blocks]).astype(np.int64) for kind, blocks in of_kind.items()
+        kind: np.concatenate([file.cells[k].data for k in blocks]).astype(np.int64) for kind, blocks in of_kind.items()
     }
     cell_data = {
         name: {kind: np.concatenate([values[k] for k in blocks]) for kind, blocks in of_kind.items()}
-        for name, values in found.cell_data.items()
+        for name, values in file.cell_data.items()
     }
-    points = np.zeros((len(found.points), 3))
-    points[:, : found.points.shape[1]] = found.points
+    points = np.zeros((len(file.points), 3))
+    points[:, : file.points.shape[1]] = file.points
     groups = _groups(cells, cell_data, _physical_names(content), _groups_of_entities(content))
     raw = Raw(points, cells, cell_data, {}, groups, "ras")
-    comments = told(_section(content, "Comments").decode("utf-8", "replace").splitlines())
+    comments = own_comments(_section(content, "Comments").decode("utf-8", "replace").splitlines())
     return raw if comments is None else _of_ours(raw, comments)
 
 
-def _of_ours(raw: Raw, comments: Told) -> Raw:
+def _of_ours(raw: Raw, comments: OwnComments) -> Raw:
     """A file of ours with what its comments tell: cell sets and materials are no longer groups and views."""
-    kind = max(raw.cells, key=lambda name: DIMENSIONS.get(name, -1))
+    kind = max(raw.cells, key=lambda name: CELL_DIMENSIONS.get(name, -1))
     entity = _by_value(raw.cell_data["gmsh:geometrical"][kind])
-    found = {  # gmsh keeps our comments and entities when it writes a file again, if not all of their cells
+    blocks_of = {  # gmsh keeps our comments and entities when it writes a file again, if not all of their cells
         name: [entity[number] for number in numbers if number in entity] for name, numbers in comments.entities.items()
     }
-    members = {name: np.sort(np.concatenate(parts)) for name, parts in found.items() if parts}
+    members = {name: np.sort(np.concatenate(parts)) for name, parts in blocks_of.items() if parts}
     constants = np.full((2, len(raw.cells[kind])), np.nan)
     for name in comments.constants.keys() & members.keys():
         constants[:, members[name]] = np.array(comments.constants[name])[:, None]
@@ -82,17 +83,17 @@ def _groups(
     """Physical groups with members, named or not."""
     tags = cell_data.get("gmsh:physical" if groups_of is None else "gmsh:geometrical", {})
     groups = []
-    for kind, dim in DIMENSIONS.items():
-        if dim not in UNNAMED or len(tags.get(kind, ())) != len(cells.get(kind, ())):
+    for kind, dim in CELL_DIMENSIONS.items():
+        if dim not in DEFAULT_LABELS or len(tags.get(kind, ())) != len(cells.get(kind, ())):
             continue
         parts: dict[int, list[NDArray[np.int64]]] = {}
         for value, members in _by_value(tags.get(kind, np.empty(0))).items():
             for group in [value] if groups_of is None else groups_of.get((dim, value), []):
                 parts.setdefault(abs(group), []).append(members)  # a sign tells orientation
         parts.pop(0, None)  # which stands for no group
-        for tag, found in sorted(parts.items()):
-            label = names.get((dim, tag)) or f"{UNNAMED[dim]}_{tag}"
-            groups.append(Group(label, kind, np.sort(np.concatenate(found))))
+        for tag, blocks in sorted(parts.items()):
+            label = names.get((dim, tag)) or f"{DEFAULT_LABELS[dim]}_{tag}"
+            groups.append(Group(label, kind, np.sort(np.concatenate(blocks))))
     return groups
 
 
@@ -112,8 +113,8 @@ def _section(content: bytes, name: str) -> bytes:
 def _physical_names(content: bytes) -> dict[tuple[int, int], str]:
     """The names of physical groups by dimension and number: a name may be that of several."""
     lines = _section(content, "PhysicalNames").decode("utf-8", "replace").splitlines()
-    found = [re.fullmatch(r'\s*(\d+)\s+(-?\d+)\s+"?(.*?)"?\s*', line) for line in lines]
-    return {(int(line[1]), abs(int(line[2]))): line[3] for line in found if line is not None}
+    matches = [re.fullmatch(r'\s*(\d+)\s+(-?\d+)\s+"?(.*?)"?\s*', line) for line in lines]
+    return {(int(line[1]), abs(int(line[2]))): line[3] for line in matches if line is not None}
 
 
 def _groups_of_entities(content: bytes) -> dict[tuple[int, int], list[int]] | None:

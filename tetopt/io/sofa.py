@@ -14,10 +14,10 @@ from tetopt.errors import InputError
 from tetopt.io.text import blocks, rows
 from tetopt.model.loads import Load
 from tetopt.model.materials import Materials
-from tetopt.model.model import UNITS, Model, described
+from tetopt.model.model import STRESS_UNITS, Model, described
 from tetopt.model.sets import facet_triples, nodes_of
 
-PLUGINS = (
+REQUIRED_PLUGINS = (
     "Sofa.Component.Constraint.Projective",
     "Sofa.Component.Engine.Select",
     "Sofa.Component.LinearSolver.Direct",
@@ -28,11 +28,11 @@ PLUGINS = (
     "Sofa.Component.Topology.Container.Dynamic",
     "Sofa.Component.Visual",
 )
-NOTES = (
+SCENE_NOTES = (
     "for SOFA v24.12 and v25; before v24.12 poissonRatio was one number for all cells",
     "no gravity; loads grow from t = 0 to 1 s; at 2 s the solid rests in static equilibrium",
 )
-EVER = "1e9"  # s; past its last key time a LinearMovementProjectiveConstraint lets go
+FOREVER_SECONDS = "1e9"  # past its last key time a LinearMovementProjectiveConstraint lets go
 
 
 def sofa(model: Model) -> bytes:
@@ -59,7 +59,7 @@ def sofa(model: Model) -> bytes:
     mesh = model.mesh
     scene = [
         f'<?xml version="1.0" encoding="UTF-8"?>\n{_comment(model)}<Node name="root" gravity="0 0 0" dt="0.1">\n',
-        *(f'<RequiredPlugin name="{name}"/>\n' for name in PLUGINS),
+        *(f'<RequiredPlugin name="{name}"/>\n' for name in REQUIRED_PLUGINS),
         '<VisualStyle displayFlags="showBehaviorModels showForceFields"/>\n<DefaultAnimationLoop/>\n',
         '<Node name="solid">\n<EulerImplicitSolver/>\n',
         '<SparseLDLSolver template="CompressedRowSparseMatrixMat3x3"/>\n',
@@ -67,7 +67,7 @@ def sofa(model: Model) -> bytes:
         f'tetrahedra="\n{rows(mesh.cells)}"/>\n',
         '<TetrahedronSetGeometryAlgorithms template="Vec3"/>\n',
         '<MechanicalObject name="dofs" template="Vec3" position="@mesh.position"/>\n',
-        f'<DiagonalMass massDensity="{UNITS[model.units].water!r}" topology="@mesh"/>\n',
+        f'<DiagonalMass massDensity="{STRESS_UNITS[model.units].water!r}" topology="@mesh"/>\n',
         _force_field(materials),
         *(_constraint(load, nodes_of(mesh, model.sets.facets[load.set_name])) for load in model.loads),
         *_sets(model),
@@ -91,7 +91,7 @@ def _checked(model: Model) -> Materials:
 
 
 def _comment(model: Model) -> str:
-    lines = [*described(model), *NOTES]
+    lines = [*described(model), *SCENE_NOTES]
     if model.cell_data:
         lines.append(f"cell data that this format has no place for: {', '.join(model.cell_data)}")
     text = re.sub("-(?=-)", "- ", "\n".join(lines))  # XML has no two hyphens in a comment
@@ -115,7 +115,7 @@ def _constraint(load: Load, nodes: NDArray[np.int64]) -> str:
     whole = " ".join(map(repr, load.displacement.tolist()))
     return (
         f'<LinearMovementProjectiveConstraint name="move_{load.set_name}" {indices}\n'
-        f'keyTimes="0 1 {EVER}" movements="0 0 0  {whole}  {whole}"/>\n'
+        f'keyTimes="0 1 {FOREVER_SECONDS}" movements="0 0 0  {whole}  {whole}"/>\n'
     )
 
 
@@ -124,14 +124,14 @@ def _sets(model: Model) -> list[str]:
     facet_sets = (
         f'<Node name="{name}">\n'
         '<PointsFromIndices name="nodes" template="Vec3" position="@../../mesh.position"\n'
-        f'indices="\n{blocks(nodes_of(model.mesh, found))}"/>\n'
+        f'indices="\n{blocks(nodes_of(model.mesh, members))}"/>\n'
         '<TriangleSetTopologyContainer name="facets" position="@../../mesh.position"\n'
-        f'triangles="\n{rows(facet_triples(cells, found))}"/>\n</Node>\n'
-        for name, found in model.sets.facets.items()
+        f'triangles="\n{rows(facet_triples(cells, members))}"/>\n</Node>\n'
+        for name, members in model.sets.facets.items()
     )
     cell_sets = (
         f'<Node name="{name}">\n<TetrahedronSetTopologyContainer name="cells" position="@../../mesh.position"\n'
-        f'tetrahedra="\n{rows(cells[found])}"/>\n</Node>\n'
-        for name, found in model.sets.cells.items()
+        f'tetrahedra="\n{rows(cells[members])}"/>\n</Node>\n'
+        for name, members in model.sets.cells.items()
     )
     return ['<Node name="sets">\n', *facet_sets, *cell_sets, "</Node>\n"]

@@ -12,12 +12,12 @@ from tetopt.geometry.surface import Surface, surface_of
 from tetopt.io.files import written_whole
 from tetopt.model.model import Model, half_turn
 
-SUFFIXES = (".stl", ".ply")
+SURFACE_SUFFIXES = (".stl", ".ply")
 
 # 3D Slicer looks for this in an STL file's header and in each comment of a PLY file, and takes points for LPS, x and y
 # negated, where it finds nothing: Slicer/Slicer, Libs/MRML/Core/vtkMRMLModelStorageNode.cxx,
 # GetCoordinateSystemFromFileHeader; https://discourse.slicer.org/t/10446.
-SPACE = "SPACE="
+SPACE_KEY = "SPACE="
 
 STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 PLY_FACE = np.dtype([("count", "u1"), ("nodes", "<i4", 3)])
@@ -49,7 +49,7 @@ def save_surface(path: str | Path, surface: Surface, about: str = "", space: str
     path = Path(path)
     writers = {".stl": _stl, ".ply": _ply}
     if path.suffix.lower() not in writers:
-        raise InputError(f"{path}: expected a surface named {' or '.join(SUFFIXES)}")
+        raise InputError(f"{path}: expected a surface named {' or '.join(SURFACE_SUFFIXES)}")
     if space == "lps":
         surface = surface._replace(points=half_turn(surface.points))
     content = writers[path.suffix.lower()](surface, about, space)
@@ -90,18 +90,18 @@ def checked_surface(path: str | Path) -> SurfaceCheck:
     if not Path(path).is_file():
         raise InputError(f"{path}: no such surface file")
     try:
-        found = trimesh.load_mesh(path)
-        n_triangles = len(found.faces)
+        surface = trimesh.load_mesh(path)
+        n_triangles = len(surface.faces)
     except Exception as error:  # trimesh raises whatever it pleases on damaged files
         raise InputError(f"{path}: cannot be read as a surface ({type(error).__name__}); damaged?") from error
     if n_triangles == 0:
         raise InputError(f"{path}: expected a surface of triangles, found none; damaged?")
     return SurfaceCheck(
-        bool(found.is_watertight),
-        bool(found.is_winding_consistent),
-        float(found.volume),
-        float(found.area),
-        int(found.body_count),
+        bool(surface.is_watertight),
+        bool(surface.is_winding_consistent),
+        float(surface.volume),
+        float(surface.area),
+        int(surface.body_count),
     )
 
 
@@ -112,7 +112,7 @@ def _plain(about: str) -> str:
 
 def _stl(surface: Surface, about: str, space: str) -> bytes:
     # A binary file must not begin with "solid", by which some readers know a file of text.
-    header = f"tetopt {SPACE}{space.upper()} mm {_plain(about)}".encode()[:80].ljust(80)
+    header = f"tetopt {SPACE_KEY}{space.upper()} mm {_plain(about)}".encode()[:80].ljust(80)
     triangles = np.zeros(len(surface.triangles), dtype=STL_TRIANGLE)
     corners = surface.points[surface.triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -125,7 +125,7 @@ def _ply(surface: Surface, about: str, space: str) -> bytes:
     header = [
         "ply",
         "format binary_little_endian 1.0",
-        f"comment {SPACE}{space.upper()}",
+        f"comment {SPACE_KEY}{space.upper()}",
         f"comment tetopt; mm; {_plain(about)}".rstrip("; "),
         f"element vertex {len(surface.points)}",
         *(f"property double {axis}" for axis in "xyz"),

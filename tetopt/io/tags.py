@@ -31,14 +31,14 @@ def cell_tags(model: Model) -> CellTags:
         A cell set that is called as a material is.
     """
     names = material_names(model, model.sets.cells)
-    found = tagged(model.sets.cells)
+    combined = tagged(model.sets.cells)
     combination = np.zeros(len(model.mesh.cells), dtype=np.int64)
-    combination[found.items] = found.tags
+    combination[combined.items] = combined.tags
     material = np.zeros_like(combination) if model.materials is None else model.materials.of_cell
     kinds, which = np.unique(np.column_stack([material, combination]), axis=0, return_inverse=True)
     ends = np.searchsorted(kinds[:, 0], np.arange(len(names) + 1))
     tags_of = {name: list(range(ends[k] + 1, ends[k + 1] + 1)) for k, name in enumerate(names)}
-    for name, tags in found.tags_of.items():
+    for name, tags in combined.tags_of.items():
         tags_of[name] = (np.flatnonzero(np.isin(kinds[:, 1], tags)) + 1).tolist()
     return CellTags(which.ravel() + 1, kinds[:, 0], tags_of)
 
@@ -50,11 +50,11 @@ def facet_tags(mesh: Mesh, sets: dict[str, NDArray[np.int64]]) -> Tagged:
     """
     of_cell = facets(mesh.cells).of_cell
     numbers = {name: of_cell[rows[:, 0], rows[:, 1]] for name, rows in sets.items()}
-    found = tagged(numbers)
+    combined = tagged(numbers)
     if not sets:
-        return found._replace(items=np.empty((0, 2), dtype=np.int64))
+        return combined._replace(items=np.empty((0, 2), dtype=np.int64))
     _, first = np.unique(np.concatenate(list(numbers.values())), return_index=True)
-    return found._replace(items=np.concatenate(list(sets.values()))[first])
+    return combined._replace(items=np.concatenate(list(sets.values()))[first])
 
 
 def material_names(model: Model, taken: dict[str, NDArray[np.int64]]) -> list[str]:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from numpy.typing import NDArray
 
-PER_LINE = 16  # more Abaqus does not take
+NUMBERS_PER_LINE = 16  # Abaqus takes no more
 
 
 def rows(*columns: NDArray, separator: str = " ") -> str:
@@ -23,7 +23,7 @@ def rows(*columns: NDArray, separator: str = " ") -> str:
 
 
 def blocks(numbers: NDArray, separator: str = " ") -> str:
-    """A list of numbers, `PER_LINE` in a line."""
+    """A list of numbers, `NUMBERS_PER_LINE` in a line."""
     texts = list(map(repr, numbers.tolist()))
-    lines = (separator.join(texts[start : start + PER_LINE]) for start in range(0, len(texts), PER_LINE))
-    return "".join(f"{line}\n" for line in lines)
+    starts = range(0, len(texts), NUMBERS_PER_LINE)
+    return "".join(f"{separator.join(texts[start : start + NUMBERS_PER_LINE])}\n" for start in starts)

@@ -27,11 +27,11 @@ from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.model.model import Model
-from tetopt.model.sets import NAME, Box, Sets, nodes_of
+from tetopt.model.sets import SET_NAME, Box, Sets, nodes_of
 
 CELL_TYPES = {2: pyvista.CellType.TRIANGLE, 3: pyvista.CellType.TETRA}
-FACETS, CELLS, ON, CHECKSUM = "facets:", "cells:", "on_", "cells_sha256"
-LEGACY = 42  # version 4.2: 5.1 is not read by older programs, 3D Slicer among them
+FACETS_PREFIX, CELLS_PREFIX, ON_PREFIX, CHECKSUM_NAME = "facets:", "cells:", "on_", "cells_sha256"
+LEGACY_VERSION = 42  # version 4.2: 5.1 is not read by older programs, 3D Slicer among them
 
 
 def to_pyvista(mesh: Mesh, cell_data: dict[str, NDArray] | None = None) -> pyvista.UnstructuredGrid:
@@ -57,7 +57,7 @@ def vtk(model: Model) -> bytes:
             data[name] = _without_int64(np.asarray(data[name]))
     writer = vtkUnstructuredGridWriter()
     writer.SetHeader(f"tetopt, mm, SPACE={model.space.upper()}")
-    writer.SetFileVersion(LEGACY)
+    writer.SetFileVersion(LEGACY_VERSION)
     writer.SetFileTypeToBinary()
     return _written(writer, grid)
 
@@ -100,7 +100,7 @@ def model_grid(model: Model) -> pyvista.UnstructuredGrid:
     for name, rows in model.sets.facets.items():
         is_on = np.zeros(len(model.mesh.points), dtype=np.uint8)
         is_on[nodes_of(model.mesh, rows)] = 1
-        grid.point_data[f"{ON}{name}"] = is_on
+        grid.point_data[f"{ON_PREFIX}{name}"] = is_on
     texts = dict(model.about) | {"space": model.space}
     if model.materials is not None:
         of_cell = model.materials.of_cell
@@ -127,30 +127,30 @@ def add_texts(grid: pyvista.UnstructuredGrid, texts: dict[str, Any]) -> None:
 def add_sets(grid: pyvista.UnstructuredGrid, mesh: Mesh, sets: Sets) -> None:
     """The sets as field data, with the checksum of the cells that they are of."""
     for name, rows in sets.facets.items():
-        grid.field_data[f"{FACETS}{name}"] = rows
+        grid.field_data[f"{FACETS_PREFIX}{name}"] = rows
     for name, members in sets.cells.items():
-        grid.field_data[f"{CELLS}{name}"] = members
+        grid.field_data[f"{CELLS_PREFIX}{name}"] = members
     if sets.facets or sets.cells:
-        add_texts(grid, {CHECKSUM: _checksum(mesh)})
+        add_texts(grid, {CHECKSUM_NAME: _checksum(mesh)})
 
 
 def sets_in(field_data: dict[str, NDArray], mesh: Mesh) -> tuple[Sets, tuple[str, ...]]:
     """The sets among a file's field data, if they were written for these cells; and what is left out, in words."""
-    names = [name for name in field_data if name.startswith((FACETS, CELLS))]
+    names = [name for name in field_data if name.startswith((FACETS_PREFIX, CELLS_PREFIX))]
     sets = Sets({}, {})
     if not names:
         return sets, ()
-    if text_in(field_data, CHECKSUM) != _checksum(mesh):
+    if text_in(field_data, CHECKSUM_NAME) != _checksum(mesh):
         words = "sets left out, as the file does not tell that its cells are still those that they were written for"
         return sets, (f"{words}: {', '.join(name.partition(':')[2] for name in names)}",)
     unfit = []
     for key in names:
         prefix, name = key[: key.index(":") + 1], key.partition(":")[2]
-        ends = (len(mesh.cells), mesh.ndim + 1) if prefix == FACETS else (len(mesh.cells),)
+        ends = (len(mesh.cells), mesh.ndim + 1) if prefix == FACETS_PREFIX else (len(mesh.cells),)
         is_free = name.lower() not in {each.lower() for part in sets for each in part}
-        if not NAME.fullmatch(name) or not is_free or not _is_set(field_data[key], ends):
+        if not SET_NAME.fullmatch(name) or not is_free or not _is_set(field_data[key], ends):
             unfit.append(name)
-        elif prefix == FACETS:
+        elif prefix == FACETS_PREFIX:
             sets.facets[name] = field_data[key].reshape(-1, 2).astype(np.int64)
         else:
             sets.cells[name] = field_data[key].ravel().astype(np.int64)

@@ -62,11 +62,11 @@ from tetopt.model.model import Model, described
 from tetopt.model.sets import facet_triples, tagged
 
 # By number of nodes; lines need theirs stated.
-TOPOLOGIES = {2: '"PolyLine" NodesPerElement="2"', 3: '"Triangle"', 4: '"Tetrahedron"'}
-GEOMETRIES = {2: "XY", 3: "XYZ"}
+TOPOLOGY_TYPES = {2: '"PolyLine" NodesPerElement="2"', 3: '"Triangle"', 4: '"Tetrahedron"'}
+GEOMETRY_TYPES = {2: "XY", 3: "XYZ"}
 # Not by XInclude, as dolfinx writes it: VTK 9.7 crashes on the address that dolfinx gives for that.
-POINTS_OF_MESH = '<DataItem Reference="XML">/Xdmf/Domain/Grid[@Name="mesh"]/Geometry/DataItem</DataItem>\n'
-TIME = '<Time Value="0"/>\n'  # pyvista 0.49 reads no XDMF without
+POINTS_REFERENCE = '<DataItem Reference="XML">/Xdmf/Domain/Grid[@Name="mesh"]/Geometry/DataItem</DataItem>\n'
+TIME_ELEMENT = '<Time Value="0"/>\n'  # pyvista 0.49 reads no XDMF without
 
 
 def xdmf(model: Model) -> bytes:
@@ -90,8 +90,8 @@ def xdmf(model: Model) -> bytes:
     if model.sets.facets:
         parts.append(_facet_grid(model))
     if model.sets.cells:
-        found = tagged(model.sets.cells)
-        parts.append(_tag_grid("cells", model, model.mesh.cells[found.items], found.tags, found.tags_of))
+        combined = tagged(model.sets.cells)
+        parts.append(_tag_grid("cells", model, model.mesh.cells[combined.items], combined.tags, combined.tags_of))
     text = "".join(parts)
     return (
         f'<?xml version="1.0" encoding="utf-8"?>\n<Xdmf Version="3.0">\n<Domain>\n{text}</Domain>\n</Xdmf>\n'.encode()
@@ -129,15 +129,15 @@ def _facet_grid(model: Model) -> str:
         f"{name} turned": number[name][listed[np.searchsorted(numbers, number[name]), 0] != members[:, 0]]
         for name, members in sets.items()
     }
-    found = tagged(number | {name: those for name, those in turned.items() if len(those)})
-    return _tag_grid("facets", model, facet_triples(model.mesh.cells, listed), found.tags, found.tags_of)
+    combined = tagged(number | {name: those for name, those in turned.items() if len(those)})
+    return _tag_grid("facets", model, facet_triples(model.mesh.cells, listed), combined.tags, combined.tags_of)
 
 
 def _tag_grid(
     name: str, model: Model, nodes: NDArray[np.int64], tags: NDArray[np.int64], tags_of: dict[str, list[int]]
 ) -> str:
     named = "".join(_information(each, " ".join(map(str, those))) for each, those in tags_of.items())
-    return _grid(name, model, nodes, POINTS_OF_MESH, {name: tags}, named)
+    return _grid(name, model, nodes, POINTS_REFERENCE, {name: tags}, named)
 
 
 def _grid(
@@ -149,10 +149,10 @@ def _grid(
         for each, values in columns.items()
     ]
     return (
-        f'<Grid Name="{name}" GridType="Uniform">\n{named}{TIME}'
-        f'<Topology TopologyType={TOPOLOGIES[nodes.shape[1]]} NumberOfElements="{len(nodes)}">\n'
+        f'<Grid Name="{name}" GridType="Uniform">\n{named}{TIME_ELEMENT}'
+        f'<Topology TopologyType={TOPOLOGY_TYPES[nodes.shape[1]]} NumberOfElements="{len(nodes)}">\n'
         f"{_item(nodes)}</Topology>\n"
-        f'<Geometry GeometryType="{GEOMETRIES[model.mesh.ndim]}">\n{points}</Geometry>\n'
+        f'<Geometry GeometryType="{GEOMETRY_TYPES[model.mesh.ndim]}">\n{points}</Geometry>\n'
         f"{''.join(attributes)}</Grid>\n"
     )
 

@@ -18,9 +18,9 @@ from tetopt.model.laws import ByLabel, Law, has_column, law_values, parse_any_la
 from tetopt.model.loads import parse_loads
 from tetopt.model.materials import Materials, Spacing, binned, by_label, materials
 from tetopt.model.model import Model
-from tetopt.model.sets import Box, Sets, box_of, standard_sets, with_asked
+from tetopt.model.sets import Box, Sets, box_of, standard_sets, with_requested
 
-NU = 0.45  # soft tissue that linear cells can still follow: they lock nearer to 0.5
+DEFAULT_NU = 0.45  # soft tissue that linear cells can still follow: they lock nearer to 0.5
 
 
 def model_of(
@@ -52,7 +52,7 @@ def model_of(
         over the voxels of the cell is taken, Eq. (2), and else its value at the cell's "mean". Without `young` the
         model has no materials; without `nu` it is the column "nu" of the file that `young` names, or 0.45.
     sets : iterable of str
-        Further sets, see `tetopt.model.sets.with_asked`.
+        Further sets, see `tetopt.model.sets.with_requested`.
     loads : iterable of str
         See `tetopt.model.loads.parse_loads`.
     bins : int, optional
@@ -85,23 +85,21 @@ def model_of(
     mean = mean if mean is not None and mean.ndim == 1 else None
     labels = labels_of(cell_data, len(mesh.cells))
     if nu is None:
-        nu = young if isinstance(young, str) and has_column(young, "nu") else NU
+        nu = young if isinstance(young, str) and has_column(young, "nu") else DEFAULT_NU
     if known_sets is None:
         box = box_of(image) if box is None and image is not None else box
         known_sets = standard_sets(mesh, box, labels)
-    found = with_asked(mesh, known_sets, sets, mean)
-    made: Materials | None = None
+    all_sets = with_requested(mesh, known_sets, sets, mean)
+    table: Materials | None = None
     if young is not None:
-        made = materials(
-            _values(young, "young", mesh, image, mean, labels),
-            _values(nu, "nu", mesh, image, mean, labels),
-            len(mesh.cells),
-        )
+        moduli = _values(young, "young", mesh, image, mean, labels)
+        ratios = _values(nu, "nu", mesh, image, mean, labels)
+        table = materials(moduli, ratios, len(mesh.cells))
         if bins is not None:
-            made = binned(made, volumes(mesh.points, mesh.cells), bins, spacing)
+            table = binned(table, volumes(mesh.points, mesh.cells), bins, spacing)
     elif bins is not None:
         raise InputError("bins: there are no moduli to group; give --young")
-    return Model(mesh, cell_data, found, made, parse_loads(loads, mesh, found), order, about=dict(about or {}))
+    return Model(mesh, cell_data, all_sets, table, parse_loads(loads, mesh, all_sets), order, about=dict(about or {}))
 
 
 def labels_of(cell_data: dict[str, NDArray], n_cells: int) -> NDArray[np.int64] | None:
@@ -114,10 +112,10 @@ def labels_of(cell_data: dict[str, NDArray], n_cells: int) -> NDArray[np.int64] 
 
 
 def _values(
-    given: Any, name: str, mesh: Mesh, image: Image | None, mean: NDArray[np.float64] | None, labels: NDArray | None
+    value: Any, name: str, mesh: Mesh, image: Image | None, mean: NDArray[np.float64] | None, labels: NDArray | None
 ) -> NDArray[np.float64]:
     """The value of each cell, or one for all."""
-    law: Any = parse_any_law(given, name) if isinstance(given, str) else given
+    law: Any = parse_any_law(value, name) if isinstance(value, str) else value
     if not callable(law) and not isinstance(law, ByLabel) and np.ndim(law) < 2:
         return np.asarray(law, dtype=np.float64)
     if isinstance(law, ByLabel):

@@ -13,16 +13,16 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 
-DEEPEST = 100  # operations within one another
-FUNCTIONS: dict[str, tuple[Callable[..., Any], int]] = {
+MOST_NESTED_OPERATIONS = 100  # more than anyone writes, and well within Python's own limit of recursion
+FORMULA_FUNCTIONS: dict[str, tuple[Callable[..., Any], int]] = {
     "abs": (np.abs, 1), "sqrt": (np.sqrt, 1), "exp": (np.exp, 1), "log": (np.log, 1),
     "min": (np.minimum, 2), "max": (np.maximum, 2),
 }  # fmt: skip
-BINARY: dict[type[ast.operator], Callable[..., Any]] = {
+BINARY_OPERATORS: dict[type[ast.operator], Callable[..., Any]] = {
     ast.Add: operator.add, ast.Sub: operator.sub, ast.Mult: operator.mul, ast.Div: np.divide, ast.Pow: np.power,
 }  # fmt: skip
-UNARY: dict[type[ast.unaryop], Callable[..., Any]] = {ast.UAdd: operator.pos, ast.USub: operator.neg}
-ALLOWED = f"numbers, h, + - * / **, brackets and {', '.join(FUNCTIONS)}"
+UNARY_OPERATORS: dict[type[ast.unaryop], Callable[..., Any]] = {ast.UAdd: operator.pos, ast.USub: operator.neg}
+FORMULA_PARTS = f"numbers, h, + - * / **, brackets and {', '.join(FORMULA_FUNCTIONS)}"
 
 
 def parse_formula(text: str) -> Callable[[NDArray[np.float64]], NDArray[np.float64]]:
@@ -49,7 +49,7 @@ def parse_formula(text: str) -> Callable[[NDArray[np.float64]], NDArray[np.float
     except (SyntaxError, SyntaxWarning, ValueError, OverflowError, RecursionError, MemoryError) as error:
         if isinstance(error, InputError):
             raise
-        raise InputError(f'formula: expected {ALLOWED}, got "{_shown(text)}"') from error
+        raise InputError(f'formula: expected {FORMULA_PARTS}, got "{_shown(text)}"') from error
 
     def law(h: NDArray[np.float64]) -> NDArray[np.float64]:
         with np.errstate(all="ignore"):  # what has no value is refused where the modulus is used
@@ -65,29 +65,29 @@ def _shown(text: str) -> str:
 
 
 def _check(node: ast.expr, text: str, depth: int) -> None:
-    """InputError unless the tree is made of what is allowed, and no deeper than `DEEPEST`."""
-    if depth > DEEPEST:
-        raise InputError(f'formula: more than {DEEPEST} operations deep: "{_shown(text)}"')
+    """InputError unless the tree is made of what is allowed, and no deeper than `MOST_NESTED_OPERATIONS`."""
+    if depth > MOST_NESTED_OPERATIONS:
+        raise InputError(f'formula: more than {MOST_NESTED_OPERATIONS} operations deep: "{_shown(text)}"')
     match node:
         case ast.Constant(value=float() | int() as value) if not isinstance(value, bool):
             float(value)  # OverflowError for a whole number beyond 1e308
         case ast.Name(id="h"):
             return
-        case ast.BinOp(left=left, op=op, right=right) if type(op) in BINARY:
+        case ast.BinOp(left=left, op=op, right=right) if type(op) in BINARY_OPERATORS:
             _check(left, text, depth + 1)
             _check(right, text, depth + 1)
-        case ast.UnaryOp(op=op, operand=operand) if type(op) in UNARY:
+        case ast.UnaryOp(op=op, operand=operand) if type(op) in UNARY_OPERATORS:
             _check(operand, text, depth + 1)
-        case ast.Call(func=ast.Name(id=name), args=args, keywords=[]) if name in FUNCTIONS:
-            if len(args) != FUNCTIONS[name][1]:
+        case ast.Call(func=ast.Name(id=name), args=args, keywords=[]) if name in FORMULA_FUNCTIONS:
+            if len(args) != FORMULA_FUNCTIONS[name][1]:
                 raise InputError(
-                    f'formula: {name} takes {FUNCTIONS[name][1]} arguments, got {len(args)} in "{_shown(text)}"'
+                    f'formula: {name} takes {FORMULA_FUNCTIONS[name][1]} arguments, got {len(args)} in "{_shown(text)}"'
                 )
             for arg in args:
                 _check(arg, text, depth + 1)
         case _:
             part = ast.get_source_segment(text.strip(), node) or text
-            raise InputError(f'formula: expected {ALLOWED}; cannot use "{_shown(part)}"')
+            raise InputError(f'formula: expected {FORMULA_PARTS}; cannot use "{_shown(part)}"')
 
 
 def _value(node: ast.expr, h: NDArray[np.float64]) -> Any:
@@ -97,9 +97,9 @@ def _value(node: ast.expr, h: NDArray[np.float64]) -> Any:
         case ast.Name():
             return h
         case ast.BinOp(left=left, op=op, right=right):
-            return BINARY[type(op)](_value(left, h), _value(right, h))
+            return BINARY_OPERATORS[type(op)](_value(left, h), _value(right, h))
         case ast.UnaryOp(op=op, operand=operand):
-            return UNARY[type(op)](_value(operand, h))
+            return UNARY_OPERATORS[type(op)](_value(operand, h))
         case ast.Call(func=ast.Name(id=name), args=args):
-            return FUNCTIONS[name][0](*(_value(arg, h) for arg in args))
+            return FORMULA_FUNCTIONS[name][0](*(_value(arg, h) for arg in args))
     raise AssertionError("checked by parse_formula")

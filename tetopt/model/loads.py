@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.mesh import Mesh
-from tetopt.model.sets import FACES, Sets, facet_triples, nodes_of
+from tetopt.model.sets import FACE_NAMES, Sets, facet_triples, nodes_of
 
-MOST = 50.0  # per cent: a linear step presses no further
+MOST_COMPRESSION_PERCENT = 50.0  # a linear step presses no further
 
 
 class Load(NamedTuple):
@@ -56,15 +56,15 @@ def parse_loads(texts: Iterable[str], mesh: Mesh, sets: Sets) -> tuple[Load, ...
     return loads
 
 
-class Words(NamedTuple):
-    """A load as it is asked for."""
+class LoadRequest(NamedTuple):
+    """A load that a user asks for."""
 
     kind: str  # "hold", "move" or "compress"
     name: str  # of the set; "" of a compression
     numbers: NDArray[np.float64]  # displacement, mm, or per cent
 
 
-def parse_load(text: str, ndim: int) -> Words:
+def parse_load(text: str, ndim: int) -> LoadRequest:
     """A load from words, see `parse_loads`, before any set is looked for.
 
     Raises
@@ -74,18 +74,19 @@ def parse_load(text: str, ndim: int) -> Words:
     """
     kind, _, rest = text.partition(":")
     if kind == "hold":
-        return Words(kind, rest, np.zeros(ndim))
+        return LoadRequest(kind, rest, np.zeros(ndim))
     if kind == "move":
         name, _, vector = rest.rpartition(":")
         numbers = _numbers(vector)
         if numbers.shape != (ndim,):
             raise InputError(f'load: expected move:SET: and {ndim} numbers in mm, got "{text}"')
-        return Words(kind, name, numbers)
+        return LoadRequest(kind, name, numbers)
     if kind == "compress":
         percent = _numbers(rest.removesuffix("%"))
-        if not rest.endswith("%") or len(percent) != 1 or not 0.0 < percent[0] <= MOST:
-            raise InputError(f'load: expected compress:P% with P above 0 and up to {MOST:g}, got "{text}"')
-        return Words(kind, "", percent)
+        if not rest.endswith("%") or len(percent) != 1 or not 0.0 < percent[0] <= MOST_COMPRESSION_PERCENT:
+            limits = f"above 0 and up to {MOST_COMPRESSION_PERCENT:g}"
+            raise InputError(f'load: expected compress:P% with P {limits}, got "{text}"')
+        return LoadRequest(kind, "", percent)
     raise InputError(f'load: expected compress:5%, hold:SET or move:SET:X,Y,Z, got "{text}"')
 
 
@@ -99,10 +100,10 @@ def _numbers(text: str) -> NDArray[np.float64]:
 
 
 def _loads(text: str, mesh: Mesh, sets: Sets) -> list[Load]:
-    words = parse_load(text, mesh.ndim)
-    if words.kind == "compress":
-        return _compression(float(words.numbers[0]), mesh, sets)
-    return [Load(known_set(words.name, sets), words.numbers)]
+    request = parse_load(text, mesh.ndim)
+    if request.kind == "compress":
+        return _compression(float(request.numbers[0]), mesh, sets)
+    return [Load(known_set(request.name, sets), request.numbers)]
 
 
 def known_set(name: str, sets: Sets) -> str:
@@ -125,7 +126,7 @@ def known_set(name: str, sets: Sets) -> str:
 
 
 def _compression(percent: float, mesh: Mesh, sets: Sets) -> list[Load]:
-    low, high = FACES[mesh.ndim][-1]
+    low, high = FACE_NAMES[mesh.ndim][-1]
     if missing := [name for name in (low, high) if name not in sets.facets]:
         raise InputError(
             f"load: the mesh has no facets on the box's face {' and '.join(missing)}; give hold:SET and move:SET:X,Y,Z "

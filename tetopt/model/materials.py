@@ -68,10 +68,10 @@ def _of_cells(name: str, values: ArrayLike, n_cells: int) -> NDArray[np.float64]
     return array
 
 
-def cells_of(made: Materials) -> list[NDArray[np.int64]]:
+def cells_of(table: Materials) -> list[NDArray[np.int64]]:
     """The cells of each material, ascending."""
-    ends = np.cumsum(np.bincount(made.of_cell, minlength=len(made.young)))
-    return np.split(np.argsort(made.of_cell, kind="stable"), ends[:-1])
+    ends = np.cumsum(np.bincount(table.of_cell, minlength=len(table.young)))
+    return np.split(np.argsort(table.of_cell, kind="stable"), ends[:-1])
 
 
 def by_label(law: ByLabel, labels: NDArray[np.integer] | None) -> NDArray[np.float64]:
@@ -84,17 +84,17 @@ def by_label(law: ByLabel, labels: NDArray[np.integer] | None) -> NDArray[np.flo
     """
     if labels is None:
         raise InputError("values by label: the mesh has no labels; mesh it with --labels")
-    found, which = np.unique(labels, return_inverse=True)
-    missing = [f"{label:g}" for label in found if label not in law.values]
+    kinds, which = np.unique(labels, return_inverse=True)
+    missing = [f"{label:g}" for label in kinds if label not in law.values]
     if missing and law.rest is None:
         raise InputError(
             f"values by label: given for {', '.join(map(str, law.values))}, the mesh also has {', '.join(missing)} "
             f"({len(missing)} more); give these, too, or all of them as *=VALUE"
         )
-    return np.array([law.values.get(int(label), law.rest) for label in found], dtype=np.float64)[which.ravel()]
+    return np.array([law.values.get(int(label), law.rest) for label in kinds], dtype=np.float64)[which.ravel()]
 
 
-def binned(given: Materials, volumes: NDArray[np.float64], count: int, spacing: Spacing = "equal") -> Materials:
+def binned(exact: Materials, volumes: NDArray[np.float64], count: int, spacing: Spacing = "equal") -> Materials:
     """At most `count` moduli instead of all.
 
     The modulus of a bin is the mean by volume of its cells'. Ratios are kept as they are while there are at most
@@ -102,7 +102,7 @@ def binned(given: Materials, volumes: NDArray[np.float64], count: int, spacing: 
 
     Parameters
     ----------
-    given : Materials
+    exact : Materials
     volumes : (M,) float64
         Of the cells.
     count : int
@@ -118,7 +118,7 @@ def binned(given: Materials, volumes: NDArray[np.float64], count: int, spacing: 
         raise InputError(f"bins: expected 1 or more, got {count}")
     if spacing not in SPACINGS:
         raise InputError(f"bins: expected {', '.join(SPACINGS)}, got {spacing}")
-    young, nu = given.young[given.of_cell], given.nu[given.of_cell]
+    young, nu = exact.young[exact.of_cell], exact.nu[exact.of_cell]
     fewer = _bin_means(young, volumes, count, spacing)
     ratios = (
         nu
@@ -142,7 +142,7 @@ def _bin_means(
     else:
         inner = np.linspace(scaled.min(), scaled.max(), count + 1)[1:-1]
     which = np.searchsorted(inner, scaled, side="right")
-    held = np.bincount(which, weights=volumes, minlength=count)
+    sizes = np.bincount(which, weights=volumes, minlength=count)
     total = np.bincount(which, weights=volumes * values, minlength=count)
     # Rounding may take a mean out of its bin by a bit where all of its values are equal.
     low = np.full(count, np.inf)
@@ -150,4 +150,4 @@ def _bin_means(
     np.minimum.at(low, which, values)
     np.maximum.at(high, which, values)
     with np.errstate(invalid="ignore"):  # bins without cells
-        return np.clip(total / held, low, high)[which]
+        return np.clip(total / sizes, low, high)[which]

@@ -28,10 +28,10 @@ class Units(NamedTuple):
     water: float  # density
 
 
-UNITS = {"kPa": Units(1.0, "mN", "uJ", "kg", 1e-6), "MPa": Units(1e3, "N", "mJ", "t", 1e-9)}
+STRESS_UNITS = {"kPa": Units(1.0, "mN", "uJ", "kg", 1e-6), "MPa": Units(1e3, "N", "mJ", "t", 1e-9)}
 SPACES = ("ras", "lps")
 # Local nodes of the edges whose midpoints are the quadratic tetrahedron's nodes 5 to 10, as in VTK, Abaqus and FEBio.
-EDGES = np.array([(0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)])
+QUADRATIC_EDGES = np.array([(0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)])
 
 
 class Model(NamedTuple):
@@ -94,17 +94,17 @@ def in_units(model: Model, units: str) -> Model:
     InputError
         Another word.
     """
-    if units not in UNITS:
-        raise InputError(f"units: expected {' or '.join(UNITS)}, got {units}")
+    if units not in STRESS_UNITS:
+        raise InputError(f"units: expected {' or '.join(STRESS_UNITS)}, got {units}")
     if model.materials is None or units == model.units:
         return model._replace(units=units)
-    scaled = model.materials.young * (UNITS[model.units].kPa / UNITS[units].kPa)
+    scaled = model.materials.young * (STRESS_UNITS[model.units].kPa / STRESS_UNITS[units].kPa)
     return model._replace(materials=model.materials._replace(young=scaled), units=units)
 
 
 def units_text(model: Model) -> str:
     """The consistent units of a file in words."""
-    units = UNITS[model.units]
+    units = STRESS_UNITS[model.units]
     return f"mm, {model.units}, {units.force}, {units.energy}, {units.mass}, s"
 
 
@@ -128,9 +128,9 @@ def described(model: Model) -> list[str]:
 def quadratic(mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Points (N + E, 3) and cells (M, 10) of straight-edged quadratic tetrahedra; the mesh's own nodes come first.
 
-    Nodes 5 to 10 of a cell are the midpoints of `EDGES`.
+    Nodes 5 to 10 of a cell are the midpoints of `QUADRATIC_EDGES`.
     """
-    ends = np.sort(mesh.cells[:, EDGES], axis=2)  # (M, 6, 2)
+    ends = np.sort(mesh.cells[:, QUADRATIC_EDGES], axis=2)  # (M, 6, 2)
     edges, number = np.unique(ends.reshape(-1, 2), axis=0, return_inverse=True)
     points = np.concatenate([mesh.points, mesh.points[edges].mean(axis=1)])
     return points, np.column_stack([mesh.cells, len(mesh.points) + number.reshape(-1, 6)])
@@ -141,7 +141,7 @@ def quadratic_facet_nodes(cells: NDArray[np.int64], rows: NDArray[np.int64]) -> 
 
     The midpoints are of the first two corners, of the second and third, and of the third and first.
     """
-    of_edge = {frozenset(edge): 4 + number for number, edge in enumerate(EDGES.tolist())}
+    of_edge = {frozenset(edge): 4 + number for number, edge in enumerate(QUADRATIC_EDGES.tolist())}
     local = np.array(
         [
             [*corners, *(of_edge[frozenset((corners[k], corners[(k + 1) % 3]))] for k in range(3))]

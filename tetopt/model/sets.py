@@ -20,14 +20,14 @@ from tetopt.geometry.topology import facets, largest_component
 from tetopt.image import Image, transformed
 from tetopt.mesh import Mesh
 
-BOUNDARY = "boundary"  # every facet of one cell only
-MASK_SURFACE = "mask_surface"  # those of them off the faces of the image's box
+BOUNDARY_SET = "boundary"  # every facet of one cell only
+MASK_SURFACE_SET = "mask_surface"  # those of them off the faces of the image's box
 # By RAS+: the side of smaller and of larger world coordinate. A slice's two axes may be any of the three.
-FACES: dict[int, tuple[tuple[str, str], ...]] = {
+FACE_NAMES: dict[int, tuple[tuple[str, str], ...]] = {
     2: (("x_min", "x_max"), ("y_min", "y_max")),
     3: (("left", "right"), ("posterior", "anterior"), ("inferior", "superior")),
 }
-NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,39}")  # what every format can carry
+SET_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,39}")  # what every format can carry
 
 
 class Sets(NamedTuple):
@@ -74,8 +74,8 @@ def nodes_of(mesh: Mesh, rows: NDArray[np.int64]) -> NDArray[np.int64]:
 
 def boundary_rows(mesh: Mesh) -> NDArray[np.int64]:
     """Every facet that belongs to one cell only, (B, 2) int64, ascending."""
-    found = facets(mesh.cells)
-    return np.argwhere(found.n_cells[found.of_cell] == 1)
+    shared = facets(mesh.cells)
+    return np.argwhere(shared.n_cells[shared.of_cell] == 1)
 
 
 def standard_sets(mesh: Mesh, box: Box | None = None, labels: NDArray[np.integer] | None = None) -> Sets:
@@ -104,7 +104,7 @@ def standard_sets(mesh: Mesh, box: Box | None = None, labels: NDArray[np.integer
         Labels that are not one whole number from 0 for each cell.
     """
     boundary = boundary_rows(mesh)
-    named = {BOUNDARY: boundary, **_face_sets(mesh, boundary, box)}
+    named = {BOUNDARY_SET: boundary, **_face_sets(mesh, boundary, box)}
     cell_sets = {}
     if labels is not None:
         labels = _checked_labels(labels, mesh)
@@ -114,7 +114,7 @@ def standard_sets(mesh: Mesh, box: Box | None = None, labels: NDArray[np.integer
 
 
 def _face_sets(mesh: Mesh, boundary: NDArray[np.int64], box: Box | None) -> dict[str, NDArray[np.int64]]:
-    """The boundary's facets on each face of the box, and, of a box that is given, those on none of them."""
+    """The boundary's facets on each face of the box, and, with a box, those on none of them."""
     n = mesh.ndim
     if box is None:
         low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
@@ -128,17 +128,17 @@ def _face_sets(mesh: Mesh, boundary: NDArray[np.int64], box: Box | None) -> dict
         directions = box.affine[list(axes), range(n)]
     is_on = facets_on_sides(places, facet_triples(mesh.cells, boundary), faces, tolerance)  # (B, n, 2)
     sets: dict[str, NDArray[np.int64]] = {}
-    for name_pair in FACES[n]:
-        axis = axes.index(FACES[n].index(name_pair))
+    for name_pair in FACE_NAMES[n]:
+        axis = axes.index(FACE_NAMES[n].index(name_pair))
         sides = is_on[:, axis].T if directions[axis] > 0.0 else is_on[:, axis, ::-1].T
         sets |= {name: boundary[side] for name, side in zip(name_pair, sides, strict=True)}
-    return sets if box is None else {**sets, MASK_SURFACE: boundary[~np.any(is_on, axis=(1, 2))]}
+    return sets if box is None else {**sets, MASK_SURFACE_SET: boundary[~np.any(is_on, axis=(1, 2))]}
 
 
 def _interfaces(mesh: Mesh, labels: NDArray[np.int64]) -> dict[str, NDArray[np.int64]]:
-    """Facets between two labels, held by the cell of the smaller one."""
-    found = facets(mesh.cells)
-    of_cell = found.cells[found.of_cell]  # (M, n+1, 2)
+    """Facets between two labels, as rows of the cells with the smaller one."""
+    shared = facets(mesh.cells)
+    of_cell = shared.cells[shared.of_cell]  # (M, n+1, 2)
     own = np.arange(len(mesh.cells))[:, None]
     other = np.where(of_cell[..., 0] == own, of_cell[..., 1], of_cell[..., 0])
     there = np.where(other >= 0, labels[other], -1)
@@ -161,14 +161,14 @@ def _checked_labels(labels: ArrayLike, mesh: Mesh) -> NDArray[np.int64]:
 # Sets that a user asks for
 
 
-def with_asked(mesh: Mesh, sets: Sets, asked: Iterable[str], mean: NDArray[np.float64] | None) -> Sets:
-    """`sets` and those that are asked for in words.
+def with_requested(mesh: Mesh, sets: Sets, requests: Iterable[str], mean: NDArray[np.float64] | None) -> Sets:
+    """`sets` and those that are requested in words.
 
     Parameters
     ----------
     mesh : Mesh
     sets : Sets
-    asked : iterable of str
+    requests : iterable of str
         "NAME=below:T", the cells of the largest facet-connected set with a mean below T (Fig. 3(f) of the paper), with
         the facets around them, "NAME_surface"; "NAME=point:X,Y,Z:D" and "NAME=plane:X,Y,Z:NX,NY,NZ:D", boundary facets
         all of whose nodes lie within D mm of a point, or of a plane through a point with a normal; world mm, RAS+.
@@ -180,19 +180,20 @@ def with_asked(mesh: Mesh, sets: Sets, asked: Iterable[str], mean: NDArray[np.fl
     InputError
         Other words, a name that is taken or that a format cannot carry, no means, or a set without members.
     """
-    for text in asked:
-        wish = parse_set(text, mesh.ndim)
-        check_free(wish, sets)
-        if wish.kind == "below":
-            chosen = _below(mesh, wish, mean)
-            sets = Sets(sets.facets | {f"{wish.name}_surface": around(mesh, chosen)}, sets.cells | {wish.name: chosen})
+    for text in requests:
+        request = parse_set(text, mesh.ndim)
+        check_free_names(request, sets)
+        if request.kind == "below":
+            cells = _below(mesh, request, mean)
+            surface = {f"{request.name}_surface": enclosing_facets(mesh, cells)}
+            sets = Sets(sets.facets | surface, sets.cells | {request.name: cells})
         else:
-            sets = Sets(sets.facets | {wish.name: _near(mesh, wish)}, sets.cells)
+            sets = Sets(sets.facets | {request.name: _near(mesh, request)}, sets.cells)
     return sets
 
 
-class Wish(NamedTuple):
-    """A set that is asked for."""
+class SetRequest(NamedTuple):
+    """A set that a user asks for."""
 
     name: str
     kind: str
@@ -203,8 +204,8 @@ class Wish(NamedTuple):
         return (self.name, f"{self.name}_surface") if self.kind == "below" else (self.name,)
 
 
-def parse_set(text: str, ndim: int) -> Wish:
-    """A set from words, see `with_asked`.
+def parse_set(text: str, ndim: int) -> SetRequest:
+    """A set from words, see `with_requested`.
 
     Raises
     ------
@@ -216,7 +217,7 @@ def parse_set(text: str, ndim: int) -> Wish:
     shapes = {"below": ("T", [1]), "point": ("X,Y,Z:D", [ndim, 1]), "plane": ("X,Y,Z:NX,NY,NZ:D", [ndim, ndim, 1])}
     if not equals or kind not in shapes:
         raise InputError(f'set: expected NAME=below:T, NAME=point:X,Y,Z:D or NAME=plane:X,Y,Z:NX,NY,NZ:D, got "{text}"')
-    if not NAME.fullmatch(name):
+    if not SET_NAME.fullmatch(name):
         raise InputError(f'set: a name is a letter, then up to 39 letters, digits, _ and -, got "{name}"')
     form, counts = shapes[kind]
     parts = rest.split(":")
@@ -227,26 +228,26 @@ def parse_set(text: str, ndim: int) -> Wish:
         raise InputError(f"set {name}: expected a distance of 0 or more, got {vectors[-1][0]:g}")
     if kind == "plane" and not vectors[1].any():
         raise InputError(f"set {name}: the plane's normal must not be 0")
-    return Wish(name, kind, vectors)
+    return SetRequest(name, kind, vectors)
 
 
-def around(mesh: Mesh, chosen: NDArray[np.int64]) -> NDArray[np.int64]:
-    """The facets between chosen cells and all else, held by the chosen, (K, 2) int64."""
-    part = Mesh(mesh.points, mesh.cells[chosen])
+def enclosing_facets(mesh: Mesh, cells: NDArray[np.int64]) -> NDArray[np.int64]:
+    """The facets between some cells and all else, as rows of those cells, (K, 2) int64."""
+    part = Mesh(mesh.points, mesh.cells[cells])
     rows = boundary_rows(part)
-    return np.column_stack([chosen[rows[:, 0]], rows[:, 1]])
+    return np.column_stack([cells[rows[:, 0]], rows[:, 1]])
 
 
-def check_free(wish: Wish, sets: Sets) -> None:
-    """InputError if a set that is asked for takes a name that there is."""
+def check_free_names(request: SetRequest, sets: Sets) -> None:
+    """InputError if a set that is requested takes a name that there is."""
     taken = {other.lower(): other for other in (*sets.facets, *sets.cells)}
-    for name in wish.names():
+    for name in request.names():
         if name.lower() in taken:
             raise InputError(f'set: there is a set "{taken[name.lower()]}" already; call it otherwise than "{name}"')
 
 
-def _below(mesh: Mesh, wish: Wish, mean: NDArray[np.float64] | None) -> NDArray[np.int64]:
-    name, threshold = wish.name, float(wish.vectors[0][0])
+def _below(mesh: Mesh, request: SetRequest, mean: NDArray[np.float64] | None) -> NDArray[np.int64]:
+    name, threshold = request.name, float(request.vectors[0][0])
     if mean is None:
         raise InputError(f"set {name}: the mesh has no means; give the image they come from (--image)")
     chosen = largest_component(mesh.cells, mean < threshold)
@@ -255,20 +256,20 @@ def _below(mesh: Mesh, wish: Wish, mean: NDArray[np.float64] | None) -> NDArray[
     return chosen
 
 
-def _near(mesh: Mesh, wish: Wish) -> NDArray[np.int64]:
-    """Boundary facets all of whose nodes are near."""
-    offset = mesh.points - wish.vectors[0]
-    if wish.kind == "point":
+def _near(mesh: Mesh, request: SetRequest) -> NDArray[np.int64]:
+    """Boundary facets all of whose nodes lie within the distance of the point or plane."""
+    offset = mesh.points - request.vectors[0]
+    if request.kind == "point":
         distance = np.sqrt((offset**2).sum(axis=1))
     else:
-        normal = wish.vectors[1] / np.abs(wish.vectors[1]).max()  # whose square neither overflows nor vanishes
+        normal = request.vectors[1] / np.abs(request.vectors[1]).max()  # whose square neither overflows nor vanishes
         distance = np.abs((offset * (normal / np.linalg.norm(normal))).sum(axis=1))
-    reach = float(wish.vectors[-1][0])
+    reach = float(request.vectors[-1][0])
     rows = boundary_rows(mesh)
     farthest = distance[facet_triples(mesh.cells, rows)].max(axis=1)
     if not (farthest <= reach).any():
         raise InputError(
-            f"set {wish.name}: no facet of the boundary lies within {reach:g} mm; the nearest does within "
+            f"set {request.name}: no facet of the boundary lies within {reach:g} mm; the nearest does within "
             f"{farthest.min():.4g} mm"
         )
     return rows[farthest <= reach]
@@ -292,8 +293,8 @@ def tagged(sets: dict[str, NDArray[np.int64]]) -> Tagged:
 
     Examples
     --------
-    >>> found = tagged({"a": np.array([4, 7]), "b": np.array([7, 9])})
-    >>> found.items.tolist(), found.tags.tolist(), found.tags_of
+    >>> tagged_items = tagged({"a": np.array([4, 7]), "b": np.array([7, 9])})
+    >>> tagged_items.items.tolist(), tagged_items.tags.tolist(), tagged_items.tags_of
     ([4, 7, 9], [1, 2, 3], {'a': [1, 2], 'b': [2, 3]})
     """
     if not sets:
@@ -314,18 +315,18 @@ def rows_of(mesh: Mesh, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
 
     A facet between two cells is held by the first of them.
     """
-    found = facets(mesh.cells)
-    every, which = np.unique(np.concatenate([found.nodes, np.sort(nodes, axis=1)]), axis=0, return_inverse=True)
-    place = np.full(len(every), -1)
-    place[which.ravel()[: len(found.nodes)]] = np.arange(len(found.nodes))
-    number = np.unique(place[which.ravel()[len(found.nodes) :]])
+    shared = facets(mesh.cells)
+    distinct, which = np.unique(np.concatenate([shared.nodes, np.sort(nodes, axis=1)]), axis=0, return_inverse=True)
+    place = np.full(len(distinct), -1)
+    place[which.ravel()[: len(shared.nodes)]] = np.arange(len(shared.nodes))
+    number = np.unique(place[which.ravel()[len(shared.nodes) :]])
     number = number[number >= 0]
-    cell = found.cells[number, 0]
-    rows = np.column_stack([cell, (found.of_cell[cell] == number[:, None]).argmax(axis=1)])
+    cell = shared.cells[number, 0]
+    rows = np.column_stack([cell, (shared.of_cell[cell] == number[:, None]).argmax(axis=1)])
     return rows[np.lexsort(rows.T[::-1])]
 
 
-def carried(before: Mesh, given: Sets, mesh: Mesh) -> Sets:
+def surviving_sets(before: Mesh, sets: Sets, mesh: Mesh) -> Sets:
     """Those facet sets of a mesh as it was before that it still has all of, node for node, in new rows.
 
     Of an optimised mesh with its boundary kept these are the sets on the boundary. Its cells are others: no cell set is
@@ -333,8 +334,8 @@ def carried(before: Mesh, given: Sets, mesh: Mesh) -> Sets:
     """
     place = {point.tobytes(): number for number, point in enumerate(mesh.points)}
     now = np.array([place.get(point.tobytes(), -1) for point in before.points])
-    found = {name: rows_of(mesh, now[facet_triples(before.cells, rows)]) for name, rows in given.facets.items()}
-    return Sets({name: rows for name, rows in found.items() if len(rows) == len(given.facets[name])}, {})
+    survivors = {name: rows_of(mesh, now[facet_triples(before.cells, rows)]) for name, rows in sets.facets.items()}
+    return Sets({name: rows for name, rows in survivors.items() if len(rows) == len(sets.facets[name])}, {})
 
 
 def free_name(label: str, taken: set[str]) -> str:
@@ -348,15 +349,15 @@ def free_name(label: str, taken: set[str]) -> str:
     return name
 
 
-def joined(standard: Sets, given: Sets) -> tuple[Sets, dict[str, str]]:
-    """The standard sets and those that came with a mesh; and the new names of given ones whose names were taken.
+def merged_sets(standard: Sets, own: Sets) -> tuple[Sets, dict[str, str]]:
+    """The standard sets and a mesh's own; and the new names of those of its own whose names were taken.
 
-    A given set that is the same as the standard one of its name is that one.
+    A set of its own that is the same as the standard one of its name is that one.
     """
     parts: tuple[dict[str, NDArray[np.int64]], ...] = (dict(standard.facets), dict(standard.cells))
     renamed = {}
-    for kind, sets in enumerate((given.facets, given.cells)):
-        for name, members in sets.items():
+    for kind, members_by_name in enumerate((own.facets, own.cells)):
+        for name, members in members_by_name.items():
             if np.array_equal(standard[kind].get(name, np.empty(0)), members):
                 continue
             free = free_name(name, {each.lower() for part in parts for each in part})

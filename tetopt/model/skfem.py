@@ -34,10 +34,10 @@ def skfem_mesh(mesh: Mesh, sets: Sets) -> skfem.Mesh:
     >>> from tetopt import Mesh
     >>> from tetopt.model.sets import standard_sets
     >>> mesh = Mesh([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]])
-    >>> found = skfem_mesh(mesh, standard_sets(mesh, labels=np.array([7])))
-    >>> found.p[:, found.facets[:, found.boundaries["x_min"]]].tolist()
+    >>> converted = skfem_mesh(mesh, standard_sets(mesh, labels=np.array([7])))
+    >>> converted.p[:, converted.facets[:, converted.boundaries["x_min"]]].tolist()
     [[[0.0], [0.0]], [[0.0], [1.0]]]
-    >>> found.subdomains["label_7"].tolist()
+    >>> converted.subdomains["label_7"].tolist()
     [0]
     """
     try:
@@ -46,10 +46,10 @@ def skfem_mesh(mesh: Mesh, sets: Sets) -> skfem.Mesh:
         raise InputError("to_skfem: scikit-fem is not installed; pip install scikit-fem") from error
     kind = skfem.MeshTet if mesh.ndim == 3 else skfem.MeshTri
     # Contiguous, or scikit-fem warns of making them so.
-    made = kind(np.ascontiguousarray(mesh.points.T), np.ascontiguousarray(mesh.cells.T))
-    boundaries = {name: _boundary(made, mesh.cells, rows) for name, rows in sets.facets.items()}
+    bare = kind(np.ascontiguousarray(mesh.points.T), np.ascontiguousarray(mesh.cells.T))
+    boundaries = {name: _boundary(bare, mesh.cells, rows) for name, rows in sets.facets.items()}
     subdomains = {name: cells.copy() for name, cells in sets.cells.items()}
-    return made.with_boundaries(boundaries).with_subdomains(subdomains)
+    return bare.with_boundaries(boundaries).with_subdomains(subdomains)
 
 
 def _boundary(mesh: skfem.Mesh, cells: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.integer]:
