@@ -20,7 +20,8 @@ import tetopt
 from tetopt.fem.reference import averaged
 from tetopt.io.files import checked_output, save_json
 from tetopt.measure.segmentation import thresholded
-from tetopt.study.compare import Settings, default_law, measured, prepared
+from tetopt.study.compare import default_law, measured, prepared
+from tetopt.study.compare_report import Settings
 
 PHANTOMS = ("sphere", "two_spheres", "ellipsoids_brain")
 ERRORS = ("strain_energy", "displacement", "interface_strain")
@@ -50,12 +51,12 @@ def _run(options: argparse.Namespace) -> int:
     rows = []
     for name, image, labels in cases(options.phantoms, options.images):
         law, _ = default_law(image)
-        setting = prepared(image, labels, law, settings, lambda text, name=name: print(f"{name}: {text}", flush=True))
+        standard = prepared(image, labels, law, settings, lambda text, name=name: print(f"{name}: {text}", flush=True))
         for nodes in options.nodes:
             initial = tetopt.lattice(image, nodes=nodes)
             for k_D in options.k_d:
                 mesh = tetopt.optimize(image, initial, k_D=k_D, iterations=20).mesh
-                found = measured(setting, mesh, settings.percent)
+                found = measured(standard, mesh, settings.percent)
                 rows.append({"image": name, "nodes": len(mesh.points), "k_D": k_D, "measured": found})
                 print(_line(rows[-1]), flush=True)
     summary = _summary(rows, options.k_d)
@@ -80,9 +81,9 @@ def cases(phantoms: Sequence[str], paths: Sequence[Path]) -> list[tuple[str, tet
 
 
 def _line(row: dict[str, Any]) -> str:
-    found = row["measured"]
-    errors = [f"nu {nu}: " + " ".join(f"{fem['errors'][e]:.4f}" for e in ERRORS) for nu, fem in found["fem"].items()]
-    shape = f"E_D {found['E_D_share']:.4f} rho {found['quality']['mean_rho']:.3f}"
+    mesh = row["measured"]
+    errors = [f"nu {nu}: " + " ".join(f"{getattr(f.errors, e):.4f}" for e in ERRORS) for nu, f in mesh.fem.items()]
+    shape = f"E_D {mesh.E_D_share:.4f} rho {mesh.quality.mean_rho:.3f}"
     return f"{row['image']} {row['nodes']} nodes k_D {row['k_D']:g}: {shape}  " + "  ".join(errors)
 
 
@@ -92,14 +93,15 @@ def _summary(rows: Sequence[dict[str, Any]], weights: Sequence[float]) -> dict[s
     for k_D in weights:
         mine, first = ([row for row in rows if row["k_D"] == k] for k in (k_D, weights[0]))
         pairs = [
-            (a["measured"]["fem"][nu], b["measured"]["fem"][nu])
+            (a["measured"].fem[nu], b["measured"].fem[nu])
             for a, b in zip(mine, first, strict=True)
-            for nu in a["measured"]["fem"]
+            for nu in a["measured"].fem
         ]
         ratios = {
-            e: float(np.exp(np.mean([np.log(a["errors"][e] / b["errors"][e]) for a, b in pairs]))) for e in ERRORS
+            e: float(np.exp(np.mean([np.log(getattr(a.errors, e) / getattr(b.errors, e)) for a, b in pairs])))
+            for e in ERRORS
         }
-        ratios["cond"] = float(np.exp(np.mean([np.log(a["cond"] / b["cond"]) for a, b in pairs])))
+        ratios["cond"] = float(np.exp(np.mean([np.log(a.cond / b.cond) for a, b in pairs])))
         summary[f"{k_D:g}"] = ratios
     return summary
 

@@ -21,7 +21,8 @@ from choose_k_d import ERRORS, PHANTOMS, cases
 import tetopt
 from tetopt.io.files import checked_output, save_json
 from tetopt.start.sizes import COARSEST
-from tetopt.study.compare import Setting, Settings, default_law, measured, prepared
+from tetopt.study.compare import Standard, default_law, measured, prepared
+from tetopt.study.compare_report import Settings
 
 NU = "0.3"
 
@@ -50,9 +51,9 @@ def _run(options: argparse.Namespace) -> int:
     rows = []
     for name, image, labels in cases(options.phantoms, options.images):
         law, _ = default_law(image)
-        setting = prepared(image, labels, law, settings, lambda text, name=name: print(f"{name}: {text}", flush=True))
-        for kind, mesh in _meshes(image, setting, options.nodes, options.largest):
-            found = measured(setting, mesh, settings.percent)
+        standard = prepared(image, labels, law, settings, lambda text, name=name: print(f"{name}: {text}", flush=True))
+        for kind, mesh in _meshes(image, standard, options.nodes, options.largest):
+            found = measured(standard, mesh, settings.percent)
             rows.append({"image": name, "mesh": kind, "measured": found})
             print(_line(rows[-1]), flush=True)
     save_json(path, {"rows": rows})
@@ -60,7 +61,7 @@ def _run(options: argparse.Namespace) -> int:
 
 
 def _meshes(
-    image: tetopt.Image, setting: Setting, nodes: int, largest: Sequence[float]
+    image: tetopt.Image, standard: Standard, nodes: int, largest: Sequence[float]
 ) -> Iterator[tuple[str, tetopt.Mesh]]:
     """Name and mesh, one after the other."""
     lattice = tetopt.lattice(image, nodes=nodes)
@@ -70,7 +71,7 @@ def _meshes(
     for factor in largest:
         sizes = tetopt.Sizes(largest=factor * edge)
         yield f"graded, largest {factor:g}", tetopt.mesh_image(image, nodes, sizes=sizes).mesh
-    strained = _strained(setting)
+    strained = _strained(standard)
     yield "uniform, by the strain", tetopt.optimize(strained, tetopt.lattice(strained, nodes=nodes)).mesh
     for k_D in (0.5, 0.85):
         yield f"graded by the strain, k_D {k_D:g}", tetopt.mesh_image(strained, nodes, k_D=k_D).mesh
@@ -78,19 +79,19 @@ def _meshes(
         yield f"lattice graded by the strain, k_D {k_D:g}", mesh
 
 
-def _strained(setting: Setting) -> tetopt.Image:
+def _strained(standard: Standard) -> tetopt.Image:
     """sqrt(E) times the strain along the push, of the reference: E_D of it is about the error of a mesh's energy."""
-    modulus, found = setting.modulus, setting.references[NU]
+    modulus, found = standard.modulus, standard.references[NU]
     strain = found.strain.reshape(*modulus.shape, modulus.ndim, modulus.ndim)
     push = int(np.argmax([abs(strain[..., d, d].mean()) for d in range(modulus.ndim)]))
     return tetopt.Image(np.sqrt(modulus.data) * strain[..., push, push], modulus.affine)
 
 
 def _line(row: dict[str, Any]) -> str:
-    found = row["measured"]
-    errors = " ".join(f"{found['fem'][NU]['errors'][e]:.4f}" for e in ERRORS)
-    share, rho = found["E_D_share"], found["quality"]["mean_rho"]
-    return f"{row['image']}, {row['mesh']}: {found['n_nodes']} nodes, E_D {share:.4f}, rho {rho:.3f}; errors {errors}"
+    mesh = row["measured"]
+    errors = " ".join(f"{getattr(mesh.fem[NU].errors, e):.4f}" for e in ERRORS)
+    size = f"{mesh.n_nodes} nodes, E_D {mesh.E_D_share:.4f}, rho {mesh.quality.mean_rho:.3f}"
+    return f"{row['image']}, {row['mesh']}: {size}; errors {errors}"
 
 
 if __name__ == "__main__":

@@ -1,12 +1,10 @@
 """Pictures of a comparison, judged by what they hold."""
 
-import copy
-
 import numpy as np
 import PIL.Image
 import pytest
 from matplotlib.collections import PolyCollection
-from test_compare_page import fake_results, meshes_of
+from test_compare_page import fake_report, finished, meshes_of, with_runs
 
 import tetopt
 from tetopt.energy.discretization import cell_E_D
@@ -14,7 +12,7 @@ from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
 from tetopt.report.figures import SliceView, save_figure
 from tetopt.study.compare_figures import (
-    ERRORS,
+    ERROR_TITLES,
     curves_figure,
     cutaways,
     histograms_figure,
@@ -72,83 +70,83 @@ def test_slices_refuse_missing_means(small):
 
 def test_label_marks_are_those_of_the_report():
     """A column for each label, the largest first; the lost have Dice 0 and no distance."""
-    results = fake_results()
-    done = [p for p in results["pipelines"] if "median" in p]
+    report = fake_report()
+    done = finished(report)
     for pipeline in done:
-        pipeline["median"]["labels"].reverse()
-    dice, distance = labels_figure(results).axes
+        pipeline.median.measurement.labels.reverse()
+    dice, distance = labels_figure(report).axes
     assert [text.get_text() for text in distance.get_xticklabels()] == ["0 (9000)", "1 (2250)", "2 (562)", "3 (140)"]
     for axes, name, n in ((dice, "dice", 4), (distance, "surface_mean_mm", 3)):
         marks = {line.get_label(): line.get_xydata() for line in axes.lines}
-        assert list(marks) == [p["title"] for p in done]
+        assert list(marks) == [p.title for p in done]
         for pipeline in done:
-            values = {row["label"]: row[name] for row in pipeline["median"]["labels"]}
-            np.testing.assert_array_equal(marks[pipeline["title"]][:, 1], [values[k] for k in range(n)])
-            np.testing.assert_array_equal(np.rint(marks[pipeline["title"]][:, 0]), np.arange(n))
+            values = {row.label: getattr(row, name) for row in pipeline.median.measurement.labels}
+            np.testing.assert_array_equal(marks[pipeline.title][:, 1], [values[k] for k in range(n)])
+            np.testing.assert_array_equal(np.rint(marks[pipeline.title][:, 0]), np.arange(n))
 
 
 def test_histograms_are_those_of_the_report():
-    results = fake_results()
-    for axes, name in zip(histograms_figure(results).axes, ("rho_histogram", "dihedral_histogram"), strict=True):
+    report = fake_report()
+    for axes, name in zip(histograms_figure(report).axes, ("rho_histogram", "dihedral_histogram"), strict=True):
         outlines = {p.get_label(): p.get_data() for p in axes.patches if p.get_label()}
-        done = [p for p in results["pipelines"] if "median" in p]
-        assert list(outlines) == [p["title"] for p in done]
-        for pipeline in done:
-            np.testing.assert_array_equal(outlines[pipeline["title"]].values, pipeline["median"][name]["share"])
-            np.testing.assert_array_equal(outlines[pipeline["title"]].edges, pipeline["median"][name]["edges"])
+        assert list(outlines) == [p.title for p in finished(report)]
+        for pipeline in finished(report):
+            histogram = getattr(pipeline.median.measurement, name)
+            np.testing.assert_array_equal(outlines[pipeline.title].values, histogram.share)
+            np.testing.assert_array_equal(outlines[pipeline.title].edges, histogram.edges)
 
 
 def test_curves_are_those_of_the_report():
-    results = fake_results()
-    results["curves"][1]["points"][0]["errors"]["0.3"]["displacement"] = None
-    panels = np.array(curves_figure(results).axes).reshape(2, 3)
+    report = fake_report()
+    errors = report.curves[1].points[0].errors
+    errors["0.3"] = errors["0.3"]._replace(displacement=None)
+    panels = np.array(curves_figure(report).axes).reshape(2, 3)
     for row, nu in enumerate(("0.3", "0.45")):
-        for axes, (name, _) in zip(panels[row], ERRORS, strict=True):
+        for axes, (name, _) in zip(panels[row], ERROR_TITLES, strict=True):
             assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
             lines = {line.get_label(): line for line in axes.lines}
-            assert list(lines) == [curve["title"] for curve in results["curves"]]
-            for curve in results["curves"]:
-                expected = [(p["n_nodes"], p["errors"][nu][name]) for p in curve["points"]]
-                shown = list(zip(*lines[curve["title"]].get_data(), strict=True))
+            assert list(lines) == [curve.title for curve in report.curves]
+            for curve in report.curves:
+                expected = [(p.n_nodes, getattr(p.errors[nu], name)) for p in curve.points]
+                shown = list(zip(*lines[curve.title].get_data(), strict=True))
                 assert shown == [pair for pair in expected if pair[1] is not None]
     markers = [line.get_marker() for line in panels[0, 0].lines]
     assert len(set(markers)) == len(markers)
 
 
 def test_curves_without_finite_elements_show_E_D(tmp_path):
-    results = fake_results()
-    for curve in results["curves"]:
-        for point in curve["points"]:
-            point["errors"] = {}
-    (axes,) = curves_figure(results).axes
-    first = results["curves"][0]["points"]
-    np.testing.assert_array_equal(axes.lines[0].get_ydata(), [p["E_D_share"] for p in first])
-    save_figure(curves_figure(results | {"curves": []}), tmp_path / "a.png", dpi=40)
+    report = fake_report()
+    for curve in report.curves:
+        for point in curve.points:
+            point.errors.clear()
+    (axes,) = curves_figure(report).axes
+    first = report.curves[0].points
+    np.testing.assert_array_equal(axes.lines[0].get_ydata(), [p.E_D_share for p in first])
+    save_figure(curves_figure(report._replace(curves=[])), tmp_path / "a.png", dpi=40)
 
 
 def test_bars_are_the_steps():
-    results = fake_results()
-    (axes,) = timing_figure(results).axes
-    assert [tick.get_text() for tick in axes.get_yticklabels()] == [p["title"] for p in results["pipelines"]]
+    report = fake_report()
+    (axes,) = timing_figure(report).axes
+    assert [tick.get_text() for tick in axes.get_yticklabels()] == [p.title for p in report.pipelines]
     texts = {round(text.get_position()[1]): text.get_text().strip() for text in axes.texts}
-    for row, pipeline in enumerate(results["pipelines"]):
+    for row, pipeline in enumerate(report.pipelines):
         bars = [b for b in axes.patches if round(b.get_y() + b.get_height() / 2) == row]
-        if "median" not in pipeline:
+        if pipeline.median is None:
             assert not bars
             assert texts[row] == "failed"
             continue
-        seconds = pipeline["median"]["seconds"]
+        seconds = pipeline.median.seconds
         assert [b.get_width() for b in bars] == pytest.approx([seconds["lattice"], seconds["optimise"]])
-        assert texts[row] == f"{pipeline['median']['seconds_total']:.3g} s"
+        assert texts[row] == f"{pipeline.median.seconds_total:.3g} s"
 
 
 def test_colours_do_not_depend_on_what_failed():
     """A pipeline keeps its colour in every picture, whichever others have no line."""
-    results = fake_results()
-    fewer = copy.deepcopy(results)
-    del fewer["pipelines"][0]["median"]
-    fewer["curves"] = fewer["curves"][1:]
-    whole, part = curves_figure(results).axes[0].lines, curves_figure(fewer).axes[0].lines
+    report = fake_report()
+    first, *others = report.pipelines
+    fewer = report._replace(pipelines=[with_runs(first, []), *others], curves=report.curves[1:])
+    whole, part = curves_figure(report).axes[0].lines, curves_figure(fewer).axes[0].lines
     assert [line.get_color() for line in whole[1:]] == [line.get_color() for line in part]
 
 

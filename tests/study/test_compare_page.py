@@ -1,7 +1,6 @@
 """The comparison's page: its numbers are the report's, winners and losses are right, failures are named."""
 
 import html
-import json
 import re
 from html.parser import HTMLParser
 
@@ -10,18 +9,33 @@ import pytest
 from browser import browser
 
 import tetopt
+from tetopt.fem.reference import Errors
+from tetopt.measure.quality import Quality, QualityErrors
 from tetopt.report.figures import save_figure
 from tetopt.report.viewer import view_of
+from tetopt.study.compare import elementwise
 from tetopt.study.compare_figures import curves_figure, histograms_figure, slices_figure, timing_figure
-from tetopt.study.compare_page import Entry, Measure, entry, measures, number_text, save_compare_page, winners
-
-PIPELINES = (
-    ("tetopt", "tetopt", "tetopt"),
-    ("pytetwild", "pytetwild", "peer"),
-    ("cleaver", "itk-cleaver", "peer"),
-    ("bcc", "BCC lattice", "control"),
-    ("odt", "ODT, image-blind", "control"),
+from tetopt.study.compare_page import Criterion, Entry, criteria, entry, number_text, save_compare_page, winners
+from tetopt.study.compare_report import (
+    Curve,
+    CurvePoint,
+    Histogram,
+    ImageFacts,
+    ImageSource,
+    LabelRow,
+    LabelSource,
+    Machine,
+    Measurement,
+    PipelineResult,
+    ReferenceEnergy,
+    ReferenceGrid,
+    Report,
+    Run,
+    Settings,
+    Simulation,
+    as_json,
 )
+from tetopt.study.pipelines import PIPELINES
 
 
 def fake_run(seed, scale):
@@ -32,83 +46,85 @@ def fake_run(seed, scale):
         return float(random.uniform(low, high))
 
     rho, angles = random.dirichlet(np.arange(1, 21)), random.dirichlet(np.bincount(range(36)) + 3)
-    errors = ("mean", "harmonic_mean", "l2", "worst")
-    quality = {
-        "mean_rho": some(0.2, 0.3), "p1_rho": some(0.05, 0.2), "min_rho": some(0.001, 0.1),
-        "errors": {name: some(0.1, 3.0) for name in errors},
-        "min_dihedral": some(1.0, 30.0), "p1_dihedral": some(10.0, 40.0), "max_dihedral": some(110.0, 178.0),
-        "n_under_10_degrees": int(random.integers(0, 50)),
-        "kinds": {"needle": 0, "wedge": 1, "cap": 0, "spade": 2, "sliver": int(random.integers(0, 9))},
-    }  # fmt: skip
+    quality = Quality(
+        ndim=3, n_nodes=5000 + seed, n_cells=27000 + 5 * seed, volume=1e6, smallest_volume=0.1,
+        mean_rho=some(0.2, 0.3), p1_rho=some(0.05, 0.2), min_rho=some(0.001, 0.1),
+        errors=QualityErrors(*(some(0.1, 3.0) for _ in range(4))),
+        min_dihedral=some(1.0, 30.0), p1_dihedral=some(10.0, 40.0), max_dihedral=some(110.0, 178.0),
+        n_under_10_degrees=int(random.integers(0, 50)),
+        kinds={"needle": 0, "wedge": 1, "cap": 0, "spade": 2, "sliver": int(random.integers(0, 9))},
+        min_edge=0.5, max_edge=20.0,
+    )  # fmt: skip
     labels = [
-        {"label": k, "voxels": 9000 // (4**k), "mesh_voxels": round(9000 // 4**k * some(0.8, 1.1)) * (k < 3),
-         "dice": some(0.7, 0.98) * (k < 3), "E_D_share": 0.02 * scale, "is_lost": k == 3,
-         "volume_mm3": 72000.0 / 4**k, "mesh_volume_mm3": 72000.0 / 4**k * some(0.8, 1.1) * (k < 3),
-         "surface_mean_mm": some(0.4, 2.0) if k < 3 else None, "surface_p95_mm": some(3.0, 5.0) if k < 3 else None,
-         "components": 1, "mesh_components": int(random.integers(1, 4)) * (k < 3)}
+        LabelRow(
+            label=k, voxels=9000 // (4**k), mesh_voxels=round(9000 // 4**k * some(0.8, 1.1)) * (k < 3),
+            dice=some(0.7, 0.98) * (k < 3), E_D_share=0.02 * scale, is_lost=k == 3,
+            volume_mm3=72000.0 / 4**k, mesh_volume_mm3=72000.0 / 4**k * some(0.8, 1.1) * (k < 3),
+            surface_mean_mm=some(0.4, 2.0) if k < 3 else None, surface_p95_mm=some(3.0, 5.0) if k < 3 else None,
+            components=1, mesh_components=int(random.integers(1, 4)) * (k < 3),
+        )
         for k in range(4)
     ]  # fmt: skip
     fem = {
-        nu: {"lambda_max": some(1e2, 1e3), "cond": some(1e3, 1e5), "cg_iterations": int(random.integers(80, 300)),
-             "strain_energy": some(1.0, 2.0), "errors": fake_errors(scale)}
+        nu: Simulation(some(1e2, 1e3), some(1e3, 1e5), int(random.integers(80, 300)), some(1.0, 2.0), errors_of(scale))
         for nu in ("0.3", "0.45")
-    }  # fmt: skip
+    }
     seconds = {"lattice": some(0.1, 1.0), "optimise": some(1.0, 20.0)}
-    return {
-        "n_nodes": 5000 + seed, "n_cells": 27000 + 5 * seed, "E_D": 1e9 * scale, "E_D_share": 0.04 * scale,
-        "seconds": {"kernels": 3.0, **seconds}, "seconds_total": sum(seconds.values()), "peak_bytes": 9e8 * scale,
-        "n_missed_voxels": 0, "quality": quality, "labels": labels, "fem": fem,
-        "rho_histogram": {"edges": np.linspace(0, 1 / 3, 21).tolist(), "share": rho.tolist()},
-        "dihedral_histogram": {"edges": list(range(0, 181, 5)), "share": angles.tolist()},
-    }  # fmt: skip
+    measurement = Measurement(
+        n_nodes=5000 + seed, n_cells=27000 + 5 * seed, E_D=1e9 * scale, E_D_share=0.04 * scale, n_missed_voxels=0,
+        n_empty_cells=0, quality=quality, rho_histogram=Histogram(np.linspace(0, 1 / 3, 21).tolist(), rho.tolist()),
+        dihedral_histogram=Histogram(list(range(0, 181, 5)), angles.tolist()), labels=labels, fem=fem,
+    )  # fmt: skip
+    return Run({"kernels": 3.0, **seconds}, sum(seconds.values()), int(9e8 * scale), measurement)
 
 
-def fake_errors(scale):
-    return {"strain_energy": 0.03 * scale, "displacement": 0.1 * scale, "interface_strain": 0.2 * scale}
+def errors_of(scale):
+    return Errors(0.03 * scale, 0.1 * scale, 0.2 * scale)
 
 
-def over(runs, of):
-    """Numbers of nested runs made one."""
-    if isinstance(runs[0], dict):
-        return {key: over([run[key] for run in runs], of) for key in runs[0]}
-    if isinstance(runs[0], list):
-        return [over(list(parts), of) for parts in zip(*runs, strict=True)]
-    return runs[0] if isinstance(runs[0], bool) or runs[0] is None else float(of(runs))
+def with_runs(pipeline, runs):
+    """The pipeline with other runs, summed up."""
+    median, low, high = (elementwise(runs, of) if runs else None for of in (np.median, np.min, np.max))
+    return pipeline._replace(runs=runs, median=median, low=low, high=high)
 
 
-def fake_results():
+def with_measured(report, number, **values):
+    """Change what all runs of the pipeline at this place measured."""
+    pipeline = report.pipelines[number]
+    runs = [run._replace(measurement=run.measurement._replace(**values)) for run in pipeline.runs]
+    report.pipelines[number] = with_runs(pipeline, runs)
+
+
+def finished(report):
+    return [pipeline for pipeline in report.pipelines if pipeline.median is not None]
+
+
+def fake_report():
     """Five pipelines: the second of three runs, the third failed."""
     pipelines = []
-    for number, (name, title, kind) in enumerate(PIPELINES):
-        runs = [fake_run(10 * number + k, 1.0 + 0.3 * number) for k in range(3 if number == 1 else 1)]
-        pipeline = {
-            "name": name, "title": title, "kind": kind, "about": f"{title}, its options", "failure": None,
-            "notes": [f"a note on {title}"], "runs": runs,
-        }  # fmt: skip
-        if number == 2:
-            pipeline |= {"failure": "crashed: signal 11 after 3 s", "runs": []}
-        else:
-            pipeline |= {word: over(runs, of) for word, of in (("median", np.median), ("low", min), ("high", max))}
-        pipelines.append(pipeline)
+    for number, name in enumerate(("tetopt", "pytetwild", "cleaver", "bcc", "odt")):
+        title, kind = PIPELINES[name].title, PIPELINES[name].kind
+        n_runs = (1, 3, 0, 1, 1)[number]
+        runs = [fake_run(10 * number + k, 1.0 + 0.3 * number) for k in range(n_runs)]
+        failure = None if runs else "crashed: signal 11 after 3 s"
+        result = PipelineResult(name, title, kind, f"{title}, its options", failure, [f"a note on {title}"], runs)
+        pipelines.append(with_runs(result, runs))
     curves = [
-        {"name": p["name"], "title": p["title"], "points": [
-            {"n_nodes": nodes, "E_D_share": 0.04 * scale,
-             "errors": {nu: fake_errors(scale * (1.0 + k * 0.4)) for nu in ("0.3", "0.45")}}
+        Curve(p.name, p.title, [
+            CurvePoint(nodes, 0.04 * scale, {nu: errors_of(scale * (1.0 + k * 0.4)) for nu in ("0.3", "0.45")})
             for nodes, scale in ((1250, 2.2), (2500, 1.5), (5000, 1.0), (10000, 0.7))
-        ]}
-        for k, p in enumerate(pipelines) if "median" in p
+        ])
+        for k, p in enumerate(pipelines) if p.runs
     ]  # fmt: skip
-    results = {
-        "versions": {"tetopt": "0.1.0", "numpy": "2.0"}, "command": "tetopt compare T1.nii.gz -o out --nodes 5000",
-        "machine": {"cores": 2, "system": "Linux"}, "seconds": 812.0,
-        "image": {"name": "T1.nii.gz", "shape": [197, 233, 189], "spacing_mm": [1, 1, 1], "sha256": "ab" * 32,
-                  "variance": 2841.2},
-        "labels": {"name": "labels.nii.gz", "kind": "given"}, "options": {"nodes": 5000, "repeats": 3, "k_D": 0.2},
-        "law": "1 kPa at 0, 10 kPa at 255",
-        "reference": {"shape": [49, 58, 47], "n_dofs": 435000, "note": "averaged", "0.3": {"strain_energy": 1.234}},
-        "pipelines": pipelines, "curves": curves,
-    }  # fmt: skip
-    return json.loads(json.dumps(results))
+    source = ImageSource("T1.nii.gz", "ab" * 32, None, None)
+    return Report(
+        command="tetopt compare T1.nii.gz -o out --nodes 5000",
+        image=ImageFacts(source, (197, 233, 189), [1, 1, 1], 2841.2),
+        labels=LabelSource("labels.nii.gz", "given", "cd" * 32), law="1 kPa at 0, 10 kPa at 255",
+        versions={"tetopt": "0.1.0", "numpy": "2.0"}, machine=Machine(2, "Linux"), options=Settings(5000),
+        reference=ReferenceGrid((49, 58, 47), 435000, "averaged", {"0.3": ReferenceEnergy(1.234)}),
+        pipelines=pipelines, tradeoff=[], curves=curves, seconds=812.0,
+    )  # fmt: skip
 
 
 def meshes_of(image, nodes, iterations):
@@ -144,21 +160,21 @@ class Tables(HTMLParser):
             self.cell[1].append(data.strip())
 
 
-def page_of(tmp_path, results, pictures=(), views=()):
-    save_compare_page(tmp_path / "report.html", results, pictures, views)
+def page_of(tmp_path, report, pictures=(), views=()):
+    save_compare_page(tmp_path / "report.html", report, pictures, views)
     return (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
 def headline(page):
     """Rows of the headline table by the row's title; each cell (classes, texts)."""
     rows = Tables(page).tables[0]
-    groups, found = "", {}
+    groups, rows_by_title = "", {}
     for row in rows[1:]:
         if len(row) == 1:
             groups = "".join(row[0][1])
         else:
-            found[groups, row[0][1][0].rstrip(" ↓↑")] = row[1:]
-    return found
+            rows_by_title[groups, row[0][1][0].rstrip(" ↓↑")] = row[1:]
+    return rows_by_title
 
 
 # --------------------------------------------------------------------------------------------------
@@ -200,22 +216,23 @@ PATHS = {
 }
 JUDGED = "Labels above 500 voxels, background 0 not counted"  # of the fake ones 1 and 2
 DERIVED = {
-    (JUDGED, "mean label Dice"): lambda rows: np.mean([r["dice"] for r in rows[1:3]]),
-    (JUDGED, "smallest label Dice"): lambda rows: min(r["dice"] for r in rows[1:3]),
-    (JUDGED, "mean label surface distance, mm"): lambda rows: np.mean([r["surface_mean_mm"] for r in rows[1:3]]),
-    (JUDGED, "label surface distance p95, mm"): lambda rows: np.mean([r["surface_p95_mm"] for r in rows[1:3]]),
+    (JUDGED, "mean label Dice"): lambda rows: np.mean([r.dice for r in rows[1:3]]),
+    (JUDGED, "smallest label Dice"): lambda rows: min(r.dice for r in rows[1:3]),
+    (JUDGED, "mean label surface distance, mm"): lambda rows: np.mean([r.surface_mean_mm for r in rows[1:3]]),
+    (JUDGED, "label surface distance p95, mm"): lambda rows: np.mean([r.surface_p95_mm for r in rows[1:3]]),
     (JUDGED, "largest label volume error"): lambda rows: max(
-        abs(r["mesh_volume_mm3"] / r["volume_mm3"] - 1) for r in rows[1:3]
+        abs(r.mesh_volume_mm3 / r.volume_mm3 - 1) for r in rows[1:3]
     ),
-    (JUDGED, "labels in more or fewer pieces"): lambda rows: sum(r["mesh_components"] != 1 for r in rows[1:3]),
+    (JUDGED, "labels in more or fewer pieces"): lambda rows: sum(r.mesh_components != 1 for r in rows[1:3]),
     (JUDGED, "labels lost (of any size)"): lambda rows: 1,
 }
 
 
 def dug(run, keys):
+    value = as_json(run)
     for key in keys:
-        run = run[key]
-    return run / 1e6 if keys == ("peak_bytes",) else run
+        value = value[key]
+    return value / 1e6 if keys == ("peak_bytes",) else value
 
 
 def close(text, value):
@@ -224,69 +241,72 @@ def close(text, value):
 
 
 def test_every_number_is_the_reports(tmp_path):
-    results = fake_results()
-    rows = headline(page_of(tmp_path, results))
+    report = fake_report()
+    rows = headline(page_of(tmp_path, report))
     assert set(rows) == set(PATHS) | set(DERIVED)
     for title, keys in PATHS.items():
-        for pipeline, (_, texts) in zip(results["pipelines"], rows[title], strict=True):
-            if "median" not in pipeline:
+        for pipeline, (_, texts) in zip(report.pipelines, rows[title], strict=True):
+            if pipeline.median is None:
                 assert texts == ["failed"]
                 continue
-            assert close(texts[0], dug(pipeline["median"], keys)), title
-            if len(pipeline["runs"]) > 1:
+            assert close(texts[0], dug(pipeline.median, keys)), title
+            if len(pipeline.runs) > 1:
                 low, high = texts[1].split(" to ")
-                assert close(low, dug(pipeline["low"], keys))
-                assert close(high, dug(pipeline["high"], keys))
+                assert close(low, dug(pipeline.low, keys))
+                assert close(high, dug(pipeline.high, keys))
             else:
                 assert not any(" to " in text for text in texts)
 
 
 def test_label_rows_are_computed_from_the_runs(tmp_path):
-    results = fake_results()
-    rows = headline(page_of(tmp_path, results))
+    report = fake_report()
+    rows = headline(page_of(tmp_path, report))
     for title, value in DERIVED.items():
-        for pipeline, (_, texts) in zip(results["pipelines"], rows[title], strict=True):
-            if "median" in pipeline:
-                found = [value(run["labels"]) for run in pipeline["runs"]]
-                assert close(texts[0], np.median(found)), title
+        for pipeline, (_, texts) in zip(report.pipelines, rows[title], strict=True):
+            if pipeline.runs:
+                values = [value(run.measurement.labels) for run in pipeline.runs]
+                assert close(texts[0], np.median(values)), title
 
 
 def test_a_lost_label_is_not_averaged_away(tmp_path):
     """Its surface has no distance: the mean over the other labels would make losing it pay."""
-    results = fake_results()
-    lose(results["pipelines"][0]["runs"][0]["labels"][2])
-    cell = headline(page_of(tmp_path, results))[JUDGED, "mean label surface distance, mm"][0]
+    report = fake_report()
+    lose(report.pipelines[0].runs[0], 2)
+    cell = headline(page_of(tmp_path, report))[JUDGED, "mean label surface distance, mm"][0]
     assert cell == [{"tetopt", "lost"}, ["–", "loses: no value"]]
 
 
-def lose(row):
-    row |= {"is_lost": True, "dice": 0.0, "surface_mean_mm": None, "surface_p95_mm": None, "mesh_volume_mm3": 0.0}
+def lose(run, label):
+    labels = run.measurement.labels
+    labels[label] = labels[label]._replace(
+        is_lost=True, dice=0.0, surface_mean_mm=None, surface_p95_mm=None, mesh_volume_mm3=0.0
+    )
 
 
 def test_labels_are_tabled_and_the_vanished_named(tmp_path):
     """A row a label, the one on which tetopt is worst first; Dice, distances and volume of each pipeline."""
-    results = fake_results()
-    lose(results["pipelines"][1]["runs"][2]["labels"][1])
-    page = page_of(tmp_path, results)
+    report = fake_report()
+    lose(report.pipelines[1].runs[2], 1)
+    page = page_of(tmp_path, report)
     assert "<li>tetopt: label 3 (140 voxels)</li>" in page
     assert "<li>pytetwild: label 1 (2250 voxels, in 1 of 3 runs), label 3 (140 voxels)</li>" in page
     head, *rows = Tables(page).tables[1]
-    done = [p for p in results["pipelines"] if "median" in p]
-    assert [cell[1][0] for cell in head] == ["label", *(p["title"] for p in done)]
-    own = {row["label"]: row["dice"] for row in done[0]["median"]["labels"]}
+    done = finished(report)
+    assert [cell[1][0] for cell in head] == ["label", *(p.title for p in done)]
+    own = {row.label: row.dice for row in done[0].median.measurement.labels}
     assert [int(row[0][1][0]) for row in rows] == sorted(own, key=own.get)
     for label, *cells in rows:
         k = int(label[1][0])
         dice = []
         for pipeline, (_, texts) in zip(done, cells, strict=True):
-            of_runs = [run["labels"][k] for run in pipeline["runs"]]
+            of_runs = [run.measurement.labels[k] for run in pipeline.runs]
             if k == 3:
                 assert texts == ["lost"]
                 continue
-            known = [row for row in of_runs if not row["is_lost"]]
-            dice.append(np.median([row["dice"] for row in of_runs]))
-            mean, p95 = (np.median([row[f"surface_{name}_mm"] for row in known]) for name in ("mean", "p95"))
-            percent = 100 * np.median([row["mesh_volume_mm3"] / row["volume_mm3"] - 1 for row in of_runs])
+            known = [row for row in of_runs if not row.is_lost]
+            dice.append(np.median([row.dice for row in of_runs]))
+            mean, p95 = np.median([(row.surface_mean_mm, row.surface_p95_mm) for row in known], axis=0)
+            percent = 100 * np.median([row.mesh_volume_mm3 / row.volume_mm3 - 1 for row in of_runs])
             expected = [f"{dice[-1]:.3f}", f"{mean:.2f} / {p95:.2f} mm", f"vol. {percent:+.1f} %".replace("-", "−")]
             assert texts == expected + ["lost in 1 of 3 runs"] * (len(known) == 2)
         if dice:
@@ -294,18 +314,19 @@ def test_labels_are_tabled_and_the_vanished_named(tmp_path):
     pieces, shares = Tables(page).tables[2:4]  # folded
     for k in range(4):
         for column, pipeline in enumerate(done, 2):
-            of_runs = [run["labels"][k] for run in pipeline["runs"]]
-            assert float(pieces[k + 1][column][1][0]) == np.median([row["mesh_components"] for row in of_runs])
-            assert close(shares[k + 1][column][1][0], np.median([row["E_D_share"] for row in of_runs]))
+            of_runs = [run.measurement.labels[k] for run in pipeline.runs]
+            assert float(pieces[k + 1][column][1][0]) == np.median([row.mesh_components for row in of_runs])
+            assert close(shares[k + 1][column][1][0], np.median([row.E_D_share for row in of_runs]))
 
 
 def test_most_of_many_labels_are_folded(tmp_path):
     """Forty labels: a dozen open to see, the rest behind a line, every one once."""
-    results = fake_results()
-    for pipeline in results["pipelines"]:
-        for run in pipeline["runs"]:
-            run["labels"] = [run["labels"][1] | {"label": k, "dice": 0.9 - 0.01 * k} for k in range(40)]
-    page = page_of(tmp_path, results)
+    report = fake_report()
+    for number, pipeline in enumerate(report.pipelines):
+        for run in pipeline.runs[:1]:
+            row = run.measurement.labels[1]
+            with_measured(report, number, labels=[row._replace(label=k, dice=0.9 - 0.01 * k) for k in range(40)])
+    page = page_of(tmp_path, report)
     open_, folded = ([int(row[0][1][0]) for row in table[1:]] for table in Tables(page).tables[1:3])
     assert open_ == list(range(39, 27, -1))
     assert folded == list(range(27, -1, -1))
@@ -313,13 +334,14 @@ def test_most_of_many_labels_are_folded(tmp_path):
 
 
 def with_dice(ours, theirs):
-    """Results in which tetopt and pytetwild have these Dice on labels 0, 1, ...; one surface is as far as the other."""
-    results = fake_results()
+    """tetopt and pytetwild have these Dice on labels 0, 1, ..., and the larger the Dice, the nearer the surface."""
+    report = fake_report()
     for number, values in ((0, ours), (1, theirs)):
-        for run in results["pipelines"][number]["runs"]:
-            for row, dice in zip(run["labels"], values, strict=False):
-                row |= {"dice": dice, "surface_mean_mm": 2.0 - dice}
-    return results
+        for run in report.pipelines[number].runs:
+            labels = run.measurement.labels
+            for k, dice in enumerate(values):
+                labels[k] = labels[k]._replace(dice=dice, surface_mean_mm=2.0 - dice)
+    return report
 
 
 def test_who_keeps_the_labels_is_said(tmp_path):
@@ -333,8 +355,7 @@ def test_who_keeps_the_labels_is_said(tmp_path):
     assert "Dice is at least pytetwild's on 2<" in page
     assert "is below" not in page
     assert "is larger than" not in page
-    results = with_dice((0.1, 0.9, 0.62), (0.99, 0.8, 0.62)) | {"labels": None}
-    page = page_of(tmp_path, results)
+    page = page_of(tmp_path, with_dice((0.1, 0.9, 0.62), (0.99, 0.8, 0.62))._replace(labels=None))
     assert "Dice is at least" not in page
     assert "background 0 not counted" not in page
 
@@ -371,18 +392,16 @@ def entries(*values):
     ],
 )
 def test_winners(better, values, expected):
-    assert winners(Measure("", "", lambda run: None, better), entries(*values)) == expected
+    assert winners(Criterion("", "", lambda run: None, better), entries(*values)) == expected
 
 
 def with_values(**shares):
-    """Results in which the named pipelines have these shares of E_D."""
-    results = fake_results()
-    for pipeline in results["pipelines"]:
-        if pipeline["name"] in shares:
-            value = shares[pipeline["name"]]
-            for word in ("median", "low", "high"):
-                pipeline[word]["E_D_share"] = value
-    return results
+    """A report in which the named pipelines have these shares of E_D."""
+    report = fake_report()
+    for number, pipeline in enumerate(report.pipelines):
+        if pipeline.name in shares:
+            with_measured(report, number, E_D_share=shares[pipeline.name])
+    return report
 
 
 E_D_ROW = ("Image", "E_D, share of the image's variance")
@@ -425,21 +444,21 @@ def test_a_loss_to_zero_and_a_narrow_one(tmp_path):
 
 
 def test_the_sentence_counts_what_the_table_marks(tmp_path):
-    page = page_of(tmp_path, fake_results())
+    page = page_of(tmp_path, fake_report())
     cells = [row[0] for row in headline(page).values()]
     n_best, n_lost = (sum(mark in classes for classes, _ in cells) for mark in ("best", "lost"))
     assert f"tetopt is best in {n_best} of {n_best + n_lost} measures" in page
     assert f"It loses in {n_lost}:" in page
     assert n_best > 0 < n_lost
-    titles = {measure.title for measure in measures(fake_results()) if measure.better == 0}
+    titles = {criterion.title for criterion in criteria(fake_report()) if criterion.better == 0}
     assert titles == {"nodes", "tetrahedra", "λ max"}
 
 
 def test_different_sizes_are_said(tmp_path):
-    assert "meshes differ in nodes" not in page_of(tmp_path, fake_results())
-    results = fake_results()
-    results["pipelines"][1]["median"]["n_nodes"] = 9000
-    assert "meshes differ in nodes (tetopt 5000, pytetwild 9000" in page_of(tmp_path, results)
+    assert "meshes differ in nodes" not in page_of(tmp_path, fake_report())
+    report = fake_report()
+    with_measured(report, 1, n_nodes=9000)
+    assert "meshes differ in nodes (tetopt 5000, pytetwild 9000" in page_of(tmp_path, report)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -447,38 +466,36 @@ def test_different_sizes_are_said(tmp_path):
 
 
 def test_a_failed_pipeline_is_named(tmp_path):
-    page = page_of(tmp_path, fake_results())
+    page = page_of(tmp_path, fake_report())
     assert "<strong>itk-cleaver failed:</strong> crashed: signal 11 after 3 s" in page
     assert all(row[2][1] == ["failed"] for row in headline(page).values())
     assert "Failed, see under the table: itk-cleaver." in page
 
 
 def test_tetopt_can_fail(tmp_path):
-    results = fake_results()
-    for word in ("median", "low", "high"):
-        del results["pipelines"][0][word]
-    results["pipelines"][0] |= {"failure": "timed out", "runs": []}
-    page = page_of(tmp_path, results)
+    report = fake_report()
+    report.pipelines[0] = with_runs(report.pipelines[0]._replace(failure="timed out"), [])
+    page = page_of(tmp_path, report)
     assert "<strong>tetopt failed.</strong>" in page
     assert "<strong>tetopt failed:</strong> timed out" in page
 
 
 def test_a_failed_repeat_is_named_beside_its_numbers(tmp_path):
-    results = fake_results()
-    results["pipelines"][1]["failure"] = "timed out after 3600 s"
-    page = page_of(tmp_path, results)
+    report = fake_report()
+    report.pipelines[1] = report.pipelines[1]._replace(failure="timed out after 3600 s")
+    page = page_of(tmp_path, report)
     assert "<strong>pytetwild, a run failed:</strong> timed out after 3600 s" in page
-    assert headline(page)[E_D_ROW][1][1][0] == number_text(results["pipelines"][1]["median"]["E_D_share"])
+    assert headline(page)[E_D_ROW][1][1][0] == number_text(report.pipelines[1].median.measurement.E_D_share)
 
 
 def test_without_labels_and_finite_elements(tmp_path):
-    results = fake_results() | {"labels": None, "reference": None}
-    for pipeline in results["pipelines"]:
-        for run in [*pipeline["runs"], *(pipeline.get(word, {}) for word in ("median", "low", "high"))]:
-            run |= {"labels": [], "fem": {}}
-    rows = headline(page_of(tmp_path, results))
+    report = fake_report()._replace(labels=None)
+    for number, pipeline in enumerate(report.pipelines):
+        if pipeline.runs:
+            with_measured(report, number, labels=[], fem={})
+    rows = headline(page_of(tmp_path, report))
     assert set(rows) == {title for title in PATHS if not title[0].startswith("Compression")}
-    assert entry(measures(results)[0], {"runs": []}) == Entry(None, None, None)
+    assert entry(criteria(report)[0], report.pipelines[2]) == Entry(None, None, None)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -486,22 +503,23 @@ def test_without_labels_and_finite_elements(tmp_path):
 
 
 def test_names_are_escaped(tmp_path):
-    results = fake_results()
+    report = fake_report()
     evil = "<script>alert(1)</script>\"'&"
-    results["image"]["name"] = results["command"] = results["law"] = evil
-    results["labels"]["name"] = results["options"]["k_D"] = evil
-    for pipeline in results["pipelines"]:
-        pipeline |= {"title": evil, "about": evil, "notes": [evil], "failure": evil}
-    page = page_of(tmp_path, results)
+    report = report._replace(
+        command=evil, law=evil, labels=report.labels._replace(name=evil), options=report.options._replace(k_D=evil),
+        image=report.image._replace(source=report.image.source._replace(name=evil)),
+        pipelines=[p._replace(title=evil, about=evil, notes=[evil], failure=evil) for p in report.pipelines],
+    )  # fmt: skip
+    page = page_of(tmp_path, report)
     assert "<script>alert" not in page
     assert html.escape(evil) in page
 
 
 def test_settings_are_shown(tmp_path):
-    results = fake_results()
-    page = page_of(tmp_path, results)
-    words = [results["command"], "a note on tetopt", "197 × 233 × 189", "ab" * 32, results["law"], "0.1.0", "435000"]
-    for word in [*words, *(p["about"] for p in results["pipelines"])]:
+    report = fake_report()
+    page = page_of(tmp_path, report)
+    words = [report.command, "a note on tetopt", "197 × 233 × 189", "ab" * 32, report.law, "0.1.0", "435000"]
+    for word in [*words, *(p.about for p in report.pipelines)]:
         assert html.escape(word) in page
 
 
@@ -512,15 +530,15 @@ def whole(tmp_path_factory):
     image = tetopt.load_phantom("two_spheres").image(voxel_mm=2.0)
     meshes = meshes_of(image, nodes=800, iterations=5)
     means = [tetopt.cell_moments(image, mesh).mean for _, mesh in meshes]
-    results = fake_results()
+    report = fake_report()
     figures = {
-        "slices": slices_figure(image, meshes, means), "histograms": histograms_figure(results),
-        "curves": curves_figure(results), "timing": timing_figure(results),
+        "slices": slices_figure(image, meshes, means), "histograms": histograms_figure(report),
+        "curves": curves_figure(report), "timing": timing_figure(report),
     }  # fmt: skip
     for name, figure in figures.items():
         save_figure(figure, folder / f"{name}.png", dpi=80)
     views = [view_of(mesh, mean, title) for (title, mesh), mean in zip(meshes, means, strict=True)]
-    save_compare_page(folder / "report.html", results, [(folder / f"{name}.png", name) for name in figures], views)
+    save_compare_page(folder / "report.html", report, [(folder / f"{name}.png", name) for name in figures], views)
     return folder / "report.html"
 
 

@@ -17,25 +17,27 @@ EQUAL, AS_LABELS = (
 
 
 @pytest.mark.parametrize(
-    ("image", "labels", "wanted", "notes"),
+    ("image", "labels", "content", "notes"),
     [(IMAGE, LABELS, BOTH, [EQUAL]), (LABELS, LABELS, ALONE, [AS_LABELS]), (IMAGE, None, IMAGE, [])],
 )
-def test_labels_that_are_given_are_meshed(image, labels, wanted, notes):
+def test_labels_that_are_given_are_meshed(image, labels, content, notes):
     """Besides the image, alone if the image is the labels; without any the image alone."""
-    made = PIPELINES["tetopt-uniform"](Job(image, labels, 200, iterations=2))
-    expected = tetopt.optimize(wanted, tetopt.lattice(image, nodes=200), k_D=0.2, iterations=2)
+    made = PIPELINES["tetopt-uniform"].function(Job(image, labels, 200, iterations=2))
+    expected = tetopt.optimize(content, tetopt.lattice(image, nodes=200), k_D=0.2, iterations=2)
     assert made.mesh.points.tobytes() == expected.mesh.points.tobytes()
     assert made.mesh.cells.tobytes() == expected.mesh.cells.tobytes()
     assert made.notes == [f"ended by: {expected.ended}", *notes]
 
 
 def test_the_graded_mesh_is_that_of_mesh_image():
-    made = PIPELINES["tetopt"](Job(IMAGE, LABELS, 300))
+    made = PIPELINES["tetopt"].function(Job(IMAGE, LABELS, 300))
     assert made.mesh.points.tobytes() == tetopt.mesh_image(BOTH, 300).mesh.points.tobytes()
     assert made.notes[1:] == [EQUAL]
 
 
 def test_the_other_pipelines_do_not_see_labels():
     for name in ("tetopt-paper", "odt", "bcc"):
-        with_labels, without = (PIPELINES[name](Job(IMAGE, labels, 100, iterations=1)) for labels in (LABELS, None))
+        with_labels, without = (
+            PIPELINES[name].function(Job(IMAGE, labels, 100, iterations=1)) for labels in (LABELS, None)
+        )
         assert with_labels.mesh.points.tobytes() == without.mesh.points.tobytes()

@@ -89,7 +89,7 @@ def baseline_command(
         json_path = checked_output(json_path, (".json",), force)
     image = read_volume(image_path, volume, crop)
     labels = None if labels_path is None else read_labels(labels_path, image, crop)
-    made = PIPELINES[pipeline.value](Job(image, labels, nodes, classes))
+    made = PIPELINES[pipeline.value].function(Job(image, labels, nodes, classes))
     measured = quality(made.mesh.points, made.mesh.cells)
     options = {"pipeline": pipeline.value, "nodes": nodes, "classes": classes}
     about = {"image": image_path.name, "image_sha256": sha256(image_path), "options": options}
@@ -151,6 +151,7 @@ def compare_command(
     """Set tetopt beside the conventional pipelines on a volume: fidelity, shape, simulation accuracy, time."""
     from tetopt.model.laws import parse_law
     from tetopt.study import compare, compare_files
+    from tetopt.study.compare_report import ImageSource, LabelSource, Settings
 
     if not 0.0 <= k_D < 1.0:
         raise InputError(f"--k-d: expected 0 <= k_D < 1, got {k_D}")
@@ -160,33 +161,28 @@ def compare_command(
     image = read_volume(image_path, volume, crop)
     labels = None if labels_path is None else read_labels(labels_path, image, crop)
     law, law_words = compare.default_law(image) if young is None else (parse_law(young), young)
-    settings = compare.Settings(
+    settings = Settings(
         nodes=nodes, pipelines=tuple(name.strip() for name in pipelines.split(",")), repeats=repeats, classes=classes,
         k_D=k_D, reference_dofs=reference_dofs, curve=_parse_curve(curve), tradeoff=tradeoff, max_seconds=max_seconds,
         max_bytes=None if max_gb is None else int(max_gb * 1e9),
     )  # fmt: skip
-    about = {
-        "command": f"tetopt {' '.join(map(shlex.quote, context.obj))}",
-        "image": {"name": image_path.name, "sha256": sha256(image_path), "volume": volume, "crop": crop},
-        "labels": None
-        if labels_path is None
-        else {"name": labels_path.name, "kind": "given", "sha256": sha256(labels_path)},
-        "law": law_words,
-    }
+    comparison = compare.Comparison(
+        image, labels, law, settings, ImageSource(image_path.name, sha256(image_path), volume, crop),
+        None if labels_path is None else LabelSource(labels_path.name, "given", sha256(labels_path)), law_words,
+        command=f"tetopt {' '.join(map(shlex.quote, context.obj))}",
+    )  # fmt: skip
     paths = compare_files.outputs(results_folder(output), force or resume)
     if (output / "runs").is_dir() and not (resume or force):
         raise InputError(f"{output / 'runs'}: finished runs are there; --resume keeps them, --force starts over")
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that the child is ended with us
     try:
-        results = compare_files.run(
-            paths, about, image, labels, law, settings, lambda text: log.print(escape(text)), resume=resume
-        )
+        report = compare_files.run(paths, comparison, lambda text: log.print(escape(text)), resume=resume)
     except KeyboardInterrupt:
         log.print(f"interrupted: {escape(str(output / 'runs'))} keeps the finished runs, --resume goes on from there")
         return 130
-    failed = [p["title"] for p in results["pipelines"] if p["failure"] is not None]
+    failed = [each.title for each in report.pipelines if each.failure is not None]
     words = f", of which failed: {', '.join(failed)}" if failed else ""
-    out.print(escape(f"{paths['report.html']}: {len(settings.pipelines)} pipelines{words}, {results['seconds']:.0f} s"))
+    out.print(escape(f"{paths['report.html']}: {len(settings.pipelines)} pipelines{words}, {report.seconds:.0f} s"))
     return 0
 
 

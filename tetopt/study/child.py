@@ -2,8 +2,8 @@
 
 The child is ``python -m tetopt.study.child FOLDER``; job and result are files in a temporary folder. Its memory,
 with that of the processes it starts, is watched from the parent as resident pages (VmRSS in /proc), not limited by
-RLIMIT_AS: numba, VTK and the allocators
-reserve far more address space than they ever touch, so a limit on that would end runs that need little.
+RLIMIT_AS: numba, VTK and the allocators reserve far more address space than they ever touch, so a limit on that would
+end runs that need little.
 """
 
 from __future__ import annotations
@@ -30,8 +30,8 @@ from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.study.pipelines import PIPELINES, Job, Produced
 
-POLL_SECONDS = 0.05
-MAXRSS_UNIT = 1 if sys.platform == "darwin" else 1024  # bytes in a unit of ru_maxrss
+POLL_SECONDS = 0.05  # between two looks at a child's memory: a fraction of what even a short run takes
+MAXRSS_UNIT_BYTES = 1 if sys.platform == "darwin" else 1024  # of ru_maxrss, as getrusage(2) has it
 
 
 class Outcome(NamedTuple):
@@ -133,11 +133,11 @@ def _own_peak_bytes() -> int:
 
     On Linux VmHWM, not ru_maxrss: the latter begins at the resident memory of the parent that started the process.
     """
-    waited = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * MAXRSS_UNIT
+    waited = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * MAXRSS_UNIT_BYTES
     own = Path("/proc/self")
     if own.exists():
         return max(waited, _status_bytes(own, "VmHWM"))
-    return max(waited, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * MAXRSS_UNIT)
+    return max(waited, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * MAXRSS_UNIT_BYTES)
 
 
 def _kill_group(child: subprocess.Popen) -> None:
@@ -181,13 +181,13 @@ def _read_job(folder: Path) -> tuple[str, Job]:
     with np.load(folder / "job.npz") as arrays:
         image = Image(arrays["image"], arrays["image_affine"])
         labels = Image(arrays["labels"], arrays["labels_affine"]) if "labels" in arrays else None
-    asked = json.loads((folder / "job.json").read_text(encoding="utf-8"))
-    return asked["pipeline"], Job(image, labels, **asked["options"])
+    words = json.loads((folder / "job.json").read_text(encoding="utf-8"))
+    return words["pipeline"], Job(image, labels, **words["options"])
 
 
 def _pipeline(name: str) -> Callable[[Job], Produced]:
     if name in PIPELINES:
-        return PIPELINES[name]
+        return PIPELINES[name].function
     module, function = name.split(":", 1)
     return getattr(importlib.import_module(module), function)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -18,22 +18,24 @@ from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.report.colours import grey_limits
+from tetopt.report.colours import UNCOVERED_COLOUR, grey_limits
 from tetopt.report.figures import MESH_LINE, SliceView
 from tetopt.report.viewer import view_of
+from tetopt.study.compare_report import CurvePoint, Measurement, PipelineResult, Report, Run
 from tetopt.study.pipelines import UNTIMED
 
 # Okabe and Ito's palette, told apart by the colour-blind, without its yellow, which vanishes on white.
-PALETTE = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000")
-MARKERS = ("o", "s", "^", "D", "v", "P", "X")
-DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (8, 2)), (0, (1, 2)))
-HATCHES = ("", "//", "..", "xx", "\\\\", "oo", "--")
-ERRORS = (
+LINE_COLOURS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000")
+LINE_MARKERS = ("o", "s", "^", "D", "v", "P", "X")
+LINE_DASHES = ("-", "--", "-.", ":", (0, (5, 1, 1, 1, 1, 1)), (0, (8, 2)), (0, (1, 2)))
+BAR_HATCHES = ("", "//", "..", "xx", "\\\\", "oo", "--")
+ERROR_TITLES = (
     ("strain_energy", "strain energy"),
     ("displacement", "displacement"),
     ("interface_strain", "strain at interfaces"),
 )
-UNCOVERED = "#cfe3f5"  # where a mesh leaves the image uncovered
+Value = Callable[[Measurement], Any]
+SHORT_RANGE = 12.0  # a logarithmic axis to less than this many times its start: powers of ten alone say too little
 
 
 def slices_figure(image: Image, meshes: Sequence[tuple[str, Mesh]], means: Sequence[NDArray[np.float64]]) -> Figure:
@@ -109,7 +111,7 @@ def _fill(
     # Antialiased, each border would let the background shine through as a light seam.
     painted = PolyCollection(list(polygons), array=values[cells], cmap=colours, edgecolors="none", antialiaseds=False)
     painted.set_clim(*limits)
-    axes.set_facecolor(UNCOVERED)
+    axes.set_facecolor(UNCOVERED_COLOUR)
     axes.add_collection(painted)
     return painted
 
@@ -129,7 +131,7 @@ def cutaways(meshes: Sequence[tuple[str, Mesh]], means: Sequence[NDArray[np.floa
     save_scenes(path, [(view.title, cutaway(view, limits)) for view in views], columns=3 if len(views) != 4 else 2)
 
 
-def histograms_figure(results: dict[str, Any]) -> Figure:
+def histograms_figure(report: Report) -> Figure:
     """Shares of cells by rho (left) and of dihedral angles (right), the pipelines' median runs over each other."""
     figure = Figure(figsize=(11.0, 4.4), layout="constrained")
     panels = figure.subplots(1, 2)
@@ -138,15 +140,12 @@ def histograms_figure(results: dict[str, Any]) -> Figure:
         ("dihedral_histogram", "dihedral angle, degrees (70.5 in a regular cell)", "share of angles"),
     )
     for axes, (name, across, up) in zip(panels, names, strict=True):
-        for number, pipeline in _finished(results):
-            histogram = pipeline["median"].get(name)
-            if histogram is None:
-                continue
-            share, edges = np.asarray(histogram["share"], dtype=np.float64), np.asarray(histogram["edges"])
+        for number, pipeline, run in _finished(report):
+            edges, share = getattr(run.measurement, name)
             style = _style(number)
-            if pipeline["kind"] == "tetopt":
+            if pipeline.kind == "tetopt":
                 axes.stairs(share, edges, fill=True, alpha=0.18, color=style["color"])
-            axes.stairs(share, edges, label=pipeline["title"], linewidth=1.8, **style)
+            axes.stairs(share, edges, label=pipeline.title, linewidth=1.8, **style)
         axes.set_xlabel(across)
         axes.set_ylabel(up)
         axes.set_ylim(bottom=0.0)
@@ -157,26 +156,26 @@ def histograms_figure(results: dict[str, Any]) -> Figure:
     return figure
 
 
-def labels_figure(results: dict[str, Any]) -> Figure:
+def labels_figure(report: Report) -> Figure:
     """Dice (top) and mean surface distance in mm (bottom) of each label, the largest on the left, a mark a pipeline.
 
     Medians over the runs; a label that is lost has Dice 0 and no distance. Labels stand in grey bars to hold on to.
     """
-    finished = _finished(results)
-    voxels = {row["label"]: row["voxels"] for _, p in finished for row in p["median"].get("labels") or ()}
+    finished = _finished(report)
+    voxels = {row.label: row.voxels for _, _, run in finished for row in run.measurement.labels}
     order = sorted(voxels, key=lambda label: -voxels[label])
     figure = Figure(figsize=(max(8.0, 2.0 + 0.32 * len(order)), 7.2), layout="constrained")
     panels = figure.subplots(2, 1, sharex=True, height_ratios=(3, 2))
     for axes, name in zip(panels, ("dice", "surface_mean_mm"), strict=True):
         for k in range(0, len(order), 2):
             axes.axvspan(k - 0.5, k + 0.5, color="#f1f1f1", zorder=0)
-        for place, (number, pipeline) in enumerate(finished):
-            rows = {row["label"]: row.get(name) for row in pipeline["median"].get("labels") or ()}
+        for place, (number, pipeline, run) in enumerate(finished):
+            values = {row.label: getattr(row, name) for row in run.measurement.labels}
             aside = 0.8 * ((place + 0.5) / len(finished) - 0.5)  # of a column, so that marks do not hide one another
-            points = [(k + aside, rows[label]) for k, label in enumerate(order) if rows.get(label) is not None]
+            points = [(k + aside, values[label]) for k, label in enumerate(order) if values.get(label) is not None]
             axes.plot(
-                [x for x, _ in points], [y for _, y in points], linestyle="none", marker=MARKERS[number % len(MARKERS)],
-                markersize=5, color=PALETTE[number % len(PALETTE)], label=pipeline["title"],
+                [x for x, _ in points], [y for _, y in points], linestyle="none", markersize=5, label=pipeline.title,
+                marker=LINE_MARKERS[number % len(LINE_MARKERS)], color=_style(number)["color"],
             )  # fmt: skip
         axes.grid(axis="y", color="#dddddd", linewidth=0.6)
     panels[0].set_ylabel("Dice")
@@ -192,26 +191,23 @@ def labels_figure(results: dict[str, Any]) -> Figure:
     return figure
 
 
-def curves_figure(results: dict[str, Any]) -> Figure:
+def curves_figure(report: Report) -> Figure:
     """Errors by number of nodes, logarithmic: a row for each Poisson's ratio, a column for each error.
 
     Without any finite-element result: E_D as a share of the image's variance instead.
     """
-    curves = results.get("curves") or []
-    ratios = sorted(
-        {nu for curve in curves for point in curve["points"] for nu in point.get("errors") or {}}, key=float
-    )
+    ratios = sorted({nu for curve in report.curves for point in curve.points for nu in point.errors}, key=float)
     rows = max(len(ratios), 1)
-    columns = len(ERRORS) if ratios else 1
+    columns = len(ERROR_TITLES) if ratios else 1
     figure = Figure(figsize=(13.0 if ratios else 6.5, 3.9 * rows + 0.5), layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False)
     for row, nu in enumerate(ratios):
-        for axes, (name, title) in zip(grid[row], ERRORS, strict=True):
-            _draw_curves(axes, results, lambda point, nu=nu, name=name: (point["errors"].get(nu) or {}).get(name))
+        for axes, (name, title) in zip(grid[row], ERROR_TITLES, strict=True):
+            _draw_curves(axes, report, _point_error(nu, name))
             axes.set_title(f"{title}, ν = {nu}", fontsize=11)
         grid[row, 0].set_ylabel("relative error")
     if not ratios:
-        _draw_curves(grid[0, 0], results, lambda point: point.get("E_D_share"))
+        _draw_curves(grid[0, 0], report, lambda point: point.E_D_share)
         grid[0, 0].set_ylabel("E_D, share of the image's variance")
     for axes in grid[-1]:
         axes.set_xlabel("nodes")
@@ -219,21 +215,25 @@ def curves_figure(results: dict[str, Any]) -> Figure:
     return figure
 
 
-def _draw_curves(axes: Axes, results: dict[str, Any], value: Any) -> None:
+def _point_error(nu: str, name: str) -> Callable[[CurvePoint], float | None]:
+    return lambda point: getattr(point.errors[nu], name) if nu in point.errors else None
+
+
+def _draw_curves(axes: Axes, report: Report, value: Callable[[CurvePoint], float | None]) -> None:
     """One line a pipeline, of `value(point)`; what has no logarithm is left out."""
-    order = {pipeline["name"]: number for number, pipeline in enumerate(results["pipelines"])}
-    for curve in results.get("curves") or []:
-        points = [(point["n_nodes"], value(point)) for point in curve["points"]]
+    order = {pipeline.name: number for number, pipeline in enumerate(report.pipelines)}
+    for curve in report.curves:
+        points = [(point.n_nodes, value(point)) for point in curve.points]
         points = sorted((nodes, error) for nodes, error in points if nodes and error is not None and error > 0.0)
         if points:
-            number = order.get(curve["name"], len(order))
-            marker = MARKERS[number % len(MARKERS)]
-            axes.plot(*zip(*points, strict=True), label=curve["title"], marker=marker, markersize=6, **_style(number))
+            number = order.get(curve.name, len(order))
+            marker = LINE_MARKERS[number % len(LINE_MARKERS)]
+            axes.plot(*zip(*points, strict=True), label=curve.title, marker=marker, markersize=6, **_style(number))
     axes.set_xscale("log")
     axes.set_yscale("log")
     for axis in (axes.xaxis, axes.yaxis):
         low, high = axis.get_view_interval()
-        if high < 12.0 * low:  # hardly a decade: its powers of ten alone would say too little
+        if high < SHORT_RANGE * low:
             axis.set_major_locator(LogLocator(subs=(1.0, 2.0, 3.0, 5.0)))
             axis.set_major_formatter("{x:g}")
         else:
@@ -242,20 +242,20 @@ def _draw_curves(axes: Axes, results: dict[str, Any], value: Any) -> None:
     axes.grid(which="both", color="#e4e4e4", linewidth=0.6)
 
 
-def tradeoff_figure(results: dict[str, Any]) -> Figure:
+def tradeoff_figure(report: Report) -> Figure:
     """What each option of a graded mesh trades: E_D's share against mean rho, angles and, where simulated, errors.
 
     A line for each option, its values along it, a star at the defaults; the other pipelines' medians as single points.
     """
-    nus = sorted({nu for row in results["tradeoff"] for nu in row["measured"]["fem"]}, key=float)[:1]
-    panels = [
-        ("mean rho (1/3: regular)", lambda run: run["quality"]["mean_rho"]),
-        ("dihedral angles: smallest (filled), 1st percentile (open)", lambda run: run["quality"]["min_dihedral"]),
+    nus = sorted({nu for row in report.tradeoff for nu in row.measured.fem}, key=float)[:1]
+    panels: list[tuple[str, Value]] = [
+        ("mean rho (1/3: regular)", lambda mesh: mesh.quality.mean_rho),
+        ("dihedral angles: smallest (filled), 1st percentile (open)", lambda mesh: mesh.quality.min_dihedral),
         *(
-            (f"{title} error, ν = {nu}", lambda run, nu=nu, name=name: run["fem"][nu]["errors"][name])
+            (f"{title} error, ν = {nu}", _error(nu, name))
             for nu in nus
-            for name, title in ERRORS
-            if all(row["measured"]["fem"][nu]["errors"][name] for row in results["tradeoff"])
+            for name, title in ERROR_TITLES
+            if all(_error(nu, name)(row.measured) for row in report.tradeoff)
         ),
     ]
     columns = 3 if len(panels) > 2 else len(panels)
@@ -263,15 +263,15 @@ def tradeoff_figure(results: dict[str, Any]) -> Figure:
     figure = Figure(figsize=(4.9 * columns, 4.3 * rows + 0.6), layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False).ravel()
     for number, (axes, (title, value)) in enumerate(zip(grid, panels, strict=False)):
-        _draw_tradeoff(axes, results, value)
+        _draw_tradeoff(axes, report, value)
         if number == 1:
-            _draw_tradeoff(axes, results, lambda run: run["quality"]["p1_dihedral"], is_open=True)
+            _draw_tradeoff(axes, report, lambda mesh: mesh.quality.p1_dihedral, is_open=True)
             axes.set_ylim(bottom=0.0)
         axes.set_title(title, fontsize=10)
         axes.set_xscale("log")
         axes.set_xlabel("E_D, share of the image's variance")
         low, high = axes.get_xlim()
-        if high < 12.0 * low:
+        if high < SHORT_RANGE * low:
             axes.xaxis.set_major_locator(LogLocator(subs=(1.0, 1.5, 2.0, 3.0, 5.0, 7.0)))
         axes.xaxis.set_major_formatter("{x:g}")
         axes.xaxis.set_minor_formatter(NullFormatter())
@@ -282,60 +282,63 @@ def tradeoff_figure(results: dict[str, Any]) -> Figure:
     return figure
 
 
-def _draw_tradeoff(axes: Axes, results: dict[str, Any], value: Any, is_open: bool = False) -> None:
-    """A line through the runs of each option, their values beside them; hollow and without words if open."""
-    options = list(dict.fromkeys(row["option"] for row in results["tradeoff"]))
+def _error(nu: str, name: str) -> Value:
+    return lambda mesh: getattr(mesh.fem[nu].errors, name)
+
+
+def _draw_tradeoff(axes: Axes, report: Report, value: Value, is_open: bool = False) -> None:
+    """A line through the meshes of each option, its values beside them; hollow and without words if open."""
+    options = list(dict.fromkeys(row.option for row in report.tradeoff))
     for number, option in enumerate(options):
-        rows = [row for row in results["tradeoff"] if row["option"] == option]
-        points = [(row["measured"]["E_D_share"], value(row["measured"])) for row in rows]
+        rows = [row for row in report.tradeoff if row.option == option]
+        points = [(row.measured.E_D_share, value(row.measured)) for row in rows]
         style = _style(number) | ({"markerfacecolor": "white", "alpha": 0.6} if is_open else {"label": option})
-        axes.plot(*zip(*points, strict=True), marker=MARKERS[number], markersize=5, linewidth=1.2, **style)
+        axes.plot(*zip(*points, strict=True), marker=LINE_MARKERS[number], markersize=5, linewidth=1.2, **style)
         for row, point in zip(rows, points, strict=True):
-            if not (is_open or row["is_default"]):
-                axes.annotate(
-                    f"{row['value']:.3g}", point, xytext=(4, 3), textcoords="offset points", fontsize=7,
-                    color=style["color"],
-                )  # fmt: skip
-    default = next(row["measured"] for row in results["tradeoff"] if row["is_default"])
+            if not (is_open or row.is_default):
+                _annotate(axes, f"{row.value:.3g}", point, (4, 3), style["color"])
+    default = next(row.measured for row in report.tradeoff if row.is_default)
+    place: tuple[Any, Any] = (default.E_D_share, value(default))
     axes.plot(
-        default["E_D_share"], value(default), marker="*", markersize=15, color="black", linestyle="none", zorder=5,
+        *place, marker="*", markersize=15, color="black", linestyle="none", zorder=5,
         markerfacecolor="white" if is_open else "black", label=None if is_open else "default",
     )  # fmt: skip
-    for pipeline in results["pipelines"]:
-        if "median" in pipeline and pipeline["kind"] != "tetopt" and pipeline["median"]["E_D_share"]:
-            run = pipeline["median"]
-            axes.plot(run["E_D_share"], value(run), marker="x", color="#666666", markersize=6, zorder=4)
+    for _, pipeline, run in _finished(report):
+        if pipeline.kind != "tetopt" and run.measurement.E_D_share:
+            place = (run.measurement.E_D_share, value(run.measurement))
+            axes.plot(*place, marker="x", color="#666666", markersize=6, zorder=4)
             if not is_open:
-                axes.annotate(
-                    pipeline["title"], (run["E_D_share"], value(run)), xytext=(5, -9), textcoords="offset points",
-                    fontsize=7, color="#444444",
-                )  # fmt: skip
+                _annotate(axes, pipeline.title, place, (5, -9), "#444444")
 
 
-def timing_figure(results: dict[str, Any]) -> Figure:
+def _annotate(axes: Axes, text: str, point: tuple[Any, Any], offset: tuple[int, int], colour: Any) -> None:
+    axes.annotate(text, point, xytext=offset, textcoords="offset points", fontsize=7, color=colour)
+
+
+def timing_figure(report: Report) -> Figure:
     """Wall seconds of each pipeline's median run as a bar, stacked by step; a failed pipeline's bar is the word."""
-    pipelines = results["pipelines"]
-    steps = list(dict.fromkeys(step for _, pipeline in _finished(results) for step in pipeline["median"]["seconds"]))
-    steps = [step for step in steps if step not in UNTIMED]
-    figure = Figure(figsize=(10.0, 0.62 * len(pipelines) + 1.6), layout="constrained")
+    timed = [
+        {} if pipeline.median is None else {k: v for k, v in pipeline.median.seconds.items() if k not in UNTIMED}
+        for pipeline in report.pipelines
+    ]
+    steps = list(dict.fromkeys(step for seconds in timed for step in seconds))
+    figure = Figure(figsize=(10.0, 0.62 * len(timed) + 1.6), layout="constrained")
     axes = figure.subplots()
-    for row, pipeline in enumerate(pipelines):
-        left = 0.0
-        if "median" not in pipeline:
+    for row, (pipeline, seconds_by_step) in enumerate(zip(report.pipelines, timed, strict=True)):
+        if pipeline.median is None:
             axes.text(0.0, row, " failed", va="center", color="#a00000")
             continue
-        for step, seconds in pipeline["median"]["seconds"].items():
-            if step in UNTIMED:
-                continue
+        left = 0.0
+        for step, seconds in seconds_by_step.items():
             number = steps.index(step)
             axes.barh(
-                row, seconds or 0.0, 0.62, left=left, color=PALETTE[(number + 1) % len(PALETTE)], edgecolor="white",
-                hatch=HATCHES[number % len(HATCHES)], label=step,
+                row, seconds, 0.62, left=left, color=LINE_COLOURS[(number + 1) % len(LINE_COLOURS)], edgecolor="white",
+                hatch=BAR_HATCHES[number % len(BAR_HATCHES)], label=step,
             )  # fmt: skip
-            left += seconds or 0.0
-        axes.text(left, row, f" {pipeline['median']['seconds_total']:.3g} s", va="center", fontsize=10)
-    axes.set_yticks(range(len(pipelines)), [pipeline["title"] for pipeline in pipelines])
-    axes.set_ylim(len(pipelines) - 0.4, -0.6)  # the first on top
+            left += seconds
+        axes.text(left, row, f" {pipeline.median.seconds_total:.3g} s", va="center", fontsize=10)
+    axes.set_yticks(range(len(timed)), [pipeline.title for pipeline in report.pipelines])
+    axes.set_ylim(len(timed) - 0.4, -0.6)  # the first on top
     axes.margins(x=0.12)
     axes.set_xlim(left=0.0)
     axes.set_xlabel("wall seconds, median run")
@@ -344,13 +347,13 @@ def timing_figure(results: dict[str, Any]) -> Figure:
     return figure
 
 
-def _finished(results: dict[str, Any]) -> list[tuple[int, dict[str, Any]]]:
-    """The pipelines with a mesh and their places in the list, which give them their colours."""
-    return [(number, each) for number, each in enumerate(results["pipelines"]) if "median" in each]
+def _finished(report: Report) -> list[tuple[int, PipelineResult, Run]]:
+    """The pipelines with a mesh: their places in the list, which give them their colours, and their median runs."""
+    return [(number, each, each.median) for number, each in enumerate(report.pipelines) if each.median is not None]
 
 
 def _style(number: int) -> dict[str, Any]:
-    return {"color": PALETTE[number % len(PALETTE)], "linestyle": DASHES[number % len(DASHES)]}
+    return {"color": LINE_COLOURS[number % len(LINE_COLOURS)], "linestyle": LINE_DASHES[number % len(LINE_DASHES)]}
 
 
 def _legend(figure: Figure, panels: Iterable[Axes]) -> None:

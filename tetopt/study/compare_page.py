@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import html
+import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
+from operator import attrgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -12,108 +14,112 @@ import numpy as np
 from tetopt.report import viewer
 from tetopt.report.page import paragraph_html, picture_html, section_html, table_html, write_page
 from tetopt.report.viewer import View, views_html
+from tetopt.study.compare_report import LabelRow, PipelineResult, ReferenceGrid, Report, Run
 from tetopt.study.pipelines import UNTIMED
 
-PLOTS = ("histograms", "curves", "tradeoff", "timing")  # stems of the pictures that come after the 3-D views
-BIG = 500  # voxels: labels with more are judged; of smaller ones a mesh of few nodes can only keep some
-UNFOLDED = 12  # labels whose rows are open to see
-Run = dict[str, Any]
+PLOT_STEMS = ("histograms", "curves", "tradeoff", "timing")  # of the pictures that come after the 3-D views
+JUDGED_VOXELS = 500  # labels with more are judged; of smaller ones a mesh of few nodes can only keep some
+UNFOLDED_LABELS = 12  # those whose rows are open to see: about a screen
+SIZE_TOLERANCE = 1.1  # meshes whose numbers of nodes differ by a larger factor are not compared without a word
 
 
-class Measure(NamedTuple):
-    """A row of the headline table."""
+class Criterion(NamedTuple):
+    """What a row of the headline table compares."""
 
     group: str
     title: str
-    value: Callable[[Run], Any]  # of a run; None if it has none
+    value: Callable[[Run], float | None]
     better: int  # -1 if smaller is better, +1 if larger, 0 if neither
-    is_derived: bool = False  # not in report.json itself: computed for each run
 
 
 class Entry(NamedTuple):
-    """What a pipeline has for a measure."""
+    """What a pipeline has for a criterion."""
 
     value: float | None  # median
     low: float | None
     high: float | None
 
 
-def save_compare_page(
-    path: Path, results: dict[str, Any], pictures: Sequence[tuple[Path, str]], views: Sequence[View]
-) -> None:
+def save_compare_page(path: Path, report: Report, pictures: Sequence[tuple[Path, str]], views: Sequence[View]) -> None:
     """Write the comparison as one HTML file without outside references, whole or not at all.
 
     Parameters
     ----------
     path : Path
-    results : dict
+    report : Report
         What `report.json` holds; every number on the page is one of these, rounded to four digits, or computed from
         them for the rows of label volumes, and nothing is measured here.
     pictures : sequence of (PNG path, caption)
-        Those named as in `PLOTS` come after the 3-D views, "labels" stands with the labels, the others before.
+        Those named as in `PLOT_STEMS` come after the 3-D views, "labels" stands with the labels, the others before.
     views : sequence of View
         Surfaces to turn; without any, the section is left out.
     """
     of_labels = [picture_html(*each) for each in pictures if Path(each[0]).stem == "labels"]
-    before = [picture_html(*each) for each in pictures if Path(each[0]).stem not in (*PLOTS, "labels")]
-    after = [picture_html(*each) for each in pictures if Path(each[0]).stem in PLOTS]
+    before = [picture_html(*each) for each in pictures if Path(each[0]).stem not in (*PLOT_STEMS, "labels")]
+    after = [picture_html(*each) for each in pictures if Path(each[0]).stem in PLOT_STEMS]
     sections = [
-        ("Result", [*_sentences(results), _headline_html(results), *_failures(results)]),
-        ("Labels", _labels_html(results, of_labels)),
+        ("Result", [*_sentences(report), _headline_html(report), *_failures(report)]),
+        ("Labels", _labels_html(report, of_labels)),
         ("The same slice through every mesh", before),
         ("Turn the meshes", [views_html(views)] if views else []),
         ("Shapes, errors by number of nodes, times", after),
-        ("Seconds by step", [_seconds_html(results)]),
-        ("Settings, versions and how to run it again", _settings_html(results)),
+        ("Seconds by step", [_seconds_html(report)]),
+        ("Settings, versions and how to run it again", _settings_html(report)),
     ]
     parts = [section_html(title, content) for title, content in sections if content]
-    write_page(path, f"tetopt compared on {results['image']['name']}", parts, _STYLE + viewer.VIEWS_STYLE)
+    write_page(path, f"tetopt compared on {report.image.source.name}", parts, _STYLE + viewer.VIEWS_STYLE)
 
 
 # --------------------------------------------------------------------------------------------------
-# Measures and winners
+# Criteria and winners
 
 
-def measures(results: dict[str, Any]) -> list[Measure]:
+def criteria(report: Report) -> list[Criterion]:
     """The rows of the headline table, in order."""
-    rows = [
-        Measure("Image", "E_D, share of the image's variance", _at("E_D_share"), -1),
-        Measure("Image", "voxels outside the mesh", _at("n_missed_voxels"), -1),
-        Measure("Size", "nodes", _at("n_nodes"), 0),
-        Measure("Size", "tetrahedra", _at("n_cells"), 0),
-        *(Measure("Shape", f"{word} rho", _at("quality", f"{word}_rho"), 1) for word in ("mean", "p1", "min")),
-    ]
     errors = {"mean": "(i) mean", "harmonic_mean": "(ii) harmonic mean", "l2": "(iii) L2", "worst": "(iv) worst"}
-    rows += [Measure("Shape", f"error {title}", _at("quality", "errors", name), -1) for name, title in errors.items()]
-    rows += [
-        Measure("Shape", "smallest dihedral angle, °", _at("quality", "min_dihedral"), 1),
-        Measure("Shape", "dihedral angle p1, °", _at("quality", "p1_dihedral"), 1),
-        Measure("Shape", "largest dihedral angle, °", _at("quality", "max_dihedral"), -1),
-        Measure("Shape", "cells under 10°", _at("quality", "n_under_10_degrees"), -1),
-    ]
     kinds = ("sliver", "cap", "needle", "wedge", "spade")
-    rows += [Measure("Shape", f"{kind}s", _at("quality", "kinds", kind), -1) for kind in kinds]
-    rows += _label_measures(results)
-    for nu in _ratios(results):
-        rows += _fem_measures(nu)
     return [
-        *rows,
-        Measure("Cost", "wall time, s", _at("seconds_total"), -1),
-        Measure("Cost", "peak memory, MB", lambda run: _scaled(run.get("peak_bytes"), 1e-6), -1),
+        Criterion("Image", "E_D, share of the image's variance", _at("E_D_share"), -1),
+        Criterion("Image", "voxels outside the mesh", _at("n_missed_voxels"), -1),
+        Criterion("Size", "nodes", _at("n_nodes"), 0),
+        Criterion("Size", "tetrahedra", _at("n_cells"), 0),
+        *(Criterion("Shape", f"{word} rho", _at("quality", f"{word}_rho"), 1) for word in ("mean", "p1", "min")),
+        *(Criterion("Shape", f"error {title}", _at("quality", "errors", name), -1) for name, title in errors.items()),
+        Criterion("Shape", "smallest dihedral angle, °", _at("quality", "min_dihedral"), 1),
+        Criterion("Shape", "dihedral angle p1, °", _at("quality", "p1_dihedral"), 1),
+        Criterion("Shape", "largest dihedral angle, °", _at("quality", "max_dihedral"), -1),
+        Criterion("Shape", "cells under 10°", _at("quality", "n_under_10_degrees"), -1),
+        *(Criterion("Shape", f"{kind}s", _at("quality", "kinds", kind), -1) for kind in kinds),
+        *_label_criteria(report),
+        *(criterion for nu in _ratios(report) for criterion in _fem_criteria(nu)),
+        Criterion("Cost", "wall time, s", lambda run: run.seconds_total, -1),
+        Criterion("Cost", "peak memory, MB", lambda run: run.peak_bytes * 1e-6, -1),
     ]
 
 
-def _label_measures(results: dict[str, Any]) -> list[Measure]:
-    judged = _judged(results)
+def _at(*keys: str) -> Callable[[Run], float | None]:
+    """What stands at this place of a run's measurement; None where a table on the way has no such row."""
 
-    def over(of: Callable[[list[float]], float], value: Callable[[Run], Any]) -> Callable[[Run], Any]:
-        def found(run: Run) -> float | None:
-            values = [_number(value(row)) for row in run.get("labels") or () if row["label"] in judged]
-            known = [v for v in values if v is not None]
+    def value(run: Run) -> Any:
+        item: Any = run.measurement
+        for key in keys:
+            if item is not None:
+                item = item.get(key) if isinstance(item, dict) else getattr(item, key)
+        return item
+
+    return value
+
+
+def _label_criteria(report: Report) -> list[Criterion]:
+    judged = _judged(report)
+
+    def over(of: Callable[[list[float]], float], value: Callable[[LabelRow], Any]) -> Callable[[Run], float | None]:
+        def of_run(run: Run) -> float | None:
+            values = [value(row) for row in run.measurement.labels if row.label in judged]
             # Without a lost label, which has no surface, the mean over the others would flatter.
-            return of(known) if known and len(known) == len(values) else None
+            return of(values) if values and None not in values else None
 
-        return found
+        return of_run
 
     def mean(values: list[float]) -> float:
         return sum(values) / len(values)
@@ -121,48 +127,42 @@ def _label_measures(results: dict[str, Any]) -> list[Measure]:
     def largest_error(values: list[float]) -> float:
         return max(map(abs, values))
 
-    rows = [
-        ("mean label Dice", over(mean, _at("dice")), 1),
-        ("smallest label Dice", over(min, _at("dice")), 1),
-        ("mean label surface distance, mm", over(mean, _at("surface_mean_mm")), -1),
-        ("label surface distance p95, mm", over(mean, _at("surface_p95_mm")), -1),
+    rows: list[tuple[str, Callable[[Run], float | None], int]] = [
+        ("mean label Dice", over(mean, attrgetter("dice")), 1),
+        ("smallest label Dice", over(min, attrgetter("dice")), 1),
+        ("mean label surface distance, mm", over(mean, attrgetter("surface_mean_mm")), -1),
+        ("label surface distance p95, mm", over(mean, attrgetter("surface_p95_mm")), -1),
         ("largest label volume error", over(largest_error, _volume_error), -1),
-        ("labels in more or fewer pieces", over(sum, _is_in_other_pieces), -1),
+        ("labels in more or fewer pieces", over(sum, lambda row: row.mesh_components != row.components), -1),
         ("labels lost (of any size)", _n_lost, -1),
     ]
-    return [Measure(f"Labels {_which(results)}", *row, is_derived=True) for row in rows]
+    return [Criterion(f"Labels {_which(report)}", *row) for row in rows]
 
 
-def _judged(results: dict[str, Any]) -> dict[Any, int]:
-    """Voxels of the labels that are judged: more than `BIG` if any has, and not a given segmentation's background."""
-    voxels = _voxels_by_label(results)
-    if _has_background(results):
+def _judged(report: Report) -> dict[int, int]:
+    """Voxels of the labels that are judged: the large ones if there are any, and no given segmentation's background."""
+    voxels = _voxels_by_label(report)
+    if _has_background(report):
         del voxels[0]
-    return {label: n for label, n in voxels.items() if n > BIG} or voxels
+    return {label: n for label, n in voxels.items() if n > JUDGED_VOXELS} or voxels
 
 
-def _is_given(results: dict[str, Any]) -> bool:
-    return (results.get("labels") or {}).get("kind") == "given"
+def _has_background(report: Report) -> bool:
+    return report.labels is not None and {0} < set(_voxels_by_label(report))
 
 
-def _has_background(results: dict[str, Any]) -> bool:
-    return _is_given(results) and {0} < set(_voxels_by_label(results))
-
-
-def _which(results: dict[str, Any]) -> str:
+def _which(report: Report) -> str:
     """Which labels are judged, in words."""
-    is_big = any(n > BIG for n in _judged(results).values())
-    size = f"above {BIG} voxels" if is_big else "of any size"
-    return f"{size}, background 0 not counted" if _has_background(results) else size
+    is_large = any(n > JUDGED_VOXELS for n in _judged(report).values())
+    size = f"above {JUDGED_VOXELS} voxels" if is_large else "of any size"
+    return f"{size}, background 0 not counted" if _has_background(report) else size
 
 
-def _voxels_by_label(results: dict[str, Any]) -> dict[Any, int]:
-    runs = (run for pipeline in results["pipelines"] for run in pipeline["runs"])
-    return {row["label"]: row["voxels"] for run in runs for row in run.get("labels") or ()}
+def _voxels_by_label(report: Report) -> dict[int, int]:
+    return {row.label: row.voxels for each in report.pipelines for run in each.runs for row in run.measurement.labels}
 
 
-def _fem_measures(nu: str) -> list[Measure]:
-    group = f"Compression, ν = {nu}"
+def _fem_criteria(nu: str) -> list[Criterion]:
     rows = [
         ("strain-energy error", _at("fem", nu, "errors", "strain_energy"), -1),
         ("displacement error", _at("fem", nu, "errors", "displacement"), -1),
@@ -171,27 +171,21 @@ def _fem_measures(nu: str) -> list[Measure]:
         ("condition number", _at("fem", nu, "cond"), -1),
         ("CG iterations", _at("fem", nu, "cg_iterations"), -1),
     ]
-    return [Measure(group, title, value, better) for title, value, better in rows]
+    return [Criterion(f"Compression, ν = {nu}", *row) for row in rows]
 
 
-def entry(measure: Measure, pipeline: dict[str, Any]) -> Entry:
-    """Median and range of a measure over a pipeline's runs; without a run that ended, all None."""
-    if "median" not in pipeline:
-        return Entry(None, None, None)
-    if not measure.is_derived:
-        return Entry(*(_number(measure.value(pipeline.get(word, {}))) for word in ("median", "low", "high")))
-    values = [number for run in pipeline["runs"] if (number := _number(measure.value(run))) is not None]
-    if not values:
-        return Entry(None, None, None)
-    return Entry(float(np.median(values)), min(values), max(values))
+def entry(criterion: Criterion, pipeline: PipelineResult) -> Entry:
+    """Median and range over a pipeline's runs; all None if no run has a value."""
+    values = [value for run in pipeline.runs if (value := criterion.value(run)) is not None]
+    return Entry(float(np.median(values)), min(values), max(values)) if values else Entry(None, None, None)
 
 
-def winners(measure: Measure, entries: Sequence[Entry]) -> list[int]:
+def winners(criterion: Criterion, entries: Sequence[Entry]) -> list[int]:
     """Places of the best medians, equal ones as printed included; none if fewer than two differ."""
     known = [(number, each.value) for number, each in enumerate(entries) if each.value is not None]
-    if measure.better == 0 or len({number_text(value) for _, value in known}) < 2:
+    if criterion.better == 0 or len({number_text(value) for _, value in known}) < 2:
         return []
-    best = max(known, key=lambda pair: measure.better * pair[1])[1]
+    best = max(known, key=lambda pair: criterion.better * pair[1])[1]
     return [number for number, value in known if number_text(value) == number_text(best)]
 
 
@@ -204,7 +198,7 @@ def number_text(value: float | None) -> str:
     return f"{value:.0f}" if 1e4 <= abs(value) < 1e9 else f"{value:.4g}"
 
 
-def _loss(measure: Measure, value: float | None, best: float) -> str:
+def _loss(value: float | None, best: float) -> str:
     """How far tetopt is from the best, in words."""
     if value is None:
         return "no value"
@@ -215,129 +209,102 @@ def _loss(measure: Measure, value: float | None, best: float) -> str:
     return f"{number_text(abs(value - best))} from best"
 
 
-def _at(*keys: str) -> Callable[[Run], Any]:
-    def value(run: Run) -> Any:
-        found: Any = run
-        for key in keys:
-            found = found.get(key) if isinstance(found, dict) else None
-        return found
-
-    return value
-
-
-def _volume_error(row: dict[str, Any]) -> float | None:
+def _volume_error(row: LabelRow) -> float | None:
     """Of a label in the mesh, as a share of its volume in the image."""
-    found, given = row.get("mesh_volume_mm3"), row.get("volume_mm3")
-    return found / given - 1.0 if given and found is not None else None
-
-
-def _is_in_other_pieces(row: dict[str, Any]) -> bool | None:
-    found, given = row.get("mesh_components"), row.get("components")
-    return None if found is None or given is None else found != given
+    return row.mesh_volume_mm3 / row.volume_mm3 - 1.0 if row.volume_mm3 else None
 
 
 def _n_lost(run: Run) -> int | None:
-    rows = run.get("labels") or ()
-    return sum(bool(row["is_lost"]) for row in rows) if rows else None
+    labels = run.measurement.labels
+    return sum(row.is_lost for row in labels) if labels else None
 
 
-def _number(value: Any) -> float | None:
-    return float(value) if value is not None and np.isfinite(value) else None
-
-
-def _scaled(value: float | None, factor: float) -> float | None:
-    return None if value is None else value * factor
-
-
-def _ratios(results: dict[str, Any]) -> list[str]:
+def _ratios(report: Report) -> list[str]:
     """Poisson's ratios of which any pipeline has a result."""
-    found = {nu for pipeline in results["pipelines"] for nu in pipeline.get("median", {}).get("fem") or {}}
-    return sorted(found, key=float)
+    return sorted({nu for each in report.pipelines for run in each.runs for nu in run.measurement.fem}, key=float)
 
 
 # --------------------------------------------------------------------------------------------------
 # The headline
 
 
-def _headline_html(results: dict[str, Any]) -> str:
-    pipelines = results["pipelines"]
+def _headline_html(report: Report) -> str:
+    pipelines = report.pipelines
     heads = "".join(_head_cell(pipeline) for pipeline in pipelines)
     lines = [
         '<div class="wide"><table class="headline">',
         f'<thead><tr><th scope="col">median of the runs</th>{heads}</tr></thead>',
     ]
     group = None
-    for measure in measures(results):
-        entries = [entry(measure, pipeline) for pipeline in pipelines]
+    for criterion in criteria(report):
+        entries = [entry(criterion, pipeline) for pipeline in pipelines]
         if all(each.value is None for each in entries):
             continue
-        if measure.group != group:
-            group = measure.group
+        if criterion.group != group:
+            group = criterion.group
             head = f'<th scope="rowgroup" colspan="{len(pipelines) + 1}"><span>{html.escape(group)}</span></th>'
             lines.append(f'<tbody><tr class="group">{head}</tr>')
-        lines.append(_row_html(measure, pipelines, entries))
+        lines.append(_row_html(criterion, pipelines, entries))
     return "\n".join([*lines, "</table></div>", _KEY])
 
 
-def _head_cell(pipeline: dict[str, Any]) -> str:
-    n_runs = len(pipeline.get("runs") or ())
-    notes = [pipeline["kind"]] if pipeline["kind"] != "tetopt" else []
-    if "median" not in pipeline:
+def _head_cell(pipeline: PipelineResult) -> str:
+    notes = [pipeline.kind] if pipeline.kind != "tetopt" else []
+    if pipeline.median is None:
         notes = [*notes, "failed"]
-    elif pipeline.get("failure"):
+    elif pipeline.failure:
         notes = [*notes, "a run failed"]
-    if n_runs > 1:
-        notes = [*notes, f"{n_runs} runs"]
+    if len(pipeline.runs) > 1:
+        notes = [*notes, f"{len(pipeline.runs)} runs"]
     note = f"<small>{html.escape(', '.join(notes))}</small>" if notes else ""
-    return f'<th scope="col" class="{html.escape(pipeline["kind"])}">{html.escape(pipeline["title"])}{note}</th>'
+    return f'<th scope="col" class="{html.escape(pipeline.kind)}">{html.escape(pipeline.title)}{note}</th>'
 
 
-def _row_html(measure: Measure, pipelines: Sequence[dict[str, Any]], entries: Sequence[Entry]) -> str:
-    best = winners(measure, entries)
+def _row_html(criterion: Criterion, pipelines: Sequence[PipelineResult], entries: Sequence[Entry]) -> str:
+    best = winners(criterion, entries)
     cells = []
     is_lost = False
     for number, (pipeline, each) in enumerate(zip(pipelines, entries, strict=True)):
-        kinds, mark = [pipeline["kind"]], ""
+        kinds, mark = [pipeline.kind], ""
         if number in best:
             kinds.append("best")
             mark = '<b class="mark">best</b>' if len(best) == 1 else '<b class="mark">best, tied</b>'
-        elif best and pipeline["kind"] == "tetopt":
+        elif best and pipeline.kind == "tetopt":
             is_lost = True
             kinds.append("lost")
             top = entries[best[0]].value
             assert top is not None, "a winner has a value"
-            mark = f'<b class="mark">loses: {html.escape(_loss(measure, each.value, top))}</b>'
+            mark = f'<b class="mark">loses: {html.escape(_loss(each.value, top))}</b>'
         cells.append(f'<td class="{html.escape(" ".join(kinds))}">{_value_html(pipeline, each)}{mark}</td>')
-    arrow = {-1: " ↓", 1: " ↑", 0: ""}[measure.better]
+    arrow = {-1: " ↓", 1: " ↑", 0: ""}[criterion.better]
     row = '<tr class="loses">' if is_lost else "<tr>"
-    return f'{row}<th scope="row">{html.escape(measure.title)}{arrow}</th>{"".join(cells)}</tr>'
+    return f'{row}<th scope="row">{html.escape(criterion.title)}{arrow}</th>{"".join(cells)}</tr>'
 
 
-def _value_html(pipeline: dict[str, Any], each: Entry) -> str:
-    if "median" not in pipeline:
+def _value_html(pipeline: PipelineResult, each: Entry) -> str:
+    if pipeline.median is None:
         return '<span class="failed">failed</span>'
     text = f'<span class="value">{number_text(each.value)}</span>'
-    is_range = each.low is not None and each.high is not None and len(pipeline["runs"]) > 1
+    is_range = each.value is not None and len(pipeline.runs) > 1
     return text + f"<small>{number_text(each.low)} to {number_text(each.high)}</small>" if is_range else text
 
 
-def _sentences(results: dict[str, Any]) -> list[str]:
+def _sentences(report: Report) -> list[str]:
     """What to read first: where tetopt is best, where it loses and to whom, and what makes that uneven."""
-    pipelines = results["pipelines"]
-    words = _label_sentences(results)
+    pipelines = report.pipelines
+    words = _label_sentences(report)
     for number, pipeline in enumerate(pipelines):
-        if pipeline["kind"] == "tetopt":
-            if "median" in pipeline:
-                words += _verdict(results, number)
+        if pipeline.kind == "tetopt":
+            if pipeline.median is not None:
+                words += _verdict(report, number)
             else:
-                words.append(f"<p><strong>{html.escape(pipeline['title'])} failed.</strong></p>")
-    failed = [each["title"] for each in pipelines if "median" not in each and each["kind"] != "tetopt"]
+                words.append(f"<p><strong>{html.escape(pipeline.title)} failed.</strong></p>")
+    failed = [each.title for each in pipelines if each.median is None and each.kind != "tetopt"]
     if failed:
         words.append(paragraph_html(f"Failed, see under the table: {', '.join(failed)}."))
-    sizes = {each["title"]: each["median"].get("n_nodes") for each in pipelines if "median" in each}
-    known = {title: nodes for title, nodes in sizes.items() if nodes}
-    if known and max(known.values()) > 1.1 * min(known.values()):
-        counts = ", ".join(f"{title} {number_text(nodes)}" for title, nodes in known.items())
+    sizes = {each.title: each.median.measurement.n_nodes for each in pipelines if each.median is not None}
+    if sizes and max(sizes.values()) > SIZE_TOLERANCE * min(sizes.values()):
+        counts = ", ".join(f"{title} {number_text(nodes)}" for title, nodes in sizes.items())
         words.append(
             paragraph_html(
                 f"The meshes differ in nodes ({counts}), and more nodes alone make E_D and the errors smaller; "
@@ -347,31 +314,31 @@ def _sentences(results: dict[str, Any]) -> list[str]:
     return words
 
 
-def _verdict(results: dict[str, Any], number: int) -> list[str]:
+def _verdict(report: Report, number: int) -> list[str]:
     """Where the pipeline at this place of the list is best and where it loses, as two or three paragraphs."""
-    pipelines = results["pipelines"]
-    title = html.escape(pipelines[number]["title"])
+    pipelines = report.pipelines
+    title = html.escape(pipelines[number].title)
     won: list[str] = []
     lost: dict[str, list[str]] = {}
     n_judged = n_lost_to_peers = 0
-    for measure in measures(results):
-        entries = [entry(measure, pipeline) for pipeline in pipelines]
-        best = winners(measure, entries)
+    for criterion in criteria(report):
+        entries = [entry(criterion, pipeline) for pipeline in pipelines]
+        best = winners(criterion, entries)
         if not best:
             continue
         n_judged += 1
-        name = measure.title.removesuffix(", °").removesuffix(", s").removesuffix(", MB").removesuffix(", mm")
-        if measure.group.startswith("Compression, "):
-            name += f" ({measure.group.removeprefix('Compression, ')})"
+        name = re.sub(", (°|s|MB|mm)$", "", criterion.title)
+        if criterion.group.startswith("Compression, "):
+            name += f" ({criterion.group.removeprefix('Compression, ')})"
         if number in best:
             won.append(name)
             continue
-        lost.setdefault(" and ".join(pipelines[k]["title"] for k in best), []).append(name)
+        lost.setdefault(" and ".join(pipelines[k].title for k in best), []).append(name)
         rest = [
-            each if pipeline["kind"] != "control" else Entry(None, None, None)
+            each if pipeline.kind != "control" else Entry(None, None, None)
             for pipeline, each in zip(pipelines, entries, strict=True)
         ]
-        best_of_peers = winners(measure, rest)
+        best_of_peers = winners(criterion, rest)
         n_lost_to_peers += bool(best_of_peers) and number not in best_of_peers
     if not n_judged:
         return [f"<p>Nothing to compare {title} with.</p>"]
@@ -380,22 +347,22 @@ def _verdict(results: dict[str, Any], number: int) -> list[str]:
         items = "".join(f"<li>to {html.escape(to)}{_list(names)}</li>" for to, names in lost.items())
         n_lost = sum(len(names) for names in lost.values())
         words.append(f"<p><strong>It loses in {n_lost}:</strong></p><ul>{items}</ul>")
-    if lost and any(each["kind"] == "control" for each in pipelines):
+    if lost and any(each.kind == "control" for each in pipelines):
         words.append(
             f"<p>Without the controls, which do not see the image, it would lose in {n_lost_to_peers} of them.</p>"
         )
     return words
 
 
-def _label_sentences(results: dict[str, Any]) -> list[str]:
+def _label_sentences(report: Report) -> list[str]:
     """Of labels that are given: on how many the first tetopt is no worse than each peer, and on which it is."""
-    done = [pipeline for pipeline in results["pipelines"] if "median" in pipeline]
-    ours = [pipeline for pipeline in done if pipeline["kind"] == "tetopt"][:1]
-    peers = [pipeline for pipeline in done if pipeline["kind"] == "peer"]
-    judged = _judged(results)
-    if not _is_given(results) or not judged:
+    done = [pipeline for pipeline in report.pipelines if pipeline.median is not None]
+    ours = [pipeline for pipeline in done if pipeline.kind == "tetopt"][:1]
+    peers = [pipeline for pipeline in done if pipeline.kind == "peer"]
+    judged = _judged(report)
+    if report.labels is None or not judged:
         return []
-    words = [line for own in ours for peer in peers for line in _label_verdict(own, peer, judged, _which(results))]
+    words = [line for own in ours for peer in peers for line in _label_verdict(own, peer, judged, _which(report))]
     how = (
         "tetopt's own meshes, but not those of the paper's scheme, are to show the labels besides the image; E_D and "
         "the simulation judge the image alone."
@@ -403,12 +370,12 @@ def _label_sentences(results: dict[str, Any]) -> list[str]:
     return [*words, paragraph_html(how)] if ours else []
 
 
-def _label_verdict(ours: dict[str, Any], peer: dict[str, Any], judged: Iterable[Any], which: str) -> Iterator[str]:
-    pairs = {label: (_of_label(ours, label), _of_label(peer, label)) for label in judged}
+def _label_verdict(ours: PipelineResult, peer: PipelineResult, judged: Iterable[int], which: str) -> Iterator[str]:
+    pairs = {label: (_label_medians(ours, label), _label_medians(peer, label)) for label in judged}
     dice = [(round(own.dice or 0.0, 4), round(other.dice or 0.0, 4), label) for label, (own, other) in pairs.items()]
     worse = sorted((row for row in dice if row[0] < row[1]), key=lambda row: row[0] - row[1])
     farther = [label for label, (own, other) in pairs.items() if _is_farther(own.surface_mean, other.surface_mean)]
-    title, other = html.escape(ours["title"]), html.escape(peer["title"])
+    title, other = html.escape(ours.title), html.escape(peer.title)
     yield (
         f"<p><strong>Of {len(pairs)} labels {which}, {title}'s Dice is at least {other}'s on {len(pairs) - len(worse)}"
         f"</strong>, and its mean surface distance no larger on {len(pairs) - len(farther)}.</p>"
@@ -429,11 +396,11 @@ def _list(names: Sequence[str]) -> str:
     return f": {html.escape(', '.join(names))}" if names else ""
 
 
-def _failures(results: dict[str, Any]) -> Iterator[str]:
-    for pipeline in results["pipelines"]:
-        if pipeline.get("failure"):
-            what = ", a run failed" if "median" in pipeline else " failed"
-            title, failure = html.escape(pipeline["title"]), html.escape(pipeline["failure"])
+def _failures(report: Report) -> Iterator[str]:
+    for pipeline in report.pipelines:
+        if pipeline.failure:
+            what = " failed" if pipeline.median is None else ", a run failed"
+            title, failure = html.escape(pipeline.title), html.escape(pipeline.failure)
             yield f'<p class="failed"><strong>{title}{what}:</strong> {failure}</p>'
 
 
@@ -441,7 +408,7 @@ def _failures(results: dict[str, Any]) -> Iterator[str]:
 # Labels, times, settings
 
 
-class OfLabel(NamedTuple):
+class LabelMedians(NamedTuple):
     """What a pipeline's runs make of a label: medians, None where no run has a value."""
 
     dice: float | None
@@ -454,50 +421,45 @@ class OfLabel(NamedTuple):
     n_runs: int
 
 
-def _of_label(pipeline: dict[str, Any], label: Any) -> OfLabel:
-    rows = [row for run in pipeline["runs"] for row in run.get("labels") or () if row["label"] == label]
+def _label_medians(pipeline: PipelineResult, label: int) -> LabelMedians:
+    rows = [row for run in pipeline.runs for row in run.measurement.labels if row.label == label]
 
-    def median(value: Callable[[dict[str, Any]], Any]) -> float | None:
-        known = [number for row in rows if (number := _number(value(row))) is not None]
-        return float(np.median(known)) if known else None
+    def median(value: Callable[[LabelRow], float | None]) -> float | None:
+        values = [number for row in rows if (number := value(row)) is not None]
+        return float(np.median(values)) if values else None
 
-    return OfLabel(
-        median(_at("dice")), median(_at("surface_mean_mm")), median(_at("surface_p95_mm")), median(_volume_error),
-        median(_at("mesh_components")), median(_at("E_D_share")), sum(bool(row["is_lost"]) for row in rows), len(rows),
-    )  # fmt: skip
+    names = ("dice", "surface_mean_mm", "surface_p95_mm", "mesh_components", "E_D_share")
+    dice, mean, p95, pieces, share = (median(attrgetter(name)) for name in names)
+    n_lost = sum(row.is_lost for row in rows)
+    return LabelMedians(dice, mean, p95, median(_volume_error), pieces, share, n_lost, len(rows))
 
 
-def _labels_html(results: dict[str, Any], pictures: Sequence[str]) -> list[str]:
+def _labels_html(report: Report, pictures: Sequence[str]) -> list[str]:
     """Vanished structures by name, the picture, then a row for each label, the worst first and the others folded."""
-    done = [pipeline for pipeline in results["pipelines"] if "median" in pipeline]
-    voxels = _voxels_by_label(results)
+    done = [pipeline for pipeline in report.pipelines if pipeline.median is not None]
+    voxels = _voxels_by_label(report)
     if not voxels:
         return []
-    is_given = _is_given(results)
-    origin = f"The labels of {results['labels']['name']}." if is_given else "Classes of the voxels' intensities."
-    found = {label: [_of_label(pipeline, label) for pipeline in done] for label in voxels}
-    first = next((k for k, pipeline in enumerate(done) if pipeline["kind"] == "tetopt"), 0)
-    order = sorted(voxels, key=lambda label: (found[label][first].dice or 0.0, voxels[label]))
-    open_, folded = order[:UNFOLDED], order[UNFOLDED:]
+    medians = {label: [_label_medians(pipeline, label) for pipeline in done] for label in voxels}
+    first = next((k for k, pipeline in enumerate(done) if pipeline.kind == "tetopt"), 0)
+    order = sorted(voxels, key=lambda label: (medians[label][first].dice or 0.0, voxels[label]))
+    open_, folded = order[:UNFOLDED_LABELS], order[UNFOLDED_LABELS:]
+    origin = f"The labels of {report.labels.name}." if report.labels else "Classes of the voxels' intensities."
     how = (
         f"{origin} Each cell counts for the label that most of its voxels carry. In the table, for each label and mesh:"
         " Dice; mean and 95th percentile of the distance between the label's surfaces in mesh and image, both ways; "
-        f"error of its volume. Labels on which {done[first]['title']} has the lowest Dice come first."
+        f"error of its volume. Labels on which {done[first].title} has the lowest Dice come first."
     )
-    words = [paragraph_html(how), _vanished_html(done, found, voxels), *pictures]
-    words.append(_label_table_html(done, found, voxels, open_))
+    words = [paragraph_html(how), _vanished_html(done, medians, voxels), *pictures]
+    words.append(_label_table_html(done, medians, voxels, open_))
     if folded:
-        words.append(_folded(f"The other {len(folded)} labels", _label_table_html(done, found, voxels, folded)))
-    components = {
-        row["label"]: row.get("components")
-        for pipeline in done for run in pipeline["runs"] for row in run.get("labels") or ()
-    }  # fmt: skip
-    pieces = [["label", "in the image", *(pipeline["title"] for pipeline in done)]]
-    shares = [["label", "voxels", *(pipeline["title"] for pipeline in done)]]
-    for label in voxels:
-        given = number_text(_number(components[label]))
-        pieces.append([_text(label), given, *(number_text(each.pieces) for each in found[label])])
-        shares.append([_text(label), str(voxels[label]), *(number_text(each.E_D_share) for each in found[label])])
+        words.append(_folded(f"The other {len(folded)} labels", _label_table_html(done, medians, voxels, folded)))
+    components = {row.label: row.components for each in done for run in each.runs for row in run.measurement.labels}
+    pieces = [["label", "in the image", *(pipeline.title for pipeline in done)]]
+    shares = [["label", "voxels", *(pipeline.title for pipeline in done)]]
+    for label, rows in medians.items():
+        pieces.append([str(label), str(components[label]), *(number_text(each.pieces) for each in rows)])
+        shares.append([str(label), str(voxels[label]), *(number_text(each.E_D_share) for each in rows)])
     words.append(_folded("Connected pieces of each label", table_html(pieces)))
     words.append(_folded("E_D in each label, share of the image's variance", table_html(shares)))
     return words
@@ -508,7 +470,10 @@ def _folded(title: str, content: str) -> str:
 
 
 def _label_table_html(
-    done: Sequence[dict[str, Any]], found: dict[Any, list[OfLabel]], voxels: dict[Any, int], labels: Sequence[Any]
+    done: Sequence[PipelineResult],
+    medians: dict[int, list[LabelMedians]],
+    voxels: dict[int, int],
+    labels: Sequence[int],
 ) -> str:
     """A row for each of `labels`, a column for each pipeline; the best Dice of a row is marked."""
     heads = "".join(_head_cell(pipeline) for pipeline in done)
@@ -516,14 +481,14 @@ def _label_table_html(
         '<div class="wide"><table class="headline labels">',
         f'<thead><tr><th scope="col">label</th>{heads}</tr></thead><tbody>',
     ]
-    by_dice = Measure("", "", _at("dice"), 1)
+    by_dice = Criterion("", "", lambda run: None, 1)
     for label in labels:
-        best = winners(by_dice, [Entry(each.dice, None, None) for each in found[label]])
+        best = winners(by_dice, [Entry(each.dice, None, None) for each in medians[label]])
         cells = [
-            f'<td class="{html.escape(pipeline["kind"])}{" best" if number in best else ""}">{_label_cell(each)}</td>'
-            for number, (pipeline, each) in enumerate(zip(done, found[label], strict=True))
+            f'<td class="{html.escape(pipeline.kind)}{" best" if number in best else ""}">{_label_cell(each)}</td>'
+            for number, (pipeline, each) in enumerate(zip(done, medians[label], strict=True))
         ]
-        head = f"{html.escape(_text(label))}<small>{_voxels_text(voxels[label])}</small>"
+        head = f"{label}<small>{_voxels_text(voxels[label])}</small>"
         lines.append(f'<tr><th scope="row">{head}</th>{"".join(cells)}</tr>')
     return "\n".join([*lines, "</tbody></table></div>"])
 
@@ -532,7 +497,7 @@ def _voxels_text(count: float) -> str:
     return f"{number_text(count)} voxel" + ("" if count == 1 else "s")
 
 
-def _label_cell(each: OfLabel) -> str:
+def _label_cell(each: LabelMedians) -> str:
     if each.n_lost and each.n_lost == each.n_runs:
         return '<span class="failed">lost</span>'
     # The same number of decimals everywhere, so that those of a row and a column are compared at a glance.
@@ -547,89 +512,80 @@ def _label_cell(each: OfLabel) -> str:
     return "".join(parts)
 
 
-def _vanished_html(done: Sequence[dict[str, Any]], found: dict[Any, list[OfLabel]], voxels: dict[Any, int]) -> str:
+def _vanished_html(
+    done: Sequence[PipelineResult], medians: dict[int, list[LabelMedians]], voxels: dict[int, int]
+) -> str:
     """Which labels no cell stands for, by pipeline."""
     items = []
     for number, pipeline in enumerate(done):
-        lost = [(label, found[label][number]) for label in voxels if found[label][number].n_lost]
+        lost = [(label, medians[label][number]) for label in voxels if medians[label][number].n_lost]
         if lost:
             names = ", ".join(
-                f"label {_text(label)} ({_voxels_text(voxels[label])}"
+                f"label {label} ({_voxels_text(voxels[label])}"
                 + (")" if each.n_lost == each.n_runs else f", in {each.n_lost} of {each.n_runs} runs)")
                 for label, each in lost
             )
-            items.append(f"<li>{html.escape(pipeline['title'])}: {html.escape(names)}</li>")
+            items.append(f"<li>{html.escape(pipeline.title)}: {html.escape(names)}</li>")
     if not items:
         return "<p>No label vanished from any mesh.</p>"
     return f"<p><strong>Vanished from the mesh:</strong></p><ul>{''.join(items)}</ul>"
 
 
-def _seconds_html(results: dict[str, Any]) -> str:
+def _seconds_html(report: Report) -> str:
     rows = [["pipeline", "step", "seconds", "low to high", "remark"]]
-    for pipeline in results["pipelines"]:
-        if "median" not in pipeline:
-            rows.append([pipeline["title"], "–", "–", "", "failed"])
+    for pipeline in report.pipelines:
+        median, low, high = pipeline.median, pipeline.low, pipeline.high
+        if median is None or low is None or high is None:
+            rows.append([pipeline.title, "–", "–", "", "failed"])
             continue
-        low, high = (pipeline.get(word, {}).get("seconds", {}) for word in ("low", "high"))
-        is_range = len(pipeline["runs"]) > 1
-        for step, seconds in pipeline["median"]["seconds"].items():
-            spread = f"{number_text(low.get(step))} to {number_text(high.get(step))}" if is_range else ""
-            remark = UNTIMED.get(step, "")
-            rows.append([pipeline["title"], step, number_text(seconds), spread, remark])
+        for step, seconds in median.seconds.items():
+            spread = f"{number_text(low.seconds[step])} to {number_text(high.seconds[step])}"
+            spread = spread if len(pipeline.runs) > 1 else ""
+            rows.append([pipeline.title, step, number_text(seconds), spread, UNTIMED.get(step, "")])
     return table_html(rows)
 
 
-def _settings_html(results: dict[str, Any]) -> list[str]:
-    image, machine = results["image"], results.get("machine") or {}
-    labels = results.get("labels")
-    rows = [
-        ["what", "value"],
-        ["image", f"{image['name']}, {_text(image['shape'], ' × ')} voxels of {_text(image['spacing_mm'], ' × ')} mm"],
-        ["image's variance", number_text(image.get("variance"))],
-        ["image's SHA-256", str(image.get("sha256"))],
-        ["labels", f"{labels['name']} ({labels['kind']})" if labels else "none given"],
-        ["modulus", str(results.get("law"))],
-        ["reference", _reference_text(results.get("reference"))],
-        ["machine", ", ".join(f"{key} {_text(value)}" for key, value in machine.items())],
-        ["whole comparison, s", number_text(results.get("seconds"))],
-    ]
-    abouts = [["pipeline", "what it is"]] + [[p["title"], str(p.get("about"))] for p in results["pipelines"]]
-    options = [["option", "value"]] + [[str(k), _text(v)] for k, v in (results.get("options") or {}).items()]
-    versions = [["package", "version"]] + [[str(k), _text(v)] for k, v in (results.get("versions") or {}).items()]
-    notes = [f"{p['title']}: {note}" for p in results["pipelines"] for note in p.get("notes") or ()]
+def _settings_html(report: Report) -> list[str]:
+    image, labels = report.image, report.labels
+    shape, spacing = _text(image.shape, " × "), _text(image.spacing_mm, " × ")
+    tables = {
+        "Pipelines": [["pipeline", "what it is"], *([each.title, each.about] for each in report.pipelines)],
+        "Data and machine": [
+            ["what", "value"],
+            ["image", f"{image.source.name}, {shape} voxels of {spacing} mm"],
+            ["image's variance", number_text(image.variance)],
+            ["image's SHA-256", image.source.sha256],
+            ["labels", f"{labels.name} ({labels.kind})" if labels else "none given"],
+            ["modulus", report.law],
+            ["reference", _reference_text(report.reference)],
+            ["machine", ", ".join(f"{key} {_text(value)}" for key, value in report.machine._asdict().items())],
+            ["whole comparison, s", number_text(report.seconds)],
+        ],
+        "Options": [["option", "value"], *([name, _text(value)] for name, value in report.options._asdict().items())],
+        "Versions": [["package", "version"], *([name, value] for name, value in report.versions.items())],
+    }
+    notes = [f"{pipeline.title}: {note}" for pipeline in report.pipelines for note in pipeline.notes]
     items = "".join(f"<li>{html.escape(note)}</li>" for note in notes)
     return [
-        f"<p>To run it again:</p><pre>{html.escape(str(results.get('command')))}</pre>",
+        f"<p>To run it again:</p><pre>{html.escape(report.command)}</pre>",
         '<div class="settings">',
-        *(
-            table_html(each, caption)
-            for each, caption in (
-                (abouts, "Pipelines"), (rows, "Data and machine"), (options, "Options"), (versions, "Versions"),
-            )
-        ),
+        *(table_html(rows, caption) for caption, rows in tables.items()),
         "</div>",
         f"<h3>Notes</h3><ul>{items}</ul>" if notes else "",
-    ]  # fmt: skip
+    ]
 
 
-def _reference_text(reference: dict[str, Any] | None) -> str:
-    if not reference:
-        return "none: no finite-element errors"
-    shape = _text(reference["shape"], " × ")
-    text = f"{shape} hexahedra, {number_text(reference.get('n_dofs'))} unknowns; {reference.get('note')}"
-    energies = [f"ν {nu}: {number_text(row.get('strain_energy'))}" for nu, row in reference.items() if _is_nu(nu, row)]
-    return f"{text}; strain energy {', '.join(energies)}" if energies else text
-
-
-def _is_nu(key: str, row: Any) -> bool:
-    return isinstance(row, dict) and key.replace(".", "", 1).isdigit()
+def _reference_text(reference: ReferenceGrid) -> str:
+    energies = [f"ν {nu}: {number_text(row.strain_energy)}" for nu, row in reference.by_nu.items()]
+    size = f"{_text(reference.shape, ' × ')} hexahedra, {reference.n_dofs} unknowns"
+    return f"{size}; {reference.note}; strain energy {', '.join(energies)}"
 
 
 def _text(value: Any, between: str = ", ") -> str:
-    """Any setting as text; sequences and arrays joined."""
-    if isinstance(value, list | tuple | np.ndarray):
+    """Any setting as text, sequences joined."""
+    if isinstance(value, list | tuple):
         return between.join(_text(item) for item in value)
-    if isinstance(value, bool) or not isinstance(value, int | float | np.number):
+    if isinstance(value, bool) or not isinstance(value, int | float):
         return "none" if value is None else str(value)
     return f"{value:.10g}"
 

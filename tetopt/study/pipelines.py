@@ -1,4 +1,4 @@
-"""Seven ways from an image to a mesh of its box with a wanted number of nodes, under one signature."""
+"""Seven ways from an image to a mesh of its box with a requested number of nodes, under one signature."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ class Job(NamedTuple):
 
     image: Image  # 3-D
     labels: Image | None  # a given segmentation, on the image's voxels; without one, those who need it make their own
-    nodes: int  # wanted
+    nodes: int  # requested
     classes: int = 4  # of the thresholds, without labels
     k_D: float = UNIFORM_K_D  # of uniform meshes; the graded one has its own
     iterations: int = UNIFORM_ITERATIONS  # likewise
@@ -91,13 +91,13 @@ def tetopt(job: Job) -> Produced:
         As `tetopt.mesh_image` and `tetopt.target.content.content`.
     """
     clock = _Clock()
-    wanted, notes = _wanted(job, clock)
+    content, notes = _content(job, clock)
     with clock.step("kernels"):
-        prepare_kernels(wanted, GRADED_K_D, is_graded=True)
+        prepare_kernels(content, GRADED_K_D, is_graded=True)
     with clock.step("octree"):
-        mesh = octree(wanted, job.nodes)
+        mesh = octree(content, job.nodes)
     with clock.step("optimize"):
-        result = optimize(wanted, mesh, k_D=GRADED_K_D, iterations=GRADED_ITERATIONS, nodes=job.nodes)
+        result = optimize(content, mesh, k_D=GRADED_K_D, iterations=GRADED_ITERATIONS, nodes=job.nodes)
     return Produced(result.mesh, clock.seconds, [f"ended by: {result.ended}", *notes])
 
 
@@ -110,13 +110,13 @@ def tetopt_uniform(job: Job) -> Produced:
         As `tetopt.start.lattice.lattice`, `tetopt.engine.fast.optimize` and `tetopt.target.content.content`.
     """
     clock = _Clock()
-    wanted, notes = _wanted(job, clock)
+    content, notes = _content(job, clock)
     with clock.step("kernels"):
-        prepare_kernels(wanted, job.k_D)
+        prepare_kernels(content, job.k_D)
     with clock.step("lattice"):
         mesh = lattice(job.image, nodes=job.nodes)
     with clock.step("optimize"):
-        result = optimize(wanted, mesh, k_D=job.k_D, iterations=job.iterations)
+        result = optimize(content, mesh, k_D=job.k_D, iterations=job.iterations)
     return Produced(result.mesh, clock.seconds, [f"ended by: {result.ended}", *notes])
 
 
@@ -173,7 +173,7 @@ def cleaver(job: Job) -> Produced:
     return Produced(result.mesh, clock.seconds, [f"{result.n_runs} runs", *result.notes])
 
 
-def _wanted(job: Job, clock: _Clock) -> tuple[Image | Content, list[str]]:
+def _content(job: Job, clock: _Clock) -> tuple[Image | Content, list[str]]:
     """What the mesh is to represent, and what to note of it: the image, with labels if they are given."""
     if job.labels is None:
         return job.image, []
@@ -195,12 +195,33 @@ def _by_the_paper(job: Job, k_D: float) -> Produced:
     return Produced(result.mesh, clock.seconds, [f"ended by: {result.ended}"])
 
 
-PIPELINES: dict[str, Callable[[Job], Produced]] = {
-    "tetopt": tetopt,
-    "tetopt-uniform": tetopt_uniform,
-    "tetopt-paper": tetopt_paper,
-    "pytetwild": pytetwild,
-    "cleaver": cleaver,
-    "bcc": bcc,
-    "odt": odt,
-}
+class Pipeline(NamedTuple):
+    """How a pipeline is shown, what it does, and whether its result changes from run to run."""
+
+    title: str
+    kind: str  # "tetopt", "peer" or "control"
+    about: str
+    function: Callable[[Job], Produced]
+    is_random: bool = False
+
+
+PIPELINES = {
+    "tetopt": Pipeline(
+        "tetopt", "tetopt", "tetopt mesh with its defaults: nodes where the image, or labels given, have content",
+        tetopt,
+    ),
+    "tetopt-uniform": Pipeline(
+        "tetopt, uniform", "tetopt", "tetopt mesh --uniform: BCC lattice, fast engine, with labels that are given",
+        tetopt_uniform,
+    ),
+    "tetopt-paper": Pipeline(
+        "tetopt, paper's scheme", "tetopt", "tetopt mesh --method paper, of the image alone", tetopt_paper
+    ),
+    "pytetwild": Pipeline(
+        "pytetwild", "peer", "classes by multi-Otsu or the labels given, their surfaces, fTetWild sized by them",
+        pytetwild, is_random=True,
+    ),
+    "cleaver": Pipeline("itk-cleaver", "peer", "the same labels, Cleaver", cleaver),
+    "bcc": Pipeline("BCC lattice", "control", "the uniform lattice, untouched", bcc),
+    "odt": Pipeline("ODT, image-blind", "control", "the lattice optimised for shape alone, k_D = 0", odt),
+}  # fmt: skip

@@ -12,6 +12,7 @@ from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.start.lattice import lattice
 from tetopt.start.sizes import COARSEST, Sizes
+from tetopt.study.compare_report import Measurement, TradeoffRow
 
 SWEEPS: dict[str, tuple[float, ...]] = {
     "k_D": (0.3, 0.5, 0.7, GRADED_K_D, 0.93),
@@ -20,31 +21,6 @@ SWEEPS: dict[str, tuple[float, ...]] = {
     "largest edge, of a uniform mesh's": (1.0, 1.15, COARSEST, 2.0, 3.0),
     "uniform, k_D": (0.0, 0.2, 0.5, 0.8),
 }
-
-
-def tradeoff(
-    image: Image, nodes: int, measure: Callable[[Mesh], dict[str, Any]], say: Callable[[str], None]
-) -> list[dict[str, Any]]:
-    """Meshes of about `nodes` nodes over `SWEEPS`, each with what `measure` finds; the default's are made once.
-
-    Returns
-    -------
-    list of dict
-        "option" and "value", whether all is as by default, and "measured".
-    """
-    found: dict[tuple[str, float] | None, dict[str, Any]] = {}  # by what is changed; None: nothing
-    rows = []
-    for option, values in SWEEPS.items():
-        for value in values:
-            is_default = (option, value) in DEFAULTS
-            changed = None if is_default else (option, value)
-            if changed not in found:
-                say(f"trade-off: {option} = {value:g}")
-                found[changed] = measure(_made(image, nodes, option, value))
-            rows.append({"option": option, "value": value, "is_default": is_default, "measured": found[changed]})
-    return rows
-
-
 DEFAULTS = {
     ("k_D", GRADED_K_D),
     ("shape power p", SHAPE_POWER),
@@ -53,7 +29,24 @@ DEFAULTS = {
 }
 
 
-def _made(image: Image, nodes: int, option: str, value: float) -> Mesh:
+def tradeoff(
+    image: Image, nodes: int, measure: Callable[[Mesh], Measurement], say: Callable[[str], None]
+) -> list[TradeoffRow]:
+    """Meshes of about `nodes` nodes over `SWEEPS`, each with its measurement; the default's are made once."""
+    measurements: dict[tuple[str, float] | None, Measurement] = {}  # by what is changed; None: nothing
+    rows = []
+    for option, values in SWEEPS.items():
+        for value in values:
+            is_default = (option, value) in DEFAULTS
+            changed = None if is_default else (option, value)
+            if changed not in measurements:
+                say(f"trade-off: {option} = {value:g}")
+                measurements[changed] = measure(_mesh(image, nodes, option, value))
+            rows.append(TradeoffRow(option, value, is_default, measurements[changed]))
+    return rows
+
+
+def _mesh(image: Image, nodes: int, option: str, value: float) -> Mesh:
     """The mesh with one option changed."""
     if option == "uniform, k_D":
         return optimize(image, lattice(image, nodes=nodes), k_D=value).mesh

@@ -1,0 +1,240 @@
+"""What `report.json` and the files in `runs` hold, as records: written as objects, and read back when resuming."""
+
+from __future__ import annotations
+
+from types import UnionType
+from typing import Any, NamedTuple, get_args, get_origin, get_type_hints
+
+from tetopt.engine.loop import UNIFORM_ITERATIONS, UNIFORM_K_D
+from tetopt.fem.reference import Errors
+from tetopt.measure.quality import Quality
+from tetopt.study.pipelines import PIPELINES
+
+# Fields whose own keys stand in the file beside those of the record that has them, and fields left out where they are
+# None: the file is flatter than the records, and older readers know it so.
+INLINE_FIELDS = ("run", "measurement", "source", "by_nu")
+OPTIONAL_FIELDS = ("median", "low", "high", "mesh_file_sha256")
+
+
+class Settings(NamedTuple):
+    """What is compared and how; all of it is in the report."""
+
+    nodes: int
+    pipelines: tuple[str, ...] = tuple(PIPELINES)
+    repeats: int = 3  # of pipelines whose result changes from run to run
+    classes: int = 4  # of the multi-Otsu segmentation, without labels
+    k_D: float = UNIFORM_K_D
+    iterations: int = UNIFORM_ITERATIONS
+    nus: tuple[float, ...] = (0.3, 0.45)
+    percent: float = 1.0  # of compression
+    reference_dofs: int = 300_000  # the voxel grid is averaged until it has no more
+    curve: tuple[float, ...] = (0.25, 0.5, 2.0)  # node counts of the error curves, of `nodes`, besides `nodes` itself
+    tradeoff: bool = False  # whether tetopt's options are swept around its defaults
+    max_seconds: float = 3600.0  # of one pipeline
+    max_bytes: int | None = None
+
+
+class ImageSource(NamedTuple):
+    """The file that is meshed, and the part of it."""
+
+    name: str
+    sha256: str
+    volume: int | None  # of a series
+    crop: str | None
+
+
+class LabelSource(NamedTuple):
+    """The file of the labels."""
+
+    name: str
+    kind: str  # "given"
+    sha256: str
+
+
+class Histogram(NamedTuple):
+    """Shares between edges."""
+
+    edges: list[float]  # one more than shares
+    share: list[float]
+
+
+class LabelRow(NamedTuple):
+    """What a mesh makes of one label (`tetopt.measure.fidelity.LabelFidelity`), its voxels painted by the cells."""
+
+    label: int
+    voxels: int
+    mesh_voxels: int
+    dice: float
+    E_D_share: float | None  # the label's part of E_D, over the image's variance; None in an image without any
+    is_lost: bool
+    volume_mm3: float
+    mesh_volume_mm3: float
+    surface_mean_mm: float | None  # None where the label has no surface in the mesh
+    surface_p95_mm: float | None
+    components: int
+    mesh_components: int
+
+
+class Simulation(NamedTuple):
+    """The compression test on a mesh, for one Poisson's ratio, and how far it is from the reference."""
+
+    lambda_max: float
+    cond: float
+    cg_iterations: int
+    strain_energy: float
+    errors: Errors
+
+
+class Measurement(NamedTuple):
+    """Everything that is compared of a mesh."""
+
+    n_nodes: int
+    n_cells: int
+    E_D: float
+    E_D_share: float | None  # of the image's variance; None in an image without any
+    n_missed_voxels: int
+    n_empty_cells: int
+    quality: Quality
+    rho_histogram: Histogram
+    dihedral_histogram: Histogram  # degrees
+    labels: list[LabelRow]
+    fem: dict[str, Simulation]  # by nu
+
+
+class Run(NamedTuple):
+    """One execution of a pipeline that ended with a mesh; also the median, lowest or highest of several, by number."""
+
+    seconds: dict[str, float]  # by step
+    seconds_total: float
+    peak_bytes: int
+    measurement: Measurement
+
+
+class Attempt(NamedTuple):
+    """What a file in `runs` holds."""
+
+    key: str  # of all that the numbers depend on
+    failure: str | None
+    notes: list[str]
+    run: Run | None  # None after a failure
+    mesh_file_sha256: str | None = None
+
+
+class PipelineResult(NamedTuple):
+    """All runs of a pipeline."""
+
+    name: str
+    title: str
+    kind: str
+    about: str
+    failure: str | None  # the first, if a run failed
+    notes: list[str]
+    runs: list[Run]
+    median: Run | None = None  # None if no run ended with a mesh, as for the next two
+    low: Run | None = None
+    high: Run | None = None
+
+
+class TradeoffRow(NamedTuple):
+    """A mesh with one option of the graded mesh changed."""
+
+    option: str
+    value: float
+    is_default: bool
+    measured: Measurement
+
+
+class CurvePoint(NamedTuple):
+    """Errors at one number of nodes."""
+
+    n_nodes: int
+    E_D_share: float | None
+    errors: dict[str, Errors]  # by nu
+
+
+class Curve(NamedTuple):
+    """A pipeline's errors by number of nodes."""
+
+    name: str
+    title: str
+    points: list[CurvePoint]
+
+
+class ImageFacts(NamedTuple):
+    """The image that is meshed."""
+
+    source: ImageSource
+    shape: tuple[int, ...]
+    spacing_mm: list[float]
+    variance: float
+
+
+class Machine(NamedTuple):
+    """Where the comparison ran."""
+
+    cores: int | None
+    system: str
+
+
+class ReferenceEnergy(NamedTuple):
+    """What the reference finds for one Poisson's ratio."""
+
+    strain_energy: float  # uJ
+
+
+class ReferenceGrid(NamedTuple):
+    """The voxel grid whose solutions the errors are measured against."""
+
+    shape: tuple[int, ...]
+    n_dofs: int
+    note: str
+    by_nu: dict[str, ReferenceEnergy]
+
+
+class Report(NamedTuple):
+    """What `report.json` holds."""
+
+    command: str
+    image: ImageFacts
+    labels: LabelSource | None
+    law: str
+    versions: dict[str, str]
+    machine: Machine
+    options: Settings
+    reference: ReferenceGrid
+    pipelines: list[PipelineResult]
+    tradeoff: list[TradeoffRow]
+    curves: list[Curve]
+    seconds: float
+
+
+def as_json(value: Any) -> Any:
+    """A record as its file holds it, for `tetopt.io.files.save_json`: objects, lists and what these hold."""
+    if isinstance(value, dict):
+        return {key: as_json(item) for key, item in value.items()}
+    if hasattr(value, "_asdict"):
+        row: dict[str, Any] = {}
+        for name, item in value._asdict().items():
+            if name in INLINE_FIELDS:
+                row |= as_json(item) or {}
+            elif item is not None or name not in OPTIONAL_FIELDS:
+                row[name] = as_json(item)
+        return row
+    return [as_json(item) for item in value] if isinstance(value, list | tuple) else value
+
+
+def from_json(kind: Any, value: Any) -> Any:
+    """What `as_json` made of a record with fields of the type `kind`; KeyError or TypeError for anything else."""
+    arguments = get_args(kind)
+    if value is None:
+        return None
+    if get_origin(kind) is UnionType:  # X | None
+        return from_json(arguments[0], value)
+    if get_origin(kind) is list:
+        return [from_json(arguments[0], item) for item in value]
+    if get_origin(kind) is dict:
+        return {key: from_json(arguments[1], item) for key, item in value.items()}
+    if hasattr(kind, "_fields"):
+        hints = get_type_hints(kind).items()
+        return kind(*(from_json(hint, value if name in INLINE_FIELDS else value[name]) for name, hint in hints))
+    return value
