@@ -28,7 +28,7 @@ def _pipes(monkeypatch):
 def test_same_bits_as_in_process(name, labels):
     job = JOB._replace(labels=labels)
     outcome = run_in_child(name, job, max_seconds=300.0)
-    here = PIPELINES[name](job)
+    here = PIPELINES[name].function(job)
     assert outcome.failure is None
     assert outcome.mesh.points.tobytes() == here.mesh.points.tobytes()
     assert outcome.mesh.cells.tobytes() == here.mesh.cells.tobytes()

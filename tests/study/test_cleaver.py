@@ -16,12 +16,12 @@ def test_unusable_package_is_told(monkeypatch):
     """Not installed; installed, but its import ends the interpreter."""
     monkeypatch.setattr(cleaver, "find_spec", lambda name: None)
     with pytest.raises(tetopt.InputError, match=r"itk-cleaver: not installed; install it with: python -m pip"):
-        PIPELINES["cleaver"](Job(IMAGE, LABELS, 300))
+        PIPELINES["cleaver"].function(Job(IMAGE, LABELS, 300))
     monkeypatch.setattr(cleaver, "find_spec", lambda name: name)
     python = cleaver._python
     monkeypatch.setattr(cleaver, "_python", lambda program: python("import os; os.kill(os.getpid(), 11)"))
     with pytest.raises(tetopt.InputError, match=r"its import ends Python \(signal 11\); install"):
-        PIPELINES["cleaver"](Job(IMAGE, LABELS, 300))
+        PIPELINES["cleaver"].function(Job(IMAGE, LABELS, 300))
 
 
 def test_cube_holds_the_labels():
@@ -55,7 +55,7 @@ def test_sphere():
     pytest.importorskip("itk", reason="itk-cleaver is not installed")
     if cleaver._python("from itk import CleaverImageToMeshFilter").returncode != 0:
         pytest.skip("itk-cleaver cannot be loaded into this ITK")
-    mesh = PIPELINES["cleaver"](Job(IMAGE, LABELS, 1500)).mesh
+    mesh = PIPELINES["cleaver"].function(Job(IMAGE, LABELS, 1500)).mesh
     assert volumes(mesh.points, mesh.cells).min() > 0.0
     assert volumes(mesh.points, mesh.cells).sum() == pytest.approx(IMAGE.volume, rel=1e-9)
     assert tetopt.cell_moments(IMAGE, mesh).n_voxels.sum() == IMAGE.data.size

@@ -51,7 +51,7 @@ def assert_fills(image, mesh):
     ids=["flipped and oblique", "anisotropic and oblique", "sheared"],
 )
 def test_fills_the_box_with_the_wanted_nodes(image, capfd):
-    produced = PIPELINES["pytetwild"](Job(image, None, 300, classes=2))
+    produced = PIPELINES["pytetwild"].function(Job(image, None, 300, classes=2))
     assert_fills(image, produced.mesh)
     assert abs(len(produced.mesh.points) / 300 - 1.0) <= 0.05
     assert list(produced.seconds) == ["surfaces", "tetrahedra", "search"]
@@ -62,7 +62,7 @@ def test_fills_the_box_with_the_wanted_nodes(image, capfd):
 def test_facets_follow_the_interface():
     """A better E_D than the lattice with as many nodes, by far, on a sphere that cells can follow."""
     labels = PHANTOM.label_image(voxel_mm=4.0)
-    mesh = PIPELINES["pytetwild"](Job(IMAGE, labels, 600)).mesh
+    mesh = PIPELINES["pytetwild"].function(Job(IMAGE, labels, 600)).mesh
     assert_fills(IMAGE, mesh)
     assert tetopt.E_D(IMAGE, mesh) < 0.6 * tetopt.E_D(IMAGE, tetopt.lattice(IMAGE, nodes=600))
 
@@ -75,7 +75,7 @@ def test_missed_count_is_told(monkeypatch):
     monkeypatch.setattr(tetwild, "_run", lambda *_: (points, mesh.cells))
     result = tetwild.filled(IMAGE, interfaces(IMAGE, 8.0, classes=2), 900)
     assert_fills(IMAGE, result.mesh)
-    assert result.n_runs == tetwild.MAX_RUNS
+    assert result.n_runs == tetwild.TETWILD_RUNS
     assert result.notes == [f"{len(points)} nodes after 6 runs of fTetWild, 900 were asked for"]
 
 
@@ -88,7 +88,7 @@ def test_too_few_nodes():
 def test_missing_package(monkeypatch):
     monkeypatch.setitem(__import__("sys").modules, "pytetwild", None)
     with pytest.raises(tetopt.InputError, match=r"pytetwild: not usable .* pip install"):
-        PIPELINES["pytetwild"](Job(IMAGE, None, 300, classes=2))
+        PIPELINES["pytetwild"].function(Job(IMAGE, None, 300, classes=2))
 
 
 def test_shaken_boundary_is_put_back():

@@ -26,14 +26,13 @@ from tetopt.errors import InputError
 from tetopt.geometry.simplex import oriented
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.study.tetwild import Filled, next_factor, node_spacing, put_on_box
+from tetopt.study.tetwild import NODE_TOLERANCE, Filled, inside_box, next_factor, node_spacing, put_on_box
 
-TOLERANCE = 0.05  # of the wanted number of nodes
-MAX_RUNS = 8
+CLEAVER_RUNS = 8  # of one search, at most; those that crash count, too
 VOXELS_PER_SPACING = 3.0  # of the cube that Cleaver gets, at least, unless the image itself is coarser
-MAX_VOXELS = 256  # along an edge of the cube
-LIPSCHITZ = 0.5  # how fast its cells may grow away from the interfaces
-HINT = "install it with: python -m pip install itk-cleaver 'itk==5.3.0' 'numpy<2'"
+CUBE_VOXELS = 256  # along an edge of the cube, at most: the next power of two takes eight times the memory
+LIPSCHITZ_BOUND = 0.5  # how fast its cells may grow away from the interfaces
+INSTALL_HINT = "install it with: python -m pip install itk-cleaver 'itk==5.3.0' 'numpy<2'"
 
 
 class Cube(NamedTuple):
@@ -51,7 +50,7 @@ class _RunError(RuntimeError):
 def stuffed(image: Image, labels: Image, nodes: int) -> Filled:
     """Cleaver's tetrahedra in the image's box, with about `nodes` nodes.
 
-    Its feature scaling is searched until the number of nodes is within 5 % of the wanted one; at most 8 runs, of
+    Its feature scaling is searched until the number of nodes is within 5 % of the requested one; at most 8 runs, of
     which the nearest that can be put on the box is taken.
 
     Parameters
@@ -61,7 +60,7 @@ def stuffed(image: Image, labels: Image, nodes: int) -> Filled:
     labels : Image
         Whole numbers, on the image's voxels.
     nodes : int
-        Wanted number of nodes, 8 or more.
+        Requested number of nodes, 8 or more.
 
     Returns
     -------
@@ -78,11 +77,11 @@ def stuffed(image: Image, labels: Image, nodes: int) -> Filled:
     _check(image, labels, nodes)
     cube = labels_in_cube(image, labels, node_spacing(image, nodes) / VOXELS_PER_SPACING)
     low, high = -0.5 * image.spacing, (np.array(image.shape) - 0.5) * image.spacing
-    runs: list[tuple[float, NDArray[np.float64], NDArray[np.int64], int, float]] = []
+    runs: list[tuple[float, NDArray[np.float64], NDArray[np.int64], int, float]] = []  # with the cells outside
     begin_search = time.perf_counter()
     notes: list[str] = []
     factor = 2.0
-    for _ in range(MAX_RUNS):
+    for _ in range(CLEAVER_RUNS):
         begin = time.perf_counter()
         try:
             points, cells = _run(cube, factor)
@@ -90,12 +89,13 @@ def stuffed(image: Image, labels: Image, nodes: int) -> Filled:
             notes.append(f"Cleaver, feature scaling {factor:.3g}: {error}")
             factor *= 0.83  # its crashes come with coarse meshes; another try beside
             continue
-        runs.append((factor, *_inside(points, cells, low, high), time.perf_counter() - begin))
-        if abs(len(runs[-1][1]) / nodes - 1.0) <= TOLERANCE:
+        points, inside = inside_box(points, cells, low, high)
+        runs.append((factor, points, inside, len(cells) - len(inside), time.perf_counter() - begin))
+        if abs(len(points) / nodes - 1.0) <= NODE_TOLERANCE:
             break
         factor = next_factor([(run[0], len(run[1])) for run in runs], nodes)
     if not runs:
-        raise InputError(f"itk-cleaver: no run gave a mesh ({notes[-1]}); ask for more nodes or {HINT}")
+        raise InputError(f"itk-cleaver: no run gave a mesh ({notes[-1]}); ask for more nodes or {INSTALL_HINT}")
     runs.sort(key=lambda run: abs(np.log(len(run[1]) / nodes)))
     _, points, cells, n_removed, seconds = runs[0]
     search = time.perf_counter() - begin_search - seconds
@@ -105,7 +105,7 @@ def stuffed(image: Image, labels: Image, nodes: int) -> Filled:
         notes.append(f"its boundary is not on the box's faces: {error}")
     if n_removed:
         notes.append(f"{n_removed} cells outside the box removed")
-    if abs(len(points) / nodes - 1.0) > TOLERANCE:
+    if abs(len(points) / nodes - 1.0) > NODE_TOLERANCE:
         notes.append(f"{len(points)} nodes after {len(runs)} runs of Cleaver, {nodes} were asked for")
     world = image.to_world(points / image.spacing)
     return Filled(Mesh(world, oriented(world, cells)), len(runs), search, notes)
@@ -113,7 +113,7 @@ def stuffed(image: Image, labels: Image, nodes: int) -> Filled:
 
 def _check(image: Image, labels: Image, nodes: int) -> None:
     if find_spec("itk") is None or find_spec("itk.CleaverPython") is None:
-        raise InputError(f"itk-cleaver: not installed; {HINT}")
+        raise InputError(f"itk-cleaver: not installed; {INSTALL_HINT}")
     if image.ndim != 3 or labels.shape != image.shape:
         raise InputError(f"labels: expected 3 axes and the image's shape {image.shape}, got {labels.shape}")
     if not np.array_equal(np.rint(labels.data), labels.data):
@@ -124,14 +124,14 @@ def _check(image: Image, labels: Image, nodes: int) -> None:
         raise InputError(f"nodes: a box needs 8 or more, got {nodes}")
     probe = _python("from itk import CleaverImageToMeshFilter")
     if probe.returncode != 0:
-        raise InputError(f"itk-cleaver: its import ends Python ({_ending(probe)}); {HINT}")
+        raise InputError(f"itk-cleaver: its import ends Python ({_ending(probe)}); {INSTALL_HINT}")
 
 
 def labels_in_cube(image: Image, labels: Image, voxel: float) -> Cube:
     """Labels sampled (nearest voxel) on a cube of 2^k isotropic voxels around the box, of about `voxel` mm or less."""
     lengths = image.spacing * image.shape
-    wanted = lengths.max() / max(voxel, image.spacing.min())
-    n = int(min(2 ** np.ceil(np.log2(max(wanted, 16.0))), MAX_VOXELS))
+    n_across = lengths.max() / max(voxel, image.spacing.min())
+    n = int(min(2 ** np.ceil(np.log2(max(n_across, 16.0))), CUBE_VOXELS))
     edge = float(lengths.max() / n)
     origin = -0.5 * image.spacing + 0.5 * (lengths - lengths.max())
     index = [
@@ -142,21 +142,11 @@ def labels_in_cube(image: Image, labels: Image, voxel: float) -> Cube:
     return Cube(numbered[np.ix_(*[i.astype(int) for i in index])], edge, origin)
 
 
-def _inside(
-    points: NDArray[np.float64], cells: NDArray[np.int64], low: NDArray[np.float64], high: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.int64], int]:
-    """The cells with their centroid in the box, their nodes, and how many were removed."""
-    centroids = points[cells].mean(axis=1)
-    is_inside = ((centroids > low) & (centroids < high)).all(axis=1)
-    used, compact = np.unique(cells[is_inside], return_inverse=True)
-    return points[used], compact.reshape(-1, 4), int((~is_inside).sum())
-
-
 def _run(cube: Cube, feature_scaling: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """One run of Cleaver in a process of its own; points in the box frame, and cells."""
     with tempfile.TemporaryDirectory(prefix="tetopt-") as name:
         folder = Path(name)
-        np.savez(folder / "job.npz", labels=cube.labels, feature_scaling=feature_scaling, lipschitz=LIPSCHITZ)
+        np.savez(folder / "job.npz", labels=cube.labels, feature_scaling=feature_scaling, lipschitz=LIPSCHITZ_BOUND)
         # The script itself, not the package: ITK 5.3 and tetopt need not share their numpy's habits.
         done = _python(Path(__file__).with_name("cleaver_run.py").read_text(encoding="utf-8"), str(folder))
         if not (folder / "mesh.npz").is_file():

@@ -19,11 +19,11 @@ from tetopt.image import Image
 from tetopt.target.otsu import class_thresholds
 
 SIGMA_VOXELS = 0.75  # of the Gaussian before thresholding: takes the noise, moves no interface wider than a voxel
-SPECK = 3.0  # pieces of surface with less area than this many size^2 are dropped: no cell of that size shows them
-EDGE = 0.7  # of a surface triangle over `size`; coarser ones round the folds off, finer ones only take time
-SMOOTHINGS = 30  # iterations of the windowed sinc
-PASS_BAND = 0.05
-PAD = 4  # voxels by which the volume is continued, so that neither smoothing nor decimation frays at the box's faces
+SPECK_AREA = 3.0  # pieces of surface with less than this many size^2 are dropped: no cell of that size shows them
+EDGE_SHARE = 0.7  # of a surface triangle over `size`; coarser ones round the folds off, finer ones only take time
+SINC_ITERATIONS = 30  # of the smoothing; VTK's default is 20, and a narrower pass band takes more
+PASS_BAND = 0.05  # of the same; VTK's default is 0.1, and less is smoother
+PAD_VOXELS = 4  # by which the volume is continued, so that neither smoothing nor decimation frays at the box's faces
 
 
 class Surfaces(NamedTuple):
@@ -50,7 +50,7 @@ def interfaces(image: Image, size: float, *, classes: int = 4, labels: Image | N
     image : Image
         3-D.
     size : float
-        Wanted edge length of the mesh in mm, near the interfaces.
+        Edge length of the mesh in mm, near the interfaces.
     classes : int
         Number of classes without labels, 2 or more.
     labels : Image, optional
@@ -149,7 +149,7 @@ def _label_surface(
 
 def _padded_grid(volume: NDArray, spacing: NDArray[np.float64], size: float) -> pyvista.ImageData:
     """The volume on its voxel centres, continued by its border values past the box's faces."""
-    pad = np.maximum(PAD, np.ceil(size / spacing)).astype(int)
+    pad = np.maximum(PAD_VOXELS, np.ceil(size / spacing)).astype(int)
     padded = np.pad(volume, [(p, p) for p in pad], mode="edge")
     grid = pyvista.ImageData(dimensions=padded.shape, spacing=spacing, origin=-pad * spacing)
     grid.point_data["h"] = padded.ravel(order="F")
@@ -157,16 +157,16 @@ def _padded_grid(volume: NDArray, spacing: NDArray[np.float64], size: float) -> 
 
 
 def _without_specks(surface: pyvista.PolyData, size: float) -> tuple[pyvista.PolyData, int]:
-    """The pieces of at least `SPECK` size^2, and how many were dropped."""
+    """The pieces of at least `SPECK_AREA` size^2, and how many were dropped."""
     if surface.n_cells == 0:
         return surface, 0
     triangles = surface.regular_faces
     region = surface.connectivity(largest=False).cell_data["RegionId"]
     a, b, c = np.asarray(surface.points, dtype=np.float64)[triangles.T]
     areas = np.bincount(region, 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1))
-    is_large = areas >= SPECK * size**2
+    is_large = areas >= SPECK_AREA * size**2
     kept = is_large[region]
-    points, triangles = _compacted(surface.points, triangles[kept])
+    points, triangles = compacted(surface.points, triangles[kept])
     large = pyvista.PolyData.from_regular_faces(points, triangles)
     if "boundary_labels" in surface.cell_data:
         large.cell_data["boundary_labels"] = surface.cell_data["boundary_labels"][kept]
@@ -175,13 +175,13 @@ def _without_specks(surface: pyvista.PolyData, size: float) -> tuple[pyvista.Pol
 
 def _smoothed(surface: pyvista.PolyData) -> pyvista.PolyData:
     return surface.smooth_taubin(
-        n_iter=SMOOTHINGS, pass_band=PASS_BAND, boundary_smoothing=False, non_manifold_smoothing=True
+        n_iter=SINC_ITERATIONS, pass_band=PASS_BAND, boundary_smoothing=False, non_manifold_smoothing=True
     )
 
 
 def _decimated(surface: pyvista.PolyData, size: float) -> pyvista.PolyData:
-    wanted = surface.area / (np.sqrt(3.0) / 4.0 * (EDGE * size) ** 2)
-    reduction = 1.0 - max(wanted, 4.0) / surface.n_cells
+    n_triangles = surface.area / (np.sqrt(3.0) / 4.0 * (EDGE_SHARE * size) ** 2)
+    reduction = 1.0 - max(n_triangles, 4.0) / surface.n_cells
     bare = pyvista.PolyData.from_regular_faces(surface.points, surface.regular_faces)
     return bare.decimate(reduction, volume_preservation=True) if reduction > 0.0 else bare
 
@@ -198,7 +198,7 @@ def _cut_by_box(
                 surface = surface.clip(normal, origin=place, invert=False).triangulate()
     if surface.n_cells == 0:
         return np.empty((0, 3)), np.empty((0, 3), dtype=np.int64)
-    points, triangles = _compacted(np.asarray(surface.points, dtype=np.float64), surface.regular_faces)
+    points, triangles = compacted(np.asarray(surface.points, dtype=np.float64), surface.regular_faces)
     near = 1e-6 * (high - low)
     for face in (low, high):
         points = np.where(np.abs(points - face) < near, face, points)
@@ -221,7 +221,7 @@ def _stacked(
     return points, np.vstack([triangles + offset for (_, triangles), offset in zip(parts, offsets, strict=False)])
 
 
-def _compacted(points: NDArray, triangles: NDArray) -> tuple[NDArray, NDArray[np.int64]]:
-    """Without the points that no triangle uses."""
-    used, compact = np.unique(triangles, return_inverse=True)
-    return points[used], compact.reshape(triangles.shape).astype(np.int64)
+def compacted(points: NDArray, cells: NDArray) -> tuple[NDArray, NDArray[np.int64]]:
+    """Without the points that no cell (or triangle) uses; those that are left keep their order."""
+    used, compact = np.unique(cells, return_inverse=True)
+    return points[used], compact.reshape(cells.shape).astype(np.int64)

@@ -9,13 +9,12 @@ from typing import NamedTuple
 
 import numpy as np
 
-from tetopt.engine.fast import optimize, prepare_kernels
+from tetopt.engine.fast import prepare_kernels
 from tetopt.engine.loop import GRADED_ITERATIONS, GRADED_K_D, UNIFORM_ITERATIONS, UNIFORM_K_D
-from tetopt.engine.paper import optimize_paper
+from tetopt.engine.meshing import Mode, mesh_image
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.start.lattice import lattice
-from tetopt.start.octree import octree
 from tetopt.target.content import Content, content
 
 
@@ -72,14 +71,14 @@ def bcc(job: Job) -> Produced:
 
 
 def odt(job: Job) -> Produced:
-    """The lattice relaxed to the best shapes, whatever the image shows: `optimize_paper` with k_D = 0.
+    """The lattice relaxed to the best shapes, whatever the image shows: the paper's scheme with k_D = 0.
 
     Raises
     ------
     InputError
-        As `tetopt.start.lattice.lattice` and `tetopt.engine.paper.optimize_paper`.
+        As `tetopt.mesh_image`.
     """
-    return _by_the_paper(job, 0.0)
+    return _by_mesh_image(job, "paper", 0.0, job.iterations)
 
 
 def tetopt(job: Job) -> Produced:
@@ -90,34 +89,18 @@ def tetopt(job: Job) -> Produced:
     InputError
         As `tetopt.mesh_image` and `tetopt.target.content.content`.
     """
-    clock = _Clock()
-    content, notes = _content(job, clock)
-    with clock.step("kernels"):
-        prepare_kernels(content, GRADED_K_D, is_graded=True)
-    with clock.step("octree"):
-        mesh = octree(content, job.nodes)
-    with clock.step("optimize"):
-        result = optimize(content, mesh, k_D=GRADED_K_D, iterations=GRADED_ITERATIONS, nodes=job.nodes)
-    return Produced(result.mesh, clock.seconds, [f"ended by: {result.ended}", *notes])
+    return _by_mesh_image(job, "graded", GRADED_K_D, GRADED_ITERATIONS)
 
 
 def tetopt_uniform(job: Job) -> Produced:
-    """The lattice and `optimize`, as `tetopt mesh --uniform`; labels that are given have their say too.
+    """The lattice and the fast engine, as `tetopt mesh --uniform`; labels that are given have their say too.
 
     Raises
     ------
     InputError
-        As `tetopt.start.lattice.lattice`, `tetopt.engine.fast.optimize` and `tetopt.target.content.content`.
+        As `tetopt.mesh_image` and `tetopt.target.content.content`.
     """
-    clock = _Clock()
-    content, notes = _content(job, clock)
-    with clock.step("kernels"):
-        prepare_kernels(content, job.k_D)
-    with clock.step("lattice"):
-        mesh = lattice(job.image, nodes=job.nodes)
-    with clock.step("optimize"):
-        result = optimize(content, mesh, k_D=job.k_D, iterations=job.iterations)
-    return Produced(result.mesh, clock.seconds, [f"ended by: {result.ended}", *notes])
+    return _by_mesh_image(job, "uniform", job.k_D, job.iterations)
 
 
 def tetopt_paper(job: Job) -> Produced:
@@ -126,9 +109,9 @@ def tetopt_paper(job: Job) -> Produced:
     Raises
     ------
     InputError
-        As `tetopt.start.lattice.lattice` and `tetopt.engine.paper.optimize_paper`.
+        As `tetopt.mesh_image`.
     """
-    return _by_the_paper(job, job.k_D)
+    return _by_mesh_image(job, "paper", job.k_D, job.iterations)
 
 
 def pytetwild(job: Job) -> Produced:
@@ -184,15 +167,16 @@ def _content(job: Job, clock: _Clock) -> tuple[Image | Content, list[str]]:
         return content(job.image, labels=job.labels), ["meshed from the image and the labels given, equally weighted"]
 
 
-def _by_the_paper(job: Job, k_D: float) -> Produced:
+def _by_mesh_image(job: Job, mode: Mode, k_D: float, iterations: int) -> Produced:
+    """A mesh of ours; the paper's scheme takes the image alone."""
     clock = _Clock()
+    content, notes = (job.image, list[str]()) if mode == "paper" else _content(job, clock)
     with clock.step("kernels"):
-        prepare_kernels(job.image, k_D, "paper")
-    with clock.step("lattice"):
-        mesh = lattice(job.image, nodes=job.nodes)
-    with clock.step("optimize"):
-        result = optimize_paper(job.image, mesh, k_D=k_D, iterations=job.iterations)
-    return Produced(result.mesh, clock.seconds, [f"ended by: {result.ended}"])
+        prepare_kernels(content, k_D, "paper" if mode == "paper" else "fast", is_graded=mode == "graded")
+    result = mesh_image(content, job.nodes, mode=mode, k_D=k_D, iterations=iterations)
+    start = "octree" if mode == "graded" else "lattice"
+    seconds = {**clock.seconds, start: result.seconds_start, "optimize": result.seconds_run}
+    return Produced(result.mesh, seconds, [f"ended by: {result.ended}", *notes])
 
 
 class Pipeline(NamedTuple):

@@ -8,8 +8,8 @@ than there are, only a wider envelope helps. How the choices were made, E_D as a
   triangles of 9.4 mm), 5090 nodes: 0.0312, mean rho 0.248, smallest angle 12.9 degrees, 173 s for 3 runs on a busy
   two-core machine.
 - Sphere phantom, 1500 nodes, fixed envelope: 0.0093 uniform and 0.0092 with the sizing field at 0.13 mm, 0.0149 and
-  0.0131 at 0.63 mm; coarser triangles 0.0137 and 0.0119. As it is now: 0.0103. By hand it
-  can be a tenth better. Two spheres, as it is now: 0.0715 for 2 classes (too few), 0.0170 for 3, 0.0081 for 4.
+  0.0131 at 0.63 mm; coarser triangles 0.0137 and 0.0119. As it is now: 0.0103. By hand it can be a tenth better. Two
+  spheres, as it is now: 0.0715 for 2 classes (too few), 0.0170 for 3, 0.0081 for 4.
 - The soup, not `tetrahedralize_csg`: the latter takes no sizing field, and needs 5566 nodes for the sphere at 0.0100,
   where the soup has 0.0103 with 1499.
 """
@@ -34,17 +34,17 @@ from tetopt.geometry.topology import boundary_facets
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.start.lattice import lattice
-from tetopt.study.interfaces import Surfaces
+from tetopt.study.interfaces import Surfaces, compacted
 
-TOLERANCE = 0.05  # of the wanted number of nodes
-MAX_RUNS = 6
-ENVELOPE = 0.2  # how far fTetWild may move a surface, over the edge length of regular cells, at factor 1
-TIGHTENING = 8.0  # exponent of the factor in the envelope: simple shapes, which end at small factors, are met closely
-GROWTH = 0.6  # by how much edges lengthen per mm of distance from the interfaces
-LONGEST = 3.0  # edge far away over edge at the interfaces
-STOP_ENERGY = 10.0
+NODE_TOLERANCE = 0.05  # of the requested number of nodes, within which a search for it ends
+TETWILD_RUNS = 6  # of one search, at most; each takes about as long as the one that is kept
+ENVELOPE_SHARE = 0.2  # how far fTetWild may move a surface, over the edge length of regular cells, at factor 1
+ENVELOPE_EXPONENT = 8.0  # of the factor in the envelope: simple shapes, which end at small factors, are met closely
+EDGE_GROWTH = 0.6  # mm by which edges lengthen per mm of distance from the interfaces
+EDGE_RATIO = 3.0  # edge far away over edge at the interfaces
+STOP_ENERGY = 10.0  # of fTetWild's cells (AMIPS; regular: 3), below which it stops: its own default
 LEAST_SHAPE = 2e-3  # volume over the longest edge's cube (regular: 0.118) under which a cell is mended
-ROUNDS = 60  # of untangling after the boundary has been put on the box
+UNTANGLING_ROUNDS = 60  # after the boundary has been put on the box; what is inverted then cannot be mended so
 
 
 class Filled(NamedTuple):
@@ -65,7 +65,7 @@ def filled(image: Image, surfaces: Surfaces, nodes: int) -> Filled:
     """Tetrahedra that fill the image's box, with facets along the surfaces, and about `nodes` nodes.
 
     One factor on the sizing field and the envelope is searched, by secants of log nodes over log factor, until the
-    number of nodes is within 5 % of the wanted one; at most 6 runs, of which the nearest is taken.
+    number of nodes is within 5 % of the requested one; at most 6 runs, of which the nearest is taken.
 
     Parameters
     ----------
@@ -74,7 +74,7 @@ def filled(image: Image, surfaces: Surfaces, nodes: int) -> Filled:
     surfaces : Surfaces
         Of the same image.
     nodes : int
-        Wanted number of nodes, 8 or more.
+        Requested number of nodes, 8 or more.
 
     Returns
     -------
@@ -94,12 +94,12 @@ def filled(image: Image, surfaces: Surfaces, nodes: int) -> Filled:
     spacing = node_spacing(image, nodes)
     runs: list[tuple[float, NDArray[np.float64], NDArray[np.int64], float]] = []
     factor = 1.0
-    while len(runs) < MAX_RUNS:
-        envelope = ENVELOPE * spacing * factor**TIGHTENING
+    while len(runs) < TETWILD_RUNS:
+        envelope = ENVELOPE_SHARE * spacing * factor**ENVELOPE_EXPONENT
         begin = time.perf_counter()
         points, cells = _run(tetrahedralize, surfaces, factor * spacing, envelope)
         runs.append((factor, points, cells, time.perf_counter() - begin))
-        if abs(len(points) / nodes - 1.0) <= TOLERANCE:
+        if abs(len(points) / nodes - 1.0) <= NODE_TOLERANCE:
             break
         factor = next_factor([(f, len(p)) for f, p, _, _ in runs], nodes)
     notes: list[str] = []
@@ -110,7 +110,7 @@ def filled(image: Image, surfaces: Surfaces, nodes: int) -> Filled:
             notes.append(f"a run with {len(points)} nodes was left out: {error}")
             continue
         world = image.to_world(points / image.spacing)
-        if abs(len(points) / nodes - 1.0) > TOLERANCE:
+        if abs(len(points) / nodes - 1.0) > NODE_TOLERANCE:
             notes.append(f"{len(points)} nodes after {len(runs)} runs of fTetWild, {nodes} were asked for")
         search = sum(run[3] for run in runs) - seconds
         return Filled(Mesh(world, oriented(world, cells)), len(runs), search, notes)
@@ -146,15 +146,20 @@ def _run(
             bg_tets=field[1],
             bg_values=field[2],
         )
-    centroids = points[cells].mean(axis=1)
-    is_inside = ((centroids > surfaces.low) & (centroids < surfaces.high)).all(axis=1)
-    used, compact = np.unique(cells[is_inside], return_inverse=True)
-    points = np.asarray(points[used], dtype=np.float64)
-    return points, oriented(points, compact.reshape(-1, 4).astype(np.int64))
+    points, cells = inside_box(np.asarray(points, dtype=np.float64), cells, surfaces.low, surfaces.high)
+    return points, oriented(points, cells)
+
+
+def inside_box(
+    points: NDArray[np.float64], cells: NDArray[np.integer], low: NDArray[np.float64], high: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """The cells with their centroid in the box, and the nodes that they use."""
+    middles = points[cells].mean(axis=1)
+    return compacted(points, cells[((middles > low) & (middles < high)).all(axis=1)])
 
 
 def _sizing_field(surfaces: Surfaces, edge: float) -> tuple[NDArray, NDArray, NDArray]:
-    """Lattice points, tetrahedra and wanted edges: `edge` at the interfaces, longer with the distance from them."""
+    """Lattice points, tetrahedra and edges to aim for: `edge` at the interfaces, longer with the distance from them."""
     size = surfaces.high - surfaces.low
     blocks = tuple(int(b) for b in np.clip(np.ceil(size / (0.75 * edge)), 2, 40))
     unit = lattice(Image(np.zeros((2, 2, 2))), "five-tet", blocks=blocks)
@@ -164,7 +169,7 @@ def _sizing_field(surfaces: Surfaces, edge: float) -> tuple[NDArray, NDArray, ND
     if len(facets) == 0:
         return points, unit.cells.astype(np.int32), np.full(len(points), edge)
     distance = cKDTree(np.vstack([facets.mean(axis=1), facets.reshape(-1, 3)])).query(points)[0]
-    values = edge * np.minimum(1.0 + GROWTH * np.maximum(distance - edge, 0.0) / edge, LONGEST)
+    values = edge * np.minimum(1.0 + EDGE_GROWTH * np.maximum(distance - edge, 0.0) / edge, EDGE_RATIO)
     return points, unit.cells.astype(np.int32), values
 
 
@@ -221,9 +226,8 @@ def put_on_box(
         if not is_flat.any():
             break
         cells = cells[~is_flat]
-    used, compact = np.unique(cells, return_inverse=True)
-    points, cells = points[used], compact.reshape(cells.shape)
-    is_fixed: NDArray[np.bool_] = np.logical_or(is_on[used, 0], is_on[used, 1])
+    is_fixed = np.any(is_on[np.unique(cells)], axis=1)
+    points, cells = compacted(points, cells)
     points = _untangled(points, cells, is_fixed)
     v = volumes(points, cells)
     if v.min() <= 0.0:
@@ -248,14 +252,14 @@ def _box_faces_of_nodes(
 def _untangled(
     points: NDArray[np.float64], cells: NDArray[np.int64], is_fixed: NDArray[np.bool_]
 ) -> NDArray[np.float64]:
-    """Nodes of inverted and nearly flat cells moved until all volumes are positive, or `ROUNDS` are over.
+    """Nodes of inverted and nearly flat cells moved until all volumes are positive, or `UNTANGLING_ROUNDS` are over.
 
     `is_fixed` (N, 3) marks the coordinates that must stay. A node goes part of the way to its neighbours' middle if
     the smallest relative volume around it (volume over its longest edge's cube) grows.
     """
     points = points.copy()
     around = [np.flatnonzero(False)] * len(points)
-    for _ in range(ROUNDS):
+    for _ in range(UNTANGLING_ROUNDS):
         shape = _relative_volumes(points[cells])
         bad = np.flatnonzero(shape < LEAST_SHAPE)
         if len(bad) == 0:

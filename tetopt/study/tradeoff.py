@@ -5,23 +5,21 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from tetopt.engine.fast import optimize
 from tetopt.engine.loop import GRADED_K_D, SHAPE_POWER
 from tetopt.engine.meshing import mesh_image
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.start.lattice import lattice
 from tetopt.start.sizes import COARSEST, Sizes
 from tetopt.study.compare_report import Measurement, TradeoffRow
 
-SWEEPS: dict[str, tuple[float, ...]] = {
+SWEEP_VALUES: dict[str, tuple[float, ...]] = {
     "k_D": (0.3, 0.5, 0.7, GRADED_K_D, 0.93),
     "shape power p": (2.0, SHAPE_POWER, 4.0, 6.0),
     "gradation": (0.2, 0.5, 1.0),
     "largest edge, of a uniform mesh's": (1.0, 1.15, COARSEST, 2.0, 3.0),
     "uniform, k_D": (0.0, 0.2, 0.5, 0.8),
 }
-DEFAULTS = {
+SWEEP_DEFAULTS = {
     ("k_D", GRADED_K_D),
     ("shape power p", SHAPE_POWER),
     ("gradation", 1.0),
@@ -32,12 +30,12 @@ DEFAULTS = {
 def tradeoff(
     image: Image, nodes: int, measure: Callable[[Mesh], Measurement], say: Callable[[str], None]
 ) -> list[TradeoffRow]:
-    """Meshes of about `nodes` nodes over `SWEEPS`, each with its measurement; the default's are made once."""
+    """Meshes of about `nodes` nodes over `SWEEP_VALUES`, each with its measurement; the default's are made once."""
     measurements: dict[tuple[str, float] | None, Measurement] = {}  # by what is changed; None: nothing
     rows = []
-    for option, values in SWEEPS.items():
+    for option, values in SWEEP_VALUES.items():
         for value in values:
-            is_default = (option, value) in DEFAULTS
+            is_default = (option, value) in SWEEP_DEFAULTS
             changed = None if is_default else (option, value)
             if changed not in measurements:
                 say(f"trade-off: {option} = {value:g}")
@@ -49,7 +47,7 @@ def tradeoff(
 def _mesh(image: Image, nodes: int, option: str, value: float) -> Mesh:
     """The mesh with one option changed."""
     if option == "uniform, k_D":
-        return optimize(image, lattice(image, nodes=nodes), k_D=value).mesh
+        return mesh_image(image, nodes, mode="uniform", k_D=value).mesh
     largest = Sizes().at_most(image, nodes) / COARSEST
     changed: dict[str, dict[str, Any]] = {
         "k_D": {"k_D": value},
