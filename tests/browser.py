@@ -5,6 +5,10 @@ import subprocess
 
 import pytest
 
+# On a loaded machine a headless browser may never get to a frame before its own time ends; timers it always runs.
+FRAMES = "<script>window.requestAnimationFrame = (draw) => setTimeout(() => draw(performance.now()), 0)</script>"
+BLIND = "<script>HTMLCanvasElement.prototype.getContext = () => null;</script>"  # no WebGL
+
 
 def browser(folder, *arguments):
     """Run headless Chromium, its console on stderr."""
@@ -16,3 +20,16 @@ def browser(folder, *arguments):
     done = subprocess.run([program, *flags, *arguments], capture_output=True, encoding="utf-8", check=True, timeout=120)
     assert "CONSOLE" not in done.stderr, [line for line in done.stderr.splitlines() if "CONSOLE" in line]
     return done.stdout
+
+
+def document(page, *flags):
+    """The document that a browser makes of the file, after its scripts."""
+    flags = (*flags, "--virtual-time-budget=60000", "--dump-dom")
+    return browser(page.parent / "profile", *flags, page.as_uri())
+
+
+def copied(text, path, first=FRAMES, last=""):
+    """The page `text` written to `path` with a script put before its own and one after."""
+    text = text.replace("<head>", "<head>" + first, 1).replace("</body>", last + "</body>")
+    path.write_text(text, encoding="utf-8")
+    return path

@@ -7,7 +7,7 @@ import re
 
 import numpy as np
 import pytest
-from browser import browser
+from browser import BLIND, FRAMES, copied, document
 
 import tetopt
 from tetopt.errors import InputError
@@ -16,19 +16,6 @@ from tetopt.geometry.simplex import centroids, volumes
 from tetopt.geometry.topology import boundary_facets, facets
 from tetopt.report import explore
 from tetopt.report.explore import colour_table, explorer_html, save_explorer, scalar_fields
-
-# Neither upright nor right-angled, one axis flipped: what is not taken through the affine comes out elsewhere.
-TILTED = np.array([[-1.9, 0.5, 0.3, 40.0], [0.4, 1.8, -0.5, -20.0], [0.3, 0.4, 2.6, 3.0], [0.0, 0.0, 0.0, 1.0]])
-
-
-@pytest.fixture(scope="module")
-def image():
-    return tetopt.Image(np.random.default_rng(0).integers(0, 200, (16, 18, 14)).astype(float), TILTED)
-
-
-@pytest.fixture(scope="module")
-def mesh(image):
-    return tetopt.lattice(image, nodes=300)
 
 
 @pytest.fixture(scope="module")
@@ -89,12 +76,12 @@ def test_the_data_are_the_meshs(mesh, cell_data, image):
 
 def test_the_image_is_where_its_affine_puts_it(mesh, image):
     data = packed(explorer_html(mesh, {}, image))
-    found = data["image"]
+    packed_image = data["image"]
     index = np.random.default_rng(0).uniform(0, 13, (9, 3))
     relative = np.append(image.to_world(index) - data["centre"], np.ones((9, 1)), axis=1)
-    np.testing.assert_allclose((relative @ np.reshape(found["toIndex"], (4, 4)))[:, :3], index, atol=1e-9)
+    np.testing.assert_allclose((relative @ np.reshape(packed_image["toIndex"], (4, 4)))[:, :3], index, atol=1e-9)
     low, high = np.percentile(image.data, [0.5, 99.5])
-    greys = array(found["voxels"], "u1").reshape(image.shape, order="F")
+    greys = array(packed_image["voxels"], "u1").reshape(image.shape, order="F")
     np.testing.assert_allclose(greys, np.clip((image.data - low) / (high - low), 0, 1) * 255, atol=0.51)
 
 
@@ -146,10 +133,7 @@ def test_the_colour_map_is_even():
     assert steps.min() > 0.6 * steps.mean()
 
 
-# What a user does, and what the page then says or shows. Frames by timers: on a loaded machine a headless browser may
-# never get to a frame before its own time ends.
-FRAMES = "<script>window.requestAnimationFrame = (draw) => setTimeout(() => draw(performance.now()), 0)</script>"
-BLIND = "<script>HTMLCanvasElement.prototype.getContext = () => null;</script>"
+# What a user does, and what the page then says or shows.
 PROBE = """<script>
 const said = {};
 const $ = (id) => document.getElementById(id);
@@ -242,6 +226,10 @@ AT = (0.23, -1.37, 3.1)  # mm from the middle: the coronal cut, the axial one, a
 CLICKS = [[300, 300], [340, 390], [420, 280]]
 
 
+def middle_of(mesh):
+    return (mesh.points.min(axis=0) + mesh.points.max(axis=0)) / 2
+
+
 def inner_facets(mesh, below):
     """Facets without a node on the surface and under a level: from above, other cells hide them all."""
     nodes = facets(mesh.cells).nodes
@@ -253,7 +241,7 @@ def inner_facets(mesh, below):
 def shown(tmp_path_factory, mesh, cell_data, image):
     """What the page says and shows, in one run of a browser: as it is, without WebGL, and in a narrow window."""
     folder = tmp_path_factory.mktemp("explore")
-    middle = (mesh.points.min(axis=0) + mesh.points.max(axis=0)) / 2
+    middle = middle_of(mesh)
     thin = np.argmin(np.ptp(mesh.points, axis=0))
     words = {"AT_0": middle[thin] + AT[2], "AT_1": middle[1] + AT[0], "AT_2": middle[2] + AT[1], "CLICKS": CLICKS}
     probe = PROBE
@@ -262,20 +250,16 @@ def shown(tmp_path_factory, mesh, cell_data, image):
     for title in ("page", "blind", "narrow"):
         sets = {"outer": boundary_facets(mesh.cells), "inner": inner_facets(mesh, below=middle[2] + AT[1] - 5.0)}
         text = explorer_html(mesh, cell_data, image, title, sets)
-        start = FRAMES + BLIND if title == "blind" else FRAMES
-        text = text.replace("<head>", "<head>" + start, 1).replace("</body>", probe + "</body>")
-        (folder / f"{title}.html").write_text(text, encoding="utf-8")
-    (folder / "frame.html").write_text(FRAME, encoding="utf-8")
-    flags = ["--window-size=1500,1500", "--virtual-time-budget=60000", "--dump-dom"]
-    found = browser(folder / "profile", *flags, (folder / "frame.html").as_uri())
-    said = re.findall(r'data-(page|blind|narrow)="([^"]*)"', found)
+        copied(text, folder / f"{title}.html", FRAMES + BLIND if title == "blind" else FRAMES, probe)
+    frame = copied(FRAME, folder / "frame.html")
+    said = re.findall(r'data-(page|blind|narrow)="([^"]*)"', document(frame, "--window-size=1500,1500"))
     return {name: json.loads(html.unescape(text)) for name, text in said}
 
 
 def test_counts_and_surfaces(shown, mesh, cell_data):
     """Cells and volume within the limits, facets of what is left and polygons of the cut are those numpy finds."""
     page, mean, label = shown["page"], cell_data["mean"], cell_data["label"]
-    middle = (mesh.points.min(axis=0) + mesh.points.max(axis=0)) / 2
+    middle = middle_of(mesh)
     extent = np.ptp(mesh.points, axis=0)
     thin = int(np.argmin(extent))
     beyond = centroids(mesh.points, mesh.cells)[:, thin] - middle[thin]
@@ -311,7 +295,7 @@ def places_of(found, mesh):
     """World x and y (K, 2), mm, of the pixels seen from above, and how many mm a pixel is."""
     width, height = found["size"]
     extent = np.ptp(mesh.points, axis=0)
-    middle = (mesh.points.min(axis=0) + mesh.points.max(axis=0)) / 2
+    middle = middle_of(mesh)
     mm = np.linalg.norm(extent) / min(width, height)
     x, y = np.array(found["cells"])[:, :2].T
     return np.column_stack([x + 0.5 - width / 2, height / 2 - y - 0.5]) * mm + middle[:2], mm
@@ -336,7 +320,7 @@ def cells_at(mesh, xyz):
 def test_the_section_shows_the_cells_it_cuts(shown, mesh, cell_data):
     page = shown["page"]
     xy, mm = places_of(page, mesh)
-    z = (mesh.points.min(axis=0) + mesh.points.max(axis=0))[2] / 2 + AT[1]
+    z = middle_of(mesh)[2] + AT[1]
     cells, distances = cells_at(mesh, np.column_stack([xy, np.full(len(xy), z)]))
     clear = (distances > 2.5 * mm) & (cells >= 0)  # of lines
     assert clear.sum() > 400
@@ -350,7 +334,7 @@ def test_the_section_shows_the_cells_it_cuts(shown, mesh, cell_data):
 def test_the_slice_shows_the_voxel_at_every_place(shown, mesh, image):
     page = shown["page"]
     xy, _ = places_of(page, mesh)
-    z = (mesh.points.min(axis=0) + mesh.points.max(axis=0))[2] / 2 + AT[1]
+    z = middle_of(mesh)[2] + AT[1]
     index = image.to_index(np.column_stack([xy, np.full(len(xy), z)])) + 0.5
     is_clear = (np.abs(index - np.rint(index)) > 0.02).all(axis=1)  # of voxels' sides, where rounding decides
     is_inside = ((index > 0.15) & (index < np.array(image.shape) - 0.15)).all(axis=1)  # clear of smoothed outlines
@@ -366,7 +350,7 @@ def test_a_click_reads_a_cell(shown, mesh, cell_data):
     page = shown["page"]
     width, height = page["size"]
     mm = places_of(page, mesh)[1]
-    middle = (mesh.points.min(axis=0) + mesh.points.max(axis=0)) / 2
+    middle = middle_of(mesh)
     xy = (np.array(CLICKS) + 0.5 - [width / 2, height / 2]) * [mm, -mm]
     cells, _ = cells_at(mesh, np.column_stack([xy, np.full(3, AT[1])]) + middle)
     for cell, text in zip(cells, page["picked"], strict=True):

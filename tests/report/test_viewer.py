@@ -7,7 +7,7 @@ import re
 import numpy as np
 import PIL.Image
 import pytest
-from browser import browser
+from browser import BLIND, browser, copied, document
 
 import tetopt
 from tetopt.errors import InputError
@@ -71,11 +71,11 @@ def unpacked(text):
 def test_the_data_are_the_surfaces_in_one_box(opened):
     _, _, view = opened
     moved = View("moved", view.points + 5.0, view.triangles[:7], view.values[:7])
-    found = unpacked(views_html([view, moved]))
+    packed = unpacked(views_html([view, moved]))
     both = np.concatenate([view.points, moved.points])
     low, high = both.min(axis=0), both.max(axis=0)
     low_grey, high_grey = grey_limits([view.values, moved.values])
-    for each, data in zip((view, moved), found, strict=True):
+    for each, data in zip((view, moved), packed, strict=True):
         places = data["points"].reshape(-1, 3) / 32767.0 * np.linalg.norm(high - low) / 2.0 + (low + high) / 2.0
         np.testing.assert_allclose(places, each.points, atol=np.linalg.norm(high - low) / 60000.0)
         np.testing.assert_array_equal(data["triangles"].reshape(-1, 3), each.triangles)
@@ -144,20 +144,11 @@ PROBE = """<script>addEventListener("load", () => setTimeout(() => {
 }, 200))</script>"""
 
 
-# On a loaded machine a headless browser may never get to a frame before its own time ends; timers it always runs.
-FRAMES = "<script>window.requestAnimationFrame = (draw) => setTimeout(() => draw(performance.now()), 0)</script>"
-
-
 def test_views_turn_together(page, tmp_path):
     """Drag, keys, wheel and buttons change every view; reset brings the first picture back."""
-    copied = tmp_path / "copy.html"
-    text = (
-        page.read_text(encoding="utf-8").replace("<head>", "<head>" + FRAMES, 1).replace("</body>", PROBE + "</body>")
-    )
-    copied.write_text(text, encoding="utf-8")
-    found = browser(tmp_path / "profile", "--virtual-time-budget=60000", "--dump-dom", copied.as_uri())
-    said = re.search(r'data-said="([^"]*)"', found)
-    assert found.count('data-drawn="1"') == 2
+    shown = document(copied(page.read_text(encoding="utf-8"), tmp_path / "copy.html", last=PROBE))
+    said = re.search(r'data-said="([^"]*)"', shown)
+    assert shown.count('data-drawn="1"') == 2
     assert said.group(1) == (
         "drag true,true; reset false,false; key true,true; wheel unasked false,false; wheel true,true"
     )
@@ -174,10 +165,6 @@ def test_a_browser_draws_cells_and_edges(page, tmp_path):
 
 
 def test_without_webgl_it_is_said(page, tmp_path):
-    copied = tmp_path / "copy.html"
-    text = page.read_text(encoding="utf-8")
-    blind = "<script>HTMLCanvasElement.prototype.getContext = () => null;</script>"
-    copied.write_text(text.replace('<p class="viewer-hint">', blind + '<p class="viewer-hint">'), encoding="utf-8")
-    found = browser(tmp_path / "profile", "--dump-dom", copied.as_uri())
-    assert found.count("This browser has no WebGL 2, so the 3-D view cannot be shown") >= 2
-    assert "<canvas" not in found
+    shown = document(copied(page.read_text(encoding="utf-8"), tmp_path / "copy.html", BLIND))
+    assert shown.count("This browser has no WebGL 2, so the 3-D view cannot be shown") >= 2
+    assert "<canvas" not in shown

@@ -6,24 +6,11 @@ import sys
 import numpy as np
 import pytest
 
-import tetopt
 from tetopt.errors import InputError
 from tetopt.geometry.cut import plane_cut
 from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import boundary_facets
 from tetopt.report.window import has_display, plane_slice, plotter, show
-
-TILTED = np.array([[-1.9, 0.5, 0.3, 40.0], [0.4, 1.8, -0.5, -20.0], [0.3, 0.4, 2.6, 3.0], [0.0, 0.0, 0.0, 1.0]])
-
-
-@pytest.fixture(scope="module")
-def image():
-    return tetopt.Image(np.random.default_rng(0).integers(0, 200, (16, 18, 14)).astype(float), TILTED)
-
-
-@pytest.fixture(scope="module")
-def mesh(image):
-    return tetopt.lattice(image, nodes=300)
 
 
 @pytest.fixture(scope="module")
