@@ -1,15 +1,16 @@
-"""One model for the tests of every format: materials, overlapping sets, a load, labels, an oblique box."""
+"""One model for the tests of every format and solver: materials, overlapping sets, a load, labels, an oblique box."""
 
 from functools import cache
 
 import numpy as np
 
 import tetopt
+from tetopt.fem.elasticity import compression, lame_constants, strains
 from tetopt.geometry.simplex import volumes
 from tetopt.model.loads import parse_loads
 from tetopt.model.materials import binned, materials
 from tetopt.model.model import Model
-from tetopt.model.sets import box_of, standard_sets, with_requested
+from tetopt.model.sets import Sets, box_of, enclosing_facets, nodes_of, standard_sets, with_requested
 
 ABOUT = {"tetopt": "0.1.0", "image": "two spheres & <more>.nii.gz", "image_sha256": "ab" * 32}
 
@@ -43,3 +44,39 @@ def sample_model(n=3, bins=3):
         made = binned(made, volumes(mesh.points, mesh.cells), bins)
     loads = parse_loads(["compress:5%"], mesh, sets)
     return Model(mesh, fields, sets, made, loads, about=dict(ABOUT))
+
+
+def young_of(model):
+    """The modulus of each cell."""
+    return model.materials.young[model.materials.of_cell]
+
+
+def with_one_ratio(model, nu):
+    """The model with one Poisson's ratio for all cells, as `tetopt.fem` wants it."""
+    return model._replace(materials=materials(young_of(model), nu, len(model.mesh.cells)))
+
+
+def with_two_sides(model):
+    """The model with the interface also as a set that holds it from its other side."""
+    bright = enclosing_facets(model.mesh, model.sets.cells["label_1"])
+    return model._replace(sets=Sets(model.sets.facets | {"bright": bright}, model.sets.cells))
+
+
+def our_compression(model, nu):
+    """What `tetopt.fem` makes of the model's two loads, the first of which holds."""
+    fixed, pushed = (nodes_of(model.mesh, model.sets.facets[load.set_name]) for load in model.loads)
+    push = model.loads[1].displacement
+    return compression(model.mesh, young_of(model), nu, fixed_nodes=fixed, pushed_nodes=pushed, displacement=push)
+
+
+def cell_energies(mesh, young, nu, u):
+    """Strain energy of each cell, uJ, from the strain and the two Lame constants."""
+    strain = strains(mesh, u)
+    lame, mu = lame_constants(np.broadcast_to(young, len(mesh.cells)), nu, mesh.ndim)
+    spread = np.einsum("cii->c", strain) ** 2
+    return volumes(mesh.points, mesh.cells) * (0.5 * lame * spread + mu * (strain**2).sum(axis=(1, 2)))
+
+
+def each_once(nodes):
+    """Rows of nodes without their order."""
+    return sorted(map(tuple, np.sort(nodes, axis=1).tolist()))

@@ -9,13 +9,13 @@ import skfem
 from hypothesis import given
 from hypothesis import strategies as st
 from meshes import ALL_SMALL, random_affine, random_rotation, split_box
+from models import cell_energies
 from skfem.helpers import ddot, sym_grad, trace
 
 from tetopt import Image, InputError, Mesh, lattice
 from tetopt.fem import elasticity
 from tetopt.fem.elasticity import (
     box_faces,
-    cell_energies,
     compression,
     constrained,
     multigrid,

@@ -7,7 +7,7 @@ from collections import Counter
 import meshio
 import numpy as np
 import pytest
-from models import sample_model
+from models import sample_model, young_of
 
 from tetopt import InputError, Mesh
 from tetopt.io.abaqus import abaqus
@@ -121,7 +121,7 @@ def test_each_cell_has_its_material_and_no_other(model):
         cells = [int(cell) - 1 for line in elements[name] for cell in line]
         assert np.isnan(constants[cells]).all()
         constants[cells] = float(young), float(nu)
-    np.testing.assert_array_equal(constants[:, 0], model.materials.young[model.materials.of_cell])
+    np.testing.assert_array_equal(constants[:, 0], young_of(model))
     np.testing.assert_array_equal(constants[:, 1], model.materials.nu[model.materials.of_cell])
 
 

@@ -10,7 +10,7 @@ from itertools import chain
 import meshio
 import numpy as np
 import pytest
-from models import ABOUT, sample_model
+from models import ABOUT, each_once, sample_model, young_of
 
 import tetopt.io.gmsh
 from tetopt.errors import InputError
@@ -126,11 +126,6 @@ class Read:
 
 def cell_numbers(model):
     return list(range(1, len(model.mesh.cells) + 1))
-
-
-def each_once(nodes):
-    """Rows of nodes without their order."""
-    return sorted(map(tuple, np.sort(nodes, axis=1).tolist()))
 
 
 # Everything, exactly
@@ -335,7 +330,7 @@ def test_many_materials_are_views_only(monkeypatch):
     model = sample_model()
     read = Read(gmsh41(model))
     assert {name for dim, name in read.groups if dim == 3} == {"label_0", "label_1"}
-    young = model.materials.young[model.materials.of_cell].tolist()
+    young = young_of(model).tolist()
     assert [read.views["young"][number] for number in cell_numbers(model)] == young
     assert "4 materials: in the views young, kPa, and nu; not groups" in read.comments
     with pytest.raises(
@@ -437,7 +432,7 @@ def test_comments_that_gmsh_has_put_at_the_end(tmp_path):
     assert back.space == "lps"
     assert set(back.sets.cells) == set(model.sets.cells)
     np.testing.assert_array_equal(back.sets.cells["dark"], model.sets.cells["dark"])
-    np.testing.assert_array_equal(back.cell_data["young"], model.materials.young[model.materials.of_cell])
+    np.testing.assert_array_equal(back.cell_data["young"], young_of(model))
     # Without the constants of a material there are no moduli: what is left are the groups' names.
     without = "".join(f"{line}\n" for line in more.splitlines() if not line.startswith("material_1:"))
     (tmp_path / "a.msh").write_text(f"{before}{after}$Comments\n{without}$EndComments\n")
@@ -544,5 +539,5 @@ def test_gmsh_reads_it(version, n, bins, tmp_path):
     if version == "4.1":
         for name in ("mean", "label"):
             assert dict(views[name])[7] == model.cell_data[name][6]
-        young = model.materials.young[model.materials.of_cell]
+        young = young_of(model)
         assert [dict(views["young"])[number] for number in cell_numbers(model)] == young.tolist()

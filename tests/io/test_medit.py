@@ -9,7 +9,7 @@ import sys
 import meshio
 import numpy as np
 import pytest
-from models import ABOUT, sample_model
+from models import ABOUT, each_once, sample_model, young_of
 
 from tetopt.errors import InputError
 from tetopt.io.medit import medit
@@ -58,11 +58,6 @@ class Read:
         return self.nodes[keyword][np.isin(self.refs[keyword], self.refs_of(keyword, name))]
 
 
-def each_once(nodes):
-    """Rows of nodes without their order."""
-    return sorted(map(tuple, np.sort(nodes, axis=1).tolist()))
-
-
 @pytest.mark.parametrize(("n", "bins"), MODELS)
 def test_all_of_the_model_is_there(n, bins):
     model = sample_model(n, bins)
@@ -102,7 +97,7 @@ def test_constants_image_and_loads_are_in_comments():
     for line in read.comments:
         if found := re.fullmatch(r"(material_\d+): young (\S+) MPa, nu (\S+)", line):
             young[read.cells_of(found[1])], nu[read.cells_of(found[1])] = float(found[2]), float(found[3])
-    assert np.array_equal(young, model.materials.young[model.materials.of_cell])
+    assert np.array_equal(young, young_of(model))
     assert np.array_equal(nu, model.materials.nu[model.materials.of_cell])
     assert f"image: {ABOUT['image']}, sha256 {ABOUT['image_sha256']}" in read.comments
     assert any(line.endswith("nodes of superior displaced by 0.0 0.0 0.0 mm") for line in read.comments)

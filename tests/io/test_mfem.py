@@ -4,7 +4,7 @@ import re
 
 import numpy as np
 import pytest
-from models import ABOUT, sample_model
+from models import ABOUT, each_once, sample_model, young_of
 
 from tetopt.errors import InputError
 from tetopt.io.mfem import mfem
@@ -64,11 +64,6 @@ class Read:
         return self.facets[np.isin(self.facet_attributes, self.facet_sets[name])]
 
 
-def each_once(nodes):
-    """Rows of nodes without their order."""
-    return sorted(map(tuple, np.sort(nodes, axis=1).tolist()))
-
-
 @pytest.mark.parametrize(("n", "bins"), MODELS)
 def test_all_of_the_model_is_there(n, bins):
     model = sample_model(n, bins)
@@ -117,7 +112,7 @@ def test_constants_and_what_attributes_mean_are_in_comments():
     for line in read.comments:
         if found := re.fullmatch(r"(material_\d+): young (\S+) MPa, nu (\S+)", line):
             young[read.cells_of(found[1])], nu[read.cells_of(found[1])] = float(found[2]), float(found[3])
-    assert np.array_equal(young, model.materials.young[model.materials.of_cell])
+    assert np.array_equal(young, young_of(model))
     assert np.array_equal(nu, model.materials.nu[model.materials.of_cell])
     for what, sets in (("attribute", read.cell_sets), ("boundary attribute", read.facet_sets)):
         for attribute in {k for attributes in sets.values() for k in attributes}:

@@ -6,7 +6,7 @@ import meshio
 import numpy as np
 import pytest
 import pyvista
-from models import ABOUT, sample_model
+from models import ABOUT, sample_model, young_of
 
 from tetopt.io.formats import save_model
 from tetopt.io.meshes import load_mesh
@@ -51,7 +51,7 @@ def test_other_readers_see_the_file_s_own_space_and_units(tmp_path, suffix):
         (meshio.read(path).points, meshio.read(path).cell_data["young"][0]),
     ):
         np.testing.assert_array_equal(points, model.mesh.points * [-1, -1, 1])
-        np.testing.assert_allclose(young, model.materials.young[model.materials.of_cell] / 1000.0, rtol=1e-15)
+        np.testing.assert_allclose(young, young_of(model) / 1000.0, rtol=1e-15)
     grid = pyvista.read(path)
     for name, rows in model.sets.facets.items():
         np.testing.assert_array_equal(np.flatnonzero(grid.point_data[f"on_{name}"]), nodes_of(model.mesh, rows))

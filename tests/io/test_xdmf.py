@@ -5,19 +5,12 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import pyvista
-from models import ABOUT, sample_model
+from models import ABOUT, sample_model, with_two_sides
 
 from tetopt.errors import InputError
 from tetopt.io.xdmf import xdmf
 from tetopt.model.model import described, in_space, in_units
-from tetopt.model.sets import Sets, enclosing_facets, facet_triples, standard_sets
-
-
-def with_two_sides(model):
-    """The model with the interface also as a set that holds it from its other side."""
-    bright = enclosing_facets(model.mesh, model.sets.cells["label_1"])
-    return model._replace(sets=Sets(model.sets.facets | {"bright": bright}, model.sets.cells))
-
+from tetopt.model.sets import Sets, facet_triples, standard_sets
 
 MODELS = {
     "3-D": sample_model,

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from models import sample_image, sample_model
+from models import sample_image, sample_model, young_of
 
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
@@ -198,10 +198,10 @@ def test_the_mean_of_the_law_and_the_law_of_the_mean():
     fields = sample_model(3).cell_data
     by_image = model_of(mesh, image, young="1 + h**2")
     by_mean = model_of(mesh, young="1 + h**2", cell_data=fields)
-    young = by_image.materials.young[by_image.materials.of_cell]
+    young = young_of(by_image)
     np.testing.assert_allclose(young, cell_values(image, mesh, lambda h: 1.0 + h**2), rtol=1e-14)
     np.testing.assert_allclose(young, 1.0 + fields["mean"] ** 2 + fields["variance"], rtol=1e-9)
-    flat = by_mean.materials.young[by_mean.materials.of_cell]
+    flat = young_of(by_mean)
     np.testing.assert_allclose(flat, 1.0 + fields["mean"] ** 2, rtol=1e-14)
     assert (young > flat + 1.0).any()
 

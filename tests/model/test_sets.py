@@ -1,4 +1,4 @@
-"""Named sets: the box's faces by their anatomical names, interfaces, what is asked for in words, tags."""
+"""Named sets: the box's faces by their anatomical names, interfaces, what is asked for in words."""
 
 from itertools import permutations, product
 
@@ -25,7 +25,6 @@ from tetopt.model.sets import (
     rows_of,
     standard_sets,
     surviving_sets,
-    tagged,
     with_requested,
 )
 
@@ -237,20 +236,7 @@ def test_below_needs_means():
         with_requested(mesh, Sets({}, {}), ["dark=below:12"], None)
 
 
-# Tags, and sets of other meshes
-
-
-def test_tags_say_which_sets_an_item_is_in():
-    for sets in (sample_model(3).sets.facets, sample_model(3).sets.cells):
-        found = tagged(sets)
-        assert found.tags.min() == 1
-        assert len(np.unique(found.items, axis=0)) == len(found.items)
-        for name, members in sets.items():
-            chosen = found.items[np.isin(found.tags, found.tags_of[name])]
-            np.testing.assert_array_equal(chosen, members)
-        together = {tuple(name for name in sets if tag in found.tags_of[name]) for tag in np.unique(found.tags)}
-        assert len(together) == found.tags.max()  # no two tags for one combination
-    assert tagged({}).tags_of == {}
+# Sets of other meshes
 
 
 def test_rows_of_nodes_in_any_order():

@@ -4,20 +4,14 @@ import sys
 
 import numpy as np
 import pytest
-from models import sample_model
+from models import sample_model, with_two_sides
 
 from tetopt.errors import InputError
 from tetopt.geometry.topology import facets
 from tetopt.model.model import in_space
-from tetopt.model.sets import Sets, enclosing_facets, facet_triples
+from tetopt.model.sets import Sets, facet_triples
 
 skfem = pytest.importorskip("skfem", reason="no scikit-fem (pip install scikit-fem)")
-
-
-def with_two_sides(model):
-    """The model with the interface also as a set that holds it from its other side."""
-    bright = enclosing_facets(model.mesh, model.sets.cells["label_1"])
-    return model._replace(sets=Sets(model.sets.facets | {"bright": bright}, model.sets.cells))
 
 
 MODELS = {

@@ -9,13 +9,13 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import skfem
-from models import sample_model
+from models import cell_energies, sample_model, young_of
 from scipy.sparse.linalg import spsolve
 from skfem.helpers import ddot, sym_grad, trace
 
 import tetopt
 from tetopt import Mesh
-from tetopt.fem.elasticity import cell_energies, constrained, lame_constants, solved, stiffness
+from tetopt.fem.elasticity import constrained, lame_constants, solved, stiffness
 from tetopt.geometry.simplex import volumes
 from tetopt.io.abaqus import abaqus
 from tetopt.model.loads import parse_loads
@@ -77,10 +77,6 @@ def pressed_model(loading="compression"):
     sets = with_requested(mesh, sets, ["dark-cells=below:20", "Patch=point:40,0,0:15"], fields["mean"])
     made = binned(materials(0.5 + fields["mean"] / 7.0, NU, len(mesh.cells)), volumes(mesh.points, mesh.cells), 16)
     return Model(mesh, fields, sets, made, parse_loads(LOADS[loading], mesh, sets), about={"image": "two spheres & ü"})
-
-
-def young_of(model):
-    return model.materials.young[model.materials.of_cell]
 
 
 def prescribed(model, n_nodes, nodes_of_rows):

@@ -2,12 +2,10 @@
 
 import numpy as np
 import pytest
-from models import sample_model
+from models import our_compression, sample_model, with_one_ratio
 
-from tetopt.fem.elasticity import compression, lame_constants
+from tetopt.fem.elasticity import lame_constants
 from tetopt.io.mfem import mfem
-from tetopt.model.materials import materials
-from tetopt.model.sets import nodes_of
 
 ser = pytest.importorskip("mfem.ser", reason="no PyMFEM (pip install mfem)")
 
@@ -49,20 +47,10 @@ def pressed(path, model):
 
 @pytest.mark.parametrize("n", [3, 2])
 def test_the_energy_is_that_of_our_own_solver(n, tmp_path):
-    model = sample_model(n)
-    young = model.materials.young[model.materials.of_cell]
-    model = model._replace(materials=materials(young, NU, len(young)))
+    model = with_one_ratio(sample_model(n), NU)
     path = tmp_path / "model.mfem"
     path.write_bytes(mfem(model))
     u, energy = pressed(path, model)
-    held, moved = model.loads
-    ours = compression(
-        model.mesh,
-        young,
-        NU,
-        fixed_nodes=nodes_of(model.mesh, model.sets.facets[held.set_name]),
-        pushed_nodes=nodes_of(model.mesh, model.sets.facets[moved.set_name]),
-        displacement=moved.displacement,
-    )
+    ours = our_compression(model, NU)
     np.testing.assert_allclose(u, ours.u, rtol=0, atol=1e-10)
     assert energy == pytest.approx(ours.strain_energy, rel=1e-10)

@@ -15,6 +15,7 @@ from tetopt.cli.inputs import check_no_input, read_image, read_mesh
 from tetopt.cli.options import CropOption, ForceOption, ImageArgument, JsonOption, SliceOption, VolumeOption
 from tetopt.io.files import checked_output, save_json
 from tetopt.io.images import sha256
+from tetopt.model.materials import DEFAULT_NU
 from tetopt.report.summary import versions
 from tetopt.report.tables import new_table
 
@@ -30,7 +31,7 @@ def fem_command(
             '"0.5 + 0.01*h" or "1/max(abs(h), 0.001)" of a strain image. Default: the intensity.',
         ),
     ] = None,
-    nu: Annotated[float, typer.Option(metavar="NU", help="Poisson's ratio, above -1 and below 0.5.")] = 0.45,
+    nu: Annotated[float, typer.Option(metavar="NU", help="Poisson's ratio, above -1 and below 0.5.")] = DEFAULT_NU,
     compress: Annotated[float, typer.Option(metavar="PERCENT", help="How far the bottom is pushed in.")] = 1.0,
     output: Annotated[
         Path | None,

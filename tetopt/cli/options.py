@@ -8,6 +8,8 @@ from typing import Annotated
 
 import typer
 
+from tetopt.model.materials import DEFAULT_NU
+
 
 class Method(StrEnum):  # noqa: D101
     fast = "fast"
@@ -53,7 +55,7 @@ YoungOption = Annotated[
         'by label "1=2.1,2=1.9", or a file .toml or .csv of such columns.',
     ),
 ]
-NuOption = Annotated[str | None, typer.Option(metavar="LAW", help="Poisson's ratio, likewise (default 0.45).")]
+NuOption = Annotated[str | None, typer.Option(metavar="LAW", help=f"Poisson's ratio, likewise (default {DEFAULT_NU}).")]
 BinsOption = Annotated[
     str | None,
     typer.Option(metavar="K[:quantile|:log]", help="Group cells into K materials, of equal width, by number, or log."),

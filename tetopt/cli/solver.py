@@ -18,7 +18,7 @@ from tetopt.io.formats import FORMATS, file_bytes, format_of, save_model
 from tetopt.model.build import labels_of, model_of
 from tetopt.model.laws import parse_any_law
 from tetopt.model.loads import known_set, parse_load
-from tetopt.model.materials import Spacing
+from tetopt.model.materials import DEFAULT_NU, Spacing
 from tetopt.model.model import SPACES, STRESS_UNITS, Model
 from tetopt.model.sets import Box, Sets, check_free_names, merged_sets, nodes_of, parse_set, standard_sets
 from tetopt.report.tables import new_table
@@ -96,7 +96,7 @@ def built(
         young = np.asarray(cell_data["young"], dtype=np.float64)
         nu = np.asarray(cell_data["nu"], dtype=np.float64) if nu is None and "nu" in cell_data else nu
     elif nu is None and "nu" in cell_data:
-        log.print("nu: of --young or 0.45; what the mesh's file has is left")
+        log.print(f"nu: of --young or {DEFAULT_NU}; what the mesh's file has is left")
     fields = {name: values for name, values in cell_data.items() if name not in ("young", "nu", "material")}
     bins, spacing = parsed_bins(wishes.bins)
     return model_of(

@@ -8,7 +8,7 @@ eigenvalue is 0. So they depend on what is held, and meshes are comparable under
 from __future__ import annotations
 
 import warnings
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -70,11 +70,7 @@ def lambda_max(K_ff: csr_array) -> float:
     """
     if K_ff.shape[0] <= DENSE_DOFS:
         return float(np.linalg.eigvalsh(K_ff.toarray())[-1])
-    try:
-        values = eigsh(K_ff, k=1, which="LA", v0=_start(K_ff)[:, 0], tol=1e-10, return_eigenvectors=False)
-    except ArpackNoConvergence as error:
-        raise RuntimeError(f"conditioning: the largest eigenvalue did not converge ({error})") from error
-    return float(values[0])
+    return _by_lanczos(K_ff, "largest", which="LA", tol=1e-10)
 
 
 def lambda_min(K_ff: csr_array, preconditioner: LinearOperator | None = None) -> float:
@@ -97,10 +93,15 @@ def lambda_min(K_ff: csr_array, preconditioner: LinearOperator | None = None) ->
     if preconditioner is not None:
         return _by_lobpcg(K_ff, preconditioner)
     inverse = LinearOperator(K_ff.shape, matvec=factorized(K_ff), dtype=np.float64)
+    return _by_lanczos(K_ff, "smallest", sigma=0.0, OPinv=inverse)
+
+
+def _by_lanczos(K_ff: csr_array, extreme: str, **options: Any) -> float:
+    """The largest or smallest eigenvalue from a fixed start, with `options` of scipy's `eigsh`."""
     try:
-        values = eigsh(K_ff, k=1, sigma=0.0, OPinv=inverse, v0=_start(K_ff)[:, 0], return_eigenvectors=False)
+        values = eigsh(K_ff, k=1, v0=_start(K_ff)[:, 0], return_eigenvectors=False, **options)
     except ArpackNoConvergence as error:
-        raise RuntimeError(f"conditioning: the smallest eigenvalue did not converge ({error})") from error
+        raise RuntimeError(f"conditioning: the {extreme} eigenvalue did not converge ({error})") from error
     return float(values[0])
 
 
@@ -132,11 +133,7 @@ def _by_inverse(K_ff: csr_array, preconditioner: LinearOperator) -> float:
         return solution
 
     inverse = LinearOperator(K_ff.shape, matvec=solve, dtype=np.float64)
-    try:
-        values = eigsh(K_ff, k=1, sigma=0.0, OPinv=inverse, v0=_start(K_ff)[:, 0], tol=1e-8, return_eigenvectors=False)
-    except ArpackNoConvergence as error:
-        raise RuntimeError(f"conditioning: the smallest eigenvalue did not converge ({error})") from error
-    return float(values[0])
+    return _by_lanczos(K_ff, "smallest", sigma=0.0, OPinv=inverse, tol=1e-8)
 
 
 def cg_iterations(K_ff: csr_array, load: NDArray[np.float64], rtol: float = RESIDUAL_SHARE) -> int:

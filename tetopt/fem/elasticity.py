@@ -136,20 +136,6 @@ def strains(mesh: Mesh, u: NDArray[np.float64]) -> NDArray[np.float64]:
     return 0.5 * (slope + slope.transpose(0, 2, 1))
 
 
-def cell_energies(mesh: Mesh, young: ArrayLike, nu: float, u: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Strain energy of each cell, (M,) float64, uJ; their sum is 1/2 u^T K u.
-
-    Raises
-    ------
-    InputError
-        As `stiffness`.
-    """
-    strain = strains(mesh, u)
-    lame, mu = lame_constants(_checked_young(young, mesh), _checked_nu(nu), mesh.ndim)
-    spread = np.einsum("cii->c", strain) ** 2
-    return volumes(mesh.points, mesh.cells) * (0.5 * lame * spread + mu * (strain**2).sum(axis=(1, 2)))
-
-
 # Boundary conditions
 
 

@@ -11,7 +11,14 @@ from tetopt.errors import InputError
 from tetopt.geometry.topology import facets
 from tetopt.mesh import Mesh
 from tetopt.model.model import Model, described
-from tetopt.model.sets import Tagged, tagged
+
+
+class Tagged(NamedTuple):
+    """Overlapping sets as tags, one an item, for formats that know no more: an item's tag tells all of its sets."""
+
+    items: NDArray[np.int64]  # (T,) or (T, 2): every cell or facet that is in any set, ascending
+    tags: NDArray[np.int64]  # (T,) from 1
+    tags_of: dict[str, list[int]]  # the tags that make up each set
 
 
 class CellTags(NamedTuple):
@@ -20,6 +27,28 @@ class CellTags(NamedTuple):
     tags: NDArray[np.int64]  # (M,) 1 to T, by material; the material's number from 1 where no set divides one
     material: NDArray[np.int64]  # (T,) of each tag, from 0; 0 without materials
     tags_of: dict[str, list[int]]  # the tags that make up each material ("material_1", ...) and each cell set
+
+
+def tagged(sets: dict[str, NDArray[np.int64]]) -> Tagged:
+    """One tag for each combination of sets that some item is in, from 1 in the order of the first such items.
+
+    Examples
+    --------
+    >>> tagged_items = tagged({"a": np.array([4, 7]), "b": np.array([7, 9])})
+    >>> tagged_items.items.tolist(), tagged_items.tags.tolist(), tagged_items.tags_of
+    ([4, 7, 9], [1, 2, 3], {'a': [1, 2], 'b': [2, 3]})
+    """
+    if not sets:
+        return Tagged(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), {})
+    items, which = np.unique(np.concatenate(list(sets.values())), axis=0, return_inverse=True)
+    of_set = np.repeat(np.arange(len(sets)), [len(members) for members in sets.values()])
+    is_in = np.zeros((len(items), len(sets)), dtype=bool)
+    is_in[which.ravel(), of_set] = True
+    kinds, first, kind = np.unique(is_in, axis=0, return_index=True, return_inverse=True)
+    rank = np.empty(len(kinds), dtype=np.int64)
+    rank[np.argsort(first)] = np.arange(1, len(kinds) + 1)
+    tags_of = {name: np.sort(rank[kinds[:, k]]).tolist() for k, name in enumerate(sets)}
+    return Tagged(items, rank[kind.ravel()], tags_of)
 
 
 def cell_tags(model: Model) -> CellTags:

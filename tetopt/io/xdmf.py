@@ -57,9 +57,10 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.geometry.topology import facets
+from tetopt.io.tags import tagged
 from tetopt.io.text import rows
 from tetopt.model.model import Model, described
-from tetopt.model.sets import facet_triples, tagged
+from tetopt.model.sets import facet_triples
 
 # By number of nodes; lines need theirs stated.
 TOPOLOGY_TYPES = {2: '"PolyLine" NodesPerElement="2"', 3: '"Triangle"', 4: '"Tetrahedron"'}

@@ -16,11 +16,9 @@ from tetopt.model.averages import cell_values, cell_young
 from tetopt.model.fields import cell_fields
 from tetopt.model.laws import ByLabel, Law, has_column, law_values, parse_any_law, young_from
 from tetopt.model.loads import parse_loads
-from tetopt.model.materials import Materials, Spacing, binned, by_label, materials
+from tetopt.model.materials import DEFAULT_NU, Materials, Spacing, binned, by_label, materials
 from tetopt.model.model import Model
 from tetopt.model.sets import Box, Sets, box_of, standard_sets, with_requested
-
-DEFAULT_NU = 0.45  # soft tissue that linear cells can still follow: they lock nearer to 0.5
 
 
 def model_of(

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.mesh import Mesh
-from tetopt.model.sets import FACE_NAMES, Sets, facet_triples, nodes_of
+from tetopt.model.sets import FACE_NAMES, Sets, facet_triples, finite_numbers, nodes_of
 
 MOST_COMPRESSION_PERCENT = 50.0  # a linear step presses no further
 
@@ -77,26 +77,17 @@ def parse_load(text: str, ndim: int) -> LoadRequest:
         return LoadRequest(kind, rest, np.zeros(ndim))
     if kind == "move":
         name, _, vector = rest.rpartition(":")
-        numbers = _numbers(vector)
+        numbers = finite_numbers(vector)
         if numbers.shape != (ndim,):
             raise InputError(f'load: expected move:SET: and {ndim} numbers in mm, got "{text}"')
         return LoadRequest(kind, name, numbers)
     if kind == "compress":
-        percent = _numbers(rest.removesuffix("%"))
+        percent = finite_numbers(rest.removesuffix("%"))
         if not rest.endswith("%") or len(percent) != 1 or not 0.0 < percent[0] <= MOST_COMPRESSION_PERCENT:
             limits = f"above 0 and up to {MOST_COMPRESSION_PERCENT:g}"
             raise InputError(f'load: expected compress:P% with P {limits}, got "{text}"')
         return LoadRequest(kind, "", percent)
     raise InputError(f'load: expected compress:5%, hold:SET or move:SET:X,Y,Z, got "{text}"')
-
-
-def _numbers(text: str) -> NDArray[np.float64]:
-    """Finite numbers between commas; none if there is anything else."""
-    try:
-        numbers = np.array([float(part) for part in text.split(",")])
-    except ValueError:
-        return np.empty(0)
-    return numbers if np.isfinite(numbers).all() else np.empty(0)
 
 
 def _loads(text: str, mesh: Mesh, sets: Sets) -> list[Load]:

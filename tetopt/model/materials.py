@@ -13,6 +13,7 @@ from numpy.typing import ArrayLike, NDArray
 from tetopt.errors import InputError
 from tetopt.model.laws import ByLabel, checked_young
 
+DEFAULT_NU = 0.45  # Poisson's ratio of soft tissue that linear cells can still follow: they lock nearer to 0.5
 Spacing = Literal["equal", "quantile", "log"]
 SPACINGS = get_args(Spacing)
 

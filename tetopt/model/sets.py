@@ -44,14 +44,6 @@ class Box(NamedTuple):
     affine: NDArray[np.float64]  # (n+1, n+1)
 
 
-class Tagged(NamedTuple):
-    """Overlapping sets as tags, one an item, for formats that know no more: an item's tag tells all of its sets."""
-
-    items: NDArray[np.int64]  # (T,) or (T, 2): every cell or facet that is in any set, ascending
-    tags: NDArray[np.int64]  # (T,) from 1
-    tags_of: dict[str, list[int]]  # the tags that make up each set
-
-
 def facet_triples(cells: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.int64]:
     """Nodes of the facets (K, 2), (K, n) int64, turned to face out of their cell.
 
@@ -276,38 +268,22 @@ def _near(mesh: Mesh, request: SetRequest) -> NDArray[np.int64]:
 
 
 def _numbers(name: str, text: str, count: int) -> NDArray[np.float64]:
-    try:
-        numbers = np.array([float(part) for part in text.split(",")])
-    except ValueError:
-        numbers = np.empty(0)
-    if len(numbers) != count or not np.isfinite(numbers).all():
+    numbers = finite_numbers(text)
+    if len(numbers) != count:
         raise InputError(f'set {name}: expected {count} number{"s" * (count > 1)}, got "{text}"')
     return numbers
 
 
-# For formats that know one tag an item
+def finite_numbers(text: str) -> NDArray[np.float64]:
+    """The numbers between commas, float64; none if there is anything else, or one that is not finite."""
+    try:
+        numbers = np.array([float(part) for part in text.split(",")])
+    except ValueError:
+        return np.empty(0)
+    return numbers if np.isfinite(numbers).all() else np.empty(0)
 
 
-def tagged(sets: dict[str, NDArray[np.int64]]) -> Tagged:
-    """One tag for each combination of sets that some item is in, from 1 in the order of the first such items.
-
-    Examples
-    --------
-    >>> tagged_items = tagged({"a": np.array([4, 7]), "b": np.array([7, 9])})
-    >>> tagged_items.items.tolist(), tagged_items.tags.tolist(), tagged_items.tags_of
-    ([4, 7, 9], [1, 2, 3], {'a': [1, 2], 'b': [2, 3]})
-    """
-    if not sets:
-        return Tagged(np.empty(0, dtype=np.int64), np.empty(0, dtype=np.int64), {})
-    items, which = np.unique(np.concatenate(list(sets.values())), axis=0, return_inverse=True)
-    of_set = np.repeat(np.arange(len(sets)), [len(members) for members in sets.values()])
-    is_in = np.zeros((len(items), len(sets)), dtype=bool)
-    is_in[which.ravel(), of_set] = True
-    kinds, first, kind = np.unique(is_in, axis=0, return_index=True, return_inverse=True)
-    rank = np.empty(len(kinds), dtype=np.int64)
-    rank[np.argsort(first)] = np.arange(1, len(kinds) + 1)
-    tags_of = {name: np.sort(rank[kinds[:, k]]).tolist() for k, name in enumerate(sets)}
-    return Tagged(items, rank[kind.ravel()], tags_of)
+# Sets that come with a mesh
 
 
 def rows_of(mesh: Mesh, nodes: NDArray[np.int64]) -> NDArray[np.int64]:

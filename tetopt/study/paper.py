@@ -27,6 +27,7 @@ from tetopt.measure.quality import QualityErrors, quality_errors
 from tetopt.mesh import Mesh
 from tetopt.model.averages import cell_young
 from tetopt.model.laws import Law
+from tetopt.model.materials import DEFAULT_NU
 from tetopt.phantom import load_phantom
 from tetopt.start.delaunay import delaunay
 from tetopt.start.lattice import lattice
@@ -202,7 +203,7 @@ def inverse_strain(strain: ArrayLike, floor: float) -> NDArray[np.float64]:
     return 1.0 / np.maximum(np.abs(strain), floor)
 
 
-def elastography(snr_db: float | None, nu: float = 0.45) -> Image:
+def elastography(snr_db: float | None, nu: float = DEFAULT_NU) -> Image:
     """Approximate modulus 1 / strain of a compressed stiffness phantom, relative to its median; Fig. 3(c).
 
     `prostate_2d` is compressed by 1 %, plane stress, on a mesh of four triangles to every 0.5 mm pixel. The axial
@@ -276,7 +277,7 @@ class Simulated(NamedTuple):
 
 
 def simulate(
-    image: Image, mesh: Mesh, nu: float = 0.45, percent: float = 1.0, law: Law = None
+    image: Image, mesh: Mesh, nu: float = DEFAULT_NU, percent: float = 1.0, law: Law = None
 ) -> tuple[Simulated, Compression]:
     """Top fixed, bottom pushed in by `percent` of the height along the faces' normal, both bonded.
 
