@@ -20,7 +20,7 @@ from choose_k_d import ERRORS, PHANTOMS, cases
 
 import tetopt
 from tetopt.io.files import checked_output, save_json
-from tetopt.start.sizes import COARSEST
+from tetopt.start.sizes import COARSEST_SHARE
 from tetopt.study.compare import Standard, default_law, measured, prepared
 from tetopt.study.compare_report import Settings
 
@@ -33,7 +33,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser.add_argument("images", type=Path, nargs="*", help="volumes, besides the phantoms")
     parser.add_argument("-o", "--output", type=Path, required=True, help="JSON file for every number")
     parser.add_argument("--phantoms", nargs="*", default=PHANTOMS, help="phantoms to take (%(default)s)")
-    parser.add_argument("--largest", type=float, nargs="+", default=[1.0, 1.2, COARSEST, 2.0, np.inf])
+    parser.add_argument("--largest", type=float, nargs="+", default=[1.0, 1.2, COARSEST_SHARE, 2.0, np.inf])
     parser.add_argument("--nodes", type=int, default=2000)
     parser.add_argument("--dofs", type=int, default=150_000, help="size of the reference grid (%(default)s)")
     parser.add_argument("--force", action="store_true", help="replace an existing output")
@@ -67,7 +67,7 @@ def _meshes(
     lattice = tetopt.lattice(image, nodes=nodes)
     yield "lattice", lattice
     yield "uniform", tetopt.optimize(image, lattice).mesh
-    edge = tetopt.Sizes().at_most(image, nodes) / COARSEST
+    edge = tetopt.Sizes().longest_edge(image, nodes) / COARSEST_SHARE
     for factor in largest:
         sizes = tetopt.Sizes(largest=factor * edge)
         yield f"graded, largest {factor:g}", tetopt.mesh_image(image, nodes, sizes=sizes).mesh

@@ -57,6 +57,17 @@ def squared_lengths(corners):
     return [dot(minus(p, q), minus(p, q)) for p, q in combinations(corners, 2)]
 
 
+def circumcentres(points, cells):
+    """Centres of the circumscribed spheres, (M, n) float64; flat cells raise LinAlgError.
+
+    With the edges e_k from the first node as rows, the centre c relative to it solves 2 e_k . c = |e_k|^2.
+    """
+    corners = points[cells]
+    edges = corners[:, 1:] - corners[:, :1]
+    right = (edges**2).sum(axis=2)
+    return corners[:, 0] + np.linalg.solve(2.0 * edges, right[..., None])[..., 0]
+
+
 # Energies
 
 

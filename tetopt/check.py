@@ -16,10 +16,10 @@ from tetopt.mesh import Mesh
 def check_mesh(mesh: Mesh, image: Image | None = None, *, is_whole: bool = True) -> list[str]:
     """What is wrong with a mesh, one line each, the first offenders named; an empty list if nothing is.
 
-    Asked are: every node used and none twice in the same place; every cell positively oriented, with distinct corners,
-    and none doubled; every facet in one or two cells, which lie on its two sides (so the mesh conforms and does not
-    fold); the boundary closed, and one piece. With an image also: the boundary's facets lie on the faces of its box,
-    and the cells' volumes add up to it.
+    In a mesh every node is used, and no two lie in the same place; every cell is positively oriented, has distinct
+    corners and is there once; every facet is in one or two cells, which lie on its two sides (so the mesh conforms and
+    does not fold); the boundary is closed, and one piece. With an image also the boundary's facets lie on the faces of
+    its box, and the cells' volumes add up to it.
 
     Parameters
     ----------
@@ -38,51 +38,54 @@ def check_mesh(mesh: Mesh, image: Image | None = None, *, is_whole: bool = True)
         raise InputError(
             f"mesh and image: expected the same dimension, got a {mesh.ndim}-D mesh and a {image.ndim}-D image"
         )
-    found = [*_nodes(mesh), *_cells(mesh)]
-    if not found:  # what follows takes sound cells for granted
-        found = _facets(mesh, is_whole)
-    if not found and image is not None:
-        found = _box(mesh, image)
-    return found
+    problems = [*_problems_of_nodes(mesh), *_problems_of_cells(mesh)]
+    if not problems:  # what follows takes sound cells for granted
+        problems = _problems_of_facets(mesh, is_whole)
+    if not problems and image is not None:
+        problems = _problems_with_box(mesh, image)
+    return problems
 
 
 def _first(numbers: NDArray) -> str:
+    """How many there are, and the first of them, for a message."""
     return f"{len(numbers)}, the first {numbers[:5].tolist()}"
 
 
-def _nodes(mesh: Mesh) -> list[str]:
-    found = []
+def _problems_of_nodes(mesh: Mesh) -> list[str]:
+    problems = []
     unused = np.flatnonzero(np.bincount(mesh.cells.ravel(), minlength=len(mesh.points)) == 0)
     if len(unused):
-        found.append(f"nodes that no cell uses: {_first(unused)}")
+        problems.append(f"nodes that no cell uses: {_first(unused)}")
     order = np.lexsort(mesh.points.T)
     same = (mesh.points[order[1:]] == mesh.points[order[:-1]]).all(axis=1)
     if same.any():
         pairs = np.column_stack([order[:-1], order[1:]])[same]
-        found.append(f"pairs of nodes in one place: {_first(np.sort(pairs, axis=1))}")
-    return found
+        problems.append(f"pairs of nodes in one place: {_first(np.sort(pairs, axis=1))}")
+    return problems
 
 
-def _cells(mesh: Mesh) -> list[str]:
-    found = []
+def _problems_of_cells(mesh: Mesh) -> list[str]:
+    problems = []
     ordered = np.sort(mesh.cells, axis=1)
     repeated = np.flatnonzero((ordered[:, 1:] == ordered[:, :-1]).any(axis=1))
     if len(repeated):
-        found.append(f"cells with a corner twice: {_first(repeated)}")
+        problems.append(f"cells with a corner twice: {_first(repeated)}")
     flat = np.flatnonzero(~(volumes(mesh.points, mesh.cells) > 0.0))
     if len(flat):
-        found.append(f"cells that are flat or inverted: {_first(flat)}")
+        problems.append(f"cells that are flat or inverted: {_first(flat)}")
     _, index, counts = np.unique(ordered, axis=0, return_index=True, return_counts=True)
     if (counts > 1).any():
-        found.append(f"cells that are there more than once: {_first(np.sort(index[counts > 1]))}")
-    return found
+        problems.append(f"cells that are there more than once: {_first(np.sort(index[counts > 1]))}")
+    return problems
 
 
-def _facets(mesh: Mesh, is_whole: bool) -> list[str]:
-    found = []
+def _problems_of_facets(mesh: Mesh, is_whole: bool) -> list[str]:
+    problems = []
     pairs = folded(mesh.cells)
     if len(pairs):
-        found.append(f"facets whose cells lie on one side of them, or of more than two cells; cells: {_first(pairs)}")
+        problems.append(
+            f"facets whose cells lie on one side of them, or of more than two cells; cells: {_first(pairs)}"
+        )
     shared = facets(mesh.cells)
     outer = shared.nodes[shared.n_cells == 1]
     if mesh.ndim == 3:  # every edge of the boundary's triangles belongs to an even number of them
@@ -92,12 +95,12 @@ def _facets(mesh: Mesh, is_whole: bool) -> list[str]:
         kinds, counts = np.unique(outer, return_counts=True)
         kinds = kinds[:, None]
     if (counts % 2).any():
-        found.append(f"places where the boundary is open; nodes: {_first(kinds[counts % 2 == 1])}")
+        problems.append(f"places where the boundary is open; nodes: {_first(kinds[counts % 2 == 1])}")
     pieces = components(mesh.cells)
     if is_whole and pieces.max() > 0:
         sizes = np.bincount(pieces)
-        found.append(f"pieces that share no facet: {len(sizes)}, of {np.sort(sizes)[::-1][:5].tolist()} cells")
-    return found
+        problems.append(f"pieces that share no facet: {len(sizes)}, of {np.sort(sizes)[::-1][:5].tolist()} cells")
+    return problems
 
 
 def check_unfolded(mesh: Mesh) -> None:
@@ -128,12 +131,12 @@ def filled_share(mesh: Mesh, image: Image) -> float:
     return float(volumes(mesh.points, mesh.cells).sum()) / image.volume
 
 
-def _box(mesh: Mesh, image: Image) -> list[str]:
-    found = []
-    outer, on_box = facets_on_box(mesh, image)
-    if not on_box.all():
-        found.append(f"boundary facets off the faces of the image's box; nodes: {_first(outer[~on_box])}")
+def _problems_with_box(mesh: Mesh, image: Image) -> list[str]:
+    problems = []
+    outer, is_on_box = facets_on_box(mesh, image)
+    if not is_on_box.all():
+        problems.append(f"boundary facets off the faces of the image's box; nodes: {_first(outer[~is_on_box])}")
     filled = filled_share(mesh, image)
     if abs(filled - 1.0) > 1e-9:
-        found.append(f"volume: {filled:.12g} of the image's box")
-    return found
+        problems.append(f"volume: {filled:.12g} of the image's box")
+    return problems

@@ -10,6 +10,8 @@ from numpy.typing import ArrayLike, NDArray
 
 from tetopt.errors import InputError
 
+SINGULAR_DETERMINANT = 1e-6  # of the axes' directions: with less they do not span the space
+
 
 @dataclass(frozen=True, eq=False)
 class Image:
@@ -117,9 +119,9 @@ def _checked_data(data: ArrayLike) -> NDArray[np.floating]:
             f"image data: {int(np.count_nonzero(~is_finite))} voxels are NaN or infinite, the first at index "
             f"{first}; replace them (for example by the background's value) first"
         )
-    held = _as_lossless_float(data)
-    held.setflags(write=False)
-    return held
+    values = _as_lossless_float(data)
+    values.setflags(write=False)
+    return values
 
 
 def _as_lossless_float(data: NDArray) -> NDArray[np.floating]:
@@ -146,7 +148,7 @@ def _checked_affine(affine: ArrayLike, n: int) -> NDArray[np.float64]:
         raise InputError(f"affine: the last row must be {np.eye(n + 1)[-1].tolist()}, got {affine[-1].tolist()}")
     columns = affine[:-1, :-1]
     lengths = np.linalg.norm(columns, axis=0)
-    if lengths.min() == 0.0 or abs(np.linalg.det(columns / lengths)) < 1e-6:
+    if lengths.min() == 0.0 or abs(np.linalg.det(columns / lengths)) < SINGULAR_DETERMINANT:
         raise InputError(
             f"affine: it is singular (voxel axes of lengths {lengths.tolist()} mm do not span {n}-D space); "
             "mend the file's header"

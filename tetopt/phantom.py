@@ -25,7 +25,7 @@ Top level
     they span with the lengths ``size_mm``.
 Shapes
     All live in world millimetres, whatever ``axes`` is. Each has a ``kind``, an ``intensity``, a ``label``
-    (an integer, 0 or more) and, if wanted, a ``name``:
+    (an integer, 0 or more) and optionally a ``name``:
 
     - ``ellipsoid``: ``center_mm``, ``radii_mm`` and optionally ``rotation_deg``;
     - ``box``: ``center_mm``, ``size_mm`` and optionally ``rotation_deg``;
@@ -51,11 +51,11 @@ from scipy.ndimage import gaussian_filter
 from scipy.spatial.transform import Rotation
 
 from tetopt.errors import InputError
-from tetopt.image import Image
+from tetopt.image import SINGULAR_DETERMINANT, Image
 
-MAX_VOXELS = 2**31
-MAX_SUPERSAMPLE = 64
-_CHUNK = 2**18  # points evaluated at once; a few tens of MB of temporaries
+MAX_PHANTOM_VOXELS = 2**31  # 17 GB in float64
+MAX_SUPERSAMPLE = 64  # sub-voxels along an axis: 262,144 to a voxel in 3-D, as many as fit one chunk of points
+POINTS_PER_CHUNK = 2**18  # evaluated at once, with a few tens of MB of temporaries
 
 _TOP_KEYS = ("name", "description", "size_mm", "voxel_mm", "background")
 _TOP_OPTIONS = ("center_mm", "axes", "blur_mm", "noise_sd", "seed", "shape")
@@ -195,7 +195,7 @@ class Phantom:
         seed: int | None = None,
         supersample: int = 4,
     ) -> Image:
-        """The phantom as voxels; what is not given is taken from the file.
+        """The phantom as voxels; the file has the options that are left out.
 
         A voxel that a surface may cut (its centre is no farther from it than half the voxel's longest
         diagonal, by the bound of `signed_distance`) holds the mean over ``supersample**n`` midpoints of its
@@ -264,19 +264,19 @@ class Phantom:
     def _checked_points(self, points: ArrayLike) -> NDArray[np.float64]:
         """Points as float64; InputError unless they are (..., n) finite numbers."""
         try:
-            held = np.asarray(points, dtype=np.float64)
+            checked = np.asarray(points, dtype=np.float64)
         except (TypeError, ValueError) as error:
             raise InputError(
                 f"phantom {self.name!r}: points: expected numbers of shape (..., {self.ndim}), got {points!r}"
             ) from error
-        if held.ndim == 0 or held.shape[-1] != self.ndim:
+        if checked.ndim == 0 or checked.shape[-1] != self.ndim:
             raise InputError(
-                f"phantom {self.name!r}: points: expected shape (..., {self.ndim}), got {held.shape}; "
+                f"phantom {self.name!r}: points: expected shape (..., {self.ndim}), got {checked.shape}; "
                 f"give {self.ndim} world coordinates in mm for each"
             )
-        if not np.isfinite(held).all():
+        if not np.isfinite(checked).all():
             raise InputError(f"phantom {self.name!r}: points: some are NaN or infinite; leave those out")
-        return held
+        return checked
 
     def _top_shape(self, points: NDArray[np.float64]) -> NDArray[np.int64]:
         """Position in painting order of the last shape at each point: 1 is the first, 0 the background."""
@@ -292,7 +292,7 @@ class Phantom:
         with np.errstate(over="ignore"):
             counts = np.maximum(1.0, np.rint(self.size_mm / voxel))
             n_voxels = counts.prod()
-        if n_voxels > MAX_VOXELS:
+        if n_voxels > MAX_PHANTOM_VOXELS:
             raise InputError(
                 f"{where}: voxel_mm: expected at most 2**31 voxels, got "
                 f"{' x '.join(f'{count:.6g}' for count in counts)} of {voxel.tolist()} mm; take larger ones"
@@ -325,7 +325,7 @@ class Phantom:
         intensities = self._intensities()
         means = intensities[top]
         cut = np.flatnonzero(is_cut.any(axis=0))
-        step = max(1, _CHUNK // len(offsets))
+        step = max(1, POINTS_PER_CHUNK // len(offsets))
         for start in range(0, len(cut), step):
             voxels = cut[start : start + step]
             paint = np.repeat(base[voxels, None], len(offsets), axis=1)
@@ -465,7 +465,7 @@ def _axes(rows: Any, n: int, what: str) -> NDArray[np.float64]:
     if not isinstance(rows, list) or len(rows) != n:
         raise InputError(f"{what}: expected {n} rows, the directions of the voxel axes, got {rows!r}")
     axes = np.array([_numbers(row, n, f"{what}: row {i}") for i, row in enumerate(rows, start=1)])
-    if not axes.any(axis=1).all() or abs(np.linalg.det(np.array([_unit(row) for row in axes]))) < 1e-6:
+    if not axes.any(axis=1).all() or abs(np.linalg.det(np.array([_unit(row) for row in axes]))) < SINGULAR_DETERMINANT:
         raise InputError(f"{what}: the directions {rows!r} do not span {n}-D space; make them independent")
     axes = np.array([_unit(row) for row in axes])
     axes.setflags(write=False)
@@ -498,8 +498,8 @@ def _index_block(start: int, stop: int, shape: tuple[int, ...]) -> NDArray[np.fl
 def _voxel_centers(shape: tuple[int, ...], affine: NDArray[np.float64]) -> Iterator[tuple[slice, NDArray[np.float64]]]:
     """Slices of the flattened grid with the world centres (M, n) of their voxels, in bounded pieces."""
     total = math.prod(shape)
-    for start in range(0, total, _CHUNK):
-        stop = min(start + _CHUNK, total)
+    for start in range(0, total, POINTS_PER_CHUNK):
+        stop = min(start + POINTS_PER_CHUNK, total)
         yield slice(start, stop), _index_block(start, stop, shape) @ affine[:-1, :-1].T + affine[:-1, -1]
 
 
@@ -552,9 +552,9 @@ def _numbers(value: Any, n: int, what: str, is_one_enough: bool = False) -> NDAr
     if not isinstance(row, list | tuple) or len(row) != n or not all(map(_is_number, row)):
         expected = f"a number or a list of {n}" if is_one_enough else f"a list of {n} numbers"
         raise InputError(f"{what}: expected {expected}, all finite, got {value!r}")
-    held = np.array(row, dtype=np.float64)
-    held.setflags(write=False)
-    return held
+    numbers = np.array(row, dtype=np.float64)
+    numbers.setflags(write=False)
+    return numbers
 
 
 def _positive(values: NDArray[np.float64], what: str) -> NDArray[np.float64]:

@@ -5,6 +5,7 @@ import sys
 import numba
 import numpy as np
 import pytest
+from naive import circumcentres
 from scipy.spatial import Delaunay
 
 import tetopt
@@ -12,7 +13,7 @@ from tetopt.energy.geometric import E_G_gradient, ring_volumes
 from tetopt.energy.sampling import sampling_grid, to_ticks
 from tetopt.engine.loop import frozen_axes
 from tetopt.engine.paper import default_n_t, optimize_paper
-from tetopt.geometry.simplex import circumcentres, oriented, rho, volumes
+from tetopt.geometry.simplex import oriented, rho, volumes
 from tetopt.geometry.topology import boundary_facets, facets, rings
 from tetopt.start.delaunay import delaunay
 

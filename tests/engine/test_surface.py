@@ -16,7 +16,7 @@ from tetopt.geometry.topology import boundary_facets
 from tetopt.measure.fidelity import cell_labels, label_fidelity, mask_fidelity
 from tetopt.start.clip import lattice_within
 from tetopt.target.content import content
-from tetopt.target.domain import domain, levels
+from tetopt.target.domain import levels, region_of
 
 
 def times_covered(image, mesh):
@@ -36,7 +36,7 @@ def check(image, mask, mesh, floor=12.0):
     index = image.to_index(mesh.points)
     outer = np.unique(boundary_facets(mesh.cells))
     on_box = ((index == -0.5) | (index == np.array(image.shape) - 0.5)).any(axis=1)
-    off = np.abs(levels(domain(mask).level, index[outer[~on_box[outer]]]))
+    off = np.abs(levels(region_of(mask).level, index[outer[~on_box[outer]]]))
     assert np.mean(off < 1e-2) > 0.97  # the level of the mask's own box differs that much from the whole image's
     assert off.max() < 0.7
 

@@ -28,7 +28,6 @@ from meshes import (
 
 from tetopt.geometry.simplex import (
     centroids,
-    circumcentres,
     dihedral_angles,
     edge_pairs,
     facet_areas,
@@ -178,19 +177,19 @@ def test_volume_gradients_of_a_cell_sum_to_zero_and_give_n_volumes(seed, n):
     ],
 )
 def test_circumcentres_of_single_cells(mesh, centre):
-    assert circumcentres(*mesh)[0] == pytest.approx(centre, abs=1e-15)
+    assert naive.circumcentres(*mesh)[0] == pytest.approx(centre, abs=1e-15)
 
 
 @given(seeds, dimensions)
 def test_circumcentres_are_as_far_from_every_node(seed, n):
     points, cells = random_cells(seed, n)
-    distances = np.linalg.norm(points[cells] - circumcentres(points, cells)[:, None], axis=2)
+    distances = np.linalg.norm(points[cells] - naive.circumcentres(points, cells)[:, None], axis=2)
     np.testing.assert_allclose(distances, np.broadcast_to(distances[:, :1], distances.shape), rtol=1e-8)
 
 
 def test_circumcentre_of_a_flat_cell_is_refused():
     with pytest.raises(np.linalg.LinAlgError):
-        circumcentres(np.array([[0.0, 0], [1, 0], [2, 0]]), np.array([[0, 1, 2]]))
+        naive.circumcentres(np.array([[0.0, 0], [1, 0], [2, 0]]), np.array([[0, 1, 2]]))
 
 
 # rho
@@ -215,7 +214,7 @@ def test_rho_of_single_cells(mesh, value):
 def test_rho_is_inradius_over_circumradius(seed, n):
     points, cells = random_cells(seed, n)
     inradius = n * volumes(points, cells) / facet_areas(points, cells).sum(axis=1)
-    circumradius = np.linalg.norm(points[cells[:, 0]] - circumcentres(points, cells), axis=1)
+    circumradius = np.linalg.norm(points[cells[:, 0]] - naive.circumcentres(points, cells), axis=1)
     np.testing.assert_allclose(rho(points, cells), inradius / circumradius, rtol=1e-7)
     assert (rho(points, cells) <= 1 / n + 1e-15).all()
     np.testing.assert_allclose(rho(points, cells[:, ::-1]), rho(points, cells), rtol=1e-12)
@@ -324,7 +323,9 @@ def test_far_from_the_origin_nothing_is_lost(mesh):
     np.testing.assert_array_equal(rho(grid + shift, cells), rho(grid, cells))
     np.testing.assert_array_equal(dihedral_angles(grid + shift, cells), dihedral_angles(grid, cells))
     np.testing.assert_array_equal(facet_areas(grid + shift, cells), facet_areas(grid, cells))
-    np.testing.assert_allclose(circumcentres(grid + shift, cells) - shift, circumcentres(grid, cells), atol=1e-9)
+    np.testing.assert_allclose(
+        naive.circumcentres(grid + shift, cells) - shift, naive.circumcentres(grid, cells), atol=1e-9
+    )
 
 
 @pytest.mark.parametrize("n", [2, 3])

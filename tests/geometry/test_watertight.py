@@ -7,10 +7,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from meshes import CUBE_CORNER, FIVE_TET_CUBE, REGULAR_TET, TWO_TETS
+from shapes import n_pieces, volume_and_area
 
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import facet_areas, oriented, volumes
-from tetopt.geometry.surface import STEP, n_pieces, surface_of, volume_and_area
+from tetopt.geometry.surface import SHIFT_SHARE, surface_of
 from tetopt.geometry.topology import boundary_facets
 from tetopt.image import Image
 from tetopt.start.lattice import lattice
@@ -162,7 +163,7 @@ def test_cells_that_share_an_edge_or_a_node_come_apart(chosen, shared):
     assert (len(surface.points), len(surface.triangles)) == (8, 8)
     assert (surface.n_parted, n_pieces(surface)) == (len(shared), 2)
     heights = 3.0 * volumes(points, cells) / facet_areas(points, cells).max(axis=1)
-    assert surface.largest_shift == pytest.approx(STEP * heights[chosen].min())
+    assert surface.largest_shift == pytest.approx(SHIFT_SHARE * heights[chosen].min())
     for node in shared:  # one copy keeps its place
         away = np.sort(np.linalg.norm(surface.points - points[node], axis=1))
         np.testing.assert_allclose(away[:2], [0.0, surface.largest_shift], atol=1e-15)

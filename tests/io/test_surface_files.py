@@ -8,12 +8,13 @@ import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 from meshes import CUBE_CORNER, TWO_TETS
+from shapes import n_pieces, volume_and_area
 from vtkmodules.vtkIOGeometry import vtkSTLReader
 from vtkmodules.vtkIOPLY import vtkPLYReader
 
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
-from tetopt.geometry.surface import Surface, n_pieces, surface_of, volume_and_area
+from tetopt.geometry.surface import Surface, surface_of
 from tetopt.geometry.topology import boundary_facets
 from tetopt.image import Image
 from tetopt.io.surfaces import checked_surface, save_surface

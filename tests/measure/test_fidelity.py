@@ -10,18 +10,18 @@ from meshes import random_affine, random_rotation
 import tetopt
 from tetopt.geometry.simplex import centroids, oriented, volumes
 from tetopt.measure.fidelity import (
-    POINTS,
-    Surface,
+    MOST_POINTS,
+    FacetSurface,
     _distances,
     _face,
     _mean_and_p95,
+    _painted,
     cell_labels,
     euler_characteristic,
     evenly_spread,
     half_level_surface,
     label_fidelity,
     mask_fidelity,
-    painted,
     surface_distances,
 )
 
@@ -96,7 +96,7 @@ def test_cell_labels_against_twin(n):
     assert found.dtype == np.int64
     assert n_ties > 3
     assert n_empty > 3
-    shown = painted(labels, mesh, found)
+    shown = _painted(owner, found)
     assert (shown == -1).any()
     for voxel in np.ndindex(labels.shape):
         assert shown[voxel] == (-1 if owner[voxel] < 0 else found[owner[voxel]])
@@ -194,9 +194,11 @@ def test_distances_need_a_surface():
 def test_points_are_spread_evenly(n):
     """Each facet has its share of the points to within two, uniformly dense by their mean and covariance."""
     corners = np.random.default_rng(n).normal(size=(3, n, n)) + 10.0 * np.arange(3)[:, None, None]
-    surface = Surface(corners.reshape(-1, n), np.arange(3 * n).reshape(3, n))
+    surface = FacetSurface(corners.reshape(-1, n), np.arange(3 * n).reshape(3, n))
     points = evenly_spread(surface, 3000)
-    apart = np.array([surface_distances(points, *Surface(surface.points, surface.facets[k : k + 1])) for k in range(3)])
+    apart = np.array(
+        [surface_distances(points, *FacetSurface(surface.points, surface.facets[k : k + 1])) for k in range(3)]
+    )
     assert apart.min(axis=0).max() < 1e-9
     edges = corners[:, 1:] - corners[:, :1]
     areas = np.linalg.norm(edges[:, 0] if n == 2 else np.cross(edges[:, 0], edges[:, 1]), axis=-1)
@@ -223,9 +225,9 @@ def test_no_side_of_a_plate_is_left_out():
 def test_no_more_points_than_allowed():
     image = slabs(3)[0]
     plane = half_level_surface(image.data == 1, image.affine)
-    there, back = _distances(plane, Surface(plane.points, plane.facets[: len(plane.facets) // 2]), 1e-9)
-    assert len(there) == POINTS
-    assert POINTS / 2 - 1 <= len(back) <= POINTS / 2 + 1
+    there, back = _distances(plane, FacetSurface(plane.points, plane.facets[: len(plane.facets) // 2]), 1e-9)
+    assert len(there) == MOST_POINTS
+    assert MOST_POINTS / 2 - 1 <= len(back) <= MOST_POINTS / 2 + 1
     assert sum(len(d) for d in _distances(plane, plane, 1e9)) == 2000
 
 
@@ -362,9 +364,8 @@ def test_ball_of_labels(n):
 def test_bad_cell_labels(of_cell, words):
     image = tetopt.Image(np.zeros((4, 2)))
     mesh = tetopt.lattice(image, blocks=(2, 1))
-    for function in (label_fidelity, painted):
-        with pytest.raises(tetopt.InputError, match=words):
-            function(image, mesh, of_cell)
+    with pytest.raises(tetopt.InputError, match=words):
+        label_fidelity(image, mesh, of_cell)
 
 
 def test_bad_labels():

@@ -5,10 +5,11 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 from meshes import box_corners, random_affine
+from naive import circumcentres
 from scipy.spatial import Delaunay
 
 from tetopt import Image, lattice
-from tetopt.geometry.simplex import circumcentres, squared_edges, volumes
+from tetopt.geometry.simplex import squared_edges, volumes
 from tetopt.geometry.topology import facets
 from tetopt.start.delaunay import delaunay
 

@@ -47,7 +47,7 @@ def test_default_largest():
     """1.4 times the edges of a uniform mesh; larger where more nodes are not wanted."""
     image = ball(48, 40, 44)
     uniform = edges(tetopt.lattice(image, nodes=1500))[1].max()
-    assert Sizes().at_most(image, 1500) == pytest.approx(1.4 * uniform, rel=0.05)
+    assert Sizes().longest_edge(image, 1500) == pytest.approx(1.4 * uniform, rel=0.05)
     assert edges(octree(image, 1500))[1].max() <= 1.4 * 1.05 * uniform
 
 
@@ -232,13 +232,13 @@ def test_longest_at_nodes():
     affine[:3, 3] = -1.0
     field = tetopt.Image(np.where(grid(12, 12, 12)[..., 0] < 5, 7.0, 0.0), affine)
     in_field = image.to_index(mesh.points)[:, 0] < 12.0
-    found = Sizes(largest=20.0, field=field).prepared(3).longest(image, 300, mesh.points, mesh.cells, own)
+    found = Sizes(largest=20.0, field=field).prepared(3).longest_edges(image, 300, mesh.points, mesh.cells, own)
     np.testing.assert_allclose(found[in_field], 7.0)
     assert found.max() > 12.0  # grows from the field by gradation x distance
     assert found.max() <= 20.0
     own = np.linspace(1.0, 3.0, len(mesh.points))
     sizes = Sizes(largest=np.inf, gradation=0.2)
-    found = sizes.longest(image, 300, mesh.points, mesh.cells, own)
+    found = sizes.longest_edges(image, 300, mesh.points, mesh.cells, own)
     np.testing.assert_allclose(found, 1.5 * _around(own, mesh.points, mesh.cells, 0.2))
 
 
@@ -324,7 +324,7 @@ def test_exchanges_do_not_follow_noise(monkeypatch):
         with monkeypatch.context() as patched:
             patched.setattr(fast, "exchange", counted)
             if not known:
-                patched.setattr(sys.modules["tetopt.content"], "noise_level", lambda data, inside: 0.0)
+                patched.setattr(sys.modules["tetopt.target.content"], "noise_level", lambda data, inside: 0.0)
             tetopt.optimize(image, start, k_D=0.85, nodes=len(start.points), iterations=8)
         count[known] = sum(made)
     assert count[False] > 100

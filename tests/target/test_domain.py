@@ -7,14 +7,14 @@ import tetopt
 from tetopt.geometry.topology import boundary_facets
 from tetopt.measure.fidelity import mask_fidelity
 from tetopt.start.clip import clipped, lattice_within, onto_surface
-from tetopt.target.domain import Domain, domain, levels
+from tetopt.target.domain import Region, levels, region_of
 
 
 def test_a_sphere_has_no_stairs():
     """Twice as near to the true sphere as the surface halfway between voxels, and nowhere far from that."""
     centre, radius = np.array([14.3, 15.1, 14.7]), 9.0
     r = np.linalg.norm(grid((30, 30, 30)) - centre, axis=-1)
-    region = domain(tetopt.Image(1.0 * (r < radius)))
+    region = region_of(tetopt.Image(1.0 * (r < radius)))
     way = np.random.default_rng(0).normal(size=(4000, 3))
     way /= np.linalg.norm(way, axis=1)[:, None]
 
@@ -34,7 +34,7 @@ def test_a_sphere_has_no_stairs():
 def test_voxels_stay_on_their_side():
     rng = np.random.default_rng(1)
     mask = rng.random((12, 13, 14)) < 0.4
-    region = domain(tetopt.Image(1.0 * mask))
+    region = region_of(tetopt.Image(1.0 * mask))
     np.testing.assert_array_equal(region.level < 0.0, mask)
     np.testing.assert_array_equal(region.inside, mask)
 
@@ -43,7 +43,7 @@ def test_smoothing_moves_no_voxel_by_more_than_a_third():
     rng = np.random.default_rng(1)
     inside = gaussian_filter(rng.normal(size=(24, 24, 24)), 2.0) > 0.0
     raw = np.where(inside, 0.5 - distance_transform_edt(inside), distance_transform_edt(~inside) - 0.5)
-    moved = np.abs(domain(tetopt.Image(1.0 * inside)).level - raw)
+    moved = np.abs(region_of(tetopt.Image(1.0 * inside)).level - raw)
     assert 0.3 < moved.max() < 0.35 + 1e-5
 
 
@@ -51,7 +51,7 @@ def test_smoothing_moves_no_voxel_by_more_than_a_third():
 def test_a_sheet_of_one_voxel_keeps_its_thickness(is_gap):
     mask = np.zeros((21, 21, 21), dtype=bool)
     mask[3:18, 3:18, 10] = True
-    level = domain(tetopt.Image(1.0 * (mask ^ is_gap))).level * (-1.0 if is_gap else 1.0)
+    level = region_of(tetopt.Image(1.0 * (mask ^ is_gap))).level * (-1.0 if is_gap else 1.0)
     along = levels(level, np.array([[10.0, 10.0, z] for z in np.linspace(8.0, 12.0, 401)]))
     assert (along < 0.0).mean() * 4.0 == pytest.approx(1.0, abs=0.02)
 
@@ -60,7 +60,7 @@ def test_fractions_have_their_own_surface():
     z = np.arange(20.0)
     part = np.clip(12.7 - z, 0.0, 1.0)  # 0.7 at 12, 0 at 13: a half in between at 12 + 2 / 7
     mask = tetopt.Image(np.broadcast_to(part, (6, 7, 20)))
-    region = domain(mask)
+    region = region_of(mask)
     at = np.array([[2.0, 3.0, 12.0 + 2.0 / 7.0]])
     assert levels(region.level, at) == pytest.approx(0.0, abs=1e-6)
     assert levels(region.level, at + np.array([0, 0, 3.0])) > 1.0
@@ -69,7 +69,7 @@ def test_fractions_have_their_own_surface():
 
 def test_all_inside_has_no_surface():
     image = tetopt.Image(np.ones((6, 7, 8)))
-    region = domain(image)
+    region = region_of(image)
     mesh = tetopt.lattice(image, nodes=100)
     assert clipped(mesh, image, region).cells.tolist() == mesh.cells.tolist()
 
@@ -87,7 +87,7 @@ def test_the_way_onto_the_surface_is_the_shortest_in_mm(n):
     normal = np.array([1.0, 2.0, -0.5])[:n]  # of a plane, in index space
     level = (grid(image.shape) - 9.3) @ normal
     at = np.random.default_rng(0).uniform(6.0, 12.0, size=(40, n))
-    there, is_there = onto_surface(at, image, Domain(level < 0, level.astype(np.float32)))
+    there, is_there = onto_surface(at, image, Region(level < 0, level.astype(np.float32)))
     assert is_there.all()
     # In the world the normal of the plane is the index normal by the inverse transposed; the way is along it.
     world = normal @ np.linalg.inv(affine[:-1, :-1])
@@ -99,13 +99,13 @@ def test_the_way_onto_the_surface_is_the_shortest_in_mm(n):
 
 def test_nodes_on_the_box_stay_on_it():
     image, mask = shaped("touching")
-    mesh = clipped(tetopt.lattice(image, nodes=900), image, domain(mask))
+    mesh = clipped(tetopt.lattice(image, nodes=900), image, region_of(mask))
     index = image.to_index(mesh.points)
     assert (index >= -0.5).all()
     assert (index[:, 0] == -0.5).sum() > 20
     outer = boundary_facets(mesh.cells)
     on_box = (index[outer][:, :, 0] == -0.5).all(axis=1)
-    level = np.abs(levels(domain(mask).level, index))
+    level = np.abs(levels(region_of(mask).level, index))
     assert on_box.any()
     assert level[np.unique(outer[~on_box])].max() < 0.35  # the rest lies on the surface, or as good as
 
@@ -113,7 +113,7 @@ def test_nodes_on_the_box_stay_on_it():
 @pytest.mark.parametrize("kind", ["ball", "pieces", "hole", "handle", "touching"])
 def test_clipped(kind):
     image, mask = shaped(kind)
-    mesh = lattice_within(image, domain(mask), spacing=2.5)
+    mesh = lattice_within(image, region_of(mask), spacing=2.5)
     assert tetopt.check_mesh(mesh, is_whole=False) == []
     assert tetopt.quality(mesh.points, mesh.cells).min_dihedral > 1.0
     found = mask_fidelity(mask, mesh)
@@ -126,7 +126,7 @@ def test_clipped(kind):
 def test_wanted_nodes_within_a_mask():
     image, mask = shaped("ball")
     for nodes in (200, 600, 1500):
-        assert len(lattice_within(image, domain(mask), nodes=nodes).points) == pytest.approx(nodes, rel=0.1)
+        assert len(lattice_within(image, region_of(mask), nodes=nodes).points) == pytest.approx(nodes, rel=0.1)
 
 
 def test_too_thin_for_its_cells():
@@ -136,4 +136,4 @@ def test_too_thin_for_its_cells():
     mesh = tetopt.lattice(image, blocks=(1, 1, 1))
     moved = tetopt.Mesh(mesh.points + np.where(mesh.points == 14.5, 3.0, 0.0), mesh.cells)
     with pytest.raises(tetopt.InputError, match="thinner than the cells, none is left inside; ask for more nodes"):
-        clipped(moved, image, domain(image))
+        clipped(moved, image, region_of(image))

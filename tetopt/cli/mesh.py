@@ -283,7 +283,7 @@ def mesh_command(
         if nodes is None and target_error is None:  # fewer on small images
             nodes = int(np.clip(wanted.n_voxels // 8, 2 ** (image.ndim + 2), DEFAULT_NODES[image.ndim]))
         if size_max is None and nodes is not None:  # what holds then is told with the other numbers
-            size_max = (tetopt.Sizes() if sizes is None else sizes).at_most(image, nodes, wanted.volume)
+            size_max = (tetopt.Sizes() if sizes is None else sizes).longest_edge(image, nodes, wanted.volume)
         initial, kind = None if nodes is None else octree(wanted, nodes, sizes), Lattice.octree.value
         options |= {"nodes": nodes, "sizes": sizes}
     else:

@@ -307,7 +307,7 @@ class _Run:
         most, mesh = int(EXCHANGED * nodes), self.mesh()
         if self.image_noise is None:
             self.image_noise = self.wanted.noise
-        longest = sizes.longest(self.image, nodes, mesh.points, mesh.cells, self.edge, self.wanted.volume)
+        longest = sizes.longest_edges(self.image, nodes, mesh.points, mesh.cells, self.edge, self.wanted.volume)
         limits = Limits(float(sizes.smallest), longest, self.image_noise)
         done = exchange(self.held, self.is_frozen, eager, self.sides, nodes, most, limits)
         self._renumber(done.held, done.is_frozen, done.source)

@@ -84,17 +84,6 @@ def volume_gradients(points: Points, cells: Cells) -> NDArray[np.float64]:
     return -_facet_normals(points, cells) / points.shape[1]
 
 
-def circumcentres(points: Points, cells: Cells) -> NDArray[np.float64]:
-    """Centres of the circumscribed spheres, (M, n) float64, mm; flat cells raise LinAlgError.
-
-    With the edges e_k from the first node as rows, the centre c relative to it solves 2 e_k . c = |e_k|^2.
-    """
-    corners = points[cells]
-    edges = corners[:, 1:] - corners[:, :1]
-    right = (edges**2).sum(axis=2)
-    return corners[:, 0] + np.linalg.solve(2.0 * edges, right[..., None])[..., 0]
-
-
 def rho(points: Points, cells: Cells) -> NDArray[np.float64]:
     """Inradius over circumradius, (M,) float64 in [0, 1/n]: 1/n for the regular simplex, 0 for a flat one.
 

@@ -21,20 +21,20 @@ from tetopt.geometry.simplex import edge_pairs, facet_areas, volumes
 from tetopt.geometry.topology import Facets, facets
 
 # The facet opposite each local node, its nodes turned to face out of a positively oriented cell.
-OUTWARD = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
+OUTWARD_FACETS = np.array([[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]])
 
 # Copies are moved by this part of the smallest height of the cells around,
-STEP = 2e-3
+SHIFT_SHARE = 2e-3
 # or by so many float32 spacings, as binary STL is in float32,
-N_SPACINGS = 16
+SHIFT_SPACINGS = 16
 # but never by more than this part of that height, so that no cell turns inside out.
-MOST = 0.1
+LARGEST_SHIFT_SHARE = 0.1
 
 # Steps of the search for a way that is inwards of a whole fan: with the mean of the normals instead, sheets of random
 # sets of cells cross fifteen times as often, with three steps about as seldom.
-N_SEARCH = 20
+SEARCH_STEPS = 20
 
-FOLDED = (
+FOLDED_MESSAGE = (
     "surface: expected a conforming mesh, some of the chosen cells fold over one another; see `tetopt quality --check`"
 )
 
@@ -114,21 +114,6 @@ def surface_of(points: NDArray[np.float64], cells: NDArray[np.integer], chosen: 
     return Surface(at, triangles, n_parted, float(np.append(shift, edge_shift).max(initial=0.0)))
 
 
-def volume_and_area(surface: Surface) -> tuple[float, float]:
-    """Enclosed volume in mm^3, cavities left out, by the divergence theorem, and area in mm^2 with their walls."""
-    centred = surface.points - surface.points.mean(axis=0)  # far from the origin its digits would cancel
-    a, b, c = centred[surface.triangles.T]
-    across = np.cross(b - a, c - a)
-    return float((a * across).sum() / 6.0), float(np.linalg.norm(across, axis=1).sum() / 2.0)
-
-
-def n_pieces(surface: Surface) -> int:
-    """Number of closed surfaces that are not connected; a cavity's wall counts as one."""
-    first, second, third = surface.triangles.T
-    number = _connected(np.append(first, first), np.append(second, third), len(surface.points))
-    return len(np.unique(number[first]))
-
-
 def _chosen_cells(points: NDArray, cells: NDArray, chosen: ArrayLike) -> NDArray[np.int64]:
     if points.shape[1] != 3 or cells.shape[1] != 4:
         raise InputError(
@@ -151,23 +136,23 @@ def _chosen_cells(points: NDArray, cells: NDArray, chosen: ArrayLike) -> NDArray
 
 
 def _skin(points: NDArray[np.float64], cells: NDArray[np.int64]) -> _Skin:
-    found = facets(cells)
-    if (found.n_cells > 2).any():
-        raise InputError(FOLDED)
-    owner, opposite = np.nonzero(found.n_cells[found.of_cell] == 1)
-    triangles = cells[owner[:, None], OUTWARD[opposite]]
+    shared = facets(cells)
+    if (shared.n_cells > 2).any():
+        raise InputError(FOLDED_MESSAGE)
+    owner, opposite = np.nonzero(shared.n_cells[shared.of_cell] == 1)
+    triangles = cells[owner[:, None], OUTWARD_FACETS[opposite]]
     a, b, c = points[triangles.T]
     normals = np.cross(b - a, c - a)
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    partner = _partners(cells, found, triangles, found.of_cell[owner, opposite])
+    partner = _partners(cells, shared, triangles, shared.of_cell[owner, opposite])
     angle = _inner_angles(points, triangles, normals, partner)
     return _Skin(points, triangles, normals, partner, angle, _smallest_heights(points, cells))
 
 
 def _partners(
-    cells: NDArray[np.int64], found: Facets, triangles: NDArray[np.int64], facet: NDArray[np.int64]
+    cells: NDArray[np.int64], shared: Facets, triangles: NDArray[np.int64], facet: NDArray[np.int64]
 ) -> NDArray[np.int64]:
-    """The half-edge that each one meets, (3K,); `facet` is each triangle's number among the facets found."""
+    """The half-edge that each one meets, (3K,); `facet` is each triangle's number among the facets."""
     start, end = triangles.ravel(), np.roll(triangles, -1, axis=1).ravel()
     n_nodes = int(cells.max()) + 1
     key, edge, count = np.unique(_pair_key(start, end, n_nodes), return_inverse=True, return_counts=True)
@@ -176,18 +161,18 @@ def _partners(
     if is_crowded.any():
         crowded = np.flatnonzero(count > 2)
         where = np.searchsorted(crowded, edge[is_crowded])
-        walk[is_crowded] = _walks(cells, found, key[crowded], n_nodes, np.repeat(facet, 3)[is_crowded], where)
+        walk[is_crowded] = _walks(cells, shared, key[crowded], n_nodes, np.repeat(facet, 3)[is_crowded], where)
     one, other = np.lexsort((walk, edge)).reshape(-1, 2).T
     partner = np.empty(len(start), dtype=np.int64)
     partner[one], partner[other] = other, one
     if (start[partner] != end).any():
-        raise InputError(FOLDED)
+        raise InputError(FOLDED_MESSAGE)
     return partner
 
 
 def _walks(
     cells: NDArray[np.int64],
-    found: Facets,
+    shared: Facets,
     crowded: NDArray[np.int64],
     n_nodes: int,
     facet: NDArray[np.int64],
@@ -206,7 +191,7 @@ def _walks(
         key = _pair_key(cells[near, i], cells[near, j], n_nodes)
         at = np.minimum(np.searchsorted(crowded, key), len(crowded) - 1)
         is_at, near = crowded[at] == key, near[crowded[at] == key]
-        steps.append(found.of_cell[near][:, [k, m]] * len(crowded) + at[is_at, None])
+        steps.append(shared.of_cell[near][:, [k, m]] * len(crowded) + at[is_at, None])
     state, step = np.unique(np.vstack(steps), return_inverse=True)
     one, other = step.reshape(-1, 2).T
     return _connected(one, other, len(state))[np.searchsorted(state, facet * len(crowded) + edge)]
@@ -292,7 +277,8 @@ def _moved_apart(sheets: _Sheets) -> tuple[NDArray[np.float64], NDArray[np.float
     rank[order] = np.arange(len(order)) - np.repeat(first, count)
     last[order] = np.repeat(count - 1, count)
     spacing = np.spacing(np.abs(sheets.points).max(axis=1).astype(np.float32)).astype(np.float64)
-    farthest = np.minimum(np.maximum(STEP * sheets.height, N_SPACINGS * last * spacing), MOST * sheets.height)
+    farthest = np.maximum(SHIFT_SHARE * sheets.height, SHIFT_SPACINGS * last * spacing)
+    farthest = np.minimum(farthest, LARGEST_SHIFT_SHARE * sheets.height)
     shift = farthest * rank / last
     sign = np.where(sheets.inside <= 0.5, -1.0, 1.0)
     return sheets.points + (sign * shift)[:, None] * _outwards(sheets.normals, sheets.sheet), shift
@@ -306,7 +292,7 @@ def _outwards(normals: NDArray[np.float64], sheet: NDArray[np.int64]) -> NDArray
     start = np.flatnonzero(np.diff(sheet, prepend=-1))
     nearest = np.add.reduceat(normals, start) / np.diff(start, append=len(sheet))[:, None]
     lowest = np.empty(len(start), dtype=np.int64)
-    for _ in range(N_SEARCH):
+    for _ in range(SEARCH_STEPS):
         product = np.einsum("ij,ij->i", normals, nearest[sheet])
         is_lowest = product == np.minimum.reduceat(product, start)[sheet]
         lowest[sheet[is_lowest]] = np.flatnonzero(is_lowest)

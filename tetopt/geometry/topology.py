@@ -25,7 +25,7 @@ class Rings(NamedTuple):
 
 
 class Facets(NamedTuple):
-    """The distinct facets of a mesh and how the cells hold them."""
+    """The distinct facets of a mesh and the cells that they belong to."""
 
     nodes: NDArray[np.int64]  # (F, n), each row ascending; rows in lexicographic order
     cells: NDArray[np.int64]  # (F, 2), the second is -1 on the boundary
@@ -71,9 +71,9 @@ def folded(cells: NDArray[np.integer]) -> NDArray[np.int64]:
     Of positively oriented cells: where the mesh folds over itself, or three cells and more share a facet. Empty for a
     conforming mesh.
     """
-    found = facets(cells)
-    sides = np.bincount(found.of_cell.ravel(), weights=found.sign.ravel(), minlength=len(found.nodes))
-    return found.cells[(found.n_cells > 2) | ((found.n_cells == 2) & (sides != 0.0))]
+    shared = facets(cells)
+    sides = np.bincount(shared.of_cell.ravel(), weights=shared.sign.ravel(), minlength=len(shared.nodes))
+    return shared.cells[(shared.n_cells > 2) | ((shared.n_cells == 2) & (sides != 0.0))]
 
 
 def _lexicographic_order(rows: NDArray[np.int64]) -> NDArray[np.int64]:
@@ -134,11 +134,11 @@ def boundary_facets(cells: NDArray[np.integer]) -> NDArray[np.int64]:
 
     For positively oriented cells the returned triangles (edges in 2-D) have their normal pointing out.
     """
-    found = facets(cells)
-    is_outer = found.n_cells == 1
-    outer = found.nodes[is_outer]
-    sign = np.empty(len(found.nodes), dtype=np.int64)
-    sign[found.of_cell] = found.sign
+    shared = facets(cells)
+    is_outer = shared.n_cells == 1
+    outer = shared.nodes[is_outer]
+    sign = np.empty(len(shared.nodes), dtype=np.int64)
+    sign[shared.of_cell] = shared.sign
     is_inward = sign[is_outer] < 0
     outer[is_inward, :2] = outer[is_inward, 1::-1]
     return outer

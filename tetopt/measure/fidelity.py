@@ -26,19 +26,20 @@ from tetopt.geometry.simplex import centroids, volumes
 from tetopt.geometry.topology import components, facets
 from tetopt.image import Image, transformed
 from tetopt.mesh import Mesh
-from tetopt.target.content import LABELS, check_labels
+from tetopt.target.content import LARGEST_LABEL, check_labels
+from tetopt.target.domain import INSIDE_SHARE
 
-IN_A_CELL = 24  # points in each cell, at which it is compared with the voxels
-POINTS = 20_000  # most points on a surface from which distances are measured
-FEWEST = 1_000  # the same on the larger of two surfaces, however small
-FLAT = 1e-6  # triangles with less area than this on the square of their size are flat
-PER_FACE = 4.0  # points on an area as large as a voxel's face: the half level bends no faster than that
-# Steps of an even sequence in the unit square and cube: powers of 1/g with g^3 = g + 1 and g^4 = g + 1.
-STEPS = {2: 0.7548776662466927 ** np.arange(1, 3), 3: 0.8191725133961645 ** np.arange(1, 4)}
+POINTS_PER_CELL = 24  # at which a cell is compared with the voxels
+MOST_POINTS = 20_000  # on a surface, from which distances are measured
+FEWEST_POINTS = 1_000  # the same on the larger of two surfaces, however small
+POINTS_PER_FACE = 4.0  # on an area as large as a voxel's face: the half level bends no faster than that
+FLAT_AREA_SHARE = 1e-6  # of the square of a triangle's size: one with less area is flat
+# Steps of an even sequence in the unit square and cube: powers of 1/g with g^3 = g + 1 and g^4 = g + 1 (Roberts 2018).
+EVEN_STEPS = {2: 0.7548776662466927 ** np.arange(1, 3), 3: 0.8191725133961645 ** np.arange(1, 4)}
 
 
-class Surface(NamedTuple):
-    """Triangles in space, or segments in the plane."""
+class FacetSurface(NamedTuple):
+    """Triangles in space, or segments in the plane; they need not close."""
 
     points: NDArray[np.float64]  # (P, n)
     facets: NDArray[np.int64]  # (T, n), which points; not turned to any side
@@ -52,7 +53,7 @@ class LabelFidelity(NamedTuple):
     volume: float  # of these voxels, mm^n
     mesh_volume: float  # of the cells that carry it, mm^n
     n_cells: int  # that carry it
-    dice: float  # of the painted voxels with the given ones, 0 to 1
+    dice: float  # of the voxels in these cells with the voxels that have it, 0 to 1
     volume_dice: float  # of the cells with the voxels as boxes: what cells as small as voxels cannot get around
     distance_mean: float  # between its surface in the mesh and in the image, both ways, mm; nan without one of them
     distance_p95: float  # 95th percentile of the same, mm
@@ -94,7 +95,7 @@ def cell_labels(labels: Image, mesh: Mesh) -> NDArray[np.int64]:
     Parameters
     ----------
     labels : Image
-        Whole numbers from 0 to `tetopt.measure.segmentation.LABELS`.
+        Whole numbers from 0 to `tetopt.target.content.LARGEST_LABEL`.
     mesh : Mesh
 
     Returns
@@ -110,30 +111,6 @@ def cell_labels(labels: Image, mesh: Mesh) -> NDArray[np.int64]:
     return _majority(labels, mesh, cell_of_voxel(labels, mesh))
 
 
-def painted(labels: Image, mesh: Mesh, of_cell: ArrayLike) -> NDArray[np.int64]:
-    """The cells' labels painted back to the voxels.
-
-    Parameters
-    ----------
-    labels : Image
-        Only its grid is used.
-    mesh : Mesh
-    of_cell : (M,) array of whole numbers
-        Label of each cell.
-
-    Returns
-    -------
-    int64 of the image's shape
-        Label of the cell that holds each voxel centre; -1 outside of the mesh.
-
-    Raises
-    ------
-    InputError
-        Not one label a cell, or as `tetopt.energy.sampling.cell_moments`.
-    """
-    return _painted(cell_of_voxel(labels, mesh), _checked_labels(of_cell, mesh))
-
-
 def label_fidelity(labels: Image, mesh: Mesh, of_cell: ArrayLike | None = None) -> list[LabelFidelity]:
     """How well the cells show each label of an image.
 
@@ -143,7 +120,7 @@ def label_fidelity(labels: Image, mesh: Mesh, of_cell: ArrayLike | None = None) 
     Parameters
     ----------
     labels : Image
-        Whole numbers from 0 to `tetopt.measure.segmentation.LABELS`.
+        Whole numbers from 0 to `tetopt.target.content.LARGEST_LABEL`.
     mesh : Mesh
     of_cell : (M,) array of whole numbers, optional
         Label that each cell carries; `cell_labels` by default.
@@ -160,37 +137,37 @@ def label_fidelity(labels: Image, mesh: Mesh, of_cell: ArrayLike | None = None) 
     """
     check_labels("labels", labels)
     owner = cell_of_voxel(labels, mesh)
-    carried = _majority(labels, mesh, owner) if of_cell is None else _checked_labels(of_cell, mesh)
-    given, shown = labels.data.astype(np.int32), np.maximum(_painted(owner, carried), 0)
-    n_given, n_shown, n_both = (_counts(v.ravel()) for v in (given, shown, given[given == shown]))
-    n_cells, mesh_volume = _counts(carried), _counts(carried, volumes(mesh.points, mesh.cells))
-    overlap, beyond = _overlaps(labels, mesh, carried, len(n_given))
-    boxes = find_objects(given + 1)
-    nodes, sides = _labels_beside_facets(labels, mesh, carried)
+    label_of_cell = _majority(labels, mesh, owner) if of_cell is None else _checked_labels(of_cell, mesh)
+    true, painted = labels.data.astype(np.int32), np.maximum(_painted(owner, label_of_cell), 0)
+    n_true, n_painted, n_both = (_counts(v.ravel()) for v in (true, painted, true[true == painted]))
+    n_cells, mesh_volume = _counts(label_of_cell), _counts(label_of_cell, volumes(mesh.points, mesh.cells))
+    overlap, beyond = _overlaps(labels, mesh, label_of_cell, len(n_true))
+    boxes = find_objects(true + 1)
+    nodes, sides = _labels_beside_facets(labels, mesh, label_of_cell)
     face = _face(labels.voxel_volume, labels.ndim)
     rows = []
-    for label in np.flatnonzero(n_given):
-        part, affine = _with_margin(labels, given, boxes[label])
+    for label in np.flatnonzero(n_true):
+        part, affine = _with_margin(labels, true, boxes[label])
         is_side = (sides == label).sum(axis=1) == 1
         distances = np.concatenate(
-            _distances(Surface(mesh.points, nodes[is_side]), half_level_surface(part == label, affine), face)
+            _distances(FacetSurface(mesh.points, nodes[is_side]), half_level_surface(part == label, affine), face)
         )
         rows.append(
             LabelFidelity(
                 int(label),
-                int(n_given[label]),
-                float(n_given[label] * labels.voxel_volume),
+                int(n_true[label]),
+                float(n_true[label] * labels.voxel_volume),
                 float(mesh_volume[label]),
                 int(n_cells[label]),
-                _dice(n_both[label], n_given[label], n_shown[label]),
+                _dice(n_both[label], n_true[label], n_painted[label]),
                 _dice(
                     overlap[label] + (label == 0) * beyond[0],
-                    n_given[label] * labels.voxel_volume,
+                    n_true[label] * labels.voxel_volume,
                     mesh_volume[label] + (label == 0) * beyond[1],
                 ),
                 *_mean_and_p95(distances),
                 int(voxel_components(part == label)[1]),
-                _n_components(mesh.cells[carried == label]),
+                _n_components(mesh.cells[label_of_cell == label]),
                 bool(n_cells[label] == 0 and (label > 0 or owner.min() >= 0)),
             )
         )
@@ -198,23 +175,23 @@ def label_fidelity(labels: Image, mesh: Mesh, of_cell: ArrayLike | None = None) 
 
 
 def _overlaps(
-    labels: Image, mesh: Mesh, carried: NDArray[np.int64], n_labels: int
+    labels: Image, mesh: Mesh, label_of_cell: NDArray[np.int64], n_labels: int
 ) -> tuple[NDArray[np.float64], tuple[float, float]]:
     """Volume of each label's voxels within the cells that carry it, and outside of the mesh: of label 0, of anything.
 
-    From points that fill each cell evenly, `IN_A_CELL` of them.
+    From points that fill each cell evenly, `POINTS_PER_CELL` of them.
     """
     n, size = mesh.ndim, volumes(mesh.points, mesh.cells)
-    steps = np.sort(np.mod(0.5 + np.outer(np.arange(1, IN_A_CELL + 1), STEPS[3][:n]), 1.0), axis=1)
+    steps = np.sort(np.mod(0.5 + np.outer(np.arange(1, POINTS_PER_CELL + 1), EVEN_STEPS[3][:n]), 1.0), axis=1)
     weights = np.diff(steps, axis=1, prepend=0.0, append=1.0)  # gaps between sorted numbers are even in a simplex
     own, none = np.zeros(len(size)), np.zeros(len(size))
     for weight in weights:
-        found = nearest_values(labels, np.einsum("k,mkn->mn", weight, mesh.points[mesh.cells]))
-        own += found == carried
-        none += found == 0
-    overlap = np.bincount(carried, own * size / IN_A_CELL, n_labels)[:n_labels].astype(np.float64)
+        labels_there = nearest_values(labels, np.einsum("k,mkn->mn", weight, mesh.points[mesh.cells]))
+        own += labels_there == label_of_cell
+        none += labels_there == 0
+    overlap = np.bincount(label_of_cell, own * size / POINTS_PER_CELL, n_labels)[:n_labels].astype(np.float64)
     rest = max(labels.volume - float(size.sum()), 0.0)
-    background = float((labels.data == 0).sum()) * labels.voxel_volume - float((none * size).sum() / IN_A_CELL)
+    background = float((labels.data == 0).sum()) * labels.voxel_volume - float((none * size).sum() / POINTS_PER_CELL)
     return overlap, (min(max(background, 0.0), rest), rest)
 
 
@@ -235,34 +212,34 @@ def mask_fidelity(mask: Image, mesh: Mesh) -> MaskFidelity:
     low, high = float(mask.data.min()), float(mask.data.max())
     if low < 0.0 or high > 1.0:
         raise InputError(f"mask: expected values from 0 to 1, got {low:g} to {high:g}; threshold or rescale it first")
-    is_filled, is_given = cell_of_voxel(mask, mesh) >= 0, mask.data >= 0.5
-    n_given, n_filled = int(is_given.sum()), int(is_filled.sum())
+    is_filled, is_inside = cell_of_voxel(mask, mesh) >= 0, mask.data >= INSIDE_SHARE
+    n_inside, n_filled = int(is_inside.sum()), int(is_filled.sum())
     outer, is_on_box = facets_on_box(mesh, mask)
-    ours = Surface(mask.to_index(mesh.points), outer[~is_on_box])
+    ours = FacetSurface(mask.to_index(mesh.points), outer[~is_on_box])
     theirs = half_level_surface(mask.data, np.eye(mask.ndim + 1))
     there, back = _distances(ours, theirs, 1.0)
     there_mm, back_mm = _distances(
-        Surface(mesh.points, ours.facets),
-        Surface(mask.to_world(theirs.points), theirs.facets),
+        FacetSurface(mesh.points, ours.facets),
+        FacetSurface(mask.to_world(theirs.points), theirs.facets),
         _face(mask.voxel_volume, mask.ndim),
     )
     return MaskFidelity(
-        n_given,
-        n_given * mask.voxel_volume,
+        n_inside,
+        n_inside * mask.voxel_volume,
         float(volumes(mesh.points, mesh.cells).sum()),
-        _dice(int((is_given & is_filled).sum()), n_given, n_filled),
+        _dice(int((is_inside & is_filled).sum()), n_inside, n_filled),
         *_mean_and_p95(there),
         *_mean_and_p95(back),
         *_mean_and_p95(there_mm),
         *_mean_and_p95(back_mm),
-        int(voxel_components(is_given)[1]),
+        int(voxel_components(is_inside)[1]),
         _n_components(mesh.cells),
         euler_characteristic(theirs.facets),
         euler_characteristic(ours.facets),
     )
 
 
-def half_level_surface(level: NDArray, affine: NDArray[np.float64]) -> Surface:
+def half_level_surface(level: NDArray, affine: NDArray[np.float64]) -> FacetSurface:
     """The surface on which a field of 0 to 1 on voxels is 1/2, by marching cubes (marching squares in 2-D).
 
     Beyond the outermost voxel centres the field goes on as it is there, so the surface runs straight on to the faces
@@ -277,7 +254,7 @@ def half_level_surface(level: NDArray, affine: NDArray[np.float64]) -> Surface:
 
     Returns
     -------
-    Surface
+    FacetSurface
         In world mm, exact to 1e-5 voxel; without facets where the field does not cross 1/2.
     """
     level = np.asarray(level)
@@ -285,12 +262,12 @@ def half_level_surface(level: NDArray, affine: NDArray[np.float64]) -> Surface:
     padded = np.pad(level, 1, mode="edge")
     grid = pyvista.ImageData(dimensions=padded.shape + (1,) * (3 - n), origin=(-1.0,) * n + (0.0,) * (3 - n))
     grid.point_data["level"] = (padded.astype(np.uint8) if level.dtype == bool else padded).ravel(order="F")
-    surface = grid.contour([0.5], scalars="level", compute_normals=False, compute_gradients=False)
-    listed = surface.faces if n == 3 else surface.lines  # before the points of each their number
-    # Between the outermost centres and their copies the field is constant along the axis: what was found at a copy,
-    # one voxel out, is the same at the face of the box, half a voxel out.
+    surface = grid.contour([INSIDE_SHARE], scalars="level", compute_normals=False, compute_gradients=False)
+    listed = surface.faces if n == 3 else surface.lines  # the points of each come after their number
+    # Between the outermost centres and their copies the field is constant along the axis: a point of the surface at a
+    # copy, one voxel out, has the same place along the others at the face of the box, half a voxel out.
     index = np.clip(np.asarray(surface.points, dtype=np.float64)[:, :n], -0.5, np.array(level.shape) - 0.5)
-    return Surface(
+    return FacetSurface(
         transformed(index, affine[:-1, :-1]) + affine[:-1, -1], listed.reshape(-1, n + 1)[:, 1:].astype(np.int64)
     )
 
@@ -309,35 +286,34 @@ def surface_distances(
     """
     if len(surface_facets) == 0:
         raise InputError("surface: expected one facet or more, got none; nothing has a distance from it")
-    chosen = surface_facets
     if points.shape[1] == 3:
-        is_flat = (
-            _measures(Surface(surface_points, chosen)) <= FLAT * np.ptp(surface_points[chosen], axis=1).max(axis=1) ** 2
-        )
-        edges = chosen[is_flat][:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-        surface = pyvista.PolyData(surface_points, faces=_vtk_cells(chosen), lines=_vtk_cells(edges))
+        size = np.ptp(surface_points[surface_facets], axis=1).max(axis=1)
+        is_flat = _areas(FacetSurface(surface_points, surface_facets)) <= FLAT_AREA_SHARE * size**2
+        edges = surface_facets[is_flat][:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+        surface = pyvista.PolyData(surface_points, faces=_vtk_cells(surface_facets), lines=_vtk_cells(edges))
     else:
-        points, surface = _in_space(points), pyvista.PolyData(_in_space(surface_points), lines=_vtk_cells(chosen))
+        points = _in_space(points)
+        surface = pyvista.PolyData(_in_space(surface_points), lines=_vtk_cells(surface_facets))
     # Not compute_implicit_distance: it looks for the side too, and crashes on flat triangles.
     _, nearest = surface.find_closest_cell(points, return_closest_point=True)
     return np.linalg.norm(nearest - points, axis=1)
 
 
-def evenly_spread(surface: Surface, count: int) -> NDArray[np.float64]:
+def evenly_spread(surface: FacetSurface, count: int) -> NDArray[np.float64]:
     """`count` points on a surface, (count, n) float64, each for the same area (length in 2-D); always the same ones.
 
     The facets' areas are laid in a row, and point i falls into the i-th of `count` equal parts of it. Where in the
     part changes from point to point: always in its middle, every second of equal facets could be left out.
     """
-    points, chosen = surface
-    place = np.arange(1, count + 1)[:, None] * STEPS[points.shape[1]] % 1.0
-    end = np.cumsum(_measures(surface))
+    points, nodes = surface
+    place = np.arange(1, count + 1)[:, None] * EVEN_STEPS[points.shape[1]] % 1.0
+    end = np.cumsum(_areas(surface))
     at = np.searchsorted(end, (np.arange(count) + place[:, 0]) / count * end[-1], side="right")
-    at, place = np.minimum(at, len(chosen) - 1), place[:, 1:]  # rounding may pass the last
+    at, place = np.minimum(at, len(nodes) - 1), place[:, 1:]  # rounding may pass the last
     is_beyond = place.sum(axis=1) > 1.0
     place[is_beyond] = 1.0 - place[is_beyond]  # from the far half of the parallelogram into the triangle
-    first = points[chosen[at, 0]]
-    return first + ((points[chosen[at, 1:]] - first[:, None]) * place[..., None]).sum(axis=1)
+    first = points[nodes[at, 0]]
+    return first + ((points[nodes[at, 1:]] - first[:, None]) * place[..., None]).sum(axis=1)
 
 
 def euler_characteristic(surface_facets: NDArray[np.int64]) -> int:
@@ -352,59 +328,60 @@ def euler_characteristic(surface_facets: NDArray[np.int64]) -> int:
 
 def _majority(labels: Image, mesh: Mesh, owner: NDArray[np.int64]) -> NDArray[np.int64]:
     """`cell_labels` from the cell of each voxel; only the pairs of cell and label that occur are counted."""
-    is_held = owner >= 0
-    pairs = owner[is_held] * (LABELS + 1) + labels.data[is_held].astype(np.int64)
+    is_in_mesh = owner >= 0
+    pairs = owner[is_in_mesh] * (LARGEST_LABEL + 1) + labels.data[is_in_mesh].astype(np.int64)
     pairs, counts = np.unique(pairs, return_counts=True)
-    cell, label = np.divmod(pairs, LABELS + 1)
+    cell, label = np.divmod(pairs, LARGEST_LABEL + 1)
     order = np.lexsort((label, -counts, cell))
-    held, first = np.unique(cell[order], return_index=True)
+    with_voxels, first = np.unique(cell[order], return_index=True)
     of_cell = nearest_values(labels, centroids(mesh.points, mesh.cells)).astype(np.int64)
-    of_cell[held] = label[order[first]]
+    of_cell[with_voxels] = label[order[first]]
     return of_cell
 
 
 def _painted(owner: NDArray[np.int64], of_cell: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Label of the cell that owns each voxel, of the image's shape; -1 outside of the mesh."""
     return np.where(owner >= 0, of_cell[owner], -1)
 
 
 def _checked_labels(of_cell: ArrayLike, mesh: Mesh) -> NDArray[np.int64]:
-    """As int64; InputError unless there is one whole number from 0 to `LABELS` for each cell."""
-    given = np.asarray(of_cell)
-    if given.shape != (len(mesh.cells),):
+    """As int64; InputError unless there is one whole number from 0 to `LARGEST_LABEL` for each cell."""
+    values = np.asarray(of_cell)
+    if values.shape != (len(mesh.cells),):
         raise InputError(
-            f"of_cell: expected one label for each of the mesh's {len(mesh.cells)} cells, got shape {given.shape}"
+            f"of_cell: expected one label for each of the mesh's {len(mesh.cells)} cells, got shape {values.shape}"
         )
-    if not ((np.rint(given) == given) & (given >= 0) & (given <= LABELS)).all():
+    if not ((np.rint(values) == values) & (values >= 0) & (values <= LARGEST_LABEL)).all():
         raise InputError(
-            f"of_cell: labels must be whole numbers from 0 to {LABELS}, got {given.min():g} to {given.max():g}"
+            f"of_cell: labels must be whole numbers from 0 to {LARGEST_LABEL}, got {values.min():g} to {values.max():g}"
         )
-    return given.astype(np.int64)
+    return values.astype(np.int64)
 
 
 def _counts(values: NDArray, weights: NDArray | None = None) -> NDArray:
-    return np.bincount(values, weights, minlength=LABELS + 1)
+    return np.bincount(values, weights, minlength=LARGEST_LABEL + 1)
 
 
 def _labels_beside_facets(
     labels: Image, mesh: Mesh, of_cell: NDArray[np.int64]
 ) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
     """All facets (F, n), and the labels on their two sides (F, 2): outside is 0, behind the box what is before it."""
-    found = facets(mesh.cells)
-    sides = of_cell[found.cells]
-    is_outer = found.n_cells == 1
+    shared = facets(mesh.cells)
+    sides = of_cell[shared.cells]
+    is_outer = shared.n_cells == 1
     is_on_box = facets_on_box(mesh, labels)[1]  # in the same order
     sides[is_outer, 1] = np.where(is_on_box, sides[is_outer, 0], 0)
-    return found.nodes, sides
+    return shared.nodes, sides
 
 
 def _with_margin(
-    labels: Image, given: NDArray[np.int32], box: tuple[slice, ...]
+    labels: Image, data: NDArray[np.int32], box: tuple[slice, ...]
 ) -> tuple[NDArray[np.int32], NDArray[np.float64]]:
     """The part of an array in a box and one voxel around, if there is one, and the part's affine."""
     low = np.array([max(side.start - 1, 0) for side in box])
     affine = labels.affine.copy()
     affine[:-1, -1] = labels.to_world(low)
-    return given[tuple(slice(first, side.stop + 1) for first, side in zip(low, box, strict=True))], affine
+    return data[tuple(slice(first, side.stop + 1) for first, side in zip(low, box, strict=True))], affine
 
 
 def _face(voxel_volume: float, n: int) -> float:
@@ -412,17 +389,17 @@ def _face(voxel_volume: float, n: int) -> float:
     return voxel_volume ** ((n - 1) / n)
 
 
-def _distances(one: Surface, other: Surface, face: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def _distances(one: FacetSurface, other: FacetSurface, face: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """From points of each of two surfaces to the other, equally dense on both; no points if a surface is empty."""
     if len(one.facets) == 0 or len(other.facets) == 0:
         return np.empty(0), np.empty(0)
-    areas = [float(_measures(surface).sum()) for surface in (one, other)]
-    density = min(max(PER_FACE / face, FEWEST / max(areas)), POINTS / max(areas))
+    areas = [float(_areas(surface).sum()) for surface in (one, other)]
+    density = min(max(POINTS_PER_FACE / face, FEWEST_POINTS / max(areas)), MOST_POINTS / max(areas))
     spread = [evenly_spread(s, max(ceil(density * area), 1)) for s, area in zip((one, other), areas, strict=True)]
     return surface_distances(spread[0], *other), surface_distances(spread[1], *one)
 
 
-def _measures(surface: Surface) -> NDArray[np.float64]:
+def _areas(surface: FacetSurface) -> NDArray[np.float64]:
     """Area of each triangle, length of each segment, (T,) float64."""
     first, *others = surface.points[surface.facets.T]
     if len(others) == 1:
@@ -449,5 +426,5 @@ def _in_space(points: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 def _vtk_cells(cells: NDArray[np.int64]) -> NDArray[np.int64] | None:
-    """As VTK lists cells: before the points of each their number."""
+    """Cells as VTK lists them: the points of each come after their number."""
     return np.insert(cells, 0, cells.shape[1], axis=1).ravel() if len(cells) else None

@@ -72,6 +72,6 @@ def _table(labels: Image, truth: Image) -> NDArray[np.int64]:
         raise InputError(f"dice: expected images of one shape, got {labels.shape} and {truth.shape}")
     for name, image in (("labels", labels), ("truth", truth)):
         check_labels(name, image)
-    found, true = labels.data.astype(np.int64).ravel(), truth.data.astype(np.int64).ravel()
-    shape = (int(found.max()) + 1, int(true.max()) + 1)
-    return np.bincount(found * shape[1] + true, minlength=shape[0] * shape[1]).reshape(shape)
+    classes, true = labels.data.astype(np.int64).ravel(), truth.data.astype(np.int64).ravel()
+    shape = (int(classes.max()) + 1, int(true.max()) + 1)
+    return np.bincount(classes * shape[1] + true, minlength=shape[0] * shape[1]).reshape(shape)

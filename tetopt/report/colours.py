@@ -35,7 +35,7 @@ def label_colours(labels: Image) -> NDArray[np.float64]:
     Parameters
     ----------
     labels : Image
-        Whole numbers from 0 to `tetopt.target.content.LABELS`.
+        Whole numbers from 0 to `tetopt.target.content.LARGEST_LABEL`.
 
     Returns
     -------

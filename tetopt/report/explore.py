@@ -25,7 +25,7 @@ from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields
 from tetopt.report.colours import grey_limits, label_colours
 from tetopt.report.page import data_html, packed, script_html
-from tetopt.target.content import LABELS
+from tetopt.target.content import LARGEST_LABEL
 
 PAGE_IMAGE_VOXELS = 2**24  # 16 MB, a byte each: an image with more is averaged
 PAGE_SIDE_VOXELS = 2048  # along an axis of it: what nearly every graphics card takes
@@ -94,7 +94,7 @@ def _field(name: str, values: NDArray) -> Field:
 
 def _categories(values: NDArray[np.float64]) -> list[tuple[int, str]]:
     """Labels and their colours; none if values are not whole, or negative, or too many for a list of colours."""
-    if (values != np.rint(values)).any() or values.min() < 0 or values.max() > LABELS:
+    if (values != np.rint(values)).any() or values.min() < 0 or values.max() > LARGEST_LABEL:
         return []
     labels = np.unique(values).astype(np.int64)
     if len(labels) > MAX_LABELS:

@@ -15,16 +15,17 @@ from tetopt.geometry.simplex import squared_edges, volumes
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.start.lattice import lattice
-from tetopt.target.domain import NEAR, Domain, levels
+from tetopt.target.domain import ON_SURFACE_VOXELS, Region, levels
 
-SNAP = 0.3  # of an edge: a node as near to the surface along it is put on the surface
-TOUCH = 0.15  # of an edge: a node as near to the surface that cannot be put there counts as on it
-SHRINK = 0.2  # of the regular cell's volume for its edges: a cell has to keep as much when nodes are put there
-AGAIN = 4  # lattices tried for a number of nodes
-STEPS = 8  # towards the surface
+SNAP_SHARE = 0.3  # of an edge: a node that lies as near to the surface along it is put on the surface
+TOUCH_SHARE = 0.15  # of an edge: a node as near to the surface counts as on it, even if it cannot be put there
+LEAST_FULLNESS = 0.2  # see `_fullness`: a cell has to keep as much when nodes are put on the surface
+LATTICE_TRIALS = 4  # lattices tried for a number of nodes within a region
+SNAP_STEPS = 8  # Newton steps towards the surface
+BISECTION_ROUNDS = 20  # along an edge that crosses the surface: to a millionth of its length
 
 
-def clipped(mesh: Mesh, image: Image, region: Domain) -> Mesh:
+def clipped(mesh: Mesh, image: Image, region: Region) -> Mesh:
     """The part of a mesh of the image's box that lies within the region, nodes on its surface, all cells whole.
 
     Raises
@@ -34,7 +35,7 @@ def clipped(mesh: Mesh, image: Image, region: Domain) -> Mesh:
     """
     index = image.to_index(mesh.points)
     level = levels(region.level, index)
-    level[np.abs(level) < NEAR] = 0.0
+    level[np.abs(level) < ON_SURFACE_VOXELS] = 0.0
     index, level = _snapped(index, level, mesh.cells, image, region)
     index, level, cells = _cut(index, level, mesh.cells, region)
     side = np.sign(level)[cells].sum(axis=1)
@@ -48,7 +49,7 @@ def clipped(mesh: Mesh, image: Image, region: Domain) -> Mesh:
 
 
 def lattice_within(
-    image: Image, region: Domain | None, kind: str | None = None, *, nodes: int | None = None,
+    image: Image, region: Region | None, kind: str | None = None, *, nodes: int | None = None,
     spacing: float | None = None,
 ) -> Mesh:  # fmt: skip
     """`tetopt.lattice` of the image's box, cut off at the region's surface, with about `nodes` nodes in it.
@@ -61,12 +62,12 @@ def lattice_within(
     if region is None or nodes is None:
         mesh = lattice(image, kind, nodes=nodes, spacing=spacing)
         return mesh if region is None else clipped(mesh, image, region)
-    asked, best = nodes * region.inside.size / region.inside.sum(), None
-    for _ in range(AGAIN):
-        mesh = clipped(lattice(image, kind, nodes=int(asked)), image, region)
+    in_box, best = nodes * region.inside.size / region.inside.sum(), None  # nodes of a lattice of the whole box
+    for _ in range(LATTICE_TRIALS):
+        mesh = clipped(lattice(image, kind, nodes=int(in_box)), image, region)
         if best is None or abs(len(mesh.points) - nodes) < abs(len(best.points) - nodes):
             best = mesh
-        asked *= nodes / len(mesh.points)
+        in_box *= nodes / len(mesh.points)
     assert best is not None
     return best
 
@@ -78,29 +79,29 @@ def _edges(cells: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def _snapped(
-    index: NDArray[np.float64], level: NDArray[np.float64], cells: NDArray[np.int64], image: Image, region: Domain
+    index: NDArray[np.float64], level: NDArray[np.float64], cells: NDArray[np.int64], image: Image, region: Region
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Nodes that are near to the surface along an edge put on it, unless that flattens a cell."""
     edge = _edges(cells).reshape(-1, 2)
     a, b = level[edge].T
     crosses = a * b < 0.0
     edge, part = edge[crosses], a[crosses] / (a[crosses] - b[crosses])
-    wishes = np.zeros(len(level), dtype=bool)
-    wishes[edge[part < SNAP, 0]] = True
-    wishes[edge[part > 1.0 - SNAP, 1]] = True
-    chosen = np.flatnonzero(wishes)
-    there, is_there = onto_surface(index[chosen], image, region)
+    is_close = np.zeros(len(level), dtype=bool)
+    is_close[edge[part < SNAP_SHARE, 0]] = True
+    is_close[edge[part > 1.0 - SNAP_SHARE, 1]] = True
+    close = np.flatnonzero(is_close)
+    there, is_there = onto_surface(index[close], image, region)
     # Where a node cannot get there on a short way, its edges are split instead.
     length = np.full(len(level), np.inf)
     np.minimum.at(length, edge.ravel(), np.repeat(np.linalg.norm(np.diff(index[edge], axis=1)[:, 0], axis=1), 2))
     way = np.zeros(len(level))
-    way[chosen] = np.linalg.norm(there - index[chosen], axis=1) / length[chosen]
-    is_there &= way[chosen] < 2.0 * SNAP
+    way[close] = np.linalg.norm(there - index[close], axis=1) / length[close]
+    is_there &= way[close] < 2.0 * SNAP_SHARE
     moved = index.copy()
-    moved[chosen[is_there]] = there[is_there]
-    way[chosen[~is_there]] = 0.0
+    moved[close[is_there]] = there[is_there]
+    way[close[~is_there]] = 0.0
     while True:
-        flat = cells[_fullness(image.to_world(moved), cells) < SHRINK]
+        flat = cells[_fullness(image.to_world(moved), cells) < LEAST_FULLNESS]
         furthest = flat[np.arange(len(flat)), way[flat].argmax(axis=1)]
         back = np.unique(furthest[way[furthest] > 0.0])
         if len(back) == 0:
@@ -110,8 +111,8 @@ def _snapped(
     # What is left very near to a crossing counts as on the surface; it gets there as soon as it moves.
     edge = edge[level[edge].prod(axis=1) < 0.0]
     a, b = np.abs(level[edge].T)
-    level[edge[a < TOUCH * (a + b), 0]] = 0.0
-    level[edge[b < TOUCH * (a + b), 1]] = 0.0
+    level[edge[a < TOUCH_SHARE * (a + b), 0]] = 0.0
+    level[edge[b < TOUCH_SHARE * (a + b), 1]] = 0.0
     return moved, level
 
 
@@ -123,7 +124,7 @@ def _fullness(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[
 
 
 def onto_surface(
-    index: NDArray[np.float64], image: Image, region: Domain
+    index: NDArray[np.float64], image: Image, region: Region
 ) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
     """Points (K, n) moved to the surface, nearly the shortest way in mm, and whether they got there, (K,).
 
@@ -134,14 +135,14 @@ def onto_surface(
     metric = np.linalg.inv(image.affine[:-1, :-1].T @ image.affine[:-1, :-1])
     metric = metric / np.trace(metric)
     at = index.copy()
-    for _ in range(STEPS):
+    for _ in range(SNAP_STEPS):
         value = levels(region.level, at)
         slope = np.stack([_slope(region.level, at, axis) for axis in range(at.shape[1])], axis=1) * is_free
         way = (slope @ metric) * is_free
         rate = (way * slope).sum(axis=1)
         step = np.divide(value, rate, out=np.zeros_like(value), where=rate > 1e-12)
         at = np.clip(at - step[:, None] * way, *sides.T)
-    return at, np.abs(levels(region.level, at)) < NEAR
+    return at, np.abs(levels(region.level, at)) < ON_SURFACE_VOXELS
 
 
 def _slope(level: NDArray, index: NDArray[np.float64], axis: int) -> NDArray[np.float64]:
@@ -153,9 +154,9 @@ def _slope(level: NDArray, index: NDArray[np.float64], axis: int) -> NDArray[np.
 
 
 def _cut(
-    index: NDArray[np.float64], level: NDArray[np.float64], cells: NDArray[np.int64], region: Domain
+    index: NDArray[np.float64], level: NDArray[np.float64], cells: NDArray[np.int64], region: Region
 ) -> tuple[NDArray[np.float64], NDArray[np.float64], NDArray[np.int64]]:
-    """Every edge that crosses the surface split there.
+    """Nodes, their levels and cells after every edge that crosses the surface is split there.
 
     In each round every cell is split at the first of its crossing edges, in an order that is the same for all cells,
     so that two of them always cut the facet between them alike.
@@ -184,11 +185,11 @@ def _cut(
         cells = np.concatenate([cells[~is_cut], one, other])
 
 
-def _crossings(a: NDArray[np.float64], b: NDArray[np.float64], region: Domain) -> NDArray[np.float64]:
+def _crossings(a: NDArray[np.float64], b: NDArray[np.float64], region: Region) -> NDArray[np.float64]:
     """Where the surface crosses the edges from a to b, (K, n), by bisection."""
     low, high = np.zeros(len(a)), np.ones(len(a))
     sign = np.sign(levels(region.level, a))
-    for _ in range(20):
+    for _ in range(BISECTION_ROUNDS):
         middle = 0.5 * (low + high)
         is_before = np.sign(levels(region.level, a + middle[:, None] * (b - a))) == sign
         low, high = np.where(is_before, middle, low), np.where(is_before, high, middle)

@@ -24,7 +24,7 @@ from tetopt.image import Image
 from tetopt.mesh import Mesh
 
 KINDS = {2: ("criss-cross",), 3: ("bcc", "five-tet")}
-MAX_NODES = 50_000_000
+MAX_NODES = 50_000_000  # six times as many cells, whose node numbers alone take 10 GB
 
 
 def lattice(
@@ -44,9 +44,9 @@ def lattice(
     kind : str, optional
         "criss-cross" in 2-D; "bcc" (default) or "five-tet" in 3-D.
     nodes : int, optional
-        Wanted number of nodes. The lattice whose count is nearest, among those with the most cubic blocks.
+        Number of nodes to come near to. The lattice whose count is nearest, among those with the most cubic blocks.
     spacing : float, optional
-        Wanted edge length of a block in mm; the nearest that divides the box is taken.
+        Edge length of a block, mm; the nearest that divides the box is taken.
     blocks : tuple of n int, optional
         Number of blocks along each axis. Exactly one of `nodes`, `spacing` and `blocks` is given.
 
@@ -84,13 +84,13 @@ def lattice(
     return Mesh(points, oriented(points, cells))
 
 
-def _checked_blocks(kind: str, given: tuple[int, ...] | None, n: int) -> tuple[int, ...]:
+def _checked_blocks(kind: str, counts: tuple[int, ...] | None, n: int) -> tuple[int, ...]:
     try:
-        blocks = tuple(index(b) for b in (() if given is None else given))
+        blocks = tuple(index(b) for b in (() if counts is None else counts))
     except TypeError:
         blocks = ()
     if len(blocks) != n or min(blocks) < 1:
-        raise InputError(f"lattice: blocks must be {n} whole numbers >= 1, got {given!r}")
+        raise InputError(f"lattice: blocks must be {n} whole numbers >= 1, got {counts!r}")
     if _node_count(kind, blocks) > MAX_NODES:
         raise InputError(
             f"lattice: {blocks} blocks have {_node_count(kind, blocks)} nodes, more than {MAX_NODES}; ask for fewer"
@@ -112,7 +112,7 @@ def _blocks_for_spacing(lengths: NDArray[np.float64], spacing: float) -> tuple[i
 def near_cubes(kind: str, lengths: NDArray[np.float64], nodes: int) -> tuple[int, ...]:
     """Nearly cubic blocks whose node count is within 3 % of `nodes`, the most cubic; else those with the nearest.
 
-    On a brain's box every wish from 3000 on is met within 3 %; smaller ones are missed by up to a tenth, since only
+    On a brain's box every number from 3000 on is met within 3 %; smaller ones are missed by up to a tenth, since only
     blocks far from cubes would meet them.
     """
     fewest = _node_count(kind, (1,) * len(lengths))
@@ -120,17 +120,17 @@ def near_cubes(kind: str, lengths: NDArray[np.float64], nodes: int) -> tuple[int
         raise InputError(f"lattice: nodes must lie between {fewest} and {MAX_NODES} for {kind}, got {nodes}")
     per_block = 1 if kind == "five-tet" else 2
     edge = (np.prod(lengths) * per_block / nodes) ** (1.0 / len(lengths))
-    found: set[tuple[int, ...]] = set()
+    candidates: set[tuple[int, ...]] = set()
     for size in edge * np.linspace(0.7, 2.0, 400):
         ideal = lengths / size
-        found.update(product(*[{max(1, int(x)), int(x) + 1} for x in ideal]))
+        candidates.update(product(*[{max(1, int(x)), int(x) + 1} for x in ideal]))
 
     def merit(blocks: tuple[int, ...]) -> tuple[float, float, tuple[int, ...]]:
         edges = lengths / np.array(blocks)
         miss = abs(_node_count(kind, blocks) - nodes) / nodes
         return max(miss - 0.03, 0.0), float(edges.max() / edges.min()) + miss, blocks
 
-    return min(found, key=merit)
+    return min(candidates, key=merit)
 
 
 def _corner_number(blocks: tuple[int, ...]) -> NDArray[np.int64]:

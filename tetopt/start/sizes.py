@@ -13,11 +13,14 @@ from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.start.lattice import near_cubes
 
-COARSEST = 1.4  # of a uniform mesh's longest edge: that of a graded one, if nothing else is asked for
-SHORT = {2: 0.5**0.5, 3: 0.75**0.5}  # the shortest: from a corner to the centre
-DIAGONAL = {2: 1.0, 3: 2.0**0.5}  # a block's longest edge of a cell, of its own: the diagonals of the box's faces
-NO_BOUND = 1e30  # mm
-UNEVEN = 1.5  # of the edge that gradation asks for: the longest; edges of a good cell differ by a third
+# A graded mesh's longest edge over that of a uniform mesh with as many nodes, where no other is set (`docs/sizes.md`).
+COARSEST_SHARE = 1.4
+# By dimension, the shortest and the longest edge of the cells in a block over the block's own edge: from a corner to
+# the centre, and, in 3-D, the diagonal of a block's side on the box's faces.
+SHORTEST_IN_BLOCK = {2: 0.5**0.5, 3: 0.75**0.5}
+LONGEST_IN_BLOCK = {2: 1.0, 3: 2.0**0.5}
+NO_BOUND_MM = 1e30  # stands for infinity in float32, to which steps can still be added
+UNEVEN_SHARE = 1.5  # a cell's longest edge over the edge that gradation gives: edges of a good cell differ by a third
 
 
 class Sizes(NamedTuple):
@@ -50,7 +53,7 @@ class Sizes(NamedTuple):
     field: Image | None = None
 
     def prepared(self, n: int) -> Sizes:
-        """Itself, the field's steps lowered to the gradation.
+        """The same limits, checked; the field's steps are lowered to the gradation.
 
         Raises
         ------
@@ -71,8 +74,8 @@ class Sizes(NamedTuple):
             raise InputError("sizing: no voxel is above 0; give lengths in mm")
         return self if self.field is None else self._replace(field=_graded(self.field, self.gradation))
 
-    def at_most(self, image: Image, nodes: int, volume: float | None = None) -> float:
-        """The longest edge of any cell, mm; `volume`, mm^n, is what the mesh covers, by default the image's box."""
+    def longest_edge(self, image: Image, nodes: int, volume: float | None = None) -> float:
+        """The longest edge that any cell may have, mm; `volume`, mm^n, is that of the mesh, by default of the box."""
         if self.largest is not None:
             return self.largest
         lengths = image.spacing * image.shape
@@ -80,35 +83,37 @@ class Sizes(NamedTuple):
         if volume is not None:  # nodes of a lattice of the whole box
             nodes = int(nodes * image.volume / volume)
         uniform = float((lengths / near_cubes(kind, lengths, max(nodes, fewest))).max())
-        return DIAGONAL[image.ndim] * max(COARSEST * uniform, self.smallest / SHORT[image.ndim])
+        return LONGEST_IN_BLOCK[image.ndim] * max(
+            COARSEST_SHARE * uniform, self.smallest / SHORTEST_IN_BLOCK[image.ndim]
+        )
 
     def on_voxels(self, image: Image) -> NDArray[np.float32] | None:
-        """The field's value at each voxel's centre, of the image's shape; infinite where nothing holds."""
+        """The field's value at each voxel's centre, of the image's shape, mm; `NO_BOUND_MM` outside of the field."""
         if self.field is None:
             return None
         to_field = np.linalg.inv(self.field.affine) @ image.affine
         return np.asarray(
             affine_transform(
-                self.field.data, to_field, output_shape=image.shape, order=0, mode="grid-constant", cval=NO_BOUND
+                self.field.data, to_field, output_shape=image.shape, order=0, mode="grid-constant", cval=NO_BOUND_MM
             )
         )
 
-    def longest(
+    def longest_edges(
         self, image: Image, nodes: int, points: NDArray, cells: NDArray, own: NDArray, volume: float | None = None
     ) -> NDArray[np.float64]:
         """The longest edge that a cell at each node may be given, (N,) mm; `own` (N,) is the mean size there now."""
-        bound = np.full(len(points), self.at_most(image, nodes, volume))
+        bound = np.full(len(points), self.longest_edge(image, nodes, volume))
         if self.field is not None:
             index, last = self.field.to_index(points), np.array(self.field.shape) - 1
-            inside = ((index >= -0.5 - 1e-6) & (index <= last + 0.5 + 1e-6)).all(axis=1)
-            voxel = np.clip(np.rint(index[inside]).astype(np.int64), 0, last)
-            bound[inside] = np.minimum(bound[inside], self.field.data[tuple(voxel.T)])
-        return np.minimum(bound, UNEVEN * _around(own, points, cells, self.gradation))
+            is_in_field = ((index >= -0.5 - 1e-6) & (index <= last + 0.5 + 1e-6)).all(axis=1)
+            voxel = np.clip(np.rint(index[is_in_field]).astype(np.int64), 0, last)
+            bound[is_in_field] = np.minimum(bound[is_in_field], self.field.data[tuple(voxel.T)])
+        return np.minimum(bound, UNEVEN_SHARE * _around(own, points, cells, self.gradation))
 
 
 def _graded(field: Image, gradation: float) -> Image:
     """The field with no value above a neighbour's by more than gradation x distance, neighbours across voxel faces."""
-    data = np.where(field.data > 0.0, field.data, NO_BOUND).astype(np.float32)
+    data = np.where(field.data > 0.0, field.data, NO_BOUND_MM).astype(np.float32)
     shape = (1,) * (3 - field.ndim) + field.shape
     steps = np.concatenate([np.zeros(3 - field.ndim), gradation * field.spacing]).astype(np.float32)
     _lower(data.reshape(shape), steps)
@@ -117,7 +122,10 @@ def _graded(field: Image, gradation: float) -> Image:
 
 @njit(cache=True, error_model="numpy")
 def _lower(data: NDArray, steps: NDArray) -> None:
-    """Forwards, then backwards over the voxels: a shortest way may take all its steps forwards first."""
+    """Lower each voxel to its least neighbour's value and a step, going forwards, then backwards over the voxels.
+
+    A shortest way may take all its steps forwards first, hence both.
+    """
     s0, s1, s2 = data.shape
     for way in (1, -1):
         for count0 in range(s0):

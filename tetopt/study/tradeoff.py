@@ -9,21 +9,21 @@ from tetopt.engine.loop import GRADED_K_D, SHAPE_POWER
 from tetopt.engine.meshing import mesh_image
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.start.sizes import COARSEST, Sizes
+from tetopt.start.sizes import COARSEST_SHARE, Sizes
 from tetopt.study.compare_report import Measurement, TradeoffRow
 
 SWEEP_VALUES: dict[str, tuple[float, ...]] = {
     "k_D": (0.3, 0.5, 0.7, GRADED_K_D, 0.93),
     "shape power p": (2.0, SHAPE_POWER, 4.0, 6.0),
     "gradation": (0.2, 0.5, 1.0),
-    "largest edge, of a uniform mesh's": (1.0, 1.15, COARSEST, 2.0, 3.0),
+    "largest edge, of a uniform mesh's": (1.0, 1.15, COARSEST_SHARE, 2.0, 3.0),
     "uniform, k_D": (0.0, 0.2, 0.5, 0.8),
 }
 SWEEP_DEFAULTS = {
     ("k_D", GRADED_K_D),
     ("shape power p", SHAPE_POWER),
     ("gradation", 1.0),
-    ("largest edge, of a uniform mesh's", COARSEST),
+    ("largest edge, of a uniform mesh's", COARSEST_SHARE),
 }
 
 
@@ -48,7 +48,7 @@ def _mesh(image: Image, nodes: int, option: str, value: float) -> Mesh:
     """The mesh with one option changed."""
     if option == "uniform, k_D":
         return mesh_image(image, nodes, mode="uniform", k_D=value).mesh
-    largest = Sizes().at_most(image, nodes) / COARSEST
+    largest = Sizes().longest_edge(image, nodes) / COARSEST_SHARE
     changed: dict[str, dict[str, Any]] = {
         "k_D": {"k_D": value},
         "shape power p": {"shape_power": value},

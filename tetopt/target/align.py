@@ -15,15 +15,15 @@ from scipy import ndimage
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.target.content import check_labels
+from tetopt.target.domain import INSIDE_SHARE
 from tetopt.target.otsu import class_thresholds
 
-SAME_GRID = 1e-4  # voxels by which two affines may differ and be the same: headers hold single precision
-HALF = 0.5  # the level of a probability map that counts as inside
-SHARE = 0.5  # of the image's voxel centres that a further contrast must cover
-SIGMAS = 4.0  # of the background's noise that still count as background
+SAME_GRID_VOXELS = 1e-4  # two grids whose corners differ by no more are the same: headers hold single precision
+LEAST_COVERED_SHARE = 0.5  # of the image's voxel centres, that a further contrast has to cover
+BACKGROUND_SIGMAS = 4.0  # of the background's noise above its median: what still counts as background
 MAD_TO_SIGMA = 1.4826  # of a normal distribution: its sigma over its median absolute deviation
-SMALL = 0.01  # pieces with less than this share of the largest one's voxels do not count
-FEW = 0.001  # share of the voxels under which a background or foreground found by itself is none
+SMALL_PIECE_SHARE = 0.01  # of the largest piece's voxels: pieces with fewer do not count
+LEAST_CLASS_SHARE = 0.001  # of the voxels: a background or foreground with fewer, found without a level, is none
 
 
 def aligned_mask(mask: Image, image: Image, name: str = "mask") -> Image:
@@ -51,7 +51,7 @@ def aligned_mask(mask: Image, image: Image, name: str = "mask") -> Image:
     _check_axes(name, mask, image)
     inside = _mask_values(name, mask.data)
     moved = _moved(Image(inside, mask.affine), image)
-    if not (moved >= HALF).any():
+    if not (moved >= INSIDE_SHARE).any():
         raise InputError(f"{name}: nothing of the mask lies in the image's box; {_both_boxes(mask, image)}")
     return Image(moved, image.affine)
 
@@ -62,7 +62,7 @@ def aligned_labels(labels: Image, image: Image, name: str = "labels") -> Image:
     Parameters
     ----------
     labels : Image
-        Whole numbers from 0 to `tetopt.target.content.LABELS`, 0 the background.
+        Whole numbers from 0 to `tetopt.target.content.LARGEST_LABEL`, 0 the background.
     image : Image
     name : str, optional
         What the labels are called in messages.
@@ -121,7 +121,7 @@ def aligned_contrast(other: Image, image: Image, name: str = "contrast") -> Imag
     if is_same_grid(other, image):
         return Image(other.data, image.affine)
     share = float(_resampled(np.ones(other.shape, dtype=np.uint8), other, image, 0, "grid-constant").mean())
-    if share < SHARE:
+    if share < LEAST_COVERED_SHARE:
         raise InputError(
             f"{name}: expected to cover half of the image's voxels or more, got {100 * share:.1f} %; "
             f"{_both_boxes(other, image)}"
@@ -157,15 +157,15 @@ def foreground(image: Image, level: float | None = None) -> Image:
     limit = background_level(image) if level is None else float(level)
     is_outside = _large_pieces(image.data <= limit, at_border=True)
     is_inside = _large_pieces(~is_outside)
-    share, few = float(is_inside.mean()), FEW if level is None else 0.0
-    if few < share < 1.0 - few:
+    share, least = float(is_inside.mean()), LEAST_CLASS_SHARE if level is None else 0.0
+    if least < share < 1.0 - least:
         return Image(is_inside, image.affine)
     if level is None:
         raise _no_background(f"{100 * share:.4g} % of the voxels would be foreground at level {limit:.4g}")
     low, high = float(image.data.min()), float(image.data.max())
-    found = "every voxel is foreground" if share > HALF else "nothing is left"
+    outcome = "every voxel is foreground" if share > 0.5 else "nothing is left"
     raise InputError(
-        f"--background {limit:g}: {found}; give a level between the background's and the tissue's values, the image "
+        f"--background {limit:g}: {outcome}; give a level between the background's and the tissue's values, the image "
         f"holds {low:g} to {high:g}"
     )
 
@@ -192,7 +192,7 @@ def background_level(image: Image) -> float:
     if len(dark) == 0:
         raise _no_background(f"no voxel on the faces of the box is among the dark ones, up to {threshold:.4g}")
     middle = np.median(dark)
-    level = float(middle + SIGMAS * MAD_TO_SIGMA * np.median(np.abs(dark - middle)))
+    level = float(middle + BACKGROUND_SIGMAS * MAD_TO_SIGMA * np.median(np.abs(dark - middle)))
     if level >= threshold:
         raise _no_background(
             f"the dark voxels on the faces of the box spread up to {level:.4g}, not under the {threshold:.4g} that "
@@ -226,9 +226,9 @@ def _mask_values(name: str, data: NDArray[np.floating]) -> NDArray[np.float32]:
             f"{name}: expected a mask, 0 and one other value or fractions from 0 to 1, got {len(values)} values from "
             f"{values[0]:g} to {values[-1]:g} ({some}); choose one label of it, or a threshold"
         )
-    if top < HALF:
-        found = "0 in every voxel" if top == 0 else f"fractions up to {top:g}"
-        raise InputError(f"{name}: the mask is empty, expected voxels of {HALF} or more, got {found}")
+    if top < INSIDE_SHARE:
+        largest = "0 in every voxel" if top == 0 else f"fractions up to {top:g}"
+        raise InputError(f"{name}: the mask is empty, expected voxels of {INSIDE_SHARE} or more, got {largest}")
     return data.astype(np.float32)
 
 
@@ -241,7 +241,7 @@ def is_same_grid(other: Image, image: Image) -> bool:
     """Whether two images have the same voxels, to within 1e-4 voxel."""
     corners = _corners(image)
     return other.shape == image.shape and bool(
-        np.abs(other.to_index(image.to_world(corners)) - corners).max() <= SAME_GRID
+        np.abs(other.to_index(image.to_world(corners)) - corners).max() <= SAME_GRID_VOXELS
     )
 
 
@@ -254,7 +254,7 @@ def _resampled(data: NDArray, other: Image, image: Image, order: int, mode: str)
     corner = other.to_index(image.to_world(np.vstack([np.zeros(n), np.eye(n)])))
     matrix, offset = (corner[1:] - corner[0]).T, corner[0]
     if order == 0:  # centres halfway between two voxels, on a grid shifted by half a voxel, all go to the upper one
-        offset = offset + SAME_GRID
+        offset = offset + SAME_GRID_VOXELS
     return ndimage.affine_transform(data, matrix, offset, image.shape, data.dtype, order=order, mode=mode)
 
 
@@ -273,12 +273,12 @@ def _extent(image: Image) -> str:
 
 
 def _on_faces(data: NDArray) -> NDArray:
-    """The values on all faces of the box, one after the other."""
+    """The values of the voxels on all faces of the box, one face after the other."""
     return np.concatenate([data.take(end, axis).ravel() for axis in range(data.ndim) for end in (0, -1)])
 
 
 def _large_pieces(is_in: NDArray[np.bool_], at_border: bool = False) -> NDArray[np.bool_]:
-    """Pieces, connected face to face, of at least `SMALL` of the largest; with `at_border` of those that touch it."""
+    """Pieces, connected face to face, not far smaller than the largest; with `at_border` of those that touch it."""
     pieces, _ = ndimage.label(is_in)
     sizes = np.bincount(pieces.ravel())
     sizes[0] = 0
@@ -286,4 +286,4 @@ def _large_pieces(is_in: NDArray[np.bool_], at_border: bool = False) -> NDArray[
         is_inner = np.ones(len(sizes), dtype=np.bool_)
         is_inner[_on_faces(pieces)] = False
         sizes[is_inner] = 0
-    return (sizes >= max(1.0, SMALL * sizes.max()))[pieces]
+    return (sizes >= max(1.0, SMALL_PIECE_SHARE * sizes.max()))[pieces]

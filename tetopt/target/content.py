@@ -16,19 +16,27 @@ from scipy.ndimage import binary_erosion, distance_transform_edt, find_objects, 
 
 from tetopt.errors import InputError
 from tetopt.image import Image
-from tetopt.target.domain import HALF, Domain, domain
+from tetopt.target.domain import INSIDE_SHARE, Region, region_of
 
-SAMPLE = 100_000  # voxels, of which the most frequent value is taken for the background's
-FEW = 32  # values, at most, that an image of labels has
-LABELS = 32_767  # largest label
-REACH = 4  # voxels: labels that come no nearer may share a channel
-RARE = 0.5  # power of a label's share of voxels by which it counts less
-SAME_PLACE = 1e-2  # voxel: what lies no further away is in the same place
-LEVELS = 256.0  # into which a contrast's standard deviation is divided, at least
-WEIGHTS = 1e-3, 1e3  # the least and the largest, besides 0
-MARGIN = 4  # voxels around a mask
-SURFACE = 4.0  # of the variance: what a voxel on the wrong side of the region's surface counts
-MOST = 2.0**31  # sums of squares along a row stay below, so that they are exact in 32 bits
+SAMPLED_VOXELS = 100_000  # of these the most frequent value is taken for the background's
+MOST_LABEL_VALUES = 32  # an image of no more values than this is one of labels, and has no noise
+LARGEST_LABEL = 32_767  # the largest of 16 bits with a sign, in which many programs keep labels
+APART_VOXELS = 4  # labels that come no nearer to one another may share a channel
+RARITY_POWER = 0.5  # of a label's share of the voxels, by which each of its voxels counts less
+SAME_PLACE_VOXELS = 1e-2  # voxel centres that lie no further apart are in the same place
+STEPS_PER_SIGMA = 256.0  # whole numbers in a contrast's standard deviation, at least
+WEIGHT_RANGE = 1e-3, 1e3  # the least and the largest weight, besides 0
+MARGIN_VOXELS = 4  # kept around a mask: as far as smoothing its surface, and cells on it, can reach
+WRONG_SIDE_VARIANCES = 4.0  # what a voxel on the wrong side of the region's surface counts, of the variance
+ROW_SUM_LIMIT = 2.0**31  # sums of squares along a row stay below, so that they are exact in 32 bits
+
+
+class Continuation(NamedTuple):
+    """Where values beyond a mask's surface come from; made by `continuation`."""
+
+    part: tuple[slice, ...]  # the voxels around the mask
+    inside: NDArray[np.bool_]  # which of them lie in it
+    nearest: NDArray[np.int64]  # (K,) for each of them outside, in C order, the flat number of the nearest one inside
 
 
 class Content(NamedTuple):
@@ -39,7 +47,8 @@ class Content(NamedTuple):
     n_contrasts: int  # the first of them: images, not labels
     unit: float  # squared intensity of the image for 1 squared of `values`
     is_plain: bool  # whether `values` is the image's own data, else whole numbers
-    region: Domain | None  # what is to be covered; None for the image's box
+    region: Region | None  # what is to be covered; None for the image's box
+    continuation: Continuation | None = None  # of the mask that the region is of; see `continued`
 
     @property
     def n_voxels(self) -> int:
@@ -59,7 +68,7 @@ class Content(NamedTuple):
     @property
     def wrong_side(self) -> float:
         """What a voxel on the wrong side of the region's surface counts, in squared units of `values`."""
-        return SURFACE * (self.variance / self.unit or 1.0)
+        return WRONG_SIDE_VARIANCES * (self.variance / self.unit or 1.0)
 
     @property
     def noise(self) -> float:
@@ -98,14 +107,14 @@ def content(
     images = [images] if isinstance(images, Image) else list(images)
     weights = [1.0] * len(images) if weights is None else [float(w) for w in weights]
     _check(images, {"labels": labels, "mask": mask}, weights, label_weight)
-    region = None
+    region = beyond = None
     if mask is not None:
-        part = _around(mask)
-        region = domain(_part(mask, part))
-        images = [_continued(_part(image, part), region.inside) for image in images]
-        labels = None if labels is None else _continued(_part(labels, part), region.inside)
+        beyond = continuation(mask, images[0].spacing)
+        region = region_of(_part(mask, beyond.part))
+        images = [continued(image, beyond) for image in images]
+        labels = None if labels is None else continued(labels, beyond)
     if len(images) == 1 and labels is None and weights[0] > 0.0:
-        return plain(images[0])._replace(region=region)
+        return plain(images[0])._replace(region=region, continuation=beyond)
     contrasts = _scaled(images, weights, region)
     number, codes = np.zeros(images[0].shape, dtype=np.int64), np.zeros((0, 1))
     if labels is not None and label_weight > 0.0:
@@ -117,25 +126,25 @@ def content(
             )
     if len(contrasts) + len(codes) == 0:
         raise InputError("weights: nothing that differs between voxels counts; give one above 0")
-    values, scale = _whole(contrasts, number, codes)
+    values, scale = _whole_numbers(contrasts, number, codes)
     unit = _variance(images[0].data, region) or 1.0
-    return Content(images[0], values, len(contrasts), unit / scale**2, False, region)
+    return Content(images[0], values, len(contrasts), unit / scale**2, False, region, beyond)
 
 
-def _scaled(images: list[Image], weights: list[float], region: Domain | None) -> list[NDArray[np.float32]]:
+def _scaled(images: list[Image], weights: list[float], region: Region | None) -> list[NDArray[np.float32]]:
     """The contrasts that count less their means, of variance `weight` each."""
-    found = []
+    scaled = []
     for image, weight in zip(images, weights, strict=True):
         data = image.data - np.mean(image.data if region is None else image.data[region.inside], dtype=np.float64)
         spread = _variance(data, region)
         if not np.isfinite(spread):
             raise InputError("image: squares of intensities overflow; rescale it first")
         if weight > 0.0 and spread > 0.0:
-            found.append((np.sqrt(weight / spread) * data).astype(np.float32))
-    return found
+            scaled.append((np.sqrt(weight / spread) * data).astype(np.float32))
+    return scaled
 
 
-def _whole(
+def _whole_numbers(
     contrasts: list[NDArray[np.float32]], number: NDArray[np.int64], codes: NDArray[np.float64]
 ) -> tuple[NDArray[np.int32], float]:
     """All channels, (C, *shape), as whole numbers, and their scale.
@@ -143,9 +152,9 @@ def _whole(
     If it can be, their sums of squares along a row fit 32 bits.
     """
     square = sum(float(np.abs(data).max()) ** 2 for data in contrasts) + float((codes**2).max(initial=0.0))
-    fitting = float(np.sqrt(0.9 * MOST / (number.shape[-1] * square)))
+    fitting = float(np.sqrt(0.9 * ROW_SUM_LIMIT / (number.shape[-1] * square)))
     # Where one voxel, or a rare label, is much larger than the rest, sums are of 64 bits rather than levels few.
-    steps = [LEVELS / float(np.std(data, dtype=np.float64)) for data in contrasts]
+    steps = [STEPS_PER_SIGMA / float(np.std(data, dtype=np.float64)) for data in contrasts]
     largest = max([float(np.abs(data).max()) for data in contrasts] + [float(codes.max(initial=0.0))])
     scale = min(max([fitting, *steps]), 2.0**30 / largest)
     values = np.empty((len(contrasts) + len(codes), *number.shape), dtype=np.int32)
@@ -161,32 +170,52 @@ def plain(image: Image | Content) -> Content:
     return image if isinstance(image, Content) else Content(image, image.data[None], 1, 1.0, True, None)
 
 
-def _variance(values: NDArray, region: Domain | None) -> float:
+def _variance(values: NDArray, region: Region | None) -> float:
     with np.errstate(over="ignore"):
         return float(np.var(values if region is None else values[region.inside], dtype=np.float64))
 
 
-def _around(mask: Image) -> tuple[slice, ...]:
-    """The voxels around a mask, with a margin: what lies further away takes only time."""
-    inside = mask.data >= HALF
+def continuation(mask: Image, spacing: NDArray[np.float64]) -> Continuation:
+    """The voxels around a mask, with a margin, and the nearest inside by voxels of these edges (n,), mm.
+
+    What lies further away takes only time. For images on the same voxels it is found once and handed on.
+
+    Raises
+    ------
+    InputError
+        Nothing inside the mask.
+    """
+    inside = mask.data >= INSIDE_SHARE
     if not inside.any():
         raise InputError("mask: no voxel has a half or more, there is nothing to mesh")
     box = find_objects(inside.astype(np.int8))[0]
-    return tuple(slice(max(s.start - MARGIN, 0), min(s.stop + MARGIN, n)) for s, n in zip(box, mask.shape, strict=True))
+    ends = ((max(s.start - MARGIN_VOXELS, 0), s.stop + MARGIN_VOXELS) for s in box)
+    part = tuple(slice(first, min(stop, n)) for (first, stop), n in zip(ends, mask.shape, strict=True))
+    inside = inside[part]
+    if inside.all():
+        return Continuation(part, inside, np.empty(0, dtype=np.int64))
+    nearest = distance_transform_edt(~inside, spacing, return_distances=False, return_indices=True)
+    return Continuation(part, inside, np.ravel_multi_index(tuple(nearest[:, ~inside]), inside.shape))
+
+
+def continued(image: Image, mask: Image | Continuation | None) -> Image:
+    """An image with the nearest value within a mask wherever it is outside: what cells at the boundary stand for.
+
+    Only the voxels around the mask are kept. Without a mask it is the image itself.
+    """
+    if mask is None:
+        return image
+    beyond = continuation(mask, image.spacing) if isinstance(mask, Image) else mask
+    part = _part(image, beyond.part)
+    data = part.data.copy()
+    data[~beyond.inside] = data.ravel()[beyond.nearest]
+    return Image(data, part.affine)
 
 
 def _part(image: Image, part: tuple[slice, ...]) -> Image:
     affine = image.affine.copy()
     affine[:-1, -1] = image.to_world([s.start for s in part])
     return Image(image.data[part], affine)
-
-
-def _continued(image: Image, inside: NDArray[np.bool_]) -> Image:
-    """The image with the nearest value of those inside wherever it is outside."""
-    if inside.all():
-        return image
-    nearest = distance_transform_edt(~inside, image.spacing, return_distances=False, return_indices=True)
-    return Image(image.data[tuple(nearest)], image.affine)
 
 
 def _check(images: list[Image], others: dict[str, Image | None], weights: list[float], label_weight: float) -> None:
@@ -200,9 +229,9 @@ def _check(images: list[Image], others: dict[str, Image | None], weights: list[f
                 f"{name}: expected all of shape {first.shape}, got {image.shape}; see tetopt.aligned_mask and the like"
             )
         last = np.array(first.shape) - 1
-        if np.abs(first.to_index(image.to_world([0 * last, last])) - [0 * last, last]).max() > SAME_PLACE:
+        if np.abs(first.to_index(image.to_world([0 * last, last])) - [0 * last, last]).max() > SAME_PLACE_VOXELS:
             raise InputError(f"{name}: expected voxels in the same place as the first image's; see tetopt.aligned_mask")
-    low, high = WEIGHTS
+    low, high = WEIGHT_RANGE
     if len(weights) != len(images) or not all(w == 0.0 or low <= w <= high for w in weights):
         raise InputError(
             f"weights: expected one for each of {len(images)} images, 0 or {low:g} to {high:g}, got {weights}"
@@ -214,52 +243,46 @@ def _check(images: list[Image], others: dict[str, Image | None], weights: list[f
 
 
 def check_labels(name: str, labels: Image) -> None:
-    """InputError unless the voxels are whole numbers from 0 to `LABELS`."""
+    """InputError unless the voxels are whole numbers from 0 to `LARGEST_LABEL`."""
     data = labels.data
-    wrong = np.argwhere((data < 0) | (data > LABELS) | (np.rint(data) != data))
+    wrong = np.argwhere((data < 0) | (data > LARGEST_LABEL) | (np.rint(data) != data))
     if len(wrong):
         first = tuple(int(i) for i in wrong[0])
         raise InputError(
-            f"{name}: labels must be whole numbers from 0 to {LABELS}, {len(wrong)} voxels have others, the first "
-            f"{data[first]:g} at {first}; is it a label image?"
+            f"{name}: labels must be whole numbers from 0 to {LARGEST_LABEL}, {len(wrong)} voxels have others, the "
+            f"first {data[first]:g} at {first}; is it a label image?"
         )
 
 
-def _one_hot(labels: NDArray[np.int64], region: Domain | None) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+def _one_hot(labels: NDArray[np.int64], region: Region | None) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Channels that tell K labels apart: each voxel's row, and the rows' values in C channels, (C, K).
 
     Each label has its value in one channel and 0 in the others. Labels that come nowhere near one another share a
-    channel. By voxel a label counts by its share of the voxels to the power -`RARE`, so that small ones are not given
-    up for the surfaces of large ones; the variance of all is 1.
+    channel. By voxel a label counts by its share of the voxels to the power -`RARITY_POWER`, so that small ones are
+    not given up for the surfaces of large ones; the variance of all is 1.
     """
     counts = np.bincount(labels.ravel() if region is None else labels[region.inside])
-    there = np.flatnonzero(counts)
+    present = np.flatnonzero(counts)
     row = np.zeros(len(counts), dtype=np.int64)
-    row[there] = np.arange(len(there))
-    number, share = row[labels], counts[there] / counts.sum()
-    size = share ** (-0.5 * RARE)
+    row[present] = np.arange(len(present))
+    number, share = row[labels], counts[present] / counts.sum()
+    size = share ** (-0.5 * RARITY_POWER)
     channel = _colours(number, len(share))
     codes = np.where(channel == np.arange(channel.max() + 1)[:, None], size, 0.0)
     spread = float((codes**2 @ share - (codes @ share) ** 2).sum())
     return number, (codes / np.sqrt(spread) if len(share) > 1 else codes[:0])
 
 
-def continued(image: Image, mask: Image | None) -> Image:
-    """An image with the nearest value within a mask wherever it is outside: what cells at the boundary stand for."""
-    if mask is None:
-        return image
-    part = _around(mask)
-    return _continued(_part(image, part), mask.data[part] >= HALF)
-
-
 def _colours(number: NDArray[np.int64], n_labels: int) -> NDArray[np.int64]:
-    """A channel for each label: labels within `REACH` voxels of one another have different ones."""
-    shape = tuple(-(-s // REACH) for s in number.shape)
-    block = np.ravel_multi_index(np.meshgrid(*[np.arange(s) // REACH for s in number.shape], indexing="ij"), shape)
-    is_there = np.zeros((n_labels, int(np.prod(shape))), dtype=bool)
-    is_there[number.ravel(), block.ravel()] = True
-    near = np.stack([maximum_filter(row.reshape(shape), size=3).ravel() for row in is_there])
-    touches = near.astype(np.float32) @ is_there.T.astype(np.float32) > 0.0
+    """A channel for each label: labels within `APART_VOXELS` voxels of one another have different ones."""
+    shape = tuple(-(-s // APART_VOXELS) for s in number.shape)
+    block = np.ravel_multi_index(
+        np.meshgrid(*[np.arange(s) // APART_VOXELS for s in number.shape], indexing="ij"), shape
+    )
+    is_in = np.zeros((n_labels, int(np.prod(shape))), dtype=bool)
+    is_in[number.ravel(), block.ravel()] = True
+    is_beside = np.stack([maximum_filter(row.reshape(shape), size=3).ravel() for row in is_in])
+    touches = is_beside.astype(np.float32) @ is_in.T.astype(np.float32) > 0.0
     channel = np.full(n_labels, -1, dtype=np.int64)
     for label in np.argsort(-touches.sum(axis=1), kind="stable"):
         taken = set(channel[touches[label]].tolist())
@@ -273,22 +296,22 @@ def noise_level(data: NDArray, inside: NDArray[np.bool_] | None = None) -> float
     Structure wider than a voxel cancels in (1, -2, 1) taken along all axes (Immerkaer 1996, here in n-D); the lower
     quartile of its size is that of noise in most of the volume. A background of one value, cut out, does not count;
     what is left in less than a tenth of the voxels are edges, not noise, and labels have none. Noise that was smoothed
-    is underestimated. With `inside` only the voxels there, and not beside others, are asked.
+    is underestimated. With `inside` only the voxels there, and not beside others, are looked at.
     """
     if min(data.shape) < 3:
         return 0.0
     rest = data.astype(np.float64)
     for axis in range(data.ndim):
         rest = np.diff(rest, n=2, axis=axis)
-    # Few values are labels, and have none.
-    values, often = np.unique(data.ravel()[:: max(data.size // SAMPLE, 1)], return_counts=True)
-    if len(values) <= FEW:
+    # An image of few values is one of labels, which have no noise.
+    values, often = np.unique(data.ravel()[:: max(data.size // SAMPLED_VOXELS, 1)], return_counts=True)
+    if len(values) <= MOST_LABEL_VALUES:
         return 0.0
     middle = (slice(1, -1),) * data.ndim
-    is_asked = (rest != 0.0) | (data[middle] != values[often.argmax()])
+    is_counted = (rest != 0.0) | (data[middle] != values[often.argmax()])
     if inside is not None:
-        is_asked &= binary_erosion(inside, np.ones((3,) * data.ndim), border_value=1)[middle]
-    size = np.abs(rest[is_asked])
+        is_counted &= binary_erosion(inside, np.ones((3,) * data.ndim), border_value=1)[middle]
+    size = np.abs(rest[is_counted])
     if np.count_nonzero(size) < 0.1 * (rest.size if inside is None else inside.sum()):
         return 0.0
     return float(np.quantile(size, 0.25) / 0.31864 / 6.0 ** (data.ndim / 2))

@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 
-BINS = 256  # of the histogram whose classes are found
+HISTOGRAM_BINS = 256  # of the histogram whose classes are found: as many as 8-bit images have values
 
 
 def class_thresholds(values: NDArray, classes: int, weights: NDArray | None = None) -> NDArray[np.float64]:
@@ -36,10 +36,12 @@ def class_thresholds(values: NDArray, classes: int, weights: NDArray | None = No
     """
     if classes < 2:
         raise InputError(f"classes: expected 2 or more, got {classes}")
-    counts, edges = np.histogram(values, bins=BINS, weights=weights)
+    counts, edges = np.histogram(values, bins=HISTOGRAM_BINS, weights=weights)
     is_filled = counts > 0
     if is_filled.sum() < classes:
-        raise InputError(f"classes: {classes} asked for, but the values fill only {is_filled.sum()} of {BINS} bins")
+        raise InputError(
+            f"classes: {classes} asked for, but the values fill only {is_filled.sum()} of {HISTOGRAM_BINS} bins"
+        )
     centres = 0.5 * (edges[1:] + edges[:-1])[is_filled]
     counts = counts[is_filled].astype(np.float64)
     within = _within_class_sums(counts, centres - centres.mean())
