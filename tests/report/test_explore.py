@@ -15,7 +15,8 @@ from tetopt.geometry.cut import plane_cut
 from tetopt.geometry.simplex import centroids, volumes
 from tetopt.geometry.topology import boundary_facets, facets
 from tetopt.report import explore
-from tetopt.report.explore import colour_table, explorer_html, save_explorer, scalar_fields
+from tetopt.report.exhibit import exhibit
+from tetopt.report.explore import colour_table, explorer_html, save_explorer
 
 
 @pytest.fixture(scope="module")
@@ -35,7 +36,7 @@ def array(text, kind):
 
 
 def test_fields_are_labels_or_quantities(mesh, cell_data):
-    mean, label = scalar_fields(mesh, cell_data)
+    mean, label = exhibit(mesh, cell_data).fields
     assert (mean.name, mean.unit, mean.categories) == ("mean", "intensity", [])
     np.testing.assert_allclose(mean.limits, np.nanpercentile(cell_data["mean"].astype(np.float32), [1, 99]), rtol=1e-6)
     assert [value for value, _ in label.categories] == [0, 1, 2, 3]
@@ -43,14 +44,13 @@ def test_fields_are_labels_or_quantities(mesh, cell_data):
     # Not all whole numbers are labels.
     n = len(mesh.cells)
     for name, values in (("n_voxels", np.full(n, 8)), ("depth", np.full(n, -1)), ("many", np.arange(n))):
-        assert scalar_fields(mesh, {name: values})[0].categories == []
+        assert exhibit(mesh, {name: values}).fields[0].categories == []
 
 
 def test_a_field_without_range_or_values_has_limits(mesh):
     n = len(mesh.cells)
-    constant, none, infinite = scalar_fields(
-        mesh, {"a": np.full(n, 0.5), "b": np.full(n, np.nan), "c": np.append(np.arange(n - 1) + 0.5, np.inf)}
-    )
+    data = {"a": np.full(n, 0.5), "b": np.full(n, np.nan), "c": np.append(np.arange(n - 1) + 0.5, np.inf)}
+    constant, none, infinite = exhibit(mesh, data).fields
     assert constant.limits[0] < 0.5 < constant.limits[1]
     assert none.limits == (0.0, 1.0)
     assert infinite.limits[1] < n
@@ -58,13 +58,13 @@ def test_a_field_without_range_or_values_has_limits(mesh):
 
 
 def test_without_fields_there_are_those_of_the_mesh(mesh, image):
-    names = [field.name for field in scalar_fields(mesh, {"strain": np.zeros((len(mesh.cells), 6))}, image)]
+    names = [field.name for field in exhibit(mesh, {"strain": np.zeros((len(mesh.cells), 6))}, image).fields]
     assert names == list(tetopt.cell_fields(mesh, image))
 
 
 def test_the_data_are_the_meshs(mesh, cell_data, image):
     top = boundary_facets(mesh.cells)[:5]
-    data = packed(explorer_html(mesh, cell_data, image, facet_sets={"top": top}))
+    data = packed(explorer_html(exhibit(mesh, cell_data, image, facet_sets={"top": top})))
     points = array(data["points"], "<f4").reshape(-1, 3) + data["centre"]
     np.testing.assert_allclose(points, mesh.points, atol=1e-5)
     np.testing.assert_array_equal(array(data["cells"], "<u4").reshape(-1, 4), mesh.cells)
@@ -75,7 +75,7 @@ def test_the_data_are_the_meshs(mesh, cell_data, image):
 
 
 def test_the_image_is_where_its_affine_puts_it(mesh, image):
-    data = packed(explorer_html(mesh, {}, image))
+    data = packed(explorer_html(exhibit(mesh, {}, image)))
     packed_image = data["image"]
     index = np.random.default_rng(0).uniform(0, 13, (9, 3))
     relative = np.append(image.to_world(index) - data["centre"], np.ones((9, 1)), axis=1)
@@ -87,41 +87,41 @@ def test_the_image_is_where_its_affine_puts_it(mesh, image):
 
 def test_a_large_image_is_averaged_over_the_same_box(mesh, image, monkeypatch):
     monkeypatch.setattr(explore, "PAGE_IMAGE_VOXELS", 600)
-    whole = packed(explorer_html(mesh, {}, image))["image"]
+    whole = packed(explorer_html(exhibit(mesh, {}, image)))["image"]
     assert np.prod(whole["shape"]) <= 600
     assert whole["original"] == list(image.shape)
     monkeypatch.undo()
-    np.testing.assert_allclose(whole["box"], packed(explorer_html(mesh, {}, image))["image"]["box"], atol=1e-9)
+    np.testing.assert_allclose(whole["box"], packed(explorer_html(exhibit(mesh, {}, image)))["image"]["box"], atol=1e-9)
 
 
 def test_the_page_is_one_file(mesh, cell_data, tmp_path):
     labels = {"</script>": cell_data["label"]}
-    save_explorer(tmp_path / "a.html", mesh, labels, title='</script><b>"$DATA')
+    save_explorer(tmp_path / "a.html", exhibit(mesh, labels, title='</script><b>"$DATA'))
     text = (tmp_path / "a.html").read_text(encoding="utf-8")
     assert not re.search(r"https?://|src=|href=|url\(|import ", text)
     assert "default-src 'none'" in text
     assert packed(text)["fields"][0]["name"] == "</script>"
     assert "<title>&lt;/script&gt;&lt;b&gt;&quot;$DATA</title>" in text
     assert "needs JavaScript" in text
-    with pytest.raises(InputError):
-        save_explorer(tmp_path / "b.html", mesh, {"mean": np.zeros(3)})
+    with pytest.raises(UnicodeEncodeError):  # on writing: nothing is left of it
+        save_explorer(tmp_path / "b.html", exhibit(mesh, labels, title="\ud800"))
     assert [path.name for path in tmp_path.iterdir()] == ["a.html"]
 
 
 def test_refusals(mesh, image):
     plane = tetopt.Mesh([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]])
     with pytest.raises(InputError, match="expected a mesh of tetrahedra, got one of triangles"):
-        explorer_html(plane, {})
+        exhibit(plane, {})
     with pytest.raises(InputError, match=f"'mean' for each of {len(mesh.cells)} cells, got 3"):
-        explorer_html(mesh, {"mean": np.zeros(3)})
+        exhibit(mesh, {"mean": np.zeros(3)})
     with pytest.raises(InputError, match="3-D image beside a mesh of tetrahedra, got a 2-D one"):
-        explorer_html(mesh, {}, tetopt.Image(np.eye(3)))
+        exhibit(mesh, {}, tetopt.Image(np.eye(3)))
     for nodes in (np.zeros((2, 4), dtype=int), np.zeros((2, 3)), np.zeros(3, dtype=int)):
         with pytest.raises(InputError, match="'top': expected \\(K, 3\\) whole numbers"):
-            explorer_html(mesh, {}, facet_sets={"top": nodes})
+            exhibit(mesh, {}, facet_sets={"top": nodes})
     for node in (-1, len(mesh.points)):
         with pytest.raises(InputError, match=f"'top': expected nodes 0..{len(mesh.points) - 1}, got"):
-            explorer_html(mesh, {}, facet_sets={"top": np.full((1, 3), node)})
+            exhibit(mesh, {}, facet_sets={"top": np.full((1, 3), node)})
 
 
 def test_the_colour_map_is_even():
@@ -249,7 +249,7 @@ def shown(tmp_path_factory, mesh, cell_data, image):
         probe = probe.replace(word, str(value))
     for title in ("page", "blind", "narrow"):
         sets = {"outer": boundary_facets(mesh.cells), "inner": inner_facets(mesh, below=middle[2] + AT[1] - 5.0)}
-        text = explorer_html(mesh, cell_data, image, title, sets)
+        text = explorer_html(exhibit(mesh, cell_data, image, title, sets))
         copied(text, folder / f"{title}.html", FRAMES + BLIND if title == "blind" else FRAMES, probe)
     frame = copied(FRAME, folder / "frame.html")
     said = re.findall(r'data-(page|blind|narrow)="([^"]*)"', document(frame, "--window-size=1500,1500"))
@@ -324,7 +324,7 @@ def test_the_section_shows_the_cells_it_cuts(shown, mesh, cell_data):
     cells, distances = cells_at(mesh, np.column_stack([xy, np.full(len(xy), z)]))
     clear = (distances > 2.5 * mm) & (cells >= 0)  # of lines
     assert clear.sum() > 400
-    (field, _) = scalar_fields(mesh, cell_data)
+    field, _ = exhibit(mesh, cell_data).fields
     low, high = field.limits
     step = np.rint(255 * np.clip((field.values[cells] - low) / (high - low), 0, 1))
     expected = np.where(np.isnan(step)[:, None], 0xAA, colour_table()[np.nan_to_num(step).astype(int)].astype(int))
@@ -362,7 +362,7 @@ def test_a_click_reads_a_cell(shown, mesh, cell_data):
 
 
 def test_labels_have_a_legend(shown, mesh, cell_data):
-    _, field = scalar_fields(mesh, cell_data)
+    _, field = exhibit(mesh, cell_data).fields
     rgb = [tuple(int(colour[i : i + 2], 16) for i in (1, 3, 5)) for _, colour in field.categories]
     assert shown["page"]["labels"] == [[str(k), f"rgb{colour}"] for k, colour in enumerate(rgb)]
 

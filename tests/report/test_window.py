@@ -10,6 +10,7 @@ from tetopt.errors import InputError
 from tetopt.geometry.cut import plane_cut
 from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import boundary_facets
+from tetopt.report.exhibit import exhibit
 from tetopt.report.window import has_display, plane_slice, plotter, show
 
 
@@ -21,9 +22,10 @@ def cell_data(mesh):
 
 @pytest.fixture
 def window(opengl, mesh, cell_data, image):
-    made = plotter(mesh, cell_data, image, off_screen=True, facet_sets={"outside": boundary_facets(mesh.cells)})
-    yield made
-    made.close()
+    shown = exhibit(mesh, cell_data, image, facet_sets={"outside": boundary_facets(mesh.cells)})
+    opened = plotter(shown, off_screen=True)
+    yield opened
+    opened.close()
 
 
 def slide(window, number, value):
@@ -136,7 +138,7 @@ def test_a_slice_has_the_voxel_at_every_place(image, axis):
 
 
 def test_without_an_image_or_a_second_field(opengl, mesh):
-    window = plotter(mesh, {"rho": np.linspace(0, 0.3, len(mesh.cells))}, off_screen=True)
+    window = plotter(exhibit(mesh, {"rho": np.linspace(0, 0.3, len(mesh.cells))}), off_screen=True)
     press(window, "m")
     press(window, "n")
     press(window, "h")
@@ -153,7 +155,7 @@ def test_without_a_display_it_is_said(monkeypatch, mesh, display):
     else:
         monkeypatch.setenv("DISPLAY", display)
     with pytest.raises(InputError, match="no display to open a window on; use --html") as caught:
-        show(mesh, {})
+        show(exhibit(mesh, {}))
     assert "\n" not in str(caught.value)
 
 

@@ -46,13 +46,16 @@ def view_command(
             fields = cell_fields(mesh, image) | fields
     sets = merged_sets(standard_sets(mesh, loaded.box, labels_of(fields, len(mesh.cells))), loaded.sets)[0].facets
     triples = {name: facet_triples(mesh.cells, rows) for name, rows in sets.items()}
+    from tetopt.report.exhibit import exhibit  # matplotlib and pyvista are slow to load, and only needed here
+
+    shown = exhibit(mesh, fields, image, mesh_path.name, triples)
     if html is None:
         from tetopt.report.window import show
 
-        show(mesh, fields, image, mesh_path.name, triples)
+        show(shown)
         return 0
     from tetopt.report.explore import save_explorer
 
-    save_explorer(html, mesh, fields, image, mesh_path.name, triples)
+    save_explorer(html, shown)
     out.print(escape(f"{html}: open it in a browser; {html.stat().st_size / 1e6:.1f} MB, needs nothing else"))
     return 0

@@ -28,11 +28,6 @@ SCENE_VIEWPOINT = (0.9, 1.25, 0.7)  # where the eye is, RAS: on the right, in fr
 Draw = Callable[[pyvista.Plotter], object]  # adds a scene's parts to a plotter
 
 
-def facets_surface(points: NDArray[np.float64], triangles: NDArray[np.int64]) -> pyvista.PolyData:
-    """Triangles (K, 3) between points (N, 3) as a pyvista surface."""
-    return pyvista.PolyData.from_regular_faces(points, triangles)
-
-
 def save_scenes(path: str | Path, scenes: Sequence[tuple[str, Draw]], columns: int | None = None) -> None:
     """PNG of scenes side by side, each with a title, seen from the same side; in rows of `columns`, by default one.
 
@@ -77,7 +72,7 @@ def _photograph(draw: Draw) -> NDArray[np.uint8]:
 
 def structure_before_slices(image: Image, mesh: Mesh, chosen: NDArray[np.int64]) -> Draw:
     """The boundary of the chosen cells in front of the volume's middle slices, drawn on the box's far sides."""
-    surface = facets_surface(mesh.points, boundary_facets(mesh.cells[chosen]))
+    surface = pyvista.PolyData.from_regular_faces(mesh.points, boundary_facets(mesh.cells[chosen]))
     return _before_slices(image, surface, show_edges=True, edge_color="#402000", line_width=1)
 
 
@@ -101,7 +96,7 @@ def slices_in_mesh(image: Image, mesh: Mesh) -> Draw:
     def draw(plotter: pyvista.Plotter) -> None:
         _add_slices(plotter, image, [image.shape[axis] // 2 for axis in range(3)])
         part = mesh.cells[mesh.points[mesh.cells].mean(axis=1)[:, 2] < middle[2]]
-        edges = facets_surface(mesh.points, boundary_facets(part)).extract_all_edges()
+        edges = pyvista.PolyData.from_regular_faces(mesh.points, boundary_facets(part)).extract_all_edges()
         plotter.add_mesh(edges, color="#2060c0", line_width=1.5)
 
     return draw
@@ -111,7 +106,7 @@ def cutaway(view: View, limits: tuple[float, float]) -> Draw:
     """The surface of an opened mesh, each cell in the grey of its value between `limits`, with the cells' edges."""
     # The darkest is not quite black, on which no light would show how a facet lies.
     shown = (limits[0] - 0.25 * (limits[1] - limits[0]), limits[1])
-    surface = facets_surface(view.points, view.triangles)
+    surface = pyvista.PolyData.from_regular_faces(view.points, view.triangles)
     surface.cell_data["h"] = view.values
     return lambda plotter: plotter.add_mesh(
         surface, scalars="h", cmap="gray", clim=shown, show_scalar_bar=False, show_edges=True, edge_color=MESH_LINE,
@@ -124,7 +119,7 @@ def labelled_cutaway(view: View, colours: NDArray[np.float64]) -> Draw:
 
     The view's values are labels; `colours` (largest label + 1, 3) as of `tetopt.report.colours.label_colours`.
     """
-    surface = facets_surface(view.points, view.triangles)
+    surface = pyvista.PolyData.from_regular_faces(view.points, view.triangles)
     surface.cell_data["colour"] = np.rint(255.0 * colours[view.values.astype(np.int64)]).astype(np.uint8)
     return lambda plotter: plotter.add_mesh(
         surface, scalars="colour", rgb=True, show_edges=True, edge_color="#202020", line_width=1, ambient=0.35

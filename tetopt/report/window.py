@@ -15,15 +15,14 @@ from matplotlib.colors import to_rgb
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
+from tetopt.geometry.box import box_sides
 from tetopt.geometry.cut import plane_cut
 from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import facets
 from tetopt.image import Image
-from tetopt.mesh import Mesh
 from tetopt.report.colours import LISTED_LABELS, grey_limits
-from tetopt.report.explore import COLOUR_MAP, NO_VALUE, Field, checked_sets, scalar_fields
+from tetopt.report.exhibit import COLOUR_MAP, NO_VALUE, Exhibit, Field
 from tetopt.report.figures import MESH_LINE
-from tetopt.report.scene import facets_surface
 
 KEYS_TEXT = "x y z: plane   k: side kept   m: mesh, image, both   n: next field   h: next set of facets   q: close"
 PLANE_CHOICES = ("mesh", "image", "both")  # what the plane shows
@@ -34,23 +33,17 @@ GLASS_OPACITY = 0.35  # of the cells' colours over the image: enough to tell the
 MAX_PIXELS = 1024  # of the image's slice along either side: about the window's
 
 
-def show(
-    mesh: Mesh,
-    cell_data: dict[str, NDArray],
-    image: Image | None = None,
-    title: str = "mesh",
-    facet_sets: dict[str, NDArray] | None = None,
-) -> None:
+def show(shown: Exhibit) -> None:
     """Open the window of `plotter` and return when it is closed.
 
     Raises
     ------
     InputError
-        No display to open it on, or as `plotter`.
+        No display to open it on.
     """
     if not has_display():
         raise InputError("view: no display to open a window on; use --html to write the same view as a page")
-    plotter(mesh, cell_data, image, title=title, facet_sets=facet_sets).show()
+    plotter(shown).show()
 
 
 def has_display() -> bool:
@@ -71,50 +64,25 @@ def has_display() -> bool:
     return True
 
 
-def plotter(
-    mesh: Mesh,
-    cell_data: dict[str, NDArray],
-    image: Image | None = None,
-    off_screen: bool = False,
-    title: str = "mesh",
-    facet_sets: dict[str, NDArray] | None = None,
-) -> pyvista.Plotter:
+def plotter(shown: Exhibit, off_screen: bool = False) -> pyvista.Plotter:
     """The window, not yet shown: the mesh cut by a plane, coloured by a field within limits, the image in the plane.
 
-    Sliders move the plane (world mm) and the limits, and choose the field; the keys in `KEYS_TEXT` the rest.
-
-    Parameters
-    ----------
-    mesh, cell_data, image, title, facet_sets
-        As in `tetopt.report.explore.explorer_html`.
-    off_screen : bool
-        To be photographed instead of shown.
-
-    Raises
-    ------
-    InputError
-        As `tetopt.report.explore.explorer_html`.
+    Sliders move the plane (world mm) and the limits, and choose the field; the keys in `KEYS_TEXT` the rest. With
+    `off_screen` it is to be photographed instead of shown.
     """
-    fields = scalar_fields(mesh, cell_data, image)
     with pyvista.vtk_verbosity("off"):
-        window = pyvista.Plotter(off_screen=off_screen, window_size=(1280, 850), title=f"tetopt: {title}")
+        window = pyvista.Plotter(off_screen=off_screen, window_size=(1280, 850), title=f"tetopt: {shown.title}")
         window.set_background("white")
-        _Scene(window, mesh, fields, image, checked_sets(mesh, facet_sets)).open()
+        _Scene(window, shown).open()
     return window
 
 
 class _Scene:
     """What the window shows, and the actors that show it."""
 
-    def __init__(
-        self,
-        window: pyvista.Plotter,
-        mesh: Mesh,
-        fields: list[Field],
-        image: Image | None,
-        sets: dict[str, NDArray],
-    ) -> None:
-        self.window, self.mesh, self.fields, self.image, self.sets = window, mesh, fields, image, sets
+    def __init__(self, window: pyvista.Plotter, shown: Exhibit) -> None:
+        self.window, self.fields, self.sets = window, shown.fields, shown.sets
+        mesh, image = self.mesh, self.image = shown.mesh, shown.image
         self.sides = facets(mesh.cells)
         self.volumes = volumes(mesh.points, mesh.cells)
         self.low, self.high = mesh.points.min(axis=0), mesh.points.max(axis=0)
@@ -195,7 +163,7 @@ class _Scene:
         is_first, is_second = is_within[first], (second >= 0) & is_within[second]
         is_outer = is_first != is_second
         of_cell = np.where(is_first, first, second)[is_outer]
-        return facets_surface(self.mesh.points, self.sides.nodes[is_outer]), of_cell
+        return pyvista.PolyData.from_regular_faces(self.mesh.points, self.sides.nodes[is_outer]), of_cell
 
     def _add_section(self, is_within: NDArray[np.bool_]) -> None:
         """The polygons in which the plane cuts the shown cells; on the image as through glass, with lines on top."""
@@ -230,7 +198,7 @@ class _Scene:
     def _marked(self) -> pyvista.PolyData:
         if self.set == 0:
             return pyvista.PolyData()
-        return facets_surface(self.mesh.points, list(self.sets.values())[self.set - 1])
+        return pyvista.PolyData.from_regular_faces(self.mesh.points, list(self.sets.values())[self.set - 1])
 
     def _add_cells(self, name: str, polygons: pyvista.PolyData, **drawn: Any) -> None:
         """Facets or polygons in the colours of their cells."""
@@ -387,7 +355,7 @@ def plane_slice(image: Image, axis: int, at: float) -> pyvista.ImageData:
     pyvista.ImageData
         One layer of cells with data `h`, float64, NaN outside of the image; up to `MAX_PIXELS` along a side.
     """
-    corners = np.stack(np.meshgrid(*([-0.5, size - 0.5] for size in image.shape), indexing="ij"), axis=-1)
+    corners = np.stack(np.meshgrid(*box_sides(image.shape), indexing="ij"), axis=-1)
     world = image.to_world(corners.reshape(-1, 3))
     low, high = world.min(axis=0), world.max(axis=0)
     pixel = max(float(image.spacing.min()) / 2.0, float(np.delete(high - low, axis).max()) / MAX_PIXELS)
