@@ -9,15 +9,15 @@ from tetopt.study.paper import inverse_strain
 
 
 def test_inverse_strain():
-    found = inverse_strain(np.array([[0.02, -0.01], [0.0, 1e-9]], dtype=np.float32), floor=1e-3)
-    np.testing.assert_allclose(found, [[50.0, 100.0], [1000.0, 1000.0]], rtol=1e-6)
-    assert found.dtype == np.float64
+    modulus = inverse_strain(np.array([[0.02, -0.01], [0.0, 1e-9]], dtype=np.float32), floor=1e-3)
+    np.testing.assert_allclose(modulus, [[50.0, 100.0], [1000.0, 1000.0]], rtol=1e-6)
+    assert modulus.dtype == np.float64
 
 
 def test_inverse_strain_is_a_law():
     image = Image(np.array([[0.01, -0.02], [0.0, 0.5]]))
-    found = young_image(image, lambda strain: inverse_strain(strain, 0.005)).data
-    np.testing.assert_allclose(found, [[100.0, 50.0], [200.0, 2.0]], rtol=1e-14)
+    modulus = young_image(image, lambda strain: inverse_strain(strain, 0.005)).data
+    np.testing.assert_allclose(modulus, [[100.0, 50.0], [200.0, 2.0]], rtol=1e-14)
 
 
 @pytest.mark.parametrize("floor", [0.0, -1.0, np.nan, np.inf])

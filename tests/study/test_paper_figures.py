@@ -104,12 +104,12 @@ def test_rows_4_and_5(k_D, name):
     about the same. (iii) and (iv) hang on a few cells at the inclusions' corners: only below the initial (iii), and
     for k_D = 0.05 below twice the printed (iv).
     """
-    found, initial = np.array(paper.errors_of(figure_2(k_D).result.mesh)), errors("fig2a")
-    assert np.all(found[:3] < initial[:3])
-    assert found[3] > initial[3]
-    assert found[0] == pytest.approx(errors(name)[0], rel=0.2)
+    ours, initial = np.array(paper.errors_of(figure_2(k_D).result.mesh)), errors("fig2a")
+    assert np.all(ours[:3] < initial[:3])
+    assert ours[3] > initial[3]
+    assert ours[0] == pytest.approx(errors(name)[0], rel=0.2)
     if k_D == 0.05:
-        assert found[3] < 2.0 * errors(name)[3]
+        assert ours[3] < 2.0 * errors(name)[3]
 
 
 def test_more_weight_fits_the_phantom_better():
@@ -123,15 +123,15 @@ def test_more_weight_fits_the_phantom_better():
 @pytest.mark.parametrize("k_D", [0.05, 0.3])
 def test_figure_2b_descent_finds_the_lowest_place(k_D):
     """The minimum that the descent finds is as low as any on a grid over the landscape, to a hundredth of its depth."""
-    found = paper.figure_2b(k_D, n_places=21)
-    assert found.E_found < found.E.min() + 0.01 * np.ptp(found.E)
-    middle = found.E[10, 10]
+    landscape = paper.figure_2b(k_D, n_places=21)
+    assert landscape.E_minimum < landscape.E.min() + 0.01 * np.ptp(landscape.E)
+    middle = landscape.E[10, 10]
     assert middle == pytest.approx(1.0, abs=0.01)
 
 
 def test_figure_2b_moves_from_the_middle_to_the_edge():
     """The priority passes from shape to image: the further from the middle the larger k_D."""
-    away = [np.linalg.norm(paper.figure_2b(k_D, n_places=3).found - 29.5) for k_D in (0.0, 0.05, 0.3, 0.8)]
+    away = [np.linalg.norm(paper.figure_2b(k_D, n_places=3).minimum - 29.5) for k_D in (0.0, 0.05, 0.3, 0.8)]
     assert away == sorted(away)
     assert away[0] < 1e-3
     assert away[3] > 10.0
@@ -166,10 +166,10 @@ def test_row_7_elastography_optimised(snr):
     """Fig. 3(d) on simulated data. Band: (i), (iii) within 20 % of the printed values at every noise level, since the
     gland and its nodules take up as much of the mesh as the paper's; the worst cell within a factor of 1.6.
     """
-    found = np.array(paper.errors_of(figure_3cd(snr).result.mesh))
+    ours = np.array(paper.errors_of(figure_3cd(snr).result.mesh))
     printed = errors("fig3d")
-    np.testing.assert_allclose(found[[0, 2]], printed[[0, 2]], rtol=0.2)
-    assert printed[3] / 1.6 < found[3] < printed[3] * 1.6
+    np.testing.assert_allclose(ours[[0, 2]], printed[[0, 2]], rtol=0.2)
+    assert printed[3] / 1.6 < ours[3] < printed[3] * 1.6
 
 
 def test_elastography_recovers_the_stiffness():

@@ -13,7 +13,7 @@ import pytest
 import tetopt
 from tetopt.cli import main
 from tetopt.study import paper
-from tetopt.study.paper_files import PICTURES
+from tetopt.study.paper_files import PAPER_PICTURES
 
 
 @pytest.fixture(scope="module")
@@ -30,8 +30,8 @@ def run(tmp_path_factory, opengl):
 
 
 def test_files(run):
-    assert {path.name for path in run.iterdir()} == {"paper.json", "paper.html", *PICTURES}
-    for name in PICTURES:
+    assert {path.name for path in run.iterdir()} == {"paper.json", "paper.html", *PAPER_PICTURES}
+    for name in PAPER_PICTURES:
         assert np.std(np.asarray(PIL.Image.open(run / name).convert("L"))) > 10.0, name
 
 
@@ -49,7 +49,7 @@ def test_page_holds_every_number(run):
         for printed, ours in zip(row["errors"], row["ours"], strict=True):
             difference = f"{ours - printed:+.4f}".replace("-0.0000", "+0.0000")
             assert f"<td>{printed:.4f}</td><td>{ours:.4f}</td><td>{difference}</td>" in page
-    assert page.count("data:image/png;base64,") == len(PICTURES)
+    assert page.count("data:image/png;base64,") == len(PAPER_PICTURES)
     assert not re.search(r"(src|href)=[\"'](?!data:)", page)
 
 
@@ -269,11 +269,11 @@ def test_simulate_is_the_compression_it_says(turn):
     affine = np.array([[1, 0, 0, 0], [0, c, -s, 0], [0, s, c, 0], [0, 0, 0, 1.0]]) @ affine
     image = tetopt.Image(rng.uniform(1.0, 5.0, (6, 9, 8)), affine)
     mesh = tetopt.lattice(image, nodes=60)
-    found, pressed = paper.simulate(image, mesh, nu=0.3, percent=2.0, law=lambda h: h**2)
+    simulated, pressed = paper.simulate(image, mesh, nu=0.3, percent=2.0, law=lambda h: h**2)
     owner = tetopt.cell_of_voxel(image, mesh)
     means = [(image.data[owner == cell] ** 2).mean() for cell in range(len(mesh.cells)) if (owner == cell).any()]
     np.testing.assert_allclose(
-        np.sort(found.young[np.bincount(owner.ravel(), minlength=len(mesh.cells)) > 0]), np.sort(means)
+        np.sort(simulated.young[np.bincount(owner.ravel(), minlength=len(mesh.cells)) > 0]), np.sort(means)
     )
     k = image.to_index(mesh.points)[:, 2]
     normal = affine[:3, 2] / 1.5

@@ -1,4 +1,4 @@
-"""The paper's figures and its table, run again: each function is one figure and returns what it found.
+"""The paper's figures and its table, run again: each function is one figure and returns its meshes or numbers.
 
 Numbers that the paper prints are in `paper.toml`. Where the paper does not say how a figure was made, the choice is
 stated in the function's docstring; nothing is chosen to make a number match.
@@ -117,8 +117,8 @@ class Landscape(NamedTuple):
     k_D: float
     places: NDArray[np.float64]  # (K,) mm, along either axis
     E: NDArray[np.float64]  # (K, K), normalised by the node in the middle
-    found: NDArray[np.float64]  # (2,) mm, where the descent ends
-    E_found: float
+    minimum: NDArray[np.float64]  # (2,) mm, where the descent ends
+    E_minimum: float
 
 
 def figure_2b(k_D: float, n_places: int = 41) -> Landscape:
@@ -293,5 +293,5 @@ def simulate(
     young = cell_young(image, mesh, law)
     push = push_of(image, percent)
     pressed = compression(mesh, young, nu, fixed_nodes=top, pushed_nodes=bottom, displacement=push)
-    found = conditioning(pressed.system)
-    return Simulated(found.lambda_max, found.cond, found.cg_iterations, pressed.strain_energy, young), pressed
+    system = conditioning(pressed.system)
+    return Simulated(system.lambda_max, system.cond, system.cg_iterations, pressed.strain_energy, young), pressed

@@ -29,21 +29,21 @@ from tetopt.report.scene import (
 )
 from tetopt.report.summary import versions
 from tetopt.study import paper
-from tetopt.study.paper_page import landscape_figure, relaxation_figure
+from tetopt.study.paper_figures import landscape_figure, relaxation_figure
 from tetopt.target.content import check_labels
 
-PICTURES = ("fig1.png", "fig2.png", "fig2b.png", "fig3ab.png", "fig3cd.png", "fig3e.png", "fig3f.png")
-SNR_DB = (None, 30.0, 20.0)
-WORDS = {
+PAPER_PICTURES = ("fig1.png", "fig2.png", "fig2b.png", "fig3ab.png", "fig3cd.png", "fig3e.png", "fig3f.png")
+SNR_DB = (None, 30.0, 20.0)  # of the strain in Fig. 3(c, d), for which the paper prints none; None: without noise
+CHANGE_WORDS = {  # of what is compared before and after, by its name in paper.json
     "lambda_max": "largest eigenvalue", "cond": "condition number", "cg_iterations": "CG iterations",
     "strain_energy": "strain energy",
 }  # fmt: skip
-MEASURES = ("(i) mean", "(ii) harmonic", "(iii) L2", "(iv) worst")
+ERROR_NAMES = ("(i) mean", "(ii) harmonic", "(iii) L2", "(iv) worst")
 
 
 def outputs(folder: Path, force: bool) -> dict[str, Path]:
     """The files that `run` writes, by name, each checked; InputError as `checked_output`."""
-    names = ("paper.json", "paper.html", *PICTURES)
+    names = ("paper.json", "paper.html", *PAPER_PICTURES)
     return {name: checked_output(folder / name, (Path(name).suffix,), force) for name in names}
 
 
@@ -78,7 +78,7 @@ def run(
     seeds : int
         Number of random meshes for Fig. 1.
     say : callable
-        Told what is being done.
+        Called with a line on each thing that is done.
     """
     begin = time.perf_counter()
     steps: list[tuple[str, Callable[[], dict[str, Any]]]] = [
@@ -122,7 +122,7 @@ def _mesh_row(name: str, mesh: Mesh) -> dict[str, Any]:
 
 def _figure_1(paths: dict[str, Path], seeds: int) -> dict[str, Any]:
     case = paper.figure_1(0)
-    save_figure(relaxation_figure(case.initial, case.result.mesh, case.result.history), paths["fig1.png"])
+    save_figure(relaxation_figure(case), paths["fig1.png"])
     spread = paper.figure_1_spread(seeds)
     rows = []
     for name, errors in spread.items():
@@ -131,13 +131,10 @@ def _figure_1(paths: dict[str, Path], seeds: int) -> dict[str, Any]:
     text = (
         f"The paper shows one set of 61 random nodes and does not say how it was drawn; ours are medians of {seeds} "
         "seeds, 24 nodes even on the boundary and 37 uniform inside; the picture is of seed 0. The harmonic mean (ii) "
-        "is "
-        "far lower than printed, since a cell that comes out almost equilateral pulls it towards 0. It seems that the "
-        "paper printed geometric means: row 6 is of two kinds of triangles, so its (i), (iii) and (iv) fix their "
-        "errors, "
-        "0.0922 and 0.0795, whose harmonic mean is 0.0854 and geometric mean 0.0856, as printed. So each (ii) stands "
-        "here "
-        "both ways."
+        "is far lower than printed, since a cell that comes out almost equilateral pulls it towards 0. It seems that "
+        "the paper printed geometric means: row 6 is of two kinds of triangles, so its (i), (iii) and (iv) fix their "
+        "errors, 0.0922 and 0.0795, whose harmonic mean is 0.0854 and geometric mean 0.0856, as printed. So each (ii) "
+        "stands here both ways."
     )
     return {"text": text, "errors": rows, "pictures": [["fig1.png", "Fig. 1, seed 0"]]}
 
@@ -158,10 +155,10 @@ def _figure_2(paths: dict[str, Path]) -> dict[str, Any]:
     worst = cases[1].result.mesh
     flat = np.sort((0.5 - rho(worst.points, worst.cells)) ** 2)[-2:]
     text = (
-        "Row 3 of Table 1 is set by the mesh alone and comes out to the printed digits. The phantom's shapes and "
-        "the number of iterations are not printed; ours are fig2_2d and 20. With k_D = 0.3 (iii) and (iv) come out "
-        f"higher than printed because of the two worst triangles, at the rim of our disc: {flat.sum():.2f} of the sum "
-        "(iii) is theirs; the paper's mode has no floor on shape."
+        "Row 3 of Table 1 is set by the mesh alone and comes out to the printed digits. The phantom's shapes and the "
+        "number of iterations are not printed; ours are fig2_2d and 20. With k_D = 0.3 (iii) and (iv) come out higher "
+        f"than printed because of the two worst triangles, at the rim of our disc: {flat.sum():.2f} of the sum (iii) "
+        "is theirs; the paper's mode has no floor on shape."
     )
     return {
         "text": text, "errors": rows, "meshes": [_mesh_row("fig2a", initial)], "dice": overlaps,
@@ -171,8 +168,8 @@ def _figure_2(paths: dict[str, Path]) -> dict[str, Any]:
 
 
 def _simulated(image: Image, mesh: Mesh) -> dict[str, float]:
-    found = paper.simulate(image, mesh)[0]._asdict()
-    return {name: value for name, value in found.items() if name != "young"}
+    simulated = paper.simulate(image, mesh)[0]
+    return {name: getattr(simulated, name) for name in CHANGE_WORDS}
 
 
 def _E_D_relative(case: paper.Case) -> float:
@@ -181,14 +178,13 @@ def _E_D_relative(case: paper.Case) -> float:
 
 def _figure_2b(paths: dict[str, Path]) -> dict[str, Any]:
     landscapes = [paper.figure_2b(k_D) for k_D in (0.05, 0.3, 0.8)]
-    rows = [(each.k_D, each.places, each.E, each.found, each.E_found) for each in landscapes]
-    save_figure(landscape_figure(landscapes[0].image, rows), paths["fig2b.png"])
-    minima = [{"k_D": each.k_D, "lowest": each.E.min(), "found": each.E_found} for each in landscapes]
+    save_figure(landscape_figure(landscapes), paths["fig2b.png"])
+    minima = [{"k_D": each.k_D, "lowest": each.E.min(), "found": each.E_minimum} for each in landscapes]
     text = (
         "E over the place of the centre node of four triangles. As k_D grows the minimum leaves the middle for the "
         "edge in the image. The descent starts in the middle and moves along the axes; it ends where no move along "
-        "either axis lowers E, which in a valley oblique to both (k_D = 0.8) need not be a minimum. Between the grid's "
-        "places it may end a little below the lowest of them (k_D = 0.05)."
+        "either axis lowers E, which in a valley oblique to both (k_D = 0.8) need not be a minimum. Between the "
+        "grid's places it may end a little below the lowest of them (k_D = 0.05)."
     )
     return {"text": text, "minima": minima, "pictures": [["fig2b.png", "Fig. 2(b), the descent's end in red"]]}
 
@@ -200,8 +196,7 @@ def _figure_3ab(paths: dict[str, Path], volume: Image) -> dict[str, Any]:
     )
     text = (
         "The paper's slice is not published; this one is axial, at 47 % of the volume's height, which on the MNI152 "
-        "brain "
-        "passes through the ventricles."
+        "brain passes through the ventricles."
     )
     return {
         "text": text, "meshes": [_mesh_row("fig3a", case.initial)], "E_D_relative": {"k_D = 0.2": _E_D_relative(case)},
@@ -223,17 +218,13 @@ def _figure_3cd(paths: dict[str, Path]) -> dict[str, Any]:
         change = {name: after[name] / before[name] - 1.0 for name in after}
         changes.append({"case": case.title, "before": before, "after": after, "change": change})
     text = (
-        "The elastography data are not published. A phantom, prostate_2d, is compressed by our plane-stress solve, its "
-        "axial strain gets noise, and 1/strain is the image. The printed initial errors are not quite those of "
+        "The elastography data are not published. A phantom, prostate_2d, is compressed by our plane-stress solve, "
+        "its axial strain gets noise, and 1/strain is the image. The printed initial errors are not quite those of "
         "squares: (i), (iii) and (iv) are those of a box 2.2 % longer than wide. The largest eigenvalue and with it "
-        "the "
-        "condition number are set by a few triangles in the stiffest nodule, so they hang on how the mesh happens to "
-        "cut "
-        "it, and range widely over the noise levels; the paper's condition number rises less than any of ours. The "
-        "strain "
-        "energy depends on how much of the box the stiff parts fill and on the modulus of the rest, which the paper "
-        "does "
-        "not print; why its change is five times ours we cannot tell."
+        "the condition number are set by a few triangles in the stiffest nodule, so they hang on how the mesh happens "
+        "to cut it, and range widely over the noise levels; the paper's condition number rises less than any of ours. "
+        "The strain energy depends on how much of the box the stiff parts fill and on the modulus of the rest, which "
+        "the paper does not print; why its change is five times ours we cannot tell."
     )
     return {
         "text": text, "errors": rows, "meshes": [_mesh_row("fig3c", shown.initial)], "simulation": changes,
@@ -256,8 +247,7 @@ def _figure_3ef(paths: dict[str, Path], volume: Image) -> dict[str, Any]:
         "The paper's volume is not published. Fig. 3(f) is the largest connected set of tetrahedra of mean below a "
         f"threshold; here {below:.0f}, 0.6 x the median of the brighter voxels, which in the optimised mesh of the "
         "MNI152 T1 gives the lateral ventricles. Beside the slices in Fig. 3(e) stands the isosurface of the voxels "
-        "at the same "
-        "threshold, freed of the sulci by an erosion of one voxel."
+        "at the same threshold, freed of the sulci by an erosion of one voxel."
     )
     return {
         "text": text, "meshes": [_mesh_row("fig3e", initial)], "E_D_relative": {"k_D = 0.3": _E_D_relative(case)},
@@ -286,9 +276,8 @@ def _segmentation(volume: Image, tissue: Image) -> dict[str, Any]:
         "grouped by their means into K classes and painted back to the voxels; each class stands for the tissue that "
         "most of its voxels carry, and a tissue for which no class stands has Dice 0. Beside it the same classes from "
         f"the voxels themselves, which have {share:.0f} times as many values. The mesh has {len(case.initial.points)} "
-        "nodes. "
-        "Labels of the MNI152: 0 background, 1 CSF, 2 grey, 3 white matter. Tissue thinner than a cell, as the CSF "
-        "round the brain, is out of reach."
+        "nodes. Labels of the MNI152: 0 background, 1 CSF, 2 grey, 3 white matter. Tissue thinner than a cell, as the "
+        "CSF round the brain, is out of reach."
     )
     return {"text": text, "dice": overlaps, "E_D_relative": {"k_D = 0.3": _E_D_relative(case)}}
 
@@ -302,13 +291,11 @@ def _write_page(paths: dict[str, Path], results: dict[str, Any]) -> None:
         pages.append({"title": section["title"], "text": section["text"], "pictures": pictures, "tables": tables})
     intro = (
         "O. Goksel and S. E. Salcudean, High-Quality Model Generation for Finite Element Simulation of Tissue "
-        "Deformation: "
-        f"each printed number beside tetopt's ({results['versions']['tetopt']}), run on {results['image']}. Errors "
-        "are of "
-        "the radius ratio rho = inradius / circumradius, 1/2 on an equilateral triangle and 1/3 on a regular "
-        "tetrahedron: "
-        "(i) mean, (ii) harmonic mean, (iii) sum of squares and (iv) maximum of 1/n - rho, n the dimension; smaller is "
-        "better. E_G is the shape energy, Eq. (1), E_D the image energy, Eq. (3), k_D its weight in E, Eq. (4)."
+        f"Deformation: each printed number beside tetopt's ({results['versions']['tetopt']}), run on "
+        f"{results['image']}. Errors are of the radius ratio rho = inradius / circumradius, 1/2 on an equilateral "
+        "triangle and 1/3 on a regular tetrahedron: (i) mean, (ii) harmonic mean, (iii) sum of squares and (iv) "
+        "maximum of 1/n - rho, n the dimension; smaller is better. E_G is the shape energy, Eq. (1), E_D the image "
+        "energy, Eq. (3), k_D its weight in E, Eq. (4)."
     )
     if not any(section.get("dice") and "Section 5" in section["title"] for section in results["sections"]):
         intro += " Section 5, segmentation, is left out: no tissue labels were given."
@@ -321,10 +308,10 @@ def _lines(section: dict[str, Any]) -> list[list[str]]:
     rows = []
     for row in section.get("errors", ()):
         name = row["title"] + (f", {row['case']}" if "case" in row else "")
-        for k, (measure, printed, ours) in enumerate(zip(MEASURES, row["errors"], row["ours"], strict=True)):
+        for k, (title, printed, ours) in enumerate(zip(ERROR_NAMES, row["errors"], row["ours"], strict=True)):
             spread = [f"{row['p5'][k]:.4f} to {row['p95'][k]:.4f}"] if "p5" in row else []
             difference = f"{ours - printed:+.4f}".replace("-0.0000", "+0.0000")
-            rows.append([f"{name}: {measure}", f"{printed:.4f}", f"{ours:.4f}", difference, *spread])
+            rows.append([f"{name}: {title}", f"{printed:.4f}", f"{ours:.4f}", difference, *spread])
             if k == 1:
                 mean = row["geometric_mean"]
                 rows.append(
@@ -336,11 +323,10 @@ def _lines(section: dict[str, Any]) -> list[list[str]]:
             rows.append([what, str(printed), str(ours), str(ours - printed)])
     for case in section.get("simulation", ()):
         for name, change in case["change"].items():
-            printed = section["printed_change"].get(name)
-            known = (
-                ["", ""] if printed is None else [f"{100 * printed:+.0f} %", f"{100 * (change - printed):+.1f} points"]
-            )
-            rows.append([f"{case['case']}: change of the {WORDS[name]}", known[0], f"{100 * change:+.1f} %", known[1]])
+            row = [f"{case['case']}: change of the {CHANGE_WORDS[name]}", "", f"{100 * change:+.1f} %", ""]
+            if (printed := section["printed_change"].get(name)) is not None:
+                row[1], row[3] = f"{100 * printed:+.0f} %", f"{100 * (change - printed):+.1f} points"
+            rows.append(row)
     for title, value in section.get("E_D_relative", {}).items():
         rows.append([f"{title}: E_D relative to the initial mesh", "", f"{value:.4f}", ""])
     width = max(map(len, rows), default=0)
