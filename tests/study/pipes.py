@@ -25,9 +25,9 @@ def sleep(job):
 
 
 def hoard(job):
-    held = []
+    arrays = []
     while True:
-        held.append(np.ones(10_000_000))
+        arrays.append(np.ones(10_000_000))
         time.sleep(0.01)
 
 

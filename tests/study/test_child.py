@@ -82,9 +82,9 @@ def test_too_much_memory():
 
 def test_peak_is_the_childs_own():
     """Not that of a large parent, which ru_maxrss would begin with."""
-    held = np.ones(100_000_000)
+    hoard = np.ones(100_000_000)
     outcome = run_in_child("pipes:fine", JOB, max_seconds=60.0)
-    assert outcome.peak_bytes < 0.7 * held.nbytes
+    assert outcome.peak_bytes < 0.7 * hoard.nbytes
 
 
 def test_interrupt_kills_the_child(tmp_path):

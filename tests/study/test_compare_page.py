@@ -24,7 +24,6 @@ from tetopt.study.compare_report import (
     ImageSource,
     LabelRow,
     LabelSource,
-    Machine,
     Measurement,
     PipelineResult,
     ReferenceEnergy,
@@ -121,7 +120,7 @@ def fake_report():
         command="tetopt compare T1.nii.gz -o out --nodes 5000",
         image=ImageFacts(source, (197, 233, 189), [1, 1, 1], 2841.2),
         labels=LabelSource("labels.nii.gz", "given", "cd" * 32), law="1 kPa at 0, 10 kPa at 255",
-        versions={"tetopt": "0.1.0", "numpy": "2.0"}, machine=Machine(2, "Linux"), options=Settings(5000),
+        versions={"tetopt": "0.1.0", "numpy": "2.0"}, machine={"cores": 2, "system": "Linux"}, options=Settings(5000),
         reference=ReferenceGrid((49, 58, 47), 435000, "averaged", {"0.3": ReferenceEnergy(1.234)}),
         pipelines=pipelines, tradeoff=[], curves=curves, seconds=812.0,
     )  # fmt: skip

@@ -1,4 +1,4 @@
-"""fTetWild's meshes fill the image's box exactly, with the wanted number of nodes, in any orientation."""
+"""fTetWild's meshes fill the image's box exactly, with the requested number of nodes, in any orientation."""
 
 from importlib.util import find_spec
 
@@ -115,7 +115,7 @@ def test_hole_is_refused():
 
 @pytest.mark.parametrize(("power", "first"), [(-3.0, 4000), (-6.0, 300), (-9.0, 700)])
 def test_secant_search(power, first):
-    """On a power law the second step is exact; the wanted 1000 are reached in a few steps."""
+    """On a power law the second step is exact; the requested 1000 are reached in a few steps."""
     tried = [(1.0, first)]
     for _ in range(5):
         factor = tetwild.next_factor(tried, 1000)

@@ -46,7 +46,6 @@ from tetopt.study.compare_report import (
     ImageSource,
     LabelRow,
     LabelSource,
-    Machine,
     Measurement,
     PipelineResult,
     ReferenceEnergy,
@@ -58,7 +57,7 @@ from tetopt.study.compare_report import (
     as_json,
     from_json,
 )
-from tetopt.study.pipelines import PIPELINES, UNTIMED, Job
+from tetopt.study.pipelines import PIPELINES, UNTIMED_STEPS, Job
 from tetopt.study.tradeoff import tradeoff
 
 Say = Callable[[str], None]
@@ -251,7 +250,7 @@ def run(
         labels=comparison.label_source,
         law=comparison.law_words,
         versions=versions() | _peers(),
-        machine=Machine(os.cpu_count(), platform.platform()),
+        machine={"cores": os.cpu_count(), "system": platform.platform()},
         options=settings,
         reference=_reference_grid(standard),
         pipelines=results,
@@ -351,7 +350,7 @@ def _attempt(bench: Bench, name: str, nodes: int, repeat: int) -> Attempt:
         return attempt
     mesh_path = path.with_suffix(".vtu")
     save_mesh(mesh_path, outcome.mesh, cell_fields(outcome.mesh, comparison.image))
-    total = sum(seconds for step, seconds in outcome.seconds.items() if step not in UNTIMED)
+    total = sum(seconds for step, seconds in outcome.seconds.items() if step not in UNTIMED_STEPS)
     done = Run(outcome.seconds, total, outcome.peak_bytes, measurement)
     save_json(path, as_json(attempt._replace(run=done, mesh_file_sha256=_sha256(mesh_path))))
     share = "none" if measurement.E_D_share is None else f"{measurement.E_D_share:.4f}"

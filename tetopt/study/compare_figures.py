@@ -22,7 +22,7 @@ from tetopt.report.colours import UNCOVERED_COLOUR, grey_limits
 from tetopt.report.figures import MESH_LINE, SliceView
 from tetopt.report.viewer import view_of
 from tetopt.study.compare_report import CurvePoint, Measurement, PipelineResult, Report, Run
-from tetopt.study.pipelines import UNTIMED
+from tetopt.study.pipelines import UNTIMED_STEPS
 
 # Okabe and Ito's palette, told apart by the colour-blind, without its yellow, which vanishes on white.
 LINE_COLOURS = ("#d55e00", "#0072b2", "#009e73", "#cc79a7", "#56b4e9", "#e69f00", "#000000")
@@ -318,7 +318,7 @@ def _annotate(axes: Axes, text: str, point: tuple[Any, Any], offset: tuple[int, 
 def timing_figure(report: Report) -> Figure:
     """Wall seconds of each pipeline's median run as a bar, stacked by step; a failed pipeline's bar is the word."""
     timed = [
-        {} if pipeline.median is None else {k: v for k, v in pipeline.median.seconds.items() if k not in UNTIMED}
+        {} if pipeline.median is None else {k: v for k, v in pipeline.median.seconds.items() if k not in UNTIMED_STEPS}
         for pipeline in report.pipelines
     ]
     steps = list(dict.fromkeys(step for seconds in timed for step in seconds))

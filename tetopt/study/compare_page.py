@@ -15,7 +15,7 @@ from tetopt.report import viewer
 from tetopt.report.page import paragraph_html, picture_html, section_html, table_html, write_page
 from tetopt.report.viewer import View, views_html
 from tetopt.study.compare_report import LabelRow, PipelineResult, ReferenceGrid, Report, Run
-from tetopt.study.pipelines import UNTIMED
+from tetopt.study.pipelines import UNTIMED_STEPS
 
 PLOT_STEMS = ("histograms", "curves", "tradeoff", "timing")  # of the pictures that come after the 3-D views
 JUDGED_VOXELS = 500  # labels with more are judged; of smaller ones a mesh of few nodes can only keep some
@@ -67,7 +67,7 @@ def save_compare_page(path: Path, report: Report, pictures: Sequence[tuple[Path,
         ("Settings, versions and how to run it again", _settings_html(report)),
     ]
     parts = [section_html(title, content) for title, content in sections if content]
-    write_page(path, f"tetopt compared on {report.image.source.name}", parts, _STYLE + viewer.VIEWS_STYLE)
+    write_page(path, f"tetopt compared on {report.image.source.name}", parts, _COMPARE_STYLE + viewer.VIEWS_STYLE)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -230,11 +230,7 @@ def _ratios(report: Report) -> list[str]:
 
 def _headline_html(report: Report) -> str:
     pipelines = report.pipelines
-    heads = "".join(_head_cell(pipeline) for pipeline in pipelines)
-    lines = [
-        '<div class="wide"><table class="headline">',
-        f'<thead><tr><th scope="col">median of the runs</th>{heads}</tr></thead>',
-    ]
+    lines = _table_head("headline", "median of the runs", pipelines)
     group = None
     for criterion in criteria(report):
         entries = [entry(criterion, pipeline) for pipeline in pipelines]
@@ -245,7 +241,14 @@ def _headline_html(report: Report) -> str:
             head = f'<th scope="rowgroup" colspan="{len(pipelines) + 1}"><span>{html.escape(group)}</span></th>'
             lines.append(f'<tbody><tr class="group">{head}</tr>')
         lines.append(_row_html(criterion, pipelines, entries))
-    return "\n".join([*lines, "</table></div>", _KEY])
+    return "\n".join([*lines, "</table></div>", _HEADLINE_KEY])
+
+
+def _table_head(kind: str, first: str, pipelines: Sequence[PipelineResult]) -> list[str]:
+    """Lines of a table of a column for each pipeline, up to its body."""
+    heads = "".join(_head_cell(pipeline) for pipeline in pipelines)
+    row = f'<thead><tr><th scope="col">{first}</th>{heads}</tr></thead>'
+    return [f'<div class="wide"><table class="{kind}">', row]
 
 
 def _head_cell(pipeline: PipelineResult) -> str:
@@ -476,11 +479,8 @@ def _label_table_html(
     labels: Sequence[int],
 ) -> str:
     """A row for each of `labels`, a column for each pipeline; the best Dice of a row is marked."""
-    heads = "".join(_head_cell(pipeline) for pipeline in done)
-    lines = [
-        '<div class="wide"><table class="headline labels">',
-        f'<thead><tr><th scope="col">label</th>{heads}</tr></thead><tbody>',
-    ]
+    lines = _table_head("headline labels", "label", done)
+    lines[-1] += "<tbody>"
     by_dice = Criterion("", "", lambda run: None, 1)
     for label in labels:
         best = winners(by_dice, [Entry(each.dice, None, None) for each in medians[label]])
@@ -541,7 +541,7 @@ def _seconds_html(report: Report) -> str:
         for step, seconds in median.seconds.items():
             spread = f"{number_text(low.seconds[step])} to {number_text(high.seconds[step])}"
             spread = spread if len(pipeline.runs) > 1 else ""
-            rows.append([pipeline.title, step, number_text(seconds), spread, UNTIMED.get(step, "")])
+            rows.append([pipeline.title, step, number_text(seconds), spread, UNTIMED_STEPS.get(step, "")])
     return table_html(rows)
 
 
@@ -558,7 +558,7 @@ def _settings_html(report: Report) -> list[str]:
             ["labels", f"{labels.name} ({labels.kind})" if labels else "none given"],
             ["modulus", report.law],
             ["reference", _reference_text(report.reference)],
-            ["machine", ", ".join(f"{key} {_text(value)}" for key, value in report.machine._asdict().items())],
+            ["machine", ", ".join(f"{key} {_text(value)}" for key, value in report.machine.items())],
             ["whole comparison, s", number_text(report.seconds)],
         ],
         "Options": [["option", "value"], *([name, _text(value)] for name, value in report.options._asdict().items())],
@@ -590,12 +590,12 @@ def _text(value: Any, between: str = ", ") -> str:
     return f"{value:.10g}"
 
 
-_KEY = (
+_HEADLINE_KEY = (
     '<p class="key">↓ smaller is better, ↑ larger is better; <b class="mark">best</b> marks the winner of a row and '
     "<b>loses</b> a tetopt that is not. Under a median of several runs its range, lowest to highest. Rows in which "
     "all are equal, or in which neither way is better, have no winner.</p>"
 )
-_STYLE = """
+_COMPARE_STYLE = """
 h1, p, li { overflow-wrap: anywhere; }
 table.headline { border-collapse: separate; border-spacing: 0; width: 100%; }
 .headline th, .headline td { vertical-align: top; padding: 0.25rem 0.5rem; background: #fff; white-space: nowrap; }

@@ -169,13 +169,6 @@ class ImageFacts(NamedTuple):
     variance: float
 
 
-class Machine(NamedTuple):
-    """Where the comparison ran."""
-
-    cores: int | None
-    system: str
-
-
 class ReferenceEnergy(NamedTuple):
     """What the reference finds for one Poisson's ratio."""
 
@@ -199,7 +192,7 @@ class Report(NamedTuple):
     labels: LabelSource | None
     law: str
     versions: dict[str, str]
-    machine: Machine
+    machine: dict[str, int | str | None]  # cores and system
     options: Settings
     reference: ReferenceGrid
     pipelines: list[PipelineResult]

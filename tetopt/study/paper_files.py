@@ -33,7 +33,7 @@ from tetopt.study.paper_figures import landscape_figure, relaxation_figure
 from tetopt.target.content import check_labels
 
 PAPER_PICTURES = ("fig1.png", "fig2.png", "fig2b.png", "fig3ab.png", "fig3cd.png", "fig3e.png", "fig3f.png")
-SNR_DB = (None, 30.0, 20.0)  # of the strain in Fig. 3(c, d), for which the paper prints none; None: without noise
+SNR_DB = (None, 30.0, 20.0)  # of the strain in Fig. 3(c, d); None: without noise
 CHANGE_WORDS = {  # of what is compared before and after, by its name in paper.json
     "lambda_max": "largest eigenvalue", "cond": "condition number", "cg_iterations": "CG iterations",
     "strain_energy": "strain energy",

@@ -37,7 +37,7 @@ class Produced(NamedTuple):
     notes: list[str]
 
 
-UNTIMED = {  # steps that a run's total does not count, and why
+UNTIMED_STEPS = {  # steps that a run's total does not count, and why
     "kernels": "loading compiled code, not in the total",
     "search": "other runs, made to meet the number of nodes; not in the total",
 }
