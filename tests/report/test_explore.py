@@ -148,11 +148,11 @@ const grid = () => {  // every ninth pixel
   const context = copy.getContext("2d");
   context.drawImage(canvas, 0, 0);
   const all = context.getImageData(0, 0, width, height).data;
-  const found = [];
+  const colours = [];
   for (let y = 3; y < height; y += 9) {
-    for (let x = 3; x < width; x += 9) found.push([x, y, ...all.subarray(4 * (y * width + x)).slice(0, 3)]);
+    for (let x = 3; x < width; x += 9) colours.push([x, y, ...all.subarray(4 * (y * width + x)).slice(0, 3)]);
   }
-  return found;
+  return colours;
 };
 const send = (type, x, y) => canvas.dispatchEvent(
   new PointerEvent(type, { pointerId: 1, clientX: x, clientY: y, bubbles: true }));
@@ -213,12 +213,12 @@ const run = async () => {
   return said;
 };
 addEventListener("load", () => setTimeout(async () => {
-  const found = await run().catch((error) => ({ error: String(error) }));
-  parent.postMessage({ name: document.title, found }, "*");
+  const said = await run().catch((error) => ({ error: String(error) }));
+  parent.postMessage({ name: document.title, said }, "*");
 }, 400));
 </script>"""
 FRAME = """<body><script>addEventListener("message", (event) => {
-  document.documentElement.dataset[event.data.name] = JSON.stringify(event.data.found);
+  document.documentElement.dataset[event.data.name] = JSON.stringify(event.data.said);
 });</script>
 <iframe src="page.html" width="1000" height="700"></iframe><iframe src="blind.html"></iframe>
 <iframe src="narrow.html" width="380" height="600"></iframe></body>"""
@@ -282,22 +282,22 @@ def test_counts_and_surfaces(shown, mesh, cell_data):
         "cut": expected(within, within, 1, AT[0]),
         "label": expected(label >= 2, label >= 2, 1, AT[0]),
     }.items():
-        text, found_facets, found_polygons, *_ = page[name]
-        found = re.fullmatch(r"([\d,]+) of ([\d,]+) cells, ([\d,.]+)\u00a0mm³", text).groups()
-        found_count, all_cells, found_volume = (float(part.replace(",", "")) for part in found)
-        assert (found_count, all_cells) == (count, len(mesh.cells)), name
-        assert found_volume == pytest.approx(volume, rel=2e-6), name
-        assert (found_facets, found_polygons) == (n_facets, n_polygons), name
+        text, *drawn = page[name][:3]
+        numbers = re.fullmatch(r"([\d,]+) of ([\d,]+) cells, ([\d,.]+)\u00a0mm³", text).groups()
+        shown_count, all_cells, shown_volume = (float(part.replace(",", "")) for part in numbers)
+        assert (shown_count, all_cells) == (count, len(mesh.cells)), name
+        assert shown_volume == pytest.approx(volume, rel=2e-6), name
+        assert drawn == [n_facets, n_polygons], name
     assert page["crossed"][3:] == ["70", "70"]  # the upper limit went along
 
 
-def places_of(found, mesh):
+def places_of(page, mesh):
     """World x and y (K, 2), mm, of the pixels seen from above, and how many mm a pixel is."""
-    width, height = found["size"]
+    width, height = page["size"]
     extent = np.ptp(mesh.points, axis=0)
     middle = middle_of(mesh)
     mm = np.linalg.norm(extent) / min(width, height)
-    x, y = np.array(found["cells"])[:, :2].T
+    x, y = np.array(page["cells"])[:, :2].T
     return np.column_stack([x + 0.5 - width / 2, height / 2 - y - 0.5]) * mm + middle[:2], mm
 
 
@@ -342,8 +342,8 @@ def test_the_slice_shows_the_voxel_at_every_place(shown, mesh, image):
     assert len(inside) > 800
     low, high = np.percentile(image.data, [0.5, 99.5])
     expected = np.clip((image.data[tuple(index[inside].astype(int).T)] - low) / (high - low), 0, 1) * 255
-    found = np.array(page["slice"])[inside, 2:]
-    np.testing.assert_allclose(found, np.repeat(expected[:, None], 3, axis=1), atol=1.01)
+    colours = np.array(page["slice"])[inside, 2:]
+    np.testing.assert_allclose(colours, np.repeat(expected[:, None], 3, axis=1), atol=1.01)
 
 
 def test_a_click_reads_a_cell(shown, mesh, cell_data):

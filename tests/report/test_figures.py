@@ -45,6 +45,11 @@ SHEARED = np.array([[-2.0, 0.5, 1.0], [0.3, 1.0, 5.0], [0, 0, 1.0]])
 WORLD_LETTERS = ["LR", "PA", "IS"]
 
 
+def noise(shape, affine=None):
+    """An image no two of whose voxels are alike."""
+    return Image(np.random.default_rng(0).normal(size=shape), affine)
+
+
 def oriented_image(worlds, signs):
     """Noise whose voxel axis a runs along world axis worlds[a], in the direction signs[a]."""
     affine = np.eye(4)
@@ -52,7 +57,7 @@ def oriented_image(worlds, signs):
     for axis, (world, sign) in enumerate(zip(worlds, signs, strict=True)):
         affine[world, axis] = sign * SPACING[axis]
     affine[:3, 3] = [11.0, -22.0, 33.0]
-    return Image(np.random.default_rng(0).normal(size=SHAPE), affine)
+    return noise(SHAPE, affine)
 
 
 def image_steps(image, view):
@@ -139,7 +144,7 @@ def test_the_default_slice_is_axial_and_in_the_middle(worlds, signs):
 
 
 def test_an_oblique_image_is_laid_out_by_its_nearest_axes():
-    image = Image(np.random.default_rng(0).normal(size=SHAPE), OBLIQUE)
+    image = noise(SHAPE, OBLIQUE)
     view = SliceView(image, None, None)
     assert (view.across, view.axes, view.letters) == (2, [0, 1], ["LR", "PA"])
     np.testing.assert_array_equal(view.pixels, image.data[::-1, :, 4])  # the first axis runs to the left
@@ -153,7 +158,7 @@ def test_a_2d_image_has_x_to_the_right_and_y_up(worlds, signs):
     affine[:2, :2] = 0.0
     for axis in range(2):
         affine[worlds[axis], axis] = signs[axis] * SPACING[axis]
-    image = Image(np.random.default_rng(0).normal(size=(5, 7)), affine)
+    image = noise((5, 7), affine)
     view = SliceView(image, None, None)
     index = np.array(list(np.ndindex(5, 7)))
     place = image.to_world(index)
@@ -173,15 +178,15 @@ def test_cells_and_pixels_share_their_places(worlds, signs):
     polygons, cells = polygons[is_wide], cells[is_wide]
     owner = SliceView(Image(cell_of_voxel(image, mesh), image.affine), None, None).pixels
     steps = image_steps(image, view)
-    n_found = 0
+    n_inside = 0
     for pixel in np.ndindex(owner.shape):
         point = (np.array(pixel) + 0.5) * steps
-        found = [cell for polygon, cell in zip(polygons, cells, strict=True) if contains(polygon, point)]
-        assert len(found) <= 1
-        if found:
-            n_found += 1
-            assert found == [owner[pixel]]
-    assert n_found > 0.9 * owner.size
+        around = [cell for polygon, cell in zip(polygons, cells, strict=True) if contains(polygon, point)]
+        assert len(around) <= 1
+        if around:
+            n_inside += 1
+            assert around == [owner[pixel]]
+    assert n_inside > 0.9 * owner.size
 
 
 # --------------------------------------------------------------------------------------------------
@@ -192,7 +197,7 @@ def test_cells_and_pixels_share_their_places(worlds, signs):
 @pytest.mark.parametrize("kind", ["bcc", "five-tet", "bent"])
 @pytest.mark.parametrize("affine", [np.eye(4), np.diag([-1.0, 2.0, 3.0, 1.0]), OBLIQUE], ids=["1mm", "flip", "oblique"])
 def test_a_section_tiles_the_slice(affine, kind, axis):
-    image = Image(np.random.default_rng(0).normal(size=(8, 9, 10)), affine)
+    image = noise((8, 9, 10), affine)
     # 9 voxels in 3 blocks: the planes of nodes at index 2.5 and 5.5; 8 and 10 in 2: at 3.5 and 4.5.
     mesh = bent(image, (2, 3, 2)) if kind == "bent" else lattice(image, kind, blocks=(2, 3, 2))
     for index in range(image.shape[axis]):
@@ -207,16 +212,14 @@ def test_a_section_tiles_the_slice(affine, kind, axis):
 @pytest.mark.parametrize("axis", [0, 1, 2])
 def test_a_section_through_a_plane_of_nodes_tiles_it_once(axis):
     """7 voxels in 2 blocks: the middle voxel's plane is a plane of nodes, and of facets."""
-    image = Image(np.random.default_rng(0).normal(size=(7, 7, 7)))
+    image = noise((7, 7, 7))
     for kind in ("bcc", "five-tet"):
         polygons, _ = SliceView(image, axis, 3).section(lattice(image, kind, blocks=(2, 2, 2)))
         assert areas(polygons).sum() == pytest.approx(49.0, rel=1e-12)
 
 
 def test_a_2d_mesh_is_shown_whole():
-    image = Image(
-        np.random.default_rng(0).normal(size=(6, 7)), np.array([[-2.0, 0.5, 1.0], [0.3, 1.0, 5.0], [0, 0, 1]])
-    )
+    image = noise((6, 7), SHEARED)
     mesh = bent(image, (2, 3))
     polygons, cells = SliceView(image, None, None).section(mesh)
     np.testing.assert_array_equal(cells, np.arange(len(mesh.cells)))
@@ -238,7 +241,7 @@ def corners(collection):
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_slice_figure_holds_each_mesh_under_its_title(n):
-    image = Image(np.random.default_rng(0).normal(size=SHAPE[:n]), np.diag([*SPACING[:n], 1.0]))
+    image = noise(SHAPE[:n], np.diag([*SPACING[:n], 1.0]))
     first, second = lattice(image, blocks=(2, 2, 2)[:n]), bent(image, (2, 3, 2)[:n])
     figure = slice_figure(image, [("first", first), ("second", second)])
     view = SliceView(image, None, None)
@@ -282,7 +285,7 @@ def lower_part(image, axis, count):
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_nothing_is_drawn_where_a_mesh_leaves_the_image_uncovered(n):
-    image = Image(np.random.default_rng(0).normal(size=SHAPE[:n]), np.diag([*SPACING[:n], 1.0]))
+    image = noise(SHAPE[:n], np.diag([*SPACING[:n], 1.0]))
     figure = slice_figure(image, [("part", lower_part(image, 0, 2))])
     for axes in figure.axes:
         (drawn,) = collections(axes)
@@ -293,7 +296,7 @@ def test_nothing_is_drawn_where_a_mesh_leaves_the_image_uncovered(n):
 
 
 def test_a_slice_beside_the_mesh_is_empty():
-    image = Image(np.random.default_rng(0).normal(size=SHAPE))
+    image = noise(SHAPE)
     figure = slice_figure(image, [("part", lower_part(image, 2, 3))], axis=2, index=7)
     assert [len(collections(axes)[0].get_paths()) for axes in figure.axes] == [0, 0]
 
@@ -398,8 +401,8 @@ def test_numbers_stand_in_their_labels_where_a_legend_is_too_short():
     # In slabs of 0.1 mm, beside 7 mm, a number has no room.
     thin = Image(labels.data[::2], labels.affine @ np.diag([0.05, 1.0, 1.0, 1.0]))
     figure = label_figure(thin, lattice(thin, blocks=(4, 2, 2)))
-    found = [[text.get_text() for text in axes.texts if text.get_text().isdigit()] for axes in figure.axes]
-    assert found == [[], [], [], [], ["7"], []]  # the sagittal slice is one label alone
+    numbers = [[text.get_text() for text in axes.texts if text.get_text().isdigit()] for axes in figure.axes]
+    assert numbers == [[], [], [], [], ["7"], []]  # the sagittal slice is one label alone
 
 
 # --------------------------------------------------------------------------------------------------
@@ -431,7 +434,7 @@ def test_boundary_and_outline_lie_between_the_same_pixels(worlds, signs):
 
 
 def test_boundary_of_a_plane_mesh():
-    image = Image(np.random.default_rng(0).normal(size=(6, 7)))
+    image = noise((6, 7))
     mask = Image(np.arange(6)[:, None] < 4.0 + np.zeros(7), image.affine)
     outline, boundary = lines(boundary_figure(image, mask, lower_part(image, 0, 4)).axes[0])
     np.testing.assert_allclose(outline[..., 0], 4.0)
@@ -456,7 +459,7 @@ def test_a_closed_boundary_is_closed_in_every_slice(index):
 
 
 def test_what_lies_on_the_box_is_no_boundary():
-    image = Image(np.random.default_rng(0).normal(size=SHAPE))
+    image = noise(SHAPE)
     assert len(SliceView(image, None, None).boundary(lattice(image, blocks=(2, 2, 2)))) == 0
 
 
@@ -477,7 +480,7 @@ def test_the_detail_is_where_the_outline_bends_most():
 
 
 def test_the_slice_is_in_the_middle_of_the_mask():
-    image = Image(np.random.default_rng(0).normal(size=(6, 7, 20)))
+    image = noise((6, 7, 20))
     mask = np.zeros(image.shape)
     mask[1:4, 2:6, 12:17] = 1.0
     figure = boundary_figure(image, Image(mask), lattice(image, blocks=(2, 2, 2)))
@@ -486,7 +489,7 @@ def test_the_slice_is_in_the_middle_of_the_mask():
 
 @pytest.mark.parametrize("value", [0.0, 1.0])
 def test_a_mask_without_outline_can_be_drawn(tmp_path, value):
-    image = Image(np.random.default_rng(0).normal(size=SHAPE))
+    image = noise(SHAPE)
     figure = boundary_figure(image, Image(np.full(SHAPE, value)), lattice(image, blocks=(1, 1, 1)))
     assert [len(drawn) for drawn in lines(figure.axes[0])] == [0, 0]
     save_figure(figure, tmp_path / "a.png", dpi=40)
@@ -504,7 +507,7 @@ def test_a_mask_of_another_shape_is_refused():
 
 @pytest.mark.parametrize("n", [2, 3])
 def test_histograms_are_shares(n):
-    image = Image(np.random.default_rng(0).normal(size=SHAPE[:n]), np.diag([*SPACING[:n], 1.0]))
+    image = noise(SHAPE[:n], np.diag([*SPACING[:n], 1.0]))
     meshes = [("first", lattice(image, blocks=(2, 2, 2)[:n])), ("second", bent(image, (2, 3, 2)[:n]))]
     figure = histogram_figure(meshes)
     outlines = [p for p in figure.axes[0].patches if p.get_label()]

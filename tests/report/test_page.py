@@ -35,8 +35,8 @@ def test_a_picture_keeps_its_size_and_a_wide_one_scrolls(tmp_path):
 
 
 def test_table_has_a_head_and_a_caption():
-    found = table_html([["a", "b"], ["1", "2"]], "C")
-    assert re.sub(r"</?div[^>]*>", "", found) == (
+    markup = table_html([["a", "b"], ["1", "2"]], "C")
+    assert re.sub(r"</?div[^>]*>", "", markup) == (
         "<table><caption>C</caption><thead><tr><th>a</th><th>b</th></tr></thead>"
         "<tbody><tr><td>1</td><td>2</td></tr></tbody></table>"
     )

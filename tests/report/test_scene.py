@@ -65,7 +65,7 @@ def test_scenes_are_drawn_side_by_side(tmp_path, opengl):
     assert (left[..., 2] > left[..., 0] + 60).mean() > 0.005  # the blue edges
 
 
-def test_slice_sheet_shows_the_middle_slice_where_it_is_asked():
+def test_slice_sheet_shows_the_middle_slice_at_its_place():
     rng = np.random.default_rng(0)
     image = tetopt.Image(rng.normal(size=(5, 8, 6)), TILTED)
     for axis, at in ((0, 4.5), (1, 3.0), (2, -0.5)):
@@ -125,9 +125,9 @@ def test_a_cutaway_is_without_background_and_its_octant(monkeypatch, tmp_path):
     is_kept = (of_cell > 0) & ~(mesh.points[mesh.cells].mean(axis=1) > centre).all(axis=1)
     expected = {facet: cells for facet, cells in cells_of.items() if is_kept[cells].sum() == 1}
     assert 0 < is_kept.sum() < (of_cell > 0).sum() < len(of_cell)
-    found = [tuple(sorted(node[tuple(points[p])] for p in triangle)) for triangle in coloured.regular_faces]
-    assert sorted(found) == sorted(expected)
-    for facet, colour, grey_value in zip(found, coloured.cell_data["colour"], grey.cell_data["h"], strict=True):
+    drawn = [tuple(sorted(node[tuple(points[p])] for p in triangle)) for triangle in coloured.regular_faces]
+    assert sorted(drawn) == sorted(expected)
+    for facet, colour, grey_value in zip(drawn, coloured.cell_data["colour"], grey.cell_data["h"], strict=True):
         (owner,) = (cell for cell in expected[facet] if is_kept[cell])
         np.testing.assert_array_equal(colour, colours[of_cell[owner]])
         assert grey_value == means[owner]

@@ -85,14 +85,14 @@ def test_history_and_end(summary, result):
 
 
 def test_image_properties(image):
-    found = image_summary(image)
-    assert found["shape"] == (12, 15)
-    np.testing.assert_allclose(found["spacing_mm"], [1.5, np.sqrt(4.25)])
-    np.testing.assert_array_equal(found["affine"], AFFINE)
-    assert found["volume_mm"] == pytest.approx(180 * 3.0)
-    assert (found["min"], found["max"]) == (image.data.min(), image.data.max())
-    assert found["mean"] == pytest.approx(image.data.mean())
-    assert found["total_variation"] == pytest.approx(((image.data - image.data.mean()) ** 2).sum() * 3.0)
+    properties = image_summary(image)
+    assert properties["shape"] == (12, 15)
+    np.testing.assert_allclose(properties["spacing_mm"], [1.5, np.sqrt(4.25)])
+    np.testing.assert_array_equal(properties["affine"], AFFINE)
+    assert properties["volume_mm"] == pytest.approx(180 * 3.0)
+    assert (properties["min"], properties["max"]) == (image.data.min(), image.data.max())
+    assert properties["mean"] == pytest.approx(image.data.mean())
+    assert properties["total_variation"] == pytest.approx(((image.data - image.data.mean()) ** 2).sum() * 3.0)
 
 
 def test_total_variation_is_E_D_of_one_cell_around_everything():

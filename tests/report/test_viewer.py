@@ -132,7 +132,7 @@ PROBE = """<script>addEventListener("load", () => setTimeout(() => {
         said.push("key " + changed());
         after(() => { send("keydown", KeyboardEvent, { key: "0" });
                       send("wheel", WheelEvent, { deltaY: 200 }); }, () => {
-          said.push("wheel unasked " + changed());
+          said.push("wheel elsewhere " + changed());
           after(() => { canvases[0].focus(); send("wheel", WheelEvent, { deltaY: 200 }); }, () => {
             said.push("wheel " + changed());
             document.documentElement.dataset.said = said.join("; ");
@@ -150,7 +150,7 @@ def test_views_turn_together(page, tmp_path):
     said = re.search(r'data-said="([^"]*)"', shown)
     assert shown.count('data-drawn="1"') == 2
     assert said.group(1) == (
-        "drag true,true; reset false,false; key true,true; wheel unasked false,false; wheel true,true"
+        "drag true,true; reset false,false; key true,true; wheel elsewhere false,false; wheel true,true"
     )
 
 

@@ -16,7 +16,7 @@ from tetopt.report.colours import grey_limits, label_colours
 from tetopt.target.content import LARGEST_LABEL
 
 COLOUR_MAP = "viridis"  # perceptually even
-MAX_LABELS = 128  # Whole numbers with more values than this are a quantity: no list of colours that long is read.
+MOST_CATEGORIES = 128  # Whole numbers with more values than this are a quantity: no list of colours that long is read.
 NO_VALUE = "#aaaaaa"  # of cells whose value is not a number
 OUTLIERS_PERCENT = 1.0  # of the cells, at either end of a field: their values do not stretch its colours
 # The fields that tetopt writes: they are quantities, even where their values are whole numbers.
@@ -62,7 +62,7 @@ def exhibit(
         Tetrahedra, world mm (RAS+).
     cell_data : dict of arrays of M rows
         By name, as `tetopt.load_mesh` returns them. Data of one number a cell are fields: those of whole numbers from
-        0 with up to `MAX_LABELS` values are labels, all others quantities. Without any, the fields of
+        0 with up to `MOST_CATEGORIES` values are labels, all others quantities. Without any, the fields of
         `tetopt.cell_fields` are taken.
     image : Image, optional
         To be shown in the plane of the cut.
@@ -112,7 +112,7 @@ def _categories(values: NDArray[np.float64]) -> list[tuple[int, str]]:
     if (values != np.rint(values)).any() or values.min() < 0 or values.max() > LARGEST_LABEL:
         return []
     labels = np.unique(values).astype(np.int64)
-    if len(labels) > MAX_LABELS:
+    if len(labels) > MOST_CATEGORIES:
         return []
     colours = label_colours(Image(values[:, None]))
     return [(int(label), to_hex(colours[label])) for label in labels]
