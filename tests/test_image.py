@@ -66,11 +66,11 @@ def test_transformed_is_a_matrix_product_row_by_row(seed, n):
         np.testing.assert_array_equal(transformed(vector, matrix), row)
 
 
-# What is held
+# What is kept
 
 
 @pytest.mark.parametrize(
-    ("data", "held"),
+    ("data", "dtype"),
     [
         (np.array([[0, 255]], dtype=np.uint8), np.float32),
         (np.array([[-32768, 32767]], dtype=np.int16), np.float32),
@@ -86,9 +86,9 @@ def test_transformed_is_a_matrix_product_row_by_row(seed, n):
         ([[1, 2], [3, 4]], np.float32),
     ],
 )
-def test_values_are_kept_as_float32_where_that_loses_nothing(data, held):
+def test_values_are_kept_as_float32_where_that_loses_nothing(data, dtype):
     image = Image(data)
-    assert image.data.dtype == held
+    assert image.data.dtype == dtype
     assert image.data.dtype.isnative
     np.testing.assert_array_equal(image.data, np.asarray(data))
     assert image.data.flags.c_contiguous

@@ -1,4 +1,4 @@
-"""The mesh: what is accepted, what is held, and every message."""
+"""The mesh: what is accepted, what is kept, and every message."""
 
 import numpy as np
 import pytest

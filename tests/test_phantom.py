@@ -532,8 +532,8 @@ def test_shipped_by_name_and_by_path_are_the_same():
 def test_messages_of_a_file(old, new, message, made, tmp_path):
     text = HEAD_2D + DISC
     # From the back where the change is one to the shape, from the front where it is one to the top.
-    head, found, tail = text.rpartition(old) if message.startswith("shape") else text.partition(old)
-    assert found, f"{old!r} is not in the file"
+    head, separator, tail = text.rpartition(old) if message.startswith("shape") else text.partition(old)
+    assert separator, f"{old!r} is not in the file"
     with pytest.raises(InputError, match=message) as caught:
         made(head + new + tail)
     assert str(caught.value).startswith(f"phantom {tmp_path / 'test.toml'}: ")

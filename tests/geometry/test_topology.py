@@ -61,18 +61,18 @@ def test_rings_are_those_of_the_twin(seed, n):
 
 
 def test_facets_of_two_triangles():
-    found = facets(TWO_TRIANGLES[1])
-    assert found.nodes.tolist() == [[0, 1], [0, 2], [0, 3], [1, 2], [2, 3]]
-    assert found.cells.tolist() == [[1, -1], [0, 1], [0, -1], [1, -1], [0, -1]]
-    assert found.n_cells.tolist() == [1, 2, 1, 1, 1]
+    sides = facets(TWO_TRIANGLES[1])
+    assert sides.nodes.tolist() == [[0, 1], [0, 2], [0, 3], [1, 2], [2, 3]]
+    assert sides.cells.tolist() == [[1, -1], [0, 1], [0, -1], [1, -1], [0, -1]]
+    assert sides.n_cells.tolist() == [1, 2, 1, 1, 1]
 
 
 @given(seeds, dimensions)
 def test_facets_are_those_of_the_twin(seed, n):
     _, cells = random_mesh(seed, n)
-    found, twin = facets(cells), naive.facets(cells)
-    assert [tuple(row) for row in found.nodes.tolist()] == sorted(twin)
-    for nodes, sides, count in zip(found.nodes.tolist(), found.cells.tolist(), found.n_cells, strict=True):
+    shared, twin = facets(cells), naive.facets(cells)
+    assert [tuple(row) for row in shared.nodes.tolist()] == sorted(twin)
+    for nodes, sides, count in zip(shared.nodes.tolist(), shared.cells.tolist(), shared.n_cells, strict=True):
         assert [side for side in sides if side >= 0] == twin[tuple(nodes)]
         assert count == len(twin[tuple(nodes)])
 
@@ -82,9 +82,9 @@ def test_facets_are_those_of_the_twin(seed, n):
 def test_facets_do_not_depend_on_how_large_the_node_numbers_are(mesh, factor):
     """Three numbers over 2^21 do not fit one of 63 bits."""
     _, cells = mesh
-    found, far = facets(cells), facets(cells * factor)
-    np.testing.assert_array_equal(far.nodes, found.nodes * factor)
-    for ours, theirs in zip(found[1:], far[1:], strict=True):
+    sides, far = facets(cells), facets(cells * factor)
+    np.testing.assert_array_equal(far.nodes, sides.nodes * factor)
+    for ours, theirs in zip(sides[1:], far[1:], strict=True):
         np.testing.assert_array_equal(ours, theirs)
 
 
@@ -92,11 +92,11 @@ def test_facets_do_not_depend_on_how_large_the_node_numbers_are(mesh, factor):
 def test_facets_know_where_each_cell_holds_them(seed, n):
     """`of_cell` by the opposite node, `sign` by the exact side on which that node lies."""
     points, cells = random_mesh(seed, n)
-    found = facets(cells)
+    sides = facets(cells)
     exact = naive.exactly(points)
-    for cell, of_cell, signs in zip(cells.tolist(), found.of_cell, found.sign, strict=True):
+    for cell, of_cell, signs in zip(cells.tolist(), sides.of_cell, sides.sign, strict=True):
         for node, facet, side in zip(cell, of_cell, signs, strict=True):
-            nodes = found.nodes[facet].tolist()
+            nodes = sides.nodes[facet].tolist()
             assert nodes == sorted(set(cell) - {node})
             behind = naive.sign(naive.signed_volume([exact[a] for a in [*nodes, node]]))
             assert side == (behind if n == 2 else -behind)  # 2-D: left of the edge; 3-D: under the triangle
@@ -105,11 +105,11 @@ def test_facets_know_where_each_cell_holds_them(seed, n):
 @given(seeds, dimensions)
 def test_the_two_cells_of_a_facet_hold_it_with_opposite_signs(seed, n):
     _, cells = random_mesh(seed, n)
-    found = facets(cells)
-    total = np.bincount(found.of_cell.ravel(), weights=found.sign.ravel())
-    np.testing.assert_array_equal(total[found.n_cells == 2], 0)
-    np.testing.assert_array_equal(np.abs(total[found.n_cells == 1]), 1)
-    np.testing.assert_array_equal(np.bincount(found.of_cell.ravel()), found.n_cells)
+    sides = facets(cells)
+    total = np.bincount(sides.of_cell.ravel(), weights=sides.sign.ravel())
+    np.testing.assert_array_equal(total[sides.n_cells == 2], 0)
+    np.testing.assert_array_equal(np.abs(total[sides.n_cells == 1]), 1)
+    np.testing.assert_array_equal(np.bincount(sides.of_cell.ravel()), sides.n_cells)
 
 
 @given(seeds, dimensions)
@@ -131,11 +131,11 @@ def test_stars_are_the_facets_of_each_node(seed, n):
 
 def test_facets_of_cells_that_do_not_conform_are_counted():
     """Three triangles on the edge 0 1."""
-    found = facets(np.array([[0, 1, 2], [0, 1, 3], [1, 0, 4]]))
-    assert found.nodes[0].tolist() == [0, 1]
-    assert found.n_cells.tolist() == [3, 1, 1, 1, 1, 1, 1]
-    assert found.cells[0].tolist() == [0, 1]
-    assert (found.cells[1:, 1] == -1).all()
+    sides = facets(np.array([[0, 1, 2], [0, 1, 3], [1, 0, 4]]))
+    assert sides.nodes[0].tolist() == [0, 1]
+    assert sides.n_cells.tolist() == [3, 1, 1, 1, 1, 1, 1]
+    assert sides.cells[0].tolist() == [0, 1]
+    assert (sides.cells[1:, 1] == -1).all()
     assert [0, 1] not in np.sort(boundary_facets(np.array([[0, 1, 2], [0, 1, 3], [1, 0, 4]]))).tolist()
 
 
@@ -283,7 +283,7 @@ def test_folded(n):
     first = mesh.cells[0]
     flipped = mesh.cells.copy()
     flipped[0] = first[[1, 0, *range(2, n + 1)]]
-    found = folded(flipped)
+    pairs = folded(flipped)
     inner = [pair for pair in facets(mesh.cells).cells.tolist() if 0 in pair and -1 not in pair]
-    assert sorted(map(sorted, found.tolist())) == sorted(map(sorted, inner))
+    assert sorted(map(sorted, pairs.tolist())) == sorted(map(sorted, inner))
     assert len(folded(np.vstack([mesh.cells, first]))) >= n

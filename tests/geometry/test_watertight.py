@@ -75,7 +75,7 @@ def n_crossings(surface):
     points, triangles = surface.points, surface.triangles
     edges = edges_of(triangles)
     edges = edges[edges[:, 0] < edges[:, 1]]
-    found = 0
+    crossings = 0
     a, b, c = points[triangles.T]
     normal = np.cross(b - a, c - a)
     normal /= np.linalg.norm(normal, axis=1, keepdims=True)
@@ -86,8 +86,8 @@ def n_crossings(surface):
         may = (over_u * over_v < 0.0) & (np.maximum(abs(over_u), abs(over_v)) > 1e-9)
         may &= ~(triangles[:, :, None] == edge).any(axis=(1, 2))
         sides = [((np.cross(p - u, q - u))[may] @ (v - u)) > 0.0 for p, q in ((a, b), (b, c), (c, a))]
-        found += int(((sides[0] == sides[1]) & (sides[1] == sides[2])).sum())
-    return found
+        crossings += int(((sides[0] == sides[1]) & (sides[1] == sides[2])).sum())
+    return crossings
 
 
 # --------------------------------------------------------------------------------------------------

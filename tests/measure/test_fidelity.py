@@ -79,7 +79,7 @@ def test_cell_labels_against_twin(n):
     whole = tetopt.lattice(labels, blocks=((5, 4, 4) if n == 3 else (6, 5))[:n])
     mesh = tetopt.Mesh(whole.points, whole.cells[len(whole.cells) // 4 :])
     owner = tetopt.cell_of_voxel(labels, mesh)
-    found = cell_labels(labels, mesh)
+    of_cell = cell_labels(labels, mesh)
     n_ties = n_empty = 0
     for cell in range(len(mesh.cells)):
         count = Counter(labels.data[owner == cell].astype(int).tolist())
@@ -92,14 +92,14 @@ def test_cell_labels_against_twin(n):
             expected = labels.data[
                 tuple(np.rint(labels.to_index(mesh.points[mesh.cells[cell]].mean(axis=0))).astype(int))
             ]
-        assert found[cell] == expected
-    assert found.dtype == np.int64
+        assert of_cell[cell] == expected
+    assert of_cell.dtype == np.int64
     assert n_ties > 3
     assert n_empty > 3
-    shown = _painted(owner, found)
+    shown = _painted(owner, of_cell)
     assert (shown == -1).any()
     for voxel in np.ndindex(labels.shape):
-        assert shown[voxel] == (-1 if owner[voxel] < 0 else found[owner[voxel]])
+        assert shown[voxel] == (-1 if owner[voxel] < 0 else of_cell[owner[voxel]])
 
 
 # Surfaces
@@ -180,9 +180,9 @@ def test_distances_against_twin(n):
     corners[2, 1:] = corners[2, 0]
     facets = np.arange(25 * n).reshape(25, n)
     points = np.vstack([rng.normal(0.0, 20.0, (60, n)), corners[:, 0] + rng.normal(0.0, 0.1, (25, n))])
-    found = surface_distances(points, corners.reshape(-1, n), facets)
+    distances = surface_distances(points, corners.reshape(-1, n), facets)
     expected = [min(naive_distance(p, c) for c in corners) for p in points]
-    np.testing.assert_allclose(found, expected, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(distances, expected, rtol=1e-9, atol=1e-9)
 
 
 def test_distances_need_a_surface():
@@ -383,15 +383,15 @@ def test_bad_labels():
 def test_mask_of_a_shifted_plane(n):
     """2 voxels of 1.5 mm; faces of the box count on neither side; the plane ends at the box, as a disc does."""
     image, mesh, x = slabs(n, shift_affine(np.random.default_rng(n), n, [1.5, 0.5, -3.0]))
-    found = mask_fidelity(image, tetopt.Mesh(mesh.points, mesh.cells[x > 1.5]))
+    fidelity = mask_fidelity(image, tetopt.Mesh(mesh.points, mesh.cells[x > 1.5]))
     layer = 8 ** (n - 1)
-    assert found.voxels == 4 * layer
-    assert found.volume == pytest.approx(4 * layer * image.voxel_volume)
-    assert found.mesh_volume == pytest.approx(6 * layer * image.voxel_volume)
-    assert found.dice == pytest.approx(2 * 4 / (4 + 6))
-    np.testing.assert_allclose(found[4:8], 2.0, atol=1e-9)
-    np.testing.assert_allclose(found[8:12], 3.0, atol=1e-9)
-    assert found[12:] == (1, 1, 1, 1)
+    assert fidelity.voxels == 4 * layer
+    assert fidelity.volume == pytest.approx(4 * layer * image.voxel_volume)
+    assert fidelity.mesh_volume == pytest.approx(6 * layer * image.voxel_volume)
+    assert fidelity.dice == pytest.approx(2 * 4 / (4 + 6))
+    np.testing.assert_allclose(fidelity[4:8], 2.0, atol=1e-9)
+    np.testing.assert_allclose(fidelity[8:12], 3.0, atol=1e-9)
+    assert fidelity[12:] == (1, 1, 1, 1)
 
 
 @pytest.mark.parametrize("n", [2, 3])
@@ -402,14 +402,14 @@ def test_mask_of_a_ball(n):
     points, cells = ball(n, 11.5, np.full(n, 15.2))
     points = image.to_world(points)
     mesh = tetopt.Mesh(points, oriented(points, cells))
-    found = mask_fidelity(image, mesh)
-    assert found.mesh_volume == pytest.approx(volumes(points, mesh.cells).sum())
-    np.testing.assert_allclose(found[4:8], 1.5, atol=0.03)
+    fidelity = mask_fidelity(image, mesh)
+    assert fidelity.mesh_volume == pytest.approx(volumes(points, mesh.cells).sum())
+    np.testing.assert_allclose(fidelity[4:8], 1.5, atol=0.03)
     factors = np.linalg.svd(image.affine[:n, :n])[1]
-    assert factors[-1] * 1.5 < found.distance_mean_mm < factors[0] * 1.5
-    assert factors[-1] * 1.5 < found.reverse_p95_mm < factors[0] * 1.55
+    assert factors[-1] * 1.5 < fidelity.distance_mean_mm < factors[0] * 1.5
+    assert factors[-1] * 1.5 < fidelity.reverse_p95_mm < factors[0] * 1.55
     euler = {2: 0, 3: 2}[n]
-    assert found[12:] == (1, 1, euler, euler)
+    assert fidelity[12:] == (1, 1, euler, euler)
 
 
 def test_mask_reverse_is_another_distance():
@@ -419,21 +419,21 @@ def test_mask_reverse_is_another_distance():
     image = tetopt.Image(level, np.diag([2.0, 2.0, 1.0]))
     mesh = blocky(image, (20, 4))
     x = image.to_index(centroids(mesh.points, mesh.cells))[:, 0]
-    found = mask_fidelity(image, tetopt.Mesh(mesh.points, mesh.cells[(x > 1.5) & (x < 4.5)]))
-    assert found.distance_p95 == pytest.approx(0.0, abs=1e-9)
-    assert found.reverse_mean == pytest.approx((0 + 0 + 7 + 10) / 4, rel=6e-3)
-    assert found.reverse_p95 == pytest.approx(10.0)
-    assert (found.distance_p95_mm, found.reverse_p95_mm) == (pytest.approx(0.0, abs=1e-9), pytest.approx(20.0))
-    assert (found.components, found.mesh_components) == (2, 1)
-    assert (found.euler, found.mesh_euler) == (4, 2)
+    fidelity = mask_fidelity(image, tetopt.Mesh(mesh.points, mesh.cells[(x > 1.5) & (x < 4.5)]))
+    assert fidelity.distance_p95 == pytest.approx(0.0, abs=1e-9)
+    assert fidelity.reverse_mean == pytest.approx((0 + 0 + 7 + 10) / 4, rel=6e-3)
+    assert fidelity.reverse_p95 == pytest.approx(10.0)
+    assert (fidelity.distance_p95_mm, fidelity.reverse_p95_mm) == (pytest.approx(0.0, abs=1e-9), pytest.approx(20.0))
+    assert (fidelity.components, fidelity.mesh_components) == (2, 1)
+    assert (fidelity.euler, fidelity.mesh_euler) == (4, 2)
 
 
 def test_mesh_of_the_whole_box_has_no_boundary():
     image, mesh, _ = slabs(2)
-    found = mask_fidelity(image, mesh)
-    assert np.isnan(found[4:12]).all()
-    assert found.dice == pytest.approx(2 * 4 / (4 + 8))
-    assert found.mesh_euler == 0
+    fidelity = mask_fidelity(image, mesh)
+    assert np.isnan(fidelity[4:12]).all()
+    assert fidelity.dice == pytest.approx(2 * 4 / (4 + 8))
+    assert fidelity.mesh_euler == 0
 
 
 def test_half_counts_as_inside():
@@ -458,9 +458,9 @@ def test_volume_dice_does_not_depend_on_the_unit():
     """A thousandth of a cubic millimetre overlaps as well as a litre."""
     labels = np.zeros((12, 12, 12))
     labels[4:8, 4:8, 4:8] = 1.0
-    found = []
+    dice = []
     for voxel in (1.0, 0.01):
         image = tetopt.Image(labels, np.diag([voxel] * 3 + [1.0]))
-        found.append([row.volume_dice for row in label_fidelity(image, tetopt.lattice(image, blocks=(6, 6, 6)))])
-    np.testing.assert_allclose(found[0], found[1], rtol=1e-6)
-    assert 0.5 < found[0][1] < 1.0
+        dice.append([row.volume_dice for row in label_fidelity(image, tetopt.lattice(image, blocks=(6, 6, 6)))])
+    np.testing.assert_allclose(dice[0], dice[1], rtol=1e-6)
+    assert 0.5 < dice[0][1] < 1.0

@@ -198,20 +198,20 @@ def test_smallest_angles_of_the_archetypes():
 
 
 def test_quality_of_the_cube_of_five():
-    found = quality(*FIVE_TET_CUBE)
+    measured = quality(*FIVE_TET_CUBE)
     corner_rho, corner_angle = 2 / (3 + 3 * sqrt(3)), degrees(acos(1 / sqrt(3)))
-    assert (found.n_nodes, found.n_cells) == (8, 5)
-    assert found.volume == pytest.approx(1)
-    assert found.smallest_volume == pytest.approx(1 / 6)
-    assert found.mean_rho == pytest.approx((1 / 3 + 4 * corner_rho) / 5)
-    assert found.min_rho == pytest.approx(corner_rho)
-    assert found.p1_rho == pytest.approx(corner_rho)
-    assert found.min_dihedral == pytest.approx(corner_angle)
-    assert found.p1_dihedral == pytest.approx(corner_angle)
-    assert found.max_dihedral == pytest.approx(90)
-    assert found.n_under_10_degrees == 0
-    assert found.errors == quality_errors(*FIVE_TET_CUBE)
-    assert found.kinds == {"needle": 0, "wedge": 0, "cap": 0, "spade": 0, "sliver": 0}
+    assert (measured.n_nodes, measured.n_cells) == (8, 5)
+    assert measured.volume == pytest.approx(1)
+    assert measured.smallest_volume == pytest.approx(1 / 6)
+    assert measured.mean_rho == pytest.approx((1 / 3 + 4 * corner_rho) / 5)
+    assert measured.min_rho == pytest.approx(corner_rho)
+    assert measured.p1_rho == pytest.approx(corner_rho)
+    assert measured.min_dihedral == pytest.approx(corner_angle)
+    assert measured.p1_dihedral == pytest.approx(corner_angle)
+    assert measured.max_dihedral == pytest.approx(90)
+    assert measured.n_under_10_degrees == 0
+    assert measured.errors == quality_errors(*FIVE_TET_CUBE)
+    assert measured.kinds == {"needle": 0, "wedge": 0, "cap": 0, "spade": 0, "sliver": 0}
 
 
 def test_quality_of_good_and_bad_cells():
@@ -219,26 +219,26 @@ def test_quality_of_good_and_bad_cells():
     shapes = [CUBE_CORNER[0]] * 99 + [make(0.02) for make in BAD_TETS.values()]
     points = np.vstack(shapes)
     cells = np.array([row + 4 * k for k, shape in enumerate(shapes) for row in single(shape)[1]])
-    found = quality(points, cells)
-    assert found.kinds == {kind: 1 for kind in BAD_TETS}
-    assert found.n_under_10_degrees == 5
+    measured = quality(points, cells)
+    assert measured.kinds == {kind: 1 for kind in BAD_TETS}
+    assert measured.n_under_10_degrees == 5
     angles = dihedral_angles(points, cells)
-    assert found.min_dihedral == angles.min() == pytest.approx(degrees(2 * atan(0.01 / sqrt(3))))
-    assert found.max_dihedral == angles.max() > 170
-    assert found.p1_dihedral == np.percentile(angles.min(axis=1), 1)
-    assert found.p1_rho == np.percentile(rho(points, cells), 1)
-    assert found.smallest_volume == volumes(points, cells).min()
+    assert measured.min_dihedral == angles.min() == pytest.approx(degrees(2 * atan(0.01 / sqrt(3))))
+    assert measured.max_dihedral == angles.max() > 170
+    assert measured.p1_dihedral == np.percentile(angles.min(axis=1), 1)
+    assert measured.p1_rho == np.percentile(rho(points, cells), 1)
+    assert measured.smallest_volume == volumes(points, cells).min()
 
 
 @pytest.mark.parametrize("mesh", ALL_SMALL)
 def test_kinds_are_named_by_dimension(mesh):
-    found = quality(*mesh)
+    measured = quality(*mesh)
     names = {"needle", "cap"} if mesh[0].shape[1] == 2 else {"needle", "wedge", "cap", "spade", "sliver"}
-    assert set(found.kinds) == names
-    assert sum(found.kinds.values()) == (bad_kinds(*mesh) != "good").sum()
+    assert set(measured.kinds) == names
+    assert sum(measured.kinds.values()) == (bad_kinds(*mesh) != "good").sum()
 
 
 def test_quality_of_an_obtuse_triangle():
-    found = quality(*OBTUSE_TRIANGLE)
-    assert found.max_dihedral == pytest.approx(120)
-    assert found.min_dihedral == pytest.approx(30)
+    measured = quality(*OBTUSE_TRIANGLE)
+    assert measured.max_dihedral == pytest.approx(120)
+    assert measured.min_dihedral == pytest.approx(30)

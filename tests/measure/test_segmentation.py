@@ -28,15 +28,17 @@ def test_thresholds_leave_the_least_variance(classes):
         values[0], values[-1] = 0.0, 255.0
         weights = rng.uniform(0.1, 5.0, 9)
         best = min(within(values, weights, values[list(cut)]) for cut in combinations(range(1, 9), classes - 1))
-        found = class_thresholds(values, classes, weights)
-        assert np.all(np.diff(found) > 0.0)
-        assert within(values, weights, found) == pytest.approx(best, rel=0.03)  # a bin's centre stands for its values
+        thresholds = class_thresholds(values, classes, weights)
+        assert np.all(np.diff(thresholds) > 0.0)
+        assert within(values, weights, thresholds) == pytest.approx(
+            best, rel=0.03
+        )  # a bin's centre stands for its values
 
 
 def test_clear_clusters_are_found():
     values = np.repeat([10.0, 12.0, 50.0, 90.0, 91.0], [5, 5, 7, 3, 9])
-    found = class_thresholds(values, 3)
-    assert 12.0 < found[0] < 50.0 < found[1] < 90.0
+    thresholds = class_thresholds(values, 3)
+    assert 12.0 < thresholds[0] < 50.0 < thresholds[1] < 90.0
 
 
 @pytest.mark.parametrize(

@@ -47,9 +47,9 @@ def check_tiling(index, cells, box):
     assert v.min() > 0
     assert v.sum() == pytest.approx(np.prod(high - low), rel=1e-10)
     assert np.unique(cells).tolist() == list(range(len(index)))
-    found = facets(cells)
-    assert found.n_cells.max() <= 2
-    walls = index[found.nodes[found.n_cells == 1]]
+    sides = facets(cells)
+    assert sides.n_cells.max() <= 2
+    walls = index[sides.nodes[sides.n_cells == 1]]
     assert ((walls == low).all(axis=1) | (walls == high).all(axis=1)).any(axis=1).all()
 
 

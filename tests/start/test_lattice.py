@@ -95,10 +95,10 @@ def test_every_lattice_is_a_mesh_of_its_box(seed, dimension_and_kind):
         assert len(mesh.cells) == per_block * np.prod(blocks)
     assert np.unique(mesh.cells).tolist() == list(range(len(mesh.points)))
     assert len(np.unique(np.sort(mesh.cells, axis=1), axis=0)) == len(mesh.cells)
-    found = facets(mesh.cells)
-    assert found.n_cells.max() <= 2
+    sides = facets(mesh.cells)
+    assert sides.n_cells.max() <= 2
     index = image.to_index(mesh.points)
-    of_boundary = index[found.nodes[found.n_cells == 1]]  # (B, n, n)
+    of_boundary = index[sides.nodes[sides.n_cells == 1]]  # (B, n, n)
     low, high = -0.5, np.array(image.shape) - 0.5
     is_on_box = (np.abs(of_boundary - low) < 1e-9).all(axis=1) | (np.abs(of_boundary - high) < 1e-9).all(axis=1)
     assert is_on_box.any(axis=1).all()
@@ -140,8 +140,8 @@ def test_shapes_of_bcc_on_cubes():
 def test_diagonals_alternate_on_the_walls_of_bcc():
     """A corner within a wall has diagonals to all four squares around it or to none: 8 or 4 triangles there."""
     mesh = lattice(Image(np.zeros((4, 5, 6))), "bcc", blocks=(4, 5, 6))
-    found = facets(mesh.cells)
-    walls = found.nodes[found.n_cells == 1]
+    sides = facets(mesh.cells)
+    walls = sides.nodes[sides.n_cells == 1]
     for axis in range(3):
         for side in (mesh.points[:, axis].min(), mesh.points[:, axis].max()):
             on_wall = walls[(mesh.points[walls, axis] == side).all(axis=1)]
@@ -155,9 +155,9 @@ def test_diagonals_alternate_on_the_walls_of_bcc():
 def test_shapes_of_five_tet_on_cubes():
     """A fifth of the cells is regular, the others are the cube's corners."""
     mesh = lattice(Image(np.zeros((3, 2, 4))), "five-tet", blocks=(3, 2, 4))
-    found = np.sort(rho(mesh.points, mesh.cells))
-    assert found[:96] == pytest.approx([2 / (3 + 3 * sqrt(3))] * 96)
-    assert found[96:] == pytest.approx([1 / 3] * 24)
+    ratios = np.sort(rho(mesh.points, mesh.cells))
+    assert ratios[:96] == pytest.approx([2 / (3 + 3 * sqrt(3))] * 96)
+    assert ratios[96:] == pytest.approx([1 / 3] * 24)
 
 
 def test_shapes_of_criss_cross_on_squares():
@@ -199,10 +199,10 @@ def test_the_count_asked_for_is_found_where_cubes_have_it(seed, dimension_and_ki
     n, kind = dimension_and_kind
     blocks = tuple(int(b) for b in np.random.default_rng(seed).integers(3, 12, n))
     image = Image(np.zeros(tuple(2 * b for b in blocks), dtype=np.uint8))
-    wanted = lattice(image, kind, blocks=blocks)
-    found = lattice(image, kind, nodes=len(wanted.points))
-    assert abs(len(found.points) - len(wanted.points)) <= 0.03 * len(wanted.points)
-    np.testing.assert_array_equal(found.points, wanted.points)
+    exact = lattice(image, kind, blocks=blocks)
+    mesh = lattice(image, kind, nodes=len(exact.points))
+    assert abs(len(mesh.points) - len(exact.points)) <= 0.03 * len(exact.points)
+    np.testing.assert_array_equal(mesh.points, exact.points)
 
 
 @pytest.mark.parametrize(("n", "kind"), KINDS)

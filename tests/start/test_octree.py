@@ -163,8 +163,8 @@ def test_every_number_of_nodes(kind, nodes):
         "noise": np.random.default_rng(0).normal(size=shape),
         "voxel": np.where((grid(*shape) == 9).all(-1), 50.0, 0.0),
     }[kind]
-    found = len(octree(tetopt.Image(data), nodes).points)
-    assert abs(found - nodes) <= max(0.07 * nodes, 30)
+    count = len(octree(tetopt.Image(data), nodes).points)
+    assert abs(count - nodes) <= max(0.07 * nodes, 30)
 
 
 @pytest.mark.parametrize("scale", [1e-150, 1e-30, 1e100])

@@ -120,11 +120,11 @@ def test_field_is_lowered_to_its_gradation(shape):
     data[data > 28.0] = 0.0
     spacing = np.arange(1.0, len(shape) + 1.0)
     field = tetopt.Image(data, np.diag([*spacing, 1.0]))
-    found = Sizes(gradation=0.3, field=field).prepared(len(shape)).field.data
+    lowered = Sizes(gradation=0.3, field=field).prepared(len(shape)).field.data
     place = grid(*shape).reshape(-1, len(shape)) * spacing
     ways = 0.3 * np.abs(place[:, None] - place[None]).sum(-1)
     value = np.where(data > 0.0, data, np.inf).ravel()
-    np.testing.assert_allclose(found.ravel(), (value[None] + ways).min(axis=1), rtol=1e-5)
+    np.testing.assert_allclose(lowered.ravel(), (value[None] + ways).min(axis=1), rtol=1e-5)
 
 
 def test_sizes_around_are_the_twin_s():
@@ -232,14 +232,14 @@ def test_longest_at_nodes():
     affine[:3, 3] = -1.0
     field = tetopt.Image(np.where(grid(12, 12, 12)[..., 0] < 5, 7.0, 0.0), affine)
     in_field = image.to_index(mesh.points)[:, 0] < 12.0
-    found = Sizes(largest=20.0, field=field).prepared(3).longest_edges(image, 300, mesh.points, mesh.cells, own)
-    np.testing.assert_allclose(found[in_field], 7.0)
-    assert found.max() > 12.0  # grows from the field by gradation x distance
-    assert found.max() <= 20.0
+    longest = Sizes(largest=20.0, field=field).prepared(3).longest_edges(image, 300, mesh.points, mesh.cells, own)
+    np.testing.assert_allclose(longest[in_field], 7.0)
+    assert longest.max() > 12.0  # grows from the field by gradation x distance
+    assert longest.max() <= 20.0
     own = np.linspace(1.0, 3.0, len(mesh.points))
     sizes = Sizes(largest=np.inf, gradation=0.2)
-    found = sizes.longest_edges(image, 300, mesh.points, mesh.cells, own)
-    np.testing.assert_allclose(found, 1.5 * _around(own, mesh.points, mesh.cells, 0.2))
+    longest = sizes.longest_edges(image, 300, mesh.points, mesh.cells, own)
+    np.testing.assert_allclose(longest, 1.5 * _around(own, mesh.points, mesh.cells, 0.2))
 
 
 # As many nodes as an error takes.

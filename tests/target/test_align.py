@@ -44,25 +44,25 @@ PAIRS["both oblique"] = (MOVE @ PAIRS["oblique"][0], MOVE @ PAIRS["oblique"][1])
 
 def nearest_twin(other, image):
     """Voxel by voxel: through the world, into the box around the voxel it falls in, lower face included."""
-    found = np.zeros(image.shape)
+    values = np.zeros(image.shape)
     for voxel in np.ndindex(image.shape):
         index = np.floor(other.to_index(image.to_world(voxel)) + 0.5 + 1e-6).astype(int)  # ties go up
         if (index >= 0).all() and (index < other.shape).all():
-            found[voxel] = other.data[tuple(index)]
-    return found
+            values[voxel] = other.data[tuple(index)]
+    return values
 
 
 def linear_twin(other, image):
     """Voxel by voxel: the eight (four) voxels around, the index held to the centres of the border."""
-    found = np.zeros(image.shape)
+    values = np.zeros(image.shape)
     for voxel in np.ndindex(image.shape):
         index = np.clip(other.to_index(image.to_world(voxel)), 0, np.array(other.shape) - 1)
         low = np.minimum(np.floor(index).astype(int), np.array(other.shape) - 2)
         part = index - low
         for corner in np.ndindex((2,) * image.ndim):
             weight = np.prod(np.where(corner, part, 1 - part))
-            found[voxel] += weight * other.data[tuple(low + corner)]
-    return found
+            values[voxel] += weight * other.data[tuple(low + corner)]
+    return values
 
 
 def pair(which, values):
@@ -86,13 +86,13 @@ def test_nearest_is_its_twin(which):
     image, labels = pair(which, lambda rng: rng.integers(1, 9, OTHER))
     expected = nearest_twin(labels, image)
     assert 0 < np.count_nonzero(expected == 0) < expected.size  # both inside and outside are tried
-    found = aligned_labels(labels, image, "l")
-    np.testing.assert_array_equal(found.data, expected)
-    np.testing.assert_array_equal(found.affine, image.affine)
+    aligned = aligned_labels(labels, image, "l")
+    np.testing.assert_array_equal(aligned.data, expected)
+    np.testing.assert_array_equal(aligned.affine, image.affine)
     mask = tetopt.Image(255 * (labels.data > 4), labels.affine)
-    found = aligned_mask(mask, image, "m")
-    np.testing.assert_array_equal(found.data, nearest_twin(mask, image) / 255)
-    np.testing.assert_array_equal(found.affine, image.affine)
+    aligned = aligned_mask(mask, image, "m")
+    np.testing.assert_array_equal(aligned.data, nearest_twin(mask, image) / 255)
+    np.testing.assert_array_equal(aligned.affine, image.affine)
     chance = tetopt.Image(labels.data / 16, labels.affine)
     np.testing.assert_array_equal(aligned_mask(chance, image, "m").data, nearest_twin(chance, image))
 
@@ -100,9 +100,9 @@ def test_nearest_is_its_twin(which):
 @pytest.mark.parametrize("which", PAIRS)
 def test_linear_is_its_twin(which):
     image, other = pair(which, lambda rng: rng.normal(size=OTHER).astype(np.float32))
-    found = aligned_contrast(other, image, "c")
-    np.testing.assert_allclose(found.data, linear_twin(other, image), atol=1e-6)
-    np.testing.assert_array_equal(found.affine, image.affine)
+    aligned = aligned_contrast(other, image, "c")
+    np.testing.assert_allclose(aligned.data, linear_twin(other, image), atol=1e-6)
+    np.testing.assert_array_equal(aligned.affine, image.affine)
 
 
 def test_linear_fields_survive_any_affine():
@@ -146,12 +146,12 @@ def test_grid_shifted_by_half_a_voxel(spacing, sign):
     affine[:3, 3] = 17.3
     image = tetopt.Image(np.zeros((40, 3, 3)), affine)
     labels = tetopt.Image(np.arange(1, 361).reshape(40, 3, 3), affine @ _translation(-0.5 * sign, 0, 0))
-    found = aligned_labels(labels, image, "l").data
+    aligned = aligned_labels(labels, image, "l").data
     if sign > 0:  # index i + 1/2: the upper is i + 1, the last is on the upper face, outside
-        np.testing.assert_array_equal(found[:-1], labels.data[1:])
-        np.testing.assert_array_equal(found[-1], 0)
+        np.testing.assert_array_equal(aligned[:-1], labels.data[1:])
+        np.testing.assert_array_equal(aligned[-1], 0)
     else:  # index i - 1/2: the upper is i, the first on the lower face, inside
-        np.testing.assert_array_equal(found, labels.data)
+        np.testing.assert_array_equal(aligned, labels.data)
 
 
 def test_cropped_and_finer_masks():
@@ -159,8 +159,8 @@ def test_cropped_and_finer_masks():
     crop = tetopt.Image(np.ones((2, 3, 1)), image.affine @ _translation(1, 2, 5))
     expected = np.zeros(image.shape)
     expected[1:3, 2:5, 5] = 1
-    found = aligned_mask(crop, image, "m").data
-    np.testing.assert_array_equal(found, expected)
+    aligned = aligned_mask(crop, image, "m").data
+    np.testing.assert_array_equal(aligned, expected)
     fine = tetopt.Image(expected.repeat(3, 0).repeat(3, 1).repeat(3, 2), np.diag([2 / 3] * 3 + [1.0]))
     fine = tetopt.Image(fine.data, fine.affine @ _translation(-1, -1, -1))
     np.testing.assert_array_equal(aligned_mask(fine, image, "m").data, expected)
@@ -190,9 +190,9 @@ def test_two_dimensions():
 )
 def test_what_a_mask_may_hold(values, expected):
     mask = tetopt.Image(values)
-    found = aligned_mask(mask, tetopt.Image(np.zeros(mask.shape)), "m")
-    np.testing.assert_array_equal(found.data, expected)
-    assert found.data.dtype == np.float32
+    aligned = aligned_mask(mask, tetopt.Image(np.zeros(mask.shape)), "m")
+    np.testing.assert_array_equal(aligned.data, expected)
+    assert aligned.data.dtype == np.float32
     doubles = aligned_mask(tetopt.Image([[0.1, 0.7]]), tetopt.Image(np.zeros((1, 2))), "m").data
     assert doubles.dtype == np.float32
 
@@ -261,8 +261,8 @@ def test_label_files_of_floats():
 def test_a_contrast_covers_half_of_the_image():
     image = tetopt.Image(np.zeros((4, 3, 2)))
     other = np.arange(24.0).reshape(4, 3, 2)
-    found = aligned_contrast(tetopt.Image(other, _translation(2, 0, 0)), image, "t2").data
-    np.testing.assert_array_equal(found, other[[0, 0, 0, 1]])  # the border goes on
+    aligned = aligned_contrast(tetopt.Image(other, _translation(2, 0, 0)), image, "t2").data
+    np.testing.assert_array_equal(aligned, other[[0, 0, 0, 1]])  # the border goes on
     assert message(aligned_contrast, "t2", tetopt.Image(other, _translation(3, 0, 0)), image) == (
         "t2: expected to cover half of the image's voxels or more, got 25.0 %; it spans 2.5..6.5 x -0.5..2.5 x "
         "-0.5..1.5 mm, the image -0.5..3.5 x -0.5..2.5 x -0.5..1.5 mm: do both lie in the same world mm?"
@@ -289,9 +289,9 @@ def test_foreground_by_hand(shape):
     pocket[(-1, 15, *[14] * (n - 2))] = True
     bright = (body | piece | speck) & ~ball(shape, 4) & ~pocket
     image = tetopt.Image(np.where(bright, 50.0, 3.0), np.diag([2.0] * n + [1.0]))
-    found = foreground(image, 3.0)
-    np.testing.assert_array_equal(found.data, body | piece)
-    np.testing.assert_array_equal(found.affine, image.affine)
+    front = foreground(image, 3.0)
+    np.testing.assert_array_equal(front.data, body | piece)
+    np.testing.assert_array_equal(front.affine, image.affine)
     np.testing.assert_array_equal(foreground(image).data, body | piece)
     assert background_level(image) == 3.0
     # A channel to the cavity: face neighbours leak, voxels that touch in an edge do not.

@@ -20,26 +20,26 @@ def contrasts(shape=(12, 13, 14)):
 
 def test_an_image_alone_is_itself():
     image = contrasts()[0]
-    for found in (content(image), content([image]), plain(image), plain(content(image))):
-        assert found.is_plain
-        assert found.image is image
-        assert np.shares_memory(found.values, image.data)
-        assert found.variance == pytest.approx(float(np.var(image.data, dtype=np.float64)), rel=1e-12)
-        assert (found.n_voxels, found.volume) == (image.data.size, image.volume)
+    for target in (content(image), content([image]), plain(image), plain(content(image))):
+        assert target.is_plain
+        assert target.image is image
+        assert np.shares_memory(target.values, image.data)
+        assert target.variance == pytest.approx(float(np.var(image.data, dtype=np.float64)), rel=1e-12)
+        assert (target.n_voxels, target.volume) == (image.data.size, image.volume)
 
 
 @pytest.mark.parametrize("weights", [None, [1.0, 1.0, 1.0], [1.0, 4.0, 0.25], [0.0, 2.0, 1.0]])
 def test_contrasts_count_by_their_weights_not_their_scales(weights):
     images = contrasts()
-    found = content(images, weights=weights)
-    wanted = [1.0, 1.0, 1.0] if weights is None else weights
+    target = content(images, weights=weights)
+    weights_ = [1.0, 1.0, 1.0] if weights is None else weights
     unit = float(np.var(images[0].data, dtype=np.float64))
-    variances = [found.unit * float(np.var(v, dtype=np.float64)) for v in found.values]
-    np.testing.assert_allclose(variances, [w * unit for w in wanted if w > 0.0], rtol=2e-3)
-    kept = [image for image, w in zip(images, wanted, strict=True) if w > 0.0]
-    for values, image in zip(found.values, kept, strict=True):
+    variances = [target.unit * float(np.var(v, dtype=np.float64)) for v in target.values]
+    np.testing.assert_allclose(variances, [w * unit for w in weights_ if w > 0.0], rtol=2e-3)
+    kept = [image for image, w in zip(images, weights_, strict=True) if w > 0.0]
+    for values, image in zip(target.values, kept, strict=True):
         assert np.corrcoef(values.ravel(), image.data.ravel())[0, 1] > 0.99999
-    assert np.issubdtype(found.values.dtype, np.integer)
+    assert np.issubdtype(target.values.dtype, np.integer)
 
 
 def test_a_rare_label_or_a_bright_voxel_leaves_the_image_its_levels():
@@ -49,13 +49,13 @@ def test_a_rare_label_or_a_bright_voxel_leaves_the_image_its_levels():
     labels = np.zeros(data.shape)
     labels[20, 20, 20] = 1.0
     data[5, 5, 5] = 1e4
-    found = content(tetopt.Image(data), tetopt.Image(labels))
+    target = content(tetopt.Image(data), tetopt.Image(labels))
     rest = np.ones(data.shape, dtype=bool)
     rest[5, 5, 5] = False
-    rounded = found.values[0][rest] * np.sqrt(found.unit) + data.mean()
+    rounded = target.values[0][rest] * np.sqrt(target.unit) + data.mean()
     off = float(np.std(rounded - data[rest]))
     assert off < 0.01 * data.std()  # the image's, of which the one voxel makes nearly all
-    assert np.abs(found.values).max() < 2**31 - 1
+    assert np.abs(target.values).max() < 2**31 - 1
 
 
 def labelled(shape=(24, 25, 26)):
@@ -67,15 +67,15 @@ def labelled(shape=(24, 25, 26)):
 
 def test_labels_are_one_hot():
     labels = labelled()
-    found = content(labels, labels, weights=[0.0])
-    assert found.n_contrasts == 0
+    target = content(labels, labels, weights=[0.0])
+    assert target.n_contrasts == 0
     codes = {}
     for label in np.unique(labels.data):
-        rows = found.values[:, labels.data == label]
+        rows = target.values[:, labels.data == label]
         assert (rows == rows[:, :1]).all()  # the same everywhere
         assert np.count_nonzero(rows[:, 0]) == 1  # in one channel
         codes[int(label)] = rows[:, 0]
-    assert found.unit * sum(np.var(v, dtype=np.float64) for v in found.values) == pytest.approx(
+    assert target.unit * sum(np.var(v, dtype=np.float64) for v in target.values) == pytest.approx(
         float(np.var(labels.data, dtype=np.float64)), rel=2e-3
     )
     # 0 and 6 are 8 voxels apart and share a channel; those that touch have different ones.
@@ -87,9 +87,9 @@ def test_labels_are_one_hot():
 def test_labels_that_touch_only_in_a_point_are_told_apart():
     labels = np.zeros((8, 8, 8))
     labels[:4, :4, :4], labels[4:, 4:, 4:] = 1, 2
-    found = content(tetopt.Image(labels), tetopt.Image(labels), weights=[0.0])
-    assert len({tuple(found.values[:, labels == k][:, 0]) for k in (0, 1, 2)}) == 3
-    assert len(found.values) == 3
+    target = content(tetopt.Image(labels), tetopt.Image(labels), weights=[0.0])
+    assert len({tuple(target.values[:, labels == k][:, 0]) for k in (0, 1, 2)}) == 3
+    assert len(target.values) == 3
 
 
 @pytest.mark.parametrize("n", [2, 3])
@@ -100,17 +100,17 @@ def test_sums_of_channels(n):
     images = [tetopt.Image(rng.normal(size=shape)) for _ in range(3)]
     mask = np.zeros(shape)
     mask[2:9, 2:10] = 1.0
-    wanted = content(images, mask=tetopt.Image(mask))._replace(region=None)
+    whole_box = content(images, mask=tetopt.Image(mask))._replace(region=None)
     region = content(images, mask=tetopt.Image(mask)).region
-    mesh = tetopt.lattice(wanted.image, nodes=120)
-    for wanted_ in (wanted, wanted._replace(region=region)):
-        grid_ = channel_grid(wanted_, mesh.points)
-        sums = moment_sums(grid_, to_ticks(wanted.image.to_index(mesh.points), grid_), mesh.cells)
+    mesh = tetopt.lattice(whole_box.image, nodes=120)
+    for target in (whole_box, whole_box._replace(region=region)):
+        grid_ = channel_grid(target, mesh.points)
+        sums = moment_sums(grid_, to_ticks(whole_box.image.to_index(mesh.points), grid_), mesh.cells)
         assert grid_.n_channels == 3
-        owner = cell_of_voxel(wanted.image, mesh).ravel()
-        flat = wanted.values.reshape(3, -1).astype(float)
+        owner = cell_of_voxel(whole_box.image, mesh).ravel()
+        flat = whole_box.values.reshape(3, -1).astype(float)
         rows = [np.ones(len(owner)), flat[0], (flat**2).sum(axis=0), flat[1], flat[2]]
-        if wanted_.region is not None:
+        if target.region is not None:
             rows.append(np.where(region.inside.ravel(), -1.0, 1.0))
         expected = np.stack([np.bincount(owner, row, len(mesh.cells)) for row in rows], axis=1)
         np.testing.assert_array_equal(sums, expected[:, : sums.shape[1]])
@@ -120,21 +120,22 @@ def test_sums_of_channels(n):
 def test_beyond_a_mask_the_nearest_value_inside_counts():
     image, mask = shaped("ball", OBLIQUE)
     far = tetopt.Image(np.where(mask.data > 0, image.data, -1e6), image.affine)
-    found = content(far, mask=mask)
-    assert found.image.data.min() > -1e3
+    target = content(far, mask=mask)
+    assert target.image.data.min() > -1e3
     whole = continued(far, mask)
-    np.testing.assert_array_equal(whole.data, found.image.data)
+    np.testing.assert_array_equal(whole.data, target.image.data)
+    np.testing.assert_array_equal(continued(far, target.continuation).data, whole.data)
     # The same place in the world, and the same voxels inside.
-    index = image.to_index(found.image.to_world(grid(found.image.shape)))
+    index = image.to_index(target.image.to_world(grid(target.image.shape)))
     start = np.rint(index[0, 0, 0]).astype(int)
-    np.testing.assert_allclose(index - start, grid(found.image.shape), atol=1e-9)
-    part = tuple(slice(s, s + n) for s, n in zip(start, found.image.shape, strict=True))
+    np.testing.assert_allclose(index - start, grid(target.image.shape), atol=1e-9)
+    part = tuple(slice(s, s + n) for s, n in zip(start, target.image.shape, strict=True))
     inside = mask.data[part] > 0
-    assert inside.sum() == mask.data.sum() == found.n_voxels
-    np.testing.assert_array_equal(found.image.data[inside], image.data[part][inside])
-    np.testing.assert_array_equal(found.region.inside, inside)
-    assert found.variance == pytest.approx(float(np.var(image.data[mask.data > 0], dtype=np.float64)), rel=1e-9)
-    assert found.volume == pytest.approx(mask.data.sum() * image.voxel_volume)
+    assert inside.sum() == mask.data.sum() == target.n_voxels
+    np.testing.assert_array_equal(target.image.data[inside], image.data[part][inside])
+    np.testing.assert_array_equal(target.region.inside, inside)
+    assert target.variance == pytest.approx(float(np.var(image.data[mask.data > 0], dtype=np.float64)), rel=1e-9)
+    assert target.volume == pytest.approx(mask.data.sum() * image.voxel_volume)
 
 
 def test_noise_within_a_mask():
@@ -152,9 +153,9 @@ def test_float_labels_of_256_cubed():
     data[40:200, 40:200, 40:120] = 3.0
     data[40:200, 40:200, 120:200] = 7.0
     labels = tetopt.Image(data)
-    found = content(labels, labels, weights=[0.0])
-    assert found.values.shape == (3, 256, 256, 256)
-    assert found.values.nbytes <= 12 * data.size
+    target = content(labels, labels, weights=[0.0])
+    assert target.values.shape == (3, 256, 256, 256)
+    assert target.values.nbytes <= 12 * data.size
 
 
 @pytest.mark.parametrize(
@@ -179,7 +180,7 @@ def test_float_labels_of_256_cubed():
     ],
 )
 def test_refused(change, message):
-    given = {"images": contrasts()} | change
+    arguments = {"images": contrasts()} | change
     with pytest.raises(tetopt.InputError) as error:
-        content(**given)
+        content(**arguments)
     assert str(error.value).startswith(message)

@@ -116,11 +116,11 @@ def test_clipped(kind):
     mesh = lattice_within(image, region_of(mask), spacing=2.5)
     assert tetopt.check_mesh(mesh, is_whole=False) == []
     assert tetopt.quality(mesh.points, mesh.cells).min_dihedral > 1.0
-    found = mask_fidelity(mask, mesh)
-    assert found.dice > 0.97
-    assert found.mesh_components == found.components
-    assert found.mesh_euler == found.euler
-    assert found.distance_mean < 0.25
+    fidelity = mask_fidelity(mask, mesh)
+    assert fidelity.dice > 0.97
+    assert fidelity.mesh_components == fidelity.components
+    assert fidelity.mesh_euler == fidelity.euler
+    assert fidelity.distance_mean < 0.25
 
 
 def test_wanted_nodes_within_a_mask():
