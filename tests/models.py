@@ -39,11 +39,11 @@ def sample_model(n=3, bins=3):
     sets = standard_sets(mesh, box_of(image), labels)
     corner = ",".join(str(x) for x in mesh.points[0])
     sets = with_requested(mesh, sets, ["dark=below:20", f"corner=point:{corner}:12"], fields["mean"])
-    made = materials(1.0 + fields["mean"] / 7.0, np.where(labels == 1, 0.3, 0.45), len(mesh.cells))
+    table = materials(1.0 + fields["mean"] / 7.0, np.where(labels == 1, 0.3, 0.45), len(mesh.cells))
     if bins is not None:
-        made = binned(made, volumes(mesh.points, mesh.cells), bins)
+        table = binned(table, volumes(mesh.points, mesh.cells), bins)
     loads = parse_loads(["compress:5%"], mesh, sets)
-    return Model(mesh, fields, sets, made, loads, about=dict(ABOUT))
+    return Model(mesh, fields, sets, table, loads, about=dict(ABOUT))
 
 
 def young_of(model):

@@ -50,12 +50,12 @@ def plain_cg(K, b, rtol):
 def test_eigenvalues_are_those_of_the_full_matrix(n, blocks, is_bonded, method):
     equations = system(n, blocks, is_bonded=is_bonded)
     values = np.linalg.eigvalsh(equations.K_ff.toarray())
-    found = conditioning(equations, method=method)
-    assert found.lambda_max == pytest.approx(values[-1], rel=1e-9)
-    assert found.lambda_min == pytest.approx(values[0], rel=1e-7)
-    assert found.cond == pytest.approx(np.linalg.cond(equations.K_ff.toarray()), rel=1e-6)
-    assert found.cond == found.lambda_max / found.lambda_min
-    assert abs(found.cg_iterations - cg_iterations(equations.K_ff, equations.load)) <= 1
+    extremes = conditioning(equations, method=method)
+    assert extremes.lambda_max == pytest.approx(values[-1], rel=1e-9)
+    assert extremes.lambda_min == pytest.approx(values[0], rel=1e-7)
+    assert extremes.cond == pytest.approx(np.linalg.cond(equations.K_ff.toarray()), rel=1e-6)
+    assert extremes.cond == extremes.lambda_max / extremes.lambda_min
+    assert abs(extremes.cg_iterations - cg_iterations(equations.K_ff, equations.load)) <= 1
 
 
 @pytest.mark.parametrize("n_free", [1, 2, 31, 32, 33, 34, 200])
@@ -71,9 +71,9 @@ def test_a_tiny_mesh():
     assert equations.K_ff.shape == (3, 3)
     values = np.linalg.eigvalsh(equations.K_ff.toarray())
     for method in ("auto", "direct", "amg"):
-        found = conditioning(equations, method=method)
-        assert found[:2] == pytest.approx((values[-1], values[0]), rel=1e-13)
-        assert 1 <= found.cg_iterations <= 3
+        extremes = conditioning(equations, method=method)
+        assert extremes[:2] == pytest.approx((values[-1], values[0]), rel=1e-13)
+        assert 1 <= extremes.cg_iterations <= 3
 
 
 def test_multigrid_and_factorisation_agree_on_a_larger_mesh():
@@ -89,7 +89,7 @@ def test_auto_takes_multigrid_for_large_systems(monkeypatch):
     equations = system(2, (8, 8))
     called = []
     original = module.multigrid
-    monkeypatch.setattr(module, "multigrid", lambda given: called.append(1) or original(given))
+    monkeypatch.setattr(module, "multigrid", lambda equations: called.append(1) or original(equations))
     conditioning(equations)
     assert called == []
     monkeypatch.setattr("tetopt.fem.elasticity.DIRECT_DOFS", {2: 10, 3: 10})

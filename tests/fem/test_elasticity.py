@@ -201,9 +201,9 @@ def test_strains_of_a_linear_field(seed, n):
     rng = np.random.default_rng(seed)
     mesh = random_mesh(rng, n)
     slope = rng.normal(size=(n, n))
-    found = strains(mesh, mesh.points @ slope.T)
-    np.testing.assert_allclose(found, np.broadcast_to(0.5 * (slope + slope.T), found.shape), atol=1e-9)
-    np.testing.assert_array_equal(found, found.transpose(0, 2, 1))
+    strain = strains(mesh, mesh.points @ slope.T)
+    np.testing.assert_allclose(strain, np.broadcast_to(0.5 * (slope + slope.T), strain.shape), atol=1e-9)
+    np.testing.assert_array_equal(strain, strain.transpose(0, 2, 1))
 
 
 # Closed forms

@@ -70,16 +70,16 @@ def test_bar_without_sideways_strain(n, flip):
     linear = np.diag([1.5, 2.0, 0.5][3 - n :])
     linear[-1, -1] *= flip
     image = tetopt.Image(np.full((4, 3, 5)[:n], 7.0), affine_of(linear, 3.0))
-    found = reference(image, 0.0, percent=2.0)
-    assert found.strain_energy == pytest.approx(0.5 * 7.0 * 0.02**2 * image.volume, rel=1e-9)
+    exact = reference(image, 0.0, percent=2.0)
+    assert exact.strain_energy == pytest.approx(0.5 * 7.0 * 0.02**2 * image.volume, rel=1e-9)
     expected = np.zeros((n, n))
     expected[-1, -1] = -0.02
-    np.testing.assert_allclose(found.strain, np.broadcast_to(expected, found.strain.shape), atol=1e-9)
-    np.testing.assert_allclose(found.u, found.u_homogeneous, atol=1e-9)
+    np.testing.assert_allclose(exact.strain, np.broadcast_to(expected, exact.strain.shape), atol=1e-9)
+    np.testing.assert_allclose(exact.u, exact.u_homogeneous, atol=1e-9)
     index = np.stack(np.meshgrid(*map(np.arange, image.shape), indexing="ij"), axis=-1).reshape(-1, n)
     along = image.to_world(index.astype(float))[:, -1]
     top = along.max() + 0.5 * abs(linear[-1, -1])
-    np.testing.assert_allclose(found.u[:, -1], 0.02 * (top - along), atol=1e-9)
+    np.testing.assert_allclose(exact.u[:, -1], 0.02 * (top - along), atol=1e-9)
 
 
 def test_meshes_tend_to_it():
@@ -87,7 +87,7 @@ def test_meshes_tend_to_it():
     image = tetopt.load_phantom("sphere").image(voxel_mm=3.0)
     image = tetopt.Image(1.0 + image.data.astype(float) / image.data.max() * 5.0, image.affine)
     labels = tetopt.load_phantom("sphere").label_image(voxel_mm=3.0).data
-    found = reference(image, 0.3)
+    exact = reference(image, 0.3)
     errors = []
     for nodes in (100, 700, 5000):
         mesh = tetopt.lattice(image, nodes=nodes)
@@ -95,7 +95,7 @@ def test_meshes_tend_to_it():
         push = [0.0, 0.0, 0.01 * np.ptp(mesh.points[:, 2])]
         young = cell_young(image, mesh)
         pressed = compression(mesh, young, 0.3, fixed_nodes=top, pushed_nodes=bottom, displacement=push)
-        errors.append(compare(found, mesh, pressed.u, pressed.strain_energy, labels))
+        errors.append(compare(exact, mesh, pressed.u, pressed.strain_energy, labels))
     energy, displacement, strain = (np.array(column) for column in zip(*errors, strict=True))
     assert np.all(np.diff(energy) < 0)
     assert np.all(np.diff(displacement) < 0)
@@ -120,11 +120,11 @@ def test_errors_of_a_known_field():
     slope, shift = rng.normal(size=(3, 3)), rng.normal(size=3)
     labels = np.zeros(image.shape)
     labels[:3] = 1
-    found = linear_reference(image, slope, shift)
+    exact = linear_reference(image, slope, shift)
     u = mesh.points @ slope.T + shift
-    np.testing.assert_allclose(compare(found, mesh, u, 2.0, labels), 0.0, atol=1e-12)
-    np.testing.assert_allclose(compare(found, mesh, 1.1 * u, 1.8, labels), 0.1, rtol=1e-9)
-    assert compare(found, mesh, u, 2.0, np.zeros(image.shape)).interface_strain is None
+    np.testing.assert_allclose(compare(exact, mesh, u, 2.0, labels), 0.0, atol=1e-12)
+    np.testing.assert_allclose(compare(exact, mesh, 1.1 * u, 1.8, labels), 0.1, rtol=1e-9)
+    assert compare(exact, mesh, u, 2.0, np.zeros(image.shape)).interface_strain is None
 
 
 def test_near_interface_by_brute_force():
@@ -132,7 +132,7 @@ def test_near_interface_by_brute_force():
     labels = np.zeros((9, 8, 7), dtype=int)
     labels[2:4, 3, 2:5] = 1
     labels[7:, 6:, :] = 2
-    found = near_interface(labels)
+    is_near = near_interface(labels)
     edges = []
     for voxel in np.ndindex(*labels.shape):
         for axis in range(3):
@@ -143,7 +143,7 @@ def test_near_interface_by_brute_force():
                     edges.append(voxel)
     edges = np.array(edges)
     for voxel in rng.permutation(list(np.ndindex(*labels.shape)))[:200]:
-        assert found[tuple(voxel)] == (np.linalg.norm(edges - voxel, axis=1).min() <= 1.5)
+        assert is_near[tuple(voxel)] == (np.linalg.norm(edges - voxel, axis=1).min() <= 1.5)
 
 
 def test_averaged_keeps_box_and_mean():
@@ -180,9 +180,9 @@ def test_homogeneous_block_has_no_displacement_error():
     image = tetopt.Image(np.full((6, 5, 4), 3.0))
     mesh = tetopt.lattice(image, nodes=40)
     bottom, top = box_faces(image, mesh)
-    found = reference(image, 0.3)
+    exact = reference(image, 0.3)
     pressed = compression(mesh, 3.0, 0.3, fixed_nodes=top, pushed_nodes=bottom, displacement=[0.0, 0.0, 0.04])
-    errors = compare(found, mesh, pressed.u, pressed.strain_energy, np.zeros(image.shape))
+    errors = compare(exact, mesh, pressed.u, pressed.strain_energy, np.zeros(image.shape))
     assert errors.displacement is None
     assert errors.interface_strain is None
 
@@ -192,16 +192,16 @@ def test_errors_are_relative_to_what_the_image_does():
     rng = np.random.default_rng(4)
     image = tetopt.Image(rng.uniform(1.0, 2.0, (12, 6, 5)))
     mesh = tetopt.lattice(image, nodes=60)
-    found = linear_reference(image, rng.normal(size=(3, 3)), rng.normal(size=3))
-    strain = np.array(found.strain)
+    exact = linear_reference(image, rng.normal(size=(3, 3)), rng.normal(size=3))
+    strain = np.array(exact.strain)
     labels = np.zeros(image.shape)
     labels[:3] = 1
     strain[~near_interface(labels).ravel()] *= 5.0
-    found = found._replace(u_homogeneous=0.5 * found.u, strain=strain)
+    exact = exact._replace(u_homogeneous=0.5 * exact.u, strain=strain)
     owner = tetopt.cell_of_voxel(image, mesh)
     assert (owner >= 0).all()
     u = np.zeros_like(mesh.points)
-    errors = compare(found, mesh, u, 2.0, labels)
+    errors = compare(exact, mesh, u, 2.0, labels)
     assert errors.displacement == pytest.approx(2.0)
     assert errors.interface_strain == pytest.approx(1.0)
 

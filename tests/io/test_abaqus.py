@@ -40,47 +40,47 @@ def read_by_meshio(content):
 
 def blocks_of(content):
     """(keyword, parameters, data lines split at commas) of each keyword, by the manual's syntax rules."""
-    found = []
+    blocks = []
     for line in content.decode().splitlines():
         if line.startswith("**"):
             continue
         words = [word.strip() for word in line.split(",")]
         if line.startswith("*"):
             parameters = dict((part.strip() for part in word.split("=")) for word in words[1:])
-            found.append((words[0], parameters, []))
+            blocks.append((words[0], parameters, []))
         else:
-            found[-1][2].append(words)
-    return found
+            blocks[-1][2].append(words)
+    return blocks
 
 
 def named(content, keyword):
     """Data lines of each block of a keyword, by the value of its first parameter."""
-    return {next(iter(given.values())): data for word, given, data in blocks_of(content) if word == keyword}
+    return {next(iter(parameters.values())): data for word, parameters, data in blocks_of(content) if word == keyword}
 
 
 def test_meshio_reads_points_and_cells_back(model):
-    found = read_by_meshio(abaqus(model))
-    (block,) = found.cells
+    file = read_by_meshio(abaqus(model))
+    (block,) = file.cells
     n_nodes, n_cells = len(model.mesh.points), len(model.mesh.cells)
-    np.testing.assert_array_equal(found.points[:n_nodes], model.mesh.points)
+    np.testing.assert_array_equal(file.points[:n_nodes], model.mesh.points)
     np.testing.assert_array_equal(block.data[:, :4], model.mesh.cells)
     if model.order == 1:
         assert block.type == "tetra"
-        assert len(found.points) == n_nodes
+        assert len(file.points) == n_nodes
         return
     assert block.type == "tetra10"
     assert block.data.shape == (n_cells, 10)
-    ends = found.points[block.data[:, np.array(MIDPOINTS) - 1]]
-    np.testing.assert_allclose(found.points[block.data[:, 4:]], ends.mean(axis=2), rtol=1e-15, atol=1e-17)
-    assert len(np.unique(block.data)) == len(found.points)
-    assert len(np.unique(found.points, axis=0)) == len(found.points)
+    ends = file.points[block.data[:, np.array(MIDPOINTS) - 1]]
+    np.testing.assert_allclose(file.points[block.data[:, 4:]], ends.mean(axis=2), rtol=1e-15, atol=1e-17)
+    assert len(np.unique(block.data)) == len(file.points)
+    assert len(np.unique(file.points, axis=0)) == len(file.points)
 
 
 def test_meshio_reads_node_and_cell_sets_back(model):
-    found = read_by_meshio(abaqus(model))
-    assert list(found.point_sets) == list(model.sets.facets)
+    file = read_by_meshio(abaqus(model))
+    assert list(file.point_sets) == list(model.sets.facets)
     for name, rows in model.sets.facets.items():
-        nodes = found.point_sets[name]
+        nodes = file.point_sets[name]
         assert len(np.unique(nodes)) == len(nodes)
         is_corner = nodes < len(model.mesh.points)
         np.testing.assert_array_equal(nodes[is_corner], nodes_of(model.mesh, rows))
@@ -88,23 +88,23 @@ def test_meshio_reads_node_and_cell_sets_back(model):
         edges = np.unique(np.concatenate([corners[:, pair] for pair in ([0, 1], [1, 2], [0, 2])]), axis=0)
         middles = model.mesh.points[edges].mean(axis=1) if model.order == 2 else np.empty((0, 3))
         np.testing.assert_allclose(
-            np.unique(found.points[nodes[~is_corner]], axis=0), np.unique(middles, axis=0), rtol=1e-15, atol=1e-17
+            np.unique(file.points[nodes[~is_corner]], axis=0), np.unique(middles, axis=0), rtol=1e-15, atol=1e-17
         )
-    own = {name for name in found.cell_sets if name == "all_cells" or name.startswith("material_")}
-    assert [name for name in found.cell_sets if name not in own] == list(model.sets.cells)
+    own = {name for name in file.cell_sets if name == "all_cells" or name.startswith("material_")}
+    assert [name for name in file.cell_sets if name not in own] == list(model.sets.cells)
     for name, cells in {**model.sets.cells, "all_cells": np.arange(len(model.mesh.cells))}.items():
-        np.testing.assert_array_equal(found.cell_sets[name][0], cells)
+        np.testing.assert_array_equal(file.cell_sets[name][0], cells)
 
 
 def test_surfaces_are_the_facets_by_the_manual_s_faces(model):
     surfaces = named(abaqus(model), "*SURFACE")
     assert list(surfaces) == list(model.sets.facets)
     for name, rows in model.sets.facets.items():
-        found = [[model.mesh.cells[int(cell) - 1][k - 1] for k in FACES[face]] for cell, face in surfaces[name]]
+        nodes = [[model.mesh.cells[int(cell) - 1][k - 1] for k in FACES[face]] for cell, face in surfaces[name]]
         np.testing.assert_array_equal([int(cell) - 1 for cell, _ in surfaces[name]], rows[:, 0])
         # Faces are listed as seen from outside, clockwise: the same nodes, turned the other way.
         expected = facet_triples(model.mesh.cells, rows)
-        np.testing.assert_array_equal(np.sort(found, axis=1), np.sort(expected, axis=1))
+        np.testing.assert_array_equal(np.sort(nodes, axis=1), np.sort(expected, axis=1))
     assert {face for data in surfaces.values() for _, face in data} == set(FACES)
 
 
@@ -114,8 +114,8 @@ def test_each_cell_has_its_material_and_no_other(model):
     words = blocks_of(content)
     elastic = {words[k - 1][1]["NAME"]: data for k, (word, _, data) in enumerate(words) if word == "*ELASTIC"}
     assert list(elastic) == list(sections) == [f"material_{k + 1}" for k in range(len(model.materials.young))]
-    links = [given for word, given, _ in words if word == "*SOLID SECTION"]
-    assert all(given["ELSET"] == given["MATERIAL"] for given in links)
+    links = [parameters for word, parameters, _ in words if word == "*SOLID SECTION"]
+    assert all(parameters["ELSET"] == parameters["MATERIAL"] for parameters in links)
     constants = np.full((len(model.mesh.cells), 2), np.nan)
     for name, ((young, nu),) in elastic.items():
         cells = [int(cell) - 1 for line in elements[name] for cell in line]
@@ -134,11 +134,11 @@ def test_the_step_holds_and_moves_all_three_components():
         *("*STEP", "*STATIC", "*BOUNDARY", "*NODE FILE", "*EL FILE", "*EL PRINT", "*NODE PRINT", "*NODE PRINT"),
         "*END STEP",
     ]
-    (held,) = (data for word, _, data in words if word == "*BOUNDARY")
+    (conditions,) = (data for word, _, data in words if word == "*BOUNDARY")
     expected = [["superior", d, d, "0.0"] for d in "123"]
     expected += [["inferior", d, d, value] for d, value in zip("123", ("0.5", "-0.25", "1.0"), strict=True)]
-    assert held == expected
-    assert [given["NSET"] for word, given, _ in words if word == "*NODE PRINT"] == ["superior", "inferior"]
+    assert conditions == expected
+    assert [parameters["NSET"] for word, parameters, _ in words if word == "*NODE PRINT"] == ["superior", "inferior"]
 
 
 def test_without_loads_no_step_and_without_materials_no_sections():
@@ -168,12 +168,14 @@ def test_lines_keep_to_the_manual_s_limits(model):
     assert content.endswith(b"\n")
     assert max(map(len, content.splitlines())) <= 256
     names = Counter()
-    for word, given, data in blocks_of(content):
+    for word, parameters, data in blocks_of(content):
         assert re.fullmatch(r"\*[A-Z ]+", word)
         assert all(len(line) <= 16 for line in data)
         if word == "*HEADING":
             continue
-        names.update((word, key, value.lower()) for key, value in given.items() if key in ("NSET", "ELSET", "NAME"))
+        names.update(
+            (word, key, value.lower()) for key, value in parameters.items() if key in ("NSET", "ELSET", "NAME")
+        )
         assert all(re.fullmatch(r"[A-Za-z0-9_.+-]{1,80}", text) for line in data for text in line)
         numbers = [text for line in data for text in line if re.match(r"[-0-9]", text)]
         assert max(map(len, numbers), default=0) <= 20
@@ -197,8 +199,8 @@ def test_numbers_of_more_than_twenty_characters_are_rounded_to_fit(value):
     np.testing.assert_allclose(read_by_meshio(content).points, mesh.points, rtol=5e-13, atol=0.0)
     ((young, nu),) = next(data for word, _, data in blocks_of(content) if word == "*ELASTIC")
     np.testing.assert_allclose([float(young), float(nu)], [-11.0 * value, 1.0 / 30.0], rtol=5e-13)
-    (held,) = (data for word, _, data in blocks_of(content) if word == "*BOUNDARY")
-    np.testing.assert_allclose([float(line[3]) for line in held], value, rtol=5e-13)
+    (conditions,) = (data for word, _, data in blocks_of(content) if word == "*BOUNDARY")
+    np.testing.assert_allclose([float(line[3]) for line in conditions], value, rtol=5e-13)
 
 
 def test_what_the_format_cannot_carry_is_refused():

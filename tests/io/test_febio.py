@@ -63,36 +63,38 @@ class Feb:
         self.node_sets = {element.get("name"): listed(element) - 1 for element in mesh.findall("NodeSet")}
         self.cell_sets = {element.get("name"): listed(element) - 1 for element in mesh.findall("ElementSet")}
         self.data = {}
-        for found in self.root.findall("MeshData/ElementData"):
-            lid, values = rows_of(found, "elem", "lid")
-            of_cell = self.data.setdefault(found.get("name"), np.full(len(self.cells), np.inf))
-            of_cell[self.parts[found.get("elem_set")][lid - 1] - 1] = values[:, 0]
+        for entry in self.root.findall("MeshData/ElementData"):
+            lid, values = rows_of(entry, "elem", "lid")
+            of_cell = self.data.setdefault(entry.get("name"), np.full(len(self.cells), np.inf))
+            of_cell[self.parts[entry.get("elem_set")][lid - 1] - 1] = values[:, 0]
 
     def moduli(self, tag):
         """A parameter of every cell, from its material or through the map that it names."""
         material_of = {m.get("name"): m for m in self.root.find("Material")}
         result = np.full(len(self.cells), np.nan)
         for domain in self.root.find("MeshDomains"):
-            found, ids = material_of[domain.get("mat")].find(tag), self.parts[domain.get("name")]
-            result[ids - 1] = self.data[found.text][ids - 1] if found.get("type") == "map" else float(found.text)
+            parameter, ids = material_of[domain.get("mat")].find(tag), self.parts[domain.get("name")]
+            result[ids - 1] = (
+                self.data[parameter.text][ids - 1] if parameter.get("type") == "map" else float(parameter.text)
+            )
         return result
 
 
 def assert_same(feb, model):
-    mesh, sets, given = model.mesh, model.sets, model.materials
+    mesh, sets, table = model.mesh, model.sets, model.materials
     assert feb.type == "tet4"
     np.testing.assert_array_equal(feb.node_ids, np.arange(1, len(mesh.points) + 1))
     assert feb.points.tobytes() == mesh.points.tobytes()
     np.testing.assert_array_equal(feb.cells, mesh.cells)
     assert list(feb.surfaces) == list(feb.node_sets) == list(sets.facets)
-    for name, found in sets.facets.items():
-        np.testing.assert_array_equal(feb.surfaces[name], facet_triples(mesh.cells, found))
-        np.testing.assert_array_equal(feb.node_sets[name], nodes_of(mesh, found))
+    for name, members in sets.facets.items():
+        np.testing.assert_array_equal(feb.surfaces[name], facet_triples(mesh.cells, members))
+        np.testing.assert_array_equal(feb.node_sets[name], nodes_of(mesh, members))
     assert list(feb.cell_sets) == list(sets.cells)
     for name, cells in sets.cells.items():
         np.testing.assert_array_equal(feb.cell_sets[name], cells)
-    np.testing.assert_array_equal(feb.moduli("E"), given.young[given.of_cell])
-    np.testing.assert_array_equal(feb.moduli("v"), given.nu[given.of_cell])
+    np.testing.assert_array_equal(feb.moduli("E"), table.young[table.of_cell])
+    np.testing.assert_array_equal(feb.moduli("v"), table.nu[table.of_cell])
     for name, values in model.cell_data.items():
         np.testing.assert_array_equal(feb.data[name], values)
 
@@ -132,8 +134,8 @@ def test_quadratic():
     assert feb.type == "tet10"
     assert feb.points.tobytes() == points.tobytes()
     np.testing.assert_array_equal(feb.cells, cells)
-    for name, found in model.sets.facets.items():
-        nodes = quadratic_facet_nodes(cells, found)
+    for name, members in model.sets.facets.items():
+        nodes = quadratic_facet_nodes(cells, members)
         np.testing.assert_array_equal(feb.surfaces[name], nodes)
         np.testing.assert_array_equal(feb.node_sets[name], np.unique(nodes))
 
@@ -200,8 +202,8 @@ def test_sections_are_those_of_pyfebio():
         expected = []
         for load in model.loads:
             if not load.displacement.any():
-                held = pyfebio.boundary.BCZeroDisplacement(node_set=load.set_name, x_dof=1, y_dof=1, z_dof=1)
-                expected.append(held.to_xml())
+                condition = pyfebio.boundary.BCZeroDisplacement(node_set=load.set_name, x_dof=1, y_dof=1, z_dof=1)
+                expected.append(condition.to_xml())
                 continue
             for dof, value in zip("xyz", load.displacement.tolist(), strict=True):
                 moved = pyfebio.boundary.Value(lc=1, text=value)
@@ -219,7 +221,7 @@ def test_units_are_consistent_with_mm():
         feb = Feb(febio(model))
         assert_same(feb, model)
         assert feb.root.find("Module/units").text == name
-        assert {float(found.text) for found in feb.root.iter("density")} == {density}
+        assert {float(element.text) for element in feb.root.iter("density")} == {density}
 
 
 def test_awkward_names():

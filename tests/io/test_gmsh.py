@@ -49,13 +49,13 @@ class Read:
                 self.read_view(lines[1:])
 
     def section(self, name):
-        (found,) = [lines[1:] for lines in self.sections if lines[0] == name]
-        return [line.split() for line in found]
+        (section,) = [lines[1:] for lines in self.sections if lines[0] == name]
+        return [line.split() for line in section]
 
     @property
     def comments(self):
-        (found,) = [lines[1:] for lines in self.sections if lines[0] == "Comments"]
-        return found
+        (section,) = [lines[1:] for lines in self.sections if lines[0] == "Comments"]
+        return section
 
     def add(self, kind, number, entity, groups, nodes):
         assert number not in self.elements
@@ -148,12 +148,12 @@ def test_points_and_cells_are_those_of_the_mesh(version, n, bins):
 def test_each_cell_is_in_the_one_group_of_its_material(version, n, bins):
     model = sample_model(n, bins)
     read = Read(WRITERS[version](model))
-    found = {name: members for (dim, name), members in read.groups.items() if dim == n}
+    groups = {name: members for (dim, name), members in read.groups.items() if dim == n}
     of_cell = model.materials.of_cell
-    assert {name: sorted(members) for name, members in found.items()} == {
+    assert {name: sorted(members) for name, members in groups.items()} == {
         f"material_{k + 1}": (np.flatnonzero(of_cell == k) + 1).tolist() for k in range(len(model.materials.young))
     }
-    assert [read.names[n, k + 1] for k in range(len(found))] == [f"material_{k + 1}" for k in range(len(found))]
+    assert [read.names[n, k + 1] for k in range(len(groups))] == [f"material_{k + 1}" for k in range(len(groups))]
 
 
 @pytest.mark.parametrize("version", WRITERS)
@@ -223,10 +223,10 @@ def test_views_hold_cell_data_materials_and_cell_sets(n, bins):
     several = np.random.default_rng(0).normal(size=(len(model.mesh.cells), 2))
     model = model._replace(cell_data={**model.cell_data, "contrast": several})
     read = Read(gmsh41(model))
-    made, numbers = model.materials, cell_numbers(model)
+    table, numbers = model.materials, cell_numbers(model)
     expected = {name: values for name, values in model.cell_data.items() if name != "contrast"}
     expected |= {"contrast_0": several[:, 0], "contrast_1": several[:, 1]}
-    expected |= {"young": made.young[made.of_cell], "nu": made.nu[made.of_cell]}
+    expected |= {"young": table.young[table.of_cell], "nu": table.nu[table.of_cell]}
     expected |= {name: np.isin(np.arange(len(numbers)), members) for name, members in model.sets.cells.items()}
     assert set(read.views) == set(expected)
     for name, values in expected.items():
@@ -281,12 +281,12 @@ def test_quadratic_cells(version):
     read = Read(WRITERS[version](model))
     points, cells = quadratic(model.mesh)
     assert np.array_equal(read.points, points)
-    found = read.nodes(cell_numbers(model))
-    assert np.array_equal(np.sort(found), np.sort(cells))
-    assert np.array_equal(found[:, :4], model.mesh.cells)
+    nodes = read.nodes(cell_numbers(model))
+    assert np.array_equal(np.sort(nodes), np.sort(cells))
+    assert np.array_equal(nodes[:, :4], model.mesh.cells)
     ends = [(0, 1), (1, 2), (0, 2), (0, 3), (2, 3), (1, 3)]
     for at, edge in enumerate(ends, 4):
-        assert np.array_equal(points[found[:, at]], points[found[:, edge]].mean(axis=1))
+        assert np.array_equal(points[nodes[:, at]], points[nodes[:, edge]].mean(axis=1))
     sides = read.nodes(read.groups[2, "left"])
     assert each_once(sides[:, :3]) == each_once(facet_triples(model.mesh.cells, model.sets.facets["left"]))
     for at, edge in enumerate([(0, 1), (1, 2), (2, 0)], 3):
@@ -300,8 +300,8 @@ def test_quadratic_cells(version):
 def test_without_materials_disjoint_cell_sets_are_groups(version):
     model = sample_model()._replace(materials=None)
     read = Read(WRITERS[version](model))
-    found = {name: sorted(members) for (dim, name), members in read.groups.items() if dim == 3}
-    assert found == {name: (model.sets.cells[name] + 1).tolist() for name in ("label_0", "label_1")}
+    groups = {name: sorted(members) for (dim, name), members in read.groups.items() if dim == 3}
+    assert groups == {name: (model.sets.cells[name] + 1).tolist() for name in ("label_0", "label_1")}
     assert sorted(read.cells_of_set("dark")) == model.sets.cells["dark"].tolist()
     assert "young" not in read.views
 
@@ -311,9 +311,9 @@ def test_cells_of_no_set_are_unnamed(version):
     sets = Sets({"a": np.array([[0, 0]])}, {"a": np.array([5]), "b": np.array([7, 9]), "c": np.array([9])})
     model = sample_model()._replace(materials=None, sets=sets)
     read = Read(WRITERS[version](model))
-    found = {name: sorted(members) for (dim, name), members in read.groups.items() if dim == 3}
-    assert found.pop("b") == [8, 10]
-    assert found == {"unnamed": [k for k in cell_numbers(model) if k not in (8, 10)]}
+    groups = {name: sorted(members) for (dim, name), members in read.groups.items() if dim == 3}
+    assert groups.pop("b") == [8, 10]
+    assert groups == {"unnamed": [k for k in cell_numbers(model) if k not in (8, 10)]}
     assert [read.cells_of_set(name) for name in "ac"] == [[5], [9]]
 
 
@@ -405,16 +405,16 @@ def test_our_reader_finds_the_model(version, n, space, bins, tmp_path, monkeypat
         np.testing.assert_array_equal(back.sets.cells[name], np.flatnonzero(np.isin(of_cell, members)))
     assert set(back.sets.facets) == set(model.sets.facets)
     for name, rows in model.sets.facets.items():
-        found = facet_triples(back.mesh.cells, back.sets.facets[name])
-        assert each_once(found) == each_once(facet_triples(model.mesh.cells, rows))
+        triples = facet_triples(back.mesh.cells, back.sets.facets[name])
+        assert each_once(triples) == each_once(facet_triples(model.mesh.cells, rows))
 
 
 def test_what_was_read_can_be_written_again(tmp_path):
     save_model(tmp_path / "a.msh", sample_model(3))
     back = load_mesh(tmp_path / "a.msh")
     again = sample_model(3)._replace(mesh=back.mesh, cell_data=back.cell_data, sets=back.sets)
-    made = materials(back.cell_data["young"], back.cell_data["nu"], len(back.mesh.cells))
-    save_model(tmp_path / "b.msh", again._replace(materials=made, loads=()))
+    table = materials(back.cell_data["young"], back.cell_data["nu"], len(back.mesh.cells))
+    save_model(tmp_path / "b.msh", again._replace(materials=table, loads=()))
     for name in ("young", "nu"):
         np.testing.assert_array_equal(
             np.sort(load_mesh(tmp_path / "b.msh").cell_data[name]), np.sort(back.cell_data[name])
@@ -480,8 +480,8 @@ def test_meshio_reads_it(version, n, bins, tmp_path):
     assert np.array_equal(mean[order[1]], model.cell_data["mean"][order[0]])
     for name, rows in model.sets.facets.items():
         members = [block.data[chosen] for block, chosen in zip(read.cells, read.cell_sets[name], strict=True)]
-        found = np.concatenate([nodes for nodes in members if len(nodes)])
-        assert each_once(found) == each_once(facet_triples(model.mesh.cells, rows))
+        triples = np.concatenate([nodes for nodes in members if len(nodes)])
+        assert each_once(triples) == each_once(facet_triples(model.mesh.cells, rows))
 
 
 # gmsh is GPL: its library is loaded by a process of its own
@@ -526,14 +526,14 @@ def test_gmsh_reads_it(version, n, bins, tmp_path):
     points = np.array(points).reshape(-1, 3)[np.argsort(order)]
     assert np.array_equal(points[:, :n], model.mesh.points)
     for name, rows in model.sets.facets.items():
-        found = np.array([each for _, each in groups.pop(f"{n - 1} {name}")]) - 1
-        assert each_once(found) == each_once(facet_triples(model.mesh.cells, rows))
+        triples = np.array([each for _, each in groups.pop(f"{n - 1} {name}")]) - 1
+        assert each_once(triples) == each_once(facet_triples(model.mesh.cells, rows))
         assert sorted(nodes[f"{n - 1} {name}"]) == (nodes_of(model.mesh, rows) + 1).tolist()
     for k in range(len(model.materials.young)):
         members = np.flatnonzero(model.materials.of_cell == k)
-        found = sorted(groups.pop(f"{n} material_{k + 1}"))
-        assert [number for number, _ in found] == (members + 1).tolist()
-        assert np.array_equal(np.array([each for _, each in found]) - 1, model.mesh.cells[members])
+        triples = sorted(groups.pop(f"{n} material_{k + 1}"))
+        assert [number for number, _ in triples] == (members + 1).tolist()
+        assert np.array_equal(np.array([each for _, each in triples]) - 1, model.mesh.cells[members])
     assert groups == {}
     assert ("young" in views) == (version == "4.1")
     if version == "4.1":

@@ -95,8 +95,8 @@ def test_constants_image_and_loads_are_in_comments():
     read = Read(medit(model))
     young, nu = np.zeros(len(model.mesh.cells)), np.zeros(len(model.mesh.cells))
     for line in read.comments:
-        if found := re.fullmatch(r"(material_\d+): young (\S+) MPa, nu (\S+)", line):
-            young[read.cells_of(found[1])], nu[read.cells_of(found[1])] = float(found[2]), float(found[3])
+        if match := re.fullmatch(r"(material_\d+): young (\S+) MPa, nu (\S+)", line):
+            young[read.cells_of(match[1])], nu[read.cells_of(match[1])] = float(match[2]), float(match[3])
     assert np.array_equal(young, young_of(model))
     assert np.array_equal(nu, model.materials.nu[model.materials.of_cell])
     assert f"image: {ABOUT['image']}, sha256 {ABOUT['image_sha256']}" in read.comments
@@ -139,8 +139,8 @@ def test_meshio_reads_it(n, bins, tmp_path):
     cells, sides = read.cells
     assert np.array_equal(cells.data, model.mesh.cells)
     assert np.array_equal(sides.data, ours.nodes[KEYWORD[n - 1]])
-    for found, keyword in zip(read.cell_data["medit:ref"], (KEYWORD[n], KEYWORD[n - 1]), strict=True):
-        assert np.array_equal(found, ours.refs[keyword])
+    for refs, keyword in zip(read.cell_data["medit:ref"], (KEYWORD[n], KEYWORD[n - 1]), strict=True):
+        assert np.array_equal(refs, ours.refs[keyword])
 
 
 # gmsh is GPL: its library is loaded by a process of its own

@@ -449,7 +449,7 @@ def test_another_vtk_data_set(tmp_path, assert_refused):
 
 
 @pytest.mark.parametrize(
-    ("cells", "found"),
+    ("cells", "words"),
     [
         ({TETRA: [[0, 1, 2, 3]], QUAD: [[0, 1, 4, 2]]}, "found quad"),
         ({QUADRATIC: [[0, 1, 2, 3, 4, 5, 0, 1, 2, 3]]}, "expected linear tetrahedra.*found quadratic_tetra"),
@@ -458,9 +458,9 @@ def test_another_vtk_data_set(tmp_path, assert_refused):
         ({HEXAHEDRON: [[0, 1, 2, 3, 4, 5, 0, 1]]}, "found hexahedron"),
     ],
 )
-def test_other_and_mixed_cells(tmp_path, cells, found, assert_refused):
+def test_other_and_mixed_cells(tmp_path, cells, words, assert_refused):
     write_grid(tmp_path / "a.vtu", cells, POINTS)
-    assert_refused(tmp_path / "a.vtu", found)
+    assert_refused(tmp_path / "a.vtu", words)
 
 
 def test_triangles_on_tetrahedra_are_left_out_and_counted(tmp_path):

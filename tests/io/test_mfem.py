@@ -48,14 +48,14 @@ class Read:
     def sets(self, keyword):
         """Attributes by name: a name in quotes, how many, and which on any number of lines."""
         self.expect(keyword)
-        found = {}
+        sets = {}
         for _ in range(int(self.lines.pop(0))):
             name, count, attributes = self.lines.pop(0).strip('"'), int(self.lines.pop(0)), []
             while len(attributes) < count:
                 attributes += map(int, self.lines.pop(0).split())
             assert len(attributes) == count
-            found[name] = attributes
-        return found
+            sets[name] = attributes
+        return sets
 
     def cells_of(self, name):
         return np.flatnonzero(np.isin(self.attributes, self.cell_sets[name]))
@@ -71,12 +71,12 @@ def test_all_of_the_model_is_there(n, bins):
     assert read.n == n
     assert np.array_equal(read.points, model.mesh.points)
     assert np.array_equal(read.cells, model.mesh.cells)
-    made = model.materials
-    assert set(read.cell_sets) == {*model.sets.cells, *(f"material_{k + 1}" for k in range(len(made.young)))}
+    table = model.materials
+    assert set(read.cell_sets) == {*model.sets.cells, *(f"material_{k + 1}" for k in range(len(table.young)))}
     for name, members in model.sets.cells.items():
         assert np.array_equal(read.cells_of(name), members)
-    for k in range(len(made.young)):
-        assert np.array_equal(read.cells_of(f"material_{k + 1}"), np.flatnonzero(made.of_cell == k))
+    for k in range(len(table.young)):
+        assert np.array_equal(read.cells_of(f"material_{k + 1}"), np.flatnonzero(table.of_cell == k))
     assert list(read.facet_sets) == list(model.sets.facets)
     for name, rows in model.sets.facets.items():
         assert each_once(read.facets_of(name)) == each_once(facet_triples(model.mesh.cells, rows))
@@ -99,10 +99,10 @@ def test_attributes_are_the_materials_where_no_set_divides_one():
 def test_attributes_run_from_one_by_material():
     model = sample_model()
     read = Read(mfem(model))
-    found, first = np.unique(read.attributes, return_index=True)
-    assert found.tolist() == list(range(1, len(found) + 1))
+    distinct, first = np.unique(read.attributes, return_index=True)
+    assert distinct.tolist() == list(range(1, len(distinct) + 1))
     assert (np.diff(model.materials.of_cell[first]) >= 0).all()
-    assert len(found) > len(model.materials.young)  # or else the sets divide none
+    assert len(distinct) > len(model.materials.young)  # or else the sets divide none
 
 
 def test_constants_and_what_attributes_mean_are_in_comments():
@@ -110,8 +110,8 @@ def test_constants_and_what_attributes_mean_are_in_comments():
     read = Read(mfem(model))
     young, nu = np.zeros(len(model.mesh.cells)), np.zeros(len(model.mesh.cells))
     for line in read.comments:
-        if found := re.fullmatch(r"(material_\d+): young (\S+) MPa, nu (\S+)", line):
-            young[read.cells_of(found[1])], nu[read.cells_of(found[1])] = float(found[2]), float(found[3])
+        if match := re.fullmatch(r"(material_\d+): young (\S+) MPa, nu (\S+)", line):
+            young[read.cells_of(match[1])], nu[read.cells_of(match[1])] = float(match[2]), float(match[3])
     assert np.array_equal(young, young_of(model))
     assert np.array_equal(nu, model.materials.nu[model.materials.of_cell])
     for what, sets in (("attribute", read.cell_sets), ("boundary attribute", read.facet_sets)):

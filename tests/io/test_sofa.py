@@ -43,25 +43,25 @@ def solid_of(content):
 
 
 def assert_same(solid, model):
-    mesh, given = model.mesh, model.materials
+    mesh, moduli = model.mesh, model.materials
     topology = solid.find("TetrahedronSetTopologyContainer")
     assert table(topology, "position", float, 3).tobytes() == mesh.points.tobytes()
     np.testing.assert_array_equal(table(topology, "tetrahedra", width=4), mesh.cells)
     law = solid.find("TetrahedronFEMForceField")
-    np.testing.assert_array_equal(table(law, "youngModulus", float), given.young[given.of_cell])
-    np.testing.assert_array_equal(table(law, "poissonRatio", float), given.nu[given.of_cell])
-    found = {node.get("name"): node for node in solid.find("Node[@name='sets']")}
-    assert list(found) == [*model.sets.facets, *model.sets.cells]
+    np.testing.assert_array_equal(table(law, "youngModulus", float), moduli.young[moduli.of_cell])
+    np.testing.assert_array_equal(table(law, "poissonRatio", float), moduli.nu[moduli.of_cell])
+    sets = {node.get("name"): node for node in solid.find("Node[@name='sets']")}
+    assert list(sets) == [*model.sets.facets, *model.sets.cells]
     for name, facets in model.sets.facets.items():
-        assert [(part.tag, part.get("name")) for part in found[name]] == [
+        assert [(part.tag, part.get("name")) for part in sets[name]] == [
             ("PointsFromIndices", "nodes"),
             ("TriangleSetTopologyContainer", "facets"),
         ]
-        np.testing.assert_array_equal(table(found[name][0], "indices"), nodes_of(mesh, facets))
-        np.testing.assert_array_equal(table(found[name][1], "triangles", width=3), facet_triples(mesh.cells, facets))
+        np.testing.assert_array_equal(table(sets[name][0], "indices"), nodes_of(mesh, facets))
+        np.testing.assert_array_equal(table(sets[name][1], "triangles", width=3), facet_triples(mesh.cells, facets))
     for name, cells in model.sets.cells.items():
-        assert [(part.tag, part.get("name")) for part in found[name]] == [("TetrahedronSetTopologyContainer", "cells")]
-        np.testing.assert_array_equal(table(found[name][0], "tetrahedra", width=4), mesh.cells[cells])
+        assert [(part.tag, part.get("name")) for part in sets[name]] == [("TetrahedronSetTopologyContainer", "cells")]
+        np.testing.assert_array_equal(table(sets[name][0], "tetrahedra", width=4), mesh.cells[cells])
 
 
 @pytest.mark.parametrize("bins", [3, None])
@@ -78,8 +78,8 @@ def test_everything_comes_back(bins, space):
 def test_every_component_has_its_plugin():
     root = ET.fromstring(sofa(sample_model()))
     needed = {PLUGIN_OF[element.tag] for element in root.iter()} - {None}
-    asked = [element.get("name") for element in root.iter("RequiredPlugin")]
-    assert sorted(needed) == sorted(asked) == sorted(REQUIRED_PLUGINS)
+    listed = [element.get("name") for element in root.iter("RequiredPlugin")]
+    assert sorted(needed) == sorted(listed) == sorted(REQUIRED_PLUGINS)
     tags = [element.tag for element in root]
     assert max(k for k, tag in enumerate(tags) if tag == "RequiredPlugin") < tags.index("VisualStyle")
 
@@ -87,7 +87,7 @@ def test_every_component_has_its_plugin():
 def test_every_link_leads_to_a_component_that_is_there_already():
     """SOFA makes all components of a node in their order, and then those of its nodes."""
     root = ET.fromstring(sofa(sample_model()))
-    made, n_links = [], 0
+    earlier, n_links = [], 0
     pending = [[root]]  # nodes with those above them
     while pending:
         path = pending.pop(0)
@@ -96,13 +96,13 @@ def test_every_link_leads_to_a_component_that_is_there_already():
                 if value.startswith("@"):
                     ups, name, data = re.fullmatch(r"@((?:\.\./)*)(\w+)(?:\.(\w+))?", value).groups()
                     (target,) = path[-1 - ups.count("/")].findall(f"*[@name='{name}']")
-                    assert target in made
+                    assert target in earlier
                     assert data is None or data in target.attrib
                     n_links += 1
             if element.tag == "Node":
                 pending.append([*path, element])
             else:
-                made.append(element)
+                earlier.append(element)
     assert n_links > 10
 
 
@@ -113,23 +113,23 @@ def test_constraints_are_the_loads():
     for load in model.loads:
         nodes = nodes_of(model.mesh, model.sets.facets[load.set_name])
         kind = ("Fixed", "hold") if not load.displacement.any() else ("LinearMovement", "move")
-        (found,) = solid.findall(f"{kind[0]}ProjectiveConstraint")
-        assert found.get("name") == f"{kind[1]}_{load.set_name}"
-        np.testing.assert_array_equal(table(found, "indices"), nodes)
+        (constraint,) = solid.findall(f"{kind[0]}ProjectiveConstraint")
+        assert constraint.get("name") == f"{kind[1]}_{load.set_name}"
+        np.testing.assert_array_equal(table(constraint, "indices"), nodes)
         if kind[1] == "move":
             whole = load.displacement.tolist()
-            assert table(found, "movements", float, 3).tolist() == [[0.0, 0.0, 0.0], whole, whole]
-            assert table(found, "keyTimes", float).tolist() == [0.0, 1.0, 1e9]
+            assert table(constraint, "movements", float, 3).tolist() == [[0.0, 0.0, 0.0], whole, whole]
+            assert table(constraint, "keyTimes", float).tolist() == [0.0, 1.0, 1e9]
     assert not [e for e in solid_of(sofa(model._replace(loads=()))) if e.tag.endswith("Constraint")]
 
 
 def test_one_ratio_is_one_number():
     model = sample_model(3, None)
-    given = model.materials
-    one = materials(given.young[given.of_cell], 0.4, len(given.of_cell))
+    moduli = model.materials
+    one = materials(moduli.young[moduli.of_cell], 0.4, len(moduli.of_cell))
     law = solid_of(sofa(model._replace(materials=one))).find("TetrahedronFEMForceField")
     assert table(law, "poissonRatio", float).tolist() == [0.4]
-    np.testing.assert_array_equal(table(law, "youngModulus", float), given.young[given.of_cell])
+    np.testing.assert_array_equal(table(law, "youngModulus", float), moduli.young[moduli.of_cell])
 
 
 def test_units_are_consistent_with_mm():

@@ -43,16 +43,16 @@ def some_surface(seed, share=0.5):
 def test_any_surface_is_closed_when_read_back(tmp_path, suffix, seed, share):
     surface, expected = some_surface(seed, share)
     save_surface(tmp_path / f"a{suffix}", surface)
-    found = checked_surface(tmp_path / f"a{suffix}")
+    check = checked_surface(tmp_path / f"a{suffix}")
     volume, area = volume_and_area(surface)
-    assert found[:2] == (True, True)
-    assert found.n_pieces == n_pieces(surface)
+    assert check[:2] == (True, True)
+    assert check.n_pieces == n_pieces(surface)
     # STL's float32 moves a node by 1.5e-5 mm in each direction at 400 mm.
     places = 3e-5 * area if suffix != ".ply" else 1e-9
-    assert found.volume == pytest.approx(volume, abs=places)
-    assert found.area == pytest.approx(area, rel=1e-4 if suffix != ".ply" else 1e-9)
-    assert found.volume == pytest.approx(expected, abs=1.01 * surface.largest_shift * area + places)
-    assert found.volume > 0.0
+    assert check.volume == pytest.approx(volume, abs=places)
+    assert check.area == pytest.approx(area, rel=1e-4 if suffix != ".ply" else 1e-9)
+    assert check.volume == pytest.approx(expected, abs=1.01 * surface.largest_shift * area + places)
+    assert check.volume > 0.0
 
 
 @SUFFIXES
@@ -61,9 +61,9 @@ def test_cells_that_touch_are_closed_only_once_they_are_parted(tmp_path, suffix)
     save_surface(tmp_path / f"raw{suffix}", Surface(points, boundary_facets(cells), 0, 0.0))
     assert not checked_surface(tmp_path / f"raw{suffix}").is_watertight
     save_surface(tmp_path / f"a{suffix}", surface_of(points, cells, [0, 1]))
-    found = checked_surface(tmp_path / f"a{suffix}")
-    assert (found.is_watertight, found.is_winding_consistent, found.n_pieces) == (True, True, 2)
-    assert found.volume == pytest.approx(1 / 3, rel=3e-3)
+    check = checked_surface(tmp_path / f"a{suffix}")
+    assert (check.is_watertight, check.is_winding_consistent, check.n_pieces) == (True, True, 2)
+    assert check.volume == pytest.approx(1 / 3, rel=3e-3)
 
 
 @SUFFIXES

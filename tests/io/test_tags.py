@@ -8,12 +8,12 @@ from tetopt.io.tags import tagged
 
 def test_tags_say_which_sets_an_item_is_in():
     for sets in (sample_model(3).sets.facets, sample_model(3).sets.cells):
-        found = tagged(sets)
-        assert found.tags.min() == 1
-        assert len(np.unique(found.items, axis=0)) == len(found.items)
+        tags = tagged(sets)
+        assert tags.tags.min() == 1
+        assert len(np.unique(tags.items, axis=0)) == len(tags.items)
         for name, members in sets.items():
-            chosen = found.items[np.isin(found.tags, found.tags_of[name])]
+            chosen = tags.items[np.isin(tags.tags, tags.tags_of[name])]
             np.testing.assert_array_equal(chosen, members)
-        together = {tuple(name for name in sets if tag in found.tags_of[name]) for tag in np.unique(found.tags)}
-        assert len(together) == found.tags.max()  # no two tags for one combination
+        together = {tuple(name for name in sets if tag in tags.tags_of[name]) for tag in np.unique(tags.tags)}
+        assert len(together) == tags.tags.max()  # no two tags for one combination
     assert tagged({}).tags_of == {}

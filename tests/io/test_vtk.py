@@ -27,9 +27,9 @@ def test_every_bit_comes_back(tmp_path, suffix, space, n):
         assert set(back.sets[kind]) == set(model.sets[kind])
         for name, members in model.sets[kind].items():
             np.testing.assert_array_equal(back.sets[kind][name], members)
-    made = model.materials
+    table = model.materials
     expected = dict(model.cell_data) | {
-        "young": made.young[made.of_cell], "nu": made.nu[made.of_cell], "material": made.of_cell + 1
+        "young": table.young[table.of_cell], "nu": table.nu[table.of_cell], "material": table.of_cell + 1
     }  # fmt: skip
     assert set(back.cell_data) == set(expected)
     for name, values in expected.items():
@@ -108,9 +108,9 @@ CHANGES = {
 
 def with_cells(grid, cells):
     """Other cells, all else as it was."""
-    made = pyvista.UnstructuredGrid({10: cells}, grid.points)
-    made.field_data.update({name: grid.field_data[name] for name in grid.field_data})
-    return made
+    other = pyvista.UnstructuredGrid({10: cells}, grid.points)
+    other.field_data.update({name: grid.field_data[name] for name in grid.field_data})
+    return other
 
 
 @pytest.mark.parametrize("suffix", ["vtu", "vtk"])

@@ -84,50 +84,50 @@ def test_mesh_and_cell_data_are_the_models_own(model):
     assert np.array_equal(item(mesh.find("Geometry/DataItem")), model.mesh.points)
     assert np.array_equal(item(mesh.find("Topology/DataItem")), model.mesh.cells)
     assert mesh.find("Topology").get("TopologyType") == {2: "Triangle", 3: "Tetrahedron"}[model.mesh.ndim]
-    found, made = fields(mesh), model.materials
-    if made is not None:
-        assert next(iter(found)) == "material"  # the one that dolfinx reads as tags
-        assert np.array_equal(found.pop("material"), made.of_cell + 1)
-        assert np.array_equal(found.pop("young"), made.young[made.of_cell])
-        assert np.array_equal(found.pop("nu"), made.nu[made.of_cell])
+    columns, table = fields(mesh), model.materials
+    if table is not None:
+        assert next(iter(columns)) == "material"  # the one that dolfinx reads as tags
+        assert np.array_equal(columns.pop("material"), table.of_cell + 1)
+        assert np.array_equal(columns.pop("young"), table.young[table.of_cell])
+        assert np.array_equal(columns.pop("nu"), table.nu[table.of_cell])
         assert {name: [float(word) for word in words] for name, words in named(mesh).items()} == {
-            "young": made.young.tolist(),
-            "nu": made.nu.tolist(),
+            "young": table.young.tolist(),
+            "nu": table.nu.tolist(),
         }
-    assert list(found) == list(model.cell_data)
+    assert list(columns) == list(model.cell_data)
     for name, values in model.cell_data.items():
-        assert np.array_equal(found[name], values), name
-        assert found[name].dtype.kind == values.dtype.kind, name
+        assert np.array_equal(columns[name], values), name
+        assert columns[name].dtype.kind == values.dtype.kind, name
 
 
 def test_every_facet_set_comes_back_with_its_side(model):
-    found = grids(model)
-    assert ("facets" in found) == bool(model.sets.facets)
+    parts = grids(model)
+    assert ("facets" in parts) == bool(model.sets.facets)
     if not model.sets.facets:
         return
-    triples = item(found["facets"].find("Topology/DataItem"))
+    triples = item(parts["facets"].find("Topology/DataItem"))
     assert len(np.unique(np.sort(triples, axis=1), axis=0)) == len(triples)  # dolfinx knows one tag a facet
-    assert {name for name in named(found["facets"]) if not name.endswith(" turned")} == set(model.sets.facets)
+    assert {name for name in named(parts["facets"]) if not name.endswith(" turned")} == set(model.sets.facets)
     for name, rows in model.sets.facets.items():
         expected = facet_triples(model.mesh.cells, rows)
-        got = facet_set(found["facets"], name)
+        got = facet_set(parts["facets"], name)
         assert np.array_equal(sorted_rows(from_smallest(got)), sorted_rows(from_smallest(expected))), name
 
 
 def test_a_side_is_told_only_where_two_sets_differ():
     turned = {
-        n: [name for name in named(grids(made)["facets"]) if "turned" in name]
-        for n, made in enumerate([sample_model(), with_two_sides(sample_model())])
+        n: [name for name in named(grids(model)["facets"]) if "turned" in name]
+        for n, model in enumerate([sample_model(), with_two_sides(sample_model())])
     }
     assert turned == {0: [], 1: ["bright turned"]}
 
 
 def test_every_cell_set_comes_back(model):
-    found = grids(model)
-    assert ("cells" in found) == bool(model.sets.cells)
+    parts = grids(model)
+    assert ("cells" in parts) == bool(model.sets.cells)
     if not model.sets.cells:
         return
-    grid = found["cells"]
+    grid = parts["cells"]
     tags, tags_of = fields(grid)["cells"], named(grid)
     assert list(tags_of) == list(model.sets.cells)
     members = item(grid.find("Topology/DataItem"))
@@ -177,16 +177,16 @@ def test_cell_data_of_any_name_shape_and_kind(tmp_path):
         "large": rng.integers(-(2**52), 2**52, count),
         "young": np.zeros(count),
     }
-    made = model._replace(cell_data=data)
-    found = fields(grids(made)["mesh"])
+    model = model._replace(cell_data=data)
+    columns = fields(grids(model)["mesh"])
     expected = {name: data[name] for name in list(data)[:2]}
     expected |= {f"pair_{k}": data["pair"][:, k] for k in range(2)} | {name: data[name] for name in ("is_in", "large")}
-    assert list(found) == ["material", "young", "nu", *expected]
-    assert (found["young"] > 0.0).all()
-    (tmp_path / "model.xdmf").write_bytes(xdmf(made))
+    assert list(columns) == ["material", "young", "nu", *expected]
+    assert (columns["young"] > 0.0).all()
+    (tmp_path / "model.xdmf").write_bytes(xdmf(model))
     read = pyvista.get_reader(tmp_path / "model.xdmf").read()["mesh"].cell_data
     for name, values in expected.items():
-        assert np.array_equal(found[name], values), name
+        assert np.array_equal(columns[name], values), name
         assert np.array_equal(read[name], values), name
 
 

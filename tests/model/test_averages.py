@@ -15,9 +15,9 @@ def noise(shape, seed=0, affine=None):
 def test_the_modulus_image_keeps_its_place():
     affine = np.array([[2.0, 0.3, 0.0, 1.0], [0.0, -1.0, 0.1, 2.0], [0.0, 0.0, 3.0, 5.0], [0.0, 0.0, 0.0, 1.0]])
     image = noise((4, 5, 6), affine=affine)
-    found = young_image(image, lambda h: 1.0 + h / 50.0)
-    np.testing.assert_array_equal(found.affine, affine)
-    np.testing.assert_array_equal(found.data, 1.0 + image.data.astype(np.float64) / 50.0)
+    moduli = young_image(image, lambda h: 1.0 + h / 50.0)
+    np.testing.assert_array_equal(moduli.affine, affine)
+    np.testing.assert_array_equal(moduli.data, 1.0 + image.data.astype(np.float64) / 50.0)
 
 
 @pytest.mark.parametrize("shape", [(24, 20), (14, 12, 10)])
@@ -32,9 +32,9 @@ def test_the_cell_s_modulus_is_the_mean_of_the_law_over_its_voxels(shape):
     owner = cell_of_voxel(image, mesh).ravel()
     squares = (image.data.astype(np.float64) ** 2).ravel()
     expected = np.bincount(owner, squares) / np.bincount(owner)
-    found = cell_young(image, mesh, lambda h: h**2)
-    np.testing.assert_allclose(found, expected, rtol=1e-12)
-    np.testing.assert_allclose(found - moments.mean**2, moments.variance, rtol=1e-9)
+    moduli = cell_young(image, mesh, lambda h: h**2)
+    np.testing.assert_allclose(moduli, expected, rtol=1e-12)
+    np.testing.assert_allclose(moduli - moments.mean**2, moments.variance, rtol=1e-9)
     np.testing.assert_allclose(cell_young(image, mesh), moments.mean, rtol=1e-14)
 
 
@@ -43,9 +43,9 @@ def test_wide_fields_lose_no_digits():
     rng = np.random.default_rng(0)
     image = tetopt.Image(rng.uniform(0.0, 46.0, (14, 12, 13)))
     mesh = tetopt.lattice(image, nodes=80)
-    found = cell_young(image, mesh, np.exp)
+    moduli = cell_young(image, mesh, np.exp)
     owner = tetopt.cell_of_voxel(image, mesh)
     for cell in range(len(mesh.cells)):
-        held = np.exp(image.data[owner == cell].astype(float))
-        if len(held):
-            assert found[cell] == pytest.approx(held.mean(), rel=1e-12)
+        voxels = np.exp(image.data[owner == cell].astype(float))
+        if len(voxels):
+            assert moduli[cell] == pytest.approx(voxels.mean(), rel=1e-12)

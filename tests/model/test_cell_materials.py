@@ -15,11 +15,11 @@ YOUNG = np.array([3.0, 1.0, 3.0, 2.0, 8.0])
 
 
 def test_equal_pairs_are_one_material():
-    made = materials(YOUNG, [0.3, 0.3, 0.4, 0.3, 0.3], 5)
-    assert made.young.tolist() == [1.0, 2.0, 3.0, 3.0, 8.0]
-    assert made.nu.tolist() == [0.3, 0.3, 0.3, 0.4, 0.3]
-    assert made.of_cell.tolist() == [2, 0, 3, 1, 4]
-    assert made.binning is None
+    table = materials(YOUNG, [0.3, 0.3, 0.4, 0.3, 0.3], 5)
+    assert table.young.tolist() == [1.0, 2.0, 3.0, 3.0, 8.0]
+    assert table.nu.tolist() == [0.3, 0.3, 0.3, 0.4, 0.3]
+    assert table.of_cell.tolist() == [2, 0, 3, 1, 4]
+    assert table.binning is None
     assert materials(2.0, 0.3, 4).of_cell.tolist() == [0, 0, 0, 0]
 
 
@@ -42,34 +42,34 @@ def test_values_out_of_range(young, nu, match):
 
 def test_bins_of_equal_width_hold_the_mean_by_volume():
     size = np.array([1.0, 1.0, 3.0, 1.0, 1.0])
-    made = binned(materials([1.0, 2.0, 3.0, 7.0, 9.0], 0.3, 5), size, 2)  # halves: 1 to 5, 5 to 9
-    assert made.young.tolist() == [(1.0 + 2.0 + 9.0) / 5.0, 8.0]
-    assert made.of_cell.tolist() == [0, 0, 0, 1, 1]
-    off = np.abs(made.young[made.of_cell] / [1.0, 2.0, 3.0, 7.0, 9.0] - 1.0)
-    assert made.binning.largest == pytest.approx(off.max())
-    assert made.binning.mean == pytest.approx((off * size).sum() / 7.0)
+    table = binned(materials([1.0, 2.0, 3.0, 7.0, 9.0], 0.3, 5), size, 2)  # halves: 1 to 5, 5 to 9
+    assert table.young.tolist() == [(1.0 + 2.0 + 9.0) / 5.0, 8.0]
+    assert table.of_cell.tolist() == [0, 0, 0, 1, 1]
+    off = np.abs(table.young[table.of_cell] / [1.0, 2.0, 3.0, 7.0, 9.0] - 1.0)
+    assert table.binning.largest == pytest.approx(off.max())
+    assert table.binning.mean == pytest.approx((off * size).sum() / 7.0)
     # As stiff altogether as before.
-    assert (made.young[made.of_cell] * size).sum() == pytest.approx(1.0 + 2.0 + 9.0 + 7.0 + 9.0)
+    assert (table.young[table.of_cell] * size).sum() == pytest.approx(1.0 + 2.0 + 9.0 + 7.0 + 9.0)
 
 
 def test_bins_by_number_and_by_logarithm():
-    given = materials([1.0, 2.0, 4.0, 8.0, 1024.0, 512.0], 0.3, 6)
-    by_number = binned(given, np.ones(6), 2, "quantile")
+    exact = materials([1.0, 2.0, 4.0, 8.0, 1024.0, 512.0], 0.3, 6)
+    by_number = binned(exact, np.ones(6), 2, "quantile")
     assert by_number.of_cell.tolist() == [0, 0, 0, 1, 1, 1]
-    by_log = binned(given, np.ones(6), 2, "log")  # halves at 2^5
+    by_log = binned(exact, np.ones(6), 2, "log")  # halves at 2^5
     assert by_log.of_cell.tolist() == [0, 0, 0, 0, 1, 1]
     assert by_log.young.tolist() == [3.75, 768.0]
     wide = materials([1.0, 9.0, 30.0, 100.0], 0.3, 4)
     assert binned(wide, np.ones(4), 2, "log").of_cell.tolist() == [0, 0, 1, 1]  # at 10; at 30.25 of square roots
-    equal = binned(given, np.ones(6), 4)  # the third quarter is empty
+    equal = binned(exact, np.ones(6), 4)  # the third quarter is empty
     assert equal.young.tolist() == [3.75, 512.0, 1024.0]
 
 
 def test_enough_bins_change_nothing():
-    given = materials(YOUNG, 0.3, 5)
-    made = binned(given, np.ones(5), 4)
-    np.testing.assert_array_equal(made.young, given.young)
-    assert made.binning == (0.0, 0.0)
+    exact = materials(YOUNG, 0.3, 5)
+    table = binned(exact, np.ones(5), 4)
+    np.testing.assert_array_equal(table.young, exact.young)
+    assert table.binning == (0.0, 0.0)
 
 
 def test_more_bins_err_less():
@@ -81,9 +81,9 @@ def test_more_bins_err_less():
 
 
 def test_ratios_by_label_are_not_blended():
-    made = binned(materials(np.arange(1.0, 11.0), np.repeat([0.3, 0.45], 5), 10), np.ones(10), 3)
-    assert set(made.nu) == {0.3, 0.45}
-    np.testing.assert_array_equal(made.nu[made.of_cell], np.repeat([0.3, 0.45], 5))
+    table = binned(materials(np.arange(1.0, 11.0), np.repeat([0.3, 0.45], 5), 10), np.ones(10), 3)
+    assert set(table.nu) == {0.3, 0.45}
+    np.testing.assert_array_equal(table.nu[table.of_cell], np.repeat([0.3, 0.45], 5))
     many = binned(materials(1.0, np.linspace(0.0, 0.4, 9), 9), np.ones(9), 2)
     assert len(many.nu) == 2
 
@@ -138,8 +138,10 @@ def test_labels_from_a_file(tmp_path):
     assert load_law(tmp_path / "b.csv") == ByLabel({3: 2.5}, 1.0)
     assert has_column(str(tmp_path / "b.csv"), "nu")
     assert not has_column(str(tmp_path / "a.csv"), "nu")
-    made = model_of(sample_model(3).mesh, young=str(tmp_path / "b.csv"), cell_data={"label": np.full(192, 3)}).materials
-    assert (made.young.tolist(), made.nu.tolist()) == ([2.5], [0.3])
+    table = model_of(
+        sample_model(3).mesh, young=str(tmp_path / "b.csv"), cell_data={"label": np.full(192, 3)}
+    ).materials
+    assert (table.young.tolist(), table.nu.tolist()) == ([2.5], [0.3])
 
 
 @pytest.mark.parametrize(
@@ -210,16 +212,16 @@ def test_constants_are_one_material():
     """Whatever the means over many voxels would round to; also where a law is constant in a cell."""
     image, mesh = sample_image(3), sample_model(3).mesh
     for young, nu in (("0.7", "0.49"), (0.7, 0.49), ("0.7 + 0*h", "0.49 + 0*h"), ([(0, 0.7), (1, 0.7)], 0.49)):
-        made = model_of(mesh, image, young=young, nu=nu).materials
-        assert (made.young.tolist(), made.nu.tolist()) == ([0.7], [0.49])
+        table = model_of(mesh, image, young=young, nu=nu).materials
+        assert (table.young.tolist(), table.nu.tolist()) == ([0.7], [0.49])
     assert model_of(mesh, young="3").materials.young.tolist() == [3.0]  # needs no image
     assert len(model_of(mesh, image, young="1 + h/7", nu="0.49", bins=4).materials.young) == 4
 
 
 def test_ratios_may_be_negative_and_laws():
     image, mesh = sample_image(3), sample_model(3).mesh
-    made = model_of(mesh, image, young=2.0, nu="-0.3 + h / 100").materials
-    assert made.nu.min() < 0.0 < made.nu.max()
+    table = model_of(mesh, image, young=2.0, nu="-0.3 + h / 100").materials
+    assert table.nu.min() < 0.0 < table.nu.max()
     with pytest.raises(InputError, match=r"-1 < nu < 0\.5"):
         model_of(mesh, image, young=2.0, nu="h")
     with pytest.raises(InputError, match="no value at intensity 0"):
@@ -233,11 +235,11 @@ def test_ratios_may_be_negative_and_laws():
 def test_one_law_for_each_label_and_one_number_a_cell():
     model = sample_model(3)
     labels = model.cell_data["label"]
-    made = model_of(model.mesh, young="0=1.5,1=4", nu="0=0.45,1=0.3", cell_data=model.cell_data).materials
-    np.testing.assert_array_equal(made.young[made.of_cell], np.where(labels == 1, 4.0, 1.5))
-    np.testing.assert_array_equal(made.nu[made.of_cell], np.where(labels == 1, 0.3, 0.45))
-    given = np.linspace(1.0, 2.0, len(labels))
-    for values in (given, given.tolist()):
-        made = model_of(model.mesh, young=values, nu=np.float32(0.25)).materials
-        np.testing.assert_array_equal(made.young[made.of_cell], given)
-        assert set(made.nu) == {0.25}
+    table = model_of(model.mesh, young="0=1.5,1=4", nu="0=0.45,1=0.3", cell_data=model.cell_data).materials
+    np.testing.assert_array_equal(table.young[table.of_cell], np.where(labels == 1, 4.0, 1.5))
+    np.testing.assert_array_equal(table.nu[table.of_cell], np.where(labels == 1, 0.3, 0.45))
+    moduli = np.linspace(1.0, 2.0, len(labels))
+    for values in (moduli, moduli.tolist()):
+        table = model_of(model.mesh, young=values, nu=np.float32(0.25)).materials
+        np.testing.assert_array_equal(table.young[table.of_cell], moduli)
+        assert set(table.nu) == {0.25}

@@ -30,10 +30,10 @@ H = np.array([[0.5, 1.0, 2.0], [3.0, 10.0, 250.0]])
     ],
 )
 def test_values(text, expected):
-    found = parse_formula(text)(H)
-    assert found.shape == H.shape
-    assert found.dtype == np.float64
-    np.testing.assert_allclose(found, expected, rtol=1e-15)
+    values = parse_formula(text)(H)
+    assert values.shape == H.shape
+    assert values.dtype == np.float64
+    np.testing.assert_allclose(values, expected, rtol=1e-15)
 
 
 @pytest.mark.parametrize(

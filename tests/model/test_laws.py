@@ -10,17 +10,17 @@ TABLE = [(-50.0, 2.0), (0.0, 1.0), (100.0, 5.0)]
 
 
 def test_a_table_is_linear_between_its_pairs_and_constant_beyond_them():
-    found = young_from(TABLE, [[-1e9, -50.0, -25.0], [50.0, 100.0, 1e9]])
-    np.testing.assert_array_equal(found, [[2.0, 2.0, 1.5], [3.0, 5.0, 5.0]])
+    moduli = young_from(TABLE, [[-1e9, -50.0, -25.0], [50.0, 100.0, 1e9]])
+    np.testing.assert_array_equal(moduli, [[2.0, 2.0, 1.5], [3.0, 5.0, 5.0]])
     np.testing.assert_array_equal(young_from(np.array(TABLE), [0.0]), [1.0])
     np.testing.assert_array_equal(young_from([(7.0, 3.0)], [-1.0, 7.0, 8.0]), [3.0, 3.0, 3.0])
 
 
 def test_no_law_takes_the_intensity_itself_and_a_copy_of_it():
     intensities = np.array([0.0, 1.5, 7.0])
-    found = young_from(None, intensities)
-    np.testing.assert_array_equal(found, intensities)
-    found[0] = 9.0
+    moduli = young_from(None, intensities)
+    np.testing.assert_array_equal(moduli, intensities)
+    moduli[0] = 9.0
     assert intensities[0] == 0.0
 
 
@@ -31,10 +31,10 @@ def test_a_function_sees_float64_and_may_return_whole_numbers():
         seen.append(h.dtype)
         return np.full(h.shape, 3)
 
-    found = young_from(law, np.array([1, 2], dtype=np.uint8))
+    moduli = young_from(law, np.array([1, 2], dtype=np.uint8))
     assert seen == [np.float64]
-    assert found.dtype == np.float64
-    np.testing.assert_array_equal(found, [3.0, 3.0])
+    assert moduli.dtype == np.float64
+    np.testing.assert_array_equal(moduli, [3.0, 3.0])
 
 
 def test_a_function_equal_to_a_table_gives_the_same():

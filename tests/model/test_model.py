@@ -26,11 +26,11 @@ def test_a_compression_is_that_of_fem(n):
     """The same nodes, and the same push, on an oblique box."""
     image, model = sample_image(n), sample_model(n)
     low, high = box_faces(image, model.mesh)
-    held, moved = parse_loads(["compress:5%"], model.mesh, model.sets)
-    np.testing.assert_array_equal(nodes_of(model.mesh, model.sets.facets[held.set_name]), high)
-    np.testing.assert_array_equal(nodes_of(model.mesh, model.sets.facets[moved.set_name]), low)
-    assert not held.displacement.any()
-    np.testing.assert_allclose(moved.displacement, push_of(image, 5.0), atol=1e-12)
+    top, bottom = parse_loads(["compress:5%"], model.mesh, model.sets)
+    np.testing.assert_array_equal(nodes_of(model.mesh, model.sets.facets[top.set_name]), high)
+    np.testing.assert_array_equal(nodes_of(model.mesh, model.sets.facets[bottom.set_name]), low)
+    assert not top.displacement.any()
+    np.testing.assert_allclose(bottom.displacement, push_of(image, 5.0), atol=1e-12)
 
 
 def test_a_sheared_box_is_pressed_along_its_faces_normal():

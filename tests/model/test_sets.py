@@ -155,14 +155,14 @@ def test_labels_that_are_none(labels):
 # Asked for in words
 
 
-def asked(text, n=3, mean=None):
+def requested(text, n=3, mean=None):
     model = sample_model(n)
     base = standard_sets(model.mesh)
     return model.mesh, with_requested(model.mesh, base, [text], model.cell_data["mean"] if mean is None else mean)
 
 
 def test_below_is_the_largest_connected_part_and_its_surface():
-    mesh, sets = asked("dark=below:12")
+    mesh, sets = requested("dark=below:12")
     mean = sample_model(3).cell_data["mean"]
     chosen = tetopt.geometry.topology.largest_component(mesh.cells, mean < 12)
     np.testing.assert_array_equal(sets.cells["dark"], chosen)
@@ -185,7 +185,7 @@ def test_near_a_point_and_a_plane():
         (f"p=point:{text}:12", np.linalg.norm(points - here, axis=1)),
         (f"p=plane:{text}:0,0,-2:1.5", np.abs(points[:, 2] - here[2])),
     ):
-        _, sets = asked(words)
+        _, sets = requested(words)
         reach = float(words.rpartition(":")[2])
         expected = every[(distance[facet_triples(mesh.cells, every)] <= reach).all(axis=1)]
         assert 0 < len(expected) < len(every)
@@ -215,7 +215,7 @@ def test_near_a_point_and_a_plane():
 )
 def test_words_that_are_refused(text, match):
     with pytest.raises(InputError, match=match) as caught:
-        asked(text)
+        requested(text)
     assert "\n" not in str(caught.value)
 
 
@@ -252,15 +252,13 @@ def test_sets_on_the_boundary_are_carried_to_an_improved_mesh():
     image = sample_image(3)
     after = tetopt.optimize(image, model.mesh, boundary="fixed", iterations=3).mesh
     assert (after.points != model.mesh.points).any()
-    given = Sets(
-        {"skin": boundary_rows(model.mesh), "inner": model.sets.facets["interface_0_1"]}, {"all": np.arange(9)}
-    )
-    found = surviving_sets(model.mesh, given, after).facets
-    assert "inner" not in found
-    assert surviving_sets(model.mesh, given, after).cells == {}
+    sets = Sets({"skin": boundary_rows(model.mesh), "inner": model.sets.facets["interface_0_1"]}, {"all": np.arange(9)})
+    survivors = surviving_sets(model.mesh, sets, after).facets
+    assert "inner" not in survivors
+    assert surviving_sets(model.mesh, sets, after).cells == {}
     places = [
         {frozenset(map(tuple, corners)) for corners in mesh.points[facet_triples(mesh.cells, rows)].tolist()}
-        for mesh, rows in ((model.mesh, given.facets["skin"]), (after, found["skin"]))
+        for mesh, rows in ((model.mesh, sets.facets["skin"]), (after, survivors["skin"]))
     ]
     assert places[0] == places[1]
 
@@ -269,13 +267,13 @@ def test_sets_of_a_mesh_join_the_standard_ones():
     mesh = sample_model(3).mesh
     standard = standard_sets(mesh, box_of(sample_image(3)))
     some = standard.facets["left"][:3]
-    given = Sets({"left": some, "right": standard.facets["right"], "skin": some}, {"Boundary": np.arange(4)})
-    found, renamed = merged_sets(standard, given)
+    own = Sets({"left": some, "right": standard.facets["right"], "skin": some}, {"Boundary": np.arange(4)})
+    merged, renamed = merged_sets(standard, own)
     assert renamed == {"left": "left_2", "Boundary": "Boundary_2"}
-    assert set(found.facets) == {*standard.facets, "left_2", "skin"}
-    np.testing.assert_array_equal(found.facets["left"], standard.facets["left"])
-    np.testing.assert_array_equal(found.facets["left_2"], some)
-    np.testing.assert_array_equal(found.cells["Boundary_2"], np.arange(4))
+    assert set(merged.facets) == {*standard.facets, "left_2", "skin"}
+    np.testing.assert_array_equal(merged.facets["left"], standard.facets["left"])
+    np.testing.assert_array_equal(merged.facets["left_2"], some)
+    np.testing.assert_array_equal(merged.cells["Boundary_2"], np.arange(4))
     assert "left_2" not in standard.facets  # which are left as they were
 
 

@@ -46,8 +46,8 @@ def test_sets_are_boundaries_and_subdomains_of_their_names(model):
     mesh = model.to_skfem()
     assert list(mesh.boundaries) == list(model.sets.facets)
     for name, rows in model.sets.facets.items():
-        found = mesh.facets[:, mesh.boundaries[name]].T
-        assert np.array_equal(np.sort(found, axis=1), np.sort(facet_triples(model.mesh.cells, rows), axis=1)), name
+        nodes = mesh.facets[:, mesh.boundaries[name]].T
+        assert np.array_equal(np.sort(nodes, axis=1), np.sort(facet_triples(model.mesh.cells, rows), axis=1)), name
     assert list(mesh.subdomains) == list(model.sets.cells)
     for name, cells in model.sets.cells.items():
         assert np.array_equal(mesh.subdomains[name], cells), name
@@ -89,6 +89,6 @@ def test_what_cannot_be_had_is_said(monkeypatch):
 def test_nothing_is_shared_with_the_model():
     model = sample_model()
     before = model.sets.cells["label_0"].copy()
-    found = model.to_skfem()
-    found.subdomains["label_0"][:] = 7
+    converted = model.to_skfem()
+    converted.subdomains["label_0"][:] = 7
     assert np.array_equal(model.sets.cells["label_0"], before)

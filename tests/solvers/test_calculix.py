@@ -52,12 +52,12 @@ def answer(content, folder):
 
 def tables(text):
     """The blocks of a .dat file; of several steps with the same requests, the last."""
-    found = {}
+    blocks = {}
     for part in re.split(r"\n(?= [a-z])", text)[1:]:
         head, _, body = part.partition("\n")
         quantity, name = re.match(r" (.*?) (?:\(.*\) )?for set (\S+)", head).groups()
-        found[quantity, name.lower()] = np.array([line.split() for line in body.split("\n") if line], dtype=float)
-    return found
+        blocks[quantity, name.lower()] = np.array([line.split() for line in body.split("\n") if line], dtype=float)
+    return blocks
 
 
 def displacements(text):
@@ -75,8 +75,8 @@ def pressed_model(loading="compression"):
     fields = tetopt.cell_fields(mesh, image)
     sets = standard_sets(mesh, box_of(image), (fields["mean"] > 15.0).astype(np.int64))
     sets = with_requested(mesh, sets, ["dark-cells=below:20", "Patch=point:40,0,0:15"], fields["mean"])
-    made = binned(materials(0.5 + fields["mean"] / 7.0, NU, len(mesh.cells)), volumes(mesh.points, mesh.cells), 16)
-    return Model(mesh, fields, sets, made, parse_loads(LOADS[loading], mesh, sets), about={"image": "two spheres & ü"})
+    table = binned(materials(0.5 + fields["mean"] / 7.0, NU, len(mesh.cells)), volumes(mesh.points, mesh.cells), 16)
+    return Model(mesh, fields, sets, table, parse_loads(LOADS[loading], mesh, sets), about={"image": "two spheres & ü"})
 
 
 def prescribed(model, n_nodes, nodes_of_rows):
@@ -96,36 +96,36 @@ def ours(model):
     return u, 0.5 * float(u.ravel() @ (system.K @ u.ravel())), (system.K @ u.ravel()).reshape(-1, 3)
 
 
-def energy(found):
-    return float(found.tables["total internal energy", "all_cells"].squeeze())
+def energy(printed):
+    return float(printed.tables["total internal energy", "all_cells"].squeeze())
 
 
-def assert_printed(found, expected, digits=PRINTED):
+def assert_printed(values, expected, digits=PRINTED):
     """Equal as far as printed: relative to the largest."""
-    np.testing.assert_allclose(found, expected, rtol=0.0, atol=digits * np.abs(expected).max())
+    np.testing.assert_allclose(values, expected, rtol=0.0, atol=digits * np.abs(expected).max())
 
 
 @pytest.mark.parametrize("loading", LOADS)
 def test_energy_displacement_and_reactions_are_our_own(loading, tmp_path):
     model = pressed_model(loading)
-    found = answer(abaqus(model), tmp_path)
+    printed = answer(abaqus(model), tmp_path)
     u, total, force = ours(model)
-    np.testing.assert_allclose(energy(found), total, rtol=PRINTED)
-    assert_printed(found.u, u, 6e-6)  # .frd has a digit less
-    by_cell = found.tables["internal energy", "all_cells"]
+    np.testing.assert_allclose(energy(printed), total, rtol=PRINTED)
+    assert_printed(printed.u, u, 6e-6)  # .frd has a digit less
+    by_cell = printed.tables["internal energy", "all_cells"]
     np.testing.assert_array_equal(by_cell[:, 0], np.arange(1, len(model.mesh.cells) + 1))
     assert_printed(by_cell[:, 1], cell_energies(model.mesh, young_of(model), NU, u))
     for name in ("superior", "inferior"):
         nodes = nodes_of(model.mesh, model.sets.facets[name])
-        np.testing.assert_array_equal(found.tables["forces", name][:, 0], nodes + 1)
-        assert_printed(found.tables["forces", name][:, 1:], force[nodes])
-        assert_printed(found.tables["total force", name].ravel(), force[nodes].sum(axis=0))
+        np.testing.assert_array_equal(printed.tables["forces", name][:, 0], nodes + 1)
+        assert_printed(printed.tables["forces", name][:, 1:], force[nodes])
+        assert_printed(printed.tables["total force", name].ravel(), force[nodes].sum(axis=0))
 
 
 def test_a_ratio_and_a_material_for_each_cell(tmp_path):
     """All of a model's moduli and ratios reach their cells; ours as the sum of two matrices of one ratio each."""
     model = sample_model(bins=None)
-    found = answer(abaqus(model), tmp_path)
+    printed = answer(abaqus(model), tmp_path)
     assert len(model.materials.young) > 50
     ratios = model.materials.nu[model.materials.of_cell]
     assert len(np.unique(ratios)) == 2
@@ -135,22 +135,22 @@ def test_a_ratio_and_a_material_for_each_cell(tmp_path):
     is_given, values = prescribed(model, len(mesh.points), lambda rows: nodes_of(mesh, rows))
     free, u = np.flatnonzero(~is_given), values.ravel()
     u[free] = spsolve(K[free][:, free], -(K @ u)[free])
-    np.testing.assert_allclose(energy(found), 0.5 * u @ (K @ u), rtol=PRINTED)
+    np.testing.assert_allclose(energy(printed), 0.5 * u @ (K @ u), rtol=PRINTED)
     for is_in, nu in parts:
         cells = Mesh(mesh.points, mesh.cells[is_in])
         expected = cell_energies(cells, young[is_in], nu, u.reshape(-1, 3))
-        assert_printed(found.tables["internal energy", "all_cells"][is_in, 1], expected)
+        assert_printed(printed.tables["internal energy", "all_cells"][is_in, 1], expected)
 
 
 def test_megapascals_give_millijoules_and_lps_turns_the_displacement(tmp_path):
     model = pressed_model("shear")
-    found = answer(abaqus(model), tmp_path)
+    printed = answer(abaqus(model), tmp_path)
     in_mpa = answer(abaqus(in_units(model, "MPa")), tmp_path)
-    np.testing.assert_allclose(1e3 * energy(in_mpa), energy(found), rtol=2.0 * PRINTED)
-    assert_printed(in_mpa.u, found.u, 1e-5)
+    np.testing.assert_allclose(1e3 * energy(in_mpa), energy(printed), rtol=2.0 * PRINTED)
+    assert_printed(in_mpa.u, printed.u, 1e-5)
     turned = answer(abaqus(in_space(model, "lps")), tmp_path)
-    np.testing.assert_allclose(energy(turned), energy(found), rtol=2.0 * PRINTED)
-    assert_printed(turned.u * [-1.0, -1.0, 1.0], found.u, 1e-5)
+    np.testing.assert_allclose(energy(turned), energy(printed), rtol=2.0 * PRINTED)
+    assert_printed(turned.u * [-1.0, -1.0, 1.0], printed.u, 1e-5)
 
 
 def second_order(model):
@@ -165,25 +165,25 @@ def second_order(model):
 
     by_cell = basis.with_element(skfem.ElementTetP0())
     K = form.assemble(basis, lame=by_cell.interpolate(lame), mu=by_cell.interpolate(mu))
-    u, given = np.zeros(basis.N), []
+    u, fixed = np.zeros(basis.N), []
     for load, side in zip(model.loads, (30.0, -30.0), strict=True):  # z of the block's faces, held first
         for d in range(3):
             dofs = np.flatnonzero(np.abs(basis.doflocs[2] - side) < 1e-9)
             dofs = np.intersect1d(dofs, np.concatenate([basis.nodal_dofs[d], basis.edge_dofs[d]]))
             u[dofs] = load.displacement[d]
-            given.append(dofs)
-    u = skfem.solve(*skfem.condense(K, x=u, D=np.concatenate(given)))
+            fixed.append(dofs)
+    u = skfem.solve(*skfem.condense(K, x=u, D=np.concatenate(fixed)))
     return u[basis.nodal_dofs].T, 0.5 * float(u @ (K @ u))
 
 
 def test_quadratic_cells_are_scikit_fem_s(tmp_path):
     model = pressed_model("shear")
-    found = answer(abaqus(model._replace(order=2)), tmp_path)
+    printed = answer(abaqus(model._replace(order=2)), tmp_path)
     u, total = second_order(model)
-    np.testing.assert_allclose(energy(found), total, rtol=PRINTED)
-    assert_printed(found.u[: len(u)], u, 6e-6)
+    np.testing.assert_allclose(energy(printed), total, rtol=PRINTED)
+    assert_printed(printed.u[: len(u)], u, 6e-6)
     linear = ours(model)[1]
-    assert 0.8 * linear < energy(found) < 0.99 * linear  # less stiff
+    assert 0.8 * linear < energy(printed) < 0.99 * linear  # less stiff
 
 
 @pytest.mark.parametrize("order", [1, 2])
@@ -194,12 +194,12 @@ def test_every_set_arrives(order, tmp_path):
     requests = [f"*NODE PRINT, NSET={name}\nU\n" for name in model.sets.facets]
     requests += [f"*EL PRINT, ELSET={name}\nELSE\n" for name in model.sets.cells]
     content = abaqus(model).replace(b"*END STEP", "".join([*requests, "*END STEP"]).encode())
-    found = answer(content, tmp_path).tables
+    printed = answer(content, tmp_path).tables
     for name, rows in model.sets.facets.items():
         nodes = np.unique((quadratic_facet_nodes if order == 2 else facet_triples)(cells, rows))
-        np.testing.assert_array_equal(found["displacements", name.lower()][:, 0], nodes + 1)
+        np.testing.assert_array_equal(printed["displacements", name.lower()][:, 0], nodes + 1)
     for name, members in model.sets.cells.items():
-        np.testing.assert_array_equal(found["internal energy", name.lower()][:, 0], members + 1)
+        np.testing.assert_array_equal(printed["internal energy", name.lower()][:, 0], members + 1)
 
 
 def test_pressure_on_each_surface_pushes_its_facets_inwards(tmp_path):
@@ -211,14 +211,14 @@ def test_pressure_on_each_surface_pushes_its_facets_inwards(tmp_path):
         step = f"*STEP\n*STATIC\n*BOUNDARY\n{side}, 1, 3\n*DSLOAD\n{name}, P, 1.0\n"
         requests = "*NODE FILE\nU\n*NODE PRINT, NSET=every\nRF\n*END STEP\n"
         content = abaqus(model._replace(loads=())) + f"{every}{step}{requests}".encode()
-        found = answer(content, tmp_path).tables["forces", "every"][:, 1:]
+        printed = answer(content, tmp_path).tables["forces", "every"][:, 1:]
         triples = facet_triples(mesh.cells, rows)
         a, b, c = np.moveaxis(mesh.points[triples], 1, 0)
         expected = np.zeros_like(mesh.points)
         np.add.at(expected, triples, -np.cross(b - a, c - a)[:, None] / 6.0)
         is_free = ~np.isin(np.arange(len(expected)), nodes_of(mesh, model.sets.facets[side]))
         assert np.abs(expected[is_free]).max() > 1.0
-        assert_printed(found[is_free], expected[is_free], 1e-5)
+        assert_printed(printed[is_free], expected[is_free], 1e-5)
 
 
 def test_numbers_of_full_length_arrive(tmp_path):

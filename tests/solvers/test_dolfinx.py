@@ -127,10 +127,10 @@ def answer(request, tmp_path_factory):
         return model, dict(read)
 
 
-def same_rows(found, expected):
+def same_rows(triples, expected):
     """Whether two lists hold the same rows in any order, the nodes of a row too."""
-    found, expected = (np.sort(rows, axis=1) for rows in (found, expected))
-    return np.array_equal(found[np.lexsort(found.T)], expected[np.lexsort(expected.T)])
+    triples, expected = (np.sort(rows, axis=1) for rows in (triples, expected))
+    return np.array_equal(triples[np.lexsort(triples.T)], expected[np.lexsort(expected.T)])
 
 
 def test_dolfinx_reads_mesh_and_moduli_exactly_though_in_another_order(answer):
@@ -139,10 +139,10 @@ def test_dolfinx_reads_mesh_and_moduli_exactly_though_in_another_order(answer):
     assert np.array_equal(np.sort(read["cells"], axis=1), np.sort(model.mesh.cells, axis=1))
     assert (np.sort(read["order"]) == np.arange(len(model.mesh.cells))).all()
     assert (np.diff(read["order"]) < 0).any()  # or else nothing is said about the order
-    made = model.materials
-    assert np.array_equal(read["young"], made.young[made.of_cell])
-    assert np.array_equal(read["nu"], made.nu[made.of_cell])
-    assert np.array_equal(read["material"], made.of_cell + 1)
+    table = model.materials
+    assert np.array_equal(read["young"], table.young[table.of_cell])
+    assert np.array_equal(read["nu"], table.nu[table.of_cell])
+    assert np.array_equal(read["material"], table.of_cell + 1)
 
 
 def test_dolfinx_finds_every_set_by_its_name(answer):

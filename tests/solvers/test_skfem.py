@@ -20,18 +20,18 @@ def pressed(model):
         3: (skfem.ElementTetP1(), skfem.ElementTetP0()),
     }[n]
     basis = skfem.Basis(mesh, skfem.ElementVector(linear), intorder=1)
-    made = model.materials
+    table = model.materials
     law = elasticity.lame_parameters if n == 3 else elasticity.plane_stress
     on_cells = basis.with_element(constant)
-    lame, mu = (np.asarray(on_cells.interpolate(c[made.of_cell])) for c in law(made.young, made.nu))
+    lame, mu = (np.asarray(on_cells.interpolate(c[table.of_cell])) for c in law(table.young, table.nu))
     K = elasticity.linear_elasticity(lame, mu).assemble(basis)
-    u, held = basis.zeros(), []
+    u, fixed = basis.zeros(), []
     for load in model.loads:
         nodal = basis.get_dofs(load.set_name).nodal
         for d in range(n):
             u[nodal[f"u^{d + 1}"]] = load.displacement[d]
-            held.append(nodal[f"u^{d + 1}"])
-    u = skfem.solve(*skfem.condense(K, x=u, D=np.concatenate(held)))
+            fixed.append(nodal[f"u^{d + 1}"])
+    u = skfem.solve(*skfem.condense(K, x=u, D=np.concatenate(fixed)))
     return u[basis.nodal_dofs].T, 0.5 * float(u @ K @ u)
 
 

@@ -14,7 +14,7 @@ from tetopt.model.materials import cells_of
 from tetopt.model.model import Model, described, quadratic, quadratic_facet_nodes
 from tetopt.model.sets import nodes_of
 
-ALL_ELEMENTS = "all_cells"
+ALL_ELEMENTS = "all_cells"  # the set that results are asked for
 # The number of the face opposite each local node: S1 is 1-2-3, S2 is 1-4-2, S3 is 2-4-3, S4 is 3-4-1.
 FACE_NUMBERS = np.array([3, 4, 2, 1])
 # Of a number: Abaqus takes no more, and CalculiX reads the first 20, so that 1.234567890123456e-05 becomes 1.23.

@@ -41,30 +41,14 @@ _ITK_READERS = {
 _PICTURE_SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp")
 _KNOWN_SUFFIXES = ", ".join((*_NIBABEL_SUFFIXES, *_ITK_READERS, *_PICTURE_SUFFIXES))
 
+# What to do about a file that ends too soon, and about one that may never have been an image.
 _DAMAGED_FILE = "the file is truncated or damaged; copy it again"
 _UNREADABLE_FILE = "truncated or damaged, or not an image of this kind; copy it again, or check its name"
-_NIBABEL_HEADER_ERRORS = (
-    ImageFileError,
-    HeaderDataError,
-    WrapStructError,
-    OSError,
-    EOFError,
-    ValueError,
-    TypeError,
-    KeyError,
-    OverflowError,
-)
-_PILLOW_ERRORS = (
-    OSError,
-    EOFError,
-    SyntaxError,
-    ValueError,
-    TypeError,
-    KeyError,
-    struct.error,
-    zlib.error,
-    PIL.Image.DecompressionBombError,
-)
+# What the two libraries raise on damaged files.
+_READER_ERRORS = (OSError, EOFError, ValueError, TypeError, KeyError)
+_NIBABEL_HEADER_ERRORS = (*_READER_ERRORS, ImageFileError, HeaderDataError, WrapStructError, OverflowError)
+_PILLOW_ERRORS = (*_READER_ERRORS, SyntaxError, struct.error, zlib.error, PIL.Image.DecompressionBombError)
+# NIfTI's units of length other than mm.
 _MM_PER_UNIT = {"meter": 1000.0, "micron": 0.001}
 # DICOM slices may be off an even spacing by this share of it, since positions are often rounded.
 _UNEVEN_SHARE = 0.05
@@ -294,7 +278,6 @@ def sha256(path: str | Path) -> str:
     return digest.hexdigest()
 
 
-# --------------------------------------------------------------------------------------------------
 # Choosing the reader
 
 
@@ -351,7 +334,6 @@ def _one_line(words: object) -> str:
     return " ".join(str(words).split())
 
 
-# --------------------------------------------------------------------------------------------------
 # NIfTI and MGZ
 
 
@@ -401,7 +383,6 @@ def _affine_in_mm(file: SpatialImage) -> NDArray[np.float64]:
     return affine
 
 
-# --------------------------------------------------------------------------------------------------
 # NRRD, MetaImage and DICOM
 
 
@@ -534,7 +515,6 @@ def _ras_affine(source: Any) -> NDArray[np.float64]:
     return affine
 
 
-# --------------------------------------------------------------------------------------------------
 # Pictures
 
 
@@ -566,7 +546,6 @@ def _grey(picture: PIL.Image.Image) -> NDArray:
     raise InputError(f"a colour or transparent picture (mode {picture.mode}); convert it to grey first")
 
 
-# --------------------------------------------------------------------------------------------------
 # Geometry of parts
 
 

@@ -30,6 +30,7 @@ from tetopt.model.model import Model
 from tetopt.model.sets import SET_NAME, Box, Sets, nodes_of
 
 CELL_TYPES = {2: pyvista.CellType.TRIANGLE, 3: pyvista.CellType.TETRA}
+# Names of field data and of point data in our files, see above.
 FACETS_PREFIX, CELLS_PREFIX, ON_PREFIX, CHECKSUM_NAME = "facets:", "cells:", "on_", "cells_sha256"
 LEGACY_VERSION = 42  # version 4.2: 5.1 is not read by older programs, 3D Slicer among them
 

@@ -110,9 +110,9 @@ def known_set(name: str, sets: Sets) -> str:
     if name in sets.cells:
         first = ", ".join(list(sets.facets)[:8])
         raise InputError(f'load: "{name}" is a set of cells; give one of facets, such as {first}')
-    near = [each for each in sets.facets if each.lower() == name.lower()]
-    near = near or difflib.get_close_matches(name, sets.facets, 1)
-    hint = f"did you mean {near[0]}?" if near else f"there are {', '.join(sets.facets)}"
+    similar = [each for each in sets.facets if each.lower() == name.lower()]
+    similar = similar or difflib.get_close_matches(name, sets.facets, 1)
+    hint = f"did you mean {similar[0]}?" if similar else f"there are {', '.join(sets.facets)}"
     raise InputError(f'load: there is no set of facets "{name}"; {hint}')
 
 

@@ -29,7 +29,7 @@ class Units(NamedTuple):
 
 
 STRESS_UNITS = {"kPa": Units(1.0, "mN", "uJ", "kg", 1e-6), "MPa": Units(1e3, "N", "mJ", "t", 1e-9)}
-SPACES = ("ras", "lps")
+SPACES = ("ras", "lps")  # conventions of the world's axes
 # Local nodes of the edges whose midpoints are the quadratic tetrahedron's nodes 5 to 10, as in VTK, Abaqus and FEBio.
 QUADRATIC_EDGES = np.array([(0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)])
 

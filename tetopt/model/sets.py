@@ -176,11 +176,11 @@ def with_requested(mesh: Mesh, sets: Sets, requests: Iterable[str], mean: NDArra
         request = parse_set(text, mesh.ndim)
         check_free_names(request, sets)
         if request.kind == "below":
-            cells = _below(mesh, request, mean)
+            cells = _cells_below(mesh, request, mean)
             surface = {f"{request.name}_surface": enclosing_facets(mesh, cells)}
             sets = Sets(sets.facets | surface, sets.cells | {request.name: cells})
         else:
-            sets = Sets(sets.facets | {request.name: _near(mesh, request)}, sets.cells)
+            sets = Sets(sets.facets | {request.name: _facets_within(mesh, request)}, sets.cells)
     return sets
 
 
@@ -238,7 +238,7 @@ def check_free_names(request: SetRequest, sets: Sets) -> None:
             raise InputError(f'set: there is a set "{taken[name.lower()]}" already; call it otherwise than "{name}"')
 
 
-def _below(mesh: Mesh, request: SetRequest, mean: NDArray[np.float64] | None) -> NDArray[np.int64]:
+def _cells_below(mesh: Mesh, request: SetRequest, mean: NDArray[np.float64] | None) -> NDArray[np.int64]:
     name, threshold = request.name, float(request.vectors[0][0])
     if mean is None:
         raise InputError(f"set {name}: the mesh has no means; give the image they come from (--image)")
@@ -248,7 +248,7 @@ def _below(mesh: Mesh, request: SetRequest, mean: NDArray[np.float64] | None) ->
     return chosen
 
 
-def _near(mesh: Mesh, request: SetRequest) -> NDArray[np.int64]:
+def _facets_within(mesh: Mesh, request: SetRequest) -> NDArray[np.int64]:
     """Boundary facets all of whose nodes lie within the distance of the point or plane."""
     offset = mesh.points - request.vectors[0]
     if request.kind == "point":
