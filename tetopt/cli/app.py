@@ -19,6 +19,7 @@ from tetopt.cli.console import log, out, show_warning
 from tetopt.cli.convert import convert_command
 from tetopt.cli.fem import fem_command
 from tetopt.cli.mesh import demo_command, mesh_command
+from tetopt.cli.options import from_records
 from tetopt.cli.phantom import phantom_command
 from tetopt.cli.quality import quality_command
 from tetopt.cli.segment import segment_command
@@ -49,7 +50,7 @@ COMMANDS: dict[str, Callable[..., int]] = {  # in the order of the help
     "demo": demo_command,
 }
 for _name, _command in COMMANDS.items():
-    app.command(_name)(_command)
+    app.command(_name)(from_records(_command))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -83,8 +84,8 @@ def _silent_plot_fonts() -> Iterator[None]:
     yield
 
 
-def _version(wanted: bool) -> None:
-    if wanted:
+def _version(is_requested: bool) -> None:
+    if is_requested:
         out.print(f"tetopt {tetopt.__version__}")
         raise typer.Exit
 

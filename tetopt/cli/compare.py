@@ -4,30 +4,96 @@ from __future__ import annotations
 
 import shlex
 import signal
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, ClassVar
 
 import typer
 from rich.markup import escape
 
 import tetopt
-from tetopt import InputError, save_mesh
+from tetopt import Image, InputError, save_mesh
 from tetopt.cli.console import log, out
 from tetopt.cli.inputs import read_labels, read_volume, results_folder
-from tetopt.cli.options import CropOption, ForceOption, ImageArgument, JsonOption, VolumeOption
+from tetopt.cli.options import DEFAULT_NODES, WHOLE_BOX, BoxPart, ForceOption, ImageArgument, ImagePart, NumberOptions
 from tetopt.cli.quality import image_fit
 from tetopt.io.files import checked_output, save_json
 from tetopt.io.images import sha256
 from tetopt.io.mni import mni_path, mni_tissue
 from tetopt.measure.quality import quality
 from tetopt.model.fields import cell_fields
+from tetopt.model.laws import parse_law
 from tetopt.report.tables import add_quality, new_table
+from tetopt.study.compare_report import ImageSource, LabelSource, Settings
+from tetopt.study.pipelines import PIPELINES, Job
+
+ClassesOption = Annotated[int, typer.Option(metavar="K", min=2, help="Classes of the segmentation (multi-Otsu).")]
+
+
+DEFAULT_SETTINGS = Settings(nodes=DEFAULT_NODES[3])
+GIGABYTE = 1e9  # bytes
 
 
 class Baseline(StrEnum):  # noqa: D101
     pytetwild = "pytetwild"
     cleaver = "cleaver"
+
+
+@dataclass(frozen=True, kw_only=True)
+class ComparedOptions:
+    """What is compared."""
+
+    panel: ClassVar[str] = "What is compared"
+    nodes: Annotated[int, typer.Option(metavar="N", min=20, help="Wanted number of nodes, of every mesh.")] = (
+        DEFAULT_SETTINGS.nodes
+    )
+    labels: Annotated[
+        Path | None,
+        typer.Option(metavar="LABELS", help="Label image, for tetopt and the pipelines that segment."),
+    ] = None
+    repeats: Annotated[int, typer.Option(metavar="R", min=1, help="Runs of a mesher whose result varies.")] = (
+        DEFAULT_SETTINGS.repeats
+    )
+    pipelines: Annotated[str, typer.Option(metavar="A,B,...", help=f"Of {', '.join(PIPELINES)}: which, in order.")] = (
+        ",".join(PIPELINES)
+    )
+    k_D: Annotated[float, typer.Option("--k-d", metavar="K", help="Weight of the image on uniform meshes.")] = (
+        DEFAULT_SETTINGS.k_D
+    )
+    classes: ClassesOption = DEFAULT_SETTINGS.classes
+    curve: Annotated[
+        str, typer.Option(metavar="F,...", help="Node counts of the error curves, as parts of N; empty for none.")
+    ] = ",".join(f"{factor:g}" for factor in DEFAULT_SETTINGS.curve)
+    tradeoff: Annotated[
+        bool, typer.Option("--tradeoff", help="Sweep tetopt's options around its defaults: some 20 more runs.")
+    ] = False
+    part: BoxPart = WHOLE_BOX
+
+
+@dataclass(frozen=True, kw_only=True)
+class SimulationOptions:
+    """The simulation that meshes are measured by."""
+
+    panel: ClassVar[str] = "The simulation"
+    young: Annotated[
+        str | None,
+        typer.Option(metavar="LAW", help="Modulus by intensity, as for `fem`. Default: 1 to 10 kPa over its range."),
+    ] = None
+    reference_dofs: Annotated[
+        int, typer.Option(metavar="D", min=1000, help="Size of the voxel grid that is the truth of the simulation.")
+    ] = DEFAULT_SETTINGS.reference_dofs
+
+
+@dataclass(frozen=True, kw_only=True)
+class LimitOptions:
+    """What one run of a pipeline may take."""
+
+    panel: ClassVar[str] = "Limits"
+    max_seconds: Annotated[float, typer.Option(metavar="S", help="Time limit of one run of a pipeline.")] = (
+        DEFAULT_SETTINGS.max_seconds
+    )
+    max_gb: Annotated[float | None, typer.Option(metavar="GB", help="Memory limit of one run of a pipeline.")] = None
 
 
 def paper_command(
@@ -46,7 +112,7 @@ def paper_command(
 
     if seeds < 1:
         raise InputError(f"--seeds: expected 1 or more, got {seeds}")
-    volume = read_volume(mni_path("t1") if image_path is None else image_path, None, None)
+    volume = read_volume(mni_path("t1") if image_path is None else image_path)
     tissue = None if labels_path is None else read_labels(labels_path, volume)
     if image_path is None and labels_path is None:
         tissue = mni_tissue()
@@ -71,36 +137,31 @@ def baseline_command(
     image_path: ImageArgument,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="MESH.vtu", help="The mesh to write.")],
     pipeline: Annotated[Baseline, typer.Option(help="The mesher of the conventional pipeline.")] = Baseline.pytetwild,
-    nodes: Annotated[int, typer.Option(metavar="N", min=20, help="Wanted number of nodes.")] = 5000,
+    nodes: Annotated[int, typer.Option(metavar="N", min=20, help="Wanted number of nodes.")] = DEFAULT_NODES[3],
     labels_path: Annotated[
         Path | None, typer.Option("--labels", metavar="LABELS", help="Label image instead of a segmentation of IMAGE.")
     ] = None,
-    classes: Annotated[int, typer.Option(metavar="K", min=2, help="Classes of the segmentation (multi-Otsu).")] = 4,
-    volume: VolumeOption = None,
-    crop: CropOption = None,
-    json_path: JsonOption = None,
-    force: ForceOption = False,
+    classes: ClassesOption = DEFAULT_SETTINGS.classes,
+    *,
+    part: BoxPart,
+    numbers: NumberOptions,
 ) -> int:
     """Mesh an image the conventional way, to compare with: segment, extract surfaces, tetrahedralise."""
-    from tetopt.study.pipelines import PIPELINES, Job
-
-    output = checked_output(output, (".vtu",), force)
-    if json_path is not None:
-        json_path = checked_output(json_path, (".json",), force)
-    image = read_volume(image_path, volume, crop)
-    labels = None if labels_path is None else read_labels(labels_path, image, crop)
+    output = checked_output(output, (".vtu",), numbers.force)
+    json_path = numbers.checked()
+    image, labels = _image_and_labels(image_path, labels_path, part)
     made = PIPELINES[pipeline.value].function(Job(image, labels, nodes, classes))
-    measured = quality(made.mesh.points, made.mesh.cells)
+    shape = quality(made.mesh.points, made.mesh.cells)
     options = {"pipeline": pipeline.value, "nodes": nodes, "classes": classes}
     about = {"image": image_path.name, "image_sha256": sha256(image_path), "options": options}
     save_mesh(output, made.mesh, cell_fields(made.mesh, image), {"tetopt": tetopt.__version__, **about})
     if json_path is not None:
         fit = image_fit(image, made.mesh)
-        save_json(json_path, about | {"seconds": made.seconds, "notes": made.notes, "fit": fit, "quality": measured})
+        save_json(json_path, about | {"seconds": made.seconds, "notes": made.notes, "fit": fit, "quality": shape})
     for note in made.notes:
         log.print(escape(f"note: {note}"))
     table = new_table("", escape(output.name))
-    add_quality(table, measured)
+    add_quality(table, shape)
     for step, seconds in made.seconds.items():
         table.add_row(f"seconds, {step}", f"{seconds:.1f}")
     out.print(table)
@@ -111,63 +172,23 @@ def compare_command(
     context: typer.Context,
     image_path: ImageArgument,
     output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the results.")],
-    nodes: Annotated[int, typer.Option(metavar="N", min=20, help="Wanted number of nodes, of every mesh.")] = 5000,
-    labels_path: Annotated[
-        Path | None,
-        typer.Option("--labels", metavar="LABELS", help="Label image, for tetopt and the pipelines that segment."),
-    ] = None,
-    repeats: Annotated[int, typer.Option(metavar="R", min=1, help="Runs of a mesher whose result varies.")] = 3,
-    pipelines: Annotated[
-        str,
-        typer.Option(
-            metavar="A,B,...",
-            help="Of tetopt, tetopt-uniform, tetopt-paper, pytetwild, cleaver, bcc, odt: which, in order.",
-        ),
-    ] = "tetopt,tetopt-uniform,tetopt-paper,pytetwild,cleaver,bcc,odt",
-    k_D: Annotated[float, typer.Option("--k-d", metavar="K", help="Weight of the image on uniform meshes.")] = 0.2,
-    classes: Annotated[int, typer.Option(metavar="K", min=2, help="Classes of the segmentation (multi-Otsu).")] = 4,
-    young: Annotated[
-        str | None,
-        typer.Option(metavar="LAW", help="Modulus by intensity, as for `fem`. Default: 1 to 10 kPa over its range."),
-    ] = None,
-    curve: Annotated[
-        str, typer.Option(metavar="F,...", help="Node counts of the error curves, as parts of N; empty for none.")
-    ] = "0.25,0.5,2",
-    tradeoff: Annotated[
-        bool, typer.Option("--tradeoff", help="Sweep tetopt's options around its defaults: some 20 more runs.")
-    ] = False,
-    reference_dofs: Annotated[
-        int, typer.Option(metavar="D", min=1000, help="Size of the voxel grid that is the truth of the simulation.")
-    ] = 300_000,
-    max_seconds: Annotated[float, typer.Option(metavar="S", help="Time limit of one run of a pipeline.")] = 3600.0,
-    max_gb: Annotated[float | None, typer.Option(metavar="GB", help="Memory limit of one run of a pipeline.")] = None,
-    volume: VolumeOption = None,
-    crop: CropOption = None,
+    compared: ComparedOptions,
+    simulation: SimulationOptions,
+    limits: LimitOptions,
     resume: Annotated[
         bool, typer.Option("--resume", help="Keep the finished runs of an interrupted comparison.")
     ] = False,
     force: ForceOption = False,
 ) -> int:
     """Set tetopt beside the conventional pipelines on a volume: fidelity, shape, simulation accuracy, time."""
-    from tetopt.model.laws import parse_law
     from tetopt.study import compare, compare_files
-    from tetopt.study.compare_report import ImageSource, LabelSource, Settings
 
-    if not 0.0 <= k_D < 1.0:
-        raise InputError(f"--k-d: expected 0 <= k_D < 1, got {k_D}")
-    for name, limit in (("--max-seconds", max_seconds), ("--max-gb", max_gb)):
-        if limit is not None and not 0.0 < limit < float("inf"):
-            raise InputError(f"{name}: expected more than 0, got {limit}")
-    image = read_volume(image_path, volume, crop)
-    labels = None if labels_path is None else read_labels(labels_path, image, crop)
+    settings = _settings(compared, simulation, limits)
+    part, labels_path, young = compared.part, compared.labels, simulation.young
+    image, labels = _image_and_labels(image_path, labels_path, part)
     law, law_words = compare.default_law(image) if young is None else (parse_law(young), young)
-    settings = Settings(
-        nodes=nodes, pipelines=tuple(name.strip() for name in pipelines.split(",")), repeats=repeats, classes=classes,
-        k_D=k_D, reference_dofs=reference_dofs, curve=_parse_curve(curve), tradeoff=tradeoff, max_seconds=max_seconds,
-        max_bytes=None if max_gb is None else int(max_gb * 1e9),
-    )  # fmt: skip
     comparison = compare.Comparison(
-        image, labels, law, settings, ImageSource(image_path.name, sha256(image_path), volume, crop),
+        image, labels, law, settings, ImageSource(image_path.name, sha256(image_path), part.volume, part.crop),
         None if labels_path is None else LabelSource(labels_path.name, "given", sha256(labels_path)), law_words,
         command=f"tetopt {' '.join(map(shlex.quote, context.obj))}",
     )  # fmt: skip
@@ -184,6 +205,28 @@ def compare_command(
     words = f", of which failed: {', '.join(failed)}" if failed else ""
     out.print(escape(f"{paths['report.html']}: {len(settings.pipelines)} pipelines{words}, {report.seconds:.0f} s"))
     return 0
+
+
+def _image_and_labels(path: Path, labels_path: Path | None, part: BoxPart) -> tuple[Image, Image | None]:
+    """The volume, and labels on its voxels, if they are given."""
+    image = read_volume(path, part)
+    return image, None if labels_path is None else read_labels(labels_path, image, ImagePart(crop=part.crop))
+
+
+def _settings(compared: ComparedOptions, simulation: SimulationOptions, limits: LimitOptions) -> Settings:
+    """What is compared and how; InputError for a number out of range."""
+    if not 0.0 <= compared.k_D < 1.0:
+        raise InputError(f"--k-d: expected 0 <= k_D < 1, got {compared.k_D}")
+    for name, limit in (("--max-seconds", limits.max_seconds), ("--max-gb", limits.max_gb)):
+        if limit is not None and not 0.0 < limit < float("inf"):
+            raise InputError(f"{name}: expected more than 0, got {limit}")
+    return Settings(
+        nodes=compared.nodes, pipelines=tuple(name.strip() for name in compared.pipelines.split(",")),
+        repeats=compared.repeats, classes=compared.classes, k_D=compared.k_D,
+        reference_dofs=simulation.reference_dofs, curve=_parse_curve(compared.curve), tradeoff=compared.tradeoff,
+        max_seconds=limits.max_seconds,
+        max_bytes=None if limits.max_gb is None else int(limits.max_gb * GIGABYTE),
+    )  # fmt: skip
 
 
 def _parse_curve(text: str) -> tuple[float, ...]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -13,23 +14,8 @@ from rich.markup import escape
 from tetopt import Image, InputError
 from tetopt.cli.console import log
 from tetopt.cli.inputs import check_no_input, image_and_others, read_mesh, warn_of_other_image
-from tetopt.cli.options import (
-    BinsOption,
-    CropOption,
-    ForceOption,
-    JsonOption,
-    LoadOption,
-    MeshArgument,
-    NuOption,
-    OrderOption,
-    SetOption,
-    SliceOption,
-    SpaceOption,
-    UnitsOption,
-    VolumeOption,
-    YoungOption,
-)
-from tetopt.cli.solver import Wishes, all_sets, built, checked_wishes, print_model, save_wished
+from tetopt.cli.options import ImagePart, MeshArgument, NumberOptions, SolverOptions
+from tetopt.cli.solver import all_sets, check_solver_options, print_model, save_for_solver, solver_model
 from tetopt.io.files import checked_output, save_json
 from tetopt.io.formats import FORMATS, format_of
 from tetopt.io.images import sha256
@@ -41,7 +27,7 @@ from tetopt.report.summary import model_summary, versions
 from tetopt.target.align import aligned_mask
 from tetopt.target.content import continued
 
-TEXTS = ("image", "image_sha256", "inputs", "options")  # of a mesh's file that go on into the new one
+TEXTS_KEPT = ("image", "image_sha256", "inputs", "options")  # of a mesh's file that go on into the new one
 
 
 def convert_command(
@@ -56,45 +42,28 @@ def convert_command(
     mask_path: Annotated[
         Path | None, typer.Option("--mask", metavar="MASK", help="With --image: only what lies in it counts.")
     ] = None,
-    young: YoungOption = None,
-    nu: NuOption = None,
-    bins: BinsOption = None,
-    sets: SetOption = None,
-    loads: LoadOption = None,
-    order: OrderOption = 1,
-    units: UnitsOption = "kPa",
-    space: SpaceOption = "ras",
-    volume: VolumeOption = None,
-    crop: CropOption = None,
-    slice_: SliceOption = None,
-    json_path: JsonOption = None,
-    force: ForceOption = False,
+    *,
+    part: ImagePart,
+    solver: SolverOptions,
+    numbers: NumberOptions,
 ) -> int:
     """Write a mesh for a solver: materials, named sets, loads, in the format of OUT's suffix."""
     format_of(output)
-    output = checked_output(output, tuple(FORMATS), force)
-    if json_path is not None:
-        json_path = checked_output(json_path, (".json",), force)
+    output = checked_output(output, tuple(FORMATS), numbers.force)
+    json_path = numbers.checked()
     check_no_input(output, mesh_path, image_path, mask_path)
-    wishes = Wishes(young, nu, bins, list(sets or []), list(loads or []), order, units, space)
-    given = {"--mask": mask_path, "--volume": volume, "--crop": crop, "--slice": slice_}
-    if image_path is None and (lost := [name for name, value in given.items() if value is not None]):
+    needs_image = {"--mask": mask_path, "--volume": part.volume, "--crop": part.crop, "--slice": part.slice_}
+    if image_path is None and (lost := [name for name, value in needs_image.items() if value is not None]):
         raise InputError(f"{lost[0]}: there is no --image")
     loaded = read_mesh(mesh_path)
-    checked_wishes(output, wishes, has_materials="young" in loaded.cell_data)
-    if not wishes.loads:
-        wishes = wishes._replace(loads=_loads_of(loaded, output))
-    fields = dict(loaded.cell_data)
-    about: dict[str, Any] = {name: text for name in TEXTS if (text := loaded.text(name)) is not None}
-    box = loaded.box
+    check_solver_options(output, solver, has_materials="young" in loaded.cell_data)
+    if not solver.loads:
+        solver = replace(solver, loads=_loads_of(loaded, output))
+    fields, box = dict(loaded.cell_data), loaded.box
+    about: dict[str, Any] = {name: text for name in TEXTS_KEPT if (text := loaded.text(name)) is not None}
     image: Image | None = None
     if image_path is not None:
-        whole, beside = image_and_others(image_path, volume, crop, slice_)
-        if whole.ndim != loaded.mesh.ndim:
-            raise InputError(
-                f"{image_path}: expected a {loaded.mesh.ndim}-D image, as the mesh is, got a {whole.ndim}-D one"
-            )
-        image = continued(whole, None if mask_path is None else beside(mask_path, aligned_mask))
+        whole, image = _images(image_path, mask_path, part, loaded.mesh.ndim)
         if warn_of_other_image(loaded, mesh_path, image_path):
             about = {}
         fields |= cell_fields(loaded.mesh, image)
@@ -104,13 +73,22 @@ def convert_command(
         about["box"] = box_text(box)
     if format_of(output).is_surface:  # which holds no materials
         fields = {name: values for name, values in fields.items() if name not in ("young", "nu")}
-    model = built(loaded.mesh, image, wishes, fields, about, all_sets(loaded.mesh, box, fields, loaded.sets))
-    save_wished(output, model, wishes)
+    known_sets = all_sets(loaded.mesh, box, fields, loaded.sets)
+    model = solver_model(loaded.mesh, image, solver, fields, about, known_sets)
+    save_for_solver(output, model, solver)
     if json_path is not None:
-        files = {"mesh": mesh_path.name, "output": output.name, "units": units, "space": space}
+        files = {"mesh": mesh_path.name, "output": output.name, "units": solver.units, "space": solver.space}
         save_json(json_path, files | {"versions": versions()} | model_summary(model))
-    print_model(output, model, wishes)
+    print_model(output, model, solver)
     return 0
+
+
+def _images(path: Path, mask_path: Path | None, part: ImagePart, ndim: int) -> tuple[Image, Image]:
+    """The image as it is, and as it counts: beyond the mask continued by the nearest value inside."""
+    whole, beside = image_and_others(path, part)
+    if whole.ndim != ndim:
+        raise InputError(f"{path}: expected a {ndim}-D image, as the mesh is, got a {whole.ndim}-D one")
+    return whole, continued(whole, None if mask_path is None else beside(mask_path, aligned_mask))
 
 
 def _loads_of(loaded: MeshFile, output: Path) -> list[str]:

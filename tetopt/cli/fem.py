@@ -3,21 +3,24 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 from rich.markup import escape
 
 import tetopt
-from tetopt import InputError, save_mesh
+from tetopt import InputError, Mesh, save_mesh
 from tetopt.cli.console import out
 from tetopt.cli.inputs import check_no_input, read_image, read_mesh
-from tetopt.cli.options import CropOption, ForceOption, ImageArgument, JsonOption, SliceOption, VolumeOption
+from tetopt.cli.options import ImageArgument, ImagePart, NumberOptions
 from tetopt.io.files import checked_output, save_json
 from tetopt.io.images import sha256
 from tetopt.model.materials import DEFAULT_NU
 from tetopt.report.summary import versions
 from tetopt.report.tables import new_table
+
+if TYPE_CHECKING:
+    from tetopt.study.paper import Simulated
 
 
 def fem_command(
@@ -37,11 +40,9 @@ def fem_command(
         Path | None,
         typer.Option("-o", "--output", metavar="PRESSED.vtu", help="Write the mesh with displacements and strains."),
     ] = None,
-    volume: VolumeOption = None,
-    crop: CropOption = None,
-    slice_: SliceOption = None,
-    json_path: JsonOption = None,
-    force: ForceOption = False,
+    *,
+    part: ImagePart,
+    numbers: NumberOptions,
 ) -> int:
     """Compress a mesh, one modulus a cell: conditioning of the stiffness matrix, strain energy, CG iterations.
 
@@ -53,43 +54,46 @@ def fem_command(
     from tetopt.model.laws import parse_law
     from tetopt.study.paper import simulate
 
-    if json_path is not None:
-        json_path = checked_output(json_path, (".json",), force)
+    json_path = numbers.checked()
     if output is not None:
-        output = checked_output(output, (".vtu",), force)
+        output = checked_output(output, (".vtu",), numbers.force)
         check_no_input(output, mesh_path)
     if not 0.0 < compress <= 50.0:
         raise InputError(f"--compress: expected a percentage above 0 and up to 50, got {compress:g}")
     law = None if young is None else parse_law(young)
-    image = read_image(image_path, volume, crop, slice_)
-    loaded = read_mesh(mesh_path)
+    image = read_image(image_path, part)
+    mesh = read_mesh(mesh_path).mesh
     try:
-        found, pressed = simulate(image, loaded.mesh, nu=nu, percent=compress, law=law)
+        simulation, pressed = simulate(image, mesh, nu=nu, percent=compress, law=law)
     except RuntimeError as error:
         raise InputError(f"{error}; the moduli differ too much, or nu is too near 0.5, for this mesh") from error
     if output is not None:
-        fields = {"young": found.young, "strain": strains(loaded.mesh, pressed.u).reshape(len(found.young), -1)}
-        save_mesh(output, loaded.mesh, fields, {"tetopt": tetopt.__version__}, {"displacement": pressed.u})
-    table = new_table("", escape(mesh_path.name))
-    table.add_row("nodes", str(len(loaded.mesh.points)))
-    table.add_row("modulus of the cells, kPa", f"{found.young.min():.4g} to {found.young.max():.4g}")
-    unit = "mN/mm" if loaded.mesh.ndim == 3 else "mN/mm per mm of thickness"
-    table.add_row(f"largest eigenvalue of the stiffness, {unit}", f"{found.lambda_max:.6g}")
-    table.add_row("condition number, 2-norm", f"{found.cond:.6g}")
-    table.add_row("Jacobi CG iterations to 1e-10", str(found.cg_iterations))
-    table.add_row(f"strain energy at {compress:g} %, uJ", f"{found.strain_energy:.6g}")
-    out.print(table)
+        fields = {"young": simulation.young, "strain": strains(mesh, pressed.u).reshape(len(simulation.young), -1)}
+        save_mesh(output, mesh, fields, {"tetopt": tetopt.__version__}, {"displacement": pressed.u})
+    _print(simulation, mesh, mesh_path.name, compress)
     if json_path is not None:
-        options = {
-            "young": young, "nu": nu, "compress_percent": compress, "volume": volume, "crop": crop, "slice": slice_
-        }  # fmt: skip
+        options = {"young": young, "nu": nu, "compress_percent": compress, **part.stated()}
         files = {"image": image_path.name, "image_sha256": sha256(image_path), "mesh": mesh_path.name}
-        size = {"n_nodes": len(loaded.mesh.points), "n_cells": len(loaded.mesh.cells)}
-        numbers = {key: value for key, value in found._asdict().items() if key != "young"}
-        moduli = {"young_kPa_min": found.young.min(), "young_kPa_max": found.young.max()}
-        units = {"lambda_max": "mN/mm", "strain_energy": "uJ"}
-        save_json(
-            json_path,
-            {**files, "versions": versions(), "options": options, **size, **moduli, **numbers, "units": units},
-        )
+        save_json(json_path, {**files, "versions": versions(), "options": options, **_numbers(simulation, mesh)})
     return 0
+
+
+def _print(simulation: Simulated, mesh: Mesh, name: str, compress: float) -> None:
+    """The table of a compression by so many per cent."""
+    table = new_table("", escape(name))
+    table.add_row("nodes", str(len(mesh.points)))
+    table.add_row("modulus of the cells, kPa", f"{simulation.young.min():.4g} to {simulation.young.max():.4g}")
+    unit = "mN/mm" if mesh.ndim == 3 else "mN/mm per mm of thickness"
+    table.add_row(f"largest eigenvalue of the stiffness, {unit}", f"{simulation.lambda_max:.6g}")
+    table.add_row("condition number, 2-norm", f"{simulation.cond:.6g}")
+    table.add_row("Jacobi CG iterations to 1e-10", str(simulation.cg_iterations))
+    table.add_row(f"strain energy at {compress:g} %, uJ", f"{simulation.strain_energy:.6g}")
+    out.print(table)
+
+
+def _numbers(simulation: Simulated, mesh: Mesh) -> dict[str, Any]:
+    """The numbers of a compression for its JSON file."""
+    size = {"n_nodes": len(mesh.points), "n_cells": len(mesh.cells)}
+    moduli = {"young_kPa_min": simulation.young.min(), "young_kPa_max": simulation.young.max()}
+    numbers = {key: value for key, value in simulation._asdict().items() if key != "young"}
+    return {**size, **moduli, **numbers, "units": {"lambda_max": "mN/mm", "strain_energy": "uJ"}}

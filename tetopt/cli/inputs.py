@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numba
@@ -13,36 +14,38 @@ from rich.markup import escape
 
 from tetopt import Image, InputError, load_image, load_mesh
 from tetopt.cli.console import log, show_warning
+from tetopt.cli.options import WHOLE_BOX, WHOLE_IMAGE, BoxPart, ImagePart
 from tetopt.io.images import parse_crop, parse_slice, part_of, sha256
 from tetopt.io.meshes import MeshFile
 from tetopt.target.align import aligned_contrast, is_same_grid
 from tetopt.target.content import check_labels
 
-INSIDE = 0.95  # of a mask or of labels that lies in the image, to expect
+INSIDE_SHARE = 0.95  # of a mask's or labels' volume: less of it in the image is more than the grids' difference
+AFFINE_MM = 1e-4  # affines that differ by less are the same: files round them to 32 bits
 
 
-def read_image(path: Path, volume: int | None, crop: str | None, slice_: str | None) -> Image:
+def read_image(path: Path, part: ImagePart = WHOLE_IMAGE) -> Image:
     """The image as the options ask for it."""
     return load_image(
         path,
-        volume=volume,
-        slice_=None if slice_ is None else parse_slice(slice_),
-        crop=None if crop is None else parse_crop(crop),
+        volume=part.volume,
+        slice_=None if part.slice_ is None else parse_slice(part.slice_),
+        crop=None if part.crop is None else parse_crop(part.crop),
     )
 
 
-def read_volume(path: Path, volume: int | None, crop: str | None) -> Image:
+def read_volume(path: Path, part: BoxPart = WHOLE_BOX) -> Image:
     """A 3-D image; InputError for a picture."""
-    image = read_image(path, volume, crop, None)
+    image = read_image(path, ImagePart(volume=part.volume, crop=part.crop))
     if image.ndim != 3:
         raise InputError(f"{path}: expected a volume, got a {image.ndim}-D image")
     return image
 
 
-def read_labels(path: Path, image: Image, crop: str | None = None, slice_: str | None = None) -> Image:
+def read_labels(path: Path, image: Image, part: ImagePart = WHOLE_IMAGE) -> Image:
     """A label image, cut as the image was; InputError unless it lies on the image's voxels."""
-    labels = read_image(path, None, crop, slice_)
-    if labels.shape != image.shape or not np.allclose(labels.affine, image.affine, atol=1e-4):
+    labels = read_image(path, replace(part, volume=None))
+    if labels.shape != image.shape or not np.allclose(labels.affine, image.affine, atol=AFFINE_MM):
         raise InputError(
             f"{path}: expected labels on the image's own voxels, {image.shape} with its affine, got {labels.shape}; "
             "resample them to the image first"
@@ -52,34 +55,34 @@ def read_labels(path: Path, image: Image, crop: str | None = None, slice_: str |
 
 
 def image_and_others(
-    path: Path, volume: int | None, crop: str | None, slice_: str | None
+    path: Path, part: ImagePart
 ) -> tuple[Image, Callable[[Path, Callable[[Image, Image, str], Image]], Image]]:
     """The image as the options ask for it, and a function that reads files beside it and aligns them to its voxels."""
-    image = read_image(path, volume, crop, slice_)
+    image = read_image(path, part)
     # A slice has lost its place across it: what goes with it is aligned to the whole image and sliced like that.
-    whole = image if slice_ is None else read_image(path, volume, None, None)
+    whole = image if part.slice_ is None else read_image(path, ImagePart(volume=part.volume))
 
     def beside(other: Path, aligned: Callable[[Image, Image, str], Image]) -> Image:
-        given = read_companion(other)
-        moved = aligned(given, whole, str(other))
-        if not is_same_grid(given, whole):
-            _say_resampled(other, given, moved, is_contrast=aligned is aligned_contrast)
-        return (
-            moved if slice_ is None else part_of(moved, parse_slice(slice_), None if crop is None else parse_crop(crop))
-        )
+        original = read_companion(other)
+        moved = aligned(original, whole, str(other))
+        if not is_same_grid(original, whole):
+            _say_resampled(other, original, moved, is_contrast=aligned is aligned_contrast)
+        if part.slice_ is None:
+            return moved
+        return part_of(moved, parse_slice(part.slice_), None if part.crop is None else parse_crop(part.crop))
 
     return image, beside
 
 
-def _say_resampled(path: Path, given: Image, moved: Image, is_contrast: bool) -> None:
+def _say_resampled(path: Path, original: Image, moved: Image, is_contrast: bool) -> None:
     """That a file lay on another grid, and how much of a mask or of labels is in the image."""
     if is_contrast:
         log.print(escape(f"{path}: taken to the image's voxels, linearly"))
         return
-    whole, there = (np.count_nonzero(each.data) * each.voxel_volume for each in (given, moved))
+    whole, inside = (np.count_nonzero(each.data) * each.voxel_volume for each in (original, moved))
     log.print(escape(f"{path}: taken to the image's voxels, nearest neighbour"))
-    if there < INSIDE * whole:
-        show_warning(f"{path}: only {there / whole:.0%} of it lies in the image; is it of the same scan?")
+    if inside < INSIDE_SHARE * whole:
+        show_warning(f"{path}: only {inside / whole:.0%} of it lies in the image; is it of the same scan?")
 
 
 def read_companion(path: Path) -> Image:

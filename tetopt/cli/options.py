@@ -1,14 +1,55 @@
-"""Arguments and options that several commands take."""
+"""Options of the commands, as records of annotated fields, and how typer takes them.
+
+A command is a function of records; `from_records` makes of it the function of single options that typer wants, each
+record's options in a panel of the help. The help's words stand here alone.
+"""
 
 from __future__ import annotations
 
+import inspect
+from collections.abc import Callable, Iterator
+from copy import copy
+from dataclasses import MISSING, dataclass, fields, is_dataclass
 from enum import StrEnum
+from functools import wraps
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any, ClassVar, cast, get_args, get_type_hints
 
 import typer
+from typer.models import OptionInfo
 
+from tetopt.engine.loop import (
+    GRADED_ITERATIONS,
+    GRADED_K_D,
+    MIN_DIHEDRAL,
+    SHAPE_POWER,
+    START_K_D,
+    UNIFORM_ITERATIONS,
+    UNIFORM_K_D,
+)
+from tetopt.io.files import checked_output
+from tetopt.io.formats import FORMATS
 from tetopt.model.materials import DEFAULT_NU
+
+DEFAULT_NODES = {2: 500, 3: 5000}  # by dimension; on small images a graded mesh has fewer
+
+
+class Lattice(StrEnum):  # noqa: D101
+    bcc = "bcc"
+    five_tet = "five-tet"
+    criss_cross = "criss-cross"
+    octree = "octree"
+
+
+class Boundary(StrEnum):  # noqa: D101
+    slide = "slide"
+    fixed = "fixed"
+
+
+class Retessellate(StrEnum):  # noqa: D101
+    first = "first"
+    accept = "accept"
+    never = "never"
 
 
 class Method(StrEnum):  # noqa: D101
@@ -20,64 +61,317 @@ ImageArgument = Annotated[
     Path,
     typer.Argument(metavar="IMAGE", help="NIfTI, MGZ, NRRD, MetaImage, a DICOM folder, or a 2-D picture."),
 ]
-ImagesArgument = Annotated[
-    list[Path],
-    typer.Argument(metavar="IMAGE...", help="As for the other commands; further contrasts go to the first one's grid."),
-]
 MeshArgument = Annotated[
     Path, typer.Argument(metavar="MESH", help="VTU, VTK or gmsh MSH file of tetrahedra or triangles.")
 ]
-MaskOption = Annotated[
-    Path | None,
-    typer.Option(metavar="MASK", help="Mesh this region only (0/1, or 0 to 1), its boundary on the mask's surface."),
-]
-LabelsOption = Annotated[
-    Path | None, typer.Option("--labels", metavar="LABELS", help="Label image: each cell is to be of one label.")
-]
-VolumeOption = Annotated[int | None, typer.Option("--volume", metavar="K", help="Volume of a 4-D file, from 0.")]
+VolumeOption = Annotated[int | None, typer.Option(metavar="K", help="Volume of a 4-D file, from 0.")]
 CropOption = Annotated[
-    str | None,
-    typer.Option("--crop", metavar="A:B,C:D,E:F", help="Keep these voxels, half open; an end may be empty."),
-]
-SliceOption = Annotated[
-    str | None, typer.Option("--slice", metavar="AXIS=INDEX", help="One slice, in 2-D; for example k=90.")
+    str | None, typer.Option(metavar="A:B,C:D,E:F", help="Keep these voxels, half open; an end may be empty.")
 ]
 JsonOption = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write every number here.")]
 ForceOption = Annotated[bool, typer.Option("--force", help="Replace existing outputs.")]
-ThreadsOption = Annotated[
-    int | None, typer.Option("--threads", metavar="N", help="Threads; the result is the same for any number.")
-]
-YoungOption = Annotated[
-    str | None,
-    typer.Option(
-        metavar="LAW",
-        help='Young\'s modulus, kPa: a number, a formula of the intensity, "0.5 + 0.01*h", a table "0:1,100:5", '
-        'by label "1=2.1,2=1.9", or a file .toml or .csv of such columns.',
-    ),
-]
-NuOption = Annotated[str | None, typer.Option(metavar="LAW", help=f"Poisson's ratio, likewise (default {DEFAULT_NU}).")]
-BinsOption = Annotated[
-    str | None,
-    typer.Option(metavar="K[:quantile|:log]", help="Group cells into K materials, of equal width, by number, or log."),
-]
-SetOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--set",
-        metavar="NAME=...",
-        help="A set more: NAME=below:T, NAME=point:X,Y,Z:D, NAME=plane:X,Y,Z:NX,NY,NZ:D (mm, RAS+). May be repeated.",
-    ),
-]
-LoadOption = Annotated[
-    list[str] | None,
-    typer.Option(
-        "--load",
-        metavar="...",
-        help="A step to run: compress:5%, or hold:SET and move:SET:X,Y,Z. May be repeated.",
-    ),
-]
-OrderOption = Annotated[
-    int, typer.Option(metavar="1|2", help="2: quadratic cells, straight-edged (.inp, .feb, .msh, .msh2).")
-]
-UnitsOption = Annotated[str, typer.Option(metavar="kPa|MPa", help="Unit of stress in the file; --young is in kPa.")]
 SpaceOption = Annotated[str, typer.Option(metavar="ras|lps", help="Convention of the file's coordinates.")]
+
+
+@dataclass(frozen=True, kw_only=True)
+class BoxPart:
+    """Which part of a volume file is read."""
+
+    volume: VolumeOption = None
+    crop: CropOption = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class ImagePart:
+    """Which part of an image file is read; a slice of it is an image in 2-D."""
+
+    volume: VolumeOption = None
+    crop: CropOption = None
+    slice_: Annotated[
+        str | None, typer.Option("--slice", metavar="AXIS=INDEX", help="One slice, in 2-D; for example k=90.")
+    ] = None
+
+    def stated(self) -> dict[str, int | str | None]:
+        """The part as files of numbers state it."""
+        return {"volume": self.volume, "crop": self.crop, "slice": self.slice_}
+
+
+WHOLE_BOX, WHOLE_IMAGE = BoxPart(), ImagePart()
+
+
+@dataclass(frozen=True, kw_only=True)
+class NumberOptions:
+    """The file of all numbers beside what a command prints."""
+
+    json_path: JsonOption = None
+    force: ForceOption = False
+
+    def checked(self) -> Path | None:
+        """The file, if there is to be one; InputError if it may not be written."""
+        return None if self.json_path is None else checked_output(self.json_path, (".json",), self.force)
+
+
+@dataclass(frozen=True, kw_only=True)
+class SourceOptions:
+    """What `tetopt mesh` meshes."""
+
+    panel: ClassVar[str] = "What is meshed"
+    images: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="IMAGE...", help="As for the other commands; further contrasts go to the first one's grid."
+        ),
+    ]
+    mask: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="MASK", help="Mesh this region only (0/1, or 0 to 1), its boundary on the mask's surface."
+        ),
+    ] = None
+    background: Annotated[
+        str | None,
+        typer.Option(metavar="VALUE|auto", help="Leave out what is up to VALUE and reaches the box: the air."),
+    ] = None
+    labels: Annotated[
+        Path | None, typer.Option(metavar="LABELS", help="Label image: each cell is to be of one label.")
+    ] = None
+    weights: Annotated[
+        str | None, typer.Option(metavar="W,...", help="How much each IMAGE counts (default 1 each; 0: not at all).")
+    ] = None
+    label_weight: Annotated[
+        float | None, typer.Option(metavar="W", help="How much the labels count beside the first IMAGE (default 1).")
+    ] = None
+    part: ImagePart = WHOLE_IMAGE
+
+
+@dataclass(frozen=True, kw_only=True)
+class SizeOptions:
+    """How many nodes there are, and how large cells may be."""
+
+    panel: ClassVar[str] = "Number and size of cells"
+    nodes: Annotated[
+        int | None,
+        typer.Option(
+            metavar="N", help=f"Wanted number of nodes (default {DEFAULT_NODES[3]}; {DEFAULT_NODES[2]} in 2-D)."
+        ),
+    ] = None
+    target_error: Annotated[
+        float | None,
+        typer.Option(metavar="T", help="As many nodes as leave this share of the image's variance in cells, instead."),
+    ] = None
+    size_min: Annotated[float | None, typer.Option(metavar="MM", help="No edge is split into shorter ones.")] = None
+    size_max: Annotated[
+        float | None,
+        typer.Option(metavar="MM", help="No cell is made with a longer edge (default 1.4 x a uniform mesh's)."),
+    ] = None
+    gradation: Annotated[
+        float | None,
+        typer.Option(metavar="G", help="How gently sizes change: each is 1/G blocks wide, 0.05 to 1 (default)."),
+    ] = None
+    sizing: Annotated[
+        Path | None, typer.Option(metavar="SIZES.nii.gz", help="Longest edge by place, mm; 0 or less: as elsewhere.")
+    ] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class StartOptions:
+    """The mesh that a run begins with."""
+
+    panel: ClassVar[str] = "The mesh it begins with"
+    lattice: Annotated[
+        Lattice | None,
+        typer.Option(
+            help="Initial mesh. octree, the default, puts nodes where the image has content; the others are uniform."
+        ),
+    ] = None
+    uniform: Annotated[
+        bool, typer.Option("--uniform", help="The paper's setting: a uniform lattice, bcc (criss-cross in 2-D).")
+    ] = False
+    spacing: Annotated[float | None, typer.Option(metavar="MM", help="A uniform lattice of this spacing.")] = None
+    start: Annotated[
+        Path | None,
+        typer.Option(metavar="MESH", help="Improve this mesh, its boundary kept, instead of making a new one."),
+    ] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class EngineOptions:
+    """How the mesh is optimised."""
+
+    panel: ClassVar[str] = "Optimisation"
+    k_D: Annotated[
+        float | None,
+        typer.Option(
+            "--k-d",
+            metavar="K",
+            help="Weight of the image: 0 shape only; 0.9 image first "
+            f"(default {GRADED_K_D:g}; --uniform {UNIFORM_K_D:g}; --start {START_K_D:g}).",
+        ),
+    ] = None
+    iterations: Annotated[
+        int | None,
+        typer.Option(
+            metavar="I",
+            min=0,
+            help="Sweeps over all nodes; 0 writes the initial mesh "
+            f"(default {GRADED_ITERATIONS}; {UNIFORM_ITERATIONS} if uniform).",
+        ),
+    ] = None
+    boundary: Annotated[
+        Boundary | None, typer.Option(help="What the boundary's nodes may do (default slide; with --start fixed).")
+    ] = None
+    method: Annotated[
+        Method, typer.Option(help="fast: gradients, flips, a floor on angles; paper: the scheme of the paper.")
+    ] = Method.fast
+    shape_power: Annotated[
+        float | None,
+        typer.Option(
+            metavar="P",
+            help=f"Fast method: 1 is the paper's E_G; up to 10 punish flat cells more (default {SHAPE_POWER:g}).",
+        ),
+    ] = None
+    min_dihedral: Annotated[
+        float | None,
+        typer.Option(
+            metavar="DEG",
+            help=f"Fast method, 3-D: smallest dihedral angle allowed, 0 (none) to 70 (default {MIN_DIHEDRAL:g}).",
+        ),
+    ] = None
+    n_t: Annotated[
+        int | None,
+        typer.Option(
+            "--n-t",
+            metavar="T",
+            min=0,
+            help="Paper's method: connect anew in the first T iterations (default half; all for k_D = 0).",
+        ),
+    ] = None
+    retessellate: Annotated[
+        Retessellate | None,
+        typer.Option(
+            help="Paper's method: Delaunay anew in the first n_t iterations (the default), whenever it lowers E, never."
+        ),
+    ] = None
+    threads: Annotated[
+        int | None, typer.Option(metavar="N", help="Threads; the result is the same for any number.")
+    ] = None
+    max_seconds: Annotated[
+        float | None, typer.Option(metavar="S", help="Stop after S seconds with the mesh reached.")
+    ] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolverOptions:
+    """What the file tells a solver besides the mesh."""
+
+    panel: ClassVar[str] = "For the solver"
+    young: Annotated[
+        str | None,
+        typer.Option(
+            metavar="LAW",
+            help='Young\'s modulus, kPa: a number, a formula of the intensity, "0.5 + 0.01*h", a table "0:1,100:5", '
+            'by label "1=2.1,2=1.9", or a file .toml or .csv of such columns.',
+        ),
+    ] = None
+    nu: Annotated[
+        str | None, typer.Option(metavar="LAW", help=f"Poisson's ratio, likewise (default {DEFAULT_NU:g}).")
+    ] = None
+    bins: Annotated[
+        str | None,
+        typer.Option(
+            metavar="K[:quantile|:log]", help="Group cells into K materials, of equal width, by number, or log."
+        ),
+    ] = None
+    sets: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="NAME=...",
+            help="A set more: NAME=below:T, NAME=point:X,Y,Z:D, NAME=plane:X,Y,Z:NX,NY,NZ:D (mm, RAS+). May be "
+            "repeated.",
+        ),
+    ] = None
+    loads: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--load",
+            metavar="...",
+            help="A step to run: compress:5%, or hold:SET and move:SET:X,Y,Z. May be repeated.",
+        ),
+    ] = None
+    order: Annotated[
+        int, typer.Option(metavar="1|2", help="2: quadratic cells, straight-edged (.inp, .feb, .msh, .msh2).")
+    ] = 1
+    units: Annotated[str, typer.Option(metavar="kPa|MPa", help="Unit of stress in the file; --young is in kPa.")] = (
+        "kPa"
+    )
+    space: SpaceOption = "ras"
+
+    def are_any(self) -> bool:
+        """Whether more is asked for than the mesh."""
+        return self != SolverOptions()
+
+
+@dataclass(frozen=True, kw_only=True)
+class OutputOptions:
+    """What `tetopt mesh` writes."""
+
+    mesh: Annotated[
+        Path, typer.Option("-o", "--output", metavar="MESH", help=f"The mesh to write: {', '.join(FORMATS)}.")
+    ]
+    json_path: JsonOption = None
+    figures: Annotated[
+        Path | None,
+        typer.Option(metavar="DIR", help="Draw slice.png, rho.png, energies.png and others in this folder."),
+    ] = None
+    force: ForceOption = False
+
+
+def from_records(command: Callable[..., int]) -> Callable[..., int]:
+    """The command as a function of single options, for typer: the fields of its records in the records' places.
+
+    A record is a dataclass; the records in it count as part of it. Its `panel`, if it has one, is the title of its
+    options in the help.
+    """
+    kinds = get_type_hints(command, include_extras=True)
+    defaults = {name: each.default for name, each in inspect.signature(command).parameters.items()}
+
+    @wraps(command)
+    def called(**values: Any) -> int:
+        return command(**{name: _of_values(kinds[name], name, values) for name in defaults})
+
+    parameters = [option for name, default in defaults.items() for option in _options(name, kinds[name], default)]
+    called.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
+    called.__annotations__ = {option.name: option.annotation for option in parameters}
+    return called
+
+
+def _options(name: str, kind: Any, default: Any, panel: str | None = None) -> Iterator[inspect.Parameter]:
+    """The parameters that stand for one of a command, or for a field of a record."""
+    if not is_dataclass(kind):
+        yield inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=_in(panel, kind))
+        return
+    kinds, panel = get_type_hints(kind, include_extras=True), getattr(kind, "panel", panel)
+    for field in fields(kind):
+        default = inspect.Parameter.empty if field.default is MISSING else field.default
+        yield from _options(field.name, kinds[field.name], default, panel)
+
+
+def _in(panel: str | None, kind: Any) -> Any:
+    """The annotation with its option in a panel of the help; arguments have one of their own."""
+    extras = get_args(kind)[1:]
+    if panel is None or not isinstance(extras[0], OptionInfo):
+        return kind
+    option = copy(extras[0])
+    option.rich_help_panel = panel
+    return Annotated[get_args(kind)[0], option]
+
+
+def _of_values(kind: Any, name: str, values: dict[str, Any]) -> Any:
+    """A parameter's value: one of `values`, or the record that is made of them."""
+    if not is_dataclass(kind):
+        return values[name]
+    kinds = get_type_hints(kind)
+    return cast(Callable[..., Any], kind)(
+        **{field.name: _of_values(kinds[field.name], field.name, values) for field in fields(kind)}
+    )

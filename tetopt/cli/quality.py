@@ -4,17 +4,18 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
 import typer
 from rich.markup import escape
+from rich.table import Table
 
 import tetopt
 from tetopt import Image, InputError, Mesh
 from tetopt.cli.console import log, out, print_fidelity
 from tetopt.cli.inputs import image_and_others, read_mesh, warn_of_other_image
-from tetopt.cli.options import CropOption, ForceOption, JsonOption, SliceOption, VolumeOption
-from tetopt.io.files import checked_output, save_json
+from tetopt.cli.options import ImagePart, NumberOptions
+from tetopt.io.files import save_json
 from tetopt.io.meshes import MeshFile
 from tetopt.measure.quality import quality
 from tetopt.report.summary import fidelity
@@ -37,62 +38,61 @@ def quality_command(
     check: Annotated[
         bool, typer.Option("--check", help="Is it a mesh? With --image, does it fill the box? Exit 1 if not.")
     ] = False,
-    volume: VolumeOption = None,
-    crop: CropOption = None,
-    slice_: SliceOption = None,
-    json_path: JsonOption = None,
-    force: ForceOption = False,
+    *,
+    part: ImagePart,
+    numbers: NumberOptions,
 ) -> int:
     """Measure a mesh: shape, angles, bad cells, and how well its cells fit an image."""
-    if json_path is not None:
-        json_path = checked_output(json_path, (".json",), force)
+    json_path = numbers.checked()
     if image_path is None and (mask_path is not None or labels_path is not None):
         raise InputError("--mask and --labels: give the --image, too, on whose voxels they are compared")
     loaded = read_mesh(mesh_path)
-    measured = quality(loaded.mesh.points, loaded.mesh.cells)
-    found: dict[str, Any] = {}
-    content: dict[str, Any] = {"mesh": mesh_path.name, "quality": measured, "n_turned": loaded.n_turned}
+    shape = quality(loaded.mesh.points, loaded.mesh.cells)
+    report: dict[str, Any] = {"mesh": mesh_path.name, "quality": shape, "n_turned": loaded.n_turned}
     table = new_table("", escape(mesh_path.name))
-    add_quality(table, measured)
+    add_quality(table, shape)
+    image: Image | None = None
+    fit: Fit | None = None
+    measured: dict[str, Any] = {}
     if image_path is not None:
-        image, beside = image_and_others(image_path, volume, crop, slice_)
+        image, beside = image_and_others(image_path, part)
         labels = None if labels_path is None else beside(labels_path, aligned_labels)
         mask = None if mask_path is None else beside(mask_path, aligned_mask)
         fit = image_fit(continued(image, mask), loaded.mesh)
-        found = fidelity(labels, mask, loaded.mesh, loaded.cell_data.get("label"))
-        content |= found
+        measured = fidelity(labels, mask, loaded.mesh, loaded.cell_data.get("label"))
         warn_of_other_image(loaded, mesh_path, image_path)
-        content |= {"image": image_path.name, "fit": fit}
-        table.add_row("E_D", f"{fit['E_D']:.6g}")
-        if fit["E_D_share_of_variance"] is not None:
-            table.add_row("E_D, share of the variance inside", f"{fit['E_D_share_of_variance']:.5f}")
-        table.add_row("voxels inside", f"{fit['n_voxels']} of {image.data.size}")
-        table.add_row("cells without a voxel", str(fit["n_empty_cells"]))
+        report |= {**measured, "image": image_path.name, "fit": fit}
+        _add_fit(table, fit, image.data.size)
     is_masked = mask_path is not None or _was_masked(loaded)
-    is_box = image_path is not None and not is_masked
     problems = []
     if check:
-        problems = tetopt.check_mesh(loaded.mesh, image if is_box else None, is_whole=not is_masked)
-    if check:
-        content["problems"] = problems
+        problems = tetopt.check_mesh(loaded.mesh, None if is_masked else image, is_whole=not is_masked)
+        report["problems"] = problems
     if json_path is not None:
-        save_json(json_path, content)
+        save_json(json_path, report)
     out.print(table)
-    print_fidelity(found)
+    print_fidelity(measured)
     for problem in problems:
         log.print(f"[bold red]tetopt:[/] {escape(str(mesh_path))}: {escape(problem)}")
     if check and not problems:
-        words = ", in one piece, fills the box" if is_box else ", in one piece"
+        words = ", in one piece" if image is None else ", in one piece, fills the box"
         words = "; made within a mask, which may have pieces" if is_masked else words
         out.print(f"checked: conforming, oriented{words}")
     if problems:
         return 1
-    if image_path is not None and fit["n_voxels"] > image.data.size:
-        log.print(
-            f"[bold red]tetopt:[/] cells overlap: together they hold {fit['n_voxels']} voxels, more than there are"
-        )
+    if image is not None and fit is not None and fit.n_voxels > image.data.size:
+        log.print(f"[bold red]tetopt:[/] cells overlap: together they hold {fit.n_voxels} voxels, more than there are")
         return 1
     return 0
+
+
+def _add_fit(table: Table, fit: Fit, n_voxels: int) -> None:
+    """Rows of how well cells fit an image of so many voxels."""
+    table.add_row("E_D", f"{fit.E_D:.6g}")
+    if fit.E_D_share_of_variance is not None:
+        table.add_row("E_D, share of the variance inside", f"{fit.E_D_share_of_variance:.5f}")
+    table.add_row("voxels inside", f"{fit.n_voxels} of {n_voxels}")
+    table.add_row("cells without a voxel", str(fit.n_empty_cells))
 
 
 def _was_masked(loaded: MeshFile) -> bool:
@@ -104,8 +104,23 @@ def _was_masked(loaded: MeshFile) -> bool:
         return False
 
 
-def image_fit(image: Image, mesh: Mesh) -> dict[str, Any]:
-    """E_D of a mesh, absolute and as share of the variance of the voxels that it covers."""
+class Fit(NamedTuple):
+    """How well the cells of a mesh fit an image."""
+
+    E_D: float  # intensity^2 mm^n
+    E_D_share_of_variance: float | None  # of the voxels that the mesh covers; None where they are all alike
+    n_voxels: int  # voxel centres inside
+    n_empty_cells: int  # cells without one
+
+
+def image_fit(image: Image, mesh: Mesh) -> Fit:
+    """E_D of a mesh, absolute and as share of the variance of the voxels that it covers.
+
+    Raises
+    ------
+    InputError
+        A mesh that covers none.
+    """
     moments = tetopt.cell_moments(image, mesh)
     E_D = float((moments.n_voxels * moments.variance).sum()) * image.voxel_volume
     n_voxels = int(moments.n_voxels.sum())
@@ -113,9 +128,4 @@ def image_fit(image: Image, mesh: Mesh) -> dict[str, Any]:
         raise InputError("mesh and image: no voxel centre lies inside the mesh; do both lie in the same world mm?")
     mean = float((moments.n_voxels * moments.mean).sum()) / n_voxels
     spread = E_D + float((moments.n_voxels * (moments.mean - mean) ** 2).sum()) * image.voxel_volume
-    return {
-        "E_D": E_D,
-        "E_D_share_of_variance": E_D / spread if spread > 0.0 else None,
-        "n_voxels": n_voxels,
-        "n_empty_cells": int((moments.n_voxels == 0).sum()),
-    }
+    return Fit(E_D, E_D / spread if spread > 0.0 else None, n_voxels, int((moments.n_voxels == 0).sum()))

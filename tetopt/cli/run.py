@@ -7,32 +7,26 @@ import signal
 import time
 from collections.abc import Callable, Iterator
 from types import FrameType
-from typing import Any
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from tetopt import Mesh
 from tetopt.cli.console import log
-from tetopt.cli.options import Method
-from tetopt.engine.fast import optimize, prepare_kernels
+from tetopt.engine.fast import prepare_kernels
 from tetopt.engine.loop import Optimized, Record
-from tetopt.engine.paper import optimize_paper
+from tetopt.engine.meshing import Mode, Run
 from tetopt.target.content import Content
 
+LONG_SECONDS = 3.0  # to make the kernels ready: they were compiled then, not loaded
 
-def watched_optimize(
-    wanted: Content, initial: Mesh, method: Method, ends: float | None, **options: Any
-) -> tuple[Optimized, bool]:
-    """`optimize` with progress shown, ended in good order at a time or by Ctrl-C; whether by that."""
-    iterations = options["iterations"]
-    _prepare_kernels(wanted, options["k_D"], method, "nodes" in options)
-    run: Callable[..., Optimized] = optimize if method is Method.fast else optimize_paper
+
+def watched_run(run: Run, initial: Mesh, iterations: int, ends: float | None) -> tuple[Optimized, bool]:
+    """A run with progress shown, ended in good order at a time or by Ctrl-C; whether by that."""
     max_seconds = None if ends is None else max(ends - time.perf_counter(), 1e-9)
     with _graceful_interrupt() as is_interrupted, _progress(iterations) as show:
-        image = wanted if method is Method.fast else wanted.image
-        result = run(image, initial, max_seconds=max_seconds, callback=show, stop=is_interrupted, **options)
+        result = run(max_seconds=max_seconds, callback=show, stop=is_interrupted)
         was_interrupted = is_interrupted()
-    if iterations == 0:  # the lattice itself, not its nodes put on the sampling grid
+    if iterations == 0:  # the initial mesh itself, not its nodes put on the sampling grid
         result = result._replace(mesh=initial)
     if result.ended != "iterations":
         words = {
@@ -44,13 +38,13 @@ def watched_optimize(
     return result, was_interrupted
 
 
-def _prepare_kernels(image: Content, k_D: float, method: Method, is_graded: bool) -> None:
+def prepare(content: Content, k_D: float, mode: Mode) -> None:
     """Load the compiled kernels, or compile them, before the clock of the first iteration starts."""
     begin = time.perf_counter()
     with log.status("preparing the kernels (the first run compiles them, one to two minutes) ..."):
-        prepare_kernels(image, k_D, method.value, is_graded)
+        prepare_kernels(content, k_D, "paper" if mode == "paper" else "fast", mode == "graded")
     seconds = time.perf_counter() - begin
-    if seconds > 3.0:
+    if seconds > LONG_SECONDS:
         log.print(f"kernels compiled in {seconds:.0f} s; later runs on images of this kind load them from the cache")
 
 

@@ -6,63 +6,92 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
-from tetopt import Image, InputError
+import tetopt
+from tetopt import Image, InputError, Mesh
 from tetopt.cli.console import log
 from tetopt.cli.inputs import file_and_volume, image_and_others
+from tetopt.cli.options import SourceOptions
 from tetopt.io.images import sha256
+from tetopt.io.vtk import box_text
+from tetopt.measure.fidelity import cell_labels
+from tetopt.model.fields import cell_fields
+from tetopt.model.sets import box_of
 from tetopt.target.align import aligned_contrast, aligned_labels, aligned_mask, background_level, foreground
-from tetopt.target.content import Content, content
+from tetopt.target.content import Content, content, continued
 
 
 class Source(NamedTuple):
     """What is meshed, and the files that it comes from."""
 
     paths: list[Path]  # of the contrasts
-    wanted: Content
+    weights: list[float]  # likewise
+    content: Content
     contrasts: list[Image]  # on the first one's voxels
     labels: Image | None  # likewise
     mask: Image | None
-    about: dict[str, Any]  # names, checksums and weights
+    about: dict[str, Any]  # names, checksums, weights and the image's box, for the mesh's file
+
+    def fields(self, mesh: Mesh) -> dict[str, NDArray]:
+        """What the mesh's file holds of each cell: as `cell_fields`, means of further contrasts, and the label."""
+        fields = cell_fields(mesh, self.content.image)
+        for number, contrast in enumerate(self.contrasts[1:], 2):
+            moments = tetopt.cell_moments(continued(contrast, self.mask), mesh)
+            fields |= {f"mean_{number}": moments.mean, f"variance_{number}": moments.variance}
+        if self.labels is not None:
+            fields["label"] = cell_labels(continued(self.labels, self.mask), mesh)
+        return fields
+
+    def by_contrast(self, fields: dict[str, NDArray]) -> list[dict[str, Any]]:
+        """How well cells with these fields represent each contrast: the share of its variance left within them."""
+        rows = []
+        for number, (path, weight) in enumerate(zip(self.paths, self.weights, strict=True), 1):
+            mean, variance = (fields[field if number == 1 else f"{field}_{number}"] for field in ("mean", "variance"))
+            count = fields["n_voxels"]
+            within = float((count * variance).sum())
+            total = within + float((count * (mean - (count * mean).sum() / count.sum()) ** 2).sum())
+            share = within / total if total > 0.0 else None
+            rows.append({"image": path.name, "weight": weight, "E_D_share_of_variance": share})
+        return rows
 
 
-def read_source(
-    paths: list[Path], volume: int | None, crop: str | None, slice_: str | None, mask_path: Path | None,
-    background: str | None, labels_path: Path | None, weights: str | None, label_weight: float | None,
-) -> Source:  # fmt: skip
+def read_source(options: SourceOptions) -> Source:
     """Images, labels and mask as the options ask for them, on the voxels of the first image."""
-    if mask_path is not None and background is not None:
+    paths = options.images
+    if options.mask is not None and options.background is not None:
         raise InputError("--mask and --background: give one of them")
-    if label_weight is not None and labels_path is None:
+    if options.label_weight is not None and options.labels is None:
         raise InputError("--label-weight: there are no --labels")
-    image, beside = image_and_others(paths[0], volume, crop, slice_)
+    image, beside = image_and_others(paths[0], options.part)
     contrasts = [image, *(beside(path, aligned_contrast) for path in paths[1:])]
-    labels = None if labels_path is None else beside(labels_path, aligned_labels)
-    mask = None if mask_path is None else beside(mask_path, aligned_mask)
+    labels = None if options.labels is None else beside(options.labels, aligned_labels)
+    mask = None if options.mask is None else beside(options.mask, aligned_mask)
     level = None
-    if background is not None:
-        level = background_level(image) if background == "auto" else _number("--background", background)
+    if options.background is not None:
+        is_auto = options.background == "auto"
+        level = background_level(image) if is_auto else _number("--background", options.background)
         mask = foreground(image, level)
         log.print(
             f"background: up to {level:g}, as far as it reaches the box; {mask.data.mean():.1%} of the voxels are left"
         )
-    counts = [1.0] * len(paths) if weights is None else [_number("--weights", part) for part in weights.split(",")]
-    if weights is None and labels is not None and len(paths) == 1 and np.array_equal(labels.data, image.data):
+    weights = [1.0] * len(paths)
+    if options.weights is not None:
+        weights = [_number("--weights", part) for part in options.weights.split(",")]
+    elif labels is not None and len(paths) == 1 and np.array_equal(labels.data, image.data):
         log.print("the image is its own labels: only these count")
-        counts = [0.0]
-    wanted = content(
-        contrasts, labels, mask, weights=counts, label_weight=1.0 if label_weight is None else label_weight
-    )
-    about: dict[str, Any] = {"image": paths[0].name, "image_sha256": sha256(paths[0])}
-    files = [*paths[1:], *(path for path in (mask_path, labels_path) if path is not None)]
-    about["inputs"] = {
-        "images": [path.name for path in paths], "weights": counts,
-        "mask": None if mask_path is None else mask_path.name, "background": level,
-        "labels": None if labels_path is None else labels_path.name,
-        "label_weight": None if labels is None else label_weight,
+        weights = [0.0]
+    label_weight = 1.0 if options.label_weight is None else options.label_weight
+    represented = content(contrasts, labels, mask, weights=weights, label_weight=label_weight)
+    files = [*paths[1:], *(path for path in (options.mask, options.labels) if path is not None)]
+    inputs = {
+        "images": [path.name for path in paths], "weights": weights,
+        "mask": None if options.mask is None else options.mask.name, "background": level,
+        "labels": None if options.labels is None else options.labels.name, "label_weight": options.label_weight,
         "sha256": {path.name: sha256(file_and_volume(path)[0]) for path in files},
     }  # fmt: skip
-    return Source(paths, wanted, contrasts, labels, mask, about)
+    about = {"image": paths[0].name, "image_sha256": sha256(paths[0]), "inputs": inputs, "box": box_text(box_of(image))}
+    return Source(paths, weights, represented, contrasts, labels, mask, about)
 
 
 def _number(name: str, text: str) -> float:

@@ -13,7 +13,7 @@ from rich.markup import escape
 from tetopt import InputError
 from tetopt.cli.console import log, out, show_warning
 from tetopt.cli.inputs import cell_field, check_no_input, read_mesh
-from tetopt.cli.options import ForceOption, JsonOption, MeshArgument, SpaceOption
+from tetopt.cli.options import MeshArgument, NumberOptions, SpaceOption
 from tetopt.geometry.simplex import volumes
 from tetopt.geometry.surface import surface_of
 from tetopt.geometry.topology import largest_component
@@ -33,15 +33,14 @@ def surface_command(
     label: Annotated[int | None, typer.Option(metavar="L", help="Of all cells with this label.")] = None,
     cell_set: Annotated[str | None, typer.Option("--set", metavar="NAME", help="Of a named set of cells.")] = None,
     space: SpaceOption = "ras",
-    json_path: JsonOption = None,
-    force: ForceOption = False,
+    *,
+    numbers: NumberOptions,
 ) -> int:
     """Write the boundary of a structure in a mesh, watertight; print its volume and area."""
-    output = checked_output(output, SURFACE_SUFFIXES, force)
-    if json_path is not None:
-        json_path = checked_output(json_path, (".json",), force)
+    output = checked_output(output, SURFACE_SUFFIXES, numbers.force)
+    json_path = numbers.checked()
     check_no_input(output, mesh_path)
-    if sum(wish is not None for wish in (below, label, cell_set)) != 1:
+    if sum(choice is not None for choice in (below, label, cell_set)) != 1:
         raise InputError("surface: give one of --below, --label and --set")
     if space not in SPACES:
         raise InputError(f"--space: expected {' or '.join(SPACES)}, got {space}")
@@ -51,26 +50,26 @@ def surface_command(
     chosen = _chosen(loaded, mesh_path, below, label, cell_set)
     surface = surface_of(loaded.mesh.points, loaded.mesh.cells, chosen)
     save_surface(output, surface, mesh_path.name, space)
-    found = checked_surface(output)
+    written = checked_surface(output)
     table = new_table("", escape(output.name))
     table.add_row("cells", str(len(chosen)))
     table.add_row("triangles", str(len(surface.triangles)))
-    table.add_row("closed surfaces", str(found.n_pieces))
-    table.add_row("volume, mm3", f"{found.volume:.6g}")
+    table.add_row("closed surfaces", str(written.n_pieces))
+    table.add_row("volume, mm3", f"{written.volume:.6g}")
     table.add_row("of the cells, mm3", f"{volumes(loaded.mesh.points, loaded.mesh.cells[chosen]).sum():.6g}")
-    table.add_row("area, mm2", f"{found.area:.6g}")
+    table.add_row("area, mm2", f"{written.area:.6g}")
     if surface.n_parted:
         log.print(
             f"{surface.n_parted} nodes and edges where the structure touches itself were parted, by "
             f"{surface.largest_shift:.2g} mm at most, so that each edge is in two triangles"
         )
     if json_path is not None:
-        measured = {"volume_mm3": found.volume, "area_mm2": found.area, "n_pieces": found.n_pieces}
+        measured = {"volume_mm3": written.volume, "area_mm2": written.area, "n_pieces": written.n_pieces}
         parted = {"n_parted": surface.n_parted, "largest_shift_mm": surface.largest_shift}
         files = {"mesh": mesh_path.name, "surface": output.name}
-        save_json(json_path, files | {"is_watertight": found.is_watertight} | measured | parted)
+        save_json(json_path, files | {"is_watertight": written.is_watertight} | measured | parted)
     out.print(table)
-    if not (found.is_watertight and found.is_winding_consistent and found.volume > 0.0):
+    if not (written.is_watertight and written.is_winding_consistent and written.volume > 0.0):
         log.print(f"[bold red]tetopt:[/] {escape(str(output))}: not watertight, by trimesh; please report this")
         return 1
     out.print("checked with trimesh: watertight, normals out")

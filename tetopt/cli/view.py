@@ -11,7 +11,7 @@ from rich.markup import escape
 from tetopt import InputError
 from tetopt.cli.console import out
 from tetopt.cli.inputs import check_no_input, read_image, read_mesh, warn_of_other_image
-from tetopt.cli.options import CropOption, ForceOption, VolumeOption
+from tetopt.cli.options import BoxPart, ForceOption, ImagePart
 from tetopt.io.files import checked_output
 from tetopt.model.build import labels_of
 from tetopt.model.fields import cell_fields
@@ -26,8 +26,8 @@ def view_command(
     html: Annotated[
         Path | None, typer.Option("--html", metavar="OUT.html", help="Write one page for a browser, open no window.")
     ] = None,
-    volume: VolumeOption = None,
-    crop: CropOption = None,
+    *,
+    part: BoxPart,
     force: ForceOption = False,
 ) -> int:
     """Look at a mesh: cut it, colour it by any field, hide cells under a threshold; in a window or a page."""
@@ -38,7 +38,7 @@ def view_command(
     mesh, fields = loaded.mesh, dict(loaded.cell_data)
     image = None
     if image_path is not None:
-        image = read_image(image_path, volume, crop, None)
+        image = read_image(image_path, ImagePart(volume=part.volume, crop=part.crop))
         if image.ndim != mesh.ndim:
             raise InputError(f"{image_path}: expected a {mesh.ndim}-D image, as the mesh is, got a {image.ndim}-D one")
         warn_of_other_image(loaded, mesh_path, image_path)

@@ -1,0 +1,212 @@
+"""What a run of `tetopt mesh` is to do: contradictions are refused, defaults are filled in, once and here."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import tetopt
+from tetopt import InputError
+from tetopt.cli.inputs import check_no_input, read_companion
+from tetopt.cli.options import (
+    DEFAULT_NODES,
+    Boundary,
+    EngineOptions,
+    Lattice,
+    Method,
+    OutputOptions,
+    Retessellate,
+    SizeOptions,
+    SolverOptions,
+    SourceOptions,
+    StartOptions,
+)
+from tetopt.cli.solver import check_solver_options
+from tetopt.engine.fast import check_options
+from tetopt.engine.loop import MIN_DIHEDRAL, SHAPE_POWER
+from tetopt.engine.meshing import DEFAULTS, Mode
+from tetopt.engine.paper import default_n_t
+from tetopt.io.files import checked_output
+from tetopt.io.formats import FORMATS, format_of
+from tetopt.start.lattice import KINDS
+from tetopt.target.content import Content
+
+
+class Plan(NamedTuple):
+    """A run without contradictions: options whose default does not depend on the image have their value."""
+
+    mode: Mode
+    source: SourceOptions
+    sizes: SizeOptions
+    start: StartOptions
+    engine: EngineOptions
+    solver: SolverOptions
+    output: OutputOptions
+    pictures: list[Path]  # slice, rho, energies, with a mask its boundary, with labels these
+
+    def kind(self, ndim: int) -> str:
+        """What the initial mesh is: a kind of lattice, octree or start."""
+        if self.mode == "start":
+            return "start"
+        if self.mode == "graded":
+            return Lattice.octree.value
+        return KINDS[ndim][0] if self.start.lattice is None else self.start.lattice.value
+
+    def engine_options(self) -> dict[str, Any]:
+        """What `mesh_image` is told besides the mesh to begin with, in the order of run.json."""
+        engine = self.engine
+        options = {"k_D": engine.k_D, "iterations": engine.iterations, "boundary": engine.boundary}
+        if self.mode == "paper":
+            return options | {"n_t": engine.n_t, "retessellate": engine.retessellate}
+        return options | {"shape_power": engine.shape_power, "min_dihedral": engine.min_dihedral}
+
+    def stated(self, ndim: int) -> dict[str, Any]:
+        """The options as the mesh's file and run.json state them; files by their names."""
+        sizes, start, part = self.sizes, self.start, self.source.part
+        return {
+            "nodes": sizes.nodes, "target_error": sizes.target_error, "spacing": start.spacing,
+            "lattice": self.kind(ndim), "size_min": sizes.size_min, "size_max": sizes.size_max,
+            "gradation": sizes.gradation, "sizing": None if sizes.sizing is None else sizes.sizing.name,
+            **part.stated(), "method": self.engine.method, "max_seconds": self.engine.max_seconds,
+            "start": None if start.start is None else start.start.name, **self.engine_options(),
+        }  # fmt: skip
+
+
+def planned(
+    source: SourceOptions, sizes: SizeOptions, start: StartOptions, engine: EngineOptions, solver: SolverOptions,
+    output: OutputOptions,
+) -> Plan:  # fmt: skip
+    """The run that the options ask for.
+
+    Raises
+    ------
+    InputError
+        Options that contradict each other or are out of range, as far as they tell without any file being read; an
+        output that may not be written.
+    """
+    format_of(output.mesh)
+    output = replace(output, mesh=checked_output(output.mesh, tuple(FORMATS), output.force))
+    check_solver_options(output.mesh, solver)
+    if output.json_path is not None:
+        output = replace(output, json_path=checked_output(output.json_path, (".json",), output.force))
+    mode = _mode(source, sizes, start, engine)
+    if start.start is not None:
+        check_no_input(output.mesh, start.start)
+    limits: dict[str, Any] = {"size-min": sizes.size_min, "size-max": sizes.size_max, "gradation": sizes.gradation}
+    limits |= {"sizing": sizes.sizing, "target-error": sizes.target_error}
+    for name, value in limits.items():
+        if value is not None and mode != "graded":
+            raise InputError(
+                f"--{name}: only on a graded mesh; leave out --uniform, --spacing, --lattice, --method, --start"
+            )
+    engine = _completed(engine, mode)
+    pictures = _pictures(source, output)
+    is_plain = len(source.images) == 1 and not (source.mask or source.background or source.labels)
+    if mode == "paper" and not is_plain:
+        raise InputError("--method paper: takes one IMAGE and its whole box; leave out mask, labels and further ones")
+    return Plan(mode, source, sizes, start, engine, solver, output, pictures)
+
+
+def _mode(source: SourceOptions, sizes: SizeOptions, start: StartOptions, engine: EngineOptions) -> Mode:
+    """Which of the four ways the options ask for; a graded mesh is the default."""
+    numbers = {"--nodes": sizes.nodes, "--spacing": start.spacing, "--target-error": sizes.target_error}
+    if len(names := [name for name, value in numbers.items() if value is not None]) > 1:
+        raise InputError(f"{' and '.join(names)}: give one of them")
+    is_paper = engine.method is Method.paper
+    if start.lattice is Lattice.octree:
+        if start.uniform:
+            raise InputError("--uniform and --lattice octree: give one of them")
+        if is_paper:
+            raise InputError("--lattice octree: only with --method fast, got --method paper")
+        if start.spacing is not None:
+            raise InputError("--lattice octree: has no one spacing; give --nodes instead of --spacing")
+    if start.start is not None:
+        others = {**numbers, "--lattice": start.lattice, "--mask": source.mask, "--background": source.background}
+        others["--uniform"] = start.uniform or None
+        if names := [name for name, value in others.items() if value is not None]:
+            raise InputError(
+                f"--start and {names[0]}: {start.start} has its nodes and its boundary already; leave one out"
+            )
+        if is_paper:
+            raise InputError("--start: only with --method fast, whose moves keep a boundary that is not convex")
+        return "start"
+    if is_paper:
+        return "paper"
+    is_lattice = start.uniform or start.spacing is not None or start.lattice not in (None, Lattice.octree)
+    return "uniform" if is_lattice else "graded"
+
+
+def _completed(engine: EngineOptions, mode: Mode) -> EngineOptions:
+    """The engine's options with the defaults of the mode; InputError where they cannot be."""
+    k_D, iterations = DEFAULTS[mode]
+    k_D = k_D if engine.k_D is None else engine.k_D
+    iterations = iterations if engine.iterations is None else engine.iterations
+    if not 0.0 <= k_D < 1.0:
+        raise InputError(f"--k-d: expected 0 <= k_D < 1, got {k_D}")
+    if engine.max_seconds is not None and not engine.max_seconds > 0.0:
+        raise InputError(f"--max-seconds: expected more than 0, got {engine.max_seconds}")
+    boundary = engine.boundary or (Boundary.fixed if mode == "start" else Boundary.slide)
+    engine = replace(engine, k_D=k_D, iterations=iterations, boundary=boundary)
+    _check_method(engine, Method.paper, ("n_t", "retessellate"))
+    _check_method(engine, Method.fast, ("shape_power", "min_dihedral"))
+    if mode == "paper":
+        n_t = default_n_t(k_D, iterations) if engine.n_t is None else engine.n_t
+        return replace(engine, n_t=n_t, retessellate=engine.retessellate or Retessellate.first)
+    shape_power = SHAPE_POWER if engine.shape_power is None else engine.shape_power
+    min_dihedral = MIN_DIHEDRAL if engine.min_dihedral is None else engine.min_dihedral
+    check_options(k_D, iterations, shape_power, min_dihedral, boundary)
+    return replace(engine, shape_power=shape_power, min_dihedral=min_dihedral)
+
+
+def _check_method(engine: EngineOptions, method: Method, names: tuple[str, ...]) -> None:
+    """InputError for an option of the other method."""
+    wrong = [name for name in names if getattr(engine, name) is not None]
+    if wrong and engine.method is not method:
+        option = wrong[0].replace("_", "-")
+        raise InputError(f"--{option}: only with --method {method.value}, got --method {engine.method.value}")
+
+
+def _pictures(source: SourceOptions, output: OutputOptions) -> list[Path]:
+    """The pictures to draw, as far as they may be written."""
+    if output.figures is None:
+        return []
+    names = ["slice.png", "rho.png", "energies.png"]
+    names += [] if source.mask is None and source.background is None else ["boundary.png"]
+    names += [] if source.labels is None else ["labels.png"]
+    return [checked_output(output.figures / name, (".png",), output.force) for name in names]
+
+
+def with_numbers(plan: Plan, content: Content) -> tuple[Plan, tetopt.Sizes | None]:
+    """The plan with the defaults that depend on the image, and the limits on sizes.
+
+    These are the number of nodes, fewer on small images, and the longest edge, which holds anyway and is stated.
+    """
+    image, sizes = content.image, plan.sizes
+    is_counted = sizes.nodes is not None or sizes.target_error is not None or plan.start.spacing is not None
+    if plan.mode == "start":
+        return plan, None
+    if plan.mode != "graded":
+        nodes = sizes.nodes if is_counted else DEFAULT_NODES[image.ndim]
+        return plan._replace(sizes=replace(sizes, nodes=nodes)), None
+    limits = _limits(sizes)
+    nodes = sizes.nodes
+    if not is_counted:
+        nodes = int(np.clip(content.n_voxels // 8, 2 ** (image.ndim + 2), DEFAULT_NODES[image.ndim]))
+    longest = sizes.size_max
+    if longest is None and nodes is not None:
+        longest = (limits or tetopt.Sizes()).longest_edge(image, nodes, content.volume)
+    return plan._replace(sizes=replace(sizes, nodes=nodes, size_max=longest)), limits
+
+
+def _limits(sizes: SizeOptions) -> tetopt.Sizes | None:
+    """The limits on sizes, if the options ask for any."""
+    if (sizes.size_min, sizes.size_max, sizes.gradation, sizes.sizing) == (None,) * 4:
+        return None
+    return tetopt.Sizes(
+        0.0 if sizes.size_min is None else sizes.size_min, sizes.size_max,
+        1.0 if sizes.gradation is None else sizes.gradation,
+        None if sizes.sizing is None else read_companion(sizes.sizing),
+    )  # fmt: skip
