@@ -162,7 +162,7 @@ def _sets_of_groups(raw: Raw, mesh: Mesh, kind: str, used: NDArray[np.int64]) ->
     taken: set[str] = set()
     n = CELL_DIMENSIONS[kind]
     groups = [group for group in raw.groups if n - 1 <= CELL_DIMENSIONS[group.kind] <= n]
-    if "young" in raw.cell_data:  # which tells materials better than their groups do, with which they would be written
+    if "young" in raw.cell_data:  # of which materials are made anew, under the names of these groups
         groups = [group for group in groups if re.fullmatch(r"material_\d+", group.label) is None]
     # Groups that can keep their names come first, so that they do.
     for group in sorted(groups, key=lambda group: SET_NAME.fullmatch(group.label) is None):

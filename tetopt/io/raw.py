@@ -1,4 +1,4 @@
-"""What a mesh's file holds, before any question is asked of it."""
+"""What a mesh's file holds, before anything of it is checked."""
 
 from __future__ import annotations
 
@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-# Cells that a mesh is made of, or that may lie on it.
+# The dimension of each kind of cell that a mesh may consist of, or that may lie on it.
 CELL_DIMENSIONS = {"vertex": 0, "poly_vertex": 0, "line": 1, "poly_line": 1, "triangle": 2, "tetra": 3}
 
 

@@ -101,7 +101,7 @@ def _by_value(tags: NDArray) -> dict[int, NDArray[np.int64]]:
     """Where each value stands, ascending."""
     order = np.argsort(tags, kind="stable")
     values, starts = np.unique(tags[order], return_index=True)
-    return dict(zip(values.tolist(), np.split(order, starts[1:]), strict=False))  # split makes one part of nothing
+    return dict(zip(values.tolist(), np.split(order, starts[1:]), strict=False))  # of no values, split makes one part
 
 
 def _section(content: bytes, name: str) -> bytes:

@@ -43,7 +43,7 @@ def parse_formula(text: str) -> Callable[[NDArray[np.float64]], NDArray[np.float
     """
     try:
         with warnings.catch_warnings():
-            warnings.simplefilter("error")  # "1if h" is a warning of Python's first
+            warnings.simplefilter("error")  # of "1if h" Python only warns
             tree = ast.parse(text.strip(), mode="eval").body
         _check(tree, text, 0)
     except (SyntaxError, SyntaxWarning, ValueError, OverflowError, RecursionError, MemoryError) as error:

@@ -227,7 +227,7 @@ def has_column(text: str, name: str) -> bool:
         return False
     try:
         return name in _columns(Path(text))
-    except (ValueError, RecursionError):  # said when the file is read for what it must have
+    except (ValueError, RecursionError):  # reported when the column that must be there is read
         return False
 
 

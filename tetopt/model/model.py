@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 class Units(NamedTuple):
     """What is consistent with mm, s and a unit of stress."""
 
-    kPa: float  # in one of the unit
+    kPa: float  # in one of the unit of stress
     force: str
     energy: str
     mass: str

@@ -303,10 +303,10 @@ def rows_of(mesh: Mesh, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
 
 
 def surviving_sets(before: Mesh, sets: Sets, mesh: Mesh) -> Sets:
-    """Those facet sets of a mesh as it was before that it still has all of, node for node, in new rows.
+    """Those facet sets of the mesh `before` of which `mesh` still has every facet, as its own rows.
 
-    Of an optimised mesh with its boundary kept these are the sets on the boundary. Its cells are others: no cell set is
-    carried.
+    Facets are the same if their nodes lie in the same places. Where an optimisation kept the boundary, these are the
+    sets on the boundary. Cell sets do not survive, since the cells are others.
     """
     place = {point.tobytes(): number for number, point in enumerate(mesh.points)}
     now = np.array([place.get(point.tobytes(), -1) for point in before.points])

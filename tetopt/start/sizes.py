@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import affine_transform
 
 from tetopt.errors import InputError
+from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides
 from tetopt.image import Image
 from tetopt.start.lattice import near_cubes
 
@@ -104,9 +105,9 @@ class Sizes(NamedTuple):
         """The longest edge that a cell at each node may be given, (N,) mm; `own` (N,) is the mean size there now."""
         bound = np.full(len(points), self.longest_edge(image, nodes, volume))
         if self.field is not None:
-            index, last = self.field.to_index(points), np.array(self.field.shape) - 1
-            is_in_field = ((index >= -0.5 - 1e-6) & (index <= last + 0.5 + 1e-6)).all(axis=1)
-            voxel = np.clip(np.rint(index[is_in_field]).astype(np.int64), 0, last)
+            index, (low, high) = self.field.to_index(points), box_sides(self.field.shape).T
+            is_in_field = ((index >= low - ON_SIDE_VOXELS) & (index <= high + ON_SIDE_VOXELS)).all(axis=1)
+            voxel = np.clip(np.rint(index[is_in_field]).astype(np.int64), 0, np.array(self.field.shape) - 1)
             bound[is_in_field] = np.minimum(bound[is_in_field], self.field.data[tuple(voxel.T)])
         return np.minimum(bound, UNEVEN_SHARE * _around(own, points, cells, self.gradation))
 
