@@ -19,7 +19,7 @@ BROAD_RATIO = 1.4  # A picture wider than this many times its height keeps a rea
 
 
 def save_page(path: Path, title: str, sections: Sequence[dict[str, Any]]) -> None:
-    """One HTML file without outside references, whole or not at all.
+    """Write one HTML file without outside references, whole or not at all.
 
     Each section has a `title`, a `text`, optionally `tables` (rows of cells, the first the heading) and `pictures`
     (PNG paths with captions).
@@ -69,9 +69,9 @@ def table_html(rows: Sequence[Sequence[str]], caption: str = "") -> str:
 
 def picture_html(path: str | Path, caption: str) -> str:
     """Markup of a PNG, embedded, with its caption as text and as what a screen reader says."""
-    content = Path(path).read_bytes()
-    width, height = struct.unpack(">II", content[16:24])  # of the IHDR chunk, always the first
-    data = base64.b64encode(content).decode("ascii")
+    png = Path(path).read_bytes()
+    width, height = struct.unpack(">II", png[16:24])  # of the IHDR chunk, which is always the first
+    data = base64.b64encode(png).decode("ascii")
     alt = html.escape(caption)
     shape = "wide broad" if width > BROAD_RATIO * height else "wide"
     return (

@@ -29,7 +29,7 @@ Draw = Callable[[pyvista.Plotter], object]  # adds a scene's parts to a plotter
 
 
 def save_scenes(path: str | Path, scenes: Sequence[tuple[str, Draw]], columns: int | None = None) -> None:
-    """PNG of scenes side by side, each with a title, seen from the same side; in rows of `columns`, by default one.
+    """PNG of scenes side by side, each with a title, seen from the same side; in rows of `columns`, or in one row.
 
     A scene is a function that adds its parts to a plotter, such as `structure_before_slices` returns.
     """
@@ -51,7 +51,7 @@ def save_scenes(path: str | Path, scenes: Sequence[tuple[str, Draw]], columns: i
 
 
 def _place(plotter: pyvista.Plotter, draw: Draw) -> None:
-    """A scene in the plotter's present part, and the camera where all scenes are seen from."""
+    """Put a scene into the plotter's present part, and the camera to where all scenes are seen from."""
     draw(plotter)
     plotter.view_vector(SCENE_VIEWPOINT, viewup=(0.0, 0.0, 1.0))
     plotter.camera.zoom(1.05)

@@ -1,4 +1,4 @@
-"""A run in numbers: what `run.json` holds."""
+"""A run in numbers: what `tetopt mesh --json` writes."""
 
 from __future__ import annotations
 

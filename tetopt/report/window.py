@@ -129,7 +129,7 @@ class _Scene:
         self.window.camera.SetWindowCenter(0.0, -0.1)  # above the sliders
 
     def draw(self) -> None:
-        """Everything that depends on the plane, the limits and the field."""
+        """Draw everything that depends on the plane, the limits and the field."""
         is_within = self.is_within()
         origin = np.where(np.arange(3) == self.axis, self.at, 0.0)
         normal = np.eye(3)[self.axis] * (-1.0 if self.is_turned else 1.0)
@@ -150,7 +150,7 @@ class _Scene:
 
     def is_within(self) -> NDArray[np.bool_]:
         """Cells whose value lies within the limits; with the full range also those without a value, (M,)."""
-        # Sliders hold single precision: the ends are the field's own.
+        # Sliders hold single precision, so that a limit at one of their ends may miss the field's own by rounding.
         low, high = self._range()
         slack = 1e-6 * (high - low)
         if self.limits[0] <= low + slack and self.limits[1] >= high - slack:
@@ -166,7 +166,7 @@ class _Scene:
         return pyvista.PolyData.from_regular_faces(self.mesh.points, self.sides.nodes[is_outer]), of_cell
 
     def _add_section(self, is_within: NDArray[np.bool_]) -> None:
-        """The polygons in which the plane cuts the shown cells; on the image as through glass, with lines on top."""
+        """Draw the polygons in which the plane cuts the shown cells; over the image like glass, with lines on top."""
         polygons = pyvista.PolyData()
         if self.inside != "image":
             shown = np.flatnonzero(is_within)
@@ -186,7 +186,7 @@ class _Scene:
         sheet = pyvista.PolyData()
         if self.image is not None and self.inside != "mesh":
             sheet = plane_slice(self.image, self.axis, self.at)
-            # Behind the cells' edges, which lie in the same plane.
+            # The slice is put behind the cells' edges, which lie in the same plane.
             behind = np.zeros(3)
             behind[self.axis] = (1.0 if self.is_turned else -1.0) * 2e-4 * float(np.linalg.norm(self.high - self.low))
             sheet.origin = np.asarray(sheet.origin) + behind
@@ -201,7 +201,7 @@ class _Scene:
         return pyvista.PolyData.from_regular_faces(self.mesh.points, list(self.sets.values())[self.set - 1])
 
     def _add_cells(self, name: str, polygons: pyvista.PolyData, **drawn: Any) -> None:
-        """Facets or polygons in the colours of their cells."""
+        """Draw facets or polygons in the colours of their cells."""
         if polygons.n_cells == 0:
             self._add(name, polygons)
             return
@@ -216,20 +216,20 @@ class _Scene:
         self._add(name, polygons, scalars="value", cmap=COLOUR_MAP, clim=limits, nan_color=NO_VALUE, **drawn)
 
     def _add(self, name: str, data: pyvista.DataSet, **drawn: Any) -> None:
-        """In place of what had this name; nothing if there is nothing to draw."""
+        """Draw `data` in place of what had this name before; if it is empty, nothing."""
         if data.n_cells:
             self.window.add_mesh(data, name=name, reset_camera=False, render=False, **drawn)
         else:
             self.window.remove_actor(name, reset_camera=False, render=False)
 
     def _add_key(self) -> None:
-        """The colour bar of a quantity, or the colours of labels."""
+        """Draw the colour bar of a quantity, or the list of labels' colours."""
         field = self.field
         for title in list(self.window.scalar_bars.keys()):
             self.window.remove_scalar_bar(title, render=False)
         self.window.remove_legend(render=False)
         if field.categories:
-            # As in the pictures' legends: those of most cells, ascending.
+            # As in the pictures' legends, the labels of most cells are listed, ascending.
             by_size = sorted(field.categories, key=lambda entry: -np.count_nonzero(field.values == entry[0]))
             entries = [[f" {label}", colour] for label, colour in sorted(by_size[:LISTED_LABELS])]
             if len(field.categories) > LISTED_LABELS:
@@ -298,7 +298,7 @@ class _Scene:
         self._changed()
 
     def limit(self, low: float | None = None, high: float | None = None) -> None:
-        """A limit that passes the other takes it along."""
+        """Set a limit; one that passes the other takes it along."""
         if low is not None:
             self.limits = (low, max(low, self.limits[1]))
         if high is not None:
