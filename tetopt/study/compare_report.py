@@ -8,11 +8,11 @@ from typing import Any, NamedTuple, get_args, get_origin, get_type_hints
 from tetopt.engine.loop import UNIFORM_ITERATIONS, UNIFORM_K_D
 from tetopt.fem.reference import Errors
 from tetopt.measure.quality import Quality
-from tetopt.study.pipelines import PIPELINES
+from tetopt.study.pipelines import OTSU_CLASSES, PIPELINES
 
-# Fields whose own keys stand in the file beside those of the record that has them, and fields left out where they are
-# None: the file is flatter than the records, and older readers know it so.
+# The files are flatter than the records: the keys of these fields' values stand beside those of the record itself,
 INLINE_FIELDS = ("run", "measurement", "source", "by_nu")
+# and these fields are left out where they are None.
 OPTIONAL_FIELDS = ("median", "low", "high", "mesh_file_sha256")
 
 
@@ -22,16 +22,16 @@ class Settings(NamedTuple):
     nodes: int
     pipelines: tuple[str, ...] = tuple(PIPELINES)
     repeats: int = 3  # of pipelines whose result changes from run to run
-    classes: int = 4  # of the multi-Otsu segmentation, without labels
+    classes: int = OTSU_CLASSES  # of the multi-Otsu segmentation, without labels
     k_D: float = UNIFORM_K_D
     iterations: int = UNIFORM_ITERATIONS
     nus: tuple[float, ...] = (0.3, 0.45)
-    percent: float = 1.0  # of compression
+    percent: float = 1.0  # of compression, of the box's height
     reference_dofs: int = 300_000  # the voxel grid is averaged until it has no more
     curve: tuple[float, ...] = (0.25, 0.5, 2.0)  # node counts of the error curves, of `nodes`, besides `nodes` itself
     tradeoff: bool = False  # whether tetopt's options are swept around its defaults
-    max_seconds: float = 3600.0  # of one pipeline
-    max_bytes: int | None = None
+    max_seconds: float = 3600.0  # of one run of a pipeline
+    max_bytes: int | None = None  # likewise, resident
 
 
 class ImageSource(NamedTuple):
@@ -217,7 +217,7 @@ def as_json(value: Any) -> Any:
 
 
 def from_json(kind: Any, value: Any) -> Any:
-    """What `as_json` made of a record with fields of the type `kind`; KeyError or TypeError for anything else."""
+    """What `as_json` made of a record with fields of the type `kind`; KeyError, TypeError or AttributeError for anything else."""
     arguments = get_args(kind)
     if value is None:
         return None

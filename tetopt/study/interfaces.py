@@ -16,6 +16,7 @@ from scipy.ndimage import gaussian_filter
 
 from tetopt.errors import InputError
 from tetopt.image import Image
+from tetopt.study.pipelines import OTSU_CLASSES
 from tetopt.target.otsu import class_thresholds
 
 SIGMA_VOXELS = 0.75  # of the Gaussian before thresholding: takes the noise, moves no interface wider than a voxel
@@ -37,7 +38,7 @@ class Surfaces(NamedTuple):
     notes: list[str]  # what was dropped
 
 
-def interfaces(image: Image, size: float, *, classes: int = 4, labels: Image | None = None) -> Surfaces:
+def interfaces(image: Image, size: float, *, classes: int = OTSU_CLASSES, labels: Image | None = None) -> Surfaces:
     """All interfaces between the classes of an image, or between given labels, and the box around them.
 
     Without labels: the volume is smoothed by a Gaussian of 0.75 voxel, exact multi-Otsu gives the thresholds of the

@@ -17,6 +17,8 @@ from tetopt.mesh import Mesh
 from tetopt.start.lattice import lattice
 from tetopt.target.content import Content, content
 
+OTSU_CLASSES = 4  # of the segmentation where no labels are given: fewer lose interfaces (see `tetopt.study.tetwild`)
+
 
 class Job(NamedTuple):
     """What every pipeline gets."""
@@ -24,7 +26,7 @@ class Job(NamedTuple):
     image: Image  # 3-D
     labels: Image | None  # a given segmentation, on the image's voxels; without one, those who need it make their own
     nodes: int  # requested
-    classes: int = 4  # of the thresholds, without labels
+    classes: int = OTSU_CLASSES
     k_D: float = UNIFORM_K_D  # of uniform meshes; the graded one has its own
     iterations: int = UNIFORM_ITERATIONS  # likewise
 
