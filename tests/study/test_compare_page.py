@@ -6,7 +6,7 @@ from html.parser import HTMLParser
 
 import numpy as np
 import pytest
-from browser import browser
+from browser import browser, copied, document
 
 import tetopt
 from tetopt.fem.reference import Errors
@@ -560,11 +560,8 @@ def test_the_page_in_a_browser(whole, tmp_path, width):
         "d.dataset.drawn = [...document.querySelectorAll('canvas')].map((c) => c.dataset.drawn).join(); "
         "d.dataset.over = d.scrollWidth - d.clientWidth; }, 300))</script>"
     )
-    copied = tmp_path / "copy.html"
-    copied.write_text(whole.read_text(encoding="utf-8").replace("</body>", probe + "</body>"), encoding="utf-8")
-    flags = [f"--window-size={width},900", "--virtual-time-budget=4000", "--dump-dom", copied.as_uri()]
-    page = browser(tmp_path / "profile", *flags)
-    data = dict(re.findall(r'data-(images|drawn|over)="([^"]*)"', page[:400]))
+    copy = copied(whole.read_text(encoding="utf-8"), tmp_path / "copy.html", last=probe)
+    data = dict(re.findall(r'data-(images|drawn|over)="([^"]*)"', document(copy, f"--window-size={width},900")[:400]))
     assert len(data["images"].split(",")) == 4
     assert all(int(size) > 100 for size in data["images"].split(","))
     assert data["drawn"] == "1,1"

@@ -217,7 +217,7 @@ def as_json(value: Any) -> Any:
 
 
 def from_json(kind: Any, value: Any) -> Any:
-    """What `as_json` made of a record with fields of the type `kind`; KeyError, TypeError or AttributeError for anything else."""
+    """What `as_json` made of a value of the type `kind`; KeyError, TypeError or AttributeError for anything else."""
     arguments = get_args(kind)
     if value is None:
         return None
