@@ -16,7 +16,16 @@ import tetopt
 from tetopt import Image, InputError, save_mesh
 from tetopt.cli.console import log, out
 from tetopt.cli.inputs import read_labels, read_volume, results_folder
-from tetopt.cli.options import DEFAULT_NODES, WHOLE_BOX, BoxPart, ForceOption, ImageArgument, ImagePart, NumberOptions
+from tetopt.cli.options import (
+    DEFAULT_NODES,
+    WHOLE_BOX,
+    BoxPart,
+    ForceOption,
+    ImageArgument,
+    ImagePart,
+    NumberOptions,
+    option,
+)
 from tetopt.cli.quality import image_fit
 from tetopt.io.files import checked_output, save_json
 from tetopt.io.images import sha256
@@ -28,11 +37,11 @@ from tetopt.report.tables import add_quality, new_table
 from tetopt.study.compare_report import ImageSource, LabelSource, Settings
 from tetopt.study.pipelines import PIPELINES, Job
 
-ClassesOption = Annotated[int, typer.Option(metavar="K", min=2, help="Classes of the segmentation (multi-Otsu).")]
+ClassesOption = Annotated[int, option("K", "Classes of the segmentation (multi-Otsu).", min=2)]
 
 
 DEFAULT_SETTINGS = Settings(nodes=DEFAULT_NODES[3])
-GIGABYTE = 1e9  # bytes
+BYTES_PER_GB = 1e9
 
 
 class Baseline(StrEnum):  # noqa: D101
@@ -45,26 +54,15 @@ class ComparedOptions:
     """What is compared."""
 
     panel: ClassVar[str] = "What is compared"
-    nodes: Annotated[int, typer.Option(metavar="N", min=20, help="Wanted number of nodes, of every mesh.")] = (
-        DEFAULT_SETTINGS.nodes
-    )
-    labels: Annotated[
-        Path | None,
-        typer.Option(metavar="LABELS", help="Label image, for tetopt and the pipelines that segment."),
-    ] = None
-    repeats: Annotated[int, typer.Option(metavar="R", min=1, help="Runs of a mesher whose result varies.")] = (
-        DEFAULT_SETTINGS.repeats
-    )
-    pipelines: Annotated[str, typer.Option(metavar="A,B,...", help=f"Of {', '.join(PIPELINES)}: which, in order.")] = (
-        ",".join(PIPELINES)
-    )
-    k_D: Annotated[float, typer.Option("--k-d", metavar="K", help="Weight of the image on uniform meshes.")] = (
-        DEFAULT_SETTINGS.k_D
-    )
+    nodes: Annotated[int, option("N", "Wanted number of nodes, of every mesh.", min=20)] = DEFAULT_SETTINGS.nodes
+    labels: Annotated[Path | None, option("LABELS", "Label image, for tetopt and the pipelines that segment.")] = None
+    repeats: Annotated[int, option("R", "Runs of a mesher whose result varies.", min=1)] = DEFAULT_SETTINGS.repeats
+    pipelines: Annotated[str, option("A,B,...", f"Of {', '.join(PIPELINES)}: which, in order.")] = ",".join(PIPELINES)
+    k_D: Annotated[float, option("K", "Weight of the image on uniform meshes.", "--k-d")] = DEFAULT_SETTINGS.k_D
     classes: ClassesOption = DEFAULT_SETTINGS.classes
-    curve: Annotated[
-        str, typer.Option(metavar="F,...", help="Node counts of the error curves, as parts of N; empty for none.")
-    ] = ",".join(f"{factor:g}" for factor in DEFAULT_SETTINGS.curve)
+    curve: Annotated[str, option("F,...", "Node counts of the error curves, as parts of N; empty for none.")] = (
+        ",".join(f"{factor:g}" for factor in DEFAULT_SETTINGS.curve)
+    )
     tradeoff: Annotated[
         bool, typer.Option("--tradeoff", help="Sweep tetopt's options around its defaults: some 20 more runs.")
     ] = False
@@ -77,11 +75,10 @@ class SimulationOptions:
 
     panel: ClassVar[str] = "The simulation"
     young: Annotated[
-        str | None,
-        typer.Option(metavar="LAW", help="Modulus by intensity, as for `fem`. Default: 1 to 10 kPa over its range."),
+        str | None, option("LAW", "Modulus by intensity, as for `fem`. Default: 1 to 10 kPa over its range.")
     ] = None
     reference_dofs: Annotated[
-        int, typer.Option(metavar="D", min=1000, help="Size of the voxel grid that is the truth of the simulation.")
+        int, option("D", "Size of the voxel grid that is the truth of the simulation.", min=1000)
     ] = DEFAULT_SETTINGS.reference_dofs
 
 
@@ -90,21 +87,17 @@ class LimitOptions:
     """What one run of a pipeline may take."""
 
     panel: ClassVar[str] = "Limits"
-    max_seconds: Annotated[float, typer.Option(metavar="S", help="Time limit of one run of a pipeline.")] = (
-        DEFAULT_SETTINGS.max_seconds
-    )
-    max_gb: Annotated[float | None, typer.Option(metavar="GB", help="Memory limit of one run of a pipeline.")] = None
+    max_seconds: Annotated[float, option("S", "Time limit of one run of a pipeline.")] = DEFAULT_SETTINGS.max_seconds
+    max_gb: Annotated[float | None, option("GB", "Memory limit of one run of a pipeline.")] = None
 
 
 def paper_command(
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the results.")],
+    output: Annotated[Path, option("DIR", "Folder for the results.", "-o", "--output")],
     image_path: Annotated[
-        Path | None, typer.Option("--image", metavar="T1", help="Brain MR volume (default: nilearn's MNI152 T1).")
+        Path | None, option("T1", "Brain MR volume (default: nilearn's MNI152 T1).", "--image")
     ] = None,
-    labels_path: Annotated[
-        Path | None, typer.Option("--labels", metavar="LABELS", help="Tissue labels of IMAGE, for Dice.")
-    ] = None,
-    seeds: Annotated[int, typer.Option(metavar="N", help="Random meshes for Fig. 1.")] = 200,
+    labels_path: Annotated[Path | None, option("LABELS", "Tissue labels of IMAGE, for Dice.", "--labels")] = None,
+    seeds: Annotated[int, option("N", "Random meshes for Fig. 1.")] = 200,
     force: ForceOption = False,
 ) -> int:
     """Run the paper's figures and table again: paper.json, pictures, a page with each printed number beside ours."""
@@ -135,11 +128,11 @@ def paper_command(
 
 def baseline_command(
     image_path: ImageArgument,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="MESH.vtu", help="The mesh to write.")],
+    output: Annotated[Path, option("MESH.vtu", "The mesh to write.", "-o", "--output")],
     pipeline: Annotated[Baseline, typer.Option(help="The mesher of the conventional pipeline.")] = Baseline.pytetwild,
-    nodes: Annotated[int, typer.Option(metavar="N", min=20, help="Wanted number of nodes.")] = DEFAULT_NODES[3],
+    nodes: Annotated[int, option("N", "Wanted number of nodes.", min=20)] = DEFAULT_NODES[3],
     labels_path: Annotated[
-        Path | None, typer.Option("--labels", metavar="LABELS", help="Label image instead of a segmentation of IMAGE.")
+        Path | None, option("LABELS", "Label image instead of a segmentation of IMAGE.", "--labels")
     ] = None,
     classes: ClassesOption = DEFAULT_SETTINGS.classes,
     *,
@@ -171,7 +164,7 @@ def baseline_command(
 def compare_command(
     context: typer.Context,
     image_path: ImageArgument,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the results.")],
+    output: Annotated[Path, option("DIR", "Folder for the results.", "-o", "--output")],
     compared: ComparedOptions,
     simulation: SimulationOptions,
     limits: LimitOptions,
@@ -225,7 +218,7 @@ def _settings(compared: ComparedOptions, simulation: SimulationOptions, limits: 
         repeats=compared.repeats, classes=compared.classes, k_D=compared.k_D,
         reference_dofs=simulation.reference_dofs, curve=_parse_curve(compared.curve), tradeoff=compared.tradeoff,
         max_seconds=limits.max_seconds,
-        max_bytes=None if limits.max_gb is None else int(limits.max_gb * GIGABYTE),
+        max_bytes=None if limits.max_gb is None else int(limits.max_gb * BYTES_PER_GB),
     )  # fmt: skip
 
 

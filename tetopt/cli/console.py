@@ -29,15 +29,15 @@ def show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
     log.print(f"[yellow]tetopt: warning:[/] {escape(str(message))}")
 
 
-def print_fidelity(found: dict[str, Any]) -> None:
-    """How well contrasts, mask and labels are met, as far as each was given; `found` as of `report.summary`."""
-    for row in found.get("contrasts", []):
+def print_fidelity(measured: dict[str, Any]) -> None:
+    """How well contrasts, mask and labels are met, as far as `measured`, of `tetopt.report.summary`, has them."""
+    for row in measured.get("contrasts", []):
         share = "constant" if row["E_D_share_of_variance"] is None else f"{row['E_D_share_of_variance']:.5f}"
         out.print(escape(f"{row['image']}: weight {row['weight']:g}, share of its own variance in cells {share}"))
-    if "mask" in found:
-        print_wide(mask_table(found["mask"]))
-    if "labels" in found:
-        print_wide(label_table(found["labels"]))
+    if "mask" in measured:
+        print_wide(mask_table(measured["mask"]))
+    if "labels" in measured:
+        print_wide(label_table(measured["labels"]))
 
 
 def print_wide(table: Table) -> None:

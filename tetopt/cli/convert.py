@@ -14,7 +14,7 @@ from rich.markup import escape
 from tetopt import Image, InputError
 from tetopt.cli.console import log
 from tetopt.cli.inputs import check_no_input, image_and_others, read_mesh, warn_of_other_image
-from tetopt.cli.options import ImagePart, MeshArgument, NumberOptions, SolverOptions
+from tetopt.cli.options import ImagePart, MeshArgument, NumberOptions, SolverOptions, option
 from tetopt.cli.solver import all_sets, check_solver_options, print_model, save_for_solver, solver_model
 from tetopt.io.files import checked_output, save_json
 from tetopt.io.formats import FORMATS, format_of
@@ -36,12 +36,9 @@ def convert_command(
         Path, typer.Argument(metavar="OUT", help=f"The file to write: {', '.join(FORMATS)}.", show_default=False)
     ],
     image_path: Annotated[
-        Path | None,
-        typer.Option("--image", metavar="IMAGE", help="Take means and laws from this image, not from the mesh's file."),
+        Path | None, option("IMAGE", "Take means and laws from this image, not from the mesh's file.", "--image")
     ] = None,
-    mask_path: Annotated[
-        Path | None, typer.Option("--mask", metavar="MASK", help="With --image: only what lies in it counts.")
-    ] = None,
+    mask_path: Annotated[Path | None, option("MASK", "With --image: only what lies in it counts.", "--mask")] = None,
     *,
     part: ImagePart,
     solver: SolverOptions,

@@ -12,7 +12,7 @@ import tetopt
 from tetopt import InputError, Mesh, save_mesh
 from tetopt.cli.console import out
 from tetopt.cli.inputs import check_no_input, read_image, read_mesh
-from tetopt.cli.options import ImageArgument, ImagePart, NumberOptions
+from tetopt.cli.options import ImageArgument, ImagePart, NumberOptions, option
 from tetopt.io.files import checked_output, save_json
 from tetopt.io.images import sha256
 from tetopt.model.materials import DEFAULT_NU
@@ -28,17 +28,16 @@ def fem_command(
     mesh_path: Annotated[Path, typer.Argument(metavar="MESH", help="VTU, VTK or MSH file that fills the image's box.")],
     young: Annotated[
         str | None,
-        typer.Option(
-            metavar="LAW",
-            help='Modulus in kPa by intensity: a table "0:1,100:5", interpolated, or a formula of h, such as '
+        option(
+            "LAW",
+            'Modulus in kPa by intensity: a table "0:1,100:5", interpolated, or a formula of h, such as '
             '"0.5 + 0.01*h" or "1/max(abs(h), 0.001)" of a strain image. Default: the intensity.',
         ),
     ] = None,
-    nu: Annotated[float, typer.Option(metavar="NU", help="Poisson's ratio, above -1 and below 0.5.")] = DEFAULT_NU,
-    compress: Annotated[float, typer.Option(metavar="PERCENT", help="How far the bottom is pushed in.")] = 1.0,
+    nu: Annotated[float, option("NU", "Poisson's ratio, above -1 and below 0.5.")] = DEFAULT_NU,
+    compress: Annotated[float, option("PERCENT", "How far the bottom is pushed in.")] = 1.0,
     output: Annotated[
-        Path | None,
-        typer.Option("-o", "--output", metavar="PRESSED.vtu", help="Write the mesh with displacements and strains."),
+        Path | None, option("PRESSED.vtu", "Write the mesh with displacements and strains.", "-o", "--output")
     ] = None,
     *,
     part: ImagePart,

@@ -1,4 +1,4 @@
-"""Read the files that a command is given; refuse or tell what is wrong with them."""
+"""Read the files that a command names; what is wrong with them is refused or said."""
 
 from __future__ import annotations
 

@@ -7,7 +7,6 @@ from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
-import typer
 from rich.markup import escape
 
 import tetopt
@@ -23,6 +22,7 @@ from tetopt.cli.options import (
     SolverOptions,
     SourceOptions,
     StartOptions,
+    option,
 )
 from tetopt.cli.plan import Plan, planned, with_numbers
 from tetopt.cli.promises import check_promises, warn_of_result
@@ -108,7 +108,7 @@ def _check_place(mesh: Mesh, image: Image, path: str) -> None:
 
 
 def _run(task: Task, begin: float) -> Outcome:
-    """The optimised mesh; several runs, one after the other, where an error is asked for instead of nodes."""
+    """The optimised mesh; a target error takes several runs, one after the other."""
     plan, content = task.plan, task.source.content
     solver, output, options = plan.solver, plan.output.mesh, plan.engine_options()
     ends = None if plan.engine.max_seconds is None else begin + plan.engine.max_seconds
@@ -247,11 +247,9 @@ def _print_comparison(content: Content, outcome: Outcome, start: str) -> None:
 
 
 def demo_command(
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="DIR", help="Folder for the results.")] = Path(
-        "demo"
-    ),
-    nodes: Annotated[int, typer.Option(metavar="N", help="Wanted number of nodes.")] = DEFAULT_NODES[3],
-    iterations: Annotated[int | None, typer.Option(metavar="I", min=0, help="Sweeps over all nodes.")] = None,
+    output: Annotated[Path, option("DIR", "Folder for the results.", "-o", "--output")] = Path("demo"),
+    nodes: Annotated[int, option("N", "Wanted number of nodes.")] = DEFAULT_NODES[3],
+    iterations: Annotated[int | None, option("I", "Sweeps over all nodes.", min=0)] = None,
     force: ForceOption = False,
 ) -> int:
     """Mesh the MNI152 T1 that nilearn's wheel carries; leave mesh, numbers and pictures in a folder."""

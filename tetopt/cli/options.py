@@ -34,6 +34,11 @@ from tetopt.model.materials import DEFAULT_NU
 DEFAULT_NODES = {2: 500, 3: 5000}  # by dimension; on small images a graded mesh has fewer
 
 
+def option(metavar: str, text: str, *names: str, **more: Any) -> Any:
+    """`typer.Option` in one line: what its value is called, and what the help says of it."""
+    return typer.Option(*names, metavar=metavar, help=text, **more)
+
+
 class Lattice(StrEnum):  # noqa: D101
     bcc = "bcc"
     five_tet = "five-tet"
@@ -64,13 +69,11 @@ ImageArgument = Annotated[
 MeshArgument = Annotated[
     Path, typer.Argument(metavar="MESH", help="VTU, VTK or gmsh MSH file of tetrahedra or triangles.")
 ]
-VolumeOption = Annotated[int | None, typer.Option(metavar="K", help="Volume of a 4-D file, from 0.")]
-CropOption = Annotated[
-    str | None, typer.Option(metavar="A:B,C:D,E:F", help="Keep these voxels, half open; an end may be empty.")
-]
-JsonOption = Annotated[Path | None, typer.Option("--json", metavar="FILE", help="Write every number here.")]
+VolumeOption = Annotated[int | None, option("K", "Volume of a 4-D file, from 0.")]
+CropOption = Annotated[str | None, option("A:B,C:D,E:F", "Keep these voxels, half open; an end may be empty.")]
+JsonOption = Annotated[Path | None, option("FILE", "Write every number here.", "--json")]
 ForceOption = Annotated[bool, typer.Option("--force", help="Replace existing outputs.")]
-SpaceOption = Annotated[str, typer.Option(metavar="ras|lps", help="Convention of the file's coordinates.")]
+SpaceOption = Annotated[str, option("ras|lps", "Convention of the file's coordinates.")]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -87,9 +90,7 @@ class ImagePart:
 
     volume: VolumeOption = None
     crop: CropOption = None
-    slice_: Annotated[
-        str | None, typer.Option("--slice", metavar="AXIS=INDEX", help="One slice, in 2-D; for example k=90.")
-    ] = None
+    slice_: Annotated[str | None, option("AXIS=INDEX", "One slice, in 2-D; for example k=90.", "--slice")] = None
 
     def stated(self) -> dict[str, int | str | None]:
         """The part as files of numbers state it."""
@@ -123,23 +124,17 @@ class SourceOptions:
         ),
     ]
     mask: Annotated[
-        Path | None,
-        typer.Option(
-            metavar="MASK", help="Mesh this region only (0/1, or 0 to 1), its boundary on the mask's surface."
-        ),
+        Path | None, option("MASK", "Mesh this region only (0/1, or 0 to 1), its boundary on the mask's surface.")
     ] = None
     background: Annotated[
-        str | None,
-        typer.Option(metavar="VALUE|auto", help="Leave out what is up to VALUE and reaches the box: the air."),
+        str | None, option("VALUE|auto", "Leave out what is up to VALUE and reaches the box: the air.")
     ] = None
-    labels: Annotated[
-        Path | None, typer.Option(metavar="LABELS", help="Label image: each cell is to be of one label.")
-    ] = None
-    weights: Annotated[
-        str | None, typer.Option(metavar="W,...", help="How much each IMAGE counts (default 1 each; 0: not at all).")
-    ] = None
+    labels: Annotated[Path | None, option("LABELS", "Label image: each cell is to be of one label.")] = None
+    weights: Annotated[str | None, option("W,...", "How much each IMAGE counts (default 1 each; 0: not at all).")] = (
+        None
+    )
     label_weight: Annotated[
-        float | None, typer.Option(metavar="W", help="How much the labels count beside the first IMAGE (default 1).")
+        float | None, option("W", "How much the labels count beside the first IMAGE (default 1).")
     ] = None
     part: ImagePart = WHOLE_IMAGE
 
@@ -150,27 +145,19 @@ class SizeOptions:
 
     panel: ClassVar[str] = "Number and size of cells"
     nodes: Annotated[
-        int | None,
-        typer.Option(
-            metavar="N", help=f"Wanted number of nodes (default {DEFAULT_NODES[3]}; {DEFAULT_NODES[2]} in 2-D)."
-        ),
+        int | None, option("N", f"Wanted number of nodes (default {DEFAULT_NODES[3]}; {DEFAULT_NODES[2]} in 2-D).")
     ] = None
     target_error: Annotated[
-        float | None,
-        typer.Option(metavar="T", help="As many nodes as leave this share of the image's variance in cells, instead."),
+        float | None, option("T", "As many nodes as leave this share of the image's variance in cells, instead.")
     ] = None
-    size_min: Annotated[float | None, typer.Option(metavar="MM", help="No edge is split into shorter ones.")] = None
+    size_min: Annotated[float | None, option("MM", "No edge is split into shorter ones.")] = None
     size_max: Annotated[
-        float | None,
-        typer.Option(metavar="MM", help="No cell is made with a longer edge (default 1.4 x a uniform mesh's)."),
+        float | None, option("MM", "No cell is made with a longer edge (default 1.4 x a uniform mesh's).")
     ] = None
     gradation: Annotated[
-        float | None,
-        typer.Option(metavar="G", help="How gently sizes change: each is 1/G blocks wide, 0.05 to 1 (default)."),
+        float | None, option("G", "How gently sizes change: each is 1/G blocks wide, 0.05 to 1 (default).")
     ] = None
-    sizing: Annotated[
-        Path | None, typer.Option(metavar="SIZES.nii.gz", help="Longest edge by place, mm; 0 or less: as elsewhere.")
-    ] = None
+    sizing: Annotated[Path | None, option("SIZES.nii.gz", "Longest edge by place, mm; 0 or less: as elsewhere.")] = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -187,10 +174,9 @@ class StartOptions:
     uniform: Annotated[
         bool, typer.Option("--uniform", help="The paper's setting: a uniform lattice, bcc (criss-cross in 2-D).")
     ] = False
-    spacing: Annotated[float | None, typer.Option(metavar="MM", help="A uniform lattice of this spacing.")] = None
+    spacing: Annotated[float | None, option("MM", "A uniform lattice of this spacing.")] = None
     start: Annotated[
-        Path | None,
-        typer.Option(metavar="MESH", help="Improve this mesh, its boundary kept, instead of making a new one."),
+        Path | None, option("MESH", "Improve this mesh, its boundary kept, instead of making a new one.")
     ] = None
 
 
@@ -201,20 +187,20 @@ class EngineOptions:
     panel: ClassVar[str] = "Optimisation"
     k_D: Annotated[
         float | None,
-        typer.Option(
-            "--k-d",
-            metavar="K",
-            help="Weight of the image: 0 shape only; 0.9 image first "
+        option(
+            "K",
+            "Weight of the image: 0 shape only; 0.9 image first "
             f"(default {GRADED_K_D:g}; --uniform {UNIFORM_K_D:g}; --start {START_K_D:g}).",
+            "--k-d",
         ),
     ] = None
     iterations: Annotated[
         int | None,
-        typer.Option(
-            metavar="I",
-            min=0,
-            help="Sweeps over all nodes; 0 writes the initial mesh "
+        option(
+            "I",
+            "Sweeps over all nodes; 0 writes the initial mesh "
             f"(default {GRADED_ITERATIONS}; {UNIFORM_ITERATIONS} if uniform).",
+            min=0,
         ),
     ] = None
     boundary: Annotated[
@@ -225,25 +211,19 @@ class EngineOptions:
     ] = Method.fast
     shape_power: Annotated[
         float | None,
-        typer.Option(
-            metavar="P",
-            help=f"Fast method: 1 is the paper's E_G; up to 10 punish flat cells more (default {SHAPE_POWER:g}).",
-        ),
+        option("P", f"Fast method: 1 is the paper's E_G; up to 10 punish flat cells more (default {SHAPE_POWER:g})."),
     ] = None
     min_dihedral: Annotated[
         float | None,
-        typer.Option(
-            metavar="DEG",
-            help=f"Fast method, 3-D: smallest dihedral angle allowed, 0 (none) to 70 (default {MIN_DIHEDRAL:g}).",
-        ),
+        option("DEG", f"Fast method, 3-D: smallest dihedral angle allowed, 0 (none) to 70 (default {MIN_DIHEDRAL:g})."),
     ] = None
     n_t: Annotated[
         int | None,
-        typer.Option(
+        option(
+            "T",
+            "Paper's method: connect anew in the first T iterations (default half; all for k_D = 0).",
             "--n-t",
-            metavar="T",
             min=0,
-            help="Paper's method: connect anew in the first T iterations (default half; all for k_D = 0).",
         ),
     ] = None
     retessellate: Annotated[
@@ -252,12 +232,8 @@ class EngineOptions:
             help="Paper's method: Delaunay anew in the first n_t iterations (the default), whenever it lowers E, never."
         ),
     ] = None
-    threads: Annotated[
-        int | None, typer.Option(metavar="N", help="Threads; the result is the same for any number.")
-    ] = None
-    max_seconds: Annotated[
-        float | None, typer.Option(metavar="S", help="Stop after S seconds with the mesh reached.")
-    ] = None
+    threads: Annotated[int | None, option("N", "Threads; the result is the same for any number.")] = None
+    max_seconds: Annotated[float | None, option("S", "Stop after S seconds with the mesh reached.")] = None
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -267,48 +243,34 @@ class SolverOptions:
     panel: ClassVar[str] = "For the solver"
     young: Annotated[
         str | None,
-        typer.Option(
-            metavar="LAW",
-            help='Young\'s modulus, kPa: a number, a formula of the intensity, "0.5 + 0.01*h", a table "0:1,100:5", '
+        option(
+            "LAW",
+            'Young\'s modulus, kPa: a number, a formula of the intensity, "0.5 + 0.01*h", a table "0:1,100:5", '
             'by label "1=2.1,2=1.9", or a file .toml or .csv of such columns.',
         ),
     ] = None
-    nu: Annotated[
-        str | None, typer.Option(metavar="LAW", help=f"Poisson's ratio, likewise (default {DEFAULT_NU:g}).")
-    ] = None
+    nu: Annotated[str | None, option("LAW", f"Poisson's ratio, likewise (default {DEFAULT_NU:g}).")] = None
     bins: Annotated[
-        str | None,
-        typer.Option(
-            metavar="K[:quantile|:log]", help="Group cells into K materials, of equal width, by number, or log."
-        ),
+        str | None, option("K[:quantile|:log]", "Group cells into K materials, of equal width, by number, or log.")
     ] = None
     sets: Annotated[
         list[str] | None,
-        typer.Option(
+        option(
+            "NAME=...",
+            "A set more: NAME=below:T, NAME=point:X,Y,Z:D, NAME=plane:X,Y,Z:NX,NY,NZ:D (mm, RAS+). May be repeated.",
             "--set",
-            metavar="NAME=...",
-            help="A set more: NAME=below:T, NAME=point:X,Y,Z:D, NAME=plane:X,Y,Z:NX,NY,NZ:D (mm, RAS+). May be "
-            "repeated.",
         ),
     ] = None
     loads: Annotated[
         list[str] | None,
-        typer.Option(
-            "--load",
-            metavar="...",
-            help="A step to run: compress:5%, or hold:SET and move:SET:X,Y,Z. May be repeated.",
-        ),
+        option("...", "A step to run: compress:5%, or hold:SET and move:SET:X,Y,Z. May be repeated.", "--load"),
     ] = None
-    order: Annotated[
-        int, typer.Option(metavar="1|2", help="2: quadratic cells, straight-edged (.inp, .feb, .msh, .msh2).")
-    ] = 1
-    units: Annotated[str, typer.Option(metavar="kPa|MPa", help="Unit of stress in the file; --young is in kPa.")] = (
-        "kPa"
-    )
+    order: Annotated[int, option("1|2", "2: quadratic cells, straight-edged (.inp, .feb, .msh, .msh2).")] = 1
+    units: Annotated[str, option("kPa|MPa", "Unit of stress in the file; --young is in kPa.")] = "kPa"
     space: SpaceOption = "ras"
 
     def are_any(self) -> bool:
-        """Whether more is asked for than the mesh."""
+        """Whether the file is to hold more than the mesh."""
         return self != SolverOptions()
 
 
@@ -316,13 +278,10 @@ class SolverOptions:
 class OutputOptions:
     """What `tetopt mesh` writes."""
 
-    mesh: Annotated[
-        Path, typer.Option("-o", "--output", metavar="MESH", help=f"The mesh to write: {', '.join(FORMATS)}.")
-    ]
+    mesh: Annotated[Path, option("MESH", f"The mesh to write: {', '.join(FORMATS)}.", "-o", "--output")]
     json_path: JsonOption = None
     figures: Annotated[
-        Path | None,
-        typer.Option(metavar="DIR", help="Draw slice.png, rho.png, energies.png and others in this folder."),
+        Path | None, option("DIR", "Draw slice.png, rho.png, energies.png and others in this folder.")
     ] = None
     force: ForceOption = False
 
@@ -340,13 +299,13 @@ def from_records(command: Callable[..., int]) -> Callable[..., int]:
     def called(**values: Any) -> int:
         return command(**{name: _of_values(kinds[name], name, values) for name in defaults})
 
-    parameters = [option for name, default in defaults.items() for option in _options(name, kinds[name], default)]
+    parameters = [each for name, default in defaults.items() for each in _parameters(name, kinds[name], default)]
     called.__signature__ = inspect.Signature(parameters)  # type: ignore[attr-defined]
-    called.__annotations__ = {option.name: option.annotation for option in parameters}
+    called.__annotations__ = {parameter.name: parameter.annotation for parameter in parameters}
     return called
 
 
-def _options(name: str, kind: Any, default: Any, panel: str | None = None) -> Iterator[inspect.Parameter]:
+def _parameters(name: str, kind: Any, default: Any, panel: str | None = None) -> Iterator[inspect.Parameter]:
     """The parameters that stand for one of a command, or for a field of a record."""
     if not is_dataclass(kind):
         yield inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=_in(panel, kind))
@@ -354,7 +313,7 @@ def _options(name: str, kind: Any, default: Any, panel: str | None = None) -> It
     kinds, panel = get_type_hints(kind, include_extras=True), getattr(kind, "panel", panel)
     for field in fields(kind):
         default = inspect.Parameter.empty if field.default is MISSING else field.default
-        yield from _options(field.name, kinds[field.name], default, panel)
+        yield from _parameters(field.name, kinds[field.name], default, panel)
 
 
 def _in(panel: str | None, kind: Any) -> Any:
@@ -362,9 +321,9 @@ def _in(panel: str | None, kind: Any) -> Any:
     extras = get_args(kind)[1:]
     if panel is None or not isinstance(extras[0], OptionInfo):
         return kind
-    option = copy(extras[0])
-    option.rich_help_panel = panel
-    return Annotated[get_args(kind)[0], option]
+    moved = copy(extras[0])
+    moved.rich_help_panel = panel
+    return Annotated[get_args(kind)[0], moved]
 
 
 def _of_values(kind: Any, name: str, values: dict[str, Any]) -> Any:

@@ -10,21 +10,18 @@ from rich.markup import escape
 
 from tetopt import InputError, load_phantom, save_image
 from tetopt.cli.console import out
-from tetopt.cli.options import ForceOption
+from tetopt.cli.options import ForceOption, option
 from tetopt.io.files import checked_output
 
 
 def phantom_command(
     name: Annotated[str, typer.Argument(metavar="NAME_OR_TOML", help="A phantom's name, or a TOML file of your own.")],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="IMAGE.nii.gz", help="The image to write.")],
-    voxel_mm: Annotated[float | None, typer.Option(metavar="MM", help="Voxel size instead of the phantom's.")] = None,
-    blur_mm: Annotated[float | None, typer.Option(metavar="MM", help="Standard deviation of a Gaussian blur.")] = None,
-    noise_sd: Annotated[float | None, typer.Option(metavar="SD", help="Standard deviation of added noise.")] = None,
-    seed: Annotated[int | None, typer.Option(metavar="N", help="Seed of the noise.")] = None,
-    labels: Annotated[
-        Path | None,
-        typer.Option(metavar="LABELS.nii.gz", help="Write the label of each voxel's centre, too."),
-    ] = None,
+    output: Annotated[Path, option("IMAGE.nii.gz", "The image to write.", "-o", "--output")],
+    voxel_mm: Annotated[float | None, option("MM", "Voxel size instead of the phantom's.")] = None,
+    blur_mm: Annotated[float | None, option("MM", "Standard deviation of a Gaussian blur.")] = None,
+    noise_sd: Annotated[float | None, option("SD", "Standard deviation of added noise.")] = None,
+    seed: Annotated[int | None, option("N", "Seed of the noise.")] = None,
+    labels: Annotated[Path | None, option("LABELS.nii.gz", "Write the label of each voxel's centre, too.")] = None,
     force: ForceOption = False,
 ) -> int:
     """Write a phantom as an image: known shapes, known intensities."""

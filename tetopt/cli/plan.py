@@ -27,7 +27,7 @@ from tetopt.cli.options import (
 from tetopt.cli.solver import check_solver_options
 from tetopt.engine.fast import check_options
 from tetopt.engine.loop import MIN_DIHEDRAL, SHAPE_POWER
-from tetopt.engine.meshing import DEFAULTS, Mode
+from tetopt.engine.meshing import MODE_DEFAULTS, Mode
 from tetopt.engine.paper import default_n_t
 from tetopt.io.files import checked_output
 from tetopt.io.formats import FORMATS, format_of
@@ -56,7 +56,7 @@ class Plan(NamedTuple):
         return KINDS[ndim][0] if self.start.lattice is None else self.start.lattice.value
 
     def engine_options(self) -> dict[str, Any]:
-        """What `mesh_image` is told besides the mesh to begin with, in the order of run.json."""
+        """Options of `mesh_image` besides those of the mesh to begin with, in the order of run.json."""
         engine = self.engine
         options = {"k_D": engine.k_D, "iterations": engine.iterations, "boundary": engine.boundary}
         if self.mode == "paper":
@@ -141,7 +141,7 @@ def _mode(source: SourceOptions, sizes: SizeOptions, start: StartOptions, engine
 
 def _completed(engine: EngineOptions, mode: Mode) -> EngineOptions:
     """The engine's options with the defaults of the mode; InputError where they cannot be."""
-    k_D, iterations = DEFAULTS[mode]
+    k_D, iterations = MODE_DEFAULTS[mode]
     k_D = k_D if engine.k_D is None else engine.k_D
     iterations = iterations if engine.iterations is None else engine.iterations
     if not 0.0 <= k_D < 1.0:

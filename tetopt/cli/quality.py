@@ -14,7 +14,7 @@ import tetopt
 from tetopt import Image, InputError, Mesh
 from tetopt.cli.console import log, out, print_fidelity
 from tetopt.cli.inputs import image_and_others, read_mesh, warn_of_other_image
-from tetopt.cli.options import ImagePart, NumberOptions
+from tetopt.cli.options import ImagePart, NumberOptions, option
 from tetopt.io.files import save_json
 from tetopt.io.meshes import MeshFile
 from tetopt.measure.quality import quality
@@ -26,14 +26,12 @@ from tetopt.target.content import continued
 
 def quality_command(
     mesh_path: Annotated[Path, typer.Argument(metavar="MESH", help="VTU, VTK or MSH file of tetrahedra or triangles.")],
-    image_path: Annotated[
-        Path | None, typer.Option("--image", metavar="IMAGE", help="Measure E_D against this image, too.")
-    ] = None,
+    image_path: Annotated[Path | None, option("IMAGE", "Measure E_D against this image, too.", "--image")] = None,
     mask_path: Annotated[
-        Path | None, typer.Option("--mask", metavar="MASK", help="How well the boundary follows it; with --image.")
+        Path | None, option("MASK", "How well the boundary follows it; with --image.", "--mask")
     ] = None,
     labels_path: Annotated[
-        Path | None, typer.Option("--labels", metavar="LABELS", help="How well cells keep to them; with --image.")
+        Path | None, option("LABELS", "How well cells keep to them; with --image.", "--labels")
     ] = None,
     check: Annotated[
         bool, typer.Option("--check", help="Is it a mesh? With --image, does it fill the box? Exit 1 if not.")

@@ -13,7 +13,7 @@ import tetopt
 from tetopt import Image, InputError, Mesh, save_image
 from tetopt.cli.console import out, show_warning
 from tetopt.cli.inputs import check_no_input, read_image, read_labels, read_mesh, warn_of_other_image
-from tetopt.cli.options import ImageArgument, ImagePart, NumberOptions
+from tetopt.cli.options import ImageArgument, ImagePart, NumberOptions, option
 from tetopt.io.files import checked_output, save_json
 from tetopt.report.tables import new_table
 
@@ -21,10 +21,10 @@ from tetopt.report.tables import new_table
 def segment_command(
     image_path: ImageArgument,
     mesh_path: Annotated[Path, typer.Argument(metavar="MESH", help="VTU, VTK or MSH file over the image.")],
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="LABELS.nii.gz", help="The labels to write.")],
-    classes: Annotated[int, typer.Option(metavar="K", min=2, help="Number of classes, by rising mean.")] = 4,
+    output: Annotated[Path, option("LABELS.nii.gz", "The labels to write.", "-o", "--output")],
+    classes: Annotated[int, option("K", "Number of classes, by rising mean.", min=2)] = 4,
     truth_path: Annotated[
-        Path | None, typer.Option("--truth", metavar="LABELS", help="True labels: print the Dice overlap with them.")
+        Path | None, option("LABELS", "True labels: print the Dice overlap with them.", "--truth")
     ] = None,
     *,
     part: ImagePart,
@@ -73,7 +73,7 @@ def segment_command(
 
 
 def _mesh_over(path: Path, image: Image, image_path: Path) -> Mesh:
-    """The mesh of a file, whose cells hold each of the image's voxels once; voxels outside are told."""
+    """The mesh of a file, whose cells hold each of the image's voxels once; a warning tells of voxels outside."""
     loaded = read_mesh(path)
     warn_of_other_image(loaded, path, image_path)
     if tetopt.cell_moments(image, loaded.mesh).n_voxels.sum() > image.data.size:

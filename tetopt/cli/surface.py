@@ -6,14 +6,13 @@ from pathlib import Path
 from typing import Annotated
 
 import numpy as np
-import typer
 from numpy.typing import NDArray
 from rich.markup import escape
 
 from tetopt import InputError
 from tetopt.cli.console import log, out, show_warning
 from tetopt.cli.inputs import cell_field, check_no_input, read_mesh
-from tetopt.cli.options import MeshArgument, NumberOptions, SpaceOption
+from tetopt.cli.options import MeshArgument, NumberOptions, SpaceOption, option
 from tetopt.geometry.simplex import volumes
 from tetopt.geometry.surface import surface_of
 from tetopt.geometry.topology import largest_component
@@ -26,12 +25,10 @@ from tetopt.report.tables import new_table
 
 def surface_command(
     mesh_path: MeshArgument,
-    output: Annotated[Path, typer.Option("-o", "--output", metavar="OUT.stl", help="Surface to write, STL or PLY.")],
-    below: Annotated[
-        float | None, typer.Option(metavar="T", help="Of the largest connected set of cells with a mean below T.")
-    ] = None,
-    label: Annotated[int | None, typer.Option(metavar="L", help="Of all cells with this label.")] = None,
-    cell_set: Annotated[str | None, typer.Option("--set", metavar="NAME", help="Of a named set of cells.")] = None,
+    output: Annotated[Path, option("OUT.stl", "Surface to write, STL or PLY.", "-o", "--output")],
+    below: Annotated[float | None, option("T", "Of the largest connected set of cells with a mean below T.")] = None,
+    label: Annotated[int | None, option("L", "Of all cells with this label.")] = None,
+    cell_set: Annotated[str | None, option("NAME", "Of a named set of cells.", "--set")] = None,
     space: SpaceOption = "ras",
     *,
     numbers: NumberOptions,

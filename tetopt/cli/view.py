@@ -11,7 +11,7 @@ from rich.markup import escape
 from tetopt import InputError
 from tetopt.cli.console import out
 from tetopt.cli.inputs import check_no_input, read_image, read_mesh, warn_of_other_image
-from tetopt.cli.options import BoxPart, ForceOption, ImagePart
+from tetopt.cli.options import BoxPart, ForceOption, ImagePart, option
 from tetopt.io.files import checked_output
 from tetopt.model.build import labels_of
 from tetopt.model.fields import cell_fields
@@ -20,12 +20,8 @@ from tetopt.model.sets import facet_triples, merged_sets, standard_sets
 
 def view_command(
     mesh_path: Annotated[Path, typer.Argument(metavar="MESH", help="VTU, VTK or gmsh MSH file of tetrahedra.")],
-    image_path: Annotated[
-        Path | None, typer.Option("--image", metavar="IMAGE", help="Show its slice behind the mesh's section.")
-    ] = None,
-    html: Annotated[
-        Path | None, typer.Option("--html", metavar="OUT.html", help="Write one page for a browser, open no window.")
-    ] = None,
+    image_path: Annotated[Path | None, option("IMAGE", "Show its slice behind the mesh's section.", "--image")] = None,
+    html: Annotated[Path | None, option("OUT.html", "Write one page for a browser, open no window.", "--html")] = None,
     *,
     part: BoxPart,
     force: ForceOption = False,

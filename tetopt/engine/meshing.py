@@ -35,13 +35,13 @@ from tetopt.target.content import Content, plain
 Mode = Literal["graded", "uniform", "paper", "start"]
 Run = Callable[..., Optimized]  # an optimisation that is ready to begin; takes further options of `optimize`
 
-DEFAULTS: dict[Mode, tuple[float, int]] = {  # k_D and iterations
+MODE_DEFAULTS: dict[Mode, tuple[float, int]] = {  # k_D and iterations
     "graded": (GRADED_K_D, GRADED_ITERATIONS),
     "uniform": (UNIFORM_K_D, UNIFORM_ITERATIONS),
     "paper": (UNIFORM_K_D, UNIFORM_ITERATIONS),
     "start": (START_K_D, UNIFORM_ITERATIONS),
 }
-TAKES: dict[Mode, tuple[str, ...]] = {  # what says which mesh a run begins with
+MODE_ARGUMENTS: dict[Mode, tuple[str, ...]] = {  # what says which mesh a run begins with
     "graded": ("nodes", "target_error", "sizes"),
     "uniform": ("nodes", "spacing", "kind"),
     "paper": ("nodes", "spacing", "kind"),
@@ -130,7 +130,7 @@ def mesh_image(
     content = plain(image)
     values = {"nodes": nodes, "target_error": target_error, "spacing": spacing, "kind": kind, "start": start}
     _check_mode(mode, content, values | {"sizes": sizes})
-    default_k_D, default_iterations = DEFAULTS[mode]
+    default_k_D, default_iterations = MODE_DEFAULTS[mode]
     options["k_D"] = default_k_D if k_D is None else k_D
     options["iterations"] = default_iterations if iterations is None else iterations
     if mode == "start":
@@ -167,16 +167,17 @@ def mesh_image(
 
 def _check_mode(mode: Mode, content: Content, values: dict[str, Any]) -> None:
     """InputError for a mode that there is not, and for what does not belong to it."""
-    if mode not in DEFAULTS:
-        raise InputError(f"mesh_image: expected a mode of {', '.join(DEFAULTS)}, got {mode!r}")
-    given = [name for name, value in values.items() if value is not None]
-    if strange := [name for name in given if name not in TAKES[mode]]:
-        raise InputError(f"mesh_image: a mesh of mode {mode!r} takes {', '.join(TAKES[mode])}, but no {strange[0]}")
-    if mode == "graded" and ("nodes" in given) == ("target_error" in given):
+    if mode not in MODE_DEFAULTS:
+        raise InputError(f"mesh_image: expected a mode of {', '.join(MODE_DEFAULTS)}, got {mode!r}")
+    names = [name for name, value in values.items() if value is not None]
+    if strange := [name for name in names if name not in MODE_ARGUMENTS[mode]]:
+        takes = ", ".join(MODE_ARGUMENTS[mode])
+        raise InputError(f"mesh_image: a mesh of mode {mode!r} takes {takes}, but no {strange[0]}")
+    if mode == "graded" and ("nodes" in names) == ("target_error" in names):
         raise InputError("mesh_image: give a number of nodes or a target_error, one of them")
-    if mode in ("uniform", "paper") and ("nodes" in given) == ("spacing" in given):
+    if mode in ("uniform", "paper") and ("nodes" in names) == ("spacing" in names):
         raise InputError("mesh_image: give a number of nodes or a spacing, one of them")
-    if mode == "start" and not given:
+    if mode == "start" and not names:
         raise InputError("mesh_image: mode 'start' needs a mesh to start from")
     if mode == "paper" and not (content.is_plain and content.region is None):
         raise InputError("mesh_image: the paper's scheme takes one image and its whole box")
