@@ -83,21 +83,34 @@ def slice_figure(
         polygons, cells = view.section(mesh)
         over, flat = grid[:, column]
         view.show_pixels(over, limits)
-        # Each line belongs to two polygons and is drawn twice. Where there are many, lines of full width, in points,
-        # would hide the image.
-        width = min(0.6, 20.0 / np.sqrt(max(len(polygons), 1)))
-        over.add_collection(PolyCollection(list(polygons), facecolors="none", edgecolors=MESH_LINE, linewidths=width))
+        draw_edges(over, polygons)
         over.set_title(title, fontsize=11)
-        means = cell_moments(image if means_of is None else means_of, mesh).mean[cells]
-        # If they were antialiased, the background would shine through along each border as a light seam.
-        painted = PolyCollection(list(polygons), array=means, cmap="gray", edgecolors="none", antialiaseds=False)
-        painted.set_clim(*limits)
-        flat.set_facecolor(UNCOVERED_COLOUR)
-        flat.add_collection(painted)
+        means = cell_moments(image if means_of is None else means_of, mesh).mean
+        fill_cells(flat, polygons, means[cells], "gray", limits)
         flat.set_title("mean of the image in each cell", fontsize=10)
         for axes in (over, flat):
             view.frame(axes)
     return figure
+
+
+def draw_edges(axes: Axes, polygons: NDArray[np.float64]) -> None:
+    """Draw the edges of a section's polygons over a slice."""
+    # Each line belongs to two polygons and is drawn twice. Where there are many, lines of full width, in points, would
+    # hide the image.
+    width = min(0.6, 20.0 / np.sqrt(max(len(polygons), 1)))
+    axes.add_collection(PolyCollection(list(polygons), facecolors="none", edgecolors=MESH_LINE, linewidths=width))
+
+
+def fill_cells(
+    axes: Axes, polygons: NDArray[np.float64], values: NDArray[np.float64], colours: str, limits: tuple[float, float]
+) -> PolyCollection:
+    """Fill a section's polygons with values (K,) in the colours of a map, and what they leave with light blue."""
+    # If they were antialiased, the background would shine through along each border as a light seam.
+    painted = PolyCollection(list(polygons), array=values, cmap=colours, edgecolors="none", antialiaseds=False)
+    painted.set_clim(*limits)
+    axes.set_facecolor(UNCOVERED_COLOUR)
+    axes.add_collection(painted)
+    return painted
 
 
 def label_figure(labels: Image, mesh: Mesh, of_cell: NDArray[np.int64] | None = None) -> Figure:

@@ -8,7 +8,6 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.collections import PolyCollection
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogFormatterSciNotation, LogLocator, NullFormatter
 from numpy.typing import NDArray
@@ -18,8 +17,9 @@ from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.report.colours import UNCOVERED_COLOUR, grey_limits
-from tetopt.report.figures import MESH_LINE, SliceView
+from tetopt.report.colours import grey_limits
+from tetopt.report.figures import SliceView, draw_edges, fill_cells
+from tetopt.report.scene import cutaway, save_scenes
 from tetopt.report.viewer import view_of
 from tetopt.study.compare_report import CurvePoint, Measurement, PipelineResult, Report, Run
 from tetopt.study.pipelines import UNTIMED_STEPS
@@ -76,14 +76,14 @@ def slices_figure(image: Image, meshes: Sequence[tuple[str, Mesh]], means: Seque
         view.show_pixels(grid[row, 0], limits)
         view.frame(grid[row, 0])
         grid[row, 0].set_title("image", fontsize=11)
-    for column, ((title, _), cut, mean, loss) in enumerate(zip(meshes, cuts, means, losses, strict=True), 1):
-        over, filled, mapped = grid[:, column]
+    for drawn, (title, _), (polygons, cells), mean, loss in zip(grid.T[1:], meshes, cuts, means, losses, strict=True):
+        over, filled, mapped = drawn
         view.show_pixels(over, limits)
-        _outline(over, cut[0])
+        draw_edges(over, polygons)
         over.set_title(title, fontsize=11)
-        _fill(filled, cut, np.asarray(mean), "gray", limits)
-        painted = _fill(mapped, cut, loss, "magma", (0.0, brightest or 1.0))
-        for axes in (over, filled, mapped):
+        fill_cells(filled, polygons, np.asarray(mean)[cells], "gray", limits)
+        painted = fill_cells(mapped, polygons, loss[cells], "magma", (0.0, brightest or 1.0))
+        for axes in drawn:
             view.frame(axes)
     grid[1, 1].set_ylabel("mean in each cell")
     grid[2, 1].set_ylabel("E_D per mm³")
@@ -95,35 +95,11 @@ def slices_figure(image: Image, meshes: Sequence[tuple[str, Mesh]], means: Seque
     return figure
 
 
-def _outline(axes: Axes, polygons: NDArray[np.float64]) -> None:
-    width = min(0.6, 20.0 / np.sqrt(max(len(polygons), 1)))  # points; thinner before the lines hide the image
-    axes.add_collection(PolyCollection(list(polygons), facecolors="none", edgecolors=MESH_LINE, linewidths=width))
-
-
-def _fill(
-    axes: Axes,
-    cut: tuple[NDArray[np.float64], NDArray[np.int64]],
-    values: NDArray[np.float64],
-    colours: str,
-    limits: tuple[float, float],
-) -> PolyCollection:
-    polygons, cells = cut
-    # Antialiased, each border would let the background shine through as a light seam.
-    painted = PolyCollection(list(polygons), array=values[cells], cmap=colours, edgecolors="none", antialiaseds=False)
-    painted.set_clim(*limits)
-    axes.set_facecolor(UNCOVERED_COLOUR)
-    axes.add_collection(painted)
-    return painted
-
-
 def cutaways(meshes: Sequence[tuple[str, Mesh]], means: Sequence[NDArray[np.float64]], path: str | Path) -> None:
     """PNG of every mesh, its right, front, upper octant taken away, cells in the grey of their means, with edges.
 
     All are opened at the middle of the first mesh's box, up to three in a row. `means` as in `slices_figure`.
     """
-    # pyvista is slow to load, and the flat pictures need it not.
-    from tetopt.report.scene import cutaway, save_scenes
-
     points = meshes[0][1].points
     centre = (points.min(axis=0) + points.max(axis=0)) / 2.0
     views = [view_of(mesh, mean, title, centre) for (title, mesh), mean in zip(meshes, means, strict=True)]
