@@ -8,20 +8,16 @@ from typing import Any
 
 import numpy as np
 import pyvista
-from matplotlib.figure import Figure
 from numpy.typing import NDArray
 from scipy import ndimage
 
-from tetopt.energy.sampling import cell_moments
-from tetopt.errors import InputError
 from tetopt.geometry.topology import boundary_facets
 from tetopt.image import Image
 from tetopt.io.files import written_whole
-from tetopt.measure.fidelity import cell_labels
 from tetopt.mesh import Mesh
-from tetopt.report.colours import grey_limits, label_colours, legend_patches
-from tetopt.report.figures import MESH_LINE, save_figure
-from tetopt.report.viewer import View, view_of
+from tetopt.report.colours import grey_limits
+from tetopt.report.figures import MESH_LINE
+from tetopt.report.viewer import View
 
 STRUCTURE_COLOUR = "#d95f02"  # orange: it stands out from the grey slices behind it
 SCENE_VIEWPOINT = (0.9, 1.25, 0.7)  # where the eye is, RAS: on the right, in front and above
@@ -43,31 +39,18 @@ def save_scenes(path: str | Path, scenes: Sequence[tuple[str, Draw]], columns: i
         plotter.set_background("white")
         for number, (title, draw) in enumerate(scenes):
             plotter.subplot(*divmod(number, columns))
-            _place(plotter, draw)
+            put_scene(plotter, draw)
             if title:
                 plotter.add_text(title, font_size=14, color="black", position="upper_edge")
         plotter.screenshot(temporary)
         plotter.close()
 
 
-def _place(plotter: pyvista.Plotter, draw: Draw) -> None:
+def put_scene(plotter: pyvista.Plotter, draw: Draw) -> None:
     """Put a scene into the plotter's present part, and the camera to where all scenes are seen from."""
     draw(plotter)
     plotter.view_vector(SCENE_VIEWPOINT, viewup=(0.0, 0.0, 1.0))
     plotter.camera.zoom(1.05)
-
-
-def _photograph(draw: Draw) -> NDArray[np.uint8]:
-    """A scene by itself, (rows, columns, 3) red, green and blue, cut to what is not white."""
-    with pyvista.vtk_verbosity("off"):
-        plotter = pyvista.Plotter(off_screen=True, window_size=(1650, 1500))
-        plotter.set_background("white")
-        _place(plotter, draw)
-        pixels = plotter.screenshot(None, return_img=True)
-        plotter.close()
-    is_drawn = (pixels < 255).any(axis=2)
-    rows, columns = (np.flatnonzero(is_drawn.any(axis=axis)) for axis in (1, 0))
-    return pixels[rows[0] : rows[-1] + 1, columns[0] : columns[-1] + 1]
 
 
 def structure_before_slices(image: Image, mesh: Mesh, chosen: NDArray[np.int64]) -> Draw:
@@ -112,63 +95,6 @@ def cutaway(view: View, limits: tuple[float, float]) -> Draw:
         surface, scalars="h", cmap="gray", clim=shown, show_scalar_bar=False, show_edges=True, edge_color=MESH_LINE,
         line_width=1, ambient=0.3,
     )  # fmt: skip
-
-
-def labelled_cutaway(view: View, colours: NDArray[np.float64]) -> Draw:
-    """The surface of an opened mesh, each cell in the colour of its label, with the cells' edges.
-
-    The view's values are labels; `colours` (largest label + 1, 3) as of `tetopt.report.colours.label_colours`.
-    """
-    surface = pyvista.PolyData.from_regular_faces(view.points, view.triangles)
-    surface.cell_data["colour"] = np.rint(255.0 * colours[view.values.astype(np.int64)]).astype(np.uint8)
-    return lambda plotter: plotter.add_mesh(
-        surface, scalars="colour", rgb=True, show_edges=True, edge_color="#202020", line_width=1, ambient=0.35
-    )
-
-
-def save_cutaway(path: str | Path, image: Image, mesh: Mesh, labels: Image | None = None) -> None:
-    """PNG of a mesh with its right, front, upper octant taken away: cells in the grey of their means, with edges.
-
-    The README's picture of a brain, `docs/organ.png`, is one.
-
-    Parameters
-    ----------
-    path : str or Path
-    image : Image
-    mesh : Mesh
-        Tetrahedra.
-    labels : Image, optional
-        Whole numbers from 0. Cells of label 0, the background, are left out, and beside the greys the cells are shown
-        in the colours of their labels, the same as in `tetopt.report.figures.label_figure`.
-
-    Raises
-    ------
-    InputError
-        A mesh of triangles, labels that are not whole numbers or all 0, or as `tetopt.energy.sampling.cell_moments`.
-    """
-    of_cell = np.ones(len(mesh.cells), dtype=np.int64) if labels is None else cell_labels(labels, mesh)
-    chosen = of_cell > 0
-    if not chosen.any():
-        raise InputError("labels: expected cells with a label above 0, got background alone; leave the labels out")
-    used, compact = np.unique(mesh.cells[chosen], return_inverse=True)
-    part = Mesh(mesh.points[used], compact.reshape(-1, mesh.ndim + 1))
-    view = view_of(part, cell_moments(image, mesh).mean[chosen], "mean of the image in each cell")
-    pictures = [(view.title, _photograph(cutaway(view, grey_limits([view.values]))))]
-    handles = []
-    if labels is not None:
-        view = view_of(part, of_cell[chosen].astype(np.float64), "label of each cell")
-        colours = label_colours(labels)
-        pictures.append((view.title, _photograph(labelled_cutaway(view, colours))))
-        handles = legend_patches(colours, np.bincount(view.values.astype(np.int64)))
-    height, width = pictures[0][1].shape[:2]
-    figure = Figure(figsize=(5.6 * len(pictures) + bool(handles), 5.6 * height / width + 0.4), layout="constrained")
-    for axes, (title, pixels) in zip(figure.subplots(1, len(pictures), squeeze=False)[0], pictures, strict=True):
-        axes.imshow(pixels)
-        axes.set_title(title, fontsize=11)
-        axes.set_axis_off()
-    if handles:
-        figure.legend(handles=handles, loc="outside right upper", fontsize=9, frameon=False, title="label")
-    save_figure(figure, path, dpi=200)
 
 
 def dark_structure_surface(image: Image, below: float, near: NDArray[np.bool_]) -> pyvista.PolyData:
