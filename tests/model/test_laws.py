@@ -1,10 +1,12 @@
-"""Laws from intensity to modulus."""
+"""Laws from intensity to modulus: of arrays, in words, in files."""
 
 import numpy as np
 import pytest
+from models import sample_model
 
 from tetopt import InputError
-from tetopt.model.laws import young_from
+from tetopt.model.build import model_of
+from tetopt.model.laws import ByLabel, has_column, load_law, parse_any_law, parse_law, young_from
 
 TABLE = [(-50.0, 2.0), (0.0, 1.0), (100.0, 5.0)]
 
@@ -89,3 +91,90 @@ def test_messages_of_laws(law, message):
     with pytest.raises(InputError) as error:
         young_from(law, [0, 5, 10])
     assert str(error.value) == message
+
+
+# From text and files
+
+
+@pytest.mark.parametrize("text", ["1=", "=2", "1=2,1=3", "1=2;2=3", "a=1", "1.5=2", "1=x", "*=1,*=2"])
+def test_labels_that_are_none(text):
+    with pytest.raises(InputError, match="by label"):
+        parse_any_law(text)
+
+
+def test_a_law_of_the_intensity_alone():
+    with pytest.raises(InputError, match="expected one of the intensity"):
+        parse_law("1=2")
+
+
+TOML = "intensity = [0, 50, 200]\nyoung = [0.5, 1, 6.0]\nnu = [0.45, 0.4, 0.49]\n"
+CSV = "intensity, young, nu\n0,0.5,0.45\n50,1,0.4\n200,6.0,0.49\n"
+
+
+@pytest.mark.parametrize(("name", "text"), [("a.toml", TOML), ("a.csv", CSV), ("A.CSV", "\ufeff" + CSV + "\n")])
+def test_tables_from_files(tmp_path, name, text):
+    path = tmp_path / name
+    path.write_text(text, encoding="utf-8")
+    assert parse_any_law(str(path)) == [(0.0, 0.5), (50.0, 1.0), (200.0, 6.0)]
+    assert load_law(path, "nu") == [(0.0, 0.45), (50.0, 0.4), (200.0, 0.49)]
+
+
+def test_labels_from_a_file(tmp_path):
+    (tmp_path / "a.csv").write_text("label,young\n3,2.5\n0,1\n")
+    assert load_law(tmp_path / "a.csv") == ByLabel({3: 2.5, 0: 1.0})
+    (tmp_path / "b.csv").write_text("Label,Young,Nu\n3,2.5,0.3\n*,1,0.45\n")
+    assert load_law(tmp_path / "b.csv") == ByLabel({3: 2.5}, 1.0)
+    assert has_column(str(tmp_path / "b.csv"), "nu")
+    assert not has_column(str(tmp_path / "a.csv"), "nu")
+    table = model_of(
+        sample_model(3).mesh, young=str(tmp_path / "b.csv"), cell_data={"label": np.full(192, 3)}
+    ).materials
+    assert (table.young.tolist(), table.nu.tolist()) == ([2.5], [0.3])
+
+
+@pytest.mark.parametrize(
+    ("name", "text", "match"),
+    [
+        ("a.toml", "intensity = [0, 50]\nyoung = [1]", "2 of intensity and 1 of young"),
+        ("a.toml", "intensity = [0, 50, 50]\nyoung = [1, 2, 3]", "must increase"),
+        ("a.toml", "intensity = [50, 0]\nyoung = [1, 2]", "must increase"),
+        ("a.toml", "intensity = [0, 'x']\nyoung = [1, 2]", "columns of numbers"),
+        ("a.toml", "intensity = 3\nyoung = [1]", "expected lists"),
+        ("a.toml", "not toml", "columns of numbers"),
+        (
+            "a.toml",
+            "h = [1]\nyoung = [1]",
+            'expected columns "young" and one of "intensity" and "label", found h, young',
+        ),
+        ("a.csv", "intensity,nu\n1,2\n", "found intensity, nu"),
+        ("a.csv", "intensity,young\n", "got an array of shape|expected pairs"),
+        ("a.csv", "", "row of names"),
+        ("a.csv", "intensity,young\n1,2,3\n", "row of names"),
+        ("a.csv", "intensity,young\n1,x\n", "columns of numbers"),
+        ("a.csv", "intensity,young\n1,nan\n", "must be finite"),
+        ("a.csv", "label,young\n1,2\n1,3\n", "label 1 has two values"),
+        ("a.csv", "label,young\n1.5,2\n", "columns of numbers"),
+        ("a.csv", "label,young,young\n1,2,3\n", "each column once"),
+        ("a.toml", "label = [1, nan]\nyoung = [1, 2]", "columns of numbers"),
+        ("a.toml", "label = [1, inf]\nyoung = [1, 2]", "columns of numbers"),
+        ("a.toml", "young = " + 3000 * "[" + 3000 * "]", "columns of numbers"),
+        ("a.csv", "label,intensity,young\n1,2,3\n", "one of"),
+    ],
+)
+def test_files_that_are_none(tmp_path, name, text, match):
+    (tmp_path / name).write_text(text)
+    with pytest.raises(InputError, match=match) as caught:
+        load_law(tmp_path / name)
+    assert "\n" not in str(caught.value)
+    with pytest.raises(InputError, match="no such file"):
+        load_law(tmp_path / "no.csv")
+
+
+def test_a_table_must_increase():
+    with pytest.raises(InputError, match="must increase, got 5 and then 3"):
+        parse_any_law("5:1,3:2")
+
+
+def test_other_names_than_h():
+    with pytest.raises(InputError, match='cannot use "x"'):
+        parse_any_law("1 + x")

@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from scipy import ndimage
 
 from tetopt.errors import InputError
+from tetopt.geometry.box import box_sides
 from tetopt.image import Image
 from tetopt.target.content import check_labels
 from tetopt.target.domain import INSIDE_SHARE
@@ -260,7 +261,7 @@ def _resampled(data: NDArray, other: Image, image: Image, order: int, mode: str)
 
 def _corners(image: Image) -> NDArray[np.float64]:
     """The corners of the image's box, (2^n, n) indices."""
-    return np.array(list(product(*((-0.5, s - 0.5) for s in image.shape))))
+    return np.array(list(product(*box_sides(image.shape))))
 
 
 def _both_boxes(other: Image, image: Image) -> str:
