@@ -229,18 +229,18 @@ def engine(image: tetopt.Image, path: Path, sizes: Sequence[int]) -> dict[str, A
     reference = tetopt.optimize_paper(image, mesh, k_D=0.5, iterations=20).history
     same = tetopt.optimize(image, mesh, k_D=0.5, iterations=20, shape_power=1.0, min_dihedral=0.0).history
     reached = next((row.seconds for row in same if row.E <= reference[-1].E), None)
-    found: dict[str, Any] = {
+    numbers: dict[str, Any] = {
         "nodes": len(mesh.points), "paper_E": reference[-1].E, "paper_seconds": reference[-1].seconds,
         "fast_E": same[-1].E, "fast_seconds": same[-1].seconds, "fast_seconds_to_paper_E": reached,
         "faster_by": None if reached is None else reference[-1].seconds / reached,
     }  # fmt: skip
-    found["runs"] = [in_a_child(path, nodes) for nodes in sizes[1:]]
-    first, last = found["runs"][1], found["runs"][-1]
-    found["time_grows_as_nodes_to_the"] = float(
+    numbers["runs"] = [in_a_child(path, nodes) for nodes in sizes[1:]]
+    first, last = numbers["runs"][1], numbers["runs"][-1]
+    numbers["time_grows_as_nodes_to_the"] = float(
         np.log(last["seconds_per_iteration"] / first["seconds_per_iteration"]) / np.log(last["nodes"] / first["nodes"])
     )
-    found["flip_seconds_per_mtet"] = flip_pass(image, sizes[1])
-    return found
+    numbers["flip_seconds_per_mtet"] = flip_pass(image, sizes[1])
+    return numbers
 
 
 def in_a_child(path: Path, nodes: int) -> dict[str, Any]:
@@ -295,48 +295,54 @@ def show(rows: dict[str, Any]) -> None:
             f"  sampling alone, {row['cells']} tets: {row['cells_per_second'] / 1e6:.1f} Mtet/s, "
             f"{row['over_numpy']:.1f} times numpy's two sums"
         )
-    for row in rows["graded"]:
+    _show_graded(rows["graded"], rows["graded_large"])
+    _show_paper(rows["paper"], rows["bar"])
+    _show_engine(rows["engine"])
+    print(f"  peak memory                       {rows['peak_memory_gb']:10.2f} GB")
+
+
+def _show_graded(rows: Sequence[dict[str, Any]], large: dict[str, Any]) -> None:
+    for row in rows:
         print(
             f"  mesh_image, {row['nodes']} nodes, {row['cells']} tets: {row['seconds']:.1f} s; E_D "
             f"{row['E_D_share']:.5f} of the image's variance, mean rho {row['mean_rho']:.4f}, angles from "
             f"{row['min_dihedral']:.1f}, 1st percentile {row['dihedral_1st_percentile']:.1f}"
         )
-    row = rows["graded_large"]
     print(
-        f"  mesh_image, 256^3 voxels, {row['nodes']} nodes, {row['cells']} tets: {row['seconds']:.0f} s, peak "
-        f"{row['peak_gb']:.2f} GB; E_D {row['E_D_share']:.6f}, mean rho {row['mean_rho']:.4f}, angles from "
-        f"{row['min_dihedral']:.1f}"
+        f"  mesh_image, 256^3 voxels, {large['nodes']} nodes, {large['cells']} tets: {large['seconds']:.0f} s, peak "
+        f"{large['peak_gb']:.2f} GB; E_D {large['E_D_share']:.6f}, mean rho {large['mean_rho']:.4f}, angles from "
+        f"{large['min_dihedral']:.1f}"
     )
-    for row in rows["paper"]:
+
+
+def _show_paper(rows: Sequence[dict[str, Any]], result: dict[str, Any]) -> None:
+    for row in rows:
         print(
             f"  --method paper, {row['nodes']:6d} nodes      {row['seconds_per_iteration']:10.2f} s an iteration, "
             f"Delaunay {100 * row['delaunay_share']:.0f} % of it"
         )
-    result = rows["bar"]
     print(
         f"  {result['nodes']} nodes, k_D = 0.2, 20 iterations: E_D {result['E_D_of_initial']:.3f} of initial, "
         f"mean rho {result['mean_rho']:.4f}, {result['seconds']:.1f} s"
     )
-    fast = rows["engine"]
+
+
+def _show_engine(fast: dict[str, Any]) -> None:
     if fast["faster_by"] is not None:
         print(
             f"  --method fast, {fast['nodes']} nodes, k_D = 0.5, p = 1, to E {fast['paper_E']:.4f} of 20 paper "
-            "iterations: "
-            f"{fast['fast_seconds_to_paper_E']:.2f} s against {fast['paper_seconds']:.1f} s, {fast['faster_by']:.0f} "
-            "times "
-            f"faster; ends at {fast['fast_E']:.4f}"
+            f"iterations: {fast['fast_seconds_to_paper_E']:.2f} s against {fast['paper_seconds']:.1f} s, "
+            f"{fast['faster_by']:.0f} times faster; ends at {fast['fast_E']:.4f}"
         )
     for row in fast["runs"]:
         print(
             f"  --method fast, {row['nodes']} nodes, {row['cells']} tets, k_D = 0.5: {row['seconds']:.1f} s, "
             f"{row['iterations']} iterations; E_D {row['E_D_of_initial']:.3f} of initial, mean rho "
-            f"{row['mean_rho']:.4f}, "
-            f"angles from {row['min_dihedral']:.1f}; {row['seconds'] / row['cells'] * 1e6:.0f} s and "
-            f"{row['gb_more_per_mtet']:.2f} GB more per Mtet"
+            f"{row['mean_rho']:.4f}, angles from {row['min_dihedral']:.1f}; "
+            f"{row['seconds'] / row['cells'] * 1e6:.0f} s and {row['gb_more_per_mtet']:.2f} GB more per Mtet"
         )
     print(f"  time of an iteration grows as nodes^{fast['time_grows_as_nodes_to_the']:.2f}")
     print(f"  flip pass over a good mesh        {fast['flip_seconds_per_mtet']:10.2f} s per Mtet")
-    print(f"  peak memory                       {rows['peak_memory_gb']:10.2f} GB")
 
 
 if __name__ == "__main__":

@@ -23,8 +23,8 @@ from tetopt.measure.segmentation import thresholded
 from tetopt.study.compare import default_law, measured, prepared
 from tetopt.study.compare_report import Settings
 
-PHANTOMS = ("sphere", "two_spheres", "ellipsoids_brain")
-ERRORS = ("strain_energy", "displacement", "interface_strain")
+PHANTOM_NAMES = ("sphere", "two_spheres", "ellipsoids_brain")
+SHOWN_ERRORS = ("strain_energy", "displacement", "interface_strain")
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -32,7 +32,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("images", type=Path, nargs="*", help="volumes, besides the phantoms")
     parser.add_argument("-o", "--output", type=Path, required=True, help="JSON file for every number")
-    parser.add_argument("--phantoms", nargs="*", default=PHANTOMS, help="phantoms to take (%(default)s)")
+    parser.add_argument("--phantoms", nargs="*", default=PHANTOM_NAMES, help="phantoms to take (%(default)s)")
     parser.add_argument("--k-d", type=float, nargs="+", default=[0.0, 0.1, 0.2, 0.3, 0.5, 0.7, 0.85])
     parser.add_argument("--nodes", type=int, nargs="+", default=[1200, 5000])
     parser.add_argument("--dofs", type=int, default=300_000, help="size of the reference grid (%(default)s)")
@@ -55,9 +55,9 @@ def _run(options: argparse.Namespace) -> int:
         for nodes in options.nodes:
             initial = tetopt.lattice(image, nodes=nodes)
             for k_D in options.k_d:
-                mesh = tetopt.optimize(image, initial, k_D=k_D, iterations=20).mesh
-                found = measured(standard, mesh, settings.percent)
-                rows.append({"image": name, "nodes": len(mesh.points), "k_D": k_D, "measured": found})
+                mesh = tetopt.optimize(image, initial, k_D=k_D).mesh
+                numbers = measured(standard, mesh, settings.percent)
+                rows.append({"image": name, "nodes": len(mesh.points), "k_D": k_D, "measured": numbers})
                 print(_line(rows[-1]), flush=True)
     summary = _summary(rows, options.k_d)
     save_json(path, {"rows": rows, "relative_to_k_D_0": summary})
@@ -82,7 +82,9 @@ def cases(phantoms: Sequence[str], paths: Sequence[Path]) -> list[tuple[str, tet
 
 def _line(row: dict[str, Any]) -> str:
     mesh = row["measured"]
-    errors = [f"nu {nu}: " + " ".join(f"{getattr(f.errors, e):.4f}" for e in ERRORS) for nu, f in mesh.fem.items()]
+    errors = [
+        f"nu {nu}: " + " ".join(f"{getattr(f.errors, e):.4f}" for e in SHOWN_ERRORS) for nu, f in mesh.fem.items()
+    ]
     shape = f"E_D {mesh.E_D_share:.4f} rho {mesh.quality.mean_rho:.3f}"
     return f"{row['image']} {row['nodes']} nodes k_D {row['k_D']:g}: {shape}  " + "  ".join(errors)
 
@@ -99,7 +101,7 @@ def _summary(rows: Sequence[dict[str, Any]], weights: Sequence[float]) -> dict[s
         ]
         ratios = {
             e: float(np.exp(np.mean([np.log(getattr(a.errors, e) / getattr(b.errors, e)) for a, b in pairs])))
-            for e in ERRORS
+            for e in SHOWN_ERRORS
         }
         ratios["cond"] = float(np.exp(np.mean([np.log(a.cond / b.cond) for a, b in pairs])))
         summary[f"{k_D:g}"] = ratios

@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from choose_k_d import ERRORS, PHANTOMS, cases
+from choose_k_d import PHANTOM_NAMES, SHOWN_ERRORS, cases
 
 import tetopt
 from tetopt.io.files import checked_output, save_json
@@ -24,7 +24,7 @@ from tetopt.start.sizes import COARSEST_SHARE
 from tetopt.study.compare import Standard, default_law, measured, prepared
 from tetopt.study.compare_report import Settings
 
-NU = "0.3"
+STANDARD_NU = "0.3"
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -32,7 +32,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("images", type=Path, nargs="*", help="volumes, besides the phantoms")
     parser.add_argument("-o", "--output", type=Path, required=True, help="JSON file for every number")
-    parser.add_argument("--phantoms", nargs="*", default=PHANTOMS, help="phantoms to take (%(default)s)")
+    parser.add_argument("--phantoms", nargs="*", default=PHANTOM_NAMES, help="phantoms to take (%(default)s)")
     parser.add_argument("--largest", type=float, nargs="+", default=[1.0, 1.2, COARSEST_SHARE, 2.0, np.inf])
     parser.add_argument("--nodes", type=int, default=2000)
     parser.add_argument("--dofs", type=int, default=150_000, help="size of the reference grid (%(default)s)")
@@ -47,14 +47,14 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     path = checked_output(options.output, (".json",), options.force)
-    settings = Settings(nodes=0, reference_dofs=options.dofs, nus=(float(NU),))
+    settings = Settings(nodes=0, reference_dofs=options.dofs, nus=(float(STANDARD_NU),))
     rows = []
     for name, image, labels in cases(options.phantoms, options.images):
         law, _ = default_law(image)
         standard = prepared(image, labels, law, settings, lambda text, name=name: print(f"{name}: {text}", flush=True))
         for kind, mesh in _meshes(image, standard, options.nodes, options.largest):
-            found = measured(standard, mesh, settings.percent)
-            rows.append({"image": name, "mesh": kind, "measured": found})
+            numbers = measured(standard, mesh, settings.percent)
+            rows.append({"image": name, "mesh": kind, "measured": numbers})
             print(_line(rows[-1]), flush=True)
     save_json(path, {"rows": rows})
     return 0
@@ -81,15 +81,15 @@ def _meshes(
 
 def _strained(standard: Standard) -> tetopt.Image:
     """sqrt(E) times the strain along the push, of the reference: E_D of it is about the error of a mesh's energy."""
-    modulus, found = standard.modulus, standard.references[NU]
-    strain = found.strain.reshape(*modulus.shape, modulus.ndim, modulus.ndim)
+    modulus, reference = standard.modulus, standard.references[STANDARD_NU]
+    strain = reference.strain.reshape(*modulus.shape, modulus.ndim, modulus.ndim)
     push = int(np.argmax([abs(strain[..., d, d].mean()) for d in range(modulus.ndim)]))
     return tetopt.Image(np.sqrt(modulus.data) * strain[..., push, push], modulus.affine)
 
 
 def _line(row: dict[str, Any]) -> str:
     mesh = row["measured"]
-    errors = " ".join(f"{getattr(mesh.fem[NU].errors, e):.4f}" for e in ERRORS)
+    errors = " ".join(f"{getattr(mesh.fem[STANDARD_NU].errors, e):.4f}" for e in SHOWN_ERRORS)
     size = f"{mesh.n_nodes} nodes, E_D {mesh.E_D_share:.4f}, rho {mesh.quality.mean_rho:.3f}"
     return f"{row['image']}, {row['mesh']}: {size}; errors {errors}"
 

@@ -30,7 +30,7 @@ from tetopt.io.mni import mni_path, mni_tissue
 from tetopt.report.summary import versions
 
 # The words after `tetopt mesh`, by the name of the run; T1, GM, TISSUE, BRAIN, ... are files made below.
-RUNS = {
+RUN_WORDS = {
     "graded": "T1 --nodes 5000",
     "graded_fine": "T1 --nodes 15000",
     "uniform": "T1 --uniform --nodes 5000",
@@ -56,7 +56,9 @@ RUNS = {
     "oblique_two_threads": "OBLIQUE --nodes 1200 --threads 2",
     "oblique_paper": "OBLIQUE --method paper --nodes 400 --iterations 4",
 }
-BEFORE = {"start": ("uniform_for_start", "HALF --uniform --nodes 1200 --iterations 2")}  # runs that others begin with
+FIRST_RUNS = {
+    "start": ("uniform_for_start", "HALF --uniform --nodes 1200 --iterations 2")
+}  # runs that others begin with
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -64,7 +66,9 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, required=True, help="JSON file")
     parser.add_argument("--against", type=Path, help="JSON file of an earlier call")
-    parser.add_argument("--only", nargs="+", choices=list(RUNS), default=list(RUNS), metavar="NAME", help="these runs")
+    parser.add_argument(
+        "--only", nargs="+", choices=list(RUN_WORDS), default=list(RUN_WORDS), metavar="NAME", help="these runs"
+    )
     parser.add_argument("--force", action="store_true", help="replace an existing file")
     options = parser.parse_args(argv)
     try:
@@ -90,10 +94,10 @@ def fingerprints(folder: Path, names: Sequence[str]) -> Iterator[tuple[str, dict
     """The checksums of each run, one after the other."""
     files = {"T1": mni_path("t1"), "GM": mni_path("gm"), **made_images(folder)}
     for name in names:
-        if name in BEFORE:
-            run(*BEFORE[name], files, folder)
+        if name in FIRST_RUNS:
+            run(*FIRST_RUNS[name], files, folder)
         begin = time.perf_counter()
-        row = run(name, RUNS[name], files, folder)
+        row = run(name, RUN_WORDS[name], files, folder)
         print(f"{name:22} {row['mesh'][:12]} {time.perf_counter() - begin:6.1f} s", flush=True)
         yield name, row
 

@@ -54,9 +54,10 @@ def _run(options: argparse.Namespace) -> int:
     mesh_path, json_path, *figures, surface_path, picture_path = (
         checked_output(folder / name, (Path(name).suffix,), options.force) for name in names
     )
-    initial = tetopt.lattice(image, nodes=options.nodes)
-    result = tetopt.optimize(image, initial, k_D=options.k_d, iterations=options.iterations, callback=_say)
-    mesh = result.mesh
+    result = tetopt.mesh_image(
+        image, options.nodes, mode="uniform", k_D=options.k_d, iterations=options.iterations, callback=_say
+    )
+    mesh, initial = result.mesh, result.initial
     fields = tetopt.cell_fields(mesh, image)
     below = _default_threshold(image) if options.below is None else options.below
     structure = inner_structure(mesh, fields["mean"] < below)
