@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 import pyvista
 import trimesh
+from commands import exit_code, numbers_in
 from models import sample_image
 
 import tetopt
-from tetopt.cli import main
 from tetopt.cli.promises import check_promises
 from tetopt.geometry.topology import boundary_facets, largest_component
 from tetopt.io.formats import FORMATS
@@ -27,12 +27,8 @@ def folder(tmp_path_factory):
     tetopt.save_image(path / "a.nii.gz", image)
     tetopt.save_image(path / "l.nii.gz", tetopt.Image(1.0 * (image.data > 30), image.affine))
     mesh = ["mesh", path / "a.nii.gz", "--labels", path / "l.nii.gz", "--spacing", "8", "--iterations", "0"]
-    assert run(*mesh, "-o", path / "a.vtu") == 0
+    assert exit_code(*mesh, "-o", path / "a.vtu") == 0
     return path
-
-
-def run(*arguments):
-    return main([str(argument) for argument in arguments])
 
 
 def test_a_mesh_s_file_has_its_sets_and_its_box(folder):
@@ -55,7 +51,7 @@ def test_a_mesh_s_file_has_its_sets_and_its_box(folder):
 def test_every_format_is_written(folder, tmp_path, suffix, capsys):
     out = tmp_path / f"out{suffix}"
     more = [] if FORMATS[suffix].is_surface else ["--young", LAW, "--bins", "3", "--set", "dark=below:20"]
-    assert run("convert", folder / "a.vtu", out, *more, "--space", "lps") == 0
+    assert exit_code("convert", folder / "a.vtu", out, *more, "--space", "lps") == 0
     assert out.stat().st_size > 1000
     said = capsys.readouterr().out
     units = "" if FORMATS[suffix].is_surface else ", kPa, "
@@ -65,59 +61,59 @@ def test_every_format_is_written(folder, tmp_path, suffix, capsys):
         assert "off by" in said
         assert "dark_surface" in said
     assert [path.name for path in tmp_path.iterdir()] == [out.name]
-    assert run("convert", folder / "a.vtu", out) == 2  # is there already
+    assert exit_code("convert", folder / "a.vtu", out) == 2  # is there already
 
 
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_mesh_writes_every_format(folder, tmp_path, suffix):
     out = tmp_path / f"out{suffix}"
     more = [] if FORMATS[suffix].is_surface else ["--young", "2.5"]
-    assert run("mesh", folder / "a.nii.gz", "-o", out, "--spacing", "8", "--iterations", "0", *more) == 0
+    assert exit_code("mesh", folder / "a.nii.gz", "-o", out, "--spacing", "8", "--iterations", "0", *more) == 0
     assert out.stat().st_size > 1000
 
 
 def test_vtu_there_and_back_with_materials_sets_and_loads(folder, tmp_path):
     options = ["--young", LAW, "--nu", "0=0.45,1=0.3", "--load", "compress:5%", "--set", "dark=below:20"]
     options += ["--json", tmp_path / "b.json"]
-    assert run("convert", folder / "a.vtu", tmp_path / "b.vtu", *options, "--units", "MPa", "--space", "lps") == 0
-    first, found = tetopt.load_mesh(folder / "a.vtu"), tetopt.load_mesh(tmp_path / "b.vtu")
-    told = json.loads((tmp_path / "b.json").read_text())
-    assert told["materials"]["count"] == len(
-        np.unique(np.column_stack([found.cell_data[k] for k in ("young", "nu")]), axis=0)
+    assert exit_code("convert", folder / "a.vtu", tmp_path / "b.vtu", *options, "--units", "MPa", "--space", "lps") == 0
+    first, loaded = tetopt.load_mesh(folder / "a.vtu"), tetopt.load_mesh(tmp_path / "b.vtu")
+    numbers = numbers_in(tmp_path / "b.json")
+    assert numbers["materials"]["count"] == len(
+        np.unique(np.column_stack([loaded.cell_data[k] for k in ("young", "nu")]), axis=0)
     )
-    assert told["sets"]["cells"]["dark"] == len(found.sets.cells["dark"])
-    assert told["loads"]["superior"] == [0.0, 0.0, 0.0]
-    assert found.space == "lps"
-    assert found.mesh.points.tobytes() == first.mesh.points.tobytes()  # turned back
-    np.testing.assert_array_equal(found.mesh.cells, first.mesh.cells)
+    assert numbers["sets"]["cells"]["dark"] == len(loaded.sets.cells["dark"])
+    assert numbers["loads"]["superior"] == [0.0, 0.0, 0.0]
+    assert loaded.space == "lps"
+    assert loaded.mesh.points.tobytes() == first.mesh.points.tobytes()  # turned back
+    np.testing.assert_array_equal(loaded.mesh.cells, first.mesh.cells)
     means = first.cell_data["mean"]
-    np.testing.assert_allclose(found.cell_data["young"], 1.0 + means / 7.0, rtol=1e-14)  # in kPa again
+    np.testing.assert_allclose(loaded.cell_data["young"], 1.0 + means / 7.0, rtol=1e-14)  # in kPa again
     raw = pyvista.read(tmp_path / "b.vtu").cell_data["young"]
     np.testing.assert_allclose(raw, (1.0 + means / 7.0) / 1000.0, rtol=1e-15)
-    np.testing.assert_array_equal(found.cell_data["nu"], np.where(first.cell_data["label"] == 1, 0.3, 0.45))
+    np.testing.assert_array_equal(loaded.cell_data["nu"], np.where(first.cell_data["label"] == 1, 0.3, 0.45))
     for kind in (0, 1):
         for name, members in first.sets[kind].items():
-            np.testing.assert_array_equal(found.sets[kind][name], members)
-    np.testing.assert_array_equal(found.sets.cells["dark"], largest_component(first.mesh.cells, means < 20))
-    assert str(found.field_data["units"][0]) == "MPa"
-    loads = json.loads(str(found.field_data["loads"][0]))
+            np.testing.assert_array_equal(loaded.sets[kind][name], members)
+    np.testing.assert_array_equal(loaded.sets.cells["dark"], largest_component(first.mesh.cells, means < 20))
+    assert str(loaded.field_data["units"][0]) == "MPa"
+    loads = json.loads(str(loaded.field_data["loads"][0]))
     assert [name for name, _ in loads] == ["superior", "inferior"]
     # And on, in kPa and RAS again, what was painted, set and loaded kept.
-    assert run("convert", tmp_path / "b.vtu", tmp_path / "c.vtu") == 0
+    assert exit_code("convert", tmp_path / "b.vtu", tmp_path / "c.vtu") == 0
     again = tetopt.load_mesh(tmp_path / "c.vtu")
     np.testing.assert_allclose(again.cell_data["young"], 1.0 + means / 7.0, rtol=1e-14)
-    np.testing.assert_array_equal(again.cell_data["nu"], found.cell_data["nu"])
+    np.testing.assert_array_equal(again.cell_data["nu"], loaded.cell_data["nu"])
     kept = json.loads(again.text("loads"))
     assert kept == [[name, [-x + 0.0, -y + 0.0, z]] for name, (x, y, z) in loads]
     assert again.space == "ras"
-    assert list(again.sets.cells) == list(found.sets.cells)
+    assert list(again.sets.cells) == list(loaded.sets.cells)
     assert again.box.shape == first.box.shape
 
 
 def test_an_image_gives_the_mean_of_the_law(folder, tmp_path):
     """Of a curved law, which is not the law of the mean."""
     for name, more in (("mean", []), ("image", ["--image", folder / "a.nii.gz"])):
-        assert run("convert", folder / "a.vtu", tmp_path / f"{name}.vtu", "--young", "1 + h**2", *more) == 0
+        assert exit_code("convert", folder / "a.vtu", tmp_path / f"{name}.vtu", "--young", "1 + h**2", *more) == 0
     young = {name: tetopt.load_mesh(tmp_path / f"{name}.vtu").cell_data["young"] for name in ("mean", "image")}
     fields = tetopt.load_mesh(folder / "a.vtu").cell_data
     np.testing.assert_allclose(young["image"] - young["mean"], fields["variance"], atol=1e-9)
@@ -140,17 +136,17 @@ def test_a_mesh_of_gmsh_s_is_measured_and_painted(folder, tmp_path, capsys):
     assert loaded.n_left == len(skin)
     assert len(loaded.sets.facets["skin"]) == len(skin)
     assert len(loaded.sets.cells["tissue"]) == len(first.cells)
-    assert run("quality", tmp_path / "g.msh", "--image", folder / "a.nii.gz", "--check") == 0
+    assert exit_code("quality", tmp_path / "g.msh", "--image", folder / "a.nii.gz", "--check") == 0
     said = capsys.readouterr()
     assert "fills the box" in said.out
     assert f"{len(skin)} cells of lower dimension are left out" in said.err
-    assert run("convert", tmp_path / "g.msh", tmp_path / "g.inp", "--young", LAW) == 2
+    assert exit_code("convert", tmp_path / "g.msh", tmp_path / "g.inp", "--young", LAW) == 2
     assert "the mesh has no means; give the image (--image)" in capsys.readouterr().err
     assert not (tmp_path / "g.inp").exists()
-    assert run("convert", tmp_path / "g.msh", tmp_path / "c.inp", "--young", "3") == 0  # which needs none
+    assert exit_code("convert", tmp_path / "g.msh", tmp_path / "c.inp", "--young", "3") == 0  # which needs none
     assert "1 material, Young's modulus 3 to 3 kPa" in capsys.readouterr().out
     options = ["--image", folder / "a.nii.gz", "--young", LAW, "--load", "compress:1%"]
-    assert run("convert", tmp_path / "g.msh", tmp_path / "g.inp", *options) == 0
+    assert exit_code("convert", tmp_path / "g.msh", tmp_path / "g.inp", *options) == 0
     text = (tmp_path / "g.inp").read_text()
     assert "*STATIC" in text
     for name in ("*NSET, NSET=skin", "*ELSET, ELSET=tissue", "*NSET, NSET=left", "*SURFACE, NAME=boundary"):
@@ -161,9 +157,9 @@ def test_a_mesh_of_gmsh_s_is_measured_and_painted(folder, tmp_path, capsys):
 
 
 def test_a_mesh_is_improved_and_its_boundary_kept(folder, tmp_path, capsys):
-    assert run("convert", folder / "a.vtu", tmp_path / "a.vtu", "--set", "top=plane:0,0,118:0,0,1:5") == 0
+    assert exit_code("convert", folder / "a.vtu", tmp_path / "a.vtu", "--set", "top=plane:0,0,118:0,0,1:5") == 0
     options = ["--start", tmp_path / "a.vtu", "--iterations", "4", "--json", tmp_path / "b.json"]
-    assert run("mesh", folder / "a.nii.gz", "-o", tmp_path / "b.vtu", *options) == 0
+    assert exit_code("mesh", folder / "a.nii.gz", "-o", tmp_path / "b.vtu", *options) == 0
     assert "start of" in capsys.readouterr().err
     before, after = (tetopt.load_mesh(tmp_path / name) for name in ("a.vtu", "b.vtu"))
     sides = [
@@ -174,10 +170,10 @@ def test_a_mesh_is_improved_and_its_boundary_kept(folder, tmp_path, capsys):
     assert len(after.sets.facets["top"]) == len(before.sets.facets["top"]) > 0
     image = sample_image(3)
     assert tetopt.E_D(image, after.mesh) < 0.95 * tetopt.E_D(image, before.mesh)
-    told = json.loads((tmp_path / "b.json").read_text())
-    assert told["options"]["start"] == "a.vtu"
-    assert told["options"]["boundary"] == "fixed"
-    assert told["sets"]["facets"]["top"] == len(after.sets.facets["top"])
+    numbers = numbers_in(tmp_path / "b.json")
+    assert numbers["options"]["start"] == "a.vtu"
+    assert numbers["options"]["boundary"] == "fixed"
+    assert numbers["sets"]["facets"]["top"] == len(after.sets.facets["top"])
 
 
 @pytest.mark.parametrize(
@@ -193,7 +189,7 @@ def test_a_mesh_is_improved_and_its_boundary_kept(folder, tmp_path, capsys):
 )
 def test_options_that_ask_for_another_mesh(folder, tmp_path, more, match, capsys):
     more = [folder / each if each.endswith(".gz") else each for each in more]
-    assert run("mesh", folder / "a.nii.gz", "-o", tmp_path / "b.vtu", "--start", folder / "a.vtu", *more) == 2
+    assert exit_code("mesh", folder / "a.nii.gz", "-o", tmp_path / "b.vtu", "--start", folder / "a.vtu", *more) == 2
     assert match in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
@@ -203,7 +199,7 @@ def test_a_mesh_beside_the_image(folder, tmp_path, capsys):
     away = image.affine.copy()
     away[:3, 3] += 500.0
     tetopt.save_image(tmp_path / "away.nii.gz", tetopt.Image(image.data, away))
-    assert run("mesh", tmp_path / "away.nii.gz", "-o", tmp_path / "b.vtu", "--start", folder / "a.vtu") == 2
+    assert exit_code("mesh", tmp_path / "away.nii.gz", "-o", tmp_path / "b.vtu", "--start", folder / "a.vtu") == 2
     assert "lies beside the image" in capsys.readouterr().err
 
 
@@ -212,7 +208,9 @@ def test_a_mask_keeps_what_lies_outside_out_of_the_means(folder, tmp_path):
     tetopt.save_image(tmp_path / "m.nii.gz", tetopt.Image(1.0 * (image.data < 30), image.affine))
     means = []
     for name, more in (("all", []), ("part", ["--mask", tmp_path / "m.nii.gz"])):
-        assert run("convert", folder / "a.vtu", tmp_path / f"{name}.vtu", "--image", folder / "a.nii.gz", *more) == 0
+        assert (
+            exit_code("convert", folder / "a.vtu", tmp_path / f"{name}.vtu", "--image", folder / "a.nii.gz", *more) == 0
+        )
         means.append(tetopt.load_mesh(tmp_path / f"{name}.vtu").cell_data["mean"])
     assert means[0].max() > 40
     assert means[1].max() < 30
@@ -220,7 +218,7 @@ def test_a_mask_keeps_what_lies_outside_out_of_the_means(folder, tmp_path):
 
 def test_an_optimised_mesh_is_kept_whatever_is_refused_after_it(folder, tmp_path, capsys):
     options = ["--spacing", "8", "--iterations", "1", "--young", "3", "--set", "p=point:0,0,0:0.01"]
-    assert run("mesh", folder / "a.nii.gz", "-o", tmp_path / "a.inp", *options) == 2
+    assert exit_code("mesh", folder / "a.nii.gz", "-o", tmp_path / "a.inp", *options) == 2
     said = capsys.readouterr().err.splitlines()
     assert "no facet of the boundary lies within 0.01 mm" in said[-1]
     assert f"the optimised mesh is in {tmp_path / 'a.vtu'}" in said[-1]
@@ -228,7 +226,7 @@ def test_an_optimised_mesh_is_kept_whatever_is_refused_after_it(folder, tmp_path
     assert not (tmp_path / "a.inp").exists()
     before = (tmp_path / "a.vtu").read_bytes()
     for number in (1, 2):  # and nothing is ever replaced by such a mesh, with --force neither
-        assert run("mesh", folder / "a.nii.gz", "-o", tmp_path / "a.inp", *options, "--force") == 2
+        assert exit_code("mesh", folder / "a.nii.gz", "-o", tmp_path / "a.inp", *options, "--force") == 2
         assert str(tmp_path / f"a_optimised_{number}.vtu") in capsys.readouterr().err
     assert (tmp_path / "a.vtu").read_bytes() == before
 
@@ -237,11 +235,11 @@ def test_loads_on_what_only_the_final_mesh_may_have_are_no_early_error(folder, t
     """On an interface of labels, or a set that is asked for; but a set that can never be is one."""
     base = ["mesh", folder / "a.nii.gz", "--labels", folder / "l.nii.gz", "--young", "2", "--iterations", "1"]
     loads = ["--load", "hold:interface_0_1", "--load", "move:inferior:1,0,0"]
-    assert run(*base, "--nodes", "300", "-o", tmp_path / "a.inp", *loads) == 0
+    assert exit_code(*base, "--nodes", "300", "-o", tmp_path / "a.inp", *loads) == 0
     loads = ["--set", "top=plane:0,0,118:0,0,1:9", "--load", "hold:top", "--load", "move:inferior:1,0,0"]
-    assert run(*base, "--nodes", "90", "-o", tmp_path / "b.inp", *loads) == 0
+    assert exit_code(*base, "--nodes", "90", "-o", tmp_path / "b.inp", *loads) == 0
     for wrong in (["--load", "move:nosuch:1,0,0"], ["--load", "compress:99%"], ["--set", "left=below:20"]):
-        assert run(*base, "--nodes", "90", "-o", tmp_path / "c.inp", *loads, *wrong) == 2
+        assert exit_code(*base, "--nodes", "90", "-o", tmp_path / "c.inp", *loads, *wrong) == 2
     assert {path.name for path in tmp_path.iterdir()} == {"a.inp", "b.inp"}
 
 
@@ -252,7 +250,7 @@ def test_loads_of_another_kind_in_a_file_are_left(folder, tmp_path, text):
     grid = pyvista.read(folder / "a.vtu")
     grid.field_data["loads"] = np.frombuffer(text.encode(), dtype=np.uint8)
     grid.save(tmp_path / "a.vtu")
-    assert run("convert", tmp_path / "a.vtu", tmp_path / "b.inp", "--young", "2") == 0
+    assert exit_code("convert", tmp_path / "a.vtu", tmp_path / "b.inp", "--young", "2") == 0
     assert "*STEP" not in (tmp_path / "b.inp").read_text()
 
 
@@ -274,7 +272,7 @@ def test_loads_run_or_are_said_to_be_in_comments(folder, tmp_path, capsys):
         if FORMATS[suffix].is_surface:
             continue
         options = ["--young", "3", "--load", "compress:5%"]
-        assert run("convert", folder / "a.vtu", tmp_path / f"a{suffix}", *options) == 0
+        assert exit_code("convert", folder / "a.vtu", tmp_path / f"a{suffix}", *options) == 0
         is_said = "the format runs no step: the loads are in the file as text" in capsys.readouterr().out
         assert is_said == (suffix not in (".inp", ".feb", ".scn")), suffix
 
@@ -319,7 +317,7 @@ def test_loads_run_or_are_said_to_be_in_comments(folder, tmp_path, capsys):
     ],
 )
 def test_conversions_that_are_refused(folder, tmp_path, out, more, match, capsys):
-    assert run("convert", folder / "a.vtu", tmp_path / out, *more) == 2
+    assert exit_code("convert", folder / "a.vtu", tmp_path / out, *more) == 2
     said = capsys.readouterr().err
     assert match in said
     assert said.count("\n") == 1
@@ -337,24 +335,28 @@ def test_what_will_not_do_is_said_before_the_optimisation(folder, tmp_path, caps
         ("a.inp", ["--set", "low=below:-5"]),
         ("a.inp", ["--set", "low=below:20", "--young", "h - 20"]),
     ):
-        assert run("mesh", folder / "a.nii.gz", "-o", tmp_path / out, "--spacing", "8", *more) == 2
+        assert exit_code("mesh", folder / "a.nii.gz", "-o", tmp_path / out, "--spacing", "8", *more) == 2
         said = capsys.readouterr().err
         assert said.count("\n") == 1, said
     for out in ("a.inp", "a.feb", "a.scn", "a.stl"):
         more = [] if out == "a.stl" else ["--young", "2"]
-        assert run("mesh", folder / "a.nii.gz", "--slice", "k=3", "-o", tmp_path / out, "--nodes", "60", *more) == 2
+        assert (
+            exit_code("mesh", folder / "a.nii.gz", "--slice", "k=3", "-o", tmp_path / out, "--nodes", "60", *more) == 2
+        )
         assert "triangles" in capsys.readouterr().err
     flat = ["mesh", folder / "a.nii.gz", "--slice", "k=3", "-o", tmp_path / "a.vtu", "--nodes", "60"]
-    assert run(*flat, "--space", "lps") == 2
+    assert exit_code(*flat, "--space", "lps") == 2
     assert "leave out --space" in capsys.readouterr().err
-    assert run("mesh", folder / "a.nii.gz", "--target-error", "0.3", "-o", tmp_path / "a.inp", "--load", "foo") == 2
+    assert (
+        exit_code("mesh", folder / "a.nii.gz", "--target-error", "0.3", "-o", tmp_path / "a.inp", "--load", "foo") == 2
+    )
     assert capsys.readouterr().err.count("\n") == 1
     assert list(tmp_path.iterdir()) == []
 
 
 def test_a_mesh_s_file_is_not_replaced_by_itself(folder, capsys):
     before = (folder / "a.vtu").read_bytes()
-    assert run("convert", folder / "a.vtu", folder / "a.vtu", "--force") == 2
+    assert exit_code("convert", folder / "a.vtu", folder / "a.vtu", "--force") == 2
     assert "is an input of this command too" in capsys.readouterr().err
     assert (folder / "a.vtu").read_bytes() == before
 
@@ -372,17 +374,17 @@ def test_the_surface_of_a_structure(folder, tmp_path, what, suffix, capsys):
     }[what]
     value = {"below": "12", "label": "1", "set": "label_0"}[what]
     out = tmp_path / f"s.{suffix}"
-    assert run("surface", folder / "a.vtu", f"--{what}", value, "-o", out, "--json", tmp_path / "s.json") == 0
+    assert exit_code("surface", folder / "a.vtu", f"--{what}", value, "-o", out, "--json", tmp_path / "s.json") == 0
     said = capsys.readouterr().out
     assert "watertight, normals out" in said
-    found = trimesh.load_mesh(out)
-    assert found.is_watertight
-    assert found.volume == pytest.approx(loaded.cell_data["volume"][chosen].sum(), rel=1e-3)
-    told = json.loads((tmp_path / "s.json").read_text())
-    assert told["volume_mm3"] == pytest.approx(found.volume)
-    assert told["area_mm2"] == pytest.approx(found.area)
-    assert f"{found.volume:.6g}" in said
-    assert f"{found.area:.6g}" in said
+    surface = trimesh.load_mesh(out)
+    assert surface.is_watertight
+    assert surface.volume == pytest.approx(loaded.cell_data["volume"][chosen].sum(), rel=1e-3)
+    numbers = numbers_in(tmp_path / "s.json")
+    assert numbers["volume_mm3"] == pytest.approx(surface.volume)
+    assert numbers["area_mm2"] == pytest.approx(surface.area)
+    assert f"{surface.volume:.6g}" in said
+    assert f"{surface.area:.6g}" in said
 
 
 @pytest.mark.parametrize(
@@ -397,7 +399,7 @@ def test_the_surface_of_a_structure(folder, tmp_path, what, suffix, capsys):
     ],
 )
 def test_surfaces_that_are_refused(folder, tmp_path, more, match, capsys):
-    assert run("surface", folder / "a.vtu", "-o", tmp_path / "s.stl", *more) == 2
+    assert exit_code("surface", folder / "a.vtu", "-o", tmp_path / "s.stl", *more) == 2
     assert match in capsys.readouterr().err
     assert list(tmp_path.iterdir()) == []
 
@@ -405,9 +407,9 @@ def test_surfaces_that_are_refused(folder, tmp_path, more, match, capsys):
 def test_a_field_that_is_not_there(folder, tmp_path, capsys):
     tetopt.save_mesh(tmp_path / "bare.vtu", tetopt.load_mesh(folder / "a.vtu").mesh)
     for more in (["--below", "3"], ["--label", "1"]):
-        assert run("surface", tmp_path / "bare.vtu", "-o", tmp_path / "s.stl", *more) == 2
+        assert exit_code("surface", tmp_path / "bare.vtu", "-o", tmp_path / "s.stl", *more) == 2
         assert "on its cells; it has nothing" in capsys.readouterr().err
-    assert run("surface", folder / "a.vtu", "-o", tmp_path / "s.obj", "--label", "1") == 2
+    assert exit_code("surface", folder / "a.vtu", "-o", tmp_path / "s.obj", "--label", "1") == 2
     assert "ends in .stl or .ply" in capsys.readouterr().err
 
 
@@ -416,17 +418,17 @@ def test_a_field_that_is_not_there(folder, tmp_path, capsys):
 
 def test_a_page_to_look_at(folder, tmp_path, capsys):
     options = ["--image", folder / "a.nii.gz", "--html", tmp_path / "a.html"]
-    assert run("view", folder / "a.vtu", *options) == 0
+    assert exit_code("view", folder / "a.vtu", *options) == 0
     page = (tmp_path / "a.html").read_text()
     assert "needs nothing else" in capsys.readouterr().out
     assert "interface_0_1" in page
     assert "min_dihedral" in page
     assert not re.search(r'(src|href)="(?!data:|#)', page)
-    assert run("view", folder / "a.vtu", "--html", tmp_path / "a.html") == 2
-    assert run("view", folder / "a.vtu", "--html", tmp_path / "a.png") == 2
+    assert exit_code("view", folder / "a.vtu", "--html", tmp_path / "a.html") == 2
+    assert exit_code("view", folder / "a.vtu", "--html", tmp_path / "a.png") == 2
 
 
 def test_no_window_without_a_display(folder, monkeypatch, capsys):
     monkeypatch.setattr("tetopt.report.window.has_display", lambda: False)
-    assert run("view", folder / "a.vtu") == 2
+    assert exit_code("view", folder / "a.vtu") == 2
     assert "use --html" in capsys.readouterr().err

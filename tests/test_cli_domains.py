@@ -1,14 +1,12 @@
 """The command with masks, backgrounds, labels and several contrasts."""
 
-import json
-
 import nibabel
 import numpy as np
 import pytest
+from commands import exit_code, numbers_in
 from shapes import OBLIQUE, distance, grid, shaped
 
 import tetopt
-from tetopt.cli import main
 
 
 @pytest.fixture(scope="module")
@@ -42,10 +40,10 @@ def inputs(tmp_path_factory):
 @pytest.fixture(scope="module")
 def run(inputs, tmp_path_factory):
     out = tmp_path_factory.mktemp("run")
-    command = ["mesh", str(inputs / "image.nii.gz"), str(inputs / "square.nii.gz"), "--weights", "1,0.5"]
-    command += ["--mask", str(inputs / "mask.nii.gz"), "--labels", str(inputs / "labels.nii.gz"), "--nodes", "600"]
-    command += ["-o", str(out / "mesh.vtu"), "--json", str(out / "run.json"), "--figures", str(out)]
-    assert main(command) == 0
+    command = ["mesh", inputs / "image.nii.gz", inputs / "square.nii.gz", "--weights", "1,0.5"]
+    command += ["--mask", inputs / "mask.nii.gz", "--labels", inputs / "labels.nii.gz", "--nodes", "600"]
+    command += ["-o", out / "mesh.vtu", "--json", out / "run.json", "--figures", out]
+    assert exit_code(*command) == 0
     return out
 
 
@@ -67,7 +65,7 @@ def test_the_mesh_file(run, inputs):
 
 
 def test_the_numbers(run):
-    numbers = json.loads((run / "run.json").read_text())
+    numbers = numbers_in(run / "run.json")
     assert numbers["inputs"]["images"] == ["image.nii.gz", "square.nii.gz"]
     assert numbers["inputs"]["weights"] == [1.0, 0.5]
     assert numbers["inputs"]["mask"] == "mask.nii.gz"
@@ -90,10 +88,10 @@ def test_the_pictures(run):
 
 def test_measured_again(run, inputs, tmp_path, capsys):
     """`quality` finds the same of the file as the run of the mesh."""
-    command = ["quality", str(run / "mesh.vtu"), "--image", str(inputs / "image.nii.gz"), "--check"]
-    command += ["--mask", str(inputs / "mask.nii.gz"), "--labels", str(inputs / "labels.nii.gz")]
-    assert main([*command, "--json", str(tmp_path / "q.json")]) == 0
-    first, again = (json.loads(path.read_text()) for path in (run / "run.json", tmp_path / "q.json"))
+    command = ["quality", run / "mesh.vtu", "--image", inputs / "image.nii.gz", "--check"]
+    command += ["--mask", inputs / "mask.nii.gz", "--labels", inputs / "labels.nii.gz"]
+    assert exit_code(*command, "--json", tmp_path / "q.json") == 0
+    first, again = (numbers_in(path) for path in (run / "run.json", tmp_path / "q.json"))
     assert again["mask"] == pytest.approx(first["mask"])
     for one, other in zip(first["labels"], again["labels"], strict=True):
         assert one == pytest.approx(other, nan_ok=True)
@@ -105,21 +103,21 @@ def test_measured_again(run, inputs, tmp_path, capsys):
 @pytest.mark.parametrize("background", ["auto", "60"])
 def test_background(inputs, tmp_path, background, capsys):
     out = tmp_path / "a.vtu"
-    command = ["mesh", str(inputs / "head.nii.gz"), "--background", background, "--uniform", "--nodes", "400"]
-    assert main([*command, "--iterations", "2", "-o", str(out), "--json", str(tmp_path / "a.json")]) == 0
+    command = ["mesh", inputs / "head.nii.gz", "--background", background, "--uniform", "--nodes", "400"]
+    assert exit_code(*command, "--iterations", "2", "-o", out, "--json", tmp_path / "a.json") == 0
     mesh = tetopt.load_mesh(out).mesh
     ball = (distance((28, 30, 32), 13, 14, 15) < 10).sum()
-    numbers = json.loads((tmp_path / "a.json").read_text())
+    numbers = numbers_in(tmp_path / "a.json")
     assert 0.0 < numbers["inputs"]["background"] < 400.0
     assert tetopt.quality(mesh.points, mesh.cells).volume == pytest.approx(ball, rel=0.05)  # the cavity stays in
 
 
 def test_labels_alone(inputs, tmp_path, capsys):
     """An image that is its own labels: whatever numbers they have, each counts as itself."""
-    path = str(inputs / "parts.nii.gz")
-    command = ["mesh", path, "--labels", path, "--nodes", "300", "--iterations", "3", "-o", str(tmp_path / "a.vtu")]
-    assert main([*command, "--json", str(tmp_path / "a.json")]) == 0
-    assert json.loads((tmp_path / "a.json").read_text())["inputs"]["weights"] == [0.0]
+    path = inputs / "parts.nii.gz"
+    command = ["mesh", path, "--labels", path, "--nodes", "300", "--iterations", "3", "-o", tmp_path / "a.vtu"]
+    assert exit_code(*command, "--json", tmp_path / "a.json") == 0
+    assert numbers_in(tmp_path / "a.json")["inputs"]["weights"] == [0.0]
     assert "only these count" in capsys.readouterr().err
 
 
@@ -132,8 +130,8 @@ def test_a_label_never_vanishes_silently(tmp_path, capsys):
     path = tmp_path / "labels.nii.gz"
     tetopt.save_image(path, tetopt.Image(labels))
     # The lattice itself, much coarser than the sheets.
-    command = ["mesh", str(path), "--labels", str(path), "--uniform", "--nodes", "60", "--iterations", "0"]
-    assert main([*command, "-o", str(tmp_path / "a.vtu")]) == 1
+    command = ["mesh", path, "--labels", path, "--uniform", "--nodes", "60", "--iterations", "0"]
+    assert exit_code(*command, "-o", tmp_path / "a.vtu") == 1
     said = " ".join(capsys.readouterr().err.split())
     assert "no cell has label 3, of more than 200 voxels; allow more nodes" in said
     assert "no cell has label 1, 2, of 200 voxels or fewer" in said
@@ -144,17 +142,17 @@ def test_pieces_that_the_cells_do_not_tell_apart(tmp_path, capsys):
     mask[4:20, 4:20, 4:11] = mask[4:20, 4:20, 12:20] = 1.0
     image = tmp_path / "image.nii.gz"
     tetopt.save_image(image, tetopt.Image(mask))
-    command = ["mesh", str(image), "--mask", str(image), "--uniform", "--nodes", "40", "--iterations", "0"]
-    code = main([*command, "-o", str(tmp_path / "a.vtu")])
+    command = ["mesh", image, "--mask", image, "--uniform", "--nodes", "40", "--iterations", "0"]
+    code = exit_code(*command, "-o", tmp_path / "a.vtu")
     said = " ".join(capsys.readouterr().err.split())
     assert ("overlap only by Dice" in said) == (code == 1)
     assert code == 1 or "the mask has 2 pieces, the mesh 1" in said
 
 
 def test_a_slice_of_all(inputs, tmp_path):
-    command = ["mesh", str(inputs / "image.nii.gz"), "--mask", str(inputs / "mask.nii.gz"), "--slice", "k=15"]
-    command += ["--labels", str(inputs / "parts.nii.gz"), "--nodes", "150", "-o", str(tmp_path / "a.vtu")]
-    assert main(command) == 0
+    command = ["mesh", inputs / "image.nii.gz", "--mask", inputs / "mask.nii.gz", "--slice", "k=15"]
+    command += ["--labels", inputs / "parts.nii.gz", "--nodes", "150", "-o", tmp_path / "a.vtu"]
+    assert exit_code(*command) == 0
     mesh = tetopt.load_mesh(tmp_path / "a.vtu").mesh
     assert mesh.ndim == 2
     assert tetopt.check_mesh(mesh) == []
@@ -167,10 +165,10 @@ def test_a_slice_of_a_mask_that_is_stored_upside_down(inputs, tmp_path):
     turned[:3, 3] = image.to_world([0.0, 0.0, image.shape[2] - 1.0])
     turned[:3, 2] *= -1.0
     tetopt.save_image(tmp_path / "turned.nii.gz", tetopt.Image(mask.data[..., ::-1], turned))
-    command = ["mesh", str(inputs / "image.nii.gz"), "--slice", "k=12", "--mask", str(tmp_path / "turned.nii.gz")]
-    command += ["--nodes", "60", "--iterations", "0", "--json", str(tmp_path / "a.json"), "-o", str(tmp_path / "a.vtu")]
-    assert main(command) == 0
-    assert json.loads((tmp_path / "a.json").read_text())["mask"]["voxels"] == mask.data[..., 12].sum()
+    command = ["mesh", inputs / "image.nii.gz", "--slice", "k=12", "--mask", tmp_path / "turned.nii.gz"]
+    command += ["--nodes", "60", "--iterations", "0", "--json", tmp_path / "a.json", "-o", tmp_path / "a.vtu"]
+    assert exit_code(*command) == 0
+    assert numbers_in(tmp_path / "a.json")["mask"]["voxels"] == mask.data[..., 12].sum()
 
 
 def test_files_on_other_grids_are_told(inputs, tmp_path, capsys):
@@ -181,12 +179,12 @@ def test_files_on_other_grids_are_told(inputs, tmp_path, capsys):
     tetopt.save_image(tmp_path / "half.nii.gz", tetopt.Image(mask.data, moved))
     command = [
         "mesh",
-        str(inputs / "image.nii.gz"),
-        str(inputs / "square.nii.gz"),
+        inputs / "image.nii.gz",
+        inputs / "square.nii.gz",
         "--mask",
-        str(tmp_path / "half.nii.gz"),
+        tmp_path / "half.nii.gz",
     ]
-    assert main([*command, "--nodes", "300", "--iterations", "0", "-o", str(tmp_path / "a.vtu")]) in (0, 1)
+    assert exit_code(*command, "--nodes", "300", "--iterations", "0", "-o", tmp_path / "a.vtu") in (0, 1)
     said = " ".join(capsys.readouterr().err.split())
     assert "square.nii.gz: taken to the image's voxels, linearly" in said
     assert "half.nii.gz: taken to the image's voxels, nearest neighbour" in said
@@ -195,16 +193,16 @@ def test_files_on_other_grids_are_told(inputs, tmp_path, capsys):
 
 def test_a_mesh_of_a_mask_is_checked_as_one(run, inputs, capsys):
     """Without the mask at hand, too: the file says that there was one."""
-    assert main(["quality", str(run / "mesh.vtu"), "--image", str(inputs / "image.nii.gz"), "--check"]) == 0
+    assert exit_code("quality", run / "mesh.vtu", "--image", inputs / "image.nii.gz", "--check") == 0
     assert "checked: conforming, oriented; made within a mask" in capsys.readouterr().out
 
 
 def test_intensities_are_no_labels(inputs, tmp_path, capsys):
-    path = str(inputs / "noise.nii.gz")
+    path = inputs / "noise.nii.gz"
     rng = np.random.default_rng(0)
     tetopt.save_image(path, tetopt.Image(np.rint(3.0 * rng.random((24, 24, 24)))))
-    command = ["mesh", path, "--labels", path, "--nodes", "200", "--iterations", "0", "-o", str(tmp_path / "a.vtu")]
-    main(command)
+    command = ["mesh", path, "--labels", path, "--nodes", "200", "--iterations", "0", "-o", tmp_path / "a.vtu"]
+    exit_code(*command)
     assert "cells are too large for them, or these are no labels" in " ".join(capsys.readouterr().err.split())
 
 
@@ -213,12 +211,12 @@ def test_a_volume_of_a_4d_file(inputs, tmp_path, capsys):
     image, mask = shaped("ball", OBLIQUE)
     both = np.stack([np.ones(image.shape), mask.data], axis=-1).astype(np.float32)
     nibabel.Nifti1Image(both, OBLIQUE).to_filename(tmp_path / "four.nii.gz")
-    command = ["mesh", str(inputs / "image.nii.gz"), "--uniform", "--nodes", "300", "--iterations", "0"]
-    command += ["-o", str(tmp_path / "a.vtu"), "--json", str(tmp_path / "a.json"), "--mask"]
-    assert main([*command, str(tmp_path / "four.nii.gz")]) == 2
+    command = ["mesh", inputs / "image.nii.gz", "--uniform", "--nodes", "300", "--iterations", "0"]
+    command += ["-o", tmp_path / "a.vtu", "--json", tmp_path / "a.json", "--mask"]
+    assert exit_code(*command, tmp_path / "four.nii.gz") == 2
     assert "the file holds 2 volumes; choose one, 0 to 1" in capsys.readouterr().err
-    assert main([*command, f"{tmp_path / 'four.nii.gz'}:1"]) == 0
-    assert json.loads((tmp_path / "a.json").read_text())["mask"]["voxels"] == mask.data.sum()
+    assert exit_code(*command, f"{tmp_path / 'four.nii.gz'}:1") == 0
+    assert numbers_in(tmp_path / "a.json")["mask"]["voxels"] == mask.data.sum()
     mesh = tetopt.load_mesh(tmp_path / "a.vtu").mesh
     assert tetopt.quality(mesh.points, mesh.cells).volume < 0.3 * image.volume
 
@@ -245,7 +243,7 @@ def test_refused(inputs, tmp_path, monkeypatch, capfd, options, match):
     """One line, exit 2, nothing written."""
     monkeypatch.chdir(inputs)
     out = tmp_path / "a.vtu"
-    assert main(["mesh", "image.nii.gz", *options.split(), "--nodes", "100", "-o", str(out)]) == 2
+    assert exit_code("mesh", "image.nii.gz", *options.split(), "--nodes", "100", "-o", out) == 2
     said = capfd.readouterr()
     lines = [line for line in said.err.splitlines() if line.strip()]
     assert len(lines) == 1
