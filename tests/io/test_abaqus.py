@@ -34,14 +34,14 @@ def model(request):
     return VARIANTS[request.param]
 
 
-def read_by_meshio(content):
-    return meshio.abaqus._abaqus.read_buffer(io.StringIO(content.decode()))
+def read_by_meshio(raw):
+    return meshio.abaqus._abaqus.read_buffer(io.StringIO(raw.decode()))
 
 
-def blocks_of(content):
+def blocks_of(raw):
     """(keyword, parameters, data lines split at commas) of each keyword, by the manual's syntax rules."""
     blocks = []
-    for line in content.decode().splitlines():
+    for line in raw.decode().splitlines():
         if line.startswith("**"):
             continue
         words = [word.strip() for word in line.split(",")]
@@ -53,9 +53,9 @@ def blocks_of(content):
     return blocks
 
 
-def named(content, keyword):
+def named(raw, keyword):
     """Data lines of each block of a keyword, by the value of its first parameter."""
-    return {next(iter(parameters.values())): data for word, parameters, data in blocks_of(content) if word == keyword}
+    return {next(iter(parameters.values())): data for word, parameters, data in blocks_of(raw) if word == keyword}
 
 
 def test_meshio_reads_points_and_cells_back(model):
@@ -109,9 +109,9 @@ def test_surfaces_are_the_facets_by_the_manual_s_faces(model):
 
 
 def test_each_cell_has_its_material_and_no_other(model):
-    content = abaqus(model)
-    elements, sections = named(content, "*ELSET"), named(content, "*SOLID SECTION")
-    words = blocks_of(content)
+    raw = abaqus(model)
+    elements, sections = named(raw, "*ELSET"), named(raw, "*SOLID SECTION")
+    words = blocks_of(raw)
     elastic = {words[k - 1][1]["NAME"]: data for k, (word, _, data) in enumerate(words) if word == "*ELASTIC"}
     assert list(elastic) == list(sections) == [f"material_{k + 1}" for k in range(len(model.materials.young))]
     links = [parameters for word, parameters, _ in words if word == "*SOLID SECTION"]
@@ -164,11 +164,11 @@ def test_head_states_coordinates_units_and_image():
 
 def test_lines_keep_to_the_manual_s_limits(model):
     """256 characters a line, 16 entries, names of up to 80, told apart whatever their case; ASCII beside comments."""
-    content = abaqus(model)
-    assert content.endswith(b"\n")
-    assert max(map(len, content.splitlines())) <= 256
+    raw = abaqus(model)
+    assert raw.endswith(b"\n")
+    assert max(map(len, raw.splitlines())) <= 256
     names = Counter()
-    for word, parameters, data in blocks_of(content):
+    for word, parameters, data in blocks_of(raw):
         assert re.fullmatch(r"\*[A-Z ]+", word)
         assert all(len(line) <= 16 for line in data)
         if word == "*HEADING":
@@ -193,13 +193,13 @@ def test_numbers_of_more_than_twenty_characters_are_rounded_to_fit(value):
     side = np.array([[0, 3]])
     loads = (Load("side", np.full(3, value)),)
     model = Model(mesh, {}, Sets({"side": side}, {}), materials(-11.0 * value, 1.0 / 30.0, 1), loads)
-    content = abaqus(model)
-    written = {text for word, _, data in blocks_of(content) if word != "*HEADING" for line in data for text in line}
+    raw = abaqus(model)
+    written = {text for word, _, data in blocks_of(raw) if word != "*HEADING" for line in data for text in line}
     assert max(map(len, written)) <= 20
-    np.testing.assert_allclose(read_by_meshio(content).points, mesh.points, rtol=5e-13, atol=0.0)
-    ((young, nu),) = next(data for word, _, data in blocks_of(content) if word == "*ELASTIC")
+    np.testing.assert_allclose(read_by_meshio(raw).points, mesh.points, rtol=5e-13, atol=0.0)
+    ((young, nu),) = next(data for word, _, data in blocks_of(raw) if word == "*ELASTIC")
     np.testing.assert_allclose([float(young), float(nu)], [-11.0 * value, 1.0 / 30.0], rtol=5e-13)
-    (conditions,) = (data for word, _, data in blocks_of(content) if word == "*BOUNDARY")
+    (conditions,) = (data for word, _, data in blocks_of(raw) if word == "*BOUNDARY")
     np.testing.assert_allclose([float(line[3]) for line in conditions], value, rtol=5e-13)
 
 

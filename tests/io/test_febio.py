@@ -46,8 +46,8 @@ def listed(element):
 class Feb:
     """What FEBio holds after reading."""
 
-    def __init__(self, content):
-        self.root = ET.fromstring(content)
+    def __init__(self, raw):
+        self.root = ET.fromstring(raw)
         mesh = self.root.find("Mesh")
         self.node_ids, self.points = rows_of(mesh.find("Nodes"), "node")
         self.parts, nodes_of_id = {}, {}
@@ -103,11 +103,11 @@ def assert_same(feb, model):
 @pytest.mark.parametrize("space", ["ras", "lps"])
 def test_everything_comes_back(kind, space):
     model = in_space(sample(kind), space)
-    content = febio(model)
-    feb = Feb(content)
+    raw = febio(model)
+    feb = Feb(raw)
     assert_same(feb, model)
     assert len(feb.parts) == (len(model.materials.young) if kind == "parts" else 1)
-    head = content.decode().split("-->")[0]
+    head = raw.decode().split("-->")[0]
     assert [line for line in head.splitlines() if line][2:] == described(model)
 
 
@@ -232,9 +232,9 @@ def test_awkward_names():
             "rgb": np.eye(3)[sample_model().materials.of_cell % 3],
         },
     )
-    content = febio(model)
-    feb = Feb(content)
-    assert "image: a- - -b- - <é> & 'c'.nii" in content.decode().split("\n-->")[0]
+    raw = febio(model)
+    feb = Feb(raw)
+    assert "image: a- - -b- - <é> & 'c'.nii" in raw.decode().split("\n-->")[0]
     assert list(feb.data) == ['a "b" <c> & d', "rgb_0", "rgb_1", "rgb_2"]
     np.testing.assert_array_equal(np.column_stack([feb.data[f"rgb_{k}"] for k in range(3)]), model.cell_data["rgb"])
     assert "MeshData" not in febio(model._replace(cell_data={})).decode()

@@ -152,7 +152,7 @@ class Row(NamedTuple):
 
 def test_json_takes_what_runs_are_made_of(tmp_path):
     path = tmp_path / "a.json"
-    content = {
+    value = {
         "integer": np.int64(2**53 + 1),
         "single": np.float32(0.5),
         "double": np.float64(0.1),
@@ -166,7 +166,7 @@ def test_json_takes_what_runs_are_made_of(tmp_path):
         "minus": -np.float64(np.inf),
         "scalar array": np.array(7),
     }
-    save_json(path, content)
+    save_json(path, value)
     text = path.read_text(encoding="utf-8")
 
     def refuse(name):

@@ -32,8 +32,8 @@ DIM_OF_TYPE = {1: 1, 2: 2, 4: 3, 9: 2, 11: 3}
 class Read:
     """What a file holds: points; elements by number; groups by dimension and name; views."""
 
-    def __init__(self, content):
-        self.sections = [block.split("\n$End")[0].split("\n") for block in f"\n{content.decode()}".split("\n$")[1:]]
+    def __init__(self, raw):
+        self.sections = [block.split("\n$End")[0].split("\n") for block in f"\n{raw.decode()}".split("\n$")[1:]]
         self.sections = [lines for lines in self.sections if not lines[0].startswith("End")]
         (self.version, is_binary, size), *_ = self.section("MeshFormat")
         assert (is_binary, size) == ("0", "8")

@@ -24,8 +24,8 @@ KEYWORD = {1: "Edges", 2: "Triangles", 3: "Tetrahedra"}
 class Read:
     """What a file holds: words parted by any space; # begins a comment; entities end with a reference."""
 
-    def __init__(self, content):
-        lines = content.decode().split("\n")
+    def __init__(self, raw):
+        lines = raw.decode().split("\n")
         self.comments = [line.removeprefix("# ") for line in lines if line.startswith("#")]
         words = " ".join(line for line in lines if not line.startswith("#")).split()
         assert words[:3] == ["MeshVersionFormatted", "2", "Dimension"]  # 2: double precision

@@ -187,7 +187,7 @@ def test_an_old_file_survives_a_failure(tmp_path, monkeypatch):
     save_mesh(tmp_path / "a.vtu", bent(3))
     before = (tmp_path / "a.vtu").read_bytes()
 
-    def interrupted(self, content):
+    def interrupted(self, raw):
         self.write_text("half")
         raise KeyboardInterrupt
 
@@ -400,12 +400,12 @@ def test_another_suffix(tmp_path, name, assert_refused):
 
 @pytest.mark.parametrize("name", ["a.vtu", "a.vtk"])
 @pytest.mark.parametrize(
-    "content",
+    "raw",
     [b"", b"\n", b"no mesh at all", bytes(range(256)) * 20, b"<?xml version='1.0'?><html></html>"],
     ids=["empty", "newline", "words", "bytes", "html"],
 )
-def test_garbage(tmp_path, name, content, assert_refused):
-    (tmp_path / name).write_bytes(content)
+def test_garbage(tmp_path, name, raw, assert_refused):
+    (tmp_path / name).write_bytes(raw)
     assert_refused(tmp_path / name, "damaged|cannot be read")
 
 

@@ -18,8 +18,8 @@ GEOMETRY = {1: "1", 2: "2", 3: "4"}  # segment, triangle, tetrahedron
 class Read:
     """What a file holds; see https://mfem.org/mesh-format-v1.0 and Mesh::Printer."""
 
-    def __init__(self, content):
-        lines = [line for line in content.decode().split("\n") if line]
+    def __init__(self, raw):
+        lines = [line for line in raw.decode().split("\n") if line]
         self.comments = [line.removeprefix("# ") for line in lines if line.startswith("#")]
         self.lines = [line for line in lines if not line.startswith("#")]
         assert self.lines.pop(0) == "MFEM mesh v1.3"

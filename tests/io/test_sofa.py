@@ -38,8 +38,8 @@ def table(element, name, dtype=np.int64, width=None):
     return values if width is None else values.reshape(-1, width)
 
 
-def solid_of(content):
-    return ET.fromstring(content).find("Node[@name='solid']")
+def solid_of(raw):
+    return ET.fromstring(raw).find("Node[@name='solid']")
 
 
 def assert_same(solid, model):
@@ -68,9 +68,9 @@ def assert_same(solid, model):
 @pytest.mark.parametrize("space", ["ras", "lps"])
 def test_everything_comes_back(bins, space):
     model = in_space(sample_model(3, bins), space)
-    content = sofa(model)
-    assert_same(solid_of(content), model)
-    head = content.decode().split("\n-->")[0].splitlines()[2:]
+    raw = sofa(model)
+    assert_same(solid_of(raw), model)
+    head = raw.decode().split("\n-->")[0].splitlines()[2:]
     assert head[: len(described(model))] == described(model)
     assert head[-1].endswith(": " + ", ".join(model.cell_data))
 
@@ -141,9 +141,9 @@ def test_units_are_consistent_with_mm():
 
 
 def test_awkward_names():
-    content = sofa(sample_model()._replace(about={"image": "a---b-- <é> & 'c'.nii"}))
-    assert "image: a- - -b- - <é> & 'c'.nii" in content.decode().split("\n-->")[0]
-    assert_same(solid_of(content), sample_model())
+    raw = sofa(sample_model()._replace(about={"image": "a---b-- <é> & 'c'.nii"}))
+    assert "image: a- - -b- - <é> & 'c'.nii" in raw.decode().split("\n-->")[0]
+    assert_same(solid_of(raw), sample_model())
 
 
 @pytest.mark.parametrize(

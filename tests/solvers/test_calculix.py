@@ -39,9 +39,9 @@ class Answer(NamedTuple):
     output: str
 
 
-def answer(content, folder):
+def answer(raw, folder):
     """Runs CalculiX on an input file; any error or warning that it prints fails the test."""
-    (folder / "job.inp").write_bytes(content)
+    (folder / "job.inp").write_bytes(raw)
     run = subprocess.run([CCX, "job"], cwd=folder, capture_output=True, text=True, timeout=120, check=False)
     output = run.stdout + run.stderr
     assert run.returncode == 0, output
@@ -193,8 +193,8 @@ def test_every_set_arrives(order, tmp_path):
     cells = quadratic(model.mesh)[1] if order == 2 else model.mesh.cells
     requests = [f"*NODE PRINT, NSET={name}\nU\n" for name in model.sets.facets]
     requests += [f"*EL PRINT, ELSET={name}\nELSE\n" for name in model.sets.cells]
-    content = abaqus(model).replace(b"*END STEP", "".join([*requests, "*END STEP"]).encode())
-    printed = answer(content, tmp_path).tables
+    raw = abaqus(model).replace(b"*END STEP", "".join([*requests, "*END STEP"]).encode())
+    printed = answer(raw, tmp_path).tables
     for name, rows in model.sets.facets.items():
         nodes = np.unique((quadratic_facet_nodes if order == 2 else facet_triples)(cells, rows))
         np.testing.assert_array_equal(printed["displacements", name.lower()][:, 0], nodes + 1)
@@ -210,8 +210,8 @@ def test_pressure_on_each_surface_pushes_its_facets_inwards(tmp_path):
         side = "superior" if name == "inferior" else "inferior"
         step = f"*STEP\n*STATIC\n*BOUNDARY\n{side}, 1, 3\n*DSLOAD\n{name}, P, 1.0\n"
         requests = "*NODE FILE\nU\n*NODE PRINT, NSET=every\nRF\n*END STEP\n"
-        content = abaqus(model._replace(loads=())) + f"{every}{step}{requests}".encode()
-        printed = answer(content, tmp_path).tables["forces", "every"][:, 1:]
+        raw = abaqus(model._replace(loads=())) + f"{every}{step}{requests}".encode()
+        printed = answer(raw, tmp_path).tables["forces", "every"][:, 1:]
         triples = facet_triples(mesh.cells, rows)
         a, b, c = np.moveaxis(mesh.points[triples], 1, 0)
         expected = np.zeros_like(mesh.points)

@@ -35,7 +35,7 @@ ELSE
 
 
 def abaqus(model: Model) -> bytes:
-    """The content of an Abaqus input file (.inp), for Abaqus/Standard and CalculiX.
+    """The bytes of an Abaqus input file (.inp), for Abaqus/Standard and CalculiX.
 
     Linear (C3D4) or quadratic (C3D10) tetrahedra. Each facet set is a surface and a node set of its name, the latter
     with midside nodes if there are; each cell set is an element set. "all_cells" are all elements, "material_1", ...

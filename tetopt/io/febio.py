@@ -67,7 +67,7 @@ class _Part(NamedTuple):
 
 
 def febio(model: Model) -> bytes:
-    """The content of an FEBio input file (.feb), febio_spec 4.0.
+    """The bytes of an FEBio input file (.feb), febio_spec 4.0.
 
     Linear (tet4) or quadratic (tet10) tetrahedra. Each facet set is a surface and a node set of its name, the latter
     with midside nodes if there are; each cell set is an element set. A cell's id is its number in the mesh plus 1.

@@ -58,10 +58,10 @@ def written_whole(path: Path) -> Iterator[Path]:
         temporary.unlink(missing_ok=True)
 
 
-def save_json(path: Path, content: Any) -> None:
-    """Write `content` as JSON, whole or not at all; numpy numbers and arrays, NamedTuples and paths are taken."""
+def save_json(path: Path, value: Any) -> None:
+    """Write `value` as JSON, whole or not at all; numpy numbers and arrays, NamedTuples and paths are taken."""
     with written_whole(path) as temporary:
-        temporary.write_text(json.dumps(_plain(content), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        temporary.write_text(json.dumps(_plain(value), indent=1, allow_nan=False) + "\n", encoding="utf-8")
 
 
 def _plain(value: Any) -> Any:

@@ -82,9 +82,9 @@ def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str
         An unknown suffix, or what the format cannot carry.
     """
     path = Path(path)
-    content = file_bytes(path, model, space=space, units=units)
+    whole = file_bytes(path, model, space=space, units=units)
     with written_whole(path) as temporary:
-        temporary.write_bytes(content)
+        temporary.write_bytes(whole)
 
 
 def file_bytes(path: Path, model: Model, *, space: str = "ras", units: str = "kPa") -> bytes:

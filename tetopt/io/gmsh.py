@@ -185,8 +185,8 @@ def _file(header: str, comments: list[str], parts: list[Part], *sections: str) -
     ).encode()
 
 
-def _section(name: str, *content: str) -> str:
-    return f"${name}\n{''.join(content)}$End{name}\n"
+def _section(name: str, *parts: str) -> str:
+    return f"${name}\n{''.join(parts)}$End{name}\n"
 
 
 def _geometry(model: Model) -> tuple[NDArray[np.float64], NDArray[np.int64]]:

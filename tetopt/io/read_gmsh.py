@@ -32,7 +32,7 @@ def read_msh(path: Path) -> Raw:
         raise InputError(f"{path}: cannot be read as a gmsh mesh ({type(error).__name__})") from error
 
 
-def _msh(file: meshio.Mesh, content: bytes) -> Raw:
+def _msh(file: meshio.Mesh, text: bytes) -> Raw:
     """A file as meshio has read it, with its groups, of which meshio loses some."""
     kinds = list(dict.fromkeys(block.type for block in file.cells))
     of_kind = {kind: [k for k, block in enumerate(file.cells) if block.type == kind] for kind in kinds}
@@ -45,9 +45,9 @@ def _msh(file: meshio.Mesh, content: bytes) -> Raw:
     }
     points = np.zeros((len(file.points), 3))
     points[:, : file.points.shape[1]] = file.points
-    groups = _groups(cells, cell_data, _physical_names(content), _groups_of_entities(content))
+    groups = _groups(cells, cell_data, _physical_names(text), _groups_of_entities(text))
     raw = Raw(points, cells, cell_data, {}, groups, "ras")
-    comments = own_comments(_section(content, "Comments").decode("utf-8", "replace").splitlines())
+    comments = own_comments(_section(text, "Comments").decode("utf-8", "replace").splitlines())
     return raw if comments is None else _of_ours(raw, comments)
 
 
@@ -104,25 +104,25 @@ def _by_value(tags: NDArray) -> dict[int, NDArray[np.int64]]:
     return dict(zip(values.tolist(), np.split(order, starts[1:]), strict=False))  # of no values, split makes one part
 
 
-def _section(content: bytes, name: str) -> bytes:
+def _section(text: bytes, name: str) -> bytes:
     """What stands between $NAME and $EndNAME, first of all."""
-    start = content.find(f"${name}".encode())
-    return b"" if start < 0 else content[content.index(b"\n", start) + 1 : content.find(f"$End{name}".encode(), start)]
+    start = text.find(f"${name}".encode())
+    return b"" if start < 0 else text[text.index(b"\n", start) + 1 : text.find(f"$End{name}".encode(), start)]
 
 
-def _physical_names(content: bytes) -> dict[tuple[int, int], str]:
+def _physical_names(text: bytes) -> dict[tuple[int, int], str]:
     """The names of physical groups by dimension and number: a name may be that of several."""
-    lines = _section(content, "PhysicalNames").decode("utf-8", "replace").splitlines()
+    lines = _section(text, "PhysicalNames").decode("utf-8", "replace").splitlines()
     matches = [re.fullmatch(r'\s*(\d+)\s+(-?\d+)\s+"?(.*?)"?\s*', line) for line in lines]
     return {(int(line[1]), abs(int(line[2]))): line[3] for line in matches if line is not None}
 
 
-def _groups_of_entities(content: bytes) -> dict[tuple[int, int], list[int]] | None:
+def _groups_of_entities(text: bytes) -> dict[tuple[int, int], list[int]] | None:
     """The physical groups of each entity, by dimension and number, of a file from version 4.1 on."""
-    version, is_binary, size = _section(content, "MeshFormat").split(maxsplit=3)[:3]
+    version, is_binary, size = _section(text, "MeshFormat").split(maxsplit=3)[:3]
     if not version.startswith(b"4") or version == b"4.0":
         return None
-    section = _section(content, "Entities")
+    section = _section(text, "Entities")
     take = _numbers(section) if is_binary == b"1" else _words(section)
     n_bytes = f"<u{int(size)}"
     groups_of = {}

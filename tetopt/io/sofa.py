@@ -36,7 +36,7 @@ FOREVER_SECONDS = "1e9"  # past its last key time a LinearMovementProjectiveCons
 
 
 def sofa(model: Model) -> bytes:
-    """The content of a SOFA scene (.scn), for SOFA v24.12 and v25.
+    """The bytes of a SOFA scene (.scn), for SOFA v24.12 and v25.
 
     The node "solid" has the topology "mesh", the state "dofs", a mass of water's density, and corotational linear
     elasticity (TetrahedronFEMForceField) with `youngModulus` for each cell, and `poissonRatio` for each cell where it

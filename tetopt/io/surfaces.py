@@ -52,18 +52,18 @@ def save_surface(path: str | Path, surface: Surface, about: str = "", space: str
         raise InputError(f"{path}: expected a surface named {' or '.join(SURFACE_SUFFIXES)}")
     if space == "lps":
         surface = surface._replace(points=half_turn(surface.points))
-    content = writers[path.suffix.lower()](surface, about, space)
+    whole = writers[path.suffix.lower()](surface, about, space)
     with written_whole(path) as temporary:
-        temporary.write_bytes(content)
+        temporary.write_bytes(whole)
 
 
 def boundary_stl(model: Model) -> bytes:
-    """The model's boundary, watertight, as the content of an STL file; nothing else of the model is in it."""
+    """The model's boundary, watertight, as the bytes of an STL file; nothing else of the model is in it."""
     return _stl(_boundary(model), _about(model), model.space)
 
 
 def boundary_ply(model: Model) -> bytes:
-    """The model's boundary, watertight, as the content of a PLY file; nothing else of the model is in it."""
+    """The model's boundary, watertight, as the bytes of a PLY file; nothing else of the model is in it."""
     return _ply(_boundary(model), _about(model), model.space)
 
 

@@ -77,7 +77,7 @@ def _without_int64(values: NDArray) -> NDArray:
 
 
 def vtu_bytes(grid: pyvista.UnstructuredGrid) -> bytes:
-    """A grid as the content of a VTU file."""
+    """A grid as the bytes of a VTU file."""
     writer = vtkXMLUnstructuredGridWriter()
     writer.SetDataModeToBinary()
     return _written(writer, grid)
@@ -91,8 +91,8 @@ def _written(writer: Any, grid: pyvista.UnstructuredGrid) -> bytes:
         raise RuntimeError("VTK could not write the mesh")
     if not isinstance(writer, vtkUnstructuredGridWriter):
         return writer.GetOutputString().encode()
-    content = writer.GetOutputStdString()  # bytes, if they are no text
-    return content if isinstance(content, bytes) else content.encode()
+    text = writer.GetOutputStdString()  # bytes, if they are no text
+    return text if isinstance(text, bytes) else text.encode()
 
 
 def model_grid(model: Model) -> pyvista.UnstructuredGrid:

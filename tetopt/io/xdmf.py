@@ -71,7 +71,7 @@ TIME_ELEMENT = '<Time Value="0"/>\n'  # pyvista 0.49 reads no XDMF without
 
 
 def xdmf(model: Model) -> bytes:
-    """The content of an XDMF file (.xdmf): mesh, cell data, materials, tags of facets and cells, and the loads as text.
+    """The bytes of an XDMF file (.xdmf): mesh, cell data, materials, tags of facets and cells, and the loads as text.
 
     A facet is listed once, its nodes facing out of the cell that the first of its sets holds it by; where a set holds
     it by the other one, its tag is also in <Information Name="NAME turned"/>. dolfinx itself gives facets no side.
