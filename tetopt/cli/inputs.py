@@ -20,7 +20,7 @@ from tetopt.io.meshes import MeshFile
 from tetopt.target.align import aligned_contrast, is_same_grid
 from tetopt.target.content import check_labels
 
-INSIDE_SHARE = 0.95  # of a mask's or labels' volume: less of it in the image is more than the grids' difference
+IN_IMAGE_SHARE = 0.95  # of a mask's or labels' volume: less of it in the image is more than the grids' difference
 AFFINE_MM = 1e-4  # affines that differ by less are the same: files round them to 32 bits
 
 
@@ -81,7 +81,7 @@ def _say_resampled(path: Path, original: Image, moved: Image, is_contrast: bool)
         return
     whole, inside = (np.count_nonzero(each.data) * each.voxel_volume for each in (original, moved))
     log.print(escape(f"{path}: taken to the image's voxels, nearest neighbour"))
-    if inside < INSIDE_SHARE * whole:
+    if inside < IN_IMAGE_SHARE * whole:
         show_warning(f"{path}: only {inside / whole:.0%} of it lies in the image; is it of the same scan?")
 
 

@@ -8,7 +8,8 @@ from typing import Any, NamedTuple, get_args, get_origin, get_type_hints
 from tetopt.engine.loop import UNIFORM_ITERATIONS, UNIFORM_K_D
 from tetopt.fem.reference import Errors
 from tetopt.measure.quality import Quality
-from tetopt.study.pipelines import OTSU_CLASSES, PIPELINES
+from tetopt.study.interfaces import OTSU_CLASSES
+from tetopt.study.pipelines import PIPELINES
 
 # The files are flatter than the records: the keys of these fields' values stand beside those of the record itself,
 INLINE_FIELDS = ("run", "measurement", "source", "by_nu")

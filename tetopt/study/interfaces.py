@@ -16,9 +16,9 @@ from scipy.ndimage import gaussian_filter
 
 from tetopt.errors import InputError
 from tetopt.image import Image
-from tetopt.study.pipelines import OTSU_CLASSES
 from tetopt.target.otsu import class_thresholds
 
+OTSU_CLASSES = 4  # of the segmentation where no labels are given: fewer lose interfaces (see `tetopt.study.tetwild`)
 SIGMA_VOXELS = 0.75  # of the Gaussian before thresholding: takes the noise, moves no interface wider than a voxel
 SPECK_AREA = 3.0  # pieces of surface with less than this many size^2 are dropped: no cell of that size shows them
 EDGE_SHARE = 0.7  # of a surface triangle over `size`; coarser ones round the folds off, finer ones only take time

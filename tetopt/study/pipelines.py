@@ -15,9 +15,8 @@ from tetopt.engine.meshing import Mode, mesh_image
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.start.lattice import lattice
+from tetopt.study.interfaces import OTSU_CLASSES
 from tetopt.target.content import Content, content
-
-OTSU_CLASSES = 4  # of the segmentation where no labels are given: fewer lose interfaces (see `tetopt.study.tetwild`)
 
 
 class Job(NamedTuple):
