@@ -385,7 +385,10 @@ def solved(system: System, method: Method = "auto") -> NDArray[np.float64]:
     n = len(system.frame)
     dofs = system.prescribed.copy()
     if len(system.free):
-        solution = factorized(system.K_ff)(system.load) if is_direct(system, method) else _by_multigrid(system)
+        if is_direct(system, method):
+            solution = factorized(system.K_ff)(system.load)
+        else:
+            solution, _ = cg(system.K_ff, system.load, rtol=RESIDUAL_SHARE, maxiter=1000, M=multigrid(system))
         residual = float(np.linalg.norm(system.K_ff @ solution - system.load))
         allowed = 10.0 * RESIDUAL_SHARE * float(np.linalg.norm(system.load))
         if not residual <= allowed:
@@ -438,11 +441,6 @@ def multigrid(system: System) -> LinearOperator:
         return (cycle @ padded)[system.free]
 
     return LinearOperator((len(system.free),) * 2, matvec=apply, dtype=np.float64)
-
-
-def _by_multigrid(system: System) -> NDArray[np.float64]:
-    solution, _ = cg(system.K_ff, system.load, rtol=RESIDUAL_SHARE, maxiter=1000, M=multigrid(system))
-    return solution
 
 
 # Checks of the arguments

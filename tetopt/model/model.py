@@ -102,18 +102,13 @@ def in_units(model: Model, units: str) -> Model:
     return model._replace(materials=model.materials._replace(young=scaled), units=units)
 
 
-def units_text(model: Model) -> str:
-    """The consistent units of a file in words."""
-    units = STRESS_UNITS[model.units]
-    return f"mm, {model.units}, {units.force}, {units.energy}, {units.mass}, s"
-
-
 def described(model: Model) -> list[str]:
     """Lines for a file's head: who wrote it, in what coordinates and units, and from what."""
+    units = STRESS_UNITS[model.units]
     lines = [
         f"tetopt {model.about.get('tetopt', '')}".strip(),
         f"coordinates: {model.space.upper()}+, mm" if model.mesh.ndim == 3 else "coordinates: of the slice's plane, mm",
-        f"units: {units_text(model)}",
+        f"units: mm, {model.units}, {units.force}, {units.energy}, {units.mass}, s",
     ]
     if "image" in model.about:
         lines.append(f"image: {model.about['image']}, sha256 {model.about.get('image_sha256', 'unknown')}")
