@@ -208,8 +208,10 @@ def _draw(task: Task, outcome: Outcome, model: Model) -> None:
 
 
 def _print(task: Task, outcome: Outcome, model: Model, measured: dict[str, Any]) -> int:
-    """Say what is odd and print the comparison; the exit code. All is written: what is printed may go into a pipe
-    that closes."""
+    """Say what is odd and print the comparison; the exit code.
+
+    Everything is written by now, as what is printed may go into a pipe that closes.
+    """
     plan, content, result = task.plan, task.source.content, outcome.result
     solver, output = plan.solver, plan.output
     start = None if task.started is None else task.started.mesh

@@ -203,10 +203,7 @@ def with_numbers(plan: Plan, content: Content) -> tuple[Plan, tetopt.Sizes | Non
 
 def _limits(sizes: SizeOptions) -> tetopt.Sizes | None:
     """The limits on sizes, if the options ask for any."""
-    if (sizes.size_min, sizes.size_max, sizes.gradation, sizes.sizing) == (None,) * 4:
-        return None
-    return tetopt.Sizes(
-        0.0 if sizes.size_min is None else sizes.size_min, sizes.size_max,
-        1.0 if sizes.gradation is None else sizes.gradation,
-        None if sizes.sizing is None else read_companion(sizes.sizing),
-    )  # fmt: skip
+    field = None if sizes.sizing is None else read_companion(sizes.sizing)
+    values = {"smallest": sizes.size_min, "largest": sizes.size_max, "gradation": sizes.gradation, "field": field}
+    limits: dict[str, Any] = {name: value for name, value in values.items() if value is not None}
+    return tetopt.Sizes(**limits) if limits else None
