@@ -37,10 +37,10 @@ class Source(NamedTuple):
         """What the mesh's file holds of each cell: as `cell_fields`, means of further contrasts, and the label."""
         fields = cell_fields(mesh, self.content.image)
         for number, contrast in enumerate(self.contrasts[1:], 2):
-            moments = tetopt.cell_moments(continued(contrast, self.mask), mesh)
+            moments = tetopt.cell_moments(continued(contrast, self.content.continuation), mesh)
             fields |= {f"mean_{number}": moments.mean, f"variance_{number}": moments.variance}
         if self.labels is not None:
-            fields["label"] = cell_labels(continued(self.labels, self.mask), mesh)
+            fields["label"] = cell_labels(continued(self.labels, self.content.continuation), mesh)
         return fields
 
     def by_contrast(self, fields: dict[str, NDArray]) -> list[dict[str, Any]]:
