@@ -23,7 +23,8 @@ from tetopt.energy.sampling import (
     sums_of_fluxes,
     to_ticks,
 )
-from tetopt.engine.descent import FLAT, State, Weights, descend, free_projections, relocate
+from tetopt.engine.complex import FLAT
+from tetopt.engine.descent import Scheme, Tessellation, descend, free_projections, relocate
 from tetopt.engine.loop import (
     NOISE,
     UNIFORM_ITERATIONS,
@@ -39,7 +40,7 @@ from tetopt.engine.loop import (
 from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides, facets_on_sides
 from tetopt.geometry.simplex import squared_edges, volumes
-from tetopt.geometry.topology import Facets, facets, node_colours, rings, stars
+from tetopt.geometry.topology import Facets, facets, greedy_colours, rings, stars
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.start.delaunay import delaunay
@@ -107,38 +108,25 @@ def optimize_paper(
         unless `retessellate` is "never", one that does not fill the image's box.
     """
     _check_options(k_D, iterations, n_t, retessellate, boundary, step_ratio)
-    if n_t is None:
-        n_t = default_n_t(k_D, iterations)
+    n_t = default_n_t(k_D, iterations) if n_t is None else n_t
     begin = time.perf_counter()
     is_over = deadline(begin, max_seconds, stop)
 
     grid = sampling_grid(image, mesh.points)
-    ticks = to_ticks(image.to_index(mesh.points), grid)
-    check_orientations(image, ticks, mesh.cells)
-    is_frozen = frozen_axes(image, ticks, mesh.cells, grid, boundary)
-    matrix = np.eye(3)
-    matrix[3 - image.ndim :, 3 - image.ndim :] = image.affine[:-1, :-1]
-    projections = free_projections(matrix)
-    state = _state(image, grid, ticks, mesh.cells, is_frozen)
-    if state.sides.n_cells.max() > 2:
-        raise InputError("mesh: a facet is shared by more than two cells; remove doubled or overlapping cells")
+    tessellation = _initial(image, mesh, grid, boundary)
     if iterations > 0 and (retessellate == "accept" or (retessellate == "first" and n_t > 0)):
         _check_fills_box(image, mesh)
     # Where every cell is uniform, what rounding leaves of E_D must not become the unit that E_D is measured in.
-    noise = NOISE * float(np.var(image.data, dtype=np.float64)) * image.volume
-    E_G0, E_D0 = _energies(state, image, noise)
-    weights = Weights((1.0 - k_D) / E_G0, k_D * image.voxel_volume / E_D0 if E_D0 > 0.0 else 0.0, step_ratio)
-
+    rounding = NOISE * float(np.var(image.data, dtype=np.float64)) * image.volume
+    E_G0, E_D0 = _energies(tessellation, image, rounding)
+    scheme = _scheme(image, grid, k_D, E_G0, E_D0, step_ratio)
     history: list[Record] = []
 
-    def record(iteration: int, movement: float, is_retessellated: bool) -> None:
-        now_G, now_D = _energies(state, image, noise)
-        E = combined(now_G, now_D, E_G0, E_D0, k_D)
-        n_voxels = int(state.sums[:, 0].sum())
+    def record(iteration: int, movement: float, is_new: bool) -> None:
+        E_G, E_D = _energies(tessellation, image, rounding)
+        E, n_voxels = combined(E_G, E_D, E_G0, E_D0, k_D), int(tessellation.sums[:, 0].sum())
         seconds = time.perf_counter() - begin
-        history.append(
-            Record(iteration, E, now_G, now_D, movement, is_retessellated, len(state.cells), n_voxels, seconds)
-        )
+        history.append(Record(iteration, E, E_G, E_D, movement, is_new, len(tessellation.cells), n_voxels, seconds))
         if callback is not None:
             callback(history[-1])
 
@@ -148,20 +136,18 @@ def optimize_paper(
         # 1. Connect the nodes anew.
         is_new = False
         if retessellate == "accept" or (retessellate == "first" and iteration <= n_t):
+            candidate = _retessellated(image, grid, tessellation, scheme.hand)
             limit = history[-1].E if retessellate == "accept" else np.inf
-            candidate = _retessellated(image, grid, state)
-            if candidate is not None:
-                E = combined(*_energies(candidate, image, noise), E_G0, E_D0, k_D)
-                if limit > E:
-                    is_new = not np.array_equal(candidate.cells, state.cells)
-                    state = candidate
+            if candidate and limit > combined(*_energies(candidate, image, rounding), E_G0, E_D0, k_D):
+                is_new = not np.array_equal(candidate.cells, tessellation.cells)
+                tessellation = candidate
         # 2. Move the nodes, one colour at a time.
-        before = state.ticks.copy()
-        is_finished = _sweep(state, grid, matrix, projections, weights, k_D, is_over)
+        before = tessellation.ticks.copy()
+        is_finished = _sweep(tessellation, scheme, relocate if k_D == 0.0 else descend, is_over)
         # 3. Measure.
         if k_D == 0.0:
-            state.sums[:] = moment_sums(grid, state.ticks, state.cells, state.sides)
-        movement = relative_movement(before, state.ticks, image, grid, matrix)
+            tessellation.sums[:] = moment_sums(grid, tessellation.ticks, tessellation.cells)
+        movement = relative_movement(before, tessellation.ticks, image, grid, scheme.matrix)
         record(iteration, movement, is_new)
         if not is_finished:
             ended = "stopped" if stop is not None and stop() else "max_seconds"
@@ -169,8 +155,8 @@ def optimize_paper(
         if movement < tolerance and not is_new:
             ended = "converged"
             break
-    points = image.to_world(from_ticks(state.ticks, grid, image.ndim))
-    return Optimized(Mesh(points, state.cells), history, ended)
+    points = image.to_world(from_ticks(tessellation.ticks, grid, image.ndim))
+    return Optimized(Mesh(points, tessellation.cells), history, ended)
 
 
 def default_n_t(k_D: float, iterations: int) -> int:
@@ -207,77 +193,99 @@ def _check_fills_box(image: Image, mesh: Mesh) -> None:
         )
 
 
-def _state(
-    image: Image,
-    grid: SamplingGrid,
-    ticks: NDArray[np.int64],
-    cells: NDArray[np.int64],
-    is_frozen: NDArray[np.bool_],
-    sides: Facets | None = None,
-) -> State:
-    """Everything a sweep needs, measured afresh; `sides` are the cells' facets where they are known already."""
+def _initial(image: Image, mesh: Mesh, grid: SamplingGrid, boundary: Boundary) -> Tessellation:
+    """The tessellation of the initial mesh."""
+    ticks = to_ticks(image.to_index(mesh.points), grid)
+    check_orientations(image, ticks, mesh.cells)
+    is_frozen = frozen_axes(image, ticks, mesh.cells, grid, boundary)
+    shared = facets(mesh.cells)
+    if shared.n_cells.max() > 2:
+        raise InputError("mesh: a facet is shared by more than two cells; remove doubled or overlapping cells")
+    return _tessellation(image, grid, ticks, mesh.cells, is_frozen, shared)
+
+
+def _tessellation(
+    image: Image, grid: SamplingGrid, ticks: NDArray[np.int64], cells: NDArray[np.int64], is_frozen: NDArray[np.bool_],
+    shared: Facets,
+) -> Tessellation:  # fmt: skip
+    """Everything that a sweep reads and writes, measured afresh; `shared` are the cells' facets."""
     points = image.to_world(from_ticks(ticks, grid, image.ndim))
-    cells = np.ascontiguousarray(cells, dtype=np.int64)
-    around, sides = rings(cells, len(ticks)), facets(cells) if sides is None else sides
-    hand = 1 if np.linalg.det(image.affine[:-1, :-1]) > 0 else -1
-    fluxes = facet_fluxes(grid, ticks, sides.nodes)
-    sums = sums_of_fluxes(fluxes, sides, hand)
-    return State(
-        ticks, cells, around, sides, stars(sides, around), is_frozen, hand, sums, cell_E_G(points, cells), fluxes
+    cells, around = np.ascontiguousarray(cells, dtype=np.int64), rings(cells, len(ticks))
+    fluxes = facet_fluxes(grid, ticks, shared.nodes)
+    return Tessellation(
+        ticks,
+        cells,
+        is_frozen,
+        *around,
+        shared.nodes,
+        shared.of_cell,
+        shared.sign,
+        *stars(shared, around),
+        sums_of_fluxes(fluxes, shared, _hand(image)),
+        cell_E_G(points, cells),
+        fluxes,
     )
 
 
-def _energies(state: State, image: Image, noise: float) -> tuple[float, float]:
-    """E_G and E_D of the mesh; an E_D up to `noise` is 0."""
-    E_D = float(E_D_of_sums(state.sums, image.voxel_volume).sum())
-    return float(state.E_G.sum()), E_D if E_D > noise else 0.0
+def _scheme(image: Image, grid: SamplingGrid, k_D: float, E_G0: float, E_D0: float, step_ratio: float) -> Scheme:
+    """The scheme of plain numbers, as the kernels are compiled for."""
+    matrix = np.eye(3)
+    matrix[3 - image.ndim :, 3 - image.ndim :] = image.affine[:-1, :-1]
+    weight = k_D * image.voxel_volume / E_D0 if E_D0 > 0.0 else 0.0
+    weights = float((1.0 - k_D) / E_G0), float(weight), float(step_ratio)
+    return Scheme(grid.prefix, int(grid.bits), _hand(image), matrix, free_projections(matrix), *weights)
 
 
-def _retessellated(image: Image, grid: SamplingGrid, state: State) -> State | None:
-    """The state with Delaunay's cells; None where they would not be a mesh of the same box.
+def _hand(image: Image) -> int:
+    """The sign in index space of the cells' volumes."""
+    return 1 if np.linalg.det(image.affine[:-1, :-1]) > 0 else -1
+
+
+def _energies(mesh: Tessellation, image: Image, rounding: float) -> tuple[float, float]:
+    """E_G and E_D of the mesh; an E_D up to `rounding` is 0."""
+    E_D = float(E_D_of_sums(mesh.sums, image.voxel_volume).sum())
+    return float(mesh.E_G.sum()), E_D if E_D > rounding else 0.0
+
+
+def _retessellated(image: Image, grid: SamplingGrid, mesh: Tessellation, hand: int) -> Tessellation | None:
+    """The tessellation by Delaunay's cells; None where they would not be a mesh of the same box.
 
     Checked exactly: every cell oriented on the fixed-point grid, every facet in one or two cells, the boundary's
     facets on the box, and every voxel in one cell.
     """
-    index = from_ticks(state.ticks, grid, image.ndim)
+    index = from_ticks(mesh.ticks, grid, image.ndim)
     cells = delaunay(index, image.affine)
     if cells is None:
         return None
-    if (orientations(state.ticks, cells) != state.hand).any() or is_flat(image.to_world(index), cells).any():
+    if (orientations(mesh.ticks, cells) != hand).any() or _is_flat(image.to_world(index), cells).any():
         return None
     shared = facets(cells)
     if shared.n_cells.max() > 2:
         return None
     outer = shared.nodes[shared.n_cells == 1]
-    if not facets_on_sides(state.ticks, outer, side_ticks(grid), tolerance=0).any(axis=(1, 2)).all():
+    if not facets_on_sides(mesh.ticks, outer, side_ticks(grid), tolerance=0).any(axis=(1, 2)).all():
         return None
-    candidate = _state(image, grid, state.ticks, cells, state.is_frozen, shared)
+    candidate = _tessellation(image, grid, mesh.ticks, cells, mesh.is_frozen, shared)
     return candidate if candidate.sums[:, 0].sum() == image.data.size else None
 
 
-def is_flat(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Cells so thin that no optimisation may make them, (M,) bool; see `FLAT`."""
+def _is_flat(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.bool_]:
+    """Cells so thin that no optimisation may make them, (M,) bool; see `tetopt.engine.complex.FLAT`."""
     size = squared_edges(points, cells).sum(axis=1) ** (points.shape[1] / 2)
     return volumes(points, cells) <= FLAT * size
 
 
 def _sweep(
-    state: State,
-    grid: SamplingGrid,
-    matrix: NDArray[np.float64],
-    projections: NDArray[np.float64],
-    weights: Weights,
-    k_D: float,
+    mesh: Tessellation,
+    scheme: Scheme,
+    move: Callable[[Tessellation, NDArray[np.int64], Scheme], None],
     is_over: Callable[[], bool],
 ) -> bool:
     """Move every node once; False if `is_over` cut it short, between two colours."""
-    colours = node_colours(state.cells, state.rings)
+    n, colours = mesh.cells.shape[1] - 1, greedy_colours(mesh.cells, mesh.start, mesh.ring)
+    is_free = ~mesh.is_frozen[:, 3 - n : 3].all(axis=1)
     for colour in range(colours.max() + 1):
         if is_over():
             return False
-        nodes = np.flatnonzero((colours == colour) & ~state.is_frozen[:, 3 - (state.cells.shape[1] - 1) :].all(axis=1))
-        if k_D == 0.0:
-            relocate(state, nodes, grid, matrix, projections)
-        else:
-            descend(state, nodes, grid, matrix, weights)
+        move(mesh, np.flatnonzero((colours == colour) & is_free), scheme)
     return True
