@@ -14,8 +14,8 @@ from tetopt.geometry.topology import (
     components,
     facets,
     folded,
+    greedy_colours,
     largest_component,
-    node_colours,
     rings,
     stars,
 )
@@ -195,23 +195,27 @@ def test_the_boundary_has_no_boundary(seed):
 # Colours
 
 
+def colours_of(cells, n_nodes):
+    around = rings(cells, n_nodes)
+    return greedy_colours(np.ascontiguousarray(cells), around.start, around.cells)
+
+
 def test_colours_of_two_squares():
     """Greedy by hand: 0 1 2 3 4 5 | 6 7."""
     points, cells = TWO_SQUARES
-    assert node_colours(cells, rings(cells, len(points))).tolist() == [0, 1, 0, 1, 0, 1, 2, 2]
+    assert colours_of(cells, len(points)).tolist() == [0, 1, 0, 1, 0, 1, 2, 2]
 
 
 @pytest.mark.parametrize("mesh", ALL_SMALL)
 def test_colours_of_small_meshes(mesh):
     points, cells = mesh
-    assert node_colours(cells, rings(cells, len(points))).tolist() == naive.node_colours(cells, len(points))
+    assert colours_of(cells, len(points)).tolist() == naive.node_colours(cells, len(points))
 
 
 @given(seeds, dimensions)
 def test_colours_are_proper_and_those_of_the_twin(seed, n):
     points, cells = random_mesh(seed, n)
-    around = rings(cells, len(points))
-    colours = node_colours(cells, around)
+    colours = colours_of(cells, len(points))
     assert colours.tolist() == naive.node_colours(cells, len(points))
     of_cells = np.sort(colours[cells], axis=1)
     assert (np.diff(of_cells, axis=1) > 0).all()
@@ -224,13 +228,13 @@ def test_colours_are_proper_and_those_of_the_twin(seed, n):
 
 
 def test_a_node_without_cells_gets_colour_0():
-    assert node_colours(np.array([[0, 2, 3]]), rings(np.array([[0, 2, 3]]), 5)).tolist() == [0, 0, 1, 2, 0]
+    assert colours_of(np.array([[0, 2, 3]]), 5).tolist() == [0, 0, 1, 2, 0]
 
 
 def test_colours_take_32_bit_cells():
     _, cells = SQUARE
     small = cells.astype(np.int32)
-    np.testing.assert_array_equal(node_colours(small, rings(small, 5)), node_colours(cells, rings(cells, 5)))
+    np.testing.assert_array_equal(colours_of(small, 5), colours_of(cells, 5))
 
 
 # Components

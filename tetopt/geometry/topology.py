@@ -111,17 +111,17 @@ def stars(sides: Facets, around: Rings) -> Stars:
     counts = np.bincount(sides.nodes.ravel(), minlength=n_nodes)
     start = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
     place = np.empty((len(around.cells), n + 1), dtype=np.int64)
-    found = (order // n).astype(np.int64)
-    _fill_places(place, around.start, around.cells, sides.of_cell, start, found)
-    return Stars(start, found, place)
+    members = (order // n).astype(np.int64)
+    _fill_places(place, around.start, around.cells, sides.of_cell, start, members)
+    return Stars(start, members, place)
 
 
 @numba.njit(cache=True)
 def _fill_places(
-    place: NDArray, ring_start: NDArray, ring: NDArray, of_cell: NDArray, start: NDArray, found: NDArray
+    place: NDArray, ring_start: NDArray, ring: NDArray, of_cell: NDArray, start: NDArray, members: NDArray
 ) -> None:
     for node in range(len(start) - 1):
-        row = found[start[node] : start[node + 1]]
+        row = members[start[node] : start[node + 1]]
         for r in range(ring_start[node], ring_start[node + 1]):
             for k in range(of_cell.shape[1]):
                 facet = of_cell[ring[r], k]
@@ -144,18 +144,13 @@ def boundary_facets(cells: NDArray[np.integer]) -> NDArray[np.int64]:
     return outer
 
 
-def node_colours(cells: NDArray[np.integer], around: Rings) -> NDArray[np.int64]:
-    """A colour for each node, (N,) int64 from 0, such that no two nodes of one cell share one.
-
-    Greedy in node order, so the same mesh always gets the same colours. Nodes of one colour can move at the
-    same time: their rings have no cell in common.
-    """
-    return greedy_colours(np.ascontiguousarray(cells, dtype=np.int64), around.start, around.cells)
-
-
 @numba.njit(cache=True)
 def greedy_colours(cells: NDArray, start: NDArray, ring_cells: NDArray) -> NDArray:
-    """`node_colours` from the rows of `Rings`, cells int64 and contiguous."""
+    """A colour for each node, (N,) int64 from 0, such that no two nodes of one cell share one.
+
+    `start` and `ring_cells` are the rows of `Rings`, cells int64 and contiguous. Greedy in node order, so the same mesh
+    always gets the same colours. Nodes of one colour can move at the same time: their rings have no cell in common.
+    """
     n_nodes = len(start) - 1
     colours = np.full(n_nodes, -1, dtype=np.int64)
     taken_by = np.full(n_nodes + 1, -1, dtype=np.int64)  # the last node that saw this colour beside it
