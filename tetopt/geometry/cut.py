@@ -19,14 +19,14 @@ class Cut(NamedTuple):
 
 # Corners of the section as pairs of local nodes, in order around it, by which nodes lie above the plane
 # (bit k: node k). One node apart gives a triangle, two a quadrilateral.
-_SECTIONS = np.zeros((16, 4, 2), dtype=np.int64)
+CUT_SECTIONS = np.zeros((16, 4, 2), dtype=np.int64)
 for _alone in range(4):
     _others = [k for k in range(4) if k != _alone]
     _pairs = [(_alone, k) for k in (*_others, _others[-1])]
-    _SECTIONS[1 << _alone] = _SECTIONS[15 - (1 << _alone)] = _pairs
+    CUT_SECTIONS[1 << _alone] = CUT_SECTIONS[15 - (1 << _alone)] = _pairs
 for _a, _b in ((0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)):
     _c, _d = (k for k in range(4) if k not in (_a, _b))
-    _SECTIONS[(1 << _a) + (1 << _b)] = [(_a, _c), (_a, _d), (_b, _d), (_b, _c)]
+    CUT_SECTIONS[(1 << _a) + (1 << _b)] = [(_a, _c), (_a, _d), (_b, _d), (_b, _c)]
 
 
 def plane_cut(points: Points, cells: Cells, height: NDArray[np.float64]) -> Cut:
@@ -47,7 +47,7 @@ def plane_cut(points: Points, cells: Cells, height: NDArray[np.float64]) -> Cut:
     is_above = height >= 0.0
     pattern = (is_above[cells] << np.arange(4)).sum(axis=1)
     cut = np.flatnonzero((pattern > 0) & (pattern < 15))
-    pairs = _SECTIONS[pattern[cut]]  # (K, 4, 2)
+    pairs = CUT_SECTIONS[pattern[cut]]  # (K, 4, 2)
     ends = np.take_along_axis(cells[cut][:, None, :], pairs, axis=2)
     low, high = height[ends[..., 0]], height[ends[..., 1]]
     share = (low / (low - high))[..., None]
