@@ -26,9 +26,9 @@ from scipy.spatial import Delaunay
 
 import tetopt
 from tetopt.energy.sampling import from_ticks, moment_sums, sampling_grid, to_ticks
-from tetopt.engine.fast import _Run, prepare_kernels
+from tetopt.engine.fast import Run, prepare_kernels
 from tetopt.engine.flips import flip
-from tetopt.engine.loop import GRADED_K_D, SHAPE_POWER
+from tetopt.engine.loop import GRADED_K_D
 from tetopt.geometry.simplex import dihedral_angles, oriented, rho, volumes
 from tetopt.geometry.topology import facets
 from tetopt.io.files import checked_output, save_json
@@ -270,9 +270,8 @@ def in_a_child(path: Path, nodes: int) -> dict[str, Any]:
 def flip_pass(image: tetopt.Image, nodes: int) -> float:
     """Seconds per million tetrahedra to look at every facet and edge of a mesh that is good already."""
     mesh = tetopt.optimize(image, tetopt.lattice(image, nodes=nodes), k_D=0.5).mesh
-    run = _Run(plain(image), mesh, 0.5, SHAPE_POWER, "slide")
-    run.held, _ = flip(run.held, run.measure)
-    return best_seconds(lambda: flip(run.held, run.measure)) / len(mesh.cells) * 1e6
+    state, _ = flip(Run(plain(image), mesh, 0.5).state)
+    return best_seconds(lambda: flip(state)) / len(mesh.cells) * 1e6
 
 
 def show(rows: dict[str, Any]) -> None:

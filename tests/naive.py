@@ -152,7 +152,7 @@ def holds(functions, point):
 def owners(image, mesh):
     """The cells that hold each voxel centre: a list for each voxel, by index. The contract says at most one."""
     grid_points, bits = ticks(image, mesh.points)
-    held = {voxel: [] for voxel in product(*map(range, image.shape))}
+    holders = {voxel: [] for voxel in product(*map(range, image.shape))}
     for number, cell in enumerate(mesh.cells):
         corners = [grid_points[a] for a in cell]
         functions = barycentric_functions(corners)
@@ -161,8 +161,8 @@ def owners(image, mesh):
             ranges.append(range(max(0, min(axis) >> bits), min(size, (max(axis) >> bits) + 2)))
         for voxel in product(*ranges):
             if holds(functions, [i << bits for i in voxel]):
-                held[voxel].append(number)
-    return held
+                holders[voxel].append(number)
+    return holders
 
 
 def cell_of_voxel(image, mesh):
@@ -238,11 +238,11 @@ def plane_cut(points, cells, height):
     points, height = exactly(points), [Fraction(float(z)) for z in height]
     crossings = {}
     for number, cell in enumerate(cells):
-        found = []
+        places = []
         for a, b in combinations(cell, 2):
             if (height[a] >= 0) != (height[b] >= 0):
                 share = height[a] / (height[a] - height[b])
-                found.append([float((1 - share) * p + share * q) for p, q in zip(points[a], points[b], strict=True)])
-        if found:
-            crossings[number] = found
+                places.append([float((1 - share) * p + share * q) for p, q in zip(points[a], points[b], strict=True)])
+        if places:
+            crossings[number] = places
     return crossings

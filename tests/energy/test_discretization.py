@@ -131,9 +131,9 @@ def test_E_D_of_the_sphere_is_the_analytic_one():
     f = 4 / 3 * pi * r**3 / V
     analytic = V * f * (1 - f) * contrast**2
     lost = 0.1645 * 4 * pi * r**2 * contrast**2
-    found = E_D(image, mesh)
-    assert found == pytest.approx(analytic, rel=0.03)
-    assert found == pytest.approx(analytic - lost, rel=1e-3)
+    sampled = E_D(image, mesh)
+    assert sampled == pytest.approx(analytic, rel=0.03)
+    assert sampled == pytest.approx(analytic - lost, rel=1e-3)
 
 
 # The law of total variance
@@ -209,9 +209,9 @@ def test_E_D_of_sums_is_cell_E_D(seed, n):
     image, mesh = random_case(seed, n)
     grid = sampling_grid(image, mesh.points)
     sums = moment_sums(grid, to_ticks(image.to_index(mesh.points), grid), mesh.cells)
-    found = E_D_of_sums(sums, image.voxel_volume)
-    np.testing.assert_allclose(found, cell_E_D(image, mesh), rtol=1e-9, atol=1e-9 * image.voxel_volume)
-    assert (found >= 0).all()
+    of_cells = E_D_of_sums(sums, image.voxel_volume)
+    np.testing.assert_allclose(of_cells, cell_E_D(image, mesh), rtol=1e-9, atol=1e-9 * image.voxel_volume)
+    assert (of_cells >= 0).all()
 
 
 def test_E_D_of_sums_by_hand():

@@ -114,9 +114,9 @@ def test_ring_volumes_add_up_to_n_plus_1_times_the_volume(seed, n):
     _, points, cells = random_mesh(seed, n)
     v = volumes(points, cells)
     expected = [sum(v[c] for c in ring) for ring in naive.rings(cells, len(points) + 1)]
-    found = ring_volumes(np.vstack([points, points[:1]]), cells)  # the last node is in no cell
-    assert found == pytest.approx(expected)
-    assert found.sum() == pytest.approx((n + 1) * 3**n)
+    around = ring_volumes(np.vstack([points, points[:1]]), cells)  # the last node is in no cell
+    assert around == pytest.approx(expected)
+    assert around.sum() == pytest.approx((n + 1) * 3**n)
 
 
 # The gradient
@@ -206,18 +206,18 @@ def test_volume_and_E_G_of_one_cell(seed, n):
     points = rng.normal(size=(8, n)) * np.exp(rng.uniform(-3, 3)) + rng.uniform(-100, 100, n)
     cells = oriented(points, np.array([rng.permutation(8)[: n + 1] for _ in range(5)]))
     for cell, v, energy in zip(cells, volumes(points, cells), cell_E_G(points, cells), strict=True):
-        found = volume_and_E_G(corners_of(points, cell), n + 1)
-        assert found == pytest.approx((v, energy), rel=1e-8)
-        assert found == pytest.approx(naive.volume_and_E_G(points[cell]), rel=1e-9)
-        assert volume_and_E_G(corners_of(points, cell[::-1]), n + 1) == pytest.approx(found, rel=1e-9)
+        measured = volume_and_E_G(corners_of(points, cell), n + 1)
+        assert measured == pytest.approx((v, energy), rel=1e-8)
+        assert measured == pytest.approx(naive.volume_and_E_G(points[cell]), rel=1e-9)
+        assert volume_and_E_G(corners_of(points, cell[::-1]), n + 1) == pytest.approx(measured, rel=1e-9)
 
 
 @pytest.mark.parametrize("mesh", ALL_SMALL)
 def test_volume_and_E_G_of_small_meshes(mesh):
     points, cells = mesh
     for cell in cells:
-        found = volume_and_E_G(corners_of(points, cell), len(cell))
-        assert found == pytest.approx(naive.volume_and_E_G(points[cell]), rel=1e-14)
+        measured = volume_and_E_G(corners_of(points, cell), len(cell))
+        assert measured == pytest.approx(naive.volume_and_E_G(points[cell]), rel=1e-14)
 
 
 def test_unit_simplices():

@@ -320,15 +320,15 @@ def test_variance_of_a_small_contrast_on_a_large_mean(offset, contrast):
 
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_float32_and_float64_give_the_same(dtype):
-    """In float32 values are held, not summed."""
+    """In float32 values are stored, not summed."""
     rng = np.random.default_rng(7)
     data = rng.integers(0, 4096, (9, 9, 9)) / 16
     image = Image(data.astype(dtype))
-    held = Image(data)
-    object.__setattr__(held, "data", data.astype(dtype))
+    stored = Image(data)
+    object.__setattr__(stored, "data", data.astype(dtype))
     mesh = placed(image, *split_box(rng, data.shape, 6))
-    owner = cell_of_voxel(held, mesh)
-    for cell, (count, mean, variance) in enumerate(zip(*cell_moments(held, mesh), strict=True)):
+    owner = cell_of_voxel(stored, mesh)
+    for cell, (count, mean, variance) in enumerate(zip(*cell_moments(stored, mesh), strict=True)):
         if count:
             assert mean == pytest.approx(data[owner == cell].mean(), rel=1e-13)
             assert variance == pytest.approx(data[owner == cell].var(), rel=1e-11, abs=1e-10)
@@ -463,14 +463,14 @@ def test_the_same_bits_on_one_and_two_threads():
     mesh = lattice(image, blocks=(6, 6, 6))
     assert len(mesh.cells) > 1000
     before = numba.get_num_threads()
-    found = []
+    sums = []
     try:
         for threads in (1, 2, 1, 2):
             numba.set_num_threads(threads)
-            found.append(b"".join(column.tobytes() for column in cell_moments(image, mesh)))
+            sums.append(b"".join(column.tobytes() for column in cell_moments(image, mesh)))
     finally:
         numba.set_num_threads(before)
-    assert len(set(found)) == 1
+    assert len(set(sums)) == 1
 
 
 # The fixed-point grid

@@ -4,11 +4,13 @@ import numpy as np
 import pytest
 from hypothesis import assume, given, settings
 from hypothesis import strategies as st
-from test_fast import OBLIQUE, Held, dimensions, random_case, seeds
+from states import OBLIQUE, Engine, assumed_case, random_case
+from test_fast import dimensions, seeds
 
 import tetopt
-from tetopt.engine.complex import build, energies, floor_of, measure_all, node_rings
+from tetopt.engine.complex import energies, node_rings
 from tetopt.engine.density import (
+    EdgeMoves,
     Limits,
     best_collapses,
     best_splits,
@@ -19,47 +21,47 @@ from tetopt.engine.density import (
     roomy,
 )
 from tetopt.engine.flips import close_gaps
-from tetopt.engine.repair import qualities
+from tetopt.engine.repair import cell_cosines
 from tetopt.engine.smooth import blocks
 from tetopt.geometry.simplex import volumes
-
-
-def sides_of(held, is_fixed=False):
-    return held.sides._replace(is_fixed=is_fixed)
 
 
 def no_limits(n_nodes):
     return Limits(0.0, np.full(n_nodes, np.inf), 0.0)
 
 
-def exchanged(held, n_nodes, most, is_fixed=False):
-    limits = no_limits(len(held.complex.ticks))
-    done = exchange(held.complex, held.is_frozen, held.measure, sides_of(held, is_fixed), n_nodes, most, limits)
-    held.complex, held.is_frozen = done.held, done.is_frozen
-    return done
+def exchanged(engine, n_nodes, most):
+    made = exchange(engine.state, n_nodes, most, no_limits(len(engine.complex.ticks)))
+    engine.state = made.state
+    return made
+
+
+def fix_boundary(engine):
+    engine.state = engine.state._replace(sides=engine.state.sides._replace(is_fixed=True))
+    engine.complex.is_frozen[engine.complex.is_frozen.any(axis=1), :3] = True
 
 
 @settings(max_examples=40, deadline=None)
 @given(seeds, dimensions, st.booleans(), st.booleans(), st.integers(-6, 12))
 def test_exchanges_leave_a_mesh(seed, n, turned, is_graded, more):
-    held = random_case(seed, n, OBLIQUE if turned and n == 3 else None, 3.0)
-    held.measure = held.measure._replace(is_graded=is_graded)
-    measure_all(held.complex, held.measure)
-    assume(np.isfinite(held.E))
+    engine = assumed_case(seed, n, OBLIQUE if turned and n == 3 else None, 3.0)
+    engine.change(is_graded=is_graded)
+    engine.remeasure()
+    assume(np.isfinite(engine.E))
     for _ in range(3):
-        before, E = len(held.complex.ticks), held.E
-        done = exchanged(held, before + more, 5)
-        held.assert_sound()
-        assert len(held.complex.ticks) - before == done.n_split - done.n_collapsed
-        assert min(done.n_split, done.n_collapsed) <= 5
-        kept = done.source[done.source >= 0]
-        assert len(kept) == before - done.n_collapsed
+        before, E = len(engine.complex.ticks), engine.E
+        made = exchanged(engine, before + more, 5)
+        engine.assert_sound()
+        assert len(engine.complex.ticks) - before == made.n_split - made.n_collapsed
+        assert min(made.n_split, made.n_collapsed) <= 5
+        kept = made.source[made.source >= 0]
+        assert len(kept) == before - made.n_collapsed
         assert (np.diff(kept) > 0).all()
         if more == 0:
-            assert held.E <= E * (1 + 1e-12)
-        held.sweep()
-        held.flip()
-        held.assert_sound()
+            assert engine.E <= E * (1 + 1e-12)
+        engine.sweep()
+        engine.flip()
+        engine.assert_sound()
 
 
 @pytest.mark.parametrize("n", [2, 3])
@@ -69,89 +71,61 @@ def test_worth_is_what_E_falls_by(n, is_fixed):
     count = 0
     for node in range(40):
         for kind in ("split", "collapse"):
-            held = random_case(7, n)
-            held.sweep()
-            N = len(held.complex.ticks)
+            engine = random_case(7, n)
+            engine.sweep()
+            N = len(engine.complex.ticks)
             if is_fixed:
-                held.is_frozen[held.is_frozen.any(axis=1), :3] = True
+                fix_boundary(engine)
             if node >= N:
                 continue
-            rings, groups, sides = node_rings(held.complex), blocks(held.complex.ticks), sides_of(held, is_fixed)
-            room = roomy(held.complex, N, 200)
-            is_frozen = np.concatenate([held.is_frozen, np.zeros_like(held.is_frozen)])
-            E = held.E
-            is_dirty = np.zeros(len(room.cells), dtype=np.bool_)
-            nobody = np.empty(0, dtype=np.int64)
+            rings, groups = node_rings(engine.state), blocks(engine.complex.ticks)
+            was_frozen, E, everyone = engine.complex.is_frozen, engine.E, np.ones(N, dtype=bool)
+            room = roomy(engine.state, N, 200)
+            is_dirty = np.zeros(len(room.complex.cells), dtype=np.bool_)
             if kind == "split":
-                gain, split = best_splits(room, rings, is_frozen, held.measure, sides, np.ones(N, dtype=bool), 0.0)
-                if split[node] < 0:
+                splits = best_splits(room, rings, everyone, no_limits(N))
+                if splits.other[node] < 0:
                     continue
-                done = make_exchanges(
-                    room,
-                    rings,
-                    is_frozen,
-                    held.measure,
-                    sides,
-                    np.array([node]),
-                    split,
-                    gain,
-                    nobody,
-                    nobody,
-                    gain,
-                    1,
-                    1,
-                    0.0,
-                    is_dirty,
-                )
-                assert done == (1, 0)
-                expected = gain[node]
-                was_on = held.is_frozen[[node, split[node]]]
+                nobody = np.empty(0, dtype=np.int64)
+                none = EdgeMoves(everyone, np.full(N, -1), np.full(N, -np.inf))
+                made = make_exchanges(room, rings, splits, none, np.array([node]), nobody, (1, 1, 0.0), is_dirty)
+                assert made == (1, 0)
+                expected = splits.gain[node]
+                was_on, is_frozen = was_frozen[[node, splits.other[node]]], room.complex.is_frozen
                 assert (is_frozen[N] <= was_on.all(axis=0)).all()
                 if is_fixed and is_frozen[N].any():
                     assert is_frozen[N, :3].all()
-                held.complex = room._replace(ticks=room.ticks[: N + 1])
+                engine.state = room
+                engine.change(ticks=room.complex.ticks[: N + 1], is_frozen=is_frozen[: N + 1])
             else:
-                cost, collapse = best_collapses(
-                    room,
-                    rings,
-                    groups,
-                    is_frozen,
-                    held.measure,
-                    sides,
-                    np.inf,
-                    np.ones(N, dtype=bool),
-                    np.full(N, np.inf),
-                )
-                if collapse[node] < 0:
+                collapses = best_collapses(room, rings, groups, everyone, no_limits(N))
+                if collapses.other[node] < 0:
                     continue
-                collapse_edge(room, rings, node, collapse[node], is_dirty, held.measure)
+                collapse_edge(room, rings, node, collapses.other[node], is_dirty)
                 close_gaps(room, is_dirty)
-                expected = -cost[node]
-                held.complex = room
-                assert not (held.complex.cells[: held.complex.n_cells[0]] == node).any()
-                held.complex.ticks[node] = held.complex.ticks[N - 1]  # out of the mesh: numbered away
-                cells = held.complex.cells
-                cells[cells == N - 1] = node
-                held.complex = held.complex._replace(ticks=held.complex.ticks[: N - 1])
+                expected = collapses.gain[node]
+                engine.state = room
+                assert not (engine.cells == node).any()
+                engine.complex.ticks[node] = engine.complex.ticks[N - 1]  # out of the mesh: numbered away
+                engine.complex.cells[engine.complex.cells == N - 1] = node
+                engine.change(ticks=engine.complex.ticks[: N - 1])
             count += 1
-            assert E - held.E == pytest.approx(expected, rel=1e-6, abs=1e-9)
-            held.assert_sound()
+            assert E - engine.E == pytest.approx(expected, rel=1e-6, abs=1e-9)
+            engine.assert_sound()
     assert count > 20
 
 
 def test_splits_make_no_edge_shorter_than_asked():
     """Of every node's best split, the halves and the edges to the other corners; some splits are refused for it."""
-    held = random_case(5, 3)
-    held.sweep()
-    N, everyone = len(held.complex.ticks), np.ones(len(held.complex.ticks), dtype=bool)
-    rings, sides = node_rings(held.complex), sides_of(held)
-    room = roomy(held.complex, N, 200)
-    is_frozen = np.concatenate([held.is_frozen, np.zeros_like(held.is_frozen)])
-    points, cells = held.mesh.points, held.mesh.cells
+    engine = random_case(5, 3)
+    engine.sweep()
+    N = len(engine.complex.ticks)
+    rings, room = node_rings(engine.state), roomy(engine.state, N, 200)
+    points, cells = engine.mesh.points, engine.mesh.cells
     shortest = 0.45 * float(np.median(np.linalg.norm(points[cells[:, 0]] - points[cells[:, 1]], axis=1)))
     made = []
     for limit in (0.0, shortest):
-        _, split = best_splits(room, rings, is_frozen, held.measure, sides, everyone, limit)
+        split = best_splits(room, rings, np.ones(N, dtype=bool), no_limits(N)._replace(shortest=limit)).other
         lengths = []
         for a in np.flatnonzero(split >= 0):
             ring = cells[(cells == a).any(axis=1) & (cells == split[a]).any(axis=1)]
@@ -169,16 +143,14 @@ def test_collapses_are_the_best_of_all_neighbours(is_bounded):
 
     Bounded: no new edge is longer than the bound at its ends, unless one as long was there.
     """
-    held = random_case(11, 3)
-    held.sweep()
-    N, cells = len(held.complex.ticks), held.mesh.cells
-    rings, groups = node_rings(held.complex), blocks(held.complex.ticks)
-    points = held.mesh.points
+    engine = random_case(11, 3)
+    engine.sweep()
+    N, cells = len(engine.complex.ticks), engine.mesh.cells
+    rings, groups = node_rings(engine.state), blocks(engine.complex.ticks)
+    points = engine.mesh.points
     longest = np.random.default_rng(0).uniform(8.0, 20.0, N) if is_bounded else np.full(N, np.inf)
-    cost, collapse = best_collapses(
-        held.complex, rings, groups, held.is_frozen, held.measure, held.sides, np.inf, np.ones(N, dtype=bool), longest
-    )
-    size = np.linalg.det(held.mesh.points[cells[:, 1:]] - held.mesh.points[cells[:, :1]]).sum()
+    collapses = best_collapses(engine.state, rings, groups, np.ones(N, dtype=bool), Limits(0.0, longest, 0.0))
+    size = np.linalg.det(engine.mesh.points[cells[:, 1:]] - engine.mesh.points[cells[:, :1]]).sum()
     joined, refused = 0, 0
     for a in range(N):
         best = np.inf
@@ -190,21 +162,19 @@ def test_collapses_are_the_best_of_all_neighbours(is_bounded):
                 refused += 1
                 continue
             new = np.where(cells == a, b, cells)[~((cells == a).any(axis=1) & (cells == b).any(axis=1))]
-            volume = np.linalg.det(held.mesh.points[new[:, 1:]] - held.mesh.points[new[:, :1]])
+            volume = np.linalg.det(engine.mesh.points[new[:, 1:]] - engine.mesh.points[new[:, :1]])
             if (volume <= 1e-6).any() or abs(volume.sum() / size - 1) > 1e-9:
                 continue
-            if (
-                held.is_frozen[a, :3] & ~(held.is_frozen[b, :3] & (held.complex.ticks[a] == held.complex.ticks[b]))
-            ).any():
+            is_frozen, ticks = engine.complex.is_frozen, engine.complex.ticks
+            if (is_frozen[a, :3] & ~(is_frozen[b, :3] & (ticks[a] == ticks[b]))).any():
                 continue
-            fresh = build(new, held.complex.ticks, held.measure)
-            E_G, squares = energies(fresh)
-            best = min(best, held.measure.geometry * E_G + held.measure.image * squares - held.E)
+            E_G, squares = energies(engine.fresh(new))
+            best = min(best, engine.objective.geometry * E_G + engine.objective.image * squares - engine.E)
         if best < np.inf:
             joined += 1
-            assert cost[a] == pytest.approx(best, rel=1e-6, abs=1e-9)
+            assert -collapses.gain[a] == pytest.approx(best, rel=1e-6, abs=1e-9)
         else:
-            assert collapse[a] == -1
+            assert collapses.other[a] == -1
     assert joined > 5
     assert (refused > 20) == is_bounded
 
@@ -213,20 +183,19 @@ def test_collapses_are_the_best_of_all_neighbours(is_bounded):
 @given(seeds, st.booleans())
 def test_mending_by_nodes(seed, turned):
     """Nodes taken out and put in at the worst cells: fewer cells below the floor, none worse, and a mesh still."""
-    held = random_case(seed, 3, OBLIQUE if turned else None)
-    assume(np.isfinite(held.E))
+    engine = assumed_case(seed, 3, OBLIQUE if turned else None)
     target = -np.cos(np.radians(20.0))
     for _ in range(3):
-        quality = qualities(held.complex, held.measure)
-        bad = np.flatnonzero(quality < target)
-        bad = bad[np.argsort(quality[bad], kind="stable")]
+        cosines = cell_cosines(engine.state)
+        bad = np.flatnonzero(cosines < target)
+        bad = bad[np.argsort(cosines[bad], kind="stable")]
         if len(bad) == 0:
             break
-        done = mend(held.complex, held.is_frozen, held.measure, held.sides, bad, target)
-        held.complex, held.is_frozen = done.held, done.is_frozen
-        held.assert_sound()
-        assert qualities(held.complex, held.measure).min() >= min(quality.min(), target)
-        if done.n_split + done.n_collapsed == 0:
+        mended = mend(engine.state, bad, target)
+        engine.state = mended.state
+        engine.assert_sound()
+        assert cell_cosines(engine.state).min() >= min(cosines.min(), target)
+        if mended.n_split + mended.n_collapsed == 0:
             break
 
 
@@ -236,29 +205,25 @@ def test_nodes_go_where_the_image_is():
     image = tetopt.Image(100.0 * (((index - 20) ** 2).sum(-1) < 49))
     E_D, nodes_near = {}, {}
     for does_exchange in (False, True):
-        held = Held(image, tetopt.lattice(image, blocks=(5, 5, 5)), 0.5)
-        floor, safe = floor_of(10.0)
-        held.measure = held.measure._replace(is_graded=True, floor=floor, safe=safe)
-        held.complex = build(held.mesh.cells, held.complex.ticks, held.measure)
-        E_G, squares = energies(held.complex)
-        held.measure = held.measure._replace(geometry=0.5 / E_G, image=0.5 / squares)
-        N = len(held.complex.ticks)
+        engine = Engine(image, tetopt.lattice(image, blocks=(5, 5, 5)), 0.5, is_graded=True)
+        engine.keep_floor(10.0)
+        N, geometry = len(engine.complex.ticks), engine.objective.geometry
         for _ in range(8):
-            held.sweep()
-            held.flip()
+            engine.sweep()
+            engine.flip()
             if does_exchange:  # most of a shape's cost goes when the nodes around move again
-                eager = held.measure._replace(geometry=0.1 * held.measure.geometry)
-                done = exchange(held.complex, held.is_frozen, eager, held.sides, N, N // 10, no_limits(N))
-                held.complex, held.is_frozen = done.held, done.is_frozen
+                engine.change(geometry=0.1 * geometry)
+                exchanged(engine, N, N // 10)
+                engine.change(geometry=geometry)
         for _ in range(3):
-            held.sweep()
-            held.flip()
-        held.assert_sound()
-        distance = np.sqrt(((held.image.to_index(held.mesh.points) - 20) ** 2).sum(axis=1))
+            engine.sweep()
+            engine.flip()
+        engine.assert_sound()
+        distance = np.sqrt(((engine.image.to_index(engine.mesh.points) - 20) ** 2).sum(axis=1))
         nodes_near[does_exchange] = int((np.abs(distance - 7) < 2.5).sum())
-        E_D[does_exchange] = energies(held.complex)[1]
-        assert len(held.complex.ticks) == N
-        assert tetopt.quality(held.mesh.points, held.mesh.cells).min_dihedral >= 10.0
+        E_D[does_exchange] = energies(engine.state)[1]
+        assert len(engine.complex.ticks) == N
+        assert tetopt.quality(engine.mesh.points, engine.mesh.cells).min_dihedral >= 10.0
     assert nodes_near[True] > 1.3 * nodes_near[False]
     assert E_D[True] < 0.9 * E_D[False]
 

@@ -9,9 +9,10 @@ from shapes import OBLIQUE, distance, grid, shaped
 
 import tetopt
 from tetopt.energy.sampling import cell_of_voxel, channel_grid, moment_sums, to_ticks
-from tetopt.engine.complex import measure_of
-from tetopt.engine.fast import _Run
-from tetopt.engine.surface import level_at, put_on_surface, sides_of
+from tetopt.engine.complex import build
+from tetopt.engine.fast import Run
+from tetopt.engine.state import objective_of, sides_of
+from tetopt.engine.surface import level_at, put_on_surface
 from tetopt.geometry.topology import boundary_facets
 from tetopt.measure.fidelity import cell_labels, label_fidelity, mask_fidelity
 from tetopt.start.clip import lattice_within
@@ -41,47 +42,47 @@ def check(image, mask, mesh, floor=12.0):
     assert off.max() < 0.7
 
 
-def hard_E_D(wanted, mesh):
+def hard_E_D(target, mesh):
     """E_D from the voxels, one by one: squares around the cells' means, and those on the wrong side of the mask."""
-    owner = cell_of_voxel(wanted.image, mesh).ravel()
+    owner = cell_of_voxel(target.image, mesh).ravel()
     is_in = owner >= 0
     squares = 0.0
-    for values in wanted.values.reshape(len(wanted.values), -1).astype(float):
+    for values in target.values.reshape(len(target.values), -1).astype(float):
         count = np.maximum(np.bincount(owner[is_in], minlength=len(mesh.cells)), 1)
         mean = np.bincount(owner[is_in], values[is_in], len(mesh.cells)) / count
         squares += ((values[is_in] - mean[owner[is_in]]) ** 2).sum()
-    if wanted.region is not None:
-        squares += wanted.wrong_side * (is_in != wanted.region.inside.ravel()).sum()
-    return squares * wanted.unit * wanted.image.voxel_volume
+    if target.region is not None:
+        squares += target.wrong_side * (is_in != target.region.inside.ravel()).sum()
+    return squares * target.unit * target.image.voxel_volume
 
 
 @pytest.mark.parametrize("is_graded", [True, False])
 @pytest.mark.parametrize("kind", ["ball", "pieces", "hole", "handle", "touching", "sheet"])
 def test_masks(kind, is_graded):
     image, mask = shaped(kind, OBLIQUE if kind == "ball" else None)
-    wanted = content(image, mask=mask)
+    target = content(image, mask=mask)
     if is_graded:
-        result = tetopt.mesh_image(wanted, 900, iterations=8)
+        result = tetopt.mesh_image(target, 900, iterations=8)
         assert len(result.mesh.points) == pytest.approx(900, rel=0.02)
     else:
-        start = lattice_within(wanted.image, wanted.region, nodes=900 if kind != "sheet" else 2500)
-        result = tetopt.optimize(wanted, start, iterations=8)
+        start = lattice_within(target.image, target.region, nodes=900 if kind != "sheet" else 2500)
+        result = tetopt.optimize(target, start, iterations=8)
         E = [row.E for row in result.history]
         assert all(later <= earlier for earlier, later in pairwise(E))
         assert E[-1] < E[0]
     check(image, mask, result.mesh)
     last = result.history[-1]
-    assert last.E_D == pytest.approx(hard_E_D(wanted, result.mesh), rel=1e-9)
-    found = mask_fidelity(mask, result.mesh)
-    assert found.mesh_components == found.components
-    assert found.mesh_euler == found.euler
-    assert found.dice > 0.95
+    assert last.E_D == pytest.approx(hard_E_D(target, result.mesh), rel=1e-9)
+    fidelity = mask_fidelity(mask, result.mesh)
+    assert fidelity.mesh_components == fidelity.components
+    assert fidelity.mesh_euler == fidelity.euler
+    assert fidelity.dice > 0.95
     if kind != "sheet":
-        assert found.distance_mean < 0.25
-        assert found.distance_p95 < 0.6
-        assert found.reverse_p95 < 0.8
+        assert fidelity.distance_mean < 0.25
+        assert fidelity.distance_p95 < 0.6
+        assert fidelity.reverse_p95 < 0.8
     else:
-        assert found.mesh_volume == pytest.approx(found.volume, rel=0.1)
+        assert fidelity.mesh_volume == pytest.approx(fidelity.volume, rel=0.1)
 
 
 def test_a_mask_in_2d():
@@ -90,19 +91,19 @@ def test_a_mask_in_2d():
     mask &= np.hypot(at[..., 0] - 35.0, at[..., 1] - 40.0) > 6.0
     affine = np.array([[0.8, 0.3, 5.0], [-0.2, 1.5, -7.0], [0.0, 0.0, 1.0]])
     image = tetopt.Image(np.sin(0.3 * at[..., 0]) + (at[..., 1] > 30), affine)
-    wanted = content(image, mask=tetopt.Image(1.0 * mask, affine))
-    result = tetopt.mesh_image(wanted, 300)
+    target = content(image, mask=tetopt.Image(1.0 * mask, affine))
+    result = tetopt.mesh_image(target, 300)
     check(image, tetopt.Image(1.0 * mask, affine), result.mesh)
     assert len(result.mesh.points) == pytest.approx(300, rel=0.02)
-    assert result.history[-1].E_D == pytest.approx(hard_E_D(wanted, result.mesh), rel=1e-9)
+    assert result.history[-1].E_D == pytest.approx(hard_E_D(target, result.mesh), rel=1e-9)
     assert mask_fidelity(tetopt.Image(1.0 * mask, affine), result.mesh).distance_mean < 0.25
 
 
 def test_the_boundary_may_be_fixed():
     image, mask = shaped("ball")
-    wanted = content(image, mask=mask)
-    start = lattice_within(wanted.image, wanted.region, nodes=600)
-    result = tetopt.optimize(wanted, start, k_D=0.5, iterations=3, min_dihedral=0.0, boundary="fixed")
+    target = content(image, mask=mask)
+    start = lattice_within(target.image, target.region, nodes=600)
+    result = tetopt.optimize(target, start, k_D=0.5, iterations=3, min_dihedral=0.0, boundary="fixed")
     outer = np.unique(boundary_facets(start.cells))
     np.testing.assert_allclose(result.mesh.points[outer], start.points[outer], atol=1e-5)
     assert np.abs(result.mesh.points - start.points).max() > 0.3
@@ -119,31 +120,31 @@ def test_what_lies_beyond_the_mask_does_not_matter():
 def test_same_bits_on_any_number_of_threads():
     image, mask = shaped("touching")
     labels = tetopt.Image(np.rint(distance(image.shape, 0, 14, 16) / 5.0))
-    wanted = content([image, tetopt.Image(image.data**2)], labels, mask)
+    target = content([image, tetopt.Image(image.data**2)], labels, mask)
     most = numba.get_num_threads()
-    found = []
+    meshes = []
     try:
         for threads in (1, most):
             numba.set_num_threads(threads)
-            found.append(tetopt.mesh_image(wanted, 700, iterations=6).mesh)
+            meshes.append(tetopt.mesh_image(target, 700, iterations=6).mesh)
     finally:
         numba.set_num_threads(most)
-    np.testing.assert_array_equal(found[0].points, found[1].points)
-    np.testing.assert_array_equal(found[0].cells, found[1].cells)
+    np.testing.assert_array_equal(meshes[0].points, meshes[1].points)
+    np.testing.assert_array_equal(meshes[0].cells, meshes[1].cells)
 
 
 def test_a_lift_that_lays_cells_over_one_another_is_undone(monkeypatch):
-    """The floor is missed then, and told; the mesh is the one before the lift."""
+    """The floor is missed then; the mesh is the one before the lift."""
     image, mask = shaped("handle")
-    wanted = content(image, mask=mask)
-    start = lattice_within(wanted.image, wanted.region, nodes=150)
-    lifted = tetopt.optimize(wanted, start, iterations=2, min_dihedral=35.0)
-    monkeypatch.setattr(_Run, "_overlaps", lambda self, held: True)
-    kept = tetopt.optimize(wanted, start, iterations=2, min_dihedral=35.0)
+    target = content(image, mask=mask)
+    start = lattice_within(target.image, target.region, nodes=150)
+    lifted = tetopt.optimize(target, start, iterations=2, min_dihedral=35.0)
+    monkeypatch.setattr(Run, "_overlaps", lambda self, state: True)
+    kept = tetopt.optimize(target, start, iterations=2, min_dihedral=35.0)
     angles = [tetopt.quality(each.mesh.points, each.mesh.cells).min_dihedral for each in (lifted, kept)]
     assert angles[1] < angles[0]
     assert all(later <= earlier for earlier, later in pairwise(row.E for row in kept.history))
-    assert kept.history[-1].E_D == pytest.approx(hard_E_D(wanted, kept.mesh), rel=1e-9)
+    assert kept.history[-1].E_D == pytest.approx(hard_E_D(target, kept.mesh), rel=1e-9)
     assert tetopt.check_mesh(kept.mesh) == []
 
 
@@ -161,14 +162,14 @@ def corners(shape=(24, 24, 24)):
 @pytest.mark.parametrize("is_graded", [True, False])
 def test_labels_that_meet_in_edges_and_points(is_graded):
     labels = corners()
-    wanted = content(labels, labels, weights=[0.0])
+    target = content(labels, labels, weights=[0.0])
     if is_graded:
-        result = tetopt.mesh_image(wanted, 700)
+        result = tetopt.mesh_image(target, 700)
     else:
-        result = tetopt.optimize(wanted, tetopt.lattice(labels, nodes=700), k_D=0.85)
+        result = tetopt.optimize(target, tetopt.lattice(labels, nodes=700), k_D=0.85)
     assert tetopt.check_mesh(result.mesh, labels) == []
     assert tetopt.quality(result.mesh.points, result.mesh.cells).min_dihedral >= 12.0 - 1e-9
-    assert result.history[-1].E_D == pytest.approx(hard_E_D(wanted, result.mesh), rel=1e-9, abs=1e-9)
+    assert result.history[-1].E_D == pytest.approx(hard_E_D(target, result.mesh), rel=1e-9, abs=1e-9)
     rows = {row.label: row for row in label_fidelity(labels, result.mesh)}
     for label in range(1, 9):
         assert rows[label].dice > (0.995 if is_graded else 0.95)
@@ -189,8 +190,8 @@ def test_labels_and_an_image_share_the_cells():
     labels = tetopt.Image(1.0 * (at[..., 1] > 9.4))
     share = {}
     for weight in (None, 1.0):
-        wanted = content(image) if weight is None else content(image, labels, label_weight=weight)
-        mesh = tetopt.mesh_image(wanted, 300).mesh
+        target = content(image) if weight is None else content(image, labels, label_weight=weight)
+        mesh = tetopt.mesh_image(target, 300).mesh
         dice = min(row.dice for row in label_fidelity(labels, mesh))
         share[weight] = dice, tetopt.E_D(image, mesh) / (np.var(image.data) * image.volume)
     assert share[None][0] < 0.98
@@ -202,9 +203,9 @@ def test_contrasts_of_different_scales_are_all_seen():
     """Steps along three axes, one in each contrast: cells keep to each, whatever its scale."""
     at = grid((24, 24, 24))
     images = [tetopt.Image(scale * (at[..., d] > 7.5 + 3 * d)) for d, scale in enumerate((1.0, 1e-4, 3e4))]
-    wanted = content(images)
-    result = tetopt.mesh_image(wanted, 400)
-    assert result.history[-1].E_D == pytest.approx(hard_E_D(wanted, result.mesh), rel=1e-9)
+    target = content(images)
+    result = tetopt.mesh_image(target, 400)
+    assert result.history[-1].E_D == pytest.approx(hard_E_D(target, result.mesh), rel=1e-9)
     for image in images:
         assert tetopt.E_D(image, result.mesh) < 0.02 * np.var(image.data, dtype=float) * image.volume
     alone = tetopt.mesh_image(images[0], 400).mesh
@@ -214,8 +215,8 @@ def test_contrasts_of_different_scales_are_all_seen():
 def test_labels_within_a_mask():
     image, mask = shaped("ball")
     labels = tetopt.Image(1.0 + (grid(image.shape)[..., 2] > 16))
-    wanted = content(image, labels, mask)
-    mesh = tetopt.mesh_image(wanted, 800, iterations=8).mesh
+    target = content(image, labels, mask)
+    mesh = tetopt.mesh_image(target, 800, iterations=8).mesh
     check(image, mask, mesh)
     of_cell = cell_labels(labels, mesh)
     assert set(of_cell) == {1, 2}
@@ -226,11 +227,11 @@ def test_labels_within_a_mask():
 
 def test_an_error_wanted_within_a_mask():
     image, mask = shaped("ball")
-    wanted = content(image, mask=mask)
-    result = tetopt.mesh_image(wanted, target_error=0.2, iterations=6)
-    share = result.history[-1].E_D / (wanted.variance * wanted.volume)
+    target = content(image, mask=mask)
+    result = tetopt.mesh_image(target, target_error=0.2, iterations=6)
+    share = result.history[-1].E_D / (target.variance * target.volume)
     assert 0.1 < share <= 0.2
-    more = tetopt.mesh_image(wanted, target_error=0.1, iterations=6)
+    more = tetopt.mesh_image(target, target_error=0.1, iterations=6)
     assert len(more.mesh.points) > len(result.mesh.points)
 
 
@@ -243,8 +244,8 @@ def test_level_between_voxels():
     for shape in ((4, 5, 6), (1, 5, 6), (2, 2, 2)):
         level = rng.normal(size=shape).astype(np.float32)
         at = rng.uniform(-1.0, 6.0, size=(30, 3))
-        found = [level_at(level, *place) for place in at]
-        np.testing.assert_allclose(found, levels(level, np.clip(at, 0, np.array(shape) - 1.0)), atol=1e-6)
+        values = [level_at(level, *place) for place in at]
+        np.testing.assert_allclose(values, levels(level, np.clip(at, 0, np.array(shape) - 1.0)), atol=1e-6)
 
 
 @pytest.mark.kernel
@@ -255,17 +256,17 @@ def test_put_on_surface():
     region_level = (distance(shape, 11.0, 12.0, -3.0) - 9.0).astype(np.float32)
     points = np.random.default_rng(0).uniform(3.0, 20.0, size=(40, 3))
     points[20:, 2] = -0.5
-    wanted = content(image)
-    grid_ = channel_grid(wanted, image.to_world(points))
+    target = content(image)
+    grid_ = channel_grid(target, image.to_world(points))
     ticks = to_ticks(points, grid_)
     before = ticks.copy()
     matrix = image.affine[:3, :3].copy()
-    sides = sides_of(grid_, matrix, False, region_level)
-    measure = measure_of(grid_, 1, matrix, 1.0, 1.0, 3.0)
     is_frozen = np.zeros((40, 4), dtype=bool)
     is_frozen[20:, 2] = True
+    objective, sides = objective_of(grid_, matrix, 3.0), sides_of(grid_, matrix, False, region_level)
+    state = build(np.empty((0, 4), dtype=np.int64), ticks, is_frozen, objective, sides)
     normal = np.empty((2, 3))
-    reached = np.array([put_on_surface(normal, ticks, k, is_frozen, sides, measure) for k in range(40)])
+    reached = np.array([put_on_surface(normal, state, k) for k in range(40)])
     assert reached.mean() > 0.8
     there = ticks[reached] * 2.0**-grid_.bits
     assert np.abs(levels(region_level, there)).max() < 1.5e-3
@@ -281,11 +282,11 @@ def test_no_facet_turns_over():
     mask[3:6, 3:17, 9] = 1.0
     rng = np.random.default_rng(0)
     image = tetopt.Image(rng.normal(size=mask.shape))
-    wanted = content(image, mask=tetopt.Image(mask))
-    start = lattice_within(wanted.image, wanted.region, spacing=3.0)
-    result = tetopt.optimize(wanted, start, k_D=0.9, iterations=4, min_dihedral=0.0)
+    target = content(image, mask=tetopt.Image(mask))
+    start = lattice_within(target.image, target.region, spacing=3.0)
+    result = tetopt.optimize(target, start, k_D=0.9, iterations=4, min_dihedral=0.0)
     total, covered = times_covered(image, result.mesh)
     assert total == covered
-    grid_ = channel_grid(wanted, result.mesh.points)
-    sums = moment_sums(grid_, to_ticks(wanted.image.to_index(result.mesh.points), grid_), result.mesh.cells)
+    grid_ = channel_grid(target, result.mesh.points)
+    sums = moment_sums(grid_, to_ticks(target.image.to_index(result.mesh.points), grid_), result.mesh.cells)
     assert sums[:, 0].sum() == total

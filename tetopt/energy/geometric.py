@@ -16,6 +16,7 @@ from numba import njit
 from numpy.typing import NDArray
 
 from tetopt.geometry.simplex import Cells, Points, squared_edges, volume_gradients, volumes
+from tetopt.geometry.vectors import cross, difference, dot
 
 
 def cell_E_G(points: Points, cells: Cells) -> NDArray[np.float64]:
@@ -64,13 +65,25 @@ def volume_and_E_G(x: NDArray, n_corners: int) -> tuple[float, float]:
         for k in range(i + 1, n_corners):
             for d in range(4 - n_corners, 3):
                 edges += (x[i, d] - x[k, d]) ** 2
+    u, v = difference(x, 1, 0), difference(x, 2, 0)
     if n_corners == 4:
-        a0, a1, a2 = x[1, 0] - x[0, 0], x[1, 1] - x[0, 1], x[1, 2] - x[0, 2]
-        b0, b1, b2 = x[2, 0] - x[0, 0], x[2, 1] - x[0, 1], x[2, 2] - x[0, 2]
-        c0, c1, c2 = x[3, 0] - x[0, 0], x[3, 1] - x[0, 1], x[3, 2] - x[0, 2]
-        volume = a0 * (b1 * c2 - b2 * c1) + a1 * (b2 * c0 - b0 * c2) + a2 * (b0 * c1 - b1 * c0)
-        volume = abs(volume) / 6.0
+        volume = abs(dot(u, cross(v, difference(x, 3, 0)))) / 6.0
     else:
-        volume = (x[1, 1] - x[0, 1]) * (x[2, 2] - x[0, 2]) - (x[1, 2] - x[0, 2]) * (x[2, 1] - x[0, 1])
-        volume = abs(volume) / 2.0
+        volume = abs(cross(u, v)[0]) / 2.0
     return volume, volume * edges / (n_corners * (n_corners + 1))
+
+
+@njit(cache=True)
+def volume_gradient(x: NDArray, at: int, n_corners: int) -> tuple:
+    """Derivative of the unsigned volume of the cell with corners x (4, 3) by its corner `at`.
+
+    It points from the opposite face to the corner, as long as the face's area over n.
+    """
+    if n_corners == 4:
+        a, b, c = (at + 1) & 3, (at + 2) & 3, (at + 3) & 3
+        n = cross(difference(x, b, a), difference(x, c, a))
+        v = (n[0] / 6.0, n[1] / 6.0, n[2] / 6.0)
+    else:
+        a, b = (at + 1) % 3, (at + 2) % 3
+        v = (0.0, (x[b, 2] - x[a, 2]) / 2.0, (x[a, 1] - x[b, 1]) / 2.0)
+    return v if dot(v, difference(x, at, a)) > 0.0 else (-v[0], -v[1], -v[2])

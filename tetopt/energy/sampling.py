@@ -33,11 +33,12 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.geometry.topology import Facets, facets
+from tetopt.geometry.vectors import cross, difference, dot, row
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.target.content import Content
 
-CHUNK = 64  # facets or cells that a parallel task takes at once
+CELLS_PER_CHUNK = 64  # cells, facets or nodes that a parallel task takes at once
 
 
 class CellMoments(NamedTuple):
@@ -66,10 +67,10 @@ def cell_moments(image: Image, mesh: Mesh) -> CellMoments:
     sums = moment_sums(grid, ticks, mesh.cells)
     n_voxels = sums[:, 0].astype(np.int64)
     is_empty = n_voxels == 0
-    held = np.maximum(sums[:, 0], 1.0)
-    offset = sums[:, 1] / held  # divided, not multiplied by 1 / held: the mean of equal whole numbers is that number
+    count = np.maximum(sums[:, 0], 1.0)
+    offset = sums[:, 1] / count  # divided, not multiplied by 1 / count: the mean of equal whole numbers is that number
     mean = grid.shift + offset
-    variance = np.maximum(sums[:, 2] / held - offset**2, 0.0)
+    variance = np.maximum(sums[:, 2] / count - offset**2, 0.0)
     mean[is_empty] = nearest_values(image, mesh.points[mesh.cells[is_empty]].mean(axis=1))
     return CellMoments(n_voxels, mean, variance)
 
@@ -211,8 +212,8 @@ def channel_grid(content: Content, points: NDArray[np.float64]) -> SamplingGrid:
     first = 2 if content.is_plain else 0
     prefix = np.zeros((*grid.prefix.shape[:3], first + len(rows)), dtype=np.int32 if is_short else np.float64)
     prefix[..., :first] = grid.prefix[..., :first]
-    for number, row in enumerate(rows, first):
-        np.cumsum(row.reshape(grid.shape), axis=2, out=prefix[:, :, 1:, number], dtype=prefix.dtype)
+    for number, values in enumerate(rows, first):
+        np.cumsum(values.reshape(grid.shape), axis=2, out=prefix[:, :, 1:, number], dtype=prefix.dtype)
     return SamplingGrid(prefix, grid.bits, shift, len(content.values))
 
 
@@ -314,14 +315,14 @@ def _fill_prefix(prefix: NDArray, volume: NDArray, shift: float) -> None:
 
 
 @njit(cache=True)
-def dot_sign(n0: int, n1: int, n2: int, d0: int, d1: int, d2: int) -> int:
+def dot_sign(n: tuple, d: tuple) -> int:
     """Exact sign of n . d, with |n| < 2**60 and |d| < 2**30: the products need up to 90 bits.
 
     Each n is cut into a high part and 30 low bits, and the two dot products are added with carry.
     """
     mask = (1 << 30) - 1
-    low = (n0 & mask) * d0 + (n1 & mask) * d1 + (n2 & mask) * d2
-    high = (n0 >> 30) * d0 + (n1 >> 30) * d1 + (n2 >> 30) * d2 + (low >> 30)
+    low = dot((n[0] & mask, n[1] & mask, n[2] & mask), d)
+    high = dot((n[0] >> 30, n[1] >> 30, n[2] >> 30), d) + (low >> 30)
     if high > 0:
         return 1
     if high < 0:
@@ -333,13 +334,10 @@ def dot_sign(n0: int, n1: int, n2: int, d0: int, d1: int, d2: int) -> int:
 def cell_orientation(ticks: NDArray, cells: NDArray, cell: int) -> int:
     """Sign of a cell's volume in index space; exact."""
     a, b, c = cells[cell, 0], cells[cell, 1], cells[cell, 2]
-    e0, e1, e2 = ticks[b, 0] - ticks[a, 0], ticks[b, 1] - ticks[a, 1], ticks[b, 2] - ticks[a, 2]
-    f0, f1, f2 = ticks[c, 0] - ticks[a, 0], ticks[c, 1] - ticks[a, 1], ticks[c, 2] - ticks[a, 2]
-    n0, n1, n2 = e1 * f2 - e2 * f1, e2 * f0 - e0 * f2, e0 * f1 - e1 * f0
+    n = cross(difference(ticks, b, a), difference(ticks, c, a))
     if cells.shape[1] == 3:
-        return 1 if n0 > 0 else (-1 if n0 < 0 else 0)
-    d = cells[cell, 3]
-    return dot_sign(n0, n1, n2, ticks[d, 0] - ticks[a, 0], ticks[d, 1] - ticks[a, 1], ticks[d, 2] - ticks[a, 2])
+        return 1 if n[0] > 0 else (-1 if n[0] < 0 else 0)
+    return dot_sign(n, difference(ticks, cells[cell, 3], a))
 
 
 @njit(cache=True)
@@ -368,14 +366,12 @@ def _edge_threshold(p0: int, p1: int, q0: int, q1: int, slope: float, bits: int,
 
 
 @njit(cache=True)
-def _exact_facet_threshold(
-    n0: int, n1: int, n2: int, a0: int, a1: int, a2: int, bits: int, i: int, j: int, low: int, high: int
-) -> int:
-    """The first voxel in [low, high] of row (i, j) on or above the facet through a with normal n, n2 > 0."""
-    d0, d1 = (i << bits) - a0, (j << bits) - a1
+def _exact_facet_threshold(n: tuple, a: tuple, bits: int, i: int, j: int, low: int, high: int) -> int:
+    """The first voxel in [low, high] of row (i, j) on or above the facet through a with normal n, n[2] > 0."""
+    d0, d1 = (i << bits) - a[0], (j << bits) - a[1]
     while low < high:
         middle = (low + high) >> 1
-        if dot_sign(n0, n1, n2, d0, d1, (middle << bits) - a2) >= 0:
+        if dot_sign(n, (d0, d1, (middle << bits) - a[2])) >= 0:
             high = middle
         else:
             low = middle + 1
@@ -384,136 +380,129 @@ def _exact_facet_threshold(
 
 @njit(cache=True)
 def triangle_flux(
-    a0: int, a1: int, a2: int, b0: int, b1: int, b2: int, c0: int, c1: int, c2: int, bits: int, prefix: NDArray,
-    steps: NDArray | None, change: int, out: NDArray, p: int, q: int,
+    ticks: NDArray, node_a: int, node_b: int, node_c: int, bits: int, prefix: NDArray, scatter: tuple | None,
+    out: NDArray, p: int, q: int,
 ) -> None:  # fmt: skip
-    """Flux of the triangle (a, b, c), corners in ticks: sums of k and of each P(k) over the rows that cross it.
+    """Flux of the triangle of three nodes: sums of k and of each P(k) over the rows that cross it.
 
-    It goes to out[p, q, :], one entry more than `prefix` has. Or, where `steps` is an array, add `change`, signed as
-    the flux, to it at each crossing.
+    It goes to out[p, q, :], one entry more than `prefix` has. Or, where `scatter` is an array of steps and a change,
+    the change, signed as the flux, is added to the steps at each crossing.
     """
     n_more = out.shape[2] - 3
     for d in range(3 + n_more):
         out[p, q, d] = 0.0
-    e0, e1, e2 = b0 - a0, b1 - a1, b2 - a2
-    f0, f1, f2 = c0 - a0, c1 - a1, c2 - a2
-    n2 = e0 * f1 - e1 * f0
-    if n2 == 0:  # it stands along the rows: none crosses it
+    n = cross(difference(ticks, node_b, node_a), difference(ticks, node_c, node_a))
+    if n[2] == 0:  # it stands along the rows: none crosses it
         return
-    n0, n1 = e1 * f2 - e2 * f1, e2 * f0 - e0 * f2
-    sign = 1 if n2 > 0 else -1
-    n0, n1, n2 = sign * n0, sign * n1, sign * n2
+    sign = 1 if n[2] > 0 else -1
+    n = (sign * n[0], sign * n[1], sign * n[2])
     # Corners in the order of axis 0: on each line one cut is on the long edge a-c, the other on a-b, then on b-c.
-    if b0 < a0:
-        a0, a1, a2, b0, b1, b2 = b0, b1, b2, a0, a1, a2
-    if c0 < b0:
-        b0, b1, b2, c0, c1, c2 = c0, c1, c2, b0, b1, b2
-        if b0 < a0:
-            a0, a1, a2, b0, b1, b2 = b0, b1, b2, a0, a1, a2
+    a, b, c = row(ticks, node_a), row(ticks, node_b), row(ticks, node_c)
+    if b[0] < a[0]:
+        a, b = b, a
+    if c[0] < b[0]:
+        b, c = c, b
+        if b[0] < a[0]:
+            a, b = b, a
     n_i, n_j, n_k = prefix.shape[0], prefix.shape[1], prefix.shape[2] - 1
-    first, last = max(-((-a0) >> bits), 0), min(-((-c0) >> bits), n_i)
-    long_slope = (c1 - a1) / (c0 - a0)
-    early_slope = (b1 - a1) / (b0 - a0) if b0 > a0 else 0.0
-    late_slope = (c1 - b1) / (c0 - b0) if c0 > b0 else 0.0
+    first, last = max(-((-a[0]) >> bits), 0), min(-((-c[0]) >> bits), n_i)
+    long_slope = (c[1] - a[1]) / (c[0] - a[0])
+    early_slope = (b[1] - a[1]) / (b[0] - a[0]) if b[0] > a[0] else 0.0
+    late_slope = (c[1] - b[1]) / (c[0] - b[0]) if c[0] > b[0] else 0.0
     # The facet cuts row (i, j) at a2 + slope0 (i - a0) + slope1 (j - a1), terms no larger than `size`.
     scale = 2.0**-bits
-    slope0, slope1 = -(n0 / n2), -(n1 / n2)
-    at0, at1, at2 = a0 * scale, a1 * scale, a2 * scale
-    size = abs(slope0) * (c0 - a0) + abs(slope1) * (abs(b1 - a1) + abs(c1 - a1))
+    slope0, slope1 = -(n[0] / n[2]), -(n[1] / n[2])
+    at = (a[0] * scale, a[1] * scale, a[2] * scale)
+    size = abs(slope0) * (c[0] - a[0]) + abs(slope1) * (abs(b[1] - a[1]) + abs(c[1] - a[1]))
     error = 1e-9 + 4e-15 * scale * size
     margin = 0.5 - error if error < 0.25 else -1.0
-    lowest, highest = min(a2, b2, c2) >> bits, -((-max(a2, b2, c2)) >> bits)
+    lowest, highest = min(a[2], b[2], c[2]) >> bits, -((-max(a[2], b[2], c[2])) >> bits)
     count, sum_1, sum_2 = 0, 0.0, 0.0
     for i in range(first, last):
-        one = _edge_threshold(a0, a1, c0, c1, long_slope, bits, i)
-        if (i << bits) < b0:
-            other = _edge_threshold(a0, a1, b0, b1, early_slope, bits, i)
+        one = _edge_threshold(a[0], a[1], c[0], c[1], long_slope, bits, i)
+        if (i << bits) < b[0]:
+            other = _edge_threshold(a[0], a[1], b[0], b[1], early_slope, bits, i)
         else:
-            other = _edge_threshold(b0, b1, c0, c1, late_slope, bits, i)
-        line = at2 + slope0 * (i - at0)
+            other = _edge_threshold(b[0], b[1], c[0], c[1], late_slope, bits, i)
+        line = at[2] + slope0 * (i - at[0])
         for j in range(max(min(one, other), 0), min(max(one, other), n_j)):
-            cut = line + slope1 * (j - at1)
+            cut = line + slope1 * (j - at[1])
             up = np.ceil(cut)
             k: Any = np.int64(up)
             if abs(up - cut - 0.5) > margin:
-                k = _exact_facet_threshold(n0, n1, n2, a0, a1, a2, bits, i, j, lowest, highest)
+                k = _exact_facet_threshold(n, a, bits, i, j, lowest, highest)
             k = min(max(k, 0), n_k)
-            if steps is None:  # numba compiles only the branch that is taken
+            if scatter is None:  # numba compiles only the branch that is taken
                 count += k
                 sum_1 += prefix[i, j, k, 0]
                 sum_2 += prefix[i, j, k, 1]
                 for d in range(n_more):
                     out[p, q, 3 + d] += sign * prefix[i, j, k, 2 + d]
             else:
-                steps[i, j, k] += sign * change
+                scatter[0][i, j, k] += sign * scatter[1]
     out[p, q, 0], out[p, q, 1], out[p, q, 2] = float(sign * count), sign * sum_1, sign * sum_2
 
 
 @njit(cache=True)
 def segment_flux(
-    a1: int, a2: int, b1: int, b2: int, bits: int, prefix: NDArray, steps: NDArray | None, change: int, out: NDArray,
-    p: int, q: int,
+    ticks: NDArray, node_a: int, node_b: int, bits: int, prefix: NDArray, scatter: tuple | None, out: NDArray, p: int,
+    q: int,
 ) -> None:  # fmt: skip
-    """Flux of the segment (a, b) of a 2-D mesh, coordinates along axes 1 and 2 in ticks; as `triangle_flux`."""
+    """Flux of the segment of two nodes of a 2-D mesh, which lies along axes 1 and 2; as `triangle_flux`."""
     n_more = out.shape[2] - 3
     for d in range(3 + n_more):
         out[p, q, d] = 0.0
-    if a1 == b1:
+    a, b = row(ticks, node_a), row(ticks, node_b)
+    if a[1] == b[1]:
         return
-    sign = -1 if b1 > a1 else 1  # it faces to the right of a -> b
-    if b1 < a1:
-        a1, a2, b1, b2 = b1, b2, a1, a2
-    slope = (b2 - a2) / (b1 - a1)
+    sign = -1 if b[1] > a[1] else 1  # it faces to the right of a -> b
+    if b[1] < a[1]:
+        a, b = b, a
+    slope = (b[2] - a[2]) / (b[1] - a[1])
     n_k = prefix.shape[2] - 1
     count, sum_1, sum_2 = 0, 0.0, 0.0
-    for j in range(max(-((-a1) >> bits), 0), min(-((-b1) >> bits), prefix.shape[1])):
-        k = min(max(_edge_threshold(a1, a2, b1, b2, slope, bits, j), 0), n_k)
-        if steps is None:
+    for j in range(max(-((-a[1]) >> bits), 0), min(-((-b[1]) >> bits), prefix.shape[1])):
+        k = min(max(_edge_threshold(a[1], a[2], b[1], b[2], slope, bits, j), 0), n_k)
+        if scatter is None:
             count += k
             sum_1 += prefix[0, j, k, 0]
             sum_2 += prefix[0, j, k, 1]
             for d in range(n_more):
                 out[p, q, 3 + d] += sign * prefix[0, j, k, 2 + d]
         else:
-            steps[0, j, k] += sign * change
+            scatter[0][0, j, k] += sign * scatter[1]
     out[p, q, 0], out[p, q, 1], out[p, q, 2] = float(sign * count), sign * sum_1, sign * sum_2
 
 
 @njit(cache=True)
 def facet_flux(
-    ticks: NDArray, nodes: NDArray, facet: int, bits: int, prefix: NDArray, steps: NDArray | None, change: int,
-    out: NDArray, p: int,
-) -> None:  # fmt: skip
+    ticks: NDArray, nodes: NDArray, facet: int, bits: int, prefix: NDArray, scatter: tuple | None, out: NDArray, p: int
+) -> None:
     """Flux of one of the facets `nodes` (F, n) to out[p, 0, :]; see `facet_fluxes` and `triangle_flux`."""
     a, b = nodes[facet, 0], nodes[facet, 1]
     if nodes.shape[1] == 2:
-        segment_flux(ticks[a, 1], ticks[a, 2], ticks[b, 1], ticks[b, 2], bits, prefix, steps, change, out, p, 0)
-        return
-    c = nodes[facet, 2]
-    triangle_flux(
-        ticks[a, 0], ticks[a, 1], ticks[a, 2], ticks[b, 0], ticks[b, 1], ticks[b, 2],
-        ticks[c, 0], ticks[c, 1], ticks[c, 2], bits, prefix, steps, change, out, p, 0,
-    )  # fmt: skip
+        segment_flux(ticks, a, b, bits, prefix, scatter, out, p, 0)
+    else:
+        triangle_flux(ticks, a, b, nodes[facet, 2], bits, prefix, scatter, out, p, 0)
 
 
 @njit(cache=True, parallel=True)
 def _fill_fluxes(fluxes: NDArray, ticks: NDArray, nodes: NDArray, bits: int, prefix: NDArray) -> None:
-    for chunk in prange((len(nodes) + CHUNK - 1) // CHUNK):
-        for facet in range(chunk * CHUNK, min((chunk + 1) * CHUNK, len(nodes))):
-            facet_flux(ticks, nodes, facet, bits, prefix, None, 0, fluxes, facet)
+    for chunk in prange((len(nodes) + CELLS_PER_CHUNK - 1) // CELLS_PER_CHUNK):
+        for facet in range(chunk * CELLS_PER_CHUNK, min((chunk + 1) * CELLS_PER_CHUNK, len(nodes))):
+            facet_flux(ticks, nodes, facet, bits, prefix, None, fluxes, facet)
 
 
 @njit(cache=True, parallel=True)
 def _fill_sums(sums: NDArray, fluxes: NDArray, of_cell: NDArray, sign: NDArray, hand: int) -> None:
-    for chunk in prange((len(sums) + CHUNK - 1) // CHUNK):
-        for cell in range(chunk * CHUNK, min((chunk + 1) * CHUNK, len(sums))):
+    for chunk in prange((len(sums) + CELLS_PER_CHUNK - 1) // CELLS_PER_CHUNK):
+        for cell in range(chunk * CELLS_PER_CHUNK, min((chunk + 1) * CELLS_PER_CHUNK, len(sums))):
             for d in range(sums.shape[1]):
                 total = 0.0
                 for k in range(of_cell.shape[1]):
                     total += sign[cell, k] * fluxes[of_cell[cell, k], d]
-                sums[cell, d] = (
-                    hand * total if d == 0 or sums[cell, 0] > 0.0 else 0.0
-                )  # no rounding left without voxels
+                is_rounding = d > 0 and sums[cell, 0] <= 0.0  # what is left without voxels
+                sums[cell, d] = 0.0 if is_rounding else hand * total
 
 
 @njit(cache=True)
@@ -522,4 +511,4 @@ def _scatter_changes(
 ) -> None:
     unused = np.empty((1, 1, 3))
     for facet in range(len(nodes)):
-        facet_flux(ticks, nodes, facet, bits, prefix, steps, change[facet], unused, 0)
+        facet_flux(ticks, nodes, facet, bits, prefix, (steps, change[facet]), unused, 0)

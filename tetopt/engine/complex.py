@@ -18,16 +18,18 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from tetopt.energy.sampling import SamplingGrid, few_threads, segment_flux, triangle_flux
+from tetopt.energy.sampling import CELLS_PER_CHUNK, few_threads, segment_flux, triangle_flux
+from tetopt.geometry.vectors import cross, difference, dot, minus, put_row, row, scaled, times
 
-CHUNK = 64
-FLAT = 1e-7  # a cell's volume over (sum of squared edges)^(n/2); below, it counts as inverted: an angle of 1e-3 degrees
+# A cell's volume over (sum of squared edges)^(n/2); below, it counts as inverted: an angle of 1e-3 degrees.
+FLAT_SHARE = 1e-7
 
 
 class Complex(NamedTuple):
     """Nodes, cells, who touches whom, and what each cell holds. Rows from `n_cells` on are room for more cells."""
 
     ticks: NDArray[np.int64]  # (N, 3) node positions on the sampling grid
+    is_frozen: NDArray[np.bool_]  # (N, 4) axes along which each node stays; whether it stays on the mask's surface
     cells: NDArray[np.int64]  # (C, n+1) corners, positively oriented in the world
     across: NDArray[np.int64]  # (C, n+1) the cell beyond each facet; -1 outside
     fluxes: NDArray[np.float64]  # (C, n+1, D) of each facet, outwards
@@ -36,7 +38,7 @@ class Complex(NamedTuple):
     n_cells: NDArray[np.int64]  # (1,) rows in use
 
 
-class Measure(NamedTuple):
+class Objective(NamedTuple):
     """What turns a cell into an energy."""
 
     prefix: NDArray  # of the sampling grid
@@ -49,53 +51,83 @@ class Measure(NamedTuple):
     n_channels: int
     power: float  # p of the shape energy
     is_graded: bool  # whether every cell's shape counts the same, whatever its size
-    is_kept: bool  # whether the boundary's facets stay as they are
     floor: float  # minus the cosine of the smallest dihedral angle that a move may leave; -1 for none
     safe: float  # a tetrahedron whose S^3 is up to this times its squared determinant is above the floor
+    rounding: float = 0.0  # a sum of squares up to this, over all cells, is only rounding
+    wrong_side: float = 0.0  # what a voxel on the wrong side of the mask's surface counts, in squares; see `surface`
 
 
-def build(cells: NDArray[np.int64], ticks: NDArray[np.int64], measure: Measure) -> Complex:
-    """The complex of a conforming mesh, everything measured.
+class Sides(NamedTuple):
+    """Where nodes may be put on the boundary: the box's sides, the mask's surface."""
 
-    `ticks` is kept, not copied. The cells must be a mesh: at most two to a facet, see `tetopt.geometry.check`.
+    low: NDArray[np.int64]  # (3,) ticks of the box's sides
+    high: NDArray[np.int64]
+    is_fixed: bool  # whether boundary nodes stay where they are
+    has_surface: bool  # whether what is not on the box's sides is on the mask's surface
+    level: NDArray[np.float32]  # (s_0, s_1, s_2) its level function; (1, 1, 1) without
+    projections: NDArray[np.float64]  # see `tetopt.engine.descent.free_projections`
+    inverse: NDArray[np.float64]  # (3, 3) mm to index vectors
+
+
+class State(NamedTuple):
+    """What the kernels carry together; made by `tetopt.engine.state.state_of`.
+
+    numba takes no tuple of tuples into the body of a `prange`, and drops what that writes through a tuple: parallel
+    kernels take the three parts, and their bodies are functions of a state put together again.
+    """
+
+    complex: Complex
+    objective: Objective
+    sides: Sides
+
+
+def build(
+    cells: NDArray[np.int64], ticks: NDArray[np.int64], is_frozen: NDArray[np.bool_], objective: Objective, sides: Sides
+) -> State:
+    """The state of a conforming mesh, everything measured.
+
+    `ticks` and `is_frozen` are kept, not copied. The cells must be a mesh: at most two to a facet, see `tetopt.check`.
     """
     n_cells, n_corners = cells.shape
-    room = n_cells + n_cells // 4 + 64
-    held = Complex(
+    room, n_sums = n_cells + n_cells // 4 + 64, objective.prefix.shape[3] + 1
+    complex_ = Complex(
         ticks,
+        is_frozen,
         np.full((room, n_corners), -1, dtype=np.int64),
         np.full((room, n_corners), -1, dtype=np.int64),
-        np.zeros((room, n_corners, measure.prefix.shape[3] + 1)),
-        np.zeros((room, measure.prefix.shape[3] + 1)),
+        np.zeros((room, n_corners, n_sums)),
+        np.zeros((room, n_sums)),
         np.zeros(room),
         np.array([n_cells]),
     )
-    held.cells[:n_cells] = cells
-    fill_across(held.across, held.cells, n_cells, len(ticks))
-    with few_threads(n_cells * 4):
-        measure_all(held, measure)
-    return held
+    complex_.cells[:n_cells] = cells
+    fill_across(complex_.across, complex_.cells, n_cells, len(ticks))
+    state = State(complex_, objective, sides)
+    remeasure(state)
+    return state
 
 
-def copied(held: Complex) -> Complex:
-    """The complex in arrays of its own."""
-    return Complex(
-        held.ticks.copy(), held.cells.copy(), held.across.copy(), held.fluxes.copy(), held.sums.copy(),
-        held.E_shape.copy(), held.n_cells.copy(),
-    )  # fmt: skip
+def remeasure(state: State) -> None:
+    """Fluxes, sums and shape energies of all cells, afresh."""
+    with few_threads(int(state.complex.n_cells[0]) * 4):
+        _measure_all(*state)
 
 
-def grown(held: Complex, least: int = 64) -> Complex:
-    """The complex with room for a quarter more cells, and for `least`."""
-    more = held.n_cells[0] // 4 + least
+def copied(state: State) -> State:
+    """The state with a complex in arrays of its own."""
+    return state._replace(complex=Complex._make(array.copy() for array in state.complex))
+
+
+def grown(state: State, least: int = 64) -> State:
+    """The state with room for a quarter more cells, and for `least`."""
+    more = int(state.complex.n_cells[0]) // 4 + least
 
     def wider(array: NDArray) -> NDArray:
         return np.concatenate([array, np.full((more, *array.shape[1:]), -1, dtype=array.dtype)])
 
-    return Complex(
-        held.ticks, wider(held.cells), wider(held.across), wider(held.fluxes), wider(held.sums), wider(held.E_shape),
-        held.n_cells,
-    )  # fmt: skip
+    ticks, is_frozen, cells, across, fluxes, sums, E_shape, n_cells = state.complex
+    rows = wider(cells), wider(across), wider(fluxes), wider(sums), wider(E_shape)
+    return state._replace(complex=Complex(ticks, is_frozen, *rows, n_cells))
 
 
 @njit(cache=True, error_model="numpy")
@@ -105,21 +137,14 @@ def fill_across(across: NDArray, cells: NDArray, n_cells: int, n_nodes: int) -> 
     start = np.zeros(n_nodes + 1, dtype=np.int64)
     for c in range(n_cells):
         for k in range(n):
-            lowest = n_nodes
-            for m in range(n):
-                if m != k:
-                    lowest = min(lowest, cells[c, m])
-            start[lowest + 1] += 1
+            start[_lowest_node(cells, c, k) + 1] += 1
     for i in range(n_nodes):
         start[i + 1] += start[i]
     fill = start.copy()
     items = np.empty(start[n_nodes], dtype=np.int64)
     for c in range(n_cells):
         for k in range(n):
-            lowest = n_nodes
-            for m in range(n):
-                if m != k:
-                    lowest = min(lowest, cells[c, m])
+            lowest = _lowest_node(cells, c, k)
             items[fill[lowest]] = c * n + k
             fill[lowest] += 1
     for i in range(n_nodes):
@@ -129,22 +154,33 @@ def fill_across(across: NDArray, cells: NDArray, n_cells: int, n_nodes: int) -> 
                 continue
             for q in range(p + 1, start[i + 1]):
                 d, m = items[q] // n, items[q] % n
-                same = d != c
-                for s in range(n):
-                    if s != k and same:
-                        found = False
-                        for t in range(n):
-                            if t != m and cells[d, t] == cells[c, s]:
-                                found = True
-                        same = found
-                if same:
+                if d != c and _is_one_facet(cells, c, k, d, m):
                     across[c, k] = d
                     across[d, m] = c
                     break
 
 
 @njit(cache=True, error_model="numpy")
-def facet_of(cells: NDArray, across: NDArray, cell: int, other: int) -> int:
+def _lowest_node(cells: NDArray, cell: int, k: int) -> int:
+    """The lowest node of facet k of a cell."""
+    lowest = cells[cell, 1 if k == 0 else 0]
+    for m in range(cells.shape[1]):
+        if m != k:
+            lowest = min(lowest, cells[cell, m])
+    return lowest
+
+
+@njit(cache=True, error_model="numpy")
+def _is_one_facet(cells: NDArray, c: int, k: int, d: int, m: int) -> bool:
+    """Whether facet k of cell c has the same nodes as facet m of cell d."""
+    for s in range(cells.shape[1]):
+        if s != k and (cells[c, s] == cells[d, m] or not has_node(cells, d, cells[c, s])):
+            return False
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def facet_of(across: NDArray, cell: int, other: int) -> int:
     """The facet of `cell` beyond which `other` lies."""
     k = 0
     while across[cell, k] != other:
@@ -164,25 +200,20 @@ def corner_of(cells: NDArray, cell: int, node: int) -> int:
 @njit(cache=True, error_model="numpy")
 def has_node(cells: NDArray, cell: int, node: int) -> bool:
     """Whether `node` is a corner of `cell`."""
-    found = False
+    is_corner = False
     for k in range(cells.shape[1]):
-        found = found or cells[cell, k] == node
-    return found
+        is_corner = is_corner or cells[cell, k] == node
+    return is_corner
 
 
 @njit(cache=True, error_model="numpy")
-def put_flux(out: NDArray, p: int, q: int, ticks: NDArray, a: int, b: int, c: int, measure: Measure) -> None:
+def put_flux(out: NDArray, p: int, q: int, ticks: NDArray, a: int, b: int, c: int, objective: Objective) -> None:
     """Flux of the facet (a, b, c), or (a, b) with c < 0, times the sign of index space, to out[p, q, :]."""
     if c < 0:
-        segment_flux(
-            ticks[a, 1], ticks[a, 2], ticks[b, 1], ticks[b, 2], measure.bits, measure.prefix, None, 0, out, p, q
-        )
+        segment_flux(ticks, a, b, objective.bits, objective.prefix, None, out, p, q)
     else:
-        triangle_flux(
-            ticks[a, 0], ticks[a, 1], ticks[a, 2], ticks[b, 0], ticks[b, 1], ticks[b, 2],
-            ticks[c, 0], ticks[c, 1], ticks[c, 2], measure.bits, measure.prefix, None, 0, out, p, q,
-        )  # fmt: skip
-    if measure.hand < 0:
+        triangle_flux(ticks, a, b, c, objective.bits, objective.prefix, None, out, p, q)
+    if objective.hand < 0:
         for d in range(out.shape[2]):
             out[p, q, d] = -out[p, q, d]
 
@@ -214,9 +245,9 @@ def image_energy(sums: NDArray, row: int, n_channels: int) -> float:
 
 
 @njit(cache=True, error_model="numpy")
-def wrong_side(sums: NDArray, row: int, measure: Measure) -> float:
+def wrong_side(sums: NDArray, row: int, objective: Objective) -> float:
     """Weighted voxels outside of the mask less those inside, in one cell: what changes is the mask's misfit."""
-    return measure.surface * sums[row, sums.shape[1] - 1] if measure.surface > 0.0 else 0.0
+    return objective.surface * sums[row, sums.shape[1] - 1] if objective.surface > 0.0 else 0.0
 
 
 @njit(cache=True, error_model="numpy")
@@ -232,15 +263,15 @@ def shape_energy(x: NDArray, n_corners: int, power: float, is_graded: bool) -> f
     cell's own volume, all sizes cancel, and what is left is eta^p: the same for every cell of that shape, so that the
     shape term has no wish for any size and E_D alone says where cells are small.
 
-    Corners come from `load`, which subtracts in integers: rounding of the signed volume is far below `FLAT`, so a cell
-    that passes is positively oriented exactly.
+    Corners come from `load`, which subtracts in integers: rounding of the signed volume is far below `FLAT_SHARE`, so a
+    cell that passes is positively oriented exactly.
     """
     if n_corners == 3:
-        u1, u2 = x[1, 1] - x[0, 1], x[1, 2] - x[0, 2]
-        v1, v2 = x[2, 1] - x[0, 1], x[2, 2] - x[0, 2]
-        volume = 0.5 * (u1 * v2 - u2 * v1)
-        S = u1 * u1 + u2 * u2 + v1 * v1 + v2 * v2 + (u1 - v1) * (u1 - v1) + (u2 - v2) * (u2 - v2)
-        if volume <= FLAT * S:
+        u, v = difference(x, 1, 0), difference(x, 2, 0)
+        w = minus(u, v)
+        volume = 0.5 * cross(u, v)[0]
+        S = u[1] * u[1] + u[2] * u[2] + v[1] * v[1] + v[2] * v[2] + w[1] * w[1] + w[2] * w[2]
+        if volume <= FLAT_SHARE * S:
             return np.inf
         eta = S / (6.928203230275509 * volume)
         if is_graded:
@@ -254,21 +285,19 @@ def shape_energy(x: NDArray, n_corners: int, power: float, is_graded: bool) -> f
 @njit(cache=True, error_model="numpy")
 def determinant_and_squares(x: NDArray) -> tuple:
     """Six times the signed volume of the tetrahedron x (4, 3), and the sum of its squared edges."""
-    u0, u1, u2 = x[1, 0] - x[0, 0], x[1, 1] - x[0, 1], x[1, 2] - x[0, 2]
-    v0, v1, v2 = x[2, 0] - x[0, 0], x[2, 1] - x[0, 1], x[2, 2] - x[0, 2]
-    w0, w1, w2 = x[3, 0] - x[0, 0], x[3, 1] - x[0, 1], x[3, 2] - x[0, 2]
-    determinant = u0 * (v1 * w2 - v2 * w1) + u1 * (v2 * w0 - v0 * w2) + u2 * (v0 * w1 - v1 * w0)
+    u, v, w = difference(x, 1, 0), difference(x, 2, 0), difference(x, 3, 0)
     # The sum over all pairs of four points is four times the sum over the points less that of their sum, squared.
-    s0, s1, s2 = u0 + v0 + w0, u1 + v1 + w1, u2 + v2 + w2
-    S = 4.0 * (u0 * u0 + u1 * u1 + u2 * u2 + v0 * v0 + v1 * v1 + v2 * v2 + w0 * w0 + w1 * w1 + w2 * w2)
-    return determinant, S - (s0 * s0 + s1 * s1 + s2 * s2)
+    s = u[0] + v[0] + w[0], u[1] + v[1] + w[1], u[2] + v[2] + w[2]
+    S = u[0] * u[0] + u[1] * u[1] + u[2] * u[2] + v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
+    S = 4.0 * (S + w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
+    return dot(u, cross(v, w)), S - dot(s, s)
 
 
 @njit(cache=True, error_model="numpy")
 def tet_energy(determinant: float, S: float, power: float, is_graded: bool) -> float:
     """`shape_energy` of a tetrahedron from six times its volume and the sum of its squared edges."""
     volume = determinant / 6.0
-    if volume <= 0.0 or volume * volume <= FLAT * FLAT * S * S * S:
+    if volume <= 0.0 or volume * volume <= FLAT_SHARE * FLAT_SHARE * S * S * S:
         return np.inf
     if is_graded:
         cube = S * S * S / (432.0 * determinant * determinant)  # eta^3
@@ -284,146 +313,142 @@ def tet_energy(determinant: float, S: float, power: float, is_graded: bool) -> f
 
 
 @njit(cache=True, error_model="numpy")
-def load(x: NDArray, row: int, ticks: NDArray, node: int, base: int, measure: Measure) -> None:
+def load(x: NDArray, row: int, ticks: NDArray, node: int, base: int, objective: Objective) -> None:
     """A node's position relative to the node `base`, in mm, to a row of x; subtracted in integers, exactly."""
-    scale = 2.0**-measure.bits
-    M = measure.matrix
-    t0 = scale * (ticks[node, 0] - ticks[base, 0])
-    t1 = scale * (ticks[node, 1] - ticks[base, 1])
-    t2 = scale * (ticks[node, 2] - ticks[base, 2])
-    x[row, 0] = M[0, 0] * t0 + M[0, 1] * t1 + M[0, 2] * t2
-    x[row, 1] = M[1, 0] * t0 + M[1, 1] * t1 + M[1, 2] * t2
-    x[row, 2] = M[2, 0] * t0 + M[2, 1] * t1 + M[2, 2] * t2
+    put_row(x, row, times(objective.matrix, scaled(2.0**-objective.bits, difference(ticks, node, base))))
 
 
 @njit(cache=True, error_model="numpy")
-def load_cell(x: NDArray, ticks: NDArray, cells: NDArray, cell: int, measure: Measure) -> None:
+def place(ticks: NDArray, node: int, base: int, objective: Objective) -> tuple:
+    """What `load` writes."""
+    return times(objective.matrix, scaled(2.0**-objective.bits, difference(ticks, node, base)))
+
+
+@njit(cache=True, error_model="numpy")
+def load_cell(x: NDArray, ticks: NDArray, cells: NDArray, cell: int, objective: Objective) -> None:
     """A cell's corners relative to its first, in mm."""
     for k in range(cells.shape[1]):
-        load(x, k, ticks, cells[cell, k], cells[cell, 0], measure)
+        load(x, k, ticks, cells[cell, k], cells[cell, 0], objective)
 
 
 @njit(cache=True, error_model="numpy")
-def shape_of_cell(x: NDArray, ticks: NDArray, cells: NDArray, cell: int, measure: Measure) -> float:
+def shape_of_cell(x: NDArray, ticks: NDArray, cells: NDArray, cell: int, objective: Objective) -> float:
     """Shape energy of a cell of the complex; its corners are left in `x` (4, 3)."""
-    load_cell(x, ticks, cells, cell, measure)
-    return shape_energy(x, cells.shape[1], measure.power, measure.is_graded)
+    load_cell(x, ticks, cells, cell, objective)
+    return shape_energy(x, cells.shape[1], objective.power, objective.is_graded)
 
 
 @njit(cache=True, error_model="numpy")
-def shape_of_tet(x: NDArray, ticks: NDArray, a: int, b: int, c: int, d: int, measure: Measure) -> float:
+def shape_of_tet(x: NDArray, ticks: NDArray, a: int, b: int, c: int, d: int, objective: Objective) -> float:
     """Shape energy of the tetrahedron (a, b, c, d); infinite unless it is positively oriented."""
-    load(x, 0, ticks, a, a, measure)
-    load(x, 1, ticks, b, a, measure)
-    load(x, 2, ticks, c, a, measure)
-    load(x, 3, ticks, d, a, measure)
-    return shape_energy(x, 4, measure.power, measure.is_graded)
+    load(x, 0, ticks, a, a, objective)
+    load(x, 1, ticks, b, a, objective)
+    load(x, 2, ticks, c, a, objective)
+    load(x, 3, ticks, d, a, objective)
+    return shape_energy(x, 4, objective.power, objective.is_graded)
 
 
 @njit(cache=True, error_model="numpy")
-def shape_of_triangle(x: NDArray, ticks: NDArray, a: int, b: int, c: int, measure: Measure) -> float:
+def shape_of_triangle(x: NDArray, ticks: NDArray, a: int, b: int, c: int, objective: Objective) -> float:
     """Shape energy of the triangle (a, b, c); infinite unless it is positively oriented."""
-    load(x, 0, ticks, a, a, measure)
-    load(x, 1, ticks, b, a, measure)
-    load(x, 2, ticks, c, a, measure)
-    return shape_energy(x, 3, measure.power, measure.is_graded)
+    load(x, 0, ticks, a, a, objective)
+    load(x, 1, ticks, b, a, objective)
+    load(x, 2, ticks, c, a, objective)
+    return shape_energy(x, 3, objective.power, objective.is_graded)
 
 
 @njit(cache=True, error_model="numpy")
-def content(x: NDArray, n_corners: int) -> float:
+def signed_volume(x: NDArray, n_corners: int) -> float:
     """Signed volume of the cell with corners x (4, 3), times n!."""
     if n_corners == 3:
-        return (x[1, 1] - x[0, 1]) * (x[2, 2] - x[0, 2]) - (x[1, 2] - x[0, 2]) * (x[2, 1] - x[0, 1])
+        return cross(difference(x, 1, 0), difference(x, 2, 0))[0]
     return determinant_and_squares(x)[0]
 
 
 @njit(cache=True, error_model="numpy")
-def least_cosine(x: NDArray) -> float:
+def worst_cosine(x: NDArray) -> float:
     """Minus the cosine of the smallest dihedral angle of the tetrahedron x (4, 3): it grows with the angle; -1 if flat.
 
     Between faces with outward normals p and q the angle's cosine is -p.q / (|p| |q|).
     """
-    n = np.empty((4, 3))
+    normals = np.empty((4, 3))
     for k in range(4):
         a, b, c = (k + 1) & 3, (k + 2) & 3, (k + 3) & 3
-        u0, u1, u2 = x[b, 0] - x[a, 0], x[b, 1] - x[a, 1], x[b, 2] - x[a, 2]
-        w0, w1, w2 = x[c, 0] - x[a, 0], x[c, 1] - x[a, 1], x[c, 2] - x[a, 2]
-        n0, n1, n2 = u1 * w2 - u2 * w1, u2 * w0 - u0 * w2, u0 * w1 - u1 * w0
-        size = np.sqrt(n0 * n0 + n1 * n1 + n2 * n2)
+        n = cross(difference(x, b, a), difference(x, c, a))
+        size = np.sqrt(dot(n, n))
         if size == 0.0:
             return -1.0
         sign = -1.0 if k & 1 else 1.0  # (k+1, k+2, k+3) turns outwards for even k of a positive cell, inwards for odd
-        n[k, 0], n[k, 1], n[k, 2] = sign * n0 / size, sign * n1 / size, sign * n2 / size
+        put_row(normals, k, (sign * n[0] / size, sign * n[1] / size, sign * n[2] / size))
     worst = 1.0
     for i in range(3):
         for k in range(i + 1, 4):
-            worst = min(worst, n[i, 0] * n[k, 0] + n[i, 1] * n[k, 1] + n[i, 2] * n[k, 2])
+            worst = min(worst, dot(row(normals, i), row(normals, k)))
     return worst
 
 
 @njit(cache=True, error_model="numpy")
-def quality_up_to(x: NDArray, measure: Measure) -> float:
-    """`least_cosine`, or just the floor for a tetrahedron that is above it by far: most are, and this costs a tenth."""
+def cosine_up_to_floor(x: NDArray, objective: Objective) -> float:
+    """`worst_cosine`, or just the floor for a tetrahedron that is above it by far: most are, and this costs a tenth."""
     determinant, S = determinant_and_squares(x)
-    if determinant > 0.0 and S * S * S <= measure.safe * determinant * determinant:
-        return measure.floor
-    return least_cosine(x)
+    if determinant > 0.0 and S * S * S <= objective.safe * determinant * determinant:
+        return objective.floor
+    return worst_cosine(x)
 
 
 @njit(cache=True, error_model="numpy")
-def cell_quality(x: NDArray, held: Complex, cell: int, measure: Measure) -> float:
-    """Minus the cosine of a cell's smallest dihedral angle."""
-    load_cell(x, held.ticks, held.cells, cell, measure)
-    return least_cosine(x)
+def cell_cosine(x: NDArray, state: State, cell: int) -> float:
+    """`worst_cosine` of a cell of the complex."""
+    load_cell(x, state.complex.ticks, state.complex.cells, cell, state.objective)
+    return worst_cosine(x)
 
 
 @njit(cache=True, error_model="numpy")
-def tet_quality(x: NDArray, held: Complex, a: int, b: int, c: int, d: int, measure: Measure) -> float:
-    """As `least_cosine`, of the tetrahedron (a, b, c, d); -2 if it is flat or inverted."""
-    if not shape_of_tet(x, held.ticks, a, b, c, d, measure) < np.inf:
+def tet_cosine(x: NDArray, state: State, a: int, b: int, c: int, d: int) -> float:
+    """`worst_cosine` of the tetrahedron (a, b, c, d); -2 if it is flat or inverted."""
+    if not shape_of_tet(x, state.complex.ticks, a, b, c, d, state.objective) < np.inf:
         return -2.0
-    return least_cosine(x)
+    return worst_cosine(x)
 
 
-# numba (0.60 to 0.68) drops what the body of a prange writes through a NamedTuple: such bodies are functions.
 @njit(cache=True, parallel=True, error_model="numpy")
-def measure_all(held: Complex, measure: Measure) -> None:
-    """Fluxes, sums and shape energies of all cells, afresh. Each facet is measured once, by its lower cell."""
-    n_cells = held.n_cells[0]
-    for chunk in prange((n_cells + CHUNK - 1) // CHUNK):
-        _measure_chunk(held, measure, chunk * CHUNK, min((chunk + 1) * CHUNK, n_cells))
-    for chunk in prange((n_cells + CHUNK - 1) // CHUNK):
-        _sum_chunk(held, chunk * CHUNK, min((chunk + 1) * CHUNK, n_cells))
+def _measure_all(complex_: Complex, objective: Objective, sides: Sides) -> None:
+    """Each facet is measured once, by its lower cell."""
+    n_cells = complex_.n_cells[0]
+    for chunk in prange((n_cells + CELLS_PER_CHUNK - 1) // CELLS_PER_CHUNK):
+        _measure_cells(State(complex_, objective, sides), np.int64(chunk) * CELLS_PER_CHUNK)
+    for chunk in prange((n_cells + CELLS_PER_CHUNK - 1) // CELLS_PER_CHUNK):
+        _sum_cells(complex_, np.int64(chunk) * CELLS_PER_CHUNK)
 
 
 @njit(cache=True, error_model="numpy")
-def _measure_chunk(held: Complex, measure: Measure, first: int, last: int) -> None:
-    x = np.empty((4, 3))
-    for cell in range(first, last):
-        held.E_shape[cell] = shape_of_cell(x, held.ticks, held.cells, cell, measure)
-        for k in range(held.cells.shape[1]):
-            other = held.across[cell, k]
-            if other > cell or other < 0:
-                measure_facet(held, cell, k, measure)
+def _measure_cells(state: State, first: int) -> None:
+    x, cells, across = np.empty((4, 3)), state.complex.cells, state.complex.across
+    for cell in range(first, min(first + CELLS_PER_CHUNK, state.complex.n_cells[0])):
+        state.complex.E_shape[cell] = shape_of_cell(x, state.complex.ticks, cells, cell, state.objective)
+        for k in range(cells.shape[1]):
+            if across[cell, k] > cell or across[cell, k] < 0:
+                measure_facet(state, cell, k)
 
 
 @njit(cache=True, error_model="numpy")
-def measure_facet(held: Complex, cell: int, k: int, measure: Measure) -> None:
+def measure_facet(state: State, cell: int, k: int) -> None:
     """Flux of facet k of a cell, as the ticks stand."""
-    a, b, c = outward(held.cells, cell, k)
-    put_flux(held.fluxes, cell, k, held.ticks, a, b, c, measure)
+    a, b, c = outward(state.complex.cells, cell, k)
+    put_flux(state.complex.fluxes, cell, k, state.complex.ticks, a, b, c, state.objective)
 
 
 @njit(cache=True, error_model="numpy")
-def _sum_chunk(held: Complex, first: int, last: int) -> None:
-    for cell in range(first, last):
-        for k in range(held.cells.shape[1]):
-            other = held.across[cell, k]
+def _sum_cells(complex_: Complex, first: int) -> None:
+    cells, across, fluxes = complex_.cells, complex_.across, complex_.fluxes
+    for cell in range(first, min(first + CELLS_PER_CHUNK, complex_.n_cells[0])):
+        for k in range(cells.shape[1]):
+            other = across[cell, k]
             if 0 <= other < cell:
-                m = facet_of(held.cells, held.across, other, cell)
-                for d in range(held.fluxes.shape[2]):
-                    held.fluxes[cell, k, d] = -held.fluxes[other, m, d]
-        sum_up(held.sums, held.fluxes, cell)
+                m = facet_of(across, other, cell)
+                for d in range(fluxes.shape[2]):
+                    fluxes[cell, k, d] = -fluxes[other, m, d]
+        sum_up(complex_.sums, fluxes, cell)
 
 
 @njit(cache=True, error_model="numpy")
@@ -437,21 +462,33 @@ def sum_up(sums: NDArray, fluxes: NDArray, cell: int) -> None:
 
 
 @njit(cache=True, error_model="numpy")
-def cell_energy(held: Complex, cell: int, measure: Measure) -> float:
+def settle(x: NDArray, state: State, cell: int) -> None:
+    """Shape energy and sums of a cell whose corners and fluxes are set; its corners' places are left in `x` (4, 3)."""
+    mesh = state.complex
+    mesh.E_shape[cell] = shape_of_cell(x, mesh.ticks, mesh.cells, cell, state.objective)
+    sum_up(mesh.sums, mesh.fluxes, cell)
+
+
+@njit(cache=True, error_model="numpy")
+def cell_energy(state: State, cell: int) -> float:
     """A cell's share of E, Eq. (4)."""
-    return measure.geometry * held.E_shape[cell] + measure.image * image_energy(held.sums, cell, measure.n_channels)
+    objective = state.objective
+    squares = image_energy(state.complex.sums, cell, objective.n_channels)
+    return objective.geometry * state.complex.E_shape[cell] + objective.image * squares
 
 
-def cell_squares(held: Complex, n_channels: int = 1) -> NDArray[np.float64]:
+def cell_squares(state: State) -> NDArray[np.float64]:
     """Sum of squares around its mean of each cell, (n_cells,)."""
-    sums = held.sums[: held.n_cells[0]]
-    within = sums[:, 2] - (sums[:, [1, *range(3, 2 + n_channels)]] ** 2).sum(axis=1) / np.maximum(sums[:, 0], 1.0)
+    sums = state.complex.sums[: state.complex.n_cells[0]]
+    firsts = sums[:, [1, *range(3, 2 + state.objective.n_channels)]]
+    within = sums[:, 2] - (firsts**2).sum(axis=1) / np.maximum(sums[:, 0], 1.0)
     return np.where(sums[:, 0] > 0.0, np.maximum(within, 0.0), 0.0)
 
 
-def energies(held: Complex, n_channels: int = 1) -> tuple[float, float]:
+def energies(state: State) -> tuple[float, float]:
     """Shape energy and sum of squares of the whole complex, summed in the order of the cells."""
-    return float(held.E_shape[: held.n_cells[0]].sum()), float(cell_squares(held, n_channels).sum())
+    E_shape = state.complex.E_shape[: state.complex.n_cells[0]]
+    return float(E_shape.sum()), float(cell_squares(state).sum())
 
 
 # Rings: the cells around each node.
@@ -466,16 +503,16 @@ class NodeRings(NamedTuple):
     twin: NDArray[np.int64]  # (C(n+1), n+1) facet with the node: (entry in the row) (n+1) + its facet there; -1 outside
 
 
-def node_rings(held: Complex) -> NodeRings:
+def node_rings(state: State) -> NodeRings:
     """The rings of a complex as it stands."""
-    n_cells, n_corners = int(held.n_cells[0]), held.cells.shape[1]
-    start = np.zeros(len(held.ticks) + 1, dtype=np.int64)
+    n_cells, n_corners = int(state.complex.n_cells[0]), state.complex.cells.shape[1]
+    start = np.zeros(len(state.complex.ticks) + 1, dtype=np.int64)
     cells = np.empty(n_cells * n_corners, dtype=np.int64)
     corner = np.empty(n_cells * n_corners, dtype=np.int64)
     twin = np.empty((n_cells * n_corners, n_corners), dtype=np.int64)
-    _fill_rings(start, cells, corner, held.cells, n_cells)
+    _fill_rings(start, cells, corner, state.complex.cells, n_cells)
     with few_threads(n_cells):
-        _fill_twins(twin, start, cells, corner, held.cells, held.across)
+        _fill_twins(twin, start, cells, corner, state.complex.cells, state.complex.across)
     return NodeRings(start, cells, corner, twin)
 
 
@@ -499,8 +536,8 @@ def _fill_rings(start: NDArray, ring: NDArray, corner: NDArray, cells: NDArray, 
 @njit(cache=True, parallel=True, error_model="numpy")
 def _fill_twins(twin: NDArray, start: NDArray, ring: NDArray, corner: NDArray, cells: NDArray, across: NDArray) -> None:
     n = cells.shape[1]
-    for chunk in prange((len(start) - 1 + CHUNK - 1) // CHUNK):
-        for node in range(chunk * CHUNK, min((chunk + 1) * CHUNK, len(start) - 1)):
+    for chunk in prange((len(start) - 1 + CELLS_PER_CHUNK - 1) // CELLS_PER_CHUNK):
+        for node in range(chunk * CELLS_PER_CHUNK, min((chunk + 1) * CELLS_PER_CHUNK, len(start) - 1)):
             for r in range(start[node], start[node + 1]):
                 for k in range(n):
                     twin[r, k] = -1
@@ -510,38 +547,4 @@ def _fill_twins(twin: NDArray, start: NDArray, ring: NDArray, corner: NDArray, c
                     s = start[node]
                     while ring[s] != other:
                         s += 1
-                    twin[r, k] = (s - start[node]) * n + facet_of(cells, across, other, ring[r])
-
-
-def measure_of(
-    grid: SamplingGrid, hand: int, matrix: NDArray[np.float64], geometry: float, image: float, power: float,
-    is_graded: bool = False, surface: float = 0.0, is_kept: bool = False,
-) -> Measure:  # fmt: skip
-    """A `Measure` of plain numbers, as the kernels are compiled for, without a floor."""
-    return Measure(
-        grid.prefix,
-        int(grid.bits),
-        int(hand),
-        matrix,
-        float(geometry),
-        float(image),
-        float(surface),
-        int(grid.n_channels),
-        float(power),
-        bool(is_graded),
-        bool(is_kept),
-        *floor_of(0.0),
-    )
-
-
-def floor_of(degrees: float) -> tuple[float, float]:
-    """`floor` and `safe` of a `Measure`, for a smallest dihedral angle; 0 for none.
-
-    Of all tetrahedra with a dihedral angle t up to a regular one's, eta is least for the one that is symmetric about
-    that edge and the opposite one: eta^3 = ((1 + s^2) / (s c))^2 / 8 with s, c = sin, cos(t / 2), and it falls as t
-    grows. In terms of S and the determinant eta^3 = S^3 / (432 det^2).
-    """
-    if degrees <= 0.0:
-        return -1.0, np.inf
-    s, c = np.sin(np.radians(degrees) / 2.0), np.cos(np.radians(degrees) / 2.0)
-    return -float(np.cos(np.radians(degrees))), float(432.0 / 8.0 * ((1.0 + s * s) / (s * c)) ** 2 * (1.0 - 1e-9))
+                    twin[r, k] = (s - start[node]) * n + facet_of(across, other, ring[r])

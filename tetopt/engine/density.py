@@ -2,7 +2,7 @@
 
 What a split or a collapse is worth is measured with the same energy as every other move. Splits always lower E_D and
 collapses raise it, so it takes a number of nodes to weigh one against the other: nodes are exchanged, the cheapest
-collapses for the splits that are worth more, at most as many as nodes are wanted. On a graded mesh (see
+collapses for the splits that are worth more, at most as many as are asked for. On a graded mesh (see
 `tetopt.engine.complex.shape_energy`) a node's cells cost the same shape energy wherever it is, so that what is
 exchanged is error of the image.
 
@@ -22,50 +22,54 @@ from numpy.typing import NDArray
 from tetopt.energy.sampling import few_threads
 from tetopt.engine.complex import (
     Complex,
-    Measure,
     NodeRings,
+    Objective,
+    Sides,
+    State,
+    cell_cosine,
     cell_energy,
-    cell_quality,
     cell_squares,
-    content,
     corner_of,
+    cosine_up_to_floor,
     energies,
     facet_of,
     grown,
     has_node,
     image_energy,
-    least_cosine,
     load,
     load_cell,
     measure_facet,
     node_rings,
     outward,
+    place,
     put_flux,
-    quality_up_to,
+    settle,
     shape_energy,
     shape_of_cell,
-    sum_up,
-    tet_quality,
+    signed_volume,
+    tet_cosine,
+    worst_cosine,
     wrong_side,
 )
 from tetopt.engine.flips import close_gaps
-from tetopt.engine.smooth import Blocks, blocks, colours_of, ring_energy
-from tetopt.engine.surface import Sides, faces_up, put_on_surface, ring_faces_up, uphill_at
+from tetopt.engine.smooth import Blocks, blocks, colours_of, ring_energy, ring_misfit, ring_shape, trial_of
+from tetopt.engine.surface import faces_up, put_on_surface, ring_faces_up, uphill_at
+from tetopt.geometry.vectors import dot, minus, put_row, row
 
-LEAST_GAIN = 1e-3  # of a node's mean share of E: an exchange of two nodes that is worth less is not made
-LEAST_OVER_NOISE = (
-    20.0  # of the noise's variance: likewise; about what the luckiest of thousands of edges wins in noise
-)
-ASTRAY = 0.25  # of an edge on a mask's surface: the furthest from its middle that a node is put
-SHIFT = 0.1  # of the ring's volume: what a collapse on a mask's surface may add or take
-NEIGHBOURS = 128  # edges of a node that are looked at, at most
+LEAST_EXCHANGE_SHARE = 1e-3  # of a node's mean share of E: an exchange of two nodes that is worth less is not made
+# Of the noise's variance: likewise; about what the luckiest of thousands of edges wins in noise.
+LEAST_OVER_NOISE = 20.0
+MIDDLE_SHIFT_SHARE = 0.25  # of an edge on a mask's surface: the furthest from its middle that a node is put
+SURFACE_VOLUME_SHARE = 0.1  # of the ring's volume: what a collapse on a mask's surface may add or take
+ROUNDING_SHARE = 1e-9  # of the ring's volume: what a collapse elsewhere may, which is only rounding
+MAX_NEIGHBOURS = 128  # edges of a node that are looked at, at most
+LEAST_LIFT_COSINE = 1e-4  # a move is made for a worst angle only if minus its cosine grows by more
 
 
 class Exchanged(NamedTuple):
-    """What `exchange` returns."""
+    """What `exchange` and `mend` return."""
 
-    held: Complex
-    is_frozen: NDArray[np.bool_]  # (N', 4)
+    state: State
     source: NDArray[np.int64]  # (N',) number of each node before; -1 for new ones
     is_touched: NDArray[np.bool_]  # (N',) nodes with a cell that has changed
     n_split: int
@@ -73,97 +77,98 @@ class Exchanged(NamedTuple):
 
 
 class Limits(NamedTuple):
-    """On the edges that moves may make, mm."""
+    """What moves have to keep."""
 
-    shortest: float
-    longest: NDArray[np.float64]  # (N,) at each node
+    shortest: float  # mm: no split makes a shorter edge
+    longest: NDArray[np.float64]  # (N,) mm: no collapse makes a longer edge at a node
     noise: float  # variance of the image's noise: what chance alone wins is not worth a node
+    dearest: float = np.inf  # E may rise by so much in a collapse
 
 
-def exchange(
-    held: Complex, is_frozen: NDArray[np.bool_], measure: Measure, sides: Sides, n_nodes: int, most: int,
-    limits: Limits,
-) -> Exchanged:  # fmt: skip
+class EdgeMoves(NamedTuple):
+    """For each node the best split, or the best collapse, of one of its edges."""
+
+    may_move: NDArray[np.bool_]  # (N,) nodes that are looked at
+    other: NDArray[np.int64]  # (N,) the edge's other end; -1 where there is none that is allowed
+    gain: NDArray[np.float64]  # (N,) by how much E falls; below 0 if it rises, -inf where there is none
+
+
+def exchange(state: State, n_nodes: int, most: int, limits: Limits) -> Exchanged:
     """One round of splits and collapses towards `n_nodes` nodes, and of exchanges of a node for another.
 
     Beyond those that the number asks for, up to `most` nodes are exchanged, as far as each lowers E. One round doubles
-    the nodes at most. `held` and `is_frozen` (N, 4) are out of date afterwards.
+    the nodes at most. The complex of `state` is out of date afterwards.
     """
-    n_before = len(held.ticks)
+    n_before, objective = len(state.complex.ticks), state.objective
     more, most = min(max(n_nodes - n_before, -n_before), n_before), min(most, n_before)
-    rings, groups = node_rings(held), blocks(held.ticks)
-    held = roomy(held, n_before, 16 * (max(more, 0) + most))
-    is_frozen = np.concatenate([is_frozen, np.zeros_like(is_frozen)])
-    # Splits pay where the error is, collapses where it is not: half of the nodes are asked for each, unless many more,
-    # or fewer, are wanted. It costs no E_D that could be measured, and half of the time.
-    error = _ring_errors(held, n_before, measure.n_channels)
+    rings, groups = node_rings(state), blocks(state.complex.ticks)
+    state = roomy(state, n_before, 16 * (max(more, 0) + most))
+    # Splits pay where the error is, collapses where it is not: half of the nodes are looked at for each, unless many
+    # nodes are to be put in, or taken out. It costs no E_D that could be measured, and saves half of the time.
+    error = _ring_errors(state, n_before)
     middle = np.median(error)
-    may_split = (error >= middle) | (more > n_before // 8)
+    splits = best_splits(state, rings, (error >= middle) | (more > n_before // 8), limits)
+    dearest = np.inf if more < 0 else float(np.sort(splits.gain)[-max(most // 4, 1)])
     may_collapse = (error <= middle) | (more < -(n_before // 8))
-    gain, split = best_splits(held, rings, is_frozen, measure, sides, may_split, limits.shortest)
-    dearest = np.inf if more < 0 else float(np.sort(gain)[-max(most // 4, 1)])
-    cost, collapse = best_collapses(
-        held, rings, groups, is_frozen, measure, sides, dearest, may_collapse, limits.longest
-    )
-    in_, out = np.lexsort((np.arange(n_before), -gain)), np.lexsort((np.arange(n_before), cost))
-    in_, out = in_[gain[in_] > -np.inf], out[cost[out] < np.inf]
-    E_G, squares = energies(held, measure.n_channels)
-    least = LEAST_GAIN * (measure.geometry * E_G + measure.image * squares) / n_before
-    least = max(least, LEAST_OVER_NOISE * measure.image * limits.noise)
-    is_dirty = np.zeros(len(held.cells), dtype=np.bool_)
-    n_split, n_collapsed = make_exchanges(
-        held, rings, is_frozen, measure, sides, in_, split, gain, out, collapse, cost, more, most, least, is_dirty
-    )
-    return _compacted(held, is_frozen, is_dirty, n_before, n_split, n_collapsed)
+    collapses = best_collapses(state, rings, groups, may_collapse, limits._replace(dearest=dearest))
+    E_G, squares = energies(state)
+    least = LEAST_EXCHANGE_SHARE * (objective.geometry * E_G + objective.image * squares) / n_before
+    least = max(least, LEAST_OVER_NOISE * objective.image * limits.noise)
+    is_dirty = np.zeros(len(state.complex.cells), dtype=np.bool_)
+    in_, out = _best_first(splits), _best_first(collapses)
+    n_split, n_collapsed = make_exchanges(state, rings, splits, collapses, in_, out, (more, most, least), is_dirty)
+    return _compacted(state, is_dirty, n_before, n_split, n_collapsed)
 
 
-def _ring_errors(held: Complex, n_nodes: int, n_channels: int) -> NDArray[np.float64]:
+def _best_first(moves: EdgeMoves) -> NDArray[np.int64]:
+    """The nodes that have a move, the most worth first."""
+    order = np.lexsort((np.arange(len(moves.gain)), -moves.gain))
+    return order[moves.gain[order] > -np.inf]
+
+
+def _ring_errors(state: State, n_nodes: int) -> NDArray[np.float64]:
     """Sum of squares around the cells' means over the cells around each node, (N,)."""
-    cells = held.cells[: held.n_cells[0]]
-    squares = np.repeat(cell_squares(held, n_channels), cells.shape[1])
+    cells = state.complex.cells[: state.complex.n_cells[0]]
+    squares = np.repeat(cell_squares(state), cells.shape[1])
     return np.bincount(cells.ravel(), squares, n_nodes).astype(np.float64)
 
 
-def roomy(held: Complex, n_nodes: int, n_cells: int) -> Complex:
-    """The complex with room for that many more nodes and cells; further rows of `ticks` are not nodes yet."""
-    if len(held.cells) - held.n_cells[0] < n_cells:
-        held = grown(held, n_cells)
-    more = np.zeros((n_nodes, 3), dtype=held.ticks.dtype)
-    return held._replace(ticks=np.concatenate([held.ticks, more]))
+def roomy(state: State, n_nodes: int, n_cells: int) -> State:
+    """The state with room for that many more nodes and cells; further rows of `ticks` are not nodes yet."""
+    if len(state.complex.cells) - state.complex.n_cells[0] < n_cells:
+        state = grown(state, n_cells)
+    ticks = np.concatenate([state.complex.ticks, np.zeros((n_nodes, 3), dtype=np.int64)])
+    is_frozen = np.concatenate([state.complex.is_frozen, np.zeros((n_nodes, 4), dtype=np.bool_)])
+    return state._replace(complex=state.complex._replace(ticks=ticks, is_frozen=is_frozen))
 
 
-def _compacted(
-    held: Complex, is_frozen: NDArray[np.bool_], is_dirty: NDArray[np.bool_], n_before: int, n_split: int,
-    n_collapsed: int,
-) -> Exchanged:  # fmt: skip
+def _compacted(state: State, is_dirty: NDArray[np.bool_], n_before: int, n_split: int, n_collapsed: int) -> Exchanged:
     """Nodes without cells left out, and the others numbered anew in their order."""
-    n_cells = int(held.n_cells[0])
-    cells = held.cells[:n_cells]
+    n_cells = int(state.complex.n_cells[0])
+    cells = state.complex.cells[:n_cells]
     is_used = np.zeros(n_before + n_split, dtype=bool)
     is_used[cells] = True
-    number = np.cumsum(is_used) - 1
-    held.cells[:n_cells] = number[cells]
+    cells[:] = (np.cumsum(is_used) - 1)[cells]
     kept = np.flatnonzero(is_used)
     is_touched = np.zeros(len(kept), dtype=bool)
-    is_touched[held.cells[:n_cells][is_dirty[:n_cells]]] = True
-    return Exchanged(
-        held._replace(ticks=held.ticks[kept]), is_frozen[kept], np.where(kept < n_before, kept, -1), is_touched,
-        n_split, n_collapsed,
-    )  # fmt: skip
+    is_touched[cells[is_dirty[:n_cells]]] = True
+    complex_ = state.complex._replace(ticks=state.complex.ticks[kept], is_frozen=state.complex.is_frozen[kept])
+    source = np.where(kept < n_before, kept, -1)
+    return Exchanged(state._replace(complex=complex_), source, is_touched, n_split, n_collapsed)
 
 
 @njit(cache=True, error_model="numpy")
 def make_exchanges(
-    held: Complex, rings: NodeRings, is_frozen: NDArray, measure: Measure, sides: Sides, in_: NDArray, split: NDArray,
-    gain: NDArray, out: NDArray, collapse: NDArray, cost: NDArray, more: int, most: int, least: float,
+    state: State, rings: NodeRings, splits: EdgeMoves, collapses: EdgeMoves, in_: NDArray, out: NDArray, quota: tuple,
     is_dirty: NDArray,
 ) -> tuple:  # fmt: skip
-    """Split edges of the nodes `in_`, or collapse the nodes `out`, until there are `more` nodes; then do both in pairs.
+    """Split edges of the nodes `in_`, or collapse the nodes `out`, until there are more nodes; then do both in pairs.
 
-    In their order, and each only if none of its cells has changed; at most `most` pairs, each of which lowers E by more
-    than `least`. Returns how many were split and collapsed.
+    In their order, and each only if none of its cells has changed. The quota: how many more nodes; at most how many
+    pairs; and by how much each pair has to lower E at least. Returns how many were split and collapsed.
     """
     n_nodes = len(rings.start) - 1
+    more, most, least = quota
     n_split, n_collapsed, s, c = 0, 0, 0, 0
     while True:
         is_pair = n_split - n_collapsed == more
@@ -171,34 +176,34 @@ def make_exchanges(
             break
         does_split, does_collapse = is_pair or n_split - n_collapsed < more, is_pair or n_split - n_collapsed > more
         if does_split:
-            while s < len(in_) and not _can_split(held, rings, in_[s], is_dirty):
+            while s < len(in_) and not _can_split(state, rings, in_[s], is_dirty):
                 s += 1
             if s == len(in_):
                 break
-            _mark_edge(held, rings, in_[s], split[in_[s]], is_dirty, True)  # its partner is to be somewhere else
+            _mark_edge(state, rings, in_[s], splits.other[in_[s]], is_dirty, True)  # its partner is to be elsewhere
         if does_collapse:
             while c < len(out) and not _is_clean(rings, out[c], is_dirty):
                 c += 1
-        if does_collapse and (c == len(out) or (is_pair and gain[in_[s]] - cost[out[c]] <= least)):
+        if does_collapse and (c == len(out) or (is_pair and splits.gain[in_[s]] + collapses.gain[out[c]] <= least)):
             if does_split:
-                _mark_edge(held, rings, in_[s], split[in_[s]], is_dirty, False)
+                _mark_edge(state, rings, in_[s], splits.other[in_[s]], is_dirty, False)
             break
         if does_split:
-            a, b, p = in_[s], split[in_[s]], n_nodes + n_split
-            _put_middle(held, rings, is_frozen, sides, a, b, p, measure)
-            split_edge(held, rings, a, b, p, is_dirty, measure)
+            a, b, p = in_[s], splits.other[in_[s]], n_nodes + n_split
+            _put_middle(state, rings, a, b, p)
+            split_edge(state, rings, a, b, p, is_dirty)
             n_split += 1
         if does_collapse:
-            collapse_edge(held, rings, out[c], collapse[out[c]], is_dirty, measure)
+            collapse_edge(state, rings, out[c], collapses.other[out[c]], is_dirty)
             n_collapsed += 1
-    close_gaps(held, is_dirty)
+    close_gaps(state, is_dirty)
     return n_split, n_collapsed
 
 
 @njit(cache=True, error_model="numpy")
-def _mark_edge(held: Complex, rings: NodeRings, a: int, b: int, is_dirty: NDArray, value: bool) -> None:
+def _mark_edge(state: State, rings: NodeRings, a: int, b: int, is_dirty: NDArray, value: bool) -> None:
     for r in range(rings.start[a], rings.start[a + 1]):
-        if has_node(held.cells, rings.cells[r], b):
+        if has_node(state.complex.cells, rings.cells[r], b):
             is_dirty[rings.cells[r]] = value
 
 
@@ -208,242 +213,215 @@ def _is_clean(rings: NodeRings, node: int, is_dirty: NDArray) -> bool:
 
 
 @njit(cache=True, error_model="numpy")
-def _can_split(held: Complex, rings: NodeRings, a: int, is_dirty: NDArray) -> bool:
+def _can_split(state: State, rings: NodeRings, a: int, is_dirty: NDArray) -> bool:
     """Whether the cells around a are as they were, and there is room for more."""
     size = rings.start[a + 1] - rings.start[a]
-    return held.n_cells[0] + size <= len(held.cells) and _is_clean(rings, a, is_dirty)
+    return state.complex.n_cells[0] + size <= len(state.complex.cells) and _is_clean(rings, a, is_dirty)
 
 
 @njit(cache=True, error_model="numpy")
-def _sides_of_edge(held: Complex, rings: NodeRings, sides: Sides, a: int, b: int) -> int:
+def _sides_of_edge(state: State, rings: NodeRings, a: int, b: int) -> int:
     """The box's sides that an edge lies in, bit d for axis d, and bit 3 if it is on the boundary elsewhere.
 
-    Asked are the boundary's facets at the edge, not its ends: they may lie in a side to which the edge is a crease.
+    The boundary's facets at the edge decide, not its ends: they may lie in a side to which the edge is a crease.
     """
-    found, t = 0, held.ticks
+    cells, t, sides = state.complex.cells, state.complex.ticks, 0
     for r in range(rings.start[a], rings.start[a + 1]):
         cell = rings.cells[r]
-        if not has_node(held.cells, cell, b):
+        if not has_node(cells, cell, b):
             continue
-        for k in range(held.cells.shape[1]):
-            if held.across[cell, k] >= 0 or held.cells[cell, k] == a or held.cells[cell, k] == b:
+        for k in range(cells.shape[1]):
+            if state.complex.across[cell, k] >= 0 or cells[cell, k] == a or cells[cell, k] == b:
                 continue
             side = 3
             for d in range(3):
                 at = t[a, d]
-                is_flat = at == sides.low[d] or at == sides.high[d]
-                for m in range(held.cells.shape[1]):
-                    is_flat = is_flat and (m == k or t[held.cells[cell, m], d] == at)
+                is_flat = at == state.sides.low[d] or at == state.sides.high[d]
+                for m in range(cells.shape[1]):
+                    is_flat = is_flat and (m == k or t[cells[cell, m], d] == at)
                 if is_flat:
                     side = d
-            found |= 1 << side
-    return found
+            sides |= 1 << side
+    return sides
 
 
 @njit(cache=True, error_model="numpy")
-def _put_middle(
-    held: Complex, rings: NodeRings, is_frozen: NDArray, sides: Sides, a: int, b: int, p: int, measure: Measure
-) -> bool:
+def _put_middle(state: State, rings: NodeRings, a: int, b: int, p: int) -> bool:
     """Put the node p at the middle of an edge, or on the surface beside it.
 
-    False if that is on a boundary that is to stay, or the surface is not found.
+    False if that is on a boundary that is to stay, or the surface is not reached.
     """
-    found = _sides_of_edge(held, rings, sides, a, b)
+    ticks, cells, is_frozen = state.complex.ticks, state.complex.cells, state.complex.is_frozen
+    sides = _sides_of_edge(state, rings, a, b)
     for d in range(3):
-        held.ticks[p, d] = (held.ticks[a, d] + held.ticks[b, d]) >> 1
-        is_frozen[p, d] = (found >> d) & 1 == 1
-    is_frozen[p, 3] = found >= 8
-    if found > 0 and sides.is_fixed:
+        ticks[p, d] = (ticks[a, d] + ticks[b, d]) >> 1
+        is_frozen[p, d] = (sides >> d) & 1 == 1
+    is_frozen[p, 3] = sides >= 8
+    if sides > 0 and state.sides.is_fixed:
         return False
-    if found < 8:
+    if sides < 8:
         return True
-    if not sides.has_surface:
+    if not state.sides.has_surface:
         return False
-    x, uphill = np.empty((4, 3)), np.empty((2, 3))
-    load(x, 1, held.ticks, p, a, measure)
-    if not put_on_surface(uphill, held.ticks, p, is_frozen, sides, measure):
+    uphill, middle = np.empty((2, 3)), place(ticks, p, a, state.objective)
+    if not put_on_surface(uphill, state, p):
         return False
-    load(x, 2, held.ticks, p, a, measure)
-    away = (x[2, 0] - x[1, 0]) ** 2 + (x[2, 1] - x[1, 1]) ** 2 + (x[2, 2] - x[1, 2]) ** 2
-    if away > ASTRAY * ASTRAY * squared_length(x, held, a, b, measure):
+    shift = minus(place(ticks, p, a, state.objective), middle)
+    if dot(shift, shift) > MIDDLE_SHIFT_SHARE * MIDDLE_SHIFT_SHARE * squared_length(state, a, b):
         return False
-    uphill_at(uphill, held.ticks, p, sides, measure)
+    uphill_at(uphill, state, p)
     for r in range(rings.start[a], rings.start[a + 1]):
         cell = rings.cells[r]
-        for k in range(held.cells.shape[1]):
-            is_outer = held.across[cell, k] < 0 and held.cells[cell, k] not in (a, b)
-            if is_outer and has_node(held.cells, cell, b):
+        for k in range(cells.shape[1]):
+            is_outer = state.complex.across[cell, k] < 0 and cells[cell, k] not in (a, b)
+            if is_outer and has_node(cells, cell, b):
                 for node in (a, b):
-                    if not faces_up(x, held, cell, k, node, p, uphill, sides, measure):
+                    if not faces_up(state, cell, k, node, p, uphill):
                         return False
     return True
 
 
-def mend(
-    held: Complex, is_frozen: NDArray[np.bool_], measure: Measure, sides: Sides, bad: NDArray[np.int64], target: float
-) -> Exchanged:
+def mend(state: State, bad: NDArray[np.int64], target: float) -> Exchanged:
     """For each bad cell the collapse or split of one of its edges that leaves the best worst angle, if any is better.
 
-    Quality is minus the cosine of the smallest dihedral angle, counted up to `target`. Cells of `bad` come worst first.
+    Judged by minus the cosine of the smallest dihedral angle, counted up to `target`. Cells of `bad` come worst first.
     """
-    n_before = len(held.ticks)
-    rings = node_rings(held)
-    held = roomy(held, len(bad), 16 * len(bad))
-    is_frozen = np.concatenate([is_frozen, np.zeros((len(bad), 4), dtype=bool)])
-    is_dirty = np.zeros(len(held.cells), dtype=np.bool_)
-    n_split, n_collapsed = _mend(held, rings, is_frozen, measure, sides, bad, target, is_dirty)
-    return _compacted(held, is_frozen, is_dirty, n_before, n_split, n_collapsed)
+    n_before = len(state.complex.ticks)
+    rings = node_rings(state)
+    state = roomy(state, len(bad), 16 * len(bad))
+    is_dirty = np.zeros(len(state.complex.cells), dtype=np.bool_)
+    n_split, n_collapsed = _mend(state, rings, bad, target, is_dirty)
+    return _compacted(state, is_dirty, n_before, n_split, n_collapsed)
 
 
 @njit(cache=True, error_model="numpy")
-def _mend(
-    held: Complex, rings: NodeRings, is_frozen: NDArray, measure: Measure, sides: Sides, bad: NDArray, target: float,
-    is_dirty: NDArray,
-) -> tuple:  # fmt: skip
-    x = np.empty((4, 3))
+def _mend(state: State, rings: NodeRings, bad: NDArray, target: float, is_dirty: NDArray) -> tuple:
+    cells, x = state.complex.cells, np.empty((4, 3))
     n_split, n_collapsed, n_nodes = 0, 0, len(rings.start) - 1
     for cell in bad:
-        best, best_a, best_b, is_split = 1e-4, -1, -1, False  # the least gain
+        best, best_a, best_b, is_split = LEAST_LIFT_COSINE, -1, -1, False
         for i in range(4):
-            a = held.cells[cell, i]
+            a = cells[cell, i]
             if is_dirty[cell] or not _is_clean(rings, a, is_dirty):
                 continue
             for j in range(4):
-                b, p = held.cells[cell, j], n_nodes + n_split
+                b, p = cells[cell, j], n_nodes + n_split
                 if i == j:
                     continue
-                gain = _lift_by_collapse(x, held, rings, is_frozen, sides, a, b, measure, target)
+                gain = _lift_by_collapse(x, state, rings, a, b, target)
                 if gain > best:
                     best, best_a, best_b, is_split = gain, a, b, False
-                if i < j and _can_split(held, rings, a, is_dirty):
-                    may_split = _put_middle(held, rings, is_frozen, sides, a, b, p, measure)
-                    gain = _lift_by_split(x, held, rings, a, b, p, measure, target) if may_split else -1.0
+                if i < j and _can_split(state, rings, a, is_dirty):
+                    may_split = _put_middle(state, rings, a, b, p)
+                    gain = _lift_by_split(x, state, rings, a, b, p, target) if may_split else -1.0
                     if gain > best:
                         best, best_a, best_b, is_split = gain, a, b, True
         if best_a >= 0 and is_split:
             p = n_nodes + n_split
-            _put_middle(held, rings, is_frozen, sides, best_a, best_b, p, measure)
-            split_edge(held, rings, best_a, best_b, p, is_dirty, measure)
+            _put_middle(state, rings, best_a, best_b, p)
+            split_edge(state, rings, best_a, best_b, p, is_dirty)
             n_split += 1
         elif best_a >= 0:
-            collapse_edge(held, rings, best_a, best_b, is_dirty, measure)
+            collapse_edge(state, rings, best_a, best_b, is_dirty)
             n_collapsed += 1
-    close_gaps(held, is_dirty)
+    close_gaps(state, is_dirty)
     return n_split, n_collapsed
 
 
 @njit(cache=True, error_model="numpy")
-def _lift_by_collapse(
-    x: NDArray, held: Complex, rings: NodeRings, is_frozen: NDArray, sides: Sides, a: int, b: int, measure: Measure,
-    target: float,
-) -> float:  # fmt: skip
-    """By how much the worst quality around a grows if a is joined to b."""
-    t = held.ticks
-    if not may_join(t, is_frozen, a, b):
+def _lift_by_collapse(x: NDArray, state: State, rings: NodeRings, a: int, b: int, target: float) -> float:
+    """By how much the worst cosine around a grows if a is joined to b."""
+    cells, t = state.complex.cells, state.complex.ticks
+    if not may_join(t, state.complex.is_frozen, a, b):
         return -1.0
-    here0, here1, here2 = t[a, 0], t[a, 1], t[a, 2]
-    old, new, size = target, target, 0.0
+    here, old, new, size = row(t, a), target, target, 0.0
     for r in range(rings.start[a], rings.start[a + 1]):
-        old = min(old, cell_quality(x, held, rings.cells[r], measure))
-        size += content(x, 4)
-    t[a, 0], t[a, 1], t[a, 2] = t[b, 0], t[b, 1], t[b, 2]
+        old = min(old, cell_cosine(x, state, rings.cells[r]))
+        size += signed_volume(x, 4)
+    put_row(t, a, row(t, b))
     for r in range(rings.start[a], rings.start[a + 1]):
-        if new > old and not has_node(held.cells, rings.cells[r], b):
-            c = held.cells[rings.cells[r]]
-            new = min(new, tet_quality(x, held, c[0], c[1], c[2], c[3], measure))
-    is_whole = new > old and _keeps_domain(x, held, rings, is_frozen, a, b, size, sides, measure)
-    t[a, 0], t[a, 1], t[a, 2] = here0, here1, here2
+        if new > old and not has_node(cells, rings.cells[r], b):
+            c = cells[rings.cells[r]]
+            new = min(new, tet_cosine(x, state, c[0], c[1], c[2], c[3]))
+    is_whole = new > old and _keeps_domain(x, state, rings, a, b, size)
+    put_row(t, a, here)
     return new - old if is_whole else -1.0
 
 
 @njit(cache=True, error_model="numpy")
-def _lift_by_split(
-    x: NDArray, held: Complex, rings: NodeRings, a: int, b: int, p: int, measure: Measure, target: float
-) -> float:
-    """By how much the worst quality around the edge (a, b) grows if it is split at p."""
+def _lift_by_split(x: NDArray, state: State, rings: NodeRings, a: int, b: int, p: int, target: float) -> float:
+    """By how much the worst cosine around the edge (a, b) grows if it is split at p."""
     old, new = target, target
     for r in range(rings.start[a], rings.start[a + 1]):
         cell = rings.cells[r]
-        if has_node(held.cells, cell, b):
-            old = min(old, cell_quality(x, held, cell, measure))
+        if has_node(state.complex.cells, cell, b):
+            old = min(old, cell_cosine(x, state, cell))
             for node in (a, b):
-                if not _shape_with(x, held, cell, node, p, measure) < np.inf:
+                if not _shape_with(x, state, cell, node, p) < np.inf:
                     return -1.0
-                new = min(new, least_cosine(x))
+                new = min(new, worst_cosine(x))
     return new - old
 
 
 # Splits.
 
 
-def best_splits(
-    held: Complex, rings: NodeRings, is_frozen: NDArray[np.bool_], measure: Measure, sides: Sides,
-    is_wanted: NDArray[np.bool_], shortest: float,
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:  # fmt: skip
-    """How much E falls if the best edge of each node that is wanted is split, (N,), and where that leads, (N,).
+def best_splits(state: State, rings: NodeRings, may_split: NDArray[np.bool_], limits: Limits) -> EdgeMoves:
+    """The best split of an edge of each node that may be, above the floor, without an edge that is too short.
 
-    -inf and -1 where none can be split above the floor, without an edge under `shortest` mm; an edge of two nodes that
-    are wanted counts for the lower one.
-    Rows N to 2 N of `held.ticks` and `is_frozen` are written to.
+    An edge of two nodes that may counts for the lower one. Rows N to 2 N of `ticks` and `is_frozen` are written to.
     """
-    n_nodes = len(is_wanted)
-    gain, split = np.full(n_nodes, -np.inf), np.full(n_nodes, -1, dtype=np.int64)
+    n_nodes = len(may_split)
+    moves = EdgeMoves(may_split, np.full(n_nodes, -1, dtype=np.int64), np.full(n_nodes, -np.inf))
     with few_threads(n_nodes * 20):
-        _fill_splits(gain, split, held, rings, is_frozen, measure, sides, is_wanted, shortest)
-    return gain, split
+        _fill_splits(moves, *state, rings, limits.shortest)
+    return moves
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def _fill_splits(
-    gain: NDArray, split: NDArray, held: Complex, rings: NodeRings, is_frozen: NDArray, measure: Measure, sides: Sides,
-    is_wanted: NDArray, shortest: float,
-) -> None:  # fmt: skip
-    for node in prange(len(gain)):
-        if is_wanted[node]:
-            _best_split(np.int64(node), gain, split, held, rings, is_frozen, measure, sides, is_wanted, shortest)
+    moves: EdgeMoves, complex_: Complex, objective: Objective, sides: Sides, rings: NodeRings, shortest: float
+) -> None:
+    for node in prange(len(moves.gain)):
+        if moves.may_move[node]:
+            _best_split(np.int64(node), moves, State(complex_, objective, sides), rings, shortest)
 
 
 @njit(cache=True, error_model="numpy")
-def _best_split(
-    a: int, gain: NDArray, split: NDArray, held: Complex, rings: NodeRings, is_frozen: NDArray, measure: Measure,
-    sides: Sides, is_wanted: NDArray, shortest: float,
-) -> None:  # fmt: skip
-    n_nodes = len(is_wanted)
-    x, near = np.empty((4, 3)), np.empty(NEIGHBOURS, dtype=np.int64)
-    for number in range(_neighbours(near, held, rings, a)):
-        b, p = near[number], n_nodes + a
-        if (b < a and is_wanted[b]) or squared_length(x, held, a, b, measure) < 4.0 * shortest * shortest:
+def _best_split(a: int, moves: EdgeMoves, state: State, rings: NodeRings, shortest: float) -> None:
+    x, near = np.empty((4, 3)), np.empty(MAX_NEIGHBOURS, dtype=np.int64)
+    for number in range(_neighbours(near, state.complex.cells, rings, a)):
+        b, p = near[number], len(moves.gain) + a
+        if (b < a and moves.may_move[b]) or squared_length(state, a, b) < 4.0 * shortest * shortest:
             continue
-        is_there = _put_middle(held, rings, is_frozen, sides, a, b, p, measure)
-        if is_there and _is_long(x, held, rings, a, b, p, shortest, measure):
-            worth = worth_of_split(x, held, rings, a, b, p, measure, gain[a])
-            if worth > gain[a]:
-                gain[a], split[a] = worth, b
+        if _put_middle(state, rings, a, b, p) and _is_long(state, rings, a, b, p, shortest):
+            worth = worth_of_split(x, state, rings, a, b, p, moves.gain[a])
+            if worth > moves.gain[a]:
+                moves.gain[a], moves.other[a] = worth, b
 
 
 @njit(cache=True, error_model="numpy")
-def _is_long(
-    x: NDArray, held: Complex, rings: NodeRings, a: int, b: int, p: int, shortest: float, measure: Measure
-) -> bool:
+def _is_long(state: State, rings: NodeRings, a: int, b: int, p: int, shortest: float) -> bool:
     """Whether no edge from p to the other corners of the cells around the edge (a, b) is shorter than that."""
+    cells = state.complex.cells
     if shortest <= 0.0:
         return True
     for r in range(rings.start[a], rings.start[a + 1]):
         cell = rings.cells[r]
-        if has_node(held.cells, cell, b):
-            for k in range(held.cells.shape[1]):
-                if squared_length(x, held, p, held.cells[cell, k], measure) < shortest * shortest:
+        if has_node(cells, cell, b):
+            for k in range(cells.shape[1]):
+                if squared_length(state, p, cells[cell, k]) < shortest * shortest:
                     return False
     return True
 
 
 @njit(cache=True, error_model="numpy")
-def _neighbours(near: NDArray, held: Complex, rings: NodeRings, node: int) -> int:
+def _neighbours(near: NDArray, cells: NDArray, rings: NodeRings, node: int) -> int:
     """The nodes that share a cell with `node`, to `near`, as many as it takes; how many."""
     count = 0
     for r in range(rings.start[node], rings.start[node + 1]):
-        for k in range(held.cells.shape[1]):
-            other = held.cells[rings.cells[r], k]
+        for k in range(cells.shape[1]):
+            other = cells[rings.cells[r], k]
             is_new = other != node
             for m in range(count):
                 is_new = is_new and near[m] != other
@@ -454,116 +432,115 @@ def _neighbours(near: NDArray, held: Complex, rings: NodeRings, node: int) -> in
 
 
 @njit(cache=True, error_model="numpy")
-def worth_of_split(
-    x: NDArray, held: Complex, rings: NodeRings, a: int, b: int, p: int, measure: Measure, least_gain: float
-) -> float:
+def worth_of_split(x: NDArray, state: State, rings: NodeRings, a: int, b: int, p: int, least_gain: float) -> float:
     """How much E falls if the edge (a, b) is split at p; -inf if it cannot be, or by less than `least_gain`."""
-    n = held.cells.shape[1]
+    cells, fluxes, objective = state.complex.cells, state.complex.fluxes, state.objective
+    n = cells.shape[1]
     old, shape = 0.0, 0.0
     for r in range(rings.start[a], rings.start[a + 1]):
         cell = rings.cells[r]
-        if not has_node(held.cells, cell, b):
+        if not has_node(cells, cell, b):
             continue
-        old += cell_energy(held, cell, measure)
-        least = measure.floor if n == 4 else -1.0
+        old += cell_energy(state, cell)
+        least = objective.floor if n == 4 else -1.0
         if least > -1.0:
-            shape_of_cell(x, held.ticks, held.cells, cell, measure)
-            least = min(least, quality_up_to(x, measure))
+            shape_of_cell(x, state.complex.ticks, cells, cell, objective)
+            least = min(least, cosine_up_to_floor(x, objective))
         for node in (a, b):
-            shape += measure.geometry * _shape_with(x, held, cell, node, p, measure)
+            shape += objective.geometry * _shape_with(x, state, cell, node, p)
             if not shape < np.inf:
                 return -np.inf
-            if least > -1.0 and quality_up_to(x, measure) < least:
+            if least > -1.0 and cosine_up_to_floor(x, objective) < least:
                 return -np.inf
-    if old - shape <= least_gain and measure.surface == 0.0:
+    if old - shape <= least_gain and objective.surface == 0.0:
         return -np.inf
-    if measure.image == 0.0:
+    if objective.image == 0.0:
         return old - shape
-    new, misfit, D = shape, 0.0, held.sums.shape[1]
+    new, misfit, D = shape, 0.0, state.complex.sums.shape[1]
     flux, sums = np.empty((1, 1, D)), np.empty((2, D))
     for r in range(rings.start[a], rings.start[a + 1]):
         cell = rings.cells[r]
-        if has_node(held.cells, cell, b):
-            i, j = corner_of(held.cells, cell, a), corner_of(held.cells, cell, b)
-            _put_flux_with(flux, held, cell, i, b, p, measure)
+        if has_node(cells, cell, b):
+            i, j = corner_of(cells, cell, a), corner_of(cells, cell, b)
+            _put_flux_with(flux, state, cell, i, b, p)
             for d in range(D):
-                sums[0, d] = held.fluxes[cell, j, d] + flux[0, 0, d]
-                sums[1, d] = held.fluxes[cell, i, d] - flux[0, 0, d]
+                sums[0, d] = fluxes[cell, j, d] + flux[0, 0, d]
+                sums[1, d] = fluxes[cell, i, d] - flux[0, 0, d]
             for k in range(n):
                 if k not in (i, j):
                     for half, node in ((0, b), (1, a)):
-                        _put_flux_with(flux, held, cell, k, node, p, measure)
+                        _put_flux_with(flux, state, cell, k, node, p)
                         for d in range(D):
                             sums[half, d] += flux[0, 0, d]
             for half in range(2):
-                new += measure.image * image_energy(sums, half, measure.n_channels)
-                misfit += wrong_side(sums, half, measure)
-            misfit -= wrong_side(held.sums, cell, measure)
-            if old - new <= least_gain and measure.surface == 0.0:  # else the misfit may fall yet
+                new += objective.image * image_energy(sums, half, objective.n_channels)
+                misfit += wrong_side(sums, half, objective)
+            misfit -= wrong_side(state.complex.sums, cell, objective)
+            if old - new <= least_gain and objective.surface == 0.0:  # else the misfit may fall yet
                 return -np.inf
     worth = old - new - misfit
     return worth if worth > least_gain else -np.inf
 
 
 @njit(cache=True, error_model="numpy")
-def _shape_with(x: NDArray, held: Complex, cell: int, node: int, p: int, measure: Measure) -> float:
+def _shape_with(x: NDArray, state: State, cell: int, node: int, p: int) -> float:
     """Shape energy of a cell with p in the place of its corner `node`; the corners are left in x."""
-    k = corner_of(held.cells, cell, node)
-    base = held.cells[cell, 0] if k > 0 else p
-    for m in range(held.cells.shape[1]):
-        load(x, m, held.ticks, p if m == k else held.cells[cell, m], base, measure)
-    return shape_energy(x, held.cells.shape[1], measure.power, measure.is_graded)
+    cells, objective = state.complex.cells, state.objective
+    k = corner_of(cells, cell, node)
+    base = cells[cell, 0] if k > 0 else p
+    for m in range(cells.shape[1]):
+        load(x, m, state.complex.ticks, p if m == k else cells[cell, m], base, objective)
+    return shape_energy(x, cells.shape[1], objective.power, objective.is_graded)
 
 
 @njit(cache=True, error_model="numpy")
-def _put_flux_with(flux: NDArray, held: Complex, cell: int, k: int, node: int, p: int, measure: Measure) -> None:
+def _put_flux_with(flux: NDArray, state: State, cell: int, k: int, node: int, p: int) -> None:
     """Flux of facet k of a cell with p in the place of `node`, outwards, to flux[0, 0, :]."""
-    a, b, c = outward(held.cells, cell, k)
+    a, b, c = outward(state.complex.cells, cell, k)
     a, b, c = p if a == node else a, p if b == node else b, p if c == node and c >= 0 else c
-    put_flux(flux, 0, 0, held.ticks, a, b, c, measure)
+    put_flux(flux, 0, 0, state.complex.ticks, a, b, c, state.objective)
 
 
 @njit(cache=True, error_model="numpy")
-def split_edge(held: Complex, rings: NodeRings, a: int, b: int, p: int, is_dirty: NDArray, measure: Measure) -> None:
+def split_edge(state: State, rings: NodeRings, a: int, b: int, p: int, is_dirty: NDArray) -> None:
     """Each cell of the edge (a, b) becomes two: it keeps a, with p for b; a new one has b, with p for a."""
-    n = held.cells.shape[1]
-    first, last = rings.start[a], rings.start[a + 1]
+    cells, across, fluxes = state.complex.cells, state.complex.across, state.complex.fluxes
+    n, first, last = cells.shape[1], rings.start[a], rings.start[a + 1]
     x, new = np.empty((4, 3)), np.full(last - first, -1, dtype=np.int64)
     for r in range(first, last):
-        if has_node(held.cells, rings.cells[r], b):
-            new[r - first] = held.n_cells[0]
-            held.n_cells[0] += 1
+        if has_node(cells, rings.cells[r], b):
+            new[r - first] = state.complex.n_cells[0]
+            state.complex.n_cells[0] += 1
     for r in range(first, last):
         cell, other = rings.cells[r], new[r - first]
         if other < 0:
             continue
-        i, j = corner_of(held.cells, cell, a), corner_of(held.cells, cell, b)
-        held.cells[other] = held.cells[cell]
-        held.across[other] = held.across[cell]
-        held.fluxes[other] = held.fluxes[cell]
-        held.cells[other, i] = p
-        beyond = held.across[cell, i]
+        i, j = corner_of(cells, cell, a), corner_of(cells, cell, b)
+        cells[other] = cells[cell]
+        across[other] = across[cell]
+        fluxes[other] = fluxes[cell]
+        cells[other, i] = p
+        beyond = across[cell, i]
         if beyond >= 0:
-            held.across[beyond, facet_of(held.cells, held.across, beyond, cell)] = other
-        held.across[other, j] = cell
+            across[beyond, facet_of(across, beyond, cell)] = other
+        across[other, j] = cell
         for k in range(n):
-            if k not in (i, j) and held.across[cell, k] >= 0:
+            if k not in (i, j) and across[cell, k] >= 0:
                 for s in range(first, last):
-                    if rings.cells[s] == held.across[cell, k]:
-                        held.across[other, k] = new[s - first]
-    for r in range(first, last):  # only now: the old corners have told the new neighbours
+                    if rings.cells[s] == across[cell, k]:
+                        across[other, k] = new[s - first]
+    for r in range(first, last):  # only now: the old corners were needed to find the new neighbours
         cell, other = rings.cells[r], new[r - first]
         if other < 0:
             continue
-        i, j = corner_of(held.cells, cell, a), corner_of(held.cells, cell, b)
-        held.cells[cell, j] = p
-        held.across[cell, i] = other
+        i, j = corner_of(cells, cell, a), corner_of(cells, cell, b)
+        cells[cell, j] = p
+        across[cell, i] = other
         for child, back in ((cell, i), (other, j)):
             for k in range(n):
-                if measure.image > 0.0 and (k == back or k not in (i, j)):
-                    measure_facet(held, child, k, measure)
-            held.E_shape[child] = shape_of_cell(x, held.ticks, held.cells, child, measure)
-            sum_up(held.sums, held.fluxes, child)
+                if state.objective.image > 0.0 and (k == back or k not in (i, j)):
+                    measure_facet(state, child, k)
+            settle(x, state, child)
             is_dirty[child] = True
 
 
@@ -571,118 +548,82 @@ def split_edge(held: Complex, rings: NodeRings, a: int, b: int, p: int, is_dirty
 
 
 def best_collapses(
-    held: Complex,
-    rings: NodeRings,
-    groups: Blocks,
-    is_frozen: NDArray[np.bool_],
-    measure: Measure,
-    sides: Sides,
-    dearest: float,
-    is_wanted: NDArray[np.bool_],
-    longest: NDArray[np.float64],
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """How much E rises if each node that is wanted is joined to its best neighbour, (N,), and which that is, (N,).
-
-    inf and -1 where there is none that leaves a mesh above the floor, or for `dearest` at most.
-    """
-    n_nodes = len(rings.start) - 1
-    cost, collapse = np.full(n_nodes, np.inf), np.full(n_nodes, -1, dtype=np.int64)
-    bare = measure._replace(image=0.0)
-    for chosen in colours_of(held, rings, groups):
+    state: State, rings: NodeRings, groups: Blocks, may_collapse: NDArray[np.bool_], limits: Limits
+) -> EdgeMoves:
+    """The neighbour to which each node that may is best joined, so that a mesh above the floor is left."""
+    n_nodes = len(may_collapse)
+    moves = EdgeMoves(may_collapse, np.full(n_nodes, -1, dtype=np.int64), np.full(n_nodes, -np.inf))
+    for chosen in colours_of(state, rings, groups):
         with few_threads(len(chosen) * 10_000):
-            _fill_collapses(
-                cost,
-                collapse,
-                held,
-                rings,
-                groups,
-                chosen,
-                is_frozen,
-                measure,
-                bare,
-                sides,
-                dearest,
-                is_wanted,
-                longest,
-            )
-    return cost, collapse
+            _fill_collapses(moves, *state, rings, groups, chosen, limits)
+    return moves
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def _fill_collapses(
-    cost: NDArray, collapse: NDArray, held: Complex, rings: NodeRings, groups: Blocks, chosen: NDArray,
-    is_frozen: NDArray, measure: Measure, bare: Measure, sides: Sides, dearest: float, is_wanted: NDArray,
-    longest: NDArray,
+    moves: EdgeMoves, complex_: Complex, objective: Objective, sides: Sides, rings: NodeRings, groups: Blocks,
+    chosen: NDArray, limits: Limits,
 ) -> None:  # fmt: skip
     for number in prange(len(chosen)):
         for at in range(groups.start[chosen[number]], groups.start[chosen[number] + 1]):
-            if is_wanted[groups.nodes[at]]:
-                _best_collapse(
-                    groups.nodes[at], cost, collapse, held, rings, is_frozen, measure, bare, sides, dearest, longest
-                )
+            if moves.may_move[groups.nodes[at]]:
+                _best_collapse(groups.nodes[at], moves, State(complex_, objective, sides), rings, limits)
 
 
 @njit(cache=True, error_model="numpy")
-def _best_collapse(
-    a: int, cost: NDArray, collapse: NDArray, held: Complex, rings: NodeRings, is_frozen: NDArray, measure: Measure,
-    bare: Measure, sides: Sides, dearest: float, longest: NDArray,
-) -> None:  # fmt: skip
+def _best_collapse(a: int, moves: EdgeMoves, state: State, rings: NodeRings, limits: Limits) -> None:
     """The neighbour to which `a` is best joined. It is moved there and back: cells of other groups do not see it."""
+    cells, t, is_frozen, objective = state.complex.cells, state.complex.ticks, state.complex.is_frozen, state.objective
     if is_frozen[a, 0] and is_frozen[a, 1] and is_frozen[a, 2]:
         return
-    n, t = held.cells.shape[1], held.ticks
-    first, last = rings.start[a], rings.start[a + 1]
-    x, near, shapes = np.empty((4, 3)), np.empty(NEIGHBOURS, dtype=np.int64), np.full(NEIGHBOURS, np.inf)
-    trial, fluxes = np.empty(last - first), np.empty((last - first, n, held.fluxes.shape[2]))
-    old, least, size = 0.0, measure.floor if n == 4 else -1.0, 0.0
-    for r in range(first, last):
-        old += cell_energy(held, rings.cells[r], measure)
-        load_cell(x, t, held.cells, rings.cells[r], measure)
-        size += content(x, n)
+    n, trial = cells.shape[1], trial_of(state, rings, a)
+    near, shapes = np.empty(MAX_NEIGHBOURS, dtype=np.int64), np.full(MAX_NEIGHBOURS, np.inf)
+    old, least, size = 0.0, objective.floor if n == 4 else -1.0, 0.0
+    for r in range(rings.start[a], rings.start[a + 1]):
+        old += cell_energy(state, rings.cells[r])
+        load_cell(trial.x, t, cells, rings.cells[r], objective)
+        size += signed_volume(trial.x, n)
         if least > -1.0:
-            least = min(least, quality_up_to(x, measure))
-    here0, here1, here2 = t[a, 0], t[a, 1], t[a, 2]
-    count = _neighbours(near, held, rings, a)
-    best = old + dearest
+            least = min(least, cosine_up_to_floor(trial.x, objective))
+    here, count, best = row(t, a), _neighbours(near, cells, rings, a), old + limits.dearest
+    _, has_misfit = ring_misfit(state, rings, a)
     for number in range(count):  # shapes are cheap, and a lower bound
         b = near[number]
-        if may_join(t, is_frozen, a, b) and _is_short(x, held, near, count, a, b, longest, measure):
-            t[a, 0], t[a, 1], t[a, 2] = t[b, 0], t[b, 1], t[b, 2]
-            shapes[number] = ring_energy(best, least, trial, fluxes, x, a, held, rings, bare, b)
-            if shapes[number] < np.inf and not _keeps_domain(x, held, rings, is_frozen, a, b, size, sides, measure):
+        if may_join(t, is_frozen, a, b) and _is_short(state, near, count, a, b, limits.longest):
+            put_row(t, a, row(t, b))
+            shapes[number] = ring_shape(trial, np.inf if has_misfit else best, least, a, state, rings, b)
+            if shapes[number] < np.inf and not _keeps_domain(trial.x, state, rings, a, b, size):
                 shapes[number] = np.inf
-            t[a, 0], t[a, 1], t[a, 2] = here0, here1, here2
+            put_row(t, a, here)
     for _ in range(count):
         number = int(np.argmin(shapes))
         if not shapes[number] < best:
             break
         b, value = near[number], shapes[number]
         shapes[number] = np.inf
-        if measure.image > 0.0:
-            t[a, 0], t[a, 1], t[a, 2] = t[b, 0], t[b, 1], t[b, 2]
-            value = ring_energy(best, least, trial, fluxes, x, a, held, rings, measure, b)
-            t[a, 0], t[a, 1], t[a, 2] = here0, here1, here2
+        if objective.image > 0.0:
+            put_row(t, a, row(t, b))
+            value = ring_energy(trial, best, least, a, state, rings, b)
+            put_row(t, a, here)
         if value < best:
-            best, cost[a], collapse[a] = value, value - old, b
+            best, moves.gain[a], moves.other[a] = value, old - value, b
 
 
 @njit(cache=True, error_model="numpy")
-def squared_length(x: NDArray, held: Complex, a: int, b: int, measure: Measure) -> float:
+def squared_length(state: State, a: int, b: int) -> float:
     """Squared distance of two nodes, mm^2."""
-    load(x, 0, held.ticks, b, a, measure)
-    return x[0, 0] * x[0, 0] + x[0, 1] * x[0, 1] + x[0, 2] * x[0, 2]
+    u = place(state.complex.ticks, b, a, state.objective)
+    return dot(u, u)
 
 
 @njit(cache=True, error_model="numpy")
-def _is_short(
-    x: NDArray, held: Complex, near: NDArray, count: int, a: int, b: int, longest: NDArray, measure: Measure
-) -> bool:
+def _is_short(state: State, near: NDArray, count: int, a: int, b: int, longest: NDArray) -> bool:
     """Whether no edge from b to a neighbour of a is longer than the bound at its ends, or than the longest was."""
     old = 0.0
     for m in range(count):
-        old = max(old, squared_length(x, held, a, near[m], measure))
+        old = max(old, squared_length(state, a, near[m]))
     for m in range(count):
-        square = squared_length(x, held, b, near[m], measure)
+        square = squared_length(state, b, near[m])
         if square > old and square > min(longest[b], longest[near[m]]) ** 2:
             return False
     return True
@@ -701,104 +642,96 @@ def may_join(ticks: NDArray, is_frozen: NDArray, a: int, b: int) -> bool:
 
 
 @njit(cache=True, error_model="numpy")
-def _keeps_domain(
-    x: NDArray, held: Complex, rings: NodeRings, is_frozen: NDArray, a: int, b: int, size: float, sides: Sides,
-    measure: Measure,
-) -> bool:  # fmt: skip
+def _keeps_domain(x: NDArray, state: State, rings: NodeRings, a: int, b: int, size: float) -> bool:
     """Whether the mesh still covers what it should with a at the place of b; `size` is n! times the ring's volume."""
-    if not is_frozen[a, 3]:
-        return _keeps_size(x, held, rings, a, b, size, measure)
+    if not state.complex.is_frozen[a, 3]:
+        return _keeps_size(x, state, rings, a, b, size, ROUNDING_SHARE)
     return (
-        _keeps_size(x, held, rings, a, b, size, measure, SHIFT)
-        and _is_linked(held, rings, a, b)
-        and ring_faces_up(x, np.empty((2, 3)), held, rings, a, b, sides, measure)
+        _keeps_size(x, state, rings, a, b, size, SURFACE_VOLUME_SHARE)
+        and _is_linked(state, rings, a, b)
+        and ring_faces_up(np.empty((2, 3)), state, rings, a, b)
     )
 
 
 @njit(cache=True, error_model="numpy")
-def _is_linked(held: Complex, rings: NodeRings, a: int, b: int) -> bool:
+def _is_linked(state: State, rings: NodeRings, a: int, b: int) -> bool:
     """Whether a boundary edge may be collapsed without closing a hole or a gap (Dey et al. 1999).
 
     It has to lie on the boundary, and a node next to both of its ends must be so by a cell with both, on the boundary
     by a facet with both.
     """
-    near, n = np.empty(NEIGHBOURS, dtype=np.int64), held.cells.shape[1]
-    edge = _is_outer(held, rings, a, b, -1)
-    for number in range(_neighbours(near, held, rings, a)):
+    cells = state.complex.cells
+    near, n = np.empty(MAX_NEIGHBOURS, dtype=np.int64), cells.shape[1]
+    edge = _is_outer(state, rings, a, b, -1)
+    for number in range(_neighbours(near, cells, rings, a)):
         c = near[number]
         has_both, is_next = False, False
         for r in range(rings.start[b], rings.start[b + 1]):
-            if has_node(held.cells, rings.cells[r], c):
+            if has_node(cells, rings.cells[r], c):
                 is_next = True
-                has_both = has_both or has_node(held.cells, rings.cells[r], a)
+                has_both = has_both or has_node(cells, rings.cells[r], a)
         if c == b or not is_next:
             continue
         if not has_both:
             return False
-        are_outer = n == 4 and _is_outer(held, rings, a, c, -1) and _is_outer(held, rings, b, c, -1)
-        if are_outer and not _is_outer(held, rings, a, b, c):
+        are_outer = n == 4 and _is_outer(state, rings, a, c, -1) and _is_outer(state, rings, b, c, -1)
+        if are_outer and not _is_outer(state, rings, a, b, c):
             return False
     return edge
 
 
 @njit(cache=True, error_model="numpy")
-def _is_outer(held: Complex, rings: NodeRings, a: int, b: int, c: int) -> bool:
+def _is_outer(state: State, rings: NodeRings, a: int, b: int, c: int) -> bool:
     """Whether a facet of the boundary has the nodes a and b, and c unless that is -1."""
+    cells = state.complex.cells
     for r in range(rings.start[a], rings.start[a + 1]):
         cell = rings.cells[r]
-        if has_node(held.cells, cell, b) and (c < 0 or has_node(held.cells, cell, c)):
-            for k in range(held.cells.shape[1]):
-                node = held.cells[cell, k]
-                if held.across[cell, k] < 0 and node not in (a, b, c):
+        if has_node(cells, cell, b) and (c < 0 or has_node(cells, cell, c)):
+            for k in range(cells.shape[1]):
+                node = cells[cell, k]
+                if state.complex.across[cell, k] < 0 and node not in (a, b, c):
                     return True
     return False
 
 
 @njit(cache=True, error_model="numpy")
-def _keeps_size(
-    x: NDArray, held: Complex, rings: NodeRings, a: int, b: int, size: float, measure: Measure, part: float = 1e-9
-) -> bool:
-    """Whether the cells around a, moved to b, fill what they filled: n! times their volume is `size`.
+def _keeps_size(x: NDArray, state: State, rings: NodeRings, a: int, b: int, size: float, share: float) -> bool:
+    """Whether the cells around a, moved to b, fill what they filled, but for a share: n! times their volume is `size`.
 
     All cells positive, they fan out from b over the ring's hull; so this holds unless the domain itself is not convex
     there.
     """
+    cells = state.complex.cells
     total = 0.0
     for r in range(rings.start[a], rings.start[a + 1]):
-        if not has_node(held.cells, rings.cells[r], b):
-            load_cell(x, held.ticks, held.cells, rings.cells[r], measure)
-            total += content(x, held.cells.shape[1])
-    return abs(total - size) <= part * size
+        if not has_node(cells, rings.cells[r], b):
+            load_cell(x, state.complex.ticks, cells, rings.cells[r], state.objective)
+            total += signed_volume(x, cells.shape[1])
+    return abs(total - size) <= share * size
 
 
 @njit(cache=True, error_model="numpy")
-def collapse_edge(held: Complex, rings: NodeRings, a: int, b: int, is_dirty: NDArray, measure: Measure) -> None:
+def collapse_edge(state: State, rings: NodeRings, a: int, b: int, is_dirty: NDArray) -> None:
     """Node a becomes b: cells with both go, and the others around a have b instead."""
-    n = held.cells.shape[1]
-    first, last = rings.start[a], rings.start[a + 1]
-    x = np.empty((4, 3))
-    for r in range(first, last):
+    cells, across, x = state.complex.cells, state.complex.across, np.empty((4, 3))
+    for r in range(rings.start[a], rings.start[a + 1]):
         cell = rings.cells[r]
         is_dirty[cell] = True
-        if not has_node(held.cells, cell, b):
-            continue
-        # What lay beyond its facets opposite a and b are neighbours now.
-        i, j = corner_of(held.cells, cell, a), corner_of(held.cells, cell, b)
-        of_b, of_a = held.across[cell, i], held.across[cell, j]
-        if of_a >= 0:
-            k = facet_of(held.cells, held.across, of_a, cell)
-            held.across[of_a, k] = of_b
-        if of_b >= 0:
-            held.across[of_b, facet_of(held.cells, held.across, of_b, cell)] = of_a
-    for r in range(first, last):
+        if has_node(cells, cell, b):
+            # What lay beyond its facets opposite a and b are neighbours now.
+            of_b, of_a = across[cell, corner_of(cells, cell, a)], across[cell, corner_of(cells, cell, b)]
+            if of_a >= 0:
+                across[of_a, facet_of(across, of_a, cell)] = of_b
+            if of_b >= 0:
+                across[of_b, facet_of(across, of_b, cell)] = of_a
+    for r in range(rings.start[a], rings.start[a + 1]):
         cell = rings.cells[r]
-        if has_node(held.cells, cell, b):
-            held.cells[cell, 0] = -1
+        if has_node(cells, cell, b):
+            cells[cell, 0] = -1
             continue
-        i = corner_of(held.cells, cell, a)
-        held.cells[cell, i] = b
-        for k in range(n):
-            if measure.image > 0.0 and k != i:
-                measure_facet(held, cell, k, measure)
-        held.E_shape[cell] = shape_of_cell(x, held.ticks, held.cells, cell, measure)
-        sum_up(held.sums, held.fluxes, cell)
+        i = corner_of(cells, cell, a)
+        cells[cell, i] = b
+        for k in range(cells.shape[1]):
+            if state.objective.image > 0.0 and k != i:
+                measure_facet(state, cell, k)
+        settle(x, state, cell)

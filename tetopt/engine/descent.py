@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from tetopt.energy.geometric import volume_and_E_G
 from tetopt.energy.sampling import cell_orientation, facet_flux, few_threads
-from tetopt.engine.complex import FLAT
+from tetopt.engine.complex import FLAT_SHARE
 
 LLOYD_HALVINGS = 4  # of a Lloyd step that inverts a cell or raises the ring's energy: then the node stays
 
@@ -113,7 +113,7 @@ def _image_energy(sums: NDArray) -> float:
 def _is_flat(volume: float, E_G: float, n_corners: int) -> bool:
     """Whether a cell is thinner than the engines allow; E_G is volume times sum of squared edges over (n+1)(n+2)."""
     edges = E_G * (n_corners * (n_corners + 1)) / max(volume, 1e-300)
-    return volume <= FLAT * edges ** (0.5 * (n_corners - 1))
+    return volume <= FLAT_SHARE * edges ** (0.5 * (n_corners - 1))
 
 
 class Trial(NamedTuple):
@@ -145,7 +145,7 @@ def _ring_energy(trial: Trial, limit: float, node: int, mesh: Tessellation, sche
         return np.inf
     flux, fluxes, facets, prefix, bits = np.empty((1, 1, 3)), trial.fluxes, mesh.facets, scheme.prefix, scheme.bits
     for s in range(mesh.star_start[node], mesh.star_start[node + 1]):
-        facet_flux(ticks, facets, mesh.star[s], bits, prefix, None, 0, flux, 0)
+        facet_flux(ticks, facets, mesh.star[s], bits, prefix, None, flux, 0)
         for d in range(3):
             fluxes[s - mesh.star_start[node], d] = flux[0, 0, d]
     sign, of_cell, present = mesh.sign, mesh.of_cell, mesh.fluxes

@@ -17,32 +17,12 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.check import check_unfolded
-from tetopt.energy.sampling import (
-    cell_moments,
-    cell_of_voxel,
-    channel_grid,
-    check_orientations,
-    few_threads,
-    from_ticks,
-    to_ticks,
-)
-from tetopt.engine.complex import (
-    Complex,
-    Measure,
-    build,
-    copied,
-    energies,
-    floor_of,
-    measure_all,
-    measure_of,
-    node_rings,
-)
+from tetopt.energy.sampling import cell_moments, cell_of_voxel, channel_grid, from_ticks
+from tetopt.engine.complex import State, copied, node_rings, remeasure
 from tetopt.engine.density import Limits, exchange
-from tetopt.engine.flips import flip, make_moves
+from tetopt.engine.flips import flip
 from tetopt.engine.loop import (
     MIN_DIHEDRAL,
-    NOISE,
     SHAPE_POWER,
     UNIFORM_ITERATIONS,
     UNIFORM_K_D,
@@ -50,13 +30,12 @@ from tetopt.engine.loop import (
     Optimized,
     Record,
     deadline,
-    frozen_axes,
     relative_movement,
 )
 from tetopt.engine.paper import optimize_paper
-from tetopt.engine.repair import repair, worst_angles
+from tetopt.engine.repair import n_cells_below, repair
 from tetopt.engine.smooth import blocks, sweep
-from tetopt.engine.surface import sides_of
+from tetopt.engine.state import content_energies, state_of, with_floor
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
 from tetopt.image import Image, transformed
@@ -65,12 +44,12 @@ from tetopt.start.lattice import lattice
 from tetopt.start.sizes import Sizes
 from tetopt.target.content import Content, plain
 
-STILL = 0.05  # of an edge: nodes that moved less need no new flips
-QUIET = 0.02  # of an edge: nodes around which none moved more are not moved again
-EXCHANGES = 0.7  # of the iterations: those after which nodes are exchanged
-EXCHANGED = 0.1  # of the nodes wanted: the most that are exchanged at once
-EAGER = 0.1  # see `_Run.exchange`
-FAR = -(1 << 40)  # ticks from anywhere
+FLIP_EDGES = 0.05  # edges: nodes that moved less need no new flips
+SWEEP_EDGES = 0.02  # edges: nodes around which none moved more are not moved again
+EXCHANGING_SHARE = 0.7  # of the iterations: the first ones, in which nodes are exchanged
+EXCHANGED_SHARE = 0.1  # of the requested nodes: the most that are exchanged at once
+EXCHANGE_SHAPE_WEIGHT = 0.1  # of the shape energy's weight: what a shape costs in an exchange, see `Run.exchange`
+FAR_TICKS = -(1 << 40)  # a place far from any other
 
 
 def optimize(
@@ -146,10 +125,11 @@ def optimize(
     check_options(k_D, iterations, shape_power, min_dihedral, boundary, nodes)
     begin = time.perf_counter()
     is_over = deadline(begin, max_seconds, stop)
-    wanted = plain(image)
-    image = wanted.image
-    sizes = (Sizes() if sizes is None else sizes).prepared(image.ndim)
-    run = _Run(wanted, mesh, k_D, shape_power, boundary, is_graded=nodes is not None)
+    content = plain(image)
+    sizes = (Sizes() if sizes is None else sizes).prepared(content.image.ndim)
+    run = Run(content, mesh, k_D, shape_power, boundary, is_graded=nodes is not None)
+    floor = min_dihedral if run.n == 3 else 0.0
+    n_early = int(EXCHANGING_SHARE * iterations) if k_D > 0.0 else 0  # iterations in which nodes may be exchanged
     history: list[Record] = []
 
     def record(iteration: int, movement: float, is_changed: bool) -> None:
@@ -159,22 +139,26 @@ def optimize(
 
     record(0, 0.0, False)
     ended = "iterations"
-    floor = min_dihedral if run.n == 3 else 0.0
     if iterations > 0:
         run.keep_floor(floor)
     for iteration in range(1, iterations + 1):
-        before = run.held.ticks.copy()
+        before = run.state.complex.ticks.copy()
+        # 1. Move the nodes.
         is_finished = run.sweep(is_over)
-        is_changed = run.flip() > 0 if is_finished else False
-        is_early = nodes is not None and k_D > 0.0 and iteration <= EXCHANGES * iterations
-        movement = relative_movement(before, run.held.ticks, image, run.grid, run.matrix)
+        # 2. Exchange cells.
+        n_changes = run.flip() if is_finished else 0
+        movement = run.movement(before)
         fall = 1.0 - run.E() / history[-1].E if history[-1].E > 0.0 else 0.0
+        # 3. Exchange nodes: in every other one of the first iterations.
+        is_early = nodes is not None and iteration <= n_early
+        if nodes is not None and is_early and is_finished and iteration % 2 == 1:
+            n_changes += run.exchange(nodes, sizes)
+        # 4. Lift what is under the floor: in the last iteration.
         is_last = iteration == iterations or not is_finished or (fall < tolerance and not is_early)
-        if nodes is not None and is_early and not is_last and iteration % 2 == 1:
-            is_changed |= run.exchange(nodes, sizes) > 0
         if is_last and run.n_below(floor) > 0 and run.lift(floor) > 0:
-            is_changed, fall = True, np.inf
-        record(iteration, movement, is_changed)
+            n_changes, fall = n_changes + 1, np.inf
+        # 5. Measure.
+        record(iteration, movement, n_changes > 0)
         if not is_finished:
             ended = "stopped" if stop is not None and stop() else "max_seconds"
             break
@@ -192,110 +176,76 @@ def prepare_kernels(
     The sampling has kernels of its own for whole-number images whose sums fit 32 bits; see `sampling_grid`. The repair
     is left to be compiled when a mesh wants it.
     """
-    wanted = plain(image)
-    image = wanted.image
-    is_whole = not wanted.is_plain or np.array_equal(np.rint(image.data), image.data)
+    content = plain(image)
+    image = content.image
+    is_whole = not content.is_plain or np.array_equal(np.rint(image.data), image.data)
     step = 1.0 if is_whole else 0.1
     tiny = Image(np.zeros((3,) * image.ndim) + step * np.arange(3))
     mesh = lattice(tiny, blocks=(1,) * image.ndim)
     if method == "paper":
         optimize_paper(tiny, mesh, k_D=k_D, iterations=1)
-        return
-    optimize(tiny, mesh, k_D=k_D, iterations=1)
-    run = _Run(plain(tiny), mesh, k_D, SHAPE_POWER, "slide")
-    none = np.empty(0, dtype=np.int64)  # nothing can be gained on so small a mesh, so that no move is made of itself
-    make_moves(none, none, np.zeros(len(run.held.cells), dtype=np.bool_), run.held, run.measure)
-    if is_graded:
-        run.exchange(len(mesh.points), Sizes())
+    elif is_graded:  # nodes are exchanged in the first of two iterations
+        optimize(tiny, mesh, k_D=k_D, iterations=2, min_dihedral=0.0, nodes=len(mesh.points))
+    else:
+        optimize(tiny, mesh, k_D=k_D, iterations=1)
 
 
-class _Run:
+class Run:
     """What one optimisation works on, and its steps."""
 
     def __init__(
-        self, wanted: Content, mesh: Mesh, k_D: float, power: float, boundary: Boundary, is_graded: bool = False
-    ) -> None:
-        self.wanted, image = wanted, wanted.image
-        self.image, self.n = image, image.ndim
-        self.grid = channel_grid(wanted, mesh.points)
-        ticks = to_ticks(image.to_index(mesh.points), self.grid)
-        check_orientations(image, ticks, mesh.cells)
-        check_unfolded(mesh)
-        region = wanted.region
-        self.is_frozen = frozen_axes(image, ticks, mesh.cells, self.grid, boundary, region is not None)
-        self.is_still = self.is_frozen[:, 3 - self.n : 3].all(axis=1)
+        self, content: Content, mesh: Mesh, k_D: float, power: float = SHAPE_POWER, boundary: Boundary = "slide",
+        is_graded: bool = False,
+    ) -> None:  # fmt: skip
+        """As `tetopt.engine.state.state_of`."""
+        self.content, self.image, self.n = content, content.image, content.image.ndim
+        self.grid = channel_grid(content, mesh.points)
+        self.state: State = state_of(content, mesh, self.grid, k_D, power, boundary, is_graded)
+        ticks = self.state.complex.ticks
         is_kept = self.is_still if boundary == "fixed" else np.zeros(len(ticks), dtype=bool)
         self.kept = dict(zip(map(tuple, ticks[is_kept].tolist()), mesh.points[is_kept], strict=True))
-        self.matrix = np.eye(3)
-        self.matrix[3 - self.n :, 3 - self.n :] = image.affine[:-1, :-1]
-        level = None if region is None else region.level
-        self.sides = sides_of(self.grid, self.matrix, boundary == "fixed", level)
-        hand = 1 if np.linalg.det(image.affine[:-1, :-1]) > 0 else -1
-        unit = measure_of(self.grid, hand, self.matrix, 1.0, 1.0, power, is_graded)
-        self.held: Complex = build(mesh.cells, ticks, unit)
-        flat = np.flatnonzero(~np.isfinite(self.held.E_shape[: len(mesh.cells)]))
-        if len(flat):
-            raise InputError(
-                f"mesh: {len(flat)} cells are too flat to be improved, the first are {flat[:5].tolist()}; "
-                "remove them or move their nodes apart"
-            )
-        # Where every cell is uniform, what rounding leaves of E_D must not become the unit that E_D is measured in.
-        self.noise = NOISE * wanted.variance / wanted.unit * wanted.n_voxels
-        self.E_G0, self.squares0 = self.energies()
-        weight = k_D / self.squares0 if self.squares0 > 0.0 else 0.0
-        if not (0.0 < self.E_G0 < np.inf and np.isfinite(self.squares0) and np.isfinite(weight)):
-            raise InputError(
-                "mesh and image: their energies overflow; are lengths in mm and intensities of usual size?"
-            )
-        self.measure: Measure = measure_of(
-            self.grid, hand, self.matrix, (1.0 - k_D) / self.E_G0, weight, power, is_graded,
-            0.0 if region is None else weight * wanted.wrong_side, boundary == "fixed",
-        )  # fmt: skip
-        self.groups = blocks(ticks)
-        self.edge = _edges(mesh)
-        self.image_noise: float | None = None  # its variance, found when it is wanted
-        self.seen = np.full_like(ticks, FAR)  # where nodes were when their flips were last looked at
-        self.tried = np.full_like(ticks, FAR)  # and when the nodes around them were moved because of it
+        self.groups, self.edge = blocks(ticks), _edges(mesh)
+        self.image_noise: float | None = None  # its variance, estimated when it is first needed
+        self.ticks_flipped = np.full_like(ticks, FAR_TICKS)  # where nodes were when their flips were last looked at
+        self.ticks_swept = np.full_like(ticks, FAR_TICKS)  # and when the nodes around them were moved because of it
 
-    def energies(self) -> tuple[float, float]:
-        """Shape energy and sum of squares, with the mask's misfit; squares that are only rounding count as 0."""
-        E_G, squares = energies(self.held, self.grid.n_channels)
-        if self.wanted.region is not None:
-            squares += self.wanted.wrong_side * self.n_misfits()
-        return E_G, squares if squares > self.noise else 0.0
+    @property
+    def is_still(self) -> NDArray[np.bool_]:
+        """Nodes that may not move along any axis, (N,)."""
+        return np.asarray(self.state.complex.is_frozen[:, 3 - self.n : 3].all(axis=1))
 
-    def n_misfits(self) -> int:
-        """Voxels of the mask outside of the mesh, and others inside of it."""
-        return self.wanted.n_voxels + int(self.held.sums[: int(self.held.n_cells[0]), -1].sum())
+    @property
+    def n_cells(self) -> int:
+        """Cells in use."""
+        return int(self.state.complex.n_cells[0])
 
     def E(self) -> float:
-        E_G, squares = self.energies()
-        return self.measure.geometry * E_G + self.measure.image * squares
+        """The combined energy, Eq. (4)."""
+        E_G, squares = content_energies(self.state, self.content)
+        return self.state.objective.geometry * E_G + self.state.objective.image * squares
 
-    def sweep(self, is_over: Callable[[], bool]) -> bool:
+    def sweep(self, is_over: Callable[[], bool] = lambda: False) -> bool:
         """Move every node whose ring has changed since it was last moved; False if `is_over` cut it short."""
-        is_near = np.zeros(len(self.tried), dtype=bool)
-        cells = self.held.cells[: int(self.held.n_cells[0])]
-        is_near[cells[self._moved(self.tried, QUIET)[cells].any(axis=1)]] = True
-        return sweep(
-            self.held, node_rings(self.held), self.groups, is_near & ~self.is_still, self.is_frozen, self.measure,
-            self.sides, is_over,
-        )  # fmt: skip
+        is_near = np.zeros(len(self.ticks_swept), dtype=bool)
+        cells = self.state.complex.cells[: self.n_cells]
+        is_near[cells[self._moved(self.ticks_swept, SWEEP_EDGES)[cells].any(axis=1)]] = True
+        return sweep(self.state, node_rings(self.state), self.groups, is_near & ~self.is_still, is_over)
 
     def flip(self) -> int:
         """Exchange cells around the nodes that have moved; the number of exchanges."""
-        moved = self._moved(self.seen, STILL)
-        is_dirty = moved[self.held.cells[: int(self.held.n_cells[0])]].any(axis=1)
+        moved = self._moved(self.ticks_flipped, FLIP_EDGES)
+        is_dirty = moved[self.state.complex.cells[: self.n_cells]].any(axis=1)
         is_touched = np.zeros(len(moved), dtype=bool)
-        self.held, made = flip(self.held, self.measure, np.asarray(is_dirty), is_touched=is_touched)
-        self.tried[is_touched] = FAR
-        return made
+        self.state, n_flips = flip(self.state, np.asarray(is_dirty), is_touched=is_touched)
+        self.ticks_swept[is_touched] = FAR_TICKS
+        return n_flips
 
     def _moved(self, since: NDArray[np.int64], share: float) -> NDArray[np.bool_]:
         """Nodes that are more than a share of an edge away from `since`, which is brought up to date for them."""
-        way = transformed((self.held.ticks - since).astype(np.float64), self.matrix * 2.0**-self.grid.bits)
+        matrix = self.state.objective.matrix
+        way = transformed((self.state.complex.ticks - since).astype(np.float64), matrix * 2.0**-self.grid.bits)
         moved: NDArray[np.bool_] = (way**2).sum(axis=1) > (share * self.edge) ** 2
-        since[moved] = self.held.ticks[moved]
+        since[moved] = self.state.complex.ticks[moved]
         return moved
 
     def exchange(self, nodes: int, sizes: Sizes) -> int:
@@ -303,26 +253,25 @@ class _Run:
 
         A shape's cost is counted at a tenth: most of it goes when the nodes around move again.
         """
-        eager = self.measure._replace(geometry=EAGER * self.measure.geometry)
-        most, mesh = int(EXCHANGED * nodes), self.mesh()
+        objective, mesh = self.state.objective, self.mesh()
         if self.image_noise is None:
-            self.image_noise = self.wanted.noise
-        longest = sizes.longest_edges(self.image, nodes, mesh.points, mesh.cells, self.edge, self.wanted.volume)
+            self.image_noise = self.content.noise
+        longest = sizes.longest_edges(self.image, nodes, mesh.points, mesh.cells, self.edge, self.content.volume)
         limits = Limits(float(sizes.smallest), longest, self.image_noise)
-        done = exchange(self.held, self.is_frozen, eager, self.sides, nodes, most, limits)
-        self._renumber(done.held, done.is_frozen, done.source)
-        self.tried[done.is_touched] = FAR
-        self.seen[done.is_touched] = FAR
-        return done.n_split + done.n_collapsed
+        eager = objective._replace(geometry=EXCHANGE_SHAPE_WEIGHT * objective.geometry)
+        made = exchange(self.state._replace(objective=eager), nodes, int(EXCHANGED_SHARE * nodes), limits)
+        self._renumber(made.state._replace(objective=objective), made.source)
+        self.ticks_swept[made.is_touched] = FAR_TICKS
+        self.ticks_flipped[made.is_touched] = FAR_TICKS
+        return made.n_split + made.n_collapsed
 
     def keep_floor(self, degrees: float) -> None:
         """Let no move leave a dihedral angle under `degrees`, nor one that is under it already any smaller."""
-        floor, safe = floor_of(degrees)
-        self.measure = self.measure._replace(floor=floor, safe=safe)
+        self.state = with_floor(self.state, degrees)
 
     def n_below(self, degrees: float) -> int:
         """Tetrahedra with an angle under `degrees`."""
-        return worst_angles(self.held, self.measure, degrees) if degrees > 0.0 else 0
+        return n_cells_below(self.state, degrees) if degrees > 0.0 else 0
 
     def lift(self, degrees: float) -> int:
         """Lift the worst cells over `degrees`, or as far as they go; the number of moves. It may raise E.
@@ -330,46 +279,50 @@ class _Run:
         On the surface of a mask whose details are as small as the cells it may lay cells over one another; then none
         of it is done, and the floor is missed.
         """
-        before = self.held if self.wanted.region is None else copied(self.held)
-        done = repair(self.held, self.is_frozen, self.measure, self.sides, degrees)
-        if self.wanted.region is not None and self._overlaps(done.held):
-            self.held = before
+        before = self.state if self.content.region is None else copied(self.state)
+        made = repair(self.state, degrees)
+        if self.content.region is not None and self._overlaps(made.state):
+            self.state = before
             return 0
-        self._renumber(done.held, done.is_frozen, done.source)
-        self.tried[:] = FAR
-        return done.n_moves
+        self._renumber(made.state, made.source)
+        self.ticks_swept[:] = FAR_TICKS
+        return made.n_moves
 
-    def _overlaps(self, held: Complex) -> bool:
+    def _overlaps(self, state: State) -> bool:
         """Whether a voxel centre lies in two cells."""
-        points = self.image.to_world(from_ticks(held.ticks, self.grid, self.n))
-        mesh = Mesh(points, held.cells[: int(held.n_cells[0])].copy())
+        points = self.image.to_world(from_ticks(state.complex.ticks, self.grid, self.n))
+        mesh = Mesh(points, state.complex.cells[: int(state.complex.n_cells[0])].copy())
         covered = int((cell_of_voxel(self.image, mesh) >= 0).sum())
         return int(cell_moments(self.image, mesh).n_voxels.sum()) != covered
 
-    def _renumber(self, held: Complex, is_frozen: NDArray[np.bool_], source: NDArray[np.int64]) -> None:
-        """Take over a complex with other nodes: where each comes from, -1 for new ones."""
+    def _renumber(self, state: State, source: NDArray[np.int64]) -> None:
+        """Take over a state with other nodes: where each comes from, -1 for new ones."""
         is_new = (source < 0)[:, None]
-        self.held, self.is_frozen = held, is_frozen
-        self.is_still = is_frozen[:, 3 - self.n : 3].all(axis=1)
-        self.seen, self.tried = (np.where(is_new, FAR, since[source]) for since in (self.seen, self.tried))
-        self.groups, self.edge = blocks(held.ticks), _edges(self.mesh())
+        self.state = state
+        self.ticks_flipped = np.where(is_new, FAR_TICKS, self.ticks_flipped[source])
+        self.ticks_swept = np.where(is_new, FAR_TICKS, self.ticks_swept[source])
+        self.groups, self.edge = blocks(state.complex.ticks), _edges(self.mesh())
+
+    def movement(self, before: NDArray[np.int64]) -> float:
+        """How far the nodes are from where they were, `before` (N, 3) in ticks; see `relative_movement`."""
+        return relative_movement(before, self.state.complex.ticks, self.image, self.grid, self.state.objective.matrix)
 
     def record(self, iteration: int, movement: float, is_changed: bool, seconds: float) -> Record:
-        if self.measure.image == 0.0:  # the moves have left the sums alone
-            with few_threads(int(self.held.n_cells[0]) * 4):
-                measure_all(self.held, self.measure)
-        E_G, squares = self.energies()
-        n_cells = int(self.held.n_cells[0])
-        n_voxels = int(self.held.sums[:n_cells, 0].sum())
-        error = squares * self.wanted.unit * self.image.voxel_volume
-        return Record(iteration, self.E(), E_G, error, movement, is_changed, n_cells, n_voxels, seconds)
+        """The row of the history that tells how things stand."""
+        if self.state.objective.image == 0.0:  # the moves have left the sums alone
+            remeasure(self.state)
+        E_G, squares = content_energies(self.state, self.content)
+        n_voxels = int(self.state.complex.sums[: self.n_cells, 0].sum())
+        E_D = squares * self.content.unit * self.image.voxel_volume
+        return Record(iteration, self.E(), E_G, E_D, movement, is_changed, self.n_cells, n_voxels, seconds)
 
     def mesh(self) -> Mesh:
-        points = self.image.to_world(from_ticks(self.held.ticks, self.grid, self.n))
+        """The mesh as it stands."""
+        points = self.image.to_world(from_ticks(self.state.complex.ticks, self.grid, self.n))
         if self.kept:  # nodes that may not move come back to the last bit, not rounded to ticks
-            for node, place in enumerate(self.held.ticks.tolist()):
+            for node, place in enumerate(self.state.complex.ticks.tolist()):
                 points[node] = self.kept.get(tuple(place), points[node])
-        return Mesh(points, self.held.cells[: int(self.held.n_cells[0])].copy())
+        return Mesh(points, self.state.complex.cells[: self.n_cells].copy())
 
 
 def _edges(mesh: Mesh) -> NDArray[np.float64]:

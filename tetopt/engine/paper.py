@@ -23,7 +23,7 @@ from tetopt.energy.sampling import (
     sums_of_fluxes,
     to_ticks,
 )
-from tetopt.engine.complex import FLAT
+from tetopt.engine.complex import FLAT_SHARE
 from tetopt.engine.descent import Scheme, Tessellation, descend, free_projections, relocate
 from tetopt.engine.loop import (
     NOISE,
@@ -270,9 +270,9 @@ def _retessellated(image: Image, grid: SamplingGrid, mesh: Tessellation, hand: i
 
 
 def _is_flat(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Cells so thin that no optimisation may make them, (M,) bool; see `tetopt.engine.complex.FLAT`."""
+    """Cells so thin that no optimisation may make them, (M,) bool; see `tetopt.engine.complex.FLAT_SHARE`."""
     size = squared_edges(points, cells).sum(axis=1) ** (points.shape[1] / 2)
-    return volumes(points, cells) <= FLAT * size
+    return volumes(points, cells) <= FLAT_SHARE * size
 
 
 def _sweep(

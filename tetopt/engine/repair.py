@@ -14,21 +14,20 @@ from numba import njit
 from numpy.typing import NDArray
 
 from tetopt.engine.complex import (
-    Complex,
-    Measure,
     NodeRings,
-    cell_quality,
+    State,
+    cell_cosine,
     facet_of,
     grown,
     load_cell,
     node_rings,
     outward,
-    tet_quality,
+    tet_cosine,
 )
-from tetopt.engine.density import mend
+from tetopt.engine.density import LEAST_LIFT_COSINE, mend
 from tetopt.engine.flips import (
-    EDGES,
-    MOST,
+    POLYGON_CORNERS,
+    TET_EDGES,
     Cavity,
     best_triangulation,
     cavity,
@@ -39,156 +38,159 @@ from tetopt.engine.flips import (
     remove_edge,
     ring_of_edge,
 )
-from tetopt.engine.smooth import ring_energy, slid, store
-from tetopt.engine.surface import Sides
+from tetopt.engine.smooth import ring_energy, slid, store, trial_of
+from tetopt.engine.surface import projection_at
+from tetopt.geometry.vectors import difference, dot, put_row, row, scaled, times
 
-ROUNDS = 40
-STEPS = 7  # halvings of a node's displacement
+REPAIR_ROUNDS = 40  # at most; a round that changes nothing ends them before
+STEP_HALVINGS = 7  # of a node's displacement
+FIRST_STEP_EDGES = 0.25  # of the ring's mean edge: the first displacement
+WORST_WEIGHT = 40.0  # a steep sum stands for the worst cosine q: exp(-40 q) outweighs all that are 3 degrees better
 
 
 class Repaired(NamedTuple):
     """What `repair` returns."""
 
-    held: Complex
-    is_frozen: NDArray[np.bool_]  # (N', 4)
+    state: State
     source: NDArray[np.int64]  # (N',) number of each node before; -1 for new ones
     n_below: int  # cells still under the floor
     n_moves: int
 
 
-def qualities(held: Complex, measure: Measure) -> NDArray[np.float64]:
+def cell_cosines(state: State) -> NDArray[np.float64]:
     """Minus the cosine of each cell's smallest dihedral angle."""
-    found = np.empty(int(held.n_cells[0]))
-    _fill_qualities(found, held, measure)
-    return found
+    cosines = np.empty(int(state.complex.n_cells[0]))
+    _fill_cosines(cosines, state)
+    return cosines
 
 
 @njit(cache=True, error_model="numpy")
-def _fill_qualities(found: NDArray, held: Complex, measure: Measure) -> None:
+def _fill_cosines(cosines: NDArray, state: State) -> None:
     x = np.empty((4, 3))
-    for cell in range(len(found)):
-        found[cell] = cell_quality(x, held, cell, measure)
+    for cell in range(len(cosines)):
+        cosines[cell] = cell_cosine(x, state, cell)
 
 
-def repair(held: Complex, is_frozen: NDArray[np.bool_], measure: Measure, sides: Sides, floor: float) -> Repaired:
+def repair(state: State, floor: float) -> Repaired:
     """Lift every cell's smallest dihedral angle to `floor`, degrees, as far as moves can.
 
     Rounds over the cells below, worst first: flips, then displacements of their nodes, and where neither helps nodes
     put in or taken out; until no cell is left, or a round changes nothing.
     """
     target = -np.cos(np.radians(floor))
-    total = 0
-    source = np.arange(len(held.ticks))
-    for _ in range(ROUNDS):
-        bad = _worst_first(held, measure, target)
+    source, n_moves = np.arange(len(state.complex.ticks)), 0
+    for _ in range(REPAIR_ROUNDS):
+        bad = _worst_first(state, target)
         if len(bad) == 0:
             break
-        if len(held.cells) - held.n_cells[0] < 4 * len(bad) + 64:
-            held = grown(held)
-        made = _reconnect(held, bad, measure, target)
-        bad = _worst_first(held, measure, target)
+        if len(state.complex.cells) - state.complex.n_cells[0] < 4 * len(bad) + 64:
+            state = grown(state)
+        n_made = _reconnect(state, bad, target)
+        bad = _worst_first(state, target)
         if len(bad):
-            made += _displace(held, node_rings(held), bad, is_frozen, measure, sides, target)
-        bad = _worst_first(held, measure, target)
-        if made == 0 and len(bad):
-            done = mend(held, is_frozen, measure, sides, bad, target)
-            held, is_frozen, made = done.held, done.is_frozen, done.n_split + done.n_collapsed
-            source = np.where(done.source >= 0, source[done.source], -1)
-        total += made
-        if made == 0:
+            n_made += _displace(state, node_rings(state), bad, target)
+        bad = _worst_first(state, target)
+        if n_made == 0 and len(bad):
+            mended = mend(state, bad, target)
+            state, n_made = mended.state, mended.n_split + mended.n_collapsed
+            source = np.where(mended.source >= 0, source[mended.source], -1)
+        n_moves += n_made
+        if n_made == 0:
             break
-    return Repaired(held, is_frozen, source, len(_worst_first(held, measure, target)), total)
+    return Repaired(state, source, len(_worst_first(state, target)), n_moves)
 
 
-def worst_angles(held: Complex, measure: Measure, floor: float) -> int:
+def n_cells_below(state: State, floor: float) -> int:
     """How many cells have a smallest dihedral angle under `floor` degrees."""
-    return int((qualities(held, measure) < -np.cos(np.radians(floor))).sum())
+    return int((cell_cosines(state) < -np.cos(np.radians(floor))).sum())
 
 
-def _worst_first(held: Complex, measure: Measure, target: float) -> NDArray[np.int64]:
-    quality = qualities(held, measure)
-    bad = np.flatnonzero(quality < target)
-    return bad[np.lexsort((bad, quality[bad]))]
+def _worst_first(state: State, target: float) -> NDArray[np.int64]:
+    cosines = cell_cosines(state)
+    bad = np.flatnonzero(cosines < target)
+    return bad[np.lexsort((bad, cosines[bad]))]
 
 
 @njit(cache=True, error_model="numpy")
-def _reconnect(held: Complex, bad: NDArray, measure: Measure, target: float) -> int:
+def _reconnect(state: State, bad: NDArray, target: float) -> int:
     """For each bad cell the flip that leaves the best worst angle in its cavity, if it is better than before."""
-    room = len(held.cells)
-    work = cavity(room, held.fluxes.shape[2])
+    cells, across = state.complex.cells, state.complex.across
+    room = len(cells)
+    work = cavity(room, state.complex.fluxes.shape[2])
     is_changed = np.zeros(room, dtype=np.bool_)
-    made = 0
+    n_made = 0
     for number in range(len(bad)):
         cell = bad[number]
-        if is_changed[cell] or held.n_cells[0] + 2 * MOST > room:
+        if is_changed[cell] or state.complex.n_cells[0] + 2 * POLYGON_CORNERS > room:
             continue
-        best, choice = 1e-4, -1  # the least gain
+        best, choice = LEAST_LIFT_COSINE, -1
         for k in range(4):
-            if held.across[cell, k] >= 0:
-                gain = _gain_of_face(work.x, held, cell, k, measure, target)
+            if across[cell, k] >= 0:
+                gain = _gain_of_face(work.x, state, cell, k, target)
                 if gain > best:
                     best, choice = gain, k
         for e in range(6):
-            m, is_open = ring_of_edge(work.ring, work.around, held, cell, EDGES[e, 0], EDGES[e, 1])
-            gain = _gain_of_edge(work, held, cell, e, m, is_open, measure, target)
+            i, j = TET_EDGES[e, 0], TET_EDGES[e, 1]
+            m, is_open = ring_of_edge(work.ring, work.around, cells, across, cell, i, j, False)
+            gain = _gain_of_edge(work, state, cell, e, m, is_open, target)
             if gain > best:
                 best, choice = gain, 4 + e
         if choice < 0:
             continue
         if choice < 4:
-            flip_face(work, held, cell, choice, is_changed, measure)
+            flip_face(work, state, cell, choice, is_changed)
         else:
             e = choice - 4
-            m, is_open = ring_of_edge(work.ring, work.around, held, cell, EDGES[e, 0], EDGES[e, 1])
-            _gain_of_edge(work, held, cell, e, m, is_open, measure, target)
-            a, b = held.cells[cell, EDGES[e, 0]], held.cells[cell, EDGES[e, 1]]
-            if measure.image > 0.0:
+            i, j = TET_EDGES[e, 0], TET_EDGES[e, 1]
+            m, is_open = ring_of_edge(work.ring, work.around, cells, across, cell, i, j, False)
+            _gain_of_edge(work, state, cell, e, m, is_open, target)
+            a, b = cells[cell, i], cells[cell, j]
+            if state.objective.image > 0.0:
                 work.is_side[:] = False
                 for i in range(m - 1):
                     for j in range(i + 1, m):
-                        fill_side(work, held, a, b, i, j, m, is_open, measure)
-            remove_edge(work, held, a, b, m, is_open, is_changed, measure)
-        made += 1
-    close_gaps(held, is_changed)
-    return made
+                        fill_side(work, state, a, b, i, j, m, is_open)
+            remove_edge(work, state, a, b, m, is_open, is_changed)
+        n_made += 1
+    close_gaps(state, is_changed)
+    return n_made
 
 
 @njit(cache=True, error_model="numpy")
-def _gain_of_face(x: NDArray, held: Complex, cell: int, k: int, measure: Measure, target: float) -> float:
+def _gain_of_face(x: NDArray, state: State, cell: int, k: int, target: float) -> float:
     """By how much the worst angle of the cavity (its minus cosine, up to the target) grows in a face flip."""
-    other = held.across[cell, k]
-    old = min(cell_quality(x, held, cell, measure), cell_quality(x, held, other, measure))
-    u, v, w = outward(held.cells, cell, k)
-    p, q = held.cells[cell, k], held.cells[other, facet_of(held.cells, held.across, other, cell)]
+    cells, across = state.complex.cells, state.complex.across
+    other = across[cell, k]
+    old = min(cell_cosine(x, state, cell), cell_cosine(x, state, other))
+    u, v, w = outward(cells, cell, k)
+    p, q = cells[cell, k], cells[other, facet_of(across, other, cell)]
     new = target
     for a, b in ((u, v), (v, w), (w, u)):
-        new = min(new, tet_quality(x, held, p, q, a, b, measure))
+        new = min(new, tet_cosine(x, state, p, q, a, b))
         if new <= old:
             return -1.0
     return new - old
 
 
 @njit(cache=True, error_model="numpy")
-def _gain_of_edge(
-    work: Cavity, held: Complex, cell: int, e: int, m: int, is_open: int, measure: Measure, target: float
-) -> float:
+def _gain_of_edge(work: Cavity, state: State, cell: int, e: int, m: int, is_open: int, target: float) -> float:
     """The same for the removal of an edge; `work.apex` holds the triangulation."""
+    cells = state.complex.cells
     x, ring, around, cost, apex, shape = work.x, work.ring, work.around, work.cost, work.apex, work.triangle
-    a, b = held.cells[cell, EDGES[e, 0]], held.cells[cell, EDGES[e, 1]]
-    if m < 3 or (is_open == 1 and not in_one_face(held, a, b, ring[0], ring[m - 1], measure)):
+    a, b = cells[cell, TET_EDGES[e, 0]], cells[cell, TET_EDGES[e, 1]]
+    if m < 3 or (is_open == 1 and not in_one_face(state, a, b, ring[0], ring[m - 1])):
         return -1.0
     old = 1.0
     for r in range(m - is_open):
-        old = min(old, cell_quality(x, held, around[r], measure))
-    # A steep sum stands for the worst: exp(-40 q) of the worst cell outweighs all others that are 3 degrees better.
+        old = min(old, cell_cosine(x, state, around[r]))
     for i in range(m - 2):
         for k in range(i + 1, m - 1):
             for j in range(k + 1, m):
-                above = tet_quality(x, held, ring[i], ring[k], ring[j], b, measure)
-                below = tet_quality(x, held, ring[i], ring[j], ring[k], a, measure)
+                above = tet_cosine(x, state, ring[i], ring[k], ring[j], b)
+                below = tet_cosine(x, state, ring[i], ring[j], ring[k], a)
                 shape[i, k, j] = np.inf
                 if min(above, below) > old:
-                    shape[i, k, j] = np.exp(-40.0 * above) + np.exp(-40.0 * below)
+                    shape[i, k, j] = np.exp(-WORST_WEIGHT * above) + np.exp(-WORST_WEIGHT * below)
     if not np.isfinite(best_triangulation(cost, apex, shape, m)):
         return -1.0
     new = target
@@ -201,8 +203,8 @@ def _gain_of_edge(
         if j == i + 1:
             continue
         k = apex[i, j]
-        new = min(new, tet_quality(x, held, ring[i], ring[k], ring[j], b, measure))
-        new = min(new, tet_quality(x, held, ring[i], ring[j], ring[k], a, measure))
+        new = min(new, tet_cosine(x, state, ring[i], ring[k], ring[j], b))
+        new = min(new, tet_cosine(x, state, ring[i], ring[j], ring[k], a))
         stack[height, 0], stack[height, 1] = i, k
         stack[height + 1, 0], stack[height + 1, 1] = k, j
         height += 2
@@ -210,88 +212,87 @@ def _gain_of_edge(
 
 
 @njit(cache=True, error_model="numpy")
-def _displace(
-    held: Complex, rings: NodeRings, bad: NDArray, is_frozen: NDArray, measure: Measure, sides: Sides, target: float
-) -> int:
+def _displace(state: State, rings: NodeRings, bad: NDArray, target: float) -> int:
     """Move the nodes of each bad cell so that the worst angle of their rings grows, up to the target."""
-    x = np.empty((4, 3))
-    made = 0
+    x, n_made = np.empty((4, 3)), 0
     for number in range(len(bad)):
         for k in range(4):
-            if cell_quality(x, held, bad[number], measure) >= target:
+            if cell_cosine(x, state, bad[number]) >= target:
                 break
-            if _lift(x, held, rings, held.cells[bad[number], k], is_frozen, measure, sides, target):
-                made += 1
-    return made
+            if _lift(x, state, rings, state.complex.cells[bad[number], k], target):
+                n_made += 1
+    return n_made
 
 
 @njit(cache=True, error_model="numpy")
-def _ring_quality(x: NDArray, held: Complex, rings: NodeRings, node: int, measure: Measure, least: float) -> float:
+def _ring_cosine(x: NDArray, state: State, rings: NodeRings, node: int, least: float) -> float:
     """The worst of a ring's cells; -2 if one is flat or inverted, and anything below `least` once that is passed."""
     worst = 1.0
     for r in range(rings.start[node], rings.start[node + 1]):
-        c = held.cells[rings.cells[r]]
-        worst = min(worst, tet_quality(x, held, c[0], c[1], c[2], c[3], measure))
+        c = state.complex.cells[rings.cells[r]]
+        worst = min(worst, tet_cosine(x, state, c[0], c[1], c[2], c[3]))
         if worst < least:
             return worst
     return worst
 
 
 @njit(cache=True, error_model="numpy")
-def _lift(
-    x: NDArray, held: Complex, rings: NodeRings, node: int, is_frozen: NDArray, measure: Measure, sides: Sides,
-    target: float,
-) -> bool:  # fmt: skip
-    """Search along 26 directions, with ever smaller steps, for a place where the ring's worst angle is larger."""
-    t = held.ticks
-    first, last = rings.start[node], rings.start[node + 1]
-    begin = _ring_quality(x, held, rings, node, measure, -3.0)
-    best = begin
-    start0, start1, start2 = t[node, 0], t[node, 1], t[node, 2]
-    if best >= target:
+def _lift(x: NDArray, state: State, rings: NodeRings, node: int, target: float) -> bool:
+    """Search around a node, with ever smaller steps, for a place where its ring's worst angle is larger."""
+    start, before = row(state.complex.ticks, node), _ring_cosine(x, state, rings, node, -3.0)
+    if before >= target:
         return False
-    # The first step: a fifth of the ring's mean edge.
-    edge, count = 0.0, 0
-    for r in range(first, last):
-        load_cell(x, t, held.cells, rings.cells[r], measure)
+    best, step, normal = before, _first_step(x, state, rings, node), np.empty((2, 3))
+    for _ in range(STEP_HALVINGS):
+        is_better = True
+        while is_better and best < target:
+            cosine = _step_around(x, normal, state, rings, node, step, best)
+            is_better, best = cosine > best, cosine
+        step *= 0.5
+    if best > before:
+        trial = trial_of(state, rings, node)
+        if np.isfinite(ring_energy(trial, np.inf, -1.0, node, state, rings, -1)):
+            store(trial, node, state, rings)
+            return True
+    put_row(state.complex.ticks, node, start)
+    return False
+
+
+@njit(cache=True, error_model="numpy")
+def _first_step(x: NDArray, state: State, rings: NodeRings, node: int) -> float:
+    """A quarter of the mean length of the edges from a node, each as often as cells have it, mm."""
+    total, count = 0.0, 0
+    for r in range(rings.start[node], rings.start[node + 1]):
+        load_cell(x, state.complex.ticks, state.complex.cells, rings.cells[r], state.objective)
         at = rings.corner[r]
         for k in range(4):
             if k != at:
-                edge += np.sqrt((x[k, 0] - x[at, 0]) ** 2 + (x[k, 1] - x[at, 1]) ** 2 + (x[k, 2] - x[at, 2]) ** 2)
+                edge = difference(x, k, at)
+                total += np.sqrt(dot(edge, edge))
                 count += 1
-    step = 0.25 * edge / count
-    P = sides.projections[is_frozen[node, 0] + 2 * is_frozen[node, 1] + 4 * is_frozen[node, 2]]
-    normal, slides = np.empty((2, 3)), is_frozen[node, 3]
-    scale = 2.0**-measure.bits
-    for _ in range(STEPS):
-        improved = True
-        while improved and best < target:
-            improved = False
-            here0, here1, here2 = t[node, 0], t[node, 1], t[node, 2]
-            there0, there1, there2 = here0, here1, here2
-            for code in range(27):
-                if code == 13:
-                    continue
-                d0, d1, d2 = float(code // 9 - 1), float(code // 3 % 3 - 1), float(code % 3 - 1)
-                size = step / np.sqrt(d0 * d0 + d1 * d1 + d2 * d2) / scale
-                t[node, 0] = here0 + np.int64(np.rint(size * (P[0, 0] * d0 + P[0, 1] * d1 + P[0, 2] * d2)))
-                t[node, 1] = here1 + np.int64(np.rint(size * (P[1, 0] * d0 + P[1, 1] * d1 + P[1, 2] * d2)))
-                t[node, 2] = here2 + np.int64(np.rint(size * (P[2, 0] * d0 + P[2, 1] * d1 + P[2, 2] * d2)))
-                if slides and not slid(x, normal, held, rings, node, is_frozen, sides, measure):
-                    continue
-                quality = _ring_quality(x, held, rings, node, measure, best)
-                if quality > best + 1e-4:
-                    best = quality
-                    there0, there1, there2 = t[node, 0], t[node, 1], t[node, 2]
-                    improved = True
-            t[node, 0], t[node, 1], t[node, 2] = there0, there1, there2
-        step *= 0.5
-    if best <= begin:
-        t[node, 0], t[node, 1], t[node, 2] = start0, start1, start2
-        return False
-    trial, fluxes = np.empty(last - first), np.empty((last - first, 4, held.fluxes.shape[2]))
-    if not np.isfinite(ring_energy(np.inf, -1.0, trial, fluxes, x, node, held, rings, measure)):
-        t[node, 0], t[node, 1], t[node, 2] = start0, start1, start2
-        return False
-    store(held, rings, node, trial, fluxes, measure)
-    return True
+    return FIRST_STEP_EDGES * total / count
+
+
+@njit(cache=True, error_model="numpy")
+def _step_around(
+    x: NDArray, normal: NDArray, state: State, rings: NodeRings, node: int, step: float, best: float
+) -> float:
+    """Move a node by a step, mm, in the one of 26 directions that leaves its ring's best cosine; that, or `best`."""
+    t, P, scale = state.complex.ticks, projection_at(state, node), 2.0**-state.objective.bits
+    here = row(t, node)
+    there = here
+    for code in range(27):
+        if code == 13:
+            continue
+        d = float(code // 9 - 1), float(code // 3 % 3 - 1), float(code % 3 - 1)
+        way = scaled(step / np.sqrt(dot(d, d)) / scale, times(P, d))
+        t[node, 0] = here[0] + np.int64(np.rint(way[0]))
+        t[node, 1] = here[1] + np.int64(np.rint(way[1]))
+        t[node, 2] = here[2] + np.int64(np.rint(way[2]))
+        if state.complex.is_frozen[node, 3] and not slid(normal, state, rings, node):
+            continue
+        cosine = _ring_cosine(x, state, rings, node, best)
+        if cosine > best + LEAST_LIFT_COSINE:
+            best, there = cosine, row(t, node)
+    put_row(t, node, there)
+    return best

@@ -19,32 +19,35 @@ import numpy as np
 from numba import njit, prange
 from numpy.typing import NDArray
 
-from tetopt.energy.geometric import volume_and_E_G
+from tetopt.energy.geometric import volume_and_E_G, volume_gradient
 from tetopt.energy.sampling import few_threads
 from tetopt.engine.complex import (
     Complex,
-    Measure,
     NodeRings,
+    Objective,
+    Sides,
+    State,
     cell_energy,
+    cosine_up_to_floor,
     has_node,
     image_energy,
     load_cell,
     outward,
     put_flux,
-    quality_up_to,
     shape_of_cell,
     sum_up,
     wrong_side,
 )
-from tetopt.engine.surface import Sides, normal_at, put_on_surface, ring_faces_up
+from tetopt.engine.surface import FLAT_RISE, normal_at, projection_at, put_on_surface, ring_faces_up
 from tetopt.geometry.topology import greedy_colours
+from tetopt.geometry.vectors import cross, difference, dot, minus, put_row, row, scaled, times
 
-POINTS = 8  # most parts that a facet's edge is cut into when h is integrated over it
-SPACING = 2.0  # voxels between such points
-REACH = 0.5  # of the distance to the nearest centroid of the ring's cells: the longest first step
-PROBE = 0.3  # of that step: how far a stalled node looks along the axes
-BLOCK = 128  # nodes in a group, at most
-TRIES = 3  # energies measured along the gradient, at most
+FACET_PARTS = 8  # most parts that a facet's edge is cut into when h is integrated over it; four times as many in 2-D
+PART_VOXELS = 2.0  # voxels between the points at which h is then taken
+FIRST_STEP_SHARE = 0.5  # of the distance to the nearest centroid of the ring's cells: the longest first step
+PROBE_SHARE = 0.3  # of that step: how far a stalled node looks along the axes
+BLOCK_NODES = 128  # nodes in a group, at most: what they read fits the cache
+LINE_TRIALS = 3  # energies measured along the gradient, at most
 
 
 class Blocks(NamedTuple):
@@ -57,7 +60,7 @@ class Blocks(NamedTuple):
 
 def blocks(ticks: NDArray[np.int64]) -> Blocks:
     """Groups of nodes along a Z-order curve (Morton 1966), so that a graded mesh gets groups of equal number."""
-    size = max(1, min(BLOCK, len(ticks) // 64))
+    size = max(1, min(BLOCK_NODES, len(ticks) // 64))
     low, high = ticks.min(axis=0), ticks.max(axis=0)
     cell = (ticks - low) * 1023 // np.maximum(high - low, 1)
     code = np.zeros(len(ticks), dtype=np.int64)
@@ -72,27 +75,30 @@ def blocks(ticks: NDArray[np.int64]) -> Blocks:
 
 
 def sweep(
-    held: Complex, rings: NodeRings, groups: Blocks, is_wanted: NDArray[np.bool_], is_frozen: NDArray[np.bool_],
-    measure: Measure, sides: Sides, is_over: Callable[[], bool] = lambda: False,
-) -> bool:  # fmt: skip
-    """Move the nodes that are wanted, (N,); `is_frozen` (N, 4): axes along which each stays, whether on the surface.
+    state: State,
+    rings: NodeRings,
+    groups: Blocks,
+    may_move: NDArray[np.bool_],
+    is_over: Callable[[], bool] = lambda: False,
+) -> bool:
+    """Move the nodes that may, `may_move` (N,), each along the axes, and on the surface, that `is_frozen` leaves it.
 
     Groups of one colour share no cell, and are worked on at the same time, their nodes one after the other: those read
     the same voxels, 1.5 to 2 times faster from the cache than nodes of one colour all over the volume. Returns False if
     `is_over` cut it short, between two colours.
     """
-    for chosen in colours_of(held, rings, groups):
+    for chosen in colours_of(state, rings, groups):
         if is_over():
             return False
-        with few_threads(len(chosen) * BLOCK * 100):
-            _sweep(held, rings, groups, chosen, is_wanted, is_frozen, measure, sides)
+        with few_threads(len(chosen) * BLOCK_NODES * 100):
+            _sweep(*state, rings, groups, chosen, may_move)
     return True
 
 
-def colours_of(held: Complex, rings: NodeRings, groups: Blocks) -> list[NDArray[np.int64]]:
+def colours_of(state: State, rings: NodeRings, groups: Blocks) -> list[NDArray[np.int64]]:
     """The groups of each colour: none shares a cell with another of its colour."""
     start, cells = _block_rings(groups.nodes, groups.start, rings.start, rings.cells)
-    colours = greedy_colours(groups.of_node[held.cells[: held.n_cells[0]]], start, cells)
+    colours = greedy_colours(groups.of_node[state.complex.cells[: state.complex.n_cells[0]]], start, cells)
     return [np.flatnonzero(colours == colour) for colour in range(int(colours.max()) + 1)]
 
 
@@ -111,36 +117,33 @@ def _block_rings(nodes: NDArray, start: NDArray, ring_start: NDArray, ring_cells
     return first, cells
 
 
-def gradient(held: Complex, rings: NodeRings, measure: Measure) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def gradient(state: State, rings: NodeRings) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Derivatives of the two weighted terms of E by every node's position, (N, 3) each, per mm: shape and image."""
-    shape, image = np.zeros((len(held.ticks), 3)), np.zeros((len(held.ticks), 3))
-    _gradients(shape, image, held, rings, measure, np.linalg.inv(measure.matrix))
+    shape, image = np.zeros((len(state.complex.ticks), 3)), np.zeros((len(state.complex.ticks), 3))
+    _gradients(shape, image, *state, rings)
     return shape, image
 
 
 @njit(cache=True, error_model="numpy")
-def _facet_moments(moment: NDArray, ticks: NDArray, node: int, b: int, c: int, measure: Measure) -> float:
+def _facet_moments(moment: NDArray, ticks: NDArray, node: int, b: int, c: int, objective: Objective) -> float:
     """Means of phi and h phi over the facet (node, b, c), or the segment (node, b), phi the node's hat function.
 
     Those of h phi go to `moment` (n_channels,), h a voxel's values less the grid's shift; 1/3 (1/2 in 2-D) is the mean
     of phi itself.
     """
-    prefix = measure.prefix
-    n_more = measure.n_channels - 1
+    prefix, n_more, scale = objective.prefix, objective.n_channels - 1, 2.0**-objective.bits
     for d in range(1 + n_more):
         moment[d] = 0.0
-    scale = 2.0**-measure.bits
-    a0, a1, a2 = ticks[node, 0] * scale, ticks[node, 1] * scale, ticks[node, 2] * scale
-    e0, e1, e2 = ticks[b, 0] * scale - a0, ticks[b, 1] * scale - a1, ticks[b, 2] * scale - a2
+    a = scaled(scale, row(ticks, node))
+    e = minus(scaled(scale, row(ticks, b)), a)
     most_i, most_j, most_k = prefix.shape[0] - 1, prefix.shape[1] - 1, prefix.shape[2] - 2
     weight, first = 0.0, 0.0
     if c < 0:
-        length = np.sqrt(e1 * e1 + e2 * e2)
-        parts = min(max(int(length / SPACING) + 1, 2), 4 * POINTS)
+        parts = min(max(int(np.sqrt(dot(e, e)) / PART_VOXELS) + 1, 2), 4 * FACET_PARTS)
         for p in range(parts):
             s = (p + 0.5) / parts
-            j = min(max(int(np.rint(a1 + s * e1)), 0), most_j)
-            k = min(max(int(np.rint(a2 + s * e2)), 0), most_k)
+            j = min(max(int(np.rint(a[1] + s * e[1])), 0), most_j)
+            k = min(max(int(np.rint(a[2] + s * e[2])), 0), most_k)
             phi = 1.0 - s
             weight += phi
             first += phi * (prefix[0, j, k + 1, 0] - prefix[0, j, k, 0])
@@ -148,9 +151,8 @@ def _facet_moments(moment: NDArray, ticks: NDArray, node: int, b: int, c: int, m
                 moment[1 + d] += phi * (prefix[0, j, k + 1, 2 + d] - prefix[0, j, k, 2 + d]) / parts
         moment[0] = first / parts
         return weight / parts
-    f0, f1, f2 = ticks[c, 0] * scale - a0, ticks[c, 1] * scale - a1, ticks[c, 2] * scale - a2
-    longest = max(e0 * e0 + e1 * e1 + e2 * e2, f0 * f0 + f1 * f1 + f2 * f2)
-    parts = min(max(int(np.sqrt(longest) / SPACING) + 1, 2), POINTS)
+    f = minus(scaled(scale, row(ticks, c)), a)
+    parts = min(max(int(np.sqrt(max(dot(e, e), dot(f, f))) / PART_VOXELS) + 1, 2), FACET_PARTS)
     for p in range(parts):
         for q in range(parts - p):
             for half in range(2):
@@ -158,9 +160,9 @@ def _facet_moments(moment: NDArray, ticks: NDArray, node: int, b: int, c: int, m
                     continue
                 s = (p + (1.0 + half) / 3.0) / parts
                 t = (q + (1.0 + half) / 3.0) / parts
-                i = min(max(int(np.rint(a0 + s * e0 + t * f0)), 0), most_i)
-                j = min(max(int(np.rint(a1 + s * e1 + t * f1)), 0), most_j)
-                k = min(max(int(np.rint(a2 + s * e2 + t * f2)), 0), most_k)
+                i = min(max(int(np.rint(a[0] + s * e[0] + t * f[0])), 0), most_i)
+                j = min(max(int(np.rint(a[1] + s * e[1] + t * f[1])), 0), most_j)
+                k = min(max(int(np.rint(a[2] + s * e[2] + t * f[2])), 0), most_k)
                 phi = 1.0 - s - t
                 weight += phi
                 first += phi * (prefix[i, j, k + 1, 0] - prefix[i, j, k, 0])
@@ -171,16 +173,12 @@ def _facet_moments(moment: NDArray, ticks: NDArray, node: int, b: int, c: int, m
 
 
 @njit(cache=True, error_model="numpy")
-def _add_image_gradient(
-    g: NDArray, held: Complex, rings: NodeRings, node: int, measure: Measure, inverse: NDArray
-) -> None:
+def _add_image_gradient(g: NDArray, state: State, rings: NodeRings, node: int) -> None:
     """Add the derivative of the weighted E_D by a node's position to g (3,), per mm."""
-    n = held.cells.shape[1]
-    scale = 2.0**-measure.bits
-    first = rings.start[node]
-    t = held.ticks
-    moment = np.empty(measure.n_channels)
-    g0, g1, g2 = 0.0, 0.0, 0.0
+    cells, sums, ticks, objective = state.complex.cells, state.complex.sums, state.complex.ticks, state.objective
+    n, first, scale = cells.shape[1], rings.start[node], 2.0**-objective.bits
+    moment = np.empty(objective.n_channels)
+    g0, g1, g2 = 0.0, 0.0, 0.0  # per voxel along each axis
     for r in range(first, rings.start[node + 1]):
         cell = rings.cells[r]
         for k in range(n):
@@ -188,135 +186,163 @@ def _add_image_gradient(
             if k == rings.corner[r] or twin < 0 or twin // n < r - first:
                 continue  # not a facet of the node; on the boundary, along which the node slides; or done
             other = rings.cells[first + twin // n]
-            count_1, count_2 = held.sums[cell, 0], held.sums[other, 0]
-            if count_1 <= 0.0 or count_2 <= 0.0:
+            if _has_same_means(sums, cell, other, objective.n_channels):
                 continue
-            is_same = True  # as between cells of the background
-            for channel in range(measure.n_channels):
-                d = 1 if channel == 0 else 2 + channel
-                is_same = is_same and held.sums[cell, d] * count_2 == held.sums[other, d] * count_1
-            if is_same:
-                continue
-            a, b, c = outward(held.cells, cell, k)
+            a, b, c = outward(cells, cell, k)
             if n == 3:  # the segment (a, b), its normal to the right; phi of `node`
-                far = b if a == node else a
-                weight = _facet_moments(moment, t, node, far, -1, measure)
-                n1, n2 = (t[b, 2] - t[a, 2]) * scale, -(t[b, 1] - t[a, 1]) * scale
-                n0 = 0.0
+                weight = _facet_moments(moment, ticks, node, b if a == node else a, -1, objective)
+                e = scaled(scale, difference(ticks, b, a))
+                normal = (0.0, e[2], -e[1])
             else:
                 if b == node:
                     a, b, c = b, c, a
                 elif c == node:
                     a, b, c = c, a, b
-                weight = _facet_moments(moment, t, node, b, c, measure)
-                e0, e1, e2 = (t[b, 0] - t[a, 0]) * scale, (t[b, 1] - t[a, 1]) * scale, (t[b, 2] - t[a, 2]) * scale
-                f0, f1, f2 = (t[c, 0] - t[a, 0]) * scale, (t[c, 1] - t[a, 1]) * scale, (t[c, 2] - t[a, 2]) * scale
-                n0, n1, n2 = 0.5 * (e1 * f2 - e2 * f1), 0.5 * (e2 * f0 - e0 * f2), 0.5 * (e0 * f1 - e1 * f0)
+                weight = _facet_moments(moment, ticks, node, b, c, objective)
+                e, f = scaled(scale, difference(ticks, b, a)), scaled(scale, difference(ticks, c, a))
+                normal = scaled(0.5, cross(e, f))
             jump = 0.0
-            for channel in range(measure.n_channels):
+            for channel in range(objective.n_channels):
                 d = 1 if channel == 0 else 2 + channel
-                mean_1, mean_2 = held.sums[cell, d] / count_1, held.sums[other, d] / count_2
+                mean_1, mean_2 = sums[cell, d] / sums[cell, 0], sums[other, d] / sums[other, 0]
                 jump += (mean_2 - mean_1) * (2.0 * moment[channel] - (mean_1 + mean_2) * weight)
-            g0 += jump * n0
-            g1 += jump * n1
-            g2 += jump * n2
-    factor = measure.image * measure.hand
+            g0 += jump * normal[0]
+            g1 += jump * normal[1]
+            g2 += jump * normal[2]
+    factor, inverse = objective.image * objective.hand, state.sides.inverse
     for d in range(3):
         g[d] += factor * (inverse[0, d] * g0 + inverse[1, d] * g1 + inverse[2, d] * g2)
 
 
 @njit(cache=True, error_model="numpy")
-def _add_shape_gradient(g: NDArray, x: NDArray, held: Complex, rings: NodeRings, node: int, measure: Measure) -> tuple:
+def _has_same_means(sums: NDArray, cell: int, other: int, n_channels: int) -> bool:
+    """Whether two cells have the same mean in all channels, as those of the background, or one holds no voxel."""
+    count_1, count_2 = sums[cell, 0], sums[other, 0]
+    if count_1 <= 0.0 or count_2 <= 0.0:
+        return True
+    is_same = True
+    for channel in range(n_channels):
+        d = 1 if channel == 0 else 2 + channel
+        is_same = is_same and sums[cell, d] * count_2 == sums[other, d] * count_1
+    return is_same
+
+
+@njit(cache=True, error_model="numpy")
+def _add_shape_gradient(g: NDArray, x: NDArray, state: State, rings: NodeRings, node: int) -> tuple:
     """Add the derivative of the weighted shape energy to g (3,), per mm.
 
     Returns a bound of its curvature, the distance in mm to the nearest centroid of the ring's cells, and the ring's
-    worst quality, up to the floor.
+    worst cosine, up to the floor.
     """
-    n = held.cells.shape[1]
+    cells, objective = state.complex.cells, state.objective
+    n, power = cells.shape[1], objective.power
     dim = n - 1
-    power = measure.power
-    curvature, nearest, least = 0.0, np.inf, measure.floor
+    curvature, nearest, least = 0.0, np.inf, objective.floor
     for r in range(rings.start[node], rings.start[node + 1]):
         cell, at = rings.cells[r], rings.corner[r]
-        load_cell(x, held.ticks, held.cells, cell, measure)
+        load_cell(x, state.complex.ticks, cells, cell, objective)
         volume, E_G = volume_and_E_G(x, n)
-        W = held.E_shape[cell]
+        W = state.complex.E_shape[cell]
         S = E_G * (n * (n + 1)) / volume
-        if n == 4:
-            a, b, c = (at + 1) & 3, (at + 2) & 3, (at + 3) & 3
-            u0, u1, u2 = x[b, 0] - x[a, 0], x[b, 1] - x[a, 1], x[b, 2] - x[a, 2]
-            w0, w1, w2 = x[c, 0] - x[a, 0], x[c, 1] - x[a, 1], x[c, 2] - x[a, 2]
-            v0, v1, v2 = (u1 * w2 - u2 * w1) / 6.0, (u2 * w0 - u0 * w2) / 6.0, (u0 * w1 - u1 * w0) / 6.0
-        else:
-            a, b = (at + 1) % 3, (at + 2) % 3
-            v0, v1, v2 = 0.0, (x[b, 2] - x[a, 2]) / 2.0, (x[a, 1] - x[b, 1]) / 2.0
-        side = v0 * (x[at, 0] - x[a, 0]) + v1 * (x[at, 1] - x[a, 1]) + v2 * (x[at, 2] - x[a, 2])
-        sign = 1.0 if side > 0.0 else -1.0
+        v = volume_gradient(x, at, n)
         # W is proportional to v^alpha S^p with alpha = 1 - 2 (p - 1) / n, on a graded mesh alpha = -2 p / n.
-        alpha = -2.0 * power / dim if measure.is_graded else 1.0 - 2.0 * (power - 1.0) / dim
-        of_volume = sign * alpha / volume
-        of_edges = power / S
+        alpha = -2.0 * power / dim if objective.is_graded else 1.0 - 2.0 * (power - 1.0) / dim
+        of_volume, of_edges = alpha / volume, power / S
         squared = 0.0
         for d in range(3):
             apart = 0.0
             for k in range(n):
                 apart += x[at, d] - x[k, d]
             squared += apart * apart
-            g[d] += measure.geometry * W * (of_volume * (v0, v1, v2)[d] + of_edges * 2.0 * apart)
-        curvature += measure.geometry * W * of_edges * 2.0 * n
+            g[d] += objective.geometry * W * (of_volume * v[d] + of_edges * 2.0 * apart)
+        curvature += objective.geometry * W * of_edges * 2.0 * n
         nearest = min(nearest, squared)
         if n == 4 and least > -1.0:
-            least = min(least, quality_up_to(x, measure))
+            least = min(least, cosine_up_to_floor(x, objective))
     return curvature, np.sqrt(nearest) / n, least
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def _gradients(
-    shape: NDArray, image: NDArray, held: Complex, rings: NodeRings, measure: Measure, inverse: NDArray
+    shape: NDArray, image: NDArray, complex_: Complex, objective: Objective, sides: Sides, rings: NodeRings
 ) -> None:
     for node in prange(len(shape)):
-        x = np.empty((4, 3))
-        _add_shape_gradient(shape[node], x, held, rings, node, measure)
-        _add_image_gradient(image[node], held, rings, node, measure, inverse)
+        x, state = np.empty((4, 3)), State(complex_, objective, sides)
+        _add_shape_gradient(shape[node], x, state, rings, node)
+        _add_image_gradient(image[node], state, rings, node)
+
+
+class Trial(NamedTuple):
+    """What `ring_energy` measures of a node's ring of R cells."""
+
+    x: NDArray[np.float64]  # (4, 3) room for a cell's corners
+    shapes: NDArray[np.float64]  # (R,) shape energy of each cell; -1 if it is gone
+    fluxes: NDArray[np.float64]  # (R, n+1, D) of its facets around the node, outwards
+
+
+@njit(cache=True, error_model="numpy")
+def trial_of(state: State, rings: NodeRings, node: int) -> Trial:
+    """Room for what is measured of a node's ring."""
+    size, fluxes = rings.start[node + 1] - rings.start[node], state.complex.fluxes
+    return Trial(np.empty((4, 3)), np.empty(size), np.empty((size, fluxes.shape[1], fluxes.shape[2])))
+
+
+@njit(cache=True, error_model="numpy")
+def ring_misfit(state: State, rings: NodeRings, node: int) -> tuple:
+    """The ring's weighted misfit to the mask before a move, times -1, and whether a move may change it."""
+    misfit, has_misfit = 0.0, False
+    if state.objective.surface > 0.0:
+        for r in range(rings.start[node], rings.start[node + 1]):
+            misfit -= wrong_side(state.complex.sums, rings.cells[r], state.objective)
+            for k in range(state.complex.cells.shape[1]):
+                has_misfit = has_misfit or (k != rings.corner[r] and rings.twin[r, k] < 0)
+    return misfit, has_misfit
+
+
+@njit(cache=True, error_model="numpy")
+def ring_shape(
+    trial: Trial, limit: float, least: float, node: int, state: State, rings: NodeRings, joined: int
+) -> float:
+    """Weighted shape energy of a node's ring as the ticks stand; each cell's goes to `trial.shapes`.
+
+    Infinite if a cell is flat or inverted or has a cosine under `least`, or once the energy is above `limit`. Cells
+    that have the node `joined`, at whose place the node is, count as gone.
+    """
+    cells, objective = state.complex.cells, state.objective
+    has_floor = cells.shape[1] == 4 and least > -1.0
+    first, energy = rings.start[node], 0.0
+    for r in range(first, rings.start[node + 1]):
+        if joined >= 0 and has_node(cells, rings.cells[r], joined):
+            trial.shapes[r - first] = -1.0
+            continue
+        shape = shape_of_cell(trial.x, state.complex.ticks, cells, rings.cells[r], objective)
+        trial.shapes[r - first] = shape
+        if has_floor and (shape == np.inf or cosine_up_to_floor(trial.x, objective) < least):
+            return np.inf
+        energy += objective.geometry * shape
+        if energy > limit:
+            return np.inf
+    return energy
 
 
 @njit(cache=True, error_model="numpy")
 def ring_energy(
-    limit: float, least: float, trial: NDArray, fluxes: NDArray, x: NDArray, node: int, held: Complex,
-    rings: NodeRings, measure: Measure, joined: int = -1,
-) -> float:  # fmt: skip
-    """Energy of a node's ring as the ticks stand; shapes and facet fluxes go to `trial` (R,), `fluxes` (R, n+1, D).
+    trial: Trial, limit: float, least: float, node: int, state: State, rings: NodeRings, joined: int = -1
+) -> float:
+    """Energy of a node's ring as the ticks stand, all that was measured in `trial`; infinite as `ring_shape`.
 
-    Infinite if a cell is flat or inverted or has a quality under `least`, or once the energy is above `limit`. Cells
-    that have the node `joined`, at whose place the node is, count as gone; their shape is -1. What the ring's misfit
-    to the mask is more than it was is added.
+    What the ring's misfit to the mask is more than it was is added.
     """
-    n, D = held.cells.shape[1], held.sums.shape[1]
-    first, last = rings.start[node], rings.start[node + 1]
-    energy, misfit, has_misfit = 0.0, 0.0, False
-    if measure.surface > 0.0:
-        for r in range(first, last):
-            misfit -= wrong_side(held.sums, rings.cells[r], measure)
-            for k in range(n):
-                has_misfit = has_misfit or (k != rings.corner[r] and rings.twin[r, k] < 0)
-    up_to = limit
-    if has_misfit:  # no sum says anything before all of the misfit is in it
-        limit = np.inf
-    for r in range(first, last):  # cheap refusals before any voxel is read
-        if joined >= 0 and has_node(held.cells, rings.cells[r], joined):
-            trial[r - first] = -1.0
-            continue
-        trial[r - first] = shape_of_cell(x, held.ticks, held.cells, rings.cells[r], measure)
-        if n == 4 and least > -1.0 and (trial[r - first] == np.inf or quality_up_to(x, measure) < least):
-            return np.inf
-        energy += measure.geometry * trial[r - first]
-        if energy > limit:
-            return np.inf
-    if measure.image == 0.0:
+    cells, objective, shapes, fluxes = state.complex.cells, state.objective, trial.shapes, trial.fluxes
+    n, D, first = cells.shape[1], fluxes.shape[2], rings.start[node]
+    misfit, has_misfit = ring_misfit(state, rings, node)
+    bound = np.inf if has_misfit else limit  # no sum says anything before all of the misfit is in it
+    energy = ring_shape(trial, bound, least, node, state, rings, joined)  # cheap refusals before any voxel is read
+    if energy == np.inf or objective.image == 0.0:
         return energy
     sums = np.empty((1, D))
-    for r in range(first, last):
-        if trial[r - first] < 0.0:
+    for r in range(first, rings.start[node + 1]):
+        if shapes[r - first] < 0.0:
             continue
         cell = rings.cells[r]
         for d in range(D):
@@ -324,152 +350,184 @@ def ring_energy(
         for k in range(n):
             if k == rings.corner[r]:
                 for d in range(D):
-                    sums[0, d] += held.fluxes[cell, k, d]
+                    sums[0, d] += state.complex.fluxes[cell, k, d]
                 continue
             twin = rings.twin[r, k]
-            if not (0 <= twin and twin // n < r - first and trial[twin // n] >= 0.0):
-                a, b, c = outward(held.cells, cell, k)
-                put_flux(fluxes, r - first, k, held.ticks, a, b, c, measure)
+            if not (0 <= twin and twin // n < r - first and shapes[twin // n] >= 0.0):
+                a, b, c = outward(cells, cell, k)
+                put_flux(fluxes, r - first, k, state.complex.ticks, a, b, c, objective)
                 if twin >= 0:
                     for d in range(D):
                         fluxes[twin // n, twin % n, d] = -fluxes[r - first, k, d]
             for d in range(D):
                 sums[0, d] += fluxes[r - first, k, d]
-        energy += measure.image * image_energy(sums, 0, measure.n_channels)
-        misfit += wrong_side(sums, 0, measure)
-        if energy > limit:
+        energy += objective.image * image_energy(sums, 0, objective.n_channels)
+        misfit += wrong_side(sums, 0, objective)
+        if energy > bound:
             return np.inf
     if has_misfit:
         energy += misfit
-    return energy if energy <= up_to else np.inf
+    return energy if energy <= limit else np.inf
+
+
+@njit(cache=True, error_model="numpy")
+def store(trial: Trial, node: int, state: State, rings: NodeRings) -> None:
+    """Write what `ring_energy` measured of a node's ring into the complex."""
+    first, fluxes = rings.start[node], state.complex.fluxes
+    for r in range(first, rings.start[node + 1]):
+        cell = rings.cells[r]
+        state.complex.E_shape[cell] = trial.shapes[r - first]
+        if state.objective.image > 0.0:
+            for k in range(fluxes.shape[1]):
+                if k != rings.corner[r]:
+                    for d in range(fluxes.shape[2]):
+                        fluxes[cell, k, d] = trial.fluxes[r - first, k, d]
+            sum_up(state.complex.sums, fluxes, cell)
 
 
 @njit(cache=True, parallel=True, error_model="numpy")
 def _sweep(
-    held: Complex, rings: NodeRings, groups: Blocks, chosen: NDArray, is_wanted: NDArray, is_frozen: NDArray,
-    measure: Measure, sides: Sides,
+    complex_: Complex, objective: Objective, sides: Sides, rings: NodeRings, groups: Blocks, chosen: NDArray,
+    may_move: NDArray,
 ) -> None:  # fmt: skip
     for number in prange(len(chosen)):
         block = np.int64(chosen[number])
         for at in range(groups.start[block], groups.start[block + 1]):
-            if is_wanted[groups.nodes[at]]:
-                _move(groups.nodes[at], held, rings, is_frozen, measure, sides)
+            if may_move[groups.nodes[at]]:
+                _move(groups.nodes[at], State(complex_, objective, sides), rings)
+
+
+class Search(NamedTuple):
+    """The best place of a node so far, and room for two trials: slot[0] is that of the best, the other the next."""
+
+    x: NDArray[np.float64]  # (4, 3) room for a cell's corners
+    normal: NDArray[np.float64]  # (2, 3) see `tetopt.engine.surface.normal_at`
+    best: NDArray[np.float64]  # (1,) the least energy of the ring
+    place: NDArray[np.int64]  # (1, 3) where that is, ticks
+    slot: NDArray[np.int64]  # (1,)
+    shapes: NDArray[np.float64]  # (2, R) as of `Trial`
+    fluxes: NDArray[np.float64]  # (2, R, n+1, D)
 
 
 @njit(cache=True, error_model="numpy")
-def _move(node: int, held: Complex, rings: NodeRings, is_frozen: NDArray, measure: Measure, sides: Sides) -> None:
+def _move(node: int, state: State, rings: NodeRings) -> None:
     """Move one node down the gradient of its ring's energy, if that lowers it."""
-    n = held.cells.shape[1]
-    scale = 2.0**-measure.bits
-    M = measure.matrix
-    first, last = rings.start[node], rings.start[node + 1]
-    x, g = np.empty((4, 3)), np.zeros(3)
-    step, moved = np.empty(3), np.empty(3)
-    curvature, nearest, least = _add_shape_gradient(g, x, held, rings, node, measure)
-    if measure.image > 0.0:
-        _add_image_gradient(g, held, rings, node, measure, sides.inverse)
-    P = sides.projections[is_frozen[node, 0] + 2 * is_frozen[node, 1] + 4 * is_frozen[node, 2]]
-    for d in range(3):
-        step[d] = -(P[d, 0] * g[0] + P[d, 1] * g[1] + P[d, 2] * g[2])  # index units
-    normal, slides = np.empty((2, 3)), is_frozen[node, 3]
-    if slides:  # along the surface
-        rise = normal_at(normal, held.ticks, node, is_frozen, sides, measure)
-        if not rise > 1e-12:
-            return
-        across = (normal[0, 0] * step[0] + normal[0, 1] * step[1] + normal[0, 2] * step[2]) / rise
-        for d in range(3):
-            step[d] -= across * normal[1, d]
-    for d in range(3):
-        moved[d] = M[d, 0] * step[0] + M[d, 1] * step[1] + M[d, 2] * step[2]  # mm
-    square = moved[0] * moved[0] + moved[1] * moved[1] + moved[2] * moved[2]
+    ticks, fluxes = state.complex.ticks, state.complex.fluxes
+    x, normal, g = np.empty((4, 3)), np.empty((2, 3)), np.zeros(3)
+    # A ring below the floor may stay as it is, but not get worse: hence the ring's own `least`.
+    curvature, nearest, least = _add_shape_gradient(g, x, state, rings, node)
+    if state.objective.image > 0.0:
+        _add_image_gradient(g, state, rings, node)
+    step = _descent_step(normal, g, node, state)
+    moved = times(state.objective.matrix, step)  # mm
+    square = dot(moved, moved)
     if not square > 0.0:
         return
-    slope = -square
-    reach = REACH * nearest
-    t = min(1.0 / curvature, reach / np.sqrt(square))
-    energy = 0.0
-    for r in range(first, last):
-        energy += cell_energy(held, rings.cells[r], measure)
-    # A ring below the floor may stay as it is, but not get worse: hence the ring's own `least`.
-    here0, here1, here2 = held.ticks[node, 0], held.ticks[node, 1], held.ticks[node, 2]
-    there0, there1, there2 = here0, here1, here2
-    best, best_t = energy, 0.0
-    trial, best_trial = np.empty(last - first), np.empty(last - first)
-    D = held.fluxes.shape[2]
-    fluxes, best_fluxes = np.empty((last - first, n, D)), np.empty((last - first, n, D))
-    for attempt in range(TRIES):
-        held.ticks[node, 0] = here0 + np.int64(np.rint(t * step[0] / scale))
-        held.ticks[node, 1] = here1 + np.int64(np.rint(t * step[1] / scale))
-        held.ticks[node, 2] = here2 + np.int64(np.rint(t * step[2] / scale))
-        limit = np.inf if attempt == 0 else best
-        value = np.inf
-        if not slides or slid(x, normal, held, rings, node, is_frozen, sides, measure):
-            value = ring_energy(limit, least, trial, fluxes, x, node, held, rings, measure)
-        if value < best:
-            best, best_t = value, t
-            there0, there1, there2 = held.ticks[node, 0], held.ticks[node, 1], held.ticks[node, 2]
-            trial, best_trial = best_trial, trial
-            fluxes, best_fluxes = best_fluxes, fluxes
-        if attempt > 0 and best_t > 0.0:
-            break
+    energy, size = 0.0, rings.start[node + 1] - rings.start[node]
+    for r in range(rings.start[node], rings.start[node + 1]):
+        energy += cell_energy(state, rings.cells[r])
+    search = Search(
+        x, normal, np.array([energy]), ticks[node : node + 1].copy(), np.zeros(1, dtype=np.int64),
+        np.empty((2, size)), np.empty((2, size, fluxes.shape[1], fluxes.shape[2]))
+    )  # fmt: skip
+    reach = FIRST_STEP_SHARE * nearest
+    length = min(1.0 / curvature, reach / np.sqrt(square))
+    _search_line(search, step, length, square, least, node, state, rings)
+    if not search.best[0] < energy and state.objective.image > 0.0:
+        _probe_axes(search, PROBE_SHARE * reach, least, node, state, rings)
+    put_row(ticks, node, row(search.place, 0))
+    if search.best[0] < energy:
+        slot = search.slot[0]
+        store(Trial(x, search.shapes[slot], search.fluxes[slot]), node, state, rings)
+
+
+@njit(cache=True, error_model="numpy")
+def _descent_step(normal: NDArray, g: NDArray, node: int, state: State) -> tuple:
+    """Down the gradient g (3,), per mm, along the axes and the surface on which the node may move; in index units."""
+    down = times(projection_at(state, node), (g[0], g[1], g[2]))
+    step = (-down[0], -down[1], -down[2])
+    if state.complex.is_frozen[node, 3]:
+        rise = normal_at(normal, state, node)
+        if not rise > FLAT_RISE:
+            return 0.0, 0.0, 0.0
+        step = minus(step, scaled(dot(row(normal, 0), step) / rise, row(normal, 1)))
+    return step
+
+
+@njit(cache=True, error_model="numpy")
+def _try_place(
+    search: Search, place: tuple, limit: float, least: float, node: int, state: State, rings: NodeRings
+) -> float:
+    """Energy of the ring with the node at a place, ticks, or on the surface beside it; the best is kept in mind."""
+    put_row(state.complex.ticks, node, place)
+    if state.complex.is_frozen[node, 3] and not slid(search.normal, state, rings, node):
+        return np.inf
+    slot = 1 - search.slot[0]
+    value = ring_energy(Trial(search.x, search.shapes[slot], search.fluxes[slot]), limit, least, node, state, rings)
+    if value < search.best[0]:
+        search.best[0], search.slot[0] = value, slot
+        put_row(search.place, 0, row(state.complex.ticks, node))
+    return value
+
+
+@njit(cache=True, error_model="numpy")
+def _search_line(
+    search: Search, step: tuple, t: float, square: float, least: float, node: int, state: State, rings: NodeRings
+) -> None:
+    """Look t steps ahead, then where the parabola through what was measured has its vertex.
+
+    `square` is the squared length of the step, mm^2: E falls by that much per step to begin with.
+    """
+    energy, slope, scale = search.best[0], -square, 2.0**-state.objective.bits
+    here = row(search.place, 0)
+    for trial in range(LINE_TRIALS):
+        place = (
+            here[0] + np.int64(np.rint(t * step[0] / scale)),
+            here[1] + np.int64(np.rint(t * step[1] / scale)),
+            here[2] + np.int64(np.rint(t * step[2] / scale)),
+        )
+        limit = np.inf if trial == 0 else search.best[0]
+        value = _try_place(search, place, limit, least, node, state, rings)
+        is_lower = search.best[0] < energy
+        if trial > 0 and is_lower:
+            return
         if not np.isfinite(value):
             t *= 0.35
             continue
         # The vertex of the parabola with the slope at 0 through this value.
         bend = value - energy - slope * t
         vertex = -0.5 * slope * t * t / bend if bend > 0.0 else 2.0 * t
-        if best_t > 0.0:
+        if is_lower:
             vertex = min(vertex, 2.0 * t)
             if abs(vertex - t) < 0.25 * t:
-                break
+                return
             t = vertex
         else:
             t = min(max(vertex, 0.1 * t), 0.5 * t)
-    if best_t == 0.0 and measure.image > 0.0:
-        # The gradient is of the continuous image, the energy of its voxels: where a node stalls, ask along the axes.
-        for axis in range(4 - n, 3):
-            if is_frozen[node, axis]:
-                continue
-            length = np.sqrt(M[0, axis] ** 2 + M[1, axis] ** 2 + M[2, axis] ** 2)
-            for sign in (1, -1):
-                shift = sign * np.int64(np.rint(PROBE * reach / (length * scale)))
-                held.ticks[node, 0] = here0 + (shift if axis == 0 else 0)
-                held.ticks[node, 1] = here1 + (shift if axis == 1 else 0)
-                held.ticks[node, 2] = here2 + (shift if axis == 2 else 0)
-                if slides and not slid(x, normal, held, rings, node, is_frozen, sides, measure):
-                    continue
-                value = ring_energy(best, least, trial, fluxes, x, node, held, rings, measure)
-                if value < best:
-                    best, best_t = value, 1.0
-                    there0, there1, there2 = held.ticks[node, 0], held.ticks[node, 1], held.ticks[node, 2]
-                    trial, best_trial = best_trial, trial
-                    fluxes, best_fluxes = best_fluxes, fluxes
-    held.ticks[node, 0], held.ticks[node, 1], held.ticks[node, 2] = there0, there1, there2
-    if best_t > 0.0:
-        store(held, rings, node, best_trial, best_fluxes, measure)
 
 
 @njit(cache=True, error_model="numpy")
-def slid(
-    x: NDArray, normal: NDArray, held: Complex, rings: NodeRings, node: int, is_frozen: NDArray, sides: Sides,
-    measure: Measure,
-) -> bool:  # fmt: skip
+def _probe_axes(search: Search, length: float, least: float, node: int, state: State, rings: NodeRings) -> None:
+    """Look a length, mm, along each free axis both ways.
+
+    The gradient is of the continuous image, the energy of its voxels: a node may stall where this still lowers E.
+    """
+    M, here = state.objective.matrix, row(search.place, 0)
+    for axis in range(4 - state.complex.cells.shape[1], 3):
+        if state.complex.is_frozen[node, axis]:
+            continue
+        spacing = np.sqrt(M[0, axis] ** 2 + M[1, axis] ** 2 + M[2, axis] ** 2)
+        for sign in (1, -1):
+            shift = sign * np.int64(np.rint(length / (spacing * 2.0**-state.objective.bits)))
+            place = (
+                here[0] + (shift if axis == 0 else 0),
+                here[1] + (shift if axis == 1 else 0),
+                here[2] + (shift if axis == 2 else 0),
+            )
+            _try_place(search, place, search.best[0], least, node, state, rings)
+
+
+@njit(cache=True, error_model="numpy")
+def slid(normal: NDArray, state: State, rings: NodeRings, node: int) -> bool:
     """Bring a moved node back to the surface; whether it got there, and the facets around it face as they should."""
-    if not put_on_surface(normal, held.ticks, node, is_frozen, sides, measure):
-        return False
-    return ring_faces_up(x, normal, held, rings, node, -1, sides, measure)
-
-
-@njit(cache=True, error_model="numpy")
-def store(held: Complex, rings: NodeRings, node: int, shapes: NDArray, fluxes: NDArray, measure: Measure) -> None:
-    """Write what `ring_energy` found of a node's ring into the complex."""
-    first = rings.start[node]
-    for r in range(first, rings.start[node + 1]):
-        cell = rings.cells[r]
-        held.E_shape[cell] = shapes[r - first]
-        if measure.image > 0.0:
-            for k in range(held.cells.shape[1]):
-                if k != rings.corner[r]:
-                    for d in range(held.fluxes.shape[2]):
-                        held.fluxes[cell, k, d] = fluxes[r - first, k, d]
-            sum_up(held.sums, held.fluxes, cell)
+    return put_on_surface(normal, state, node) and ring_faces_up(normal, state, rings, node, -1)

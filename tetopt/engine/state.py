@@ -1,0 +1,124 @@
+"""The one place where a state is made: what the kernels carry together, of a content and a mesh."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.check import check_unfolded
+from tetopt.energy.sampling import SamplingGrid, check_orientations, to_ticks
+from tetopt.engine.complex import Objective, Sides, State, build, energies
+from tetopt.engine.descent import free_projections
+from tetopt.engine.loop import NOISE, SHAPE_POWER, Boundary, frozen_axes, side_ticks
+from tetopt.errors import InputError
+from tetopt.image import Image
+from tetopt.mesh import Mesh
+from tetopt.target.content import Content
+
+
+def state_of(
+    content: Content, mesh: Mesh, grid: SamplingGrid, k_D: float, power: float = SHAPE_POWER,
+    boundary: Boundary = "slide", is_graded: bool = False,
+) -> State:  # fmt: skip
+    """The state of an initial mesh, which normalises the two energies; no floor yet. `grid` is the content's.
+
+    Raises
+    ------
+    InputError
+        A mesh that the sampling cannot take, that is folded, or a cell too flat to have a shape energy; or energies
+        that overflow.
+    """
+    image, region = content.image, content.region
+    ticks = to_ticks(image.to_index(mesh.points), grid)
+    check_orientations(image, ticks, mesh.cells)
+    check_unfolded(mesh)
+    matrix = matrix_of(image)
+    is_frozen = frozen_axes(image, ticks, mesh.cells, grid, boundary, region is not None)
+    sides = sides_of(grid, matrix, boundary == "fixed", None if region is None else region.level)
+    # Where every cell is uniform, what rounding leaves of E_D must not become the unit that E_D is measured in.
+    rounding = float(NOISE * content.variance / content.unit * content.n_voxels)
+    wrong_side = 0.0 if region is None else float(content.wrong_side)
+    objective = objective_of(grid, matrix, power, is_graded)
+    objective = objective._replace(rounding=rounding, wrong_side=wrong_side)
+    state = build(mesh.cells, ticks, is_frozen, objective, sides)
+    flat = np.flatnonzero(~np.isfinite(state.complex.E_shape[: len(mesh.cells)]))
+    if len(flat):
+        raise InputError(
+            f"mesh: {len(flat)} cells are too flat to be improved, the first are {flat[:5].tolist()}; "
+            "remove them or move their nodes apart"
+        )
+    E_G0, squares0 = content_energies(state, content)
+    weight = k_D / squares0 if squares0 > 0.0 else 0.0
+    if not (0.0 < E_G0 < np.inf and np.isfinite(squares0) and np.isfinite(weight)):
+        raise InputError("mesh and image: their energies overflow; are lengths in mm and intensities of usual size?")
+    geometry, surface = float((1.0 - k_D) / E_G0), float(weight * wrong_side)
+    objective = objective._replace(geometry=geometry, image=float(weight), surface=surface)
+    return state._replace(objective=objective)
+
+
+def content_energies(state: State, content: Content) -> tuple[float, float]:
+    """Shape energy and sum of squares, with the mask's misfit; squares that are only rounding count as 0."""
+    E_G, squares = energies(state)
+    if content.region is not None:
+        squares += state.objective.wrong_side * n_misfits(state, content)
+    return E_G, squares if squares > state.objective.rounding else 0.0
+
+
+def n_misfits(state: State, content: Content) -> int:
+    """Voxels of the mask outside of the mesh, and others inside of it."""
+    return content.n_voxels + int(state.complex.sums[: int(state.complex.n_cells[0]), -1].sum())
+
+
+def matrix_of(image: Image) -> NDArray[np.float64]:
+    """The map from index vectors to mm, (3, 3); of a 2-D image with a leading axis of its own."""
+    matrix = np.eye(3)
+    matrix[3 - image.ndim :, 3 - image.ndim :] = image.affine[:-1, :-1]
+    return matrix
+
+
+def sides_of(
+    grid: SamplingGrid, matrix: NDArray[np.float64], is_fixed: bool, level: NDArray[np.float32] | None = None
+) -> Sides:
+    """Sides of the box of an image, `matrix` (3, 3) taking index vectors to mm, and the surface of a level function."""
+    low, high = np.ascontiguousarray(side_ticks(grid).T)
+    has_surface = level is not None
+    level = np.zeros((1, 1, 1), dtype=np.float32) if level is None else level.reshape(grid.shape)
+    inverse = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
+    return Sides(low, high, is_fixed, has_surface, level, free_projections(matrix), inverse)
+
+
+def objective_of(grid: SamplingGrid, matrix: NDArray[np.float64], power: float, is_graded: bool = False) -> Objective:
+    """An objective of plain numbers, as the kernels are compiled for, of weights 1 and without a floor."""
+    return Objective(
+        prefix=grid.prefix,
+        bits=int(grid.bits),
+        hand=1 if np.linalg.det(matrix) > 0.0 else -1,
+        matrix=matrix,
+        geometry=1.0,
+        image=1.0,
+        surface=0.0,
+        n_channels=int(grid.n_channels),
+        power=float(power),
+        is_graded=bool(is_graded),
+        floor=-1.0,
+        safe=np.inf,
+    )
+
+
+def with_floor(state: State, degrees: float) -> State:
+    """The state in which no move may leave a dihedral angle under `degrees`, nor one that is under it any smaller."""
+    floor, safe = floor_of(degrees)
+    return state._replace(objective=state.objective._replace(floor=floor, safe=safe))
+
+
+def floor_of(degrees: float) -> tuple[float, float]:
+    """`floor` and `safe` of an `Objective`, for a smallest dihedral angle; 0 for none.
+
+    Of all tetrahedra with a dihedral angle t up to a regular one's, eta is least for the one that is symmetric about
+    that edge and the opposite one: eta^3 = ((1 + s^2) / (s c))^2 / 8 with s, c = sin, cos(t / 2), and it falls as t
+    grows. In terms of S and the determinant eta^3 = S^3 / (432 det^2).
+    """
+    if degrees <= 0.0:
+        return -1.0, np.inf
+    s, c = np.sin(np.radians(degrees) / 2.0), np.cos(np.radians(degrees) / 2.0)
+    return -float(np.cos(np.radians(degrees))), float(432.0 / 8.0 * ((1.0 + s * s) / (s * c)) ** 2 * (1.0 - 1e-9))
