@@ -5,17 +5,20 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from functools import partial
 from typing import NamedTuple
 
 import numpy as np
 
 from tetopt.engine.fast import prepare_kernels
-from tetopt.engine.loop import GRADED_ITERATIONS, GRADED_K_D, UNIFORM_ITERATIONS, UNIFORM_K_D
-from tetopt.engine.meshing import Mode, mesh_image
+from tetopt.engine.loop import UNIFORM_ITERATIONS, UNIFORM_K_D
+from tetopt.engine.meshing import MODE_DEFAULTS, Mode, mesh_image
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.start.lattice import lattice
-from tetopt.study.interfaces import OTSU_CLASSES
+from tetopt.study.cleaver import stuffed
+from tetopt.study.interfaces import OTSU_CLASSES, class_labels, interfaces
+from tetopt.study.tetwild import Filled, filled, node_spacing
 from tetopt.target.content import Content, content
 
 
@@ -44,17 +47,12 @@ UNTIMED_STEPS = {  # steps that a run's total does not count, and why
 }
 
 
-class _Clock:
-    """Wall time by step."""
-
-    def __init__(self) -> None:
-        self.seconds: dict[str, float] = {}
-
-    @contextmanager
-    def step(self, name: str) -> Iterator[None]:
-        begin = time.perf_counter()
-        yield
-        self.seconds[name] = time.perf_counter() - begin
+@contextmanager
+def _timed(seconds: dict[str, float], step: str) -> Iterator[None]:
+    """Put the wall time of a block into `seconds`."""
+    begin = time.perf_counter()
+    yield
+    seconds[step] = time.perf_counter() - begin
 
 
 def bcc(job: Job) -> Produced:
@@ -65,54 +63,40 @@ def bcc(job: Job) -> Produced:
     InputError
         As `tetopt.start.lattice.lattice`.
     """
-    clock = _Clock()
-    with clock.step("lattice"):
+    seconds: dict[str, float] = {}
+    with _timed(seconds, "lattice"):
         mesh = lattice(job.image, nodes=job.nodes)
-    return Produced(mesh, clock.seconds, [])
+    return Produced(mesh, seconds, [])
 
 
-def odt(job: Job) -> Produced:
-    """The lattice relaxed to the best shapes, whatever the image shows: the paper's scheme with k_D = 0.
-
-    Raises
-    ------
-    InputError
-        As `tetopt.mesh_image`.
-    """
-    return _by_mesh_image(job, "paper", 0.0, job.iterations)
-
-
-def tetopt(job: Job) -> Produced:
-    """`tetopt.mesh_image` with its defaults: nodes where the image, and labels that are given, have content.
+def ours(job: Job, mode: Mode) -> Produced:
+    """`tetopt.mesh_image`: graded with its defaults, else as the job says; the paper's scheme takes the image alone.
 
     Raises
     ------
     InputError
         As `tetopt.mesh_image` and `tetopt.target.content.content`.
     """
-    return _by_mesh_image(job, "graded", GRADED_K_D, GRADED_ITERATIONS)
+    seconds: dict[str, float] = {}
+    k_D, iterations = MODE_DEFAULTS[mode] if mode == "graded" else (job.k_D, job.iterations)
+    content, notes = (job.image, list[str]()) if mode == "paper" else _content(job, seconds)
+    with _timed(seconds, "kernels"):
+        prepare_kernels(content, k_D, "paper" if mode == "paper" else "fast", is_graded=mode == "graded")
+    result = mesh_image(content, job.nodes, mode=mode, k_D=k_D, iterations=iterations)
+    seconds["octree" if mode == "graded" else "lattice"] = result.seconds_start
+    seconds["optimize"] = result.seconds_run
+    return Produced(result.mesh, seconds, [f"ended by: {result.ended}", *notes])
 
 
-def tetopt_uniform(job: Job) -> Produced:
-    """The lattice and the fast engine, as `tetopt mesh --uniform`; labels that are given have their say too.
-
-    Raises
-    ------
-    InputError
-        As `tetopt.mesh_image` and `tetopt.target.content.content`.
-    """
-    return _by_mesh_image(job, "uniform", job.k_D, job.iterations)
-
-
-def tetopt_paper(job: Job) -> Produced:
-    """The lattice and the paper's own scheme, as `tetopt mesh --method paper`.
-
-    Raises
-    ------
-    InputError
-        As `tetopt.mesh_image`.
-    """
-    return _by_mesh_image(job, "paper", job.k_D, job.iterations)
+def _content(job: Job, seconds: dict[str, float]) -> tuple[Image | Content, list[str]]:
+    """What the mesh is to represent, and what to note of it: the image, with labels if they are given."""
+    if job.labels is None:
+        return job.image, []
+    with _timed(seconds, "labels"):
+        if np.array_equal(job.image.data, job.labels.data):
+            # As intensities the numbers of labels mean nothing: label 9 is no farther from 1 than 2 is.
+            return content(job.image, labels=job.labels, weights=[0.0]), ["the image is its labels: meshed as labels"]
+        return content(job.image, labels=job.labels), ["meshed from the image and the labels given, equally weighted"]
 
 
 def pytetwild(job: Job) -> Produced:
@@ -123,17 +107,12 @@ def pytetwild(job: Job) -> Produced:
     InputError
         As `tetopt.study.interfaces.interfaces` and `tetopt.study.tetwild.filled`.
     """
-    from tetopt.study.interfaces import interfaces
-    from tetopt.study.tetwild import filled, node_spacing
-
-    clock = _Clock()
-    with clock.step("surfaces"):
+    seconds: dict[str, float] = {}
+    with _timed(seconds, "surfaces"):
         surfaces = interfaces(job.image, node_spacing(job.image, job.nodes), classes=job.classes, labels=job.labels)
-    with clock.step("tetrahedra"):
+    with _timed(seconds, "tetrahedra"):
         result = filled(job.image, surfaces, job.nodes)
-    clock.seconds["tetrahedra"] -= result.search_seconds
-    clock.seconds["search"] = result.search_seconds
-    return Produced(result.mesh, clock.seconds, [*surfaces.notes, f"{result.n_runs} runs", *result.notes])
+    return _searched(result, seconds, surfaces.notes)
 
 
 def cleaver(job: Job) -> Produced:
@@ -144,40 +123,19 @@ def cleaver(job: Job) -> Produced:
     InputError
         As `tetopt.study.cleaver.stuffed`.
     """
-    from tetopt.study.cleaver import stuffed
-    from tetopt.study.interfaces import class_labels
-
-    clock = _Clock()
-    with clock.step("labels"):
+    seconds: dict[str, float] = {}
+    with _timed(seconds, "labels"):
         labels = class_labels(job.image, job.classes) if job.labels is None else job.labels
-    with clock.step("tetrahedra"):
+    with _timed(seconds, "tetrahedra"):
         result = stuffed(job.image, labels, job.nodes)
-    clock.seconds["tetrahedra"] -= result.search_seconds
-    clock.seconds["search"] = result.search_seconds
-    return Produced(result.mesh, clock.seconds, [f"{result.n_runs} runs", *result.notes])
+    return _searched(result, seconds, [])
 
 
-def _content(job: Job, clock: _Clock) -> tuple[Image | Content, list[str]]:
-    """What the mesh is to represent, and what to note of it: the image, with labels if they are given."""
-    if job.labels is None:
-        return job.image, []
-    with clock.step("labels"):
-        if np.array_equal(job.image.data, job.labels.data):
-            # As intensities the numbers of labels mean nothing: label 9 is no farther from 1 than 2 is.
-            return content(job.image, labels=job.labels, weights=[0.0]), ["the image is its labels: meshed as labels"]
-        return content(job.image, labels=job.labels), ["meshed from the image and the labels given, equally weighted"]
-
-
-def _by_mesh_image(job: Job, mode: Mode, k_D: float, iterations: int) -> Produced:
-    """A mesh of ours; the paper's scheme takes the image alone."""
-    clock = _Clock()
-    content, notes = (job.image, list[str]()) if mode == "paper" else _content(job, clock)
-    with clock.step("kernels"):
-        prepare_kernels(content, k_D, "paper" if mode == "paper" else "fast", is_graded=mode == "graded")
-    result = mesh_image(content, job.nodes, mode=mode, k_D=k_D, iterations=iterations)
-    start = "octree" if mode == "graded" else "lattice"
-    seconds = {**clock.seconds, start: result.seconds_start, "optimize": result.seconds_run}
-    return Produced(result.mesh, seconds, [f"ended by: {result.ended}", *notes])
+def _searched(result: Filled, seconds: dict[str, float], notes: list[str]) -> Produced:
+    """What a peer made; the runs that only met the number of nodes are a step of their own."""
+    seconds["tetrahedra"] -= result.search_seconds
+    seconds["search"] = result.search_seconds
+    return Produced(result.mesh, seconds, [*notes, f"{result.n_runs} runs", *result.notes])
 
 
 class Pipeline(NamedTuple):
@@ -193,14 +151,15 @@ class Pipeline(NamedTuple):
 PIPELINES = {
     "tetopt": Pipeline(
         "tetopt", "tetopt", "tetopt mesh with its defaults: nodes where the image, or labels given, have content",
-        tetopt,
+        partial(ours, mode="graded"),
     ),
     "tetopt-uniform": Pipeline(
         "tetopt, uniform", "tetopt", "tetopt mesh --uniform: BCC lattice, fast engine, with labels that are given",
-        tetopt_uniform,
+        partial(ours, mode="uniform"),
     ),
     "tetopt-paper": Pipeline(
-        "tetopt, paper's scheme", "tetopt", "tetopt mesh --method paper, of the image alone", tetopt_paper
+        "tetopt, paper's scheme", "tetopt", "tetopt mesh --method paper, of the image alone",
+        partial(ours, mode="paper"),
     ),
     "pytetwild": Pipeline(
         "pytetwild", "peer", "classes by multi-Otsu or the labels given, their surfaces, fTetWild sized by them",
@@ -208,5 +167,8 @@ PIPELINES = {
     ),
     "cleaver": Pipeline("itk-cleaver", "peer", "the same labels, Cleaver", cleaver),
     "bcc": Pipeline("BCC lattice", "control", "the uniform lattice, untouched", bcc),
-    "odt": Pipeline("ODT, image-blind", "control", "the lattice optimised for shape alone, k_D = 0", odt),
+    "odt": Pipeline(
+        "ODT, image-blind", "control", "the lattice optimised for shape alone, k_D = 0",
+        lambda job: ours(job._replace(k_D=0.0), "paper"),
+    ),
 }  # fmt: skip
