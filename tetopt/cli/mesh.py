@@ -31,6 +31,7 @@ from tetopt.cli.solver import all_sets, check_early, print_model, save_anyway, s
 from tetopt.cli.source import Source, read_source
 from tetopt.engine.loop import Optimized
 from tetopt.engine.meshing import Run, mesh_image
+from tetopt.geometry.box import box_sides
 from tetopt.geometry.simplex import centroids, squared_edges
 from tetopt.io.files import save_json
 from tetopt.io.meshes import MeshFile
@@ -100,7 +101,8 @@ def _check_place(mesh: Mesh, image: Image, path: str) -> None:
     if mesh.ndim != image.ndim:
         raise InputError(f"{path}: expected a {image.ndim}-D mesh, as the image is, got a {mesh.ndim}-D one")
     index = image.to_index(centroids(mesh.points, mesh.cells))
-    is_in = ((index >= -0.5) & (index <= np.array(image.shape) - 0.5)).all(axis=1)
+    low, high = box_sides(image.shape).T
+    is_in = ((index >= low) & (index <= high)).all(axis=1)
     if not is_in.any():
         raise InputError(f"{path}: lies beside the image; do both lie in the same world mm (RAS+)?")
     if not is_in.all():

@@ -23,6 +23,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
+from tetopt.geometry.box import box_sides
 from tetopt.geometry.simplex import oriented
 from tetopt.image import Image
 from tetopt.mesh import Mesh
@@ -51,7 +52,7 @@ def stuffed(image: Image, labels: Image, nodes: int) -> Filled:
     """Cleaver's tetrahedra in the image's box, with about `nodes` nodes.
 
     Its feature scaling is searched until the number of nodes is within 5 % of the requested one; at most 8 runs, of
-    which the nearest that can be put on the box is taken.
+    which the nearest is taken.
 
     Parameters
     ----------
@@ -76,7 +77,7 @@ def stuffed(image: Image, labels: Image, nodes: int) -> Filled:
     """
     _check(image, labels, nodes)
     cube = labels_in_cube(image, labels, node_spacing(image, nodes) / VOXELS_PER_SPACING)
-    low, high = -0.5 * image.spacing, (np.array(image.shape) - 0.5) * image.spacing
+    low, high = box_sides(image.shape).T * image.spacing
     runs: list[tuple[float, NDArray[np.float64], NDArray[np.int64], int, float]] = []  # with the cells outside
     begin_search = time.perf_counter()
     notes: list[str] = []

@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
 from tetopt.errors import InputError
+from tetopt.geometry.box import box_sides
 from tetopt.image import Image
 from tetopt.target.otsu import class_thresholds
 
@@ -72,7 +73,7 @@ def interfaces(image: Image, size: float, *, classes: int = OTSU_CLASSES, labels
         pieces, notes = _isosurfaces(image, size, classes)
     else:
         pieces, notes = _label_surface(labels.data, image.spacing, size)
-    low, high = -0.5 * image.spacing, (np.array(image.shape) - 0.5) * image.spacing
+    low, high = box_sides(image.shape).T * image.spacing
     cut = [_cut_by_box(_decimated(piece, size), low, high) for piece in pieces]
     soup = [(points, triangles) for points, triangles in cut if len(triangles)]
     if not soup:
