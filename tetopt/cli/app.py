@@ -2,20 +2,18 @@
 
 from __future__ import annotations
 
-import contextlib
 import logging
 import sys
 import warnings
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from typing import Annotated
 
 import typer
-from rich.markup import escape
 
 import tetopt
 from tetopt import InputError
 from tetopt.cli.compare import baseline_command, compare_command, paper_command
-from tetopt.cli.console import log, out, show_warning
+from tetopt.cli.console import out, show_error, show_warning
 from tetopt.cli.convert import convert_command
 from tetopt.cli.fem import fem_command
 from tetopt.cli.mesh import demo_command, mesh_command
@@ -55,33 +53,25 @@ for _name, _command in COMMANDS.items():
 
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; the exit code: 0 done, 1 a promise of the mesh missed, 2 an input to mend, 130 Ctrl-C."""
-    with warnings.catch_warnings(), _silent_plot_fonts():
+    with warnings.catch_warnings():
         warnings.showwarning = show_warning
+        logging.getLogger("matplotlib").setLevel(logging.ERROR)  # its font-cache notice is not the user's business
         try:
             arguments = list(sys.argv[1:] if argv is None else argv)
             return app(args=arguments, obj=arguments, standalone_mode=False) or 0
-        except InputError as error:
-            log.print(f"[bold red]tetopt:[/] {escape(str(error))}")
+        except (InputError, OSError) as error:  # also a full disk, a folder that may not be written to
+            show_error(error)
             return 2
         except typer.Exit as ended:
             return ended.exit_code
         except (typer.Abort, KeyboardInterrupt):  # newer versions of typer return 130 themselves
             return 130
-        except OSError as error:  # a full disk, a folder that may not be written to
-            log.print(f"[bold red]tetopt:[/] {escape(str(error))}")
-            return 2
         except Exception as error:
             if type(error).__module__.split(".")[0] not in ("click", "typer") or not hasattr(error, "format_message"):
                 raise
             if error.format_message():  # empty after the help that a bare `tetopt` prints
-                log.print(f"[bold red]tetopt:[/] {escape(error.format_message())} (see --help)")
+                show_error(f"{error.format_message()} (see --help)")
             return 2
-
-
-@contextlib.contextmanager
-def _silent_plot_fonts() -> Iterator[None]:
-    logging.getLogger("matplotlib").setLevel(logging.ERROR)  # its font-cache notice is not the user's business
-    yield
 
 
 def _version(is_requested: bool) -> None:

@@ -24,6 +24,11 @@ log = _Console(stderr=True, highlight=False, soft_wrap=True, emoji=False)
 out = _Console(highlight=False, soft_wrap=True, emoji=False)
 
 
+def show_error(message: object) -> None:
+    """Say what is wrong, on one line."""
+    log.print(f"[bold red]tetopt:[/] {escape(str(message))}")
+
+
 def show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
     """Say a warning on one line; also in place of `warnings.showwarning`."""
     log.print(f"[yellow]tetopt: warning:[/] {escape(str(message))}")

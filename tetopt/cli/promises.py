@@ -2,11 +2,13 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from itertools import chain
 from typing import Any
 
 import tetopt
 from tetopt import Mesh
-from tetopt.cli.console import log, show_warning
+from tetopt.cli.console import show_error, show_warning
 from tetopt.cli.options import Method
 from tetopt.engine.loop import Optimized
 from tetopt.geometry.simplex import dihedral_angles, volumes
@@ -35,86 +37,78 @@ def check_promises(
 
     It should cover the mask, or what the user's own mesh `start` did, or the image's box.
     """
-    image = content.image
-    below = 0
-    if image.ndim == 3 and result.history[-1].iteration > 0:
+    problems = []
+    if content.image.ndim == 3 and result.history[-1].iteration > 0:
         angles = dihedral_angles(result.mesh.points, result.mesh.cells).min(axis=1)
-        below = int((angles < min_dihedral - ANGLE_ROUNDING).sum())
-    if below:
-        remedy = "" if start is not None else "more nodes, "
-        log.print(
-            f"[bold red]tetopt:[/] {below} of {len(angles)} cells have an angle under {min_dihedral:g} degrees, "
-            f"down to {angles.min():.2f}; allow {remedy}a lower --k-d, or a lower --min-dihedral"
-        )
+        if below := int((angles < min_dihedral - ANGLE_ROUNDING).sum()):
+            remedy = "" if start is not None else "more nodes, "
+            problems.append(
+                f"{below} of {len(angles)} cells have an angle under {min_dihedral:g} degrees, down to "
+                f"{angles.min():.2f}; allow {remedy}a lower --k-d, or a lower --min-dihedral"
+            )
     share = result.history[-1].E_D / (content.variance * content.volume or 1.0)
-    is_above = target_error is not None and share > target_error
-    if is_above:
-        log.print(
-            f"[bold red]tetopt:[/] {share:.4g} of the image's variance is left in the cells, more than "
-            f"{target_error:g}; allow smaller cells or more --iterations, or ask for a number of --nodes"
+    if target_error is not None and share > target_error:
+        problems.append(
+            f"{share:.4g} of the image's variance is left in the cells, more than {target_error:g}; allow smaller "
+            "cells or more --iterations, or ask for a number of --nodes"
         )
-    is_lost = _says_what_is_lost(measured)
-    if content.region is not None:
-        n_voxels = result.history[-1].n_voxels
-        overlapping = n_voxels - int((tetopt.cell_of_voxel(image, result.mesh) >= 0).sum())
-        if overlapping:
-            log.print(
-                f"[bold red]tetopt:[/] cells overlap: together they hold {overlapping} voxels twice; allow more nodes, "
-                "and please report this"
-            )
-        return 1 if below or is_above or is_lost or overlapping else 0
-    if start is not None:
-        before, after = (float(volumes(mesh.points, mesh.cells).sum()) for mesh in (start, result.mesh))
-        gained = result.history[-1].n_voxels - result.history[0].n_voxels
-        if gained or abs(after / before - 1.0) > BOUNDARY_ROUNDING:
-            log.print(
-                f"[bold red]tetopt:[/] the mesh no longer covers what it did: {gained:+d} voxels, its volume is "
-                f"{after:.9g} of {before:.9g} mm^{image.ndim}; please report this"
-            )
-            return 1
-        return 1 if below or is_lost else 0
-    covered = float(volumes(result.mesh.points, result.mesh.cells).sum())
-    missed = image.data.size - result.history[-1].n_voxels
-    if missed == 0 and abs(covered / image.volume - 1.0) < VOLUME_ROUNDING:
-        return 1 if below or is_above or is_lost else 0
-    log.print(
-        f"[bold red]tetopt:[/] the mesh does not cover the image: {missed} voxels are outside, "
-        f"its volume is {covered:.9g} of {image.volume:.9g} mm^{image.ndim}; please report this"
-    )
-    return 1
+    code = 0
+    for problem in chain(problems, _lost(measured), _uncovered(content, result, start)):
+        show_error(problem)
+        code = 1
+    return code
 
 
-def _says_what_is_lost(measured: dict[str, Any]) -> bool:
-    """Name labels of more than 200 voxels that no cell carries, or hardly any, and say where a mask is not met.
-
-    Whether a promise is missed: such a label is lost, or the mesh has little in common with the mask.
-    """
-    lost = [row for row in measured.get("labels", []) if row.is_lost]
+def _lost(measured: dict[str, Any]) -> Iterator[str]:
+    """Labels of more than 200 voxels that no cell carries, a mask that the mesh hardly meets; warns of lesser ones."""
+    labels, mask = measured.get("labels", []), measured.get("mask")
+    lost = [row for row in labels if row.is_lost]
     large = [str(row.label) for row in lost if row.voxels > LABEL_VOXELS]
     if large:
-        log.print(
-            f"[bold red]tetopt:[/] no cell has label {', '.join(large)}, of more than {LABEL_VOXELS} voxels; allow "
-            "more nodes, or a higher --label-weight"
+        yield (
+            f"no cell has label {', '.join(large)}, of more than {LABEL_VOXELS} voxels; allow more nodes, or a higher "
+            "--label-weight"
         )
     if small := [str(row.label) for row in lost if row.voxels <= LABEL_VOXELS]:
         show_warning(f"no cell has label {', '.join(small)}, of {LABEL_VOXELS} voxels or fewer")
-    poor = [str(row.label) for row in measured.get("labels", []) if row.voxels > LABEL_VOXELS and row.dice < LABEL_DICE]
+    poor = [str(row.label) for row in labels if row.voxels > LABEL_VOXELS and row.dice < LABEL_DICE]
     if poor := [label for label in poor if label not in large]:
         first = ", ".join(poor[:5]) + (f" and {len(poor) - 5} more" if len(poor) > 5 else "")
         show_warning(f"Dice below {LABEL_DICE} for label {first}: cells are too large for them, or these are no labels")
-    mask = measured.get("mask")
     if mask is not None and mask.dice < MASK_DICE:
-        log.print(
-            f"[bold red]tetopt:[/] the mesh and the mask overlap only by Dice {mask.dice:.3f}: cells are larger "
-            "than parts of the mask; allow more nodes"
+        yield (
+            f"the mesh and the mask overlap only by Dice {mask.dice:.3f}: cells are larger than parts of the mask; "
+            "allow more nodes"
         )
-        return True
-    if mask is not None and mask.components != mask.mesh_components:
+    elif mask is not None and mask.components != mask.mesh_components:
         show_warning(
             f"the mask has {mask.components} pieces, the mesh {mask.mesh_components}: cells are as large "
             "as parts, or gaps, of the mask; allow more nodes"
         )
-    return bool(large)
+
+
+def _uncovered(content: Content, result: Optimized, start: Mesh | None) -> Iterator[str]:
+    image, n_voxels = content.image, result.history[-1].n_voxels
+    volume = float(volumes(result.mesh.points, result.mesh.cells).sum())
+    if content.region is not None:
+        if overlapping := n_voxels - int((tetopt.cell_of_voxel(image, result.mesh) >= 0).sum()):
+            yield (
+                f"cells overlap: together they hold {overlapping} voxels twice; allow more nodes, and please report "
+                "this"
+            )
+    elif start is not None:
+        before = float(volumes(start.points, start.cells).sum())
+        gained = n_voxels - result.history[0].n_voxels
+        if gained or abs(volume / before - 1.0) > BOUNDARY_ROUNDING:
+            yield (
+                f"the mesh no longer covers what it did: {gained:+d} voxels, its volume is {volume:.9g} of "
+                f"{before:.9g} mm^{image.ndim}; please report this"
+            )
+    elif (missed := image.data.size - n_voxels) or abs(volume / image.volume - 1.0) >= VOLUME_ROUNDING:
+        yield (
+            f"the mesh does not cover the image: {missed} voxels are outside, its volume is {volume:.9g} of "
+            f"{image.volume:.9g} mm^{image.ndim}; please report this"
+        )
 
 
 def warn_of_result(result: Optimized, method: Method, nodes: int | None, n_empty: int) -> None:

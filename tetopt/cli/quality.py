@@ -12,7 +12,7 @@ from rich.table import Table
 
 import tetopt
 from tetopt import Image, InputError, Mesh
-from tetopt.cli.console import log, out, print_fidelity
+from tetopt.cli.console import out, print_fidelity, show_error
 from tetopt.cli.inputs import image_and_others, read_mesh, warn_of_other_image
 from tetopt.cli.options import ImagePart, NumberOptions, option
 from tetopt.io.files import save_json
@@ -71,7 +71,7 @@ def quality_command(
     out.print(table)
     print_fidelity(measured)
     for problem in problems:
-        log.print(f"[bold red]tetopt:[/] {escape(str(mesh_path))}: {escape(problem)}")
+        show_error(f"{mesh_path}: {problem}")
     if check and not problems:
         words = ", in one piece" if image is None else ", in one piece, fills the box"
         words = "; made within a mask, which may have pieces" if is_masked else words
@@ -79,7 +79,7 @@ def quality_command(
     if problems:
         return 1
     if image is not None and fit is not None and fit.n_voxels > image.data.size:
-        log.print(f"[bold red]tetopt:[/] cells overlap: together they hold {fit.n_voxels} voxels, more than there are")
+        show_error(f"cells overlap: together they hold {fit.n_voxels} voxels, more than there are")
         return 1
     return 0
 

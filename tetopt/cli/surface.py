@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from rich.markup import escape
 
 from tetopt import InputError
-from tetopt.cli.console import log, out, show_warning
+from tetopt.cli.console import log, out, show_error, show_warning
 from tetopt.cli.inputs import cell_field, check_no_input, read_mesh
 from tetopt.cli.options import MeshArgument, NumberOptions, SpaceOption, option
 from tetopt.geometry.simplex import volumes
@@ -67,7 +67,7 @@ def surface_command(
         save_json(json_path, files | {"is_watertight": written.is_watertight} | measured | parted)
     out.print(table)
     if not (written.is_watertight and written.is_winding_consistent and written.volume > 0.0):
-        log.print(f"[bold red]tetopt:[/] {escape(str(output))}: not watertight, by trimesh; please report this")
+        show_error(f"{output}: not watertight, by trimesh; please report this")
         return 1
     out.print("checked with trimesh: watertight, normals out")
     return 0
