@@ -11,8 +11,7 @@ from tetopt.errors import InputError
 from tetopt.io.tags import check_apart, material_names, without_cell_data
 from tetopt.io.text import blocks, rows
 from tetopt.model.materials import cells_of
-from tetopt.model.model import Model, described, quadratic, quadratic_facet_nodes
-from tetopt.model.sets import nodes_of
+from tetopt.model.model import Model, described, element_facets, elements
 
 ALL_ELEMENTS = "all_cells"  # the set that results are asked for
 # The number of the face opposite each local node: S1 is 1-2-3, S2 is 1-4-2, S3 is 2-4-3, S4 is 3-4-1.
@@ -78,15 +77,13 @@ def _head(model: Model) -> str:
 
 def _mesh(model: Model) -> list[str]:
     """Nodes, node sets and elements."""
-    if model.order == 2:
-        points, cells = quadratic(model.mesh)
-        node_sets = {n: np.unique(quadratic_facet_nodes(cells, members)) for n, members in model.sets.facets.items()}
-    else:
-        points, cells = model.mesh.points, model.mesh.cells
-        node_sets = {n: nodes_of(model.mesh, members) for n, members in model.sets.facets.items()}
+    points, cells = elements(model)
     return [
         f"*NODE\n{_numbered(_fitting(points))}",
-        *(f"*NSET, NSET={name}\n{_list(nodes)}" for name, nodes in node_sets.items()),
+        *(
+            f"*NSET, NSET={name}\n{_list(np.unique(element_facets(cells, members)))}"
+            for name, members in model.sets.facets.items()
+        ),
         f"*ELEMENT, TYPE=C3D{cells.shape[1]}, ELSET={ALL_ELEMENTS}\n{_numbered(cells + 1)}",
     ]
 

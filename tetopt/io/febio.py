@@ -5,7 +5,6 @@ Written from the sources of FEBio 4 and FEBio Studio 2 and read back with pyfebi
 
 from __future__ import annotations
 
-import re
 from typing import NamedTuple
 from xml.sax.saxutils import escape
 
@@ -13,11 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
-from tetopt.io.text import rows
+from tetopt.io.tags import as_scalars
+from tetopt.io.text import rows, xml_comment
 from tetopt.model.loads import Load
 from tetopt.model.materials import Materials, cells_of
-from tetopt.model.model import STRESS_UNITS, Model, described, quadratic, quadratic_facet_nodes
-from tetopt.model.sets import facet_triples
+from tetopt.model.model import STRESS_UNITS, Model, described, element_facets, elements
 
 MOST_MATERIAL_PARTS = 100  # with more, FEBio Studio's list of parts is no use
 STUDIO_UNITS = {"kPa": "mm-kg-s", "MPa": "mm-N-s"}  # FEBio's own words for what is consistent with them
@@ -129,9 +128,8 @@ def _parts(materials: Materials) -> list[_Part]:
 
 
 def _head(model: Model) -> str:
-    lines = re.sub("-(?=-)", "- ", "\n".join(described(model)))  # XML has no two hyphens in a comment
     return (
-        f'<?xml version="1.0" encoding="UTF-8"?>\n<!--\n{lines}\n-->\n<febio_spec version="4.0">\n'
+        f'<?xml version="1.0" encoding="UTF-8"?>\n{xml_comment(described(model))}<febio_spec version="4.0">\n'
         f'<Module type="solid">\n<units>{STUDIO_UNITS[model.units]}</units>\n</Module>\n'
     )
 
@@ -156,13 +154,8 @@ def _parameter(tag: str, value: str, map_name: str) -> str:
 
 
 def _mesh(model: Model, parts: list[_Part]) -> list[str]:
-    facets = model.sets.facets
-    if model.order == 2:
-        points, cells = quadratic(model.mesh)
-        surfaces = {name: quadratic_facet_nodes(cells, members) for name, members in facets.items()}
-    else:
-        points, cells = model.mesh.points, model.mesh.cells
-        surfaces = {name: facet_triples(cells, members) for name, members in facets.items()}
+    points, cells = elements(model)
+    surfaces = {name: element_facets(cells, members) for name, members in model.sets.facets.items()}
     return [
         f'<Mesh>\n<Nodes name="{ALL_NODES}">\n{_items("node", points)}</Nodes>\n',
         *(
@@ -185,7 +178,10 @@ def _mesh_data(model: Model, parts: list[_Part]) -> list[str]:
 
     A set of all cells would not do: FEBio takes one across parts in their order, and not in the set's.
     """
-    fields = dict(_columns(model.cell_data))
+    fields: dict[str, NDArray[np.float64]] = {}
+    for name, values in model.cell_data.items():
+        column = values.ravel() if values.size == len(values) else values
+        fields |= as_scalars(name, column.astype(np.float64))
     if model.materials is not None and parts[0].young == YOUNG_MAP:
         fields[YOUNG_MAP] = model.materials.young[model.materials.of_cell]
         if parts[0].nu == NU_MAP:
@@ -199,16 +195,6 @@ def _mesh_data(model: Model, parts: list[_Part]) -> list[str]:
         for part in parts
     ]
     return ["<MeshData>\n", *data, "</MeshData>\n"]
-
-
-def _columns(cell_data: dict[str, NDArray]) -> list[tuple[str, NDArray[np.float64]]]:
-    """Scalars of each cell by name; the components of what has several are numbered from 0."""
-    tables = {name: values.reshape(len(values), -1).astype(np.float64) for name, values in cell_data.items()}
-    return [
-        (name if table.shape[1] == 1 else f"{name}_{k}", column)
-        for name, table in tables.items()
-        for k, column in enumerate(table.T)
-    ]
 
 
 def _loads(loads: tuple[Load, ...]) -> list[str]:

@@ -33,6 +33,7 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.io.tags import (
+    as_scalars,
     cell_tags,
     check_apart,
     facet_tags,
@@ -42,7 +43,7 @@ from tetopt.io.tags import (
     without_cell_data,
 )
 from tetopt.io.text import rows
-from tetopt.model.model import Model, quadratic, quadratic_facet_nodes
+from tetopt.model.model import Model, element_facets, elements
 from tetopt.model.sets import facet_triples
 
 # gmsh's numbers for elements of a dimension and an order: line, triangle, tetrahedron; triangle and tetrahedron again.
@@ -190,19 +191,19 @@ def _section(name: str, *parts: str) -> str:
 
 
 def _geometry(model: Model) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Points (P, 3) and cells in the mesh's order of nodes, of the model's order."""
-    if model.mesh.ndim == 2:
-        if model.order == 2:
-            raise InputError("order 2: only of tetrahedra, the mesh is of triangles; leave out --order")
-        return np.column_stack([model.mesh.points, np.zeros(len(model.mesh.points))]), model.mesh.cells
-    return quadratic(model.mesh) if model.order == 2 else (model.mesh.points, model.mesh.cells)
+    """Points (P, 3) and cells, as `elements`."""
+    if model.mesh.ndim == 3:
+        return elements(model)
+    if model.order == 2:
+        raise InputError("order 2: only of tetrahedra, the mesh is of triangles; leave out --order")
+    return np.column_stack([model.mesh.points, np.zeros(len(model.mesh.points))]), model.mesh.cells
 
 
 def _nodes(model: Model, cells: NDArray[np.int64], part: Part) -> NDArray[np.int64]:
     """The nodes of each element, from 0, in gmsh's order."""
     if part.rows.ndim == 1:
         return cells[part.rows][:, TET10_ORDER] if model.order == 2 else cells[part.rows]
-    return (quadratic_facet_nodes if model.order == 2 else facet_triples)(cells, part.rows)
+    return element_facets(cells, part.rows)
 
 
 # Which elements there are
@@ -217,8 +218,7 @@ def _cells(model: Model) -> Part:
         names, group = material_names(model, model.sets.facets), model.materials.of_cell + 1
     _, first = np.unique(tagged.tags, return_index=True)
     groups_of = [[number] for number in group[first].tolist()]
-    cells = np.arange(len(model.mesh.cells))
-    return Part(model.mesh.ndim, cells + 1, cells, tagged.tags, groups_of, names, tagged.tags_of)
+    return Part(model.mesh.ndim, tagged.items + 1, tagged.items, tagged.tags, groups_of, names, tagged.tags_of)
 
 
 def _disjoint_sets(model: Model) -> tuple[list[str], NDArray[np.int64]]:
@@ -324,8 +324,5 @@ def _fields(model: Model) -> dict[str, NDArray[np.float64]]:
     check_apart(list(fields), model.sets.cells)
     for name, members in model.sets.cells.items():
         fields[name] = np.isin(np.arange(len(model.mesh.cells)), members)
-    columns: dict[str, NDArray[np.float64]] = {}
-    for name, values in fields.items():
-        table = np.asarray(values, dtype=np.float64).reshape(len(values), -1)
-        columns |= {name: table[:, 0]} if values.ndim == 1 else {f"{name}_{k}": c for k, c in enumerate(table.T)}
-    return columns
+    scalars = [as_scalars(name, values.astype(np.float64)) for name, values in fields.items()]
+    return {name: values for each in scalars for name, values in each.items()}

@@ -5,13 +5,11 @@ Written from SOFA's sources and documentation and read back as XML; no SOFA has 
 
 from __future__ import annotations
 
-import re
-
 import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
-from tetopt.io.text import blocks, rows
+from tetopt.io.text import blocks, rows, xml_comment
 from tetopt.model.loads import Load
 from tetopt.model.materials import Materials
 from tetopt.model.model import STRESS_UNITS, Model, described
@@ -94,8 +92,7 @@ def _comment(model: Model) -> str:
     lines = [*described(model), *SCENE_NOTES]
     if model.cell_data:
         lines.append(f"cell data that this format has no place for: {', '.join(model.cell_data)}")
-    text = re.sub("-(?=-)", "- ", "\n".join(lines))  # XML has no two hyphens in a comment
-    return f"<!--\n{text}\n-->\n"
+    return xml_comment(lines)
 
 
 def _force_field(materials: Materials) -> str:

@@ -21,14 +21,6 @@ class Tagged(NamedTuple):
     tags_of: dict[str, list[int]]  # the tags that make up each set
 
 
-class CellTags(NamedTuple):
-    """One tag a cell that tells its material and all of its sets."""
-
-    tags: NDArray[np.int64]  # (M,) 1 to T, by material; the material's number from 1 where no set divides one
-    material: NDArray[np.int64]  # (T,) of each tag, from 0; 0 without materials
-    tags_of: dict[str, list[int]]  # the tags that make up each material ("material_1", ...) and each cell set
-
-
 def tagged(sets: dict[str, NDArray[np.int64]]) -> Tagged:
     """One tag for each combination of sets that some item is in, from 1 in the order of the first such items.
 
@@ -51,8 +43,10 @@ def tagged(sets: dict[str, NDArray[np.int64]]) -> Tagged:
     return Tagged(items, rank[kind.ravel()], tags_of)
 
 
-def cell_tags(model: Model) -> CellTags:
-    """One tag for each combination of a material and cell sets.
+def cell_tags(model: Model) -> Tagged:
+    """Every cell, with one tag for each combination of a material ("material_1", ...) and cell sets.
+
+    Tags go by material: they are the materials' numbers from 1 where no set divides one.
 
     Raises
     ------
@@ -69,7 +63,7 @@ def cell_tags(model: Model) -> CellTags:
     tags_of = {name: list(range(ends[k] + 1, ends[k + 1] + 1)) for k, name in enumerate(names)}
     for name, tags in combined.tags_of.items():
         tags_of[name] = (np.flatnonzero(np.isin(kinds[:, 1], tags)) + 1).tolist()
-    return CellTags(which.ravel() + 1, kinds[:, 0], tags_of)
+    return Tagged(np.arange(len(material)), which.ravel() + 1, tags_of)
 
 
 def facet_tags(mesh: Mesh, sets: dict[str, NDArray[np.int64]]) -> Tagged:
@@ -115,6 +109,13 @@ def remarks(model: Model) -> list[str]:
 def without_cell_data(model: Model) -> list[str]:
     """A line for the head of a file whose format has no place for cell data."""
     return [f"cell data, which this format has no place for: {', '.join(model.cell_data)}"] if model.cell_data else []
+
+
+def as_scalars(name: str, values: NDArray) -> dict[str, NDArray]:
+    """Cell data as scalars by name: the columns of what has several are numbered, NAME_0, NAME_1, ..."""
+    if values.ndim == 1:
+        return {name: values}
+    return {f"{name}_{k}": column for k, column in enumerate(values.reshape(len(values), -1).T)}
 
 
 def tag_lines(tags_of: dict[str, list[int]], what: str) -> list[str]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import re
+
 from numpy.typing import NDArray
 
 NUMBERS_PER_LINE = 16  # Abaqus takes no more
@@ -20,6 +22,12 @@ def rows(*columns: NDArray, separator: str = " ") -> str:
     single = [each for column in columns for each in ([column] if column.ndim == 1 else column.T)]
     texts = [map(repr, column.tolist()) for column in single]
     return "".join(f"{separator.join(row)}\n" for row in zip(*texts, strict=True))
+
+
+def xml_comment(lines: list[str]) -> str:
+    """Lines as a comment of XML, which has no two hyphens in one."""
+    text = re.sub("-(?=-)", "- ", "\n".join(lines))
+    return f"<!--\n{text}\n-->\n"
 
 
 def blocks(numbers: NDArray, separator: str = " ") -> str:

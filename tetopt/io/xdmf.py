@@ -57,7 +57,7 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.geometry.topology import facets
-from tetopt.io.tags import tagged
+from tetopt.io.tags import as_scalars, tagged
 from tetopt.io.text import rows
 from tetopt.model.model import Model, described
 from tetopt.model.sets import facet_triples
@@ -116,7 +116,9 @@ def _mesh_grid(model: Model) -> str:
         own = {"material": of_cell + 1, "young": young[of_cell], "nu": nu[of_cell]}
         fields = own | {name: values for name, values in fields.items() if name not in own}
         table = _information("young", _listed(young)) + _information("nu", _listed(nu))
-    columns = {part: values for name in fields for part, values in _columns(name, np.asarray(fields[name])).items()}
+    columns: dict[str, NDArray] = {}
+    for name, values in fields.items():  # VTK takes no matrices but vectors for what they are
+        columns |= {name: values} if np.shape(values)[1:] == (3,) else as_scalars(name, np.asarray(values))
     points = _item(model.mesh.points)
     return _grid("mesh", model, model.mesh.cells, points, columns, table)
 
@@ -156,13 +158,6 @@ def _grid(
         f'<Geometry GeometryType="{GEOMETRY_TYPES[model.mesh.ndim]}">\n{points}</Geometry>\n'
         f"{''.join(attributes)}</Grid>\n"
     )
-
-
-def _columns(name: str, values: NDArray) -> dict[str, NDArray]:
-    """Scalars and vectors; VTK takes no other matrices for what they are."""
-    if values.ndim == 1 or values.shape[1:] == (3,):
-        return {name: values}
-    return {f"{name}_{k}": column for k, column in enumerate(values.reshape(len(values), -1).T)}
 
 
 def _item(values: NDArray) -> str:

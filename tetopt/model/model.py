@@ -11,7 +11,7 @@ from tetopt.errors import InputError
 from tetopt.mesh import Mesh
 from tetopt.model.loads import Load
 from tetopt.model.materials import Materials
-from tetopt.model.sets import Sets, outward_facet_nodes
+from tetopt.model.sets import Sets, facet_triples, outward_facet_nodes
 from tetopt.model.skfem import skfem_mesh
 
 if TYPE_CHECKING:
@@ -118,6 +118,16 @@ def described(model: Model) -> list[str]:
         )
     # A line break in a file's name would end a comment.
     return [" ".join(line.split()) for line in lines]
+
+
+def elements(model: Model) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Points and cells of the model's order: the mesh's own, or those of `quadratic`."""
+    return quadratic(model.mesh) if model.order == 2 else (model.mesh.points, model.mesh.cells)
+
+
+def element_facets(cells: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Nodes of the facets (K, 2) of cells of either order: `facet_triples` or `quadratic_facet_nodes`."""
+    return (quadratic_facet_nodes if cells.shape[1] == 10 else facet_triples)(cells, rows)
 
 
 def quadratic(mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
