@@ -114,13 +114,8 @@ def compare(exact: Reference, mesh: Mesh, u: NDArray[np.float64], strain_energy:
 
 def near_interface(labels: NDArray) -> NDArray[np.bool_]:
     """Voxels whose centre is within `INTERFACE_BAND_VOXELS` of a facet between two labels, distances in voxels."""
-    is_edge = np.zeros(labels.shape, dtype=bool)
-    for axis in range(labels.ndim):
-        differs = np.diff(labels, axis=axis) != 0
-        before, after = [slice(None)] * labels.ndim, [slice(None)] * labels.ndim
-        before[axis], after[axis] = slice(None, -1), slice(1, None)
-        is_edge[tuple(before)] |= differs
-        is_edge[tuple(after)] |= differs
+    around = ndimage.generate_binary_structure(labels.ndim, 1)  # a voxel and those that it shares a facet with
+    is_edge = ndimage.minimum_filter(labels, footprint=around) != ndimage.maximum_filter(labels, footprint=around)
     if not is_edge.any():
         return is_edge
     # A voxel at an interface has its centre half a voxel away from it.
