@@ -10,6 +10,7 @@ from typing import Literal, NamedTuple, get_args
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tetopt.energy.sampling import ranges_of
 from tetopt.errors import InputError
 from tetopt.model.laws import ByLabel, checked_young
 
@@ -146,9 +147,6 @@ def _bin_means(
     sizes = np.bincount(which, weights=volumes, minlength=count)
     total = np.bincount(which, weights=volumes * values, minlength=count)
     # Rounding may take a mean out of its bin by a bit where all of its values are equal.
-    low = np.full(count, np.inf)
-    high = np.full(count, -np.inf)
-    np.minimum.at(low, which, values)
-    np.maximum.at(high, which, values)
+    low, high = ranges_of(which, values, count)
     with np.errstate(invalid="ignore"):  # bins without cells
         return np.clip(total / sizes, low, high)[which]
