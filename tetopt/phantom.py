@@ -223,8 +223,8 @@ class Phantom:
             An option out of range, or more than ``2**31`` voxels.
         """
         where = f"phantom {self.name!r}"
-        blur = _non_negative(self.blur_mm if blur_mm is None else blur_mm, f"{where}: blur_mm")
-        sd = _non_negative(self.noise_sd if noise_sd is None else noise_sd, f"{where}: noise_sd")
+        blur = _number(self.blur_mm if blur_mm is None else blur_mm, f"{where}: blur_mm", 0.0)
+        sd = _number(self.noise_sd if noise_sd is None else noise_sd, f"{where}: noise_sd", 0.0)
         seed = _integer(self.seed if seed is None else seed, f"{where}: seed")
         supersample = _integer(supersample, f"{where}: supersample", 1, MAX_SUPERSAMPLE)
         shape, affine = self._grid(voxel_mm)
@@ -415,8 +415,8 @@ def _phantom(table: dict[str, Any], where: str) -> Phantom:
         background_intensity=_number(background["intensity"], f"{where}: background: intensity"),
         background_label=_integer(background.get("label", 0), f"{where}: background: label"),
         shapes=tuple(_shape(shape, n, f"{where}: shape {k}") for k, shape in enumerate(shapes, start=1)),
-        blur_mm=_non_negative(table.get("blur_mm", 0.0), f"{where}: blur_mm"),
-        noise_sd=_non_negative(table.get("noise_sd", 0.0), f"{where}: noise_sd"),
+        blur_mm=_number(table.get("blur_mm", 0.0), f"{where}: blur_mm", 0.0),
+        noise_sd=_number(table.get("noise_sd", 0.0), f"{where}: noise_sd", 0.0),
         seed=_integer(table.get("seed", 0), f"{where}: seed"),
     )
 
@@ -464,10 +464,10 @@ def _axes(rows: Any, n: int, what: str) -> NDArray[np.float64]:
     """Unit rows (n, n), read-only."""
     if not isinstance(rows, list) or len(rows) != n:
         raise InputError(f"{what}: expected {n} rows, the directions of the voxel axes, got {rows!r}")
-    axes = np.array([_numbers(row, n, f"{what}: row {i}") for i, row in enumerate(rows, start=1)])
-    if not axes.any(axis=1).all() or abs(np.linalg.det(np.array([_unit(row) for row in axes]))) < SINGULAR_DETERMINANT:
+    with np.errstate(invalid="ignore"):  # a row of zeros becomes NaN, and with it the determinant
+        axes = np.array([_unit(_numbers(row, n, f"{what}: row {i}")) for i, row in enumerate(rows, start=1)])
+    if not abs(np.linalg.det(axes)) >= SINGULAR_DETERMINANT:
         raise InputError(f"{what}: the directions {rows!r} do not span {n}-D space; make them independent")
-    axes = np.array([_unit(row) for row in axes])
     axes.setflags(write=False)
     return axes
 
@@ -521,19 +521,12 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, int | float) and not isinstance(value, bool) and -1e300 < value < 1e300
 
 
-def _number(value: Any, what: str) -> float:
-    """A finite number as float."""
+def _number(value: Any, what: str, low: float = -np.inf) -> float:
+    """A finite number, `low` or more, as float."""
     value = _plain(value)
-    if not _is_number(value):
-        raise InputError(f"{what}: expected a finite number, got {value!r}")
-    return float(value)
-
-
-def _non_negative(value: Any, what: str) -> float:
-    """A finite number, 0 or more."""
-    value = _plain(value)
-    if not _is_number(value) or value < 0:
-        raise InputError(f"{what}: expected a finite number, 0 or more, got {value!r}")
+    if not _is_number(value) or value < low:
+        limit = f", {low:g} or more" if low > -np.inf else ""
+        raise InputError(f"{what}: expected a finite number{limit}, got {value!r}")
     return float(value)
 
 
