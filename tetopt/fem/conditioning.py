@@ -8,6 +8,7 @@ eigenvalue is 0. So they depend on what is held, and meshes are comparable under
 from __future__ import annotations
 
 import warnings
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -92,8 +93,15 @@ def lambda_min(K_ff: csr_array, preconditioner: LinearOperator | None = None) ->
         return float(np.linalg.eigvalsh(K_ff.toarray())[0])
     if preconditioner is not None:
         return _by_lobpcg(K_ff, preconditioner)
-    inverse = LinearOperator(K_ff.shape, matvec=factorized(K_ff), dtype=np.float64)
-    return _by_lanczos(K_ff, "smallest", sigma=0.0, OPinv=inverse)
+    return _by_inverse(K_ff, factorized(K_ff))
+
+
+def _by_inverse(
+    K_ff: csr_array, solve: Callable[[NDArray[np.float64]], NDArray[np.float64]], tol: float = 0.0
+) -> float:
+    """The smallest eigenvalue by Lanczos on the inverse of K_ff, each product a solution; `tol` 0 is all digits."""
+    inverse = LinearOperator(K_ff.shape, matvec=solve, dtype=np.float64)
+    return _by_lanczos(K_ff, "smallest", sigma=0.0, OPinv=inverse, tol=tol)
 
 
 def _by_lanczos(K_ff: csr_array, extreme: str, **options: Any) -> float:
@@ -120,11 +128,6 @@ def _by_lobpcg(K_ff: csr_array, preconditioner: LinearOperator) -> float:
         # The eigenvalue's error is about residual^2 over the gap to the next one.
         if residual <= 1e-4 * estimate:
             return estimate
-    return _by_inverse(K_ff, preconditioner)  # slower, but where moduli differ a lot it comes through
-
-
-def _by_inverse(K_ff: csr_array, preconditioner: LinearOperator) -> float:
-    """Lanczos on the inverse of K_ff, each product a preconditioned solve."""
 
     def solve(load: NDArray[np.float64]) -> NDArray[np.float64]:
         solution, failure = cg(K_ff, load.ravel(), rtol=1e-10, maxiter=3000, M=preconditioner)
@@ -132,8 +135,7 @@ def _by_inverse(K_ff: csr_array, preconditioner: LinearOperator) -> float:
             raise RuntimeError("conditioning: the smallest eigenvalue did not converge: a solve did not")
         return solution
 
-    inverse = LinearOperator(K_ff.shape, matvec=solve, dtype=np.float64)
-    return _by_lanczos(K_ff, "smallest", sigma=0.0, OPinv=inverse, tol=1e-8)
+    return _by_inverse(K_ff, solve, tol=1e-8)  # slower, but where moduli differ a lot it comes through
 
 
 def cg_iterations(K_ff: csr_array, load: NDArray[np.float64], rtol: float = RESIDUAL_SHARE) -> int:
