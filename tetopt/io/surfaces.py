@@ -59,22 +59,20 @@ def save_surface(path: str | Path, surface: Surface, about: str = "", space: str
 
 def boundary_stl(model: Model) -> bytes:
     """The model's boundary, watertight, as the bytes of an STL file; nothing else of the model is in it."""
-    return _stl(_boundary(model), _about(model), model.space)
+    return _stl(*_boundary(model))
 
 
 def boundary_ply(model: Model) -> bytes:
     """The model's boundary, watertight, as the bytes of a PLY file; nothing else of the model is in it."""
-    return _ply(_boundary(model), _about(model), model.space)
+    return _ply(*_boundary(model))
 
 
-def _boundary(model: Model) -> Surface:
+def _boundary(model: Model) -> tuple[Surface, str, str]:
+    """The surface, what its file says of it, and the space of its points."""
     if model.mesh.ndim != 3:
         raise InputError("surface: expected tetrahedra, whose boundary is a surface, got triangles")
-    return surface_of(model.mesh.points, model.mesh.cells, np.arange(len(model.mesh.cells)))
-
-
-def _about(model: Model) -> str:
-    return str(model.about.get("image", ""))
+    surface = surface_of(model.mesh.points, model.mesh.cells, np.arange(len(model.mesh.cells)))
+    return surface, str(model.about.get("image", "")), model.space
 
 
 def checked_surface(path: str | Path) -> SurfaceCheck:
