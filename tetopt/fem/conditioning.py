@@ -96,9 +96,7 @@ def lambda_min(K_ff: csr_array, preconditioner: LinearOperator | None = None) ->
     return _by_inverse(K_ff, factorized(K_ff))
 
 
-def _by_inverse(
-    K_ff: csr_array, solve: Callable[[NDArray[np.float64]], NDArray[np.float64]], tol: float = 0.0
-) -> float:
+def _by_inverse(K_ff: csr_array, solve: Callable[[NDArray], NDArray], tol: float = 0.0) -> float:
     """The smallest eigenvalue by Lanczos on the inverse of K_ff, each product a solution; `tol` 0 is all digits."""
     inverse = LinearOperator(K_ff.shape, matvec=solve, dtype=np.float64)
     return _by_lanczos(K_ff, "smallest", sigma=0.0, OPinv=inverse, tol=tol)

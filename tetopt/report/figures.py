@@ -275,7 +275,7 @@ class SliceView:
         self.letters = [("LR", "PA", "IS")[nearest[a]] if image.ndim == 3 else "" for a in self.axes]
         pixels = image.data if self.across is None else np.take(image.data, self.index, axis=self.across)
         pixels = pixels if self.axes == inside else pixels.T
-        self.pixels = np.flip(pixels, axis=tuple(k for k in (0, 1) if self.flip[k]))
+        self.pixels = np.flip(pixels, axis=tuple(np.flatnonzero(self.flip)))
         self.steps = image.spacing[self.axes]  # mm, of a pixel
         self.size = [image.shape[a] * image.spacing[a] for a in self.axes]
         self.extent = (0.0, self.size[0], 0.0, self.size[1])
@@ -305,10 +305,7 @@ class SliceView:
     def _flat(self, index: NDArray[np.float64]) -> NDArray[np.float64]:
         """Places in the picture (..., 2), mm, of index coordinates (..., n)."""
         flat = (index[..., self.axes] + 0.5) * self.steps
-        for k in (0, 1):
-            if self.flip[k]:
-                flat[..., k] = self.size[k] - flat[..., k]
-        return flat
+        return np.where(self.flip, self.size - flat, flat)
 
     def frame(self, axes: Axes) -> None:
         """The whole slice in one scale, with the patient's sides as letters in place of ticks."""
