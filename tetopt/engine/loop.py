@@ -25,7 +25,7 @@ GRADED_ITERATIONS = 16  # sweeps; four more would lower E_D by 2 % there
 START_K_D = 0.02
 SHAPE_POWER = 3.0  # p: from 3 on the energy itself keeps angles above the floor at the uniform k_D
 MIN_DIHEDRAL = 12.0  # degrees: the floor
-NOISE = 1e-12  # of the image's own variance x volume: less E_D than this is rounding
+E_D_ROUNDING = 1e-12  # of the image's own variance x volume: less E_D than this is rounding
 
 Boundary = Literal["slide", "fixed"]
 

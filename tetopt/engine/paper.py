@@ -26,7 +26,7 @@ from tetopt.energy.sampling import (
 from tetopt.engine.complex import FLAT_SHARE
 from tetopt.engine.descent import Scheme, Tessellation, descend, free_projections, relocate
 from tetopt.engine.loop import (
-    NOISE,
+    E_D_ROUNDING,
     UNIFORM_ITERATIONS,
     UNIFORM_K_D,
     Boundary,
@@ -117,7 +117,7 @@ def optimize_paper(
     if iterations > 0 and (retessellate == "accept" or (retessellate == "first" and n_t > 0)):
         _check_fills_box(image, mesh)
     # Where every cell is uniform, what rounding leaves of E_D must not become the unit that E_D is measured in.
-    rounding = NOISE * float(np.var(image.data, dtype=np.float64)) * image.volume
+    rounding = E_D_ROUNDING * float(np.var(image.data, dtype=np.float64)) * image.volume
     E_G0, E_D0 = _energies(tessellation, image, rounding)
     scheme = _scheme(image, grid, k_D, E_G0, E_D0, step_ratio)
     history: list[Record] = []

@@ -9,7 +9,7 @@ from tetopt.check import check_unfolded
 from tetopt.energy.sampling import SamplingGrid, check_orientations, to_ticks
 from tetopt.engine.complex import Objective, Sides, State, build, energies
 from tetopt.engine.descent import free_projections
-from tetopt.engine.loop import NOISE, SHAPE_POWER, Boundary, frozen_axes, side_ticks
+from tetopt.engine.loop import E_D_ROUNDING, SHAPE_POWER, Boundary, frozen_axes, side_ticks
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.mesh import Mesh
@@ -36,7 +36,7 @@ def state_of(
     is_frozen = frozen_axes(image, ticks, mesh.cells, grid, boundary, region is not None)
     sides = sides_of(grid, matrix, boundary == "fixed", None if region is None else region.level)
     # Where every cell is uniform, what rounding leaves of E_D must not become the unit that E_D is measured in.
-    rounding = float(NOISE * content.variance / content.unit * content.n_voxels)
+    rounding = float(E_D_ROUNDING * content.variance / content.unit * content.n_voxels)
     wrong_side = 0.0 if region is None else float(content.wrong_side)
     objective = objective_of(grid, matrix, power, is_graded)
     objective = objective._replace(rounding=rounding, wrong_side=wrong_side)
