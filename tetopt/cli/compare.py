@@ -41,7 +41,7 @@ ClassesOption = Annotated[int, option("K", "Classes of the segmentation (multi-O
 
 
 DEFAULT_SETTINGS = Settings(nodes=DEFAULT_NODES[3])
-BYTES_PER_GB = 1e9
+BYTES_PER_GB = 1e9  # as --max-gb counts them
 
 
 class Baseline(StrEnum):  # noqa: D101

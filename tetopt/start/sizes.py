@@ -19,7 +19,7 @@ COARSEST_SHARE = 1.4
 # By dimension, the shortest and the longest edge of the cells in a block over the block's own edge: from a corner to
 # the centre, and, in 3-D, the diagonal of a block's side on the box's faces.
 SHORTEST_IN_BLOCK = {2: 0.5**0.5, 3: 0.75**0.5}
-LONGEST_IN_BLOCK = {2: 1.0, 3: 2.0**0.5}
+LONGEST_IN_BLOCK = {2: 1.0, 3: 2.0**0.5}  # in 2-D the side itself is as long as the block
 NO_BOUND_MM = 1e30  # stands for infinity in float32, to which steps can still be added
 UNEVEN_SHARE = 1.5  # a cell's longest edge over the edge that gradation gives: edges of a good cell differ by a third
 

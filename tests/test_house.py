@@ -1,0 +1,209 @@
+"""The house rules: what a reader of any one file may rely on in all of them."""
+
+import ast
+import importlib
+import io
+import re
+import tokenize
+from functools import cache
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+SOURCES = sorted((ROOT / "tetopt").rglob("*.py"))
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), ROOT / "tests" / "benchmarks" / "README.md"]
+# More than 8 parameters: public functions, whose signature is a contract, and fluxes of numbers with no common noun.
+WIDE = {
+    "tetopt.energy.sampling.segment_flux": 9,
+    "tetopt.energy.sampling.triangle_flux": 10,
+    "tetopt.engine.fast.optimize": 13,
+    "tetopt.engine.meshing.mesh_image": 11,
+    "tetopt.engine.paper.optimize_paper": 12,
+    "tetopt.model.build.model_of": 13,
+}
+# Verbs that once stood for a dozen things each; a variable is a noun, see docs/glossary.md.
+VERBS = {"held", "wanted", "found", "given", "told", "asked"}
+
+
+@cache
+def text_of(path):
+    return path.read_text(encoding="utf-8")
+
+
+@cache
+def tree_of(path):
+    return ast.parse(text_of(path))
+
+
+def module_name(path):
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
+
+
+def constants():
+    """Each assignment to a module's constant: path, line, name, value."""
+    for path in SOURCES:
+        for node in tree_of(path).body:
+            if isinstance(node, ast.Assign | ast.AnnAssign) and node.value is not None:
+                targets = node.targets if isinstance(node, ast.Assign) else [node.target]
+                for target in targets:
+                    if isinstance(target, ast.Name) and re.fullmatch(r"_?[A-Z][A-Z0-9_]*", target.id):
+                        yield path, node.lineno, target.id, node.value
+
+
+def is_numeric(value):
+    """A number, or a tuple, list or table of numbers, with whatever arithmetic."""
+    if isinstance(value, ast.Constant):
+        return isinstance(value.value, int | float) and not isinstance(value.value, bool)
+    if isinstance(value, ast.UnaryOp):
+        return is_numeric(value.operand)
+    if isinstance(value, ast.BinOp):
+        return is_numeric(value.left) and is_numeric(value.right)
+    if isinstance(value, ast.Tuple | ast.List):
+        return all(is_numeric(item) for item in value.elts)
+    return isinstance(value, ast.Dict) and all(is_numeric(item) for item in (*value.keys, *value.values))
+
+
+def comment_lines(path):
+    tokens = tokenize.generate_tokens(io.StringIO(text_of(path)).readline)
+    return {token.start[0] for token in tokens if token.type == tokenize.COMMENT}
+
+
+def functions():
+    """Every function: its name, its node, the number of its parameters and of its lines of code."""
+    quiet = {tokenize.COMMENT, tokenize.NL, tokenize.NEWLINE, tokenize.INDENT, tokenize.DEDENT, tokenize.ENDMARKER}
+    for path in SOURCES:
+        lines = set()
+        for token in tokenize.generate_tokens(io.StringIO(text_of(path)).readline):
+            if token.type not in quiet:
+                lines.update(range(token.start[0], token.end[0] + 1))
+        for node in ast.walk(tree_of(path)):
+            if isinstance(node, ast.FunctionDef):
+                own = {line for line in lines if node.lineno <= line <= node.end_lineno}
+                first = node.body[0]
+                if ast.get_docstring(node) is not None:
+                    own -= set(range(first.lineno, first.end_lineno + 1))
+                count = len(node.args.posonlyargs) + len(node.args.args) + len(node.args.kwonlyargs)
+                yield f"{module_name(path)}.{node.name}", count, len(own)
+
+
+def test_a_constant_has_one_meaning():
+    """No name of a constant stands for two values, nor for one value in two places."""
+    places = {}
+    for path, line, name, _ in constants():
+        places.setdefault(name, []).append(f"{module_name(path)}:{line}")
+    assert {name: where for name, where in places.items() if len(where) > 1} == {}
+
+
+def test_a_number_has_two_words_and_its_reason():
+    """A numeric constant says in its name what it is of, and in a comment beside or above it why it is that."""
+    one_word, bare = [], []
+    for path, line, name, value in constants():
+        if is_numeric(value):
+            if "_" not in name.strip("_"):
+                one_word.append(f"{module_name(path)}.{name}")
+            lines = comment_lines(path)
+            last = value.end_lineno
+            if not lines & set(range(line - 1, last + 1)):
+                bare.append(f"{module_name(path)}.{name}")
+    assert one_word == []
+    assert bare == []
+
+
+def exists(name):
+    """Whether a dotted name is a module, or an attribute of one, however deep."""
+    parts = name.split(".")
+    for count in range(len(parts), 0, -1):
+        try:
+            thing = importlib.import_module(".".join(parts[:count]))
+        except ImportError:
+            continue
+        for part in parts[count:]:
+            fields = getattr(thing, "__annotations__", {})
+            if not hasattr(thing, part):
+                return part in fields and part == parts[-1]
+            thing = getattr(thing, part)
+        return True
+    return False
+
+
+@pytest.mark.parametrize("path", [*SOURCES, *DOCUMENTS], ids=lambda path: str(path.relative_to(ROOT)))
+def test_what_is_named_exists(path):
+    """Every `tetopt.x.y` of a docstring, comment or document; and every file of the package that one names."""
+    names = set(re.findall(r"\btetopt(?:\.[A-Za-z_]\w*)+", text_of(path)))
+    files = {name for name in names if re.search(r"\.(vtu|toml|scn|nii|inp|feb|py|md|json|html)$", name)}
+    assert sorted(name for name in names - files if not exists(name)) == []
+    named = re.findall(r"`((?:tetopt|tests|docs|scripts|phantoms)/[\w./]+)`", text_of(path))
+    assert sorted({name for name in named if not (ROOT / name).exists()}) == []
+
+
+def test_variables_are_nouns():
+    """No variable, parameter or field is called by one of `VERBS` alone."""
+    verbs = []
+    for path in SOURCES:
+        for node in ast.walk(tree_of(path)):
+            name = getattr(node, "id", None) or getattr(node, "arg", None)
+            if isinstance(node, ast.Name | ast.arg) and name in VERBS:
+                verbs.append(f"{module_name(path)}:{node.lineno} {name}")
+    assert verbs == []
+
+
+def test_no_function_is_too_long_to_see():
+    assert [(name, lines) for name, _, lines in functions() if lines > 60] == []
+
+
+def test_few_functions_have_many_parameters():
+    """More than 8 parameters are named here, each; none has more than 13."""
+    many = {name: count for name, count, _ in functions() if count > 8}
+    assert many == WIDE
+    assert len(WIDE) <= 10
+    assert max(many.values()) <= 13
+
+
+def test_no_circle_of_imports():
+    """Not even through imports inside functions."""
+    modules = {module_name(path): path for path in SOURCES}
+    edges = {}
+    for name, path in modules.items():
+        found = set()
+        for node in ast.walk(tree_of(path)):
+            if isinstance(node, ast.Import):
+                found.update(alias.name for alias in node.names)
+            elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+                submodules = {f"{node.module}.{alias.name}" for alias in node.names}
+                found.update(submodules & set(modules) or {node.module})
+        edges[name] = {target for target in found if target in modules and target != "tetopt"}
+    done = set()
+
+    def visit(name, way):
+        assert name not in way, " -> ".join([*way[way.index(name) :], name])
+        if name not in done:
+            for target in sorted(edges[name]):
+                visit(target, [*way, name])
+            done.add(name)
+
+    for name in sorted(modules):
+        visit(name, [])
+
+
+def test_every_room_is_on_the_page_and_in_the_picture():
+    rooms = {path.parent.name for path in (ROOT / "tetopt").glob("*/__init__.py")}
+    page, picture = text_of(ROOT / "docs" / "architecture.md"), text_of(ROOT / "docs" / "architecture.svg")
+    assert {room for room in rooms if f"`{room}/`" not in page} == set()
+    assert {room for room in rooms if f">{room}/<" not in picture} == set()
+
+
+def test_every_public_module_is_on_the_page():
+    """Each module of a room is named in its line of the page."""
+    page = text_of(ROOT / "docs" / "architecture.md")
+    rows = dict(re.findall(r"^\| (`[^|]*) \| (.*) \|$", page, re.M))
+    of_room = {room: row for rooms, row in rows.items() for room in re.findall(r"`(\w+)/?`", rooms)}
+    missing = []
+    for path in SOURCES:
+        parts = path.relative_to(ROOT / "tetopt").with_suffix("").parts
+        if len(parts) == 2 and not parts[1].startswith("__"):
+            words = set(re.findall(r"`(\w+)`", of_room.get(parts[0], "")))
+            if parts[1] not in words:
+                missing.append("/".join(parts))
+    assert missing == []
