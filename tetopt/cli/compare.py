@@ -22,7 +22,6 @@ from tetopt.cli.options import (
     BoxPart,
     ForceOption,
     ImageArgument,
-    ImagePart,
     NumberOptions,
     option,
 )
@@ -203,7 +202,7 @@ def compare_command(
 def _image_and_labels(path: Path, labels_path: Path | None, part: BoxPart) -> tuple[Image, Image | None]:
     """The volume, and labels on its voxels, if they are given."""
     image = read_volume(path, part)
-    return image, None if labels_path is None else read_labels(labels_path, image, ImagePart(crop=part.crop))
+    return image, None if labels_path is None else read_labels(labels_path, image, part)
 
 
 def _settings(compared: ComparedOptions, simulation: SimulationOptions, limits: LimitOptions) -> Settings:

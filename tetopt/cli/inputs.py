@@ -14,7 +14,7 @@ from rich.markup import escape
 
 from tetopt import Image, InputError, load_image, load_mesh
 from tetopt.cli.console import log, show_warning
-from tetopt.cli.options import WHOLE_BOX, WHOLE_IMAGE, BoxPart, ImagePart
+from tetopt.cli.options import WHOLE_BOX, BoxPart, ImagePart
 from tetopt.io.images import parse_crop, parse_slice, part_of, sha256
 from tetopt.io.meshes import MeshFile
 from tetopt.target.align import aligned_contrast, is_same_grid
@@ -24,25 +24,26 @@ IN_IMAGE_SHARE = 0.95  # of a mask's or labels' volume: less of it in the image 
 AFFINE_MM = 1e-4  # affines that differ by less are the same: files round them to 32 bits
 
 
-def read_image(path: Path, part: ImagePart = WHOLE_IMAGE) -> Image:
+def read_image(path: Path, part: BoxPart = WHOLE_BOX) -> Image:
     """The image as the options ask for it."""
+    slice_ = part.slice_ if isinstance(part, ImagePart) else None
     return load_image(
         path,
         volume=part.volume,
-        slice_=None if part.slice_ is None else parse_slice(part.slice_),
+        slice_=None if slice_ is None else parse_slice(slice_),
         crop=None if part.crop is None else parse_crop(part.crop),
     )
 
 
 def read_volume(path: Path, part: BoxPart = WHOLE_BOX) -> Image:
     """A 3-D image; InputError for a picture."""
-    image = read_image(path, ImagePart(volume=part.volume, crop=part.crop))
+    image = read_image(path, part)
     if image.ndim != 3:
         raise InputError(f"{path}: expected a volume, got a {image.ndim}-D image")
     return image
 
 
-def read_labels(path: Path, image: Image, part: ImagePart = WHOLE_IMAGE) -> Image:
+def read_labels(path: Path, image: Image, part: BoxPart = WHOLE_BOX) -> Image:
     """A label image, cut as the image was; InputError unless it lies on the image's voxels."""
     labels = read_image(path, replace(part, volume=None))
     if labels.shape != image.shape or not np.allclose(labels.affine, image.affine, atol=AFFINE_MM):

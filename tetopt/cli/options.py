@@ -85,11 +85,9 @@ class BoxPart:
 
 
 @dataclass(frozen=True, kw_only=True)
-class ImagePart:
+class ImagePart(BoxPart):
     """Which part of an image file is read; a slice of it is an image in 2-D."""
 
-    volume: VolumeOption = None
-    crop: CropOption = None
     slice_: Annotated[str | None, option("AXIS=INDEX", "One slice, in 2-D; for example k=90.", "--slice")] = None
 
     def stated(self) -> dict[str, int | str | None]:

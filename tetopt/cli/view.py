@@ -11,7 +11,7 @@ from rich.markup import escape
 from tetopt import InputError
 from tetopt.cli.console import out
 from tetopt.cli.inputs import check_no_input, read_image, read_mesh, warn_of_other_image
-from tetopt.cli.options import BoxPart, ForceOption, ImagePart, option
+from tetopt.cli.options import BoxPart, ForceOption, option
 from tetopt.io.files import checked_output
 from tetopt.model.build import labels_of
 from tetopt.model.fields import cell_fields
@@ -34,7 +34,7 @@ def view_command(
     mesh, fields = loaded.mesh, dict(loaded.cell_data)
     image = None
     if image_path is not None:
-        image = read_image(image_path, ImagePart(volume=part.volume, crop=part.crop))
+        image = read_image(image_path, part)
         if image.ndim != mesh.ndim:
             raise InputError(f"{image_path}: expected a {mesh.ndim}-D image, as the mesh is, got a {image.ndim}-D one")
         warn_of_other_image(loaded, mesh_path, image_path)

@@ -12,35 +12,28 @@ from tetopt.mesh import Mesh
 from tetopt.start.sizes import COARSEST_SHARE, Sizes
 from tetopt.study.compare_report import Measurement, TradeoffRow
 
-SWEEP_VALUES: dict[str, tuple[float, ...]] = {
-    "k_D": (0.3, 0.5, 0.7, GRADED_K_D, 0.93),
-    "shape power p": (2.0, SHAPE_POWER, 4.0, 6.0),
-    "gradation": (0.2, 0.5, 1.0),
-    "largest edge, of a uniform mesh's": (1.0, 1.15, COARSEST_SHARE, 2.0, 3.0),
-    "uniform, k_D": (0.0, 0.2, 0.5, 0.8),
-}
-SWEEP_DEFAULTS = {
-    ("k_D", GRADED_K_D),
-    ("shape power p", SHAPE_POWER),
-    ("gradation", 1.0),
-    ("largest edge, of a uniform mesh's", COARSEST_SHARE),
-}
+SWEPT_OPTIONS: tuple[tuple[str, float | None, tuple[float, ...]], ...] = (  # option, its default, and values around it
+    ("k_D", GRADED_K_D, (0.3, 0.5, 0.7, GRADED_K_D, 0.93)),
+    ("shape power p", SHAPE_POWER, (2.0, SHAPE_POWER, 4.0, 6.0)),
+    ("gradation", 1.0, (0.2, 0.5, 1.0)),
+    ("largest edge, of a uniform mesh's", COARSEST_SHARE, (1.0, 1.15, COARSEST_SHARE, 2.0, 3.0)),
+    ("uniform, k_D", None, (0.0, 0.2, 0.5, 0.8)),  # of another mesh than the graded one
+)
 
 
 def tradeoff(
     image: Image, nodes: int, measure: Callable[[Mesh], Measurement], say: Callable[[str], None]
 ) -> list[TradeoffRow]:
-    """Meshes of about `nodes` nodes over `SWEEP_VALUES`, each with its measurement; the default's are made once."""
+    """Meshes of about `nodes` nodes over `SWEPT_OPTIONS`, each with its measurement; the default's are made once."""
     measurements: dict[tuple[str, float] | None, Measurement] = {}  # by what is changed; None: nothing
     rows = []
-    for option, values in SWEEP_VALUES.items():
+    for option, default, values in SWEPT_OPTIONS:
         for value in values:
-            is_default = (option, value) in SWEEP_DEFAULTS
-            changed = None if is_default else (option, value)
+            changed = None if value == default else (option, value)
             if changed not in measurements:
                 say(f"trade-off: {option} = {value:g}")
                 measurements[changed] = measure(_mesh(image, nodes, option, value))
-            rows.append(TradeoffRow(option, value, is_default, measurements[changed]))
+            rows.append(TradeoffRow(option, value, changed is None, measurements[changed]))
     return rows
 
 
