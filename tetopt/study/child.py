@@ -10,8 +10,8 @@ from __future__ import annotations
 
 import contextlib
 import importlib
-import json
 import os
+import pickle
 import resource
 import signal
 import subprocess
@@ -21,12 +21,9 @@ import time
 import traceback
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, NamedTuple
-
-import numpy as np
+from typing import NamedTuple
 
 from tetopt.errors import InputError
-from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.study.pipelines import PIPELINES, Job, Produced
 
@@ -74,7 +71,7 @@ def run_in_child(pipeline: str, job: Job, *, max_seconds: float, max_bytes: int 
         raise InputError(f"limits: expected more than 0 seconds and bytes, got {max_seconds} s and {max_bytes} bytes")
     with tempfile.TemporaryDirectory(prefix="tetopt-") as name:
         folder = Path(name)
-        _write_job(folder, pipeline, job)
+        (folder / "job.pickle").write_bytes(pickle.dumps((pipeline, job)))
         with open(folder / "stderr.txt", "wb") as errors:
             child = subprocess.Popen(
                 [sys.executable, "-m", "tetopt.study.child", str(folder)],
@@ -149,10 +146,9 @@ def _kill_group(child: subprocess.Popen) -> None:
 
 def _outcome(folder: Path, code: int, peak: int, failure: str | None) -> Outcome:
     if failure is None and code == 0:
-        report = json.loads((folder / "report.json").read_text(encoding="utf-8"))
-        with np.load(folder / "mesh.npz") as arrays:
-            mesh = Mesh(arrays["points"], arrays["cells"])
-        return Outcome(mesh, report["seconds"], max(peak, report["peak_bytes"]), report["notes"], None)
+        (mesh, seconds, notes), own_peak = pickle.loads((folder / "result.pickle").read_bytes())
+        # Checked, and its arrays locked again: pickle does not keep that.
+        return Outcome(Mesh(mesh.points, mesh.cells), seconds, max(peak, own_peak), notes, None)
     return Outcome(None, {}, peak, [], failure or _failure(code, folder / "stderr.txt"))
 
 
@@ -168,34 +164,11 @@ def _failure(code: int, errors: Path) -> str:
     return lines[-1] if lines else f"ended with exit code {code} and no message"
 
 
-def _write_job(folder: Path, pipeline: str, job: Job) -> None:
-    arrays: dict[str, Any] = {"image": job.image.data, "image_affine": job.image.affine}
-    if job.labels is not None:
-        arrays |= {"labels": job.labels.data, "labels_affine": job.labels.affine}
-    np.savez(folder / "job.npz", **arrays)
-    options = {name: getattr(job, name) for name in ("nodes", "classes", "k_D", "iterations")}
-    (folder / "job.json").write_text(json.dumps({"pipeline": pipeline, "options": options}), encoding="utf-8")
-
-
-def _read_job(folder: Path) -> tuple[str, Job]:
-    with np.load(folder / "job.npz") as arrays:
-        image = Image(arrays["image"], arrays["image_affine"])
-        labels = Image(arrays["labels"], arrays["labels_affine"]) if "labels" in arrays else None
-    words = json.loads((folder / "job.json").read_text(encoding="utf-8"))
-    return words["pipeline"], Job(image, labels, **words["options"])
-
-
 def _pipeline(name: str) -> Callable[[Job], Produced]:
     if name in PIPELINES:
         return PIPELINES[name].function
     module, function = name.split(":", 1)
     return getattr(importlib.import_module(module), function)
-
-
-def _write_result(folder: Path, produced: Produced) -> None:
-    np.savez(folder / "mesh.npz", points=produced.mesh.points, cells=produced.mesh.cells)
-    report = {"seconds": produced.seconds, "notes": produced.notes, "peak_bytes": _own_peak_bytes()}
-    (folder / "report.json").write_text(json.dumps(report), encoding="utf-8")
 
 
 def main(folder: Path) -> int:
@@ -204,8 +177,9 @@ def main(folder: Path) -> int:
     The last line on stderr says what went wrong.
     """
     try:
-        name, job = _read_job(folder)
-        _write_result(folder, _pipeline(name)(job))
+        name, job = pickle.loads((folder / "job.pickle").read_bytes())
+        produced = _pipeline(name)(job)
+        (folder / "result.pickle").write_bytes(pickle.dumps((produced, _own_peak_bytes())))
     except InputError as error:
         print(" ".join(str(error).split()), file=sys.stderr)
         return 2
