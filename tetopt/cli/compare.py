@@ -15,7 +15,7 @@ from rich.markup import escape
 import tetopt
 from tetopt import Image, InputError, save_mesh
 from tetopt.cli.console import log, out
-from tetopt.cli.inputs import read_labels, read_volume, results_folder
+from tetopt.cli.inputs import checked_outputs, read_labels, read_volume, results_folder
 from tetopt.cli.options import (
     DEFAULT_NODES,
     WHOLE_BOX,
@@ -104,22 +104,18 @@ def paper_command(
 
     if seeds < 1:
         raise InputError(f"--seeds: expected 1 or more, got {seeds}")
-    volume = read_volume(mni_path("t1") if image_path is None else image_path)
-    tissue = None if labels_path is None else read_labels(labels_path, volume)
-    if image_path is None and labels_path is None:
-        tissue = mni_tissue()
+    source = mni_path("t1") if image_path is None else image_path
+    volume = read_volume(source)
+    tissue, labels_name = None, None
+    if labels_path is not None:
+        tissue, labels_name = read_labels(labels_path, volume), labels_path.name
+    elif image_path is None:
+        tissue, labels_name = mni_tissue(), "MNI152 tissue"
     paper_files.check_inputs(volume, tissue)
     if tissue is None:
         log.print("no --labels: the section on approximate segmentation is left out")
-    paths = paper_files.outputs(results_folder(output), force)
-    source = mni_path("t1") if image_path is None else image_path
-    about = {
-        "image": source.name,
-        "image_sha256": sha256(source),
-        "labels": None if tissue is None else "MNI152 tissue",
-    }
-    if labels_path is not None:
-        about["labels"] = labels_path.name
+    paths = checked_outputs(results_folder(output), paper_files.PAPER_FILES, force)
+    about = {"image": source.name, "image_sha256": sha256(source), "labels": labels_name}
     results = paper_files.run(paths, about, volume, tissue, seeds, lambda text: log.print(escape(text)))
     out.print(escape(f"{paths['paper.html']}: the paper's numbers beside ours, in {results['seconds']:.0f} s"))
     return 0
@@ -184,7 +180,7 @@ def compare_command(
         None if labels_path is None else LabelSource(labels_path.name, "given", sha256(labels_path)), law_words,
         command=f"tetopt {' '.join(map(shlex.quote, context.obj))}",
     )  # fmt: skip
-    paths = compare_files.outputs(results_folder(output), force or resume)
+    paths = checked_outputs(results_folder(output), compare_files.COMPARE_FILES, force or resume)
     if (output / "runs").is_dir() and not (resume or force):
         raise InputError(f"{output / 'runs'}: finished runs are there; --resume keeps them, --force starts over")
     signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that the child is ended with us

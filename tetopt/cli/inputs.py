@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import replace
 from pathlib import Path
 
@@ -15,6 +15,7 @@ from rich.markup import escape
 from tetopt import Image, InputError, load_image, load_mesh
 from tetopt.cli.console import log, show_warning
 from tetopt.cli.options import WHOLE_BOX, BoxPart, ImagePart
+from tetopt.io.files import checked_output
 from tetopt.io.images import parse_crop, parse_slice, part_of, sha256
 from tetopt.io.meshes import MeshFile
 from tetopt.target.align import aligned_contrast, is_same_grid
@@ -136,6 +137,11 @@ def results_folder(path: Path) -> Path:
         raise InputError(f"{path}: expected a folder for the results, found a file")
     path.mkdir(parents=True, exist_ok=True)
     return path
+
+
+def checked_outputs(folder: Path, names: Iterable[str], force: bool) -> dict[str, Path]:
+    """Files in a folder by their names; InputError as `checked_output`."""
+    return {name: checked_output(folder / name, (Path(name).suffix,), force) for name in names}
 
 
 def set_threads(threads: int | None) -> None:

@@ -10,7 +10,7 @@ import numpy as np
 
 import tetopt
 from tetopt import InputError
-from tetopt.cli.inputs import check_no_input, read_companion
+from tetopt.cli.inputs import check_no_input, checked_outputs, read_companion
 from tetopt.cli.options import (
     DEFAULT_NODES,
     Boundary,
@@ -88,10 +88,10 @@ def planned(
         output that may not be written.
     """
     format_of(output.mesh)
-    output = replace(output, mesh=checked_output(output.mesh, tuple(FORMATS), output.force))
+    checked_output(output.mesh, tuple(FORMATS), output.force)
     check_solver_options(output.mesh, solver)
     if output.json_path is not None:
-        output = replace(output, json_path=checked_output(output.json_path, (".json",), output.force))
+        checked_output(output.json_path, (".json",), output.force)
     mode = _mode(source, sizes, start, engine)
     if start.start is not None:
         check_no_input(output.mesh, start.start)
@@ -176,7 +176,7 @@ def _pictures(source: SourceOptions, output: OutputOptions) -> list[Path]:
     names = ["slice.png", "rho.png", "energies.png"]
     names += [] if source.mask is None and source.background is None else ["boundary.png"]
     names += [] if source.labels is None else ["labels.png"]
-    return [checked_output(output.figures / name, (".png",), output.force) for name in names]
+    return list(checked_outputs(output.figures, names, output.force).values())
 
 
 def with_numbers(plan: Plan, content: Content) -> tuple[Plan, tetopt.Sizes | None]:

@@ -7,7 +7,7 @@ from pathlib import Path
 from tetopt.energy.sampling import cell_moments
 from tetopt.errors import InputError
 from tetopt.image import Image
-from tetopt.io.files import checked_output, save_json
+from tetopt.io.files import save_json
 from tetopt.measure.segmentation import thresholded
 from tetopt.mesh import Mesh
 from tetopt.report.figures import save_figure
@@ -38,16 +38,11 @@ COMPARE_PICTURES = {
     "against shape, the smallest and the 1st percentile of the dihedral angles, and the errors of the compression test",
     "timing.png": "Seconds by step",
 }
-
-
-def outputs(folder: Path, force: bool) -> dict[str, Path]:
-    """The files that `run` writes, by name, each checked; InputError as `checked_output`."""
-    names = ("report.json", "report.html", *COMPARE_PICTURES)
-    return {name: checked_output(folder / name, (Path(name).suffix,), force) for name in names}
+COMPARE_FILES = ("report.json", "report.html", *COMPARE_PICTURES)
 
 
 def run(paths: dict[str, Path], comparison: compare.Comparison, say: compare.Say, *, resume: bool = False) -> Report:
-    """Compare, write the files of `outputs`, return what `report.json` holds; arguments as `compare.run`.
+    """Compare, write the files `COMPARE_FILES`, return what `report.json` holds; arguments as `compare.run`.
 
     Raises
     ------

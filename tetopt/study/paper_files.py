@@ -14,7 +14,7 @@ from tetopt.errors import InputError
 from tetopt.geometry.simplex import rho
 from tetopt.geometry.topology import largest_component
 from tetopt.image import Image
-from tetopt.io.files import checked_output, save_json
+from tetopt.io.files import save_json
 from tetopt.measure.segmentation import dice, segmented, thresholded
 from tetopt.mesh import Mesh
 from tetopt.phantom import load_phantom
@@ -33,18 +33,13 @@ from tetopt.study.paper_figures import landscape_figure, relaxation_figure
 from tetopt.target.content import check_labels
 
 PAPER_PICTURES = ("fig1.png", "fig2.png", "fig2b.png", "fig3ab.png", "fig3cd.png", "fig3e.png", "fig3f.png")
+PAPER_FILES = ("paper.json", "paper.html", *PAPER_PICTURES)
 SNR_DB = (None, 30.0, 20.0)  # of the strain in Fig. 3(c, d); None: without noise
 CHANGE_WORDS = {  # of what is compared before and after, by its name in paper.json
     "lambda_max": "largest eigenvalue", "cond": "condition number", "cg_iterations": "CG iterations",
     "strain_energy": "strain energy",
 }  # fmt: skip
 ERROR_NAMES = ("(i) mean", "(ii) harmonic", "(iii) L2", "(iv) worst")
-
-
-def outputs(folder: Path, force: bool) -> dict[str, Path]:
-    """The files that `run` writes, by name, each checked; InputError as `checked_output`."""
-    names = ("paper.json", "paper.html", *PAPER_PICTURES)
-    return {name: checked_output(folder / name, (Path(name).suffix,), force) for name in names}
 
 
 def check_inputs(volume: Image, tissue: Image | None) -> None:
@@ -63,12 +58,12 @@ def run(
     seeds: int,
     say: Callable[[str], None],
 ) -> dict[str, Any]:
-    """Run every experiment, write the files of `outputs`, return what `paper.json` holds.
+    """Run every experiment, write the files `PAPER_FILES`, return what `paper.json` holds.
 
     Parameters
     ----------
     paths : dict
-        From `outputs`.
+        Where each of them goes, by its name.
     about : dict
         Names of the files read, for the record.
     volume : Image
@@ -95,13 +90,8 @@ def run(
     for title, step in steps:
         say(title)
         sections.append({"title": title, **step()})
-    results = {
-        **about,
-        "seeds": seeds,
-        "versions": versions(),
-        "seconds": time.perf_counter() - begin,
-        "sections": sections,
-    }
+    seconds = time.perf_counter() - begin
+    results = about | {"seeds": seeds, "versions": versions(), "seconds": seconds, "sections": sections}
     save_json(paths["paper.json"], results)
     _write_page(paths, results)
     return results
