@@ -17,11 +17,8 @@ than there are, only a wider envelope helps. How the choices were made, E_D as a
 from __future__ import annotations
 
 import importlib
-import os
-import sys
 import time
-from collections.abc import Callable, Iterator
-from contextlib import contextmanager
+from collections.abc import Callable
 from typing import NamedTuple
 
 import numpy as np
@@ -132,20 +129,20 @@ def _run(
     """One run, in the box frame: the cells inside the box and the nodes they use."""
     diagonal = float(np.linalg.norm(surfaces.high - surfaces.low))
     field = _sizing_field(surfaces, edge)
-    with _silent_stdout():
-        points, cells = tetrahedralize(
-            surfaces.points,
-            surfaces.triangles.astype(np.int32),
-            edge_length_abs=float(field[2].max()),
-            epsilon=envelope / diagonal,
-            stop_energy=STOP_ENERGY,
-            # Unfiltered: by winding numbers fTetWild would drop what nested or open interfaces enclose. What lies
-            # outside the box is dropped here.
-            disable_filtering=True,
-            bg_vertices=field[0],
-            bg_tets=field[1],
-            bg_values=field[2],
-        )
+    points, cells = tetrahedralize(
+        surfaces.points,
+        surfaces.triangles.astype(np.int32),
+        edge_length_abs=float(field[2].max()),
+        epsilon=envelope / diagonal,
+        stop_energy=STOP_ENERGY,
+        # Unfiltered: by winding numbers fTetWild would drop what nested or open interfaces enclose. What lies
+        # outside the box is dropped here.
+        disable_filtering=True,
+        quiet=True,
+        bg_vertices=field[0],
+        bg_tets=field[1],
+        bg_values=field[2],
+    )
     points, cells = inside_box(np.asarray(points, dtype=np.float64), cells, surfaces.low, surfaces.high)
     return points, oriented(points, cells)
 
@@ -304,17 +301,3 @@ def _relative_volumes(corners: NDArray[np.float64]) -> NDArray[np.float64]:
     volume = (np.cross(a, b) * c).sum(axis=1) / 6.0
     edges = np.stack([a, b, c, b - a, c - a, c - b])
     return volume / np.maximum((edges**2).sum(axis=2).max(axis=0), 1e-300) ** 1.5
-
-
-@contextmanager
-def _silent_stdout() -> Iterator[None]:
-    """fTetWild writes to the process's standard output, past `sys.stdout`: the descriptor itself is redirected."""
-    sys.stdout.flush()
-    saved = os.dup(1)
-    try:
-        with open(os.devnull, "wb") as nowhere:
-            os.dup2(nowhere.fileno(), 1)
-        yield
-    finally:
-        os.dup2(saved, 1)
-        os.close(saved)
