@@ -5,9 +5,8 @@ from __future__ import annotations
 import shlex
 import signal
 from dataclasses import dataclass
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, ClassVar
+from typing import Annotated, ClassVar, Literal
 
 import typer
 from rich.markup import escape
@@ -41,11 +40,6 @@ ClassesOption = Annotated[int, option("K", "Classes of the segmentation (multi-O
 
 DEFAULT_SETTINGS = Settings(nodes=DEFAULT_NODES[3])
 BYTES_PER_GB = 1e9  # as --max-gb counts them
-
-
-class Baseline(StrEnum):  # noqa: D101
-    pytetwild = "pytetwild"
-    cleaver = "cleaver"
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -124,7 +118,9 @@ def paper_command(
 def baseline_command(
     image_path: ImageArgument,
     output: Annotated[Path, option("MESH.vtu", "The mesh to write.", "-o", "--output")],
-    pipeline: Annotated[Baseline, typer.Option(help="The mesher of the conventional pipeline.")] = Baseline.pytetwild,
+    pipeline: Annotated[
+        Literal["pytetwild", "cleaver"], typer.Option(help="The mesher of the conventional pipeline.")
+    ] = "pytetwild",
     nodes: Annotated[int, option("N", "Wanted number of nodes.", min=20)] = DEFAULT_NODES[3],
     labels_path: Annotated[
         Path | None, option("LABELS", "Label image instead of a segmentation of IMAGE.", "--labels")
@@ -138,9 +134,9 @@ def baseline_command(
     output = checked_output(output, (".vtu",), numbers.force)
     json_path = numbers.checked()
     image, labels = _image_and_labels(image_path, labels_path, part)
-    made = PIPELINES[pipeline.value].function(Job(image, labels, nodes, classes))
+    made = PIPELINES[pipeline].function(Job(image, labels, nodes, classes))
     shape = quality(made.mesh.points, made.mesh.cells)
-    options = {"pipeline": pipeline.value, "nodes": nodes, "classes": classes}
+    options = {"pipeline": pipeline, "nodes": nodes, "classes": classes}
     about = {"image": image_path.name, "image_sha256": sha256(image_path), "options": options}
     save_mesh(output, made.mesh, cell_fields(made.mesh, image), {"tetopt": tetopt.__version__, **about})
     if json_path is not None:

@@ -10,10 +10,9 @@ import inspect
 from collections.abc import Callable, Iterator
 from copy import copy
 from dataclasses import MISSING, dataclass, fields, is_dataclass
-from enum import StrEnum
 from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, cast, get_args, get_type_hints
+from typing import Annotated, Any, ClassVar, Literal, cast, get_args, get_type_hints
 
 import typer
 from typer.models import OptionInfo
@@ -26,40 +25,21 @@ from tetopt.engine.loop import (
     START_K_D,
     UNIFORM_ITERATIONS,
     UNIFORM_K_D,
+    Boundary,
 )
+from tetopt.engine.paper import Retessellate
 from tetopt.io.files import checked_output
 from tetopt.io.formats import FORMATS
 from tetopt.model.materials import DEFAULT_NU
 
+Lattice = Literal["bcc", "five-tet", "criss-cross", "octree"]
+Method = Literal["fast", "paper"]
 DEFAULT_NODES = {2: 500, 3: 5000}  # by dimension; on small images a graded mesh has fewer
 
 
 def option(metavar: str, text: str, *names: str, **more: Any) -> Any:
     """`typer.Option` in one line: what its value is called, and what the help says of it."""
     return typer.Option(*names, metavar=metavar, help=text, **more)
-
-
-class Lattice(StrEnum):  # noqa: D101
-    bcc = "bcc"
-    five_tet = "five-tet"
-    criss_cross = "criss-cross"
-    octree = "octree"
-
-
-class Boundary(StrEnum):  # noqa: D101
-    slide = "slide"
-    fixed = "fixed"
-
-
-class Retessellate(StrEnum):  # noqa: D101
-    first = "first"
-    accept = "accept"
-    never = "never"
-
-
-class Method(StrEnum):  # noqa: D101
-    fast = "fast"
-    paper = "paper"
 
 
 ImageArgument = Annotated[
@@ -206,7 +186,7 @@ class EngineOptions:
     ] = None
     method: Annotated[
         Method, typer.Option(help="fast: gradients, flips, a floor on angles; paper: the scheme of the paper.")
-    ] = Method.fast
+    ] = "fast"
     shape_power: Annotated[
         float | None,
         option("P", f"Fast method: 1 is the paper's E_G; up to 10 punish flat cells more (default {SHAPE_POWER:g})."),

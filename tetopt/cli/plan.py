@@ -13,12 +13,9 @@ from tetopt import InputError
 from tetopt.cli.inputs import check_no_input, checked_outputs, read_companion
 from tetopt.cli.options import (
     DEFAULT_NODES,
-    Boundary,
     EngineOptions,
-    Lattice,
     Method,
     OutputOptions,
-    Retessellate,
     SizeOptions,
     SolverOptions,
     SourceOptions,
@@ -52,8 +49,8 @@ class Plan(NamedTuple):
         if self.mode == "start":
             return "start"
         if self.mode == "graded":
-            return Lattice.octree.value
-        return KINDS[ndim][0] if self.start.lattice is None else self.start.lattice.value
+            return "octree"
+        return self.start.lattice or KINDS[ndim][0]
 
     def engine_options(self) -> dict[str, Any]:
         """Options of `mesh_image` besides those of the mesh to begin with, in the order of run.json."""
@@ -115,8 +112,8 @@ def _mode(source: SourceOptions, sizes: SizeOptions, start: StartOptions, engine
     numbers = {"--nodes": sizes.nodes, "--spacing": start.spacing, "--target-error": sizes.target_error}
     if len(names := [name for name, value in numbers.items() if value is not None]) > 1:
         raise InputError(f"{' and '.join(names)}: give one of them")
-    is_paper = engine.method is Method.paper
-    if start.lattice is Lattice.octree:
+    is_paper = engine.method == "paper"
+    if start.lattice == "octree":
         if start.uniform:
             raise InputError("--uniform and --lattice octree: give one of them")
         if is_paper:
@@ -135,7 +132,7 @@ def _mode(source: SourceOptions, sizes: SizeOptions, start: StartOptions, engine
         return "start"
     if is_paper:
         return "paper"
-    is_lattice = start.uniform or start.spacing is not None or start.lattice not in (None, Lattice.octree)
+    is_lattice = start.uniform or start.spacing is not None or start.lattice not in (None, "octree")
     return "uniform" if is_lattice else "graded"
 
 
@@ -148,13 +145,13 @@ def _completed(engine: EngineOptions, mode: Mode) -> EngineOptions:
         raise InputError(f"--k-d: expected 0 <= k_D < 1, got {k_D}")
     if engine.max_seconds is not None and not engine.max_seconds > 0.0:
         raise InputError(f"--max-seconds: expected more than 0, got {engine.max_seconds}")
-    boundary = engine.boundary or (Boundary.fixed if mode == "start" else Boundary.slide)
+    boundary = engine.boundary or ("fixed" if mode == "start" else "slide")
     engine = replace(engine, k_D=k_D, iterations=iterations, boundary=boundary)
-    _check_method(engine, Method.paper, ("n_t", "retessellate"))
-    _check_method(engine, Method.fast, ("shape_power", "min_dihedral"))
+    _check_method(engine, "paper", ("n_t", "retessellate"))
+    _check_method(engine, "fast", ("shape_power", "min_dihedral"))
     if mode == "paper":
         n_t = default_n_t(k_D, iterations) if engine.n_t is None else engine.n_t
-        return replace(engine, n_t=n_t, retessellate=engine.retessellate or Retessellate.first)
+        return replace(engine, n_t=n_t, retessellate=engine.retessellate or "first")
     shape_power = SHAPE_POWER if engine.shape_power is None else engine.shape_power
     min_dihedral = MIN_DIHEDRAL if engine.min_dihedral is None else engine.min_dihedral
     check_options(k_D, iterations, shape_power, min_dihedral, boundary)
@@ -164,9 +161,9 @@ def _completed(engine: EngineOptions, mode: Mode) -> EngineOptions:
 def _check_method(engine: EngineOptions, method: Method, names: tuple[str, ...]) -> None:
     """InputError for an option of the other method."""
     wrong = [name for name in names if getattr(engine, name) is not None]
-    if wrong and engine.method is not method:
+    if wrong and engine.method != method:
         option = wrong[0].replace("_", "-")
-        raise InputError(f"--{option}: only with --method {method.value}, got --method {engine.method.value}")
+        raise InputError(f"--{option}: only with --method {method}, got --method {engine.method}")
 
 
 def _pictures(source: SourceOptions, output: OutputOptions) -> list[Path]:

@@ -117,7 +117,7 @@ def warn_of_result(result: Optimized, method: Method, nodes: int | None, n_empty
     if nodes is not None and abs(n_nodes - nodes) > NODES_MISSED * nodes:
         show_warning(f"{n_nodes} nodes instead of {nodes}: more iterations, or a --k-d above 0, come nearer")
     lowest, last = min(row.E for row in result.history), result.history[-1].E
-    if last > lowest * (1.0 + ENERGY_RISE) and method is Method.paper:
+    if last > lowest * (1.0 + ENERGY_RISE) and method == "paper":
         show_warning(
             f"E ended at {last:.4f}, above {lowest:.4f} on the way: a tessellation taken in the first n_t iterations "
             "raised it; --retessellate accept takes only those that lower it"
