@@ -45,7 +45,7 @@ def parse_formula(text: str) -> Callable[[NDArray[np.float64]], NDArray[np.float
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # of "1if h" Python only warns
             tree = ast.parse(text.strip(), mode="eval").body
-        _check(tree, text, 0)
+        value = _compiled(tree, text, 0)
     except (SyntaxError, SyntaxWarning, ValueError, OverflowError, RecursionError, MemoryError) as error:
         if isinstance(error, InputError):
             raise
@@ -53,7 +53,7 @@ def parse_formula(text: str) -> Callable[[NDArray[np.float64]], NDArray[np.float
 
     def law(h: NDArray[np.float64]) -> NDArray[np.float64]:
         with np.errstate(all="ignore"):  # what has no value is refused where the modulus is used
-            return np.array(np.broadcast_to(_value(tree, h), h.shape), dtype=np.float64)
+            return np.array(np.broadcast_to(value(h), h.shape), dtype=np.float64)
 
     return law
 
@@ -64,42 +64,29 @@ def _shown(text: str) -> str:
     return line if len(line) <= 60 else f"{line[:57]}..."
 
 
-def _check(node: ast.expr, text: str, depth: int) -> None:
-    """InputError unless the tree is made of what is allowed, and no deeper than `MOST_NESTED_OPERATIONS`."""
+def _compiled(node: ast.expr, text: str, depth: int) -> Callable[[NDArray[np.float64]], Any]:
+    """The function of h that a tree stands for.
+
+    InputError unless the tree is made of what is allowed, and no deeper than `MOST_NESTED_OPERATIONS`.
+    """
     if depth > MOST_NESTED_OPERATIONS:
         raise InputError(f'formula: more than {MOST_NESTED_OPERATIONS} operations deep: "{_shown(text)}"')
     match node:
         case ast.Constant(value=float() | int() as value) if not isinstance(value, bool):
-            float(value)  # OverflowError for a whole number beyond 1e308
+            number = np.float64(value)  # OverflowError for a whole number beyond 1e308
+            return lambda h: number
         case ast.Name(id="h"):
-            return
+            return lambda h: h
         case ast.BinOp(left=left, op=op, right=right) if type(op) in BINARY_OPERATORS:
-            _check(left, text, depth + 1)
-            _check(right, text, depth + 1)
+            function, operands = BINARY_OPERATORS[type(op)], [left, right]
         case ast.UnaryOp(op=op, operand=operand) if type(op) in UNARY_OPERATORS:
-            _check(operand, text, depth + 1)
-        case ast.Call(func=ast.Name(id=name), args=args, keywords=[]) if name in FORMULA_FUNCTIONS:
-            if len(args) != FORMULA_FUNCTIONS[name][1]:
-                raise InputError(
-                    f'formula: {name} takes {FORMULA_FUNCTIONS[name][1]} arguments, got {len(args)} in "{_shown(text)}"'
-                )
-            for arg in args:
-                _check(arg, text, depth + 1)
+            function, operands = UNARY_OPERATORS[type(op)], [operand]
+        case ast.Call(func=ast.Name(id=name), args=operands, keywords=[]) if name in FORMULA_FUNCTIONS:
+            function, count = FORMULA_FUNCTIONS[name]
+            if len(operands) != count:
+                raise InputError(f'formula: {name} takes {count} arguments, got {len(operands)} in "{_shown(text)}"')
         case _:
             part = ast.get_source_segment(text.strip(), node) or text
             raise InputError(f'formula: expected {FORMULA_PARTS}; cannot use "{_shown(part)}"')
-
-
-def _value(node: ast.expr, h: NDArray[np.float64]) -> Any:
-    match node:
-        case ast.Constant(value=float() | int() as value):
-            return np.float64(value)
-        case ast.Name():
-            return h
-        case ast.BinOp(left=left, op=op, right=right):
-            return BINARY_OPERATORS[type(op)](_value(left, h), _value(right, h))
-        case ast.UnaryOp(op=op, operand=operand):
-            return UNARY_OPERATORS[type(op)](_value(operand, h))
-        case ast.Call(func=ast.Name(id=name), args=args):
-            return FORMULA_FUNCTIONS[name][0](*(_value(arg, h) for arg in args))
-    raise AssertionError("checked by parse_formula")
+    values = [_compiled(operand, text, depth + 1) for operand in operands]
+    return lambda h: function(*(value(h) for value in values))
