@@ -65,10 +65,9 @@ def _cell_means(field: Image, mesh: Mesh) -> NDArray[np.float64]:
     inside = owner >= 0
     n_voxels = np.bincount(owner[inside], minlength=len(mesh.cells))
     total = np.bincount(owner[inside], weights=field.data.ravel()[inside], minlength=len(mesh.cells))
-    is_empty = n_voxels == 0
-    means = total / np.maximum(n_voxels, 1)
-    # So that a cell of equal values has exactly that value: constants stay one material.
+    # Within their range, so that a cell of equal values has exactly that value: constants stay one material.
     low, high = ranges_of(owner, field.data.ravel(), len(mesh.cells))
-    means = np.clip(means, low, high, where=~is_empty, out=means)
+    means = np.clip(total / np.maximum(n_voxels, 1), low, high)
+    is_empty = n_voxels == 0
     means[is_empty] = nearest_values(field, mesh.points[mesh.cells[is_empty]].mean(axis=1))
     return means

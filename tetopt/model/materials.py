@@ -122,11 +122,7 @@ def binned(exact: Materials, volumes: NDArray[np.float64], count: int, spacing: 
         raise InputError(f"bins: expected {', '.join(SPACINGS)}, got {spacing}")
     young, nu = exact.young[exact.of_cell], exact.nu[exact.of_cell]
     fewer = _bin_means(young, volumes, count, spacing)
-    ratios = (
-        nu
-        if len(np.unique(nu)) <= count
-        else _bin_means(nu, volumes, count, "quantile" if spacing == "quantile" else "equal")
-    )
+    ratios = _bin_means(nu, volumes, count, "quantile" if spacing == "quantile" else "equal")
     off = np.abs(fewer - young) / young
     error = BinningError(float((off * volumes).sum() / volumes.sum()), float(off.max()))
     return materials(fewer, ratios, len(young))._replace(binning=error)
