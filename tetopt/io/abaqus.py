@@ -127,8 +127,7 @@ def _numbered(array: NDArray) -> str:
 
 
 def _faces(members: NDArray[np.int64]) -> str:
-    numbers, faces = members[:, 0] + 1, FACE_NUMBERS[members[:, 1]]
-    return "".join(f"{cell}, S{face}\n" for cell, face in zip(numbers, faces, strict=True))
+    return rows(members[:, 0] + 1, FACE_NUMBERS[members[:, 1]], separator=", S")
 
 
 def _fitting(values: NDArray[np.float64]) -> NDArray[np.float64]:
