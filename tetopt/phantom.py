@@ -120,9 +120,7 @@ def signed_distance(shape: Shape, points: ArrayLike) -> NDArray[np.float64]:
         square = sum((x / radius) ** 2 for x, radius in zip(local, shape.half, strict=True))
         return (np.sqrt(square) - 1.0) * shape.half.min()
     excess = [np.abs(x) - half for x, half in zip(local, shape.half, strict=True)]
-    deepest = excess[0]
-    for q in excess[1:]:
-        deepest = np.maximum(deepest, q)
+    deepest = np.max(excess, axis=0)
     outside = np.sqrt(sum(np.maximum(q, 0.0) ** 2 for q in excess))
     return outside + np.minimum(deepest, 0.0)
 
