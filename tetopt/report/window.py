@@ -133,16 +133,14 @@ class _Scene:
         is_within = self.is_within()
         origin = np.where(np.arange(3) == self.axis, self.at, 0.0)
         normal = np.eye(3)[self.axis] * (-1.0 if self.is_turned else 1.0)
-        surface, of_cell = self._surface(is_within)
-        surface.cell_data["cell"] = of_cell
-        clipped = surface.clip(normal=normal, origin=origin, invert=True) if surface.n_cells else surface
-        self._add_cells("surface", clipped, lighting=True)
+
+        def before_plane(data: pyvista.PolyData) -> pyvista.DataSet:
+            return data.clip(normal=normal, origin=origin, invert=True) if data.n_cells else data
+
+        self._add_cells("surface", before_plane(self._surface(is_within)), lighting=True)
         self._add_section(is_within)
         self._add_slice()
-        marked = self._marked()
-        if marked.n_cells:
-            marked = marked.clip(normal=normal, origin=origin, invert=True)
-        self._add("set", marked, color="#ff00c0", show_edges=True, ambient=0.3)
+        self._add("set", before_plane(self._marked()), color="#ff00c0", show_edges=True, ambient=0.3)
         count, volume = int(np.count_nonzero(is_within)), float(self.volumes[is_within].sum())
         text = f"{count:,} of {len(self.mesh.cells):,} cells, {volume:,.7g} mm³; world RAS, mm"
         self.window.add_text(text, name="count", font_size=10, color="black", position="upper_left", render=False)
@@ -157,13 +155,14 @@ class _Scene:
             return np.full(len(self.mesh.cells), True)
         return (self.field.values >= self.limits[0] - slack) & (self.field.values <= self.limits[1] + slack)
 
-    def _surface(self, is_within: NDArray[np.bool_]) -> tuple[pyvista.PolyData, NDArray[np.int64]]:
-        """The facets that exactly one shown cell has, and that cell."""
+    def _surface(self, is_within: NDArray[np.bool_]) -> pyvista.PolyData:
+        """The facets that exactly one shown cell has, with that cell as cell data."""
         first, second = self.sides.cells.T
         is_first, is_second = is_within[first], (second >= 0) & is_within[second]
         is_outer = is_first != is_second
-        of_cell = np.where(is_first, first, second)[is_outer]
-        return pyvista.PolyData.from_regular_faces(self.mesh.points, self.sides.nodes[is_outer]), of_cell
+        surface = pyvista.PolyData.from_regular_faces(self.mesh.points, self.sides.nodes[is_outer])
+        surface.cell_data["cell"] = np.where(is_first, first, second)[is_outer]
+        return surface
 
     def _add_section(self, is_within: NDArray[np.bool_]) -> None:
         """Draw the polygons in which the plane cuts the shown cells; over the image like glass, with lines on top."""
