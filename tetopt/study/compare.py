@@ -28,6 +28,7 @@ from tetopt.fem.reference import Reference, averaged, compare, nearest, referenc
 from tetopt.geometry.simplex import dihedral_angles
 from tetopt.image import Image
 from tetopt.io.files import save_json
+from tetopt.io.images import sha256
 from tetopt.io.meshes import load_mesh, save_mesh
 from tetopt.measure.fidelity import cell_labels, label_fidelity
 from tetopt.measure.quality import quality, rho_histogram
@@ -318,14 +319,10 @@ def _kept(path: Path, key: str) -> Attempt | None:
     """A finished run's numbers, if they are whole, of the same key and of the mesh that lies beside them."""
     try:
         attempt: Attempt = from_json(Attempt, json.loads(path.read_text(encoding="utf-8")))
-        mesh_hash = _sha256(path.with_suffix(".vtu"))
+        mesh_hash = sha256(path.with_suffix(".vtu"))
     except (OSError, ValueError, LookupError, TypeError, AttributeError):
         return None
     return attempt if (attempt.key, attempt.mesh_file_sha256) == (key, mesh_hash) else None
-
-
-def _sha256(path: Path) -> str:
-    return hashlib.sha256(path.read_bytes()).hexdigest()
 
 
 def _attempt(bench: Bench, name: str, nodes: int, repeat: int) -> Attempt:
@@ -352,7 +349,7 @@ def _attempt(bench: Bench, name: str, nodes: int, repeat: int) -> Attempt:
     save_mesh(mesh_path, outcome.mesh, cell_fields(outcome.mesh, comparison.image))
     total = sum(seconds for step, seconds in outcome.seconds.items() if step not in UNTIMED_STEPS)
     done = Run(outcome.seconds, total, outcome.peak_bytes, measurement)
-    save_json(path, as_json(attempt._replace(run=done, mesh_file_sha256=_sha256(mesh_path))))
+    save_json(path, as_json(attempt._replace(run=done, mesh_file_sha256=sha256(mesh_path))))
     share = "none" if measurement.E_D_share is None else f"{measurement.E_D_share:.4f}"
     bench.say(f"{title}: {measurement.n_nodes} nodes, E_D share {share}, {total:.0f} s")
     # Read back, so that a kept run and a new one are the same: what is not finite is None in both.
