@@ -92,12 +92,11 @@ def planned(
     mode = _mode(source, sizes, start, engine)
     if start.start is not None:
         check_no_input(output.mesh, start.start)
-    limits: dict[str, Any] = {"size-min": sizes.size_min, "size-max": sizes.size_max, "gradation": sizes.gradation}
-    limits |= {"sizing": sizes.sizing, "target-error": sizes.target_error}
-    for name, value in limits.items():
-        if value is not None and mode != "graded":
+    for name in ("size_min", "size_max", "gradation", "sizing", "target_error"):
+        if mode != "graded" and getattr(sizes, name) is not None:
             raise InputError(
-                f"--{name}: only on a graded mesh; leave out --uniform, --spacing, --lattice, --method, --start"
+                f"--{name.replace('_', '-')}: only on a graded mesh; leave out --uniform, --spacing, --lattice, "
+                "--method, --start"
             )
     engine = _completed(engine, mode)
     pictures = _pictures(source, output)
