@@ -83,9 +83,9 @@ def views_html(views: Sequence[View]) -> str:
     if not views:
         return ""
     figures = [
-        f'<figure><canvas tabindex="0" role="img" aria-label="{html.escape(_label(view))}"></canvas>'
-        f"<figcaption>{html.escape(view.title)}</figcaption></figure>"
-        for view in views
+        f'<figure><canvas tabindex="0" role="img" aria-label="3-D view of {title}, opened; drag or press the arrow '
+        f'keys to turn it, plus and minus to zoom"></canvas><figcaption>{title}</figcaption></figure>'
+        for title in (html.escape(view.title) for view in views)
     ]
     return "\n".join(
         [
@@ -96,10 +96,6 @@ def views_html(views: Sequence[View]) -> str:
             script_html("webgl.js", "viewer.js"),
         ]
     )  # fmt: skip
-
-
-def _label(view: View) -> str:
-    return f"3-D view of {view.title}, opened; drag or press the arrow keys to turn it, plus and minus to zoom"
 
 
 def _views_data(views: Sequence[View]) -> list[dict[str, Any]]:
