@@ -15,7 +15,7 @@ from tetopt.report.figures import save_figure
 from tetopt.report.viewer import view_of
 from tetopt.study.compare import elementwise
 from tetopt.study.compare_figures import curves_figure, histograms_figure, slices_figure, timing_figure
-from tetopt.study.compare_page import Criterion, Entry, criteria, entry, number_text, save_compare_page, winners
+from tetopt.study.compare_page import Entry, criteria, entry, number_text, save_compare_page, winners
 from tetopt.study.compare_report import (
     Curve,
     CurvePoint,
@@ -371,10 +371,6 @@ def test_number_text(value, text):
 # Winners
 
 
-def entries(*values):
-    return [Entry(value, value, value) for value in values]
-
-
 @pytest.mark.parametrize(
     ("better", "values", "expected"),
     [
@@ -391,7 +387,7 @@ def entries(*values):
     ],
 )
 def test_winners(better, values, expected):
-    assert winners(Criterion("", "", lambda run: None, better), entries(*values)) == expected
+    assert winners(better, values) == expected
 
 
 def with_values(**shares):

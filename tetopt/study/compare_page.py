@@ -180,12 +180,12 @@ def entry(criterion: Criterion, pipeline: PipelineResult) -> Entry:
     return Entry(float(np.median(values)), min(values), max(values)) if values else Entry(None, None, None)
 
 
-def winners(criterion: Criterion, entries: Sequence[Entry]) -> list[int]:
-    """Places of the best medians, equal ones as printed included; none if fewer than two differ."""
-    known = [(number, each.value) for number, each in enumerate(entries) if each.value is not None]
-    if criterion.better == 0 or len({number_text(value) for _, value in known}) < 2:
+def winners(better: int, values: Sequence[float | None]) -> list[int]:
+    """Places of the best values, equal ones as printed included; none if fewer than two differ."""
+    known = [(number, value) for number, value in enumerate(values) if value is not None]
+    if better == 0 or len({number_text(value) for _, value in known}) < 2:
         return []
-    best = max(known, key=lambda pair: criterion.better * pair[1])[1]
+    best = max(known, key=lambda pair: better * pair[1])[1]
     return [number for number, value in known if number_text(value) == number_text(best)]
 
 
@@ -264,7 +264,7 @@ def _head_cell(pipeline: PipelineResult) -> str:
 
 
 def _row_html(criterion: Criterion, pipelines: Sequence[PipelineResult], entries: Sequence[Entry]) -> str:
-    best = winners(criterion, entries)
+    best = winners(criterion.better, [each.value for each in entries])
     cells = []
     is_lost = False
     for number, (pipeline, each) in enumerate(zip(pipelines, entries, strict=True)):
@@ -326,7 +326,7 @@ def _verdict(report: Report, number: int) -> list[str]:
     n_judged = n_lost_to_peers = 0
     for criterion in criteria(report):
         entries = [entry(criterion, pipeline) for pipeline in pipelines]
-        best = winners(criterion, entries)
+        best = winners(criterion.better, [each.value for each in entries])
         if not best:
             continue
         n_judged += 1
@@ -337,11 +337,8 @@ def _verdict(report: Report, number: int) -> list[str]:
             won.append(name)
             continue
         lost.setdefault(" and ".join(pipelines[k].title for k in best), []).append(name)
-        rest = [
-            each if pipeline.kind != "control" else Entry(None, None, None)
-            for pipeline, each in zip(pipelines, entries, strict=True)
-        ]
-        best_of_peers = winners(criterion, rest)
+        rest = [None if pipelines[k].kind == "control" else each.value for k, each in enumerate(entries)]
+        best_of_peers = winners(criterion.better, rest)
         n_lost_to_peers += bool(best_of_peers) and number not in best_of_peers
     if not n_judged:
         return [f"<p>Nothing to compare {title} with.</p>"]
@@ -481,9 +478,8 @@ def _label_table_html(
     """A row for each of `labels`, a column for each pipeline; the best Dice of a row is marked."""
     lines = _table_head("headline labels", "label", done)
     lines[-1] += "<tbody>"
-    by_dice = Criterion("", "", lambda run: None, 1)
     for label in labels:
-        best = winners(by_dice, [Entry(each.dice, None, None) for each in medians[label]])
+        best = winners(1, [each.dice for each in medians[label]])
         cells = [
             f'<td class="{html.escape(pipeline.kind)}{" best" if number in best else ""}">{_label_cell(each)}</td>'
             for number, (pipeline, each) in enumerate(zip(done, medians[label], strict=True))
