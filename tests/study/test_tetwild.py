@@ -53,7 +53,7 @@ def assert_fills(image, mesh):
 def test_fills_the_box_with_the_wanted_nodes(image, capfd):
     produced = PIPELINES["pytetwild"].function(Job(image, None, 300, classes=2))
     assert_fills(image, produced.mesh)
-    assert abs(len(produced.mesh.points) / 300 - 1.0) <= 0.05
+    assert abs(len(produced.mesh.points) - 300) <= 15  # 5 %
     assert list(produced.seconds) == ["surfaces", "tetrahedra", "search"]
     assert capfd.readouterr().out == ""
 

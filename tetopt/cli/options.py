@@ -31,8 +31,9 @@ from tetopt.engine.paper import Retessellate
 from tetopt.io.files import checked_output
 from tetopt.io.formats import FORMATS
 from tetopt.model.materials import DEFAULT_NU
+from tetopt.start.lattice import Kind
 
-Lattice = Literal["bcc", "five-tet", "criss-cross", "octree"]
+Lattice = Literal[Kind, "octree"]
 Method = Literal["fast", "paper"]
 DEFAULT_NODES = {2: 500, 3: 5000}  # by dimension; on small images a graded mesh has fewer
 

@@ -136,8 +136,7 @@ def _evaluate(gain: NDArray, move: NDArray, is_dirty: NDArray, state: State) -> 
         kernel(gain, move, is_dirty, *state)
 
 
-# Both loops are in the parallel function itself: each level of calls is optimised again, 3 s of compiling. Here and in
-# the functions below parts of a state are not named for short: arrays that are named are counted, 18 % of a pass.
+# Both loops are in the parallel function itself: each level of calls is optimised again, 3 s of compiling.
 @njit(cache=True, parallel=True, error_model="numpy")
 def _evaluate_cells(
     gain: NDArray, move: NDArray, is_dirty: NDArray, complex_: Complex, objective: Objective, sides: Sides
@@ -285,7 +284,7 @@ def ring_of_edge(
         current, back, front = after, front, _fourth_node(cells, after, a, b, front)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")
 def _fourth_node(cells: NDArray, cell: int, a: int, b: int, c: int) -> int:
     """The corner of a tetrahedron that is none of a, b and c."""
     fourth = 0
@@ -423,7 +422,7 @@ def _pair_shape(y: NDArray, i: int, k: int, j: int, limit: float, objective: Obj
     return energy if energy < limit else np.inf
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")
 def _edge_squares(u: tuple, v: tuple, w: tuple) -> float:
     """Sum of the six squared edges of the tetrahedron of the origin and three vectors."""
     base = u[0] * u[0] + u[1] * u[1] + u[2] * u[2] + v[0] * v[0] + v[1] * v[1] + v[2] * v[2]

@@ -14,6 +14,7 @@ from __future__ import annotations
 
 from itertools import product
 from operator import index
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +24,8 @@ from tetopt.geometry.simplex import oriented
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 
-KINDS = {2: ("criss-cross",), 3: ("bcc", "five-tet")}
+Kind = Literal["bcc", "five-tet", "criss-cross"]
+KINDS: dict[int, tuple[Kind, ...]] = {2: ("criss-cross",), 3: ("bcc", "five-tet")}  # by dimension; the default first
 MAX_NODES = 50_000_000  # six times as many cells, whose node numbers alone take 10 GB
 
 
