@@ -116,15 +116,23 @@ def test_mesh_in_3d(run):
     assert numbers["energies"]["E_D_relative"] < 0.5  # the sphere is found
 
 
+SIZES = ("size_min", "size_max", "gradation", "sizing")
+OPTIONS_OF_A_RUN = {
+    *("nodes", "target_error", "spacing", "lattice", *SIZES, "start"),
+    *("volume", "crop", "slice", "method", "max_seconds", "k_D", "iterations", "boundary", "n_t", "retessellate"),
+}
+
+
 def test_json_of_a_run(run, inputs):
     _, numbers, file, _ = run
     assert numbers["image"] == "sphere.nii.gz"
     assert numbers["image_sha256"] == hashlib.sha256((inputs / "sphere.nii.gz").read_bytes()).hexdigest()
     options = numbers["options"]
+    assert set(options) == OPTIONS_OF_A_RUN
     assert (options["method"], options["n_t"], options["retessellate"]) == ("paper", 1, "first")
     assert (options["nodes"], options["lattice"], options["boundary"]) == (150, "bcc", "slide")
     assert (options["k_D"], options["iterations"]) == (0.3, 3)
-    for name in ("spacing", "volume", "crop", "slice", "start", "max_seconds", "target_error", "size_min", "sizing"):
+    for name in ("spacing", "volume", "crop", "slice", "start", "max_seconds", "target_error", *SIZES):
         assert options[name] is None
     assert numbers["versions"]["tetopt"] == tetopt.__version__
     assert numbers["versions"]["numba"] == numba.__version__

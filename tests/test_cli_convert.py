@@ -428,6 +428,14 @@ def test_a_page_to_look_at(folder, tmp_path, capsys):
     assert exit_code("view", folder / "a.vtu", "--html", tmp_path / "a.png") == 2
 
 
+def test_what_is_refused_leaves_no_page(folder, tmp_path, capsys):
+    tetopt.save_image(tmp_path / "flat.nii.gz", tetopt.Image(np.zeros((4, 5))))
+    options = ["--image", tmp_path / "flat.nii.gz", "--html", tmp_path / "a.html"]
+    assert exit_code("view", folder / "a.vtu", *options) == 2
+    assert "-D" in capsys.readouterr().err
+    assert not (tmp_path / "a.html").exists()
+
+
 def test_no_window_without_a_display(folder, monkeypatch, capsys):
     monkeypatch.setattr("tetopt.report.window.has_display", lambda: False)
     assert exit_code("view", folder / "a.vtu") == 2

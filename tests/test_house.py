@@ -18,7 +18,7 @@ WIDE = {
     "tetopt.energy.sampling.segment_flux": 9,
     "tetopt.energy.sampling.triangle_flux": 10,
     "tetopt.engine.fast.optimize": 13,
-    "tetopt.engine.meshing.mesh_image": 11,
+    "tetopt.engine.meshing.mesh_image": 12,
     "tetopt.engine.paper.optimize_paper": 12,
     "tetopt.model.build.model_of": 13,
 }
@@ -60,14 +60,18 @@ def is_numeric(value):
         return is_numeric(value.operand)
     if isinstance(value, ast.BinOp):
         return is_numeric(value.left) and is_numeric(value.right)
+    if isinstance(value, ast.Call):
+        return bool(value.args) and all(is_numeric(argument) for argument in value.args)
     if isinstance(value, ast.Tuple | ast.List):
         return all(is_numeric(item) for item in value.elts)
     return isinstance(value, ast.Dict) and all(is_numeric(item) for item in (*value.keys, *value.values))
 
 
 def comment_lines(path):
+    """Lines with a comment of words, and those of them that hold nothing else."""
     tokens = tokenize.generate_tokens(io.StringIO(text_of(path)).readline)
-    return {token.start[0] for token in tokens if token.type == tokenize.COMMENT}
+    comments = [t for t in tokens if t.type == tokenize.COMMENT and not re.match(r"# *(noqa|type:|fmt:)", t.string)]
+    return {t.start[0] for t in comments}, {t.start[0] for t in comments if t.line.lstrip().startswith("#")}
 
 
 def functions():
@@ -79,12 +83,13 @@ def functions():
             if token.type not in quiet:
                 lines.update(range(token.start[0], token.end[0] + 1))
         for node in ast.walk(tree_of(path)):
-            if isinstance(node, ast.FunctionDef):
+            if isinstance(node, ast.FunctionDef | ast.AsyncFunctionDef):
                 own = {line for line in lines if node.lineno <= line <= node.end_lineno}
                 first = node.body[0]
                 if ast.get_docstring(node) is not None:
                     own -= set(range(first.lineno, first.end_lineno + 1))
                 count = len(node.args.posonlyargs) + len(node.args.args) + len(node.args.kwonlyargs)
+                count += (node.args.vararg is not None) + (node.args.kwarg is not None)
                 yield f"{module_name(path)}.{node.name}", count, len(own)
 
 
@@ -103,9 +108,10 @@ def test_a_number_has_two_words_and_its_reason():
         if is_numeric(value):
             if "_" not in name.strip("_"):
                 one_word.append(f"{module_name(path)}.{name}")
-            lines = comment_lines(path)
-            last = value.end_lineno
-            if not lines & set(range(line - 1, last + 1)):
+            beside, alone = comment_lines(path)
+            is_grouped = re.match(r"_?[A-Z]", text_of(path).splitlines()[line - 2]) is not None  # under one comment
+            above = line - 2 if is_grouped else line - 1
+            if not beside & set(range(line, value.end_lineno + 1)) and above not in alone:
                 bare.append(f"{module_name(path)}.{name}")
     assert one_word == []
     assert bare == []
@@ -170,7 +176,8 @@ def test_no_circle_of_imports():
         for node in ast.walk(tree_of(path)):
             if isinstance(node, ast.Import):
                 found.update(alias.name for alias in node.names)
-            elif isinstance(node, ast.ImportFrom) and node.level == 0 and node.module:
+            elif isinstance(node, ast.ImportFrom):
+                assert node.level == 0, f"{name}:{node.lineno}: imports by their whole names"
                 submodules = {f"{node.module}.{alias.name}" for alias in node.names}
                 found.update(submodules & set(modules) or {node.module})
         edges[name] = {target for target in found if target in modules and target != "tetopt"}

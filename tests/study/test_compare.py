@@ -76,6 +76,32 @@ def test_numbers_are_those_of_the_meshes(run, head):
         assert sum(row["E_D_share"] for row in median["labels"]) == pytest.approx(median["E_D_share"], rel=1e-9)
 
 
+def test_the_keys_of_the_report(run):
+    """What other programs read: a field that is renamed would rename its key."""
+    report = json.loads((run / "report.json").read_text())
+    assert set(report) == {
+        *("command", "curves", "image", "labels", "law", "machine", "options", "pipelines", "reference", "seconds"),
+        *("tradeoff", "versions"),
+    }
+    pipeline = report["pipelines"][0]
+    assert set(pipeline) == {"about", "failure", "high", "kind", "low", "median", "name", "notes", "runs", "title"}
+    median = pipeline["median"]
+    assert set(median) == {
+        *("E_D", "E_D_share", "dihedral_histogram", "fem", "labels", "n_cells", "n_empty_cells", "n_missed_voxels"),
+        *("n_nodes", "peak_bytes", "quality", "rho_histogram", "seconds", "seconds_total"),
+    }
+    assert set(median["labels"][0]) == {
+        *("E_D_share", "components", "dice", "is_lost", "label", "mesh_components", "mesh_volume_mm3", "mesh_voxels"),
+        *("surface_mean_mm", "surface_p95_mm", "volume_mm3", "voxels"),
+    }
+    assert set(median["fem"]["0.3"]) == {"cg_iterations", "cond", "errors", "lambda_max", "strain_energy"}
+    assert set(report["options"]) == {
+        *("classes", "curve", "iterations", "k_D", "max_bytes", "max_seconds", "nodes", "nus", "percent", "pipelines"),
+        *("reference_dofs", "repeats", "tradeoff"),
+    }
+    assert set(report["curves"][0]["points"][0]) == {"E_D_share", "errors", "n_nodes"}
+
+
 def test_runs_are_read_back_as_they_were_written(run):
     for path in (run / "runs").glob("*.json"):
         row = json.loads(path.read_text())

@@ -1,6 +1,7 @@
 """Vectors of three numbers as tuples, for kernels that would else spell out every coordinate; whole numbers stay so.
 
-They are put in the place of their calls before anything is compiled: left to the optimiser, flips took a tenth longer.
+They are put in the place of their calls before anything is compiled: left to the optimiser, looking for flips took a
+tenth longer (MNI152 T1, 5,000 nodes, one thread).
 """
 
 from __future__ import annotations
