@@ -312,7 +312,8 @@ def tet_energy(determinant: float, S: float, power: float, is_graded: bool) -> f
     return E_G * (S / (12.0 * np.cbrt(9.0 * volume * volume))) ** (power - 1.0)
 
 
-@njit(cache=True, error_model="numpy")
+# Inlined, here and in `cell_energy`: as calls they made a pass of flips a quarter slower (MNI152 T1, 5,000 nodes).
+@njit(cache=True, error_model="numpy", inline="always")
 def load(x: NDArray, row: int, ticks: NDArray, node: int, base: int, objective: Objective) -> None:
     """A node's position relative to the node `base`, in mm, to a row of x; subtracted in integers, exactly."""
     put_row(x, row, times(objective.matrix, scaled(2.0**-objective.bits, difference(ticks, node, base))))
@@ -469,7 +470,7 @@ def settle(x: NDArray, state: State, cell: int) -> None:
     sum_up(mesh.sums, mesh.fluxes, cell)
 
 
-@njit(cache=True, error_model="numpy")
+@njit(cache=True, error_model="numpy", inline="always")
 def cell_energy(state: State, cell: int) -> float:
     """A cell's share of E, Eq. (4)."""
     objective = state.objective
