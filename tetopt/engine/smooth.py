@@ -409,8 +409,8 @@ class Search(NamedTuple):
     fluxes: NDArray[np.float64]  # (2, R, n+1, D)
 
 
-# Its steps, and those of `ring_energy`, are inlined: a call hands over every array of the state, and a sweep of calls
-# took 12 % longer than one function did; inlined it takes 4 %.
+# Its steps, and those of `ring_energy`, are inlined: a sweep of calls took 12 % longer than one long function did,
+# inlined steps 3 to 8 % (MNI152 T1, 5,000 nodes, one thread).
 @njit(cache=True, error_model="numpy")
 def _move(node: int, state: State, rings: NodeRings) -> None:
     """Move one node down the gradient of its ring's energy, if that lowers it."""
