@@ -10,6 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from meshes import ALL_SMALL, random_affine, random_rotation, split_box
 from models import cell_energies
+from scipy.spatial import cKDTree
 from skfem.helpers import ddot, sym_grad, trace
 
 from tetopt import Image, InputError, Mesh, lattice
@@ -24,6 +25,7 @@ from tetopt.fem.elasticity import (
     strains,
 )
 from tetopt.fem.rigidity import check_held, rigid_modes
+from tetopt.geometry.quadratic import quadratic
 from tetopt.geometry.simplex import oriented, volumes
 from tetopt.geometry.topology import boundary_facets, facets
 
@@ -103,14 +105,31 @@ def test_stiffness_is_the_textbook_s(case, nu):
 
 
 @pytest.mark.parametrize("nu", [0.3, 0.45])
+@pytest.mark.parametrize("order", [1, 2])
 @pytest.mark.parametrize("n", [2, 3])
-def test_stiffness_is_scikit_fem_s(n, nu):
+def test_stiffness_is_scikit_fem_s(n, order, nu):
+    """Node by node: scikit-fem's dofs are matched to ours by where they lie."""
     mesh = random_mesh(np.random.default_rng(5), n, 40)
     young = np.random.default_rng(6).uniform(1.0, 9.0, len(mesh.cells))
-    kinds = {2: (skfem.MeshTri, skfem.ElementTriP1, skfem.ElementTriP0)}
-    kinds[3] = (skfem.MeshTet, skfem.ElementTetP1, skfem.ElementTetP0)
-    Kind, linear, constant = kinds[n]
-    basis = skfem.Basis(Kind(mesh.points.T.copy(), mesh.cells.T.copy()), skfem.ElementVector(linear()), intorder=1)
+    K, place = skfem_stiffness(mesh, young, nu, order)
+    points = mesh.points if order == 1 else quadratic(mesh.points, mesh.cells)[0]
+    distance, ours = cKDTree(points).query(place)
+    assert distance.max() < 1e-12
+    assert len(np.unique(ours)) == len(points)
+    dofs = (ours[:, None] * n + np.arange(n)).ravel()
+    actual = stiffness(mesh, young, nu, order).toarray()[np.ix_(dofs, dofs)]
+    np.testing.assert_allclose(actual, K, atol=1e-12 * np.abs(K).max())
+
+
+def skfem_stiffness(mesh, young, nu, order):
+    """scikit-fem's matrix with dofs node by node, and where its nodes lie."""
+    n = mesh.ndim
+    element = {
+        (2, 1): skfem.ElementTriP1, (3, 1): skfem.ElementTetP1, (2, 2): skfem.ElementTriP2, (3, 2): skfem.ElementTetP2
+    }[n, order]()  # fmt: skip
+    Kind, constant = {2: (skfem.MeshTri, skfem.ElementTriP0), 3: (skfem.MeshTet, skfem.ElementTetP0)}[n]
+    bare = Kind(mesh.points.T.copy(), mesh.cells.T.copy())
+    basis = skfem.Basis(bare, skfem.ElementVector(element), intorder=2 * order - 1 + (order == 1))
     narrowing = 1.0 - nu**2 if n == 2 else (1.0 + nu) * (1.0 - 2.0 * nu)
 
     @skfem.BilinearForm
@@ -118,8 +137,12 @@ def test_stiffness_is_scikit_fem_s(n, nu):
         stress_free = w.young * nu / narrowing * trace(sym_grad(u)) * trace(sym_grad(v))
         return stress_free + w.young / (1.0 + nu) * ddot(sym_grad(u), sym_grad(v))
 
-    expected = form.assemble(basis, young=basis.with_element(constant()).interpolate(young)).toarray()
-    np.testing.assert_allclose(stiffness(mesh, young, nu).toarray(), expected, atol=1e-12 * np.abs(expected).max())
+    K = form.assemble(basis, young=basis.with_element(constant()).interpolate(young))
+    # Of a vector element the first component's dofs name the nodes; the others of a node follow it.
+    first = np.concatenate([np.atleast_2d(basis.nodal_dofs)[0], basis.edge_dofs[0] if n == 3 and order == 2 else [],
+                            basis.facet_dofs[0] if n == 2 and order == 2 else []]).astype(int)  # fmt: skip
+    dofs = (first[:, None] + np.arange(n)).ravel()
+    return K.toarray()[np.ix_(dofs, dofs)], basis.doflocs[:, first].T
 
 
 @given(seeds, dimensions, st.floats(-0.9, 0.49))
@@ -645,7 +668,7 @@ PLATE = Mesh([[0.0, 0.0], [1.0, 0.0], [1.0, 2.0], [0.0, 2.0]], [[0, 1, 2], [0, 2
             'give empty space a small modulus too, as --young "0:0.1,255:6" does',
         ),
         ({"young": [1.0, 2.0, 3.0]}, "young: expected one modulus for each of 2 cells, got shape (3,)"),
-        ({"young": [[1.0], [2.0]]}, "young: expected one modulus for each of 2 cells, got shape (2, 1)"),
+        ({"young": [[1.0, 1.0], [2.0, 1.0]]}, "young: expected one modulus for each of 2 cells, got shape (2, 2)"),
         ({"young": "soft"}, "young: expected one modulus for each cell, got 'soft'"),
         ({"nu": 0.5}, "nu: expected -1 < nu < 0.5, got 0.5; for nearly incompressible tissue take 0.45 to 0.49"),
         ({"nu": -1.0}, "nu: expected -1 < nu < 0.5, got -1.0; for nearly incompressible tissue take 0.45 to 0.49"),
@@ -722,11 +745,11 @@ def test_messages_of_constrained():
     )
     assert (
         message_of(lambda: constrained(PLATE, 1.0, 0.3, is_held[:, 0], values))
-        == "is_prescribed: expected shape (4, 2) as the mesh's points, got (4,)"
+        == "is_prescribed: expected shape (4, 2), a row a node, got (4,)"
     )
     assert (
         message_of(lambda: constrained(PLATE, 1.0, 0.3, is_held, values[:3]))
-        == "prescribed: expected shape (4, 2) as the mesh's points, got (3, 2)"
+        == "prescribed: expected shape (4, 2), a row a node, got (3, 2)"
     )
 
 

@@ -10,9 +10,10 @@ import pytest
 from models import sample_model
 
 from tetopt.errors import InputError
+from tetopt.geometry.quadratic import quadratic, quadratic_facet_nodes
 from tetopt.io.febio import MOST_MATERIAL_PARTS, febio
 from tetopt.model.materials import materials
-from tetopt.model.model import described, in_space, in_units, quadratic, quadratic_facet_nodes
+from tetopt.model.model import described, in_space, in_units
 from tetopt.model.sets import facet_triples, nodes_of
 
 
@@ -130,7 +131,7 @@ def test_no_name_is_taken_twice():
 def test_quadratic():
     model = sample_model()._replace(order=2)
     feb = Feb(febio(model))
-    points, cells = quadratic(model.mesh)
+    points, cells = quadratic(model.mesh.points, model.mesh.cells)
     assert feb.type == "tet10"
     assert feb.points.tobytes() == points.tobytes()
     np.testing.assert_array_equal(feb.cells, cells)

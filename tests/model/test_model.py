@@ -7,15 +7,13 @@ from models import sample_image, sample_model
 import tetopt
 from tetopt.errors import InputError
 from tetopt.fem.elasticity import box_faces, push_of
+from tetopt.geometry.quadratic import QUADRATIC_EDGES, quadratic, quadratic_facet_nodes
 from tetopt.model.build import model_of
 from tetopt.model.loads import parse_loads
 from tetopt.model.model import (
-    QUADRATIC_EDGES,
     described,
     in_space,
     in_units,
-    quadratic,
-    quadratic_facet_nodes,
 )
 from tetopt.model.sets import box_of, facet_triples, nodes_of, standard_sets
 
@@ -137,7 +135,7 @@ def test_the_head_is_of_single_lines():
 
 def test_quadratic_cells_have_their_nodes_in_the_middle_of_edges():
     mesh = sample_model(3).mesh
-    points, cells = quadratic(mesh)
+    points, cells = quadratic(mesh.points, mesh.cells)
     np.testing.assert_array_equal(points[: len(mesh.points)], mesh.points)
     np.testing.assert_array_equal(cells[:, :4], mesh.cells)
     np.testing.assert_allclose(

@@ -16,11 +16,12 @@ from skfem.helpers import ddot, sym_grad, trace
 import tetopt
 from tetopt import Mesh
 from tetopt.fem.elasticity import constrained, lame_constants, solved, stiffness
+from tetopt.geometry.quadratic import quadratic, quadratic_facet_nodes
 from tetopt.geometry.simplex import volumes
 from tetopt.io.abaqus import abaqus
 from tetopt.model.loads import parse_loads
 from tetopt.model.materials import binned, materials
-from tetopt.model.model import Model, in_space, in_units, quadratic, quadratic_facet_nodes
+from tetopt.model.model import Model, in_space, in_units
 from tetopt.model.sets import box_of, facet_triples, nodes_of, standard_sets, with_requested
 
 CCX = shutil.which("ccx")
@@ -190,7 +191,7 @@ def test_quadratic_cells_are_scikit_fem_s(tmp_path):
 def test_every_set_arrives(order, tmp_path):
     """Asked for by name, CalculiX lists the members of node and element sets, though surfaces share their names."""
     model = pressed_model()._replace(order=order)
-    cells = quadratic(model.mesh)[1] if order == 2 else model.mesh.cells
+    cells = quadratic(model.mesh.points, model.mesh.cells)[1] if order == 2 else model.mesh.cells
     requests = [f"*NODE PRINT, NSET={name}\nU\n" for name in model.sets.facets]
     requests += [f"*EL PRINT, ELSET={name}\nELSE\n" for name in model.sets.cells]
     raw = abaqus(model).replace(b"*END STEP", "".join([*requests, "*END STEP"]).encode())

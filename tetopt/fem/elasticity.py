@@ -1,19 +1,21 @@
-"""Linear elasticity on the mesh: linear displacements in each cell, one Young's modulus a cell.
+"""Linear elasticity on the mesh: linear or quadratic displacements in each cell, of order 1 or 2.
 
 The strain energy of a cell is 1/2 u^T B^T C' B u E v, with E the mean of the modulus field over the cell and v its
-volume, Eq. (2). Written with the gradients g_a of the cell's hat functions and the two Lame constants, the block of
+volume, Eq. (2). Written with the gradients g_a of the cell's shape functions and the two Lame constants, the block of
 the stiffness matrix between nodes a and b is
 
-    K_ab = v (lambda g_a g_b^T + mu g_b g_a^T + mu (g_a . g_b) I),
+    K_ab = sum over Gauss points of w v (lambda g_a g_b^T + mu g_b g_a^T + mu (g_a . g_b) I),
 
-which is B_a^T C B_b multiplied out; in two dimensions lambda is that of plane stress. It takes fewer lines this way
-than through scikit-fem's forms and runs three to six times faster, and K comes out symmetric to the last bit;
-scikit-fem is the tests' oracle.
+which is B_a^T C B_b multiplied out; in two dimensions lambda is that of plane stress. With linear cells there is one
+point; with quadratic ones there are n + 1, which integrate it exactly, and the modulus may differ between them. It
+takes fewer lines this way than through scikit-fem's forms and runs three to six times faster, and K comes out
+symmetric to the last bit; scikit-fem is the tests' oracle.
 
 Units: lengths in mm and moduli in kPa = mN/mm^2 give forces in mN and energies in mN mm = uJ. A two-dimensional
 mesh is a plate 1 mm thick, in plane stress.
 
-Degrees of freedom go node by node: component d of node i is number i n + d.
+Degrees of freedom go node by node: component d of node i is number i n + d. Nodes of order 2 are those of
+`tetopt.geometry.quadratic.quadratic`.
 """
 
 from __future__ import annotations
@@ -29,6 +31,7 @@ from tetopt.check import check_unfolded, facets_on_box, filled_share
 from tetopt.errors import InputError
 from tetopt.fem.rigidity import check_held, rigid_modes
 from tetopt.geometry.box import box_sides, is_on_sides, upright_axis
+from tetopt.geometry.quadratic import cell_edges, gauss_rule, quadratic, shape_slopes
 from tetopt.geometry.simplex import volume_gradients, volumes
 from tetopt.image import Image
 from tetopt.mesh import Mesh
@@ -63,16 +66,19 @@ class Compression(NamedTuple):
     system: System  # as it was solved, for `tetopt.fem.conditioning`
 
 
-def stiffness(mesh: Mesh, young: ArrayLike, nu: float) -> csr_array:
-    """The stiffness matrix, (N*n, N*n), mN/mm; in 2-D plane stress, by mm of thickness.
+def stiffness(mesh: Mesh, young: ArrayLike, nu: ArrayLike, order: int = 1) -> csr_array:
+    """The stiffness matrix, (N*n, N*n), mN/mm, of the N nodes of the order; in 2-D plane stress, by mm of thickness.
 
     Parameters
     ----------
     mesh : Mesh
-    young : (M,) array of real numbers, or one for all
-        Young's modulus of each cell, kPa, above 0: the mean over the cell, Eq. (2).
-    nu : float
+    young : (M,) or (M, Q) array of real numbers, or one for all
+        Young's modulus of each cell, kPa, above 0, or at each of its Gauss points
+        (`tetopt.geometry.quadratic.gauss_rule`). Eq. (2): the mean over the cell.
+    nu : (M,) array, or one number for all
         Poisson's ratio, -1 < nu < 0.5. Linear cells lock as it nears 0.5: they are then far too stiff.
+    order : {1, 2}
+        Of the displacements in a cell.
 
     Returns
     -------
@@ -82,7 +88,7 @@ def stiffness(mesh: Mesh, young: ArrayLike, nu: float) -> csr_array:
     Raises
     ------
     InputError
-        A modulus that is not a number above 0, one modulus too many or too few, or nu out of range.
+        A modulus that is not a number above 0, one modulus too many or too few, nu out of range, or another order.
 
     Examples
     --------
@@ -90,50 +96,92 @@ def stiffness(mesh: Mesh, young: ArrayLike, nu: float) -> csr_array:
     >>> K.toarray()[0, :3]
     array([ 1.5,  0.5, -1. ])
     """
-    return _stiffness(mesh, _checked_young(young, mesh), _checked_nu(nu), np.eye(mesh.ndim))
+    elements = elements_of(mesh, order)
+    return _stiffness(elements, _checked_young(young, elements), _checked_nu(nu, mesh), np.eye(mesh.ndim))
 
 
-def _stiffness(mesh: Mesh, young: NDArray[np.float64], nu: float, frame: NDArray[np.float64]) -> csr_array:
-    """`stiffness` with dofs along the columns of `frame`: an isotropic law only needs its gradients turned."""
-    n, n_nodes = mesh.ndim, len(mesh.points)
+class Elements(NamedTuple):
+    """The cells of a mesh as elements of one order; `elements_of` makes them."""
+
+    points: NDArray[np.float64]  # (N, n) nodes of the order, mm
+    cells: NDArray[np.int64]  # (M, A) their nodes
+    volumes: NDArray[np.float64]  # (M,) mm^n
+    gradients: NDArray[np.float64]  # (M, n+1, n) of the barycentric coordinates, 1/mm
+    slopes: NDArray[np.float64]  # (Q, A, n+1) of the shape functions by these coordinates, at the Gauss points
+    weights: NDArray[np.float64]  # (Q,) of the Gauss points
+
+
+def elements_of(mesh: Mesh, order: int) -> Elements:
+    """The mesh's cells as elements of order 1 or 2; InputError for another order."""
+    if order not in (1, 2):
+        raise InputError(f"order: expected 1 or 2, got {order}")
+    points, cells = (mesh.points, mesh.cells) if order == 1 else quadratic(mesh.points, mesh.cells)
+    places, weights = gauss_rule(mesh.ndim, order)
     v, gradients = _gradients(mesh)
-    gradients = gradients @ frame
-    lame, mu = (constant[:, None, None] * v[:, None, None] for constant in lame_constants(young, nu, n))
-    pairs, slot = np.unique(mesh.cells[:, :, None] * n_nodes + mesh.cells[:, None, :], return_inverse=True)
+    return Elements(points, cells, v, gradients, shape_slopes(places, order), weights)
+
+
+def _stiffness(
+    elements: Elements, young: NDArray[np.float64], nu: NDArray[np.float64], frame: NDArray[np.float64]
+) -> csr_array:
+    """`stiffness` with dofs along the columns of `frame`: an isotropic law only needs its gradients turned.
+
+    `young` (M, Q), `nu` (M,).
+    """
+    n_nodes, n = elements.points.shape
+    pairs, slot = np.unique(elements.cells[:, :, None] * n_nodes + elements.cells[:, None, :], return_inverse=True)
     slot = slot.ravel()
-    blocks = np.empty((len(pairs), n, n))
-
-    def products(i: int, j: int) -> NDArray[np.float64]:
-        return gradients[:, :, None, i] * gradients[:, None, :, j]
-
-    shear = mu * sum(products(k, k) for k in range(n))
-    for i in range(n):
-        for j in range(n):
-            entries = lame * products(i, j) + mu * products(j, i)
-            if i == j:
-                entries += shear
-            # In the order of the cells for (a, b) as for (b, a), so that K is symmetric to the last bit.
-            blocks[:, i, j] = np.bincount(slot, weights=entries.ravel(), minlength=len(pairs))
+    blocks = np.zeros((len(pairs), n, n))
+    turned = elements.gradients @ frame
+    for slopes, weight, moduli in zip(elements.slopes, elements.weights, young.T, strict=True):
+        # One term is 1, all others are 0, for linear cells: their gradients come through to the last bit.
+        g = sum(slopes[:, k, None] * turned[:, None, k] for k in range(n + 1))  # (M, A, n)
+        lame, mu = (constant * (weight * elements.volumes) for constant in lame_constants(moduli, nu, n))
+        lame, mu = lame[:, None, None], mu[:, None, None]
+        shear = mu * sum(g[:, :, None, k] * g[:, None, :, k] for k in range(n))
+        for i in range(n):
+            for j in range(n):
+                entries = lame * (g[:, :, None, i] * g[:, None, :, j]) + mu * (g[:, :, None, j] * g[:, None, :, i])
+                if i == j:
+                    entries += shear
+                # In the order of the cells for (a, b) as for (b, a), so that K is symmetric to the last bit.
+                blocks[:, i, j] += np.bincount(slot, weights=entries.ravel(), minlength=len(pairs))
     start = np.searchsorted(pairs, np.arange(n_nodes + 1) * n_nodes)
     return bsr_array((blocks, pairs % n_nodes, start), shape=(n_nodes * n, n_nodes * n)).tocsr()
 
 
 def _gradients(mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Volumes (M,) and gradients of the hat functions (M, n+1, n), 1/mm: how v grows with the node, over v."""
+    """Volumes (M,) and gradients of the barycentric coordinates (M, n+1, n), 1/mm: how v grows with a node, over v."""
     v = volumes(mesh.points, mesh.cells)
     return v, volume_gradients(mesh.points, mesh.cells) / v[:, None, None]
 
 
-def lame_constants(young: NDArray[np.float64], nu: float, n: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+def lame_constants(
+    young: NDArray[np.float64], nu: float | NDArray[np.float64], n: int
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Lame's lambda (in 2-D that of plane stress) and mu, kPa."""
     narrowing = 1.0 - nu**2 if n == 2 else (1.0 + nu) * (1.0 - 2.0 * nu)
     return young * (nu / narrowing), young / (2.0 * (1.0 + nu))
 
 
+def gauss_strains(mesh: Mesh, u: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Strain at the Gauss points of each cell, (M, Q, n, n) float64, symmetric, of displacements `u`, (N, n) mm.
+
+    `u` has a row for each node of the mesh (Q = 1), or for each of order 2 (Q = n + 1).
+    """
+    elements = elements_of(mesh, order_of(mesh, u))
+    slope = np.einsum("cai,qak,ckj->cqij", u[elements.cells], elements.slopes, elements.gradients, optimize=True)
+    return 0.5 * (slope + slope.swapaxes(2, 3))
+
+
 def strains(mesh: Mesh, u: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Strain in each cell, (M, n, n) float64, symmetric, of the displacements `u`, (N, n) mm."""
-    slope = np.einsum("cai,caj->cij", u[mesh.cells], _gradients(mesh)[1])
-    return 0.5 * (slope + slope.transpose(0, 2, 1))
+    """Mean strain in each cell, (M, n, n) float64, symmetric, of displacements `u` as in `gauss_strains`."""
+    return gauss_strains(mesh, u).mean(axis=1)
+
+
+def order_of(mesh: Mesh, u: NDArray[np.float64]) -> int:
+    """Order of the displacements `u`: 1 with a row for each node of the mesh, else 2."""
+    return 1 if len(u) == len(mesh.points) else 2
 
 
 # Boundary conditions
@@ -219,19 +267,21 @@ def check_fills_box(image: Image, mesh: Mesh) -> None:
 def constrained(
     mesh: Mesh,
     young: ArrayLike,
-    nu: float,
+    nu: ArrayLike,
     is_prescribed: NDArray[np.bool_],
     prescribed: NDArray[np.float64],
     *,
+    order: int = 1,
     frame: NDArray[np.float64] | None = None,
 ) -> System:
     """The equations of the mesh with some displacements given.
 
     Parameters
     ----------
-    mesh, young, nu
+    mesh, young, nu, order
         As for `stiffness`.
     is_prescribed : (N, n) bool
+        Of the nodes of the order.
     prescribed : (N, n) float64
         Displacements, mm; counted only where prescribed.
     frame : (n, n) float64, optional
@@ -246,19 +296,20 @@ def constrained(
     """
     n = mesh.ndim
     frame = np.eye(n) if frame is None else frame
-    young, nu = _checked_young(young, mesh), _checked_nu(nu)
+    elements = elements_of(mesh, order)
+    young, nu = _checked_young(young, elements), _checked_nu(nu, mesh)
     is_prescribed, prescribed = np.asarray(is_prescribed, dtype=bool), np.asarray(prescribed, dtype=np.float64)
     for name, array in (("is_prescribed", is_prescribed), ("prescribed", prescribed)):
-        if array.shape != mesh.points.shape:
-            raise InputError(f"{name}: expected shape {mesh.points.shape} as the mesh's points, got {array.shape}")
+        if array.shape != elements.points.shape:
+            raise InputError(f"{name}: expected shape {elements.points.shape}, a row a node, got {array.shape}")
     values = np.where(is_prescribed, prescribed, 0.0)
     if not np.isfinite(values).all():
         node = int(np.flatnonzero(~np.isfinite(values).all(axis=1))[0])
         raise InputError(f"prescribed: displacements must be finite, node {node} has {values[node].tolist()}")
     check_unfolded(mesh)
-    points = mesh.points @ frame
-    check_held(points, mesh.cells, is_prescribed)
-    K = _stiffness(mesh, young, nu, frame)
+    points = elements.points @ frame
+    check_held(points, elements.cells, is_prescribed)
+    K = _stiffness(elements, young, nu, frame)
     free = np.flatnonzero(~is_prescribed.ravel())
     rows = K[free]
     return System(K, free, rows[:, free], -(rows @ values.ravel()), values.ravel(), rigid_modes(points), frame)
@@ -267,11 +318,12 @@ def constrained(
 def compression(
     mesh: Mesh,
     young: ArrayLike,
-    nu: float,
+    nu: ArrayLike,
     *,
     fixed_nodes: ArrayLike,
     pushed_nodes: ArrayLike,
     displacement: ArrayLike,
+    order: int = 1,
     is_bonded: bool = True,
     method: Method = "auto",
 ) -> Compression:
@@ -279,10 +331,11 @@ def compression(
 
     Parameters
     ----------
-    mesh, young, nu
+    mesh, young, nu, order
         As for `stiffness`.
     fixed_nodes, pushed_nodes : (K,) arrays of integers
-        Node numbers, such as `box_faces` returns. The paper fixes the top and compresses the bottom.
+        Nodes of the mesh, such as `box_faces` returns. The paper fixes the top and compresses the bottom. With order 2
+        the nodes between two of them are, too.
     displacement : (n,) array
         Displacement of the pushed nodes, mm, world.
     is_bonded : bool
@@ -324,24 +377,36 @@ def compression(
             f"fixed_nodes and pushed_nodes: {len(both)} nodes are in both, the first {both[:5].tolist()}; "
             "they cannot rest and move by the displacement"
         )
-    is_prescribed = np.zeros((len(mesh.points), n), dtype=bool)
-    prescribed = np.zeros((len(mesh.points), n))
+    if order == 2:
+        fixed, pushed = (_with_midpoints(mesh, nodes) for nodes in (fixed, pushed))
+    points = elements_of(mesh, order).points
+    is_prescribed = np.zeros(points.shape, dtype=bool)
+    prescribed = np.zeros(points.shape)
     if is_bonded:
         frame = np.eye(n)
         is_prescribed[fixed] = is_prescribed[pushed] = True
         prescribed[pushed] = push
     else:
-        frame, partner = _sliding_frame(mesh.points[fixed], push)
+        frame, partner = _sliding_frame(points[fixed], push)
         is_prescribed[fixed, 0] = is_prescribed[pushed, 0] = True
         is_prescribed[fixed[0]] = True
         is_prescribed[fixed[partner], 2:] = True
         prescribed[pushed, 0] = np.linalg.norm(push)
-    system = constrained(mesh, young, nu, is_prescribed, prescribed, frame=frame)
+    system = constrained(mesh, young, nu, is_prescribed, prescribed, order=order, frame=frame)
     u = solved(system, method)
     dofs = (u @ frame).ravel()
     force = system.K @ dofs
     reaction = force.reshape(-1, n)[pushed].sum(axis=0) @ frame.T
     return Compression(u, 0.5 * float(dofs @ force), reaction, system)
+
+
+def _with_midpoints(mesh: Mesh, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Nodes of order 2: the mesh's nodes given, and those in the middle of edges between two of them."""
+    cells = quadratic(mesh.points, mesh.cells)[1]
+    is_chosen = np.zeros(len(mesh.points), dtype=bool)
+    is_chosen[nodes] = True
+    is_between = is_chosen[mesh.cells[:, cell_edges(mesh.ndim)]].all(axis=2)
+    return np.union1d(nodes, cells[:, mesh.ndim + 1 :][is_between])
 
 
 def _sliding_frame(fixed: NDArray[np.float64], push: NDArray[np.float64]) -> tuple[NDArray[np.float64], int]:
@@ -446,22 +511,32 @@ def multigrid(system: System) -> LinearOperator:
 # Checks of the arguments
 
 
-def _checked_young(young: ArrayLike, mesh: Mesh) -> NDArray[np.float64]:
+def _checked_young(young: ArrayLike, elements: Elements) -> NDArray[np.float64]:
+    """Moduli at the Gauss points, (M, Q)."""
     try:
         young = np.asarray(young, dtype=np.float64)
     except (TypeError, ValueError) as error:
         raise InputError(f"young: expected one modulus for each cell, got {young!r}") from error
+    n_cells, n_places = len(elements.cells), len(elements.weights)
     if young.ndim == 0:
-        young = np.full(len(mesh.cells), float(young))
-    if young.shape != (len(mesh.cells),):
-        raise InputError(f"young: expected one modulus for each of {len(mesh.cells)} cells, got shape {young.shape}")
-    return checked_young(young)
+        young = np.full(n_cells, float(young))
+    if young.shape == (n_cells,):
+        return np.broadcast_to(checked_young(young)[:, None], (n_cells, n_places))
+    if young.shape != (n_cells, n_places):
+        raise InputError(f"young: expected one modulus for each of {n_cells} cells, got shape {young.shape}")
+    checked_young(young.min(axis=1))  # not a number in any place makes this not a number
+    checked_young(young.max(axis=1))
+    return young
 
 
-def _checked_nu(nu: float) -> float:
-    if not -1.0 < nu < 0.5:
-        raise InputError(f"nu: expected -1 < nu < 0.5, got {nu}; for nearly incompressible tissue take 0.45 to 0.49")
-    return float(nu)
+def _checked_nu(nu: ArrayLike, mesh: Mesh) -> NDArray[np.float64]:
+    """Poisson's ratios of the cells, (M,)."""
+    ratios = np.asarray(nu, dtype=np.float64)
+    if ratios.shape not in ((), (len(mesh.cells),)):
+        raise InputError(f"nu: expected one ratio, or one for each of {len(mesh.cells)} cells, got {ratios.shape}")
+    if not ((ratios > -1.0) & (ratios < 0.5)).all():
+        raise InputError(f"nu: expected -1 < nu < 0.5, got {nu!r}; for nearly incompressible tissue take 0.45 to 0.49")
+    return np.broadcast_to(ratios, (len(mesh.cells),))
 
 
 def _checked_nodes(name: str, nodes: ArrayLike, mesh: Mesh) -> NDArray[np.int64]:

@@ -48,6 +48,8 @@ def _rigid_rows(arms: NDArray[np.float64]) -> NDArray[np.float64]:
 def check_held(points: NDArray[np.float64], cells: NDArray[np.int64], is_prescribed: NDArray[np.bool_]) -> None:
     """InputError if some part of the mesh can move without strain, for then K_ff is singular.
 
+    Cells (M, A) of either order, their corners first.
+
     Without strain, cells that share a facet move as one rigid body. So a motion without strain is one of each
     facet-connected set of cells such that sets that share a node agree there, and prescribed dofs rest.
     """
@@ -60,7 +62,7 @@ def check_held(points: NDArray[np.float64], cells: NDArray[np.int64], is_prescri
         )
     if not is_prescribed.any():
         raise InputError("mesh: no displacement is prescribed, so it could fly away; fix some nodes")
-    body = components(cells)
+    body = components(cells[:, : points.shape[1] + 1])
     _check_pieces(cells, body, is_prescribed)
     weakest, loose = _weakest_hold(points, cells, body, is_prescribed)
     if weakest < LOOSE_VIOLATION:

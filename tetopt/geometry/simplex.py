@@ -25,6 +25,13 @@ def facet_nodes(n: int) -> list[tuple[int, ...]]:
     return [tuple(k for k in range(n + 1) if k != i) for i in range(n + 1)]
 
 
+def outward_facet_nodes(n: int) -> NDArray[np.int64]:
+    """Local nodes of each facet, facing out: facets of a positively oriented simplex do for even k as they stand."""
+    return np.array(
+        [nodes if k % 2 == 0 else (nodes[1], nodes[0], *nodes[2:]) for k, nodes in enumerate(facet_nodes(n))]
+    )
+
+
 def volumes(points: Points, cells: Cells) -> NDArray[np.float64]:
     """Signed volumes (areas in 2-D), (M,) float64, mm^n; positive for a positively oriented cell."""
     corners = points[cells]

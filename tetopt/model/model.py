@@ -8,10 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
+from tetopt.geometry.quadratic import quadratic, quadratic_facet_nodes
 from tetopt.mesh import Mesh
 from tetopt.model.loads import Load
 from tetopt.model.materials import Materials
-from tetopt.model.sets import Sets, facet_triples, outward_facet_nodes
+from tetopt.model.sets import Sets, facet_triples
 from tetopt.model.skfem import skfem_mesh
 
 if TYPE_CHECKING:
@@ -30,8 +31,6 @@ class Units(NamedTuple):
 
 STRESS_UNITS = {"kPa": Units(1.0, "mN", "uJ", "kg", 1e-6), "MPa": Units(1e3, "N", "mJ", "t", 1e-9)}
 SPACES = ("ras", "lps")  # conventions of the world's axes
-# Local nodes of the edges whose midpoints are the quadratic tetrahedron's nodes 5 to 10, as in VTK, Abaqus and FEBio.
-QUADRATIC_EDGES = np.array([(0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)])
 
 
 class Model(NamedTuple):
@@ -122,35 +121,9 @@ def described(model: Model) -> list[str]:
 
 def elements(model: Model) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Points and cells of the model's order: the mesh's own, or those of `quadratic`."""
-    return quadratic(model.mesh) if model.order == 2 else (model.mesh.points, model.mesh.cells)
+    return quadratic(model.mesh.points, model.mesh.cells) if model.order == 2 else (model.mesh.points, model.mesh.cells)
 
 
 def element_facets(cells: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.int64]:
     """Nodes of the facets (K, 2) of cells of either order: `facet_triples` or `quadratic_facet_nodes`."""
-    return (quadratic_facet_nodes if cells.shape[1] == 10 else facet_triples)(cells, rows)
-
-
-def quadratic(mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Points (N + E, 3) and cells (M, 10) of straight-edged quadratic tetrahedra; the mesh's own nodes come first.
-
-    Nodes 5 to 10 of a cell are the midpoints of `QUADRATIC_EDGES`.
-    """
-    ends = np.sort(mesh.cells[:, QUADRATIC_EDGES], axis=2)  # (M, 6, 2)
-    edges, number = np.unique(ends.reshape(-1, 2), axis=0, return_inverse=True)
-    points = np.concatenate([mesh.points, mesh.points[edges].mean(axis=1)])
-    return points, np.column_stack([mesh.cells, len(mesh.points) + number.reshape(-1, 6)])
-
-
-def quadratic_facet_nodes(cells: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Nodes (K, 6) of the facets (K, 2) of quadratic cells (M, 10): three corners facing out, then their midpoints.
-
-    The midpoints are of the first two corners, of the second and third, and of the third and first.
-    """
-    of_edge = {frozenset(edge): 4 + number for number, edge in enumerate(QUADRATIC_EDGES.tolist())}
-    local = np.array(
-        [
-            [*corners, *(of_edge[frozenset((corners[k], corners[(k + 1) % 3]))] for k in range(3))]
-            for corners in outward_facet_nodes(3).tolist()
-        ]
-    )
-    return cells[rows[:, :1], local[rows[:, 1]]]
+    return (quadratic_facet_nodes if cells.shape[1] in (6, 10) else facet_triples)(cells, rows)

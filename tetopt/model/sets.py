@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides, facets_on_sides, world_axes
-from tetopt.geometry.simplex import facet_nodes
+from tetopt.geometry.simplex import outward_facet_nodes
 from tetopt.geometry.topology import facets, largest_component
 from tetopt.image import Image, transformed
 from tetopt.mesh import Mesh
@@ -50,13 +50,6 @@ def facet_triples(cells: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[
     In 3-D the normal (b - a) x (c - a) of a row (a, b, c) points out; in 2-D the right side of a -> b lies outside.
     """
     return cells[rows[:, :1], outward_facet_nodes(cells.shape[1] - 1)[rows[:, 1]]]
-
-
-def outward_facet_nodes(n: int) -> NDArray[np.int64]:
-    """Local nodes of each facet, facing out: facets of a positively oriented simplex do for even k as they stand."""
-    return np.array(
-        [nodes if k % 2 == 0 else (nodes[1], nodes[0], *nodes[2:]) for k, nodes in enumerate(facet_nodes(n))]
-    )
 
 
 def nodes_of(mesh: Mesh, rows: NDArray[np.int64]) -> NDArray[np.int64]:

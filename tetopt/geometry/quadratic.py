@@ -1,0 +1,96 @@
+"""Cells of order 1 and 2: nodes, shape functions, rules of integration.
+
+Order 1 has a node at each corner and displacements that are linear in a cell; order 2 also one in the middle of each
+edge, and quadratic displacements. Edges are straight, so that a cell of either order is the same simplex.
+Places within a cell are barycentric, (K, n+1). See Zienkiewicz and Taylor, The Finite Element Method, volume 1,
+chapters 4 (shape functions) and 5 (integration).
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.geometry.simplex import outward_facet_nodes
+
+# Local corners of the edges whose midpoints are a tetrahedron's nodes 4 to 9, as in VTK, Abaqus and FEBio; the first
+# three are a triangle's, nodes 3 to 5.
+QUADRATIC_EDGES = np.array([(0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)])
+
+
+def cell_edges(n: int) -> NDArray[np.int64]:
+    """Local corners (E, 2) of the edges of a triangle (n = 2) or a tetrahedron, in the order of their nodes."""
+    return QUADRATIC_EDGES[: n * (n + 1) // 2]
+
+
+def quadratic(points: NDArray[np.float64], cells: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Nodes (N + E, n) and cells (M, 6 or 10) of order 2, of points (N, n) and cells (M, n+1).
+
+    The points come first, then the midpoints of the edges, which are sorted by their ends; a cell's corners come first,
+    then the midpoints of `cell_edges`.
+    """
+    ends = np.sort(cells[:, cell_edges(points.shape[1])], axis=2)  # (M, E, 2)
+    edges, number = np.unique(ends.reshape(-1, 2), axis=0, return_inverse=True)
+    midpoints = points[edges].mean(axis=1)
+    return np.concatenate([points, midpoints]), np.column_stack([cells, len(points) + number.reshape(len(cells), -1)])
+
+
+def quadratic_facet_nodes(cells: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Nodes (K, 3 or 6) of facets (K, 2), rows of (cell, local corner opposite), of cells of order 2.
+
+    The corners come first, facing out, then the midpoints: of a triangle those of the first two corners, of the second
+    and third, and of the third and first.
+    """
+    n = 2 if cells.shape[1] == 6 else 3
+    of_edge = {frozenset(edge): n + 1 + number for number, edge in enumerate(cell_edges(n).tolist())}
+    sides = [(0, 1), (1, 2), (2, 0)] if n == 3 else [(0, 1)]
+    local = np.array(
+        [
+            [*corners, *(of_edge[frozenset((corners[a], corners[b]))] for a, b in sides)]
+            for corners in outward_facet_nodes(n).tolist()
+        ]
+    )
+    return cells[rows[:, :1], local[rows[:, 1]]]
+
+
+def shape_values(places: NDArray[np.float64], order: int) -> NDArray[np.float64]:
+    """Shape functions at places (K, n+1) within a cell, (K, A), in the order of the cell's nodes.
+
+    At a corner lambda (2 lambda - 1), in the middle of an edge 4 lambda_a lambda_b; for order 1 lambda.
+    """
+    if order == 1:
+        return places
+    a, b = cell_edges(places.shape[1] - 1).T
+    return np.column_stack([places * (2.0 * places - 1.0), 4.0 * places[:, a] * places[:, b]])
+
+
+def shape_slopes(places: NDArray[np.float64], order: int) -> NDArray[np.float64]:
+    """Derivatives of the shape functions by the barycentric coordinates, (K, A, n+1).
+
+    Multiplied by the gradients of the coordinates, (n+1, n), they are those of the shape functions in the world.
+    """
+    n_places, n_corners = places.shape
+    if order == 1:
+        return np.broadcast_to(np.eye(n_corners), (n_places, n_corners, n_corners))
+    edges = cell_edges(n_corners - 1)
+    slopes = np.zeros((n_places, n_corners + len(edges), n_corners))
+    corners = np.arange(n_corners)
+    slopes[:, corners, corners] = 4.0 * places - 1.0
+    for node, (a, b) in enumerate(edges, start=n_corners):
+        slopes[:, node, a] = 4.0 * places[:, b]
+        slopes[:, node, b] = 4.0 * places[:, a]
+    return slopes
+
+
+def gauss_rule(n: int, order: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Places (Q, n+1) and weights (Q,), which sum to 1, of the rule that integrates a cell's stiffness.
+
+    One point for order 1; n + 1 for order 2, exact for polynomials of degree 2, which the product of two strains is.
+    Point k lies nearest to corner k.
+    """
+    if order == 1:
+        return np.full((1, n + 1), 1.0 / (n + 1)), np.ones(1)
+    near = (5.0 - np.sqrt(5.0)) / 20.0 if n == 3 else 1.0 / 6.0
+    places = np.full((n + 1, n + 1), near)
+    np.fill_diagonal(places, 1.0 - n * near)
+    return places, np.full(n + 1, 1.0 / (n + 1))
