@@ -65,7 +65,7 @@ def with_two_sides(model):
 def our_compression(model, nu):
     """What `tetopt.fem` makes of the model's two loads, the first of which holds."""
     fixed, pushed = (nodes_of(model.mesh, model.sets.facets[load.set_name]) for load in model.loads)
-    push = model.loads[1].displacement
+    push = model.loads[1].numbers
     return compression(model.mesh, young_of(model), nu, fixed_nodes=fixed, pushed_nodes=pushed, displacement=push)
 
 

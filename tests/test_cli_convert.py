@@ -82,7 +82,7 @@ def test_vtu_there_and_back_with_materials_sets_and_loads(folder, tmp_path):
         np.unique(np.column_stack([loaded.cell_data[k] for k in ("young", "nu")]), axis=0)
     )
     assert numbers["sets"]["cells"]["dark"] == len(loaded.sets.cells["dark"])
-    assert numbers["loads"]["superior"] == [0.0, 0.0, 0.0]
+    assert numbers["loads"][0] == "hold:superior"
     assert loaded.space == "lps"
     assert loaded.mesh.points.tobytes() == first.mesh.points.tobytes()  # turned back
     np.testing.assert_array_equal(loaded.mesh.cells, first.mesh.cells)
@@ -97,14 +97,15 @@ def test_vtu_there_and_back_with_materials_sets_and_loads(folder, tmp_path):
     np.testing.assert_array_equal(loaded.sets.cells["dark"], largest_component(first.mesh.cells, means < 20))
     assert str(loaded.field_data["units"][0]) == "MPa"
     loads = json.loads(str(loaded.field_data["loads"][0]))
-    assert [name for name, _ in loads] == ["superior", "inferior"]
+    assert [word.rpartition(":")[0] for word in loads] == ["hold", "move:inferior"]
     # And on, in kPa and RAS again, what was painted, set and loaded kept.
     assert exit_code("convert", tmp_path / "b.vtu", tmp_path / "c.vtu") == 0
     again = tetopt.load_mesh(tmp_path / "c.vtu")
     np.testing.assert_allclose(again.cell_data["young"], 1.0 + means / 7.0, rtol=1e-14)
     np.testing.assert_array_equal(again.cell_data["nu"], loaded.cell_data["nu"])
     kept = json.loads(again.text("loads"))
-    assert kept == [[name, [-x + 0.0, -y + 0.0, z]] for name, (x, y, z) in loads]
+    x, y, z = map(float, loads[1].rpartition(":")[2].split(","))
+    assert kept == ["hold:superior", f"move:inferior:{-x + 0.0},{-y + 0.0},{z}"]
     assert again.space == "ras"
     assert list(again.sets.cells) == list(loaded.sets.cells)
     assert again.box.shape == first.box.shape
@@ -297,7 +298,10 @@ def test_loads_run_or_are_said_to_be_in_comments(folder, tmp_path, capsys):
         ("a.inp", ["--nu", "0.3"], "--nu: there is no --young"),
         ("a.inp", ["--young", "1=2"], "the mesh also has 0 (1 more)"),
         ("a.inp", ["--crop", "1:3,:,:"], "--crop: there is no --image"),
-        ("a.inp", ["--young", "2", "--load", "move:left:0,0,1"], 'nothing but "left" is loaded'),
+        ("a.inp", ["--young", "2", "--load", "gravity:0,0,-9810"], "gravity: the cells have no density"),
+        ("a.inp", ["--density", "1000"], "--density: there is no --young"),
+        ("a.inp", ["--young", "2", "--density", "-h"], "expected kg/m3 above 0"),
+        ("a.inp", ["--young", "2", "--load", "2/hold:left"], "no load is of step 1 alone"),
         ("a.inp", ["--bins", "4"], "no moduli to group"),
         ("a.inp", ["--young", "h+1", "--bins", "0"], "--bins: expected K"),
         ("a.inp", ["--young", "h+1", "--bins", "4:cubic"], "--bins: expected K"),

@@ -127,7 +127,12 @@ def test_each_cell_has_its_material_and_no_other(model):
 
 def test_the_step_holds_and_moves_all_three_components():
     model = sample_model()
-    moved = model._replace(loads=(Load("superior", np.zeros(3)), Load("inferior", np.array([0.5, -0.25, 1.0]))))
+    moved = model._replace(
+        loads=(
+            Load("displacement", "superior", np.zeros(3)),
+            Load("displacement", "inferior", np.array([0.5, -0.25, 1.0])),
+        )
+    )
     words = blocks_of(abaqus(moved))
     order = [word for word, _, _ in words]
     assert order[order.index("*STEP") :] == [
@@ -191,7 +196,7 @@ def test_numbers_of_more_than_twenty_characters_are_rounded_to_fit(value):
     size = abs(value)
     mesh = Mesh(np.array([[value, 0, 0], [size, 0, 0], [0, size, 0], [0, 0, size]]), [[0, 1, 2, 3]])
     side = np.array([[0, 3]])
-    loads = (Load("side", np.full(3, value)),)
+    loads = (Load("displacement", "side", np.full(3, value)),)
     model = Model(mesh, {}, Sets({"side": side}, {}), materials(-11.0 * value, 1.0 / 30.0, 1), loads)
     raw = abaqus(model)
     written = {text for word, _, data in blocks_of(raw) if word != "*HEADING" for line in data for text in line}

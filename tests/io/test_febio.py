@@ -162,7 +162,7 @@ def test_conditions_move_each_node_of_each_load():
             assert bc.find("value").get("lc") == "1" == root.find("LoadData/load_controller").get("id")
             assert bc.find("dof").text == "xyz"[len(prescribed.setdefault(bc.get("node_set"), []))]
             prescribed[bc.get("node_set")].append(float(bc.find("value").text))
-    assert prescribed == {load.set_name: load.displacement.tolist() for load in model.loads}
+    assert prescribed == {load.set_name: load.numbers.tolist() for load in model.loads}
     assert [pt.text for pt in root.iter("pt")] == ["0,0", "1,1"]
     steps = root.find("Control")
     assert int(steps.find("time_steps").text) * float(steps.find("step_size").text) == 1.0
@@ -202,11 +202,11 @@ def test_sections_are_those_of_pyfebio():
                 child.tail = None
         expected = []
         for load in model.loads:
-            if not load.displacement.any():
+            if not load.numbers.any():
                 condition = pyfebio.boundary.BCZeroDisplacement(node_set=load.set_name, x_dof=1, y_dof=1, z_dof=1)
                 expected.append(condition.to_xml())
                 continue
-            for dof, value in zip("xyz", load.displacement.tolist(), strict=True):
+            for dof, value in zip("xyz", load.numbers.tolist(), strict=True):
                 moved = pyfebio.boundary.Value(lc=1, text=value)
                 expected.append(
                     pyfebio.boundary.BCPrescribedDisplacement(node_set=load.set_name, dof=dof, value=moved).to_xml()

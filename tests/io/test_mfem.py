@@ -119,7 +119,7 @@ def test_constants_and_what_attributes_mean_are_in_comments():
             names = [name for name, attributes in sets.items() if attribute in attributes]
             assert f"{what} {attribute}: {' '.join(names)}" in read.comments
     assert f"image: {ABOUT['image']}, sha256 {ABOUT['image_sha256']}" in read.comments
-    assert any(line.endswith("nodes of superior displaced by 0.0 0.0 0.0 mm") for line in read.comments)
+    assert any(line.endswith("load, which this format has no place for: hold:superior") for line in read.comments)
     assert any(line.startswith("cell data") and line.endswith(", ".join(model.cell_data)) for line in read.comments)
 
 

@@ -112,12 +112,12 @@ def test_constraints_are_the_loads():
     assert len(model.loads) == 2
     for load in model.loads:
         nodes = nodes_of(model.mesh, model.sets.facets[load.set_name])
-        kind = ("Fixed", "hold") if not load.displacement.any() else ("LinearMovement", "move")
+        kind = ("Fixed", "hold") if not load.numbers.any() else ("LinearMovement", "move")
         (constraint,) = solid.findall(f"{kind[0]}ProjectiveConstraint")
         assert constraint.get("name") == f"{kind[1]}_{load.set_name}"
         np.testing.assert_array_equal(table(constraint, "indices"), nodes)
         if kind[1] == "move":
-            whole = load.displacement.tolist()
+            whole = load.numbers.tolist()
             assert table(constraint, "movements", float, 3).tolist() == [[0.0, 0.0, 0.0], whole, whole]
             assert table(constraint, "keyTimes", float).tolist() == [0.0, 1.0, 1e9]
     assert not [e for e in solid_of(sofa(model._replace(loads=()))) if e.tag.endswith("Constraint")]

@@ -11,6 +11,7 @@ from models import ABOUT, sample_model, young_of
 from tetopt.io.formats import save_model
 from tetopt.io.meshes import load_mesh
 from tetopt.io.vtk import to_pyvista
+from tetopt.model.loads import load_words
 from tetopt.model.sets import nodes_of
 
 
@@ -35,10 +36,11 @@ def test_every_bit_comes_back(tmp_path, suffix, space, n):
     for name, values in expected.items():
         np.testing.assert_array_equal(back.cell_data[name], values)
     texts = {name: str(back.field_data[name][0]) for name in (*ABOUT, "units", "space", "loads")}
-    loads = [
-        [load.set_name, (load.displacement * ([-1, -1, 1] if space == "lps" else 1)).tolist()] for load in model.loads
+    words = [
+        load_words(load._replace(numbers=load.numbers * ([-1, -1, 1] if space == "lps" else 1) + 0.0))
+        for load in model.loads
     ]
-    assert json.loads(texts.pop("loads")) == [[name, [x + 0.0 for x in vector]] for name, vector in loads]
+    assert json.loads(texts.pop("loads")) == words
     assert texts == ABOUT | {"units": "kPa", "space": space}
 
 

@@ -9,6 +9,7 @@ from models import ABOUT, sample_model, with_two_sides
 
 from tetopt.errors import InputError
 from tetopt.io.xdmf import xdmf
+from tetopt.model.loads import load_words
 from tetopt.model.model import described, in_space, in_units
 from tetopt.model.sets import Sets, facet_triples, standard_sets
 
@@ -138,10 +139,8 @@ def test_every_cell_set_comes_back(model):
 def test_loads_and_origin_are_told():
     model = sample_model()
     head = ElementTree.fromstring(xdmf(model)).findall("./Domain/Information")
-    loads = [each.get("Value").split() for each in head if each.get("Name") == "load"]
-    assert [(name, [float(x) for x in vector]) for name, *vector in loads] == [
-        (load.set_name, load.displacement.tolist()) for load in model.loads
-    ]
+    loads = [each.get("Value") for each in head if each.get("Name") == "load"]
+    assert loads == [load_words(load) for load in model.loads]
     about = [each.get("Value") for each in head if each.get("Name") == "about"]
     assert about == described(model)
     assert f"image: {ABOUT['image']}, sha256 {ABOUT['image_sha256']}" in about

@@ -85,7 +85,7 @@ def prescribed(model, n_nodes, nodes_of_rows):
     is_given, values = np.zeros((n_nodes, 3), dtype=bool), np.zeros((n_nodes, 3))
     for load in model.loads:
         nodes = nodes_of_rows(model.sets.facets[load.set_name])
-        is_given[nodes], values[nodes] = True, load.displacement
+        is_given[nodes], values[nodes] = True, load.numbers
     return is_given, values
 
 
@@ -171,7 +171,7 @@ def second_order(model):
         for d in range(3):
             dofs = np.flatnonzero(np.abs(basis.doflocs[2] - side) < 1e-9)
             dofs = np.intersect1d(dofs, np.concatenate([basis.nodal_dofs[d], basis.edge_dofs[d]]))
-            u[dofs] = load.displacement[d]
+            u[dofs] = load.numbers[d]
             fixed.append(dofs)
     u = skfem.solve(*skfem.condense(K, x=u, D=np.concatenate(fixed)))
     return u[basis.nodal_dofs].T, 0.5 * float(u @ (K @ u))
@@ -227,6 +227,6 @@ def test_numbers_of_full_length_arrive(tmp_path):
     model = pressed_model()
     shrunk = Mesh(model.mesh.points * (np.pi * 1e-6), model.mesh.cells)
     assert max(len(repr(x)) for x in shrunk.points.ravel().tolist()) > 20
-    loads = tuple(load._replace(displacement=load.displacement * (np.pi * 1e-6)) for load in model.loads)
+    loads = tuple(load._replace(numbers=load.numbers * (np.pi * 1e-6)) for load in model.loads)
     small = model._replace(mesh=shrunk, loads=loads)
     np.testing.assert_allclose(energy(answer(abaqus(small), tmp_path)), ours(small)[1], rtol=PRINTED)

@@ -31,7 +31,7 @@ def pressed(path, model):
     u.Assign(0.0)
     for load in model.loads:
         marker = mesh.bdr_attribute_sets.GetAttributeSetMarker(load.set_name)
-        u.ProjectBdrCoefficient(ser.VectorConstantCoefficient(ser.Vector(load.displacement.tolist())), marker)
+        u.ProjectBdrCoefficient(ser.VectorConstantCoefficient(ser.Vector(load.numbers.tolist())), marker)
         dofs = ser.intArray()
         space.GetEssentialTrueDofs(marker, dofs)
         prescribed.Append(dofs)

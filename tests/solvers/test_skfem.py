@@ -29,7 +29,7 @@ def pressed(model):
     for load in model.loads:
         nodal = basis.get_dofs(load.set_name).nodal
         for d in range(n):
-            u[nodal[f"u^{d + 1}"]] = load.displacement[d]
+            u[nodal[f"u^{d + 1}"]] = load.numbers[d]
             fixed.append(nodal[f"u^{d + 1}"])
     u = skfem.solve(*skfem.condense(K, x=u, D=np.concatenate(fixed)))
     return u[basis.nodal_dofs].T, 0.5 * float(u @ K @ u)

@@ -7,7 +7,6 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
-import numpy as np
 import typer
 from rich.markup import escape
 
@@ -15,13 +14,22 @@ from tetopt import Image, InputError
 from tetopt.cli.console import log
 from tetopt.cli.inputs import check_no_input, image_and_others, read_mesh, warn_of_other_image
 from tetopt.cli.options import ImagePart, MeshArgument, NumberOptions, SolverOptions, option
-from tetopt.cli.solver import all_sets, check_solver_options, print_model, save_for_solver, solver_model
+from tetopt.cli.solver import (
+    MATERIAL_FIELDS,
+    all_sets,
+    check_solver_options,
+    print_model,
+    save_for_solver,
+    solver_model,
+)
 from tetopt.io.files import checked_output, save_json
 from tetopt.io.formats import FORMATS, format_of
 from tetopt.io.images import sha256
 from tetopt.io.meshes import MeshFile
 from tetopt.io.vtk import box_text
 from tetopt.model.fields import cell_fields
+from tetopt.model.loads import load_words, parse_load
+from tetopt.model.model import STRESS_UNITS, half_turned, scaled
 from tetopt.model.sets import box_of
 from tetopt.report.summary import model_summary, versions
 from tetopt.target.align import aligned_mask
@@ -69,7 +77,7 @@ def convert_command(
     if box is not None:
         about["box"] = box_text(box)
     if format_of(output).is_surface:  # which holds no materials
-        fields = {name: values for name, values in fields.items() if name not in ("young", "nu")}
+        fields = {name: values for name, values in fields.items() if name not in MATERIAL_FIELDS}
     known_sets = all_sets(loaded.mesh, box, fields, loaded.sets)
     model = solver_model(loaded.mesh, image, solver, fields, about, known_sets)
     save_for_solver(output, model, solver)
@@ -89,17 +97,17 @@ def _images(path: Path, mask_path: Path | None, part: ImagePart, ndim: int) -> t
 
 
 def _loads_of(loaded: MeshFile, output: Path) -> list[str]:
-    """The loads that a file of ours holds, in the words of --load and in RAS+, if their sets are there still."""
-    turn = np.array([-1.0, -1.0, 1.0]) if loaded.space == "lps" else np.ones(loaded.mesh.ndim)
+    """The loads that a file of ours holds, in the words of --load, in RAS+ and kPa, if their sets are there still."""
+    if format_of(output).is_surface:
+        return []
     try:
-        loads = json.loads(loaded.text("loads") or "[]")
-        vectors = {str(name): (np.array(vector, dtype=np.float64) * turn + 0.0).tolist() for name, vector in loads}
-        words = [f"move:{name}:{','.join(repr(float(x)) for x in vector)}" for name, vector in vectors.items()]
-    except (ValueError, TypeError, RecursionError):  # another program's
+        words = json.loads(loaded.text("loads") or "[]")
+        loads = [parse_load(text, loaded.mesh.ndim) for text in words]
+    except (ValueError, TypeError, AttributeError, RecursionError):  # another program's
         return []
-    if not words or format_of(output).is_surface or not np.isfinite(list(vectors.values())).all():
-        return []
-    if lost := [name for name in vectors if name not in loaded.sets.facets]:
+    if lost := [load.set_name for load in loads if load.set_name and load.set_name not in loaded.sets.facets]:
         log.print(escape(f"the file's loads are left out: it no longer has the sets {', '.join(lost)}"))
         return []
-    return words
+    factor = STRESS_UNITS.get(loaded.text("units") or "", STRESS_UNITS["kPa"]).kPa
+    turned = [half_turned(load) if loaded.space == "lps" else load for load in loads]
+    return [load_words(scaled(load, factor)) for load in turned]

@@ -229,6 +229,9 @@ class SolverOptions:
         ),
     ] = None
     nu: Annotated[str | None, option("LAW", f"Poisson's ratio, likewise (default {DEFAULT_NU:g}).")] = None
+    density: Annotated[str | None, option("LAW", "Density, kg/m3, likewise (water's is 1000); gravity needs it.")] = (
+        None
+    )
     bins: Annotated[
         str | None, option("K[:quantile|:log]", "Group cells into K materials, of equal width, by number, or log.")
     ] = None
@@ -242,7 +245,13 @@ class SolverOptions:
     ] = None
     loads: Annotated[
         list[str] | None,
-        option("...", "A step to run: compress:5%, or hold:SET and move:SET:X,Y,Z. May be repeated.", "--load"),
+        option(
+            "...",
+            "compress:5%, hold:SET, move:SET:X,Y,Z (mm, or free), pressure:SET:P (kPa, inwards), traction:SET:X,Y,Z "
+            "(kPa), spring:SET:K (kPa/mm), gravity:X,Y,Z (mm/s2; the earth's is 9810); 2/... is in step 2 alone. "
+            "May be repeated.",
+            "--load",
+        ),
     ] = None
     order: Annotated[int, option("1|2", "2: quadratic cells, straight-edged (.inp, .feb, .msh, .msh2).")] = 1
     units: Annotated[str, option("kPa|MPa", "Unit of stress in the file; --young is in kPa.")] = "kPa"

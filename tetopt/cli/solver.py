@@ -19,12 +19,13 @@ from tetopt.cli.options import SolverOptions
 from tetopt.io.formats import FORMATS, file_bytes, format_of, save_model
 from tetopt.model.build import labels_of, model_of
 from tetopt.model.laws import parse_any_law
-from tetopt.model.loads import known_set, parse_load
+from tetopt.model.loads import check_steps, known_set, load_words, parse_load
 from tetopt.model.materials import DEFAULT_NU, Spacing
 from tetopt.model.model import SPACES, STRESS_UNITS, Model
 from tetopt.model.sets import Box, Sets, check_free_names, merged_sets, nodes_of, parse_set, standard_sets
 from tetopt.report.tables import new_table
 
+MATERIAL_FIELDS = ("young", "nu", "density", "material")  # what a file of ours says of each cell's material
 SLOW_MATERIALS = 30_000  # CalculiX takes three times as long with as many as there are cells (tests/benchmarks)
 
 
@@ -39,11 +40,11 @@ def check_solver_options(output: Path, solver: SolverOptions, has_materials: boo
     form = format_of(output)
     if form.is_surface and (solver.young or solver.bins or solver.sets or solver.loads):
         raise InputError(f"{output}: holds the boundary alone; leave out --young, --bins, --set and --load")
-    for name, law in (("young", solver.young), ("nu", solver.nu)):
+    for name, law in (("young", solver.young), ("nu", solver.nu), ("density", solver.density)):
         if law is not None:
             parse_any_law(law, name)
-    if solver.nu is not None and solver.young is None and not has_materials:
-        raise InputError("--nu: there is no --young")
+            if solver.young is None and not has_materials:
+                raise InputError(f"--{name}: there is no --young")
     parsed_bins(solver.bins)
     if solver.units not in STRESS_UNITS:
         raise InputError(f"--units: expected {' or '.join(STRESS_UNITS)}, got {solver.units}")
@@ -75,16 +76,20 @@ def solver_model(
     """The model that the options ask for, of a mesh with the sets `known_sets`."""
     young: Any = solver.young
     nu: Any = solver.nu
+    density: Any = solver.density
     if young is None and "young" in cell_data:  # painted before
         young = np.asarray(cell_data["young"], dtype=np.float64)
         nu = np.asarray(cell_data["nu"], dtype=np.float64) if nu is None and "nu" in cell_data else nu
+        if density is None and "density" in cell_data:
+            density = np.asarray(cell_data["density"], dtype=np.float64)
     elif nu is None and "nu" in cell_data:
         log.print(f"nu: of --young or {DEFAULT_NU:g}; what the mesh's file has is left")
-    fields = {name: values for name, values in cell_data.items() if name not in ("young", "nu", "material")}
+    fields = {name: values for name, values in cell_data.items() if name not in MATERIAL_FIELDS}
     bins, spacing = parsed_bins(solver.bins)
     return model_of(
-        mesh, image, young=young, nu=nu, sets=solver.sets or (), loads=solver.loads or (), bins=bins, spacing=spacing,
-        order=solver.order, cell_data=fields, about={"tetopt": tetopt.__version__, **about}, known_sets=known_sets,
+        mesh, image, young=young, nu=nu, density=density, sets=solver.sets or (), loads=solver.loads or (), bins=bins,
+        spacing=spacing, order=solver.order, cell_data=fields, known_sets=known_sets,
+        about={"tetopt": tetopt.__version__, **about},
     )  # fmt: skip
 
 
@@ -111,7 +116,9 @@ def check_early(output: Path, solver: SolverOptions, image: Image, build: Callab
                 f"{image.data.min():g}"
             )
     names = {name for request in requests for name in request.names()}
-    loaded = [parse_load(text, image.ndim).name for text in solver.loads or ()]
+    loads = [parse_load(text, image.ndim) for text in solver.loads or ()]
+    check_steps(loads)
+    loaded = [load.set_name for load in loads]
     is_certain = not any(name in names or name.startswith("interface_") for name in loaded)
     model = build(replace(solver, sets=None, loads=solver.loads if is_certain else None))
     for request in requests:
@@ -165,8 +172,7 @@ def _lines(output: Path, model: Model, solver: SolverOptions) -> Iterator[str]:
         mean, largest = materials.binning.mean, materials.binning.largest
         yield f"bins: modulus off by {mean:.2%} in the mean by volume, {largest:.2%} at most"
     for load in () if form.is_surface else model.loads:
-        where = ", ".join(f"{x:.6g}" for x in load.displacement)
-        yield f"load: {load.set_name} {'held' if not load.displacement.any() else f'moved by {where} mm'}"
+        yield f"load: {load_words(load)}"
     if model.loads and not (form.runs or form.is_surface):
         yield "the format runs no step: the loads are in the file as text"
     low, high = model.mesh.points.min(axis=0), model.mesh.points.max(axis=0)

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
-from tetopt.io.tags import check_apart, material_names, without_cell_data
+from tetopt.io.tags import check_apart, check_kinds, material_names, without_cell_data
 from tetopt.io.text import blocks, rows
 from tetopt.model.materials import cells_of
 from tetopt.model.model import Model, described, element_facets, elements
@@ -66,6 +66,7 @@ def _check(model: Model) -> None:
         raise InputError(
             "abaqus: loads, but no materials to press on; give a law of the modulus (--young) or leave out the loads"
         )
+    check_kinds(model, "abaqus", ("displacement",), 1)
     check_apart([ALL_ELEMENTS, *material_names(model, {})], model.sets.cells)
 
 
@@ -105,7 +106,8 @@ def _step(model: Model) -> list[str]:
     conditions = [
         f"{load.set_name}, {line}\n"
         for load in model.loads
-        for line in rows(dofs, dofs, _fitting(load.displacement), separator=", ").splitlines()
+        for each in [~np.isnan(load.numbers)]
+        for line in rows(dofs[each], dofs[each], _fitting(load.numbers[each]), separator=", ").splitlines()
     ]
     reactions = [f"*NODE PRINT, NSET={load.set_name}, TOTALS=YES\nRF\n" for load in model.loads]
     return [

@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
-from tetopt.io.tags import as_scalars
+from tetopt.io.tags import as_scalars, check_kinds
 from tetopt.io.text import rows, xml_comment
 from tetopt.model.loads import Load
 from tetopt.model.materials import Materials, cells_of
@@ -112,6 +112,7 @@ def _checked(model: Model) -> Materials:
         raise InputError("febio: a part needs a material; give a law of the modulus (--young)")
     if taken := {YOUNG_MAP, NU_MAP} & model.cell_data.keys():
         raise InputError(f'febio: the file\'s map of a modulus is called "{min(taken)}"; call the cell data otherwise')
+    check_kinds(model, "febio", ("displacement",), 1)
     return model.materials
 
 
@@ -204,7 +205,7 @@ def _loads(loads: tuple[Load, ...]) -> list[str]:
 
 
 def _condition(load: Load) -> str:
-    if not load.displacement.any():
+    if (load.numbers == 0.0).all():
         return (
             f'<bc name="hold {load.set_name}" type="zero displacement" node_set="{load.set_name}">\n'
             "<x_dof>1</x_dof>\n<y_dof>1</y_dof>\n<z_dof>1</z_dof>\n</bc>\n"
@@ -212,7 +213,8 @@ def _condition(load: Load) -> str:
     return "".join(
         f'<bc name="move {load.set_name} {dof}" type="prescribed displacement" node_set="{load.set_name}">\n'
         f'<dof>{dof}</dof>\n<value lc="1">{value!r}</value>\n<relative>0</relative>\n</bc>\n'
-        for dof, value in zip("xyz", load.displacement.tolist(), strict=True)
+        for dof, value in zip("xyz", load.numbers.tolist(), strict=True)
+        if not np.isnan(value)
     )
 
 

@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
+from tetopt.io.tags import check_kinds
 from tetopt.io.text import blocks, rows, xml_comment
 from tetopt.model.loads import Load
 from tetopt.model.materials import Materials
@@ -85,6 +86,9 @@ def _checked(model: Model) -> Materials:
         raise InputError(
             f"sofa: expected 0 <= nu < 0.5, got {model.materials.nu.min():g}, which SOFA would replace; give another"
         )
+    check_kinds(model, "sofa", ("displacement",), 1)
+    if any(np.isnan(load.numbers).any() for load in model.loads):
+        raise InputError("sofa: a set moves in all directions or in none; give numbers instead of free, or take .inp")
     return model.materials
 
 
@@ -107,9 +111,9 @@ def _force_field(materials: Materials) -> str:
 def _constraint(load: Load, nodes: NDArray[np.int64]) -> str:
     """The indices are written out: a link to those of a set could only lead to what SOFA makes later."""
     indices = f'template="Vec3" topology="@mesh" indices="\n{blocks(nodes)}"'
-    if not load.displacement.any():
+    if (load.numbers == 0.0).all():
         return f'<FixedProjectiveConstraint name="hold_{load.set_name}" {indices}/>\n'
-    whole = " ".join(map(repr, load.displacement.tolist()))
+    whole = " ".join(map(repr, load.numbers.tolist()))
     return (
         f'<LinearMovementProjectiveConstraint name="move_{load.set_name}" {indices}\n'
         f'keyTimes="0 1 {FOREVER_SECONDS}" movements="0 0 0  {whole}  {whole}"/>\n'

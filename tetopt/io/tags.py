@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from tetopt.errors import InputError
 from tetopt.geometry.topology import facets
 from tetopt.mesh import Mesh
+from tetopt.model.loads import count_of_steps, load_words
 from tetopt.model.model import Model, described
 
 
@@ -94,15 +95,26 @@ def check_apart(names: list[str], taken: dict[str, NDArray[np.int64]]) -> None:
         raise InputError(f'set {both[0]}: the file calls something else "{both[0]}"; call the set otherwise')
 
 
+def check_kinds(model: Model, form: str, kinds: tuple[str, ...], most_steps: int) -> None:
+    """InputError for loads that a format has no words for, or more steps than it can tell apart."""
+    if others := [load for load in model.loads if load.kind not in kinds]:
+        raise InputError(f"{form}: no place for the load {load_words(others[0])}; .inp holds it")
+    if (count := count_of_steps(model.loads)) > most_steps:
+        raise InputError(f"{form}: a file is one step, got {count}; write a file for each, without the others' loads")
+
+
 def remarks(model: Model) -> list[str]:
     """Lines for the head of a mesh file: `described`, each material's constants, the loads."""
     lines = described(model)
     if model.materials is not None:
         pairs = zip(model.materials.young.tolist(), model.materials.nu.tolist(), strict=True)
-        lines += [f"material_{k}: young {young!r} {model.units}, nu {nu!r}" for k, (young, nu) in enumerate(pairs, 1)]
-    for load in model.loads:
-        vector = " ".join(map(repr, load.displacement.tolist()))
-        lines.append(f"load, which this format has no place for: nodes of {load.set_name} displaced by {vector} mm")
+        density = [] if model.materials.density is None else model.materials.density.tolist()
+        masses = [f", density {each!r} kg/m3" for each in density] or [""] * len(model.materials.young)
+        lines += [
+            f"material_{k}: young {young!r} {model.units}, nu {nu!r}{mass}"
+            for k, ((young, nu), mass) in enumerate(zip(pairs, masses, strict=True), 1)
+        ]
+    lines += [f"load, which this format has no place for: {load_words(load)}" for load in model.loads]
     return lines
 
 

@@ -1,8 +1,8 @@
 """Meshes and models as VTK's files: XML (.vtu) and legacy (.vtk), through VTK's own writers.
 
 Points in world mm, cells positively oriented, of one type. What is on each cell is cell data; with materials also
-`young`, `nu` and `material`, from 1. Texts are field data, held as bytes of UTF-8: meshio refuses files with VTK's
-string arrays, and pyvista writes only ASCII into them.
+`young`, `nu`, `material`, from 1, and, if there is one, `density`, kg/m3. Texts are field data, held as bytes of UTF-8:
+meshio refuses files with VTK's string arrays, and pyvista writes only ASCII into them. `loads` are the words of --load.
 
 A facet set is field data "facets:NAME", rows (cell, local node opposite), and its nodes are point data "on_NAME", 1 or
 0, to be seen in ParaView; a cell set is field data "cells:NAME", cell numbers from 0. Other programs keep field data
@@ -26,6 +26,7 @@ from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
 
 from tetopt.image import Image
 from tetopt.mesh import Mesh
+from tetopt.model.loads import load_words
 from tetopt.model.model import Model
 from tetopt.model.sets import SET_NAME, Box, Sets, nodes_of
 
@@ -108,11 +109,14 @@ def model_grid(model: Model) -> pyvista.UnstructuredGrid:
         grid.cell_data["young"] = model.materials.young[of_cell]
         grid.cell_data["nu"] = model.materials.nu[of_cell]
         grid.cell_data["material"] = of_cell + 1
-        texts["units"] = model.units
+        if model.materials.density is not None:
+            grid.cell_data["density"] = model.materials.density[of_cell]
         if model.materials.binning is not None:
             texts["binning"] = model.materials.binning._asdict()
+    if model.materials is not None or model.loads:
+        texts["units"] = model.units
     if model.loads:
-        texts["loads"] = [[load.set_name, load.displacement.tolist()] for load in model.loads]
+        texts["loads"] = [load_words(load) for load in model.loads]
     add_texts(grid, texts)
     add_sets(grid, model.mesh, model.sets)
     return grid

@@ -41,7 +41,7 @@ beside this one. It reads no floating point numbers of cells from XDMF, hence th
 there, on these same cells.
 
 In the grid "mesh" <Information Name="young"/> and <Information Name="nu"/> list what the materials 1, 2, ... have. In
-the domain <Information Name="load" Value="superior 0.0 0.0 0.0"/> is a facet set and its nodes' displacement, mm, and
+the domain <Information Name="load" Value="hold:superior"/> is a load in the words of `tetopt.model.loads`, and
 <Information Name="about"/> says where the file comes from, in what coordinates and units.
 
 VTK, and with it pyvista and ParaView, reads the grids as blocks, as long as no list is longer than 10 MB, which that of
@@ -59,6 +59,7 @@ from tetopt.errors import InputError
 from tetopt.geometry.topology import facets
 from tetopt.io.tags import as_scalars, tagged
 from tetopt.io.text import rows
+from tetopt.model.loads import load_words
 from tetopt.model.model import Model, described
 from tetopt.model.sets import facet_triples
 
@@ -76,7 +77,7 @@ def xdmf(model: Model) -> bytes:
     A facet is listed once, its nodes facing out of the cell that the first of its sets holds it by; where a set holds
     it by the other one, its tag is also in <Information Name="NAME turned"/>. dolfinx itself gives facets no side.
     Cell data of 3 columns is written as vectors, of other numbers of columns as that many fields NAME_0, NAME_1, ...;
-    materials replace cell data of the names material, young and nu.
+    materials replace cell data of the names material, young, nu and density.
 
     Raises
     ------
@@ -86,7 +87,7 @@ def xdmf(model: Model) -> bytes:
     """
     _check(model)
     parts = [_information("about", line) for line in described(model)]
-    parts += [_information("load", f"{load.set_name} {_listed(load.displacement)}") for load in model.loads]
+    parts += [_information("load", load_words(load)) for load in model.loads]
     parts.append(_mesh_grid(model))
     if model.sets.facets:
         parts.append(_facet_grid(model))
@@ -114,6 +115,8 @@ def _mesh_grid(model: Model) -> str:
     if model.materials is not None:
         young, nu, of_cell = model.materials.young, model.materials.nu, model.materials.of_cell
         own = {"material": of_cell + 1, "young": young[of_cell], "nu": nu[of_cell]}
+        if model.materials.density is not None:
+            own["density"] = model.materials.density[of_cell]
         fields = own | {name: values for name, values in fields.items() if name not in own}
         table = _information("young", _listed(young)) + _information("nu", _listed(nu))
     columns: dict[str, NDArray] = {}

@@ -16,7 +16,7 @@ from tetopt.model.averages import cell_values, cell_young
 from tetopt.model.fields import cell_fields
 from tetopt.model.laws import ByLabel, Law, has_column, law_values, parse_any_law, young_from
 from tetopt.model.loads import parse_loads
-from tetopt.model.materials import DEFAULT_NU, Materials, Spacing, binned, by_label, materials
+from tetopt.model.materials import DEFAULT_NU, Materials, Spacing, binned, by_label, density_of, materials
 from tetopt.model.model import Model
 from tetopt.model.sets import Box, Sets, box_of, standard_sets, with_requested
 
@@ -27,6 +27,7 @@ def model_of(
     *,
     young: str | float | NDArray[np.float64] | Law | ByLabel = None,
     nu: str | float | NDArray[np.float64] | Law | ByLabel = None,
+    density: str | float | NDArray[np.float64] | Law | ByLabel = None,
     sets: Iterable[str] = (),
     loads: Iterable[str] = (),
     bins: int | None = None,
@@ -49,6 +50,9 @@ def model_of(
         a law of the intensity or of the label (`tetopt.model.laws.parse_any_law`), of which with an image the mean
         over the voxels of the cell is taken, Eq. (2), and else its value at the cell's "mean". Without `young` the
         model has no materials; without `nu` it is the column "nu" of the file that `young` names, or 0.45.
+    density : number, (M,) array, law or text, optional
+        kg/m3, above 0, likewise; without it the column "density" of the file that `young` names, or none. Gravity
+        needs it.
     sets : iterable of str
         Further sets, see `tetopt.model.sets.with_requested`.
     loads : iterable of str
@@ -70,7 +74,7 @@ def model_of(
     Raises
     ------
     InputError
-        As the functions named above; a dimension or an order that there is not.
+        As the functions named above; a dimension or an order that there is not; gravity without a density.
     """
     if order not in (1, 2):
         raise InputError(f"order: expected 1 or 2, got {order}")
@@ -84,6 +88,8 @@ def model_of(
     labels = labels_of(cell_data, len(mesh.cells))
     if nu is None:
         nu = young if isinstance(young, str) and has_column(young, "nu") else DEFAULT_NU
+    if density is None and isinstance(young, str) and has_column(young, "density"):
+        density = young
     if known_sets is None:
         box = box_of(image) if box is None and image is not None else box
         known_sets = standard_sets(mesh, box, labels)
@@ -92,12 +98,18 @@ def model_of(
     if young is not None:
         moduli = _values(young, "young", mesh, image, mean, labels)
         ratios = _values(nu, "nu", mesh, image, mean, labels)
-        table = materials(moduli, ratios, len(mesh.cells))
+        masses = None if density is None else _values(density, "density", mesh, image, mean, labels)
+        table = materials(moduli, ratios, len(mesh.cells), masses)
         if bins is not None:
             table = binned(table, volumes(mesh.points, mesh.cells), bins, spacing)
     elif bins is not None:
         raise InputError("bins: there are no moduli to group; give --young")
-    return Model(mesh, cell_data, all_sets, table, parse_loads(loads, mesh, all_sets), order, about=dict(about or {}))
+    elif density is not None:
+        raise InputError("density: a material has a modulus, too; give --young")
+    parsed = parse_loads(loads, mesh, all_sets)
+    if any(load.kind == "gravity" for load in parsed):
+        density_of(table)  # or it is refused
+    return Model(mesh, cell_data, all_sets, table, parsed, order, about=dict(about or {}))
 
 
 def labels_of(cell_data: dict[str, NDArray], n_cells: int) -> NDArray[np.int64] | None:

@@ -1,4 +1,9 @@
-"""Loads as written on a command line: sets that are held or moved, their nodes bonded."""
+"""Loads as written on a command line: what holds facet sets, moves them, presses, pulls or weighs, in steps.
+
+Each step is a load case of its own, from the undeformed state; a load without a step is in all of them. What pushes
+facets acts on their nodes, by `facet_weights`, which solvers and writers share, so that all of them solve the same
+equations.
+"""
 
 from __future__ import annotations
 
@@ -10,17 +15,38 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
+from tetopt.geometry.quadratic import quadratic, quadratic_facet_nodes
+from tetopt.geometry.topology import facets
 from tetopt.mesh import Mesh
 from tetopt.model.sets import FACE_NAMES, Sets, facet_triples, finite_numbers, nodes_of
 
 MOST_COMPRESSION_PERCENT = 50.0  # a linear step presses no further
+FREE_WORD = "free"  # a component of move:SET:X,Y,Z that is not prescribed
+# By kind, what follows SET: how the numbers are written (n stands for one a dimension), and their unit.
+LOAD_FORMS = {
+    "move": ("SET:X,Y,Z", "n", "mm or free"),
+    "pressure": ("SET:P", "1", "kPa"),
+    "traction": ("SET:X,Y,Z", "n", "kPa"),
+    "spring": ("SET:K", "1", "kPa/mm"),
+    "gravity": ("X,Y,Z", "n", "mm/s2"),
+}
+FACET_FORCES = ("pressure", "traction", "spring")  # kinds that act on facets from outside
 
 
 class Load(NamedTuple):
-    """The nodes of a facet set are displaced by so much, in all directions: 0 holds them."""
+    """One load, of one kind.
 
-    set_name: str
-    displacement: NDArray[np.float64]  # (n,) mm
+    - "displacement": the nodes of the set move by `numbers` (n,), mm; 0 holds them, NaN leaves a component free.
+    - "pressure": (1,) kPa, against the facets, inwards, along their undeformed normals.
+    - "traction": (n,) kPa, force by undeformed area along the world's axes.
+    - "spring": (1,) kPa/mm, stiffness by area of what surrounds the set, the same in all directions.
+    - "gravity": (n,) mm/s2, acts on all cells, whose materials have a density.
+    """
+
+    kind: str
+    set_name: str  # a facet set; "" for gravity
+    numbers: NDArray[np.float64]  # in the model's units and space
+    step: int = 0  # 0: in every step; 1, 2, ...: in that one alone
 
 
 def parse_loads(texts: Iterable[str], mesh: Mesh, sets: Sets) -> tuple[Load, ...]:
@@ -29,72 +55,122 @@ def parse_loads(texts: Iterable[str], mesh: Mesh, sets: Sets) -> tuple[Load, ...
     Parameters
     ----------
     texts : iterable of str
-        "hold:SET"; "move:SET:X,Y,Z", mm; or "compress:5%", which holds the face of the box with the largest z and moves
-        the opposite one towards it by 5 % of the distance between the two, as `tetopt fem` does.
+        "hold:SET"; "move:SET:X,Y,Z", mm, where a component may be "free"; "compress:5%", which holds the face of the
+        box with the largest z and moves the opposite one towards it by 5 % of the distance between the two, as `tetopt
+        fem` does; "pressure:SET:P", kPa, inwards; "traction:SET:X,Y,Z", kPa; "spring:SET:K", kPa/mm;
+        "gravity:X,Y,Z", mm/s2. A prefix "2/" puts a load into step 2 alone; others are in every step. Forces on the
+        same facets add up.
     mesh : Mesh
     sets : Sets
 
     Raises
     ------
     InputError
-        Other words, a set that is not there, or a node that would go two ways.
+        Other words or numbers; a set that is not there; steps that leave one out; a component of a node's displacement
+        that is prescribed twice in a step; forces on facets between two cells.
     """
     loads = tuple(load for text in texts for load in _loads(text, mesh, sets))
-    if loads and not any(load.displacement.any() for load in loads):
-        raise InputError("load: everything is held and nothing moves; add move:SET:X,Y,Z")
-    if len(loads) == 1:
-        raise InputError(f'load: nothing but "{loads[0].set_name}" is loaded, and all would move along; add hold:SET')
-    is_held = np.zeros(len(mesh.points), dtype=bool)
+    check_steps(loads)
     for load in loads:
-        nodes = nodes_of(mesh, sets.facets[load.set_name])
-        if is_held[nodes].any():
-            raise InputError(
-                f'load: {int(is_held[nodes].sum())} nodes of set "{load.set_name}" are in another loaded set, too, and '
-                "cannot go both ways; take sets apart, such as --set NAME=plane:X,Y,Z:NX,NY,NZ:D"
-            )
-        is_held[nodes] = True
+        if load.kind in FACET_FORCES:
+            _check_outer(load, mesh, sets)
+    for step in range(1, count_of_steps(loads) + 1):
+        _check_apart([load for load in in_step(loads, step) if load.kind == "displacement"], mesh, sets)
     return loads
 
 
-class LoadRequest(NamedTuple):
-    """A load that a user asks for."""
-
-    kind: str  # "hold", "move" or "compress"
-    name: str  # of the set; "" of a compression
-    numbers: NDArray[np.float64]  # displacement, mm, or per cent
+def count_of_steps(loads: Iterable[Load]) -> int:
+    """How many steps there are: 1 if no load is of one alone."""
+    return max([1, *(load.step for load in loads)])
 
 
-def parse_load(text: str, ndim: int) -> LoadRequest:
-    """A load from words, see `parse_loads`, before any set is looked for.
+def in_step(loads: Iterable[Load], step: int) -> tuple[Load, ...]:
+    """The loads of a step, from 1: its own, and those of all."""
+    return tuple(load for load in loads if load.step in (0, step))
+
+
+def check_steps(loads: Iterable[Load]) -> None:
+    """InputError if steps leave a number out."""
+    numbers = {load.step for load in loads} - {0}
+    if missing := sorted(set(range(1, max(numbers, default=0) + 1)) - numbers):
+        raise InputError(
+            f"load: there is a step {max(numbers)}, but no load is of step {missing[0]} alone; number steps from 1"
+        )
+
+
+def parse_load(text: str, ndim: int) -> Load:
+    """A load from words, see `parse_loads`, before any set is looked for; "compress" is a kind still, in per cent.
 
     Raises
     ------
     InputError
         Other words or numbers.
     """
-    kind, _, rest = text.partition(":")
+    step, words = _step_of(text)
+    kind, _, rest = words.partition(":")
     if kind == "hold":
-        return LoadRequest(kind, rest, np.zeros(ndim))
-    if kind == "move":
-        name, _, vector = rest.rpartition(":")
-        numbers = finite_numbers(vector)
-        if numbers.shape != (ndim,):
-            raise InputError(f'load: expected move:SET: and {ndim} numbers in mm, got "{text}"')
-        return LoadRequest(kind, name, numbers)
+        return Load("displacement", rest, np.zeros(ndim), step)
     if kind == "compress":
         percent = finite_numbers(rest.removesuffix("%"))
         if not rest.endswith("%") or len(percent) != 1 or not 0.0 < percent[0] <= MOST_COMPRESSION_PERCENT:
             limits = f"above 0 and up to {MOST_COMPRESSION_PERCENT:g}"
             raise InputError(f'load: expected compress:P% with P {limits}, got "{text}"')
-        return LoadRequest(kind, "", percent)
-    raise InputError(f'load: expected compress:5%, hold:SET or move:SET:X,Y,Z, got "{text}"')
+        return Load(kind, "", percent, step)
+    if kind not in LOAD_FORMS:
+        forms = ", ".join(f"{each}:{form}" for each, (form, _, _) in LOAD_FORMS.items())
+        raise InputError(f'load: expected compress:5%, hold:SET, {forms}, got "{text}"')
+    form, size, unit = LOAD_FORMS[kind]
+    name, _, numbers_text = rest.rpartition(":") if "SET" in form else ("", "", rest)
+    count = ndim if size == "n" else 1
+    numbers = _moved(numbers_text) if kind == "move" else finite_numbers(numbers_text)
+    if len(numbers) != count or (kind == "move" and np.isnan(numbers).all()):
+        what = f"{count} finite number{'s' * (count > 1)} in {unit}"
+        raise InputError(f'load: expected {kind}:{form} with {what}, got "{text}"')
+    if kind == "spring" and numbers[0] <= 0.0:
+        raise InputError(f'load: expected spring:{form} with a stiffness above 0, got "{text}"')
+    return Load("displacement" if kind == "move" else kind, name, numbers, step)
+
+
+def load_words(load: Load) -> str:
+    """A load in the words of `parse_loads`, to the last bit.
+
+    Examples
+    --------
+    >>> load_words(Load("displacement", "left", np.array([0.5, np.nan, 0.0]), 2))
+    '2/move:left:0.5,free,0.0'
+    """
+    prefix = f"{load.step}/" if load.step else ""
+    if load.kind == "displacement" and (load.numbers == 0.0).all():
+        return f"{prefix}hold:{load.set_name}"
+    kind = "move" if load.kind == "displacement" else load.kind
+    name = "" if load.kind == "gravity" else f"{load.set_name}:"
+    numbers = [FREE_WORD if np.isnan(number) else repr(number) for number in load.numbers.tolist()]
+    return f"{prefix}{kind}:{name}{','.join(numbers)}"
+
+
+def _step_of(text: str) -> tuple[int, str]:
+    """The step, 0 for all, and the words behind it."""
+    prefix, slash, words = text.partition("/")
+    if not slash or ":" in prefix:
+        return 0, text
+    if not prefix.isdecimal() or int(prefix) < 1:
+        raise InputError(f'load: expected a step of 1 or more before the stroke, as in 2/{words}, got "{text}"')
+    return int(prefix), words
+
+
+def _moved(text: str) -> NDArray[np.float64]:
+    """Numbers between commas, NaN where the word is free; none if there is anything else."""
+    parts = [part.strip() for part in text.split(",")]
+    is_free = np.array([part == FREE_WORD for part in parts])
+    numbers = finite_numbers(",".join("0" if free else part for part, free in zip(parts, is_free, strict=True)))
+    return np.where(is_free, np.nan, numbers) if len(numbers) else numbers
 
 
 def _loads(text: str, mesh: Mesh, sets: Sets) -> list[Load]:
-    request = parse_load(text, mesh.ndim)
-    if request.kind == "compress":
-        return _compression(float(request.numbers[0]), mesh, sets)
-    return [Load(known_set(request.name, sets), request.numbers)]
+    load = parse_load(text, mesh.ndim)
+    if load.kind == "compress":
+        return _compression(load, mesh, sets)
+    return [load if load.kind == "gravity" else load._replace(set_name=known_set(load.set_name, sets))]
 
 
 def known_set(name: str, sets: Sets) -> str:
@@ -116,22 +192,118 @@ def known_set(name: str, sets: Sets) -> str:
     raise InputError(f'load: there is no set of facets "{name}"; {hint}')
 
 
-def _compression(percent: float, mesh: Mesh, sets: Sets) -> list[Load]:
+def _compression(load: Load, mesh: Mesh, sets: Sets) -> list[Load]:
     low, high = FACE_NAMES[mesh.ndim][-1]
     if missing := [name for name in (low, high) if name not in sets.facets]:
         raise InputError(
             f"load: the mesh has no facets on the box's face {' and '.join(missing)}; give hold:SET and move:SET:X,Y,Z "
             f"of {', '.join(sets.facets)}"
         )
-    return [Load(high, np.zeros(mesh.ndim)), Load(low, 0.01 * percent * _across(mesh, sets, low, high))]
+    push = 0.01 * float(load.numbers[0]) * _across(mesh, sets, low, high)
+    return [
+        Load("displacement", high, np.zeros(mesh.ndim), load.step),
+        Load("displacement", low, push, load.step),
+    ]
 
 
 def _across(mesh: Mesh, sets: Sets, low: str, high: str) -> NDArray[np.float64]:
     """From one of two parallel faces to the other along their normal, (n,) mm."""
-    corners = mesh.points[facet_triples(mesh.cells, sets.facets[low])]
-    edges = corners[:, 1:] - corners[:, :1]
-    areas = np.cross(edges[:, 0], edges[:, 1]) if mesh.ndim == 3 else edges[:, 0, ::-1] * np.array([1.0, -1.0])
+    areas = area_vectors(mesh, sets.facets[low])
     inward = -areas.sum(axis=0)
     inward /= np.sqrt((inward**2).sum())
-    across = mesh.points[nodes_of(mesh, sets.facets[high])[0]] - corners[0, 0]
+    corner = mesh.points[facet_triples(mesh.cells, sets.facets[low])[0, 0]]
+    across = mesh.points[nodes_of(mesh, sets.facets[high])[0]] - corner
     return inward * float((across * inward).sum()) + 0.0  # + 0.0: no -0
+
+
+def _check_outer(load: Load, mesh: Mesh, sets: Sets) -> None:
+    rows, shared = sets.facets[load.set_name], facets(mesh.cells)
+    if inner := int((shared.n_cells[shared.of_cell[rows[:, 0], rows[:, 1]]] > 1).sum()):
+        raise InputError(
+            f'load: {inner} of the {len(rows)} facets of "{load.set_name}" lie between two cells, where nothing '
+            f"outside can act ({load.kind}); take a set of the boundary, mesh one side alone (--mask), or move the set"
+        )
+
+
+def _check_apart(loads: list[Load], mesh: Mesh, sets: Sets) -> None:
+    is_prescribed = np.zeros(mesh.points.shape, dtype=bool)
+    for load in loads:
+        nodes = nodes_of(mesh, sets.facets[load.set_name])
+        components = ~np.isnan(load.numbers)
+        twice = (is_prescribed[nodes] & components).any(axis=1)
+        if twice.any():
+            raise InputError(
+                f'load: {int(twice.sum())} nodes of set "{load.set_name}" are in another loaded set, too, and '
+                "cannot go both ways; take sets apart, such as --set NAME=plane:X,Y,Z:NX,NY,NZ:D"
+            )
+        is_prescribed[nodes] |= components
+
+
+# Forces on facets
+
+
+def area_vectors(mesh: Mesh, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Outward normals of facets (K, 2), as long as each is large, (K, n), mm2 (in 2-D mm)."""
+    corners = mesh.points[facet_triples(mesh.cells, rows)]
+    edges = corners[:, 1:] - corners[:, :1]
+    if mesh.ndim == 3:
+        return 0.5 * np.cross(edges[:, 0], edges[:, 1])
+    return edges[:, 0, ::-1] * np.array([1.0, -1.0])
+
+
+def facet_weights(mesh: Mesh, rows: NDArray[np.int64], order: int = 1) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Nodes of facets and the integrals of their shape functions over the facets, (K, w) each.
+
+    What a constant traction does to each node, mm2 (in 2-D mm, by mm of thickness); see Zienkiewicz and Taylor, The
+    Finite Element Method, volume 1, on consistent nodal forces.
+
+    Parameters
+    ----------
+    mesh : Mesh
+    rows : (K, 2) int64
+        Facets, see `tetopt.model.sets`.
+    order : {1, 2}
+        Nodes of order 2 are rows of `tetopt.geometry.quadratic.quadratic`. In 3-D a facet's area A then goes to the
+        midpoints of its edges, A/3 each, and nothing to its corners; in 2-D an edge's length is shared as Simpson's
+        rule does, L/6, L/6 and 4 L/6 in the middle. For order 1 each corner gets the same share.
+    """
+    areas = np.sqrt((area_vectors(mesh, rows) ** 2).sum(axis=1))
+    if order == 1:
+        nodes = facet_triples(mesh.cells, rows)
+        shares = np.full(mesh.ndim, 1.0 / mesh.ndim)
+    else:
+        nodes = quadratic_facet_nodes(quadratic(mesh.points, mesh.cells)[1], rows)
+        shares = np.array([0.0] * 3 + [1.0 / 3.0] * 3 if mesh.ndim == 3 else [1.0 / 6.0, 1.0 / 6.0, 4.0 / 6.0])
+    return nodes, areas[:, None] * shares
+
+
+def facet_forces(mesh: Mesh, sets: Sets, load: Load, order: int = 1) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """What a pressure or traction does to nodes: their numbers (P,), ascending, and forces (P, n), mN if it is in kPa.
+
+    Nodes whose share is 0 are left out.
+    """
+    rows = sets.facets[load.set_name]
+    nodes, weights = facet_weights(mesh, rows, order)
+    if load.kind == "pressure":
+        areas = area_vectors(mesh, rows)
+        stress = -load.numbers * areas / np.sqrt((areas**2).sum(axis=1))[:, None]
+    else:
+        stress = np.broadcast_to(load.numbers, (len(rows), mesh.ndim))
+    forces = weights[:, :, None] * stress[:, None, :]
+    return _summed(nodes[weights != 0.0], forces[weights != 0.0])
+
+
+def spring_constants(
+    mesh: Mesh, sets: Sets, load: Load, order: int = 1
+) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """The springs from nodes to the ground: numbers (P,), ascending, and stiffness (P,), mN/mm if it is in kPa/mm."""
+    nodes, weights = facet_weights(mesh, sets.facets[load.set_name], order)
+    which, total = _summed(nodes[weights != 0.0], weights[weights != 0.0][:, None])
+    return which, load.numbers[0] * total[:, 0]
+
+
+def _summed(nodes: NDArray[np.int64], values: NDArray[np.float64]) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Distinct nodes, ascending, and the sums of the rows (P, w) of each."""
+    distinct, which = np.unique(nodes, return_inverse=True)
+    columns = [np.bincount(which.ravel(), weights=column, minlength=len(distinct)) for column in values.T]
+    return distinct, np.stack(columns, axis=1)

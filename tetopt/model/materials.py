@@ -33,32 +33,56 @@ class Materials(NamedTuple):
     nu: NDArray[np.float64]  # (K,) Poisson's ratio
     of_cell: NDArray[np.int64]  # (M,) 0 to K - 1
     binning: BinningError | None = None  # if they stand for more moduli
+    density: NDArray[np.float64] | None = None  # (K,) kg/m3 in every system of units
 
 
-def materials(young: ArrayLike, nu: ArrayLike, n_cells: int) -> Materials:
-    """Cells of equal modulus and ratio are of one material.
+def materials(young: ArrayLike, nu: ArrayLike, n_cells: int, density: ArrayLike | None = None) -> Materials:
+    """Cells of equal modulus, ratio and density are of one material.
 
     Parameters
     ----------
     young, nu : (M,) arrays, or one number for all
         Above 0; above -1 and below 0.5.
     n_cells : int
+    density : (M,) array, or one number for all, optional
+        kg/m3, above 0.
 
     Raises
     ------
     InputError
         Values out of range, or not one for each cell.
     """
-    pairs = np.column_stack([_of_cells("young", young, n_cells), _of_cells("nu", nu, n_cells)])
-    checked_young(pairs[:, 0])
-    outside = np.flatnonzero(~((pairs[:, 1] > -1.0) & (pairs[:, 1] < 0.5)))
+    columns = [_of_cells("young", young, n_cells), _of_cells("nu", nu, n_cells)]
+    checked_young(columns[0])
+    outside = np.flatnonzero(~((columns[1] > -1.0) & (columns[1] < 0.5)))
     if len(outside):
         raise InputError(
-            f"nu: expected -1 < nu < 0.5, got {len(outside)} cells with others, the first {pairs[outside[0], 1]:g} in "
-            f"cell {outside[0]}; for nearly incompressible tissue take 0.45 to 0.49"
+            f"nu: expected -1 < nu < 0.5, got {len(outside)} cells with others, the first {columns[1][outside[0]]:g} "
+            f"in cell {outside[0]}; for nearly incompressible tissue take 0.45 to 0.49"
         )
-    kinds, of_cell = np.unique(pairs, axis=0, return_inverse=True)
-    return Materials(kinds[:, 0].copy(), kinds[:, 1].copy(), of_cell.ravel().astype(np.int64))
+    if density is not None:
+        columns.append(_checked_density(_of_cells("density", density, n_cells)))
+    kinds, of_cell = np.unique(np.column_stack(columns), axis=0, return_inverse=True)
+    values = [column.copy() for column in kinds.T]
+    masses = values[2] if len(values) == 3 else None
+    return Materials(values[0], values[1], of_cell.ravel().astype(np.int64), density=masses)
+
+
+def _checked_density(density: NDArray[np.float64]) -> NDArray[np.float64]:
+    bad = np.flatnonzero(~(np.isfinite(density) & (density > 0.0)))
+    if len(bad):
+        raise InputError(
+            f"density: expected kg/m3 above 0, got {len(bad)} cells with others, the first {density[bad[0]]:g} in cell "
+            f"{bad[0]}; water's is 1000"
+        )
+    return density
+
+
+def density_of(table: Materials | None) -> NDArray[np.float64]:
+    """The density of each material, (K,) kg/m3; InputError if there is none, which gravity needs."""
+    if table is None or table.density is None:
+        raise InputError("gravity: the cells have no density; give --density, kg/m3, such as 1000")
+    return table.density
 
 
 def _of_cells(name: str, values: ArrayLike, n_cells: int) -> NDArray[np.float64]:
@@ -99,8 +123,8 @@ def by_label(law: ByLabel, labels: NDArray[np.integer] | None) -> NDArray[np.flo
 def binned(exact: Materials, volumes: NDArray[np.float64], count: int, spacing: Spacing = "equal") -> Materials:
     """At most `count` moduli instead of all.
 
-    The modulus of a bin is the mean by volume of its cells'. Ratios are kept as they are while there are at most
-    `count` of them, else put into bins in the same way; a material is a pair of bins.
+    The modulus of a bin is the mean by volume of its cells'. Ratios, and densities, are kept as they are while there
+    are at most `count` of them, else put into bins in the same way; a material is one bin of each.
 
     Parameters
     ----------
@@ -122,10 +146,12 @@ def binned(exact: Materials, volumes: NDArray[np.float64], count: int, spacing: 
         raise InputError(f"bins: expected {', '.join(SPACINGS)}, got {spacing}")
     young, nu = exact.young[exact.of_cell], exact.nu[exact.of_cell]
     fewer = _bin_means(young, volumes, count, spacing)
-    ratios = _bin_means(nu, volumes, count, "quantile" if spacing == "quantile" else "equal")
+    linear: Spacing = "quantile" if spacing == "quantile" else "equal"
+    ratios = _bin_means(nu, volumes, count, linear)
+    density = None if exact.density is None else _bin_means(exact.density[exact.of_cell], volumes, count, linear)
     off = np.abs(fewer - young) / young
     error = BinningError(float((off * volumes).sum() / volumes.sum()), float(off.max()))
-    return materials(fewer, ratios, len(young))._replace(binning=error)
+    return materials(fewer, ratios, len(young), density)._replace(binning=error)
 
 
 def _bin_means(

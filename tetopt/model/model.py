@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import quadratic, quadratic_facet_nodes
 from tetopt.mesh import Mesh
-from tetopt.model.loads import Load
+from tetopt.model.loads import FACET_FORCES, Load
 from tetopt.model.materials import Materials
 from tetopt.model.sets import Sets, facet_triples
 from tetopt.model.skfem import skfem_mesh
@@ -44,6 +44,7 @@ class Model(NamedTuple):
     order: int = 1  # 2: straight-edged quadratic cells, see `quadratic`
     units: str = "kPa"
     space: str = "ras"  # "lps": x and y have changed sign
+    node_young: NDArray[np.float64] | None = None  # (N,) a modulus at each corner, linear within cells, instead
     about: dict[str, Any] = {}  # noqa: RUF012 - a default that nobody changes; name -> text, or what JSON can hold
 
     def to_skfem(self) -> skfem.Mesh:
@@ -75,7 +76,7 @@ def in_space(model: Model, space: str) -> Model:
         return model
     if model.mesh.ndim == 2:
         raise InputError("space: a mesh of triangles has coordinates in its own plane; leave out --space")
-    loads = tuple(Load(load.set_name, half_turn(load.displacement)) for load in model.loads)
+    loads = tuple(half_turned(load) for load in model.loads)
     mesh = Mesh(half_turn(model.mesh.points), model.mesh.cells)
     return model._replace(mesh=mesh, loads=loads, space=space)
 
@@ -85,8 +86,13 @@ def half_turn(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     return vectors * np.array([-1.0, -1.0, 1.0]) + 0.0  # + 0.0: no -0
 
 
+def half_turned(load: Load) -> Load:
+    """A load from RAS+ to LPS+ or back."""
+    return load._replace(numbers=half_turn(load.numbers)) if len(load.numbers) == 3 else load
+
+
 def in_units(model: Model, units: str) -> Model:
-    """The model with its moduli in another unit of stress, kPa or MPa.
+    """The model with its moduli, pressures, tractions and springs in another unit of stress, kPa or MPa.
 
     Raises
     ------
@@ -95,10 +101,21 @@ def in_units(model: Model, units: str) -> Model:
     """
     if units not in STRESS_UNITS:
         raise InputError(f"units: expected {' or '.join(STRESS_UNITS)}, got {units}")
-    if model.materials is None or units == model.units:
-        return model._replace(units=units)
-    scaled = model.materials.young * (STRESS_UNITS[model.units].kPa / STRESS_UNITS[units].kPa)
-    return model._replace(materials=model.materials._replace(young=scaled), units=units)
+    if units == model.units:
+        return model
+    factor = STRESS_UNITS[model.units].kPa / STRESS_UNITS[units].kPa
+    table = model.materials
+    return model._replace(
+        materials=None if table is None else table._replace(young=table.young * factor),
+        loads=tuple(scaled(load, factor) for load in model.loads),
+        node_young=None if model.node_young is None else model.node_young * factor,
+        units=units,
+    )
+
+
+def scaled(load: Load, factor: float) -> Load:
+    """A load in a unit of stress of which there are `factor` in the present one."""
+    return load._replace(numbers=load.numbers * factor) if load.kind in FACET_FORCES else load
 
 
 def described(model: Model) -> list[str]:

@@ -18,6 +18,7 @@ from tetopt.image import Image
 from tetopt.measure.fidelity import label_fidelity, mask_fidelity
 from tetopt.measure.quality import quality
 from tetopt.mesh import Mesh
+from tetopt.model.loads import load_words
 from tetopt.model.model import Model
 from tetopt.target.content import Content, plain
 
@@ -88,8 +89,10 @@ def model_summary(model: Model) -> dict[str, Any]:
     if (table := model.materials) is not None:
         young, nu = table.young, table.nu
         summary["materials"] = {"count": len(young), "young_kPa": young, "nu": nu, "binning": table.binning}
+        if table.density is not None:
+            summary["materials"]["density_kg_m3"] = table.density
     if model.loads:
-        summary["loads"] = {load.set_name: load.displacement for load in model.loads}
+        summary["loads"] = [load_words(load) for load in model.loads]
     return summary
 
 

@@ -1,0 +1,230 @@
+"""Loads in words, and what those on facets do to nodes."""
+
+import numpy as np
+import pytest
+from models import sample_image, sample_model
+
+import tetopt
+from tetopt.errors import InputError
+from tetopt.fem.elasticity import box_faces, push_of
+from tetopt.geometry.quadratic import quadratic
+from tetopt.geometry.simplex import volumes
+from tetopt.model.loads import (
+    Load,
+    area_vectors,
+    count_of_steps,
+    facet_forces,
+    facet_weights,
+    in_step,
+    load_words,
+    parse_load,
+    parse_loads,
+    spring_constants,
+)
+from tetopt.model.sets import box_of, nodes_of, standard_sets
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_a_compression_is_that_of_fem(n):
+    """The same nodes, and the same push, on an oblique box."""
+    image, model = sample_image(n), sample_model(n)
+    low, high = box_faces(image, model.mesh)
+    top, bottom = parse_loads(["compress:5%"], model.mesh, model.sets)
+    np.testing.assert_array_equal(nodes_of(model.mesh, model.sets.facets[top.set_name]), high)
+    np.testing.assert_array_equal(nodes_of(model.mesh, model.sets.facets[bottom.set_name]), low)
+    assert not top.numbers.any()
+    np.testing.assert_allclose(bottom.numbers, push_of(image, 5.0), atol=1e-12)
+
+
+def test_a_sheared_box_is_pressed_along_its_faces_normal():
+    affine = np.array([[1.0, 0, 0.2, 0], [0, 1, 0.1, 0], [0.1, 0, 1, 0], [0, 0, 0, 1]])
+    image = tetopt.Image(np.zeros((4, 4, 4)), affine)
+    mesh = tetopt.lattice(image, blocks=(1, 1, 1))
+    (_, moved) = parse_loads(["compress:2.5%"], mesh, standard_sets(mesh, box_of(image)))
+    np.testing.assert_allclose(moved.numbers, push_of(image, 2.5), atol=1e-12)
+
+
+WORDS = {  # and what they mean in 3-D
+    "hold:left": ("displacement", "left", [0.0, 0.0, 0.0], 0),
+    "move:right:0.5,0,-1e-1": ("displacement", "right", [0.5, 0.0, -0.1], 0),
+    "2/move:right:free, 0 ,free": ("displacement", "right", [np.nan, 0.0, np.nan], 2),
+    "pressure:superior:1.5": ("pressure", "superior", [1.5], 0),
+    "1/pressure:superior:-2": ("pressure", "superior", [-2.0], 1),
+    "traction:superior:0,0,0.25": ("traction", "superior", [0.0, 0.0, 0.25], 0),
+    "spring:anterior:0.1": ("spring", "anterior", [0.1], 0),
+    "12/gravity:0,0,-9810": ("gravity", "", [0.0, 0.0, -9810.0], 12),
+}
+
+
+def plain(load):
+    return load.kind, load.set_name, load.numbers.tolist(), load.step
+
+
+@pytest.mark.parametrize("text", WORDS)
+def test_words_and_back(text):
+    load = parse_load(text, 3)
+    assert repr(plain(load)) == repr(WORDS[text])  # NaN is not equal to itself
+    assert repr(plain(parse_load(load_words(load), 3))) == repr(plain(load))
+
+
+def test_words_in_two_dimensions():
+    assert plain(parse_load("move:x_min:1,free", 2))[2][0] == 1.0
+    assert plain(parse_load("gravity:0,-9810", 2)) == ("gravity", "", [0.0, -9810.0], 0)
+    for text in ("gravity:0,0,-9810", "traction:x_min:1,2,3"):
+        with pytest.raises(InputError, match="2 finite numbers"):
+            parse_load(text, 2)
+
+
+def test_a_model_may_hold_without_pushing():
+    model = sample_model(3)
+    (load,) = parse_loads(["hold:left"], model.mesh, model.sets)
+    assert plain(load) == ("displacement", "left", [0.0, 0.0, 0.0], 0)
+    assert len(parse_loads(["gravity:0,0,1"], model.mesh, model.sets)) == 1
+    assert parse_loads([], model.mesh, model.sets) == ()
+
+
+def test_components_and_steps_keep_displacements_apart():
+    """The same nodes may be held along one axis by one load and along another by the next, or in other steps."""
+    model = sample_model(3)
+    sliding = ["move:left:0,free,free", "move:superior:free,free,0", "move:inferior:free,0,1"]
+    assert len(parse_loads(sliding, model.mesh, model.sets)) == 3
+    steps = ["hold:superior", "1/move:inferior:0,0,1", "2/move:inferior:0,1,0"]
+    loads = parse_loads(steps, model.mesh, model.sets)
+    assert count_of_steps(loads) == 2
+    assert [[load.numbers.tolist() for load in in_step(loads, step)][1] for step in (1, 2)] == [[0, 0, 1], [0, 1, 0]]
+    assert count_of_steps(()) == 1
+
+
+@pytest.mark.parametrize(
+    ("texts", "match"),
+    [
+        (["squeeze:5%"], "expected compress:5%, hold:SET"),
+        (["compress:5"], "expected compress:P%"),
+        (["compress:0%"], "expected compress:P%"),
+        (["compress:51%"], "expected compress:P%"),
+        (["compress:x%"], "expected compress:P%"),
+        (["compress:nan%"], "expected compress:P%"),
+        (["hold:nowhere"], 'no set of facets "nowhere"; there are boundary, left'),
+        (["hold:Left"], "did you mean left"),
+        (["hold:dark"], '"dark" is a set of cells; give one of facets, such as boundary'),
+        (["hold:left", "move:right:1,2"], "3 finite numbers in mm or free"),
+        (["hold:left", "move:right"], "3 finite numbers"),
+        (["hold:left", "move:right:1,2,inf"], "3 finite numbers"),
+        (["move:right:1,2,nan"], "3 finite numbers"),
+        (["move:right:free,free,free"], "3 finite numbers"),
+        (["move:right:loose,0,0"], "3 finite numbers"),
+        (["pressure:left:x"], "expected pressure:SET:P with 1 finite number in kPa"),
+        (["pressure:left:nan"], "1 finite number in kPa"),
+        (["pressure:left"], "1 finite number"),
+        (["traction:left:1"], "expected traction:SET:X,Y,Z with 3 finite numbers in kPa"),
+        (["spring:left:0"], "stiffness above 0"),
+        (["spring:left:-1"], "stiffness above 0"),
+        (["spring:left:inf"], "1 finite number in kPa/mm"),
+        (["gravity:9810"], "expected gravity:X,Y,Z with 3 finite numbers in mm/s2"),
+        (["pressure:nowhere:1"], 'no set of facets "nowhere"'),
+        (["pressure:Superior:1"], "did you mean superior"),
+        (["spring:dark:1"], '"dark" is a set of cells'),
+        (["pressure:interface_0_1:1"], 'of "interface_0_1" lie between two cells'),
+        (["traction:interface_0_1:0,0,1"], "lie between two cells"),
+        (["spring:interface_0_1:1"], "lie between two cells"),
+        (["0/hold:left"], "a step of 1 or more"),
+        (["1.5/hold:left"], "a step of 1 or more"),
+        (["-1/hold:left"], "a step of 1 or more"),
+        (["first/hold:left"], "a step of 1 or more"),
+        (["/hold:left"], "a step of 1 or more"),
+        (["hold:left", "2/pressure:right:1"], "a step 2, but no load is of step 1 alone"),
+        (["1/hold:left", "3/hold:left"], "a step 3, but no load is of step 2 alone"),
+        (["hold:left", "2/move:left:0,0,1", "1/pressure:right:1"], "cannot go both ways"),
+        (["move:left:free,0,free", "move:posterior:1,2,free"], "cannot go both ways"),
+        (["hold:left", "move:superior:0,0,1"], "cannot go both ways"),
+        (["compress:5%", "hold:superior"], "cannot go both ways"),
+    ],
+)
+def test_loads_that_are_none(texts, match):
+    model = sample_model(3)
+    with pytest.raises(InputError, match=match) as caught:
+        parse_loads(texts, model.mesh, model.sets)
+    assert "\n" not in str(caught.value)
+
+
+def test_no_face_to_press():
+    image = sample_image(3)
+    mesh = sample_model(3).mesh
+    is_inner = (np.abs(image.to_index(mesh.points)[mesh.cells][:, :, 2] - 3.0) < 3.0).all(axis=1)
+    used, cells = np.unique(mesh.cells[is_inner], return_inverse=True)
+    part = tetopt.Mesh(mesh.points[used], cells.reshape(-1, 4))
+    with pytest.raises(InputError, match="no facets on the box's face inferior and superior; give hold:SET"):
+        parse_loads(["compress:5%"], part, standard_sets(part, box_of(image)))
+
+
+# Forces on facets
+
+
+def nodes_and_cells(mesh, order):
+    return (mesh.points, mesh.cells) if order == 1 else quadratic(mesh.points, mesh.cells)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("n", [2, 3])
+def test_weights_integrate_what_cells_of_the_order_can_be(n, order):
+    """Linear functions, and of order 2 quadratic ones, over a closed surface: Gauss's theorem."""
+    model = sample_model(n)
+    mesh, rows = model.mesh, model.sets.facets["boundary"]
+    points = nodes_and_cells(mesh, order)[0]
+    nodes, weights = facet_weights(mesh, rows, order)
+    areas = area_vectors(mesh, rows)
+    normals = areas / np.linalg.norm(areas, axis=1)[:, None]
+    volume = volumes(mesh.points, mesh.cells).sum()
+    flux = np.einsum("kw,ki,kwj->ij", weights, normals, points[nodes])  # of each coordinate's unit vector
+    np.testing.assert_allclose(flux, volume * np.eye(n), atol=1e-10 * volume)
+    if order == 2:
+        centre = volumes(mesh.points, mesh.cells) @ mesh.points[mesh.cells].mean(axis=1) / volume
+        squares = np.einsum("kw,ki,kwi->i", weights, normals, points[nodes] ** 2)
+        np.testing.assert_allclose(squares, 2.0 * volume * centre, rtol=1e-12)
+
+
+def test_each_order_s_shares_of_a_facet():
+    """A right triangle of area 1/2, and an edge of length 2."""
+    solid = tetopt.Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 2, 3]])
+    bottom = np.array([[0, 3]])
+    nodes, weights = facet_weights(solid, bottom, 1)
+    assert (sorted(nodes[0].tolist()), weights.tolist()) == ([0, 1, 2], [[1 / 6] * 3])
+    nodes, weights = facet_weights(solid, bottom, 2)
+    np.testing.assert_allclose(weights, [[0, 0, 0, 1 / 6, 1 / 6, 1 / 6]])
+    middles = quadratic(solid.points, solid.cells)[0][nodes[0, 3:]]
+    assert sorted(middles.tolist()) == [[0, 0.5, 0], [0.5, 0, 0], [0.5, 0.5, 0]]
+    plate = tetopt.Mesh([[0, 0], [2, 0], [0, 1]], [[0, 1, 2]])
+    nodes, weights = facet_weights(plate, np.array([[0, 2]]), 2)
+    np.testing.assert_allclose(weights, [[1 / 3, 1 / 3, 4 / 3]])
+    assert quadratic(plate.points, plate.cells)[0][nodes[0, 2]].tolist() == [1.0, 0.0]
+
+
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("n", [2, 3])
+def test_forces_add_up_to_stress_times_area(n, order):
+    model = sample_model(n)
+    mesh, sets = model.mesh, model.sets
+    name = "superior" if n == 3 else "y_max"
+    areas = area_vectors(mesh, sets.facets[name])
+    area = np.linalg.norm(areas, axis=1).sum()
+    nodes, forces = facet_forces(mesh, sets, Load("pressure", name, np.array([2.0])), order)
+    np.testing.assert_allclose(forces.sum(axis=0), -2.0 * areas.sum(axis=0), atol=1e-9)
+    pull = np.array([1.0, -2.0, 0.5])[:n]
+    also, forces = facet_forces(mesh, sets, Load("traction", name, pull), order)
+    np.testing.assert_allclose(forces.sum(axis=0), area * pull)
+    np.testing.assert_array_equal(nodes, also)
+    which, stiffness = spring_constants(mesh, sets, Load("spring", name, np.array([0.3])), order)
+    np.testing.assert_array_equal(nodes, which)
+    assert stiffness.sum() == pytest.approx(0.3 * area)
+    assert (stiffness > 0.0).all()
+    corners = nodes_of(mesh, sets.facets[name])
+    if order == 1:
+        np.testing.assert_array_equal(nodes, corners)
+    elif n == 3:
+        assert (nodes >= len(mesh.points)).all()  # corners get nothing
+    # A pressure on all of the boundary pushes a body nowhere, and does not turn it.
+    nodes, forces = facet_forces(mesh, sets, Load("pressure", "boundary", np.array([1.0])), order)
+    np.testing.assert_allclose(forces.sum(axis=0), 0.0, atol=1e-9)
+    places = nodes_and_cells(mesh, order)[0][nodes] - mesh.points.mean(axis=0)
+    moments = np.einsum("ki,kj->ij", places, forces)
+    np.testing.assert_allclose(moments, moments.T, atol=1e-7)
