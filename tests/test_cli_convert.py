@@ -15,6 +15,7 @@ import tetopt
 from tetopt.cli.promises import check_promises
 from tetopt.geometry.topology import boundary_facets, largest_component
 from tetopt.io.formats import FORMATS
+from tetopt.model.averages import cell_young
 
 LAW = "1 + h/7"
 
@@ -112,13 +113,19 @@ def test_vtu_there_and_back_with_materials_sets_and_loads(folder, tmp_path):
 
 
 def test_an_image_gives_the_mean_of_the_law(folder, tmp_path):
-    """Of a curved law, which is not the law of the mean."""
-    for name, more in (("mean", []), ("image", ["--image", folder / "a.nii.gz"])):
+    """Of a curved law, which is not the law of the mean; the geometric one unless another is asked for."""
+    image = ["--image", folder / "a.nii.gz"]
+    for name, more in (("mean", []), ("image", [*image, "--average", "mean"]), ("default", image)):
         assert exit_code("convert", folder / "a.vtu", tmp_path / f"{name}.vtu", "--young", "1 + h**2", *more) == 0
-    young = {name: tetopt.load_mesh(tmp_path / f"{name}.vtu").cell_data["young"] for name in ("mean", "image")}
-    fields = tetopt.load_mesh(folder / "a.vtu").cell_data
+    young = {
+        name: tetopt.load_mesh(tmp_path / f"{name}.vtu").cell_data["young"] for name in ("mean", "image", "default")
+    }
+    loaded = tetopt.load_mesh(folder / "a.vtu")
+    fields, mesh = loaded.cell_data, loaded.mesh
     np.testing.assert_allclose(young["image"] - young["mean"], fields["variance"], atol=1e-9)
     assert fields["variance"].max() > 10
+    expected = cell_young(tetopt.load_image(folder / "a.nii.gz"), mesh, lambda h: 1.0 + h**2, "geometric")
+    np.testing.assert_allclose(young["default"], expected, rtol=1e-12)
 
 
 def test_a_mesh_of_gmsh_s_is_measured_and_painted(folder, tmp_path, capsys):
@@ -303,6 +310,9 @@ def test_loads_run_or_are_said_to_be_in_comments(folder, tmp_path, capsys):
         ("a.inp", ["--young", "2", "--density", "-h"], "expected kg/m3 above 0"),
         ("a.inp", ["--young", "2", "--load", "2/hold:left"], "no load is of step 1 alone"),
         ("a.inp", ["--bins", "4"], "no moduli to group"),
+        ("a.inp", ["--average", "mean"], "--average: there is no --young"),
+        ("a.inp", ["--young", "h+1", "--average", "voigt"], "average: expected mean, geometric, harmonic, hill"),
+        ("a.inp", ["--young", "h+1", "--average", "hill"], "average: hill is over the image's voxels; give the image"),
         ("a.inp", ["--young", "h+1", "--bins", "0"], "--bins: expected K"),
         ("a.inp", ["--young", "h+1", "--bins", "4:cubic"], "--bins: expected K"),
         ("a.inp", ["--units", "Pa"], "--units: expected kPa or MPa"),

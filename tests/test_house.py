@@ -21,7 +21,7 @@ WIDE = {
     "tetopt.engine.fast.optimize": 13,
     "tetopt.engine.meshing.mesh_image": 12,
     "tetopt.engine.paper.optimize_paper": 12,
-    "tetopt.model.build.model_of": 14,
+    "tetopt.model.build.model_of": 15,
 }
 # Verbs that once stood for a dozen things each; a variable is a noun, see docs/glossary.md.
 VERBS = {"held", "wanted", "found", "given", "told", "asked"}
@@ -161,7 +161,7 @@ def test_no_function_is_too_long_to_see():
 
 
 def test_few_functions_have_many_parameters():
-    """More than 8 parameters are named here, each; none has more than 13."""
+    """More than 8 parameters are named here, each; none has more than 15."""
     many = {name: count for name, count, _ in functions() if count > 8}
     assert many == WIDE
     assert len(WIDE) <= 10

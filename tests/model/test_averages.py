@@ -1,11 +1,14 @@
 """The modulus of a cell: the mean of the law over its voxels."""
 
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
 import tetopt
-from tetopt import Image, cell_moments, cell_of_voxel, lattice
-from tetopt.model.averages import cell_young, young_image
+from tetopt import Image, InputError, cell_moments, cell_of_voxel, lattice
+from tetopt.model.averages import cell_young, node_young, parse_average, young_image
+from tetopt.model.build import model_of
 
 
 def noise(shape, seed=0, affine=None):
@@ -49,3 +52,116 @@ def test_wide_fields_lose_no_digits():
         voxels = np.exp(image.data[owner == cell].astype(float))
         if len(voxels):
             assert moduli[cell] == pytest.approx(voxels.mean(), rel=1e-12)
+
+
+AVERAGES = {
+    "mean": lambda values: values.mean(),
+    "geometric": lambda values: np.exp(np.log(values).mean()),
+    "harmonic": lambda values: 1.0 / (1.0 / values).mean(),
+    "power:2": lambda values: np.sqrt((values**2).mean()),
+    "power:-0.5": lambda values: (values**-0.5).mean() ** -2.0,
+    "power:1e-9": lambda values: np.exp(np.log(values).mean()),  # of which it is 1e-9 times a variance away
+    "hill": lambda values: 0.5 * (values.mean() + 1.0 / (1.0 / values).mean()),
+}
+
+
+@pytest.mark.parametrize("average", AVERAGES)
+@pytest.mark.parametrize("shape", [(12, 13), (14, 12, 13)])
+def test_averages_over_ten_orders_of_magnitude(average, shape):
+    """Against each cell's voxels one cell after the other; a cell without any has the modulus at its centroid."""
+    image = Image(np.random.default_rng(0).uniform(-11.5, 11.5, shape))
+    mesh = lattice(image, nodes=60 if len(shape) == 2 else 700)
+    young = cell_young(image, mesh, np.exp, average)
+    owner = cell_of_voxel(image, mesh)
+    n_empty = 0
+    for cell in range(len(mesh.cells)):
+        values = np.exp(image.data[owner == cell])
+        if len(values) == 0:
+            n_empty += 1
+            at = tuple(np.rint(image.to_index(mesh.points[mesh.cells[cell]].mean(axis=0)[None])[0]).astype(int))
+            assert young[cell] == np.exp(image.data[at])
+            continue
+        assert values.min() <= young[cell] <= values.max()
+        assert young[cell] == pytest.approx(AVERAGES[average](values), rel=1e-7 if "e-9" in average else 1e-12)
+    assert n_empty > 0 or len(shape) == 2
+
+
+def test_averages_are_in_the_order_of_their_powers():
+    """The inequality of means of powers; Hill's is between its bounds, and all are one where the law is constant."""
+    image = noise((14, 12, 13))
+    mesh = lattice(image, nodes=80)
+    words = ["power:-10", "harmonic", "power:-0.5", "geometric", "power:0.5", "mean", "power:3", "power:10"]
+    moduli = [cell_young(image, mesh, lambda h: 1.0 + h, each) for each in words]
+    for less, more in pairwise(moduli):
+        assert (less < more).all()
+    hill = cell_young(image, mesh, lambda h: 1.0 + h, "hill")
+    assert ((moduli[1] < hill) & (hill < moduli[5])).all()
+    np.testing.assert_allclose(cell_young(image, mesh, lambda h: 1.0 + h, "power:-1"), moduli[1], rtol=1e-14)
+    for each in [*words, "hill", "nodes"]:
+        assert (cell_young(image, mesh, lambda h: 0.7 + 0.0 * h, each) == 0.7).all()
+
+
+def test_empty_space_in_a_cell():
+    """A modulus of 0 counts in means of powers above 0; of others it would be all that counts, and is refused."""
+    image = noise((10, 10, 10))
+    mesh = lattice(image, nodes=40)
+    owner = cell_of_voxel(image, mesh)
+    law = [(99.0, 0.0), (199.0, 10.0)]
+    assert (cell_young(image, mesh, law) > 0.0).all()
+    roots = cell_young(image, mesh, law, "power:0.5")
+    values = np.interp(image.data[owner == 0], [99.0, 199.0], [0.0, 10.0])
+    assert roots[0] == pytest.approx((values**0.5).mean() ** 2, rel=1e-12)
+    assert (cell_young(image, mesh, lambda h: 0.0 * h, "power:0.5") == 0.0).all()
+    for each in ("geometric", "harmonic", "hill", "nodes", "power:-2", "power:-0.5"):
+        with pytest.raises(
+            InputError, match=rf"above 0 kPa for {each}, got 0 in \d+ voxels of the mesh.*--average mean"
+        ):
+            cell_young(image, mesh, law, each)
+
+
+@pytest.mark.parametrize("text", ["", "voigt", "power", "power:", "power:x", "power:nan", "power:11", "mean:1", "Mean"])
+def test_words_that_are_no_average(text):
+    with pytest.raises(InputError, match=r'average: expected mean, .*power:P with P from -10 to 10.*got "'):
+        parse_average(text)
+    with pytest.raises(InputError, match="average: expected"):
+        model_of(lattice(noise((4, 4, 4)), blocks=(1, 1, 1)), average=text)
+
+
+def test_words_of_averages():
+    assert [parse_average(each).power for each in ("mean", "geometric", "harmonic", "power:0.5", "hill")] == [
+        1.0, 0.0, -1.0, 0.5, None
+    ]  # fmt: skip
+    assert parse_average(" power:+5e-1 ") == parse_average("power:0.5")
+    assert parse_average("nodes").is_nodal
+
+
+@pytest.mark.parametrize("shape", [(24, 20), (14, 12, 10)])
+def test_moduli_of_nodes(shape):
+    """The weighted geometric mean, hat function by hat function; within the range of the voxels around."""
+    image = noise(shape)
+    mesh = lattice(image, blocks=(2,) * len(shape))
+    young = node_young(image, mesh, lambda h: 1.0 + h)
+    owner = cell_of_voxel(image, mesh)
+    index = np.argwhere(owner >= 0)
+    weight, total = np.zeros(len(mesh.points)), np.zeros(len(mesh.points))
+    for place in index:
+        corners = mesh.cells[owner[tuple(place)]]
+        frame = np.vstack([mesh.points[corners].T, np.ones(len(corners))])
+        hats = np.linalg.solve(frame, [*image.to_world(place[None].astype(float))[0], 1.0])
+        weight[corners] += hats
+        total[corners] += hats * np.log(1.0 + image.data[tuple(place)])
+    np.testing.assert_allclose(young, np.exp(total / weight), rtol=1e-9)
+    np.testing.assert_allclose(
+        cell_young(image, mesh, lambda h: 1.0 + h, "nodes"), young[mesh.cells].mean(axis=1), rtol=1e-15
+    )
+
+
+def test_a_node_without_voxels_has_the_nearest_one_s_modulus():
+    image = noise((3, 3, 3))
+    mesh = lattice(image, blocks=(9, 9, 9))
+    young = node_young(image, mesh, lambda h: 1.0 + h)
+    counts = np.bincount(cell_of_voxel(image, mesh).ravel(), minlength=len(mesh.cells))
+    is_empty = np.bincount(mesh.cells.ravel(), np.repeat(counts, 4)) == 0
+    assert is_empty.sum() > 100
+    index = np.clip(np.rint(image.to_index(mesh.points)).astype(int), 0, 2)
+    np.testing.assert_array_equal(young[is_empty], 1.0 + image.data[tuple(index[is_empty].T)])

@@ -111,7 +111,7 @@ def test_values_by_label():
 def test_the_mean_of_the_law_and_the_law_of_the_mean():
     image, mesh = sample_image(3), sample_model(3).mesh
     fields = sample_model(3).cell_data
-    by_image = model_of(mesh, image, young="1 + h**2")
+    by_image = model_of(mesh, image, young="1 + h**2", average="mean")
     by_mean = model_of(mesh, young="1 + h**2", cell_data=fields)
     young = young_of(by_image)
     np.testing.assert_allclose(young, cell_values(image, mesh, lambda h: 1.0 + h**2), rtol=1e-14)

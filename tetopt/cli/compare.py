@@ -18,6 +18,7 @@ from tetopt.cli.inputs import checked_outputs, read_labels, read_volume, results
 from tetopt.cli.options import (
     DEFAULT_NODES,
     WHOLE_BOX,
+    AverageOption,
     BoxPart,
     ForceOption,
     ImageArgument,
@@ -29,6 +30,7 @@ from tetopt.io.files import checked_output, save_json
 from tetopt.io.images import sha256
 from tetopt.io.mni import mni_path, mni_tissue
 from tetopt.measure.quality import quality
+from tetopt.model.averages import parse_average
 from tetopt.model.fields import cell_fields
 from tetopt.model.laws import parse_law
 from tetopt.report.tables import add_quality, new_table
@@ -70,6 +72,7 @@ class SimulationOptions:
     young: Annotated[
         str | None, option("LAW", "Modulus by intensity, as for `fem`. Default: 1 to 10 kPa over its range.")
     ] = None
+    average: AverageOption = DEFAULT_SETTINGS.average
     reference_dofs: Annotated[
         int, option("D", "Size of the voxel grid that is the truth of the simulation.", min=1000)
     ] = DEFAULT_SETTINGS.reference_dofs
@@ -204,11 +207,12 @@ def _settings(compared: ComparedOptions, simulation: SimulationOptions, limits: 
     for name, limit in (("--max-seconds", limits.max_seconds), ("--max-gb", limits.max_gb)):
         if limit is not None and not 0.0 < limit < float("inf"):
             raise InputError(f"{name}: expected more than 0, got {limit}")
+    parse_average(simulation.average)
     return Settings(
         nodes=compared.nodes, pipelines=tuple(name.strip() for name in compared.pipelines.split(",")),
         repeats=compared.repeats, classes=compared.classes, k_D=compared.k_D,
         reference_dofs=simulation.reference_dofs, curve=_parse_curve(compared.curve), tradeoff=compared.tradeoff,
-        max_seconds=limits.max_seconds,
+        average=simulation.average, max_seconds=limits.max_seconds,
         max_bytes=None if limits.max_gb is None else int(limits.max_gb * BYTES_PER_GB),
     )  # fmt: skip
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -12,10 +13,10 @@ import tetopt
 from tetopt import InputError, Mesh, save_mesh
 from tetopt.cli.console import out
 from tetopt.cli.inputs import check_no_input, read_image, read_mesh
-from tetopt.cli.options import ImageArgument, ImagePart, NumberOptions, option
+from tetopt.cli.options import ImageArgument, ImagePart, LawOptions, NumberOptions, option
 from tetopt.io.files import checked_output, save_json
 from tetopt.io.images import sha256
-from tetopt.model.materials import DEFAULT_NU
+from tetopt.model.averages import parse_average
 from tetopt.report.summary import versions
 from tetopt.report.tables import new_table
 
@@ -26,20 +27,12 @@ if TYPE_CHECKING:
 def fem_command(
     image_path: ImageArgument,
     mesh_path: Annotated[Path, typer.Argument(metavar="MESH", help="VTU, VTK or MSH file that fills the image's box.")],
-    young: Annotated[
-        str | None,
-        option(
-            "LAW",
-            'Modulus in kPa by intensity: a table "0:1,100:5", interpolated, or a formula of h, such as '
-            '"0.5 + 0.01*h" or "1/max(abs(h), 0.001)" of a strain image. Default: the intensity.',
-        ),
-    ] = None,
-    nu: Annotated[float, option("NU", "Poisson's ratio, above -1 and below 0.5.")] = DEFAULT_NU,
     compress: Annotated[float, option("PERCENT", "How far the bottom is pushed in.")] = 1.0,
     output: Annotated[
         Path | None, option("PRESSED.vtu", "Write the mesh with displacements and strains.", "-o", "--output")
     ] = None,
     *,
+    moduli: LawOptions,
     part: ImagePart,
     numbers: NumberOptions,
 ) -> int:
@@ -59,11 +52,12 @@ def fem_command(
         check_no_input(output, mesh_path)
     if not 0.0 < compress <= 50.0:
         raise InputError(f"--compress: expected a percentage above 0 and up to 50, got {compress:g}")
-    law = None if young is None else parse_law(young)
+    law = None if moduli.young is None else parse_law(moduli.young)
+    parse_average(moduli.average)
     image = read_image(image_path, part)
     mesh = read_mesh(mesh_path).mesh
     try:
-        simulation, pressed = simulate(image, mesh, nu=nu, percent=compress, law=law)
+        simulation, pressed = simulate(image, mesh, moduli.nu, compress, law, moduli.average)
     except RuntimeError as error:
         raise InputError(f"{error}; the moduli differ too much, or nu is too near 0.5, for this mesh") from error
     if output is not None:
@@ -71,7 +65,7 @@ def fem_command(
         save_mesh(output, mesh, fields, {"tetopt": tetopt.__version__}, {"displacement": pressed.u})
     _print(simulation, mesh, mesh_path.name, compress)
     if json_path is not None:
-        options = {"young": young, "nu": nu, "compress_percent": compress, **part.stated()}
+        options = {**asdict(moduli), "compress_percent": compress, **part.stated()}
         files = {"image": image_path.name, "image_sha256": sha256(image_path), "mesh": mesh_path.name}
         save_json(json_path, {**files, "versions": versions(), "options": options, **_numbers(simulation, mesh)})
     return 0

@@ -30,6 +30,7 @@ from tetopt.engine.loop import (
 from tetopt.engine.paper import Retessellate
 from tetopt.io.files import checked_output
 from tetopt.io.formats import FORMATS
+from tetopt.model.averages import DEFAULT_AVERAGE
 from tetopt.model.materials import DEFAULT_NU
 from tetopt.start.lattice import Kind
 
@@ -54,6 +55,14 @@ VolumeOption = Annotated[int | None, option("K", "Volume of a 4-D file, from 0."
 CropOption = Annotated[str | None, option("A:B,C:D,E:F", "Keep these voxels, half open; an end may be empty.")]
 JsonOption = Annotated[Path | None, option("FILE", "Write every number here.", "--json")]
 ForceOption = Annotated[bool, typer.Option("--force", help="Replace existing outputs.")]
+AverageOption = Annotated[
+    str,
+    option(
+        "WORD",
+        "One modulus of those of a cell's voxels: mean (the paper's), geometric, harmonic, power:P, hill (between mean "
+        "and harmonic), or nodes (linear between nodes).",
+    ),
+]
 SpaceOption = Annotated[str, option("ras|lps", "Convention of the file's coordinates.")]
 
 
@@ -89,6 +98,22 @@ class NumberOptions:
     def checked(self) -> Path | None:
         """The file, if there is to be one; InputError if it may not be written."""
         return None if self.json_path is None else checked_output(self.json_path, (".json",), self.force)
+
+
+@dataclass(frozen=True, kw_only=True)
+class LawOptions:
+    """The material that `tetopt fem` makes of an image."""
+
+    young: Annotated[
+        str | None,
+        option(
+            "LAW",
+            'Modulus in kPa by intensity: a table "0:1,100:5", interpolated, or a formula of h, such as '
+            '"0.5 + 0.01*h" or "1/max(abs(h), 0.001)" of a strain image. Default: the intensity.',
+        ),
+    ] = None
+    average: AverageOption = DEFAULT_AVERAGE
+    nu: Annotated[float, option("NU", "Poisson's ratio, above -1 and below 0.5.")] = DEFAULT_NU
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -232,6 +257,7 @@ class SolverOptions:
     density: Annotated[str | None, option("LAW", "Density, kg/m3, likewise (water's is 1000); gravity needs it.")] = (
         None
     )
+    average: AverageOption = DEFAULT_AVERAGE
     bins: Annotated[
         str | None, option("K[:quantile|:log]", "Group cells into K materials, of equal width, by number, or log.")
     ] = None

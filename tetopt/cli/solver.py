@@ -17,6 +17,7 @@ from tetopt import Image, InputError, Mesh
 from tetopt.cli.console import log, out, print_wide
 from tetopt.cli.options import SolverOptions
 from tetopt.io.formats import FORMATS, file_bytes, format_of, save_model
+from tetopt.model.averages import DEFAULT_AVERAGE, parse_average
 from tetopt.model.build import labels_of, model_of
 from tetopt.model.laws import parse_any_law
 from tetopt.model.loads import check_steps, known_set, load_words, parse_load
@@ -45,6 +46,9 @@ def check_solver_options(output: Path, solver: SolverOptions, has_materials: boo
             parse_any_law(law, name)
             if solver.young is None and not has_materials:
                 raise InputError(f"--{name}: there is no --young")
+    parse_average(solver.average)
+    if solver.average != DEFAULT_AVERAGE and solver.young is None:
+        raise InputError("--average: there is no --young")
     parsed_bins(solver.bins)
     if solver.units not in STRESS_UNITS:
         raise InputError(f"--units: expected {' or '.join(STRESS_UNITS)}, got {solver.units}")
@@ -87,9 +91,9 @@ def solver_model(
     fields = {name: values for name, values in cell_data.items() if name not in MATERIAL_FIELDS}
     bins, spacing = parsed_bins(solver.bins)
     return model_of(
-        mesh, image, young=young, nu=nu, density=density, sets=solver.sets or (), loads=solver.loads or (), bins=bins,
-        spacing=spacing, order=solver.order, cell_data=fields, known_sets=known_sets,
-        about={"tetopt": tetopt.__version__, **about},
+        mesh, image, young=young, nu=nu, density=density, average=solver.average, sets=solver.sets or (),
+        loads=solver.loads or (), bins=bins, spacing=spacing, order=solver.order, cell_data=fields,
+        known_sets=known_sets, about={"tetopt": tetopt.__version__, **about},
     )  # fmt: skip
 
 

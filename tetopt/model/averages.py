@@ -1,20 +1,81 @@
-"""Moduli of cells: means over their voxels.
+"""Moduli of cells: averages over their voxels.
 
 Eq. (2) wants the *mean of the modulus field* over each cell. A law from intensity to modulus is therefore applied to
-the voxels first and the mean taken afterwards; the law of the mean intensity is another number wherever the law is
+the voxels first and the average taken afterwards; the law of the mean intensity is another number wherever the law is
 curved and the cell is not uniform.
+
+The mean is what a mixture has if all of it is strained alike (Voigt, Annalen der Physik 274, 1889, 573-587), and an
+upper bound; the harmonic mean what it has if all of it is stressed alike (Reuss, ZAMM 9, 1929, 49-58), and a lower
+bound (Hill, Proc. Phys. Soc. A 65, 1952, 349-354, who takes the middle of the two). Between them lie the means of
+powers; power 0 is the geometric mean (Lichtenecker, Physikalische Zeitschrift 27, 1926, 115-158).
 """
 
 from __future__ import annotations
+
+from collections.abc import Iterator
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.energy.sampling import cell_of_voxel, nearest_values, ranges_of
 from tetopt.errors import InputError
+from tetopt.geometry.simplex import centroids, volume_gradients, volumes
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.model.laws import Law, law_values, young_from
+
+DEFAULT_AVERAGE = "geometric"  # of moduli, but in `tetopt paper`, which keeps Eq. (2)
+POWER_WORDS = {"mean": 1.0, "geometric": 0.0, "harmonic": -1.0}
+LARGEST_POWER = 10.0  # either way; beyond it a mean of powers is hardly but the greatest or the least value
+VOXELS_PER_CHUNK = 2**20  # whose places in their cells are computed at once, 100 MB
+
+
+class Average(NamedTuple):
+    """How one modulus is made of many; what `parse_average` returns."""
+
+    words: str  # as a user writes it
+    power: float | None  # of the mean of powers; None: Hill's, halfway between the powers 1 and -1
+    is_nodal: bool = False  # whether it is taken around each node, and linear between the nodes
+
+
+def parse_average(text: str) -> Average:
+    """An average from its word.
+
+    Parameters
+    ----------
+    text : str
+        "mean" (of Eq. (2), Voigt's; power 1), "geometric" (power 0), "harmonic" (Reuss's; power -1), "power:P" with P
+        from -10 to 10, "hill" (halfway between mean and harmonic), or "nodes" (geometric around each node, and linear
+        between nodes).
+
+    Raises
+    ------
+    InputError
+        The text is something else.
+
+    Examples
+    --------
+    >>> parse_average("power:-0.5").power
+    -0.5
+    """
+    word, colon, number = text.strip().partition(":")
+    if not colon and word in POWER_WORDS:
+        return Average(word, POWER_WORDS[word])
+    if not colon and word == "hill":
+        return Average(word, None)
+    if not colon and word == "nodes":
+        return Average(word, 0.0, is_nodal=True)
+    try:
+        power = float(number) if word == "power" else np.nan
+    except ValueError:
+        power = np.nan
+    if not abs(power) <= LARGEST_POWER:
+        raise InputError(
+            f"average: expected {', '.join(POWER_WORDS)}, hill, nodes, or power:P with P from {-LARGEST_POWER:g} to "
+            f'{LARGEST_POWER:g}, such as power:0.5, got "{text}"'
+        )
+    return Average(f"power:{power:g}", power)
 
 
 def young_image(image: Image, law: Law) -> Image:
@@ -30,21 +91,39 @@ def young_image(image: Image, law: Law) -> Image:
     return Image(young_from(law, image.data), image.affine)
 
 
-def cell_young(image: Image, mesh: Mesh, law: Law = None) -> NDArray[np.float64]:
-    """Modulus of each cell, (M,) float64, kPa: the mean of the modulus field over it, Eq. (2).
+def cell_young(image: Image, mesh: Mesh, law: Law = None, average: str = "mean") -> NDArray[np.float64]:
+    """Modulus of each cell, (M,) float64, kPa: an average of the modulus field over it.
 
-    A cell without voxel centre gets the modulus at its centroid, see `tetopt.energy.sampling.cell_moments`.
+    Parameters
+    ----------
+    image : Image
+    mesh : Mesh
+    law : callable, (K, 2) table or None
+        From intensity to kPa, see `tetopt.model.laws.law_values`.
+    average : str
+        See `parse_average`. "mean" is Eq. (2). With "nodes" it is the mean of `node_young` over the cell's corners, and
+        so over the cell.
+
+    A cell without voxel centre gets the modulus at its centroid, see `tetopt.energy.sampling.cell_moments`. A cell of
+    equal moduli has exactly that one, and none is outside of the range of its voxels'.
 
     Raises
     ------
     InputError
-        As `young_from` and `tetopt.energy.sampling.cell_of_voxel`.
+        As `parse_average`, `young_from` and `tetopt.energy.sampling.cell_of_voxel`; a modulus of 0 in the mesh, but for
+        means of powers above 0.
     """
-    return _cell_means(young_image(image, law), mesh)
+    parsed = parse_average(average)
+    if parsed.is_nodal:
+        return node_young(image, mesh, law)[mesh.cells].mean(axis=1)
+    field = young_image(image, law)
+    owner = cell_of_voxel(field, mesh).ravel()
+    _check_above_zero(parsed, image, field, owner)
+    return _cell_averages(field, mesh, owner, parsed.power)
 
 
 def cell_values(image: Image, mesh: Mesh, law: Law) -> NDArray[np.float64]:
-    """`cell_young` of any quantity, which may be negative, such as Poisson's ratio.
+    """The mean over each cell of any other quantity, such as Poisson's ratio or the density; it may be negative.
 
     Raises
     ------
@@ -55,19 +134,107 @@ def cell_values(image: Image, mesh: Mesh, law: Law) -> NDArray[np.float64]:
     if not np.isfinite(values).all():
         at = image.data[~np.isfinite(values)].ravel()[0]
         raise InputError(f"law: it has no value at intensity {at:g}; give one defined over the image's whole range")
-    return _cell_means(Image(values, image.affine), mesh)
+    field = Image(values, image.affine)
+    return _cell_averages(field, mesh, cell_of_voxel(field, mesh).ravel(), 1.0)
 
 
-def _cell_means(field: Image, mesh: Mesh) -> NDArray[np.float64]:
-    # Summed voxel by voxel. `cell_moments` takes differences of sums over rows, whose rounding would drown the soft
-    # cells of a field that spans ten orders of magnitude.
+def node_young(image: Image, mesh: Mesh, law: Law = None) -> NDArray[np.float64]:
+    """A modulus for each node, (N,) float64, kPa, that of the cells to be linear between them.
+
+    The geometric mean of the voxels in the cells around the node, each weighted by the node's hat function at its
+    centre; where no voxel has its centre there, the modulus of the voxel nearest to the node.
+
+    Raises
+    ------
+    InputError
+        As `young_from` and `tetopt.energy.sampling.cell_of_voxel`; a modulus of 0 in the mesh.
+    """
+    field = young_image(image, law)
     owner = cell_of_voxel(field, mesh).ravel()
+    _check_above_zero(parse_average("nodes"), image, field, owner)
+    n_nodes = len(mesh.points)
+    weight, total = np.zeros(n_nodes), np.zeros(n_nodes)
+    for voxels, hats in _places(field, mesh, owner):
+        nodes = mesh.cells[owner[voxels]].ravel()
+        logarithms = np.log(field.data.ravel()[voxels])[:, None]
+        weight += np.bincount(nodes, hats.ravel(), minlength=n_nodes)
+        total += np.bincount(nodes, (hats * logarithms).ravel(), minlength=n_nodes)
+    # Within the range of the voxels around, so that equal moduli stay as they are.
+    low, high = np.full(n_nodes, np.inf), np.full(n_nodes, -np.inf)
+    low_of_cell, high_of_cell = ranges_of(owner, field.data.ravel(), len(mesh.cells))
+    for corner in mesh.cells.T:
+        np.minimum.at(low, corner, low_of_cell)
+        np.maximum.at(high, corner, high_of_cell)
+    is_empty = weight <= 0.0
+    young = np.clip(np.exp(total / np.where(is_empty, 1.0, weight)), low, high)
+    young[is_empty] = nearest_values(field, mesh.points[is_empty])
+    return young
+
+
+def _places(
+    image: Image, mesh: Mesh, owner: NDArray[np.int64]
+) -> Iterator[tuple[NDArray[np.int64], NDArray[np.float64]]]:
+    """Numbers (K,) of the voxels in the mesh, some at a time, and their cells' hat functions there, (K, n+1)."""
+    inside = np.flatnonzero(owner >= 0)
+    slopes = volume_gradients(mesh.points, mesh.cells) / volumes(mesh.points, mesh.cells)[:, None, None]
+    middle = centroids(mesh.points, mesh.cells)
+    for start in range(0, len(inside), VOXELS_PER_CHUNK):
+        voxels = inside[start : start + VOXELS_PER_CHUNK]
+        cell = owner[voxels]
+        centres = image.to_world(np.stack(np.unravel_index(voxels, image.shape), axis=1).astype(np.float64))
+        hats = np.einsum("kai,ki->ka", slopes[cell], centres - middle[cell]) + 1.0 / (mesh.ndim + 1)
+        yield voxels, np.maximum(hats, 0.0)  # not below 0 by rounding
+
+
+def _check_above_zero(average: Average, image: Image, field: Image, owner: NDArray[np.int64]) -> None:
+    """InputError where the average of a modulus of 0 and others would be 0."""
+    if average.power is not None and average.power > 0.0:
+        return
+    empty = np.flatnonzero((owner >= 0) & (field.data.ravel() == 0.0))
+    if len(empty):
+        raise InputError(
+            f"average: expected moduli above 0 kPa for {average.words}, got 0 in {len(empty)} voxels of the mesh, as "
+            f"at intensity {image.data.ravel()[empty[0]]:g}; give empty space a small modulus too, as "
+            '--young "0:0.1,255:6" does, or take --average mean'
+        )
+
+
+def _cell_averages(field: Image, mesh: Mesh, owner: NDArray[np.int64], power: float | None) -> NDArray[np.float64]:
+    """Mean of powers over each cell, or Hill's average; the nearest voxel's value in a cell without any."""
     inside = owner >= 0
-    n_voxels = np.bincount(owner[inside], minlength=len(mesh.cells))
-    total = np.bincount(owner[inside], weights=field.data.ravel()[inside], minlength=len(mesh.cells))
-    # Within their range, so that a cell of equal values has exactly that value: constants stay one material.
+    cell, values = owner[inside], field.data.ravel()[inside].astype(np.float64)
+    n_voxels = np.bincount(cell, minlength=len(mesh.cells))
     low, high = ranges_of(owner, field.data.ravel(), len(mesh.cells))
-    means = np.clip(total / np.maximum(n_voxels, 1), low, high)
+    if power is None:
+        averages = 0.5 * sum(_powers(cell, values, n_voxels, (low, high), each) for each in (1.0, -1.0))
+    else:
+        averages = _powers(cell, values, n_voxels, (low, high), power)
+    # Within their range, so that a cell of equal values has exactly that value: constants stay one material.
+    averages = np.clip(averages, low, high)
     is_empty = n_voxels == 0
-    means[is_empty] = nearest_values(field, mesh.points[mesh.cells[is_empty]].mean(axis=1))
-    return means
+    averages[is_empty] = nearest_values(field, mesh.points[mesh.cells[is_empty]].mean(axis=1))
+    return averages
+
+
+def _powers(
+    cell: NDArray[np.int64],
+    values: NDArray[np.float64],
+    n_voxels: NDArray[np.int64],
+    ranges: tuple[NDArray[np.float64], NDArray[np.float64]],
+    power: float,
+) -> NDArray[np.float64]:
+    """The mean of powers of the values that each cell owns, (M,); 0 where it owns none."""
+    count = np.maximum(n_voxels, 1)
+    if power == 1.0:
+        # Summed voxel by voxel. `cell_moments` takes differences of sums over rows, whose rounding would drown the
+        # soft cells of a field that spans ten orders of magnitude.
+        return np.bincount(cell, weights=values, minlength=len(count)) / count
+    # Each as a ratio to the value that counts most, so that powers are from 0 to 1; and less 1, so that powers near 0
+    # lose no digits on their way to the logarithm.
+    largest = ranges[1] if power > 0.0 else ranges[0]
+    largest = np.where((n_voxels > 0) & (largest > 0.0), largest, 1.0)
+    with np.errstate(divide="ignore"):  # a modulus of 0, which means of powers above 0 may take
+        ratios = np.log(values / largest[cell])
+        less_one = ratios if power == 0.0 else np.expm1(power * ratios)
+        means = np.bincount(cell, weights=less_one, minlength=len(count)) / count
+        return largest * np.exp(means if power == 0.0 else np.log1p(means) / power)

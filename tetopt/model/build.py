@@ -12,7 +12,7 @@ from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.model.averages import cell_values, cell_young
+from tetopt.model.averages import DEFAULT_AVERAGE, cell_values, cell_young, parse_average
 from tetopt.model.fields import cell_fields
 from tetopt.model.laws import ByLabel, Law, has_column, law_values, parse_any_law, young_from
 from tetopt.model.loads import parse_loads
@@ -28,6 +28,7 @@ def model_of(
     young: str | float | NDArray[np.float64] | Law | ByLabel = None,
     nu: str | float | NDArray[np.float64] | Law | ByLabel = None,
     density: str | float | NDArray[np.float64] | Law | ByLabel = None,
+    average: str = DEFAULT_AVERAGE,
     sets: Iterable[str] = (),
     loads: Iterable[str] = (),
     bins: int | None = None,
@@ -47,12 +48,15 @@ def model_of(
         Its intensities are what laws are of, and its box's faces become sets.
     young, nu : number, (M,) array, law or text, optional
         Young's modulus, kPa, above 0, and Poisson's ratio, above -1 and below 0.5: one for all cells, one for each, or
-        a law of the intensity or of the label (`tetopt.model.laws.parse_any_law`), of which with an image the mean
-        over the voxels of the cell is taken, Eq. (2), and else its value at the cell's "mean". Without `young` the
-        model has no materials; without `nu` it is the column "nu" of the file that `young` names, or 0.45.
+        a law of the intensity or of the label (`tetopt.model.laws.parse_any_law`), of which with an image an average
+        over the voxels of the cell is taken, and else its value at the cell's "mean". Without `young` the model has
+        no materials; without `nu` it is the column "nu" of the file that `young` names, or 0.45.
     density : number, (M,) array, law or text, optional
         kg/m3, above 0, likewise; without it the column "density" of the file that `young` names, or none. Gravity
         needs it.
+    average : str
+        Of a law of Young's modulus over the voxels, see `tetopt.model.averages.parse_average`; "mean" is Eq. (2).
+        Ratios and densities are always the mean.
     sets : iterable of str
         Further sets, see `tetopt.model.sets.with_requested`.
     loads : iterable of str
@@ -78,6 +82,7 @@ def model_of(
     """
     if order not in (1, 2):
         raise InputError(f"order: expected 1 or 2, got {order}")
+    parse_average(average)
     if order == 2 and mesh.ndim == 2:
         raise InputError("order: quadratic cells are tetrahedra here, got a mesh of triangles")
     if image is not None and image.ndim != mesh.ndim:
@@ -96,7 +101,7 @@ def model_of(
     all_sets = with_requested(mesh, known_sets, sets, mean)
     table: Materials | None = None
     if young is not None:
-        moduli = _values(young, "young", mesh, image, mean, labels)
+        moduli = _values(young, "young", mesh, image, mean, labels, average)
         ratios = _values(nu, "nu", mesh, image, mean, labels)
         masses = None if density is None else _values(density, "density", mesh, image, mean, labels)
         table = materials(moduli, ratios, len(mesh.cells), masses)
@@ -122,17 +127,20 @@ def labels_of(cell_data: dict[str, NDArray], n_cells: int) -> NDArray[np.int64] 
 
 
 def _values(
-    value: Any, name: str, mesh: Mesh, image: Image | None, mean: NDArray[np.float64] | None, labels: NDArray | None
-) -> NDArray[np.float64]:
+    value: Any, name: str, mesh: Mesh, image: Image | None, mean: NDArray[np.float64] | None, labels: NDArray | None,
+    average: str = "mean",
+) -> NDArray[np.float64]:  # fmt: skip
     """The value of each cell, or one for all."""
     law: Any = parse_any_law(value, name) if isinstance(value, str) else value
     if not callable(law) and not isinstance(law, ByLabel) and np.ndim(law) < 2:
         return np.asarray(law, dtype=np.float64)
     if isinstance(law, ByLabel):
         return by_label(law, labels)
-    if image is not None:  # the law of each voxel, and then the mean, as Eq. (2) wants it
-        return cell_young(image, mesh, law) if name == "young" else cell_values(image, mesh, law)
+    if image is not None:  # the law of each voxel, and then the average, as Eq. (2) wants it
+        return cell_young(image, mesh, law, average) if name == "young" else cell_values(image, mesh, law)
     if mean is None:
         raise InputError(f"{name}: a law of the intensity, but the mesh has no means; give the image (--image)")
+    if name == "young" and average != DEFAULT_AVERAGE:
+        raise InputError(f"average: {average} is over the image's voxels; give the image (--image)")
     # The law of each cell's mean: the same only where the law is linear over the cell.
     return young_from(law, mean) if name == "young" else law_values(law, mean)

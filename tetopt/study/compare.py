@@ -33,7 +33,7 @@ from tetopt.io.meshes import load_mesh, save_mesh
 from tetopt.measure.fidelity import cell_labels, label_fidelity
 from tetopt.measure.quality import quality, rho_histogram
 from tetopt.mesh import Mesh
-from tetopt.model.averages import cell_young, young_image
+from tetopt.model.averages import DEFAULT_AVERAGE, cell_young, young_image
 from tetopt.model.fields import cell_fields
 from tetopt.model.laws import Law
 from tetopt.report.summary import image_summary, versions
@@ -88,6 +88,7 @@ class Standard(NamedTuple):
     modulus_fine: Image  # the same field at the image's voxels
     coarse_labels: NDArray  # of the reference's voxels
     references: dict[str, Reference]  # by nu
+    average: str = DEFAULT_AVERAGE  # of a cell's moduli
 
 
 class Bench(NamedTuple):
@@ -136,7 +137,9 @@ def prepared(image: Image, labels: Image, law: Law, settings: Settings, say: Say
     for nu in settings.nus:
         say(f"reference: {' x '.join(map(str, modulus.shape))} voxels, nu = {nu:g}")
         references[f"{nu:g}"] = reference(modulus, nu, settings.percent)
-    return Standard(image, labels, modulus, nearest(modulus, fine), nearest(labels, modulus).data, references)
+    return Standard(
+        image, labels, modulus, nearest(modulus, fine), nearest(labels, modulus).data, references, settings.average
+    )
 
 
 # One mesh, measured.
@@ -189,7 +192,7 @@ def _label_rows(standard: Standard, mesh: Mesh, means: NDArray[np.float64], owne
 
 def _simulation(standard: Standard, mesh: Mesh, against: Reference, percent: float) -> Simulation:
     """The compression test on a mesh, and how far it is from the reference."""
-    young = cell_young(standard.modulus_fine, mesh)
+    young = cell_young(standard.modulus_fine, mesh, average=standard.average)
     bottom, top = box_faces(standard.image, mesh)
     push = push_of(standard.image, percent)
     pressed = compression(mesh, young, against.nu, fixed_nodes=top, pushed_nodes=bottom, displacement=push)

@@ -8,6 +8,7 @@ from typing import Any, NamedTuple, get_args, get_origin, get_type_hints
 from tetopt.engine.loop import UNIFORM_ITERATIONS, UNIFORM_K_D
 from tetopt.fem.reference import Errors
 from tetopt.measure.quality import Quality
+from tetopt.model.averages import DEFAULT_AVERAGE
 from tetopt.study.interfaces import OTSU_CLASSES
 from tetopt.study.pipelines import PIPELINES
 
@@ -28,6 +29,7 @@ class Settings(NamedTuple):
     iterations: int = UNIFORM_ITERATIONS
     nus: tuple[float, ...] = (0.3, 0.45)
     percent: float = 1.0  # of compression, of the box's height
+    average: str = DEFAULT_AVERAGE  # of a cell's moduli
     reference_dofs: int = 300_000  # the voxel grid is averaged until it has no more
     curve: tuple[float, ...] = (0.25, 0.5, 2.0)  # node counts of the error curves, of `nodes`, besides `nodes` itself
     tradeoff: bool = False  # whether tetopt's options are swept around its defaults

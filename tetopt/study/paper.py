@@ -212,7 +212,7 @@ def elastography(snr_db: float | None, nu: float = DEFAULT_NU) -> Image:
     """
     stiffness = load_phantom("prostate_2d").image()
     fine = lattice(stiffness, blocks=stiffness.shape)
-    young = cell_young(stiffness, fine)
+    young = cell_young(stiffness, fine, average="mean")
     bottom, top = box_faces(stiffness, fine)
     height = stiffness.shape[1] * stiffness.spacing[1]
     u = compression(
@@ -267,7 +267,7 @@ def segmentation_case(volume: Image) -> Case:
 
 
 class Simulated(NamedTuple):
-    """What the compression test finds on a mesh; each with one modulus a cell, the mean of the image in it."""
+    """What the compression test finds on a mesh; each with one modulus a cell."""
 
     lambda_max: float
     cond: float
@@ -277,20 +277,22 @@ class Simulated(NamedTuple):
 
 
 def simulate(
-    image: Image, mesh: Mesh, nu: float = DEFAULT_NU, percent: float = 1.0, law: Law = None
+    image: Image, mesh: Mesh, nu: float = DEFAULT_NU, percent: float = 1.0, law: Law = None, average: str = "mean"
 ) -> tuple[Simulated, Compression]:
     """Top fixed, bottom pushed in by `percent` of the height along the faces' normal, both bonded.
 
-    `law` takes intensities to kPa (see `tetopt.model.laws.young_from`); None: the image is the modulus.
+    `law` takes intensities to kPa (see `tetopt.model.laws.young_from`); None: the image is the modulus. `average`
+    makes one of those of a cell's voxels (`tetopt.model.averages.parse_average`); "mean" is the paper's, Eq. (2).
 
     Raises
     ------
     InputError
-        A modulus that is not positive, or a mesh that does not fill the image's box in one piece.
+        An average that there is not, a modulus that is not positive, or a mesh that does not fill the image's box in
+        one piece.
     """
     bottom, top = box_faces(image, mesh)
     check_fills_box(image, mesh)
-    young = cell_young(image, mesh, law)
+    young = cell_young(image, mesh, law, average)
     push = push_of(image, percent)
     pressed = compression(mesh, young, nu, fixed_nodes=top, pushed_nodes=bottom, displacement=push)
     system = conditioning(pressed.system)
