@@ -1,4 +1,4 @@
-"""Pipelines that misbehave, for tests of `run_in_child`; found by the child as "pipes:name"."""
+"""Pipelines that misbehave, for tests of `run_in_child`."""
 
 import os
 import signal

@@ -1,6 +1,7 @@
 """A pipeline in a child process: same bits, limits kept, each failure one clear line."""
 
 import os
+import pipes
 import signal
 import subprocess
 import sys
@@ -19,15 +20,10 @@ JOB = Job(IMAGE, None, 300, classes=2, iterations=3)
 LABELS = tetopt.Image((IMAGE.data > 50) + (np.indices(IMAGE.shape)[0] > 12), IMAGE.affine)
 
 
-@pytest.fixture(autouse=True)
-def _pipes(monkeypatch):
-    monkeypatch.syspath_prepend(str(Path(__file__).parent))
-
-
 @pytest.mark.parametrize(("name", "labels"), [("tetopt", LABELS), ("odt", None)])
 def test_same_bits_as_in_process(name, labels):
     job = JOB._replace(labels=labels)
-    outcome = run_in_child(name, job, max_seconds=300.0)
+    outcome = run_in_child(PIPELINES[name].function, job, max_seconds=300.0)
     here = PIPELINES[name].function(job)
     assert outcome.failure is None
     assert outcome.mesh.points.tobytes() == here.mesh.points.tobytes()
@@ -41,25 +37,24 @@ def test_job_arrives_whole():
     """Affine, labels, seconds in their order, and notes."""
     image = tetopt.Image(IMAGE.data + 0.1, np.array([[0, -2.0, 0, 5], [3, 0, 0.5, 1], [0, 0, 1.5, 2], [0, 0, 0, 1]]))
     labels = tetopt.Image((IMAGE.data > 50).astype(int), image.affine)
-    outcome = run_in_child("pipes:fine", Job(image, labels, 200), max_seconds=60.0)
+    outcome = run_in_child(pipes.fine, Job(image, labels, 200), max_seconds=60.0)
     assert outcome.mesh.points.tobytes() == tetopt.lattice(image, nodes=200).points.tobytes()
     assert list(outcome.seconds.items()) == [("first", 1.5), ("second", 0.25)]
     assert outcome.notes == ["a note"]
 
 
 @pytest.mark.parametrize(
-    ("name", "line"),
+    ("pipeline", "line"),
     [
-        ("pipes:crash", "crashed: SIGSEGV"),
-        ("pipes:divide", "ZeroDivisionError: division by zero"),
-        ("pipes:refuse", "thing: expected a, got b; do c"),
-        ("pipes:missing", "ModuleNotFoundError: No module named 'tetopt_has_no_such_package'"),
-        ("pipes:leave", "ended with exit code 3 and no message"),
-        ("pipes:unknown", "AttributeError: module 'pipes' has no attribute 'unknown'"),
+        (pipes.crash, "crashed: SIGSEGV"),
+        (pipes.divide, "ZeroDivisionError: division by zero"),
+        (pipes.refuse, "thing: expected a, got b; do c"),
+        (pipes.missing, "ModuleNotFoundError: No module named 'tetopt_has_no_such_package'"),
+        (pipes.leave, "ended with exit code 3 and no message"),
     ],
 )
-def test_failure_is_one_line(name, line):
-    outcome = run_in_child(name, JOB, max_seconds=60.0)
+def test_failure_is_one_line(pipeline, line):
+    outcome = run_in_child(pipeline, JOB, max_seconds=60.0)
     assert outcome.mesh is None
     assert outcome.failure == line
 
@@ -67,14 +62,14 @@ def test_failure_is_one_line(name, line):
 def test_time_out_kills_the_whole_group(tmp_path, monkeypatch):
     monkeypatch.setenv("PIPES_PID", str(tmp_path / "pid"))
     begin = time.perf_counter()
-    outcome = run_in_child("pipes:sleep", JOB, max_seconds=4.0)
+    outcome = run_in_child(pipes.sleep, JOB, max_seconds=4.0)
     assert outcome.failure == "out of time: killed after 4 s"
     assert time.perf_counter() - begin < 10.0
     assert not is_running(int((tmp_path / "pid").read_text()))
 
 
 def test_too_much_memory():
-    outcome = run_in_child("pipes:hoard", JOB, max_seconds=60.0, max_bytes=600_000_000)
+    outcome = run_in_child(pipes.hoard, JOB, max_seconds=60.0, max_bytes=600_000_000)
     assert outcome.failure.startswith("too much memory: ")
     assert outcome.failure.endswith(" MB resident, 600 MB allowed")
     assert 600e6 < outcome.peak_bytes < 1500e6
@@ -83,15 +78,15 @@ def test_too_much_memory():
 def test_peak_is_the_childs_own():
     """Not that of a large parent, which ru_maxrss would begin with."""
     hoard = np.ones(100_000_000)
-    outcome = run_in_child("pipes:fine", JOB, max_seconds=60.0)
+    outcome = run_in_child(pipes.fine, JOB, max_seconds=60.0)
     assert outcome.peak_bytes < 0.7 * hoard.nbytes
 
 
 def test_interrupt_kills_the_child(tmp_path):
     program = (
-        "import tetopt; from tetopt.study.child import run_in_child; from tetopt.study.pipelines import Job\n"
+        "import pipes, tetopt; from tetopt.study.child import run_in_child; from tetopt.study.pipelines import Job\n"
         "image = tetopt.load_phantom('sphere').image(voxel_mm=4.0)\n"
-        "run_in_child('pipes:sleep', Job(image, None, 300), max_seconds=300.0)"
+        "run_in_child(pipes.sleep, Job(image, None, 300), max_seconds=300.0)"
     )
     pid_file = tmp_path / "pid"
     paths = [str(Path(__file__).parent), str(Path(tetopt.__file__).parents[1])]
@@ -107,10 +102,9 @@ def test_interrupt_kills_the_child(tmp_path):
 
 
 def test_bad_requests():
-    with pytest.raises(tetopt.InputError, match="expected one of tetopt, tetopt-uniform, tetopt-paper, pytetwild"):
-        run_in_child("tetwild", JOB, max_seconds=1.0)
-    with pytest.raises(tetopt.InputError, match="more than 0 seconds"):
-        run_in_child("bcc", JOB, max_seconds=0.0)
+    for limits in ({"max_seconds": 0.0}, {"max_seconds": 1.0, "max_bytes": 0}):
+        with pytest.raises(tetopt.InputError, match="more than 0 seconds"):
+            run_in_child(PIPELINES["bcc"].function, JOB, **limits)
 
 
 def is_running(pid):

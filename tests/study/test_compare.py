@@ -88,7 +88,7 @@ def test_the_keys_of_the_report(run):
     median = pipeline["median"]
     assert set(median) == {
         *("E_D", "E_D_share", "dihedral_histogram", "fem", "labels", "n_cells", "n_empty_cells", "n_missed_voxels"),
-        *("n_nodes", "peak_bytes", "quality", "rho_histogram", "seconds", "seconds_total"),
+        *("n_nodes", "not_compressed", "peak_bytes", "quality", "rho_histogram", "seconds", "seconds_total"),
     }
     assert set(median["labels"][0]) == {
         *("E_D_share", "components", "dice", "is_lost", "label", "mesh_components", "mesh_volume_mm3", "mesh_voxels"),
@@ -97,7 +97,7 @@ def test_the_keys_of_the_report(run):
     assert set(median["fem"]["0.3"]) == {"cg_iterations", "cond", "errors", "lambda_max", "strain_energy"}
     assert set(report["options"]) == {
         *("classes", "curve", "iterations", "k_D", "max_bytes", "max_seconds", "nodes", "nus", "percent", "pipelines"),
-        *("reference_dofs", "repeats", "tradeoff"),
+        *("programs", "reference_dofs", "repeats", "tradeoff"),
     }
     assert set(report["curves"][0]["points"][0]) == {"E_D_share", "errors", "n_nodes"}
 

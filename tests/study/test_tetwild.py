@@ -111,16 +111,3 @@ def test_hole_is_refused():
     middle = np.linalg.norm(mesh.points[mesh.cells].mean(axis=1) - 0.5 * (low + high), axis=1).argmin()
     with pytest.raises(tetopt.InputError, match=r"turn inside out|fill 0"):
         tetwild.put_on_box(mesh.points, np.delete(mesh.cells, middle, axis=0), low, high)
-
-
-@pytest.mark.parametrize(("power", "first"), [(-3.0, 4000), (-6.0, 300), (-9.0, 700)])
-def test_secant_search(power, first):
-    """On a power law the second step is exact; the requested 1000 are reached in a few steps."""
-    tried = [(1.0, first)]
-    for _ in range(5):
-        factor = tetwild.next_factor(tried, 1000)
-        tried.append((factor, round(first * factor**power)))
-        if abs(tried[-1][1] / 1000 - 1.0) < 0.05:
-            break
-    assert abs(tried[-1][1] / 1000 - 1.0) < 0.05
-    assert len(tried) <= 5

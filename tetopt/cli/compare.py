@@ -36,6 +36,7 @@ from tetopt.model.laws import parse_law
 from tetopt.report.tables import add_quality, new_table
 from tetopt.study.compare_report import ImageSource, LabelSource, Settings
 from tetopt.study.pipelines import PIPELINES, Job
+from tetopt.study.program import Program, parse_program
 
 ClassesOption = Annotated[int, option("K", "Classes of the segmentation (multi-Otsu).", min=2)]
 
@@ -53,6 +54,14 @@ class ComparedOptions:
     labels: Annotated[Path | None, option("LABELS", "Label image, for tetopt and the pipelines that segment.")] = None
     repeats: Annotated[int, option("R", "Runs of a mesher whose result varies.", min=1)] = DEFAULT_SETTINGS.repeats
     pipelines: Annotated[str, option("A,B,...", f"Of {', '.join(PIPELINES)}: which, in order.")] = ",".join(PIPELINES)
+    programs: Annotated[
+        list[str] | None,
+        option(
+            "NAME=COMMAND",
+            "A program as one more pipeline: 'NAME=program {image} {labels} {nodes} {output}'.",
+            "--pipeline",
+        ),
+    ] = None
     k_D: Annotated[float, option("K", "Weight of the image on uniform meshes.", "--k-d")] = DEFAULT_SETTINGS.k_D
     classes: ClassesOption = DEFAULT_SETTINGS.classes
     curve: Annotated[str, option("F,...", "Node counts of the error curves, as parts of N; empty for none.")] = (
@@ -208,13 +217,25 @@ def _settings(compared: ComparedOptions, simulation: SimulationOptions, limits: 
         if limit is not None and not 0.0 < limit < float("inf"):
             raise InputError(f"{name}: expected more than 0, got {limit}")
     parse_average(simulation.average)
+    programs = _programs(compared.programs or [])
+    names = [name.strip() for name in compared.pipelines.split(",")]
+    names += [each.name for each in programs if each.name not in names]
     return Settings(
-        nodes=compared.nodes, pipelines=tuple(name.strip() for name in compared.pipelines.split(",")),
+        nodes=compared.nodes, pipelines=tuple(names), programs=programs,
         repeats=compared.repeats, classes=compared.classes, k_D=compared.k_D,
         reference_dofs=simulation.reference_dofs, curve=_parse_curve(compared.curve), tradeoff=compared.tradeoff,
         average=simulation.average, max_seconds=limits.max_seconds,
         max_bytes=None if limits.max_gb is None else int(limits.max_gb * BYTES_PER_GB),
     )  # fmt: skip
+
+
+def _programs(texts: list[str]) -> tuple[Program, ...]:
+    """The user's own pipelines; InputError for one that cannot be run, or a name that there is already."""
+    programs = tuple(map(parse_program, texts))
+    names = [*PIPELINES, *(each.name for each in programs)]
+    if twice := [name for number, name in enumerate(names) if name in names[:number]]:
+        raise InputError(f'--pipeline: there is a pipeline named "{twice[0]}" already; give it another name')
+    return programs
 
 
 def _parse_curve(text: str) -> tuple[float, ...]:

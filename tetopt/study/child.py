@@ -9,7 +9,6 @@ end runs that need little.
 from __future__ import annotations
 
 import contextlib
-import importlib
 import os
 import pickle
 import resource
@@ -25,7 +24,7 @@ from typing import NamedTuple
 
 from tetopt.errors import InputError
 from tetopt.mesh import Mesh
-from tetopt.study.pipelines import PIPELINES, Job, Produced
+from tetopt.study.pipelines import Job, Produced
 
 POLL_SECONDS = 0.05  # between two looks at a child's memory: a fraction of what even a short run takes
 MAXRSS_UNIT_BYTES = 1 if sys.platform == "darwin" else 1024  # of ru_maxrss, as getrusage(2) has it
@@ -41,13 +40,16 @@ class Outcome(NamedTuple):
     failure: str | None  # one line, None if all went well
 
 
-def run_in_child(pipeline: str, job: Job, *, max_seconds: float, max_bytes: int | None = None) -> Outcome:
+def run_in_child(
+    pipeline: Callable[[Job], Produced], job: Job, *, max_seconds: float, max_bytes: int | None = None
+) -> Outcome:
     """Run a pipeline in a child process, within limits; the mesh has the same bits as in this process.
 
     Parameters
     ----------
-    pipeline : str
-        A name of `tetopt.study.pipelines.PIPELINES`, or "module:function" for any other importable one.
+    pipeline : callable
+        The function of a `tetopt.study.pipelines.Pipeline`, or any other that can be pickled. Its temporary files, and
+        those of programs that it runs, lie in a folder that goes away with the child, however it ends.
     job : Job
     max_seconds : float
         Wall time, the child's start included, after which its process group is killed.
@@ -63,10 +65,8 @@ def run_in_child(pipeline: str, job: Job, *, max_seconds: float, max_bytes: int 
     Raises
     ------
     InputError
-        An unknown pipeline, or a limit that is not above 0.
+        A limit that is not above 0.
     """
-    if pipeline not in PIPELINES and ":" not in pipeline:
-        raise InputError(f"pipeline: expected one of {', '.join(PIPELINES)} or module:function, got {pipeline!r}")
     if not max_seconds > 0.0 or (max_bytes is not None and max_bytes <= 0):
         raise InputError(f"limits: expected more than 0 seconds and bytes, got {max_seconds} s and {max_bytes} bytes")
     with tempfile.TemporaryDirectory(prefix="tetopt-") as name:
@@ -78,7 +78,8 @@ def run_in_child(pipeline: str, job: Job, *, max_seconds: float, max_bytes: int 
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=errors,
-                env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},  # same modules as here
+                # The same modules as here.
+                env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path)), "TMPDIR": name},
                 start_new_session=True,  # a group of its own, killed as a whole
             )
         try:
@@ -164,21 +165,14 @@ def _failure(code: int, errors: Path) -> str:
     return lines[-1] if lines else f"ended with exit code {code} and no message"
 
 
-def _pipeline(name: str) -> Callable[[Job], Produced]:
-    if name in PIPELINES:
-        return PIPELINES[name].function
-    module, function = name.split(":", 1)
-    return getattr(importlib.import_module(module), function)
-
-
 def main(folder: Path) -> int:
     """Run the job in the folder; exit code 0 with a result there, 2 for bad input, 1 for any other exception.
 
     The last line on stderr says what went wrong.
     """
     try:
-        name, job = pickle.loads((folder / "job.pickle").read_bytes())
-        produced = _pipeline(name)(job)
+        pipeline, job = pickle.loads((folder / "job.pickle").read_bytes())
+        produced = pipeline(job)
         (folder / "result.pickle").write_bytes(pickle.dumps((produced, _own_peak_bytes())))
     except InputError as error:
         print(" ".join(str(error).split()), file=sys.stderr)

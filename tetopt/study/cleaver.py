@@ -27,9 +27,11 @@ from tetopt.geometry.box import box_sides
 from tetopt.geometry.simplex import oriented
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.study.tetwild import NODE_TOLERANCE, Filled, inside_box, next_factor, node_spacing, put_on_box
+from tetopt.study.search import is_near, tries
+from tetopt.study.tetwild import TETWILD_RESPONSE, Filled, inside_box, node_spacing, put_on_box
 
 CLEAVER_RUNS = 8  # of one search, at most; those that crash count, too
+FIRST_SCALING = 2.0  # of features, in the first run: on the coarse side, where runs take the least time
 VOXELS_PER_SPACING = 3.0  # of the cube that Cleaver gets, at least, unless the image itself is coarser
 CUBE_VOXELS = 256  # along an edge of the cube, at most: the next power of two takes eight times the memory
 LIPSCHITZ_BOUND = 0.5  # how fast its cells may grow away from the interfaces
@@ -78,35 +80,31 @@ def stuffed(image: Image, labels: Image, nodes: int) -> Filled:
     _check(image, labels, nodes)
     cube = labels_in_cube(image, labels, node_spacing(image, nodes) / VOXELS_PER_SPACING)
     low, high = box_sides(image.shape).T * image.spacing
-    runs: list[tuple[float, NDArray[np.float64], NDArray[np.int64], int, float]] = []  # with the cells outside
-    begin_search = time.perf_counter()
     notes: list[str] = []
-    factor = 2.0
-    for _ in range(CLEAVER_RUNS):
-        begin = time.perf_counter()
+
+    def run(factor: float) -> tuple[NDArray[np.float64], NDArray[np.int64], int] | None:
+        """Nodes and cells in the box, and the number of cells outside."""
         try:
             points, cells = _run(cube, factor)
         except _RunError as error:
             notes.append(f"Cleaver, feature scaling {factor:.3g}: {error}")
-            factor *= 0.83  # its crashes come with coarse meshes; another try beside
-            continue
+            return None
         points, inside = inside_box(points, cells, low, high)
-        runs.append((factor, points, inside, len(cells) - len(inside), time.perf_counter() - begin))
-        if abs(len(points) / nodes - 1.0) <= NODE_TOLERANCE:
-            break
-        factor = next_factor([(run[0], len(run[1])) for run in runs], nodes)
+        return points, inside, len(cells) - len(inside)
+
+    begin = time.perf_counter()
+    runs = tries(run, lambda made: len(made[0]), nodes, TETWILD_RESPONSE, first=FIRST_SCALING, most=CLEAVER_RUNS)
     if not runs:
         raise InputError(f"itk-cleaver: no run gave a mesh ({notes[-1]}); ask for more nodes or {INSTALL_HINT}")
-    runs.sort(key=lambda run: abs(np.log(len(run[1]) / nodes)))
-    _, points, cells, n_removed, seconds = runs[0]
-    search = time.perf_counter() - begin_search - seconds
+    points, cells, n_removed = runs[0].result
+    search = time.perf_counter() - begin - runs[0].seconds
     try:
         points, cells = put_on_box(points, cells, low, high)
     except InputError as error:
         notes.append(f"its boundary is not on the box's faces: {error}")
     if n_removed:
         notes.append(f"{n_removed} cells outside the box removed")
-    if abs(len(points) / nodes - 1.0) > NODE_TOLERANCE:
+    if not is_near(len(points), nodes):
         notes.append(f"{len(points)} nodes after {len(runs)} runs of Cleaver, {nodes} were asked for")
     world = image.to_world(points / image.spacing)
     return Filled(Mesh(world, oriented(world, cells)), len(runs), search, notes)

@@ -23,7 +23,7 @@ from numpy.typing import NDArray
 from tetopt.energy.sampling import cell_moments, cell_of_voxel
 from tetopt.errors import InputError
 from tetopt.fem.conditioning import conditioning
-from tetopt.fem.elasticity import box_faces, compression, push_of
+from tetopt.fem.elasticity import box_faces, check_fills_box, compression, push_of
 from tetopt.fem.reference import Reference, averaged, compare, nearest, reference
 from tetopt.geometry.simplex import dihedral_angles
 from tetopt.image import Image
@@ -58,7 +58,8 @@ from tetopt.study.compare_report import (
     as_json,
     from_json,
 )
-from tetopt.study.pipelines import PIPELINES, UNTIMED_STEPS, Job
+from tetopt.study.pipelines import UNTIMED_STEPS, Job, Pipeline
+from tetopt.study.program import file_checksums, pipelines_with
 from tetopt.study.tradeoff import tradeoff
 
 Say = Callable[[str], None]
@@ -96,8 +97,8 @@ class Bench(NamedTuple):
 
     comparison: Comparison
     standard: Standard
+    pipelines: dict[str, Pipeline]
     folder: Path  # of the runs' files
-    key: str  # changes with everything that a run's numbers depend on
     say: Say
     resume: bool
 
@@ -154,6 +155,12 @@ def measured(standard: Standard, mesh: Mesh, percent: float) -> Measurement:
     E_D = float((moments.n_voxels * moments.variance).sum()) * image.voxel_volume
     share, edges = rho_histogram(mesh.points, mesh.cells, bins=20)
     angles, angle_edges = np.histogram(dihedral_angles(mesh.points, mesh.cells), bins=36, range=(0.0, 180.0))
+    try:
+        check_fills_box(image, mesh)
+        not_compressed = None
+    except InputError as error:
+        not_compressed = str(error)
+    references = standard.references if not_compressed is None else {}
     return Measurement(
         n_nodes=len(mesh.points),
         n_cells=len(mesh.cells),
@@ -165,7 +172,8 @@ def measured(standard: Standard, mesh: Mesh, percent: float) -> Measurement:
         rho_histogram=Histogram(edges.tolist(), share.tolist()),
         dihedral_histogram=Histogram(angle_edges.tolist(), (angles / angles.sum()).tolist()),
         labels=_label_rows(standard, mesh, moments.mean, owner),
-        fem={nu: _simulation(standard, mesh, each, percent) for nu, each in standard.references.items()},
+        fem={nu: _simulation(standard, mesh, each, percent) for nu, each in references.items()},
+        not_compressed=not_compressed,
     )
 
 
@@ -234,11 +242,12 @@ def run(
     runs = folder / "runs"
     runs.mkdir(exist_ok=True)
     standard = prepared(image, classes, comparison.law, settings, say)
-    bench = Bench(comparison, standard, runs, _key(comparison), say, resume)
+    pipelines = pipelines_with(settings.programs)
+    bench = Bench(comparison, standard, pipelines, runs, say, resume)
     results, meshes = [], {}
     for name in settings.pipelines:
         attempts = _attempts(bench, name)
-        results.append(_summed_up(name, attempts))
+        results.append(_summed_up(name, pipelines[name], attempts))
         first = next((number for number, attempt in enumerate(attempts, 1) if attempt.run is not None), None)
         if first is not None:
             meshes[name] = load_mesh(_run_path(bench, name, settings.nodes, first).with_suffix(".vtu")).mesh
@@ -288,15 +297,17 @@ def _peers() -> dict[str, str]:
     return installed
 
 
-def _key(comparison: Comparison) -> str:
+def _key(comparison: Comparison, name: str) -> str:
     """Changes with everything that a finished run's numbers depend on, but not with what else is compared."""
-    same = comparison.settings._replace(
-        pipelines=(), repeats=0, curve=(), nodes=0, tradeoff=False, max_seconds=0.0, max_bytes=None
+    settings = comparison.settings
+    same = settings._replace(
+        pipelines=(), programs=(), repeats=0, curve=(), nodes=0, tradeoff=False, max_seconds=0.0, max_bytes=None
     )
     facts = {
         "image": as_json(comparison.image_source),
         "labels": as_json(comparison.label_source),
         "law": comparison.law_words,
+        "program": [[each.command, file_checksums(each)] for each in settings.programs if each.name == name],
     }
     tools = versions() | _peers()
     return hashlib.sha256(json.dumps([facts, same, tools], sort_keys=True, default=str).encode()).hexdigest()
@@ -311,7 +322,7 @@ def _attempts(bench: Bench, name: str) -> list[Attempt]:
     """A pipeline as often as its result varies; the first failure is the last attempt."""
     settings = bench.comparison.settings
     attempts: list[Attempt] = []
-    for repeat in range(settings.repeats if PIPELINES[name].is_random else 1):
+    for repeat in range(settings.repeats if bench.pipelines[name].is_random else 1):
         attempts.append(_attempt(bench, name, settings.nodes, repeat + 1))
         if attempts[-1].failure is not None:
             break
@@ -330,16 +341,19 @@ def _kept(path: Path, key: str) -> Attempt | None:
 
 def _attempt(bench: Bench, name: str, nodes: int, repeat: int) -> Attempt:
     """One pipeline once, from its file if that is finished and of the same key."""
-    path, title = _run_path(bench, name, nodes, repeat), PIPELINES[name].title
-    kept = _kept(path, bench.key) if bench.resume else None
+    path, title = _run_path(bench, name, nodes, repeat), bench.pipelines[name].title
+    key = _key(bench.comparison, name)
+    kept = _kept(path, key) if bench.resume else None
     if kept is not None:
         bench.say(f"{title}, {nodes} nodes: kept from before")
         return kept
     bench.say(f"{title}, {nodes} nodes")
     comparison, settings = bench.comparison, bench.comparison.settings
     job = Job(comparison.image, comparison.labels, nodes, settings.classes, settings.k_D, settings.iterations)
-    outcome = run_in_child(name, job, max_seconds=settings.max_seconds, max_bytes=settings.max_bytes)
-    attempt = Attempt(bench.key, outcome.failure, outcome.notes, run=None)
+    outcome = run_in_child(
+        bench.pipelines[name].function, job, max_seconds=settings.max_seconds, max_bytes=settings.max_bytes
+    )
+    attempt = Attempt(key, outcome.failure, outcome.notes, run=None)
     if outcome.mesh is not None:
         try:
             measurement = measured(bench.standard, outcome.mesh, settings.percent)
@@ -359,9 +373,8 @@ def _attempt(bench: Bench, name: str, nodes: int, repeat: int) -> Attempt:
     return from_json(Attempt, json.loads(path.read_text(encoding="utf-8")))
 
 
-def _summed_up(name: str, attempts: list[Attempt]) -> PipelineResult:
+def _summed_up(name: str, shown: Pipeline, attempts: list[Attempt]) -> PipelineResult:
     """A pipeline's entry in the report."""
-    shown = PIPELINES[name]
     runs = [attempt.run for attempt in attempts if attempt.run is not None]
     failures = [attempt.failure for attempt in attempts if attempt.failure is not None]
     notes = list(dict.fromkeys(note for attempt in attempts for note in attempt.notes))

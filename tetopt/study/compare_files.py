@@ -24,7 +24,7 @@ from tetopt.study.compare_figures import (
 )
 from tetopt.study.compare_page import save_compare_page
 from tetopt.study.compare_report import Report, as_json
-from tetopt.study.pipelines import PIPELINES
+from tetopt.study.program import pipelines_with
 
 # File and caption of each picture, in the order in which they are listed.
 COMPARE_PICTURES = {
@@ -52,10 +52,10 @@ def run(paths: dict[str, Path], comparison: compare.Comparison, say: compare.Say
     image, settings = comparison.image, comparison.settings
     if image.ndim != 3:
         raise InputError(f"compare: expected a volume, got a {image.ndim}-D image")
-    names = set(settings.pipelines)
-    if not names or not names <= set(PIPELINES) or len(names) < len(settings.pipelines):
+    names, known = set(settings.pipelines), pipelines_with(settings.programs)
+    if not names or not names <= set(known) or len(names) < len(settings.pipelines):
         raise InputError(
-            f'pipelines: expected some of {", ".join(PIPELINES)}, each once, got "{",".join(settings.pipelines)}"'
+            f'pipelines: expected some of {", ".join(known)}, each once, got "{",".join(settings.pipelines)}"'
         )
     classes = thresholded(image, settings.classes) if comparison.labels is None else comparison.labels
     report, meshes = compare.run(paths["report.json"].parent, comparison, classes, say, resume=resume)
@@ -69,7 +69,9 @@ def run(paths: dict[str, Path], comparison: compare.Comparison, say: compare.Say
 
 
 def _draw(paths: dict[str, Path], report: Report, image: Image, meshes: dict[str, Mesh]) -> None:
-    titled = [(PIPELINES[name].title, mesh) for name, mesh in meshes.items()]
+    kinds = {each.name: each.kind for each in report.pipelines}
+    titles = {each.name: each.title for each in report.pipelines}
+    titled = [(titles[name], mesh) for name, mesh in meshes.items()]
     means = [cell_moments(image, mesh).mean for mesh in meshes.values()]
     cutaways(titled, means, paths["cutaways.png"])
     figures = {
@@ -87,6 +89,6 @@ def _draw(paths: dict[str, Path], report: Report, image: Image, meshes: dict[str
         save_figure(figure, paths[name])
     drawn = {"cutaways.png", *figures}
     pictures = [(paths[name], caption) for name, caption in COMPARE_PICTURES.items() if name in drawn]
-    shown = [k for k, name in enumerate(meshes) if PIPELINES[name].kind != "control"] or [0]
+    shown = [k for k, name in enumerate(meshes) if kinds[name] != "control"] or [0]
     views = [view_of(titled[k][1], means[k], titled[k][0]) for k in shown]
     save_compare_page(paths["report.html"], report, pictures, views)

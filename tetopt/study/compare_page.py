@@ -402,6 +402,9 @@ def _failures(report: Report) -> Iterator[str]:
             what = " failed" if pipeline.median is None else ", a run failed"
             title, failure = html.escape(pipeline.title), html.escape(pipeline.failure)
             yield f'<p class="failed"><strong>{title}{what}:</strong> {failure}</p>'
+        reason = None if pipeline.median is None else pipeline.median.measurement.not_compressed
+        if reason is not None:
+            yield f"<p><strong>{html.escape(pipeline.title)} was not compressed:</strong> {html.escape(reason)}</p>"
 
 
 # --------------------------------------------------------------------------------------------------

@@ -11,6 +11,7 @@ from tetopt.measure.quality import Quality
 from tetopt.model.averages import DEFAULT_AVERAGE
 from tetopt.study.interfaces import OTSU_CLASSES
 from tetopt.study.pipelines import PIPELINES
+from tetopt.study.program import Program
 
 # The files are flatter than the records: the keys of these fields' values stand beside those of the record itself,
 INLINE_FIELDS = ("run", "measurement", "source", "by_nu")
@@ -23,6 +24,7 @@ class Settings(NamedTuple):
 
     nodes: int
     pipelines: tuple[str, ...] = tuple(PIPELINES)
+    programs: tuple[Program, ...] = ()  # of the user's own, among the pipelines by their names
     repeats: int = 3  # of pipelines whose result changes from run to run
     classes: int = OTSU_CLASSES  # of the multi-Otsu segmentation, without labels
     k_D: float = UNIFORM_K_D
@@ -101,7 +103,8 @@ class Measurement(NamedTuple):
     rho_histogram: Histogram
     dihedral_histogram: Histogram  # degrees
     labels: list[LabelRow]
-    fem: dict[str, Simulation]  # by nu
+    fem: dict[str, Simulation]  # by nu; empty if the mesh cannot be compressed
+    not_compressed: str | None = None  # why
 
 
 class Run(NamedTuple):

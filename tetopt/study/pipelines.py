@@ -88,6 +88,17 @@ def ours(job: Job, mode: Mode) -> Produced:
     return Produced(result.mesh, seconds, [f"ended by: {result.ended}", *notes])
 
 
+def image_blind(job: Job) -> Produced:
+    """The paper's scheme with k_D = 0: optimal Delaunay triangulation, whatever the image is.
+
+    Raises
+    ------
+    InputError
+        As `ours`.
+    """
+    return ours(job._replace(k_D=0.0), "paper")
+
+
 def _content(job: Job, seconds: dict[str, float]) -> tuple[Image | Content, list[str]]:
     """What the mesh is to represent, and what to note of it: the image, with labels if they are given."""
     if job.labels is None:
@@ -169,6 +180,6 @@ PIPELINES = {
     "bcc": Pipeline("BCC lattice", "control", "the uniform lattice, untouched", bcc),
     "odt": Pipeline(
         "ODT, image-blind", "control", "the lattice optimised for shape alone, k_D = 0",
-        lambda job: ours(job._replace(k_D=0.0), "paper"),
+        image_blind,
     ),
 }  # fmt: skip

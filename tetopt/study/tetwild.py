@@ -17,7 +17,6 @@ than there are, only a wider envelope helps. How the choices were made, E_D as a
 from __future__ import annotations
 
 import importlib
-import time
 from collections.abc import Callable
 from typing import NamedTuple
 
@@ -32,9 +31,11 @@ from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.start.lattice import lattice
 from tetopt.study.interfaces import Surfaces, compacted
+from tetopt.study.search import Response, is_near, tries
 
-NODE_TOLERANCE = 0.05  # of the requested number of nodes, within which a search for it ends
 TETWILD_RUNS = 6  # of one search, at most; each takes about as long as the one that is kept
+# Of nodes to the factor: slopes of -3 to -9 were measured. Cleaver, which shares it, crashes on coarse meshes.
+TETWILD_RESPONSE = Response(-5.0, -12.0, -2.0, step=1.5, after_failure=0.83)
 ENVELOPE_SHARE = 0.2  # how far fTetWild may move a surface, over the edge length of regular cells, at factor 1
 ENVELOPE_EXPONENT = 8.0  # of the factor in the envelope: simple shapes, which end at small factors, are met closely
 EDGE_GROWTH = 0.6  # mm by which edges lengthen per mm of distance from the interfaces
@@ -89,27 +90,23 @@ def filled(image: Image, surfaces: Surfaces, nodes: int) -> Filled:
         raise InputError(f"nodes: a box needs 8 or more, got {nodes}")
     tetrahedralize = _tetrahedralize()
     spacing = node_spacing(image, nodes)
-    runs: list[tuple[float, NDArray[np.float64], NDArray[np.int64], float]] = []
-    factor = 1.0
-    while len(runs) < TETWILD_RUNS:
+
+    def run(factor: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         envelope = ENVELOPE_SHARE * spacing * factor**ENVELOPE_EXPONENT
-        begin = time.perf_counter()
-        points, cells = _run(tetrahedralize, surfaces, factor * spacing, envelope)
-        runs.append((factor, points, cells, time.perf_counter() - begin))
-        if abs(len(points) / nodes - 1.0) <= NODE_TOLERANCE:
-            break
-        factor = next_factor([(f, len(p)) for f, p, _, _ in runs], nodes)
+        return _run(tetrahedralize, surfaces, factor * spacing, envelope)
+
+    runs = tries(run, lambda made: len(made[0]), nodes, TETWILD_RESPONSE, most=TETWILD_RUNS)
     notes: list[str] = []
-    for _, points, cells, seconds in sorted(runs, key=lambda run: abs(np.log(len(run[1]) / nodes))):
+    for each in runs:
         try:
-            points, cells = put_on_box(points, cells, surfaces.low, surfaces.high)
+            points, cells = put_on_box(*each.result, surfaces.low, surfaces.high)
         except InputError as error:
-            notes.append(f"a run with {len(points)} nodes was left out: {error}")
+            notes.append(f"a run with {each.n_nodes} nodes was left out: {error}")
             continue
         world = image.to_world(points / image.spacing)
-        if abs(len(points) / nodes - 1.0) > NODE_TOLERANCE:
+        if not is_near(len(points), nodes):
             notes.append(f"{len(points)} nodes after {len(runs)} runs of fTetWild, {nodes} were asked for")
-        search = sum(run[3] for run in runs) - seconds
+        search = sum(other.seconds for other in runs) - each.seconds
         return Filled(Mesh(world, oriented(world, cells)), len(runs), search, notes)
     raise InputError(f"pytetwild: none of {len(runs)} meshes could be made to fill the box; ask for more nodes")
 
@@ -168,23 +165,6 @@ def _sizing_field(surfaces: Surfaces, edge: float) -> tuple[NDArray, NDArray, ND
     distance = cKDTree(np.vstack([facets.mean(axis=1), facets.reshape(-1, 3)])).query(points)[0]
     values = edge * np.minimum(1.0 + EDGE_GROWTH * np.maximum(distance - edge, 0.0) / edge, EDGE_RATIO)
     return points, unit.cells.astype(np.int32), values
-
-
-def next_factor(tried: list[tuple[float, int]], nodes: int) -> float:
-    """The factor at which the secant of log nodes over log factor meets `nodes`; at most 1.5 times up or down."""
-    x, y = np.log(np.array(tried, dtype=np.float64)).T
-    goal = np.log(nodes)
-    slope = -5.0  # the first guess; measured are -3 to -9
-    order = np.argsort(np.abs(y - goal))
-    if len(tried) > 1:
-        a = order[0]
-        # The other end on the far side of the goal, if there is one, so that the secant brackets.
-        across = [b for b in order[1:] if (y[b] - goal) * (y[a] - goal) < 0.0]
-        b = across[0] if across else order[1]
-        if x[a] != x[b]:
-            slope = float(np.clip((y[a] - y[b]) / (x[a] - x[b]), -12.0, -2.0))
-    step = (goal - y[order[0]]) / slope
-    return float(np.exp(x[order[0]] + np.clip(step, -np.log(1.5), np.log(1.5))))
 
 
 def put_on_box(

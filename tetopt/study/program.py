@@ -1,0 +1,217 @@
+"""A mesher of the user's own in the comparison: a program that reads NIfTI files and writes a mesh.
+
+Its command line is split into arguments as a shell would, and the placeholders of each are filled; no shell runs it.
+It runs in the folder in which `tetopt` was started; image, labels and mesh lie in a temporary one.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+import shutil
+import subprocess
+import tempfile
+from collections.abc import Sequence
+from functools import partial
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from tetopt.errors import InputError
+from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides
+from tetopt.geometry.simplex import oriented
+from tetopt.geometry.topology import boundary_facets
+from tetopt.image import Image
+from tetopt.io.images import save_image, sha256
+from tetopt.io.meshes import MESH_SUFFIXES, load_mesh
+from tetopt.mesh import Mesh
+from tetopt.study.interfaces import class_labels
+from tetopt.study.pipelines import PIPELINES, Job, Pipeline, Produced
+from tetopt.study.search import Response, is_near, tries
+from tetopt.study.tetwild import node_spacing, put_on_box
+
+PROGRAM_RUNS = 5  # of one search, at most; the first asks for what is wanted, the second is seldom far off
+# Of nodes to the number that is asked for: proportional, or nearly so. What fails is rather too coarse than too fine.
+REQUEST_RESPONSE = Response(1.0, 0.3, 3.0, step=4.0, after_failure=1.25)
+LEAST_REQUEST = 8  # nodes: a box has as many corners
+NEAR_BOX_VOXELS = 1.0  # how far off the box's sides a mesh's boundary may lie to be put on them
+PLACEHOLDERS = ("image", "labels", "nodes", "size", "output")
+PROGRAM_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,39}")
+
+
+class Program(NamedTuple):
+    """A program, and what it is called in the comparison."""
+
+    name: str
+    command: str  # as it is written, with placeholders
+
+
+def parse_program(text: str) -> Program:
+    """The program of a text such as "cgal=cgal_mesh {labels} --size {size} -o {output}", checked.
+
+    Placeholders: ``{image}`` and ``{labels}``, paths of NIfTI files (without labels those of multi-Otsu classes);
+    ``{nodes}``, the number of nodes to ask for; ``{size}``, the edge length, mm, at which regular tetrahedra fill the
+    box with that many; ``{output}``, the path of the mesh to write, which ends in .vtu unless a suffix follows, as in
+    ``{output}.msh``.
+
+    Raises
+    ------
+    InputError
+        No name, or one that is no plain word; a command that cannot be split, has an unknown placeholder, lacks
+        ``{output}`` or both of ``{image}`` and ``{labels}``; a program that does not exist, or cannot be run.
+    """
+    name, equals, command = text.partition("=")
+    if not equals or not PROGRAM_NAME.fullmatch(name):
+        raise InputError(
+            f"--pipeline: expected NAME='program {{image}} {{nodes}} {{output}}' with a name of letters, digits, - and "
+            f'_, got "{text}"'
+        )
+    where = f"--pipeline {name}"
+    try:
+        words = shlex.split(command)
+    except ValueError as error:
+        raise InputError(f"{where}: its quotes do not match ({error}): {command}") from error
+    used = {key for word in words for key in re.findall(r"\{(\w*)\}", word)}
+    if strange := sorted(used - set(PLACEHOLDERS)):
+        raise InputError(f"{where}: expected placeholders of {_braced(PLACEHOLDERS)}, got {{{strange[0]}}}")
+    if "output" not in used or not used & {"image", "labels"}:
+        raise InputError(f"{where}: expected {{output}}, and {{image}} or {{labels}} or both, got: {command}")
+    for word in words:
+        suffix = _suffix(word)
+        if suffix is not None and suffix not in MESH_SUFFIXES:
+            raise InputError(f"{where}: the mesh must be named {', '.join(MESH_SUFFIXES)}, got {{output}}{suffix}")
+    if shutil.which(words[0]) is None:
+        raise InputError(f'{where}: no program "{words[0]}" that can be run; give its path, or put its folder on PATH')
+    return Program(name, command)
+
+
+def _braced(names: tuple[str, ...]) -> str:
+    return ", ".join(f"{{{name}}}" for name in names)
+
+
+def _suffix(word: str) -> str | None:
+    """What the mesh's name ends in, if the word has the mesh's name."""
+    match = re.search(r"\{output\}(\.\w+)?", word)
+    return None if match is None else match[1] or ".vtu"
+
+
+def by_program(job: Job, program: Program) -> Produced:
+    """The program's mesh of about as many nodes as the job says, its boundary on the box if it lies near.
+
+    What it is told to make is corrected up to four times until the number of nodes is within 5 %.
+
+    Raises
+    ------
+    InputError
+        The program ends with another code than 0, or without a mesh that can be read: the last line that it wrote on
+        its standard error.
+    """
+    words = shlex.split(program.command)
+    is_steered = any(f"{{{key}}}" in program.command for key in ("nodes", "size"))
+    notes: list[str] = []
+    sizes: list[int] = []
+    with tempfile.TemporaryDirectory(prefix="program-") as name:
+        paths = _inputs(Path(name), job, program.command)
+
+        def run(factor: float) -> Mesh | None:
+            request = max(round(factor * job.nodes), LEAST_REQUEST)
+            values = paths | {"nodes": str(request), "size": f"{node_spacing(job.image, request):.6g}"}
+            try:
+                mesh = _run(program.name, [_filled(word, values) for word in words], _output(words, values["output"]))
+            except InputError as error:
+                if not sizes:
+                    raise
+                notes.append(f"asked for {request} nodes: {error}")
+                return None
+            sizes.append(len(mesh.points))
+            return mesh
+
+        most = PROGRAM_RUNS if is_steered else 1
+        runs = tries(run, lambda mesh: len(mesh.points), job.nodes, REQUEST_RESPONSE, most=most)
+    mesh = runs[0].result
+    if not is_near(len(mesh.points), job.nodes):
+        counts = ", ".join(map(str, sizes))
+        notes.append(f"{len(mesh.points)} nodes, {job.nodes} were asked for; its runs gave {counts}")
+    mesh, on_box = boxed(job.image, mesh)
+    seconds = {"program": runs[0].seconds, "search": sum(each.seconds for each in runs[1:])}
+    return Produced(mesh, seconds, [f"{len(runs)} runs", *notes, *on_box])
+
+
+def _inputs(folder: Path, job: Job, command: str) -> dict[str, str]:
+    """Paths by placeholder; of the files that the program reads those are written that it is to read."""
+    paths = {"image": str(folder / "image.nii.gz"), "labels": str(folder / "labels.nii.gz")}
+    if "{image}" in command:
+        save_image(paths["image"], job.image)
+    if "{labels}" in command:
+        save_image(paths["labels"], class_labels(job.image, job.classes) if job.labels is None else job.labels)
+    return paths | {"output": str(folder / "mesh")}
+
+
+def _filled(word: str, values: dict[str, str]) -> str:
+    """An argument with its placeholders filled; the mesh is a VTU file unless a suffix follows its placeholder."""
+    word = re.sub(r"\{output\}(?!\.\w)", "{output}.vtu", word)
+    return re.sub(r"\{(\w+)\}", lambda match: values[match[1]], word)
+
+
+def _output(words: list[str], stem: str) -> Path:
+    return Path(stem + next(suffix for word in words if (suffix := _suffix(word)) is not None))
+
+
+def _run(name: str, command: list[str], output: Path) -> Mesh:
+    """One run; its mesh, in three dimensions, its cells positively oriented."""
+    output.unlink(missing_ok=True)
+    try:
+        done = subprocess.run(
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, check=False
+        )
+    except OSError as error:
+        raise InputError(f"{name}: cannot be run ({error})") from error
+    lines = done.stderr.decode(errors="replace").strip().splitlines()
+    said = f": {lines[-1]}" if lines else ", and wrote nothing on its standard error"
+    if done.returncode != 0:
+        how = f"signal {-done.returncode}" if done.returncode < 0 else f"exit code {done.returncode}"
+        raise InputError(f"{name} ended with {how}{said}")
+    if not output.is_file():
+        raise InputError(f"{name} wrote no mesh{said}")
+    mesh = load_mesh(output).mesh
+    if mesh.ndim != 3:
+        raise InputError(f"{name}: expected tetrahedra, got triangles")
+    return mesh
+
+
+def boxed(image: Image, mesh: Mesh) -> tuple[Mesh, list[str]]:
+    """The mesh with its boundary on the sides of the image's box, if it lies near them, and notes on that.
+
+    A mesh whose boundary lies farther off than `NEAR_BOX_VOXELS`, or which does not fill the box then, stays as it is.
+    """
+    sides = box_sides(image.shape)
+    index = image.to_index(mesh.points)
+    facets = boundary_facets(mesh.cells)
+    off = np.abs(index[facets][..., None] - sides).max(axis=1).reshape(len(facets), -1)  # of each of the six sides
+    distance = float(off.min(axis=1).max())
+    if distance <= ON_SIDE_VOXELS:
+        return mesh, []
+    if distance > NEAR_BOX_VOXELS:
+        return mesh, [f"its boundary lies up to {distance:.3g} voxels off the sides of the image's box"]
+    try:
+        points, cells = put_on_box(index * image.spacing, mesh.cells, *(sides.T * image.spacing))
+    except InputError as error:
+        return mesh, [f"its boundary is not on the box's faces: {error}"]
+    world = image.to_world(points / image.spacing)
+    note = f"its boundary was moved by up to {distance:.2g} voxels onto the sides of the image's box"
+    return Mesh(world, oriented(world, cells)), [note]
+
+
+def file_checksums(program: Program) -> list[str]:
+    """SHA-256 of the program, and of every file that its command line names, such as a script."""
+    files = (shutil.which(word) or word for word in shlex.split(program.command))
+    return [sha256(Path(name)) for name in files if Path(name).is_file()]
+
+
+def pipelines_with(programs: Sequence[Program]) -> dict[str, Pipeline]:
+    """All pipelines by name, the user's programs last."""
+    return PIPELINES | {
+        each.name: Pipeline(each.name, "peer", f"a program: {each.command}", partial(by_program, program=each))
+        for each in programs
+    }
