@@ -246,3 +246,42 @@ def plane_cut(points, cells, height):
         if places:
             crossings[number] = places
     return crossings
+
+
+# The voxel grid
+
+
+def grid_stiffness(shape, young, element):
+    """Dense stiffness of a grid of voxels, nodes at their corners in C order, dofs node by node.
+
+    `element` (2^n, 2^n, n, n) is of modulus 1, its corners as `product((0, 1), repeat=n)`.
+    """
+    n = len(shape)
+    nodes = tuple(s + 1 for s in shape)
+    K = np.zeros((int(np.prod(nodes)) * n,) * 2)
+    for voxel in np.ndindex(*shape):
+        ids = [int(np.ravel_multi_index(np.add(voxel, c), nodes)) for c in product((0, 1), repeat=n)]
+        for (a, i), (b, k) in product(enumerate(ids), repeat=2):
+            K[i * n : i * n + n, k * n : k * n + n] += young[voxel] * element[a, b]
+    return K
+
+
+def interpolation(fine, coarse):
+    """Dense linear interpolation from coarse + 1 nodes to fine + 1 on the same length."""
+    P = np.zeros((fine + 1, coarse + 1))
+    for node in range(fine + 1):
+        for other in range(coarse + 1):
+            P[node, other] = max(Fraction(0), 1 - abs(Fraction(node * coarse, max(fine, 1)) - other))
+    return P
+
+
+def block_means(data, shape):
+    """Means over the voxels of a coarser grid on the same box, cut voxels by their share; exact shares."""
+    for axis, new in enumerate(shape):
+        old = data.shape[axis]
+        shares = np.zeros((new, old))
+        for row, column in product(range(new), range(old)):
+            low, high = max(Fraction(row * old, new), column), min(Fraction((row + 1) * old, new), column + 1)
+            shares[row, column] = max(Fraction(0), high - low) * Fraction(new, old)
+        data = np.moveaxis(np.tensordot(shares, data, axes=(1, axis)), 0, axis)
+    return data

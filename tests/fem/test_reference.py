@@ -10,15 +10,16 @@ from skfem.models.elasticity import lame_parameters, linear_elasticity
 import tetopt
 from tetopt.fem.elasticity import box_faces, compression
 from tetopt.fem.reference import (
+    OwnError,
     Reference,
+    at_centres,
     averaged,
     compare,
-    element_stiffness,
-    grid_stiffness,
     near_interface,
     nearest,
     reference,
 )
+from tetopt.fem.voxels import Work, element_stiffness
 from tetopt.model.averages import cell_young
 
 SHEARED = np.array([[1.5, 0.3, -0.2], [0.1, 2.0, 0.4], [0.2, -0.3, 0.8]])
@@ -47,22 +48,6 @@ def test_element_against_scikit_fem(nu):
         np.testing.assert_allclose(ours[order[a], order[b]], K[np.ix_(dof[:, a], dof[:, b])], atol=1e-12)
 
 
-@pytest.mark.parametrize("n", [2, 3])
-def test_grid_is_the_sum_of_its_elements(n):
-    rng = np.random.default_rng(n)
-    shape = (3, 2, 4)[:n]
-    image = tetopt.Image(np.ones(shape), affine_of(SHEARED[:n, :n], 0.0))
-    young = rng.uniform(1.0, 5.0, shape)
-    element = element_stiffness(SHEARED[:n, :n], 0.3)
-    nodes = tuple(s + 1 for s in shape)
-    K = np.zeros((np.prod(nodes) * n,) * 2)
-    for voxel in np.ndindex(*shape):
-        ids = [np.ravel_multi_index(np.add(voxel, c), nodes) for c in product((0, 1), repeat=n)]
-        for (a, i), (b, k) in product(enumerate(ids), repeat=2):
-            K[i * n : i * n + n, k * n : k * n + n] += young[voxel] * element[a, b]
-    np.testing.assert_allclose(grid_stiffness(image, young, 0.3).toarray(), K, atol=1e-12)
-
-
 @pytest.mark.parametrize("flip", [1.0, -1.0])
 @pytest.mark.parametrize("n", [2, 3])
 def test_bar_without_sideways_strain(n, flip):
@@ -74,12 +59,16 @@ def test_bar_without_sideways_strain(n, flip):
     assert exact.strain_energy == pytest.approx(0.5 * 7.0 * 0.02**2 * image.volume, rel=1e-9)
     expected = np.zeros((n, n))
     expected[-1, -1] = -0.02
-    np.testing.assert_allclose(exact.strain, np.broadcast_to(expected, exact.strain.shape), atol=1e-9)
+    u, strain = at_centres(image, exact.u, np.arange(image.data.size))
+    np.testing.assert_allclose(strain, np.broadcast_to(expected, strain.shape), atol=1e-9)
     np.testing.assert_allclose(exact.u, exact.u_homogeneous, atol=1e-9)
+    assert exact.own_error.strain_energy < 1e-9
+    assert exact.own_error.displacement is None
+    assert exact.n_dofs == np.prod(np.array(image.shape) + 1) * n
     index = np.stack(np.meshgrid(*map(np.arange, image.shape), indexing="ij"), axis=-1).reshape(-1, n)
     along = image.to_world(index.astype(float))[:, -1]
     top = along.max() + 0.5 * abs(linear[-1, -1])
-    np.testing.assert_allclose(exact.u[:, -1], 0.02 * (top - along), atol=1e-9)
+    np.testing.assert_allclose(u[:, -1], 0.02 * (top - along), atol=1e-9)
 
 
 def test_meshes_tend_to_it():
@@ -105,11 +94,9 @@ def test_meshes_tend_to_it():
 
 def linear_reference(image, slope, shift):
     """A made-up solution u = slope x + shift, against 0 for the homogeneous block."""
-    n = image.ndim
-    index = np.stack(np.meshgrid(*map(np.arange, image.shape), indexing="ij"), axis=-1).reshape(-1, n)
-    u = image.to_world(index.astype(float)) @ slope.T + shift
-    strain = np.broadcast_to(0.5 * (slope + slope.T), (len(u), n, n))
-    return Reference(image, 0.3, 2.0, u, np.zeros_like(u), strain, 0)
+    nodes = np.stack(np.meshgrid(*(np.arange(s + 1) - 0.5 for s in image.shape), indexing="ij"), axis=-1)
+    u = image.to_world(nodes.reshape(-1, image.ndim)).reshape(nodes.shape) @ slope.T + shift
+    return Reference(image, 0.3, 2.0, u, np.zeros_like(u), OwnError(0.0, None), Work(0, 0.0))
 
 
 def test_errors_of_a_known_field():
@@ -192,18 +179,32 @@ def test_errors_are_relative_to_what_the_image_does():
     rng = np.random.default_rng(4)
     image = tetopt.Image(rng.uniform(1.0, 2.0, (12, 6, 5)))
     mesh = tetopt.lattice(image, nodes=60)
-    exact = linear_reference(image, rng.normal(size=(3, 3)), rng.normal(size=3))
-    strain = np.array(exact.strain)
+    slope, shift = rng.normal(size=(3, 3)), rng.normal(size=3)
+    exact = linear_reference(image, slope, shift)
     labels = np.zeros(image.shape)
     labels[:3] = 1
-    strain[~near_interface(labels).ravel()] *= 5.0
-    exact = exact._replace(u_homogeneous=0.5 * exact.u, strain=strain)
-    owner = tetopt.cell_of_voxel(image, mesh)
-    assert (owner >= 0).all()
-    u = np.zeros_like(mesh.points)
-    errors = compare(exact, mesh, u, 2.0, labels)
+    exact = exact._replace(u_homogeneous=0.5 * exact.u)
+    assert (tetopt.cell_of_voxel(image, mesh) >= 0).all()
+    errors = compare(exact, mesh, np.zeros_like(mesh.points), 2.0, labels)
     assert errors.displacement == pytest.approx(2.0)
     assert errors.interface_strain == pytest.approx(1.0)
+    exact.u[8:] *= 5.0  # far from the interface
+    errors = compare(exact, mesh, mesh.points @ slope.T + shift, 2.0, labels)
+    assert errors.displacement > 0.5
+    assert errors.interface_strain == pytest.approx(0.0, abs=1e-12)
+
+
+def test_work_is_done_in_pieces(monkeypatch):
+    """However many voxels are compared at once, the errors are the same."""
+    rng = np.random.default_rng(9)
+    image = tetopt.Image(rng.uniform(1.0, 2.0, (7, 6, 5)), affine_of(SHEARED, 4.0))
+    mesh = tetopt.lattice(image, nodes=60)
+    labels = rng.integers(0, 2, image.shape)
+    exact = linear_reference(image, rng.normal(size=(3, 3)), rng.normal(size=3))
+    u = rng.normal(size=mesh.points.shape)
+    whole = compare(exact, mesh, u, 2.0, labels)
+    monkeypatch.setattr("tetopt.fem.reference.VOXELS_AT_ONCE", 17)
+    np.testing.assert_allclose(compare(exact, mesh, u, 2.0, labels), whole, rtol=1e-12)
 
 
 def test_nearest_to_a_coarser_grid():

@@ -1,28 +1,51 @@
 """The reference that meshes are judged by: the same compression on a grid with an element to every voxel.
 
 Elements are n-linear (hexahedra; quadrilaterals of plane stress in 2-D), parallelepipeds under the image's affine, each
-with its voxel's modulus. All have one shape, so one element matrix serves for all, times the modulus.
+with its voxel's modulus. `tetopt.fem.voxels` solves them without a matrix, on millions of voxels.
 """
 
 from __future__ import annotations
 
-from itertools import product
+from itertools import product as combinations_of
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy import ndimage
-from scipy.sparse import bsr_array, csr_array
 
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.errors import InputError
-from tetopt.fem.elasticity import System, lame_constants, push_of, solved, strains
-from tetopt.fem.rigidity import rigid_modes
-from tetopt.geometry.box import box_sides, is_on_sides, upright_axis
+from tetopt.fem.elasticity import push_of, strains
+from tetopt.fem.voxel_kernels import product
+from tetopt.fem.voxels import (
+    Grid,
+    Work,
+    block_means,
+    grid_of,
+    interpolated,
+    shape_gradients,
+    solve_voxels,
+    stiffness_product,
+)
+from tetopt.geometry.box import upright_axis
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 
 INTERFACE_BAND_VOXELS = 2.0  # how near to an interface the strain there is judged
+SCALE_RESIDUAL = (
+    1e-6  # of the homogeneous block, which only scales an error: a thousandth of the smallest that there is
+)
+VOXELS_AT_ONCE = 2**18  # compared, so that a volume of millions takes no more memory than its solution
+
+
+class OwnError(NamedTuple):
+    """How far the solution at half the resolution is from the reference's, each relative as in `Errors`.
+
+    Where errors fall with the voxels' size, the reference's own is about as large; with its square, a third of it.
+    """
+
+    strain_energy: float
+    displacement: float | None
 
 
 class Reference(NamedTuple):
@@ -31,10 +54,15 @@ class Reference(NamedTuple):
     modulus: Image  # kPa, the grid's elements
     nu: float
     strain_energy: float  # uJ (a mm of thickness in 2-D)
-    u: NDArray[np.float64]  # (K, n) mm, at the voxels' centres, in the image's order
-    u_homogeneous: NDArray[np.float64]  # (K, n) mm, of the same block with one modulus everywhere
-    strain: NDArray[np.float64]  # (K, n, n), at the voxels' centres
-    n_dofs: int
+    u: NDArray[np.float64]  # (*shape + 1, n) mm, at the voxels' corners
+    u_homogeneous: NDArray[np.float64]  # the same of the block with one modulus everywhere
+    own_error: OwnError
+    work: Work
+
+    @property
+    def n_dofs(self) -> int:
+        """Displacements of all nodes, prescribed ones too."""
+        return self.u.size
 
 
 class Errors(NamedTuple):
@@ -62,21 +90,30 @@ def reference(modulus: Image, nu: float, percent: float = 1.0) -> Reference:
     InputError
         A modulus that is not above 0, or nu out of range.
     RuntimeError
-        As `tetopt.fem.elasticity.solved`.
+        As `tetopt.fem.voxels.solve_voxels`.
     """
-    young = modulus.data.astype(np.float64)
-    if not (np.isfinite(young) & (young > 0.0)).all():
-        raise InputError(f"modulus: expected moduli above 0 kPa in every voxel, got down to {young.min():g}")
+    if not (modulus.data > 0.0).all():
+        raise InputError(f"modulus: expected moduli above 0 kPa in every voxel, got down to {modulus.data.min():g}")
     if not -1.0 < nu < 0.5:
         raise InputError(f"nu: expected -1 < nu < 0.5, got {nu}")
-    K, u = _compressed(modulus, young, nu, percent)
-    homogeneous = _compressed(modulus, np.ones_like(young), nu, percent)[1]
-    dofs = u.ravel()
-    shape = tuple(s + 1 for s in modulus.shape)
-    centre, slope = _at_centres(u.reshape(*shape, -1), modulus)
-    strain = 0.5 * (slope + slope.transpose(0, 2, 1))
-    even = _at_centres(homogeneous.reshape(*shape, -1), modulus)[0]
-    return Reference(modulus, nu, 0.5 * float(dofs @ (K @ dofs)), centre, even, strain, len(dofs))
+    grid = grid_of(modulus, nu)
+    push = push_of(modulus, percent)
+    half = grid.coarsened(tuple(max(1, s // 2) for s in grid.young.shape))
+    u_half = _pushed(modulus, half, push)
+    solve_voxels(half, u_half)
+    u = _pushed(modulus, grid, push, interpolated(u_half, half, grid))
+    work = solve_voxels(grid, u)
+    difference = _distance(u, interpolated(u_half, half, grid))
+    energy, half_energy = (0.5 * float(product(v, stiffness_product(g, v))) for g, v in ((grid, u), (half, u_half)))
+    even = u
+    if grid.young.min() < grid.young.max():
+        even = _pushed(modulus, grid, push)
+        solve_voxels(grid._replace(young=np.ones_like(grid.young)), even, SCALE_RESIDUAL)
+    scale = _distance(u, even)
+    own = OwnError(
+        abs(half_energy / energy - 1.0), None if scale <= 1e-7 * _distance(u, np.zeros(len(u))) else difference / scale
+    )
+    return Reference(modulus, nu, energy, grid.in_image(u), grid.in_image(even), own, work)
 
 
 def compare(exact: Reference, mesh: Mesh, u: NDArray[np.float64], strain_energy: float, labels: ArrayLike) -> Errors:
@@ -100,16 +137,40 @@ def compare(exact: Reference, mesh: Mesh, u: NDArray[np.float64], strain_energy:
     inside = np.flatnonzero(owner >= 0)
     if len(inside) == 0:
         raise InputError("mesh: no voxel centre of the reference lies in it")
-    ours = _interpolated(exact.modulus, mesh, u, owner, inside)
-    scale = _rms(exact.u[inside] - exact.u_homogeneous[inside])
-    is_homogeneous = scale <= 1e-7 * _rms(exact.u[inside])  # all that is left is the solver's own
-    is_near = near_interface(np.asarray(labels)).ravel()[inside]
-    strain_error = None
-    if is_near.any():
-        voxels = inside[is_near]
-        strain_error = _rms(strains(mesh, u)[owner[voxels]] - exact.strain[voxels]) / _rms(exact.strain[voxels])
-    energy_error = abs(strain_energy / exact.strain_energy - 1.0)
-    return Errors(energy_error, None if is_homogeneous else _rms(ours - exact.u[inside]) / scale, strain_error)
+    is_near = near_interface(np.asarray(labels)).ravel()
+    of_cell = strains(mesh, u)
+    error, scale, size, strain_error, strain_size = np.zeros(5)
+    for begin in range(0, len(inside), VOXELS_AT_ONCE):
+        voxels = inside[begin : begin + VOXELS_AT_ONCE]
+        there, strain = at_centres(exact.modulus, exact.u, voxels)
+        error += _squares(_interpolated(exact.modulus, mesh, u, owner, voxels) - there)
+        scale += _squares(there - at_centres(exact.modulus, exact.u_homogeneous, voxels)[0])
+        size += _squares(there)
+        near = is_near[voxels]
+        strain_error += _squares(of_cell[owner[voxels[near]]] - strain[near])
+        strain_size += _squares(strain[near])
+    is_homogeneous = scale <= 1e-14 * size  # all that is left is the solver's own
+    return Errors(
+        abs(strain_energy / exact.strain_energy - 1.0),
+        None if is_homogeneous else float(np.sqrt(error / scale)),
+        float(np.sqrt(strain_error / strain_size)) if is_near[inside].any() else None,
+    )
+
+
+def at_centres(
+    image: Image, u: NDArray[np.float64], voxels: NDArray[np.int64]
+) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    """Displacement (K, n) and strain (K, n, n) at the centres of voxels of these flat numbers, from nodes' `u`."""
+    n = image.ndim
+    corners = np.array(list(combinations_of((0, 1), repeat=n)))
+    gradients = shape_gradients(np.full(n, 0.5), corners) @ np.linalg.inv(image.affine[:n, :n])
+    place = np.unravel_index(voxels, image.shape)
+    value, slope = np.zeros((len(voxels), n)), np.zeros((len(voxels), n, n))
+    for corner, g in zip(corners, gradients, strict=True):
+        part = u[tuple(axis + c for axis, c in zip(place, corner, strict=True))]
+        value += part / 2**n
+        slope += part[:, :, None] * g
+    return value, 0.5 * (slope + slope.transpose(0, 2, 1))
 
 
 def near_interface(labels: NDArray) -> NDArray[np.bool_]:
@@ -133,12 +194,7 @@ def averaged(image: Image, shape: tuple[int, ...]) -> Image:
     n = image.ndim
     if len(shape) != n or any(not 1 <= c <= s for c, s in zip(shape, image.shape, strict=False)):
         raise InputError(f"averaged: expected up to {image.shape} voxels, got {shape}")
-    data = image.data.astype(np.float64)
-    for axis, (new, old) in enumerate(zip(shape, image.shape, strict=True)):
-        ends = np.linspace(0.0, old, new + 1)
-        overlap = np.minimum(ends[1:, None], np.arange(1, old + 1)) - np.maximum(ends[:-1, None], np.arange(old))
-        share = np.maximum(overlap, 0.0) * (new / old)
-        data = np.moveaxis(np.tensordot(share, data, axes=(1, axis)), 0, axis)
+    data = block_means(image.data.astype(np.float64), shape)
     size = np.array(image.shape) / np.array(shape)
     wider = np.eye(n + 1)
     wider[:n, :n] = np.diag(size)
@@ -155,90 +211,19 @@ def nearest(image: Image, grid: Image) -> Image:
     return Image(image.data[np.ix_(*places)], grid.affine)
 
 
-def _compressed(
-    image: Image, young: NDArray[np.float64], nu: float, percent: float
-) -> tuple[csr_array, NDArray[np.float64]]:
-    """The stiffness matrix and the displacement of every node, (N, n) mm."""
-    n = image.ndim
-    shape = tuple(s + 1 for s in image.shape)
-    K = grid_stiffness(image, young, nu)
-    index = np.stack(np.meshgrid(*(np.arange(s) - 0.5 for s in shape), indexing="ij"), axis=-1).reshape(-1, n)
-    points = image.to_world(index)
-    axis = upright_axis(image.affine)
-    is_on = is_on_sides(index, box_sides(image.shape))[:, axis].T
-    bottom, top = is_on if image.affine[n - 1, axis] > 0.0 else is_on[::-1]
-    prescribed = np.zeros((len(points), n))
-    prescribed[bottom] = push_of(image, percent)
-    is_free = np.repeat(~(bottom | top), n)
-    free = np.flatnonzero(is_free)
-    rows = K[free]
-    values = prescribed.ravel()
-    system = System(K, free, rows[:, free], -(rows @ values), values, rigid_modes(points), np.eye(n))
-    return K, solved(system)
-
-
-def grid_stiffness(image: Image, young: NDArray[np.float64], nu: float) -> csr_array:
-    """Stiffness of the grid of voxels, nodes at their corners in C order, dofs node by node, mN/mm."""
-    n = image.ndim
-    element = element_stiffness(image.affine[:n, :n], nu)
-    corners = list(product((0, 1), repeat=n))
-    offsets = list(product((-1, 0, 1), repeat=n))
-    shape = tuple(s + 1 for s in image.shape)
-    blocks = np.zeros((*shape, len(offsets), n, n))
-    for a, corner in enumerate(corners):
-        here = blocks[tuple(slice(c, c + s) for c, s in zip(corner, image.shape, strict=True))]
-        for b, other in enumerate(corners):
-            slot = offsets.index(tuple(o - c for o, c in zip(other, corner, strict=True)))
-            here[..., slot, :, :] += young[..., None, None] * element[a, b]
-    place = np.stack(np.meshgrid(*(np.arange(s) for s in shape), indexing="ij"), axis=-1).reshape(-1, 1, n)
-    neighbour = place + np.array(offsets)
-    exists = ((neighbour >= 0) & (neighbour < shape)).all(axis=2)
-    column = np.ravel_multi_index(np.where(exists[..., None], neighbour, 0).reshape(-1, n).T, shape)
-    start = np.concatenate([[0], np.cumsum(exists.sum(axis=1))])
-    data = blocks.reshape(-1, len(offsets), n, n)[exists]
-    columns = column.reshape(exists.shape)[exists]
-    return bsr_array((data, columns, start), shape=(n * len(place),) * 2).tocsr()
-
-
-def element_stiffness(jacobian: NDArray[np.float64], nu: float) -> NDArray[np.float64]:
-    """Stiffness of one element of modulus 1 between its corners, (2^n, 2^n, n, n); corners as `product((0, 1), ...)`.
-
-    `jacobian` (n, n) takes a voxel's index axes to mm. By Gauss's rule of two points along each axis, exact here.
-    """
-    n = len(jacobian)
-    corners = np.array(list(product((0, 1), repeat=n)))
-    lame_1, mu = (float(constant[0]) for constant in lame_constants(np.ones(1), nu, n))
-    size = abs(float(np.linalg.det(jacobian))) / 2**n  # of each Gauss point's share
-    K = np.zeros((2**n, 2**n, n, n))
-    for sign in product((-1.0, 1.0), repeat=n):
-        at = 0.5 + np.array(sign) / np.sqrt(12.0)
-        g = _shape_gradients(at, corners) @ np.linalg.inv(jacobian)
-        outer = np.einsum("ai,bj->abij", g, g)
-        dot = np.einsum("ai,bi->ab", g, g)
-        K += size * (lame_1 * outer + mu * outer.transpose(0, 1, 3, 2) + mu * dot[..., None, None] * np.eye(n))
-    return K
-
-
-def _shape_gradients(at: NDArray[np.float64], corners: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Gradients of the n-linear hat functions at a point of the unit cube, (2^n, n), per unit of index."""
-    factors = np.where(corners == 1, at, 1.0 - at)
-    g = np.empty(corners.shape)
-    for axis in range(len(at)):
-        g[:, axis] = np.where(corners[:, axis] == 1, 1.0, -1.0) * np.delete(factors, axis, axis=1).prod(axis=1)
-    return g
-
-
-def _at_centres(u: NDArray[np.float64], image: Image) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Displacement (K, n) and its gradient (K, n, n), du_i / dx_k, at the voxels' centres from nodes (*shape+1, n)."""
-    n = image.ndim
-    corners = np.array(list(product((0, 1), repeat=n)))
-    gradients = _shape_gradients(np.full(n, 0.5), corners) @ np.linalg.inv(image.affine[:n, :n])
-    value, slope = np.zeros((*image.shape, n)), np.zeros((*image.shape, n, n))
-    for corner, g in zip(corners, gradients, strict=True):
-        part = u[tuple(slice(c, c + s) for c, s in zip(corner, image.shape, strict=True))]
-        value += part / 2**n
-        slope += part[..., :, None] * g
-    return value.reshape(-1, n), slope.reshape(-1, n, n)
+def _pushed(
+    image: Image, grid: Grid, push: NDArray[np.float64], start: NDArray[np.float32] | None = None
+) -> NDArray[np.float64]:
+    """Displacements with the bottom pushed in and the top at rest; between them `start`, or linear."""
+    u = np.zeros_like(grid.nodes()) if start is None else start.astype(np.float64)
+    planes = np.moveaxis(u, 1 + grid.plates, 0)
+    is_up = image.affine[image.ndim - 1, upright_axis(image.affine)] > 0.0
+    bottom, top = (0, -1) if is_up else (-1, 0)
+    if start is None:
+        planes[:] = np.linspace(*((1.0, 0.0) if is_up else (0.0, 1.0)), len(planes))[:, None, None, None]
+        u *= push[:, None, None, None]
+    planes[bottom], planes[top] = push[:, None, None], 0.0
+    return u
 
 
 def _interpolated(
@@ -256,5 +241,10 @@ def _interpolated(
     return np.einsum("ka,kai->ki", weights, u[mesh.cells[cell]])
 
 
-def _rms(values: NDArray[np.float64]) -> float:
-    return float(np.sqrt((values**2).sum() / len(values)))
+def _squares(values: NDArray[np.float64]) -> float:
+    return float((values**2).sum())
+
+
+def _distance(a: NDArray[np.floating], b: NDArray[np.floating]) -> float:
+    """Between two fields of nodes."""
+    return float(np.sqrt(sum(_squares(one - other) for one, other in zip(a, b, strict=True))))
