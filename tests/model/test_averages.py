@@ -7,7 +7,8 @@ import pytest
 
 import tetopt
 from tetopt import Image, InputError, cell_moments, cell_of_voxel, lattice
-from tetopt.model.averages import cell_young, node_young, parse_average, young_image
+from tetopt.geometry.quadratic import gauss_rule
+from tetopt.model.averages import cell_young, gauss_young, node_young, parse_average, young_image
 from tetopt.model.build import model_of
 
 
@@ -165,3 +166,40 @@ def test_a_node_without_voxels_has_the_nearest_one_s_modulus():
     assert is_empty.sum() > 100
     index = np.clip(np.rint(image.to_index(mesh.points)).astype(int), 0, 2)
     np.testing.assert_array_equal(young[is_empty], 1.0 + image.data[tuple(index[is_empty].T)])
+
+
+@pytest.mark.parametrize("n", [2, 3])
+@pytest.mark.parametrize("order", [1, 2])
+def test_moduli_at_gauss_points_are_linear_in_the_cell(n, order):
+    """Exact for a linear field; their weighted sum is the mean over the cell; equal corners give that very number."""
+    image = noise((8,) * n)
+    mesh = lattice(image, blocks=(2,) * n)
+    places, weights = gauss_rule(n, order)
+    slope = np.array([0.3, -0.7, 0.2])[:n]
+    young = 20.0 + mesh.points @ slope
+    moduli = gauss_young(young, mesh, order)
+    at = np.einsum("qa,cai->cqi", places, mesh.points[mesh.cells])
+    np.testing.assert_allclose(moduli, 20.0 + at @ slope, rtol=1e-13)
+    np.testing.assert_allclose(moduli @ weights, young[mesh.cells].mean(axis=1), rtol=1e-13)
+    assert (gauss_young(np.full(len(mesh.points), 0.7), mesh, order) == 0.7).all()
+
+
+def test_a_model_has_moduli_of_nodes():
+    image = noise((8, 9, 10))
+    mesh = lattice(image, blocks=(2, 2, 2))
+    law = [(0.0, 1.0), (200.0, 10.0)]
+    model = model_of(mesh, image, young=law, average="nodes")
+    np.testing.assert_array_equal(model.node_young, node_young(image, mesh, law))
+    np.testing.assert_array_equal(
+        model.materials.young[model.materials.of_cell], gauss_young(model.node_young, mesh, 1)[:, 0]
+    )
+    np.testing.assert_array_equal(
+        model_of(mesh, image, young="1 + 0.045*h", average="nodes").node_young,
+        node_young(image, mesh, lambda h: 1.0 + 0.045 * h),
+    )
+    assert model_of(mesh, image, young=law).node_young is None
+    assert model_of(mesh, image, young="3", average="nodes").node_young is None  # nothing varies
+    with pytest.raises(InputError, match=r"bins: moduli that are linear between nodes have no groups"):
+        model_of(mesh, image, young=law, average="nodes", bins=3)
+    with pytest.raises(InputError, match=r"average: nodes is over the image's voxels; give the image \(--image\)"):
+        model_of(mesh, young=law, average="nodes", cell_data={"mean": np.ones(len(mesh.cells))})

@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 
 from tetopt.energy.sampling import cell_of_voxel, nearest_values, ranges_of
 from tetopt.errors import InputError
+from tetopt.geometry.quadratic import gauss_rule
 from tetopt.geometry.simplex import centroids, volume_gradients, volumes
 from tetopt.image import Image
 from tetopt.mesh import Mesh
@@ -115,7 +116,7 @@ def cell_young(image: Image, mesh: Mesh, law: Law = None, average: str = "mean")
     """
     parsed = parse_average(average)
     if parsed.is_nodal:
-        return node_young(image, mesh, law)[mesh.cells].mean(axis=1)
+        return gauss_young(node_young(image, mesh, law), mesh, 1)[:, 0]
     field = young_image(image, law)
     owner = cell_of_voxel(field, mesh).ravel()
     _check_above_zero(parsed, image, field, owner)
@@ -169,6 +170,18 @@ def node_young(image: Image, mesh: Mesh, law: Law = None) -> NDArray[np.float64]
     young = np.clip(np.exp(total / np.where(is_empty, 1.0, weight)), low, high)
     young[is_empty] = nearest_values(field, mesh.points[is_empty])
     return young
+
+
+def gauss_young(node_young: NDArray[np.float64], mesh: Mesh, order: int) -> NDArray[np.float64]:
+    """Moduli (M, Q) at the Gauss points of each cell of an order, kPa, of moduli (N,) of the mesh's nodes.
+
+    Linear between a cell's corners, as Abaqus and CalculiX have moduli that depend on a nodal temperature.
+    """
+    places, _ = gauss_rule(mesh.ndim, order)
+    corners = node_young[mesh.cells]
+    # Within their range, so that equal moduli stay as they are.
+    low, high = corners.min(axis=1, keepdims=True), corners.max(axis=1, keepdims=True)
+    return np.clip(np.einsum("qa,ca->cq", places, corners), low, high)
 
 
 def _places(

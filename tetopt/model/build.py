@@ -12,11 +12,11 @@ from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.model.averages import DEFAULT_AVERAGE, cell_values, cell_young, parse_average
+from tetopt.model.averages import DEFAULT_AVERAGE, cell_values, cell_young, gauss_young, node_young, parse_average
 from tetopt.model.fields import cell_fields
 from tetopt.model.laws import ByLabel, Law, has_column, law_values, parse_any_law, young_from
 from tetopt.model.loads import parse_loads
-from tetopt.model.materials import DEFAULT_NU, Materials, Spacing, binned, by_label, density_of, materials
+from tetopt.model.materials import DEFAULT_NU, Spacing, binned, by_label, density_of, materials
 from tetopt.model.model import Model
 from tetopt.model.sets import Box, Sets, box_of, standard_sets, with_requested
 
@@ -99,9 +99,15 @@ def model_of(
         box = box_of(image) if box is None and image is not None else box
         known_sets = standard_sets(mesh, box, labels)
     all_sets = with_requested(mesh, known_sets, sets, mean)
-    table: Materials | None = None
+    table, nodal = None, None
     if young is not None:
-        moduli = _values(young, "young", mesh, image, mean, labels, average)
+        nodal = _node_moduli(young, mesh, image) if parse_average(average).is_nodal else None
+        if nodal is None:
+            moduli = _values(young, "young", mesh, image, mean, labels, average)
+        elif bins is None:
+            moduli = gauss_young(nodal, mesh, 1)[:, 0]
+        else:
+            raise InputError("bins: moduli that are linear between nodes have no groups; take another average, or none")
         ratios = _values(nu, "nu", mesh, image, mean, labels)
         masses = None if density is None else _values(density, "density", mesh, image, mean, labels)
         table = materials(moduli, ratios, len(mesh.cells), masses)
@@ -114,7 +120,7 @@ def model_of(
     parsed = parse_loads(loads, mesh, all_sets)
     if any(load.kind == "gravity" for load in parsed):
         density_of(table)  # or it is refused
-    return Model(mesh, cell_data, all_sets, table, parsed, order, about=dict(about or {}))
+    return Model(mesh, cell_data, all_sets, table, parsed, order, node_young=nodal, about=dict(about or {}))
 
 
 def labels_of(cell_data: dict[str, NDArray], n_cells: int) -> NDArray[np.int64] | None:
@@ -124,6 +130,13 @@ def labels_of(cell_data: dict[str, NDArray], n_cells: int) -> NDArray[np.int64] 
         return None
     whole = labels.astype(np.int64)
     return whole if (whole == labels).all() and whole.min() >= 0 else None
+
+
+def _node_moduli(young: Any, mesh: Mesh, image: Image | None) -> NDArray[np.float64] | None:
+    """`node_young` of a law of the intensity; None if the modulus is something else, or there is no image."""
+    law: Any = parse_any_law(young) if isinstance(young, str) else young
+    is_law = callable(law) or np.ndim(law) == 2
+    return node_young(image, mesh, law) if is_law and image is not None else None
 
 
 def _values(
