@@ -6,6 +6,7 @@ import numpy as np
 
 import tetopt
 from tetopt.fem.elasticity import compression, lame_constants, strains
+from tetopt.geometry.quadratic import cell_edges, quadratic
 from tetopt.geometry.simplex import volumes
 from tetopt.model.loads import parse_loads
 from tetopt.model.materials import binned, materials
@@ -44,6 +45,25 @@ def sample_model(n=3, bins=3):
         table = binned(table, volumes(mesh.points, mesh.cells), bins)
     loads = parse_loads(["compress:5%"], mesh, sets)
     return Model(mesh, fields, sets, table, loads, about=dict(ABOUT))
+
+
+@cache
+def quadratic_model(n=3, bins=3):
+    """The same of order 2, with point data of every node ("displacement") and of the corners alone ("warmth")."""
+    model, rng = sample_model(n, bins), np.random.default_rng(n)
+    n_nodes = len(quadratic(model.mesh.points, model.mesh.cells)[0])
+    fields = {"displacement": rng.normal(size=(n_nodes, n)), "warmth": rng.normal(size=len(model.mesh.points))}
+    return model._replace(order=2, point_data=fields)
+
+
+def all_nodes(values, mesh):
+    """A field of the corners with the mean of an edge's ends at its middle, as the docstrings say it."""
+    nodes, cells = quadratic(mesh.points, mesh.cells)
+    filled = np.concatenate([values, np.empty(len(nodes) - len(values))])
+    for cell in cells:
+        for node, (a, b) in zip(cell[mesh.ndim + 1 :], cell_edges(mesh.ndim), strict=True):
+            filled[node] = 0.5 * (values[cell[a]] + values[cell[b]])
+    return filled
 
 
 def young_of(model):

@@ -318,7 +318,7 @@ def test_loads_run_or_are_said_to_be_in_comments(folder, tmp_path, capsys):
         ("a.inp", ["--units", "Pa"], "--units: expected kPa or MPa"),
         ("a.inp", ["--space", "xyz"], "--space: expected ras or lps"),
         ("a.inp", ["--order", "3"], "--order: expected 1 or 2"),
-        ("a.vtu", ["--order", "2"], "--order 2 is for .msh, .msh2, .inp, .feb only"),
+        ("a.stl", ["--order", "2"], "--order 2 is for .vtu, .vtk, "),
         ("a.inp", ["--load", "compress:5%"], "loads, but no materials"),
         ("a.inp", ["--young", "2", "--load", "compress:5"], "expected compress:P%"),
         ("a.inp", ["--young", "2", "--load", "hold:skin"], 'no set of facets "skin"'),

@@ -10,23 +10,24 @@ from itertools import chain
 import meshio
 import numpy as np
 import pytest
-from models import ABOUT, each_once, sample_model, young_of
+from models import ABOUT, all_nodes, each_once, quadratic_model, sample_model, young_of
 
 import tetopt.io.gmsh
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import quadratic
+from tetopt.geometry.simplex import volumes
 from tetopt.io.formats import save_model
 from tetopt.io.gmsh import gmsh22, gmsh41, own_comments
 from tetopt.io.meshes import load_mesh
 from tetopt.model.loads import load_words
 from tetopt.model.materials import materials
-from tetopt.model.model import in_space, in_units
+from tetopt.model.model import element_facets, elements, in_space, in_units
 from tetopt.model.sets import Sets, facet_triples, nodes_of
 
 WRITERS = {"4.1": gmsh41, "2.2": gmsh22}
 MODELS = [(3, 3), (3, None), (2, 3), (2, None)]
-NODES_OF_TYPE = {1: 2, 2: 3, 4: 4, 9: 6, 11: 10}
-DIM_OF_TYPE = {1: 1, 2: 2, 4: 3, 9: 2, 11: 3}
+NODES_OF_TYPE = {1: 2, 2: 3, 4: 4, 8: 3, 9: 6, 11: 10}
+DIM_OF_TYPE = {1: 1, 2: 2, 4: 3, 8: 1, 9: 2, 11: 3}
 
 # Reading, after the chapters "MSH file format" and "MSH file format version 2" of gmsh's manual
 
@@ -276,22 +277,48 @@ def test_lps(version):
 
 
 @pytest.mark.parametrize("version", WRITERS)
-def test_quadratic_cells(version):
+@pytest.mark.parametrize("n", [3, 2])
+def test_quadratic_cells(version, n):
     """Each midpoint is where gmsh's manual has it: edges 01 12 02 03 23 13 of a tetrahedron, 01 12 20 of a triangle."""
-    model = sample_model()._replace(order=2)
+    model = quadratic_model(n)
     read = Read(WRITERS[version](model))
     points, cells = quadratic(model.mesh.points, model.mesh.cells)
-    assert np.array_equal(read.points, points)
+    assert np.array_equal(read.points[:, :n], points)
     nodes = read.nodes(cell_numbers(model))
     assert np.array_equal(np.sort(nodes), np.sort(cells))
-    assert np.array_equal(nodes[:, :4], model.mesh.cells)
+    assert np.array_equal(nodes[:, : n + 1], model.mesh.cells)
     ends = [(0, 1), (1, 2), (0, 2), (0, 3), (2, 3), (1, 3)]
-    for at, edge in enumerate(ends, 4):
+    for at, edge in enumerate(ends[: n * (n + 1) // 2], n + 1):
         assert np.array_equal(points[nodes[:, at]], points[nodes[:, edge]].mean(axis=1))
-    sides = read.nodes(read.groups[2, "left"])
-    assert each_once(sides[:, :3]) == each_once(facet_triples(model.mesh.cells, model.sets.facets["left"]))
-    for at, edge in enumerate([(0, 1), (1, 2), (2, 0)], 3):
+    left = next(iter(model.sets.facets))
+    sides = read.nodes(read.groups[n - 1, left])
+    assert each_once(sides[:, :n]) == each_once(facet_triples(model.mesh.cells, model.sets.facets[left]))
+    for at, edge in enumerate([(0, 1), (1, 2), (2, 0)][: 3 if n == 3 else 1], n):
         assert np.array_equal(points[sides[:, at]], points[sides[:, edge]].mean(axis=1))
+
+
+@pytest.mark.parametrize("n", [3, 2])
+def test_point_data_are_views_in_41_and_a_comment_in_22(n):
+    model = quadratic_model(n)
+    lines = gmsh41(model).decode().split("$NodeData\n")[1:]
+    columns = {}
+    for block in lines:
+        head, rows = block.split("\n$End")[0].split("\n")[:8], block.split("\n$End")[0].split("\n")[8:]
+        table = np.array([row.split() for row in rows], dtype=float)
+        assert head[2:] == ["1", "0.0", "3", "0", str(table.shape[1] - 1), str(len(table))]
+        assert table[:, 0].tolist() == list(range(1, len(table) + 1))
+        columns[head[1].strip('"')] = table[:, 1:]
+    displacement = model.point_data["displacement"]
+    if n == 3:  # as gmsh deforms by it
+        expected = {"displacement": displacement}
+    else:
+        expected = {"displacement_0": displacement[:, :1], "displacement_1": displacement[:, 1:]}
+    expected["warmth"] = all_nodes(model.point_data["warmth"], model.mesh)[:, None]
+    assert set(columns) == set(expected)
+    for name, values in expected.items():
+        assert np.array_equal(columns[name], values), name
+    left_out = [line for line in Read(gmsh22(model)).comments if line.startswith("point data")]
+    assert left_out == ["point data, which this format has no place for: displacement, warmth"]
 
 
 # Other models
@@ -363,12 +390,6 @@ def test_names_that_cell_data_have():
         gmsh41(model)
 
 
-@pytest.mark.parametrize("version", WRITERS)
-def test_quadratic_triangles_are_refused(version):
-    with pytest.raises(InputError, match=r"^order 2: only of tetrahedra"):
-        WRITERS[version](sample_model(2)._replace(order=2))
-
-
 # Our own reader
 
 SUFFIX = {"4.1": ".msh", "2.2": ".msh2"}
@@ -376,17 +397,21 @@ SUFFIX = {"4.1": ".msh", "2.2": ".msh2"}
 
 @pytest.mark.parametrize("version", WRITERS)
 @pytest.mark.parametrize(("n", "space"), [(2, "ras"), (3, "ras"), (3, "lps")])
-@pytest.mark.parametrize("bins", [3, "none", "many"])
-def test_our_reader_finds_the_model(version, n, space, bins, tmp_path, monkeypatch):
+@pytest.mark.parametrize(("bins", "order"), [(3, 1), ("none", 1), ("many", 1), (3, 2)])
+def test_our_reader_finds_the_model(version, n, space, bins, order, tmp_path, monkeypatch):
     """Points, cells, sets, moduli in their units, where the file came from; in 4.1 in another order of cells."""
-    model, path = sample_model(n), tmp_path / f"a{SUFFIX[version]}"
+    model, path = (sample_model if order == 1 else quadratic_model)(n), tmp_path / f"a{SUFFIX[version]}"
     if bins == "none":
         model = model._replace(materials=None)
     if bins == "many" and version == "4.1":  # then they are no groups
         monkeypatch.setattr(tetopt.io.gmsh, "MOST_MATERIAL_GROUPS", 2)
     save_model(path, model, space=space, units="MPa")
     back = load_mesh(path)
-    assert (back.space, back.n_turned, back.notes) == (space, 0, ())
+    assert (back.space, back.n_turned, back.notes, back.order) == (space, 0, (), order)
+    if order == 2 and version == "4.1":
+        assert np.array_equal(back.point_data["warmth"], all_nodes(model.point_data["warmth"], model.mesh))
+        if n == 3:
+            assert np.array_equal(back.point_data["displacement"], model.point_data["displacement"])
     assert back.mesh.points.tobytes() == model.mesh.points.tobytes()
     assert {name: values.tolist() for name, values in back.field_data.items()} == {
         "units": ["MPa"], "image": [ABOUT["image"]], "image_sha256": [ABOUT["image_sha256"]]
@@ -458,31 +483,34 @@ def test_comments_of_others_are_not_ours():
 
 
 @pytest.mark.parametrize("version", WRITERS)
-@pytest.mark.parametrize(("n", "bins"), [(3, 3), (2, None)])
-def test_meshio_reads_it(version, n, bins, tmp_path):
-    model = sample_model(n, bins)
+@pytest.mark.parametrize(("n", "bins", "order"), [(3, 3, 1), (2, None, 1), (3, 3, 2), (2, None, 2)])
+def test_meshio_reads_it(version, n, bins, order, tmp_path):
+    model = (sample_model if order == 1 else quadratic_model)(n, bins)
+    points, own = elements(model)
     path = tmp_path / "model.msh"
     path.write_bytes(WRITERS[version](model))
     read = meshio.read(path)
-    assert np.array_equal(read.points[:, :n], model.mesh.points)
-    kind = {2: "triangle", 3: "tetra"}[n]
+    assert np.array_equal(read.points[:, :n], points)
+    kind = {3: "triangle", 4: "tetra", 6: "triangle6", 10: "tetra10"}[own.shape[1]]
     blocks = [k for k, block in enumerate(read.cells) if block.type == kind]
     cells = np.concatenate([read.cells[k].data for k in blocks])
     material = np.concatenate([read.cell_data["gmsh:physical"][k] for k in blocks]) - 1
-    order = np.lexsort(model.mesh.cells.T), np.lexsort(cells.T)  # meshio drops the numbers of elements
-    assert np.array_equal(cells[order[1]], model.mesh.cells[order[0]])
-    assert np.array_equal(material[order[1]], model.materials.of_cell[order[0]])
+    ours, theirs = np.lexsort(own.T), np.lexsort(cells.T)  # meshio drops the numbers of elements
+    assert np.array_equal(cells[theirs], own[ours])
+    assert np.array_equal(material[theirs], model.materials.of_cell[ours])
     if version == "2.2":
-        assert np.array_equal(cells, model.mesh.cells)
+        assert np.array_equal(cells, own)
         return
     for name in ("mean", "young", "dark"):
         assert len(read.cell_data[name]) == len(read.cells)
     mean = np.concatenate([read.cell_data["mean"][k] for k in blocks])
-    assert np.array_equal(mean[order[1]], model.cell_data["mean"][order[0]])
+    assert np.array_equal(mean[theirs], model.cell_data["mean"][ours])
+    if order == 2:
+        assert np.array_equal(read.point_data["warmth"], all_nodes(model.point_data["warmth"], model.mesh))
     for name, rows in model.sets.facets.items():
         members = [block.data[chosen] for block, chosen in zip(read.cells, read.cell_sets[name], strict=True)]
         triples = np.concatenate([nodes for nodes in members if len(nodes)])
-        assert each_once(triples) == each_once(facet_triples(model.mesh.cells, rows))
+        assert each_once(triples) == each_once(element_facets(own, rows))
 
 
 # gmsh is GPL: its library is loaded by a process of its own
@@ -509,32 +537,43 @@ for view in gmsh.view.getTags():
     _, numbers, values, _, _ = gmsh.view.getModelData(view, 0)
     name = gmsh.option.getString(f"View[{gmsh.view.getIndex(view)}].Name")
     views[name] = list(zip(numbers.tolist(), [value[0] for value in values]))
+dim = gmsh.model.getDimension()
+determinants = []
+for kind in mesh.getElementTypes(dim):
+    places, _ = mesh.getIntegrationPoints(kind, "Gauss3")
+    determinants += mesh.getJacobians(kind, places)[1].tolist()
 said = [line for line in gmsh.logger.get() if not line.startswith("Info")]
-print(json.dumps([order.tolist(), points.tolist(), groups, nodes, views, said]))
+print(json.dumps([order.tolist(), points.tolist(), groups, nodes, views, said, determinants]))
 """
 
 
 @pytest.mark.skipif(importlib.util.find_spec("gmsh") is None, reason="no gmsh (pip install gmsh)")
 @pytest.mark.parametrize("version", WRITERS)
-@pytest.mark.parametrize(("n", "bins"), [(3, 3), (2, None)])
-def test_gmsh_reads_it(version, n, bins, tmp_path):
-    model = sample_model(n, bins)
+@pytest.mark.parametrize(("n", "bins", "order"), [(3, 3, 1), (2, None, 1), (3, 3, 2), (2, None, 2)])
+def test_gmsh_reads_it(version, n, bins, order, tmp_path):
+    """Cells, facets and their groups; that all cells are as large as ours, anywhere within, tells their edges apart."""
+    model = (sample_model if order == 1 else quadratic_model)(n, bins)
+    own_points, own = elements(model)
     path = tmp_path / "model.msh"
     path.write_bytes(WRITERS[version](model))
     child = subprocess.run([sys.executable, "-c", GMSH, str(path)], capture_output=True, text=True, check=True)
-    order, points, groups, nodes, views, said = json.loads(child.stdout.splitlines()[-1])
+    numbers, points, groups, nodes, views, said, determinants = json.loads(child.stdout.splitlines()[-1])
     assert said == []
-    points = np.array(points).reshape(-1, 3)[np.argsort(order)]
-    assert np.array_equal(points[:, :n], model.mesh.points)
+    points = np.array(points).reshape(-1, 3)[np.argsort(numbers)]
+    assert np.array_equal(points[:, :n], own_points)
+    sizes = np.sort(np.reshape(determinants, (len(own), -1)) / [0, 0, 2, 6][n], axis=0)
+    expected = np.sort(volumes(model.mesh.points, model.mesh.cells))
+    np.testing.assert_allclose(sizes, np.broadcast_to(expected[:, None], sizes.shape), rtol=1e-10)
     for name, rows in model.sets.facets.items():
         triples = np.array([each for _, each in groups.pop(f"{n - 1} {name}")]) - 1
-        assert each_once(triples) == each_once(facet_triples(model.mesh.cells, rows))
-        assert sorted(nodes[f"{n - 1} {name}"]) == (nodes_of(model.mesh, rows) + 1).tolist()
+        assert each_once(triples) == each_once(element_facets(own, rows))
+        assert sorted(nodes[f"{n - 1} {name}"]) == (np.unique(element_facets(own, rows)) + 1).tolist()
     for k in range(len(model.materials.young)):
         members = np.flatnonzero(model.materials.of_cell == k)
         triples = sorted(groups.pop(f"{n} material_{k + 1}"))
         assert [number for number, _ in triples] == (members + 1).tolist()
-        assert np.array_equal(np.array([each for _, each in triples]) - 1, model.mesh.cells[members])
+        swapped = [0, 1, 2, 3, 4, 5, 6, 7, 9, 8] if own.shape[1] == 10 else slice(None)
+        assert np.array_equal(np.array([each for _, each in triples]) - 1, own[members][:, swapped])
     assert groups == {}
     assert ("young" in views) == (version == "4.1")
     if version == "4.1":

@@ -17,6 +17,7 @@ from meshes import ALL_SMALL
 
 import tetopt
 from tetopt.errors import InputError
+from tetopt.geometry.quadratic import cell_edges, quadratic
 from tetopt.geometry.simplex import volumes
 from tetopt.image import Image
 from tetopt.io.images import save_image
@@ -238,6 +239,99 @@ def test_a_file_in_single_precision(tmp_path):
 
 
 # --------------------------------------------------------------------------------------------------
+# Cells of order 2
+
+
+def quadratic_grid(n):
+    """A grid of VTK's quadratic cells as another program might number them: middle nodes before corners, from last to
+    first, some cells inverted; and its mesh, with the file's node of each of our nodes."""
+    mesh = bent(n)
+    ours, of_cell = quadratic(mesh.points, mesh.cells)
+    place = len(ours) - 1 - np.arange(len(ours))  # in the file
+    nodes = place[of_cell]
+    # Exchanging corners 0 and 1 exchanges the edges that end there.
+    turn = {2: [1, 0, 2, 3, 5, 4], 3: [1, 0, 2, 3, 4, 6, 5, 8, 7, 9]}[n]
+    nodes[::3] = nodes[::3][:, turn]
+    points = np.zeros((len(ours), 3))
+    points[place, :n] = ours
+    return pyvista.UnstructuredGrid({QUADRATIC - 2 * (n == 2): nodes}, points), mesh, place
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_quadratic_cells_become_their_corners(tmp_path, n):
+    """Point data come back in our order of edges, whatever that of the file, where corners are turned round, too."""
+    grid, mesh, place = quadratic_grid(n)
+    expected = np.random.default_rng(2).normal(size=(len(place), 3))
+    field = np.empty_like(expected)
+    field[place] = expected
+    grid.point_data["displacement"] = field
+    grid.point_data["name"] = ["x"] * len(place)
+    grid.cell_data["k"] = np.arange(grid.n_cells)
+    grid.save(tmp_path / "a.vtu")
+    back = load_mesh(tmp_path / "a.vtu")
+    assert (back.order, back.n_left, back.n_turned) == (2, 0, len(range(0, grid.n_cells, 3)))
+    assert back.notes == ("point data left out, as they are no numbers: name",)
+    assert back.cell_data["k"].tolist() == list(range(grid.n_cells))
+    nodes = np.argsort(place[: len(mesh.points)])  # the corners in the order of the file, as ours are read
+    np.testing.assert_array_equal(back.mesh.points, mesh.points[nodes])
+    places = quadratic(back.mesh.points, back.mesh.cells)[0]
+    own = {
+        tuple(point): row for point, row in zip(quadratic(mesh.points, mesh.cells)[0].round(9), expected, strict=True)
+    }
+    assert back.point_data["displacement"].tolist() == [own[tuple(point)].tolist() for point in places.round(9)]
+
+
+@pytest.mark.parametrize("file_format", ["vtu", "vtk", "gmsh", "gmsh22"])
+@pytest.mark.parametrize("n", [2, 3])
+def test_quadratic_files_of_meshio(tmp_path, n, file_format):
+    mesh = bent(n)
+    nodes, cells = quadratic(mesh.points, mesh.cells)
+    points = np.column_stack([nodes, np.zeros((len(nodes), 3 - n))])
+    path = tmp_path / f"a.{'msh' if file_format.startswith('gmsh') else file_format}"
+    data = {"u": points + 1.0}
+    meshio.write(path, meshio.Mesh(points, [({2: "triangle6", 3: "tetra10"}[n], cells)], data), file_format)
+    back = load_mesh(path)
+    assert back.mesh.points.tobytes() == mesh.points.tobytes()
+    np.testing.assert_array_equal(back.mesh.cells, mesh.cells)
+    assert (back.order, back.notes) == (2, ())
+    np.testing.assert_array_equal(back.point_data["u"], points + 1.0)
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_curved_edges_are_made_straight_and_told(tmp_path, n):
+    grid, mesh, place = quadratic_grid(n)
+    ends = np.sort(mesh.cells[:, cell_edges(n)], axis=2).reshape(-1, 2)
+    edges = np.unique(ends, axis=0)
+    length = np.linalg.norm(np.diff(mesh.points[edges], axis=1)[:, 0], axis=1)
+    first = len(mesh.points)
+    for number, share in ((3, 0.99e-6), (5, 1.01e-6), (7, 0.25)):
+        grid.points[place[first + number], 0] += share * length[number]
+    grid.save(tmp_path / "a.vtu")
+    back = load_mesh(tmp_path / "a.vtu")
+    (note,) = back.notes
+    off = f"{0.25 * length[7]:.2g}"
+    assert note == f"2 of {len(edges)} edges are curved, by {off} mm at most: they are made straight"
+    np.testing.assert_allclose(volumes(back.mesh.points, back.mesh.cells).sum(), volumes(mesh.points, mesh.cells).sum())
+
+
+def test_rounded_midpoints_of_a_file_in_single_precision_are_not_curved(tmp_path):
+    mesh = bent(3)
+    nodes, cells = quadratic(mesh.points + 100.0, mesh.cells)
+    pyvista.UnstructuredGrid({QUADRATIC: cells}, nodes.astype(np.float32)).save(tmp_path / "a.vtu")
+    assert load_mesh(tmp_path / "a.vtu").notes == ()
+
+
+def test_two_middle_nodes_of_one_edge_are_told(tmp_path):
+    points, cells = quadratic(*map(np.array, (POINTS[:5], [[0, 1, 2, 3], [1, 2, 3, 4]])))
+    cells[1, 4] = len(points)  # of the edge 1 2, which cell 0 has, too
+    grid = pyvista.UnstructuredGrid({QUADRATIC: cells}, np.vstack([points, [0.5, 0.5, 0.0]]))
+    grid.save(tmp_path / "a.vtu")
+    assert load_mesh(tmp_path / "a.vtu").notes == (
+        "1 edges have a middle node in each of their cells: one of them is taken",
+    )
+
+
+# --------------------------------------------------------------------------------------------------
 # gmsh's physical groups
 
 
@@ -452,7 +546,10 @@ def test_another_vtk_data_set(tmp_path, assert_refused):
     ("cells", "words"),
     [
         ({TETRA: [[0, 1, 2, 3]], QUAD: [[0, 1, 4, 2]]}, "found quad"),
-        ({QUADRATIC: [[0, 1, 2, 3, 4, 5, 0, 1, 2, 3]]}, "expected linear tetrahedra.*found quadratic_tetra"),
+        (
+            {TETRA: [[0, 1, 2, 3]], QUADRATIC: [[0, 1, 2, 4, 4, 5, 0, 1, 2, 3]]},
+            "expected cells of one order, found tetra cells of order 1 and of order 2",
+        ),
         ({LINE: [[0, 1]]}, "found line"),
         ({QUAD: [[0, 1, 4, 2]]}, "found quad"),
         ({HEXAHEDRON: [[0, 1, 2, 3, 4, 5, 0, 1]]}, "found hexahedron"),

@@ -6,24 +6,31 @@ import meshio
 import numpy as np
 import pytest
 import pyvista
-from models import ABOUT, sample_model, young_of
+from models import ABOUT, all_nodes, quadratic_model, sample_model, young_of
 
+from tetopt.errors import InputError
+from tetopt.geometry.quadratic import quadratic, quadratic_facet_nodes
 from tetopt.io.formats import save_model
 from tetopt.io.meshes import load_mesh
-from tetopt.io.vtk import to_pyvista
+from tetopt.io.vtk import model_grid, to_pyvista, vtu
 from tetopt.model.loads import load_words
 from tetopt.model.sets import nodes_of
 
 
 @pytest.mark.parametrize("suffix", ["vtu", "vtk"])
 @pytest.mark.parametrize(("n", "space"), [(2, "ras"), (3, "ras"), (3, "lps")])  # a slice has a plane of its own
-def test_every_bit_comes_back(tmp_path, suffix, space, n):
-    model, path = sample_model(n), tmp_path / f"a.{suffix}"
+@pytest.mark.parametrize("order", [1, 2])
+def test_every_bit_comes_back(tmp_path, suffix, space, n, order):
+    model, path = (sample_model if order == 1 else quadratic_model)(n), tmp_path / f"a.{suffix}"
     save_model(path, model, space=space)
     back = load_mesh(path)
     assert back.mesh.points.tobytes() == model.mesh.points.tobytes()
     np.testing.assert_array_equal(back.mesh.cells, model.mesh.cells)
-    assert (back.n_turned, back.n_left, back.space, back.notes) == (0, 0, space, ())
+    assert (back.n_turned, back.n_left, back.space, back.notes, back.order) == (0, 0, space, (), order)
+    assert set(back.point_data) == set(model.point_data)
+    for name, values in model.point_data.items():
+        expected = values if name == "displacement" else all_nodes(values, model.mesh)
+        assert back.point_data[name].tobytes() == expected.tobytes()
     for kind in (0, 1):
         assert set(back.sets[kind]) == set(model.sets[kind])
         for name, members in model.sets[kind].items():
@@ -57,6 +64,85 @@ def test_other_readers_see_the_file_s_own_space_and_units(tmp_path, suffix):
     grid = pyvista.read(path)
     for name, rows in model.sets.facets.items():
         np.testing.assert_array_equal(np.flatnonzero(grid.point_data[f"on_{name}"]), nodes_of(model.mesh, rows))
+
+
+@pytest.mark.parametrize("suffix", ["vtu", "vtk"])
+@pytest.mark.parametrize("n", [2, 3])
+def test_other_readers_see_quadratic_cells(tmp_path, n, suffix):
+    """VTK finds a quadratic field exactly in the middle of cells, so that nodes and edges go together; sets have their
+    middle nodes, too."""
+    model, path = quadratic_model(n), tmp_path / f"a.{suffix}"
+    nodes, cells = quadratic(model.mesh.points, model.mesh.cells)
+    middle = nodes.mean(axis=0)
+    field = ((nodes - middle) ** 2).sum(axis=1)
+    save_model(path, model._replace(point_data={"square": field}))
+    other = meshio.read(path)
+    np.testing.assert_array_equal(other.points[:, :n], nodes)
+    assert [(block.type, block.data.tolist()) for block in other.cells] == [
+        ({2: "triangle6", 3: "tetra10"}[n], cells.tolist())
+    ]
+    grid = pyvista.read(path)
+    np.testing.assert_array_equal(grid.points[:, :n], nodes)
+    for name, rows in model.sets.facets.items():
+        on_set = np.unique(quadratic_facet_nodes(cells, rows))
+        np.testing.assert_array_equal(np.flatnonzero(grid.point_data[f"on_{name}"]), on_set)
+        np.testing.assert_array_equal(np.flatnonzero(other.point_data[f"on_{name}"]), on_set)
+    centres = model.mesh.points[model.mesh.cells].mean(axis=1)
+    expected = ((centres - middle) ** 2).sum(axis=1)
+    places = pyvista.PolyData(np.column_stack([centres, np.zeros((len(centres), 3 - n))]))
+    # VTK looks for a place in a cell by iteration. Were two edges exchanged, values would be off by 1.
+    np.testing.assert_allclose(places.sample(grid)["square"], expected, rtol=0, atol=0.01)
+
+
+def test_point_data_of_another_length_is_refused():
+    model = quadratic_model(3)
+    for values in (np.ones(5), np.ones(len(model.point_data["displacement"]) + 1)):
+        with pytest.raises(
+            InputError, match=r"^point data: expected a row for each of \d+ corner nodes or of \d+ in all"
+        ):
+            vtu(model._replace(point_data={"odd": values}))
+
+
+def test_a_linear_file_has_the_corners_point_data(tmp_path):
+    model = quadratic_model(3)
+    save_model(tmp_path / "a.vtu", model._replace(order=1))
+    back, n_corners = load_mesh(tmp_path / "a.vtu"), len(model.mesh.points)
+    assert back.order == 1
+    np.testing.assert_array_equal(back.point_data["displacement"], model.point_data["displacement"][:n_corners])
+    np.testing.assert_array_equal(back.point_data["warmth"], model.point_data["warmth"])
+
+
+def test_results_are_turned_and_scaled_with_the_file(tmp_path):
+    """In LPS and MPa for whoever reads the file, and back in RAS and kPa for us; also of a second step."""
+    rng, model = np.random.default_rng(5), sample_model(3)
+    tensor = rng.normal(size=(len(model.mesh.cells), 3, 3))
+    cell_data = {"stress": tensor.reshape(-1, 9), "strain_step2": tensor.reshape(-1, 9), "von_mises": tensor[:, 0, 0]}
+    point_data = {"displacement_step2": model.mesh.points + 1.0, "stress_nodes": np.ones((len(model.mesh.points), 9))}
+    model = model._replace(cell_data=cell_data, point_data=point_data, materials=None)
+    save_model(tmp_path / "a.vtu", model, space="lps", units="MPa")
+    grid, turn = pyvista.read(tmp_path / "a.vtu"), np.diag([-1.0, -1.0, 1.0])
+    there = turn @ tensor @ turn.T
+    np.testing.assert_allclose(grid.cell_data["stress"], there.reshape(-1, 9) / 1000.0, rtol=1e-14)
+    np.testing.assert_allclose(grid.cell_data["strain_step2"], there.reshape(-1, 9), rtol=1e-14)
+    np.testing.assert_allclose(grid.cell_data["von_mises"], tensor[:, 0, 0] / 1000.0, rtol=1e-14)
+    np.testing.assert_allclose(grid.point_data["displacement_step2"], (model.mesh.points + 1.0) @ turn, rtol=1e-14)
+    back = load_mesh(tmp_path / "a.vtu")
+    for fields, expected in ((back.cell_data, cell_data), (back.point_data, point_data)):
+        assert set(fields) == set(expected)
+        for name, values in expected.items():
+            np.testing.assert_allclose(fields[name], values, rtol=1e-14, err_msg=name)
+
+
+def test_stresses_of_an_unknown_unit_are_left_out(tmp_path):
+    model = quadratic_model(3)
+    ones = np.ones(len(model.mesh.points))
+    grid = model_grid(model._replace(point_data={"von_mises_nodes": ones, "kept": ones}))
+    grid.field_data["units"] = ["psi"]
+    grid.save(tmp_path / "a.vtu")
+    back = load_mesh(tmp_path / "a.vtu")
+    assert list(back.point_data) == ["kept"]
+    assert not {"young", "nu", "material"} & set(back.cell_data)
+    assert back.notes == ('moduli and stresses left out, as their unit is neither kPa nor MPa: "psi"',)
 
 
 def test_the_head_of_a_legacy_file_is_what_3d_slicer_looks_for(tmp_path):

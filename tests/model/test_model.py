@@ -80,10 +80,10 @@ def test_quadratic_cells_have_their_nodes_in_the_middle_of_edges():
         np.testing.assert_allclose(points[facets[:, 3 + k]], ends / 2.0, rtol=1e-15)
 
 
-@pytest.mark.parametrize(("n", "order", "match"), [(3, 3, "expected 1 or 2"), (2, 2, "tetrahedra here")])
-def test_orders_that_there_are_not(n, order, match):
-    with pytest.raises(InputError, match=match):
-        model_of(sample_model(n).mesh, order=order)
+@pytest.mark.parametrize("order", [0, 3])
+def test_orders_that_there_are_not(order):
+    with pytest.raises(InputError, match="expected 1 or 2"):
+        model_of(sample_model(3).mesh, order=order)
 
 
 def test_bins_need_moduli():

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
-from tetopt.io.tags import check_apart, check_kinds, material_names, without_cell_data
+from tetopt.io.tags import check_apart, check_kinds, material_names, without_data
 from tetopt.io.text import blocks, rows
 from tetopt.model.materials import cells_of
 from tetopt.model.model import Model, described, element_facets, elements
@@ -71,7 +71,7 @@ def _check(model: Model) -> None:
 
 
 def _head(model: Model) -> str:
-    lines = described(model) + without_cell_data(model)
+    lines = described(model) + without_data(model)
     comments = [f"** {part}\n" for line in lines for part in textwrap.wrap(line, COMMENT_CHARACTERS)]
     return "".join([*comments, "*HEADING\n", "; ".join(lines[:3]), "\n"])
 

@@ -15,6 +15,7 @@ sides is turned, in 4.1, as in the first of them. The nodes of a group are those
 Views ($ElementData), in 4.1 only, as meshio 5.3.5 reads no 2.2 that has them: the cell data, "young" and "nu" of the
 materials in place of cell data of these names, and each cell set as 0 and 1. Facets have the values of the cell that
 they are held by, since meshio takes no view that leaves elements out. Data of several columns are one view a column.
+$NodeData are the point data, those of 3 and 9 columns as gmsh's vectors and tensors.
 
 More than 1000 materials are no groups, only views; in 2.2 they are refused.
 
@@ -40,15 +41,17 @@ from tetopt.io.tags import (
     material_names,
     remarks,
     tag_lines,
-    without_cell_data,
+    without_data,
 )
 from tetopt.io.text import rows
+from tetopt.model.fields import node_field
 from tetopt.model.model import Model, element_facets, elements
 from tetopt.model.sets import facet_triples
 
-# gmsh's numbers for elements of a dimension and an order: line, triangle, tetrahedron; triangle and tetrahedron again.
-ELEMENT_TYPES = {(1, 1): 1, (2, 1): 2, (3, 1): 4, (2, 2): 9, (3, 2): 11}
+# gmsh's numbers for elements of a dimension and an order: line, triangle, tetrahedron, and again.
+ELEMENT_TYPES = {(1, 1): 1, (2, 1): 2, (3, 1): 4, (1, 2): 8, (2, 2): 9, (3, 2): 11}
 TET10_ORDER = np.array([0, 1, 2, 3, 4, 5, 6, 7, 9, 8])  # gmsh has the midpoint of edge (2, 3) before that of (1, 3)
+VIEW_SHAPES = ((3,), (9,))  # of a row: a view holds vectors, by which gmsh deforms, and tensors
 UNNAMED_GROUP = "unnamed"  # the group of cells that are in no other
 MOST_MATERIAL_GROUPS = 1000  # gmsh takes minutes to open a 2.2 file with 200,000, meshio hours for a 4.1
 
@@ -103,7 +106,7 @@ def gmsh41(model: Model) -> bytes:
     Raises
     ------
     InputError
-        A set that is called as a group of cells or as cell data are, or a 2-D model of order 2.
+        A set that is called as a group of cells or as cell data are.
     """
     grouped, comments = model, []
     if _n_materials(model) > MOST_MATERIAL_GROUPS:
@@ -159,7 +162,7 @@ def gmsh22(model: Model) -> bytes:
     parts = [part for part in (_cells(model), _facets_each(model)) if len(part.numbers)]
     return _file(
         "2.2 0 8",
-        [*remarks(model), *without_cell_data(model), *tag_lines(parts[0].sets, "entity of cells")],
+        [*remarks(model), *without_data(model), *tag_lines(parts[0].sets, "entity of cells")],
         parts,
         _section("Nodes", f"{len(points)}\n", rows(np.arange(1, len(points) + 1), points)),
         _section(
@@ -192,17 +195,14 @@ def _section(name: str, *parts: str) -> str:
 
 def _geometry(model: Model) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Points (P, 3) and cells, as `elements`."""
-    if model.mesh.ndim == 3:
-        return elements(model)
-    if model.order == 2:
-        raise InputError("order 2: only of tetrahedra, the mesh is of triangles; leave out --order")
-    return np.column_stack([model.mesh.points, np.zeros(len(model.mesh.points))]), model.mesh.cells
+    points, cells = elements(model)
+    return np.column_stack([points, np.zeros((len(points), 3 - model.mesh.ndim))]), cells
 
 
 def _nodes(model: Model, cells: NDArray[np.int64], part: Part) -> NDArray[np.int64]:
     """The nodes of each element, from 0, in gmsh's order."""
     if part.rows.ndim == 1:
-        return cells[part.rows][:, TET10_ORDER] if model.order == 2 else cells[part.rows]
+        return cells[part.rows][:, TET10_ORDER] if cells.shape[1] == 10 else cells[part.rows]
     return element_facets(cells, part.rows)
 
 
@@ -312,7 +312,22 @@ def _views(model: Model, parts: list[Part]) -> list[str]:
     return [
         _section("ElementData", f'1\n"{name}"\n1\n0.0\n3\n0\n1\n{len(numbers)}\n', rows(numbers, values[of_cell]))
         for name, values in _fields(model).items()
-    ]
+    ] + [_node_view(name, values) for name, values in _node_fields(model).items()]
+
+
+def _node_view(name: str, values: NDArray) -> str:
+    """A $NodeData section."""
+    n_columns, numbers = values[0].size, np.arange(1, len(values) + 1)
+    return _section("NodeData", f'1\n"{name}"\n1\n0.0\n3\n0\n{n_columns}\n{len(values)}\n', rows(numbers, values))
+
+
+def _node_fields(model: Model) -> dict[str, NDArray[np.float64]]:
+    """Point data of each node, vectors and tensors of gmsh's as they are, else scalars."""
+    fields: dict[str, NDArray[np.float64]] = {}
+    for name, values in model.point_data.items():
+        filled = node_field(values, model.mesh, model.order).astype(np.float64)
+        fields |= {name: filled} if filled.shape[1:] in VIEW_SHAPES else as_scalars(name, filled)
+    return fields
 
 
 def _fields(model: Model) -> dict[str, NDArray[np.float64]]:

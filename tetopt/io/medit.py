@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
-from tetopt.io.tags import cell_tags, facet_tags, remarks, tag_lines, without_cell_data
+from tetopt.io.tags import cell_tags, facet_tags, remarks, tag_lines, without_data
 from tetopt.io.text import rows
 from tetopt.model.model import Model
 from tetopt.model.sets import facet_triples
@@ -36,7 +36,7 @@ def medit(model: Model) -> bytes:
     mesh = model.mesh
     in_cells, on_facets = cell_tags(model), facet_tags(mesh, model.sets.facets)
     cells, sides = ELEMENT_KEYWORDS[mesh.ndim], ELEMENT_KEYWORDS[mesh.ndim - 1]
-    comments = [*remarks(model), *without_cell_data(model)]
+    comments = [*remarks(model), *without_data(model)]
     comments += tag_lines(in_cells.tags_of, f"{cells} ref") + tag_lines(on_facets.tags_of, f"{sides} ref")
     return "".join(
         [

@@ -15,16 +15,19 @@ import pyvista
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
+from tetopt.geometry.quadratic import cell_edges
 from tetopt.geometry.simplex import oriented
 from tetopt.io.files import written_whole
-from tetopt.io.raw import CELL_DIMENSIONS, Raw
+from tetopt.io.raw import CELL_DIMENSIONS, CORNER_KINDS, Raw, by_corners
 from tetopt.io.read_gmsh import read_msh
-from tetopt.io.vtk import add_texts, box_in, sets_in, text_in, to_pyvista, vtu_bytes
+from tetopt.io.vtk import ON_PREFIX, add_texts, box_in, sets_in, text_in, to_pyvista, vtu_bytes
 from tetopt.mesh import Mesh
+from tetopt.model.fields import half_turned_fields, is_stress, stresses_times
 from tetopt.model.model import STRESS_UNITS, half_turn
 from tetopt.model.sets import SET_NAME, Box, Sets, free_name, rows_of
 
 MESH_SUFFIXES = (".vtu", ".vtk", ".msh", ".msh2")
+STRAIGHT_SHARE = 1e-6  # of an edge: a middle node that is less off its middle was rounded, as in files of few digits
 
 
 class MeshFile(NamedTuple):
@@ -39,6 +42,8 @@ class MeshFile(NamedTuple):
     box: Box | None = None  # of the image that the mesh was made from
     space: str = "ras"  # of the file: from "lps" the mesh has been turned to RAS+
     notes: tuple[str, ...] = ()  # what was left out or renamed, a line each
+    order: int = 1  # of the file's cells; of those of order 2 the mesh has the corners
+    point_data: dict[str, NDArray] = {}  # noqa: RUF012 - nobody changes it; a row for each node of the order
 
     def text(self, name: str) -> str | None:
         """A text among the field data, if it is there."""
@@ -51,28 +56,30 @@ def save_mesh(
     cell_data: dict[str, NDArray] | None = None,
     about: dict[str, Any] | None = None,
     point_data: dict[str, NDArray] | None = None,
+    order: int = 1,
 ) -> None:
     """Write a VTU file, whole or not at all.
 
-    Points in world mm (RAS+), cells positively oriented, `cell_data` and `point_data` by name; each entry of `about`
-    becomes a field-data text, as JSON unless it is a string already. `tetopt.save_model` writes more, and other
-    formats. Replaces an existing file; ask `tetopt.io.files.checked_output` first.
+    Points in world mm (RAS+), cells positively oriented, of order 1 or 2, `cell_data` and `point_data` by name, the
+    latter with a row for each mesh point or for each node of order 2; each entry of `about` becomes a field-data text,
+    as JSON unless it is a string already. `tetopt.save_model` writes more, and other formats. Replaces an existing
+    file; ask `tetopt.io.files.checked_output` first.
     """
-    grid = to_pyvista(mesh, cell_data)
-    for name, values in (point_data or {}).items():
-        grid.point_data[name] = values
+    grid = to_pyvista(mesh, cell_data, point_data, order)
     add_texts(grid, about or {})
     with written_whole(Path(path)) as temporary:
         temporary.write_bytes(vtu_bytes(grid))
 
 
 def load_mesh(path: str | Path) -> MeshFile:
-    """Read triangles or tetrahedra from a VTU, VTK or gmsh MSH file.
+    """Read triangles or tetrahedra, linear or quadratic, from a VTU, VTK or gmsh MSH file.
 
+    Of cells of order 2 the corners are the mesh, so that curved edges become straight, which a note then tells; point
+    data has a row for each node of order 2, in the order of `tetopt.geometry.quadratic.quadratic`.
     Cells oriented the other way are turned and counted; cells of lower dimension are left out and counted, and so are
     nodes that no cell uses. Without tetrahedra, a file of triangles is 2-D and must lie in the plane z = 0. Coordinates
     are taken for RAS+ unless the file says LPS, as those of `tetopt convert --space lps` and of 3D Slicer do; these are
-    turned, and moduli that it holds in MPa taken to kPa. Cell data other than numbers are left out.
+    turned, and moduli and stresses that it holds in MPa taken to kPa. Data other than numbers are left out.
 
     The sets of a VTU or VTK file of ours are taken if its cells are still those that they were written for. gmsh's
     physical groups (files named .msh or .msh2) become sets, with names that every format can carry; in files of ours
@@ -92,12 +99,13 @@ def load_mesh(path: str | Path) -> MeshFile:
     kind = _kind_of_cells(path, raw)
     n = CELL_DIMENSIONS[kind]
     cells, points = raw.cells[kind], raw.points
-    if cells.min() < 0 or cells.max() >= len(points):
+    nodes = np.column_stack([cells, raw.middles[kind]]) if kind in raw.middles else cells
+    if nodes.min() < 0 or nodes.max() >= len(points):
         raise InputError(
-            f"{path}: its cells use nodes {cells.min()}..{cells.max()}, it holds 0..{len(points) - 1}; damaged?"
+            f"{path}: its cells use nodes {nodes.min()}..{nodes.max()}, it holds 0..{len(points) - 1}; damaged?"
         )
     used, compact = np.unique(cells, return_inverse=True)
-    if n == 2 and np.any(points[used, 2] != 0.0):
+    if n == 2 and np.any(points[nodes, 2] != 0.0):
         raise InputError(f"{path}: a mesh of triangles must lie in the plane z = 0; surfaces in space are not meshed")
     if n == 3 and raw.space == "lps":
         points = half_turn(points)
@@ -108,50 +116,84 @@ def load_mesh(path: str | Path) -> MeshFile:
         mesh = Mesh(corners, turned)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
-    is_turned = (turned != cells).any(axis=1)
-    cell_data, notes = _cell_data(raw, kind)
-    cell_data, of_moduli = _in_kPa(cell_data, text_in(raw.field_data, "units") or "kPa")
+    middles, of_edges = _middles(raw, kind)
     sets, of_sets = _sets_of_groups(raw, mesh, kind, used) if raw.groups else sets_in(raw.field_data, mesh)
+    shown = {f"{ON_PREFIX}{name}" for name in sets.facets}  # which only tell the sets again
+    at_nodes = {name: values for name, values in raw.point_data.items() if name not in shown}
+    of_cells = {name: values[kind] for name, values in raw.cell_data.items() if kind in values}
+    (cell_data, point_data), notes = _numbers(raw, n, of_cells, at_nodes)
     return MeshFile(
         mesh,
         cell_data,
         raw.field_data,
-        int(is_turned.sum()),
+        int((turned != cells).any(axis=1).sum()),
         sum(len(others) for name, others in raw.cells.items() if name != kind),
         sets,
         box_in(raw.field_data, n),
         raw.space,
-        notes + of_moduli + of_sets,
+        notes + of_sets + of_edges,
+        2 if kind in raw.middles else 1,
+        {name: values[np.concatenate([used, middles])] for name, values in point_data.items()},
     )
 
 
-def _in_kPa(cell_data: dict[str, NDArray], units: str) -> tuple[dict[str, NDArray], tuple[str, ...]]:
-    """Cell data with the moduli in kPa; without them, and a note, if their unit is not known."""
-    if "young" not in cell_data:
-        return cell_data, ()
+def _middles(raw: Raw, kind: str) -> tuple[NDArray[np.int64], tuple[str, ...]]:
+    """The nodes (E,) on the edges of cells of order 2, in the order of `quadratic`, none of order 1; and in words
+    which edges are not straight in the file."""
+    if kind not in raw.middles:
+        return np.empty(0, dtype=np.int64), ()
+    ends = np.sort(raw.cells[kind][:, cell_edges(CELL_DIMENSIONS[kind])], axis=2).reshape(-1, 2)
+    edges, first, number = np.unique(ends, axis=0, return_index=True, return_inverse=True)
+    nodes, notes = raw.middles[kind].ravel()[first], []
+    if n_torn := len(np.unique(number.ravel()[nodes[number.ravel()] != raw.middles[kind].ravel()])):
+        notes.append(f"{n_torn} edges have a middle node in each of their cells: one of them is taken")
+    start, end = np.moveaxis(raw.points[edges], 1, 0)
+    off = np.linalg.norm(raw.points[nodes] - 0.5 * (start + end), axis=1)
+    straight = STRAIGHT_SHARE * np.linalg.norm(end - start, axis=1)
+    if (raw.points.astype(np.float32) == raw.points).all():  # a file in single precision, which rounds midpoints
+        straight += np.finfo(np.float32).eps * np.abs(raw.points).max()
+    if n_curved := int((~(off <= straight)).sum()):
+        notes.append(
+            f"{n_curved} of {len(edges)} edges are curved, by {off.max():.2g} mm at most: they are made straight"
+        )
+    return nodes, tuple(notes)
+
+
+def _numbers(
+    raw: Raw, ndim: int, cell_data: dict[str, NDArray], point_data: dict[str, NDArray]
+) -> tuple[list[dict[str, NDArray]], tuple[str, ...]]:
+    """Cell data and point data that are numbers, in RAS+ and kPa; and what is left out, in words."""
+    fields, notes = [], []
+    for what, values_of in (("cell", cell_data), ("point", point_data)):
+        numbers = {name: values for name, values in values_of.items() if values.dtype.kind in "biuf"}
+        if others := ", ".join(name for name in values_of if name not in numbers):
+            notes.append(f"{what} data left out, as they are no numbers: {others}")
+        fields.append(numbers)
+    units = text_in(raw.field_data, "units") or "kPa"
     if units in STRESS_UNITS:
-        return cell_data | {"young": cell_data["young"] * STRESS_UNITS[units].kPa}, ()
-    others = {name: values for name, values in cell_data.items() if name not in ("young", "nu", "material")}
-    return others, (f'moduli left out, as their unit is neither {" nor ".join(STRESS_UNITS)}: "{units}"',)
+        fields = [stresses_times(STRESS_UNITS[units].kPa, each) for each in fields]
+    elif lost := [name for each in fields for name in each if is_stress(name)]:
+        lost += ["nu", "material", "density"] if "young" in lost else []
+        fields = [{name: values for name, values in each.items() if name not in lost} for each in fields]
+        words = f'their unit is neither {" nor ".join(STRESS_UNITS)}: "{units}"'
+        notes.append(f"moduli and stresses left out, as {words}")
+    if raw.space == "lps" and ndim == 3:
+        fields = [half_turned_fields(each) for each in fields]
+    return fields, tuple(notes)
 
 
 def _kind_of_cells(path: Path, raw: Raw) -> str:
-    if unknown := sorted(set(raw.cells) - set(CELL_DIMENSIONS)):
-        raise InputError(f"{path}: expected linear tetrahedra, or triangles, found {', '.join(unknown)}")
+    unknown = sorted(set(raw.cells) - set(CELL_DIMENSIONS))
+    if both := sorted(CORNER_KINDS[name] for name in unknown if name in CORNER_KINDS):
+        raise InputError(f"{path}: expected cells of one order, found {both[0]} cells of order 1 and of order 2")
+    if unknown:
+        raise InputError(f"{path}: expected tetrahedra or triangles, of order 1 or 2, found {', '.join(unknown)}")
     kind = max(raw.cells, key=lambda name: CELL_DIMENSIONS[name], default="none")
     if kind not in ("tetra", "triangle"):
         raise InputError(
             f"{path}: expected tetrahedra or triangles, found {', '.join(sorted(raw.cells)) or 'no cells'}"
         )
     return kind
-
-
-def _cell_data(raw: Raw, kind: str) -> tuple[dict[str, NDArray], tuple[str, ...]]:
-    """What is on the cells of this kind, and a note on what is no numbers."""
-    values_of = {name: values[kind] for name, values in raw.cell_data.items() if kind in values}
-    numbers = {name: values for name, values in values_of.items() if values.dtype.kind in "biuf"}
-    others = ", ".join(name for name in values_of if name not in numbers)
-    return numbers, (f"cell data left out, as they are no numbers: {others}",) if others else ()
 
 
 def _sets_of_groups(raw: Raw, mesh: Mesh, kind: str, used: NDArray[np.int64]) -> tuple[Sets, tuple[str, ...]]:
@@ -184,7 +226,9 @@ def _sets_of_groups(raw: Raw, mesh: Mesh, kind: str, used: NDArray[np.int64]) ->
 def _read_vtk(path: Path) -> Raw:
     grid = _read_quietly(path)
     names = {int(kind): pyvista.CellType(kind).name.lower() for kind in np.unique(grid.celltypes)}
-    if set(names.values()) <= set(CELL_DIMENSIONS):  # pyvista takes other kinds apart only if they have fixed sizes
+    if (
+        set(names.values()) <= CELL_DIMENSIONS.keys() | CORNER_KINDS.keys()
+    ):  # pyvista takes other kinds apart only if they have fixed sizes
         cells = {names[int(kind)]: np.asarray(nodes, dtype=np.int64) for kind, nodes in grid.cells_dict.items()}
     else:
         cells = {name: np.empty((0, 1), dtype=np.int64) for name in names.values()}
@@ -193,7 +237,9 @@ def _read_vtk(path: Path) -> Raw:
         for name in grid.cell_data
     }
     field_data = {name: _decoded(np.asarray(grid.field_data[name])) for name in grid.field_data}
-    return Raw(np.asarray(grid.points, dtype=np.float64), cells, cell_data, field_data, [], _space(path, field_data))
+    point_data = {name: np.asarray(grid.point_data[name]) for name in grid.point_data}
+    points, space = np.asarray(grid.points, dtype=np.float64), _space(path, field_data)
+    return by_corners(Raw(points, cells, cell_data, point_data, field_data, [], space))
 
 
 def _space(path: Path, field_data: dict[str, NDArray]) -> str:

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
-from tetopt.io.tags import cell_tags, facet_tags, remarks, tag_lines, without_cell_data
+from tetopt.io.tags import cell_tags, facet_tags, remarks, tag_lines, without_data
 from tetopt.io.text import blocks, rows
 from tetopt.model.model import Model
 from tetopt.model.sets import facet_triples
@@ -40,7 +40,7 @@ def mfem(model: Model) -> bytes:
         )
     mesh = model.mesh
     in_cells, on_facets = cell_tags(model), facet_tags(mesh, model.sets.facets)
-    comments = [*remarks(model), *without_cell_data(model)]
+    comments = [*remarks(model), *without_data(model)]
     comments += tag_lines(in_cells.tags_of, "attribute") + tag_lines(on_facets.tags_of, "boundary attribute")
     return "".join(
         [

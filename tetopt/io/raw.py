@@ -9,6 +9,11 @@ from numpy.typing import NDArray
 
 # The dimension of each kind of cell that a mesh may consist of, or that may lie on it.
 CELL_DIMENSIONS = {"vertex": 0, "poly_vertex": 0, "line": 1, "poly_line": 1, "triangle": 2, "tetra": 3}
+# What the kinds of order 2 are by their corners; pyvista's names and meshio's. All have the nodes of VTK's order.
+CORNER_KINDS = {
+    "quadratic_edge": "line", "quadratic_triangle": "triangle", "quadratic_tetra": "tetra",
+    "line3": "line", "triangle6": "triangle", "tetra10": "tetra",
+}  # fmt: skip
 
 
 class Group(NamedTuple):
@@ -25,6 +30,29 @@ class Raw(NamedTuple):
     points: NDArray[np.float64]  # (N, 3)
     cells: dict[str, NDArray[np.int64]]
     cell_data: dict[str, dict[str, NDArray]]  # by name, then kind
+    point_data: dict[str, NDArray]  # by name, a row a point
     field_data: dict[str, NDArray]
     groups: list[Group]
     space: str
+    middles: dict[str, NDArray[np.int64]] = {}  # noqa: RUF012 - nobody changes it; see `by_corners`
+
+
+def by_corners(raw: Raw) -> Raw:
+    """The cells of order 2 as what they are by their corners; the nodes on their edges are `middles`, by kind.
+
+    Where a kind comes in both orders, that of order 2 keeps its name.
+    """
+    kinds = {kind: CORNER_KINDS[kind] for kind in raw.cells if kind in CORNER_KINDS}
+    kinds = {kind: corner for kind, corner in kinds.items() if corner not in raw.cells}
+    n_corners = {corner: CELL_DIMENSIONS[corner] + 1 for corner in kinds.values()}
+
+    def renamed(by_kind: dict[str, NDArray]) -> dict[str, NDArray]:
+        return {kinds.get(kind, kind): values for kind, values in by_kind.items()}
+
+    cells = {kind: nodes[:, : n_corners.get(kind)] for kind, nodes in renamed(raw.cells).items()}
+    return raw._replace(
+        cells=cells,
+        cell_data={name: renamed(by_kind) for name, by_kind in raw.cell_data.items()},
+        groups=[group._replace(kind=kinds.get(group.kind, group.kind)) for group in raw.groups],
+        middles={corner: raw.cells[kind][:, n_corners[corner] :] for kind, corner in kinds.items()},
+    )

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.io.gmsh import OwnComments, own_comments
-from tetopt.io.raw import CELL_DIMENSIONS, Group, Raw
+from tetopt.io.raw import CELL_DIMENSIONS, Group, Raw, by_corners
 
 # What groups without a name are called here, by their dimension; their number follows.
 DEFAULT_LABELS = {1: "edge", 2: "surface", 3: "volume"}
@@ -45,8 +45,10 @@ def _msh(file: meshio.Mesh, text: bytes) -> Raw:
     }
     points = np.zeros((len(file.points), 3))
     points[:, : file.points.shape[1]] = file.points
-    groups = _groups(cells, cell_data, _physical_names(text), _groups_of_entities(text))
-    raw = Raw(points, cells, cell_data, {}, groups, "ras")
+    point_data = {name: values for name, values in file.point_data.items() if not name.startswith("gmsh:")}
+    raw = by_corners(Raw(points, cells, cell_data, point_data, {}, [], "ras"))
+    groups = _groups(raw.cells, raw.cell_data, _physical_names(text), _groups_of_entities(text))
+    raw = raw._replace(groups=groups)
     comments = own_comments(_section(text, "Comments").decode("utf-8", "replace").splitlines())
     return raw if comments is None else _of_ours(raw, comments)
 

@@ -118,13 +118,14 @@ def remarks(model: Model) -> list[str]:
     return lines
 
 
-def without_cell_data(model: Model) -> list[str]:
-    """A line for the head of a file whose format has no place for cell data."""
-    return [f"cell data, which this format has no place for: {', '.join(model.cell_data)}"] if model.cell_data else []
+def without_data(model: Model) -> list[str]:
+    """Lines for the head of a file whose format has no place for cell data and point data."""
+    left_out = {"cell data": model.cell_data, "point data": model.point_data}
+    return [f"{what}, which this format has no place for: {', '.join(data)}" for what, data in left_out.items() if data]
 
 
 def as_scalars(name: str, values: NDArray) -> dict[str, NDArray]:
-    """Cell data as scalars by name: the columns of what has several are numbered, NAME_0, NAME_1, ..."""
+    """Cell or point data as scalars by name: the columns of what has several are numbered, NAME_0, NAME_1, ..."""
     if values.ndim == 1:
         return {name: values}
     return {f"{name}_{k}": column for k, column in enumerate(values.reshape(len(values), -1).T)}

@@ -1,6 +1,7 @@
 """Meshes and models as VTK's files: XML (.vtu) and legacy (.vtk), through VTK's own writers.
 
-Points in world mm, cells positively oriented, of one type. What is on each cell is cell data; with materials also
+Points in world mm, cells positively oriented, of one type: linear, or quadratic with straight edges, whose corners come
+first among the points. What is on each cell is cell data, on each point point data; with materials there is cell data
 `young`, `nu`, `material`, from 1, and, if there is one, `density`, kg/m3. Texts are field data, held as bytes of UTF-8:
 meshio refuses files with VTK's string arrays, and pyvista writes only ASCII into them. `loads` are the words of --load.
 
@@ -24,25 +25,41 @@ from numpy.typing import NDArray
 from vtkmodules.vtkIOLegacy import vtkUnstructuredGridWriter
 from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
 
+from tetopt.geometry.quadratic import quadratic
 from tetopt.image import Image
 from tetopt.mesh import Mesh
+from tetopt.model.fields import is_stress, node_field
 from tetopt.model.loads import load_words
-from tetopt.model.model import Model
-from tetopt.model.sets import SET_NAME, Box, Sets, nodes_of
+from tetopt.model.model import Model, element_facets, elements
+from tetopt.model.sets import SET_NAME, Box, Sets
 
-CELL_TYPES = {2: pyvista.CellType.TRIANGLE, 3: pyvista.CellType.TETRA}
+CELL_TYPES = {  # by dimension and order
+    (2, 1): pyvista.CellType.TRIANGLE, (3, 1): pyvista.CellType.TETRA,
+    (2, 2): pyvista.CellType.QUADRATIC_TRIANGLE, (3, 2): pyvista.CellType.QUADRATIC_TETRA,
+}  # fmt: skip
 # Names of field data and of point data in our files, see above.
 FACETS_PREFIX, CELLS_PREFIX, ON_PREFIX, CHECKSUM_NAME = "facets:", "cells:", "on_", "cells_sha256"
 LEGACY_VERSION = 42  # version 4.2: 5.1 is not read by older programs, 3D Slicer among them
 
 
-def to_pyvista(mesh: Mesh, cell_data: dict[str, NDArray] | None = None) -> pyvista.UnstructuredGrid:
-    """The mesh as a pyvista grid in world mm; a 2-D mesh lies in the plane z = 0."""
-    points = np.zeros((len(mesh.points), 3))
-    points[:, : mesh.ndim] = mesh.points
-    grid = pyvista.UnstructuredGrid({CELL_TYPES[mesh.ndim]: mesh.cells}, points)
+def to_pyvista(
+    mesh: Mesh,
+    cell_data: dict[str, NDArray] | None = None,
+    point_data: dict[str, NDArray] | None = None,
+    order: int = 1,
+) -> pyvista.UnstructuredGrid:
+    """The mesh as a pyvista grid in world mm, of cells of an order; a 2-D mesh lies in the plane z = 0.
+
+    Point data of the mesh's nodes alone are interpolated to those of order 2, see `tetopt.model.fields.node_field`.
+    """
+    places, cells = quadratic(mesh.points, mesh.cells) if order == 2 else (mesh.points, mesh.cells)
+    points = np.zeros((len(places), 3))
+    points[:, : mesh.ndim] = places
+    grid = pyvista.UnstructuredGrid({CELL_TYPES[mesh.ndim, order]: cells}, points)
     for name, values in (cell_data or {}).items():
         grid.cell_data[name] = values
+    for name, values in (point_data or {}).items():
+        grid.point_data[name] = node_field(values, mesh, order)
     return grid
 
 
@@ -98,10 +115,11 @@ def _written(writer: Any, grid: pyvista.UnstructuredGrid) -> bytes:
 
 def model_grid(model: Model) -> pyvista.UnstructuredGrid:
     """All of a model on one grid."""
-    grid = to_pyvista(model.mesh, model.cell_data)
+    grid = to_pyvista(model.mesh, model.cell_data, model.point_data, model.order)
+    cells = elements(model)[1]
     for name, rows in model.sets.facets.items():
-        is_on = np.zeros(len(model.mesh.points), dtype=np.uint8)
-        is_on[nodes_of(model.mesh, rows)] = 1
+        is_on = np.zeros(grid.n_points, dtype=np.uint8)
+        is_on[element_facets(cells, rows)] = 1
         grid.point_data[f"{ON_PREFIX}{name}"] = is_on
     texts = dict(model.about) | {"space": model.space}
     if model.materials is not None:
@@ -113,7 +131,7 @@ def model_grid(model: Model) -> pyvista.UnstructuredGrid:
             grid.cell_data["density"] = model.materials.density[of_cell]
         if model.materials.binning is not None:
             texts["binning"] = model.materials.binning._asdict()
-    if model.materials is not None or model.loads:
+    if model.materials is not None or model.loads or any(map(is_stress, [*model.cell_data, *model.point_data])):
         texts["units"] = model.units
     if model.loads:
         texts["loads"] = [load_words(load) for load in model.loads]

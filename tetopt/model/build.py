@@ -83,8 +83,6 @@ def model_of(
     if order not in (1, 2):
         raise InputError(f"order: expected 1 or 2, got {order}")
     parse_average(average)
-    if order == 2 and mesh.ndim == 2:
-        raise InputError("order: quadratic cells are tetrahedra here, got a mesh of triangles")
     if image is not None and image.ndim != mesh.ndim:
         raise InputError(f"image: expected a {mesh.ndim}-D one, as the mesh is, got a {image.ndim}-D one")
     cell_data = cell_fields(mesh, image) if cell_data is None else dict(cell_data)

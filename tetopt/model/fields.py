@@ -1,13 +1,24 @@
-"""What is known of each cell."""
+"""What is known of each cell, and what a solver found on cells and nodes."""
 
 from __future__ import annotations
 
+import re
+
+import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.energy.sampling import cell_moments, cell_ranges
+from tetopt.errors import InputError
+from tetopt.geometry.quadratic import cell_edges, quadratic
 from tetopt.geometry.simplex import dihedral_angles, rho, volumes
 from tetopt.image import Image
 from tetopt.mesh import Mesh
+
+# Fields that depend on the world's axes or on the unit of stress, by name; a suffix such as _step2 may follow.
+VECTOR_FIELDS = ("displacement",)
+TENSOR_FIELDS = ("strain", "stress", "strain_nodes", "stress_nodes")
+STRESS_FIELDS = ("young", "stress", "von_mises", "stress_nodes", "von_mises_nodes")
+HALF_TURN = np.array([-1.0, -1.0, 1.0])  # about z, from RAS+ to LPS+ or back
 
 
 def cell_fields(mesh: Mesh, image: Image | None = None) -> dict[str, NDArray]:
@@ -24,3 +35,61 @@ def cell_fields(mesh: Mesh, image: Image | None = None) -> dict[str, NDArray]:
     fields["rho"] = rho(mesh.points, mesh.cells)
     fields["min_dihedral"] = dihedral_angles(mesh.points, mesh.cells).min(axis=1)
     return fields
+
+
+def node_field(values: NDArray, mesh: Mesh, order: int) -> NDArray:
+    """A field with a row for each node of the order (1: the mesh's; 2: those of `quadratic`).
+
+    Of rows for the mesh's nodes alone the middle of an edge has the mean of its ends; rows for more than the order has
+    are left out.
+
+    Raises
+    ------
+    InputError
+        Neither so many rows as the mesh has nodes, nor as many as order 2 has.
+    """
+    values, n_corners = np.asarray(values), len(mesh.points)
+    if order == 1 and len(values) == n_corners:
+        return values
+    cells = quadratic(mesh.points, mesh.cells)[1]
+    n_nodes = int(cells.max()) + 1
+    if len(values) not in (n_corners, n_nodes):
+        raise InputError(
+            f"point data: expected a row for each of {n_corners} corner nodes or of {n_nodes} in all, got {len(values)}"
+        )
+    if order == 1 or len(values) == n_nodes:
+        return values[: n_corners if order == 1 else n_nodes]
+    ends = mesh.cells[:, cell_edges(mesh.ndim)]
+    filled = np.empty((n_nodes, *values.shape[1:]), dtype=np.result_type(values, np.float32))
+    filled[:n_corners] = values
+    filled[cells[:, mesh.ndim + 1 :]] = 0.5 * (filled[ends[:, :, 0]] + filled[ends[:, :, 1]])
+    return filled
+
+
+def half_turned_fields(fields: dict[str, NDArray]) -> dict[str, NDArray]:
+    """3-D fields by name, a row each cell or node, from RAS+ to LPS+ or back: vectors and tensors (row by row) change.
+
+    Raises nothing: a field of such a name but of another shape is another program's, and stays.
+    """
+    turned = dict(fields)
+    for name, values in fields.items():
+        kind = _base_name(name)
+        if kind in VECTOR_FIELDS and values.shape[1:] == (3,):
+            turned[name] = values * HALF_TURN + 0.0  # + 0.0: no -0
+        elif kind in TENSOR_FIELDS and values.shape[1:] == (9,):
+            turned[name] = values * np.outer(HALF_TURN, HALF_TURN).ravel() + 0.0
+    return turned
+
+
+def is_stress(name: str) -> bool:
+    """Whether a field of this name is a modulus or a stress."""
+    return _base_name(name) in STRESS_FIELDS
+
+
+def stresses_times(factor: float, fields: dict[str, NDArray]) -> dict[str, NDArray]:
+    """Fields by name, moduli and stresses in another unit."""
+    return {name: values * factor if is_stress(name) else values for name, values in fields.items()}
+
+
+def _base_name(name: str) -> str:
+    return re.sub(r"_step\d+$", "", name)

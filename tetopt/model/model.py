@@ -10,6 +10,7 @@ from numpy.typing import NDArray
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import quadratic, quadratic_facet_nodes
 from tetopt.mesh import Mesh
+from tetopt.model.fields import HALF_TURN, half_turned_fields, stresses_times
 from tetopt.model.loads import FACET_FORCES, Load
 from tetopt.model.materials import Materials
 from tetopt.model.sets import Sets, facet_triples
@@ -46,6 +47,7 @@ class Model(NamedTuple):
     space: str = "ras"  # "lps": x and y have changed sign
     node_young: NDArray[np.float64] | None = None  # (N,) a modulus at each corner, linear within cells, instead
     about: dict[str, Any] = {}  # noqa: RUF012 - a default that nobody changes; name -> text, or what JSON can hold
+    point_data: dict[str, NDArray] = {}  # noqa: RUF012 - likewise; by name, a row a mesh point, or a node of order 2
 
     def to_skfem(self) -> skfem.Mesh:
         """The mesh for scikit-fem, with the sets; see `tetopt.model.skfem.skfem_mesh`.
@@ -78,12 +80,13 @@ def in_space(model: Model, space: str) -> Model:
         raise InputError("space: a mesh of triangles has coordinates in its own plane; leave out --space")
     loads = tuple(half_turned(load) for load in model.loads)
     mesh = Mesh(half_turn(model.mesh.points), model.mesh.cells)
-    return model._replace(mesh=mesh, loads=loads, space=space)
+    cell_data, point_data = (half_turned_fields(each) for each in (model.cell_data, model.point_data))
+    return model._replace(mesh=mesh, loads=loads, space=space, cell_data=cell_data, point_data=point_data)
 
 
 def half_turn(vectors: NDArray[np.float64]) -> NDArray[np.float64]:
     """Vectors (..., 3) turned about z: from RAS+ to LPS+ or back."""
-    return vectors * np.array([-1.0, -1.0, 1.0]) + 0.0  # + 0.0: no -0
+    return vectors * HALF_TURN + 0.0  # + 0.0: no -0
 
 
 def half_turned(load: Load) -> Load:
@@ -109,6 +112,8 @@ def in_units(model: Model, units: str) -> Model:
         materials=None if table is None else table._replace(young=table.young * factor),
         loads=tuple(scaled(load, factor) for load in model.loads),
         node_young=None if model.node_young is None else model.node_young * factor,
+        cell_data=stresses_times(factor, model.cell_data),
+        point_data=stresses_times(factor, model.point_data),
         units=units,
     )
 
