@@ -15,7 +15,7 @@ from tetopt.geometry.cut import plane_cut
 from tetopt.geometry.simplex import centroids, volumes
 from tetopt.geometry.topology import boundary_facets, facets
 from tetopt.report import explore
-from tetopt.report.exhibit import exhibit
+from tetopt.report.exhibit import exhibit, warp_factors
 from tetopt.report.explore import colour_table, explorer_html, save_explorer
 
 
@@ -164,7 +164,34 @@ const steps = {
     put("at-number", AT_1); },
   label() { slide("low", 0); slide("high", 1000); put("field", 1); put("low-number", 2); },
 };
+const warped = async () => {
+  canvas.setPointerCapture = () => {};
+  const names = (id) => [...$(id).children].map((option) => option.textContent);
+  const state = () => [$("warp-number").value, $("warped").textContent, $("field").selectedOptions[0].textContent,
+    $("extremes").textContent, Number(canvas.dataset.section)];
+  said.names = [names("field"), names("by"), names("step")];
+  said.first = state();
+  press("axis", 2); put("at-number", AT_2); put("warp-number", 0);
+  await frame();
+  said.rest = state();
+  slide("warp", 1000);
+  await frame();
+  said.most = state();
+  put("step", 2); put("warp-number", 1.5); press("from", "S");
+  await frame();
+  said.second = state();
+  said.size = [canvas.width, canvas.height];
+  said.cells = grid();
+  send("pointerdown", ...CLICKS[0]);
+  send("pointerup", ...CLICKS[0]);
+  said.picked = $("picked").innerText;
+  put("field", $("field").children[1].value);
+  await frame();
+  said.grey = grid().some(([, , ...rgb]) => rgb.join() === "170,170,170");
+  return said;
+};
 const run = async () => {
+  if (document.title === "warped") return warped();
   if (!canvas.isConnected) return { words: document.body.innerText };
   said.over = document.documentElement.scrollWidth - document.documentElement.clientWidth;
   if (document.title === "narrow") return said;
@@ -220,7 +247,8 @@ addEventListener("load", () => setTimeout(async () => {
 FRAME = """<body><script>addEventListener("message", (event) => {
   document.documentElement.dataset[event.data.name] = JSON.stringify(event.data.said);
 });</script>
-<iframe src="page.html" width="1000" height="700"></iframe><iframe src="blind.html"></iframe>
+<iframe src="page.html" width="1000" height="700"></iframe>
+<iframe src="warped.html" width="1000" height="700"></iframe><iframe src="blind.html"></iframe>
 <iframe src="narrow.html" width="380" height="600"></iframe></body>"""
 AT = (0.23, -1.37, 3.1)  # mm from the middle: the coronal cut, the axial one, and the one the page begins with
 CLICKS = [[300, 300], [340, 390], [420, 280]]
@@ -237,9 +265,20 @@ def inner_facets(mesh, below):
     return nodes[~is_outer & (mesh.points[nodes][..., 2].max(axis=1) < below)]
 
 
+def pressed(mesh):
+    """Results of two steps at the nodes of order 2 (those in the middles of edges are not drawn), and a temperature."""
+    x, y, z = (mesh.points - mesh.points.min(axis=0)).T / np.ptp(mesh.points, axis=0).max()
+    first = np.column_stack([0.6 * (x - 0.3) * z, -0.4 * y * z, 1.0 - z])
+    second = np.column_stack([1.5 * z**2, 0.4 * x, 0.0 * x])
+    heat = np.where(np.arange(len(x)) % 17 == 0, np.nan, x)
+    data = {"on_top": np.zeros((len(x), 2)), "displacement": first, "displacement_step2": second, "heat": heat}
+    data |= {"von_mises_nodes": z, "von_mises_nodes_step2": 2.0 * z, "strain_nodes": np.zeros((len(x), 9))}
+    return {name: np.concatenate([values, np.full_like(values, 1e9)]) for name, values in data.items()}
+
+
 @pytest.fixture(scope="module")
 def shown(tmp_path_factory, mesh, cell_data, image):
-    """What the page says and shows, in one run of a browser: as it is, without WebGL, and in a narrow window."""
+    """What the page says and shows, in one run of a browser: as it is, deformed, without WebGL, in a narrow window."""
     folder = tmp_path_factory.mktemp("explore")
     middle = middle_of(mesh)
     thin = np.argmin(np.ptp(mesh.points, axis=0))
@@ -247,12 +286,13 @@ def shown(tmp_path_factory, mesh, cell_data, image):
     probe = PROBE
     for word, value in words.items():
         probe = probe.replace(word, str(value))
-    for title in ("page", "blind", "narrow"):
+    for title in ("page", "warped", "blind", "narrow"):
         sets = {"outer": boundary_facets(mesh.cells), "inner": inner_facets(mesh, below=middle[2] + AT[1] - 5.0)}
-        text = explorer_html(exhibit(mesh, cell_data, image, title, sets))
+        results = pressed(mesh) if title == "warped" else {}
+        text = explorer_html(exhibit(mesh, cell_data, image, title, sets, results))
         copied(text, folder / f"{title}.html", FRAMES + BLIND if title == "blind" else FRAMES, probe)
     frame = copied(FRAME, folder / "frame.html")
-    said = re.findall(r'data-(page|blind|narrow)="([^"]*)"', document(frame, "--window-size=1500,1500"))
+    said = re.findall(r'data-(page|warped|blind|narrow)="([^"]*)"', document(frame, "--window-size=1500,2300"))
     return {name: json.loads(html.unescape(text)) for name, text in said}
 
 
@@ -291,12 +331,12 @@ def test_counts_and_surfaces(shown, mesh, cell_data):
     assert page["crossed"][3:] == ["70", "70"]  # the upper limit went along
 
 
-def places_of(page, mesh):
+def places_of(page, mesh, radius=None):
     """World x and y (K, 2), mm, of the pixels seen from above, and how many mm a pixel is."""
     width, height = page["size"]
     extent = np.ptp(mesh.points, axis=0)
     middle = middle_of(mesh)
-    mm = np.linalg.norm(extent) / min(width, height)
+    mm = (np.linalg.norm(extent) if radius is None else 2 * radius) / min(width, height)
     x, y = np.array(page["cells"])[:, :2].T
     return np.column_stack([x + 0.5 - width / 2, height / 2 - y - 0.5]) * mm + middle[:2], mm
 
@@ -359,6 +399,92 @@ def test_a_click_reads_a_cell(shown, mesh, cell_data):
         assert float(re.search(r"mean \(intensity\)\t(\S+)", text)[1]) == pytest.approx(
             cell_data["mean"][cell], rel=1e-5
         )
+
+
+def moved(mesh, factor, name="displacement"):
+    return tetopt.Mesh(mesh.points + factor * pressed(mesh)[name][: len(mesh.points)], mesh.cells)
+
+
+def test_results_at_the_nodes_are_fields_and_deformations(mesh, cell_data):
+    shown = exhibit(mesh, cell_data, point_data=pressed(mesh))
+    names = [(field.name, field.unit, field.step, field.nodes is not None) for field in shown.fields]
+    assert names == [
+        ("displacement", "mm", 1, True), ("displacement", "mm", 2, True), ("heat", "", 0, True),
+        ("von_mises_nodes", "kPa", 1, True), ("von_mises_nodes", "kPa", 2, True),
+        ("mean", "intensity", 0, False), ("label", "", 0, False),
+    ]  # fmt: skip
+    assert shown.skipped == ["strain", "on_top", "strain_nodes"]
+    lengths = np.linalg.norm(pressed(mesh)["displacement_step2"][: len(mesh.points)], axis=1)
+    np.testing.assert_allclose(shown.fields[1].nodes, lengths, rtol=1e-6)
+    np.testing.assert_allclose(shown.fields[1].values, lengths[mesh.cells].mean(axis=1), rtol=1e-6)
+    np.testing.assert_allclose(shown.fields[1].limits, np.percentile(lengths, [1, 99]), rtol=1e-6)
+    assert list(shown.displacements) == [1, 2]
+    alone = exhibit(mesh, cell_data, point_data={"displacement": pressed(mesh)["displacement"]})
+    assert list(alone.displacements) == [0]
+    assert alone.fields[0].step == 0
+    for odd in (np.full((len(mesh.points), 3), np.nan), np.zeros((len(mesh.points), 2))):
+        assert exhibit(mesh, cell_data, point_data={"displacement": odd}).skipped == ["strain", "displacement"]
+    with pytest.raises(InputError, match=f"'heat' for each of {len(mesh.points)} nodes, got 3"):
+        exhibit(mesh, cell_data, point_data={"heat": np.zeros(3)})
+
+
+@pytest.mark.parametrize(("times", "first"), [(1.0, 1.0), (0.1, 1.0), (1e-3, 50.0), (2.4e-3, 20.0), (0.0, 1.0)])
+def test_a_displacement_is_drawn_so_that_it_is_seen(mesh, times, first):
+    """Its largest is some twentieth of the diagonal, by a round factor that is never less than 1."""
+    along = np.zeros_like(mesh.points)
+    along[3, 1] = -times * np.linalg.norm(np.ptp(mesh.points, axis=0))
+    factors = warp_factors(exhibit(mesh, {}, point_data={"displacement": along}))
+    assert factors == pytest.approx((first, 5.0 * first), rel=1e-12)
+
+
+def test_a_slider_deforms_the_mesh(shown, mesh):
+    """At rest, and as far as it goes, the plane cuts the cells that it cuts in numpy."""
+    page = shown["warped"]
+    fields = ["displacement (mm)", "heat", "von_mises_nodes (kPa)", "mean (intensity)", "label"]
+    assert page["names"] == [fields, fields, ["1", "2"]]
+    first, most = warp_factors(exhibit(mesh, {}, point_data=pressed(mesh)))
+    assert page["first"][:3] == [f"{first:g}", f"Deformation × {first:g}", "displacement (mm)"]
+    at = middle_of(mesh)[2] + AT[1]
+    for name, factor in (("rest", 0.0), ("most", most)):
+        points = moved(mesh, factor).points
+        assert np.abs(points[:, 2] - at).min() > 1e-4  # else single precision decides
+        polygons = plane_cut(points, mesh.cells, points[:, 2] - at).cells
+        words = f"Deformation × {factor:g}" if factor else "At rest"
+        assert page[name][:2] + page[name][4:] == [f"{factor:g}", words, len(polygons)]
+    assert page["rest"][4] != page["most"][4]
+
+
+def test_the_second_step_is_drawn_interpolated_and_picked(shown, mesh):
+    page = shown["warped"]
+    shape = moved(mesh, 1.5, "displacement_step2")
+    middle, first = middle_of(mesh), warp_factors(exhibit(mesh, {}, point_data=pressed(mesh)))[0]
+    farthest = np.abs(moved(mesh, first).points - middle).max(axis=0)
+    radius = max(np.linalg.norm(np.ptp(mesh.points, axis=0)) / 2, np.linalg.norm(farthest))
+    xy, mm = places_of(page, mesh, radius)
+    places = np.column_stack([xy, np.full(len(xy), middle[2] + AT[1])])
+    cells, distances = cells_at(shape, places)
+    clear = np.flatnonzero((distances > 2.5 * mm) & (cells >= 0))  # of lines
+    assert len(clear) > 300
+    corners = shape.points[mesh.cells[cells[clear]]]
+    edges = np.swapaxes(corners[:, 1:] - corners[:, :1], 1, 2)
+    shares = np.linalg.solve(edges, (places[clear] - corners[:, 0])[..., None])[..., 0]
+    field = exhibit(mesh, {}, point_data=pressed(mesh)).fields[1]
+    at_corners = field.nodes[mesh.cells[cells[clear]]]
+    values = at_corners[:, 0] + (shares * (at_corners[:, 1:] - at_corners[:, :1])).sum(axis=1)
+    low, high = field.limits
+    step = np.rint(255 * np.clip((values - low) / (high - low), 0, 1)).astype(int)
+    np.testing.assert_allclose(np.array(page["cells"])[clear, 2:], colour_table()[step].astype(int), atol=3)
+    assert page["second"][1:3] == ["Deformation × 1.5", "displacement (mm)"]
+    numbers = [float(text) for text in re.findall(r"[\d.]+", page["second"][3])]
+    np.testing.assert_allclose(numbers, [field.nodes.min(), field.nodes.max()], rtol=1e-4)
+    clicked = np.array([[*places_of({**page, "cells": CLICKS[:1]}, mesh, radius)[0][0], middle[2] + AT[1]]])
+    cell = cells_at(shape, clicked)[0][0]
+    assert page["picked"].startswith(f"Cell {cell}\n")
+    length = float(re.search(r"displacement \(mm\), mean of its nodes\t(\S+)", page["picked"])[1])
+    assert length == pytest.approx(field.values[cell], rel=1e-5)
+    x, y, z = map(float, re.search(r"centroid \(RAS, mm\)\t(\S+), (\S+), (\S+)", page["picked"]).groups())
+    np.testing.assert_allclose([x, y, z], mesh.points[mesh.cells[cell]].mean(axis=0), atol=0.051)  # at rest
+    assert page["grey"]  # nodes without a value
 
 
 def test_labels_have_a_legend(shown, mesh, cell_data):

@@ -162,3 +162,61 @@ def test_without_a_display_it_is_said(monkeypatch, mesh, display):
 @pytest.mark.skipif(not os.environ.get("DISPLAY"), reason="no display to be found")
 def test_a_display_is_found():
     assert has_display()
+
+
+@pytest.fixture
+def bent(opengl, mesh, cell_data):
+    """A window of the mesh bent in one step and sheared in another, and what its nodes move by."""
+    z = (mesh.points[:, 2] - mesh.points[:, 2].min()) / np.ptp(mesh.points[:, 2])
+    steps = [np.outer(z**2, [1.0, 0.5, 0.0]), np.outer(z, [0.0, -2.0, 0.3])]
+    data = {"displacement": steps[0], "displacement_step2": steps[1], "von_mises_nodes": z, "von_mises_nodes_step2": -z}
+    opened = plotter(exhibit(mesh, cell_data, point_data=data), off_screen=True)
+    yield opened, steps
+    opened.close()
+
+
+def test_a_slider_deforms_the_mesh(bent, mesh):
+    window, steps = bent
+    first = window.widgets.slider_widgets[4].GetRepresentation()
+    assert first.GetMinimumValue() == 0.0
+    assert first.GetMaximumValue() == 5.0 * first.GetValue() > 5.0
+    text = window.actors["count"].get_text(2)
+    assert text.endswith(f"\ndeformation x {first.GetValue():g}, step 1")
+    for factor in (0.0, 2.5):
+        slide(window, 4, factor)
+        points = mesh.points + factor * steps[0]
+        axis = int(np.argmin(np.ptp(mesh.points, axis=0)))
+        slide(window, 0, points[:, axis].mean() + 0.3)
+        deformed = type(mesh)(points, mesh.cells)
+        expected = section_area(deformed, mesh.cells, axis, points[:, axis].mean() + 0.3)
+        assert drawn(window, "section").area == pytest.approx(expected)
+        slide(window, 0, points[:, axis].max())
+        surface = drawn(window, "surface")
+        np.testing.assert_allclose(np.array(surface.bounds)[1::2], points.max(axis=0), rtol=1e-6)
+
+
+def test_a_field_of_the_nodes_is_interpolated_and_goes_with_the_step(bent, mesh):
+    window, steps = bent
+    slide(window, 4, 1.0)
+    z = (mesh.points[:, 2] - mesh.points[:, 2].min()) / np.ptp(mesh.points[:, 2])
+    section = drawn(window, "section")
+    assert list(window.scalar_bars.keys()) == ["displacement\n(mm)\n"]
+    lengths = np.linalg.norm(steps[0], axis=1)
+    assert lengths.min() < section.point_data["value"].min() < section.point_data["value"].max() < lengths.max()
+    press(window, "n")
+    assert list(window.scalar_bars.keys()) == ["von_mises_nodes\n(kPa)\n"]
+    press(window, "z")
+    slide(window, 0, 0.5 * (mesh.points[:, 2].max() + mesh.points[:, 2].min()))
+    np.testing.assert_allclose(drawn(window, "section").point_data["value"], 0.5, atol=1e-6)  # z where it is cut
+    press(window, "s")
+    assert window.actors["count"].get_text(2).endswith("deformation x 1, step 2")
+    surface = drawn(window, "surface")
+    assert list(window.scalar_bars.keys()) == ["von_mises_nodes\n(kPa)\n"]
+    height = np.array(surface.points)[:, 2]
+    at_rest = (height - mesh.points[:, 2].min()) / (np.ptp(mesh.points[:, 2]) + 0.3)  # linear in z, and so is the field
+    np.testing.assert_allclose(surface.point_data["value"], -at_rest, atol=1e-6)
+    slide(window, 1, -0.5)  # cells by the mean of their nodes
+    within = int((-z[mesh.cells].astype(np.float32).mean(axis=1) >= -0.5 - 1e-6).sum())
+    assert window.actors["count"].get_text(2).startswith(f"{within:,} of ")
+    press(window, "s")
+    assert window.actors["count"].get_text(2).endswith("deformation x 1, step 1")

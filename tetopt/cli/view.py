@@ -26,7 +26,10 @@ def view_command(
     part: BoxPart,
     force: ForceOption = False,
 ) -> int:
-    """Look at a mesh: cut it, colour it by any field, hide cells under a threshold; in a window or a page."""
+    """Look at a mesh, or at results on it: cut, colour by any field, threshold, deform; in a window or a page.
+
+    A mesh with displacements is drawn deformed, by a factor that a slider changes; of quadratic cells the corners are.
+    """
     if html is not None:
         html = checked_output(html, (".html",), force)
         check_no_input(html, mesh_path, image_path)
@@ -44,7 +47,7 @@ def view_command(
     triples = {name: facet_triples(mesh.cells, rows) for name, rows in sets.items()}
     from tetopt.report.exhibit import exhibit  # matplotlib and pyvista are slow to load, and only needed here
 
-    shown = exhibit(mesh, fields, image, mesh_path.name, triples)
+    shown = exhibit(mesh, fields, image, mesh_path.name, triples, loaded.point_data)
     if html is None:
         from tetopt.report.window import show
 

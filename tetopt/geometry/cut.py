@@ -13,7 +13,7 @@ from tetopt.geometry.simplex import Cells, Points
 class Cut(NamedTuple):
     """Polygons of three or four corners; a triangle repeats its last corner."""
 
-    corners: NDArray[np.float64]  # (K, 4, 3)
+    corners: NDArray[np.float64]  # (K, 4, w), of what `plane_cut` takes for points
     cells: NDArray[np.int64]  # (K,) the cell each one comes from
 
 
@@ -34,7 +34,8 @@ def plane_cut(points: Points, cells: Cells, height: NDArray[np.float64]) -> Cut:
 
     Parameters
     ----------
-    points : (N, 3) float64
+    points : (N, w) float64
+        Their coordinates, or whatever else is linear in each cell.
     cells : (M, 4) integer
     height : (N,) float64
         Signed distance of each node from the plane, in any unit; a node on the plane counts as above.

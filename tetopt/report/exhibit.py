@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from typing import NamedTuple
 
 import numpy as np
@@ -22,18 +23,27 @@ OUTLIERS_PERCENT = 1.0  # of the cells, at either end of a field: their values d
 # The fields that tetopt writes: they are quantities, even where their values are whole numbers.
 FIELD_UNITS = {
     "mean": "intensity", "variance": "intensity²", "n_voxels": "voxels", "min": "intensity", "max": "intensity",
-    "volume": "mm³", "rho": "0 to 1/3", "min_dihedral": "degrees", "young": "kPa",
+    "volume": "mm³", "rho": "0 to 1/3", "min_dihedral": "degrees", "young": "kPa", "displacement": "mm",
+    "von_mises": "kPa", "von_mises_nodes": "kPa",
 }  # fmt: skip
+DISPLACEMENT = "displacement"  # the point data by which the mesh is deformed
+STEP_NAME = re.compile(r"(.+)_step([1-9]\d*)")  # of results of the second and further steps
+ROUNDED_SHARE = 1e-9  # of the upper limit: a lower one within it is 0 but for rounding
+SEEN_SHARE = 0.05  # of the mesh's diagonal: about so long the largest displacement is drawn at first, to be seen
+MOST_TIMES = 5.0  # that: the cells' shapes are lost beyond
+ROUND_NUMBERS = (1.0, 2.0, 5.0, 10.0)  # of which, and powers of ten, a factor is one
 
 
 class Field(NamedTuple):
-    """One number a cell, and how it is coloured."""
+    """One number a cell or a node, and how it is coloured."""
 
     name: str
     unit: str  # "" where none is known
-    values: NDArray[np.float32]  # (M,)
+    values: NDArray[np.float32]  # (M,); of a field at the nodes the mean of each cell's corners
     limits: tuple[float, float]  # between which the colour map runs; always apart
     categories: list[tuple[int, str]]  # value and colour "#rrggbb" of labels, ascending; empty for a quantity
+    nodes: NDArray[np.float32] | None = None  # (N,), to be interpolated; None for a field of the cells
+    step: int = 0  # of a load, from 1; 0 for what is of none, or of the only one
 
 
 class Exhibit(NamedTuple):
@@ -41,10 +51,11 @@ class Exhibit(NamedTuple):
 
     mesh: Mesh
     fields: list[Field]  # at least one
-    skipped: list[str]  # names of cell data that are not shown
+    skipped: list[str]  # names of data that are not shown
     image: Image | None  # 3-D
     title: str
     sets: dict[str, NDArray]  # (K, 3) integer: the nodes of facets, by name
+    displacements: dict[int, NDArray[np.float64]]  # (N, 3) mm by step; of the only one under 0
 
 
 def exhibit(
@@ -53,6 +64,7 @@ def exhibit(
     image: Image | None = None,
     title: str = "mesh",
     facet_sets: dict[str, NDArray] | None = None,
+    point_data: dict[str, NDArray] | None = None,
 ) -> Exhibit:
     """What is shown of a mesh and its data.
 
@@ -69,12 +81,16 @@ def exhibit(
     title : str
     facet_sets : dict of (K, 3) integer, optional
         Triples of nodes to be highlighted, by name.
+    point_data : dict of arrays of N rows or more, optional
+        By name; the first N rows are the mesh's nodes', what follows (the middles of quadratic cells' edges) is not
+        drawn. Data of one number a node are quantities. "displacement" (3 columns, mm) deforms the mesh, and its length
+        is a field; with "displacement_step2" and so on there are steps, and data with such an end are of that step.
 
     Raises
     ------
     InputError
-        A mesh of triangles, a field of another length than there are cells, an image that is not 3-D, a facet set that
-        is not triples of the mesh's nodes.
+        A mesh of triangles, a field of another length than there are cells, or of less than there are nodes, an image
+        that is not 3-D, a facet set that is not triples of the mesh's nodes.
     """
     if mesh.ndim != 3:
         raise InputError(
@@ -90,21 +106,88 @@ def exhibit(
             )
     arrays = {name: np.asarray(values) for name, values in cell_data.items()}
     scalars = {name: values for name, values in arrays.items() if values.ndim == 1 and values.dtype.kind in "buif"}
-    fields = [_field(name, values) for name, values in (scalars or cell_fields(mesh, image)).items()]
-    skipped = [name for name in cell_data if name not in scalars]
-    return Exhibit(mesh, fields, skipped, image, title, _checked_sets(mesh, facet_sets or {}))
+    at_nodes, displacements, others = _nodal(mesh, point_data or {})
+    fields = [_field(name, values[mesh.cells].mean(axis=1), values) for name, values in at_nodes.items()]
+    fields += [_field(name, values) for name, values in (scalars or cell_fields(mesh, image)).items()]
+    skipped = [name for name in cell_data if name not in scalars] + others
+    checked = _checked_sets(mesh, facet_sets or {})
+    return Exhibit(mesh, _by_step(fields, displacements), skipped, image, title, checked, displacements)
 
 
-def _field(name: str, values: NDArray) -> Field:
+def warp_factors(shown: Exhibit) -> tuple[float, float]:
+    """By what displacements are multiplied at first, so that they are seen (1 or more), and at most."""
+    largest = max((float(np.sqrt((u**2).sum(axis=1)).max()) for u in shown.displacements.values()), default=0.0)
+    diagonal = float(np.sqrt((np.ptp(shown.mesh.points, axis=0) ** 2).sum()))
+    if largest <= ROUNDED_SHARE * diagonal:  # it rests
+        return 1.0, MOST_TIMES
+    factor = SEEN_SHARE * diagonal / largest
+    power = 10.0 ** np.floor(np.log10(factor))
+    first = max(1.0, power * min(ROUND_NUMBERS, key=lambda number: abs(np.log(factor / power / number))))
+    return float(first), MOST_TIMES * float(first)
+
+
+def _nodal(
+    mesh: Mesh, point_data: dict[str, NDArray]
+) -> tuple[dict[str, NDArray], dict[int, NDArray[np.float64]], list[str]]:
+    """Numbers by name, the lengths of displacements first; displacements by step; the names of what is left."""
+    numbers: dict[str, NDArray] = {}
+    displacements: dict[int, NDArray[np.float64]] = {}
+    others = []
+    for name, rows in point_data.items():
+        if len(rows) < len(mesh.points):
+            raise InputError(
+                f"view: expected one row of {name!r} for each of {len(mesh.points)} nodes, got {len(rows)}; "
+                "pass the data of this mesh"
+            )
+        values = np.asarray(rows)[: len(mesh.points)]
+        match = STEP_NAME.fullmatch(name)
+        if (match[1] if match else name) == DISPLACEMENT and values.shape[1:] == (3,) and np.isfinite(values).all():
+            displacements[int(match[2]) if match else 1] = values.astype(np.float64)
+            numbers[name] = np.sqrt((values.astype(np.float64) ** 2).sum(axis=1))
+        elif values.ndim == 1 and values.dtype.kind in "buif":
+            numbers[name] = values.astype(np.float64)
+        else:
+            others.append(name)
+    numbers = dict(sorted(numbers.items(), key=lambda entry: not entry[0].startswith(DISPLACEMENT)))
+    if len(displacements) == 1:
+        displacements = {0: next(iter(displacements.values()))}
+    return numbers, dict(sorted(displacements.items())), others
+
+
+def _by_step(fields: list[Field], displacements: dict[int, NDArray[np.float64]]) -> list[Field]:
+    """The fields with the steps that they are of; those of a step without its number in the name."""
+    if len(displacements) < 2:
+        return fields
+    matches = [STEP_NAME.fullmatch(field.name) for field in fields]
+    repeated = {match[1] for match in matches if match and int(match[2]) in displacements}
+    return [
+        field._replace(name=match[1], step=int(match[2]))
+        if match and int(match[2]) in displacements
+        else field._replace(step=1 if field.name in repeated else 0)
+        for field, match in zip(fields, matches, strict=True)
+    ]
+
+
+def _field(name: str, values: NDArray, nodes: NDArray | None = None) -> Field:
+    """A field of the cells, or of the nodes with its mean over the corners of each cell."""
+    values, at_nodes = _single(values), None if nodes is None else _single(nodes)
+    shown = values if at_nodes is None else at_nodes
+    finite = shown[np.isfinite(shown)].astype(np.float64)
+    unit = FIELD_UNITS.get(STEP_NAME.sub(r"\1", name), "")
+    if len(finite) == 0:
+        return Field(name, unit, values, (0.0, 1.0), [], at_nodes)
+    low, high = (float(limit) for limit in np.percentile(finite, [OUTLIERS_PERCENT, 100.0 - OUTLIERS_PERCENT]))
+    low = 0.0 if abs(low) < ROUNDED_SHARE * high else low
+    limits = (low, high) if high > low else grey_limits([finite])
+    is_quantity = unit or at_nodes is not None
+    return Field(name, unit, values, limits, [] if is_quantity else _categories(finite), at_nodes)
+
+
+def _single(values: NDArray) -> NDArray[np.float32]:
+    """In single precision, NaN where a value is infinite."""
     with np.errstate(over="ignore"):
         values = values.astype(np.float32)
-    values = np.where(np.isfinite(values), values, np.nan).astype(np.float32)
-    finite = values[np.isfinite(values)].astype(np.float64)
-    if len(finite) == 0:
-        return Field(name, FIELD_UNITS.get(name, ""), values, (0.0, 1.0), [])
-    low, high = (float(limit) for limit in np.percentile(finite, [OUTLIERS_PERCENT, 100.0 - OUTLIERS_PERCENT]))
-    limits = (low, high) if high > low else grey_limits([finite])
-    return Field(name, FIELD_UNITS.get(name, ""), values, limits, [] if name in FIELD_UNITS else _categories(finite))
+    return np.where(np.isfinite(values), values, np.nan).astype(np.float32)
 
 
 def _categories(values: NDArray[np.float64]) -> list[tuple[int, str]]:

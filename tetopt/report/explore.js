@@ -27,7 +27,8 @@ function start() {
     say("This browser has no WebGL 2, so the mesh cannot be shown; try another browser or machine.");
     return;
   }
-  const notes = data.skipped.length ? [`Not one number a cell, so not shown: ${data.skipped.join(", ")}.`] : [];
+  const notes = data.skipped.length
+    ? [`Neither one number a cell nor one a node, so not shown: ${data.skipped.join(", ")}.`] : [];
   const most = gl.getParameter(gl.MAX_3D_TEXTURE_SIZE);
   if (data.image && Math.max(...data.image.shape) > most) {
     notes.push(`This machine's graphics take up to ${most} voxels along an axis, so the image is not shown.`);
@@ -44,14 +45,22 @@ function explore(gl, data, notes) {
   const table = new Uint8Array(bytes(data.colours));
   const sets = data.sets.map((set) => ({ ...set, triangles: new Uint32Array(bytes(set.triangles)) }));
   const size = [0, 1, 2].map((k) => mesh.high[k] - mesh.low[k]);
-  const radius = Math.hypot(...size) / 2;
-  const far = image ? Math.hypot(...[0, 1, 2].map((k) => Math.max(-image.box[0][k], image.box[1][k]))) : 0;
-  const drawn = renderer(gl, image, radius, 1.05 * Math.max(radius, far));
+  const displacements = data.displacements.map(({ step, u }) => ({ step, u: new Float32Array(bytes(u)) }));
+  const [firstWarp, mostWarp] = data.factors;
+  let depth = image ? reach({ low: image.box[0], high: image.box[1] }) : 0;
+  for (const { u } of displacements) {
+    deform(mesh, u, mostWarp);
+    depth = Math.max(depth, reach(mesh));
+  }
+  if (displacements.length) deform(mesh, displacements[0].u, firstWarp);
+  const radius = Math.max(Math.hypot(...size) / 2, reach(mesh));
+  const drawn = renderer(gl, image, radius, 1.05 * Math.max(radius, depth), table, hex(data.noValue));
 
   const thin = size.indexOf(Math.min(...size));  // so that the section one begins with is the largest
   const state = {
     field: 0, by: 0, low: fields[0].min, high: fields[0].max, axis: thin, at: 0, isTurned: false, isWhole: false,
-    inside: "cells", share: 0.35, set: -1, picked: -1,
+    inside: "cells", share: 0.35, set: -1, picked: -1, warp: firstWarp,
+    step: displacements.length ? displacements[0].step : 0,
   };
   const camera = { ...facing(), ...WHOLE };
   const isWithin = new Uint8Array(mesh.count).fill(1);
@@ -97,9 +106,11 @@ function explore(gl, data, notes) {
     const { axis, at } = state;
     const nothing = new Triangles(0);
     const hasSlice = axis >= 0 && image && state.inside !== "cells";
-    const outside = surface(mesh, shown());
+    const field = fields[state.field];
+    const levels = field.nodes && nodeLevels(field);
+    const outside = surface(mesh, shown(), levels);
     // Where only the image is shown, the cells of the section are there as well, unseen, to be clicked on.
-    const cut = axis >= 0 && (hasSlice || !state.isWhole) ? section(mesh, isWithin, axis, at) : nothing;
+    const cut = axis >= 0 && (hasSlice || !state.isWhole) ? section(mesh, isWithin, axis, at, levels) : nothing;
     drawn.parts.surface.fill(outside);
     drawn.parts.section.fill(cut);
     drawn.parts.slice.fill(hasSlice ? slice(image.box, axis, at) : nothing);
@@ -145,9 +156,10 @@ function explore(gl, data, notes) {
     $("labels").hidden = !field.categories.length;
     const stops = Array.from({ length: 18 }, (_, i) => `rgb(${table.subarray(45 * i, 45 * i + 3).join()})`);
     $("bar").style.background = `linear-gradient(to right, ${stops.join()})`;
-    const texts = [low, (low + high) / 2, high].map((value) => number(value, 3));
-    if (field.min < low) texts[0] = `≤ ${texts[0]}`;
-    if (field.max > high) texts[2] = `≥ ${texts[2]}`;
+    const rounded = (value, digits) => number(Math.abs(value) < 1e-6 * (high - low) ? 0 : value, digits);
+    const texts = [low, (low + high) / 2, high].map((value) => rounded(value, 3));
+    if (field.least < low) texts[0] = `≤ ${texts[0]}`;
+    if (field.most > high) texts[2] = `≥ ${texts[2]}`;
     $("ticks").replaceChildren(...texts.map((text) => element("span", text)));
     $("labels").replaceChildren(...field.categories.map(([value, colour]) => {
       const [entry, swatch] = [element("span", ""), element("i", "")];
@@ -155,8 +167,8 @@ function explore(gl, data, notes) {
       entry.append(swatch, String(value));
       return entry;
     }));
-    const hasNone = !(field.min <= field.max) || field.values.some(Number.isNaN);
-    const range = field.min <= field.max ? `least ${number(field.min)}, most ${number(field.max)}` : "";
+    const hasNone = !(field.least <= field.most) || (field.nodes || field.values).some(Number.isNaN);
+    const range = field.least <= field.most ? `least ${rounded(field.least)}, most ${rounded(field.most)}` : "";
     $("extremes").textContent = [range, hasNone ? "grey: no value" : ""].filter(Boolean).join("; ");
   }
 
@@ -184,7 +196,7 @@ function explore(gl, data, notes) {
 
   function fill(place, names, act) {
     $(place).replaceChildren(...names.map(([text, value]) => Object.assign(element("option", text), { value })));
-    $(place).addEventListener("change", () => act(Number($(place).value)));
+    $(place).onchange = () => act(Number($(place).value));
   }
 
   // A slider of 1000 steps between two ends, and the number beside it, which takes any value between.
@@ -213,6 +225,7 @@ function explore(gl, data, notes) {
   const showAt = couple("at", (value) => cutAt(value === null ? state.at : value - centre[state.axis]));
   const showLow = couple("low", (value) => limit(value === null ? state.low : value, null));
   const showHigh = couple("high", (value) => limit(null, value === null ? state.high : value));
+  const showFactor = couple("warp", (value) => warp(value === null ? state.warp : value));
 
   function cutAt(at) {
     state.at = Math.max(mesh.low[state.axis], Math.min(mesh.high[state.axis], at));
@@ -250,11 +263,43 @@ function explore(gl, data, notes) {
     const { min, max } = fields[state.by];
     state.field = field;
     $("field").value = field;
-    drawn.paint(cellColours(fields[field], table, hex(data.noValue)));
+    drawn.paint(fields[field].nodes ? null : cellColours(fields[field], table, hex(data.noValue)));
     showKey();
     // Limits that leave nothing out go along with the field one looks at.
     if (state.low <= min && state.high >= max) chooseBy(field);
-    redraw();
+    else build();
+  }
+
+  function warp(factor) {
+    state.warp = factor;
+    showWarp();
+    build();
+  }
+
+  function showWarp() {
+    if (!displacements.length) return;
+    deform(mesh, displacements.find((each) => each.step === state.step).u, state.warp);
+    showCut();
+    showFactor(state.warp, 0, mostWarp);
+    $("warped").textContent = state.warp ? `Deformation × ${number(state.warp)}` : "At rest";
+  }
+
+  // The fields of the step, and those of none; what one looks at is followed from step to step.
+  function chooseStep(step) {
+    const counterpart = (k) => {
+      const same = fields.findIndex((field) => field.name === fields[k].name && [0, step].includes(field.step));
+      return same < 0 ? fields.findIndex((field) => [0, step].includes(field.step)) : same;
+    };
+    state.step = step;
+    showWarp();
+    const options = fields.map((field, i) => [heading(field), i]).filter(([, i]) => [0, step].includes(fields[i].step));
+    fill("field", options, chooseField);
+    fill("by", options, chooseBy);
+    const [field, by] = [counterpart(state.field), counterpart(state.by)];
+    if (by !== state.by) chooseBy(by);
+    else $("by").value = by;
+    chooseField(field);
+    showPicked();
   }
 
   function showCut() {
@@ -293,13 +338,15 @@ function explore(gl, data, notes) {
       return;
     }
     const table = element("table", "");
-    const middle = [0, 1, 2].map((k) => (mesh.centroids[3 * picked + k] + centre[k]).toFixed(1)).join(", ");
-    const rows = fields.map((field) => [
-      heading(field),
+    const nodes = [...mesh.cells.subarray(4 * picked, 4 * picked + 4)];
+    const middle = [0, 1, 2].map((k) => (
+      nodes.reduce((sum, node) => sum + mesh.rest[3 * node + k], 0) / 4 + centre[k]
+    ).toFixed(1)).join(", ");
+    const rows = fields.filter((field) => [0, state.step].includes(field.step)).map((field) => [
+      field.nodes ? `${heading(field)}, mean of its nodes` : heading(field),
       Number.isNaN(field.values[picked]) ? "no value" : number(field.values[picked], 6),
     ]);
-    const nodes = [...mesh.cells.subarray(4 * picked, 4 * picked + 4)].join(", ");
-    for (const texts of [...rows, ["centroid (RAS, mm)", middle], ["nodes", nodes]]) {
+    for (const texts of [...rows, ["centroid (RAS, mm)", middle], ["nodes", nodes.join(", ")]]) {
       const row = element("tr", "");
       row.append(...texts.map((text) => element("td", text)));
       table.append(row);
@@ -360,9 +407,6 @@ function explore(gl, data, notes) {
     $("about").textContent = [...words, ...notes].join(" ");
   }
 
-  const options = fields.map((field, i) => [heading(field), i]);
-  fill("field", options, chooseField);
-  fill("by", options, chooseBy);
   fill("set", [["none", -1], ...sets.map((set, i) => [`${set.name} (${set.triangles.length / 3})`, i])],
     (set) => change({ set }));
   $("marking").hidden = !sets.length;
@@ -378,10 +422,12 @@ function explore(gl, data, notes) {
     const [yaw, pitch] = FROM[letter].map((quarters) => quarters * Math.PI / 2);
     look({ yaw, pitch });
   });
+  fill("step", displacements.map(({ step }) => [`${step}`, step]), chooseStep);
+  $("deforming").hidden = !displacements.length;
+  $("stepping").hidden = displacements.length < 2;
   about();
-  chooseField(0);
+  chooseStep(state.step);
   showCut();
-  showPicked();
   listen(canvas, { turn, zoom, move, pick, keys });
   canvas.addEventListener("pointerdown", () => canvas.focus());
   canvas.addEventListener("contextmenu", (event) => event.preventDefault());

@@ -21,7 +21,7 @@ from tetopt.geometry.box import box_sides
 from tetopt.image import Image
 from tetopt.io.files import written_whole
 from tetopt.report.colours import grey_limits
-from tetopt.report.exhibit import COLOUR_MAP, NO_VALUE, Exhibit
+from tetopt.report.exhibit import COLOUR_MAP, NO_VALUE, Exhibit, Field, warp_factors
 from tetopt.report.page import data_html, packed, script_html
 
 PAGE_IMAGE_VOXELS = 2**24  # 16 MB, a byte each: an image with more is averaged
@@ -51,22 +51,29 @@ def explorer_html(shown: Exhibit) -> str:
     its 99.5 percentile, each voxel where its affine puts it; above `PAGE_IMAGE_VOXELS` neighbours are averaged, which
     the page says.
     """
-    mesh, fields, skipped, image, title, sets = shown
+    mesh, fields, skipped, image, title, sets, displacements = shown
     centre = (mesh.points.min(axis=0) + mesh.points.max(axis=0)) / 2.0
     data = {
         "centre": centre.tolist(),
         "points": packed(mesh.points - centre, "<f4"),
         "cells": packed(mesh.cells, "<u4"),
-        "fields": [{**field._asdict(), "values": packed(field.values, "<f4")} for field in fields],
+        "fields": [_packed_field(field) for field in fields],
         "skipped": skipped,
         "colours": packed(colour_table(), "u1"),
         "image": None if image is None else _packed_image(image, centre),
         "sets": [{"name": name, "triangles": packed(nodes, "<u4")} for name, nodes in sets.items()],
         "noValue": NO_VALUE,
+        "displacements": [{"step": step, "u": packed(u, "<f4")} for step, u in displacements.items()],
+        "factors": warp_factors(shown),
     }
     page = resources.files("tetopt.report").joinpath("explore.html").read_text(encoding="utf-8")
     script = script_html("webgl.js", "explore_mesh.js", "explore_gl.js", "explore.js")
     return string.Template(page).substitute(TITLE=html.escape(title), DATA=data_html("data", data), SCRIPT=script)
+
+
+def _packed_field(field: Field) -> dict[str, Any]:
+    nodes = None if field.nodes is None else packed(field.nodes, "<f4")
+    return {**field._asdict(), "values": packed(field.values, "<f4"), "nodes": nodes}
 
 
 def _packed_image(image: Image, centre: NDArray[np.float64]) -> dict[str, Any]:

@@ -1,13 +1,20 @@
 // Draws the mesh's parts in the colours of their cells or the image's greys, and says which cell is in a pixel.
 
+const NO_LEVEL = -1e6;  // of a node without a value
 const FRAGMENT = `${SHADING}
+  const float NO_LEVEL = ${NO_LEVEL.toFixed(1)};
   uniform int kind; uniform vec4 plane; uniform float share; uniform bool isPicking; uniform uint picked;
-  uniform sampler2D colours; uniform sampler3D voxels; uniform mat4 toIndex; uniform vec3 shape;
+  uniform bool isNodal; uniform vec3 noValue; uniform sampler2D table; uniform sampler2D colours;
+  uniform sampler3D voxels; uniform mat4 toIndex; uniform vec3 shape;
   const int SURFACE = 0, SECTION = 1, SLICE = 2, SET = 3;
   vec4 grey() {  // of the voxel around this place; nothing outside of the image
     vec3 index = (toIndex * vec4(world, 1.0)).xyz + 0.5;
     if (any(lessThan(index, vec3(0.0))) || any(greaterThanEqual(index, shape))) return vec4(0.0);
     return vec4(vec3(texelFetch(voxels, ivec3(index), 0).r), 1.0);
+  }
+  vec3 atNodes() {  // the colour of a field that is interpolated
+    if (level < 0.1 * NO_LEVEL) return noValue;
+    return texelFetch(table, ivec2(int(255.0 * clamp(level, 0.0, 1.0) + 0.5), 0), 0).rgb;
   }
   void main() {
     float line = edge();  // before any pixel is discarded: its neighbours' slopes need it
@@ -27,7 +34,7 @@ const FRAGMENT = `${SHADING}
       colour = vec4(mix(vec3(1.0, 0.0, 0.75) * lit, vec3(0.35, 0.0, 0.25), 0.6 * line), 0.3);
       return;
     }
-    vec3 own = texelFetch(colours, ivec2(cell % 2048u, cell / 2048u), 0).rgb;
+    vec3 own = isNodal ? atNodes() : texelFetch(colours, ivec2(cell % 2048u, cell / 2048u), 0).rgb;
     vec4 below = kind == SECTION ? grey() : vec4(0.0);
     float seenOwn = mix(1.0, share, below.a);
     vec3 fill = mix(below.rgb, own, seenOwn) * lit;
@@ -61,6 +68,12 @@ function cellColours(field, table, noValue) {
   return colours;
 }
 
+// Where the values of a field at the nodes lie between its limits, from 0 to 1.
+function nodeLevels(field) {
+  const [low, high] = field.limits;
+  return field.nodes.map((value) => (Number.isNaN(value) ? NO_LEVEL : (value - low) / (high - low)));
+}
+
 function nearestTexture(gl, unit, target) {
   gl.activeTexture(gl.TEXTURE0 + unit);
   gl.bindTexture(target, gl.createTexture());
@@ -69,14 +82,17 @@ function nearestTexture(gl, unit, target) {
 }
 
 // What draws the view. It draws all of it for every change; only what `fill` and `paint` take stays on the card.
-function renderer(gl, image, radius, depth) {
+function renderer(gl, image, radius, depth, table, noValue) {
   const { at, part, clear } = painter(gl, FRAGMENT);
   const parts = Object.fromEntries(Object.keys(KINDS).map((name) => [name, part()]));
   gl.blendFuncSeparate(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA, gl.ONE, gl.ONE);
   nearestTexture(gl, 0, gl.TEXTURE_2D);
   nearestTexture(gl, 1, gl.TEXTURE_3D);
-  gl.uniform1i(at("colours"), 0);
-  gl.uniform1i(at("voxels"), 1);
+  nearestTexture(gl, 2, gl.TEXTURE_2D);
+  gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGB, table.length / 3, 1, 0, gl.RGB, gl.UNSIGNED_BYTE, table);
+  ["colours", "voxels", "table"].forEach((name, unit) => gl.uniform1i(at(name), unit));
+  gl.uniform3fv(at("noValue"), noValue.map((tone) => tone / 255));
+  gl.activeTexture(gl.TEXTURE1);
   const shape = image ? image.shape : [1, 1, 1];
   gl.texImage3D(gl.TEXTURE_3D, 0, gl.R8, ...shape, 0, gl.RED, gl.UNSIGNED_BYTE,
     image ? new Uint8Array(bytes(image.voxels)) : new Uint8Array(1));
@@ -113,7 +129,10 @@ function renderer(gl, image, radius, depth) {
   return {
     parts,
     frame,
+    // The colours of the cells, or null where they come from what their corners have.
     paint(colours) {
+      gl.uniform1i(at("isNodal"), colours ? 0 : 1);
+      if (!colours) return;
       gl.activeTexture(gl.TEXTURE0);
       const rows = colours.length / 4 / WIDE;
       gl.texImage2D(gl.TEXTURE_2D, 0, gl.RGBA, WIDE, rows, 0, gl.RGBA, gl.UNSIGNED_BYTE, colours);

@@ -48,32 +48,54 @@ function centroidsAndVolumes(points, cells) {
   return { centroids, volumes };
 }
 
-function unpackedField(packed) {
-  const values = new Float32Array(bytes(packed.values));
+function extremes(values) {
   let min = Infinity, max = -Infinity;
   for (const value of values) {
     if (value < min) min = value;
     if (value > max) max = value;
   }
-  return { ...packed, values, min, max };
+  return [min, max];
 }
 
-function unpackedMesh(data) {
-  const points = new Float32Array(bytes(data.points));
-  const cells = new Uint32Array(bytes(data.cells));
+// Its cells' values lie from `min` to `max`; what is drawn, which may be the nodes', from `least` to `most`.
+function unpackedField(packed) {
+  const values = new Float32Array(bytes(packed.values));
+  const nodes = packed.nodes && new Float32Array(bytes(packed.nodes));
+  const [min, max] = extremes(values);
+  const [least, most] = nodes ? extremes(nodes) : [min, max];
+  return { ...packed, values, nodes, min, max, least, most };
+}
+
+function boxOf(points) {
   const low = [Infinity, Infinity, Infinity], high = [-Infinity, -Infinity, -Infinity];
   points.forEach((value, i) => {
     low[i % 3] = Math.min(low[i % 3], value);
     high[i % 3] = Math.max(high[i % 3], value);
   });
+  return { low, high };
+}
+
+// The mesh at rest; `deform` moves its points, box and centroids, and leaves its volumes.
+function unpackedMesh(data) {
+  const rest = new Float32Array(bytes(data.points));
+  const cells = new Uint32Array(bytes(data.cells));
   return {
-    points, cells, low, high, count: cells.length / 4, neighbours: neighbours(cells, points.length / 3),
-    ...centroidsAndVolumes(points, cells),
+    rest, points: rest, cells, count: cells.length / 4, neighbours: neighbours(cells, rest.length / 3),
+    ...boxOf(rest), ...centroidsAndVolumes(rest, cells),
   };
 }
 
-// The facets that exactly one shown cell has.
-function surface(mesh, isShown) {
+function deform(mesh, displacement, factor) {
+  mesh.points = mesh.rest.map((value, i) => value + factor * displacement[i]);
+  Object.assign(mesh, boxOf(mesh.points));
+  mesh.centroids = centroidsAndVolumes(mesh.points, mesh.cells).centroids;
+}
+
+// The farthest from the middle that a box reaches.
+const reach = ({ low, high }) => Math.hypot(...low.map((value, k) => Math.max(-value, high[k])));
+
+// The facets that exactly one shown cell has; with `levels`, one a node, the values at their corners.
+function surface(mesh, isShown, levels) {
   const { points, cells } = mesh;
   const isOuter = (half) => isShown[half >> 2] && !(mesh.neighbours[half] >= 0 && isShown[mesh.neighbours[half]]);
   let count = 0;
@@ -83,8 +105,9 @@ function surface(mesh, isShown) {
     if (!isOuter(half)) continue;
     const start = half - half % 4;
     for (let k = 0; k < 3; k++) {
-      const node = 3 * cells[start + FACETS[half % 4][k]];
-      triangles.set(3 * triangles.count + k, half >> 2, 7, points[node], points[node + 1], points[node + 2]);
+      const number = cells[start + FACETS[half % 4][k]], node = 3 * number;
+      triangles.set(3 * triangles.count + k, half >> 2, 7, points[node], points[node + 1], points[node + 2],
+        levels ? levels[number] : 0);
     }
     triangles.count++;
   }
@@ -92,7 +115,7 @@ function surface(mesh, isShown) {
 }
 
 // The polygons in which the plane axis = at cuts the shown cells: triangles, or quadrilaterals in two triangles.
-function section(mesh, isShown, axis, at) {
+function section(mesh, isShown, axis, at, levels) {
   const { points, cells } = mesh;
   const triangles = new Triangles(64);
   const between = (i, j) => {
@@ -100,6 +123,7 @@ function section(mesh, isShown, axis, at) {
     const place = [0, 0, 0];
     for (let k = 0; k < 3; k++) place[k] = points[3 * i + k] + share * (points[3 * j + k] - points[3 * i + k]);
     place[axis] = at;
+    if (levels) place.push(levels[i] + share * (levels[j] - levels[i]));
     return place;
   };
   let nPolygons = 0;

@@ -3,13 +3,14 @@
 
 const VERTEX = `#version 300 es
   precision highp float; precision highp int;
-  in vec3 place; in uint tag;
+  in vec3 place; in uint tag; in float value;
   uniform mat3 turn; uniform vec3 scale; uniform vec2 shift;
-  out vec3 world; out vec3 seen; out vec3 corner; flat out uint cell; flat out uint sides;
+  out vec3 world; out vec3 seen; out vec3 corner; out float level; flat out uint cell; flat out uint sides;
   void main() {
     int k = gl_VertexID % 3;  // vertices are not shared, so this is the corner's number in its triangle
     corner = vec3(k == 0, k == 1, k == 2);
     world = place;
+    level = value;
     seen = turn * place;
     cell = tag >> 3;
     sides = tag & 7u;
@@ -18,7 +19,7 @@ const VERTEX = `#version 300 es
 // What a view's fragment shader begins with: the line along the drawn sides, 0 to 1, and the light on a facet.
 const SHADING = `#version 300 es
   precision highp float; precision highp int; precision highp sampler3D;
-  in vec3 world; in vec3 seen; in vec3 corner; flat in uint cell; flat in uint sides;
+  in vec3 world; in vec3 seen; in vec3 corner; in float level; flat in uint cell; flat in uint sides;
   out vec4 colour;
   float edge() {
     vec3 step = fwidth(corner);
@@ -39,29 +40,33 @@ function bytes(text) {
   return numbers.buffer;
 }
 
-// Triangles with their own three corners each; a tag is the cell's number and which of the sides are drawn, as bits.
+// Triangles with their own three corners each; a tag is the cell's number and which of the sides are drawn, as bits; a
+// value is what a field at the nodes is there.
 class Triangles {
   constructor(capacity) {
     this.places = new Float32Array(9 * capacity);
     this.tags = new Uint32Array(3 * capacity);
+    this.values = new Float32Array(3 * capacity);
     this.count = 0;
   }
   add(cell, sides, ...corners) {
     if (3 * this.count === this.tags.length) this.grow();
-    corners.forEach(([x, y, z], k) => this.set(3 * this.count + k, cell, sides, x, y, z));
+    corners.forEach((corner, k) => this.set(3 * this.count + k, cell, sides, ...corner));
     this.count++;
   }
-  set(vertex, cell, sides, x, y, z) {
+  set(vertex, cell, sides, x, y, z, value = 0) {
     this.places[3 * vertex] = x;
     this.places[3 * vertex + 1] = y;
     this.places[3 * vertex + 2] = z;
     this.tags[vertex] = cell * 8 + sides;
+    this.values[vertex] = value;
   }
   grow() {
     const more = new Triangles(Math.max(64, 2 * this.count));
     more.places.set(this.places);
     more.tags.set(this.tags);
-    [this.places, this.tags] = [more.places, more.tags];
+    more.values.set(this.values);
+    [this.places, this.tags, this.values] = [more.places, more.tags, more.values];
   }
 }
 
@@ -105,23 +110,26 @@ function painter(gl, fragment) {
 // A list of triangles on the graphics card.
 function part(gl, program) {
   const array = gl.createVertexArray();
-  const [places, tags] = [gl.createBuffer(), gl.createBuffer()];
+  const buffers = {};
   gl.bindVertexArray(array);
-  for (const [name, buffer] of [["place", places], ["tag", tags]]) {
+  for (const [name, numbers] of [["place", 3], ["tag", 1], ["value", 1]]) {
     const at = gl.getAttribLocation(program, name);
-    gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
+    if (at < 0) continue;  // the fragment shader makes nothing of it
+    buffers[name] = gl.createBuffer();
+    gl.bindBuffer(gl.ARRAY_BUFFER, buffers[name]);
     gl.enableVertexAttribArray(at);
-    if (name === "tag") gl.vertexAttribIPointer(at, 1, gl.UNSIGNED_INT, 0, 0);
-    else gl.vertexAttribPointer(at, 3, gl.FLOAT, false, 0, 0);
+    if (name === "tag") gl.vertexAttribIPointer(at, numbers, gl.UNSIGNED_INT, 0, 0);
+    else gl.vertexAttribPointer(at, numbers, gl.FLOAT, false, 0, 0);
   }
   let count = 0;
   return {
     fill(triangles) {
       count = triangles.count;
-      gl.bindBuffer(gl.ARRAY_BUFFER, places);
-      gl.bufferData(gl.ARRAY_BUFFER, triangles.places.subarray(0, 9 * count), gl.DYNAMIC_DRAW);
-      gl.bindBuffer(gl.ARRAY_BUFFER, tags);
-      gl.bufferData(gl.ARRAY_BUFFER, triangles.tags.subarray(0, 3 * count), gl.DYNAMIC_DRAW);
+      const lists = { place: triangles.places, tag: triangles.tags, value: triangles.values };
+      for (const [name, buffer] of Object.entries(buffers)) {
+        gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
+        gl.bufferData(gl.ARRAY_BUFFER, lists[name].subarray(0, (name === "place" ? 9 : 3) * count), gl.DYNAMIC_DRAW);
+      }
     },
     draw() {
       if (!count) return;

@@ -21,10 +21,11 @@ from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import facets
 from tetopt.image import Image
 from tetopt.report.colours import LISTED_LABELS, grey_limits
-from tetopt.report.exhibit import COLOUR_MAP, NO_VALUE, Exhibit, Field
+from tetopt.report.exhibit import COLOUR_MAP, NO_VALUE, Exhibit, Field, warp_factors
 from tetopt.report.figures import MESH_LINE
 
 KEYS_TEXT = "x y z: plane   k: side kept   m: mesh, image, both   n: next field   h: next set of facets   q: close"
+STEP_KEY_TEXT = "   s: next step"  # where there are several
 PLANE_CHOICES = ("mesh", "image", "both")  # what the plane shows
 AXIS_LETTERS = "RAS"  # the sides to which the world's axes run
 # Where the eye is at first, RAS, for the cut across each axis: before the cut, a little aside.
@@ -67,8 +68,8 @@ def has_display() -> bool:
 def plotter(shown: Exhibit, off_screen: bool = False) -> pyvista.Plotter:
     """The window, not yet shown: the mesh cut by a plane, coloured by a field within limits, the image in the plane.
 
-    Sliders move the plane (world mm) and the limits, and choose the field; the keys in `KEYS_TEXT` the rest. With
-    `off_screen` it is to be photographed instead of shown.
+    Sliders move the plane (world mm) and the limits, choose the field, and multiply displacements, where there are any;
+    the keys in `KEYS_TEXT` the rest. With `off_screen` it is to be photographed instead of shown.
     """
     with pyvista.vtk_verbosity("off"):
         window = pyvista.Plotter(off_screen=off_screen, window_size=(1280, 850), title=f"tetopt: {shown.title}")
@@ -81,11 +82,14 @@ class _Scene:
     """What the window shows, and the actors that show it."""
 
     def __init__(self, window: pyvista.Plotter, shown: Exhibit) -> None:
-        self.window, self.fields, self.sets = window, shown.fields, shown.sets
+        self.window, self.every_field, self.sets = window, shown.fields, shown.sets
         mesh, image = self.mesh, self.image = shown.mesh, shown.image
         self.sides = facets(mesh.cells)
         self.volumes = volumes(mesh.points, mesh.cells)
-        self.low, self.high = mesh.points.min(axis=0), mesh.points.max(axis=0)
+        self.displacements = shown.displacements
+        self.step = next(iter(self.displacements), 0)  # of the loads
+        self.warp, self.most_warp = warp_factors(shown)
+        self.deform()
         self.greys = (0.0, 1.0) if image is None else grey_limits([image.data.astype(np.float64)])
         self.axis = int(np.argmin(self.high - self.low))  # so that the section one begins with is the largest
         self.at = float((self.low + self.high)[self.axis] / 2.0)
@@ -96,6 +100,17 @@ class _Scene:
         self.limits = self._range()
         self.sliders: dict[str, Any] = {}  # of VTK
         self.is_open = False  # a slider calls back as soon as it is added
+
+    def deform(self) -> None:
+        """Put the points where the displacements of the step, multiplied, take them."""
+        u = self.displacements.get(self.step)
+        self.points = self.mesh.points if u is None else self.mesh.points + self.warp * u
+        self.low, self.high = self.points.min(axis=0), self.points.max(axis=0)
+
+    @property
+    def fields(self) -> list[Field]:
+        """Those of the step, and of none."""
+        return [field for field in self.every_field if field.step in (0, self.step)]
 
     @property
     def field(self) -> Field:
@@ -113,11 +128,13 @@ class _Scene:
 
     def open(self) -> None:
         self._add_sliders()
-        self.window.add_text(KEYS_TEXT, name="keys", font_size=8, color="#555555", position="lower_left")
+        text = KEYS_TEXT + (STEP_KEY_TEXT if len(self.displacements) > 1 else "")
+        self.window.add_text(text, name="keys", font_size=8, color="#555555", position="lower_left")
         self.window.add_axes(xlabel="R", ylabel="A", zlabel="S", color="black", viewport=(0.0, 0.2, 0.15, 0.4))
         for key, act in (
             ("x", lambda: self.cut_across(0)), ("y", lambda: self.cut_across(1)), ("z", lambda: self.cut_across(2)),
             ("k", self.turn), ("m", self.next_inside), ("n", self.next_field), ("h", self.next_set),
+            ("s", self.next_step),
         ):  # fmt: skip
             self.window.add_key_event(key, act)
         self.is_open = True
@@ -143,6 +160,8 @@ class _Scene:
         self._add("set", before_plane(self._marked()), color="#ff00c0", show_edges=True, ambient=0.3)
         count, volume = int(np.count_nonzero(is_within)), float(self.volumes[is_within].sum())
         text = f"{count:,} of {len(self.mesh.cells):,} cells, {volume:,.7g} mm³; world RAS, mm"
+        if self.displacements:
+            text += f"\ndeformation x {self.warp:.4g}" + (f", step {self.step}" if self.step else "")
         self.window.add_text(text, name="count", font_size=10, color="black", position="upper_left", render=False)
         self.window.render()
 
@@ -160,8 +179,10 @@ class _Scene:
         first, second = self.sides.cells.T
         is_first, is_second = is_within[first], (second >= 0) & is_within[second]
         is_outer = is_first != is_second
-        surface = pyvista.PolyData.from_regular_faces(self.mesh.points, self.sides.nodes[is_outer])
+        surface = pyvista.PolyData.from_regular_faces(self.points, self.sides.nodes[is_outer])
         surface.cell_data["cell"] = np.where(is_first, first, second)[is_outer]
+        if self.field.nodes is not None:
+            surface.point_data["value"] = self.field.nodes
         return surface
 
     def _add_section(self, is_within: NDArray[np.bool_]) -> None:
@@ -169,11 +190,16 @@ class _Scene:
         polygons = pyvista.PolyData()
         if self.inside != "image":
             shown = np.flatnonzero(is_within)
-            cut = plane_cut(self.mesh.points, self.mesh.cells[shown], self.mesh.points[:, self.axis] - self.at)
+            nodal = self.field.nodes
+            columns = self.points if nodal is None else np.column_stack([self.points, nodal])
+            cut = plane_cut(columns, self.mesh.cells[shown], self.points[:, self.axis] - self.at)
             corners = np.arange(4 * len(cut.cells)).reshape(-1, 4)
             if len(corners):
-                polygons = pyvista.PolyData.from_regular_faces(cut.corners.reshape(-1, 3), corners)
+                places = cut.corners.reshape(-1, columns.shape[1])
+                polygons = pyvista.PolyData.from_regular_faces(places[:, :3], corners)
                 polygons.cell_data["cell"] = shown[cut.cells]
+                if nodal is not None:
+                    polygons.point_data["value"] = places[:, 3]
         is_glass = self.inside == "both"
         lines = polygons.extract_all_edges() if is_glass and polygons.n_cells else pyvista.PolyData()
         self._add_cells(
@@ -197,10 +223,10 @@ class _Scene:
     def _marked(self) -> pyvista.PolyData:
         if self.set == 0:
             return pyvista.PolyData()
-        return pyvista.PolyData.from_regular_faces(self.mesh.points, list(self.sets.values())[self.set - 1])
+        return pyvista.PolyData.from_regular_faces(self.points, list(self.sets.values())[self.set - 1])
 
     def _add_cells(self, name: str, polygons: pyvista.PolyData, **drawn: Any) -> None:
-        """Draw facets or polygons in the colours of their cells."""
+        """Draw facets or polygons in the colours of their cells, or of what is interpolated on them."""
         if polygons.n_cells == 0:
             self._add(name, polygons)
             return
@@ -210,7 +236,8 @@ class _Scene:
             polygons.cell_data["colour"] = _label_colours(self.field, values)
             self._add(name, polygons, scalars="colour", rgb=True, **drawn)
             return
-        polygons.cell_data["value"] = values
+        if self.field.nodes is None:
+            polygons.cell_data["value"] = values
         limits = self.field.limits
         self._add(name, polygons, scalars="value", cmap=COLOUR_MAP, clim=limits, nan_color=NO_VALUE, **drawn)
 
@@ -256,12 +283,15 @@ class _Scene:
             last = float(len(self.fields) - 1)
             self._add_slider("field", lambda value: self.colour_by(round(value)), (0.0, last), 0.0, (0.78, 0.97))
             self.sliders["field"].GetRepresentation().ShowSliderLabelOff()
+        if self.displacements:
+            self._add_slider("warp", self.warp_by, (0.0, self.most_warp), self.warp, (0.78, 0.97), 0.24)
 
     def _add_slider(
-        self, name: str, act: Callable[[float], None], ends: tuple[float, float], value: float, x: tuple[float, float]
-    ) -> None:
+        self, name: str, act: Callable[[float], None], ends: tuple[float, float], value: float,
+        x: tuple[float, float], y: float = 0.1,
+    ) -> None:  # fmt: skip
         self.sliders[name] = self.window.add_slider_widget(
-            act, rng=ends, value=value, title=name, pointa=(x[0], 0.1), pointb=(x[1], 0.1), color="#333333",
+            act, rng=ends, value=value, title=name, pointa=(x[0], y), pointb=(x[1], y), color="#333333",
             style="modern", interaction_event="always", title_height=0.02, fmt="%.5g",
         )  # fmt: skip
 
@@ -282,6 +312,7 @@ class _Scene:
         self._set_slider("low", f"{self.field.name} from", self.limits[0], self._range())
         self._set_slider("high", f"{self.field.name} to", self.limits[1], self._range())
         self._set_slider("field", f"field: {self.field.name}", self.number, (0, len(self.fields) - 1))
+        self._set_slider("warp", "deformation x", self.warp, (0.0, self.most_warp))
 
     def _changed(self) -> None:
         if self.is_open:
@@ -309,6 +340,24 @@ class _Scene:
             return
         self.number = number
         self.limits = self._range()
+        self._add_key()
+        self._changed()
+
+    def warp_by(self, factor: float) -> None:
+        self.warp = float(factor)
+        self.deform()
+        self._changed()
+
+    def next_step(self) -> None:
+        """Show the next step's deformation and field; the limits are then the field's whole range."""
+        if len(self.displacements) < 2:
+            return
+        name, steps = self.field.name, list(self.displacements)
+        self.step = steps[(steps.index(self.step) + 1) % len(steps)]
+        names = [field.name for field in self.fields]
+        self.number = names.index(name) if name in names else 0
+        self.limits = self._range()
+        self.deform()
         self._add_key()
         self._changed()
 
