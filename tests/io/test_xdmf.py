@@ -5,12 +5,12 @@ from xml.etree import ElementTree
 import numpy as np
 import pytest
 import pyvista
-from models import ABOUT, sample_model, with_two_sides
+from models import ABOUT, all_nodes, quadratic_model, sample_model, with_two_sides
 
 from tetopt.errors import InputError
 from tetopt.io.xdmf import xdmf
 from tetopt.model.loads import load_words
-from tetopt.model.model import described, in_space, in_units
+from tetopt.model.model import described, elements, in_space, in_units
 from tetopt.model.sets import Sets, facet_triples, standard_sets
 
 MODELS = {
@@ -20,6 +20,8 @@ MODELS = {
     "two sides, 2-D": lambda: with_two_sides(sample_model(2)),
     "as many materials as cells": lambda: sample_model(3, None),
     "LPS, MPa": lambda: in_units(in_space(sample_model(), "lps"), "MPa"),
+    "quadratic": lambda: with_two_sides(quadratic_model()),
+    "quadratic, 2-D": lambda: with_two_sides(quadratic_model(2)),
     "label sets only": lambda: sample_model()._replace(
         sets=standard_sets(sample_model().mesh, labels=sample_model().cell_data["label"]), loads=()
     ),
@@ -51,8 +53,9 @@ def grids(model):
     return {grid.get("Name"): grid for grid in root.findall("./Domain/Grid")}
 
 
-def fields(grid):
-    return {each.get("Name"): item(each.find("DataItem")) for each in grid.findall("Attribute")}
+def fields(grid, center="Cell"):
+    of_kind = [each for each in grid.findall("Attribute") if each.get("Center") == center]
+    return {each.get("Name"): item(each.find("DataItem")) for each in of_kind}
 
 
 def sorted_rows(rows):
@@ -77,14 +80,16 @@ def facet_set(grid, name):
     tags_of = {each: np.array(words, dtype=int) for each, words in named(grid).items()}
     is_in = np.isin(tags, tags_of[name])
     is_turned = np.isin(tags, tags_of.get(f"{name} turned", []))
+    nodes = nodes[:, : len(grid.find("Geometry").get("GeometryType"))]  # corners come first
     return np.where(is_turned[:, None], turned_over(nodes), nodes)[is_in]
 
 
 def test_mesh_and_cell_data_are_the_models_own(model):
-    mesh = grids(model)["mesh"]
-    assert np.array_equal(item(mesh.find("Geometry/DataItem")), model.mesh.points)
-    assert np.array_equal(item(mesh.find("Topology/DataItem")), model.mesh.cells)
-    assert mesh.find("Topology").get("TopologyType") == {2: "Triangle", 3: "Tetrahedron"}[model.mesh.ndim]
+    mesh, (points, cells) = grids(model)["mesh"], elements(model)
+    assert np.array_equal(item(mesh.find("Geometry/DataItem")), points)
+    assert np.array_equal(item(mesh.find("Topology/DataItem")), cells)
+    kind = {3: "Triangle", 4: "Tetrahedron", 6: "Triangle_6", 10: "Tetrahedron_10"}[cells.shape[1]]
+    assert mesh.find("Topology").get("TopologyType") == kind
     columns, table = fields(mesh), model.materials
     if table is not None:
         assert next(iter(columns)) == "material"  # the one that dolfinx reads as tags
@@ -106,7 +111,13 @@ def test_every_facet_set_comes_back_with_its_side(model):
     assert ("facets" in parts) == bool(model.sets.facets)
     if not model.sets.facets:
         return
-    triples = item(parts["facets"].find("Topology/DataItem"))
+    nodes, n = item(parts["facets"].find("Topology/DataItem")), model.mesh.ndim
+    triples = nodes[:, :n]
+    if model.order == 2:  # the middles of the edges 01, 12 and 20
+        points = elements(model)[0]
+        for k, edge in enumerate([(0, 1), (1, 2), (2, 0)][: 3 if n == 3 else 1], n):
+            assert np.array_equal(points[nodes[:, k]], points[nodes[:, edge]].mean(axis=1))
+    assert nodes.shape[1] == (n if model.order == 1 else 3 * n - 3)
     assert len(np.unique(np.sort(triples, axis=1), axis=0)) == len(triples)  # dolfinx knows one tag a facet
     assert {name for name in named(parts["facets"]) if not name.endswith(" turned")} == set(model.sets.facets)
     for name, rows in model.sets.facets.items():
@@ -133,7 +144,23 @@ def test_every_cell_set_comes_back(model):
     assert list(tags_of) == list(model.sets.cells)
     members = item(grid.find("Topology/DataItem"))
     for name, cells in model.sets.cells.items():
-        assert np.array_equal(members[np.isin(tags, np.array(tags_of[name], dtype=int))], model.mesh.cells[cells]), name
+        own = elements(model)[1][cells]
+        assert np.array_equal(members[np.isin(tags, np.array(tags_of[name], dtype=int))], own), name
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_point_data_are_on_every_node(n, tmp_path):
+    """Of corners alone they are interpolated; vectors of three columns stay together."""
+    model = quadratic_model(n)
+    columns, displacement = fields(grids(model)["mesh"], "Node"), model.point_data["displacement"]
+    parts = {"displacement": displacement} if n == 3 else {f"displacement_{k}": displacement[:, k] for k in range(n)}
+    expected = parts | {"warmth": all_nodes(model.point_data["warmth"], model.mesh)}
+    assert list(columns) == list(expected)
+    (tmp_path / "model.xdmf").write_bytes(xdmf(model))
+    read = pyvista.get_reader(tmp_path / "model.xdmf").read()["mesh"].point_data
+    for name, values in expected.items():
+        assert np.array_equal(columns[name], values), name
+        assert np.array_equal(read[name], values), name
 
 
 def test_loads_and_origin_are_told():
@@ -153,15 +180,18 @@ def test_vtk_reads_the_same(model, tmp_path):
     if not isinstance(read, pyvista.MultiBlock):  # of one grid
         read = pyvista.MultiBlock({"mesh": read})
     assert read.keys() == ["mesh", *(["facets"] if model.sets.facets else []), *(["cells"] if model.sets.cells else [])]
+    n, (points, cells) = model.mesh.ndim, elements(model)
     for name in read.keys():  # noqa: SIM118 - iterating over blocks gives the blocks
-        assert np.array_equal(read[name].points[:, : model.mesh.ndim], model.mesh.points)
-    n = model.mesh.ndim
-    assert np.array_equal(read["mesh"].cells.reshape(-1, n + 2)[:, 1:], model.mesh.cells)
+        assert np.array_equal(read[name].points[:, :n], points)
+    assert np.array_equal(read["mesh"].cells.reshape(len(cells), -1)[:, 1:], cells)
+    kinds = {3: "TRIANGLE", 4: "TETRA", 6: "QUADRATIC_TRIANGLE", 10: "QUADRATIC_TETRA"}
+    assert set(read["mesh"].celltypes) == {pyvista.CellType[kinds[cells.shape[1]]]}
     for name, values in fields(grids(model)["mesh"]).items():
         assert np.array_equal(read["mesh"].cell_data[name], values), name
     if model.sets.facets:
         grid = grids(model)["facets"]
-        assert np.array_equal(read["facets"].cells.reshape(-1, n + 1)[:, 1:], item(grid.find("Topology/DataItem")))
+        nodes = item(grid.find("Topology/DataItem"))
+        assert np.array_equal(read["facets"].cells.reshape(len(nodes), -1)[:, 1:], nodes)
         assert np.array_equal(read["facets"].cell_data["facets"], fields(grid)["facets"])
 
 
@@ -195,12 +225,6 @@ def test_names_that_xml_cannot_carry_are_mended():
     assert head[3].get("Value") == "image: a?? -- ]]>.nii, sha256 unknown"
 
 
-def test_quadratic_cells_are_refused():
-    expected = r"^xdmf: expected linear cells, got order 2; .* P2 elements in FEniCSx$"
-    with pytest.raises(InputError, match=expected):
-        xdmf(sample_model()._replace(order=2))
-
-
 @pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
 def test_values_that_vtk_cannot_read_are_refused(value):
     model = sample_model()
@@ -209,3 +233,5 @@ def test_values_that_vtk_cannot_read_are_refused(value):
         InputError, match=r'^xdmf: expected finite cell data, got 1 values of "odd" that are not; take .vtu$'
     ):
         xdmf(model._replace(cell_data=data))
+    with pytest.raises(InputError, match=r'^xdmf: expected finite point data, got 1 values of "odd" that are not'):
+        xdmf(model._replace(point_data={"odd": np.array([value] + [1.0] * (len(model.mesh.points) - 1))}))

@@ -33,7 +33,7 @@ class Format(NamedTuple):
 FORMATS = {
     ".vtu": Format("VTK, ParaView", vtu, has_quadratic=True),
     ".vtk": Format("legacy VTK, 3D Slicer", vtk, has_quadratic=True),
-    ".xdmf": Format("XDMF with tags, FEniCSx", xdmf),
+    ".xdmf": Format("XDMF with tags, FEniCSx", xdmf, has_quadratic=True),
     ".msh": Format("gmsh 4.1", gmsh41, has_quadratic=True),
     ".msh2": Format("gmsh 2.2", gmsh22, has_quadratic=True),
     ".inp": Format("Abaqus, CalculiX", abaqus, has_quadratic=True, runs=True),

@@ -38,7 +38,8 @@ reads all of it, on any number of processes::
 Before 0.7 `fem.functionspace` was `fem.FunctionSpace`; with that, 0.5.2 runs it, too. `read_meshtags` takes the first
 attribute of a grid, which `material` is for that reason. The encoding must be given, or dolfinx looks for an HDF5 file
 beside this one. It reads no floating point numbers of cells from XDMF, hence the parsing. Quadratic elements are chosen
-there, on these same cells.
+there, on cells of either order: a file of order 2 has the nodes of order 2, too, of cells that are as straight, which
+dolfinx integrates as if they were curved.
 
 In the grid "mesh" <Information Name="young"/> and <Information Name="nu"/> list what the materials 1, 2, ... have. In
 the domain <Information Name="load" Value="hold:superior"/> is a load in the words of `tetopt.model.loads`, and
@@ -57,14 +58,17 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.geometry.topology import facets
-from tetopt.io.tags import as_scalars, tagged
+from tetopt.io.tags import Tagged, as_scalars, tagged
 from tetopt.io.text import rows
+from tetopt.model.fields import node_field
 from tetopt.model.loads import load_words
-from tetopt.model.model import Model, described
-from tetopt.model.sets import facet_triples
+from tetopt.model.model import Model, described, element_facets, elements
 
-# By number of nodes; lines need theirs stated.
-TOPOLOGY_TYPES = {2: '"PolyLine" NodesPerElement="2"', 3: '"Triangle"', 4: '"Tetrahedron"'}
+# By dimension and order; lines need their number of nodes stated. VTK's order of nodes.
+TOPOLOGY_TYPES = {
+    (1, 1): '"PolyLine" NodesPerElement="2"', (2, 1): '"Triangle"', (3, 1): '"Tetrahedron"',
+    (1, 2): '"Edge_3"', (2, 2): '"Triangle_6"', (3, 2): '"Tetrahedron_10"',
+}  # fmt: skip
 GEOMETRY_TYPES = {2: "XY", 3: "XYZ"}
 # Not by XInclude, as dolfinx writes it: VTK 9.7 crashes on the address that dolfinx gives for that.
 POINTS_REFERENCE = '<DataItem Reference="XML">/Xdmf/Domain/Grid[@Name="mesh"]/Geometry/DataItem</DataItem>\n'
@@ -82,8 +86,7 @@ def xdmf(model: Model) -> bytes:
     Raises
     ------
     InputError
-        A quadratic model, since elements of any order are chosen in FEniCSx; or cell data that is not finite, since VTK
-        stops reading there and makes up the rest.
+        Data of cells or points that is not finite, since VTK stops reading there and makes up the rest.
     """
     _check(model)
     parts = [_information("about", line) for line in described(model)]
@@ -92,8 +95,9 @@ def xdmf(model: Model) -> bytes:
     if model.sets.facets:
         parts.append(_facet_grid(model))
     if model.sets.cells:
-        combined = tagged(model.sets.cells)
-        parts.append(_tag_grid("cells", model, model.mesh.cells[combined.items], combined.tags, combined.tags_of))
+        combined, dim = tagged(model.sets.cells), model.mesh.ndim
+        nodes = elements(model)[1][combined.items]
+        parts.append(_tag_grid("cells", model, dim, nodes, combined))
     text = "".join(parts)
     return (
         f'<?xml version="1.0" encoding="utf-8"?>\n<Xdmf Version="3.0">\n<Domain>\n{text}</Domain>\n</Xdmf>\n'.encode()
@@ -101,13 +105,11 @@ def xdmf(model: Model) -> bytes:
 
 
 def _check(model: Model) -> None:
-    if model.order != 1:
-        raise InputError(
-            "xdmf: expected linear cells, got order 2; leave out the order and take P2 elements in FEniCSx"
-        )
-    for name, values in model.cell_data.items():
-        if bad := int((~np.isfinite(values)).sum()):
-            raise InputError(f'xdmf: expected finite cell data, got {bad} values of "{name}" that are not; take .vtu')
+    for what, data in (("cell", model.cell_data), ("point", model.point_data)):
+        for name, values in data.items():
+            if bad := int((~np.isfinite(values)).sum()):
+                words = f'got {bad} values of "{name}" that are not; take .vtu'
+                raise InputError(f"xdmf: expected finite {what} data, {words}")
 
 
 def _mesh_grid(model: Model) -> str:
@@ -119,11 +121,18 @@ def _mesh_grid(model: Model) -> str:
             own["density"] = model.materials.density[of_cell]
         fields = own | {name: values for name, values in fields.items() if name not in own}
         table = _information("young", _listed(young)) + _information("nu", _listed(nu))
+    points, cells = elements(model)
+    at_nodes = {name: node_field(values, model.mesh, model.order) for name, values in model.point_data.items()}
+    attributes = "".join(_attributes(_columns(each), of) for each, of in ((fields, "Cell"), (at_nodes, "Node")))
+    return _grid("mesh", model, model.mesh.ndim, cells, _item(points), attributes, table)
+
+
+def _columns(fields: dict[str, NDArray]) -> dict[str, NDArray]:
+    """Fields as VTK takes them for what they are: scalars and vectors, no matrices."""
     columns: dict[str, NDArray] = {}
-    for name, values in fields.items():  # VTK takes no matrices but vectors for what they are
+    for name, values in fields.items():
         columns |= {name: values} if np.shape(values)[1:] == (3,) else as_scalars(name, np.asarray(values))
-    points = _item(model.mesh.points)
-    return _grid("mesh", model, model.mesh.cells, points, columns, table)
+    return columns
 
 
 def _facet_grid(model: Model) -> str:
@@ -136,30 +145,30 @@ def _facet_grid(model: Model) -> str:
         for name, members in sets.items()
     }
     combined = tagged(number | {name: those for name, those in turned.items() if len(those)})
-    return _tag_grid("facets", model, facet_triples(model.mesh.cells, listed), combined.tags, combined.tags_of)
+    nodes = element_facets(elements(model)[1], listed)
+    return _tag_grid("facets", model, model.mesh.ndim - 1, nodes, combined)
 
 
-def _tag_grid(
-    name: str, model: Model, nodes: NDArray[np.int64], tags: NDArray[np.int64], tags_of: dict[str, list[int]]
-) -> str:
-    named = "".join(_information(each, " ".join(map(str, those))) for each, those in tags_of.items())
-    return _grid(name, model, nodes, POINTS_REFERENCE, {name: tags}, named)
+def _tag_grid(name: str, model: Model, dim: int, nodes: NDArray[np.int64], combined: Tagged) -> str:
+    named = "".join(_information(each, " ".join(map(str, those))) for each, those in combined.tags_of.items())
+    return _grid(name, model, dim, nodes, POINTS_REFERENCE, _attributes({name: combined.tags}, "Cell"), named)
 
 
-def _grid(
-    name: str, model: Model, nodes: NDArray[np.int64], points: str, columns: dict[str, NDArray], named: str
-) -> str:
-    attributes = [
-        f'<Attribute Name={_quoted(each)} AttributeType="{"Scalar" if values.ndim == 1 else "Vector"}" Center="Cell">\n'
-        f"{_item(values)}</Attribute>\n"
-        for each, values in columns.items()
-    ]
+def _attributes(columns: dict[str, NDArray], center: str) -> str:
+    return "".join(
+        f'<Attribute Name={_quoted(name)} AttributeType="{"Scalar" if values.ndim == 1 else "Vector"}" '
+        f'Center="{center}">\n{_item(values)}</Attribute>\n'
+        for name, values in columns.items()
+    )
+
+
+def _grid(name: str, model: Model, dim: int, nodes: NDArray[np.int64], points: str, attributes: str, named: str) -> str:
     return (
         f'<Grid Name="{name}" GridType="Uniform">\n{named}{TIME_ELEMENT}'
-        f'<Topology TopologyType={TOPOLOGY_TYPES[nodes.shape[1]]} NumberOfElements="{len(nodes)}">\n'
+        f'<Topology TopologyType={TOPOLOGY_TYPES[dim, model.order]} NumberOfElements="{len(nodes)}">\n'
         f"{_item(nodes)}</Topology>\n"
         f'<Geometry GeometryType="{GEOMETRY_TYPES[model.mesh.ndim]}">\n{points}</Geometry>\n'
-        f"{''.join(attributes)}</Grid>\n"
+        f"{attributes}</Grid>\n"
     )
 
 
