@@ -9,15 +9,18 @@ import sys
 import meshio
 import numpy as np
 import pytest
-from models import ABOUT, each_once, sample_model, young_of
+from models import ABOUT, each_once, quadratic_model, sample_model, young_of
 
 from tetopt.errors import InputError
+from tetopt.geometry.quadratic import quadratic
+from tetopt.geometry.simplex import volumes
 from tetopt.io.medit import medit
+from tetopt.model.model import elements as model_elements
 from tetopt.model.model import in_space, in_units
 from tetopt.model.sets import Sets, facet_triples
 
 MODELS = [(3, 3), (3, None), (2, 3), (2, None)]
-WIDTH = {"Edges": 2, "Triangles": 3, "Tetrahedra": 4}
+WIDTH = {"Edges": 2, "Triangles": 3, "Tetrahedra": 4, "EdgesP2": 3, "TrianglesP2": 6, "TetrahedraP2": 10}
 KEYWORD = {1: "Edges", 2: "Triangles", 3: "Tetrahedra"}
 
 
@@ -118,10 +121,27 @@ def test_a_mesh_alone():
     assert read.comments == ["tetopt", "coordinates: RAS+, mm", "units: mm, kPa, mN, uJ, kg, s"]
 
 
+@pytest.mark.parametrize("n", [3, 2])
+def test_order_2(n):
+    """Corners, then the middles of the edges 01 12 20 03 13 23, of cells and of facets."""
+    model = quadratic_model(n)
+    read, linear = Read(medit(model)), Read(medit(sample_model(n)))
+    points = quadratic(model.mesh.points, model.mesh.cells)[0]
+    assert np.array_equal(read.points, points)
+    assert set(read.nodes) == {f"{KEYWORD[n]}P2", f"{KEYWORD[n - 1]}P2"}
+    for dim in (n, n - 1):
+        nodes = read.nodes[f"{KEYWORD[dim]}P2"]
+        assert np.array_equal(nodes[:, : dim + 1], linear.nodes[KEYWORD[dim]])
+        assert np.array_equal(read.refs[f"{KEYWORD[dim]}P2"], linear.refs[KEYWORD[dim]])
+        for at, edge in enumerate([(0, 1), (1, 2), (2, 0), (0, 3), (1, 3), (2, 3)][: dim * (dim + 1) // 2], dim + 1):
+            assert np.array_equal(points[nodes[:, at]], points[nodes[:, edge]].mean(axis=1))
+    assert "point data, which this format has no place for: displacement, warmth" in read.comments
+    named = [line.replace("P2 ref", " ref") for line in read.comments if " ref " in line]
+    assert named == [line for line in linear.comments if " ref " in line]
+
+
 def test_refused():
     model = sample_model()
-    with pytest.raises(InputError, match=r"^order 2: .*; leave out --order$"):
-        medit(model._replace(order=2))
     with pytest.raises(InputError, match=r'^set material_1: the file calls something else "material_1"; call the set'):
         medit(model._replace(sets=Sets({}, {"material_1": np.array([0])})))
 
@@ -154,24 +174,37 @@ gmsh.open(sys.argv[1])
 mesh = gmsh.model.mesh
 order, points, _ = mesh.getNodes()
 elements = {str(entity): mesh.getElements(*entity)[2][0].tolist() for entity in gmsh.model.getEntities()}
+determinants = []
+for kind in mesh.getElementTypes(gmsh.model.getDimension()):
+    places, _ = mesh.getIntegrationPoints(kind, "Gauss3")
+    determinants += mesh.getJacobians(kind, places)[1].tolist()
 said = [line for line in gmsh.logger.get() if not line.startswith("Info")]
-print(json.dumps([order.tolist(), points.tolist(), elements, said]))
+print(json.dumps([order.tolist(), points.tolist(), elements, said, determinants]))
 """
 
 
 @pytest.mark.skipif(importlib.util.find_spec("gmsh") is None, reason="no gmsh (pip install gmsh)")
+@pytest.mark.parametrize("order", [1, 2])
 @pytest.mark.parametrize("n", [3, 2])
-def test_gmsh_reads_it(n, tmp_path):
+def test_gmsh_reads_it(n, order, tmp_path):
+    """And finds cells of order 2 as large as ours, anywhere within, so that their edges are where it has them."""
+    model = (sample_model if order == 1 else quadratic_model)(n)
     path = tmp_path / "model.mesh"
-    path.write_bytes(medit(sample_model(n)))
+    path.write_bytes(medit(model))
     child = subprocess.run([sys.executable, "-c", GMSH, str(path)], capture_output=True, text=True, check=True)
-    order, points, elements, said = json.loads(child.stdout.splitlines()[-1])
+    numbers, points, elements, said, determinants = json.loads(child.stdout.splitlines()[-1])
     assert said == []
-    points = np.array(points).reshape(-1, 3)[np.argsort(order)]
-    assert np.array_equal(points[:, :n], sample_model(n).mesh.points)
+    points, own_points = np.array(points).reshape(-1, 3)[np.argsort(numbers)], model_elements(model)[0]
+    assert np.array_equal(points[:, :n], own_points)
+    sizes = np.sort(np.reshape(determinants, (len(model.mesh.cells), -1)) / [0, 0, 2, 6][n], axis=0)
+    ours = np.sort(volumes(model.mesh.points, model.mesh.cells))
+    np.testing.assert_allclose(sizes, np.broadcast_to(ours[:, None], sizes.shape), rtol=1e-10)
     read, expected = Read(path.read_bytes()), {}
     for dim in (n - 1, n):
-        nodes, refs = read.nodes[KEYWORD[dim]], read.refs[KEYWORD[dim]]
+        keyword = KEYWORD[dim] + ("P2" if order == 2 else "")
+        nodes, refs = read.nodes[keyword], read.refs[keyword]
+        if nodes.shape[1] == 10:
+            nodes = nodes[:, [0, 1, 2, 3, 4, 5, 6, 7, 9, 8]]  # gmsh's own order
         for ref in np.unique(refs):
             expected[str((dim, int(ref)))] = (nodes[refs == ref] + 1).ravel().tolist()
     assert elements == expected

@@ -4,9 +4,11 @@ import re
 
 import numpy as np
 import pytest
-from models import ABOUT, each_once, sample_model, young_of
+from models import ABOUT, each_once, quadratic_model, sample_model, young_of
 
 from tetopt.errors import InputError
+from tetopt.geometry.quadratic import quadratic
+from tetopt.geometry.simplex import volumes
 from tetopt.io.mfem import mfem
 from tetopt.model.model import in_space, in_units
 from tetopt.model.sets import Sets, facet_triples
@@ -30,9 +32,16 @@ class Read:
         self.facet_attributes, self.facets = self.elements("boundary", self.n - 1)
         self.facet_sets = self.sets("bdr_attribute_sets")
         self.expect("vertices")
-        count = int(self.lines.pop(0))
-        assert int(self.lines.pop(0)) == self.n
-        self.points = np.array([self.lines.pop(0).split() for _ in range(count)], dtype=float)
+        count, self.middles = int(self.lines.pop(0)), np.empty((0, self.n))
+        if self.lines[0] != "nodes":
+            assert int(self.lines.pop(0)) == self.n
+        else:  # a grid function that is saved node by node
+            head = ["nodes", "FiniteElementSpace", f"FiniteElementCollection: H1_{self.n}D_P2", f"VDim: {self.n}"]
+            assert [self.lines.pop(0) for _ in range(5)] == [*head, "Ordering: 1"]
+            values = np.array([self.lines.pop(0).split() for _ in range(len(self.lines) - 1)], dtype=float)
+            self.points, self.middles = values[:count], values[count:]
+        if not len(self.middles):
+            self.points = np.array([self.lines.pop(0).split() for _ in range(count)], dtype=float)
         assert self.lines == ["mfem_mesh_end"]
 
     def expect(self, keyword):
@@ -137,10 +146,21 @@ def test_a_mesh_alone():
     assert read.comments == ["tetopt", "coordinates: RAS+, mm", "units: mm, kPa, mN, uJ, kg, s"]
 
 
+@pytest.mark.parametrize("n", [3, 2])
+def test_order_2_adds_the_middle_of_each_edge_once(n):
+    model = quadratic_model(n)
+    read, linear = Read(mfem(model)), Read(mfem(sample_model(n)))
+    assert np.array_equal(read.points, model.mesh.points)
+    assert np.array_equal(read.cells, model.mesh.cells)
+    assert np.array_equal(read.facets, linear.facets)
+    assert (read.cell_sets, read.facet_sets) == (linear.cell_sets, linear.facet_sets)
+    expected = quadratic(model.mesh.points, model.mesh.cells)[0][len(model.mesh.points) :]
+    assert sorted(read.middles.tolist()) == sorted(expected.tolist())
+    assert "point data, which this format has no place for: displacement, warmth" in read.comments
+
+
 def test_refused():
     model = sample_model()
-    with pytest.raises(InputError, match=r"^order 2: .*; leave out --order$"):
-        mfem(model._replace(order=2))
     with pytest.raises(InputError, match=r'^set material_1: the file calls something else "material_1"; call the set'):
         mfem(model._replace(sets=Sets({}, {"material_1": np.array([0])})))
 
@@ -170,3 +190,27 @@ def test_pymfem_reads_it(n, bins, tmp_path):
         assert each_once(sides[chosen]) == each_once(facet_triples(model.mesh.cells, rows))
     # Nothing had to be turned, and the faces of each boundary element are those of the cells
     assert (read.CheckElementOrientation(False), read.CheckBdrElementOrientation(False)) == (0, 0)
+
+
+@pytest.mark.parametrize("is_turned", [False, True], ids=["as it is", "turned for refinement"])
+@pytest.mark.parametrize("n", [3, 2])
+def test_pymfem_reads_order_2(n, is_turned, tmp_path):
+    """The nodes of each element are ours, to the last bit; and its cells are as large as ours and anywhere straight."""
+    ser = pytest.importorskip("mfem.ser", reason="no PyMFEM (pip install mfem)")
+    model = quadratic_model(n)
+    points, cells = quadratic(model.mesh.points, model.mesh.cells)
+    (tmp_path / "model.mfem").write_bytes(mfem(model))
+    read = ser.Mesh(str(tmp_path / "model.mfem"), 1, int(is_turned))
+    nodes = read.GetNodes()
+    space = nodes.FESpace()
+    assert (space.GetNDofs(), space.GetVDim()) == (len(points), n)
+    places = nodes.GetDataArray().reshape(-1, n)
+    sizes = volumes(model.mesh.points, model.mesh.cells)
+    rule = ser.IntRules.Get(ser.Geometry.TETRAHEDRON if n == 3 else ser.Geometry.TRIANGLE, 3)
+    for k, cell in enumerate(cells):
+        dofs = space.GetElementDofs(k)
+        assert sorted(places[list(dofs)].tolist()) == sorted(points[cell].tolist())
+        mapping = read.GetElementTransformation(k)
+        for j in range(rule.GetNPoints()):
+            mapping.SetIntPoint(rule.IntPoint(j))
+            assert mapping.Weight() == pytest.approx(sizes[k] * (6 if n == 3 else 2), rel=1e-9)

@@ -39,8 +39,8 @@ FORMATS = {
     ".inp": Format("Abaqus, CalculiX", abaqus, has_quadratic=True, runs=True),
     ".feb": Format("FEBio 4.0", febio, has_quadratic=True, runs=True),
     ".scn": Format("SOFA scene", sofa, runs=True),
-    ".mfem": Format("MFEM mesh", mfem),
-    ".mesh": Format("medit", medit),
+    ".mfem": Format("MFEM mesh", mfem, has_quadratic=True),
+    ".mesh": Format("medit", medit, has_quadratic=True),
     ".stl": Format("the boundary as STL", boundary_stl, is_surface=True),
     ".ply": Format("the boundary as PLY", boundary_ply, is_surface=True),
 }

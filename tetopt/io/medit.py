@@ -12,11 +12,9 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.errors import InputError
 from tetopt.io.tags import cell_tags, facet_tags, remarks, tag_lines, without_data
 from tetopt.io.text import rows
-from tetopt.model.model import Model
-from tetopt.model.sets import facet_triples
+from tetopt.model.model import Model, element_facets, elements
 
 ELEMENT_KEYWORDS = {1: "Edges", 2: "Triangles", 3: "Tetrahedra"}
 
@@ -24,18 +22,17 @@ ELEMENT_KEYWORDS = {1: "Edges", 2: "Triangles", 3: "Tetrahedra"}
 def medit(model: Model) -> bytes:
     """A .mesh file in double precision; see the module for what is where.
 
-    Nodes, elements and their order are those of the mesh. There is no cell data.
+    Nodes, elements and their order are those of the mesh. There is no cell data, nor data at the nodes.
 
     Raises
     ------
     InputError
-        A cell set that is called as a material is, or order 2.
+        A cell set that is called as a material is.
     """
-    if model.order != 1:
-        raise InputError("order 2: few programs read it from a medit file; leave out --order")
     mesh = model.mesh
+    points, nodes = elements(model)
     in_cells, on_facets = cell_tags(model), facet_tags(mesh, model.sets.facets)
-    cells, sides = ELEMENT_KEYWORDS[mesh.ndim], ELEMENT_KEYWORDS[mesh.ndim - 1]
+    cells, sides = (f"{ELEMENT_KEYWORDS[dim]}{'P2' if model.order == 2 else ''}" for dim in (mesh.ndim, mesh.ndim - 1))
     comments = [*remarks(model), *without_data(model)]
     comments += tag_lines(in_cells.tags_of, f"{cells} ref") + tag_lines(on_facets.tags_of, f"{sides} ref")
     return "".join(
@@ -43,9 +40,9 @@ def medit(model: Model) -> bytes:
             "MeshVersionFormatted 2\n\n",
             *(f"# {line}\n" for line in comments),
             f"\nDimension {mesh.ndim}\n",
-            _section("Vertices", mesh.points, np.zeros(len(mesh.points), dtype=np.int64)),
-            _section(cells, mesh.cells + 1, in_cells.tags),
-            _section(sides, facet_triples(mesh.cells, on_facets.items) + 1, on_facets.tags),
+            _section("Vertices", points, np.zeros(len(points), dtype=np.int64)),
+            _section(cells, nodes + 1, in_cells.tags),
+            _section(sides, element_facets(nodes, on_facets.items) + 1, on_facets.tags),
             "\nEnd\n",
         ]
     ).encode()

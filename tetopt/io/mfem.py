@@ -6,6 +6,10 @@ attributes make them up. A boundary element's attribute stands in the same way f
 inside the mesh that are in a set are boundary elements, too, as MFEM allows; one that two sets hold from opposite sides
 is turned as in the first of them.
 
+A mesh of order 2 has a nodal function of MFEM's quadratic H1 space, as `Mesh::SetCurvature(2)` makes one: vertices,
+then the middles of edges in the order in which the elements first name them. MFEM takes elements with such a function
+for curved ones; these are straight.
+
 The comments at the head tell coordinates, units, each material's constants and attributes, and the loads.
 `mesh.bdr_attribute_sets.GetAttributeSetMarker(name)` marks where a condition holds.
 """
@@ -15,29 +19,30 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.errors import InputError
 from tetopt.io.tags import cell_tags, facet_tags, remarks, tag_lines, without_data
 from tetopt.io.text import blocks, rows
+from tetopt.mesh import Mesh
 from tetopt.model.model import Model
 from tetopt.model.sets import facet_triples
 
 ELEMENT_GEOMETRIES = {1: 1, 2: 2, 3: 4}  # MFEM's numbers for the simplex of a dimension: segment, triangle, tetrahedron
+# Local corners of an element's edges in the order in which MFEM goes through them (fem/geom.cpp), by dimension.
+ELEMENT_EDGES = {
+    2: np.array([(0, 1), (1, 2), (2, 0)]),
+    3: np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)]),
+}
 
 
 def mfem(model: Model) -> bytes:
     """An MFEM mesh file; see the module for what is where.
 
-    Nodes, elements and their order are those of the mesh. There is no cell data.
+    Nodes, elements and their order are those of the mesh. There is no cell data, nor data at the nodes.
 
     Raises
     ------
     InputError
-        A cell set that is called as a material is, or order 2: MFEM asks for the order when it makes its space.
+        A cell set that is called as a material is.
     """
-    if model.order != 1:
-        raise InputError(
-            "order 2: a MFEM mesh with straight edges has none, the solver's space does; leave out --order"
-        )
     mesh = model.mesh
     in_cells, on_facets = cell_tags(model), facet_tags(mesh, model.sets.facets)
     comments = [*remarks(model), *without_data(model)]
@@ -55,8 +60,8 @@ def mfem(model: Model) -> bytes:
             _elements(on_facets.tags, mesh.ndim - 1, facet_triples(mesh.cells, on_facets.items)),
             "\nbdr_attribute_sets\n",
             _sets(on_facets.tags_of),
-            f"\nvertices\n{len(mesh.points)}\n{mesh.ndim}\n",
-            rows(mesh.points),
+            f"\nvertices\n{len(mesh.points)}\n",
+            f"{mesh.ndim}\n{rows(mesh.points)}" if model.order == 1 else _nodes(mesh),
             "\nmfem_mesh_end\n",
         ]
     ).encode()
@@ -64,6 +69,15 @@ def mfem(model: Model) -> bytes:
 
 def _elements(attributes: NDArray[np.int64], dim: int, nodes: NDArray[np.int64]) -> str:
     return f"{len(nodes)}\n" + rows(attributes, np.full(len(nodes), ELEMENT_GEOMETRIES[dim]), nodes)
+
+
+def _nodes(mesh: Mesh) -> str:
+    """The function of the nodes of order 2, node by node."""
+    ends = np.sort(mesh.cells[:, ELEMENT_EDGES[mesh.ndim]], axis=2).reshape(-1, 2)
+    edges, first = np.unique(ends, axis=0, return_index=True)
+    middles = mesh.points[edges].mean(axis=1)[np.argsort(first)]
+    head = f"FiniteElementSpace\nFiniteElementCollection: H1_{mesh.ndim}D_P2\nVDim: {mesh.ndim}\nOrdering: 1\n"
+    return f"\nnodes\n{head}\n{rows(np.concatenate([mesh.points, middles]))}"
 
 
 def _sets(tags_of: dict[str, list[int]]) -> str:
