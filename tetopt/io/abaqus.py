@@ -8,12 +8,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
-from tetopt.io.tags import check_apart, check_kinds, material_names, without_data
+from tetopt.io.tags import check_apart, material_names, without_data
 from tetopt.io.text import blocks, rows
-from tetopt.model.materials import cells_of
-from tetopt.model.model import Model, described, element_facets, elements
+from tetopt.model.loads import Load, count_of_steps, facet_forces, in_step, load_words, spring_constants
+from tetopt.model.materials import Materials, cells_of, without_moduli
+from tetopt.model.model import Model, at_nodes, described, element_facets, elements, mass_densities
 
 ALL_ELEMENTS = "all_cells"  # the set that results are asked for
+SPRING_PREFIX = "spring-"  # of the sets of one spring each, which are elements behind the cells
+LOAD_CARDS = ("*BOUNDARY", "*CLOAD", "*DLOAD")
 # The number of the face opposite each local node: S1 is 1-2-3, S2 is 1-4-2, S3 is 2-4-3, S4 is 3-4-1.
 FACE_NUMBERS = np.array([3, 4, 2, 1])
 # Of a number: Abaqus takes no more, and CalculiX reads the first 20, so that 1.234567890123456e-05 becomes 1.23.
@@ -38,8 +41,14 @@ def abaqus(model: Model) -> bytes:
 
     Linear (C3D4) or quadratic (C3D10) tetrahedra. Each facet set is a surface and a node set of its name, the latter
     with midside nodes if there are; each cell set is an element set. "all_cells" are all elements, "material_1", ...
-    those of each material. With loads there is a linear static step, whose strain energy and reaction forces both
-    solvers print. Cell data has no place in such a file; a comment names what is left out.
+    those of each material. A modulus that varies within cells is a material whose modulus depends on the temperature:
+    at each node the temperature is the modulus, both solvers take it linearly from the corners, and nothing expands.
+
+    With loads there is a static step for each of theirs, a load case of its own, whose strain energy and reaction
+    forces both solvers print: pressure on faces, tractions as forces at nodes and springs from nodes to the ground
+    by `tetopt.model.loads.facet_weights`, gravity on all cells. A nonlinear model's steps ask for large deformation, of
+    a neo-Hookean material, since the linear law of Green's strain collapses under pressure; a modulus that varies
+    within cells keeps that law.
 
     Numbers read back the same, but for those that take more than 20 characters, which neither solver reads: they are
     rounded to the 13 to 16 digits that fit. Of coordinates these are some of those within 0.1 mm of 0.
@@ -47,7 +56,8 @@ def abaqus(model: Model) -> bytes:
     Raises
     ------
     InputError
-        A 2-D model, loads without materials, or a cell set with the name of one of the file's own.
+        A 2-D model, loads without materials, springs in some of the steps alone, or a set with the name of one of the
+        file's own.
     """
     _check(model)
     parts = [_head(model), *_mesh(model)]
@@ -55,7 +65,9 @@ def abaqus(model: Model) -> bytes:
     parts += [f"*SURFACE, NAME={name}, TYPE=ELEMENT\n{_faces(members)}" for name, members in model.sets.facets.items()]
     parts += _materials(model)
     if model.loads:
-        parts += _step(model)
+        parts += _springs(model)
+        for step in range(1, count_of_steps(model.loads) + 1):
+            parts += _step(model, step)
     return "".join(parts).encode("utf-8", "replace")
 
 
@@ -66,7 +78,15 @@ def _check(model: Model) -> None:
         raise InputError(
             "abaqus: loads, but no materials to press on; give a law of the modulus (--young) or leave out the loads"
         )
-    check_kinds(model, "abaqus", ("displacement",), 1)
+    if count_of_steps(model.loads) > 1 and (some := [x for x in model.loads if x.kind == "spring" and x.step]):
+        raise InputError(
+            f"abaqus: springs are in every step, got {load_words(some[0])}; leave out the step, or write several files"
+        )
+    if model.is_nonlinear and (count := count_of_steps(model.loads)) > 1:
+        raise InputError(
+            f"abaqus: expected one nonlinear step, got {count}, each of which would go on from the one before; write a "
+            "file for each"
+        )
     check_apart([ALL_ELEMENTS, *material_names(model, {})], model.sets.cells)
 
 
@@ -92,32 +112,90 @@ def _mesh(model: Model) -> list[str]:
 def _materials(model: Model) -> list[str]:
     if model.materials is None:
         return []
-    materials = model.materials
-    constants = rows(_fitting(materials.young), _fitting(materials.nu), separator=", ").splitlines()
-    return [
-        f"*ELSET, ELSET={name}\n{_list(members)}"
-        f"*MATERIAL, NAME={name}\n*ELASTIC\n{pair}\n*SOLID SECTION, ELSET={name}, MATERIAL={name}\n"
-        for name, members, pair in zip(material_names(model, {}), cells_of(materials), constants, strict=True)
-    ]
+    materials = model.materials if model.node_young is None else without_moduli(model.materials)
+    parts = []
+    densities = [] if materials.density is None else mass_densities(model._replace(materials=materials)).tolist()
+    for k, members in enumerate(cells_of(materials)):
+        name = f"material_{k + 1}"
+        parts.append(f"*ELSET, ELSET={name}\n{_list(members)}*MATERIAL, NAME={name}\n{_law(model, materials, k)}")
+        if densities:
+            parts.append(f"*DENSITY\n{_number(densities[k])}\n")
+        parts.append(f"*SOLID SECTION, ELSET={name}, MATERIAL={name}\n")
+    if model.node_young is not None:
+        temperatures = at_nodes(model.node_young, model.mesh, model.order)
+        parts.append(f"*INITIAL CONDITIONS, TYPE=TEMPERATURE\n{_numbered(_fitting(temperatures))}")
+    return parts
 
 
-def _step(model: Model) -> list[str]:
-    dofs = np.arange(1, 4)
-    conditions = [
-        f"{load.set_name}, {line}\n"
-        for load in model.loads
-        for each in [~np.isnan(load.numbers)]
-        for line in rows(dofs[each], dofs[each], _fitting(load.numbers[each]), separator=", ").splitlines()
-    ]
-    reactions = [f"*NODE PRINT, NSET={load.set_name}, TOTALS=YES\nRF\n" for load in model.loads]
+def _law(model: Model, materials: Materials, k: int) -> str:
+    """The elastic law of a material."""
+    nu = float(materials.nu[k])
+    if model.node_young is not None:
+        ends = np.unique([model.node_young.min(), model.node_young.max()])
+        return f"*ELASTIC\n{rows(_fitting(ends), np.full(len(ends), nu), _fitting(ends), separator=', ')}"
+    young = float(materials.young[k])
+    if not model.is_nonlinear:
+        return f"*ELASTIC\n{_number(young)}, {_number(nu)}\n"
+    # C10 = mu / 2 and D1 = 2 / bulk modulus, so that small strains find the same law.
+    return f"*HYPERELASTIC, NEO HOOKE\n{_number(young / (4.0 + 4.0 * nu))}, {_number(6.0 * (1.0 - 2.0 * nu) / young)}\n"
+
+
+def _springs(model: Model) -> list[str]:
+    """Three springs at each node of a sprung set, along the axes, each of its own stiffness."""
+    parts, number = [], len(model.mesh.cells)
+    for load in model.loads:
+        if load.kind != "spring":
+            continue
+        nodes, constants = spring_constants(model.mesh, model.sets, load, model.order)
+        for node, constant in zip(nodes.tolist(), _fitting(constants).tolist(), strict=True):
+            for dof in (1, 2, 3):
+                number += 1
+                name = f"{SPRING_PREFIX}{number}"
+                parts.append(
+                    f"*ELEMENT, TYPE=SPRING1, ELSET={name}\n{number}, {node + 1}\n"
+                    f"*SPRING, ELSET={name}\n{dof}\n{constant!r}\n"
+                )
+    return parts
+
+
+def _step(model: Model, step: int) -> list[str]:
+    """A step, which begins by removing what acts in the one before."""
+    loads = in_step(model.loads, step)
+    new = ", OP=NEW" if count_of_steps(model.loads) > 1 else ""
+    lines = {card: [line for load in loads for line in _lines(model, load, card)] for card in LOAD_CARDS}
+    displaced = [load.set_name for load in loads if load.kind == "displacement"]
     return [
-        "*STEP\n*STATIC\n*BOUNDARY\n",
-        *conditions,
+        "*STEP, NLGEOM, INC=1000\n*STATIC\n0.1, 1.0, 1e-05, 0.25\n" if model.is_nonlinear else "*STEP\n*STATIC\n",
+        *(f"{card}{new}\n{''.join(those)}" for card, those in lines.items() if those or new),
         OUTPUT_REQUESTS,
-        "** Reaction forces and their sums\n",
-        *reactions,
+        "** Reaction forces and their sums\n" if displaced else "",
+        *(f"*NODE PRINT, NSET={name}, TOTALS=YES\nRF\n" for name in displaced),
         "*END STEP\n",
     ]
+
+
+def _lines(model: Model, load: Load, card: str) -> list[str]:
+    """What a load has to say under a card."""
+    dofs = np.arange(1, 4)
+    if card == "*BOUNDARY" and load.kind == "displacement":
+        is_set = ~np.isnan(load.numbers)
+        values = rows(dofs[is_set], dofs[is_set], _fitting(load.numbers[is_set]), separator=", ")
+        return [f"{load.set_name}, {line}\n" for line in values.splitlines()]
+    if card == "*CLOAD" and load.kind == "traction":
+        nodes, forces = facet_forces(model.mesh, model.sets, load, model.order)
+        return [
+            rows(nodes + 1, np.full(len(nodes), dof), _fitting(forces[:, dof - 1]), separator=", ")
+            for dof in dofs
+            if load.numbers[dof - 1] != 0.0
+        ]
+    if card == "*DLOAD" and load.kind == "gravity" and load.numbers.any():
+        size = float(np.linalg.norm(load.numbers))
+        direction = ", ".join(_number(float(x)) for x in load.numbers / size)
+        return [f"{ALL_ELEMENTS}, GRAV, {_number(size)}, {direction}\n"]
+    if card == "*DLOAD" and load.kind == "pressure":  # by faces: CalculiX takes no OP=NEW for those of surfaces
+        members, pressure = model.sets.facets[load.set_name], _number(float(load.numbers[0]))
+        return [f"{line}, {pressure}\n" for line in _faces(members, "P").splitlines()]
+    return []
 
 
 def _list(numbers: NDArray[np.int64]) -> str:
@@ -128,8 +206,12 @@ def _numbered(array: NDArray) -> str:
     return rows(np.arange(1, len(array) + 1), array, separator=", ")
 
 
-def _faces(members: NDArray[np.int64]) -> str:
-    return rows(members[:, 0] + 1, FACE_NUMBERS[members[:, 1]], separator=", S")
+def _faces(members: NDArray[np.int64], letter: str = "S") -> str:
+    return rows(members[:, 0] + 1, FACE_NUMBERS[members[:, 1]], separator=f", {letter}")
+
+
+def _number(value: float) -> str:
+    return repr(_shortened(value))
 
 
 def _fitting(values: NDArray[np.float64]) -> NDArray[np.float64]:

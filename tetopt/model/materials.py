@@ -78,6 +78,12 @@ def _checked_density(density: NDArray[np.float64]) -> NDArray[np.float64]:
     return density
 
 
+def without_moduli(table: Materials) -> Materials:
+    """The materials by ratio and density alone; their moduli are 1."""
+    density = None if table.density is None else table.density[table.of_cell]
+    return materials(1.0, table.nu[table.of_cell], len(table.of_cell), density)
+
+
 def density_of(table: Materials | None) -> NDArray[np.float64]:
     """The density of each material, (K,) kg/m3; InputError if there is none, which gravity needs."""
     if table is None or table.density is None:

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
-from tetopt.geometry.quadratic import quadratic, quadratic_facet_nodes
+from tetopt.geometry.quadratic import cell_edges, quadratic, quadratic_facet_nodes
 from tetopt.mesh import Mesh
 from tetopt.model.fields import HALF_TURN, half_turned_fields, stresses_times
 from tetopt.model.loads import FACET_FORCES, Load
@@ -31,6 +31,7 @@ class Units(NamedTuple):
 
 
 STRESS_UNITS = {"kPa": Units(1.0, "mN", "uJ", "kg", 1e-6), "MPa": Units(1e3, "N", "mJ", "t", 1e-9)}
+WATER_DENSITY = 1000.0  # kg/m3
 SPACES = ("ras", "lps")  # conventions of the world's axes
 
 
@@ -46,6 +47,7 @@ class Model(NamedTuple):
     units: str = "kPa"
     space: str = "ras"  # "lps": x and y have changed sign
     node_young: NDArray[np.float64] | None = None  # (N,) a modulus at each corner, linear within cells, instead
+    is_nonlinear: bool = False  # whether steps ask for large deformation
     about: dict[str, Any] = {}  # noqa: RUF012 - a default that nobody changes; name -> text, or what JSON can hold
     point_data: dict[str, NDArray] = {}  # noqa: RUF012 - likewise; by name, a row a mesh point, or a node of order 2
 
@@ -144,6 +146,24 @@ def described(model: Model) -> list[str]:
 def elements(model: Model) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Points and cells of the model's order: the mesh's own, or those of `quadratic`."""
     return quadratic(model.mesh.points, model.mesh.cells) if model.order == 2 else (model.mesh.points, model.mesh.cells)
+
+
+def at_nodes(values: NDArray[np.float64], mesh: Mesh, order: int) -> NDArray[np.float64]:
+    """What is on the mesh's points, (N,), on all nodes of the order: in the middle of an edge the mean of its ends."""
+    if order == 1:
+        return values
+    points, cells = quadratic(mesh.points, mesh.cells)
+    everywhere = np.empty(len(points))
+    everywhere[: len(values)] = values
+    everywhere[cells[:, mesh.ndim + 1 :]] = values[mesh.cells[:, cell_edges(mesh.ndim)]].mean(axis=2)
+    return everywhere
+
+
+def mass_densities(model: Model) -> NDArray[np.float64]:
+    """The density of each material, (K,), in the model's units of mass by mm3; water's if none is stated."""
+    assert model.materials is not None
+    density, water = model.materials.density, STRESS_UNITS[model.units].water
+    return np.full(len(model.materials.young), water) if density is None else density / WATER_DENSITY * water
 
 
 def element_facets(cells: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.int64]:
