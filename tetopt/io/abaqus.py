@@ -10,9 +10,10 @@ from numpy.typing import NDArray
 from tetopt.errors import InputError
 from tetopt.io.tags import check_apart, material_names, without_data
 from tetopt.io.text import blocks, rows
+from tetopt.model.fields import node_field
 from tetopt.model.loads import Load, count_of_steps, facet_forces, in_step, load_words, spring_constants
 from tetopt.model.materials import Materials, cells_of, without_moduli
-from tetopt.model.model import Model, at_nodes, described, element_facets, elements, mass_densities
+from tetopt.model.model import Model, described, element_facets, elements, mass_densities
 
 ALL_ELEMENTS = "all_cells"  # the set that results are asked for
 SPRING_PREFIX = "spring-"  # of the sets of one spring each, which are elements behind the cells
@@ -122,7 +123,7 @@ def _materials(model: Model) -> list[str]:
             parts.append(f"*DENSITY\n{_number(densities[k])}\n")
         parts.append(f"*SOLID SECTION, ELSET={name}, MATERIAL={name}\n")
     if model.node_young is not None:
-        temperatures = at_nodes(model.node_young, model.mesh, model.order)
+        temperatures = node_field(model.node_young, model.mesh, model.order)
         parts.append(f"*INITIAL CONDITIONS, TYPE=TEMPERATURE\n{_numbered(_fitting(temperatures))}")
     return parts
 

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
-from tetopt.geometry.quadratic import cell_edges, quadratic, quadratic_facet_nodes
+from tetopt.geometry.quadratic import quadratic, quadratic_facet_nodes
 from tetopt.mesh import Mesh
 from tetopt.model.fields import HALF_TURN, half_turned_fields, stresses_times
 from tetopt.model.loads import FACET_FORCES, Load
@@ -146,17 +146,6 @@ def described(model: Model) -> list[str]:
 def elements(model: Model) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Points and cells of the model's order: the mesh's own, or those of `quadratic`."""
     return quadratic(model.mesh.points, model.mesh.cells) if model.order == 2 else (model.mesh.points, model.mesh.cells)
-
-
-def at_nodes(values: NDArray[np.float64], mesh: Mesh, order: int) -> NDArray[np.float64]:
-    """What is on the mesh's points, (N,), on all nodes of the order: in the middle of an edge the mean of its ends."""
-    if order == 1:
-        return values
-    points, cells = quadratic(mesh.points, mesh.cells)
-    everywhere = np.empty(len(points))
-    everywhere[: len(values)] = values
-    everywhere[cells[:, mesh.ndim + 1 :]] = values[mesh.cells[:, cell_edges(mesh.ndim)]].mean(axis=2)
-    return everywhere
 
 
 def mass_densities(model: Model) -> NDArray[np.float64]:
