@@ -100,3 +100,28 @@ def test_choose_sizes(tmp_path, monkeypatch, capsys):
     assert displacement["graded, largest 1"] < displacement["graded, largest inf"]
     assert script("choose_sizes").main(words) == 2
     assert "exists" in capsys.readouterr().err
+
+
+def test_choose_average(tmp_path, monkeypatch, capsys):
+    """Every average is solved on every mesh; the stiffer it is, the more energy there is."""
+    monkeypatch.syspath_prepend(str(SCRIPTS))
+    out = tmp_path / "averages.json"
+    words = ["-o", str(out), "--phantoms", "two_spheres", "--nodes", "400", "--dofs", "20000", "--modes", "uniform"]
+    assert script("choose_average").main(words) == 0
+    written = json.loads(out.read_text())
+    assert len(written["rows"]) == 8 * 2 * 2
+    for order in (1, 2):
+        rows = {row["average"]: row for row in written["rows"] if (row["order"], row["nu"]) == (order, "0.3")}
+        stiffer = [rows[each]["stiffer"] for each in ("mean", "power:0.5", "geometric", "power:-0.5", "harmonic")]
+        assert stiffer == sorted(stiffer, reverse=True)
+        assert rows["harmonic"]["stiffer"] < rows["hill"]["stiffer"] < rows["mean"]["stiffer"]
+        assert rows["mean"]["n_nodes"] == pytest.approx(400, rel=0.25)
+        for each, row in rows.items():
+            assert abs(row["stiffer"]) == pytest.approx(row["errors"]["strain_energy"], rel=1e-9), each
+    assert set(written["relative_to_mean"]["order 2, mean"].values()) == {1.0}
+    assert "order 2, nodes" in written["relative_to_mean"]
+    assert "all, order 1, hill: strain_energy x" in capsys.readouterr().out
+    assert script("choose_average").main(words) == 2
+    assert "exists" in capsys.readouterr().err
+    assert script("choose_average").main([*words, "--force", "--averages", "voigt"]) == 2
+    assert "average: expected mean" in capsys.readouterr().err
