@@ -20,6 +20,7 @@ from tetopt.fem.reference import (
     reference,
 )
 from tetopt.fem.voxels import Work, element_stiffness
+from tetopt.geometry.quadratic import quadratic
 from tetopt.model.averages import cell_young
 
 SHEARED = np.array([[1.5, 0.3, -0.2], [0.1, 2.0, 0.4], [0.2, -0.3, 0.8]])
@@ -112,6 +113,34 @@ def test_errors_of_a_known_field():
     np.testing.assert_allclose(compare(exact, mesh, u, 2.0, labels), 0.0, atol=1e-12)
     np.testing.assert_allclose(compare(exact, mesh, 1.1 * u, 1.8, labels), 0.1, rtol=1e-9)
     assert compare(exact, mesh, u, 2.0, np.zeros(image.shape)).interface_strain is None
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_errors_of_quadratic_cells(n):
+    """A quadratic field is that of cells of order 2: its error against itself is what the voxels leave out of it."""
+    rng = np.random.default_rng(n)
+    image = tetopt.Image(np.ones((9, 8, 7)[:n]), affine_of(SHEARED[:n, :n], 4.0))
+    mesh = tetopt.lattice(image, nodes=60)
+    bend = rng.normal(size=(n, n, n))
+
+    def field(x):
+        return np.einsum("...i,dij,...j->...d", x, bend, x)
+
+    nodes = np.stack(np.meshgrid(*(np.arange(s + 1) - 0.5 for s in image.shape), indexing="ij"), axis=-1)
+    exact = linear_reference(image, np.zeros((n, n)), np.zeros(n))
+    exact.u[:] = field(image.to_world(nodes.reshape(-1, n))).reshape(nodes.shape)
+    labels = np.zeros(image.shape)
+    labels[:4] = 1
+    u = field(quadratic(mesh.points, mesh.cells)[0])
+    errors = compare(exact, mesh, u, 2.0, labels)
+    # The mean of a voxel's corners is above a quadratic at its centre by a constant; the slope is the same.
+    corners = np.array(list(product((-0.5, 0.5), repeat=n))) @ SHEARED[:n, :n].T
+    excess = field(corners).mean(axis=0)
+    there = at_centres(image, exact.u, np.arange(image.data.size))[0]
+    assert errors.displacement == pytest.approx(np.linalg.norm(excess) / np.sqrt((there**2).sum(axis=1).mean()))
+    assert errors.interface_strain == pytest.approx(0.0, abs=1e-12)
+    linear = compare(exact, mesh, field(mesh.points), 2.0, labels)
+    assert linear.interface_strain > 0.1
 
 
 def test_near_interface_by_brute_force():

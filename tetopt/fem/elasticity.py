@@ -20,11 +20,12 @@ Degrees of freedom go node by node: component d of node i is number i n + d. Nod
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from collections.abc import Iterable
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import bsr_array, bsr_matrix, csr_array, diags_array
+from scipy.sparse import bsr_array, bsr_matrix, csr_array, diags_array, eye_array, kron
 from scipy.sparse.linalg import LinearOperator, cg, splu
 
 from tetopt.check import check_unfolded, facets_on_box, filled_share
@@ -45,16 +46,24 @@ DIRECT_DOFS = {2: 200_000, 3: 10_000}
 RESIDUAL_SHARE = 1e-10  # residual over load that an iterative solution goes down to; ten times as much is refused
 
 
-class System(NamedTuple):
-    """K u = f, with some of the displacements prescribed and no force on the others."""
+class Outside(NamedTuple):
+    """What acts on the nodes from outside."""
 
-    K: csr_array  # (N*n, N*n) of all dofs, which are components along the columns of `frame`
+    forces: NDArray[np.float64]  # (N, n) mN, world
+    springs: NDArray[np.float64]  # (N,) mN/mm, from the node to the ground, the same in all directions
+
+
+class System(NamedTuple):
+    """K u = f, with some of the displacements prescribed and known forces, mostly none, on the others."""
+
+    K: csr_array  # (N*n, N*n) of all dofs, springs with them; dofs are components along the columns of `frame`
     free: NDArray[np.int64]  # (F,) dofs that are not prescribed, ascending
     K_ff: csr_array  # (F, F) among the free ones: symmetric, positive definite
-    load: NDArray[np.float64]  # (F,) mN, -K_fc u_c: how the prescribed dofs pull at the free ones
+    load: NDArray[np.float64]  # (F,) mN, f - K_fc u_c: the forces, and how the prescribed dofs pull at the free ones
     prescribed: NDArray[np.float64]  # (N*n,) mm, 0 at the free dofs
     modes: NDArray[np.float64]  # (N*n, 3 or 6) rigid motions
     frame: NDArray[np.float64]  # (n, n) a rotation; the identity if dofs are components along the world's axes
+    of_corners: csr_array | None = None  # (N, corners) of order 2: linear displacements at its nodes from the corners'
 
 
 class Compression(NamedTuple):
@@ -111,11 +120,16 @@ class Elements(NamedTuple):
     weights: NDArray[np.float64]  # (Q,) of the Gauss points
 
 
-def elements_of(mesh: Mesh, order: int) -> Elements:
-    """The mesh's cells as elements of order 1 or 2; InputError for another order."""
+def nodes_and_cells(mesh: Mesh, order: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """The nodes (N, n) of order 1 or 2, and the cells (M, A) of them; InputError for another order."""
     if order not in (1, 2):
         raise InputError(f"order: expected 1 or 2, got {order}")
-    points, cells = (mesh.points, mesh.cells) if order == 1 else quadratic(mesh.points, mesh.cells)
+    return (mesh.points, mesh.cells) if order == 1 else quadratic(mesh.points, mesh.cells)
+
+
+def elements_of(mesh: Mesh, order: int) -> Elements:
+    """The mesh's cells as elements of order 1 or 2; InputError for another order."""
+    points, cells = nodes_and_cells(mesh, order)
     places, weights = gauss_rule(mesh.ndim, order)
     v, gradients = _gradients(mesh)
     return Elements(points, cells, v, gradients, shape_slopes(places, order), weights)
@@ -131,23 +145,38 @@ def _stiffness(
     n_nodes, n = elements.points.shape
     pairs, slot = np.unique(elements.cells[:, :, None] * n_nodes + elements.cells[:, None, :], return_inverse=True)
     slot = slot.ravel()
-    blocks = np.zeros((len(pairs), n, n))
+    blocks = np.empty((len(pairs), n, n))
     turned = elements.gradients @ frame
+    points = []  # of Gauss: gradients of the shape functions, (M, A, n), and the constants there
     for slopes, weight, moduli in zip(elements.slopes, elements.weights, young.T, strict=True):
         # One term is 1, all others are 0, for linear cells: their gradients come through to the last bit.
-        g = sum(slopes[:, k, None] * turned[:, None, k] for k in range(n + 1))  # (M, A, n)
+        g = sum(slopes[:, k, None] * turned[:, None, k] for k in range(n + 1))
         lame, mu = (constant * (weight * elements.volumes) for constant in lame_constants(moduli, nu, n))
-        lame, mu = lame[:, None, None], mu[:, None, None]
-        shear = mu * sum(g[:, :, None, k] * g[:, None, :, k] for k in range(n))
-        for i in range(n):
-            for j in range(n):
-                entries = lame * (g[:, :, None, i] * g[:, None, :, j]) + mu * (g[:, :, None, j] * g[:, None, :, i])
-                if i == j:
-                    entries += shear
-                # In the order of the cells for (a, b) as for (b, a), so that K is symmetric to the last bit.
-                blocks[:, i, j] += np.bincount(slot, weights=entries.ravel(), minlength=len(pairs))
+        points.append((g, lame[:, None, None], mu[:, None, None]))
+    shear = _sum(mu * _sum(g[:, :, None, k] * g[:, None, :, k] for k in range(n)) for g, _, mu in points)
+    for i in range(n):
+        for j in range(i, n):
+            entries = _sum(
+                lame * (g[:, :, None, i] * g[:, None, :, j]) + mu * (g[:, :, None, j] * g[:, None, :, i])
+                for g, lame, mu in points
+            )
+            if i == j:
+                entries += shear
+            # In the order of the cells for (a, b) as for (b, a), so that K is symmetric to the last bit.
+            blocks[:, i, j] = np.bincount(slot, weights=entries.ravel(), minlength=len(pairs))
+            if i != j:
+                blocks[:, j, i] = np.bincount(slot, weights=entries.swapaxes(1, 2).ravel(), minlength=len(pairs))
     start = np.searchsorted(pairs, np.arange(n_nodes + 1) * n_nodes)
     return bsr_array((blocks, pairs % n_nodes, start), shape=(n_nodes * n, n_nodes * n)).tocsr()
+
+
+def _sum(arrays: Iterable[NDArray[np.float64]]) -> NDArray[np.float64]:
+    """The sum of arrays that are made one by one, from the first to the last, in the memory of the first."""
+    iterator = iter(arrays)
+    total = next(iterator)
+    for array in iterator:
+        total += array
+    return total
 
 
 def _gradients(mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -273,6 +302,7 @@ def constrained(
     *,
     order: int = 1,
     frame: NDArray[np.float64] | None = None,
+    outside: Outside | None = None,
 ) -> System:
     """The equations of the mesh with some displacements given.
 
@@ -286,13 +316,15 @@ def constrained(
         Displacements, mm; counted only where prescribed.
     frame : (n, n) float64, optional
         A rotation. The two arrays, and the system's dofs, are then components along its columns.
+    outside : Outside, optional
+        Forces and springs on the nodes of the order, in the world. A spring holds its node in all directions.
 
     Raises
     ------
     InputError
         As `stiffness`; wrong shapes, displacements that are not finite; cells that overlap across the facet they
-        share; or a part of the mesh that could still move without being strained: one without any prescribed node,
-        or one that hangs by too few.
+        share; or a part of the mesh that could still move without being strained: one without any prescribed node or
+        spring, or one that hangs by too few.
     """
     n = mesh.ndim
     frame = np.eye(n) if frame is None else frame
@@ -308,11 +340,29 @@ def constrained(
         raise InputError(f"prescribed: displacements must be finite, node {node} has {values[node].tolist()}")
     check_unfolded(mesh)
     points = elements.points @ frame
-    check_held(points, elements.cells, is_prescribed)
+    is_sprung = np.zeros(len(points), dtype=bool) if outside is None else outside.springs > 0.0
+    check_held(points, elements.cells, is_prescribed | is_sprung[:, None])
     K = _stiffness(elements, young, nu, frame)
+    if outside is not None and is_sprung.any():
+        K = (K + diags_array(np.repeat(outside.springs, n))).tocsr()
     free = np.flatnonzero(~is_prescribed.ravel())
     rows = K[free]
-    return System(K, free, rows[:, free], -(rows @ values.ravel()), values.ravel(), rigid_modes(points), frame)
+    load = -(rows @ values.ravel())
+    if outside is not None:
+        load += (outside.forces @ frame).ravel()[free]
+    of_corners = None if order == 1 else _of_corners(elements, len(mesh.points))
+    return System(K, free, rows[:, free], load, values.ravel(), rigid_modes(points), frame, of_corners)
+
+
+def _of_corners(elements: Elements, n_corners: int) -> csr_array:
+    """The interpolation of linear displacements at the nodes of order 2, (N, corners): the ends' mean on an edge."""
+    n_nodes, n = elements.points.shape
+    ends = np.empty((n_nodes - n_corners, 2), dtype=np.int64)
+    ends[elements.cells[:, n + 1 :] - n_corners] = elements.cells[:, cell_edges(n)]
+    column = np.concatenate([np.arange(n_corners), ends.ravel()])
+    values = np.concatenate([np.ones(n_corners), np.full(ends.size, 0.5)])
+    starts = np.concatenate([np.arange(n_corners), np.arange(n_corners, n_corners + ends.size + 1, 2)])
+    return csr_array((values, column, starts), shape=(n_nodes, n_corners))
 
 
 def compression(
@@ -447,19 +497,30 @@ def solved(system: System, method: Method = "auto") -> NDArray[np.float64]:
         The residual stayed above ten times that, as it may for moduli that differ by more than 9 orders of
         magnitude.
     """
-    n = len(system.frame)
+    return solved_in_steps(system, method)[0]
+
+
+def solved_in_steps(system: System, method: Method = "auto") -> tuple[NDArray[np.float64], int]:
+    """What `solved` returns, and how many steps conjugate gradients took: 0 where the matrix was factorised."""
+    n, n_steps = len(system.frame), 0
+
+    def count(_: NDArray[np.float64]) -> None:
+        nonlocal n_steps
+        n_steps += 1
+
     dofs = system.prescribed.copy()
     if len(system.free):
         if is_direct(system, method):
             solution = factorized(system.K_ff)(system.load)
         else:
-            solution, _ = cg(system.K_ff, system.load, rtol=RESIDUAL_SHARE, maxiter=1000, M=multigrid(system))
+            options: dict[str, Any] = {"rtol": RESIDUAL_SHARE, "maxiter": 1000, "callback": count}
+            solution, _ = cg(system.K_ff, system.load, M=multigrid(system), **options)
         residual = float(np.linalg.norm(system.K_ff @ solution - system.load))
         allowed = 10.0 * RESIDUAL_SHARE * float(np.linalg.norm(system.load))
         if not residual <= allowed:
             raise RuntimeError(f"elasticity: not solved, the residual is {residual:.3g} mN where {allowed:.3g} may be")
         dofs[system.free] = solution
-    return dofs.reshape(-1, n) @ system.frame.T
+    return dofs.reshape(-1, n) @ system.frame.T, n_steps
 
 
 def is_direct(system: System, method: Method) -> bool:
@@ -475,30 +536,48 @@ def factorized(K_ff: csr_array):  # type: ignore[no-untyped-def]
 
 
 def multigrid(system: System) -> LinearOperator:
-    """One V-cycle of smoothed aggregation on K_ff, (F, F): symmetric, and nothing about it is random.
+    """One V-cycle on K_ff, (F, F): symmetric, and nothing about it is random.
 
-    Aggregation is of nodes, not dofs, and reproduces the rigid motions. For that the prescribed dofs stay in as
-    equations of their own, coupled to none.
+    With linear cells it is of smoothed aggregation, of nodes, not dofs, which reproduces the rigid motions. For that
+    the prescribed dofs stay in as equations of their own, coupled to none.
+
+    With quadratic cells the first coarse level are the linear displacements, K of which is that of linear cells, and
+    aggregation goes on from there. Against aggregation of all nodes of order 2, with 107,000 dofs and moduli of
+    1 : 10 at nu 0.3, it takes 19 steps of conjugate gradients instead of 29 and half of the time (4.6 s against
+    9.2), with 1 : 10^4 37 instead of 87 (7.9 s against 22.4), at nu 0.45 30 instead of 44 (5.3 s against 9.4).
     """
     from pyamg import smoothed_aggregation_solver  # type: ignore[import-untyped]  # half a second: only when needed
+    from pyamg.multilevel import MultilevelSolver  # type: ignore[import-untyped]
+    from pyamg.relaxation.smoothing import change_smoothers  # type: ignore[import-untyped]
 
     n, n_dofs = len(system.frame), system.K.shape[0]
     is_free = np.zeros(n_dofs)
     is_free[system.free] = 1.0
-    keep = diags_array(is_free)
-    K = keep @ system.K @ keep + diags_array((1.0 - is_free) * system.K.diagonal().mean())
-    smoother = ("block_gauss_seidel", {"sweep": "symmetric"})
+    alone = system.K.diagonal().mean()  # what stands on the diagonal of a prescribed dof
+    K = _with_held(system.K, is_free, alone)
+    levels = []
+    modes = system.modes * is_free[:, None]
+    if system.of_corners is not None:
+        down = kron(system.of_corners, eye_array(n)).tocsr()
+        is_free_corner = is_free[: down.shape[1]]
+        down = (diags_array(is_free) @ down @ diags_array(is_free_corner)).tocsr()
+        top = MultilevelSolver.Level()
+        top.A, top.P, top.R = (bsr_matrix(matrix.tobsr((n, n))) for matrix in (K, down, down.T.tocsr()))
+        levels.append(top)
+        K = _with_held((down.T @ K @ down).tocsr(), is_free_corner, alone)
+        modes = modes[: len(is_free_corner)]
     hierarchy = smoothed_aggregation_solver(
         bsr_matrix(K.tobsr((n, n))),
-        B=system.modes * is_free[:, None],
+        B=modes,
         strength=("symmetric", {"theta": 0.1}),
         smooth=("jacobi", {"weighting": "local"}),  # its other weightings start from random vectors
         improve_candidates=None,
-        presmoother=smoother,
-        postsmoother=smoother,
         max_coarse=50,
     )
-    cycle = hierarchy.aspreconditioner(cycle="V")
+    whole = MultilevelSolver(levels + hierarchy.levels)
+    smoother = ("block_gauss_seidel", {"sweep": "symmetric"})
+    change_smoothers(whole, smoother, smoother)
+    cycle = whole.aspreconditioner(cycle="V")
 
     def apply(residual: NDArray[np.float64]) -> NDArray[np.float64]:
         padded = np.zeros(n_dofs)
@@ -506,6 +585,12 @@ def multigrid(system: System) -> LinearOperator:
         return (cycle @ padded)[system.free]
 
     return LinearOperator((len(system.free),) * 2, matvec=apply, dtype=np.float64)
+
+
+def _with_held(K: csr_array, is_free: NDArray[np.float64], alone: float) -> csr_array:
+    """K with the dofs that are not free coupled to none, and `alone` on their diagonal."""
+    keep = diags_array(is_free)
+    return (keep @ K @ keep + diags_array((1.0 - is_free) * alone)).tocsr()
 
 
 # Checks of the arguments

@@ -15,7 +15,7 @@ from scipy import ndimage
 
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.errors import InputError
-from tetopt.fem.elasticity import push_of, strains
+from tetopt.fem.elasticity import Elements, elements_of, order_of, push_of
 from tetopt.fem.voxel_kernels import product
 from tetopt.fem.voxels import (
     Grid,
@@ -28,6 +28,7 @@ from tetopt.fem.voxels import (
     stiffness_product,
 )
 from tetopt.geometry.box import upright_axis
+from tetopt.geometry.quadratic import shape_slopes, shape_values
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 
@@ -117,13 +118,14 @@ def reference(modulus: Image, nu: float, percent: float = 1.0) -> Reference:
 
 
 def compare(exact: Reference, mesh: Mesh, u: NDArray[np.float64], strain_energy: float, labels: ArrayLike) -> Errors:
-    """Errors of a mesh's displacements `u` (N, n) and energy against the reference, over voxel centres in the mesh.
+    """Errors of a mesh's displacements and energy against the reference, over voxel centres in the mesh.
 
     Parameters
     ----------
     exact : Reference
     mesh, u, strain_energy
-        As `tetopt.fem.elasticity.compression` solved it, with the same `nu` and push.
+        As `tetopt.fem.elasticity.compression` solved it, with the same `nu` and push; `u` of order 1 or 2, a row for
+        each node of that order. Displacement and strain are those of the cell at each voxel's centre.
     labels : array of the image's shape
         Materials: an interface is where a voxel's neighbour has another one. Its strain is measured at voxel centres
         up to `INTERFACE_BAND_VOXELS` away; the error is None where there is no interface.
@@ -138,16 +140,17 @@ def compare(exact: Reference, mesh: Mesh, u: NDArray[np.float64], strain_energy:
     if len(inside) == 0:
         raise InputError("mesh: no voxel centre of the reference lies in it")
     is_near = near_interface(np.asarray(labels)).ravel()
-    of_cell = strains(mesh, u)
+    elements, order = elements_of(mesh, order_of(mesh, u)), order_of(mesh, u)
     error, scale, size, strain_error, strain_size = np.zeros(5)
     for begin in range(0, len(inside), VOXELS_AT_ONCE):
         voxels = inside[begin : begin + VOXELS_AT_ONCE]
+        cell, near = owner[voxels], is_near[voxels]
         there, strain = at_centres(exact.modulus, exact.u, voxels)
-        error += _squares(_interpolated(exact.modulus, mesh, u, owner, voxels) - there)
+        places = _places(exact.modulus, elements, cell, voxels)
+        error += _squares(_displacements(elements, order, u, cell, places) - there)
         scale += _squares(there - at_centres(exact.modulus, exact.u_homogeneous, voxels)[0])
         size += _squares(there)
-        near = is_near[voxels]
-        strain_error += _squares(of_cell[owner[voxels[near]]] - strain[near])
+        strain_error += _squares(_strains(elements, order, u, cell[near], places[near]) - strain[near])
         strain_size += _squares(strain[near])
     is_homogeneous = scale <= 1e-14 * size  # all that is left is the solver's own
     return Errors(
@@ -226,19 +229,31 @@ def _pushed(
     return u
 
 
-def _interpolated(
-    image: Image, mesh: Mesh, u: NDArray[np.float64], owner: NDArray[np.int64], voxels: NDArray[np.int64]
+def _places(
+    image: Image, elements: Elements, cell: NDArray[np.int64], voxels: NDArray[np.int64]
 ) -> NDArray[np.float64]:
-    """A mesh's displacements at the centres of voxels, (K, n), linear in each cell."""
-    n = mesh.ndim
+    """Barycentric coordinates (K, n + 1) of the centres of voxels, each in its cell."""
+    n = image.ndim
     centres = image.to_world(np.stack(np.unravel_index(voxels, image.shape), axis=1).astype(np.float64))
-    corners = mesh.points[mesh.cells]
-    edges = (corners[:, 1:] - corners[:, :1]).transpose(0, 2, 1)
-    cell = owner[voxels]
-    weights = np.empty((len(voxels), n + 1))
-    weights[:, 1:] = np.einsum("kij,kj->ki", np.linalg.inv(edges)[cell], centres - corners[cell, 0])
-    weights[:, 0] = 1.0 - weights[:, 1:].sum(axis=1)
-    return np.einsum("ka,kai->ki", weights, u[mesh.cells[cell]])
+    arms = centres - elements.points[elements.cells[cell, 0]]
+    places = np.empty((len(voxels), n + 1))
+    places[:, 1:] = np.einsum("kai,ki->ka", elements.gradients[cell, 1:], arms)
+    places[:, 0] = 1.0 - places[:, 1:].sum(axis=1)
+    return places
+
+
+def _displacements(
+    elements: Elements, order: int, u: NDArray[np.float64], cell: NDArray[np.int64], places: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    return np.einsum("ka,kai->ki", shape_values(places, order), u[elements.cells[cell]])
+
+
+def _strains(
+    elements: Elements, order: int, u: NDArray[np.float64], cell: NDArray[np.int64], places: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    by_place = np.einsum("kai,kab->kib", u[elements.cells[cell]], shape_slopes(places, order))
+    slope = by_place @ elements.gradients[cell]
+    return 0.5 * (slope + slope.transpose(0, 2, 1))
 
 
 def _squares(values: NDArray[np.float64]) -> float:

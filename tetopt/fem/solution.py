@@ -1,0 +1,287 @@
+"""What becomes of a model: displacements, strains and stresses, energies, reactions.
+
+Each step of a model is one linear problem, from the undeformed state. What acts on facets acts on nodes by the weights
+of `tetopt.model.loads.facet_weights`, which the files for other solvers have, too, so that all of them solve the same
+equations.
+
+Half of the work of all forces on their way is what the body and the springs around it store (Clapeyron's theorem):
+
+    strain energy + energy of the springs = 1/2 (forces . u + reactions . prescribed u).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.errors import InputError
+from tetopt.fem.elasticity import (
+    RESIDUAL_SHARE,
+    Method,
+    Outside,
+    System,
+    constrained,
+    gauss_strains,
+    lame_constants,
+    nodes_and_cells,
+    solved_in_steps,
+)
+from tetopt.geometry.quadratic import cell_edges, gauss_rule
+from tetopt.geometry.simplex import volumes
+from tetopt.mesh import Mesh
+from tetopt.model.loads import Load, count_of_steps, facet_forces, in_step, spring_constants
+from tetopt.model.materials import density_of
+from tetopt.model.model import Model, element_facets, in_units
+
+KG_PER_MM3 = 1e-9  # in a kg/m3
+BALANCE_ROUNDING = 1e-12  # of a matrix's row times its displacements: what is lost to rounding in a sum of forces
+
+
+class Solution(NamedTuple):
+    """One step of a model, solved, in mm, kPa, mN and uJ (in 2-D by mm of thickness) and the model's axes."""
+
+    u: NDArray[np.float64]  # (N, n) mm, a row a node of the model's order
+    strain: NDArray[np.float64]  # (M, Q, n, n) at the Gauss points
+    stress: NDArray[np.float64]  # (M, Q, n, n) kPa, in 2-D in the plane
+    strain_energy: float  # uJ, in the cells
+    spring_energy: float  # uJ, in the springs
+    work: float  # uJ, half of forces on their way, prescribed ones with them: the sum of the two energies
+    reactions: dict[str, NDArray[np.float64]]  # by set that is prescribed or on springs: (n,) mN that hold it there
+    applied: NDArray[np.float64]  # (n,) mN, the sum of pressures, tractions and gravity; the reactions balance it
+    n_iterations: int  # of conjugate gradients, 0 where the matrix was factorised
+
+
+class _Task(NamedTuple):
+    """The loads of one step on the nodes of the model's order."""
+
+    is_prescribed: NDArray[np.bool_]  # (N, n)
+    prescribed: NDArray[np.float64]  # (N, n) mm
+    of_set: dict[str, NDArray[np.bool_]]  # (N, n) which of them a set prescribes
+    outside: Outside
+    springs: dict[str, NDArray[np.float64]]  # (N,) mN/mm of each set
+
+
+def solved_model(model: Model, step: int = 1, method: Method = "auto") -> Solution:
+    """The displacements of one step, and what follows from them.
+
+    Parameters
+    ----------
+    model : Model
+        With moduli: of its materials, or, where it has them, those at the nodes, linear within each cell.
+    step : int
+        From 1. Loads of no step are in all of them.
+    method : {"auto", "direct", "amg"}
+        See `tetopt.fem.elasticity.solved`.
+
+    Raises
+    ------
+    InputError
+        No moduli, no such step, gravity without a density, another kind of load, or something that could move without
+        being strained, as no load holds it.
+    RuntimeError
+        Not solved, or forces and reactions do not balance, as for moduli that differ too much.
+
+    Examples
+    --------
+    A bar of 2 mm, 1 kPa of traction at one end, 10 kPa stiff: it grows by a tenth.
+
+    >>> from tetopt.model.build import model_of
+    >>> from tetopt.model.sets import standard_sets
+    >>> bar = Mesh([[0, 0], [2, 0], [2, 1], [0, 1]], [[0, 1, 2], [0, 2, 3]])
+    >>> words = ["hold:x_min", "traction:x_max:1,0"]
+    >>> model = model_of(bar, young=10.0, nu=0.0, known_sets=standard_sets(bar), loads=words)
+    >>> solution = solved_model(model)
+    >>> solution.u[1].round(12).tolist(), solution.reactions["x_min"].round(12).tolist()
+    ([0.2, 0.0], [-1.0, 0.0])
+    """
+    model = in_units(model, "kPa")
+    n_steps = count_of_steps(model.loads)
+    if not 1 <= step <= n_steps:
+        raise InputError(f"step: expected 1 to {n_steps}, got {step}")
+    if model.materials is None:
+        raise InputError("model: its cells have no moduli; give --young")
+    task = _task(model, in_step(model.loads, step))
+    young, nu = gauss_moduli(model), model.materials.nu[model.materials.of_cell]
+    system = constrained(
+        model.mesh, young, nu, task.is_prescribed, task.prescribed, order=model.order, outside=task.outside
+    )
+    u, n_iterations = solved_in_steps(system, method)
+    strain = gauss_strains(model.mesh, u)
+    stress = _stress(strain, young, nu)
+    v, weights = volumes(model.mesh.points, model.mesh.cells), gauss_rule(model.mesh.ndim, model.order)[1]
+    strain_energy = 0.5 * float((v[:, None] * weights * (strain * stress).sum(axis=(2, 3))).sum())
+    pull = -task.outside.springs[:, None] * u
+    # K has the springs, whose pull is thus on the body's side: what is left over is the supports'.
+    reaction = (system.K @ u.ravel()).reshape(u.shape) - task.outside.forces
+    _check_balance(system, task, reaction, pull, u)
+    reactions = {name: np.where(where, reaction, 0.0).sum(axis=0) for name, where in task.of_set.items()}
+    for name, springs in task.springs.items():
+        reactions[name] = reactions.get(name, 0.0) - (springs[:, None] * u).sum(axis=0)
+    by_supports = np.where(task.is_prescribed, reaction * task.prescribed, 0.0).sum()
+    return Solution(
+        u, strain, stress, strain_energy, -0.5 * float((pull * u).sum()),
+        0.5 * float((task.outside.forces * u).sum() + by_supports),
+        reactions, task.outside.forces.sum(axis=0), n_iterations,
+    )  # fmt: skip
+
+
+def gauss_moduli(model: Model) -> NDArray[np.float64]:
+    """Modulus at the Gauss points of the model's order, (M, Q), in its unit of stress.
+
+    That of each cell's material; or, of moduli at the nodes, the linear interpolation.
+    """
+    places, weights = gauss_rule(model.mesh.ndim, model.order)
+    if model.node_young is not None:
+        return model.node_young[model.mesh.cells] @ places.T
+    assert model.materials is not None, "who asks for moduli has checked that there are some"
+    of_cell = model.materials.young[model.materials.of_cell]
+    return np.repeat(of_cell[:, None], len(weights), axis=1)
+
+
+def _stress(strain: NDArray[np.float64], young: NDArray[np.float64], nu: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Stress (M, Q, n, n), kPa, of strains, moduli (M, Q) and ratios (M,); in 2-D plane stress."""
+    n = strain.shape[-1]
+    lame, mu = lame_constants(young, nu[:, None], n)
+    spread = lame * np.einsum("cqii->cq", strain)
+    return 2.0 * mu[:, :, None, None] * strain + spread[:, :, None, None] * np.eye(n)
+
+
+# Loads on nodes
+
+
+def _task(model: Model, loads: tuple[Load, ...]) -> _Task:
+    points, cells = nodes_and_cells(model.mesh, model.order)
+    of_set: dict[str, NDArray[np.bool_]] = {}
+    springs: dict[str, NDArray[np.float64]] = {}
+    task = _Task(
+        np.zeros(points.shape, dtype=bool), np.zeros(points.shape), of_set,
+        Outside(np.zeros(points.shape), np.zeros(len(points))), springs,
+    )  # fmt: skip
+    for load in loads:
+        if load.kind == "displacement":
+            where = np.zeros(points.shape, dtype=bool)
+            # By facets, not by pairs of nodes: an edge between two nodes of a set may leave it.
+            where[np.unique(element_facets(cells, model.sets.facets[load.set_name]))] = ~np.isnan(load.numbers)
+            task.is_prescribed[where] = True
+            task.prescribed[where] = np.broadcast_to(load.numbers, where.shape)[where]
+            of_set[load.set_name] = where | of_set.get(load.set_name, False)
+        elif load.kind == "spring":
+            nodes, constants = spring_constants(model.mesh, model.sets, load, model.order)
+            task.outside.springs[nodes] += constants
+            springs.setdefault(load.set_name, np.zeros(len(points)))[nodes] += constants
+        elif load.kind in ("pressure", "traction"):
+            nodes, forces = facet_forces(model.mesh, model.sets, load, model.order)
+            task.outside.forces[nodes] += forces
+        elif load.kind == "gravity":
+            table = model.materials
+            density = density_of(table)[table.of_cell]  # type: ignore[union-attr]  # or it was refused
+            task.outside.forces[:] += weight_forces(model.mesh, density, load.numbers, model.order)
+        else:
+            raise InputError(f'load: expected displacement, pressure, traction, spring or gravity, got "{load.kind}"')
+    return task
+
+
+def weight_forces(
+    mesh: Mesh, density: NDArray[np.float64], acceleration: NDArray[np.float64], order: int
+) -> NDArray[np.float64]:
+    """What a uniform acceleration (n,), mm/s2, of cells of a density (M,), kg/m3, does to each node, (N, n) mN.
+
+    Each node of a cell gets the integral of its shape function: with order 1 as much as the others; with order 2 a
+    triangle's weight goes to the middles of its edges alone, and of a tetrahedron's a fifth to each of these and -1/20
+    to each corner (Zienkiewicz and Taylor, The Finite Element Method, volume 1, on consistent nodal forces).
+    """
+    n = mesh.ndim
+    points, cells = nodes_and_cells(mesh, order)
+    if order == 1:
+        shares = np.full(n + 1, 1.0 / (n + 1))
+    else:
+        corner, edge = (0.0, 1.0 / 3.0) if n == 2 else (-1.0 / 20.0, 1.0 / 5.0)
+        shares = np.array([corner] * (n + 1) + [edge] * len(cell_edges(n)))
+    mass = KG_PER_MM3 * density * volumes(mesh.points, mesh.cells)
+    at_node = np.bincount(cells.ravel(), weights=(mass[:, None] * shares).ravel(), minlength=len(points))
+    return at_node[:, None] * acceleration
+
+
+def _check_balance(
+    system: System, task: _Task, reaction: NDArray[np.float64], pull: NDArray[np.float64], u: NDArray[np.float64]
+) -> None:
+    """RuntimeError unless reactions, forces and springs cancel: their sum, and their moments about any axis.
+
+    The work of all of them on each rigid motion, of root mean square 1, is that of the residual at the free nodes.
+    """
+    total = np.where(task.is_prescribed, reaction, 0.0) + task.outside.forces + pull
+    left = float(np.abs(system.modes.T @ total.ravel()).max())
+    residual = 10.0 * RESIDUAL_SHARE * np.sqrt(len(system.free)) * float(np.linalg.norm(system.load))
+    size = float(np.abs(system.modes).max())
+    allowed = size * (residual + BALANCE_ROUNDING * float(system.K.diagonal() @ np.abs(u.ravel())))
+    if not left <= allowed:
+        raise RuntimeError(
+            f"elasticity: forces and reactions do not balance, {left:.3g} mN are left where {allowed:.3g} may be"
+        )
+
+
+# Fields on the mesh
+
+
+def von_mises(stress: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The equivalent stress of von Mises of stresses (..., n, n); in 2-D plane stress."""
+    spread = np.einsum("...ii->...", stress)
+    return np.sqrt(np.maximum(1.5 * ((stress**2).sum(axis=(-2, -1)) - spread**2 / 3.0), 0.0))
+
+
+def node_means(mesh: Mesh, values: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Values at Gauss points (M, Q, ...) brought to the nodes of the order that has Q of them, (N, ...).
+
+    Within a cell they are linear, which is what strains of order 2 are; a node has the mean by volume over the cells
+    around it.
+    """
+    n, n_places = mesh.ndim, values.shape[1]
+    order = 1 if n_places == 1 else 2
+    cells = nodes_and_cells(mesh, order)[1]
+    if order == 2:
+        at_corners = np.linalg.inv(gauss_rule(n, 2)[0])  # (n+1, Q): linear values are those at the corners, weighted
+        at_nodes = np.concatenate([at_corners, at_corners[cell_edges(n)].mean(axis=1)])
+    else:
+        at_nodes = np.ones((n + 1, 1))
+    n_nodes, flat = int(cells.max()) + 1, values.reshape(len(cells), n_places, -1)
+    weight = np.repeat(volumes(mesh.points, mesh.cells)[:, None], cells.shape[1], axis=1)
+    around = np.bincount(cells.ravel(), weights=weight.ravel(), minlength=n_nodes)
+    columns = [
+        np.bincount(cells.ravel(), weights=(weight * (flat[:, :, k] @ at_nodes.T)).ravel(), minlength=n_nodes) / around
+        for k in range(flat.shape[2])
+    ]
+    return np.stack(columns, axis=1).reshape(n_nodes, *values.shape[2:])
+
+
+class Fields(NamedTuple):
+    """What a solution puts on a mesh's file, by name."""
+
+    cell_data: dict[str, NDArray[np.float64]]  # (M, ...)
+    point_data: dict[str, NDArray[np.float64]]  # (N, ...) a row a node of the order
+
+
+def solution_fields(mesh: Mesh, solution: Solution, step: int = 1) -> Fields:
+    """Displacement, mm, strain, stress, kPa, and von Mises stress, on cells (means) and nodes; tensors row by row.
+
+    Names of steps after the first end in "_step2" and so on.
+    """
+    suffix = "" if step == 1 else f"_step{step}"
+    n = mesh.ndim
+    strain_nodes, stress_nodes = node_means(mesh, solution.strain), node_means(mesh, solution.stress)
+    cell_data = {
+        "strain": solution.strain.mean(axis=1).reshape(-1, n * n),
+        "stress": solution.stress.mean(axis=1).reshape(-1, n * n),
+        "von_mises": von_mises(solution.stress).mean(axis=1),
+    }
+    point_data = {
+        "displacement": solution.u,
+        "strain_nodes": strain_nodes.reshape(-1, n * n),
+        "stress_nodes": stress_nodes.reshape(-1, n * n),
+        "von_mises_nodes": von_mises(stress_nodes),
+    }
+    return Fields(
+        {name + suffix: values for name, values in cell_data.items()},
+        {name + suffix: values for name, values in point_data.items()},
+    )
