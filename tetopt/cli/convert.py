@@ -7,11 +7,12 @@ from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import typer
 from rich.markup import escape
 
 from tetopt import Image, InputError
-from tetopt.cli.console import log
+from tetopt.cli.console import log, out
 from tetopt.cli.inputs import check_no_input, image_and_others, read_mesh, warn_of_other_image
 from tetopt.cli.options import ImagePart, MeshArgument, NumberOptions, SolverOptions, option
 from tetopt.cli.solver import (
@@ -24,10 +25,11 @@ from tetopt.cli.solver import (
 )
 from tetopt.io.files import checked_output, save_json
 from tetopt.io.formats import FORMATS, format_of
+from tetopt.io.frd import read_frd
 from tetopt.io.images import sha256
 from tetopt.io.meshes import MeshFile
 from tetopt.io.vtk import box_text
-from tetopt.model.fields import cell_fields
+from tetopt.model.fields import cell_fields, is_result, is_stress
 from tetopt.model.loads import load_words, parse_load
 from tetopt.model.model import STRESS_UNITS, half_turned, scaled
 from tetopt.model.sets import box_of
@@ -35,6 +37,7 @@ from tetopt.report.summary import model_summary, versions
 from tetopt.target.align import aligned_mask
 from tetopt.target.content import continued
 
+RESULT_SUFFIXES = (".vtu", ".vtk")  # of the files that hold results
 TEXTS_KEPT = ("image", "image_sha256", "inputs", "options")  # of a mesh's file that go on into the new one
 
 
@@ -47,6 +50,9 @@ def convert_command(
         Path | None, option("IMAGE", "Take means and laws from this image, not from the mesh's file.", "--image")
     ] = None,
     mask_path: Annotated[Path | None, option("MASK", "With --image: only what lies in it counts.", "--mask")] = None,
+    results_path: Annotated[
+        Path | None, option("JOB.frd", "Bring CalculiX's results of this mesh back onto it (.vtu, .vtk).", "--results")
+    ] = None,
     *,
     part: ImagePart,
     solver: SolverOptions,
@@ -56,11 +62,16 @@ def convert_command(
     format_of(output)
     output = checked_output(output, tuple(FORMATS), numbers.force)
     json_path = numbers.checked()
-    check_no_input(output, mesh_path, image_path, mask_path)
+    check_no_input(output, mesh_path, image_path, mask_path, results_path)
+    if results_path is not None and output.suffix.lower() not in RESULT_SUFFIXES:
+        raise InputError(f"--results: expected OUT named {' or '.join(RESULT_SUFFIXES)}, got {output}")
     needs_image = {"--mask": mask_path, "--volume": part.volume, "--crop": part.crop, "--slice": part.slice_}
     if image_path is None and (lost := [name for name, value in needs_image.items() if value is not None]):
         raise InputError(f"{lost[0]}: there is no --image")
     loaded = read_mesh(mesh_path)
+    if results_path is not None:
+        loaded = _with_results(loaded, results_path)
+        solver = replace(solver, order=loaded.order)
     check_solver_options(output, solver, has_materials="young" in loaded.cell_data)
     if not solver.loads:
         solver = replace(solver, loads=_loads_of(loaded, output))
@@ -80,12 +91,30 @@ def convert_command(
         fields = {name: values for name, values in fields.items() if name not in MATERIAL_FIELDS}
     known_sets = all_sets(loaded.mesh, box, fields, loaded.sets)
     model = solver_model(loaded.mesh, image, solver, fields, about, known_sets)
+    model = model._replace(point_data=loaded.point_data)
     save_for_solver(output, model, solver)
     if json_path is not None:
         files = {"mesh": mesh_path.name, "output": output.name, "units": solver.units, "space": solver.space}
+        files |= {} if results_path is None else {"results": results_path.name}
         save_json(json_path, files | {"versions": versions()} | model_summary(model))
     print_model(output, model, solver)
     return 0
+
+
+def _with_results(loaded: MeshFile, path: Path) -> MeshFile:
+    """The mesh with a solver's results in place of earlier ones, of the order that was solved; they are printed."""
+    results = read_frd(path, loaded.mesh)
+    for note in results.notes:
+        log.print(escape(f"{path}: {note}"))
+    for name, values in results.point_data.items():
+        if values.shape[1:] != (9,):  # tensors have their von Mises stress beside them
+            largest = float(np.abs(values).max() if values.ndim == 1 else np.sqrt((values**2).sum(axis=1)).max())
+            out.print(escape(f"{path.name}: {name} up to {largest:.4g} {'kPa' if is_stress(name) else 'mm'}"))
+    cell_data, point_data = (
+        {name: values for name, values in data.items() if not is_result(name)}
+        for data in (loaded.cell_data, loaded.point_data)
+    )
+    return loaded._replace(cell_data=cell_data, point_data=point_data | results.point_data, order=results.order)
 
 
 def _images(path: Path, mask_path: Path | None, part: ImagePart, ndim: int) -> tuple[Image, Image]:

@@ -81,6 +81,11 @@ def half_turned_fields(fields: dict[str, NDArray]) -> dict[str, NDArray]:
     return turned
 
 
+def is_result(name: str) -> bool:
+    """Whether a field of this name is what a solver found."""
+    return _base_name(name) in (*VECTOR_FIELDS, *TENSOR_FIELDS, "von_mises", "von_mises_nodes")
+
+
 def is_stress(name: str) -> bool:
     """Whether a field of this name is a modulus or a stress."""
     return _base_name(name) in STRESS_FIELDS

@@ -1,0 +1,73 @@
+"""A solver's results on a mesh, as a user gets and looks at them: `tetopt convert --results`, `tetopt view`."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+from commands import exit_code, numbers_in
+from results import FOLDER, our_displacement, solved_model
+
+import tetopt
+
+
+@pytest.fixture(params=[1, 2])
+def order(request):
+    return request.param
+
+
+@pytest.fixture
+def folder(order, tmp_path):
+    """The mesh that was solved, with results of an earlier run on it, and CalculiX's file."""
+    mesh = solved_model(order).mesh
+    rest = np.zeros_like(mesh.points)
+    cells = {"mean": np.arange(float(len(mesh.cells))), "stress": np.ones((len(mesh.cells), 9))}
+    tetopt.save_mesh(tmp_path / "a.vtu", mesh, cells, point_data={"displacement_step7": rest, "heat": rest[:, 0]})
+    (tmp_path / "a.frd").write_bytes((FOLDER / f"order_{order}.frd").read_bytes())
+    return tmp_path
+
+
+@pytest.mark.parametrize(("suffix", "options"), [(".vtu", []), (".vtk", ["--space", "lps", "--units", "MPa"])])
+def test_results_are_in_the_file_in_place_of_earlier_ones(folder, order, suffix, options, capsys):
+    out = folder / f"b{suffix}"
+    words = ["convert", folder / "a.vtu", out, "--results", folder / "a.frd", "--json", folder / "b.json", *options]
+    assert exit_code(*words) == 0
+    loaded = tetopt.load_mesh(out)
+    assert loaded.order == order
+    assert list(loaded.cell_data) == ["mean"]
+    names = ["heat", "displacement", "strain_nodes", "stress_nodes", "von_mises_nodes"]
+    second = [f"{name}_step2" for name in names[1:]] if order == 1 else []
+    assert set(loaded.point_data) == {*names, *second}
+    u = our_displacement(order, 1)
+    np.testing.assert_allclose(loaded.point_data["displacement"], u, rtol=0.0, atol=6e-6 * np.abs(u).max())
+    said = capsys.readouterr().out
+    largest = np.linalg.norm(loaded.point_data["displacement"], axis=1).max()
+    assert f"a.frd: displacement up to {largest:.4g} mm\n" in said
+    assert f"a.frd: von_mises_nodes up to {loaded.point_data['von_mises_nodes'].max():.4g} kPa\n" in said
+    assert numbers_in(folder / "b.json")["results"] == "a.frd"
+
+
+def test_the_page_shows_them(folder, order):
+    assert exit_code("convert", folder / "a.vtu", folder / "b.vtu", "--results", folder / "a.frd") == 0
+    assert exit_code("view", folder / "b.vtu", "--html", folder / "b.html") == 0
+    page = (folder / "b.html").read_text(encoding="utf-8")
+    data = json.loads(re.search(r'id="data">(.*?)</script>', page, re.DOTALL).group(1))
+    assert [each["step"] for each in data["displacements"]] == ([1, 2] if order == 1 else [0])
+    assert {field["name"] for field in data["fields"]} >= {"displacement", "von_mises_nodes", "mean", "heat"}
+
+
+@pytest.mark.parametrize("order", [1], indirect=True)
+def test_refusals_write_nothing(folder, capsys):
+    def refused(words, *arguments):
+        before = {path.name for path in folder.iterdir()}
+        assert exit_code("convert", folder / "a.vtu", *arguments) == 2
+        said = capsys.readouterr().err
+        assert words in re.sub(r"\s+", " ", said)
+        assert {path.name for path in folder.iterdir()} == before
+
+    refused("--results: expected OUT named .vtu or .vtk, got", folder / "b.inp", "--results", folder / "a.frd")
+    refused("no such file of results", folder / "b.vtu", "--results", folder / "c.frd")
+    refused("is of another mesh", folder / "b.vtu", "--results", FOLDER / "order_2.frd")
+    refused("expected CalculiX's results", folder / "b.vtu", "--results", folder / "a.vtu")
+    (folder / "c.vtu").write_bytes((folder / "a.frd").read_bytes())
+    refused("is an input of this command", folder / "c.vtu", "--results", folder / "c.vtu", "--force")
