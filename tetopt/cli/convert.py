@@ -71,7 +71,7 @@ def convert_command(
     loaded = read_mesh(mesh_path)
     if results_path is not None:
         loaded = _with_results(loaded, results_path)
-        solver = replace(solver, order=loaded.order)
+    solver = replace(solver, order=_order_of(loaded, solver, output))
     check_solver_options(output, solver, has_materials="young" in loaded.cell_data)
     if not solver.loads:
         solver = replace(solver, loads=_loads_of(loaded, output))
@@ -115,6 +115,16 @@ def _with_results(loaded: MeshFile, path: Path) -> MeshFile:
         for data in (loaded.cell_data, loaded.point_data)
     )
     return loaded._replace(cell_data=cell_data, point_data=point_data | results.point_data, order=results.order)
+
+
+def _order_of(loaded: MeshFile, solver: SolverOptions, output: Path) -> int:
+    """The order of the cells to be written: as asked for, else as in the mesh's file, if the format has it."""
+    form = format_of(output)
+    if solver.order is not None or loaded.order == 1 or form.has_quadratic:
+        return solver.order or loaded.order
+    if not form.is_surface:
+        log.print(escape(f"{output}: {form.what} has no quadratic cells; the mesh's are written as linear ones"))
+    return 1
 
 
 def _images(path: Path, mask_path: Path | None, part: ImagePart, ndim: int) -> tuple[Image, Image]:

@@ -39,8 +39,8 @@ from tetopt.io.mni import mni_path
 from tetopt.measure.quality import quality
 from tetopt.model.model import Model
 from tetopt.model.sets import Sets, box_of, surviving_sets
-from tetopt.report.summary import fidelity, model_summary, run_summary
-from tetopt.report.tables import add_quality, new_table
+from tetopt.report.summary import fidelity, model_summary, run_summary, size_summary
+from tetopt.report.tables import add_quality, new_table, nodes_in_words
 from tetopt.target.content import Content
 
 
@@ -222,12 +222,13 @@ def _print(task: Task, outcome: Outcome, model: Model, measured: dict[str, Any])
     n_empty = 0 if is_constant else int((model.cell_data["n_voxels"] == 0).sum())
     is_counted = plan.mode == "graded" and plan.sizes.target_error is None
     warn_of_result(result, plan.engine.method, plan.sizes.nodes if is_counted else None, n_empty)
-    _print_comparison(content, outcome, task.start_name)
+    _print_comparison(content, outcome, task.start_name, model.order)
     print_fidelity(measured)
     if solver.are_any() or output.mesh.suffix.lower() != ".vtu":
         print_model(output.mesh, model, solver)
     else:
-        out.print(escape(f"{output.mesh}: {len(result.mesh.points)} nodes, {len(result.mesh.cells)} cells"))
+        size = f"{nodes_in_words(model.mesh, model.order)}, {len(model.mesh.cells)} cells"
+        out.print(escape(f"{output.mesh}: {size}"))
     if output.json_path is not None:
         out.print(escape(f"{output.json_path}: every number of the run"))
     for path in plan.pictures:
@@ -235,7 +236,7 @@ def _print(task: Task, outcome: Outcome, model: Model, measured: dict[str, Any])
     return 130 if outcome.is_interrupted else code
 
 
-def _print_comparison(content: Content, outcome: Outcome, start: str) -> None:
+def _print_comparison(content: Content, outcome: Outcome, start: str, order: int) -> None:
     mesh, initial = outcome.result.mesh, outcome.initial
     first, last = outcome.result.history[0], outcome.result.history[-1]
     table = new_table("", start, "optimised")
@@ -246,7 +247,9 @@ def _print_comparison(content: Content, outcome: Outcome, start: str) -> None:
     if first.E_D > 0.0 and (spread := content.variance * content.volume) > 0.0:
         whose = "the image's variance" if content.is_plain and content.region is None else "all channels' variance"
         table.add_row(f"E_D, share of {whose}", f"{first.E_D / spread:.5f}", f"{last.E_D / spread:.5f}")
-    add_quality(table, quality(initial.points, initial.cells), quality(mesh.points, mesh.cells))
+    meshes = (initial, mesh)
+    in_all = [size_summary(each, order)["n_nodes_in_all"] for each in meshes] if order == 2 else []
+    add_quality(table, *(quality(each.points, each.cells) for each in meshes), in_all=in_all)
     out.print(table)
 
 

@@ -279,7 +279,9 @@ class SolverOptions:
             "--load",
         ),
     ] = None
-    order: Annotated[int, option("1|2", "2: quadratic cells, straight-edged (.inp, .feb, .msh, .msh2).")] = 1
+    order: Annotated[
+        int | None, option("1|2", "2: quadratic cells, straight-edged; 1: linear. By default as the mesh read, else 1.")
+    ] = None
     units: Annotated[str, option("kPa|MPa", "Unit of stress in the file; --young is in kPa.")] = "kPa"
     space: SpaceOption = "ras"
 

@@ -18,7 +18,7 @@ from tetopt.cli.options import ImagePart, NumberOptions, option
 from tetopt.io.files import save_json
 from tetopt.io.meshes import MeshFile
 from tetopt.measure.quality import quality
-from tetopt.report.summary import fidelity
+from tetopt.report.summary import fidelity, size_summary
 from tetopt.report.tables import add_quality, new_table
 from tetopt.target.align import aligned_labels, aligned_mask
 from tetopt.target.content import continued
@@ -46,9 +46,10 @@ def quality_command(
         raise InputError("--mask and --labels: give the --image, too, on whose voxels they are compared")
     loaded = read_mesh(mesh_path)
     shape = quality(loaded.mesh.points, loaded.mesh.cells)
-    report: dict[str, Any] = {"mesh": mesh_path.name, "quality": shape, "n_turned": loaded.n_turned}
+    size = size_summary(loaded.mesh, loaded.order)
+    report: dict[str, Any] = {"mesh": mesh_path.name, "size": size, "quality": shape, "n_turned": loaded.n_turned}
     table = new_table("", escape(mesh_path.name))
-    add_quality(table, shape)
+    add_quality(table, shape, in_all=[size["n_nodes_in_all"]] if loaded.order == 2 else [])
     image: Image | None = None
     fit: Fit | None = None
     measured: dict[str, Any] = {}

@@ -22,9 +22,9 @@ from tetopt.model.build import labels_of, model_of
 from tetopt.model.laws import parse_any_law
 from tetopt.model.loads import check_steps, known_set, load_words, parse_load
 from tetopt.model.materials import DEFAULT_NU, Spacing
-from tetopt.model.model import SPACES, STRESS_UNITS, Model
-from tetopt.model.sets import Box, Sets, check_free_names, merged_sets, nodes_of, parse_set, standard_sets
-from tetopt.report.tables import new_table
+from tetopt.model.model import SPACES, STRESS_UNITS, Model, element_facets, elements
+from tetopt.model.sets import Box, Sets, check_free_names, merged_sets, parse_set, standard_sets
+from tetopt.report.tables import new_table, nodes_in_words
 
 MATERIAL_FIELDS = ("young", "nu", "density", "material")  # what a file of ours says of each cell's material
 SLOW_MATERIALS = 30_000  # CalculiX takes three times as long with as many as there are cells (tests/benchmarks)
@@ -54,7 +54,7 @@ def check_solver_options(output: Path, solver: SolverOptions, has_materials: boo
         raise InputError(f"--units: expected {' or '.join(STRESS_UNITS)}, got {solver.units}")
     if solver.space not in SPACES:
         raise InputError(f"--space: expected {' or '.join(SPACES)}, got {solver.space}")
-    if solver.order not in (1, 2):
+    if solver.order not in (None, 1, 2):
         raise InputError(f"--order: expected 1 or 2, got {solver.order}")
     if solver.order == 2 and not form.has_quadratic:
         raise InputError(
@@ -92,7 +92,7 @@ def solver_model(
     bins, spacing = parsed_bins(solver.bins)
     return model_of(
         mesh, image, young=young, nu=nu, density=density, average=solver.average, sets=solver.sets or (),
-        loads=solver.loads or (), bins=bins, spacing=spacing, order=solver.order, cell_data=fields,
+        loads=solver.loads or (), bins=bins, spacing=spacing, order=solver.order or 1, cell_data=fields,
         known_sets=known_sets, about={"tetopt": tetopt.__version__, **about},
     )  # fmt: skip
 
@@ -156,9 +156,9 @@ def print_model(output: Path, model: Model, solver: SolverOptions) -> None:
         out.print(escape(line))
     if format_of(output).is_surface:
         return
-    table = new_table("set", "facets", "nodes", "cells")
+    table, cells = new_table("set", "facets", "nodes", "cells"), elements(model)[1]
     for name, rows in model.sets.facets.items():
-        table.add_row(escape(name), str(len(rows)), str(len(nodes_of(model.mesh, rows))), "")
+        table.add_row(escape(name), str(len(rows)), str(len(np.unique(element_facets(cells, rows)))), "")
     for name, members in model.sets.cells.items():
         table.add_row(escape(name), "", "", str(len(members)))
     print_wide(table)
@@ -190,5 +190,5 @@ def _lines(output: Path, model: Model, solver: SolverOptions) -> Iterator[str]:
     if form.is_surface:
         yield f"{output}: {form.what}, {space}"
         return
-    size = f"{len(model.mesh.points)} nodes, {len(model.mesh.cells)} cells"
+    size = f"{nodes_in_words(model.mesh, model.order)}, {len(model.mesh.cells)} cells"
     yield f"{output}: {form.what}, {space}, {solver.units}, {size}"

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 import tetopt
 from tetopt.engine.loop import Optimized
+from tetopt.geometry.quadratic import quadratic
 from tetopt.image import Image
 from tetopt.measure.fidelity import label_fidelity, mask_fidelity
 from tetopt.measure.quality import quality
@@ -81,11 +82,20 @@ def run_summary(
     }
 
 
+def size_summary(mesh: Mesh, order: int) -> dict[str, Any]:
+    """How many nodes a mesh has, and how many with those of order 2 ("n_nodes_in_all"), and how many cells."""
+    n_nodes = len(quadratic(mesh.points, mesh.cells)[0]) if order == 2 else len(mesh.points)
+    return {"order": order, "n_nodes": len(mesh.points), "n_nodes_in_all": n_nodes, "n_cells": len(mesh.cells)}
+
+
 def model_summary(model: Model) -> dict[str, Any]:
-    """How large the sets are, and what the cells are made of, moduli in kPa."""
+    """How large mesh and sets are, and what the cells are made of, moduli in kPa."""
     of_facets = {name: len(rows) for name, rows in model.sets.facets.items()}
     of_cells = {name: len(cells) for name, cells in model.sets.cells.items()}
-    summary: dict[str, Any] = {"sets": {"facets": of_facets, "cells": of_cells}}
+    summary: dict[str, Any] = {
+        "size": size_summary(model.mesh, model.order),
+        "sets": {"facets": of_facets, "cells": of_cells},
+    }
     if (table := model.materials) is not None:
         young, nu = table.young, table.nu
         summary["materials"] = {"count": len(young), "young_kPa": young, "nu": nu, "binning": table.binning}

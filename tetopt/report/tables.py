@@ -7,8 +7,10 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from rich.table import Table
 
+from tetopt.geometry.quadratic import quadratic
 from tetopt.measure.fidelity import LabelFidelity, MaskFidelity
 from tetopt.measure.quality import Quality
+from tetopt.mesh import Mesh
 
 
 def new_table(*columns: str) -> Table:
@@ -19,10 +21,20 @@ def new_table(*columns: str) -> Table:
     return table
 
 
-def add_quality(table: Table, *meshes: Quality) -> None:
-    """Rows of the shape of one or several meshes, a column each."""
+def nodes_in_words(mesh: Mesh, order: int) -> str:
+    """How many nodes a mesh has: "4864 nodes", or of order 2 "716 corner nodes, 5012 in all"."""
+    if order == 1:
+        return f"{len(mesh.points)} nodes"
+    return f"{len(mesh.points)} corner nodes, {len(quadratic(mesh.points, mesh.cells)[0])} in all"
+
+
+def add_quality(table: Table, *meshes: Quality, in_all: Sequence[int] = ()) -> None:
+    """Rows of the shape of one or several meshes, a column each; `in_all` are their nodes where cells are quadratic."""
+    corners = [str(q.n_nodes) for q in meshes]
+    table.add_row("corner nodes" if in_all else "nodes", *corners)
+    if in_all:
+        table.add_row("nodes in all", *map(str, in_all))
     rows: list[tuple[str, Callable[[Quality], str]]] = [
-        ("nodes", lambda q: str(q.n_nodes)),
         ("cells", lambda q: str(q.n_cells)),
         ("volume, mm3" if meshes[0].ndim == 3 else "area, mm2", lambda q: f"{q.volume:.2f}"),
         ("rho, mean", lambda q: f"{q.mean_rho:.4f}"),
