@@ -13,6 +13,7 @@ from models import sample_image
 
 import tetopt
 from tetopt.cli.promises import check_promises
+from tetopt.geometry.quadratic import quadratic
 from tetopt.geometry.topology import boundary_facets, largest_component
 from tetopt.io.formats import FORMATS
 from tetopt.model.averages import cell_young
@@ -71,6 +72,70 @@ def test_mesh_writes_every_format(folder, tmp_path, suffix):
     more = [] if FORMATS[suffix].is_surface else ["--young", "2.5"]
     assert exit_code("mesh", folder / "a.nii.gz", "-o", out, "--spacing", "8", "--iterations", "0", *more) == 0
     assert out.stat().st_size > 1000
+
+
+@pytest.fixture(scope="module")
+def quadratic_path(folder):
+    """The same mesh of order 2, with a displacement of every node."""
+    path = folder / "quadratic.vtu"
+    assert exit_code("convert", folder / "a.vtu", path, "--order", "2", "--young", LAW, "--load", "compress:5%") == 0
+    grid = pyvista.read(path)
+    grid.point_data["displacement"] = np.asarray(grid.points) ** 2
+    grid.save(path)
+    return path
+
+
+def test_convert_keeps_the_order_unless_told_otherwise(folder, quadratic_path, tmp_path, capsys):
+    mesh = tetopt.load_mesh(folder / "a.vtu").mesh
+    n_corners, n_all = len(mesh.points), len(quadratic(mesh.points, mesh.cells)[0])
+    capsys.readouterr()
+    for suffix, form in FORMATS.items():
+        out, numbers = tmp_path / f"kept{suffix}", tmp_path / f"kept{suffix}.json"
+        assert exit_code("convert", quadratic_path, out, "--json", numbers) == 0
+        order = 2 if form.has_quadratic else 1
+        assert numbers_in(numbers)["size"] == {
+            "order": order, "n_nodes": n_corners, "n_nodes_in_all": n_all if order == 2 else n_corners,
+            "n_cells": len(mesh.cells),
+        }  # fmt: skip
+        said = " ".join("".join(capsys.readouterr()).split())
+        if order == 2:
+            assert f"{n_corners} corner nodes, {n_all} in all, {len(mesh.cells)} cells" in said
+        assert ("has no quadratic cells; the mesh's are written as linear ones" in said) == (suffix == ".scn")
+    for name in ("kept.vtu", "kept.vtk", "kept.msh"):
+        loaded = tetopt.load_mesh(tmp_path / name)
+        assert loaded.order == 2
+        points = quadratic(loaded.mesh.points, loaded.mesh.cells)[0]
+        np.testing.assert_array_equal(loaded.point_data["displacement"], points**2)
+    assert exit_code("convert", quadratic_path, tmp_path / "linear.vtu", "--order", "1") == 0
+    loaded = tetopt.load_mesh(tmp_path / "linear.vtu")
+    assert loaded.order == 1
+    np.testing.assert_array_equal(loaded.point_data["displacement"], mesh.points**2)
+    assert exit_code("convert", quadratic_path, tmp_path / "b.scn", "--order", "2") == 2
+
+
+def test_commands_take_a_quadratic_mesh(folder, quadratic_path, tmp_path, capsys):
+    """Each says of it what it says of the corners' mesh."""
+    mesh = tetopt.load_mesh(folder / "a.vtu").mesh
+    n_all = len(quadratic(mesh.points, mesh.cells)[0])
+    texts = []
+    for path in (folder / "a.vtu", quadratic_path):
+        numbers = tmp_path / f"{path.stem}.json"
+        assert exit_code("quality", path, "--image", folder / "a.nii.gz", "--check", "--json", numbers) == 0
+        texts.append(capsys.readouterr().out)
+        labels = tmp_path / f"{path.stem}.nii.gz"
+        assert exit_code("segment", folder / "a.nii.gz", path, "-o", labels, "--classes", "2") == 0
+        surface = tmp_path / f"{path.stem}.stl"
+        assert exit_code("surface", path, "--label", "1", "-o", surface) == 0
+        assert exit_code("view", path, "--html", tmp_path / f"{path.stem}.html") == 0
+        capsys.readouterr()
+    assert re.search(rf"^corner nodes +{len(mesh.points)}\nnodes in all +{n_all}\n", texts[1], re.MULTILINE)
+    assert re.search(rf"^nodes +{len(mesh.points)}\ncells", texts[0], re.MULTILINE)
+    linear, both = (numbers_in(tmp_path / f"{name}.json") for name in ("a", "quadratic"))
+    assert linear["quality"] == both["quality"]
+    assert linear["fit"] == both["fit"]
+    assert (both["size"]["n_nodes_in_all"], linear["size"]["n_nodes_in_all"]) == (n_all, len(mesh.points))
+    for name in ("nii.gz", "stl"):
+        assert (tmp_path / f"a.{name}").stat().st_size == (tmp_path / f"quadratic.{name}").stat().st_size
 
 
 def test_vtu_there_and_back_with_materials_sets_and_loads(folder, tmp_path):
