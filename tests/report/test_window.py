@@ -185,7 +185,7 @@ def test_a_slider_deforms_the_mesh(bent, mesh):
     for factor in (0.0, 2.5):
         slide(window, 4, factor)
         points = mesh.points + factor * steps[0]
-        axis = int(np.argmin(np.ptp(mesh.points, axis=0)))
+        axis = 2  # across which nothing moves
         slide(window, 0, points[:, axis].mean() + 0.3)
         deformed = type(mesh)(points, mesh.cells)
         expected = section_area(deformed, mesh.cells, axis, points[:, axis].mean() + 0.3)

@@ -126,6 +126,13 @@ def warp_factors(shown: Exhibit) -> tuple[float, float]:
     return float(first), MOST_TIMES * float(first)
 
 
+def first_axis(shown: Exhibit) -> int:
+    """The axis across which the first cut is: it is then the largest or, of a deformed mesh, shows the most of it."""
+    if not shown.displacements:
+        return int(np.argmin(np.ptp(shown.mesh.points, axis=0)))
+    return int(np.argmin(np.abs(next(iter(shown.displacements.values()))).sum(axis=0)))
+
+
 def _nodal(
     mesh: Mesh, point_data: dict[str, NDArray]
 ) -> tuple[dict[str, NDArray], dict[int, NDArray[np.float64]], list[str]]:

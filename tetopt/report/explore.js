@@ -56,9 +56,8 @@ function explore(gl, data, notes) {
   const radius = Math.max(Math.hypot(...size) / 2, reach(mesh));
   const drawn = renderer(gl, image, radius, 1.05 * Math.max(radius, depth), table, hex(data.noValue));
 
-  const thin = size.indexOf(Math.min(...size));  // so that the section one begins with is the largest
   const state = {
-    field: 0, by: 0, low: fields[0].min, high: fields[0].max, axis: thin, at: 0, isTurned: false, isWhole: false,
+    field: 0, by: 0, low: fields[0].min, high: fields[0].max, axis: data.axis, at: 0, isTurned: false, isWhole: false,
     inside: "cells", share: 0.35, set: -1, picked: -1, warp: firstWarp,
     step: displacements.length ? displacements[0].step : 0,
   };

@@ -21,7 +21,7 @@ from tetopt.geometry.box import box_sides
 from tetopt.image import Image
 from tetopt.io.files import written_whole
 from tetopt.report.colours import grey_limits
-from tetopt.report.exhibit import COLOUR_MAP, NO_VALUE, Exhibit, Field, warp_factors
+from tetopt.report.exhibit import COLOUR_MAP, NO_VALUE, Exhibit, Field, first_axis, warp_factors
 from tetopt.report.page import data_html, packed, script_html
 
 PAGE_IMAGE_VOXELS = 2**24  # 16 MB, a byte each: an image with more is averaged
@@ -65,6 +65,7 @@ def explorer_html(shown: Exhibit) -> str:
         "noValue": NO_VALUE,
         "displacements": [{"step": step, "u": packed(u, "<f4")} for step, u in displacements.items()],
         "factors": warp_factors(shown),
+        "axis": first_axis(shown),
     }
     page = resources.files("tetopt.report").joinpath("explore.html").read_text(encoding="utf-8")
     script = script_html("webgl.js", "explore_mesh.js", "explore_gl.js", "explore.js")

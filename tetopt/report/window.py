@@ -21,7 +21,7 @@ from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import facets
 from tetopt.image import Image
 from tetopt.report.colours import LISTED_LABELS, grey_limits
-from tetopt.report.exhibit import COLOUR_MAP, NO_VALUE, Exhibit, Field, warp_factors
+from tetopt.report.exhibit import COLOUR_MAP, NO_VALUE, Exhibit, Field, first_axis, warp_factors
 from tetopt.report.figures import MESH_LINE
 
 KEYS_TEXT = "x y z: plane   k: side kept   m: mesh, image, both   n: next field   h: next set of facets   q: close"
@@ -91,7 +91,7 @@ class _Scene:
         self.warp, self.most_warp = warp_factors(shown)
         self.deform()
         self.greys = (0.0, 1.0) if image is None else grey_limits([image.data.astype(np.float64)])
-        self.axis = int(np.argmin(self.high - self.low))  # so that the section one begins with is the largest
+        self.axis = first_axis(shown)
         self.at = float((self.low + self.high)[self.axis] / 2.0)
         self.is_turned = False
         self.inside = PLANE_CHOICES[0] if image is None else PLANE_CHOICES[2]
