@@ -100,3 +100,35 @@ def cell_energies(mesh, young, nu, u):
 def each_once(nodes):
     """Rows of nodes without their order."""
     return sorted(map(tuple, np.sort(nodes, axis=1).tolist()))
+
+
+# What a model can be loaded by, each kind alone and together; on what `sample_model` has, in 3-D and in 2-D.
+LOAD_CASES = {
+    "compression": ["compress:5%"],
+    "free components": ["hold:{high}", "move:{low}:{free},1.5"],
+    "pressure": ["hold:{high}", "pressure:{low}:0.3"],
+    "traction": ["hold:{high}", "traction:{low}:{pull},0.25"],
+    "spring": ["spring:{high}:0.2", "pressure:{low}:0.3"],
+    "gravity": ["hold:{high}", "gravity:{pull},-9810"],
+    "all": ["hold:{high}", "spring:{side}:0.05", "pressure:boundary:0.1", "pressure:{low}:0.1", "gravity:{pull},-9810"],
+}
+
+
+def load_words(case, n=3):
+    """The words of a load case."""
+    names = {"high": "superior", "low": "inferior", "side": "left", "free": "free,free", "pull": "0.1,-0.2"}
+    if n == 2:
+        names = {"high": "y_max", "low": "y_min", "side": "x_min", "free": "free", "pull": "0.1"}
+    return [words.format(**names) for words in LOAD_CASES[case]]
+
+
+def loaded_model(case, n=3, order=1, moduli="cells"):
+    """`sample_model` under a load case, or under other words; cells of two densities, moduli of cells or of nodes."""
+    model = sample_model(n)
+    table = model.materials
+    density = np.where(model.cell_data["label"] == 1, 1500.0, 1000.0)
+    table = materials(young_of(model), table.nu[table.of_cell], len(model.mesh.cells), density)
+    words = load_words(case, n) if isinstance(case, str) else case
+    loads = parse_loads(words, model.mesh, model.sets)
+    nodal = np.random.default_rng(7).uniform(1.0, 9.0, len(model.mesh.points)) if moduli == "nodes" else None
+    return model._replace(materials=table, loads=loads, order=order, node_young=nodal)

@@ -7,11 +7,12 @@ from collections import Counter
 import meshio
 import numpy as np
 import pytest
-from models import sample_model, young_of
+from models import loaded_model, sample_model, young_of
 
 from tetopt import InputError, Mesh
+from tetopt.geometry.quadratic import quadratic
 from tetopt.io.abaqus import abaqus
-from tetopt.model.loads import Load
+from tetopt.model.loads import Load, facet_forces, spring_constants
 from tetopt.model.materials import materials
 from tetopt.model.model import Model, in_space, in_units
 from tetopt.model.sets import Sets, facet_triples, nodes_of
@@ -218,3 +219,73 @@ def test_what_the_format_cannot_carry_is_refused():
         sets = Sets(model.sets.facets, {**model.sets.cells, name: np.array([0])})
         with pytest.raises(InputError, match=f'the file calls something else "{name}"'):
             abaqus(model._replace(sets=sets))
+
+
+def test_each_load_has_its_card_and_steps_begin_anew():
+    words = [
+        "hold:superior",
+        "1/pressure:inferior:0.5",
+        "1/gravity:0,0,-9810",
+        "2/traction:inferior:0,0,2",
+        "spring:left:3",
+    ]
+    model = loaded_model(words)
+    blocks = blocks_of(abaqus(model))
+    steps = [k for k, (word, _, _) in enumerate(blocks) if word == "*STEP"]
+    first, second = blocks[steps[0] : steps[1]], blocks[steps[1] :]
+    for step in (first, second):
+        assert [word for word, parameters, _ in step if parameters == {"OP": "NEW"}] == [
+            "*BOUNDARY",
+            "*CLOAD",
+            "*DLOAD",
+        ]
+    data = [{word: lines for word, _, lines in step} for step in (first, second)]
+    assert not data[0]["*CLOAD"]
+    assert not data[1]["*DLOAD"]
+    *faces, weight = data[0]["*DLOAD"]
+    rows = model.sets.facets["inferior"]
+    assert [int(line[0]) - 1 for line in faces] == rows[:, 0].tolist()
+    assert {line[2] for line in faces} == {"0.5"}
+    assert weight == ["all_cells", "GRAV", "9810.0", "0.0", "0.0", "-1.0"]
+    nodes, forces = facet_forces(model.mesh, model.sets, model.loads[3])
+    assert [(int(node) - 1, dof, float(force)) for node, dof, force in data[1]["*CLOAD"]] == [
+        (node, "3", force) for node, force in zip(nodes.tolist(), forces[:, 2].tolist(), strict=True)
+    ]
+    springs = [lines for word, _, lines in blocks if word == "*SPRING"]
+    nodes, stiffness = spring_constants(model.mesh, model.sets, model.loads[4])
+    assert [line[0][0] for line in springs] == ["1", "2", "3"] * len(nodes)
+    assert [float(line[1][0]) for line in springs] == np.repeat(stiffness, 3).tolist()
+    numbers = [
+        int(line[0]) for word, parameters, lines in blocks for line in lines if parameters.get("TYPE") == "SPRING1"
+    ]
+    assert numbers == list(range(len(model.mesh.cells) + 1, len(model.mesh.cells) + 1 + 3 * len(nodes)))
+    assert {lines[0][0] for word, _, lines in blocks if word == "*DENSITY"} == {"1e-06", "1.5e-06"}
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_a_modulus_that_varies_is_one_that_depends_on_the_temperature(order):
+    model = loaded_model(["hold:superior"], order=order, moduli="nodes")
+    blocks = blocks_of(abaqus(model))
+    tables = [np.array(lines, dtype=float) for word, _, lines in blocks if word == "*ELASTIC"]
+    assert len(tables) == 2  # of one ratio and density each
+    (degrees,) = (np.array(lines, dtype=float)[:, 1] for word, _, lines in blocks if word == "*INITIAL CONDITIONS")
+    for table in tables:
+        young = np.interp(degrees, table[:, 2], table[:, 0])
+        np.testing.assert_allclose(young[: len(model.node_young)], model.node_young, rtol=1e-14)
+    ends = model.mesh.cells[:, [0, 1]]
+    if order == 2:
+        middles = quadratic(model.mesh.points, model.mesh.cells)[1][:, 4]
+        np.testing.assert_allclose(degrees[middles], degrees[ends].mean(axis=1), rtol=1e-14)
+
+
+def test_steps_that_a_file_cannot_tell_apart_are_refused():
+    for words, nonlinear, match in (
+        (
+            ["hold:superior", "1/spring:left:1", "2/pressure:left:1"],
+            False,
+            "springs are in every step, got 1/spring:left:1",
+        ),
+        (["1/hold:superior", "2/hold:inferior"], True, "one nonlinear step, got 2"),
+    ):
+        with pytest.raises(InputError, match=match):
+            abaqus(loaded_model(words)._replace(is_nonlinear=nonlinear))

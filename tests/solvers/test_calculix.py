@@ -9,13 +9,14 @@ from typing import NamedTuple
 import numpy as np
 import pytest
 import skfem
-from models import cell_energies, sample_model, young_of
+from models import LOAD_CASES, cell_energies, loaded_model, sample_model, young_of
 from scipy.sparse.linalg import spsolve
 from skfem.helpers import ddot, sym_grad, trace
 
 import tetopt
 from tetopt import Mesh
 from tetopt.fem.elasticity import constrained, lame_constants, solved, stiffness
+from tetopt.fem.solution import solved_model
 from tetopt.geometry.quadratic import quadratic, quadratic_facet_nodes
 from tetopt.geometry.simplex import volumes
 from tetopt.io.abaqus import abaqus
@@ -230,3 +231,78 @@ def test_numbers_of_full_length_arrive(tmp_path):
     loads = tuple(load._replace(numbers=load.numbers * (np.pi * 1e-6)) for load in model.loads)
     small = model._replace(mesh=shrunk, loads=loads)
     np.testing.assert_allclose(energy(answer(abaqus(small), tmp_path)), ours(small)[1], rtol=PRINTED)
+
+
+# Every kind of load, both orders, moduli of cells and moduli that vary within them
+
+
+@pytest.mark.parametrize("moduli", ["cells", "nodes"])
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("case", LOAD_CASES)
+def test_each_load_is_what_fem_makes_of_it(case, order, moduli, tmp_path):
+    model = loaded_model(case, order=order, moduli=moduli)
+    printed, own = answer(abaqus(model), tmp_path), solved_model(model)
+    np.testing.assert_allclose(energy(printed), own.strain_energy, rtol=PRINTED)
+    assert own.strain_energy > 1.0
+    assert_printed(printed.u, own.u, 6e-6)
+    if case in ("gravity", "all"):  # what CalculiX prints leaves out what acts on the held nodes themselves
+        return
+    for name in {load.set_name for load in model.loads if load.kind == "displacement"}:
+        total = printed.tables["total force", name].ravel()
+        np.testing.assert_allclose(total, own.reactions[name], rtol=0.0, atol=1e-5 * np.abs(own.reactions[name]).max())
+
+
+STEPS = [
+    *("hold:superior", "spring:anterior:0.05", "1/pressure:inferior:0.3", "1/gravity:0,0,-9810"),
+    *("2/traction:inferior:0.1,-0.2,0.25", "3/move:inferior:1,free,0.5", "3/pressure:anterior:0.2"),
+    *("4/gravity:1000,0,0", "5/pressure:left:0.1"),
+]
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_each_step_is_a_case_of_its_own(order, tmp_path):
+    """Nothing of a step is left in the next: pressures, forces, weights and displacements come and go."""
+    model = loaded_model(STEPS, order=order)
+    answer(abaqus(model), tmp_path)
+    totals = re.findall(r"total internal energy.*\n\s*\n\s*(\S+)", (tmp_path / "job.dat").read_text())
+    blocks = (tmp_path / "job.frd").read_text().split(" DISP ")[1:]
+    assert len(totals) == len(blocks) == 5
+    for step, (total, block) in enumerate(zip(totals, blocks, strict=True), 1):
+        own = solved_model(model, step)
+        np.testing.assert_allclose(float(total), own.strain_energy, rtol=PRINTED)
+        assert_printed(displacements(f" DISP {block}"), own.u, 6e-6)
+
+
+def test_a_model_that_only_holds_rests(tmp_path):
+    """The step is there for loads of the user's own."""
+    printed = answer(abaqus(loaded_model(["hold:superior"])), tmp_path)
+    assert energy(printed) == 0.0
+    assert not printed.u.any()
+
+
+def test_lps_and_megapascals_are_the_same_loads(tmp_path):
+    """Displacements turned about z; energies in mJ."""
+    model = loaded_model("all", order=2, moduli="nodes")
+    printed = answer(abaqus(in_units(in_space(model, "lps"), "MPa")), tmp_path)
+    own = solved_model(model)
+    np.testing.assert_allclose(1e3 * energy(printed), own.strain_energy, rtol=PRINTED)
+    assert_printed(printed.u * [-1.0, -1.0, 1.0], own.u, 6e-6)
+
+
+# Large deformation
+
+
+@pytest.mark.parametrize("moduli", ["cells", "nodes"])
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("kind", ["compress", "pressure"])
+def test_large_deformation_begins_as_the_linear_step(kind, order, moduli, tmp_path):
+    """A hundredth of the load: the same within a few per cent of that hundredth; the whole of it runs, and differs."""
+    energies = []
+    for share in (0.01, 1.0):
+        pressed = ["hold:superior", f"pressure:inferior:{0.1 * share}"]
+        words = {"compress": [f"compress:{20.0 * share}%"], "pressure": pressed}
+        model = loaded_model(words[kind], order=order, moduli=moduli)
+        printed = answer(abaqus(model._replace(is_nonlinear=True)), tmp_path)
+        energies.append(energy(printed) / solved_model(model).strain_energy)
+    assert abs(energies[0] - 1.0) < 0.01
+    assert abs(energies[1] - 1.0) > 5.0 * abs(energies[0] - 1.0)

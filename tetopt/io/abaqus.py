@@ -17,6 +17,9 @@ from tetopt.model.model import Model, described, element_facets, elements, mass_
 
 ALL_ELEMENTS = "all_cells"  # the set that results are asked for
 SPRING_PREFIX = "spring-"  # of the sets of one spring each, which are elements behind the cells
+HOTTEST_DEGREES = 1000.0  # for the largest modulus; CalculiX rounds temperatures to some 1e-8 degrees
+# From one temperature to the next, where 1 / modulus is taken for linear in between: off by 5e-5 at most.
+TEMPERATURE_RATIO = 1.02
 LOAD_CARDS = ("*BOUNDARY", "*CLOAD", "*DLOAD")
 # The number of the face opposite each local node: S1 is 1-2-3, S2 is 1-4-2, S3 is 2-4-3, S4 is 3-4-1.
 FACE_NUMBERS = np.array([3, 4, 2, 1])
@@ -43,13 +46,13 @@ def abaqus(model: Model) -> bytes:
     Linear (C3D4) or quadratic (C3D10) tetrahedra. Each facet set is a surface and a node set of its name, the latter
     with midside nodes if there are; each cell set is an element set. "all_cells" are all elements, "material_1", ...
     those of each material. A modulus that varies within cells is a material whose modulus depends on the temperature:
-    at each node the temperature is the modulus, both solvers take it linearly from the corners, and nothing expands.
+    at each node the temperature is the modulus, as thousandths of the largest; both solvers take it linearly from the
+    corners, and nothing expands.
 
     With loads there is a static step for each of theirs, a load case of its own, whose strain energy and reaction
     forces both solvers print: pressure on faces, tractions as forces at nodes and springs from nodes to the ground
     by `tetopt.model.loads.facet_weights`, gravity on all cells. A nonlinear model's steps ask for large deformation, of
-    a neo-Hookean material, since the linear law of Green's strain collapses under pressure; a modulus that varies
-    within cells keeps that law.
+    a neo-Hookean material, since the linear law of Green's strain collapses under pressure.
 
     Numbers read back the same, but for those that take more than 20 characters, which neither solver reads: they are
     rounded to the 13 to 16 digits that fit. Of coordinates these are some of those within 0.1 mm of 0.
@@ -123,22 +126,33 @@ def _materials(model: Model) -> list[str]:
             parts.append(f"*DENSITY\n{_number(densities[k])}\n")
         parts.append(f"*SOLID SECTION, ELSET={name}, MATERIAL={name}\n")
     if model.node_young is not None:
-        temperatures = node_field(model.node_young, model.mesh, model.order)
+        temperatures = _temperatures(model, node_field(model.node_young, model.mesh, model.order))
         parts.append(f"*INITIAL CONDITIONS, TYPE=TEMPERATURE\n{_numbered(_fitting(temperatures))}")
     return parts
 
 
 def _law(model: Model, materials: Materials, k: int) -> str:
-    """The elastic law of a material."""
+    """The elastic law of a material, at each of some temperatures if it depends on them."""
     nu = float(materials.nu[k])
-    if model.node_young is not None:
-        ends = np.unique([model.node_young.min(), model.node_young.max()])
-        return f"*ELASTIC\n{rows(_fitting(ends), np.full(len(ends), nu), _fitting(ends), separator=', ')}"
-    young = float(materials.young[k])
+    if model.node_young is None:
+        young = materials.young[k : k + 1]
+    else:
+        low, high = float(model.node_young.min()), float(model.node_young.max())
+        count = 1 + int(np.ceil(np.log(high / low) / np.log(TEMPERATURE_RATIO))) if model.is_nonlinear else 2
+        young = np.unique(np.geomspace(low, high, count).clip(low, high))
+    temperatures = () if model.node_young is None else (_fitting(_temperatures(model, young)),)
     if not model.is_nonlinear:
-        return f"*ELASTIC\n{_number(young)}, {_number(nu)}\n"
+        constants = (young, np.full(len(young), nu))
+        return f"*ELASTIC\n{rows(*map(_fitting, constants), *temperatures, separator=', ')}"
     # C10 = mu / 2 and D1 = 2 / bulk modulus, so that small strains find the same law.
-    return f"*HYPERELASTIC, NEO HOOKE\n{_number(young / (4.0 + 4.0 * nu))}, {_number(6.0 * (1.0 - 2.0 * nu) / young)}\n"
+    constants = (young / (4.0 + 4.0 * nu), 6.0 * (1.0 - 2.0 * nu) / young)
+    return f"*HYPERELASTIC, NEO HOOKE\n{rows(*map(_fitting, constants), *temperatures, separator=', ')}"
+
+
+def _temperatures(model: Model, young: NDArray[np.float64]) -> NDArray[np.float64]:
+    """The temperatures that stand for moduli."""
+    assert model.node_young is not None
+    return young * (HOTTEST_DEGREES / model.node_young.max())
 
 
 def _springs(model: Model) -> list[str]:
