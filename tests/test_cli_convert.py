@@ -17,6 +17,7 @@ from tetopt.geometry.quadratic import quadratic
 from tetopt.geometry.topology import boundary_facets, largest_component
 from tetopt.io.formats import FORMATS
 from tetopt.model.averages import cell_young
+from tetopt.model.loads import parse_load
 
 LAW = "1 + h/7"
 
@@ -316,6 +317,49 @@ def test_loads_on_what_only_the_final_mesh_may_have_are_no_early_error(folder, t
     assert {path.name for path in tmp_path.iterdir()} == {"a.inp", "b.inp"}
 
 
+def test_loads_of_all_kinds_density_and_moduli_at_nodes_go_on(folder, tmp_path):
+    """Through MPa and LPS and back, into the same CalculiX file as from the first one."""
+    words = [
+        *("hold:superior", "spring:left:0.5", "1/pressure:inferior:0.25", "1/gravity:0,8,-9810"),
+        *("2/traction:inferior:0.5,-2,0.125", "2/move:inferior:free,1,free"),
+    ]
+    loads = [part for word in words for part in ("--load", word)]
+    law = ["--young", LAW, "--density", "1000 + h", "--average", "nodes", "--image", folder / "a.nii.gz"]
+    first, second = tmp_path / "a.vtu", tmp_path / "b.vtu"
+    assert exit_code("convert", folder / "a.vtu", first, *law, *loads) == 0
+    assert exit_code("convert", first, second, "--units", "MPa", "--space", "lps") == 0
+    texts = [json.loads(tetopt.load_mesh(path).text("loads")) for path in (first, second)]
+    assert texts[1][1:4] == ["spring:left:0.0005", "1/pressure:inferior:0.00025", "1/gravity:0.0,-8.0,-9810.0"]
+    assert exit_code("convert", second, tmp_path / "c.vtu") == 0
+    again, before = tetopt.load_mesh(tmp_path / "c.vtu"), tetopt.load_mesh(first)
+    np.testing.assert_allclose(again.point_data["young_nodes"], before.point_data["young_nodes"], rtol=1e-14)
+    np.testing.assert_array_equal(again.cell_data["density"], before.cell_data["density"])
+    assert again.cell_data["density"].min() >= 1000.0
+    for kept, text in zip(json.loads(again.text("loads")), texts[0], strict=True):
+        (load, original) = (parse_load(words, 3) for words in (kept, text))
+        assert (load.kind, load.set_name, load.step) == (original.kind, original.set_name, original.step)
+        np.testing.assert_allclose(load.numbers, original.numbers, rtol=1e-14)
+    for name, path in (("c.inp", tmp_path / "c.vtu"), ("first.inp", first)):
+        assert exit_code("convert", path, tmp_path / name) == 0
+    steps = [(tmp_path / name).read_text().partition("*STEP")[2] for name in ("c.inp", "first.inp")]
+    assert steps[0].count("*STEP") == 1
+    assert "*INITIAL CONDITIONS, TYPE=TEMPERATURE" in (tmp_path / "c.inp").read_text()
+    numbers = [np.array(re.findall(r"-?\d+\.\d+(?:e-?\d+)?", step), dtype=float) for step in steps]
+    np.testing.assert_allclose(*numbers, rtol=1e-12)
+    # Other moduli take the place of those at the nodes.
+    assert exit_code("convert", first, tmp_path / "d.vtu", "--bins", "3") == 0
+    assert "young_nodes" not in tetopt.load_mesh(tmp_path / "d.vtu").point_data
+
+
+def test_large_deformation_and_means_over_cells_are_said(folder, tmp_path, capsys):
+    law = ["--young", LAW, "--average", "nodes", "--image", folder / "a.nii.gz", "--load", "compress:5%"]
+    assert exit_code("convert", folder / "a.vtu", tmp_path / "a.inp", *law, "--nonlinear") == 0
+    assert "*STEP, NLGEOM" in (tmp_path / "a.inp").read_text()
+    assert "linear within cells" in capsys.readouterr().out
+    assert exit_code("convert", folder / "a.vtu", tmp_path / "a.scn", *law) == 0
+    assert "one modulus a cell: the mean" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     "text", ['[["left", null]]', '[["left", [[1,2,3]]]]', "[" * 100_000, "{}", "3", '[["gone", [0,0,1]]]']
 )
@@ -371,6 +415,15 @@ def test_loads_run_or_are_said_to_be_in_comments(folder, tmp_path, capsys):
         ("a.inp", ["--young", "1=2"], "the mesh also has 0 (1 more)"),
         ("a.inp", ["--crop", "1:3,:,:"], "--crop: there is no --image"),
         ("a.inp", ["--young", "2", "--load", "gravity:0,0,-9810"], "gravity: the cells have no density"),
+        ("a.vtu", ["--young", "2", "--nonlinear"], "--nonlinear is for .inp, .feb only"),
+        (
+            "a.inp",
+            ["--young", "2", "--load", "1/hold:left", "--load", "2/hold:left", "--nonlinear"],
+            "one nonlinear step",
+        ),
+        ("a.inp", ["--young", "2", "--load", "pressure:nowhere:1"], 'no set of facets "nowhere"'),
+        ("a.inp", ["--young", "2", "--load", "spring:left:-1"], "stiffness above 0"),
+        ("a.inp", ["--young", "2", "--load", "pressure:interface_0_1:1"], "lie between two cells"),
         ("a.inp", ["--density", "1000"], "--density: there is no --young"),
         ("a.inp", ["--young", "2", "--density", "-h"], "expected kg/m3 above 0"),
         ("a.inp", ["--young", "2", "--load", "2/hold:left"], "no load is of step 1 alone"),

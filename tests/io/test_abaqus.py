@@ -222,23 +222,14 @@ def test_what_the_format_cannot_carry_is_refused():
 
 
 def test_each_load_has_its_card_and_steps_begin_anew():
-    words = [
-        "hold:superior",
-        "1/pressure:inferior:0.5",
-        "1/gravity:0,0,-9810",
-        "2/traction:inferior:0,0,2",
-        "spring:left:3",
-    ]
-    model = loaded_model(words)
+    words = ["hold:superior", "1/pressure:inferior:0.5", "1/gravity:0,0,-9810", "2/traction:inferior:0,0,2"]
+    model = loaded_model([*words, "spring:left:3"])
     blocks = blocks_of(abaqus(model))
     steps = [k for k, (word, _, _) in enumerate(blocks) if word == "*STEP"]
     first, second = blocks[steps[0] : steps[1]], blocks[steps[1] :]
     for step in (first, second):
-        assert [word for word, parameters, _ in step if parameters == {"OP": "NEW"}] == [
-            "*BOUNDARY",
-            "*CLOAD",
-            "*DLOAD",
-        ]
+        anew = [word for word, parameters, _ in step if parameters == {"OP": "NEW"}]
+        assert anew == ["*BOUNDARY", "*CLOAD", "*DLOAD"]
     data = [{word: lines for word, _, lines in step} for step in (first, second)]
     assert not data[0]["*CLOAD"]
     assert not data[1]["*DLOAD"]
@@ -255,9 +246,7 @@ def test_each_load_has_its_card_and_steps_begin_anew():
     nodes, stiffness = spring_constants(model.mesh, model.sets, model.loads[4])
     assert [line[0][0] for line in springs] == ["1", "2", "3"] * len(nodes)
     assert [float(line[1][0]) for line in springs] == np.repeat(stiffness, 3).tolist()
-    numbers = [
-        int(line[0]) for word, parameters, lines in blocks for line in lines if parameters.get("TYPE") == "SPRING1"
-    ]
+    numbers = [int(lines[0][0]) for _, parameters, lines in blocks if parameters.get("TYPE") == "SPRING1"]
     assert numbers == list(range(len(model.mesh.cells) + 1, len(model.mesh.cells) + 1 + 3 * len(nodes)))
     assert {lines[0][0] for word, _, lines in blocks if word == "*DENSITY"} == {"1e-06", "1.5e-06"}
 
@@ -279,12 +268,9 @@ def test_a_modulus_that_varies_is_one_that_depends_on_the_temperature(order):
 
 
 def test_steps_that_a_file_cannot_tell_apart_are_refused():
+    some = ["hold:superior", "1/spring:left:1", "2/pressure:left:1"]
     for words, nonlinear, match in (
-        (
-            ["hold:superior", "1/spring:left:1", "2/pressure:left:1"],
-            False,
-            "springs are in every step, got 1/spring:left:1",
-        ),
+        (some, False, "springs are in every step, got 1/spring:left:1"),
         (["1/hold:superior", "2/hold:inferior"], True, "one nonlinear step, got 2"),
     ):
         with pytest.raises(InputError, match=match):

@@ -9,6 +9,7 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
+from numpy.typing import NDArray
 from rich.markup import escape
 
 from tetopt import Image, InputError
@@ -29,9 +30,10 @@ from tetopt.io.frd import read_frd
 from tetopt.io.images import sha256
 from tetopt.io.meshes import MeshFile
 from tetopt.io.vtk import box_text
-from tetopt.model.fields import cell_fields, is_result, is_stress
+from tetopt.model.fields import NODE_MODULI, cell_fields, is_result, is_stress
+from tetopt.model.laws import checked_young
 from tetopt.model.loads import load_words, parse_load
-from tetopt.model.model import STRESS_UNITS, half_turned, scaled
+from tetopt.model.model import STRESS_UNITS, Model, half_turned, scaled
 from tetopt.model.sets import box_of
 from tetopt.report.summary import model_summary, versions
 from tetopt.target.align import aligned_mask
@@ -91,7 +93,7 @@ def convert_command(
         fields = {name: values for name, values in fields.items() if name not in MATERIAL_FIELDS}
     known_sets = all_sets(loaded.mesh, box, fields, loaded.sets)
     model = solver_model(loaded.mesh, image, solver, fields, about, known_sets)
-    model = model._replace(point_data=loaded.point_data)
+    model = _with_point_data(model, loaded.point_data, solver)
     save_for_solver(output, model, solver)
     if json_path is not None:
         files = {"mesh": mesh_path.name, "output": output.name, "units": solver.units, "space": solver.space}
@@ -99,6 +101,15 @@ def convert_command(
         save_json(json_path, files | {"versions": versions()} | model_summary(model))
     print_model(output, model, solver)
     return 0
+
+
+def _with_point_data(model: Model, point_data: dict[str, NDArray], solver: SolverOptions) -> Model:
+    """The model with what the mesh's file has at nodes: its moduli, too, unless --young or --bins makes others."""
+    others = {name: values for name, values in point_data.items() if name != NODE_MODULI}
+    moduli = point_data.get(NODE_MODULI)
+    if moduli is None or solver.young is not None or solver.bins is not None or model.materials is None:
+        return model._replace(point_data=others)
+    return model._replace(point_data=others, node_young=checked_young(moduli[: len(model.mesh.points)]))
 
 
 def _with_results(loaded: MeshFile, path: Path) -> MeshFile:

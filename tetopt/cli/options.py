@@ -279,6 +279,9 @@ class SolverOptions:
             "--load",
         ),
     ] = None
+    nonlinear: Annotated[
+        bool, typer.Option("--nonlinear", help="The step is of large deformation (.inp; FEBio's always is).")
+    ] = False
     order: Annotated[
         int | None, option("1|2", "2: quadratic cells, straight-edged; 1: linear. By default as the mesh read, else 1.")
     ] = None

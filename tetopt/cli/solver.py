@@ -20,7 +20,7 @@ from tetopt.io.formats import FORMATS, file_bytes, format_of, save_model
 from tetopt.model.averages import DEFAULT_AVERAGE, parse_average
 from tetopt.model.build import labels_of, model_of
 from tetopt.model.laws import parse_any_law
-from tetopt.model.loads import check_steps, known_set, load_words, parse_load
+from tetopt.model.loads import check_steps, count_of_steps, known_set, load_words, parse_load
 from tetopt.model.materials import DEFAULT_NU, Spacing
 from tetopt.model.model import SPACES, STRESS_UNITS, Model, element_facets, elements
 from tetopt.model.sets import Box, Sets, check_free_names, merged_sets, parse_set, standard_sets
@@ -54,6 +54,8 @@ def check_solver_options(output: Path, solver: SolverOptions, has_materials: boo
         raise InputError(f"--units: expected {' or '.join(STRESS_UNITS)}, got {solver.units}")
     if solver.space not in SPACES:
         raise InputError(f"--space: expected {' or '.join(SPACES)}, got {solver.space}")
+    if solver.nonlinear and not form.has_large:
+        raise InputError(f"{output}: --nonlinear is for {', '.join(s for s, f in FORMATS.items() if f.has_large)} only")
     if solver.order not in (None, 1, 2):
         raise InputError(f"--order: expected 1 or 2, got {solver.order}")
     if solver.order == 2 and not form.has_quadratic:
@@ -90,11 +92,12 @@ def solver_model(
         log.print(f"nu: of --young or {DEFAULT_NU:g}; what the mesh's file has is left")
     fields = {name: values for name, values in cell_data.items() if name not in MATERIAL_FIELDS}
     bins, spacing = parsed_bins(solver.bins)
-    return model_of(
+    model = model_of(
         mesh, image, young=young, nu=nu, density=density, average=solver.average, sets=solver.sets or (),
         loads=solver.loads or (), bins=bins, spacing=spacing, order=solver.order or 1, cell_data=fields,
         known_sets=known_sets, about={"tetopt": tetopt.__version__, **about},
     )  # fmt: skip
+    return model._replace(is_nonlinear=solver.nonlinear)
 
 
 def all_sets(mesh: Mesh, box: Box | None, fields: dict[str, NDArray], own: Sets, is_told: bool = True) -> Sets:
@@ -175,8 +178,17 @@ def _lines(output: Path, model: Model, solver: SolverOptions) -> Iterator[str]:
     if materials is not None and materials.binning is not None:
         mean, largest = materials.binning.mean, materials.binning.largest
         yield f"bins: modulus off by {mean:.2%} in the mean by volume, {largest:.2%} at most"
+    if model.node_young is not None and not form.is_surface:
+        low, high = model.node_young.min(), model.node_young.max()
+        yield (
+            f"the modulus is linear within cells, {low:.4g} to {high:.4g} kPa at their corners"
+            if form.has_node_moduli
+            else "the format has one modulus a cell: the mean of what is linear between the corners"
+        )
     for load in () if form.is_surface else model.loads:
         yield f"load: {load_words(load)}"
+    if (n_steps := count_of_steps(model.loads)) > 1 and not form.is_surface:
+        yield f"{n_steps} steps, each from the undeformed state"
     if model.loads and not (form.runs or form.is_surface):
         yield "the format runs no step: the loads are in the file as text"
     low, high = model.mesh.points.min(axis=0), model.mesh.points.max(axis=0)

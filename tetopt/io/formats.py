@@ -28,16 +28,18 @@ class Format(NamedTuple):
     has_quadratic: bool = False
     runs: bool = False  # whether loads become a step that the solver runs; else they are words in the file
     is_surface: bool = False  # holds the boundary alone
+    has_node_moduli: bool = False  # else a modulus that varies within cells is its mean over each
+    has_large: bool = False  # whether a step can ask for large deformation
 
 
 FORMATS = {
-    ".vtu": Format("VTK, ParaView", vtu, has_quadratic=True),
-    ".vtk": Format("legacy VTK, 3D Slicer", vtk, has_quadratic=True),
-    ".xdmf": Format("XDMF with tags, FEniCSx", xdmf, has_quadratic=True),
+    ".vtu": Format("VTK, ParaView", vtu, has_quadratic=True, has_node_moduli=True),
+    ".vtk": Format("legacy VTK, 3D Slicer", vtk, has_quadratic=True, has_node_moduli=True),
+    ".xdmf": Format("XDMF with tags, FEniCSx", xdmf, has_quadratic=True, has_node_moduli=True),
     ".msh": Format("gmsh 4.1", gmsh41, has_quadratic=True),
     ".msh2": Format("gmsh 2.2", gmsh22, has_quadratic=True),
-    ".inp": Format("Abaqus, CalculiX", abaqus, has_quadratic=True, runs=True),
-    ".feb": Format("FEBio 4.0", febio, has_quadratic=True, runs=True),
+    ".inp": Format("Abaqus, CalculiX", abaqus, has_quadratic=True, runs=True, has_node_moduli=True, has_large=True),
+    ".feb": Format("FEBio 4.0", febio, has_quadratic=True, runs=True, has_large=True),
     ".scn": Format("SOFA scene", sofa, runs=True),
     ".mfem": Format("MFEM mesh", mfem, has_quadratic=True),
     ".mesh": Format("medit", medit, has_quadratic=True),

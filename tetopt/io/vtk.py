@@ -28,7 +28,7 @@ from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
 from tetopt.geometry.quadratic import quadratic
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.model.fields import is_stress, node_field
+from tetopt.model.fields import NODE_MODULI, is_stress, node_field
 from tetopt.model.loads import load_words
 from tetopt.model.model import Model, element_facets, elements
 from tetopt.model.sets import SET_NAME, Box, Sets
@@ -131,6 +131,8 @@ def model_grid(model: Model) -> pyvista.UnstructuredGrid:
             grid.cell_data["density"] = model.materials.density[of_cell]
         if model.materials.binning is not None:
             texts["binning"] = model.materials.binning._asdict()
+    if model.node_young is not None:
+        grid.point_data[NODE_MODULI] = node_field(model.node_young, model.mesh, model.order)
     if model.materials is not None or model.loads or any(map(is_stress, [*model.cell_data, *model.point_data])):
         texts["units"] = model.units
     if model.loads:

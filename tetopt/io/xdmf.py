@@ -60,7 +60,7 @@ from tetopt.errors import InputError
 from tetopt.geometry.topology import facets
 from tetopt.io.tags import Tagged, as_scalars, tagged
 from tetopt.io.text import rows
-from tetopt.model.fields import node_field
+from tetopt.model.fields import NODE_MODULI, node_field
 from tetopt.model.loads import load_words
 from tetopt.model.model import Model, described, element_facets, elements
 
@@ -122,7 +122,9 @@ def _mesh_grid(model: Model) -> str:
         fields = own | {name: values for name, values in fields.items() if name not in own}
         table = _information("young", _listed(young)) + _information("nu", _listed(nu))
     points, cells = elements(model)
-    at_nodes = {name: node_field(values, model.mesh, model.order) for name, values in model.point_data.items()}
+    nodal = {} if model.node_young is None else {NODE_MODULI: model.node_young}
+    nodal |= model.point_data
+    at_nodes = {name: node_field(values, model.mesh, model.order) for name, values in nodal.items()}
     attributes = "".join(_attributes(_columns(each), of) for each, of in ((fields, "Cell"), (at_nodes, "Node")))
     return _grid("mesh", model, model.mesh.ndim, cells, _item(points), attributes, table)
 

@@ -17,7 +17,8 @@ from tetopt.mesh import Mesh
 # Fields that depend on the world's axes or on the unit of stress, by name; a suffix such as _step2 may follow.
 VECTOR_FIELDS = ("displacement",)
 TENSOR_FIELDS = ("strain", "stress", "strain_nodes", "stress_nodes")
-STRESS_FIELDS = ("young", "stress", "von_mises", "stress_nodes", "von_mises_nodes")
+NODE_MODULI = "young_nodes"  # point data of our files: moduli that are linear within cells
+STRESS_FIELDS = ("young", NODE_MODULI, "stress", "von_mises", "stress_nodes", "von_mises_nodes")
 HALF_TURN = np.array([-1.0, -1.0, 1.0])  # about z, from RAS+ to LPS+ or back
 
 
