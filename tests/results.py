@@ -5,17 +5,14 @@ from pathlib import Path
 
 import numpy as np
 from meshes import FIVE_TET_CUBE
-from models import sample_image, young_of
-from scipy.sparse.linalg import spsolve
+from models import sample_image
 
 import tetopt
 from tetopt import Mesh
-from tetopt.fem.elasticity import constrained
-from tetopt.geometry.quadratic import quadratic, quadratic_facet_nodes
+from tetopt.fem.solution import solved_model as tetopt_solution
 from tetopt.io.abaqus import abaqus
 from tetopt.model.build import model_of
 from tetopt.model.model import in_space, in_units
-from tetopt.model.sets import facet_triples
 
 NU = 0.3
 FOLDER = Path(__file__).parent / "io" / "frd"
@@ -34,44 +31,17 @@ def solved_model(order):
         points, cells = FIVE_TET_CUBE
         mesh = Mesh(points * [20.0, 25.0, 31.0] + [-31.7, 12.3, 101.1], cells)
     young = 1.0 + np.arange(len(mesh.cells)) % 5
-    return model_of(mesh, young=young, nu=NU, loads=["hold:inferior", move(CASES[order][2][0])], order=order)
-
-
-def move(vector):
-    return f"move:superior:{','.join(map(str, vector))}"
+    moves = [f"{k}/move:superior:{','.join(map(str, u))}" for k, u in enumerate(CASES[order][2], start=1)]
+    return model_of(mesh, young=young, nu=NU, loads=["hold:inferior", *moves], order=order)
 
 
 def input_file(order):
     """The bytes that CalculiX reads."""
-    units, space, vectors = CASES[order]
-    model = solved_model(order)
-    first, *others = (
-        abaqus(in_units(in_space(model._replace(loads=loads_of(model, vector)), space), units)).decode()
-        for vector in vectors
-    )
-    steps = [text[text.index("*STEP") :].replace("*BOUNDARY", "*BOUNDARY, OP=NEW") for text in others]
-    return "".join([first, *steps]).encode()
+    units, space, _ = CASES[order]
+    return abaqus(in_units(in_space(solved_model(order), space), units))
 
 
-def loads_of(model, vector):
-    """The model's loads with "superior" moved so."""
-    return tuple(
-        load._replace(numbers=np.array(vector)) if load.set_name == "superior" else load for load in model.loads
-    )
-
-
+@cache
 def our_displacement(order, step):
     """At the nodes of the order, by our own elements."""
-    model = solved_model(order)
-    nodes = len(quadratic(model.mesh.points, model.mesh.cells)[0]) if order == 2 else len(model.mesh.points)
-    is_given, values = np.zeros((nodes, 3), dtype=bool), np.zeros((nodes, 3))
-    cells = quadratic(model.mesh.points, model.mesh.cells)[1] if order == 2 else model.mesh.cells
-    for load in loads_of(model, CASES[order][2][step - 1]):
-        at = np.unique(
-            (quadratic_facet_nodes if order == 2 else facet_triples)(cells, model.sets.facets[load.set_name])
-        )
-        is_given[at], values[at] = True, load.numbers
-    K = constrained(model.mesh, young_of(model), NU, is_given, values, order=order).K
-    free, u = np.flatnonzero(~is_given), values.ravel()
-    u[free] = spsolve(K[free][:, free].tocsc(), -(K @ u)[free])
-    return u.reshape(-1, 3)
+    return tetopt_solution(solved_model(order), step).u

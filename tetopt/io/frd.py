@@ -17,6 +17,7 @@ import pyvista
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
+from tetopt.fem.solution import von_mises
 from tetopt.geometry.quadratic import quadratic
 from tetopt.mesh import Mesh
 from tetopt.model.fields import half_turned_fields, stresses_times
@@ -195,6 +196,5 @@ def _on_mesh(arrays: dict[str, NDArray[np.float64]]) -> dict[str, NDArray[np.flo
         point_data["strain_nodes"] = arrays["TOSTRAIN"][:, TENSOR_ROWS]
     if "STRESS" in arrays:
         stress = arrays["STRESS"][:, TENSOR_ROWS]
-        deviator = stress - stress[:, [0, 4, 8]].mean(axis=1)[:, None] * np.eye(3).ravel()
-        point_data |= {"stress_nodes": stress, "von_mises_nodes": np.sqrt(1.5 * (deviator**2).sum(axis=1))}
+        point_data |= {"stress_nodes": stress, "von_mises_nodes": von_mises(stress.reshape(-1, 3, 3))}
     return point_data
