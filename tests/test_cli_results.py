@@ -56,6 +56,18 @@ def test_the_page_shows_them(folder, order):
     assert {field["name"] for field in data["fields"]} >= {"displacement", "von_mises_nodes", "mean", "heat"}
 
 
+def test_the_page_has_the_reactions_of_the_file(tmp_path):
+    mesh = solved_model(1).mesh
+    about = {"reactions": {"superior": [1, 2, 3.5]}, "reactions_step2": [1], "reactions_step3": {"a": ["x", 1, 2]}}
+    about |= {"reactions_step4": {"superior": [0.0, float("nan"), 1.0]}}
+    rest = {"displacement": 0.1 * mesh.points}
+    tetopt.save_mesh(tmp_path / "a.vtu", mesh, {"mean": np.ones(len(mesh.cells))}, about, rest)
+    assert exit_code("view", tmp_path / "a.vtu", "--html", tmp_path / "a.html") == 0
+    page = (tmp_path / "a.html").read_text(encoding="utf-8")
+    data = json.loads(re.search(r'id="data">(.*?)</script>', page, re.DOTALL).group(1))
+    assert data["reactions"] == {"0": {"superior": [1.0, 2.0, 3.5]}}
+
+
 @pytest.mark.parametrize("order", [1], indirect=True)
 def test_refusals_write_nothing(folder, capsys):
     def refused(words, *arguments):

@@ -187,6 +187,12 @@ const warped = async () => {
   said.picked = $("picked").innerText;
   put("field", $("field").children[1].value);
   await frame();
+  put("set", 0);
+  said.reactions = [$("reaction").textContent];
+  put("step", 1);
+  said.reactions.push($("reaction").textContent);
+  put("set", 1);
+  said.reactions.push($("reaction").textContent);
   said.grey = grid().some(([, , ...rgb]) => rgb.join() === "170,170,170");
   return said;
 };
@@ -291,7 +297,8 @@ def shown(tmp_path_factory, mesh, cell_data, image):
         results = pressed(mesh) if title in ("warped", "narrow") else {}
         if title == "narrow":  # of one step
             del results["displacement_step2"]
-        text = explorer_html(exhibit(mesh, cell_data, image, title, sets, results))
+        forces = {1: {"outer": [3.0, -4.0, 0.0]}, 2: {"outer": [0.0, 0.5, 1234.56]}}
+        text = explorer_html(exhibit(mesh, cell_data, image, title, sets, results, forces))
         copied(text, folder / f"{title}.html", FRAMES + BLIND if title == "blind" else FRAMES, probe)
     frame = copied(FRAME, folder / "frame.html")
     said = re.findall(r'data-(page|warped|blind|narrow)="([^"]*)"', document(frame, "--window-size=1500,2300"))
@@ -496,6 +503,10 @@ def test_the_second_step_is_drawn_interpolated_and_picked(shown, mesh):
     x, y, z = map(float, re.search(r"centroid \(RAS, mm\)\t(\S+), (\S+), (\S+)", page["picked"]).groups())
     np.testing.assert_allclose([x, y, z], mesh.points[mesh.cells[cell]].mean(axis=0), atol=0.051)  # at rest
     assert page["grey"]  # nodes without a value
+    second, first, none = page["reactions"]
+    assert second == "held by 1,235 mN: R 0, A 0.5, S 1,235"
+    assert first == "held by 5 mN: R 3, A -4, S 0"
+    assert none == ""
 
 
 def test_labels_have_a_legend(shown, mesh, cell_data):

@@ -170,7 +170,8 @@ def bent(opengl, mesh, cell_data):
     z = (mesh.points[:, 2] - mesh.points[:, 2].min()) / np.ptp(mesh.points[:, 2])
     steps = [np.outer(z**2, [1.0, 0.5, 0.0]), np.outer(z, [0.0, -2.0, 0.3])]
     data = {"displacement": steps[0], "displacement_step2": steps[1], "von_mises_nodes": z, "von_mises_nodes_step2": -z}
-    opened = plotter(exhibit(mesh, cell_data, point_data=data), off_screen=True)
+    sets, forces = {"outside": boundary_facets(mesh.cells)}, {2: {"outside": [1.5, 0.0, -2.0]}}
+    opened = plotter(exhibit(mesh, cell_data, None, "bent", sets, data, forces), off_screen=True)
     yield opened, steps
     opened.close()
 
@@ -218,5 +219,8 @@ def test_a_field_of_the_nodes_is_interpolated_and_goes_with_the_step(bent, mesh)
     slide(window, 1, -0.5)  # cells by the mean of their nodes
     within = int((-z[mesh.cells].astype(np.float32).mean(axis=1) >= -0.5 - 1e-6).sum())
     assert window.actors["count"].get_text(2).startswith(f"{within:,} of ")
+    press(window, "h")
+    held = "deformation x 1, step 2\noutside is held by R 1.5, A 0, S -2 mN"
+    assert window.actors["count"].get_text(2).endswith(held)
     press(window, "s")
     assert window.actors["count"].get_text(2).endswith("deformation x 1, step 1")

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import json
+import re
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 from rich.markup import escape
 
@@ -13,6 +16,7 @@ from tetopt.cli.console import out
 from tetopt.cli.inputs import check_no_input, read_image, read_mesh, warn_of_other_image
 from tetopt.cli.options import BoxPart, ForceOption, option
 from tetopt.io.files import checked_output
+from tetopt.io.meshes import MeshFile
 from tetopt.model.build import labels_of
 from tetopt.model.fields import cell_fields
 from tetopt.model.sets import facet_triples, merged_sets, standard_sets
@@ -47,7 +51,7 @@ def view_command(
     triples = {name: facet_triples(mesh.cells, rows) for name, rows in sets.items()}
     from tetopt.report.exhibit import exhibit  # matplotlib and pyvista are slow to load, and only needed here
 
-    shown = exhibit(mesh, fields, image, mesh_path.name, triples, loaded.point_data)
+    shown = exhibit(mesh, fields, image, mesh_path.name, triples, loaded.point_data, _reactions(loaded))
     if html is None:
         from tetopt.report.window import show
 
@@ -58,3 +62,20 @@ def view_command(
     save_explorer(html, shown)
     out.print(escape(f"{html}: open it in a browser; {html.stat().st_size / 1e6:.1f} MB, needs nothing else"))
     return 0
+
+
+def _reactions(loaded: MeshFile) -> dict[int, dict[str, list[float]]]:
+    """The forces that hold sets, mN by step, that a file of `tetopt fem` states."""
+    reactions = {}
+    for key in loaded.field_data:
+        match = re.fullmatch(r"reactions(?:_step(\d+))?", key)
+        if match is None:
+            continue
+        try:
+            by_set = json.loads(loaded.text(key) or "{}")
+            forces = {str(name): [float(x) for x in force] for name, force in by_set.items() if len(force) == 3}
+        except (TypeError, ValueError, AttributeError, RecursionError):  # another program's
+            continue
+        if np.isfinite([*forces.values()]).all():
+            reactions[int(match[1] or 1)] = forces
+    return reactions

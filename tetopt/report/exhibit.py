@@ -56,6 +56,7 @@ class Exhibit(NamedTuple):
     title: str
     sets: dict[str, NDArray]  # (K, 3) integer: the nodes of facets, by name
     displacements: dict[int, NDArray[np.float64]]  # (N, 3) mm by step; of the only one under 0
+    reactions: dict[int, dict[str, list[float]]]  # by step likewise, and set: (3,) mN that hold it
 
 
 def exhibit(
@@ -65,6 +66,7 @@ def exhibit(
     title: str = "mesh",
     facet_sets: dict[str, NDArray] | None = None,
     point_data: dict[str, NDArray] | None = None,
+    reactions: dict[int, dict[str, list[float]]] | None = None,
 ) -> Exhibit:
     """What is shown of a mesh and its data.
 
@@ -85,6 +87,8 @@ def exhibit(
         By name; the first N rows are the mesh's nodes', what follows (the middles of quadratic cells' edges) is not
         drawn. Data of one number a node are quantities. "displacement" (3 columns, mm) deforms the mesh, and its length
         is a field; with "displacement_step2" and so on there are steps, and data with such an end are of that step.
+    reactions : dict, optional
+        By step, from 1, and facet set: the force that holds it, three numbers, mN.
 
     Raises
     ------
@@ -111,7 +115,8 @@ def exhibit(
     fields += [_field(name, values) for name, values in (scalars or cell_fields(mesh, image)).items()]
     skipped = [name for name in cell_data if name not in scalars] + others
     checked = _checked_sets(mesh, facet_sets or {})
-    return Exhibit(mesh, _by_step(fields, displacements), skipped, image, title, checked, displacements)
+    forces = {step if len(displacements) > 1 else 0: by_set for step, by_set in (reactions or {}).items()}
+    return Exhibit(mesh, _by_step(fields, displacements), skipped, image, title, checked, displacements, forces)
 
 
 def warp_factors(shown: Exhibit) -> tuple[float, float]:

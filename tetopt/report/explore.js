@@ -299,6 +299,13 @@ function explore(gl, data, notes) {
     else $("by").value = by;
     chooseField(field);
     showPicked();
+    showReaction();
+  }
+
+  function showReaction() {
+    const force = state.set < 0 ? null : (data.reactions[state.step] || {})[sets[state.set].name];
+    const parts = force && force.map((value, k) => `${SIDES[k][0]} ${number(value, 4)}`).join(", ");
+    $("reaction").textContent = force ? `held by ${number(Math.hypot(...force), 4)} mN: ${parts}` : "";
   }
 
   function showCut() {
@@ -407,7 +414,7 @@ function explore(gl, data, notes) {
   }
 
   fill("set", [["none", -1], ...sets.map((set, i) => [`${set.name} (${set.triangles.length / 3})`, i])],
-    (set) => change({ set }));
+    (set) => { change({ set }); showReaction(); });
   $("marking").hidden = !sets.length;
   $("imaging").hidden = !image;
   choose("axis", [["none", -1], ["sagittal", 0, "across R-L"], ["coronal", 1, "across A-P"],

@@ -86,7 +86,7 @@ class _Scene:
         mesh, image = self.mesh, self.image = shown.mesh, shown.image
         self.sides = facets(mesh.cells)
         self.volumes = volumes(mesh.points, mesh.cells)
-        self.displacements = shown.displacements
+        self.displacements, self.reactions = shown.displacements, shown.reactions
         self.step = next(iter(self.displacements), 0)  # of the loads
         self.warp, self.most_warp = warp_factors(shown)
         self.deform()
@@ -162,6 +162,10 @@ class _Scene:
         text = f"{count:,} of {len(self.mesh.cells):,} cells, {volume:,.7g} mm³; world RAS, mm"
         if self.displacements:
             text += f"\ndeformation x {self.warp:.4g}" + (f", step {self.step}" if self.step else "")
+        name = list(self.sets)[self.set - 1] if self.set else ""
+        if force := self.reactions.get(self.step, {}).get(name):
+            parts = ", ".join(f"{letter} {value:.4g}" for letter, value in zip(AXIS_LETTERS, force, strict=True))
+            text += f"\n{name} is held by {parts} mN"
         self.window.add_text(text, name="count", font_size=10, color="black", position="upper_left", render=False)
         self.window.render()
 
