@@ -22,7 +22,7 @@ from tetopt.energy.sampling import few_threads
 
 CHUNK_VOXELS = 128  # of a row at once: 48 rows of them stay in the first cache
 SLAB_PLANES = 4  # a plane in this many is written by two slabs; more planes leave threads idle at the end
-VOXELS_PER_TASK = 8  # as `few_threads` counts: a voxel's product takes some 20 ns
+VOXELS_PER_TASK = 32  # as `few_threads` counts: a voxel takes some 20 ns, and waking a thread up to 1 ms if others run
 
 
 class Terms(NamedTuple):

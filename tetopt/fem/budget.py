@@ -1,0 +1,105 @@
+"""How fine a reference's grid may be: as many degrees of freedom as fit a time, and the memory that is free."""
+
+from __future__ import annotations
+
+import os
+import re
+import time
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.errors import InputError
+from tetopt.fem.reference import averaged, reference
+from tetopt.fem.voxels import Grid, grid_of, multigrid_of, preconditioned, stiffness_product
+from tetopt.image import Image
+
+STEP_GROWTH = 1.02  # between voxel sizes that are tried for the reference's grid: it misses the limit by under 6 %
+TRIAL_DOFS = 50_000  # of the grid whose iterations are counted: finer ones take hardly more
+TIMED_DOFS = 3_000_000  # of the grid on which an iteration is timed: larger than the processor's caches
+SOLUTION_SHARE = 1.6  # iterations of all of a reference over those of its solution: homogeneous block, half resolution
+LEAST_DOFS = 1_000  # however little time there is
+BYTES_PER_DOF = 100  # resident, of a solution and all that is made of it; 70 were measured at 27 million, 110 at 3 million
+FREE_SHARE = 0.8  # of the memory that is free may be taken
+
+
+class Budget(NamedTuple):
+    """What `affordable_dofs` returns."""
+
+    dofs: int  # that fit
+    is_short_of_memory: bool  # whether it was the memory that set them, not the time
+
+
+def reference_shape(shape: Sequence[int], spacing: NDArray[np.float64], dofs: int) -> tuple[int, ...]:
+    """The finest grid of nearly cubic voxels over the image's box of `dofs` or fewer, no finer than the image."""
+    n = len(shape)
+    size = np.array(shape) * spacing
+    step = spacing.min()
+    while True:
+        coarse = np.clip(np.rint(size / np.maximum(step, spacing)), 1, shape).astype(int)
+        if n * np.prod(coarse + 1) <= dofs:
+            return tuple(int(c) for c in coarse)
+        step *= STEP_GROWTH
+
+
+def affordable_dofs(modulus: Image, nus: Sequence[float], seconds: float, percent: float = 1.0) -> Budget:
+    """How many degrees of freedom the references for all of `nus` may have, to be solved in about `seconds`.
+
+    Iterations are counted on a small grid of the same moduli, since finer ones take hardly more, and one is timed on a
+    large one. So the choice differs a little from run to run; write it down to repeat it.
+
+    Parameters
+    ----------
+    modulus : Image
+        kPa, at the image's own resolution.
+    nus : sequence of float
+    seconds : float
+        Of wall time, on this machine as busy as it is now; above 0.
+    percent : float
+        As of `tetopt.fem.reference.reference`.
+
+    Raises
+    ------
+    InputError
+        `seconds` not above 0; as `reference`.
+    """
+    if not 0.0 < seconds < float("inf"):
+        raise InputError(f"reference: expected more than 0 seconds, got {seconds}")
+    whole = modulus.ndim * int(np.prod(np.array(modulus.shape) + 1))
+    if whole <= LEAST_DOFS:
+        return Budget(whole, False)
+    trial = averaged(modulus, reference_shape(modulus.shape, modulus.spacing, TRIAL_DOFS))
+    iterations = sum(reference(trial, nu, percent).work.iterations for nu in nus)
+    timed = averaged(modulus, reference_shape(modulus.shape, modulus.spacing, TIMED_DOFS))
+    in_time = seconds / (SOLUTION_SHARE * max(iterations, 1) * seconds_of_iteration(grid_of(timed, nus[0])))
+    free = free_bytes()
+    # The references stay, all of them, with two fields each.
+    in_memory = np.inf if free is None else FREE_SHARE * free / (BYTES_PER_DOF + 16.0 * (len(nus) - 1))
+    return Budget(max(LEAST_DOFS, int(min(in_time, in_memory, whole))), bool(in_memory < min(in_time, whole)))
+
+
+def seconds_of_iteration(grid: Grid) -> float:
+    """Wall time of one iteration for each degree of freedom: a cycle and a product."""
+    hierarchy, r = multigrid_of(grid), grid.nodes()
+    r[:, 1:-1] = 1.0
+    times = []
+    for _ in range(4):
+        begin = time.perf_counter()
+        stiffness_product(grid, preconditioned(hierarchy, r, 1.0).astype(np.float64))
+        times.append(time.perf_counter() - begin)
+    return float(np.median(times[1:])) / r.size  # the first may compile
+
+
+def free_bytes() -> int | None:
+    """Memory that could be had without swapping, where the system says so."""
+    table = Path("/proc/meminfo")
+    if table.is_file():
+        row = re.search(r"^MemAvailable: +(\d+) kB", table.read_text(encoding="ascii"), re.M)
+        if row is not None:
+            return 1024 * int(row.group(1))
+    if "SC_PHYS_PAGES" in getattr(os, "sysconf_names", {}):
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return None
