@@ -7,9 +7,10 @@ import pytest
 
 import tetopt
 from tetopt.cli import main
+from tetopt.fem.budget import Budget
 from tetopt.study import compare
 from tetopt.study.compare_files import COMPARE_PICTURES
-from tetopt.study.compare_report import Attempt, as_json, from_json
+from tetopt.study.compare_report import Attempt, ImageSource, Settings, as_json, from_json
 
 SMALL = ["--nodes", "150", "--repeats", "2", "--reference-dofs", "6000"]
 
@@ -97,7 +98,7 @@ def test_the_keys_of_the_report(run):
     assert set(median["fem"]["0.3"]) == {"cg_iterations", "cond", "errors", "lambda_max", "strain_energy"}
     assert set(report["options"]) == {
         *("classes", "curve", "iterations", "k_D", "max_bytes", "max_seconds", "nodes", "nus", "percent", "pipelines"),
-        *("programs", "reference_dofs", "repeats", "tradeoff"),
+        *("programs", "reference_dofs", "reference_seconds", "repeats", "tradeoff"),
     }
     assert set(report["curves"][0]["points"][0]) == {"E_D_share", "errors", "n_nodes"}
 
@@ -228,6 +229,7 @@ def test_baseline(head, tmp_path, capsys):
         (["--curve", "a"], "--curve: expected parts"),
         (["--k-d", "1"], "--k-d"),
         (["--max-seconds", "0"], "--max-seconds"),
+        (["--reference-seconds", "10"], "--reference-dofs sets the size of the reference already"),
         (["--young", "h-1000"], "modulus: expected 0 kPa or more"),
     ],
 )
@@ -237,14 +239,41 @@ def test_bad_input(head, tmp_path, options, words, capsys):
     assert words in err[-1]
 
 
-def test_reference_shape_is_as_fine_as_allowed():
-    """No more dofs than allowed, no finer than the image, nearly cubic."""
-    for shape, spacing, dofs in (((60, 50, 40), (1.0, 1.0, 1.0), 30_000), ((200, 180, 20), (0.5, 0.5, 5.0), 90_000)):
-        coarse = compare.reference_shape(shape, np.array(spacing), dofs)
-        assert 3 * np.prod(np.array(coarse) + 1) <= dofs
-        assert all(c <= s for c, s in zip(coarse, shape, strict=True))
-        assert 3 * np.prod(np.array(coarse) + 1) > 0.7 * dofs
-    assert compare.reference_shape((9, 8, 7), np.ones(3), 10**9) == (9, 8, 7)
+def test_the_reference_is_chosen_once(head, tmp_path, monkeypatch):
+    """By its time the size differs from run to run: what was chosen is written down, and kept by --resume."""
+    image = tetopt.load_image(head / "image.nii.gz")
+    settings = Settings(nodes=150, reference_seconds=5.0)
+    comparison = compare.Comparison(
+        image, None, [(0.0, 1.0), (100.0, 10.0)], settings, ImageSource("image", "ab", None, None), None, "law", ""
+    )
+    sizes = iter([Budget(5000, False), Budget(6000, True), Budget(7000, False)])
+    monkeypatch.setattr(compare, "affordable_dofs", lambda *arguments: next(sizes))
+    lines = []
+
+    def chosen(settings=settings, resume=True):
+        once = compare._settled(comparison._replace(settings=settings), tmp_path, lines.append, resume=resume)
+        return once.settings.reference_dofs
+
+    assert chosen(settings._replace(reference_dofs=4000)) == 4000
+    assert not (tmp_path / "reference.json").exists()
+    assert [chosen(), chosen()] == [5000, 5000]
+    assert chosen(resume=False) == 6000
+    assert chosen() == 6000
+    assert chosen(settings._replace(reference_seconds=9.0)) == 7000
+    assert len(lines) == 3
+    assert "in 5 s; --reference-dofs 5000" in lines[0]
+    assert "in the free memory; --reference-dofs 6000" in lines[1]
+    (tmp_path / "reference.json").write_text("{")
+    with pytest.raises(StopIteration):
+        chosen()
+
+
+@pytest.mark.parametrize("seconds", ["0", "nan", "-1"])
+def test_refuses_no_time(head, tmp_path, seconds, capsys):
+    words = [str(head / "image.nii.gz"), "-o", str(tmp_path / "o"), "--reference-seconds", seconds]
+    assert main(["compare", *words]) == 2
+    assert "--reference-seconds: expected more than 0" in capsys.readouterr().err
+    assert not (tmp_path / "o").exists()
 
 
 def test_elementwise():

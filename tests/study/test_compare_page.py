@@ -9,7 +9,7 @@ import pytest
 from browser import browser, copied, document
 
 import tetopt
-from tetopt.fem.reference import Errors
+from tetopt.fem.reference import Errors, OwnError
 from tetopt.measure.quality import Quality, QualityErrors
 from tetopt.report.figures import save_figure
 from tetopt.report.viewer import view_of
@@ -121,7 +121,9 @@ def fake_report():
         image=ImageFacts(source, (197, 233, 189), [1, 1, 1], 2841.2),
         labels=LabelSource("labels.nii.gz", "given", "cd" * 32), law="1 kPa at 0, 10 kPa at 255",
         versions={"tetopt": "0.1.0", "numpy": "2.0"}, machine={"cores": 2, "system": "Linux"}, options=Settings(5000),
-        reference=ReferenceGrid((49, 58, 47), 435000, "averaged", {"0.3": ReferenceEnergy(1.234)}),
+        reference=ReferenceGrid(
+            (49, 58, 47), 435000, "averaged", {"0.3": ReferenceEnergy(1.234, OwnError(0.01, 0.02), 17)}
+        ),
         pipelines=pipelines, tradeoff=[], curves=curves, seconds=812.0,
     )  # fmt: skip
 

@@ -82,9 +82,12 @@ class SimulationOptions:
         str | None, option("LAW", "Modulus by intensity, as for `fem`. Default: 1 to 10 kPa over its range.")
     ] = None
     average: AverageOption = DEFAULT_SETTINGS.average
-    reference_dofs: Annotated[
-        int, option("D", "Size of the voxel grid that is the truth of the simulation.", min=1000)
-    ] = DEFAULT_SETTINGS.reference_dofs
+    reference_seconds: Annotated[
+        float | None, option("S", "Time for the voxel grid that is the truth; it is as fine as fits. Default: 120.")
+    ] = None
+    reference_dofs: Annotated[int | None, option("D", "Size of that grid exactly, instead of a time.", min=1000)] = (
+        DEFAULT_SETTINGS.reference_dofs
+    )
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -217,13 +220,20 @@ def _settings(compared: ComparedOptions, simulation: SimulationOptions, limits: 
         if limit is not None and not 0.0 < limit < float("inf"):
             raise InputError(f"{name}: expected more than 0, got {limit}")
     parse_average(simulation.average)
+    seconds = simulation.reference_seconds
+    if seconds is not None and simulation.reference_dofs is not None:
+        raise InputError("--reference-seconds: --reference-dofs sets the size of the reference already; give one")
+    if seconds is not None and not 0.0 < seconds < float("inf"):
+        raise InputError(f"--reference-seconds: expected more than 0, got {seconds}")
     programs = _programs(compared.programs or [])
     names = [name.strip() for name in compared.pipelines.split(",")]
     names += [each.name for each in programs if each.name not in names]
     return Settings(
         nodes=compared.nodes, pipelines=tuple(names), programs=programs,
         repeats=compared.repeats, classes=compared.classes, k_D=compared.k_D,
-        reference_dofs=simulation.reference_dofs, curve=_parse_curve(compared.curve), tradeoff=compared.tradeoff,
+        reference_dofs=simulation.reference_dofs,
+        reference_seconds=DEFAULT_SETTINGS.reference_seconds if seconds is None else seconds,
+        curve=_parse_curve(compared.curve), tradeoff=compared.tradeoff,
         average=simulation.average, max_seconds=limits.max_seconds,
         max_bytes=None if limits.max_gb is None else int(limits.max_gb * BYTES_PER_GB),
     )  # fmt: skip

@@ -22,7 +22,9 @@ TRIAL_DOFS = 50_000  # of the grid whose iterations are counted: finer ones take
 TIMED_DOFS = 3_000_000  # of the grid on which an iteration is timed: larger than the processor's caches
 SOLUTION_SHARE = 1.6  # iterations of all of a reference over those of its solution: homogeneous block, half resolution
 LEAST_DOFS = 1_000  # however little time there is
-BYTES_PER_DOF = 100  # resident, of a solution and all that is made of it; 70 were measured at 27 million, 110 at 3 million
+BYTES_PER_DOF = (
+    100  # resident, of a solution and all that is made of it; 70 were measured at 27 million, 110 at 3 million
+)
 FREE_SHARE = 0.8  # of the memory that is free may be taken
 
 

@@ -12,7 +12,7 @@ import json
 import os
 import platform
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from tetopt.energy.sampling import cell_moments, cell_of_voxel
 from tetopt.errors import InputError
+from tetopt.fem.budget import affordable_dofs, reference_shape
 from tetopt.fem.conditioning import conditioning
 from tetopt.fem.elasticity import box_faces, check_fills_box, compression, push_of
 from tetopt.fem.reference import Reference, averaged, compare, nearest, reference
@@ -63,8 +64,6 @@ from tetopt.study.program import file_checksums, pipelines_with
 from tetopt.study.tradeoff import tradeoff
 
 Say = Callable[[str], None]
-
-STEP_GROWTH = 1.02  # between voxel sizes that are tried for the reference's grid: it misses the limit by under 6 %
 
 
 class Comparison(NamedTuple):
@@ -112,18 +111,6 @@ def default_law(image: Image) -> tuple[Law, str]:
     return [(low, 1.0), (high, 10.0)], words
 
 
-def reference_shape(shape: Sequence[int], spacing: NDArray[np.float64], dofs: int) -> tuple[int, ...]:
-    """The finest grid of nearly cubic voxels over the image's box of `dofs` or fewer, no finer than the image."""
-    n = len(shape)
-    size = np.array(shape) * spacing
-    step = spacing.min()
-    while True:
-        coarse = np.clip(np.rint(size / np.maximum(step, spacing)), 1, shape).astype(int)
-        if n * np.prod(coarse + 1) <= dofs:
-            return tuple(int(c) for c in coarse)
-        step *= STEP_GROWTH
-
-
 def prepared(image: Image, labels: Image, law: Law, settings: Settings, say: Say) -> Standard:
     """The reference solutions, which take a while.
 
@@ -133,7 +120,10 @@ def prepared(image: Image, labels: Image, law: Law, settings: Settings, say: Say
         As `tetopt.model.laws.young_from` and `tetopt.fem.reference.reference`.
     """
     fine = young_image(image, law)
-    modulus = averaged(fine, reference_shape(image.shape, image.spacing, settings.reference_dofs))
+    dofs = settings.reference_dofs
+    if dofs is None:
+        dofs = reference_dofs(image, law, settings, say)
+    modulus = averaged(fine, reference_shape(image.shape, image.spacing, dofs))
     references = {}
     for nu in settings.nus:
         say(f"reference: {' x '.join(map(str, modulus.shape))} voxels, nu = {nu:g}")
@@ -141,6 +131,37 @@ def prepared(image: Image, labels: Image, law: Law, settings: Settings, say: Say
     return Standard(
         image, labels, modulus, nearest(modulus, fine), nearest(labels, modulus).data, references, settings.average
     )
+
+
+def reference_dofs(image: Image, law: Law, settings: Settings, say: Say) -> int:
+    """Size of the reference that `reference_seconds` and the memory allow; another one in every run, by a little."""
+    budget = affordable_dofs(young_image(image, law), settings.nus, settings.reference_seconds, settings.percent)
+    limit = "the free memory" if budget.is_short_of_memory else f"{settings.reference_seconds:g} s"
+    say(f"reference: up to {budget.dofs} unknowns in {limit}; --reference-dofs {budget.dofs} repeats it")
+    return budget.dofs
+
+
+def _settled(comparison: Comparison, runs: Path, say: Say, *, resume: bool) -> Comparison:
+    """The size of the reference decided, and kept in the runs' folder for `resume`."""
+    settings, path = comparison.settings, runs / "reference.json"
+    if settings.reference_dofs is None:
+        choice = {"seconds": settings.reference_seconds, "image": comparison.image_source.sha256}
+        dofs = _earlier_dofs(path, choice) if resume else None
+        if dofs is None:
+            dofs = reference_dofs(comparison.image, comparison.law, settings, say)
+            save_json(path, choice | {"dofs": dofs})
+        comparison = comparison._replace(settings=settings._replace(reference_dofs=dofs))
+    return comparison
+
+
+def _earlier_dofs(path: Path, choice: dict[str, Any]) -> int | None:
+    """What was decided before by the same choice, if the file is whole."""
+    try:
+        before = json.loads(path.read_text(encoding="utf-8"))
+        dofs = before.pop("dofs")
+    except (OSError, ValueError, LookupError, AttributeError):
+        return None
+    return dofs if before == choice and isinstance(dofs, int) else None
 
 
 # One mesh, measured.
@@ -236,11 +257,12 @@ def run(
         As `prepared`, or `folder` holds the report of another comparison that `resume` would replace.
     """
     begin = time.perf_counter()
-    image, settings = comparison.image, comparison.settings
     if resume:
         _check_resumable(folder, comparison)
     runs = folder / "runs"
     runs.mkdir(exist_ok=True)
+    comparison = _settled(comparison, runs, say, resume=resume)
+    image, settings = comparison.image, comparison.settings
     standard = prepared(image, classes, comparison.law, settings, say)
     pipelines = pipelines_with(settings.programs)
     bench = Bench(comparison, standard, pipelines, runs, say, resume)
@@ -301,7 +323,15 @@ def _key(comparison: Comparison, name: str) -> str:
     """Changes with everything that a finished run's numbers depend on, but not with what else is compared."""
     settings = comparison.settings
     same = settings._replace(
-        pipelines=(), programs=(), repeats=0, curve=(), nodes=0, tradeoff=False, max_seconds=0.0, max_bytes=None
+        pipelines=(),
+        programs=(),
+        repeats=0,
+        curve=(),
+        nodes=0,
+        tradeoff=False,
+        max_seconds=0.0,
+        max_bytes=None,
+        reference_seconds=0.0,
     )
     facts = {
         "image": as_json(comparison.image_source),
@@ -423,5 +453,8 @@ def _reference_grid(standard: Standard) -> ReferenceGrid:
     first = next(iter(standard.references.values()))
     is_same = standard.modulus.shape == standard.image.shape
     note = "a hexahedron to every voxel" if is_same else "the modulus averaged over a coarser grid, for meshes too"
-    by_nu = {nu: ReferenceEnergy(each.strain_energy) for nu, each in standard.references.items()}
+    by_nu = {
+        nu: ReferenceEnergy(each.strain_energy, each.own_error, each.work.iterations)
+        for nu, each in standard.references.items()
+    }
     return ReferenceGrid(standard.modulus.shape, first.n_dofs, note, by_nu)

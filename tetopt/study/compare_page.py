@@ -577,7 +577,14 @@ def _settings_html(report: Report) -> list[str]:
 def _reference_text(reference: ReferenceGrid) -> str:
     energies = [f"ν {nu}: {number_text(row.strain_energy)}" for nu, row in reference.by_nu.items()]
     size = f"{_text(reference.shape, ' × ')} hexahedra, {reference.n_dofs} unknowns"
-    return f"{size}; {reference.note}; strain energy {', '.join(energies)}"
+    own = [
+        f"ν {nu}: {number_text(row.own_error.strain_energy)} and {number_text(row.own_error.displacement)}"
+        for nu, row in reference.by_nu.items()
+    ]
+    return (
+        f"{size}; {reference.note}; strain energy {', '.join(energies)}; at half the resolution the energy and the "
+        f"displacement differ by {', '.join(own)}"
+    )
 
 
 def _text(value: Any, between: str = ", ") -> str:

@@ -6,7 +6,7 @@ from types import UnionType
 from typing import Any, NamedTuple, get_args, get_origin, get_type_hints
 
 from tetopt.engine.loop import UNIFORM_ITERATIONS, UNIFORM_K_D
-from tetopt.fem.reference import Errors
+from tetopt.fem.reference import Errors, OwnError
 from tetopt.measure.quality import Quality
 from tetopt.model.averages import DEFAULT_AVERAGE
 from tetopt.study.interfaces import OTSU_CLASSES
@@ -32,7 +32,8 @@ class Settings(NamedTuple):
     nus: tuple[float, ...] = (0.3, 0.45)
     percent: float = 1.0  # of compression, of the box's height
     average: str = DEFAULT_AVERAGE  # of a cell's moduli
-    reference_dofs: int = 300_000  # the voxel grid is averaged until it has no more
+    reference_dofs: int | None = None  # the voxel grid is averaged until it has no more; in a report what was chosen
+    reference_seconds: float = 120.0  # that it may take without such a number, for all of `nus`
     curve: tuple[float, ...] = (0.25, 0.5, 2.0)  # node counts of the error curves, of `nodes`, besides `nodes` itself
     tradeoff: bool = False  # whether tetopt's options are swept around its defaults
     max_seconds: float = 3600.0  # of one run of a pipeline
@@ -179,6 +180,8 @@ class ReferenceEnergy(NamedTuple):
     """What the reference finds for one Poisson's ratio."""
 
     strain_energy: float  # uJ
+    own_error: OwnError  # of the solution at half the resolution against it
+    iterations: int
 
 
 class ReferenceGrid(NamedTuple):
