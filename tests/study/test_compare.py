@@ -97,7 +97,19 @@ def test_the_keys_of_the_report(run):
     }
     assert set(median["fem"]["0.3"]) == {"cg_iterations", "cond", "errors", "lambda_max", "strain_energy"}
     assert set(report["options"]) == {
-        *("classes", "curve", "iterations", "k_D", "max_bytes", "max_seconds", "nodes", "nus", "percent", "pipelines"),
+        *(
+            "average",
+            "classes",
+            "curve",
+            "iterations",
+            "k_D",
+            "max_bytes",
+            "max_seconds",
+            "nodes",
+            "nus",
+            "percent",
+            "pipelines",
+        ),
         *("programs", "reference_dofs", "reference_seconds", "repeats", "tradeoff"),
     }
     assert set(report["curves"][0]["points"][0]) == {"E_D_share", "errors", "n_nodes"}
