@@ -705,8 +705,8 @@ def test_messages_of_meshes_that_are_not_held():
         message_of(
             lambda: compression(pieces, 1.0, 0.3, fixed_nodes=[2, 3], pushed_nodes=[0, 1], displacement=[0.0, 0.1])
         )
-        == "mesh: 2 pieces have no fixed or pushed node, the first has 2 cells around cell 2 (node 4); "
-        "hold it or take it out"
+        == "mesh: 2 pieces have no node that is held, pushed or on a spring, the first has 2 cells around cell 2 "
+        "(node 4); hold it or take it out"
     )
     unused = Mesh(points, PLATE.cells)
     assert (
@@ -718,7 +718,8 @@ def test_messages_of_meshes_that_are_not_held():
     nothing = np.zeros((4, 2))
     assert (
         message_of(lambda: constrained(PLATE, 1.0, 0.3, nothing > 1, nothing))
-        == "mesh: no displacement is prescribed, so it could fly away; fix some nodes"
+        == "mesh: nothing holds it, neither a displacement nor a spring, so it could fly away; hold some nodes, as "
+        "hold:SET and spring:SET:K do"
     )
     # One fixed and one pushed node, smooth plates: it turns until they are apart by the way.
     assert (

@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import json
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
 import numpy as np
 import typer
-from numpy.typing import NDArray
 from rich.markup import escape
 
 from tetopt import Image, InputError
@@ -20,9 +18,11 @@ from tetopt.cli.solver import (
     MATERIAL_FIELDS,
     all_sets,
     check_solver_options,
+    loads_of,
     print_model,
     save_for_solver,
     solver_model,
+    with_point_data,
 )
 from tetopt.io.files import checked_output, save_json
 from tetopt.io.formats import FORMATS, format_of
@@ -30,10 +30,7 @@ from tetopt.io.frd import read_frd
 from tetopt.io.images import sha256
 from tetopt.io.meshes import MeshFile
 from tetopt.io.vtk import box_text
-from tetopt.model.fields import NODE_MODULI, cell_fields, is_result, is_stress
-from tetopt.model.laws import checked_young
-from tetopt.model.loads import load_words, parse_load
-from tetopt.model.model import STRESS_UNITS, Model, half_turned, scaled
+from tetopt.model.fields import cell_fields, is_result, is_stress
 from tetopt.model.sets import box_of
 from tetopt.report.summary import model_summary, versions
 from tetopt.target.align import aligned_mask
@@ -75,8 +72,8 @@ def convert_command(
         loaded = _with_results(loaded, results_path)
     solver = replace(solver, order=_order_of(loaded, solver, output))
     check_solver_options(output, solver, has_materials="young" in loaded.cell_data)
-    if not solver.loads:
-        solver = replace(solver, loads=_loads_of(loaded, output))
+    if not solver.loads and not format_of(output).is_surface:
+        solver = replace(solver, loads=loads_of(loaded))
     fields, box = dict(loaded.cell_data), loaded.box
     about: dict[str, Any] = {name: text for name in TEXTS_KEPT if (text := loaded.text(name)) is not None}
     image: Image | None = None
@@ -93,7 +90,7 @@ def convert_command(
         fields = {name: values for name, values in fields.items() if name not in MATERIAL_FIELDS}
     known_sets = all_sets(loaded.mesh, box, fields, loaded.sets)
     model = solver_model(loaded.mesh, image, solver, fields, about, known_sets)
-    model = _with_point_data(model, loaded.point_data, solver)
+    model = with_point_data(model, loaded.point_data, solver)
     save_for_solver(output, model, solver)
     if json_path is not None:
         files = {"mesh": mesh_path.name, "output": output.name, "units": solver.units, "space": solver.space}
@@ -101,15 +98,6 @@ def convert_command(
         save_json(json_path, files | {"versions": versions()} | model_summary(model))
     print_model(output, model, solver)
     return 0
-
-
-def _with_point_data(model: Model, point_data: dict[str, NDArray], solver: SolverOptions) -> Model:
-    """The model with what the mesh's file has at nodes: its moduli, too, unless --young or --bins makes others."""
-    others = {name: values for name, values in point_data.items() if name != NODE_MODULI}
-    moduli = point_data.get(NODE_MODULI)
-    if moduli is None or solver.young is not None or solver.bins is not None or model.materials is None:
-        return model._replace(point_data=others)
-    return model._replace(point_data=others, node_young=checked_young(moduli[: len(model.mesh.points)]))
 
 
 def _with_results(loaded: MeshFile, path: Path) -> MeshFile:
@@ -144,20 +132,3 @@ def _images(path: Path, mask_path: Path | None, part: ImagePart, ndim: int) -> t
     if whole.ndim != ndim:
         raise InputError(f"{path}: expected a {ndim}-D image, as the mesh is, got a {whole.ndim}-D one")
     return whole, continued(whole, None if mask_path is None else beside(mask_path, aligned_mask))
-
-
-def _loads_of(loaded: MeshFile, output: Path) -> list[str]:
-    """The loads that a file of ours holds, in the words of --load, in RAS+ and kPa, if their sets are there still."""
-    if format_of(output).is_surface:
-        return []
-    try:
-        words = json.loads(loaded.text("loads") or "[]")
-        loads = [parse_load(text, loaded.mesh.ndim) for text in words]
-    except (ValueError, TypeError, AttributeError, RecursionError):  # another program's
-        return []
-    if lost := [load.set_name for load in loads if load.set_name and load.set_name not in loaded.sets.facets]:
-        log.print(escape(f"the file's loads are left out: it no longer has the sets {', '.join(lost)}"))
-        return []
-    factor = STRESS_UNITS.get(loaded.text("units") or "", STRESS_UNITS["kPa"]).kPa
-    turned = [half_turned(load) if loaded.space == "lps" else load for load in loads]
-    return [load_words(scaled(load, factor)) for load in turned]

@@ -1,92 +1,252 @@
-"""``tetopt fem``: compress a mesh."""
+"""``tetopt fem``: solve a mesh with its loads."""
 
 from __future__ import annotations
 
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
+import numpy as np
 import typer
+from numpy.typing import NDArray
 from rich.markup import escape
 
-import tetopt
-from tetopt import InputError, Mesh, save_mesh
-from tetopt.cli.console import out
-from tetopt.cli.inputs import check_no_input, read_image, read_mesh
-from tetopt.cli.options import ImageArgument, ImagePart, LawOptions, NumberOptions, option
+from tetopt import Image, InputError
+from tetopt.cli.console import log, print_wide
+from tetopt.cli.inputs import check_no_input, read_image, read_mesh, warn_of_other_image
+from tetopt.cli.options import ImagePart, ModelOptions, NumberOptions, option
+from tetopt.cli.solver import all_sets, check_model_options, loads_of, solver_model, with_point_data
 from tetopt.io.files import checked_output, save_json
+from tetopt.io.formats import save_model
 from tetopt.io.images import sha256
-from tetopt.model.averages import parse_average
-from tetopt.report.summary import versions
-from tetopt.report.tables import new_table
+from tetopt.io.meshes import MeshFile
+from tetopt.io.vtk import box_text
+from tetopt.model.fields import cell_fields, is_result
+from tetopt.model.loads import MOST_COMPRESSION_PERCENT, count_of_steps
+from tetopt.model.model import Model
+from tetopt.model.sets import box_of
+from tetopt.report.summary import model_summary, versions
+from tetopt.report.tables import new_table, nodes_in_words
 
 if TYPE_CHECKING:
-    from tetopt.study.paper import Simulated
+    from tetopt.fem.conditioning import Conditioning
+    from tetopt.fem.solution import Solution
+
+INTENSITY_LAW = "h"  # an image without --young: its intensities are the moduli, as in the paper
+PAPER_PERCENT = 1.0  # how far the paper's test compresses, for a linear law only a scale
+LOCKING_NU = 0.45  # from where on linear cells are far behind quadratic ones, see docs/order.md
 
 
 def fem_command(
-    image_path: ImageArgument,
-    mesh_path: Annotated[Path, typer.Argument(metavar="MESH", help="VTU, VTK or MSH file that fills the image's box.")],
-    compress: Annotated[float, option("PERCENT", "How far the bottom is pushed in.")] = 1.0,
+    paths: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="[IMAGE] MESH",
+            help="VTU, VTK or MSH file; with moduli and loads it needs no more. Laws are of IMAGE's intensities.",
+        ),
+    ],
+    compress: Annotated[
+        float | None,
+        option("PERCENT", f"Push the bottom of the box in, its top held (with IMAGE by default {PAPER_PERCENT:g})."),
+    ] = None,
+    conditioning: Annotated[
+        bool | None,
+        typer.Option(
+            help="Condition number of the first step's stiffness (default: for the compression of an IMAGE's box)."
+        ),
+    ] = None,
     output: Annotated[
-        Path | None, option("PRESSED.vtu", "Write the mesh with displacements and strains.", "-o", "--output")
+        Path | None, option("SOLVED.vtu", "Write displacements, strains and stresses on the mesh.", "-o", "--output")
     ] = None,
     *,
-    moduli: LawOptions,
+    model: ModelOptions,
     part: ImagePart,
     numbers: NumberOptions,
 ) -> int:
-    """Compress a mesh, one modulus a cell: conditioning of the stiffness matrix, strain energy, CG iterations.
+    """Solve a mesh with its loads: displacements, stresses, strain energy, reactions.
 
-    The face of the image's box with the largest z is held, the one opposite is pushed in along z; both are bonded:
-    their nodes cannot slide sideways. In 2-D y takes the place of z, in plane stress, 1 mm thick. Linear cells lock
-    near nu = 0.5: above 0.49 they are far too stiff.
+    Linear elasticity, small displacements; in 2-D plane stress, 1 mm thick. Each step is a load case of its own.
+    Without loads, and with IMAGE, it is the paper's test: the face of the image's box with the largest z (in 2-D y) is
+    held and the one opposite pushed in, both bonded; without --young intensities are the moduli.
     """
-    from tetopt.fem.elasticity import strains
-    from tetopt.model.laws import parse_law
-    from tetopt.study.paper import simulate
-
+    if len(paths) > 2:
+        raise InputError(f"expected [IMAGE] MESH, got {len(paths)} files")
+    image_path, mesh_path = (None, paths[0]) if len(paths) == 1 else (paths[0], paths[1])
     json_path = numbers.checked()
     if output is not None:
-        output = checked_output(output, (".vtu",), numbers.force)
-        check_no_input(output, mesh_path)
-    if not 0.0 < compress <= 50.0:
-        raise InputError(f"--compress: expected a percentage above 0 and up to 50, got {compress:g}")
-    law = None if moduli.young is None else parse_law(moduli.young)
-    parse_average(moduli.average)
-    image = read_image(image_path, part)
-    mesh = read_mesh(mesh_path).mesh
-    try:
-        simulation, pressed = simulate(image, mesh, moduli.nu, compress, law, moduli.average)
-    except RuntimeError as error:
-        raise InputError(f"{error}; the moduli differ too much, or nu is too near 0.5, for this mesh") from error
+        output = checked_output(output, (".vtu", ".vtk"), numbers.force)
+        check_no_input(output, mesh_path, image_path)
+    if image_path is not None and model.young is None:
+        model = replace(model, young=INTENSITY_LAW)
+    _check_options(image_path, compress, model, part)
+    image = None if image_path is None else read_image(image_path, part)
+    loaded = read_mesh(mesh_path)
+    if image_path is not None and image is not None:
+        warn_of_other_image(loaded, mesh_path, image_path)
+    of_box = image is not None and not model.loads
+    if image is not None and of_box:
+        _check_box(image, loaded)
+    task = _model(loaded, image, _filled(model, loaded, image, compress))
+    solutions, extremes = _solved(task, of_box if conditioning is None else conditioning)
     if output is not None:
-        fields = {"young": simulation.young, "strain": strains(mesh, pressed.u).reshape(len(simulation.young), -1)}
-        save_mesh(output, mesh, fields, {"tetopt": tetopt.__version__}, {"displacement": pressed.u})
-    _print(simulation, mesh, mesh_path.name, compress)
+        save_model(output, _with_results(task, solutions))
+    _advise(task)
+    _print(mesh_path.name, task, solutions, extremes)
     if json_path is not None:
-        options = {**asdict(moduli), "compress_percent": compress, **part.stated()}
-        files = {"image": image_path.name, "image_sha256": sha256(image_path), "mesh": mesh_path.name}
-        save_json(json_path, {**files, "versions": versions(), "options": options, **_numbers(simulation, mesh)})
+        options = {**asdict(model), "compress_percent": compress, **part.stated()}
+        files = {"mesh": mesh_path.name}
+        if image_path is not None:
+            files |= {"image": image_path.name, "image_sha256": sha256(image_path)}
+        about = {**files, "versions": versions(), "options": options}
+        save_json(json_path, {**about, **_numbers(task, solutions, extremes), **model_summary(task)})
     return 0
 
 
-def _print(simulation: Simulated, mesh: Mesh, name: str, compress: float) -> None:
-    """The table of a compression by so many per cent."""
-    table = new_table("", escape(name))
-    table.add_row("nodes", str(len(mesh.points)))
-    table.add_row("modulus of the cells, kPa", f"{simulation.young.min():.4g} to {simulation.young.max():.4g}")
-    unit = "mN/mm" if mesh.ndim == 3 else "mN/mm per mm of thickness"
-    table.add_row(f"largest eigenvalue of the stiffness, {unit}", f"{simulation.lambda_max:.6g}")
-    table.add_row("condition number, 2-norm", f"{simulation.cond:.6g}")
-    table.add_row("Jacobi CG iterations to 1e-10", str(simulation.cg_iterations))
-    table.add_row(f"strain energy at {compress:g} %, uJ", f"{simulation.strain_energy:.6g}")
-    out.print(table)
+def _check_options(image_path: Path | None, compress: float | None, model: ModelOptions, part: ImagePart) -> None:
+    """InputError for what is wrong whatever the files hold."""
+    if compress is not None and not 0.0 < compress <= MOST_COMPRESSION_PERCENT:
+        most = f"{MOST_COMPRESSION_PERCENT:g}"
+        raise InputError(f"--compress: expected a percentage above 0 and up to {most}, got {compress:g}")
+    if compress is not None and model.loads:
+        raise InputError("--compress and --load: give one of them, as in --load compress:5% --load pressure:left:1.5")
+    if image_path is None and (lost := [name for name, value in part.stated().items() if value is not None]):
+        raise InputError(f"--{lost[0]}: there is no IMAGE, only a mesh")
+    check_model_options(model, has_materials=True)
 
 
-def _numbers(simulation: Simulated, mesh: Mesh) -> dict[str, Any]:
-    """The numbers of a compression for its JSON file."""
-    size = {"n_nodes": len(mesh.points), "n_cells": len(mesh.cells)}
-    moduli = {"young_kPa_min": simulation.young.min(), "young_kPa_max": simulation.young.max()}
-    numbers = {key: value for key, value in simulation._asdict().items() if key != "young"}
-    return {**size, **moduli, **numbers, "units": {"lambda_max": "mN/mm", "strain_energy": "uJ"}}
+def _filled(model: ModelOptions, loaded: MeshFile, image: Image | None, compress: float | None) -> ModelOptions:
+    """The options with what is left out taken from the mesh's file, or, of an image's box, from the paper's test."""
+    if model.order is None:
+        model = replace(model, order=loaded.order)
+    if compress is not None or (image is not None and not model.loads):
+        model = replace(model, loads=[f"compress:{PAPER_PERCENT if compress is None else compress!r}%"])
+    elif not model.loads:
+        model = replace(model, loads=loads_of(loaded))
+    if model.young is None and "young" not in loaded.cell_data:
+        raise InputError(
+            "the mesh's file has no moduli: give --young, such as --young 3.5, or the IMAGE before the MESH"
+        )
+    if not model.loads:
+        raise InputError(
+            "the mesh's file has no loads: give --load, such as --load compress:5%, "
+            "or --load hold:inferior --load pressure:superior:1.5"
+        )
+    return model
+
+
+def _check_box(image: Image, loaded: MeshFile) -> None:
+    """InputError unless the mesh fills the image's box: what is compressed is the box."""
+    from tetopt.fem.elasticity import box_faces, check_fills_box
+
+    box_faces(image, loaded.mesh)
+    check_fills_box(image, loaded.mesh)
+
+
+def _model(loaded: MeshFile, image: Image | None, options: ModelOptions) -> Model:
+    """The mesh with all that it is solved with."""
+    fields = {name: values for name, values in loaded.cell_data.items() if not is_result(name)}
+    box = loaded.box if image is None else box_of(image)
+    if image is not None:
+        fields |= cell_fields(loaded.mesh, image)
+    about = {} if box is None else {"box": box_text(box)}
+    sets = all_sets(loaded.mesh, box, fields, loaded.sets)
+    others = {name: values for name, values in loaded.point_data.items() if not is_result(name)}
+    return with_point_data(solver_model(loaded.mesh, image, options, fields, about, sets), others, options)
+
+
+def _solved(model: Model, is_conditioned: bool) -> tuple[list[Solution], Conditioning | None]:
+    """Each step solved, and the conditioning of the first, if it is to be known."""
+    from tetopt.fem.conditioning import conditioning
+    from tetopt.fem.solution import solved_model
+
+    try:
+        solutions = [solved_model(model, step) for step in range(1, count_of_steps(model.loads) + 1)]
+        return solutions, conditioning(solutions[0].system) if is_conditioned else None
+    except RuntimeError as error:
+        raise InputError(f"{error}; the moduli differ too much, or nu is too near 0.5, for this mesh") from error
+
+
+def _with_results(model: Model, solutions: list[Solution]) -> Model:
+    """The model with what was found on its cells and nodes, and the reactions among its texts."""
+    from tetopt.fem.solution import solution_fields
+
+    cell_data, point_data, about = dict(model.cell_data), dict(model.point_data), dict(model.about)
+    for step, solution in enumerate(solutions, start=1):
+        fields = solution_fields(model.mesh, solution, step)
+        cell_data |= fields.cell_data
+        point_data |= fields.point_data
+        about["reactions" if step == 1 else f"reactions_step{step}"] = _lists(solution.reactions)
+    return model._replace(cell_data=cell_data, point_data=point_data, about=about)
+
+
+def _lists(reactions: dict[str, NDArray[np.float64]]) -> dict[str, list[float]]:
+    return {name: force.tolist() for name, force in reactions.items()}
+
+
+def _advise(model: Model) -> None:
+    """A line where the cells are of the wrong order for the material."""
+    assert model.materials is not None, "it has been solved"
+    largest = float(model.materials.nu.max())
+    if model.order == 1 and largest >= LOCKING_NU:
+        log.print(f"nu is up to {largest:g}, where linear cells are too stiff: --order 2 (docs/order.md)")
+
+
+def _print(name: str, model: Model, solutions: list[Solution], extremes: Conditioning | None) -> None:
+    """A table of a column for each step."""
+    steps = [f"step {step}" for step in range(1, len(solutions) + 1)] if len(solutions) > 1 else [""]
+    table = new_table(escape(name), *steps)
+    moduli = [solutions[0].young.min(), solutions[0].young.max()]
+    table.add_row("size", f"{nodes_in_words(model.mesh, model.order)}, {len(model.mesh.cells)} cells")
+    table.add_row("modulus of the cells, kPa", f"{moduli[0]:.4g} to {moduli[1]:.4g}")
+    of_step = [_numbers_of(solution) for solution in solutions]
+    table.add_row("largest displacement, mm", *(f"{each['largest_displacement']:.5g}" for each in of_step))
+    table.add_row("largest von Mises stress of a cell, kPa", *(f"{each['largest_von_mises']:.5g}" for each in of_step))
+    table.add_row("strain energy, uJ", *(f"{each['strain_energy']:.8g}" for each in of_step))
+    if any(solution.spring_energy for solution in solutions):
+        table.add_row("energy of the springs, uJ", *(f"{each['spring_energy']:.8g}" for each in of_step))
+    for set_name in dict.fromkeys(name for solution in solutions for name in solution.reactions):
+        forces = (solution.reactions.get(set_name) for solution in solutions)
+        row = ("" if force is None else ", ".join(f"{part:.6g}" for part in force) for force in forces)
+        table.add_row(f"reaction of {escape(set_name)}, mN", *row)
+    table.add_row("sum of the other forces, mN", *(", ".join(f"{x:.6g}" for x in each.applied) for each in solutions))
+    table.add_row("multigrid CG iterations (0: factorised)", *(str(each.n_iterations) for each in solutions))
+    if extremes is not None:
+        unit = "mN/mm" if model.mesh.ndim == 3 else "mN/mm per mm of thickness"
+        table.add_row(f"largest eigenvalue of the stiffness, {unit}", f"{extremes.lambda_max:.6g}")
+        table.add_row("condition number, 2-norm", f"{extremes.cond:.6g}")
+        table.add_row("Jacobi CG iterations to 1e-10", str(extremes.cg_iterations))
+    print_wide(table)
+
+
+def _numbers_of(solution: Solution) -> dict[str, Any]:
+    """The numbers of a step for the JSON file."""
+    from tetopt.fem.solution import von_mises
+
+    return {
+        "strain_energy": solution.strain_energy,
+        "spring_energy": solution.spring_energy,
+        "work": solution.work,
+        "largest_displacement": float(np.sqrt((solution.u**2).sum(axis=1).max())),
+        "largest_von_mises": float(von_mises(solution.stress).mean(axis=1).max()),
+        "reactions": _lists(solution.reactions),
+        "applied": solution.applied.tolist(),
+        "iterations": solution.n_iterations,
+    }
+
+
+def _numbers(model: Model, solutions: list[Solution], extremes: Conditioning | None) -> dict[str, Any]:
+    """All numbers for the JSON file; the strain energy is the first step's."""
+    numbers: dict[str, Any] = {
+        "n_nodes": len(model.mesh.points),
+        "n_nodes_in_all": len(solutions[0].u),
+        "n_cells": len(model.mesh.cells),
+        "order": model.order,
+        "young_kPa_min": float(solutions[0].young.min()),
+        "young_kPa_max": float(solutions[0].young.max()),
+        "strain_energy": solutions[0].strain_energy,
+        "steps": [_numbers_of(solution) for solution in solutions],
+    }
+    if extremes is not None:
+        numbers |= {"lambda_max": extremes.lambda_max, "cond": extremes.cond, "cg_iterations": extremes.cg_iterations}
+    units = {"lambda_max": "mN/mm", "strain_energy": "uJ", "reactions": "mN", "largest_von_mises": "kPa"}
+    return numbers | {"units": units}

@@ -101,22 +101,6 @@ class NumberOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class LawOptions:
-    """The material that `tetopt fem` makes of an image."""
-
-    young: Annotated[
-        str | None,
-        option(
-            "LAW",
-            'Modulus in kPa by intensity: a table "0:1,100:5", interpolated, or a formula of h, such as '
-            '"0.5 + 0.01*h" or "1/max(abs(h), 0.001)" of a strain image. Default: the intensity.',
-        ),
-    ] = None
-    average: AverageOption = DEFAULT_AVERAGE
-    nu: Annotated[float, option("NU", "Poisson's ratio, above -1 and below 0.5.")] = DEFAULT_NU
-
-
-@dataclass(frozen=True, kw_only=True)
 class SourceOptions:
     """What `tetopt mesh` meshes."""
 
@@ -241,8 +225,8 @@ class EngineOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SolverOptions:
-    """What the file tells a solver besides the mesh."""
+class ModelOptions:
+    """What a solver is told besides the mesh."""
 
     panel: ClassVar[str] = "For the solver"
     young: Annotated[
@@ -279,12 +263,18 @@ class SolverOptions:
             "--load",
         ),
     ] = None
-    nonlinear: Annotated[
-        bool, typer.Option("--nonlinear", help="The step is of large deformation (.inp; FEBio's always is).")
-    ] = False
     order: Annotated[
         int | None, option("1|2", "2: quadratic cells, straight-edged; 1: linear. By default as the mesh read, else 1.")
     ] = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class SolverOptions(ModelOptions):
+    """What the file tells a solver besides the mesh."""
+
+    nonlinear: Annotated[
+        bool, typer.Option("--nonlinear", help="The step is of large deformation (.inp; FEBio's always is).")
+    ] = False
     units: Annotated[str, option("kPa|MPa", "Unit of stress in the file; --young is in kPa.")] = "kPa"
     space: SpaceOption = "ras"
 

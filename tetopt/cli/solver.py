@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 from itertools import chain, count
@@ -15,14 +16,16 @@ from rich.markup import escape
 import tetopt
 from tetopt import Image, InputError, Mesh
 from tetopt.cli.console import log, out, print_wide
-from tetopt.cli.options import SolverOptions
+from tetopt.cli.options import ModelOptions, SolverOptions
 from tetopt.io.formats import FORMATS, file_bytes, format_of, save_model
+from tetopt.io.meshes import MeshFile
 from tetopt.model.averages import DEFAULT_AVERAGE, parse_average
 from tetopt.model.build import labels_of, model_of
-from tetopt.model.laws import parse_any_law
+from tetopt.model.fields import NODE_MODULI
+from tetopt.model.laws import checked_young, parse_any_law
 from tetopt.model.loads import check_steps, count_of_steps, known_set, load_words, parse_load
 from tetopt.model.materials import DEFAULT_NU, Spacing
-from tetopt.model.model import SPACES, STRESS_UNITS, Model, element_facets, elements
+from tetopt.model.model import SPACES, STRESS_UNITS, Model, element_facets, elements, half_turned, scaled
 from tetopt.model.sets import Box, Sets, check_free_names, merged_sets, parse_set, standard_sets
 from tetopt.report.tables import new_table, nodes_in_words
 
@@ -41,27 +44,38 @@ def check_solver_options(output: Path, solver: SolverOptions, has_materials: boo
     form = format_of(output)
     if form.is_surface and (solver.young or solver.bins or solver.sets or solver.loads):
         raise InputError(f"{output}: holds the boundary alone; leave out --young, --bins, --set and --load")
-    for name, law in (("young", solver.young), ("nu", solver.nu), ("density", solver.density)):
-        if law is not None:
-            parse_any_law(law, name)
-            if solver.young is None and not has_materials:
-                raise InputError(f"--{name}: there is no --young")
-    parse_average(solver.average)
-    if solver.average != DEFAULT_AVERAGE and solver.young is None:
-        raise InputError("--average: there is no --young")
-    parsed_bins(solver.bins)
+    check_model_options(solver, has_materials)
     if solver.units not in STRESS_UNITS:
         raise InputError(f"--units: expected {' or '.join(STRESS_UNITS)}, got {solver.units}")
     if solver.space not in SPACES:
         raise InputError(f"--space: expected {' or '.join(SPACES)}, got {solver.space}")
     if solver.nonlinear and not form.has_large:
         raise InputError(f"{output}: --nonlinear is for {', '.join(s for s, f in FORMATS.items() if f.has_large)} only")
-    if solver.order not in (None, 1, 2):
-        raise InputError(f"--order: expected 1 or 2, got {solver.order}")
     if solver.order == 2 and not form.has_quadratic:
         raise InputError(
             f"{output}: --order 2 is for {', '.join(s for s, f in FORMATS.items() if f.has_quadratic)} only"
         )
+
+
+def check_model_options(options: ModelOptions, has_materials: bool) -> None:
+    """InputError for what is wrong whatever mesh and file may be; `has_materials`: the mesh's file does, or an image.
+
+    Raises
+    ------
+    InputError
+        A law, average, number of bins or order that there is not; what needs moduli without any.
+    """
+    for name, law in (("young", options.young), ("nu", options.nu), ("density", options.density)):
+        if law is not None:
+            parse_any_law(law, name)
+            if options.young is None and not has_materials:
+                raise InputError(f"--{name}: there is no --young")
+    parse_average(options.average)
+    if options.average != DEFAULT_AVERAGE and options.young is None:
+        raise InputError("--average: there is no --young")
+    parsed_bins(options.bins)
+    if options.order not in (None, 1, 2):
+        raise InputError(f"--order: expected 1 or 2, got {options.order}")
 
 
 def parsed_bins(text: str | None) -> tuple[int | None, Spacing]:
@@ -76,7 +90,7 @@ def parsed_bins(text: str | None) -> tuple[int | None, Spacing]:
 
 
 def solver_model(
-    mesh: Mesh, image: Image | None, solver: SolverOptions, cell_data: dict[str, NDArray], about: dict[str, Any],
+    mesh: Mesh, image: Image | None, solver: ModelOptions, cell_data: dict[str, NDArray], about: dict[str, Any],
     known_sets: Sets,
 ) -> Model:  # fmt: skip
     """The model that the options ask for, of a mesh with the sets `known_sets`."""
@@ -97,7 +111,31 @@ def solver_model(
         loads=solver.loads or (), bins=bins, spacing=spacing, order=solver.order or 1, cell_data=fields,
         known_sets=known_sets, about={"tetopt": tetopt.__version__, **about},
     )  # fmt: skip
-    return model._replace(is_nonlinear=solver.nonlinear)
+    return model._replace(is_nonlinear=isinstance(solver, SolverOptions) and solver.nonlinear)
+
+
+def with_point_data(model: Model, point_data: dict[str, NDArray], solver: ModelOptions) -> Model:
+    """The model with what the mesh's file has at nodes: its moduli, too, unless --young or --bins makes others."""
+    others = {name: values for name, values in point_data.items() if name != NODE_MODULI}
+    moduli = point_data.get(NODE_MODULI)
+    if moduli is None or solver.young is not None or solver.bins is not None or model.materials is None:
+        return model._replace(point_data=others)
+    return model._replace(point_data=others, node_young=checked_young(moduli[: len(model.mesh.points)]))
+
+
+def loads_of(loaded: MeshFile) -> list[str]:
+    """The loads that a file of ours holds, in the words of --load, in RAS+ and kPa, if their sets are there still."""
+    try:
+        words = json.loads(loaded.text("loads") or "[]")
+        loads = [parse_load(text, loaded.mesh.ndim) for text in words]
+    except (ValueError, TypeError, AttributeError, RecursionError):  # another program's
+        return []
+    if lost := [load.set_name for load in loads if load.set_name and load.set_name not in loaded.sets.facets]:
+        log.print(escape(f"the file's loads are left out: it no longer has the sets {', '.join(lost)}"))
+        return []
+    factor = STRESS_UNITS.get(loaded.text("units") or "", STRESS_UNITS["kPa"]).kPa
+    turned = [half_turned(load) if loaded.space == "lps" else load for load in loads]
+    return [load_words(scaled(load, factor)) for load in turned]
 
 
 def all_sets(mesh: Mesh, box: Box | None, fields: dict[str, NDArray], own: Sets, is_told: bool = True) -> Sets:

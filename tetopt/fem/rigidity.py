@@ -48,7 +48,7 @@ def _rigid_rows(arms: NDArray[np.float64]) -> NDArray[np.float64]:
 def check_held(points: NDArray[np.float64], cells: NDArray[np.int64], is_prescribed: NDArray[np.bool_]) -> None:
     """InputError if some part of the mesh can move without strain, for then K_ff is singular.
 
-    Cells (M, A) of either order, their corners first.
+    Cells (M, A) of either order, their corners first; `is_prescribed` (N, n) is true where a spring holds, too.
 
     Without strain, cells that share a facet move as one rigid body. So a motion without strain is one of each
     facet-connected set of cells such that sets that share a node agree there, and prescribed dofs rest.
@@ -61,7 +61,10 @@ def check_held(points: NDArray[np.float64], cells: NDArray[np.int64], is_prescri
             f"mesh: {len(unused)} nodes belong to no cell, the first {unused[:5].tolist()}; take them out of the mesh"
         )
     if not is_prescribed.any():
-        raise InputError("mesh: no displacement is prescribed, so it could fly away; fix some nodes")
+        raise InputError(
+            "mesh: nothing holds it, neither a displacement nor a spring, so it could fly away; hold some nodes, as "
+            "hold:SET and spring:SET:K do"
+        )
     body = components(cells[:, : points.shape[1] + 1])
     _check_pieces(cells, body, is_prescribed)
     weakest, loose = _weakest_hold(points, cells, body, is_prescribed)
@@ -88,8 +91,8 @@ def _check_pieces(cells: NDArray[np.int64], body: NDArray[np.int64], is_prescrib
         piece = loose[label[cells[loose, 0]] == label[cells[loose[0], 0]]]
         n_pieces = len(np.unique(label[cells[loose, 0]]))
         raise InputError(
-            f"mesh: {n_pieces} pieces have no fixed or pushed node, the first has {len(piece)} cells around cell "
-            f"{piece[0]} (node {cells[piece[0], 0]}); hold it or take it out"
+            f"mesh: {n_pieces} pieces have no node that is held, pushed or on a spring, the first has {len(piece)} "
+            f"cells around cell {piece[0]} (node {cells[piece[0], 0]}); hold it or take it out"
         )
 
 

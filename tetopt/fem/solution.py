@@ -31,6 +31,7 @@ from tetopt.fem.elasticity import (
 from tetopt.geometry.quadratic import cell_edges, gauss_rule
 from tetopt.geometry.simplex import volumes
 from tetopt.mesh import Mesh
+from tetopt.model.averages import gauss_young
 from tetopt.model.loads import Load, count_of_steps, facet_forces, in_step, spring_constants
 from tetopt.model.materials import density_of
 from tetopt.model.model import Model, element_facets, in_units
@@ -43,7 +44,8 @@ class Solution(NamedTuple):
     """One step of a model, solved, in mm, kPa, mN and uJ (in 2-D by mm of thickness) and the model's axes."""
 
     u: NDArray[np.float64]  # (N, n) mm, a row a node of the model's order
-    strain: NDArray[np.float64]  # (M, Q, n, n) at the Gauss points
+    young: NDArray[np.float64]  # (M, Q) kPa, at the Gauss points
+    strain: NDArray[np.float64]  # (M, Q, n, n) there
     stress: NDArray[np.float64]  # (M, Q, n, n) kPa, in 2-D in the plane
     strain_energy: float  # uJ, in the cells
     spring_energy: float  # uJ, in the springs
@@ -51,6 +53,7 @@ class Solution(NamedTuple):
     reactions: dict[str, NDArray[np.float64]]  # by set that is prescribed or on springs: (n,) mN that hold it there
     applied: NDArray[np.float64]  # (n,) mN, the sum of pressures, tractions and gravity; the reactions balance it
     n_iterations: int  # of conjugate gradients, 0 where the matrix was factorised
+    system: System  # as it was solved, for `tetopt.fem.conditioning`
 
 
 class _Task(NamedTuple):
@@ -121,9 +124,9 @@ def solved_model(model: Model, step: int = 1, method: Method = "auto") -> Soluti
         reactions[name] = reactions.get(name, 0.0) - (springs[:, None] * u).sum(axis=0)
     by_supports = np.where(task.is_prescribed, reaction * task.prescribed, 0.0).sum()
     return Solution(
-        u, strain, stress, strain_energy, -0.5 * float((pull * u).sum()),
+        u, young, strain, stress, strain_energy, -0.5 * float((pull * u).sum()),
         0.5 * float((task.outside.forces * u).sum() + by_supports),
-        reactions, task.outside.forces.sum(axis=0), n_iterations,
+        reactions, task.outside.forces.sum(axis=0), n_iterations, system,
     )  # fmt: skip
 
 
@@ -132,12 +135,11 @@ def gauss_moduli(model: Model) -> NDArray[np.float64]:
 
     That of each cell's material; or, of moduli at the nodes, the linear interpolation.
     """
-    places, weights = gauss_rule(model.mesh.ndim, model.order)
     if model.node_young is not None:
-        return model.node_young[model.mesh.cells] @ places.T
+        return gauss_young(model.node_young, model.mesh, model.order)
     assert model.materials is not None, "who asks for moduli has checked that there are some"
     of_cell = model.materials.young[model.materials.of_cell]
-    return np.repeat(of_cell[:, None], len(weights), axis=1)
+    return np.repeat(of_cell[:, None], len(gauss_rule(model.mesh.ndim, model.order)[1]), axis=1)
 
 
 def _stress(strain: NDArray[np.float64], young: NDArray[np.float64], nu: NDArray[np.float64]) -> NDArray[np.float64]:
