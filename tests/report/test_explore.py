@@ -182,6 +182,10 @@ const warped = async () => {
   said.second = state();
   said.size = [canvas.width, canvas.height];
   said.cells = grid();
+  press("inside", "both"); slide("share", 0);
+  await frame();
+  said.carried = grid();
+  press("inside", "cells");
   send("pointerdown", ...CLICKS[0]);
   send("pointerup", ...CLICKS[0]);
   said.picked = $("picked").innerText;
@@ -472,7 +476,7 @@ def test_a_slider_deforms_the_mesh(shown, mesh):
     assert page["rest"][4] != page["most"][4]
 
 
-def test_the_second_step_is_drawn_interpolated_and_picked(shown, mesh):
+def test_the_second_step_is_drawn_interpolated_and_picked(shown, mesh, image):
     page = shown["warped"]
     shape = moved(mesh, 1.5, "displacement_step2")
     middle, first = middle_of(mesh), warp_factors(exhibit(mesh, {}, point_data=pressed(mesh)))[0]
@@ -492,6 +496,15 @@ def test_the_second_step_is_drawn_interpolated_and_picked(shown, mesh):
     low, high = field.limits
     step = np.rint(255 * np.clip((values - low) / (high - low), 0, 1)).astype(int)
     np.testing.assert_allclose(np.array(page["cells"])[clear, 2:], colour_table()[step].astype(int), atol=3)
+    rest = mesh.points[mesh.cells[cells[clear]]]
+    index = image.to_index(rest[:, 0] + (shares[..., None] * (rest[:, 1:] - rest[:, :1])).sum(axis=1)) + 0.5
+    is_inside = ((index > 0.05) & (index < np.array(image.shape) - 0.05)).all(axis=1)
+    is_inside &= (np.abs(index - np.rint(index)) > 0.02).all(axis=1)
+    low, high = np.percentile(image.data, [0.5, 99.5])
+    grey = np.clip((image.data[tuple(index[is_inside].astype(int).T)] - low) / (high - low), 0, 1) * 255
+    colours = np.array(page["carried"])[clear[is_inside], 2:]
+    assert len(grey) > 200
+    np.testing.assert_allclose(colours, np.repeat(grey[:, None], 3, axis=1), atol=1.01)
     assert page["second"][1:3] == ["Deformation × 1.5", "displacement (mm)"]
     numbers = [float(text) for text in re.findall(r"[\d.]+", page["second"][3])]
     np.testing.assert_allclose(numbers, [field.nodes.min(), field.nodes.max()], rtol=1e-4)

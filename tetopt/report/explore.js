@@ -103,7 +103,7 @@ function explore(gl, data, notes) {
 
   function build() {
     const { axis, at } = state;
-    const nothing = new Triangles(0);
+    const nothing = new Triangles(0, true);
     const hasSlice = axis >= 0 && image && state.inside !== "cells";
     const field = fields[state.field];
     const levels = field.nodes && nodeLevels(field);
@@ -112,7 +112,9 @@ function explore(gl, data, notes) {
     const cut = axis >= 0 && (hasSlice || !state.isWhole) ? section(mesh, isWithin, axis, at, levels) : nothing;
     drawn.parts.surface.fill(outside);
     drawn.parts.section.fill(cut);
-    drawn.parts.slice.fill(hasSlice ? slice(image.box, axis, at) : nothing);
+    // Cells that are deformed take the image along: around them it would be where it was.
+    const isAlone = state.inside === "image" || !displacements.length || state.warp === 0;
+    drawn.parts.slice.fill(hasSlice && isAlone ? slice(image.box, axis, at) : nothing);
     drawn.parts.set.fill(state.set < 0 ? nothing : setTriangles(mesh, sets[state.set].triangles));
     canvas.dataset.surface = outside.count;
     canvas.dataset.section = cut.nPolygons || 0;

@@ -7,8 +7,8 @@ const FRAGMENT = `${SHADING}
   uniform bool isNodal; uniform vec3 noValue; uniform sampler2D table; uniform sampler2D colours;
   uniform sampler3D voxels; uniform mat4 toIndex; uniform vec3 shape;
   const int SURFACE = 0, SECTION = 1, SLICE = 2, SET = 3;
-  vec4 grey() {  // of the voxel around this place; nothing outside of the image
-    vec3 index = (toIndex * vec4(world, 1.0)).xyz + 0.5;
+  vec4 grey(vec3 place) {  // of the voxel around a place; nothing outside of the image
+    vec3 index = (toIndex * vec4(place, 1.0)).xyz + 0.5;
     if (any(lessThan(index, vec3(0.0))) || any(greaterThanEqual(index, shape))) return vec4(0.0);
     return vec4(vec3(texelFetch(voxels, ivec3(index), 0).r), 1.0);
   }
@@ -21,7 +21,7 @@ const FRAGMENT = `${SHADING}
     float lit = kind == SECTION ? 1.0 : light(0.55);
     if (kind != SECTION && kind != SLICE && dot(plane.xyz, world) > plane.w) discard;
     if (kind == SLICE) {
-      colour = grey();
+      colour = grey(world);
       if (colour.a == 0.0) discard;
       return;
     }
@@ -35,7 +35,7 @@ const FRAGMENT = `${SHADING}
       return;
     }
     vec3 own = isNodal ? atNodes() : texelFetch(colours, ivec2(cell % 2048u, cell / 2048u), 0).rgb;
-    vec4 below = kind == SECTION ? grey() : vec4(0.0);
+    vec4 below = kind == SECTION ? grey(rest) : vec4(0.0);  // the image is moved along
     float seenOwn = mix(1.0, share, below.a);
     vec3 fill = mix(below.rgb, own, seenOwn) * lit;
     // Lines that show on any cell: dark, on dark cells light, over the image orange.
@@ -84,7 +84,7 @@ function nearestTexture(gl, unit, target) {
 // What draws the view. It draws all of it for every change; only what `fill` and `paint` take stays on the card.
 function renderer(gl, image, radius, depth, table, noValue) {
   const { at, part, clear } = painter(gl, FRAGMENT);
-  const parts = Object.fromEntries(Object.keys(KINDS).map((name) => [name, part()]));
+  const parts = Object.fromEntries(Object.keys(KINDS).map((name) => [name, part(name === "section")]));
   gl.blendFuncSeparate(gl.SRC_ALPHA, gl.ONE_MINUS_SRC_ALPHA, gl.ONE, gl.ONE);
   nearestTexture(gl, 0, gl.TEXTURE_2D);
   nearestTexture(gl, 1, gl.TEXTURE_3D);

@@ -116,15 +116,14 @@ function surface(mesh, isShown, levels) {
 
 // The polygons in which the plane axis = at cuts the shown cells: triangles, or quadrilaterals in two triangles.
 function section(mesh, isShown, axis, at, levels) {
-  const { points, cells } = mesh;
-  const triangles = new Triangles(64);
+  const { points, rest, cells } = mesh;
+  const triangles = new Triangles(64, true);
   const between = (i, j) => {
     const share = (at - points[3 * i + axis]) / (points[3 * j + axis] - points[3 * i + axis]);
-    const place = [0, 0, 0];
-    for (let k = 0; k < 3; k++) place[k] = points[3 * i + k] + share * (points[3 * j + k] - points[3 * i + k]);
+    const along = (list) => [0, 1, 2].map((k) => list[3 * i + k] + share * (list[3 * j + k] - list[3 * i + k]));
+    const place = along(points);
     place[axis] = at;
-    if (levels) place.push(levels[i] + share * (levels[j] - levels[i]));
-    return place;
+    return [...place, levels ? levels[i] + share * (levels[j] - levels[i]) : 0, rest === points ? place : along(rest)];
   };
   let nPolygons = 0;
   for (let cell = 0; cell < mesh.count; cell++) {

@@ -3,13 +3,14 @@
 
 const VERTEX = `#version 300 es
   precision highp float; precision highp int;
-  in vec3 place; in uint tag; in float value;
+  in vec3 place; in uint tag; in float value; in vec3 origin;
   uniform mat3 turn; uniform vec3 scale; uniform vec2 shift;
-  out vec3 world; out vec3 seen; out vec3 corner; out float level; flat out uint cell; flat out uint sides;
+  out vec3 world; out vec3 rest; out vec3 seen; out vec3 corner; out float level; flat out uint cell; flat out uint sides;
   void main() {
     int k = gl_VertexID % 3;  // vertices are not shared, so this is the corner's number in its triangle
     corner = vec3(k == 0, k == 1, k == 2);
     world = place;
+    rest = origin;
     level = value;
     seen = turn * place;
     cell = tag >> 3;
@@ -19,7 +20,7 @@ const VERTEX = `#version 300 es
 // What a view's fragment shader begins with: the line along the drawn sides, 0 to 1, and the light on a facet.
 const SHADING = `#version 300 es
   precision highp float; precision highp int; precision highp sampler3D;
-  in vec3 world; in vec3 seen; in vec3 corner; in float level; flat in uint cell; flat in uint sides;
+  in vec3 world; in vec3 rest; in vec3 seen; in vec3 corner; in float level; flat in uint cell; flat in uint sides;
   out vec4 colour;
   float edge() {
     vec3 step = fwidth(corner);
@@ -41,12 +42,13 @@ function bytes(text) {
 }
 
 // Triangles with their own three corners each; a tag is the cell's number and which of the sides are drawn, as bits; a
-// value is what a field at the nodes is there.
+// value is what a field at the nodes is there, an origin, if the list has them, where the corner is of a mesh at rest.
 class Triangles {
-  constructor(capacity) {
+  constructor(capacity, hasOrigins = false) {
     this.places = new Float32Array(9 * capacity);
     this.tags = new Uint32Array(3 * capacity);
     this.values = new Float32Array(3 * capacity);
+    this.origins = hasOrigins ? new Float32Array(9 * capacity) : null;
     this.count = 0;
   }
   add(cell, sides, ...corners) {
@@ -54,19 +56,21 @@ class Triangles {
     corners.forEach((corner, k) => this.set(3 * this.count + k, cell, sides, ...corner));
     this.count++;
   }
-  set(vertex, cell, sides, x, y, z, value = 0) {
+  set(vertex, cell, sides, x, y, z, value = 0, origin = null) {
     this.places[3 * vertex] = x;
     this.places[3 * vertex + 1] = y;
     this.places[3 * vertex + 2] = z;
     this.tags[vertex] = cell * 8 + sides;
     this.values[vertex] = value;
+    if (origin) this.origins.set(origin, 3 * vertex);
   }
   grow() {
-    const more = new Triangles(Math.max(64, 2 * this.count));
+    const more = new Triangles(Math.max(64, 2 * this.count), this.origins !== null);
     more.places.set(this.places);
     more.tags.set(this.tags);
     more.values.set(this.values);
-    [this.places, this.tags, this.values] = [more.places, more.tags, more.values];
+    if (this.origins) more.origins.set(this.origins);
+    [this.places, this.tags, this.values, this.origins] = [more.places, more.tags, more.values, more.origins];
   }
 }
 
@@ -94,7 +98,7 @@ function painter(gl, fragment) {
   const at = (name) => gl.getUniformLocation(program, name);
   return {
     at,
-    part: () => part(gl, program),
+    part: (hasOrigins = false) => part(gl, program, hasOrigins),
     // Clears a frame of `size` pixels, whose shorter side shows `radius` to either side of the middle at zoom 1.
     clear(size, camera, radius, depth) {
       gl.viewport(0, 0, ...size);
@@ -108,16 +112,16 @@ function painter(gl, fragment) {
 }
 
 // A list of triangles on the graphics card.
-function part(gl, program) {
+function part(gl, program, hasOrigins) {
   const array = gl.createVertexArray();
   const buffers = {};
   gl.bindVertexArray(array);
-  for (const [name, numbers] of [["place", 3], ["tag", 1], ["value", 1]]) {
+  for (const [name, numbers] of [["place", 3], ["tag", 1], ["value", 1], ["origin", 3]]) {
     const at = gl.getAttribLocation(program, name);
     if (at < 0) continue;  // the fragment shader makes nothing of it
     buffers[name] = gl.createBuffer();
     gl.bindBuffer(gl.ARRAY_BUFFER, buffers[name]);
-    gl.enableVertexAttribArray(at);
+    if (name !== "origin" || hasOrigins) gl.enableVertexAttribArray(at);
     if (name === "tag") gl.vertexAttribIPointer(at, numbers, gl.UNSIGNED_INT, 0, 0);
     else gl.vertexAttribPointer(at, numbers, gl.FLOAT, false, 0, 0);
   }
@@ -125,10 +129,15 @@ function part(gl, program) {
   return {
     fill(triangles) {
       count = triangles.count;
-      const lists = { place: triangles.places, tag: triangles.tags, value: triangles.values };
+      const lists = {
+        place: [triangles.places, 9], tag: [triangles.tags, 3], value: [triangles.values, 3],
+        origin: [triangles.origins, 9],
+      };
       for (const [name, buffer] of Object.entries(buffers)) {
+        const [list, size] = lists[name];
+        if (!list) continue;
         gl.bindBuffer(gl.ARRAY_BUFFER, buffer);
-        gl.bufferData(gl.ARRAY_BUFFER, lists[name].subarray(0, (name === "place" ? 9 : 3) * count), gl.DYNAMIC_DRAW);
+        gl.bufferData(gl.ARRAY_BUFFER, list.subarray(0, size * count), gl.DYNAMIC_DRAW);
       }
     },
     draw() {

@@ -162,6 +162,7 @@ class _Scene:
         text = f"{count:,} of {len(self.mesh.cells):,} cells, {volume:,.7g} mm³; world RAS, mm"
         if self.displacements:
             text += f"\ndeformation x {self.warp:.4g}" + (f", step {self.step}" if self.step else "")
+            text += "; the image is at rest" if self.image is not None and self.inside != "mesh" else ""
         name = list(self.sets)[self.set - 1] if self.set else ""
         if force := self.reactions.get(self.step, {}).get(name):
             parts = ", ".join(f"{letter} {value:.4g}" for letter, value in zip(AXIS_LETTERS, force, strict=True))
