@@ -3,9 +3,11 @@
 from functools import cache
 
 import numpy as np
+from scipy.sparse import diags_array
+from scipy.sparse.linalg import spsolve
 
 import tetopt
-from tetopt.fem.elasticity import compression, lame_constants, strains
+from tetopt.fem.elasticity import compression, lame_constants, stiffness, strains
 from tetopt.geometry.quadratic import cell_edges, quadratic
 from tetopt.geometry.simplex import volumes
 from tetopt.model.loads import parse_loads
@@ -132,3 +134,13 @@ def loaded_model(case, n=3, order=1, moduli="cells"):
     loads = parse_loads(words, model.mesh, model.sets)
     nodal = np.random.default_rng(7).uniform(1.0, 9.0, len(model.mesh.points)) if moduli == "nodes" else None
     return model._replace(materials=table, loads=loads, order=order, node_young=nodal)
+
+
+def displaced(model, is_prescribed, prescribed, forces, springs):
+    """Displacement (N, 3) of nodes under what a file says of them, by our matrix and a plain factorisation."""
+    of_cell = model.materials.of_cell
+    K = stiffness(model.mesh, model.materials.young[of_cell], model.materials.nu[of_cell], model.order)
+    K = (K + diags_array(np.repeat(springs, 3))).tocsr()
+    u, free = np.where(is_prescribed, prescribed, 0.0).ravel(), np.flatnonzero(~is_prescribed.ravel())
+    u[free] = spsolve(K[free][:, free], forces.ravel()[free] - (K @ u)[free])
+    return u.reshape(-1, 3)

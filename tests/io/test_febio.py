@@ -7,13 +7,14 @@ import xml.etree.ElementTree as ET
 
 import numpy as np
 import pytest
-from models import sample_model
+from models import LOAD_CASES, displaced, loaded_model, sample_model
 
 from tetopt.errors import InputError
+from tetopt.fem.solution import solved_model
 from tetopt.geometry.quadratic import quadratic, quadratic_facet_nodes
 from tetopt.io.febio import MOST_MATERIAL_PARTS, febio
 from tetopt.model.materials import materials
-from tetopt.model.model import described, in_space, in_units
+from tetopt.model.model import described, elements, in_space, in_units
 from tetopt.model.sets import facet_triples, nodes_of
 
 
@@ -38,6 +39,10 @@ def rows_of(section, tag, number="id"):
     assert {child.tag for child in section} == {tag}
     table = np.array([[float(x) for x in child.text.split(",")] for child in section])
     return np.array([int(child.get(number)) for child in section]), table
+
+
+def numbers(element):
+    return [float(x) for x in element.text.split(",")]
 
 
 def listed(element):
@@ -253,3 +258,75 @@ def test_what_it_cannot_carry(model, message):
     with pytest.raises(InputError, match=message) as caught:
         febio(model)
     assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("case", LOAD_CASES)
+def test_what_the_file_says_is_what_fem_solves(case, order):
+    """Pressures on the file's own surfaces, forces, springs at small displacements, conditions; by our own matrix."""
+    model = loaded_model(case, order=order)
+    root = ET.fromstring(febio(model))
+    nodes = {node.get("id"): numbers(node) for nodes in root.iter("Nodes") for node in nodes}
+    points = np.array(list(nodes.values()))
+    sets = {each.get("name"): listed(each) - 1 for each in root.iter("NodeSet")}
+    is_prescribed, prescribed = np.zeros(points.shape, dtype=bool), np.zeros(points.shape)
+    for bc in root.find("Boundary") or ():
+        dofs = [0, 1, 2] if bc.get("type") == "zero displacement" else ["xyz".index(bc.find("dof").text)]
+        for dof in dofs:
+            is_prescribed[sets[bc.get("node_set")], dof] = True
+            prescribed[sets[bc.get("node_set")], dof] = float(bc.findtext("value") or 0.0)
+    forces = np.zeros(points.shape)
+    for load in root.find("Loads") or ():
+        if load.get("type") == "nodal_force":
+            assert (load.find("value").get("type"), load.find("value").get("lc")) == ("map", "1")
+            (data,) = (each for each in root.iter("NodeData") if each.get("name") == load.find("value").text)
+            assert (data.get("node_set"), data.get("data_type")) == (load.get("node_set"), "vec3")
+            assert [node.get("lid") for node in data] == list(map(str, range(1, len(data) + 1)))
+            forces[sets[load.get("node_set")]] += np.array([numbers(node) for node in data])
+            continue
+        assert load.get("type") == "pressure"
+        (surface,) = (each for each in root.iter("Surface") if each.get("name") == load.get("surface"))
+        for facet in surface:
+            corners = listed(facet) - 1
+            a, b, c = points[corners[:3]]
+            push = -float(load.findtext("pressure")) * np.cross(b - a, c - a) / 6.0
+            forces[corners[-3:]] += push  # corners of a linear facet; midpoints of a quadratic one
+    springs = np.zeros(points.shape)
+    stiffness = {each.get("id"): float(each.findtext("E")) for each in root.iter("discrete_material")}
+    for each in root.iter("discrete"):
+        (pairs,) = (one for one in root.iter("DiscreteSet") if one.get("name") == each.get("discrete_set"))
+        for pair in pairs:
+            here, there = listed(pair) - 1
+            along = (points[there] - points[here]) / np.linalg.norm(points[there] - points[here])
+            assert is_prescribed[there].all()
+            springs[here] += stiffness[each.get("dmat")] * along**2
+    n = len(elements(model)[0])
+    np.testing.assert_allclose(springs, springs[:, :1] * np.ones(3))  # the same in all directions
+    u = displaced(model, is_prescribed[:n], prescribed[:n], forces[:n], springs[:n, 0])
+    np.testing.assert_allclose(u, solved_model(model).u, atol=1e-9 * np.abs(u).max())
+
+
+def test_several_steps_are_several_files():
+    with pytest.raises(InputError, match="febio: a file is one step, got 2"):
+        febio(loaded_model(["1/hold:left", "2/hold:left"]))
+
+
+def test_loads_are_those_of_pyfebio():
+    """Every tag and type of the loads is known to the spec as pyfebio models it."""
+    pyfebio = pytest.importorskip("pyfebio")
+    root = ET.fromstring(febio(loaded_model("all")))
+    known = ET.fromstring(pyfebio.loads.PressureLoad(surface="left").to_xml())
+    pressures = [load for load in root.find("Loads") if load.get("type") == "pressure"]
+    assert len(pressures) == 2
+    for load in pressures:
+        assert {child.tag for child in load} <= {child.tag for child in known}
+        assert load.tag == known.tag
+    (force,) = (load for load in root.find("Loads") if load.get("type") == "nodal_force")
+    known = ET.fromstring(pyfebio.loads.NodalForce(node_set="left").to_xml())
+    assert (force.tag, force[0].tag) == (known.tag, known[-1].tag)
+    data = next(root.iter("NodeData"))
+    assert pyfebio.meshdata.NodeData.from_xml(ET.tostring(data)).data_type == "vec3"
+    sets = [pyfebio.mesh.DiscreteSet.from_xml(ET.tostring(each)) for each in root.iter("DiscreteSet")]
+    assert (
+        len(sets) == len(pyfebio.discrete.Discrete.from_xml(ET.tostring(root.find("Discrete"))).discrete_materials) > 3
+    )

@@ -5,9 +5,10 @@ import xml.etree.ElementTree as ET
 
 import numpy as np
 import pytest
-from models import sample_model
+from models import LOAD_CASES, displaced, loaded_model, sample_model
 
 from tetopt.errors import InputError
+from tetopt.fem.solution import solved_model
 from tetopt.io.sofa import REQUIRED_PLUGINS, sofa
 from tetopt.model.materials import materials
 from tetopt.model.model import described, in_space, in_units
@@ -15,6 +16,7 @@ from tetopt.model.sets import facet_triples, nodes_of
 
 # The plugin of every component, from SOFA's documentation; None for what is always there.
 PLUGIN_OF = {
+    "ConstantForceField": "Sofa.Component.MechanicalLoad",
     "DefaultAnimationLoop": None,
     "DiagonalMass": "Sofa.Component.Mass",
     "EulerImplicitSolver": "Sofa.Component.ODESolver.Backward",
@@ -22,8 +24,10 @@ PLUGIN_OF = {
     "LinearMovementProjectiveConstraint": "Sofa.Component.Constraint.Projective",
     "MechanicalObject": "Sofa.Component.StateContainer",
     "Node": None,
+    "PartialFixedProjectiveConstraint": "Sofa.Component.Constraint.Projective",
     "PointsFromIndices": "Sofa.Component.Engine.Select",
     "RequiredPlugin": None,
+    "RestShapeSpringsForceField": "Sofa.Component.SolidMechanics.Spring",
     "SparseLDLSolver": "Sofa.Component.LinearSolver.Direct",
     "TetrahedronFEMForceField": "Sofa.Component.SolidMechanics.FEM.Elastic",
     "TetrahedronSetGeometryAlgorithms": "Sofa.Component.Topology.Container.Dynamic",
@@ -159,3 +163,43 @@ def test_what_it_cannot_carry(model, message):
     with pytest.raises(InputError, match=message) as caught:
         sofa(model)
     assert "\n" not in str(caught.value)
+
+
+SOFA_CASES = LOAD_CASES.keys() - {"free components"}
+
+
+@pytest.mark.parametrize("case", sorted(SOFA_CASES))
+def test_what_the_scene_says_is_what_fem_solves(case):
+    """Masses, forces, springs and constraints taken from the scene, by our own matrix."""
+    model = loaded_model(case)
+    root = ET.fromstring(sofa(model))
+    solid, shape = root.find("Node[@name='solid']"), model.mesh.points.shape
+    is_prescribed, prescribed = np.zeros(shape, dtype=bool), np.zeros(shape)
+    mass = table(solid.find("DiagonalMass"), "vertexMass", float)
+    forces = mass[:, None] * table(root, "gravity", float)
+    springs = np.zeros(len(mass))
+    for element in solid:
+        if element.tag == "ConstantForceField":
+            forces[table(element, "indices")] += table(element, "forces", float, 3)
+        elif element.tag == "RestShapeSpringsForceField":
+            springs[table(element, "points")] += table(element, "stiffness", float)
+        elif element.tag.endswith("ProjectiveConstraint"):
+            nodes = table(element, "indices")
+            is_prescribed[nodes] = True
+            prescribed[nodes] = table(element, "movements", float, 3)[-1] if element.get("movements") else 0.0
+    u = displaced(model, is_prescribed, prescribed, forces, springs)
+    np.testing.assert_allclose(u, solved_model(model).u, atol=1e-9 * np.abs(u).max())
+    plugins = {element.get("name") for element in root.iter("RequiredPlugin")}
+    assert plugins >= {PLUGIN_OF[element.tag] for element in root.iter()} - {None}
+
+
+def test_components_that_are_free_and_steps():
+    model = loaded_model(["move:left:0,free,0", "pressure:right:1"])
+    (constraint,) = solid_of(sofa(model)).findall("PartialFixedProjectiveConstraint")
+    assert constraint.get("fixedDirections") == "1 0 1"
+    for words, match in (
+        (["move:left:1,free,0"], "instead of free"),
+        (["1/hold:left", "2/hold:left"], "one step, got 2"),
+    ):
+        with pytest.raises(InputError, match=match):
+            sofa(loaded_model(words))

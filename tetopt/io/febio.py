@@ -1,6 +1,7 @@
 """FEBio input files, febio_spec 4.0: mesh, sets, materials, cell data and a static step.
 
-Written from the sources of FEBio 4 and FEBio Studio 2 and read back with pyfebio; no FEBio has run one of them here.
+Written from the sources and manuals of FEBio 4 and FEBio Studio 2 and read back with pyfebio; no FEBio has run one of
+them here.
 """
 
 from __future__ import annotations
@@ -12,17 +13,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
-from tetopt.io.tags import as_scalars, check_kinds
+from tetopt.fem.solution import weight_forces
+from tetopt.io.tags import as_scalars, check_one_step
 from tetopt.io.text import rows, xml_comment
-from tetopt.model.loads import Load
-from tetopt.model.materials import Materials, cells_of
-from tetopt.model.model import STRESS_UNITS, Model, described, element_facets, elements
+from tetopt.model.loads import Load, facet_forces, spring_constants
+from tetopt.model.materials import cells_of, density_of
+from tetopt.model.model import STRESS_UNITS, Model, described, element_facets, elements, mass_densities
 
 MOST_MATERIAL_PARTS = 100  # with more, FEBio Studio's list of parts is no use
 STUDIO_UNITS = {"kPa": "mm-kg-s", "MPa": "mm-N-s"}  # FEBio's own words for what is consistent with them
 # A set's name has no spaces, so that neither these nor the names of parts ("material 1") are ever a set's.
 ALL_NODES, ALL_CELLS = "all nodes", "all cells"
-YOUNG_MAP, NU_MAP = "E", "v"  # maps of the moduli, named as the parameters they stand for
+YOUNG_MAP, NU_MAP, DENSITY_MAP = "E", "v", "density"  # maps, named as the parameters they stand for
+DEAD_FORCES = "dead forces"  # the set of the nodes that tractions and weight act on, and the map of their forces
+GROUND_NODES = "ground nodes"  # the far ends of springs
+# Springs of FEBio act along their length, so that three stand for one that is the same in all directions: so many times
+# the size of the mesh long, what moves across one stretches it by next to nothing.
+SPRING_LENGTHS = 1000.0
 
 # What FEBio Studio writes, too, but for the equal steps up to the whole displacement, which the solver may halve.
 CONTROL_SECTION = """\
@@ -62,6 +69,7 @@ class _Part(NamedTuple):
     name: str  # the material's, too
     young: str  # a number, or the name of a map of it
     nu: str
+    density: str
     cells: NDArray[np.int64]
 
 
@@ -77,27 +85,30 @@ def febio(model: Model) -> bytes:
 
     The material is neo-Hookean: at small strains it is linear elasticity of these moduli, as `tetopt fem` solves it,
     and it withstands large compression, where FEBio's "isotropic elastic" (St. Venant-Kirchhoff) softens until cells
-    collapse. With loads there is a static step of ten increments from 0 to the whole displacement. It plots the density
+    collapse. With loads there is a static step of ten increments from 0 to the whole of them, of large deformation.
+    Pressures follow their surfaces; tractions and weight are forces on nodes by `tetopt.model.loads.facet_weights` and
+    of a direction that stays; what surrounds a set are three long springs at each of its nodes. It plots the density
     of the strain energy, whose integral over the undeformed volume is the total. Without loads, the step is left to
     FEBio Studio.
 
     Raises
     ------
     InputError
-        A 2-D model, no materials, or cell data named like the map of a modulus.
+        A 2-D model, no materials, several steps, or cell data named like the map of a modulus.
     """
-    parts = _parts(_checked(model))
+    _check(model)
+    parts = _parts(model)
     sections = [
         _head(model),
         "<Globals>\n<Constants>\n<T>0</T>\n<P>0</P>\n<R>0</R>\n<Fc>0</Fc>\n</Constants>\n</Globals>\n",
         CONTROL_SECTION if model.loads else "",
-        _materials(parts, STRESS_UNITS[model.units].water),
+        _materials(parts),
         *_mesh(model, parts),
         "<MeshDomains>\n",
         *(f'<SolidDomain name="{part.name}" mat="{part.name}"/>\n' for part in parts),
         "</MeshDomains>\n",
         *_mesh_data(model, parts),
-        *_loads(model.loads),
+        *_loads(model),
         '<Output>\n<plotfile type="febio">\n',
         *(f'<var type="{name}"/>\n' for name in PLOT_VARIABLES),
         "</plotfile>\n</Output>\n</febio_spec>\n",
@@ -105,25 +116,29 @@ def febio(model: Model) -> bytes:
     return "".join(sections).encode("utf-8", "replace")
 
 
-def _checked(model: Model) -> Materials:
+def _check(model: Model) -> None:
     if model.mesh.ndim == 2:
         raise InputError("febio: expected a mesh of tetrahedra, got triangles; .vtu holds them")
     if model.materials is None:
         raise InputError("febio: a part needs a material; give a law of the modulus (--young)")
-    if taken := {YOUNG_MAP, NU_MAP} & model.cell_data.keys():
-        raise InputError(f'febio: the file\'s map of a modulus is called "{min(taken)}"; call the cell data otherwise')
-    check_kinds(model, "febio", ("displacement",), 1)
-    return model.materials
+    if taken := {YOUNG_MAP, NU_MAP, DENSITY_MAP, DEAD_FORCES} & model.cell_data.keys():
+        raise InputError(f'febio: a map that the file needs is called "{min(taken)}"; call the cell data otherwise')
+    check_one_step(model, "febio")
 
 
-def _parts(materials: Materials) -> list[_Part]:
-    young, nu, of_cell = materials.young, materials.nu, materials.of_cell
+def _parts(model: Model) -> list[_Part]:
+    assert model.materials is not None
+    young, nu, of_cell = model.materials.young, model.materials.nu, model.materials.of_cell
+    density = mass_densities(model)
     if len(young) > MOST_MATERIAL_PARTS:
-        ratio = NU_MAP if np.ptp(nu) > 0.0 else repr(float(nu[0]))
-        return [_Part(ALL_CELLS, YOUNG_MAP, ratio, np.arange(len(of_cell)))]
+        ratio, mass = (
+            name if np.ptp(values) > 0.0 else repr(float(values[0]))
+            for name, values in ((NU_MAP, nu), (DENSITY_MAP, density))
+        )
+        return [_Part(ALL_CELLS, YOUNG_MAP, ratio, mass, np.arange(len(of_cell)))]
     return [
-        _Part(f"material {k + 1}", repr(float(young[k])), repr(float(nu[k])), members)
-        for k, members in enumerate(cells_of(materials))
+        _Part(f"material {k + 1}", repr(float(young[k])), repr(float(nu[k])), repr(float(density[k])), members)
+        for k, members in enumerate(cells_of(model.materials))
         if len(members)
     ]
 
@@ -135,12 +150,13 @@ def _head(model: Model) -> str:
     )
 
 
-def _materials(parts: list[_Part], density: float) -> str:
+def _materials(parts: list[_Part]) -> str:
     return "".join(
         [
             "<Material>\n",
             *(
-                f'<material id="{k}" name="{part.name}" type="neo-Hookean">\n<density>{density!r}</density>\n'
+                f'<material id="{k}" name="{part.name}" type="neo-Hookean">\n'
+                f"{_parameter('density', part.density, DENSITY_MAP)}"
                 f"{_parameter('E', part.young, YOUNG_MAP)}{_parameter('v', part.nu, NU_MAP)}</material>\n"
                 for k, part in enumerate(parts, start=1)
             ),
@@ -159,6 +175,7 @@ def _mesh(model: Model, parts: list[_Part]) -> list[str]:
     surfaces = {name: element_facets(cells, members) for name, members in model.sets.facets.items()}
     return [
         f'<Mesh>\n<Nodes name="{ALL_NODES}">\n{_items("node", points)}</Nodes>\n',
+        *_ground(model, points),
         *(
             f'<Elements type="tet{cells.shape[1]}" name="{part.name}">\n'
             f"{_items('elem', cells[part.cells] + 1, part.cells + 1)}</Elements>\n"
@@ -170,6 +187,7 @@ def _mesh(model: Model, parts: list[_Part]) -> list[str]:
         ),
         *(f'<ElementSet name="{name}">{_list(members)}</ElementSet>\n' for name, members in model.sets.cells.items()),
         *(f'<NodeSet name="{name}">{_list(np.unique(nodes))}</NodeSet>\n' for name, nodes in surfaces.items()),
+        *_force_and_spring_sets(model, points),
         "</Mesh>\n",
     ]
 
@@ -187,21 +205,107 @@ def _mesh_data(model: Model, parts: list[_Part]) -> list[str]:
         fields[YOUNG_MAP] = model.materials.young[model.materials.of_cell]
         if parts[0].nu == NU_MAP:
             fields[NU_MAP] = model.materials.nu[model.materials.of_cell]
-    if not fields:
-        return []
+        if parts[0].density == DENSITY_MAP:
+            fields[DENSITY_MAP] = mass_densities(model)[model.materials.of_cell]
     data = [
         f'<ElementData name="{_attribute(name)}" elem_set="{part.name}" data_type="scalar">\n'
         f"{_items('elem', values[part.cells], number='lid')}</ElementData>\n"
         for name, values in fields.items()
         for part in parts
     ]
-    return ["<MeshData>\n", *data, "</MeshData>\n"]
+    nodes, forces = _dead_forces(model)
+    if len(nodes):
+        data.append(
+            f'<NodeData name="{DEAD_FORCES}" node_set="{DEAD_FORCES}" data_type="vec3">\n'
+            f"{_items('node', forces, number='lid')}</NodeData>\n"
+        )
+    return ["<MeshData>\n", *data, "</MeshData>\n"] if data else []
 
 
-def _loads(loads: tuple[Load, ...]) -> list[str]:
-    if not loads:
+def _loads(model: Model) -> list[str]:
+    if not model.loads:
         return []
-    return [RAMP_SECTION, "<Boundary>\n", *(_condition(load) for load in loads), "</Boundary>\n"]
+    pushes = [
+        f'<surface_load name="pressure {load.set_name}" type="pressure" surface="{load.set_name}">\n'
+        f'<pressure lc="1">{float(load.numbers[0])!r}</pressure>\n<linear>0</linear>\n'
+        "<symmetric_stiffness>1</symmetric_stiffness>\n</surface_load>\n"
+        for load in model.loads
+        if load.kind == "pressure"
+    ]
+    if len(_dead_forces(model)[0]):
+        pushes.append(
+            f'<nodal_load name="{DEAD_FORCES}" type="nodal_force" node_set="{DEAD_FORCES}">\n'
+            f'<value lc="1" type="map">{DEAD_FORCES}</value>\n</nodal_load>\n'
+        )
+    conditions = [_condition(load) for load in model.loads if load.kind == "displacement"]
+    constants = _springs(model)[1]
+    if len(constants):
+        conditions.append(_condition(Load("displacement", GROUND_NODES, np.zeros(3))))
+    return [
+        RAMP_SECTION,
+        *(["<Boundary>\n", *conditions, "</Boundary>\n"] if conditions else []),
+        *(["<Loads>\n", *pushes, "</Loads>\n"] if pushes else []),
+        *(["<Discrete>\n", *_discrete(constants), "</Discrete>\n"] if len(constants) else []),
+    ]
+
+
+def _dead_forces(model: Model) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Nodes and what tractions and weight do to them, (P, 3)."""
+    total = np.zeros_like(elements(model)[0])
+    for load in model.loads:
+        if load.kind == "traction":
+            nodes, forces = facet_forces(model.mesh, model.sets, load, model.order)
+            total[nodes] += forces
+        elif load.kind == "gravity" and (table := model.materials) is not None:
+            density = density_of(table)[table.of_cell]
+            total += weight_forces(model.mesh, density, load.numbers, model.order) / STRESS_UNITS[model.units].kPa
+    nodes = np.flatnonzero(total.any(axis=1))
+    return nodes, total[nodes]
+
+
+def _springs(model: Model) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+    """Nodes on springs, and how stiff these are, (P,)."""
+    total = np.zeros(len(elements(model)[0]))
+    for load in model.loads:
+        if load.kind == "spring":
+            nodes, constants = spring_constants(model.mesh, model.sets, load, model.order)
+            total[nodes] += constants
+    nodes = np.flatnonzero(total)
+    return nodes, total[nodes]
+
+
+def _ground(model: Model, points: NDArray[np.float64]) -> list[str]:
+    """The far ends of the springs, numbered behind the nodes: along x, y and z from each node on springs."""
+    nodes = _springs(model)[0]
+    if len(nodes) == 0:
+        return []
+    length = SPRING_LENGTHS * float(np.ptp(points, axis=0).max())
+    ends = (points[nodes][:, None] + length * np.eye(3)).reshape(-1, 3)
+    lines = _items("node", ends, len(points) + 1 + np.arange(len(ends)))
+    return [f'<Nodes name="far ends of springs">\n{lines}</Nodes>\n']
+
+
+def _force_and_spring_sets(model: Model, points: NDArray[np.float64]) -> list[str]:
+    forced, sprung = _dead_forces(model)[0], _springs(model)[0]
+    sets = [f'<NodeSet name="{DEAD_FORCES}">{_list(forced)}</NodeSet>\n'] if len(forced) else []
+    if len(sprung) == 0:
+        return sets
+    ends = len(points) + np.arange(3 * len(sprung))
+    sets.append(f'<NodeSet name="{GROUND_NODES}">{_list(ends)}</NodeSet>\n')
+    for k, (node, three) in enumerate(zip(sprung.tolist(), ends.reshape(-1, 3).tolist(), strict=True), start=1):
+        pairs = "".join(f"<delem>{node + 1},{end + 1}</delem>\n" for end in three)
+        sets.append(f'<DiscreteSet name="spring {k}">\n{pairs}</DiscreteSet>\n')
+    return sets
+
+
+def _discrete(constants: NDArray[np.float64]) -> list[str]:
+    """A material for each node on springs, and then which springs are of it."""
+    materials = [
+        f'<discrete_material id="{k}" name="spring {k}" type="linear spring">\n<E>{constant!r}</E>\n'
+        "</discrete_material>\n"
+        for k, constant in enumerate(constants.tolist(), start=1)
+    ]
+    return materials + [f'<discrete dmat="{k}" discrete_set="spring {k}"/>\n' for k in range(1, len(constants) + 1)]
 
 
 def _condition(load: Load) -> str:

@@ -95,12 +95,10 @@ def check_apart(names: list[str], taken: dict[str, NDArray[np.int64]]) -> None:
         raise InputError(f'set {both[0]}: the file calls something else "{both[0]}"; call the set otherwise')
 
 
-def check_kinds(model: Model, form: str, kinds: tuple[str, ...], most_steps: int) -> None:
-    """InputError for loads that a format has no words for, or more steps than it can tell apart."""
-    if others := [load for load in model.loads if load.kind not in kinds]:
-        raise InputError(f"{form}: no place for the load {load_words(others[0])}; .inp holds it")
-    if (count := count_of_steps(model.loads)) > most_steps:
-        raise InputError(f"{form}: a file is one step, got {count}; write a file for each, without the others' loads")
+def check_one_step(model: Model, form: str) -> None:
+    """InputError for several steps, where each would go on from the one before."""
+    if (count := count_of_steps(model.loads)) > 1:
+        raise InputError(f"{form}: a file is one step, got {count}; write one for each, with its loads alone")
 
 
 def remarks(model: Model) -> list[str]:
