@@ -26,12 +26,12 @@ from tetopt.fem.elasticity import box_faces, compression, push_of
 from tetopt.fem.reference import compare
 from tetopt.geometry.quadratic import gauss_rule, quadratic
 from tetopt.io.files import checked_output, save_json
-from tetopt.model.averages import cell_young, gauss_young, node_young, parse_average
+from tetopt.model.averages import element_young, parse_average
 from tetopt.study.compare import Standard, default_law, prepared
 from tetopt.study.compare_report import Settings
 
 POINTS = "points"
-AVERAGES = ("mean", "power:0.5", "geometric", "power:-0.5", "harmonic", "hill", "nodes", POINTS)
+AVERAGES = ("mean", "power:0.5", "geometric", "power:-0.5", "harmonic", "hill", "gauss", "nodes", POINTS)
 CORNER_SHARE = 1 / 7.2  # of all nodes of quadratic tetrahedra, before a mesh has shown its own
 COUNT_TOLERANCE = 0.03  # of the requested number of nodes
 
@@ -99,9 +99,7 @@ def _moduli(image: tetopt.Image, mesh: tetopt.Mesh, order: int, average: str) ->
     if average == POINTS:
         places = np.einsum("qa,cai->cqi", gauss_rule(mesh.ndim, order)[0], mesh.points[mesh.cells])
         return nearest_values(image, places.reshape(-1, mesh.ndim)).reshape(places.shape[:2])
-    if parse_average(average).is_nodal:
-        return gauss_young(node_young(image, mesh), mesh, order)
-    return cell_young(image, mesh, average=average)
+    return element_young(image, mesh, average=average, order=order)
 
 
 def _measured(

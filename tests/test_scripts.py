@@ -109,7 +109,7 @@ def test_choose_average(tmp_path, monkeypatch, capsys):
     words = ["-o", str(out), "--phantoms", "two_spheres", "--nodes", "400", "--dofs", "20000", "--modes", "uniform"]
     assert script("choose_average").main(words) == 0
     written = json.loads(out.read_text())
-    assert len(written["rows"]) == 8 * 2 * 2
+    assert len(written["rows"]) == 9 * 2 * 2
     for order in (1, 2):
         rows = {row["average"]: row for row in written["rows"] if (row["order"], row["nu"]) == (order, "0.3")}
         stiffer = [rows[each]["stiffer"] for each in ("mean", "power:0.5", "geometric", "power:-0.5", "harmonic")]

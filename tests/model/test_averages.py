@@ -7,9 +7,11 @@ import pytest
 
 import tetopt
 from tetopt import Image, InputError, cell_moments, cell_of_voxel, lattice
+from tetopt.fem.solution import gauss_moduli, solved_model
 from tetopt.geometry.quadratic import gauss_rule
-from tetopt.model.averages import cell_young, gauss_young, node_young, parse_average, young_image
+from tetopt.model.averages import cell_young, element_young, gauss_young, node_young, parse_average, young_image
 from tetopt.model.build import model_of
+from tetopt.model.model import in_units
 
 
 def noise(shape, seed=0, affine=None):
@@ -98,8 +100,10 @@ def test_averages_are_in_the_order_of_their_powers():
     hill = cell_young(image, mesh, lambda h: 1.0 + h, "hill")
     assert ((moduli[1] < hill) & (hill < moduli[5])).all()
     np.testing.assert_allclose(cell_young(image, mesh, lambda h: 1.0 + h, "power:-1"), moduli[1], rtol=1e-14)
-    for each in [*words, "hill", "nodes"]:
+    for each in [*words, "hill", "nodes", "gauss"]:
         assert (cell_young(image, mesh, lambda h: 0.7 + 0.0 * h, each) == 0.7).all()
+        for order in (1, 2):
+            assert (element_young(image, mesh, lambda h: 0.7 + 0.0 * h, each, order) == 0.7).all()
 
 
 def test_empty_space_in_a_cell():
@@ -113,7 +117,7 @@ def test_empty_space_in_a_cell():
     values = np.interp(image.data[owner == 0], [99.0, 199.0], [0.0, 10.0])
     assert roots[0] == pytest.approx((values**0.5).mean() ** 2, rel=1e-12)
     assert (cell_young(image, mesh, lambda h: 0.0 * h, "power:0.5") == 0.0).all()
-    for each in ("geometric", "harmonic", "hill", "nodes", "power:-2", "power:-0.5"):
+    for each in ("geometric", "harmonic", "hill", "nodes", "gauss", "power:-2", "power:-0.5"):
         with pytest.raises(
             InputError, match=rf"above 0 kPa for {each}, got 0 in \d+ voxels of the mesh.*--average mean"
         ):
@@ -133,7 +137,7 @@ def test_words_of_averages():
         1.0, 0.0, -1.0, 0.5, None
     ]  # fmt: skip
     assert parse_average(" power:+5e-1 ") == parse_average("power:0.5")
-    assert parse_average("nodes").is_nodal
+    assert [parse_average(each).place for each in ("nodes", "gauss", "hill")] == ["nodes", "gauss", "cells"]
 
 
 @pytest.mark.parametrize("shape", [(24, 20), (14, 12, 10)])
@@ -199,7 +203,60 @@ def test_a_model_has_moduli_of_nodes():
     )
     assert model_of(mesh, image, young=law).node_young is None
     assert model_of(mesh, image, young="3", average="nodes").node_young is None  # nothing varies
-    with pytest.raises(InputError, match=r"bins: moduli that are linear between nodes have no groups"):
+    with pytest.raises(InputError, match=r"bins: moduli that vary in a cell.*another average than nodes"):
         model_of(mesh, image, young=law, average="nodes", bins=3)
     with pytest.raises(InputError, match=r"average: nodes is over the image's voxels; give the image \(--image\)"):
         model_of(mesh, young=law, average="nodes", cell_data={"mean": np.ones(len(mesh.cells))})
+
+
+@pytest.mark.parametrize("shape", [(24, 20), (14, 12, 10)])
+def test_moduli_around_gauss_points(shape):
+    """Each has the geometric mean of the cell's voxels nearest to its corner; empty ones the nearest voxel's."""
+    n = len(shape)
+    image = noise(shape)
+    mesh = lattice(image, blocks=(12 - 2 * n,) * n)
+    young = element_young(image, mesh, lambda h: 1.0 + h, "gauss", 2)
+    assert young.shape == (len(mesh.cells), n + 1)
+    owner = cell_of_voxel(image, mesh)
+    of_part, h = {}, 1.0 + image.data.astype(float)
+    for place in np.argwhere(owner >= 0):
+        corners = mesh.points[mesh.cells[owner[tuple(place)]]]
+        centre = image.to_world(place[None].astype(float))[0]
+        hats = np.linalg.solve(np.vstack([corners.T, np.ones(n + 1)]), [*centre, 1.0])
+        if np.diff(np.sort(hats)[-2:])[0] < 1e-9:  # on the border of two parts: either may have it
+            of_part[owner[tuple(place)], -1] = []
+        of_part.setdefault((owner[tuple(place)], int(np.argmax(hats))), []).append(h[tuple(place)])
+    n_full, n_empty = 0, 0
+    at = np.einsum("qa,cai->cqi", gauss_rule(n, 2)[0], mesh.points[mesh.cells])
+    nearest = np.rint(image.to_index(at.reshape(-1, n))).astype(int).reshape(at.shape)
+    for cell in range(len(mesh.cells)):
+        if (cell, -1) in of_part:
+            continue
+        for part in range(n + 1):
+            values = of_part.get((cell, part), [])
+            expected = np.exp(np.log(values).mean()) if values else h[tuple(nearest[cell, part])]
+            assert young[cell, part] == pytest.approx(expected, rel=1e-12)
+            n_full, n_empty = n_full + bool(values), n_empty + (not values)
+    assert n_full > 20
+    assert n_empty > 0
+    np.testing.assert_array_equal(
+        element_young(image, mesh, lambda h: 1.0 + h, "gauss"), cell_young(image, mesh, lambda h: 1.0 + h, "geometric")
+    )
+
+
+def test_a_model_has_moduli_at_gauss_points():
+    """Solved as they are; its materials, for files, have the geometric means; linear cells have no others."""
+    image = noise((8, 9, 10))
+    mesh = lattice(image, blocks=(2, 2, 2))
+    law = [(0.0, 1.0), (200.0, 10.0)]
+    model = model_of(mesh, image, young=law, average="gauss", order=2, loads=["compress:1%"])
+    np.testing.assert_array_equal(gauss_moduli(model), element_young(image, mesh, law, "gauss", 2))
+    np.testing.assert_array_equal(gauss_moduli(in_units(model, "MPa")), gauss_moduli(model) * 1e-3)
+    of_cells = model.materials.young[model.materials.of_cell]
+    np.testing.assert_array_equal(of_cells, cell_young(image, mesh, law, "geometric"))
+    assert model_of(mesh, image, young=law, average="gauss").gauss_young is None
+    one = solved_model(model)
+    other = solved_model(model._replace(gauss_young=None))
+    assert abs(one.strain_energy / other.strain_energy - 1.0) > 1e-4
+    with pytest.raises(InputError, match="take another average than gauss"):
+        model_of(mesh, image, young=law, average="gauss", order=2, bins=3)

@@ -60,7 +60,7 @@ AverageOption = Annotated[
     option(
         "WORD",
         "One modulus of those of a cell's voxels: mean (the paper's), geometric, harmonic, power:P, hill (between mean "
-        "and harmonic), or nodes (linear between nodes).",
+        "and harmonic); or gauss (around each Gauss point of quadratic cells), nodes (linear between nodes).",
     ),
 ]
 SpaceOption = Annotated[str, option("ras|lps", "Convention of the file's coordinates.")]

@@ -133,8 +133,10 @@ def solved_model(model: Model, step: int = 1, method: Method = "auto") -> Soluti
 def gauss_moduli(model: Model) -> NDArray[np.float64]:
     """Modulus at the Gauss points of the model's order, (M, Q), in its unit of stress.
 
-    That of each cell's material; or, of moduli at the nodes, the linear interpolation.
+    That of each cell's material; or, of moduli at the nodes, the linear interpolation; or the model's own there.
     """
+    if model.gauss_young is not None:
+        return model.gauss_young
     if model.node_young is not None:
         return gauss_young(model.node_young, model.mesh, model.order)
     assert model.materials is not None, "who asks for moduli has checked that there are some"

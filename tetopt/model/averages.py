@@ -13,7 +13,7 @@ powers; power 0 is the geometric mean (Lichtenecker, Physikalische Zeitschrift 2
 from __future__ import annotations
 
 from collections.abc import Iterator
-from typing import NamedTuple
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -37,7 +37,7 @@ class Average(NamedTuple):
 
     words: str  # as a user writes it
     power: float | None  # of the mean of powers; None: Hill's, halfway between the powers 1 and -1
-    is_nodal: bool = False  # whether it is taken around each node, and linear between the nodes
+    place: Literal["cells", "nodes", "gauss"] = "cells"  # around what: each cell, each node, each Gauss point of a cell
 
 
 def parse_average(text: str) -> Average:
@@ -47,8 +47,8 @@ def parse_average(text: str) -> Average:
     ----------
     text : str
         "mean" (of Eq. (2), Voigt's; power 1), "geometric" (power 0), "harmonic" (Reuss's; power -1), "power:P" with P
-        from -10 to 10, "hill" (halfway between mean and harmonic), or "nodes" (geometric around each node, and linear
-        between nodes).
+        from -10 to 10, "hill" (halfway between mean and harmonic), "gauss" (geometric around each Gauss point of a
+        cell) or "nodes" (geometric around each node, and linear between nodes).
 
     Raises
     ------
@@ -65,16 +65,16 @@ def parse_average(text: str) -> Average:
         return Average(word, POWER_WORDS[word])
     if not colon and word == "hill":
         return Average(word, None)
-    if not colon and word == "nodes":
-        return Average(word, 0.0, is_nodal=True)
+    if not colon and word in ("nodes", "gauss"):
+        return Average(word, 0.0, "nodes" if word == "nodes" else "gauss")
     try:
         power = float(number) if word == "power" else np.nan
     except ValueError:
         power = np.nan
     if not abs(power) <= LARGEST_POWER:
         raise InputError(
-            f"average: expected {', '.join(POWER_WORDS)}, hill, nodes, or power:P with P from {-LARGEST_POWER:g} to "
-            f'{LARGEST_POWER:g}, such as power:0.5, got "{text}"'
+            f"average: expected {', '.join(POWER_WORDS)}, hill, gauss, nodes, or power:P with P from "
+            f'{-LARGEST_POWER:g} to {LARGEST_POWER:g}, such as power:0.5, got "{text}"'
         )
     return Average(f"power:{power:g}", power)
 
@@ -103,7 +103,7 @@ def cell_young(image: Image, mesh: Mesh, law: Law = None, average: str = "mean")
         From intensity to kPa, see `tetopt.model.laws.law_values`.
     average : str
         See `parse_average`. "mean" is Eq. (2). With "nodes" it is the mean of `node_young` over the cell's corners, and
-        so over the cell.
+        so over the cell; with "gauss" the geometric mean.
 
     A cell without voxel centre gets the modulus at its centroid, see `tetopt.energy.sampling.cell_moments`. A cell of
     equal moduli has exactly that one, and none is outside of the range of its voxels'.
@@ -115,12 +115,12 @@ def cell_young(image: Image, mesh: Mesh, law: Law = None, average: str = "mean")
         means of powers above 0.
     """
     parsed = parse_average(average)
-    if parsed.is_nodal:
+    if parsed.place == "nodes":
         return gauss_young(node_young(image, mesh, law), mesh, 1)[:, 0]
     field = young_image(image, law)
     owner = cell_of_voxel(field, mesh).ravel()
     _check_above_zero(parsed, image, field, owner)
-    return _cell_averages(field, mesh, owner, parsed.power)
+    return _averages(field, owner, parsed.power, centroids(mesh.points, mesh.cells))
 
 
 def cell_values(image: Image, mesh: Mesh, law: Law) -> NDArray[np.float64]:
@@ -136,7 +136,7 @@ def cell_values(image: Image, mesh: Mesh, law: Law) -> NDArray[np.float64]:
         at = image.data[~np.isfinite(values)].ravel()[0]
         raise InputError(f"law: it has no value at intensity {at:g}; give one defined over the image's whole range")
     field = Image(values, image.affine)
-    return _cell_averages(field, mesh, cell_of_voxel(field, mesh).ravel(), 1.0)
+    return _averages(field, cell_of_voxel(field, mesh).ravel(), 1.0, centroids(mesh.points, mesh.cells))
 
 
 def node_young(image: Image, mesh: Mesh, law: Law = None) -> NDArray[np.float64]:
@@ -170,6 +170,37 @@ def node_young(image: Image, mesh: Mesh, law: Law = None) -> NDArray[np.float64]
     young = np.clip(np.exp(total / np.where(is_empty, 1.0, weight)), low, high)
     young[is_empty] = nearest_values(field, mesh.points[is_empty])
     return young
+
+
+def element_young(
+    image: Image, mesh: Mesh, law: Law = None, average: str = "mean", order: int = 1
+) -> NDArray[np.float64]:
+    """Moduli for `tetopt.fem.elasticity.stiffness` of an order: `cell_young` (M,), or at Gauss points (M, Q), kPa.
+
+    The latter with "nodes", see `gauss_young`, and with "gauss" and order 2: each Gauss point, of which one is near
+    each corner, has the geometric mean of the cell's voxels that are nearest to that corner in barycentric coordinates;
+    without any, the modulus of the voxel that it is in. So a quadratic cell has as many moduli as corners, which need
+    not agree with its neighbours', as at an interface they do not.
+
+    Raises
+    ------
+    InputError
+        As `cell_young`.
+    """
+    place = parse_average(average).place
+    if place == "nodes":
+        return gauss_young(node_young(image, mesh, law), mesh, order)
+    if place == "cells" or order == 1:
+        return cell_young(image, mesh, law, average)
+    field = young_image(image, law)
+    owner = cell_of_voxel(field, mesh).ravel()
+    _check_above_zero(parse_average(average), image, field, owner)
+    places, _ = gauss_rule(mesh.ndim, order)
+    part = np.full(len(owner), -1)
+    for voxels, hats in _places(field, mesh, owner):
+        part[voxels] = len(places) * owner[voxels] + np.argmax(hats, axis=1)
+    at = np.einsum("qa,cai->cqi", places, mesh.points[mesh.cells]).reshape(-1, mesh.ndim)
+    return _averages(field, part, 0.0, at).reshape(len(mesh.cells), len(places))
 
 
 def gauss_young(node_young: NDArray[np.float64], mesh: Mesh, order: int) -> NDArray[np.float64]:
@@ -212,42 +243,47 @@ def _check_above_zero(average: Average, image: Image, field: Image, owner: NDArr
         )
 
 
-def _cell_averages(field: Image, mesh: Mesh, owner: NDArray[np.int64], power: float | None) -> NDArray[np.float64]:
-    """Mean of powers over each cell, or Hill's average; the nearest voxel's value in a cell without any."""
+def _averages(
+    field: Image, owner: NDArray[np.int64], power: float | None, places: NDArray[np.float64]
+) -> NDArray[np.float64]:
+    """Mean of powers, or Hill's average, of the voxels that each part owns; if none, of that nearest to its place.
+
+    `owner` has a number of a part, or -1, for each voxel; `places` (K, n) mm.
+    """
     inside = owner >= 0
-    cell, values = owner[inside], field.data.ravel()[inside].astype(np.float64)
-    n_voxels = np.bincount(cell, minlength=len(mesh.cells))
-    low, high = ranges_of(owner, field.data.ravel(), len(mesh.cells))
+    part, values = owner[inside], field.data.ravel()[inside].astype(np.float64)
+    n_voxels = np.bincount(part, minlength=len(places))
+    ranges = ranges_of(owner, field.data.ravel(), len(places))
     if power is None:
-        averages = 0.5 * sum(_powers(cell, values, n_voxels, (low, high), each) for each in (1.0, -1.0))
+        averages = 0.5 * sum(_powers(part, values, n_voxels, ranges, each) for each in (1.0, -1.0))
     else:
-        averages = _powers(cell, values, n_voxels, (low, high), power)
+        averages = _powers(part, values, n_voxels, ranges, power)
     # Within their range, so that a cell of equal values has exactly that value: constants stay one material.
-    averages = np.clip(averages, low, high)
+    averages = np.clip(averages, *ranges)
     is_empty = n_voxels == 0
-    averages[is_empty] = nearest_values(field, mesh.points[mesh.cells[is_empty]].mean(axis=1))
+    averages[is_empty] = nearest_values(field, places[is_empty])
     return averages
 
 
 def _powers(
-    cell: NDArray[np.int64],
+    part: NDArray[np.int64],
     values: NDArray[np.float64],
     n_voxels: NDArray[np.int64],
     ranges: tuple[NDArray[np.float64], NDArray[np.float64]],
     power: float,
 ) -> NDArray[np.float64]:
-    """The mean of powers of the values that each cell owns, (M,); 0 where it owns none."""
+    """The mean of powers of the values that each part owns, (K,); any number where it owns none."""
     count = np.maximum(n_voxels, 1)
     if power == 1.0:
         # Summed voxel by voxel. `cell_moments` takes differences of sums over rows, whose rounding would drown the
         # soft cells of a field that spans ten orders of magnitude.
-        return np.bincount(cell, weights=values, minlength=len(count)) / count
+        return np.bincount(part, weights=values, minlength=len(count)) / count
     # Each as a ratio to the value that counts most, so that powers are from 0 to 1; and less 1, so that powers near 0
     # lose no digits on their way to the logarithm.
     largest = ranges[1] if power > 0.0 else ranges[0]
     largest = np.where((n_voxels > 0) & (largest > 0.0), largest, 1.0)
     with np.errstate(divide="ignore"):  # a modulus of 0, which means of powers above 0 may take
-        ratios = np.log(values / largest[cell])
+        ratios = np.log(values / largest[part])
         less_one = ratios if power == 0.0 else np.expm1(power * ratios)
-        means = np.bincount(cell, weights=less_one, minlength=len(count)) / count
+        means = np.bincount(part, weights=less_one, minlength=len(count)) / count
         return largest * np.exp(means if power == 0.0 else np.log1p(means) / power)

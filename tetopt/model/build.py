@@ -12,7 +12,7 @@ from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.model.averages import DEFAULT_AVERAGE, cell_values, cell_young, gauss_young, node_young, parse_average
+from tetopt.model.averages import DEFAULT_AVERAGE, cell_values, cell_young, element_young, node_young, parse_average
 from tetopt.model.fields import cell_fields
 from tetopt.model.laws import ByLabel, Law, has_column, law_values, parse_any_law, young_from
 from tetopt.model.loads import parse_loads
@@ -56,6 +56,7 @@ def model_of(
         needs it.
     average : str
         Of a law of Young's modulus over the voxels, see `tetopt.model.averages.parse_average`; "mean" is Eq. (2).
+        With "gauss" and quadratic cells moduli vary in a cell for `tetopt.fem.solution.solved_model`; files have one.
         Ratios and densities are always the mean.
     sets : iterable of str
         Further sets, see `tetopt.model.sets.with_requested`.
@@ -97,15 +98,12 @@ def model_of(
         box = box_of(image) if box is None and image is not None else box
         known_sets = standard_sets(mesh, box, labels)
     all_sets = with_requested(mesh, known_sets, sets, mean)
-    table, nodal = None, None
+    table, nodal, at_gauss = None, None, None
     if young is not None:
-        nodal = _node_moduli(young, mesh, image) if parse_average(average).is_nodal else None
-        if nodal is None:
-            moduli = _values(young, "young", mesh, image, mean, labels, average)
-        elif bins is None:
-            moduli = gauss_young(nodal, mesh, 1)[:, 0]
-        else:
-            raise InputError("bins: moduli that are linear between nodes have no groups; take another average, or none")
+        nodal, at_gauss = _varying_moduli(young, mesh, image, average, order)
+        if bins is not None and (nodal is not None or at_gauss is not None):
+            raise InputError(f"bins: moduli that vary in a cell have no groups; take another average than {average}")
+        moduli = _values(young, "young", mesh, image, mean, labels, average)
         ratios = _values(nu, "nu", mesh, image, mean, labels)
         masses = None if density is None else _values(density, "density", mesh, image, mean, labels)
         table = materials(moduli, ratios, len(mesh.cells), masses)
@@ -118,7 +116,9 @@ def model_of(
     parsed = parse_loads(loads, mesh, all_sets)
     if any(load.kind == "gravity" for load in parsed):
         density_of(table)  # or it is refused
-    return Model(mesh, cell_data, all_sets, table, parsed, order, node_young=nodal, about=dict(about or {}))
+    return Model(
+        mesh, cell_data, all_sets, table, parsed, order, node_young=nodal, gauss_young=at_gauss, about=dict(about or {})
+    )
 
 
 def labels_of(cell_data: dict[str, NDArray], n_cells: int) -> NDArray[np.int64] | None:
@@ -130,11 +130,18 @@ def labels_of(cell_data: dict[str, NDArray], n_cells: int) -> NDArray[np.int64] 
     return whole if (whole == labels).all() and whole.min() >= 0 else None
 
 
-def _node_moduli(young: Any, mesh: Mesh, image: Image | None) -> NDArray[np.float64] | None:
-    """`node_young` of a law of the intensity; None if the modulus is something else, or there is no image."""
+def _varying_moduli(
+    young: Any, mesh: Mesh, image: Image | None, average: str, order: int
+) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None]:
+    """`node_young`, and moduli at Gauss points, of a law of the intensity; None but where the average has them."""
     law: Any = parse_any_law(young) if isinstance(young, str) else young
-    is_law = callable(law) or np.ndim(law) == 2
-    return node_young(image, mesh, law) if is_law and image is not None else None
+    place = parse_average(average).place
+    if image is None or not (callable(law) or np.ndim(law) == 2):
+        return None, None
+    return (
+        node_young(image, mesh, law) if place == "nodes" else None,
+        element_young(image, mesh, law, average, order) if place == "gauss" and order == 2 else None,
+    )
 
 
 def _values(

@@ -47,6 +47,7 @@ class Model(NamedTuple):
     units: str = "kPa"
     space: str = "ras"  # "lps": x and y have changed sign
     node_young: NDArray[np.float64] | None = None  # (N,) a modulus at each corner, linear within cells, instead
+    gauss_young: NDArray[np.float64] | None = None  # (M, Q) one at each Gauss point of the order, for `tetopt.fem`
     is_nonlinear: bool = False  # whether steps ask for large deformation
     about: dict[str, Any] = {}  # noqa: RUF012 - a default that nobody changes; name -> text, or what JSON can hold
     point_data: dict[str, NDArray] = {}  # noqa: RUF012 - likewise; by name, a row a mesh point, or a node of order 2
@@ -114,6 +115,7 @@ def in_units(model: Model, units: str) -> Model:
         materials=None if table is None else table._replace(young=table.young * factor),
         loads=tuple(scaled(load, factor) for load in model.loads),
         node_young=None if model.node_young is None else model.node_young * factor,
+        gauss_young=None if model.gauss_young is None else model.gauss_young * factor,
         cell_data=stresses_times(factor, model.cell_data),
         point_data=stresses_times(factor, model.point_data),
         units=units,
