@@ -19,7 +19,7 @@ WIDE = {
     "tetopt.energy.sampling.segment_flux": 9,
     "tetopt.energy.sampling.triangle_flux": 10,
     "tetopt.engine.fast.optimize": 13,
-    "tetopt.engine.meshing.mesh_image": 12,
+    "tetopt.engine.meshing.mesh_image": 13,
     "tetopt.engine.paper.optimize_paper": 12,
     "tetopt.model.build.model_of": 15,
 }

@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 
 import tetopt
+from tetopt.engine.meshing import sizes_of_order
+from tetopt.geometry.quadratic import quadratic
 from tetopt.start.clip import lattice_within
+from tetopt.target.content import plain
 
 IMAGE = tetopt.load_phantom("sphere").image(voxel_mm=4.0)
 MASK = tetopt.Image((IMAGE.data > 50).astype(np.uint8), IMAGE.affine)
@@ -31,6 +34,38 @@ def test_uniform(mask):
     region = None if mask is None else image.region
     initial = lattice_within(IMAGE if mask is None else image.image, region, "five-tet", nodes=150)
     assert_same(result, tetopt.optimize(image, initial, k_D=0.2, iterations=2, shape_power=2.0))
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_nodes_of_order_2_are_counted_in_all(n):
+    """Corners and midpoints together; the same run as with these corners and this longest edge from the start."""
+    image = IMAGE if n == 3 else tetopt.Image(IMAGE.data[15].copy(), np.diag([4.0, 4.0, 1.0]))
+    nodes = 900 if n == 3 else 300
+    result = tetopt.mesh_image(image, nodes, order=2, iterations=8)
+    points, cells = result.mesh.points, result.mesh.cells
+    assert abs(len(quadratic(points, cells)[0]) / nodes - 1.0) <= 0.01
+    assert result.nodes == nodes
+    sizes = sizes_of_order(plain(image), nodes, None, 2)
+    assert_same(tetopt.mesh_image(image, len(points), sizes=sizes, iterations=8), result)
+
+
+def test_a_lattice_for_order_2():
+    """As near as the steps of lattices allow, over all runs."""
+    result = tetopt.mesh_image(IMAGE, 1200, mode="uniform", order=2, iterations=1)
+    assert len(result.mesh.points) < 250
+    assert abs(len(quadratic(result.mesh.points, result.mesh.cells)[0]) / 1200 - 1.0) < 0.2
+
+
+def test_longest_edge_of_order_2():
+    """1.15 times that of a uniform mesh with the corners; a longest edge that is asked for stays."""
+    content = plain(IMAGE)
+    uniform = tetopt.Sizes(coarsest=1.0).longest_edge(IMAGE, round(1000 / 7.2))
+    assert sizes_of_order(content, 1000, None, 2).largest == pytest.approx(1.15 * uniform)
+    assert sizes_of_order(content, 1000, None, 2).gradation == 0.5
+    assert sizes_of_order(content, 1000, tetopt.Sizes(largest=9.0), 2).largest == 9.0
+    assert sizes_of_order(content, 1000, None, 1) is None
+    with pytest.raises(tetopt.InputError, match="expected order 1 or 2, got 3"):
+        tetopt.mesh_image(IMAGE, 100, order=3)
 
 
 def test_by_the_paper():

@@ -37,7 +37,7 @@ from tetopt.io.files import save_json
 from tetopt.io.meshes import MeshFile
 from tetopt.io.mni import mni_path
 from tetopt.measure.quality import quality
-from tetopt.model.model import Model
+from tetopt.model.model import Model, elements
 from tetopt.model.sets import Sets, box_of, surviving_sets
 from tetopt.report.summary import fidelity, model_summary, run_summary, size_summary
 from tetopt.report.tables import add_quality, new_table, nodes_in_words
@@ -131,7 +131,7 @@ def _run(task: Task, begin: float) -> Outcome:
     start = None if task.started is None else task.started.mesh
     result = mesh_image(
         content, plan.sizes.nodes, target_error=plan.sizes.target_error, mode=plan.mode, start=start,
-        spacing=plan.start.spacing, kind=kind, sizes=task.sizes, watch=watch, **options,
+        spacing=plan.start.spacing, kind=kind, sizes=task.sizes, order=solver.order, watch=watch, **options,
     )  # fmt: skip
     assert result.initial is not None
     seconds = {"load": begun[0] - begin, "optimize": time.perf_counter() - begun[0]}
@@ -221,7 +221,8 @@ def _print(task: Task, outcome: Outcome, model: Model, measured: dict[str, Any])
     is_constant = content.image.data.min() == content.image.data.max()
     n_empty = 0 if is_constant else int((model.cell_data["n_voxels"] == 0).sum())
     is_counted = plan.mode == "graded" and plan.sizes.target_error is None
-    warn_of_result(result, plan.engine.method, plan.sizes.nodes if is_counted else None, n_empty)
+    n_nodes = len(elements(model)[0])
+    warn_of_result(result, plan.engine.method, n_nodes, plan.sizes.nodes if is_counted else None, n_empty)
     _print_comparison(content, outcome, task.start_name, model.order)
     print_fidelity(measured)
     if solver.are_any() or output.mesh.suffix.lower() != ".vtu":

@@ -24,7 +24,7 @@ from tetopt.cli.options import (
 from tetopt.cli.solver import check_solver_options
 from tetopt.engine.fast import check_options
 from tetopt.engine.loop import MIN_DIHEDRAL, SHAPE_POWER
-from tetopt.engine.meshing import MODE_DEFAULTS, Mode
+from tetopt.engine.meshing import MODE_DEFAULTS, QUADRATIC_NODES, Mode, sizes_of_order
 from tetopt.engine.paper import default_n_t
 from tetopt.io.files import checked_output
 from tetopt.io.formats import FORMATS, format_of
@@ -187,10 +187,12 @@ def with_numbers(plan: Plan, content: Content) -> tuple[Plan, tetopt.Sizes | Non
     if plan.mode != "graded":
         nodes = sizes.nodes if is_counted else DEFAULT_NODES[image.ndim]
         return plan._replace(sizes=replace(sizes, nodes=nodes)), None
-    limits = _limits(sizes)
-    nodes = sizes.nodes
+    order, nodes = plan.solver.order, sizes.nodes
     if not is_counted:
-        nodes = int(np.clip(content.n_voxels // 8, 2 ** (image.ndim + 2), DEFAULT_NODES[image.ndim]))
+        many = QUADRATIC_NODES[image.ndim] if order == 2 else 1.0  # nodes to a corner
+        corners = np.clip(content.n_voxels // 8, 2 ** (image.ndim + 2), DEFAULT_NODES[image.ndim] / many)
+        nodes = int(np.rint(many * corners))
+    limits = sizes_of_order(content, nodes, _limits(sizes), order)
     longest = sizes.size_max
     if longest is None and nodes is not None:
         longest = (limits or tetopt.Sizes()).longest_edge(image, nodes, content.volume)

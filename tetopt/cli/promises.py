@@ -111,9 +111,11 @@ def _uncovered(content: Content, result: Optimized, start: Mesh | None) -> Itera
         )
 
 
-def warn_of_result(result: Optimized, method: Method, nodes: int | None, n_empty: int) -> None:
-    """Say what is allowed but hardly meant; a graded mesh was to have `nodes`, `n_empty` cells hold no voxel."""
-    n_nodes = len(result.mesh.points)
+def warn_of_result(result: Optimized, method: Method, n_nodes: int, nodes: int | None, n_empty: int) -> None:
+    """Say what is allowed but hardly meant.
+
+    There are `n_nodes` in all, where a graded mesh was to have `nodes`; `n_empty` cells hold no voxel.
+    """
     if nodes is not None and abs(n_nodes - nodes) > NODES_MISSED * nodes:
         show_warning(f"{n_nodes} nodes instead of {nodes}: more iterations, or a --k-d above 0, come nearer")
     lowest, last = min(row.E for row in result.history), result.history[-1].E

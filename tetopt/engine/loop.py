@@ -25,6 +25,10 @@ GRADED_ITERATIONS = 16  # sweeps; four more would lower E_D by 2 % there
 START_K_D = 0.02
 SHAPE_POWER = 3.0  # p: from 3 on the energy itself keeps angles above the floor at the uniform k_D
 MIN_DIHEDRAL = 12.0  # degrees: the floor
+# The longest edge over a uniform mesh's for cells of order 2 (docs/order.md): there are seven times fewer cells, and
+# the displacement suffers sooner from those that grow where the image is uniform.
+QUADRATIC_SHARE = 1.15
+QUADRATIC_GRADATION = 0.5  # of sizes, likewise: gentler changes lower the displacement's error and the interfaces'
 E_D_ROUNDING = 1e-12  # of the image's own variance x volume: less E_D than this is rounding
 
 Boundary = Literal["slide", "fixed"]

@@ -18,6 +18,8 @@ from tetopt.engine.fast import optimize
 from tetopt.engine.loop import (
     GRADED_ITERATIONS,
     GRADED_K_D,
+    QUADRATIC_GRADATION,
+    QUADRATIC_SHARE,
     START_K_D,
     UNIFORM_ITERATIONS,
     UNIFORM_K_D,
@@ -25,11 +27,12 @@ from tetopt.engine.loop import (
 )
 from tetopt.engine.paper import optimize_paper
 from tetopt.errors import InputError
+from tetopt.geometry.quadratic import quadratic
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.start.clip import lattice_within
 from tetopt.start.octree import is_near, nearest_octree, octree
-from tetopt.start.sizes import Sizes
+from tetopt.start.sizes import COARSEST_SHARE, Sizes
 from tetopt.target.content import Content, plain
 
 Mode = Literal["graded", "uniform", "paper", "start"]
@@ -47,6 +50,9 @@ MODE_ARGUMENTS: dict[Mode, tuple[str, ...]] = {  # what says which mesh a run be
     "paper": ("nodes", "spacing", "kind"),
     "start": ("start",),
 }
+QUADRATIC_NODES = {2: 3.9, 3: 7.2}  # of order 2 to a corner, by dimension: of graded meshes of the MNI152 T1
+NODES_NEAR = 0.01  # of the number of nodes of order 2: a run that is so near is taken
+NODE_RUNS = 3  # towards a number of nodes of order 2, at most; the second mostly meets it
 FIRST_NODES = {2: 200, 3: 1500}  # of the first run towards an error, by dimension: so few that it takes no time
 ERROR_RATE = 0.7  # E_D falls with nodes^-0.7, on the MNI152 T1 from 5,000 to 40,000 nodes
 ERROR_REACHED = 0.85  # of the target error: from here to all of it a run is near enough, and the search ends
@@ -65,6 +71,7 @@ def mesh_image(
     k_D: float | None = None,
     iterations: int | None = None,
     sizes: Sizes | None = None,
+    order: int = 1,
     watch: Callable[[Mesh, Run], Optimized] | None = None,
     **options: Any,
 ) -> Optimized:
@@ -76,8 +83,9 @@ def mesh_image(
         The intensities h; or several contrasts, labels, a mask, within which alone there will be cells
         (`tetopt.content`).
     nodes : int
-        Number of nodes. A graded mesh meets it exactly unless the run is cut short, k_D is 0, cells have to be lifted
-        over the floor, or no more nodes can be taken out; count them.
+        Number of nodes, of order 2 with those in the middle of edges. A graded mesh meets it (of order 2 to 1 %) unless
+        the run is cut short, k_D is 0, cells have to be lifted over the floor, or no more nodes can be taken out; count
+        them.
     target_error : float
         Instead of `nodes`, of a graded mesh: the share of the image's variance that may be left within cells, 0 to 1;
         as many nodes as that takes, found in a few runs, each with its own `max_seconds`. A run that ends above it
@@ -99,7 +107,11 @@ def mesh_image(
     iterations : int
         As of `optimize`, by default 16 on a graded mesh, else 20; nodes are exchanged in the first 0.7 of them.
     sizes : Sizes
-        Limits on the edges of a graded mesh's cells; by default up to 1.4 times a uniform mesh's.
+        Limits on the edges of a graded mesh's cells; by default up to 1.4 times a uniform mesh's, with order 2 up to
+        1.15 times with a gradation of 0.5.
+    order : {1, 2}
+        Of the cells that the mesh is for (`tetopt.geometry.quadratic`). With 2 `nodes` counts mid-edge nodes, too:
+        about a seventh of them are the mesh's own (a quarter in 2-D), as many as up to three runs find.
     watch : callable
         Called for each run with its initial mesh and a function that does it; returns the run's result. It may set up
         what watches a run: `lambda initial, run: run(callback=print)`.
@@ -127,6 +139,8 @@ def mesh_image(
     """
     if mode is None:
         mode = "graded" if start is None else "start"
+    if order not in (1, 2):
+        raise InputError(f"mesh_image: expected order 1 or 2, got {order!r}")
     content = plain(image)
     values = {"nodes": nodes, "target_error": target_error, "spacing": spacing, "kind": kind, "start": start}
     _check_mode(mode, content, values | {"sizes": sizes})
@@ -136,6 +150,8 @@ def mesh_image(
     if mode == "start":
         options.setdefault("boundary", "fixed")
 
+    if mode == "graded":
+        sizes = sizes_of_order(content, nodes, sizes, order)
     seconds: list[float] = []
 
     def run(initial: Mesh, nodes: int | None) -> Optimized:
@@ -150,17 +166,22 @@ def mesh_image(
         seconds.append(time.perf_counter() - begin)
         return result._replace(initial=initial, nodes=nodes)
 
+    def begun(corners: int | None) -> Optimized:
+        if mode == "graded":
+            assert corners is not None
+            return run(octree(content, corners, sizes), corners)
+        return run(lattice_within(content.image, content.region, kind, nodes=corners, spacing=spacing), corners)
+
     begin = time.perf_counter()
     if target_error is not None:
         result = meshed_to_error(content, target_error, sizes, run)
-    elif mode == "graded":
-        assert nodes is not None
-        result = run(octree(content, nodes, sizes), nodes)
     elif mode == "start":
         assert start is not None
         result = run(start, None)
+    elif order == 2 and nodes is not None:
+        result = meshed_in_all(content.image.ndim, nodes, begun)
     else:
-        result = run(lattice_within(content.image, content.region, kind, nodes=nodes, spacing=spacing), nodes)
+        result = begun(nodes)
     seconds_run = sum(seconds)
     return result._replace(seconds_start=time.perf_counter() - begin - seconds_run, seconds_run=seconds_run)
 
@@ -181,6 +202,44 @@ def _check_mode(mode: Mode, content: Content, values: dict[str, Any]) -> None:
         raise InputError("mesh_image: mode 'start' needs a mesh to start from")
     if mode == "paper" and not (content.is_plain and content.region is None):
         raise InputError("mesh_image: the paper's scheme takes one image and its whole box")
+
+
+def sizes_of_order(content: Content, nodes: int | None, sizes: Sizes | None, order: int) -> Sizes | None:
+    """The limits on sizes of a graded mesh for cells of an order; with `nodes` of order 2 the longest edge, too."""
+    if order == 1:
+        return sizes
+    sizes = Sizes() if sizes is None else sizes
+    if sizes.coarsest == COARSEST_SHARE:
+        sizes = sizes._replace(coarsest=QUADRATIC_SHARE)
+    if sizes.gradation == 1.0:
+        sizes = sizes._replace(gradation=QUADRATIC_GRADATION)
+    if nodes is None:
+        return sizes
+    corners = round(nodes / QUADRATIC_NODES[content.image.ndim])
+    return sizes._replace(largest=sizes.longest_edge(content.image, corners, content.volume))
+
+
+def meshed_in_all(ndim: int, nodes: int, run: Callable[[int], Optimized]) -> Optimized:
+    """Run after run with other numbers of corners, until corners and midpoints of edges together are `nodes`.
+
+    The result of the run that is nearest, or of one that was cut short.
+    """
+    corners, ratio = 0, QUADRATIC_NODES[ndim]
+    best: tuple[float, Optimized] | None = None
+    for _ in range(NODE_RUNS):
+        before, corners = corners, max(round(nodes / ratio), 2 ** (ndim + 1))
+        if corners == before:
+            break
+        result = run(corners)._replace(nodes=nodes)
+        count = len(quadratic(result.mesh.points, result.mesh.cells)[0])
+        ratio = count / len(result.mesh.points)
+        miss = abs(count / nodes - 1.0)
+        if best is None or miss < best[0]:
+            best = miss, result
+        if miss <= NODES_NEAR or result.ended in ("stopped", "max_seconds"):
+            break
+    assert best is not None
+    return best[1]
 
 
 def meshed_to_error(

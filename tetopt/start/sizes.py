@@ -36,13 +36,16 @@ class Sizes(NamedTuple):
         No block and no split makes a shorter edge, mm. Where not both can be, this is kept rather than `largest`.
         Nodes then move nearer: in one run a tenth of the edges ended shorter.
     largest : float, optional
-        No block and no collapse makes a longer edge, mm. By default 1.4 times the longest edge of a uniform mesh with
-        as many nodes: smaller cells in uniform regions do not represent the image any better, but the displacement.
-        `inf` for none. Most edges are 0.6 times the longest, which are the diagonals of blocks on the box's faces.
+        No block and no collapse makes a longer edge, mm. By default `coarsest` times the longest edge of a uniform mesh
+        with as many nodes: smaller cells in uniform regions do not represent the image any better, but the
+        displacement. `inf` for none. Most edges are 0.6 times the longest, which are the diagonals of blocks on the
+        box's faces.
     gradation : float
         How gently sizes change: each size of the octree, between the next smaller and the next larger one, is at least
         1 / gradation blocks wide; 1 to 0.05. Collapses make no edge longer than 1.5 times the size that grows from its
         surroundings by gradation x distance. Where there are hardly two sizes it changes little.
+    coarsest : float
+        Without `largest`: the longest edge over that of a uniform mesh with as many nodes.
     field : Image, optional
         Longest edge, mm, by place: an image that need not lie on the voxels of the one to be meshed. Outside of it, and
         where it is 0 or below, nothing but `largest` holds.
@@ -52,6 +55,7 @@ class Sizes(NamedTuple):
     largest: float | None = None
     gradation: float = 1.0
     field: Image | None = None
+    coarsest: float = COARSEST_SHARE
 
     def prepared(self, n: int) -> Sizes:
         """The same limits, checked; the field's steps are lowered to the gradation.
@@ -85,7 +89,7 @@ class Sizes(NamedTuple):
             nodes = int(nodes * image.volume / volume)
         uniform = float((lengths / near_cubes(kind, lengths, max(nodes, fewest))).max())
         return LONGEST_IN_BLOCK[image.ndim] * max(
-            COARSEST_SHARE * uniform, self.smallest / SHORTEST_IN_BLOCK[image.ndim]
+            self.coarsest * uniform, self.smallest / SHORTEST_IN_BLOCK[image.ndim]
         )
 
     def on_voxels(self, image: Image) -> NDArray[np.float32] | None:
