@@ -131,7 +131,7 @@ def _run(task: Task, begin: float) -> Outcome:
     start = None if task.started is None else task.started.mesh
     result = mesh_image(
         content, plan.sizes.nodes, target_error=plan.sizes.target_error, mode=plan.mode, start=start,
-        spacing=plan.start.spacing, kind=kind, sizes=task.sizes, order=solver.order, watch=watch, **options,
+        spacing=plan.start.spacing, kind=kind, sizes=task.sizes, order=solver.order or 1, watch=watch, **options,
     )  # fmt: skip
     assert result.initial is not None
     seconds = {"load": begun[0] - begin, "optimize": time.perf_counter() - begun[0]}

@@ -187,7 +187,7 @@ def with_numbers(plan: Plan, content: Content) -> tuple[Plan, tetopt.Sizes | Non
     if plan.mode != "graded":
         nodes = sizes.nodes if is_counted else DEFAULT_NODES[image.ndim]
         return plan._replace(sizes=replace(sizes, nodes=nodes)), None
-    order, nodes = plan.solver.order, sizes.nodes
+    order, nodes = plan.solver.order or 1, sizes.nodes
     if not is_counted:
         many = QUADRATIC_NODES[image.ndim] if order == 2 else 1.0  # nodes to a corner
         corners = np.clip(content.n_voxels // 8, 2 ** (image.ndim + 2), DEFAULT_NODES[image.ndim] / many)

@@ -169,7 +169,8 @@ def mesh_image(
     def begun(corners: int | None) -> Optimized:
         if mode == "graded":
             assert corners is not None
-            return run(octree(content, corners, sizes), corners)
+            # The longest edge of order 2 may leave no octree near to so few corners: exchanges take out what they can.
+            return run((octree if order == 1 else nearest_octree)(content, corners, sizes), corners)
         return run(lattice_within(content.image, content.region, kind, nodes=corners, spacing=spacing), corners)
 
     begin = time.perf_counter()
