@@ -7,10 +7,13 @@ import textwrap
 
 import numpy as np
 import pytest
-from models import our_compression, sample_model, with_one_ratio, with_two_sides
+from models import LOAD_CASES, loaded_model, our_compression, sample_model, with_one_ratio, with_two_sides
+from scipy.spatial import KDTree
 
 import tetopt.io.xdmf
+from tetopt.fem.solution import solved_model
 from tetopt.io.xdmf import xdmf
+from tetopt.model.model import elements
 from tetopt.model.sets import facet_triples
 
 NU = 0.4
@@ -65,9 +68,10 @@ else:
     V = fem.functionspace(mesh, ("Lagrange", 1, (dim,)))
 bcs = []
 for load in root.findall("./Domain/Information[@Name='load']"):
-    name, *displacement = load.get("Value").split()
+    kind, name, *displacement = load.get("Value").split(":")
+    values = np.array(displacement[0].split(","), dtype=float) if kind == "move" else np.zeros(dim)
     dofs = fem.locate_dofs_topological(V, dim - 1, members(facet_tags, "facets", name))
-    bcs.append(fem.dirichletbc(np.array(displacement, dtype=float), dofs, V))
+    bcs.append(fem.dirichletbc(values, dofs, V))
 
 lame = young * nu / ((1 + nu) * (1 - 2 * nu) if dim == 3 else 1 - nu**2)  # plane stress in 2-D
 mu = young / (2 * (1 + nu))
@@ -105,26 +109,32 @@ def python_with_dolfinx():
     return pytest.skip("no Python with dolfinx (FEniCSx), as Debian's python3-dolfinx brings it")
 
 
-def snippet():
-    """The program in the docstring."""
+def snippet(first="from xml.etree", then="Before 0.7"):
+    """A program in the docstring."""
     text = tetopt.io.xdmf.__doc__
-    return textwrap.dedent(text[text.index("    from xml.etree") : text.index("\nBefore 0.7")])
+    return textwrap.dedent(text[text.index(f"    {first}") : text.index(f"\n{then}")])
 
 
 @pytest.fixture(scope="module", params=[3, 2])
 def answer(request, tmp_path_factory):
     """The model and what dolfinx made of its file."""
-    python, folder = python_with_dolfinx(), tmp_path_factory.mktemp("dolfinx")
-    model = pressed_model(request.param)
+    folder, model = tmp_path_factory.mktemp("dolfinx"), pressed_model(request.param)
     folder.joinpath("model.xdmf").write_bytes(xdmf(model))
     program = snippet().replace('"superior"', f'"{model.loads[0].set_name}"')
-    folder.joinpath("read.py").write_text(BEFORE + program + READ + SOLVE)
-    done = subprocess.run([python, "read.py"], cwd=folder, env=environment(), capture_output=True, text=True)
+    run(BEFORE + program + READ + SOLVE, folder)
+    with np.load(folder / "read.npz") as read:
+        return model, dict(read)
+
+
+def run(program, folder):
+    """Has dolfinx run a program in a folder."""
+    folder.joinpath("run.py").write_text(program)
+    done = subprocess.run(
+        [python_with_dolfinx(), "run.py"], cwd=folder, env=environment(), capture_output=True, text=True
+    )
     if "CompileError" in done.stderr:
         pytest.skip("dolfinx finds no C compiler for its forms")
     assert done.returncode == 0, done.stderr
-    with np.load(folder / "read.npz") as read:
-        return model, dict(read)
 
 
 def same_rows(triples, expected):
@@ -161,3 +171,102 @@ def test_dolfinx_presses_with_the_same_energy(answer):
     ours = our_compression(model, NU)
     assert read["energy"] == pytest.approx(ours.strain_energy, rel=1e-11)
     assert ours.strain_energy > 1.0
+
+
+# Every kind of load: the docstring's second program applies it
+
+LOADED = """
+import ufl
+
+order, is_nodal = {order}, {is_nodal}
+if hasattr(fem, "VectorFunctionSpace"):
+    V = fem.VectorFunctionSpace(mesh, ("Lagrange", order))
+else:
+    V = fem.functionspace(mesh, ("Lagrange", order, (dim,)))
+u, v = ufl.TrialFunction(V), ufl.TestFunction(V)
+"""
+
+AT_NODES = """
+def flat(table):
+    return getattr(table, "array", table).reshape(-1)
+
+if is_nodal:
+    text = root.find(".//Grid[@Name='mesh']/Attribute[@Name='young_nodes']/DataItem").text
+    young = fem.Function(fem.functionspace(mesh, ("Lagrange", 1)))
+    node = np.array(mesh.geometry.input_global_indices)[flat(mesh.geometry.dofmap)]
+    young.x.array[flat(young.function_space.dofmap.list)] = np.array(text.split(), dtype=float)[node]
+"""
+
+SOLVE_LOADED = """
+from dolfinx.fem import petsc
+from petsc4py import PETSc
+
+lame = young * nu / ((1 + nu) * (1 - 2 * nu) if dim == 3 else 1 - nu**2)  # plane stress in 2-D
+mu = young / (2 * (1 + nu))
+dx = ufl.dx(degree=2 * order - 2 if order == 2 else 1)
+
+def product(u, v):
+    strain = ufl.sym(ufl.grad(u))
+    return ufl.inner(lame * ufl.tr(strain) * ufl.Identity(dim) + 2 * mu * strain, ufl.sym(ufl.grad(v))) * dx
+
+def total(forms):
+    nothing = ufl.inner(fem.Constant(mesh, np.zeros(dim)), v) * ufl.dx
+    return petsc.assemble_vector(fem.form(sum(forms, nothing)))
+
+stiffness, push, diagonal = fem.form(product(u, v)), total(forces), total(springs)
+petsc.set_bc(diagonal, conditions, None, 0.0)
+A = petsc.assemble_matrix(stiffness, conditions)
+A.assemble()
+A.setDiagonal(A.getDiagonal() + diagonal)
+A.assemble()
+petsc.apply_lifting(push, [stiffness], [conditions])
+petsc.set_bc(push, conditions)
+solver = PETSc.KSP().create(mesh.comm)
+solver.setOperators(A)
+solver.setType("preonly")
+solver.getPC().setType("lu")
+solution = fem.Function(V)
+solver.solve(push, solution.vector if hasattr(solution, "vector") else solution.x.petsc_vec)
+solution.x.scatter_forward()
+energy = fem.assemble_scalar(fem.form(0.5 * product(solution, solution)))
+np.savez("solved.npz", energy=energy, places=V.tabulate_dof_coordinates()[:, :dim],
+         u=solution.x.array.reshape(-1, dim))
+"""
+
+CASES = [
+    *((case, 3, order, "cells") for case in LOAD_CASES for order in (1, 2)),
+    *(("all", n, order, moduli) for n, moduli in ((3, "nodes"), (2, "cells")) for order in (1, 2)),
+]
+
+
+@pytest.fixture(scope="module")
+def solved_cases(tmp_path_factory):
+    """The folder of what dolfinx solved, a folder a case, all in one process."""
+    folder, programs = tmp_path_factory.mktemp("loads"), []
+    for number, (case, n, order, moduli) in enumerate(CASES):
+        (folder / str(number)).mkdir()
+        model = loaded_model(case, n, 1, moduli)
+        (folder / str(number) / "model.xdmf").write_bytes(xdmf(model))
+        reading = snippet().replace('"superior"', '"boundary"')
+        applying = snippet("import ufl", "Moduli that are linear")
+        loaded = LOADED.format(order=order, is_nodal=moduli == "nodes")
+        programs.append(f"{BEFORE}{reading}{loaded}{applying}{AT_NODES}{SOLVE_LOADED}")
+    each = (
+        "import os\nfor number, program in enumerate({}):\n    os.chdir({!r} + str(number))\n    exec(program, {{}})\n"
+    )
+    run(each.format(programs, f"{folder}/"), folder)
+    return folder
+
+
+@pytest.mark.parametrize("number", range(len(CASES)), ids=lambda number: "-".join(map(str, CASES[number])))
+def test_each_load_is_what_fem_makes_of_it(solved_cases, number):
+    """Displacements found by their places, which dolfinx orders otherwise."""
+    case, n, order, moduli = CASES[number]
+    own = solved_model(model := loaded_model(case, n, order, moduli))
+    with np.load(solved_cases / str(number) / "solved.npz") as answer:
+        points, _ = elements(model)
+        distance, node = KDTree(points).query(answer["places"])
+        assert distance.max() < 1e-9
+        assert len(np.unique(node)) == len(points)
+        assert np.abs(answer["u"] - own.u[node]).max() < 1e-10 * np.abs(own.u).max()
+        assert float(answer["energy"]) == pytest.approx(own.strain_energy, rel=1e-10)

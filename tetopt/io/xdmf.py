@@ -43,7 +43,39 @@ dolfinx integrates as if they were curved.
 
 In the grid "mesh" <Information Name="young"/> and <Information Name="nu"/> list what the materials 1, 2, ... have. In
 the domain <Information Name="load" Value="hold:superior"/> is a load in the words of `tetopt.model.loads`, and
-<Information Name="about"/> says where the file comes from, in what coordinates and units.
+<Information Name="about"/> says where the file comes from, in what coordinates and units. With a test function `v` of a
+space `V` of vectors, on from the program above, this applies the loads of step 1::
+
+    import ufl
+
+    normal, ds = ufl.FacetNormal(mesh), ufl.Measure("ds", mesh, subdomain_data=facet_tags)
+    per_mm3 = 1e-9  # kg in a kg/m3; 1e-12 t if moduli are in MPa
+    conditions, forces, springs = [], [], []
+    for load in root.findall("./Domain/Information[@Name='load']"):
+        step, _, words = load.get("Value").rpartition("/")
+        kind, *rest = words.split(":")
+        if step not in ("", "1"):
+            continue
+        texts = "0 " * dim if kind == "hold" else rest[-1].replace("free", "nan").replace(",", " ")
+        numbers = np.array(texts.split(), dtype=float)
+        if kind == "gravity":
+            forces.append(ufl.inner(per_mm3 * on_cells("density") * fem.Constant(mesh, numbers), v) * ufl.dx)
+            continue
+        if kind in ("hold", "move"):
+            for d in np.flatnonzero(np.isfinite(numbers)):
+                dofs = fem.locate_dofs_topological(V.sub(d), dim - 1, members(facet_tags, "facets", rest[0]))
+                conditions.append(fem.dirichletbc(numbers[d], dofs, V.sub(d)))
+            continue
+        of_set = root.find(f".//Grid[@Name='facets']/Information[@Name='{rest[0]}']").get("Value")
+        on_set = ds(tuple(map(int, of_set.split())))
+        if kind == "pressure":
+            forces.append(-numbers[0] * ufl.inner(normal, v) * on_set)
+        elif kind == "traction":
+            forces.append(ufl.inner(fem.Constant(mesh, numbers), v) * on_set)
+        else:  # a spring: what is assembled of these goes onto the matrix's diagonal
+            springs.append(numbers[0] * ufl.inner(fem.Constant(mesh, np.ones(dim)), v) * on_set)
+
+Moduli that are linear within cells are the attribute `young_nodes`, one for each node.
 
 VTK, and with it pyvista and ParaView, reads the grids as blocks, as long as no list is longer than 10 MB, which that of
 the cells is from some 400 000 tetrahedra on: take .vtu for those. meshio 5.3.5 reads no XDMF with more than one grid.
