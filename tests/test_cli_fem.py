@@ -1,0 +1,196 @@
+"""`tetopt fem` on models: what it prints and writes is what `solved_model` finds; bad input is one line."""
+
+import json
+from dataclasses import fields
+
+import meshio
+import numpy as np
+import pytest
+from models import sample_image, sample_model
+
+import tetopt
+from tetopt.cli.app import main
+from tetopt.cli.options import ModelOptions
+from tetopt.fem.solution import solution_fields, solved_model
+from tetopt.io.formats import save_model
+from tetopt.model.build import model_of
+from tetopt.model.loads import parse_loads
+
+STEP_2 = ["2/traction:left:0.1,0,0", "2/spring:right:0.4", "2/gravity:0,0,-9810"]
+LOADS = ["hold:superior", "1/pressure:inferior:0.3", *STEP_2]
+
+
+def model_with(loads, **changes):
+    model = sample_model()
+    density = np.linspace(900.0, 1100.0, len(model.materials.young))
+    table = model.materials._replace(density=density)
+    return model._replace(loads=parse_loads(loads, model.mesh, model.sets), materials=table, **changes)
+
+
+@pytest.fixture
+def path(tmp_path):
+    """A file with moduli, densities, sets, and two steps of loads."""
+    save_model(tmp_path / "model.vtu", model_with(LOADS))
+    return str(tmp_path / "model.vtu")
+
+
+def run(capsys, *words):
+    """The numbers of the JSON file, and what was printed."""
+    assert main(["fem", *words]) == 0
+    printed = capsys.readouterr()
+    return printed.out, printed.err
+
+
+@pytest.mark.parametrize("order", [1, 2])
+def test_a_file_with_moduli_and_loads_needs_no_options(order, path, tmp_path, capsys):
+    model = model_with(LOADS, order=order)
+    solved, numbers = str(tmp_path / "solved.vtu"), str(tmp_path / "numbers.json")
+    out, _ = run(capsys, path, "--order", str(order), "-o", solved, "--json", numbers)
+    written, grid = json.loads((tmp_path / "numbers.json").read_text()), meshio.read(solved)
+    assert [each["iterations"] for each in written["steps"]] == [0, 0]
+    for step in (1, 2):
+        solution = solved_model(model, step)
+        row, suffix = written["steps"][step - 1], "" if step == 1 else "_step2"
+        for name in ("strain_energy", "spring_energy", "work"):
+            assert row[name] == pytest.approx(getattr(solution, name), rel=1e-9, abs=1e-12)
+        assert f"{row['strain_energy']:.8g}" in out
+        assert row["largest_displacement"] == pytest.approx(np.linalg.norm(solution.u, axis=1).max(), rel=1e-9)
+        reactions = json.loads(bytes(grid.field_data[f"reactions{suffix}"]).decode())
+        assert reactions == row["reactions"]
+        assert set(reactions) == ({"superior"} if step == 1 else {"superior", "right"})
+        for name, force in solution.reactions.items():
+            np.testing.assert_allclose(reactions[name], force, rtol=1e-8, atol=1e-9)
+        found = solution_fields(model.mesh, solution, step)
+        for name, values in found.cell_data.items():
+            np.testing.assert_allclose(grid.cell_data[name][0], values, atol=1e-9 * np.abs(values).max())
+        for name, values in found.point_data.items():
+            np.testing.assert_allclose(grid.point_data[name], values, atol=1e-9 * np.abs(values).max())
+    assert written["n_nodes_in_all"] == len(solution.u)
+    assert written["order"] == order
+
+
+def test_what_was_solved_can_be_solved_again(path, tmp_path, capsys):
+    """The order is the file's, so are loads, moduli and densities; results are new ones."""
+    first, second = str(tmp_path / "first.vtu"), str(tmp_path / "second.vtk")
+    run(capsys, path, "--order", "2", "-o", first)
+    run(capsys, first, "-o", second)
+    one, other = (tetopt.load_mesh(each) for each in (first, second))
+    assert other.order == 2
+    for name in ("displacement", "displacement_step2", "von_mises_nodes"):
+        np.testing.assert_allclose(other.point_data[name], one.point_data[name], atol=1e-12)
+    run(capsys, first, "-o", str(tmp_path / "third.vtu"), "--load", "compress:5%")
+    third = tetopt.load_mesh(tmp_path / "third.vtu")
+    assert not any("step2" in name for name in [*third.point_data, *third.cell_data, *third.field_data])
+
+
+def test_options_instead_of_what_the_file_holds(path, tmp_path, capsys):
+    numbers = str(tmp_path / "numbers.json")
+    run(capsys, path, "--json", numbers, "--compress", "2", "--young", "3", "--nu", "0.3", "--no-conditioning")
+    model = sample_model()
+    loads = parse_loads(["compress:2%"], model.mesh, model.sets)
+    ours = solved_model(model_of(model.mesh, young=3.0, nu=0.3, known_sets=model.sets)._replace(loads=loads))
+    written = json.loads((tmp_path / "numbers.json").read_text())
+    assert written["strain_energy"] == pytest.approx(ours.strain_energy, rel=1e-10)
+    assert "cond" not in written
+
+
+def test_an_image_with_loads_of_the_user_s(path, tmp_path, capsys):
+    """Its intensities are what the law is of; the conditioning is for the paper's test, or on demand."""
+    image, model = sample_image(), sample_model()
+    tetopt.save_image(tmp_path / "image.nii", image)
+    numbers = str(tmp_path / "numbers.json")
+    words = ["--load", "hold:left", "--load", "pressure:right:0.2", "--young", "1+0.02*h", "--average", "harmonic"]
+    out, _ = run(capsys, str(tmp_path / "image.nii"), path, *words, "--json", numbers, "--conditioning", "--nu", "0.4")
+    ours = solved_model(
+        model_of(
+            model.mesh,
+            tetopt.load_image(tmp_path / "image.nii"),
+            young="1+0.02*h",
+            nu=0.4,
+            average="harmonic",
+            loads=["hold:left", "pressure:right:0.2"],
+            known_sets=model.sets,
+        )
+    )  # fmt: skip
+    written = json.loads((tmp_path / "numbers.json").read_text())
+    assert written["strain_energy"] == pytest.approx(ours.strain_energy, rel=1e-9)
+    assert f"{written['cond']:.6g}" in out
+
+
+def test_triangles(tmp_path, capsys):
+    save_model(tmp_path / "plane.vtu", sample_model(2))
+    for order in (1, 2):
+        run(capsys, str(tmp_path / "plane.vtu"), "--order", str(order), "--json", str(tmp_path / f"{order}.json"))
+    one, two = (json.loads((tmp_path / f"{order}.json").read_text())["strain_energy"] for order in (1, 2))
+    assert 0.8 * one < two < one
+
+
+@pytest.mark.parametrize(
+    ("options", "is_advised"),
+    [
+        (["--nu", "0.45"], True),
+        (["--nu", "0.49"], True),
+        (["--nu", "0.44"], False),
+        (["--nu", "0.49", "--order", "2"], False),
+    ],
+)
+def test_advice_where_linear_cells_lock(options, is_advised, path, capsys):
+    _, err = run(capsys, path, "--young", "3", "--density", "1000", *options)
+    assert ("--order 2 (docs/order.md)" in err) == is_advised
+
+
+@pytest.mark.parametrize(
+    ("words", "message"),
+    [
+        (["{mesh}", "--young", "3"], "the mesh's file has no loads: give --load, such as --load compress:5%"),
+        (["{mesh}", "--load", "compress:5%"], "the mesh's file has no moduli: give --young, such as --young 3.5"),
+        (["{mesh}", "{mesh}", "{mesh}"], "expected [IMAGE] MESH, got 3 files"),
+        (["{model}", "--compress", "5", "--load", "hold:left"], "--compress and --load: give one of them"),
+        (["{model}", "--compress", "51"], "--compress: expected a percentage above 0 and up to 50, got 51"),
+        (["{model}", "--compress", "nan"], "--compress: expected a percentage above 0 and up to 50, got nan"),
+        (["{model}", "--crop", "0:2,0:2,0:2"], "--crop: there is no IMAGE, only a mesh"),
+        (["{model}", "--slice", "k=1"], "--slice: there is no IMAGE, only a mesh"),
+        (["{model}", "--order", "3"], "--order: expected 1 or 2, got 3"),
+        (["{model}", "--average", "power:x"], "average: expected"),
+        (["{model}", "--young", "3;4"], "formula: expected numbers"),
+        (["{model}", "--nu", "0.5"], "nu: expected -1 < nu < 0.5"),
+        (["{model}", "--young", "3"], "gravity: the cells have no density; give --density"),
+        (["{model}", "--density", "-1"], "density: expected kg/m3 above 0"),
+        (["{model}", "--load", "hold:inferor"], "did you mean inferior?"),
+        (["{model}", "--load", "pressure:left:1"], "mesh: nothing holds it, neither a displacement nor a spring"),
+        (["{model}", "--load", "move:left:0,free,free"], "can still turn or slide as a whole"),
+        (["{model}", "--load", "hold:interface_0_1", "--load", "pressure:interface_0_1:1"], "lie between two cells"),
+        (["{model}", "--load", "3/hold:left"], "there is a step 3, but no load is of step 1 alone"),
+        (["{model}", "-o", "{model}", "--force"], "is an input of this command too"),
+        (["{model}", "-o", "out.inp"], "out.inp: expected a name that ends in .vtu or .vtk"),
+    ],
+)  # fmt: skip
+def test_bad_input_is_one_line_and_nothing_is_written(words, message, path, tmp_path, capsys, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    tetopt.save_mesh(tmp_path / "mesh.vtu", sample_model().mesh)
+    before = (tmp_path / "model.vtu").read_bytes()
+    words = [word.format(mesh="mesh.vtu", model="model.vtu") for word in words]
+    output = [] if "-o" in words else ["-o", "out.vtu"]
+    assert main(["fem", *words, *output, "--json", "out.json"]) == 2
+    err = capsys.readouterr().err.strip().splitlines()
+    assert message in err[-1]
+    assert sum(line.startswith("tetopt:") for line in err) == 1
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["mesh.vtu", "model.vtu"]
+    assert (tmp_path / "model.vtu").read_bytes() == before
+
+
+def test_moduli_too_far_apart_are_one_line(tmp_path, capsys):
+    """Stone on the softest of beds."""
+    model = sample_model()
+    loads = parse_loads(["spring:inferior:1e-6", "pressure:superior:1"], model.mesh, model.sets)
+    stone = model_of(model.mesh, young=1e12, known_sets=model.sets)._replace(loads=loads)
+    save_model(tmp_path / "model.vtu", stone)
+    assert main(["fem", str(tmp_path / "model.vtu"), "-o", str(tmp_path / "solved.vtu")]) == 2
+    assert "the moduli differ too much, or nu is too near 0.5, for this mesh" in capsys.readouterr().err
+    assert not (tmp_path / "solved.vtu").exists()
+
+
+def test_every_option_of_the_model_reaches_it():
+    """None of them is left out of what is tested above, but for sets and bins, which convert's tests have."""
+    names = {field.name for field in fields(ModelOptions)}
+    assert names == {"young", "nu", "density", "average", "bins", "sets", "loads", "order"}
