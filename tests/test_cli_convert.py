@@ -128,6 +128,9 @@ def test_commands_take_a_quadratic_mesh(folder, quadratic_path, tmp_path, capsys
         surface = tmp_path / f"{path.stem}.stl"
         assert exit_code("surface", path, "--label", "1", "-o", surface) == 0
         assert exit_code("view", path, "--html", tmp_path / f"{path.stem}.html") == 0
+        started, improved = ["--start", path, "--iterations", "1"], tmp_path / f"{path.stem}_improved.json"
+        output = ["-o", tmp_path / f"{path.stem}.msh", "--json", improved]
+        assert exit_code("mesh", folder / "a.nii.gz", *output, *started) == 0
         capsys.readouterr()
     assert re.search(rf"^corner nodes +{len(mesh.points)}\nnodes in all +{n_all}\n", texts[1], re.MULTILINE)
     assert re.search(rf"^nodes +{len(mesh.points)}\ncells", texts[0], re.MULTILINE)
@@ -135,6 +138,9 @@ def test_commands_take_a_quadratic_mesh(folder, quadratic_path, tmp_path, capsys
     assert linear["quality"] == both["quality"]
     assert linear["fit"] == both["fit"]
     assert (both["size"]["n_nodes_in_all"], linear["size"]["n_nodes_in_all"]) == (n_all, len(mesh.points))
+    improved = [numbers_in(tmp_path / f"{name}_improved.json") for name in ("a", "quadratic")]
+    assert improved[0]["mesh_sha256"] == improved[1]["mesh_sha256"]
+    assert improved[1]["size"]["order"] == 1  # unless --order says otherwise
     for name in ("nii.gz", "stl"):
         assert (tmp_path / f"a.{name}").stat().st_size == (tmp_path / f"quadratic.{name}").stat().st_size
 
