@@ -23,16 +23,25 @@ def cell_edges(n: int) -> NDArray[np.int64]:
     return QUADRATIC_EDGES[: n * (n + 1) // 2]
 
 
+def numbered_edges(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The edges (E, 2) of cells (M, n+1), sorted by their ends, and which of them are a cell's `cell_edges`, (M, 3 or 6)."""
+    ends = np.sort(cells[:, cell_edges(cells.shape[1] - 1)], axis=2)
+    n_nodes = int(cells.max()) + 1
+    keys, number = np.unique(
+        ends[..., 0] * n_nodes + ends[..., 1], return_inverse=True
+    )  # ten times faster than of pairs
+    return np.column_stack(np.divmod(keys, n_nodes)), number.reshape(len(cells), -1)
+
+
 def quadratic(points: NDArray[np.float64], cells: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Nodes (N + E, n) and cells (M, 6 or 10) of order 2, of points (N, n) and cells (M, n+1).
 
     The points come first, then the midpoints of the edges, which are sorted by their ends; a cell's corners come first,
     then the midpoints of `cell_edges`.
     """
-    ends = np.sort(cells[:, cell_edges(points.shape[1])], axis=2)  # (M, E, 2)
-    edges, number = np.unique(ends.reshape(-1, 2), axis=0, return_inverse=True)
+    edges, number = numbered_edges(cells)
     midpoints = points[edges].mean(axis=1)
-    return np.concatenate([points, midpoints]), np.column_stack([cells, len(points) + number.reshape(len(cells), -1)])
+    return np.concatenate([points, midpoints]), np.column_stack([cells, len(points) + number])
 
 
 def quadratic_facet_nodes(cells: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.int64]:

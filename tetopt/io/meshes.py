@@ -15,7 +15,7 @@ import pyvista
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
-from tetopt.geometry.quadratic import cell_edges
+from tetopt.geometry.quadratic import numbered_edges
 from tetopt.geometry.simplex import oriented
 from tetopt.io.files import written_whole
 from tetopt.io.raw import CELL_DIMENSIONS, CORNER_KINDS, Raw, by_corners
@@ -142,10 +142,10 @@ def _middles(raw: Raw, kind: str) -> tuple[NDArray[np.int64], tuple[str, ...]]:
     which edges are not straight in the file."""
     if kind not in raw.middles:
         return np.empty(0, dtype=np.int64), ()
-    ends = np.sort(raw.cells[kind][:, cell_edges(CELL_DIMENSIONS[kind])], axis=2).reshape(-1, 2)
-    edges, first, number = np.unique(ends, axis=0, return_index=True, return_inverse=True)
-    nodes, notes = raw.middles[kind].ravel()[first], []
-    if n_torn := len(np.unique(number.ravel()[nodes[number.ravel()] != raw.middles[kind].ravel()])):
+    edges, number = numbered_edges(raw.cells[kind])
+    nodes, notes = np.empty(len(edges), dtype=np.int64), []
+    nodes[number] = raw.middles[kind]
+    if n_torn := len(np.unique(number[nodes[number] != raw.middles[kind]])):
         notes.append(f"{n_torn} edges have a middle node in each of their cells: one of them is taken")
     start, end = np.moveaxis(raw.points[edges], 1, 0)
     off = np.linalg.norm(raw.points[nodes] - 0.5 * (start + end), axis=1)

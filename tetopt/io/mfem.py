@@ -74,8 +74,8 @@ def _elements(attributes: NDArray[np.int64], dim: int, nodes: NDArray[np.int64])
 def _nodes(mesh: Mesh) -> str:
     """The function of the nodes of order 2, node by node."""
     ends = np.sort(mesh.cells[:, ELEMENT_EDGES[mesh.ndim]], axis=2).reshape(-1, 2)
-    edges, first = np.unique(ends, axis=0, return_index=True)
-    middles = mesh.points[edges].mean(axis=1)[np.argsort(first)]
+    _, first = np.unique(ends[:, 0] * len(mesh.points) + ends[:, 1], return_index=True)
+    middles = mesh.points[ends[np.sort(first)]].mean(axis=1)
     head = f"FiniteElementSpace\nFiniteElementCollection: H1_{mesh.ndim}D_P2\nVDim: {mesh.ndim}\nOrdering: 1\n"
     return f"\nnodes\n{head}\n{rows(np.concatenate([mesh.points, middles]))}"
 
