@@ -24,12 +24,11 @@ def cell_edges(n: int) -> NDArray[np.int64]:
 
 
 def numbered_edges(cells: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-    """The edges (E, 2) of cells (M, n+1), sorted by their ends, and which of them are a cell's `cell_edges`, (M, 3 or 6)."""
+    """The edges (E, 2) of cells (M, n+1), sorted by their ends; and of each cell the numbers (M, 3 or 6) of its own."""
     ends = np.sort(cells[:, cell_edges(cells.shape[1] - 1)], axis=2)
     n_nodes = int(cells.max()) + 1
-    keys, number = np.unique(
-        ends[..., 0] * n_nodes + ends[..., 1], return_inverse=True
-    )  # ten times faster than of pairs
+    # As single numbers: ten times faster than as pairs, at 112,000 tetrahedra.
+    keys, number = np.unique(ends[..., 0] * n_nodes + ends[..., 1], return_inverse=True)
     return np.column_stack(np.divmod(keys, n_nodes)), number.reshape(len(cells), -1)
 
 
