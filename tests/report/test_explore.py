@@ -169,6 +169,7 @@ const warped = async () => {
   const names = (id) => [...$(id).children].map((option) => option.textContent);
   const state = () => [$("warp-number").value, $("warped").textContent, $("field").selectedOptions[0].textContent,
     $("extremes").textContent, Number(canvas.dataset.section)];
+  said.about = $("about").textContent;
   said.names = [names("field"), names("by"), names("step")];
   said.first = state();
   press("axis", 2); put("at-number", AT_2); put("warp-number", 0);
@@ -283,6 +284,7 @@ def pressed(mesh):
     heat = np.where(np.arange(len(x)) % 17 == 0, np.nan, x)
     data = {"on_top": np.zeros((len(x), 2)), "displacement": first, "displacement_step2": second, "heat": heat}
     data |= {"von_mises_nodes": z, "von_mises_nodes_step2": 2.0 * z, "strain_nodes": np.zeros((len(x), 9))}
+    data["strain_nodes_step2"] = np.ones((len(x), 9))
     return {name: np.concatenate([values, np.full_like(values, 1e9)]) for name, values in data.items()}
 
 
@@ -464,6 +466,7 @@ def test_a_slider_deforms_the_mesh(shown, mesh):
     page = shown["warped"]
     fields = ["displacement (mm)", "heat", "von_mises_nodes (kPa)", "mean (intensity)", "label"]
     assert page["names"] == [fields, fields, ["1", "2"]]
+    assert f"{len(mesh.points)} corner nodes (of {2 * len(mesh.points)})" in page["about"]
     first, most = warp_factors(exhibit(mesh, {}, point_data=pressed(mesh)))
     assert page["first"][:3] == [f"{first:g}", f"Deformation × {first:g}", "displacement (mm)"]
     at = middle_of(mesh)[2] + AT[1]

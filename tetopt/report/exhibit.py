@@ -24,7 +24,7 @@ OUTLIERS_PERCENT = 1.0  # of the cells, at either end of a field: their values d
 FIELD_UNITS = {
     "mean": "intensity", "variance": "intensity²", "n_voxels": "voxels", "min": "intensity", "max": "intensity",
     "volume": "mm³", "rho": "0 to 1/3", "min_dihedral": "degrees", "young": "kPa", "displacement": "mm",
-    "von_mises": "kPa", "von_mises_nodes": "kPa",
+    "von_mises": "kPa", "von_mises_nodes": "kPa", "young_nodes": "kPa", "density": "kg/m³",
 }  # fmt: skip
 DISPLACEMENT = "displacement"  # the point data by which the mesh is deformed
 STEP_NAME = re.compile(r"(.+)_step([1-9]\d*)")  # of results of the second and further steps
@@ -56,6 +56,7 @@ class Exhibit(NamedTuple):
     title: str
     sets: dict[str, NDArray]  # (K, 3) integer: the nodes of facets, by name
     displacements: dict[int, NDArray[np.float64]]  # (N, 3) mm by step; of the only one under 0
+    n_nodes: int  # of cells of order 2 more than the mesh's, which alone are drawn
     reactions: dict[int, dict[str, list[float]]]  # by step likewise, and set: (3,) mN that hold it
 
 
@@ -114,9 +115,13 @@ def exhibit(
     fields = [_field(name, values[mesh.cells].mean(axis=1), values) for name, values in at_nodes.items()]
     fields += [_field(name, values) for name, values in (scalars or cell_fields(mesh, image)).items()]
     skipped = [name for name in cell_data if name not in scalars] + others
+    if len(displacements) > 1:
+        skipped = list(dict.fromkeys(STEP_NAME.sub(r"\1", name) for name in skipped))
     checked = _checked_sets(mesh, facet_sets or {})
     forces = {step if len(displacements) > 1 else 0: by_set for step, by_set in (reactions or {}).items()}
-    return Exhibit(mesh, _by_step(fields, displacements), skipped, image, title, checked, displacements, forces)
+    n_nodes = max([len(mesh.points), *(len(rows) for rows in (point_data or {}).values())])
+    shown = _by_step(fields, displacements)
+    return Exhibit(mesh, shown, skipped, image, title, checked, displacements, n_nodes, forces)
 
 
 def warp_factors(shown: Exhibit) -> tuple[float, float]:

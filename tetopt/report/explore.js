@@ -405,8 +405,10 @@ function explore(gl, data, notes) {
 
   function about() {
     const volume = mesh.volumes.reduce((sum, one) => sum + one, 0);
-    const words = [`World coordinates: RAS, mm. Mesh: ${whole(mesh.points.length / 3)} nodes,
-      ${whole(mesh.count)} cells, ${number(volume, 7)} mm³.`];
+    const corners = mesh.points.length / 3;
+    const nodes = data.nNodes > corners ? `${whole(corners)} corner nodes (of ${whole(data.nNodes)})`
+      : `${whole(corners)} nodes`;
+    const words = [`World coordinates: RAS, mm. Mesh: ${nodes}, ${whole(mesh.count)} cells, ${number(volume, 7)} mm³.`];
     if (image) {
       const coarser = image.shape.join() === image.original.join() ? "" : `, averaged to ${image.shape.join(" × ")}`;
       words.push(`Image: ${image.original.join(" × ")} voxels${coarser}; black is ${number(image.limits[0])},

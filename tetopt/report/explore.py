@@ -51,7 +51,7 @@ def explorer_html(shown: Exhibit) -> str:
     its 99.5 percentile, each voxel where its affine puts it; above `PAGE_IMAGE_VOXELS` neighbours are averaged, which
     the page says.
     """
-    mesh, fields, skipped, image, title, sets, displacements, reactions = shown
+    mesh, fields, skipped, image, title, sets, displacements, n_nodes, reactions = shown
     centre = (mesh.points.min(axis=0) + mesh.points.max(axis=0)) / 2.0
     data = {
         "centre": centre.tolist(),
@@ -64,6 +64,7 @@ def explorer_html(shown: Exhibit) -> str:
         "sets": [{"name": name, "triangles": packed(nodes, "<u4")} for name, nodes in sets.items()],
         "noValue": NO_VALUE,
         "displacements": [{"step": step, "u": packed(u, "<f4")} for step, u in displacements.items()],
+        "nNodes": n_nodes,
         "reactions": reactions,
         "factors": warp_factors(shown),
         "axis": first_axis(shown),

@@ -94,7 +94,8 @@ class _Scene:
         self.axis = first_axis(shown)
         self.at = float((self.low + self.high)[self.axis] / 2.0)
         self.is_turned = False
-        self.inside = PLANE_CHOICES[0] if image is None else PLANE_CHOICES[2]
+        # Behind a mesh that is deformed the image, which is not, would mislead at first sight.
+        self.inside = PLANE_CHOICES[0] if image is None or self.displacements else PLANE_CHOICES[2]
         self.set = 0  # none, then those in `sets`
         self.number = 0  # of the field
         self.limits = self._range()
