@@ -83,7 +83,8 @@ def cases(phantoms: Sequence[str], paths: Sequence[Path]) -> list[tuple[str, tet
 def _line(row: dict[str, Any]) -> str:
     mesh = row["measured"]
     errors = [
-        f"nu {nu}: " + " ".join(f"{getattr(f.errors, e):.4f}" for e in SHOWN_ERRORS) for nu, f in mesh.fem.items()
+        f"nu {nu}: " + " ".join(f"{getattr(f.averages['mean'].errors, e):.4f}" for e in SHOWN_ERRORS)
+        for nu, f in mesh.fem.items()
     ]
     shape = f"E_D {mesh.E_D_share:.4f} rho {mesh.quality.mean_rho:.3f}"
     return f"{row['image']} {row['nodes']} nodes k_D {row['k_D']:g}: {shape}  " + "  ".join(errors)
@@ -100,7 +101,16 @@ def _summary(rows: Sequence[dict[str, Any]], weights: Sequence[float]) -> dict[s
             for nu in a["measured"].fem
         ]
         ratios = {
-            e: float(np.exp(np.mean([np.log(getattr(a.errors, e) / getattr(b.errors, e)) for a, b in pairs])))
+            e: float(
+                np.exp(
+                    np.mean(
+                        [
+                            np.log(getattr(a.averages["mean"].errors, e) / getattr(b.averages["mean"].errors, e))
+                            for a, b in pairs
+                        ]
+                    )
+                )
+            )
             for e in SHOWN_ERRORS
         }
         ratios["cond"] = float(np.exp(np.mean([np.log(a.cond / b.cond) for a, b in pairs])))

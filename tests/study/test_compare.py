@@ -8,11 +8,16 @@ import pytest
 import tetopt
 from tetopt.cli import main
 from tetopt.fem.budget import Budget
+from tetopt.fem.elasticity import box_faces, compression, push_of
+from tetopt.fem.reference import Errors, averaged, nearest, reference
+from tetopt.fem.reference import compare as reference_errors
+from tetopt.geometry.quadratic import quadratic
+from tetopt.model.averages import cell_young, young_image
 from tetopt.study import compare
 from tetopt.study.compare_files import COMPARE_PICTURES
 from tetopt.study.compare_report import Attempt, ImageSource, Settings, as_json, from_json
 
-SMALL = ["--nodes", "150", "--repeats", "2", "--reference-dofs", "6000"]
+SMALL = ["--nodes", "400", "--repeats", "2", "--reference-dofs", "6000"]
 
 
 LABEL_KEYS = {  # of the report, and what the library calls it
@@ -44,7 +49,12 @@ def test_files(run):
     pictures = set(COMPARE_PICTURES) - {"tradeoff.png"}
     assert {p.name for p in run.iterdir()} == {"report.json", "report.html", "runs", *pictures}
     names = {p.stem for p in (run / "runs").iterdir()}
-    assert names == {f"{name}-{nodes}-1" for name in ("tetopt", "bcc", "odt") for nodes in (150, 75)}
+    assert names == {
+        f"{name}-{nodes}{order}-1"
+        for name in ("tetopt", "bcc", "odt")
+        for nodes in (400, 200)
+        for order in ("", "-quadratic")
+    }
 
 
 def test_numbers_are_those_of_the_meshes(run, head):
@@ -53,7 +63,7 @@ def test_numbers_are_those_of_the_meshes(run, head):
     image, labels = (tetopt.load_image(head / name) for name in ("image.nii.gz", "labels.nii.gz"))
     h, true = image.data.astype(float).ravel(), labels.data.astype(int).ravel()
     for pipeline in report["pipelines"]:
-        mesh = tetopt.load_mesh(run / "runs" / f"{pipeline['name']}-150-1.vtu").mesh
+        mesh = tetopt.load_mesh(run / "runs" / f"{pipeline['name']}-400-1.vtu").mesh
         owner = tetopt.cell_of_voxel(image, mesh).ravel()
         assert (owner >= 0).all()
         means = np.bincount(owner, weights=h) / np.maximum(np.bincount(owner), 1)
@@ -82,37 +92,30 @@ def test_the_keys_of_the_report(run):
     report = json.loads((run / "report.json").read_text())
     assert set(report) == {
         *("command", "curves", "image", "labels", "law", "machine", "options", "pipelines", "reference", "seconds"),
-        *("tradeoff", "versions"),
+        *("quadratic", "tradeoff", "versions"),
     }
     pipeline = report["pipelines"][0]
     assert set(pipeline) == {"about", "failure", "high", "kind", "low", "median", "name", "notes", "runs", "title"}
     median = pipeline["median"]
     assert set(median) == {
-        *("E_D", "E_D_share", "dihedral_histogram", "fem", "labels", "n_cells", "n_empty_cells", "n_missed_voxels"),
+        *("E_D", "E_D_share", "dihedral_histogram", "fem", "labels", "n_cells", "n_corners", "n_empty_cells"),
+        *("n_missed_voxels", "order"),
         *("n_nodes", "not_compressed", "peak_bytes", "quality", "rho_histogram", "seconds", "seconds_total"),
     }
     assert set(median["labels"][0]) == {
         *("E_D_share", "components", "dice", "is_lost", "label", "mesh_components", "mesh_volume_mm3", "mesh_voxels"),
         *("surface_mean_mm", "surface_p95_mm", "volume_mm3", "voxels"),
     }
-    assert set(median["fem"]["0.3"]) == {"cg_iterations", "cond", "errors", "lambda_max", "strain_energy"}
+    assert set(median["fem"]["0.3"]) == {"averages", "cg_iterations", "cond", "lambda_max"}
+    assert set(median["fem"]["0.3"]["averages"]) == {"geometric", "mean"}
+    assert set(median["fem"]["0.3"]["averages"]["mean"]) == {"errors", "seconds", "strain_energy"}
     assert set(report["options"]) == {
-        *(
-            "average",
-            "classes",
-            "curve",
-            "iterations",
-            "k_D",
-            "max_bytes",
-            "max_seconds",
-            "nodes",
-            "nus",
-            "percent",
-            "pipelines",
-        ),
-        *("programs", "reference_dofs", "reference_seconds", "repeats", "tradeoff"),
+        *("classes", "curve", "iterations", "k_D", "max_bytes", "max_seconds", "nodes", "nus", "percent", "pipelines"),
+        *("average", "programs", "reference_dofs", "reference_seconds", "repeats", "tradeoff"),
     }
-    assert set(report["curves"][0]["points"][0]) == {"E_D_share", "errors", "n_nodes"}
+    assert set(report["curves"][0]["points"][0]) == {"E_D_share", "fem", "n_nodes"}
+    assert set(report["curves"][0]) == {"name", "order", "points", "title"}
+    assert [each["name"] for each in report["quadratic"]] == [each["name"] for each in report["pipelines"]]
 
 
 def test_runs_are_read_back_as_they_were_written(run):
@@ -121,7 +124,9 @@ def test_runs_are_read_back_as_they_were_written(run):
         attempt = from_json(Attempt, row)
         assert as_json(attempt) == row
         assert sum(attempt.run.measurement.rho_histogram.share) == pytest.approx(1.0)
-        assert attempt.run.measurement.fem["0.3"].errors.strain_energy == row["fem"]["0.3"]["errors"]["strain_energy"]
+        assert attempt.run.measurement.fem["0.3"].averages["mean"].errors == Errors(
+            **row["fem"]["0.3"]["averages"]["mean"]["errors"]
+        )
 
 
 def test_the_image_helps_and_the_reference_is_one(run):
@@ -129,11 +134,48 @@ def test_the_image_helps_and_the_reference_is_one(run):
     report = json.loads((run / "report.json").read_text())
     share = {p["name"]: p["median"]["E_D_share"] for p in report["pipelines"]}
     assert share["tetopt"] < 0.5 * min(share["bcc"], share["odt"])
-    for pipeline in report["pipelines"]:
+    for pipeline in [*report["pipelines"], *report["quadratic"]]:
         for nu, fem in pipeline["median"]["fem"].items():
             energy = report["reference"][nu]["strain_energy"]
-            assert fem["errors"]["strain_energy"] == pytest.approx(abs(fem["strain_energy"] / energy - 1.0), rel=1e-9)
-    assert [len(curve["points"]) for curve in report["curves"]] == [2, 2, 2]
+            for solved in fem["averages"].values():
+                error = abs(solved["strain_energy"] / energy - 1.0)
+                assert solved["errors"]["strain_energy"] == pytest.approx(error, rel=1e-9)
+                assert solved["seconds"] > 0.0
+    assert [len(curve["points"]) for curve in report["curves"]] == [2] * 6
+
+
+def test_the_quadratic_mesh_is_a_coarser_one(run, head):
+    """About as many nodes in all; its errors are those of the library, solved anew from its file."""
+    report = json.loads((run / "report.json").read_text())
+    image = tetopt.load_image(head / "image.nii.gz")
+    law, _ = compare.default_law(image)
+    settings = Settings(400, reference_dofs=6000)
+    modulus = averaged(young_image(image, law), compare.reference_shape(image.shape, image.spacing, 6000))
+    exact = reference(modulus, 0.45)
+    labels = nearest(tetopt.load_image(head / "labels.nii.gz"), modulus).data
+    for pipeline in report["quadratic"]:
+        mesh = tetopt.load_mesh(run / "runs" / f"{pipeline['name']}-400-quadratic-1.vtu").mesh
+        median = pipeline["median"]
+        assert median["order"] == 2
+        assert median["n_corners"] == len(mesh.points) < 100
+        assert median["n_nodes"] == len(quadratic(mesh.points, mesh.cells)[0])
+        assert 0.75 < median["n_nodes"] / 400 < 1.25  # of a lattice there are few so coarse
+        bottom, top = box_faces(image, mesh)
+        for average in ("mean", "geometric"):
+            young = cell_young(nearest(modulus, image), mesh, average=average)
+            pressed = compression(
+                mesh, young, 0.45, fixed_nodes=top, pushed_nodes=bottom, order=2,
+                displacement=push_of(image, settings.percent),
+            )  # fmt: skip
+            errors = reference_errors(exact, mesh, pressed.u, pressed.strain_energy, labels)
+            assert median["fem"]["0.45"]["averages"][average]["errors"] == pytest.approx(errors._asdict(), rel=1e-6)
+
+
+def without_seconds(fem):
+    return {
+        nu: each | {"averages": {name: solved | {"seconds": 0} for name, solved in each["averages"].items()}}
+        for nu, each in fem.items()
+    }
 
 
 def test_tradeoff(head, opengl, tmp_path):
@@ -143,14 +185,16 @@ def test_tradeoff(head, opengl, tmp_path):
     assert main(["compare", *words, "--tradeoff"]) == 0
     report = json.loads((out / "report.json").read_text())
     rows = report["tradeoff"]
-    defaults = [row["measured"] for row in rows if row["is_default"]]
-    assert len(defaults) == 4
-    assert all(measured == defaults[0] for measured in defaults)
-    own = report["pipelines"][0]["median"]
-    assert {k: own[k] for k in ("E_D_share", "quality", "fem")} == {
-        k: defaults[0][k] for k in ("E_D_share", "quality", "fem")
-    }
-    by_k_D = [row["measured"] for row in rows if row["option"] == "k_D"]
+    for order, results in ((1, report["pipelines"]), (2, report["quadratic"])):
+        defaults = [row["measured"] for row in rows if row["is_default"] and row["order"] == order]
+        assert len(defaults) == 4
+        assert all(measured == defaults[0] for measured in defaults)
+        own = results[0]["median"]
+        assert {k: own[k] for k in ("E_D_share", "quality", "n_nodes")} == {
+            k: defaults[0][k] for k in ("E_D_share", "quality", "n_nodes")
+        }
+        assert without_seconds(own["fem"]) == without_seconds(defaults[0]["fem"])
+    by_k_D = [row["measured"] for row in rows if row["option"] == "k_D" and row["order"] == 1]
     assert by_k_D[0]["E_D_share"] > by_k_D[-1]["E_D_share"]
     assert by_k_D[0]["quality"]["mean_rho"] > by_k_D[-1]["quality"]["mean_rho"]
     assert (out / "tradeoff.png").stat().st_size > 20_000
@@ -165,11 +209,11 @@ def test_resume_keeps_what_is_done(run, head, capsys):
     inputs = [str(head / "image.nii.gz"), "--labels", str(head / "labels.nii.gz")]
     again = ["compare", *inputs, "-o", str(run), *SMALL, "--pipelines", "tetopt,bcc,odt", "--curve", "0.5", "--resume"]
     before = json.loads((run / "report.json").read_text())
-    (run / "runs" / "bcc-150-1.json").unlink()
+    (run / "runs" / "bcc-400-1.json").unlink()
     capsys.readouterr()
     assert main(again) == 0
     err = capsys.readouterr().err
-    assert err.count("kept from before") == 5
+    assert err.count("kept from before") == 11
     after = json.loads((run / "report.json").read_text())
     assert [p["median"]["E_D"] for p in after["pipelines"]] == [p["median"]["E_D"] for p in before["pipelines"]]
     assert main([*again, "--k-d", "0.3", "--pipelines", "bcc"]) == 0
@@ -216,7 +260,7 @@ def test_pytetwild_in_the_comparison(head, opengl):
     assert len(ours["runs"]) == 1
     assert len(theirs["runs"]) == 2
     assert theirs["low"]["E_D"] <= theirs["median"]["E_D"] <= theirs["high"]["E_D"]
-    assert abs(theirs["median"]["n_nodes"] / 150 - 1) < 0.15
+    assert abs(theirs["median"]["n_nodes"] / 400 - 1) < 0.15
     assert (out / "report.html").read_text(encoding="utf-8").count("pytetwild") > 3
 
 

@@ -13,6 +13,7 @@ from tetopt.geometry.simplex import volumes
 from tetopt.report.figures import SliceView, save_figure
 from tetopt.study.compare_figures import (
     ERROR_TITLES,
+    curve_title,
     curves_figure,
     cutaways,
     histograms_figure,
@@ -96,29 +97,31 @@ def test_histograms_are_those_of_the_report():
             np.testing.assert_array_equal(outlines[pipeline.title].edges, histogram.edges)
 
 
-def test_curves_are_those_of_the_report():
+@pytest.mark.parametrize("is_by_time", [False, True])
+def test_curves_are_those_of_the_report(is_by_time):
     report = fake_report()
-    errors = report.curves[1].points[0].errors
-    errors["0.3"] = errors["0.3"]._replace(displacement=None)
-    panels = np.array(curves_figure(report).axes).reshape(2, 3)
+    solved = report.curves[1].points[0].fem["0.3"].averages
+    solved["geometric"] = solved["geometric"]._replace(errors=solved["geometric"].errors._replace(displacement=None))
+    panels = np.array(curves_figure(report, is_by_time=is_by_time).axes).reshape(2, 3)
     for row, nu in enumerate(("0.3", "0.45")):
         for axes, (name, _) in zip(panels[row], ERROR_TITLES, strict=True):
             assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
             lines = {line.get_label(): line for line in axes.lines}
-            assert list(lines) == [curve.title for curve in report.curves]
+            assert list(lines) == [curve_title(curve) for curve in report.curves]
             for curve in report.curves:
-                expected = [(p.n_nodes, getattr(p.errors[nu], name)) for p in curve.points]
-                shown = list(zip(*lines[curve.title].get_data(), strict=True))
-                assert shown == [pair for pair in expected if pair[1] is not None]
-    markers = [line.get_marker() for line in panels[0, 0].lines]
-    assert len(set(markers)) == len(markers)
+                rows = [(p.n_nodes, p.fem[nu].averages["geometric"]) for p in curve.points]
+                expected = [(s.seconds if is_by_time else n, getattr(s.errors, name)) for n, s in rows]
+                shown = list(zip(*lines[curve_title(curve)].get_data(), strict=True))
+                assert shown == sorted(pair for pair in expected if pair[1] is not None)
+    kinds = [(line.get_marker(), line.get_linestyle()) for line in panels[0, 0].lines]
+    assert len(set(kinds)) == len(kinds)
 
 
 def test_curves_without_finite_elements_show_E_D(tmp_path):
     report = fake_report()
     for curve in report.curves:
         for point in curve.points:
-            point.errors.clear()
+            point.fem.clear()
     (axes,) = curves_figure(report).axes
     first = report.curves[0].points
     np.testing.assert_array_equal(axes.lines[0].get_ydata(), [p.E_D_share for p in first])
@@ -145,9 +148,12 @@ def test_colours_do_not_depend_on_what_failed():
     """A pipeline keeps its colour in every picture, whichever others have no line."""
     report = fake_report()
     first, *others = report.pipelines
-    fewer = report._replace(pipelines=[with_runs(first, []), *others], curves=report.curves[1:])
+    fewer = report._replace(
+        pipelines=[with_runs(first, []), *others], curves=[each for each in report.curves if each.name != first.name]
+    )
     whole, part = curves_figure(report).axes[0].lines, curves_figure(fewer).axes[0].lines
-    assert [line.get_color() for line in whole[1:]] == [line.get_color() for line in part]
+    colours = [line.get_color() for line, curve in zip(whole, report.curves, strict=True) if curve.name != first.name]
+    assert colours == [line.get_color() for line in part]
 
 
 def test_cutaways_are_drawn(small, tmp_path, opengl):

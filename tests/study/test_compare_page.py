@@ -32,13 +32,14 @@ from tetopt.study.compare_report import (
     Run,
     Settings,
     Simulation,
+    Solved,
     as_json,
 )
 from tetopt.study.pipelines import PIPELINES
 
 
-def fake_run(seed, scale):
-    """A run of plausible numbers; errors go with `scale`."""
+def fake_run(seed, scale, order=1):
+    """A run of plausible numbers; errors go with `scale`, and are half as large with quadratic cells."""
     random = np.random.default_rng(seed)
 
     def some(low, high):
@@ -64,17 +65,24 @@ def fake_run(seed, scale):
         )
         for k in range(4)
     ]  # fmt: skip
-    fem = {
-        nu: Simulation(some(1e2, 1e3), some(1e3, 1e5), int(random.integers(80, 300)), some(1.0, 2.0), errors_of(scale))
-        for nu in ("0.3", "0.45")
-    }
+    fem = {nu: simulation_of(random, scale / order) for nu in ("0.3", "0.45")}
     seconds = {"lattice": some(0.1, 1.0), "optimise": some(1.0, 20.0)}
     measurement = Measurement(
-        n_nodes=5000 + seed, n_cells=27000 + 5 * seed, E_D=1e9 * scale, E_D_share=0.04 * scale, n_missed_voxels=0,
+        order=order, n_nodes=5000 + seed, n_corners=(5000 + seed) // (1, 7)[order - 1],
+        n_cells=27000 + 5 * seed, E_D=1e9 * scale, E_D_share=0.04 * scale, n_missed_voxels=0,
         n_empty_cells=0, quality=quality, rho_histogram=Histogram(np.linspace(0, 1 / 3, 21).tolist(), rho.tolist()),
         dihedral_histogram=Histogram(list(range(0, 181, 5)), angles.tolist()), labels=labels, fem=fem,
     )  # fmt: skip
     return Run({"kernels": 3.0, **seconds}, sum(seconds.values()), int(9e8 * scale), measurement)
+
+
+def simulation_of(random, scale):
+    """The geometric mean errs a fifth less than Eq. (2)'s."""
+    averages = {
+        name: Solved(random.uniform(1.0, 2.0), errors_of(factor * scale), 0.5 / scale)
+        for name, factor in (("mean", 1.0), ("geometric", 0.8))
+    }
+    return Simulation(random.uniform(1e2, 1e3), random.uniform(1e3, 1e5), int(random.integers(80, 300)), averages)
 
 
 def errors_of(scale):
@@ -88,10 +96,11 @@ def with_runs(pipeline, runs):
 
 
 def with_measured(report, number, **values):
-    """Change what all runs of the pipeline at this place measured."""
-    pipeline = report.pipelines[number]
-    runs = [run._replace(measurement=run.measurement._replace(**values)) for run in pipeline.runs]
-    report.pipelines[number] = with_runs(pipeline, runs)
+    """Change what all runs of the pipeline at this place measured, with cells of both orders."""
+    for pipelines in (report.pipelines, report.quadratic):
+        pipeline = pipelines[number]
+        runs = [run._replace(measurement=run.measurement._replace(**values)) for run in pipeline.runs]
+        pipelines[number] = with_runs(pipeline, runs)
 
 
 def finished(report):
@@ -100,20 +109,24 @@ def finished(report):
 
 def fake_report():
     """Five pipelines: the second of three runs, the third failed."""
-    pipelines = []
+    results = {1: [], 2: []}
     for number, name in enumerate(("tetopt", "pytetwild", "cleaver", "bcc", "odt")):
         title, kind = PIPELINES[name].title, PIPELINES[name].kind
         n_runs = (1, 3, 0, 1, 1)[number]
-        runs = [fake_run(10 * number + k, 1.0 + 0.3 * number) for k in range(n_runs)]
-        failure = None if runs else "crashed: signal 11 after 3 s"
-        result = PipelineResult(name, title, kind, f"{title}, its options", failure, [f"a note on {title}"], runs)
-        pipelines.append(with_runs(result, runs))
+        for order, pipelines in results.items():
+            runs = [fake_run(10 * number + k, 1.0 + 0.3 * number, order) for k in range(n_runs)]
+            failure = None if runs else "crashed: signal 11 after 3 s"
+            result = PipelineResult(name, title, kind, f"{title}, its options", failure, [f"a note on {title}"], runs)
+            pipelines.append(with_runs(result, runs))
+    random = np.random.default_rng(0)
     curves = [
-        Curve(p.name, p.title, [
-            CurvePoint(nodes, 0.04 * scale, {nu: errors_of(scale * (1.0 + k * 0.4)) for nu in ("0.3", "0.45")})
+        Curve(p.name, p.title, order, [
+            CurvePoint(nodes, 0.04 * scale, {
+                nu: simulation_of(random, scale * (1.0 + k * 0.4) / order) for nu in ("0.3", "0.45")
+            })
             for nodes, scale in ((1250, 2.2), (2500, 1.5), (5000, 1.0), (10000, 0.7))
         ])
-        for k, p in enumerate(pipelines) if p.runs
+        for order, pipelines in results.items() for k, p in enumerate(pipelines) if p.runs
     ]  # fmt: skip
     source = ImageSource("T1.nii.gz", "ab" * 32, None, None)
     return Report(
@@ -124,7 +137,7 @@ def fake_report():
         reference=ReferenceGrid(
             (49, 58, 47), 435000, "averaged", {"0.3": ReferenceEnergy(1.234, OwnError(0.01, 0.02), 17)}
         ),
-        pipelines=pipelines, tradeoff=[], curves=curves, seconds=812.0,
+        pipelines=results[1], quadratic=results[2], tradeoff=[], curves=curves, seconds=812.0,
     )  # fmt: skip
 
 
@@ -201,12 +214,13 @@ PATHS = {
     ("Shape", "cells under 10°"): ("quality", "n_under_10_degrees"),
     **{("Shape", f"{kind}s"): ("quality", "kinds", kind) for kind in ("sliver", "cap", "needle", "wedge", "spade")},
     **{
-        (f"Compression, ν = {nu}", title): ("fem", nu, *keys)
+        (f"Compression, ν = {nu}, {cells} cells", title): ("fem", nu, *keys)
         for nu in ("0.3", "0.45")
+        for cells in ("linear", "quadratic")
         for title, keys in (
-            ("strain-energy error", ("errors", "strain_energy")),
-            ("displacement error", ("errors", "displacement")),
-            ("interface-strain error", ("errors", "interface_strain")),
+            ("strain-energy error", ("averages", "geometric", "errors", "strain_energy")),
+            ("displacement error", ("averages", "geometric", "errors", "displacement")),
+            ("interface-strain error", ("averages", "geometric", "errors", "interface_strain")),
             ("λ max", ("lambda_max",)),
             ("condition number", ("cond",)),
             ("CG iterations", ("cg_iterations",)),
@@ -215,6 +229,13 @@ PATHS = {
     ("Cost", "wall time, s"): ("seconds_total",),
     ("Cost", "peak memory, MB"): ("peak_bytes",),
 }
+
+
+def pipelines_of(report, title):
+    """The pipelines that a row of the headline is of."""
+    return report.quadratic if "quadratic" in title[0] else report.pipelines
+
+
 JUDGED = "Labels above 500 voxels, background 0 not counted"  # of the fake ones 1 and 2
 DERIVED = {
     (JUDGED, "mean label Dice"): lambda rows: np.mean([r.dice for r in rows[1:3]]),
@@ -246,7 +267,7 @@ def test_every_number_is_the_reports(tmp_path):
     rows = headline(page_of(tmp_path, report))
     assert set(rows) == set(PATHS) | set(DERIVED)
     for title, keys in PATHS.items():
-        for pipeline, (_, texts) in zip(report.pipelines, rows[title], strict=True):
+        for pipeline, (_, texts) in zip(pipelines_of(report, title), rows[title], strict=True):
             if pipeline.median is None:
                 assert texts == ["failed"]
                 continue
@@ -257,6 +278,66 @@ def test_every_number_is_the_reports(tmp_path):
                 assert close(high, dug(pipeline.high, keys))
             else:
                 assert not any(" to " in text for text in texts)
+
+
+def test_every_order_and_average_has_a_row(tmp_path):
+    """The errors of the report, and which of them is the smallest in one sentence."""
+    report = fake_report()
+    page = page_of(tmp_path, report)
+    _, *rows = Tables(page).tables[1]
+    places = {}
+    for row in rows:
+        if len(row) == 1:
+            group = row[0][1][0]
+        else:
+            places[group, row[0][1][0].rstrip(" ↓")] = [texts[0] for _, texts in row[1:]]
+    assert len(places) == 2 * 3 * 4
+    for nu in ("0.3", "0.45"):
+        for title, name in (("strain-energy", "strain_energy"), ("displacement", "displacement")):
+            for cells, pipelines in (("linear", report.pipelines), ("quadratic", report.quadratic)):
+                for average in ("mean", "geometric"):
+                    texts = places[f"{title} error, ν = {nu}", f"{cells} cells, {average}"]
+                    for text, pipeline in zip(texts, pipelines, strict=True):
+                        if pipeline.median is not None:
+                            solved = pipeline.median.measurement.fem[nu].averages[average]
+                            assert close(text, getattr(solved.errors, name))
+    best = report.quadratic[0].median.measurement.fem["0.3"].averages["geometric"].errors
+    line = (
+        "At about 5000 nodes in all and ν = 0.3, the displacement&#x27;s error is smallest with tetopt, quadratic "
+        f"cells, geometric: {number_text(best.displacement)} (strain energy {number_text(best.strain_energy)})."
+    )
+    assert line in page
+    assert "The best with linear cells, and of the others: </strong>tetopt, linear cells, geometric: 0.08;" in page
+    assert page.index("ν = 0.45, the displacement") > page.index(line)
+
+
+def test_errors_at_equal_times(tmp_path):
+    """Between two meshes of the curve, on logarithms; nothing beyond its ends."""
+    report = fake_report()
+    _, *rows = Tables(page_of(tmp_path, report)).tables[2]
+    shown = {(row[0][1][0], row[1][1][0]): [cell[1][0] for cell in row[2:]] for row in rows}
+    assert len(shown) == 2 * len(finished(report))
+    linear = report.pipelines[0].median.measurement.fem["0.3"].averages["geometric"]
+    points = [point.fem["0.3"].averages["geometric"] for point in report.curves[4].points]
+    assert report.curves[4].order == 2
+    # Of the fake report: error x seconds is the same for all, so that the line is straight on logarithms.
+    expected = points[0].errors.displacement * points[0].seconds / linear.seconds
+    seconds, own, theirs = shown["tetopt", "0.3"]
+    assert close(seconds, linear.seconds)
+    assert close(own, linear.errors.displacement)
+    assert close(theirs, expected)
+    report.pipelines[0].median.measurement.fem["0.3"].averages["geometric"] = linear._replace(seconds=5.0)
+    _, row, *_ = Tables(page_of(tmp_path, report)).tables[2]
+    assert [cell[1][0] for cell in row[2:]] == ["5", number_text(linear.errors.displacement), "–"]
+
+
+def test_quadratic_failures_are_named(tmp_path):
+    report = fake_report()
+    report.quadratic[1] = with_runs(report.quadratic[1]._replace(failure="timed out"), [])
+    page = page_of(tmp_path, report)
+    assert "<strong>pytetwild, quadratic cells, failed:</strong> timed out" in page
+    assert headline(page)["Compression, ν = 0.3, quadratic cells", "displacement error"][1][1] == ["failed"]
+    assert headline(page)["Compression, ν = 0.3, linear cells", "displacement error"][1][1] != ["failed"]
 
 
 def test_label_rows_are_computed_from_the_runs(tmp_path):
@@ -291,7 +372,7 @@ def test_labels_are_tabled_and_the_vanished_named(tmp_path):
     page = page_of(tmp_path, report)
     assert "<li>tetopt: label 3 (140 voxels)</li>" in page
     assert "<li>pytetwild: label 1 (2250 voxels, in 1 of 3 runs), label 3 (140 voxels)</li>" in page
-    head, *rows = Tables(page).tables[1]
+    head, *rows = Tables(page).tables[3]
     done = finished(report)
     assert [cell[1][0] for cell in head] == ["label", *(p.title for p in done)]
     own = {row.label: row.dice for row in done[0].median.measurement.labels}
@@ -312,7 +393,7 @@ def test_labels_are_tabled_and_the_vanished_named(tmp_path):
             assert texts == expected + ["lost in 1 of 3 runs"] * (len(known) == 2)
         if dice:
             assert [("best" in classes) for classes, _ in cells] == [d == max(dice) for d in dice]
-    pieces, shares = Tables(page).tables[2:4]  # folded
+    pieces, shares = Tables(page).tables[4:6]  # folded
     for k in range(4):
         for column, pipeline in enumerate(done, 2):
             of_runs = [run.measurement.labels[k] for run in pipeline.runs]
@@ -328,7 +409,7 @@ def test_most_of_many_labels_are_folded(tmp_path):
             row = run.measurement.labels[1]
             with_measured(report, number, labels=[row._replace(label=k, dice=0.9 - 0.01 * k) for k in range(40)])
     page = page_of(tmp_path, report)
-    open_, folded = ([int(row[0][1][0]) for row in table[1:]] for table in Tables(page).tables[1:3])
+    open_, folded = ([int(row[0][1][0]) for row in table[1:]] for table in Tables(page).tables[3:5])
     assert open_ == list(range(39, 27, -1))
     assert folded == list(range(27, -1, -1))
     assert "<details><summary>The other 28 labels</summary>" in page

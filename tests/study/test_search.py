@@ -2,8 +2,7 @@
 
 import pytest
 
-from tetopt.study.program import REQUEST_RESPONSE
-from tetopt.study.search import is_near, tries
+from tetopt.study.search import REQUEST_RESPONSE, is_near, tries
 from tetopt.study.tetwild import TETWILD_RESPONSE
 
 

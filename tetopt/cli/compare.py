@@ -201,6 +201,7 @@ def compare_command(
         log.print(f"interrupted: {escape(str(output / 'runs'))} keeps the finished runs, --resume goes on from there")
         return 130
     failed = [each.title for each in report.pipelines if each.failure is not None]
+    failed += [f"{each.title} for quadratic cells" for each in report.quadratic if each.failure is not None]
     words = f", of which failed: {', '.join(failed)}" if failed else ""
     out.print(escape(f"{paths['report.html']}: {len(settings.pipelines)} pipelines{words}, {report.seconds:.0f} s"))
     return 0

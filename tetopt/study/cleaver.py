@@ -27,7 +27,7 @@ from tetopt.geometry.box import box_sides
 from tetopt.geometry.simplex import oriented
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.study.search import is_near, tries
+from tetopt.study.search import corners_for, is_near, nodes_of, tries
 from tetopt.study.tetwild import TETWILD_RESPONSE, Filled, inside_box, node_spacing, put_on_box
 
 CLEAVER_RUNS = 8  # of one search, at most; those that crash count, too
@@ -50,7 +50,7 @@ class _RunError(RuntimeError):
     """Cleaver's process ended without a mesh; the text says how."""
 
 
-def stuffed(image: Image, labels: Image, nodes: int) -> Filled:
+def stuffed(image: Image, labels: Image, nodes: int, order: int = 1) -> Filled:
     """Cleaver's tetrahedra in the image's box, with about `nodes` nodes.
 
     Its feature scaling is searched until the number of nodes is within 5 % of the requested one; at most 8 runs, of
@@ -64,6 +64,8 @@ def stuffed(image: Image, labels: Image, nodes: int) -> Filled:
         Whole numbers, on the image's voxels.
     nodes : int
         Requested number of nodes, 8 or more.
+    order : {1, 2}
+        Of the cells whose nodes are counted.
 
     Returns
     -------
@@ -78,7 +80,7 @@ def stuffed(image: Image, labels: Image, nodes: int) -> Filled:
         than 8 nodes, or no run that gave a mesh.
     """
     _check(image, labels, nodes)
-    cube = labels_in_cube(image, labels, node_spacing(image, nodes) / VOXELS_PER_SPACING)
+    cube = labels_in_cube(image, labels, node_spacing(image, corners_for(nodes, order)) / VOXELS_PER_SPACING)
     low, high = box_sides(image.shape).T * image.spacing
     notes: list[str] = []
 
@@ -93,7 +95,10 @@ def stuffed(image: Image, labels: Image, nodes: int) -> Filled:
         return points, inside, len(cells) - len(inside)
 
     begin = time.perf_counter()
-    runs = tries(run, lambda made: len(made[0]), nodes, TETWILD_RESPONSE, first=FIRST_SCALING, most=CLEAVER_RUNS)
+    runs = tries(
+        run, lambda made: nodes_of(made[0], made[1], order), nodes, TETWILD_RESPONSE,
+        first=FIRST_SCALING, most=CLEAVER_RUNS,
+    )  # fmt: skip
     if not runs:
         raise InputError(f"itk-cleaver: no run gave a mesh ({notes[-1]}); ask for more nodes or {INSTALL_HINT}")
     points, cells, n_removed = runs[0].result
@@ -104,8 +109,9 @@ def stuffed(image: Image, labels: Image, nodes: int) -> Filled:
         notes.append(f"its boundary is not on the box's faces: {error}")
     if n_removed:
         notes.append(f"{n_removed} cells outside the box removed")
-    if not is_near(len(points), nodes):
-        notes.append(f"{len(points)} nodes after {len(runs)} runs of Cleaver, {nodes} were asked for")
+    n_nodes = nodes_of(points, cells, order)
+    if not is_near(n_nodes, nodes):
+        notes.append(f"{n_nodes} nodes after {len(runs)} runs of Cleaver, {nodes} were asked for")
     world = image.to_world(points / image.spacing)
     return Filled(Mesh(world, oriented(world, cells)), len(runs), search, notes)
 

@@ -14,6 +14,7 @@ import platform
 import time
 from collections.abc import Callable
 from importlib.metadata import PackageNotFoundError, version
+from itertools import product
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -34,7 +35,7 @@ from tetopt.io.meshes import load_mesh, save_mesh
 from tetopt.measure.fidelity import cell_labels, label_fidelity
 from tetopt.measure.quality import quality, rho_histogram
 from tetopt.mesh import Mesh
-from tetopt.model.averages import DEFAULT_AVERAGE, cell_young, young_image
+from tetopt.model.averages import element_young, young_image
 from tetopt.model.fields import cell_fields
 from tetopt.model.laws import Law
 from tetopt.report.summary import image_summary, versions
@@ -56,11 +57,15 @@ from tetopt.study.compare_report import (
     Run,
     Settings,
     Simulation,
+    Solved,
+    TradeoffRow,
     as_json,
+    averages_of,
     from_json,
 )
 from tetopt.study.pipelines import UNTIMED_STEPS, Job, Pipeline
 from tetopt.study.program import file_checksums, pipelines_with
+from tetopt.study.search import nodes_of
 from tetopt.study.tradeoff import tradeoff
 
 Say = Callable[[str], None]
@@ -88,7 +93,7 @@ class Standard(NamedTuple):
     modulus_fine: Image  # the same field at the image's voxels
     coarse_labels: NDArray  # of the reference's voxels
     references: dict[str, Reference]  # by nu
-    average: str = DEFAULT_AVERAGE  # of a cell's moduli
+    averages: tuple[str, ...]  # of a cell's moduli
 
 
 class Bench(NamedTuple):
@@ -129,7 +134,7 @@ def prepared(image: Image, labels: Image, law: Law, settings: Settings, say: Say
         say(f"reference: {' x '.join(map(str, modulus.shape))} voxels, nu = {nu:g}")
         references[f"{nu:g}"] = reference(modulus, nu, settings.percent)
     return Standard(
-        image, labels, modulus, nearest(modulus, fine), nearest(labels, modulus).data, references, settings.average
+        image, labels, modulus, nearest(modulus, fine), nearest(labels, modulus).data, references, averages_of(settings)
     )
 
 
@@ -167,8 +172,8 @@ def _earlier_dofs(path: Path, choice: dict[str, Any]) -> int | None:
 # One mesh, measured.
 
 
-def measured(standard: Standard, mesh: Mesh, percent: float) -> Measurement:
-    """Everything that is compared of a mesh, compressed by `percent` of its height."""
+def measured(standard: Standard, mesh: Mesh, percent: float, order: int = 1) -> Measurement:
+    """Everything that is compared of a mesh with cells of this order, compressed by `percent` of its height."""
     image = standard.image
     moments = cell_moments(image, mesh)
     owner = cell_of_voxel(image, mesh)
@@ -183,7 +188,9 @@ def measured(standard: Standard, mesh: Mesh, percent: float) -> Measurement:
         not_compressed = str(error)
     references = standard.references if not_compressed is None else {}
     return Measurement(
-        n_nodes=len(mesh.points),
+        order=order,
+        n_nodes=nodes_of(mesh.points, mesh.cells, order),
+        n_corners=len(mesh.points),
         n_cells=len(mesh.cells),
         E_D=E_D,
         E_D_share=E_D / total if total > 0.0 else None,
@@ -193,7 +200,7 @@ def measured(standard: Standard, mesh: Mesh, percent: float) -> Measurement:
         rho_histogram=Histogram(edges.tolist(), share.tolist()),
         dihedral_histogram=Histogram(angle_edges.tolist(), (angles / angles.sum()).tolist()),
         labels=_label_rows(standard, mesh, moments.mean, owner),
-        fem={nu: _simulation(standard, mesh, each, percent) for nu, each in references.items()},
+        fem={nu: _simulation(standard, mesh, order, each, percent) for nu, each in references.items()},
         not_compressed=not_compressed,
     )
 
@@ -219,15 +226,23 @@ def _label_rows(standard: Standard, mesh: Mesh, means: NDArray[np.float64], owne
     ]  # fmt: skip
 
 
-def _simulation(standard: Standard, mesh: Mesh, against: Reference, percent: float) -> Simulation:
-    """The compression test on a mesh, and how far it is from the reference."""
-    young = cell_young(standard.modulus_fine, mesh, average=standard.average)
+def _simulation(standard: Standard, mesh: Mesh, order: int, against: Reference, percent: float) -> Simulation:
+    """The compression test on a mesh, and how far it is from the reference, with each average of the moduli."""
     bottom, top = box_faces(standard.image, mesh)
     push = push_of(standard.image, percent)
-    pressed = compression(mesh, young, against.nu, fixed_nodes=top, pushed_nodes=bottom, displacement=push)
-    system = conditioning(pressed.system)
-    errors = compare(against, mesh, pressed.u, pressed.strain_energy, standard.coarse_labels)
-    return Simulation(system.lambda_max, system.cond, system.cg_iterations, pressed.strain_energy, errors)
+    averages: dict[str, Solved] = {}
+    for average in standard.averages:
+        young = element_young(standard.modulus_fine, mesh, None, average, order)
+        begin = time.process_time()
+        # By multigrid, whatever the size, so that the times of all meshes are of one solver.
+        pressed = compression(
+            mesh, young, against.nu, fixed_nodes=top, pushed_nodes=bottom, displacement=push, order=order, method="amg"
+        )
+        seconds = time.process_time() - begin
+        errors = compare(against, mesh, pressed.u, pressed.strain_energy, standard.coarse_labels)
+        averages[average] = Solved(pressed.strain_energy, errors, seconds)
+    system = conditioning(pressed.system)  # of the last, the average that is set
+    return Simulation(system.lambda_max, system.cond, system.cg_iterations, averages)
 
 
 # All pipelines.
@@ -235,8 +250,10 @@ def _simulation(standard: Standard, mesh: Mesh, against: Reference, percent: flo
 
 def run(
     folder: Path, comparison: Comparison, classes: Image, say: Say, *, resume: bool = False
-) -> tuple[Report, dict[str, Mesh]]:
-    """Run and measure every pipeline; what `report.json` holds, and the mesh of each pipeline's first run.
+) -> tuple[Report, dict[int, dict[str, Mesh]]]:
+    """Run and measure every pipeline, for linear and for quadratic cells.
+
+    Returns what `report.json` holds, and the mesh of each pipeline's first run by the order of the cells and by name.
 
     Parameters
     ----------
@@ -266,17 +283,22 @@ def run(
     standard = prepared(image, classes, comparison.law, settings, say)
     pipelines = pipelines_with(settings.programs)
     bench = Bench(comparison, standard, pipelines, runs, say, resume)
-    results, meshes = [], {}
-    for name in settings.pipelines:
-        attempts = _attempts(bench, name)
-        results.append(_summed_up(name, pipelines[name], attempts))
+    results: dict[int, list[PipelineResult]] = {1: [], 2: []}
+    meshes: dict[int, dict[str, Mesh]] = {1: {}, 2: {}}
+    curves = []
+    for name, order in product(settings.pipelines, results):
+        attempts = _attempts(bench, name, order)
+        results[order].append(_summed_up(name, pipelines[name], attempts))
         first = next((number for number, attempt in enumerate(attempts, 1) if attempt.run is not None), None)
         if first is not None:
-            meshes[name] = load_mesh(_run_path(bench, name, settings.nodes, first).with_suffix(".vtu")).mesh
-    curves = [_curve(bench, result) for result in results]
-    sweep = []
-    if settings.tradeoff:
-        sweep = tradeoff(image, settings.nodes, lambda mesh: measured(standard, mesh, settings.percent), say)
+            path = _run_path(bench, name, order, settings.nodes, first)
+            meshes[order][name] = load_mesh(path.with_suffix(".vtu")).mesh
+        curves.append(_curve(bench, results[order][-1], order))
+    sweep: list[TradeoffRow] = []
+    for order in results if settings.tradeoff else ():
+        sweep += tradeoff(
+            image, settings.nodes, order, lambda mesh, of: measured(standard, mesh, settings.percent, of), say
+        )
     report = Report(
         command=comparison.command,
         image=ImageFacts(
@@ -288,7 +310,8 @@ def run(
         machine={"cores": os.cpu_count(), "system": platform.platform()},
         options=settings,
         reference=_reference_grid(standard),
-        pipelines=results,
+        pipelines=results[1],
+        quadratic=results[2],
         tradeoff=sweep,
         curves=[curve for curve in curves if curve.points],
         seconds=time.perf_counter() - begin,
@@ -343,17 +366,17 @@ def _key(comparison: Comparison, name: str) -> str:
     return hashlib.sha256(json.dumps([facts, same, tools], sort_keys=True, default=str).encode()).hexdigest()
 
 
-def _run_path(bench: Bench, name: str, nodes: int, repeat: int) -> Path:
+def _run_path(bench: Bench, name: str, order: int, nodes: int, repeat: int) -> Path:
     """Of the numbers of a run; its mesh lies beside."""
-    return bench.folder / f"{name}-{nodes}-{repeat}.json"
+    return bench.folder / f"{name}-{nodes}{'-quadratic' if order == 2 else ''}-{repeat}.json"
 
 
-def _attempts(bench: Bench, name: str) -> list[Attempt]:
+def _attempts(bench: Bench, name: str, order: int) -> list[Attempt]:
     """A pipeline as often as its result varies; the first failure is the last attempt."""
     settings = bench.comparison.settings
     attempts: list[Attempt] = []
     for repeat in range(settings.repeats if bench.pipelines[name].is_random else 1):
-        attempts.append(_attempt(bench, name, settings.nodes, repeat + 1))
+        attempts.append(_attempt(bench, name, order, settings.nodes, repeat + 1))
         if attempts[-1].failure is not None:
             break
     return attempts
@@ -369,9 +392,10 @@ def _kept(path: Path, key: str) -> Attempt | None:
     return attempt if (attempt.key, attempt.mesh_file_sha256) == (key, mesh_hash) else None
 
 
-def _attempt(bench: Bench, name: str, nodes: int, repeat: int) -> Attempt:
+def _attempt(bench: Bench, name: str, order: int, nodes: int, repeat: int) -> Attempt:
     """One pipeline once, from its file if that is finished and of the same key."""
-    path, title = _run_path(bench, name, nodes, repeat), bench.pipelines[name].title
+    path = _run_path(bench, name, order, nodes, repeat)
+    title = bench.pipelines[name].title + (", quadratic" if order == 2 else "")
     key = _key(bench.comparison, name)
     kept = _kept(path, key) if bench.resume else None
     if kept is not None:
@@ -379,14 +403,16 @@ def _attempt(bench: Bench, name: str, nodes: int, repeat: int) -> Attempt:
         return kept
     bench.say(f"{title}, {nodes} nodes")
     comparison, settings = bench.comparison, bench.comparison.settings
-    job = Job(comparison.image, comparison.labels, nodes, settings.classes, settings.k_D, settings.iterations)
+    job = Job(
+        comparison.image, comparison.labels, nodes, settings.classes, settings.k_D, settings.iterations, order
+    )  # fmt: skip
     outcome = run_in_child(
         bench.pipelines[name].function, job, max_seconds=settings.max_seconds, max_bytes=settings.max_bytes
     )
     attempt = Attempt(key, outcome.failure, outcome.notes, run=None)
     if outcome.mesh is not None:
         try:
-            measurement = measured(bench.standard, outcome.mesh, settings.percent)
+            measurement = measured(bench.standard, outcome.mesh, settings.percent, order)
         except (InputError, RuntimeError, ArithmeticError, np.linalg.LinAlgError) as error:
             attempt = attempt._replace(failure=f"its mesh cannot be measured: {error}")
     if outcome.mesh is None or attempt.failure is not None:
@@ -431,22 +457,22 @@ def elementwise(rows: list[Any], of: Callable[[Any], Any]) -> Any:
     return int(value) if all(isinstance(row, int) for row in rows) and value.is_integer() else value
 
 
-def _curve(bench: Bench, result: PipelineResult) -> Curve:
+def _curve(bench: Bench, result: PipelineResult, order: int) -> Curve:
     """Errors against the number of nodes; one run a count besides the main one. Failures are noted in `result`."""
     runs = [] if result.median is None else [result.median]
     settings = bench.comparison.settings
     counts = sorted({max(round(factor * settings.nodes), 20) for factor in settings.curve} - {settings.nodes})
     for nodes in counts if runs else ():
-        attempt = _attempt(bench, result.name, nodes, 1)
+        attempt = _attempt(bench, result.name, order, nodes, 1)
         if attempt.run is not None:
             runs.append(attempt.run)
         else:
             result.notes.append(f"at {nodes} nodes: {attempt.failure}")
     points = [
-        CurvePoint(each.n_nodes, each.E_D_share, {nu: simulation.errors for nu, simulation in each.fem.items()})
+        CurvePoint(each.n_nodes, each.E_D_share, each.fem)
         for each in sorted((run.measurement for run in runs), key=lambda each: each.n_nodes)
     ]
-    return Curve(result.name, result.title, points)
+    return Curve(result.name, result.title, order, points)
 
 
 def _reference_grid(standard: Standard) -> ReferenceGrid:

@@ -21,7 +21,7 @@ from tetopt.report.colours import grey_limits
 from tetopt.report.figures import SliceView, draw_edges, fill_cells
 from tetopt.report.scene import cutaway, save_scenes
 from tetopt.report.viewer import view_of
-from tetopt.study.compare_report import CurvePoint, Measurement, PipelineResult, Report, Run
+from tetopt.study.compare_report import ORDER_WORDS, Curve, CurvePoint, Measurement, PipelineResult, Report, Run
 from tetopt.study.pipelines import UNTIMED_STEPS
 
 # Okabe and Ito's palette, told apart by the colour-blind, without its yellow, which vanishes on white.
@@ -35,6 +35,7 @@ ERROR_TITLES = (
     ("interface_strain", "strain at interfaces"),
 )
 Value = Callable[[Measurement], Any]
+Place = tuple[float | None, float | None]  # of a point, across and up
 SHORT_RANGE = 12.0  # a logarithmic axis to less than this many times its start: powers of ten alone say too little
 
 
@@ -167,44 +168,60 @@ def labels_figure(report: Report) -> Figure:
     return figure
 
 
-def curves_figure(report: Report) -> Figure:
-    """Errors by number of nodes, logarithmic: a row for each Poisson's ratio, a column for each error.
+def curves_figure(report: Report, *, is_by_time: bool = False) -> Figure:
+    """Errors by number of nodes, or by the seconds of a solve: a row for each Poisson's ratio, a column for each error.
 
-    Without any finite-element result: E_D as a share of the image's variance instead.
+    Logarithmic, with the average of moduli that is set; lines of quadratic cells are solid, of linear ones broken.
+    Without any finite-element result: E_D as a share of the image's variance by the number of nodes instead.
     """
-    ratios = sorted({nu for curve in report.curves for point in curve.points for nu in point.errors}, key=float)
+    ratios = sorted({nu for curve in report.curves for point in curve.points for nu in point.fem}, key=float)
     rows = max(len(ratios), 1)
     columns = len(ERROR_TITLES) if ratios else 1
-    figure = Figure(figsize=(13.0 if ratios else 6.5, 3.9 * rows + 0.5), layout="constrained")
+    figure = Figure(figsize=(13.0 if ratios else 6.5, 3.9 * rows + 1.0), layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False)
     for row, nu in enumerate(ratios):
         for axes, (name, title) in zip(grid[row], ERROR_TITLES, strict=True):
-            _draw_curves(axes, report, _point_error(nu, name))
+            _draw_curves(axes, report, _point_of_curve(report, nu, name, is_by_time))
             axes.set_title(f"{title}, ν = {nu}", fontsize=11)
         grid[row, 0].set_ylabel("relative error")
     if not ratios:
-        _draw_curves(grid[0, 0], report, lambda point: point.E_D_share)
+        _draw_curves(grid[0, 0], report, lambda point: (point.n_nodes, point.E_D_share))
         grid[0, 0].set_ylabel("E_D, share of the image's variance")
     for axes in grid[-1]:
-        axes.set_xlabel("nodes")
+        axes.set_xlabel("seconds of the processor, matrix and solve" if is_by_time and ratios else "nodes in all")
     _legend(figure, grid.ravel())
     return figure
 
 
-def _point_error(nu: str, name: str) -> Callable[[CurvePoint], float | None]:
-    return lambda point: getattr(point.errors[nu], name) if nu in point.errors else None
+def curve_title(curve: Curve) -> str:
+    """What a line is called."""
+    return f"{curve.title}, {ORDER_WORDS[curve.order]}"
 
 
-def _draw_curves(axes: Axes, report: Report, value: Callable[[CurvePoint], float | None]) -> None:
-    """One line a pipeline, of `value(point)`; what has no logarithm is left out."""
-    order = {pipeline.name: number for number, pipeline in enumerate(report.pipelines)}
+def _point_of_curve(report: Report, nu: str, name: str, is_by_time: bool) -> Callable[[CurvePoint], Place]:
+    def place(point: CurvePoint) -> Place:
+        if nu not in point.fem:
+            return None, None
+        solved = point.fem[nu].averages[report.options.average]
+        return solved.seconds if is_by_time else point.n_nodes, getattr(solved.errors, name)
+
+    return place
+
+
+def _draw_curves(axes: Axes, report: Report, place: Callable[[CurvePoint], Place]) -> None:
+    """One line a pipeline and order of cells, through `place(point)`; what has no logarithm is left out."""
+    numbers = {pipeline.name: number for number, pipeline in enumerate(report.pipelines)}
     for curve in report.curves:
-        points = [(point.n_nodes, value(point)) for point in curve.points]
-        points = sorted((nodes, error) for nodes, error in points if nodes and error is not None and error > 0.0)
+        places = [place(point) for point in curve.points]
+        points = sorted((x, y) for x, y in places if x and y is not None and y > 0.0)
         if points:
-            number = order.get(curve.name, len(order))
-            marker = LINE_MARKERS[number % len(LINE_MARKERS)]
-            axes.plot(*zip(*points, strict=True), label=curve.title, marker=marker, markersize=6, **_style(number))
+            number = numbers.get(curve.name, len(numbers))
+            colour = LINE_COLOURS[number % len(LINE_COLOURS)]
+            axes.plot(
+                *zip(*points, strict=True), label=curve_title(curve), color=colour, markersize=6,
+                marker=LINE_MARKERS[number % len(LINE_MARKERS)], linestyle="-" if curve.order == 2 else "--",
+                markerfacecolor=colour if curve.order == 2 else "white",
+            )  # fmt: skip
     axes.set_xscale("log")
     axes.set_yscale("log")
     for axis in (axes.xaxis, axes.yaxis):
@@ -224,24 +241,27 @@ def tradeoff_figure(report: Report) -> Figure:
     A line for each option, its values along it, a star at the defaults; the other pipelines' medians as single points.
     """
     nus = sorted({nu for row in report.tradeoff for nu in row.measured.fem}, key=float)[:1]
-    panels: list[tuple[str, Value]] = [
-        ("mean rho (1/3: regular)", lambda mesh: mesh.quality.mean_rho),
-        ("dihedral angles: smallest (filled), 1st percentile (open)", lambda mesh: mesh.quality.min_dihedral),
+    orders = sorted({row.order for row in report.tradeoff})
+    average = report.options.average
+    panels: list[tuple[str, int, Value]] = [
+        ("mean rho (1/3: regular)", 1, lambda mesh: mesh.quality.mean_rho),
+        ("dihedral angles: smallest (filled), 1st percentile (open)", 1, lambda mesh: mesh.quality.min_dihedral),
         *(
-            (f"{title} error, ν = {nu}", _error(nu, name))
+            (f"{title} error, ν = {nu}, {ORDER_WORDS[order]} cells", order, _error(nu, average, name))
+            for order in orders
             for nu in nus
             for name, title in ERROR_TITLES
-            if all(_error(nu, name)(row.measured) for row in report.tradeoff)
+            if all(_error(nu, average, name)(row.measured) for row in report.tradeoff)
         ),
     ]
     columns = 3 if len(panels) > 2 else len(panels)
     rows = -(-len(panels) // columns)
     figure = Figure(figsize=(4.9 * columns, 4.3 * rows + 0.6), layout="constrained")
     grid = figure.subplots(rows, columns, squeeze=False).ravel()
-    for number, (axes, (title, value)) in enumerate(zip(grid, panels, strict=False)):
-        _draw_tradeoff(axes, report, value)
+    for number, (axes, (title, order, value)) in enumerate(zip(grid, panels, strict=False)):
+        _draw_tradeoff(axes, report, order, value)
         if number == 1:
-            _draw_tradeoff(axes, report, lambda mesh: mesh.quality.p1_dihedral, is_open=True)
+            _draw_tradeoff(axes, report, order, lambda mesh: mesh.quality.p1_dihedral, is_open=True)
             axes.set_ylim(bottom=0.0)
         axes.set_title(title, fontsize=10)
         axes.set_xscale("log")
@@ -258,30 +278,34 @@ def tradeoff_figure(report: Report) -> Figure:
     return figure
 
 
-def _error(nu: str, name: str) -> Value:
-    return lambda mesh: getattr(mesh.fem[nu].errors, name)
+def _error(nu: str, average: str, name: str) -> Value:
+    return lambda mesh: getattr(mesh.fem[nu].averages[average].errors, name) if nu in mesh.fem else None
 
 
-def _draw_tradeoff(axes: Axes, report: Report, value: Value, is_open: bool = False) -> None:
+def _draw_tradeoff(axes: Axes, report: Report, order: int, value: Value, is_open: bool = False) -> None:
     """A line through the meshes of each option, its values beside them; hollow and without words if open."""
-    options = list(dict.fromkeys(row.option for row in report.tradeoff))
+    of_order = [row for row in report.tradeoff if row.order == order]
+    options = list(dict.fromkeys(row.option for row in of_order))
     for number, option in enumerate(options):
-        rows = [row for row in report.tradeoff if row.option == option]
+        rows = [row for row in of_order if row.option == option]
         points = [(row.measured.E_D_share, value(row.measured)) for row in rows]
         style = _style(number) | ({"markerfacecolor": "white", "alpha": 0.6} if is_open else {"label": option})
         axes.plot(*zip(*points, strict=True), marker=LINE_MARKERS[number], markersize=5, linewidth=1.2, **style)
         for row, point in zip(rows, points, strict=True):
             if not (is_open or row.is_default):
                 _annotate(axes, f"{row.value:.3g}", point, (4, 3), style["color"])
-    default = next(row.measured for row in report.tradeoff if row.is_default)
+    default = next(row.measured for row in of_order if row.is_default)
     place: tuple[Any, Any] = (default.E_D_share, value(default))
     axes.plot(
         *place, marker="*", markersize=15, color="black", linestyle="none", zorder=5,
         markerfacecolor="white" if is_open else "black", label=None if is_open else "default",
     )  # fmt: skip
-    for _, pipeline, run in _finished(report):
-        if pipeline.kind != "tetopt" and run.measurement.E_D_share:
+    for pipeline in report.pipelines if order == 1 else report.quadratic:
+        run = pipeline.median
+        if pipeline.kind != "tetopt" and run is not None and run.measurement.E_D_share:
             place = (run.measurement.E_D_share, value(run.measurement))
+            if place[1] is None:  # not compressed
+                continue
             axes.plot(*place, marker="x", color="#666666", markersize=6, zorder=4)
             if not is_open:
                 _annotate(axes, pipeline.title, place, (5, -9), "#444444")

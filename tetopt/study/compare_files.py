@@ -29,11 +29,15 @@ from tetopt.study.program import pipelines_with
 # File and caption of each picture, in the order in which they are listed.
 COMPARE_PICTURES = {
     "slices.png": "The same slice through every mesh; the mean of the image in each cell; E_D of each cell",
+    "quadratic.png": "The same slice through the coarser meshes whose quadratic cells have as many nodes in all",
     "cutaways.png": "Cut open, cells in the grey of their mean",
     "labels.png": "Every label, by size: Dice, and mean distance between its surfaces in mesh and image; lost labels "
     "have Dice 0 and no distance",
     "histograms.png": "Radius ratio rho and dihedral angles",
-    "curves.png": "Error of the compression test against the number of nodes",
+    "curves.png": "Error of the compression test against the number of nodes, those in the middle of the edges of "
+    "quadratic cells counted",
+    "solve_time.png": "The same against the seconds that the processor takes for the matrix and the solve, by the same "
+    "multigrid for all",
     "tradeoff.png": "What tetopt's options trade, one at a time around the defaults (star), on the image alone: E_D "
     "against shape, the smallest and the 1st percentile of the dihedral angles, and the errors of the compression test",
     "timing.png": "Seconds by step",
@@ -59,7 +63,7 @@ def run(paths: dict[str, Path], comparison: compare.Comparison, say: compare.Say
         )
     classes = thresholded(image, settings.classes) if comparison.labels is None else comparison.labels
     report, meshes = compare.run(paths["report.json"].parent, comparison, classes, say, resume=resume)
-    if not meshes:
+    if not meshes[1]:
         how = "; ".join(f"{each.title}: {each.failure}" for each in report.pipelines)
         raise InputError(f"compare: every pipeline failed, nothing is reported: {how}")
     save_json(paths["report.json"], as_json(report))
@@ -68,27 +72,29 @@ def run(paths: dict[str, Path], comparison: compare.Comparison, say: compare.Say
     return report
 
 
-def _draw(paths: dict[str, Path], report: Report, image: Image, meshes: dict[str, Mesh]) -> None:
-    kinds = {each.name: each.kind for each in report.pipelines}
-    titles = {each.name: each.title for each in report.pipelines}
-    titled = [(titles[name], mesh) for name, mesh in meshes.items()]
-    means = [cell_moments(image, mesh).mean for mesh in meshes.values()]
-    cutaways(titled, means, paths["cutaways.png"])
+def _draw(paths: dict[str, Path], report: Report, image: Image, meshes: dict[int, dict[str, Mesh]]) -> None:
+    shown = {each.name: each for each in report.pipelines}
+    titled = {order: [(shown[name].title, mesh) for name, mesh in of.items()] for order, of in meshes.items()}
+    means = {order: [cell_moments(image, mesh).mean for mesh in of.values()] for order, of in meshes.items()}
+    cutaways(titled[1], means[1], paths["cutaways.png"])
     figures = {
-        "slices.png": slices_figure(image, titled, means),
+        "slices.png": slices_figure(image, titled[1], means[1]),
         "labels.png": labels_figure(report),
         "histograms.png": histograms_figure(report),
         "curves.png": curves_figure(report),
+        "solve_time.png": curves_figure(report, is_by_time=True),
         "timing.png": timing_figure(report),
     }
+    if titled[2]:
+        figures["quadratic.png"] = slices_figure(image, titled[2], means[2])
     if report.tradeoff:
         figures["tradeoff.png"] = tradeoff_figure(report)
-    else:  # what lies there is of the report that this one replaces
-        paths["tradeoff.png"].unlink(missing_ok=True)
+    drawn = {"cutaways.png", *figures}
+    for name in set(COMPARE_PICTURES) - drawn:  # what lies there is of the report that this one replaces
+        paths[name].unlink(missing_ok=True)
     for name, figure in figures.items():
         save_figure(figure, paths[name])
-    drawn = {"cutaways.png", *figures}
     pictures = [(paths[name], caption) for name, caption in COMPARE_PICTURES.items() if name in drawn]
-    shown = [k for k, name in enumerate(meshes) if kinds[name] != "control"] or [0]
-    views = [view_of(titled[k][1], means[k], titled[k][0]) for k in shown]
+    turned = [k for k, name in enumerate(meshes[1]) if shown[name].kind != "control"] or [0]
+    views = [view_of(titled[1][k][1], means[1][k], titled[1][k][0]) for k in turned]
     save_compare_page(paths["report.html"], report, pictures, views)

@@ -14,11 +14,31 @@ import numpy as np
 from tetopt.report import viewer
 from tetopt.report.page import paragraph_html, picture_html, section_html, table_html, write_page
 from tetopt.report.viewer import View, views_html
-from tetopt.study.compare_report import LabelRow, PipelineResult, ReferenceGrid, Report, Run
+from tetopt.study.compare_report import (
+    ORDER_WORDS,
+    Curve,
+    LabelRow,
+    PipelineResult,
+    ReferenceGrid,
+    Report,
+    Run,
+    averages_of,
+)
 from tetopt.study.pipelines import UNTIMED_STEPS
 
-PLOT_STEMS = ("histograms", "curves", "tradeoff", "timing")  # of the pictures that come after the 3-D views
+PLOT_STEMS = (
+    "histograms",
+    "curves",
+    "solve_time",
+    "tradeoff",
+    "timing",
+)  # of the pictures that come after the 3-D views
 JUDGED_VOXELS = 500  # labels with more are judged; of smaller ones a mesh of few nodes can only keep some
+COMPRESSION_ERRORS = (  # of the compression, and the fields of `tetopt.fem.reference.Errors`
+    ("strain-energy", "strain_energy"),
+    ("displacement", "displacement"),
+    ("interface-strain", "interface_strain"),
+)
 UNFOLDED_LABELS = 12  # those whose rows are open to see: about a screen
 SIZE_TOLERANCE = 1.1  # meshes whose numbers of nodes differ by a larger factor are not compared without a word
 
@@ -30,6 +50,7 @@ class Criterion(NamedTuple):
     title: str
     value: Callable[[Run], float | None]
     better: int  # -1 if smaller is better, +1 if larger, 0 if neither
+    order: int = 1  # of the cells whose meshes are compared
 
 
 class Entry(NamedTuple):
@@ -58,7 +79,8 @@ def save_compare_page(path: Path, report: Report, pictures: Sequence[tuple[Path,
     before = [picture_html(*each) for each in pictures if Path(each[0]).stem not in (*PLOT_STEMS, "labels")]
     after = [picture_html(*each) for each in pictures if Path(each[0]).stem in PLOT_STEMS]
     sections = [
-        ("Result", [*_sentences(report), _headline_html(report), *_failures(report)]),
+        ("Result", [*simulation_sentences(report), *_sentences(report), _headline_html(report), *_failures(report)]),
+        ("The simulation, by cells and moduli", simulation_html(report)),
         ("Labels", _labels_html(report, of_labels)),
         ("The same slice through every mesh", before),
         ("Turn the meshes", [views_html(views)] if views else []),
@@ -91,7 +113,7 @@ def criteria(report: Report) -> list[Criterion]:
         Criterion("Shape", "cells under 10°", _at("quality", "n_under_10_degrees"), -1),
         *(Criterion("Shape", f"{kind}s", _at("quality", "kinds", kind), -1) for kind in kinds),
         *_label_criteria(report),
-        *(criterion for nu in _ratios(report) for criterion in _fem_criteria(nu)),
+        *(criterion for nu in _ratios(report) for criterion in _fem_criteria(report, nu)),
         Criterion("Cost", "wall time, s", lambda run: run.seconds_total, -1),
         Criterion("Cost", "peak memory, MB", lambda run: run.peak_bytes * 1e-6, -1),
     ]
@@ -162,16 +184,34 @@ def _voxels_by_label(report: Report) -> dict[int, int]:
     return {row.label: row.voxels for each in report.pipelines for run in each.runs for row in run.measurement.labels}
 
 
-def _fem_criteria(nu: str) -> list[Criterion]:
-    rows = [
-        ("strain-energy error", _at("fem", nu, "errors", "strain_energy"), -1),
-        ("displacement error", _at("fem", nu, "errors", "displacement"), -1),
-        ("interface-strain error", _at("fem", nu, "errors", "interface_strain"), -1),
-        ("λ max", _at("fem", nu, "lambda_max"), 0),
-        ("condition number", _at("fem", nu, "cond"), -1),
-        ("CG iterations", _at("fem", nu, "cg_iterations"), -1),
-    ]
-    return [Criterion(f"Compression, ν = {nu}", *row) for row in rows]
+def _fem_criteria(report: Report, nu: str) -> list[Criterion]:
+    rows = []
+    for order, word in ORDER_WORDS.items():
+        group = f"Compression, ν = {nu}, {word} cells"
+        rows += [
+            Criterion(group, f"{title} error", _error(nu, report.options.average, name), -1, order)
+            for title, name in COMPRESSION_ERRORS
+        ]
+        rows += [
+            Criterion(group, "λ max", _at("fem", nu, "lambda_max"), 0, order),
+            Criterion(group, "condition number", _at("fem", nu, "cond"), -1, order),
+            Criterion(group, "CG iterations", _at("fem", nu, "cg_iterations"), -1, order),
+        ]
+    return rows
+
+
+def _error(nu: str, average: str, name: str) -> Callable[[Run], float | None]:
+    return _at("fem", nu, "averages", average, "errors", name)
+
+
+def _of_order(report: Report, order: int) -> list[PipelineResult]:
+    """The pipelines with their meshes for cells of this order."""
+    return report.pipelines if order == 1 else report.quadratic
+
+
+def _entries(criterion: Criterion, report: Report) -> list[Entry]:
+    """What each pipeline has for a criterion."""
+    return [entry(criterion, pipeline) for pipeline in _of_order(report, criterion.order)]
 
 
 def entry(criterion: Criterion, pipeline: PipelineResult) -> Entry:
@@ -233,14 +273,14 @@ def _headline_html(report: Report) -> str:
     lines = _table_head("headline", "median of the runs", pipelines)
     group = None
     for criterion in criteria(report):
-        entries = [entry(criterion, pipeline) for pipeline in pipelines]
+        entries = _entries(criterion, report)
         if all(each.value is None for each in entries):
             continue
         if criterion.group != group:
             group = criterion.group
             head = f'<th scope="rowgroup" colspan="{len(pipelines) + 1}"><span>{html.escape(group)}</span></th>'
             lines.append(f'<tbody><tr class="group">{head}</tr>')
-        lines.append(_row_html(criterion, pipelines, entries))
+        lines.append(_row_html(criterion, _of_order(report, criterion.order), entries))
     return "\n".join([*lines, "</table></div>", _HEADLINE_KEY])
 
 
@@ -325,7 +365,7 @@ def _verdict(report: Report, number: int) -> list[str]:
     lost: dict[str, list[str]] = {}
     n_judged = n_lost_to_peers = 0
     for criterion in criteria(report):
-        entries = [entry(criterion, pipeline) for pipeline in pipelines]
+        entries = _entries(criterion, report)
         best = winners(criterion.better, [each.value for each in entries])
         if not best:
             continue
@@ -397,14 +437,135 @@ def _list(names: Sequence[str]) -> str:
 
 
 def _failures(report: Report) -> Iterator[str]:
-    for pipeline in report.pipelines:
+    linear, quadratic = (_of_order(report, order) for order in ORDER_WORDS)
+    for number, pipeline in enumerate([*linear, *quadratic]):
+        title = html.escape(pipeline.title) + ("" if number < len(linear) else ", quadratic cells,")
         if pipeline.failure:
             what = " failed" if pipeline.median is None else ", a run failed"
-            title, failure = html.escape(pipeline.title), html.escape(pipeline.failure)
+            failure = html.escape(pipeline.failure)
             yield f'<p class="failed"><strong>{title}{what}:</strong> {failure}</p>'
         reason = None if pipeline.median is None else pipeline.median.measurement.not_compressed
         if reason is not None:
-            yield f"<p><strong>{html.escape(pipeline.title)} was not compressed:</strong> {html.escape(reason)}</p>"
+            yield f"<p><strong>{title} was not compressed:</strong> {html.escape(reason)}</p>"
+
+
+# --------------------------------------------------------------------------------------------------
+# Linear and quadratic cells, averages of moduli
+
+
+class Variant(NamedTuple):
+    """How a mesh is solved, and the error that comes of it."""
+
+    pipeline: PipelineResult
+    order: int
+    average: str
+    error: float
+
+    @property
+    def words(self) -> str:
+        """With which cells and moduli."""
+        return f"{self.pipeline.title}, {ORDER_WORDS[self.order]} cells, {self.average}"
+
+
+def _variants(report: Report, nu: str, name: str) -> list[Variant]:
+    """Every pipeline with every order and average, the smallest error first."""
+    rows = []
+    for order in ORDER_WORDS:
+        for average in averages_of(report.options):
+            criterion = Criterion("", "", _error(nu, average, name), -1, order)
+            for pipeline, each in zip(_of_order(report, order), _entries(criterion, report), strict=True):
+                if each.value is not None:
+                    rows.append(Variant(pipeline, order, average, each.value))
+    return sorted(rows, key=lambda row: row.error)
+
+
+def simulation_sentences(report: Report) -> list[str]:
+    """For each Poisson's ratio: with which mesh, cells and moduli the displacement is best, and the best of others."""
+    words = []
+    for nu in _ratios(report):
+        rows = _variants(report, nu, "displacement")
+        if not rows:
+            continue
+        best = rows[0]
+        energy = _error(nu, best.average, "strain_energy")
+        loss = entry(Criterion("", "", energy, -1, best.order), best.pipeline).value
+        text = (
+            f"At about {report.options.nodes} nodes in all and ν = {nu}, the displacement's error is smallest with "
+            f"{best.words}: {number_text(best.error)} (strain energy {number_text(loss)})."
+        )
+        others = [next((row for row in rows if row.order != best.order), None)]
+        others += [
+            next((row for row in rows if row.pipeline.name == name), None)
+            for name in dict.fromkeys(row.pipeline.name for row in rows if row.pipeline.kind != best.pipeline.kind)
+        ]
+        rest = [f"{row.words}: {number_text(row.error)}" for row in others if row is not None]
+        text += f" The best with {ORDER_WORDS[3 - best.order]} cells, and of the others: " if rest else ""
+        words.append(f"<p><strong>{html.escape(text)}</strong>{html.escape('; '.join(dict.fromkeys(rest)))}</p>")
+    return words
+
+
+def simulation_html(report: Report) -> list[str]:
+    """A table of all errors, a row for each order of cells and average; and the errors at equal times of a solve."""
+    ratios = _ratios(report)
+    if not ratios:
+        return []
+    how = (
+        "Linear cells on the mesh of so many nodes; quadratic cells on a coarser mesh of the same pipeline, which has "
+        "as many nodes with those in the middle of its (straight) edges. Moduli of cells: the mean of Eq. (2)"
+        + ("" if report.options.average == "mean" else f", and the average that was set, {report.options.average}")
+        + "."
+    )
+    lines = _table_head("headline", "median of the runs", report.pipelines)
+    for nu in ratios:
+        for title, name in COMPRESSION_ERRORS:
+            head = f"{title} error, ν = {nu}"
+            lines.append(
+                f'<tbody><tr class="group"><th scope="rowgroup" colspan="{len(report.pipelines) + 1}">'
+                f"<span>{html.escape(head)}</span></th></tr>"
+            )
+            for order, word in ORDER_WORDS.items():
+                for average in averages_of(report.options):
+                    criterion = Criterion(head, f"{word} cells, {average}", _error(nu, average, name), -1, order)
+                    entries = _entries(criterion, report)
+                    if any(each.value is not None for each in entries):
+                        lines.append(_row_html(criterion, _of_order(report, order), entries))
+    parts = [paragraph_html(how), "\n".join([*lines, "</table></div>"])]
+    times = equal_times(report)
+    if times:
+        again = (
+            "At equal time: the seconds of the processor that the linear mesh takes for matrix and solve, its "
+            "displacement error, and that of quadratic cells which take as long, between the two measured meshes that "
+            "take less and more (logarithms, linearly); – where the curve does not reach so far."
+        )
+        names = ["pipeline", "ν", "seconds", "linear", "quadratic"]
+        parts += [paragraph_html(again), table_html([names, *times])]
+    return parts
+
+
+def equal_times(report: Report) -> list[list[str]]:
+    """Rows of pipeline, nu, seconds of the linear mesh's solve, its displacement error and the quadratic one then."""
+    curves = {(curve.name, curve.order): curve for curve in report.curves}
+    rows = []
+    for pipeline in report.pipelines:
+        quadratic = curves.get((pipeline.name, 2))
+        for nu in _ratios(report):
+            if pipeline.median is None or quadratic is None or nu not in pipeline.median.measurement.fem:
+                continue
+            linear = pipeline.median.measurement.fem[nu].averages[report.options.average]
+            error = _error_at(quadratic, nu, report.options.average, linear.seconds)
+            numbers = (linear.seconds, linear.errors.displacement, error)
+            rows.append([pipeline.title, nu, *map(number_text, numbers)])
+    return rows
+
+
+def _error_at(curve: Curve, nu: str, average: str, seconds: float) -> float | None:
+    """The displacement's error on a curve at a time between those of two of its meshes; None beyond them."""
+    solved = [point.fem[nu].averages[average] for point in curve.points if nu in point.fem]
+    points = sorted((each.seconds, each.errors.displacement) for each in solved if each.errors.displacement)
+    if not points or not points[0][0] <= seconds <= points[-1][0]:
+        return None
+    x, y = np.log(np.array(points, dtype=np.float64)).T
+    return float(np.exp(np.interp(np.log(seconds), x, y)))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -563,7 +724,12 @@ def _settings_html(report: Report) -> list[str]:
         "Options": [["option", "value"], *([name, _text(value)] for name, value in report.options._asdict().items())],
         "Versions": [["package", "version"], *([name, value] for name, value in report.versions.items())],
     }
-    notes = [f"{pipeline.title}: {note}" for pipeline in report.pipelines for note in pipeline.notes]
+    notes = [
+        f"{pipeline.title}{'' if order == 1 else ', quadratic cells'}: {note}"
+        for order in ORDER_WORDS
+        for pipeline in _of_order(report, order)
+        for note in pipeline.notes
+    ]
     items = "".join(f"<li>{html.escape(note)}</li>" for note in notes)
     return [
         f"<p>To run it again:</p><pre>{html.escape(report.command)}</pre>",

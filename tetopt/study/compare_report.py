@@ -17,6 +17,7 @@ from tetopt.study.program import Program
 INLINE_FIELDS = ("run", "measurement", "source", "by_nu")
 # and these fields are left out where they are None.
 OPTIONAL_FIELDS = ("median", "low", "high", "mesh_file_sha256")
+ORDER_WORDS = {1: "linear", 2: "quadratic"}
 
 
 class Settings(NamedTuple):
@@ -31,7 +32,7 @@ class Settings(NamedTuple):
     iterations: int = UNIFORM_ITERATIONS
     nus: tuple[float, ...] = (0.3, 0.45)
     percent: float = 1.0  # of compression, of the box's height
-    average: str = DEFAULT_AVERAGE  # of a cell's moduli
+    average: str = DEFAULT_AVERAGE  # of a cell's moduli, beside Eq. (2)'s mean
     reference_dofs: int | None = None  # the voxel grid is averaged until it has no more; in a report what was chosen
     reference_seconds: float = 120.0  # that it may take without such a number, for all of `nus`
     curve: tuple[float, ...] = (0.25, 0.5, 2.0)  # node counts of the error curves, of `nodes`, besides `nodes` itself
@@ -81,20 +82,29 @@ class LabelRow(NamedTuple):
     mesh_components: int
 
 
-class Simulation(NamedTuple):
-    """The compression test on a mesh, for one Poisson's ratio, and how far it is from the reference."""
+class Solved(NamedTuple):
+    """The compression of a mesh with one average of the moduli, and how far it is from the reference."""
 
-    lambda_max: float
+    strain_energy: float  # uJ
+    errors: Errors
+    seconds: float  # of the processor, to assemble the matrix and to solve; the moduli and the errors not counted
+
+
+class Simulation(NamedTuple):
+    """The compression test on a mesh, for one Poisson's ratio."""
+
+    lambda_max: float  # with `Settings.average`, as the next two
     cond: float
     cg_iterations: int
-    strain_energy: float
-    errors: Errors
+    averages: dict[str, Solved]  # by the average of the moduli of a cell
 
 
 class Measurement(NamedTuple):
-    """Everything that is compared of a mesh."""
+    """Everything that is compared of a mesh, with cells of one order."""
 
-    n_nodes: int
+    order: int  # 1: linear cells, 2: quadratic ones
+    n_nodes: int  # in all: those in the middle of edges, which quadratic cells have, too
+    n_corners: int  # the mesh's own
     n_cells: int
     E_D: float
     E_D_share: float | None  # of the image's variance; None in an image without any
@@ -145,6 +155,7 @@ class PipelineResult(NamedTuple):
 class TradeoffRow(NamedTuple):
     """A mesh with one option of the graded mesh changed."""
 
+    order: int
     option: str
     value: float
     is_default: bool
@@ -154,16 +165,17 @@ class TradeoffRow(NamedTuple):
 class CurvePoint(NamedTuple):
     """Errors at one number of nodes."""
 
-    n_nodes: int
+    n_nodes: int  # in all
     E_D_share: float | None
-    errors: dict[str, Errors]  # by nu
+    fem: dict[str, Simulation]  # by nu
 
 
 class Curve(NamedTuple):
-    """A pipeline's errors by number of nodes."""
+    """A pipeline's errors by number of nodes, with cells of one order."""
 
     name: str
     title: str
+    order: int
     points: list[CurvePoint]
 
 
@@ -204,10 +216,16 @@ class Report(NamedTuple):
     machine: dict[str, int | str | None]  # cores and system
     options: Settings
     reference: ReferenceGrid
-    pipelines: list[PipelineResult]
+    pipelines: list[PipelineResult]  # meshes of so many nodes, with linear cells
+    quadratic: list[PipelineResult]  # the same pipelines' coarser meshes, with quadratic cells, as many nodes in all
     tradeoff: list[TradeoffRow]
     curves: list[Curve]
     seconds: float
+
+
+def averages_of(settings: Settings) -> tuple[str, ...]:
+    """The averages of moduli that every mesh is solved with: Eq. (2)'s, and the one that is set."""
+    return tuple(dict.fromkeys(("mean", settings.average)))
 
 
 def as_json(value: Any) -> Any:

@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 
@@ -18,8 +18,12 @@ from tetopt.mesh import Mesh
 from tetopt.start.lattice import lattice
 from tetopt.study.cleaver import stuffed
 from tetopt.study.interfaces import OTSU_CLASSES, class_labels, interfaces
+from tetopt.study.search import LEAST_REQUEST, REQUEST_RESPONSE, corners_for, nodes_of, tries
 from tetopt.study.tetwild import Filled, filled, node_spacing
 from tetopt.target.content import Content, content
+
+CORNER_RUNS = 4  # of a search for a number of corners, at most; the second is seldom off by more than a few percent
+Made = TypeVar("Made")
 
 
 class Job(NamedTuple):
@@ -27,10 +31,11 @@ class Job(NamedTuple):
 
     image: Image  # 3-D
     labels: Image | None  # a given segmentation, on the image's voxels; without one, those who need it make their own
-    nodes: int  # requested
+    nodes: int  # requested, in all
     classes: int = OTSU_CLASSES
     k_D: float = UNIFORM_K_D  # of uniform meshes; the graded one has its own
     iterations: int = UNIFORM_ITERATIONS  # likewise
+    order: int = 1  # of the cells whose nodes are counted: 2 also have one in the middle of each edge
 
 
 class Produced(NamedTuple):
@@ -65,8 +70,27 @@ def bcc(job: Job) -> Produced:
     """
     seconds: dict[str, float] = {}
     with _timed(seconds, "lattice"):
-        mesh = lattice(job.image, nodes=job.nodes)
+        mesh = with_nodes(lambda corners: lattice(job.image, nodes=corners), lambda made: made, job.nodes, job.order)
     return Produced(mesh, seconds, [])
+
+
+def with_nodes(make: Callable[[int], Made], mesh_of: Callable[[Made], Mesh], nodes: int, order: int) -> Made:
+    """What `make` makes of a number of corners: that number at which cells of this order have `nodes` nodes in all.
+
+    With linear cells that is one call; with quadratic ones a few, until the number is met within 5 %, or the nearest.
+    """
+    if order == 1:
+        return make(nodes)
+
+    def count(made: Made) -> int:
+        mesh = mesh_of(made)
+        return nodes_of(mesh.points, mesh.cells, order)
+
+    def run(factor: float) -> Made:
+        return make(max(round(factor * nodes), LEAST_REQUEST))
+
+    first = corners_for(nodes, order) / nodes
+    return tries(run, count, nodes, REQUEST_RESPONSE, first=first, most=CORNER_RUNS)[0].result
 
 
 def ours(job: Job, mode: Mode) -> Produced:
@@ -82,9 +106,16 @@ def ours(job: Job, mode: Mode) -> Produced:
     content, notes = (job.image, list[str]()) if mode == "paper" else _content(job, seconds)
     with _timed(seconds, "kernels"):
         prepare_kernels(content, k_D, "paper" if mode == "paper" else "fast", is_graded=mode == "graded")
-    result = mesh_image(content, job.nodes, mode=mode, k_D=k_D, iterations=iterations)
+    begin = time.perf_counter()
+    result = with_nodes(
+        lambda corners: mesh_image(content, corners, mode=mode, k_D=k_D, iterations=iterations),
+        lambda made: made.mesh, job.nodes, job.order,
+    )  # fmt: skip
+    search = time.perf_counter() - begin - result.seconds_start - result.seconds_run
     seconds["octree" if mode == "graded" else "lattice"] = result.seconds_start
     seconds["optimize"] = result.seconds_run
+    if job.order == 2:
+        seconds["search"] = search
     return Produced(result.mesh, seconds, [f"ended by: {result.ended}", *notes])
 
 
@@ -119,10 +150,11 @@ def pytetwild(job: Job) -> Produced:
         As `tetopt.study.interfaces.interfaces` and `tetopt.study.tetwild.filled`.
     """
     seconds: dict[str, float] = {}
+    size = node_spacing(job.image, corners_for(job.nodes, job.order))
     with _timed(seconds, "surfaces"):
-        surfaces = interfaces(job.image, node_spacing(job.image, job.nodes), classes=job.classes, labels=job.labels)
+        surfaces = interfaces(job.image, size, classes=job.classes, labels=job.labels)
     with _timed(seconds, "tetrahedra"):
-        result = filled(job.image, surfaces, job.nodes)
+        result = filled(job.image, surfaces, job.nodes, job.order)
     return _searched(result, seconds, surfaces.notes)
 
 
@@ -138,7 +170,7 @@ def cleaver(job: Job) -> Produced:
     with _timed(seconds, "labels"):
         labels = class_labels(job.image, job.classes) if job.labels is None else job.labels
     with _timed(seconds, "tetrahedra"):
-        result = stuffed(job.image, labels, job.nodes)
+        result = stuffed(job.image, labels, job.nodes, job.order)
     return _searched(result, seconds, [])
 
 

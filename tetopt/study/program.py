@@ -28,13 +28,10 @@ from tetopt.io.meshes import MESH_SUFFIXES, load_mesh
 from tetopt.mesh import Mesh
 from tetopt.study.interfaces import class_labels
 from tetopt.study.pipelines import PIPELINES, Job, Pipeline, Produced
-from tetopt.study.search import Response, is_near, tries
+from tetopt.study.search import LEAST_REQUEST, REQUEST_RESPONSE, corners_for, is_near, nodes_of, tries
 from tetopt.study.tetwild import node_spacing, put_on_box
 
 PROGRAM_RUNS = 5  # of one search, at most; the first asks for what is wanted, the second is seldom far off
-# Of nodes to the number that is asked for: proportional, or nearly so. What fails is rather too coarse than too fine.
-REQUEST_RESPONSE = Response(1.0, 0.3, 3.0, step=4.0, after_failure=1.25)
-LEAST_REQUEST = 8  # nodes: a box has as many corners
 NEAR_BOX_VOXELS = 1.0  # how far off the box's sides a mesh's boundary may lie to be put on them
 PLACEHOLDERS = ("image", "labels", "nodes", "size", "output")
 PROGRAM_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,39}")
@@ -124,15 +121,16 @@ def by_program(job: Job, program: Program) -> Produced:
                     raise
                 notes.append(f"asked for {request} nodes: {error}")
                 return None
-            sizes.append(len(mesh.points))
+            sizes.append(nodes_of(mesh.points, mesh.cells, job.order))
             return mesh
 
         most = PROGRAM_RUNS if is_steered else 1
-        runs = tries(run, lambda mesh: len(mesh.points), job.nodes, REQUEST_RESPONSE, most=most)
+        first = corners_for(job.nodes, job.order) / job.nodes
+        runs = tries(run, lambda _: sizes[-1], job.nodes, REQUEST_RESPONSE, first=first, most=most)
     mesh = runs[0].result
-    if not is_near(len(mesh.points), job.nodes):
+    if not is_near(runs[0].n_nodes, job.nodes):
         counts = ", ".join(map(str, sizes))
-        notes.append(f"{len(mesh.points)} nodes, {job.nodes} were asked for; its runs gave {counts}")
+        notes.append(f"{runs[0].n_nodes} nodes, {job.nodes} were asked for; its runs gave {counts}")
     mesh, on_box = boxed(job.image, mesh)
     seconds = {"program": runs[0].seconds, "search": sum(each.seconds for each in runs[1:])}
     return Produced(mesh, seconds, [f"{len(runs)} runs", *notes, *on_box])

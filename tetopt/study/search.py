@@ -1,4 +1,7 @@
-"""The number of nodes that was asked for, from meshers that take none: run after run with another factor."""
+"""The number of nodes that was asked for, from meshers that take none: run after run with another factor.
+
+Nodes are counted as the cells' order has them: quadratic cells also have one in the middle of each edge.
+"""
 
 from __future__ import annotations
 
@@ -7,10 +10,15 @@ from collections.abc import Callable
 from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.geometry.quadratic import quadratic
 
 Result = TypeVar("Result")
 
 NODE_TOLERANCE = 0.05  # of the requested number of nodes, within which a search for it ends
+# Nodes in all over corners, of tetrahedra of either order: with about 6.5 edges a node, and fewer at the boundary.
+NODES_PER_CORNER = {1: 1.0, 2: 7.2}
 
 
 class Response(NamedTuple):
@@ -21,6 +29,11 @@ class Response(NamedTuple):
     high: float
     step: float  # by how much a factor may change from one run to the next, up or down
     after_failure: float  # what it is multiplied by after a run without a mesh
+
+
+# Of nodes to the number that is asked for: proportional, or nearly so. What fails is rather too coarse than too fine.
+REQUEST_RESPONSE = Response(1.0, 0.3, 3.0, step=4.0, after_failure=1.25)
+LEAST_REQUEST = 8  # nodes: a box has as many corners
 
 
 class Try(NamedTuple, Generic[Result]):
@@ -69,6 +82,16 @@ def tries(
             break
         factor = next_factor([(each.factor, each.n_nodes) for each in done], nodes, response)
     return sorted(done, key=lambda each: abs(np.log(each.n_nodes / nodes)))
+
+
+def nodes_of(points: NDArray[np.float64], cells: NDArray[np.int64], order: int) -> int:
+    """Nodes in all of a mesh with cells of this order."""
+    return len(points) if order == 1 else len(quadratic(points, cells)[0])
+
+
+def corners_for(nodes: int, order: int) -> int:
+    """About how many corners a mesh has whose cells of this order have `nodes` nodes in all."""
+    return max(round(nodes / NODES_PER_CORNER[order]), LEAST_REQUEST)
 
 
 def is_near(count: int, nodes: int) -> bool:

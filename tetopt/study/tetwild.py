@@ -31,7 +31,7 @@ from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.start.lattice import lattice
 from tetopt.study.interfaces import Surfaces, compacted
-from tetopt.study.search import Response, is_near, tries
+from tetopt.study.search import Response, corners_for, is_near, nodes_of, tries
 
 TETWILD_RUNS = 6  # of one search, at most; each takes about as long as the one that is kept
 # Of nodes to the factor: slopes of -3 to -9 were measured. Cleaver, which shares it, crashes on coarse meshes.
@@ -59,7 +59,7 @@ def node_spacing(image: Image, nodes: int) -> float:
     return float((np.sqrt(2.0) * image.volume / nodes) ** (1.0 / 3.0))
 
 
-def filled(image: Image, surfaces: Surfaces, nodes: int) -> Filled:
+def filled(image: Image, surfaces: Surfaces, nodes: int, order: int = 1) -> Filled:
     """Tetrahedra that fill the image's box, with facets along the surfaces, and about `nodes` nodes.
 
     One factor on the sizing field and the envelope is searched, by secants of log nodes over log factor, until the
@@ -73,6 +73,8 @@ def filled(image: Image, surfaces: Surfaces, nodes: int) -> Filled:
         Of the same image.
     nodes : int
         Requested number of nodes, 8 or more.
+    order : {1, 2}
+        Of the cells whose nodes are counted.
 
     Returns
     -------
@@ -89,13 +91,13 @@ def filled(image: Image, surfaces: Surfaces, nodes: int) -> Filled:
     if nodes < 8:
         raise InputError(f"nodes: a box needs 8 or more, got {nodes}")
     tetrahedralize = _tetrahedralize()
-    spacing = node_spacing(image, nodes)
+    spacing = node_spacing(image, corners_for(nodes, order))
 
     def run(factor: float) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         envelope = ENVELOPE_SHARE * spacing * factor**ENVELOPE_EXPONENT
         return _run(tetrahedralize, surfaces, factor * spacing, envelope)
 
-    runs = tries(run, lambda made: len(made[0]), nodes, TETWILD_RESPONSE, most=TETWILD_RUNS)
+    runs = tries(run, lambda made: nodes_of(*made, order), nodes, TETWILD_RESPONSE, most=TETWILD_RUNS)
     notes: list[str] = []
     for each in runs:
         try:
@@ -104,8 +106,9 @@ def filled(image: Image, surfaces: Surfaces, nodes: int) -> Filled:
             notes.append(f"a run with {each.n_nodes} nodes was left out: {error}")
             continue
         world = image.to_world(points / image.spacing)
-        if not is_near(len(points), nodes):
-            notes.append(f"{len(points)} nodes after {len(runs)} runs of fTetWild, {nodes} were asked for")
+        n_nodes = nodes_of(points, cells, order)
+        if not is_near(n_nodes, nodes):
+            notes.append(f"{n_nodes} nodes after {len(runs)} runs of fTetWild, {nodes} were asked for")
         search = sum(other.seconds for other in runs) - each.seconds
         return Filled(Mesh(world, oriented(world, cells)), len(runs), search, notes)
     raise InputError(f"pytetwild: none of {len(runs)} meshes could be made to fill the box; ask for more nodes")

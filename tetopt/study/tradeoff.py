@@ -10,7 +10,9 @@ from tetopt.engine.meshing import mesh_image
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.start.sizes import COARSEST_SHARE, Sizes
-from tetopt.study.compare_report import Measurement, TradeoffRow
+from tetopt.study.compare_report import ORDER_WORDS, Measurement, TradeoffRow
+from tetopt.study.pipelines import with_nodes
+from tetopt.study.search import corners_for
 
 # An option, its default on a graded mesh, values around it, and what `mesh_image` gets for a value; that may depend on
 # the longest edge of a uniform mesh with as many nodes, mm.
@@ -28,17 +30,24 @@ SWEPT_OPTIONS: tuple[SweptOption, ...] = (
 
 
 def tradeoff(
-    image: Image, nodes: int, measure: Callable[[Mesh], Measurement], say: Callable[[str], None]
+    image: Image, nodes: int, order: int, measure: Callable[[Mesh, int], Measurement], say: Callable[[str], None]
 ) -> list[TradeoffRow]:
-    """Meshes of about `nodes` nodes over `SWEPT_OPTIONS`, each with its measurement; the default's are made once."""
-    longest = Sizes().longest_edge(image, nodes) / COARSEST_SHARE
+    """Meshes over `SWEPT_OPTIONS` whose cells of this order have about `nodes` nodes in all, each with its measurement.
+
+    The default's mesh is made once.
+    """
+    longest = Sizes().longest_edge(image, corners_for(nodes, order)) / COARSEST_SHARE
     measurements: dict[tuple[str, float] | None, Measurement] = {}  # by what is changed; None: nothing
     rows = []
     for option, default, values, arguments in SWEPT_OPTIONS:
         for value in values:
             changed = None if value == default else (option, value)
             if changed not in measurements:
-                say(f"trade-off: {option} = {value:g}")
-                measurements[changed] = measure(mesh_image(image, nodes, **arguments(value, longest)).mesh)
-            rows.append(TradeoffRow(option, value, changed is None, measurements[changed]))
+                say(f"trade-off, {ORDER_WORDS[order]} cells: {option} = {value:g}")
+                measurements[changed] = measure(_meshed(image, nodes, order, arguments(value, longest)), order)
+            rows.append(TradeoffRow(order, option, value, changed is None, measurements[changed]))
     return rows
+
+
+def _meshed(image: Image, nodes: int, order: int, options: dict[str, Any]) -> Mesh:
+    return with_nodes(lambda corners: mesh_image(image, corners, **options).mesh, lambda mesh: mesh, nodes, order)
