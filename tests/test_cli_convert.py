@@ -435,6 +435,7 @@ def test_loads_run_or_are_said_to_be_in_comments(folder, tmp_path, capsys):
         ("a.inp", ["--young", "2", "--load", "2/hold:left"], "no load is of step 1 alone"),
         ("a.inp", ["--bins", "4"], "no moduli to group"),
         ("a.inp", ["--average", "mean"], "--average: there is no --young"),
+        ("a.inp", ["--young", "h+1", "--average", "gauss"], "--average gauss: is for tetopt fem and compare"),
         ("a.inp", ["--young", "h+1", "--average", "voigt"], "average: expected mean, geometric, harmonic, hill"),
         ("a.inp", ["--young", "h+1", "--average", "hill"], "average: hill is over the image's voxels; give the image"),
         ("a.inp", ["--young", "h+1", "--bins", "0"], "--bins: expected K"),

@@ -170,6 +170,24 @@ def test_fem_bad_input(block, options, words, capsys):
     assert words in err[-1]
 
 
+def test_fem_averages(tmp_path, capsys):
+    """Without a law, too: of the intensities. Around Gauss points it is another one for quadratic cells."""
+    image = tetopt.Image(np.random.default_rng(0).uniform(1.0, 9.0, (8, 8, 8)))
+    tetopt.save_image(tmp_path / "i.nii", image)
+    tetopt.save_mesh(tmp_path / "i.vtu", tetopt.lattice(image, blocks=(2, 2, 2)))
+    files, energies = [str(tmp_path / "i.nii"), str(tmp_path / "i.vtu")], {}
+    for average in ("mean", "geometric", "harmonic", "gauss"):
+        for order in "12":
+            options = ["--average", average, "--order", order, "--force", "--json", str(tmp_path / "i.json")]
+            assert main(["fem", *files, *options]) == 0
+            energies[average + order] = json.loads((tmp_path / "i.json").read_text())["strain_energy"]
+    assert energies["harmonic1"] < energies["geometric1"] < energies["mean1"]
+    assert energies["gauss1"] == energies["geometric1"]
+    assert abs(energies["gauss2"] / energies["geometric2"] - 1.0) > 1e-3
+    assert main(["fem", files[1], "--young", "3", "--average", "mean", "--load", "compress:1%"]) == 2
+    assert "--average: it is over an image's voxels; give the IMAGE" in capsys.readouterr().err
+
+
 def written(folder, points, cells):
     """A mesh file with no checks between: what another program may have written."""
     kind = meshio.CellBlock("tetra", np.asarray(cells))

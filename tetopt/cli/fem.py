@@ -21,6 +21,7 @@ from tetopt.io.formats import save_model
 from tetopt.io.images import sha256
 from tetopt.io.meshes import MeshFile
 from tetopt.io.vtk import box_text
+from tetopt.model.averages import DEFAULT_AVERAGE
 from tetopt.model.fields import cell_fields, is_result
 from tetopt.model.loads import MOST_COMPRESSION_PERCENT, count_of_steps
 from tetopt.model.model import Model
@@ -111,6 +112,8 @@ def _check_options(image_path: Path | None, compress: float | None, model: Model
         raise InputError("--compress and --load: give one of them, as in --load compress:5% --load pressure:left:1.5")
     if image_path is None and (lost := [name for name, value in part.stated().items() if value is not None]):
         raise InputError(f"--{lost[0]}: there is no IMAGE, only a mesh")
+    if image_path is None and model.average != DEFAULT_AVERAGE:
+        raise InputError("--average: it is over an image's voxels; give the IMAGE before the MESH")
     check_model_options(model, has_materials=True)
 
 

@@ -45,6 +45,10 @@ def check_solver_options(output: Path, solver: SolverOptions, has_materials: boo
     if form.is_surface and (solver.young or solver.bins or solver.sets or solver.loads):
         raise InputError(f"{output}: holds the boundary alone; leave out --young, --bins, --set and --load")
     check_model_options(solver, has_materials)
+    if solver.average != DEFAULT_AVERAGE and solver.young is None:
+        raise InputError("--average: there is no --young")
+    if parse_average(solver.average).place == "gauss":
+        raise InputError("--average gauss: is for tetopt fem and compare; files have one modulus a cell, or a node")
     if solver.units not in STRESS_UNITS:
         raise InputError(f"--units: expected {' or '.join(STRESS_UNITS)}, got {solver.units}")
     if solver.space not in SPACES:
@@ -71,8 +75,6 @@ def check_model_options(options: ModelOptions, has_materials: bool) -> None:
             if options.young is None and not has_materials:
                 raise InputError(f"--{name}: there is no --young")
     parse_average(options.average)
-    if options.average != DEFAULT_AVERAGE and options.young is None:
-        raise InputError("--average: there is no --young")
     parsed_bins(options.bins)
     if options.order not in (None, 1, 2):
         raise InputError(f"--order: expected 1 or 2, got {options.order}")
