@@ -281,6 +281,33 @@ def test_quadratic_cells_become_their_corners(tmp_path, n):
     assert back.point_data["displacement"].tolist() == [own[tuple(point)].tolist() for point in places.round(9)]
 
 
+@pytest.mark.parametrize("order", [1, 2])
+@pytest.mark.parametrize("n", [2, 3])
+def test_cells_of_vtk_s_lagrange_kinds(tmp_path, n, order):
+    """As dolfinx writes them, whatever the order: with so few nodes they are numbered as the kinds of fixed size."""
+    mesh = bent(n)
+    nodes, cells = quadratic(mesh.points, mesh.cells) if order == 2 else (mesh.points, mesh.cells)
+    points = np.column_stack([nodes, np.zeros((len(nodes), 3 - n))])
+    sides = cells[:2, :2] if order == 1 else np.column_stack([cells[:2, :2], cells[:2, n + 1]])
+    blocks = [(sides, 68), (cells, {2: 69, 3: 71}[n])]
+    listed = [np.column_stack([np.full(len(rows), rows.shape[1]), rows]).ravel() for rows, _ in blocks]
+    kinds = np.concatenate([np.full(len(rows), kind) for rows, kind in blocks])
+    grid = pyvista.UnstructuredGrid(np.concatenate(listed), kinds, points)
+    grid.cell_data["k"] = np.arange(grid.n_cells)
+    grid.save(tmp_path / "a.vtu")
+    back = load_mesh(tmp_path / "a.vtu")
+    assert (back.order, back.n_left, back.notes) == (order, 2, ())
+    assert back.mesh.points.tobytes() == mesh.points.tobytes()
+    np.testing.assert_array_equal(back.mesh.cells, mesh.cells)
+    assert back.cell_data["k"].tolist() == list(range(2, len(cells) + 2))
+
+
+def test_cells_of_order_3_are_refused(tmp_path, assert_refused):
+    points = np.random.default_rng(0).normal(size=(20, 3))
+    pyvista.UnstructuredGrid(np.array([20, *range(20)]), np.array([71]), points).save(tmp_path / "a.vtu")
+    assert_refused(tmp_path / "a.vtu", "of order 1 or 2, found lagrange_tetrahedron")
+
+
 @pytest.mark.parametrize("file_format", ["vtu", "vtk", "gmsh", "gmsh22"])
 @pytest.mark.parametrize("n", [2, 3])
 def test_quadratic_files_of_meshio(tmp_path, n, file_format):
@@ -295,6 +322,20 @@ def test_quadratic_files_of_meshio(tmp_path, n, file_format):
     np.testing.assert_array_equal(back.mesh.cells, mesh.cells)
     assert (back.order, back.notes) == (2, ())
     np.testing.assert_array_equal(back.point_data["u"], points + 1.0)
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_save_mesh_of_order_2(tmp_path, n):
+    """Point data of every node, and of the corners alone, which are interpolated."""
+    mesh = bent(n)
+    points = quadratic(mesh.points, mesh.cells)[0]
+    data = {"displacement": points * 0.5, "corners": mesh.points}
+    save_mesh(tmp_path / "a.vtu", mesh, {"k": np.arange(len(mesh.cells))}, ABOUT, data, order=2)
+    back = load_mesh(tmp_path / "a.vtu")
+    assert (back.order, back.notes, back.text("image")) == (2, (), ABOUT["image"])
+    assert back.cell_data["k"].tolist() == list(range(len(mesh.cells)))
+    assert back.point_data["displacement"].tobytes() == (points * 0.5).tobytes()
+    np.testing.assert_allclose(back.point_data["corners"], points, rtol=1e-15, atol=1e-15)
 
 
 @pytest.mark.parametrize("n", [2, 3])
@@ -550,6 +591,8 @@ def test_another_vtk_data_set(tmp_path, assert_refused):
             {TETRA: [[0, 1, 2, 3]], QUADRATIC: [[0, 1, 2, 4, 4, 5, 0, 1, 2, 3]]},
             "expected cells of one order, found tetra cells of order 1 and of order 2",
         ),
+        ({QUADRATIC - 2: [[0, 1, 2, 3, 4, 5]]}, "plane z = 0"),
+        ({QUADRATIC: [[0, 1, 2, 2, 4, 5, 4, 5, 4, 5]]}, "1 of 1 are flat"),
         ({LINE: [[0, 1]]}, "found line"),
         ({QUAD: [[0, 1, 4, 2]]}, "found quad"),
         ({HEXAHEDRON: [[0, 1, 2, 3, 4, 5, 0, 1]]}, "found hexahedron"),
@@ -597,6 +640,13 @@ def test_triangles_out_of_the_plane(tmp_path, assert_refused):
 def test_bad_cells(tmp_path, nodes, z, match, assert_refused):
     (tmp_path / "a.vtu").write_text(VTU.format(nodes=nodes, z=z))
     assert_refused(tmp_path / "a.vtu", match)
+
+
+def test_a_middle_node_that_there_is_not(tmp_path, assert_refused):
+    text = VTU.format(nodes="0 1 2 3 4 4 4 4 4 9", z="1")
+    text = text.replace('"ascii">10<', '"ascii">24<').replace('"ascii">4<', '"ascii">10<')
+    (tmp_path / "a.vtu").write_text(text)
+    assert_refused(tmp_path / "a.vtu", "nodes 0..9, it holds 0..4; damaged")
 
 
 def test_the_text_of_the_bad_cells_is_else_good(tmp_path):

@@ -27,6 +27,12 @@ from tetopt.model.model import STRESS_UNITS, half_turn
 from tetopt.model.sets import SET_NAME, Box, Sets, free_name, rows_of
 
 MESH_SUFFIXES = (".vtu", ".vtk", ".msh", ".msh2")
+# VTK's kinds of any order, with a number of nodes, that are numbered as kinds of one order; dolfinx writes them.
+LAGRANGE_KINDS = {
+    "lagrange_curve 2": "line", "lagrange_triangle 3": "triangle", "lagrange_tetrahedron 4": "tetra",
+    "lagrange_curve 3": "quadratic_edge", "lagrange_triangle 6": "quadratic_triangle",
+    "lagrange_tetrahedron 10": "quadratic_tetra",
+}  # fmt: skip
 STRAIGHT_SHARE = 1e-6  # of an edge: a middle node that is less off its middle was rounded, as in files of few digits
 
 
@@ -225,21 +231,35 @@ def _sets_of_groups(raw: Raw, mesh: Mesh, kind: str, used: NDArray[np.int64]) ->
 
 def _read_vtk(path: Path) -> Raw:
     grid = _read_quietly(path)
-    names = {int(kind): pyvista.CellType(kind).name.lower() for kind in np.unique(grid.celltypes)}
-    if (
-        set(names.values()) <= CELL_DIMENSIONS.keys() | CORNER_KINDS.keys()
-    ):  # pyvista takes other kinds apart only if they have fixed sizes
-        cells = {names[int(kind)]: np.asarray(nodes, dtype=np.int64) for kind, nodes in grid.cells_dict.items()}
-    else:
-        cells = {name: np.empty((0, 1), dtype=np.int64) for name in names.values()}
+    rows_of_kind = _rows_by_kind(grid)
+    connectivity, starts = np.asarray(grid.cell_connectivity, dtype=np.int64), np.asarray(grid.cell_offsets)
+    cells = {}
+    for kind, chosen in rows_of_kind.items():
+        width = int(np.diff(starts)[chosen].min())  # of a polyline, which may be of several, the first nodes are enough
+        cells[kind] = connectivity[starts[chosen][:, None] + np.arange(width)]
     cell_data = {
-        name: {kind: np.asarray(grid.cell_data[name])[grid.celltypes == number] for number, kind in names.items()}
+        name: {kind: np.asarray(grid.cell_data[name])[chosen] for kind, chosen in rows_of_kind.items()}
         for name in grid.cell_data
     }
     field_data = {name: _decoded(np.asarray(grid.field_data[name])) for name in grid.field_data}
-    point_data = {name: np.asarray(grid.point_data[name]) for name in grid.point_data}
+    own = [name for name in grid.point_data if not name.startswith("vtk")]  # not VTK's, such as vtkGhostType
+    point_data = {name: np.asarray(grid.point_data[name]) for name in own}
     points, space = np.asarray(grid.points, dtype=np.float64), _space(path, field_data)
     return by_corners(Raw(points, cells, cell_data, point_data, field_data, [], space))
+
+
+def _rows_by_kind(grid: pyvista.UnstructuredGrid) -> dict[str, NDArray[np.int64]]:
+    """Which cells are of each kind; those of any number of nodes are of the kinds of fixed size that they stand for."""
+    sizes = np.diff(grid.cell_offsets).astype(np.int64)
+    stride = int(sizes.max()) + 1
+    sorts, which = np.unique(grid.celltypes.astype(np.int64) * stride + sizes, return_inverse=True)
+    parts: dict[str, list[NDArray[np.int64]]] = {}
+    for number, sort in enumerate(sorts.tolist()):
+        vtk_type, size = divmod(sort, stride)
+        name = pyvista.CellType(vtk_type).name.lower()
+        kind = LAGRANGE_KINDS.get(f"{name} {size}", name)
+        parts.setdefault(kind, []).append(np.flatnonzero(which.ravel() == number))
+    return {kind: np.sort(np.concatenate(rows)) for kind, rows in parts.items()}
 
 
 def _space(path: Path, field_data: dict[str, NDArray]) -> str:
