@@ -2,6 +2,7 @@
 
 from itertools import product
 
+import naive
 import numpy as np
 import pytest
 import skfem
@@ -183,6 +184,22 @@ def test_nearest_takes_the_voxel_around_the_centre():
     image = tetopt.Image(np.arange(6.0).reshape(3, 2))
     fine = tetopt.Image(np.zeros((9, 4)), np.diag([1 / 3, 1 / 2, 1.0]))
     np.testing.assert_array_equal(nearest(image, fine).data, image.data.repeat(3, axis=0).repeat(2, axis=1))
+
+
+def test_own_error_is_that_of_half_the_resolution():
+    """Energy and displacement of a reference on voxels twice as long; the homogeneous block is that of one modulus."""
+    rng = np.random.default_rng(10)
+    image = tetopt.Image(rng.uniform(1.0, 10.0, (8, 7, 10)), affine_of(SHEARED, 1.0))
+    exact = reference(image, 0.3)
+    coarse = reference(averaged(image, (4, 3, 5)), 0.3)
+    P = [naive.interpolation(*pair) for pair in ((8, 4), (7, 3), (10, 5))]
+    difference = np.einsum("ai,bj,ck,ijkd->abcd", *P, coarse.u) - exact.u
+    even = reference(tetopt.Image(np.ones(image.shape), image.affine), 0.3).u
+    np.testing.assert_allclose(exact.u_homogeneous, even, atol=1e-5 * np.abs(even).max())
+    assert exact.own_error.strain_energy == pytest.approx(abs(coarse.strain_energy / exact.strain_energy - 1.0))
+    scale = np.linalg.norm(exact.u - even)
+    assert exact.own_error.displacement == pytest.approx(np.linalg.norm(difference) / scale, rel=1e-4)
+    assert exact.own_error.displacement > 0.01
 
 
 @pytest.mark.parametrize(("value", "nu", "words"), [(0.0, 0.3, "above 0 kPa"), (1.0, 0.5, "nu: expected")])

@@ -249,6 +249,16 @@ def test_short_axes_are_coarsened_first():
     assert np.prod(shapes[-1]) == 2
 
 
+@pytest.mark.parametrize(("shape", "linear"), SHAPES)
+def test_rows_are_long(shape, linear):
+    """The longest axis comes last, and a field comes back as the image has its axes."""
+    grid, _, _ = grid_and_oracle(shape, linear, 0.3)
+    assert grid.young.shape[2] == max(shape)
+    assert grid.in_image(grid.nodes()).shape == (*(s + 1 for s in shape), len(shape))
+    if len(shape) == 2:
+        assert grid.young.shape[1] == 1
+
+
 @kernel
 def test_interpolated_is_exact_for_linear_fields():
     grid, _, _ = grid_and_oracle((5, 4, 6), SHEARED, 0.3)
