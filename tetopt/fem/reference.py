@@ -33,9 +33,7 @@ from tetopt.image import Image
 from tetopt.mesh import Mesh
 
 INTERFACE_BAND_VOXELS = 2.0  # how near to an interface the strain there is judged
-SCALE_RESIDUAL = (
-    1e-6  # of the homogeneous block, which only scales an error: a thousandth of the smallest that there is
-)
+SCALE_RESIDUAL = 1e-6  # of the homogeneous block, which only scales an error: a thousandth of the smallest
 VOXELS_AT_ONCE = 2**18  # compared, so that a volume of millions takes no more memory than its solution
 
 
