@@ -114,6 +114,19 @@ def test_convert_keeps_the_order_unless_told_otherwise(folder, quadratic_path, t
     assert exit_code("convert", quadratic_path, tmp_path / "b.scn", "--order", "2") == 2
 
 
+def test_forces_that_hold_sets_go_on_with_the_results_in_their_own_axes_and_units(quadratic_path, tmp_path):
+    grid, text = pyvista.read(quadratic_path), json.dumps({"left": [1.5, 0.0, -2.0]})
+    for name in ("reactions", "reactions_step2", "reactions of mine"):
+        grid.field_data[name] = np.frombuffer(text.encode(), dtype=np.uint8)
+    grid.save(tmp_path / "a.vtu")
+    for options, is_kept in (([], True), (["--space", "lps"], False), (["--units", "MPa"], False)):
+        assert exit_code("convert", tmp_path / "a.vtu", tmp_path / "b.vtu", "--force", *options) == 0
+        loaded = tetopt.load_mesh(tmp_path / "b.vtu")
+        for name in ("reactions", "reactions_step2"):
+            assert loaded.text(name) == (text if is_kept else None)
+        assert loaded.text("reactions of mine") is None
+
+
 def test_commands_take_a_quadratic_mesh(folder, quadratic_path, tmp_path, capsys):
     """Each says of it what it says of the corners' mesh."""
     mesh = tetopt.load_mesh(folder / "a.vtu").mesh

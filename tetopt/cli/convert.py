@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -75,7 +76,7 @@ def convert_command(
     if not solver.loads and not format_of(output).is_surface:
         solver = replace(solver, loads=loads_of(loaded))
     fields, box = dict(loaded.cell_data), loaded.box
-    about: dict[str, Any] = {name: text for name in TEXTS_KEPT if (text := loaded.text(name)) is not None}
+    about = _texts_of(loaded, solver, has_new_results=results_path is not None)
     image: Image | None = None
     if image_path is not None:
         whole, image = _images(image_path, mask_path, part, loaded.mesh.ndim)
@@ -98,6 +99,13 @@ def convert_command(
         save_json(json_path, files | {"versions": versions()} | model_summary(model))
     print_model(output, model, solver)
     return 0
+
+
+def _texts_of(loaded: MeshFile, solver: SolverOptions, *, has_new_results: bool) -> dict[str, Any]:
+    """The texts of the mesh's file that go on; the forces that hold sets, which are in RAS+ and mN, only as such."""
+    is_as_solved = (solver.space, solver.units) == ("ras", "kPa") and not has_new_results
+    names = [name for name in loaded.field_data if is_as_solved and re.fullmatch(r"reactions(_step\d+)?", name)]
+    return {name: text for name in (*TEXTS_KEPT, *names) if (text := loaded.text(name)) is not None}
 
 
 def _with_results(loaded: MeshFile, path: Path) -> MeshFile:
