@@ -194,3 +194,15 @@ def test_every_option_of_the_model_reaches_it():
     """None of them is left out of what is tested above, but for sets and bins, which convert's tests have."""
     names = {field.name for field in fields(ModelOptions)}
     assert names == {"young", "nu", "density", "average", "bins", "sets", "loads", "order"}
+
+
+def test_moduli_at_nodes_go_through_the_file(tmp_path, capsys):
+    """A modulus that is linear between nodes, written by --average nodes and solved from the file."""
+    image, model = sample_image(), sample_model()
+    words = {"young": "1+0.02*h", "nu": 0.4, "average": "nodes", "loads": ["compress:5%"], "known_sets": model.sets}
+    nodal = model_of(model.mesh, image, **words)._replace(order=2)
+    save_model(tmp_path / "nodal.vtu", nodal)
+    run(capsys, str(tmp_path / "nodal.vtu"), "--json", str(tmp_path / "numbers.json"))
+    written = json.loads((tmp_path / "numbers.json").read_text())["strain_energy"]
+    assert written == pytest.approx(solved_model(nodal).strain_energy, rel=1e-12)
+    assert abs(written / solved_model(nodal._replace(node_young=None)).strain_energy - 1.0) > 1e-4

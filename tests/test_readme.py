@@ -41,7 +41,7 @@ def test_commands(tmp_path, monkeypatch):
         for line in README.splitlines()
         if re.match("tetopt (mesh|quality|phantom|fem|segment|convert|surface|view) ", line)
     ]
-    assert len(lines) == 17
+    assert len(lines) == 18
     monkeypatch.chdir(tmp_path)
     assert main(["phantom", "sphere", "-o", "T1.nii.gz", "--voxel-mm", "2", "--labels", "mask.nii.gz"]) == 0
     shutil.copy("T1.nii.gz", "T2.nii.gz")
@@ -56,6 +56,7 @@ def test_commands(tmp_path, monkeypatch):
         "mask.nii.gz",
         "tissues.nii.gz",
         "organ.vtu",
+        "sagging.vtu",
         "head.vtu",
         "tissues.vtu",
         "labels.nii.gz",

@@ -35,6 +35,7 @@ if TYPE_CHECKING:
 
 INTENSITY_LAW = "h"  # an image without --young: its intensities are the moduli, as in the paper
 PAPER_PERCENT = 1.0  # how far the paper's test compresses, for a linear law only a scale
+SHOWN_SHARE = 1e-9  # of a force's largest component: less is what an iterative solution leaves
 LOCKING_NU = 0.45  # from where on linear cells are far behind quadratic ones, see docs/order.md
 
 
@@ -209,9 +210,9 @@ def _print(name: str, model: Model, solutions: list[Solution], extremes: Conditi
         table.add_row("energy of the springs, uJ", *(f"{each['spring_energy']:.8g}" for each in of_step))
     for set_name in dict.fromkeys(name for solution in solutions for name in solution.reactions):
         forces = (solution.reactions.get(set_name) for solution in solutions)
-        row = ("" if force is None else ", ".join(f"{part:.6g}" for part in force) for force in forces)
+        row = ("" if force is None else _vector(force) for force in forces)
         table.add_row(f"reaction of {escape(set_name)}, mN", *row)
-    table.add_row("sum of the other forces, mN", *(", ".join(f"{x:.6g}" for x in each.applied) for each in solutions))
+    table.add_row("sum of the other forces, mN", *(_vector(each.applied) for each in solutions))
     table.add_row("multigrid CG iterations (0: factorised)", *(str(each.n_iterations) for each in solutions))
     if extremes is not None:
         unit = "mN/mm" if model.mesh.ndim == 3 else "mN/mm per mm of thickness"
@@ -219,6 +220,12 @@ def _print(name: str, model: Model, solutions: list[Solution], extremes: Conditi
         table.add_row("condition number, 2-norm", f"{extremes.cond:.6g}")
         table.add_row("Jacobi CG iterations to 1e-10", str(extremes.cg_iterations))
     print_wide(table)
+
+
+def _vector(force: NDArray[np.float64]) -> str:
+    """The components of a force; what is rounding beside the largest is 0."""
+    shown = np.where(np.abs(force) > SHOWN_SHARE * np.abs(force).max(), force, 0.0)
+    return ", ".join(f"{part:.6g}" for part in shown)
 
 
 def _numbers_of(solution: Solution) -> dict[str, Any]:
