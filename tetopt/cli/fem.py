@@ -192,7 +192,10 @@ def _advise(model: Model) -> None:
     assert model.materials is not None, "it has been solved"
     largest = float(model.materials.nu.max())
     if model.order == 1 and largest >= LOCKING_NU:
-        log.print(f"nu is up to {largest:g}, where linear cells are too stiff: --order 2 (docs/order.md)")
+        log.print(
+            f"nu is up to {largest:g}, where linear cells are too stiff: at 0.45 their displacement error was 1.8 times, "
+            "at 0.49 2.8 times that of as many nodes of quadratic cells; --order 2 (docs/order.md)"
+        )
 
 
 def _print(name: str, model: Model, solutions: list[Solution], extremes: Conditioning | None) -> None:
