@@ -136,7 +136,7 @@ def test_triangles(tmp_path, capsys):
 )
 def test_advice_where_linear_cells_lock(options, is_advised, path, capsys):
     _, err = run(capsys, path, "--young", "3", "--density", "1000", *options)
-    assert ("--order 2 (docs/order.md)" in err) == is_advised
+    assert ("try --order 2 (docs/order.md)" in err) == is_advised
 
 
 @pytest.mark.parametrize(
@@ -151,7 +151,7 @@ def test_advice_where_linear_cells_lock(options, is_advised, path, capsys):
         (["{model}", "--crop", "0:2,0:2,0:2"], "--crop: there is no IMAGE, only a mesh"),
         (["{model}", "--slice", "k=1"], "--slice: there is no IMAGE, only a mesh"),
         (["{model}", "--order", "3"], "--order: expected 1 or 2, got 3"),
-        (["{model}", "--average", "power:x"], "average: expected"),
+        (["{model}", "--average", "mean"], "--average: it is over an image's voxels; give the IMAGE before the MESH"),
         (["{model}", "--young", "3;4"], "formula: expected numbers"),
         (["{model}", "--nu", "0.5"], "nu: expected -1 < nu < 0.5"),
         (["{model}", "--young", "3"], "gravity: the cells have no density; give --density"),
