@@ -112,7 +112,15 @@ LOAD_CASES = {
     "traction": ["hold:{high}", "traction:{low}:{pull},0.25"],
     "spring": ["spring:{high}:0.2", "pressure:{low}:0.3"],
     "gravity": ["hold:{high}", "gravity:{pull},-9810"],
-    "all": ["hold:{high}", "spring:{side}:0.05", "pressure:boundary:0.1", "pressure:{low}:0.1", "gravity:{pull},-9810"],
+    "all": [
+        "hold:{high}",
+        "spring:{side}:0.05",
+        "pressure:boundary:0.1",
+        "pressure:{low}:0.1",
+        "gravity:{pull},-9810",
+        "traction:{low}:{pull},0.25",
+        "traction:{side}:{pull},0.5",
+    ],
 }
 
 

@@ -233,7 +233,7 @@ def test_each_load_has_its_card_and_steps_begin_anew():
     data = [{word: lines for word, _, lines in step} for step in (first, second)]
     assert not data[0]["*CLOAD"]
     assert not data[1]["*DLOAD"]
-    *faces, weight = data[0]["*DLOAD"]
+    weight, *faces = data[0]["*DLOAD"]
     rows = model.sets.facets["inferior"]
     assert [int(line[0]) - 1 for line in faces] == rows[:, 0].tolist()
     assert {line[2] for line in faces} == {"0.5"}

@@ -132,6 +132,8 @@ def test_components_and_steps_keep_displacements_apart():
         (["-1/hold:left"], "a step of 1 or more"),
         (["first/hold:left"], "a step of 1 or more"),
         (["/hold:left"], "a step of 1 or more"),
+        (["9" * 5000 + "/hold:left"], "a step of 1 or more"),
+        (["1/hold:left", "9999/hold:left"], "a step 9999, but no load is of step 2 alone"),
         (["hold:left", "2/pressure:right:1"], "a step 2, but no load is of step 1 alone"),
         (["1/hold:left", "3/hold:left"], "a step 3, but no load is of step 2 alone"),
         (["hold:left", "2/move:left:0,0,1", "1/pressure:right:1"], "cannot go both ways"),

@@ -20,7 +20,6 @@ SPRING_PREFIX = "spring-"  # of the sets of one spring each, which are elements 
 HOTTEST_DEGREES = 1000.0  # for the largest modulus; CalculiX rounds temperatures to some 1e-8 degrees
 # From one temperature to the next, where 1 / modulus is taken for linear in between: off by 5e-5 at most.
 TEMPERATURE_RATIO = 1.02
-LOAD_CARDS = ("*BOUNDARY", "*CLOAD", "*DLOAD")
 # The number of the face opposite each local node: S1 is 1-2-3, S2 is 1-4-2, S3 is 2-4-3, S4 is 3-4-1.
 FACE_NUMBERS = np.array([3, 4, 2, 1])
 # Of a number: Abaqus takes no more, and CalculiX reads the first 20, so that 1.234567890123456e-05 becomes 1.23.
@@ -174,14 +173,20 @@ def _springs(model: Model) -> list[str]:
 
 
 def _step(model: Model, step: int) -> list[str]:
-    """A step, which begins by removing what acts in the one before."""
+    """A step, which begins by removing what acts in the one before.
+
+    Loads that add up are added here: solvers differ in what they make of a node or face that is named twice.
+    """
     loads = in_step(model.loads, step)
     new = ", OP=NEW" if count_of_steps(model.loads) > 1 else ""
-    lines = {card: [line for load in loads for line in _lines(model, load, card)] for card in LOAD_CARDS}
-    displaced = [load.set_name for load in loads if load.kind == "displacement"]
+    cards = {
+        "*BOUNDARY": _conditions(loads), "*CLOAD": _forces(model, loads),
+        "*DLOAD": _weight(loads) + _pressures(model, loads),
+    }  # fmt: skip
+    displaced = dict.fromkeys(load.set_name for load in loads if load.kind == "displacement")
     return [
         "*STEP, NLGEOM, INC=1000\n*STATIC\n0.1, 1.0, 1e-05, 0.25\n" if model.is_nonlinear else "*STEP\n*STATIC\n",
-        *(f"{card}{new}\n{''.join(those)}" for card, those in lines.items() if those or new),
+        *(f"{card}{new}\n{lines}" for card, lines in cards.items() if lines or new),
         OUTPUT_REQUESTS,
         "** Reaction forces and their sums\n" if displaced else "",
         *(f"*NODE PRINT, NSET={name}, TOTALS=YES\nRF\n" for name in displaced),
@@ -189,28 +194,48 @@ def _step(model: Model, step: int) -> list[str]:
     ]
 
 
-def _lines(model: Model, load: Load, card: str) -> list[str]:
-    """What a load has to say under a card."""
-    dofs = np.arange(1, 4)
-    if card == "*BOUNDARY" and load.kind == "displacement":
-        is_set = ~np.isnan(load.numbers)
-        values = rows(dofs[is_set], dofs[is_set], _fitting(load.numbers[is_set]), separator=", ")
-        return [f"{load.set_name}, {line}\n" for line in values.splitlines()]
-    if card == "*CLOAD" and load.kind == "traction":
-        nodes, forces = facet_forces(model.mesh, model.sets, load, model.order)
-        return [
-            rows(nodes + 1, np.full(len(nodes), dof), _fitting(forces[:, dof - 1]), separator=", ")
-            for dof in dofs
-            if load.numbers[dof - 1] != 0.0
-        ]
-    if card == "*DLOAD" and load.kind == "gravity" and load.numbers.any():
-        size = float(np.linalg.norm(load.numbers))
-        direction = ", ".join(_number(float(x)) for x in load.numbers / size)
-        return [f"{ALL_ELEMENTS}, GRAV, {_number(size)}, {direction}\n"]
-    if card == "*DLOAD" and load.kind == "pressure":  # by faces: CalculiX takes no OP=NEW for those of surfaces
-        members, pressure = model.sets.facets[load.set_name], _number(float(load.numbers[0]))
-        return [f"{line}, {pressure}\n" for line in _faces(members, "P").splitlines()]
-    return []
+def _conditions(loads: tuple[Load, ...]) -> str:
+    """Displacements of sets, by component."""
+    lines = []
+    for load in loads:
+        if load.kind == "displacement":
+            dofs = np.flatnonzero(~np.isnan(load.numbers))
+            values = rows(dofs + 1, dofs + 1, _fitting(load.numbers[dofs]), separator=", ")
+            lines += [f"{load.set_name}, {line}\n" for line in values.splitlines()]
+    return "".join(lines)
+
+
+def _forces(model: Model, loads: tuple[Load, ...]) -> str:
+    """What tractions do to nodes, by component."""
+    total = np.zeros_like(elements(model)[0])
+    for load in loads:
+        if load.kind == "traction":
+            nodes, forces = facet_forces(model.mesh, model.sets, load, model.order)
+            total[nodes] += forces
+    node, dof = np.nonzero(total)
+    return rows(node + 1, dof + 1, _fitting(total[node, dof]), separator=", ")
+
+
+def _pressures(model: Model, loads: tuple[Load, ...]) -> str:
+    """Pressures on faces of cells; CalculiX takes no OP=NEW for pressures on surfaces."""
+    pressed = [load for load in loads if load.kind == "pressure"]
+    if not pressed:
+        return ""
+    members = [model.sets.facets[load.set_name] for load in pressed]
+    faces, which = np.unique(np.concatenate(members), axis=0, return_inverse=True)
+    values = np.repeat([float(load.numbers[0]) for load in pressed], [len(each) for each in members])
+    total: NDArray[np.float64] = np.bincount(which.ravel(), weights=values).astype(np.float64)
+    lines = zip(_faces(faces, "P").splitlines(), _fitting(total).tolist(), strict=True)
+    return "".join(f"{face}, {value!r}\n" for face, value in lines)
+
+
+def _weight(loads: tuple[Load, ...]) -> str:
+    """Gravity on all cells."""
+    acceleration = sum((load.numbers for load in loads if load.kind == "gravity"), np.zeros(3))
+    size = float(np.linalg.norm(acceleration))
+    if size == 0.0:
+        return ""
+    return f"{ALL_ELEMENTS}, GRAV, {', '.join(_number(float(x)) for x in (size, *(acceleration / size)))}\n"
 
 
 def _list(numbers: NDArray[np.int64]) -> str:

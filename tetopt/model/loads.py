@@ -8,6 +8,7 @@ equations.
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable
 from typing import NamedTuple
 
@@ -91,11 +92,12 @@ def in_step(loads: Iterable[Load], step: int) -> tuple[Load, ...]:
 
 def check_steps(loads: Iterable[Load]) -> None:
     """InputError if steps leave a number out."""
-    numbers = {load.step for load in loads} - {0}
-    if missing := sorted(set(range(1, max(numbers, default=0) + 1)) - numbers):
-        raise InputError(
-            f"load: there is a step {max(numbers)}, but no load is of step {missing[0]} alone; number steps from 1"
-        )
+    numbers = sorted({load.step for load in loads} - {0})
+    for expected, number in enumerate(numbers, start=1):
+        if number != expected:
+            raise InputError(
+                f"load: there is a step {numbers[-1]}, but no load is of step {expected} alone; number steps from 1"
+            )
 
 
 def parse_load(text: str, ndim: int) -> Load:
@@ -153,7 +155,7 @@ def _step_of(text: str) -> tuple[int, str]:
     prefix, slash, words = text.partition("/")
     if not slash or ":" in prefix:
         return 0, text
-    if not prefix.isdecimal() or int(prefix) < 1:
+    if not re.fullmatch("[1-9][0-9]{0,3}", prefix):
         raise InputError(f'load: expected a step of 1 or more before the stroke, as in 2/{words}, got "{text}"')
     return int(prefix), words
 
