@@ -6,7 +6,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
-from typing import NamedTuple, TypeVar
+from typing import NamedTuple
 
 import numpy as np
 
@@ -22,8 +22,7 @@ from tetopt.study.search import LEAST_REQUEST, REQUEST_RESPONSE, corners_for, no
 from tetopt.study.tetwild import Filled, filled, node_spacing
 from tetopt.target.content import Content, content
 
-CORNER_RUNS = 4  # of a search for a number of corners, at most; the second is seldom off by more than a few percent
-Made = TypeVar("Made")
+LATTICE_RUNS = 4  # of the search for a lattice of order 2, at most; there are few so coarse, and it takes milliseconds
 
 
 class Job(NamedTuple):
@@ -70,27 +69,13 @@ def bcc(job: Job) -> Produced:
     """
     seconds: dict[str, float] = {}
     with _timed(seconds, "lattice"):
-        mesh = with_nodes(lambda corners: lattice(job.image, nodes=corners), lambda made: made, job.nodes, job.order)
-    return Produced(mesh, seconds, [])
-
-
-def with_nodes(make: Callable[[int], Made], mesh_of: Callable[[Made], Mesh], nodes: int, order: int) -> Made:
-    """What `make` makes of a number of corners: that number at which cells of this order have `nodes` nodes in all.
-
-    With linear cells that is one call; with quadratic ones a few, until the number is met within 5 %, or the nearest.
-    """
-    if order == 1:
-        return make(nodes)
-
-    def count(made: Made) -> int:
-        mesh = mesh_of(made)
-        return nodes_of(mesh.points, mesh.cells, order)
-
-    def run(factor: float) -> Made:
-        return make(max(round(factor * nodes), LEAST_REQUEST))
-
-    first = corners_for(nodes, order) / nodes
-    return tries(run, count, nodes, REQUEST_RESPONSE, first=first, most=CORNER_RUNS)[0].result
+        first = corners_for(job.nodes, job.order) / job.nodes
+        runs = tries(
+            lambda factor: lattice(job.image, nodes=max(round(factor * job.nodes), LEAST_REQUEST)),
+            lambda mesh: nodes_of(mesh.points, mesh.cells, job.order),
+            job.nodes, REQUEST_RESPONSE, first=first, most=1 if job.order == 1 else LATTICE_RUNS,
+        )  # fmt: skip
+    return Produced(runs[0].result, seconds, [])
 
 
 def ours(job: Job, mode: Mode) -> Produced:
@@ -106,16 +91,9 @@ def ours(job: Job, mode: Mode) -> Produced:
     content, notes = (job.image, list[str]()) if mode == "paper" else _content(job, seconds)
     with _timed(seconds, "kernels"):
         prepare_kernels(content, k_D, "paper" if mode == "paper" else "fast", is_graded=mode == "graded")
-    begin = time.perf_counter()
-    result = with_nodes(
-        lambda corners: mesh_image(content, corners, mode=mode, k_D=k_D, iterations=iterations),
-        lambda made: made.mesh, job.nodes, job.order,
-    )  # fmt: skip
-    search = time.perf_counter() - begin - result.seconds_start - result.seconds_run
+    result = mesh_image(content, job.nodes, mode=mode, k_D=k_D, iterations=iterations, order=job.order)
     seconds["octree" if mode == "graded" else "lattice"] = result.seconds_start
     seconds["optimize"] = result.seconds_run
-    if job.order == 2:
-        seconds["search"] = search
     return Produced(result.mesh, seconds, [f"ended by: {result.ended}", *notes])
 
 

@@ -5,27 +5,28 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any
 
-from tetopt.engine.loop import GRADED_K_D, SHAPE_POWER
+from tetopt.engine.loop import GRADED_K_D, QUADRATIC_GRADATION, QUADRATIC_SHARE, SHAPE_POWER
 from tetopt.engine.meshing import mesh_image
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.start.sizes import COARSEST_SHARE, Sizes
 from tetopt.study.compare_report import ORDER_WORDS, Measurement, TradeoffRow
-from tetopt.study.pipelines import with_nodes
-from tetopt.study.search import corners_for
 
-# An option, its default on a graded mesh, values around it, and what `mesh_image` gets for a value; that may depend on
-# the longest edge of a uniform mesh with as many nodes, mm.
-SweptOption = tuple[str, float | None, tuple[float, ...], Callable[[float, float], dict[str, Any]]]
+# An option, its defaults and values around them by the order of the cells, and what `mesh_image` gets for a value.
+# With order 2 a gradation of 1 and a longest edge of `COARSEST_SHARE` stand for the defaults: neither is here.
+SweptOption = tuple[str, dict[int, float | None], dict[int, tuple[float, ...]], Callable[[float], dict[str, Any]]]
 SWEPT_OPTIONS: tuple[SweptOption, ...] = (
-    ("k_D", GRADED_K_D, (0.3, 0.5, 0.7, GRADED_K_D, 0.93), lambda value, _: {"k_D": value}),
-    ("shape power p", SHAPE_POWER, (2.0, SHAPE_POWER, 4.0, 6.0), lambda value, _: {"shape_power": value}),
-    ("gradation", 1.0, (0.2, 0.5, 1.0), lambda value, _: {"sizes": Sizes(gradation=value)}),
-    (
-        "largest edge, of a uniform mesh's", COARSEST_SHARE, (1.0, 1.15, COARSEST_SHARE, 2.0, 3.0),
-        lambda value, longest: {"sizes": Sizes(largest=longest * value)},
-    ),
-    ("uniform, k_D", None, (0.0, 0.2, 0.5, 0.8), lambda value, _: {"mode": "uniform", "k_D": value}),
+    ("k_D", dict.fromkeys((1, 2), GRADED_K_D), dict.fromkeys((1, 2), (0.3, 0.5, 0.7, GRADED_K_D, 0.93)),
+     lambda value: {"k_D": value}),
+    ("shape power p", dict.fromkeys((1, 2), SHAPE_POWER), dict.fromkeys((1, 2), (2.0, SHAPE_POWER, 4.0, 6.0)),
+     lambda value: {"shape_power": value}),
+    ("gradation", {1: 1.0, 2: QUADRATIC_GRADATION}, {1: (0.2, 0.5, 1.0), 2: (0.2, QUADRATIC_GRADATION, 0.9)},
+     lambda value: {"sizes": Sizes(gradation=value)}),
+    ("largest edge, of a uniform mesh's", {1: COARSEST_SHARE, 2: QUADRATIC_SHARE},
+     {1: (1.0, 1.15, COARSEST_SHARE, 2.0, 3.0), 2: (0.9, 1.0, QUADRATIC_SHARE, 1.3, 1.6)},
+     lambda value: {"sizes": Sizes(coarsest=value)}),
+    ("uniform, k_D", dict.fromkeys((1, 2)), dict.fromkeys((1, 2), (0.0, 0.2, 0.5, 0.8)),
+     lambda value: {"mode": "uniform", "k_D": value}),
 )  # fmt: skip
 
 
@@ -36,18 +37,14 @@ def tradeoff(
 
     The default's mesh is made once.
     """
-    longest = Sizes().longest_edge(image, corners_for(nodes, order)) / COARSEST_SHARE
     measurements: dict[tuple[str, float] | None, Measurement] = {}  # by what is changed; None: nothing
     rows = []
-    for option, default, values, arguments in SWEPT_OPTIONS:
-        for value in values:
-            changed = None if value == default else (option, value)
+    for option, defaults, values, arguments in SWEPT_OPTIONS:
+        for value in values[order]:
+            changed = None if value == defaults[order] else (option, value)
             if changed not in measurements:
                 say(f"trade-off, {ORDER_WORDS[order]} cells: {option} = {value:g}")
-                measurements[changed] = measure(_meshed(image, nodes, order, arguments(value, longest)), order)
+                mesh = mesh_image(image, nodes, order=order, **arguments(value)).mesh
+                measurements[changed] = measure(mesh, order)
             rows.append(TradeoffRow(order, option, value, changed is None, measurements[changed]))
     return rows
-
-
-def _meshed(image: Image, nodes: int, order: int, options: dict[str, Any]) -> Mesh:
-    return with_nodes(lambda corners: mesh_image(image, corners, **options).mesh, lambda mesh: mesh, nodes, order)
