@@ -19,6 +19,7 @@ import numpy as np
 from choose_k_d import PHANTOM_NAMES, SHOWN_ERRORS, cases
 
 import tetopt
+from tetopt.fem.reference import at_centres
 from tetopt.io.files import checked_output, save_json
 from tetopt.start.sizes import COARSEST_SHARE
 from tetopt.study.compare import Standard, default_law, measured, prepared
@@ -82,7 +83,7 @@ def _meshes(
 def _strained(standard: Standard) -> tetopt.Image:
     """sqrt(E) times the strain along the push, of the reference: E_D of it is about the error of a mesh's energy."""
     modulus, reference = standard.modulus, standard.references[STANDARD_NU]
-    strain = reference.strain.reshape(*modulus.shape, modulus.ndim, modulus.ndim)
+    strain = at_centres(modulus, reference.u, np.arange(modulus.data.size))[1].reshape(*modulus.shape, 3, 3)
     push = int(np.argmax([abs(strain[..., d, d].mean()) for d in range(modulus.ndim)]))
     return tetopt.Image(np.sqrt(modulus.data) * strain[..., push, push], modulus.affine)
 
