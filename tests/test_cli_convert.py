@@ -213,6 +213,15 @@ def test_an_image_gives_the_mean_of_the_law(folder, tmp_path):
     np.testing.assert_allclose(young["default"], expected, rtol=1e-12)
 
 
+def test_a_file_has_one_modulus_a_cell_of_those_at_gauss_points(folder, tmp_path, capsys):
+    for average in ("geometric", "gauss"):
+        options = ["--young", LAW, "--average", average, "--image", folder / "a.nii.gz", "--order", "2"]
+        assert exit_code("convert", folder / "a.vtu", tmp_path / f"{average}.vtu", *options) == 0
+        assert ("one modulus a cell, its geometric mean" in capsys.readouterr().out) == (average == "gauss")
+    first, second = (tetopt.load_mesh(tmp_path / f"{each}.vtu").cell_data["young"] for each in ("geometric", "gauss"))
+    np.testing.assert_array_equal(first, second)
+
+
 def test_a_mesh_of_gmsh_s_is_measured_and_painted(folder, tmp_path, capsys):
     first = tetopt.load_mesh(folder / "a.vtu").mesh
     skin = boundary_facets(first.cells)
@@ -448,7 +457,6 @@ def test_loads_run_or_are_said_to_be_in_comments(folder, tmp_path, capsys):
         ("a.inp", ["--young", "2", "--load", "2/hold:left"], "no load is of step 1 alone"),
         ("a.inp", ["--bins", "4"], "no moduli to group"),
         ("a.inp", ["--average", "mean"], "--average: there is no --young"),
-        ("a.inp", ["--young", "h+1", "--average", "gauss"], "--average gauss: is for tetopt fem and compare"),
         ("a.inp", ["--young", "h+1", "--average", "voigt"], "average: expected mean, geometric, harmonic, hill"),
         ("a.inp", ["--young", "h+1", "--average", "hill"], "average: hill is over the image's voxels; give the image"),
         ("a.inp", ["--young", "h+1", "--bins", "0"], "--bins: expected K"),

@@ -101,8 +101,9 @@ def model_of(
     table, nodal, at_gauss = None, None, None
     if young is not None:
         nodal, at_gauss = _varying_moduli(young, mesh, image, average, order)
-        if bins is not None and (nodal is not None or at_gauss is not None):
+        if bins is not None and nodal is not None:
             raise InputError(f"bins: moduli that vary in a cell have no groups; take another average than {average}")
+        at_gauss = None if bins is not None else at_gauss
         moduli = _values(young, "young", mesh, image, mean, labels, average)
         ratios = _values(nu, "nu", mesh, image, mean, labels)
         masses = None if density is None else _values(density, "density", mesh, image, mean, labels)
