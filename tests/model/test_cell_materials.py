@@ -9,7 +9,7 @@ from tetopt.geometry.simplex import volumes
 from tetopt.model.averages import cell_values
 from tetopt.model.build import model_of
 from tetopt.model.laws import ByLabel
-from tetopt.model.materials import binned, by_label, materials
+from tetopt.model.materials import binned, by_label, density_of, materials, without_moduli
 
 YOUNG = np.array([3.0, 1.0, 3.0, 2.0, 8.0])
 
@@ -156,3 +156,46 @@ def test_one_law_for_each_label_and_one_number_a_cell():
         table = model_of(model.mesh, young=values, nu=np.float32(0.25)).materials
         np.testing.assert_array_equal(table.young[table.of_cell], moduli)
         assert set(table.nu) == {0.25}
+
+
+# Densities
+
+
+def test_cells_of_another_density_are_of_another_material():
+    table = materials([2.0, 1.0, 1.0, 2.0], 0.3, 4, [1000.0, 1000.0, 1500.0, 1000.0])
+    assert table.young.tolist() == [1.0, 1.0, 2.0]
+    assert table.density.tolist() == [1000.0, 1500.0, 1000.0]
+    assert table.of_cell.tolist() == [2, 0, 1, 2]
+    alone = without_moduli(table)
+    assert (alone.young.tolist(), alone.density.tolist()) == ([1.0, 1.0], [1000.0, 1500.0])
+    assert materials(1.0, 0.3, 2).density is None
+    fewer = binned(materials([1.0, 2.0, 3.0], 0.3, 3, [900.0, 1000.0, 2000.0]), np.ones(3), 2)
+    assert np.unique(fewer.density).tolist() == [950.0, 2000.0]
+
+
+@pytest.mark.parametrize("wrong", [0.0, -1.0, np.nan, np.inf])
+def test_densities_that_are_none(wrong):
+    with pytest.raises(InputError, match="density: expected kg/m3 above 0, got 1 cells with others"):
+        materials(1.0, 0.3, 2, [1000.0, wrong])
+    with pytest.raises(InputError, match="gravity: the cells have no density; give --density"):
+        density_of(materials(1.0, 0.3, 2))
+
+
+def test_density_by_law_by_label_and_from_the_moduli_s_file(tmp_path):
+    mesh = sample_model(3).mesh
+    fields = sample_model(3).cell_data
+    labels, mean = fields["label"], fields["mean"]
+    path = tmp_path / "tissues.csv"
+    path.write_text("label,young,nu,density\n0,1,0.45,1000\n1,9,0.3,1900\n")
+    expected = np.where(labels == 1, 1900.0, 1000.0)
+    for young, density, values in (
+        (str(path), None, expected),
+        (2.0, "0=1000,1=1900", expected),
+        (2.0, "1000 + 2*h", 1000.0 + 2.0 * mean),
+        (2.0, 1060, np.full(len(mean), 1060.0)),
+    ):
+        table = model_of(mesh, young=young, density=density, cell_data=fields).materials
+        np.testing.assert_allclose(table.density[table.of_cell], values, rtol=1e-14)
+    assert model_of(mesh, young=2.0, cell_data=fields).materials.density is None
+    with pytest.raises(InputError, match="a material has a modulus, too; give --young"):
+        model_of(mesh, density=1000.0)
