@@ -447,6 +447,22 @@ def test_what_was_read_can_be_written_again(tmp_path):
         )
 
 
+def test_results_come_back_in_our_axes_and_units(tmp_path):
+    """Tensors stay whole, or else nobody knows by their names which axes and units they are in."""
+    model, rng = quadratic_model(3), np.random.default_rng(1)
+    cell_data = {"stress": rng.normal(size=(len(model.mesh.cells), 9)), "von_mises": rng.random(len(model.mesh.cells))}
+    point_data = {"stress_nodes": rng.normal(size=(len(model.point_data["displacement"]), 9))} | model.point_data
+    save_model(tmp_path / "a.msh", model._replace(cell_data=cell_data, point_data=point_data), space="lps", units="MPa")
+    back = load_mesh(tmp_path / "a.msh")
+    place = {tuple(cell): k for k, cell in enumerate(model.mesh.cells.tolist())}
+    of_cell = np.array([place[tuple(cell)] for cell in back.mesh.cells.tolist()])
+    assert set(back.cell_data) == {*cell_data, "young", "nu"}
+    for name, values in cell_data.items():
+        np.testing.assert_allclose(back.cell_data[name], values[of_cell], rtol=1e-14)
+    for name in ("stress_nodes", "displacement"):
+        np.testing.assert_allclose(back.point_data[name], point_data[name], rtol=1e-14)
+
+
 def test_comments_that_gmsh_has_put_at_the_end(tmp_path):
     """As it does when it writes a file again; and here an entity is gone that they tell of."""
     model = sample_model(3)

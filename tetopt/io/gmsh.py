@@ -14,8 +14,8 @@ sides is turned, in 4.1, as in the first of them. The nodes of a group are those
 
 Views ($ElementData), in 4.1 only, as meshio 5.3.5 reads no 2.2 that has them: the cell data, "young" and "nu" of the
 materials in place of cell data of these names, and each cell set as 0 and 1. Facets have the values of the cell that
-they are held by, since meshio takes no view that leaves elements out. Data of several columns are one view a column.
-$NodeData are the point data, those of 3 and 9 columns as gmsh's vectors and tensors.
+they are held by, since meshio takes no view that leaves elements out. $NodeData are the point data. Of 3 columns either
+is a vector, by which gmsh deforms, of 9 a tensor; data of other numbers of columns are one view a column.
 
 More than 1000 materials are no groups, only views; in 2.2 they are refused.
 
@@ -51,7 +51,7 @@ from tetopt.model.sets import facet_triples
 # gmsh's numbers for elements of a dimension and an order: line, triangle, tetrahedron, and again.
 ELEMENT_TYPES = {(1, 1): 1, (2, 1): 2, (3, 1): 4, (1, 2): 8, (2, 2): 9, (3, 2): 11}
 TET10_ORDER = np.array([0, 1, 2, 3, 4, 5, 6, 7, 9, 8])  # gmsh has the midpoint of edge (2, 3) before that of (1, 3)
-VIEW_SHAPES = ((3,), (9,))  # of a row: a view holds vectors, by which gmsh deforms, and tensors
+VIEW_SHAPES = ((3,), (9,))  # of a row: a view holds vectors and tensors
 UNNAMED_GROUP = "unnamed"  # the group of cells that are in no other
 MOST_MATERIAL_GROUPS = 1000  # gmsh takes minutes to open a 2.2 file with 200,000, meshio hours for a 4.1
 
@@ -309,29 +309,28 @@ def _views(model: Model, parts: list[Part]) -> list[str]:
     """The $ElementData sections, with the elements in the order of the file: meshio goes by that."""
     numbers = np.concatenate([part.numbers for part in parts])
     of_cell = np.concatenate([part.rows if part.rows.ndim == 1 else part.rows[:, 0] for part in parts])
-    return [
-        _section("ElementData", f'1\n"{name}"\n1\n0.0\n3\n0\n1\n{len(numbers)}\n', rows(numbers, values[of_cell]))
-        for name, values in _fields(model).items()
-    ] + [_node_view(name, values) for name, values in _node_fields(model).items()]
+    of_cells = [_view("ElementData", name, numbers, values[of_cell]) for name, values in _fields(model).items()]
+    at_nodes = {name: node_field(values, model.mesh, model.order) for name, values in model.point_data.items()}
+    points = np.arange(1, len(elements(model)[0]) + 1)
+    return of_cells + [_view("NodeData", name, points, values) for name, values in _view_columns(at_nodes).items()]
 
 
-def _node_view(name: str, values: NDArray) -> str:
-    """A $NodeData section."""
-    n_columns, numbers = values[0].size, np.arange(1, len(values) + 1)
-    return _section("NodeData", f'1\n"{name}"\n1\n0.0\n3\n0\n{n_columns}\n{len(values)}\n', rows(numbers, values))
+def _view(section: str, name: str, numbers: NDArray[np.int64], values: NDArray) -> str:
+    n_columns = values[0].size
+    return _section(section, f'1\n"{name}"\n1\n0.0\n3\n0\n{n_columns}\n{len(numbers)}\n', rows(numbers, values))
 
 
-def _node_fields(model: Model) -> dict[str, NDArray[np.float64]]:
-    """Point data of each node, vectors and tensors of gmsh's as they are, else scalars."""
-    fields: dict[str, NDArray[np.float64]] = {}
-    for name, values in model.point_data.items():
-        filled = node_field(values, model.mesh, model.order).astype(np.float64)
-        fields |= {name: filled} if filled.shape[1:] in VIEW_SHAPES else as_scalars(name, filled)
-    return fields
+def _view_columns(fields: dict[str, NDArray]) -> dict[str, NDArray[np.float64]]:
+    """Fields as views hold them: numbers, vectors and tensors; the columns of others one by one."""
+    columns: dict[str, NDArray[np.float64]] = {}
+    for name, values in fields.items():
+        exact = values.astype(np.float64)
+        columns |= {name: exact} if exact.shape[1:] in VIEW_SHAPES else as_scalars(name, exact)
+    return columns
 
 
 def _fields(model: Model) -> dict[str, NDArray[np.float64]]:
-    """All that there is of each cell, (M,) float64, by name."""
+    """All that there is of each cell, (M,), (M, 3) or (M, 9) float64, by name."""
     fields = dict(model.cell_data)
     if model.materials is not None:
         of_cell = model.materials.of_cell
@@ -339,5 +338,4 @@ def _fields(model: Model) -> dict[str, NDArray[np.float64]]:
     check_apart(list(fields), model.sets.cells)
     for name, members in model.sets.cells.items():
         fields[name] = np.isin(np.arange(len(model.mesh.cells)), members)
-    scalars = [as_scalars(name, values.astype(np.float64)) for name, values in fields.items()]
-    return {name: values for each in scalars for name, values in each.items()}
+    return _view_columns(fields)
