@@ -291,7 +291,7 @@ def test_what_the_file_says_is_what_fem_solves(case, order):
             a, b, c = points[corners[:3]]
             push = -float(load.findtext("pressure")) * np.cross(b - a, c - a) / 6.0
             forces[corners[-3:]] += push  # corners of a linear facet; midpoints of a quadratic one
-    springs = np.zeros(points.shape)
+    springs = np.zeros((len(points), 3, 3))
     stiffness = {each.get("id"): float(each.findtext("E")) for each in root.iter("discrete_material")}
     for each in root.iter("discrete"):
         (pairs,) = (one for one in root.iter("DiscreteSet") if one.get("name") == each.get("discrete_set"))
@@ -299,10 +299,10 @@ def test_what_the_file_says_is_what_fem_solves(case, order):
             here, there = listed(pair) - 1
             along = (points[there] - points[here]) / np.linalg.norm(points[there] - points[here])
             assert is_prescribed[there].all()
-            springs[here] += stiffness[each.get("dmat")] * along**2
+            springs[here] += stiffness[each.get("dmat")] * np.outer(along, along)
     n = len(elements(model)[0])
-    np.testing.assert_allclose(springs, springs[:, :1] * np.ones(3))  # the same in all directions
-    u = displaced(model, is_prescribed[:n], prescribed[:n], forces[:n], springs[:n, 0])
+    np.testing.assert_allclose(springs, springs[:, :1, :1] * np.eye(3), atol=1e-12)  # the same in all directions
+    u = displaced(model, is_prescribed[:n], prescribed[:n], forces[:n], springs[:n, 0, 0])
     np.testing.assert_allclose(u, solved_model(model).u, atol=1e-9 * np.abs(u).max())
 
 
