@@ -194,8 +194,8 @@ def _advise(model: Model) -> None:
     if model.order == 1 and largest >= LOCKING_NU:
         log.print(
             f"nu is up to {largest:g}, where linear cells are too stiff: their displacements were off by 1.6 to 1.8 "
-            "times as much as those of quadratic cells on as many nodes at 0.45, 2.4 to 2.8 times at 0.49; try --order 2 "
-            "(docs/order.md)"
+            "times as much as those of quadratic cells on as many nodes at 0.45, 2.4 to 2.8 times at 0.49; try "
+            "--order 2 (docs/order.md)"
         )
 
 
