@@ -289,6 +289,7 @@ def test_baseline(head, tmp_path, capsys):
         (["--max-seconds", "0"], "--max-seconds"),
         (["--reference-seconds", "10"], "--reference-dofs sets the size of the reference already"),
         (["--young", "h-1000"], "modulus: expected 0 kPa or more"),
+        (["--average", "voigt"], "average: expected mean, geometric, harmonic, hill"),
     ],
 )
 def test_bad_input(head, tmp_path, options, words, capsys):
