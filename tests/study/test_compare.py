@@ -107,7 +107,7 @@ def test_the_keys_of_the_report(run):
         *("surface_mean_mm", "surface_p95_mm", "volume_mm3", "voxels"),
     }
     assert set(median["fem"]["0.3"]) == {"averages", "cg_iterations", "cond", "lambda_max"}
-    assert set(median["fem"]["0.3"]["averages"]) == {"geometric", "mean"}
+    assert set(median["fem"]["0.3"]["averages"]) == {"gauss", "mean"}
     assert set(median["fem"]["0.3"]["averages"]["mean"]) == {"errors", "seconds", "strain_energy"}
     assert set(report["options"]) == {
         *("classes", "curve", "iterations", "k_D", "max_bytes", "max_seconds", "nodes", "nus", "percent", "pipelines"),
@@ -161,7 +161,7 @@ def test_the_quadratic_mesh_is_a_coarser_one(run, head):
         assert median["n_nodes"] == len(quadratic(mesh.points, mesh.cells)[0])
         assert 0.75 < median["n_nodes"] / 400 < 1.25  # of a lattice there are few so coarse
         bottom, top = box_faces(image, mesh)
-        for average in ("mean", "geometric"):
+        for average in ("mean", "gauss"):
             young = cell_young(nearest(modulus, image), mesh, average=average)
             pressed = compression(
                 mesh, young, 0.45, fixed_nodes=top, pushed_nodes=bottom, order=2,

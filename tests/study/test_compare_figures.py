@@ -101,7 +101,7 @@ def test_histograms_are_those_of_the_report():
 def test_curves_are_those_of_the_report(is_by_time):
     report = fake_report()
     solved = report.curves[1].points[0].fem["0.3"].averages
-    solved["geometric"] = solved["geometric"]._replace(errors=solved["geometric"].errors._replace(displacement=None))
+    solved["gauss"] = solved["gauss"]._replace(errors=solved["gauss"].errors._replace(displacement=None))
     panels = np.array(curves_figure(report, is_by_time=is_by_time).axes).reshape(2, 3)
     for row, nu in enumerate(("0.3", "0.45")):
         for axes, (name, _) in zip(panels[row], ERROR_TITLES, strict=True):
@@ -109,7 +109,7 @@ def test_curves_are_those_of_the_report(is_by_time):
             lines = {line.get_label(): line for line in axes.lines}
             assert list(lines) == [curve_title(curve) for curve in report.curves]
             for curve in report.curves:
-                rows = [(p.n_nodes, p.fem[nu].averages["geometric"]) for p in curve.points]
+                rows = [(p.n_nodes, p.fem[nu].averages["gauss"]) for p in curve.points]
                 expected = [(s.seconds if is_by_time else n, getattr(s.errors, name)) for n, s in rows]
                 shown = list(zip(*lines[curve_title(curve)].get_data(), strict=True))
                 assert shown == sorted(pair for pair in expected if pair[1] is not None)

@@ -77,10 +77,10 @@ def fake_run(seed, scale, order=1):
 
 
 def simulation_of(random, scale):
-    """The geometric mean errs a fifth less than Eq. (2)'s."""
+    """The default average errs a fifth less than Eq. (2)'s."""
     averages = {
         name: Solved(random.uniform(1.0, 2.0), errors_of(factor * scale), 0.5 / scale)
-        for name, factor in (("mean", 1.0), ("geometric", 0.8))
+        for name, factor in (("mean", 1.0), ("gauss", 0.8))
     }
     return Simulation(random.uniform(1e2, 1e3), random.uniform(1e3, 1e5), int(random.integers(80, 300)), averages)
 
@@ -218,9 +218,9 @@ PATHS = {
         for nu in ("0.3", "0.45")
         for cells in ("linear", "quadratic")
         for title, keys in (
-            ("strain-energy error", ("averages", "geometric", "errors", "strain_energy")),
-            ("displacement error", ("averages", "geometric", "errors", "displacement")),
-            ("interface-strain error", ("averages", "geometric", "errors", "interface_strain")),
+            ("strain-energy error", ("averages", "gauss", "errors", "strain_energy")),
+            ("displacement error", ("averages", "gauss", "errors", "displacement")),
+            ("interface-strain error", ("averages", "gauss", "errors", "interface_strain")),
             ("λ max", ("lambda_max",)),
             ("condition number", ("cond",)),
             ("CG iterations", ("cg_iterations",)),
@@ -295,19 +295,19 @@ def test_every_order_and_average_has_a_row(tmp_path):
     for nu in ("0.3", "0.45"):
         for title, name in (("strain-energy", "strain_energy"), ("displacement", "displacement")):
             for cells, pipelines in (("linear", report.pipelines), ("quadratic", report.quadratic)):
-                for average in ("mean", "geometric"):
+                for average in ("mean", "gauss"):
                     texts = places[f"{title} error, ν = {nu}", f"{cells} cells, {average}"]
                     for text, pipeline in zip(texts, pipelines, strict=True):
                         if pipeline.median is not None:
                             solved = pipeline.median.measurement.fem[nu].averages[average]
                             assert close(text, getattr(solved.errors, name))
-    best = report.quadratic[0].median.measurement.fem["0.3"].averages["geometric"].errors
+    best = report.quadratic[0].median.measurement.fem["0.3"].averages["gauss"].errors
     line = (
         "At about 5000 nodes in all and ν = 0.3, the displacement&#x27;s error is smallest with tetopt, quadratic "
-        f"cells, geometric: {number_text(best.displacement)} (strain energy {number_text(best.strain_energy)})."
+        f"cells, gauss: {number_text(best.displacement)} (strain energy {number_text(best.strain_energy)})."
     )
     assert line in page
-    assert "The best with linear cells, and of the others: </strong>tetopt, linear cells, geometric: 0.08;" in page
+    assert "The best with linear cells, and of the others: </strong>tetopt, linear cells, gauss: 0.08;" in page
     assert page.index("ν = 0.45, the displacement") > page.index(line)
 
 
@@ -317,8 +317,8 @@ def test_errors_at_equal_times(tmp_path):
     _, *rows = Tables(page_of(tmp_path, report)).tables[2]
     shown = {(row[0][1][0], row[1][1][0]): [cell[1][0] for cell in row[2:]] for row in rows}
     assert len(shown) == 2 * len(finished(report))
-    linear = report.pipelines[0].median.measurement.fem["0.3"].averages["geometric"]
-    points = [point.fem["0.3"].averages["geometric"] for point in report.curves[4].points]
+    linear = report.pipelines[0].median.measurement.fem["0.3"].averages["gauss"]
+    points = [point.fem["0.3"].averages["gauss"] for point in report.curves[4].points]
     assert report.curves[4].order == 2
     # Of the fake report: error x seconds is the same for all, so that the line is straight on logarithms.
     expected = points[0].errors.displacement * points[0].seconds / linear.seconds
@@ -326,7 +326,7 @@ def test_errors_at_equal_times(tmp_path):
     assert close(seconds, linear.seconds)
     assert close(own, linear.errors.displacement)
     assert close(theirs, expected)
-    report.pipelines[0].median.measurement.fem["0.3"].averages["geometric"] = linear._replace(seconds=5.0)
+    report.pipelines[0].median.measurement.fem["0.3"].averages["gauss"] = linear._replace(seconds=5.0)
     _, row, *_ = Tables(page_of(tmp_path, report)).tables[2]
     assert [cell[1][0] for cell in row[2:]] == ["5", number_text(linear.errors.displacement), "–"]
 
