@@ -307,7 +307,7 @@ def test_every_order_and_average_has_a_row(tmp_path):
         f"cells, gauss: {number_text(best.displacement)} (strain energy {number_text(best.strain_energy)})."
     )
     assert line in page
-    assert "The best with linear cells, and of the others: </strong>tetopt, linear cells, gauss: 0.08;" in page
+    assert "</strong> The best with linear cells, and of the others: tetopt, linear cells, gauss: 0.08;" in page
     assert page.index("ν = 0.45, the displacement") > page.index(line)
 
 

@@ -499,8 +499,11 @@ def simulation_sentences(report: Report) -> list[str]:
             for name in dict.fromkeys(row.pipeline.name for row in rows if row.pipeline.kind != best.pipeline.kind)
         ]
         rest = [f"{row.words}: {number_text(row.error)}" for row in others if row is not None]
-        text += f" The best with {ORDER_WORDS[3 - best.order]} cells, and of the others: " if rest else ""
-        words.append(f"<p><strong>{html.escape(text)}</strong>{html.escape('; '.join(dict.fromkeys(rest)))}</p>")
+        words.append(f"<p><strong>{html.escape(text)}</strong>")
+        if rest:
+            also = f" The best with {ORDER_WORDS[3 - best.order]} cells, and of the others: "
+            words[-1] += html.escape(also + "; ".join(dict.fromkeys(rest)))
+        words[-1] += "</p>"
     return words
 
 
