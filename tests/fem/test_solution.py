@@ -591,3 +591,17 @@ def test_forces_that_do_not_balance_are_an_error(monkeypatch):
     monkeypatch.setattr(module, "constrained", with_leak)
     with pytest.raises(RuntimeError, match=r"^elasticity: forces and reactions do not balance, .* mN are left where"):
         solved_model(model)
+
+
+# What a set's reaction is made of
+
+
+def test_reactions_of_a_set_add_up():
+    """Held along single axes by two loads, and on springs besides: one force, which balances the others."""
+    mesh, sets = bar(3)
+    words = ["move:inferior:0,0,free", "move:inferior:free,free,0.1", "spring:inferior:2", "traction:superior:1,0,3"]
+    for order in (1, 2):
+        solution = solved_model(model_of(mesh, young=10.0, known_sets=sets, loads=words, order=order))
+        assert list(solution.reactions) == ["inferior"]
+        # The springs pull by 2 kPa/mm * 0.1 mm on 4 mm2; the support's part is what is left.
+        np.testing.assert_allclose(solution.reactions["inferior"], [-4.0, 0.0, -12.0], atol=1e-7)

@@ -11,10 +11,11 @@ import pytest
 import tetopt
 from tetopt.cli import main
 from tetopt.fem.elasticity import check_fills_box
+from tetopt.io.images import sha256
 from tetopt.study.child import run_in_child
 from tetopt.study.interfaces import class_labels
 from tetopt.study.pipelines import Job
-from tetopt.study.program import by_program, parse_program, pipelines_with
+from tetopt.study.program import by_program, file_checksums, parse_program, pipelines_with
 
 PHANTOM = tetopt.load_phantom("sphere")
 IMAGE = PHANTOM.image(voxel_mm=4.0)
@@ -179,3 +180,11 @@ def test_programs_in_the_comparison(tmp_path, opengl):
     _, mine, other = json.loads((out / "report.json").read_text())["pipelines"]
     assert np.array_equal([mine["median"]["E_D"]], before)
     assert set(other["median"]["fem"]) == {"0.3", "0.45"}
+
+
+def test_checksums_are_of_the_files_of_a_command_line(tmp_path):
+    """The program and every file; a shell's whole script, too long to be a file's name, is none."""
+    (tmp_path / "a.txt").write_text("x")
+    script = shlex.quote("echo hello; " * 100)
+    program = parse_program(f"mine={PYTHON} -c {script} {tmp_path / 'a.txt'} {{image}} {{output}}")
+    assert file_checksums(program) == [sha256(Path(sys.executable)), sha256(tmp_path / "a.txt")]

@@ -31,6 +31,7 @@ from tetopt.io.frd import read_frd
 from tetopt.io.images import sha256
 from tetopt.io.meshes import MeshFile
 from tetopt.io.vtk import box_text
+from tetopt.model.averages import DEFAULT_AVERAGE
 from tetopt.model.fields import cell_fields, is_result, is_stress
 from tetopt.model.sets import box_of
 from tetopt.report.summary import model_summary, versions
@@ -73,6 +74,8 @@ def convert_command(
         loaded = _with_results(loaded, results_path)
     solver = replace(solver, order=_order_of(loaded, solver, output))
     check_solver_options(output, solver, has_materials="young" in loaded.cell_data)
+    if image_path is None and solver.average != DEFAULT_AVERAGE:
+        raise InputError(f"--average: {solver.average} is over an image's voxels; give the image (--image)")
     if not solver.loads and not format_of(output).is_surface:
         solver = replace(solver, loads=loads_of(loaded))
     fields, box = dict(loaded.cell_data), loaded.box

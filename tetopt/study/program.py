@@ -6,6 +6,7 @@ It runs in the folder in which `tetopt` was started; image, labels and mesh lie 
 
 from __future__ import annotations
 
+import os
 import re
 import shlex
 import shutil
@@ -204,7 +205,8 @@ def boxed(image: Image, mesh: Mesh) -> tuple[Mesh, list[str]]:
 def file_checksums(program: Program) -> list[str]:
     """SHA-256 of the program, and of every file that its command line names, such as a script."""
     files = (shutil.which(word) or word for word in shlex.split(program.command))
-    return [sha256(Path(name)) for name in files if Path(name).is_file()]
+    # By os.path: to Path.is_file a word that is too long for a name, as a shell's whole script may be, is an error.
+    return [sha256(Path(name)) for name in files if os.path.isfile(name)]
 
 
 def pipelines_with(programs: Sequence[Program]) -> dict[str, Pipeline]:
