@@ -6,6 +6,7 @@ import naive
 import numpy as np
 import pytest
 import skfem
+from meshes import random_affine
 from skfem.models.elasticity import lame_parameters, linear_elasticity
 
 import tetopt
@@ -19,6 +20,7 @@ from tetopt.fem.reference import (
     near_interface,
     nearest,
     reference,
+    refined,
 )
 from tetopt.fem.voxels import Work, element_stiffness
 from tetopt.geometry.quadratic import quadratic
@@ -184,6 +186,18 @@ def test_nearest_takes_the_voxel_around_the_centre():
     image = tetopt.Image(np.arange(6.0).reshape(3, 2))
     fine = tetopt.Image(np.zeros((9, 4)), np.diag([1 / 3, 1 / 2, 1.0]))
     np.testing.assert_array_equal(nearest(image, fine).data, image.data.repeat(3, axis=0).repeat(2, axis=1))
+
+
+def test_refined_is_the_same_field():
+    """Every voxel is divided evenly, so that the mean stays; the box, and what a place in it holds, are the same."""
+    image = tetopt.Image(np.random.default_rng(3).uniform(size=(5, 4, 3)), random_affine(np.random.default_rng(4), 3))
+    fine = refined(image, (11, 4, 8))
+    assert fine.shape == (10, 4, 9)
+    assert fine.data.mean() == pytest.approx(image.data.mean(), rel=1e-12)
+    index = np.stack(np.meshgrid(*(np.arange(s) for s in fine.shape), indexing="ij"), axis=-1).reshape(-1, 3)
+    of = np.rint(image.to_index(fine.to_world(index.astype(float)))).astype(int)
+    np.testing.assert_array_equal(fine.data.ravel(), image.data[tuple(of.T)])
+    np.testing.assert_array_equal(refined(image, image.shape).data, image.data)
 
 
 def test_own_error_is_that_of_half_the_resolution():

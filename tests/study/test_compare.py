@@ -9,10 +9,10 @@ import tetopt
 from tetopt.cli import main
 from tetopt.fem.budget import Budget
 from tetopt.fem.elasticity import box_faces, compression, push_of
-from tetopt.fem.reference import Errors, averaged, nearest, reference
+from tetopt.fem.reference import Errors, averaged, nearest, reference, refined
 from tetopt.fem.reference import compare as reference_errors
 from tetopt.geometry.quadratic import quadratic
-from tetopt.model.averages import cell_young, young_image
+from tetopt.model.averages import element_young, young_image
 from tetopt.study import compare, tradeoff
 from tetopt.study.compare_files import COMPARE_PICTURES
 from tetopt.study.compare_report import Attempt, ImageSource, Settings, as_json, from_json
@@ -162,7 +162,7 @@ def test_the_quadratic_mesh_is_a_coarser_one(run, head):
         assert 0.75 < median["n_nodes"] / 400 < 1.25  # of a lattice there are few so coarse
         bottom, top = box_faces(image, mesh)
         for average in ("mean", "gauss"):
-            young = cell_young(nearest(modulus, image), mesh, average=average)
+            young = element_young(refined(modulus, image.shape), mesh, None, average, 2)
             pressed = compression(
                 mesh, young, 0.45, fixed_nodes=top, pushed_nodes=bottom, order=2,
                 displacement=push_of(image, settings.percent),

@@ -203,6 +203,23 @@ def averaged(image: Image, shape: tuple[int, ...]) -> Image:
     return Image(data, image.affine @ wider)
 
 
+def refined(image: Image, shape: tuple[int, ...]) -> Image:
+    """The same field on voxels divided evenly, into about so many along each axis.
+
+    Each voxel has as many parts as the others, so that means over parts of the box are those of the field. Values at
+    the centres of another grid (`nearest`) take some voxels more often: MNI152 at 2 mm, looked up at 1 mm, has a mean
+    modulus that is 0.6 % too high, which is as much as the errors that are measured.
+    """
+    data, n = image.data, image.ndim
+    parts = [max(int(np.rint(new / old)), 1) for new, old in zip(shape, image.shape, strict=True)]
+    for axis, count in enumerate(parts):
+        data = np.repeat(data, count, axis=axis)
+    smaller = np.eye(n + 1)
+    smaller[:n, :n] = np.diag(1.0 / np.array(parts))
+    smaller[:n, n] = (1.0 / np.array(parts) - 1.0) / 2.0
+    return Image(data, image.affine @ smaller)
+
+
 def nearest(image: Image, grid: Image) -> Image:
     """The image's values at the centres of another grid over the same box, each from the voxel around it."""
     places = [

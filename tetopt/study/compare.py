@@ -26,7 +26,7 @@ from tetopt.errors import InputError
 from tetopt.fem.budget import affordable_dofs, reference_shape
 from tetopt.fem.conditioning import conditioning
 from tetopt.fem.elasticity import box_faces, check_fills_box, compression, push_of
-from tetopt.fem.reference import Reference, averaged, compare, nearest, reference
+from tetopt.fem.reference import Reference, averaged, compare, nearest, reference, refined
 from tetopt.geometry.simplex import dihedral_angles
 from tetopt.image import Image
 from tetopt.io.files import save_json
@@ -90,7 +90,7 @@ class Standard(NamedTuple):
     image: Image
     labels: Image  # materials, on the image's voxels
     modulus: Image  # kPa, of the reference's grid, piecewise constant
-    modulus_fine: Image  # the same field at the image's voxels
+    modulus_fine: Image  # the same field on about as many voxels as the image
     coarse_labels: NDArray  # of the reference's voxels
     references: dict[str, Reference]  # by nu
     averages: tuple[str, ...]  # of a cell's moduli
@@ -134,7 +134,13 @@ def prepared(image: Image, labels: Image, law: Law, settings: Settings, say: Say
         say(f"reference: {' x '.join(map(str, modulus.shape))} voxels, nu = {nu:g}")
         references[f"{nu:g}"] = reference(modulus, nu, settings.percent)
     return Standard(
-        image, labels, modulus, nearest(modulus, fine), nearest(labels, modulus).data, references, averages_of(settings)
+        image,
+        labels,
+        modulus,
+        refined(modulus, fine.shape),
+        nearest(labels, modulus).data,
+        references,
+        averages_of(settings),
     )
 
 
