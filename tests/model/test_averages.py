@@ -260,3 +260,14 @@ def test_a_model_has_moduli_at_gauss_points():
     assert abs(one.strain_energy / other.strain_energy - 1.0) > 1e-4
     groups = model_of(mesh, image, young=law, average="gauss", order=2, bins=3)
     assert (groups.gauss_young, len(groups.materials.young)) == (None, 3)
+
+
+def test_voxels_are_taken_in_parts(monkeypatch):
+    """Seven at a time, as a large image's are by the million: the same moduli."""
+    image = Image(np.random.default_rng(5).uniform(1.0, 9.0, (6, 5, 7)), np.eye(4))
+    mesh = lattice(image, blocks=(2, 2, 2))
+    whole = element_young(image, mesh, average="gauss", order=2), node_young(image, mesh)
+    monkeypatch.setattr("tetopt.model.averages.VOXELS_PER_CHUNK", 7)
+    parts = element_young(image, mesh, average="gauss", order=2), node_young(image, mesh)
+    for one, other in zip(whole, parts, strict=True):
+        np.testing.assert_allclose(one, other, rtol=1e-13)
