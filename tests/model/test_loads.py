@@ -83,6 +83,15 @@ def test_a_model_may_hold_without_pushing():
     assert parse_loads([], model.mesh, model.sets) == ()
 
 
+def test_step_1_may_have_the_loads_of_all_steps_alone():
+    """As weight in all, and a pressure from step 2 on."""
+    model = sample_model(3)
+    loads = parse_loads(["hold:left", "2/pressure:right:1"], model.mesh, model.sets)
+    assert count_of_steps(loads) == 2
+    assert [load.kind for load in in_step(loads, 1)] == ["displacement"]
+    assert [load.kind for load in in_step(loads, 2)] == ["displacement", "pressure"]
+
+
 def test_components_and_steps_keep_displacements_apart():
     """The same nodes may be held along one axis by one load and along another by the next, or in other steps."""
     model = sample_model(3)
@@ -134,7 +143,7 @@ def test_components_and_steps_keep_displacements_apart():
         (["/hold:left"], "a step of 1 or more"),
         (["9" * 5000 + "/hold:left"], "a step of 1 or more"),
         (["1/hold:left", "9999/hold:left"], "a step 9999, but no load is of step 2 alone"),
-        (["hold:left", "2/pressure:right:1"], "a step 2, but no load is of step 1 alone"),
+        (["hold:left", "3/pressure:right:1"], "a step 3, but no load is of step 2 alone"),
         (["1/hold:left", "3/hold:left"], "a step 3, but no load is of step 2 alone"),
         (["hold:left", "2/move:left:0,0,1", "1/pressure:right:1"], "cannot go both ways"),
         (["move:left:free,0,free", "move:posterior:1,2,free"], "cannot go both ways"),

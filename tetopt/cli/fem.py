@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 INTENSITY_LAW = "h"  # an image without --young: its intensities are the moduli, as in the paper
 PAPER_PERCENT = 1.0  # how far the paper's test compresses, for a linear law only a scale
 SHOWN_SHARE = 1e-9  # of a force's largest component: less is what an iterative solution leaves
+SMALL_SHARE = 0.1  # of the mesh's length: displacements beyond it are not small, at strains of some 10 %
 LOCKING_NU = 0.45  # from where on linear cells are far behind quadratic ones, see docs/order.md
 
 
@@ -92,7 +93,7 @@ def fem_command(
     solutions, extremes = _solved(task, of_box if conditioning is None else conditioning)
     if output is not None:
         save_model(output, _with_results(task, solutions))
-    _advise(task)
+    _advise(task, solutions)
     _print(mesh_path.name, task, solutions, extremes)
     if json_path is not None:
         options = {**asdict(model), "compress_percent": compress, **part.stated()}
@@ -187,8 +188,8 @@ def _lists(reactions: dict[str, NDArray[np.float64]]) -> dict[str, list[float]]:
     return {name: force.tolist() for name, force in reactions.items()}
 
 
-def _advise(model: Model) -> None:
-    """A line where the cells are of the wrong order for the material."""
+def _advise(model: Model, solutions: list[Solution]) -> None:
+    """Lines where the cells are of the wrong order for the material, or the displacements too large for the method."""
     assert model.materials is not None, "it has been solved"
     largest = float(model.materials.nu.max())
     if model.order == 1 and largest >= LOCKING_NU:
@@ -196,6 +197,14 @@ def _advise(model: Model) -> None:
             f"nu is up to {largest:g}, where linear cells are too stiff: their displacements were off by 1.6 to 1.8 "
             "times as much as those of quadratic cells on as many nodes at 0.45, 2.4 to 2.8 times at 0.49; try "
             "--order 2 (docs/order.md)"
+        )
+    size = float(np.ptp(model.mesh.points, axis=0).max())
+    moved = max(float(np.sqrt((solution.u**2).sum(axis=1).max())) for solution in solutions)
+    if moved > SMALL_SHARE * size:
+        log.print(
+            f"the largest displacement, {moved:.4g} mm, is {moved / size:.0%} of the mesh's length: small "
+            "displacements, which this solves, no longer hold; look at the loads and at what is held, or write a file "
+            "for CalculiX with --nonlinear"
         )
 
 

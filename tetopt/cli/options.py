@@ -133,7 +133,12 @@ class SizeOptions:
 
     panel: ClassVar[str] = "Number and size of cells"
     nodes: Annotated[
-        int | None, option("N", f"Wanted number of nodes (default {DEFAULT_NODES[3]}; {DEFAULT_NODES[2]} in 2-D).")
+        int | None,
+        option(
+            "N",
+            "Wanted number of nodes, with --order 2 mid-edge ones too "
+            f"(default {DEFAULT_NODES[3]}; {DEFAULT_NODES[2]} in 2-D).",
+        ),
     ] = None
     target_error: Annotated[
         float | None, option("T", "As many nodes as leave this share of the image's variance in cells, instead.")

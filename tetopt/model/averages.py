@@ -120,7 +120,7 @@ def cell_young(image: Image, mesh: Mesh, law: Law = None, average: str = "mean")
     field = young_image(image, law)
     owner = cell_of_voxel(field, mesh).ravel()
     _check_above_zero(parsed, image, field, owner)
-    return _averages(field, owner, parsed.power, centroids(mesh.points, mesh.cells))
+    return _of_cells(field, mesh, owner, parsed.power)
 
 
 def cell_values(image: Image, mesh: Mesh, law: Law) -> NDArray[np.float64]:
@@ -136,7 +136,7 @@ def cell_values(image: Image, mesh: Mesh, law: Law) -> NDArray[np.float64]:
         at = image.data[~np.isfinite(values)].ravel()[0]
         raise InputError(f"law: it has no value at intensity {at:g}; give one defined over the image's whole range")
     field = Image(values, image.affine)
-    return _averages(field, cell_of_voxel(field, mesh).ravel(), 1.0, centroids(mesh.points, mesh.cells))
+    return _of_cells(field, mesh, cell_of_voxel(field, mesh).ravel(), 1.0)
 
 
 def node_young(image: Image, mesh: Mesh, law: Law = None) -> NDArray[np.float64]:
@@ -179,7 +179,7 @@ def element_young(
 
     The latter with "nodes", see `gauss_young`, and with "gauss" and order 2: each Gauss point, of which one is near
     each corner, has the geometric mean of the cell's voxels that are nearest to that corner in barycentric coordinates;
-    without any, the modulus of the voxel that it is in. So a quadratic cell has as many moduli as corners, which need
+    without any, that of the whole cell. So a quadratic cell has as many moduli as corners, which need
     not agree with its neighbours', as at an interface they do not.
 
     Raises
@@ -199,8 +199,9 @@ def element_young(
     part = np.full(len(owner), -1)
     for voxels, hats in _places(field, mesh, owner):
         part[voxels] = len(places) * owner[voxels] + np.argmax(hats, axis=1)
-    at = np.einsum("qa,cai->cqi", places, mesh.points[mesh.cells]).reshape(-1, mesh.ndim)
-    return _averages(field, part, 0.0, at).reshape(len(mesh.cells), len(places))
+    young, is_empty = _averages(field, part, 0.0, len(mesh.cells) * len(places))
+    shape = len(mesh.cells), len(places)
+    return np.where(is_empty.reshape(shape), _of_cells(field, mesh, owner, 0.0)[:, None], young.reshape(shape))
 
 
 def gauss_young(node_young: NDArray[np.float64], mesh: Mesh, order: int) -> NDArray[np.float64]:
@@ -243,26 +244,30 @@ def _check_above_zero(average: Average, image: Image, field: Image, owner: NDArr
         )
 
 
-def _averages(
-    field: Image, owner: NDArray[np.int64], power: float | None, places: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Mean of powers, or Hill's average, of the voxels that each part owns; if none, of that nearest to its place.
+def _of_cells(field: Image, mesh: Mesh, owner: NDArray[np.int64], power: float | None) -> NDArray[np.float64]:
+    """The average over each cell; without any voxel centre in it, the value of the voxel at its centroid."""
+    averages, is_empty = _averages(field, owner, power, len(mesh.cells))
+    averages[is_empty] = nearest_values(field, centroids(mesh.points, mesh.cells[is_empty]))
+    return averages
 
-    `owner` has a number of a part, or -1, for each voxel; `places` (K, n) mm.
+
+def _averages(
+    field: Image, owner: NDArray[np.int64], power: float | None, n_parts: int
+) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """Mean of powers, or Hill's average, of the voxels that each part owns, and whether it has none.
+
+    `owner` has a number of a part, or -1, for each voxel.
     """
     inside = owner >= 0
     part, values = owner[inside], field.data.ravel()[inside].astype(np.float64)
-    n_voxels = np.bincount(part, minlength=len(places))
-    ranges = ranges_of(owner, field.data.ravel(), len(places))
+    n_voxels = np.bincount(part, minlength=n_parts)
+    ranges = ranges_of(owner, field.data.ravel(), n_parts)
     if power is None:
         averages = 0.5 * sum(_powers(part, values, n_voxels, ranges, each) for each in (1.0, -1.0))
     else:
         averages = _powers(part, values, n_voxels, ranges, power)
     # Within their range, so that a cell of equal values has exactly that value: constants stay one material.
-    averages = np.clip(averages, *ranges)
-    is_empty = n_voxels == 0
-    averages[is_empty] = nearest_values(field, places[is_empty])
-    return averages
+    return np.clip(averages, *ranges), n_voxels == 0
 
 
 def _powers(

@@ -91,8 +91,9 @@ def in_step(loads: Iterable[Load], step: int) -> tuple[Load, ...]:
 
 
 def check_steps(loads: Iterable[Load]) -> None:
-    """InputError if steps leave a number out."""
-    numbers = sorted({load.step for load in loads} - {0})
+    """InputError if steps leave a number out; step 1 may have the loads of all steps alone."""
+    steps = {load.step for load in loads}
+    numbers = sorted(steps | {1} if 0 in steps else steps)[0 in steps :]
     for expected, number in enumerate(numbers, start=1):
         if number != expected:
             raise InputError(
