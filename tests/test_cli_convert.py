@@ -153,7 +153,7 @@ def test_commands_take_a_quadratic_mesh(folder, quadratic_path, tmp_path, capsys
     assert (both["size"]["n_nodes_in_all"], linear["size"]["n_nodes_in_all"]) == (n_all, len(mesh.points))
     improved = [numbers_in(tmp_path / f"{name}_improved.json") for name in ("a", "quadratic")]
     assert improved[0]["mesh_sha256"] == improved[1]["mesh_sha256"]
-    assert improved[1]["size"]["order"] == 1  # unless --order says otherwise
+    assert improved[1]["size"]["order"] == 2  # as the mesh read
     for name in ("nii.gz", "stl"):
         assert (tmp_path / f"a.{name}").stat().st_size == (tmp_path / f"quadratic.{name}").stat().st_size
 

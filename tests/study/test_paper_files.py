@@ -157,7 +157,7 @@ def test_fem(tmp_path, block, capsys):
         (["--young", "open('x')"], "cannot use"),
         (["--young", "h - 100"], "such as -50 at intensity 50"),
         (["--young", "0:1,100:1", "--compress", "200"], "--compress: expected a percentage"),
-        (["--young", "0:0"], "average: expected moduli above 0 kPa for geometric"),
+        (["--young", "0:0"], "average: expected moduli above 0 kPa for gauss"),
         (["--young", "0:0", "--average", "mean"], "young: expected moduli above 0 kPa"),
         (["--average", "power:20"], 'power:P with P from -10 to 10, such as power:0.5, got "power:20"'),
         (["--nu", "0.5"], "nu"),

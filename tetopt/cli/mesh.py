@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -34,6 +35,7 @@ from tetopt.engine.meshing import Run, mesh_image
 from tetopt.geometry.box import box_sides
 from tetopt.geometry.simplex import centroids, squared_edges
 from tetopt.io.files import save_json
+from tetopt.io.formats import format_of
 from tetopt.io.meshes import MeshFile
 from tetopt.io.mni import mni_path
 from tetopt.measure.quality import quality
@@ -92,6 +94,8 @@ def _read(plan: Plan) -> Task:
     if plan.start.start is not None:
         started = read_mesh(plan.start.start)
         _check_place(started.mesh, source.contrasts[0], str(plan.start.start))
+        if plan.solver.order is None and started.order == 2 and format_of(plan.output.mesh).has_quadratic:
+            plan = plan._replace(solver=replace(plan.solver, order=2))
     plan, sizes = with_numbers(plan, source.content)
     return Task(plan, source, started, sizes)
 
