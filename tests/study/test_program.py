@@ -89,6 +89,14 @@ def test_a_boundary_near_the_box_is_put_on_it():
     assert made.notes[1] == "its boundary was moved by up to 0.5 voxels onto the sides of the image's box"
 
 
+def test_flat_cells_on_the_sides_are_taken_off():
+    """As where points of a side are found roughly: a node a little inside, under a cell that is all but flat."""
+    made, smooth = (by_program(JOB, parse_program(command(kind))) for kind in ("rough", "wide"))
+    check_fills_box(IMAGE, made.mesh)
+    assert len(made.mesh.cells) == len(smooth.mesh.cells)
+    assert made.notes[1] == "its boundary was moved by up to 0.5 voxels onto the sides of the image's box"
+
+
 def test_a_boundary_far_from_the_box_stays():
     made = by_program(JOB, parse_program(command("small")))
     assert made.notes[1] == "its boundary lies up to 3 voxels off the sides of the image's box"

@@ -20,7 +20,7 @@ from typing import NamedTuple
 import numpy as np
 
 from tetopt.errors import InputError
-from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides
+from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides, is_on_sides
 from tetopt.geometry.simplex import oriented
 from tetopt.geometry.topology import boundary_facets
 from tetopt.image import Image
@@ -34,6 +34,7 @@ from tetopt.study.tetwild import node_spacing, put_on_box
 
 PROGRAM_RUNS = 5  # of one search, at most; the first asks for what is wanted, the second is seldom far off
 NEAR_BOX_VOXELS = 1.0  # how far off the box's sides a mesh's boundary may lie to be put on them
+ROUGH_SIDE_VOXELS = 1e-3  # a node this near to a side is on it: CGAL finds the points of a surface to 1e-4 voxel
 PLACEHOLDERS = ("image", "labels", "nodes", "size", "output")
 PROGRAM_NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9_-]{0,39}")
 
@@ -193,8 +194,15 @@ def boxed(image: Image, mesh: Mesh) -> tuple[Mesh, list[str]]:
         return mesh, []
     if distance > NEAR_BOX_VOXELS:
         return mesh, [f"its boundary lies up to {distance:.3g} voxels off the sides of the image's box"]
+    # Stretched onto the box first, which turns no cell inside out: a mesh of padded labels is too wide by half a voxel.
+    low, high = index.min(axis=0), index.max(axis=0)
+    index = sides[:, 0] + (index - low) * (sides[:, 1] - sides[:, 0]) / (high - low)
+    # Nodes meant to be on a side may lie under flat cells, which hide them from `put_on_box`.
+    for side in (0, 1):
+        index = np.where(np.abs(index - sides[:, side]) <= ROUGH_SIDE_VOXELS, sides[:, side], index)
+    is_flat = np.any(np.all(is_on_sides(index, sides, 0.0)[mesh.cells], axis=1), axis=(1, 2))
     try:
-        points, cells = put_on_box(index * image.spacing, mesh.cells, *(sides.T * image.spacing))
+        points, cells = put_on_box(index * image.spacing, mesh.cells[~is_flat], *(sides.T * image.spacing))
     except InputError as error:
         return mesh, [f"its boundary is not on the box's faces: {error}"]
     world = image.to_world(points / image.spacing)
