@@ -157,6 +157,7 @@ def test_two_of_one_name(tmp_path, capsys):
     assert 'named "a" already' in capsys.readouterr().err
 
 
+@pytest.mark.slow
 def test_programs_in_the_comparison(tmp_path, opengl):
     """A row as the others have; one that does not fill the box has all but the compression; resumed by its words."""
     tetopt.save_image(tmp_path / "image.nii.gz", IMAGE)
