@@ -21,7 +21,7 @@ from tetopt.fem.reference import averaged
 from tetopt.io.files import checked_output, save_json
 from tetopt.measure.segmentation import thresholded
 from tetopt.study.compare import default_law, measured, prepared
-from tetopt.study.compare_report import Settings
+from tetopt.study.compare_report import Settings, Simulation
 
 PHANTOM_NAMES = ("sphere", "two_spheres", "ellipsoids_brain")
 SHOWN_ERRORS = ("strain_energy", "displacement", "interface_strain")
@@ -80,12 +80,14 @@ def cases(phantoms: Sequence[str], paths: Sequence[Path]) -> list[tuple[str, tet
     return cases
 
 
+def error_of(simulation: Simulation, name: str) -> float:
+    """One of a simulation's errors, moduli by Eq. (2)'s mean."""
+    return float(getattr(simulation.averages["mean"].errors, name))
+
+
 def _line(row: dict[str, Any]) -> str:
     mesh = row["measured"]
-    errors = [
-        f"nu {nu}: " + " ".join(f"{getattr(f.averages['mean'].errors, e):.4f}" for e in SHOWN_ERRORS)
-        for nu, f in mesh.fem.items()
-    ]
+    errors = [f"nu {nu}: " + " ".join(f"{error_of(f, e):.4f}" for e in SHOWN_ERRORS) for nu, f in mesh.fem.items()]
     shape = f"E_D {mesh.E_D_share:.4f} rho {mesh.quality.mean_rho:.3f}"
     return f"{row['image']} {row['nodes']} nodes k_D {row['k_D']:g}: {shape}  " + "  ".join(errors)
 
@@ -101,17 +103,7 @@ def _summary(rows: Sequence[dict[str, Any]], weights: Sequence[float]) -> dict[s
             for nu in a["measured"].fem
         ]
         ratios = {
-            e: float(
-                np.exp(
-                    np.mean(
-                        [
-                            np.log(getattr(a.averages["mean"].errors, e) / getattr(b.averages["mean"].errors, e))
-                            for a, b in pairs
-                        ]
-                    )
-                )
-            )
-            for e in SHOWN_ERRORS
+            e: float(np.exp(np.mean([np.log(error_of(a, e) / error_of(b, e)) for a, b in pairs]))) for e in SHOWN_ERRORS
         }
         ratios["cond"] = float(np.exp(np.mean([np.log(a.cond / b.cond) for a, b in pairs])))
         summary[f"{k_D:g}"] = ratios

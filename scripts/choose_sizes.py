@@ -16,7 +16,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from choose_k_d import PHANTOM_NAMES, SHOWN_ERRORS, cases
+from choose_k_d import PHANTOM_NAMES, SHOWN_ERRORS, cases, error_of
 
 import tetopt
 from tetopt.fem.reference import at_centres
@@ -90,7 +90,7 @@ def _strained(standard: Standard) -> tetopt.Image:
 
 def _line(row: dict[str, Any]) -> str:
     mesh = row["measured"]
-    errors = " ".join(f"{getattr(mesh.fem[STANDARD_NU].averages['mean'].errors, e):.4f}" for e in SHOWN_ERRORS)
+    errors = " ".join(f"{error_of(mesh.fem[STANDARD_NU], e):.4f}" for e in SHOWN_ERRORS)
     size = f"{mesh.n_nodes} nodes, E_D {mesh.E_D_share:.4f}, rho {mesh.quality.mean_rho:.3f}"
     return f"{row['image']}, {row['mesh']}: {size}; errors {errors}"
 

@@ -33,13 +33,14 @@ from tetopt.cli.source import Source, read_source
 from tetopt.engine.loop import Optimized
 from tetopt.engine.meshing import Run, mesh_image
 from tetopt.geometry.box import box_sides
+from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import centroids, squared_edges
 from tetopt.io.files import save_json
 from tetopt.io.formats import format_of
 from tetopt.io.meshes import MeshFile
 from tetopt.io.mni import mni_path
 from tetopt.measure.quality import quality
-from tetopt.model.model import Model, elements
+from tetopt.model.model import Model
 from tetopt.model.sets import Sets, box_of, surviving_sets
 from tetopt.report.summary import fidelity, model_summary, run_summary, size_summary
 from tetopt.report.tables import add_quality, new_table, nodes_in_words
@@ -225,7 +226,7 @@ def _print(task: Task, outcome: Outcome, model: Model, measured: dict[str, Any])
     is_constant = content.image.data.min() == content.image.data.max()
     n_empty = 0 if is_constant else int((model.cell_data["n_voxels"] == 0).sum())
     is_counted = plan.mode == "graded" and plan.sizes.target_error is None
-    n_nodes = len(elements(model)[0])
+    n_nodes = node_count(model.mesh.points, model.mesh.cells, model.order)
     warn_of_result(result, plan.engine.method, n_nodes, plan.sizes.nodes if is_counted else None, n_empty)
     _print_comparison(content, outcome, task.start_name, model.order)
     print_fidelity(measured)

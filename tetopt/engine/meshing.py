@@ -27,7 +27,7 @@ from tetopt.engine.loop import (
 )
 from tetopt.engine.paper import optimize_paper
 from tetopt.errors import InputError
-from tetopt.geometry.quadratic import quadratic
+from tetopt.geometry.quadratic import node_count
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.start.clip import lattice_within
@@ -232,7 +232,7 @@ def meshed_in_all(ndim: int, nodes: int, run: Callable[[int], Optimized]) -> Opt
         if corners == before:
             break
         result = run(corners)._replace(nodes=nodes)
-        count = len(quadratic(result.mesh.points, result.mesh.cells)[0])
+        count = node_count(result.mesh.points, result.mesh.cells, 2)
         ratio = count / len(result.mesh.points)
         miss = abs(count / nodes - 1.0)
         if best is None or miss < best[0]:

@@ -32,7 +32,7 @@ from tetopt.check import check_unfolded, facets_on_box, filled_share
 from tetopt.errors import InputError
 from tetopt.fem.rigidity import check_held, rigid_modes
 from tetopt.geometry.box import box_sides, is_on_sides, upright_axis
-from tetopt.geometry.quadratic import cell_edges, gauss_rule, quadratic, shape_slopes
+from tetopt.geometry.quadratic import cell_edges, gauss_rule, of_order, shape_slopes
 from tetopt.geometry.simplex import volume_gradients, volumes
 from tetopt.image import Image
 from tetopt.mesh import Mesh
@@ -120,16 +120,9 @@ class Elements(NamedTuple):
     weights: NDArray[np.float64]  # (Q,) of the Gauss points
 
 
-def nodes_and_cells(mesh: Mesh, order: int) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """The nodes (N, n) of order 1 or 2, and the cells (M, A) of them; InputError for another order."""
-    if order not in (1, 2):
-        raise InputError(f"order: expected 1 or 2, got {order}")
-    return (mesh.points, mesh.cells) if order == 1 else quadratic(mesh.points, mesh.cells)
-
-
 def elements_of(mesh: Mesh, order: int) -> Elements:
     """The mesh's cells as elements of order 1 or 2; InputError for another order."""
-    points, cells = nodes_and_cells(mesh, order)
+    points, cells = of_order(mesh.points, mesh.cells, order)
     places, weights = gauss_rule(mesh.ndim, order)
     v, gradients = _gradients(mesh)
     return Elements(points, cells, v, gradients, shape_slopes(places, order), weights)
@@ -427,9 +420,9 @@ def compression(
             f"fixed_nodes and pushed_nodes: {len(both)} nodes are in both, the first {both[:5].tolist()}; "
             "they cannot rest and move by the displacement"
         )
+    points, cells = of_order(mesh.points, mesh.cells, order)
     if order == 2:
-        fixed, pushed = (_with_midpoints(mesh, nodes) for nodes in (fixed, pushed))
-    points = elements_of(mesh, order).points
+        fixed, pushed = (_with_midpoints(mesh, cells, nodes) for nodes in (fixed, pushed))
     is_prescribed = np.zeros(points.shape, dtype=bool)
     prescribed = np.zeros(points.shape)
     if is_bonded:
@@ -450,9 +443,8 @@ def compression(
     return Compression(u, 0.5 * float(dofs @ force), reaction, system)
 
 
-def _with_midpoints(mesh: Mesh, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Nodes of order 2: the mesh's nodes given, and those in the middle of edges between two of them."""
-    cells = quadratic(mesh.points, mesh.cells)[1]
+def _with_midpoints(mesh: Mesh, cells: NDArray[np.int64], nodes: NDArray[np.int64]) -> NDArray[np.int64]:
+    """Nodes of order 2, whose cells are `cells`: the mesh's nodes given, and the middles of edges between them."""
     is_chosen = np.zeros(len(mesh.points), dtype=bool)
     is_chosen[nodes] = True
     is_between = is_chosen[mesh.cells[:, cell_edges(mesh.ndim)]].all(axis=2)

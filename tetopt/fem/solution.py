@@ -25,16 +25,15 @@ from tetopt.fem.elasticity import (
     constrained,
     gauss_strains,
     lame_constants,
-    nodes_and_cells,
     solved_in_steps,
 )
-from tetopt.geometry.quadratic import cell_edges, gauss_rule
+from tetopt.geometry.quadratic import cell_edges, gauss_rule, of_order
 from tetopt.geometry.simplex import volumes
 from tetopt.mesh import Mesh
 from tetopt.model.averages import gauss_young
 from tetopt.model.loads import Load, count_of_steps, facet_forces, in_step, spring_constants
 from tetopt.model.materials import density_of
-from tetopt.model.model import Model, element_facets, in_units
+from tetopt.model.model import Model, element_facets, elements, in_units
 
 KG_PER_MM3 = 1e-9  # in a kg/m3
 BALANCE_ROUNDING = 1e-12  # of a matrix's row times its displacements: what is lost to rounding in a sum of forces
@@ -156,7 +155,7 @@ def _stress(strain: NDArray[np.float64], young: NDArray[np.float64], nu: NDArray
 
 
 def _task(model: Model, loads: tuple[Load, ...]) -> _Task:
-    points, cells = nodes_and_cells(model.mesh, model.order)
+    points, cells = elements(model)
     of_set: dict[str, NDArray[np.bool_]] = {}
     springs: dict[str, NDArray[np.float64]] = {}
     task = _Task(
@@ -197,7 +196,7 @@ def weight_forces(
     to each corner (Zienkiewicz and Taylor, The Finite Element Method, volume 1, on consistent nodal forces).
     """
     n = mesh.ndim
-    points, cells = nodes_and_cells(mesh, order)
+    points, cells = of_order(mesh.points, mesh.cells, order)
     if order == 1:
         shares = np.full(n + 1, 1.0 / (n + 1))
     else:
@@ -243,7 +242,7 @@ def node_means(mesh: Mesh, values: NDArray[np.float64]) -> NDArray[np.float64]:
     """
     n, n_places = mesh.ndim, values.shape[1]
     order = 1 if n_places == 1 else 2
-    cells = nodes_and_cells(mesh, order)[1]
+    cells = of_order(mesh.points, mesh.cells, order)[1]
     if order == 2:
         at_corners = np.linalg.inv(gauss_rule(n, 2)[0])  # (n+1, Q): linear values are those at the corners, weighted
         at_nodes = np.concatenate([at_corners, at_corners[cell_edges(n)].mean(axis=1)])

@@ -11,6 +11,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt.errors import InputError
 from tetopt.geometry.simplex import outward_facet_nodes
 
 # Local corners of the edges whose midpoints are a tetrahedron's nodes 4 to 9, as in VTK, Abaqus and FEBio; the first
@@ -41,6 +42,20 @@ def quadratic(points: NDArray[np.float64], cells: NDArray[np.int64]) -> tuple[ND
     edges, number = numbered_edges(cells)
     midpoints = points[edges].mean(axis=1)
     return np.concatenate([points, midpoints]), np.column_stack([cells, len(points) + number])
+
+
+def of_order(
+    points: NDArray[np.float64], cells: NDArray[np.int64], order: int
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Nodes and cells of order 1, which are the points and cells themselves, or 2; InputError for another order."""
+    if order not in (1, 2):
+        raise InputError(f"order: expected 1 or 2, got {order}")
+    return (points, cells) if order == 1 else quadratic(points, cells)
+
+
+def node_count(points: NDArray[np.float64], cells: NDArray[np.int64], order: int) -> int:
+    """How many nodes of an order there are, those in the middle of edges with order 2."""
+    return len(of_order(points, cells, order)[0])
 
 
 def quadratic_facet_nodes(cells: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.int64]:

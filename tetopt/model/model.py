@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
-from tetopt.geometry.quadratic import quadratic, quadratic_facet_nodes
+from tetopt.geometry.quadratic import of_order, quadratic_facet_nodes
 from tetopt.mesh import Mesh
 from tetopt.model.fields import HALF_TURN, half_turned_fields, stresses_times
 from tetopt.model.loads import FACET_FORCES, Load
@@ -147,7 +147,7 @@ def described(model: Model) -> list[str]:
 
 def elements(model: Model) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
     """Points and cells of the model's order: the mesh's own, or those of `quadratic`."""
-    return quadratic(model.mesh.points, model.mesh.cells) if model.order == 2 else (model.mesh.points, model.mesh.cells)
+    return of_order(model.mesh.points, model.mesh.cells, model.order)
 
 
 def mass_densities(model: Model) -> NDArray[np.float64]:

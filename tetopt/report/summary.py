@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 import tetopt
 from tetopt.engine.loop import Optimized
-from tetopt.geometry.quadratic import quadratic
+from tetopt.geometry.quadratic import node_count
 from tetopt.image import Image
 from tetopt.measure.fidelity import label_fidelity, mask_fidelity
 from tetopt.measure.quality import quality
@@ -84,7 +84,7 @@ def run_summary(
 
 def size_summary(mesh: Mesh, order: int) -> dict[str, Any]:
     """How many nodes a mesh has, and how many with those of order 2 ("n_nodes_in_all"), and how many cells."""
-    n_nodes = len(quadratic(mesh.points, mesh.cells)[0]) if order == 2 else len(mesh.points)
+    n_nodes = node_count(mesh.points, mesh.cells, order)
     return {"order": order, "n_nodes": len(mesh.points), "n_nodes_in_all": n_nodes, "n_cells": len(mesh.cells)}
 
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 import numpy as np
 from rich.table import Table
 
-from tetopt.geometry.quadratic import quadratic
+from tetopt.geometry.quadratic import node_count
 from tetopt.measure.fidelity import LabelFidelity, MaskFidelity
 from tetopt.measure.quality import Quality
 from tetopt.mesh import Mesh
@@ -25,7 +25,7 @@ def nodes_in_words(mesh: Mesh, order: int) -> str:
     """How many nodes a mesh has: "4864 nodes", or of order 2 "716 corner nodes, 5012 in all"."""
     if order == 1:
         return f"{len(mesh.points)} nodes"
-    return f"{len(mesh.points)} corner nodes, {len(quadratic(mesh.points, mesh.cells)[0])} in all"
+    return f"{len(mesh.points)} corner nodes, {node_count(mesh.points, mesh.cells, order)} in all"
 
 
 def add_quality(table: Table, *meshes: Quality, in_all: Sequence[int] = ()) -> None:

@@ -24,10 +24,11 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.geometry.box import box_sides
+from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import oriented
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.study.search import corners_for, is_near, nodes_of, tries
+from tetopt.study.search import corners_for, is_near, tries
 from tetopt.study.tetwild import TETWILD_RESPONSE, Filled, inside_box, node_spacing, put_on_box
 
 CLEAVER_RUNS = 8  # of one search, at most; those that crash count, too
@@ -96,7 +97,7 @@ def stuffed(image: Image, labels: Image, nodes: int, order: int = 1) -> Filled:
 
     begin = time.perf_counter()
     runs = tries(
-        run, lambda made: nodes_of(made[0], made[1], order), nodes, TETWILD_RESPONSE,
+        run, lambda made: node_count(made[0], made[1], order), nodes, TETWILD_RESPONSE,
         first=FIRST_SCALING, most=CLEAVER_RUNS,
     )  # fmt: skip
     if not runs:
@@ -109,7 +110,7 @@ def stuffed(image: Image, labels: Image, nodes: int, order: int = 1) -> Filled:
         notes.append(f"its boundary is not on the box's faces: {error}")
     if n_removed:
         notes.append(f"{n_removed} cells outside the box removed")
-    n_nodes = nodes_of(points, cells, order)
+    n_nodes = node_count(points, cells, order)
     if not is_near(n_nodes, nodes):
         notes.append(f"{n_nodes} nodes after {len(runs)} runs of Cleaver, {nodes} were asked for")
     world = image.to_world(points / image.spacing)

@@ -27,6 +27,7 @@ from tetopt.fem.budget import affordable_dofs, reference_shape
 from tetopt.fem.conditioning import conditioning
 from tetopt.fem.elasticity import box_faces, check_fills_box, compression, push_of
 from tetopt.fem.reference import Reference, averaged, compare, nearest, reference, refined
+from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import dihedral_angles
 from tetopt.image import Image
 from tetopt.io.files import save_json
@@ -65,7 +66,6 @@ from tetopt.study.compare_report import (
 )
 from tetopt.study.pipelines import UNTIMED_STEPS, Job, Pipeline
 from tetopt.study.program import file_checksums, pipelines_with
-from tetopt.study.search import nodes_of
 from tetopt.study.tradeoff import tradeoff
 
 Say = Callable[[str], None]
@@ -195,7 +195,7 @@ def measured(standard: Standard, mesh: Mesh, percent: float, order: int = 1) -> 
     references = standard.references if not_compressed is None else {}
     return Measurement(
         order=order,
-        n_nodes=nodes_of(mesh.points, mesh.cells, order),
+        n_nodes=node_count(mesh.points, mesh.cells, order),
         n_corners=len(mesh.points),
         n_cells=len(mesh.cells),
         E_D=E_D,

@@ -13,12 +13,13 @@ import numpy as np
 from tetopt.engine.fast import prepare_kernels
 from tetopt.engine.loop import UNIFORM_ITERATIONS, UNIFORM_K_D
 from tetopt.engine.meshing import MODE_DEFAULTS, Mode, mesh_image
+from tetopt.geometry.quadratic import node_count
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.start.lattice import lattice
 from tetopt.study.cleaver import stuffed
 from tetopt.study.interfaces import OTSU_CLASSES, class_labels, interfaces
-from tetopt.study.search import LEAST_REQUEST, REQUEST_RESPONSE, corners_for, nodes_of, tries
+from tetopt.study.search import LEAST_REQUEST, REQUEST_RESPONSE, corners_for, tries
 from tetopt.study.tetwild import Filled, filled, node_spacing
 from tetopt.target.content import Content, content
 
@@ -72,7 +73,7 @@ def bcc(job: Job) -> Produced:
         first = corners_for(job.nodes, job.order) / job.nodes
         runs = tries(
             lambda factor: lattice(job.image, nodes=max(round(factor * job.nodes), LEAST_REQUEST)),
-            lambda mesh: nodes_of(mesh.points, mesh.cells, job.order),
+            lambda mesh: node_count(mesh.points, mesh.cells, job.order),
             job.nodes, REQUEST_RESPONSE, first=first, most=1 if job.order == 1 else LATTICE_RUNS,
         )  # fmt: skip
     return Produced(runs[0].result, seconds, [])

@@ -21,6 +21,7 @@ import numpy as np
 
 from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides, is_on_sides
+from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import oriented
 from tetopt.geometry.topology import boundary_facets
 from tetopt.image import Image
@@ -29,7 +30,7 @@ from tetopt.io.meshes import MESH_SUFFIXES, load_mesh
 from tetopt.mesh import Mesh
 from tetopt.study.interfaces import class_labels
 from tetopt.study.pipelines import PIPELINES, Job, Pipeline, Produced
-from tetopt.study.search import LEAST_REQUEST, REQUEST_RESPONSE, corners_for, is_near, nodes_of, tries
+from tetopt.study.search import LEAST_REQUEST, REQUEST_RESPONSE, corners_for, is_near, tries
 from tetopt.study.tetwild import node_spacing, put_on_box
 
 PROGRAM_RUNS = 5  # of one search, at most; the first asks for what is wanted, the second is seldom far off
@@ -123,7 +124,7 @@ def by_program(job: Job, program: Program) -> Produced:
                     raise
                 notes.append(f"asked for {request} nodes: {error}")
                 return None
-            sizes.append(nodes_of(mesh.points, mesh.cells, job.order))
+            sizes.append(node_count(mesh.points, mesh.cells, job.order))
             return mesh
 
         most = PROGRAM_RUNS if is_steered else 1

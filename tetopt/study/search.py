@@ -10,15 +10,12 @@ from collections.abc import Callable
 from typing import Generic, NamedTuple, TypeVar
 
 import numpy as np
-from numpy.typing import NDArray
 
-from tetopt.geometry.quadratic import quadratic
+from tetopt.engine.meshing import QUADRATIC_NODES
 
 Result = TypeVar("Result")
 
 NODE_TOLERANCE = 0.05  # of the requested number of nodes, within which a search for it ends
-# Nodes in all over corners, of tetrahedra of either order: with about 6.5 edges a node, and fewer at the boundary.
-NODES_PER_CORNER = {1: 1.0, 2: 7.2}
 
 
 class Response(NamedTuple):
@@ -84,14 +81,9 @@ def tries(
     return sorted(done, key=lambda each: abs(np.log(each.n_nodes / nodes)))
 
 
-def nodes_of(points: NDArray[np.float64], cells: NDArray[np.int64], order: int) -> int:
-    """Nodes in all of a mesh with cells of this order."""
-    return len(points) if order == 1 else len(quadratic(points, cells)[0])
-
-
 def corners_for(nodes: int, order: int) -> int:
     """About how many corners a mesh has whose cells of this order have `nodes` nodes in all."""
-    return max(round(nodes / NODES_PER_CORNER[order]), LEAST_REQUEST)
+    return max(nodes if order == 1 else round(nodes / QUADRATIC_NODES[3]), LEAST_REQUEST)
 
 
 def is_near(count: int, nodes: int) -> bool:

@@ -25,13 +25,14 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from tetopt.errors import InputError
+from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import oriented, volumes
 from tetopt.geometry.topology import boundary_facets
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.start.lattice import lattice
 from tetopt.study.interfaces import Surfaces, compacted
-from tetopt.study.search import Response, corners_for, is_near, nodes_of, tries
+from tetopt.study.search import Response, corners_for, is_near, tries
 
 TETWILD_RUNS = 6  # of one search, at most; each takes about as long as the one that is kept
 # Of nodes to the factor: slopes of -3 to -9 were measured. Cleaver, which shares it, crashes on coarse meshes.
@@ -97,7 +98,7 @@ def filled(image: Image, surfaces: Surfaces, nodes: int, order: int = 1) -> Fill
         envelope = ENVELOPE_SHARE * spacing * factor**ENVELOPE_EXPONENT
         return _run(tetrahedralize, surfaces, factor * spacing, envelope)
 
-    runs = tries(run, lambda made: nodes_of(*made, order), nodes, TETWILD_RESPONSE, most=TETWILD_RUNS)
+    runs = tries(run, lambda made: node_count(*made, order), nodes, TETWILD_RESPONSE, most=TETWILD_RUNS)
     notes: list[str] = []
     for each in runs:
         try:
@@ -106,7 +107,7 @@ def filled(image: Image, surfaces: Surfaces, nodes: int, order: int = 1) -> Fill
             notes.append(f"a run with {each.n_nodes} nodes was left out: {error}")
             continue
         world = image.to_world(points / image.spacing)
-        n_nodes = nodes_of(points, cells, order)
+        n_nodes = node_count(points, cells, order)
         if not is_near(n_nodes, nodes):
             notes.append(f"{n_nodes} nodes after {len(runs)} runs of fTetWild, {nodes} were asked for")
         search = sum(other.seconds for other in runs) - each.seconds
