@@ -267,13 +267,13 @@ def _one_hot(labels: NDArray[np.int64], region: Region | None) -> tuple[NDArray[
     row[present] = np.arange(len(present))
     number, share = row[labels], counts[present] / counts.sum()
     size = share ** (-0.5 * RARITY_POWER)
-    channel = _colours(number, len(share))
+    channel = label_channels(number, len(share))
     codes = np.where(channel == np.arange(channel.max() + 1)[:, None], size, 0.0)
     spread = float((codes**2 @ share - (codes @ share) ** 2).sum())
     return number, (codes / np.sqrt(spread) if len(share) > 1 else codes[:0])
 
 
-def _colours(number: NDArray[np.int64], n_labels: int) -> NDArray[np.int64]:
+def label_channels(number: NDArray[np.int64], n_labels: int) -> NDArray[np.int64]:
     """A channel for each label: labels within `APART_VOXELS` voxels of one another have different ones."""
     shape = tuple(-(-s // APART_VOXELS) for s in number.shape)
     block = np.ravel_multi_index(
