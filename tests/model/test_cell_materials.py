@@ -108,6 +108,35 @@ def test_values_by_label():
         by_label(ByLabel({1: 2.5}), None)
 
 
+def test_values_by_name():
+    names, labels = {0: "air", 3: "left lung", 5: "liver", 8: "liver"}, np.array([0, 3, 5, 8])
+    law = ByLabel({"Left_Lung": 2.5, "liver": 4.0}, 1.0)
+    assert by_label(law, labels, names).tolist() == [1.0, 2.5, 4.0, 4.0]
+    assert by_label(ByLabel({3: 2.5, "liver_8": 4.0}, 1.0), labels, names).tolist() == [1.0, 2.5, 1.0, 4.0]
+    with pytest.raises(InputError, match=r"label 3 \(left lung\) has two values"):
+        by_label(ByLabel({3: 2.5, "left lung": 4.0}), labels, names)
+    with pytest.raises(InputError, match=r"given for liver, the mesh also has 0 \(air\), 3 \(left lung\)"):
+        by_label(ByLabel({"liver": 4.0}), labels, names)
+    with pytest.raises(InputError, match="did you mean left lung"):
+        by_label(ByLabel({"left lnug": 4.0}, 1.0), labels, names)
+    with pytest.raises(InputError, match="no label has a name"):
+        by_label(ByLabel({"liver": 4.0}, 1.0), labels)
+
+
+def test_a_model_s_table_names_laws_and_sets():
+    model = sample_model(3)
+    about = {"label_table": {"1": {"name": "bright/ball"}, "0": {"name": "rest"}, "9": {"name": "far"}}}
+    named = model_of(
+        model.mesh, young="bright/ball=5,*=2", nu="rest=0.3,far=0.1,*=0.4", cell_data=model.cell_data, about=about
+    )
+    is_bright = model.cell_data["label"] == 1
+    np.testing.assert_array_equal(named.materials.young[named.materials.of_cell], np.where(is_bright, 5.0, 2.0))
+    np.testing.assert_array_equal(named.materials.nu[named.materials.of_cell], np.where(is_bright, 0.4, 0.3))
+    assert set(named.sets.cells) == {"rest", "bright_ball"}
+    assert "interface_rest_bright_ball" in named.sets.facets
+    np.testing.assert_array_equal(named.sets.facets["interface_rest_bright_ball"], model.sets.facets["interface_0_1"])
+
+
 def test_the_mean_of_the_law_and_the_law_of_the_mean():
     image, mesh = sample_image(3), sample_model(3).mesh
     fields = sample_model(3).cell_data

@@ -96,7 +96,7 @@ def test_messages_of_laws(law, message):
 # From text and files
 
 
-@pytest.mark.parametrize("text", ["1=", "=2", "1=2,1=3", "1=2;2=3", "a=1", "1.5=2", "1=x", "*=1,*=2"])
+@pytest.mark.parametrize("text", ["1=", "=2", "1=2,1=3", "1=2;2=3", "a=1,a=2", "1.5=2", "1=x", "*=1,*=2"])
 def test_labels_that_are_none(text):
     with pytest.raises(InputError, match="by label"):
         parse_any_law(text)
@@ -122,6 +122,11 @@ def test_tables_from_files(tmp_path, name, text):
 def test_labels_from_a_file(tmp_path):
     (tmp_path / "a.csv").write_text("label,young\n3,2.5\n0,1\n")
     assert load_law(tmp_path / "a.csv") == ByLabel({3: 2.5, 0: 1.0})
+    for head in ("name", "label"):
+        (tmp_path / "n.csv").write_text(f"{head},young\nleft lung,2.5\n7,1\n*,3\n")
+        assert load_law(tmp_path / "n.csv") == ByLabel({"left lung": 2.5, 7: 1.0}, 3.0)
+    (tmp_path / "n.toml").write_text('name = ["liver", "*"]\nyoung = [5, 20]\n')
+    assert load_law(tmp_path / "n.toml") == ByLabel({"liver": 5.0}, 20.0)
     (tmp_path / "b.csv").write_text("Label,Young,Nu\n3,2.5,0.3\n*,1,0.45\n")
     assert load_law(tmp_path / "b.csv") == ByLabel({3: 2.5}, 1.0)
     assert has_column(str(tmp_path / "b.csv"), "nu")
@@ -144,7 +149,7 @@ def test_labels_from_a_file(tmp_path):
         (
             "a.toml",
             "h = [1]\nyoung = [1]",
-            'expected columns "young" and one of "intensity" and "label", found h, young',
+            'expected columns "young" and one of "intensity", "label" and "name", found h, young',
         ),
         ("a.csv", "intensity,nu\n1,2\n", "found intensity, nu"),
         ("a.csv", "intensity,young\n", "got an array of shape|expected pairs"),

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +14,7 @@ from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.model.averages import DEFAULT_AVERAGE, cell_values, cell_young, element_young, node_young, parse_average
 from tetopt.model.fields import cell_fields
+from tetopt.model.labels import TABLE_TEXT, table_of_words
 from tetopt.model.laws import ByLabel, Law, has_column, law_values, parse_any_law, young_from
 from tetopt.model.loads import parse_loads
 from tetopt.model.materials import DEFAULT_NU, Spacing, binned, by_label, density_of, materials
@@ -74,7 +75,8 @@ def model_of(
     box : Box, optional
         Of the image that the mesh was made from; by default of `image`.
     about : dict, optional
-        Texts for the file's head.
+        Texts for the file's head. Its "label_table" (`tetopt.model.labels.table_words`) is what labels are called, in
+        laws and in the standard sets.
 
     Raises
     ------
@@ -90,13 +92,14 @@ def model_of(
     mean = cell_data.get("mean")
     mean = mean if mean is not None and mean.ndim == 1 else None
     labels = labels_of(cell_data, len(mesh.cells))
+    names = table_of_words((about or {}).get(TABLE_TEXT)).names
     if nu is None:
         nu = young if isinstance(young, str) and has_column(young, "nu") else DEFAULT_NU
     if density is None and isinstance(young, str) and has_column(young, "density"):
         density = young
     if known_sets is None:
         box = box_of(image) if box is None and image is not None else box
-        known_sets = standard_sets(mesh, box, labels)
+        known_sets = standard_sets(mesh, box, labels, names)
     all_sets = with_requested(mesh, known_sets, sets, mean)
     table, nodal, at_gauss = None, None, None
     if young is not None:
@@ -104,9 +107,10 @@ def model_of(
         if bins is not None and nodal is not None:
             raise InputError(f"bins: moduli that vary in a cell have no groups; take another average than {average}")
         at_gauss = None if bins is not None else at_gauss
-        moduli = _values(young, "young", mesh, image, mean, labels, average)
-        ratios = _values(nu, "nu", mesh, image, mean, labels)
-        masses = None if density is None else _values(density, "density", mesh, image, mean, labels)
+        cells = _Cells(mesh, image, mean, labels, names)
+        moduli = _values(young, "young", cells, average)
+        ratios = _values(nu, "nu", cells)
+        masses = None if density is None else _values(density, "density", cells)
         table = materials(moduli, ratios, len(mesh.cells), masses)
         if bins is not None:
             table = binned(table, volumes(mesh.points, mesh.cells), bins, spacing)
@@ -145,21 +149,29 @@ def _varying_moduli(
     )
 
 
-def _values(
-    value: Any, name: str, mesh: Mesh, image: Image | None, mean: NDArray[np.float64] | None, labels: NDArray | None,
-    average: str = "mean",
-) -> NDArray[np.float64]:  # fmt: skip
+class _Cells(NamedTuple):
+    """What laws are of."""
+
+    mesh: Mesh
+    image: Image | None
+    mean: NDArray[np.float64] | None  # (M,)
+    labels: NDArray[np.int64] | None  # (M,)
+    names: dict[int, str]  # of labels
+
+
+def _values(value: Any, name: str, cells: _Cells, average: str = "mean") -> NDArray[np.float64]:
     """The value of each cell, or one for all."""
     law: Any = parse_any_law(value, name) if isinstance(value, str) else value
     if not callable(law) and not isinstance(law, ByLabel) and np.ndim(law) < 2:
         return np.asarray(law, dtype=np.float64)
     if isinstance(law, ByLabel):
-        return by_label(law, labels)
-    if image is not None:  # the law of each voxel, and then the average, as Eq. (2) wants it
-        return cell_young(image, mesh, law, average) if name == "young" else cell_values(image, mesh, law)
-    if mean is None:
+        return by_label(law, cells.labels, cells.names)
+    if cells.image is not None:  # the law of each voxel, and then the average, as Eq. (2) wants it
+        by_voxel = (cells.image, cells.mesh, law)
+        return cell_young(*by_voxel, average) if name == "young" else cell_values(*by_voxel)
+    if cells.mean is None:
         raise InputError(f"{name}: a law of the intensity, but the mesh has no means; give the image (--image)")
     if name == "young" and average != DEFAULT_AVERAGE:
         raise InputError(f"average: {average} is over the image's voxels; give the image (--image)")
     # The law of each cell's mean: the same only where the law is linear over the cell.
-    return young_from(law, mean) if name == "young" else law_values(law, mean)
+    return young_from(law, cells.mean) if name == "young" else law_values(law, cells.mean)

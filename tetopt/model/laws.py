@@ -21,7 +21,7 @@ Law = Callable[[NDArray[np.float64]], ArrayLike] | Sequence[Sequence[float]] | N
 class ByLabel(NamedTuple):
     """A value for each label instead of a law of the intensity."""
 
-    values: dict[int, float]
+    values: dict[int | str, float]  # by label, or by a label's name (`tetopt.model.materials.by_label`)
     rest: float | None = None  # of all labels that are not named
 
 
@@ -106,7 +106,7 @@ def parse_table(text: str) -> list[tuple[float, float]]:
 
 
 def parse_labels(text: str) -> ByLabel:
-    """Values by label as written on a command line, `*` for all others.
+    """Values by label, or by labels' names, as written on a command line, `*` for all others.
 
     Raises
     ------
@@ -117,6 +117,8 @@ def parse_labels(text: str) -> ByLabel:
     --------
     >>> parse_labels("1=2.1, 2=1.9, *=0.5")
     ByLabel(values={1: 2.1, 2: 1.9}, rest=0.5)
+    >>> parse_labels("left lung=5,*=20")
+    ByLabel(values={'left lung': 5.0}, rest=20.0)
     """
     pairs = [pair.partition("=") for pair in text.split(",")]
     try:
@@ -128,18 +130,30 @@ def parse_labels(text: str) -> ByLabel:
 
 
 def _by_label(pairs: list[tuple[str, float]]) -> ByLabel:
-    """Values by label from pairs; ValueError for a label that is no whole number, InputError for one named twice."""
-    values: dict[int, float] = {}
+    """Values by label from pairs; ValueError for a number that is no label, InputError for a label named twice."""
+    values: dict[int | str, float] = {}
     rest: float | None = None
-    for label, value in pairs:
-        is_rest = label.strip() == "*"
-        if (rest is not None) if is_rest else (int(label) in values):
-            raise InputError(f"values by label: label {label.strip()} has two values; give each once")
+    for text, value in pairs:
+        label = text.strip()
+        is_rest, key = label == "*", _label_of(label)
+        if (rest is not None) if is_rest else (key in values):
+            raise InputError(f"values by label: label {label} has two values; give each once")
         if is_rest:
             rest = value
         else:
-            values[int(label)] = value
+            values[key] = value
     return ByLabel(values, rest)
+
+
+def _label_of(text: str) -> int | str:
+    """A label, or the name of one; ValueError for no text, and for a number that is not whole."""
+    if not text:
+        raise ValueError("a label without a name")
+    try:
+        float(text)
+    except ValueError:
+        return text
+    return int(text)
 
 
 def parse_law(text: str) -> Law:
@@ -162,8 +176,8 @@ def parse_any_law(text: str, quantity: str = "young") -> Law | ByLabel | float:
     Parameters
     ----------
     text : str
-        A number; a table of intensities, "0:1,100:5.5"; values by label, "1=2.1,2=1.9,*=0.5"; a formula of h
-        (`parse_formula`); or a file named .toml or .csv (`load_law`).
+        A number; a table of intensities, "0:1,100:5.5"; values by label or name, "1=2.1,liver=1.9,*=0.5"; a formula of
+        h (`parse_formula`); or a file named .toml or .csv (`load_law`).
     quantity : str
         The file's column.
 
@@ -185,8 +199,8 @@ def parse_any_law(text: str, quantity: str = "young") -> Law | ByLabel | float:
 def load_law(path: Path, quantity: str = "young") -> Law | ByLabel:
     """A law from a file: two columns, or more, as lists in TOML or under names in the first row of CSV.
 
-    One column is "intensity", or "label" ("*" for all that are not named), and one the quantity, such as "young" (kPa)
-    or "nu".
+    One column is "intensity", or "label" (numbers or names, "*" for all that are not there), or in its place "name",
+    and one the quantity, such as "young" (kPa) or "nu".
 
     Raises
     ------
@@ -196,18 +210,20 @@ def load_law(path: Path, quantity: str = "young") -> Law | ByLabel:
     """
     try:
         columns = _columns(path)
-        keys = [name for name in ("intensity", "label") if name in columns]
+        keys: list[str] = [name for name in ("intensity", "label") if name in columns]
+        if not keys and "name" in columns:
+            keys = ["name"]
         if len(keys) != 1 or quantity not in columns:
             raise InputError(
-                f'{path}: expected columns "{quantity}" and one of "intensity" and "label", found '
+                f'{path}: expected columns "{quantity}" and one of "intensity", "label" and "name", found '
                 f"{', '.join(map(str, columns)) or 'none'}"
             )
         if len(columns[keys[0]]) != len(columns[quantity]):
             counts = f"{len(columns[keys[0]])} of {keys[0]} and {len(columns[quantity])} of {quantity}"
             raise InputError(f"{path}: {counts}; give one for each")
         values = [float(value) for value in columns[quantity]]
-        if keys == ["label"]:
-            return _by_label([(str(label), value) for label, value in zip(columns["label"], values, strict=True)])
+        if keys != ["intensity"]:
+            return _by_label([(str(label), value) for label, value in zip(columns[keys[0]], values, strict=True)])
         return _checked_pairs([(float(h), value) for h, value in zip(columns["intensity"], values, strict=True)])
     except InputError as error:
         raise error if str(error).startswith(str(path)) else InputError(f"{path}: {error}") from error

@@ -7,7 +7,9 @@ it which side of an interface is meant. Nodes need no sets of their own: those o
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+import unicodedata
+from collections import Counter
+from collections.abc import Iterable, Mapping
 from typing import NamedTuple
 
 import numpy as np
@@ -27,7 +29,10 @@ FACE_NAMES: dict[int, tuple[tuple[str, str], ...]] = {
     2: (("x_min", "x_max"), ("y_min", "y_max")),
     3: (("left", "right"), ("posterior", "anterior"), ("inferior", "superior")),
 }
-SET_NAME = re.compile(r"[A-Za-z][A-Za-z0-9_-]{0,39}")  # what every format can carry
+MOST_LETTERS = 72  # of a name: room for an interface of two long ones; Abaqus and CalculiX take 80
+SET_NAME = re.compile(rf"[A-Za-z][A-Za-z0-9_-]{{0,{MOST_LETTERS - 1}}}")  # what every format can carry
+# What labels' names are not to be taken for: other labels, interfaces, and what formats call their own.
+RESERVED_NAME = re.compile(r"label_\d+|interface_.*|material_\d+|unnamed|all_cells", re.IGNORECASE)
 
 
 class Sets(NamedTuple):
@@ -63,7 +68,12 @@ def boundary_rows(mesh: Mesh) -> NDArray[np.int64]:
     return np.argwhere(shared.n_cells[shared.of_cell] == 1)
 
 
-def standard_sets(mesh: Mesh, box: Box | None = None, labels: NDArray[np.integer] | None = None) -> Sets:
+def standard_sets(
+    mesh: Mesh,
+    box: Box | None = None,
+    labels: NDArray[np.integer] | None = None,
+    names: Mapping[int, str] | None = None,
+) -> Sets:
     """The sets that every mesh comes with.
 
     Parameters
@@ -74,14 +84,15 @@ def standard_sets(mesh: Mesh, box: Box | None = None, labels: NDArray[np.integer
         to: "left" is the side of smaller x in RAS+. By default the box along the world's axes around the mesh.
     labels : (M,) integers, optional
         Label of each cell.
+    names : mapping of label to text, optional
+        What labels are called.
 
     Returns
     -------
     Sets
         Facets "boundary", "left", "right", "posterior", "anterior", "inferior", "superior" (in 2-D "x_min", "x_max",
         "y_min", "y_max"), and, with a box, "mask_surface" for the boundary off its faces; sets without facets are
-        left out. With labels also cells "label_1", ... and facets "interface_1_2", ..., of the cells of the smaller
-        label.
+        left out. With labels also those of `label_sets`.
 
     Raises
     ------
@@ -90,12 +101,79 @@ def standard_sets(mesh: Mesh, box: Box | None = None, labels: NDArray[np.integer
     """
     boundary = boundary_rows(mesh)
     named = {BOUNDARY_SET: boundary, **_face_sets(mesh, boundary, box)}
-    cell_sets = {}
-    if labels is not None:
-        labels = _checked_labels(labels, mesh)
-        cell_sets = {f"label_{label}": np.flatnonzero(labels == label) for label in np.unique(labels)}
-        named |= _interfaces(mesh, labels)
-    return Sets({name: rows for name, rows in named.items() if len(rows)}, cell_sets)
+    of_labels = Sets({}, {}) if labels is None else label_sets(mesh, labels, names)
+    return Sets({name: rows for name, rows in named.items() if len(rows)} | of_labels.facets, of_labels.cells)
+
+
+def label_sets(mesh: Mesh, labels: NDArray[np.integer], names: Mapping[int, str] | None = None) -> Sets:
+    """Cells of each label, and facets between each two, as rows of the cells with the smaller one.
+
+    They are called "label_1", ..., "interface_1_2", ..., with a name for a number where a label has one: see
+    `label_set_names` and `interface_names`.
+
+    Raises
+    ------
+    InputError
+        Labels that are not one whole number from 0 for each cell.
+    """
+    labels = _checked_labels(labels, mesh)
+    of_label = label_set_names(np.unique(labels).tolist(), names or {})
+    facet_rows = _interfaces(mesh, labels)
+    of_pair = interface_names(facet_rows, of_label)
+    return Sets(
+        {of_pair[pair]: rows for pair, rows in facet_rows.items()},
+        {name: np.flatnonzero(labels == label) for label, name in of_label.items()},
+    )
+
+
+def label_set_names(labels: Iterable[int], names: Mapping[int, str]) -> dict[int, str]:
+    """What the set of each label's cells is called: its name, as far as every format can carry it, or "label_5".
+
+    All names differ by more than case, and do not depend on which of the labels of `names` are there: where two would
+    be the same, or one is another set's, the label's number follows each.
+
+    Examples
+    --------
+    >>> label_set_names([5, 6, 7, 8], {5: "left lung", 6: "Rib (a)", 7: "rib/a"})
+    {5: 'left_lung', 6: 'Rib_a_6', 7: 'rib_a_7', 8: 'label_8'}
+    """
+    plain = {label: _plain_name(name) for label, name in names.items()}
+    counts = Counter(name.lower() for name in plain.values())
+    counts.update(
+        2 * [BOUNDARY_SET, MASK_SURFACE_SET, *(face for n in FACE_NAMES for pair in FACE_NAMES[n] for face in pair)]
+    )
+    of_label = {}
+    for label in labels:
+        name, default = plain.get(label, ""), f"label_{label}"
+        if name.lower() == default:
+            name = default
+        elif name and (counts[name.lower()] > 1 or RESERVED_NAME.fullmatch(name)):
+            name = f"{name[: MOST_LETTERS - 1 - len(str(label))]}_{label}"
+            name = default if counts[name.lower()] or RESERVED_NAME.fullmatch(name) else name
+        of_label[label] = name or default
+    return of_label
+
+
+def _plain_name(name: str) -> str:
+    """The name in letters that every format can carry; nothing if none of it is left."""
+    letters = unicodedata.normalize("NFKD", name).encode("ascii", "ignore").decode()
+    joined = re.sub(r"[^A-Za-z0-9-]+", "_", letters).strip("_-")
+    return (joined if joined[:1].isalpha() or not joined else f"label_{joined}")[:MOST_LETTERS]
+
+
+def interface_names(pairs: Iterable[tuple[int, int]], of_label: Mapping[int, str]) -> dict[tuple[int, int], str]:
+    """What the facets between each two labels are called: "interface_liver_spleen", by numbers "interface_1_5".
+
+    `of_label` is as of `label_set_names`. Numbers stand where a label has no name, and where the names are too long
+    together or would be the same for two pairs.
+    """
+    parts = {label: str(label) if name == f"label_{label}" else name for label, name in of_label.items()}
+    named = {(a, b): f"interface_{parts[a]}_{parts[b]}" for a, b in pairs}
+    counts = Counter(name.lower() for name in named.values())
+    return {
+        (a, b): name if counts[name.lower()] == 1 and len(name) <= MOST_LETTERS else f"interface_{a}_{b}"
+        for (a, b), name in named.items()
+    }
 
 
 def _face_sets(mesh: Mesh, boundary: NDArray[np.int64], box: Box | None) -> dict[str, NDArray[np.int64]]:
@@ -120,8 +198,8 @@ def _face_sets(mesh: Mesh, boundary: NDArray[np.int64], box: Box | None) -> dict
     return sets if box is None else {**sets, MASK_SURFACE_SET: boundary[~np.any(is_on, axis=(1, 2))]}
 
 
-def _interfaces(mesh: Mesh, labels: NDArray[np.int64]) -> dict[str, NDArray[np.int64]]:
-    """Facets between two labels, as rows of the cells with the smaller one."""
+def _interfaces(mesh: Mesh, labels: NDArray[np.int64]) -> dict[tuple[int, int], NDArray[np.int64]]:
+    """Facets between each two labels, the smaller first, as rows of its cells."""
     shared = facets(mesh.cells)
     of_cell = shared.cells[shared.of_cell]  # (M, n+1, 2)
     own = np.arange(len(mesh.cells))[:, None]
@@ -130,7 +208,7 @@ def _interfaces(mesh: Mesh, labels: NDArray[np.int64]) -> dict[str, NDArray[np.i
     rows = np.argwhere(there > labels[:, None])
     pairs = np.column_stack([labels[rows[:, 0]], there[rows[:, 0], rows[:, 1]]])
     kinds, which = np.unique(pairs, axis=0, return_inverse=True)
-    return {f"interface_{a}_{b}": rows[which.ravel() == k] for k, (a, b) in enumerate(kinds)}
+    return {(a, b): rows[which.ravel() == k] for k, (a, b) in enumerate(kinds.tolist())}
 
 
 def _checked_labels(labels: ArrayLike, mesh: Mesh) -> NDArray[np.int64]:
@@ -203,7 +281,9 @@ def parse_set(text: str, ndim: int) -> SetRequest:
     if not equals or kind not in shapes:
         raise InputError(f'set: expected NAME=below:T, NAME=point:X,Y,Z:D or NAME=plane:X,Y,Z:NX,NY,NZ:D, got "{text}"')
     if not SET_NAME.fullmatch(name):
-        raise InputError(f'set: a name is a letter, then up to 39 letters, digits, _ and -, got "{name}"')
+        raise InputError(
+            f'set: a name is a letter, then up to {MOST_LETTERS - 1} letters, digits, _ and -, got "{name}"'
+        )
     form, counts = shapes[kind]
     parts = rest.split(":")
     if len(parts) != len(counts):
@@ -310,11 +390,11 @@ def surviving_sets(before: Mesh, sets: Sets, mesh: Mesh) -> Sets:
 def free_name(label: str, taken: set[str]) -> str:
     """A name like `label` that every format can carry and that differs from those taken by more than case."""
     name = re.sub(r"[^A-Za-z0-9_-]", "_", label)
-    stem = (name if name[0].isalpha() else f"set_{name}")[:40]
+    stem = (name if name[0].isalpha() else f"set_{name}")[:MOST_LETTERS]
     name, number = stem, 1
     while name.lower() in taken:
         number += 1
-        name = f"{stem[: 39 - len(str(number))]}_{number}"
+        name = f"{stem[: MOST_LETTERS - 1 - len(str(number))]}_{number}"
     return name
 
 

@@ -1,0 +1,104 @@
+"""Labels by name: a table of names and colours, and which labels a name means."""
+
+from __future__ import annotations
+
+import difflib
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
+
+from tetopt.errors import InputError
+from tetopt.model.sets import label_set_names
+
+TABLE_TEXT = "label_table"  # of a mesh's file, and of a model's `about`: what `table_words` makes
+
+
+class LabelTable(NamedTuple):
+    """Names and colours of labels; a label may have one of them, or neither."""
+
+    names: dict[int, str]  # any text on one line; two labels may have the same
+    colours: dict[int, tuple[float, float, float]]  # red, green and blue, 0 to 1
+
+
+NO_TABLE = LabelTable({}, {})  # of labels that only have numbers
+
+
+def label_words(label: int, names: Mapping[int, str]) -> str:
+    """A label as it is told: "5 (liver)", or "5" if it has no name."""
+    return f"{label} ({names[label]})" if label in names else f"{label}"
+
+
+def labels_named(text: str, names: Mapping[int, str]) -> list[int]:
+    """The labels that a text means, ascending: those of this name, or the one whose set is called so.
+
+    Capitals do not matter where no label has the name exactly. A whole number is that label.
+
+    Raises
+    ------
+    InputError
+        No label has such a name, with those nearest to it.
+
+    Examples
+    --------
+    >>> labels_named("liver", {5: "liver", 6: "stomach"}), labels_named("6", {})
+    ([5], [6])
+    >>> labels_named("left_lung", {10: "Left lung"})
+    [10]
+    """
+    text = text.strip()
+    if text.isdecimal():
+        return [int(text)]
+    of_sets = label_set_names(names, names)
+    for known in (names, of_sets):
+        for same in (str, str.lower):
+            if labels := sorted(label for label, name in known.items() if same(name.strip()) == same(text)):
+                return labels
+    if not names:
+        raise InputError(f'label "{text}": no label has a name; give a table of them (--label-names)')
+    lower = {name.lower(): name for name in (*of_sets.values(), *names.values())}
+    near = [lower[each] for each in difflib.get_close_matches(text.lower(), lower, 3)]
+    first = ", ".join(list(names.values())[:8]) + (", ..." if len(names) > 8 else "")
+    hint = f"did you mean {' or '.join(near)}?" if near else f"there are {first}"
+    raise InputError(f'label "{text}": no label is called so; {hint}')
+
+
+def table_words(table: LabelTable) -> dict[str, dict[str, str]]:
+    """The table as JSON can hold it: by label, "name" and "colour" ("#rrggbb"), as far as it has them."""
+    words: dict[str, dict[str, str]] = {str(label): {} for label in sorted({*table.names, *table.colours})}
+    for label, name in table.names.items():
+        words[str(label)]["name"] = name
+    for label, colour in table.colours.items():
+        words[str(label)]["colour"] = "#" + "".join(f"{round(255.0 * part):02x}" for part in colour)
+    return words
+
+
+def table_of_words(words: Any) -> LabelTable:
+    """The table that `table_words` was made of, colours to 1/255; what is not of that kind is left out."""
+    names, colours = {}, {}
+    for label, entry in words.items() if isinstance(words, dict) else ():
+        if not str(label).isdecimal() or not isinstance(entry, dict):
+            continue
+        if isinstance(name := entry.get("name"), str):
+            names[int(label)] = name
+        if (colour := hex_colour(entry.get("colour"))) is not None:
+            colours[int(label)] = colour
+    return LabelTable(names, colours)
+
+
+def hex_colour(text: Any) -> tuple[float, float, float] | None:
+    """Red, green and blue, 0 to 1, of "#rrggbb"; None of anything else."""
+    if not isinstance(text, str) or len(text) != 7 or text[0] != "#":
+        return None
+    try:
+        parts = bytes.fromhex(text[1:])
+    except ValueError:
+        return None
+    return (parts[0] / 255.0, parts[1] / 255.0, parts[2] / 255.0)
+
+
+def table_of_labels(table: LabelTable, labels: Iterable[int]) -> LabelTable:
+    """The entries of these labels alone."""
+    few = set(labels)
+    return LabelTable(
+        {label: name for label, name in table.names.items() if label in few},
+        {label: colour for label, colour in table.colours.items() if label in few},
+    )
