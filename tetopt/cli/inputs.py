@@ -19,7 +19,7 @@ from tetopt.io.files import checked_output
 from tetopt.io.images import parse_crop, parse_slice, part_of, sha256
 from tetopt.io.meshes import MeshFile
 from tetopt.target.align import aligned_contrast, is_same_grid
-from tetopt.target.content import check_labels
+from tetopt.target.labels import check_labels
 
 IN_IMAGE_SHARE = 0.95  # of a mask's or labels' volume: less of it in the image is more than the grids' difference
 AFFINE_MM = 1e-4  # affines that differ by less are the same: files round them to 32 bits

@@ -26,8 +26,8 @@ from tetopt.geometry.simplex import centroids, volumes
 from tetopt.geometry.topology import components, facets
 from tetopt.image import Image, transformed
 from tetopt.mesh import Mesh
-from tetopt.target.content import LARGEST_LABEL, check_labels
 from tetopt.target.domain import INSIDE_SHARE
+from tetopt.target.labels import LARGEST_LABEL, check_labels
 
 POINTS_PER_CELL = 24  # at which a cell is compared with the voxels
 MOST_POINTS = 20_000  # on a surface, from which distances are measured
@@ -95,7 +95,7 @@ def cell_labels(labels: Image, mesh: Mesh) -> NDArray[np.int64]:
     Parameters
     ----------
     labels : Image
-        Whole numbers from 0 to `tetopt.target.content.LARGEST_LABEL`.
+        Whole numbers from 0 to `tetopt.target.labels.LARGEST_LABEL`.
     mesh : Mesh
 
     Returns
@@ -120,7 +120,7 @@ def label_fidelity(labels: Image, mesh: Mesh, of_cell: ArrayLike | None = None) 
     Parameters
     ----------
     labels : Image
-        Whole numbers from 0 to `tetopt.target.content.LARGEST_LABEL`.
+        Whole numbers from 0 to `tetopt.target.labels.LARGEST_LABEL`.
     mesh : Mesh
     of_cell : (M,) array of whole numbers, optional
         Label that each cell carries; `cell_labels` by default.

@@ -13,7 +13,7 @@ from tetopt.energy.sampling import cell_moments, cell_of_voxel
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.target.content import check_labels
+from tetopt.target.labels import check_labels
 from tetopt.target.otsu import class_thresholds
 
 

@@ -10,7 +10,7 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from tetopt.image import Image
-from tetopt.target.content import check_labels
+from tetopt.target.labels import check_labels
 
 BACKGROUND_COLOUR = "#e6e6e6"  # of label 0
 UNCOVERED_COLOUR = "#cfe3f5"  # where a mesh leaves the image uncovered
@@ -35,7 +35,7 @@ def label_colours(labels: Image) -> NDArray[np.float64]:
     Parameters
     ----------
     labels : Image
-        Whole numbers from 0 to `tetopt.target.content.LARGEST_LABEL`.
+        Whole numbers from 0 to `tetopt.target.labels.LARGEST_LABEL`.
 
     Returns
     -------

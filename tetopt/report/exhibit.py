@@ -14,7 +14,7 @@ from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields
 from tetopt.report.colours import grey_limits, label_colours
-from tetopt.target.content import LARGEST_LABEL
+from tetopt.target.labels import LARGEST_LABEL
 
 COLOUR_MAP = "viridis"  # perceptually even
 MOST_CATEGORIES = 128  # Whole numbers with more values than this are a quantity: no list of colours that long is read.

@@ -119,7 +119,7 @@ def label_figure(labels: Image, mesh: Mesh, of_cell: NDArray[np.int64] | None = 
     Parameters
     ----------
     labels : Image
-        Whole numbers from 0 to `tetopt.target.content.LARGEST_LABEL`.
+        Whole numbers from 0 to `tetopt.target.labels.LARGEST_LABEL`.
     mesh : Mesh
     of_cell : (M,) int64, optional
         Each cell's label; by default that of most of its voxels (`tetopt.measure.fidelity.cell_labels`).

@@ -30,7 +30,7 @@ from tetopt.report.scene import (
 from tetopt.report.summary import versions
 from tetopt.study import paper
 from tetopt.study.paper_figures import landscape_figure, relaxation_figure
-from tetopt.target.content import check_labels
+from tetopt.target.labels import check_labels
 
 PAPER_PICTURES = ("fig1.png", "fig2.png", "fig2b.png", "fig3ab.png", "fig3cd.png", "fig3e.png", "fig3f.png")
 PAPER_FILES = ("paper.json", "paper.html", *PAPER_PICTURES)

@@ -15,8 +15,8 @@ from scipy import ndimage
 from tetopt.errors import InputError
 from tetopt.geometry.box import box_sides
 from tetopt.image import Image
-from tetopt.target.content import check_labels
 from tetopt.target.domain import INSIDE_SHARE
+from tetopt.target.labels import check_labels
 from tetopt.target.otsu import class_thresholds
 
 SAME_GRID_VOXELS = 1e-4  # two grids whose corners differ by no more are the same: headers hold single precision
@@ -63,7 +63,7 @@ def aligned_labels(labels: Image, image: Image, name: str = "labels") -> Image:
     Parameters
     ----------
     labels : Image
-        Whole numbers from 0 to `tetopt.target.content.LARGEST_LABEL`, 0 the background.
+        Whole numbers from 0 to `tetopt.target.labels.LARGEST_LABEL`, 0 the background.
     image : Image
     name : str, optional
         What the labels are called in messages.

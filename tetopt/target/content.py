@@ -12,16 +12,15 @@ from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import binary_erosion, distance_transform_edt, find_objects, maximum_filter
+from scipy.ndimage import binary_erosion, distance_transform_edt, find_objects
 
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.target.domain import INSIDE_SHARE, Region, region_of
+from tetopt.target.labels import check_labels, label_channels
 
 SAMPLED_VOXELS = 100_000  # of these the most frequent value is taken for the background's
 MOST_LABEL_VALUES = 32  # an image of no more values than this is one of labels, and has no noise
-LARGEST_LABEL = 32_767  # the largest of 16 bits with a sign, in which many programs keep labels
-APART_VOXELS = 4  # labels that come no nearer to one another may share a channel
 RARITY_POWER = 0.5  # of a label's share of the voxels, by which each of its voxels counts less
 SAME_PLACE_VOXELS = 1e-2  # voxel centres that lie no further apart are in the same place
 STEPS_PER_SIGMA = 256.0  # whole numbers in a contrast's standard deviation, at least
@@ -242,18 +241,6 @@ def _check(images: list[Image], others: dict[str, Image | None], weights: list[f
         check_labels("labels", others["labels"])
 
 
-def check_labels(name: str, labels: Image) -> None:
-    """InputError unless the voxels are whole numbers from 0 to `LARGEST_LABEL`."""
-    data = labels.data
-    wrong = np.argwhere((data < 0) | (data > LARGEST_LABEL) | (np.rint(data) != data))
-    if len(wrong):
-        first = tuple(int(i) for i in wrong[0])
-        raise InputError(
-            f"{name}: labels must be whole numbers from 0 to {LARGEST_LABEL}, {len(wrong)} voxels have others, the "
-            f"first {data[first]:g} at {first}; is it a label image?"
-        )
-
-
 def _one_hot(labels: NDArray[np.int64], region: Region | None) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
     """Channels that tell K labels apart: each voxel's row, and the rows' values in C channels, (C, K).
 
@@ -271,23 +258,6 @@ def _one_hot(labels: NDArray[np.int64], region: Region | None) -> tuple[NDArray[
     codes = np.where(channel == np.arange(channel.max() + 1)[:, None], size, 0.0)
     spread = float((codes**2 @ share - (codes @ share) ** 2).sum())
     return number, (codes / np.sqrt(spread) if len(share) > 1 else codes[:0])
-
-
-def label_channels(number: NDArray[np.int64], n_labels: int) -> NDArray[np.int64]:
-    """A channel for each label: labels within `APART_VOXELS` voxels of one another have different ones."""
-    shape = tuple(-(-s // APART_VOXELS) for s in number.shape)
-    block = np.ravel_multi_index(
-        np.meshgrid(*[np.arange(s) // APART_VOXELS for s in number.shape], indexing="ij"), shape
-    )
-    is_in = np.zeros((n_labels, int(np.prod(shape))), dtype=bool)
-    is_in[number.ravel(), block.ravel()] = True
-    is_beside = np.stack([maximum_filter(row.reshape(shape), size=3).ravel() for row in is_in])
-    touches = is_beside.astype(np.float32) @ is_in.T.astype(np.float32) > 0.0
-    channel = np.full(n_labels, -1, dtype=np.int64)
-    for label in np.argsort(-touches.sum(axis=1), kind="stable"):
-        taken = set(channel[touches[label]].tolist())
-        channel[label] = next(c for c in range(n_labels) if c not in taken)
-    return channel
 
 
 def noise_level(data: NDArray, inside: NDArray[np.bool_] | None = None) -> float:

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from scipy.ndimage import distance_transform_edt, gaussian_filter, maximum_filter
 
 from tetopt.image import Image
-from tetopt.target.content import check_labels, label_channels
+from tetopt.target.labels import check_labels, label_channels
 
 FARTHEST_LEVEL = 6.0  # levels end there: nothing that moves by steps near an interface looks further
 STAIRS_VOXELS = 1.0  # sigma of the Gaussian that takes the stairs of voxels off a label
