@@ -285,3 +285,80 @@ def block_means(data, shape):
             shares[row, column] = max(Fraction(0), high - low) * Fraction(new, old)
         data = np.moveaxis(np.tensordot(shares, data, axes=(1, axis)), 0, axis)
     return data
+
+
+# Labels of cells
+
+
+def faces_of(cells):
+    """All simplices of some cells, their nodes as frozensets."""
+    return {frozenset(map(int, part)) for cell in cells for k in range(len(cell)) for part in combinations(cell, k + 1)}
+
+
+def euler(simplices):
+    return sum((-1) ** (len(simplex) - 1) for simplex in simplices)
+
+
+def is_disc(shared, n):
+    """Whether simplices on the surface of a cell of n + 1 corners are a disc: of facets, with Euler number 1."""
+    walls = [simplex for simplex in shared if len(simplex) == n]
+    return all(any(simplex <= wall for wall in walls) for simplex in shared) and euler(shared) == 1
+
+
+def keeps_topology(cells, labels, cell, label):
+    """Of the old label and the new: what a cell shares with it, and with all others and the outside, is a disc each."""
+    n = cells.shape[1] - 1
+    outer = [sorted(nodes) for nodes, sides in facets(cells).items() if len(sides) == 1]
+    rest = [(nodes, own) for number, (nodes, own) in enumerate(zip(cells, labels, strict=True)) if number != cell]
+    mine = faces_of([cells[cell]])
+    groups = []
+    for one in (labels[cell], label):
+        groups.append([nodes for nodes, own in rest if own == one])
+        groups.append([nodes for nodes, own in rest if own != one] + outer)
+    return all(is_disc(mine & faces_of(group), n) for group in groups)
+
+
+def fans(cells, chosen, face, is_outside):
+    """Sets of the chosen cells around a node or edge that hang together by facets around it, or by the outside."""
+    around = [number for number, cell in enumerate(cells) if face <= set(cell.tolist())]
+    left = {number for number in around if number in chosen}
+    links = []
+    for nodes, sides in facets(cells[around]).items():
+        if face <= set(nodes):
+            sides = [around[i] for i in sides]
+            links.append(sides if len(sides) == 2 else [*sides, -1])
+    if is_outside and any(-1 in link for link in links):
+        left.add(-1)
+    count = 0
+    while left:
+        count, front = count + 1, [left.pop()]
+        while front:
+            last = front.pop()
+            new = {number for link in links if last in link for number in link} & left
+            left -= new
+            front += new
+    return count
+
+
+def pinched(cells, labels, label):
+    """Nodes of each edge and node at which the cells of a label, or all others, are several fans."""
+    own, others = (set(np.flatnonzero((labels == label) == is_own).tolist()) for is_own in (True, False))
+    at = faces_of(cells[sorted(own)]) & faces_of(cells[sorted(others)])
+    faces = [face for face in at if len(face) < cells.shape[1] - 1]
+    return {face for face in faces if fans(cells, own, face, False) > 1 or fans(cells, others, face, True) > 1}
+
+
+def nonmanifold(cells, labels):
+    """From the nodes of each edge and node that is `pinched` for a label to the labels there."""
+    bad = set().union(*(pinched(cells, labels, label) for label in set(labels.tolist())))
+    return {face: {int(labels[i]) for i, cell in enumerate(cells) if face <= set(cell.tolist())} for face in bad}
+
+
+def labelling_energy(voxels, tension, cells, labels):
+    """Volume of voxels (M, K) that are not of their cell's label, and tension (M, n+1) of facets between labels."""
+    energy = sum(row.sum() - row[label] for row, label in zip(voxels, labels, strict=True))
+    for nodes, sides in facets(cells).items():
+        if len(sides) == 2 and labels[sides[0]] != labels[sides[1]]:
+            k = next(k for k, node in enumerate(cells[sides[0]]) if node not in nodes)
+            energy += tension[sides[0], k]
+    return energy

@@ -1,0 +1,197 @@
+"""Labels of cells: energy, fragments, manifold interfaces, and which cells may change without changing topology."""
+
+import naive
+import numpy as np
+import pytest
+from meshes import delaunay_box
+from scipy.sparse import csr_array
+from shapes import distance
+
+import tetopt
+from tetopt.energy.sampling import cell_of_voxel
+from tetopt.engine import labelling
+from tetopt.engine.complex import fill_across
+from tetopt.engine.labelling import keeps_topology, labelled, pieces_of, voxel_pieces
+from tetopt.geometry.simplex import oriented, volumes
+from tetopt.geometry.topology import rings
+
+
+def across_of(cells, n_nodes):
+    across = np.full(cells.shape, -1, dtype=np.int64)
+    fill_across(across, np.ascontiguousarray(cells), len(cells), n_nodes)
+    return across
+
+
+def whole(labels, n_labels, size):
+    """Counts of a mesh whose cells each hold their volume in voxels of one label."""
+    return csr_array((size, (np.arange(len(labels)), labels)), shape=(len(labels), n_labels))
+
+
+def solved(points, cells, labels, n_labels=2, pieces=None, weight=None, counts=None):
+    """`labelled` of cells that are full of one label each."""
+    counts = whole(labels, n_labels, volumes(points, cells)) if counts is None else counts
+    pieces = [np.array([1])] * n_labels if pieces is None else pieces
+    return labelled(points, cells, across_of(cells, len(points)), counts, pieces, weight)
+
+
+def lattice(n, cubes):
+    """A small lattice: cells numbered as they come."""
+    mesh = tetopt.lattice(tetopt.Image(np.zeros((cubes,) * n)), blocks=(cubes,) * n)
+    return mesh.points, mesh.cells
+
+
+def box(n, count, seed):
+    points, cells = delaunay_box(np.random.default_rng(seed), (6, 5, 7)[:n], count)
+    return points, oriented(points, cells)
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_keeps_topology_as_its_twin(n):
+    """On thousands of random labels: the twin's answer, and where it is yes neither Euler numbers nor pieces change."""
+    rng, n_kept, n_asked = np.random.default_rng(7), 0, 0
+    for seed in range(6):
+        points, cells = box(n, 25, seed) if seed % 2 else lattice(n, 2)
+        across, ring = across_of(cells, len(points)), rings(cells, len(points))
+        for _ in range(8):
+            # Half spaces with noise: few cells of pure noise may change.
+            place = points[cells].mean(axis=1) @ rng.normal(size=n)
+            labels = np.digitize(place, np.quantile(place, [0.3, 0.6]))
+            labels = np.where(rng.random(len(cells)) < 0.1, rng.integers(0, 3, len(cells)), labels)
+            for cell in rng.choice(len(cells), 12):
+                for label in {0, 1, 2} - {int(labels[cell])}:
+                    keeps = keeps_topology(cells, across, labels, ring.start, ring.cells, cell, label)
+                    assert keeps == naive.keeps_topology(cells, labels, cell, label)
+                    n_asked, n_kept = n_asked + 1, n_kept + keeps
+                    if keeps:
+                        assert_same_topology(cells, labels, cell, label)
+    assert n_asked >= 1000
+    assert n_kept > 0.05 * n_asked
+
+
+def assert_same_topology(cells, labels, cell, label):
+    after = labels.copy()
+    after[cell] = label
+    across = across_of(cells, int(cells.max()) + 1)
+    for one in (labels[cell], label):
+        assert naive.euler(naive.faces_of(cells[labels == one])) == naive.euler(naive.faces_of(cells[after == one]))
+        n_pieces = [(pieces_of(across, of)[1] == one).sum() for of in (labels, after)]
+        assert n_pieces[0] == n_pieces[1]
+        assert naive.pinched(cells, after, one) == naive.pinched(cells, labels, one)
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_what_is_not_manifold_as_the_twin(n):
+    rng = np.random.default_rng(3)
+    for seed in range(3):
+        points, cells = box(n, 20, seed) if seed else lattice(n, 2)
+        labels = rng.integers(0, 2 + seed, len(cells))
+        counts = whole(labels, 4, volumes(points, cells))
+        dual = labelling._dual(points, cells, across_of(cells, len(points)), counts, None)
+        faces, is_two = labelling._nonmanifold(dual, labels)
+        bad = {frozenset(int(i) for i in face if i >= 0): two for face, two in zip(faces, is_two, strict=True)}
+        assert bad == {face: len(there) == 2 for face, there in naive.nonmanifold(cells, labels).items()}
+        assert len(bad) > 1
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_moves_lower_the_energy(n):
+    """By cells of random content: each time cells settle it falls, and no move of one cell is left that lowers it."""
+    rng = np.random.default_rng(5)
+    points, cells = box(n, 40, 1)
+    voxels = rng.random((len(cells), 3)) * volumes(points, cells)[:, None]
+    dual = labelling._dual(points, cells, across_of(cells, len(points)), csr_array(voxels), 0.2)
+    labels = voxels.argmax(axis=1)
+    voxels *= volumes(points, cells).sum() / voxels.sum()
+
+    def energy(labels):
+        return naive.labelling_energy(voxels, dual.tension, cells, labels)
+
+    np.testing.assert_array_equal(labelling._majority(dual), labels)
+    before = energy(labels)
+    moved = labelling._settle(dual, labels, np.zeros(3), False)
+    after = energy(labels)
+    assert moved > 0
+    assert after < before
+    for cell in range(len(cells)):
+        for other in dual.across[cell][dual.across[cell] >= 0]:
+            changed = labels.copy()
+            changed[cell] = labels[other]
+            assert energy(changed) >= after - 1e-6
+
+
+def ball(n_blocks=7, radius=7.5, seed=None):
+    """A lattice and the labels of a ball in it, with some cells of noise."""
+    shape = (24, 24, 24)
+    image = tetopt.Image(1.0 * (distance(shape, 11.5, 11.6, 11.7) < radius))
+    mesh = tetopt.lattice(image, blocks=(n_blocks,) * 3)
+    owner, n_cells = cell_of_voxel(image, mesh).ravel(), len(mesh.cells)
+    counts = np.zeros((n_cells, 2))
+    np.add.at(counts, (owner, image.data.ravel().astype(int)), 1.0)
+    if seed is not None:
+        loose = np.random.default_rng(seed).random(n_cells) < 0.03
+        counts[loose] = counts[loose][:, ::-1]
+    counts[counts.sum(axis=1) == 0.0, 0] = 0.1
+    return mesh, image, csr_array(counts)
+
+
+@pytest.mark.parametrize("seed", [None, 0, 1])
+def test_a_ball_is_one_piece_with_a_manifold_surface(seed):
+    """Noise or not: one piece, the Euler number of a ball and of its surface, and most of its volume."""
+    mesh, image, counts = ball(seed=seed)
+    result = solved(mesh.points, mesh.cells, None, counts=counts)
+    inside = mesh.cells[result.labels == 1]
+    assert result.pieces.tolist() == [1, 1]
+    assert (result.n_nonmanifold_edges, result.n_nonmanifold_nodes) == (0, 0)
+    assert naive.euler(naive.faces_of(inside)) == 1
+    assert volumes(mesh.points, inside).sum() == pytest.approx(image.data.sum(), rel=0.12)
+    assert result.n_moved == (result.labels != counts.toarray().argmax(axis=1)).sum()
+    assert len(result.lost) == 0
+
+
+def test_fragments_go_and_pieces_stay():
+    """Two balls are two pieces where voxels have two; the smaller goes where they have one, or it is too small."""
+    mesh, image, counts = ball(radius=5.0)
+    centre = mesh.points[mesh.cells].mean(axis=1)
+    full = counts.toarray()
+    is_corner = np.linalg.norm(centre - 2.0, axis=1) < 5.0
+    full[is_corner] = np.column_stack([0.0 * full[is_corner, 0], full[is_corner].sum(axis=1)])
+    counts = csr_array(full)
+    large, small = int(image.data.sum()), int(full[is_corner, 1].sum())
+    ends = {}
+    for name, sizes in (("two", [large, small]), ("one", [large]), ("larger", [large, 3 * small])):
+        ends[name] = solved(mesh.points, mesh.cells, None, counts=counts, pieces=[np.array([9000]), np.array(sizes)])
+    assert ends["two"].pieces.tolist() == [1, 2]
+    assert ends["one"].pieces.tolist() == ends["larger"].pieces.tolist() == [1, 1]
+    assert (ends["one"].labels[is_corner] == 0).all()
+    assert (ends["two"].labels[is_corner] == 1).mean() > 0.5
+
+
+def test_cubes_that_touch_at_an_edge_or_a_corner_are_linked_or_parted():
+    """A lattice of cubes, two of which have the label: what they share is no longer pinched."""
+    image = tetopt.Image(np.zeros((4, 4, 4)))
+    mesh = tetopt.lattice(image, "five-tet", blocks=(4, 4, 4))
+    cube = np.floor(mesh.points[mesh.cells].mean(axis=1) + 0.5).astype(int)
+    for other in ((2, 2, 1), (2, 2, 2)):
+        labels = ((cube == 1).all(axis=1) | (cube == other).all(axis=1)).astype(np.int64)
+        assert len(naive.nonmanifold(mesh.cells, labels)) > 0
+        result = solved(mesh.points, mesh.cells, labels, pieces=[np.array([60]), np.array([1, 1])], weight=1e-6)
+        assert naive.nonmanifold(mesh.cells, result.labels) == {}
+        assert (result.n_nonmanifold_edges, result.n_nonmanifold_nodes) == (0, 0)
+        assert 0 < result.n_moved < 10
+
+
+def test_a_label_of_one_cell_stays_and_one_without_is_lost():
+    """However much tension there is."""
+    mesh, _, counts = ball()
+    full = np.column_stack([counts.toarray(), np.zeros((len(mesh.cells), 2))])
+    full[100] = [0.0, 0.0, full[100].sum(), 0.0]
+    full[200, 3] = 0.1
+    result = solved(mesh.points, mesh.cells, None, 4, counts=csr_array(full), weight=50.0)
+    assert (result.labels == 2).any()
+    assert result.lost.tolist() == [3]
+
+
+def test_pieces_of_voxels():
+    partition = np.array([[0, 0, 1, 1], [1, 0, 0, 1], [1, 1, 0, 3]])
+    sizes = voxel_pieces(partition, 4)
+    assert [s.tolist() for s in sizes] == [[5], [3, 3], [], [1]]

@@ -1,0 +1,637 @@
+"""Which label each cell has: labels whole, their interfaces short and manifold.
+
+The labels minimise a Potts energy on the dual graph of a mesh that stays as it is (Boykov, Veksler, Zabih 2001),
+
+    sum over cells of the volume of voxels that are not of the cell's label
+    + sum over facets between cells of different labels of tension x area,
+
+a surface tension in mm: how far a surface would move to save itself. A ball smaller than three of it in radius, or a
+sheet thinner than two, costs more than it is worth. From the labels that most voxels of each cell have, cells take
+the label of a neighbour, the best move first, as long as the energy falls. Then pieces of cells that no piece of
+voxels justifies go to their neighbours, and what is not manifold is mended by the cells around it that cost least.
+
+An interface is manifold at an edge or a node if, of each label there, the cells around it are one fan, and all
+others, with the outside among them, are one, too: linked by facets that contain the edge or the node.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.ndimage import find_objects
+from scipy.ndimage import label as voxel_components
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import connected_components
+
+from tetopt.engine.complex import has_node
+from tetopt.geometry.simplex import facet_areas, volumes
+from tetopt.geometry.topology import rings
+
+TENSION_SHARE = (
+    0.1  # of the local edge: a regular cell with three facets against one label goes, unless nearly full of its own
+)
+LEAST_SHARE = 0.5  # of a label's volume: tension takes no more, so that small labels do not wither away
+PIECE_SHARE = 0.5  # of a piece of voxels that a piece of cells must hold to be that piece
+MENDING_ROUNDS = 6  # of fragments and mending, at most; the second mostly has nothing left to do
+TWO_LABELS_WEIGHT = 100.0  # volumes of cells around: what is not manifold between two labels goes at nearly any cost
+MORE_LABELS_WEIGHT = 4.0  # the same where three labels meet or more: only if a few cells are enough
+LEAST_GAIN = 1e-9  # of a cell's volume: less than this is rounding
+
+
+class Labelling(NamedTuple):
+    """The label of each cell, as rows of the labels, and what is left undone."""
+
+    labels: NDArray[np.int64]  # (M,)
+    n_moved: int  # cells whose label is not the one of most of their voxels
+    n_nonmanifold_edges: int  # where only two labels meet; nodes in 2-D have no edges, 0
+    n_nonmanifold_nodes: int
+    pieces: NDArray[np.int64]  # (K,) pieces of cells, linked by facets
+    lost: NDArray[np.int64]  # labels with voxels but without cells
+
+
+class Dual(NamedTuple):
+    """A mesh as its cells touch each other, and what each cell holds."""
+
+    cells: NDArray[np.int64]  # (M, n+1)
+    across: NDArray[np.int64]  # (M, n+1) the cell beyond each facet; -1 outside
+    ring_start: NDArray[np.int64]  # (N+1,)
+    ring_cells: NDArray[np.int64]  # (M (n+1),) the cells around each node, ascending
+    size: NDArray[np.float64]  # (M,) volumes, mm^n
+    scale: NDArray[np.float64]  # (N,) mean volume of the cells around each node
+    tension: NDArray[np.float64]  # (M, n+1) what each facet costs between different labels, mm^n; 0 on the boundary
+    first: NDArray[np.int64]  # (M+1,) where each cell's row of voxels begins
+    row: NDArray[np.int64]  # labels in it
+    volume: NDArray[np.float64]  # of their voxels in it, mm^n
+
+
+def labelled(
+    points: NDArray[np.float64], cells: NDArray[np.int64], across: NDArray[np.int64], counts: csr_array,
+    pieces: list[NDArray], weight: float | None = None,
+) -> Labelling:  # fmt: skip
+    """The label of each cell of a mesh: close to the voxels in it, interfaces short and manifold, no fragments.
+
+    It ends, since every move but that of fragments lowers an energy, and fragments go at most `MENDING_ROUNDS` times.
+    A label that most voxels of a cell have keeps a cell at least.
+
+    Parameters
+    ----------
+    points : (N, n) float64
+        Nodes, mm.
+    cells : (M, n+1) int64
+        Positively oriented.
+    across : (M, n+1) int64
+        The cell beyond each facet, opposite each corner; -1 outside.
+    counts : (M, K) sparse array in rows
+        Voxels of each label in each cell, with shares of a voxel where a cell holds no centre. No row is empty.
+    pieces : list of K arrays
+        Voxels in each piece of each label, falling: `voxel_pieces`. As many pieces of cells may stay.
+    weight : float, optional
+        Surface tension, mm; by default `TENSION_SHARE` of the mean edge of the two cells at each facet.
+
+    Returns
+    -------
+    Labelling
+    """
+    dual, n_labels = _dual(points, cells, across, counts, weight), counts.shape[1]
+    begin = _majority(dual)
+    labels = begin.copy()
+    least = (LEAST_SHARE * np.bincount(dual.row, dual.volume, n_labels)).astype(np.float64)
+    _settle(dual, labels, least, False)
+    for _ in range(MENDING_ROUNDS):
+        moved = _without_fragments(dual, labels, counts, pieces)
+        moved += _mended(dual, labels, n_labels)
+        moved += _settle(dual, labels, least, True)
+        if moved == 0:
+            break
+    faces, is_two = _nonmanifold(dual, labels)
+    _, of_piece = pieces_of(across, labels)
+    present = np.bincount(dual.row, dual.volume, n_labels) > 0.0
+    return Labelling(
+        labels,
+        int((labels != begin).sum()),
+        int((is_two & (faces[:, 1] >= 0)).sum()),
+        int((is_two & (faces[:, 1] < 0)).sum()),
+        np.bincount(of_piece, minlength=n_labels),
+        np.flatnonzero(present & (np.bincount(labels, minlength=n_labels) == 0)),
+    )
+
+
+def voxel_pieces(partition: NDArray[np.int64], n_labels: int) -> list[NDArray[np.int64]]:
+    """Voxels in each piece of each label of a grid, falling; linked by faces."""
+    boxes = find_objects(partition + 1, n_labels)
+    parts = [np.zeros(1, dtype=bool) if box is None else partition[box] == k for k, box in enumerate(boxes)]
+    return [np.sort(np.bincount(voxel_components(part)[0].ravel())[1:])[::-1] for part in parts]
+
+
+def pieces_of(across: NDArray[np.int64], labels: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
+    """The piece of each cell, (M,), linked by facets between cells of one label; and the label of each piece."""
+    one = np.repeat(np.arange(len(labels)), across.shape[1])
+    other = across.ravel()
+    is_link = (other > one) & (labels[one] == labels[other])
+    links = coo_array((np.ones(is_link.sum(), dtype=np.int8), (one[is_link], other[is_link])), shape=(len(labels),) * 2)
+    n_pieces, number = connected_components(links, directed=False)
+    of_piece = np.empty(n_pieces, dtype=np.int64)
+    of_piece[number] = labels
+    return number.astype(np.int64), of_piece
+
+
+def _dual(
+    points: NDArray[np.float64], cells: NDArray[np.int64], across: NDArray[np.int64], counts: csr_array,
+    weight: float | None,
+) -> Dual:  # fmt: skip
+    assert (np.diff(counts.indptr) > 0).all(), "labelled: a cell without voxels has no shares of any label"
+    n = points.shape[1]
+    size, around = np.abs(volumes(points, cells)), rings(cells, len(points))
+    scale = np.add.reduceat(np.append(size[around.cells], 0.0), around.start[:-1]) / np.maximum(
+        np.diff(around.start), 1
+    )
+    tension = np.full(across.shape, weight)
+    if weight is None:
+        # The edge of a regular cell of that volume: thin cells do not make a surface dear.
+        edge = (size * (6.0 * np.sqrt(2.0) if n == 3 else 4.0 / np.sqrt(3.0))) ** (1.0 / n)
+        tension = TENSION_SHARE * 0.5 * (edge[:, None] + edge[across])
+    tension = np.where(across >= 0, tension * facet_areas(points, cells), 0.0)
+    voxel = size.sum() / counts.sum()
+    return Dual(
+        np.ascontiguousarray(cells, dtype=np.int64),
+        np.ascontiguousarray(across, dtype=np.int64),
+        around.start,
+        around.cells,
+        size,
+        scale,
+        tension,
+        counts.indptr.astype(np.int64),
+        counts.indices.astype(np.int64),
+        voxel * counts.data.astype(np.float64),
+    )
+
+
+def _majority(dual: Dual) -> NDArray[np.int64]:
+    """The label that most voxels of each cell have, of equally many the first."""
+    cell = np.repeat(np.arange(len(dual.cells)), np.diff(dual.first))
+    order = np.lexsort((dual.row, -dual.volume, cell))
+    return dual.row[order[dual.first[:-1]]]
+
+
+def _settle(dual: Dual, labels: NDArray[np.int64], least: NDArray[np.float64], is_careful: bool) -> int:
+    """Cells take the label of a neighbour while the energy falls, the best moves first; how many did.
+
+    Tension alone takes no label below its volume `least`. With care only where no label's topology changes.
+    """
+    room = np.bincount(labels, dual.size, len(least)) - least
+    n_of = np.bincount(labels, minlength=len(least))
+    total, gains = 0, np.zeros(len(labels))
+    while True:
+        _fill_gains(gains, dual, labels)
+        active = np.flatnonzero(gains > LEAST_GAIN * dual.size)
+        moved = _settle_once(dual, labels, active[np.argsort(-gains[active], kind="stable")], room, n_of, is_careful)
+        total += moved
+        if moved == 0:
+            return total
+
+
+@njit(cache=True, error_model="numpy")
+def _voxels(dual: Dual, cell: int, label: int) -> float:
+    """Volume of the voxels of a label in a cell."""
+    for p in range(dual.first[cell], dual.first[cell + 1]):
+        if dual.row[p] == label:
+            return dual.volume[p]
+    return 0.0
+
+
+@njit(cache=True, error_model="numpy")
+def _price(dual: Dual, labels: NDArray, cell: int, label: int) -> float:
+    """The part of the energy that a cell's label decides, less what it is at best, if its label were this."""
+    price = -_voxels(dual, cell, label)
+    for k in range(dual.across.shape[1]):
+        other = dual.across[cell, k]
+        if other >= 0 and labels[other] != label:
+            price += dual.tension[cell, k]
+    return price
+
+
+@njit(cache=True, error_model="numpy")
+def _best_label(dual: Dual, labels: NDArray, cell: int) -> tuple:
+    """Of the labels of a cell's neighbours the one of least price, and what is gained by it; its own if nothing is."""
+    own = _price(dual, labels, cell, labels[cell])
+    best, gain = labels[cell], 0.0
+    for k in range(dual.across.shape[1]):
+        other = dual.across[cell, k]
+        if other >= 0 and labels[other] != labels[cell] and labels[other] != best:
+            more = own - _price(dual, labels, cell, labels[other])
+            if more > gain or (more == gain and labels[other] < best):
+                best, gain = labels[other], more
+    return best, gain
+
+
+@njit(cache=True, error_model="numpy")
+def _fill_gains(gains: NDArray, dual: Dual, labels: NDArray) -> None:
+    for cell in range(len(labels)):
+        gains[cell] = _best_label(dual, labels, cell)[1]
+
+
+@njit(cache=True, error_model="numpy")
+def _settle_once(dual: Dual, labels: NDArray, order: NDArray, room: NDArray, n_of: NDArray, is_careful: bool) -> int:
+    """The cells of `order` take the best label of a neighbour one after the other, where that gains still."""
+    moved = 0
+    for cell in order:
+        old = labels[cell]
+        new, gain = _best_label(dual, labels, cell)
+        if not gain > LEAST_GAIN * dual.size[cell] or n_of[old] == 1:
+            continue
+        if room[old] < dual.size[cell] and _voxels(dual, cell, new) < _voxels(dual, cell, old):
+            continue
+        if is_careful and not keeps_topology(
+            dual.cells, dual.across, labels, dual.ring_start, dual.ring_cells, cell, new
+        ):
+            continue
+        labels[cell] = new
+        room[old] -= dual.size[cell]
+        room[new] += dual.size[cell]
+        n_of[old] -= 1
+        n_of[new] += 1
+        moved += 1
+    return moved
+
+
+@njit(cache=True, error_model="numpy")
+def keeps_topology(
+    cells: NDArray, across: NDArray, labels: NDArray, ring_start: NDArray, ring_cells: NDArray, cell: int, label: int
+) -> bool:
+    """Whether a cell may have another label without changing the topology of its own label or of the new one.
+
+    A simple point in a complex of simplices: of either label, what the cell shares with its other cells and what it
+    shares with all that is not of it, the outside among them, are discs. Pinches are topology, too.
+    """
+    rest = (cells, across, labels, ring_start, ring_cells, cell)
+    old = labels[cell]
+    return (
+        _is_disc(*rest, old, True)
+        and _is_disc(*rest, old, False)
+        and _is_disc(*rest, label, True)
+        and _is_disc(*rest, label, False)
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def _is_disc(
+    cells: NDArray, across: NDArray, labels: NDArray, ring_start: NDArray, ring_cells: NDArray, cell: int,
+    label: int, is_of: bool,
+) -> bool:  # fmt: skip
+    """Whether what a cell shares with the other cells of a label, or with those of others and the outside, is a disc.
+
+    It is a disc of facets if there is one of them and not all, and nothing else is shared. Facets opposite the corners
+    S cover all of the cell's surface but what contains all of S: only cells around the simplex S share more.
+    """
+    n, first, n_shared = cells.shape[1], -1, 0
+    is_shared = np.zeros(4, dtype=np.bool_)
+    for k in range(n):
+        other = across[cell, k]
+        is_shared[k] = (labels[other] == label) == is_of if other >= 0 else not is_of
+        if is_shared[k]:
+            n_shared, first = n_shared + 1, k
+    if n_shared == 0 or n_shared == n:
+        return False
+    node = cells[cell, first]
+    for r in range(ring_start[node], ring_start[node + 1]):
+        other = ring_cells[r]
+        if other == cell or not _has_corners(cells, other, cell, is_shared):
+            continue
+        if (labels[other] == label) == is_of:
+            return False
+        for k in range(n):  # the outside, beyond a facet that has all of S, too
+            if not is_of and across[other, k] < 0 and not _is_opposite(cells, other, k, cell, is_shared):
+                return False
+    # The cell's own facets outside are shared already: none of them contains all of S.
+    return True
+
+
+@njit(cache=True, error_model="numpy")
+def _has_corners(cells: NDArray, other: int, cell: int, is_one: NDArray) -> bool:
+    """Whether a cell has those corners of another one."""
+    has_all = True
+    for k in range(cells.shape[1]):
+        has_all = has_all and (not is_one[k] or has_node(cells, other, cells[cell, k]))
+    return has_all
+
+
+@njit(cache=True, error_model="numpy")
+def _is_opposite(cells: NDArray, other: int, k: int, cell: int, is_one: NDArray) -> bool:
+    """Whether facet k of a cell lies opposite one of those corners of another cell."""
+    is_opposite = False
+    for m in range(cells.shape[1]):
+        is_opposite = is_opposite or (is_one[m] and cells[cell, m] == cells[other, k])
+    return is_opposite
+
+
+def _without_fragments(dual: Dual, labels: NDArray[np.int64], counts: csr_array, pieces: list[NDArray]) -> int:
+    """Pieces of cells that no piece of voxels justifies go to their neighbours, cell by cell; how many cells did.
+
+    The pieces of a label are ranked by the voxels of it that they hold. The first stays. A further one stays if there
+    is a piece of voxels of that rank, of which it holds `PIECE_SHARE`.
+    """
+    number, of_piece = pieces_of(dual.across, labels)
+    cell = np.repeat(np.arange(len(labels)), np.diff(dual.first))
+    content = np.bincount(number[cell], np.where(dual.row == labels[cell], dual.volume, 0.0), len(of_piece))
+    order = np.lexsort((np.arange(len(of_piece)), -content, of_piece))
+    rank = np.empty(len(of_piece), dtype=np.int64)
+    rank[order] = np.arange(len(of_piece)) - np.searchsorted(of_piece[order], of_piece[order])
+    voxel = dual.volume.sum() / counts.sum()
+    ranked = zip(of_piece, rank, content, strict=True)
+    stays = [k == 0 or (k < len(pieces[p]) and c >= PIECE_SHARE * voxel * pieces[p][k]) for p, k, c in ranked]
+    return _give_away(dual, labels, ~np.array(stays)[number])
+
+
+@njit(cache=True, error_model="numpy")
+def _give_away(dual: Dual, labels: NDArray, is_loose: NDArray) -> int:
+    """Loose cells take the label of least price among those of neighbours that are not, from the outside in."""
+    total, moved = 0, 1
+    while moved > 0:
+        moved = 0
+        for cell in range(len(labels)):
+            if not is_loose[cell]:
+                continue
+            best, least = -1, np.inf
+            for k in range(dual.across.shape[1]):
+                other = dual.across[cell, k]
+                if other >= 0 and not is_loose[other]:
+                    price = _price(dual, labels, cell, labels[other])
+                    if price < least or (price == least and labels[other] < best):
+                        best, least = labels[other], price
+            if best >= 0:
+                labels[cell], is_loose[cell] = best, False
+                moved += 1
+        total += moved
+    return total
+
+
+# What is not manifold, at an edge (a, b) or a node (a, -1), and how it is mended.
+
+
+def _nonmanifold(dual: Dual, labels: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Edges (a, b) and nodes (a, -1) where a label's interface is not manifold, (F, 2), and where two labels meet."""
+    near = _mixed_nodes(dual, labels)
+    place = np.full(len(labels), -1, dtype=np.int64)
+    faces, number = np.empty((0, 2), dtype=np.int64), np.empty(0, dtype=np.int64)
+    n_faces = _find_nonmanifold(faces, number, dual, labels, near, place)
+    faces, number = np.empty((n_faces, 2), dtype=np.int64), np.empty(n_faces, dtype=np.int64)
+    _find_nonmanifold(faces, number, dual, labels, near, place)
+    return faces, number == 2
+
+
+def _mended(dual: Dual, labels: NDArray[np.int64], n_labels: int) -> int:
+    """What is not manifold is mended where that lowers the energy; how many cells took another label."""
+    total, moved = 0, 1
+    n_of = np.bincount(labels, minlength=n_labels)
+    place = np.full(len(labels), -1, dtype=np.int64)
+    while moved > 0:
+        faces, _ = _nonmanifold(dual, labels)
+        moved = _mend(dual, labels, n_of, faces, place)
+        total += moved
+    return total
+
+
+@njit(cache=True, error_model="numpy")
+def _mixed_nodes(dual: Dual, labels: NDArray) -> NDArray:
+    """Whether cells of two labels meet at each node."""
+    is_mixed = np.zeros(len(dual.ring_start) - 1, dtype=np.bool_)
+    for node in range(len(is_mixed)):
+        for r in range(dual.ring_start[node] + 1, dual.ring_start[node + 1]):
+            if labels[dual.ring_cells[r]] != labels[dual.ring_cells[dual.ring_start[node]]]:
+                is_mixed[node] = True
+    return is_mixed
+
+
+@njit(cache=True, error_model="numpy")
+def _find_nonmanifold(
+    faces: NDArray, number: NDArray, dual: Dual, labels: NDArray, is_mixed: NDArray, place: NDArray
+) -> int:
+    """The rows of `_nonmanifold`, and the number of labels that meet there, as far as there is room; their count."""
+    count, star = 0, np.empty(_widest(dual), dtype=np.int64)
+    for a in range(len(is_mixed)):
+        if not is_mixed[a]:
+            continue
+        excess, n_labels = _excess(dual, labels, a, -1, star, place)
+        if excess > 0:
+            if count < len(faces):
+                faces[count, 0], faces[count, 1], number[count] = a, -1, n_labels
+            count += 1
+        for r in range(dual.ring_start[a], dual.ring_start[a + 1]):
+            for k in range(4 if dual.cells.shape[1] == 4 else 0):
+                b = dual.cells[dual.ring_cells[r], k]
+                if b <= a or not is_mixed[b] or not _is_first(dual, a, r, b):
+                    continue
+                excess, n_labels = _excess(dual, labels, a, b, star, place)
+                if excess > 0:
+                    if count < len(faces):
+                        faces[count, 0], faces[count, 1], number[count] = a, b, n_labels
+                    count += 1
+    return count
+
+
+@njit(cache=True, error_model="numpy")
+def _is_first(dual: Dual, a: int, r: int, b: int) -> bool:
+    """Whether entry r of the ring of a is the first with b."""
+    is_first = True
+    for q in range(dual.ring_start[a], r):
+        is_first = is_first and not has_node(dual.cells, dual.ring_cells[q], b)
+    return is_first
+
+
+@njit(cache=True, error_model="numpy")
+def _widest(dual: Dual) -> int:
+    """The largest number of cells around a node."""
+    most = 0
+    for node in range(len(dual.ring_start) - 1):
+        most = max(most, dual.ring_start[node + 1] - dual.ring_start[node])
+    return most
+
+
+@njit(cache=True, error_model="numpy")
+def _gather(dual: Dual, a: int, b: int, star: NDArray) -> int:
+    """The cells around a node, or around an edge with b >= 0, and how many they are."""
+    count = 0
+    for r in range(dual.ring_start[a], dual.ring_start[a + 1]):
+        if b < 0 or has_node(dual.cells, dual.ring_cells[r], b):
+            star[count] = dual.ring_cells[r]
+            count += 1
+    return count
+
+
+@njit(cache=True, error_model="numpy")
+def _excess(dual: Dual, labels: NDArray, a: int, b: int, star: NDArray, place: NDArray) -> tuple:
+    """How many fans too many there are around a node or an edge, over all labels there; and how many these are.
+
+    For each label, the fans of its cells less one and those of all others, the outside among them, less one.
+    """
+    count = _gather(dual, a, b, star)
+    is_mixed = False
+    for i in range(1, count):
+        is_mixed = is_mixed or labels[star[i]] != labels[star[0]]
+    if not is_mixed:
+        return 0, 1
+    for i in range(count):
+        place[star[i]] = i
+    excess, n_labels = 0, 0
+    for i in range(count):
+        is_new = True
+        for j in range(i):
+            is_new = is_new and labels[star[j]] != labels[star[i]]
+        if is_new:
+            n_labels += 1
+            excess += _fans(dual, labels, a, b, star[:count], place, labels[star[i]]) - 2
+    for i in range(count):
+        place[star[i]] = -1
+    return excess, n_labels
+
+
+@njit(cache=True, error_model="numpy")
+def _fans(dual: Dual, labels: NDArray, a: int, b: int, star: NDArray, place: NDArray, label: int) -> int:
+    """Fans of a label's cells in a star and of all others, the outside among them: linked by facets around it."""
+    count = len(star)
+    root = np.arange(count + 1)  # the last is the outside
+    n_fans, is_open = count, False
+    for i in range(count):
+        cell = star[i]
+        for k in range(dual.cells.shape[1]):
+            if dual.cells[cell, k] == a or dual.cells[cell, k] == b:
+                continue
+            other = dual.across[cell, k]
+            j = count if other < 0 else place[other]
+            is_open = is_open or other < 0
+            if j < i or (labels[cell] == label) != (j < count and labels[other] == label):
+                continue
+            p, q = i, j
+            while root[p] != p:
+                p = root[p]
+            while root[q] != q:
+                q = root[q]
+            if p != q:
+                root[p] = q
+                n_fans -= 1
+    return n_fans + 1 if is_open else n_fans
+
+
+@njit(cache=True, error_model="numpy")
+def _mend(dual: Dual, labels: NDArray, n_of: NDArray, faces: NDArray, place: NDArray) -> int:
+    """Each face that is not manifold takes the move that lowers the energy with what is not manifold most."""
+    widest, total = _widest(dual), 0
+    star, around, group = np.empty(widest, np.int64), np.empty(widest, np.int64), np.empty(widest, np.int64)
+    for f in range(len(faces)):
+        a, b = faces[f, 0], faces[f, 1]
+        if _excess(dual, labels, a, b, star, place)[0] == 0:
+            continue
+        count = _gather(dual, a, b, star)
+        best, best_from, best_label = -LEAST_GAIN * dual.scale[a], -1, -1
+        for i in range(2 * count):
+            size = _group(dual, labels, a, b, star[:count], i, group)
+            if size == 0 or n_of[labels[group[0]]] <= size:
+                continue
+            new, change = _best_of_group(dual, labels, group[:size], star[:count], around, place)
+            if change < best:
+                best, best_from, best_label = change, i, new
+        if best_from >= 0:
+            size = _group(dual, labels, a, b, star[:count], best_from, group)
+            n_of[labels[group[0]]] -= size
+            n_of[best_label] += size
+            for i in range(size):
+                labels[group[i]] = best_label
+            total += size
+    return total
+
+
+@njit(cache=True, error_model="numpy")
+def _group(dual: Dual, labels: NDArray, a: int, b: int, star: NDArray, i: int, group: NDArray) -> int:
+    """Cells that may change together: cell i of a star; for i beyond these, the fan of one label that it begins."""
+    if i < len(star):
+        group[0] = star[i]
+        return 1
+    first, count, done = star[i - len(star)], 1, 0
+    group[0] = first
+    while done < count:
+        cell = group[done]
+        done += 1
+        for k in range(dual.cells.shape[1]):
+            other = dual.across[cell, k]
+            if dual.cells[cell, k] in (a, b) or other < 0 or labels[other] != labels[first]:
+                continue
+            is_new = True
+            for j in range(count):
+                is_new = is_new and group[j] != other
+            if is_new:
+                group[count] = other
+                count += 1
+            if other < first:
+                return 0  # another cell begins it
+    return count if count > 1 else 0
+
+
+@njit(cache=True, error_model="numpy")
+def _best_of_group(
+    dual: Dual, labels: NDArray, group: NDArray, star: NDArray, around: NDArray, place: NDArray
+) -> tuple:
+    """The label in the star that lowers the energy most if all cells of the group take it, and by how much."""
+    old, best, least = labels[group[0]], -1, np.inf
+    faces = _closure(dual, group)
+    before = _local_energy(dual, labels, group, faces, around, place)
+    for j in range(len(star)):
+        new = labels[star[j]]
+        is_new = new != old and _touches(dual, labels, group, new)
+        for i in range(j):
+            is_new = is_new and labels[star[i]] != new
+        if not is_new:
+            continue
+        for cell in group:
+            labels[cell] = new
+        change = _local_energy(dual, labels, group, faces, around, place) - before
+        for cell in group:
+            labels[cell] = old
+        if change < least:
+            best, least = new, change
+    return best, least
+
+
+@njit(cache=True, error_model="numpy")
+def _touches(dual: Dual, labels: NDArray, group: NDArray, label: int) -> bool:
+    """Whether a cell of a label lies across a facet of the group."""
+    for cell in group:
+        for k in range(dual.across.shape[1]):
+            if dual.across[cell, k] >= 0 and labels[dual.across[cell, k]] == label:
+                return True
+    return False
+
+
+@njit(cache=True, error_model="numpy")
+def _closure(dual: Dual, group: NDArray) -> NDArray:
+    """Nodes (a, -1) and, in 3-D, edges (a, b) of some cells, each once, (F, 2)."""
+    n = dual.cells.shape[1]
+    faces, count = np.empty((len(group) * (n + n * (n - 1) // 2), 2), dtype=np.int64), 0
+    for cell in group:
+        for k in range(n):
+            for m in range(k, n if n == 4 else k + 1):
+                a, b = dual.cells[cell, k], dual.cells[cell, m]
+                a, b = (a, -1) if k == m else (min(a, b), max(a, b))
+                is_new = True
+                for i in range(count):
+                    is_new = is_new and (faces[i, 0] != a or faces[i, 1] != b)
+                if is_new:
+                    faces[count, 0], faces[count, 1] = a, b
+                    count += 1
+    return faces[:count]
+
+
+@njit(cache=True, error_model="numpy")
+def _local_energy(dual: Dual, labels: NDArray, group: NDArray, faces: NDArray, star: NDArray, place: NDArray) -> float:
+    """The part of the energy that a group of cells of one label decides, with what is not manifold around them."""
+    energy = 0.0
+    for cell in group:
+        energy += _price(dual, labels, cell, labels[cell])
+    for f in range(len(faces)):
+        excess, n_labels = _excess(dual, labels, faces[f, 0], faces[f, 1], star, place)
+        if excess > 0:
+            weight = TWO_LABELS_WEIGHT if n_labels == 2 else MORE_LABELS_WEIGHT
+            energy += weight * excess * dual.scale[faces[f, 0]]
+    return energy
