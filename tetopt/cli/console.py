@@ -42,7 +42,7 @@ def print_fidelity(measured: dict[str, Any]) -> None:
     if "mask" in measured:
         print_wide(mask_table(measured["mask"]))
     if "labels" in measured:
-        print_wide(label_table(measured["labels"]))
+        print_wide(label_table(measured["labels"], measured.get("label_names", {})))
 
 
 def print_wide(table: Table) -> None:

@@ -17,12 +17,13 @@ from tetopt.cli.inputs import check_no_input, image_and_others, read_mesh, warn_
 from tetopt.cli.options import ImagePart, MeshArgument, NumberOptions, SolverOptions, option
 from tetopt.cli.solver import (
     MATERIAL_FIELDS,
-    all_sets,
     check_solver_options,
     loads_of,
     print_model,
     save_for_solver,
+    sets_and_table,
     solver_model,
+    with_chosen_sets,
     with_point_data,
 )
 from tetopt.io.files import checked_output, save_json
@@ -92,9 +93,9 @@ def convert_command(
         about["box"] = box_text(box)
     if format_of(output).is_surface:  # which holds no materials
         fields = {name: values for name, values in fields.items() if name not in MATERIAL_FIELDS}
-    known_sets = all_sets(loaded.mesh, box, fields, loaded.sets)
-    model = solver_model(loaded.mesh, image, solver, fields, about, known_sets)
-    model = with_point_data(model, loaded.point_data, solver)
+    known_sets, words = sets_and_table(loaded, box, fields, solver)
+    model = solver_model(loaded.mesh, image, solver, fields, about | words, known_sets)
+    model = with_chosen_sets(with_point_data(model, loaded.point_data, solver), output, solver)
     save_for_solver(output, model, solver)
     if json_path is not None:
         files = {"mesh": mesh_path.name, "output": output.name, "units": solver.units, "space": solver.space}

@@ -15,7 +15,14 @@ from tetopt import Image, InputError
 from tetopt.cli.console import log, print_wide
 from tetopt.cli.inputs import check_no_input, read_image, read_mesh, warn_of_other_image
 from tetopt.cli.options import ImagePart, ModelOptions, NumberOptions, option
-from tetopt.cli.solver import all_sets, check_model_options, loads_of, solver_model, with_point_data
+from tetopt.cli.solver import (
+    check_model_options,
+    loads_of,
+    sets_and_table,
+    solver_model,
+    with_chosen_sets,
+    with_point_data,
+)
 from tetopt.io.files import checked_output, save_json
 from tetopt.io.formats import save_model
 from tetopt.io.images import sha256
@@ -81,6 +88,8 @@ def fem_command(
         check_no_input(output, mesh_path, image_path)
     if image_path is not None and model.young is None:
         model = replace(model, young=INTENSITY_LAW)
+    if output is None and model.written_sets is not None:
+        raise InputError("--sets: no file is written; give -o SOLVED.vtu, too")
     _check_options(image_path, compress, model, part)
     image = None if image_path is None else read_image(image_path, part)
     loaded = read_mesh(mesh_path)
@@ -92,11 +101,12 @@ def fem_command(
     task = _model(loaded, image, _filled(model, loaded, image, compress))
     solutions, extremes = _solved(task, of_box if conditioning is None else conditioning)
     if output is not None:
-        save_model(output, _with_results(task, solutions))
+        save_model(output, with_chosen_sets(_with_results(task, solutions), output, model))
     _advise(task, solutions)
     _print(mesh_path.name, task, solutions, extremes)
     if json_path is not None:
         options = {**asdict(model), "compress_percent": compress, **part.stated()}
+        options["label_names"] = None if model.label_names is None else model.label_names.name
         files = {"mesh": mesh_path.name}
         if image_path is not None:
             files |= {"image": image_path.name, "image_sha256": sha256(image_path)}
@@ -154,9 +164,9 @@ def _model(loaded: MeshFile, image: Image | None, options: ModelOptions) -> Mode
     if image is not None:
         fields |= cell_fields(loaded.mesh, image)
     about = {} if box is None else {"box": box_text(box)}
-    sets = all_sets(loaded.mesh, box, fields, loaded.sets)
+    sets, words = sets_and_table(loaded, box, fields, options)
     others = {name: values for name, values in loaded.point_data.items() if not is_result(name)}
-    return with_point_data(solver_model(loaded.mesh, image, options, fields, about, sets), others, options)
+    return with_point_data(solver_model(loaded.mesh, image, options, fields, about | words, sets), others, options)
 
 
 def _solved(model: Model, is_conditioned: bool) -> tuple[list[Solution], Conditioning | None]:

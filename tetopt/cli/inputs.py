@@ -17,7 +17,9 @@ from tetopt.cli.console import log, show_warning
 from tetopt.cli.options import WHOLE_BOX, BoxPart, ImagePart
 from tetopt.io.files import checked_output
 from tetopt.io.images import parse_crop, parse_slice, part_of, sha256
+from tetopt.io.label_tables import LabelTable, load_label_table, table_in
 from tetopt.io.meshes import MeshFile
+from tetopt.model.labels import TABLE_TEXT
 from tetopt.target.align import aligned_contrast, is_same_grid
 from tetopt.target.labels import check_labels
 
@@ -113,6 +115,13 @@ def read_mesh(path: Path) -> MeshFile:
     for note in loaded.notes:
         log.print(escape(f"{path}: {note}"))
     return loaded
+
+
+def label_table(path: Path | None, loaded: MeshFile | None = None) -> LabelTable:
+    """Names and colours of labels: those of the file, else those that the mesh's file keeps, else none."""
+    if path is not None:
+        return load_label_table(path)
+    return table_in(None if loaded is None else loaded.text(TABLE_TEXT))
 
 
 def warn_of_other_image(loaded: MeshFile, mesh_path: Path, image_path: Path) -> bool:

@@ -13,7 +13,7 @@ from rich.markup import escape
 import tetopt
 from tetopt import Image, InputError, Mesh
 from tetopt.cli.console import log, out, print_fidelity, show_warning
-from tetopt.cli.inputs import read_mesh, results_folder, set_threads
+from tetopt.cli.inputs import label_table, read_mesh, results_folder, set_threads
 from tetopt.cli.options import (
     DEFAULT_NODES,
     EngineOptions,
@@ -28,7 +28,15 @@ from tetopt.cli.options import (
 from tetopt.cli.plan import Plan, planned, with_numbers
 from tetopt.cli.promises import check_promises, warn_of_result
 from tetopt.cli.run import prepare, watched_run
-from tetopt.cli.solver import all_sets, check_early, print_model, save_anyway, save_for_solver, solver_model
+from tetopt.cli.solver import (
+    all_sets,
+    check_early,
+    print_model,
+    save_anyway,
+    save_for_solver,
+    solver_model,
+    with_chosen_sets,
+)
 from tetopt.cli.source import Source, read_source
 from tetopt.engine.loop import Optimized
 from tetopt.engine.meshing import Run, mesh_image
@@ -40,8 +48,9 @@ from tetopt.io.formats import format_of
 from tetopt.io.meshes import MeshFile
 from tetopt.io.mni import mni_path
 from tetopt.measure.quality import quality
+from tetopt.model.labels import TABLE_TEXT, table_of_labels, table_words
 from tetopt.model.model import Model
-from tetopt.model.sets import Sets, box_of, surviving_sets
+from tetopt.model.sets import Sets, box_of, label_set_names, surviving_sets
 from tetopt.report.summary import fidelity, model_summary, run_summary, size_summary
 from tetopt.report.tables import add_quality, new_table, nodes_in_words
 from tetopt.target.content import Content
@@ -90,7 +99,7 @@ def mesh_command(
 
 def _read(plan: Plan) -> Task:
     """The files that the plan names, and the defaults that depend on them."""
-    source = read_source(plan.source)
+    source = read_source(plan.source, plan.solver.label_names)
     started = None
     if plan.start.start is not None:
         started = read_mesh(plan.start.start)
@@ -124,7 +133,8 @@ def _run(task: Task, begin: float) -> Outcome:
 
     def watch(initial: Mesh, run: Run) -> Optimized:
         if not begun and (solver.are_any() or output.suffix.lower() != ".vtu"):
-            check_early(output, solver, content.image, lambda early: _model(task, initial, early, {}, is_told=False))
+            about = task.source.about
+            check_early(output, solver, content.image, lambda early: _model(task, initial, early, about, is_told=False))
         begun.append(time.perf_counter())
         log.print(escape(_described(task, initial)))
         prepare(content, options["k_D"], plan.mode)
@@ -164,12 +174,14 @@ def _model(task: Task, mesh: Mesh, solver: SolverOptions, about: dict[str, Any],
     if started is not None and is_told:
         lost = [name for kind in (0, 1) for name in started.sets[kind] if name not in own[kind]]
         if source.labels is not None:  # of which these are made anew
-            lost = [name for name in lost if not name.startswith(("label_", "interface_"))]
+            names = label_table(None, started).names
+            of_labels = label_set_names(names, names).values()
+            lost = [name for name in lost if not name.startswith(("label_", "interface_")) and name not in of_labels]
         if lost:
             log.print(escape(f"not kept, as their cells or facets are others now: the sets {', '.join(lost)}"))
         if "young" in started.cell_data or started.text("loads") is not None:
             log.print("moduli and loads of the mesh that is improved are not kept; give --young and --load")
-    known_sets = all_sets(mesh, box_of(source.contrasts[0]), fields, own, is_told)
+    known_sets = all_sets(mesh, box_of(source.contrasts[0]), fields, own, source.table.names, is_told=is_told)
     return solver_model(mesh, source.content.image, solver, fields, about, known_sets)
 
 
@@ -182,7 +194,7 @@ def _write(task: Task, outcome: Outcome, begin: float) -> tuple[Model, dict[str,
         options["nodes"] = result.nodes
     about = {**source.about, "options": options}
     try:
-        model = _model(task, result.mesh, solver, about)
+        model = with_chosen_sets(_model(task, result.mesh, solver, about), output.mesh, solver)
         save_for_solver(output.mesh, model, solver)
     except InputError as error:  # hours may have gone into the mesh
         bare = _model(task, result.mesh, SolverOptions(), about, is_told=False)
@@ -190,6 +202,10 @@ def _write(task: Task, outcome: Outcome, begin: float) -> tuple[Model, dict[str,
     measured = fidelity(source.labels, source.mask, result.mesh, model.cell_data.get("label"))
     if not source.content.is_plain or source.content.region is not None:
         measured["contrasts"] = source.by_contrast(model.cell_data)
+    if source.labels is not None and source.table.names:
+        there = table_of_labels(source.table, np.unique(source.labels.data).astype(np.int64).tolist())
+        measured["label_names"] = there.names
+        about |= {TABLE_TEXT: table_words(there)}
     if output.json_path is not None:
         seconds = {**outcome.seconds, "all": time.perf_counter() - begin}
         summary = run_summary(source.content, outcome.initial, result, about, seconds)

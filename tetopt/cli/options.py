@@ -9,7 +9,7 @@ from __future__ import annotations
 import inspect
 from collections.abc import Callable, Iterator
 from copy import copy
-from dataclasses import MISSING, dataclass, fields, is_dataclass
+from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from functools import wraps
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, cast, get_args, get_type_hints
@@ -61,6 +61,15 @@ AverageOption = Annotated[
         "WORD",
         "One modulus of those of a cell's voxels: mean (the paper's), geometric, harmonic, power:P, hill (between mean "
         "and harmonic); or gauss (around each Gauss point of quadratic cells), nodes (linear between nodes).",
+    ),
+]
+LabelNamesOption = Annotated[
+    Path | None,
+    option(
+        "TABLE",
+        "Names and colours of labels: FreeSurfer, ITK-SNAP, 3D Slicer, BIDS' dseg.tsv, or CSV; the mesh's file keeps "
+        "them.",
+        "--label-names",
     ),
 ]
 SpaceOption = Annotated[str, option("ras|lps", "Convention of the file's coordinates.")]
@@ -239,7 +248,7 @@ class ModelOptions:
         option(
             "LAW",
             'Young\'s modulus, kPa: a number, a formula of the intensity, "0.5 + 0.01*h", a table "0:1,100:5", '
-            'by label "1=2.1,2=1.9", or a file .toml or .csv of such columns.',
+            'by label "1=2.1,liver=1.9,*=5", or a file .toml or .csv of such columns.',
         ),
     ] = None
     nu: Annotated[str | None, option("LAW", f"Poisson's ratio, likewise (default {DEFAULT_NU:g}).")] = None
@@ -258,6 +267,14 @@ class ModelOptions:
             "--set",
         ),
     ] = None
+    written_sets: Annotated[
+        str | None,
+        option(
+            "GROUP,...",
+            "Sets that the file gets besides --set and those of loads: labels, interfaces, boundary; or all, or none.",
+            "--sets",
+        ),
+    ] = None
     loads: Annotated[
         list[str] | None,
         option(
@@ -268,6 +285,7 @@ class ModelOptions:
             "--load",
         ),
     ] = None
+    label_names: LabelNamesOption = None
     order: Annotated[
         int | None, option("1|2", "2: quadratic cells, straight-edged; 1: linear. By default as the mesh read, else 1.")
     ] = None
@@ -284,8 +302,8 @@ class SolverOptions(ModelOptions):
     space: SpaceOption = "ras"
 
     def are_any(self) -> bool:
-        """Whether the file is to hold more than the mesh."""
-        return self != SolverOptions()
+        """Whether the file is to hold more than the mesh and what labels are called."""
+        return replace(self, label_names=None) != SolverOptions()
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -13,10 +14,11 @@ from rich.table import Table
 import tetopt
 from tetopt import Image, InputError, Mesh
 from tetopt.cli.console import out, print_fidelity, show_error
-from tetopt.cli.inputs import image_and_others, read_mesh, warn_of_other_image
-from tetopt.cli.options import ImagePart, NumberOptions, option
+from tetopt.cli.inputs import image_and_others, label_table, read_mesh, warn_of_other_image
+from tetopt.cli.options import ImagePart, LabelNamesOption, NumberOptions, option
 from tetopt.io.files import save_json
 from tetopt.io.meshes import MeshFile
+from tetopt.measure.fidelity import LabelFidelity
 from tetopt.measure.quality import quality
 from tetopt.report.summary import fidelity, size_summary
 from tetopt.report.tables import add_quality, new_table
@@ -36,14 +38,14 @@ def quality_command(
     check: Annotated[
         bool, typer.Option("--check", help="Is it a mesh? With --image, does it fill the box? Exit 1 if not.")
     ] = False,
+    label_names: LabelNamesOption = None,
     *,
     part: ImagePart,
     numbers: NumberOptions,
 ) -> int:
     """Measure a mesh: shape, angles, bad cells, and how well its cells fit an image."""
     json_path = numbers.checked()
-    if image_path is None and (mask_path is not None or labels_path is not None):
-        raise InputError("--mask and --labels: give the --image, too, on whose voxels they are compared")
+    _check_options(image_path, mask_path, labels_path, label_names)
     loaded = read_mesh(mesh_path)
     shape = quality(loaded.mesh.points, loaded.mesh.cells)
     size = size_summary(loaded.mesh, loaded.order)
@@ -59,6 +61,7 @@ def quality_command(
         mask = None if mask_path is None else beside(mask_path, aligned_mask)
         fit = image_fit(continued(image, mask), loaded.mesh)
         measured = fidelity(labels, mask, loaded.mesh, loaded.cell_data.get("label"))
+        measured |= _names(measured.get("labels", []), label_table(label_names, loaded).names)
         warn_of_other_image(loaded, mesh_path, image_path)
         report |= {**measured, "image": image_path.name, "fit": fit}
         _add_fit(table, fit, image.data.size)
@@ -83,6 +86,20 @@ def quality_command(
         show_error(f"cells overlap: together they hold {fit.n_voxels} voxels, more than there are")
         return 1
     return 0
+
+
+def _check_options(image: Path | None, mask: Path | None, labels: Path | None, names: Path | None) -> None:
+    """InputError for files without those that they belong to."""
+    if image is None and (mask is not None or labels is not None):
+        raise InputError("--mask and --labels: give the --image, too, on whose voxels they are compared")
+    if names is not None and labels is None:
+        raise InputError("--label-names: there are no --labels")
+
+
+def _names(rows: Sequence[LabelFidelity], names: Mapping[int, str]) -> dict[str, dict[int, str]]:
+    """What those of the labels that have a name are called, as "label_names"; nothing if none has."""
+    of_rows = {row.label: names[row.label] for row in rows if row.label in names}
+    return {"label_names": of_rows} if of_rows else {}
 
 
 def _add_fit(table: Table, fit: Fit, n_voxels: int) -> None:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import replace
 from itertools import chain, count
 from pathlib import Path
@@ -16,20 +16,36 @@ from rich.markup import escape
 import tetopt
 from tetopt import Image, InputError, Mesh
 from tetopt.cli.console import log, out, print_wide
+from tetopt.cli.inputs import label_table
 from tetopt.cli.options import ModelOptions, SolverOptions
 from tetopt.io.formats import FORMATS, file_bytes, format_of, save_model
 from tetopt.io.meshes import MeshFile
 from tetopt.model.averages import DEFAULT_AVERAGE, parse_average
 from tetopt.model.build import labels_of, model_of
 from tetopt.model.fields import NODE_MODULI
+from tetopt.model.labels import TABLE_TEXT, table_of_words, table_words
 from tetopt.model.laws import checked_young, parse_any_law
 from tetopt.model.loads import check_steps, count_of_steps, known_set, load_words, parse_load
 from tetopt.model.materials import DEFAULT_NU, Spacing
 from tetopt.model.model import SPACES, STRESS_UNITS, Model, element_facets, elements, half_turned, scaled
-from tetopt.model.sets import Box, Sets, check_free_names, merged_sets, parse_set, standard_sets
+from tetopt.model.sets import (
+    Box,
+    Sets,
+    check_free_names,
+    interface_names,
+    label_set_names,
+    label_sets,
+    merged_sets,
+    parse_set,
+    standard_names,
+    standard_sets,
+)
 from tetopt.report.tables import new_table, nodes_in_words
 
 MATERIAL_FIELDS = ("young", "nu", "density", "material")  # what a file of ours says of each cell's material
+SET_GROUPS = ("labels", "interfaces", "boundary")  # of the sets that every mesh has
+# Each is an array more on the nodes of a VTU or VTK file; labels and their sets can be made anew of its cells.
+MANY_INTERFACES = 24
 SLOW_MATERIALS = 30_000  # CalculiX takes three times as long with as many as there are cells (tests/benchmarks)
 
 
@@ -42,8 +58,8 @@ def check_solver_options(output: Path, solver: SolverOptions, has_materials: boo
         A suffix, law, number of bins, unit or convention that there is not; what needs moduli without any.
     """
     form = format_of(output)
-    if form.is_surface and (solver.young or solver.bins or solver.sets or solver.loads):
-        raise InputError(f"{output}: holds the boundary alone; leave out --young, --bins, --set and --load")
+    if form.is_surface and (solver.young or solver.bins or solver.sets or solver.loads or solver.written_sets):
+        raise InputError(f"{output}: holds the boundary alone; leave out --young, --bins, --set, --sets and --load")
     check_model_options(solver, has_materials)
     if solver.average != DEFAULT_AVERAGE and solver.young is None:
         raise InputError("--average: there is no --young")
@@ -74,6 +90,7 @@ def check_model_options(options: ModelOptions, has_materials: bool) -> None:
                 raise InputError(f"--{name}: there is no --young")
     parse_average(options.average)
     parsed_bins(options.bins)
+    parsed_groups(options.written_sets)
     if options.order not in (None, 1, 2):
         raise InputError(f"--order: expected 1 or 2, got {options.order}")
 
@@ -87,6 +104,16 @@ def parsed_bins(text: str | None) -> tuple[int | None, Spacing]:
     if not count.isdecimal() or int(count) < 1 or spacing not in get_args(Spacing):
         raise InputError(f'--bins: expected K, K:quantile or K:log with K of 1 or more, got "{text}"')
     return int(count), cast(Spacing, spacing)
+
+
+def parsed_groups(text: str | None) -> tuple[str, ...]:
+    """Which of `SET_GROUPS` are to be written, from "labels,interfaces,boundary", "all", or "none"."""
+    if text in (None, "all"):
+        return SET_GROUPS
+    words = [] if text == "none" else [word.strip() for word in text.split(",")]
+    if unknown := [word for word in words if word not in SET_GROUPS]:
+        raise InputError(f'--sets: expected some of {", ".join(SET_GROUPS)}, or all, or none, got "{unknown[0]}"')
+    return tuple(words)
 
 
 def solver_model(
@@ -138,13 +165,76 @@ def loads_of(loaded: MeshFile) -> list[str]:
     return [load_words(scaled(load, factor)) for load in turned]
 
 
-def all_sets(mesh: Mesh, box: Box | None, fields: dict[str, NDArray], own: Sets, is_told: bool = True) -> Sets:
-    """The standard sets and the mesh's own; a line for each of the latter that had to be called otherwise."""
-    sets, renamed = merged_sets(standard_sets(mesh, box, labels_of(fields, len(mesh.cells))), own)
+def all_sets(
+    mesh: Mesh,
+    box: Box | None,
+    fields: dict[str, NDArray],
+    own: Sets,
+    names: Mapping[int, str],
+    former: Mapping[int, str] | None = None,
+    kept: Iterable[str] = (),
+    is_told: bool = True,
+) -> Sets:
+    """The standard sets and the mesh's own; a line for each of the latter that had to be called otherwise.
+
+    Labels are called as `names` says. Sets of labels, and interfaces, under their numbers or `former` names are not
+    there a second time, but those that loads name (`kept`).
+    """
+    labels = labels_of(fields, len(mesh.cells))
+    if labels is not None and names and (own.facets or own.cells):
+        for others in {id(each): each for each in ({}, former or {}) if each != names}.values():
+            of_labels = label_sets(mesh, labels, others)
+            own = Sets(*(
+                {
+                    name: rows for name, rows in mine.items()
+                    if name in kept or not np.array_equal(rows, anew.get(name, np.empty(0)))
+                }
+                for mine, anew in zip(own, of_labels, strict=True)
+            ))  # fmt: skip
+    sets, renamed = merged_sets(standard_sets(mesh, box, labels, names), own)
     if is_told:
         for old, new in renamed.items():
             log.print(f'the mesh came with a set "{old}" of its own: it is {new} here')
     return sets
+
+
+def with_chosen_sets(model: Model, output: Path, options: ModelOptions) -> Model:
+    """The model with those sets that its file is to get; a line if interfaces are left out unasked.
+
+    Of the sets that every mesh has those of --sets are written, by default all, but into a VTU or VTK file no more
+    interfaces than `MANY_INTERFACES`. Others, and those that loads name, always are.
+    """
+    groups = set(parsed_groups(options.written_sets))
+    labels = labels_of(model.cell_data, len(model.mesh.cells))
+    names = table_of_words(model.about.get(TABLE_TEXT)).names
+    of_label = {} if labels is None else label_set_names(np.unique(labels).tolist(), names)
+    pairs = [(a, b) for a in of_label for b in of_label if a < b]
+    between = {*interface_names(pairs, of_label).values(), *(f"interface_{a}_{b}" for a, b in pairs)}
+    interfaces = between & set(model.sets.facets)
+    if options.written_sets is None and output.suffix.lower() in (".vtu", ".vtk") and len(interfaces) > MANY_INTERFACES:
+        log.print(
+            f"{len(interfaces)} interfaces are not written as sets, which --sets all does; convert, fem and view have "
+            "them anyway, from the cells' labels"
+        )
+        groups.discard("interfaces")
+    left = set()
+    for group, members in (
+        ("labels", set(of_label.values())), ("interfaces", interfaces), ("boundary", standard_names(model.mesh.ndim)),
+    ):  # fmt: skip
+        left |= set() if group in groups else members
+    left -= {load.set_name for load in model.loads}
+    facets, cells = ({name: rows for name, rows in kind.items() if name not in left} for kind in model.sets)
+    return model._replace(sets=Sets(facets, cells))
+
+
+def sets_and_table(
+    loaded: MeshFile, box: Box | None, fields: dict[str, NDArray], options: ModelOptions
+) -> tuple[Sets, dict[str, Any]]:
+    """The sets of a mesh's file, `all_sets`, and the texts of labels' names that go on into the next."""
+    table, former = label_table(options.label_names, loaded), label_table(None, loaded)
+    of_loads = {parse_load(text, loaded.mesh.ndim).set_name for text in options.loads or ()}
+    sets = all_sets(loaded.mesh, box, fields, loaded.sets, table.names, former.names, of_loads)
+    return sets, {TABLE_TEXT: table_words(table)} if table.names else {}
 
 
 def check_early(output: Path, solver: SolverOptions, image: Image, build: Callable[[SolverOptions], Model]) -> None:

@@ -11,12 +11,14 @@ from numpy.typing import NDArray
 import tetopt
 from tetopt import Image, InputError, Mesh
 from tetopt.cli.console import log
-from tetopt.cli.inputs import file_and_volume, image_and_others
+from tetopt.cli.inputs import file_and_volume, image_and_others, label_table
 from tetopt.cli.options import SourceOptions
 from tetopt.io.images import sha256
+from tetopt.io.label_tables import LabelTable
 from tetopt.io.vtk import box_text
 from tetopt.measure.fidelity import cell_labels
 from tetopt.model.fields import cell_fields
+from tetopt.model.labels import TABLE_TEXT, table_words
 from tetopt.model.sets import box_of
 from tetopt.target.align import aligned_contrast, aligned_labels, aligned_mask, background_level, foreground
 from tetopt.target.content import Content, content, continued
@@ -32,6 +34,7 @@ class Source(NamedTuple):
     labels: Image | None  # likewise
     mask: Image | None
     about: dict[str, Any]  # names, checksums, weights and the image's box, for the mesh's file
+    table: LabelTable  # of the labels
 
     def fields(self, mesh: Mesh) -> dict[str, NDArray]:
         """What the mesh's file holds of each cell: as `cell_fields`, means of further contrasts, and the label."""
@@ -56,9 +59,12 @@ class Source(NamedTuple):
         return rows
 
 
-def read_source(options: SourceOptions) -> Source:
-    """Images, labels and mask as the options ask for them, on the voxels of the first image."""
+def read_source(options: SourceOptions, label_names: Path | None = None) -> Source:
+    """Images, labels, what these are called, and mask as asked for, on the voxels of the first image."""
     paths = options.images
+    if label_names is not None and options.labels is None:
+        raise InputError("--label-names: there are no --labels")
+    table = label_table(label_names)
     if options.mask is not None and options.background is not None:
         raise InputError("--mask and --background: give one of them")
     if options.label_weight is not None and options.labels is None:
@@ -91,7 +97,8 @@ def read_source(options: SourceOptions) -> Source:
         "sha256": {path.name: sha256(file_and_volume(path)[0]) for path in files},
     }  # fmt: skip
     about = {"image": paths[0].name, "image_sha256": sha256(paths[0]), "inputs": inputs, "box": box_text(box_of(image))}
-    return Source(paths, weights, represented, contrasts, labels, mask, about)
+    about |= {TABLE_TEXT: table_words(table)} if table.names else {}
+    return Source(paths, weights, represented, contrasts, labels, mask, about, table)
 
 
 def _number(name: str, text: str) -> float:

@@ -11,14 +11,15 @@ from rich.markup import escape
 
 from tetopt import InputError
 from tetopt.cli.console import log, out, show_error, show_warning
-from tetopt.cli.inputs import cell_field, check_no_input, read_mesh
-from tetopt.cli.options import MeshArgument, NumberOptions, SpaceOption, option
+from tetopt.cli.inputs import cell_field, check_no_input, label_table, read_mesh
+from tetopt.cli.options import LabelNamesOption, MeshArgument, NumberOptions, SpaceOption, option
 from tetopt.geometry.simplex import volumes
 from tetopt.geometry.surface import surface_of
 from tetopt.geometry.topology import largest_component
 from tetopt.io.files import checked_output, save_json
 from tetopt.io.meshes import MeshFile
 from tetopt.io.surfaces import SURFACE_SUFFIXES, checked_surface, save_surface
+from tetopt.model.labels import label_words, labels_named
 from tetopt.model.model import SPACES
 from tetopt.report.tables import new_table
 
@@ -27,9 +28,10 @@ def surface_command(
     mesh_path: MeshArgument,
     output: Annotated[Path, option("OUT.stl", "Surface to write, STL or PLY.", "-o", "--output")],
     below: Annotated[float | None, option("T", "Of the largest connected set of cells with a mean below T.")] = None,
-    label: Annotated[int | None, option("L", "Of all cells with this label.")] = None,
+    label: Annotated[str | None, option("L", "Of all cells with this label, by number or name.")] = None,
     cell_set: Annotated[str | None, option("NAME", "Of a named set of cells.", "--set")] = None,
     space: SpaceOption = "ras",
+    label_names: LabelNamesOption = None,
     *,
     numbers: NumberOptions,
 ) -> int:
@@ -44,7 +46,11 @@ def surface_command(
     loaded = read_mesh(mesh_path)
     if loaded.mesh.ndim != 3:
         raise InputError(f"{mesh_path}: expected tetrahedra, whose boundary is a surface, found triangles")
-    chosen = _chosen(loaded, mesh_path, below, label, cell_set)
+    names = label_table(label_names, loaded).names
+    if label is not None:
+        chosen = _with_label(loaded, mesh_path, labels_named(label, names), names)
+    else:
+        chosen = _chosen(loaded, mesh_path, below, cell_set)
     surface = surface_of(loaded.mesh.points, loaded.mesh.cells, chosen)
     save_surface(output, surface, mesh_path.name, space)
     written = checked_surface(output)
@@ -73,22 +79,24 @@ def surface_command(
     return 0
 
 
-def _chosen(
-    loaded: MeshFile, path: Path, below: float | None, label: int | None, cell_set: str | None
-) -> NDArray[np.int64]:
+def _with_label(loaded: MeshFile, path: Path, chosen: list[int], names: dict[int, str]) -> NDArray[np.int64]:
+    """Numbers of the cells of these labels."""
+    labels = cell_field(loaded, path, "label")
+    cells = np.flatnonzero(np.isin(labels, chosen))
+    if len(cells) == 0:
+        known = ", ".join(label_words(each, names) for each in np.unique(labels)[:20].astype(np.int64).tolist())
+        words = " or ".join(label_words(each, names) for each in chosen)
+        raise InputError(f"{path}: no cell has label {words}; there are {known}")
+    return cells
+
+
+def _chosen(loaded: MeshFile, path: Path, below: float | None, cell_set: str | None) -> NDArray[np.int64]:
     """Numbers of the cells that make up the structure."""
     if cell_set is not None:
         if cell_set not in loaded.sets.cells:
             known = ", ".join(loaded.sets.cells) or "none"
             raise InputError(f'{path}: has no set of cells "{cell_set}"; it has {known}')
         return loaded.sets.cells[cell_set]
-    if label is not None:
-        labels = cell_field(loaded, path, "label")
-        chosen = np.flatnonzero(labels == label)
-        if len(chosen) == 0:
-            known = ", ".join(f"{each:g}" for each in np.unique(labels)[:20])
-            raise InputError(f"{path}: no cell has label {label}; there are {known}")
-        return chosen
     assert below is not None
     mean = cell_field(loaded, path, "mean")
     chosen = largest_component(loaded.mesh.cells, mean < below)

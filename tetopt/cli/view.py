@@ -13,19 +13,20 @@ from rich.markup import escape
 
 from tetopt import InputError
 from tetopt.cli.console import out
-from tetopt.cli.inputs import check_no_input, read_image, read_mesh, warn_of_other_image
-from tetopt.cli.options import BoxPart, ForceOption, option
+from tetopt.cli.inputs import check_no_input, label_table, read_image, read_mesh, warn_of_other_image
+from tetopt.cli.options import BoxPart, ForceOption, LabelNamesOption, option
+from tetopt.cli.solver import all_sets
 from tetopt.io.files import checked_output
 from tetopt.io.meshes import MeshFile
-from tetopt.model.build import labels_of
 from tetopt.model.fields import cell_fields
-from tetopt.model.sets import facet_triples, merged_sets, standard_sets
+from tetopt.model.sets import facet_triples
 
 
 def view_command(
     mesh_path: Annotated[Path, typer.Argument(metavar="MESH", help="VTU, VTK or gmsh MSH file of tetrahedra.")],
     image_path: Annotated[Path | None, option("IMAGE", "Show its slice behind the mesh's section.", "--image")] = None,
     html: Annotated[Path | None, option("OUT.html", "Write one page for a browser, open no window.", "--html")] = None,
+    label_names: LabelNamesOption = None,
     *,
     part: BoxPart,
     force: ForceOption = False,
@@ -47,7 +48,8 @@ def view_command(
         warn_of_other_image(loaded, mesh_path, image_path)
         if "mean" not in fields:
             fields = cell_fields(mesh, image) | fields
-    sets = merged_sets(standard_sets(mesh, loaded.box, labels_of(fields, len(mesh.cells))), loaded.sets)[0].facets
+    table, former = label_table(label_names, loaded), label_table(None, loaded).names
+    sets = all_sets(mesh, loaded.box, fields, loaded.sets, table.names, former, is_told=False).facets
     triples = {name: facet_triples(mesh.cells, rows) for name, rows in sets.items()}
     from tetopt.report.exhibit import exhibit  # matplotlib and pyvista are slow to load, and only needed here
 

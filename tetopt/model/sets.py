@@ -49,6 +49,11 @@ class Box(NamedTuple):
     affine: NDArray[np.float64]  # (n+1, n+1)
 
 
+def standard_names(ndim: int) -> set[str]:
+    """The names of the sets on the boundary of every mesh."""
+    return {BOUNDARY_SET, MASK_SURFACE_SET, *(name for pair in FACE_NAMES[ndim] for name in pair)}
+
+
 def facet_triples(cells: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.int64]:
     """Nodes of the facets (K, 2), (K, n) int64, turned to face out of their cell.
 
@@ -139,9 +144,7 @@ def label_set_names(labels: Iterable[int], names: Mapping[int, str]) -> dict[int
     """
     plain = {label: _plain_name(name) for label, name in names.items()}
     counts = Counter(name.lower() for name in plain.values())
-    counts.update(
-        2 * [BOUNDARY_SET, MASK_SURFACE_SET, *(face for n in FACE_NAMES for pair in FACE_NAMES[n] for face in pair)]
-    )
+    counts.update(2 * [*standard_names(2), *standard_names(3)])
     of_label = {}
     for label in labels:
         name, default = plain.get(label, ""), f"label_{label}"

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
+from rich.markup import escape
 from rich.table import Table
 
 from tetopt.geometry.quadratic import node_count
@@ -74,17 +75,18 @@ def mask_table(mask: MaskFidelity) -> Table:
     return table
 
 
-def label_table(rows: Sequence[LabelFidelity]) -> Table:
-    """How well a mesh represents labels, a row for each."""
+def label_table(rows: Sequence[LabelFidelity], names: Mapping[int, str]) -> Table:
+    """How well a mesh represents labels, a row for each, with its name if it has one."""
     table = new_table(
         "label", "voxels", "size, mm^n", "cells", "their size", "more, %", "Dice", "by volume", "apart, mm", "95 %",
         "pieces", "of cells",
     )  # fmt: skip
     for row in rows:
         change = 100.0 * (row.mesh_volume / row.volume - 1.0)
+        words = escape(f"{row.label} {names.get(row.label, '')}".strip())
         apart = (f"{mm:.3f}" if np.isfinite(mm) else "-" for mm in (row.distance_mean, row.distance_p95))
         table.add_row(
-            str(row.label), str(row.voxels), f"{row.volume:.1f}", str(row.n_cells), f"{row.mesh_volume:.1f}",
+            words, str(row.voxels), f"{row.volume:.1f}", str(row.n_cells), f"{row.mesh_volume:.1f}",
             f"{change:+.1f}", f"{row.dice:.4f}", f"{row.volume_dice:.4f}", *apart, str(row.components),
             str(row.mesh_components),
         )  # fmt: skip
