@@ -93,11 +93,14 @@ def test_measured_again(run, inputs, tmp_path, capsys):
     assert exit_code(*command, "--json", tmp_path / "q.json") == 0
     first, again = (numbers_in(path) for path in (run / "run.json", tmp_path / "q.json"))
     assert again["mask"] == pytest.approx(first["mask"])
-    for one, other in zip(first["labels"], again["labels"], strict=True):
-        assert one == pytest.approx(other, nan_ok=True)
+    for name in ("labels", "interfaces"):
+        assert [row["label"] for row in first[name]] == [2, 4, 9]
+        for one, other in zip(first[name], again[name], strict=True):
+            assert one == pytest.approx(other, nan_ok=True)
     said = capsys.readouterr().out
     assert "boundary to the mask's surface, mean, 95 %" in said
     assert "by volume" in said
+    assert f"{again['interfaces'][0]['area_ratio']:.3f}" in said
 
 
 @pytest.mark.parametrize("background", ["auto", "60"])

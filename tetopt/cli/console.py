@@ -9,7 +9,9 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from tetopt.report.tables import label_table, mask_table
+from tetopt.report.tables import label_differences, label_table, mask_table
+
+WIDEST_TABLE = 500  # characters in a line
 
 
 class _Console(Console):
@@ -42,9 +44,13 @@ def print_fidelity(measured: dict[str, Any]) -> None:
     if "mask" in measured:
         print_wide(mask_table(measured["mask"]))
     if "labels" in measured:
-        print_wide(label_table(measured["labels"], measured.get("label_names", {})))
+        rows, interfaces, names = measured["labels"], measured["interfaces"], measured.get("label_names", {})
+        print_wide(label_table(rows, interfaces, names))
+        for line in label_differences(rows, interfaces, names):
+            out.print(escape(line))
 
 
 def print_wide(table: Table) -> None:
     """A table as wide as it is, also where a pipe has no width."""
-    _Console(file=out.file, width=max(out.width, 120), highlight=False, emoji=False).print(table)
+    width = out.measure(table, options=out.options.update(width=WIDEST_TABLE)).maximum
+    _Console(file=out.file, width=max(out.width, width), highlight=False, emoji=False).print(table)

@@ -16,7 +16,8 @@ import tetopt
 from tetopt.engine.loop import Optimized
 from tetopt.geometry.quadratic import node_count
 from tetopt.image import Image
-from tetopt.measure.fidelity import label_fidelity, mask_fidelity
+from tetopt.measure.fidelity import cell_labels, label_fidelity, mask_fidelity
+from tetopt.measure.interfaces import label_interfaces
 from tetopt.measure.quality import quality
 from tetopt.mesh import Mesh
 from tetopt.model.loads import load_words
@@ -107,9 +108,10 @@ def model_summary(model: Model) -> dict[str, Any]:
 
 
 def fidelity(labels: Image | None, mask: Image | None, mesh: Mesh, of_cell: NDArray | None) -> dict[str, Any]:
-    """How well a mesh represents a mask and labels: a `MaskFidelity` in `mask` and `LabelFidelity` rows in `labels`.
+    """How well a mesh represents a mask and labels.
 
-    Each is there only if the image is. With a mask, labels count inside of it alone, and label 0, which is the outside
+    A `MaskFidelity` in `mask`, and for each label a `LabelFidelity` in `labels` and a `LabelInterface` in `interfaces`;
+    each is there only if the image is. With a mask, labels count inside of it alone, and label 0, which is the outside
     as well, is left out. `of_cell` (M,) is each cell's label, by default that of most of its voxels.
     """
     measured: dict[str, Any] = {}
@@ -118,6 +120,9 @@ def fidelity(labels: Image | None, mask: Image | None, mesh: Mesh, of_cell: NDAr
     if labels is not None:
         if mask is not None:
             labels = Image(np.where(mask.data >= 0.5, labels.data, 0.0), labels.affine)
-        rows = label_fidelity(labels, mesh, of_cell)
-        measured["labels"] = [row for row in rows if mask is None or row.label > 0]
+        of_cell = cell_labels(labels, mesh) if of_cell is None else of_cell
+        measured["labels"] = label_fidelity(labels, mesh, of_cell)
+        measured["interfaces"] = label_interfaces(labels, mesh, of_cell)
+        if mask is not None:
+            measured |= {name: [row for row in measured[name] if row.label > 0] for name in ("labels", "interfaces")}
     return measured

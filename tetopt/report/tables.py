@@ -10,8 +10,11 @@ from rich.table import Table
 
 from tetopt.geometry.quadratic import node_count
 from tetopt.measure.fidelity import LabelFidelity, MaskFidelity
+from tetopt.measure.interfaces import LabelInterface
 from tetopt.measure.quality import Quality
 from tetopt.mesh import Mesh
+
+LARGE_SIZE = 1e4  # mm^n: of a label so large its tenths are not shown
 
 
 def new_table(*columns: str) -> Table:
@@ -75,19 +78,54 @@ def mask_table(mask: MaskFidelity) -> Table:
     return table
 
 
-def label_table(rows: Sequence[LabelFidelity], names: Mapping[int, str]) -> Table:
-    """How well a mesh represents labels, a row for each, with its name if it has one."""
+def label_table(rows: Sequence[LabelFidelity], interfaces: Sequence[LabelInterface], names: Mapping[int, str]) -> Table:
+    """How well a mesh represents labels, and what their surfaces are like, a row for each, with its name if any."""
     table = new_table(
-        "label", "voxels", "size, mm^n", "cells", "their size", "more, %", "Dice", "by volume", "apart, mm", "95 %",
-        "pieces", "of cells",
+        "label", "voxels", "size, mm^n", "cells", "more, %", "Dice", "by volume", "apart, mm", "95 %", "area ratio",
+        "folded, %", "edges in > 2", "pieces", "of cells",
     )  # fmt: skip
-    for row in rows:
+    for row, surface in zip(rows, interfaces, strict=True):
         change = 100.0 * (row.mesh_volume / row.volume - 1.0)
         words = escape(f"{row.label} {names.get(row.label, '')}".strip())
-        apart = (f"{mm:.3f}" if np.isfinite(mm) else "-" for mm in (row.distance_mean, row.distance_p95))
+        size = _decimals(row.volume, 1 if row.volume < LARGE_SIZE else 0)
+        apart = [_decimals(mm, 3) for mm in (row.distance_mean, row.distance_p95)]
         table.add_row(
-            words, str(row.voxels), f"{row.volume:.1f}", str(row.n_cells), f"{row.mesh_volume:.1f}",
-            f"{change:+.1f}", f"{row.dice:.4f}", f"{row.volume_dice:.4f}", *apart, str(row.components),
+            words, str(row.voxels), size, str(row.n_cells), f"{change:+.1f}",
+            f"{row.dice:.4f}", f"{row.volume_dice:.4f}", *apart, _decimals(surface.area_ratio, 3),
+            _decimals(100.0 * surface.folded, 1), str(surface.nonmanifold_edges), str(row.components),
             str(row.mesh_components),
         )  # fmt: skip
     return table
+
+
+def _decimals(number: float, count: int) -> str:
+    return f"{number:.{count}f}" if np.isfinite(number) else "-"
+
+
+def label_differences(
+    rows: Sequence[LabelFidelity], interfaces: Sequence[LabelInterface], names: Mapping[int, str]
+) -> list[str]:
+    """Where cells hang together otherwise than the voxels of their label, a line for each label that has any."""
+    lines = []
+    for row, surface in zip(rows, interfaces, strict=True):
+        cavities, of_cells = surface.cavities, surface.mesh_cavities
+        holes = row.components + cavities - surface.euler // 2
+        parts = []
+        if row.components != row.mesh_components:
+            parts.append(f"{_number_of(row.components, 'piece')} of voxels, {row.mesh_components} of cells")
+        parts += _surplus(row.mesh_components + of_cells - surface.mesh_euler // 2 - holes, "hole")
+        parts += _surplus(of_cells - cavities, "cavity")
+        if parts and row.n_cells:
+            name = f" ({names[row.label]})" if row.label in names else ""
+            lines.append(f"label {row.label}{name}: {'; '.join(parts)}")
+    return lines
+
+
+def _surplus(count: int, noun: str) -> list[str]:
+    """Of cells over voxels, in words, if there is any."""
+    return [f"{_number_of(abs(count), noun)} {'more' if count > 0 else 'fewer'}"] if count else []
+
+
+def _number_of(count: int, noun: str) -> str:
+    plural = f"{noun[:-1]}ies" if noun.endswith("y") else f"{noun}s"
+    return f"{count} {noun if count == 1 else plural}"

@@ -1,0 +1,253 @@
+"""Surfaces of labels: cubes, rings and shells whose numbers are known, an independent program's numbers, slow twins."""
+
+from collections import Counter
+from itertools import combinations
+
+import numpy as np
+import pytest
+import pyvista
+from meshes import random_affine
+from scipy.sparse.csgraph import connected_components
+from shapes import OBLIQUE, shaped
+
+import tetopt
+from tetopt.geometry.simplex import oriented
+from tetopt.measure.fidelity import FacetSurface, LabelFidelity, cell_labels, surface_areas
+from tetopt.measure.interfaces import (
+    LabelInterface,
+    label_interfaces,
+    smooth_surface,
+    voxel_cavities,
+    voxel_euler,
+)
+from tetopt.report.tables import label_differences
+
+
+def blocky(labels, affine=None):
+    """An image of labels, a mesh with a block of cells in each voxel, and the label of each cell."""
+    image = tetopt.Image(labels, affine)
+    mesh = tetopt.lattice(image, "criss-cross" if image.ndim == 2 else "five-tet", blocks=image.shape)
+    return image, mesh, cell_labels(image, mesh)
+
+
+def cubes(*corners, n=3):
+    """Label 1 in single voxels, 0 around."""
+    labels = np.zeros((5,) * n)
+    for corner in corners:
+        labels[corner] = 1
+    return blocky(labels)
+
+
+def broken(row):
+    return row[6:10]  # edges, those of two labels; nodes, those of two labels
+
+
+def test_two_cubes_that_share_an_edge_or_a_corner():
+    """Of both labels' surfaces; a ring of four labels is no ring of two."""
+    for row in label_interfaces(*cubes((1, 1, 1), (2, 2, 1))):
+        assert broken(row) == (1, 1, 0, 0)
+    for row in label_interfaces(*cubes((1, 1, 1), (2, 2, 2))):
+        assert broken(row) == (0, 0, 1, 1)
+    for row in label_interfaces(*cubes((1, 1, 1), (2, 1, 1))):
+        assert broken(row) == (0, 0, 0, 0)
+    for row in label_interfaces(*cubes((1, 1), (2, 2), n=2)):
+        assert broken(row) == (1, 1, 0, 0)
+    labels = np.zeros((5, 5, 5))
+    labels[1, 1, 1] = labels[2, 2, 1] = 1
+    labels[1, 2, 1] = 2
+    assert [broken(row) for row in label_interfaces(*blocky(labels))] == [(0,) * 4, (1, 0, 0, 0), (0,) * 4]
+    labels[1, 2, 1], labels[2, 2, 1], labels[2, 2, 2] = 0, 0, 1
+    labels[1, 1, 2] = 2
+    assert [broken(row) for row in label_interfaces(*blocky(labels))] == [(1, 0, 0, 0), (0, 0, 1, 0), (0,) * 4]
+
+
+def test_the_outside_is_no_label_but_is_around():
+    """At a wall of the box two cubes, their background and the outside are three."""
+    background, ones = label_interfaces(*cubes((0, 1, 1), (0, 2, 2)))
+    assert broken(ones) == broken(background) == (1, 1, 0, 0)
+    labels = np.zeros((2, 2, 1))
+    labels[0, 0] = labels[1, 1] = 1
+    background, ones = label_interfaces(*blocky(labels))
+    assert broken(ones) == (1, 1, 0, 0)
+    labels = np.zeros((1, 4, 4))
+    labels[0, 1, 1] = labels[0, 2, 2] = 1
+    image, mesh, of_cell = blocky(labels)
+    only = of_cell == 1  # the two cubes alone: the outside is all around
+    alone = tetopt.Mesh(*compact(mesh.points, mesh.cells[only]))
+    assert broken(label_interfaces(image, alone, np.ones(only.sum()))[1]) == (1, 1, 0, 0)
+
+
+def compact(points, cells):
+    used, cells = np.unique(cells, return_inverse=True)
+    return points[used], cells.reshape(-1, points.shape[1] + 1)
+
+
+@pytest.mark.parametrize(
+    ("kind", "euler", "cavities"), [("ball", 2, 0), ("pieces", 4, 0), ("hole", 4, 1), ("handle", 0, 0)]
+)
+def test_euler_numbers(kind, euler, cavities):
+    """Of a ball, two, a shell, a torus; and of what is around them."""
+    _, mask = shaped(kind, OBLIQUE)
+    background, inside = label_interfaces(*blocky(mask.data, OBLIQUE))
+    assert (inside.euler, inside.mesh_euler, inside.cavities, inside.mesh_cavities) == (
+        euler,
+        euler,
+        cavities,
+        cavities,
+    )
+    around = {"ball": (4, 1), "pieces": (6, 2), "hole": (6, 1), "handle": (2, 1)}[kind]
+    assert (background.euler, background.cavities) == (background.mesh_euler, background.mesh_cavities) == around
+    assert broken(inside) == broken(background) == (0, 0, 0, 0)
+
+
+@pytest.mark.parametrize("n", [2, 3])
+@pytest.mark.parametrize("seed", range(4))
+def test_cells_that_are_voxels_have_their_numbers(n, seed):
+    """Random labels, in which everything touches everything at edges and corners."""
+    rng = np.random.default_rng(seed)
+    rows = label_interfaces(*blocky(rng.integers(0, 3, (6, 7, 5)[:n]), random_affine(rng, n)))
+    assert [row.mesh_euler for row in rows] == [row.euler for row in rows]
+    assert [row.mesh_cavities for row in rows] == [row.cavities for row in rows]
+    assert len({row.euler for row in rows}) > 1
+
+
+def naive_counts(cells, of_cell, label):
+    """`broken`, found one by one."""
+    n = cells.shape[1] - 1
+    surface = {}
+    boundary = Counter(tuple(sorted(f)) for cell in cells.tolist() for f in combinations(cell, n))
+    for cell in cells[of_cell == label].tolist():
+        for facet in combinations(cell, n):
+            surface[tuple(sorted(facet))] = surface.get(tuple(sorted(facet)), 0) + 1
+    surface = [facet for facet, count in surface.items() if count == 1]
+
+    def around(part):
+        labels = {of_cell[m] for m, cell in enumerate(cells.tolist()) if set(part) <= set(cell)}
+        is_outer = any(count == 1 and set(part) <= set(facet) for facet, count in boundary.items())
+        return len(labels) + is_outer
+
+    edges = Counter(edge for facet in surface for edge in combinations(facet, n - 1))
+    crowded = [edge for edge, count in edges.items() if count > 2]
+    pinched = []
+    for node in {node for facet in surface for node in facet}:
+        own = [set(facet) for facet in surface if node in facet]
+        links = [[len(a & b) >= n - 1 for b in own] for a in own]
+        if connected_components(np.array(links))[0] > 1:
+            pinched.append((node,))
+    return len(crowded), sum(around(e) == 2 for e in crowded), len(pinched), sum(around(p) == 2 for p in pinched)
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_edges_and_nodes_against_a_slow_twin(n):
+    rng = np.random.default_rng(n)
+    image, mesh, of_cell = blocky(rng.integers(0, 3, (5, 4, 3)[:n]))
+    of_cell[rng.random(len(of_cell)) < 0.1] = 1  # some that cells of a voxel do not share
+    rows = label_interfaces(image, mesh, of_cell)
+    assert [broken(row) for row in rows] == [naive_counts(mesh.cells, of_cell, row.label) for row in rows]
+    assert max(row.nonmanifold_edges for row in rows) >= 3
+
+
+@pytest.mark.parametrize("side", [1, 2, 4])
+def test_a_cube(side):
+    """Its area; its edges of a voxel's length are folded, its diagonals and those within a face are flat."""
+    labels = np.zeros((6, 6, 6))
+    labels[1 : 1 + side, 1 : 1 + side, 1 : 1 + side] = 1
+    row = label_interfaces(*blocky(labels, np.diag([2.0, 2.0, 2.0, 1.0])))[1]
+    assert row.area == pytest.approx(6 * (2 * side) ** 2)
+    assert row.n_facets == 12 * side**2
+    assert row.folded == pytest.approx(12 * side / (18 * side**2))
+
+
+def test_a_ball_of_cells():
+    """Area of the polyhedron over that of the nets of the ball's voxels, which relax inwards by some per cent."""
+    sphere = pyvista.Icosphere(radius=12.0, nsub=4)
+    points = np.vstack([np.asarray(sphere.points, dtype=np.float64), np.zeros(3)]) + 15.2
+    cells = np.column_stack([sphere.regular_faces, np.full(sphere.n_cells, len(points) - 1)])
+    mesh = tetopt.Mesh(points, oriented(points, cells))
+    at = np.stack(np.meshgrid(*[np.arange(32)] * 3, indexing="ij"), axis=-1)
+    labels = tetopt.Image(np.linalg.norm(at - 15.2, axis=-1) < 12.0)
+    background, ball = label_interfaces(labels, mesh, np.ones(len(cells)))
+    assert ball.area == pytest.approx(sphere.area, rel=1e-6)
+    assert ball.area_ratio == pytest.approx(4 * np.pi * 12.0**2 / ball.smooth_area, rel=2e-3)
+    assert ball.smooth_area == pytest.approx(4 * np.pi * 12.0**2, rel=0.05)
+    assert (ball.folded, ball.mesh_euler, ball.n_facets) == (0.0, 2, len(cells))
+    assert np.isnan(background.area_ratio)
+    assert np.isnan(background.folded)
+    assert (background.area, background.n_facets, background.mesh_euler) == (0.0, 0, 0)
+
+
+def test_a_circle_of_pixels():
+    at = np.stack(np.meshgrid(*[np.arange(40)] * 2, indexing="ij"), axis=-1)
+    nets = smooth_surface(np.linalg.norm(at - 19.3, axis=-1) < 15.0, np.diag([0.5, 0.5, 1.0]))
+    assert surface_areas(nets).sum() == pytest.approx(2 * np.pi * 7.5, rel=0.02)
+    assert voxel_euler(np.linalg.norm(at - 19.3, axis=-1) < 15.0) == 2
+    ring = np.abs(np.linalg.norm(at - 19.3, axis=-1) - 12.0) < 3.0
+    assert (voxel_euler(ring), voxel_cavities(ring)) == (0, 0)
+
+
+def test_the_numbers_of_an_independent_program():
+    """Areas, folds and edges as a few lines of numpy and pyvista have them, of random patches of three labels."""
+    rng = np.random.default_rng(7)
+    affine = random_affine(rng, 3)
+    coarse = rng.integers(0, 3, (4, 4, 4))
+    image = tetopt.Image(np.kron(coarse, np.ones((5, 4, 6))), affine)
+    mesh = tetopt.lattice(image, nodes=900)
+    mesh = tetopt.Mesh(mesh.points + rng.normal(0.0, 0.01, mesh.points.shape), mesh.cells)  # no angle of just 60
+    of_cell = cell_labels(image, mesh)
+    for row in label_interfaces(image, mesh, of_cell):
+        cells, points = mesh.cells[of_cell == row.label], mesh.points
+        triangles = cells[:, [[1, 2, 3], [0, 3, 2], [0, 1, 3], [0, 2, 1]]].reshape(-1, 3)
+        _, which, count = np.unique(np.sort(triangles, axis=1), axis=0, return_inverse=True, return_counts=True)
+        triangles = triangles[count[which.ravel()] == 1]
+        normals = np.cross(*(points[triangles[:, k]] - points[triangles[:, 0]] for k in (1, 2)))
+        area = np.linalg.norm(normals, axis=1)
+        sides = {}
+        for number, triangle in enumerate(np.sort(triangles, axis=1).tolist()):
+            for edge in combinations(triangle, 2):
+                sides.setdefault(edge, []).append(normals[number] / area[number])
+        cosines = [pair[0] @ pair[1] for pair in sides.values() if len(pair) == 2]
+        padded = np.pad((image.data == row.label).astype(np.uint8), 1)
+        grid = pyvista.ImageData(dimensions=padded.shape)
+        grid.point_data["v"] = padded.ravel(order="F")
+        nets = grid.contour_labels(scalars="v", smoothing=True, output_mesh_type="triangles", boundary_style="external")
+        at = np.asarray(nets.points, dtype=np.float64) @ affine[:3, :3].T
+        smooth = surface_areas(FacetSurface(at, nets.faces.reshape(-1, 4)[:, 1:])).sum()
+        assert row.area == pytest.approx(area.sum() / 2)
+        assert row.smooth_area == pytest.approx(smooth, rel=1e-5)
+        assert row.area_ratio == pytest.approx(area.sum() / 2 / smooth, rel=1e-5)
+        assert row.folded == pytest.approx(np.mean(np.array(cosines) < 0.5))
+        assert row.nonmanifold_edges == sum(len(side) > 2 for side in sides.values()) > 0
+        assert row.n_facets == len(triangles)
+
+
+def test_one_label_a_cell():
+    image, mesh, of_cell = cubes((1, 1, 1))
+    with pytest.raises(tetopt.InputError, match="one label for each of the mesh's 625 cells"):
+        label_interfaces(image, mesh, of_cell[1:])
+    with pytest.raises(tetopt.InputError, match="is it a label image"):
+        label_interfaces(tetopt.Image(image.data + 0.5), mesh, of_cell)
+
+
+def test_differences_in_words():
+    """Only those that there are, of labels that have cells."""
+
+    def rows(label, pieces, eulers, cavities, n_cells=9):
+        fidelity = dict.fromkeys(LabelFidelity._fields, 0) | {"label": label, "n_cells": n_cells}
+        surface = dict.fromkeys(LabelInterface._fields, 0) | {"label": label}
+        fidelity["components"], fidelity["mesh_components"] = pieces
+        surface["euler"], surface["mesh_euler"] = eulers
+        surface["cavities"], surface["mesh_cavities"] = cavities
+        return LabelFidelity(**fidelity), LabelInterface(**surface)
+
+    each = [
+        rows(1, (1, 1), (2, 2), (0, 0)),
+        rows(5, (1, 3), (2, 4), (0, 0)),
+        rows(6, (2, 1), (4, 6), (0, 2)),
+        rows(7, (1, 1), (-2, 2), (0, 0)),
+        rows(8, (1, 0), (2, 0), (0, 0), n_cells=0),
+    ]
+    assert label_differences(*zip(*each, strict=True), {5: "liver [left]"}) == [
+        "label 5 (liver [left]): 1 piece of voxels, 3 of cells; 1 hole more",
+        "label 6: 2 pieces of voxels, 1 of cells; 2 cavities more",
+        "label 7: 2 holes fewer",
+    ]

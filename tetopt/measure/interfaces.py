@@ -1,0 +1,264 @@
+"""How smooth, whole and manifold the surfaces of labels are.
+
+A label's surface are the facets between the cells that carry it and all else: other labels, and what lies outside of
+the mesh, so that it is closed. It is compared with a smooth surface of the label's voxels, closed likewise:
+surface nets (Gibson 1998), relaxed within a voxel's diagonal, by VTK's vtkSurfaceNets3D.
+
+Pieces, holes and cavities are those of the label's inside, without its surface: cells hang together by facets, voxels
+by faces (6 neighbours, and 26 outside), so that a ring that closes in an edge or a node alone has no hole.
+"""
+
+from __future__ import annotations
+
+from itertools import product
+from typing import NamedTuple
+
+import numpy as np
+import pyvista
+from numpy.typing import ArrayLike, NDArray
+from scipy.ndimage import find_objects
+from scipy.ndimage import label as voxel_components
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from vtkmodules.util.numpy_support import vtk_to_numpy
+from vtkmodules.vtkFiltersCore import vtkSurfaceNets2D, vtkSurfaceNets3D
+
+from tetopt.geometry.manifold import OUTSIDE_LABEL, LabelSurfaces, Ridges, label_surfaces, surface_fans, surface_ridges
+from tetopt.geometry.simplex import edge_pairs
+from tetopt.geometry.topology import Facets, facets
+from tetopt.image import Image, transformed
+from tetopt.measure.fidelity import FacetSurface, checked_cell_labels, surface_areas
+from tetopt.mesh import Mesh
+from tetopt.target.labels import check_labels
+
+FOLD_DEGREES = 60.0  # by which the normals at a ridge turn where it is folded; a dihedral angle under 120 degrees
+NET_ITERATIONS = 16  # of the relaxation of surface nets, and the next: VTK's own values
+NET_RELAXATION = 0.5  # the share of the way to the neighbours' mean that a point goes in each
+
+
+class LabelInterface(NamedTuple):
+    """What a label's surface is like. In 2-D areas are lengths, and edges are nodes."""
+
+    label: int
+    area: float  # of its surface in the mesh, mm^(n-1)
+    smooth_area: float  # of the smooth surface of its voxels, mm^(n-1)
+    area_ratio: float  # of the two; nan without cells
+    folded: float  # share of the surface's edges at which it turns by more than 60 degrees; nan without cells
+    n_facets: int  # of its surface
+    nonmanifold_edges: int  # in more than two of its facets
+    nonmanifold_edges_two_labels: int  # those around which it meets one other label alone, or the outside alone
+    nonmanifold_nodes: int  # around which its facets form more than one fan, over edges; 0 in 2-D
+    nonmanifold_nodes_two_labels: int  # likewise
+    euler: int  # of its voxels' closed surface: 2 (pieces - holes + cavities); the same in 2-D, where no curve has one
+    mesh_euler: int  # of its cells' closed surface
+    cavities: int  # shut in within its voxels; 0 in 2-D, where they are holes
+    mesh_cavities: int  # likewise of its cells
+
+
+def label_interfaces(labels: Image, mesh: Mesh, of_cell: ArrayLike) -> list[LabelInterface]:
+    """How smooth, whole and manifold the surface of each label of an image is.
+
+    Parameters
+    ----------
+    labels : Image
+        Whole numbers from 0 to `tetopt.target.labels.LARGEST_LABEL`.
+    mesh : Mesh
+        A conforming one.
+    of_cell : (M,) array of whole numbers
+        Label that each cell carries, such as `tetopt.measure.fidelity.cell_labels`.
+
+    Returns
+    -------
+    list of LabelInterface
+        One for each label in the image, ascending, 0 among them.
+
+    Raises
+    ------
+    InputError
+        Labels that are none, or not one label a cell.
+    """
+    check_labels("labels", labels)
+    of_cell = checked_cell_labels(of_cell, mesh)
+    voxels = labels.data.astype(np.int32)
+    boxes = find_objects(voxels + 1)
+    present = np.array([label for label, box in enumerate(boxes) if box is not None])
+    shared = facets(mesh.cells)
+    surfaces = label_surfaces(shared, of_cell)
+    ridges = surface_ridges(surfaces)
+    fans = surface_fans(surfaces, ridges)
+    n_labels = int(max(of_cell.max(), present.max())) + 1
+
+    def counts(which: NDArray[np.int64], weights: NDArray | None = None) -> NDArray:
+        """Of labels, without what is outside."""
+        return np.bincount(which[which >= 0], None if weights is None else weights[which >= 0], n_labels)
+
+    edges, nodes, turns = ridges.n_facets > 2, fans.n_fans > 1, _turns(mesh.points, surfaces, ridges)
+    of_label = {
+        "n_facets": counts(surfaces.label),
+        "nonmanifold_edges": counts(ridges.label[edges]),
+        "nonmanifold_edges_two_labels": counts(ridges.label[edges & (ridges.n_labels == 2)]),
+        "nonmanifold_nodes": counts(fans.label[nodes]),
+        "nonmanifold_nodes_two_labels": counts(fans.label[nodes & (fans.n_labels == 2)]),
+        "mesh_euler": _cell_eulers(shared, mesh.cells, of_cell, counts(ridges.label), counts(fans.label)),
+        "mesh_cavities": _cell_cavities(shared, mesh.cells, of_cell, n_labels),
+    }
+    area = counts(surfaces.label, surface_areas(FacetSurface(mesh.points, surfaces.nodes)))
+    n_folded, n_paired = counts(ridges.label[turns > FOLD_DEGREES]), counts(ridges.label[np.isfinite(turns)])
+    rows = []
+    for label in present.tolist():
+        is_label = np.pad(voxels[boxes[label]] == label, 1)
+        smooth_area = float(surface_areas(smooth_surface(is_label, labels.affine)).sum())
+        rows.append(
+            LabelInterface(
+                label=label,
+                area=float(area[label]),
+                smooth_area=smooth_area,
+                area_ratio=float(area[label]) / smooth_area if area[label] > 0.0 else np.nan,
+                folded=float(n_folded[label] / n_paired[label]) if n_paired[label] else np.nan,
+                euler=voxel_euler(is_label),
+                cavities=voxel_cavities(is_label),
+                **{name: int(values[label]) for name, values in of_label.items()},
+            )
+        )
+    return rows
+
+
+def smooth_surface(is_label: NDArray[np.bool_], affine: NDArray[np.float64]) -> FacetSurface:
+    """Surface nets of a label's voxels, in mm; not moved to their place in the world.
+
+    Points of the nets go halfway to their neighbours' mean, again and again, within a voxel's diagonal of where they
+    were: as `pyvista.ImageDataFilters.contour_labels` has it, to the same numbers, and in the plane likewise.
+
+    Parameters
+    ----------
+    is_label : (s_0, ..., s_{n-1}) bool
+        False in the outermost voxels, or else the surface is open there.
+    affine : (n+1, n+1) float64
+        Index -> world mm.
+    """
+    n = is_label.ndim
+    grid = pyvista.ImageData(dimensions=is_label.shape + (1,) * (3 - n))
+    grid.point_data["label"] = is_label.astype(np.uint8).ravel(order="F")
+    grid.set_active_scalars("label")
+    nets = vtkSurfaceNets2D() if n == 2 else vtkSurfaceNets3D()
+    nets.SetInputData(grid)
+    nets.SetBackgroundLabel(0)
+    for value in (0, 1):  # without the first VTK relaxes edges at which voxels touch in another way
+        nets.SetLabel(value, value)
+    nets.SmoothingOn()
+    smoother = nets.GetSmoother()
+    smoother.SetNumberOfIterations(NET_ITERATIONS)
+    smoother.SetRelaxationFactor(NET_RELAXATION)
+    smoother.SetConstraintDistance(n**0.5)
+    if isinstance(nets, vtkSurfaceNets3D):
+        nets.AutomaticSmoothingConstraintsOff()
+        nets.SetOutputMeshTypeToTriangles()
+    with pyvista.vtk_verbosity("off"):
+        nets.Update()
+    surface = nets.GetOutput()
+    nodes = vtk_to_numpy((surface.GetPolys() if n == 3 else surface.GetLines()).GetConnectivityArray())
+    points = np.asarray(pyvista.wrap(surface).points, dtype=np.float64)[:, :n]
+    return FacetSurface(transformed(points, affine[:n, :n]), nodes.reshape(-1, n).astype(np.int64))
+
+
+def voxel_euler(is_label: NDArray[np.bool_]) -> int:
+    """Euler number of the closed surface of voxels that hang together by faces.
+
+    That is twice the number of what it encloses: voxels, less pairs that share a face, plus fours around an edge, less
+    eights around a corner, for 6 neighbours inside and 26 outside (Kong and Rosenfeld 1989). In 2-D likewise: pixels,
+    less pairs, plus fours.
+    """
+    n, total = is_label.ndim, 0
+    for is_joined in product((False, True), repeat=n):
+        together = is_label
+        for axis in np.flatnonzero(is_joined):
+            first, second = [slice(None)] * n, [slice(None)] * n
+            first[axis], second[axis] = slice(None, -1), slice(1, None)
+            together = together[tuple(first)] & together[tuple(second)]
+        total += (-1) ** sum(is_joined) * int(np.count_nonzero(together))
+    return 2 * total
+
+
+def voxel_cavities(is_label: NDArray[np.bool_]) -> int:
+    """How many parts of what is around voxels are shut in; corners let through. None in 2-D."""
+    if is_label.ndim == 2:
+        return 0
+    return int(voxel_components(~np.pad(is_label, 1), np.ones((3,) * is_label.ndim))[1]) - 1
+
+
+def _turns(points: NDArray[np.float64], surfaces: LabelSurfaces, ridges: Ridges) -> NDArray[np.float64]:
+    """Angle between the normals of the two facets at each ridge, (R,), degrees; nan where there are more."""
+    corners = points[surfaces.nodes]
+    along = corners[:, 1:] - corners[:, :1]
+    if points.shape[1] == 2:
+        normals = np.column_stack([along[:, 0, 1], -along[:, 0, 0]])
+    else:
+        normals = np.cross(along[:, 0], along[:, 1])
+    normals /= np.maximum(np.linalg.norm(normals, axis=1), np.finfo(np.float64).tiny)[:, None]
+    of_ridge = np.argsort(ridges.of_facet.ravel(), kind="stable") // points.shape[1]
+    first = np.cumsum(ridges.n_facets) - ridges.n_facets
+    paired = np.flatnonzero(ridges.n_facets == 2)
+    cosine = (normals[of_ridge[first[paired]]] * normals[of_ridge[first[paired] + 1]]).sum(axis=1)
+    turns = np.full(len(ridges.n_facets), np.nan)
+    turns[paired] = np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0))).round(6)  # 60 on lattices is no more than 60
+    return turns
+
+
+def _cell_eulers(
+    shared: Facets,
+    cells: NDArray[np.int64],
+    of_cell: NDArray[np.int64],
+    n_ridges: NDArray[np.int64],
+    n_nodes: NDArray[np.int64],
+) -> NDArray[np.int64]:
+    """`voxel_euler` of each label's cells: those, less the facets between them, plus edges, less nodes in their midst.
+
+    `n_ridges` and `n_nodes` are those of each label's surface, which are not in its midst.
+    """
+    n, n_labels, base = cells.shape[1] - 1, len(n_nodes), int(cells.max()) + 1
+    near, far = of_cell[shared.cells].T
+    is_inner = (shared.n_cells == 2) & (near == far)
+    total = np.bincount(of_cell, minlength=n_labels) - np.bincount(near[is_inner], minlength=n_labels)
+    nodes = np.unique(of_cell[:, None] * base + cells) // base
+    total -= (-1) ** (n + 1) * (np.bincount(nodes, minlength=n_labels) - n_nodes)
+    if n == 3:
+        ends = np.sort(cells[:, np.array(edge_pairs(n))], axis=2)
+        edges = np.unique((of_cell[:, None] * base + ends[..., 0]) * base + ends[..., 1]) // base**2
+        total += np.bincount(edges, minlength=n_labels) - n_ridges
+    return 2 * total
+
+
+def _cell_cavities(
+    shared: Facets, cells: NDArray[np.int64], of_cell: NDArray[np.int64], n_labels: int
+) -> NDArray[np.int64]:
+    """`voxel_cavities` of each label's cells: what is around them hangs together by nodes."""
+    cavities = np.zeros(n_labels, dtype=np.int64)
+    if cells.shape[1] == 3:
+        return cavities
+    near, far = shared.cells[(shared.n_cells == 2) & (of_cell[shared.cells[:, 0]] == of_cell[shared.cells[:, 1]])].T
+    n_pieces, piece = _parts(near, far, len(cells))
+    of_piece = np.empty(n_pieces + 1, dtype=np.int64)
+    of_piece[piece], of_piece[n_pieces] = of_cell, OUTSIDE_LABEL
+    boundary = np.unique(shared.nodes[shared.n_cells == 1])
+    meets = np.unique(
+        np.concatenate([(cells * (n_pieces + 1) + piece[:, None]).ravel(), boundary * (n_pieces + 1) + n_pieces])
+    )
+    node, piece = np.divmod(meets, n_pieces + 1)
+    pairs = [np.empty((0, 2), dtype=np.int64)]
+    for step in range(1, int(np.bincount(node).max())):  # all pieces of a node with one another
+        is_same = node[step:] == node[:-step]
+        pairs.append(np.column_stack([piece[:-step], piece[step:]])[is_same])
+    one, other = np.unique(np.vstack(pairs), axis=0).T
+    for label in np.unique(of_cell):
+        is_around = of_piece != label
+        is_link = is_around[one] & is_around[other]
+        _, part = _parts(one[is_link], other[is_link], n_pieces + 1)
+        cavities[label] = len(np.unique(part[is_around])) - 1
+    return cavities
+
+
+def _parts(one: NDArray[np.int64], other: NDArray[np.int64], n: int) -> tuple[int, NDArray[np.int64]]:
+    """How many connected sets n things fall into, of which one[i] and other[i] are linked, and each thing's."""
+    graph = coo_array((np.ones(len(one), dtype=np.int8), (one, other)), shape=(n, n))
+    count, part = connected_components(graph, directed=False)
+    return int(count), part.astype(np.int64)
