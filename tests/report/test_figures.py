@@ -16,6 +16,7 @@ from tetopt.image import Image
 from tetopt.measure.fidelity import cell_labels
 from tetopt.measure.quality import rho_histogram
 from tetopt.mesh import Mesh
+from tetopt.model.labels import LabelTable
 from tetopt.report import figures
 from tetopt.report.colours import (
     BACKGROUND_COLOUR,
@@ -334,6 +335,13 @@ def test_the_largest_labels_have_the_first_colours():
         np.testing.assert_array_equal(colours[label], to_rgb(colour))
 
 
+def test_labels_keep_colours_of_their_own_but_the_background():
+    labels = Image(np.array([[7, 7, 7, 0], [2, 2, 5, 0]]))
+    colours = label_colours(labels, {0: (0, 0, 0), 2: (0.1, 0.2, 0.3), 9: (1, 1, 1)})
+    np.testing.assert_array_equal(colours[2], [0.1, 0.2, 0.3])
+    np.testing.assert_array_equal(np.delete(colours, 2, axis=0), np.delete(label_colours(labels), 2, axis=0))
+
+
 def test_colours_begin_again_after_the_last():
     n = len(LABEL_PALETTE)
     colours = label_colours(Image(np.arange(n + 2)[:, None]))
@@ -349,6 +357,8 @@ def test_a_legend_lists_the_largest_and_counts_the_others():
     entries = legend_patches(colours, shown)
     assert [entry.get_label() for entry in entries] == [*(str(k) for k in (0, *range(4, 15))), "and 2 more"]
     assert entries[1].get_facecolor() == (*colours[4], 1.0)
+    named = legend_patches(colours, shown, {4: "left lung", 1: "not shown"})
+    assert [entry.get_label() for entry in named[:3]] == ["0", "4 left lung", "5"]
     entries = legend_patches(colours, shown[:-2])
     assert [entry.get_label() for entry in entries] == [str(k) for k in (0, *range(2, 13))]
 
@@ -377,6 +387,42 @@ def test_voxels_and_cells_have_the_same_colours(worlds, signs):
         assert len(left.texts) == 4
     (legend,) = left.figure.legends
     assert [text.get_text() for text in legend.get_texts()] == ["0", "1", "2", "3"]
+
+
+@pytest.mark.parametrize(("worlds", "signs"), ORIENTATIONS[::11])
+def test_interfaces_are_drawn_over_the_image(worlds, signs):
+    """Slabs whose borders the lattice's cells keep to: the lines lie on the borders, as long as these are."""
+    labels = blocks_of_labels(4, worlds, signs)
+    mesh = lattice(labels, blocks=(4, 3, 3), kind="five-tet")  # whose cells lie in its blocks
+    image, table = noise(labels.shape, labels.affine), LabelTable({2: "left lung"}, {2: (0.0, 1.0, 0.5)})
+    figure = label_figure(labels, mesh, image=image, table=table)
+    grid = np.array(figure.axes).reshape(3, 3)
+    of_cell = cell_labels(labels, mesh)
+    n_cells = np.bincount(of_cell)
+    for axes, normal in zip(grid[:, 2], (2, 1, 0), strict=True):
+        view = SliceView(image, worlds.index(normal), None)
+        np.testing.assert_array_equal(axes.images[0].get_array(), view.pixels.T)
+        under, over = [each for each in axes.collections if isinstance(each, LineCollection)]
+        lines = np.array(over.get_segments())
+        np.testing.assert_array_equal(np.array(under.get_segments()), lines)
+        _, sides = view.interfaces(mesh, of_cell)
+        rarer = np.where(n_cells[sides[:, 0]] <= n_cells[sides[:, 1]], sides[:, 0], sides[:, 1])
+        np.testing.assert_array_equal(over.get_colors()[:, :3], label_colours(labels, table.colours)[rarer])
+        if worlds.index(normal) != 0:
+            along = view.axes.index(0)
+            np.testing.assert_allclose(lines[:, 0, along], lines[:, 1, along], atol=1e-9)
+            lengths = np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1).sum()
+            assert lengths == pytest.approx(3 * view.size[1 - along])
+    assert "2 left lung" in [text.get_text() for text in figure.legends[0].get_texts()]
+
+
+def test_interfaces_of_a_plane():
+    labels = Image(np.repeat([0, 3], 4)[:, None] + np.zeros((1, 6)), np.diag([2.0, 1.0, 1.0]))
+    mesh = lattice(labels, blocks=(2, 2))
+    lines, sides = SliceView(labels, None, None).interfaces(mesh, cell_labels(labels, mesh))
+    np.testing.assert_allclose(lines[..., 0], 8.0)
+    assert np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1).sum() == pytest.approx(6.0)
+    assert {tuple(sorted(pair)) for pair in sides.tolist()} == {(0, 3)}
 
 
 def test_labels_of_a_part_and_of_a_plane():

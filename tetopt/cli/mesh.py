@@ -227,7 +227,10 @@ def _draw(task: Task, outcome: Outcome, model: Model) -> None:
     if source.mask is not None:
         figures.save_figure(figures.boundary_figure(image, source.mask, mesh), pictures[3])
     if source.labels is not None:
-        figures.save_figure(figures.label_figure(source.labels, mesh, model.cell_data["label"]), pictures[-1])
+        other = None if np.array_equal(image.data, source.labels.data) else image
+        of_cell = model.cell_data["label"]
+        figure = figures.label_figure(source.labels, mesh, of_cell, other, source.table)
+        figures.save_figure(figure, pictures[-1])
 
 
 def _print(task: Task, outcome: Outcome, model: Model, measured: dict[str, Any]) -> int:

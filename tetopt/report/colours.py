@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.colors import to_rgba_array
@@ -26,16 +26,18 @@ LABEL_PALETTE = (
 )  # fmt: skip
 
 
-def label_colours(labels: Image) -> NDArray[np.float64]:
+def label_colours(labels: Image, own: Mapping[int, tuple[float, float, float]] | None = None) -> NDArray[np.float64]:
     """Colour of each label, so that ``label_colours(labels)[label]`` paints an array of labels.
 
     The labels with most voxels have the colours that are told apart best; after the palette's last they begin again.
-    0 is the background, in light grey.
+    Those that have colours of their `own`, such as `tetopt.model.labels.LabelTable.colours`, keep these. 0 is the
+    background, always in light grey: tables have it in black.
 
     Parameters
     ----------
     labels : Image
         Whole numbers from 0 to `tetopt.target.labels.LARGEST_LABEL`.
+    own : mapping of label to red, green and blue, 0 to 1, optional
 
     Returns
     -------
@@ -53,6 +55,9 @@ def label_colours(labels: Image) -> NDArray[np.float64]:
     colours = np.empty((len(counts), 3))
     colours[0] = to_rgba_array(BACKGROUND_COLOUR)[0, :3]
     colours[by_size] = to_rgba_array(LABEL_PALETTE)[np.arange(len(by_size)) % len(LABEL_PALETTE), :3]
+    for label, colour in (own or {}).items():
+        if 0 < label < len(colours):
+            colours[label] = colour
     return colours
 
 
@@ -62,7 +67,9 @@ def grey_limits(values: Sequence[NDArray], brightest: float = 99.5) -> tuple[flo
     return (float(low), float(high)) if high > low else (float(low) - 0.5, float(low) + 0.5)
 
 
-def legend_patches(colours: NDArray[np.float64], shown: NDArray[np.integer]) -> list[Patch]:
+def legend_patches(
+    colours: NDArray[np.float64], shown: NDArray[np.integer], names: Mapping[int, str] | None = None
+) -> list[Patch]:
     """A legend's entries: the `LISTED_LABELS` labels of which most is shown, ascending, then how many more there are.
 
     Parameters
@@ -71,11 +78,16 @@ def legend_patches(colours: NDArray[np.float64], shown: NDArray[np.integer]) -> 
         As `label_colours` returns them.
     shown : (up to K,) integer
         How much of each label is shown, in any unit; what is not shown is not listed.
+    names : mapping of label to text, optional
+        What labels are called.
     """
+    names = names or {}
     by_size = np.argsort(-shown, kind="stable")[: np.count_nonzero(shown)]
     entries = [
-        Patch(facecolor=colours[label], edgecolor="black", linewidth=0.5, label=f"{label}")
-        for label in np.sort(by_size[:LISTED_LABELS])
+        Patch(
+            facecolor=colours[label], edgecolor="black", linewidth=0.5, label=f"{label} {names.get(label, '')}".strip()
+        )
+        for label in np.sort(by_size[:LISTED_LABELS]).tolist()
     ]
     if len(by_size) > LISTED_LABELS:
         entries.append(Patch(facecolor="none", label=f"and {len(by_size) - LISTED_LABELS} more"))

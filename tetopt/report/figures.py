@@ -22,11 +22,13 @@ from tetopt.errors import InputError
 from tetopt.geometry.box import world_axes
 from tetopt.geometry.cut import plane_cut
 from tetopt.geometry.simplex import rho
+from tetopt.geometry.topology import facets
 from tetopt.image import Image
 from tetopt.io.files import written_whole
 from tetopt.measure.fidelity import cell_labels, half_level_surface
 from tetopt.measure.quality import BAD_SHAPE, quality_errors, rho_histogram
 from tetopt.mesh import Mesh
+from tetopt.model.labels import NO_TABLE, LabelTable
 from tetopt.report.colours import LISTED_LABELS, UNCOVERED_COLOUR, grey_limits, label_colours, legend_patches
 
 matplotlib.use("agg")
@@ -37,6 +39,7 @@ MASK_LINE = "#1e90ff"  # blue: the colour-blind tell it from the orange
 DETAIL_VOXELS = 25  # along the side of an enlarged region: single voxels are still seen in 5 inches
 SLICE_WIDTH_INCHES = 4.2  # of the widest slice of a figure of several planes: two fill a page
 SLICES_HEIGHT_INCHES = 12.0  # of all its planes over each other, which one page can hold
+LETTER_INCHES = 0.075  # of a legend's texts, in 9 points
 NUMBER_RADIUS_SHARE = 0.014  # of that width: the radius that a label's number takes in 5 points
 
 
@@ -113,7 +116,13 @@ def fill_cells(
     return painted
 
 
-def label_figure(labels: Image, mesh: Mesh, of_cell: NDArray[np.int64] | None = None) -> Figure:
+def label_figure(
+    labels: Image,
+    mesh: Mesh,
+    of_cell: NDArray[np.int64] | None = None,
+    image: Image | None = None,
+    table: LabelTable = NO_TABLE,
+) -> Figure:
     """The labels of the voxels, and beside them those of the cells in the same colours, in three planes.
 
     Parameters
@@ -123,6 +132,11 @@ def label_figure(labels: Image, mesh: Mesh, of_cell: NDArray[np.int64] | None = 
     mesh : Mesh
     of_cell : (M,) int64, optional
         Each cell's label; by default that of most of its voxels (`tetopt.measure.fidelity.cell_labels`).
+    image : Image, optional
+        On the labels' voxels. In a third column the interfaces of the cells' labels are drawn over it, each in the
+        colour of the label on its side that has fewer cells.
+    table : LabelTable
+        Names and colours of labels.
 
     Returns
     -------
@@ -136,7 +150,7 @@ def label_figure(labels: Image, mesh: Mesh, of_cell: NDArray[np.int64] | None = 
     InputError
         As `tetopt.measure.fidelity.cell_labels`.
     """
-    colours = label_colours(labels)
+    colours = label_colours(labels, table.colours)
     of_cell = cell_labels(labels, mesh) if of_cell is None else of_cell
     views = _middle_views(labels)
     pixels = [view.pixels.astype(np.int64) for view in views]
@@ -144,9 +158,11 @@ def label_figure(labels: Image, mesh: Mesh, of_cell: NDArray[np.int64] | None = 
     shown = _counted(pixels, len(colours)) + (_counted([of_cell[cells] for _, cells in cuts], len(colours)) > 0)
     width, heights = max(view.size[0] for view in views), [view.size[1] for view in views]
     inches = min(SLICE_WIDTH_INCHES / width, SLICES_HEIGHT_INCHES / sum(heights))  # a mm
-    figure = Figure(figsize=(2.0 * inches * width + 1.4, inches * sum(heights) + 0.6), layout="constrained")
-    grid = figure.subplots(len(views), 2, squeeze=False, height_ratios=heights)
-    for (left, right), view, numbers, (polygons, cells) in zip(grid, views, pixels, cuts, strict=True):
+    handles, n_columns = legend_patches(colours, shown, table.names), 2 if image is None else 3
+    beside = 1.1 + LETTER_INCHES * max(len(str(handle.get_label())) for handle in handles)
+    figure = Figure(figsize=(n_columns * inches * width + beside, inches * sum(heights) + 0.6), layout="constrained")
+    grid = figure.subplots(len(views), n_columns, squeeze=False, height_ratios=heights)
+    for (left, right, *_), view, numbers, (polygons, cells) in zip(grid, views, pixels, cuts, strict=True):
         left.imshow(colours[numbers.T], origin="lower", extent=view.extent, interpolation="nearest")
         if np.count_nonzero(shown) > LISTED_LABELS:
             _write_numbers(left, view, numbers, colours, NUMBER_RADIUS_SHARE * width)
@@ -158,9 +174,28 @@ def label_figure(labels: Image, mesh: Mesh, of_cell: NDArray[np.int64] | None = 
             view.frame(axes)
     grid[0, 0].set_title("labels of the voxels", fontsize=11)
     grid[0, 1].set_title(f"labels of the cells, {len(mesh.points)} nodes", fontsize=11)
-    handles = legend_patches(colours, shown)
+    if image is not None:
+        _draw_interfaces(list(grid[:, 2]), image, mesh, of_cell, colours)
+        grid[0, 2].set_title("interfaces of the cells over the image", fontsize=11)
     figure.legend(handles=handles, loc="outside right upper", fontsize=9, frameon=False, title="label")
     return figure
+
+
+def _draw_interfaces(
+    column: Sequence[Axes], image: Image, mesh: Mesh, of_cell: NDArray[np.int64], colours: NDArray[np.float64]
+) -> None:
+    """Draw the middle slices of the image, and over them where the interfaces of the cells' labels cut them."""
+    views = _middle_views(image)
+    limits = grey_limits([view.pixels for view in views], brightest=99.8)
+    n_cells = np.bincount(of_cell, minlength=len(colours))
+    for axes, view in zip(column, views, strict=True):
+        lines, sides = view.interfaces(mesh, of_cell)
+        rarer = np.take_along_axis(sides, n_cells[sides].argmin(axis=1)[:, None], axis=1).ravel()
+        view.show_pixels(axes, limits)
+        # Dark beneath, so that light colours show on white.
+        axes.add_collection(LineCollection(list(lines), colors="black", linewidths=1.6, capstyle="round"))
+        axes.add_collection(LineCollection(list(lines), colors=colours[rarer], linewidths=1.1, capstyle="round"))
+        view.frame(axes)
 
 
 def _counted(arrays: Sequence[NDArray[np.int64]], n: int) -> NDArray[np.int64]:
@@ -300,7 +335,17 @@ class SliceView:
         outer, is_on_box = facets_on_box(mesh, self.image)
         if self.across is None:
             return self._flat(index[outer[~is_on_box]])
-        return self._flat(_triangle_cut(index, outer[~is_on_box], index[:, self.across] - self.index))
+        return self._flat(_triangle_cut(index, outer[~is_on_box], index[:, self.across] - self.index)[0])
+
+    def interfaces(self, mesh: Mesh, of_cell: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+        """Segments (K, 2, 2), in picture mm, of the facets between cells of two labels, and these labels (K, 2)."""
+        index, shared = self.image.to_index(mesh.points), facets(mesh.cells)
+        is_between = (shared.n_cells == 2) & (of_cell[shared.cells[:, 0]] != of_cell[shared.cells[:, 1]])
+        nodes, sides = shared.nodes[is_between], of_cell[shared.cells[is_between]]
+        if self.across is None:
+            return self._flat(index[nodes]), sides
+        lines, triangles = _triangle_cut(index, nodes, index[:, self.across] - self.index)
+        return self._flat(lines), sides[triangles]
 
     def _flat(self, index: NDArray[np.float64]) -> NDArray[np.float64]:
         """Places in the picture (..., 2), mm, of index coordinates (..., n)."""
@@ -331,15 +376,18 @@ def _middle_views(image: Image) -> list[SliceView]:
 
 def _triangle_cut(
     points: NDArray[np.float64], triangles: NDArray[np.int64], height: NDArray[np.float64]
-) -> NDArray[np.float64]:
-    """Segments (K, 2, 3) in which the plane height = 0 cuts triangles; a node on the plane counts as above it."""
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Segments (K, 2, 3) in which the plane height = 0 cuts triangles, and the numbers (K,) of these.
+
+    A node on the plane counts as above it.
+    """
     is_above = height[triangles] >= 0.0
     n_above = is_above.sum(axis=1)
     alone = (is_above == (n_above == 1)[:, None]).argmax(axis=1)  # the node with no other on its side
     turned = np.take_along_axis(triangles, (alone[:, None] + np.arange(3)) % 3, axis=1)[(n_above % 3) > 0]
     one, others = turned[:, :1], turned[:, 1:]
     share = (height[one] / (height[one] - height[others]))[..., None]
-    return points[one] * (1.0 - share) + points[others] * share
+    return points[one] * (1.0 - share) + points[others] * share, np.flatnonzero(n_above % 3)
 
 
 def histogram_figure(meshes: Sequence[tuple[str, Mesh]]) -> Figure:
