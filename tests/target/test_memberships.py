@@ -35,7 +35,7 @@ def test_a_sphere_has_no_stairs(radius):
 
 def test_supersampling():
     assert supersampling(np.array([0.9, 0.9, 5.0])) == (1, 1, 5)
-    assert supersampling(np.array([6.5, 1.0, 1.0])) == (6, 1, 1)
+    assert supersampling(np.array([6.5, 1.0, 1.0])) == (7, 1, 1)
     assert supersampling(np.array([1.0, 1.4])) == (1, 1)
 
 

@@ -8,19 +8,28 @@ gaps and do not overlap, where three of them meet as well. Between voxel centres
 from __future__ import annotations
 
 from collections.abc import Sequence
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
+import numba
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt, gaussian_filter, maximum_filter
+from scipy.ndimage import correlate1d, distance_transform_edt, find_objects, gaussian_filter, maximum_filter
+from scipy.ndimage import label as components
 
 from tetopt.image import Image
 from tetopt.target.labels import check_labels, label_channels
 
 FARTHEST_LEVEL = 6.0  # levels end there: nothing that moves by steps near an interface looks further
-STAIRS_VOXELS = 1.0  # sigma of the Gaussian that takes the stairs of voxels off a label
-MOST_MOVED_VOXELS = 0.45  # below a half, so that every voxel's centre keeps its label
-SLACK_SLICES = 0.25  # added to the ratio of two spacings before it is cut to a whole number: 1.75 voxels become two
+FARTHEST_DISTANCE = 8  # voxels beyond which distances to a label do not count: more than levels and smoothing look at
+FINE_SIGMA, BROAD_SIGMA = 1.0, 3.0  # voxels: of the Gaussian where a label is thin, and where it and its gaps are not
+THIN_REACH = 4.0, 7.0  # voxels from the middle to the surface of what is thin for the broad one, and of what is not
+VOLUME_SIGMA, VOLUME_BLOCK = 5.0, 4  # volumes are kept in a Gaussian of so many voxels, summed over such blocks
+NEAR_SURFACE = 0.05, 0.95  # distance from the surface of a voxel beside it: less than 1, and its centre keeps its label
+MOST_LIFTED = 1.0  # voxels by which smoothing changes levels further off: what distances to voxels can be wrong by
+THIN_SHARE = 0.5  # of these bounds where a label, or a gap in it, is one or two voxels thick
+FLOW_STEPS = 4  # more do not bring spheres of 3 to 20 voxels, or shells of 2 to 6, any nearer to the true ones
+ABSENT_DISTANCE = 1e4  # voxels to what is not in a slice at all
 
 
 class Memberships(NamedTuple):
@@ -33,8 +42,13 @@ class Memberships(NamedTuple):
 
 
 def supersampling(spacing: NDArray[np.float64]) -> tuple[int, ...]:
-    """Into how many a voxel of these edges (n,), mm, is divided along each axis, so that its parts are nearly cubes."""
-    return tuple(max(1, int(ratio)) for ratio in np.asarray(spacing) / np.min(spacing) + SLACK_SLICES)
+    """Into how many a voxel of these edges (n,), mm, is divided along each axis, so that its parts are nearly cubes.
+
+    Odd numbers, so that a slice's plane goes through voxels' centres: 1, 3, 5, ..., whichever is nearest in ratio.
+    """
+    ratio = np.asarray(spacing) / np.min(spacing)
+    odd = np.arange(1, ratio.max() + 4.0, 2.0)
+    return tuple(int(f) for f in odd[np.searchsorted(np.sqrt(odd[:-1] * odd[1:]), ratio)])
 
 
 def finer(image: Image, factors: Sequence[int]) -> Image:
@@ -42,13 +56,7 @@ def finer(image: Image, factors: Sequence[int]) -> Image:
 
     Between the centres of two voxels intensities are linear; beyond the outermost they are constant.
     """
-    data = image.data.astype(np.float64)
-    for axis, factor in enumerate(factors):
-        at = np.clip(finer_index(data.shape[axis], factor), 0.0, data.shape[axis] - 1.0)
-        below = np.minimum(at.astype(np.int64), max(data.shape[axis] - 2, 0))
-        share = (at - below).reshape((-1,) + (1,) * (data.ndim - 1 - axis))
-        above = np.minimum(below + 1, data.shape[axis] - 1)
-        data = np.take(data, below, axis) * (1.0 - share) + np.take(data, above, axis) * share
+    data = _spread(image.data.astype(np.float64), factors)
     return Image(data.astype(image.data.dtype), finer_affine(image.affine, factors))
 
 
@@ -68,12 +76,16 @@ def finer_affine(affine: NDArray[np.float64], factors: Sequence[int]) -> NDArray
 def memberships(labels: Image, factors: Sequence[int] | None = None) -> Memberships:
     """Of each label the signed distance to its smooth surface, on the labels' voxels or on finer ones.
 
+    Every voxel's centre keeps its label: on a slice's plane the surface stays between the same two voxels' centres.
+    Between slices that are divided it is interpolated by shape (Raya and Udupa 1990, IEEE Trans. Med. Imaging 9, 32),
+    and smoothing may move it by one more finer voxel for each that the plane is away.
+
     Parameters
     ----------
     labels : Image
         Whole numbers from 0.
     factors : sequence of int, optional
-        Into how many a voxel is divided along each axis, as `supersampling` has them; 1 by default.
+        Into how many a voxel is divided along each axis, odd, as `supersampling` has them; 1 by default.
 
     Raises
     ------
@@ -81,31 +93,195 @@ def memberships(labels: Image, factors: Sequence[int] | None = None) -> Membersh
         Labels that are not whole numbers from 0.
     """
     check_labels("labels", labels)
-    values, number = np.unique(labels.data.astype(np.int64), return_inverse=True)
-    number = number.reshape(labels.shape)
-    for axis, factor in enumerate(factors or ()):
-        number = np.repeat(number, factor, axis)
-    channel = label_channels(number, len(values))
-    levels = np.stack([_level(channel[number] == c) for c in range(channel.max() + 1)])
-    return Memberships(values, channel, levels, _partition(number, channel, levels))
+    factors = tuple(factors or (1,) * labels.ndim)
+    assert all(factor % 2 == 1 for factor in factors), f"factors: expected odd numbers, got {factors}"
+    values = np.flatnonzero(np.bincount(labels.data.astype(np.int64).ravel()))
+    raw = start = np.searchsorted(values, labels.data).reshape(labels.shape)
+    off: NDArray = np.zeros((1,) * labels.ndim)
+    for axis, factor in enumerate(factors):
+        raw = np.repeat(raw, factor, axis)
+        if factor > 1:
+            start = _between_slices(start, axis, factors)
+            along = np.abs(np.arange(start.shape[axis]) % factor - factor // 2)
+            off = np.maximum(off, along.reshape((-1,) + (1,) * (labels.ndim - 1 - axis)))
+    off = np.broadcast_to(off, start.shape)
+    channel = label_channels(start, len(values))
+    levels = np.full((channel.max() + 1, *start.shape), FARTHEST_LEVEL, dtype=np.float32)
+    smallest, partition = np.full(start.shape, np.inf, dtype=np.float32), np.zeros(start.shape, dtype=np.int64)
+    boxes = [_around(box, start.shape) for box in find_objects(start + 1)]
+
+    def level_in(row: int) -> NDArray[np.float32]:
+        box = boxes[row]
+        return _level(start[box] == row, raw[box] == row, off[box])
+
+    with ThreadPoolExecutor(numba.get_num_threads()) as threads:
+        for row, level in enumerate(threads.map(level_in, range(len(values)))):
+            shared, least = levels[channel[row]][boxes[row]], smallest[boxes[row]]
+            np.minimum(shared, level, out=shared)
+            partition[boxes[row]][level < least] = row
+            np.minimum(least, level, out=least)
+    return Memberships(values, channel, levels, partition)
 
 
-def _level(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """The smooth level of a label, or of several that are apart."""
+def _around(box: tuple[slice, ...], shape: tuple[int, ...]) -> tuple[slice, ...]:
+    """A label's box with a margin, beyond which its level is the farthest."""
+    ends = ((max(s.start - FARTHEST_DISTANCE, 0), s.stop + FARTHEST_DISTANCE) for s in box)
+    return tuple(slice(first, min(stop, n)) for (first, stop), n in zip(ends, shape, strict=True))
+
+
+def _level(inside: NDArray[np.bool_], raw: NDArray[np.bool_], off: NDArray) -> NDArray[np.float32]:
+    """The smooth level of a label, (*shape) float32.
+
+    Stairs are taken off as by biharmonic flow: 2 G - G^2, of a Gaussian G, keeps planes and quadrics. After each step
+    volumes are put right and voxels beside the surface brought back to their own side, so that what was smoothed too
+    far returns. Where nothing is thin the Gaussian is broad, since the stairs of a nearly flat surface are.
+
+    Parameters
+    ----------
+    inside : (*shape) bool
+        Voxels of the label; between slices by shape.
+    raw : (*shape) bool
+        The same, with the label of the slice that each voxel is of: its volume is kept.
+    off : (*shape) int
+        How many voxels each is away from the plane of a slice.
+    """
     if inside.all():
         return np.full(inside.shape, -FARTHEST_LEVEL, dtype=np.float32)
-    within, without = distance_transform_edt(inside), distance_transform_edt(~inside)
-    raw = np.where(inside, 0.5 - within, without - 0.5)
-    once = gaussian_filter(raw, STAIRS_VOXELS, mode="nearest")
-    twice = once + gaussian_filter(raw - once, STAIRS_VOXELS, mode="nearest")
-    room = np.minimum(maximum_filter(within, size=5), maximum_filter(without, size=5))
-    most = MOST_MOVED_VOXELS * np.clip(room - 1.0, 0.0, 1.0)
-    level = np.clip(twice, raw - most, raw + most)
-    return np.clip(level, -FARTHEST_LEVEL, FARTHEST_LEVEL).astype(np.float32)
+    within, without = _distance(inside), _distance(~inside)
+    level = np.where(inside, 0.5 - within, without - 0.5)
+    low, high = _bounds(level, np.minimum(maximum_filter(within, 7), maximum_filter(without, 7)), off)
+    thin, broad = THIN_REACH
+    reach = np.minimum(maximum_filter(within, 13), maximum_filter(without, 13))
+    share = np.clip((reach - thin) / (broad - thin), 0.0, 1.0)
+    for _ in range(FLOW_STEPS):
+        smooth = _flowed(level, FINE_SIGMA)
+        if share.any():
+            smooth += share * (_flowed(level, BROAD_SIGMA) - smooth)
+        level = np.clip(_with_volume(smooth, raw), low, high)
+    return np.clip(level, -FARTHEST_LEVEL, FARTHEST_LEVEL)
 
 
-def _partition(number: NDArray[np.int64], channel: NDArray[np.int64], levels: NDArray[np.float32]) -> NDArray[np.int64]:
-    """The label of the smallest level at each voxel; of labels that share a channel the one whose voxel it is."""
-    smallest = levels.argmin(axis=0)
-    assert np.array_equal(smallest, channel[number]), "a voxel's centre left its label"
-    return number
+def _distance(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """To the nearest voxel's centre outside, voxels; 0 outside, and what is far is cut off."""
+    return np.minimum(distance_transform_edt(inside), FARTHEST_DISTANCE).astype(np.float32)
+
+
+def _bounds(
+    raw: NDArray[np.float32], room: NDArray[np.float32], off: NDArray
+) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """The least and the largest level of each voxel; `room` is 1 where label or gap are one or two voxels thick."""
+    size = np.abs(raw)
+    is_beside = size <= 0.5
+    share = np.where(size < 1.5, np.clip(room - 1.0, THIN_SHARE, 1.0), 1.0)
+    least = size + share * np.where(is_beside, NEAR_SURFACE[0] - 0.5, -MOST_LIFTED)
+    least = np.maximum(least, NEAR_SURFACE[0]) - off
+    most = size + share * np.where(is_beside, NEAR_SURFACE[1] - 0.5, MOST_LIFTED) + off
+    inside = raw < 0.0
+    return np.where(inside, -most, least).astype(np.float32), np.where(inside, -least, most).astype(np.float32)
+
+
+def _flowed(level: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
+    once = gaussian_filter(level, sigma, mode="nearest", truncate=3.0)
+    return once + gaussian_filter(level - once, sigma, mode="nearest", truncate=3.0)
+
+
+def _with_volume(level: NDArray[np.float32], raw: NDArray[np.bool_]) -> NDArray[np.float32]:
+    """The level raised or lowered, gently from place to place, so that it has the label's volume there."""
+    mean = level  # over each voxel, of the level that is linear between centres
+    for axis in range(level.ndim):
+        mean = correlate1d(mean, [0.125, 0.75, 0.125], axis, mode="nearest")
+    missing = _summed(raw - np.clip(0.5 - mean, 0.0, 1.0))
+    area = _summed((np.abs(mean) < 0.5).astype(np.float32))
+    lowered = np.where(area > 0.01 * VOLUME_BLOCK**level.ndim, missing / np.maximum(area, 1e-3), 0.0)
+    spread = _spread(lowered, (VOLUME_BLOCK,) * level.ndim)
+    return level - spread[tuple(slice(n) for n in level.shape)].astype(np.float32)
+
+
+def _summed(values: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Sums over blocks of voxels, weighed by a Gaussian over the blocks around."""
+    for axis, n in enumerate(values.shape):
+        values = np.add.reduceat(values, np.arange(0, n, VOLUME_BLOCK), axis)
+    return gaussian_filter(values, VOLUME_SIGMA / VOLUME_BLOCK, mode="constant", truncate=3.0)
+
+
+def _spread(data: NDArray, factors: Sequence[int]) -> NDArray:
+    """Values at the centres of voxels divided into so many along each axis: linear, constant beyond the outermost."""
+    for axis, factor in enumerate(factors):
+        if factor > 1:
+            n = data.shape[axis]
+            at = np.clip(finer_index(n, factor), 0.0, n - 1.0)
+            below = np.minimum(at.astype(np.int64), max(n - 2, 0))
+            share = (at - below).reshape((-1,) + (1,) * (data.ndim - 1 - axis))
+            above = np.minimum(below + 1, n - 1)
+            data = np.take(data, below, axis) * (1.0 - share) + np.take(data, above, axis) * share
+    return data
+
+
+def _between_slices(number: NDArray[np.int64], axis: int, factors: Sequence[int]) -> NDArray[np.int64]:
+    """Labels on slices divided along one axis, interpolated by shape.
+
+    Within a slice a label's level is the signed distance to its outline, and between slices it is linear. A piece that
+    the next slice has nothing of shrinks to its innermost point on half the way.
+
+    Parameters
+    ----------
+    number : (*shape) int
+        Rows of labels.
+    axis : int
+        The one that is divided.
+    factors : sequence of int
+        Of all axes; those behind `axis` are not divided yet, and their voxels are as many times longer.
+    """
+    length = [float(f) if i > axis else 1.0 for i, f in enumerate(factors)]
+    length[axis] = ABSENT_DISTANCE
+    divided = [factors[axis] if i == axis else 1 for i in range(number.ndim)]
+    shape = tuple(n * f for n, f in zip(number.shape, divided, strict=True))
+    smallest, partition = np.full(shape, np.inf, dtype=np.float32), np.zeros(shape, dtype=np.int64)
+    for row, box in enumerate(find_objects(number + 1)):
+        margin = tuple(slice(max(s.start - 1, 0), min(s.stop + 1, n)) for s, n in zip(box, number.shape, strict=True))
+        fine = tuple(slice(s.start * f, s.stop * f) for s, f in zip(margin, divided, strict=True))
+        level = _interpolated(number[margin] == row, axis, factors[axis], length)
+        least = smallest[fine]
+        partition[fine][level < least] = row
+        np.minimum(least, level, out=least)
+    return partition
+
+
+def _interpolated(inside: NDArray[np.bool_], axis: int, factor: int, length: Sequence[float]) -> NDArray[np.float32]:
+    """A label's level on slices divided along one axis."""
+    inside = np.moveaxis(inside, axis, 0)
+    length = [length[axis], *length[:axis], *length[axis + 1 :]]
+    level, deepest = _outlined(inside, length)
+    fine = np.repeat(level, factor, axis=0)
+    middle = factor // 2
+    for k in range(len(level) - 1):
+        is_crossed = inside[k] != inside[k + 1]
+        low, high = (
+            np.where(is_crossed, np.clip(level[one], -most, most), level[one])
+            for one, most in ((k, _rest(level, deepest, k + 1)), (k + 1, _rest(level, deepest, k)))
+        )
+        for step in range(1, factor):
+            fine[k * factor + middle + step] = low + (high - low) * np.float32(step / factor)
+    return np.moveaxis(fine, 0, axis)
+
+
+def _rest(level: NDArray[np.float32], deepest: NDArray[np.float32], k: int) -> NDArray[np.float32]:
+    """How far from its outline a slice may be where slice `k` is on the other side: what ends there does half way."""
+    return 2.0 * deepest[k] - np.abs(level[k])
+
+
+def _outlined(inside: NDArray[np.bool_], length: Sequence[float]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """Within each slice the signed distance to the outline, and the largest in the piece that a voxel is of."""
+    link = np.zeros((3,) * inside.ndim)
+    link[1] = [[0, 1, 0], [1, 1, 1], [0, 1, 0]] if inside.ndim == 3 else [1, 1, 1]
+    level, deepest = np.zeros(inside.shape, dtype=np.float32), np.zeros(inside.shape, dtype=np.float32)
+    for side, sign in ((inside, -1.0), (~inside, 1.0)):
+        distance = np.minimum(
+            distance_transform_edt(side, length) if not side.all() else ABSENT_DISTANCE, ABSENT_DISTANCE
+        )
+        piece, n = components(side, link)
+        largest = np.zeros(n + 1, dtype=np.float32)
+        np.maximum.at(largest, piece, np.where(side, distance - 0.5, 0.0))
+        level += np.where(side, sign * (distance - 0.5), 0.0).astype(np.float32)
+        deepest += largest[piece]
+    return level, deepest
