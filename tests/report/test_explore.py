@@ -14,6 +14,7 @@ from tetopt.errors import InputError
 from tetopt.geometry.cut import plane_cut
 from tetopt.geometry.simplex import centroids, volumes
 from tetopt.geometry.topology import boundary_facets, facets
+from tetopt.model.labels import LabelTable
 from tetopt.report import explore
 from tetopt.report.exhibit import exhibit, first_axis, warp_factors
 from tetopt.report.explore import colour_table, explorer_html, save_explorer
@@ -248,6 +249,26 @@ const run = async () => {
     await frame();
     said.changed.push(canvas.toDataURL() !== before);
   }
+  const labels = async () => {
+    await frame();
+    return [$("count").textContent, Number(canvas.dataset.surface), Number(canvas.dataset.glass),
+      $("field").selectedOptions[0].textContent, [...$("labels").children].map((entry) => entry.textContent),
+      canvas.toDataURL()];
+  };
+  put("set", -1); press("inside", "cells"); press("axis", -1); press("from", "S");
+  const rows = [...$("label-list").children];
+  said.rows = rows.map((row) => row.firstChild.textContent);
+  said.every = await labels();
+  rows[2].lastChild.click();
+  said.only = await labels();
+  $("glass").click();
+  said.unglazed = await labels();
+  rows[0].querySelector("input").click();
+  said.two = await labels();
+  press("label-all", "none");
+  said.none = await labels();
+  press("label-all", "all");
+  said.again = await labels();
   return said;
 };
 addEventListener("load", () => setTimeout(async () => {
@@ -261,6 +282,7 @@ FRAME = """<body><script>addEventListener("message", (event) => {
 <iframe src="page.html" width="1000" height="700"></iframe>
 <iframe src="warped.html" width="1000" height="700"></iframe><iframe src="blind.html"></iframe>
 <iframe src="narrow.html" width="380" height="600"></iframe></body>"""
+TABLE = LabelTable({2: "left <lung>", 9: "not there"}, {2: (0.0, 1.0, 0.2)})
 AT = (0.23, -1.37, 3.1)  # mm from the middle: the coronal cut, the axial one, and the one the page begins with
 CLICKS = [[300, 300], [340, 390], [420, 280]]
 
@@ -304,7 +326,7 @@ def shown(tmp_path_factory, mesh, cell_data, image):
         if title == "narrow":  # of one step
             del results["displacement_step2"]
         forces = {1: {"outer": [3.0, -4.0, 0.0]}, 2: {"outer": [0.0, 0.5, 1234.56]}}
-        text = explorer_html(exhibit(mesh, cell_data, image, title, sets, results, forces))
+        text = explorer_html(exhibit(mesh, cell_data, image, title, sets, results, forces, TABLE))
         copied(text, folder / f"{title}.html", FRAMES + BLIND if title == "blind" else FRAMES, probe)
     frame = copied(FRAME, folder / "frame.html")
     said = re.findall(r'data-(page|warped|blind|narrow)="([^"]*)"', document(frame, "--window-size=1500,2300"))
@@ -410,7 +432,7 @@ def test_a_click_reads_a_cell(shown, mesh, cell_data):
     cells, _ = cells_at(mesh, np.column_stack([xy, np.full(3, AT[1])]) + middle)
     for cell, text in zip(cells, page["picked"], strict=True):
         assert text.startswith(f"Cell {cell}\n")
-        assert re.search(rf"label\t{cell_data['label'][cell]}\n", text)
+        assert re.search(rf"label\t{cell_data['label'][cell]}( left <lung>)?\n", text)
         assert float(re.search(r"mean \(intensity\)\t(\S+)", text)[1]) == pytest.approx(
             cell_data["mean"][cell], rel=1e-5
         )
@@ -526,9 +548,32 @@ def test_the_second_step_is_drawn_interpolated_and_picked(shown, mesh, image):
 
 
 def test_labels_have_a_legend(shown, mesh, cell_data):
-    _, field = exhibit(mesh, cell_data).fields
+    _, field = exhibit(mesh, cell_data, table=TABLE).fields
+    assert (field.names, field.categories[2][1]) == ({2: "left <lung>"}, "#00ff33")
     rgb = [tuple(int(colour[i : i + 2], 16) for i in (1, 3, 5)) for _, colour in field.categories]
-    assert shown["page"]["labels"] == [[str(k), f"rgb{colour}"] for k, colour in enumerate(rgb)]
+    names = ["0", "1", "2 left <lung>", "3"]
+    assert shown["page"]["labels"] == [[name, f"rgb{colour}"] for name, colour in zip(names, rgb, strict=True)]
+    assert shown["page"]["rows"] == names
+
+
+def test_labels_are_shown_by_name(shown, mesh, cell_data):
+    """One alone, its surface among the others' interfaces as glass; two; none; and all again."""
+    page, label, sides = shown["page"], cell_data["label"], facets(mesh.cells)
+    inner = label[sides.cells[sides.n_cells == 2]]
+    rows = [page[name] for name in ("every", "only", "unglazed", "two", "none", "again")]
+    of_all = (inner[:, 0] != inner[:, 1]) & ~np.isin(inner, [2]).any(axis=1)
+    glass = [0, np.count_nonzero(of_all), 0, 0, 0, 0]
+    for row, labels, n_glass in zip(rows, [[0, 1, 2, 3], [2], [2], [0, 2], [], [0, 1, 2, 3]], glass, strict=True):
+        is_shown = np.isin(label, labels)
+        n_facets = len(boundary_facets(mesh.cells[is_shown])) if labels else 0
+        assert row[0].startswith(f"{is_shown.sum():,} of {len(label):,} cells")
+        assert row[1:3] == [n_facets, n_glass]
+        names = ["0", "1", "2 left <lung>", "3"]
+        assert row[4] == ([names[k] for k in labels] if row is not rows[0] else [])
+    assert rows[0][3] == "mean (intensity)"
+    assert {row[3] for row in rows[1:]} == {"label"}  # the choice colours the cells, too
+    pictures = [row[5] for row in rows[:5]]
+    assert len(set(pictures)) == 5  # the glass, too, is seen
 
 
 def test_the_view_turns_and_zooms(shown):

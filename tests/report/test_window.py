@@ -9,7 +9,8 @@ import pytest
 from tetopt.errors import InputError
 from tetopt.geometry.cut import plane_cut
 from tetopt.geometry.simplex import volumes
-from tetopt.geometry.topology import boundary_facets
+from tetopt.geometry.topology import boundary_facets, facets
+from tetopt.model.labels import LabelTable
 from tetopt.report.exhibit import exhibit
 from tetopt.report.window import has_display, plane_slice, plotter, show
 
@@ -98,6 +99,32 @@ def test_a_field_colours_the_cells(window, mesh, cell_data):
     assert (low.GetMinimumValue(), low.GetMaximumValue(), low.GetValue()) == (0.0, 3.0, 0.0)
     press(window, "n")
     assert "value" in drawn(window, "surface").cell_data
+
+
+def test_a_label_is_shown_alone(opengl, mesh, cell_data):
+    """Its surface, in its colour, among the others' interfaces as glass; each in its turn, and then all."""
+    label, sides = cell_data["label"], facets(mesh.cells)
+    table = LabelTable({1: "left lung"}, {1: (1.0, 0.0, 0.0)})
+    window = plotter(exhibit(mesh, cell_data, table=table), off_screen=True)
+    slide(window, 0, mesh.points.max(axis=0)[np.argmin(np.ptp(mesh.points, axis=0))])
+    assert "glass" not in window.actors
+    for k in range(4):
+        press(window, "l")
+        text, surface = window.actors["count"].get_text(2), drawn(window, "surface")
+        assert text.startswith(f"{(label == k).sum():,} of")
+        assert text.splitlines()[-1] == ("label 1 left lung" if k == 1 else f"label {k}")
+        assert surface.n_cells == len(boundary_facets(mesh.cells[label == k]))
+        if k == 1:
+            assert (surface.cell_data["colour"] == [255, 0, 0]).all()
+        inner = label[sides.cells[sides.n_cells == 2]]
+        is_glass = (inner[:, 0] != inner[:, 1]) & ~(inner == k).any(axis=1)
+        glass = drawn(window, "glass")
+        assert glass.n_cells == is_glass.sum()
+        assert (label[glass.cell_data["cell"]] == inner[is_glass].max(axis=1)).all()
+    press(window, "l")
+    assert "glass" not in window.actors
+    assert window.actors["count"].get_text(2).startswith(f"{len(label):,} of")
+    window.close()
 
 
 def test_the_plane_shows_mesh_image_or_both(window):

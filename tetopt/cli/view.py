@@ -53,7 +53,7 @@ def view_command(
     triples = {name: facet_triples(mesh.cells, rows) for name, rows in sets.items()}
     from tetopt.report.exhibit import exhibit  # matplotlib and pyvista are slow to load, and only needed here
 
-    shown = exhibit(mesh, fields, image, mesh_path.name, triples, loaded.point_data, _reactions(loaded))
+    shown = exhibit(mesh, fields, image, mesh_path.name, triples, loaded.point_data, _reactions(loaded), table)
     if html is None:
         from tetopt.report.window import show
 

@@ -13,6 +13,7 @@ from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields
+from tetopt.model.labels import NO_TABLE, LabelTable, table_of_labels
 from tetopt.report.colours import grey_limits, label_colours
 from tetopt.target.labels import LARGEST_LABEL
 
@@ -26,6 +27,7 @@ FIELD_UNITS = {
     "volume": "mm³", "rho": "0 to 1/3", "min_dihedral": "degrees", "young": "kPa", "displacement": "mm",
     "von_mises": "kPa", "von_mises_nodes": "kPa", "young_nodes": "kPa", "density": "kg/m³",
 }  # fmt: skip
+LABEL_FIELD = "label"  # the cell data that a table's names and colours are of, and that labels are chosen by
 DISPLACEMENT = "displacement"  # the point data by which the mesh is deformed
 STEP_NAME = re.compile(r"(.+)_step([1-9]\d*)")  # of results of the second and further steps
 ROUNDED_SHARE = 1e-9  # of the upper limit: a lower one within it is 0 but for rounding
@@ -44,6 +46,7 @@ class Field(NamedTuple):
     categories: list[tuple[int, str]]  # value and colour "#rrggbb" of labels, ascending; empty for a quantity
     nodes: NDArray[np.float32] | None = None  # (N,), to be interpolated; None for a field of the cells
     step: int = 0  # of a load, from 1; 0 for what is of none, or of the only one
+    names: dict[int, str] = {}  # noqa: RUF012 - nobody changes it; what categories are called
 
 
 class Exhibit(NamedTuple):
@@ -68,6 +71,7 @@ def exhibit(
     facet_sets: dict[str, NDArray] | None = None,
     point_data: dict[str, NDArray] | None = None,
     reactions: dict[int, dict[str, list[float]]] | None = None,
+    table: LabelTable = NO_TABLE,
 ) -> Exhibit:
     """What is shown of a mesh and its data.
 
@@ -90,6 +94,8 @@ def exhibit(
         is a field; with "displacement_step2" and so on there are steps, and data with such an end are of that step.
     reactions : dict, optional
         By step, from 1, and facet set: the force that holds it, three numbers, mN.
+    table : LabelTable
+        Names and colours of the labels in the data "label".
 
     Raises
     ------
@@ -113,7 +119,10 @@ def exhibit(
     scalars = {name: values for name, values in arrays.items() if values.ndim == 1 and values.dtype.kind in "buif"}
     at_nodes, displacements, others = _nodal(mesh, point_data or {})
     fields = [_field(name, values[mesh.cells].mean(axis=1), values) for name, values in at_nodes.items()]
-    fields += [_field(name, values) for name, values in (scalars or cell_fields(mesh, image)).items()]
+    fields += [
+        _field(name, values, table=table if name == LABEL_FIELD else NO_TABLE)
+        for name, values in (scalars or cell_fields(mesh, image)).items()
+    ]
     skipped = [name for name in cell_data if name not in scalars] + others
     if len(displacements) > 1:
         skipped = list(dict.fromkeys(STEP_NAME.sub(r"\1", name) for name in skipped))
@@ -185,7 +194,7 @@ def _by_step(fields: list[Field], displacements: dict[int, NDArray[np.float64]])
     ]
 
 
-def _field(name: str, values: NDArray, nodes: NDArray | None = None) -> Field:
+def _field(name: str, values: NDArray, nodes: NDArray | None = None, table: LabelTable = NO_TABLE) -> Field:
     """A field of the cells, or of the nodes with its mean over the corners of each cell."""
     values, at_nodes = _single(values), None if nodes is None else _single(nodes)
     shown = values if at_nodes is None else at_nodes
@@ -197,7 +206,9 @@ def _field(name: str, values: NDArray, nodes: NDArray | None = None) -> Field:
     low = 0.0 if abs(low) < ROUNDED_SHARE * high else low
     limits = (low, high) if high > low else grey_limits([finite])
     is_quantity = unit or at_nodes is not None
-    return Field(name, unit, values, limits, [] if is_quantity else _categories(finite), at_nodes)
+    categories = [] if is_quantity else _categories(finite, table)
+    names = table_of_labels(table, [label for label, _ in categories]).names
+    return Field(name, unit, values, limits, categories, at_nodes, names=names)
 
 
 def _single(values: NDArray) -> NDArray[np.float32]:
@@ -207,14 +218,14 @@ def _single(values: NDArray) -> NDArray[np.float32]:
     return np.where(np.isfinite(values), values, np.nan).astype(np.float32)
 
 
-def _categories(values: NDArray[np.float64]) -> list[tuple[int, str]]:
+def _categories(values: NDArray[np.float64], table: LabelTable) -> list[tuple[int, str]]:
     """Labels and their colours; none if values are not whole, or negative, or too many for a list of colours."""
     if (values != np.rint(values)).any() or values.min() < 0 or values.max() > LARGEST_LABEL:
         return []
     labels = np.unique(values).astype(np.int64)
     if len(labels) > MOST_CATEGORIES:
         return []
-    colours = label_colours(Image(values[:, None]))
+    colours = label_colours(Image(values[:, None]), table.colours)
     return [(int(label), to_hex(colours[label])) for label in labels]
 
 

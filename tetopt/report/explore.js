@@ -12,6 +12,7 @@ const number = (value, digits = 5) => value.toLocaleString("en-US", {
   maximumSignificantDigits: digits, notation: value !== 0 && Math.abs(value) < 1e-3 ? "scientific" : "standard",
 });
 const whole = (value) => value.toLocaleString("en-US");
+const called = (field, value) => [value, field.names[value]].filter((word) => word !== undefined).join(" ");
 const heading = (field) => (field.unit ? `${field.name} (${field.unit})` : field.name);
 
 function say(words) {
@@ -63,6 +64,9 @@ function explore(gl, data, notes) {
   };
   const camera = { ...facing(), ...WHOLE };
   const isWithin = new Uint8Array(mesh.count).fill(1);
+  // The field by which labels are chosen, and those that are not shown.
+  const labelling = fields.findIndex((field) => field.name === data.labelField && field.categories.length > 1);
+  const hidden = new Set();
 
   // From where the cut is seen at first, slantwise.
   function facing() {
@@ -85,9 +89,11 @@ function explore(gl, data, notes) {
   function within() {
     const { values, min, max } = fields[state.by];
     const isAll = state.low <= min && state.high >= max;  // then cells without a value are shown, too
+    const labels = hidden.size ? fields[labelling].values : null;
     let count = 0, volume = 0;
     for (let cell = 0; cell < mesh.count; cell++) {
       isWithin[cell] = isAll || (values[cell] >= state.low && values[cell] <= state.high) ? 1 : 0;
+      if (labels && hidden.has(labels[cell])) isWithin[cell] = 0;
       count += isWithin[cell];
       volume += isWithin[cell] * mesh.volumes[cell];
     }
@@ -115,6 +121,10 @@ function explore(gl, data, notes) {
     // Cells that are deformed take the image along: around them it would be where it was.
     const isAlone = state.inside === "image" || !displacements.length || state.warp === 0;
     drawn.parts.slice.fill(hasSlice && isAlone ? slice(image.box, axis, at) : nothing);
+    const isGlass = hidden.size && $("glass").checked;
+    const glass = isGlass ? interfaces(mesh, fields[labelling].values, (label) => hidden.has(label)) : nothing;
+    drawn.parts.glass.fill(glass);
+    canvas.dataset.glass = glass.count;
     drawn.parts.set.fill(state.set < 0 ? nothing : setTriangles(mesh, sets[state.set].triangles));
     canvas.dataset.surface = outside.count;
     canvas.dataset.section = cut.nPolygons || 0;
@@ -162,10 +172,11 @@ function explore(gl, data, notes) {
     if (field.least < low) texts[0] = `≤ ${texts[0]}`;
     if (field.most > high) texts[2] = `≥ ${texts[2]}`;
     $("ticks").replaceChildren(...texts.map((text) => element("span", text)));
-    $("labels").replaceChildren(...field.categories.map(([value, colour]) => {
-      const [entry, swatch] = [element("span", ""), element("i", "")];
-      swatch.style.background = colour;
-      entry.append(swatch, String(value));
+    $("labels").classList.toggle("named", Object.keys(field.names).length > 0);
+    const seen = field.categories.filter(([value]) => state.field !== labelling || !hidden.has(value));
+    $("labels").replaceChildren(...seen.map(([value, colour]) => {
+      const entry = element("span", "");
+      entry.append(swatch(colour), called(field, value));
       return entry;
     }));
     const hasNone = !(field.least <= field.most) || (field.nodes || field.values).some(Number.isNaN);
@@ -177,6 +188,13 @@ function explore(gl, data, notes) {
 
   function element(kind, text) {
     return Object.assign(document.createElement(kind), { textContent: text });
+  }
+
+  function swatch(colour) {
+    const square = element("i", "");
+    square.className = "swatch";
+    square.style.background = colour;
+    return square;
   }
 
   function choose(place, options, act) {
@@ -304,6 +322,39 @@ function explore(gl, data, notes) {
     showReaction();
   }
 
+  // Labels are shown or not; the first choice also colours the cells by them.
+  function chooseLabels(isShown) {
+    const { categories } = fields[labelling];
+    for (const [value] of categories) {
+      const is = isShown(value);
+      if (is) hidden.delete(value);
+      else if (is === false) hidden.add(value);
+    }
+    for (const box of $("label-list").querySelectorAll("input")) box.checked = !hidden.has(Number(box.value));
+    within();
+    if (state.field !== labelling && hidden.size) chooseField(labelling);
+    else build();
+    showKey();
+  }
+
+  function listLabels() {
+    $("labelling").hidden = labelling < 0;
+    if (labelling < 0) return;
+    const field = fields[labelling];
+    choose("label-all", [["all", "all"], ["none", "none"]], (which) => chooseLabels(() => which === "all"));
+    $("glass").addEventListener("change", build);
+    $("label-list").replaceChildren(...field.categories.map(([value, colour]) => {
+      const [row, label, only] = [element("div", ""), element("label", ""), element("button", "only")];
+      const box = Object.assign(element("input", ""), { type: "checkbox", value, checked: true });
+      box.addEventListener("change", () => chooseLabels((each) => (each === value ? box.checked : null)));
+      Object.assign(only, { type: "button", title: `show ${called(field, value)} alone` });
+      only.addEventListener("click", () => chooseLabels((each) => each === value));
+      label.append(box, swatch(colour), called(field, value));
+      row.append(label, only);
+      return row;
+    }));
+  }
+
   function showReaction() {
     const force = state.set < 0 ? null : (data.reactions[state.step] || {})[sets[state.set].name];
     const parts = force && force.map((value, k) => `${SIDES[k][0]} ${number(value, 4)}`).join(", ");
@@ -352,7 +403,8 @@ function explore(gl, data, notes) {
     ).toFixed(1)).join(", ");
     const rows = fields.filter((field) => [0, state.step].includes(field.step)).map((field) => [
       field.nodes ? `${heading(field)}, mean of its nodes` : heading(field),
-      Number.isNaN(field.values[picked]) ? "no value" : number(field.values[picked], 6),
+      Number.isNaN(field.values[picked]) ? "no value"
+        : field.names[field.values[picked]] ? called(field, field.values[picked]) : number(field.values[picked], 6),
     ]);
     for (const texts of [...rows, ["centroid (RAS, mm)", middle], ["nodes", nodes.join(", ")]]) {
       const row = element("tr", "");
@@ -436,6 +488,7 @@ function explore(gl, data, notes) {
   $("deforming").hidden = !displacements.length;
   $("stepping").hidden = displacements.length < 2;
   about();
+  listLabels();
   chooseStep(state.step);
   showCut();
   listen(canvas, { turn, zoom, move, pick, keys });

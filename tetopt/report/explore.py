@@ -21,7 +21,7 @@ from tetopt.geometry.box import box_sides
 from tetopt.image import Image
 from tetopt.io.files import written_whole
 from tetopt.report.colours import grey_limits
-from tetopt.report.exhibit import COLOUR_MAP, NO_VALUE, Exhibit, Field, first_axis, warp_factors
+from tetopt.report.exhibit import COLOUR_MAP, LABEL_FIELD, NO_VALUE, Exhibit, Field, first_axis, warp_factors
 from tetopt.report.page import data_html, packed, script_html
 
 PAGE_IMAGE_VOXELS = 2**24  # 16 MB, a byte each: an image with more is averaged
@@ -57,6 +57,7 @@ def explorer_html(shown: Exhibit) -> str:
         "centre": centre.tolist(),
         "points": packed(mesh.points - centre, "<f4"),
         "cells": packed(mesh.cells, "<u4"),
+        "labelField": LABEL_FIELD,
         "fields": [_packed_field(field) for field in fields],
         "skipped": skipped,
         "colours": packed(colour_table(), "u1"),

@@ -6,7 +6,7 @@ const FRAGMENT = `${SHADING}
   uniform int kind; uniform vec4 plane; uniform float share; uniform bool isPicking; uniform uint picked;
   uniform bool isNodal; uniform vec3 noValue; uniform sampler2D table; uniform sampler2D colours;
   uniform sampler3D voxels; uniform mat4 toIndex; uniform vec3 shape;
-  const int SURFACE = 0, SECTION = 1, SLICE = 2, SET = 3;
+  const int SURFACE = 0, SECTION = 1, SLICE = 2, SET = 3, GLASS = 4;
   vec4 grey(vec3 place) {  // of the voxel around a place; nothing outside of the image
     vec3 index = (toIndex * vec4(place, 1.0)).xyz + 0.5;
     if (any(lessThan(index, vec3(0.0))) || any(greaterThanEqual(index, shape))) return vec4(0.0);
@@ -34,6 +34,11 @@ const FRAGMENT = `${SHADING}
       colour = vec4(mix(vec3(1.0, 0.0, 0.75) * lit, vec3(0.35, 0.0, 0.25), 0.6 * line), 0.3);
       return;
     }
+    if (kind == GLASS) {  // of labels that are not shown
+      colour = vec4(isNodal ? vec3(0.6) : texelFetch(colours, ivec2(cell % 2048u, cell / 2048u), 0).rgb, 0.14);
+      colour.rgb *= lit;
+      return;
+    }
     vec3 own = isNodal ? atNodes() : texelFetch(colours, ivec2(cell % 2048u, cell / 2048u), 0).rgb;
     vec4 below = kind == SECTION ? grey(rest) : vec4(0.0);  // the image is moved along
     float seenOwn = mix(1.0, share, below.a);
@@ -45,7 +50,7 @@ const FRAGMENT = `${SHADING}
     colour = vec4(mix(fill, ink, mix(0.5, 0.65, seenOwn) * line), 1.0);
   }`;
 // The parts in the order in which they are drawn, with the shader's numbers of them.
-const KINDS = { surface: 0, section: 1, slice: 2, set: 3 };
+const KINDS = { surface: 0, section: 1, slice: 2, set: 3, glass: 4 };
 const WIDE = 2048;  // cells in a row of the texture of their colours
 
 const hex = (text) => [1, 3, 5].map((i) => parseInt(text.slice(i, i + 2), 16));
@@ -108,6 +113,7 @@ function renderer(gl, image, radius, depth, table, noValue) {
     gl.uniform1i(at("isPicking"), isPicking ? 1 : 0);
     for (const [name, kind] of Object.entries(KINDS)) {
       if (isPicking ? name === "slice" || name === "set" : name === "section" && share < 0) continue;
+      if (name === "glass") continue;  // last
       // The slice lies behind the cells cut by its plane, a highlighted set before the facets it is made of; these have
       // the same corners, so a few steps of depth are enough, and steep ones do not come through others.
       const [slope, nearer] = { slice: [1, 1], set: [0, -16] }[name] || [0, 0];
@@ -117,13 +123,18 @@ function renderer(gl, image, radius, depth, table, noValue) {
       gl.uniform1i(at("kind"), kind);
       parts[name].draw();
     }
-    // What of the set lies behind other cells shines through.
+    // What of the set lies behind other cells shines through, and then all of the glass, over what is behind it.
     if (isPicking) return;
     gl.enable(gl.BLEND);
     gl.depthFunc(gl.GREATER);
     parts.set.draw();
-    gl.disable(gl.BLEND);
     gl.depthFunc(gl.LESS);
+    gl.disable(gl.POLYGON_OFFSET_FILL);
+    gl.depthMask(false);
+    gl.uniform1i(at("kind"), KINDS.glass);
+    parts.glass.draw();
+    gl.depthMask(true);
+    gl.disable(gl.BLEND);
   };
 
   return {

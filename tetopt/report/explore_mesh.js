@@ -114,6 +114,19 @@ function surface(mesh, isShown, levels) {
   return triangles;
 }
 
+// The facets between cells of two labels neither of which is shown, as facets of the cell with the larger one.
+function interfaces(mesh, labels, isHidden) {
+  const { points, cells } = mesh;
+  const triangles = new Triangles(64);
+  for (let half = 0; half < cells.length; half++) {
+    const [cell, other] = [half >> 2, mesh.neighbours[half]];
+    if (other < 0 || !(labels[cell] > labels[other]) || !isHidden(labels[cell]) || !isHidden(labels[other])) continue;
+    const corners = FACETS[half % 4].map((k) => 3 * cells[4 * cell + k]);
+    triangles.add(cell, 0, ...corners.map((node) => points.subarray(node, node + 3)));
+  }
+  return triangles;
+}
+
 // The polygons in which the plane axis = at cuts the shown cells: triangles, or quadrilaterals in two triangles.
 function section(mesh, isShown, axis, at, levels) {
   const { points, rest, cells } = mesh;

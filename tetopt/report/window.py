@@ -21,15 +21,17 @@ from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import facets
 from tetopt.image import Image
 from tetopt.report.colours import LISTED_LABELS, grey_limits
-from tetopt.report.exhibit import COLOUR_MAP, NO_VALUE, Exhibit, Field, first_axis, warp_factors
+from tetopt.report.exhibit import COLOUR_MAP, LABEL_FIELD, NO_VALUE, Exhibit, Field, first_axis, warp_factors
 from tetopt.report.figures import MESH_LINE
 
 KEYS_TEXT = "x y z: plane   k: side kept   m: mesh, image, both   n: next field   h: next set of facets   q: close"
+LABEL_KEY_TEXT = "   l: next label alone"  # likewise
 STEP_KEY_TEXT = "   s: next step"  # where there are several
 PLANE_CHOICES = ("mesh", "image", "both")  # what the plane shows
 AXIS_LETTERS = "RAS"  # the sides to which the world's axes run
 # Where the eye is at first, RAS, for the cut across each axis: before the cut, a little aside.
 CUT_VIEWPOINTS = ((1.6, 0.9, 0.7), (0.9, 1.6, 0.7), (0.4, -1.0, 1.6))
+OTHERS_OPACITY = 0.14  # of the interfaces of labels that are not shown: the one that is shines through several
 GLASS_OPACITY = 0.35  # of the cells' colours over the image: enough to tell them, and the voxels show through
 MAX_PIXELS = 1024  # of the image's slice along either side: about the window's
 
@@ -97,6 +99,9 @@ class _Scene:
         # Behind a mesh that is deformed the image, which is not, would mislead at first sight.
         self.inside = PLANE_CHOICES[0] if image is None or self.displacements else PLANE_CHOICES[2]
         self.set = 0  # none, then those in `sets`
+        of_labels = [field for field in shown.fields if field.name == LABEL_FIELD and len(field.categories) > 1]
+        self.labels = of_labels[0] if of_labels else None
+        self.label = 0  # all, then each of them alone
         self.number = 0  # of the field
         self.limits = self._range()
         self.sliders: dict[str, Any] = {}  # of VTK
@@ -129,13 +134,14 @@ class _Scene:
 
     def open(self) -> None:
         self._add_sliders()
-        text = KEYS_TEXT + (STEP_KEY_TEXT if len(self.displacements) > 1 else "")
+        text = KEYS_TEXT + (LABEL_KEY_TEXT if self.labels else "")
+        text += STEP_KEY_TEXT if len(self.displacements) > 1 else ""
         self.window.add_text(text, name="keys", font_size=8, color="#555555", position="lower_left")
         self.window.add_axes(xlabel="R", ylabel="A", zlabel="S", color="black", viewport=(0.0, 0.2, 0.15, 0.4))
         for key, act in (
             ("x", lambda: self.cut_across(0)), ("y", lambda: self.cut_across(1)), ("z", lambda: self.cut_across(2)),
             ("k", self.turn), ("m", self.next_inside), ("n", self.next_field), ("h", self.next_set),
-            ("s", self.next_step),
+            ("s", self.next_step), ("l", self.next_label),
         ):  # fmt: skip
             self.window.add_key_event(key, act)
         self.is_open = True
@@ -158,9 +164,13 @@ class _Scene:
         self._add_cells("surface", before_plane(self._surface(is_within)), lighting=True)
         self._add_section(is_within)
         self._add_slice()
+        self._add_cells("glass", before_plane(self._others()), lighting=True, show_edges=False, opacity=OTHERS_OPACITY)
         self._add("set", before_plane(self._marked()), color="#ff00c0", show_edges=True, ambient=0.3)
         count, volume = int(np.count_nonzero(is_within)), float(self.volumes[is_within].sum())
         text = f"{count:,} of {len(self.mesh.cells):,} cells, {volume:,.7g} mm³; world RAS, mm"
+        if self.labels and self.label:
+            label = self.labels.categories[self.label - 1][0]
+            text += f"\nlabel {label} {self.labels.names.get(label, '')}".rstrip()
         if self.displacements:
             text += f"\ndeformation x {self.warp:.4g}" + (f", step {self.step}" if self.step else "")
             text += "; the image is at rest" if self.image is not None and self.inside != "mesh" else ""
@@ -172,13 +182,36 @@ class _Scene:
         self.window.render()
 
     def is_within(self) -> NDArray[np.bool_]:
-        """Cells whose value lies within the limits; with the full range also those without a value, (M,)."""
+        """Cells of the label whose value lies within the limits; with the full range also those without one, (M,)."""
         # Sliders hold single precision, so that a limit at one of their ends may miss the field's own by rounding.
         low, high = self._range()
         slack = 1e-6 * (high - low)
+        is_of_label = self._is_of_label()
         if self.limits[0] <= low + slack and self.limits[1] >= high - slack:
+            return is_of_label
+        values = self.field.values
+        return is_of_label & (values >= self.limits[0] - slack) & (values <= self.limits[1] + slack)
+
+    def _is_of_label(self) -> NDArray[np.bool_]:
+        """Cells of the label that is shown alone, or all, (M,)."""
+        if self.labels is None or self.label == 0:
             return np.full(len(self.mesh.cells), True)
-        return (self.field.values >= self.limits[0] - slack) & (self.field.values <= self.limits[1] + slack)
+        return self.labels.values == self.labels.categories[self.label - 1][0]
+
+    def _others(self) -> pyvista.PolyData:
+        """The facets between cells of two labels neither of which is shown, with the cell of the larger one."""
+        if self.labels is None or self.label == 0:
+            return pyvista.PolyData()
+        values, is_hidden = self.labels.values, ~self._is_of_label()
+        inner = np.flatnonzero(self.sides.n_cells == 2)
+        sides = self.sides.cells[inner]
+        is_between = (values[sides[:, 0]] != values[sides[:, 1]]) & is_hidden[sides].all(axis=1)
+        surface = pyvista.PolyData.from_regular_faces(self.points, self.sides.nodes[inner[is_between]])
+        larger = np.where(values[sides[:, 0]] > values[sides[:, 1]], *sides.T)
+        surface.cell_data["cell"] = larger[is_between]
+        if self.field.nodes is not None:
+            surface.point_data["value"] = self.field.nodes
+        return surface
 
     def _surface(self, is_within: NDArray[np.bool_]) -> pyvista.PolyData:
         """The facets that exactly one shown cell has, with that cell as cell data."""
@@ -263,12 +296,14 @@ class _Scene:
         if field.categories:
             # As in the pictures' legends, the labels of most cells are listed, ascending.
             by_size = sorted(field.categories, key=lambda entry: -np.count_nonzero(field.values == entry[0]))
-            entries = [[f" {label}", colour] for label, colour in sorted(by_size[:LISTED_LABELS])]
+            listed = sorted(by_size[:LISTED_LABELS])
+            entries = [[f" {label} {field.names.get(label, '')}".rstrip(), colour] for label, colour in listed]
             if len(field.categories) > LISTED_LABELS:
                 entries.append([f" and {len(field.categories) - LISTED_LABELS} more", "#555555"])
             height = 0.03 * len(entries)
-            legend = self.window.add_legend(entries, bcolor="white", face="rectangle", size=(0.11, height))
-            legend.SetPosition(0.88, 0.95 - height)
+            width = 0.11 if not field.names else 0.2
+            legend = self.window.add_legend(entries, bcolor="white", face="rectangle", size=(width, height))
+            legend.SetPosition(0.99 - width, 0.95 - height)
             return
         mapper = pyvista.DataSetMapper()
         mapper.lookup_table = pyvista.LookupTable(COLOUR_MAP, scalar_range=field.limits)
@@ -378,6 +413,15 @@ class _Scene:
 
     def next_field(self) -> None:
         self.colour_by((self.number + 1) % len(self.fields))
+
+    def next_label(self) -> None:
+        """Show the next label alone, or after the last one all, the cells in the colours of their labels."""
+        if self.labels is None:
+            return
+        self.label = (self.label + 1) % (len(self.labels.categories) + 1)
+        if self.label:
+            self.colour_by(next(number for number, field in enumerate(self.fields) if field is self.labels))
+        self._changed()
 
     def next_set(self) -> None:
         self.set = (self.set + 1) % (len(self.sets) + 1)
