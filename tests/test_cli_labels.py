@@ -88,6 +88,15 @@ def test_laws_and_loads_by_name(folder, tmp_path, mesh):
     assert table_in(tetopt.load_mesh(tmp_path / "s.vtu").text("label_table")).names[9] == "spleen"
 
 
+def test_an_improved_mesh_keeps_the_names(folder, tmp_path, capsys):
+    words = ["mesh", folder / "a.nii.gz", "--labels", folder / "l.nii.gz", "--iterations", "0"]
+    assert exit_code(*words, "--start", folder / "named.vtu", "-o", tmp_path / "a.vtu") == 0
+    loaded = tetopt.load_mesh(tmp_path / "a.vtu")
+    assert table_in(loaded.text("label_table")).names[9] == "spleen"
+    assert set(loaded.sets.cells) == {"soft_tissue", "bright_ball_e"}
+    assert "not kept" not in capsys.readouterr().err
+
+
 def test_another_table_renames(folder, tmp_path):
     (tmp_path / "other.csv").write_text("label,name\n1,ball\n")
     out = tmp_path / "a.vtu"
@@ -134,6 +143,7 @@ def test_what_is_refused(folder, tmp_path, capsys):
     assert "--label-names: there are no --labels" in refused(capsys, *plan, *names)
     assert "did you mean spleen" in refused(capsys, *plan, *labels, *names, "--young", "splen=5,*=20")
     assert "--label-names: there are no --labels" in refused(capsys, "quality", mesh, *names)
+    assert "--label-names: there are no --labels" in refused(capsys, "compare", image, "-o", tmp_path / "c", *names)
     (tmp_path / "bad.csv").write_text("label,name\n1,a\n1,b\n")
     for words in (
         ["convert", mesh, out],

@@ -433,6 +433,15 @@ def test_who_keeps_the_labels_is_said(tmp_path):
     assert "and its mean surface distance no larger on 1." in page
     assert "tetopt's Dice is below pytetwild's on label 2 (0.61 against 0.62)." in page
     assert "tetopt's mean surface distance is larger than pytetwild's on label 2." in page
+    report = with_dice((0.1, 0.9, 0.61), (0.99, 0.8, 0.62))
+    lose(report.pipelines[0].runs[0], 3)
+    page = page_of(tmp_path, report._replace(labels=report.labels._replace(names={2: "left <lung>", 3: "dot"})))
+    assert "pytetwild's on label 2 left &lt;lung&gt; (0.61 against 0.62)." in page
+    assert "larger than pytetwild's on label 2 left &lt;lung&gt;." in page
+    assert "label 3 dot (140 voxels" in page
+    table, pieces, shares = Tables(page).tables[3:6]
+    for each in (table, pieces, shares):
+        assert {row[0][1][0] for row in each[1:]} == {"0", "1", "2 left <lung>", "3 dot"}
     page = page_of(tmp_path, with_dice((0.1, 0.9, 0.62), (0.99, 0.8, 0.62)))
     assert "Dice is at least pytetwild's on 2<" in page
     assert "is below" not in page
@@ -584,7 +593,8 @@ def test_names_are_escaped(tmp_path):
     report = fake_report()
     evil = "<script>alert(1)</script>\"'&"
     report = report._replace(
-        command=evil, law=evil, labels=report.labels._replace(name=evil), options=report.options._replace(k_D=evil),
+        command=evil, law=evil, labels=report.labels._replace(name=evil, names={1: evil, 3: evil}),
+        options=report.options._replace(k_D=evil),
         image=report.image._replace(source=report.image.source._replace(name=evil)),
         pipelines=[p._replace(title=evil, about=evil, notes=[evil], failure=evil) for p in report.pipelines],
     )  # fmt: skip

@@ -8,13 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
+import numpy as np
 import typer
 from rich.markup import escape
 
 import tetopt
 from tetopt import Image, InputError, save_mesh
 from tetopt.cli.console import log, out
-from tetopt.cli.inputs import checked_outputs, read_labels, read_volume, results_folder
+from tetopt.cli.inputs import checked_outputs, label_table, read_labels, read_volume, results_folder
 from tetopt.cli.options import (
     DEFAULT_NODES,
     WHOLE_BOX,
@@ -22,6 +23,7 @@ from tetopt.cli.options import (
     BoxPart,
     ForceOption,
     ImageArgument,
+    LabelNamesOption,
     NumberOptions,
     option,
 )
@@ -32,6 +34,7 @@ from tetopt.io.mni import mni_path, mni_tissue
 from tetopt.measure.quality import quality
 from tetopt.model.averages import parse_average
 from tetopt.model.fields import cell_fields
+from tetopt.model.labels import table_of_labels
 from tetopt.model.laws import parse_law
 from tetopt.report.tables import add_quality, new_table
 from tetopt.study.compare_report import ImageSource, LabelSource, Settings
@@ -52,6 +55,7 @@ class ComparedOptions:
     panel: ClassVar[str] = "What is compared"
     nodes: Annotated[int, option("N", "Wanted number of nodes, of every mesh.", min=20)] = DEFAULT_SETTINGS.nodes
     labels: Annotated[Path | None, option("LABELS", "Label image, for tetopt and the pipelines that segment.")] = None
+    label_names: LabelNamesOption = None
     repeats: Annotated[int, option("R", "Runs of a mesher whose result varies.", min=1)] = DEFAULT_SETTINGS.repeats
     pipelines: Annotated[str, option("A,B,...", f"Of {', '.join(PIPELINES)}: which, in order.")] = ",".join(PIPELINES)
     programs: Annotated[
@@ -188,7 +192,7 @@ def compare_command(
     law, law_words = compare.default_law(image) if young is None else (parse_law(young), young)
     comparison = compare.Comparison(
         image, labels, law, settings, ImageSource(image_path.name, sha256(image_path), part.volume, part.crop),
-        None if labels_path is None else LabelSource(labels_path.name, "given", sha256(labels_path)), law_words,
+        _label_source(labels_path, labels, compared.label_names), law_words,
         command=f"tetopt {' '.join(map(shlex.quote, context.obj))}",
     )  # fmt: skip
     paths = checked_outputs(results_folder(output), compare_files.COMPARE_FILES, force or resume)
@@ -211,6 +215,16 @@ def _image_and_labels(path: Path, labels_path: Path | None, part: BoxPart) -> tu
     """The volume, and labels on its voxels, if they are given."""
     image = read_volume(path, part)
     return image, None if labels_path is None else read_labels(labels_path, image, part)
+
+
+def _label_source(path: Path | None, labels: Image | None, names: Path | None) -> LabelSource | None:
+    """The labels' file, and what those in it are called; InputError for names of labels that there are not."""
+    if names is not None and labels is None:
+        raise InputError("--label-names: there are no --labels")
+    if path is None or labels is None:
+        return None
+    there = table_of_labels(label_table(names), np.unique(labels.data).astype(np.int64).tolist())
+    return LabelSource(path.name, "given", sha256(path), there.names)
 
 
 def _settings(compared: ComparedOptions, simulation: SimulationOptions, limits: LimitOptions) -> Settings:

@@ -106,6 +106,8 @@ def _read(plan: Plan) -> Task:
         _check_place(started.mesh, source.contrasts[0], str(plan.start.start))
         if plan.solver.order is None and started.order == 2 and format_of(plan.output.mesh).has_quadratic:
             plan = plan._replace(solver=replace(plan.solver, order=2))
+        if source.labels is not None and not source.table.names:
+            source = source.with_table(label_table(None, started))
     plan, sizes = with_numbers(plan, source.content)
     return Task(plan, source, started, sizes)
 

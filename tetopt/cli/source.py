@@ -14,7 +14,7 @@ from tetopt.cli.console import log
 from tetopt.cli.inputs import file_and_volume, image_and_others, label_table
 from tetopt.cli.options import SourceOptions
 from tetopt.io.images import sha256
-from tetopt.io.label_tables import LabelTable
+from tetopt.io.label_tables import NO_TABLE, LabelTable
 from tetopt.io.vtk import box_text
 from tetopt.measure.fidelity import cell_labels
 from tetopt.model.fields import cell_fields
@@ -45,6 +45,11 @@ class Source(NamedTuple):
         if self.labels is not None:
             fields["label"] = cell_labels(continued(self.labels, self.content.continuation), mesh)
         return fields
+
+    def with_table(self, table: LabelTable) -> Source:
+        """The same with other names and colours of labels."""
+        words = {TABLE_TEXT: table_words(table)} if table.names else {}
+        return self._replace(table=table, about=self.about | words)
 
     def by_contrast(self, fields: dict[str, NDArray]) -> list[dict[str, Any]]:
         """How well cells with these fields represent each contrast: the share of its variance left within them."""
@@ -97,8 +102,8 @@ def read_source(options: SourceOptions, label_names: Path | None = None) -> Sour
         "sha256": {path.name: sha256(file_and_volume(path)[0]) for path in files},
     }  # fmt: skip
     about = {"image": paths[0].name, "image_sha256": sha256(paths[0]), "inputs": inputs, "box": box_text(box_of(image))}
-    about |= {TABLE_TEXT: table_words(table)} if table.names else {}
-    return Source(paths, weights, represented, contrasts, labels, mask, about, table)
+    source = Source(paths, weights, represented, contrasts, labels, mask, about, NO_TABLE)
+    return source.with_table(table)
 
 
 def _number(name: str, text: str) -> float:

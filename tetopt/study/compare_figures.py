@@ -160,8 +160,9 @@ def labels_figure(report: Report) -> Figure:
     panels[1].set_ylabel("mean surface distance, mm")
     panels[1].set_ylim(bottom=0.0)
     panels[1].set_xlim(-0.5, len(order) - 0.5)
+    words = {label: report.labels.words(label) if report.labels else f"{label:.0f}" for label in order}
     panels[1].set_xticks(
-        range(len(order)), [f"{label:.0f} ({voxels[label]:.0f})" for label in order], rotation=90, fontsize=8
+        range(len(order)), [f"{words[label]} ({voxels[label]:.0f})" for label in order], rotation=90, fontsize=8
     )
     panels[1].set_xlabel("label (voxels)")
     _legend(figure, panels)

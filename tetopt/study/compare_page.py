@@ -402,7 +402,7 @@ def _label_sentences(report: Report) -> list[str]:
     judged = _judged(report)
     if report.labels is None or not judged:
         return []
-    words = [line for own in ours for peer in peers for line in _label_verdict(own, peer, judged, _which(report))]
+    words = [line for own in ours for peer in peers for line in _label_verdict(own, peer, judged, report)]
     how = (
         "tetopt's own meshes, but not those of the paper's scheme, are to show the labels besides the image; E_D and "
         "the simulation judge the image alone."
@@ -410,21 +410,27 @@ def _label_sentences(report: Report) -> list[str]:
     return [*words, paragraph_html(how)] if ours else []
 
 
-def _label_verdict(ours: PipelineResult, peer: PipelineResult, judged: Iterable[int], which: str) -> Iterator[str]:
+def _label_words(report: Report, label: int) -> str:
+    return _text(label) if report.labels is None else report.labels.words(label)
+
+
+def _label_verdict(ours: PipelineResult, peer: PipelineResult, judged: Iterable[int], report: Report) -> Iterator[str]:
     pairs = {label: (_label_medians(ours, label), _label_medians(peer, label)) for label in judged}
     dice = [(round(own.dice or 0.0, 4), round(other.dice or 0.0, 4), label) for label, (own, other) in pairs.items()]
     worse = sorted((row for row in dice if row[0] < row[1]), key=lambda row: row[0] - row[1])
     farther = [label for label, (own, other) in pairs.items() if _is_farther(own.surface_mean, other.surface_mean)]
     title, other = html.escape(ours.title), html.escape(peer.title)
     yield (
-        f"<p><strong>Of {len(pairs)} labels {which}, {title}'s Dice is at least {other}'s on {len(pairs) - len(worse)}"
-        f"</strong>, and its mean surface distance no larger on {len(pairs) - len(farther)}.</p>"
+        f"<p><strong>Of {len(pairs)} labels {_which(report)}, {title}'s Dice is at least {other}'s on "
+        f"{len(pairs) - len(worse)}</strong>, and its mean surface distance no larger on "
+        f"{len(pairs) - len(farther)}.</p>"
     )
     if worse:
-        names = ", ".join(f"{_text(k)} ({number_text(a)} against {number_text(b)})" for a, b, k in worse)
+        names = ", ".join(f"{_label_words(report, k)} ({number_text(a)} against {number_text(b)})" for a, b, k in worse)
         yield f"<p>{title}'s Dice is below {other}'s on label {html.escape(names)}.</p>"
     if farther:
-        yield f"<p>{title}'s mean surface distance is larger than {other}'s on label {html.escape(_text(farther))}.</p>"
+        names = html.escape(", ".join(_label_words(report, label) for label in farther))
+        yield f"<p>{title}'s mean surface distance is larger than {other}'s on label {names}.</p>"
 
 
 def _is_farther(value: float | None, other: float | None) -> bool:
@@ -617,16 +623,18 @@ def _labels_html(report: Report, pictures: Sequence[str]) -> list[str]:
         " Dice; mean and 95th percentile of the distance between the label's surfaces in mesh and image, both ways; "
         f"error of its volume. Labels on which {done[first].title} has the lowest Dice come first."
     )
-    words = [paragraph_html(how), _vanished_html(done, medians, voxels), *pictures]
-    words.append(_label_table_html(done, medians, voxels, open_))
+    heads = {label: _label_words(report, label) for label in voxels}
+    words = [paragraph_html(how), _vanished_html(done, medians, voxels, heads), *pictures]
+    words.append(_label_table_html(done, medians, voxels, {label: heads[label] for label in open_}))
     if folded:
-        words.append(_folded(f"The other {len(folded)} labels", _label_table_html(done, medians, voxels, folded)))
+        rest = _label_table_html(done, medians, voxels, {label: heads[label] for label in folded})
+        words.append(_folded(f"The other {len(folded)} labels", rest))
     components = {row.label: row.components for each in done for run in each.runs for row in run.measurement.labels}
     pieces = [["label", "in the image", *(pipeline.title for pipeline in done)]]
     shares = [["label", "voxels", *(pipeline.title for pipeline in done)]]
     for label, rows in medians.items():
-        pieces.append([str(label), str(components[label]), *(number_text(each.pieces) for each in rows)])
-        shares.append([str(label), str(voxels[label]), *(number_text(each.E_D_share) for each in rows)])
+        pieces.append([heads[label], str(components[label]), *(number_text(each.pieces) for each in rows)])
+        shares.append([heads[label], str(voxels[label]), *(number_text(each.E_D_share) for each in rows)])
     words.append(_folded("Connected pieces of each label", table_html(pieces)))
     words.append(_folded("E_D in each label, share of the image's variance", table_html(shares)))
     return words
@@ -640,18 +648,18 @@ def _label_table_html(
     done: Sequence[PipelineResult],
     medians: dict[int, list[LabelMedians]],
     voxels: dict[int, int],
-    labels: Sequence[int],
+    heads: dict[int, str],
 ) -> str:
-    """A row for each of `labels`, a column for each pipeline; the best Dice of a row is marked."""
+    """A row for each label of `heads`, in words there, a column a pipeline; the best Dice of a row is marked."""
     lines = _table_head("headline labels", "label", done)
     lines[-1] += "<tbody>"
-    for label in labels:
+    for label, words in heads.items():
         best = winners(1, [each.dice for each in medians[label]])
         cells = [
             f'<td class="{html.escape(pipeline.kind)}{" best" if number in best else ""}">{_label_cell(each)}</td>'
             for number, (pipeline, each) in enumerate(zip(done, medians[label], strict=True))
         ]
-        head = f"{label}<small>{_voxels_text(voxels[label])}</small>"
+        head = f"{html.escape(words)}<small>{_voxels_text(voxels[label])}</small>"
         lines.append(f'<tr><th scope="row">{head}</th>{"".join(cells)}</tr>')
     return "\n".join([*lines, "</tbody></table></div>"])
 
@@ -676,7 +684,10 @@ def _label_cell(each: LabelMedians) -> str:
 
 
 def _vanished_html(
-    done: Sequence[PipelineResult], medians: dict[int, list[LabelMedians]], voxels: dict[int, int]
+    done: Sequence[PipelineResult],
+    medians: dict[int, list[LabelMedians]],
+    voxels: dict[int, int],
+    heads: dict[int, str],
 ) -> str:
     """Which labels no cell stands for, by pipeline."""
     items = []
@@ -684,7 +695,7 @@ def _vanished_html(
         lost = [(label, medians[label][number]) for label in voxels if medians[label][number].n_lost]
         if lost:
             names = ", ".join(
-                f"label {label} ({_voxels_text(voxels[label])}"
+                f"label {heads[label]} ({_voxels_text(voxels[label])}"
                 + (")" if each.n_lost == each.n_runs else f", in {each.n_lost} of {each.n_runs} runs)")
                 for label, each in lost
             )

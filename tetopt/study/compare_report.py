@@ -56,6 +56,11 @@ class LabelSource(NamedTuple):
     name: str
     kind: str  # "given"
     sha256: str
+    names: dict[int, str] = {}  # noqa: RUF012 - nobody changes it; of the labels in the image that have one
+
+    def words(self, label: int) -> str:
+        """A label with its name, if it has one."""
+        return f"{label} {self.names.get(label, '')}".rstrip()
 
 
 class Histogram(NamedTuple):
