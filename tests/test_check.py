@@ -4,6 +4,8 @@ import numpy as np
 import pytest
 
 import tetopt
+from tetopt.check import check_unfolded
+from tetopt.measure.fidelity import cell_labels
 
 IMAGE = tetopt.Image(np.zeros((8, 9, 10)), np.diag([1.0, 2.0, 0.5, 1.0]))
 
@@ -40,3 +42,57 @@ def test_faults(mesh):
     on_top = np.vstack([cells, [cells[0, 0], cells[0, 1], cells[0, 2], len(points)]])
     assert "more than two cells" in problems(apex, on_top)
     assert inner >= 0
+
+
+def cubes(labels):
+    """A block of cells for each voxel, and which of them have label 1."""
+    image = tetopt.Image(labels)
+    mesh = tetopt.lattice(image, "criss-cross" if image.ndim == 2 else "five-tet", blocks=image.shape)
+    return mesh, cell_labels(image, mesh)
+
+
+@pytest.mark.parametrize(
+    ("corner", "words"),
+    [
+        ((1, 1, 0), "edges where {} has more than two facets{}; nodes: 1, the first [[{}, {}]]"),
+        ((1, 1, 1), "nodes where {} touches itself{}; nodes: 1, the first [[{}]]"),
+        ((1, 1), "nodes where {} has more than two facets{}; nodes: 1, the first [[{}]]"),
+        ((1, 0, 0), None),
+    ],
+)
+def test_two_cubes_that_touch(corner, words):
+    """As a mesh of their own its boundary is no manifold; within a mesh the interface is not."""
+    labels = np.zeros((4,) * len(corner))
+    first = (1,) * len(corner)
+    labels[first] = labels[tuple(np.add(first, corner))] = 1
+    mesh, of_cell = cubes(labels)
+    assert tetopt.check_mesh(mesh) == []
+    used, cells = np.unique(mesh.cells[of_cell == 1], return_inverse=True)
+    alone = tetopt.Mesh(mesh.points[used], cells.reshape(-1, mesh.ndim + 1))
+    here = np.flatnonzero((alone.points[:, :2] == 1.5).all(axis=1) & (len(corner) < 3 or corner[-1] == 0))
+    here = np.flatnonzero((alone.points == 1.5).all(axis=1)) if corner == (1, 1, 1) else here
+    problems = [] if words is None else [words.format("the boundary", "", *here)]
+    assert tetopt.check_mesh(alone, is_whole=False) == problems
+    assert tetopt.check_mesh(alone, is_whole=False, is_manifold=False) == []
+    check_unfolded(alone)  # what an optimisation asks for
+    inner = [] if words is None else [words.format("the interface of two labels", " (0 and 1 at 1)", *used[here])]
+    assert tetopt.check_mesh(mesh, of_cell=of_cell) == inner
+    with pytest.raises(tetopt.InputError, match="whole number from 0 for each of the mesh's"):
+        tetopt.check_mesh(mesh, of_cell=of_cell[1:])
+    with pytest.raises(tetopt.InputError, match="whole number from 0 for each of the mesh's"):
+        tetopt.check_mesh(mesh, of_cell=of_cell - 0.5)
+
+
+def test_where_three_labels_meet_interfaces_end():
+    labels = np.zeros((4, 4, 4))
+    labels[1, 1, 1] = labels[2, 2, 1] = 1
+    labels[1, 2, 1] = 2
+    mesh, of_cell = cubes(labels)
+    assert tetopt.check_mesh(mesh, of_cell=of_cell) == []
+    labels[1, 2, 1] = 0
+    labels[0, 0, 0] = labels[1, 1, 0] = 3
+    mesh, of_cell = cubes(labels)
+    (line,) = tetopt.check_mesh(mesh, of_cell=of_cell)
+    assert line.startswith(
+        "edges where the interface of two labels has more than two facets (0 and 1 at 1, 0 and 3 at 1)"
+    )

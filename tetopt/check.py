@@ -3,23 +3,32 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from tetopt.errors import InputError
 from tetopt.geometry.box import box_sides, facets_on_sides
+from tetopt.geometry.manifold import OUTSIDE_LABEL, label_surfaces, surface_fans, surface_ridges
 from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import boundary_facets, components, facets, folded
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 
 
-def check_mesh(mesh: Mesh, image: Image | None = None, *, is_whole: bool = True) -> list[str]:
+def check_mesh(
+    mesh: Mesh,
+    image: Image | None = None,
+    *,
+    is_whole: bool = True,
+    is_manifold: bool = True,
+    of_cell: ArrayLike | None = None,
+) -> list[str]:
     """What is wrong with a mesh, one line each, the first offenders named; an empty list if nothing is.
 
     In a mesh every node is used, and no two lie in the same place; every cell is positively oriented, has distinct
     corners and is there once; every facet is in one or two cells, which lie on its two sides (so the mesh conforms and
-    does not fold); the boundary is closed, and one piece. With an image also the boundary's facets lie on the faces of
-    its box, and the cells' volumes add up to it.
+    does not fold); the boundary is closed, a manifold (`manifold_problems`), and one piece. With labels, so are their
+    interfaces manifolds. With an image also the boundary's facets lie on the faces of its box, and the cells' volumes
+    add up to it.
 
     Parameters
     ----------
@@ -28,11 +37,15 @@ def check_mesh(mesh: Mesh, image: Image | None = None, *, is_whole: bool = True)
         The image whose box the mesh should fill. Without it overlaps of cells that share no facet are not found.
     is_whole : bool
         Whether it should be one piece; a mask may have several.
+    is_manifold : bool
+        Whether its boundary should be one; a mask's may be none.
+    of_cell : (M,) array of whole numbers, optional
+        Label of each cell, 0 or more.
 
     Raises
     ------
     InputError
-        Mesh and image of different dimension.
+        Mesh and image of different dimension, or labels that are not one whole number a cell.
     """
     if image is not None and image.ndim != mesh.ndim:
         raise InputError(
@@ -40,9 +53,13 @@ def check_mesh(mesh: Mesh, image: Image | None = None, *, is_whole: bool = True)
         )
     problems = [*_problems_of_nodes(mesh), *_problems_of_cells(mesh)]
     if not problems:  # what follows takes sound cells for granted
-        problems = _problems_of_facets(mesh, is_whole)
-    if not problems and image is not None:
-        problems = _problems_with_box(mesh, image)
+        problems = _problems_of_facets(mesh)
+    if problems:
+        return problems
+    problems = _problems_of_pieces(mesh) if is_whole else []
+    problems += manifold_problems(mesh) if is_manifold else []
+    problems += [] if of_cell is None else manifold_problems(mesh, of_cell)
+    problems += [] if image is None else _problems_with_box(mesh, image)
     return problems
 
 
@@ -79,7 +96,7 @@ def _problems_of_cells(mesh: Mesh) -> list[str]:
     return problems
 
 
-def _problems_of_facets(mesh: Mesh, is_whole: bool) -> list[str]:
+def _problems_of_facets(mesh: Mesh) -> list[str]:
     problems = []
     pairs = folded(mesh.cells)
     if len(pairs):
@@ -96,11 +113,63 @@ def _problems_of_facets(mesh: Mesh, is_whole: bool) -> list[str]:
         kinds = kinds[:, None]
     if (counts % 2).any():
         problems.append(f"places where the boundary is open; nodes: {_first(kinds[counts % 2 == 1])}")
-    pieces = components(mesh.cells)
-    if is_whole and pieces.max() > 0:
-        sizes = np.bincount(pieces)
-        problems.append(f"pieces that share no facet: {len(sizes)}, of {np.sort(sizes)[::-1][:5].tolist()} cells")
     return problems
+
+
+def _problems_of_pieces(mesh: Mesh) -> list[str]:
+    sizes = np.sort(np.bincount(components(mesh.cells)))[::-1]
+    return [f"pieces that share no facet: {len(sizes)}, of {sizes[:5].tolist()} cells"] if len(sizes) > 1 else []
+
+
+def manifold_problems(mesh: Mesh, of_cell: ArrayLike | None = None) -> list[str]:
+    """Where the boundary, or with labels of the cells the interface of two of them, is no manifold, a line each.
+
+    At an edge (in 2-D at a node) that is in more than two of its facets; at a node around which its facets fall into
+    several fans. Where three labels or more meet, or two at the boundary, interfaces end, and are not asked.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        Whose facets are in one or two cells, which do not fold over one another.
+    of_cell : (M,) array of whole numbers, optional
+        Label of each cell, 0 or more.
+
+    Raises
+    ------
+    InputError
+        Labels that are not one whole number from 0 for each cell.
+    """
+    labels = np.zeros(len(mesh.cells), dtype=np.int64) if of_cell is None else np.asarray(of_cell)
+    if labels.shape != (len(mesh.cells),) or not ((np.rint(labels) == labels) & (labels >= 0)).all():
+        raise InputError(f"of_cell: expected a whole number from 0 for each of the mesh's {len(mesh.cells)} cells")
+    surfaces = label_surfaces(facets(mesh.cells), labels.astype(np.int64))
+    ridges = surface_ridges(surfaces)
+    fans = surface_fans(surfaces, ridges)
+    noun = "edges" if mesh.ndim == 3 else "nodes"
+    whose = "the boundary" if of_cell is None else "the interface of two labels"
+    problems = []
+    for label, places, is_bad, words in (
+        (ridges.label, ridges.nodes, (ridges.n_facets > 2) & (ridges.n_labels == 2), "has more than two facets"),
+        (fans.label, fans.node[:, None], (fans.n_fans > 1) & (fans.n_labels == 2), "touches itself"),
+    ):
+        rows = np.flatnonzero(is_bad)
+        rows = rows[np.lexsort((label[rows], *places[rows].T[::-1]))]
+        # Where two labels meet, they share all facets: each place is there twice, once for either.
+        pairs, at = label[rows].reshape(-1, 2), places[rows[::2]]
+        is_meant = (pairs[:, 0] == OUTSIDE_LABEL) == (of_cell is None)
+        if is_meant.any():
+            which = "" if of_cell is None else f" ({_most_frequent(pairs[is_meant])})"
+            kind = noun if words.startswith("has") else "nodes"
+            problems.append(f"{kind} where {whose} {words}{which}; nodes: {_first(at[is_meant])}")
+    return problems
+
+
+def _most_frequent(pairs: NDArray[np.int64]) -> str:
+    """The most frequent pairs of labels, and how often they are there, for a message."""
+    kinds, counts = np.unique(pairs, axis=0, return_counts=True)
+    most = np.argsort(-counts, kind="stable")[:3]
+    words = [f"{kinds[k, 0]} and {kinds[k, 1]} at {counts[k]}" for k in most]
+    return ", ".join([*words, *(["others"] if len(kinds) > len(most) else [])])
 
 
 def check_unfolded(mesh: Mesh) -> None:

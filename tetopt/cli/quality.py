@@ -7,23 +7,27 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
+import numpy as np
 import typer
 from rich.markup import escape
 from rich.table import Table
 
 import tetopt
 from tetopt import Image, InputError, Mesh
-from tetopt.cli.console import out, print_fidelity, show_error
+from tetopt.check import manifold_problems
+from tetopt.cli.console import out, print_fidelity, show_error, show_warning
 from tetopt.cli.inputs import image_and_others, label_table, read_mesh, warn_of_other_image
 from tetopt.cli.options import ImagePart, LabelNamesOption, NumberOptions, option
 from tetopt.io.files import save_json
 from tetopt.io.meshes import MeshFile
 from tetopt.measure.fidelity import LabelFidelity
+from tetopt.measure.interfaces import touching_voxels
 from tetopt.measure.quality import quality
 from tetopt.report.summary import fidelity, size_summary
 from tetopt.report.tables import add_quality, new_table
 from tetopt.target.align import aligned_labels, aligned_mask
 from tetopt.target.content import continued
+from tetopt.target.domain import INSIDE_SHARE
 
 
 def quality_command(
@@ -36,7 +40,10 @@ def quality_command(
         Path | None, option("LABELS", "How well cells keep to them; with --image.", "--labels")
     ] = None,
     check: Annotated[
-        bool, typer.Option("--check", help="Is it a mesh? With --image, does it fill the box? Exit 1 if not.")
+        bool,
+        typer.Option(
+            "--check", help="Is it a mesh, with a manifold boundary? With --image, does it fill the box? Exit 1 if not."
+        ),
     ] = False,
     label_names: LabelNamesOption = None,
     *,
@@ -53,6 +60,7 @@ def quality_command(
     table = new_table("", escape(mesh_path.name))
     add_quality(table, shape, in_all=[size["n_nodes_in_all"]] if loaded.order == 2 else [])
     image: Image | None = None
+    mask: Image | None = None
     fit: Fit | None = None
     measured: dict[str, Any] = {}
     if image_path is not None:
@@ -65,27 +73,54 @@ def quality_command(
         warn_of_other_image(loaded, mesh_path, image_path)
         report |= {**measured, "image": image_path.name, "fit": fit}
         _add_fit(table, fit, image.data.size)
-    is_masked = mask_path is not None or _was_masked(loaded)
-    problems = []
-    if check:
-        problems = tetopt.check_mesh(loaded.mesh, None if is_masked else image, is_whole=not is_masked)
-        report["problems"] = problems
+    is_masked = mask is not None or _was_masked(loaded)
+    problems, remarks = _checked(loaded, image, mask, is_masked) if check else ([], [])
+    report |= {"problems": problems, "remarks": remarks} if check else {}
     if json_path is not None:
         save_json(json_path, report)
     out.print(table)
     print_fidelity(measured)
-    for problem in problems:
-        show_error(f"{mesh_path}: {problem}")
-    if check and not problems:
-        words = ", in one piece" if image is None else ", in one piece, fills the box"
-        words = "; made within a mask, which may have pieces" if is_masked else words
-        out.print(f"checked: conforming, oriented{words}")
+    if check:
+        _say_checked(mesh_path, image, is_masked, problems, remarks)
     if problems:
         return 1
     if image is not None and fit is not None and fit.n_voxels > image.data.size:
         show_error(f"cells overlap: together they hold {fit.n_voxels} voxels, more than there are")
         return 1
     return 0
+
+
+def _checked(loaded: MeshFile, image: Image | None, mask: Image | None, is_masked: bool) -> tuple[list[str], list[str]]:
+    """What is wrong with a mesh; and if nothing is, what is no fault, and yet good to know.
+
+    That is a boundary which is no manifold where the mask's own voxels only touch, and interfaces of labels, which
+    voxels seldom make manifolds.
+    """
+    n_touching = 0 if mask is None else touching_voxels(mask.data >= INSIDE_SHARE)
+    problems = tetopt.check_mesh(
+        loaded.mesh, None if is_masked else image, is_whole=not is_masked, is_manifold=n_touching == 0
+    )
+    if problems:
+        return problems, []
+    remarks = manifold_problems(loaded.mesh) if n_touching else []
+    remarks = [f"{each}; the mask's voxels touch like that at {n_touching} edges and corners" for each in remarks]
+    labels = loaded.cell_data.get("label")
+    if labels is not None and labels.ndim == 1 and ((np.rint(labels) == labels) & (labels >= 0)).all():
+        remarks += manifold_problems(loaded.mesh, labels)
+    return [], remarks
+
+
+def _say_checked(
+    path: Path, image: Image | None, is_masked: bool, problems: Sequence[str], remarks: Sequence[str]
+) -> None:
+    for remark in remarks:
+        show_warning(f"{path}: {remark}")
+    for problem in problems:
+        show_error(f"{path}: {problem}")
+    if not problems:
+        words = ", in one piece" if image is None else ", in one piece, fills the box"
+        words = "; made within a mask, which may have pieces" if is_masked else words
+        out.print(f"checked: conforming, oriented{words}")
 
 
 def _check_options(image: Path | None, mask: Path | None, labels: Path | None, names: Path | None) -> None:
