@@ -41,11 +41,12 @@ def test_commands(tmp_path, monkeypatch):
         for line in README.splitlines()
         if re.match("tetopt (mesh|quality|phantom|fem|segment|convert|surface|view) ", line)
     ]
-    assert len(lines) == 18
+    assert len(lines) == 19
     monkeypatch.chdir(tmp_path)
     assert main(["phantom", "sphere", "-o", "T1.nii.gz", "--voxel-mm", "2", "--labels", "mask.nii.gz"]) == 0
     shutil.copy("T1.nii.gz", "T2.nii.gz")
     shutil.copy("mask.nii.gz", "tissues.nii.gz")
+    Path("tissues.csv").write_text("label,name\n1,grey matter\n")
     for line in lines:
         words = shlex.split(line, comments=True)[1:]
         words = ["200" if before == "--nodes" else word for before, word in zip(["", *words], words, strict=False)]
@@ -59,6 +60,8 @@ def test_commands(tmp_path, monkeypatch):
         "sagging.vtu",
         "head.vtu",
         "tissues.vtu",
+        "tissues.csv",
+        "named.vtu",
         "labels.nii.gz",
         "brain.vtu",
         "fine.vtu",

@@ -13,6 +13,7 @@ from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.io.formats import save_model
 from tetopt.io.images import load_image, save_image
+from tetopt.io.label_tables import load_label_table
 from tetopt.io.meshes import load_mesh, save_mesh
 from tetopt.measure.fidelity import cell_labels, label_fidelity, mask_fidelity
 from tetopt.measure.quality import quality
@@ -47,6 +48,7 @@ __all__ = [
     "label_fidelity",
     "lattice",
     "load_image",
+    "load_label_table",
     "load_mesh",
     "load_phantom",
     "mask_fidelity",

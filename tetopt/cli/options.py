@@ -271,7 +271,7 @@ class ModelOptions:
         str | None,
         option(
             "GROUP,...",
-            "Sets that the file gets besides --set and those of loads: labels, interfaces, boundary; or all, or none.",
+            "Which sets of every mesh the file gets: labels, interfaces, boundary; or all, or none.",
             "--sets",
         ),
     ] = None
