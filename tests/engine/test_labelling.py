@@ -148,22 +148,37 @@ def test_a_ball_is_one_piece_with_a_manifold_surface(seed):
     assert len(result.lost) == 0
 
 
-def test_fragments_go_and_pieces_stay():
-    """Two balls are two pieces where voxels have two; the smaller goes where they have one, or it is too small."""
+def two_balls(gap):
+    """A lattice with a large ball and a small one, each cell full of one label but for a share `gap` along a line."""
     mesh, image, counts = ball(radius=5.0)
-    centre = mesh.points[mesh.cells].mean(axis=1)
-    full = counts.toarray()
-    is_corner = np.linalg.norm(centre - 2.0, axis=1) < 5.0
-    full[is_corner] = np.column_stack([0.0 * full[is_corner, 0], full[is_corner].sum(axis=1)])
-    counts = csr_array(full)
-    large, small = int(image.data.sum()), int(full[is_corner, 1].sum())
+    centre, full = mesh.points[mesh.cells].mean(axis=1), counts.toarray()
+    is_small = np.linalg.norm(centre - 3.0, axis=1) < 4.0
+    is_between = (np.ptp(centre, axis=1) < 4.0) & (centre.mean(axis=1) < 9.0) & ~is_small
+    for chosen, share in ((is_small, 1.0), (is_between, gap)):
+        full[chosen] = full[chosen].sum(axis=1)[:, None] * [1.0 - share, share]
+    return mesh, csr_array(full), is_small, (int(image.data.sum()), int(full[is_small, 1].sum()))
+
+
+def test_fragments_go_and_pieces_stay():
+    """Two balls are two pieces where voxels have two; the smaller goes where they have one, or only a speck besides."""
+    mesh, counts, is_small, (large, small) = two_balls(0.0)
     ends = {}
-    for name, sizes in (("two", [large, small]), ("one", [large]), ("larger", [large, 3 * small])):
+    for name, sizes in (("two", [large, small]), ("one", [large]), ("speck", [large, small // 4])):
         ends[name] = solved(mesh.points, mesh.cells, None, counts=counts, pieces=[np.array([9000]), np.array(sizes)])
     assert ends["two"].pieces.tolist() == [1, 2]
-    assert ends["one"].pieces.tolist() == ends["larger"].pieces.tolist() == [1, 1]
-    assert (ends["one"].labels[is_corner] == 0).all()
-    assert (ends["two"].labels[is_corner] == 1).mean() > 0.5
+    assert ends["one"].pieces.tolist() == ends["speck"].pieces.tolist() == [1, 1]
+    assert (ends["one"].labels[is_small] == 0).all()
+    assert (ends["two"].labels[is_small] == 1).mean() > 0.5
+
+
+def test_what_hangs_together_in_the_voxels_is_bridged():
+    """Between the balls nearly half of the voxels have the label: they are linked, where voxels have one piece."""
+    mesh, counts, is_small, (large, small) = two_balls(0.45)
+    for sizes, n_pieces in (([large, small], 2), ([large + small], 1)):
+        result = solved(mesh.points, mesh.cells, None, counts=counts, pieces=[np.array([9000]), np.array(sizes)])
+        assert result.pieces.tolist() == [1, n_pieces]
+        assert (result.n_nonmanifold_edges, result.n_nonmanifold_nodes) == (0, 0)
+        assert (result.labels[is_small] == 1).mean() > 0.5
 
 
 def test_cubes_that_touch_at_an_edge_or_a_corner_are_linked_or_parted():

@@ -16,6 +16,7 @@ others, with the outside among them, are one, too: linked by facets that contain
 
 from __future__ import annotations
 
+import heapq
 from typing import NamedTuple
 
 import numpy as np
@@ -34,10 +35,10 @@ TENSION_SHARE = (
     0.1  # of the local edge: a regular cell with three facets against one label goes, unless nearly full of its own
 )
 LEAST_SHARE = 0.5  # of a label's volume: tension takes no more, so that small labels do not wither away
-PIECE_SHARE = 0.5  # of a piece of voxels that a piece of cells must hold to be that piece
+PIECE_SHARE = 0.5  # of the voxels of a piece of cells that a piece of voxels has at least, if it is to justify it
 MENDING_ROUNDS = 6  # of fragments and mending, at most; the second mostly has nothing left to do
-TWO_LABELS_WEIGHT = 100.0  # volumes of cells around: what is not manifold between two labels goes at nearly any cost
-MORE_LABELS_WEIGHT = 4.0  # the same where three labels meet or more: only if a few cells are enough
+TWO_LABELS_WEIGHT = 20.0  # volumes of the cells around: what is not manifold between two labels goes at any cost
+MORE_LABELS_WEIGHT = 0.3  # where more labels meet: edges go with it, and with 4 a tenth of small organs' Dice, too
 LEAST_GAIN = 1e-9  # of a cell's volume: less than this is rounding
 
 
@@ -97,12 +98,13 @@ def labelled(
     """
     dual, n_labels = _dual(points, cells, across, counts, weight), counts.shape[1]
     begin = _majority(dual)
-    labels = begin.copy()
+    labels, voxel = begin.copy(), float(dual.volume.sum() / counts.sum())
     least = (LEAST_SHARE * np.bincount(dual.row, dual.volume, n_labels)).astype(np.float64)
     _settle(dual, labels, least, False)
+    is_bridge = np.zeros(len(labels), dtype=bool)
     for _ in range(MENDING_ROUNDS):
-        moved = _without_fragments(dual, labels, counts, pieces)
-        moved += _mended(dual, labels, n_labels)
+        moved = _without_fragments(dual, labels, is_bridge, voxel, pieces)
+        moved += _mended(dual, labels, is_bridge, n_labels)
         moved += _settle(dual, labels, least, True)
         if moved == 0:
             break
@@ -327,22 +329,83 @@ def _is_opposite(cells: NDArray, other: int, k: int, cell: int, is_one: NDArray)
     return is_opposite
 
 
-def _without_fragments(dual: Dual, labels: NDArray[np.int64], counts: csr_array, pieces: list[NDArray]) -> int:
-    """Pieces of cells that no piece of voxels justifies go to their neighbours, cell by cell; how many cells did.
+def _without_fragments(
+    dual: Dual, labels: NDArray[np.int64], is_bridge: NDArray[np.bool_], voxel: float, pieces: list[NDArray]
+) -> int:
+    """Pieces of cells that no piece of voxels justifies are bridged or go; how many cells took another label.
 
-    The pieces of a label are ranked by the voxels of it that they hold. The first stays. A further one stays if there
-    is a piece of voxels of that rank, of which it holds `PIECE_SHARE`.
+    The pieces of a label are ranked by the voxels of it that they hold. The first stays, and each further one of whose
+    rank there is a piece of voxels, not far smaller. The others are linked to one of the same label, or are given to
+    their neighbours cell by cell, whatever puts fewer voxels into cells of another label.
     """
     number, of_piece = pieces_of(dual.across, labels)
     cell = np.repeat(np.arange(len(labels)), np.diff(dual.first))
-    content = np.bincount(number[cell], np.where(dual.row == labels[cell], dual.volume, 0.0), len(of_piece))
+    is_own = dual.row == labels[cell]
+    content = np.bincount(number[cell], np.where(is_own, dual.volume, 0.0), len(of_piece))
+    # What a cell would hold of the best other label: at most so much is lost if it goes.
+    others = np.maximum.reduceat(np.where(is_own, 0.0, dual.volume), dual.first[:-1])
+    price = content - np.bincount(number, others, len(of_piece))
     order = np.lexsort((np.arange(len(of_piece)), -content, of_piece))
     rank = np.empty(len(of_piece), dtype=np.int64)
     rank[order] = np.arange(len(of_piece)) - np.searchsorted(of_piece[order], of_piece[order])
-    voxel = dual.volume.sum() / counts.sum()
     ranked = zip(of_piece, rank, content, strict=True)
-    stays = [k == 0 or (k < len(pieces[p]) and c >= PIECE_SHARE * voxel * pieces[p][k]) for p, k, c in ranked]
-    return _give_away(dual, labels, ~np.array(stays)[number])
+    stays = [k == 0 or (k < len(pieces[p]) and voxel * pieces[p][k] >= PIECE_SHARE * c) for p, k, c in ranked]
+    is_loose, moved = ~np.array(stays)[number], 0
+    way, before, bridge = np.full(len(labels), np.inf), np.empty_like(labels), np.empty_like(labels)
+    for piece in order[~np.array(stays)[order]]:
+        if (labels[number == piece] != of_piece[piece]).any():  # another bridge goes over it
+            continue
+        count = _bridge(bridge, way, before, dual, labels, np.flatnonzero(number == piece), price[piece])
+        if count > 0:
+            labels[bridge[:count]] = of_piece[piece]
+            is_loose[bridge[:count]] = is_loose[number == piece] = False
+            is_bridge[bridge[:count]] = True
+            moved += count
+    return moved + _give_away(dual, labels, is_loose)
+
+
+@njit(cache=True, error_model="numpy")
+def _bridge(
+    bridge: NDArray, way: NDArray, before: NDArray, dual: Dual, labels: NDArray, piece: NDArray, most: float
+) -> int:
+    """The cells by which a piece is linked to another of its label at least cost, below `most`; how many there are.
+
+    Dijkstra's shortest path: a step costs what it costs that its cell has the label, all others as they are. `way` is
+    infinite before and after.
+    """
+    label, end, count = labels[piece[0]], -1, 0
+    heap = [(0.0, piece[0])]
+    for cell in piece:
+        way[cell], before[cell] = 0.0, -1
+        if cell != piece[0]:
+            heapq.heappush(heap, (0.0, cell))
+    done = [piece[0] for _ in range(0)]
+    while len(heap) > 0 and end < 0:
+        so_far, cell = heapq.heappop(heap)
+        if so_far > way[cell]:
+            continue
+        if labels[cell] == label and before[cell] >= 0:
+            end = cell
+            break
+        for k in range(dual.across.shape[1]):
+            other = dual.across[cell, k]
+            if other < 0:
+                continue
+            price = _price(dual, labels, other, label) - _price(dual, labels, other, labels[other])
+            there = so_far + (0.0 if labels[other] == label else max(price, LEAST_GAIN * dual.size[other]))
+            if there < way[other] and there < most:
+                way[other], before[other] = there, cell
+                done.append(other)
+                heapq.heappush(heap, (there, other))
+    while end >= 0 and before[before[end]] >= 0:
+        end = before[end]
+        bridge[count] = end
+        count += 1
+    for cell in done:
+        way[cell] = np.inf
+    for cell in piece:
+        way[cell] = np.inf
+    return count
 
 
 @njit(cache=True, error_model="numpy")
@@ -371,25 +434,42 @@ def _give_away(dual: Dual, labels: NDArray, is_loose: NDArray) -> int:
 # What is not manifold, at an edge (a, b) or a node (a, -1), and how it is mended.
 
 
-def _nonmanifold(dual: Dual, labels: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
-    """Edges (a, b) and nodes (a, -1) where a label's interface is not manifold, (F, 2), and where two labels meet."""
-    near = _mixed_nodes(dual, labels)
-    place = np.full(len(labels), -1, dtype=np.int64)
-    faces, number = np.empty((0, 2), dtype=np.int64), np.empty(0, dtype=np.int64)
-    n_faces = _find_nonmanifold(faces, number, dual, labels, near, place)
-    faces, number = np.empty((n_faces, 2), dtype=np.int64), np.empty(n_faces, dtype=np.int64)
-    _find_nonmanifold(faces, number, dual, labels, near, place)
-    return faces, number == 2
+class _Work(NamedTuple):
+    """Room for the kernels below."""
+
+    star: NDArray[np.int64]  # the cells around one node or edge
+    root: NDArray[np.int64]  # of each of them, in the fan that it is in
+    place: NDArray[np.int64]  # (M,) where a cell is in the star; -1 in between
+    seen: NDArray[np.int64]  # (N,) the last node of which a node was seen to be a neighbour
 
 
-def _mended(dual: Dual, labels: NDArray[np.int64], n_labels: int) -> int:
-    """What is not manifold is mended where that lowers the energy; how many cells took another label."""
+def _work(dual: Dual) -> _Work:
+    widest = int(np.diff(dual.ring_start).max())
+    place, seen = (np.full(len(array), -1, dtype=np.int64) for array in (dual.cells, dual.scale))
+    return _Work(np.empty(widest, dtype=np.int64), np.empty(widest + 1, dtype=np.int64), place, seen)
+
+
+def _nonmanifold(
+    dual: Dual, labels: NDArray[np.int64], is_near: NDArray[np.bool_] | None = None
+) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Edges (a, b) and nodes (a, -1) where a label's interface is not manifold, (F, 2), and where two labels meet.
+
+    All of them, or those with a node that is near.
+    """
+    # As many as there can be; pages that are not written to take no room.
+    faces = np.empty((len(dual.scale) + 6 * len(labels), 3), dtype=np.int64)
+    is_near = np.ones(len(dual.scale), dtype=bool) if is_near is None else is_near
+    faces = faces[: _find_nonmanifold(faces, dual, labels, is_near, _work(dual))].copy()
+    return faces[:, :2], faces[:, 2] == 2
+
+
+def _mended(dual: Dual, labels: NDArray[np.int64], is_bridge: NDArray[np.bool_], n_labels: int) -> int:
+    """What is not manifold is mended where that lowers the energy, bridges stay; how many cells took another label."""
     total, moved = 0, 1
-    n_of = np.bincount(labels, minlength=n_labels)
-    place = np.full(len(labels), -1, dtype=np.int64)
+    n_of, is_near = np.bincount(labels, minlength=n_labels), None
     while moved > 0:
-        faces, _ = _nonmanifold(dual, labels)
-        moved = _mend(dual, labels, n_of, faces, place)
+        faces, is_near = _nonmanifold(dual, labels, is_near)[0], np.zeros(len(dual.scale), dtype=bool)
+        moved = _mend(dual, labels, n_of, is_bridge, faces, is_near, _work(dual))
         total += moved
     return total
 
@@ -397,57 +477,38 @@ def _mended(dual: Dual, labels: NDArray[np.int64], n_labels: int) -> int:
 @njit(cache=True, error_model="numpy")
 def _mixed_nodes(dual: Dual, labels: NDArray) -> NDArray:
     """Whether cells of two labels meet at each node."""
-    is_mixed = np.zeros(len(dual.ring_start) - 1, dtype=np.bool_)
+    is_mixed = np.zeros(len(dual.scale), dtype=np.bool_)
     for node in range(len(is_mixed)):
-        for r in range(dual.ring_start[node] + 1, dual.ring_start[node + 1]):
-            if labels[dual.ring_cells[r]] != labels[dual.ring_cells[dual.ring_start[node]]]:
+        first, last = dual.ring_start[node], dual.ring_start[node + 1]
+        for r in range(first + 1, last):
+            if labels[dual.ring_cells[r]] != labels[dual.ring_cells[first]]:
                 is_mixed[node] = True
+                break
     return is_mixed
 
 
 @njit(cache=True, error_model="numpy")
-def _find_nonmanifold(
-    faces: NDArray, number: NDArray, dual: Dual, labels: NDArray, is_mixed: NDArray, place: NDArray
-) -> int:
-    """The rows of `_nonmanifold`, and the number of labels that meet there, as far as there is room; their count."""
-    count, star = 0, np.empty(_widest(dual), dtype=np.int64)
+def _find_nonmanifold(faces: NDArray, dual: Dual, labels: NDArray, is_near: NDArray, work: _Work) -> int:
+    """The rows of `_nonmanifold` and the number of labels that meet there, (F, 3); their count."""
+    count, is_mixed = 0, _mixed_nodes(dual, labels)
     for a in range(len(is_mixed)):
         if not is_mixed[a]:
             continue
-        excess, n_labels = _excess(dual, labels, a, -1, star, place)
+        excess, n_labels = _excess(dual, labels, a, -1, work) if is_near[a] else (0, 1)
         if excess > 0:
-            if count < len(faces):
-                faces[count, 0], faces[count, 1], number[count] = a, -1, n_labels
+            faces[count, 0], faces[count, 1], faces[count, 2] = a, -1, n_labels
             count += 1
-        for r in range(dual.ring_start[a], dual.ring_start[a + 1]):
-            for k in range(4 if dual.cells.shape[1] == 4 else 0):
+        for r in range(dual.ring_start[a], dual.ring_start[a + 1] if dual.cells.shape[1] == 4 else 0):
+            for k in range(4):
                 b = dual.cells[dual.ring_cells[r], k]
-                if b <= a or not is_mixed[b] or not _is_first(dual, a, r, b):
+                if b <= a or not is_mixed[b] or work.seen[b] == a or not (is_near[a] or is_near[b]):
                     continue
-                excess, n_labels = _excess(dual, labels, a, b, star, place)
+                work.seen[b] = a
+                excess, n_labels = _excess(dual, labels, a, b, work)
                 if excess > 0:
-                    if count < len(faces):
-                        faces[count, 0], faces[count, 1], number[count] = a, b, n_labels
+                    faces[count, 0], faces[count, 1], faces[count, 2] = a, b, n_labels
                     count += 1
     return count
-
-
-@njit(cache=True, error_model="numpy")
-def _is_first(dual: Dual, a: int, r: int, b: int) -> bool:
-    """Whether entry r of the ring of a is the first with b."""
-    is_first = True
-    for q in range(dual.ring_start[a], r):
-        is_first = is_first and not has_node(dual.cells, dual.ring_cells[q], b)
-    return is_first
-
-
-@njit(cache=True, error_model="numpy")
-def _widest(dual: Dual) -> int:
-    """The largest number of cells around a node."""
-    most = 0
-    for node in range(len(dual.ring_start) - 1):
-        most = max(most, dual.ring_start[node + 1] - dual.ring_start[node])
-    return most
 
 
 @njit(cache=True, error_model="numpy")
@@ -462,19 +523,18 @@ def _gather(dual: Dual, a: int, b: int, star: NDArray) -> int:
 
 
 @njit(cache=True, error_model="numpy")
-def _excess(dual: Dual, labels: NDArray, a: int, b: int, star: NDArray, place: NDArray) -> tuple:
+def _excess(dual: Dual, labels: NDArray, a: int, b: int, work: _Work) -> tuple:
     """How many fans too many there are around a node or an edge, over all labels there; and how many these are.
 
     For each label, the fans of its cells less one and those of all others, the outside among them, less one.
     """
-    count = _gather(dual, a, b, star)
-    is_mixed = False
+    count, is_mixed, star = _gather(dual, a, b, work.star), False, work.star
     for i in range(1, count):
         is_mixed = is_mixed or labels[star[i]] != labels[star[0]]
     if not is_mixed:
         return 0, 1
     for i in range(count):
-        place[star[i]] = i
+        work.place[star[i]] = i
     excess, n_labels = 0, 0
     for i in range(count):
         is_new = True
@@ -482,25 +542,25 @@ def _excess(dual: Dual, labels: NDArray, a: int, b: int, star: NDArray, place: N
             is_new = is_new and labels[star[j]] != labels[star[i]]
         if is_new:
             n_labels += 1
-            excess += _fans(dual, labels, a, b, star[:count], place, labels[star[i]]) - 2
+            excess += _fans(dual, labels, a, b, count, labels[star[i]], work) - 2
     for i in range(count):
-        place[star[i]] = -1
+        work.place[star[i]] = -1
     return excess, n_labels
 
 
 @njit(cache=True, error_model="numpy")
-def _fans(dual: Dual, labels: NDArray, a: int, b: int, star: NDArray, place: NDArray, label: int) -> int:
+def _fans(dual: Dual, labels: NDArray, a: int, b: int, count: int, label: int, work: _Work) -> int:
     """Fans of a label's cells in a star and of all others, the outside among them: linked by facets around it."""
-    count = len(star)
-    root = np.arange(count + 1)  # the last is the outside
-    n_fans, is_open = count, False
+    root, n_fans, is_open = work.root, count, False  # the last of the roots is the outside's
+    for i in range(count + 1):
+        root[i] = i
     for i in range(count):
-        cell = star[i]
+        cell = work.star[i]
         for k in range(dual.cells.shape[1]):
             if dual.cells[cell, k] == a or dual.cells[cell, k] == b:
                 continue
             other = dual.across[cell, k]
-            j = count if other < 0 else place[other]
+            j = count if other < 0 else work.place[other]
             is_open = is_open or other < 0
             if j < i or (labels[cell] == label) != (j < count and labels[other] == label):
                 continue
@@ -516,29 +576,35 @@ def _fans(dual: Dual, labels: NDArray, a: int, b: int, star: NDArray, place: NDA
 
 
 @njit(cache=True, error_model="numpy")
-def _mend(dual: Dual, labels: NDArray, n_of: NDArray, faces: NDArray, place: NDArray) -> int:
-    """Each face that is not manifold takes the move that lowers the energy with what is not manifold most."""
-    widest, total = _widest(dual), 0
-    star, around, group = np.empty(widest, np.int64), np.empty(widest, np.int64), np.empty(widest, np.int64)
+def _mend(
+    dual: Dual, labels: NDArray, n_of: NDArray, is_bridge: NDArray, faces: NDArray, is_near: NDArray, work: _Work
+) -> int:
+    """Each face that is not manifold takes the move that lowers the energy with what is not manifold most.
+
+    Nodes of cells that changed are marked in `is_near`.
+    """
+    total, star, group = 0, np.empty_like(work.star), np.empty_like(work.star)
     for f in range(len(faces)):
         a, b = faces[f, 0], faces[f, 1]
-        if _excess(dual, labels, a, b, star, place)[0] == 0:
+        if _excess(dual, labels, a, b, work)[0] == 0:
             continue
         count = _gather(dual, a, b, star)
         best, best_from, best_label = -LEAST_GAIN * dual.scale[a], -1, -1
         for i in range(2 * count):
             size = _group(dual, labels, a, b, star[:count], i, group)
-            if size == 0 or n_of[labels[group[0]]] <= size:
+            if size == 0 or n_of[labels[group[0]]] <= size or is_bridge[group[:size]].any():
                 continue
-            new, change = _best_of_group(dual, labels, group[:size], star[:count], around, place)
+            new, change = _best_of_group(dual, labels, group[:size], star[:count], work)
             if change < best:
                 best, best_from, best_label = change, i, new
         if best_from >= 0:
             size = _group(dual, labels, a, b, star[:count], best_from, group)
             n_of[labels[group[0]]] -= size
             n_of[best_label] += size
-            for i in range(size):
-                labels[group[i]] = best_label
+            for cell in group[:size]:
+                labels[cell] = best_label
+                for k in range(dual.cells.shape[1]):
+                    is_near[dual.cells[cell, k]] = True
             total += size
     return total
 
@@ -570,13 +636,10 @@ def _group(dual: Dual, labels: NDArray, a: int, b: int, star: NDArray, i: int, g
 
 
 @njit(cache=True, error_model="numpy")
-def _best_of_group(
-    dual: Dual, labels: NDArray, group: NDArray, star: NDArray, around: NDArray, place: NDArray
-) -> tuple:
+def _best_of_group(dual: Dual, labels: NDArray, group: NDArray, star: NDArray, work: _Work) -> tuple:
     """The label in the star that lowers the energy most if all cells of the group take it, and by how much."""
     old, best, least = labels[group[0]], -1, np.inf
-    faces = _closure(dual, group)
-    before = _local_energy(dual, labels, group, faces, around, place)
+    faces, before = np.empty((0, 2), dtype=np.int64), 0.0
     for j in range(len(star)):
         new = labels[star[j]]
         is_new = new != old and _touches(dual, labels, group, new)
@@ -584,9 +647,12 @@ def _best_of_group(
             is_new = is_new and labels[star[i]] != new
         if not is_new:
             continue
+        if len(faces) == 0:
+            faces = _closure(dual, group)
+            before = _local_energy(dual, labels, group, faces, work)
         for cell in group:
             labels[cell] = new
-        change = _local_energy(dual, labels, group, faces, around, place) - before
+        change = _local_energy(dual, labels, group, faces, work) - before
         for cell in group:
             labels[cell] = old
         if change < least:
@@ -624,13 +690,13 @@ def _closure(dual: Dual, group: NDArray) -> NDArray:
 
 
 @njit(cache=True, error_model="numpy")
-def _local_energy(dual: Dual, labels: NDArray, group: NDArray, faces: NDArray, star: NDArray, place: NDArray) -> float:
+def _local_energy(dual: Dual, labels: NDArray, group: NDArray, faces: NDArray, work: _Work) -> float:
     """The part of the energy that a group of cells of one label decides, with what is not manifold around them."""
     energy = 0.0
     for cell in group:
         energy += _price(dual, labels, cell, labels[cell])
     for f in range(len(faces)):
-        excess, n_labels = _excess(dual, labels, faces[f, 0], faces[f, 1], star, place)
+        excess, n_labels = _excess(dual, labels, faces[f, 0], faces[f, 1], work)
         if excess > 0:
             weight = TWO_LABELS_WEIGHT if n_labels == 2 else MORE_LABELS_WEIGHT
             energy += weight * excess * dual.scale[faces[f, 0]]
