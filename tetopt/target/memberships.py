@@ -27,7 +27,7 @@ THIN_REACH = 4.0, 7.0  # voxels from the middle to the surface of what is thin f
 VOLUME_SIGMA, VOLUME_BLOCK = 5.0, 4  # volumes are kept in a Gaussian of so many voxels, summed over such blocks
 NEAR_SURFACE = 0.05, 0.95  # distance from the surface of a voxel beside it: less than 1, and its centre keeps its label
 MOST_LIFTED = 1.0  # voxels by which smoothing changes levels further off: what distances to voxels can be wrong by
-THIN_SHARE = 0.5  # of these bounds where a label, or a gap in it, is one or two voxels thick
+LEAST_SLOPE = 0.3  # of a level that volumes are measured with; flatter ones are those of sheets of a voxel
 FLOW_STEPS = 4  # more do not bring spheres of 3 to 20 voxels, or shells of 2 to 6, any nearer to the true ones
 ABSENT_DISTANCE = 1e4  # voxels to what is not in a slice at all
 
@@ -97,12 +97,12 @@ def memberships(labels: Image, factors: Sequence[int] | None = None) -> Membersh
     assert all(factor % 2 == 1 for factor in factors), f"factors: expected odd numbers, got {factors}"
     values = np.flatnonzero(np.bincount(labels.data.astype(np.int64).ravel()))
     raw = start = np.searchsorted(values, labels.data).reshape(labels.shape)
-    off: NDArray = np.zeros((1,) * labels.ndim)
+    off = np.zeros((1,) * labels.ndim, dtype=np.float32)
     for axis, factor in enumerate(factors):
         raw = np.repeat(raw, factor, axis)
         if factor > 1:
             start = _between_slices(start, axis, factors)
-            along = np.abs(np.arange(start.shape[axis]) % factor - factor // 2)
+            along = np.abs(np.arange(start.shape[axis], dtype=np.float32) % factor - factor // 2)
             off = np.maximum(off, along.reshape((-1,) + (1,) * (labels.ndim - 1 - axis)))
     off = np.broadcast_to(off, start.shape)
     channel = label_channels(start, len(values))
@@ -142,14 +142,14 @@ def _level(inside: NDArray[np.bool_], raw: NDArray[np.bool_], off: NDArray) -> N
         Voxels of the label; between slices by shape.
     raw : (*shape) bool
         The same, with the label of the slice that each voxel is of: its volume is kept.
-    off : (*shape) int
+    off : (*shape) float32
         How many voxels each is away from the plane of a slice.
     """
     if inside.all():
         return np.full(inside.shape, -FARTHEST_LEVEL, dtype=np.float32)
     within, without = _distance(inside), _distance(~inside)
     level = np.where(inside, 0.5 - within, without - 0.5)
-    low, high = _bounds(level, np.minimum(maximum_filter(within, 7), maximum_filter(without, 7)), off)
+    low, high = _bounds(level, off)
     thin, broad = THIN_REACH
     reach = np.minimum(maximum_filter(within, 13), maximum_filter(without, 13))
     share = np.clip((reach - thin) / (broad - thin), 0.0, 1.0)
@@ -166,17 +166,12 @@ def _distance(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
     return np.minimum(distance_transform_edt(inside), FARTHEST_DISTANCE).astype(np.float32)
 
 
-def _bounds(
-    raw: NDArray[np.float32], room: NDArray[np.float32], off: NDArray
-) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-    """The least and the largest level of each voxel; `room` is 1 where label or gap are one or two voxels thick."""
-    size = np.abs(raw)
-    is_beside = size <= 0.5
-    share = np.where(size < 1.5, np.clip(room - 1.0, THIN_SHARE, 1.0), 1.0)
-    least = size + share * np.where(is_beside, NEAR_SURFACE[0] - 0.5, -MOST_LIFTED)
-    least = np.maximum(least, NEAR_SURFACE[0]) - off
-    most = size + share * np.where(is_beside, NEAR_SURFACE[1] - 0.5, MOST_LIFTED) + off
-    inside = raw < 0.0
+def _bounds(raw: NDArray[np.float32], off: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+    """The least and the largest level of each voxel."""
+    inside, size = raw < 0.0, np.abs(raw)
+    least = np.maximum(size - MOST_LIFTED, NEAR_SURFACE[0])
+    most = np.where(size <= 0.5, NEAR_SURFACE[1], size + MOST_LIFTED)
+    least, most = least - off, most + off
     return np.where(inside, -most, least).astype(np.float32), np.where(inside, -least, most).astype(np.float32)
 
 
@@ -190,11 +185,22 @@ def _with_volume(level: NDArray[np.float32], raw: NDArray[np.bool_]) -> NDArray[
     mean = level  # over each voxel, of the level that is linear between centres
     for axis in range(level.ndim):
         mean = correlate1d(mean, [0.125, 0.75, 0.125], axis, mode="nearest")
-    missing = _summed(raw - np.clip(0.5 - mean, 0.0, 1.0))
-    area = _summed((np.abs(mean) < 0.5).astype(np.float32))
+    distance = mean / np.clip(_slope(level), LEAST_SLOPE, 1.0)
+    missing = _summed(raw - np.clip(0.5 - distance, 0.0, 1.0))
+    area = _summed((np.abs(distance) < 0.5).astype(np.float32))
     lowered = np.where(area > 0.01 * VOLUME_BLOCK**level.ndim, missing / np.maximum(area, 1e-3), 0.0)
     spread = _spread(lowered, (VOLUME_BLOCK,) * level.ndim)
     return level - spread[tuple(slice(n) for n in level.shape)].astype(np.float32)
+
+
+def _slope(level: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Of the gradient, with the larger difference along each axis; across a thin sheet those of both sides cancel."""
+    square = np.zeros_like(level)
+    for axis in range(level.ndim):
+        step = np.abs(np.diff(level, axis=axis, prepend=level.take([0], axis), append=level.take([-1], axis)))
+        before, after = (step.take(range(k, k + level.shape[axis]), axis) for k in (0, 1))
+        square += np.maximum(before, after) ** 2
+    return np.sqrt(square)
 
 
 def _summed(values: NDArray[np.float32]) -> NDArray[np.float32]:
