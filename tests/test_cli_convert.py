@@ -551,12 +551,19 @@ def test_the_surface_of_a_structure(folder, tmp_path, what, suffix, capsys):
 @pytest.mark.parametrize(
     ("more", "match"),
     [
-        ([], "one of --below, --label and --set"),
-        (["--below", "3", "--label", "1"], "one of --below, --label and --set"),
+        ([], "one of --below, --label, --set, --boundary, --interface"),
+        (["--below", "3", "--label", "1"], "one of --below, --label, --set, --boundary, --interface"),
         (["--below", "-3"], "no cell has a mean below -3"),
         (["--label", "7"], "no cell has label 7; there are 0, 1"),
         (["--set", "skin"], 'no set of cells "skin"; it has label_0, label_1'),
         (["--label", "1", "--space", "x"], "expected ras or lps"),
+        (["--interface", "0,1", "--boundary"], "give one of --below"),
+        (["--interfaces"], "STL cannot tell which labels a triangle lies between; take .ply or .vtp or .vtk"),
+        (["--interface", "0"], 'two labels as J,K, by number or name, got "0"'),
+        (["--interface", "0,1,2"], "two labels as J,K"),
+        (["--interface", "1,1"], 'two different labels, got "1,1"'),
+        (["--interface", "0,7"], "no facet lies between labels 0 and 7"),
+        (["--interface", "0,liver"], "no label has a name"),
     ],
 )
 def test_surfaces_that_are_refused(folder, tmp_path, more, match, capsys):
@@ -567,11 +574,11 @@ def test_surfaces_that_are_refused(folder, tmp_path, more, match, capsys):
 
 def test_a_field_that_is_not_there(folder, tmp_path, capsys):
     tetopt.save_mesh(tmp_path / "bare.vtu", tetopt.load_mesh(folder / "a.vtu").mesh)
-    for more in (["--below", "3"], ["--label", "1"]):
+    for more in (["--below", "3"], ["--label", "1"], ["--interface", "0,1"]):
         assert exit_code("surface", tmp_path / "bare.vtu", "-o", tmp_path / "s.stl", *more) == 2
         assert "on its cells; it has nothing" in capsys.readouterr().err
     assert exit_code("surface", folder / "a.vtu", "-o", tmp_path / "s.obj", "--label", "1") == 2
-    assert "ends in .stl or .ply" in capsys.readouterr().err
+    assert "ends in .stl or .ply or .vtp or .vtk" in capsys.readouterr().err
 
 
 # Looking

@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+import pyvista
+import trimesh
 from commands import exit_code, numbers_in
 
 import tetopt
@@ -62,3 +64,104 @@ def test_a_mask_that_is_a_manifold_excuses_nothing(touching):
     tetopt.save_image(touching / "mask.nii.gz", tetopt.Image(mask))
     beside = ["--image", touching / "labels.nii.gz", "--mask", touching / "mask.nii.gz"]
     assert exit_code("quality", touching / "ones.vtu", "--check", *beside) == 1
+
+
+# Surfaces
+
+
+@pytest.fixture
+def slabs(tmp_path):
+    """Slabs of labels 1, 2, 4 and 1 again, each 4 x 3 voxels wide and one or two thick, 2 mm a voxel."""
+    labels = np.zeros((4, 3, 6))
+    labels[:] = [1, 1, 2, 4, 4, 1]
+    mesh = tetopt.lattice(tetopt.Image(labels, np.diag([2.0, 2.0, 2.0, 1.0])), "five-tet", blocks=(4, 3, 6))
+    of_cell = cell_labels(tetopt.Image(labels, np.diag([2.0, 2.0, 2.0, 1.0])), mesh)
+    tetopt.save_mesh(tmp_path / "slabs.vtu", mesh, {"label": of_cell})
+    (tmp_path / "names.csv").write_text("label,name\n2,bone\n4,left lung\n")
+    return tmp_path
+
+
+SLAB = 4 * 3 * 4.0  # mm2
+
+
+def labels_in(path):
+    """Places of the corners, labels inside and outside of each triangle, by readers that share no code with ours."""
+    if path.suffix == ".ply":
+        read = trimesh.load_mesh(path, process=False)
+        corners = read.vertices[read.faces]
+        sides = [read.metadata["_ply_raw"]["face"]["data"][f"label_{side}"] for side in ("inside", "outside")]
+        assert pyvista.read(path).n_cells == len(corners)  # by the class of VTK that 3D Slicer takes
+    else:
+        read = pyvista.read(path)
+        corners = np.asarray(read.points)[read.regular_faces]
+        sides = [np.asarray(read.cell_data[f"label_{side}"]) for side in ("inside", "outside")]
+    return corners, np.column_stack(sides)
+
+
+@pytest.mark.parametrize("suffix", [".ply", ".vtp", ".vtk"])
+@pytest.mark.parametrize("has_boundary", [False, True])
+def test_all_interfaces_with_the_labels_of_both_sides(slabs, suffix, has_boundary, capsys):
+    """Each lies in its plane, in its area, and faces out of its smaller label; so does the boundary."""
+    out, more = slabs / f"all{suffix}", ["--boundary"] * has_boundary
+    command = ["surface", slabs / "slabs.vtu", "--interfaces", *more, "-o", out, "--json", slabs / "a.json"]
+    assert exit_code(*command, "--label-names", slabs / "names.csv") == 0
+    corners, sides = labels_in(out)
+    normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2.0
+    for (inside, outside), z, up in (((1, 2), 3.0, 1), ((2, 4), 5.0, 1), ((1, 4), 9.0, -1)):
+        mine = (sides == (inside, outside)).all(axis=1)
+        np.testing.assert_allclose(corners[mine][..., 2], z)
+        np.testing.assert_allclose(normals[mine].sum(axis=0), [0.0, 0.0, up * SLAB])
+    outer = sides[:, 1] == -1
+    assert set(sides[outer, 0]) == ({1, 2, 4} if has_boundary else set())
+    centre = np.array([3.0, 2.0, 5.0])
+    assert ((normals[outer] * (corners[outer].mean(axis=1) - centre)).sum(axis=1) > 0.0).all()
+    assert np.linalg.norm(normals[outer], axis=1).sum() == pytest.approx(
+        (2 * 12 + 2 * 24 + 2 * 18) * 4.0 * has_boundary
+    )
+    assert (sides[:, 0] != sides[:, 1]).all()
+
+    numbers = numbers_in(slabs / "a.json")
+    rows = {(row["label_inside"], row["label_outside"]): row["area_mm2"] for row in numbers["interfaces"]}
+    assert rows[1, 2] == rows[2, 4] == rows[1, 4] == pytest.approx(SLAB)
+    assert set(rows) == {(1, 2), (1, 4), (2, 4)} | ({(1, -1), (2, -1), (4, -1)} if has_boundary else set())
+    assert numbers["n_triangles"] == len(corners)
+    # Around each interface its rim: 14 edges of voxels, to which the boundary adds two triangles.
+    edges = (0, 3 * 14) if has_boundary else (3 * 14, 0)
+    assert (numbers["n_rim_edges"], numbers["n_seam_edges"]) == edges
+    said = capsys.readouterr().out
+    assert "2 (bone) to 4 (left lung)" in said
+    assert ("2 (bone) to outside" in said) == has_boundary
+
+
+@pytest.mark.parametrize("suffix", [".stl", ".ply", ".vtp", ".vtk"])
+def test_one_interface(slabs, suffix):
+    """Out of the label that is named first, by number or name."""
+    for sides, up in (("2,4", 1.0), ("left lung,bone", -1.0)):
+        out = slabs / f"one{suffix}"
+        command = ["surface", slabs / "slabs.vtu", "--interface", sides, "-o", out, "--force"]
+        assert exit_code(*command, "--label-names", slabs / "names.csv") == 0
+        surface = pyvista.read(out)
+        corners = np.asarray(surface.points, dtype=np.float64)[surface.regular_faces]
+        normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2.0
+        np.testing.assert_allclose(normals.sum(axis=0), [0.0, 0.0, up * SLAB], atol=1e-5)
+        np.testing.assert_allclose(corners[..., 2], 5.0)
+
+
+@pytest.mark.parametrize("suffix", [".stl", ".ply", ".vtp", ".vtk"])
+def test_the_whole_boundary(slabs, suffix, capsys):
+    out = slabs / f"b{suffix}"
+    assert exit_code("surface", slabs / "slabs.vtu", "--boundary", "-o", out) == 0
+    assert "watertight, normals out" in capsys.readouterr().out
+    surface = pyvista.read(out)
+    assert surface.volume == pytest.approx(4 * 3 * 6 * 8.0)
+    closed = trimesh.Trimesh(surface.points, surface.regular_faces)
+    assert closed.is_watertight
+    assert closed.area == pytest.approx(108 * 4.0)
+
+
+def test_one_label_has_no_interfaces(slabs, capsys):
+    mesh = tetopt.load_mesh(slabs / "slabs.vtu").mesh
+    tetopt.save_mesh(slabs / "one.vtu", mesh, {"label": np.ones(len(mesh.cells), dtype=int)})
+    assert exit_code("surface", slabs / "one.vtu", "--interfaces", "-o", slabs / "x.ply") == 2
+    assert "all cells have one label, which has no interfaces" in capsys.readouterr().err
+    assert not (slabs / "x.ply").exists()

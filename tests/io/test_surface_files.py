@@ -1,9 +1,10 @@
-"""Surfaces through STL and PLY files: closed for a reader that welds by place, every bit in PLY, RAS in the header."""
+"""Surfaces through files: closed for a reader that welds by place, every bit but in STL, RAS in the header."""
 
 from pathlib import Path
 
 import numpy as np
 import pytest
+import pyvista
 import trimesh
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
@@ -25,7 +26,7 @@ EDGE = (
     np.array([[0, 0, 0], [0, 0, 1], [1, 0, 0], [1, 1, 0], [-1, 0, 0], [-1, -1, 0]]) + np.array([150.1, -230.2, 310.3]),
     np.array([[0, 2, 3, 1], [0, 4, 5, 1]]),
 )
-SUFFIXES = pytest.mark.parametrize("suffix", [".stl", ".ply", ".STL"])
+SUFFIXES = pytest.mark.parametrize("suffix", [".stl", ".ply", ".STL", ".vtp", ".vtk"])
 
 
 def some_surface(seed, share=0.5):
@@ -48,9 +49,9 @@ def test_any_surface_is_closed_when_read_back(tmp_path, suffix, seed, share):
     assert check[:2] == (True, True)
     assert check.n_pieces == n_pieces(surface)
     # STL's float32 moves a node by 1.5e-5 mm in each direction at 400 mm.
-    places = 3e-5 * area if suffix != ".ply" else 1e-9
+    places = 3e-5 * area if suffix.lower() == ".stl" else 1e-9
     assert check.volume == pytest.approx(volume, abs=places)
-    assert check.area == pytest.approx(area, rel=1e-4 if suffix != ".ply" else 1e-9)
+    assert check.area == pytest.approx(area, rel=1e-4 if suffix.lower() == ".stl" else 1e-9)
     assert check.volume == pytest.approx(expected, abs=1.01 * surface.largest_shift * area + places)
     assert check.volume > 0.0
 
@@ -120,6 +121,29 @@ def test_the_header_says_ras_where_slicer_looks(tmp_path):
     assert [comments.GetValue(k) for k in range(comments.GetNumberOfValues())] == ["SPACE=RAS", f"tetopt; mm; {said}"]
 
 
+@pytest.mark.parametrize("space", ["ras", "lps"])
+def test_vtk_files_say_their_space_and_hold_every_bit(tmp_path, space):
+    """Where Slicer looks: in the head of a VTK file, in a text SPACE of a VTP file."""
+    surface, _ = some_surface(5)
+    labels = {"label_inside": np.arange(len(surface.triangles)), "label_outside": np.full(len(surface.triangles), -1)}
+    for suffix in (".vtp", ".vtk"):
+        save_surface(tmp_path / f"a{suffix}", surface, "solid.nii\nmean " + "x" * 300, space, labels)
+        back = pyvista.read(tmp_path / f"a{suffix}")
+        sign = np.array([1.0, 1.0, 1.0]) if space == "ras" else np.array([-1.0, -1.0, 1.0])
+        assert np.asarray(back.points).tobytes() == (surface.points * sign).tobytes()
+        np.testing.assert_array_equal(back.regular_faces, surface.triangles)
+        for name, values in labels.items():
+            np.testing.assert_array_equal(back.cell_data[name], values)
+    assert (tmp_path / "a.vtk").read_bytes().splitlines()[1].startswith(f"tetopt, mm, SPACE={space.upper()} ".encode())
+    assert list(pyvista.read(tmp_path / "a.vtp").field_data["SPACE"]) == [space.upper()]
+
+
+def test_stl_has_no_room_for_labels(tmp_path):
+    with pytest.raises(InputError, match=r"STL holds no labels of triangles; take \.ply or \.vtp or \.vtk"):
+        save_surface(tmp_path / "a.stl", surface_of(*CUBE_CORNER, [0]), labels={"label": np.zeros(4, dtype=int)})
+    assert list(tmp_path.iterdir()) == []
+
+
 def test_whole_or_not_at_all(tmp_path, monkeypatch):
     (tmp_path / "a.stl").write_text("before")
 
@@ -135,7 +159,7 @@ def test_whole_or_not_at_all(tmp_path, monkeypatch):
 
 
 def test_one_line_for_every_bad_file(tmp_path):
-    with pytest.raises(InputError, match=r"a\.obj: expected a surface named \.stl or \.ply"):
+    with pytest.raises(InputError, match=r"a\.obj: expected a surface named \.stl or \.ply or \.vtp or \.vtk"):
         save_surface(tmp_path / "a.obj", surface_of(*CUBE_CORNER, [0]))
     with pytest.raises(InputError, match="no such surface file"):
         checked_surface(tmp_path / "none.stl")

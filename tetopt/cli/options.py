@@ -110,6 +110,28 @@ class NumberOptions:
 
 
 @dataclass(frozen=True, kw_only=True)
+class SurfacePart:
+    """Which surface `tetopt surface` writes, and how its points are."""
+
+    below: Annotated[float | None, option("T", "Of the largest connected set of cells with a mean below T.")] = None
+    label: Annotated[str | None, option("L", "Of all cells with this label, by number or name.")] = None
+    cell_set: Annotated[str | None, option("NAME", "Of a named set of cells.", "--set")] = None
+    boundary: Annotated[
+        bool, typer.Option("--boundary", help="Of the whole mesh; with --interfaces, the boundary as well as these.")
+    ] = False
+    interface: Annotated[str | None, option("J,K", "What lies between two labels, out of J; it may be open.")] = None
+    interfaces: Annotated[
+        bool,
+        typer.Option(
+            "--interfaces",
+            help="All interfaces of labels as one surface, each triangle with the labels on its two sides.",
+        ),
+    ] = False
+    space: SpaceOption = "ras"
+    label_names: LabelNamesOption = None
+
+
+@dataclass(frozen=True, kw_only=True)
 class SourceOptions:
     """What `tetopt mesh` meshes."""
 

@@ -1,23 +1,33 @@
-"""Triangle surfaces as STL and PLY files."""
+"""Triangle surfaces as STL, PLY, and VTK's VTP and VTK files; all but STL hold whole numbers of each triangle."""
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import pyvista
+from numpy.typing import NDArray
+from vtkmodules.vtkIOLegacy import vtkPolyDataWriter
+from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
 from tetopt.errors import InputError
 from tetopt.geometry.surface import Surface, surface_of
 from tetopt.io.files import written_whole
+from tetopt.io.vtk import LEGACY_VERSION
 from tetopt.model.model import Model, half_turn
 
-SURFACE_SUFFIXES = (".stl", ".ply")
+SURFACE_SUFFIXES = (".stl", ".ply", ".vtp", ".vtk")
+LABELLED_SUFFIXES = SURFACE_SUFFIXES[1:]  # that hold labels of triangles
 
-# 3D Slicer looks for this in an STL file's header and in each comment of a PLY file, and takes points for LPS, x and y
-# negated, where it finds nothing: Slicer/Slicer, Libs/MRML/Core/vtkMRMLModelStorageNode.cxx,
-# GetCoordinateSystemFromFileHeader; https://discourse.slicer.org/t/10446.
+# 3D Slicer looks for this in an STL or VTK file's header and in each comment of a PLY file, or for a text of this name
+# in a VTP file, and takes points for LPS, x and y negated, where it finds nothing: Slicer/Slicer,
+# Libs/MRML/Core/vtkMRMLModelStorageNode.cxx, GetCoordinateSystemFromFileHeader and ...FromFieldData;
+# https://discourse.slicer.org/t/10446.
 SPACE_KEY = "SPACE="
+
+Labels = Mapping[str, NDArray[np.integer]]  # by name, one number of 32 bits for each triangle
 
 STL_TRIANGLE = np.dtype([("normal", "<f4", 3), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
 PLY_FACE = np.dtype([("count", "u1"), ("nodes", "<i4", 3)])
@@ -33,38 +43,44 @@ class SurfaceCheck(NamedTuple):
     n_pieces: int  # closed surfaces that are not connected; a cavity's wall counts as one
 
 
-def save_surface(path: str | Path, surface: Surface, about: str = "", space: str = "ras") -> None:
-    """Write a binary STL or PLY file, by the name's suffix, whole or not at all.
+def save_surface(
+    path: str | Path, surface: Surface, about: str = "", space: str = "ras", labels: Labels | None = None
+) -> None:
+    """Write a binary STL, PLY, VTP or VTK file, by the name's suffix, whole or not at all.
 
     World coordinates in mm; with `space` "lps", x and y change sign. The header says which in the words that 3D
-    Slicer looks for; then `about`, in one line of ASCII, of which STL keeps the first 60 characters. PLY holds every
-    bit of the points and their order; STL rounds to float32. Replaces an existing file; ask
+    Slicer looks for; then `about`, in one line of ASCII, of which STL keeps the first 60 characters, and VTP nothing.
+    All but STL, which rounds to float32, hold every bit of the points and their order. Replaces an existing file; ask
     `tetopt.io.files.checked_output` first.
+
+    `labels` are whole numbers of the triangles, (T,) each, by name: properties of the faces in PLY, cell data in VTK's.
 
     Raises
     ------
     InputError
-        Another suffix.
+        Another suffix, or labels in an STL file, which has no room for them.
     """
     path = Path(path)
-    writers = {".stl": _stl, ".ply": _ply}
+    writers = {".stl": _stl, ".ply": _ply, ".vtp": _vtp, ".vtk": _vtk}
     if path.suffix.lower() not in writers:
         raise InputError(f"{path}: expected a surface named {' or '.join(SURFACE_SUFFIXES)}")
+    if labels and path.suffix.lower() not in LABELLED_SUFFIXES:
+        raise InputError(f"{path}: STL holds no labels of triangles; take {' or '.join(LABELLED_SUFFIXES)}")
     if space == "lps":
         surface = surface._replace(points=half_turn(surface.points))
-    whole = writers[path.suffix.lower()](surface, about, space)
+    whole = writers[path.suffix.lower()](surface, about, space, labels or {})
     with written_whole(path) as temporary:
         temporary.write_bytes(whole)
 
 
 def boundary_stl(model: Model) -> bytes:
     """The model's boundary, watertight, as the bytes of an STL file; nothing else of the model is in it."""
-    return _stl(*_boundary(model))
+    return _stl(*_boundary(model), {})
 
 
 def boundary_ply(model: Model) -> bytes:
     """The model's boundary, watertight, as the bytes of a PLY file; nothing else of the model is in it."""
-    return _ply(*_boundary(model))
+    return _ply(*_boundary(model), {})
 
 
 def _boundary(model: Model) -> tuple[Surface, str, str]:
@@ -76,7 +92,9 @@ def _boundary(model: Model) -> tuple[Surface, str, str]:
 
 
 def checked_surface(path: str | Path) -> SurfaceCheck:
-    """Read a surface file with trimesh, which welds nodes of the same place, and look whether it is closed.
+    """Read a surface file, have trimesh weld nodes of the same place, and look whether it is closed.
+
+    STL and PLY are read by trimesh as well, the others by VTK.
 
     Raises
     ------
@@ -88,7 +106,7 @@ def checked_surface(path: str | Path) -> SurfaceCheck:
     if not Path(path).is_file():
         raise InputError(f"{path}: no such surface file")
     try:
-        surface = trimesh.load_mesh(path)
+        surface = _from_vtk(path) if Path(path).suffix.lower() in (".vtp", ".vtk") else trimesh.load_mesh(path)
         n_triangles = len(surface.faces)
     except Exception as error:  # trimesh raises whatever it pleases on damaged files
         raise InputError(f"{path}: cannot be read as a surface ({type(error).__name__}); damaged?") from error
@@ -103,12 +121,20 @@ def checked_surface(path: str | Path) -> SurfaceCheck:
     )
 
 
+def _from_vtk(path: str | Path) -> Any:
+    """The triangles of one of VTK's files as trimesh has them."""
+    import trimesh
+
+    grid = pyvista.read(path)
+    return trimesh.Trimesh(np.asarray(grid.points, dtype=np.float64), grid.regular_faces)
+
+
 def _plain(about: str) -> str:
     """One line of ASCII."""
     return " ".join(about.encode("ascii", "replace").decode().split())
 
 
-def _stl(surface: Surface, about: str, space: str) -> bytes:
+def _stl(surface: Surface, about: str, space: str, labels: Labels) -> bytes:
     # A binary file must not begin with "solid", by which some readers know a file of text.
     header = f"tetopt {SPACE_KEY}{space.upper()} mm {_plain(about)}".encode()[:80].ljust(80)
     triangles = np.zeros(len(surface.triangles), dtype=STL_TRIANGLE)
@@ -119,7 +145,7 @@ def _stl(surface: Surface, about: str, space: str) -> bytes:
     return header + np.uint32(len(triangles)).astype("<u4").tobytes() + triangles.tobytes()
 
 
-def _ply(surface: Surface, about: str, space: str) -> bytes:
+def _ply(surface: Surface, about: str, space: str, labels: Labels) -> bytes:
     header = [
         "ply",
         "format binary_little_endian 1.0",
@@ -129,8 +155,41 @@ def _ply(surface: Surface, about: str, space: str) -> bytes:
         *(f"property double {axis}" for axis in "xyz"),
         f"element face {len(surface.triangles)}",
         "property list uchar int vertex_indices",
+        *(f"property int {name}" for name in labels),
         "end_header\n",
     ]
-    faces = np.empty(len(surface.triangles), dtype=PLY_FACE)
+    faces = np.empty(len(surface.triangles), dtype=[*PLY_FACE.descr, *((name, "<i4") for name in labels)])
     faces["count"], faces["nodes"] = 3, surface.triangles
+    for name, values in labels.items():
+        faces[name] = values
     return "\n".join(header).encode() + surface.points.astype("<f8").tobytes() + faces.tobytes()
+
+
+def _vtp(surface: Surface, about: str, space: str, labels: Labels) -> bytes:
+    grid = _grid(surface, labels)
+    grid.field_data[SPACE_KEY.rstrip("=")] = [space.upper()]
+    writer = vtkXMLPolyDataWriter()
+    writer.SetDataModeToBinary()
+    writer.SetInputData(grid)
+    writer.WriteToOutputStringOn()
+    writer.Write()
+    return writer.GetOutputString().encode()
+
+
+def _vtk(surface: Surface, about: str, space: str, labels: Labels) -> bytes:
+    writer = vtkPolyDataWriter()
+    writer.SetHeader(f"tetopt, mm, {SPACE_KEY}{space.upper()} {_plain(about)}"[:250])  # a line of 256 characters
+    writer.SetFileVersion(LEGACY_VERSION)
+    writer.SetFileTypeToBinary()
+    writer.SetInputData(_grid(surface, labels))
+    writer.WriteToOutputStringOn()
+    writer.Write()
+    text = writer.GetOutputStdString()  # bytes, if they are no text
+    return text if isinstance(text, bytes) else text.encode()
+
+
+def _grid(surface: Surface, labels: Labels) -> pyvista.PolyData:
+    grid = pyvista.PolyData.from_regular_faces(surface.points, surface.triangles)
+    for name, values in labels.items():
+        grid.cell_data[name] = np.asarray(values, dtype=np.int32)
+    return grid
