@@ -269,6 +269,12 @@ const run = async () => {
   said.none = await labels();
   press("label-all", "all");
   said.again = await labels();
+  press("axis", 2); put("at-number", AT_2);
+  said.lines = [];
+  for (const lines of ["cells", "labels"]) {
+    press("lines", lines);
+    said.lines.push(Number(canvas.dataset.lines), (await labels())[5]);
+  }
   return said;
 };
 addEventListener("load", () => setTimeout(async () => {
@@ -572,6 +578,16 @@ def test_labels_are_shown_by_name(shown, mesh, cell_data):
         assert row[4] == ([names[k] for k in labels] if row is not rows[0] else [])
     assert rows[0][3] == "mean (intensity)"
     assert {row[3] for row in rows[1:]} == {"label"}  # the choice colours the cells, too
+    n_lines, picture, n_of_labels, picture_of_labels = page["lines"]
+    height = mesh.points[:, 2] - middle_of(mesh)[2] - AT[1]
+    is_above = height[mesh.cells] >= 0.0
+    is_cut = np.array([np.ptp(np.delete(is_above, k, axis=1).astype(int), axis=1) for k in range(4)]).T > 0
+    of_side = sides.cells[sides.of_cell]
+    other = np.where(of_side[..., 0] == np.arange(len(label))[:, None], of_side[..., 1], of_side[..., 0])
+    is_border = (other < 0) | (label[other] != label[:, None])
+    assert (n_lines, n_of_labels) == (is_cut.sum(), (is_cut & is_border).sum())
+    assert n_of_labels < n_lines
+    assert picture != picture_of_labels
     pictures = [row[5] for row in rows[:5]]
     assert len(set(pictures)) == 5  # the glass, too, is seen
 

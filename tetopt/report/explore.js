@@ -59,7 +59,7 @@ function explore(gl, data, notes) {
 
   const state = {
     field: 0, by: 0, low: fields[0].min, high: fields[0].max, axis: data.axis, at: 0, isTurned: false, isWhole: false,
-    inside: "cells", share: 0.35, set: -1, picked: -1, warp: firstWarp,
+    inside: "cells", share: 0.35, set: -1, picked: -1, warp: firstWarp, lines: "cells",
     step: displacements.length ? displacements[0].step : 0,
   };
   const camera = { ...facing(), ...WHOLE };
@@ -113,9 +113,10 @@ function explore(gl, data, notes) {
     const hasSlice = axis >= 0 && image && state.inside !== "cells";
     const field = fields[state.field];
     const levels = field.nodes && nodeLevels(field);
+    const lines = labelling >= 0 && state.lines === "labels" ? fields[labelling].values : null;
     const outside = surface(mesh, shown(), levels);
     // Where only the image is shown, the cells of the section are there as well, unseen, to be clicked on.
-    const cut = axis >= 0 && (hasSlice || !state.isWhole) ? section(mesh, isWithin, axis, at, levels) : nothing;
+    const cut = axis >= 0 && (hasSlice || !state.isWhole) ? section(mesh, isWithin, axis, at, levels, lines) : nothing;
     drawn.parts.surface.fill(outside);
     drawn.parts.section.fill(cut);
     // Cells that are deformed take the image along: around them it would be where it was.
@@ -128,6 +129,7 @@ function explore(gl, data, notes) {
     drawn.parts.set.fill(state.set < 0 ? nothing : setTriangles(mesh, sets[state.set].triangles));
     canvas.dataset.surface = outside.count;
     canvas.dataset.section = cut.nPolygons || 0;
+    canvas.dataset.lines = cut.nLines || 0;
     redraw();
   }
 
@@ -373,6 +375,7 @@ function explore(gl, data, notes) {
     press("side", state.isTurned);
     press("style", state.isWhole);
     press("inside", state.inside);
+    press("lines", state.lines);
     $("sharing").hidden = state.inside !== "both";
     $("share").value = state.share;
     $("share-text").textContent = `${Math.round(100 * state.share)} %`;
@@ -479,6 +482,8 @@ function explore(gl, data, notes) {
   choose("style", [["through cells", false], ["whole cells", true, "cells whose centroids are beyond are hidden"]],
     (isWhole) => change({ isWhole }));
   choose("inside", [["mesh", "cells"], ["image", "image"], ["both", "both"]], (inside) => change({ inside }));
+  choose("lines", [["lines of cells", "cells"], ["of labels", "labels"]], (lines) => change({ lines }));
+  $("lines").hidden = labelling < 0;
   $("share").addEventListener("input", () => change({ share: Number($("share").value) }));
   choose("from", Object.keys(FROM).map((letter) => [letter, letter]), (letter) => {
     const [yaw, pitch] = FROM[letter].map((quarters) => quarters * Math.PI / 2);

@@ -127,8 +127,9 @@ function interfaces(mesh, labels, isHidden) {
   return triangles;
 }
 
-// The polygons in which the plane axis = at cuts the shown cells: triangles, or quadrilaterals in two triangles.
-function section(mesh, isShown, axis, at, levels) {
+// The polygons in which the plane axis = at cuts the shown cells: triangles, or quadrilaterals in two triangles. With
+// `labels`, one a cell, only those of their sides are lines that lie between two labels, or on the boundary.
+function section(mesh, isShown, axis, at, levels, labels) {
   const { points, rest, cells } = mesh;
   const triangles = new Triangles(64, true);
   const between = (i, j) => {
@@ -138,28 +139,33 @@ function section(mesh, isShown, axis, at, levels) {
     place[axis] = at;
     return [...place, levels ? levels[i] + share * (levels[j] - levels[i]) : 0, rest === points ? place : along(rest)];
   };
-  let nPolygons = 0;
+  let [nPolygons, nLines] = [0, 0];
   for (let cell = 0; cell < mesh.count; cell++) {
     if (!isShown[cell]) continue;
     let above = 0;
     for (let k = 0; k < 4; k++) if (points[3 * cells[4 * cell + k] + axis] >= at) above++;
     if (above === 0 || above === 4) continue;
     nPolygons++;
-    const up = [], down = [];
+    const up = [], down = [], isLine = new Map();  // whether the side in the facet opposite a node is drawn
     for (let k = 0; k < 4; k++) {
-      const node = cells[4 * cell + k];
+      const [node, other] = [cells[4 * cell + k], mesh.neighbours[4 * cell + k]];
       (points[3 * node + axis] >= at ? up : down).push(node);
+      isLine.set(node, !labels || other < 0 || labels[other] !== labels[cell] ? 1 : 0);
     }
+    // The facet opposite a node is cut, unless that node is alone on its side.
+    for (const side of [up, down]) if (side.length > 1) nLines += side.reduce((sum, node) => sum + isLine.get(node), 0);
+    // Bit k is the side opposite corner k.
+    const sides = (...nodes) => nodes.reduce((sum, node, k) => sum + (node < 0 ? 0 : isLine.get(node) << k), 0);
     if (up.length === 2) {
       const [a, b, c, d] = [[0, 0], [0, 1], [1, 1], [1, 0]].map(([i, j]) => between(up[i], down[j]));
-      triangles.add(cell, 0b101, a, b, c);  // the diagonal from a to c is no edge of the cell
-      triangles.add(cell, 0b011, a, c, d);
+      triangles.add(cell, sides(down[0], -1, up[1]), a, b, c);  // the diagonal from a to c is no edge of the cell
+      triangles.add(cell, sides(up[0], down[1], -1), a, c, d);
     } else {
       const [alone, others] = up.length === 1 ? [up[0], down] : [down[0], up];
-      triangles.add(cell, 0b111, ...others.map((node) => between(alone, node)));
+      triangles.add(cell, sides(...others), ...others.map((node) => between(alone, node)));
     }
   }
-  triangles.nPolygons = nPolygons;
+  Object.assign(triangles, { nPolygons, nLines });
   return triangles;
 }
 
