@@ -155,7 +155,24 @@ def test_a_table_goes_through_json(tmp_path):
     }  # fmt: skip
 
 
-@pytest.mark.parametrize("text", [None, "", "[1]", "not json", '{"a": {"name": "b"}}', '{"1": "b"}', 9000 * "["])
+def test_names_stay_on_one_line():
+    assert table_in('{"1": {"name": " a\\n b "}, "2": {"name": " "}}') == LabelTable({1: "a b"}, {})
+
+
+@pytest.mark.parametrize(
+    "text",
+    [
+        None,
+        "",
+        "[1]",
+        "not json",
+        '{"1": 5}',
+        '{"' + 5000 * "1" + '": {"name": "a"}}',
+        '{"a": {"name": "b"}}',
+        '{"1": "b"}',
+        9000 * "[",
+    ],
+)
 def test_another_program_s_text_is_no_table(text):
     assert table_in(text) == NO_TABLE
 

@@ -5,6 +5,7 @@ from itertools import permutations, product
 import numpy as np
 import PIL.Image
 import pytest
+from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_rgb, to_rgba, to_rgba_array
 
@@ -39,6 +40,7 @@ from tetopt.report.figures import (
 )
 from tetopt.start.lattice import lattice
 
+DOLLARS = LabelTable({1: r"5 $ and a_b $\frac"}, {})
 SHAPE = (5, 7, 9)
 SPACING = (2.0, 1.0, 3.0)
 OBLIQUE = np.array([[-0.75, 0.31, 1.1, 12.5], [0.12, 0.68, -0.9, -33.0], [0.05, -0.22, 5.1, 7.25], [0, 0, 0, 1.0]])
@@ -357,6 +359,8 @@ def test_a_legend_lists_the_largest_and_counts_the_others():
     entries = legend_patches(colours, shown)
     assert [entry.get_label() for entry in entries] == [*(str(k) for k in (0, *range(4, 15))), "and 2 more"]
     assert entries[1].get_facecolor() == (*colours[4], 1.0)
+    dollars = label_figure(blocks_of_labels(2), lattice(blocks_of_labels(2), blocks=(2, 2, 2)), table=DOLLARS)
+    FigureCanvasAgg(dollars).draw()  # which would parse a formula
     named = legend_patches(colours, shown, {4: "left lung", 1: "not shown"})
     assert [entry.get_label() for entry in named[:3]] == ["0", "4 left lung", "5"]
     entries = legend_patches(colours, shown[:-2])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import re
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
@@ -75,10 +76,10 @@ def table_of_words(words: Any) -> LabelTable:
     """The table that `table_words` was made of, colours to 1/255; what is not of that kind is left out."""
     names, colours = {}, {}
     for label, entry in words.items() if isinstance(words, dict) else ():
-        if not str(label).isdecimal() or not isinstance(entry, dict):
+        if re.fullmatch(r"\d{1,9}", str(label)) is None or not isinstance(entry, dict):
             continue
-        if isinstance(name := entry.get("name"), str):
-            names[int(label)] = name
+        if isinstance(name := entry.get("name"), str) and name.strip():
+            names[int(label)] = " ".join(name.split())
         if (colour := hex_colour(entry.get("colour"))) is not None:
             colours[int(label)] = colour
     return LabelTable(names, colours)

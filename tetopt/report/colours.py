@@ -61,6 +61,11 @@ def label_colours(labels: Image, own: Mapping[int, tuple[float, float, float]] |
     return colours
 
 
+def plain_text(text: str) -> str:
+    """The text as matplotlib draws it letter by letter, and not as a formula between dollars."""
+    return text.replace("$", r"\$")
+
+
 def grey_limits(values: Sequence[NDArray], brightest: float = 99.5) -> tuple[float, float]:
     """What is drawn black and white: the 0.5 and the `brightest` percentile of all `values`, and never the same."""
     low, high = np.percentile(np.concatenate([part.ravel() for part in values]), [0.5, brightest])
@@ -85,7 +90,10 @@ def legend_patches(
     by_size = np.argsort(-shown, kind="stable")[: np.count_nonzero(shown)]
     entries = [
         Patch(
-            facecolor=colours[label], edgecolor="black", linewidth=0.5, label=f"{label} {names.get(label, '')}".strip()
+            facecolor=colours[label],
+            edgecolor="black",
+            linewidth=0.5,
+            label=plain_text(f"{label} {names.get(label, '')}".strip()),
         )
         for label in np.sort(by_size[:LISTED_LABELS]).tolist()
     ]

@@ -17,7 +17,7 @@ from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.report.colours import grey_limits
+from tetopt.report.colours import grey_limits, plain_text
 from tetopt.report.figures import SliceView, draw_edges, fill_cells
 from tetopt.report.scene import cutaway, save_scenes
 from tetopt.report.viewer import view_of
@@ -160,7 +160,7 @@ def labels_figure(report: Report) -> Figure:
     panels[1].set_ylabel("mean surface distance, mm")
     panels[1].set_ylim(bottom=0.0)
     panels[1].set_xlim(-0.5, len(order) - 0.5)
-    words = {label: report.labels.words(label) if report.labels else f"{label:.0f}" for label in order}
+    words = {label: plain_text(report.labels.words(label)) if report.labels else f"{label:.0f}" for label in order}
     panels[1].set_xticks(
         range(len(order)), [f"{words[label]} ({voxels[label]:.0f})" for label in order], rotation=90, fontsize=8
     )
