@@ -272,8 +272,13 @@ def _interpolated(inside: NDArray[np.bool_], axis: int, factor: int, length: Seq
 
 
 def _rest(level: NDArray[np.float32], deepest: NDArray[np.float32], k: int) -> NDArray[np.float32]:
-    """How far from its outline a slice may be where slice `k` is on the other side: what ends there does half way."""
-    return 2.0 * deepest[k] - np.abs(level[k])
+    """How far from its outline a slice is at most where slice `k` is on the other side.
+
+    A piece that ends there, of depth D, is cut off at its depth d after the share t = sqrt(1 - (1 - d / D)^2) / 2 of
+    the way: as half an ellipsoid that ends half way. Linear between -d and the other level, that is d (1 / t - 1).
+    """
+    share = np.abs(level[k]) / deepest[k]
+    return deepest[k] * (2.0 * np.sqrt(share / (2.0 - share)) - share)
 
 
 def _outlined(inside: NDArray[np.bool_], length: Sequence[float]) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
