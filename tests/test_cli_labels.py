@@ -67,11 +67,13 @@ def test_the_table_prints_names(folder, capsys):
 
 
 @pytest.mark.parametrize("mesh", ["named.vtu", "plain.vtu"])
-def test_laws_and_loads_by_name(folder, tmp_path, mesh):
+def test_laws_and_loads_by_name(folder, tmp_path, mesh, capsys):
     more = [] if mesh == "named.vtu" else ["--label-names", folder / "t.csv"]
     young = ["--young", "bright/ball [é]=5,spleen=3,*=20", "--nu", "Bright_Ball_E=0.3,*=0.4"]
     load = ["--load", f"hold:{INTERFACE}", "--load", "pressure:inferior:1"]
     assert exit_code("convert", folder / mesh, tmp_path / "a.vtu", *young, *load, *more) == 0
+    said = capsys.readouterr().out
+    assert "  5 kPa, nu 0.3: bright/ball [é]\n  20 kPa, nu 0.4: soft tissue\n" in said
     loaded = tetopt.load_mesh(tmp_path / "a.vtu")
     is_bright = loaded.cell_data["label"] == 1
     np.testing.assert_array_equal(loaded.cell_data["young"], np.where(is_bright, 5.0, 20.0))
@@ -221,4 +223,14 @@ def test_many_interfaces_are_not_written_into_vtu(folder, tmp_path, capsys):
     assert f"NSET={name}\n" in (tmp_path / "b.inp").read_text()
     words = ["--young", "1", "--load", f"hold:{name}", "--force"]
     assert exit_code("convert", tmp_path / "a.vtu", tmp_path / "a2.vtu", *words) == 0
+    (tmp_path / "some.csv").write_text("label,name\n1,liver\n")
+    named = ["--label-names", tmp_path / "some.csv", "--young", "liver=5,*=2", "--sets", "none"]
+    capsys.readouterr()
+    assert exit_code("convert", tmp_path / "a.vtu", tmp_path / "c.inp", *named) == 0
+    assert (
+        "\n  2 kPa, nu 0.45: 0, 2, 3, 4, 5, 6, 7, 8 and 51 more\n  5 kPa, nu 0.45: liver\n" in capsys.readouterr().out
+    )
+    assert (
+        exit_code("convert", tmp_path / "a.vtu", tmp_path / "d.inp", *named[:2], "--young", "1+0.1*h") == 2
+    )  # no means
     assert [each for each in tetopt.load_mesh(tmp_path / "a2.vtu").sets.facets if "interface" in each] == [name]

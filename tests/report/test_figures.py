@@ -40,7 +40,7 @@ from tetopt.report.figures import (
 )
 from tetopt.start.lattice import lattice
 
-DOLLARS = LabelTable({1: r"5 $ and a_b $\frac"}, {})
+DOLLARS = LabelTable({1: r"5 $\frac$ and a_b"}, {})
 SHAPE = (5, 7, 9)
 SPACING = (2.0, 1.0, 3.0)
 OBLIQUE = np.array([[-0.75, 0.31, 1.1, 12.5], [0.12, 0.68, -0.9, -33.0], [0.05, -0.22, 5.1, 7.25], [0, 0, 0, 1.0]])

@@ -26,7 +26,7 @@ from tetopt.model.fields import NODE_MODULI
 from tetopt.model.labels import TABLE_TEXT, table_of_words, table_words
 from tetopt.model.laws import checked_young, parse_any_law
 from tetopt.model.loads import check_steps, count_of_steps, known_set, load_words, parse_load
-from tetopt.model.materials import DEFAULT_NU, Spacing
+from tetopt.model.materials import DEFAULT_NU, Materials, Spacing
 from tetopt.model.model import SPACES, STRESS_UNITS, Model, element_facets, elements, half_turned, scaled
 from tetopt.model.sets import (
     Box,
@@ -46,6 +46,7 @@ MATERIAL_FIELDS = ("young", "nu", "density", "material")  # what a file of ours 
 SET_GROUPS = ("labels", "interfaces", "boundary")  # of the sets that every mesh has
 # Each is an array more on the nodes of a VTU or VTK file; labels and their sets can be made anew of its cells.
 MANY_INTERFACES = 24
+LISTED_NAMES = 8  # of labels of one material: a line's worth
 SLOW_MATERIALS = 30_000  # CalculiX takes three times as long with as many as there are cells (tests/benchmarks)
 
 
@@ -295,6 +296,20 @@ def print_model(output: Path, model: Model, solver: SolverOptions) -> None:
     print_wide(table)
 
 
+def _materials_by_name(model: Model, materials: Materials) -> Iterator[str]:
+    """A line for each material with the names of its labels, where labels have names and each is of one material."""
+    labels, names = labels_of(model.cell_data, len(model.mesh.cells)), table_of_words(model.about.get(TABLE_TEXT)).names
+    if labels is None or not names:
+        return
+    pairs = np.unique(np.column_stack([labels, materials.of_cell]), axis=0).tolist()
+    if len(pairs) > len(np.unique(labels)):
+        return
+    for number, (young, nu) in enumerate(zip(materials.young, materials.nu, strict=True)):
+        made_of = [names.get(label, str(label)) for label, material in pairs if material == number]
+        more = f" and {len(made_of) - LISTED_NAMES} more" if len(made_of) > LISTED_NAMES else ""
+        yield f"  {young:.4g} kPa, nu {nu:.4g}: {', '.join(made_of[:LISTED_NAMES])}{more}"
+
+
 def _lines(output: Path, model: Model, solver: SolverOptions) -> Iterator[str]:
     form = format_of(output)
     materials = None if form.is_surface else model.materials
@@ -303,6 +318,7 @@ def _lines(output: Path, model: Model, solver: SolverOptions) -> Iterator[str]:
         ratios = f"{nu.min():.4g}" if nu.min() == nu.max() else f"{nu.min():.4g} to {nu.max():.4g}"
         count = f"{len(young)} material{'s' * (len(young) > 1)}"
         yield f"{count}, Young's modulus {young.min():.4g} to {young.max():.4g} kPa, nu {ratios}"
+        yield from _materials_by_name(model, materials)
     if materials is not None and model.gauss_young is not None:
         yield "one modulus a cell, its geometric mean; tetopt fem IMAGE MESH has one at each Gauss point"
     if materials is not None and materials.binning is not None:
