@@ -24,7 +24,10 @@ FARTHEST_LEVEL = 6.0  # levels end there: nothing that moves by steps near an in
 FARTHEST_DISTANCE = 8  # voxels beyond which distances to a label do not count: more than levels and smoothing look at
 FINE_SIGMA, BROAD_SIGMA = 1.0, 3.0  # voxels: of the Gaussian where a label is thin, and where it and its gaps are not
 THIN_REACH = 4.0, 7.0  # voxels from the middle to the surface of what is thin for the broad one, and of what is not
-VOLUME_SIGMA, VOLUME_BLOCK = 3.0, 2  # volumes are kept in a Gaussian of so many voxels, summed over such blocks
+VOLUME_SIGMA, VOLUME_BLOCK = (
+    3.0,
+    2,
+)  # volumes are kept in a Gaussian of so many voxels, at least; summed over blocks
 NEAR_SURFACE = 0.05, 0.95  # distance from the surface of a voxel beside it: less than 1, and its centre keeps its label
 MOST_LIFTED = 1.0  # voxels by which smoothing changes levels further off: what distances to voxels can be wrong by
 LEAST_SLOPE = 0.3  # of a level that volumes are measured with; flatter ones are those of sheets of a voxel
@@ -112,7 +115,7 @@ def memberships(labels: Image, factors: Sequence[int] | None = None) -> Membersh
 
     def level_in(row: int) -> NDArray[np.float32]:
         box = boxes[row]
-        return _level(start[box] == row, raw[box] == row, off[box])
+        return _level(start[box] == row, raw[box] == row, off[box], factors)
 
     with ThreadPoolExecutor(numba.get_num_threads()) as threads:
         for row, level in enumerate(threads.map(level_in, range(len(values)))):
@@ -129,7 +132,9 @@ def _around(box: tuple[slice, ...], shape: tuple[int, ...]) -> tuple[slice, ...]
     return tuple(slice(first, min(stop, n)) for (first, stop), n in zip(ends, shape, strict=True))
 
 
-def _level(inside: NDArray[np.bool_], raw: NDArray[np.bool_], off: NDArray) -> NDArray[np.float32]:
+def _level(
+    inside: NDArray[np.bool_], raw: NDArray[np.bool_], off: NDArray[np.float32], factors: Sequence[int]
+) -> NDArray[np.float32]:
     """The smooth level of a label, (*shape) float32.
 
     Stairs are taken off as by biharmonic flow: 2 G - G^2, of a Gaussian G, keeps planes and quadrics. After each step
@@ -144,6 +149,8 @@ def _level(inside: NDArray[np.bool_], raw: NDArray[np.bool_], off: NDArray) -> N
         The same, with the label of the slice that each voxel is of: its volume is kept.
     off : (*shape) float32
         How many voxels each is away from the plane of a slice.
+    factors : sequence of int
+        How many voxels a slice is thick along each axis.
     """
     if inside.all():
         return np.full(inside.shape, -FARTHEST_LEVEL, dtype=np.float32)
@@ -157,7 +164,7 @@ def _level(inside: NDArray[np.bool_], raw: NDArray[np.bool_], off: NDArray) -> N
         smooth = _flowed(level, FINE_SIGMA)
         if share.any():
             smooth += share * (_flowed(level, BROAD_SIGMA) - smooth)
-        level = np.clip(_with_volume(smooth, raw), low, high)
+        level = np.clip(_with_volume(smooth, raw, max(VOLUME_SIGMA, *factors)), low, high)
     return np.clip(level, -FARTHEST_LEVEL, FARTHEST_LEVEL)
 
 
@@ -180,14 +187,14 @@ def _flowed(level: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
     return once + gaussian_filter(level - once, sigma, mode="nearest", truncate=3.0)
 
 
-def _with_volume(level: NDArray[np.float32], raw: NDArray[np.bool_]) -> NDArray[np.float32]:
-    """The level raised or lowered, gently from place to place, so that it has the label's volume there."""
+def _with_volume(level: NDArray[np.float32], raw: NDArray[np.bool_], sigma: float) -> NDArray[np.float32]:
+    """The level raised or lowered, gently from place to place, so that it has the label's volume within `sigma`."""
     mean = level  # over each voxel, of the level that is linear between centres
     for axis in range(level.ndim):
         mean = correlate1d(mean, [0.125, 0.75, 0.125], axis, mode="nearest")
     distance = mean / np.clip(_slope(level), LEAST_SLOPE, 1.0)
-    missing = _summed(raw - np.clip(0.5 - distance, 0.0, 1.0))
-    area = _summed((np.abs(distance) < 0.5).astype(np.float32))
+    missing = _summed(raw - np.clip(0.5 - distance, 0.0, 1.0), sigma)
+    area = _summed((np.abs(distance) < 0.5).astype(np.float32), sigma)
     lowered = np.where(area > 0.01 * VOLUME_BLOCK**level.ndim, missing / np.maximum(area, 1e-3), 0.0)
     spread = _spread(lowered, (VOLUME_BLOCK,) * level.ndim)
     return level - spread[tuple(slice(n) for n in level.shape)].astype(np.float32)
@@ -203,11 +210,11 @@ def _slope(level: NDArray[np.float32]) -> NDArray[np.float32]:
     return np.sqrt(square)
 
 
-def _summed(values: NDArray[np.float32]) -> NDArray[np.float32]:
+def _summed(values: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
     """Sums over blocks of voxels, weighed by a Gaussian over the blocks around."""
     for axis, n in enumerate(values.shape):
         values = np.add.reduceat(values, np.arange(0, n, VOLUME_BLOCK), axis)
-    return gaussian_filter(values, VOLUME_SIGMA / VOLUME_BLOCK, mode="constant", truncate=3.0)
+    return gaussian_filter(values, sigma / VOLUME_BLOCK, mode="constant", truncate=3.0)
 
 
 def _spread(data: NDArray, factors: Sequence[int]) -> NDArray:
