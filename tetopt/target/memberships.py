@@ -100,14 +100,12 @@ def memberships(labels: Image, factors: Sequence[int] | None = None) -> Membersh
     assert all(factor % 2 == 1 for factor in factors), f"factors: expected odd numbers, got {factors}"
     values = np.flatnonzero(np.bincount(labels.data.astype(np.int64).ravel()))
     raw = start = np.searchsorted(values, labels.data).reshape(labels.shape)
-    off = np.zeros((1,) * labels.ndim, dtype=np.float32)
+    off = np.zeros(labels.shape, dtype=np.float32)
     for axis, factor in enumerate(factors):
-        raw = np.repeat(raw, factor, axis)
         if factor > 1:
+            off = np.maximum(np.repeat(off, factor, axis), _off_planes(start, axis, factor))
             start = _between_slices(start, axis, factors)
-            along = np.abs(np.arange(start.shape[axis], dtype=np.float32) % factor - factor // 2)
-            off = np.maximum(off, along.reshape((-1,) + (1,) * (labels.ndim - 1 - axis)))
-    off = np.broadcast_to(off, start.shape)
+            raw = np.repeat(raw, factor, axis)
     channel = label_channels(start, len(values))
     levels = np.full((channel.max() + 1, *start.shape), FARTHEST_LEVEL, dtype=np.float32)
     smallest, partition = np.full(start.shape, np.inf, dtype=np.float32), np.zeros(start.shape, dtype=np.int64)
@@ -123,6 +121,8 @@ def memberships(labels: Image, factors: Sequence[int] | None = None) -> Membersh
             np.minimum(shared, level, out=shared)
             partition[boxes[row]][level < least] = row
             np.minimum(least, level, out=least)
+    if off.any():
+        _merge_crumbs(levels, partition, channel, off == 0.0)
     return Memberships(values, channel, levels, partition)
 
 
@@ -148,7 +148,7 @@ def _level(
     raw : (*shape) bool
         The same, with the label of the slice that each voxel is of: its volume is kept.
     off : (*shape) float32
-        How many voxels each is away from the plane of a slice.
+        How many voxels each is away from the plane of a slice; 0 between slices that have the same label.
     factors : sequence of int
         How many voxels a slice is thick along each axis.
     """
@@ -228,6 +228,38 @@ def _spread(data: NDArray, factors: Sequence[int]) -> NDArray:
             above = np.minimum(below + 1, n - 1)
             data = np.take(data, below, axis) * (1.0 - share) + np.take(data, above, axis) * share
     return data
+
+
+def _off_planes(number: NDArray[np.int64], axis: int, factor: int) -> NDArray[np.float32]:
+    """How many voxels each is away from its slice's plane, after the division, where slices differ; 0 elsewhere."""
+    n = number.shape[axis]
+    along = np.arange(n * factor)
+    away = along % factor - factor // 2
+    beside = np.clip(along // factor + np.sign(away), 0, n - 1)
+    differs = number.take(along // factor, axis) != number.take(beside, axis)
+    return np.abs(away, dtype=np.float32).reshape((-1,) + (1,) * (number.ndim - 1 - axis)) * differs
+
+
+def _merge_crumbs(
+    levels: NDArray[np.float32], partition: NDArray[np.int64], channel: NDArray[np.int64], is_plane: NDArray[np.bool_]
+) -> None:
+    """Pieces of a label between slices that reach no slice's plane join what is nearest, in place.
+
+    There the two labels' levels are exchanged.
+    """
+    is_crumb = np.zeros(partition.shape, dtype=bool)
+    for row, box in enumerate(find_objects(partition + 1)):
+        piece, n = components(partition[box] == row)
+        reaches = np.zeros(n + 1, dtype=bool)
+        reaches[piece[is_plane[box]]] = True
+        reaches[0] = True
+        is_crumb[box] |= ~reaches[piece]
+    if is_crumb.any():
+        nearest = distance_transform_edt(is_crumb, return_distances=False, return_indices=True)[:, is_crumb]
+        at, old, new = np.nonzero(is_crumb), partition[is_crumb], partition[tuple(nearest)]
+        low, high = levels[(channel[old], *at)], levels[(channel[new], *at)]
+        levels[(channel[old], *at)], levels[(channel[new], *at)] = high, low
+        partition[is_crumb] = new
 
 
 def _between_slices(number: NDArray[np.int64], axis: int, factors: Sequence[int]) -> NDArray[np.int64]:
