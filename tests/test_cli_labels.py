@@ -230,7 +230,6 @@ def test_many_interfaces_are_not_written_into_vtu(folder, tmp_path, capsys):
     assert (
         "\n  2 kPa, nu 0.45: 0, 2, 3, 4, 5, 6, 7, 8 and 51 more\n  5 kPa, nu 0.45: liver\n" in capsys.readouterr().out
     )
-    assert (
-        exit_code("convert", tmp_path / "a.vtu", tmp_path / "d.inp", *named[:2], "--young", "1+0.1*h") == 2
-    )  # no means
+    assert exit_code("convert", folder / "named.vtu", tmp_path / "d.inp", "--young", "1+0.1*h") == 0
+    assert ", nu 0.45: " not in capsys.readouterr().out  # a label is of many materials
     assert [each for each in tetopt.load_mesh(tmp_path / "a2.vtu").sets.facets if "interface" in each] == [name]
