@@ -25,6 +25,7 @@ from tetopt.io.meshes import load_mesh, save_mesh
 from tetopt.io.vtk import to_pyvista
 from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields
+from tetopt.model.sets import MOST_LETTERS
 from tetopt.start.lattice import lattice
 
 OPTIONS = {"k_D": 0.2, "n_t": None, "crop": "ä"}
@@ -376,7 +377,7 @@ def test_two_middle_nodes_of_one_edge_are_told(tmp_path):
 # gmsh's physical groups
 
 
-LONG = "x" * 45
+LONG = "x" * 77
 NAMES = {
     (2, 1): "my left", (2, 2): "Skin", (2, 5): f"{LONG}a", (2, 6): f"{LONG}b", (2, 8): "1st", (2, 9): "nothing",
     (2, 10): "my_left",
@@ -437,16 +438,16 @@ def test_every_physical_group_becomes_a_set_of_a_valid_name(tmp_path, is_binary)
     np.testing.assert_array_equal(back.mesh.cells, TETRAHEDRA)
     first, second = [0, 3], [1, 2]  # rows of the triangles
     assert {name: rows.tolist() for name, rows in back.sets.facets.items()} == {
-        "Skin": [first, second], "surface_4": [first], "my_left": [second], "my_left_2": [first], "x" * 40: [first],
-        f"{'x' * 38}_2": [second], "set_1st": [second],
+        "Skin": [first, second], "surface_4": [first], "my_left": [second], "my_left_2": [first],
+        "x" * MOST_LETTERS: [first], f"{'x' * (MOST_LETTERS - 2)}_2": [second], "set_1st": [second],
     }  # fmt: skip
     assert {name: members.tolist() for name, members in back.sets.cells.items()} == {
         "skin_2": [0], "Skin_3": [0], "ok-1": [0], "volume_7": [1], "H_hle": [1]
     }  # fmt: skip
     assert set(back.notes) == {
         '"my left" is the set my_left_2 here',
-        f'"{LONG}a" is the set {"x" * 40} here',
-        f'"{LONG}b" is the set {"x" * 38}_2 here',
+        f'"{LONG}a" is the set {LONG[:MOST_LETTERS]} here',
+        f'"{LONG}b" is the set {LONG[: MOST_LETTERS - 2]}_2 here',
         '"1st" is the set set_1st here',
         '"skin" is the set skin_2 here',
         '"Skin" is the set Skin_3 here',
