@@ -362,3 +362,13 @@ def labelling_energy(voxels, tension, cells, labels):
             k = next(k for k, node in enumerate(cells[sides[0]]) if node not in nodes)
             energy += tension[sides[0], k]
     return energy
+
+
+def cheapest_way(cells, costs, sources, ends):
+    """Least cost of the cells between the sources and the nearest end, from facet to facet, by relaxing all of them."""
+    way = {number: 0.0 if number in sources else np.inf for number in range(len(cells))}
+    pairs = [sides for sides in facets(cells).values() if len(sides) == 2]
+    for _ in cells:
+        for one, other in [*pairs, *([b, a] for a, b in pairs)]:
+            way[other] = min(way[other], way[one] + (0.0 if other in ends else costs[other]))
+    return min(way[end] for end in ends)

@@ -119,6 +119,37 @@ def test_moves_lower_the_energy(n):
             assert energy(changed) >= after - 1e-6
 
 
+def test_a_bridge_is_the_cheapest():
+    """Between two pieces of a label, by the energy of each cell that it takes."""
+    points, cells = box(3, 16, 4)
+    voxels = np.random.default_rng(9).random((len(cells), 3)) * volumes(points, cells)[:, None]
+    dual = labelling._dual(points, cells, across_of(cells, len(points)), csr_array(voxels), 0.1)
+    voxels *= volumes(points, cells).sum() / voxels.sum()
+    labels = voxels.argmax(axis=1)
+    number, of_piece = pieces_of(dual.across, labels)
+    way, before, bridge = np.full(len(cells), np.inf), np.empty_like(labels), np.empty_like(labels)
+    energy = naive.labelling_energy(voxels, dual.tension, cells, labels)
+    n_bridges = 0
+    for piece, label in enumerate(of_piece):
+        sources, ends = np.flatnonzero(number == piece), np.flatnonzero((labels == label) & (number != piece))
+        if len(ends) == 0 or len(sources) > 4:
+            continue
+        changed = [np.where(np.arange(len(cells)) == cell, label, labels) for cell in range(len(cells))]
+        costs = [naive.labelling_energy(voxels, dual.tension, cells, of) - energy for of in changed]
+        costs = np.maximum(costs, 0.0)
+        least = naive.cheapest_way(cells, costs, set(sources.tolist()), set(ends.tolist()))
+        assert labelling._bridge(bridge, way, before, dual, labels, sources, 0.99 * least) == 0
+        count = labelling._bridge(bridge, way, before, dual, labels, sources, 1.01 * least + 1e-6)
+        assert costs[bridge[:count]].sum() == pytest.approx(least, abs=1e-6)
+        linked = labels.copy()
+        linked[bridge[:count]] = label
+        after = pieces_of(dual.across, linked)[0]
+        assert np.isin(after[ends], after[sources]).any()
+        assert np.isinf(way).all()
+        n_bridges += 1
+    assert n_bridges > 5
+
+
 def ball(n_blocks=7, radius=7.5, seed=None):
     """A lattice and the labels of a ball in it, with some cells of noise."""
     shape = (24, 24, 24)

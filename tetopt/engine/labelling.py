@@ -35,7 +35,9 @@ TENSION_SHARE = (
     0.1  # of the local edge: a regular cell with three facets against one label goes, unless nearly full of its own
 )
 LEAST_SHARE = 0.5  # of a label's volume: tension takes no more, so that small labels do not wither away
+LAST_SHARE = 0.1  # of that: mending may take more in the end, rather than leave a pinch
 PIECE_SHARE = 0.5  # of the voxels of a piece of cells that a piece of voxels has at least, if it is to justify it
+BRIDGE_SHARE = 3.0  # of the voxels lost with a piece: what a bridge may cost; with 1 a coarse mesh loses half a rib
 MENDING_ROUNDS = 6  # of fragments and mending, at most; the second mostly has nothing left to do
 TWO_LABELS_WEIGHT = 20.0  # volumes of the cells around: what is not manifold between two labels goes at any cost
 MORE_LABELS_WEIGHT = 0.3  # where more labels meet: edges go with it, and with 4 a tenth of small organs' Dice, too
@@ -104,10 +106,11 @@ def labelled(
     is_bridge = np.zeros(len(labels), dtype=bool)
     for _ in range(MENDING_ROUNDS):
         moved = _without_fragments(dual, labels, is_bridge, voxel, pieces)
-        moved += _mended(dual, labels, is_bridge, n_labels)
+        moved += _mended(dual, labels, is_bridge, least)
         moved += _settle(dual, labels, least, True)
         if moved == 0:
             break
+    _mend_pairs(dual, labels, LAST_SHARE * least)
     faces, is_two = _nonmanifold(dual, labels)
     _, of_piece = pieces_of(across, labels)
     present = np.bincount(dual.row, dual.volume, n_labels) > 0.0
@@ -335,8 +338,8 @@ def _without_fragments(
     """Pieces of cells that no piece of voxels justifies are bridged or go; how many cells took another label.
 
     The pieces of a label are ranked by the voxels of it that they hold. The first stays, and each further one of whose
-    rank there is a piece of voxels, not far smaller. The others are linked to one of the same label, or are given to
-    their neighbours cell by cell, whatever puts fewer voxels into cells of another label.
+    rank there is a piece of voxels, not far smaller. The others are linked to one of the same label, or, where that
+    costs more than `BRIDGE_SHARE` of the voxels that are then lost, given to their neighbours cell by cell.
     """
     number, of_piece = pieces_of(dual.across, labels)
     cell = np.repeat(np.arange(len(labels)), np.diff(dual.first))
@@ -344,7 +347,7 @@ def _without_fragments(
     content = np.bincount(number[cell], np.where(is_own, dual.volume, 0.0), len(of_piece))
     # What a cell would hold of the best other label: at most so much is lost if it goes.
     others = np.maximum.reduceat(np.where(is_own, 0.0, dual.volume), dual.first[:-1])
-    price = content - np.bincount(number, others, len(of_piece))
+    most = BRIDGE_SHARE * (content - np.bincount(number, others, len(of_piece)))
     order = np.lexsort((np.arange(len(of_piece)), -content, of_piece))
     rank = np.empty(len(of_piece), dtype=np.int64)
     rank[order] = np.arange(len(of_piece)) - np.searchsorted(of_piece[order], of_piece[order])
@@ -355,7 +358,7 @@ def _without_fragments(
     for piece in order[~np.array(stays)[order]]:
         if (labels[number == piece] != of_piece[piece]).any():  # another bridge goes over it
             continue
-        count = _bridge(bridge, way, before, dual, labels, np.flatnonzero(number == piece), price[piece])
+        count = _bridge(bridge, way, before, dual, labels, np.flatnonzero(number == piece), most[piece])
         if count > 0:
             labels[bridge[:count]] = of_piece[piece]
             is_loose[bridge[:count]] = is_loose[number == piece] = False
@@ -463,15 +466,26 @@ def _nonmanifold(
     return faces[:, :2], faces[:, 2] == 2
 
 
-def _mended(dual: Dual, labels: NDArray[np.int64], is_bridge: NDArray[np.bool_], n_labels: int) -> int:
-    """What is not manifold is mended where that lowers the energy, bridges stay; how many cells took another label."""
-    total, moved = 0, 1
-    n_of, is_near = np.bincount(labels, minlength=n_labels), None
+def _mended(dual: Dual, labels: NDArray[np.int64], is_bridge: NDArray[np.bool_], least: NDArray[np.float64]) -> int:
+    """What is not manifold is mended where that lowers the energy; how many cells took another label.
+
+    Bridges stay, and no label goes below its volume `least`.
+    """
+    total, moved, is_near = 0, 1, None
+    room = np.bincount(labels, dual.size, len(least)) - least
     while moved > 0:
         faces, is_near = _nonmanifold(dual, labels, is_near)[0], np.zeros(len(dual.scale), dtype=bool)
-        moved = _mend(dual, labels, n_of, is_bridge, faces, is_near, _work(dual))
+        moved = _mend(dual, labels, room, is_bridge, faces, is_near, _work(dual))
         total += moved
     return total
+
+
+def _mend_pairs(dual: Dual, labels: NDArray[np.int64], least: NDArray[np.float64]) -> None:
+    """What is left where two labels meet is mended even if a bridge goes by it."""
+    faces, is_two = _nonmanifold(dual, labels)
+    room = np.bincount(labels, dual.size, len(least)) - least
+    is_bridge, is_near = np.zeros(len(labels), dtype=bool), np.zeros(len(dual.scale), dtype=bool)
+    _mend(dual, labels, room, is_bridge, faces[is_two], is_near, _work(dual))
 
 
 @njit(cache=True, error_model="numpy")
@@ -577,7 +591,7 @@ def _fans(dual: Dual, labels: NDArray, a: int, b: int, count: int, label: int, w
 
 @njit(cache=True, error_model="numpy")
 def _mend(
-    dual: Dual, labels: NDArray, n_of: NDArray, is_bridge: NDArray, faces: NDArray, is_near: NDArray, work: _Work
+    dual: Dual, labels: NDArray, room: NDArray, is_bridge: NDArray, faces: NDArray, is_near: NDArray, work: _Work
 ) -> int:
     """Each face that is not manifold takes the move that lowers the energy with what is not manifold most.
 
@@ -592,15 +606,16 @@ def _mend(
         best, best_from, best_label = -LEAST_GAIN * dual.scale[a], -1, -1
         for i in range(2 * count):
             size = _group(dual, labels, a, b, star[:count], i, group)
-            if size == 0 or n_of[labels[group[0]]] <= size or is_bridge[group[:size]].any():
+            if size == 0 or room[labels[group[0]]] < dual.size[group[:size]].sum() or is_bridge[group[:size]].any():
                 continue
-            new, change = _best_of_group(dual, labels, group[:size], star[:count], work)
-            if change < best:
+            new, change = _best_of_group(dual, labels, group[:size], star[:count], best, work)
+            if new >= 0:
                 best, best_from, best_label = change, i, new
         if best_from >= 0:
             size = _group(dual, labels, a, b, star[:count], best_from, group)
-            n_of[labels[group[0]]] -= size
-            n_of[best_label] += size
+            volume = dual.size[group[:size]].sum()
+            room[labels[group[0]]] -= volume
+            room[best_label] += volume
             for cell in group[:size]:
                 labels[cell] = best_label
                 for k in range(dual.cells.shape[1]):
@@ -636,10 +651,10 @@ def _group(dual: Dual, labels: NDArray, a: int, b: int, star: NDArray, i: int, g
 
 
 @njit(cache=True, error_model="numpy")
-def _best_of_group(dual: Dual, labels: NDArray, group: NDArray, star: NDArray, work: _Work) -> tuple:
-    """The label in the star that lowers the energy most if all cells of the group take it, and by how much."""
-    old, best, least = labels[group[0]], -1, np.inf
-    faces, before = np.empty((0, 2), dtype=np.int64), 0.0
+def _best_of_group(dual: Dual, labels: NDArray, group: NDArray, star: NDArray, least: float, work: _Work) -> tuple:
+    """The label in the star that lowers the energy most if the group takes it, and the change: below `least`, or -1."""
+    old, best, faces = labels[group[0]], -1, np.empty((0, 2), dtype=np.int64)
+    before, pinches = 0.0, 0.0
     for j in range(len(star)):
         new = labels[star[j]]
         is_new = new != old and _touches(dual, labels, group, new)
@@ -649,12 +664,12 @@ def _best_of_group(dual: Dual, labels: NDArray, group: NDArray, star: NDArray, w
             continue
         if len(faces) == 0:
             faces = _closure(dual, group)
-            before = _local_energy(dual, labels, group, faces, work)
-        for cell in group:
-            labels[cell] = new
-        change = _local_energy(dual, labels, group, faces, work) - before
-        for cell in group:
-            labels[cell] = old
+            before, pinches = _prices(dual, labels, group), _pinches(dual, labels, faces, work)
+        labels[group] = new
+        change = _prices(dual, labels, group) - before - pinches
+        if change < least:  # with all pinches gone
+            change += _pinches(dual, labels, faces, work)
+        labels[group] = old
         if change < least:
             best, least = new, change
     return best, least
@@ -690,14 +705,21 @@ def _closure(dual: Dual, group: NDArray) -> NDArray:
 
 
 @njit(cache=True, error_model="numpy")
-def _local_energy(dual: Dual, labels: NDArray, group: NDArray, faces: NDArray, work: _Work) -> float:
-    """The part of the energy that a group of cells of one label decides, with what is not manifold around them."""
-    energy = 0.0
+def _prices(dual: Dual, labels: NDArray, group: NDArray) -> float:
+    """The part of the energy that the label of a group of cells, one for all, decides."""
+    total = 0.0
     for cell in group:
-        energy += _price(dual, labels, cell, labels[cell])
+        total += _price(dual, labels, cell, labels[cell])
+    return total
+
+
+@njit(cache=True, error_model="numpy")
+def _pinches(dual: Dual, labels: NDArray, faces: NDArray, work: _Work) -> float:
+    """What these nodes and edges cost that are not manifold."""
+    total = 0.0
     for f in range(len(faces)):
         excess, n_labels = _excess(dual, labels, faces[f, 0], faces[f, 1], work)
         if excess > 0:
             weight = TWO_LABELS_WEIGHT if n_labels == 2 else MORE_LABELS_WEIGHT
-            energy += weight * excess * dual.scale[faces[f, 0]]
-    return energy
+            total += weight * excess * dual.scale[faces[f, 0]]
+    return total
