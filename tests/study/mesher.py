@@ -6,7 +6,8 @@ It makes a lattice of the image's box with two thirds of the nodes; KIND says wh
 boundary lies half a voxel outside of the box ("wide"), there with a flat cell over a node ("rough"), or far inside it
 ("small"), it makes the same mesh whatever it
 is asked for ("stubborn"), it ends without a mesh ("none"), with a message ("fails"), only at the second run
-("once"), or writes a mesh of triangles ("flat").
+("once"), or writes a mesh of triangles ("flat"). With "labelled" in it the cells
+have labels, 0 and 1 in turn, and every second one 99.
 """
 
 import sys
@@ -33,13 +34,15 @@ def main(kind, image_path, labels_path, nodes, output, log=None):
     mesh = tetopt.lattice(image, nodes=400 if kind == "stubborn" else round(2 / 3 * int(nodes)))
     if kind == "flat":
         mesh = tetopt.Mesh([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]])
-    if kind in ("wide", "rough", "small"):
+    if kind in ("wide", "rough", "rough-labelled", "small"):
         middle = (np.array(image.shape) - 1) / 2
         factor = (np.array(image.shape) + (-6 if kind == "small" else 1)) / image.shape
         mesh = tetopt.Mesh(image.to_world(middle + factor * (image.to_index(mesh.points) - middle)), mesh.cells)
-    if kind == "rough":  # a node on a side goes in, and the hole that this leaves is filled by flat cells
+    if kind.startswith("rough"):  # a node on a side goes in, and the hole that this leaves is filled by flat cells
         mesh = covered(mesh)
-    tetopt.save_mesh(output, mesh)
+    number = np.arange(len(mesh.cells))
+    labels = {"label": np.where(number % 2 == 0, number // 2 % 2, 99)} if "labelled" in kind else {}
+    tetopt.save_mesh(output, mesh, labels)
 
 
 def covered(mesh):

@@ -84,6 +84,11 @@ def test_numbers_are_those_of_the_meshes(run, head):
             assert [row[name] for name in LABEL_KEYS] == pytest.approx(
                 [getattr(of_label, k) for k in LABEL_KEYS.values()]
             )
+        of_cell = tetopt.measure.fidelity.cell_labels(labels, mesh)
+        surfaces = tetopt.measure.interfaces.label_interfaces(labels, mesh, of_cell)
+        for row, surface in zip(median["labels"], surfaces, strict=True):
+            for name in ("area_ratio", "folded", "nonmanifold_edges", "nonmanifold_edges_two_labels"):
+                assert row[name] == pytest.approx(getattr(surface, name))
         assert sum(row["E_D_share"] for row in median["labels"]) == pytest.approx(median["E_D_share"], rel=1e-9)
 
 
@@ -105,6 +110,7 @@ def test_the_keys_of_the_report(run):
     assert set(median["labels"][0]) == {
         *("E_D_share", "components", "dice", "is_lost", "label", "mesh_components", "mesh_volume_mm3", "mesh_voxels"),
         *("surface_mean_mm", "surface_p95_mm", "volume_mm3", "voxels"),
+        *("area_ratio", "folded", "nonmanifold_edges", "nonmanifold_edges_two_labels"),
     }
     assert set(median["fem"]["0.3"]) == {"averages", "cg_iterations", "cond", "lambda_max"}
     assert set(median["fem"]["0.3"]["averages"]) == {"gauss", "mean"}

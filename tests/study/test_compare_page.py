@@ -62,6 +62,8 @@ def fake_run(seed, scale, order=1):
             volume_mm3=72000.0 / 4**k, mesh_volume_mm3=72000.0 / 4**k * some(0.8, 1.1) * (k < 3),
             surface_mean_mm=some(0.4, 2.0) if k < 3 else None, surface_p95_mm=some(3.0, 5.0) if k < 3 else None,
             components=1, mesh_components=int(random.integers(1, 4)) * (k < 3),
+            area_ratio=some(0.9, 1.8) if k < 3 else None, folded=some(0.0, 0.5) if k < 3 else None,
+            nonmanifold_edges=10 * k, nonmanifold_edges_two_labels=5 * k,
         )
         for k in range(4)
     ]  # fmt: skip
@@ -245,6 +247,14 @@ DERIVED = {
     (JUDGED, "largest label volume error"): lambda rows: max(
         abs(r.mesh_volume_mm3 / r.volume_mm3 - 1) for r in rows[1:3]
     ),
+    (JUDGED, "label area over smoothed voxels', mean by voxels"): lambda rows: np.average(
+        [r.area_ratio for r in rows[1:3]], weights=[r.voxels for r in rows[1:3]]
+    ),
+    (JUDGED, "label edges folded over 60°, mean by voxels"): lambda rows: np.average(
+        [r.folded for r in rows[1:3]], weights=[r.voxels for r in rows[1:3]]
+    ),
+    (JUDGED, "label edges in more than two facets"): lambda rows: sum(r.nonmanifold_edges for r in rows[1:3]),
+    (JUDGED, "of these, where two labels meet"): lambda rows: sum(r.nonmanifold_edges_two_labels for r in rows[1:3]),
     (JUDGED, "labels in more or fewer pieces"): lambda rows: sum(r.mesh_components != 1 for r in rows[1:3]),
     (JUDGED, "labels lost (of any size)"): lambda rows: 1,
 }
@@ -354,15 +364,17 @@ def test_a_lost_label_is_not_averaged_away(tmp_path):
     """Its surface has no distance: the mean over the other labels would make losing it pay."""
     report = fake_report()
     lose(report.pipelines[0].runs[0], 2)
-    cell = headline(page_of(tmp_path, report))[JUDGED, "mean label surface distance, mm"][0]
-    assert cell == [{"tetopt", "lost"}, ["–", "loses: no value"]]
+    for title in ("mean label surface distance, mm", "label edges folded over 60°, mean by voxels"):
+        cell = headline(page_of(tmp_path, report))[JUDGED, title][0]
+        assert cell == [{"tetopt", "lost"}, ["–", "loses: no value"]]
 
 
 def lose(run, label):
     labels = run.measurement.labels
     labels[label] = labels[label]._replace(
-        is_lost=True, dice=0.0, surface_mean_mm=None, surface_p95_mm=None, mesh_volume_mm3=0.0
-    )
+        is_lost=True, dice=0.0, surface_mean_mm=None, surface_p95_mm=None, mesh_volume_mm3=0.0, area_ratio=None,
+        folded=None,
+    )  # fmt: skip
 
 
 def test_labels_are_tabled_and_the_vanished_named(tmp_path):
@@ -390,6 +402,8 @@ def test_labels_are_tabled_and_the_vanished_named(tmp_path):
             mean, p95 = np.median([(row.surface_mean_mm, row.surface_p95_mm) for row in known], axis=0)
             percent = 100 * np.median([row.mesh_volume_mm3 / row.volume_mm3 - 1 for row in of_runs])
             expected = [f"{dice[-1]:.3f}", f"{mean:.2f} / {p95:.2f} mm", f"vol. {percent:+.1f} %".replace("-", "−")]
+            area, folded = np.median([(row.area_ratio, row.folded) for row in known], axis=0)
+            expected.append(f"area {area:.2f}, folded {100 * folded:.0f} %")
             assert texts == expected + ["lost in 1 of 3 runs"] * (len(known) == 2)
         if dice:
             assert [("best" in classes) for classes, _ in cells] == [d == max(dice) for d in dice]
@@ -538,7 +552,7 @@ def test_the_sentence_counts_what_the_table_marks(tmp_path):
     assert f"It loses in {n_lost}:" in page
     assert n_best > 0 < n_lost
     titles = {criterion.title for criterion in criteria(fake_report()) if criterion.better == 0}
-    assert titles == {"nodes", "tetrahedra", "λ max"}
+    assert titles == {"nodes", "tetrahedra", "label area over smoothed voxels', mean by voxels", "λ max"}
 
 
 def test_different_sizes_are_said(tmp_path):

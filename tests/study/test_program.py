@@ -44,6 +44,17 @@ def test_number_of_nodes_is_corrected(tmp_path):
     assert log.read_text().splitlines()[0] == "1000 [0, 7]"
 
 
+@pytest.mark.parametrize("kind", ["labelled", "rough-labelled"])
+def test_cells_have_the_labels_of_the_program(kind):
+    """Those of the image, on the cells that are left when flat ones are taken off; not others, nor without labels."""
+    made = by_program(JOB._replace(labels=class_labels(IMAGE, 2)), parse_program(command(kind)))
+    number = np.arange(len(made.mesh.cells))
+    np.testing.assert_array_equal(made.labels, np.where(number % 2 == 0, number // 2 % 2, -1))
+    n_known = (number % 2 == 0).sum()
+    assert made.notes[-1] == f'{n_known} of {len(number)} cells count for the "label" that its file gives them'
+    assert by_program(JOB, parse_program(command(kind))).labels is None
+
+
 def test_sizes_instead_of_numbers(tmp_path):
     """{size} shrinks as the number grows, by its cube root; no shell reads the words."""
     script = tmp_path / "by size.py"

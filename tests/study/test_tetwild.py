@@ -97,10 +97,11 @@ def test_shaken_boundary_is_put_back():
     low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
     rng = np.random.default_rng(0)
     shaken = mesh.points + rng.uniform(-0.4, 0.4, mesh.points.shape)
-    points, cells = tetwild.put_on_box(shaken, mesh.cells, low, high)
+    points, cells, kept = tetwild.put_on_box(shaken, mesh.cells, low, high)
     v = volumes(points, cells)
     assert v.min() > 0.0
     assert v.sum() == pytest.approx(IMAGE.volume, rel=1e-12)
+    np.testing.assert_array_equal(np.unique(mesh.cells[kept], return_inverse=True)[1].reshape(-1, 4), cells)
     assert np.array_equal(points.min(axis=0), low)
     assert np.array_equal(points.max(axis=0), high)
 

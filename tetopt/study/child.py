@@ -22,6 +22,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from tetopt.errors import InputError
 from tetopt.mesh import Mesh
 from tetopt.study.pipelines import Job, Produced
@@ -38,6 +41,7 @@ class Outcome(NamedTuple):
     peak_bytes: int  # largest resident memory of the child, interpreter and libraries included
     notes: list[str]
     failure: str | None  # one line, None if all went well
+    labels: NDArray[np.int64] | None = None  # of each cell, if the pipeline gives them any
 
 
 def run_in_child(
@@ -147,9 +151,9 @@ def _kill_group(child: subprocess.Popen) -> None:
 
 def _outcome(folder: Path, code: int, peak: int, failure: str | None) -> Outcome:
     if failure is None and code == 0:
-        (mesh, seconds, notes), own_peak = pickle.loads((folder / "result.pickle").read_bytes())
+        (mesh, seconds, notes, labels), own_peak = pickle.loads((folder / "result.pickle").read_bytes())
         # Checked, and its arrays locked again: pickle does not keep that.
-        return Outcome(Mesh(mesh.points, mesh.cells), seconds, max(peak, own_peak), notes, None)
+        return Outcome(Mesh(mesh.points, mesh.cells), seconds, max(peak, own_peak), notes, None, labels)
     return Outcome(None, {}, peak, [], failure or _failure(code, folder / "stderr.txt"))
 
 

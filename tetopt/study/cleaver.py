@@ -105,7 +105,7 @@ def stuffed(image: Image, labels: Image, nodes: int, order: int = 1) -> Filled:
     points, cells, n_removed = runs[0].result
     search = time.perf_counter() - begin - runs[0].seconds
     try:
-        points, cells = put_on_box(points, cells, low, high)
+        points, cells, _ = put_on_box(points, cells, low, high)
     except InputError as error:
         notes.append(f"its boundary is not on the box's faces: {error}")
     if n_removed:

@@ -34,6 +34,7 @@ from tetopt.io.files import save_json
 from tetopt.io.images import sha256
 from tetopt.io.meshes import load_mesh, save_mesh
 from tetopt.measure.fidelity import cell_labels, label_fidelity
+from tetopt.measure.interfaces import label_interfaces
 from tetopt.measure.quality import quality, rho_histogram
 from tetopt.mesh import Mesh
 from tetopt.model.averages import element_young, young_image
@@ -178,8 +179,13 @@ def _earlier_dofs(path: Path, choice: dict[str, Any]) -> int | None:
 # One mesh, measured.
 
 
-def measured(standard: Standard, mesh: Mesh, percent: float, order: int = 1) -> Measurement:
-    """Everything that is compared of a mesh with cells of this order, compressed by `percent` of its height."""
+def measured(
+    standard: Standard, mesh: Mesh, percent: float, order: int = 1, of_cell: NDArray[np.int64] | None = None
+) -> Measurement:
+    """Everything that is compared of a mesh with cells of this order, compressed by `percent` of its height.
+
+    `of_cell` (M,) are the labels that its pipeline gives the cells; of most of its voxels a cell's where -1, or None.
+    """
     image = standard.image
     moments = cell_moments(image, mesh)
     owner = cell_of_voxel(image, mesh)
@@ -205,15 +211,22 @@ def measured(standard: Standard, mesh: Mesh, percent: float, order: int = 1) -> 
         quality=quality(mesh.points, mesh.cells),
         rho_histogram=Histogram(edges.tolist(), share.tolist()),
         dihedral_histogram=Histogram(angle_edges.tolist(), (angles / angles.sum()).tolist()),
-        labels=_label_rows(standard, mesh, moments.mean, owner),
+        labels=_label_rows(standard, mesh, of_cell, moments.mean, owner),
         fem={nu: _simulation(standard, mesh, order, each, percent) for nu, each in references.items()},
         not_compressed=not_compressed,
     )
 
 
-def _label_rows(standard: Standard, mesh: Mesh, means: NDArray[np.float64], owner: NDArray[np.int64]) -> list[LabelRow]:
-    """A row for each label of the image: `LabelFidelity`, the voxels of its cells, E_D's share."""
-    of_cell = cell_labels(standard.labels, mesh)
+def _label_rows(
+    standard: Standard,
+    mesh: Mesh,
+    of_cell: NDArray[np.int64] | None,
+    means: NDArray[np.float64],
+    owner: NDArray[np.int64],
+) -> list[LabelRow]:
+    """A row for each label of the image: `LabelFidelity`, `LabelInterface`, the voxels of its cells, E_D's share."""
+    of_voxels = cell_labels(standard.labels, mesh)
+    of_cell = of_voxels if of_cell is None else np.where(of_cell < 0, of_voxels, of_cell)
     label = standard.labels.data.ravel().astype(np.int64)
     # Outside of the mesh there is label 0, as `label_fidelity` has it.
     painted = np.bincount(np.where(owner >= 0, of_cell[owner], 0).ravel(), minlength=int(label.max()) + 1)
@@ -227,8 +240,13 @@ def _label_rows(standard: Standard, mesh: Mesh, means: NDArray[np.float64], owne
             volume_mm3=row.volume, mesh_volume_mm3=row.mesh_volume,
             surface_mean_mm=row.distance_mean, surface_p95_mm=row.distance_p95,
             components=row.components, mesh_components=row.mesh_components,
+            area_ratio=surface.area_ratio, folded=surface.folded, nonmanifold_edges=surface.nonmanifold_edges,
+            nonmanifold_edges_two_labels=surface.nonmanifold_edges_two_labels,
         )
-        for row in label_fidelity(standard.labels, mesh, of_cell)
+        for row, surface in zip(
+            label_fidelity(standard.labels, mesh, of_cell), label_interfaces(standard.labels, mesh, of_cell),
+            strict=True,
+        )
     ]  # fmt: skip
 
 
@@ -419,14 +437,16 @@ def _attempt(bench: Bench, name: str, order: int, nodes: int, repeat: int) -> At
     attempt = Attempt(key, outcome.failure, outcome.notes, run=None)
     if outcome.mesh is not None:
         try:
-            measurement = measured(bench.standard, outcome.mesh, settings.percent, order)
+            measurement = measured(bench.standard, outcome.mesh, settings.percent, order, outcome.labels)
         except (InputError, RuntimeError, ArithmeticError, np.linalg.LinAlgError) as error:
             attempt = attempt._replace(failure=f"its mesh cannot be measured: {error}")
     if outcome.mesh is None or attempt.failure is not None:
         bench.say(f"{title}: {attempt.failure}")
         return attempt
     mesh_path = path.with_suffix(".vtu")
-    save_mesh(mesh_path, outcome.mesh, cell_fields(outcome.mesh, comparison.image))
+    fields = cell_fields(outcome.mesh, comparison.image)
+    fields |= {} if outcome.labels is None else {"label": outcome.labels}
+    save_mesh(mesh_path, outcome.mesh, fields)
     total = sum(seconds for step, seconds in outcome.seconds.items() if step not in UNTIMED_STEPS)
     done = Run(outcome.seconds, total, outcome.peak_bytes, measurement)
     save_json(path, as_json(attempt._replace(run=done, mesh_file_sha256=sha256(mesh_path))))

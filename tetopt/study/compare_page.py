@@ -143,6 +143,11 @@ def _label_criteria(report: Report) -> list[Criterion]:
 
         return of_run
 
+    def by_voxels(value: Callable[[LabelRow], Any]) -> Callable[[Run], float | None]:
+        weighed = over(sum, lambda row: None if value(row) is None else judged[row.label] * value(row))
+        total = sum(judged.values())
+        return lambda run: None if (whole := weighed(run)) is None else whole / total
+
     def mean(values: list[float]) -> float:
         return sum(values) / len(values)
 
@@ -154,6 +159,10 @@ def _label_criteria(report: Report) -> list[Criterion]:
         ("smallest label Dice", over(min, attrgetter("dice")), 1),
         ("mean label surface distance, mm", over(mean, attrgetter("surface_mean_mm")), -1),
         ("label surface distance p95, mm", over(mean, attrgetter("surface_p95_mm")), -1),
+        ("label area over smoothed voxels', mean by voxels", by_voxels(attrgetter("area_ratio")), 0),
+        ("label edges folded over 60°, mean by voxels", by_voxels(attrgetter("folded")), -1),
+        ("label edges in more than two facets", over(sum, attrgetter("nonmanifold_edges")), -1),
+        ("of these, where two labels meet", over(sum, attrgetter("nonmanifold_edges_two_labels")), -1),
         ("largest label volume error", over(largest_error, _volume_error), -1),
         ("labels in more or fewer pieces", over(sum, lambda row: row.mesh_components != row.components), -1),
         ("labels lost (of any size)", _n_lost, -1),
@@ -590,6 +599,8 @@ class LabelMedians(NamedTuple):
     volume_error: float | None  # share of the volume in the image
     pieces: float | None
     E_D_share: float | None
+    area_ratio: float | None  # of its surface over that of its voxels smoothed
+    folded: float | None  # share of its edges folded sharper than 60 degrees
     n_lost: int  # runs in which nothing carries it
     n_runs: int
 
@@ -601,10 +612,12 @@ def _label_medians(pipeline: PipelineResult, label: int) -> LabelMedians:
         values = [number for row in rows if (number := value(row)) is not None]
         return float(np.median(values)) if values else None
 
-    names = ("dice", "surface_mean_mm", "surface_p95_mm", "mesh_components", "E_D_share")
-    dice, mean, p95, pieces, share = (median(attrgetter(name)) for name in names)
+    names = ("dice", "surface_mean_mm", "surface_p95_mm", "mesh_components", "E_D_share", "area_ratio", "folded")
+    dice, mean, p95, pieces, share, area, folded = (median(attrgetter(name)) for name in names)
     n_lost = sum(row.is_lost for row in rows)
-    return LabelMedians(dice, mean, p95, median(_volume_error), pieces, share, n_lost, len(rows))
+    return LabelMedians(
+        dice, mean, p95, median(_volume_error), pieces, share, area, folded, n_lost, len(rows)
+    )  # fmt: skip
 
 
 def _labels_html(report: Report, pictures: Sequence[str]) -> list[str]:
@@ -619,9 +632,11 @@ def _labels_html(report: Report, pictures: Sequence[str]) -> list[str]:
     open_, folded = order[:UNFOLDED_LABELS], order[UNFOLDED_LABELS:]
     origin = f"The labels of {report.labels.name}." if report.labels else "Classes of the voxels' intensities."
     how = (
-        f"{origin} Each cell counts for the label that most of its voxels carry. In the table, for each label and mesh:"
-        " Dice; mean and 95th percentile of the distance between the label's surfaces in mesh and image, both ways; "
-        f"error of its volume. Labels on which {done[first].title} has the lowest Dice come first."
+        f"{origin} Each cell counts for the label that its mesher gives it, or else most of its voxels carry. In the "
+        "table, for each label and mesh: Dice; mean and 95th percentile of the distance between the label's surfaces "
+        "in mesh and image, both ways; error of its volume; area of its surface over that of its voxels smoothed "
+        "(vtkSurfaceNets3D), and share of its edges folded sharper than 60°. Labels on which "
+        f"{done[first].title} has the lowest Dice come first."
     )
     heads = {label: _label_words(report, label) for label in voxels}
     words = [paragraph_html(how), _vanished_html(done, medians, voxels, heads), *pictures]
@@ -678,6 +693,8 @@ def _label_cell(each: LabelMedians) -> str:
     if each.volume_error is not None:
         percent = round(100.0 * each.volume_error, 1) + 0.0  # no -0.0
         parts.append(f"<small>vol. {percent:+.1f} %</small>".replace("-", "−"))
+    if each.area_ratio is not None and each.folded is not None:
+        parts.append(f"<small>area {each.area_ratio:.2f}, folded {100.0 * each.folded:.0f} %</small>")
     if each.n_lost:
         parts.append(f'<small class="failed">lost in {each.n_lost} of {each.n_runs} runs</small>')
     return "".join(parts)

@@ -71,7 +71,10 @@ class Histogram(NamedTuple):
 
 
 class LabelRow(NamedTuple):
-    """What a mesh makes of one label (`tetopt.measure.fidelity.LabelFidelity`), its voxels painted by the cells."""
+    """What a mesh makes of one label, its voxels painted by the cells, and what its surface is like.
+
+    As `tetopt.measure.fidelity.LabelFidelity` and `tetopt.measure.interfaces.LabelInterface` have it.
+    """
 
     label: int
     voxels: int
@@ -85,6 +88,10 @@ class LabelRow(NamedTuple):
     surface_p95_mm: float | None
     components: int
     mesh_components: int
+    area_ratio: float | None  # of its surface over that of its voxels smoothed; None where it has none, as the next
+    folded: float | None
+    nonmanifold_edges: int
+    nonmanifold_edges_two_labels: int
 
 
 class Solved(NamedTuple):

@@ -9,6 +9,7 @@ from functools import partial
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tetopt.engine.fast import prepare_kernels
 from tetopt.engine.loop import UNIFORM_ITERATIONS, UNIFORM_K_D
@@ -44,6 +45,7 @@ class Produced(NamedTuple):
     mesh: Mesh  # fills the image's box, unless a note says otherwise
     seconds: dict[str, float]  # by step, in their order
     notes: list[str]
+    labels: NDArray[np.int64] | None = None  # (M,) of each cell, of the job's; of most of its voxels where -1, or None
 
 
 UNTIMED_STEPS = {  # steps that a run's total does not count, and why

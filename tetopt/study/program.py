@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides, is_on_sides
@@ -26,7 +27,7 @@ from tetopt.geometry.simplex import oriented
 from tetopt.geometry.topology import boundary_facets
 from tetopt.image import Image
 from tetopt.io.images import save_image, sha256
-from tetopt.io.meshes import MESH_SUFFIXES, load_mesh
+from tetopt.io.meshes import MESH_SUFFIXES, MeshFile, load_mesh
 from tetopt.mesh import Mesh
 from tetopt.study.interfaces import class_labels
 from tetopt.study.pipelines import PIPELINES, Job, Pipeline, Produced
@@ -114,29 +115,30 @@ def by_program(job: Job, program: Program) -> Produced:
     with tempfile.TemporaryDirectory(prefix="program-") as name:
         paths = _inputs(Path(name), job, program.command)
 
-        def run(factor: float) -> Mesh | None:
+        def run(factor: float) -> MeshFile | None:
             request = max(round(factor * job.nodes), LEAST_REQUEST)
             values = paths | {"nodes": str(request), "size": f"{node_spacing(job.image, request):.6g}"}
             try:
-                mesh = _run(program.name, [_filled(word, values) for word in words], _output(words, values["output"]))
+                loaded = _run(program.name, [_filled(word, values) for word in words], _output(words, values["output"]))
             except InputError as error:
                 if not sizes:
                     raise
                 notes.append(f"asked for {request} nodes: {error}")
                 return None
-            sizes.append(node_count(mesh.points, mesh.cells, job.order))
-            return mesh
+            sizes.append(node_count(loaded.mesh.points, loaded.mesh.cells, job.order))
+            return loaded
 
         most = PROGRAM_RUNS if is_steered else 1
         first = corners_for(job.nodes, job.order) / job.nodes
         runs = tries(run, lambda _: sizes[-1], job.nodes, REQUEST_RESPONSE, first=first, most=most)
-    mesh = runs[0].result
+    loaded = runs[0].result
     if not is_near(runs[0].n_nodes, job.nodes):
         counts = ", ".join(map(str, sizes))
         notes.append(f"{runs[0].n_nodes} nodes, {job.nodes} were asked for; its runs gave {counts}")
-    mesh, on_box = boxed(job.image, mesh)
+    mesh, kept, on_box = boxed(job.image, loaded.mesh)
+    labels, of_labels = _own_labels(loaded, kept, job)
     seconds = {"program": runs[0].seconds, "search": sum(each.seconds for each in runs[1:])}
-    return Produced(mesh, seconds, [f"{len(runs)} runs", *notes, *on_box])
+    return Produced(mesh, seconds, [f"{len(runs)} runs", *notes, *on_box, *of_labels], labels)
 
 
 def _inputs(folder: Path, job: Job, command: str) -> dict[str, str]:
@@ -159,7 +161,17 @@ def _output(words: list[str], stem: str) -> Path:
     return Path(stem + next(suffix for word in words if (suffix := _suffix(word)) is not None))
 
 
-def _run(name: str, command: list[str], output: Path) -> Mesh:
+def _own_labels(loaded: MeshFile, kept: NDArray[np.int64], job: Job) -> tuple[NDArray[np.int64] | None, list[str]]:
+    """The label that a program gives each cell kept, as "label" in its file, -1 if it is none of the image's."""
+    labels = loaded.cell_data.get("label")
+    if labels is None or job.labels is None or labels.ndim != 1:
+        return None, []
+    is_known = np.isin(labels[kept], np.unique(job.labels.data))
+    note = f'{is_known.sum()} of {len(kept)} cells count for the "label" that its file gives them'
+    return np.where(is_known, labels[kept], -1).astype(np.int64), [note]
+
+
+def _run(name: str, command: list[str], output: Path) -> MeshFile:
     """One run; its mesh, in three dimensions, its cells positively oriented."""
     output.unlink(missing_ok=True)
     try:
@@ -175,26 +187,26 @@ def _run(name: str, command: list[str], output: Path) -> Mesh:
         raise InputError(f"{name} ended with {how}{said}")
     if not output.is_file():
         raise InputError(f"{name} wrote no mesh{said}")
-    mesh = load_mesh(output).mesh
-    if mesh.ndim != 3:
+    loaded = load_mesh(output)
+    if loaded.mesh.ndim != 3:
         raise InputError(f"{name}: expected tetrahedra, got triangles")
-    return mesh
+    return loaded
 
 
-def boxed(image: Image, mesh: Mesh) -> tuple[Mesh, list[str]]:
-    """The mesh with its boundary on the sides of the image's box, if it lies near them, and notes on that.
+def boxed(image: Image, mesh: Mesh) -> tuple[Mesh, NDArray[np.int64], list[str]]:
+    """The mesh with its boundary on the sides of the image's box, if it lies near them, its cells, and notes on that.
 
     A mesh whose boundary lies farther off than `NEAR_BOX_VOXELS`, or which does not fill the box then, stays as it is.
     """
-    sides = box_sides(image.shape)
+    sides, every = box_sides(image.shape), np.arange(len(mesh.cells))
     index = image.to_index(mesh.points)
     facets = boundary_facets(mesh.cells)
     off = np.abs(index[facets][..., None] - sides).max(axis=1).reshape(len(facets), -1)  # of each of the six sides
     distance = float(off.min(axis=1).max())
     if distance <= ON_SIDE_VOXELS:
-        return mesh, []
+        return mesh, every, []
     if distance > NEAR_BOX_VOXELS:
-        return mesh, [f"its boundary lies up to {distance:.3g} voxels off the sides of the image's box"]
+        return mesh, every, [f"its boundary lies up to {distance:.3g} voxels off the sides of the image's box"]
     # Stretched onto the box first, which turns no cell inside out: a mesh of padded labels is too wide by half a voxel.
     low, high = index.min(axis=0), index.max(axis=0)
     index = sides[:, 0] + (index - low) * (sides[:, 1] - sides[:, 0]) / (high - low)
@@ -203,12 +215,12 @@ def boxed(image: Image, mesh: Mesh) -> tuple[Mesh, list[str]]:
         index = np.where(np.abs(index - sides[:, side]) <= ROUGH_SIDE_VOXELS, sides[:, side], index)
     is_flat = np.any(np.all(is_on_sides(index, sides, 0.0)[mesh.cells], axis=1), axis=(1, 2))
     try:
-        points, cells = put_on_box(index * image.spacing, mesh.cells[~is_flat], *(sides.T * image.spacing))
+        points, cells, kept = put_on_box(index * image.spacing, mesh.cells[~is_flat], *(sides.T * image.spacing))
     except InputError as error:
-        return mesh, [f"its boundary is not on the box's faces: {error}"]
+        return mesh, every, [f"its boundary is not on the box's faces: {error}"]
     world = image.to_world(points / image.spacing)
     note = f"its boundary was moved by up to {distance:.2g} voxels onto the sides of the image's box"
-    return Mesh(world, oriented(world, cells)), [note]
+    return Mesh(world, oriented(world, cells)), every[~is_flat][kept], [note]
 
 
 def file_checksums(program: Program) -> list[str]:

@@ -102,7 +102,7 @@ def filled(image: Image, surfaces: Surfaces, nodes: int, order: int = 1) -> Fill
     notes: list[str] = []
     for each in runs:
         try:
-            points, cells = put_on_box(*each.result, surfaces.low, surfaces.high)
+            points, cells, _ = put_on_box(*each.result, surfaces.low, surfaces.high)
         except InputError as error:
             notes.append(f"a run with {each.n_nodes} nodes was left out: {error}")
             continue
@@ -173,7 +173,7 @@ def _sizing_field(surfaces: Surfaces, edge: float) -> tuple[NDArray, NDArray, ND
 
 def put_on_box(
     points: NDArray[np.float64], cells: NDArray[np.int64], low: NDArray[np.float64], high: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+) -> tuple[NDArray[np.float64], NDArray[np.int64], NDArray[np.int64]]:
     """The mesh with its boundary, which runs along the box's faces within the envelope, exactly on them.
 
     Each boundary facet goes onto the face it is nearest to. Cells that become flat (all four nodes on one face) are
@@ -191,6 +191,8 @@ def put_on_box(
     -------
     points, cells
         Nodes that no cell uses are gone; all volumes positive and adding up to the box's.
+    kept : (K,) int64
+        Which of the cells these are.
 
     Raises
     ------
@@ -199,6 +201,7 @@ def put_on_box(
     """
     points = points.copy()
     faces = np.stack([low, high])
+    kept = np.arange(len(cells))
     while True:
         is_on = _box_faces_of_nodes(points, cells, faces)  # [node, side, axis]
         for side in (0, 1):
@@ -206,7 +209,7 @@ def put_on_box(
         is_flat = is_on[cells].all(axis=1).reshape(-1, 6).any(axis=1)
         if not is_flat.any():
             break
-        cells = cells[~is_flat]
+        cells, kept = cells[~is_flat], kept[~is_flat]
     is_fixed = np.any(is_on[np.unique(cells)], axis=1)
     points, cells = compacted(points, cells)
     points = _untangled(points, cells, is_fixed)
@@ -215,7 +218,7 @@ def put_on_box(
         raise InputError(f"{int((v <= 0.0).sum())} cells turn inside out on the box's faces")
     if abs(v.sum() / np.prod(high - low) - 1.0) > 1e-9:
         raise InputError(f"the cells fill {v.sum() / np.prod(high - low):.6f} of the box")
-    return points, cells
+    return points, cells, kept
 
 
 def _box_faces_of_nodes(
