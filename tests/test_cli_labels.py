@@ -66,6 +66,16 @@ def test_the_table_prints_names(folder, capsys):
     assert "bright" not in capsys.readouterr().out
 
 
+def test_a_label_without_cells_is_named(folder, tmp_path, capsys):
+    labels = tetopt.load_image(folder / "l.nii.gz")
+    data = labels.data.copy()
+    data[1, 1, 1] = 9.0
+    tetopt.save_image(tmp_path / "l.nii.gz", tetopt.Image(data, labels.affine))
+    words = ["mesh", folder / "a.nii.gz", "--labels", tmp_path / "l.nii.gz", "--label-names", folder / "t.csv"]
+    assert exit_code(*words, "--spacing", "8", "--iterations", "0", "-o", tmp_path / "a.vtu") == 0
+    assert "no cell has label 9 (spleen), of 200 voxels or fewer" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize("mesh", ["named.vtu", "plain.vtu"])
 def test_laws_and_loads_by_name(folder, tmp_path, mesh, capsys):
     more = [] if mesh == "named.vtu" else ["--label-names", folder / "t.csv"]

@@ -12,6 +12,7 @@ from tetopt.cli.console import show_error, show_warning
 from tetopt.cli.options import Method
 from tetopt.engine.loop import Optimized
 from tetopt.geometry.simplex import dihedral_angles, volumes
+from tetopt.model.labels import label_words
 from tetopt.target.content import Content
 
 MASK_DICE = 0.9  # of a mesh with its mask, at least: below it the cells are larger than parts of the mask
@@ -63,15 +64,16 @@ def _lost(measured: dict[str, Any]) -> Iterator[str]:
     """Labels of more than 200 voxels that no cell carries, a mask that the mesh hardly meets; warns of lesser ones."""
     labels, mask = measured.get("labels", []), measured.get("mask")
     lost = [row for row in labels if row.is_lost]
-    large = [str(row.label) for row in lost if row.voxels > LABEL_VOXELS]
+    words = {row.label: label_words(row.label, measured.get("label_names", {})) for row in labels}
+    large = [words[row.label] for row in lost if row.voxels > LABEL_VOXELS]
     if large:
         yield (
             f"no cell has label {', '.join(large)}, of more than {LABEL_VOXELS} voxels; allow more nodes, or a higher "
             "--label-weight"
         )
-    if small := [str(row.label) for row in lost if row.voxels <= LABEL_VOXELS]:
+    if small := [words[row.label] for row in lost if row.voxels <= LABEL_VOXELS]:
         show_warning(f"no cell has label {', '.join(small)}, of {LABEL_VOXELS} voxels or fewer")
-    poor = [str(row.label) for row in labels if row.voxels > LABEL_VOXELS and row.dice < LABEL_DICE]
+    poor = [words[row.label] for row in labels if row.voxels > LABEL_VOXELS and row.dice < LABEL_DICE]
     if poor := [label for label in poor if label not in large]:
         first = ", ".join(poor[:5]) + (f" and {len(poor) - 5} more" if len(poor) > 5 else "")
         show_warning(f"Dice below {LABEL_DICE} for label {first}: cells are too large for them, or these are no labels")
