@@ -372,3 +372,91 @@ def cheapest_way(cells, costs, sources, ends):
         for one, other in [*pairs, *([b, a] for a, b in pairs)]:
             way[other] = min(way[other], way[one] + (0.0 if other in ends else costs[other]))
     return min(way[end] for end in ends)
+
+
+# Memberships of labels
+
+
+def distances_across(inside):
+    """Of each voxel to the nearest centre of the other kind, cut off at 8."""
+    voxels = list(np.ndindex(inside.shape))
+    distance = np.zeros(inside.shape)
+    for p in voxels:
+        others = [sum((a - b) ** 2 for a, b in zip(p, q, strict=True)) for q in voxels if inside[q] != inside[p]]
+        distance[p] = min(8.0, min(others) ** 0.5)
+    return distance
+
+
+def blurred(values, sigma, is_padded=False):
+    """By a Gaussian cut off at 3 sigma; beyond the sides the nearest value goes on, or 0 where it is padded."""
+    reach = int(3.0 * sigma + 0.5)
+    weights = [np.exp(-0.5 * (k / sigma) ** 2) for k in range(-reach, reach + 1)]
+    for axis, n in enumerate(values.shape):
+        result = np.zeros(values.shape)
+        for p in np.ndindex(values.shape):
+            for k, weight in zip(range(-reach, reach + 1), weights, strict=True):
+                i = p[axis] + k
+                if 0 <= i < n or not is_padded:
+                    q = (*p[:axis], min(max(i, 0), n - 1), *p[axis + 1 :])
+                    result[p] += weight / sum(weights) * values[q]
+        values = result
+    return values
+
+
+def largest_around(values, reach):
+    """The largest value in the cube of voxels at most `reach` away along each axis."""
+    result = np.zeros(values.shape)
+    for p in np.ndindex(values.shape):
+        cube = tuple(slice(max(i - reach, 0), i + reach + 1) for i in p)
+        result[p] = max(values[cube].ravel())
+    return result
+
+
+def volume_missing(level, inside):
+    """By how much a level is to be lowered in each voxel, so that it has the label's volume within 3 voxels."""
+    mean, square = level, np.zeros(level.shape)
+    for axis, n in enumerate(level.shape):
+        filtered = np.zeros(level.shape)
+        for p in np.ndindex(level.shape):
+            before, after = ((*p[:axis], min(max(p[axis] + k, 0), n - 1), *p[axis + 1 :]) for k in (-1, 1))
+            filtered[p] = 0.75 * mean[p] + 0.125 * (mean[before] + mean[after])
+            square[p] += max(abs(level[p] - level[before]), abs(level[after] - level[p])) ** 2
+        mean = filtered
+    blocks = tuple(-(-n // 2) for n in level.shape)
+    missing, area = np.zeros(blocks), np.zeros(blocks)
+    for p in np.ndindex(level.shape):
+        distance = mean[p] / min(max(square[p] ** 0.5, 0.3), 1.0)
+        block = tuple(i // 2 for i in p)
+        missing[block] += inside[p] - min(max(0.5 - distance, 0.0), 1.0)
+        area[block] += abs(distance) < 0.5
+    missing, area = blurred(missing, 1.5, True), blurred(area, 1.5, True)
+    lowered = np.where(area > 0.01 * 2**level.ndim, missing / np.maximum(area, 1e-3), 0.0)
+    result = np.zeros(level.shape)
+    for p in np.ndindex(level.shape):  # multilinear between the blocks' centres
+        for corner in product((0, 1), repeat=level.ndim):
+            weight, q = 1.0, []
+            for i, n, c in zip(p, blocks, corner, strict=True):
+                at = min(max((i + 0.5) / 2 - 0.5, 0.0), n - 1.0)
+                low = int(at)
+                weight *= at - low if c else 1.0 - (at - low)
+                q.append(min(low + c, n - 1))
+            result[p] += weight * lowered[tuple(q)]
+    return result
+
+
+def smooth_level(inside):
+    """A label's level on voxels that are nearly cubes."""
+    distance = distances_across(inside)
+    sign = np.where(inside, -1.0, 1.0)
+    size = distance - 0.5
+    least = np.maximum(size - 1.0, 0.05)
+    most = np.where(size <= 0.5, 0.95, size + 1.0)
+    reach = np.minimum(largest_around(distance * inside, 6), largest_around(distance * ~inside, 6))
+    share = np.clip((reach - 4.0) / 3.0, 0.0, 1.0)
+    level = sign * size
+    for _ in range(4):
+        fine, broad = ((once := blurred(level, sigma)) + blurred(level - once, sigma) for sigma in (1.0, 3.0))
+        smooth = fine + share * (broad - fine)
+        smooth = smooth - volume_missing(smooth, inside)
+        level = sign * np.clip(sign * smooth, least, most)
+    return np.clip(level, -6.0, 6.0)
