@@ -209,9 +209,13 @@ def _interfaces(mesh: Mesh, labels: NDArray[np.int64]) -> dict[tuple[int, int], 
     other = np.where(of_cell[..., 0] == own, of_cell[..., 1], of_cell[..., 0])
     there = np.where(other >= 0, labels[other], -1)
     rows = np.argwhere(there > labels[:, None])
-    pairs = np.column_stack([labels[rows[:, 0]], there[rows[:, 0], rows[:, 1]]])
-    kinds, which = np.unique(pairs, axis=0, return_inverse=True)
-    return {(a, b): rows[which.ravel() == k] for k, (a, b) in enumerate(kinds.tolist())}
+    values, rank = np.unique(labels, return_inverse=True)
+    other_rank = np.searchsorted(values, there[rows[:, 0], rows[:, 1]])
+    pairs, which = np.unique(rank.ravel()[rows[:, 0]] * len(values) + other_rank, return_inverse=True)
+    ends = np.cumsum(np.bincount(which.ravel(), minlength=len(pairs)))[:-1]
+    parts = np.split(rows[np.argsort(which.ravel(), kind="stable")], ends) if len(pairs) else []
+    kinds = zip(values[pairs // len(values)].tolist(), values[pairs % len(values)].tolist(), strict=True)
+    return dict(zip(kinds, parts, strict=True))
 
 
 def _checked_labels(labels: ArrayLike, mesh: Mesh) -> NDArray[np.int64]:
