@@ -197,23 +197,30 @@ def _with_volume(level: NDArray[np.float32], raw: NDArray[np.bool_], sigma: floa
     area = _summed((np.abs(distance) < 0.5).astype(np.float32), sigma)
     lowered = np.where(area > 0.01 * VOLUME_BLOCK**level.ndim, missing / np.maximum(area, 1e-3), 0.0)
     spread = _spread(lowered, (VOLUME_BLOCK,) * level.ndim)
-    return level - spread[tuple(slice(n) for n in level.shape)].astype(np.float32)
+    return level - spread[tuple(slice(n) for n in level.shape)]
 
 
 def _slope(level: NDArray[np.float32]) -> NDArray[np.float32]:
     """Of the gradient, with the larger difference along each axis; across a thin sheet those of both sides cancel."""
     square = np.zeros_like(level)
     for axis in range(level.ndim):
-        step = np.abs(np.diff(level, axis=axis, prepend=level.take([0], axis), append=level.take([-1], axis)))
-        before, after = (step.take(range(k, k + level.shape[axis]), axis) for k in (0, 1))
-        square += np.maximum(before, after) ** 2
+        step = np.moveaxis(np.diff(level, axis=axis) ** 2, axis, 0)
+        along = np.moveaxis(square, axis, 0)
+        if len(step):
+            along[0] += step[0]
+            along[-1] += step[-1]
+            along[1:-1] += np.maximum(step[1:], step[:-1])
     return np.sqrt(square)
 
 
 def _summed(values: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
     """Sums over blocks of voxels, weighed by a Gaussian over the blocks around."""
-    for axis, n in enumerate(values.shape):
-        values = np.add.reduceat(values, np.arange(0, n, VOLUME_BLOCK), axis)
+    for axis in range(values.ndim):
+        parts = np.moveaxis(values, axis, 0)
+        total = parts[::VOLUME_BLOCK].copy()
+        for first in range(1, VOLUME_BLOCK):
+            total[: len(parts[first::VOLUME_BLOCK])] += parts[first::VOLUME_BLOCK]
+        values = np.moveaxis(total, 0, axis)
     return gaussian_filter(values, sigma / VOLUME_BLOCK, mode="constant", truncate=3.0)
 
 
@@ -224,9 +231,10 @@ def _spread(data: NDArray, factors: Sequence[int]) -> NDArray:
             n = data.shape[axis]
             at = np.clip(finer_index(n, factor), 0.0, n - 1.0)
             below = np.minimum(at.astype(np.int64), max(n - 2, 0))
-            share = (at - below).reshape((-1,) + (1,) * (data.ndim - 1 - axis))
+            share = (at - below).astype(data.dtype).reshape((-1,) + (1,) * (data.ndim - 1 - axis))
             above = np.minimum(below + 1, n - 1)
-            data = np.take(data, below, axis) * (1.0 - share) + np.take(data, above, axis) * share
+            low = np.take(data, below, axis)
+            data = low + (np.take(data, above, axis) - low) * share
     return data
 
 
