@@ -16,6 +16,7 @@ from tetopt.io.images import load_image, save_image
 from tetopt.io.label_tables import load_label_table
 from tetopt.io.meshes import load_mesh, save_mesh
 from tetopt.measure.fidelity import cell_labels, label_fidelity, mask_fidelity
+from tetopt.measure.interfaces import label_interfaces
 from tetopt.measure.quality import quality
 from tetopt.mesh import Mesh
 from tetopt.model.build import model_of
@@ -46,6 +47,7 @@ __all__ = [
     "content",
     "foreground",
     "label_fidelity",
+    "label_interfaces",
     "lattice",
     "load_image",
     "load_label_table",

@@ -177,6 +177,20 @@ def test_a_ball_of_cells():
     assert (background.area, background.n_facets, background.mesh_euler) == (0.0, 0, 0)
 
 
+def test_small_labels_have_no_ratio():
+    """Their nets collapse: of a single voxel to nothing."""
+    labels = np.zeros((9, 9, 9))
+    labels[1:7, 1:7, 1:7], labels[8, 8, 8] = 1, 2
+    _, cube, voxel = label_interfaces(*blocky(labels))
+    assert cube.area_ratio == cube.area / cube.smooth_area > 1.0
+    assert np.isnan(voxel.area_ratio)
+    assert voxel.area == pytest.approx(6.0)
+    assert voxel.smooth_area < 0.1
+    labels = np.zeros((9, 9))
+    labels[1:7, 1:7], labels[8, 8] = 1, 2
+    assert [np.isnan(row.area_ratio) for row in label_interfaces(*blocky(labels))] == [False, False, True]
+
+
 def test_a_circle_of_pixels():
     at = np.stack(np.meshgrid(*[np.arange(40)] * 2, indexing="ij"), axis=-1)
     nets = smooth_surface(np.linalg.norm(at - 19.3, axis=-1) < 15.0, np.diag([0.5, 0.5, 1.0]))

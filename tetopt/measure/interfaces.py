@@ -2,7 +2,8 @@
 
 A label's surface are the facets between the cells that carry it and all else: other labels, and what lies outside of
 the mesh, so that it is closed. It is compared with a smooth surface of the label's voxels, closed likewise:
-surface nets (Gibson 1998), relaxed within a voxel's diagonal, by VTK's vtkSurfaceNets3D.
+surface nets (Gibson 1998), relaxed within a voxel's diagonal, by VTK's vtkSurfaceNets3D. These shrink what is small: a
+perfect ball has 1.16 times their area at a radius of 6 voxels, 1.04 at 12 and 1.01 at 20, a tube 1.15 at 4, 1.07 at 8.
 
 Pieces, holes and cavities are those of the label's inside, without its surface: cells hang together by facets, voxels
 by faces (6 neighbours, and 26 outside), so that a ring that closes in an edge or a node alone has no hole.
@@ -33,6 +34,7 @@ from tetopt.target.labels import check_labels
 
 FOLD_DEGREES = 60.0  # by which the normals at a ridge turn where it is folded; a dihedral angle under 120 degrees
 NET_ITERATIONS = 16  # of the relaxation of surface nets, and the next: VTK's own values
+NET_VOXELS = {2: 34, 3: 200}  # by dimension: the nets of fewer shrink by half of their area and more
 NET_RELAXATION = 0.5  # the share of the way to the neighbours' mean that a point goes in each
 
 
@@ -42,7 +44,7 @@ class LabelInterface(NamedTuple):
     label: int
     area: float  # of its surface in the mesh, mm^(n-1)
     smooth_area: float  # of the smooth surface of its voxels, mm^(n-1)
-    area_ratio: float  # of the two; nan without cells
+    area_ratio: float  # of the two; nan without cells, or of fewer voxels than `NET_VOXELS`
     folded: float  # share of the surface's edges at which it turns by more than 60 degrees; nan without cells
     n_facets: int  # of its surface
     nonmanifold_edges: int  # in more than two of its facets
@@ -107,13 +109,14 @@ def label_interfaces(labels: Image, mesh: Mesh, of_cell: ArrayLike) -> list[Labe
     rows = []
     for label in present.tolist():
         is_label = np.pad(voxels[boxes[label]] == label, 1)
+        is_large = np.count_nonzero(is_label) >= NET_VOXELS[mesh.ndim]
         smooth_area = float(surface_areas(smooth_surface(is_label, labels.affine)).sum())
         rows.append(
             LabelInterface(
                 label=label,
                 area=float(area[label]),
                 smooth_area=smooth_area,
-                area_ratio=float(area[label]) / smooth_area if area[label] > 0.0 else np.nan,
+                area_ratio=float(area[label]) / smooth_area if area[label] > 0.0 and is_large else np.nan,
                 folded=float(n_folded[label] / n_paired[label]) if n_paired[label] else np.nan,
                 euler=voxel_euler(is_label),
                 cavities=voxel_cavities(is_label),
