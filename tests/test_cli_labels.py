@@ -150,9 +150,13 @@ def test_what_is_refused(folder, tmp_path, capsys):
     assert "no cell has label 9 (spleen); there are 0 (soft tissue), 1 (bright/ball [é])" in said
     said = refused(capsys, "convert", mesh, out, "--young", "5", "--load", "hold:interface_soft_tissue_bright_ball")
     assert f"did you mean {INTERFACE}?" in said
+    other = "hold:interface_bright_ball_e_soft_tissue"
+    assert f"did you mean {INTERFACE}?" in refused(capsys, "convert", mesh, out, "--young", "5", "--load", other)
     image, labels = folder / "a.nii.gz", ["--labels", folder / "l.nii.gz"]
     plan = ["mesh", image, "-o", out, "--spacing", "8", "--iterations", "0"]
     assert "--label-names: there are no --labels" in refused(capsys, *plan, *names)
+    said = refused(capsys, *plan, *labels, *names, "--young", "5", "--load", other)  # before the optimisation
+    assert said.endswith(f"did you mean {INTERFACE}?\n")
     assert "did you mean spleen" in refused(capsys, *plan, *labels, *names, "--young", "splen=5,*=20")
     assert "--label-names: there are no --labels" in refused(capsys, "quality", mesh, *names)
     assert "--label-names: there are no --labels" in refused(capsys, "compare", image, "-o", tmp_path / "c", *names)

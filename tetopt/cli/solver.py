@@ -25,7 +25,7 @@ from tetopt.model.build import labels_of, model_of
 from tetopt.model.fields import NODE_MODULI
 from tetopt.model.labels import TABLE_TEXT, table_of_words, table_words
 from tetopt.model.laws import checked_young, parse_any_law
-from tetopt.model.loads import check_steps, count_of_steps, known_set, load_words, parse_load
+from tetopt.model.loads import check_steps, count_of_steps, known_set, load_words, other_orders, parse_load
 from tetopt.model.materials import DEFAULT_NU, Materials, Spacing
 from tetopt.model.model import SPACES, STRESS_UNITS, Model, element_facets, elements, half_turned, scaled
 from tetopt.model.sets import (
@@ -260,7 +260,8 @@ def check_early(output: Path, solver: SolverOptions, image: Image, build: Callab
     for request in requests:
         check_free_names(request, model.sets)
     for name in loaded:
-        if name and name not in names and not name.startswith("interface_"):
+        may_come = name.startswith("interface_") and not other_orders(name, model.sets)
+        if name and name not in names and not may_come:
             known_set(name, model.sets)
     file_bytes(output, model, space=solver.space, units=solver.units)
 

@@ -189,10 +189,16 @@ def known_set(name: str, sets: Sets) -> str:
     if name in sets.cells:
         first = ", ".join(list(sets.facets)[:8])
         raise InputError(f'load: "{name}" is a set of cells; give one of facets, such as {first}')
-    similar = [each for each in sets.facets if each.lower() == name.lower()]
+    similar = [each for each in sets.facets if each.lower() == name.lower()] or other_orders(name, sets)
     similar = similar or difflib.get_close_matches(name, sets.facets, 1)
     hint = f"did you mean {similar[0]}?" if similar else f"there are {', '.join(sets.facets)}"
     raise InputError(f'load: there is no set of facets "{name}"; {hint}')
+
+
+def other_orders(name: str, sets: Sets) -> list[str]:
+    """The facet sets of the same words in another order, as an interface named from its other side would be."""
+    words = sorted(name.lower().split("_"))
+    return [each for each in sets.facets if each != name and sorted(each.lower().split("_")) == words]
 
 
 def _compression(load: Load, mesh: Mesh, sets: Sets) -> list[Load]:
