@@ -179,6 +179,29 @@ def test_a_ball_is_one_piece_with_a_manifold_surface(seed):
     assert len(result.lost) == 0
 
 
+def test_tension_takes_half_of_a_label_at_most():
+    """A ball smaller than three times the tension in radius would wither away; here it and its noise would."""
+    mesh, image, counts = ball(11, 3.0, seed=0)
+    result = solved(mesh.points, mesh.cells, None, counts=counts, weight=5.0)
+    assert result.n_moved > 200
+    assert volumes(mesh.points, mesh.cells[result.labels == 1]).sum() / image.data.sum() > 0.45
+
+
+def test_a_disc_in_the_plane():
+    shape = (30, 28)
+    image = tetopt.Image(1.0 * (distance(shape, 14.2, 13.1) < 8.0))
+    mesh = tetopt.lattice(image, blocks=(9, 9))
+    counts = np.zeros((len(mesh.cells), 2))
+    np.add.at(counts, (cell_of_voxel(image, mesh).ravel(), image.data.ravel().astype(int)), 1.0)
+    loose = np.random.default_rng(2).random(len(counts)) < 0.05
+    counts[loose] = counts[loose][:, ::-1]
+    result = solved(mesh.points, mesh.cells, None, counts=csr_array(counts))
+    assert result.pieces.tolist() == [1, 1]
+    assert (result.n_nonmanifold_edges, result.n_nonmanifold_nodes) == (0, 0)
+    assert naive.nonmanifold(mesh.cells, result.labels) == {}
+    assert volumes(mesh.points, mesh.cells[result.labels == 1]).sum() == pytest.approx(image.data.sum(), rel=0.1)
+
+
 def two_balls(gap):
     """A lattice with a large ball and a small one, each cell full of one label but for a share `gap` along a line."""
     mesh, image, counts = ball(radius=5.0)
