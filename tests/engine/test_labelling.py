@@ -260,6 +260,16 @@ def test_a_label_of_one_cell_stays_and_one_without_is_lost():
     assert result.lost.tolist() == [3]
 
 
+def test_no_label_goes_for_a_bridge():
+    """Three triangles in a row: the only way between the outer ones is the only cell of another label."""
+    points = np.array([[0.0, 0.0], [2.0, 0.0], [1.0, 1.5], [3.0, 1.5], [4.0, 0.0]])
+    cells = np.array([[0, 1, 2], [1, 3, 2], [1, 4, 3]])
+    counts = csr_array([[1.0, 0.0], [0.08, 0.1], [1.0, 0.0]])
+    result = solved(points, cells, None, counts=counts, pieces=[np.array([2])] * 2, weight=1e-9)
+    assert result.labels.tolist() == [0, 1, 1]
+    assert len(result.lost) == 0
+
+
 def test_pieces_of_voxels():
     partition = np.array([[0, 0, 1, 1], [1, 0, 0, 1], [1, 1, 0, 3]])
     sizes = voxel_pieces(partition, 4)

@@ -359,7 +359,8 @@ def _without_fragments(
         if (labels[number == piece] != of_piece[piece]).any():  # another bridge goes over it
             continue
         count = _bridge(bridge, way, before, dual, labels, np.flatnonzero(number == piece), most[piece])
-        if count > 0:
+        n_of, n_taken = (np.bincount(of, minlength=len(pieces)) for of in (labels, labels[bridge[:count]]))
+        if count > 0 and ((n_taken == 0) | (n_taken < n_of)).all():  # no label goes for it
             labels[bridge[:count]] = of_piece[piece]
             is_loose[bridge[:count]] = is_loose[number == piece] = False
             is_bridge[bridge[:count]] = True
