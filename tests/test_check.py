@@ -75,6 +75,7 @@ def test_two_cubes_that_touch(corner, words):
     assert tetopt.check_mesh(alone, is_whole=False) == problems
     assert tetopt.check_mesh(alone, is_whole=False, is_manifold=False) == []
     check_unfolded(alone)  # what an optimisation asks for
+    assert tetopt.check_mesh(alone, is_whole=False, is_manifold=False, of_cell=np.ones(len(alone.cells))) == []
     inner = [] if words is None else [words.format("the interface of two labels", " (0 and 1 at 1)", *used[here])]
     assert tetopt.check_mesh(mesh, of_cell=of_cell) == inner
     with pytest.raises(tetopt.InputError, match="whole number from 0 for each of the mesh's"):

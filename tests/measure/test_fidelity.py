@@ -302,6 +302,19 @@ def test_lost_label():
     assert background.dice == 2 * 511 / (511 + 512)
 
 
+def test_cells_without_a_voxel():
+    """Five cells to a block of half a voxel along x: of two blocks one may hold the centre, on their common side."""
+    labels = np.zeros((4, 4, 4))
+    labels[2:] = 3
+    image = tetopt.Image(labels)
+    mesh = blocky(image, (8, 4, 4))
+    rows = label_fidelity(image, mesh)
+    is_empty = tetopt.cell_moments(image, mesh).n_voxels == 0
+    of_cell = cell_labels(image, mesh)
+    assert [row.n_empty_cells for row in rows] == [is_empty[of_cell == row.label].sum() for row in rows]
+    assert 0 < is_empty.sum() < len(mesh.cells)
+
+
 def test_label_that_fills_the_box_has_no_distance():
     (row,) = label_fidelity(tetopt.Image(np.ones((4, 4))), tetopt.lattice(tetopt.Image(np.ones((4, 4))), nodes=20))
     assert np.isnan(row.distance_mean)

@@ -101,6 +101,19 @@ def test_euler_numbers(kind, euler, cavities):
     assert broken(inside) == broken(background) == (0, 0, 0, 0)
 
 
+def test_a_cavity_is_open_where_corners_meet():
+    """A hollow cube with a voxel taken out of a corner: what is within touches what is around, in a point."""
+    labels = np.zeros((5, 5, 5))
+    labels[1:4, 1:4, 1:4] = 1
+    labels[2, 2, 2] = 0
+    for hole, cavities in ((None, 1), ((1, 1, 1), 0), ((1, 1, 2), 0), ((3, 3, 3), 0)):
+        opened = labels.copy()
+        opened[(2, 2, 2) if hole is None else hole] = 0
+        row = label_interfaces(*blocky(opened))[1]
+        assert (row.cavities, row.mesh_cavities) == (cavities, cavities)
+        assert row.euler == row.mesh_euler
+
+
 @pytest.mark.parametrize("n", [2, 3])
 @pytest.mark.parametrize("seed", range(4))
 def test_cells_that_are_voxels_have_their_numbers(n, seed):
