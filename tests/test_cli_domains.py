@@ -230,6 +230,7 @@ def test_a_volume_of_a_4d_file(inputs, tmp_path, capsys):
         ("--mask mask.nii.gz --background 3", "--mask and --background: give one of them"),
         ("--background dark", '--background: expected a number, got "dark"'),
         ("--label-weight 2", "--label-weight: there are no --labels"),
+        ("--smooth-interfaces 1", "--smooth-interfaces: there are no --labels"),
         ("--weights 1,2", "weights: expected one for each of 1 images, 0 or 0.001 to 1000, got"),
         ("--weights 1,x", '--weights: expected a number, got "x"'),
         ("--mask empty.nii.gz", "empty.nii.gz: "),

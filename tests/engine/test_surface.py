@@ -262,10 +262,10 @@ def test_put_on_surface():
     before = ticks.copy()
     matrix = image.affine[:3, :3].copy()
     is_frozen = np.zeros((40, 4), dtype=bool)
-    is_frozen[20:, 2] = True
+    is_frozen[20:, 2] = is_frozen[:, 3] = True
     objective, sides = objective_of(grid_, matrix, 3.0), sides_of(grid_, matrix, False, region_level)
     state = build(np.empty((0, 4), dtype=np.int64), ticks, is_frozen, objective, sides)
-    normal = np.empty((2, 3))
+    normal = np.zeros((7, 3))
     reached = np.array([put_on_surface(normal, state, k) for k in range(40)])
     assert reached.mean() > 0.8
     there = ticks[reached] * 2.0**-grid_.bits

@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
 import numpy as np
+from numpy.typing import NDArray
 from rich.markup import escape
 
 import tetopt
@@ -136,7 +137,9 @@ def _run(task: Task, begin: float) -> Outcome:
     def watch(initial: Mesh, run: Run) -> Optimized:
         if not begun and (solver.are_any() or output.suffix.lower() != ".vtu"):
             about = task.source.about
-            check_early(output, solver, content.image, lambda early: _model(task, initial, early, about, is_told=False))
+            check_early(
+                output, solver, task.source.image, lambda early: _model(task, initial, early, about, is_told=False)
+            )
         begun.append(time.perf_counter())
         log.print(escape(_described(task, initial)))
         prepare(content, options["k_D"], plan.mode)
@@ -168,10 +171,13 @@ def _described(task: Task, initial: Mesh) -> str:
     return ", ".join([f"{source.paths[0]}: {size} voxels of {spacing} mm", *more]) + f"; {start}"
 
 
-def _model(task: Task, mesh: Mesh, solver: SolverOptions, about: dict[str, Any], is_told: bool = True) -> Model:
+def _model(
+    task: Task, mesh: Mesh, solver: SolverOptions, about: dict[str, Any], is_told: bool = True,
+    labels: NDArray[np.int64] | None = None,
+) -> Model:  # fmt: skip
     """The mesh with all that the options say of it."""
     source, started = task.source, task.started
-    fields = source.fields(mesh)
+    fields = source.fields(mesh, labels)
     own = Sets({}, {}) if started is None else surviving_sets(started.mesh, started.sets, mesh)
     if started is not None and is_told:
         lost = [name for kind in (0, 1) for name in started.sets[kind] if name not in own[kind]]
@@ -184,7 +190,7 @@ def _model(task: Task, mesh: Mesh, solver: SolverOptions, about: dict[str, Any],
         if "young" in started.cell_data or started.text("loads") is not None:
             log.print("moduli and loads of the mesh that is improved are not kept; give --young and --load")
     known_sets = all_sets(mesh, box_of(source.contrasts[0]), fields, own, source.table.names, is_told=is_told)
-    return solver_model(mesh, source.content.image, solver, fields, about, known_sets)
+    return solver_model(mesh, source.image, solver, fields, about, known_sets)
 
 
 def _write(task: Task, outcome: Outcome, begin: float) -> tuple[Model, dict[str, Any]]:
@@ -196,10 +202,10 @@ def _write(task: Task, outcome: Outcome, begin: float) -> tuple[Model, dict[str,
         options["nodes"] = result.nodes
     about = {**source.about, "options": options}
     try:
-        model = with_chosen_sets(_model(task, result.mesh, solver, about), output.mesh, solver)
+        model = with_chosen_sets(_model(task, result.mesh, solver, about, labels=result.labels), output.mesh, solver)
         save_for_solver(output.mesh, model, solver)
     except InputError as error:  # hours may have gone into the mesh
-        bare = _model(task, result.mesh, SolverOptions(), about, is_told=False)
+        bare = _model(task, result.mesh, SolverOptions(), about, is_told=False, labels=result.labels)
         raise save_anyway(output.mesh, bare, error) from error
     measured = fidelity(source.labels, source.mask, result.mesh, model.cell_data.get("label"))
     if not source.content.is_plain or source.content.region is not None:
@@ -223,9 +229,7 @@ def _draw(task: Task, outcome: Outcome, model: Model) -> None:
 
     source, pictures = task.source, task.plan.pictures
     image, mesh = source.contrasts[0], outcome.result.mesh
-    figures.save_run_figures(
-        pictures[:3], source.content.image, outcome.initial, outcome.result, task.start_name, image
-    )
+    figures.save_run_figures(pictures[:3], source.image, outcome.initial, outcome.result, task.start_name, image)
     if source.mask is not None:
         figures.save_figure(figures.boundary_figure(image, source.mask, mesh), pictures[3])
     if source.labels is not None:

@@ -152,6 +152,10 @@ class SourceOptions:
     weights: Annotated[str | None, option("W,...", "How much each IMAGE counts (default 1 each; 0: not at all).")] = (
         None
     )
+    smooth_interfaces: Annotated[
+        float | None,
+        option("W", "Tension of the surfaces between labels, voxels (default 0.4; 0 leaves voxels their stairs)."),
+    ] = None
     label_weight: Annotated[
         float | None, option("W", "How much the labels count beside the first IMAGE (default 1).")
     ] = None

@@ -21,7 +21,7 @@ from tetopt.model.fields import cell_fields
 from tetopt.model.labels import TABLE_TEXT, table_words
 from tetopt.model.sets import box_of
 from tetopt.target.align import aligned_contrast, aligned_labels, aligned_mask, background_level, foreground
-from tetopt.target.content import Content, content, continued
+from tetopt.target.content import SMOOTH_INTERFACES, Content, content, continued
 
 
 class Source(NamedTuple):
@@ -36,13 +36,23 @@ class Source(NamedTuple):
     about: dict[str, Any]  # names, checksums, weights and the image's box, for the mesh's file
     table: LabelTable  # of the labels
 
-    def fields(self, mesh: Mesh) -> dict[str, NDArray]:
-        """What the mesh's file holds of each cell: as `cell_fields`, means of further contrasts, and the label."""
-        fields = cell_fields(mesh, self.content.image)
+    @property
+    def image(self) -> Image:
+        """The first contrast on its own voxels; beyond a mask, around which alone they are kept, continued."""
+        return continued(self.contrasts[0], self.content.continuation)
+
+    def fields(self, mesh: Mesh, labels: NDArray[np.int64] | None = None) -> dict[str, NDArray]:
+        """What the mesh's file holds of each cell: as `cell_fields`, means of further contrasts, and the label.
+
+        `labels` (M,) are those of the optimisation; without, a cell has the label of most of its voxels.
+        """
+        fields = cell_fields(mesh, self.image)
         for number, contrast in enumerate(self.contrasts[1:], 2):
             moments = tetopt.cell_moments(continued(contrast, self.content.continuation), mesh)
             fields |= {f"mean_{number}": moments.mean, f"variance_{number}": moments.variance}
-        if self.labels is not None:
+        if labels is not None:
+            fields["label"] = labels
+        elif self.labels is not None:
             fields["label"] = cell_labels(continued(self.labels, self.content.continuation), mesh)
         return fields
 
@@ -74,6 +84,8 @@ def read_source(options: SourceOptions, label_names: Path | None = None) -> Sour
         raise InputError("--mask and --background: give one of them")
     if options.label_weight is not None and options.labels is None:
         raise InputError("--label-weight: there are no --labels")
+    if options.smooth_interfaces is not None and options.labels is None:
+        raise InputError("--smooth-interfaces: there are no --labels")
     image, beside = image_and_others(paths[0], options.part)
     contrasts = [image, *(beside(path, aligned_contrast) for path in paths[1:])]
     labels = None if options.labels is None else beside(options.labels, aligned_labels)
@@ -93,12 +105,16 @@ def read_source(options: SourceOptions, label_names: Path | None = None) -> Sour
         log.print("the image is its own labels: only these count")
         weights = [0.0]
     label_weight = 1.0 if options.label_weight is None else options.label_weight
-    represented = content(contrasts, labels, mask, weights=weights, label_weight=label_weight)
+    tension = SMOOTH_INTERFACES if options.smooth_interfaces is None else options.smooth_interfaces
+    represented = content(
+        contrasts, labels, mask, weights=weights, label_weight=label_weight, smooth_interfaces=tension
+    )
     files = [*paths[1:], *(path for path in (options.mask, options.labels) if path is not None)]
     inputs = {
         "images": [path.name for path in paths], "weights": weights,
         "mask": None if options.mask is None else options.mask.name, "background": level,
         "labels": None if options.labels is None else options.labels.name, "label_weight": options.label_weight,
+        "smooth_interfaces": None if labels is None else tension,
         "sha256": {path.name: sha256(file_and_volume(path)[0]) for path in files},
     }  # fmt: skip
     about = {"image": paths[0].name, "image_sha256": sha256(paths[0]), "inputs": inputs, "box": box_text(box_of(image))}

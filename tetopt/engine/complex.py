@@ -23,6 +23,7 @@ from tetopt.geometry.vectors import cross, difference, dot, minus, put_row, row,
 
 # A cell's volume over (sum of squared edges)^(n/2); below, it counts as inverted: an angle of 1e-3 degrees.
 FLAT_SHARE = 1e-7
+CELL_ROWS = ("cells", "labels", "across", "fluxes", "sums", "E_shape")  # of a `Complex`: one row for each cell
 
 
 class Complex(NamedTuple):
@@ -30,7 +31,9 @@ class Complex(NamedTuple):
 
     ticks: NDArray[np.int64]  # (N, 3) node positions on the sampling grid
     is_frozen: NDArray[np.bool_]  # (N, 4) axes along which each node stays; whether it stays on the mask's surface
+    meeting: NDArray[np.int64]  # (N, 4) labels of the cells around each node, where there are two or more; else -1
     cells: NDArray[np.int64]  # (C, n+1) corners, positively oriented in the world
+    labels: NDArray[np.int64]  # (C,) each cell's label, a row of the memberships; all 0 as long as none are given
     across: NDArray[np.int64]  # (C, n+1) the cell beyond each facet; -1 outside
     fluxes: NDArray[np.float64]  # (C, n+1, D) of each facet, outwards
     sums: NDArray[np.float64]  # (C, D) moment sums: their sum over the facets
@@ -53,8 +56,12 @@ class Objective(NamedTuple):
     is_graded: bool  # whether every cell's shape counts the same, whatever its size
     floor: float  # minus the cosine of the smallest dihedral angle that a move may leave; -1 for none
     safe: float  # a tetrahedron whose S^3 is up to this times its squared determinant is above the floor
-    rounding: float = 0.0  # a sum of squares up to this, over all cells, is only rounding
-    wrong_side: float = 0.0  # what a voxel on the wrong side of the mask's surface counts, in squares; see `surface`
+    rounding: float  # a sum of squares up to this, over all cells, is only rounding
+    wrong_side: float  # what a voxel on the wrong side of the mask's surface counts, in squares; see `surface`
+    n_means: int  # the first channels, of which a cell has its mean; of the others it has what its label says
+    own_column: NDArray[np.int64]  # (K,) for each label the column of a cell's sums that is its channel's
+    own_value: NDArray[np.float64]  # (K,) and its value there; 0 in the other channels of labels
+    tension: float  # weight of the area between labels a and b, times own_value[a]^2 + own_value[b]^2, per mm^(n-1)
 
 
 class Sides(NamedTuple):
@@ -65,6 +72,8 @@ class Sides(NamedTuple):
     is_fixed: bool  # whether boundary nodes stay where they are
     has_surface: bool  # whether what is not on the box's sides is on the mask's surface
     level: NDArray[np.float32]  # (s_0, s_1, s_2) its level function; (1, 1, 1) without
+    levels: NDArray[np.float32]  # (L, s_0, s_1, s_2) level functions of labels; (1, 1, 1, 1) without
+    channel: NDArray[np.int64]  # (K,) which of them is each label's
     projections: NDArray[np.float64]  # see `tetopt.engine.descent.free_projections`
     inverse: NDArray[np.float64]  # (3, 3) mm to index vectors
 
@@ -93,7 +102,9 @@ def build(
     complex_ = Complex(
         ticks,
         is_frozen,
+        np.full((len(ticks), 4), -1, dtype=np.int64),
         np.full((room, n_corners), -1, dtype=np.int64),
+        np.zeros(room, dtype=np.int64),
         np.full((room, n_corners), -1, dtype=np.int64),
         np.zeros((room, n_corners, n_sums)),
         np.zeros((room, n_sums)),
@@ -125,9 +136,9 @@ def grown(state: State, least: int = 64) -> State:
     def wider(array: NDArray) -> NDArray:
         return np.concatenate([array, np.full((more, *array.shape[1:]), -1, dtype=array.dtype)])
 
-    ticks, is_frozen, cells, across, fluxes, sums, E_shape, n_cells = state.complex
-    rows = wider(cells), wider(across), wider(fluxes), wider(sums), wider(E_shape)
-    return state._replace(complex=Complex(ticks, is_frozen, *rows, n_cells))
+    mesh = state.complex
+    wide = {name: wider(getattr(mesh, name)) for name in CELL_ROWS}
+    return state._replace(complex=mesh._replace(**wide))
 
 
 @njit(cache=True, error_model="numpy")
@@ -233,15 +244,33 @@ def outward(cells: NDArray, cell: int, k: int) -> tuple:
 
 
 @njit(cache=True, error_model="numpy")
-def image_energy(sums: NDArray, row: int, n_channels: int) -> float:
-    """Sum of squares around the mean of one cell, over all channels, from its moment sums, a row of `sums`."""
+def image_energy(sums: NDArray, row: int, label: int, objective: Objective) -> float:
+    """Sum of squares around the values of one cell, over all channels, from its moment sums, a row of `sums`.
+
+    A cell's value is its mean; of the channels of labels, once cells have labels, what its own label has there: so
+    that what a cell of one label holds of another is wrong whatever cells it is divided into.
+    """
     count = sums[row, 0]
     if count <= 0.0:
         return 0.0
-    within = sums[row, 2] - sums[row, 1] * sums[row, 1] / count
-    for d in range(3, 2 + n_channels):
+    within = sums[row, 2]
+    if objective.n_means > 0:
+        within -= sums[row, 1] * sums[row, 1] / count
+    for d in range(3, 2 + objective.n_means):
         within -= sums[row, d] * sums[row, d] / count
+    if objective.n_means < objective.n_channels:
+        value = objective.own_value[label]
+        within += value * (value * count - 2.0 * sums[row, objective.own_column[label]])
     return max(within, 0.0)
+
+
+@njit(cache=True, error_model="numpy")
+def cell_value(sums: NDArray, cell: int, label: int, channel: int, objective: Objective) -> float:
+    """What a cell that holds voxels has for a channel: its mean, or what its label has; see `image_energy`."""
+    column = 1 if channel == 0 else 2 + channel
+    if channel < objective.n_means:
+        return sums[cell, column] / sums[cell, 0]
+    return objective.own_value[label] if objective.own_column[label] == column else 0.0
 
 
 @njit(cache=True, error_model="numpy")
@@ -474,22 +503,65 @@ def settle(x: NDArray, state: State, cell: int) -> None:
 def cell_energy(state: State, cell: int) -> float:
     """A cell's share of E, Eq. (4)."""
     objective = state.objective
-    squares = image_energy(state.complex.sums, cell, objective.n_channels)
+    squares = image_energy(state.complex.sums, cell, state.complex.labels[cell], objective)
     return objective.geometry * state.complex.E_shape[cell] + objective.image * squares
 
 
-def cell_squares(state: State) -> NDArray[np.float64]:
-    """Sum of squares around its mean of each cell, (n_cells,)."""
-    sums = state.complex.sums[: state.complex.n_cells[0]]
-    firsts = sums[:, [1, *range(3, 2 + state.objective.n_channels)]]
+def cell_squares(state: State, n_means: int | None = None) -> NDArray[np.float64]:
+    """Sum of squares around its values of each cell, (n_cells,); around its means with all channels as `n_means`."""
+    n_cells, objective = int(state.complex.n_cells[0]), state.objective
+    n_means = objective.n_means if n_means is None else n_means
+    sums, labels = state.complex.sums[:n_cells], state.complex.labels[:n_cells]
+    firsts = sums[:, [1, *range(3, 2 + objective.n_channels)]][:, :n_means]
     within = sums[:, 2] - (firsts**2).sum(axis=1) / np.maximum(sums[:, 0], 1.0)
+    if n_means < objective.n_channels:
+        value, own = objective.own_value[labels], sums[np.arange(n_cells), objective.own_column[labels]]
+        within += value * (value * sums[:, 0] - 2.0 * own)
     return np.where(sums[:, 0] > 0.0, np.maximum(within, 0.0), 0.0)
 
 
-def energies(state: State) -> tuple[float, float]:
-    """Shape energy and sum of squares of the whole complex, summed in the order of the cells."""
+@njit(cache=True, error_model="numpy")
+def is_interface(complex_: Complex, cell: int, k: int) -> bool:
+    """Whether a facet lies between two labels."""
+    other = complex_.across[cell, k]
+    return other >= 0 and complex_.labels[other] != complex_.labels[cell]
+
+
+@njit(cache=True, error_model="numpy")
+def pair_tension(objective: Objective, one: int, other: int) -> float:
+    """What a mm^(n-1) between two labels costs."""
+    return objective.tension * (objective.own_value[one] ** 2 + objective.own_value[other] ** 2)
+
+
+@njit(cache=True, error_model="numpy")
+def facet_area(ticks: NDArray, a: int, b: int, c: int, objective: Objective) -> float:
+    """Area of the facet (a, b, c), mm^2, or length of the segment (a, b) with c < 0, mm."""
+    u = place(ticks, b, a, objective)
+    if c < 0:
+        return np.sqrt(dot(u, u))
+    n = cross(u, place(ticks, c, a, objective))
+    return 0.5 * np.sqrt(dot(n, n))
+
+
+@njit(cache=True, error_model="numpy")
+def interface_energy(state: State) -> float:
+    """What all facets between labels cost together."""
+    mesh, total = state.complex, 0.0
+    if state.objective.tension > 0.0:
+        for cell in range(mesh.n_cells[0]):
+            for k in range(mesh.cells.shape[1]):
+                other = mesh.across[cell, k]
+                if other > cell and is_interface(mesh, cell, k):
+                    a, b, c = outward(mesh.cells, cell, k)
+                    weight = pair_tension(state.objective, mesh.labels[cell], mesh.labels[other])
+                    total += weight * facet_area(mesh.ticks, a, b, c, state.objective)
+    return total
+
+
+def energies(state: State, n_means: int | None = None) -> tuple[float, float]:
+    """Shape energy and sum of squares (`cell_squares`) of the whole complex, summed in the order of the cells."""
     E_shape = state.complex.E_shape[: state.complex.n_cells[0]]
-    return float(E_shape.sum()), float(cell_squares(state).sum())
+    return float(E_shape.sum()), float(cell_squares(state, n_means).sum())
 
 
 # Rings: the cells around each node.

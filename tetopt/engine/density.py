@@ -32,15 +32,19 @@ from tetopt.engine.complex import (
     corner_of,
     cosine_up_to_floor,
     energies,
+    facet_area,
     facet_of,
     grown,
     has_node,
     image_energy,
+    interface_energy,
+    is_interface,
     load,
     load_cell,
     measure_facet,
     node_rings,
     outward,
+    pair_tension,
     place,
     put_flux,
     settle,
@@ -52,8 +56,17 @@ from tetopt.engine.complex import (
     wrong_side,
 )
 from tetopt.engine.flips import close_gaps
-from tetopt.engine.smooth import Blocks, blocks, colours_of, ring_energy, ring_misfit, ring_shape, trial_of
-from tetopt.engine.surface import faces_up, put_on_surface, ring_faces_up, uphill_at
+from tetopt.engine.smooth import (
+    Blocks,
+    blocks,
+    colours_of,
+    ring_energy,
+    ring_misfit,
+    ring_shape,
+    ring_tension,
+    trial_of,
+)
+from tetopt.engine.surface import MOST_MEETING, faces_up, put_on_surface, ring_faces_up, uphill_at
 from tetopt.geometry.vectors import dot, minus, put_row, row
 
 LEAST_EXCHANGE_SHARE = 1e-3  # of a node's mean share of E: an exchange of two nodes that is worth less is not made
@@ -112,7 +125,8 @@ def exchange(state: State, n_nodes: int, most: int, limits: Limits) -> Exchanged
     may_collapse = (error <= middle) | (more < -(n_before // 8))
     collapses = best_collapses(state, rings, groups, may_collapse, limits._replace(dearest=dearest))
     E_G, squares = energies(state)
-    least = LEAST_EXCHANGE_SHARE * (objective.geometry * E_G + objective.image * squares) / n_before
+    E = objective.geometry * E_G + objective.image * squares + interface_energy(state)
+    least = LEAST_EXCHANGE_SHARE * E / n_before
     least = max(least, LEAST_OVER_NOISE * objective.image * limits.noise)
     is_dirty = np.zeros(len(state.complex.cells), dtype=np.bool_)
     in_, out = _best_first(splits), _best_first(collapses)
@@ -139,7 +153,8 @@ def roomy(state: State, n_nodes: int, n_cells: int) -> State:
         state = grown(state, n_cells)
     ticks = np.concatenate([state.complex.ticks, np.zeros((n_nodes, 3), dtype=np.int64)])
     is_frozen = np.concatenate([state.complex.is_frozen, np.zeros((n_nodes, 4), dtype=np.bool_)])
-    return state._replace(complex=state.complex._replace(ticks=ticks, is_frozen=is_frozen))
+    meeting = np.concatenate([state.complex.meeting, np.full((n_nodes, 4), -1, dtype=np.int64)])
+    return state._replace(complex=state.complex._replace(ticks=ticks, is_frozen=is_frozen, meeting=meeting))
 
 
 def _compacted(state: State, is_dirty: NDArray[np.bool_], n_before: int, n_split: int, n_collapsed: int) -> Exchanged:
@@ -152,7 +167,8 @@ def _compacted(state: State, is_dirty: NDArray[np.bool_], n_before: int, n_split
     kept = np.flatnonzero(is_used)
     is_touched = np.zeros(len(kept), dtype=bool)
     is_touched[cells[is_dirty[:n_cells]]] = True
-    complex_ = state.complex._replace(ticks=state.complex.ticks[kept], is_frozen=state.complex.is_frozen[kept])
+    old = state.complex
+    complex_ = old._replace(ticks=old.ticks[kept], is_frozen=old.is_frozen[kept], meeting=old.meeting[kept])
     source = np.where(kept < n_before, kept, -1)
     return Exchanged(state._replace(complex=complex_), source, is_touched, n_split, n_collapsed)
 
@@ -257,18 +273,21 @@ def _put_middle(state: State, rings: NodeRings, a: int, b: int, p: int) -> bool:
         ticks[p, d] = (ticks[a, d] + ticks[b, d]) >> 1
         is_frozen[p, d] = (sides >> d) & 1 == 1
     is_frozen[p, 3] = sides >= 8
-    if sides > 0 and state.sides.is_fixed:
+    n_labels = labels_of_edge(state.complex.meeting[p], state, rings, a, b)
+    if (sides > 0 and state.sides.is_fixed) or n_labels > MOST_MEETING:
         return False
-    if sides < 8:
+    if sides < 8 and n_labels < 2:
         return True
-    if not state.sides.has_surface:
+    if sides >= 8 and not state.sides.has_surface:
         return False
-    uphill, middle = np.empty((2, 3)), place(ticks, p, a, state.objective)
+    uphill, middle = np.zeros((7, 3)), place(ticks, p, a, state.objective)
     if not put_on_surface(uphill, state, p):
         return False
     shift = minus(place(ticks, p, a, state.objective), middle)
     if dot(shift, shift) > MIDDLE_SHIFT_SHARE * MIDDLE_SHIFT_SHARE * squared_length(state, a, b):
         return False
+    if sides < 8:
+        return True
     uphill_at(uphill, state, p)
     for r in range(rings.start[a], rings.start[a + 1]):
         cell = rings.cells[r]
@@ -279,6 +298,35 @@ def _put_middle(state: State, rings: NodeRings, a: int, b: int, p: int) -> bool:
                     if not faces_up(state, cell, k, node, p, uphill):
                         return False
     return True
+
+
+@njit(cache=True, error_model="numpy")
+def is_among(label: int, labels: NDArray) -> bool:
+    """Whether a label is one of several."""
+    is_one = False
+    for other in labels:
+        is_one = is_one or other == label
+    return is_one
+
+
+@njit(cache=True, error_model="numpy")
+def labels_of_edge(meeting: NDArray, state: State, rings: NodeRings, a: int, b: int) -> int:
+    """The labels of the cells around an edge, to `meeting` (4,) if they are 2 to 4, else -1; how many there are."""
+    count = 0
+    for m in range(MOST_MEETING):
+        meeting[m] = -1
+    for r in range(rings.start[a], rings.start[a + 1]):
+        cell = rings.cells[r]
+        if not has_node(state.complex.cells, cell, b):
+            continue
+        label = state.complex.labels[cell]
+        if not is_among(label, meeting[: min(count, MOST_MEETING)]):
+            if count < MOST_MEETING:
+                meeting[count] = label
+            count += 1
+    if count == 1:
+        meeting[0] = -1
+    return count
 
 
 def mend(state: State, bad: NDArray[np.int64], target: float) -> Exchanged:
@@ -332,7 +380,7 @@ def _mend(state: State, rings: NodeRings, bad: NDArray, target: float, is_dirty:
 def _lift_by_collapse(x: NDArray, state: State, rings: NodeRings, a: int, b: int, target: float) -> float:
     """By how much the worst cosine around a grows if a is joined to b."""
     cells, t = state.complex.cells, state.complex.ticks
-    if not may_join(t, state.complex.is_frozen, a, b):
+    if not may_join(state, a, b):
         return -1.0
     here, old, new, size = row(t, a), target, target, 0.0
     for r in range(rings.start[a], rings.start[a + 1]):
@@ -452,6 +500,8 @@ def worth_of_split(x: NDArray, state: State, rings: NodeRings, a: int, b: int, p
                 return -np.inf
             if least > -1.0 and cosine_up_to_floor(x, objective) < least:
                 return -np.inf
+        if objective.tension > 0.0 and state.complex.meeting[p, 1] >= 0:
+            shape += _rise_of_tension(state, cell, a, b, p)
     if old - shape <= least_gain and objective.surface == 0.0:
         return -np.inf
     if objective.image == 0.0:
@@ -473,13 +523,30 @@ def worth_of_split(x: NDArray, state: State, rings: NodeRings, a: int, b: int, p
                         for d in range(D):
                             sums[half, d] += flux[0, 0, d]
             for half in range(2):
-                new += objective.image * image_energy(sums, half, objective.n_channels)
+                new += objective.image * image_energy(sums, half, state.complex.labels[cell], objective)
                 misfit += wrong_side(sums, half, objective)
             misfit -= wrong_side(state.complex.sums, cell, objective)
             if old - new <= least_gain and objective.surface == 0.0:  # else the misfit may fall yet
                 return -np.inf
     worth = old - new - misfit
     return worth if worth > least_gain else -np.inf
+
+
+@njit(cache=True, error_model="numpy")
+def _rise_of_tension(state: State, cell: int, a: int, b: int, p: int) -> float:
+    """By how much a cell's facets between labels cost more if the edge (a, b) is split at p: half of it, its share."""
+    mesh, objective, rise = state.complex, state.objective, 0.0
+    for k in range(mesh.cells.shape[1]):
+        if mesh.cells[cell, k] in (a, b) or not is_interface(mesh, cell, k):
+            continue
+        c = -1
+        for m in range(mesh.cells.shape[1]):
+            if m != k and mesh.cells[cell, m] not in (a, b):
+                c = mesh.cells[cell, m]
+        more = facet_area(mesh.ticks, a, p, c, objective) + facet_area(mesh.ticks, p, b, c, objective)
+        more -= facet_area(mesh.ticks, a, b, c, objective)
+        rise += 0.5 * pair_tension(objective, mesh.labels[cell], mesh.labels[mesh.across[cell, k]]) * more
+    return rise
 
 
 @njit(cache=True, error_model="numpy")
@@ -519,6 +586,7 @@ def split_edge(state: State, rings: NodeRings, a: int, b: int, p: int, is_dirty:
         cells[other] = cells[cell]
         across[other] = across[cell]
         fluxes[other] = fluxes[cell]
+        state.complex.labels[other] = state.complex.labels[cell]
         cells[other, i] = p
         beyond = across[cell, i]
         if beyond >= 0:
@@ -578,7 +646,7 @@ def _best_collapse(a: int, moves: EdgeMoves, state: State, rings: NodeRings, lim
         return
     n, trial = cells.shape[1], trial_of(state, rings, a)
     near, shapes = np.empty(MAX_NEIGHBOURS, dtype=np.int64), np.full(MAX_NEIGHBOURS, np.inf)
-    old, least, size = 0.0, objective.floor if n == 4 else -1.0, 0.0
+    old, least, size = ring_tension(state, rings, a), objective.floor if n == 4 else -1.0, 0.0
     for r in range(rings.start[a], rings.start[a + 1]):
         old += cell_energy(state, rings.cells[r])
         load_cell(trial.x, t, cells, rings.cells[r], objective)
@@ -589,7 +657,7 @@ def _best_collapse(a: int, moves: EdgeMoves, state: State, rings: NodeRings, lim
     _, has_misfit = ring_misfit(state, rings, a)
     for number in range(count):  # shapes are cheap, and a lower bound
         b = near[number]
-        if may_join(t, is_frozen, a, b) and _is_short(state, near, count, a, b, limits.longest):
+        if may_join(state, a, b) and _is_short(state, near, count, a, b, limits.longest):
             put_row(t, a, row(t, b))
             shapes[number] = ring_shape(trial, np.inf if has_misfit else best, least, a, state, rings, b)
             if shapes[number] < np.inf and not _keeps_domain(trial.x, state, rings, a, b, size):
@@ -630,12 +698,15 @@ def _is_short(state: State, near: NDArray, count: int, a: int, b: int, longest: 
 
 
 @njit(cache=True, error_model="numpy")
-def may_join(ticks: NDArray, is_frozen: NDArray, a: int, b: int) -> bool:
-    """Whether a may go where b is: it has to stay in the sides of the box that it is in, and on the surface.
+def may_join(state: State, a: int, b: int) -> bool:
+    """Whether a may go where b is: it has to stay in the sides of the box that it is in, and on its surfaces.
 
     The ring would lose volume otherwise (`_keeps_size`), which costs more to find out.
     """
+    ticks, is_frozen, meeting = state.complex.ticks, state.complex.is_frozen, state.complex.meeting
     may = not is_frozen[a, 3] or is_frozen[b, 3]
+    for m in range(MOST_MEETING):
+        may = may and (meeting[a, m] < 0 or is_among(meeting[a, m], meeting[b]))
     for d in range(3):
         may = may and (not is_frozen[a, d] or (is_frozen[b, d] and ticks[a, d] == ticks[b, d]))
     return may
@@ -644,6 +715,8 @@ def may_join(ticks: NDArray, is_frozen: NDArray, a: int, b: int) -> bool:
 @njit(cache=True, error_model="numpy")
 def _keeps_domain(x: NDArray, state: State, rings: NodeRings, a: int, b: int, size: float) -> bool:
     """Whether the mesh still covers what it should with a at the place of b; `size` is n! times the ring's volume."""
+    if state.complex.meeting[a, 1] >= 0 and not _stays_between_labels(state, rings, a, b):
+        return False
     if not state.complex.is_frozen[a, 3]:
         return _keeps_size(x, state, rings, a, b, size, ROUNDING_SHARE)
     return (
@@ -651,6 +724,35 @@ def _keeps_domain(x: NDArray, state: State, rings: NodeRings, a: int, b: int, si
         and _is_linked(state, rings, a, b)
         and ring_faces_up(np.empty((2, 3)), state, rings, a, b)
     )
+
+
+@njit(cache=True, error_model="numpy")
+def _stays_between_labels(state: State, rings: NodeRings, a: int, b: int) -> bool:
+    """Whether a node between labels may be joined to b so that all labels keep their topology.
+
+    All labels that meet at it do so along the whole edge, which therefore lies on the same surface or curve; what holds
+    for the boundary holds for the facets between labels (`_is_linked`), and a curve of three edges is kept.
+    """
+    meeting, other = np.empty(MOST_MEETING, dtype=np.int64), np.empty(MOST_MEETING, dtype=np.int64)
+    n_labels = labels_of_edge(meeting, state, rings, a, b)
+    for m in range(MOST_MEETING):
+        if state.complex.meeting[a, m] >= 0 and not is_among(state.complex.meeting[a, m], meeting):
+            return False
+    sides = _sides_of_edge(state, rings, a, b)
+    for d in range(3):
+        if state.complex.is_frozen[a, d] and (sides >> d) & 1 == 0:
+            return False
+    if n_labels > 2:
+        near = np.empty(MAX_NEIGHBOURS, dtype=np.int64)
+        for number in range(_neighbours(near, state.complex.cells, rings, a)):
+            c = near[number]
+            if (
+                c != b
+                and labels_of_edge(other, state, rings, a, c) > 2
+                and labels_of_edge(other, state, rings, b, c) > 2
+            ):
+                return False
+    return _is_linked(state, rings, a, b)
 
 
 @njit(cache=True, error_model="numpy")
@@ -682,14 +784,14 @@ def _is_linked(state: State, rings: NodeRings, a: int, b: int) -> bool:
 
 @njit(cache=True, error_model="numpy")
 def _is_outer(state: State, rings: NodeRings, a: int, b: int, c: int) -> bool:
-    """Whether a facet of the boundary has the nodes a and b, and c unless that is -1."""
+    """Whether a facet of the boundary, or between labels, has the nodes a and b, and c unless that is -1."""
     cells = state.complex.cells
     for r in range(rings.start[a], rings.start[a + 1]):
         cell = rings.cells[r]
         if has_node(cells, cell, b) and (c < 0 or has_node(cells, cell, c)):
             for k in range(cells.shape[1]):
-                node = cells[cell, k]
-                if state.complex.across[cell, k] < 0 and node not in (a, b, c):
+                is_outer = state.complex.across[cell, k] < 0 or is_interface(state.complex, cell, k)
+                if is_outer and cells[cell, k] not in (a, b, c):
                     return True
     return False
 

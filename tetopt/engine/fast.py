@@ -18,9 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.energy.sampling import cell_moments, cell_of_voxel, channel_grid, from_ticks
-from tetopt.engine.complex import State, copied, node_rings, remeasure
+from tetopt.engine.complex import State, copied, interface_energy, node_rings, remeasure
 from tetopt.engine.density import Limits, exchange
 from tetopt.engine.flips import flip
+from tetopt.engine.interfaces import relabel, with_labels
 from tetopt.engine.loop import (
     MIN_DIHEDRAL,
     SHAPE_POWER,
@@ -34,8 +35,8 @@ from tetopt.engine.loop import (
 )
 from tetopt.engine.paper import optimize_paper
 from tetopt.engine.repair import n_cells_below, repair
-from tetopt.engine.smooth import blocks, sweep
-from tetopt.engine.state import content_energies, state_of, with_floor
+from tetopt.engine.smooth import attract, blocks, sweep
+from tetopt.engine.state import content_energies, floor_of, state_of, with_floor
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
 from tetopt.image import Image, transformed
@@ -49,6 +50,9 @@ SWEEP_EDGES = 0.02  # edges: nodes around which none moved more are not moved ag
 EXCHANGING_SHARE = 0.7  # of the iterations: the first ones, in which nodes are exchanged
 EXCHANGED_SHARE = 0.1  # of the requested nodes: the most that are exchanged at once
 EXCHANGE_SHAPE_WEIGHT = 0.1  # of the shape energy's weight: what a shape costs in an exchange, see `Run.exchange`
+LABELLED_AT = 3  # the iteration from which cells have labels: exchanges have found thin parts, and not yet folds
+LEAST_EDGE_VOXELS = 1.0  # with labels no exchange makes a shorter edge, beside the limits on sizes
+ATTRACTED_FLOOR = 4.0  # degrees: no cell is flattened below when nodes are brought between labels
 FAR_TICKS = -(1 << 40)  # a place far from any other
 
 
@@ -141,8 +145,13 @@ def optimize(
     ended = "iterations"
     if iterations > 0:
         run.keep_floor(floor)
+    has_labels = content.memberships is not None and run.state.objective.image > 0.0
     for iteration in range(1, iterations + 1):
         before = run.state.complex.ticks.copy()
+        if has_labels and iteration == min(LABELLED_AT, iterations):
+            run.give_labels()
+        if run.has_labels:
+            run.attract()
         # 1. Move the nodes.
         is_finished = run.sweep(is_over)
         # 2. Exchange cells.
@@ -165,7 +174,7 @@ def optimize(
         if is_last and fall < tolerance:
             ended = "converged"
             break
-    return Optimized(run.mesh(), history, ended)
+    return Optimized(run.mesh(), history, ended, labels=run.labels())
 
 
 def prepare_kernels(
@@ -205,6 +214,7 @@ class Run:
         is_kept = self.is_still if boundary == "fixed" else np.zeros(len(ticks), dtype=bool)
         self.kept = dict(zip(map(tuple, ticks[is_kept].tolist()), mesh.points[is_kept], strict=True))
         self.groups, self.edge = blocks(ticks), _edges(mesh)
+        self.has_labels = False
         self.image_noise: float | None = None  # its variance, estimated when it is first needed
         self.ticks_flipped = np.full_like(ticks, FAR_TICKS)  # where nodes were when their flips were last looked at
         self.ticks_swept = np.full_like(ticks, FAR_TICKS)  # and when the nodes around them were moved because of it
@@ -222,7 +232,8 @@ class Run:
     def E(self) -> float:
         """The combined energy, Eq. (4)."""
         E_G, squares = content_energies(self.state, self.content)
-        return self.state.objective.geometry * E_G + self.state.objective.image * squares
+        objective = self.state.objective
+        return objective.geometry * E_G + objective.image * squares + interface_energy(self.state)
 
     def sweep(self, is_over: Callable[[], bool] = lambda: False) -> bool:
         """Move every node whose ring has changed since it was last moved; False if `is_over` cut it short."""
@@ -257,13 +268,28 @@ class Run:
         if self.image_noise is None:
             self.image_noise = self.content.noise
         longest = sizes.longest_edges(self.image, nodes, mesh.points, mesh.cells, self.edge, self.content.volume)
-        limits = Limits(float(sizes.smallest), longest, self.image_noise)
+        # A step of a voxel between labels always pays, though their surfaces have no detail so fine.
+        voxel = self.image.voxel_volume ** (1.0 / self.n) if self.content.memberships is not None else 0.0
+        shortest = max(float(sizes.smallest), LEAST_EDGE_VOXELS * voxel)
+        limits = Limits(shortest, longest, self.image_noise)
         eager = objective._replace(geometry=EXCHANGE_SHAPE_WEIGHT * objective.geometry)
         made = exchange(self.state._replace(objective=eager), nodes, int(EXCHANGED_SHARE * nodes), limits)
         self._renumber(made.state._replace(objective=objective), made.source)
         self.ticks_swept[made.is_touched] = FAR_TICKS
         self.ticks_flipped[made.is_touched] = FAR_TICKS
         return made.n_split + made.n_collapsed
+
+    def give_labels(self) -> None:
+        """Give each cell a label, and let nodes between labels slide from now on."""
+        self.state = with_labels(self.state, self.content, self.mesh())
+        self.has_labels = True
+        self.ticks_swept[:] = FAR_TICKS
+        self.ticks_flipped[:] = FAR_TICKS
+
+    def attract(self) -> None:
+        """Let cells take other labels where that pays, and bring nodes between labels to where those meet."""
+        relabel(self.state)
+        attract(self.state, node_rings(self.state), self.groups, floor_of(ATTRACTED_FLOOR)[0])
 
     def keep_floor(self, degrees: float) -> None:
         """Let no move leave a dihedral angle under `degrees`, nor one that is under it already any smaller."""
@@ -311,10 +337,17 @@ class Run:
         """The row of the history that tells how things stand."""
         if self.state.objective.image == 0.0:  # the moves have left the sums alone
             remeasure(self.state)
-        E_G, squares = content_energies(self.state, self.content)
+        E_G, squares = content_energies(self.state, self.content, len(self.content.values))
         n_voxels = int(self.state.complex.sums[: self.n_cells, 0].sum())
         E_D = squares * self.content.unit * self.image.voxel_volume
         return Record(iteration, self.E(), E_G, E_D, movement, is_changed, self.n_cells, n_voxels, seconds)
+
+    def labels(self) -> NDArray[np.int64] | None:
+        """The label of each cell, (M,), if they have any."""
+        members = self.content.memberships
+        if members is None or not self.has_labels:
+            return None
+        return members.labels[self.state.complex.labels[: self.n_cells]]
 
     def mesh(self) -> Mesh:
         """The mesh as it stands."""

@@ -29,11 +29,14 @@ from tetopt.engine.complex import (
     cell_cosine,
     cell_energy,
     corner_of,
+    facet_area,
     facet_of,
     grown,
     image_energy,
+    is_interface,
     load,
     outward,
+    pair_tension,
     put_flux,
     settle,
     shape_of_triangle,
@@ -69,6 +72,7 @@ class Cavity(NamedTuple):
     stack: NDArray[np.int64]  # (2 POLYGON_CORNERS, 3)
     new: NDArray[np.int64]  # (2 POLYGON_CORNERS,) the cells that will fill the cavity
     free: NDArray[np.int64]  # (1 + R,) how many cells were left over, and which
+    arc: NDArray[np.int64]  # (1,) how many cells of the first label come first; 0 if all around the edge have one label
 
 
 @njit(cache=True, error_model="numpy")
@@ -91,6 +95,7 @@ def cavity(n_free: int, D: int) -> Cavity:
         np.empty((2 * POLYGON_CORNERS, 3), dtype=np.int64),
         np.empty(2 * POLYGON_CORNERS, dtype=np.int64),
         np.zeros(1 + n_free, dtype=np.int64),
+        np.zeros(1, dtype=np.int64),
     )
 
 
@@ -149,7 +154,7 @@ def _evaluate_cells(
         for cell in range(first, min(first + CELLS_PER_CHUNK, len(gain))):
             for k in range(4):
                 other = complex_.across[cell, k]
-                if other > cell and (is_dirty[cell] or is_dirty[other]):
+                if other > cell and (is_dirty[cell] or is_dirty[other]) and not is_interface(complex_, cell, k):
                     worth = _worth_of_face(work, state, cell, k)
                     if worth > gain[cell]:
                         gain[cell], move[cell] = worth, k
@@ -210,7 +215,7 @@ def _worth_of_face(work: Cavity, state: State, cell: int, k: int) -> float:
         for d in range(sums.shape[1]):
             outer = state.complex.fluxes[cell, below, d] + state.complex.fluxes[other, above, d]
             sums[0, d] = outer + spoke[s, 0, d] - spoke[r, 0, d]
-        new += state.objective.image * image_energy(sums, 0, state.objective.n_channels)
+        new += state.objective.image * image_energy(sums, 0, state.complex.labels[cell], state.objective)
         if not new < limit:
             return -np.inf
     return old - new
@@ -309,6 +314,60 @@ def in_one_face(state: State, a: int, b: int, c: int, d: int) -> bool:
 
 
 @njit(cache=True, error_model="numpy")
+def turn_to_arcs(work: Cavity, labels: NDArray, m: int, is_open: int) -> bool:
+    """Whether the edge whose cells are in `work` may be removed without a change of topology between labels.
+
+    All of its cells have one label; or those of one label come after those of another, two or more of each. Then the
+    polygon is turned so that the first label's come first, `work.arc` of them, and the two facets between the labels
+    are exchanged for the two on the polygon's diagonal from its corner 0 to `work.arc`.
+    """
+    ring, around, n_cells = work.ring, work.around, m - is_open
+    n_changes, first = 0, 0
+    for r in range(1 if is_open == 1 else 0, n_cells):
+        if labels[around[r]] != labels[around[(r - 1) % n_cells]]:
+            n_changes += 1
+            if n_changes == 1:
+                first = r
+    work.arc[0] = 0
+    if n_changes == 0:
+        return True
+    if is_open == 1 or n_changes != 2:
+        return False
+    for r in range(m):
+        work.stack[r, 0], work.stack[r, 1] = ring[(first + r) % m], around[(first + r) % m]
+    for r in range(m):
+        ring[r], around[r] = work.stack[r, 0], work.stack[r, 1]
+    while labels[around[work.arc[0]]] == labels[around[0]]:
+        work.arc[0] += 1
+    return 2 <= work.arc[0] <= m - 2
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def joins_arcs(work: Cavity, i: int, k: int, j: int) -> bool:
+    """Whether a triangle i < k < j of the polygon would lie in two labels."""
+    t = work.arc[0]
+    return t > 0 and j > t and (0 < i < t or 0 < k < t)
+
+
+@njit(cache=True, error_model="numpy", inline="always")
+def _arc_of(work: Cavity, j: int) -> int:
+    """The first cell around the edge that has the label of the polygon's triangle with the last corner j."""
+    return work.arc[0] if 0 < work.arc[0] < j else 0
+
+
+@njit(cache=True, error_model="numpy")
+def _fall_of_tension(work: Cavity, state: State, a: int, b: int) -> float:
+    """By how much the facets between labels cost less once the edge (a, b) is removed."""
+    t, ticks, objective = work.arc[0], state.complex.ticks, state.objective
+    if t == 0 or objective.tension == 0.0:
+        return 0.0
+    u, v, labels = work.ring[0], work.ring[t], state.complex.labels
+    fall = facet_area(ticks, a, b, u, objective) + facet_area(ticks, a, b, v, objective)
+    fall -= facet_area(ticks, u, v, a, objective) + facet_area(ticks, u, v, b, objective)
+    return pair_tension(objective, labels[work.around[0]], labels[work.around[t]]) * fall
+
+
+@njit(cache=True, error_model="numpy")
 def _worth_of_edge(work: Cavity, state: State, a: int, b: int, m: int, is_open: int) -> float:
     """How much E falls if the edge (a, b) is removed, -inf if it cannot be; `work.apex` then holds the diagonals.
 
@@ -319,7 +378,9 @@ def _worth_of_edge(work: Cavity, state: State, a: int, b: int, m: int, is_open: 
     cost, apex, triangle = work.cost, work.apex, work.triangle
     if m < 3 or (is_open == 1 and not in_one_face(state, a, b, ring[0], ring[m - 1])):
         return -np.inf
-    old = 0.0
+    if not turn_to_arcs(work, state.complex.labels, m, is_open):
+        return -np.inf
+    old = _fall_of_tension(work, state, a, b)
     for r in range(m - is_open):
         old += cell_energy(state, around[r])
     limit = old * (1.0 - LEAST_FLIP_SHARE)
@@ -344,7 +405,9 @@ def _worth_of_edge(work: Cavity, state: State, a: int, b: int, m: int, is_open: 
     for i in range(m - 2):
         for k in range(i + 1, m - 1):
             for j in range(k + 1, m):
-                triangle[i, k, j] = _pair_shape(y, 2 + i, 2 + k, 2 + j, limit, state.objective)
+                triangle[i, k, j] = np.inf
+                if not joins_arcs(work, i, k, j):
+                    triangle[i, k, j] = _pair_shape(y, 2 + i, 2 + k, 2 + j, limit, state.objective)
     if not best_triangulation(cost, apex, triangle, m) < limit:
         return -np.inf
     # The floor last: few edges come so far, and its angles cost more than energies (half of a pass, when first).
@@ -397,9 +460,9 @@ def _measure_triangles(work: Cavity, state: State, a: int, b: int, m: int, is_op
             u = work.flux[0, 0, d]
             work.sums[0, d] = side_b[i, k, d] + side_b[k, j, d] - side_b[i, j, d] - u
             work.sums[1, d] = side_a[i, k, d] + side_a[k, j, d] - side_a[i, j, d] + u
+        label = state.complex.labels[work.around[_arc_of(work, j)]]
         work.triangle[i, k, j] += state.objective.image * (
-            image_energy(work.sums, 0, state.objective.n_channels)
-            + image_energy(work.sums, 1, state.objective.n_channels)
+            image_energy(work.sums, 0, label, state.objective) + image_energy(work.sums, 1, label, state.objective)
         )
     return is_new
 
@@ -551,6 +614,7 @@ def flip_face(work: Cavity, state: State, cell: int, k: int, is_dirty: NDArray) 
     other = across[cell, k]
     u, v, w = outward(cells, cell, k)
     p, q = (cells[cell, k], cells[other, facet_of(across, other, cell)])
+    label = state.complex.labels[cell]
     corner, D = np.array([u, v, w]), fluxes.shape[2]
     below, above = np.empty((3, D)), np.empty((3, D))  # fluxes of the facets opposite u, v, w
     under, over = np.empty(3, dtype=np.int64), np.empty(3, dtype=np.int64)  # the cells beyond them
@@ -577,6 +641,7 @@ def flip_face(work: Cavity, state: State, cell: int, k: int, is_dirty: NDArray) 
         s, t = (r + 1) % 3, (r + 2) % 3
         c = new[r]
         cells[c, 0], cells[c, 1], cells[c, 2], cells[c, 3] = (p, q, corner[r], corner[s])
+        state.complex.labels[c] = label
         (across[c, 0], across[c, 1], across[c, 2], across[c, 3]) = (over[t], under[t], new[s], new[t])
         for d in range(D):
             fluxes[c, 0, d], fluxes[c, 1, d] = above[t, d], below[t, d]
@@ -618,6 +683,8 @@ def remove_edge(work: Cavity, state: State, a: int, b: int, m: int, is_open: int
     Over the triangle (i, k, j), i < k < j: (v_i, v_k, v_j, b) and (v_i, v_j, v_k, a).
     """
     cells, across, ring, new = state.complex.cells, state.complex.across, work.ring, work.new
+    labels = state.complex.labels
+    one, other = labels[work.around[0]], labels[work.around[work.arc[0]]]
     beyond_a = _beyond_polygon(work, state, b, m - is_open)  # opposite b, on the side of a
     beyond_b = _beyond_polygon(work, state, a, m - is_open)
     take_cells(work, state, m - is_open, 2 * (m - 2), is_dirty)
@@ -635,6 +702,7 @@ def remove_edge(work: Cavity, state: State, a: int, b: int, m: int, is_open: int
         top, low = new[2 * t], new[2 * t + 1]  # of b, of a
         cells[top, 0], cells[top, 1], cells[top, 2], cells[top, 3] = ring[i], ring[k], ring[j], b
         cells[low, 0], cells[low, 1], cells[low, 2], cells[low, 3] = ring[i], ring[j], ring[k], a
+        labels[top] = labels[low] = one if _arc_of(work, j) == 0 else other
         join(across, top, 3, low, 3)
         _put_pair_fluxes(work, state, top, low, i, k, j)
         # The side (i, j): the triangle above, or what is beyond the closing side of the polygon.
@@ -695,6 +763,7 @@ def close_gaps(state: State, is_dirty: NDArray) -> None:
         fluxes[cell] = fluxes[last]
         sums[cell] = sums[last]
         E_shape[cell] = E_shape[last]
+        state.complex.labels[cell] = state.complex.labels[last]
         is_dirty[cell] = is_dirty[last]
         for k in range(n):
             other = across[cell, k]
@@ -720,7 +789,7 @@ def _evaluate_triangles(
         for cell in range(first, min(first + CELLS_PER_CHUNK, len(gain))):
             for k in range(3):
                 other = complex_.across[cell, k]
-                if other > cell and (is_dirty[cell] or is_dirty[other]):
+                if other > cell and (is_dirty[cell] or is_dirty[other]) and not is_interface(complex_, cell, k):
                     worth = _worth_of_turn(x, sums, state, cell, k)
                     if worth > gain[cell]:
                         gain[cell], move[cell] = worth, k
@@ -748,9 +817,8 @@ def _worth_of_turn(x: NDArray, sums: NDArray, state: State, cell: int, k: int) -
         for d in range(sums.shape[1]):  # over the edges (p, u), (u, q), and (q, v), (v, p)
             sums[0, d] = fluxes[cell, (k + 2) % 3, d] + fluxes[other, (m + 1) % 3, d] - flux[0, 0, d]
             sums[1, d] = fluxes[other, (m + 2) % 3, d] + fluxes[cell, (k + 1) % 3, d] + flux[0, 0, d]
-        new += objective.image * (
-            image_energy(sums, 0, objective.n_channels) + image_energy(sums, 1, objective.n_channels)
-        )
+        label = state.complex.labels[cell]
+        new += objective.image * (image_energy(sums, 0, label, objective) + image_energy(sums, 1, label, objective))
     return old - new if new < limit else -np.inf
 
 

@@ -58,6 +58,7 @@ class Optimized(NamedTuple):
     nodes: int | None = None  # the number that the run was to have, asked for or found to have a target error
     seconds_start: float = 0.0  # for initial meshes, over all runs towards a target error
     seconds_run: float = 0.0  # for the optimisations, likewise
+    labels: NDArray[np.int64] | None = None  # (M,) label of each cell, of a content with memberships
 
 
 def deadline(begin: float, max_seconds: float | None, stop: Callable[[], bool] | None) -> Callable[[], bool]:

@@ -19,6 +19,7 @@ from tetopt.engine.complex import (
     cell_cosine,
     facet_of,
     grown,
+    is_interface,
     load_cell,
     node_rings,
     outward,
@@ -35,11 +36,13 @@ from tetopt.engine.flips import (
     fill_side,
     flip_face,
     in_one_face,
+    joins_arcs,
     remove_edge,
     ring_of_edge,
+    turn_to_arcs,
 )
 from tetopt.engine.smooth import ring_energy, slid, store, trial_of
-from tetopt.engine.surface import projection_at
+from tetopt.engine.surface import projection_at, slides
 from tetopt.geometry.vectors import difference, dot, put_row, row, scaled, times
 
 REPAIR_ROUNDS = 40  # at most; a round that changes nothing ends them before
@@ -125,7 +128,7 @@ def _reconnect(state: State, bad: NDArray, target: float) -> int:
             continue
         best, choice = LEAST_LIFT_COSINE, -1
         for k in range(4):
-            if across[cell, k] >= 0:
+            if across[cell, k] >= 0 and not is_interface(state.complex, cell, k):
                 gain = _gain_of_face(work.x, state, cell, k, target)
                 if gain > best:
                     best, choice = gain, k
@@ -180,6 +183,8 @@ def _gain_of_edge(work: Cavity, state: State, cell: int, e: int, m: int, is_open
     a, b = cells[cell, TET_EDGES[e, 0]], cells[cell, TET_EDGES[e, 1]]
     if m < 3 or (is_open == 1 and not in_one_face(state, a, b, ring[0], ring[m - 1])):
         return -1.0
+    if not turn_to_arcs(work, state.complex.labels, m, is_open):
+        return -1.0
     old = 1.0
     for r in range(m - is_open):
         old = min(old, cell_cosine(x, state, around[r]))
@@ -189,7 +194,7 @@ def _gain_of_edge(work: Cavity, state: State, cell: int, e: int, m: int, is_open
                 above = tet_cosine(x, state, ring[i], ring[k], ring[j], b)
                 below = tet_cosine(x, state, ring[i], ring[j], ring[k], a)
                 shape[i, k, j] = np.inf
-                if min(above, below) > old:
+                if min(above, below) > old and not joins_arcs(work, i, k, j):
                     shape[i, k, j] = np.exp(-WORST_WEIGHT * above) + np.exp(-WORST_WEIGHT * below)
     if not np.isfinite(best_triangulation(cost, apex, shape, m)):
         return -1.0
@@ -242,11 +247,12 @@ def _lift(x: NDArray, state: State, rings: NodeRings, node: int, target: float) 
     start, before = row(state.complex.ticks, node), _ring_cosine(x, state, rings, node, -3.0)
     if before >= target:
         return False
-    best, step, normal = before, _first_step(x, state, rings, node), np.empty((2, 3))
+    best, step, normal = before, _first_step(x, state, rings, node), np.zeros((7, 3))
+    is_sliding = slides(normal, state, node)
     for _ in range(STEP_HALVINGS):
         is_better = True
         while is_better and best < target:
-            cosine = _step_around(x, normal, state, rings, node, step, best)
+            cosine = _step_around(x, normal, is_sliding, state, rings, node, step, best)
             is_better, best = cosine > best, cosine
         step *= 0.5
     if best > before:
@@ -275,7 +281,7 @@ def _first_step(x: NDArray, state: State, rings: NodeRings, node: int) -> float:
 
 @njit(cache=True, error_model="numpy")
 def _step_around(
-    x: NDArray, normal: NDArray, state: State, rings: NodeRings, node: int, step: float, best: float
+    x: NDArray, normal: NDArray, is_sliding: bool, state: State, rings: NodeRings, node: int, step: float, best: float
 ) -> float:
     """Move a node by a step, mm, in the one of 26 directions that leaves its ring's best cosine; that, or `best`."""
     t, P, scale = state.complex.ticks, projection_at(state, node), 2.0**-state.objective.bits
@@ -289,7 +295,7 @@ def _step_around(
         t[node, 0] = here[0] + np.int64(np.rint(way[0]))
         t[node, 1] = here[1] + np.int64(np.rint(way[1]))
         t[node, 2] = here[2] + np.int64(np.rint(way[2]))
-        if state.complex.is_frozen[node, 3] and not slid(normal, state, rings, node):
+        if is_sliding and not slid(normal, state, rings, node):
             continue
         cosine = _ring_cosine(x, state, rings, node, best)
         if cosine > best + LEAST_LIFT_COSINE:

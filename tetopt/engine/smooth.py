@@ -28,17 +28,30 @@ from tetopt.engine.complex import (
     Sides,
     State,
     cell_energy,
+    cell_value,
     cosine_up_to_floor,
+    facet_area,
     has_node,
     image_energy,
+    is_interface,
     load_cell,
     outward,
+    pair_tension,
+    place,
     put_flux,
     shape_of_cell,
     sum_up,
     wrong_side,
 )
-from tetopt.engine.surface import FLAT_RISE, normal_at, projection_at, put_on_surface, ring_faces_up
+from tetopt.engine.surface import (
+    combined_ways,
+    is_on_surface,
+    normals_at,
+    projection_at,
+    put_on_surface,
+    ring_faces_up,
+    slides,
+)
 from tetopt.geometry.topology import greedy_colours
 from tetopt.geometry.vectors import cross, difference, dot, minus, put_row, row, scaled, times
 
@@ -47,6 +60,7 @@ PART_VOXELS = 2.0  # voxels between the points at which h is then taken
 FIRST_STEP_SHARE = 0.5  # of the distance to the nearest centroid of the ring's cells: the longest first step
 PROBE_SHARE = 0.3  # of that step: how far a stalled node looks along the axes
 BLOCK_NODES = 128  # nodes in a group, at most: what they read fits the cache
+APPROACH_TRIALS = 4  # of the way to a surface: all of it, a half, ...
 LINE_TRIALS = 3  # energies measured along the gradient, at most
 
 
@@ -186,7 +200,8 @@ def _add_image_gradient(g: NDArray, state: State, rings: NodeRings, node: int) -
             if k == rings.corner[r] or twin < 0 or twin // n < r - first:
                 continue  # not a facet of the node; on the boundary, along which the node slides; or done
             other = rings.cells[first + twin // n]
-            if _has_same_means(sums, cell, other, objective.n_channels):
+            label_1, label_2 = state.complex.labels[cell], state.complex.labels[other]
+            if _has_same_values(sums, cell, other, label_1, label_2, objective):
                 continue
             a, b, c = outward(cells, cell, k)
             if n == 3:  # the segment (a, b), its normal to the right; phi of `node`
@@ -203,9 +218,9 @@ def _add_image_gradient(g: NDArray, state: State, rings: NodeRings, node: int) -
                 normal = scaled(0.5, cross(e, f))
             jump = 0.0
             for channel in range(objective.n_channels):
-                d = 1 if channel == 0 else 2 + channel
-                mean_1, mean_2 = sums[cell, d] / sums[cell, 0], sums[other, d] / sums[other, 0]
-                jump += (mean_2 - mean_1) * (2.0 * moment[channel] - (mean_1 + mean_2) * weight)
+                value_1 = cell_value(sums, cell, label_1, channel, objective)
+                value_2 = cell_value(sums, other, label_2, channel, objective)
+                jump += (value_2 - value_1) * (2.0 * moment[channel] - (value_1 + value_2) * weight)
             g0 += jump * normal[0]
             g1 += jump * normal[1]
             g2 += jump * normal[2]
@@ -215,16 +230,60 @@ def _add_image_gradient(g: NDArray, state: State, rings: NodeRings, node: int) -
 
 
 @njit(cache=True, error_model="numpy")
-def _has_same_means(sums: NDArray, cell: int, other: int, n_channels: int) -> bool:
-    """Whether two cells have the same mean in all channels, as those of the background, or one holds no voxel."""
+def _has_same_values(sums: NDArray, cell: int, other: int, label_1: int, label_2: int, objective: Objective) -> bool:
+    """Whether two cells have the same value in all channels, as those of the background, or one holds no voxel."""
     count_1, count_2 = sums[cell, 0], sums[other, 0]
     if count_1 <= 0.0 or count_2 <= 0.0:
         return True
-    is_same = True
-    for channel in range(n_channels):
+    is_same = label_1 == label_2
+    for channel in range(objective.n_means):
         d = 1 if channel == 0 else 2 + channel
         is_same = is_same and sums[cell, d] * count_2 == sums[other, d] * count_1
     return is_same
+
+
+@njit(cache=True, error_model="numpy")
+def _add_tension_gradient(g: NDArray, state: State, rings: NodeRings, node: int) -> None:
+    """Add the derivative of what the interfaces around a node cost to g (3,), per mm."""
+    mesh, objective = state.complex, state.objective
+    for r in range(rings.start[node], rings.start[node + 1]):
+        cell = rings.cells[r]
+        for k in range(mesh.cells.shape[1]):
+            other = mesh.across[cell, k]
+            if k == rings.corner[r] or other < cell or not is_interface(mesh, cell, k):
+                continue
+            weight = pair_tension(objective, mesh.labels[cell], mesh.labels[other])
+            a, b, c = outward(mesh.cells, cell, k)
+            if c < 0:
+                way = place(mesh.ticks, a if b == node else b, node, objective)
+                way = scaled(-1.0 / np.sqrt(dot(way, way)), way)
+            else:
+                if b == node:
+                    a, b, c = b, c, a
+                elif c == node:
+                    a, b, c = c, a, b
+                u, v = place(mesh.ticks, b, a, objective), place(mesh.ticks, c, a, objective)
+                n = cross(u, v)
+                way = scaled(0.5 / np.sqrt(dot(n, n)), cross(n, minus(v, u)))
+            for d in range(3):
+                g[d] += weight * way[d]
+
+
+@njit(cache=True, error_model="numpy")
+def ring_tension(state: State, rings: NodeRings, node: int) -> float:
+    """What the interfaces around a node cost as the ticks stand."""
+    mesh, total = state.complex, 0.0
+    if not (state.objective.tension > 0.0 and mesh.meeting[node, 1] >= 0):
+        return 0.0
+    for r in range(rings.start[node], rings.start[node + 1]):
+        cell = rings.cells[r]
+        for k in range(mesh.cells.shape[1]):
+            other = mesh.across[cell, k]
+            if k != rings.corner[r] and other > cell and is_interface(mesh, cell, k):
+                a, b, c = outward(mesh.cells, cell, k)
+                weight = pair_tension(state.objective, mesh.labels[cell], mesh.labels[other])
+                total += weight * facet_area(mesh.ticks, a, b, c, state.objective)
+    return total
 
 
 @njit(cache=True, error_model="numpy")
@@ -340,6 +399,7 @@ def ring_energy(
     energy = ring_shape(trial, bound, least, node, state, rings, joined)  # cheap refusals before any voxel is read
     if energy == np.inf or objective.image == 0.0:
         return energy
+    energy += ring_tension(state, rings, node)
     sums = np.empty((1, D))
     for r in range(first, rings.start[node + 1]):
         if shapes[r - first] < 0.0:
@@ -361,7 +421,7 @@ def ring_energy(
                         fluxes[twin // n, twin % n, d] = -fluxes[r - first, k, d]
             for d in range(D):
                 sums[0, d] += fluxes[r - first, k, d]
-        energy += objective.image * image_energy(sums, 0, objective.n_channels)
+        energy += objective.image * image_energy(sums, 0, state.complex.labels[cell], objective)
         misfit += wrong_side(sums, 0, objective)
         if energy > bound:
             return np.inf
@@ -401,7 +461,8 @@ class Search(NamedTuple):
     """The best place of a node so far, and room for two trials: slot[0] is that of the best, the other the next."""
 
     x: NDArray[np.float64]  # (4, 3) room for a cell's corners
-    normal: NDArray[np.float64]  # (2, 3) see `tetopt.engine.surface.normal_at`
+    normal: NDArray[np.float64]  # (7, 3) see `tetopt.engine.surface.normals_at`
+    is_sliding: bool  # whether the node stays on its surfaces
     best: NDArray[np.float64]  # (1,) the least energy of the ring
     place: NDArray[np.int64]  # (1, 3) where that is, ticks
     slot: NDArray[np.int64]  # (1,)
@@ -415,21 +476,24 @@ class Search(NamedTuple):
 def _move(node: int, state: State, rings: NodeRings) -> None:
     """Move one node down the gradient of its ring's energy, if that lowers it."""
     ticks, fluxes = state.complex.ticks, state.complex.fluxes
-    x, normal, g = np.empty((4, 3)), np.empty((2, 3)), np.zeros(3)
+    x, normal, g = np.empty((4, 3)), np.zeros((7, 3)), np.zeros(3)
     # A ring below the floor may stay as it is, but not get worse: hence the ring's own `least`.
     curvature, nearest, least = _add_shape_gradient(g, x, state, rings, node)
     if state.objective.image > 0.0:
         _add_image_gradient(g, state, rings, node)
-    step = _descent_step(normal, g, node, state)
+        if state.objective.tension > 0.0 and state.complex.meeting[node, 1] >= 0:
+            _add_tension_gradient(g, state, rings, node)
+    is_sliding = slides(normal, state, node)
+    step = _descent_step(normal, g, is_sliding, node, state)
     moved = times(state.objective.matrix, step)  # mm
     square = dot(moved, moved)
     if not square > 0.0:
         return
-    energy, size = 0.0, rings.start[node + 1] - rings.start[node]
+    energy, size = ring_tension(state, rings, node), rings.start[node + 1] - rings.start[node]
     for r in range(rings.start[node], rings.start[node + 1]):
         energy += cell_energy(state, rings.cells[r])
     search = Search(
-        x, normal, np.empty(1), np.empty((1, 3), dtype=np.int64), np.zeros(1, dtype=np.int64),
+        x, normal, is_sliding, np.empty(1), np.empty((1, 3), dtype=np.int64), np.zeros(1, dtype=np.int64),
         np.empty((2, size)), np.empty((2, size, fluxes.shape[1], fluxes.shape[2]))
     )  # fmt: skip
     search.best[0] = energy
@@ -446,15 +510,17 @@ def _move(node: int, state: State, rings: NodeRings) -> None:
 
 
 @njit(cache=True, error_model="numpy", inline="always")
-def _descent_step(normal: NDArray, g: NDArray, node: int, state: State) -> tuple:
+def _descent_step(normal: NDArray, g: NDArray, is_sliding: bool, node: int, state: State) -> tuple:
     """Down the gradient g (3,), per mm, along the axes and the surface on which the node may move; in index units."""
     down = times(projection_at(state, node), (g[0], g[1], g[2]))
     step = (-down[0], -down[1], -down[2])
-    if state.complex.is_frozen[node, 3]:
-        rise = normal_at(normal, state, node)
-        if not rise > FLAT_RISE:
+    if is_sliding:
+        count = normals_at(normal, state, node)
+        rise = dot(row(normal, 0), step), dot(row(normal, 1), step), dot(row(normal, 2), step)
+        is_found, way = combined_ways(normal, count, rise)
+        if not is_found:
             return 0.0, 0.0, 0.0
-        step = minus(step, scaled(dot(row(normal, 0), step) / rise, row(normal, 1)))
+        step = minus(step, way)
     return step
 
 
@@ -464,7 +530,7 @@ def _try_place(
 ) -> float:
     """Energy of the ring with the node at a place, ticks, or on the surface beside it; the best is kept in mind."""
     put_row(state.complex.ticks, node, place)
-    if state.complex.is_frozen[node, 3] and not slid(search.normal, state, rings, node):
+    if search.is_sliding and not slid(search.normal, state, rings, node):
         return np.inf
     slot = 1 - search.slot[0]
     value = ring_energy(Trial(search.x, search.shapes[slot], search.fluxes[slot]), limit, least, node, state, rings)
@@ -533,5 +599,60 @@ def _probe_axes(search: Search, length: float, least: float, node: int, state: S
 
 @njit(cache=True, error_model="numpy")
 def slid(normal: NDArray, state: State, rings: NodeRings, node: int) -> bool:
-    """Bring a moved node back to the surface; whether it got there, and the facets around it face as they should."""
-    return put_on_surface(normal, state, node) and ring_faces_up(normal, state, rings, node, -1)
+    """Bring a moved node back to its surfaces; whether it got there, and the mask's facets face as they should."""
+    is_there = put_on_surface(normal, state, node)
+    return is_there and (not state.complex.is_frozen[node, 3] or ring_faces_up(normal, state, rings, node, -1))
+
+
+# Nodes between labels are brought to the surface that they are to slide on.
+
+
+def attract(state: State, rings: NodeRings, groups: Blocks, floor: float) -> None:
+    """Move nodes between labels to where those meet, or as far as no cell is left flatter than `floor`, degrees.
+
+    A cell that is flatter already may get no worse. E may rise. `floor` is minus a cosine, as of an `Objective`.
+    """
+    lowered = state.objective._replace(floor=floor)
+    for chosen in colours_of(state, rings, groups):
+        with few_threads(len(chosen) * BLOCK_NODES * 20):
+            _attract(state.complex, lowered, state.sides, rings, groups, chosen)
+
+
+@njit(cache=True, parallel=True, error_model="numpy")
+def _attract(
+    complex_: Complex, objective: Objective, sides: Sides, rings: NodeRings, groups: Blocks, chosen: NDArray
+) -> None:
+    for number in prange(len(chosen)):
+        block = np.int64(chosen[number])
+        for at in range(groups.start[block], groups.start[block + 1]):
+            if complex_.meeting[groups.nodes[at], 1] >= 0:
+                _approach(groups.nodes[at], State(complex_, objective, sides), rings)
+
+
+@njit(cache=True, error_model="numpy")
+def _approach(node: int, state: State, rings: NodeRings) -> None:
+    ticks, normal, x = state.complex.ticks, np.zeros((7, 3)), np.empty((4, 3))
+    if is_on_surface(normal, state, node):
+        return
+    least = state.objective.floor
+    for r in range(rings.start[node], rings.start[node + 1]):
+        load_cell(x, ticks, state.complex.cells, rings.cells[r], state.objective)
+        if state.complex.cells.shape[1] == 4:
+            least = min(least, cosine_up_to_floor(x, state.objective))
+    here = row(ticks, node)
+    put_on_surface(normal, state, node)
+    way, share, trial = minus(row(ticks, node), here), 1.0, trial_of(state, rings, node)
+    for _ in range(APPROACH_TRIALS):
+        put_row(
+            ticks, node,
+            (
+                here[0] + np.int64(np.rint(share * way[0])),
+                here[1] + np.int64(np.rint(share * way[1])),
+                here[2] + np.int64(np.rint(share * way[2])),
+            ),
+        )  # fmt: skip
+        if ring_energy(trial, np.inf, least, node, state, rings) < np.inf:
+            store(trial, node, state, rings)
+            return
+        share *= 0.5
+    put_row(ticks, node, here)

@@ -56,9 +56,13 @@ def state_of(
     return state._replace(objective=objective)
 
 
-def content_energies(state: State, content: Content) -> tuple[float, float]:
-    """Shape energy and sum of squares, with the mask's misfit; squares that are only rounding count as 0."""
-    E_G, squares = energies(state)
+def content_energies(state: State, content: Content, n_means: int | None = None) -> tuple[float, float]:
+    """Shape energy and sum of squares, with the mask's misfit; squares that are only rounding count as 0.
+
+    Squares are around the cells' values, as `tetopt.engine.complex.image_energy` has them; with `n_means` all channels,
+    as Eq. (3) has them.
+    """
+    E_G, squares = energies(state, n_means)
     if content.region is not None:
         squares += state.objective.wrong_side * n_misfits(state, content)
     return E_G, squares if squares > state.objective.rounding else 0.0
@@ -84,7 +88,8 @@ def sides_of(
     has_surface = level is not None
     level = np.zeros((1, 1, 1), dtype=np.float32) if level is None else level.reshape(grid.shape)
     inverse = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
-    return Sides(low, high, is_fixed, has_surface, level, free_projections(matrix), inverse)
+    levels, channel = np.zeros((1, 1, 1, 1), dtype=np.float32), np.zeros(0, dtype=np.int64)
+    return Sides(low, high, is_fixed, has_surface, level, levels, channel, free_projections(matrix), inverse)
 
 
 def objective_of(grid: SamplingGrid, matrix: NDArray[np.float64], power: float, is_graded: bool = False) -> Objective:
@@ -102,6 +107,12 @@ def objective_of(grid: SamplingGrid, matrix: NDArray[np.float64], power: float, 
         is_graded=bool(is_graded),
         floor=-1.0,
         safe=np.inf,
+        rounding=0.0,
+        wrong_side=0.0,
+        n_means=int(grid.n_channels),
+        own_column=np.zeros(0, dtype=np.int64),
+        own_value=np.zeros(0),
+        tension=0.0,
     )
 
 

@@ -7,12 +7,17 @@ from numba import njit
 from numpy.typing import NDArray
 
 from tetopt.engine.complex import NodeRings, State, has_node, outward, place
-from tetopt.geometry.vectors import cross, dot, row
+from tetopt.geometry.vectors import cross, dot, row, scaled
 from tetopt.target.domain import ON_SURFACE_VOXELS
 
+NEAR_CURVE_VOXELS = 0.1  # where several surfaces meet, a place with levels as near to 0 lies on all of them
+CURVE_STEP_VOXELS = 0.7  # the longest step towards such a place: levels bend there
+CURVE_STEPS = 16  # onto a curve or a point, at most
 NEWTON_STEPS = 6  # onto the surface, at most
 OUTWARD_COSINE = 0.1  # cosine of the widest angle between a facet's normal and the way up the level at its moved node
 ASIDE_VOXELS = 0.25  # on either side of a place: where the level is taken for its slope
+MOST_MEETING = 4  # labels that a node slides between; one where more meet stays
+PARALLEL_SHARE = 1e-3  # squared sine of the angle between ways up: below, two surfaces are taken for one
 FLAT_RISE = 1e-12  # where the level rises less along the way up, steps would be divided by nothing
 
 
@@ -99,38 +104,139 @@ def projection_at(state: State, node: int) -> NDArray:
 
 
 @njit(cache=True, error_model="numpy")
-def normal_at(normal: NDArray, state: State, node: int) -> float:
-    """The shortest way up the level from a node within its sides of the box, to `normal` (2, 3) in index units.
+def _label_levels(state: State, node: int, m: int) -> tuple:
+    """The level functions of the first and the m-th of the labels that meet at a node."""
+    meeting, channel, levels = state.complex.meeting, state.sides.channel, state.sides.levels
+    return levels[channel[meeting[node, 0]]], levels[channel[meeting[node, m]]]
 
-    Its first row is the slope of the level, its second the way; returned is the rise along it.
+
+@njit(cache=True, error_model="numpy")
+def _add_slope(slope: NDArray, row: int, level: NDArray, at: tuple, sign: float) -> None:
+    """Add the slope of a level at an index position, per voxel along each axis, to slope[row]."""
+    i, j, k = at
+    slope[row, 0] += sign * 2.0 * (level_at(level, i + ASIDE_VOXELS, j, k) - level_at(level, i - ASIDE_VOXELS, j, k))
+    slope[row, 1] += sign * 2.0 * (level_at(level, i, j + ASIDE_VOXELS, k) - level_at(level, i, j - ASIDE_VOXELS, k))
+    slope[row, 2] += sign * 2.0 * (level_at(level, i, j, k + ASIDE_VOXELS) - level_at(level, i, j, k - ASIDE_VOXELS))
+
+
+@njit(cache=True, error_model="numpy")
+def constraint_values(normal: NDArray, state: State, node: int) -> int:
+    """The values of a node's constraints, to normal[6, :3]; how many there are."""
+    ticks, scale, count = state.complex.ticks, 2.0**-state.objective.bits, 0
+    i, j, k = ticks[node, 0] * scale, ticks[node, 1] * scale, ticks[node, 2] * scale
+    if state.complex.is_frozen[node, 3]:
+        normal[6, 0] = level_at(state.sides.level, i, j, k)
+        count = 1
+    for m in range(1, MOST_MEETING):
+        if state.complex.meeting[node, m] >= 0 and count < 3:
+            one, other = _label_levels(state, node, m)
+            normal[6, count] = level_at(one, i, j, k) - level_at(other, i, j, k)
+            count += 1
+    return count
+
+
+@njit(cache=True, error_model="numpy")
+def normals_at(normal: NDArray, state: State, node: int) -> int:
+    """Slopes and shortest ways up of a node's constraints within its sides of the box, in index units; their number.
+
+    `normal` is (7, 3): slopes in its first rows, ways from its fourth on.
     """
-    P = projection_at(state, node)
-    _slope_at(normal, 0, state, node)
-    rise = 0.0
-    for d in range(3):
-        normal[1, d] = 0.0
-        for m in range(3):
-            in_mm = 0.0
-            for c in range(3):
-                in_mm += state.sides.inverse[c, m] * normal[0, c]
-            normal[1, d] += P[d, m] * in_mm
-    for d in range(3):
-        rise += normal[0, d] * normal[1, d]
-    return rise
+    P, ticks, scale, count = projection_at(state, node), state.complex.ticks, 2.0**-state.objective.bits, 0
+    at = ticks[node, 0] * scale, ticks[node, 1] * scale, ticks[node, 2] * scale
+    normal[:6] = 0.0
+    if state.complex.is_frozen[node, 3]:
+        _add_slope(normal, 0, state.sides.level, at, 1.0)
+        count = 1
+    for m in range(1, MOST_MEETING):
+        if state.complex.meeting[node, m] >= 0 and count < 3:
+            one, other = _label_levels(state, node, m)
+            _add_slope(normal, count, one, at, 1.0)
+            _add_slope(normal, count, other, at, -1.0)
+            count += 1
+    for q in range(count):
+        for d in range(3):
+            for m in range(3):
+                in_mm = 0.0
+                for c in range(3):
+                    in_mm += state.sides.inverse[c, m] * normal[q, c]
+                normal[3 + q, d] += P[d, m] * in_mm
+    return count
+
+
+@njit(cache=True, error_model="numpy")
+def combined_ways(normal: NDArray, count: int, r: tuple) -> tuple:
+    """The shortest index vector along which the constraints rise by r, (3,), as `normals_at` left them in `normal`.
+
+    Whether there is one comes first: not where a level is flat, or two of them rise the same way.
+    """
+    w = row(normal, 3)
+    g00 = dot(row(normal, 0), w)
+    if not g00 > FLAT_RISE:
+        return False, w
+    if count == 1:
+        return True, scaled(r[0] / g00, w)
+    v = row(normal, 4)
+    g01, g11 = dot(row(normal, 0), v), dot(row(normal, 1), v)
+    pair = g00 * g11 - g01 * g01
+    if not (g11 > FLAT_RISE and pair > PARALLEL_SHARE * g00 * g11):
+        return False, w
+    if count == 2:
+        m0, m1 = (g11 * r[0] - g01 * r[1]) / pair, (g00 * r[1] - g01 * r[0]) / pair
+        return True, (m0 * w[0] + m1 * v[0], m0 * w[1] + m1 * v[1], m0 * w[2] + m1 * v[2])
+    u = row(normal, 5)
+    g02, g12, g22 = dot(row(normal, 0), u), dot(row(normal, 1), u), dot(row(normal, 2), u)
+    c0, c1 = g01 * g12 - g02 * g11, g01 * g02 - g00 * g12
+    triple = g02 * c0 + g12 * c1 + g22 * pair
+    if not (g22 > FLAT_RISE and triple > PARALLEL_SHARE * pair * g22):
+        return False, w
+    # Cramer's rule, from the adjugate of the symmetric matrix of the g's.
+    a00, a01, a11 = g11 * g22 - g12 * g12, g02 * g12 - g01 * g22, g00 * g22 - g02 * g02
+    m0 = (a00 * r[0] + a01 * r[1] + c0 * r[2]) / triple
+    m1 = (a01 * r[0] + a11 * r[1] + c1 * r[2]) / triple
+    m2 = (c0 * r[0] + c1 * r[1] + pair * r[2]) / triple
+    return True, (
+        m0 * w[0] + m1 * v[0] + m2 * u[0],
+        m0 * w[1] + m1 * v[1] + m2 * u[1],
+        m0 * w[2] + m1 * v[2] + m2 * u[2],
+    )
+
+
+@njit(cache=True, error_model="numpy")
+def is_on_surface(normal: NDArray, state: State, node: int) -> bool:
+    """Whether all of a node's constraints are met."""
+    count = constraint_values(normal, state, node)
+    far = 0.0
+    for q in range(count):
+        far = max(far, abs(normal[6, q]))
+    return far < (ON_SURFACE_VOXELS if count == 1 else NEAR_CURVE_VOXELS)
+
+
+@njit(cache=True, error_model="numpy")
+def slides(normal: NDArray, state: State, node: int) -> bool:
+    """Whether a node is on its surfaces and stays there; one between labels may not have got there yet."""
+    if state.complex.is_frozen[node, 3]:
+        return True
+    return state.complex.meeting[node, 1] >= 0 and is_on_surface(normal, state, node)
 
 
 @njit(cache=True, error_model="numpy")
 def put_on_surface(normal: NDArray, state: State, node: int) -> bool:
-    """Move a node onto the surface, nearly the shortest way in its sides of the box; False if it is not reached."""
+    """Move a node to where its constraints are met, nearly the shortest way in its sides of the box; False if not."""
     ticks, sides, scale = state.complex.ticks, state.sides, 2.0**-state.objective.bits
-    for step in range(NEWTON_STEPS + 1):
-        value = level_at(sides.level, ticks[node, 0] * scale, ticks[node, 1] * scale, ticks[node, 2] * scale)
-        if abs(value) < ON_SURFACE_VOXELS:
+    for step in range(CURVE_STEPS + 1):
+        if is_on_surface(normal, state, node):
             return True
-        rise = normal_at(normal, state, node)
-        if step == NEWTON_STEPS or not rise > FLAT_RISE:
+        if step == CURVE_STEPS or (step == NEWTON_STEPS and state.complex.meeting[node, 2] < 0):
             return False
+        value = row(normal, 6)
+        count = normals_at(normal, state, node)
+        is_found, way = combined_ways(normal, count, value)
+        if not is_found:
+            return False
+        size = np.sqrt(dot(way, way))
+        if count > 1 and size > CURVE_STEP_VOXELS:
+            way = scaled(CURVE_STEP_VOXELS / size, way)
         for d in range(3):
-            to = ticks[node, d] - np.int64(np.rint(value / rise * normal[1, d] / scale))
+            to = ticks[node, d] - np.int64(np.rint(way[d] / scale))
             ticks[node, d] = min(max(to, sides.low[d]), sides.high[d])
     return False

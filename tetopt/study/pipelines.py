@@ -97,7 +97,7 @@ def ours(job: Job, mode: Mode) -> Produced:
     result = mesh_image(content, job.nodes, mode=mode, k_D=k_D, iterations=iterations, order=job.order)
     seconds["octree" if mode == "graded" else "lattice"] = result.seconds_start
     seconds["optimize"] = result.seconds_run
-    return Produced(result.mesh, seconds, [f"ended by: {result.ended}", *notes])
+    return Produced(result.mesh, seconds, [f"ended by: {result.ended}", *notes], result.labels)
 
 
 def image_blind(job: Job) -> Produced:

@@ -18,6 +18,7 @@ from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.target.domain import INSIDE_SHARE, Region, region_of
 from tetopt.target.labels import check_labels, label_channels
+from tetopt.target.memberships import Memberships, finer, memberships, supersampling
 
 SAMPLED_VOXELS = 100_000  # of these the most frequent value is taken for the background's
 MOST_LABEL_VALUES = 32  # an image of no more values than this is one of labels, and has no noise
@@ -25,6 +26,8 @@ RARITY_POWER = 0.5  # of a label's share of the voxels, by which each of its vox
 SAME_PLACE_VOXELS = 1e-2  # voxel centres that lie no further apart are in the same place
 STEPS_PER_SIGMA = 256.0  # whole numbers in a contrast's standard deviation, at least
 WEIGHT_RANGE = 1e-3, 1e3  # the least and the largest weight, besides 0
+MOST_TENSION = 10.0  # voxels; a part of twice the radius would be given up
+SMOOTH_INTERFACES = 0.4  # voxels, the default tension: twice of it is the radius of what it would take away
 MARGIN_VOXELS = 4  # kept around a mask: as far as smoothing its surface, and cells on it, can reach
 WRONG_SIDE_VARIANCES = 4.0  # what a voxel on the wrong side of the region's surface counts, of the variance
 ROW_SUM_LIMIT = 2.0**31  # sums of squares along a row stay below, so that they are exact in 32 bits
@@ -41,13 +44,17 @@ class Continuation(NamedTuple):
 class Content(NamedTuple):
     """What a mesh is to represent; made by `content`."""
 
-    image: Image  # the voxels, and the first contrast; only those around the mask, where there is one
+    image: Image  # the voxels, and the first contrast; only those around the mask; divided where slices are thick
     values: NDArray  # (C, *image.shape) what is to be one value in a cell, in one unit
     n_contrasts: int  # the first of them: images, not labels
     unit: float  # squared intensity of the image for 1 squared of `values`
     is_plain: bool  # whether `values` is the image's own data, else whole numbers
     region: Region | None  # what is to be covered; None for the image's box
     continuation: Continuation | None = None  # of the mask that the region is of; see `continued`
+    memberships: Memberships | None = None  # of labels whose interfaces are to be smooth
+    smoothness: float = 0.0  # of these: how far an interface would move to save itself, in voxels
+    own_channel: NDArray[np.int64] | None = None  # (K,) each of these labels' channel, a row of `values`
+    own_value: NDArray[np.int32] | None = None  # (K,) and what its voxels have there
 
     @property
     def n_voxels(self) -> int:
@@ -78,7 +85,7 @@ class Content(NamedTuple):
 
 def content(
     images: Image | Sequence[Image], labels: Image | None = None, mask: Image | None = None, *,
-    weights: Sequence[float] | None = None, label_weight: float = 1.0,
+    weights: Sequence[float] | None = None, label_weight: float = 1.0, smooth_interfaces: float = SMOOTH_INTERFACES,
 ) -> Content:  # fmt: skip
     """Contrasts, labels and a mask on the voxels of the first image, for `mesh_image`, `octree` or `optimize`.
 
@@ -97,6 +104,10 @@ def content(
         0.001 to 1000, or 0, which leaves an image out.
     label_weight : float
         Likewise for the labels altogether. Of the labels the rarer count more by voxel.
+    smooth_interfaces : float
+        Surface tension of interfaces, voxels: how far one would move to save itself. Labels are then smooth between
+        voxels (`tetopt.target.memberships`), which are divided where slices are thick; nodes between labels lie where
+        these meet. 0 leaves labels their stairs, and cells the label of most of their voxels.
 
     Raises
     ------
@@ -105,7 +116,7 @@ def content(
     """
     images = [images] if isinstance(images, Image) else list(images)
     weights = [1.0] * len(images) if weights is None else [float(w) for w in weights]
-    _check(images, {"labels": labels, "mask": mask}, weights, label_weight)
+    _check(images, {"labels": labels, "mask": mask}, weights, label_weight, smooth_interfaces)
     region = beyond = None
     if mask is not None:
         beyond = continuation(mask, images[0].spacing)
@@ -114,6 +125,14 @@ def content(
         labels = None if labels is None else continued(labels, beyond)
     if len(images) == 1 and labels is None and weights[0] > 0.0:
         return plain(images[0])._replace(region=region, continuation=beyond)
+    members = None
+    if labels is not None and label_weight > 0.0 and smooth_interfaces > 0.0:
+        factors = supersampling(labels.spacing)
+        members = memberships(labels, factors)
+        if max(factors) > 1:
+            images = [finer(image, factors) for image in images]
+            region = None if region is None else _finer_region(region, labels, factors)
+        labels = Image(members.labels[members.partition].astype(np.float64), images[0].affine)
     contrasts = _scaled(images, weights, region)
     number, codes = np.zeros(images[0].shape, dtype=np.int64), np.zeros((0, 1))
     if labels is not None and label_weight > 0.0:
@@ -127,7 +146,23 @@ def content(
         raise InputError("weights: nothing that differs between voxels counts; give one above 0")
     values, scale = _whole_numbers(contrasts, number, codes)
     unit = _variance(images[0].data, region) or 1.0
-    return Content(images[0], values, len(contrasts), unit / scale**2, False, region, beyond)
+    result = Content(images[0], values, len(contrasts), unit / scale**2, False, region, beyond)
+    if members is None:
+        return result
+    channel, value = len(contrasts) + codes.argmax(axis=0), np.rint(scale * codes).astype(np.int32).max(axis=0)
+    return result._replace(
+        memberships=members, smoothness=smooth_interfaces, own_channel=channel.astype(np.int64), own_value=value
+    )
+
+
+def _finer_region(region: Region, labels: Image, factors: Sequence[int]) -> Region:
+    """The region on divided voxels, its surface interpolated between slices as labels are."""
+    if region.inside.all():
+        inside = np.ones([n * factor for n, factor in zip(labels.shape, factors, strict=True)], dtype=bool)
+        return Region(inside, np.full(inside.shape, region.level.min(), dtype=np.float32))
+    sides = memberships(Image(region.inside.astype(np.float64), labels.affine), factors)
+    outside, within = sides.levels[sides.channel]
+    return Region(sides.partition == 1, (0.5 * (within - outside)).astype(np.float32))
 
 
 def _scaled(images: list[Image], weights: list[float], region: Region | None) -> list[NDArray[np.float32]]:
@@ -217,7 +252,13 @@ def _part(image: Image, part: tuple[slice, ...]) -> Image:
     return Image(image.data[part], affine)
 
 
-def _check(images: list[Image], others: dict[str, Image | None], weights: list[float], label_weight: float) -> None:
+def _check(
+    images: list[Image],
+    others: dict[str, Image | None],
+    weights: list[float],
+    label_weight: float,
+    smooth_interfaces: float,
+) -> None:
     if not images:
         raise InputError("images: expected one or more, got none")
     first = images[0]
@@ -234,6 +275,11 @@ def _check(images: list[Image], others: dict[str, Image | None], weights: list[f
     if len(weights) != len(images) or not all(w == 0.0 or low <= w <= high for w in weights):
         raise InputError(
             f"weights: expected one for each of {len(images)} images, 0 or {low:g} to {high:g}, got {weights}"
+        )
+    if not 0.0 <= smooth_interfaces <= MOST_TENSION:
+        raise InputError(
+            f"smooth_interfaces: expected 0 to {MOST_TENSION:g} voxels, got {smooth_interfaces}; thinner "
+            "parts than about twice of it are given up"
         )
     if not (label_weight == 0.0 or low <= label_weight <= high):
         raise InputError(f"label_weight: expected 0 or {low:g} to {high:g}, got {label_weight}")

@@ -1,0 +1,290 @@
+"""Cells with labels: interfaces smooth, whole and manifold, and what every move keeps of them."""
+
+import numba
+import numpy as np
+import pytest
+
+import tetopt
+from tetopt.energy.sampling import channel_grid, from_ticks
+from tetopt.engine.complex import cell_squares, energies, interface_energy, node_rings, remeasure
+from tetopt.engine.density import Limits, exchange
+from tetopt.engine.flips import flip
+from tetopt.engine.interfaces import relabel, with_labels
+from tetopt.engine.repair import repair
+from tetopt.engine.smooth import attract, blocks, ring_tension, sweep
+from tetopt.engine.state import state_of, with_floor
+from tetopt.engine.surface import combined_ways, constraint_values
+from tetopt.errors import InputError
+from tetopt.measure.interfaces import label_interfaces
+from tetopt.target.content import content
+
+
+def ball_in_ball(n=32, spacing=(1.0, 1.0, 1.0)):
+    """Labels 5 in 2 in 0: an off-centre ball in a ball, exactly known."""
+    at = np.stack(np.meshgrid(*[np.arange(n) - (n - 1) / 2] * 3, indexing="ij"), axis=-1)
+    inner = np.linalg.norm(at - [2.1, 0.0, -1.3], axis=-1) < 5.0
+    data = np.where(inner, 5.0, np.where(np.linalg.norm(at, axis=-1) < 11.5, 2.0, 0.0))
+    return tetopt.Image(data, np.diag([*spacing, 1.0]))
+
+
+def quarters(n=20):
+    """Three labels that meet along a line: a half of the box, and two quarters."""
+    data = np.zeros((n, n, n))
+    data[n // 2 :] = 1.0
+    data[: n // 2, n // 2 :] = 2.0
+    return tetopt.Image(data)
+
+
+CASES = {"balls": ball_in_ball(), "quarters": quarters()}
+
+
+@pytest.fixture(scope="module")
+def labelled_state():
+    """A state with labels, some moves on, of each case; a function, as tests change it."""
+
+    def made(name, nodes=500):
+        target = content(CASES[name], labels=CASES[name], weights=[0.0])
+        mesh = tetopt.octree(target, nodes)
+        grid = channel_grid(target, mesh.points)
+        state = with_floor(state_of(target, mesh, grid, 0.85, is_graded=True), 12.0)
+        return with_labels(state, target, mesh), target, grid
+
+    return made
+
+
+def parts(state, target, grid):
+    """Mesh, label of each cell, and the labels' rows in `label_interfaces`."""
+    n_cells = int(state.complex.n_cells[0])
+    points = target.image.to_world(from_ticks(state.complex.ticks, grid, 3))
+    mesh = tetopt.Mesh(points, state.complex.cells[:n_cells].copy())
+    labels = target.memberships.labels[state.complex.labels[:n_cells]]
+    return mesh, labels, label_interfaces(target.image, mesh, labels)
+
+
+def topology(state, target, grid):
+    return [
+        (row.label, row.mesh_euler, row.nonmanifold_edges, row.nonmanifold_nodes)
+        for row in parts(state, target, grid)[2]
+    ]
+
+
+def meeting_labels(state):
+    """The labels around each node, plainly."""
+    n_cells = int(state.complex.n_cells[0])
+    around = [set() for _ in state.complex.ticks]
+    for cell, label in zip(state.complex.cells[:n_cells], state.complex.labels[:n_cells], strict=True):
+        for node in cell:
+            around[node].add(int(label))
+    return [labels if len(labels) > 1 else set() for labels in around]
+
+
+def stated_labels(state):
+    return [set(row[row >= 0].tolist()) for row in state.complex.meeting]
+
+
+def swept(state):
+    n_nodes = len(state.complex.ticks)
+    sweep(state, node_rings(state), blocks(state.complex.ticks), np.ones(n_nodes, dtype=bool))
+    return state
+
+
+def attracted(state):
+    attract(state, node_rings(state), blocks(state.complex.ticks), -0.99)
+    return state
+
+
+def exchanged(state):
+    n_nodes = len(state.complex.ticks)
+    return exchange(state, n_nodes - 30, 60, Limits(1.0, np.full(n_nodes, 1e3), 0.0)).state
+
+
+def relabelled(state):
+    relabel(state)
+    return state
+
+
+MOVES = {
+    "sweep": swept,
+    "attract": attracted,
+    "flip": lambda state: flip(state)[0],
+    "exchange": exchanged,
+    "repair": lambda state: repair(state, 25.0).state,
+    "relabel": relabelled,
+}
+
+
+@pytest.mark.parametrize("name", CASES)
+def test_every_move_keeps_labels_topology_and_sums(labelled_state, name):
+    """Euler numbers and manifoldness of every label, which labels meet at a node, and all sums measured afresh."""
+    state, target, grid = labelled_state(name)
+    state = MOVES["attract"](state)
+    before = topology(state, target, grid)
+    for move in ("sweep", "flip", "exchange", "attract", "relabel", "sweep", "exchange", "flip", "repair"):
+        n_cells = int(state.complex.n_cells[0])
+        old = state.complex.cells[:n_cells].copy(), state.complex.labels[:n_cells].copy(), state.complex.ticks.copy()
+        state = MOVES[move](state)
+        n_cells = int(state.complex.n_cells[0])
+        new = state.complex.cells[:n_cells], state.complex.labels[:n_cells], state.complex.ticks
+        if move in ("sweep", "flip", "exchange"):
+            assert any(a.shape != b.shape or (a != b).any() for a, b in zip(old, new, strict=True)), move
+        assert topology(state, target, grid) == before, move
+        assert stated_labels(state) == meeting_labels(state), move
+        sums, E_shape = state.complex.sums[:n_cells].copy(), state.complex.E_shape[:n_cells].copy()
+        remeasure(state)
+        np.testing.assert_allclose(state.complex.sums[:n_cells], sums, atol=1e-6 * np.abs(sums).max(), err_msg=move)
+        np.testing.assert_allclose(state.complex.E_shape[:n_cells], E_shape, rtol=1e-9, err_msg=move)
+
+
+def test_energy_falls_with_labels(labelled_state):
+    """Sweeps, flips and labels of cells never raise E, tension and voxels of other labels with it."""
+    state, _, _ = labelled_state("balls")
+    state = MOVES["attract"](state)
+
+    def E():
+        E_G, squares = energies(state)
+        return state.objective.geometry * E_G + state.objective.image * squares + interface_energy(state)
+
+    last = E()
+    for move in ("sweep", "flip", "relabel", "sweep", "flip"):
+        state = MOVES[move](state)
+        assert last * (1.0 + 1e-9) >= E(), move
+        last = E()
+
+
+def test_squares_count_voxels_of_other_labels(labelled_state):
+    """Of labels alone: a voxel of label b in a cell of label a costs a's squared value and b's."""
+    state, target, grid = labelled_state("balls")
+    mesh, _, _ = parts(state, target, grid)
+    owner = tetopt.energy.sampling.cell_of_voxel(target.image, mesh).ravel()
+    own, there = state.complex.labels[owner], target.memberships.partition.ravel()
+    value = target.own_value.astype(float) ** 2
+    cost = np.where(own != there, value[own] + value[there], 0.0)
+    np.testing.assert_allclose(cell_squares(state), np.bincount(owner, cost, len(mesh.cells)), rtol=1e-9, atol=1e-6)
+    assert cost.sum() > 0.0
+
+
+def test_interface_energy_is_the_area_between_labels(labelled_state):
+    state, target, grid = labelled_state("quarters")
+    mesh, _, _ = parts(state, target, grid)
+    shared, labels, value = (
+        tetopt.geometry.topology.facets(mesh.cells),
+        state.complex.labels,
+        target.own_value.astype(float) ** 2,
+    )
+    inner = shared.cells[(shared.cells >= 0).all(axis=1)]
+    total = 0.0
+    for one, other in inner[labels[inner[:, 0]] != labels[inner[:, 1]]]:
+        a, b, c = mesh.points[np.intersect1d(mesh.cells[one], mesh.cells[other])]
+        total += (value[labels[one]] + value[labels[other]]) * 0.5 * np.linalg.norm(np.cross(b - a, c - a))
+    assert interface_energy(state) == pytest.approx(state.objective.tension * total, rel=1e-12)
+    rings = node_rings(state)
+    each = sum(ring_tension(state, rings, node) for node in range(len(mesh.points)))
+    assert each == pytest.approx(3.0 * interface_energy(state), rel=1e-12)  # each facet has three nodes
+
+
+@pytest.mark.kernel
+def test_combined_ways_are_the_shortest():
+    """As least squares have them, for one to three constraints; none where two are parallel."""
+    rng = np.random.default_rng(0)
+    for count in (1, 2, 3):
+        slopes, rise = rng.normal(size=(count, 3)), rng.normal(size=count)
+        normal = np.zeros((7, 3))
+        normal[:count] = normal[3 : 3 + count] = slopes
+        is_found, way = combined_ways(normal, count, (*rise, 0.0, 0.0)[:3])
+        assert is_found
+        np.testing.assert_allclose(way, np.linalg.lstsq(slopes, rise, rcond=None)[0], rtol=1e-9)
+    normal[1] = normal[4] = 2.0 * normal[0]
+    assert not combined_ways(normal, 2, (1.0, 1.0, 0.0))[0]
+
+
+@pytest.fixture(scope="module")
+def balls():
+    return tetopt.mesh_image(content(CASES["balls"], labels=CASES["balls"], weights=[0.0]), 1500)
+
+
+def test_balls(balls):
+    """Two nested balls: their surfaces are within a tenth of a voxel, whole, manifold and without folds."""
+    rows = {row.label: row for row in label_interfaces(CASES["balls"], balls.mesh, balls.labels)}
+    for label in (2, 5):
+        row = rows[label]
+        assert (row.nonmanifold_edges, row.nonmanifold_nodes) == (0, 0)
+        assert (row.mesh_euler, row.mesh_cavities) == (row.euler, row.cavities)
+        assert row.folded < 0.03
+    shared = tetopt.geometry.topology.facets(balls.mesh.cells)
+    labels = balls.labels[shared.cells]
+    for pair, centre, radius in (((0, 2), 15.5, 11.5), ((2, 5), np.array([17.6, 15.5, 14.2]), 5.0)):
+        is_between = (shared.cells >= 0).all(axis=1) & (np.sort(labels, axis=1) == pair).all(axis=1)
+        nodes = np.unique(shared.nodes[is_between])
+        off = np.abs(np.linalg.norm(balls.mesh.points[nodes] - centre, axis=1) - radius)
+        assert off.mean() < 0.1
+        assert np.quantile(off, 0.95) < 0.2
+        assert off.max() < 0.7
+        a, b, c = np.moveaxis(balls.mesh.points[shared.nodes[is_between]], 1, 0)
+        area = 0.5 * np.linalg.norm(np.cross(b - a, c - a), axis=1).sum()
+        assert area == pytest.approx(4.0 * np.pi * radius**2, rel=0.07)  # chords of the smaller ball lose most
+    assert tetopt.quality(balls.mesh.points, balls.mesh.cells).min_dihedral >= 12.0
+
+
+def test_same_bits_on_any_number_of_threads(balls):
+    before = numba.get_num_threads()
+    try:
+        numba.set_num_threads(1)
+        again = tetopt.mesh_image(content(CASES["balls"], labels=CASES["balls"], weights=[0.0]), 1500)
+    finally:
+        numba.set_num_threads(before)
+    np.testing.assert_array_equal(again.mesh.points, balls.mesh.points)
+    np.testing.assert_array_equal(again.mesh.cells, balls.mesh.cells)
+    np.testing.assert_array_equal(again.labels, balls.labels)
+
+
+def test_nodes_of_three_labels_lie_on_their_curve(labelled_state):
+    """Where three labels meet along a line, nodes between them come to it, and stay on it."""
+    state, _, _ = labelled_state("quarters")
+    for _ in range(4):
+        state = MOVES["attract"](state)
+        state = MOVES["sweep"](state)
+        state = MOVES["flip"](state)
+    is_curve = state.complex.meeting[:, 2] >= 0
+    assert is_curve.sum() > 5
+    at = state.complex.ticks[is_curve] * 2.0**-state.objective.bits
+    assert np.abs(at[:, :2] - 9.5).max() < 0.5
+    normal = np.zeros((7, 3))
+    for node in np.flatnonzero(is_curve):
+        assert constraint_values(normal, state, node) == 2
+
+
+def test_thick_slices_do_not_show():
+    """A ball on slices four times as thick as voxels: no fold between slices, and half of the steps' area is gone."""
+    fine = ball_in_ball(32)
+    data = np.where(fine.data > 0.0, 1.0, 0.0)[:, :, 1::3]
+    thick = tetopt.Image(data, np.diag([1.0, 1.0, 3.0, 1.0]))
+    target = content(thick, labels=thick, weights=[0.0])
+    assert target.image.shape == (32, 32, 3 * data.shape[2])
+    np.testing.assert_allclose(target.image.volume, thick.volume)
+    result = tetopt.mesh_image(target, 1200)
+    row = label_interfaces(thick, result.mesh, result.labels)[1]
+    assert row.folded < 0.08
+    assert row.area == pytest.approx(4.0 * np.pi * 11.5**2, rel=0.08)
+    rough = tetopt.mesh_image(content(thick, labels=thick, weights=[0.0], smooth_interfaces=0.0), 1200)
+    assert rough.labels is None
+    before = label_interfaces(thick, rough.mesh, tetopt.cell_labels(thick, rough.mesh))[1]
+    assert before.folded > 4.0 * row.folded
+
+
+def test_triangles():
+    """A disc in the plane: its outline is one circle."""
+    at = np.stack(np.meshgrid(*[np.arange(40) - 19.5] * 2, indexing="ij"), axis=-1)
+    disc = tetopt.Image((np.linalg.norm(at, axis=-1) < 12.0).astype(float))
+    result = tetopt.mesh_image(content(disc, labels=disc, weights=[0.0]), 200)
+    facets = tetopt.geometry.topology.facets(result.mesh.cells)
+    labels = result.labels[facets.cells]
+    is_between = (facets.cells >= 0).all(axis=1) & (labels[:, 0] != labels[:, 1])
+    nodes, count = np.unique(facets.nodes[is_between], return_counts=True)
+    assert (count == 2).all()
+    assert np.abs(np.linalg.norm(result.mesh.points[nodes] - 19.5, axis=1) - 12.0).max() < 0.4
+
+
+@pytest.mark.parametrize("tension", [-0.1, 11.0, np.nan])
+def test_refused(tension):
+    with pytest.raises(InputError, match="smooth_interfaces: expected 0 to 10 voxels"):
+        content(CASES["balls"], labels=CASES["balls"], smooth_interfaces=tension)

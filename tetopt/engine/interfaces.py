@@ -1,0 +1,151 @@
+"""Interfaces between labels: which cells they lie between, where their nodes slide, and what E counts of them.
+
+A cell begins with the label that the voxels in it, tension and topology ask for (`tetopt.engine.labelling`). From then
+on labels change only with the mesh: cells beside an interface take the label of a neighbour where that lowers E and
+leaves both labels' topology as it is.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+from scipy.sparse import csr_array
+
+from tetopt.energy.sampling import cell_of_voxel
+from tetopt.engine.complex import NodeRings, State, facet_area, image_energy, node_rings, outward, pair_tension
+from tetopt.engine.labelling import keeps_topology, labelled, voxel_pieces
+from tetopt.engine.surface import MOST_MEETING
+from tetopt.geometry.simplex import centroids, volumes
+from tetopt.mesh import Mesh
+from tetopt.target.content import Content
+
+RELABELLING_PASSES = 10  # at most; the third mostly changes nothing
+LEAST_RELABELLING_SHARE = 1e-9  # of the energies weighed: a smaller gain may be rounding
+
+
+def with_labels(state: State, content: Content, mesh: Mesh) -> State:
+    """The state with a label for each cell, and an objective that counts what is not of it."""
+    members, own_channel, own_value = content.memberships, content.own_channel, content.own_value
+    assert members is not None
+    assert own_channel is not None
+    assert own_value is not None
+    pieces = voxel_pieces(members.partition, len(members.labels))
+    n_cells, image = len(mesh.cells), content.image
+    across = state.complex.across[:n_cells]
+    state.complex.labels[:n_cells] = labelled(
+        mesh.points, mesh.cells, across, cell_counts(content, mesh), pieces
+    ).labels
+    step = image.voxel_volume ** (1.0 / image.ndim)
+    objective = state.objective._replace(
+        n_means=int(content.n_contrasts),
+        own_column=np.where(own_channel == 0, 1, 2 + own_channel),
+        own_value=own_value.astype(np.float64),
+        tension=float(state.objective.image * content.smoothness * step / image.voxel_volume),
+    )
+    levels = members.levels.reshape(len(members.levels), *(1,) * (3 - image.ndim), *image.shape)
+    state = state._replace(objective=objective, sides=state.sides._replace(levels=levels, channel=members.channel))
+    _meet_everywhere(state, node_rings(state))
+    return state
+
+
+def cell_counts(content: Content, mesh: Mesh) -> csr_array:
+    """Voxels of each label in each cell, (M, K); of a cell without voxels its size in those of its centroid's label."""
+    assert content.memberships is not None
+    image, partition = content.image, content.memberships.partition
+    owner, n_labels = cell_of_voxel(image, mesh).ravel(), len(content.memberships.labels)
+    is_in, shape = owner >= 0, (len(mesh.cells), n_labels)
+    counts = csr_array((np.ones(int(is_in.sum())), (owner[is_in], partition.ravel()[is_in])), shape=shape)
+    empty = np.flatnonzero(counts.sum(axis=1) == 0.0)
+    nearest = np.rint(image.to_index(centroids(mesh.points, mesh.cells[empty]))).astype(np.int64)
+    nearest = np.clip(nearest, 0, np.array(image.shape) - 1)
+    size = volumes(mesh.points, mesh.cells[empty]) / image.voxel_volume
+    counts = csr_array(counts + csr_array((size, (empty, partition[tuple(nearest.T)])), shape=shape))
+    counts.sum_duplicates()
+    return counts
+
+
+@njit(cache=True, error_model="numpy")
+def _meet(state: State, rings: NodeRings, node: int) -> None:
+    """Note which labels the cells around a node have."""
+    meeting, count = state.complex.meeting[node], 0
+    meeting[:] = -1
+    for r in range(rings.start[node], rings.start[node + 1]):
+        label, is_new = state.complex.labels[rings.cells[r]], True
+        for m in range(count):
+            is_new = is_new and meeting[m] != label
+        if is_new and count < MOST_MEETING:
+            meeting[count] = label
+            count += 1
+    meeting[:count].sort()
+    if count == 1:
+        meeting[0] = -1
+
+
+@njit(cache=True, error_model="numpy")
+def _meet_everywhere(state: State, rings: NodeRings) -> None:
+    for node in range(len(state.complex.ticks)):
+        _meet(state, rings, node)
+
+
+def relabel(state: State) -> int:
+    """Let cells beside an interface take a neighbour's label where E falls and no topology changes; how many did."""
+    rings, total = node_rings(state), 0
+    gain, label = np.zeros(int(state.complex.n_cells[0])), np.zeros(int(state.complex.n_cells[0]), dtype=np.int64)
+    for _ in range(RELABELLING_PASSES):
+        _find_relabellings(gain, label, state)
+        order = np.flatnonzero(gain > 0.0)
+        moved = _relabel(order[np.lexsort((order, -gain[order]))], gain, label, state, rings)
+        total += moved
+        if moved == 0:
+            break
+    return total
+
+
+@njit(cache=True, error_model="numpy")
+def _price(state: State, cell: int, label: int) -> float:
+    """What a cell costs with a label, as far as the label matters."""
+    mesh, objective = state.complex, state.objective
+    price = objective.image * image_energy(mesh.sums, cell, label, objective)
+    for k in range(mesh.cells.shape[1]):
+        other = mesh.across[cell, k]
+        if other >= 0 and mesh.labels[other] != label:
+            a, b, c = outward(mesh.cells, cell, k)
+            price += pair_tension(objective, label, mesh.labels[other]) * facet_area(mesh.ticks, a, b, c, objective)
+    return price
+
+
+@njit(cache=True, error_model="numpy")
+def _find_relabelling(gain: NDArray, label: NDArray, state: State, cell: int) -> None:
+    mesh = state.complex
+    gain[cell], label[cell], own = 0.0, mesh.labels[cell], -1.0
+    for k in range(mesh.cells.shape[1]):
+        other = mesh.across[cell, k]
+        if other < 0 or mesh.labels[other] == mesh.labels[cell]:
+            continue
+        if own < 0.0:
+            own = _price(state, cell, mesh.labels[cell])
+        more = own - _price(state, cell, mesh.labels[other])
+        if more > max(gain[cell], LEAST_RELABELLING_SHARE * own):
+            gain[cell], label[cell] = more, mesh.labels[other]
+
+
+@njit(cache=True, error_model="numpy")
+def _find_relabellings(gain: NDArray, label: NDArray, state: State) -> None:
+    for cell in range(len(gain)):
+        _find_relabelling(gain, label, state, cell)
+
+
+@njit(cache=True, error_model="numpy")
+def _relabel(order: NDArray, gain: NDArray, label: NDArray, state: State, rings: NodeRings) -> int:
+    mesh, moved = state.complex, 0
+    for cell in order:
+        _find_relabelling(gain, label, state, cell)
+        if gain[cell] > 0.0 and keeps_topology(
+            mesh.cells, mesh.across, mesh.labels, rings.start, rings.cells, cell, label[cell]
+        ):
+            mesh.labels[cell] = label[cell]
+            for k in range(mesh.cells.shape[1]):
+                _meet(state, rings, mesh.cells[cell, k])
+            moved += 1
+    return moved
