@@ -44,6 +44,7 @@ from tetopt.mesh import Mesh
 from tetopt.start.lattice import lattice
 from tetopt.start.sizes import Sizes
 from tetopt.target.content import Content, plain
+from tetopt.target.content import content as make_content
 
 FLIP_EDGES = 0.05  # edges: nodes that moved less need no new flips
 SWEEP_EDGES = 0.02  # edges: nodes around which none moved more are not moved again
@@ -52,7 +53,7 @@ EXCHANGED_SHARE = 0.1  # of the requested nodes: the most that are exchanged at 
 EXCHANGE_SHAPE_WEIGHT = 0.1  # of the shape energy's weight: what a shape costs in an exchange, see `Run.exchange`
 LABELLED_AT = 3  # the iteration from which cells have labels: exchanges have found thin parts, and not yet folds
 LEAST_EDGE_VOXELS = 1.0  # with labels no exchange makes a shorter edge, beside the limits on sizes
-ATTRACTED_FLOOR = 4.0  # degrees: no cell is flattened below when nodes are brought between labels
+ATTRACTED_FLOOR = 4.0  # degrees: cells may be as flat, if not the floor is lower, until nodes have come between labels
 FAR_TICKS = -(1 << 40)  # a place far from any other
 
 
@@ -151,7 +152,7 @@ def optimize(
         if has_labels and iteration == min(LABELLED_AT, iterations):
             run.give_labels()
         if run.has_labels:
-            run.attract()
+            run.attract(min(ATTRACTED_FLOOR, floor) if iteration <= n_early else floor)
         # 1. Move the nodes.
         is_finished = run.sweep(is_over)
         # 2. Exchange cells.
@@ -191,6 +192,9 @@ def prepare_kernels(
     step = 1.0 if is_whole else 0.1
     tiny = Image(np.zeros((3,) * image.ndim) + step * np.arange(3))
     mesh = lattice(tiny, blocks=(1,) * image.ndim)
+    if content.memberships is not None and k_D > 0.0:
+        halves = Image((np.arange(3) > 0) * np.ones(tiny.shape))
+        optimize(make_content(tiny, halves), mesh, k_D=k_D, iterations=1)
     if method == "paper":
         optimize_paper(tiny, mesh, k_D=k_D, iterations=1)
     elif is_graded:  # nodes are exchanged in the first of two iterations
@@ -286,10 +290,13 @@ class Run:
         self.ticks_swept[:] = FAR_TICKS
         self.ticks_flipped[:] = FAR_TICKS
 
-    def attract(self) -> None:
-        """Let cells take other labels where that pays, and bring nodes between labels to where those meet."""
+    def attract(self, degrees: float) -> None:
+        """Let cells take other labels where that pays, and bring nodes between labels to where those meet.
+
+        No angle gets under `degrees` by it.
+        """
         relabel(self.state)
-        attract(self.state, node_rings(self.state), self.groups, floor_of(ATTRACTED_FLOOR)[0])
+        attract(self.state, node_rings(self.state), self.groups, floor_of(degrees)[0])
 
     def keep_floor(self, degrees: float) -> None:
         """Let no move leave a dihedral angle under `degrees`, nor one that is under it already any smaller."""
