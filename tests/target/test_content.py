@@ -92,6 +92,19 @@ def test_labels_that_touch_only_in_a_point_are_told_apart():
     assert len(target.values) == 3
 
 
+def test_sums_of_a_rare_label():
+    """One voxel among many is so large a number that squares along a row do not fit 32 bits."""
+    data = np.zeros((20, 60, 20))
+    data[10, 30, 10] = 1.0
+    image = tetopt.Image(data)
+    noise = tetopt.Image(np.random.default_rng(0).normal(size=data.shape))
+    target = content(noise, labels=image, weights=[0.1])
+    square = (target.values.astype(np.float64) ** 2).sum(axis=0)
+    assert square.sum(axis=-1).max() > 2**31
+    prefix = channel_grid(target, tetopt.lattice(image, blocks=(1, 1, 1)).points).prefix
+    np.testing.assert_array_equal(np.diff(prefix[..., 1], axis=2), square)
+
+
 @pytest.mark.parametrize("n", [2, 3])
 def test_sums_of_channels(n):
     """Counts, sums and the squares of all channels against those over the voxels of each cell."""

@@ -206,7 +206,8 @@ def channel_grid(content: Content, points: NDArray[np.float64]) -> SamplingGrid:
         rows, shift, is_short = [], grid.shift, grid.prefix.dtype == np.int32
     else:
         square = sum(values.astype(np.float64) ** 2 for values in content.values)
-        rows, shift, is_short = [content.values[0], square, *content.values[1:]], 0.0, True
+        # No channel's sums are larger than those of the squares of its whole numbers.
+        rows, shift, is_short = [content.values[0], square, *content.values[1:]], 0.0, square.sum(-1).max() < 2**31
     if content.region is not None:
         rows.append(np.where(content.region.inside, -1, 1))
     first = 2 if content.is_plain else 0
