@@ -198,7 +198,7 @@ def make_exchanges(
                 break
             _mark_edge(state, rings, in_[s], splits.other[in_[s]], is_dirty, True)  # its partner is to be elsewhere
         if does_collapse:
-            while c < len(out) and not _is_clean(rings, out[c], is_dirty):
+            while c < len(out) and not _can_collapse(state, rings, out[c], collapses.other[out[c]], is_dirty):
                 c += 1
         if does_collapse and (c == len(out) or (is_pair and splits.gain[in_[s]] + collapses.gain[out[c]] <= least)):
             if does_split:
@@ -226,6 +226,26 @@ def _mark_edge(state: State, rings: NodeRings, a: int, b: int, is_dirty: NDArray
 @njit(cache=True, error_model="numpy")
 def _is_clean(rings: NodeRings, node: int, is_dirty: NDArray) -> bool:
     return not is_dirty[rings.cells[rings.start[node] : rings.start[node + 1]]].any()
+
+
+@njit(cache=True, error_model="numpy")
+def _can_collapse(state: State, rings: NodeRings, a: int, b: int, is_dirty: NDArray) -> bool:
+    """Whether nothing has changed around a; nor, between labels, around b and next to either.
+
+    A cell that goes takes facets between labels from those beside it, too.
+    """
+    if not _is_clean(rings, a, is_dirty):
+        return False
+    if state.complex.meeting[a, 1] < 0:
+        return True
+    for node in (a, b):
+        for r in range(rings.start[node], rings.start[node + 1]):
+            if is_dirty[rings.cells[r]]:
+                return False
+            for other in state.complex.across[rings.cells[r]]:
+                if other >= 0 and is_dirty[other]:
+                    return False
+    return True
 
 
 @njit(cache=True, error_model="numpy")
@@ -356,7 +376,8 @@ def _mend(state: State, rings: NodeRings, bad: NDArray, target: float, is_dirty:
                 b, p = cells[cell, j], n_nodes + n_split
                 if i == j:
                     continue
-                gain = _lift_by_collapse(x, state, rings, a, b, target)
+                may_collapse = _can_collapse(state, rings, a, b, is_dirty)
+                gain = _lift_by_collapse(x, state, rings, a, b, target) if may_collapse else -1.0
                 if gain > best:
                     best, best_a, best_b, is_split = gain, a, b, False
                 if i < j and _can_split(state, rings, a, is_dirty):
@@ -731,12 +752,19 @@ def _stays_between_labels(state: State, rings: NodeRings, a: int, b: int) -> boo
     """Whether a node between labels may be joined to b so that all labels keep their topology.
 
     All labels that meet at it do so along the whole edge, which therefore lies on the same surface or curve; what holds
-    for the boundary holds for the facets between labels (`_is_linked`), and a curve of three edges is kept.
+    for the boundary holds for the facets between labels (`_is_linked`), and a curve of three edges is kept. No cell
+    that goes may have such facets opposite both ends: these would be laid on one another, and a label's last cell go.
     """
+    cells, labels = state.complex.cells, state.complex.labels
     meeting, other = np.empty(MOST_MEETING, dtype=np.int64), np.empty(MOST_MEETING, dtype=np.int64)
     n_labels = labels_of_edge(meeting, state, rings, a, b)
-    for m in range(MOST_MEETING):
-        if state.complex.meeting[a, m] >= 0 and not is_among(state.complex.meeting[a, m], meeting):
+    if n_labels > MOST_MEETING:
+        return False
+    for r in range(rings.start[a], rings.start[a + 1]):
+        cell = rings.cells[r]
+        if not is_among(labels[cell], meeting):
+            return False
+        if has_node(cells, cell, b) and _is_side(state, cell, a) and _is_side(state, cell, b):
             return False
     sides = _sides_of_edge(state, rings, a, b)
     for d in range(3):
@@ -753,6 +781,13 @@ def _stays_between_labels(state: State, rings: NodeRings, a: int, b: int) -> boo
             ):
                 return False
     return _is_linked(state, rings, a, b)
+
+
+@njit(cache=True, error_model="numpy")
+def _is_side(state: State, cell: int, node: int) -> bool:
+    """Whether a cell's facet opposite a node is on the boundary, or between labels."""
+    k = corner_of(state.complex.cells, cell, node)
+    return state.complex.across[cell, k] < 0 or is_interface(state.complex, cell, k)
 
 
 @njit(cache=True, error_model="numpy")

@@ -16,7 +16,7 @@ CURVE_STEPS = 16  # onto a curve or a point, at most
 NEWTON_STEPS = 6  # onto the surface, at most
 OUTWARD_COSINE = 0.1  # cosine of the widest angle between a facet's normal and the way up the level at its moved node
 ASIDE_VOXELS = 0.25  # on either side of a place: where the level is taken for its slope
-MOST_MEETING = 4  # labels that a node slides between; one where more meet stays
+MOST_MEETING = 4  # labels whose levels a node is brought to; where more meet, four of them
 PARALLEL_SHARE = 1e-3  # squared sine of the angle between ways up: below, two surfaces are taken for one
 FLAT_RISE = 1e-12  # where the level rises less along the way up, steps would be divided by nothing
 
