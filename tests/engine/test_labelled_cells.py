@@ -284,6 +284,51 @@ def test_triangles():
     assert np.abs(np.linalg.norm(result.mesh.points[nodes] - 19.5, axis=1) - 12.0).max() < 0.4
 
 
+def patches(seed, n, count):
+    """Labels of the nearest of some random places: many of them meet at a node of large cells."""
+    at = np.indices((n,) * 3).reshape(3, -1).T
+    places = np.random.default_rng(seed).uniform(0, n, (count, 3))
+    nearest = ((at[:, None] - places) ** 2).sum(axis=-1).argmin(axis=1)
+    return tetopt.Image(nearest.reshape((n,) * 3).astype(float))
+
+
+def test_collapses_keep_labels_as_small_as_a_cell(labelled_state):
+    """Where labels are as small as cells: no cell between two interfaces goes with a node, nor one of five labels."""
+    image = patches(27, 14, 6)
+    target = content(image, labels=image, weights=[0.0])
+    mesh = tetopt.octree(target, 300)
+    grid = channel_grid(target, mesh.points)
+    state = with_labels(with_floor(state_of(target, mesh, grid, 0.85, is_graded=True), 12.0), target, mesh)
+    before = None
+    for move in ("attract", "sweep", "flip", "exchange"):
+        before = topology(state, target, grid)
+        state = MOVES[move](state)
+        assert topology(state, target, grid) == before, move
+    for stated, there in zip(stated_labels(state), meeting_labels(state), strict=True):
+        assert stated == there or (len(stated) == 4 and stated < there)
+
+
+def test_uniform_meshes_go_on_with_labels():
+    """E is another one once cells have labels, and higher: that is not yet the end."""
+    at = np.stack(np.meshgrid(*[np.arange(40) - 19.5] * 2, indexing="ij"), axis=-1)
+    disc = tetopt.Image((np.linalg.norm(at, axis=-1) < 12.0).astype(float))
+    result = tetopt.mesh_image(content(disc, labels=disc, weights=[0.0]), 200, mode="uniform")
+    energies_ = [row.E for row in result.history]
+    assert energies_[3] > energies_[2]
+    assert result.history[-1].iteration > 3
+    few = tetopt.mesh_image(content(disc, labels=disc, weights=[0.0]), 200, mode="uniform", tolerance=0.9)
+    assert few.labels is not None
+
+
+def test_floor_within_a_mask():
+    """Nodes are brought between labels without a cell under the floor, which might not be lifted again."""
+    image = patches(2, 12, 20)
+    at = np.stack(np.meshgrid(*[np.arange(12) - 5.5] * 3, indexing="ij"), axis=-1)
+    mask = tetopt.Image((np.linalg.norm(at, axis=-1) < 5.2).astype(float))
+    result = tetopt.mesh_image(content(image, labels=image, mask=mask, weights=[0.0]), 300)
+    assert tetopt.quality(result.mesh.points, result.mesh.cells).min_dihedral >= 12.0
+
+
 @pytest.mark.parametrize("tension", [-0.1, 11.0, np.nan])
 def test_refused(tension):
     with pytest.raises(InputError, match="smooth_interfaces: expected 0 to 10 voxels"):

@@ -2,10 +2,10 @@
 
 Each iteration moves every node down the gradient of its ring's energy (`smooth`) and then exchanges cells wherever
 that lowers E (`flips`), which takes the place of Delaunay re-tessellation. No move takes a dihedral angle under the
-floor, and a lattice starts far above it, so E falls from first to last. Cells of other initial meshes that are under
-the floor are mended at the end (`repair`), if nothing else has lifted them. Keeping the floor all along costs as much
-E_D as lifting the worst cells once E has settled (0.3587 of the initial one against 0.3560: MNI152 T1, 4,864 nodes,
-k_D = 0.5), and E need not rise for it.
+floor, and a lattice starts far above it, so E falls from first to last, unless nodes are brought between labels.
+Cells of other initial meshes that are under the floor are mended at the end (`repair`), if nothing else has lifted
+them. Keeping the floor all along costs as much E_D as lifting the worst cells once E has settled (0.3587 of the
+initial one against 0.3560: MNI152 T1, 4,864 nodes, k_D = 0.5), and E need not rise for it.
 """
 
 from __future__ import annotations
@@ -118,8 +118,9 @@ def optimize(
     -------
     Optimized
         Mesh, history and why it ended. The mesh covers the same domain, every cell is positively oriented. E never
-        rises from one record to the next, unless cells of the initial mesh had to be lifted over the floor, for which
-        nodes may be put in or taken out, or nodes were exchanged. The same bits on any number of threads.
+        rises from one record to the next, unless cells had to be lifted over the floor, for which nodes may be put in
+        or taken out, or nodes were exchanged, or brought between labels; it is another E once cells have labels. The
+        same bits on any number of threads.
 
     Raises
     ------
@@ -158,7 +159,8 @@ def optimize(
         # 2. Exchange cells.
         n_changes = run.flip() if is_finished else 0
         movement = run.movement(before)
-        fall = 1.0 - run.E() / history[-1].E if history[-1].E > 0.0 else 0.0
+        is_new = has_labels and iteration <= LABELLED_AT  # E is another one from then on: nothing has settled yet
+        fall = np.inf if is_new else 1.0 - run.E() / history[-1].E if history[-1].E > 0.0 else 0.0
         # 3. Exchange nodes: in every other one of the first iterations.
         is_early = nodes is not None and iteration <= n_early
         if nodes is not None and is_early and is_finished and iteration % 2 == 1:
@@ -293,10 +295,13 @@ class Run:
     def attract(self, degrees: float) -> None:
         """Let cells take other labels where that pays, and bring nodes between labels to where those meet.
 
-        No angle gets under `degrees` by it.
+        No angle gets under `degrees` by it; within a mask, where `lift` may be given up, none under the floor.
         """
         relabel(self.state)
-        attract(self.state, node_rings(self.state), self.groups, floor_of(degrees)[0])
+        lowest = floor_of(degrees)[0]
+        if self.content.region is not None:
+            lowest = max(lowest, self.state.objective.floor)
+        attract(self.state, node_rings(self.state), self.groups, lowest)
 
     def keep_floor(self, degrees: float) -> None:
         """Let no move leave a dihedral angle under `degrees`, nor one that is under it already any smaller."""
