@@ -52,9 +52,10 @@ from tetopt.measure.quality import quality
 from tetopt.model.labels import TABLE_TEXT, table_of_labels, table_words
 from tetopt.model.model import Model
 from tetopt.model.sets import Sets, box_of, label_set_names, surviving_sets
-from tetopt.report.summary import fidelity, model_summary, run_summary, size_summary
+from tetopt.report.summary import fidelity, image_summary, model_summary, run_summary, size_summary
 from tetopt.report.tables import add_quality, new_table, nodes_in_words
 from tetopt.target.content import Content
+from tetopt.target.domain import INSIDE_SHARE
 
 
 class Task(NamedTuple):
@@ -167,7 +168,8 @@ def _described(task: Task, initial: Mesh) -> str:
     start += f", edges up to {np.sqrt(squared_edges(initial.points, initial.cells).max()):.3g} mm"
     more = [f"and {len(source.paths) - 1} more"] if len(source.paths) > 1 else []
     more += ["labels"] if source.labels is not None else []
-    more += [f"within a mask of {source.content.n_voxels} voxels"] if source.mask is not None else []
+    if source.mask is not None:
+        more += [f"within a mask of {int((source.mask.data >= INSIDE_SHARE).sum())} voxels"]
     return ", ".join([f"{source.paths[0]}: {size} voxels of {spacing} mm", *more]) + f"; {start}"
 
 
@@ -217,6 +219,7 @@ def _write(task: Task, outcome: Outcome, begin: float) -> tuple[Model, dict[str,
     if output.json_path is not None:
         seconds = {**outcome.seconds, "all": time.perf_counter() - begin}
         summary = run_summary(source.content, outcome.initial, result, about, seconds)
+        summary["image_properties"] = image_summary(source.image)  # on its own voxels, not on divided ones
         save_json(output.json_path, summary | measured | model_summary(model))
     if plan.pictures:
         _draw(task, outcome, model)
