@@ -114,7 +114,7 @@ def read_source(options: SourceOptions, label_names: Path | None = None) -> Sour
         "images": [path.name for path in paths], "weights": weights,
         "mask": None if options.mask is None else options.mask.name, "background": level,
         "labels": None if options.labels is None else options.labels.name, "label_weight": options.label_weight,
-        "smooth_interfaces": None if labels is None else tension,
+        **({} if labels is None else {"smooth_interfaces": tension}),
         "sha256": {path.name: sha256(file_and_volume(path)[0]) for path in files},
     }  # fmt: skip
     about = {"image": paths[0].name, "image_sha256": sha256(paths[0]), "inputs": inputs, "box": box_text(box_of(image))}
