@@ -277,8 +277,9 @@ def test_one_label_a_cell():
 def test_differences_in_words():
     """Only those that there are, of labels that have cells."""
 
-    def rows(label, pieces, eulers, cavities, n_cells=9):
+    def rows(label, pieces, eulers, cavities, n_cells=9, mesh_volume=10.0):
         fidelity = dict.fromkeys(LabelFidelity._fields, 0) | {"label": label, "n_cells": n_cells}
+        fidelity |= {"volume": 10.0, "mesh_volume": mesh_volume}
         surface = dict.fromkeys(LabelInterface._fields, 0) | {"label": label}
         fidelity["components"], fidelity["mesh_components"] = pieces
         surface["euler"], surface["mesh_euler"] = eulers
@@ -291,9 +292,12 @@ def test_differences_in_words():
         rows(6, (2, 1), (4, 6), (0, 2)),
         rows(7, (1, 1), (-2, 2), (0, 0)),
         rows(8, (1, 0), (2, 0), (0, 0), n_cells=0),
+        rows(9, (1, 1), (2, 2), (0, 0), mesh_volume=3.8),
+        rows(10, (1, 1), (2, 2), (0, 0), mesh_volume=8.1),
     ]
     assert label_differences(*zip(*each, strict=True), {5: "liver [left]"}) == [
         "label 5 (liver [left]): 1 piece of voxels, 3 of cells; 1 hole more",
         "label 6: 2 pieces of voxels, 1 of cells; 2 cavities more",
         "label 7: 2 holes fewer",
+        "label 9: 62% of its size lost",
     ]

@@ -274,7 +274,8 @@ def _print_comparison(content: Content, outcome: Outcome, start: str, order: int
     mesh, initial = outcome.result.mesh, outcome.initial
     first, last = outcome.result.history[0], outcome.result.history[-1]
     table = new_table("", start, "optimised")
-    table.add_row("E, combined", f"{first.E:.4f}", f"{last.E:.4f}")
+    is_tense = outcome.result.labels is not None  # as soon as cells have labels
+    table.add_row("E, combined, + tension at the end" if is_tense else "E, combined", f"{first.E:.4f}", f"{last.E:.4f}")
     table.add_row("E_G, of initial", "1.0000", f"{last.E_G / first.E_G:.4f}")
     if first.E_D > 0.0:
         table.add_row("E_D, of initial", "1.0000", f"{last.E_D / first.E_D:.4f}")

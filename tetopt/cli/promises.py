@@ -76,7 +76,10 @@ def _lost(measured: dict[str, Any]) -> Iterator[str]:
     poor = [words[row.label] for row in labels if row.voxels > LABEL_VOXELS and row.dice < LABEL_DICE]
     if poor := [label for label in poor if label not in large]:
         first = ", ".join(poor[:5]) + (f" and {len(poor) - 5} more" if len(poor) > 5 else "")
-        show_warning(f"Dice below {LABEL_DICE} for label {first}: cells are too large for them, or these are no labels")
+        show_warning(
+            f"Dice below {LABEL_DICE} for label {first}: cells are too large for them, or these are no labels; allow "
+            "more nodes, or follow every voxel by --smooth-interfaces 0"
+        )
     if mask is not None and mask.dice < MASK_DICE:
         yield (
             f"the mesh and the mask overlap only by Dice {mask.dice:.3f}: cells are larger than parts of the mask; "

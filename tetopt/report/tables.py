@@ -14,6 +14,7 @@ from tetopt.measure.interfaces import LabelInterface
 from tetopt.measure.quality import Quality
 from tetopt.mesh import Mesh
 
+CHANGED_SHARE = 0.2  # of a label's size: what cells have more or less is said in words
 LARGE_SIZE = 1e4  # mm^n: of a label so large its tenths are not shown
 
 
@@ -105,12 +106,14 @@ def _decimals(number: float, count: int) -> str:
 def label_differences(
     rows: Sequence[LabelFidelity], interfaces: Sequence[LabelInterface], names: Mapping[int, str]
 ) -> list[str]:
-    """Where cells hang together otherwise than the voxels of their label, a line for each label that has any."""
+    """Where cells hang together otherwise than the voxels of their label, or are far fewer: a line for each label."""
     lines = []
     for row, surface in zip(rows, interfaces, strict=True):
         cavities, of_cells = surface.cavities, surface.mesh_cavities
         holes = row.components + cavities - surface.euler // 2
-        parts = []
+        parts, more = [], row.mesh_volume - row.volume
+        if abs(more) > CHANGED_SHARE * row.volume:
+            parts.append(f"{abs(more) / row.volume:.0%} of its size {'lost' if more < 0.0 else 'more'}")
         if row.components != row.mesh_components:
             parts.append(f"{_number_of(row.components, 'piece')} of voxels, {row.mesh_components} of cells")
         parts += _surplus(row.mesh_components + of_cells - surface.mesh_euler // 2 - holes, "hole")

@@ -278,8 +278,7 @@ def _check(
         )
     if not 0.0 <= smooth_interfaces <= MOST_TENSION:
         raise InputError(
-            f"smooth_interfaces: expected 0 to {MOST_TENSION:g} voxels, got {smooth_interfaces}; thinner "
-            "parts than about twice of it are given up"
+            f"smooth_interfaces: expected 0 to {MOST_TENSION:g} voxels, got {smooth_interfaces:g}; 0.3 is usual"
         )
     if not (label_weight == 0.0 or low <= label_weight <= high):
         raise InputError(f"label_weight: expected 0 or {low:g} to {high:g}, got {label_weight}")
