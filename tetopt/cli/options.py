@@ -154,7 +154,7 @@ class SourceOptions:
     )
     smooth_interfaces: Annotated[
         float | None,
-        option("W", "Tension of the surfaces between labels, voxels, 0 to 10 (default 0.3; 0 leaves voxels their stairs)."),
+        option("W", "Tension of surfaces between labels, voxels, to 10 (default 0.3; 0 leaves voxels their stairs)."),
     ] = None
     label_weight: Annotated[
         float | None, option("W", "How much the labels count beside the first IMAGE (default 1).")
