@@ -2,6 +2,9 @@
 
 import json
 
+from models import sample_image
+
+import tetopt
 from tetopt.cli import main
 
 
@@ -13,6 +16,14 @@ def exit_code(*words):
 def mesh_words(image, folder, *options):
     """`tetopt mesh` of an image, to a.vtu and a.json in a folder."""
     return ["mesh", image, "-o", folder / "a.vtu", "--json", folder / "a.json", *options]
+
+
+def labelled_lattice_words(folder):
+    """`tetopt mesh` of an image and its labels, written to a folder, as a lattice of 60 nodes; no output yet."""
+    image = sample_image(3)
+    tetopt.save_image(folder / "a.nii.gz", image)
+    tetopt.save_image(folder / "l.nii.gz", tetopt.Image(1.0 * (image.data > 30), image.affine))
+    return ["mesh", folder / "a.nii.gz", "--labels", folder / "l.nii.gz", "--spacing", "8", "--iterations", "0"]
 
 
 def numbers_in(path):

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import pyvista
 import trimesh
-from commands import exit_code, numbers_in
+from commands import exit_code, labelled_lattice_words, numbers_in
 from models import sample_image
 
 import tetopt
@@ -26,10 +26,7 @@ LAW = "1 + h/7"
 def folder(tmp_path_factory):
     """An image, its labels, a lattice of 60 nodes with both, and the same mesh as gmsh's and LPS files."""
     path = tmp_path_factory.mktemp("convert")
-    image = sample_image(3)
-    tetopt.save_image(path / "a.nii.gz", image)
-    tetopt.save_image(path / "l.nii.gz", tetopt.Image(1.0 * (image.data > 30), image.affine))
-    mesh = ["mesh", path / "a.nii.gz", "--labels", path / "l.nii.gz", "--spacing", "8", "--iterations", "0"]
+    mesh = labelled_lattice_words(path)
     assert exit_code(*mesh, "-o", path / "a.vtu") == 0
     return path
 

@@ -5,8 +5,7 @@ import json
 import numpy as np
 import pytest
 import pyvista
-from commands import exit_code, numbers_in
-from models import sample_image
+from commands import exit_code, labelled_lattice_words, numbers_in
 
 import tetopt
 from tetopt.cli.solver import MANY_INTERFACES
@@ -21,11 +20,8 @@ INTERFACE = "interface_soft_tissue_bright_ball_e"
 def folder(tmp_path_factory):
     """An image, its labels, a table of them, and a lattice of 60 nodes with and without names."""
     path = tmp_path_factory.mktemp("labels")
-    image = sample_image(3)
-    tetopt.save_image(path / "a.nii.gz", image)
-    tetopt.save_image(path / "l.nii.gz", tetopt.Image(1.0 * (image.data > 30), image.affine))
+    mesh = labelled_lattice_words(path)
     (path / "t.csv").write_text(TABLE, encoding="utf-8")
-    mesh = ["mesh", path / "a.nii.gz", "--labels", path / "l.nii.gz", "--spacing", "8", "--iterations", "0"]
     assert exit_code(*mesh, "-o", path / "plain.vtu") == 0
     named = ["--label-names", path / "t.csv", "--json", path / "named.json"]
     assert exit_code(*mesh, "-o", path / "named.vtu", *named) == 0
