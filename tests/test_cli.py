@@ -20,8 +20,11 @@ import pytest
 from commands import exit_code, mesh_words, numbers_in
 
 import tetopt
-import tetopt.cli
+import tetopt.cli.mesh
+import tetopt.cli.phantom
+import tetopt.engine.meshing
 from tetopt import Image, Mesh, lattice, load_image, load_mesh, load_phantom, quality, save_image, save_mesh
+from tetopt.cli.app import COMMANDS, loaded_command
 from tetopt.geometry.simplex import volumes
 from tetopt.measure.segmentation import dice, segmented
 from tetopt.phantom import phantom_names
@@ -622,6 +625,42 @@ def test_help_lists_the_commands(capsys):
 def test_version(capsys):
     assert exit_code("--version") == 0
     assert capsys.readouterr() == (f"tetopt {tetopt.__version__}\n", "")
+
+
+# Libraries that take time to load; the order is that of the printed line.
+HEAVY = "matplotlib meshio nibabel numba PIL pyvista scipy.linalg scipy.ndimage scipy.sparse scipy.spatial vtkmodules"
+
+
+@pytest.mark.parametrize(
+    ("code", "needed"),
+    [
+        ("import tetopt", ""),
+        ("import tetopt.cli; tetopt.cli.main(['--help'])", ""),
+        ("import tetopt.cli; tetopt.cli.main(['--version'])", ""),
+        ("import tetopt.cli; tetopt.cli.main(['msh'])", ""),
+        # The rest is loaded where a run comes to it.
+        ("import tetopt.cli.mesh", "nibabel numba PIL"),
+        ("import tetopt; tetopt.mesh_image", "numba"),
+    ],
+)
+def test_nothing_is_loaded_before_it_is_used(code, needed):
+    environment = os.environ | {"PYTHONPATH": str(Path(tetopt.__file__).parents[1])}
+    code += f"; import sys; print('loaded:', *(name for name in {HEAVY!r}.split() if name in sys.modules))"
+    done = subprocess.run([sys.executable, "-c", code], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout.splitlines()[-1].split()[1:] == sorted(needed.split(), key=HEAVY.split().index)
+
+
+def test_the_list_of_commands_has_their_first_lines():
+    for name, (_, text) in COMMANDS.items():
+        assert loaded_command(name).__doc__.splitlines()[0] == text
+
+
+def test_every_public_name_is_there():
+    for name in dir(tetopt):
+        assert getattr(tetopt, name) is not None
+    assert {name for names in tetopt._NAMES_OF.values() for name in names} == {*dir(tetopt)} - {"__version__"}
+    with pytest.raises(AttributeError, match="no attribute 'octre'"):
+        tetopt.octre  # noqa: B018
 
 
 def test_as_a_module():

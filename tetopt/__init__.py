@@ -2,32 +2,63 @@
 
 __version__ = "0.1.0"
 
-from tetopt.check import check_mesh
-from tetopt.energy.discretization import E_D
-from tetopt.energy.geometric import E_G
-from tetopt.energy.sampling import cell_moments, cell_of_voxel
-from tetopt.engine.fast import optimize
-from tetopt.engine.meshing import mesh_image
-from tetopt.engine.paper import optimize_paper
-from tetopt.errors import InputError
-from tetopt.image import Image
-from tetopt.io.formats import save_model
-from tetopt.io.images import load_image, save_image
-from tetopt.io.label_tables import load_label_table
-from tetopt.io.meshes import load_mesh, save_mesh
-from tetopt.measure.fidelity import cell_labels, label_fidelity, mask_fidelity
-from tetopt.measure.interfaces import label_interfaces
-from tetopt.measure.quality import quality
-from tetopt.mesh import Mesh
-from tetopt.model.build import model_of
-from tetopt.model.fields import cell_fields
-from tetopt.phantom import load_phantom
-from tetopt.start.lattice import lattice
-from tetopt.start.octree import octree
-from tetopt.start.sizes import Sizes
-from tetopt.target.align import aligned_contrast, aligned_labels, aligned_mask, foreground
-from tetopt.target.content import content
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
 
+if TYPE_CHECKING:
+    from tetopt.check import check_mesh
+    from tetopt.energy.discretization import E_D
+    from tetopt.energy.geometric import E_G
+    from tetopt.energy.sampling import cell_moments, cell_of_voxel
+    from tetopt.engine.fast import optimize
+    from tetopt.engine.meshing import mesh_image
+    from tetopt.engine.paper import optimize_paper
+    from tetopt.errors import InputError
+    from tetopt.image import Image
+    from tetopt.io.formats import save_model
+    from tetopt.io.images import load_image, save_image
+    from tetopt.io.label_tables import load_label_table
+    from tetopt.io.meshes import load_mesh, save_mesh
+    from tetopt.measure.fidelity import cell_labels, label_fidelity, mask_fidelity
+    from tetopt.measure.interfaces import label_interfaces
+    from tetopt.measure.quality import quality
+    from tetopt.mesh import Mesh
+    from tetopt.model.build import model_of
+    from tetopt.model.fields import cell_fields
+    from tetopt.phantom import load_phantom
+    from tetopt.start.lattice import lattice
+    from tetopt.start.octree import octree
+    from tetopt.start.sizes import Sizes
+    from tetopt.target.align import aligned_contrast, aligned_labels, aligned_mask, foreground
+    from tetopt.target.content import content
+
+_NAMES_OF = {  # by module
+    "check": ("check_mesh",),
+    "energy.discretization": ("E_D",),
+    "energy.geometric": ("E_G",),
+    "energy.sampling": ("cell_moments", "cell_of_voxel"),
+    "engine.fast": ("optimize",),
+    "engine.meshing": ("mesh_image",),
+    "engine.paper": ("optimize_paper",),
+    "errors": ("InputError",),
+    "image": ("Image",),
+    "io.formats": ("save_model",),
+    "io.images": ("load_image", "save_image"),
+    "io.label_tables": ("load_label_table",),
+    "io.meshes": ("load_mesh", "save_mesh"),
+    "measure.fidelity": ("cell_labels", "label_fidelity", "mask_fidelity"),
+    "measure.interfaces": ("label_interfaces",),
+    "measure.quality": ("quality",),
+    "mesh": ("Mesh",),
+    "model.build": ("model_of",),
+    "model.fields": ("cell_fields",),
+    "phantom": ("load_phantom",),
+    "start.lattice": ("lattice",),
+    "start.octree": ("octree",),
+    "start.sizes": ("Sizes",),
+    "target.align": ("aligned_contrast", "aligned_labels", "aligned_mask", "foreground"),
+    "target.content": ("content",),
+}
 __all__ = [
     "E_D",
     "E_G",
@@ -64,3 +95,16 @@ __all__ = [
     "save_mesh",
     "save_model",
 ]
+
+
+def __getattr__(name: str) -> Any:
+    """A public name, whose module is loaded when it is first used: `tetopt --help` needs none of the kernels."""
+    for module, names in _NAMES_OF.items():
+        if name in names:
+            value = globals()[name] = getattr(import_module(f"tetopt.{module}"), name)
+            return value
+    raise AttributeError(f"module 'tetopt' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    return __all__

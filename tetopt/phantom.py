@@ -46,9 +46,8 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import gaussian_filter
-from scipy.spatial.transform import Rotation
 
 from tetopt.errors import InputError
 from tetopt.image import SINGULAR_DETERMINANT, Image
@@ -237,7 +236,7 @@ class Phantom:
         for part, centers in _voxel_centers(shape, affine):
             flat[part] = self._voxel_means(centers, offsets, reach)
         if blur > 0.0:
-            data = gaussian_filter(data, blur / np.linalg.norm(linear, axis=0), mode="nearest")
+            data = scipy.ndimage.gaussian_filter(data, blur / np.linalg.norm(linear, axis=0), mode="nearest")
         if sd > 0.0:
             data += np.random.default_rng(seed).normal(0.0, sd, shape)
         return Image(data, affine)
@@ -454,8 +453,8 @@ def _rotation(angles: Any, n: int, what: str) -> NDArray[np.float64]:
     if angles is None:
         return np.eye(n)
     if n == 2:
-        return Rotation.from_euler("z", _number(angles, what), degrees=True).as_matrix()[:2, :2]
-    return Rotation.from_euler("xyz", _numbers(angles, n, what), degrees=True).as_matrix()
+        return scipy.spatial.transform.Rotation.from_euler("z", _number(angles, what), degrees=True).as_matrix()[:2, :2]
+    return scipy.spatial.transform.Rotation.from_euler("xyz", _numbers(angles, n, what), degrees=True).as_matrix()
 
 
 def _axes(rows: Any, n: int, what: str) -> NDArray[np.float64]:

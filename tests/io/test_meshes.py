@@ -22,7 +22,7 @@ from tetopt.geometry.simplex import volumes
 from tetopt.image import Image
 from tetopt.io.images import save_image
 from tetopt.io.meshes import load_mesh, save_mesh
-from tetopt.io.vtk import to_pyvista
+from tetopt.io.vtk import to_vtk
 from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields
 from tetopt.model.sets import MOST_LETTERS
@@ -145,7 +145,7 @@ def test_files_of_meshio(tmp_path, file_format):
 
 
 def test_field_data_that_is_no_text_stays(tmp_path):
-    grid = to_pyvista(bent(3))
+    grid = pyvista.wrap(to_vtk(bent(3)))
     grid.field_data["numbers"] = np.array([1.5, 2.5])
     grid.field_data["bytes"] = np.array([255, 254], dtype=np.uint8)
     grid.field_data["string"] = ["of VTK"]

@@ -6,49 +6,55 @@ import logging
 import sys
 import warnings
 from collections.abc import Callable, Sequence
-from typing import Annotated
+from importlib import import_module
+from typing import Annotated, Any
 
 import typer
 
 import tetopt
-from tetopt import InputError
-from tetopt.cli.compare import baseline_command, compare_command, paper_command
 from tetopt.cli.console import out, show_error, show_warning
-from tetopt.cli.convert import convert_command
-from tetopt.cli.fem import fem_command
-from tetopt.cli.mesh import demo_command, mesh_command
-from tetopt.cli.options import from_records
-from tetopt.cli.phantom import phantom_command
-from tetopt.cli.quality import quality_command
-from tetopt.cli.segment import segment_command
-from tetopt.cli.surface import surface_command
-from tetopt.cli.view import view_command
+from tetopt.errors import InputError
 
-app = typer.Typer(
-    name="tetopt",
-    help="From a medical volume straight to an image-aligned tetrahedral mesh, without segmentation.",
-    no_args_is_help=True,
-    add_completion=False,
-    pretty_exceptions_enable=False,
-    rich_markup_mode="rich",
-    context_settings={"help_option_names": ["-h", "--help"]},
-)
-COMMANDS: dict[str, Callable[..., int]] = {  # in the order of the help
-    "mesh": mesh_command,
-    "quality": quality_command,
-    "convert": convert_command,
-    "surface": surface_command,
-    "view": view_command,
-    "phantom": phantom_command,
-    "fem": fem_command,
-    "segment": segment_command,
-    "paper": paper_command,
-    "baseline": baseline_command,
-    "compare": compare_command,
-    "demo": demo_command,
+# In the order of the help: the module that has NAME_command, and the first line of that function's docstring, which is
+# the command's help. It is here as well so that `tetopt --help` takes no second: only the command that runs is loaded.
+COMMANDS = {
+    "mesh": (
+        "mesh",
+        "Mesh an image: nodes where it has content (or a uniform lattice), optimised, for a solver or as VTU.",
+    ),
+    "quality": ("quality", "Measure a mesh: shape, angles, bad cells, and how well its cells fit an image."),
+    "convert": (
+        "convert",
+        "Write a mesh for a solver: materials, named sets, loads, in the format of OUT's suffix.",
+    ),
+    "surface": (
+        "surface",
+        "Write the boundary of a structure in a mesh, watertight, or interfaces of its labels; print volume and area.",
+    ),
+    "view": (
+        "view",
+        "Look at a mesh, or at results on it: cut, colour by any field, threshold, deform; in a window or a page.",
+    ),
+    "phantom": ("phantom", "Write a phantom as an image: known shapes, known intensities."),
+    "fem": ("fem", "Solve a mesh with its loads: displacements, stresses, strain energy, reactions."),
+    "segment": (
+        "segment",
+        "Segment an image by its mesh, fast and roughly: cells grouped by mean into K classes, painted to the voxels.",
+    ),
+    "paper": (
+        "compare",
+        "Run the paper's figures and table again: paper.json, pictures, a page with each printed number beside ours.",
+    ),
+    "baseline": (
+        "compare",
+        "Mesh an image the conventional way, to compare with: segment, extract surfaces, tetrahedralise.",
+    ),
+    "compare": (
+        "compare",
+        "Set tetopt beside the conventional pipelines on a volume: fidelity, shape, simulation accuracy, time.",
+    ),
+    "demo": ("mesh", "Mesh the MNI152 T1 that nilearn's wheel carries; leave mesh, numbers and pictures in a folder."),
 }
-for _name, _command in COMMANDS.items():
-    app.command(_name)(from_records(_command))
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -58,7 +64,7 @@ def main(argv: Sequence[str] | None = None) -> int:
         logging.getLogger("matplotlib").setLevel(logging.ERROR)  # its font-cache notice is not the user's business
         try:
             arguments = list(sys.argv[1:] if argv is None else argv)
-            return app(args=arguments, obj=arguments, standalone_mode=False) or 0
+            return _app(arguments)(args=arguments, obj=arguments, standalone_mode=False) or 0
         except (InputError, OSError) as error:  # also a full disk, a folder that may not be written to
             show_error(error)
             return 2
@@ -74,13 +80,40 @@ def main(argv: Sequence[str] | None = None) -> int:
             return 2
 
 
+def _app(arguments: Sequence[str]) -> typer.Typer:
+    """The command line, of whose commands only the one that the arguments name can run; the others are names."""
+    app = typer.Typer(
+        name="tetopt",
+        help="From a medical volume straight to an image-aligned tetrahedral mesh, without segmentation.",
+        no_args_is_help=True,
+        add_completion=False,
+        pretty_exceptions_enable=False,
+        rich_markup_mode="rich",
+        context_settings={"help_option_names": ["-h", "--help"]},
+    )
+    app.callback()(_common)
+    chosen = next((word for word in arguments if not word.startswith("-")), None)  # no option before it takes a value
+    for name, (_, text) in COMMANDS.items():
+        if name == chosen:
+            app.command(name)(loaded_command(name))
+        else:
+            app.command(name, help=text)(lambda: None)
+    return app
+
+
+def loaded_command(name: str) -> Callable[..., Any]:
+    """The function of a command, as typer takes it."""
+    from tetopt.cli.options import from_records  # which loads what its defaults come from
+
+    return from_records(getattr(import_module(f"tetopt.cli.{COMMANDS[name][0]}"), f"{name}_command"))
+
+
 def _version(is_requested: bool) -> None:
     if is_requested:
         out.print(f"tetopt {tetopt.__version__}")
         raise typer.Exit
 
 
-@app.callback()
 def _common(
     version: Annotated[
         bool, typer.Option("--version", callback=_version, is_eager=True, help="Print the version and exit.")

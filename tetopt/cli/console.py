@@ -9,8 +9,6 @@ from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
 
-from tetopt.report.tables import label_differences, label_table, mask_table
-
 WIDEST_TABLE = 500  # characters in a line
 
 
@@ -38,6 +36,8 @@ def show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
 
 def print_fidelity(measured: dict[str, Any]) -> None:
     """How well contrasts, mask and labels are met, as far as `measured`, of `tetopt.report.summary`, has them."""
+    from tetopt.report.tables import label_differences, label_table, mask_table  # numba and more come with these
+
     for row in measured.get("contrasts", []):
         share = "constant" if row["E_D_share_of_variance"] is None else f"{row['E_D_share_of_variance']:.5f}"
         out.print(escape(f"{row['image']}: weight {row['weight']:g}, share of its own variance in cells {share}"))

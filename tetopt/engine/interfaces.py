@@ -8,9 +8,9 @@ leaves both labels' topology as it is.
 from __future__ import annotations
 
 import numpy as np
+import scipy
 from numba import njit
 from numpy.typing import NDArray
-from scipy.sparse import csr_array
 
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.engine.complex import NodeRings, State, facet_area, image_energy, node_rings, outward, pair_tension
@@ -49,18 +49,18 @@ def with_labels(state: State, content: Content, mesh: Mesh) -> State:
     return state
 
 
-def cell_counts(content: Content, mesh: Mesh) -> csr_array:
+def cell_counts(content: Content, mesh: Mesh) -> scipy.sparse.csr_array:
     """Voxels of each label in each cell, (M, K); of a cell without voxels its size in those of its centroid's label."""
     assert content.memberships is not None
     image, partition = content.image, content.memberships.partition
     owner, n_labels = cell_of_voxel(image, mesh).ravel(), len(content.memberships.labels)
     is_in, shape = owner >= 0, (len(mesh.cells), n_labels)
-    counts = csr_array((np.ones(int(is_in.sum())), (owner[is_in], partition.ravel()[is_in])), shape=shape)
+    counts = scipy.sparse.csr_array((np.ones(int(is_in.sum())), (owner[is_in], partition.ravel()[is_in])), shape=shape)
     empty = np.flatnonzero(counts.sum(axis=1) == 0.0)
     nearest = np.rint(image.to_index(centroids(mesh.points, mesh.cells[empty]))).astype(np.int64)
     nearest = np.clip(nearest, 0, np.array(image.shape) - 1)
     size = volumes(mesh.points, mesh.cells[empty]) / image.voxel_volume
-    counts = csr_array(counts + csr_array((size, (empty, partition[tuple(nearest.T)])), shape=shape))
+    counts = counts + scipy.sparse.csr_array((size, (empty, partition[tuple(nearest.T)])), shape=shape)
     counts.sum_duplicates()
     return counts
 

@@ -20,12 +20,9 @@ import heapq
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numba import njit
 from numpy.typing import NDArray
-from scipy.ndimage import find_objects
-from scipy.ndimage import label as voxel_components
-from scipy.sparse import coo_array, csr_array
-from scipy.sparse.csgraph import connected_components
 
 from tetopt.engine.complex import has_node
 from tetopt.geometry.simplex import facet_areas, volumes
@@ -71,7 +68,7 @@ class Dual(NamedTuple):
 
 
 def labelled(
-    points: NDArray[np.float64], cells: NDArray[np.int64], across: NDArray[np.int64], counts: csr_array,
+    points: NDArray[np.float64], cells: NDArray[np.int64], across: NDArray[np.int64], counts: scipy.sparse.csr_array,
     pieces: list[NDArray], weight: float | None = None,
 ) -> Labelling:  # fmt: skip
     """The label of each cell of a mesh: close to the voxels in it, interfaces short and manifold, no fragments.
@@ -126,9 +123,9 @@ def labelled(
 
 def voxel_pieces(partition: NDArray[np.int64], n_labels: int) -> list[NDArray[np.int64]]:
     """Voxels in each piece of each label of a grid, falling; linked by faces."""
-    boxes = find_objects(partition + 1, n_labels)
+    boxes = scipy.ndimage.find_objects(partition + 1, n_labels)
     parts = [np.zeros(1, dtype=bool) if box is None else partition[box] == k for k, box in enumerate(boxes)]
-    return [np.sort(np.bincount(voxel_components(part)[0].ravel())[1:])[::-1] for part in parts]
+    return [np.sort(np.bincount(scipy.ndimage.label(part)[0].ravel())[1:])[::-1] for part in parts]
 
 
 def pieces_of(across: NDArray[np.int64], labels: NDArray[np.int64]) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
@@ -136,15 +133,16 @@ def pieces_of(across: NDArray[np.int64], labels: NDArray[np.int64]) -> tuple[NDA
     one = np.repeat(np.arange(len(labels)), across.shape[1])
     other = across.ravel()
     is_link = (other > one) & (labels[one] == labels[other])
-    links = coo_array((np.ones(is_link.sum(), dtype=np.int8), (one[is_link], other[is_link])), shape=(len(labels),) * 2)
-    n_pieces, number = connected_components(links, directed=False)
+    linked = one[is_link], other[is_link]
+    links = scipy.sparse.coo_array((np.ones(is_link.sum(), dtype=np.int8), linked), shape=(len(labels),) * 2)
+    n_pieces, number = scipy.sparse.csgraph.connected_components(links, directed=False)
     of_piece = np.empty(n_pieces, dtype=np.int64)
     of_piece[number] = labels
     return number.astype(np.int64), of_piece
 
 
 def _dual(
-    points: NDArray[np.float64], cells: NDArray[np.int64], across: NDArray[np.int64], counts: csr_array,
+    points: NDArray[np.float64], cells: NDArray[np.int64], across: NDArray[np.int64], counts: scipy.sparse.csr_array,
     weight: float | None,
 ) -> Dual:  # fmt: skip
     assert (np.diff(counts.indptr) > 0).all(), "labelled: a cell without voxels has no shares of any label"

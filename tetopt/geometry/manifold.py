@@ -10,9 +10,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from tetopt.geometry.simplex import facet_nodes
 from tetopt.geometry.topology import Facets
@@ -99,8 +98,8 @@ def surface_fans(surfaces: LabelSurfaces, ridges: Ridges) -> Fans:
     ridge, ends = ridges.of_facet.ravel()[by_ridge], corner.reshape(-1, n - 1)[by_ridge]
     is_same = ridge[1:] == ridge[:-1]
     link = (ends[:-1][is_same].ravel(), ends[1:][is_same].ravel())
-    graph = coo_array((np.ones(len(link[0]), dtype=np.int8), link), shape=(surfaces.nodes.size,) * 2)
-    n_fans, fan = connected_components(graph, directed=False)
+    graph = scipy.sparse.coo_array((np.ones(len(link[0]), dtype=np.int8), link), shape=(surfaces.nodes.size,) * 2)
+    n_fans, fan = scipy.sparse.csgraph.connected_components(graph, directed=False)
     base = int(surfaces.nodes.max(initial=0)) + 1
     key = np.empty(n_fans, dtype=np.int64)
     key[fan] = ((surfaces.label[:, None] - OUTSIDE_LABEL) * base + surfaces.nodes).ravel()

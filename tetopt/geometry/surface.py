@@ -12,9 +12,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import edge_pairs, facet_areas, volumes
@@ -337,5 +336,5 @@ def _pair_key(one: NDArray[np.int64], other: NDArray[np.int64], base: int) -> ND
 
 def _connected(one: NDArray[np.int64], other: NDArray[np.int64], n: int) -> NDArray[np.int64]:
     """Number of the connected set of each of n things, (n,), where one[i] and other[i] are linked."""
-    graph = coo_array((np.ones(len(one), dtype=np.int8), (one, other)), shape=(n, n))
-    return connected_components(graph, directed=False)[1].astype(np.int64)
+    graph = scipy.sparse.coo_array((np.ones(len(one), dtype=np.int8), (one, other)), shape=(n, n))
+    return scipy.sparse.csgraph.connected_components(graph, directed=False)[1].astype(np.int64)

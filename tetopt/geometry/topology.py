@@ -7,9 +7,8 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from tetopt.geometry.simplex import facet_nodes
 
@@ -174,8 +173,9 @@ def components(cells: NDArray[np.integer]) -> NDArray[np.int64]:
     """
     sides = facets(cells).cells
     sides = sides[sides[:, 1] >= 0]
-    graph = coo_array((np.ones(len(sides), dtype=np.int8), (sides[:, 0], sides[:, 1])), shape=(len(cells),) * 2)
-    _, number = connected_components(graph, directed=False)
+    ones = np.ones(len(sides), dtype=np.int8)
+    graph = scipy.sparse.coo_array((ones, (sides[:, 0], sides[:, 1])), shape=(len(cells),) * 2)
+    _, number = scipy.sparse.csgraph.connected_components(graph, directed=False)
     _, first, inverse = np.unique(number, return_index=True, return_inverse=True)
     rank = np.empty(len(first), dtype=np.int64)
     rank[np.argsort(first)] = np.arange(len(first))

@@ -13,7 +13,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
-from tetopt.fem.solution import weight_forces
 from tetopt.io.tags import as_scalars, check_one_step
 from tetopt.io.text import rows, xml_comment
 from tetopt.model.loads import Load, facet_forces, spring_constants
@@ -258,6 +257,8 @@ def _dead_forces(model: Model) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
             total[nodes] += forces
         elif load.kind == "gravity" and (table := model.materials) is not None:
             density = density_of(table)[table.of_cell]
+            from tetopt.fem.solution import weight_forces  # scipy's solvers come with it
+
             total += weight_forces(model.mesh, density, load.numbers, model.order) / STRESS_UNITS[model.units].kPa
     nodes = np.flatnonzero(total.any(axis=1))
     return nodes, total[nodes]

@@ -8,10 +8,9 @@ import re
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import pyvista
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
@@ -20,11 +19,14 @@ from tetopt.geometry.simplex import oriented
 from tetopt.io.files import written_whole
 from tetopt.io.raw import CELL_DIMENSIONS, CORNER_KINDS, Raw, by_corners
 from tetopt.io.read_gmsh import read_msh
-from tetopt.io.vtk import ON_PREFIX, add_texts, box_in, sets_in, text_in, to_pyvista, vtu_bytes
+from tetopt.io.vtk import ON_PREFIX, add_texts, box_in, sets_in, text_in, to_vtk, vtu_bytes
 from tetopt.mesh import Mesh
 from tetopt.model.fields import half_turned_fields, is_stress, stresses_times
 from tetopt.model.model import STRESS_UNITS, half_turn
 from tetopt.model.sets import SET_NAME, Box, Sets, free_name, rows_of
+
+if TYPE_CHECKING:
+    import pyvista
 
 MESH_SUFFIXES = (".vtu", ".vtk", ".msh", ".msh2")
 # VTK's kinds of any order, with a number of nodes, that are numbered as kinds of one order; dolfinx writes them.
@@ -71,7 +73,7 @@ def save_mesh(
     as JSON unless it is a string already. `tetopt.save_model` writes more, and other formats. Replaces an existing
     file; ask `tetopt.io.files.checked_output` first.
     """
-    grid = to_pyvista(mesh, cell_data, point_data, order)
+    grid = to_vtk(mesh, cell_data, point_data, order)
     add_texts(grid, about or {})
     with written_whole(Path(path)) as temporary:
         temporary.write_bytes(vtu_bytes(grid))
@@ -250,6 +252,8 @@ def _read_vtk(path: Path) -> Raw:
 
 def _rows_by_kind(grid: pyvista.UnstructuredGrid) -> dict[str, NDArray[np.int64]]:
     """Which cells are of each kind; those of any number of nodes are of the kinds of fixed size that they stand for."""
+    import pyvista
+
     sizes = np.diff(grid.cell_offsets).astype(np.int64)
     stride = int(sizes.max()) + 1
     sorts, which = np.unique(grid.celltypes.astype(np.int64) * stride + sizes, return_inverse=True)
@@ -284,6 +288,8 @@ def _decoded(values: NDArray) -> NDArray:
 
 def _read_quietly(path: Path) -> pyvista.UnstructuredGrid:
     """pyvista's reading, with VTK's complaints turned into one InputError."""
+    import pyvista  # slow to load, and only needed to read
+
     try:
         with _vtk_errors() as errors:
             grid = pyvista.read(path)
@@ -299,6 +305,8 @@ def _read_quietly(path: Path) -> pyvista.UnstructuredGrid:
 @contextlib.contextmanager
 def _vtk_errors() -> Iterator[list[str]]:
     """VTK's errors, instead of on the screen: pyvista passes them to the root logger and on as warnings."""
+    import pyvista
+
     errors: list[str] = []
 
     def caught(record: logging.LogRecord) -> bool:

@@ -8,8 +8,8 @@ import warnings
 from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-import meshio
 import numpy as np
 from numpy.typing import NDArray
 
@@ -17,12 +17,17 @@ from tetopt.errors import InputError
 from tetopt.io.gmsh import OwnComments, own_comments
 from tetopt.io.raw import CELL_DIMENSIONS, Group, Raw, by_corners
 
+if TYPE_CHECKING:
+    import meshio
+
 # What groups without a name are called here, by their dimension; their number follows.
 DEFAULT_LABELS = {1: "edge", 2: "surface", 3: "volume"}
 
 
 def read_msh(path: Path) -> Raw:
     """gmsh's file through meshio, whose complaints become one InputError."""
+    import meshio  # slow to load, and only needed here
+
     try:
         with warnings.catch_warnings(), contextlib.redirect_stdout(None), contextlib.redirect_stderr(None):
             warnings.simplefilter("ignore")

@@ -4,19 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
-import pyvista
 from numpy.typing import NDArray
-from vtkmodules.vtkIOLegacy import vtkPolyDataWriter
-from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
 
 from tetopt.errors import InputError
 from tetopt.geometry.surface import Surface, surface_of
 from tetopt.io.files import written_whole
 from tetopt.io.vtk import LEGACY_VERSION
 from tetopt.model.model import Model, half_turn
+
+if TYPE_CHECKING:
+    import pyvista
 
 SURFACE_SUFFIXES = (".stl", ".ply", ".vtp", ".vtk")
 LABELLED_SUFFIXES = SURFACE_SUFFIXES[1:]  # that hold labels of triangles
@@ -123,6 +123,7 @@ def checked_surface(path: str | Path) -> SurfaceCheck:
 
 def _from_vtk(path: str | Path) -> Any:
     """The triangles of one of VTK's files as trimesh has them."""
+    import pyvista
     import trimesh
 
     grid = pyvista.read(path)
@@ -166,6 +167,8 @@ def _ply(surface: Surface, about: str, space: str, labels: Labels) -> bytes:
 
 
 def _vtp(surface: Surface, about: str, space: str, labels: Labels) -> bytes:
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataWriter
+
     grid = _grid(surface, labels)
     grid.field_data[SPACE_KEY.rstrip("=")] = [space.upper()]
     writer = vtkXMLPolyDataWriter()
@@ -177,6 +180,8 @@ def _vtp(surface: Surface, about: str, space: str, labels: Labels) -> bytes:
 
 
 def _vtk(surface: Surface, about: str, space: str, labels: Labels) -> bytes:
+    from vtkmodules.vtkIOLegacy import vtkPolyDataWriter
+
     writer = vtkPolyDataWriter()
     writer.SetHeader(f"tetopt, mm, {SPACE_KEY}{space.upper()} {_plain(about)}"[:250])  # a line of 256 characters
     writer.SetFileVersion(LEGACY_VERSION)
@@ -189,6 +194,8 @@ def _vtk(surface: Surface, about: str, space: str, labels: Labels) -> bytes:
 
 
 def _grid(surface: Surface, labels: Labels) -> pyvista.PolyData:
+    import pyvista  # slow to load, and with VTK only needed here
+
     grid = pyvista.PolyData.from_regular_faces(surface.points, surface.triangles)
     for name, values in labels.items():
         grid.cell_data[name] = np.asarray(values, dtype=np.int32)

@@ -17,13 +17,10 @@ from __future__ import annotations
 
 import hashlib
 import json
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import pyvista
 from numpy.typing import NDArray
-from vtkmodules.vtkIOLegacy import vtkUnstructuredGridWriter
-from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
 
 from tetopt.geometry.quadratic import quadratic
 from tetopt.image import Image
@@ -33,34 +30,61 @@ from tetopt.model.loads import load_words
 from tetopt.model.model import Model, element_facets, elements
 from tetopt.model.sets import SET_NAME, Box, Sets
 
-CELL_TYPES = {  # by dimension and order
-    (2, 1): pyvista.CellType.TRIANGLE, (3, 1): pyvista.CellType.TETRA,
-    (2, 2): pyvista.CellType.QUADRATIC_TRIANGLE, (3, 2): pyvista.CellType.QUADRATIC_TETRA,
-}  # fmt: skip
+if TYPE_CHECKING:
+    from vtkmodules.vtkCommonDataModel import vtkFieldData, vtkUnstructuredGrid
+
+CELL_TYPES = {(2, 1): 5, (3, 1): 10, (2, 2): 22, (3, 2): 24}  # VTK's numbers, by dimension and order
 # Names of field data and of point data in our files, see above.
 FACETS_PREFIX, CELLS_PREFIX, ON_PREFIX, CHECKSUM_NAME = "facets:", "cells:", "on_", "cells_sha256"
 LEGACY_VERSION = 42  # version 4.2: 5.1 is not read by older programs, 3D Slicer among them
 
 
-def to_pyvista(
+def to_vtk(
     mesh: Mesh,
     cell_data: dict[str, NDArray] | None = None,
     point_data: dict[str, NDArray] | None = None,
     order: int = 1,
-) -> pyvista.UnstructuredGrid:
-    """The mesh as a pyvista grid in world mm, of cells of an order; a 2-D mesh lies in the plane z = 0.
+) -> vtkUnstructuredGrid:
+    """The mesh as VTK's grid in world mm, of cells of an order; a 2-D mesh lies in the plane z = 0.
 
     Point data of the mesh's nodes alone are interpolated to those of order 2, see `tetopt.model.fields.node_field`.
     """
+    # VTK without pyvista, and only here: files are written by the quickest of runs, too.
+    from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
+    from vtkmodules.vtkCommonCore import vtkPoints
+    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkUnstructuredGrid
+
     places, cells = quadratic(mesh.points, mesh.cells) if order == 2 else (mesh.points, mesh.cells)
     points = np.zeros((len(places), 3))
     points[:, : mesh.ndim] = places
-    grid = pyvista.UnstructuredGrid({CELL_TYPES[mesh.ndim, order]: cells}, points)
+    nodes = vtkPoints()
+    nodes.SetData(numpy_to_vtk(points, deep=True))
+    listed = vtkCellArray()
+    listed.SetData(
+        cells.shape[1], numpy_to_vtkIdTypeArray(np.ascontiguousarray(cells, dtype=np.int64).ravel(), deep=True)
+    )
+    grid = vtkUnstructuredGrid()
+    grid.SetPoints(nodes)
+    grid.SetCells(CELL_TYPES[mesh.ndim, order], listed)
     for name, values in (cell_data or {}).items():
-        grid.cell_data[name] = values
+        _add(grid.GetCellData(), name, values)
     for name, values in (point_data or {}).items():
-        grid.point_data[name] = node_field(values, mesh, order)
+        _add(grid.GetPointData(), name, node_field(values, mesh, order))
     return grid
+
+
+def _add(fields: vtkFieldData, name: str, values: NDArray) -> None:
+    """Add an array of numbers; the first on cells, or on points, is the one that programs show."""
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+    from vtkmodules.vtkCommonDataModel import vtkDataSetAttributes
+
+    values = np.asarray(values)
+    values = values.reshape(len(values), -1) if values.ndim > 1 else values
+    array = numpy_to_vtk(np.ascontiguousarray(values.view(np.uint8) if values.dtype == bool else values), deep=True)
+    array.SetName(name)
+    fields.AddArray(array)
+    if isinstance(fields, vtkDataSetAttributes) and fields.GetScalars() is None:
+        fields.SetActiveScalars(name)
 
 
 def vtu(model: Model) -> bytes:
@@ -70,7 +94,10 @@ def vtu(model: Model) -> bytes:
 
 def vtk(model: Model) -> bytes:
     """A legacy VTK file, binary, since VTK rounds ASCII to eleven digits."""
-    grid = model_grid(model)
+    import pyvista
+    from vtkmodules.vtkIOLegacy import vtkUnstructuredGridWriter
+
+    grid = pyvista.wrap(model_grid(model))
     for data in (grid.point_data, grid.cell_data, grid.field_data):
         for name in data:
             data[name] = _without_int64(np.asarray(data[name]))
@@ -94,45 +121,47 @@ def _without_int64(values: NDArray) -> NDArray:
     return values.astype(np.int32 if fits else np.float64)
 
 
-def vtu_bytes(grid: pyvista.UnstructuredGrid) -> bytes:
+def vtu_bytes(grid: vtkUnstructuredGrid) -> bytes:
     """A grid as the bytes of a VTU file."""
+    from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
+
     writer = vtkXMLUnstructuredGridWriter()
     writer.SetDataModeToBinary()
     return _written(writer, grid)
 
 
-def _written(writer: Any, grid: pyvista.UnstructuredGrid) -> bytes:
+def _written(writer: Any, grid: vtkUnstructuredGrid) -> bytes:
     # VTK writes into memory and Python to the disk: on a full one VTK reports nothing, or ends the process.
     writer.SetInputData(grid)
     writer.WriteToOutputStringOn()
     if not writer.Write():
         raise RuntimeError("VTK could not write the mesh")
-    if not isinstance(writer, vtkUnstructuredGridWriter):
+    if writer.IsA("vtkXMLWriter"):
         return writer.GetOutputString().encode()
     text = writer.GetOutputStdString()  # bytes, if they are no text
     return text if isinstance(text, bytes) else text.encode()
 
 
-def model_grid(model: Model) -> pyvista.UnstructuredGrid:
+def model_grid(model: Model) -> vtkUnstructuredGrid:
     """All of a model on one grid."""
-    grid = to_pyvista(model.mesh, model.cell_data, model.point_data, model.order)
+    grid = to_vtk(model.mesh, model.cell_data, model.point_data, model.order)
     cells = elements(model)[1]
     for name, rows in model.sets.facets.items():
-        is_on = np.zeros(grid.n_points, dtype=np.uint8)
+        is_on = np.zeros(grid.GetNumberOfPoints(), dtype=np.uint8)
         is_on[element_facets(cells, rows)] = 1
-        grid.point_data[f"{ON_PREFIX}{name}"] = is_on
+        _add(grid.GetPointData(), f"{ON_PREFIX}{name}", is_on)
     texts = dict(model.about) | {"space": model.space}
     if model.materials is not None:
-        of_cell = model.materials.of_cell
-        grid.cell_data["young"] = model.materials.young[of_cell]
-        grid.cell_data["nu"] = model.materials.nu[of_cell]
-        grid.cell_data["material"] = of_cell + 1
+        of_cell, on_cells = model.materials.of_cell, grid.GetCellData()
+        _add(on_cells, "young", model.materials.young[of_cell])
+        _add(on_cells, "nu", model.materials.nu[of_cell])
+        _add(on_cells, "material", of_cell + 1)
         if model.materials.density is not None:
-            grid.cell_data["density"] = model.materials.density[of_cell]
+            _add(on_cells, "density", model.materials.density[of_cell])
         if model.materials.binning is not None:
             texts["binning"] = model.materials.binning._asdict()
     if model.node_young is not None:
-        grid.point_data[NODE_MODULI] = node_field(model.node_young, model.mesh, model.order)
+        _add(grid.GetPointData(), NODE_MODULI, node_field(model.node_young, model.mesh, model.order))
     if model.materials is not None or model.loads or any(map(is_stress, [*model.cell_data, *model.point_data])):
         texts["units"] = model.units
     if model.loads:
@@ -142,19 +171,19 @@ def model_grid(model: Model) -> pyvista.UnstructuredGrid:
     return grid
 
 
-def add_texts(grid: pyvista.UnstructuredGrid, texts: dict[str, Any]) -> None:
+def add_texts(grid: vtkUnstructuredGrid, texts: dict[str, Any]) -> None:
     """Each entry as field data, as JSON unless it is a string already."""
     for name, value in texts.items():
         text = value if isinstance(value, str) else json.dumps(value)
-        grid.field_data[name] = np.frombuffer(text.encode(), dtype=np.uint8)
+        _add(grid.GetFieldData(), name, np.frombuffer(text.encode(), dtype=np.uint8))
 
 
-def add_sets(grid: pyvista.UnstructuredGrid, mesh: Mesh, sets: Sets) -> None:
+def add_sets(grid: vtkUnstructuredGrid, mesh: Mesh, sets: Sets) -> None:
     """The sets as field data, with the checksum of the cells that they are of."""
     for name, rows in sets.facets.items():
-        grid.field_data[f"{FACETS_PREFIX}{name}"] = rows
+        _add(grid.GetFieldData(), f"{FACETS_PREFIX}{name}", rows)
     for name, members in sets.cells.items():
-        grid.field_data[f"{CELLS_PREFIX}{name}"] = members
+        _add(grid.GetFieldData(), f"{CELLS_PREFIX}{name}", members)
     if sets.facets or sets.cells:
         add_texts(grid, {CHECKSUM_NAME: _checksum(mesh)})
 

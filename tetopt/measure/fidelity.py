@@ -14,10 +14,8 @@ from math import ceil
 from typing import NamedTuple
 
 import numpy as np
-import pyvista
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import find_objects
-from scipy.ndimage import label as voxel_components
 
 from tetopt.check import facets_on_box
 from tetopt.energy.sampling import cell_of_voxel, nearest_values
@@ -144,7 +142,7 @@ def label_fidelity(labels: Image, mesh: Mesh, of_cell: ArrayLike | None = None) 
     n_cells, mesh_volume = _counts(label_of_cell), _counts(label_of_cell, volumes(mesh.points, mesh.cells))
     n_empty = _counts(label_of_cell[np.bincount(owner.ravel() + 1, minlength=len(mesh.cells) + 1)[1:] == 0])
     overlap, beyond = _overlaps(labels, mesh, label_of_cell, len(n_true))
-    boxes = find_objects(true + 1)
+    boxes = scipy.ndimage.find_objects(true + 1)
     nodes, sides = _labels_beside_facets(labels, mesh, label_of_cell)
     face = _face(labels.voxel_volume, labels.ndim)
     rows = []
@@ -169,7 +167,7 @@ def label_fidelity(labels: Image, mesh: Mesh, of_cell: ArrayLike | None = None) 
                     mesh_volume[label] + (label == 0) * beyond[1],
                 ),
                 *_mean_and_p95(distances),
-                int(voxel_components(part == label)[1]),
+                int(scipy.ndimage.label(part == label)[1]),
                 _n_components(mesh.cells[label_of_cell == label]),
                 bool(n_cells[label] == 0 and (label > 0 or owner.min() >= 0)),
             )
@@ -235,7 +233,7 @@ def mask_fidelity(mask: Image, mesh: Mesh) -> MaskFidelity:
         *_mean_and_p95(back),
         *_mean_and_p95(there_mm),
         *_mean_and_p95(back_mm),
-        int(voxel_components(is_inside)[1]),
+        int(scipy.ndimage.label(is_inside)[1]),
         _n_components(mesh.cells),
         euler_characteristic(theirs.facets),
         euler_characteristic(ours.facets),
@@ -260,6 +258,8 @@ def half_level_surface(level: NDArray, affine: NDArray[np.float64]) -> FacetSurf
     FacetSurface
         In world mm, exact to 1e-5 voxel; without facets where the field does not cross 1/2.
     """
+    import pyvista  # slow to load, and only needed with a mask or labels
+
     level = np.asarray(level)
     n = level.ndim
     padded = np.pad(level, 1, mode="edge")
@@ -287,6 +287,8 @@ def surface_distances(
     InputError
         A surface without facets.
     """
+    import pyvista
+
     if len(surface_facets) == 0:
         raise InputError("surface: expected one facet or more, got none; nothing has a distance from it")
     if points.shape[1] == 3:

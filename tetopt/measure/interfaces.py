@@ -15,14 +15,8 @@ from itertools import chain, combinations, product
 from typing import NamedTuple
 
 import numpy as np
-import pyvista
+import scipy
 from numpy.typing import ArrayLike, NDArray
-from scipy.ndimage import find_objects
-from scipy.ndimage import label as voxel_components
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
-from vtkmodules.util.numpy_support import vtk_to_numpy
-from vtkmodules.vtkFiltersCore import vtkSurfaceNets2D, vtkSurfaceNets3D
 
 from tetopt.geometry.manifold import OUTSIDE_LABEL, LabelSurfaces, Ridges, label_surfaces, surface_fans, surface_ridges
 from tetopt.geometry.simplex import edge_pairs
@@ -82,7 +76,7 @@ def label_interfaces(labels: Image, mesh: Mesh, of_cell: ArrayLike) -> list[Labe
     check_labels("labels", labels)
     of_cell = checked_cell_labels(of_cell, mesh)
     voxels = labels.data.astype(np.int32)
-    boxes = find_objects(voxels + 1)
+    boxes = scipy.ndimage.find_objects(voxels + 1)
     present = np.array([label for label, box in enumerate(boxes) if box is not None])
     shared = facets(mesh.cells)
     surfaces = label_surfaces(shared, of_cell)
@@ -139,6 +133,10 @@ def smooth_surface(is_label: NDArray[np.bool_], affine: NDArray[np.float64]) -> 
     affine : (n+1, n+1) float64
         Index -> world mm.
     """
+    import pyvista  # slow to load, and only needed with labels
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkFiltersCore import vtkSurfaceNets2D, vtkSurfaceNets3D
+
     n = is_label.ndim
     grid = pyvista.ImageData(dimensions=is_label.shape + (1,) * (3 - n))
     grid.point_data["label"] = is_label.astype(np.uint8).ravel(order="F")
@@ -186,7 +184,7 @@ def voxel_cavities(is_label: NDArray[np.bool_]) -> int:
     """How many parts of what is around voxels are shut in; corners let through. None in 2-D."""
     if is_label.ndim == 2:
         return 0
-    return int(voxel_components(~np.pad(is_label, 1), np.ones((3,) * is_label.ndim))[1]) - 1
+    return int(scipy.ndimage.label(~np.pad(is_label, 1), np.ones((3,) * is_label.ndim))[1]) - 1
 
 
 def touching_voxels(is_label: NDArray[np.bool_]) -> int:
@@ -285,6 +283,6 @@ def _cell_cavities(
 
 def _parts(one: NDArray[np.int64], other: NDArray[np.int64], n: int) -> tuple[int, NDArray[np.int64]]:
     """How many connected sets n things fall into, of which one[i] and other[i] are linked, and each thing's."""
-    graph = coo_array((np.ones(len(one), dtype=np.int8), (one, other)), shape=(n, n))
-    count, part = connected_components(graph, directed=False)
+    graph = scipy.sparse.coo_array((np.ones(len(one), dtype=np.int8), (one, other)), shape=(n, n))
+    count, part = scipy.sparse.csgraph.connected_components(graph, directed=False)
     return int(count), part.astype(np.int64)

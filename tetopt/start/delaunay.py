@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.spatial import ConvexHull, QhullError
 
 from tetopt.geometry.simplex import oriented
 from tetopt.image import transformed
@@ -50,8 +50,8 @@ def delaunay(
     height = (height - height.min()) / np.ptp(height)
     lifted = np.column_stack([centred / np.abs(centred).max(), height])
     try:
-        hull = ConvexHull(lifted)
-    except QhullError:
+        hull = scipy.spatial.ConvexHull(lifted)
+    except scipy.spatial.QhullError:
         return None
     is_lower = hull.equations[:, n] < -1e-9  # faces of the box stand upright: 0 up to rounding
     cells = oriented(world, hull.simplices[is_lower])

@@ -18,8 +18,8 @@ from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter
 
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
@@ -378,7 +378,8 @@ def _divided(blocks: list[_Blocks], threshold: float, n_rings: int) -> list[NDAr
     """
     divided = [(at_depth.error > threshold) | at_depth.is_too_large for at_depth in blocks[:-1]]
     for depth in range(len(divided) - 1, 0, -1):
-        near = maximum_filter(divided[depth], size=2 * n_rings + 1, mode="nearest")  # these blocks have to exist
+        # These blocks have to exist:
+        near = scipy.ndimage.maximum_filter(divided[depth], size=2 * n_rings + 1, mode="nearest")
         for axis in range(near.ndim):
             near = near.reshape(*near.shape[:axis], -1, 2, *near.shape[axis + 1 :]).any(axis=axis + 1)
         divided[depth - 1] |= near

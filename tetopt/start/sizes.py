@@ -5,9 +5,9 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numba import njit
 from numpy.typing import NDArray
-from scipy.ndimage import affine_transform
 
 from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides
@@ -98,7 +98,7 @@ class Sizes(NamedTuple):
             return None
         to_field = np.linalg.inv(self.field.affine) @ image.affine
         return np.asarray(
-            affine_transform(
+            scipy.ndimage.affine_transform(
                 self.field.data, to_field, output_shape=image.shape, order=0, mode="grid-constant", cval=NO_BOUND_MM
             )
         )

@@ -9,8 +9,8 @@ from __future__ import annotations
 from itertools import product
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy import ndimage
 
 from tetopt.errors import InputError
 from tetopt.geometry.box import box_sides
@@ -256,7 +256,7 @@ def _resampled(data: NDArray, other: Image, image: Image, order: int, mode: str)
     matrix, offset = (corner[1:] - corner[0]).T, corner[0]
     if order == 0:  # centres halfway between two voxels, on a grid shifted by half a voxel, all go to the upper one
         offset = offset + SAME_GRID_VOXELS
-    return ndimage.affine_transform(data, matrix, offset, image.shape, data.dtype, order=order, mode=mode)
+    return scipy.ndimage.affine_transform(data, matrix, offset, image.shape, data.dtype, order=order, mode=mode)
 
 
 def _corners(image: Image) -> NDArray[np.float64]:
@@ -280,7 +280,7 @@ def _on_faces(data: NDArray) -> NDArray:
 
 def _large_pieces(is_in: NDArray[np.bool_], at_border: bool = False) -> NDArray[np.bool_]:
     """Pieces, connected face to face, not far smaller than the largest; with `at_border` of those that touch it."""
-    pieces, _ = ndimage.label(is_in)
+    pieces, _ = scipy.ndimage.label(is_in)
     sizes = np.bincount(pieces.ravel())
     sizes[0] = 0
     if at_border:

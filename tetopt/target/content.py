@@ -11,8 +11,8 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import binary_erosion, distance_transform_edt, find_objects
 
 from tetopt.errors import InputError
 from tetopt.image import Image
@@ -222,13 +222,13 @@ def continuation(mask: Image, spacing: NDArray[np.float64]) -> Continuation:
     inside = mask.data >= INSIDE_SHARE
     if not inside.any():
         raise InputError("mask: no voxel has a half or more, there is nothing to mesh")
-    box = find_objects(inside.astype(np.int8))[0]
+    box = scipy.ndimage.find_objects(inside.astype(np.int8))[0]
     ends = ((max(s.start - MARGIN_VOXELS, 0), s.stop + MARGIN_VOXELS) for s in box)
     part = tuple(slice(first, min(stop, n)) for (first, stop), n in zip(ends, mask.shape, strict=True))
     inside = inside[part]
     if inside.all():
         return Continuation(part, inside, np.empty(0, dtype=np.int64))
-    nearest = distance_transform_edt(~inside, spacing, return_distances=False, return_indices=True)
+    nearest = scipy.ndimage.distance_transform_edt(~inside, spacing, return_distances=False, return_indices=True)
     return Continuation(part, inside, np.ravel_multi_index(tuple(nearest[:, ~inside]), inside.shape))
 
 
@@ -325,7 +325,7 @@ def noise_level(data: NDArray, inside: NDArray[np.bool_] | None = None) -> float
     middle = (slice(1, -1),) * data.ndim
     is_counted = (rest != 0.0) | (data[middle] != values[often.argmax()])
     if inside is not None:
-        is_counted &= binary_erosion(inside, np.ones((3,) * data.ndim), border_value=1)[middle]
+        is_counted &= scipy.ndimage.binary_erosion(inside, np.ones((3,) * data.ndim), border_value=1)[middle]
     size = np.abs(rest[is_counted])
     if np.count_nonzero(size) < 0.1 * (rest.size if inside is None else inside.sum()):
         return 0.0

@@ -10,8 +10,8 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates, maximum_filter
 
 from tetopt.image import Image
 
@@ -38,16 +38,16 @@ def region_of(mask: Image) -> Region:
     inside = data >= INSIDE_SHARE
     if inside.all():
         return Region(inside, np.full(inside.shape, -float(max(inside.shape)), dtype=np.float32))
-    within, without = distance_transform_edt(inside), distance_transform_edt(~inside)
+    within, without = scipy.ndimage.distance_transform_edt(inside), scipy.ndimage.distance_transform_edt(~inside)
     raw = np.where(inside, 0.5 - within, without - 0.5)
     if np.any((data > 0.0) & (data < 1.0)):
         level = np.where(np.abs(raw) < 1.0, np.clip(0.5 - data, -0.5, 0.5), raw)
     else:
-        once = gaussian_filter(raw, SMOOTHING_VOXELS, mode="nearest")
-        twice = once + gaussian_filter(
+        once = scipy.ndimage.gaussian_filter(raw, SMOOTHING_VOXELS, mode="nearest")
+        twice = once + scipy.ndimage.gaussian_filter(
             raw - once, SMOOTHING_VOXELS, mode="nearest"
         )  # what the first one took of curves, back
-        room = np.minimum(maximum_filter(within, size=5), maximum_filter(without, size=5))
+        room = np.minimum(scipy.ndimage.maximum_filter(within, size=5), scipy.ndimage.maximum_filter(without, size=5))
         most = MOST_SMOOTHED_VOXELS * np.clip(room - 1.0, 0.0, 1.0)
         level = np.clip(twice, raw - most, raw + most)
     return Region(inside, level.astype(np.float32))
@@ -55,4 +55,4 @@ def region_of(mask: Image) -> Region:
 
 def levels(level: NDArray, index: NDArray[np.float64]) -> NDArray[np.float64]:
     """The level function at index coordinates (K, n), (K,)."""
-    return np.asarray(map_coordinates(level, index.T, order=1, mode="nearest", output=np.float64))
+    return np.asarray(scipy.ndimage.map_coordinates(level, index.T, order=1, mode="nearest", output=np.float64))

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import maximum_filter
 
 from tetopt.errors import InputError
 from tetopt.image import Image
@@ -33,7 +33,7 @@ def label_channels(number: NDArray[np.int64], n_labels: int) -> NDArray[np.int64
     )
     is_in = np.zeros((n_labels, int(np.prod(shape))), dtype=bool)
     is_in[number.ravel(), block.ravel()] = True
-    is_beside = np.stack([maximum_filter(row.reshape(shape), size=3).ravel() for row in is_in])
+    is_beside = np.stack([scipy.ndimage.maximum_filter(row.reshape(shape), size=3).ravel() for row in is_in])
     touches = is_beside.astype(np.float32) @ is_in.T.astype(np.float32) > 0.0
     channel = np.full(n_labels, -1, dtype=np.int64)
     for label in np.argsort(-touches.sum(axis=1), kind="stable"):

@@ -13,9 +13,8 @@ from typing import NamedTuple
 
 import numba
 import numpy as np
+import scipy
 from numpy.typing import NDArray
-from scipy.ndimage import correlate1d, distance_transform_edt, find_objects, gaussian_filter, maximum_filter
-from scipy.ndimage import label as components
 
 from tetopt.image import Image
 from tetopt.target.labels import check_labels, label_channels
@@ -109,7 +108,7 @@ def memberships(labels: Image, factors: Sequence[int] | None = None) -> Membersh
     channel = label_channels(start, len(values))
     levels = np.full((channel.max() + 1, *start.shape), FARTHEST_LEVEL, dtype=np.float32)
     smallest, partition = np.full(start.shape, np.inf, dtype=np.float32), np.zeros(start.shape, dtype=np.int64)
-    boxes = [_around(box, start.shape) for box in find_objects(start + 1)]
+    boxes = [_around(box, start.shape) for box in scipy.ndimage.find_objects(start + 1)]
 
     def level_in(row: int) -> NDArray[np.float32]:
         box = boxes[row]
@@ -158,7 +157,7 @@ def _level(
     level = np.where(inside, 0.5 - within, without - 0.5)
     low, high = _bounds(level, off)
     thin, broad = THIN_REACH
-    reach = np.minimum(maximum_filter(within, 13), maximum_filter(without, 13))
+    reach = np.minimum(scipy.ndimage.maximum_filter(within, 13), scipy.ndimage.maximum_filter(without, 13))
     share = np.clip((reach - thin) / (broad - thin), 0.0, 1.0)
     for _ in range(FLOW_STEPS):
         smooth = _flowed(level, FINE_SIGMA)
@@ -170,7 +169,7 @@ def _level(
 
 def _distance(inside: NDArray[np.bool_]) -> NDArray[np.float32]:
     """To the nearest voxel's centre outside, voxels; 0 outside, and what is far is cut off."""
-    return np.minimum(distance_transform_edt(inside), FARTHEST_DISTANCE).astype(np.float32)
+    return np.minimum(scipy.ndimage.distance_transform_edt(inside), FARTHEST_DISTANCE).astype(np.float32)
 
 
 def _bounds(raw: NDArray[np.float32], off: NDArray) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
@@ -183,15 +182,15 @@ def _bounds(raw: NDArray[np.float32], off: NDArray) -> tuple[NDArray[np.float32]
 
 
 def _flowed(level: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
-    once = gaussian_filter(level, sigma, mode="nearest", truncate=3.0)
-    return once + gaussian_filter(level - once, sigma, mode="nearest", truncate=3.0)
+    once = scipy.ndimage.gaussian_filter(level, sigma, mode="nearest", truncate=3.0)
+    return once + scipy.ndimage.gaussian_filter(level - once, sigma, mode="nearest", truncate=3.0)
 
 
 def _with_volume(level: NDArray[np.float32], raw: NDArray[np.bool_], sigma: float) -> NDArray[np.float32]:
     """The level raised or lowered, gently from place to place, so that it has the label's volume within `sigma`."""
     mean = level  # over each voxel, of the level that is linear between centres
     for axis in range(level.ndim):
-        mean = correlate1d(mean, [0.125, 0.75, 0.125], axis, mode="nearest")
+        mean = scipy.ndimage.correlate1d(mean, [0.125, 0.75, 0.125], axis, mode="nearest")
     distance = mean / np.clip(_slope(level), LEAST_SLOPE, 1.0)
     missing = _summed(raw - np.clip(0.5 - distance, 0.0, 1.0), sigma)
     area = _summed((np.abs(distance) < 0.5).astype(np.float32), sigma)
@@ -221,7 +220,7 @@ def _summed(values: NDArray[np.float32], sigma: float) -> NDArray[np.float32]:
         for first in range(1, VOLUME_BLOCK):
             total[: len(parts[first::VOLUME_BLOCK])] += parts[first::VOLUME_BLOCK]
         values = np.moveaxis(total, 0, axis)
-    return gaussian_filter(values, sigma / VOLUME_BLOCK, mode="constant", truncate=3.0)
+    return scipy.ndimage.gaussian_filter(values, sigma / VOLUME_BLOCK, mode="constant", truncate=3.0)
 
 
 def _spread(data: NDArray, factors: Sequence[int]) -> NDArray:
@@ -256,14 +255,15 @@ def _merge_crumbs(
     There the two labels' levels are exchanged.
     """
     is_crumb = np.zeros(partition.shape, dtype=bool)
-    for row, box in enumerate(find_objects(partition + 1)):
-        piece, n = components(partition[box] == row)
+    for row, box in enumerate(scipy.ndimage.find_objects(partition + 1)):
+        piece, n = scipy.ndimage.label(partition[box] == row)
         reaches = np.zeros(n + 1, dtype=bool)
         reaches[piece[is_plane[box]]] = True
         reaches[0] = True
         is_crumb[box] |= ~reaches[piece]
     if is_crumb.any():
-        nearest = distance_transform_edt(is_crumb, return_distances=False, return_indices=True)[:, is_crumb]
+        place = scipy.ndimage.distance_transform_edt(is_crumb, return_distances=False, return_indices=True)
+        nearest = place[:, is_crumb]
         at, old, new = np.nonzero(is_crumb), partition[is_crumb], partition[tuple(nearest)]
         low, high = levels[(channel[old], *at)], levels[(channel[new], *at)]
         levels[(channel[old], *at)], levels[(channel[new], *at)] = high, low
@@ -290,7 +290,7 @@ def _between_slices(number: NDArray[np.int64], axis: int, factors: Sequence[int]
     divided = [factors[axis] if i == axis else 1 for i in range(number.ndim)]
     shape = tuple(n * f for n, f in zip(number.shape, divided, strict=True))
     smallest, partition = np.full(shape, np.inf, dtype=np.float32), np.zeros(shape, dtype=np.int64)
-    for row, box in enumerate(find_objects(number + 1)):
+    for row, box in enumerate(scipy.ndimage.find_objects(number + 1)):
         margin = tuple(slice(max(s.start - 1, 0), min(s.stop + 1, n)) for s, n in zip(box, number.shape, strict=True))
         fine = tuple(slice(s.start * f, s.stop * f) for s, f in zip(margin, divided, strict=True))
         level = _interpolated(number[margin] == row, axis, factors[axis], length)
@@ -335,9 +335,9 @@ def _outlined(inside: NDArray[np.bool_], length: Sequence[float]) -> tuple[NDArr
     level, deepest = np.zeros(inside.shape, dtype=np.float32), np.zeros(inside.shape, dtype=np.float32)
     for side, sign in ((inside, -1.0), (~inside, 1.0)):
         distance = np.minimum(
-            distance_transform_edt(side, length) if not side.all() else ABSENT_DISTANCE, ABSENT_DISTANCE
+            scipy.ndimage.distance_transform_edt(side, length) if not side.all() else ABSENT_DISTANCE, ABSENT_DISTANCE
         )
-        piece, n = components(side, link)
+        piece, n = scipy.ndimage.label(side, link)
         largest = np.zeros(n + 1, dtype=np.float32)
         np.maximum.at(largest, piece, np.where(side, distance - 0.5, 0.0))
         level += np.where(side, sign * (distance - 0.5), 0.0).astype(np.float32)
