@@ -160,6 +160,24 @@ def test_noise_within_a_mask():
     assert noise_level(data, inside) == pytest.approx(3.0, rel=0.1)
 
 
+@pytest.mark.parametrize("shape", [(60, 70), (41, 30, 35)])
+@pytest.mark.parametrize("has_mask", [False, True])
+def test_noise_of_a_large_image_is_that_of_some_of_its_slices(monkeypatch, shape, has_mask):
+    rng = np.random.default_rng(0)
+    data = rng.normal(0.0, 3.0, shape) + 20.0 * (np.indices(shape)[0] > 25)
+    inside = np.indices(shape)[1] > 6 if has_mask else None
+    every = noise_level(data, inside)
+    monkeypatch.setattr("tetopt.target.content.NOISE_VOXELS", data.size // 6)  # each fifth slice
+    some = noise_level(data, inside)
+    assert some == pytest.approx(every, rel=0.05)
+    assert some != every
+    middles = np.arange(1 + (shape[0] - 3) % 5 // 2, shape[0] - 1, 5)
+    others = np.setdiff1d(np.arange(shape[0]), [middles - 1, middles, middles + 1])
+    assert len(others) > shape[0] // 3
+    data[others] *= 10.0
+    assert noise_level(data, inside) == some  # those have no say
+
+
 def test_float_labels_of_256_cubed():
     """Whole numbers in float32, as many tools write them: a few seconds, and no more than some bytes a voxel."""
     data = np.zeros((256, 256, 256), dtype=np.float32)

@@ -200,18 +200,26 @@ class _Voxels(NamedTuple):
 
 def _voxels(content: Content) -> _Voxels:
     """The channels less their means, at most 1: numbers of nodes do not depend on the unit of intensity."""
-    channels = [v.astype(np.float64) - float(np.mean(v, dtype=np.float64)) for v in content.values]
-    scale = max(float(np.abs(channel).max()) for channel in channels)
-    if not np.isfinite(scale * scale * channels[0].size):
+    means = [float(np.mean(v, dtype=np.float64)) for v in content.values]
+    extremes = [abs(float(end) - m) for v, m in zip(content.values, means, strict=True) for end in (v.min(), v.max())]
+    scale = max(extremes)
+    if not np.isfinite(scale * scale * content.values[0].size):
         raise InputError(f"image: squares of deviations up to {scale:.3g} overflow; rescale it first")
     scale = scale or 1.0
-    inside = np.ones(content.image.shape) if content.region is None else content.region.inside.astype(np.float64)
-    channels = [inside * channel / scale for channel in channels]
-    square = sum(channel * channel for channel in channels)
-    step = content.wrong_side / scale**2
+    inside = None if content.region is None else content.region.inside.astype(np.float64)
+    channels = []
+    for values, mean in zip(content.values, means, strict=True):
+        channel = np.subtract(values, mean, dtype=np.float64)
+        channel /= scale
+        channels.append(channel if inside is None else inside * channel)
+    square = channels[0] * channels[0]
+    for channel in channels[1:]:
+        square += channel * channel
     # The noise is that of values at most 1, too: its estimate rounds differently otherwise.
-    noise = content._replace(values=np.stack(channels)).noise
-    return _Voxels([inside, square, *channels], None if content.region is None else 1.0 - inside, noise, step)
+    noise = content.noise_of(channels)
+    if inside is None:
+        return _Voxels([np.broadcast_to(1.0, square.shape), square, *channels], None, noise, 0.0)
+    return _Voxels([inside, square, *channels], 1.0 - inside, noise, content.wrong_side / scale**2)
 
 
 class _Blocks(NamedTuple):
@@ -296,10 +304,16 @@ def _block_totals(data: NDArray, counts: NDArray[np.int64], total_of: np.ufunc, 
     for axis, count in enumerate(counts):
         size = data.shape[axis]
         start = np.ceil(np.arange(count) * (size / count) - 0.5).astype(np.int64)
-        stop = np.append(start[1:], size)
-        total = total_of.reduceat(data, np.minimum(start, size - 1), axis=axis)
-        is_empty = np.expand_dims(start == stop, [d for d in range(data.ndim) if d != axis])
-        data = np.where(is_empty, empty, total)
+        length = np.append(start[1:], size) - start
+        # The first voxel of each block, the second of each that has one, ...: five times as fast as `reduceat`.
+        data = np.moveaxis(data, axis, 0)
+        total = data[np.minimum(start, size - 1)]
+        total[length == 0] = empty
+        for k in range(1, length.max()):
+            longer = length > k
+            of_longer = slice(None) if longer.all() else longer
+            total[of_longer] = total_of(total[of_longer], data[start[longer] + k])
+        data = np.moveaxis(total, 0, axis)
     return data
 
 
