@@ -48,7 +48,7 @@ from tetopt.io.files import save_json
 from tetopt.io.formats import format_of
 from tetopt.io.meshes import MeshFile
 from tetopt.io.mni import mni_path
-from tetopt.measure.quality import quality
+from tetopt.measure.quality import Quality, quality
 from tetopt.model.labels import TABLE_TEXT, table_of_labels, table_words
 from tetopt.model.model import Model
 from tetopt.model.sets import Sets, box_of, label_set_names, surviving_sets
@@ -79,6 +79,7 @@ class Outcome(NamedTuple):
     initial: Mesh
     is_interrupted: bool  # by Ctrl-C
     seconds: dict[str, float]  # up to the optimisation, and of it
+    shapes: tuple[Quality, Quality]  # of the initial mesh and of the result
 
 
 def mesh_command(
@@ -156,7 +157,8 @@ def _run(task: Task, begin: float) -> Outcome:
     )  # fmt: skip
     assert result.initial is not None
     seconds = {"load": begun[0] - begin, "optimize": time.perf_counter() - begun[0]}
-    return Outcome(result, result.initial, any(interrupted), seconds)
+    first, last = (quality(each.points, each.cells) for each in (result.initial, result.mesh))
+    return Outcome(result, result.initial, any(interrupted), seconds, (first, last))
 
 
 def _described(task: Task, initial: Mesh) -> str:
@@ -218,7 +220,7 @@ def _write(task: Task, outcome: Outcome, begin: float) -> tuple[Model, dict[str,
         about |= {TABLE_TEXT: table_words(there)}
     if output.json_path is not None:
         seconds = {**outcome.seconds, "all": time.perf_counter() - begin}
-        summary = run_summary(source.content, outcome.initial, result, about, seconds)
+        summary = run_summary(source.content, outcome.initial, result, about, seconds, outcome.shapes)
         summary["image_properties"] = image_summary(source.image)  # on its own voxels, not on divided ones
         save_json(output.json_path, summary | measured | model_summary(model))
     if plan.pictures:
@@ -284,7 +286,7 @@ def _print_comparison(content: Content, outcome: Outcome, start: str, order: int
         table.add_row(f"E_D, share of {whose}", f"{first.E_D / spread:.5f}", f"{last.E_D / spread:.5f}")
     meshes = (initial, mesh)
     in_all = [size_summary(each, order)["n_nodes_in_all"] for each in meshes] if order == 2 else []
-    add_quality(table, *(quality(each.points, each.cells) for each in meshes), in_all=in_all)
+    add_quality(table, *outcome.shapes, in_all=in_all)
     out.print(table)
 
 

@@ -61,10 +61,35 @@ def cell_moments(image: Image, mesh: Mesh) -> CellMoments:
         Mesh and image of different dimension, a cell that is flat or inverted at the sampling's resolution, or
         a mesh far larger than the image.
     """
+    return _moments(image, mesh, _sampled(image, mesh))
+
+
+def cell_moments_and_ranges(
+    image: Image, mesh: Mesh
+) -> tuple[CellMoments, tuple[NDArray[np.float64], NDArray[np.float64]]]:
+    """`cell_moments` and `cell_ranges` in two thirds of the time."""
+    sampled = _sampled(image, mesh)
+    return _moments(image, mesh, sampled), _ranges(image, mesh, sampled)
+
+
+class _Sampled(NamedTuple):
+    """A mesh on the grid of an image."""
+
+    grid: SamplingGrid
+    ticks: NDArray[np.int64]  # (N, 3)
+    sides: Facets
+
+
+def _sampled(image: Image, mesh: Mesh) -> _Sampled:
     grid = sampling_grid(image, mesh.points)
     ticks = to_ticks(image.to_index(mesh.points), grid)
     check_orientations(image, ticks, mesh.cells)
-    sums = moment_sums(grid, ticks, mesh.cells)
+    return _Sampled(grid, ticks, facets(mesh.cells))
+
+
+def _moments(image: Image, mesh: Mesh, sampled: _Sampled) -> CellMoments:
+    grid = sampled.grid
+    sums = moment_sums(grid, sampled.ticks, mesh.cells, sampled.sides)
     n_voxels = sums[:, 0].astype(np.int64)
     is_empty = n_voxels == 0
     count = np.maximum(sums[:, 0], 1.0)
@@ -83,18 +108,23 @@ def cell_of_voxel(image: Image, mesh: Mesh) -> NDArray[np.int64]:
     InputError
         As `cell_moments`.
     """
-    grid = sampling_grid(image, mesh.points)
-    ticks = to_ticks(image.to_index(mesh.points), grid)
-    check_orientations(image, ticks, mesh.cells)
-    sides = facets(mesh.cells)
+    steps = _cell_changes(mesh, _sampled(image, mesh))
+    owner = np.cumsum(steps[..., :-1], axis=2, dtype=np.int64)
+    owner -= 1
+    return owner.reshape(image.shape)
+
+
+def _cell_changes(mesh: Mesh, sampled: _Sampled) -> NDArray[np.int32]:
+    """By how much the number of the cell, from 1, changes at each voxel of each row: (s_0, s_1, s_2 + 1)."""
+    grid, ticks, sides = sampled
     # Crossing a facet upwards, a row changes from the cell below to the cell above: the numbers' differences,
     # added up along the row, are the number of the cell that it is in.
-    change = np.zeros(len(sides.nodes), dtype=np.int64)
-    number = np.arange(1, len(mesh.cells) + 1)
-    np.subtract.at(change, sides.of_cell, _hand(ticks, mesh.cells) * sides.sign * number[:, None])
-    steps = np.zeros(grid.prefix.shape[:3], dtype=np.int64)
-    _scatter_changes(steps, change, ticks, sides.nodes, grid.bits, grid.prefix)
-    return (np.cumsum(steps, axis=2)[..., :-1] - 1).reshape(image.shape)
+    number = _hand(ticks, mesh.cells) * np.arange(1, len(mesh.cells) + 1)
+    # Sums of whole numbers below 2^53 are exact in float64.
+    change = -np.bincount(sides.of_cell.ravel(), (sides.sign * number[:, None]).ravel(), len(sides.nodes))
+    steps = np.zeros(grid.prefix.shape[:3], dtype=np.int32)
+    _scatter_changes(steps, change.astype(np.int64), ticks, sides.nodes, grid.bits, grid.prefix)
+    return steps
 
 
 def cell_ranges(image: Image, mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
@@ -107,7 +137,12 @@ def cell_ranges(image: Image, mesh: Mesh) -> tuple[NDArray[np.float64], NDArray[
     InputError
         As `cell_moments`.
     """
-    low, high = ranges_of(cell_of_voxel(image, mesh).ravel(), image.data.ravel(), len(mesh.cells))
+    return _ranges(image, mesh, _sampled(image, mesh))
+
+
+def _ranges(image: Image, mesh: Mesh, sampled: _Sampled) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
+    low, high = np.full(len(mesh.cells), np.inf), np.full(len(mesh.cells), -np.inf)
+    _fill_ranges(low, high, _cell_changes(mesh, sampled), image.data.reshape(sampled.grid.shape))
     is_empty = low > high
     low[is_empty] = high[is_empty] = nearest_values(image, mesh.points[mesh.cells[is_empty]].mean(axis=1))
     return low, high
@@ -513,3 +548,15 @@ def _scatter_changes(
     unused = np.empty((1, 1, 3))
     for facet in range(len(nodes)):
         facet_flux(ticks, nodes, facet, bits, prefix, (steps, change[facet]), unused, 0)
+
+
+@njit(cache=True)
+def _fill_ranges(low: NDArray, high: NDArray, steps: NDArray, volume: NDArray) -> None:
+    for i in range(volume.shape[0]):
+        for j in range(volume.shape[1]):
+            cell = -1
+            for k in range(volume.shape[2]):
+                cell += steps[i, j, k]
+                if cell >= 0:
+                    h = float(volume[i, j, k])
+                    low[cell], high[cell] = min(low[cell], h), max(high[cell], h)

@@ -68,18 +68,44 @@ def squared_edges(points: Points, cells: Cells) -> NDArray[np.float64]:
 
 def facet_areas(points: Points, cells: Cells) -> NDArray[np.float64]:
     """Areas (edge lengths in 2-D) of each cell's facets, (M, n+1) float64, mm^(n-1); column i is opposite node i."""
-    return np.linalg.norm(_facet_normals(points, cells), axis=2)
+    return np.stack([np.sqrt(_dot(normal, normal)) for normal in _facet_normals(points, cells)], axis=1)
 
 
-def _facet_normals(points: Points, cells: Cells) -> NDArray[np.float64]:
-    """Outward normals as long as their facet's area, (M, n+1, n) float64; the cells positively oriented."""
-    corners = points[cells]
+Vectors = list[NDArray[np.float64]]  # (n,) of them, their components, (M,) each: three times as fast as rows
+
+
+def _corners(points: Points, cells: Cells) -> list[Vectors]:
+    """Each cell's corners, one after the other."""
+    axes = [np.ascontiguousarray(axis)[cells.T] for axis in points.T]
+    return [[axis[k] for axis in axes] for k in range(cells.shape[1])]
+
+
+def _minus(a: Vectors, b: Vectors) -> Vectors:
+    return [x - y for x, y in zip(a, b, strict=True)]
+
+
+def _dot(a: Vectors, b: Vectors) -> NDArray[np.float64]:
+    total = a[0] * b[0] + 0.0  # + 0.0: no -0, on which side of it angles of flat cells turn
+    for x, y in zip(a[1:], b[1:], strict=True):
+        total += x * y
+    return total
+
+
+def _cross(a: Vectors, b: Vectors) -> Vectors:
+    return [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+
+
+def _facet_normals(points: Points, cells: Cells) -> list[Vectors]:
+    """Outward normals as long as their facet's area, by the node opposite; the cells positively oriented."""
+    corners = _corners(points, cells)
     if points.shape[1] == 2:
-        along = corners[:, [2, 0, 1]] - corners[:, [1, 2, 0]]
-        return np.stack([along[..., 1], -along[..., 0]], axis=-1)
-    # Facet opposite node i, its nodes in the order that turns the cross product outwards.
-    a, b, c = (corners[:, order] for order in ([1, 0, 0, 0], [2, 3, 1, 2], [3, 2, 3, 1]))
-    return 0.5 * np.cross(b - a, c - a)
+        along = [_minus(corners[b], corners[a]) for a, b in ((1, 2), (2, 0), (0, 1))]
+        return [[y, -x] for x, y in along]
+    normals = []
+    for a, b, c in ((1, 2, 3), (0, 3, 2), (0, 1, 3), (0, 2, 1)):  # in the order that turns the product outwards
+        product = _cross(_minus(corners[b], corners[a]), _minus(corners[c], corners[a]))
+        normals.append([0.5 * x for x in product])
+    return normals
 
 
 def volume_gradients(points: Points, cells: Cells) -> NDArray[np.float64]:
@@ -88,7 +114,8 @@ def volume_gradients(points: Points, cells: Cells) -> NDArray[np.float64]:
     Moving node i along a vector d changes the volume by (area of the opposite facet) x (height gained) / n,
     so the gradient is minus the outward area normal over n.
     """
-    return -_facet_normals(points, cells) / points.shape[1]
+    normals = np.stack([np.stack(normal, axis=1) for normal in _facet_normals(points, cells)], axis=1)
+    return -normals / points.shape[1]
 
 
 def rho(points: Points, cells: Cells) -> NDArray[np.float64]:
@@ -105,11 +132,12 @@ def rho(points: Points, cells: Cells) -> NDArray[np.float64]:
         below = lengths.sum(axis=1) * lengths.prod(axis=1)
         above = 8.0 * v**2
     else:
-        corners = points[cells]
-        a, b, c = (corners[:, k] - corners[:, 0] for k in (1, 2, 3))
-        aa, bb, cc = ((x**2).sum(axis=1, keepdims=True) for x in (a, b, c))
-        numerator = np.linalg.norm(aa * np.cross(b, c) + bb * np.cross(c, a) + cc * np.cross(a, b), axis=1)
-        below = facet_areas(points, cells).sum(axis=1) * numerator
+        corners = _corners(points, cells)
+        a, b, c = (_minus(corner, corners[0]) for corner in corners[1:])
+        aa, bb, cc = (_dot(x, x) for x in (a, b, c))
+        products = zip(_cross(b, c), _cross(c, a), _cross(a, b), strict=True)
+        numerator = [aa * x + bb * y + cc * z for x, y, z in products]
+        below = facet_areas(points, cells).sum(axis=1) * np.sqrt(_dot(numerator, numerator))
         above = 36.0 * v**2
     return np.divide(above, below, out=np.zeros_like(v), where=below > 0.0)
 
@@ -128,11 +156,11 @@ def dihedral_angles(points: Points, cells: Cells) -> NDArray[np.float64]:
         pairs = edge_pairs(3)[::-1]  # the facets at an edge lie opposite the two nodes it leaves out
     angles = np.empty((len(cells), len(pairs)))
     for column, (i, j) in enumerate(pairs):
-        p, q = normals[:, i], normals[:, j]
-        cosine = -(p * q).sum(axis=1)
+        p, q = normals[i], normals[j]
         if n == 2:
-            sine = np.abs(p[:, 0] * q[:, 1] - p[:, 1] * q[:, 0])
+            sine = np.abs(p[0] * q[1] - p[1] * q[0])
         else:
-            sine = np.linalg.norm(np.cross(p, q), axis=1)
-        angles[:, column] = np.degrees(np.arctan2(sine, cosine))  # exact near 0 and 180, where arccos is not
+            product = _cross(p, q)
+            sine = np.sqrt(_dot(product, product))
+        angles[:, column] = np.degrees(np.arctan2(sine, -_dot(p, q)))  # exact near 0 and 180, where arccos is not
     return angles

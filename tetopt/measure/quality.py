@@ -30,7 +30,11 @@ def quality_errors(points: Points, cells: Cells) -> QualityErrors:
     third row, 196 congruent triangles, has (ii) equal to (i). (iii) is the plain sum of squares. An error that
     rounding made negative is 0, and (ii) is 0 where any error is.
     """
-    error = np.maximum(1.0 / points.shape[1] - rho(points, cells), 0.0)
+    return _errors_of(rho(points, cells), points.shape[1])
+
+
+def _errors_of(shape: NDArray[np.float64], n: int) -> QualityErrors:
+    error = np.maximum(1.0 / n - shape, 0.0)
     harmonic = 0.0 if (error == 0.0).any() else len(error) / float((1.0 / error).sum())
     return QualityErrors(float(error.mean()), harmonic, float((error**2).sum()), float(error.max()))
 
@@ -57,8 +61,12 @@ def bad_kinds(points: Points, cells: Cells) -> NDArray[np.str_]:
 
     Triangles: ``needle`` has an edge under 1/4 of the longest, ``cap`` an angle near 180 degrees.
     """
+    return _kinds_of(points, cells, rho(points, cells))
+
+
+def _kinds_of(points: Points, cells: Cells, shape: NDArray[np.float64]) -> NDArray[np.str_]:
     kinds = np.full(len(cells), "good", dtype="<U6")
-    is_bad = points.shape[1] * rho(points, cells) < BAD_SHAPE
+    is_bad = points.shape[1] * shape < BAD_SHAPE
     if points.shape[1] == 2:
         edges = squared_edges(points, cells[is_bad])
         is_needle = edges.min(axis=1) < SHORT_EDGE**2 * edges.max(axis=1)
@@ -115,7 +123,7 @@ def quality(points: Points, cells: Cells) -> Quality:
     angles = dihedral_angles(points, cells)
     smallest = angles.min(axis=1)
     names = ("needle", "wedge", "cap", "spade", "sliver") if n == 3 else ("needle", "cap")
-    kinds = bad_kinds(points, cells)
+    kinds = _kinds_of(points, cells, shape)
     squares = squared_edges(points, cells)
     return Quality(
         ndim=n,
@@ -126,7 +134,7 @@ def quality(points: Points, cells: Cells) -> Quality:
         mean_rho=float(shape.mean()),
         p1_rho=float(np.percentile(shape, 1)),
         min_rho=float(shape.min()),
-        errors=quality_errors(points, cells),
+        errors=_errors_of(shape, n),
         min_dihedral=float(smallest.min()),
         p1_dihedral=float(np.percentile(smallest, 1)),
         max_dihedral=float(angles.max()),

@@ -7,7 +7,7 @@ import re
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.energy.sampling import cell_moments, cell_ranges
+from tetopt.energy.sampling import cell_moments_and_ranges
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import cell_edges, quadratic
 from tetopt.geometry.simplex import dihedral_angles, rho, volumes
@@ -29,9 +29,9 @@ def cell_fields(mesh: Mesh, image: Image | None = None) -> dict[str, NDArray]:
     """
     fields: dict[str, NDArray] = {}
     if image is not None:
-        moments = cell_moments(image, mesh)
+        moments, (low, high) = cell_moments_and_ranges(image, mesh)
         fields |= {"mean": moments.mean, "variance": moments.variance, "n_voxels": moments.n_voxels}
-        fields["min"], fields["max"] = cell_ranges(image, mesh)
+        fields |= {"min": low, "max": high}
     fields["volume"] = volumes(mesh.points, mesh.cells)
     fields["rho"] = rho(mesh.points, mesh.cells)
     fields["min_dihedral"] = dihedral_angles(mesh.points, mesh.cells).min(axis=1)

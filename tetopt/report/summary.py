@@ -18,7 +18,7 @@ from tetopt.geometry.quadratic import node_count
 from tetopt.image import Image
 from tetopt.measure.fidelity import cell_labels, label_fidelity, mask_fidelity
 from tetopt.measure.interfaces import label_interfaces
-from tetopt.measure.quality import quality
+from tetopt.measure.quality import Quality, quality
 from tetopt.mesh import Mesh
 from tetopt.model.loads import load_words
 from tetopt.model.model import Model
@@ -55,9 +55,15 @@ def image_summary(image: Image) -> dict[str, Any]:
 
 
 def run_summary(
-    image: Image | Content, initial: Mesh, result: Optimized, about: dict[str, Any], seconds: dict[str, float]
-) -> dict[str, Any]:
-    """Every number of a run: options and file (`about`), versions, energies by iteration, quality before and after."""
+    image: Image | Content, initial: Mesh, result: Optimized, about: dict[str, Any], seconds: dict[str, float],
+    shapes: tuple[Quality, Quality] | None = None,
+) -> dict[str, Any]:  # fmt: skip
+    """Every number of a run: options and file (`about`), versions, energies by iteration, quality before and after.
+
+    `shapes` are those qualities, if they are known.
+    """
+    if shapes is None:
+        shapes = quality(initial.points, initial.cells), quality(result.mesh.points, result.mesh.cells)
     first, last = result.history[0], result.history[-1]
     content = plain(image)
     spread = content.variance * content.volume
@@ -75,8 +81,8 @@ def run_summary(
             "E_D_share_of_variance": last.E_D / spread if spread > 0.0 else None,
             "E_D_share_of_variance_initial": first.E_D / spread if spread > 0.0 else None,
         },
-        "quality_initial": quality(initial.points, initial.cells),
-        "quality": quality(result.mesh.points, result.mesh.cells),
+        "quality_initial": shapes[0],
+        "quality": shapes[1],
         "history": result.history,
         "seconds": seconds,
         "mesh_sha256": mesh_hash(result.mesh),
