@@ -15,11 +15,28 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
 from tetopt.energy.sampling import CELLS_PER_CHUNK, few_threads, segment_flux, triangle_flux
 from tetopt.geometry.vectors import cross, difference, dot, minus, put_row, row, scaled, times
+from tetopt.kernels import (
+    Bools2,
+    Floats1,
+    Floats2,
+    Floats3,
+    Floats4,
+    Ints1,
+    Ints2,
+    Shorts4,
+    Singles3,
+    Singles4,
+    entry,
+    helper,
+    inlined,
+    packed,
+    run,
+    unit,
+)
 
 # A cell's volume over (sum of squared edges)^(n/2); below, it counts as inverted: an angle of 1e-3 degrees.
 FLAT_SHARE = 1e-7
@@ -29,25 +46,27 @@ CELL_ROWS = ("cells", "labels", "across", "fluxes", "sums", "E_shape")  # of a `
 class Complex(NamedTuple):
     """Nodes, cells, who touches whom, and what each cell holds. Rows from `n_cells` on are room for more cells."""
 
-    ticks: NDArray[np.int64]  # (N, 3) node positions on the sampling grid
-    is_frozen: NDArray[np.bool_]  # (N, 4) axes along which each node stays; whether it stays on the mask's surface
-    meeting: NDArray[np.int64]  # (N, 4) labels of the cells around each node, where there are two or more; else -1
-    cells: NDArray[np.int64]  # (C, n+1) corners, positively oriented in the world
-    labels: NDArray[np.int64]  # (C,) each cell's label, a row of the memberships; all 0 as long as none are given
-    across: NDArray[np.int64]  # (C, n+1) the cell beyond each facet; -1 outside
-    fluxes: NDArray[np.float64]  # (C, n+1, D) of each facet, outwards
-    sums: NDArray[np.float64]  # (C, D) moment sums: their sum over the facets
-    E_shape: NDArray[np.float64]  # (C,) shape energy, see `shape_energy`
-    n_cells: NDArray[np.int64]  # (1,) rows in use
+    ticks: Ints2  # (N, 3) node positions on the sampling grid
+    is_frozen: Bools2  # (N, 4) axes along which each node stays; whether it stays on the mask's surface
+    meeting: Ints2  # (N, 4) labels of the cells around each node, where there are two or more; else -1
+    cells: Ints2  # (C, n+1) corners, positively oriented in the world
+    labels: Ints1  # (C,) each cell's label, a row of the memberships; all 0 as long as none are given
+    across: Ints2  # (C, n+1) the cell beyond each facet; -1 outside
+    fluxes: Floats3  # (C, n+1, D) of each facet, outwards
+    sums: Floats2  # (C, D) moment sums: their sum over the facets
+    E_shape: Floats1  # (C,) shape energy, see `shape_energy`
+    n_cells: Ints1  # (1,) rows in use
 
 
 class Objective(NamedTuple):
     """What turns a cell into an energy."""
 
-    prefix: NDArray  # of the sampling grid
+    prefix: Floats4  # of the sampling grid, unless that is of 32 bits; one row of nothing then
+    short_prefix: Shorts4  # likewise
+    is_short: bool  # which of them it is
     bits: int
     hand: int  # sign of the cells' volumes in index space
-    matrix: NDArray[np.float64]  # (3, 3) index vectors to mm
+    matrix: Floats2  # (3, 3) index vectors to mm
     geometry: float  # weight of the shape energy: (1 - k_D) / E_G0
     image: float  # weight of a cell's sum of squares: k_D x voxel volume / E_D0
     surface: float  # weight of a voxel on the wrong side of the mask's surface; 0 without a mask
@@ -59,31 +78,27 @@ class Objective(NamedTuple):
     rounding: float  # a sum of squares up to this, over all cells, is only rounding
     wrong_side: float  # what a voxel on the wrong side of the mask's surface counts, in squares; see `surface`
     n_means: int  # the first channels, of which a cell has its mean; of the others it has what its label says
-    own_column: NDArray[np.int64]  # (K,) for each label the column of a cell's sums that is its channel's
-    own_value: NDArray[np.float64]  # (K,) and its value there; 0 in the other channels of labels
+    own_column: Ints1  # (K,) for each label the column of a cell's sums that is its channel's
+    own_value: Floats1  # (K,) and its value there; 0 in the other channels of labels
     tension: float  # weight of the area between labels a and b, times own_value[a]^2 + own_value[b]^2, per mm^(n-1)
 
 
 class Sides(NamedTuple):
     """Where nodes may be put on the boundary: the box's sides, the mask's surface."""
 
-    low: NDArray[np.int64]  # (3,) ticks of the box's sides
-    high: NDArray[np.int64]
+    low: Ints1  # (3,) ticks of the box's sides
+    high: Ints1
     is_fixed: bool  # whether boundary nodes stay where they are
     has_surface: bool  # whether what is not on the box's sides is on the mask's surface
-    level: NDArray[np.float32]  # (s_0, s_1, s_2) its level function; (1, 1, 1) without
-    levels: NDArray[np.float32]  # (L, s_0, s_1, s_2) level functions of labels; (1, 1, 1, 1) without
-    channel: NDArray[np.int64]  # (K,) which of them is each label's
-    projections: NDArray[np.float64]  # see `tetopt.engine.descent.free_projections`
-    inverse: NDArray[np.float64]  # (3, 3) mm to index vectors
+    level: Singles3  # (s_0, s_1, s_2) its level function; (1, 1, 1) without
+    levels: Singles4  # (L, s_0, s_1, s_2) level functions of labels; (1, 1, 1, 1) without
+    channel: Ints1  # (K,) which of them is each label's
+    projections: Floats3  # see `tetopt.engine.descent.free_projections`
+    inverse: Floats2  # (3, 3) mm to index vectors
 
 
 class State(NamedTuple):
-    """What the kernels carry together; made by `tetopt.engine.state.state_of`.
-
-    numba takes no tuple of tuples into the body of a `prange`, and drops what that writes through a tuple: parallel
-    kernels take the three parts, and their bodies are functions of a state put together again.
-    """
+    """What the kernels carry together; made by `tetopt.engine.state.state_of`."""
 
     complex: Complex
     objective: Objective
@@ -98,7 +113,8 @@ def build(
     `ticks` and `is_frozen` are kept, not copied. The cells must be a mesh: at most two to a facet, see `tetopt.check`.
     """
     n_cells, n_corners = cells.shape
-    room, n_sums = n_cells + n_cells // 4 + 64, objective.prefix.shape[3] + 1
+    room = n_cells + n_cells // 4 + 64
+    n_sums = (objective.short_prefix if objective.is_short else objective.prefix).shape[3] + 1
     complex_ = Complex(
         ticks,
         is_frozen,
@@ -121,7 +137,9 @@ def build(
 def remeasure(state: State) -> None:
     """Fluxes, sums and shape energies of all cells, afresh."""
     with few_threads(int(state.complex.n_cells[0]) * 4):
-        _measure_all(*state)
+        n_chunks, laid_out = (int(state.complex.n_cells[0]) + CELLS_PER_CHUNK - 1) // CELLS_PER_CHUNK, packed(state)
+        run(_measure_cells, n_chunks, laid_out)
+        run(_sum_cells, n_chunks, laid_out)
 
 
 def copied(state: State) -> State:
@@ -141,7 +159,7 @@ def grown(state: State, least: int = 64) -> State:
     return state._replace(complex=mesh._replace(**wide))
 
 
-@njit(cache=True, error_model="numpy")
+@entry
 def fill_across(across: NDArray, cells: NDArray, n_cells: int, n_nodes: int) -> None:
     """The cell beyond each facet, by counting sort over the facets' lowest nodes."""
     n = cells.shape[1]
@@ -171,7 +189,7 @@ def fill_across(across: NDArray, cells: NDArray, n_cells: int, n_nodes: int) -> 
                     break
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def _lowest_node(cells: NDArray, cell: int, k: int) -> int:
     """The lowest node of facet k of a cell."""
     lowest = cells[cell, 1 if k == 0 else 0]
@@ -181,7 +199,7 @@ def _lowest_node(cells: NDArray, cell: int, k: int) -> int:
     return lowest
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def _is_one_facet(cells: NDArray, c: int, k: int, d: int, m: int) -> bool:
     """Whether facet k of cell c has the same nodes as facet m of cell d."""
     for s in range(cells.shape[1]):
@@ -190,7 +208,7 @@ def _is_one_facet(cells: NDArray, c: int, k: int, d: int, m: int) -> bool:
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def facet_of(across: NDArray, cell: int, other: int) -> int:
     """The facet of `cell` beyond which `other` lies."""
     k = 0
@@ -199,7 +217,7 @@ def facet_of(across: NDArray, cell: int, other: int) -> int:
     return k
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def corner_of(cells: NDArray, cell: int, node: int) -> int:
     """Which corner of `cell` is `node`."""
     k = 0
@@ -208,7 +226,7 @@ def corner_of(cells: NDArray, cell: int, node: int) -> int:
     return k
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def has_node(cells: NDArray, cell: int, node: int) -> bool:
     """Whether `node` is a corner of `cell`."""
     is_corner = False
@@ -217,11 +235,16 @@ def has_node(cells: NDArray, cell: int, node: int) -> bool:
     return is_corner
 
 
-@njit(cache=True, error_model="numpy")
-def put_flux(out: NDArray, p: int, q: int, ticks: NDArray, a: int, b: int, c: int, objective: Objective) -> None:
+@unit
+def put_flux(out: Floats3, p: int, q: int, ticks: Ints2, a: int, b: int, c: int, objective: Objective) -> None:
     """Flux of the facet (a, b, c), or (a, b) with c < 0, times the sign of index space, to out[p, q, :]."""
     if c < 0:
-        segment_flux(ticks, a, b, objective.bits, objective.prefix, None, out, p, q)
+        if objective.is_short:
+            segment_flux(ticks, a, b, objective.bits, objective.short_prefix, None, out, p, q)
+        else:
+            segment_flux(ticks, a, b, objective.bits, objective.prefix, None, out, p, q)
+    elif objective.is_short:
+        triangle_flux(ticks, a, b, c, objective.bits, objective.short_prefix, None, out, p, q)
     else:
         triangle_flux(ticks, a, b, c, objective.bits, objective.prefix, None, out, p, q)
     if objective.hand < 0:
@@ -229,7 +252,7 @@ def put_flux(out: NDArray, p: int, q: int, ticks: NDArray, a: int, b: int, c: in
             out[p, q, d] = -out[p, q, d]
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def outward(cells: NDArray, cell: int, k: int) -> tuple:
     """Nodes of facet k of a cell, turned outwards; the third is -1 in 2-D."""
     if cells.shape[1] == 3:
@@ -243,7 +266,7 @@ def outward(cells: NDArray, cell: int, k: int) -> tuple:
     return cells[cell, 0], cells[cell, 2], cells[cell, 1]
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def image_energy(sums: NDArray, row: int, label: int, objective: Objective) -> float:
     """Sum of squares around the values of one cell, over all channels, from its moment sums, a row of `sums`.
 
@@ -264,7 +287,7 @@ def image_energy(sums: NDArray, row: int, label: int, objective: Objective) -> f
     return max(within, 0.0)
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def cell_value(sums: NDArray, cell: int, label: int, channel: int, objective: Objective) -> float:
     """What a cell that holds voxels has for a channel: its mean, or what its label has; see `image_energy`."""
     column = 1 if channel == 0 else 2 + channel
@@ -273,13 +296,13 @@ def cell_value(sums: NDArray, cell: int, label: int, channel: int, objective: Ob
     return objective.own_value[label] if objective.own_column[label] == column else 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def wrong_side(sums: NDArray, row: int, objective: Objective) -> float:
     """Weighted voxels outside of the mask less those inside, in one cell: what changes is the mask's misfit."""
     return objective.surface * sums[row, sums.shape[1] - 1] if objective.surface > 0.0 else 0.0
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def shape_energy(x: NDArray, n_corners: int, power: float, is_graded: bool) -> float:
     """E_G of the cell with corners x (4, 3) times eta^(p - 1); infinite for one that is flat or inverted.
 
@@ -311,7 +334,7 @@ def shape_energy(x: NDArray, n_corners: int, power: float, is_graded: bool) -> f
     return tet_energy(determinant, S, power, is_graded)
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def determinant_and_squares(x: NDArray) -> tuple:
     """Six times the signed volume of the tetrahedron x (4, 3), and the sum of its squared edges."""
     u, v, w = difference(x, 1, 0), difference(x, 2, 0), difference(x, 3, 0)
@@ -322,7 +345,7 @@ def determinant_and_squares(x: NDArray) -> tuple:
     return dot(u, cross(v, w)), S - dot(s, s)
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def tet_energy(determinant: float, S: float, power: float, is_graded: bool) -> float:
     """`shape_energy` of a tetrahedron from six times its volume and the sum of its squared edges."""
     volume = determinant / 6.0
@@ -342,34 +365,34 @@ def tet_energy(determinant: float, S: float, power: float, is_graded: bool) -> f
 
 
 # Inlined, as `cell_energy` is: a pass of flips took 70 ms, not 96 (with `tet_energy`, too: that alone gains little).
-@njit(cache=True, error_model="numpy", inline="always")
+@inlined
 def load(x: NDArray, row: int, ticks: NDArray, node: int, base: int, objective: Objective) -> None:
     """A node's position relative to the node `base`, in mm, to a row of x; subtracted in integers, exactly."""
     put_row(x, row, times(objective.matrix, scaled(2.0**-objective.bits, difference(ticks, node, base))))
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def place(ticks: NDArray, node: int, base: int, objective: Objective) -> tuple:
     """What `load` writes."""
     return times(objective.matrix, scaled(2.0**-objective.bits, difference(ticks, node, base)))
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def load_cell(x: NDArray, ticks: NDArray, cells: NDArray, cell: int, objective: Objective) -> None:
     """A cell's corners relative to its first, in mm."""
     for k in range(cells.shape[1]):
         load(x, k, ticks, cells[cell, k], cells[cell, 0], objective)
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def shape_of_cell(x: NDArray, ticks: NDArray, cells: NDArray, cell: int, objective: Objective) -> float:
     """Shape energy of a cell of the complex; its corners are left in `x` (4, 3)."""
     load_cell(x, ticks, cells, cell, objective)
     return shape_energy(x, cells.shape[1], objective.power, objective.is_graded)
 
 
-@njit(cache=True, error_model="numpy")
-def shape_of_tet(x: NDArray, ticks: NDArray, a: int, b: int, c: int, d: int, objective: Objective) -> float:
+@unit
+def shape_of_tet(x: Floats2, ticks: Ints2, a: int, b: int, c: int, d: int, objective: Objective) -> float:
     """Shape energy of the tetrahedron (a, b, c, d); infinite unless it is positively oriented."""
     load(x, 0, ticks, a, a, objective)
     load(x, 1, ticks, b, a, objective)
@@ -378,7 +401,7 @@ def shape_of_tet(x: NDArray, ticks: NDArray, a: int, b: int, c: int, d: int, obj
     return shape_energy(x, 4, objective.power, objective.is_graded)
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def shape_of_triangle(x: NDArray, ticks: NDArray, a: int, b: int, c: int, objective: Objective) -> float:
     """Shape energy of the triangle (a, b, c); infinite unless it is positively oriented."""
     load(x, 0, ticks, a, a, objective)
@@ -387,7 +410,7 @@ def shape_of_triangle(x: NDArray, ticks: NDArray, a: int, b: int, c: int, object
     return shape_energy(x, 3, objective.power, objective.is_graded)
 
 
-@njit(cache=True, error_model="numpy")
+@entry
 def signed_volume(x: NDArray, n_corners: int) -> float:
     """Signed volume of the cell with corners x (4, 3), times n!."""
     if n_corners == 3:
@@ -395,8 +418,8 @@ def signed_volume(x: NDArray, n_corners: int) -> float:
     return determinant_and_squares(x)[0]
 
 
-@njit(cache=True, error_model="numpy")
-def worst_cosine(x: NDArray) -> float:
+@unit
+def worst_cosine(x: Floats2) -> float:
     """Minus the cosine of the smallest dihedral angle of the tetrahedron x (4, 3): it grows with the angle; -1 if flat.
 
     Between faces with outward normals p and q the angle's cosine is -p.q / (|p| |q|).
@@ -417,7 +440,7 @@ def worst_cosine(x: NDArray) -> float:
     return worst
 
 
-@njit(cache=True, error_model="numpy")
+@entry
 def cosine_up_to_floor(x: NDArray, objective: Objective) -> float:
     """`worst_cosine`, or just the floor for a tetrahedron that is above it by far: most are, and this costs a tenth."""
     determinant, S = determinant_and_squares(x)
@@ -426,14 +449,14 @@ def cosine_up_to_floor(x: NDArray, objective: Objective) -> float:
     return worst_cosine(x)
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def cell_cosine(x: NDArray, state: State, cell: int) -> float:
     """`worst_cosine` of a cell of the complex."""
     load_cell(x, state.complex.ticks, state.complex.cells, cell, state.objective)
     return worst_cosine(x)
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def tet_cosine(x: NDArray, state: State, a: int, b: int, c: int, d: int) -> float:
     """`worst_cosine` of the tetrahedron (a, b, c, d); -2 if it is flat or inverted."""
     if not shape_of_tet(x, state.complex.ticks, a, b, c, d, state.objective) < np.inf:
@@ -441,18 +464,10 @@ def tet_cosine(x: NDArray, state: State, a: int, b: int, c: int, d: int) -> floa
     return worst_cosine(x)
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def _measure_all(complex_: Complex, objective: Objective, sides: Sides) -> None:
+@unit
+def _measure_cells(state: State, chunk: int) -> None:
     """Each facet is measured once, by its lower cell."""
-    n_cells = complex_.n_cells[0]
-    for chunk in prange((n_cells + CELLS_PER_CHUNK - 1) // CELLS_PER_CHUNK):
-        _measure_cells(State(complex_, objective, sides), np.int64(chunk) * CELLS_PER_CHUNK)
-    for chunk in prange((n_cells + CELLS_PER_CHUNK - 1) // CELLS_PER_CHUNK):
-        _sum_cells(complex_, np.int64(chunk) * CELLS_PER_CHUNK)
-
-
-@njit(cache=True, error_model="numpy")
-def _measure_cells(state: State, first: int) -> None:
+    first = chunk * CELLS_PER_CHUNK
     x, cells, across = np.empty((4, 3)), state.complex.cells, state.complex.across
     for cell in range(first, min(first + CELLS_PER_CHUNK, state.complex.n_cells[0])):
         state.complex.E_shape[cell] = shape_of_cell(x, state.complex.ticks, cells, cell, state.objective)
@@ -461,15 +476,16 @@ def _measure_cells(state: State, first: int) -> None:
                 measure_facet(state, cell, k)
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def measure_facet(state: State, cell: int, k: int) -> None:
     """Flux of facet k of a cell, as the ticks stand."""
     a, b, c = outward(state.complex.cells, cell, k)
     put_flux(state.complex.fluxes, cell, k, state.complex.ticks, a, b, c, state.objective)
 
 
-@njit(cache=True, error_model="numpy")
-def _sum_cells(complex_: Complex, first: int) -> None:
+@unit
+def _sum_cells(state: State, chunk: int) -> None:
+    complex_, first = state.complex, chunk * CELLS_PER_CHUNK
     cells, across, fluxes = complex_.cells, complex_.across, complex_.fluxes
     for cell in range(first, min(first + CELLS_PER_CHUNK, complex_.n_cells[0])):
         for k in range(cells.shape[1]):
@@ -481,7 +497,7 @@ def _sum_cells(complex_: Complex, first: int) -> None:
         sum_up(complex_.sums, fluxes, cell)
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def sum_up(sums: NDArray, fluxes: NDArray, cell: int) -> None:
     """A cell's moment sums from its facets."""
     for d in range(fluxes.shape[2]):
@@ -491,15 +507,15 @@ def sum_up(sums: NDArray, fluxes: NDArray, cell: int) -> None:
         sums[cell, d] = total if d == 0 or sums[cell, 0] > 0.0 else 0.0  # no rounding left without voxels
 
 
-@njit(cache=True, error_model="numpy")
-def settle(x: NDArray, state: State, cell: int) -> None:
+@unit
+def settle(x: Floats2, state: State, cell: int) -> None:
     """Shape energy and sums of a cell whose corners and fluxes are set; its corners' places are left in `x` (4, 3)."""
     mesh = state.complex
     mesh.E_shape[cell] = shape_of_cell(x, mesh.ticks, mesh.cells, cell, state.objective)
     sum_up(mesh.sums, mesh.fluxes, cell)
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@inlined
 def cell_energy(state: State, cell: int) -> float:
     """A cell's share of E, Eq. (4)."""
     objective = state.objective
@@ -520,20 +536,20 @@ def cell_squares(state: State, n_means: int | None = None) -> NDArray[np.float64
     return np.where(sums[:, 0] > 0.0, np.maximum(within, 0.0), 0.0)
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def is_interface(complex_: Complex, cell: int, k: int) -> bool:
     """Whether a facet lies between two labels."""
     other = complex_.across[cell, k]
     return other >= 0 and complex_.labels[other] != complex_.labels[cell]
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def pair_tension(objective: Objective, one: int, other: int) -> float:
     """What a mm^(n-1) between two labels costs."""
     return objective.tension * (objective.own_value[one] ** 2 + objective.own_value[other] ** 2)
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def facet_area(ticks: NDArray, a: int, b: int, c: int, objective: Objective) -> float:
     """Area of the facet (a, b, c), mm^2, or length of the segment (a, b) with c < 0, mm."""
     u = place(ticks, b, a, objective)
@@ -543,7 +559,7 @@ def facet_area(ticks: NDArray, a: int, b: int, c: int, objective: Objective) -> 
     return 0.5 * np.sqrt(dot(n, n))
 
 
-@njit(cache=True, error_model="numpy")
+@entry
 def interface_energy(state: State) -> float:
     """What all facets between labels cost together."""
     mesh, total = state.complex, 0.0
@@ -570,10 +586,10 @@ def energies(state: State, n_means: int | None = None) -> tuple[float, float]:
 class NodeRings(NamedTuple):
     """The cells around each node, as compressed rows, and which of their facets are one and the same."""
 
-    start: NDArray[np.int64]  # (N+1,)
-    cells: NDArray[np.int64]  # (C(n+1),)
-    corner: NDArray[np.int64]  # (C(n+1),) which corner of the cell is the node
-    twin: NDArray[np.int64]  # (C(n+1), n+1) facet with the node: (entry in the row) (n+1) + its facet there; -1 outside
+    start: Ints1  # (N+1,)
+    cells: Ints1  # (C(n+1),)
+    corner: Ints1  # (C(n+1),) which corner of the cell is the node
+    twin: Ints2  # (C(n+1), n+1) facet with the node: (entry in the row) (n+1) + its facet there; -1 outside
 
 
 def node_rings(state: State) -> NodeRings:
@@ -585,11 +601,13 @@ def node_rings(state: State) -> NodeRings:
     twin = np.empty((n_cells * n_corners, n_corners), dtype=np.int64)
     _fill_rings(start, cells, corner, state.complex.cells, n_cells)
     with few_threads(n_cells):
-        _fill_twins(twin, start, cells, corner, state.complex.cells, state.complex.across)
-    return NodeRings(start, cells, corner, twin)
+        rings = NodeRings(start, cells, corner, twin)
+        n_chunks = (len(state.complex.ticks) + CELLS_PER_CHUNK - 1) // CELLS_PER_CHUNK
+        run(_fill_twins, n_chunks, Twins(rings, state.complex.across))
+    return rings
 
 
-@njit(cache=True, error_model="numpy")
+@entry
 def _fill_rings(start: NDArray, ring: NDArray, corner: NDArray, cells: NDArray, n_cells: int) -> None:
     n = cells.shape[1]
     for c in range(n_cells):
@@ -606,18 +624,31 @@ def _fill_rings(start: NDArray, ring: NDArray, corner: NDArray, cells: NDArray, 
             fill[node] += 1
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def _fill_twins(twin: NDArray, start: NDArray, ring: NDArray, corner: NDArray, cells: NDArray, across: NDArray) -> None:
-    n = cells.shape[1]
-    for chunk in prange((len(start) - 1 + CELLS_PER_CHUNK - 1) // CELLS_PER_CHUNK):
-        for node in range(chunk * CELLS_PER_CHUNK, min((chunk + 1) * CELLS_PER_CHUNK, len(start) - 1)):
-            for r in range(start[node], start[node + 1]):
-                for k in range(n):
-                    twin[r, k] = -1
-                    other = across[ring[r], k]
-                    if k == corner[r] or other < 0:
-                        continue
-                    s = start[node]
-                    while ring[s] != other:
-                        s += 1
-                    twin[r, k] = (s - start[node]) * n + facet_of(across, other, ring[r])
+class Twins(NamedTuple):
+    """What their twins are filled in from."""
+
+    rings: NodeRings
+    across: Ints2  # as of the complex
+
+
+@unit
+def _fill_twins(work: Twins, chunk: int) -> None:
+    across, start, ring, corner, twin = (
+        work.across,
+        work.rings.start,
+        work.rings.cells,
+        work.rings.corner,
+        work.rings.twin,
+    )
+    n = across.shape[1]
+    for node in range(chunk * CELLS_PER_CHUNK, min((chunk + 1) * CELLS_PER_CHUNK, len(start) - 1)):
+        for r in range(start[node], start[node + 1]):
+            for k in range(n):
+                twin[r, k] = -1
+                other = across[ring[r], k]
+                if k == corner[r] or other < 0:
+                    continue
+                s = start[node]
+                while ring[s] != other:
+                    s += 1
+                twin[r, k] = (s - start[node]) * n + facet_of(across, other, ring[r])

@@ -16,15 +16,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
 from tetopt.energy.sampling import few_threads
 from tetopt.engine.complex import (
-    Complex,
     NodeRings,
-    Objective,
-    Sides,
     State,
     cell_cosine,
     cell_energy,
@@ -68,6 +64,7 @@ from tetopt.engine.smooth import (
 )
 from tetopt.engine.surface import MOST_MEETING, faces_up, put_on_surface, ring_faces_up, uphill_at
 from tetopt.geometry.vectors import dot, minus, put_row, row
+from tetopt.kernels import Bools1, Floats1, Floats2, Ints1, Ints2, entry, helper, packed, run, unit
 
 LEAST_EXCHANGE_SHARE = 1e-3  # of a node's mean share of E: an exchange of two nodes that is worth less is not made
 # Of the noise's variance: likewise; about what the luckiest of thousands of edges wins in noise.
@@ -93,7 +90,7 @@ class Limits(NamedTuple):
     """What moves have to keep."""
 
     shortest: float  # mm: no split makes a shorter edge
-    longest: NDArray[np.float64]  # (N,) mm: no collapse makes a longer edge at a node
+    longest: Floats1  # (N,) mm: no collapse makes a longer edge at a node
     noise: float  # variance of the image's noise: what chance alone wins is not worth a node
     dearest: float = np.inf  # E may rise by so much in a collapse
 
@@ -101,9 +98,9 @@ class Limits(NamedTuple):
 class EdgeMoves(NamedTuple):
     """For each node the best split, or the best collapse, of one of its edges."""
 
-    may_move: NDArray[np.bool_]  # (N,) nodes that are looked at
-    other: NDArray[np.int64]  # (N,) the edge's other end; -1 where there is none that is allowed
-    gain: NDArray[np.float64]  # (N,) by how much E falls; below 0 if it rises, -inf where there is none
+    may_move: Bools1  # (N,) nodes that are looked at
+    other: Ints1  # (N,) the edge's other end; -1 where there is none that is allowed
+    gain: Floats1  # (N,) by how much E falls; below 0 if it rises, -inf where there is none
 
 
 def exchange(state: State, n_nodes: int, most: int, limits: Limits) -> Exchanged:
@@ -173,7 +170,7 @@ def _compacted(state: State, is_dirty: NDArray[np.bool_], n_before: int, n_split
     return Exchanged(state._replace(complex=complex_), source, is_touched, n_split, n_collapsed)
 
 
-@njit(cache=True, error_model="numpy")
+@entry
 def make_exchanges(
     state: State, rings: NodeRings, splits: EdgeMoves, collapses: EdgeMoves, in_: NDArray, out: NDArray, quota: tuple,
     is_dirty: NDArray,
@@ -216,20 +213,20 @@ def make_exchanges(
     return n_split, n_collapsed
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def _mark_edge(state: State, rings: NodeRings, a: int, b: int, is_dirty: NDArray, value: bool) -> None:
     for r in range(rings.start[a], rings.start[a + 1]):
         if has_node(state.complex.cells, rings.cells[r], b):
             is_dirty[rings.cells[r]] = value
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def _is_clean(rings: NodeRings, node: int, is_dirty: NDArray) -> bool:
     return not is_dirty[rings.cells[rings.start[node] : rings.start[node + 1]]].any()
 
 
-@njit(cache=True, error_model="numpy")
-def _can_collapse(state: State, rings: NodeRings, a: int, b: int, is_dirty: NDArray) -> bool:
+@unit
+def _can_collapse(state: State, rings: NodeRings, a: int, b: int, is_dirty: Bools1) -> bool:
     """Whether nothing has changed around a; nor, between labels, around b and next to either.
 
     A cell that goes takes facets between labels from those beside it, too.
@@ -248,14 +245,14 @@ def _can_collapse(state: State, rings: NodeRings, a: int, b: int, is_dirty: NDAr
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def _can_split(state: State, rings: NodeRings, a: int, is_dirty: NDArray) -> bool:
     """Whether the cells around a are as they were, and there is room for more."""
     size = rings.start[a + 1] - rings.start[a]
     return state.complex.n_cells[0] + size <= len(state.complex.cells) and _is_clean(rings, a, is_dirty)
 
 
-@njit(cache=True, error_model="numpy")
+@unit
 def _sides_of_edge(state: State, rings: NodeRings, a: int, b: int) -> int:
     """The box's sides that an edge lies in, bit d for axis d, and bit 3 if it is on the boundary elsewhere.
 
@@ -281,7 +278,7 @@ def _sides_of_edge(state: State, rings: NodeRings, a: int, b: int) -> int:
     return sides
 
 
-@njit(cache=True, error_model="numpy")
+@unit
 def _put_middle(state: State, rings: NodeRings, a: int, b: int, p: int) -> bool:
     """Put the node p at the middle of an edge, or on the surface beside it.
 
@@ -320,7 +317,7 @@ def _put_middle(state: State, rings: NodeRings, a: int, b: int, p: int) -> bool:
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def is_among(label: int, labels: NDArray) -> bool:
     """Whether a label is one of several."""
     is_one = False
@@ -329,8 +326,8 @@ def is_among(label: int, labels: NDArray) -> bool:
     return is_one
 
 
-@njit(cache=True, error_model="numpy")
-def labels_of_edge(meeting: NDArray, state: State, rings: NodeRings, a: int, b: int) -> int:
+@unit
+def labels_of_edge(meeting: Ints1, state: State, rings: NodeRings, a: int, b: int) -> int:
     """The labels of the cells around an edge, to `meeting` (4,) if they are 2 to 4, else -1; how many there are."""
     count = 0
     for m in range(MOST_MEETING):
@@ -362,7 +359,7 @@ def mend(state: State, bad: NDArray[np.int64], target: float) -> Exchanged:
     return _compacted(state, is_dirty, n_before, n_split, n_collapsed)
 
 
-@njit(cache=True, error_model="numpy")
+@entry
 def _mend(state: State, rings: NodeRings, bad: NDArray, target: float, is_dirty: NDArray) -> tuple:
     cells, x = state.complex.cells, np.empty((4, 3))
     n_split, n_collapsed, n_nodes = 0, 0, len(rings.start) - 1
@@ -397,7 +394,7 @@ def _mend(state: State, rings: NodeRings, bad: NDArray, target: float, is_dirty:
     return n_split, n_collapsed
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def _lift_by_collapse(x: NDArray, state: State, rings: NodeRings, a: int, b: int, target: float) -> float:
     """By how much the worst cosine around a grows if a is joined to b."""
     cells, t = state.complex.cells, state.complex.ticks
@@ -417,7 +414,7 @@ def _lift_by_collapse(x: NDArray, state: State, rings: NodeRings, a: int, b: int
     return new - old if is_whole else -1.0
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def _lift_by_split(x: NDArray, state: State, rings: NodeRings, a: int, b: int, p: int, target: float) -> float:
     """By how much the worst cosine around the edge (a, b) grows if it is split at p."""
     old, new = target, target
@@ -443,20 +440,26 @@ def best_splits(state: State, rings: NodeRings, may_split: NDArray[np.bool_], li
     n_nodes = len(may_split)
     moves = EdgeMoves(may_split, np.full(n_nodes, -1, dtype=np.int64), np.full(n_nodes, -np.inf))
     with few_threads(n_nodes * 20):
-        _fill_splits(moves, *state, rings, limits.shortest)
+        run(_fill_splits, n_nodes, Splits(moves, state, rings, limits.shortest))
     return moves
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def _fill_splits(
-    moves: EdgeMoves, complex_: Complex, objective: Objective, sides: Sides, rings: NodeRings, shortest: float
-) -> None:
-    for node in prange(len(moves.gain)):
-        if moves.may_move[node]:
-            _best_split(np.int64(node), moves, State(complex_, objective, sides), rings, shortest)
+class Splits(NamedTuple):
+    """What `best_splits` fills."""
+
+    moves: EdgeMoves
+    state: State
+    rings: NodeRings
+    shortest: float  # mm, as of `Limits`
 
 
-@njit(cache=True, error_model="numpy")
+@unit
+def _fill_splits(work: Splits, node: int) -> None:
+    if work.moves.may_move[node]:
+        _best_split(node, work.moves, work.state, work.rings, work.shortest)
+
+
+@unit
 def _best_split(a: int, moves: EdgeMoves, state: State, rings: NodeRings, shortest: float) -> None:
     x, near = np.empty((4, 3)), np.empty(MAX_NEIGHBOURS, dtype=np.int64)
     for number in range(_neighbours(near, state.complex.cells, rings, a)):
@@ -469,7 +472,7 @@ def _best_split(a: int, moves: EdgeMoves, state: State, rings: NodeRings, shorte
                 moves.gain[a], moves.other[a] = worth, b
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def _is_long(state: State, rings: NodeRings, a: int, b: int, p: int, shortest: float) -> bool:
     """Whether no edge from p to the other corners of the cells around the edge (a, b) is shorter than that."""
     cells = state.complex.cells
@@ -484,8 +487,8 @@ def _is_long(state: State, rings: NodeRings, a: int, b: int, p: int, shortest: f
     return True
 
 
-@njit(cache=True, error_model="numpy")
-def _neighbours(near: NDArray, cells: NDArray, rings: NodeRings, node: int) -> int:
+@unit
+def _neighbours(near: Ints1, cells: Ints2, rings: NodeRings, node: int) -> int:
     """The nodes that share a cell with `node`, to `near`, as many as it takes; how many."""
     count = 0
     for r in range(rings.start[node], rings.start[node + 1]):
@@ -500,8 +503,8 @@ def _neighbours(near: NDArray, cells: NDArray, rings: NodeRings, node: int) -> i
     return count
 
 
-@njit(cache=True, error_model="numpy")
-def worth_of_split(x: NDArray, state: State, rings: NodeRings, a: int, b: int, p: int, least_gain: float) -> float:
+@unit
+def worth_of_split(x: Floats2, state: State, rings: NodeRings, a: int, b: int, p: int, least_gain: float) -> float:
     """How much E falls if the edge (a, b) is split at p; -inf if it cannot be, or by less than `least_gain`."""
     cells, fluxes, objective = state.complex.cells, state.complex.fluxes, state.objective
     n = cells.shape[1]
@@ -553,7 +556,7 @@ def worth_of_split(x: NDArray, state: State, rings: NodeRings, a: int, b: int, p
     return worth if worth > least_gain else -np.inf
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def _rise_of_tension(state: State, cell: int, a: int, b: int, p: int) -> float:
     """By how much a cell's facets between labels cost more if the edge (a, b) is split at p: half of it, its share."""
     mesh, objective, rise = state.complex, state.objective, 0.0
@@ -570,8 +573,8 @@ def _rise_of_tension(state: State, cell: int, a: int, b: int, p: int) -> float:
     return rise
 
 
-@njit(cache=True, error_model="numpy")
-def _shape_with(x: NDArray, state: State, cell: int, node: int, p: int) -> float:
+@unit
+def _shape_with(x: Floats2, state: State, cell: int, node: int, p: int) -> float:
     """Shape energy of a cell with p in the place of its corner `node`; the corners are left in x."""
     cells, objective = state.complex.cells, state.objective
     k = corner_of(cells, cell, node)
@@ -581,7 +584,7 @@ def _shape_with(x: NDArray, state: State, cell: int, node: int, p: int) -> float
     return shape_energy(x, cells.shape[1], objective.power, objective.is_graded)
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def _put_flux_with(flux: NDArray, state: State, cell: int, k: int, node: int, p: int) -> None:
     """Flux of facet k of a cell with p in the place of `node`, outwards, to flux[0, 0, :]."""
     a, b, c = outward(state.complex.cells, cell, k)
@@ -589,8 +592,8 @@ def _put_flux_with(flux: NDArray, state: State, cell: int, k: int, node: int, p:
     put_flux(flux, 0, 0, state.complex.ticks, a, b, c, state.objective)
 
 
-@njit(cache=True, error_model="numpy")
-def split_edge(state: State, rings: NodeRings, a: int, b: int, p: int, is_dirty: NDArray) -> None:
+@unit
+def split_edge(state: State, rings: NodeRings, a: int, b: int, p: int, is_dirty: Bools1) -> None:
     """Each cell of the edge (a, b) becomes two: it keeps a, with p for b; a new one has b, with p for a."""
     cells, across, fluxes = state.complex.cells, state.complex.across, state.complex.fluxes
     n, first, last = cells.shape[1], rings.start[a], rings.start[a + 1]
@@ -642,24 +645,33 @@ def best_collapses(
     """The neighbour to which each node that may is best joined, so that a mesh above the floor is left."""
     n_nodes = len(may_collapse)
     moves = EdgeMoves(may_collapse, np.full(n_nodes, -1, dtype=np.int64), np.full(n_nodes, -np.inf))
+    laid_out = packed(state), packed(rings), packed(groups)
     for chosen in colours_of(state, rings, groups):
         with few_threads(len(chosen) * 10_000):
-            _fill_collapses(moves, *state, rings, groups, chosen, limits)
+            run(_fill_collapses, len(chosen), Collapses(moves, *laid_out, chosen, limits))
     return moves
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def _fill_collapses(
-    moves: EdgeMoves, complex_: Complex, objective: Objective, sides: Sides, rings: NodeRings, groups: Blocks,
-    chosen: NDArray, limits: Limits,
-) -> None:  # fmt: skip
-    for number in prange(len(chosen)):
-        for at in range(groups.start[chosen[number]], groups.start[chosen[number] + 1]):
-            if moves.may_move[groups.nodes[at]]:
-                _best_collapse(groups.nodes[at], moves, State(complex_, objective, sides), rings, limits)
+class Collapses(NamedTuple):
+    """What `best_collapses` fills: the nodes of the groups of one colour."""
+
+    moves: EdgeMoves
+    state: State
+    rings: NodeRings
+    groups: Blocks
+    chosen: Ints1  # (G,) the groups
+    limits: Limits
 
 
-@njit(cache=True, error_model="numpy")
+@unit
+def _fill_collapses(work: Collapses, number: int) -> None:
+    groups, block = work.groups, work.chosen[number]
+    for at in range(groups.start[block], groups.start[block + 1]):
+        if work.moves.may_move[groups.nodes[at]]:
+            _best_collapse(groups.nodes[at], work.moves, work.state, work.rings, work.limits)
+
+
+@unit
 def _best_collapse(a: int, moves: EdgeMoves, state: State, rings: NodeRings, limits: Limits) -> None:
     """The neighbour to which `a` is best joined. It is moved there and back: cells of other groups do not see it."""
     cells, t, is_frozen, objective = state.complex.cells, state.complex.ticks, state.complex.is_frozen, state.objective
@@ -698,15 +710,15 @@ def _best_collapse(a: int, moves: EdgeMoves, state: State, rings: NodeRings, lim
             best, moves.gain[a], moves.other[a] = value, old - value, b
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def squared_length(state: State, a: int, b: int) -> float:
     """Squared distance of two nodes, mm^2."""
     u = place(state.complex.ticks, b, a, state.objective)
     return dot(u, u)
 
 
-@njit(cache=True, error_model="numpy")
-def _is_short(state: State, near: NDArray, count: int, a: int, b: int, longest: NDArray) -> bool:
+@unit
+def _is_short(state: State, near: Ints1, count: int, a: int, b: int, longest: Floats1) -> bool:
     """Whether no edge from b to a neighbour of a is longer than the bound at its ends, or than the longest was."""
     old = 0.0
     for m in range(count):
@@ -718,7 +730,7 @@ def _is_short(state: State, near: NDArray, count: int, a: int, b: int, longest: 
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def may_join(state: State, a: int, b: int) -> bool:
     """Whether a may go where b is: it has to stay in the sides of the box that it is in, and on its surfaces.
 
@@ -733,8 +745,8 @@ def may_join(state: State, a: int, b: int) -> bool:
     return may
 
 
-@njit(cache=True, error_model="numpy")
-def _keeps_domain(x: NDArray, state: State, rings: NodeRings, a: int, b: int, size: float) -> bool:
+@unit
+def _keeps_domain(x: Floats2, state: State, rings: NodeRings, a: int, b: int, size: float) -> bool:
     """Whether the mesh still covers what it should with a at the place of b; `size` is n! times the ring's volume."""
     if state.complex.meeting[a, 1] >= 0 and not _stays_between_labels(state, rings, a, b):
         return False
@@ -747,7 +759,7 @@ def _keeps_domain(x: NDArray, state: State, rings: NodeRings, a: int, b: int, si
     )
 
 
-@njit(cache=True, error_model="numpy")
+@unit
 def _stays_between_labels(state: State, rings: NodeRings, a: int, b: int) -> bool:
     """Whether a node between labels may be joined to b so that all labels keep their topology.
 
@@ -783,14 +795,14 @@ def _stays_between_labels(state: State, rings: NodeRings, a: int, b: int) -> boo
     return _is_linked(state, rings, a, b)
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def _is_side(state: State, cell: int, node: int) -> bool:
     """Whether a cell's facet opposite a node is on the boundary, or between labels."""
     k = corner_of(state.complex.cells, cell, node)
     return state.complex.across[cell, k] < 0 or is_interface(state.complex, cell, k)
 
 
-@njit(cache=True, error_model="numpy")
+@unit
 def _is_linked(state: State, rings: NodeRings, a: int, b: int) -> bool:
     """Whether a boundary edge may be collapsed without closing a hole or a gap (Dey et al. 1999).
 
@@ -817,7 +829,7 @@ def _is_linked(state: State, rings: NodeRings, a: int, b: int) -> bool:
     return edge
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def _is_outer(state: State, rings: NodeRings, a: int, b: int, c: int) -> bool:
     """Whether a facet of the boundary, or between labels, has the nodes a and b, and c unless that is -1."""
     cells = state.complex.cells
@@ -831,8 +843,8 @@ def _is_outer(state: State, rings: NodeRings, a: int, b: int, c: int) -> bool:
     return False
 
 
-@njit(cache=True, error_model="numpy")
-def _keeps_size(x: NDArray, state: State, rings: NodeRings, a: int, b: int, size: float, share: float) -> bool:
+@unit
+def _keeps_size(x: Floats2, state: State, rings: NodeRings, a: int, b: int, size: float, share: float) -> bool:
     """Whether the cells around a, moved to b, fill what they filled, but for a share: n! times their volume is `size`.
 
     All cells positive, they fan out from b over the ring's hull; so this holds unless the domain itself is not convex
@@ -847,8 +859,8 @@ def _keeps_size(x: NDArray, state: State, rings: NodeRings, a: int, b: int, size
     return abs(total - size) <= share * size
 
 
-@njit(cache=True, error_model="numpy")
-def collapse_edge(state: State, rings: NodeRings, a: int, b: int, is_dirty: NDArray) -> None:
+@unit
+def collapse_edge(state: State, rings: NodeRings, a: int, b: int, is_dirty: Bools1) -> None:
     """Node a becomes b: cells with both go, and the others around a have b instead."""
     cells, across, x = state.complex.cells, state.complex.across, np.empty((4, 3))
     for r in range(rings.start[a], rings.start[a + 1]):

@@ -14,17 +14,15 @@ the threads, and E falls by what was measured.
 
 from __future__ import annotations
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import get_num_threads
 from numpy.typing import NDArray
 
 from tetopt.energy.sampling import CELLS_PER_CHUNK, few_threads
 from tetopt.engine.complex import (
-    Complex,
     Objective,
-    Sides,
     State,
     cell_cosine,
     cell_energy,
@@ -45,6 +43,23 @@ from tetopt.engine.complex import (
     worst_cosine,
 )
 from tetopt.geometry.vectors import cross, difference, dot, row
+from tetopt.kernels import (
+    Bools1,
+    Bools2,
+    Bools3,
+    Floats1,
+    Floats2,
+    Floats3,
+    Ints1,
+    Ints2,
+    entry,
+    helper,
+    inlined,
+    nth,
+    run,
+    thread,
+    unit,
+)
 
 POLYGON_CORNERS = 7  # corners of the largest polygon around an edge that is triangulated anew
 LEAST_FLIP_SHARE = 1e-9  # of the cavity's energy: a smaller gain may be rounding
@@ -54,28 +69,25 @@ TET_EDGES = np.array([(0, 1), (0, 2), (0, 3), (1, 2), (1, 3), (2, 3)])  # betwee
 class Cavity(NamedTuple):
     """Room for one cavity at a time."""
 
-    x: NDArray[np.float64]  # (4, 3) corners of a cell
-    y: NDArray[np.float64]  # (POLYGON_CORNERS + 2, 3) corners of the cavity: of an edge a, b, then the polygon
-    ring: NDArray[np.int64]  # (POLYGON_CORNERS,) the polygon's nodes
-    around: NDArray[np.int64]  # (POLYGON_CORNERS,) the cells around the edge
-    cost: NDArray[np.float64]  # (POLYGON_CORNERS, POLYGON_CORNERS) of the best triangulation between two corners
-    apex: NDArray[np.int64]  # (POLYGON_CORNERS, POLYGON_CORNERS) the corner between them of its triangle
-    triangle: NDArray[
-        np.float64
-    ]  # (POLYGON_CORNERS, POLYGON_CORNERS, POLYGON_CORNERS) energy of the two cells over each triangle
-    is_measured: NDArray[np.bool_]  # (POLYGON_CORNERS, POLYGON_CORNERS, POLYGON_CORNERS) whether the image is in it
-    side_a: NDArray[np.float64]  # (POLYGON_CORNERS, POLYGON_CORNERS, D) fluxes of the facets (v_j, v_i, a)
-    side_b: NDArray[np.float64]  # and (v_i, v_j, b)
-    flux: NDArray[np.float64]  # (3, 1, D) of facets inside the cavity
-    sums: NDArray[np.float64]  # (2, D) of two cells
-    is_side: NDArray[np.bool_]  # (POLYGON_CORNERS, POLYGON_CORNERS) whether they are measured
-    stack: NDArray[np.int64]  # (2 POLYGON_CORNERS, 3)
-    new: NDArray[np.int64]  # (2 POLYGON_CORNERS,) the cells that will fill the cavity
-    free: NDArray[np.int64]  # (1 + R,) how many cells were left over, and which
-    arc: NDArray[np.int64]  # (1,) how many cells of the first label come first; 0 if all around the edge have one label
+    x: Floats2  # (4, 3) corners of a cell
+    y: Floats2  # (POLYGON_CORNERS + 2, 3) corners of the cavity: of an edge a, b, then the polygon
+    ring: Ints1  # (POLYGON_CORNERS,) the polygon's nodes
+    around: Ints1  # (POLYGON_CORNERS,) the cells around the edge
+    cost: Floats2  # (POLYGON_CORNERS, POLYGON_CORNERS) of the best triangulation between two corners
+    apex: Ints2  # (POLYGON_CORNERS, POLYGON_CORNERS) the corner between them of its triangle
+    triangle: Floats3  # (POLYGON_CORNERS, POLYGON_CORNERS, POLYGON_CORNERS) energy of the two cells over each one
+    is_measured: Bools3  # (POLYGON_CORNERS, POLYGON_CORNERS, POLYGON_CORNERS) whether the image is in it
+    side_a: Floats3  # (POLYGON_CORNERS, POLYGON_CORNERS, D) fluxes of the facets (v_j, v_i, a)
+    side_b: Floats3  # and (v_i, v_j, b)
+    flux: Floats3  # (3, 1, D) of facets inside the cavity
+    sums: Floats2  # (2, D) of two cells
+    is_side: Bools2  # (POLYGON_CORNERS, POLYGON_CORNERS) whether they are measured
+    stack: Ints2  # (2 POLYGON_CORNERS, 3)
+    new: Ints1  # (2 POLYGON_CORNERS,) the cells that will fill the cavity
+    free: Ints1  # (1 + R,) how many cells were left over, and which
+    arc: Ints1  # (1,) how many cells of the first label come first; 0 if all around the edge have one label
 
 
-@njit(cache=True, error_model="numpy")
 def cavity(n_free: int, D: int) -> Cavity:
     """Room for a cavity, and for the numbers of `n_free` cells left over; D numbers make a flux."""
     return Cavity(
@@ -124,7 +136,8 @@ def flip(
         order = np.flatnonzero(move >= 0)
         order = order[np.lexsort((order, -gain[order]))]
         dirty[:] = False
-        n_made = make_moves(order, move, dirty, state)
+        work = cavity(len(state.complex.cells), state.complex.fluxes.shape[2])
+        n_made = make_moves(order, move, dirty, state, work)
         if n_made == 0:
             break
         n_moves += n_made
@@ -137,44 +150,52 @@ def flip(
 def _evaluate(gain: NDArray, move: NDArray, is_dirty: NDArray, state: State) -> None:
     """The move worth most of each cell, and its worth, to `move` (C,) and `gain` (C,)."""
     with few_threads(len(gain) * 4):
-        kernel = _evaluate_triangles if state.complex.cells.shape[1] == 3 else _evaluate_cells
-        kernel(gain, move, is_dirty, *state)
+        task = _evaluate_triangles if state.complex.cells.shape[1] == 3 else _evaluate_cells
+        rooms = [cavity(0, state.complex.fluxes.shape[2]) for _ in range(get_num_threads())]
+        work = Evaluation(gain, move, is_dirty, state, rooms)
+        run(task, (len(gain) + CELLS_PER_CHUNK - 1) // CELLS_PER_CHUNK, work)
 
 
-# Both loops are in the parallel function itself: each level of calls is optimised again, 3 s of compiling.
-@njit(cache=True, parallel=True, error_model="numpy")
-def _evaluate_cells(
-    gain: NDArray, move: NDArray, is_dirty: NDArray, complex_: Complex, objective: Objective, sides: Sides
-) -> None:
+class Evaluation(NamedTuple):
+    """What the moves of all cells are looked for in."""
+
+    gain: Floats1  # (C,) of each cell's best move
+    move: Ints1  # (C,) which
+    is_dirty: Bools1  # (C,) only cavities with one of these are looked at
+    state: State
+    rooms: list[Cavity]  # one for each thread
+
+
+@unit
+def _evaluate_cells(search: Evaluation, chunk: int) -> None:
     """Moves 0 to 3 flip that facet, 4 to 9 remove an edge of `TET_EDGES`."""
-    for chunk in prange((len(gain) + CELLS_PER_CHUNK - 1) // CELLS_PER_CHUNK):
-        work = cavity(0, complex_.fluxes.shape[2])
-        state = State(complex_, objective, sides)
-        first: Any = np.int64(chunk) * CELLS_PER_CHUNK
-        for cell in range(first, min(first + CELLS_PER_CHUNK, len(gain))):
-            for k in range(4):
-                other = complex_.across[cell, k]
-                if other > cell and (is_dirty[cell] or is_dirty[other]) and not is_interface(complex_, cell, k):
-                    worth = _worth_of_face(work, state, cell, k)
-                    if worth > gain[cell]:
-                        gain[cell], move[cell] = worth, k
-            for e in range(6):
-                i, j = TET_EDGES[5 - e, 0], TET_EDGES[5 - e, 1]  # the other two corners, opposite the edge's two facets
-                if 0 <= complex_.across[cell, i] < cell or 0 <= complex_.across[cell, j] < cell:
-                    continue  # a lower cell has the edge too, and looks at it
-                i, j = TET_EDGES[e, 0], TET_EDGES[e, 1]
-                m, is_open = ring_of_edge(work.ring, work.around, complex_.cells, complex_.across, cell, i, j, True)
-                dirty = False
-                for r in range(m - is_open):
-                    dirty = dirty or is_dirty[work.around[r]]
-                if not dirty:
-                    continue
-                worth = _worth_of_edge(work, state, complex_.cells[cell, i], complex_.cells[cell, j], m, is_open)
+    gain, move, is_dirty, state = search.gain, search.move, search.is_dirty, search.state
+    work, complex_ = nth(search.rooms, thread()), state.complex
+    first = chunk * CELLS_PER_CHUNK
+    for cell in range(first, min(first + CELLS_PER_CHUNK, len(gain))):
+        for k in range(4):
+            other = complex_.across[cell, k]
+            if other > cell and (is_dirty[cell] or is_dirty[other]) and not is_interface(complex_, cell, k):
+                worth = _worth_of_face(work, state, cell, k)
                 if worth > gain[cell]:
-                    gain[cell], move[cell] = worth, 4 + e
+                    gain[cell], move[cell] = worth, k
+        for e in range(6):
+            i, j = TET_EDGES[5 - e, 0], TET_EDGES[5 - e, 1]  # the other two corners, opposite the edge's two facets
+            if 0 <= complex_.across[cell, i] < cell or 0 <= complex_.across[cell, j] < cell:
+                continue  # a lower cell has the edge too, and looks at it
+            i, j = TET_EDGES[e, 0], TET_EDGES[e, 1]
+            m, is_open = ring_of_edge(work.ring, work.around, complex_.cells, complex_.across, cell, i, j, True)
+            dirty = False
+            for r in range(m - is_open):
+                dirty = dirty or is_dirty[work.around[r]]
+            if not dirty:
+                continue
+            worth = _worth_of_edge(work, state, complex_.cells[cell, i], complex_.cells[cell, j], m, is_open)
+            if worth > gain[cell]:
+                gain[cell], move[cell] = worth, 4 + e
 
 
-@njit(cache=True, error_model="numpy")
+@unit
 def _worth_of_face(work: Cavity, state: State, cell: int, k: int) -> float:
     """How much E falls if the facet's two cells become three; 0 or less, or -inf, if not."""
     x, y = work.x, work.y
@@ -221,7 +242,7 @@ def _worth_of_face(work: Cavity, state: State, cell: int, k: int) -> float:
     return old - new
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@inlined
 def _squares_by_axis(y: NDArray, a: int, b: int, c: int) -> float:
     """Sum of the six squared edges of the tetrahedron of the origin and three rows, axis by axis."""
     S = 0.0
@@ -231,10 +252,10 @@ def _squares_by_axis(y: NDArray, a: int, b: int, c: int) -> float:
     return S
 
 
-@njit(cache=True, error_model="numpy")
+@unit
 def ring_of_edge(
-    ring: NDArray, around: NDArray, cells: NDArray, across: NDArray, cell: int, i: int, j: int, owned: bool
-) -> tuple:
+    ring: Ints1, around: Ints1, cells: Ints2, across: Ints2, cell: int, i: int, j: int, owned: bool
+) -> tuple[int, int]:
     """The cells around the edge of a cell between its corners i and j, and the polygon of their other corners.
 
     Turning from a to b to the right: cell r holds a, b, ring[r] and ring[r + 1]. Returns the polygon's number of
@@ -289,7 +310,7 @@ def ring_of_edge(
         current, back, front = after, front, _fourth_node(cells, after, a, b, front)
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@inlined
 def _fourth_node(cells: NDArray, cell: int, a: int, b: int, c: int) -> int:
     """The corner of a tetrahedron that is none of a, b and c."""
     fourth = 0
@@ -299,7 +320,7 @@ def _fourth_node(cells: NDArray, cell: int, a: int, b: int, c: int) -> int:
     return fourth
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def in_one_face(state: State, a: int, b: int, c: int, d: int) -> bool:
     """Whether four boundary nodes have one index coordinate in common, so that they lie in one face of the box.
 
@@ -313,8 +334,8 @@ def in_one_face(state: State, a: int, b: int, c: int, d: int) -> bool:
     return False
 
 
-@njit(cache=True, error_model="numpy")
-def turn_to_arcs(work: Cavity, labels: NDArray, m: int, is_open: int) -> bool:
+@unit
+def turn_to_arcs(work: Cavity, labels: Ints1, m: int, is_open: int) -> bool:
     """Whether the edge whose cells are in `work` may be removed without a change of topology between labels.
 
     All of its cells have one label; or those of one label come after those of another, two or more of each. Then the
@@ -342,20 +363,20 @@ def turn_to_arcs(work: Cavity, labels: NDArray, m: int, is_open: int) -> bool:
     return 2 <= work.arc[0] <= m - 2
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@inlined
 def joins_arcs(work: Cavity, i: int, k: int, j: int) -> bool:
     """Whether a triangle i < k < j of the polygon would lie in two labels."""
     t = work.arc[0]
     return t > 0 and j > t and (0 < i < t or 0 < k < t)
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@inlined
 def _arc_of(work: Cavity, j: int) -> int:
     """The first cell around the edge that has the label of the polygon's triangle with the last corner j."""
     return work.arc[0] if 0 < work.arc[0] < j else 0
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def _fall_of_tension(work: Cavity, state: State, a: int, b: int) -> float:
     """By how much the facets between labels cost less once the edge (a, b) is removed."""
     t, ticks, objective = work.arc[0], state.complex.ticks, state.objective
@@ -367,7 +388,7 @@ def _fall_of_tension(work: Cavity, state: State, a: int, b: int) -> float:
     return pair_tension(objective, labels[work.around[0]], labels[work.around[t]]) * fall
 
 
-@njit(cache=True, error_model="numpy")
+@unit
 def _worth_of_edge(work: Cavity, state: State, a: int, b: int, m: int, is_open: int) -> float:
     """How much E falls if the edge (a, b) is removed, -inf if it cannot be; `work.apex` then holds the diagonals.
 
@@ -434,7 +455,7 @@ def _worth_of_edge(work: Cavity, state: State, a: int, b: int, m: int, is_open: 
     return old - cost[0, m - 1]
 
 
-@njit(cache=True, error_model="numpy")
+@unit
 def _measure_triangles(work: Cavity, state: State, a: int, b: int, m: int, is_open: int) -> bool:
     """Add their image energy to the triangles of the triangulation in `apex`; whether one had not had it."""
     stack, side_a, side_b, ring = work.stack, work.side_a, work.side_b, work.ring
@@ -467,7 +488,7 @@ def _measure_triangles(work: Cavity, state: State, a: int, b: int, m: int, is_op
     return is_new
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def _pair_shape(y: NDArray, i: int, k: int, j: int, limit: float, objective: Objective) -> float:
     """Weighted shape energy of the tetrahedra (i, k, j, b) and (i, j, k, a) over a triangle of the polygon.
 
@@ -485,7 +506,7 @@ def _pair_shape(y: NDArray, i: int, k: int, j: int, limit: float, objective: Obj
     return energy if energy < limit else np.inf
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@inlined
 def _edge_squares(u: tuple, v: tuple, w: tuple) -> float:
     """Sum of the six squared edges of the tetrahedron of the origin and three vectors."""
     base = u[0] * u[0] + u[1] * u[1] + u[2] * u[2] + v[0] * v[0] + v[1] * v[1] + v[2] * v[2]
@@ -493,7 +514,7 @@ def _edge_squares(u: tuple, v: tuple, w: tuple) -> float:
     return 4.0 * (base + w[0] * w[0] + w[1] * w[1] + w[2] * w[2]) - dot(s, s)
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def _pair_cosine(x: NDArray, y: NDArray, i: int, k: int, j: int) -> float:
     """`worst_cosine` of the worse of the same two tetrahedra."""
     for d in range(3):
@@ -504,8 +525,8 @@ def _pair_cosine(x: NDArray, y: NDArray, i: int, k: int, j: int) -> float:
     return min(above, worst_cosine(x))
 
 
-@njit(cache=True, error_model="numpy")
-def best_triangulation(cost: NDArray, apex: NDArray, triangle: NDArray, m: int) -> float:
+@unit
+def best_triangulation(cost: Floats2, apex: Ints2, triangle: Floats3, m: int) -> float:
     """Least sum of `triangle[i, k, j]` over the triangulations of a polygon of m corners; `apex` is filled."""
     for i in range(m - 1):
         cost[i, i + 1] = 0.0
@@ -522,7 +543,7 @@ def best_triangulation(cost: NDArray, apex: NDArray, triangle: NDArray, m: int) 
     return cost[0, m - 1]
 
 
-@njit(cache=True, error_model="numpy")
+@unit
 def fill_side(work: Cavity, state: State, a: int, b: int, i: int, j: int, m: int, is_open: int) -> None:
     """Fluxes of the facets (v_i, v_j, b) and (v_j, v_i, a), unless known: on the polygon's sides the old cells'."""
     if work.is_side[i, j]:
@@ -541,15 +562,14 @@ def fill_side(work: Cavity, state: State, a: int, b: int, i: int, j: int, m: int
         put_flux(side, i, j, state.complex.ticks, p, q, end, state.objective)
 
 
-@njit(cache=True, error_model="numpy")
-def make_moves(order: NDArray, move: NDArray, is_dirty: NDArray, state: State) -> int:
+@entry
+def make_moves(order: NDArray, move: NDArray, is_dirty: NDArray, state: State, work: Cavity) -> int:
     """Make the moves of the cells in `order` whose cavities are as they were; the number made.
 
     Cells of a cavity that changed are marked dirty, and those left over are taken out at the end.
     """
     cells, across = state.complex.cells, state.complex.across
     room = len(cells)
-    work = cavity(room, state.complex.fluxes.shape[2])
     made = 0
     for number in range(len(order)):
         cell = order[number]
@@ -582,8 +602,8 @@ def make_moves(order: NDArray, move: NDArray, is_dirty: NDArray, state: State) -
     return made
 
 
-@njit(cache=True, error_model="numpy")
-def take_cells(work: Cavity, state: State, n_old: int, n_new: int, is_dirty: NDArray) -> None:
+@unit
+def take_cells(work: Cavity, state: State, n_old: int, n_new: int, is_dirty: Bools1) -> None:
     """Numbers of the cells that fill a cavity, to `work.new`: first those that it had, `n_old` in `work.around`.
 
     Further ones are of cells left over before, or from the end; those left over now are marked by a corner of -1. All
@@ -607,8 +627,8 @@ def take_cells(work: Cavity, state: State, n_old: int, n_new: int, is_dirty: NDA
         is_dirty[cell] = True
 
 
-@njit(cache=True, error_model="numpy")
-def flip_face(work: Cavity, state: State, cell: int, k: int, is_dirty: NDArray) -> None:
+@unit
+def flip_face(work: Cavity, state: State, cell: int, k: int, is_dirty: Bools1) -> None:
     """Two cells become three around the edge (p, q) of the corners across their facet (u, v, w)."""
     cells, across, fluxes, objective = state.complex.cells, state.complex.across, state.complex.fluxes, state.objective
     other = across[cell, k]
@@ -651,7 +671,7 @@ def flip_face(work: Cavity, state: State, cell: int, k: int, is_dirty: NDArray) 
         settle(work.x, state, c)
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def join(across: NDArray, cell: int, k: int, other: int, m: int) -> None:
     """Let facet k of a cell and facet m of another be one; or the boundary's, if there is none other: -1."""
     across[cell, k] = other
@@ -659,7 +679,7 @@ def join(across: NDArray, cell: int, k: int, other: int, m: int) -> None:
         across[other, m] = cell
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def _beyond_polygon(work: Cavity, state: State, node: int, n_cells: int) -> NDArray:
     """What lies beyond the sides of the polygon in `work`, over the node: row r (cell, its facet that leads here).
 
@@ -675,8 +695,8 @@ def _beyond_polygon(work: Cavity, state: State, node: int, n_cells: int) -> NDAr
     return beyond
 
 
-@njit(cache=True, error_model="numpy")
-def remove_edge(work: Cavity, state: State, a: int, b: int, m: int, is_open: int, is_dirty: NDArray) -> None:
+@unit
+def remove_edge(work: Cavity, state: State, a: int, b: int, m: int, is_open: int, is_dirty: Bools1) -> None:
     """The cells around (a, b) become pairs over the triangles of the polygon in `work.apex`; see `_worth_of_edge`.
 
     The sides of its triangles have their fluxes, if the image counts.
@@ -725,7 +745,7 @@ def remove_edge(work: Cavity, state: State, a: int, b: int, m: int, is_open: int
         settle(work.x, state, new[r])
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def _put_pair_fluxes(work: Cavity, state: State, top: int, low: int, i: int, k: int, j: int) -> None:
     """Fluxes of the two cells over the triangle (i, k, j); 0 inside the cavity if the image does not count."""
     fluxes, side_a, side_b, ring = state.complex.fluxes, work.side_a, work.side_b, work.ring
@@ -741,8 +761,8 @@ def _put_pair_fluxes(work: Cavity, state: State, top: int, low: int, i: int, k: 
             fluxes[top, 1, d], fluxes[low, 2, d] = -side_b[i, j, d], -side_a[i, j, d]
 
 
-@njit(cache=True, error_model="numpy")
-def close_gaps(state: State, is_dirty: NDArray) -> None:
+@unit
+def close_gaps(state: State, is_dirty: Bools1) -> None:
     """Move the last cells into the places of those that were taken out."""
     cells, across, fluxes, sums = state.complex.cells, state.complex.across, state.complex.fluxes, state.complex.sums
     E_shape = state.complex.E_shape
@@ -777,26 +797,23 @@ def close_gaps(state: State, is_dirty: NDArray) -> None:
 # Triangles.
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def _evaluate_triangles(
-    gain: NDArray, move: NDArray, is_dirty: NDArray, complex_: Complex, objective: Objective, sides: Sides
-) -> None:
+@unit
+def _evaluate_triangles(search: Evaluation, chunk: int) -> None:
     """Moves 0 to 2 turn that edge."""
-    for chunk in prange((len(gain) + CELLS_PER_CHUNK - 1) // CELLS_PER_CHUNK):
-        x, sums = np.empty((4, 3)), np.empty((2, complex_.sums.shape[1]))
-        state = State(complex_, objective, sides)
-        first: Any = np.int64(chunk) * CELLS_PER_CHUNK
-        for cell in range(first, min(first + CELLS_PER_CHUNK, len(gain))):
-            for k in range(3):
-                other = complex_.across[cell, k]
-                if other > cell and (is_dirty[cell] or is_dirty[other]) and not is_interface(complex_, cell, k):
-                    worth = _worth_of_turn(x, sums, state, cell, k)
-                    if worth > gain[cell]:
-                        gain[cell], move[cell] = worth, k
+    gain, move, is_dirty, state = search.gain, search.move, search.is_dirty, search.state
+    x, sums, complex_ = np.empty((4, 3)), np.empty((2, state.complex.sums.shape[1])), state.complex
+    first = chunk * CELLS_PER_CHUNK
+    for cell in range(first, min(first + CELLS_PER_CHUNK, len(gain))):
+        for k in range(3):
+            other = complex_.across[cell, k]
+            if other > cell and (is_dirty[cell] or is_dirty[other]) and not is_interface(complex_, cell, k):
+                worth = _worth_of_turn(x, sums, state, cell, k)
+                if worth > gain[cell]:
+                    gain[cell], move[cell] = worth, k
 
 
-@njit(cache=True, error_model="numpy")
-def _worth_of_turn(x: NDArray, sums: NDArray, state: State, cell: int, k: int) -> float:
+@unit
+def _worth_of_turn(x: Floats2, sums: Floats2, state: State, cell: int, k: int) -> float:
     """How much E falls if the edge (u, v) between two triangles is turned to (p, q); -inf if it cannot be."""
     ticks, cells, across, fluxes = state.complex.ticks, state.complex.cells, state.complex.across, state.complex.fluxes
     objective = state.objective
@@ -822,7 +839,7 @@ def _worth_of_turn(x: NDArray, sums: NDArray, state: State, cell: int, k: int) -
     return old - new if new < limit else -np.inf
 
 
-@njit(cache=True, error_model="numpy")
+@unit
 def _turn_edge(state: State, cell: int, k: int) -> None:
     """Triangles (p, u, v) and (q, v, u) become (p, u, q) and (p, q, v)."""
     ticks, cells, across, fluxes = state.complex.ticks, state.complex.cells, state.complex.across, state.complex.fluxes

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import numpy as np
 import scipy
-from numba import njit
 from numpy.typing import NDArray
 
 from tetopt.energy.sampling import cell_of_voxel
@@ -17,6 +16,7 @@ from tetopt.engine.complex import NodeRings, State, facet_area, image_energy, no
 from tetopt.engine.labelling import keeps_topology, labelled, voxel_pieces
 from tetopt.engine.surface import MOST_MEETING
 from tetopt.geometry.simplex import centroids, volumes
+from tetopt.kernels import entry, helper, unit
 from tetopt.mesh import Mesh
 from tetopt.target.content import Content
 
@@ -65,7 +65,7 @@ def cell_counts(content: Content, mesh: Mesh) -> scipy.sparse.csr_array:
     return counts
 
 
-@njit(cache=True, error_model="numpy")
+@unit
 def _meet(state: State, rings: NodeRings, node: int) -> None:
     """Note which labels the cells around a node have."""
     meeting, count = state.complex.meeting[node], 0
@@ -82,7 +82,7 @@ def _meet(state: State, rings: NodeRings, node: int) -> None:
         meeting[0] = -1
 
 
-@njit(cache=True, error_model="numpy")
+@entry
 def _meet_everywhere(state: State, rings: NodeRings) -> None:
     for node in range(len(state.complex.ticks)):
         _meet(state, rings, node)
@@ -102,7 +102,7 @@ def relabel(state: State) -> int:
     return total
 
 
-@njit(cache=True, error_model="numpy")
+@unit
 def _price(state: State, cell: int, label: int) -> float:
     """What a cell costs with a label, as far as the label matters."""
     mesh, objective = state.complex, state.objective
@@ -115,7 +115,7 @@ def _price(state: State, cell: int, label: int) -> float:
     return price
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def _find_relabelling(gain: NDArray, label: NDArray, state: State, cell: int) -> None:
     mesh = state.complex
     gain[cell], label[cell], own = 0.0, mesh.labels[cell], -1.0
@@ -130,13 +130,13 @@ def _find_relabelling(gain: NDArray, label: NDArray, state: State, cell: int) ->
             gain[cell], label[cell] = more, mesh.labels[other]
 
 
-@njit(cache=True, error_model="numpy")
+@entry
 def _find_relabellings(gain: NDArray, label: NDArray, state: State) -> None:
     for cell in range(len(gain)):
         _find_relabelling(gain, label, state, cell)
 
 
-@njit(cache=True, error_model="numpy")
+@entry
 def _relabel(order: NDArray, gain: NDArray, label: NDArray, state: State, rings: NodeRings) -> int:
     mesh, moved = state.complex, 0
     for cell in order:

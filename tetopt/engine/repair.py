@@ -10,7 +10,6 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from tetopt.engine.complex import (
@@ -44,6 +43,7 @@ from tetopt.engine.flips import (
 from tetopt.engine.smooth import ring_energy, slid, store, trial_of
 from tetopt.engine.surface import projection_at, slides
 from tetopt.geometry.vectors import difference, dot, put_row, row, scaled, times
+from tetopt.kernels import Floats2, entry, helper, unit
 
 REPAIR_ROUNDS = 40  # at most; a round that changes nothing ends them before
 STEP_HALVINGS = 7  # of a node's displacement
@@ -67,7 +67,7 @@ def cell_cosines(state: State) -> NDArray[np.float64]:
     return cosines
 
 
-@njit(cache=True, error_model="numpy")
+@entry
 def _fill_cosines(cosines: NDArray, state: State) -> None:
     x = np.empty((4, 3))
     for cell in range(len(cosines)):
@@ -88,7 +88,7 @@ def repair(state: State, floor: float) -> Repaired:
             break
         if len(state.complex.cells) - state.complex.n_cells[0] < 4 * len(bad) + 64:
             state = grown(state)
-        n_made = _reconnect(state, bad, target)
+        n_made = _reconnect(state, bad, target, cavity(len(state.complex.cells), state.complex.fluxes.shape[2]))
         bad = _worst_first(state, target)
         if len(bad):
             n_made += _displace(state, node_rings(state), bad, target)
@@ -114,12 +114,11 @@ def _worst_first(state: State, target: float) -> NDArray[np.int64]:
     return bad[np.lexsort((bad, cosines[bad]))]
 
 
-@njit(cache=True, error_model="numpy")
-def _reconnect(state: State, bad: NDArray, target: float) -> int:
+@entry
+def _reconnect(state: State, bad: NDArray, target: float, work: Cavity) -> int:
     """For each bad cell the flip that leaves the best worst angle in its cavity, if it is better than before."""
     cells, across = state.complex.cells, state.complex.across
     room = len(cells)
-    work = cavity(room, state.complex.fluxes.shape[2])
     is_changed = np.zeros(room, dtype=np.bool_)
     n_made = 0
     for number in range(len(bad)):
@@ -159,8 +158,8 @@ def _reconnect(state: State, bad: NDArray, target: float) -> int:
     return n_made
 
 
-@njit(cache=True, error_model="numpy")
-def _gain_of_face(x: NDArray, state: State, cell: int, k: int, target: float) -> float:
+@unit
+def _gain_of_face(x: Floats2, state: State, cell: int, k: int, target: float) -> float:
     """By how much the worst angle of the cavity (its minus cosine, up to the target) grows in a face flip."""
     cells, across = state.complex.cells, state.complex.across
     other = across[cell, k]
@@ -175,7 +174,7 @@ def _gain_of_face(x: NDArray, state: State, cell: int, k: int, target: float) ->
     return new - old
 
 
-@njit(cache=True, error_model="numpy")
+@unit
 def _gain_of_edge(work: Cavity, state: State, cell: int, e: int, m: int, is_open: int, target: float) -> float:
     """The same for the removal of an edge; `work.apex` holds the triangulation."""
     cells = state.complex.cells
@@ -216,7 +215,7 @@ def _gain_of_edge(work: Cavity, state: State, cell: int, e: int, m: int, is_open
     return new - old
 
 
-@njit(cache=True, error_model="numpy")
+@entry
 def _displace(state: State, rings: NodeRings, bad: NDArray, target: float) -> int:
     """Move the nodes of each bad cell so that the worst angle of their rings grows, up to the target."""
     x, n_made = np.empty((4, 3)), 0
@@ -229,8 +228,8 @@ def _displace(state: State, rings: NodeRings, bad: NDArray, target: float) -> in
     return n_made
 
 
-@njit(cache=True, error_model="numpy")
-def _ring_cosine(x: NDArray, state: State, rings: NodeRings, node: int, least: float) -> float:
+@unit
+def _ring_cosine(x: Floats2, state: State, rings: NodeRings, node: int, least: float) -> float:
     """The worst of a ring's cells; -2 if one is flat or inverted, and anything below `least` once that is passed."""
     worst = 1.0
     for r in range(rings.start[node], rings.start[node + 1]):
@@ -241,8 +240,8 @@ def _ring_cosine(x: NDArray, state: State, rings: NodeRings, node: int, least: f
     return worst
 
 
-@njit(cache=True, error_model="numpy")
-def _lift(x: NDArray, state: State, rings: NodeRings, node: int, target: float) -> bool:
+@unit
+def _lift(x: Floats2, state: State, rings: NodeRings, node: int, target: float) -> bool:
     """Search around a node, with ever smaller steps, for a place where its ring's worst angle is larger."""
     start, before = row(state.complex.ticks, node), _ring_cosine(x, state, rings, node, -3.0)
     if before >= target:
@@ -264,7 +263,7 @@ def _lift(x: NDArray, state: State, rings: NodeRings, node: int, target: float) 
     return False
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def _first_step(x: NDArray, state: State, rings: NodeRings, node: int) -> float:
     """A quarter of the mean length of the edges from a node, each as often as cells have it, mm."""
     total, count = 0.0, 0
@@ -279,9 +278,9 @@ def _first_step(x: NDArray, state: State, rings: NodeRings, node: int) -> float:
     return FIRST_STEP_EDGES * total / count
 
 
-@njit(cache=True, error_model="numpy")
+@unit
 def _step_around(
-    x: NDArray, normal: NDArray, is_sliding: bool, state: State, rings: NodeRings, node: int, step: float, best: float
+    x: Floats2, normal: Floats2, is_sliding: bool, state: State, rings: NodeRings, node: int, step: float, best: float
 ) -> float:
     """Move a node by a step, mm, in the one of 26 directions that leaves its ring's best cosine; that, or `best`."""
     t, P, scale = state.complex.ticks, projection_at(state, node), 2.0**-state.objective.bits

@@ -13,19 +13,16 @@ others; the result does not depend on the threads. A move is made only if no cel
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Annotated, NamedTuple
 
 import numpy as np
-from numba import njit, prange
 from numpy.typing import NDArray
 
 from tetopt.energy.geometric import volume_and_E_G, volume_gradient
 from tetopt.energy.sampling import few_threads
 from tetopt.engine.complex import (
-    Complex,
     NodeRings,
     Objective,
-    Sides,
     State,
     cell_energy,
     cell_value,
@@ -54,6 +51,21 @@ from tetopt.engine.surface import (
 )
 from tetopt.geometry.topology import greedy_colours
 from tetopt.geometry.vectors import cross, difference, dot, minus, put_row, row, scaled, times
+from tetopt.kernels import (
+    Bools1,
+    Floats1,
+    Floats2,
+    Floats3,
+    Ints1,
+    Ints2,
+    by_value,
+    entry,
+    helper,
+    inlined,
+    packed,
+    run,
+    unit,
+)
 
 FACET_PARTS = 8  # most parts that a facet's edge is cut into when h is integrated over it; four times as many in 2-D
 PART_VOXELS = 2.0  # voxels between the points at which h is then taken
@@ -67,9 +79,9 @@ LINE_TRIALS = 3  # energies measured along the gradient, at most
 class Blocks(NamedTuple):
     """Nodes in groups that lie together."""
 
-    nodes: NDArray[np.int64]  # (N,) one group after the other
-    start: NDArray[np.int64]  # (B+1,) where each begins
-    of_node: NDArray[np.int64]  # (N,) the group of each node
+    nodes: Ints1  # (N,) one group after the other
+    start: Ints1  # (B+1,) where each begins
+    of_node: Ints1  # (N,) the group of each node
 
 
 def blocks(ticks: NDArray[np.int64]) -> Blocks:
@@ -101,11 +113,12 @@ def sweep(
     the same voxels, 1.5 to 2 times faster from the cache than nodes of one colour all over the volume. Returns False if
     `is_over` cut it short, between two colours.
     """
+    laid_out = packed(state), packed(rings), packed(groups)
     for chosen in colours_of(state, rings, groups):
         if is_over():
             return False
         with few_threads(len(chosen) * BLOCK_NODES * 100):
-            _sweep(*state, rings, groups, chosen, may_move)
+            run(_sweep, len(chosen), Sweep(*laid_out, chosen, may_move))
     return True
 
 
@@ -116,7 +129,7 @@ def colours_of(state: State, rings: NodeRings, groups: Blocks) -> list[NDArray[n
     return [np.flatnonzero(colours == colour) for colour in range(int(colours.max()) + 1)]
 
 
-@njit(cache=True)
+@entry
 def _block_rings(nodes: NDArray, start: NDArray, ring_start: NDArray, ring_cells: NDArray) -> tuple:
     """The cells around the nodes of each group, as `Rings`; cells may be named several times."""
     first = np.zeros(len(start), dtype=np.int64)
@@ -134,18 +147,27 @@ def _block_rings(nodes: NDArray, start: NDArray, ring_start: NDArray, ring_cells
 def gradient(state: State, rings: NodeRings) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Derivatives of the two weighted terms of E by every node's position, (N, 3) each, per mm: shape and image."""
     shape, image = np.zeros((len(state.complex.ticks), 3)), np.zeros((len(state.complex.ticks), 3))
-    _gradients(shape, image, *state, rings)
+    run(_gradients, len(shape), Gradients(shape, image, state, rings))
     return shape, image
 
 
-@njit(cache=True, error_model="numpy")
-def _facet_moments(moment: NDArray, ticks: NDArray, node: int, b: int, c: int, objective: Objective) -> float:
+@unit
+def _facet_moments(moment: Floats1, ticks: Ints2, node: int, b: int, c: int, objective: Objective) -> float:
     """Means of phi and h phi over the facet (node, b, c), or the segment (node, b), phi the node's hat function.
 
     Those of h phi go to `moment` (n_channels,), h a voxel's values less the grid's shift; 1/3 (1/2 in 2-D) is the mean
     of phi itself.
     """
-    prefix, n_more, scale = objective.prefix, objective.n_channels - 1, 2.0**-objective.bits
+    if objective.is_short:
+        return _moments_of(moment, objective.short_prefix, ticks, node, b, c, objective)
+    return _moments_of(moment, objective.prefix, ticks, node, b, c, objective)
+
+
+@helper
+def _moments_of(
+    moment: NDArray, prefix: NDArray, ticks: NDArray, node: int, b: int, c: int, objective: Objective
+) -> float:
+    n_more, scale = objective.n_channels - 1, 2.0**-objective.bits
     for d in range(1 + n_more):
         moment[d] = 0.0
     a = scaled(scale, row(ticks, node))
@@ -186,8 +208,8 @@ def _facet_moments(moment: NDArray, ticks: NDArray, node: int, b: int, c: int, o
     return weight / (parts * parts)
 
 
-@njit(cache=True, error_model="numpy")
-def _add_image_gradient(g: NDArray, state: State, rings: NodeRings, node: int) -> None:
+@unit
+def _add_image_gradient(g: Floats1, state: State, rings: NodeRings, node: int) -> None:
     """Add the derivative of the weighted E_D by a node's position to g (3,), per mm."""
     cells, sums, ticks, objective = state.complex.cells, state.complex.sums, state.complex.ticks, state.objective
     n, first, scale = cells.shape[1], rings.start[node], 2.0**-objective.bits
@@ -229,7 +251,7 @@ def _add_image_gradient(g: NDArray, state: State, rings: NodeRings, node: int) -
         g[d] += factor * (inverse[0, d] * g0 + inverse[1, d] * g1 + inverse[2, d] * g2)
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def _has_same_values(sums: NDArray, cell: int, other: int, label_1: int, label_2: int, objective: Objective) -> bool:
     """Whether two cells have the same value in all channels, as those of the background, or one holds no voxel."""
     count_1, count_2 = sums[cell, 0], sums[other, 0]
@@ -242,8 +264,8 @@ def _has_same_values(sums: NDArray, cell: int, other: int, label_1: int, label_2
     return is_same
 
 
-@njit(cache=True, error_model="numpy")
-def _add_tension_gradient(g: NDArray, state: State, rings: NodeRings, node: int) -> None:
+@unit
+def _add_tension_gradient(g: Floats1, state: State, rings: NodeRings, node: int) -> None:
     """Add the derivative of what the interfaces around a node cost to g (3,), per mm."""
     mesh, objective = state.complex, state.objective
     for r in range(rings.start[node], rings.start[node + 1]):
@@ -269,7 +291,7 @@ def _add_tension_gradient(g: NDArray, state: State, rings: NodeRings, node: int)
                 g[d] += weight * way[d]
 
 
-@njit(cache=True, error_model="numpy")
+@unit
 def ring_tension(state: State, rings: NodeRings, node: int) -> float:
     """What the interfaces around a node cost as the ticks stand."""
     mesh, total = state.complex, 0.0
@@ -286,8 +308,10 @@ def ring_tension(state: State, rings: NodeRings, node: int) -> float:
     return total
 
 
-@njit(cache=True, error_model="numpy")
-def _add_shape_gradient(g: NDArray, x: NDArray, state: State, rings: NodeRings, node: int) -> tuple:
+@unit
+def _add_shape_gradient(
+    g: Floats1, x: Floats2, state: State, rings: NodeRings, node: int
+) -> tuple[float, float, float]:
     """Add the derivative of the weighted shape energy to g (3,), per mm.
 
     Returns a bound of its curvature, the distance in mm to the nearest centroid of the ring's cells, and the ring's
@@ -321,32 +345,40 @@ def _add_shape_gradient(g: NDArray, x: NDArray, state: State, rings: NodeRings, 
     return curvature, np.sqrt(nearest) / n, least
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def _gradients(
-    shape: NDArray, image: NDArray, complex_: Complex, objective: Objective, sides: Sides, rings: NodeRings
-) -> None:
-    for node in prange(len(shape)):
-        x, state = np.empty((4, 3)), State(complex_, objective, sides)
-        _add_shape_gradient(shape[node], x, state, rings, node)
-        _add_image_gradient(image[node], state, rings, node)
+class Gradients(NamedTuple):
+    """What `gradient` fills."""
+
+    shape: Floats2  # (N, 3)
+    image: Floats2  # (N, 3)
+    state: State
+    rings: NodeRings
+
+
+@unit
+def _gradients(work: Gradients, node: int) -> None:
+    _add_shape_gradient(work.shape[node], np.empty((4, 3)), work.state, work.rings, node)
+    _add_image_gradient(work.image[node], work.state, work.rings, node)
 
 
 class Trial(NamedTuple):
     """What `ring_energy` measures of a node's ring of R cells."""
 
-    x: NDArray[np.float64]  # (4, 3) room for a cell's corners
-    shapes: NDArray[np.float64]  # (R,) shape energy of each cell; -1 if it is gone
-    fluxes: NDArray[np.float64]  # (R, n+1, D) of its facets around the node, outwards
+    x: Floats2  # (4, 3) room for a cell's corners
+    shapes: Floats1  # (R,) shape energy of each cell; -1 if it is gone
+    fluxes: Floats3  # (R, n+1, D) of its facets around the node, outwards
 
 
-@njit(cache=True, error_model="numpy")
+TrialByValue = Annotated[Trial, by_value(Trial)]  # it is made by the kernels, several a move
+
+
+@helper
 def trial_of(state: State, rings: NodeRings, node: int) -> Trial:
     """Room for what is measured of a node's ring."""
     size, fluxes = rings.start[node + 1] - rings.start[node], state.complex.fluxes
     return Trial(np.empty((4, 3)), np.empty(size), np.empty((size, fluxes.shape[1], fluxes.shape[2])))
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@inlined
 def ring_misfit(state: State, rings: NodeRings, node: int) -> tuple:
     """The ring's weighted misfit to the mask before a move, times -1, and whether a move may change it."""
     misfit, has_misfit = 0.0, False
@@ -358,7 +390,7 @@ def ring_misfit(state: State, rings: NodeRings, node: int) -> tuple:
     return misfit, has_misfit
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@inlined
 def ring_shape(
     trial: Trial, limit: float, least: float, node: int, state: State, rings: NodeRings, joined: int
 ) -> float:
@@ -384,9 +416,9 @@ def ring_shape(
     return energy
 
 
-@njit(cache=True, error_model="numpy")
+@unit
 def ring_energy(
-    trial: Trial, limit: float, least: float, node: int, state: State, rings: NodeRings, joined: int = -1
+    trial: TrialByValue, limit: float, least: float, node: int, state: State, rings: NodeRings, joined: int
 ) -> float:
     """Energy of a node's ring as the ticks stand, all that was measured in `trial`; infinite as `ring_shape`.
 
@@ -430,8 +462,8 @@ def ring_energy(
     return energy if energy <= limit else np.inf
 
 
-@njit(cache=True, error_model="numpy")
-def store(trial: Trial, node: int, state: State, rings: NodeRings) -> None:
+@unit
+def store(trial: TrialByValue, node: int, state: State, rings: NodeRings) -> None:
     """Write what `ring_energy` measured of a node's ring into the complex."""
     first, fluxes = rings.start[node], state.complex.fluxes
     for r in range(first, rings.start[node + 1]):
@@ -445,16 +477,22 @@ def store(trial: Trial, node: int, state: State, rings: NodeRings) -> None:
             sum_up(state.complex.sums, fluxes, cell)
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def _sweep(
-    complex_: Complex, objective: Objective, sides: Sides, rings: NodeRings, groups: Blocks, chosen: NDArray,
-    may_move: NDArray,
-) -> None:  # fmt: skip
-    for number in prange(len(chosen)):
-        block = np.int64(chosen[number])
-        for at in range(groups.start[block], groups.start[block + 1]):
-            if may_move[groups.nodes[at]]:
-                _move(groups.nodes[at], State(complex_, objective, sides), rings)
+class Sweep(NamedTuple):
+    """The groups of one colour, whose nodes are to be moved."""
+
+    state: State
+    rings: NodeRings
+    groups: Blocks
+    chosen: Ints1  # (G,) the groups
+    may_move: Bools1  # (N,)
+
+
+@unit
+def _sweep(work: Sweep, number: int) -> None:
+    groups, block = work.groups, work.chosen[number]
+    for at in range(groups.start[block], groups.start[block + 1]):
+        if work.may_move[groups.nodes[at]]:
+            _move(groups.nodes[at], work.state, work.rings)
 
 
 class Search(NamedTuple):
@@ -472,7 +510,7 @@ class Search(NamedTuple):
 
 # Its steps, and those of `ring_energy`, are inlined: a sweep of calls took 12 % longer than one long function did,
 # inlined steps 3 to 8 % (MNI152 T1, 5,000 nodes, one thread).
-@njit(cache=True, error_model="numpy")
+@unit
 def _move(node: int, state: State, rings: NodeRings) -> None:
     """Move one node down the gradient of its ring's energy, if that lowers it."""
     ticks, fluxes = state.complex.ticks, state.complex.fluxes
@@ -509,7 +547,7 @@ def _move(node: int, state: State, rings: NodeRings) -> None:
         store(Trial(x, search.shapes[slot], search.fluxes[slot]), node, state, rings)
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@inlined
 def _descent_step(normal: NDArray, g: NDArray, is_sliding: bool, node: int, state: State) -> tuple:
     """Down the gradient g (3,), per mm, along the axes and the surface on which the node may move; in index units."""
     down = times(projection_at(state, node), (g[0], g[1], g[2]))
@@ -524,7 +562,7 @@ def _descent_step(normal: NDArray, g: NDArray, is_sliding: bool, node: int, stat
     return step
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@inlined
 def _try_place(
     search: Search, place: tuple, limit: float, least: float, node: int, state: State, rings: NodeRings
 ) -> float:
@@ -533,14 +571,14 @@ def _try_place(
     if search.is_sliding and not slid(search.normal, state, rings, node):
         return np.inf
     slot = 1 - search.slot[0]
-    value = ring_energy(Trial(search.x, search.shapes[slot], search.fluxes[slot]), limit, least, node, state, rings)
+    value = ring_energy(Trial(search.x, search.shapes[slot], search.fluxes[slot]), limit, least, node, state, rings, -1)
     if value < search.best[0]:
         search.best[0], search.slot[0] = value, slot
         put_row(search.place, 0, row(state.complex.ticks, node))
     return value
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@inlined
 def _search_line(
     search: Search, step: tuple, t: float, square: float, least: float, node: int, state: State, rings: NodeRings
 ) -> None:
@@ -576,7 +614,7 @@ def _search_line(
             t = min(max(vertex, 0.1 * t), 0.5 * t)
 
 
-@njit(cache=True, error_model="numpy", inline="always")
+@inlined
 def _probe_axes(search: Search, length: float, least: float, node: int, state: State, rings: NodeRings) -> None:
     """Look a length, mm, along each free axis both ways.
 
@@ -597,8 +635,8 @@ def _probe_axes(search: Search, length: float, least: float, node: int, state: S
             _try_place(search, place, search.best[0], least, node, state, rings)
 
 
-@njit(cache=True, error_model="numpy")
-def slid(normal: NDArray, state: State, rings: NodeRings, node: int) -> bool:
+@unit
+def slid(normal: Floats2, state: State, rings: NodeRings, node: int) -> bool:
     """Bring a moved node back to its surfaces; whether it got there, and the mask's facets face as they should."""
     is_there = put_on_surface(normal, state, node)
     return is_there and (not state.complex.is_frozen[node, 3] or ring_faces_up(normal, state, rings, node, -1))
@@ -612,24 +650,25 @@ def attract(state: State, rings: NodeRings, groups: Blocks, floor: float) -> Non
 
     A cell that is flatter already may get no worse. E may rise. `floor` is minus a cosine, as of an `Objective`.
     """
-    lowered = state.objective._replace(floor=floor)
+    lowered, is_between = (
+        state._replace(objective=state.objective._replace(floor=floor)),
+        state.complex.meeting[:, 1] >= 0,
+    )
+    laid_out = packed(lowered), packed(rings), packed(groups)
     for chosen in colours_of(state, rings, groups):
         with few_threads(len(chosen) * BLOCK_NODES * 20):
-            _attract(state.complex, lowered, state.sides, rings, groups, chosen)
+            run(_attract, len(chosen), Sweep(*laid_out, chosen, is_between))
 
 
-@njit(cache=True, parallel=True, error_model="numpy")
-def _attract(
-    complex_: Complex, objective: Objective, sides: Sides, rings: NodeRings, groups: Blocks, chosen: NDArray
-) -> None:
-    for number in prange(len(chosen)):
-        block = np.int64(chosen[number])
-        for at in range(groups.start[block], groups.start[block + 1]):
-            if complex_.meeting[groups.nodes[at], 1] >= 0:
-                _approach(groups.nodes[at], State(complex_, objective, sides), rings)
+@unit
+def _attract(work: Sweep, number: int) -> None:
+    groups, block = work.groups, work.chosen[number]
+    for at in range(groups.start[block], groups.start[block + 1]):
+        if work.may_move[groups.nodes[at]]:
+            _approach(groups.nodes[at], work.state, work.rings)
 
 
-@njit(cache=True, error_model="numpy")
+@unit
 def _approach(node: int, state: State, rings: NodeRings) -> None:
     ticks, normal, x = state.complex.ticks, np.zeros((7, 3)), np.empty((4, 3))
     if is_on_surface(normal, state, node):
@@ -651,7 +690,7 @@ def _approach(node: int, state: State, rings: NodeRings) -> None:
                 here[2] + np.int64(np.rint(share * way[2])),
             ),
         )  # fmt: skip
-        if ring_energy(trial, np.inf, least, node, state, rings) < np.inf:
+        if ring_energy(trial, np.inf, least, node, state, rings, -1) < np.inf:
             store(trial, node, state, rings)
             return
         share *= 0.5

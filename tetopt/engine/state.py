@@ -94,8 +94,11 @@ def sides_of(
 
 def objective_of(grid: SamplingGrid, matrix: NDArray[np.float64], power: float, is_graded: bool = False) -> Objective:
     """An objective of plain numbers, as the kernels are compiled for, of weights 1 and without a floor."""
+    is_short, nothing = grid.prefix.dtype == np.int32, np.zeros((1, 1, 1, grid.prefix.shape[3]))
     return Objective(
-        prefix=grid.prefix,
+        prefix=nothing if is_short else grid.prefix,
+        short_prefix=grid.prefix if is_short else nothing.astype(np.int32),
+        is_short=bool(is_short),
         bits=int(grid.bits),
         hand=1 if np.linalg.det(matrix) > 0.0 else -1,
         matrix=matrix,

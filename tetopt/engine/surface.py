@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from tetopt.engine.complex import NodeRings, State, has_node, outward, place
 from tetopt.geometry.vectors import cross, dot, row, scaled
+from tetopt.kernels import Floats2, entry, helper, unit
 from tetopt.target.domain import ON_SURFACE_VOXELS
 
 NEAR_CURVE_VOXELS = 0.1  # where several surfaces meet, a place with levels as near to 0 lies on all of them
@@ -21,7 +21,7 @@ PARALLEL_SHARE = 1e-3  # squared sine of the angle between ways up: below, two s
 FLAT_RISE = 1e-12  # where the level rises less along the way up, steps would be divided by nothing
 
 
-@njit(cache=True, error_model="numpy")
+@entry
 def level_at(level: NDArray, i: float, j: float, k: float) -> float:
     """The level at an index position, linear along each axis between voxel centres."""
     i = min(max(i, 0.0), level.shape[0] - 1.0)
@@ -40,7 +40,7 @@ def level_at(level: NDArray, i: float, j: float, k: float) -> float:
     return (1.0 - u) * near + u * far
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def _slope_at(slope: NDArray, row: int, state: State, node: int) -> None:
     """Slope of the level at a node, per voxel along each axis, to slope[row]."""
     ticks, scale, L = state.complex.ticks, 2.0**-state.objective.bits, state.sides.level
@@ -50,8 +50,8 @@ def _slope_at(slope: NDArray, row: int, state: State, node: int) -> None:
     slope[row, 2] = 2.0 * (level_at(L, i, j, k + ASIDE_VOXELS) - level_at(L, i, j, k - ASIDE_VOXELS))
 
 
-@njit(cache=True, error_model="numpy")
-def uphill_at(uphill: NDArray, state: State, node: int) -> None:
+@unit
+def uphill_at(uphill: Floats2, state: State, node: int) -> None:
     """The way up the level at a node, in mm, to uphill[0]; uphill (2, 3)."""
     _slope_at(uphill, 1, state, node)
     for m in range(3):
@@ -60,8 +60,8 @@ def uphill_at(uphill: NDArray, state: State, node: int) -> None:
             uphill[0, m] += state.sides.inverse[c, m] * uphill[1, c]
 
 
-@njit(cache=True, error_model="numpy")
-def faces_up(state: State, cell: int, k: int, old: int, new: int, uphill: NDArray) -> bool:
+@unit
+def faces_up(state: State, cell: int, k: int, old: int, new: int, uphill: Floats2) -> bool:
     """Whether a facet of the boundary, with the node `new` for `old`, faces up the level, or lies on a side of the box.
 
     A node that slid, or was put, across a gap onto another part of the surface would turn it over.
@@ -80,8 +80,8 @@ def faces_up(state: State, cell: int, k: int, old: int, new: int, uphill: NDArra
     return dot(n, up) > OUTWARD_COSINE * np.sqrt(dot(n, n) * dot(up, up))
 
 
-@njit(cache=True, error_model="numpy")
-def ring_faces_up(uphill: NDArray, state: State, rings: NodeRings, node: int, joined: int) -> bool:
+@unit
+def ring_faces_up(uphill: Floats2, state: State, rings: NodeRings, node: int, joined: int) -> bool:
     """`faces_up` for all facets of the boundary around a node where it is, of cells that do not have `joined`."""
     cells = state.complex.cells
     uphill_at(uphill, state, node)
@@ -96,21 +96,21 @@ def ring_faces_up(uphill: NDArray, state: State, rings: NodeRings, node: int, jo
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def projection_at(state: State, node: int) -> NDArray:
     """The map (3, 3) from a vector in mm to the index vector nearest to it along the axes on which a node may move."""
     is_frozen = state.complex.is_frozen
     return state.sides.projections[is_frozen[node, 0] + 2 * is_frozen[node, 1] + 4 * is_frozen[node, 2]]
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def _label_levels(state: State, node: int, m: int) -> tuple:
     """The level functions of the first and the m-th of the labels that meet at a node."""
     meeting, channel, levels = state.complex.meeting, state.sides.channel, state.sides.levels
     return levels[channel[meeting[node, 0]]], levels[channel[meeting[node, m]]]
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def _add_slope(slope: NDArray, row: int, level: NDArray, at: tuple, sign: float) -> None:
     """Add the slope of a level at an index position, per voxel along each axis, to slope[row]."""
     i, j, k = at
@@ -119,8 +119,8 @@ def _add_slope(slope: NDArray, row: int, level: NDArray, at: tuple, sign: float)
     slope[row, 2] += sign * 2.0 * (level_at(level, i, j, k + ASIDE_VOXELS) - level_at(level, i, j, k - ASIDE_VOXELS))
 
 
-@njit(cache=True, error_model="numpy")
-def constraint_values(normal: NDArray, state: State, node: int) -> int:
+@unit
+def constraint_values(normal: Floats2, state: State, node: int) -> int:
     """The values of a node's constraints, to normal[6, :3]; how many there are."""
     ticks, scale, count = state.complex.ticks, 2.0**-state.objective.bits, 0
     i, j, k = ticks[node, 0] * scale, ticks[node, 1] * scale, ticks[node, 2] * scale
@@ -135,8 +135,8 @@ def constraint_values(normal: NDArray, state: State, node: int) -> int:
     return count
 
 
-@njit(cache=True, error_model="numpy")
-def normals_at(normal: NDArray, state: State, node: int) -> int:
+@unit
+def normals_at(normal: Floats2, state: State, node: int) -> int:
     """Slopes and shortest ways up of a node's constraints within its sides of the box, in index units; their number.
 
     `normal` is (7, 3): slopes in its first rows, ways from its fourth on.
@@ -163,8 +163,10 @@ def normals_at(normal: NDArray, state: State, node: int) -> int:
     return count
 
 
-@njit(cache=True, error_model="numpy")
-def combined_ways(normal: NDArray, count: int, r: tuple) -> tuple:
+@unit
+def combined_ways(
+    normal: Floats2, count: int, r: tuple[float, float, float]
+) -> tuple[bool, tuple[float, float, float]]:
     """The shortest index vector along which the constraints rise by r, (3,), as `normals_at` left them in `normal`.
 
     Whether there is one comes first: not where a level is flat, or two of them rise the same way.
@@ -201,7 +203,7 @@ def combined_ways(normal: NDArray, count: int, r: tuple) -> tuple:
     )
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def is_on_surface(normal: NDArray, state: State, node: int) -> bool:
     """Whether all of a node's constraints are met."""
     count = constraint_values(normal, state, node)
@@ -211,16 +213,16 @@ def is_on_surface(normal: NDArray, state: State, node: int) -> bool:
     return far < (ON_SURFACE_VOXELS if count == 1 else NEAR_CURVE_VOXELS)
 
 
-@njit(cache=True, error_model="numpy")
-def slides(normal: NDArray, state: State, node: int) -> bool:
+@unit
+def slides(normal: Floats2, state: State, node: int) -> bool:
     """Whether a node is on its surfaces and stays there; one between labels may not have got there yet."""
     if state.complex.is_frozen[node, 3]:
         return True
     return state.complex.meeting[node, 1] >= 0 and is_on_surface(normal, state, node)
 
 
-@njit(cache=True, error_model="numpy")
-def put_on_surface(normal: NDArray, state: State, node: int) -> bool:
+@unit
+def put_on_surface(normal: Floats2, state: State, node: int) -> bool:
     """Move a node to where its constraints are met, nearly the shortest way in its sides of the box; False if not."""
     ticks, sides, scale = state.complex.ticks, state.sides, 2.0**-state.objective.bits
     for step in range(CURVE_STEPS + 1):

@@ -1,0 +1,388 @@
+"""Compiled kernels: each is compiled once, apart from the others, and records go to them by address.
+
+numba compiles a function again inside of every function that calls it, and passes a record of thirty arrays as three
+hundred numbers. Here a *unit* is compiled on its own, with a signature from its annotations, and called through the
+linker's symbol, as a function of another file is in C; a *record* (a NamedTuple of arrays, numbers and records) is a
+block of memory whose address is passed. Helpers are plain numba functions that go into the units that use them;
+*entries* are what Python calls; and a parallel loop is a unit run for each number of a range (`run`).
+
+docs/kernels.md tells what each of these bought.
+"""
+
+from __future__ import annotations
+
+import inspect
+import typing
+import zlib
+from collections.abc import Callable, Iterator
+from functools import cache, cached_property
+from pathlib import Path
+from typing import Annotated, Any
+
+import llvmlite.binding as llvm
+import numba
+import numpy as np
+from llvmlite import ir
+from numba import njit, prange, types
+from numba.core import cgutils
+from numba.core.datamodel.models import OpaqueModel
+from numba.core.extending import register_model, typeof_impl, unbox
+from numba.core.imputils import impl_ret_borrowed, lower_getattr_generic
+from numba.core.typing.templates import AttributeTemplate, infer_getattr, make_intrinsic_template
+from numba.extending import NativeValue, intrinsic
+from numba.np.arrayobj import populate_array
+from numpy.typing import NDArray
+
+# Arrays in the signatures of units and in records: of so many axes, the last one contiguous.
+Floats1 = Annotated[NDArray[np.float64], types.float64[::1]]
+Floats2 = Annotated[NDArray[np.float64], types.float64[:, ::1]]
+Floats3 = Annotated[NDArray[np.float64], types.float64[:, :, ::1]]
+Floats4 = Annotated[NDArray[np.float64], types.float64[:, :, :, ::1]]
+Singles3 = Annotated[NDArray[np.float32], types.float32[:, :, ::1]]
+Singles4 = Annotated[NDArray[np.float32], types.float32[:, :, :, ::1]]
+Shorts4 = Annotated[NDArray[np.int32], types.int32[:, :, :, ::1]]
+Ints1 = Annotated[NDArray[np.int64], types.int64[::1]]
+Ints2 = Annotated[NDArray[np.int64], types.int64[:, ::1]]
+Bools1 = Annotated[NDArray[np.bool_], types.boolean[::1]]
+Bools2 = Annotated[NDArray[np.bool_], types.boolean[:, ::1]]
+Bools3 = Annotated[NDArray[np.bool_], types.boolean[:, :, ::1]]
+
+SCALAR_TYPES = {int: types.int64, float: types.float64, bool: types.boolean, type(None): types.void}
+WORD_BYTES = 8  # of a number, an address, or a length in a record's memory
+
+
+@cache
+def checksum() -> str:
+    """Of the sources of all kernels: what is compiled of other sources is not taken from numba's cache."""
+    folder, total = Path(__file__).parent, 0
+    for room in ("geometry", "energy", "engine"):
+        for path in sorted((folder / room).glob("*.py")):
+            total = zlib.crc32(path.read_bytes(), total)
+    return f"{zlib.crc32(Path(__file__).read_bytes(), total):08x}"
+
+
+# Records.
+
+
+class RecordType(types.Type):
+    """What numba knows of a NamedTuple whose address it gets."""
+
+    def __init__(self, record: type) -> None:
+        self.record = record
+        self.fields = {name: type_of(hint) for name, hint in typing.get_type_hints(record, include_extras=True).items()}
+        self.offsets: dict[str, int] = {}
+        self.n_words = 0
+        for name, field in self.fields.items():
+            self.offsets[name] = self.n_words
+            self.n_words += 1 + 2 * field.ndim if isinstance(field, types.Array) else 1
+        super().__init__(f"{record.__module__}.{record.__qualname__}-{checksum()}")
+
+
+@cache
+def record_type(record: Any) -> RecordType:
+    """The one type of a NamedTuple."""
+    return RecordType(record)
+
+
+def type_of(hint: Any) -> types.Type:
+    """numba's type of an annotation: a number, one of the arrays above, a record, or a tuple of these."""
+    if typing.get_origin(hint) is Annotated:
+        return typing.get_args(hint)[1]
+    if typing.get_origin(hint) is tuple:
+        return types.BaseTuple.from_types([type_of(part) for part in typing.get_args(hint)])
+    if typing.get_origin(hint) is list:  # of records, of which kernels get the first; see `nth`
+        return record_type(typing.get_args(hint)[0])
+    return SCALAR_TYPES[hint] if hint in SCALAR_TYPES else record_type(hint)
+
+
+def by_value(record: type) -> types.NamedTuple:
+    """numba's own type of a NamedTuple, which kernels make and pass on in all its numbers."""
+    hints = typing.get_type_hints(record, include_extras=True)
+    return types.NamedTuple([type_of(hint) for hint in hints.values()], record)
+
+
+register_model(RecordType)(OpaqueModel)
+
+
+@intrinsic
+def _nth(_context: Any, records: Any, number: Any) -> Any:
+    def generate(_context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+        step = ir.Constant(ir.IntType(64), WORD_BYTES * signature.return_type.n_words)
+        return builder.gep(arguments[0], [builder.mul(arguments[1], step)])
+
+    return records(records, types.int64), generate
+
+
+def _entry_of(records: list[Any], number: int) -> Any:
+    return records[number]
+
+
+# The record of that number in a list of them, of which kernels have the address of the first.
+nth = _entry_of if numba.config.DISABLE_JIT else _nth
+
+
+@infer_getattr
+class _RecordFields(AttributeTemplate):
+    key = RecordType
+
+    def generic_resolve(self, record: RecordType, name: str) -> types.Type | None:
+        return record.fields.get(name)
+
+
+@lower_getattr_generic(RecordType)
+def _load_field(context: Any, builder: Any, record: RecordType, value: Any, name: str) -> Any:
+    """A field of a record. Its memory never changes while kernels run, which LLVM is told: loads leave the loops."""
+    field, first = record.fields[name], record.offsets[name]
+    words = builder.bitcast(value, ir.IntType(64).as_pointer())
+    constant = builder.module.add_metadata([])
+
+    def word(number: int, of: Any = ir.IntType(64)) -> Any:  # noqa: B008
+        place = builder.gep(words, [ir.Constant(ir.IntType(64), first + number)], inbounds=True)
+        loaded = builder.load(builder.bitcast(place, of.as_pointer()))
+        loaded.set_metadata("invariant.load", constant)
+        return loaded
+
+    if isinstance(field, types.Array):
+        array, n = context.make_array(field)(context, builder), field.ndim
+        shape, strides = [word(1 + d) for d in range(n)], [word(1 + n + d) for d in range(n)]
+        data, itemsize = word(0, array.data.type), context.get_constant(types.intp, numpy_dtype(field).itemsize)
+        populate_array(array, data, shape, strides, itemsize, meminfo=None)
+        return impl_ret_borrowed(context, builder, field, array._getvalue())
+    if field == types.boolean:
+        return builder.trunc(word(0), ir.IntType(1))
+    return word(0, context.get_value_type(field))
+
+
+def numpy_dtype(array: types.Array) -> np.dtype[Any]:
+    """The dtype of numpy of one of numba's types of arrays."""
+    return np.dtype(np.bool_ if array.dtype == types.boolean else array.dtype.name)
+
+
+class Packed:
+    """A record laid out in memory, of which kernels get the address. It keeps what it points to."""
+
+    __slots__ = ("address", "kept", "type", "words")
+
+    def __init__(self, record: Any) -> None:
+        record_class: Any = type(record)
+        self.type: RecordType = record_type(record_class)
+        self.words = np.empty(self.type.n_words, dtype=np.int64)
+        self.kept = record, [self._put(getattr(record, name), name) for name in self.type.fields]
+        self.address = self.words.ctypes.data
+
+    def _put(self, value: Any, name: str) -> Any:
+        """Lay out one field; what has to be kept for it besides the record itself."""
+        field, first = self.type.fields[name], self.type.offsets[name]
+        if isinstance(field, types.Array):
+            if not (value.flags.c_contiguous and value.ndim == field.ndim and value.dtype == numpy_dtype(field)):
+                raise TypeError(f"{self.type.record.__name__}.{name}: expected {field}, got {numba.typeof(value)}")
+            self.words[first] = value.ctypes.data
+            self.words[first + 1 : first + 1 + field.ndim] = value.shape
+            self.words[first + 1 + field.ndim : first + 1 + 2 * field.ndim] = value.strides
+        elif isinstance(value, list):
+            rows = [Packed(record) for record in value]
+            words = np.concatenate([row.words for row in rows])
+            self.words[first] = words.ctypes.data
+            return rows, words
+        elif isinstance(field, RecordType):
+            inner = packed(value)
+            self.words[first] = inner.address
+            return inner
+        elif field == types.float64:
+            self.words[first : first + 1].view(np.float64)[0] = value
+        else:
+            self.words[first] = int(value)
+        return None
+
+
+def packed(value: Any) -> Any:
+    """A record laid out for kernels; anything else as it is, one that is laid out already among it."""
+    if numba.config.DISABLE_JIT:
+        return value
+    return Packed(value) if isinstance(value, tuple) and hasattr(value, "_fields") else value
+
+
+@typeof_impl.register(Packed)
+def _typeof_packed(value: Packed, _context: Any) -> types.Type:
+    return value.type
+
+
+@unbox(RecordType)
+def _unbox_packed(_type: RecordType, value: Any, context: Any) -> NativeValue:
+    number = context.pyapi.object_getattr_string(value, "address")
+    address = context.pyapi.long_as_voidptr(number)
+    context.pyapi.decref(number)
+    return NativeValue(address, is_error=cgutils.is_not_null(context.builder, context.pyapi.err_occurred()))
+
+
+# Functions.
+
+
+class Unit:
+    """A function compiled on its own, called by other kernels through its symbol.
+
+    Its annotations are its signature. Called from Python it is an entry.
+    """
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        self.function = function
+        self.__name__, self.__doc__, self.__module__ = function.__name__, function.__doc__, function.__module__
+        self.is_linked = False
+
+    @cached_property
+    def signature(self) -> Any:
+        """numba's, of the annotations."""
+        hints = typing.get_type_hints(self.function, include_extras=True)
+        result = type_of(hints.pop("return"))
+        return result(*(type_of(hint) for hint in hints.values()))
+
+    @cached_property
+    def symbol(self) -> str:
+        """Its name for the linker."""
+        return f"{self.__module__}.{self.__name__}.{checksum()}"
+
+    @cached_property
+    def type(self) -> types.Function:
+        """How other kernels call it: to numba an operation of its own."""
+
+        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
+            kinds = [context.get_value_type(kind) for kind in signature.args]
+            returns = signature.return_type
+            result = ir.VoidType() if returns == types.void else context.get_value_type(returns)
+            function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(result, kinds), self.symbol)
+            value = builder.call(function, arguments)
+            return context.get_constant_null(types.none) if returns == types.void else value
+
+        def typed(_context: Any, *_arguments: Any) -> Any:
+            return self.signature, generate
+
+        parameters = inspect.signature(self.function).parameters.values()
+        first = inspect.Parameter("_context", inspect.Parameter.POSITIONAL_OR_KEYWORD)
+        typed.__signature__ = inspect.Signature([first, *parameters])  # type: ignore[attr-defined]
+        return types.Function(make_intrinsic_template(self, typed, self.symbol))
+
+    @cached_property
+    def entry(self) -> Entry:
+        """How Python calls it."""
+        return Entry(self.function)
+
+    @cached_property
+    def address(self) -> int:
+        """Of the compiled function; compiled now, or taken from the cache."""
+        compiled = numba.cfunc(self.signature, cache=True, error_model="numpy")(self.function)
+        return int(compiled.address)
+
+    def link(self) -> None:
+        """Make its symbol known, and those of what it calls before."""
+        if not self.is_linked:
+            for unit in units_of(self.function):
+                unit.link()
+            llvm.add_symbol(self.symbol, self.address)
+            self.is_linked = True
+
+    def __call__(self, *values: Any) -> Any:
+        """Call it from Python."""
+        return self.entry(*values)
+
+
+class Entry:
+    """A function that Python calls: records are laid out for it, and the units that it calls are linked before."""
+
+    def __init__(self, function: Callable[..., Any], **options: Any) -> None:
+        self.function = function
+        self.__name__, self.__doc__, self.__module__ = function.__name__, function.__doc__, function.__module__
+        self.compiled = njit(cache=True, error_model="numpy", **options)(function)
+        self.is_linked = False
+
+    def __call__(self, *values: Any) -> Any:
+        """Call it from Python."""
+        if not self.is_linked:
+            for unit in units_of(self.function):
+                unit.link()
+            self.is_linked = True
+        return self.compiled(*map(packed, values))
+
+
+@typeof_impl.register(Unit)
+def _typeof_unit(unit: Unit, context: Any) -> types.Type:
+    return unit.type
+
+
+@typeof_impl.register(Entry)
+def _typeof_entry(entry: Entry, context: Any) -> types.Type:
+    return types.Dispatcher(entry.compiled)
+
+
+def units_of(function: Callable[..., Any]) -> Iterator[Unit]:
+    """The units that a function calls, itself or by helpers that go into it."""
+    seen: set[int] = set()
+    todo = [function]
+    while todo:
+        now: Any = todo.pop()
+        if id(now) in seen:
+            continue
+        seen.add(id(now))
+        for name in now.__code__.co_names:
+            value = now.__globals__.get(name)
+            if isinstance(value, Unit):
+                yield value
+            elif isinstance(value, Entry):
+                todo.append(value.function)
+            elif isinstance(value, numba.core.dispatcher.Dispatcher):
+                todo.append(value.py_func)
+
+
+@intrinsic
+def _call(_context: Any, address: Any, values: Any, number: Any) -> Any:
+    """Call the task at an address, void (record, number)."""
+
+    def generate(context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
+        pointer = ir.IntType(8).as_pointer()
+        kind = ir.FunctionType(ir.VoidType(), [pointer, ir.IntType(64)])
+        task = builder.inttoptr(arguments[0], kind.as_pointer())
+        builder.call(task, [builder.inttoptr(arguments[1], pointer), arguments[2]])
+        return context.get_constant_null(types.none)
+
+    return types.void(types.int64, types.int64, types.int64), generate
+
+
+# The one parallel loop: each loop of its own took 2 s to compile.
+@njit(cache=True, parallel=True)
+def _run(task: int, values: int, n: int) -> None:
+    for number in prange(n):
+        _call(task, values, np.int64(number))
+
+
+def run(task: Any, n: int, values: Any) -> None:
+    """Call a unit `task(values, number)` for all numbers up to n, on as many threads as numba is set to.
+
+    `values` is a record. The calls must not depend on one another.
+    """
+    if numba.config.DISABLE_JIT:
+        for number in range(n):
+            task(values, number)
+        return
+    task.link()
+    laid_out = packed(values)
+    _run(task.address, laid_out.address, n)
+
+
+def unit(function: Callable[..., Any]) -> Any:
+    """Compile a function on its own; its annotations are its signature."""
+    return function if numba.config.DISABLE_JIT else Unit(function)
+
+
+def entry(function: Callable[..., Any]) -> Any:
+    """Compile a function that Python calls."""
+    return function if numba.config.DISABLE_JIT else Entry(function)
+
+
+# What goes into the functions that call it; `inlined` as numba reads it, before LLVM does.
+helper = njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
+inlined = njit(error_model="numpy", inline="always")
+
+
+@helper
+def thread() -> int:
+    """The number of the thread that runs a task."""
+    return numba.get_thread_id()
