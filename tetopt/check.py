@@ -9,7 +9,7 @@ from tetopt.errors import InputError
 from tetopt.geometry.box import box_sides, facets_on_sides
 from tetopt.geometry.manifold import OUTSIDE_LABEL, label_surfaces, surface_fans, surface_ridges
 from tetopt.geometry.simplex import volumes
-from tetopt.geometry.topology import boundary_facets, components, facets, folded
+from tetopt.geometry.topology import Facets, boundary_facets, components, facets, folded
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 
@@ -98,12 +98,12 @@ def _problems_of_cells(mesh: Mesh) -> list[str]:
 
 def _problems_of_facets(mesh: Mesh) -> list[str]:
     problems = []
-    pairs = folded(mesh.cells)
+    shared = facets(mesh.cells)
+    pairs = folded(mesh.cells, shared)
     if len(pairs):
         problems.append(
             f"facets whose cells lie on one side of them, or of more than two cells; cells: {_first(pairs)}"
         )
-    shared = facets(mesh.cells)
     outer = shared.nodes[shared.n_cells == 1]
     if mesh.ndim == 3:  # every edge of the boundary's triangles belongs to an even number of them
         edges = np.sort(outer[:, [[0, 1], [1, 2], [0, 2]]].reshape(-1, 2), axis=1)
@@ -172,15 +172,15 @@ def _most_frequent(pairs: NDArray[np.int64]) -> str:
     return ", ".join([*words, *(["others"] if len(kinds) > len(most) else [])])
 
 
-def check_unfolded(mesh: Mesh) -> None:
-    """InputError if cells overlap at a facet, or more than two share one.
+def check_unfolded(mesh: Mesh, shared: Facets | None = None) -> None:
+    """InputError if cells overlap at a facet, or more than two share one; `shared` are its facets, if known.
 
     Raises
     ------
     InputError
         With the first cells that do.
     """
-    pairs = folded(mesh.cells)
+    pairs = folded(mesh.cells, shared)
     if len(pairs):
         raise InputError(
             f"mesh: {len(pairs)} facets have cells that overlap there, as inverted ones do, or more than two; the "

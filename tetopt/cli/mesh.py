@@ -221,7 +221,8 @@ def _write(task: Task, outcome: Outcome, begin: float) -> tuple[Model, dict[str,
     if output.json_path is not None:
         seconds = {**outcome.seconds, "all": time.perf_counter() - begin}
         summary = run_summary(source.content, outcome.initial, result, about, seconds, outcome.shapes)
-        summary["image_properties"] = image_summary(source.image)  # on its own voxels, not on divided ones
+        if source.image is not source.content.image:
+            summary["image_properties"] = image_summary(source.image)  # on its own voxels, not on divided ones
         save_json(output.json_path, summary | measured | model_summary(model))
     if plan.pictures:
         _draw(task, outcome, model)

@@ -219,7 +219,7 @@ class Run:
         ticks = self.state.complex.ticks
         is_kept = self.is_still if boundary == "fixed" else np.zeros(len(ticks), dtype=bool)
         self.kept = dict(zip(map(tuple, ticks[is_kept].tolist()), mesh.points[is_kept], strict=True))
-        self.groups, self.edge = blocks(ticks), _edges(mesh)
+        self.groups, self.edge = blocks(ticks), _edges(mesh.points, mesh.cells)
         self.has_labels = False
         self.image_noise: float | None = None  # its variance, estimated when it is first needed
         self.ticks_flipped = np.full_like(ticks, FAR_TICKS)  # where nodes were when their flips were last looked at
@@ -244,14 +244,13 @@ class Run:
     def sweep(self, is_over: Callable[[], bool] = lambda: False) -> bool:
         """Move every node whose ring has changed since it was last moved; False if `is_over` cut it short."""
         is_near = np.zeros(len(self.ticks_swept), dtype=bool)
-        cells = self.state.complex.cells[: self.n_cells]
-        is_near[cells[self._moved(self.ticks_swept, SWEEP_EDGES)[cells].any(axis=1)]] = True
+        is_near[self.cells[self._moved(self.ticks_swept, SWEEP_EDGES)[self.cells].any(axis=1)]] = True
         return sweep(self.state, node_rings(self.state), self.groups, is_near & ~self.is_still, is_over)
 
     def flip(self) -> int:
         """Exchange cells around the nodes that have moved; the number of exchanges."""
         moved = self._moved(self.ticks_flipped, FLIP_EDGES)
-        is_dirty = moved[self.state.complex.cells[: self.n_cells]].any(axis=1)
+        is_dirty = moved[self.cells].any(axis=1)
         is_touched = np.zeros(len(moved), dtype=bool)
         self.state, n_flips = flip(self.state, np.asarray(is_dirty), is_touched=is_touched)
         self.ticks_swept[is_touched] = FAR_TICKS
@@ -270,10 +269,10 @@ class Run:
 
         A shape's cost is counted at a tenth: most of it goes when the nodes around move again.
         """
-        objective, mesh = self.state.objective, self.mesh()
+        objective = self.state.objective
         if self.image_noise is None:
             self.image_noise = self.content.noise
-        longest = sizes.longest_edges(self.image, nodes, mesh.points, mesh.cells, self.edge, self.content.volume)
+        longest = sizes.longest_edges(self.image, nodes, self.points(), self.cells, self.edge, self.content.volume)
         # A step of a voxel between labels always pays, though their surfaces have no detail so fine.
         voxel = self.image.voxel_volume ** (1.0 / self.n) if self.content.memberships is not None else 0.0
         shortest = max(float(sizes.smallest), LEAST_EDGE_VOXELS * voxel)
@@ -339,7 +338,7 @@ class Run:
         self.state = state
         self.ticks_flipped = np.where(is_new, FAR_TICKS, self.ticks_flipped[source])
         self.ticks_swept = np.where(is_new, FAR_TICKS, self.ticks_swept[source])
-        self.groups, self.edge = blocks(state.complex.ticks), _edges(self.mesh())
+        self.groups, self.edge = blocks(state.complex.ticks), _edges(self.points(), self.cells)
 
     def movement(self, before: NDArray[np.int64]) -> float:
         """How far the nodes are from where they were, `before` (N, 3) in ticks; see `relative_movement`."""
@@ -361,20 +360,29 @@ class Run:
             return None
         return members.labels[self.state.complex.labels[: self.n_cells]]
 
-    def mesh(self) -> Mesh:
-        """The mesh as it stands."""
+    @property
+    def cells(self) -> NDArray[np.int64]:
+        """The cells as they stand, (M, n+1); a view."""
+        return self.state.complex.cells[: self.n_cells]
+
+    def points(self) -> NDArray[np.float64]:
+        """The nodes as they stand, (N, n) mm."""
         points = self.image.to_world(from_ticks(self.state.complex.ticks, self.grid, self.n))
         if self.kept:  # nodes that may not move come back to the last bit, not rounded to ticks
             for node, place in enumerate(self.state.complex.ticks.tolist()):
                 points[node] = self.kept.get(tuple(place), points[node])
-        return Mesh(points, self.state.complex.cells[: self.n_cells].copy())
+        return points
+
+    def mesh(self) -> Mesh:
+        """The mesh as it stands."""
+        return Mesh(self.points(), self.cells)
 
 
-def _edges(mesh: Mesh) -> NDArray[np.float64]:
+def _edges(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.float64]:
     """Edge of the regular cell that has the mean volume of the cells around each node, (N,) mm."""
-    n, around = mesh.ndim, mesh.cells.ravel()
-    total = np.bincount(around, np.repeat(volumes(mesh.points, mesh.cells), n + 1), len(mesh.points))
-    mean = total / np.maximum(np.bincount(around, minlength=len(mesh.points)), 1)
+    n, around = points.shape[1], cells.ravel()
+    total = np.bincount(around, np.repeat(volumes(points, cells), n + 1), len(points))
+    mean = total / np.maximum(np.bincount(around, minlength=len(points)), 1)
     return (2.0**0.5 * 6.0 * mean) ** (1 / 3) if n == 3 else (4.0 / 3.0**0.5 * mean) ** 0.5
 
 

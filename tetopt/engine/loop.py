@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tetopt.energy.sampling import SamplingGrid
 from tetopt.geometry.box import facets_on_sides
-from tetopt.geometry.topology import boundary_facets
+from tetopt.geometry.topology import Facets, boundary_facets
 from tetopt.image import Image, transformed
 from tetopt.mesh import Mesh
 
@@ -74,16 +74,16 @@ def deadline(begin: float, max_seconds: float | None, stop: Callable[[], bool] |
 
 def frozen_axes(
     image: Image, ticks: NDArray[np.int64], cells: NDArray[np.int64], grid: SamplingGrid, boundary: Boundary,
-    has_surface: bool = False,
+    has_surface: bool = False, shared: Facets | None = None,
 ) -> NDArray[np.bool_]:  # fmt: skip
     """Index axes along which each node must stay, (N, 4) bool; the leading axis of a 2-D image counts as free.
 
     A node on a face of the box, index -0.5 or shape - 0.5, keeps its coordinate across it. A node of a boundary
     facet that lies on no face of the box keeps all of them, as every boundary node does with "fixed"; or, with a
-    surface on which such nodes slide, is marked in the last column.
+    surface on which such nodes slide, is marked in the last column. `shared` are the cells' facets, if known.
     """
     is_frozen = np.zeros((len(ticks), 4), dtype=bool)
-    facets_out = boundary_facets(cells)
+    facets_out = boundary_facets(cells, shared)
     if boundary == "fixed":
         is_frozen[facets_out.ravel(), :3] = True
         return is_frozen

@@ -11,6 +11,7 @@ from tetopt.engine.complex import Objective, Sides, State, build, energies
 from tetopt.engine.descent import free_projections
 from tetopt.engine.loop import E_D_ROUNDING, SHAPE_POWER, Boundary, frozen_axes, side_ticks
 from tetopt.errors import InputError
+from tetopt.geometry.topology import facets
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.target.content import Content
@@ -31,9 +32,10 @@ def state_of(
     image, region = content.image, content.region
     ticks = to_ticks(image.to_index(mesh.points), grid)
     check_orientations(image, ticks, mesh.cells)
-    check_unfolded(mesh)
+    shared = facets(mesh.cells)
+    check_unfolded(mesh, shared)
     matrix = matrix_of(image)
-    is_frozen = frozen_axes(image, ticks, mesh.cells, grid, boundary, region is not None)
+    is_frozen = frozen_axes(image, ticks, mesh.cells, grid, boundary, region is not None, shared)
     sides = sides_of(grid, matrix, boundary == "fixed", None if region is None else region.level)
     # Where every cell is uniform, what rounding leaves of E_D must not become the unit that E_D is measured in.
     rounding = float(E_D_ROUNDING * content.variance / content.unit * content.n_voxels)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from itertools import combinations
 from typing import NamedTuple
 
 import numba
@@ -47,51 +46,50 @@ def facets(cells: NDArray[np.integer]) -> Facets:
     A facet (a, b) faces the side to the right of a -> b in 2-D; (a, b, c) the side of (b - a) x (c - a) in 3-D.
     """
     n = cells.shape[1] - 1
-    every = cells[:, facet_nodes(n)].astype(np.int64)  # (M, n+1, n)
+    nodes = np.array(facet_nodes(n))
     # Facet k of a positively oriented simplex, its nodes in local order, faces outwards for even k.
-    sign = np.where(np.arange(n + 1) % 2 == 0, 1, -1) * _permutation_sign(every)
-    every = np.sort(every, axis=2).reshape(-1, n)
-    owner = np.repeat(np.arange(len(cells), dtype=np.int64), n + 1)
-    order = _lexicographic_order(every)
-    ordered, owner = every[order], owner[order]
-    is_first = np.concatenate([[True], (ordered[1:] != ordered[:-1]).any(axis=1)])
-    of_cell = np.empty(len(every), dtype=np.int64)
+    sign = np.broadcast_to(np.where(np.arange(n + 1) % 2 == 0, 1, -1), cells.shape)
+    columns = [cells[:, nodes[:, d]].astype(np.int64) for d in range(n)]  # of the nodes of all facets
+    for i, k in ((0, 1), (1, 2), (0, 1))[: 2 * n - 3]:  # sorted by exchanges, each of which turns the facet around
+        sign = np.where(columns[i] < columns[k], sign, -sign)
+        columns[i], columns[k] = np.minimum(columns[i], columns[k]), np.maximum(columns[i], columns[k])
+    columns = [column.ravel() for column in columns]
+    order, is_first = _lexicographic_order(columns)
+    of_cell = np.empty(len(order), dtype=np.int64)
     of_cell[order] = np.cumsum(is_first) - 1
     first = np.flatnonzero(is_first)
-    n_cells = np.diff(np.append(first, len(every)))
+    n_cells = np.diff(np.append(first, len(order)))
+    owner = order // (n + 1)
     second = np.where(n_cells > 1, owner[np.minimum(first + 1, len(owner) - 1)], -1)
     sides = np.column_stack([owner[first], second])
-    return Facets(ordered[first], sides, n_cells, of_cell.reshape(cells.shape), sign)
+    listed = np.column_stack([column[order[first]] for column in columns])
+    return Facets(listed, sides, n_cells, of_cell.reshape(cells.shape), sign)
 
 
-def folded(cells: NDArray[np.integer]) -> NDArray[np.int64]:
+def _lexicographic_order(columns: list[NDArray[np.int64]]) -> tuple[NDArray[np.int64], NDArray[np.bool_]]:
+    """Stable order of rows of node numbers, (n,) columns (K,), and whether each row in it is the first of its kind."""
+    base = max(int(column.max()) for column in columns) + 1
+    if base ** len(columns) >= 2**63:
+        order = np.lexsort(columns[::-1])
+        is_new = [column[order[1:]] != column[order[:-1]] for column in columns]
+        return order, np.concatenate([[True], np.logical_or.reduce(is_new)])
+    key = columns[0].copy()  # one number a row: ten times faster
+    for column in columns[1:]:
+        key = key * base + column
+    order = np.argsort(key, kind="stable")
+    ordered = key[order]
+    return order, np.concatenate([[True], ordered[1:] != ordered[:-1]])
+
+
+def folded(cells: NDArray[np.integer], shared: Facets | None = None) -> NDArray[np.int64]:
     """Groups of cells that do not lie on opposite sides of the facet they share, (K, 2) int64, by facet.
 
     Of positively oriented cells: where the mesh folds over itself, or three cells and more share a facet. Empty for a
-    conforming mesh.
+    conforming mesh. `shared` are the cells' facets where they are known already.
     """
-    shared = facets(cells)
+    shared = facets(cells) if shared is None else shared
     sides = np.bincount(shared.of_cell.ravel(), weights=shared.sign.ravel(), minlength=len(shared.nodes))
     return shared.cells[(shared.n_cells > 2) | ((shared.n_cells == 2) & (sides != 0.0))]
-
-
-def _lexicographic_order(rows: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Stable order of rows of node numbers (K, n): by one number a row where it fits, ten times faster."""
-    base = int(rows.max()) + 1
-    if base ** rows.shape[1] >= 2**63:
-        return np.lexsort(rows.T[::-1])
-    key = rows[:, 0].copy()
-    for column in range(1, rows.shape[1]):
-        key = key * base + rows[:, column]
-    return np.argsort(key, kind="stable")
-
-
-def _permutation_sign(nodes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """+1 where the last axis of two or three distinct numbers is an even permutation of ascending order, else -1."""
-    sign = np.ones(nodes.shape[:-1], dtype=np.int64)
-    for i, k in combinations(range(nodes.shape[-1]), 2):
-        sign *= np.where(nodes[..., i] < nodes[..., k], 1, -1)
-    return sign
 
 
 class Stars(NamedTuple):
@@ -128,12 +126,13 @@ def _fill_places(
                 place[r, k] = at if at < len(row) and row[at] == facet else -1
 
 
-def boundary_facets(cells: NDArray[np.integer]) -> NDArray[np.int64]:
+def boundary_facets(cells: NDArray[np.integer], shared: Facets | None = None) -> NDArray[np.int64]:
     """Nodes of the facets that belong to one cell only, (B, n) int64, turned to face outwards.
 
-    For positively oriented cells the returned triangles (edges in 2-D) have their normal pointing out.
+    For positively oriented cells the returned triangles (edges in 2-D) have their normal pointing out. `shared` are
+    the cells' facets where they are known already.
     """
-    shared = facets(cells)
+    shared = facets(cells) if shared is None else shared
     is_outer = shared.n_cells == 1
     outer = shared.nodes[is_outer]
     sign = np.empty(len(shared.nodes), dtype=np.int64)
