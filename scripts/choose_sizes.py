@@ -70,7 +70,7 @@ def _meshes(
     yield "uniform", tetopt.optimize(image, lattice).mesh
     edge = tetopt.Sizes().longest_edge(image, nodes) / COARSEST_SHARE
     for factor in largest:
-        sizes = tetopt.Sizes(largest=factor * edge)
+        sizes = tetopt.Sizes(longest=factor * edge)
         yield f"graded, largest {factor:g}", tetopt.mesh_image(image, nodes, sizes=sizes).mesh
     strained = _strained(standard)
     yield "uniform, by the strain", tetopt.optimize(strained, tetopt.lattice(strained, nodes=nodes)).mesh

@@ -198,6 +198,17 @@ def moment_sums(image, owner, n_cells, shift):
 # Topology
 
 
+def too_long(points, cells, target):
+    """Nodes with an edge over sqrt 2 times the mean of the targets at its ends."""
+    is_one = [False] * len(points)
+    for cell in cells:
+        for a, b in combinations(cell, 2):
+            length = sum((p - q) ** 2 for p, q in zip(points[a], points[b], strict=True)) ** 0.5
+            if length > 2.0**0.5 * (target[a] + target[b]) / 2.0:
+                is_one[a] = is_one[b] = True
+    return is_one
+
+
 def rings(cells, n_nodes):
     """The cells of each node, ascending."""
     return [[number for number, cell in enumerate(cells) if node in cell] for node in range(n_nodes)]

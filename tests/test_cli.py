@@ -29,6 +29,8 @@ from tetopt.geometry.simplex import volumes
 from tetopt.measure.segmentation import dice, segmented
 from tetopt.phantom import phantom_names
 from tetopt.report.summary import mesh_hash
+from tetopt.start.octree import nodes_of_sizes
+from tetopt.start.sizes import edge_ratios
 
 OBLIQUE_TOML = """
 name = "oblique"
@@ -119,7 +121,7 @@ def test_mesh_in_3d(run):
     assert numbers["energies"]["E_D_relative"] < 0.5  # the sphere is found
 
 
-SIZES = ("size_min", "size_max", "gradation", "sizing")
+SIZES = ("size_min", "size_max", "edge_max", "gradation", "sizing")
 OPTIONS_OF_A_RUN = {
     *("nodes", "target_error", "spacing", "lattice", *SIZES, "start"),
     *("volume", "crop", "slice", "method", "max_seconds", "k_D", "iterations", "boundary", "n_t", "retessellate"),
@@ -608,7 +610,7 @@ def test_help_of_mesh_is_in_six_groups(monkeypatch, capsys):
     sizes = {name: len(re.findall(r"^│ [ *]*--[a-z]", text, re.M)) for name, text in pairs}
     assert sizes.pop("Arguments") == 0
     assert sizes == {
-        "Options": 5, "What is meshed": 9, "Number and size of cells": 6, "The mesh it begins with": 4,
+        "Options": 5, "What is meshed": 9, "Number and size of cells": 7, "The mesh it begins with": 4,
         "Optimisation": 10, "For the solver": 13,
     }  # fmt: skip
 
@@ -928,6 +930,10 @@ def test_many_more_cells_than_voxels_are_said(tmp_path, capsys):
         (["--nodes", "500", "--target-error", "0.1"], "--nodes and --target-error: give one of them"),
         (["--target-error", "1.5"], "expected a share of the image's variance, 0 to 1, got 1.5"),
         (["--nodes", "100", "--size-max", "6"], "100 nodes are too few for 16 x 16 x 16 voxels and these limits"),
+        (["--nodes", "100", "--edge-max", "6"], "100 nodes are too few for 16 x 16 x 16 voxels and these limits"),
+        (["--size-max", "0.2"], "sizes: so short edges are asked for that cells are below voxels"),
+        (["--edge-max", "0"], "edge_max: expected a length above 0"),
+        (["--size-min", "9", "--edge-max", "8"], "edge_max: 8 mm is below the smallest size, 9 mm"),
         (["--size-max", "-1"], "size_max: expected a length above 0"),
         (["--size-min", "9", "--size-max", "8"], "size_max: 8 mm is below the smallest size, 9 mm"),
         (["--gradation", "3"], "gradation: expected 0.05 (gentle) to 1, got 3"),
@@ -960,7 +966,7 @@ def test_octree_mesh(tmp_path, inputs, capsys):
 
 
 @pytest.mark.parametrize("word", ["--uniform", "--spacing 8", "--lattice five-tet", "--method paper"])
-@pytest.mark.parametrize("option", ["--target-error 0.1", "--size-min 1", "--size-max 9", "--gradation 0.5"])
+@pytest.mark.parametrize("option", ["--target-error 0.1", "--size-min 1", "--size-max 9", "--edge-max 9"])
 def test_limits_are_for_graded_meshes(tmp_path, inputs, capfd, word, option):
     if word == "--spacing 8" and option.startswith("--target"):
         option = "--size-max 9"
@@ -968,22 +974,45 @@ def test_limits_are_for_graded_meshes(tmp_path, inputs, capfd, word, option):
     assert_refused(capfd, command, f"{option.split()[0]}: only on a graded mesh")
 
 
-def test_mesh_with_limits(tmp_path, inputs):
-    """They reach the mesh, and the numbers tell them."""
+def test_mesh_with_limits(tmp_path, inputs, capfd):
+    """They reach the mesh, and the numbers and a line tell them."""
     image = load_image(inputs / "sphere.nii.gz")
     field = np.where(np.arange(16)[:, None, None] < 5, 13.0, 0.0) * np.ones((1, 16, 16))
     save_image(tmp_path / "sizes.nii.gz", Image(field, image.affine))
     command = mesh_words(inputs / "sphere.nii.gz", tmp_path)
-    words = ["--nodes", "700", "--size-max", "30", "--sizing", tmp_path / "sizes.nii.gz", "--gradation", "0.9"]
+    words = ["--nodes", "500", "--size-max", "30", "--sizing", tmp_path / "sizes.nii.gz", "--gradation", "0.9"]
     assert exit_code(*command, *words) == 0
     mesh = load_mesh(tmp_path / "a.vtu").mesh
-    assert len(mesh.points) == 700
-    size = volumes(mesh.points, mesh.cells)
-    is_fine = image.to_index(mesh.points[mesh.cells].mean(axis=1))[:, 0] < 4.0
-    assert size[is_fine].max() < 13.0**3 / 6.0
-    assert size[~is_fine].max() > 1.3 * size[is_fine].max()
-    options = numbers_in(tmp_path / "a.json")["options"]
-    assert (options["size_max"], options["gradation"], options["sizing"]) == (30.0, 0.9, "sizes.nii.gz")
+    assert len(mesh.points) == 500
+    numbers = numbers_in(tmp_path / "a.json")
+    options, met = numbers["options"], numbers["edges_over_target"]
+    assert [options[name] for name in SIZES] == [None, 30.0, None, 0.9, "sizes.nii.gz"]
+    sizes = tetopt.Sizes(largest=30.0, field=Image(field, image.affine), gradation=0.9)
+    assert met["mean"] == pytest.approx(edge_ratios(mesh.points, mesh.cells, sizes).mean)
+    assert len(met["edges_of_bins"]) == len(met["share"]) + 1
+    line = f"edges over their target size: {met['mean']:.2f} in the mean; {met['below']:.1%} under 0.71"
+    assert line in capfd.readouterr().out
+    assert exit_code(*command, "--force", "--nodes", "500", "--edge-max", "40") == 0
+    numbers = numbers_in(tmp_path / "a.json")
+    assert numbers["options"]["edge_max"] == 40.0
+    assert "edges_over_target" not in numbers
+    assert "target size" not in capfd.readouterr().out
+
+
+def test_sizes_make_the_number_of_nodes(tmp_path, inputs):
+    """Alone they say it; where only a part has a target, the rest gets its share of the usual number."""
+    image = load_image(inputs / "sphere.nii.gz")
+    command = [*mesh_words(inputs / "sphere.nii.gz", tmp_path), "--iterations", "6", "--force"]
+    assert exit_code(*command, "--size-max", "14") == 0
+    needed = nodes_of_sizes(image, tetopt.Sizes(largest=14.0))[0]
+    assert numbers_in(tmp_path / "a.json")["options"]["nodes"] == needed
+    assert len(load_mesh(tmp_path / "a.vtu").mesh.points) == needed
+    field = Image(np.where(np.arange(16)[:, None, None] < 4, 14.0, 0.0) * np.ones((1, 16, 16)), image.affine)
+    save_image(tmp_path / "sizes.nii.gz", field)
+    assert exit_code(*command, "--sizing", tmp_path / "sizes.nii.gz") == 0
+    of_part, share = nodes_of_sizes(image, tetopt.Sizes(field=field))
+    assert share == 0.25
+    assert numbers_in(tmp_path / "a.json")["options"]["nodes"] == round(of_part + 0.75 * 16**3 / 8)
 
 
 def test_target_error(tmp_path, inputs, capfd):

@@ -1,5 +1,6 @@
 """Splits and collapses: each leaves a mesh, measured as if afresh, and changes E by what was said."""
 
+import naive
 import numpy as np
 import pytest
 from hypothesis import assume, given, settings
@@ -19,6 +20,7 @@ from tetopt.engine.density import (
     make_exchanges,
     mend,
     roomy,
+    too_long,
 )
 from tetopt.engine.flips import close_gaps
 from tetopt.engine.repair import cell_cosines
@@ -27,7 +29,7 @@ from tetopt.geometry.simplex import volumes
 
 
 def no_limits(n_nodes):
-    return Limits(0.0, np.full(n_nodes, np.inf), 0.0)
+    return Limits(0.0, np.full(n_nodes, np.inf), 0.0, np.full(n_nodes, np.inf))
 
 
 def exchanged(engine, n_nodes, most):
@@ -137,6 +139,42 @@ def test_splits_make_no_edge_shorter_than_asked():
     assert made[1].min() >= shortest * (1 - 1e-3)  # ticks round the middle
 
 
+@pytest.mark.parametrize("n", [2, 3])
+def test_edges_too_long_for_their_targets_are_split_first(n):
+    """The nodes that have one are the twin's; their splits come before all others, and raise E if they have to."""
+    engine = random_case(5, n)
+    engine.sweep()
+    N = len(engine.complex.ticks)
+    points, cells = engine.mesh.points, engine.mesh.cells
+    ends = np.array([cells[:, [i, j]] for i in range(n + 1) for j in range(i)]).reshape(-1, 2)
+    length = np.linalg.norm(points[ends[:, 0]] - points[ends[:, 1]], axis=1)
+    target = np.random.default_rng(2).uniform(0.6, 0.8, N) * np.percentile(length, 90)
+    expected = naive.too_long(points.tolist(), cells.tolist(), target.tolist())
+    np.testing.assert_array_equal(too_long(engine.state, target), expected)
+    assert 0 < sum(expected) < N
+    assert not too_long(engine.state, np.full(N, np.inf)).any()
+    rings, room = node_rings(engine.state), roomy(engine.state, N, 200)
+    limits = no_limits(N)._replace(target=target)
+    plain, sized = (best_splits(room, rings, np.ones(N, dtype=bool), each) for each in (no_limits(N), limits))
+    is_long = np.zeros(N, dtype=bool)
+    for a in np.flatnonzero(sized.other >= 0):
+        b = sized.other[a]
+        is_long[a] = np.linalg.norm(points[a] - points[b]) > 2.0**0.5 * (target[a] + target[b]) / 2.0
+        if not is_long[a]:
+            assert (sized.other[a], sized.gain[a]) == (plain.other[a], plain.gain[a])
+    assert is_long.any()
+    assert not is_long.all()
+    assert sized.gain[is_long].min() > plain.gain.max() + 1e3
+    made = exchange(engine.state, N, 2, limits)
+    engine.state = made.state
+    engine.assert_sound()
+    assert made.n_split == made.n_collapsed == 2
+    is_one = length > 2.0**0.5 * target[ends].mean(axis=1)
+    middles = points[ends[is_one]].mean(axis=1)
+    for point in engine.mesh.points[made.source < 0]:
+        assert np.linalg.norm(middles - point, axis=1).min() < 1e-2  # ticks round them
+
+
 @pytest.mark.parametrize("is_bounded", [False, True])
 def test_collapses_are_the_best_of_all_neighbours(is_bounded):
     """Against meshes in which each node is joined to each neighbour, measured from nothing.
@@ -149,7 +187,9 @@ def test_collapses_are_the_best_of_all_neighbours(is_bounded):
     rings, groups = node_rings(engine.state), blocks(engine.complex.ticks)
     points = engine.mesh.points
     longest = np.random.default_rng(0).uniform(8.0, 20.0, N) if is_bounded else np.full(N, np.inf)
-    collapses = best_collapses(engine.state, rings, groups, np.ones(N, dtype=bool), Limits(0.0, longest, 0.0))
+    collapses = best_collapses(
+        engine.state, rings, groups, np.ones(N, dtype=bool), no_limits(N)._replace(longest=longest)
+    )
     size = np.linalg.det(engine.mesh.points[cells[:, 1:]] - engine.mesh.points[cells[:, :1]]).sum()
     joined, refused = 0, 0
     for a in range(N):

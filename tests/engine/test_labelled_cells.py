@@ -95,7 +95,7 @@ def attracted(state):
 
 def exchanged(state):
     n_nodes = len(state.complex.ticks)
-    return exchange(state, n_nodes - 30, 60, Limits(1.0, np.full(n_nodes, 1e3), 0.0)).state
+    return exchange(state, n_nodes - 30, 60, Limits(1.0, np.full(n_nodes, 1e3), 0.0, np.full(n_nodes, np.inf))).state
 
 
 def relabelled(state):

@@ -60,9 +60,9 @@ def test_longest_edge_of_order_2():
     """1.15 times that of a uniform mesh with the corners; a longest edge that is asked for stays."""
     content = plain(IMAGE)
     uniform = tetopt.Sizes(coarsest=1.0).longest_edge(IMAGE, round(1000 / 7.2))
-    assert sizes_of_order(content, 1000, None, 2).largest == pytest.approx(1.15 * uniform)
+    assert sizes_of_order(content, 1000, None, 2).longest == pytest.approx(1.15 * uniform)
     assert sizes_of_order(content, 1000, None, 2).gradation == 0.5
-    assert sizes_of_order(content, 1000, tetopt.Sizes(largest=9.0), 2).largest == 9.0
+    assert sizes_of_order(content, 1000, tetopt.Sizes(longest=9.0), 2).longest == 9.0
     assert sizes_of_order(content, 1000, None, 1) is None
     with pytest.raises(tetopt.InputError, match="expected order 1 or 2, got 3"):
         tetopt.mesh_image(IMAGE, 100, order=3)

@@ -104,7 +104,7 @@ def test_nodes_do_not_follow_noise(monkeypatch):
 
     def share_in_wave():
         image = tetopt.Image(data)
-        index = image.to_index(octree(image, 2000, tetopt.Sizes(largest=np.inf)).points)
+        index = image.to_index(octree(image, 2000, tetopt.Sizes(longest=np.inf)).points)
         return float((index[:, 0] < 31.5).sum()) / len(index)
 
     known = share_in_wave()

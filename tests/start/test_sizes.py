@@ -1,4 +1,4 @@
-"""Limits on sizes: kept by the octree to the letter and by the run but for a few edges; what they are made of."""
+"""Sizes: targets that a run comes near to, limits that it keeps but for a few edges; what they are made of."""
 
 import sys
 
@@ -10,8 +10,8 @@ from test_octree import OBLIQUE, ball, grid
 
 import tetopt
 from tetopt.engine.meshing import meshed_to_error
-from tetopt.start.octree import _Blocks, _divided, octree
-from tetopt.start.sizes import Sizes, _around
+from tetopt.start.octree import _Blocks, _divided, nodes_of_sizes, octree
+from tetopt.start.sizes import EQUILATERAL_NODES, RATIO_BINS, Sizes, _around, edge_ratios, equilateral_nodes
 
 
 def edges(mesh):
@@ -30,16 +30,16 @@ def test_largest(shape, affine):
         affine = OBLIQUE[:3, :3].copy()
         affine[2] = 0, 0, 1
     image, nodes = ball(*shape, affine=affine), 1500 if len(shape) == 3 else 500
-    free = octree(image, nodes, Sizes(largest=np.inf))
+    free = octree(image, nodes, Sizes(longest=np.inf))
     largest = 0.65 * edges(free)[1].max()
-    sizes = Sizes(largest=largest)
+    sizes = Sizes(longest=largest)
     mesh = octree(image, nodes, sizes)
     slant = 1.3 if affine is not None else 1.0  # blocks are parallelepipeds, whose diagonals are longer
     assert edges(mesh)[1].max() <= largest * slant * (1 + 1e-9)
     assert edges(mesh)[1].max() > 0.6 * largest
     after = edges(tetopt.mesh_image(image, nodes, sizes=sizes).mesh)[1]
     assert np.percentile(after, 99) <= 1.05 * slant * largest
-    unbounded = edges(tetopt.mesh_image(image, nodes, sizes=Sizes(largest=np.inf)).mesh)[1]
+    unbounded = edges(tetopt.mesh_image(image, nodes, sizes=Sizes(longest=np.inf)).mesh)[1]
     assert unbounded.max() > 1.1 * after.max()
 
 
@@ -61,25 +61,128 @@ def test_smallest():
     assert np.percentile(coarse, 2) > 1.2 * np.percentile(fine, 2)
 
 
-@pytest.mark.parametrize("field_affine", [np.diag([2.0, 2.0, 2.0, 1.0]), np.diag([-4.0, 1.0, 8.0, 1.0])])
-def test_field(field_affine):
-    """A field on another grid: fine where it says so, free elsewhere."""
+def half_sized(image, size, elsewhere=0.0, stretch=1.0):
+    """A field on voxels of another size, with `size` in the half of low x."""
+    affine = np.diag([*[stretch] * image.ndim, 1.0])
+    affine[:-1, -1] = 0.5 * (stretch - 1.0)
+    shape = tuple(int(np.ceil(s / stretch)) for s in image.shape)
+    low = tetopt.Image(np.zeros(shape), image.affine @ affine).to_world(grid(*shape))[..., 0]
+    middle = 0.5 * (image.affine[0, 0] * (image.shape[0] - 1)) + image.affine[0, -1]
+    return tetopt.Image(np.where(low < middle, size, elsewhere), image.affine @ affine)
+
+
+@pytest.mark.parametrize("shape", [(48, 40, 44), (90, 70)])
+@pytest.mark.parametrize("stretch", [1.0, 2.5])
+def test_targets_in_one_half(shape, stretch):
+    """With 1.5 times the nodes of equilateral cells the mean edge is no longer than its target, hardly any over sqrt 2.
+
+    So many nodes come out; the other half, which has no target, has longer edges.
+    """
+    image = ball(*shape)
+    field = half_sized(image, 5.0 if len(shape) == 3 else 4.0, stretch=stretch)
+    sizes = Sizes(field=field)
+    nodes, share = nodes_of_sizes(image, sizes)
+    assert share == pytest.approx(0.5, abs=0.04)
+    mesh = tetopt.mesh_image(image, nodes, sizes=sizes).mesh
+    assert len(mesh.points) == nodes
+    assert tetopt.check_mesh(mesh, image) == []
+    ratios = edge_ratios(mesh.points, mesh.cells, sizes)
+    assert 0.75 < ratios.mean < 1.03
+    assert ratios.above < 0.02
+    ends, length = edges(mesh)
+    has_none = (sizes.prepared(len(shape)).at(mesh.points)[ends] == np.inf).all(axis=1)
+    assert length[has_none].mean() > 1.2 * length[~has_none].mean()
+    with pytest.raises(tetopt.InputError, match=r"nodes are too few for .* voxels and these limits .* ask for"):
+        tetopt.mesh_image(image, nodes // 3, sizes=sizes)
+
+
+def test_targets_ask_for_nothing_that_is_there():
+    """Where they are longer than all edges, or infinite, they say no more than that there is no bound."""
     image = ball(48, 40, 44)
-    corners = np.array([[-1.0, -1.0, -1.0], [48.0, 40.0, 44.0]])
-    at = (corners @ np.linalg.inv(field_affine[:3, :3]).T).round()
-    affine = field_affine.copy()
-    affine[:3, 3] = field_affine[:3, :3] @ at.min(axis=0)
-    shape = tuple((at.max(axis=0) - at.min(axis=0) + 1).astype(int))
-    place = tetopt.Image(np.zeros(shape), affine).to_world(grid(*shape))
-    field = tetopt.Image(np.where(place[..., 0] < 12.0, 6.0, 0.0), affine)
-    sizes = Sizes(largest=20.0, field=field)
-    for mesh in (octree(image, 3000, sizes), tetopt.mesh_image(image, 3000, sizes=sizes).mesh):
-        ends, length = edges(mesh)
-        middle = mesh.points[ends].mean(axis=1)[:, 0]
-        assert np.percentile(length[middle < 9.0], 99) <= 6.3
-        assert np.percentile(length[middle > 24.0], 90) > 6.3
-    with pytest.raises(tetopt.InputError, match=r"300 nodes are too few for 48 x 40 x 44 voxels and these limits"):
-        octree(image, 300, sizes)
+    free = tetopt.mesh_image(image, 700, sizes=Sizes(longest=np.inf), iterations=6).mesh
+    for largest in (np.inf, 500.0):
+        mesh = tetopt.mesh_image(image, 700, sizes=Sizes(largest=largest), iterations=6).mesh
+        assert mesh.points.tobytes() == free.points.tobytes()
+
+
+@pytest.mark.parametrize("count", [150, 6000])
+def test_targets_from_any_mesh(count):
+    """A lattice with a fifth of the nodes, or five times as many, ends with the number and its edges."""
+    image, sizes = ball(48, 40, 44), Sizes(largest=6.0)
+    nodes = nodes_of_sizes(image, sizes)[0]
+    start = tetopt.lattice(image, nodes=count)
+    mesh = tetopt.optimize(image, start, k_D=0.85, nodes=nodes, sizes=sizes, iterations=16).mesh
+    assert len(mesh.points) == nodes
+    assert tetopt.check_mesh(mesh, image) == []
+    ratios = edge_ratios(mesh.points, mesh.cells, sizes)
+    assert ratios.mean < 1.0
+    assert ratios.above < 0.03
+
+
+def test_nodes_follow_from_sizes():
+    """Without a number of nodes; a bound of the longest edge says nothing of it, nor does a field of one half."""
+    image = ball(30, 30, 30)
+    sizes = Sizes(largest=6.0)
+    result = tetopt.mesh_image(image, sizes=sizes, iterations=6)
+    assert result.nodes == nodes_of_sizes(image, sizes)[0] == len(result.mesh.points)
+    in_all = tetopt.mesh_image(image, sizes=sizes, iterations=4, order=2).nodes
+    assert in_all == pytest.approx(7.2 * result.nodes, rel=1e-3)
+    for sizes in (Sizes(longest=6.0), Sizes(field=half_sized(image, 6.0))):
+        with pytest.raises(tetopt.InputError, match="give a number of nodes or a target_error"):
+            tetopt.mesh_image(image, sizes=sizes)
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_equilateral_nodes(n):
+    """Those inside, in closed form, and half of a boundary's; in 2-D a strip of triangles that can be counted."""
+    shape = (60, 52, 45)[:n]
+    image = tetopt.Image(np.zeros(shape), np.diag([*(1.0, 2.0, 0.5)[:n], 1.0]))
+    lengths = image.spacing * shape
+    density = 2.0 / 3.0**0.5 / 9.0 if n == 2 else 6.0 * 2.0**0.5 / (4.0 * np.pi / 0.551285598 / 4.0) / 27.0
+    half_a_side = 0.5 / 3.0 if n == 2 else 1.0 / 3.0**0.5 / 9.0
+    sides = 2.0 * lengths.sum() if n == 2 else 2.0 * sum(np.prod(np.delete(lengths, d)) for d in range(3))
+    expected = density * np.prod(lengths) + half_a_side * sides
+    target = np.full(shape, 3.0, dtype=np.float32)
+    assert equilateral_nodes(target, image) == pytest.approx(expected, rel=1e-6)
+    target[:20] = 1e30
+    assert equilateral_nodes(target, image) < 0.75 * expected
+    if n == 2:
+        rows, columns = 1 + 104 / (3.0 * 0.75**0.5), 1 + 60 / 3.0
+        assert expected == pytest.approx(rows * columns, rel=0.02)
+
+
+@pytest.mark.parametrize("shape", [(90, 80), (50, 48, 46)])
+def test_equilateral_nodes_of_a_mask(shape):
+    """A ball's boundary is not that of its voxels' stairs."""
+    n, radius = len(shape), 20.0
+    inside = ((grid(*shape) - 0.5 * (np.array(shape) - 1.0)) ** 2).sum(-1) < radius**2
+    image = tetopt.Image(np.zeros(shape))
+    target = np.full(shape, 4.0, dtype=np.float32)
+    whole = equilateral_nodes(target, image, inside)
+    body = EQUILATERAL_NODES[n] * inside.sum() / 4.0**n
+    around = 0.5 * 2.0 * np.pi * radius / 4.0 if n == 2 else EQUILATERAL_NODES[2] * 2.0 * np.pi * radius**2 / 16.0
+    assert whole - body == pytest.approx(around, rel=0.05)
+    content = tetopt.content(tetopt.Image(1.0 * inside), mask=tetopt.Image(1.0 * inside))
+    assert nodes_of_sizes(content, Sizes(largest=4.0))[0] == pytest.approx(1.5 * whole, abs=1.0)
+
+
+def test_edge_ratios():
+    """Each edge once, over the mean of the targets at its ends, and only where both have one."""
+    image = ball(20, 20, 20)
+    mesh = tetopt.lattice(image, "five-tet", blocks=(4, 4, 4))
+    ratios = edge_ratios(mesh.points, mesh.cells, Sizes(largest=5.0))
+    n_short, n_long = 3 * 4 * 25, 6 * 4 * 4 * 5 // 2
+    assert ratios.mean == pytest.approx((n_short + 2.0**0.5 * n_long) / (n_short + n_long))
+    assert sum(ratios.share) == pytest.approx(1.0)
+    assert ratios.share[RATIO_BINS.index(1.0)] == pytest.approx(n_short / (n_short + n_long))
+    assert (ratios.above, ratios.below) == (0.0, 0.0)
+    tight = edge_ratios(mesh.points, mesh.cells, Sizes(largest=4.0))
+    assert tight.above == pytest.approx(n_long / (n_short + n_long))
+    assert edge_ratios(mesh.points, mesh.cells, Sizes(largest=8.0)).below == pytest.approx(1.0 - tight.above)
+    in_half = edge_ratios(mesh.points, mesh.cells, Sizes(field=half_sized(image, 5.0)))
+    n_short, n_long = 2 * 25 + 2 * 2 * 4 * 5, 4 * 4 * 2 + 2 * (2 * 4 * 5)
+    assert in_half.mean == pytest.approx((n_short + 2.0**0.5 * n_long) / (n_short + n_long), rel=0.05)
+    assert edge_ratios(mesh.points, mesh.cells, Sizes(longest=5.0)) is None
 
 
 def test_gradation():
@@ -89,10 +192,10 @@ def test_gradation():
     spot = tetopt.Image(np.where(((grid(*shape) - 31.5) ** 2).sum(-1) < 9.0, 3.0, 0.0))
     far = {}
     for gradation in (1.0, 0.25):
-        mesh = octree(image, 3000 if gradation == 1.0 else 11000, Sizes(largest=40.0, gradation=gradation, field=spot))
+        mesh = octree(image, 3000 if gradation == 1.0 else 11000, Sizes(longest=40.0, gradation=gradation, field=spot))
         ends, length = edges(mesh)
         distance = np.linalg.norm(mesh.points[ends].mean(axis=1) - 31.5, axis=1)
-        assert length[distance < 2.0].max() <= 3.0
+        assert length[distance < 2.0].mean() < 1.25 * 3.0
         near = (distance > 8.0) & (distance < 12.0)
         assert length[near].max() <= 3.0 + 2.5 * gradation * 12.0
         far[gradation] = float(length[near].mean())
@@ -114,7 +217,7 @@ def test_blocks_around_a_divided_one(rings):
 
 @pytest.mark.parametrize("shape", [(9, 8), (7, 6, 5)])
 def test_field_is_lowered_to_its_gradation(shape):
-    """Against shortest ways over the faces of voxels, found for every pair."""
+    """Against shortest ways over the faces of voxels, found for every pair; voxels without a size stay so."""
     rng = np.random.default_rng(0)
     data = rng.uniform(1.0, 30.0, shape)
     data[data > 28.0] = 0.0
@@ -124,7 +227,9 @@ def test_field_is_lowered_to_its_gradation(shape):
     place = grid(*shape).reshape(-1, len(shape)) * spacing
     ways = 0.3 * np.abs(place[:, None] - place[None]).sum(-1)
     value = np.where(data > 0.0, data, np.inf).ravel()
-    np.testing.assert_allclose(lowered.ravel(), (value[None] + ways).min(axis=1), rtol=1e-5)
+    expected = np.where(np.isfinite(value), (value[None] + ways).min(axis=1), 0.0)
+    assert (expected == 0.0).any()
+    np.testing.assert_allclose(lowered.ravel(), expected, rtol=1e-5)
 
 
 def test_sizes_around_are_the_twin_s():
@@ -149,6 +254,10 @@ def test_sizes_around_are_the_twin_s():
         (Sizes(smallest=-1.0), "size_min: expected 0 mm or more, got -1"),
         (Sizes(smallest=float("nan")), "size_min"),
         (Sizes(largest=0.0), "size_max: expected a length above 0 mm"),
+        (Sizes(largest=float("nan")), "size_max: expected a length above 0 mm"),
+        (Sizes(longest=0.0), "edge_max: expected a length above 0 mm"),
+        (Sizes(smallest=5.0, longest=4.0), "edge_max: 4 mm is below the smallest size, 5 mm"),
+        (Sizes(longest=0.3), "500 nodes are too few .* they need"),
         (Sizes(smallest=5.0, largest=4.0), "size_max: 4 mm is below the smallest size, 5 mm"),
         (Sizes(gradation=0.0), "gradation: expected 0.05"),
         (Sizes(gradation=2.0), "gradation: expected 0.05"),
@@ -176,7 +285,7 @@ def test_limits_that_cannot_be(sizes, words):
 
 def test_smallest_before_largest():
     """Where not both can be, the smallest is kept."""
-    mesh = octree(ball(30, 30, 30), 320, Sizes(smallest=5.0, largest=5.0))
+    mesh = octree(ball(30, 30, 30), 320, Sizes(smallest=5.0, longest=5.0))
     assert edges(mesh)[1].min() >= 5.0 * (1 - 1e-9)
 
 
@@ -193,7 +302,7 @@ def test_runs_keep_to_the_largest():
     start = tetopt.lattice(image, nodes=1000)
     longest = edges(start)[1].max()
     bounded, free = (
-        edges(tetopt.optimize(image, start, k_D=0.85, nodes=1000, iterations=10, sizes=Sizes(largest=largest)).mesh)[1]
+        edges(tetopt.optimize(image, start, k_D=0.85, nodes=1000, iterations=10, sizes=Sizes(longest=largest)).mesh)[1]
         for largest in (1.1 * longest, np.inf)
     )
     assert np.percentile(bounded, 99.5) < 1.1 * 1.05 * longest
@@ -216,7 +325,7 @@ def test_runs_keep_to_the_smallest(monkeypatch):
     splits = []
     for smallest in (0.0, 0.65 * edges(start)[1].max()):
         made.clear()
-        sizes = Sizes(smallest=smallest, largest=np.inf)
+        sizes = Sizes(smallest=smallest, longest=np.inf)
         tetopt.optimize(image, start, k_D=0.85, nodes=len(start.points), iterations=6, sizes=sizes)
         splits.append(sum(made))
     assert splits[0] > 100
@@ -224,21 +333,27 @@ def test_runs_keep_to_the_smallest(monkeypatch):
 
 
 def test_longest_at_nodes():
-    """The least of the largest, the field's value, and what grows from the sizes around."""
+    """The least of the longest, sqrt 2 of the target, and what grows from the sizes around."""
     image = ball(30, 30, 30)
     mesh = octree(image, 300)
     own = np.full(len(mesh.points), 100.0)
-    affine = np.diag([3.0, 3.0, 3.0, 1.0])
-    affine[:3, 3] = -1.0
-    field = tetopt.Image(np.where(grid(12, 12, 12)[..., 0] < 5, 7.0, 0.0), affine)
-    in_field = image.to_index(mesh.points)[:, 0] < 12.0
-    longest = Sizes(largest=20.0, field=field).prepared(3).longest_edges(image, 300, mesh.points, mesh.cells, own)
-    np.testing.assert_allclose(longest[in_field], 7.0)
-    assert longest.max() > 12.0  # grows from the field by gradation x distance
-    assert longest.max() <= 20.0
+    field = half_sized(image, 7.0, stretch=3.0)
+    sizes = Sizes(longest=20.0, field=field).prepared(3)
+    has_one = sizes.at(mesh.points) == 7.0
+    np.testing.assert_array_equal(
+        has_one, field.data[tuple(np.rint(field.to_index(mesh.points)).astype(int).clip(0, 9).T)] > 0.0
+    )
+    target = sizes.around(mesh.points, mesh.cells)
+    np.testing.assert_allclose(target[has_one], 7.0)
+    grown = np.minimum(sizes.at(mesh.points), _around(sizes.at(mesh.points), mesh.points, mesh.cells, 1.0))
+    np.testing.assert_array_equal(target, grown)
+    assert target.max() > 15.0
+    longest = sizes.longest_edges(image, 300, mesh.points, mesh.cells, own, target)
+    np.testing.assert_allclose(longest, np.minimum(20.0, 2.0**0.5 * target))
     own = np.linspace(1.0, 3.0, len(mesh.points))
-    sizes = Sizes(largest=np.inf, gradation=0.2)
-    longest = sizes.longest_edges(image, 300, mesh.points, mesh.cells, own)
+    sizes, free = Sizes(longest=np.inf, gradation=0.2), np.full(len(mesh.points), np.inf)
+    assert (sizes.around(mesh.points, mesh.cells) == np.inf).all()
+    longest = sizes.longest_edges(image, 300, mesh.points, mesh.cells, own, free)
     np.testing.assert_allclose(longest, 1.5 * _around(own, mesh.points, mesh.cells, 0.2))
 
 
@@ -282,10 +397,10 @@ def test_target_error_within_limits():
     """Limits on sizes that ask for more nodes than the error does, or for fewer, have the last word."""
     image = ball(40, 40, 40)
     total = float(np.var(image.data, dtype=np.float64)) * image.volume
-    fine = tetopt.mesh_image(image, target_error=0.5, sizes=Sizes(largest=9.0))
+    fine = tetopt.mesh_image(image, target_error=0.5, sizes=Sizes(longest=9.0))
     assert edges(fine.mesh)[1].max() < 11.0
     assert fine.history[-1].E_D < 0.1 * total
-    coarse = tetopt.mesh_image(image, target_error=0.001, sizes=Sizes(smallest=9.0, largest=40.0))
+    coarse = tetopt.mesh_image(image, target_error=0.001, sizes=Sizes(smallest=9.0, longest=40.0))
     assert edges(coarse.mesh)[1].mean() > 9.0
     assert coarse.history[-1].E_D > 0.001 * total
 

@@ -35,9 +35,12 @@ def show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
 
 
 def print_fidelity(measured: dict[str, Any]) -> None:
-    """How well contrasts, mask and labels are met, as far as `measured`, of `tetopt.report.summary`, has them."""
-    from tetopt.report.tables import label_differences, label_table, mask_table  # numba and more come with these
+    """How well sizes, contrasts, mask and labels are met, as far as `measured` has them (`tetopt.report.summary`)."""
+    # numba and more come with these
+    from tetopt.report.tables import label_differences, label_table, mask_table, sizes_in_words
 
+    if "edges_over_target" in measured:
+        out.print(escape(sizes_in_words(measured["edges_over_target"])))
     for row in measured.get("contrasts", []):
         share = "constant" if row["E_D_share_of_variance"] is None else f"{row['E_D_share_of_variance']:.5f}"
         out.print(escape(f"{row['image']}: weight {row['weight']:g}, share of its own variance in cells {share}"))

@@ -54,6 +54,7 @@ from tetopt.model.model import Model
 from tetopt.model.sets import Sets, box_of, label_set_names, surviving_sets
 from tetopt.report.summary import fidelity, image_summary, model_summary, run_summary, size_summary
 from tetopt.report.tables import add_quality, new_table, nodes_in_words
+from tetopt.start.sizes import edge_ratios
 from tetopt.target.content import Content
 from tetopt.target.domain import INSIDE_SHARE
 
@@ -218,6 +219,8 @@ def _write(task: Task, outcome: Outcome, begin: float) -> tuple[Model, dict[str,
         there = table_of_labels(source.table, np.unique(source.labels.data).astype(np.int64).tolist())
         measured["label_names"] = there.names
         about |= {TABLE_TEXT: table_words(there)}
+    if task.sizes is not None and (ratios := edge_ratios(result.mesh.points, result.mesh.cells, task.sizes)):
+        measured["edges_over_target"] = ratios
     if output.json_path is not None:
         seconds = {**outcome.seconds, "all": time.perf_counter() - begin}
         summary = run_summary(source.content, outcome.initial, result, about, seconds, outcome.shapes)

@@ -172,7 +172,7 @@ class SizeOptions:
         option(
             "N",
             "Wanted number of nodes, with --order 2 mid-edge ones too "
-            f"(default {DEFAULT_NODES[3]}; {DEFAULT_NODES[2]} in 2-D).",
+            f"(default as sizes take, or {DEFAULT_NODES[3]}; {DEFAULT_NODES[2]} in 2-D).",
         ),
     ] = None
     target_error: Annotated[
@@ -180,12 +180,15 @@ class SizeOptions:
     ] = None
     size_min: Annotated[float | None, option("MM", "No edge is split into shorter ones.")] = None
     size_max: Annotated[
-        float | None, option("MM", "No cell is made with a longer edge (default 1.4 x a uniform mesh's).")
+        float | None, option("MM", "Usual edge of cells, at most: longer ones are split as far as nodes go.")
+    ] = None
+    edge_max: Annotated[
+        float | None, option("MM", "No longer edge is made (default 1.4 x a uniform mesh's; with --size-max none).")
     ] = None
     gradation: Annotated[
         float | None, option("G", "How gently sizes change: each is 1/G blocks wide, 0.05 to 1 (default).")
     ] = None
-    sizing: Annotated[Path | None, option("SIZES.nii.gz", "Longest edge by place, mm; 0 or less: as elsewhere.")] = None
+    sizing: Annotated[Path | None, option("SIZES.nii.gz", "Usual edge by place, mm; 0 or less: as elsewhere.")] = None
 
 
 @dataclass(frozen=True, kw_only=True)

@@ -29,6 +29,7 @@ from tetopt.engine.paper import default_n_t
 from tetopt.io.files import checked_output
 from tetopt.io.formats import FORMATS, format_of
 from tetopt.start.lattice import KINDS
+from tetopt.start.octree import nodes_of_sizes
 from tetopt.target.content import Content
 
 
@@ -66,7 +67,8 @@ class Plan(NamedTuple):
         return {
             "nodes": sizes.nodes, "target_error": sizes.target_error, "spacing": start.spacing,
             "lattice": self.kind(ndim), "size_min": sizes.size_min, "size_max": sizes.size_max,
-            "gradation": sizes.gradation, "sizing": None if sizes.sizing is None else sizes.sizing.name,
+            "edge_max": sizes.edge_max, "gradation": sizes.gradation,
+            "sizing": None if sizes.sizing is None else sizes.sizing.name,
             **part.stated(), "method": self.engine.method, "max_seconds": self.engine.max_seconds,
             "start": None if start.start is None else start.start.name, **self.engine_options(),
         }  # fmt: skip
@@ -92,7 +94,7 @@ def planned(
     mode = _mode(source, sizes, start, engine)
     if start.start is not None:
         check_no_input(output.mesh, start.start)
-    for name in ("size_min", "size_max", "gradation", "sizing", "target_error"):
+    for name in ("size_min", "size_max", "edge_max", "gradation", "sizing", "target_error"):
         if mode != "graded" and getattr(sizes, name) is not None:
             raise InputError(
                 f"--{name.replace('_', '-')}: only on a graded mesh; leave out --uniform, --spacing, --lattice, "
@@ -176,9 +178,10 @@ def _pictures(source: SourceOptions, output: OutputOptions) -> list[Path]:
 
 
 def with_numbers(plan: Plan, content: Content) -> tuple[Plan, tetopt.Sizes | None]:
-    """The plan with the defaults that depend on the image, and the limits on sizes.
+    """The plan with the defaults that depend on the image, and the sizes.
 
-    These are the number of nodes, fewer on small images, and the longest edge, which holds anyway and is stated.
+    These are the number of nodes, as many as the sizes take or fewer on small images, and the longest edge, which holds
+    anyway and is stated.
     """
     image, sizes = content.image, plan.sizes
     is_counted = sizes.nodes is not None or sizes.target_error is not None or plan.start.spacing is not None
@@ -187,21 +190,37 @@ def with_numbers(plan: Plan, content: Content) -> tuple[Plan, tetopt.Sizes | Non
     if plan.mode != "graded":
         nodes = sizes.nodes if is_counted else DEFAULT_NODES[image.ndim]
         return plan._replace(sizes=replace(sizes, nodes=nodes)), None
-    order, nodes = plan.solver.order or 1, sizes.nodes
+    order, nodes, limits = plan.solver.order or 1, sizes.nodes, _limits(sizes)
     if not is_counted:
-        many = QUADRATIC_NODES[image.ndim] if order == 2 else 1.0  # nodes to a corner
-        corners = np.clip(content.n_voxels // 8, 2 ** (image.ndim + 2), DEFAULT_NODES[image.ndim] / many)
-        nodes = int(np.rint(many * corners))
-    limits = sizes_of_order(content, nodes, _limits(sizes), order)
-    longest = sizes.size_max
+        nodes = _default_nodes(content, limits, QUADRATIC_NODES[image.ndim] if order == 2 else 1.0)
+    limits = sizes_of_order(content, nodes, limits, order)
+    longest = sizes.edge_max
     if longest is None and nodes is not None:
         longest = (limits or tetopt.Sizes()).longest_edge(image, nodes, content.volume)
-    return plan._replace(sizes=replace(sizes, nodes=nodes, size_max=longest)), limits
+        longest = longest if longest < np.inf else None
+    return plan._replace(sizes=replace(sizes, nodes=nodes, edge_max=longest)), limits
+
+
+def _default_nodes(content: Content, limits: tetopt.Sizes | None, many: float) -> int:
+    """As many nodes as the targets take, where there are any, and elsewhere their share of the usual number.
+
+    `many` are the nodes in all to a corner of cells.
+    """
+    corners = float(
+        np.clip(content.n_voxels // 8, 2 ** (content.image.ndim + 2), DEFAULT_NODES[content.image.ndim] / many)
+    )
+    if limits is not None and limits.has_target:
+        needed, share = nodes_of_sizes(content, limits)
+        corners = needed + (1.0 - share) * corners
+    return int(np.rint(many * corners))
 
 
 def _limits(sizes: SizeOptions) -> tetopt.Sizes | None:
     """The limits on sizes, if the options ask for any."""
     field = None if sizes.sizing is None else read_companion(sizes.sizing)
-    values = {"smallest": sizes.size_min, "largest": sizes.size_max, "gradation": sizes.gradation, "field": field}
+    values = {
+        "smallest": sizes.size_min, "largest": sizes.size_max, "gradation": sizes.gradation, "field": field,
+        "longest": sizes.edge_max,
+    }  # fmt: skip
     limits: dict[str, Any] = {name: value for name, value in values.items() if value is not None}
     return tetopt.Sizes(**limits) if limits else None

@@ -122,7 +122,9 @@ def warn_of_result(result: Optimized, method: Method, n_nodes: int, nodes: int |
     There are `n_nodes` in all, where a graded mesh was to have `nodes`; `n_empty` cells hold no voxel.
     """
     if nodes is not None and abs(n_nodes - nodes) > NODES_MISSED * nodes:
-        show_warning(f"{n_nodes} nodes instead of {nodes}: more iterations, or a --k-d above 0, come nearer")
+        show_warning(
+            f"{n_nodes} nodes instead of {nodes}: more iterations, a --k-d above 0, or larger sizes come nearer"
+        )
     lowest, last = min(row.E for row in result.history), result.history[-1].E
     if last > lowest * (1.0 + ENERGY_RISE) and method == "paper":
         show_warning(

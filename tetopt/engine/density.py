@@ -65,6 +65,7 @@ from tetopt.engine.smooth import (
 from tetopt.engine.surface import MOST_MEETING, faces_up, put_on_surface, ring_faces_up, uphill_at
 from tetopt.geometry.vectors import dot, minus, put_row, row
 from tetopt.kernels import Bools1, Floats1, Floats2, Ints1, Ints2, entry, helper, packed, run, unit
+from tetopt.start.sizes import LONG_EDGE
 
 LEAST_EXCHANGE_SHARE = 1e-3  # of a node's mean share of E: an exchange of two nodes that is worth less is not made
 # Of the noise's variance: likewise; about what the luckiest of thousands of edges wins in noise.
@@ -73,6 +74,9 @@ MIDDLE_SHIFT_SHARE = 0.25  # of an edge on a mask's surface: the furthest from i
 SURFACE_VOLUME_SHARE = 0.1  # of the ring's volume: what a collapse on a mask's surface may add or take
 ROUNDING_SHARE = 1e-9  # of the ring's volume: what a collapse elsewhere may, which is only rounding
 MAX_NEIGHBOURS = 128  # edges of a node that are looked at, at most
+# What the split of an edge that is too long for its target counts besides what E falls by, times the square of its
+# length over the target: E is about 1 to begin with, so that no other split is before it, and E's digits are kept.
+TARGET_CREDIT = 1e4
 LEAST_LIFT_COSINE = 1e-4  # a move is made for a worst angle only if minus its cosine grows by more
 
 
@@ -92,6 +96,7 @@ class Limits(NamedTuple):
     shortest: float  # mm: no split makes a shorter edge
     longest: Floats1  # (N,) mm: no collapse makes a longer edge at a node
     noise: float  # variance of the image's noise: what chance alone wins is not worth a node
+    target: Floats1  # (N,) mm: edges over sqrt 2 times it are split before all others
     dearest: float = np.inf  # E may rise by so much in a collapse
 
 
@@ -106,8 +111,9 @@ class EdgeMoves(NamedTuple):
 def exchange(state: State, n_nodes: int, most: int, limits: Limits) -> Exchanged:
     """One round of splits and collapses towards `n_nodes` nodes, and of exchanges of a node for another.
 
-    Beyond those that the number asks for, up to `most` nodes are exchanged, as far as each lowers E. One round doubles
-    the nodes at most. The complex of `state` is out of date afterwards.
+    Beyond those that the number asks for, up to `most` nodes are exchanged, as far as each lowers E, or splits an edge
+    that is too long for its target. One round doubles the nodes at most. The complex of `state` is out of date
+    afterwards.
     """
     n_before, objective = len(state.complex.ticks), state.objective
     more, most = min(max(n_nodes - n_before, -n_before), n_before), min(most, n_before)
@@ -117,9 +123,11 @@ def exchange(state: State, n_nodes: int, most: int, limits: Limits) -> Exchanged
     # nodes are to be put in, or taken out. It costs no E_D that could be measured, and saves half of the time.
     error = _ring_errors(state, n_before)
     middle = np.median(error)
-    splits = best_splits(state, rings, (error >= middle) | (more > n_before // 8), limits)
-    dearest = np.inf if more < 0 else float(np.sort(splits.gain)[-max(most // 4, 1)])
-    may_collapse = (error <= middle) | (more < -(n_before // 8))
+    may_split = (error >= middle) | (more > n_before // 8) | too_long(state, limits.target)
+    splits = best_splits(state, rings, may_split, limits)
+    is_sized = bool((splits.gain >= TARGET_CREDIT).any())  # edges that are too long are split whatever it costs
+    dearest = np.inf if more < 0 or is_sized else float(np.sort(splits.gain)[-max(most // 4, 1)])
+    may_collapse = (error <= middle) | (more < -(n_before // 8)) | is_sized
     collapses = best_collapses(state, rings, groups, may_collapse, limits._replace(dearest=dearest))
     E_G, squares = energies(state)
     E = objective.geometry * E_G + objective.image * squares + interface_energy(state)
@@ -129,6 +137,31 @@ def exchange(state: State, n_nodes: int, most: int, limits: Limits) -> Exchanged
     in_, out = _best_first(splits), _best_first(collapses)
     n_split, n_collapsed = make_exchanges(state, rings, splits, collapses, in_, out, (more, most, least), is_dirty)
     return _compacted(state, is_dirty, n_before, n_split, n_collapsed)
+
+
+def too_long(state: State, target: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Nodes with an edge that is over sqrt 2 times its target, (N,)."""
+    is_one = np.zeros(len(target), dtype=np.bool_)
+    if np.isfinite(target).any():
+        _fill_too_long(is_one, state, target)
+    return is_one
+
+
+@entry
+def _fill_too_long(is_one: NDArray, state: State, target: NDArray) -> None:
+    cells = state.complex.cells
+    for cell in range(state.complex.n_cells[0]):
+        for i in range(cells.shape[1]):
+            for j in range(i):
+                a, b = cells[cell, i], cells[cell, j]
+                if squared_ratio(state, a, b, target) > LONG_EDGE * LONG_EDGE:
+                    is_one[a] = is_one[b] = True
+
+
+@helper
+def squared_ratio(state: State, a: int, b: int, target: NDArray) -> float:
+    """The square of an edge's length over its target, the mean of those at its ends; 0 where there is none."""
+    return squared_length(state, a, b) / (0.25 * (target[a] + target[b]) ** 2)
 
 
 def _best_first(moves: EdgeMoves) -> NDArray[np.int64]:
@@ -440,7 +473,7 @@ def best_splits(state: State, rings: NodeRings, may_split: NDArray[np.bool_], li
     n_nodes = len(may_split)
     moves = EdgeMoves(may_split, np.full(n_nodes, -1, dtype=np.int64), np.full(n_nodes, -np.inf))
     with few_threads(n_nodes * 20):
-        run(_fill_splits, n_nodes, Splits(moves, state, rings, limits.shortest))
+        run(_fill_splits, n_nodes, Splits(moves, state, rings, limits.shortest, limits.target))
     return moves
 
 
@@ -451,23 +484,28 @@ class Splits(NamedTuple):
     state: State
     rings: NodeRings
     shortest: float  # mm, as of `Limits`
+    target: Floats1  # likewise
 
 
 @unit
 def _fill_splits(work: Splits, node: int) -> None:
     if work.moves.may_move[node]:
-        _best_split(node, work.moves, work.state, work.rings, work.shortest)
+        _best_split(node, work.moves, work.state, work.rings, work.shortest, work.target)
 
 
 @unit
-def _best_split(a: int, moves: EdgeMoves, state: State, rings: NodeRings, shortest: float) -> None:
+def _best_split(
+    a: int, moves: EdgeMoves, state: State, rings: NodeRings, shortest: float, target: Floats1
+) -> None:  # fmt: skip
     x, near = np.empty((4, 3)), np.empty(MAX_NEIGHBOURS, dtype=np.int64)
     for number in range(_neighbours(near, state.complex.cells, rings, a)):
         b, p = near[number], len(moves.gain) + a
         if (b < a and moves.may_move[b]) or squared_length(state, a, b) < 4.0 * shortest * shortest:
             continue
         if _put_middle(state, rings, a, b, p) and _is_long(state, rings, a, b, p, shortest):
-            worth = worth_of_split(x, state, rings, a, b, p, moves.gain[a])
+            ratio = squared_ratio(state, a, b, target)
+            credit = TARGET_CREDIT * ratio if ratio > LONG_EDGE * LONG_EDGE else 0.0
+            worth = worth_of_split(x, state, rings, a, b, p, moves.gain[a] - credit) + credit
             if worth > moves.gain[a]:
                 moves.gain[a], moves.other[a] = worth, b
 

@@ -103,7 +103,7 @@ def optimize(
         a number far from that of `mesh`, may miss it; count them. By default the nodes of `mesh` are kept, and the
         shape energy is that of Eq. (1).
     sizes : Sizes, optional
-        Limits on the edges that exchanges make, with `nodes`.
+        Targets and limits for the edges that exchanges make, with `nodes`.
     tolerance : float
         Converged when E falls by less, relatively, in an iteration.
     max_seconds : float, optional
@@ -164,7 +164,7 @@ def optimize(
         # 3. Exchange nodes: in every other one of the first iterations.
         is_early = nodes is not None and iteration <= n_early
         if nodes is not None and is_early and is_finished and iteration % 2 == 1:
-            n_changes += run.exchange(nodes, sizes)
+            n_changes += run.exchange_towards(nodes, sizes)
         # 4. Lift what is under the floor: in the last iteration.
         is_last = iteration == iterations or not is_finished or (fall < tolerance and not is_early)
         if is_last and run.n_below(floor) > 0 and run.lift(floor) > 0:
@@ -264,6 +264,17 @@ class Run:
         since[moved] = self.state.complex.ticks[moved]
         return moved
 
+    def exchange_towards(self, nodes: int, sizes: Sizes) -> int:
+        """One exchange; towards targets several, while there are far more or fewer nodes; how many were put in or out.
+
+        Targets are reached from any mesh, also one with a tenth of the nodes; to move them first would be in vain.
+        """
+        n_changes = n_last = self.exchange(nodes, sizes)
+        while sizes.has_target and n_last > 0 and abs(len(self.edge) - nodes) > EXCHANGED_SHARE * nodes:
+            n_last = self.exchange(nodes, sizes)
+            n_changes += n_last
+        return n_changes
+
     def exchange(self, nodes: int, sizes: Sizes) -> int:
         """Splits and collapses towards a number of nodes; how many nodes were put in or taken out.
 
@@ -272,11 +283,13 @@ class Run:
         objective = self.state.objective
         if self.image_noise is None:
             self.image_noise = self.content.noise
-        longest = sizes.longest_edges(self.image, nodes, self.points(), self.cells, self.edge, self.content.volume)
+        points = self.points()
+        target = sizes.around(points, self.cells)
+        longest = sizes.longest_edges(self.image, nodes, points, self.cells, self.edge, target, self.content.volume)
         # A step of a voxel between labels always pays, though their surfaces have no detail so fine.
         voxel = self.image.voxel_volume ** (1.0 / self.n) if self.content.memberships is not None else 0.0
         shortest = max(float(sizes.smallest), LEAST_EDGE_VOXELS * voxel)
-        limits = Limits(shortest, longest, self.image_noise)
+        limits = Limits(shortest, longest, self.image_noise, target)
         eager = objective._replace(geometry=EXCHANGE_SHAPE_WEIGHT * objective.geometry)
         made = exchange(self.state._replace(objective=eager), nodes, int(EXCHANGED_SHARE * nodes), limits)
         self._renumber(made.state._replace(objective=objective), made.source)

@@ -31,7 +31,7 @@ from tetopt.geometry.quadratic import node_count
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.start.clip import lattice_within
-from tetopt.start.octree import is_near, nearest_octree, octree
+from tetopt.start.octree import is_near, nearest_octree, nodes_of_sizes, octree
 from tetopt.start.sizes import COARSEST_SHARE, Sizes
 from tetopt.target.content import Content, plain
 
@@ -85,7 +85,7 @@ def mesh_image(
     nodes : int
         Number of nodes, of order 2 with those in the middle of edges. A graded mesh meets it (of order 2 to 1 %) unless
         the run is cut short, k_D is 0, cells have to be lifted over the floor, or no more nodes can be taken out; count
-        them.
+        them. Without it and `target_error`, as many as `sizes` take that have a target everywhere.
     target_error : float
         Instead of `nodes`, of a graded mesh: the share of the image's variance that may be left within cells, 0 to 1;
         as many nodes as that takes, found in a few runs, each with its own `max_seconds`. A run that ends above it
@@ -107,8 +107,8 @@ def mesh_image(
     iterations : int
         As of `optimize`, by default 16 on a graded mesh, else 20; nodes are exchanged in the first 0.7 of them.
     sizes : Sizes
-        Limits on the edges of a graded mesh's cells; by default up to 1.4 times a uniform mesh's, with order 2 up to
-        1.15 times with a gradation of 0.5.
+        Targets and limits for the edges of a graded mesh's cells; by default up to 1.4 times a uniform mesh's, with
+        order 2 up to 1.15 times with a gradation of 0.5.
     order : {1, 2}
         Of the cells that the mesh is for (`tetopt.geometry.quadratic`). With 2 `nodes` counts mid-edge nodes, too:
         about a seventh of them are the mesh's own (a quarter in 2-D), as many as up to three runs find.
@@ -143,6 +143,8 @@ def mesh_image(
         raise InputError(f"mesh_image: expected order 1 or 2, got {order!r}")
     content = plain(image)
     values = {"nodes": nodes, "target_error": target_error, "spacing": spacing, "kind": kind, "start": start}
+    if mode == "graded" and nodes is None and target_error is None and sizes is not None:
+        nodes = values["nodes"] = _nodes_of(content, sizes, order)
     _check_mode(mode, content, values | {"sizes": sizes})
     default_k_D, default_iterations = MODE_DEFAULTS[mode]
     options["k_D"] = default_k_D if k_D is None else k_D
@@ -187,6 +189,14 @@ def mesh_image(
     return result._replace(seconds_start=time.perf_counter() - begin - seconds_run, seconds_run=seconds_run)
 
 
+def _nodes_of(content: Content, sizes: Sizes, order: int) -> int | None:
+    """As many nodes, of order 2 in all, as the sizes take if they say so everywhere."""
+    needed, share = nodes_of_sizes(content, sizes)
+    if share < 1.0:
+        return None
+    return round(needed * (QUADRATIC_NODES[content.image.ndim] if order == 2 else 1.0))
+
+
 def _check_mode(mode: Mode, content: Content, values: dict[str, Any]) -> None:
     """InputError for a mode that there is not, and for what does not belong to it."""
     if mode not in MODE_DEFAULTS:
@@ -217,7 +227,7 @@ def sizes_of_order(content: Content, nodes: int | None, sizes: Sizes | None, ord
     if nodes is None:
         return sizes
     corners = round(nodes / QUADRATIC_NODES[content.image.ndim])
-    return sizes._replace(largest=sizes.longest_edge(content.image, corners, content.volume))
+    return sizes._replace(longest=sizes.longest_edge(content.image, corners, content.volume))
 
 
 def meshed_in_all(ndim: int, nodes: int, run: Callable[[int], Optimized]) -> Optimized:

@@ -13,6 +13,7 @@ from tetopt.measure.fidelity import LabelFidelity, MaskFidelity
 from tetopt.measure.interfaces import LabelInterface
 from tetopt.measure.quality import Quality
 from tetopt.mesh import Mesh
+from tetopt.start.sizes import LONG_EDGE, SHORT_EDGE_SHARE, EdgeRatios
 
 CHANGED_SHARE = 0.2  # of a label's size: what cells have more or less is said in words
 LARGE_SIZE = 1e4  # mm^n: of a label so large its tenths are not shown
@@ -77,6 +78,14 @@ def mask_table(mask: MaskFidelity) -> Table:
     table.add_row("pieces", str(mask.components), str(mask.mesh_components))
     table.add_row("Euler number of the surface", str(mask.euler), str(mask.mesh_euler))
     return table
+
+
+def sizes_in_words(edges: EdgeRatios) -> str:
+    """How the edges of a mesh meet their targets, and why they do not, in one line."""
+    return (
+        f"edges over their target size: {edges.mean:.2f} in the mean; {edges.below:.1%} under {SHORT_EDGE_SHARE:.2f}, "
+        f"where the image asks for smaller cells; {edges.above:.1%} over {LONG_EDGE:.2f}"
+    )
 
 
 def label_table(rows: Sequence[LabelFidelity], interfaces: Sequence[LabelInterface], names: Mapping[int, str]) -> Table:

@@ -5,9 +5,10 @@ those that hold the largest sum of squared deviations from their mean: that is t
 block, so what is left is spread evenly over the leaves. Noise has no say: of each block's sum, what noise of the
 image's own strength would leave is taken off, so that a noisy but uniform region stays coarse. Neighbouring leaves
 differ by one division at most, also across edges and corners (2:1), and nodes are put at their corners and centres: a
-lattice of body-centred cubes that coarsens by steps of two, joined by Delaunay. Limits on sizes (`tetopt.Sizes`) have
-the first say: blocks with longer edges are divided, whatever they hold, and those whose halves would be too short are
-not.
+lattice of body-centred cubes that coarsens by steps of two, joined by Delaunay. Sizes (`tetopt.Sizes`) have the first
+say: blocks with longer edges than are allowed are divided, whatever they hold, and those whose halves would be too
+short are not. Blocks halve, so that a target for the usual edge lies between two of them: here and there one is
+divided, as many as give the target's number of nodes, and the exchanges of `optimize` make the rest of it.
 
 The depth of a block is the number of divisions that it takes to get to it: 0 of the box's own blocks, the roots.
 """
@@ -28,7 +29,15 @@ from tetopt.mesh import Mesh
 from tetopt.start.clip import clipped
 from tetopt.start.delaunay import delaunay
 from tetopt.start.lattice import near_cubes
-from tetopt.start.sizes import LONGEST_IN_BLOCK, NO_BOUND_MM, SHORTEST_IN_BLOCK, Sizes
+from tetopt.start.sizes import (
+    LONGEST_IN_BLOCK,
+    NO_BOUND_MM,
+    SHORTEST_IN_BLOCK,
+    SIZED_OVER_EQUILATERAL,
+    USUAL_IN_BLOCK,
+    Sizes,
+    equilateral_nodes,
+)
 from tetopt.target.content import Content, plain
 
 # Nodes of the undivided blocks, over the requested number: tried in turn, the largest blocks first.
@@ -45,6 +54,8 @@ LEAF_VOXELS = 2.0  # the least edge of a leaf where voxels are smallest; a quart
 SPREAD_OF_VARIANCE = 1e-3  # of the image's: what every voxel counts besides, so that any number of nodes is reached
 SPREAD_OF_NOISE = 0.03  # of the noise's variance, likewise: chance does not decide which noise is divided first
 NOISE_SIGMAS = 2.0  # standard deviations of a sum of squared noise that are not taken for content
+# Of a target's blocks to the n-th power: those larger by less are not divided, since a lattice seldom fits exactly.
+TARGET_SLACK = 0.25
 TIE_SPREAD = 0.05  # of a block's error: what decides between blocks that are alike
 TIE_BREAKS = (1e-5, 1e-4, 1e-3)  # see `delaunay`, tried in turn: with 1e-7, 2 of 88,661 cells were flat
 FLAT_VOLUME_SHARE = 1e-6  # of the mean volume: a cell with less is flat
@@ -61,7 +72,7 @@ def octree(image: Image | Content, nodes: int, sizes: Sizes | None = None) -> Me
     nodes : int
         Number of nodes to come near to. The nearest octree has a few per cent more or less, of few a few dozen.
     sizes : Sizes, optional
-        Limits on the blocks' edges.
+        Targets and limits for the blocks' edges.
 
     Returns
     -------
@@ -71,22 +82,24 @@ def octree(image: Image | Content, nodes: int, sizes: Sizes | None = None) -> Me
     Raises
     ------
     InputError
-        More nodes than leaves of 2 voxels, or of the smallest size, can have, or fewer than the largest sizes need; or
+        More nodes than leaves of 2 voxels, or of the smallest size, can have, or fewer than the sizes need; or
         intensities whose squares overflow.
     """
     content = plain(image)
     shape = " x ".join(map(str, content.image.shape))
     given_sizes = "" if sizes is None or sizes == Sizes() else " and these limits on sizes"
     limits = _block_limits(content, nodes, sizes)
-    fewest = _fewest_nodes(content, limits)
-    if fewest > (1.0 + LARGEST_MISS) * nodes + LARGEST_MISS_NODES:
+    fewest, by_target = _fewest_nodes(content, limits), _target_nodes(content, limits)
+    if max(fewest, by_target) > (1.0 + LARGEST_MISS) * nodes + LARGEST_MISS_NODES:
+        least, enough = max(fewest, by_target), max(fewest, SIZED_OVER_EQUILATERAL * by_target)
         raise InputError(
-            f"octree: {nodes} nodes are too few for {shape} voxels{given_sizes}: they need {fewest:.4g} or more; ask "
-            "for as many, or allow longer edges"
+            f"octree: {nodes} nodes are too few for {shape} voxels{given_sizes}: they need {least:.4g} or more; "
+            f"ask for {np.ceil(enough):.0f}, or allow longer edges"
         )
     mesh = _octree_within(content, nodes, limits)
     count = len(mesh.points)
-    if is_near(count, nodes) or content.region is not None:  # exchanges take care of the rest
+    # Exchanges take care of the rest.
+    if is_near(count, nodes) or content.region is not None or limits.target is not None:
         return mesh
     raise InputError(
         f"octree: {nodes} nodes are too {'many' if count < nodes else 'few'} for {shape} voxels{given_sizes}: the "
@@ -95,10 +108,10 @@ def octree(image: Image | Content, nodes: int, sizes: Sizes | None = None) -> Me
 
 
 class _BlockLimits(NamedTuple):
-    """Limits on the blocks: on their edges, mm, and on how many of a size lie beside one another."""
+    """Targets and limits for the blocks: for their edges, mm, and on how many of a size lie beside one another."""
 
     largest: float
-    largest_at: NDArray[np.float32] | None  # of the image's shape, by voxel, besides
+    target: NDArray[np.float32] | None  # of the image's shape, by voxel: the usual edge of cells
     smallest: float  # kept where not both can be
     n_rings: int  # blocks of a divided block's size around it, in every direction
 
@@ -119,23 +132,57 @@ def _block_limits(content: Content, nodes: int, sizes: Sizes | None) -> _BlockLi
         raise InputError(f"size_min: {sizes.smallest:g} mm is longer than the box, {longest_side:.4g} mm")
     smallest = sizes.smallest / SHORTEST_IN_BLOCK[n]
     largest = max(sizes.longest_edge(image, nodes, content.volume) / LONGEST_IN_BLOCK[n], smallest)
-    largest_at = sizes.on_voxels(image)
-    if largest_at is not None:
-        if largest_at.min() >= NO_BOUND_MM:
-            raise InputError("sizing: no voxel above 0 lies in the image's box; do both lie in the same world mm?")
-        largest_at = np.maximum(largest_at / LONGEST_IN_BLOCK[n], smallest).astype(np.float32)
-    return _BlockLimits(largest, largest_at, smallest, int(np.ceil(1.0 / sizes.gradation - 1e-9)))
+    target = _target(image, sizes) if sizes.has_target else None
+    return _BlockLimits(largest, target, smallest, int(np.ceil(1.0 / sizes.gradation - 1e-9)))
+
+
+def _target(image: Image, sizes: Sizes) -> NDArray[np.float32]:
+    """The target by voxel, mm; InputError where a field has none."""
+    target = sizes.on_voxels(image)
+    if target.min() >= NO_BOUND_MM:
+        raise InputError("sizing: no voxel above 0 lies in the image's box; do both lie in the same world mm?")
+    return target
+
+
+def nodes_of_sizes(image: Image | Content, sizes: Sizes) -> tuple[int, float]:
+    """How many nodes the targets take, 1.5 times those of equilateral cells; and the share of the mesh that has one.
+
+    Raises
+    ------
+    InputError
+        Sizes out of range, or below voxels; a field beside the image.
+    """
+    content = plain(image)
+    sizes = sizes.prepared(content.image.ndim)
+    if not sizes.has_target:
+        return 0, 0.0
+    target = _target(content.image, sizes)
+    inside = None if content.region is None else content.region.inside
+    needed = equilateral_nodes(target, content.image, inside)
+    _check_not_below_voxels(content.image, needed)
+    has_one = target < NO_BOUND_MM
+    return int(np.ceil(SIZED_OVER_EQUILATERAL * needed)), float(np.mean(has_one if inside is None else has_one[inside]))
 
 
 def _fewest_nodes(content: Content, limits: _BlockLimits) -> float:
-    """A lower bound of the nodes that the limits need: two for each block as large as it may be."""
-    n, largest_at = content.image.ndim, limits.largest_at
-    if largest_at is None:
-        return 2.0 * content.volume / limits.largest**n
-    with np.errstate(over="ignore"):
-        largest_at = largest_at if content.region is None else largest_at[content.region.inside]
-        edges = np.minimum(largest_at, limits.largest).astype(np.float64)
-        return 2.0 * content.image.voxel_volume * float((edges**-n).sum())
+    """A lower bound of the nodes that the bounds need: two for each block as large as it may be."""
+    return 2.0 * content.volume / limits.largest**content.image.ndim
+
+
+def _target_nodes(content: Content, limits: _BlockLimits) -> float:
+    """The nodes of equilateral cells of the targets, where there are any."""
+    if limits.target is None:
+        return 0.0
+    inside = None if content.region is None else content.region.inside
+    return equilateral_nodes(limits.target, content.image, inside)
+
+
+def _check_not_below_voxels(image: Image, nodes: float) -> None:
+    """InputError if there are more nodes than voxels."""
+    if nodes > max(image.data.size, ALWAYS_ALLOWED_NODES):
+        raise InputError(
+            "sizes: so short edges are asked for that cells are below voxels, and see nothing; allow longer ones"
+        )
 
 
 def is_near(count: int, nodes: int) -> bool:
@@ -175,10 +222,7 @@ def _octree_within(content: Content, nodes: int, limits: _BlockLimits) -> Mesh:
 def _octree_of_box(content: Content, nodes: int, limits: _BlockLimits) -> Mesh:
     """The octree of the whole box that has most nearly so many nodes."""
     image = content.image
-    if _fewest_nodes(content, limits) > max(image.data.size, ALWAYS_ALLOWED_NODES):
-        raise InputError(
-            "sizes: so short edges are asked for that cells are below voxels, and see nothing; allow longer ones"
-        )
+    _check_not_below_voxels(image, max(_fewest_nodes(content, limits), _target_nodes(content, limits)))
     roots, divided = _best_division(content, nodes, limits)
     index = _leaf_nodes(divided, roots) / np.array(roots) * image.shape - 0.5
     points = image.to_world(index)
@@ -240,10 +284,9 @@ def _blocks_by_depth(
     spread = SPREAD_OF_VARIANCE * float(voxels.sums[1].sum() / voxels.sums[0].sum()) + SPREAD_OF_NOISE * variance
     every = voxels.sums if voxels.outside is None else [*voxels.sums, voxels.outside]
     sums = [_block_totals(field, np.array(roots) << depth, np.add) for field in every]
-    longest = np.full(sums[0].shape, limits.largest)
-    if limits.largest_at is not None:
-        least = _block_totals(limits.largest_at, np.array(roots) << depth, np.minimum, NO_BOUND_MM)
-        longest = np.minimum(limits.largest, least)
+    target = None
+    if limits.target is not None:
+        target = _block_totals(limits.target, np.array(roots) << depth, np.minimum, NO_BOUND_MM)
     blocks = []
     for d in range(depth, -1, -1):
         count, second, *firsts = sums[: len(voxels.sums)]
@@ -254,14 +297,16 @@ def _blocks_by_depth(
         if voxels.outside is not None:
             error += voxels.step * count * sums[-1] / np.maximum(count + sums[-1], 1.0)
         may_be_divided = edge.min() / 2 ** (d + 1) >= limits.smallest
-        is_too_large = (longest * (1.0 + 1e-9) < edge.max() / 2**d) & may_be_divided
+        is_too_large = np.full(count.shape, limits.largest * (1.0 + 1e-9) < edge.max() / 2**d and may_be_divided)
+        if target is not None and d < depth and may_be_divided:
+            is_too_large |= _divided_for(target, float(np.prod(edge)) ** (1 / image.ndim) / 2**d)
         is_in_region = count > 0.0 if voxels.outside is not None else np.ones(count.shape, dtype=bool)
         error = (error + spread * count) * _uneven(error.shape) * (d < n_by_content)
         blocks.append(_Blocks(error, is_too_large & is_in_region, is_in_region))
         if d > 0:
             half = np.array(count.shape) // 2
             sums = [_block_totals(total, half, np.add) for total in sums]
-            longest = _block_totals(longest, half, np.minimum)
+            target = None if target is None else _block_totals(target, half, np.minimum, NO_BOUND_MM)
     return blocks[::-1]
 
 
@@ -275,7 +320,7 @@ def _depths(edge: NDArray[np.float64], spacing: NDArray[np.float64], limits: _Bl
             break
         n_by_content += 1
     depth = n_by_content
-    while (edge / 2**depth).max() > _least_edge(limits) * (1.0 + 1e-9):
+    while (edge / 2**depth).max() > _least_edge(limits, len(edge)) * (1.0 + 1e-9):
         half = edge / 2 ** (depth + 1)
         if half.min() < limits.smallest or (half / spacing).max() < 1.0:
             break
@@ -283,9 +328,21 @@ def _depths(edge: NDArray[np.float64], spacing: NDArray[np.float64], limits: _Bl
     return depth, n_by_content
 
 
-def _least_edge(limits: _BlockLimits) -> float:
+def _least_edge(limits: _BlockLimits, n: int) -> float:
     """The edge, mm, that blocks may have where they have to be smallest."""
-    return limits.largest if limits.largest_at is None else min(limits.largest, float(limits.largest_at.min()))
+    return min(limits.largest, np.inf if limits.target is None else float(limits.target.min()) / USUAL_IN_BLOCK[n])
+
+
+def _divided_for(target: NDArray, edge: float) -> NDArray[np.bool_]:
+    """Which blocks of an edge are divided for the sake of their targets for the usual edge of cells, mm.
+
+    Divided, a block has 2^n times the nodes. To have k times as many, one in (2^n - 1) / (k - 1) is, which ones as
+    `_uneven` has it.
+    """
+    n = target.ndim
+    more = (USUAL_IN_BLOCK[n] * edge / target) ** n - 1.0
+    share = (_uneven(target.shape) - 1.0) / TIE_SPREAD
+    return np.asarray(more > np.maximum((2**n - 1) * share, TARGET_SLACK))
 
 
 def _uneven(shape: tuple[int, ...]) -> NDArray[np.float64]:
@@ -339,7 +396,7 @@ def _best_division(
         if abs(count - nodes) <= TRIAL_MISS * nodes:
             break
     if best is None:
-        least = LONGEST_IN_BLOCK[image.ndim] * _least_edge(limits)
+        least = LONGEST_IN_BLOCK[image.ndim] * _least_edge(limits, image.ndim)
         raise InputError(
             f"sizes: edges of {least:.3g} mm are asked for, but blocks below a voxel ({image.spacing.max():.3g} mm) "
             "see nothing; allow longer ones"
@@ -355,6 +412,10 @@ def _root_counts(image: Image, nodes: int, limits: _BlockLimits) -> Iterator[tup
     coarse = [near_cubes(kind, lengths, max(2**image.ndim + 1, int(nodes * share))) for share in ROOT_SHARES]
     edges = [lengths / roots for roots in coarse]
     fit = [e.max() <= largest * (1.0 + 1e-9) and e.min() >= smallest for e in edges]
+    if limits.target is not None and (widest := float(limits.target.max())) < NO_BOUND_MM:
+        fitting = np.clip(np.rint(lengths * USUAL_IN_BLOCK[image.ndim] / widest), 1, None)
+        if (lengths / fitting).max() <= largest * (1.0 + 1e-9) and (lengths / fitting).min() >= smallest:
+            yield tuple(int(c) for c in fitting)
     if not all(fit):
         fewest, finest = np.ceil(lengths / largest - 1e-9), lengths / max(smallest, 1e-300)
         yield tuple(int(c) for c in np.maximum(np.minimum(fewest, np.floor(finest * (1.0 + 1e-9))), 1))

@@ -1,4 +1,4 @@
-"""How small and how large cells of a graded mesh may be: limits, a field of them, and how fast sizes may change."""
+"""How small and how large cells of a graded mesh may be: targets by place, bounds, and how fast sizes may change."""
 
 from __future__ import annotations
 
@@ -16,39 +16,58 @@ from tetopt.start.lattice import near_cubes
 
 # A graded mesh's longest edge over that of a uniform mesh with as many nodes, where no other is set (`docs/sizes.md`).
 COARSEST_SHARE = 1.4
-# By dimension, the shortest and the longest edge of the cells in a block over the block's own edge: from a corner to
-# the centre, and, in 3-D, the diagonal of a block's side on the box's faces.
+# By dimension, the shortest, the mean and the longest edge of the cells in a block over the block's own edge: from a
+# corner to the centre; over 8 of these and 6 sides (in 2-D 4 and 2); and, in 3-D, the diagonal of a block's side on the
+# box's faces.
 SHORTEST_IN_BLOCK = {2: 0.5**0.5, 3: 0.75**0.5}
+USUAL_IN_BLOCK = {2: (2.0 * 0.5**0.5 + 1.0) / 3.0, 3: (4.0 * 0.75**0.5 + 3.0) / 7.0}
 LONGEST_IN_BLOCK = {2: 1.0, 3: 2.0**0.5}  # in 2-D the side itself is as long as the block
+# Nodes of equilateral cells by dimension, times edge^n per volume. In 3-D a cell has edge^3 / (6 sqrt 2), and the solid
+# angle 3 arccos(1/3) - pi at each of its corners, of the 4 pi around a node.
+EQUILATERAL_NODES = {
+    2: 2.0 / 3.0**0.5,
+    3: 6.0 * 2.0**0.5 * (3.0 * np.arccos(1.0 / 3.0) - np.pi) / np.pi,
+}
+STAIRCASE_SHARE = {2: np.pi / 4.0, 3: 2.0 / 3.0}  # a surface over its voxels' sides, over all directions
+SIZED_OVER_EQUILATERAL = 1.5  # nodes that targets take: cells of an image are neither regular nor all of one size
+LONG_EDGE = 2.0**0.5  # over its target: a longer edge is split, as in MMG, since its halves are nearer to it
+SHORT_EDGE_SHARE = 0.5**0.5  # of its target: a shorter edge is one that the image has made
+RATIO_BINS = tuple(0.5 ** (0.25 * k) for k in range(12, -9, -1))  # edges over target: 1/8 to 4, four to a doubling
 NO_BOUND_MM = 1e30  # stands for infinity in float32, to which steps can still be added
 UNEVEN_SHARE = 1.5  # a cell's longest edge over the edge that gradation gives: edges of a good cell differ by a third
 
 
 class Sizes(NamedTuple):
-    """Limits on the edges of cells where `octree` and the exchanges of `optimize` put nodes in and take them out.
+    """Targets and limits for the edges of cells where `octree` and the exchanges of `optimize` put nodes in and out.
 
-    Nodes move in between, which makes some edges longer or shorter: in the tests one in a hundred is more than 5 %
-    longer than the largest. `quality` tells the longest and the shortest.
+    A target (`largest`, `field`) is for the usual edge: octrees begin near it, edges over sqrt 2 times it are split, as
+    far as there are nodes, and no collapse makes one. Where the image is worth it, cells are smaller. That takes up to
+    1.5 times the nodes of equilateral cells (`nodes_of_sizes`). `smallest` and `longest` are bounds. Nodes move in
+    between, which makes some edges longer or shorter: in the tests one in a hundred is more than 5 % longer than the
+    longest. `quality` tells the longest and the shortest.
 
     Parameters
     ----------
     smallest : float
-        No block and no split makes a shorter edge, mm. Where not both can be, this is kept rather than `largest`.
-        Nodes then move nearer: in one run a tenth of the edges ended shorter.
+        No block and no split makes a shorter edge, mm, and no target is below it. Where not both can be, this is kept
+        rather than `longest`. Nodes then move nearer: in one run a tenth of the edges ended shorter.
     largest : float, optional
-        No block and no collapse makes a longer edge, mm. By default `coarsest` times the longest edge of a uniform mesh
-        with as many nodes: smaller cells in uniform regions do not represent the image any better, but the
-        displacement. `inf` for none. Most edges are 0.6 times the longest, which are the diagonals of blocks on the
-        box's faces.
+        The largest target anywhere, mm; `inf` for none.
     gradation : float
         How gently sizes change: each size of the octree, between the next smaller and the next larger one, is at least
-        1 / gradation blocks wide; 1 to 0.05. Collapses make no edge longer than 1.5 times the size that grows from its
-        surroundings by gradation x distance. Where there are hardly two sizes it changes little.
-    coarsest : float
-        Without `largest`: the longest edge over that of a uniform mesh with as many nodes.
+        1 / gradation blocks wide; 1 to 0.05. Targets grow by no more than gradation x distance, and collapses make no
+        edge longer than 1.5 times the size that grows so from its surroundings. Where there are hardly two sizes it
+        changes little.
     field : Image, optional
-        Longest edge, mm, by place: an image that need not lie on the voxels of the one to be meshed. Outside of it, and
-        where it is 0 or below, nothing but `largest` holds.
+        The target, mm, by place: an image that need not lie on the voxels of the one to be meshed. Outside of it, and
+        where it is 0 or below, only `largest` is one.
+    coarsest : float
+        Without `largest` and `longest`: the longest edge over that of a uniform mesh with as many nodes.
+    longest : float, optional
+        No block and no collapse makes a longer edge, mm. By default, without `largest`, `coarsest` times the longest
+        edge of a uniform mesh with as many nodes: smaller cells in uniform regions do not represent the image any
+        better, but the displacement. `inf` for none. Most edges are 0.6 times the longest, which are the diagonals of
+        blocks on the box's faces.
     """
 
     smallest: float = 0.0
@@ -56,9 +75,15 @@ class Sizes(NamedTuple):
     gradation: float = 1.0
     field: Image | None = None
     coarsest: float = COARSEST_SHARE
+    longest: float | None = None
+
+    @property
+    def has_target(self) -> bool:
+        """Whether there is a target anywhere."""
+        return self.field is not None or (self.largest is not None and self.largest < np.inf)
 
     def prepared(self, n: int) -> Sizes:
-        """The same limits, checked; the field's steps are lowered to the gradation.
+        """The same sizes, checked; the field's steps are lowered to the gradation.
 
         Raises
         ------
@@ -67,10 +92,11 @@ class Sizes(NamedTuple):
         """
         if not 0.0 <= self.smallest < np.inf:
             raise InputError(f"size_min: expected 0 mm or more, got {self.smallest}")
-        if self.largest is not None and not self.largest > 0.0:
-            raise InputError(f"size_max: expected a length above 0 mm, got {self.largest}")
-        if self.largest is not None and self.largest < self.smallest:
-            raise InputError(f"size_max: {self.largest:g} mm is below the smallest size, {self.smallest:g} mm")
+        for name, value in (("size_max", self.largest), ("edge_max", self.longest)):
+            if value is not None and not value > 0.0:
+                raise InputError(f"{name}: expected a length above 0 mm, got {value}")
+            if value is not None and value < self.smallest:
+                raise InputError(f"{name}: {value:g} mm is below the smallest size, {self.smallest:g} mm")
         if not 0.05 <= self.gradation <= 1.0:
             raise InputError(f"gradation: expected 0.05 (gentle) to 1, got {self.gradation}")
         if self.field is not None and self.field.ndim != n:
@@ -81,8 +107,10 @@ class Sizes(NamedTuple):
 
     def longest_edge(self, image: Image, nodes: int, volume: float | None = None) -> float:
         """The longest edge that any cell may have, mm; `volume`, mm^n, is that of the mesh, by default of the box."""
+        if self.longest is not None:
+            return self.longest
         if self.largest is not None:
-            return self.largest
+            return np.inf
         lengths = image.spacing * image.shape
         kind, fewest = ("bcc", 9) if image.ndim == 3 else ("criss-cross", 5)
         if volume is not None:  # nodes of a lattice of the whole box
@@ -92,37 +120,108 @@ class Sizes(NamedTuple):
             self.coarsest * uniform, self.smallest / SHORTEST_IN_BLOCK[image.ndim]
         )
 
-    def on_voxels(self, image: Image) -> NDArray[np.float32] | None:
-        """The field's value at each voxel's centre, of the image's shape, mm; `NO_BOUND_MM` outside of the field."""
+    def on_voxels(self, image: Image) -> NDArray[np.float32]:
+        """The target at each voxel's centre, of the image's shape, mm; `NO_BOUND_MM` where there is none."""
+        largest = np.float32(NO_BOUND_MM if self.largest is None else np.clip(self.largest, 1e-30, NO_BOUND_MM))
+        smallest = np.float32(self.smallest)
         if self.field is None:
-            return None
+            return np.broadcast_to(np.maximum(largest, smallest), image.shape)
         to_field = np.linalg.inv(self.field.affine) @ image.affine
-        return np.asarray(
-            scipy.ndimage.affine_transform(
-                self.field.data, to_field, output_shape=image.shape, order=0, mode="grid-constant", cval=NO_BOUND_MM
-            )
+        by_place = scipy.ndimage.affine_transform(
+            self.field.data, to_field, output_shape=image.shape, order=0, mode="grid-constant"
         )
+        return np.asarray(np.clip(np.where(by_place > 0.0, by_place, NO_BOUND_MM), smallest, largest))
 
-    def longest_edges(
-        self, image: Image, nodes: int, points: NDArray, cells: NDArray, own: NDArray, volume: float | None = None
-    ) -> NDArray[np.float64]:
-        """The longest edge that a cell at each node may be given, (N,) mm; `own` (N,) is the mean size there now."""
-        bound = np.full(len(points), self.longest_edge(image, nodes, volume))
+    def at(self, points: NDArray) -> NDArray[np.float64]:
+        """The target at points, (N,) mm; `inf` where there is none."""
+        target = np.full(len(points), np.inf if self.largest is None else self.largest)
         if self.field is not None:
             index, (low, high) = self.field.to_index(points), box_sides(self.field.shape).T
             is_in_field = ((index >= low - ON_SIDE_VOXELS) & (index <= high + ON_SIDE_VOXELS)).all(axis=1)
             voxel = np.clip(np.rint(index[is_in_field]).astype(np.int64), 0, np.array(self.field.shape) - 1)
-            bound[is_in_field] = np.minimum(bound[is_in_field], self.field.data[tuple(voxel.T)])
+            by_place = self.field.data[tuple(voxel.T)]
+            target[is_in_field] = np.minimum(target[is_in_field], np.where(by_place > 0.0, by_place, np.inf))
+        return np.maximum(target, self.smallest)
+
+    def around(self, points: NDArray, cells: NDArray) -> NDArray[np.float64]:
+        """The target at nodes, (N,) mm; where there is none, what grows by the gradation from where there are."""
+        target = self.at(points)
+        if not np.isfinite(target).any() or np.isfinite(target).all():
+            return target
+        return np.minimum(target, _around(target, points, cells, self.gradation))
+
+    def longest_edges(
+        self, image: Image, nodes: int, points: NDArray, cells: NDArray, own: NDArray, target: NDArray,
+        volume: float | None = None,
+    ) -> NDArray[np.float64]:  # fmt: skip
+        """The longest edge that a cell at each node may be given, (N,) mm.
+
+        `own` (N,) is the mean size there now, `target` (N,) what it is to be (`around`).
+        """
+        bound = np.minimum(self.longest_edge(image, nodes, volume), LONG_EDGE * target)
         return np.minimum(bound, UNEVEN_SHARE * _around(own, points, cells, self.gradation))
 
 
+def equilateral_nodes(target: NDArray, image: Image, inside: NDArray[np.bool_] | None = None) -> float:
+    """How many nodes a mesh of equilateral cells would have whose edges are the targets at voxels, mm.
+
+    `target` is of the image's shape, and counts up to `NO_BOUND_MM`; `inside` says which voxels are to be meshed.
+    Nodes on the boundary have half of their room inside: so many are added, by its area over that of a triangle (in
+    2-D its length over that of an edge).
+    """
+    n = image.ndim
+    is_in = target < NO_BOUND_MM if inside is None else inside & (target < NO_BOUND_MM)
+    edge = np.where(is_in, target, np.inf).astype(np.float64)
+    nodes = EQUILATERAL_NODES[n] * image.voxel_volume * float((edge**-n).sum())
+    of_facet = 0.5 * (EQUILATERAL_NODES[2] if n == 3 else 1.0)
+    across = np.linalg.norm(np.linalg.inv(image.affine[:n, :n]), axis=1)  # of a voxel's volume, to its sides' areas
+    for axis in range(n):
+        area = image.voxel_volume * float(across[axis])
+        of_voxel = np.moveaxis(of_facet * area * edge ** (1 - n), axis, 0)
+        nodes += float(of_voxel[0].sum() + of_voxel[-1].sum())
+        if inside is not None:
+            whole = np.moveaxis(inside, axis, 0)
+            steps = of_voxel[1:][whole[1:] & ~whole[:-1]].sum() + of_voxel[:-1][whole[:-1] & ~whole[1:]].sum()
+            nodes += STAIRCASE_SHARE[n] * float(steps)
+    return nodes
+
+
+class EdgeRatios(NamedTuple):
+    """Edges over their targets, each edge once; those of which both ends have one."""
+
+    mean: float
+    above: float  # share of edges over sqrt 2 times their target: there were no nodes to split them
+    below: float  # share of edges under 1 / sqrt 2 times their target: the image has made them so
+    edges_of_bins: tuple[float, ...]  # edge over target, B + 1, rising; the first and last bins hold what is beyond
+    share: list[float]  # (B,) of the edges in each bin
+
+
+def edge_ratios(points: NDArray, cells: NDArray, sizes: Sizes) -> EdgeRatios | None:
+    """How the edges of a mesh meet the targets of sizes; None if no edge has any."""
+    n, target = points.shape[1], sizes.prepared(points.shape[1]).at(points)
+    first, second = np.triu_indices(n + 1, 1)
+    ends = np.unique(np.sort(np.stack([cells[:, first].ravel(), cells[:, second].ravel()], axis=1), axis=1), axis=0)
+    wish = 0.5 * target[ends].sum(axis=1)
+    length = np.linalg.norm(points[ends[:, 1]] - points[ends[:, 0]], axis=1)
+    ratio = (length / wish)[np.isfinite(wish)]
+    if len(ratio) == 0:
+        return None
+    counts = np.histogram(np.clip(ratio, RATIO_BINS[0], RATIO_BINS[-1]), RATIO_BINS)[0]
+    above, below = float((ratio > LONG_EDGE).mean()), float((ratio < SHORT_EDGE_SHARE).mean())
+    return EdgeRatios(float(ratio.mean()), above, below, RATIO_BINS, (counts / len(ratio)).tolist())
+
+
 def _graded(field: Image, gradation: float) -> Image:
-    """The field with no value above a neighbour's by more than gradation x distance, neighbours across voxel faces."""
-    data = np.where(field.data > 0.0, field.data, NO_BOUND_MM).astype(np.float32)
+    """The field with no value above a neighbour's by more than gradation x distance, neighbours across voxel faces.
+
+    Voxels of 0 or less let sizes grow across, and stay without one.
+    """
+    has_one = field.data > 0.0
+    data = np.where(has_one, field.data, NO_BOUND_MM).astype(np.float32)
     shape = (1,) * (3 - field.ndim) + field.shape
     steps = np.concatenate([np.zeros(3 - field.ndim), gradation * field.spacing]).astype(np.float32)
     _lower(data.reshape(shape), steps)
-    return Image(data, field.affine)
+    return Image(np.where(has_one, data, np.float32(0.0)), field.affine)
 
 
 @njit(cache=True, error_model="numpy")
