@@ -2,12 +2,20 @@ import naive
 import numba
 import numpy as np
 import pytest
-from scipy.ndimage import gaussian_filter, map_coordinates
+from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinates
 from scipy.ndimage import label as components
 from shapes import OBLIQUE, distance, grid
 
 import tetopt
-from tetopt.target.memberships import finer, finer_affine, memberships, supersampling
+from tetopt.target.memberships import (
+    FARTHEST_DISTANCE,
+    finer,
+    finer_affine,
+    gaussian,
+    memberships,
+    near_distance,
+    supersampling,
+)
 
 
 def between(members, first, second):
@@ -67,6 +75,24 @@ def test_a_level_as_by_its_plain_twin(shape):
     inside[14, 2], inside[3, 1] = True, False
     members = memberships(tetopt.Image(1.0 * inside))
     np.testing.assert_allclose(members.levels[members.channel[1]], naive.smooth_level(inside), atol=2e-5)
+
+
+@pytest.mark.parametrize("shape", [(19, 5, 4), (22, 9), (3, 40, 2), (1, 7, 30)])
+def test_filters_are_scipys_to_the_last_bit(shape):
+    rng = np.random.default_rng(0)
+    level = rng.normal(size=shape).astype(np.float32)
+    for sigma in (1.0, 3.0):
+        twin = gaussian_filter(level, sigma, mode="nearest", truncate=3.0)
+        assert gaussian(level, sigma).tobytes() == twin.tobytes()
+        assert (
+            gaussian(level.T, sigma).tobytes()
+            == gaussian_filter(level.T, sigma, mode="nearest", truncate=3.0).tobytes()
+        )
+    for share in (0.5, 0.97, 0.995):
+        inside = rng.random(shape) < share
+        inside.flat[3] = False
+        twin = np.minimum(distance_transform_edt(inside), FARTHEST_DISTANCE).astype(np.float32)
+        assert near_distance(inside).tobytes() == twin.tobytes()
 
 
 @pytest.mark.parametrize("radius", [3.0, 6.0, 9.0, 14.0])
