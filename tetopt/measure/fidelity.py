@@ -287,32 +287,49 @@ def surface_distances(
     InputError
         A surface without facets.
     """
-    import pyvista
-
     if len(surface_facets) == 0:
         raise InputError("surface: expected one facet or more, got none; nothing has a distance from it")
+    surface = FacetSurface(surface_points, surface_facets)
+    return _distances_from(points, surface, _areas_and_flat(surface)[1])
+
+
+def _distances_from(
+    points: NDArray[np.float64], surface: FacetSurface, is_flat: NDArray[np.bool_]
+) -> NDArray[np.float64]:
+    """As `surface_distances`, of a surface of whose facets it is known which are flat."""
+    import pyvista
+    from vtkmodules.vtkCommonCore import mutable
+    from vtkmodules.vtkCommonDataModel import vtkGenericCell, vtkStaticCellLocator
+
     if points.shape[1] == 3:
-        size = np.ptp(surface_points[surface_facets], axis=1).max(axis=1)
-        is_flat = surface_areas(FacetSurface(surface_points, surface_facets)) <= FLAT_AREA_SHARE * size**2
-        edges = surface_facets[is_flat][:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
-        surface = pyvista.PolyData(surface_points, faces=_vtk_cells(surface_facets), lines=_vtk_cells(edges))
+        edges = surface.facets[is_flat][:, [[0, 1], [1, 2], [2, 0]]].reshape(-1, 2)
+        grid = pyvista.PolyData(surface.points, faces=_vtk_cells(surface.facets), lines=_vtk_cells(edges))
     else:
         points = _in_space(points)
-        surface = pyvista.PolyData(_in_space(surface_points), lines=_vtk_cells(surface_facets))
+        grid = pyvista.PolyData(_in_space(surface.points), lines=_vtk_cells(surface.facets))
     # Not compute_implicit_distance: it looks for the side too, and crashes on flat triangles.
-    _, nearest = surface.find_closest_cell(points, return_closest_point=True)
-    return np.linalg.norm(nearest - points, axis=1)
+    locator, cell = vtkStaticCellLocator(), vtkGenericCell()
+    locator.SetDataSet(grid)
+    locator.BuildLocator()
+    of_cell, of_part, square, place = mutable(0), mutable(0), mutable(0.0), [0.0, 0.0, 0.0]
+    nearest: list[float] = []
+    for point in points.tolist():
+        locator.FindClosestPoint(point, place, cell, of_cell, of_part, square)  # type: ignore[call-overload]
+        nearest.extend(place)
+    return np.linalg.norm(np.array(nearest).reshape(points.shape) - points, axis=1)
 
 
-def evenly_spread(surface: FacetSurface, count: int) -> NDArray[np.float64]:
+def evenly_spread(surface: FacetSurface, count: int, areas: NDArray[np.float64] | None = None) -> NDArray[np.float64]:
     """`count` points on a surface, (count, n) float64, each for the same area (length in 2-D); always the same ones.
+
+    `areas` (T,) are its facets', if they are known.
 
     The facets' areas are laid in a row, and point i falls into the i-th of `count` equal parts of it. Where in the
     part changes from point to point: always in its middle, every second of equal facets could be left out.
     """
     points, nodes = surface
     place = np.arange(1, count + 1)[:, None] * EVEN_STEPS[points.shape[1]] % 1.0
-    end = np.cumsum(surface_areas(surface))
+    end = np.cumsum(surface_areas(surface) if areas is None else areas)
     at = np.searchsorted(end, (np.arange(count) + place[:, 0]) / count * end[-1], side="right")
     at, place = np.minimum(at, len(nodes) - 1), place[:, 1:]  # rounding may pass the last
     is_beyond = place.sum(axis=1) > 1.0
@@ -398,21 +415,31 @@ def _distances(one: FacetSurface, other: FacetSurface, face: float) -> tuple[NDA
     """From points of each of two surfaces to the other, equally dense on both; no points if a surface is empty."""
     if len(one.facets) == 0 or len(other.facets) == 0:
         return np.empty(0), np.empty(0)
-    areas = [float(surface_areas(surface).sum()) for surface in (one, other)]
-    density = min(max(POINTS_PER_FACE / face, FEWEST_POINTS / max(areas)), MOST_POINTS / max(areas))
-    spread = [evenly_spread(s, max(ceil(density * area), 1)) for s, area in zip((one, other), areas, strict=True)]
-    return surface_distances(spread[0], *other), surface_distances(spread[1], *one)
+    (areas, is_flat), (areas_there, is_flat_there) = _areas_and_flat(one), _areas_and_flat(other)
+    total, total_there = float(areas.sum()), float(areas_there.sum())
+    largest = max(total, total_there)
+    density = min(max(POINTS_PER_FACE / face, FEWEST_POINTS / largest), MOST_POINTS / largest)
+    spread = evenly_spread(one, max(ceil(density * total), 1), areas)
+    spread_there = evenly_spread(other, max(ceil(density * total_there), 1), areas_there)
+    return _distances_from(spread, other, is_flat_there), _distances_from(spread_there, one, is_flat)
 
 
 def surface_areas(surface: FacetSurface) -> NDArray[np.float64]:
     """Area of each triangle, length of each segment, (T,) float64."""
+    return _areas_and_flat(surface)[0]
+
+
+def _areas_and_flat(surface: FacetSurface) -> tuple[NDArray[np.float64], NDArray[np.bool_]]:
+    """`surface_areas`, and which triangles are flat; no segment is."""
     nodes = surface.facets.T
     corners = [np.ascontiguousarray(axis)[nodes] for axis in surface.points.T]  # axis by axis: three times as fast
     along = [corner[1:] - corner[0] for corner in corners]
     if len(along) == 2:
-        return np.hypot(along[0][0], along[1][0])
+        return np.hypot(along[0][0], along[1][0]), np.zeros(len(surface.facets), dtype=bool)
     (ax, bx), (ay, by), (az, bz) = along
-    return 0.5 * np.sqrt((ay * bz - az * by) ** 2 + (az * bx - ax * bz) ** 2 + (ax * by - ay * bx) ** 2)
+    areas = 0.5 * np.sqrt((ay * bz - az * by) ** 2 + (az * bx - ax * bz) ** 2 + (ax * by - ay * bx) ** 2)
+    size = np.maximum.reduce([corner.max(axis=0) - corner.min(axis=0) for corner in corners])
+    return areas, areas <= FLAT_AREA_SHARE * size**2
 
 
 def _mean_and_p95(distances: NDArray[np.float64]) -> tuple[float, float]:
