@@ -218,7 +218,7 @@ def test_a_flip_is_worth_what_it_says():
     engine = random_case(11, 3)
     n_cells, room = len(engine.cells), len(engine.complex.cells)
     gain, move = np.zeros(n_cells), np.full(n_cells, -1)
-    flips._evaluate(gain, move, np.ones(room, dtype=bool), engine.state)
+    flips._evaluate(gain, move, np.arange(n_cells), np.ones(room, dtype=bool), engine.state)
     best = int(np.argmax(gain))
     E = engine.E
     work = flips.cavity(room, engine.complex.fluxes.shape[2])
@@ -339,10 +339,11 @@ def test_removing_an_edge_takes_the_best_triangulation():
     engine = random_case(23, 3)
     work = flips.cavity(0, 3)
     ring, around = work.ring, work.around
+    cells, across, is_all = engine.complex.cells, engine.complex.across, np.ones(len(engine.cells), dtype=bool)
     edges = gained = 0
     for cell in range(len(engine.cells)):
         for i, j in flips.TET_EDGES:
-            m, is_open = flips.ring_of_edge(ring, around, engine.complex.cells, engine.complex.across, cell, i, j, True)
+            m, is_open = flips.ring_of_edge(ring, around, cells, across, cell, i, j, is_all)
             if m < 3 or is_open:
                 continue
             a, b = engine.complex.cells[cell, i], engine.complex.cells[cell, j]
@@ -399,7 +400,9 @@ def test_edges_with_many_cells_are_left_alone():
         ring, around = room[: flips.POLYGON_CORNERS], np.full(flips.POLYGON_CORNERS, -7)
         for cell in range(12):
             for i, j in flips.TET_EDGES:
-                m, _ = flips.ring_of_edge(ring, around, engine.complex.cells, engine.complex.across, cell, i, j, False)
+                m, _ = flips.ring_of_edge(
+                    ring, around, engine.complex.cells, engine.complex.across, cell, i, j, np.zeros(0, dtype=bool)
+                )
                 is_axis = set(engine.complex.cells[cell, [i, j]].tolist()) == {0, 1}
                 assert m == 0 if is_axis else m in (2, 3)
         assert (room[flips.POLYGON_CORNERS :] == -7).all()

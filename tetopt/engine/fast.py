@@ -156,14 +156,15 @@ def optimize(
             run.attract(min(ATTRACTED_FLOOR, floor) if iteration <= n_early else floor)
         # 1. Move the nodes.
         is_finished = run.sweep(is_over)
-        # 2. Exchange cells.
-        n_changes = run.flip() if is_finished else 0
+        # 2. Exchange cells: where nodes are exchanged next, only at first, for cells change around them anyway.
+        is_early = nodes is not None and iteration <= n_early
+        does_exchange = is_early and is_finished and iteration % 2 == 1
+        n_changes = run.flip() if is_finished and (iteration == 1 or not does_exchange) else 0
         movement = run.movement(before)
         is_new = has_labels and iteration <= LABELLED_AT  # E is another one from then on: nothing has settled yet
         fall = np.inf if is_new else 1.0 - run.E() / history[-1].E if history[-1].E > 0.0 else 0.0
         # 3. Exchange nodes: in every other one of the first iterations.
-        is_early = nodes is not None and iteration <= n_early
-        if nodes is not None and is_early and is_finished and iteration % 2 == 1:
+        if nodes is not None and does_exchange:
             n_changes += run.exchange_towards(nodes, sizes)
         # 4. Lift what is under the floor: in the last iteration.
         is_last = iteration == iterations or not is_finished or (fall < tolerance and not is_early)

@@ -131,11 +131,12 @@ def flip(
         if len(dirty) - n_cells < n_cells // 8 + 32:
             state = grown(state)
             dirty = np.concatenate([dirty, np.zeros(len(state.complex.cells) - len(dirty), dtype=np.bool_)])
+        near = np.flatnonzero(dirty[:n_cells])
         gain, move = np.zeros(n_cells), np.full(n_cells, -1, dtype=np.int64)
-        _evaluate(gain, move, dirty, state)
-        order = np.flatnonzero(move >= 0)
+        _evaluate(gain, move, near, dirty, state)
+        order = near[move[near] >= 0]
         order = order[np.lexsort((order, -gain[order]))]
-        dirty[:] = False
+        dirty[near] = False
         work = cavity(len(state.complex.cells), state.complex.fluxes.shape[2])
         n_made = make_moves(order, move, dirty, state, work)
         if n_made == 0:
@@ -147,13 +148,16 @@ def flip(
     return state, n_moves
 
 
-def _evaluate(gain: NDArray, move: NDArray, is_dirty: NDArray, state: State) -> None:
-    """The move worth most of each cell, and its worth, to `move` (C,) and `gain` (C,)."""
-    with few_threads(len(gain) * 4):
+def _evaluate(gain: NDArray, move: NDArray, near: NDArray, is_dirty: NDArray, state: State) -> None:
+    """The move worth most of each of the cells `near`, those marked dirty, and its worth, to `move` and `gain` (C,).
+
+    Each facet and edge is looked at by the lowest of the dirty cells that have it.
+    """
+    with few_threads(len(near) * 4):
         task = _evaluate_triangles if state.complex.cells.shape[1] == 3 else _evaluate_cells
         rooms = [cavity(0, state.complex.fluxes.shape[2]) for _ in range(get_num_threads())]
-        work = Evaluation(gain, move, is_dirty, state, rooms)
-        run(task, (len(gain) + CELLS_PER_CHUNK - 1) // CELLS_PER_CHUNK, work)
+        work = Evaluation(gain, move, near, is_dirty, state, rooms)
+        run(task, (len(near) + CELLS_PER_CHUNK - 1) // CELLS_PER_CHUNK, work)
 
 
 class Evaluation(NamedTuple):
@@ -161,6 +165,7 @@ class Evaluation(NamedTuple):
 
     gain: Floats1  # (C,) of each cell's best move
     move: Ints1  # (C,) which
+    near: Ints1  # the cells that are marked in `is_dirty`
     is_dirty: Bools1  # (C,) only cavities with one of these are looked at
     state: State
     rooms: list[Cavity]  # one for each thread
@@ -169,26 +174,26 @@ class Evaluation(NamedTuple):
 @unit
 def _evaluate_cells(search: Evaluation, chunk: int) -> None:
     """Moves 0 to 3 flip that facet, 4 to 9 remove an edge of `TET_EDGES`."""
-    gain, move, is_dirty, state = search.gain, search.move, search.is_dirty, search.state
+    gain, move, near, is_dirty, state = search.gain, search.move, search.near, search.is_dirty, search.state
     work, complex_ = nth(search.rooms, thread()), state.complex
     first = chunk * CELLS_PER_CHUNK
-    for cell in range(first, min(first + CELLS_PER_CHUNK, len(gain))):
+    for number in range(first, min(first + CELLS_PER_CHUNK, len(near))):
+        cell = near[number]
         for k in range(4):
             other = complex_.across[cell, k]
-            if other > cell and (is_dirty[cell] or is_dirty[other]) and not is_interface(complex_, cell, k):
+            is_others = 0 <= other < cell and is_dirty[other]  # the cell beyond looks at the facet
+            if other >= 0 and not is_others and not is_interface(complex_, cell, k):
                 worth = _worth_of_face(work, state, cell, k)
                 if worth > gain[cell]:
                     gain[cell], move[cell] = worth, k
         for e in range(6):
             i, j = TET_EDGES[5 - e, 0], TET_EDGES[5 - e, 1]  # the other two corners, opposite the edge's two facets
-            if 0 <= complex_.across[cell, i] < cell or 0 <= complex_.across[cell, j] < cell:
+            one, other = complex_.across[cell, i], complex_.across[cell, j]
+            if (0 <= one < cell and is_dirty[one]) or (0 <= other < cell and is_dirty[other]):
                 continue  # a lower cell has the edge too, and looks at it
             i, j = TET_EDGES[e, 0], TET_EDGES[e, 1]
-            m, is_open = ring_of_edge(work.ring, work.around, complex_.cells, complex_.across, cell, i, j, True)
-            dirty = False
-            for r in range(m - is_open):
-                dirty = dirty or is_dirty[work.around[r]]
-            if not dirty:
+            m, is_open = ring_of_edge(work.ring, work.around, complex_.cells, complex_.across, cell, i, j, is_dirty)
+            if m == 0:
                 continue
             worth = _worth_of_edge(work, state, complex_.cells[cell, i], complex_.cells[cell, j], m, is_open)
             if worth > gain[cell]:
@@ -254,13 +259,14 @@ def _squares_by_axis(y: NDArray, a: int, b: int, c: int) -> float:
 
 @unit
 def ring_of_edge(
-    ring: Ints1, around: Ints1, cells: Ints2, across: Ints2, cell: int, i: int, j: int, owned: bool
+    ring: Ints1, around: Ints1, cells: Ints2, across: Ints2, cell: int, i: int, j: int, looks: Bools1
 ) -> tuple[int, int]:
     """The cells around the edge of a cell between its corners i and j, and the polygon of their other corners.
 
     Turning from a to b to the right: cell r holds a, b, ring[r] and ring[r + 1]. Returns the polygon's number of
     corners, and 1 if it is open, that is if the edge is on the boundary; then there is one cell less than corners. The
-    number is 0 if it would be more than `POLYGON_CORNERS` or, with `owned`, if `cell` is not the lowest of the cells.
+    number is 0 if it would be more than `POLYGON_CORNERS`, or if a lower cell looks at the edge: one marked in `looks`
+    (C,); with (0,) none does.
     """
     a, b = cells[cell, i], cells[cell, j]
     # The other two corners, so that (a, b, v, w) is positively oriented.
@@ -284,7 +290,7 @@ def ring_of_edge(
         if before < 0 or before == cell:
             break
         steps += 1
-        if steps > POLYGON_CORNERS or (owned and before < cell):
+        if steps > POLYGON_CORNERS or (before < min(cell, len(looks)) and looks[before]):
             return 0, 0
         current, front, back = before, back, _fourth_node(cells, before, a, b, back)
     is_open = 1 if across[current, corner_of(cells, current, front)] < 0 else 0
@@ -304,7 +310,7 @@ def ring_of_edge(
             return count + 1, 1
         if after == first:
             return count, 0
-        if count == POLYGON_CORNERS or (owned and after < cell):
+        if count == POLYGON_CORNERS or (after < min(cell, len(looks)) and looks[after]):
             return 0, 0
         ring[count] = front
         current, back, front = after, front, _fourth_node(cells, after, a, b, front)
@@ -588,7 +594,7 @@ def make_moves(order: NDArray, move: NDArray, is_dirty: NDArray, state: State, w
             flip_face(work, state, cell, move[cell], is_dirty)
         else:
             i, j = TET_EDGES[move[cell] - 4]
-            m, is_open = ring_of_edge(work.ring, work.around, cells, across, cell, i, j, False)
+            m, is_open = ring_of_edge(work.ring, work.around, cells, across, cell, i, j, is_dirty[:0])
             clean = m > 0
             for r in range(m - is_open):
                 clean = clean and not is_dirty[work.around[r]]
@@ -800,13 +806,15 @@ def close_gaps(state: State, is_dirty: Bools1) -> None:
 @unit
 def _evaluate_triangles(search: Evaluation, chunk: int) -> None:
     """Moves 0 to 2 turn that edge."""
-    gain, move, is_dirty, state = search.gain, search.move, search.is_dirty, search.state
+    gain, move, near, is_dirty, state = search.gain, search.move, search.near, search.is_dirty, search.state
     x, sums, complex_ = np.empty((4, 3)), np.empty((2, state.complex.sums.shape[1])), state.complex
     first = chunk * CELLS_PER_CHUNK
-    for cell in range(first, min(first + CELLS_PER_CHUNK, len(gain))):
+    for number in range(first, min(first + CELLS_PER_CHUNK, len(near))):
+        cell = near[number]
         for k in range(3):
             other = complex_.across[cell, k]
-            if other > cell and (is_dirty[cell] or is_dirty[other]) and not is_interface(complex_, cell, k):
+            is_others = 0 <= other < cell and is_dirty[other]  # the triangle beyond looks at the edge
+            if other >= 0 and not is_others and not is_interface(complex_, cell, k):
                 worth = _worth_of_turn(x, sums, state, cell, k)
                 if worth > gain[cell]:
                     gain[cell], move[cell] = worth, k

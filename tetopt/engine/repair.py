@@ -133,7 +133,7 @@ def _reconnect(state: State, bad: NDArray, target: float, work: Cavity) -> int:
                     best, choice = gain, k
         for e in range(6):
             i, j = TET_EDGES[e, 0], TET_EDGES[e, 1]
-            m, is_open = ring_of_edge(work.ring, work.around, cells, across, cell, i, j, False)
+            m, is_open = ring_of_edge(work.ring, work.around, cells, across, cell, i, j, is_changed[:0])
             gain = _gain_of_edge(work, state, cell, e, m, is_open, target)
             if gain > best:
                 best, choice = gain, 4 + e
@@ -144,7 +144,7 @@ def _reconnect(state: State, bad: NDArray, target: float, work: Cavity) -> int:
         else:
             e = choice - 4
             i, j = TET_EDGES[e, 0], TET_EDGES[e, 1]
-            m, is_open = ring_of_edge(work.ring, work.around, cells, across, cell, i, j, False)
+            m, is_open = ring_of_edge(work.ring, work.around, cells, across, cell, i, j, is_changed[:0])
             _gain_of_edge(work, state, cell, e, m, is_open, target)
             a, b = cells[cell, i], cells[cell, j]
             if state.objective.image > 0.0:
