@@ -13,10 +13,10 @@ import tetopt
 from tetopt.energy.geometric import E_G_gradient, cell_E_G
 from tetopt.energy.sampling import from_ticks
 from tetopt.engine import flips
-from tetopt.engine.complex import build, cosine_up_to_floor, energies, node_rings
+from tetopt.engine.complex import build, cosine_up_to_floor, energies, node_rings, remeasure
 from tetopt.engine.fast import Run
 from tetopt.engine.repair import n_cells_below
-from tetopt.engine.smooth import gradient
+from tetopt.engine.smooth import _add_image_gradient, _add_shape_gradient, gradient
 from tetopt.engine.state import floor_of
 from tetopt.geometry.simplex import dihedral_angles, oriented
 from tetopt.geometry.topology import boundary_facets
@@ -87,6 +87,51 @@ def test_shape_gradient(n, power):
     if power == 1.0:
         expected = engine.objective.geometry * E_G_gradient(mesh.points, mesh.cells)
         np.testing.assert_allclose(shape[:, 3 - n :], expected, rtol=1e-6, atol=1e-12)
+
+
+@pytest.mark.parametrize("is_graded", [False, True])
+@pytest.mark.parametrize("n", [2, 3])
+def test_shape_curvature(n, is_graded):
+    """Against central differences of the gradient."""
+    engine = random_case(5, n, OBLIQUE if n == 3 else None, 2.2)
+    state = engine.state._replace(objective=engine.objective._replace(is_graded=is_graded))
+    rings, matrix = node_rings(state), state.objective.matrix * 2.0**-state.objective.bits  # mm per tick
+    step = int(1e-4 / np.abs(matrix).max())
+
+    def derivatives(node):
+        g, H = np.zeros(3), np.zeros((3, 3))
+        remeasure(state)
+        _add_shape_gradient(g, H, np.empty((4, 3)), state, rings, node)
+        return g, H
+
+    for node in range(0, len(state.complex.ticks), 5):
+        expected, here = np.zeros((3, 3)), state.complex.ticks[node].copy()
+        _, H = derivatives(node)
+        for axis in range(3 - n, 3):
+            ends = []
+            for sign in (1, -1):
+                state.complex.ticks[node, axis] = here[axis] + sign * step
+                ends.append(derivatives(node)[0])
+            state.complex.ticks[node] = here
+            expected[axis] = (ends[0] - ends[1]) / (2 * step)  # per tick along the axis
+        got = (matrix.T @ H)[3 - n :, 3 - n :]
+        np.testing.assert_allclose(got, expected[3 - n :, 3 - n :], rtol=1e-5, atol=1e-7 * np.abs(expected).max())
+
+
+def test_image_curvature_at_a_step():
+    """Where the image steps across a facet that is nearly there already, E_D bends; in a uniform image it does not."""
+    data = np.where(np.arange(40)[:, None, None] > 20, 100.0, 20.0) * np.ones((40, 36, 32))
+    image = tetopt.Image(data)
+    mesh = tetopt.lattice(image, blocks=(2, 2, 2))
+    engine = Engine(image, mesh, 0.5)
+    rings = node_rings(engine.state)
+    for node in range(len(mesh.points)):
+        g, H = np.zeros(3), np.zeros((3, 3))
+        _add_image_gradient(g, H, engine.state, rings, node)
+        assert np.linalg.eigvalsh(H).min() >= -1e-12 * np.abs(H).max()
+        if abs(mesh.points[node, 0] - 20.0) < 1.0:
+            assert H[0, 0] > 0.0
+            assert H[0, 0] >= max(H[1, 1], H[2, 2])
 
 
 @pytest.mark.parametrize(("n", "turned"), [(2, False), (3, False), (3, True)])

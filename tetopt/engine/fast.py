@@ -1,6 +1,6 @@
 """The fast engine: the paper's energy, minimised by analytic gradients and energy-driven flips, with a floor on angles.
 
-Each iteration moves every node down the gradient of its ring's energy (`smooth`) and then exchanges cells wherever
+Each iteration moves the nodes that can hope to lower their rings' energies (`smooth`) and then exchanges cells wherever
 that lowers E (`flips`), which takes the place of Delaunay re-tessellation. No move takes a dihedral angle under the
 floor, and a lattice starts far above it, so E falls from first to last, unless nodes are brought between labels.
 Cells of other initial meshes that are under the floor are mended at the end (`repair`), if nothing else has lifted
@@ -47,7 +47,7 @@ from tetopt.target.content import Content, plain
 from tetopt.target.content import content as make_content
 
 FLIP_EDGES = 0.05  # edges: nodes that moved less need no new flips
-SWEEP_EDGES = 0.02  # edges: nodes around which none moved more are not moved again
+HOPE_SHARE = 0.01  # of E over the number of nodes: nodes whose next move may win less are not moved
 EXCHANGING_SHARE = 0.7  # of the iterations: the first ones, in which nodes are exchanged
 EXCHANGED_SHARE = 0.1  # of the requested nodes: the most that are exchanged at once
 EXCHANGE_SHAPE_WEIGHT = 0.1  # of the shape energy's weight: what a shape costs in an exchange, see `Run.exchange`
@@ -224,7 +224,7 @@ class Run:
         self.has_labels = False
         self.image_noise: float | None = None  # its variance, estimated when it is first needed
         self.ticks_flipped = np.full_like(ticks, FAR_TICKS)  # where nodes were when their flips were last looked at
-        self.ticks_swept = np.full_like(ticks, FAR_TICKS)  # and when the nodes around them were moved because of it
+        self.hope = np.full(len(ticks), np.inf)  # what each node's next move may win, (N,); see `sweep`
 
     @property
     def is_still(self) -> NDArray[np.bool_]:
@@ -243,10 +243,19 @@ class Run:
         return objective.geometry * E_G + objective.image * squares + interface_energy(self.state)
 
     def sweep(self, is_over: Callable[[], bool] = lambda: False) -> bool:
-        """Move every node whose ring has changed since it was last moved; False if `is_over` cut it short."""
-        is_near = np.zeros(len(self.ticks_swept), dtype=bool)
-        is_near[self.cells[self._moved(self.ticks_swept, SWEEP_EDGES)[self.cells].any(axis=1)]] = True
-        return sweep(self.state, node_rings(self.state), self.groups, is_near & ~self.is_still, is_over)
+        """Move the nodes that may win something; False if `is_over` cut it short.
+
+        A node may win what its last move did, and what has been won around it since then: the mean over its
+        neighbours, sweep by sweep. It is left alone until that is a share of E. One whose cells were exchanged may win
+        anything.
+        """
+        gains = np.zeros(len(self.hope))
+        is_active = (self.hope > HOPE_SHARE * self.E() / len(gains)) & ~self.is_still
+        is_finished = sweep(self.state, node_rings(self.state), self.groups, is_active, is_over, gains)
+        around = np.bincount(self.cells.ravel(), np.repeat(gains[self.cells].sum(axis=1), self.n + 1), len(gains))
+        number = np.bincount(self.cells.ravel(), minlength=len(gains))
+        self.hope = np.where(is_active, gains, self.hope) + (around / np.maximum(number, 1) - gains) / self.n
+        return is_finished
 
     def flip(self) -> int:
         """Exchange cells around the nodes that have moved; the number of exchanges."""
@@ -254,7 +263,7 @@ class Run:
         is_dirty = moved[self.cells].any(axis=1)
         is_touched = np.zeros(len(moved), dtype=bool)
         self.state, n_flips = flip(self.state, np.asarray(is_dirty), is_touched=is_touched)
-        self.ticks_swept[is_touched] = FAR_TICKS
+        self.hope[is_touched] = np.inf
         return n_flips
 
     def _moved(self, since: NDArray[np.int64], share: float) -> NDArray[np.bool_]:
@@ -294,7 +303,7 @@ class Run:
         eager = objective._replace(geometry=EXCHANGE_SHAPE_WEIGHT * objective.geometry)
         made = exchange(self.state._replace(objective=eager), nodes, int(EXCHANGED_SHARE * nodes), limits)
         self._renumber(made.state._replace(objective=objective), made.source)
-        self.ticks_swept[made.is_touched] = FAR_TICKS
+        self.hope[made.is_touched] = np.inf
         self.ticks_flipped[made.is_touched] = FAR_TICKS
         return made.n_split + made.n_collapsed
 
@@ -302,7 +311,7 @@ class Run:
         """Give each cell a label, and let nodes between labels slide from now on."""
         self.state = with_labels(self.state, self.content, self.mesh())
         self.has_labels = True
-        self.ticks_swept[:] = FAR_TICKS
+        self.hope[:] = np.inf
         self.ticks_flipped[:] = FAR_TICKS
 
     def attract(self, degrees: float) -> None:
@@ -310,11 +319,15 @@ class Run:
 
         No angle gets under `degrees` by it; within a mask, where `lift` may be given up, none under the floor.
         """
+        ticks, labels = self.state.complex.ticks.copy(), self.state.complex.labels.copy()
         relabel(self.state)
         lowest = floor_of(degrees)[0]
         if self.content.region is not None:
             lowest = max(lowest, self.state.objective.floor)
         attract(self.state, node_rings(self.state), self.groups, lowest)
+        is_other = (self.state.complex.ticks != ticks).any(axis=1)[self.cells].any(axis=1)
+        is_other |= (self.state.complex.labels != labels)[: self.n_cells]
+        self.hope[self.cells[is_other]] = np.inf
 
     def keep_floor(self, degrees: float) -> None:
         """Let no move leave a dihedral angle under `degrees`, nor one that is under it already any smaller."""
@@ -336,7 +349,7 @@ class Run:
             self.state = before
             return 0
         self._renumber(made.state, made.source)
-        self.ticks_swept[:] = FAR_TICKS
+        self.hope[:] = np.inf
         return made.n_moves
 
     def _overlaps(self, state: State) -> bool:
@@ -351,7 +364,7 @@ class Run:
         is_new = (source < 0)[:, None]
         self.state = state
         self.ticks_flipped = np.where(is_new, FAR_TICKS, self.ticks_flipped[source])
-        self.ticks_swept = np.where(is_new, FAR_TICKS, self.ticks_swept[source])
+        self.hope = np.where(is_new[:, 0], np.inf, self.hope[source])
         self.groups, self.edge = blocks(state.complex.ticks), _edges(self.points(), self.cells)
 
     def movement(self, before: NDArray[np.int64]) -> float:

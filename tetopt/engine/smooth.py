@@ -1,9 +1,10 @@
-"""Moving nodes along the analytic gradient of E, groups of one colour at a time.
+"""Moving nodes by Newton steps on the E of their rings, groups of one colour at a time.
 
 The shape energy's derivative is in closed form. That of E_D, connectivity fixed, needs only the facets around the
 node: with hbar_j the mean of cell j, dE_D/dx_a is the sum over the cells of the integral of (h - hbar_j)^2 phi_a n
 over their facets, phi_a the node's hat function and n the outward normal; hbar's own change drops out, because it is
 the minimiser. Two cells share a facet with opposite normals, so what counts is (h - hbar_j)^2 - (h - hbar_i)^2.
+The second derivative of the shape energy is exact; of E_D's it is the part in which h changes across the facets.
 
 Groups of nodes of one colour share no cell, so each is worked on, and its rings rewritten, at the same time as the
 others; the result does not depend on the threads. A move is made only if no cell of the ring loses its orientation
@@ -68,12 +69,15 @@ from tetopt.kernels import (
 )
 
 FACET_PARTS = 8  # most parts that a facet's edge is cut into when h is integrated over it; four times as many in 2-D
-PART_VOXELS = 2.0  # voxels between the points at which h is then taken
-FIRST_STEP_SHARE = 0.5  # of the distance to the nearest centroid of the ring's cells: the longest first step
-PROBE_SHARE = 0.3  # of that step: how far a stalled node looks along the axes
+PART_VOXELS = 3.0  # voxels between the points at which h is then taken
+FACET_ASIDE = 0.25  # how far to either side of them: E falls by less per sweep at 0.05 as at 0.5
+BEND_SHARE = 0.4  # of the image's own curvature: jumps of h end within voxels, and steps are longer than that
+FLAT_BEND = 1e-9  # a curvature's determinant over the product of its diagonal: below, it is nothing to divide by
+FIRST_STEP_SHARE = 0.4  # of the distance to the nearest centroid of the ring's cells: the longest first step
+AXIS_STEP_SHARE = 0.1  # of that distance: how far a stalled node looks along the axes
 BLOCK_NODES = 128  # nodes in a group, at most: what they read fits the cache
 APPROACH_TRIALS = 4  # of the way to a surface: all of it, a half, ...
-LINE_TRIALS = 3  # energies measured along the gradient, at most
+LINE_TRIALS = 2  # energies measured along the step: a third gains a twentieth of what the axes do
 
 
 class Blocks(NamedTuple):
@@ -106,19 +110,22 @@ def sweep(
     groups: Blocks,
     may_move: NDArray[np.bool_],
     is_over: Callable[[], bool] = lambda: False,
+    gains: NDArray[np.float64] | None = None,
 ) -> bool:
     """Move the nodes that may, `may_move` (N,), each along the axes, and on the surface, that `is_frozen` leaves it.
 
+    By how much E falls with the move of each goes to `gains` (N,).
     Groups of one colour share no cell, and are worked on at the same time, their nodes one after the other: those read
     the same voxels, 1.5 to 2 times faster from the cache than nodes of one colour all over the volume. Returns False if
     `is_over` cut it short, between two colours.
     """
+    gains = np.zeros(len(may_move)) if gains is None else gains
     laid_out = packed(state), packed(rings), packed(groups)
     for chosen in colours_of(state, rings, groups):
         if is_over():
             return False
         with few_threads(len(chosen) * BLOCK_NODES * 100):
-            run(_sweep, len(chosen), Sweep(*laid_out, chosen, may_move))
+            run(_sweep, len(chosen), Sweep(*laid_out, chosen, may_move, gains))
     return True
 
 
@@ -152,43 +159,38 @@ def gradient(state: State, rings: NodeRings) -> tuple[NDArray[np.float64], NDArr
 
 
 @unit
-def _facet_moments(moment: Floats1, ticks: Ints2, node: int, b: int, c: int, objective: Objective) -> float:
-    """Means of phi and h phi over the facet (node, b, c), or the segment (node, b), phi the node's hat function.
+def _facet_moments(
+    moment: Floats2, ticks: Ints2, node: int, b: int, c: int, aside: tuple[float, float, float], objective: Objective
+) -> float:
+    """Means of phi, h phi and phi^2 dh over the facet (node, b, c), or the segment (node, b), phi the hat function.
 
-    Those of h phi go to `moment` (n_channels,), h a voxel's values less the grid's shift; 1/3 (1/2 in 2-D) is the mean
-    of phi itself.
+    h is the mean of the voxels `aside` of a place, to and from, in voxels, less the grid's shift, and dh what the one
+    is more than the other. moment (2, n_channels) gets the means of h phi and of phi^2 dh; that of phi is returned,
+    1/3 (1/2 in 2-D).
     """
     if objective.is_short:
-        return _moments_of(moment, objective.short_prefix, ticks, node, b, c, objective)
-    return _moments_of(moment, objective.prefix, ticks, node, b, c, objective)
+        return _moments_of(moment, objective.short_prefix, ticks, node, b, c, aside, objective)
+    return _moments_of(moment, objective.prefix, ticks, node, b, c, aside, objective)
 
 
 @helper
 def _moments_of(
-    moment: NDArray, prefix: NDArray, ticks: NDArray, node: int, b: int, c: int, objective: Objective
+    moment: NDArray, prefix: NDArray, ticks: NDArray, node: int, b: int, c: int, aside: tuple, objective: Objective
 ) -> float:
-    n_more, scale = objective.n_channels - 1, 2.0**-objective.bits
-    for d in range(1 + n_more):
-        moment[d] = 0.0
+    scale, weight = 2.0**-objective.bits, 0.0
+    moment[:] = 0.0
     a = scaled(scale, row(ticks, node))
     e = minus(scaled(scale, row(ticks, b)), a)
-    most_i, most_j, most_k = prefix.shape[0] - 1, prefix.shape[1] - 1, prefix.shape[2] - 2
-    weight, first = 0.0, 0.0
     if c < 0:
         parts = min(max(int(np.sqrt(dot(e, e)) / PART_VOXELS) + 1, 2), 4 * FACET_PARTS)
         for p in range(parts):
             s = (p + 0.5) / parts
-            j = min(max(int(np.rint(a[1] + s * e[1])), 0), most_j)
-            k = min(max(int(np.rint(a[2] + s * e[2])), 0), most_k)
-            phi = 1.0 - s
-            weight += phi
-            first += phi * (prefix[0, j, k + 1, 0] - prefix[0, j, k, 0])
-            for d in range(n_more):
-                moment[1 + d] += phi * (prefix[0, j, k + 1, 2 + d] - prefix[0, j, k, 2 + d]) / parts
-        moment[0] = first / parts
+            weight += 1.0 - s
+            _add_sample(moment, prefix, (a[0], a[1] + s * e[1], a[2] + s * e[2]), aside, 1.0 - s, 1.0 / parts)
         return weight / parts
     f = minus(scaled(scale, row(ticks, c)), a)
     parts = min(max(int(np.sqrt(max(dot(e, e), dot(f, f))) / PART_VOXELS) + 1, 2), FACET_PARTS)
+    share = 1.0 / (parts * parts)
     for p in range(parts):
         for q in range(parts - p):
             for half in range(2):
@@ -196,25 +198,40 @@ def _moments_of(
                     continue
                 s = (p + (1.0 + half) / 3.0) / parts
                 t = (q + (1.0 + half) / 3.0) / parts
-                i = min(max(int(np.rint(a[0] + s * e[0] + t * f[0])), 0), most_i)
-                j = min(max(int(np.rint(a[1] + s * e[1] + t * f[1])), 0), most_j)
-                k = min(max(int(np.rint(a[2] + s * e[2] + t * f[2])), 0), most_k)
-                phi = 1.0 - s - t
-                weight += phi
-                first += phi * (prefix[i, j, k + 1, 0] - prefix[i, j, k, 0])
-                for d in range(n_more):
-                    moment[1 + d] += phi * (prefix[i, j, k + 1, 2 + d] - prefix[i, j, k, 2 + d]) / (parts * parts)
-    moment[0] = first / (parts * parts)
-    return weight / (parts * parts)
+                weight += 1.0 - s - t
+                at = a[0] + s * e[0] + t * f[0], a[1] + s * e[1] + t * f[1], a[2] + s * e[2] + t * f[2]
+                _add_sample(moment, prefix, at, aside, 1.0 - s - t, share)
+    return weight * share
+
+
+@helper
+def _add_sample(moment: NDArray, prefix: NDArray, at: tuple, aside: tuple, phi: float, share: float) -> None:
+    """Add a share of phi h and of phi^2 dh at a place, in voxels, to the rows of `moment`; see `_facet_moments`."""
+    most_i, most_j, most_k = prefix.shape[0] - 1, prefix.shape[1] - 1, prefix.shape[2] - 2
+    i = min(max(int(np.rint(at[0] + aside[0])), 0), most_i)
+    j = min(max(int(np.rint(at[1] + aside[1])), 0), most_j)
+    k = min(max(int(np.rint(at[2] + aside[2])), 0), most_k)
+    p = min(max(int(np.rint(at[0] - aside[0])), 0), most_i)
+    q = min(max(int(np.rint(at[1] - aside[1])), 0), most_j)
+    r = min(max(int(np.rint(at[2] - aside[2])), 0), most_k)
+    for channel in range(moment.shape[1]):
+        d = 0 if channel == 0 else 1 + channel
+        beyond = prefix[i, j, k + 1, d] - prefix[i, j, k, d]
+        before = prefix[p, q, r + 1, d] - prefix[p, q, r, d]
+        moment[0, channel] += share * phi * 0.5 * (beyond + before)
+        moment[1, channel] += share * phi * phi * (beyond - before)
 
 
 @unit
-def _add_image_gradient(g: Floats1, state: State, rings: NodeRings, node: int) -> None:
-    """Add the derivative of the weighted E_D by a node's position to g (3,), per mm."""
+def _add_image_gradient(g: Floats1, H: Floats2, state: State, rings: NodeRings, node: int) -> None:
+    """Add the derivative of the weighted E_D by a node's position to g (3,), and its curvature to H (3, 3), per voxel.
+
+    As a facet moves by phi along its normal, the jump of (h - hbar)^2 over it changes as h does there. Like in a
+    Gauss-Newton step that is all of the curvature that is taken, and only where it is positive.
+    """
     cells, sums, ticks, objective = state.complex.cells, state.complex.sums, state.complex.ticks, state.objective
     n, first, scale = cells.shape[1], rings.start[node], 2.0**-objective.bits
-    moment = np.empty(objective.n_channels)
-    g0, g1, g2 = 0.0, 0.0, 0.0  # per voxel along each axis
+    moment = np.empty((2, objective.n_channels))
     for r in range(first, rings.start[node + 1]):
         cell = rings.cells[r]
         for k in range(n):
@@ -226,29 +243,29 @@ def _add_image_gradient(g: Floats1, state: State, rings: NodeRings, node: int) -
             if _has_same_values(sums, cell, other, label_1, label_2, objective):
                 continue
             a, b, c = outward(cells, cell, k)
+            e = scaled(scale, difference(ticks, b, a))
             if n == 3:  # the segment (a, b), its normal to the right; phi of `node`
-                weight = _facet_moments(moment, ticks, node, b if a == node else a, -1, objective)
-                e = scaled(scale, difference(ticks, b, a))
                 normal = (0.0, e[2], -e[1])
+                b = a if b == node else b
             else:
+                normal = scaled(0.5, cross(e, scaled(scale, difference(ticks, c, a))))
                 if b == node:
-                    a, b, c = b, c, a
+                    b, c = c, a
                 elif c == node:
-                    a, b, c = c, a, b
-                weight = _facet_moments(moment, ticks, node, b, c, objective)
-                e, f = scaled(scale, difference(ticks, b, a)), scaled(scale, difference(ticks, c, a))
-                normal = scaled(0.5, cross(e, f))
-            jump = 0.0
+                    b, c = a, b
+            normal, area = scaled(float(objective.hand), normal), np.sqrt(dot(normal, normal))
+            weight = _facet_moments(moment, ticks, node, b, c, scaled(FACET_ASIDE / area, normal), objective)
+            jump, rise = 0.0, 0.0
             for channel in range(objective.n_channels):
                 value_1 = cell_value(sums, cell, label_1, channel, objective)
                 value_2 = cell_value(sums, other, label_2, channel, objective)
-                jump += (value_2 - value_1) * (2.0 * moment[channel] - (value_1 + value_2) * weight)
-            g0 += jump * normal[0]
-            g1 += jump * normal[1]
-            g2 += jump * normal[2]
-    factor, inverse = objective.image * objective.hand, state.sides.inverse
-    for d in range(3):
-        g[d] += factor * (inverse[0, d] * g0 + inverse[1, d] * g1 + inverse[2, d] * g2)
+                jump += (value_2 - value_1) * (2.0 * moment[0, channel] - (value_1 + value_2) * weight)
+                rise += (value_2 - value_1) * moment[1, channel]
+            bend = BEND_SHARE * max(rise, 0.0) / (FACET_ASIDE * area)
+            for d in range(3):
+                g[d] += objective.image * jump * normal[d]
+                for m in range(3):
+                    H[d, m] += objective.image * bend * normal[d] * normal[m]
 
 
 @helper
@@ -310,39 +327,39 @@ def ring_tension(state: State, rings: NodeRings, node: int) -> float:
 
 @unit
 def _add_shape_gradient(
-    g: Floats1, x: Floats2, state: State, rings: NodeRings, node: int
-) -> tuple[float, float, float]:
-    """Add the derivative of the weighted shape energy to g (3,), per mm.
+    g: Floats1, H: Floats2, x: Floats2, state: State, rings: NodeRings, node: int
+) -> tuple[float, float]:
+    """Add the weighted shape energy's derivatives to g (3,), per mm, and H (3, 3), per mm^2.
 
-    Returns a bound of its curvature, the distance in mm to the nearest centroid of the ring's cells, and the ring's
-    worst cosine, up to the floor.
+    Returns the distance in mm to the nearest centroid of the ring's cells, and the ring's worst cosine, up to the
+    floor.
     """
     cells, objective = state.complex.cells, state.objective
     n, power = cells.shape[1], objective.power
-    dim = n - 1
-    curvature, nearest, least = 0.0, np.inf, objective.floor
+    dim, nearest, least = n - 1, np.inf, objective.floor
+    # W is proportional to v^alpha S^p with alpha = 1 - 2 (p - 1) / n, on a graded mesh alpha = -2 p / n. The volume is
+    # linear in the corner's place, and S has the second derivative 2 n along each axis.
+    alpha = -2.0 * power / dim if objective.is_graded else 1.0 - 2.0 * (power - 1.0) / dim
     for r in range(rings.start[node], rings.start[node + 1]):
         cell, at = rings.cells[r], rings.corner[r]
         load_cell(x, state.complex.ticks, cells, cell, objective)
         volume, E_G = volume_and_E_G(x, n)
-        W = state.complex.E_shape[cell]
+        W = objective.geometry * state.complex.E_shape[cell]
         S = E_G * (n * (n + 1)) / volume
-        v = volume_gradient(x, at, n)
-        # W is proportional to v^alpha S^p with alpha = 1 - 2 (p - 1) / n, on a graded mesh alpha = -2 p / n.
-        alpha = -2.0 * power / dim if objective.is_graded else 1.0 - 2.0 * (power - 1.0) / dim
-        of_volume, of_edges = alpha / volume, power / S
-        squared = 0.0
+        apart = (0.0, 0.0, 0.0)
+        for k in range(n):
+            apart = minus(apart, difference(x, k, at))
+        nearest = min(nearest, dot(apart, apart))
+        v, w = scaled(1.0 / volume, volume_gradient(x, at, n)), scaled(2.0 / S, apart)
         for d in range(3):
-            apart = 0.0
-            for k in range(n):
-                apart += x[at, d] - x[k, d]
-            squared += apart * apart
-            g[d] += objective.geometry * W * (of_volume * v[d] + of_edges * 2.0 * apart)
-        curvature += objective.geometry * W * of_edges * 2.0 * n
-        nearest = min(nearest, squared)
+            slope = alpha * v[d] + power * w[d]
+            g[d] += W * slope
+            H[d, d] += W * power * 2.0 * dim / S
+            for m in range(3):
+                H[d, m] += W * (slope * (alpha * v[m] + power * w[m]) - alpha * v[d] * v[m] - power * w[d] * w[m])
         if n == 4 and least > -1.0:
             least = min(least, cosine_up_to_floor(x, objective))
-    return curvature, np.sqrt(nearest) / n, least
+    return np.sqrt(nearest) / n, least
 
 
 class Gradients(NamedTuple):
@@ -356,8 +373,10 @@ class Gradients(NamedTuple):
 
 @unit
 def _gradients(work: Gradients, node: int) -> None:
-    _add_shape_gradient(work.shape[node], np.empty((4, 3)), work.state, work.rings, node)
-    _add_image_gradient(work.image[node], work.state, work.rings, node)
+    g, H = np.zeros(3), np.zeros((3, 3))
+    _add_shape_gradient(work.shape[node], H, np.empty((4, 3)), work.state, work.rings, node)
+    _add_image_gradient(g, H, work.state, work.rings, node)
+    put_row(work.image, node, _per_mm(g, work.state))
 
 
 class Trial(NamedTuple):
@@ -485,6 +504,7 @@ class Sweep(NamedTuple):
     groups: Blocks
     chosen: Ints1  # (G,) the groups
     may_move: Bools1  # (N,)
+    gains: Floats1  # (N,) by how much E falls with the move of each; none are kept of `attract`
 
 
 @unit
@@ -492,7 +512,7 @@ def _sweep(work: Sweep, number: int) -> None:
     groups, block = work.groups, work.chosen[number]
     for at in range(groups.start[block], groups.start[block + 1]):
         if work.may_move[groups.nodes[at]]:
-            _move(groups.nodes[at], work.state, work.rings)
+            work.gains[groups.nodes[at]] = _move(groups.nodes[at], work.state, work.rings)
 
 
 class Search(NamedTuple):
@@ -511,22 +531,23 @@ class Search(NamedTuple):
 # Its steps, and those of `ring_energy`, are inlined: a sweep of calls took 12 % longer than one long function did,
 # inlined steps 3 to 8 % (MNI152 T1, 5,000 nodes, one thread).
 @unit
-def _move(node: int, state: State, rings: NodeRings) -> None:
-    """Move one node down the gradient of its ring's energy, if that lowers it."""
-    ticks, fluxes = state.complex.ticks, state.complex.fluxes
-    x, normal, g = np.empty((4, 3)), np.zeros((7, 3)), np.zeros(3)
+def _move(node: int, state: State, rings: NodeRings) -> float:
+    """Move one node towards the least energy of its ring, if that lowers it; returns by how much."""
+    ticks, fluxes, has_image = state.complex.ticks, state.complex.fluxes, state.objective.image > 0.0
+    x, normal, g, H = np.empty((4, 3)), np.zeros((7, 3)), np.zeros(3), np.zeros((3, 3))
     # A ring below the floor may stay as it is, but not get worse: hence the ring's own `least`.
-    curvature, nearest, least = _add_shape_gradient(g, x, state, rings, node)
-    if state.objective.image > 0.0:
-        _add_image_gradient(g, state, rings, node)
-        if state.objective.tension > 0.0 and state.complex.meeting[node, 1] >= 0:
-            _add_tension_gradient(g, state, rings, node)
+    nearest, least = _add_shape_gradient(g, H, x, state, rings, node)
+    if has_image and state.objective.tension > 0.0 and state.complex.meeting[node, 1] >= 0:
+        _add_tension_gradient(g, state, rings, node)
+    _turn_to_index(g, H, state.objective.matrix)
+    if has_image:
+        _add_image_gradient(g, H, state, rings, node)
     is_sliding = slides(normal, state, node)
-    step = _descent_step(normal, g, is_sliding, node, state)
-    moved = times(state.objective.matrix, step)  # mm
-    square = dot(moved, moved)
-    if not square > 0.0:
-        return
+    step = _sliding_step(normal, g, node, state) if is_sliding else _newton_step(g, H, node, state)
+    moved, slope = times(state.objective.matrix, step), g[0] * step[0] + g[1] * step[1] + g[2] * step[2]
+    square = dot(moved, moved)  # mm^2
+    if not (square > 0.0 and slope < 0.0):
+        return 0.0
     energy, size = ring_tension(state, rings, node), rings.start[node + 1] - rings.start[node]
     for r in range(rings.start[node], rings.start[node + 1]):
         energy += cell_energy(state, rings.cells[r])
@@ -536,30 +557,75 @@ def _move(node: int, state: State, rings: NodeRings) -> None:
     )  # fmt: skip
     search.best[0] = energy
     put_row(search.place, 0, row(ticks, node))
-    reach = FIRST_STEP_SHARE * nearest
-    length = min(1.0 / curvature, reach / np.sqrt(square))
-    _search_line(search, step, length, square, least, node, state, rings)
-    if not search.best[0] < energy and state.objective.image > 0.0:
-        _probe_axes(search, PROBE_SHARE * reach, least, node, state, rings)
+    length, bend = FIRST_STEP_SHARE * nearest / np.sqrt(square), dot(step, times(H, step))
+    if bend > 0.0:
+        length = min(length, -slope / bend)
+    _search_line(search, step, length, slope, least, node, state, rings)
+    if not search.best[0] < energy and has_image:
+        _search_axes(search, step, AXIS_STEP_SHARE * nearest, least, node, state, rings)
     put_row(ticks, node, row(search.place, 0))
     if search.best[0] < energy:
         slot = search.slot[0]
         store(Trial(x, search.shapes[slot], search.fluxes[slot]), node, state, rings)
+    return energy - search.best[0]
 
 
 @inlined
-def _descent_step(normal: NDArray, g: NDArray, is_sliding: bool, node: int, state: State) -> tuple:
-    """Down the gradient g (3,), per mm, along the axes and the surface on which the node may move; in index units."""
-    down = times(projection_at(state, node), (g[0], g[1], g[2]))
-    step = (-down[0], -down[1], -down[2])
-    if is_sliding:
-        count = normals_at(normal, state, node)
-        rise = dot(row(normal, 0), step), dot(row(normal, 1), step), dot(row(normal, 2), step)
-        is_found, way = combined_ways(normal, count, rise)
-        if not is_found:
-            return 0.0, 0.0, 0.0
-        step = minus(step, way)
-    return step
+def _turn_to_index(g: NDArray, H: NDArray, matrix: NDArray) -> None:
+    """Turn first and second derivatives per mm, g (3,) and H (3, 3), into those per index unit."""
+    u, A = (g[0], g[1], g[2]), H.copy()
+    for d in range(3):
+        g[d] = matrix[0, d] * u[0] + matrix[1, d] * u[1] + matrix[2, d] * u[2]
+        for m in range(3):
+            H[d, m] = 0.0
+            for p in range(3):
+                for q in range(3):
+                    H[d, m] += matrix[p, d] * A[p, q] * matrix[q, m]
+
+
+@inlined
+def _per_mm(g: NDArray, state: State) -> tuple:
+    """Derivatives per index unit, g (3,), as those per mm."""
+    M = state.sides.inverse
+    return (
+        M[0, 0] * g[0] + M[1, 0] * g[1] + M[2, 0] * g[2],
+        M[0, 1] * g[0] + M[1, 1] * g[1] + M[2, 1] * g[2],
+        M[0, 2] * g[0] + M[1, 2] * g[1] + M[2, 2] * g[2],
+    )
+
+
+@helper
+def _newton_step(g: NDArray, H: NDArray, node: int, state: State) -> tuple:
+    """-H^-1 g over the axes along which a node may move; down the gradient where H is not positive. Index units.
+
+    The rows of the other axes are cleared.
+    """
+    trace = H[0, 0] + H[1, 1] + H[2, 2]
+    for d in range(3):
+        if state.complex.is_frozen[node, d]:
+            g[d] = 0.0
+            H[d, :] = 0.0
+            H[:, d] = 0.0
+            H[d, d] = trace
+    # Cramer's rule, from the adjugate.
+    c00, c11 = H[1, 1] * H[2, 2] - H[1, 2] * H[1, 2], H[0, 0] * H[2, 2] - H[0, 2] * H[0, 2]
+    c22, c01 = H[0, 0] * H[1, 1] - H[0, 1] * H[0, 1], H[0, 2] * H[1, 2] - H[0, 1] * H[2, 2]
+    c02, c12 = H[0, 1] * H[1, 2] - H[0, 2] * H[1, 1], H[0, 1] * H[0, 2] - H[0, 0] * H[1, 2]
+    determinant = H[0, 0] * c00 + H[0, 1] * c01 + H[0, 2] * c02
+    if H[0, 0] > 0.0 and c22 > 0.0 and determinant > FLAT_BEND * H[0, 0] * H[1, 1] * H[2, 2]:
+        u = scaled(-1.0 / determinant, (g[0], g[1], g[2]))
+        return dot((c00, c01, c02), u), dot((c01, c11, c12), u), dot((c02, c12, c22), u)
+    return scaled(-1.0, times(projection_at(state, node), _per_mm(g, state)))
+
+
+@helper
+def _sliding_step(normal: NDArray, g: NDArray, node: int, state: State) -> tuple:
+    """Down the gradient g (3,), along the axes and on the surfaces on which a node may move; index units."""
+    step = scaled(-1.0, times(projection_at(state, node), _per_mm(g, state)))
+    count = normals_at(normal, state, node)
+    rise = dot(row(normal, 0), step), dot(row(normal, 1), step), dot(row(normal, 2), step)
+    is_found, way = combined_ways(normal, count, rise)
+    return minus(step, way) if is_found else (0.0, 0.0, 0.0)
 
 
 @inlined
@@ -580,13 +646,13 @@ def _try_place(
 
 @inlined
 def _search_line(
-    search: Search, step: tuple, t: float, square: float, least: float, node: int, state: State, rings: NodeRings
+    search: Search, step: tuple, t: float, slope: float, least: float, node: int, state: State, rings: NodeRings
 ) -> None:
     """Look t steps ahead, then where the parabola through what was measured has its vertex.
 
-    `square` is the squared length of the step, mm^2: E falls by that much per step to begin with.
+    `slope` is by how much E changes per step to begin with.
     """
-    energy, slope, scale = search.best[0], -square, 2.0**-state.objective.bits
+    energy, scale = search.best[0], 2.0**-state.objective.bits
     here = row(search.place, 0)
     for trial in range(LINE_TRIALS):
         place = (
@@ -615,24 +681,31 @@ def _search_line(
 
 
 @inlined
-def _probe_axes(search: Search, length: float, least: float, node: int, state: State, rings: NodeRings) -> None:
-    """Look a length, mm, along each free axis both ways.
+def _search_axes(
+    search: Search, step: tuple, length: float, least: float, node: int, state: State, rings: NodeRings
+) -> None:
+    """Look a length, mm, along each free axis in turn, where the step goes first, and go on from where E is lower.
 
     The gradient is of the continuous image, the energy of its voxels: a node may stall where this still lowers E.
     """
-    M, here = state.objective.matrix, row(search.place, 0)
+    M = state.objective.matrix
     for axis in range(4 - state.complex.cells.shape[1], 3):
         if state.complex.is_frozen[node, axis]:
             continue
         spacing = np.sqrt(M[0, axis] ** 2 + M[1, axis] ** 2 + M[2, axis] ** 2)
-        for sign in (1, -1):
-            shift = sign * np.int64(np.rint(length / (spacing * 2.0**-state.objective.bits)))
+        shift = np.int64(np.rint(length / (spacing * 2.0**-state.objective.bits)))
+        if step[axis] < 0.0:
+            shift = -shift
+        here, energy = row(search.place, 0), search.best[0]
+        for _ in range(2):
             place = (
                 here[0] + (shift if axis == 0 else 0),
                 here[1] + (shift if axis == 1 else 0),
                 here[2] + (shift if axis == 2 else 0),
             )
-            _try_place(search, place, search.best[0], least, node, state, rings)
+            if _try_place(search, place, search.best[0], least, node, state, rings) < energy:
+                break
+            shift = -shift
 
 
 @unit
@@ -657,7 +730,7 @@ def attract(state: State, rings: NodeRings, groups: Blocks, floor: float) -> Non
     laid_out = packed(lowered), packed(rings), packed(groups)
     for chosen in colours_of(state, rings, groups):
         with few_threads(len(chosen) * BLOCK_NODES * 20):
-            run(_attract, len(chosen), Sweep(*laid_out, chosen, is_between))
+            run(_attract, len(chosen), Sweep(*laid_out, chosen, is_between, np.zeros(0)))
 
 
 @unit
