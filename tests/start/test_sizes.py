@@ -400,6 +400,8 @@ def test_target_error_within_limits():
     fine = tetopt.mesh_image(image, target_error=0.5, sizes=Sizes(longest=9.0))
     assert edges(fine.mesh)[1].max() < 11.0
     assert fine.history[-1].E_D < 0.1 * total
+    sized = tetopt.mesh_image(image, target_error=0.5, sizes=Sizes(largest=6.0))
+    assert sized.nodes == nodes_of_sizes(image, Sizes(largest=6.0))[0] == len(sized.mesh.points)
     coarse = tetopt.mesh_image(image, target_error=0.001, sizes=Sizes(smallest=9.0, longest=40.0))
     assert edges(coarse.mesh)[1].mean() > 9.0
     assert coarse.history[-1].E_D > 0.001 * total

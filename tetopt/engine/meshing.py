@@ -260,7 +260,8 @@ def meshed_to_error(
 
     Returns the result, with the octree and the number of nodes, of the run with the fewest nodes that has the error; if
     none has, of the one with the least, or of one that was cut short. It is the same as with that number of nodes from
-    the start, unless limits on sizes forbid that number. No fewer than 2^(n + 2) nodes are tried.
+    the start, unless limits on sizes forbid that number. No fewer than 2^(n + 2) nodes are tried, nor than targets of
+    sizes take.
 
     Raises
     ------
@@ -279,10 +280,12 @@ def meshed_to_error(
             f"target_error: {target_error:g} of the variance is below the noise's share, by estimate {noise:.3g}: "
             "cells would have to follow the noise; ask for more, or denoise the image"
         )
+    fewest = 0 if sizes is None else nodes_of_sizes(content, sizes)[0]
     nodes, shares = FIRST_NODES[content.image.ndim], dict[int, float]()  # what is left, by number of nodes
     best: Optimized | None = None
     requests: set[int] = set()
     for _ in range(ERROR_RUNS):
+        nodes = max(nodes, fewest)
         initial = nearest_octree(content, nodes, sizes)
         # Limits on sizes may ask for more nodes than the error, or allow fewer; a mask's octree is near only roughly.
         if content.region is None and not is_near(len(initial.points), nodes):

@@ -147,6 +147,8 @@ def _target(image: Image, sizes: Sizes) -> NDArray[np.float32]:
 def nodes_of_sizes(image: Image | Content, sizes: Sizes) -> tuple[int, float]:
     """How many nodes the targets take, 1.5 times those of equilateral cells; and the share of the mesh that has one.
 
+    Where there is one, there are 2^(n + 2) nodes or more, as few as any image is meshed with.
+
     Raises
     ------
     InputError
@@ -161,7 +163,8 @@ def nodes_of_sizes(image: Image | Content, sizes: Sizes) -> tuple[int, float]:
     needed = equilateral_nodes(target, content.image, inside)
     _check_not_below_voxels(content.image, needed)
     has_one = target < NO_BOUND_MM
-    return int(np.ceil(SIZED_OVER_EQUILATERAL * needed)), float(np.mean(has_one if inside is None else has_one[inside]))
+    enough = max(int(np.ceil(SIZED_OVER_EQUILATERAL * needed)), 2 ** (content.image.ndim + 2))
+    return enough, float(np.mean(has_one if inside is None else has_one[inside]))
 
 
 def _fewest_nodes(content: Content, limits: _BlockLimits) -> float:
