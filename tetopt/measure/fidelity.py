@@ -438,7 +438,9 @@ def _areas_and_flat(surface: FacetSurface) -> tuple[NDArray[np.float64], NDArray
         return np.hypot(along[0][0], along[1][0]), np.zeros(len(surface.facets), dtype=bool)
     (ax, bx), (ay, by), (az, bz) = along
     areas = 0.5 * np.sqrt((ay * bz - az * by) ** 2 + (az * bx - ax * bz) ** 2 + (ax * by - ay * bx) ** 2)
-    size = np.maximum.reduce([corner.max(axis=0) - corner.min(axis=0) for corner in corners])
+    size = np.zeros(len(areas))
+    for a, b, c in corners:  # not by `max` over an axis of three, which takes five times as long
+        np.maximum(size, np.maximum(np.maximum(a, b), c) - np.minimum(np.minimum(a, b), c), out=size)
     return areas, areas <= FLAT_AREA_SHARE * size**2
 
 
