@@ -11,11 +11,17 @@ docs/kernels.md tells what each of these bought.
 
 from __future__ import annotations
 
+import contextlib
 import inspect
+import os
+import subprocess
+import sys
+import tempfile
 import typing
 import zlib
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from functools import cache, cached_property
+from importlib import import_module
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -40,6 +46,7 @@ Floats3 = Annotated[NDArray[np.float64], types.float64[:, :, ::1]]
 Floats4 = Annotated[NDArray[np.float64], types.float64[:, :, :, ::1]]
 Singles3 = Annotated[NDArray[np.float32], types.float32[:, :, ::1]]
 Singles4 = Annotated[NDArray[np.float32], types.float32[:, :, :, ::1]]
+Shorts3 = Annotated[NDArray[np.int32], types.int32[:, :, ::1]]
 Shorts4 = Annotated[NDArray[np.int32], types.int32[:, :, :, ::1]]
 Ints1 = Annotated[NDArray[np.int64], types.int64[::1]]
 Ints2 = Annotated[NDArray[np.int64], types.int64[:, ::1]]
@@ -48,6 +55,7 @@ Bools2 = Annotated[NDArray[np.bool_], types.boolean[:, ::1]]
 Bools3 = Annotated[NDArray[np.bool_], types.boolean[:, :, ::1]]
 
 SCALAR_TYPES = {int: types.int64, float: types.float64, bool: types.boolean, type(None): types.void}
+MOST_COMPILING = 4  # processes at most: each loads numba first, 1 s and 200 MB
 WORD_BYTES = 8  # of a number, an address, or a length in a record's memory
 
 
@@ -217,17 +225,18 @@ def _unbox_packed(_type: RecordType, value: Any, context: Any) -> NativeValue:
 
 # Functions.
 
+KERNELS: list[Any] = []  # all that were defined, in the modules imported so far
 
-class Unit:
-    """A function compiled on its own, called by other kernels through its symbol.
 
-    Its annotations are its signature. Called from Python it is an entry.
-    """
+class Kernel:
+    """A function that numba compiles, with a signature from its annotations."""
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self.function = function
         self.__name__, self.__doc__, self.__module__ = function.__name__, function.__doc__, function.__module__
+        self.room = self.__module__.rpartition(".")[2]
         self.is_linked = False
+        KERNELS.append(self)
 
     @cached_property
     def signature(self) -> Any:
@@ -235,6 +244,18 @@ class Unit:
         hints = typing.get_type_hints(self.function, include_extras=True)
         result = type_of(hints.pop("return"))
         return result(*(type_of(hint) for hint in hints.values()))
+
+    def link(self) -> None:
+        """Make the symbols known of what it calls."""
+        if not self.is_linked:
+            numba.get_num_threads()  # the threads' own functions are known to the linker from then on
+            for unit in units_of(self.function):
+                unit.link()
+            self.is_linked = True
+
+
+class Unit(Kernel):
+    """A function compiled on its own, called by other kernels through its symbol. Called from Python it is an entry."""
 
     @cached_property
     def symbol(self) -> str:
@@ -262,45 +283,60 @@ class Unit:
         return types.Function(make_intrinsic_template(self, typed, self.symbol))
 
     @cached_property
-    def entry(self) -> Entry:
-        """How Python calls it."""
-        return Entry(self.function)
+    def compiled(self) -> Any:
+        """The function for callers of machine code; compiled now, or taken from the cache."""
+        return numba.cfunc(self.signature, cache=True, error_model="numpy")(self.function)
 
-    @cached_property
+    @property
     def address(self) -> int:
-        """Of the compiled function; compiled now, or taken from the cache."""
-        compiled = numba.cfunc(self.signature, cache=True, error_model="numpy")(self.function)
-        return int(compiled.address)
+        """Where it is in memory."""
+        return int(self.compiled.address)
 
     def link(self) -> None:
         """Make its symbol known, and those of what it calls before."""
         if not self.is_linked:
-            for unit in units_of(self.function):
-                unit.link()
+            super().link()
             llvm.add_symbol(self.symbol, self.address)
-            self.is_linked = True
+
+    @property
+    def was_cached(self) -> bool:
+        """Whether it was compiled before this process."""
+        return bool(self.compiled.cache_hits > 0)
+
+    @cached_property
+    def entry(self) -> Any:
+        """How Python calls it."""
+        return njit(cache=True, error_model="numpy")(self.function)
 
     def __call__(self, *values: Any) -> Any:
         """Call it from Python."""
-        return self.entry(*values)
+        self.link()
+        return self.entry(*map(packed, values))
 
 
-class Entry:
+class Entry(Kernel):
     """A function that Python calls: records are laid out for it, and the units that it calls are linked before."""
 
-    def __init__(self, function: Callable[..., Any], **options: Any) -> None:
-        self.function = function
-        self.__name__, self.__doc__, self.__module__ = function.__name__, function.__doc__, function.__module__
-        self.compiled = njit(cache=True, error_model="numpy", **options)(function)
-        self.is_linked = False
+    @cached_property
+    def dispatcher(self) -> Any:
+        """numba's."""
+        return njit(cache=True, error_model="numpy")(self.function)
+
+    @cached_property
+    def compiled(self) -> Any:
+        """The same, compiled now for its signature, or taken from the cache."""
+        self.dispatcher.compile(self.signature.args)
+        return self.dispatcher
+
+    @property
+    def was_cached(self) -> bool:
+        """Whether it was compiled before this process."""
+        return bool(sum(self.compiled.stats.cache_hits.values()) > 0)
 
     def __call__(self, *values: Any) -> Any:
         """Call it from Python."""
-        if not self.is_linked:
-            for unit in units_of(self.function):
-                unit.link()
-            self.is_linked = True
-        return self.compiled(*map(packed, values))
+        self.link()
+        return self.dispatcher(*map(packed, values))
 
 
 @typeof_impl.register(Unit)
@@ -310,26 +346,99 @@ def _typeof_unit(unit: Unit, context: Any) -> types.Type:
 
 @typeof_impl.register(Entry)
 def _typeof_entry(entry: Entry, context: Any) -> types.Type:
-    return types.Dispatcher(entry.compiled)
+    return types.Dispatcher(entry.dispatcher)
 
 
 def units_of(function: Callable[..., Any]) -> Iterator[Unit]:
     """The units that a function calls, itself or by helpers that go into it."""
-    seen: set[int] = set()
-    todo = [function]
-    while todo:
-        now: Any = todo.pop()
-        if id(now) in seen:
-            continue
-        seen.add(id(now))
-        for name in now.__code__.co_names:
-            value = now.__globals__.get(name)
+    for part in _parts(function):
+        for name in part.__code__.co_names:
+            value = part.__globals__.get(name)
             if isinstance(value, Unit):
                 yield value
-            elif isinstance(value, Entry):
-                todo.append(value.function)
-            elif isinstance(value, numba.core.dispatcher.Dispatcher):
-                todo.append(value.py_func)
+
+
+def _parts(function: Callable[..., Any]) -> list[Any]:
+    """A function and the helpers that go into it."""
+    parts: list[Any] = [function]
+    for part in parts:
+        for name in part.__code__.co_names:
+            value = part.__globals__.get(name)
+            is_entry = isinstance(value, Entry)
+            if is_entry or isinstance(value, numba.core.dispatcher.Dispatcher):
+                inner = value.function if is_entry else value.py_func
+                if inner not in parts:
+                    parts.append(inner)
+    return parts
+
+
+# Compiling in several processes.
+
+
+def link(kernels: Sequence[Any]) -> None:
+    """Link kernels and all that they call; what the cache does not hold is compiled in several processes."""
+    if numba.config.DISABLE_JIT:
+        return
+    order = list(dict.fromkeys(inner for kernel in kernels for inner in _callees_first(kernel)))
+    for number, kernel in enumerate(order):
+        kernel.link()
+        if not kernel.was_cached:
+            _compile_apart(order[number + 1 :])
+            break
+    for kernel in order:
+        kernel.link()
+        _ = kernel.compiled
+
+
+def roots() -> list[Kernel]:
+    """The kernels that no other calls: those of all modules imported so far."""
+    called = {inner for kernel in KERNELS for inner in units_of(kernel.function)}
+    return [kernel for kernel in KERNELS if kernel not in called]
+
+
+def _callees_first(kernel: Any) -> Iterator[Any]:
+    for inner in units_of(kernel.function):
+        yield from _callees_first(inner)
+    yield kernel
+
+
+def _compile_apart(kernels: Sequence[Any]) -> None:
+    """Compile kernels into the cache in as many processes as there are cores, up to `MOST_COMPILING`."""
+    n_processes = min(MOST_COMPILING, os.cpu_count() or 1)
+    if n_processes < 2 or not kernels or not sys.executable:
+        return
+    sizes = {kernel: sum(len(part.__code__.co_code) for part in _parts(kernel.function)) for kernel in kernels}
+    names = [
+        f"{kernel.__module__}:{kernel.__name__}" for kernel in sorted(kernels, key=sizes.__getitem__, reverse=True)
+    ]
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
+    processes: list[subprocess.Popen[bytes]] = []
+    with tempfile.TemporaryDirectory(prefix="tetopt-") as claims:
+        code = f"from tetopt.kernels import compile_named; compile_named({names!r}, {claims!r})"
+        try:
+            command = [sys.executable, "-c", code]
+            processes.extend(subprocess.Popen(command, env=environment) for _ in range(n_processes))
+            for process in processes:
+                process.wait()  # what one has not done, the process that waits does next
+        finally:
+            for process in processes:
+                process.kill()
+
+
+def compile_named(names: Sequence[str], claims: str) -> None:
+    """Compile kernels, `module:name` each, into numba's cache, unless another process has claimed them.
+
+    They know only the names of what they call, so that none may be called in this process.
+    """
+    chosen = [getattr(import_module(name.split(":")[0]), name.split(":")[1]) for name in names]
+    numba.get_num_threads()
+    for kernel in KERNELS:
+        if isinstance(kernel, Unit):
+            llvm.add_symbol(kernel.symbol, 1)
+    for number, kernel in enumerate(chosen):
+        with contextlib.suppress(FileExistsError):
+            (Path(claims) / str(number)).touch(exist_ok=False)
+            _ = kernel.compiled
 
 
 @intrinsic

@@ -28,13 +28,14 @@ from typing import Any, NamedTuple
 
 import numba
 import numpy as np
-from numba import njit, prange
+from numba import njit
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.geometry.topology import Facets, facets
 from tetopt.geometry.vectors import cross, difference, dot, row
 from tetopt.image import Image
+from tetopt.kernels import Floats1, Floats2, Floats3, Floats4, Ints1, Ints2, Shorts3, Shorts4, entry, helper, run, unit
 from tetopt.mesh import Mesh
 from tetopt.target.content import Content
 
@@ -124,7 +125,9 @@ def _cell_changes(mesh: Mesh, sampled: _Sampled) -> NDArray[np.int32]:
     # Sums of whole numbers below 2^53 are exact in float64.
     change = -np.bincount(sides.of_cell.ravel(), (sides.sign * number[:, None]).ravel(), len(sides.nodes))
     steps = np.zeros(grid.prefix.shape[:3], dtype=np.int32)
-    _scatter_changes(steps, change.astype(np.int64), ticks, sides.nodes, grid.bits, grid.prefix)
+    # Only their shape matters where nothing is summed: one kind of volume for all images.
+    rows = steps[..., None]
+    _scatter_changes(steps, change.astype(np.int64), ticks, sides.nodes, grid.bits, rows)
     return steps
 
 
@@ -221,7 +224,8 @@ def sampling_grid(image: Image, points: NDArray[np.float64]) -> SamplingGrid:
     is_short = is_whole and shape[2] * max(largest, largest * largest) < 2**31
     prefix = np.empty((shape[0], shape[1], shape[2] + 1, 2), dtype=np.int32 if is_short else np.float64)
     with few_threads(image.data.size // 50):
-        _fill_prefix(prefix, image.data.reshape(shape), float(shift))
+        data = np.ascontiguousarray(image.data.reshape(shape), dtype=np.float64)
+        run(_fill_prefix, shape[0], _Filling(_volume(prefix, bits), data, float(shift)))
     return SamplingGrid(prefix, bits, float(shift))
 
 
@@ -316,7 +320,8 @@ def facet_fluxes(grid: SamplingGrid, ticks: NDArray[np.int64], nodes: NDArray[np
     """
     fluxes = np.empty((len(nodes), 1, grid.prefix.shape[3] + 1))
     with few_threads(len(nodes)):
-        _fill_fluxes(fluxes, ticks, np.ascontiguousarray(nodes), grid.bits, grid.prefix)
+        work = _Fluxes(fluxes, ticks, np.ascontiguousarray(nodes), volume_of(grid))
+        run(_fill_fluxes, -(-len(nodes) // CELLS_PER_CHUNK), work)
     return fluxes[:, 0]
 
 
@@ -324,7 +329,8 @@ def sums_of_fluxes(fluxes: NDArray[np.float64], sides: Facets, hand: int) -> NDA
     """Moment sums of the cells, (M, D), from their facets' fluxes; `hand` is the cells' sign in index space."""
     sums = np.empty((len(sides.of_cell), fluxes.shape[1]))
     with few_threads(len(sums)):
-        _fill_sums(sums, fluxes, sides.of_cell, sides.sign, hand)
+        work = _Sums(sums, np.ascontiguousarray(fluxes), sides.of_cell, sides.sign, hand)
+        run(_fill_sums, -(-len(sums) // CELLS_PER_CHUNK), work)
     return sums
 
 
@@ -336,19 +342,53 @@ def _hand(ticks: NDArray[np.int64], cells: NDArray[np.int64]) -> int:
 # Kernels.
 
 
-@njit(cache=True, parallel=True)
-def _fill_prefix(prefix: NDArray, volume: NDArray, shift: float) -> None:
-    for i in prange(volume.shape[0]):
-        for j in range(volume.shape[1]):
-            first, second = 0.0, 0.0
-            for k in range(volume.shape[2]):
-                prefix[i, j, k, 0] = first
-                prefix[i, j, k, 1] = second
-                h = float(volume[i, j, k]) - shift
-                first += h
-                second += h * h
-            prefix[i, j, volume.shape[2], 0] = first
-            prefix[i, j, volume.shape[2], 1] = second
+class Volume(NamedTuple):
+    """A sampling grid as kernels get it: its prefix sums are of 32 or of 64 bits, and the others have no voxel."""
+
+    long: Floats4
+    short: Shorts4
+    is_short: bool
+    bits: int
+
+
+def volume_of(grid: SamplingGrid) -> Volume:
+    """The volume of a grid."""
+    return _volume(grid.prefix, grid.bits)
+
+
+def _volume(prefix: NDArray, bits: int) -> Volume:
+    is_short, nothing = prefix.dtype == np.int32, np.zeros((1, 1, 1, prefix.shape[3]))
+    return Volume(nothing if is_short else prefix, prefix if is_short else nothing.astype(np.int32), is_short, bits)
+
+
+class _Filling(NamedTuple):
+    """The sums to be filled in, and what of."""
+
+    volume: Volume
+    data: Floats3
+    shift: float
+
+
+@unit
+def _fill_prefix(work: _Filling, i: int) -> None:
+    if work.volume.is_short:
+        _fill_rows(work.volume.short, work.data, work.shift, i)
+    else:
+        _fill_rows(work.volume.long, work.data, work.shift, i)
+
+
+@helper
+def _fill_rows(prefix: NDArray, volume: NDArray, shift: float, i: int) -> None:
+    for j in range(volume.shape[1]):
+        first, second = 0.0, 0.0
+        for k in range(volume.shape[2]):
+            prefix[i, j, k, 0] = first
+            prefix[i, j, k, 1] = second
+            h = volume[i, j, k] - shift
+            first += h
+            second += h * h
+        prefix[i, j, volume.shape[2], 0] = first
+        prefix[i, j, volume.shape[2], 1] = second
 
 
 @njit(cache=True)
@@ -533,41 +573,73 @@ def facet_flux(
         triangle_flux(ticks, a, b, nodes[facet, 2], bits, prefix, scatter, out, p, 0)
 
 
-@njit(cache=True, parallel=True)
-def _fill_fluxes(fluxes: NDArray, ticks: NDArray, nodes: NDArray, bits: int, prefix: NDArray) -> None:
-    for chunk in prange((len(nodes) + CELLS_PER_CHUNK - 1) // CELLS_PER_CHUNK):
-        for facet in range(chunk * CELLS_PER_CHUNK, min((chunk + 1) * CELLS_PER_CHUNK, len(nodes))):
-            facet_flux(ticks, nodes, facet, bits, prefix, None, fluxes, facet)
+class _Fluxes(NamedTuple):
+    """The fluxes to be filled in, and what of."""
+
+    fluxes: Floats3
+    ticks: Ints2
+    nodes: Ints2
+    volume: Volume
 
 
-@njit(cache=True, parallel=True)
-def _fill_sums(sums: NDArray, fluxes: NDArray, of_cell: NDArray, sign: NDArray, hand: int) -> None:
-    for chunk in prange((len(sums) + CELLS_PER_CHUNK - 1) // CELLS_PER_CHUNK):
-        for cell in range(chunk * CELLS_PER_CHUNK, min((chunk + 1) * CELLS_PER_CHUNK, len(sums))):
-            for d in range(sums.shape[1]):
-                total = 0.0
-                for k in range(of_cell.shape[1]):
-                    total += sign[cell, k] * fluxes[of_cell[cell, k], d]
-                is_rounding = d > 0 and sums[cell, 0] <= 0.0  # what is left without voxels
-                sums[cell, d] = 0.0 if is_rounding else hand * total
+@unit
+def put_flux(out: Floats3, p: int, q: int, ticks: Ints2, a: int, b: int, c: int, volume: Volume) -> None:
+    """Flux of the facet (a, b, c), or (a, b) with c < 0, to out[p, q, :]."""
+    if c < 0:
+        if volume.is_short:
+            segment_flux(ticks, a, b, volume.bits, volume.short, None, out, p, q)
+        else:
+            segment_flux(ticks, a, b, volume.bits, volume.long, None, out, p, q)
+    elif volume.is_short:
+        triangle_flux(ticks, a, b, c, volume.bits, volume.short, None, out, p, q)
+    else:
+        triangle_flux(ticks, a, b, c, volume.bits, volume.long, None, out, p, q)
 
 
-@njit(cache=True)
-def _scatter_changes(
-    steps: NDArray, change: NDArray, ticks: NDArray, nodes: NDArray, bits: int, prefix: NDArray
-) -> None:
+@unit
+def _fill_fluxes(work: _Fluxes, chunk: int) -> None:
+    nodes = work.nodes
+    for facet in range(chunk * CELLS_PER_CHUNK, min((chunk + 1) * CELLS_PER_CHUNK, len(nodes))):
+        c = nodes[facet, 2] if nodes.shape[1] == 3 else -1
+        put_flux(work.fluxes, facet, 0, work.ticks, nodes[facet, 0], nodes[facet, 1], c, work.volume)
+
+
+class _Sums(NamedTuple):
+    """The sums to be filled in, and what of."""
+
+    sums: Floats2
+    fluxes: Floats2
+    of_cell: Ints2
+    sign: Ints2
+    hand: int
+
+
+@unit
+def _fill_sums(work: _Sums, chunk: int) -> None:
+    sums, fluxes, of_cell, sign = work.sums, work.fluxes, work.of_cell, work.sign
+    for cell in range(chunk * CELLS_PER_CHUNK, min((chunk + 1) * CELLS_PER_CHUNK, len(sums))):
+        for d in range(sums.shape[1]):
+            total = 0.0
+            for k in range(of_cell.shape[1]):
+                total += sign[cell, k] * fluxes[of_cell[cell, k], d]
+            is_rounding = d > 0 and sums[cell, 0] <= 0.0  # what is left without voxels
+            sums[cell, d] = 0.0 if is_rounding else work.hand * total
+
+
+@entry
+def _scatter_changes(steps: Shorts3, change: Ints1, ticks: Ints2, nodes: Ints2, bits: int, rows: Shorts4) -> None:
     unused = np.empty((1, 1, 3))
     for facet in range(len(nodes)):
-        facet_flux(ticks, nodes, facet, bits, prefix, (steps, change[facet]), unused, 0)
+        facet_flux(ticks, nodes, facet, bits, rows, (steps, change[facet]), unused, 0)
 
 
-@njit(cache=True)
-def _fill_ranges(low: NDArray, high: NDArray, steps: NDArray, volume: NDArray) -> None:
+@entry
+def _fill_ranges(low: Floats1, high: Floats1, steps: Shorts3, volume: Floats3) -> None:
     for i in range(volume.shape[0]):
         for j in range(volume.shape[1]):
             cell = -1
             for k in range(volume.shape[2]):
                 cell += steps[i, j, k]
                 if cell >= 0:
-                    h = float(volume[i, j, k])
+                    h = volume[i, j, k]
                     low[cell], high[cell] = min(low[cell], h), max(high[cell], h)

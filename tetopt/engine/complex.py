@@ -17,17 +17,16 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.energy.sampling import CELLS_PER_CHUNK, few_threads, segment_flux, triangle_flux
+from tetopt.energy.sampling import CELLS_PER_CHUNK, Volume, few_threads
+from tetopt.energy.sampling import put_flux as sampled_flux
 from tetopt.geometry.vectors import cross, difference, dot, minus, put_row, row, scaled, times
 from tetopt.kernels import (
     Bools2,
     Floats1,
     Floats2,
     Floats3,
-    Floats4,
     Ints1,
     Ints2,
-    Shorts4,
     Singles3,
     Singles4,
     entry,
@@ -61,9 +60,7 @@ class Complex(NamedTuple):
 class Objective(NamedTuple):
     """What turns a cell into an energy."""
 
-    prefix: Floats4  # of the sampling grid, unless that is of 32 bits; one row of nothing then
-    short_prefix: Shorts4  # likewise
-    is_short: bool  # which of them it is
+    volume: Volume  # of the sampling grid
     bits: int
     hand: int  # sign of the cells' volumes in index space
     matrix: Floats2  # (3, 3) index vectors to mm
@@ -114,7 +111,7 @@ def build(
     """
     n_cells, n_corners = cells.shape
     room = n_cells + n_cells // 4 + 64
-    n_sums = (objective.short_prefix if objective.is_short else objective.prefix).shape[3] + 1
+    n_sums = objective.volume.long.shape[3] + 1
     complex_ = Complex(
         ticks,
         is_frozen,
@@ -160,7 +157,7 @@ def grown(state: State, least: int = 64) -> State:
 
 
 @entry
-def fill_across(across: NDArray, cells: NDArray, n_cells: int, n_nodes: int) -> None:
+def fill_across(across: Ints2, cells: Ints2, n_cells: int, n_nodes: int) -> None:
     """The cell beyond each facet, by counting sort over the facets' lowest nodes."""
     n = cells.shape[1]
     start = np.zeros(n_nodes + 1, dtype=np.int64)
@@ -235,18 +232,10 @@ def has_node(cells: NDArray, cell: int, node: int) -> bool:
     return is_corner
 
 
-@unit
+@helper
 def put_flux(out: Floats3, p: int, q: int, ticks: Ints2, a: int, b: int, c: int, objective: Objective) -> None:
     """Flux of the facet (a, b, c), or (a, b) with c < 0, times the sign of index space, to out[p, q, :]."""
-    if c < 0:
-        if objective.is_short:
-            segment_flux(ticks, a, b, objective.bits, objective.short_prefix, None, out, p, q)
-        else:
-            segment_flux(ticks, a, b, objective.bits, objective.prefix, None, out, p, q)
-    elif objective.is_short:
-        triangle_flux(ticks, a, b, c, objective.bits, objective.short_prefix, None, out, p, q)
-    else:
-        triangle_flux(ticks, a, b, c, objective.bits, objective.prefix, None, out, p, q)
+    sampled_flux(out, p, q, ticks, a, b, c, objective.volume)
     if objective.hand < 0:
         for d in range(out.shape[2]):
             out[p, q, d] = -out[p, q, d]
@@ -411,7 +400,7 @@ def shape_of_triangle(x: NDArray, ticks: NDArray, a: int, b: int, c: int, object
 
 
 @entry
-def signed_volume(x: NDArray, n_corners: int) -> float:
+def signed_volume(x: Floats2, n_corners: int) -> float:
     """Signed volume of the cell with corners x (4, 3), times n!."""
     if n_corners == 3:
         return cross(difference(x, 1, 0), difference(x, 2, 0))[0]
@@ -441,7 +430,7 @@ def worst_cosine(x: Floats2) -> float:
 
 
 @entry
-def cosine_up_to_floor(x: NDArray, objective: Objective) -> float:
+def cosine_up_to_floor(x: Floats2, objective: Objective) -> float:
     """`worst_cosine`, or just the floor for a tetrahedron that is above it by far: most are, and this costs a tenth."""
     determinant, S = determinant_and_squares(x)
     if determinant > 0.0 and S * S * S <= objective.safe * determinant * determinant:
@@ -608,7 +597,7 @@ def node_rings(state: State) -> NodeRings:
 
 
 @entry
-def _fill_rings(start: NDArray, ring: NDArray, corner: NDArray, cells: NDArray, n_cells: int) -> None:
+def _fill_rings(start: Ints1, ring: Ints1, corner: Ints1, cells: Ints2, n_cells: int) -> None:
     n = cells.shape[1]
     for c in range(n_cells):
         for k in range(n):

@@ -148,7 +148,7 @@ def too_long(state: State, target: NDArray[np.float64]) -> NDArray[np.bool_]:
 
 
 @entry
-def _fill_too_long(is_one: NDArray, state: State, target: NDArray) -> None:
+def _fill_too_long(is_one: Bools1, state: State, target: Floats1) -> None:
     cells = state.complex.cells
     for cell in range(state.complex.n_cells[0]):
         for i in range(cells.shape[1]):
@@ -205,9 +205,9 @@ def _compacted(state: State, is_dirty: NDArray[np.bool_], n_before: int, n_split
 
 @entry
 def make_exchanges(
-    state: State, rings: NodeRings, splits: EdgeMoves, collapses: EdgeMoves, in_: NDArray, out: NDArray, quota: tuple,
-    is_dirty: NDArray,
-) -> tuple:  # fmt: skip
+    state: State, rings: NodeRings, splits: EdgeMoves, collapses: EdgeMoves, in_: Ints1, out: Ints1,
+    quota: tuple[int, int, float], is_dirty: Bools1,
+) -> tuple[int, int]:  # fmt: skip
     """Split edges of the nodes `in_`, or collapse the nodes `out`, until there are more nodes; then do both in pairs.
 
     In their order, and each only if none of its cells has changed. The quota: how many more nodes; at most how many
@@ -393,7 +393,7 @@ def mend(state: State, bad: NDArray[np.int64], target: float) -> Exchanged:
 
 
 @entry
-def _mend(state: State, rings: NodeRings, bad: NDArray, target: float, is_dirty: NDArray) -> tuple:
+def _mend(state: State, rings: NodeRings, bad: Ints1, target: float, is_dirty: Bools1) -> tuple[int, int]:
     cells, x = state.complex.cells, np.empty((4, 3))
     n_split, n_collapsed, n_nodes = 0, 0, len(rings.start) - 1
     for cell in bad:
@@ -645,9 +645,10 @@ def split_edge(state: State, rings: NodeRings, a: int, b: int, p: int, is_dirty:
         if other < 0:
             continue
         i, j = corner_of(cells, cell, a), corner_of(cells, cell, b)
-        cells[other] = cells[cell]
-        across[other] = across[cell]
-        fluxes[other] = fluxes[cell]
+        for k in range(n):  # numba compiles whole rows four times as long
+            cells[other, k], across[other, k] = cells[cell, k], across[cell, k]
+            for d in range(fluxes.shape[2]):
+                fluxes[other, k, d] = fluxes[cell, k, d]
         state.complex.labels[other] = state.complex.labels[cell]
         cells[other, i] = p
         beyond = across[cell, i]

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from tetopt.energy.sampling import cell_moments, cell_of_voxel, channel_grid, from_ticks
 from tetopt.engine.complex import State, copied, interface_energy, node_rings, remeasure
 from tetopt.engine.density import Limits, exchange
-from tetopt.engine.flips import flip
+from tetopt.engine.flips import _evaluate_cells, _evaluate_triangles, flip
 from tetopt.engine.interfaces import relabel, with_labels
 from tetopt.engine.loop import (
     MIN_DIHEDRAL,
@@ -35,11 +35,12 @@ from tetopt.engine.loop import (
 )
 from tetopt.engine.paper import optimize_paper
 from tetopt.engine.repair import n_cells_below, repair
-from tetopt.engine.smooth import attract, blocks, sweep
+from tetopt.engine.smooth import _gradients, attract, blocks, sweep
 from tetopt.engine.state import content_energies, floor_of, state_of, with_floor
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
 from tetopt.image import Image, transformed
+from tetopt.kernels import link, roots
 from tetopt.mesh import Mesh
 from tetopt.start.lattice import lattice
 from tetopt.start.sizes import Sizes
@@ -186,16 +187,20 @@ def prepare_kernels(
 ) -> None:
     """Compile the kernels of a method for images of this kind, or load them, before a clock starts.
 
-    The sampling has kernels of its own for whole-number images whose sums fit 32 bits; see `sampling_grid`. The repair
-    is left to be compiled when a mesh wants it.
+    Several processes compile what the cache does not hold; a tiny run then loads what is left.
     """
     content = plain(image)
     image = content.image
+    has_labels = content.memberships is not None and k_D > 0.0
+    if method == "fast":
+        unused = {_gradients, _evaluate_triangles if image.ndim == 3 else _evaluate_cells}
+        purposes = {"density": is_graded or image.ndim == 3, "repair": image.ndim == 3, "interfaces": has_labels}
+        link([kernel for kernel in roots() if kernel not in unused and purposes.get(kernel.room, True)])
     is_whole = not content.is_plain or np.array_equal(np.rint(image.data), image.data)
     step = 1.0 if is_whole else 0.1
     tiny = Image(np.zeros((3,) * image.ndim) + step * np.arange(3))
     mesh = lattice(tiny, blocks=(1,) * image.ndim)
-    if content.memberships is not None and k_D > 0.0:
+    if has_labels:
         halves = Image((np.arange(3) > 0) * np.ones(tiny.shape))
         optimize(make_content(tiny, halves), mesh, k_D=k_D, iterations=1)
     if method == "paper":

@@ -453,8 +453,11 @@ def _worth_of_edge(work: Cavity, state: State, a: int, b: int, m: int, is_open: 
         return old - cost[0, m - 1]
     # Then the image, only for the triangles of the best triangulation, until it is the best with it: a triangle that
     # is not measured has its least possible energy, so no better triangulation is passed over.
-    work.is_measured[:] = False
-    work.is_side[:] = False
+    for i in range(m):
+        for k in range(m):
+            work.is_side[i, k] = False
+            for j in range(m):
+                work.is_measured[i, k, j] = False
     while _measure_triangles(work, state, a, b, m, is_open):
         if not best_triangulation(cost, apex, triangle, m) < limit:
             return -np.inf
@@ -569,7 +572,7 @@ def fill_side(work: Cavity, state: State, a: int, b: int, i: int, j: int, m: int
 
 
 @entry
-def make_moves(order: NDArray, move: NDArray, is_dirty: NDArray, state: State, work: Cavity) -> int:
+def make_moves(order: Ints1, move: Ints1, is_dirty: Bools1, state: State, work: Cavity) -> int:
     """Make the moves of the cells in `order` whose cavities are as they were; the number made.
 
     Cells of a cavity that changed are marked dirty, and those left over are taken out at the end.
@@ -641,24 +644,28 @@ def flip_face(work: Cavity, state: State, cell: int, k: int, is_dirty: Bools1) -
     u, v, w = outward(cells, cell, k)
     p, q = (cells[cell, k], cells[other, facet_of(across, other, cell)])
     label = state.complex.labels[cell]
-    corner, D = np.array([u, v, w]), fluxes.shape[2]
+    corner, D = (u, v, w), fluxes.shape[2]
     below, above = np.empty((3, D)), np.empty((3, D))  # fluxes of the facets opposite u, v, w
     under, over = np.empty(3, dtype=np.int64), np.empty(3, dtype=np.int64)  # the cells beyond them
     for r in range(3):
         i, j = corner_of(cells, cell, corner[r]), corner_of(cells, other, corner[r])
         under[r], over[r] = across[cell, i], across[other, j]
-        below[r], above[r] = fluxes[cell, i], fluxes[other, j]
+        for d in range(D):
+            below[r, d], above[r, d] = fluxes[cell, i, d], fluxes[other, j, d]
     work.around[0], work.around[1] = cell, other
     take_cells(work, state, 2, 3, is_dirty)
     new = work.new
     spoke = work.flux
-    spoke[:] = 0.0
+    for r in range(3):
+        for d in range(D):
+            spoke[r, 0, d] = 0.0
     if objective.image > 0.0:
         for r in range(3):
             put_flux(spoke, r, 0, state.complex.ticks, p, q, corner[r], objective)
     # The facets of the neighbours that lead here, before anything is overwritten.
-    under_k, over_k = np.full(3, -1, dtype=np.int64), np.full(3, -1, dtype=np.int64)
+    under_k, over_k = np.empty(3, dtype=np.int64), np.empty(3, dtype=np.int64)
     for r in range(3):
+        under_k[r] = over_k[r] = -1
         if under[r] >= 0:
             under_k[r] = facet_of(across, under[r], cell)
         if over[r] >= 0:
@@ -692,7 +699,9 @@ def _beyond_polygon(work: Cavity, state: State, node: int, n_cells: int) -> NDAr
     -1 where that is nothing, and in the last row of an open polygon.
     """
     cells, across = state.complex.cells, state.complex.across
-    beyond = np.full((POLYGON_CORNERS, 2), -1, dtype=np.int64)
+    beyond = np.empty((POLYGON_CORNERS, 2), dtype=np.int64)
+    for r in range(POLYGON_CORNERS):
+        beyond[r, 0] = beyond[r, 1] = -1
     for r in range(n_cells):
         cell = work.around[r]
         other = across[cell, corner_of(cells, cell, node)]
@@ -756,7 +765,8 @@ def _put_pair_fluxes(work: Cavity, state: State, top: int, low: int, i: int, k: 
     """Fluxes of the two cells over the triangle (i, k, j); 0 inside the cavity if the image does not count."""
     fluxes, side_a, side_b, ring = state.complex.fluxes, work.side_a, work.side_b, work.ring
     has_image = state.objective.image > 0.0
-    work.flux[0] = 0.0
+    for d in range(fluxes.shape[2]):
+        work.flux[0, 0, d] = 0.0
     if has_image:
         put_flux(work.flux, 0, 0, state.complex.ticks, ring[i], ring[k], ring[j], state.objective)
     for d in range(fluxes.shape[2]):
@@ -784,10 +794,12 @@ def close_gaps(state: State, is_dirty: Bools1) -> None:
         if last == cell:
             last -= 1
             break
-        cells[cell] = cells[last]
-        across[cell] = across[last]
-        fluxes[cell] = fluxes[last]
-        sums[cell] = sums[last]
+        for k in range(n):  # numba compiles whole rows four times as long
+            cells[cell, k], across[cell, k] = cells[last, k], across[last, k]
+            for d in range(sums.shape[1]):
+                fluxes[cell, k, d] = fluxes[last, k, d]
+        for d in range(sums.shape[1]):
+            sums[cell, d] = sums[last, d]
         E_shape[cell] = E_shape[last]
         state.complex.labels[cell] = state.complex.labels[last]
         is_dirty[cell] = is_dirty[last]

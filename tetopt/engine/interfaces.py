@@ -16,7 +16,7 @@ from tetopt.engine.complex import NodeRings, State, facet_area, image_energy, no
 from tetopt.engine.labelling import keeps_topology, labelled, voxel_pieces
 from tetopt.engine.surface import MOST_MEETING
 from tetopt.geometry.simplex import centroids, volumes
-from tetopt.kernels import entry, helper, unit
+from tetopt.kernels import Floats1, Ints1, entry, helper, unit
 from tetopt.mesh import Mesh
 from tetopt.target.content import Content
 
@@ -69,15 +69,19 @@ def cell_counts(content: Content, mesh: Mesh) -> scipy.sparse.csr_array:
 def _meet(state: State, rings: NodeRings, node: int) -> None:
     """Note which labels the cells around a node have."""
     meeting, count = state.complex.meeting[node], 0
-    meeting[:] = -1
+    for m in range(MOST_MEETING):
+        meeting[m] = -1
     for r in range(rings.start[node], rings.start[node + 1]):
         label, is_new = state.complex.labels[rings.cells[r]], True
         for m in range(count):
             is_new = is_new and meeting[m] != label
         if is_new and count < MOST_MEETING:
-            meeting[count] = label
+            m = count
+            while m > 0 and meeting[m - 1] > label:  # in rising order
+                meeting[m] = meeting[m - 1]
+                m -= 1
+            meeting[m] = label
             count += 1
-    meeting[:count].sort()
     if count == 1:
         meeting[0] = -1
 
@@ -131,13 +135,13 @@ def _find_relabelling(gain: NDArray, label: NDArray, state: State, cell: int) ->
 
 
 @entry
-def _find_relabellings(gain: NDArray, label: NDArray, state: State) -> None:
+def _find_relabellings(gain: Floats1, label: Ints1, state: State) -> None:
     for cell in range(len(gain)):
         _find_relabelling(gain, label, state, cell)
 
 
 @entry
-def _relabel(order: NDArray, gain: NDArray, label: NDArray, state: State, rings: NodeRings) -> int:
+def _relabel(order: Ints1, gain: Floats1, label: Ints1, state: State, rings: NodeRings) -> int:
     mesh, moved = state.complex, 0
     for cell in order:
         _find_relabelling(gain, label, state, cell)

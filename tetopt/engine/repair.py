@@ -43,7 +43,7 @@ from tetopt.engine.flips import (
 from tetopt.engine.smooth import ring_energy, slid, store, trial_of
 from tetopt.engine.surface import projection_at, slides
 from tetopt.geometry.vectors import difference, dot, put_row, row, scaled, times
-from tetopt.kernels import Floats2, entry, helper, unit
+from tetopt.kernels import Floats1, Floats2, Ints1, entry, helper, unit
 
 REPAIR_ROUNDS = 40  # at most; a round that changes nothing ends them before
 STEP_HALVINGS = 7  # of a node's displacement
@@ -68,7 +68,7 @@ def cell_cosines(state: State) -> NDArray[np.float64]:
 
 
 @entry
-def _fill_cosines(cosines: NDArray, state: State) -> None:
+def _fill_cosines(cosines: Floats1, state: State) -> None:
     x = np.empty((4, 3))
     for cell in range(len(cosines)):
         cosines[cell] = cell_cosine(x, state, cell)
@@ -115,7 +115,7 @@ def _worst_first(state: State, target: float) -> NDArray[np.int64]:
 
 
 @entry
-def _reconnect(state: State, bad: NDArray, target: float, work: Cavity) -> int:
+def _reconnect(state: State, bad: Ints1, target: float, work: Cavity) -> int:
     """For each bad cell the flip that leaves the best worst angle in its cavity, if it is better than before."""
     cells, across = state.complex.cells, state.complex.across
     room = len(cells)
@@ -148,7 +148,9 @@ def _reconnect(state: State, bad: NDArray, target: float, work: Cavity) -> int:
             _gain_of_edge(work, state, cell, e, m, is_open, target)
             a, b = cells[cell, i], cells[cell, j]
             if state.objective.image > 0.0:
-                work.is_side[:] = False
+                for i in range(m):
+                    for j in range(m):
+                        work.is_side[i, j] = False
                 for i in range(m - 1):
                     for j in range(i + 1, m):
                         fill_side(work, state, a, b, i, j, m, is_open)
@@ -216,7 +218,7 @@ def _gain_of_edge(work: Cavity, state: State, cell: int, e: int, m: int, is_open
 
 
 @entry
-def _displace(state: State, rings: NodeRings, bad: NDArray, target: float) -> int:
+def _displace(state: State, rings: NodeRings, bad: Ints1, target: float) -> int:
     """Move the nodes of each bad cell so that the worst angle of their rings grows, up to the target."""
     x, n_made = np.empty((4, 3)), 0
     for number in range(len(bad)):

@@ -137,7 +137,7 @@ def colours_of(state: State, rings: NodeRings, groups: Blocks) -> list[NDArray[n
 
 
 @entry
-def _block_rings(nodes: NDArray, start: NDArray, ring_start: NDArray, ring_cells: NDArray) -> tuple:
+def _block_rings(nodes: Ints1, start: Ints1, ring_start: Ints1, ring_cells: Ints1) -> tuple[Ints1, Ints1]:
     """The cells around the nodes of each group, as `Rings`; cells may be named several times."""
     first = np.zeros(len(start), dtype=np.int64)
     cells = np.empty(len(ring_cells), dtype=np.int64)
@@ -168,9 +168,9 @@ def _facet_moments(
     is more than the other. moment (2, n_channels) gets the means of h phi and of phi^2 dh; that of phi is returned,
     1/3 (1/2 in 2-D).
     """
-    if objective.is_short:
-        return _moments_of(moment, objective.short_prefix, ticks, node, b, c, aside, objective)
-    return _moments_of(moment, objective.prefix, ticks, node, b, c, aside, objective)
+    if objective.volume.is_short:
+        return _moments_of(moment, objective.volume.short, ticks, node, b, c, aside, objective)
+    return _moments_of(moment, objective.volume.long, ticks, node, b, c, aside, objective)
 
 
 @helper

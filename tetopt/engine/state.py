@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.check import check_unfolded
-from tetopt.energy.sampling import SamplingGrid, check_orientations, to_ticks
+from tetopt.energy.sampling import SamplingGrid, check_orientations, to_ticks, volume_of
 from tetopt.engine.complex import Objective, Sides, State, build, energies
 from tetopt.engine.descent import free_projections
 from tetopt.engine.loop import E_D_ROUNDING, SHAPE_POWER, Boundary, frozen_axes, side_ticks
@@ -96,11 +96,8 @@ def sides_of(
 
 def objective_of(grid: SamplingGrid, matrix: NDArray[np.float64], power: float, is_graded: bool = False) -> Objective:
     """An objective of plain numbers, as the kernels are compiled for, of weights 1 and without a floor."""
-    is_short, nothing = grid.prefix.dtype == np.int32, np.zeros((1, 1, 1, grid.prefix.shape[3]))
     return Objective(
-        prefix=nothing if is_short else grid.prefix,
-        short_prefix=grid.prefix if is_short else nothing.astype(np.int32),
-        is_short=bool(is_short),
+        volume=volume_of(grid),
         bits=int(grid.bits),
         hand=1 if np.linalg.det(matrix) > 0.0 else -1,
         matrix=matrix,

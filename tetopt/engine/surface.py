@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from tetopt.engine.complex import NodeRings, State, has_node, outward, place
 from tetopt.geometry.vectors import cross, dot, row, scaled
-from tetopt.kernels import Floats2, entry, helper, unit
+from tetopt.kernels import Floats2, Singles3, entry, helper, unit
 from tetopt.target.domain import ON_SURFACE_VOXELS
 
 NEAR_CURVE_VOXELS = 0.1  # where several surfaces meet, a place with levels as near to 0 lies on all of them
@@ -22,7 +22,7 @@ FLAT_RISE = 1e-12  # where the level rises less along the way up, steps would be
 
 
 @entry
-def level_at(level: NDArray, i: float, j: float, k: float) -> float:
+def level_at(level: Singles3, i: float, j: float, k: float) -> float:
     """The level at an index position, linear along each axis between voxel centres."""
     i = min(max(i, 0.0), level.shape[0] - 1.0)
     j = min(max(j, 0.0), level.shape[1] - 1.0)
