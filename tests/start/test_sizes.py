@@ -119,6 +119,25 @@ def test_targets_from_any_mesh(count):
     assert ratios.above < 0.03
 
 
+@pytest.mark.parametrize("shape", [(48, 40, 44), (90, 70)])
+def test_targets_without_the_image(shape):
+    """With k_D = 0 they are met too, by cells of better shape than an image's."""
+    image = ball(*shape)
+    sizes = Sizes(field=half_sized(image, 5.0 if len(shape) == 3 else 4.0))
+    nodes = nodes_of_sizes(image, sizes)[0]
+    result, seeing = (tetopt.mesh_image(image, nodes, sizes=sizes, k_D=k_D) for k_D in (0.0, 0.85))
+    mesh = result.mesh
+    assert len(mesh.points) == nodes
+    assert tetopt.check_mesh(mesh, image) == []
+    assert result.history[-1].n_voxels == image.data.size
+    assert result.history[-1].E_D == pytest.approx(tetopt.E_D(image, mesh), rel=1e-9)
+    ratios = edge_ratios(mesh.points, mesh.cells, sizes)
+    assert 0.75 < ratios.mean < 1.03
+    assert ratios.above < 0.02
+    rho, other = (tetopt.quality(each.points, each.cells).mean_rho for each in (mesh, seeing.mesh))
+    assert rho > other
+
+
 def test_nodes_follow_from_sizes():
     """Without a number of nodes; a bound of the longest edge says nothing of it, nor does a field of one half."""
     image = ball(30, 30, 30)

@@ -100,9 +100,9 @@ def optimize(
     nodes : int, optional
         Put nodes where they lower E most, towards this number of them: on a graded mesh, such as `octree`. Every
         cell's shape then counts the same, whatever its size (see `tetopt.engine.complex.shape_energy`), and nodes
-        are exchanged in the first iterations, if k_D > 0. An exchange doubles them at most, so that few iterations, or
-        a number far from that of `mesh`, may miss it; count them. By default the nodes of `mesh` are kept, and the
-        shape energy is that of Eq. (1).
+        are exchanged in the first iterations, if k_D > 0 or `sizes` have a target. An exchange doubles them at most, so
+        that few iterations, or a number far from that of `mesh`, may miss it; count them. By default the nodes of
+        `mesh` are kept, and the shape energy is that of Eq. (1).
     sizes : Sizes, optional
         Targets and limits for the edges that exchanges make, with `nodes`.
     tolerance : float
@@ -136,7 +136,8 @@ def optimize(
     sizes = (Sizes() if sizes is None else sizes).prepared(content.image.ndim)
     run = Run(content, mesh, k_D, shape_power, boundary, is_graded=nodes is not None)
     floor = min_dihedral if run.n == 3 else 0.0
-    n_early = int(EXCHANGING_SHARE * iterations) if k_D > 0.0 else 0  # iterations in which nodes may be exchanged
+    # Iterations in which nodes may be exchanged: shape alone does not say where there should be more.
+    n_early = int(EXCHANGING_SHARE * iterations) if k_D > 0.0 or sizes.has_target else 0
     history: list[Record] = []
 
     def record(iteration: int, movement: float, is_changed: bool) -> None:

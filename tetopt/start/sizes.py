@@ -200,9 +200,10 @@ def edge_ratios(points: NDArray, cells: NDArray, sizes: Sizes) -> EdgeRatios | N
     """How the edges of a mesh meet the targets of sizes; None if no edge has any."""
     n, target = points.shape[1], sizes.prepared(points.shape[1]).at(points)
     first, second = np.triu_indices(n + 1, 1)
-    ends = np.unique(np.sort(np.stack([cells[:, first].ravel(), cells[:, second].ravel()], axis=1), axis=1), axis=0)
-    wish = 0.5 * target[ends].sum(axis=1)
-    length = np.linalg.norm(points[ends[:, 1]] - points[ends[:, 0]], axis=1)
+    a, b = cells[:, first].ravel(), cells[:, second].ravel()
+    a, b = np.divmod(np.unique(np.minimum(a, b) * len(points) + np.maximum(a, b)), len(points))
+    wish = 0.5 * (target[a] + target[b])
+    length = np.linalg.norm(points[b] - points[a], axis=1)
     ratio = (length / wish)[np.isfinite(wish)]
     if len(ratio) == 0:
         return None
