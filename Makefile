@@ -15,6 +15,7 @@ demo: $(VENV)/.demo
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt demo -o demo --force
 
 test: $(VENV)/.test
+	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt warm-up
 	$(TESTED) -m "not slow" -n auto --dist loadfile
 	$(MAKE) --no-print-directory test-onethread test-nojit
 

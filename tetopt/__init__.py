@@ -5,6 +5,10 @@ __version__ = "0.1.0"
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
+from tetopt.cache import place_cache
+
+place_cache()  # before numba is loaded
+
 if TYPE_CHECKING:
     from tetopt.check import check_mesh
     from tetopt.energy.discretization import E_D

@@ -18,11 +18,13 @@ import subprocess
 import sys
 import tempfile
 import typing
+import warnings
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from functools import cache, cached_property
 from importlib import import_module
 from pathlib import Path
+from types import CellType, FunctionType
 from typing import Annotated, Any
 
 import llvmlite.binding as llvm
@@ -38,6 +40,8 @@ from numba.core.typing.templates import AttributeTemplate, infer_getattr, make_i
 from numba.extending import NativeValue, intrinsic
 from numba.np.arrayobj import populate_array
 from numpy.typing import NDArray
+
+from tetopt.cache import place_cache
 
 # Arrays in the signatures of units and in records: of so many axes, the last one contiguous.
 Floats1 = Annotated[NDArray[np.float64], types.float64[::1]]
@@ -225,7 +229,19 @@ def _unbox_packed(_type: RecordType, value: Any, context: Any) -> NativeValue:
 
 # Functions.
 
-KERNELS: list[Any] = []  # all that were defined, in the modules imported so far
+ALL_KERNELS: list[Any] = []  # all that were defined, in the modules imported so far
+
+
+def _versioned(function: Callable[..., Any]) -> Callable[..., Any]:
+    """A function for numba to compile that closes over the checksum of all kernels.
+
+    numba's cache is keyed by the code of one function and what that closes over, so that it would return a function
+    compiled with others as they were before.
+    """
+    code = function.__code__.replace(co_freevars=("checksum",))
+    version = FunctionType(code, function.__globals__, function.__name__, None, (CellType(checksum()),))
+    version.__qualname__, version.__module__ = function.__qualname__, function.__module__
+    return version
 
 
 class Kernel:
@@ -236,7 +252,7 @@ class Kernel:
         self.__name__, self.__doc__, self.__module__ = function.__name__, function.__doc__, function.__module__
         self.room = self.__module__.rpartition(".")[2]
         self.is_linked = False
-        KERNELS.append(self)
+        ALL_KERNELS.append(self)
 
     @cached_property
     def signature(self) -> Any:
@@ -285,7 +301,7 @@ class Unit(Kernel):
     @cached_property
     def compiled(self) -> Any:
         """The function for callers of machine code; compiled now, or taken from the cache."""
-        return numba.cfunc(self.signature, cache=True, error_model="numpy")(self.function)
+        return numba.cfunc(self.signature, cache=True, error_model="numpy")(_versioned(self.function))
 
     @property
     def address(self) -> int:
@@ -306,7 +322,7 @@ class Unit(Kernel):
     @cached_property
     def entry(self) -> Any:
         """How Python calls it."""
-        return njit(cache=True, error_model="numpy")(self.function)
+        return njit(cache=True, error_model="numpy")(_versioned(self.function))
 
     def __call__(self, *values: Any) -> Any:
         """Call it from Python."""
@@ -320,7 +336,7 @@ class Entry(Kernel):
     @cached_property
     def dispatcher(self) -> Any:
         """numba's."""
-        return njit(cache=True, error_model="numpy")(self.function)
+        return njit(cache=True, error_model="numpy")(_versioned(self.function))
 
     @cached_property
     def compiled(self) -> Any:
@@ -383,6 +399,8 @@ def link(kernels: Sequence[Any]) -> None:
     for number, kernel in enumerate(order):
         kernel.link()
         if not kernel.was_cached:
+            if (notice := place_cache()) is not None:
+                warnings.warn(notice, RuntimeWarning, stacklevel=2)
             _compile_apart(order[number + 1 :])
             break
     for kernel in order:
@@ -392,8 +410,15 @@ def link(kernels: Sequence[Any]) -> None:
 
 def roots() -> list[Kernel]:
     """The kernels that no other calls: those of all modules imported so far."""
-    called = {inner for kernel in KERNELS for inner in units_of(kernel.function)}
-    return [kernel for kernel in KERNELS if kernel not in called]
+    called = {inner for kernel in ALL_KERNELS for inner in units_of(kernel.function)}
+    return [kernel for kernel in ALL_KERNELS if kernel not in called]
+
+
+def cache_folder() -> Path:
+    """Where numba keeps what it compiled."""
+    if chosen := os.environ.get("NUMBA_CACHE_DIR"):
+        return Path(chosen)
+    return Path(next(kernel for kernel in ALL_KERNELS if isinstance(kernel, Entry)).dispatcher.stats.cache_path)
 
 
 def _callees_first(kernel: Any) -> Iterator[Any]:
@@ -432,7 +457,7 @@ def compile_named(names: Sequence[str], claims: str) -> None:
     """
     chosen = [getattr(import_module(name.split(":")[0]), name.split(":")[1]) for name in names]
     numba.get_num_threads()
-    for kernel in KERNELS:
+    for kernel in ALL_KERNELS:
         if isinstance(kernel, Unit):
             llvm.add_symbol(kernel.symbol, 1)
     for number, kernel in enumerate(chosen):

@@ -53,6 +53,10 @@ COMMANDS = {
         "compare",
         "Set tetopt beside the conventional pipelines on a volume: fidelity, shape, simulation accuracy, time.",
     ),
+    "warm-up": (
+        "warm_up",
+        "Compile all kernels ahead, as for an image of a container or a cluster; later runs load them from the cache.",
+    ),
     "demo": ("mesh", "Mesh the MNI152 T1 that nilearn's wheel carries; leave mesh, numbers and pictures in a folder."),
 }
 
@@ -105,7 +109,7 @@ def loaded_command(name: str) -> Callable[..., Any]:
     """The function of a command, as typer takes it."""
     from tetopt.cli.options import from_records  # which loads what its defaults come from
 
-    return from_records(getattr(import_module(f"tetopt.cli.{COMMANDS[name][0]}"), f"{name}_command"))
+    return from_records(getattr(import_module(f"tetopt.cli.{COMMANDS[name][0]}"), f"{name.replace('-', '_')}_command"))
 
 
 def _version(is_requested: bool) -> None:

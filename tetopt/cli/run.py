@@ -41,7 +41,7 @@ def watched_run(run: Run, initial: Mesh, iterations: int, ends: float | None) ->
 def prepare(content: Content, k_D: float, mode: Mode) -> None:
     """Load the compiled kernels, or compile them, before the clock of the first iteration starts."""
     begin = time.perf_counter()
-    with log.status("preparing the kernels (the first run compiles them, one to two minutes) ..."):
+    with log.status("preparing the kernels (the first run compiles them, half a minute) ..."):
         prepare_kernels(content, k_D, "paper" if mode == "paper" else "fast", mode == "graded")
     seconds = time.perf_counter() - begin
     if seconds > LONG_SECONDS:

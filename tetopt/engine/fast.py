@@ -195,7 +195,12 @@ def prepare_kernels(
     has_labels = content.memberships is not None and k_D > 0.0
     if method == "fast":
         unused = {_gradients, _evaluate_triangles if image.ndim == 3 else _evaluate_cells}
-        purposes = {"density": is_graded or image.ndim == 3, "repair": image.ndim == 3, "interfaces": has_labels}
+        purposes = {
+            "density": is_graded or image.ndim == 3,
+            "repair": image.ndim == 3,
+            "interfaces": has_labels,
+            "labelling": has_labels,
+        }
         link([kernel for kernel in roots() if kernel not in unused and purposes.get(kernel.room, True)])
     is_whole = not content.is_plain or np.array_equal(np.rint(image.data), image.data)
     step = 1.0 if is_whole else 0.1

@@ -21,12 +21,12 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy
-from numba import njit
 from numpy.typing import NDArray
 
 from tetopt.engine.complex import has_node
 from tetopt.geometry.simplex import facet_areas, volumes
 from tetopt.geometry.topology import rings
+from tetopt.kernels import Bools1, Floats1, Floats2, Ints1, Ints2, entry, helper, unit
 
 TENSION_SHARE = (
     0.1  # of the local edge: a regular cell with three facets against one label goes, unless nearly full of its own
@@ -55,16 +55,16 @@ class Labelling(NamedTuple):
 class Dual(NamedTuple):
     """A mesh as its cells touch each other, and what each cell holds."""
 
-    cells: NDArray[np.int64]  # (M, n+1)
-    across: NDArray[np.int64]  # (M, n+1) the cell beyond each facet; -1 outside
-    ring_start: NDArray[np.int64]  # (N+1,)
-    ring_cells: NDArray[np.int64]  # (M (n+1),) the cells around each node, ascending
-    size: NDArray[np.float64]  # (M,) volumes, mm^n
-    scale: NDArray[np.float64]  # (N,) mean volume of the cells around each node
-    tension: NDArray[np.float64]  # (M, n+1) what each facet costs between different labels, mm^n; 0 on the boundary
-    first: NDArray[np.int64]  # (M+1,) where each cell's row of voxels begins
-    row: NDArray[np.int64]  # labels in it
-    volume: NDArray[np.float64]  # of their voxels in it, mm^n
+    cells: Ints2  # (M, n+1)
+    across: Ints2  # (M, n+1) the cell beyond each facet; -1 outside
+    ring_start: Ints1  # (N+1,)
+    ring_cells: Ints1  # (M (n+1),) the cells around each node, ascending
+    size: Floats1  # (M,) volumes, mm^n
+    scale: Floats1  # (N,) mean volume of the cells around each node
+    tension: Floats2  # (M, n+1) what each facet costs between different labels, mm^n; 0 on the boundary
+    first: Ints1  # (M+1,) where each cell's row of voxels begins
+    row: Ints1  # labels in it
+    volume: Floats1  # of their voxels in it, mm^n
 
 
 def labelled(
@@ -196,7 +196,7 @@ def _settle(dual: Dual, labels: NDArray[np.int64], least: NDArray[np.float64], i
             return total
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def _voxels(dual: Dual, cell: int, label: int) -> float:
     """Volume of the voxels of a label in a cell."""
     for p in range(dual.first[cell], dual.first[cell + 1]):
@@ -205,8 +205,8 @@ def _voxels(dual: Dual, cell: int, label: int) -> float:
     return 0.0
 
 
-@njit(cache=True, error_model="numpy")
-def _price(dual: Dual, labels: NDArray, cell: int, label: int) -> float:
+@unit
+def _price(dual: Dual, labels: Ints1, cell: int, label: int) -> float:
     """The part of the energy that a cell's label decides, less what it is at best, if its label were this."""
     price = -_voxels(dual, cell, label)
     for k in range(dual.across.shape[1]):
@@ -216,7 +216,7 @@ def _price(dual: Dual, labels: NDArray, cell: int, label: int) -> float:
     return price
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def _best_label(dual: Dual, labels: NDArray, cell: int) -> tuple:
     """Of the labels of a cell's neighbours the one of least price, and what is gained by it; its own if nothing is."""
     own = _price(dual, labels, cell, labels[cell])
@@ -230,14 +230,14 @@ def _best_label(dual: Dual, labels: NDArray, cell: int) -> tuple:
     return best, gain
 
 
-@njit(cache=True, error_model="numpy")
-def _fill_gains(gains: NDArray, dual: Dual, labels: NDArray) -> None:
+@entry
+def _fill_gains(gains: Floats1, dual: Dual, labels: Ints1) -> None:
     for cell in range(len(labels)):
         gains[cell] = _best_label(dual, labels, cell)[1]
 
 
-@njit(cache=True, error_model="numpy")
-def _settle_once(dual: Dual, labels: NDArray, order: NDArray, room: NDArray, n_of: NDArray, is_careful: bool) -> int:
+@entry
+def _settle_once(dual: Dual, labels: Ints1, order: Ints1, room: Floats1, n_of: Ints1, is_careful: bool) -> int:
     """The cells of `order` take the best label of a neighbour one after the other, where that gains still."""
     moved = 0
     for cell in order:
@@ -260,9 +260,9 @@ def _settle_once(dual: Dual, labels: NDArray, order: NDArray, room: NDArray, n_o
     return moved
 
 
-@njit(cache=True, error_model="numpy")
+@unit
 def keeps_topology(
-    cells: NDArray, across: NDArray, labels: NDArray, ring_start: NDArray, ring_cells: NDArray, cell: int, label: int
+    cells: Ints2, across: Ints2, labels: Ints1, ring_start: Ints1, ring_cells: Ints1, cell: int, label: int
 ) -> bool:
     """Whether a cell may have another label without changing the topology of its own label or of the new one.
 
@@ -279,9 +279,9 @@ def keeps_topology(
     )
 
 
-@njit(cache=True, error_model="numpy")
+@unit
 def _is_disc(
-    cells: NDArray, across: NDArray, labels: NDArray, ring_start: NDArray, ring_cells: NDArray, cell: int,
+    cells: Ints2, across: Ints2, labels: Ints1, ring_start: Ints1, ring_cells: Ints1, cell: int,
     label: int, is_of: bool,
 ) -> bool:  # fmt: skip
     """Whether what a cell shares with the other cells of a label, or with those of others and the outside, is a disc.
@@ -312,7 +312,7 @@ def _is_disc(
     return True
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def _has_corners(cells: NDArray, other: int, cell: int, is_one: NDArray) -> bool:
     """Whether a cell has those corners of another one."""
     has_all = True
@@ -321,7 +321,7 @@ def _has_corners(cells: NDArray, other: int, cell: int, is_one: NDArray) -> bool
     return has_all
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def _is_opposite(cells: NDArray, other: int, k: int, cell: int, is_one: NDArray) -> bool:
     """Whether facet k of a cell lies opposite one of those corners of another cell."""
     is_opposite = False
@@ -366,10 +366,8 @@ def _without_fragments(
     return moved + _give_away(dual, labels, is_loose)
 
 
-@njit(cache=True, error_model="numpy")
-def _bridge(
-    bridge: NDArray, way: NDArray, before: NDArray, dual: Dual, labels: NDArray, piece: NDArray, most: float
-) -> int:
+@entry
+def _bridge(bridge: Ints1, way: Floats1, before: Ints1, dual: Dual, labels: Ints1, piece: Ints1, most: float) -> int:
     """The cells by which a piece is linked to another of its label at least cost, below `most`; how many there are.
 
     Dijkstra's shortest path: a step costs what it costs that its cell has the label, all others as they are. `way` is
@@ -410,8 +408,8 @@ def _bridge(
     return count
 
 
-@njit(cache=True, error_model="numpy")
-def _give_away(dual: Dual, labels: NDArray, is_loose: NDArray) -> int:
+@entry
+def _give_away(dual: Dual, labels: Ints1, is_loose: Bools1) -> int:
     """Loose cells take the label of least price among those of neighbours that are not, from the outside in."""
     total, moved = 0, 1
     while moved > 0:
@@ -439,10 +437,10 @@ def _give_away(dual: Dual, labels: NDArray, is_loose: NDArray) -> int:
 class _Work(NamedTuple):
     """Room for the kernels below."""
 
-    star: NDArray[np.int64]  # the cells around one node or edge
-    root: NDArray[np.int64]  # of each of them, in the fan that it is in
-    place: NDArray[np.int64]  # (M,) where a cell is in the star; -1 in between
-    seen: NDArray[np.int64]  # (N,) the last node of which a node was seen to be a neighbour
+    star: Ints1  # the cells around one node or edge
+    root: Ints1  # of each of them, in the fan that it is in
+    place: Ints1  # (M,) where a cell is in the star; -1 in between
+    seen: Ints1  # (N,) the last node of which a node was seen to be a neighbour
 
 
 def _work(dual: Dual) -> _Work:
@@ -462,7 +460,7 @@ def _nonmanifold(
     faces = np.empty((len(dual.scale) + 6 * len(labels), 3), dtype=np.int64)
     is_near = np.ones(len(dual.scale), dtype=bool) if is_near is None else is_near
     faces = faces[: _find_nonmanifold(faces, dual, labels, is_near, _work(dual))].copy()
-    return faces[:, :2], faces[:, 2] == 2
+    return np.ascontiguousarray(faces[:, :2]), faces[:, 2] == 2
 
 
 def _mended(dual: Dual, labels: NDArray[np.int64], is_bridge: NDArray[np.bool_], least: NDArray[np.float64]) -> int:
@@ -487,7 +485,7 @@ def _mend_pairs(dual: Dual, labels: NDArray[np.int64], least: NDArray[np.float64
     _mend(dual, labels, room, is_bridge, faces[is_two], is_near, _work(dual))
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def _mixed_nodes(dual: Dual, labels: NDArray) -> NDArray:
     """Whether cells of two labels meet at each node."""
     is_mixed = np.zeros(len(dual.scale), dtype=np.bool_)
@@ -500,8 +498,8 @@ def _mixed_nodes(dual: Dual, labels: NDArray) -> NDArray:
     return is_mixed
 
 
-@njit(cache=True, error_model="numpy")
-def _find_nonmanifold(faces: NDArray, dual: Dual, labels: NDArray, is_near: NDArray, work: _Work) -> int:
+@entry
+def _find_nonmanifold(faces: Ints2, dual: Dual, labels: Ints1, is_near: Bools1, work: _Work) -> int:
     """The rows of `_nonmanifold` and the number of labels that meet there, (F, 3); their count."""
     count, is_mixed = 0, _mixed_nodes(dual, labels)
     for a in range(len(is_mixed)):
@@ -524,7 +522,7 @@ def _find_nonmanifold(faces: NDArray, dual: Dual, labels: NDArray, is_near: NDAr
     return count
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def _gather(dual: Dual, a: int, b: int, star: NDArray) -> int:
     """The cells around a node, or around an edge with b >= 0, and how many they are."""
     count = 0
@@ -535,8 +533,8 @@ def _gather(dual: Dual, a: int, b: int, star: NDArray) -> int:
     return count
 
 
-@njit(cache=True, error_model="numpy")
-def _excess(dual: Dual, labels: NDArray, a: int, b: int, work: _Work) -> tuple:
+@unit
+def _excess(dual: Dual, labels: Ints1, a: int, b: int, work: _Work) -> tuple[int, int]:
     """How many fans too many there are around a node or an edge, over all labels there; and how many these are.
 
     For each label, the fans of its cells less one and those of all others, the outside among them, less one.
@@ -561,7 +559,7 @@ def _excess(dual: Dual, labels: NDArray, a: int, b: int, work: _Work) -> tuple:
     return excess, n_labels
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def _fans(dual: Dual, labels: NDArray, a: int, b: int, count: int, label: int, work: _Work) -> int:
     """Fans of a label's cells in a star and of all others, the outside among them: linked by facets around it."""
     root, n_fans, is_open = work.root, count, False  # the last of the roots is the outside's
@@ -588,9 +586,9 @@ def _fans(dual: Dual, labels: NDArray, a: int, b: int, count: int, label: int, w
     return n_fans + 1 if is_open else n_fans
 
 
-@njit(cache=True, error_model="numpy")
+@entry
 def _mend(
-    dual: Dual, labels: NDArray, room: NDArray, is_bridge: NDArray, faces: NDArray, is_near: NDArray, work: _Work
+    dual: Dual, labels: Ints1, room: Floats1, is_bridge: Bools1, faces: Ints2, is_near: Bools1, work: _Work
 ) -> int:
     """Each face that is not manifold takes the move that lowers the energy with what is not manifold most.
 
@@ -623,8 +621,8 @@ def _mend(
     return total
 
 
-@njit(cache=True, error_model="numpy")
-def _group(dual: Dual, labels: NDArray, a: int, b: int, star: NDArray, i: int, group: NDArray) -> int:
+@unit
+def _group(dual: Dual, labels: Ints1, a: int, b: int, star: Ints1, i: int, group: Ints1) -> int:
     """Cells that may change together: cell i of a star; for i beyond these, the fan of one label that it begins."""
     if i < len(star):
         group[0] = star[i]
@@ -649,8 +647,10 @@ def _group(dual: Dual, labels: NDArray, a: int, b: int, star: NDArray, i: int, g
     return count if count > 1 else 0
 
 
-@njit(cache=True, error_model="numpy")
-def _best_of_group(dual: Dual, labels: NDArray, group: NDArray, star: NDArray, least: float, work: _Work) -> tuple:
+@unit
+def _best_of_group(
+    dual: Dual, labels: Ints1, group: Ints1, star: Ints1, least: float, work: _Work
+) -> tuple[int, float]:
     """The label in the star that lowers the energy most if the group takes it, and the change: below `least`, or -1."""
     old, best, faces = labels[group[0]], -1, np.empty((0, 2), dtype=np.int64)
     before, pinches = 0.0, 0.0
@@ -664,17 +664,19 @@ def _best_of_group(dual: Dual, labels: NDArray, group: NDArray, star: NDArray, l
         if len(faces) == 0:
             faces = _closure(dual, group)
             before, pinches = _prices(dual, labels, group), _pinches(dual, labels, faces, work)
-        labels[group] = new
+        for cell in group:
+            labels[cell] = new
         change = _prices(dual, labels, group) - before - pinches
         if change < least:  # with all pinches gone
             change += _pinches(dual, labels, faces, work)
-        labels[group] = old
+        for cell in group:
+            labels[cell] = old
         if change < least:
             best, least = new, change
     return best, least
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def _touches(dual: Dual, labels: NDArray, group: NDArray, label: int) -> bool:
     """Whether a cell of a label lies across a facet of the group."""
     for cell in group:
@@ -684,7 +686,7 @@ def _touches(dual: Dual, labels: NDArray, group: NDArray, label: int) -> bool:
     return False
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def _closure(dual: Dual, group: NDArray) -> NDArray:
     """Nodes (a, -1) and, in 3-D, edges (a, b) of some cells, each once, (F, 2)."""
     n = dual.cells.shape[1]
@@ -703,7 +705,7 @@ def _closure(dual: Dual, group: NDArray) -> NDArray:
     return faces[:count]
 
 
-@njit(cache=True, error_model="numpy")
+@helper
 def _prices(dual: Dual, labels: NDArray, group: NDArray) -> float:
     """The part of the energy that the label of a group of cells, one for all, decides."""
     total = 0.0
@@ -712,8 +714,8 @@ def _prices(dual: Dual, labels: NDArray, group: NDArray) -> float:
     return total
 
 
-@njit(cache=True, error_model="numpy")
-def _pinches(dual: Dual, labels: NDArray, faces: NDArray, work: _Work) -> float:
+@unit
+def _pinches(dual: Dual, labels: Ints1, faces: Ints2, work: _Work) -> float:
     """What these nodes and edges cost that are not manifold."""
     total = 0.0
     for f in range(len(faces)):

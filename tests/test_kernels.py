@@ -1,0 +1,224 @@
+"""How kernels are compiled: records by address, units through symbols, several processes, the cache."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from typing import NamedTuple
+
+import numba
+import numpy as np
+import pytest
+
+from tetopt import cache, kernels
+from tetopt.kernels import (
+    Bools1,
+    Floats1,
+    Floats2,
+    Floats3,
+    Ints1,
+    Packed,
+    by_value,
+    entry,
+    helper,
+    nth,
+    run,
+    thread,
+    unit,
+)
+
+compiled_only = pytest.mark.skipif(numba.config.DISABLE_JIT, reason="NUMBA_DISABLE_JIT is set: nothing is compiled")
+
+
+class Part(NamedTuple):
+    values: Floats2
+    is_on: Bools1
+    count: int
+    weight: float
+    is_heavy: bool
+
+
+class Whole(NamedTuple):
+    name: int
+    part: Part
+    others: list[Part]
+    out: Floats1
+    threads: Ints1
+
+
+@unit
+def row_sum(part: Part, i: int) -> tuple[float, int]:
+    total = 0.0
+    for k in range(part.values.shape[1]):
+        total += part.values[i, k]
+    return (part.weight * total if part.is_heavy and part.is_on[i] else total), part.count
+
+
+@helper
+def both_sums(whole: Whole, i: int) -> float:
+    return row_sum(whole.part, i)[0] + 10.0 * row_sum(nth(whole.others, 1), i)[0]
+
+
+@unit
+def fill(whole: Whole, number: int) -> None:
+    whole.out[number] = both_sums(whole, number) + whole.name
+    whole.threads[number] = thread()
+
+
+@entry
+def all_sums(whole: Whole, n: int) -> float:
+    total = 0.0
+    for i in range(n):
+        total += both_sums(whole, i)
+    return total
+
+
+def part(seed, n=7):
+    rng = np.random.default_rng(seed)
+    return Part(rng.normal(size=(n, 3)), rng.random(n) < 0.5, int(seed), float(rng.random()), bool(seed % 2))
+
+
+def whole():
+    return Whole(-4, part(3), [part(4), part(5)], np.zeros(7), np.zeros(7, dtype=np.int64))
+
+
+def expected_sum(part, i):
+    total = part.values[i].sum()
+    return part.weight * total if part.is_heavy and part.is_on[i] else total
+
+
+@pytest.mark.kernel
+def test_kernels_read_records():
+    work = whole()
+    sums = [expected_sum(work.part, i) + 10.0 * expected_sum(work.others[1], i) for i in range(7)]
+    assert all_sums(work, 7) == pytest.approx(sum(sums), rel=1e-14)
+    for i in range(7):
+        value, count = row_sum(work.part, i)
+        assert (value, count) == (pytest.approx(expected_sum(work.part, i), rel=1e-14), 3)
+    run(fill, 7, work)
+    assert work.out == pytest.approx(np.array(sums) - 4.0, rel=1e-14)
+    assert (0 <= work.threads).all()
+    assert (work.threads < numba.get_num_threads()).all()
+
+
+@compiled_only
+@pytest.mark.parametrize(
+    "values", [np.zeros((3, 7)).T, np.zeros(7), np.zeros((7, 3), dtype=np.float32)], ids=["turned", "flat", "single"]
+)
+def test_a_record_of_other_arrays_is_refused(values):
+    with pytest.raises(TypeError, match=r"Part\.values: expected array\(float64, 2d, C\), got"):
+        Packed(part(1)._replace(values=values))
+
+
+@compiled_only
+def test_a_record_keeps_what_it_points_to():
+    """Its arrays may have no other owner."""
+    laid_out = Packed(Whole(1, part(3), [part(4), part(5)], np.zeros(7), np.zeros(7, dtype=np.int64)))
+    fresh = [np.full((7, 3), -1.0) for _ in range(1000)]  # over what was freed, if it was
+    assert all_sums(laid_out, 7) == all_sums(whole(), 7)
+    assert len(fresh) == 1000
+
+
+@compiled_only
+def test_roots_are_what_no_kernel_calls():
+    here = {kernel.__name__ for kernel in kernels.roots() if kernel.__module__ == __name__}
+    assert here == {"fill", "all_sums"}
+
+
+class Room(NamedTuple):
+    places: Floats3
+
+
+def test_by_value_is_a_named_tuple_of_its_arrays():
+    assert by_value(Room) == numba.types.NamedTuple([numba.types.float64[:, :, ::1]], Room)
+
+
+MODULE = """
+from __future__ import annotations
+from typing import NamedTuple
+from tetopt.kernels import Floats1, entry, unit
+
+class Row(NamedTuple):
+    x: Floats1
+"""
+UNIT = """
+@unit
+def step_{0}(row: Row, i: int) -> float:
+    return row.x[i] + {0}.0 + {1}
+"""
+PROGRAM = """
+import os, sys
+import numpy as np
+import some_kernels as k
+from tetopt import kernels
+os.cpu_count = lambda: 2
+started = []
+popen = kernels.subprocess.Popen
+kernels.subprocess.Popen = lambda *a, **b: started.append(1) or popen(*a, **b)
+kernels.link([k.step_7])
+print(k.step_7(k.Row(np.ones(3)), 2), len(started), [f.was_cached for f in (k.step_0, k.step_3, k.step_7)])
+"""
+
+
+@compiled_only
+def test_processes_share_what_is_to_be_compiled(tmp_path):
+    """The first kernel that the cache lacks is compiled here, the others by two processes; a second run loads them."""
+    units = [UNIT.format(n, f"step_{n - 1}(row, i)" if n else "0.0") for n in range(8)]
+    (tmp_path / "some_kernels.py").write_text(MODULE + "".join(units))
+    environment = os.environ | {
+        "NUMBA_CACHE_DIR": str(tmp_path / "cache"),
+        "PYTHONPATH": os.pathsep.join([str(tmp_path), *filter(None, sys.path)]),
+    }
+    said = [
+        subprocess.run(
+            [sys.executable, "-c", PROGRAM], env=environment, capture_output=True, text=True, check=True
+        ).stdout.strip()
+        for _ in range(2)
+    ]
+    assert said == ["36.0 2 [False, True, True]", "36.0 0 [True, True, True]"]
+
+
+@compiled_only
+def test_the_cache_knows_all_sources(monkeypatch):
+    """numba's own key is the code of one function; here what it closes over is of all kernels."""
+    before = kernels._versioned(row_sum.function).__closure__[0].cell_contents
+    monkeypatch.setattr(kernels, "checksum", lambda: "other")
+    assert before != "other" == kernels._versioned(row_sum.function).__closure__[0].cell_contents
+    assert row_sum.symbol.endswith(before)
+
+
+# Where the cache is.
+
+
+@pytest.fixture
+def place(monkeypatch):
+    cache.place_cache.cache_clear()
+    yield cache.place_cache
+    cache.place_cache.cache_clear()
+
+
+def test_a_cache_that_can_be_written_is_left_alone(place, monkeypatch, tmp_path):
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "not" / "yet"))
+    assert place() is None
+    assert os.environ["NUMBA_CACHE_DIR"] == str(tmp_path / "not" / "yet")
+
+
+@pytest.mark.parametrize("chosen", [None, "/nowhere"])
+def test_without_a_folder_kernels_are_kept_for_one_run(place, monkeypatch, chosen):
+    """The package and the home, or the chosen folder, cannot be written."""
+    if chosen is None:
+        monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
+    else:
+        monkeypatch.setenv("NUMBA_CACHE_DIR", chosen)
+    monkeypatch.setattr(cache.os, "access", lambda *_: False)
+    monkeypatch.setattr(numba.config, "CACHE_DIR", numba.config.CACHE_DIR)
+    notice = place()
+    assert "compiled anew in each run" in notice
+    assert (chosen or "__pycache__") in notice
+    assert "set NUMBA_CACHE_DIR" in notice
+    assert "\n" not in notice
+    folder = os.environ["NUMBA_CACHE_DIR"]
+    assert folder != chosen
+    assert os.path.isdir(folder)
+    os.rmdir(folder)

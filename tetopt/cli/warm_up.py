@@ -1,0 +1,45 @@
+"""``tetopt warm-up``: compile all kernels ahead."""
+
+from __future__ import annotations
+
+import time
+
+import numpy as np
+from rich.markup import escape
+
+from tetopt import Image, cell_fields, label_fidelity, mask_fidelity, mesh_image
+from tetopt.cli.console import log, out
+from tetopt.fem.reference import reference
+from tetopt.kernels import cache_folder, link, roots
+from tetopt.target.content import content
+
+BALL_VOXELS = 24  # along each axis of the image that is meshed: an octree of 300 nodes needs as many
+BALL_NODES = {2: 60, 3: 300}  # by its axes
+
+
+def warm_up_command() -> int:
+    """Compile all kernels ahead, as for an image of a container or a cluster; later runs load them from the cache."""
+    begin = time.perf_counter()
+    with log.status("compiling all kernels, a minute on two cores ..."):
+        link(roots())
+        for n in (3, 2):
+            _mesh_balls(n)
+        reference(Image(1.0 + np.indices((8, 8, 8)).sum(axis=0)), nu=0.3)
+    seconds = time.perf_counter() - begin
+    out.print(escape(f"all kernels are ready after {seconds:.0f} s, kept in {cache_folder()}"), soft_wrap=True)
+    return 0
+
+
+def _mesh_balls(n: int) -> None:
+    """Tiny meshes of all kinds, and what is measured of them: what no kernel calls is compiled with its caller."""
+    radius = np.sqrt(((np.indices((BALL_VOXELS,) * n) - 0.5 * (BALL_VOXELS - 1)) ** 2).sum(axis=0))
+    balls = Image((radius < 0.4 * BALL_VOXELS) + 1.0 * (radius < 0.2 * BALL_VOXELS))
+    nodes = BALL_NODES[n]
+    mesh_image(Image(np.exp(-radius)), nodes, iterations=2)
+    mesh_image(balls, nodes, mode="paper", iterations=2)
+    inside = Image((radius < 0.45 * BALL_VOXELS).astype(float))
+    mesh_image(content(balls, mask=inside), nodes, mode="uniform", iterations=2)
+    mesh = mesh_image(content(balls, labels=balls), nodes, iterations=4).mesh
+    cell_fields(mesh, balls)
+    label_fidelity(balls, mesh)
+    mask_fidelity(inside, mesh)
