@@ -28,6 +28,7 @@ from tetopt.engine.complex import (
     cell_energy,
     cell_value,
     cosine_up_to_floor,
+    determinant_and_squares,
     facet_area,
     has_node,
     image_energy,
@@ -39,6 +40,8 @@ from tetopt.engine.complex import (
     put_flux,
     shape_of_cell,
     sum_up,
+    tet_energy,
+    worst_cosine,
     wrong_side,
 )
 from tetopt.engine.surface import (
@@ -343,9 +346,8 @@ def _add_shape_gradient(
     for r in range(rings.start[node], rings.start[node + 1]):
         cell, at = rings.cells[r], rings.corner[r]
         load_cell(x, state.complex.ticks, cells, cell, objective)
-        volume, E_G = volume_and_E_G(x, n)
+        volume, S = _volume_and_squares(x, n)
         W = objective.geometry * state.complex.E_shape[cell]
-        S = E_G * (n * (n + 1)) / volume
         apart = (0.0, 0.0, 0.0)
         for k in range(n):
             apart = minus(apart, difference(x, k, at))
@@ -360,6 +362,16 @@ def _add_shape_gradient(
         if n == 4 and least > -1.0:
             least = min(least, cosine_up_to_floor(x, objective))
     return np.sqrt(nearest) / n, least
+
+
+@helper
+def _volume_and_squares(x: NDArray, n_corners: int) -> tuple:
+    """Volume and sum of squared edges of the cell x (4, 3)."""
+    if n_corners == 4:
+        determinant, S = determinant_and_squares(x)
+        return abs(determinant) / 6.0, S
+    volume, E_G = volume_and_E_G(x, n_corners)
+    return volume, E_G * (n_corners * (n_corners + 1)) / volume
 
 
 class Gradients(NamedTuple):
@@ -425,10 +437,16 @@ def ring_shape(
         if joined >= 0 and has_node(cells, rings.cells[r], joined):
             trial.shapes[r - first] = -1.0
             continue
-        shape = shape_of_cell(trial.x, state.complex.ticks, cells, rings.cells[r], objective)
+        if has_floor:  # of tetrahedra; one determinant serves both questions
+            load_cell(trial.x, state.complex.ticks, cells, rings.cells[r], objective)
+            determinant, S = determinant_and_squares(trial.x)
+            shape = tet_energy(determinant, S, objective.power, objective.is_graded)
+            is_safe = shape < np.inf and S * S * S <= objective.safe * determinant * determinant
+            if not (is_safe or (shape < np.inf and worst_cosine(trial.x) >= least)):
+                return np.inf
+        else:
+            shape = shape_of_cell(trial.x, state.complex.ticks, cells, rings.cells[r], objective)
         trial.shapes[r - first] = shape
-        if has_floor and (shape == np.inf or cosine_up_to_floor(trial.x, objective) < least):
-            return np.inf
         energy += objective.geometry * shape
         if energy > limit:
             return np.inf
