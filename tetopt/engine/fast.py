@@ -48,7 +48,8 @@ from tetopt.target.content import Content, plain
 from tetopt.target.content import content as make_content
 
 FLIP_EDGES = 0.05  # edges: nodes that moved less need no new flips
-HOPE_SHARE = 0.01  # of E over the number of nodes: nodes whose next move may win less are not moved
+HOPE_SHARE = 0.003  # of E over the number of nodes: nodes whose next move may win less are not moved
+EARLY_HOPE_SHARE = 0.05  # likewise, as long as nodes are exchanged: cells change around them anyway
 EXCHANGING_SHARE = 0.7  # of the iterations: the first ones, in which nodes are exchanged
 EXCHANGED_SHARE = 0.1  # of the requested nodes: the most that are exchanged at once
 EXCHANGE_SHAPE_WEIGHT = 0.1  # of the shape energy's weight: what a shape costs in an exchange, see `Run.exchange`
@@ -157,9 +158,9 @@ def optimize(
         if run.has_labels:
             run.attract(min(ATTRACTED_FLOOR, floor) if iteration <= n_early else floor)
         # 1. Move the nodes.
-        is_finished = run.sweep(is_over)
-        # 2. Exchange cells: where nodes are exchanged next, only at first, for cells change around them anyway.
         is_early = nodes is not None and iteration <= n_early
+        is_finished = run.sweep(is_over, EARLY_HOPE_SHARE if is_early else HOPE_SHARE)
+        # 2. Exchange cells: where nodes are exchanged next, only at first, for cells change around them anyway.
         does_exchange = is_early and is_finished and iteration % 2 == 1
         n_changes = run.flip() if is_finished and (iteration == 1 or not does_exchange) else 0
         movement = run.movement(before)
@@ -253,15 +254,15 @@ class Run:
         objective = self.state.objective
         return objective.geometry * E_G + objective.image * squares + interface_energy(self.state)
 
-    def sweep(self, is_over: Callable[[], bool] = lambda: False) -> bool:
+    def sweep(self, is_over: Callable[[], bool] = lambda: False, share: float = HOPE_SHARE) -> bool:
         """Move the nodes that may win something; False if `is_over` cut it short.
 
         A node may win what its last move did, and what has been won around it since then: the mean over its
-        neighbours, sweep by sweep. It is left alone until that is a share of E. One whose cells were exchanged may win
-        anything.
+        neighbours, sweep by sweep. It is left alone until that is a share of what E is to a node. One whose cells were
+        exchanged may win anything.
         """
         gains = np.zeros(len(self.hope))
-        is_active = (self.hope > HOPE_SHARE * self.E() / len(gains)) & ~self.is_still
+        is_active = (self.hope > share * self.E() / len(gains)) & ~self.is_still
         is_finished = sweep(self.state, node_rings(self.state), self.groups, is_active, is_over, gains)
         around = np.bincount(self.cells.ravel(), np.repeat(gains[self.cells].sum(axis=1), self.n + 1), len(gains))
         number = np.bincount(self.cells.ravel(), minlength=len(gains))
