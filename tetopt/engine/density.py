@@ -67,6 +67,8 @@ from tetopt.geometry.vectors import dot, minus, put_row, row
 from tetopt.kernels import Bools1, Floats1, Floats2, Ints1, Ints2, entry, helper, packed, run, unit
 from tetopt.start.sizes import LONG_EDGE
 
+# Of a node's mean share of E: splits worth less are not looked for. The last one made in a round is worth 0.4 to 0.8.
+LEAST_SPLIT_SHARE = 0.2
 LEAST_EXCHANGE_SHARE = 1e-3  # of a node's mean share of E: an exchange of two nodes that is worth less is not made
 # Of the noise's variance: likewise; about what the luckiest of thousands of edges wins in noise.
 LEAST_OVER_NOISE = 20.0
@@ -98,6 +100,7 @@ class Limits(NamedTuple):
     noise: float  # variance of the image's noise: what chance alone wins is not worth a node
     target: Floats1  # (N,) mm: edges over sqrt 2 times it are split before all others
     dearest: float = np.inf  # E may rise by so much in a collapse
+    least: float = -np.inf  # and has to fall by more in a split
 
 
 class EdgeMoves(NamedTuple):
@@ -115,26 +118,27 @@ def exchange(state: State, n_nodes: int, most: int, limits: Limits) -> Exchanged
     that is too long for its target. One round doubles the nodes at most. The complex of `state` is out of date
     afterwards.
     """
-    n_before, objective = len(state.complex.ticks), state.objective
+    n_before = len(state.complex.ticks)
     more, most = min(max(n_nodes - n_before, -n_before), n_before), min(most, n_before)
     rings, groups = node_rings(state), blocks(state.complex.ticks)
     state = roomy(state, n_before, 16 * (max(more, 0) + most))
+    E_G, squares = energies(state)
+    E = state.objective.geometry * E_G + state.objective.image * squares + interface_energy(state)
     # Splits pay where the error is, collapses where it is not: half of the nodes are looked at for each, unless many
     # nodes are to be put in, or taken out. It costs no E_D that could be measured, and saves half of the time.
     error = _ring_errors(state, n_before)
     middle = np.median(error)
     may_split = (error >= middle) | (more > n_before // 8) | too_long(state, limits.target)
-    splits = best_splits(state, rings, may_split, limits)
+    least = LEAST_SPLIT_SHARE * E / n_before if more <= 0 else -np.inf
+    splits = best_splits(state, rings, may_split, limits._replace(least=least))
     is_sized = bool((splits.gain >= TARGET_CREDIT).any())  # edges that are too long are split whatever it costs
-    dearest = np.inf if more < 0 or is_sized else float(np.sort(splits.gain)[-max(most // 4, 1)])
+    in_ = _best_first(splits)
+    dearest = np.inf if more < 0 or is_sized else float(splits.gain[in_[: max(most // 4, 1)]].min(initial=np.inf))
     may_collapse = (error <= middle) | (more < -(n_before // 8)) | is_sized
     collapses = best_collapses(state, rings, groups, may_collapse, limits._replace(dearest=dearest))
-    E_G, squares = energies(state)
-    E = objective.geometry * E_G + objective.image * squares + interface_energy(state)
-    least = LEAST_EXCHANGE_SHARE * E / n_before
-    least = max(least, LEAST_OVER_NOISE * objective.image * limits.noise)
+    least = max(LEAST_EXCHANGE_SHARE * E / n_before, LEAST_OVER_NOISE * state.objective.image * limits.noise)
     is_dirty = np.zeros(len(state.complex.cells), dtype=np.bool_)
-    in_, out = _best_first(splits), _best_first(collapses)
+    out = _best_first(collapses)
     n_split, n_collapsed = make_exchanges(state, rings, splits, collapses, in_, out, (more, most, least), is_dirty)
     return _compacted(state, is_dirty, n_before, n_split, n_collapsed)
 
@@ -473,7 +477,7 @@ def best_splits(state: State, rings: NodeRings, may_split: NDArray[np.bool_], li
     n_nodes = len(may_split)
     moves = EdgeMoves(may_split, np.full(n_nodes, -1, dtype=np.int64), np.full(n_nodes, -np.inf))
     with few_threads(n_nodes * 20):
-        run(_fill_splits, n_nodes, Splits(moves, state, rings, limits.shortest, limits.target))
+        run(_fill_splits, n_nodes, Splits(moves, state, rings, limits))
     return moves
 
 
@@ -483,31 +487,49 @@ class Splits(NamedTuple):
     moves: EdgeMoves
     state: State
     rings: NodeRings
-    shortest: float  # mm, as of `Limits`
-    target: Floats1  # likewise
+    limits: Limits
 
 
 @unit
 def _fill_splits(work: Splits, node: int) -> None:
     if work.moves.may_move[node]:
-        _best_split(node, work.moves, work.state, work.rings, work.shortest, work.target)
+        _best_split(node, work.moves, work.state, work.rings, work.limits)
 
 
 @unit
-def _best_split(
-    a: int, moves: EdgeMoves, state: State, rings: NodeRings, shortest: float, target: Floats1
-) -> None:  # fmt: skip
+def _best_split(a: int, moves: EdgeMoves, state: State, rings: NodeRings, limits: Limits) -> None:
     x, near = np.empty((4, 3)), np.empty(MAX_NEIGHBOURS, dtype=np.int64)
-    for number in range(_neighbours(near, state.complex.cells, rings, a)):
+    count, best = _neighbours(near, state.complex.cells, rings, a), limits.least
+    bound = np.empty(MAX_NEIGHBOURS)
+    for number in range(count):
+        b = near[number]
+        bound[number] = -np.inf
+        if (b > a or not moves.may_move[b]) and squared_length(state, a, b) >= 4.0 * limits.shortest * limits.shortest:
+            ratio = squared_ratio(state, a, b, limits.target)
+            bound[number] = TARGET_CREDIT * ratio if ratio > LONG_EDGE * LONG_EDGE else 0.0
+            bound[number] += np.inf if state.objective.surface > 0.0 else _energy_of_edge(state, rings, a, b)
+    for _ in range(count):  # no edge is worth more than what its cells have, so the dearest come first
+        number = int(np.argmax(bound[:count]))
+        if not bound[number] > best:
+            break
         b, p = near[number], len(moves.gain) + a
-        if (b < a and moves.may_move[b]) or squared_length(state, a, b) < 4.0 * shortest * shortest:
-            continue
-        if _put_middle(state, rings, a, b, p) and _is_long(state, rings, a, b, p, shortest):
-            ratio = squared_ratio(state, a, b, target)
+        bound[number] = -np.inf
+        if _put_middle(state, rings, a, b, p) and _is_long(state, rings, a, b, p, limits.shortest):
+            ratio = squared_ratio(state, a, b, limits.target)
             credit = TARGET_CREDIT * ratio if ratio > LONG_EDGE * LONG_EDGE else 0.0
-            worth = worth_of_split(x, state, rings, a, b, p, moves.gain[a] - credit) + credit
-            if worth > moves.gain[a]:
-                moves.gain[a], moves.other[a] = worth, b
+            worth = worth_of_split(x, state, rings, a, b, p, best - credit) + credit
+            if worth > best:
+                best, moves.gain[a], moves.other[a] = worth, worth, b
+
+
+@helper
+def _energy_of_edge(state: State, rings: NodeRings, a: int, b: int) -> float:
+    """What the cells around the edge (a, b) have of E."""
+    energy = 0.0
+    for r in range(rings.start[a], rings.start[a + 1]):
+        if has_node(state.complex.cells, rings.cells[r], b):
+            energy += cell_energy(state, rings.cells[r])
+    return energy
 
 
 @helper
@@ -569,6 +591,8 @@ def worth_of_split(x: Floats2, state: State, rings: NodeRings, a: int, b: int, p
     if objective.image == 0.0:
         return old - shape
     new, misfit, D = shape, 0.0, state.complex.sums.shape[1]
+    # Unless p was brought to a surface, the two halves of a facet of the edge are all of it: one of them is measured.
+    is_beside = state.complex.is_frozen[p, 3] or state.complex.meeting[p, 1] >= 0
     flux, sums = np.empty((1, 1, D)), np.empty((2, D))
     for r in range(rings.start[a], rings.start[a + 1]):
         cell = rings.cells[r]
@@ -580,10 +604,14 @@ def worth_of_split(x: Floats2, state: State, rings: NodeRings, a: int, b: int, p
                 sums[1, d] = fluxes[cell, i, d] - flux[0, 0, d]
             for k in range(n):
                 if k not in (i, j):
-                    for half, node in ((0, b), (1, a)):
-                        _put_flux_with(flux, state, cell, k, node, p)
+                    _put_flux_with(flux, state, cell, k, b, p)
+                    for d in range(D):
+                        sums[0, d] += flux[0, 0, d]
+                        sums[1, d] += 0.0 if is_beside else fluxes[cell, k, d] - flux[0, 0, d]
+                    if is_beside:
+                        _put_flux_with(flux, state, cell, k, a, p)
                         for d in range(D):
-                            sums[half, d] += flux[0, 0, d]
+                            sums[1, d] += flux[0, 0, d]
             for half in range(2):
                 new += objective.image * image_energy(sums, half, state.complex.labels[cell], objective)
                 misfit += wrong_side(sums, half, objective)
