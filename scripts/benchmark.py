@@ -9,6 +9,7 @@ depend on the machine and on what else it does.
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import os
 import resource
@@ -32,7 +33,7 @@ from tetopt.engine.loop import GRADED_K_D
 from tetopt.geometry.simplex import dihedral_angles, oriented, rho, volumes
 from tetopt.geometry.topology import facets
 from tetopt.io.files import checked_output, save_json
-from tetopt.io.mni import mni_path
+from tetopt.io.mni import mni_path, mni_tissue
 from tetopt.report.summary import versions
 from tetopt.start.delaunay import delaunay
 from tetopt.target.content import plain
@@ -43,6 +44,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("image", type=Path, nargs="?", help="volume to measure on")
     parser.add_argument("-o", "--output", type=Path, required=True, help="JSON file")
+    parser.add_argument("--cgal", help="a program that meshes labels by CGAL's Mesh_3, see `peers`")
     parser.add_argument("--quick", action="store_true", help="small meshes, to try the script itself")
     parser.add_argument("--force", action="store_true", help="replace an existing file")
     options = parser.parse_args(argv)
@@ -60,7 +62,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         "threads": numba.get_num_threads(),
         "versions": versions(),
     }
-    rows["compile_seconds"], rows["load_seconds"] = compile_seconds()
+    rows["first_calls"] = first_calls(300)
+    rows["peers"] = peers(path, 400 if options.quick else 15_000, options.cgal, 1 if options.quick else 3)
     rows |= sampling(image, 2_000 if options.quick else 37_000)
     rows["sampling_by_size"] = [sampling_by_size(image, n) for n in ((300, 600) if options.quick else (4_000, 145_000))]
     rows["graded"] = [graded(image, n) for n in ((400,) if options.quick else (5_000, 15_000, 40_000))]
@@ -86,26 +89,97 @@ def best_seconds(task: Callable[[], Any], repeats: int = 5) -> float:
     return min(times)
 
 
-def compile_seconds() -> tuple[float, float]:
-    """Seconds of the first optimisation of a tiny image in a new process, without and with a cache of kernels."""
-    program = (
-        "import time, numpy as np, tetopt\n"
-        "image = tetopt.Image(np.arange(8.0).reshape(2, 2, 2))\n"
-        "mesh = tetopt.lattice(image, blocks=(1, 1, 1))\n"
-        "begin = time.perf_counter()\n"
-        "tetopt.optimize_paper(image, mesh, k_D=0.2, iterations=1)\n"
-        "tetopt.optimize_paper(image, mesh, k_D=0.0, iterations=1)\n"
-        "print(time.perf_counter() - begin)\n"
-    )
-    with tempfile.TemporaryDirectory() as cache:
-        environment = os.environ | {"NUMBA_CACHE_DIR": cache}
-        times = [
-            float(
-                subprocess.run([sys.executable, "-c", program], env=environment, check=True, capture_output=True).stdout
-            )
-            for _ in range(2)
-        ]
-    return times[0], times[1]
+def first_calls(nodes: int) -> dict[str, dict[str, float]]:
+    """Wall and CPU seconds of the first `tetopt mesh` of each kind with an empty cache of kernels, less the second's.
+
+    Of a ball in 24^3 voxels; `again` is the second's wall time, of a whole process.
+    """
+    radius = np.sqrt(((np.indices((24, 24, 24)) - 11.5) ** 2).sum(axis=0))
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        tetopt.save_image(folder / "ball.nii.gz", tetopt.Image(np.rint(100.0 * np.exp(-((radius / 8.0) ** 2)))))
+        tetopt.save_image(folder / "mask.nii.gz", tetopt.Image((radius < 10.0).astype(float)))
+        tetopt.save_image(folder / "labels.nii.gz", tetopt.Image((radius < 9.0) + 1.0 * (radius < 5.0)))
+        kinds = {
+            "default": [],
+            "uniform": ["--uniform"],
+            "mask": ["--mask", str(folder / "mask.nii.gz")],
+            "labels": ["--labels", str(folder / "labels.nii.gz")],
+            "paper": ["--method", "paper"],
+        }
+        rows = {}
+        for kind, words in kinds.items():
+            output = ["-o", str(folder / "out.vtu"), "--force", "--nodes", str(nodes), "--iterations", "4"]
+            command = [sys.executable, "-m", "tetopt", "mesh", str(folder / "ball.nii.gz"), *output, *words]
+            environment = os.environ | {"NUMBA_CACHE_DIR": str(folder / kind)}
+            first, again = (process_seconds(command, environment) for _ in range(2))
+            rows[kind] = {"wall": first[0] - again[0], "cpu": first[1] - again[1], "again": again[0]}
+    return rows
+
+
+def process_seconds(command: Sequence[str], environment: dict[str, str] | None = None) -> tuple[float, float]:
+    """Wall and CPU seconds of a process and of those that it starts."""
+    before, begin = os.times(), time.perf_counter()
+    subprocess.run(command, env=environment, check=True, capture_output=True)
+    wall, after = time.perf_counter() - begin, os.times()
+    cpu = after.children_user + after.children_system - before.children_user - before.children_system
+    return wall, cpu
+
+
+def peers(path: Path, nodes: int, cgal: str | None, turns: int) -> dict[str, Any]:
+    """Whole processes in turns at about equal numbers of nodes, the least seconds of each: tetopt, pytetwild, CGAL.
+
+    The others mesh the tissue labels that come with the MNI152 T1, or two classes of another image. CGAL is a program
+    `cgal LABELS.raw nx ny nz sx sy sz OUT.bin SIZE` that prints JSON with `nodes`, run alone at the size that gives
+    about as many nodes.
+    """
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        image = tetopt.load_image(path)
+        two_classes = tetopt.Image(1.0 * (image.data > image.data.mean()), image.affine)
+        labels = mni_tissue() if path.name == mni_path("t1").name else two_classes
+        tetopt.save_image(folder / "labels.nii.gz", labels)
+        ours = [sys.executable, "-m", "tetopt", "mesh", str(path), "-o", str(folder / "ours.vtu"), "--force"]
+        commands = {"tetopt": [*ours, "--nodes", str(nodes)]}
+        rows: dict[str, Any] = {}
+        if importlib.util.find_spec("pytetwild") is None:
+            rows["pytetwild"] = "not installed"
+        else:
+            base = [sys.executable, "-m", "tetopt", "baseline", str(path), "-o", str(folder / "wild.vtu"), "--force"]
+            commands["pytetwild"] = [*base, "--nodes", str(nodes), "--labels", str(folder / "labels.nii.gz")]
+        if cgal is None:
+            rows["cgal"] = "no program named (--cgal)"
+        else:
+            commands["cgal"], rows["cgal_nodes"] = _cgal_command(cgal, labels, nodes, folder)
+        seconds: dict[str, list[tuple[float, float]]] = {}
+        for _ in range(turns):
+            for name, command in commands.items():
+                seconds.setdefault(name, []).append(process_seconds(command))
+        for name, times in seconds.items():
+            wall, cpu = (min(column) for column in zip(*times, strict=True))
+            rows[name] = {"wall": wall, "cpu": cpu}
+        for name in ("pytetwild", "cgal"):
+            if name in seconds:
+                rows[f"over_{name}"] = rows["tetopt"]["wall"] / rows[name]["wall"]
+    return rows
+
+
+def _cgal_command(program: str, labels: tetopt.Image, nodes: int, folder: Path) -> tuple[list[str], int]:
+    """The command of the size that gives about so many nodes, and how many those are; at most six runs to find it."""
+    # Label 0 is left out by CGAL: all are raised by one. Padded by a voxel, so that the outer ones are meshed whole.
+    raised = np.pad(labels.data.astype(np.uint8) + np.uint8(1), 1, mode="edge")
+    raised.transpose(2, 1, 0).tofile(folder / "labels.raw")
+    spacing = np.sqrt((labels.affine[:3, :3] ** 2).sum(axis=0))
+    size = 1.8 * (labels.volume / nodes) ** (1 / 3)
+    for _ in range(6):
+        numbers = [*map(str, raised.shape), *map(str, spacing)]
+        command = [program, str(folder / "labels.raw"), *numbers, str(folder / "mesh.bin"), str(size)]
+        done = subprocess.run(command, check=True, capture_output=True, text=True)
+        n_nodes = int(json.loads(done.stdout)["nodes"])
+        if abs(n_nodes / nodes - 1.0) < 0.03:
+            break
+        size *= (n_nodes / nodes) ** (1 / 2.2)
+    return command, n_nodes
 
 
 def sampling(image: tetopt.Image, nodes: int) -> dict[str, Any]:
@@ -277,8 +351,14 @@ def flip_pass(image: tetopt.Image, nodes: int) -> float:
 def show(rows: dict[str, Any]) -> None:
     """Print the table."""
     print(f"{rows['image']}, {rows['cores']} cores, {rows['threads']} threads")
-    print(f"  first call (compiling)            {rows['compile_seconds']:10.1f} s")
-    print(f"  first call (cached kernels)       {rows['load_seconds']:10.1f} s")
+    for kind, seconds in rows["first_calls"].items():
+        print(
+            f"  first call, {kind:22s}{seconds['wall']:10.1f} s of compiling ({seconds['cpu']:.0f} of CPU); whole "
+            f"process with the kernels in the cache {seconds['again']:.1f} s"
+        )
+    for name, row in rows["peers"].items():
+        words = f"{row['wall']:.1f} s, {row['cpu']:.1f} of CPU" if isinstance(row, dict) else row
+        print(f"  peers, whole process: {name} {words}")
     per_second = rows["sampling_voxels_per_second"] / 1e6
     print(f"  sampling, {rows['sampling_cells']:7d} tets          {per_second:10.1f} Mvoxel/s")
     raster, scattered = rows["find_simplex_voxels_per_second"], rows["find_simplex_scattered_voxels_per_second"]
