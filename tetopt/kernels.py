@@ -232,6 +232,26 @@ def _unbox_packed(_type: RecordType, value: Any, context: Any) -> NativeValue:
 ALL_KERNELS: list[Any] = []  # all that were defined, in the modules imported so far
 
 
+ALLOCATING_NAMES = frozenset(("empty", "empty_like", "full", "zeros", "ones", "array", "arange", "copy"))
+
+
+def _counts(function: Callable[..., Any]) -> bool:
+    """Whether numba has to count references to arrays in a function: it makes some, or gets some from a helper.
+
+    Counting is atomic, up and down at every call, and was a third of a sweep and half of a pass of flips.
+    """
+    if ALLOCATING_NAMES.intersection(function.__code__.co_names):
+        return True
+    called = [function.__globals__.get(name) for name in function.__code__.co_names]
+    inner = [value.py_func for value in called if isinstance(value, numba.core.dispatcher.Dispatcher)]
+    return any(_returns_arrays(part) for part in [function, *inner])
+
+
+def _returns_arrays(function: Callable[..., Any]) -> bool:
+    result = function.__annotations__.get("return")
+    return result not in ("None", "bool", "int", "float", "Any") and not str(result).startswith("tuple")
+
+
 def _versioned(function: Callable[..., Any]) -> Callable[..., Any]:
     """A function for numba to compile that closes over the checksum of all kernels.
 
@@ -301,7 +321,8 @@ class Unit(Kernel):
     @cached_property
     def compiled(self) -> Any:
         """The function for callers of machine code; compiled now, or taken from the cache."""
-        return numba.cfunc(self.signature, cache=True, error_model="numpy")(_versioned(self.function))
+        function = _versioned(self.function)
+        return numba.cfunc(self.signature, cache=True, error_model="numpy", _nrt=_counts(self.function))(function)
 
     @property
     def address(self) -> int:
@@ -511,9 +532,12 @@ def entry(function: Callable[..., Any]) -> Any:
     return function if numba.config.DISABLE_JIT else Entry(function)
 
 
-# What goes into the functions that call it; `inlined` as numba reads it, before LLVM does.
-helper = njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
-inlined = njit(error_model="numpy", inline="always")
+def helper(function: Callable[..., Any]) -> Any:
+    """What goes into the functions that call it."""
+    return njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=_counts(function))(function)
+
+
+inlined = njit(error_model="numpy", inline="always")  # likewise, as numba reads it, before LLVM does
 
 
 @helper

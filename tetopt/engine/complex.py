@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 
 from tetopt.energy.sampling import CELLS_PER_CHUNK, Volume, few_threads
 from tetopt.energy.sampling import put_flux as sampled_flux
-from tetopt.geometry.vectors import cross, difference, dot, minus, put_row, row, scaled, times
+from tetopt.geometry.vectors import cross, difference, dot, minus, over, put_row, scaled, times
 from tetopt.kernels import (
     Bools2,
     Floats1,
@@ -413,20 +413,22 @@ def worst_cosine(x: Floats2) -> float:
 
     Between faces with outward normals p and q the angle's cosine is -p.q / (|p| |q|).
     """
-    normals = np.empty((4, 3))
-    for k in range(4):
-        a, b, c = (k + 1) & 3, (k + 2) & 3, (k + 3) & 3
-        n = cross(difference(x, b, a), difference(x, c, a))
-        size = np.sqrt(dot(n, n))
-        if size == 0.0:
-            return -1.0
-        sign = -1.0 if k & 1 else 1.0  # (k+1, k+2, k+3) turns outwards for even k of a positive cell, inwards for odd
-        put_row(normals, k, (sign * n[0] / size, sign * n[1] / size, sign * n[2] / size))
-    worst = 1.0
-    for i in range(3):
-        for k in range(i + 1, 4):
-            worst = min(worst, dot(row(normals, i), row(normals, k)))
-    return worst
+    n_0, n_1, n_2, n_3 = _face_normal(x, 0), _face_normal(x, 1), _face_normal(x, 2), _face_normal(x, 3)
+    size_0, size_1 = np.sqrt(dot(n_0, n_0)), np.sqrt(dot(n_1, n_1))
+    size_2, size_3 = np.sqrt(dot(n_2, n_2)), np.sqrt(dot(n_3, n_3))
+    if size_0 == 0.0 or size_1 == 0.0 or size_2 == 0.0 or size_3 == 0.0:
+        return -1.0
+    p, q = over(n_0, size_0), over(n_1, size_1)
+    r, s = over(n_2, size_2), over(n_3, size_3)
+    return min(1.0, dot(p, q), dot(p, r), dot(p, s), dot(q, r), dot(q, s), dot(r, s))
+
+
+@helper
+def _face_normal(x: NDArray, k: int) -> tuple:
+    """A normal of the face opposite a corner of a tetrahedron, outwards."""
+    a, b, c = (k + 1) & 3, (k + 2) & 3, (k + 3) & 3
+    # (k+1, k+2, k+3) turns outwards for even k of a positive cell, inwards for odd.
+    return scaled(-1.0 if k & 1 else 1.0, cross(difference(x, b, a), difference(x, c, a)))
 
 
 @entry

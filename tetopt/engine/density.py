@@ -259,7 +259,10 @@ def _mark_edge(state: State, rings: NodeRings, a: int, b: int, is_dirty: NDArray
 
 @helper
 def _is_clean(rings: NodeRings, node: int, is_dirty: NDArray) -> bool:
-    return not is_dirty[rings.cells[rings.start[node] : rings.start[node + 1]]].any()
+    is_clean = True
+    for r in range(rings.start[node], rings.start[node + 1]):
+        is_clean = is_clean and not is_dirty[rings.cells[r]]
+    return is_clean
 
 
 @unit
