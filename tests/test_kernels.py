@@ -204,18 +204,21 @@ def test_a_cache_that_can_be_written_is_left_alone(place, monkeypatch, tmp_path)
     assert os.environ["NUMBA_CACHE_DIR"] == str(tmp_path / "not" / "yet")
 
 
-@pytest.mark.parametrize("chosen", [None, "/nowhere"])
-def test_without_a_folder_kernels_are_kept_for_one_run(place, monkeypatch, chosen):
-    """The package and the home, or the chosen folder, cannot be written."""
-    if chosen is None:
-        monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
-    else:
+@pytest.mark.parametrize("is_chosen", [False, True])
+def test_without_a_folder_kernels_are_kept_for_one_run(place, monkeypatch, tmp_path, is_chosen):
+    """The package and the home, or the chosen folder, cannot be written, whatever the rights of their folders say."""
+    (tmp_path / "file").touch()
+    chosen = str(tmp_path / "file" / "kernels")  # cannot be made, not even by root
+    if is_chosen:
         monkeypatch.setenv("NUMBA_CACHE_DIR", chosen)
-    monkeypatch.setattr(cache.os, "access", lambda *_: False)
+    else:
+        monkeypatch.setenv("NUMBA_CACHE_DIR", "")  # not `delenv`: what is set meanwhile has to go again
+        monkeypatch.setattr(cache, "__file__", str(tmp_path / "file" / "cache.py"))
+        monkeypatch.setattr(cache, "_user_cache", lambda: tmp_path / "file")
     monkeypatch.setattr(numba.config, "CACHE_DIR", numba.config.CACHE_DIR)
     notice = place()
     assert "compiled anew in each run" in notice
-    assert (chosen or "__pycache__") in notice
+    assert (chosen if is_chosen else "__pycache__") in notice
     assert "set NUMBA_CACHE_DIR" in notice
     assert "\n" not in notice
     folder = os.environ["NUMBA_CACHE_DIR"]

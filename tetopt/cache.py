@@ -44,7 +44,10 @@ def _user_cache() -> Path:
 
 
 def _can_be_written(folder: Path) -> bool:
-    """Whether a folder, or the nearest one above it that there is, takes new files."""
-    while not folder.exists() and folder != folder.parent:
-        folder = folder.parent
-    return folder.is_dir() and os.access(folder, os.W_OK)
+    """Whether a folder takes new files, made if it is not there, as numba tries it: rights alone do not tell."""
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+        with tempfile.TemporaryFile(dir=folder):
+            return True
+    except OSError:
+        return False

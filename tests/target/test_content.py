@@ -215,3 +215,18 @@ def test_refused(change, message):
     with pytest.raises(tetopt.InputError) as error:
         content(**arguments)
     assert str(error.value).startswith(message)
+
+
+def test_noise_needs_neighbours_within_the_mask_along_all_axes():
+    data, inside = np.random.default_rng(0).normal(size=(20, 20, 20)), np.zeros((20, 20, 20), dtype=bool)
+    inside[10] = True
+    assert noise_level(data, inside) == 0.0
+    inside[9:12] = True
+    assert noise_level(data, inside) == pytest.approx(1.0, rel=0.2)
+
+
+def test_noise_of_few_slices_of_a_mask_is_noise(monkeypatch):
+    """What is left of it is compared with the voxels of the mask in those slices, not in all."""
+    data = np.random.default_rng(0).normal(size=(60, 20, 20))
+    monkeypatch.setattr("tetopt.target.content.NOISE_VOXELS", 1000)  # one slice in 23
+    assert noise_level(data, np.ones(data.shape, dtype=bool)) == pytest.approx(1.0, rel=0.2)
