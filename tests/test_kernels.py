@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import pickle
 import subprocess
 import sys
 from typing import NamedTuple
@@ -37,6 +38,10 @@ class Part(NamedTuple):
     count: int
     weight: float
     is_heavy: bool
+
+
+class Room(NamedTuple):
+    places: Floats3
 
 
 class Whole(NamedTuple):
@@ -112,6 +117,30 @@ def test_a_record_of_other_arrays_is_refused(values):
 
 
 @compiled_only
+def test_another_record_is_refused():
+    """Kernels would read its memory as that of the one they are for."""
+    room = Room(np.zeros((1, 1, 1)))
+    with pytest.raises(TypeError, match=r"Whole\.part: expected .*Part"):
+        Packed(whole()._replace(part=room))
+    with pytest.raises(TypeError, match=r"Whole\.others: expected .*Part"):
+        Packed(whole()._replace(others=[room]))
+    with pytest.raises(TypeError, match=r"fill: expected a .*Whole.*, got a .*Room"):
+        run(fill, 3, room)
+
+
+@compiled_only
+def test_a_key_of_another_version_is_read(monkeypatch):
+    """numba reads all keys of a file of its cache; one may name a record that there is no more."""
+    here = pickle.dumps(kernels.record_type(Room))
+    assert pickle.loads(here) is kernels.record_type(Room)
+    renamed = here.replace(b"Room", b"Rope")
+    assert len(renamed) == len(here)
+    assert isinstance(pickle.loads(renamed), numba.types.Opaque)
+    monkeypatch.setattr(kernels, "checksum", lambda: "another")
+    assert isinstance(pickle.loads(here), numba.types.Opaque)
+
+
+@compiled_only
 def test_a_record_keeps_what_it_points_to():
     """Its arrays may have no other owner."""
     laid_out = Packed(Whole(1, part(3), [part(4), part(5)], np.zeros(7), np.zeros(7, dtype=np.int64)))
@@ -124,10 +153,6 @@ def test_a_record_keeps_what_it_points_to():
 def test_roots_are_what_no_kernel_calls():
     here = {kernel.__name__ for kernel in kernels.roots() if kernel.__module__ == __name__}
     assert here == {"fill", "all_sums"}
-
-
-class Room(NamedTuple):
-    places: Floats3
 
 
 def test_by_value_is_a_named_tuple_of_its_arrays():

@@ -65,9 +65,9 @@ WORD_BYTES = 8  # of a number, an address, or a length in a record's memory
 
 @cache
 def checksum() -> str:
-    """Of the sources of all kernels: what is compiled of other sources is not taken from numba's cache."""
+    """Of the sources of all kernels and of their constants: what is compiled of others is not taken from the cache."""
     folder, total = Path(__file__).parent, 0
-    for room in ("geometry", "energy", "engine"):
+    for room in ("geometry", "energy", "engine", "start", "target"):
         for path in sorted((folder / room).glob("*.py")):
             total = zlib.crc32(path.read_bytes(), total)
     return f"{zlib.crc32(Path(__file__).read_bytes(), total):08x}"
@@ -88,6 +88,16 @@ class RecordType(types.Type):
             self.offsets[name] = self.n_words
             self.n_words += 1 + 2 * field.ndim if isinstance(field, types.Array) else 1
         super().__init__(f"{record.__module__}.{record.__qualname__}-{checksum()}")
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        """In the keys of numba's cache, by name: the record of another version may be gone."""
+        return _type_of_name, (self.record.__module__, self.record.__qualname__, checksum())
+
+
+def _type_of_name(module: str, name: str, version: str) -> types.Type:
+    record = getattr(sys.modules.get(module), name, None)
+    is_same = version == checksum() and record is not None
+    return record_type(record) if is_same else types.Opaque(f"{module}.{name}-{version}")
 
 
 @cache
@@ -193,11 +203,14 @@ class Packed:
             self.words[first + 1 + field.ndim : first + 1 + 2 * field.ndim] = value.strides
         elif isinstance(value, list):
             rows = [Packed(record) for record in value]
+            for row in rows:
+                self._check(row, name)
             words = np.concatenate([row.words for row in rows])
             self.words[first] = words.ctypes.data
             return rows, words
         elif isinstance(field, RecordType):
             inner = packed(value)
+            self._check(inner, name)
             self.words[first] = inner.address
             return inner
         elif field == types.float64:
@@ -205,6 +218,11 @@ class Packed:
         else:
             self.words[first] = int(value)
         return None
+
+    def _check(self, inner: Any, name: str) -> None:
+        """TypeError unless a field gets the record that it is for: kernels would read another one's memory."""
+        if getattr(inner, "type", None) != self.type.fields[name]:
+            raise TypeError(f"{self.type.record.__name__}.{name}: expected {self.type.fields[name]}, got {inner!r}")
 
 
 def packed(value: Any) -> Any:
@@ -437,9 +455,9 @@ def roots() -> list[Kernel]:
 
 def cache_folder() -> Path:
     """Where numba keeps what it compiled."""
-    if chosen := os.environ.get("NUMBA_CACHE_DIR"):
-        return Path(chosen)
-    return Path(next(kernel for kernel in ALL_KERNELS if isinstance(kernel, Entry)).dispatcher.stats.cache_path)
+    folder = Path(next(kernel for kernel in ALL_KERNELS if isinstance(kernel, Entry)).dispatcher.stats.cache_path)
+    chosen = os.environ.get("NUMBA_CACHE_DIR")
+    return Path(chosen) if chosen and folder.is_relative_to(Path(chosen)) else folder
 
 
 def _callees_first(kernel: Any) -> Iterator[Any]:
@@ -460,7 +478,11 @@ def _compile_apart(kernels: Sequence[Any]) -> None:
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     processes: list[subprocess.Popen[bytes]] = []
     with tempfile.TemporaryDirectory(prefix="tetopt-") as claims:
-        code = f"from tetopt.kernels import compile_named; compile_named({names!r}, {claims!r})"
+        # Ctrl-C is for this process, which then ends the others.
+        code = (
+            "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); "
+            f"from tetopt.kernels import compile_named; compile_named({names!r}, {claims!r}, {os.getpid()})"
+        )
         try:
             command = [sys.executable, "-c", code]
             processes.extend(subprocess.Popen(command, env=environment) for _ in range(n_processes))
@@ -471,10 +493,10 @@ def _compile_apart(kernels: Sequence[Any]) -> None:
                 process.kill()
 
 
-def compile_named(names: Sequence[str], claims: str) -> None:
+def compile_named(names: Sequence[str], claims: str, parent: int) -> None:
     """Compile kernels, `module:name` each, into numba's cache, unless another process has claimed them.
 
-    They know only the names of what they call, so that none may be called in this process.
+    They know only the names of what they call, so that none may be called in this process. It ends when `parent` has.
     """
     chosen = [getattr(import_module(name.split(":")[0]), name.split(":")[1]) for name in names]
     numba.get_num_threads()
@@ -482,6 +504,8 @@ def compile_named(names: Sequence[str], claims: str) -> None:
         if isinstance(kernel, Unit):
             llvm.add_symbol(kernel.symbol, 1)
     for number, kernel in enumerate(chosen):
+        if os.getppid() != parent:
+            return
         with contextlib.suppress(FileExistsError):
             (Path(claims) / str(number)).touch(exist_ok=False)
             _ = kernel.compiled
@@ -519,6 +543,8 @@ def run(task: Any, n: int, values: Any) -> None:
         return
     task.link()
     laid_out = packed(values)
+    if laid_out.type != task.signature.args[0]:
+        raise TypeError(f"{task.__name__}: expected a {task.signature.args[0]}, got a {laid_out.type}")
     _run(task.address, laid_out.address, n)
 
 

@@ -7,7 +7,8 @@ import time
 import numpy as np
 from rich.markup import escape
 
-from tetopt import Image, cell_fields, label_fidelity, mask_fidelity, mesh_image
+from tetopt import Image, InputError, cell_fields, label_fidelity, mask_fidelity, mesh_image
+from tetopt.cache import place_cache
 from tetopt.cli.console import log, out
 from tetopt.fem.reference import reference
 from tetopt.kernels import cache_folder, link, roots
@@ -19,6 +20,8 @@ BALL_NODES = {2: 60, 3: 300}  # by its axes
 
 def warm_up_command() -> int:
     """Compile all kernels ahead, as for an image of a container or a cluster; later runs load them from the cache."""
+    if (notice := place_cache()) is not None:
+        raise InputError(f"warm-up: nothing can be kept: {notice}")
     begin = time.perf_counter()
     with log.status("compiling all kernels, a minute on two cores ..."):
         link(roots())
