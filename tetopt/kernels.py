@@ -253,6 +253,11 @@ ALL_KERNELS: list[Any] = []  # all that were defined, in the modules imported so
 ALLOCATING_NAMES = frozenset(("empty", "empty_like", "full", "zeros", "ones", "array", "arange", "copy"))
 
 
+def _named(function: Any) -> list[Any]:
+    """The global values that a function names."""
+    return [function.__globals__.get(name) for name in function.__code__.co_names]
+
+
 def _counts(function: Callable[..., Any]) -> bool:
     """Whether numba has to count references to arrays in a function: it makes some, or gets some from a helper.
 
@@ -260,8 +265,7 @@ def _counts(function: Callable[..., Any]) -> bool:
     """
     if ALLOCATING_NAMES.intersection(function.__code__.co_names):
         return True
-    called = [function.__globals__.get(name) for name in function.__code__.co_names]
-    inner = [value.py_func for value in called if isinstance(value, numba.core.dispatcher.Dispatcher)]
+    inner = [value.py_func for value in _named(function) if isinstance(value, numba.core.dispatcher.Dispatcher)]
     return any(_returns_arrays(part) for part in [function, *inner])
 
 
@@ -300,12 +304,26 @@ class Kernel:
         return result(*(type_of(hint) for hint in hints.values()))
 
     def link(self) -> None:
-        """Make the symbols known of what it calls."""
+        """Make its symbol known, and those of what it calls before."""
         if not self.is_linked:
             numba.get_num_threads()  # the threads' own functions are known to the linker from then on
             for unit in units_of(self.function):
                 unit.link()
+            self._make_known()
             self.is_linked = True
+
+    def _make_known(self) -> None:
+        """Let the linker know its own symbol; an entry has none."""
+
+    @cached_property
+    def dispatcher(self) -> Any:
+        """How Python calls it: numba's."""
+        return njit(cache=True, error_model="numpy")(_versioned(self.function))
+
+    def __call__(self, *values: Any) -> Any:
+        """Call it from Python: records are laid out for it, and the units that it calls are linked before."""
+        self.link()
+        return self.dispatcher(*map(packed, values))
 
 
 class Unit(Kernel):
@@ -347,35 +365,17 @@ class Unit(Kernel):
         """Where it is in memory."""
         return int(self.compiled.address)
 
-    def link(self) -> None:
-        """Make its symbol known, and those of what it calls before."""
-        if not self.is_linked:
-            super().link()
-            llvm.add_symbol(self.symbol, self.address)
+    def _make_known(self) -> None:
+        llvm.add_symbol(self.symbol, self.address)
 
     @property
     def was_cached(self) -> bool:
         """Whether it was compiled before this process."""
         return bool(self.compiled.cache_hits > 0)
 
-    @cached_property
-    def entry(self) -> Any:
-        """How Python calls it."""
-        return njit(cache=True, error_model="numpy")(_versioned(self.function))
-
-    def __call__(self, *values: Any) -> Any:
-        """Call it from Python."""
-        self.link()
-        return self.entry(*map(packed, values))
-
 
 class Entry(Kernel):
-    """A function that Python calls: records are laid out for it, and the units that it calls are linked before."""
-
-    @cached_property
-    def dispatcher(self) -> Any:
-        """numba's."""
-        return njit(cache=True, error_model="numpy")(_versioned(self.function))
+    """A function that Python calls."""
 
     @cached_property
     def compiled(self) -> Any:
@@ -387,11 +387,6 @@ class Entry(Kernel):
     def was_cached(self) -> bool:
         """Whether it was compiled before this process."""
         return bool(sum(self.compiled.stats.cache_hits.values()) > 0)
-
-    def __call__(self, *values: Any) -> Any:
-        """Call it from Python."""
-        self.link()
-        return self.dispatcher(*map(packed, values))
 
 
 @typeof_impl.register(Unit)
@@ -407,18 +402,14 @@ def _typeof_entry(entry: Entry, context: Any) -> types.Type:
 def units_of(function: Callable[..., Any]) -> Iterator[Unit]:
     """The units that a function calls, itself or by helpers that go into it."""
     for part in _parts(function):
-        for name in part.__code__.co_names:
-            value = part.__globals__.get(name)
-            if isinstance(value, Unit):
-                yield value
+        yield from (value for value in _named(part) if isinstance(value, Unit))
 
 
 def _parts(function: Callable[..., Any]) -> list[Any]:
     """A function and the helpers that go into it."""
     parts: list[Any] = [function]
     for part in parts:
-        for name in part.__code__.co_names:
-            value = part.__globals__.get(name)
+        for value in _named(part):
             is_entry = isinstance(value, Entry)
             if is_entry or isinstance(value, numba.core.dispatcher.Dispatcher):
                 inner = value.function if is_entry else value.py_func

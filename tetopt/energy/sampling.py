@@ -35,7 +35,21 @@ from tetopt.errors import InputError
 from tetopt.geometry.topology import Facets, facets
 from tetopt.geometry.vectors import cross, difference, dot, row
 from tetopt.image import Image
-from tetopt.kernels import Floats1, Floats2, Floats3, Floats4, Ints1, Ints2, Shorts3, Shorts4, entry, helper, run, unit
+from tetopt.kernels import (
+    Floats1,
+    Floats2,
+    Floats3,
+    Floats4,
+    Ints1,
+    Ints2,
+    Shorts3,
+    Shorts4,
+    Singles3,
+    entry,
+    helper,
+    run,
+    unit,
+)
 from tetopt.mesh import Mesh
 from tetopt.target.content import Content
 
@@ -224,8 +238,11 @@ def sampling_grid(image: Image, points: NDArray[np.float64]) -> SamplingGrid:
     is_short = is_whole and shape[2] * max(largest, largest * largest) < 2**31
     prefix = np.empty((shape[0], shape[1], shape[2] + 1, 2), dtype=np.int32 if is_short else np.float64)
     with few_threads(image.data.size // 50):
-        data = np.ascontiguousarray(image.data.reshape(shape), dtype=np.float64)
-        run(_fill_prefix, shape[0], _Filling(_volume(prefix, bits), data, float(shift)))
+        data: Any = image.data.reshape(shape)
+        is_single, nothing = data.dtype == np.float32, np.zeros((1, 1, 1))
+        single = data if is_single else nothing.astype(np.float32)
+        work = _Filling(_volume(prefix, bits), nothing if is_single else data, single, is_single, float(shift))
+        run(_fill_prefix, shape[0], work)
     return SamplingGrid(prefix, bits, float(shift))
 
 
@@ -365,16 +382,26 @@ class _Filling(NamedTuple):
     """The sums to be filled in, and what of."""
 
     volume: Volume
-    data: Floats3
+    data: Floats3  # of the image, unless they are of 32 bits; one voxel of nothing then
+    single: Singles3  # likewise
+    is_single: bool  # which of them it is
     shift: float
 
 
 @unit
 def _fill_prefix(work: _Filling, i: int) -> None:
-    if work.volume.is_short:
-        _fill_rows(work.volume.short, work.data, work.shift, i)
+    if work.is_single:
+        _fill_plane(work.volume, work.single, work.shift, i)
     else:
-        _fill_rows(work.volume.long, work.data, work.shift, i)
+        _fill_plane(work.volume, work.data, work.shift, i)
+
+
+@helper
+def _fill_plane(volume: Volume, data: NDArray, shift: float, i: int) -> None:
+    if volume.is_short:
+        _fill_rows(volume.short, data, shift, i)
+    else:
+        _fill_rows(volume.long, data, shift, i)
 
 
 @helper
@@ -384,7 +411,7 @@ def _fill_rows(prefix: NDArray, volume: NDArray, shift: float, i: int) -> None:
         for k in range(volume.shape[2]):
             prefix[i, j, k, 0] = first
             prefix[i, j, k, 1] = second
-            h = volume[i, j, k] - shift
+            h = float(volume[i, j, k]) - shift
             first += h
             second += h * h
         prefix[i, j, volume.shape[2], 0] = first
@@ -634,12 +661,12 @@ def _scatter_changes(steps: Shorts3, change: Ints1, ticks: Ints2, nodes: Ints2, 
 
 
 @entry
-def _fill_ranges(low: Floats1, high: Floats1, steps: Shorts3, volume: Floats3) -> None:
+def _fill_ranges(low: Floats1, high: Floats1, steps: Shorts3, volume: Singles3) -> None:
     for i in range(volume.shape[0]):
         for j in range(volume.shape[1]):
             cell = -1
             for k in range(volume.shape[2]):
                 cell += steps[i, j, k]
                 if cell >= 0:
-                    h = volume[i, j, k]
+                    h = float(volume[i, j, k])
                     low[cell], high[cell] = min(low[cell], h), max(high[cell], h)

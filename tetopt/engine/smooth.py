@@ -741,10 +741,8 @@ def attract(state: State, rings: NodeRings, groups: Blocks, floor: float) -> Non
 
     A cell that is flatter already may get no worse. E may rise. `floor` is minus a cosine, as of an `Objective`.
     """
-    lowered, is_between = (
-        state._replace(objective=state.objective._replace(floor=floor)),
-        state.complex.meeting[:, 1] >= 0,
-    )
+    lowered = state._replace(objective=state.objective._replace(floor=floor))
+    is_between = state.complex.meeting[:, 1] >= 0
     laid_out = packed(lowered), packed(rings), packed(groups)
     for chosen in colours_of(state, rings, groups):
         with few_threads(len(chosen) * BLOCK_NODES * 20):
