@@ -2,13 +2,9 @@
 
 from __future__ import annotations
 
-import contextlib
-import logging
 import re
-import warnings
-from collections.abc import Iterator
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,17 +12,17 @@ from numpy.typing import NDArray
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import numbered_edges
 from tetopt.geometry.simplex import oriented
+from tetopt.incoming import regular_file
 from tetopt.io.files import written_whole
 from tetopt.io.raw import CELL_DIMENSIONS, CORNER_KINDS, Raw, by_corners
 from tetopt.io.read_gmsh import read_msh
+from tetopt.io.read_vtk import Grid, read_vtk
+from tetopt.io.text import plain
 from tetopt.io.vtk import ON_PREFIX, add_texts, box_in, sets_in, text_in, to_vtk, vtu_bytes
 from tetopt.mesh import Mesh
 from tetopt.model.fields import half_turned_fields, is_stress, stresses_times
 from tetopt.model.model import STRESS_UNITS, half_turn
 from tetopt.model.sets import SET_NAME, Box, Sets, free_name, rows_of
-
-if TYPE_CHECKING:
-    import pyvista
 
 MESH_SUFFIXES = (".vtu", ".vtk", ".msh", ".msh2")
 # VTK's kinds of any order, with a number of nodes, that are numbered as kinds of one order; dolfinx writes them.
@@ -34,6 +30,11 @@ LAGRANGE_KINDS = {
     "lagrange_curve 2": "line", "lagrange_triangle 3": "triangle", "lagrange_tetrahedron 4": "tetra",
     "lagrange_curve 3": "quadratic_edge", "lagrange_triangle 6": "quadratic_triangle",
     "lagrange_tetrahedron 10": "quadratic_tetra",
+}  # fmt: skip
+# Nodes of a cell, of the kinds that have a fixed number; without pyvista's other kinds, which are refused by name.
+NODES_OF_KIND = {
+    "vertex": 1, "line": 2, "triangle": 3, "tetra": 4,
+    "quadratic_edge": 3, "quadratic_triangle": 6, "quadratic_tetra": 10,
 }  # fmt: skip
 STRAIGHT_SHARE = 1e-6  # of an edge: a middle node that is less off its middle was rounded, as in files of few digits
 
@@ -98,12 +99,13 @@ def load_mesh(path: str | Path) -> MeshFile:
     InputError
         A missing or unreadable file, no cells, other cell types, triangles out of the plane, flat cells.
     """
-    path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such mesh file")
+    path = regular_file(path, "mesh file")
     if path.suffix.lower() not in MESH_SUFFIXES:
         raise InputError(f"{path}: expected a mesh named {', '.join(MESH_SUFFIXES[:-1])} or {MESH_SUFFIXES[-1]}")
-    raw = read_msh(path) if path.suffix.lower() in (".msh", ".msh2") else _read_vtk(path)
+    try:
+        raw = read_msh(path) if path.suffix.lower() in (".msh", ".msh2") else _read_vtk(path)
+    except InputError as error:
+        raise InputError(f"{path}: {plain(str(error))}") from error
     kind = _kind_of_cells(path, raw)
     n = CELL_DIMENSIONS[kind]
     cells, points = raw.cells[kind], raw.points
@@ -232,35 +234,37 @@ def _sets_of_groups(raw: Raw, mesh: Mesh, kind: str, used: NDArray[np.int64]) ->
 
 
 def _read_vtk(path: Path) -> Raw:
-    grid = _read_quietly(path)
+    grid = read_vtk(path)
     rows_of_kind = _rows_by_kind(grid)
-    connectivity, starts = np.asarray(grid.cell_connectivity, dtype=np.int64), np.asarray(grid.cell_offsets)
+    sizes = np.diff(grid.offsets)
     cells = {}
     for kind, chosen in rows_of_kind.items():
-        width = int(np.diff(starts)[chosen].min())  # of a polyline, which may be of several, the first nodes are enough
-        cells[kind] = connectivity[starts[chosen][:, None] + np.arange(width)]
+        width = int(sizes[chosen].min())  # of a polyline, which may be of several, the first nodes are enough
+        if kind in NODES_OF_KIND and (sizes[chosen] != NODES_OF_KIND[kind]).any():
+            raise InputError(f"damaged: cells of {NODES_OF_KIND[kind]} nodes ({kind}) have another number of them")
+        cells[kind] = grid.connectivity[grid.offsets[chosen][:, None] + np.arange(width)]
     cell_data = {
-        name: {kind: np.asarray(grid.cell_data[name])[chosen] for kind, chosen in rows_of_kind.items()}
-        for name in grid.cell_data
+        name: {kind: values[chosen] for kind, chosen in rows_of_kind.items()} for name, values in grid.cell_data.items()
     }
-    field_data = {name: _decoded(np.asarray(grid.field_data[name])) for name in grid.field_data}
-    own = [name for name in grid.point_data if not name.startswith("vtk")]  # not VTK's, such as vtkGhostType
-    point_data = {name: np.asarray(grid.point_data[name]) for name in own}
-    points, space = np.asarray(grid.points, dtype=np.float64), _space(path, field_data)
-    return by_corners(Raw(points, cells, cell_data, point_data, field_data, [], space))
+    field_data = {name: _decoded(values) for name, values in grid.field_data.items()}
+    own = {name: values for name, values in grid.point_data.items() if not name.startswith("vtk")}  # as vtkGhostType
+    return by_corners(Raw(grid.points, cells, cell_data, own, field_data, [], _space(path, field_data)))
 
 
-def _rows_by_kind(grid: pyvista.UnstructuredGrid) -> dict[str, NDArray[np.int64]]:
+def _rows_by_kind(grid: Grid) -> dict[str, NDArray[np.int64]]:
     """Which cells are of each kind; those of any number of nodes are of the kinds of fixed size that they stand for."""
     import pyvista
 
-    sizes = np.diff(grid.cell_offsets).astype(np.int64)
+    sizes = np.diff(grid.offsets)
     stride = int(sizes.max()) + 1
-    sorts, which = np.unique(grid.celltypes.astype(np.int64) * stride + sizes, return_inverse=True)
+    sorts, which = np.unique(grid.cell_types.astype(np.int64) * stride + sizes, return_inverse=True)
     parts: dict[str, list[NDArray[np.int64]]] = {}
     for number, sort in enumerate(sorts.tolist()):
         vtk_type, size = divmod(sort, stride)
-        name = pyvista.CellType(vtk_type).name.lower()
+        try:
+            name = pyvista.CellType(vtk_type).name.lower()
+        except ValueError:
+            raise InputError(f"damaged: VTK has no cells of type {vtk_type}") from None
         kind = LAGRANGE_KINDS.get(f"{name} {size}", name)
         parts.setdefault(kind, []).append(np.flatnonzero(which.ravel() == number))
     return {kind: np.sort(np.concatenate(rows)) for kind, rows in parts.items()}
@@ -284,41 +288,3 @@ def _decoded(values: NDArray) -> NDArray:
         return np.array([values.tobytes().decode()])
     except UnicodeDecodeError:
         return values
-
-
-def _read_quietly(path: Path) -> pyvista.UnstructuredGrid:
-    """pyvista's reading, with VTK's complaints turned into one InputError."""
-    import pyvista  # slow to load, and only needed to read
-
-    try:
-        with _vtk_errors() as errors:
-            grid = pyvista.read(path)
-    except Exception as error:  # VTK's readers raise whatever they please on damaged files
-        raise InputError(f"{path}: cannot be read as a VTK mesh ({type(error).__name__})") from error
-    if errors:
-        raise InputError(f"{path}: damaged, or not a VTK mesh ({' '.join(errors[0].split())})")
-    if not isinstance(grid, pyvista.UnstructuredGrid) or grid.n_cells == 0:
-        raise InputError(f"{path}: expected an unstructured grid with cells, found {type(grid).__name__}; damaged?")
-    return grid
-
-
-@contextlib.contextmanager
-def _vtk_errors() -> Iterator[list[str]]:
-    """VTK's errors, instead of on the screen: pyvista passes them to the root logger and on as warnings."""
-    import pyvista
-
-    errors: list[str] = []
-
-    def caught(record: logging.LogRecord) -> bool:
-        if record.levelno >= logging.ERROR:
-            errors.append(record.getMessage())
-        return False
-
-    root = logging.getLogger()
-    root.addFilter(caught)
-    try:
-        with warnings.catch_warnings(), pyvista.vtk_verbosity("off"):
-            warnings.simplefilter("ignore")
-            yield errors
-    finally:
-        root.removeFilter(caught)

@@ -1,0 +1,144 @@
+"""What comes in stays data, and bounded: regular files only, texts and tables of a size that can be meant."""
+
+from __future__ import annotations
+
+import json
+import stat
+import tomllib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from tetopt.errors import InputError
+
+TEXT_BYTES = 2**26  # 67 MB: the longest table of labels that is known, FreeSurfer's, has 0.1
+LARGEST_NUMBER = 1e300  # of a table: its square root is still far beyond anything measured, and its float is finite
+# What stands in a file's place and is none; a pipe that nobody writes to blocks for ever, /dev/zero never ends.
+KINDS_OF_FILES = {
+    stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket", stat.S_IFCHR: "a device", stat.S_IFBLK: "a device",
+    stat.S_IFDIR: "a folder",
+}  # fmt: skip
+
+
+def irregular(path: Path) -> str | None:
+    """What `path` is, links followed, if it is there and no regular file: "a pipe", "a device", "a folder".
+
+    Raises
+    ------
+    OSError
+        Nothing is there, or it may not be looked at.
+    """
+    mode = path.stat().st_mode
+    return None if stat.S_ISREG(mode) else KINDS_OF_FILES.get(stat.S_IFMT(mode), "no regular file")
+
+
+def regular_file(path: str | Path, noun: str) -> Path:
+    """`path`, where a file is to be read; asked before it is opened, as opening a pipe may block for ever.
+
+    Parameters
+    ----------
+    path : str or Path
+    noun : str
+        What is expected, as "mesh file".
+
+    Raises
+    ------
+    InputError
+        Nothing is there, it may not be looked at, or it is no regular file.
+    """
+    if not isinstance(path, str | Path):
+        raise InputError(f"expected the path of a {noun}, got {type(path).__name__}")
+    path = Path(path)
+    try:
+        other = irregular(path)
+    except (FileNotFoundError, NotADirectoryError):
+        raise InputError(f"{path}: no such {noun}; check the path") from None
+    except (OSError, ValueError) as error:  # ValueError: a zero among the letters
+        raise InputError(f"{path}: cannot be opened ({getattr(error, 'strerror', None) or error})") from error
+    if other == "a folder":
+        raise InputError(f"{path}: no such {noun}, it is a folder")
+    if other is not None:
+        raise InputError(f"{path}: expected a regular file, got {other}; copy what it gives into a file")
+    return path
+
+
+def text_of(path: str | Path, noun: str) -> str:
+    """The text of a file in UTF-8, with or without a mark at its beginning.
+
+    Raises
+    ------
+    InputError
+        As `regular_file`; it may not be read, is longer than `TEXT_BYTES`, or is not UTF-8.
+    """
+    path = regular_file(path, noun)
+    try:
+        with path.open("rb") as stream:
+            raw = stream.read(TEXT_BYTES + 1)
+    except OSError as error:
+        raise InputError(f"{path}: cannot be read, {error.strerror}; expected a {noun}") from error
+    if len(raw) > TEXT_BYTES:
+        raise InputError(f"{path}: expected a {noun} of at most {TEXT_BYTES / 1e6:.0f} MB, got {_size(path)}")
+    try:
+        return raw.decode("utf-8-sig")
+    except UnicodeDecodeError as error:
+        raise InputError(f"{path}: expected a {noun} in UTF-8 (byte {error.start} is not); save it again") from error
+
+
+def toml_of(path: str | Path, noun: str) -> dict[str, Any]:
+    """The table in a TOML file, of numbers that a float can be.
+
+    Raises
+    ------
+    InputError
+        As `text_of`; not TOML, nested too deeply, or with a number beyond `LARGEST_NUMBER`.
+    """
+    text = text_of(path, noun)
+    try:
+        table = tomllib.loads(text)
+        _check_numbers(table)
+    except ValueError as error:  # also int's, of more digits than it converts
+        raise InputError(f"{path}: expected a {noun} in TOML, got {_short(error)}; mend that place") from error
+    except RecursionError as error:
+        raise InputError(f"{path}: expected a {noun} in TOML, got brackets nested too deeply") from error
+    return table
+
+
+def json_of(text: str) -> Any:
+    """What a text in JSON stands for, of numbers that a float can be.
+
+    Raises
+    ------
+    ValueError
+        Not JSON, nested too deeply, or with a number beyond `LARGEST_NUMBER`.
+    """
+    try:
+        value = json.loads(text)
+        _check_numbers(value)
+    except RecursionError as error:
+        raise ValueError("brackets nested too deeply") from error
+    return value
+
+
+def _check_numbers(value: Any) -> None:
+    for number in _whole_numbers(value):
+        if abs(number) > LARGEST_NUMBER:
+            raise ValueError(f"a number of {len(str(abs(number)))} digits")
+
+
+def _whole_numbers(value: Any) -> Iterator[int]:
+    if isinstance(value, dict):
+        value = list(value.values())
+    if isinstance(value, list):
+        for item in value:
+            yield from _whole_numbers(item)
+    elif isinstance(value, int):
+        yield value
+
+
+def _short(error: Exception) -> str:
+    words = " ".join(str(error).split())
+    return words if len(words) <= 200 else f"{words[:197]}..."  # 200: a line or two of a terminal
+
+
+def _size(path: Path) -> str:
+    return f"{path.stat().st_size / 1e6:.0f} MB"

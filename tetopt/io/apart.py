@@ -1,0 +1,225 @@
+"""A stranger's file read in a process of its own, by libraries of compiled code that end the process at damaged ones.
+
+The child is ``python -P -m tetopt.io.apart``: job by standard input, arrays by standard output, as a line of JSON and
+then their bytes, so that nothing of it is executed here (no pickle). Its memory is limited (RLIMIT_AS), so that what a
+header promises is refused instead of allocated, and so is its time. It costs a third of a second, most of it for
+loading the library, which the parent then need not load.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib
+import json
+import os
+import signal
+import subprocess
+import sys
+import threading
+from collections.abc import Callable
+from pathlib import Path
+from typing import IO, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.errors import InputError
+
+LEAST_BYTES = 2**31  # of memory for any file, libraries loaded: their buffers and the largest small file
+BYTES_A_BYTE = 64  # of memory for each of the file, beyond: text grows eightfold, zlib on meshes tenfold
+BYTES_A_VALUE_BYTE = 4  # of memory for each that the voxels take by the header: the library's copy, numpy's, turned
+LEAST_SECONDS = 60.0  # for any file, also on a busy machine
+SECONDS_A_BYTE = 1e-6  # 1 MB/s, a twentieth of what the slowest of these files are read at
+PAGE_BYTES = 4096  # of a page in statm, where the system does not say
+
+
+def read_apart(
+    read: Callable[..., Any], path: Path, *rest: Any, size: int | None = None, value_bytes: int = 0, library: str
+) -> Any:
+    """``read(str(path), *rest)``, done in a child process.
+
+    Parameters
+    ----------
+    read : function
+        Of a module. Gives numbers, texts, None, arrays of numbers or texts, and lists, tuples and dicts of them; lists
+        come back for tuples.
+    path : Path
+        The file, or folder.
+    *rest
+        What JSON can tell.
+    size : int, optional
+        Bytes to read, by which memory and time are limited; the file's by default.
+    value_bytes : int
+        What the values take by the header, checked by the caller, if it tells.
+    library : str
+        Which one reads it, for the message.
+
+    Raises
+    ------
+    InputError
+        That of `read`; or the child has crashed, passed a limit, or raised anything else.
+    """
+    size = path.stat().st_size if size is None else size
+    most_bytes = LEAST_BYTES + BYTES_A_BYTE * size + BYTES_A_VALUE_BYTE * value_bytes
+    seconds = LEAST_SECONDS + SECONDS_A_BYTE * (size + value_bytes)
+    name = f"{read.__module__}:{read.__qualname__}"
+    job = {"read": name, "path": str(path), "rest": rest, "bytes": most_bytes, "seconds": int(seconds)}
+    child = subprocess.Popen(
+        # -P: not the current folder's modules, which may be the stranger's as well.
+        [sys.executable, "-P", "-m", "tetopt.io.apart"],
+        stdin=subprocess.PIPE,
+        stdout=subprocess.PIPE,
+        stderr=subprocess.DEVNULL,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},  # the same modules as here
+    )
+    assert child.stdin is not None
+    assert child.stdout is not None
+    is_late = threading.Event()
+
+    def end() -> None:
+        is_late.set()
+        child.kill()
+
+    timer = threading.Timer(seconds, end)
+    timer.start()
+    try:
+        with contextlib.suppress(BrokenPipeError):  # it ended before; its exit code says how
+            child.stdin.write(json.dumps(job).encode())
+            child.stdin.close()
+        answer = _received(child.stdout)
+        code = child.wait()
+    finally:
+        timer.cancel()
+        child.kill()
+        child.wait()
+        child.stdout.close()
+    if answer is None:
+        if is_late.is_set() or code == -getattr(signal, "SIGXCPU", 0):
+            raise InputError(f"was not read within {seconds:.0f} s by {library}; damaged, or made to take for ever")
+        raise InputError(
+            f"{library} crashed at this file ({_ending(code)}; it may take {most_bytes / 1e9:.1f} GB); "
+            "the file is damaged: copy or export it again"
+        )
+    if "refused" in answer:
+        raise InputError(answer["refused"])
+    return answer["value"]
+
+
+def _ending(code: int) -> str:
+    """How the child ended, by its exit code."""
+    with contextlib.suppress(ValueError):
+        return signal.Signals(-code).name if code < 0 else f"exit code {code}"
+    return f"signal {-code}"
+
+
+# The way back: one line of JSON, in which arrays are numbers of those that follow.
+
+
+def _sent(stream: IO[bytes], answer: dict[str, Any]) -> None:
+    arrays: list[NDArray] = []
+    tree = _packed(answer, arrays)
+    heads = [[each.dtype.str, each.shape] for each in arrays]
+    stream.write(json.dumps({"tree": tree, "arrays": heads}).encode() + b"\n")
+    for each in arrays:
+        stream.write(_bytes_of(each))
+    stream.flush()
+
+
+def _bytes_of(array: NDArray) -> memoryview:
+    """The memory of a C-ordered array."""
+    return memoryview(array.reshape(-1).view(np.uint8).data if array.nbytes else b"")
+
+
+def _packed(value: Any, arrays: list[NDArray]) -> Any:
+    if isinstance(value, np.ndarray):
+        if value.dtype.kind not in "buifcU":
+            raise TypeError(f"array of {value.dtype}")
+        # A volume of ITK's is turned: it is sent as it lies, and turned again.
+        is_turned = value.flags.f_contiguous and not value.flags.c_contiguous
+        arrays.append(
+            np.ascontiguousarray(value.T if is_turned else value).reshape(value.shape[:: -1 if is_turned else 1])
+        )
+        return {"turned" if is_turned else "array": len(arrays) - 1}
+    if isinstance(value, np.generic):
+        return value.item()
+    if isinstance(value, dict):
+        return {"dict": [[key, _packed(item, arrays)] for key, item in value.items()]}
+    if isinstance(value, list | tuple):
+        return [_packed(item, arrays) for item in value]
+    return value
+
+
+def _received(stream: IO[bytes]) -> dict[str, Any] | None:
+    """What the child sent; None if it did not come to its end."""
+    line = stream.readline()
+    if not line.endswith(b"\n"):
+        return None
+    head = json.loads(line)
+    arrays = []
+    for dtype, shape in head["arrays"]:
+        array = np.empty(shape, dtype)
+        raw = _bytes_of(array)
+        while len(raw):
+            n_read = stream.readinto(raw)  # type: ignore[attr-defined]
+            if not n_read:
+                return None
+            raw = raw[n_read:]
+        arrays.append(array)
+    return _unpacked(head["tree"], arrays)
+
+
+def _unpacked(tree: Any, arrays: list[NDArray]) -> Any:
+    if isinstance(tree, list):
+        return [_unpacked(item, arrays) for item in tree]
+    if not isinstance(tree, dict):
+        return tree
+    if "dict" in tree:
+        return {key: _unpacked(item, arrays) for key, item in tree["dict"]}
+    return arrays[tree["array"]] if "array" in tree else arrays[tree["turned"]].T
+
+
+# In the child
+
+
+def _limit(most_bytes: int, seconds: int) -> None:
+    """No more address space than what is taken already and `most_bytes`, where the system can; so much CPU time."""
+    try:
+        import resource
+    except ImportError:  # not on Windows
+        return
+    statm = Path("/proc/self/statm")
+    taken = int(statm.read_text(encoding="ascii").split()[0]) * resource.getpagesize() if statm.exists() else 0
+    for limit, value in ((resource.RLIMIT_AS, taken + most_bytes), (resource.RLIMIT_CPU, seconds)):
+        _, hard = resource.getrlimit(limit)
+        with contextlib.suppress(ValueError, OSError):  # macOS has no such limit of memory
+            resource.setrlimit(limit, (value if hard == resource.RLIM_INFINITY else min(value, hard), hard))
+    with contextlib.suppress(ValueError, OSError):
+        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # no core file of somebody's scan in the folder
+
+
+def main() -> None:
+    """Do the job of standard input."""
+    stream = os.fdopen(os.dup(1), "wb")
+    nowhere = os.open(os.devnull, os.O_WRONLY)
+    os.dup2(nowhere, 1)  # libraries write there what they please
+    job = json.loads(sys.stdin.buffer.read())
+    module, _, name = job["read"].partition(":")
+    try:
+        read = getattr(importlib.import_module(module), name)
+        _limit(job["bytes"], job["seconds"])
+        answer = {"value": read(job["path"], *job["rest"])}
+    except InputError as error:
+        answer = {"refused": str(error)}
+    except MemoryError:
+        answer = {"refused": f"needs more than {job['bytes'] / 1e9:.1f} GB of memory to be read; damaged?"}
+    except Exception as error:  # whatever a library raises at a damaged file
+        words = " ".join(str(error).split())
+        answer = {"refused": f"truncated or damaged; copy it again ({type(error).__name__}: {words[:200]})"}
+    with contextlib.suppress(BrokenPipeError):  # the parent has gone
+        _sent(stream, answer)
+        stream.close()
+    os._exit(0)  # a library whose memory the file has damaged need not tidy up
+
+
+if __name__ == "__main__":
+    main()
