@@ -215,8 +215,75 @@ def test_a_file_has_one_modulus_a_cell_of_those_at_gauss_points(folder, tmp_path
         options = ["--young", LAW, "--average", average, "--image", folder / "a.nii.gz", "--order", "2"]
         assert exit_code("convert", folder / "a.vtu", tmp_path / f"{average}.vtu", *options) == 0
         assert ("one modulus a cell, its geometric mean" in capsys.readouterr().out) == (average == "gauss")
+        assert exit_code("convert", tmp_path / f"{average}.vtu", tmp_path / f"{average}.inp") == 0
+        assert (".vtu and .vtk files have one at each Gauss point" in capsys.readouterr().out) == (average == "gauss")
     first, second = (tetopt.load_mesh(tmp_path / f"{each}.vtu").cell_data["young"] for each in ("geometric", "gauss"))
     np.testing.assert_array_equal(first, second)
+
+
+def test_results_of_other_moduli_or_loads_are_left_out(folder, tmp_path, capsys):
+    first, solved = tmp_path / "a.vtu", tmp_path / "solved.vtu"
+    assert exit_code("convert", folder / "a.vtu", first, "--young", "2", "--load", "compress:5%") == 0
+    assert exit_code("fem", first, "-o", solved) == 0
+    fields = {"displacement", "von_mises", "stress_nodes"}
+    said = "left out, as they are of other moduli or loads: strain, stress, von_mises, displacement,"
+    for options in ([], ["--young", "3"], ["--nu", "0.3"], ["--load", "compress:4%"], ["--bins", "2"]):
+        more = ["--young", "2", *options] if "--nu" in options else options
+        capsys.readouterr()
+        assert exit_code("convert", solved, tmp_path / "b.vtu", "--force", *more) == 0
+        assert (said in capsys.readouterr().err) == bool(options)
+        loaded = tetopt.load_mesh(tmp_path / "b.vtu")
+        kept = fields & {*loaded.cell_data, *loaded.point_data}
+        assert kept == (set() if options else fields)
+        assert ("reactions" in loaded.field_data) == (not options)
+    assert exit_code("mesh", folder / "a.nii.gz", "--start", solved, "-o", tmp_path / "c.vtu", "--iterations", "1") == 0
+    assert "moduli, loads and results of the mesh that is improved are not kept" in capsys.readouterr().err
+    assert not fields & {*tetopt.load_mesh(tmp_path / "c.vtu").point_data}
+
+
+def test_the_error_of_bins_goes_on(folder, tmp_path, capsys):
+    assert exit_code("convert", folder / "a.vtu", tmp_path / "a.vtu", "--young", LAW, "--bins", "3") == 0
+    line = next(line for line in capsys.readouterr().out.splitlines() if line.startswith("bins: modulus off by"))
+    for source, out in (("a.vtu", "b.vtu"), ("b.vtu", "b.inp")):
+        assert exit_code("convert", tmp_path / source, tmp_path / out, "--json", tmp_path / f"{out}.json") == 0
+        assert line in capsys.readouterr().out.splitlines()
+        assert numbers_in(tmp_path / f"{out}.json")["materials"]["binning"]["mean"] > 0.0
+    assert exit_code("convert", tmp_path / "b.vtu", tmp_path / "c.vtu", "--young", "2") == 0
+    assert "modulus off by" not in capsys.readouterr().out
+
+
+def test_what_msh_files_do_not_bring_back_is_said(folder, tmp_path, capsys):
+    (tmp_path / "names.csv").write_text("label,name\n1,liver\n")
+    more = ["--young", "2", "--load", "compress:5%", "--label-names", tmp_path / "names.csv"]
+    for suffix, is_said in ((".msh", True), (".msh2", True), (".vtu", False), (".inp", False)):
+        assert exit_code("convert", folder / "a.vtu", tmp_path / f"a{suffix}", *more) == 0
+        said = capsys.readouterr().out
+        assert (f"loads and labels' names are not read back from {suffix}" in said) == is_said
+    assert exit_code("convert", folder / "a.vtu", tmp_path / "b.msh") == 0
+    assert "are not read back" not in capsys.readouterr().out
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--young", "3500"], "young is from 3500 to 3500 kPa, stiffer than soft tissue"),
+        (["--young", "0.003"], "young is up to 0.003 kPa, softer than any tissue"),
+        (["--young", "3", "--density", "1.06"], "density is up to 1.06 kg/m3, where water's is 1000"),
+        (["--young", "3", "--density", "1060", "--load", "gravity:0,0,-9.81"], "gravity is 9.81 mm/s2"),
+        (["--young", "1=1e7,0=0.5"], None),
+        (["--young", "0=17e6,1=1e5", "--density", "1=1000,0=1.2", "--load", "gravity:0,0,-9810"], None),
+    ],
+)
+def test_quantities_in_other_units_are_said(folder, tmp_path, options, said, capsys):
+    image = ["mesh", folder / "a.nii.gz", "--spacing", "8", "--iterations", "0", "-o", tmp_path / "b.inp"]
+    for words in (
+        ["convert", folder / "a.vtu", tmp_path / "a.inp"],
+        *([image] if "gravity:0,0,-9.81" in options else []),
+    ):
+        assert exit_code(*words, *options) == 0
+        err = " ".join(capsys.readouterr().err.split())
+        assert err.count("if it was meant in") == (said is not None)
+        assert said is None or f"warning: {said}" in err
 
 
 def test_a_mesh_of_gmsh_s_is_measured_and_painted(folder, tmp_path, capsys):
@@ -429,7 +496,13 @@ def test_loads_run_or_are_said_to_be_in_comments(folder, tmp_path, capsys):
         ("a", [], "unknown suffix"),
         ("a.inp", ["--young", "1 + x"], 'cannot use "x"'),
         ("a.inp", ["--young", "__import__('os')"], "cannot use"),
-        ("a.inp", ["--young", "0:1,100:5,50:3"], "must increase, got 100 and then 50"),
+        ("a.inp", ["--young", "0:1,100:5,50:3"], "--young: intensities must increase, got 100 and then 50"),
+        ("a.inp", ["--young", "2", "--nu", "0:x"], "--nu: expected pairs intensity:value"),
+        (
+            "a.inp",
+            ["--young", "h+1", "--average", "gauss"],
+            "--average: gauss is over an image's voxels; give the image",
+        ),
         ("a.inp", ["--young", "no.toml"], "no such file"),
         ("a.inp", ["--young", "0"], "young: expected moduli above 0 kPa"),
         ("a.inp", ["--young", "-h"], "expected 0 kPa or more"),
@@ -492,6 +565,8 @@ def test_what_will_not_do_is_said_before_the_optimisation(folder, tmp_path, caps
         ("a.inp", ["--set", "foo"]),
         ("a.inp", ["--set", "low=below:-5"]),
         ("a.inp", ["--set", "low=below:20", "--young", "h - 20"]),
+        ("a.inp", ["--set", "all_cells=below:20", "--young", "2"]),
+        ("a.inp", ["--labels", folder / "l.nii.gz", "--young", "2", "--load", "pressure:interface_0_1:1"]),
     ):
         assert exit_code("mesh", folder / "a.nii.gz", "-o", tmp_path / out, "--spacing", "8", *more) == 2
         said = capsys.readouterr().err

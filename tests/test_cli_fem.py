@@ -151,6 +151,7 @@ def test_advice_where_linear_cells_lock(options, is_advised, path, capsys):
         (["{model}", "--crop", "0:2,0:2,0:2"], "--crop: there is no IMAGE, only a mesh"),
         (["{model}", "--slice", "k=1"], "--slice: there is no IMAGE, only a mesh"),
         (["{model}", "--order", "3"], "--order: expected 1 or 2, got 3"),
+        (["{model}", "--average", "gauss"], "--average: it is over an image's voxels; give the IMAGE before the MESH"),
         (["{model}", "--average", "mean"], "--average: it is over an image's voxels; give the IMAGE before the MESH"),
         (["{model}", "--young", "3;4"], "formula: expected numbers"),
         (["{model}", "--nu", "0.5"], "nu: expected -1 < nu < 0.5"),
@@ -206,3 +207,28 @@ def test_moduli_at_nodes_go_through_the_file(tmp_path, capsys):
     written = json.loads((tmp_path / "numbers.json").read_text())["strain_energy"]
     assert written == pytest.approx(solved_model(nodal).strain_energy, rel=1e-12)
     assert abs(written / solved_model(nodal._replace(node_young=None)).strain_energy - 1.0) > 1e-4
+
+
+@pytest.mark.parametrize("units", [["--space", "lps", "--units", "MPa"], []])
+def test_moduli_at_gauss_points_go_through_the_file(units, tmp_path, capsys):
+    """What was solved with them is solved again from its file, to the same numbers, but not on other moduli."""
+    image, model = sample_image(), sample_model()
+    tetopt.save_image(tmp_path / "a.nii.gz", image)
+    tetopt.save_mesh(tmp_path / "mesh.vtu", model.mesh)
+    names = [str(tmp_path / name) for name in ("solved.vtu", "again.vtu", "1.json", "2.json", "3.json")]
+    words = [str(tmp_path / "a.nii.gz"), str(tmp_path / "mesh.vtu"), "--young", "1+0.02*h", "--order", "2"]
+    out, _ = run(capsys, *words, "-o", names[0], "--json", names[2])
+    assert "law of the modulus" in out
+    assert "1+0.02*h" in out
+    assert "one around each Gauss point" in out
+    assert main(["convert", names[0], names[1], *units]) == 0
+    run(capsys, names[1], "--json", names[3])
+    run(capsys, names[1], "--bins", "1000000", "--json", names[4])
+    energies = [json.loads((tmp_path / f"{k}.json").read_text())["strain_energy"] for k in (1, 2, 3)]
+    assert energies[1] == pytest.approx(energies[0], rel=1e-12)
+    assert abs(energies[2] / energies[0] - 1.0) > 1e-5
+    loaded = tetopt.load_mesh(names[0])
+    fields = dict(loaded.cell_data) | {"young": 2.0 * loaded.cell_data["young"]}
+    tetopt.save_mesh(tmp_path / "changed.vtu", loaded.mesh, fields, {"loads": ["compress:5%"], "units": "kPa"}, order=2)
+    _, err = run(capsys, str(tmp_path / "changed.vtu"), "--load", "compress:1%")
+    assert "young_gauss of the mesh's file is left out" in err

@@ -9,7 +9,15 @@ import tetopt
 from tetopt import Image, InputError, cell_moments, cell_of_voxel, lattice
 from tetopt.fem.solution import gauss_moduli, solved_model
 from tetopt.geometry.quadratic import gauss_rule
-from tetopt.model.averages import cell_young, element_young, gauss_young, node_young, parse_average, young_image
+from tetopt.model.averages import (
+    cell_values,
+    cell_young,
+    element_young,
+    gauss_young,
+    node_young,
+    parse_average,
+    young_image,
+)
 from tetopt.model.build import model_of
 from tetopt.model.model import in_units
 
@@ -122,6 +130,22 @@ def test_empty_space_in_a_cell():
             InputError, match=rf"above 0 kPa for {each}, got 0 in \d+ voxels of the mesh.*--average mean"
         ):
             cell_young(image, mesh, law, each)
+
+
+@pytest.mark.parametrize("average", ["mean", "geometric", "gauss", "nodes"])
+def test_a_law_need_not_be_one_for_voxels_beside_the_mesh(average):
+    """As of the air around an organ; within it everything is as with a law that holds everywhere."""
+    image = noise((12, 12, 12))
+    mesh = lattice(image, nodes=200)
+    inner = mesh.cells[(mesh.points[mesh.cells].max(axis=1)[:, 0] < 7.0)]
+    used, cells = np.unique(inner, return_inverse=True)
+    part = tetopt.Mesh(mesh.points[used], cells.reshape(inner.shape))
+    air = Image(np.where((cell_of_voxel(image, part) < 0) & (np.indices(image.shape)[0] > 8), -1000.0, image.data))
+    moduli = element_young(air, part, lambda h: 1.0 + h, average, 2)
+    np.testing.assert_array_equal(moduli, element_young(image, part, lambda h: 1.0 + np.abs(h), average, 2))
+    np.testing.assert_array_equal(cell_values(air, part, np.sqrt), cell_values(image, part, np.sqrt))
+    with pytest.raises(InputError, match="expected 0 kPa or more"):
+        element_young(air, mesh, lambda h: 1.0 + h, average, 2)
 
 
 @pytest.mark.parametrize("text", ["", "voigt", "power", "power:", "power:x", "power:nan", "power:11", "mean:1", "Mean"])

@@ -17,14 +17,17 @@ from tetopt.cli.inputs import check_no_input, image_and_others, read_mesh, warn_
 from tetopt.cli.options import ImagePart, MeshArgument, NumberOptions, SolverOptions, option
 from tetopt.cli.solver import (
     MATERIAL_FIELDS,
+    REACTIONS_TEXT,
     check_solver_options,
+    completed,
     loads_of,
     print_model,
     save_for_solver,
     sets_and_table,
     solver_model,
+    warn_of_units,
     with_chosen_sets,
-    with_point_data,
+    without_stale_results,
 )
 from tetopt.io.files import checked_output, save_json
 from tetopt.io.formats import FORMATS, format_of
@@ -32,7 +35,6 @@ from tetopt.io.frd import read_frd
 from tetopt.io.images import sha256
 from tetopt.io.meshes import MeshFile
 from tetopt.io.vtk import box_text
-from tetopt.model.averages import DEFAULT_AVERAGE
 from tetopt.model.fields import cell_fields, is_result, is_stress
 from tetopt.model.sets import box_of
 from tetopt.report.summary import model_summary, versions
@@ -71,11 +73,10 @@ def convert_command(
     if image_path is None and (lost := [name for name, value in needs_image.items() if value is not None]):
         raise InputError(f"{lost[0]}: there is no --image")
     loaded = read_mesh(mesh_path)
-    if results_path is not None:
-        loaded = _with_results(loaded, results_path)
+    loaded = without_stale_results(loaded, solver) if results_path is None else _with_results(loaded, results_path)
     solver = replace(solver, order=_order_of(loaded, solver, output))
     check_solver_options(output, solver, has_materials="young" in loaded.cell_data)
-    if image_path is None and solver.average != DEFAULT_AVERAGE:
+    if image_path is None and solver.average is not None:
         raise InputError(f"--average: {solver.average} is over an image's voxels; give the image (--image)")
     if not solver.loads and not format_of(output).is_surface:
         solver = replace(solver, loads=loads_of(loaded))
@@ -95,7 +96,8 @@ def convert_command(
         fields = {name: values for name, values in fields.items() if name not in MATERIAL_FIELDS}
     known_sets, words = sets_and_table(loaded, box, fields, solver)
     model = solver_model(loaded.mesh, image, solver, fields, about | words, known_sets)
-    model = with_chosen_sets(with_point_data(model, loaded.point_data, solver), output, solver)
+    warn_of_units(model)
+    model = with_chosen_sets(completed(model, loaded, solver), output, solver)
     save_for_solver(output, model, solver)
     if json_path is not None:
         files = {"mesh": mesh_path.name, "output": output.name, "units": solver.units, "space": solver.space}
@@ -108,7 +110,7 @@ def convert_command(
 def _texts_of(loaded: MeshFile, solver: SolverOptions, *, has_new_results: bool) -> dict[str, Any]:
     """The texts of the mesh's file that go on; the forces that hold sets, which are in RAS+ and mN, only as such."""
     is_as_solved = (solver.space, solver.units) == ("ras", "kPa") and not has_new_results
-    names = [name for name in loaded.field_data if is_as_solved and re.fullmatch(r"reactions(_step\d+)?", name)]
+    names = [name for name in loaded.field_data if is_as_solved and re.fullmatch(REACTIONS_TEXT, name)]
     return {name: text for name in (*TEXTS_KEPT, *names) if (text := loaded.text(name)) is not None}
 
 

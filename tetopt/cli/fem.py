@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
@@ -17,11 +18,12 @@ from tetopt.cli.inputs import check_no_input, read_image, read_mesh, warn_of_oth
 from tetopt.cli.options import ImagePart, ModelOptions, NumberOptions, option
 from tetopt.cli.solver import (
     check_model_options,
+    completed,
     loads_of,
     sets_and_table,
     solver_model,
+    warn_of_units,
     with_chosen_sets,
-    with_point_data,
 )
 from tetopt.io.files import checked_output, save_json
 from tetopt.io.formats import save_model
@@ -86,8 +88,8 @@ def fem_command(
     if output is not None:
         output = checked_output(output, (".vtu", ".vtk"), numbers.force)
         check_no_input(output, mesh_path, image_path)
-    if image_path is not None and model.young is None:
-        model = replace(model, young=INTENSITY_LAW)
+    if image_path is not None:
+        model = replace(model, young=model.young or INTENSITY_LAW, average=model.average or DEFAULT_AVERAGE)
     if output is None and model.written_sets is not None:
         raise InputError("--sets: no file is written; give -o SOLVED.vtu, too")
     _check_options(image_path, compress, model, part)
@@ -103,7 +105,7 @@ def fem_command(
     if output is not None:
         save_model(output, with_chosen_sets(_with_results(task, solutions), output, model))
     _advise(task, solutions)
-    _print(mesh_path.name, task, solutions, extremes)
+    _print(mesh_path.name, task, model, solutions, extremes)
     if json_path is not None:
         options = {**asdict(model), "compress_percent": compress, **part.stated()}
         options["label_names"] = None if model.label_names is None else model.label_names.name
@@ -124,7 +126,7 @@ def _check_options(image_path: Path | None, compress: float | None, model: Model
         raise InputError("--compress and --load: give one of them, as in --load compress:5% --load pressure:left:1.5")
     if image_path is None and (lost := [name for name, value in part.stated().items() if value is not None]):
         raise InputError(f"--{lost[0]}: there is no IMAGE, only a mesh")
-    if image_path is None and model.average != DEFAULT_AVERAGE:
+    if image_path is None and model.average is not None:
         raise InputError("--average: it is over an image's voxels; give the IMAGE before the MESH")
     check_model_options(model, has_materials=True)
 
@@ -166,7 +168,10 @@ def _model(loaded: MeshFile, image: Image | None, options: ModelOptions) -> Mode
     about = {} if box is None else {"box": box_text(box)}
     sets, words = sets_and_table(loaded, box, fields, options)
     others = {name: values for name, values in loaded.point_data.items() if not is_result(name)}
-    return with_point_data(solver_model(loaded.mesh, image, options, fields, about | words, sets), others, options)
+    model = solver_model(loaded.mesh, image, options, fields, about | words, sets)
+    if options.young != INTENSITY_LAW:  # which has no units
+        warn_of_units(model)
+    return completed(model, loaded._replace(point_data=others), options)
 
 
 def _solved(model: Model, is_conditioned: bool) -> tuple[list[Solution], Conditioning | None]:
@@ -218,13 +223,31 @@ def _advise(model: Model, solutions: list[Solution]) -> None:
         )
 
 
-def _print(name: str, model: Model, solutions: list[Solution], extremes: Conditioning | None) -> None:
+def _of_what(model: Model, options: ModelOptions) -> Iterator[tuple[str, str]]:
+    """Rows that tell what the moduli are of: the law, how it was averaged, the ratios."""
+    assert model.materials is not None, "it has been solved"
+    yield "law of the modulus", "of the mesh's file" if options.young is None else escape(options.young)
+    if model.node_young is not None:
+        yield "modulus within a cell", "linear between its nodes"
+    elif model.gauss_young is not None:
+        yield "modulus within a cell", "one around each Gauss point"
+    elif options.average is not None:
+        yield "average over a cell", options.average
+    low, high = model.materials.nu.min(), model.materials.nu.max()
+    yield "Poisson's ratio", f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"
+
+
+def _print(
+    name: str, model: Model, options: ModelOptions, solutions: list[Solution], extremes: Conditioning | None
+) -> None:
     """A table of a column for each step."""
     steps = [f"step {step}" for step in range(1, len(solutions) + 1)] if len(solutions) > 1 else [""]
     table = new_table(escape(name), *steps)
     moduli = [solutions[0].young.min(), solutions[0].young.max()]
     table.add_row("size", f"{nodes_in_words(model.mesh, model.order)}, {len(model.mesh.cells)} cells")
     table.add_row("modulus of the cells, kPa", f"{moduli[0]:.4g} to {moduli[1]:.4g}")
+    for title, words in _of_what(model, options):
+        table.add_row(title, words)
     of_step = [_numbers_of(solution) for solution in solutions]
     table.add_row("largest displacement, mm", *(f"{each['largest_displacement']:.5g}" for each in of_step))
     table.add_row("largest von Mises stress of a cell, kPa", *(f"{each['largest_von_mises']:.5g}" for each in of_step))

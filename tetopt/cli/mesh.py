@@ -49,6 +49,7 @@ from tetopt.io.formats import format_of
 from tetopt.io.meshes import MeshFile
 from tetopt.io.mni import mni_path
 from tetopt.measure.quality import Quality, quality
+from tetopt.model.fields import is_result
 from tetopt.model.labels import TABLE_TEXT, table_of_labels, table_words
 from tetopt.model.model import Model
 from tetopt.model.sets import Sets, box_of, label_set_names, surviving_sets
@@ -192,8 +193,9 @@ def _model(
             lost = [name for name in lost if not name.startswith(("label_", "interface_")) and name not in of_labels]
         if lost:
             log.print(escape(f"not kept, as their cells or facets are others now: the sets {', '.join(lost)}"))
-        if "young" in started.cell_data or started.text("loads") is not None:
-            log.print("moduli and loads of the mesh that is improved are not kept; give --young and --load")
+        has_results = any(is_result(name) for name in (*started.cell_data, *started.point_data))
+        if "young" in started.cell_data or started.text("loads") is not None or has_results:
+            log.print("moduli, loads and results of the mesh that is improved are not kept; give --young and --load")
     known_sets = all_sets(mesh, box_of(source.contrasts[0]), fields, own, source.table.names, is_told=is_told)
     return solver_model(mesh, source.image, solver, fields, about, known_sets)
 

@@ -55,14 +55,13 @@ VolumeOption = Annotated[int | None, option("K", "Volume of a 4-D file, from 0."
 CropOption = Annotated[str | None, option("A:B,C:D,E:F", "Keep these voxels, half open; an end may be empty.")]
 JsonOption = Annotated[Path | None, option("FILE", "Write every number here.", "--json")]
 ForceOption = Annotated[bool, typer.Option("--force", help="Replace existing outputs.")]
-AverageOption = Annotated[
-    str,
-    option(
-        "WORD",
-        "One modulus of those of a cell's voxels: mean (the paper's), geometric, harmonic, power:P, hill (between mean "
-        "and harmonic); or gauss (around each Gauss point of quadratic cells), nodes (linear between nodes).",
-    ),
-]
+AVERAGE_OPTION = option(
+    "WORD",
+    "One modulus of those of a cell's voxels: mean (the paper's), geometric, harmonic, power:P, hill (between mean "
+    f"and harmonic); or gauss (around each Gauss point of quadratic cells), nodes (linear between nodes); by default "
+    f"{DEFAULT_AVERAGE}.",
+)
+AverageOption = Annotated[str, AVERAGE_OPTION]
 LabelNamesOption = Annotated[
     Path | None,
     option(
@@ -284,7 +283,7 @@ class ModelOptions:
     density: Annotated[str | None, option("LAW", "Density, kg/m3, likewise (water's is 1000); gravity needs it.")] = (
         None
     )
-    average: AverageOption = DEFAULT_AVERAGE
+    average: Annotated[str | None, AVERAGE_OPTION] = None
     bins: Annotated[
         str | None, option("K[:quantile|:log]", "Group cells into K materials, of equal width, by number, or log.")
     ] = None

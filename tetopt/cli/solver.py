@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping
+import re
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
 from itertools import chain, count
 from pathlib import Path
@@ -15,21 +16,31 @@ from rich.markup import escape
 
 import tetopt
 from tetopt import Image, InputError, Mesh
-from tetopt.cli.console import log, out, print_wide
+from tetopt.cli.console import log, out, print_wide, show_warning
 from tetopt.cli.inputs import label_table
 from tetopt.cli.options import ModelOptions, SolverOptions
 from tetopt.io.formats import FORMATS, file_bytes, format_of, save_model
 from tetopt.io.meshes import MeshFile
 from tetopt.model.averages import DEFAULT_AVERAGE, parse_average
 from tetopt.model.build import labels_of, model_of
-from tetopt.model.fields import NODE_MODULI
+from tetopt.model.fields import GAUSS_MODULI, NODE_MODULI, is_result
 from tetopt.model.labels import TABLE_TEXT, table_of_words, table_words
 from tetopt.model.laws import checked_young, parse_any_law
-from tetopt.model.loads import check_steps, count_of_steps, known_set, load_words, other_orders, parse_load
-from tetopt.model.materials import DEFAULT_NU, Materials, Spacing
-from tetopt.model.model import SPACES, STRESS_UNITS, Model, element_facets, elements, half_turned, scaled
+from tetopt.model.loads import (
+    FACET_FORCES,
+    check_steps,
+    count_of_steps,
+    known_set,
+    load_words,
+    other_orders,
+    parse_load,
+)
+from tetopt.model.materials import DEFAULT_NU, BinningError, Materials, Spacing
+from tetopt.model.model import SPACES, STRESS_UNITS, Model, element_facets, elements, half_turned, odd_units, scaled
 from tetopt.model.sets import (
+    BOUNDARY_SET,
     Box,
+    SetRequest,
     Sets,
     check_free_names,
     interface_names,
@@ -42,10 +53,14 @@ from tetopt.model.sets import (
 )
 from tetopt.report.tables import new_table, nodes_in_words
 
-MATERIAL_FIELDS = ("young", "nu", "density", "material")  # what a file of ours says of each cell's material
+MATERIAL_FIELDS = ("young", "nu", "density", "material", GAUSS_MODULI)  # of cells of a file of ours
+REACTIONS_TEXT = r"reactions(_step\d+)?"  # of a solved mesh's file: the forces that hold sets
+MODULUS_ROUNDING = 1e-9  # relative: of a cell's modulus beside those at its Gauss points, in files of other units
 SET_GROUPS = ("labels", "interfaces", "boundary")  # of the sets that every mesh has
 # Each is an array more on the nodes of a VTU or VTK file; labels and their sets can be made anew of its cells.
 MANY_INTERFACES = 24
+READ_WITHOUT_TEXTS = (".msh", ".msh2")  # read back with sets and fields, but without our texts
+INTERFACE_PREFIX = "interface_"  # of the names of facet sets between two labels
 LISTED_NAMES = 8  # of labels of one material: a line's worth
 SLOW_MATERIALS = 30_000  # CalculiX takes three times as long with as many as there are cells (tests/benchmarks)
 
@@ -62,7 +77,7 @@ def check_solver_options(output: Path, solver: SolverOptions, has_materials: boo
     if form.is_surface and (solver.young or solver.bins or solver.sets or solver.loads or solver.written_sets):
         raise InputError(f"{output}: holds the boundary alone; leave out --young, --bins, --set, --sets and --load")
     check_model_options(solver, has_materials)
-    if solver.average != DEFAULT_AVERAGE and solver.young is None:
+    if solver.average is not None and solver.young is None:
         raise InputError("--average: there is no --young")
     if solver.units not in STRESS_UNITS:
         raise InputError(f"--units: expected {' or '.join(STRESS_UNITS)}, got {solver.units}")
@@ -86,14 +101,22 @@ def check_model_options(options: ModelOptions, has_materials: bool) -> None:
     """
     for name, law in (("young", options.young), ("nu", options.nu), ("density", options.density)):
         if law is not None:
-            parse_any_law(law, name)
+            _check_law(law, name)
             if options.young is None and not has_materials:
                 raise InputError(f"--{name}: there is no --young")
-    parse_average(options.average)
+    parse_average(options.average or DEFAULT_AVERAGE)
     parsed_bins(options.bins)
     parsed_groups(options.written_sets)
     if options.order not in (None, 1, 2):
         raise InputError(f"--order: expected 1 or 2, got {options.order}")
+
+
+def _check_law(text: str, name: str) -> None:
+    """InputError that names the option, for a law that is none."""
+    try:
+        parse_any_law(text, name)
+    except InputError as error:
+        raise InputError(f"--{name}: {str(error).removeprefix('law: ')}") from error
 
 
 def parsed_bins(text: str | None) -> tuple[int | None, Spacing]:
@@ -135,20 +158,67 @@ def solver_model(
     fields = {name: values for name, values in cell_data.items() if name not in MATERIAL_FIELDS}
     bins, spacing = parsed_bins(solver.bins)
     model = model_of(
-        mesh, image, young=young, nu=nu, density=density, average=solver.average, sets=solver.sets or (),
-        loads=solver.loads or (), bins=bins, spacing=spacing, order=solver.order or 1, cell_data=fields,
-        known_sets=known_sets, about={"tetopt": tetopt.__version__, **about},
+        mesh, image, young=young, nu=nu, density=density, average=solver.average or DEFAULT_AVERAGE,
+        sets=solver.sets or (), loads=solver.loads or (), bins=bins, spacing=spacing, order=solver.order or 1,
+        cell_data=fields, known_sets=known_sets, about={"tetopt": tetopt.__version__, **about},
     )  # fmt: skip
     return model._replace(is_nonlinear=isinstance(solver, SolverOptions) and solver.nonlinear)
 
 
-def with_point_data(model: Model, point_data: dict[str, NDArray], solver: ModelOptions) -> Model:
-    """The model with what the mesh's file has at nodes: its moduli, too, unless --young or --bins makes others."""
-    others = {name: values for name, values in point_data.items() if name != NODE_MODULI}
-    moduli = point_data.get(NODE_MODULI)
-    if moduli is None or solver.young is not None or solver.bins is not None or model.materials is None:
-        return model._replace(point_data=others)
-    return model._replace(point_data=others, node_young=checked_young(moduli[: len(model.mesh.points)]))
+def completed(model: Model, loaded: MeshFile, solver: ModelOptions) -> Model:
+    """The model with what the mesh's file alone has: data at nodes and, unless --young or --bins makes others, moduli
+    that vary within cells, and the error of those that stand for more."""
+    model = model._replace(point_data={name: rows for name, rows in loaded.point_data.items() if name != NODE_MODULI})
+    if model.materials is None or solver.young is not None or solver.bins is not None:
+        return model
+    if (moduli := loaded.point_data.get(NODE_MODULI)) is not None:
+        model = model._replace(node_young=checked_young(moduli[: len(model.mesh.points)]))
+    table = model.materials and model.materials._replace(binning=_binning_error(loaded))
+    return model._replace(materials=table, gauss_young=_gauss_moduli(model, loaded))
+
+
+def _binning_error(loaded: MeshFile) -> BinningError | None:
+    """How far the moduli of a file of ours are from those that they stand for, if it tells."""
+    try:
+        words = json.loads(loaded.text("binning") or "{}")
+        return BinningError(float(words["mean"]), float(words["largest"]))
+    except (ValueError, TypeError, KeyError, RecursionError):  # there is none, or it is another program's
+        return None
+
+
+def _gauss_moduli(model: Model, loaded: MeshFile) -> NDArray[np.float64] | None:
+    """The moduli at Gauss points (M, Q) that a file of ours holds, if they are still those of its cells."""
+    moduli = loaded.cell_data.get(GAUSS_MODULI)
+    if moduli is None or model.order == 1 or model.materials is None:
+        return None
+    of_cell, shape = model.materials.young[model.materials.of_cell], (len(model.mesh.cells), model.mesh.ndim + 1)
+    # A cell's own modulus is a mean of these; columns go by a cell's nodes, which turning exchanges.
+    if moduli.shape == shape and not loaded.n_turned:
+        low, high = moduli.min(axis=1), moduli.max(axis=1)
+        if ((1.0 - MODULUS_ROUNDING) * low <= of_cell).all() and (of_cell <= (1.0 + MODULUS_ROUNDING) * high).all():
+            checked_young(low)
+            return np.asarray(moduli, dtype=np.float64)
+    log.print(f"{GAUSS_MODULI} of the mesh's file is left out: it does not belong to its cells and their young")
+    return None
+
+
+def without_stale_results(loaded: MeshFile, solver: ModelOptions) -> MeshFile:
+    """The mesh's file without what a solver found on it, if moduli, densities or loads are to be others; a line."""
+    if not any((solver.young, solver.nu, solver.density, solver.bins, solver.loads)):
+        return loaded
+    names = [name for data in (loaded.cell_data, loaded.point_data) for name in data if is_result(name)]
+    texts = {name: text for name, text in loaded.field_data.items() if re.fullmatch(REACTIONS_TEXT, name) is None}
+    if not names and len(texts) == len(loaded.field_data):
+        return loaded
+    log.print(
+        escape(f"left out, as they are of other moduli or loads: {', '.join(dict.fromkeys(names)) or 'reactions'}; ")
+        + "tetopt fem finds them anew"
+    )
+    cell_data, point_data = (
+        {name: rows for name, rows in data.items() if name not in names}
+        for data in (loaded.cell_data, loaded.point_data)
+    )
+    return loaded._replace(cell_data=cell_data, point_data=point_data, field_data=texts)
 
 
 def loads_of(loaded: MeshFile) -> list[str]:
@@ -255,15 +325,38 @@ def check_early(output: Path, solver: SolverOptions, image: Image, build: Callab
     loads = [parse_load(text, image.ndim) for text in solver.loads or ()]
     check_steps(loads)
     loaded = [load.set_name for load in loads]
-    is_certain = not any(name in names or name.startswith("interface_") for name in loaded)
+    is_certain = not any(name in names or name.startswith(INTERFACE_PREFIX) for name in loaded)
     model = build(replace(solver, sets=None, loads=solver.loads if is_certain else None))
+    warn_of_units(model._replace(loads=tuple(loads)))
     for request in requests:
         check_free_names(request, model.sets)
     for name in loaded:
-        may_come = name.startswith("interface_") and not other_orders(name, model.sets)
+        may_come = name.startswith(INTERFACE_PREFIX) and not other_orders(name, model.sets)
         if name and name not in names and not may_come:
             known_set(name, model.sets)
-    file_bytes(output, model, space=solver.space, units=solver.units)
+    for load in loads:
+        if load.kind in FACET_FORCES and load.set_name.startswith(INTERFACE_PREFIX) and load.set_name not in names:
+            raise InputError(
+                f'load: the facets of "{load.set_name}" lie between two cells, where nothing outside can act '
+                f"({load.kind}); take a set of the boundary, mesh one side alone (--mask), or move the set"
+            )
+    file_bytes(output, _with_names(model, requests), space=solver.space, units=solver.units)
+
+
+def _with_names(model: Model, requests: Sequence[SetRequest]) -> Model:
+    """The model with a facet and a cell under each name of a set that is asked for, so that a writer refuses it now."""
+    facets, cells = dict(model.sets.facets), dict(model.sets.cells)
+    for request in requests:
+        *of_cells, of_facets = request.names()
+        facets[of_facets] = model.sets.facets[BOUNDARY_SET][:1]
+        cells |= {name: np.zeros(1, dtype=np.int64) for name in of_cells}
+    return model._replace(sets=Sets(facets, cells))
+
+
+def warn_of_units(model: Model) -> None:
+    """A line for each quantity that seems to be in another unit than is expected."""
+    for words in odd_units(model):
+        show_warning(words)
 
 
 def save_for_solver(output: Path, model: Model, solver: SolverOptions) -> None:
@@ -311,6 +404,12 @@ def _materials_by_name(model: Model, materials: Materials) -> Iterator[str]:
         yield f"  {young:.4g} kPa, nu {nu:.4g}: {', '.join(made_of[:LISTED_NAMES])}{more}"
 
 
+def _only_in_vtu(model: Model) -> str:
+    """What of a model only a VTU or VTK file of ours tells when it is read, in words; nothing if there is none."""
+    names = model.about.get(TABLE_TEXT)
+    return " and ".join(["loads"] * bool(model.loads) + ["labels' names"] * bool(names))
+
+
 def _lines(output: Path, model: Model, solver: SolverOptions) -> Iterator[str]:
     form = format_of(output)
     materials = None if form.is_surface else model.materials
@@ -321,7 +420,11 @@ def _lines(output: Path, model: Model, solver: SolverOptions) -> Iterator[str]:
         yield f"{count}, Young's modulus {young.min():.4g} to {young.max():.4g} kPa, nu {ratios}"
         yield from _materials_by_name(model, materials)
     if materials is not None and model.gauss_young is not None:
-        yield "one modulus a cell, its geometric mean; tetopt fem IMAGE MESH has one at each Gauss point"
+        yield (
+            f"one modulus a cell, its geometric mean, and, for tetopt fem, one at each Gauss point ({GAUSS_MODULI})"
+            if output.suffix.lower() in (".vtu", ".vtk")
+            else "one modulus a cell, its geometric mean; .vtu and .vtk files have one at each Gauss point, too"
+        )
     if materials is not None and materials.binning is not None:
         mean, largest = materials.binning.mean, materials.binning.largest
         yield f"bins: modulus off by {mean:.2%} in the mean by volume, {largest:.2%} at most"
@@ -338,6 +441,8 @@ def _lines(output: Path, model: Model, solver: SolverOptions) -> Iterator[str]:
         yield f"{n_steps} steps, each from the undeformed state"
     if model.loads and not (form.runs or form.is_surface):
         yield "the format runs no step: the loads are in the file as text"
+    if (lost := _only_in_vtu(model)) and not form.is_surface and output.suffix.lower() in READ_WITHOUT_TEXTS:
+        yield f"{lost} are not read back from {output.suffix}: tetopt takes them from .vtu and .vtk files alone"
     low, high = model.mesh.points.min(axis=0), model.mesh.points.max(axis=0)
     ranges = zip("xyz", low, high, strict=False)
     yield (

@@ -182,9 +182,13 @@ def ranges_of(
 
 def nearest_values(image: Image, points: NDArray[np.float64]) -> NDArray[np.float64]:
     """Value of the voxel nearest to each world point, (K,) float64; points outside take the border's."""
+    return image.data[tuple(nearest_voxels(image, points).T)].astype(np.float64)
+
+
+def nearest_voxels(image: Image, points: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Index of the voxel nearest to each world point, (K, n) int64; points outside take the border's."""
     index = np.rint(image.to_index(points)).astype(np.int64)
-    index = np.clip(index, 0, np.array(image.shape) - 1)
-    return image.data[tuple(index.T)].astype(np.float64)
+    return np.clip(index, 0, np.array(image.shape) - 1)
 
 
 class SamplingGrid(NamedTuple):

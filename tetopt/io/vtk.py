@@ -2,8 +2,10 @@
 
 Points in world mm, cells positively oriented, of one type: linear, or quadratic with straight edges, whose corners come
 first among the points. What is on each cell is cell data, on each point point data; with materials there is cell data
-`young`, `nu`, `material`, from 1, and, if there is one, `density`, kg/m3. Texts are field data, held as bytes of UTF-8:
-meshio refuses files with VTK's string arrays, and pyvista writes only ASCII into them. `loads` are the words of --load.
+`young`, `nu`, `material`, from 1, and, if there is one, `density`, kg/m3; of moduli that vary in a cell also
+`young_gauss`, a column for each Gauss point of quadratic cells, or point data `young_nodes`. Texts are field data, held
+as bytes of UTF-8: meshio refuses files with VTK's string arrays, and pyvista writes only ASCII into them. `loads` are
+the words of --load.
 
 A facet set is field data "facets:NAME", rows (cell, local node opposite), and its nodes are point data "on_NAME", 1 or
 0, to be seen in ParaView; a cell set is field data "cells:NAME", cell numbers from 0. Other programs keep field data
@@ -25,7 +27,7 @@ from numpy.typing import NDArray
 from tetopt.geometry.quadratic import quadratic
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.model.fields import NODE_MODULI, is_stress, node_field
+from tetopt.model.fields import GAUSS_MODULI, NODE_MODULI, is_stress, node_field
 from tetopt.model.loads import load_words
 from tetopt.model.model import Model, element_facets, elements
 from tetopt.model.sets import SET_NAME, Box, Sets
@@ -160,6 +162,8 @@ def model_grid(model: Model) -> vtkUnstructuredGrid:
             _add(on_cells, "density", model.materials.density[of_cell])
         if model.materials.binning is not None:
             texts["binning"] = model.materials.binning._asdict()
+    if model.gauss_young is not None:
+        _add(grid.GetCellData(), GAUSS_MODULI, model.gauss_young)
     if model.node_young is not None:
         _add(grid.GetPointData(), NODE_MODULI, node_field(model.node_young, model.mesh, model.order))
     if model.materials is not None or model.loads or any(map(is_stress, [*model.cell_data, *model.point_data])):

@@ -18,7 +18,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.energy.sampling import cell_of_voxel, nearest_values, ranges_of
+from tetopt.energy.sampling import cell_of_voxel, nearest_values, nearest_voxels, ranges_of
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import gauss_rule
 from tetopt.geometry.simplex import centroids, volume_gradients, volumes
@@ -117,8 +117,8 @@ def cell_young(image: Image, mesh: Mesh, law: Law = None, average: str = "mean")
     parsed = parse_average(average)
     if parsed.place == "nodes":
         return gauss_young(node_young(image, mesh, law), mesh, 1)[:, 0]
-    field = young_image(image, law)
-    owner = cell_of_voxel(field, mesh).ravel()
+    seen, owner = _seen(image, mesh)
+    field = young_image(seen, law)
     _check_above_zero(parsed, image, field, owner)
     return _of_cells(field, mesh, owner, parsed.power)
 
@@ -131,12 +131,15 @@ def cell_values(image: Image, mesh: Mesh, law: Law) -> NDArray[np.float64]:
     InputError
         As `law_values` and `tetopt.energy.sampling.cell_of_voxel`; values that are not finite.
     """
-    values = law_values(law, image.data)
+    seen, owner = _seen(image, mesh)
+    values = law_values(law, seen.data)
     if not np.isfinite(values).all():
-        at = image.data[~np.isfinite(values)].ravel()[0]
-        raise InputError(f"law: it has no value at intensity {at:g}; give one defined over the image's whole range")
-    field = Image(values, image.affine)
-    return _of_cells(field, mesh, cell_of_voxel(field, mesh).ravel(), 1.0)
+        at = seen.data[~np.isfinite(values)].ravel()[0]
+        raise InputError(
+            f"law: it has no value at intensity {at:g}; give one (--nu, --density) defined over all intensities within "
+            "the mesh"
+        )
+    return _of_cells(Image(values, image.affine), mesh, owner, 1.0)
 
 
 def node_young(image: Image, mesh: Mesh, law: Law = None) -> NDArray[np.float64]:
@@ -150,8 +153,8 @@ def node_young(image: Image, mesh: Mesh, law: Law = None) -> NDArray[np.float64]
     InputError
         As `young_from` and `tetopt.energy.sampling.cell_of_voxel`; a modulus of 0 in the mesh.
     """
-    field = young_image(image, law)
-    owner = cell_of_voxel(field, mesh).ravel()
+    seen, owner = _seen(image, mesh)
+    field = young_image(seen, law)
     _check_above_zero(parse_average("nodes"), image, field, owner)
     n_nodes = len(mesh.points)
     weight, total = np.zeros(n_nodes), np.zeros(n_nodes)
@@ -192,8 +195,8 @@ def element_young(
         return gauss_young(node_young(image, mesh, law), mesh, order)
     if place == "cells" or order == 1:
         return cell_young(image, mesh, law, average)
-    field = young_image(image, law)
-    owner = cell_of_voxel(field, mesh).ravel()
+    seen, owner = _seen(image, mesh)
+    field = young_image(seen, law)
     _check_above_zero(parse_average(average), image, field, owner)
     places, _ = gauss_rule(mesh.ndim, order)
     part = np.full(len(owner), -1)
@@ -214,6 +217,22 @@ def gauss_young(node_young: NDArray[np.float64], mesh: Mesh, order: int) -> NDAr
     # Within their range, so that equal moduli stay as they are.
     low, high = corners.min(axis=1, keepdims=True), corners.max(axis=1, keepdims=True)
     return np.clip(np.einsum("qa,ca->cq", places, corners), low, high)
+
+
+def _seen(image: Image, mesh: Mesh) -> tuple[Image, NDArray[np.int64]]:
+    """The image as the mesh sees it, and the cell of each voxel, (V,), -1 outside.
+
+    Voxels whose value no average takes get that of one which some do: a law need not be one for the air around an
+    organ. Taken are those in cells, and those nearest to nodes and centroids, which stand in for cells without any.
+    """
+    owner = cell_of_voxel(image, mesh).ravel()
+    is_seen = owner >= 0
+    if is_seen.all():
+        return image, owner
+    for points in (mesh.points, centroids(mesh.points, mesh.cells)):
+        is_seen[np.ravel_multi_index(tuple(nearest_voxels(image, points).T), image.shape)] = True
+    data = image.data.ravel()
+    return Image(np.where(is_seen, data, data[np.argmax(is_seen)]).reshape(image.shape), image.affine), owner
 
 
 def _places(

@@ -18,7 +18,8 @@ from tetopt.mesh import Mesh
 VECTOR_FIELDS = ("displacement",)
 TENSOR_FIELDS = ("strain", "stress", "strain_nodes", "stress_nodes")
 NODE_MODULI = "young_nodes"  # point data of our files: moduli that are linear within cells
-STRESS_FIELDS = ("young", NODE_MODULI, "stress", "von_mises", "stress_nodes", "von_mises_nodes")
+GAUSS_MODULI = "young_gauss"  # cell data of our files: moduli at the Gauss points of quadratic cells, a column each
+STRESS_FIELDS = ("young", NODE_MODULI, GAUSS_MODULI, "stress", "von_mises", "stress_nodes", "von_mises_nodes")
 HALF_TURN = np.array([-1.0, -1.0, 1.0])  # about z, from RAS+ to LPS+ or back
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -32,6 +33,12 @@ class Units(NamedTuple):
 
 STRESS_UNITS = {"kPa": Units(1.0, "mN", "uJ", "kg", 1e-6), "MPa": Units(1e3, "N", "mJ", "t", 1e-9)}
 WATER_DENSITY = 1000.0  # kg/m3
+# What is a thousand times off from any tissue is most likely in another unit. Soft tissue is from 0.1 to some hundred
+# kPa; as Pa all of it lies between the first two, where hardly anything but cartilage does, and as MPa below the third.
+PASCAL_RANGE = (1e3, 1e5)
+MEGAPASCAL_MOST = 0.05
+GRAM_DENSITY_MOST = 20.0  # kg/m3: gold has so many g/cm3, and nothing but gases so few kg/m3
+METRE_GRAVITY = (1.0, 100.0)  # mm/s2: the moon's to ten times the earth's in m/s2, of which 9.81 are 9810 mm/s2
 SPACES = ("ras", "lps")  # conventions of the world's axes
 
 
@@ -125,6 +132,33 @@ def in_units(model: Model, units: str) -> Model:
 def scaled(load: Load, factor: float) -> Load:
     """A load in a unit of stress of which there are `factor` in the present one."""
     return load._replace(numbers=load.numbers * factor) if load.kind in FACET_FORCES else load
+
+
+def odd_units(model: Model) -> Iterator[str]:
+    """What of a model, in kPa, seems to be in another unit than it should be, a line each."""
+    if (table := model.materials) is not None:
+        low, high = float(table.young.min()), float(table.young.max())
+        if PASCAL_RANGE[0] <= low and high <= PASCAL_RANGE[1]:
+            yield (
+                f"young is from {low:.4g} to {high:.4g} kPa, stiffer than soft tissue (0.1 to some hundred kPa): if it "
+                "was meant in Pa, divide it by 1000"
+            )
+        elif high < MEGAPASCAL_MOST:
+            yield (
+                f"young is up to {high:.4g} kPa, softer than any tissue (0.1 kPa and more): if it was meant in MPa, "
+                "multiply it by 1000; --units is of the file alone"
+            )
+        if table.density is not None and (densest := float(table.density.max())) < GRAM_DENSITY_MOST:
+            yield (
+                f"density is up to {densest:.4g} kg/m3, where water's is 1000: if it was meant in g/cm3, multiply it "
+                "by 1000"
+            )
+    for load in model.loads:
+        size = float(np.sqrt((load.numbers**2).sum()))
+        if load.kind == "gravity" and METRE_GRAVITY[0] <= size <= METRE_GRAVITY[1]:
+            yield (
+                f"gravity is {size:.4g} mm/s2, where the earth's is 9810: if it was meant in m/s2, multiply it by 1000"
+            )
 
 
 def described(model: Model) -> list[str]:
