@@ -1,9 +1,12 @@
 """Outputs: asked for before the work, written whole or not at all, with the permissions of any other file."""
 
+import errno
 import json
 import math
 import os
 import stat
+import sys
+import tempfile
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,7 +14,17 @@ import numpy as np
 import pytest
 
 from tetopt.errors import InputError
-from tetopt.io.files import checked_output, save_json, written_whole
+from tetopt.io.files import (
+    TakenError,
+    check_space,
+    checked_output,
+    name_files,
+    outputs_of_command,
+    save_bytes,
+    save_json,
+    save_text,
+    written_whole,
+)
 
 VTU = (".vtu",)
 NIFTI = (".nii", ".nii.gz")
@@ -67,13 +80,133 @@ def test_a_folder_in_place_of_the_file_is_refused(tmp_path):
     assert_refused(tmp_path / "mesh.vtu", "found a folder", force=True)
 
 
-@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() == 0, reason="root may write everywhere")
-def test_a_read_only_folder_is_refused(tmp_path):
-    tmp_path.chmod(0o555)
-    try:
-        assert_refused(tmp_path / "mesh.vtu", "cannot be written to")
-    finally:
-        tmp_path.chmod(0o755)
+def test_a_folder_that_takes_no_file_is_refused(tmp_path, monkeypatch):
+    """Whatever its rights say, a file is made there: root may write everywhere, but not on a full disk."""
+
+    def refused(*_, **__):
+        raise OSError(errno.EROFS, "Read-only file system")
+
+    monkeypatch.setattr(tempfile, "mkstemp", refused)
+    assert_refused(tmp_path / "mesh.vtu", "folder cannot be written to: Read-only file system")
+
+
+@pytest.mark.parametrize("name", ["m" * 252 + ".vtu", "m\0.vtu"])
+def test_a_name_that_cannot_be_is_refused(tmp_path, name):
+    assert_refused(tmp_path / name, "cannot be written: (File name too long|embedded null)")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="the system has no pipes in folders")
+def test_what_is_no_file_is_not_replaced(tmp_path):
+    os.mkfifo(tmp_path / "mesh.vtu")
+    assert_refused(tmp_path / "mesh.vtu", "found a device, a pipe", force=True)
+    (tmp_path / "a.vtu").symlink_to("b.vtu")
+    (tmp_path / "b.vtu").symlink_to("a.vtu")
+    assert_refused(tmp_path / "a.vtu", "a link in a circle|Too many levels", force=True)
+
+
+def test_a_link_is_written_through(tmp_path):
+    """And stays; one whose target is not there yet makes that."""
+    (tmp_path / "far").mkdir()
+    for name, old in (("a.vtu", "old"), ("b.vtu", None)):
+        target, link = tmp_path / "far" / name, tmp_path / name
+        link.symlink_to(Path("far") / name)
+        if old is not None:
+            target.write_text(old)
+        assert_refused(link, "exists already; pass --force")
+        checked_output(link, VTU, force=True)
+        save_bytes(link, b"new")
+        assert link.is_symlink()
+        assert not target.is_symlink()
+        assert target.read_text() == "new"
+    (tmp_path / "c.vtu").symlink_to(tmp_path / "no" / "c.vtu")
+    assert_refused(tmp_path / "c.vtu", "a link to .*its folder does not exist", force=True)
+
+
+def test_a_link_that_is_turned_during_the_run_changes_nothing(tmp_path):
+    (tmp_path / "a").write_text("old a")
+    (tmp_path / "b").write_text("old b")
+    link = tmp_path / "l.vtu"
+    link.symlink_to("a")
+    with outputs_of_command():
+        checked_output(link, VTU, force=True)
+        link.unlink()
+        link.symlink_to("b")
+        save_bytes(link, b"new")
+    assert [(tmp_path / name).read_text() for name in "ab"] == ["new", "old b"]
+
+
+# --------------------------------------------------------------------------------------------------
+# Within a command
+
+
+@pytest.mark.parametrize("has_links", [True, False])
+def test_what_another_program_wrote_meanwhile_stays(tmp_path, monkeypatch, has_links):
+    if not has_links:
+        no_links(monkeypatch)
+    path = tmp_path / "a.nii.gz"
+    for number in (1, 2):
+        with outputs_of_command() as outputs:
+            checked_output(path, NIFTI)
+            path.write_text("theirs")
+            kept = tmp_path / f"a_kept_{number}.nii.gz"
+            with pytest.raises(TakenError, match=f"without --force it stays.* is in {kept}"):
+                save_bytes(path, b"ours")
+        assert outputs.written == []
+        assert path.read_text() == "theirs"
+        assert kept.read_text() == "ours"
+        path.unlink()
+    assert len(list(tmp_path.iterdir())) == 2
+
+
+@pytest.mark.parametrize("has_links", [True, False])
+def test_a_new_output_appears_and_may_be_written_again(tmp_path, monkeypatch, has_links):
+    if not has_links:
+        no_links(monkeypatch)
+    path = tmp_path / "a.vtu"
+    with outputs_of_command() as outputs:
+        checked_output(path, VTU)
+        for text in (b"new", b"newer"):
+            save_bytes(path, text)
+            assert path.read_bytes() == text
+    assert outputs.written == [path, path]
+    assert list(tmp_path.iterdir()) == [path]
+
+
+def test_force_replaces_what_came_meanwhile(tmp_path):
+    path = tmp_path / "a.vtu"
+    with outputs_of_command():
+        checked_output(path, VTU, force=True)
+        path.write_text("theirs")
+        save_bytes(path, b"ours")
+    assert path.read_text() == "ours"
+
+
+def no_links(monkeypatch):
+    """A file system as FAT is."""
+
+    def refused(*_):
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(os, "link", refused)
+
+
+def test_no_output_is_an_input_or_another_output(tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("a.vtu").write_text("an input")
+    Path("l.vtu").symlink_to("a.vtu")
+    os.link("a.vtu", "h.vtu")
+    for output, named in (
+        ("a.vtu", ["a.vtu", "a.vtu"]), ("a.vtu", ["a.vtu", "./a.vtu"]), ("l.vtu", ["l.vtu", "a.vtu"]),
+        ("h.vtu", ["a.vtu", "h.vtu"]), ("new.vtu", ["new.vtu", tmp_path / "new.vtu"]),
+        ("a.vtu", [tmp_path, "a.vtu", tmp_path / "a.vtu"]),
+    ):  # fmt: skip
+        with outputs_of_command():
+            name_files([None, 3, [Path(name) for name in named]])
+            assert_refused(Path(output), "is an input of this command too, or another output", force=True)
+    with outputs_of_command():
+        name_files([Path("a.vtu"), Path("b.vtu")])
+        checked_output("a.vtu", VTU, force=True)
+        checked_output("b.vtu", VTU)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -139,6 +272,75 @@ def test_permissions_follow_the_umask(tmp_path, mask, mode):
     finally:
         os.umask(before)
     assert stat.S_IMODE((tmp_path / "a.json").stat().st_mode) == mode
+
+
+@pytest.mark.skipif(os.name == "nt", reason="Windows has no such rights")
+@pytest.mark.parametrize("mode", [0o600, 0o640, 0o444])
+def test_a_replaced_file_keeps_its_rights(tmp_path, mode):
+    """Patient data that nobody else may read stays so."""
+    path = tmp_path / "a.json"
+    path.write_text("old")
+    path.chmod(mode)
+    save_bytes(path, b"new")
+    assert path.read_text() == "new"
+    assert stat.S_IMODE(path.stat().st_mode) == mode
+
+
+@pytest.mark.skipif(not hasattr(os, "geteuid") or os.geteuid() != 0, reason="only root has every group")
+def test_a_replaced_file_keeps_its_group(tmp_path, monkeypatch):
+    path = tmp_path / "a.json"
+    path.write_text("old")
+    os.chown(path, -1, 12345)
+    path.chmod(0o660)
+    save_bytes(path, b"new")
+    assert (path.stat().st_gid, stat.S_IMODE(path.stat().st_mode)) == (12345, 0o660)
+
+    def refused(*_):
+        raise PermissionError(errno.EPERM, "Operation not permitted")
+
+    monkeypatch.setattr(os, "chown", refused)  # another group must not get what that one was allowed
+    save_bytes(path, b"newer")
+    assert path.stat().st_gid != 12345
+    assert stat.S_IMODE(path.stat().st_mode) == 0o600
+
+
+def test_a_file_is_on_the_disk_before_it_has_its_name(tmp_path, monkeypatch):
+    steps = []
+    real_sync, real_replace = os.fsync, os.replace
+    monkeypatch.setattr(os, "fsync", lambda handle: steps.append(stat.S_IFMT(os.fstat(handle).st_mode)))
+    monkeypatch.setattr(os, "replace", lambda *names: (steps.append("name"), real_replace(*names)))
+    save_bytes(tmp_path / "a.json", b"new")
+    assert steps == [stat.S_IFREG, "name", *([] if os.name == "nt" else [stat.S_IFDIR])]
+    assert real_sync is not os.fsync
+
+
+def test_an_error_names_the_file_and_a_full_disk_the_bytes(tmp_path, monkeypatch):
+    path = tmp_path / "mesh.vtu"
+
+    def full(*_):
+        raise OSError(errno.ENOSPC, "No space left on device")
+
+    monkeypatch.setattr(Path, "write_bytes", full)
+    words = r"cannot be written: No space left on device; it takes 3 bytes, \d+ are free"
+    with pytest.raises(OSError, match=words) as caught:
+        save_bytes(path, b"new")
+    assert caught.value.filename == str(path)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_space_is_asked_for(tmp_path):
+    check_space(tmp_path / "a.vtu", 1)
+    with pytest.raises(InputError, match=r"a.vtu: takes some 1000000000000 MB, \d+ MB are free; make room"):
+        check_space(tmp_path / "a.vtu", 10**18)
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names are of bytes on Linux alone")
+def test_text_of_names_that_are_not_utf_8_is_written(tmp_path):
+    name = os.fsdecode(b"caf\xe9")
+    save_text(tmp_path / f"{name}.html", f"of {name} Grösse")
+    assert (tmp_path / f"{name}.html").read_text(encoding="utf-8") == "of caf\\udce9 Grösse"
+    save_json(tmp_path / f"{name}.json", {name: Path(name)})
+    assert json.loads((tmp_path / f"{name}.json").read_text()) == {"caf\\udce9": "caf\\udce9"}
 
 
 # --------------------------------------------------------------------------------------------------

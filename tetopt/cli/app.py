@@ -10,10 +10,13 @@ from importlib import import_module
 from typing import Annotated, Any
 
 import typer
+from rich.markup import escape
 
 import tetopt
-from tetopt.cli.console import out, show_error, show_warning
+from tetopt.cli.console import error_words, log, open_streams, out, settle_streams, show_error, show_warning
+from tetopt.cli.ending import INTERRUPTED_CODE, signal_code, signals_heard
 from tetopt.errors import InputError
+from tetopt.io.files import Outputs, outputs_of_command
 
 # In the order of the help: the module that has NAME_command, and the first line of that function's docstring, which is
 # the command's help. It is here as well so that `tetopt --help` takes no second: only the command that runs is loaded.
@@ -62,26 +65,53 @@ COMMANDS = {
 
 
 def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command; the exit code: 0 done, 1 a promise of the mesh missed, 2 an input to mend, 130 Ctrl-C."""
-    with warnings.catch_warnings():
+    """Run the command; the exit code.
+
+    0: done; 1: a promise of the mesh is missed; 2: an input to mend, or an output that could not be written, standard
+    output among them; 130, 143 and 129: ended by Ctrl-C, SIGTERM and SIGHUP.
+    """
+    open_streams()
+    with warnings.catch_warnings(), outputs_of_command() as outputs, signals_heard():
         warnings.showwarning = show_warning
         logging.getLogger("matplotlib").setLevel(logging.ERROR)  # its font-cache notice is not the user's business
-        try:
-            arguments = list(sys.argv[1:] if argv is None else argv)
-            return _app(arguments)(args=arguments, obj=arguments, standalone_mode=False) or 0
-        except (InputError, OSError) as error:  # also a full disk, a folder that may not be written to
-            show_error(error)
-            return 2
-        except typer.Exit as ended:
-            return ended.exit_code
-        except (typer.Abort, KeyboardInterrupt):  # newer versions of typer return 130 themselves
-            return 130
-        except Exception as error:
-            if type(error).__module__.split(".")[0] not in ("click", "typer") or not hasattr(error, "format_message"):
-                raise
-            if error.format_message():  # empty after the help that a bare `tetopt` prints
-                show_error(f"{error.format_message()} (see --help)")
-            return 2
+        code = _run(list(sys.argv[1:] if argv is None else argv), outputs)
+    if reason := settle_streams():
+        show_error(f"standard output: cannot be written: {reason}; what was printed is incomplete")
+        code = code or 2
+    return code
+
+
+def _run(arguments: list[str], outputs: Outputs) -> int:
+    """Run the command; the exit code. What went wrong is said, and what was written in spite of it."""
+    try:
+        code = _app(arguments)(args=arguments, obj=arguments, standalone_mode=False) or 0
+        if code == INTERRUPTED_CODE:
+            _say_written(outputs)
+            return signal_code()
+        return code
+    except (InputError, OSError, MemoryError) as error:
+        show_error(error_words(error))
+        _say_written(outputs)
+        return 2
+    except typer.Exit as ended:
+        return ended.exit_code
+    except (typer.Abort, KeyboardInterrupt):  # newer versions of typer return 130 themselves
+        _say_written(outputs)
+        return signal_code()
+    except SystemExit:  # what typer and rich answer to a pipe that has closed, in which their help was to go
+        return 0
+    except Exception as error:
+        if type(error).__module__.split(".")[0] not in ("click", "typer") or not hasattr(error, "format_message"):
+            raise
+        if error.format_message():  # empty after the help that a bare `tetopt` prints
+            show_error(f"{error.format_message()} (see --help)")
+        return 2
+
+
+def _say_written(outputs: Outputs) -> None:
+    """The outputs that are there although the command ended early."""
+    if outputs.written:
+        log.print(escape(f"written all the same: {', '.join(map(str, outputs.written))}"))
 
 
 def _app(arguments: Sequence[str]) -> typer.Typer:

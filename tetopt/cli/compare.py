@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import shlex
-import signal
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
@@ -198,7 +197,6 @@ def compare_command(
     paths = checked_outputs(results_folder(output), compare_files.COMPARE_FILES, force or resume)
     if (output / "runs").is_dir() and not (resume or force):
         raise InputError(f"{output / 'runs'}: finished runs are there; --resume keeps them, --force starts over")
-    signal.signal(signal.SIGTERM, signal.default_int_handler)  # so that the child is ended with us
     try:
         report = compare_files.run(paths, comparison, lambda text: log.print(escape(text)), resume=resume)
     except KeyboardInterrupt:

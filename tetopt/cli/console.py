@@ -1,37 +1,129 @@
-"""What the commands say: `log` on standard error, `out`, the result, on standard output."""
+"""What the commands say: `log` on standard error, `out`, the result, on standard output. Neither ends a run."""
 
 from __future__ import annotations
 
+import errno
 import os
-from typing import Any
+import sys
+from contextlib import suppress
+from typing import IO, Any
 
 from rich.console import Console
 from rich.markup import escape
 from rich.table import Table
+from rich.text import Text
+
+from tetopt.io.text import plain
 
 WIDEST_TABLE = 500  # characters in a line
 
 
-class _Console(Console):
-    """A console that falls silent when the reader of its pipe has gone, and lets the command end in its own way."""
+class _Stream:
+    """A stream that takes what it can: letters that it has not as escapes, and nothing more once a write has failed."""
 
-    def on_broken_pipe(self) -> None:
-        self.quiet = True
-        os.dup2(os.open(os.devnull, os.O_WRONLY), self.file.fileno())
+    def __init__(self, stream: Any) -> None:
+        self._stream = stream
+
+    def __getattr__(self, name: str) -> Any:
+        return getattr(self._stream, name)
+
+    def write(self, text: str) -> int:
+        """Write, if it can be; the number of letters."""
+        encoding = getattr(self._stream, "encoding", None) or "utf-8"
+        self._try(lambda: self._stream.write(text.encode(encoding, "backslashreplace").decode(encoding)))
+        return len(text)
+
+    def flush(self) -> None:
+        """Flush, if it can be."""
+        self._try(self._stream.flush)
+
+    def _try(self, action: Any) -> None:
+        try:
+            action()
+        except OSError as error:  # full, or the reader of the pipe has gone
+            if error.errno != errno.EPIPE and self._stream is sys.stdout:
+                _unprinted.append(error.strerror or str(error))
+            _silence(self._stream)
+        except (ValueError, RuntimeError):  # closed; written to by what a signal has interrupted
+            pass
+
+
+_unprinted: list[str] = []  # why standard output has not taken what was printed
+
+
+def _silence(stream: Any) -> None:
+    """Let the rest of what goes to a stream, and what waits in its buffer, go nowhere."""
+    with suppress(OSError, ValueError, AttributeError):  # a stream of a program that has put its own in the place
+        number = stream.fileno()
+        null = os.open(os.devnull, os.O_WRONLY)
+        os.dup2(null, number)
+        os.close(null)
+
+
+class _Console(Console):
+    """A console that shows foreign control characters, and whose stream may be closed, full or gone."""
+
+    @property
+    def file(self) -> IO[str]:
+        """The stream, by whose failures nothing ends."""
+        stream: Any = super().file
+        return stream if isinstance(stream, _Stream) else _Stream(stream)  # type: ignore[return-value]
+
+    @file.setter
+    def file(self, new_file: IO[str]) -> None:
+        self._file = new_file
+
+    def render_str(self, text: str, **options: Any) -> Text:
+        """Text of a message or a table, in which names of files may hold anything."""
+        return super().render_str("\n".join(map(plain, text.split("\n"))), **options)
 
 
 log = _Console(stderr=True, highlight=False, soft_wrap=True, emoji=False)
 out = _Console(highlight=False, soft_wrap=True, emoji=False)
 
 
+def open_streams() -> None:
+    """Put the null device where standard input, output or error is closed.
+
+    Else the next file that is opened takes their number, and with it what libraries print.
+    """
+    for number in range(3):
+        try:
+            os.fstat(number)
+        except OSError:
+            os.set_inheritable(os.open(os.devnull, os.O_RDWR), True)  # it takes the lowest free number: this one
+    for name in ("stdout", "stderr"):
+        if getattr(sys, name) is None:
+            setattr(sys, name, open(os.devnull, "w", encoding="utf-8"))  # noqa: SIM115, as long as the process
+
+
+def settle_streams() -> str | None:
+    """Flush the streams, so that Python has nothing left to fail at its end; why standard output lost something."""
+    for stream in (sys.stdout, sys.stderr):
+        if stream is not None:
+            _Stream(stream).flush()
+    reason = _unprinted[0] if _unprinted else None
+    _unprinted.clear()
+    return reason
+
+
+def error_words(error: Exception) -> str:
+    """What went wrong: of a file with its name first, of memory with what was to be laid out."""
+    if isinstance(error, MemoryError):
+        return f"not enough memory: {error}".removesuffix(": ") + "; take fewer nodes, a part of the image or --max-gb"
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{os.fsdecode(error.filename)}: {error.strerror}"
+    return str(error)
+
+
 def show_error(message: object) -> None:
     """Say what is wrong, on one line."""
-    log.print(f"[bold red]tetopt:[/] {escape(str(message))}")
+    log.print(f"[bold red]tetopt:[/] {escape(plain(str(message)))}")
 
 
 def show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
     """Say a warning on one line; also in place of `warnings.showwarning`."""
-    log.print(f"[yellow]tetopt: warning:[/] {escape(str(message))}")
+    log.print(f"[yellow]tetopt: warning:[/] {escape(plain(str(message)))}")
 
 
 def print_fidelity(measured: dict[str, Any]) -> None:

@@ -13,7 +13,7 @@ from rich.markup import escape
 
 from tetopt import Image, InputError
 from tetopt.cli.console import log, out
-from tetopt.cli.inputs import check_no_input, image_and_others, read_mesh, warn_of_other_image
+from tetopt.cli.inputs import image_and_others, read_mesh, warn_of_other_image
 from tetopt.cli.options import ImagePart, MeshArgument, NumberOptions, SolverOptions, option
 from tetopt.cli.solver import (
     MATERIAL_FIELDS,
@@ -66,7 +66,6 @@ def convert_command(
     format_of(output)
     output = checked_output(output, tuple(FORMATS), numbers.force)
     json_path = numbers.checked()
-    check_no_input(output, mesh_path, image_path, mask_path, results_path)
     if results_path is not None and output.suffix.lower() not in RESULT_SUFFIXES:
         raise InputError(f"--results: expected OUT named {' or '.join(RESULT_SUFFIXES)}, got {output}")
     needs_image = {"--mask": mask_path, "--volume": part.volume, "--crop": part.crop, "--slice": part.slice_}

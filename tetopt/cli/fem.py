@@ -14,7 +14,7 @@ from rich.markup import escape
 
 from tetopt import Image, InputError
 from tetopt.cli.console import log, print_wide
-from tetopt.cli.inputs import check_no_input, read_image, read_mesh, warn_of_other_image
+from tetopt.cli.inputs import read_image, read_mesh, warn_of_other_image
 from tetopt.cli.options import ImagePart, ModelOptions, NumberOptions, option
 from tetopt.cli.solver import (
     check_model_options,
@@ -87,7 +87,6 @@ def fem_command(
     json_path = numbers.checked()
     if output is not None:
         output = checked_output(output, (".vtu", ".vtk"), numbers.force)
-        check_no_input(output, mesh_path, image_path)
     if image_path is not None:
         model = replace(model, young=model.young or INTENSITY_LAW, average=model.average or DEFAULT_AVERAGE)
     if output is None and model.written_sets is not None:

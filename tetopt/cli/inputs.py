@@ -133,13 +133,6 @@ def warn_of_other_image(loaded: MeshFile, mesh_path: Path, image_path: Path) -> 
     return is_other
 
 
-def check_no_input(output: Path, *inputs: Path | None) -> None:
-    """InputError if the output, which --force may replace, is one of the inputs."""
-    for path in inputs:
-        if path is not None and output.exists() and path.exists() and output.samefile(path):
-            raise InputError(f"{output}: is an input of this command too; write somewhere else")
-
-
 def results_folder(path: Path) -> Path:
     """`path`, made if it is not there."""
     if path.exists() and not path.is_dir():

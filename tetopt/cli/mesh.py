@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import time
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -14,6 +15,7 @@ from rich.markup import escape
 import tetopt
 from tetopt import Image, InputError, Mesh
 from tetopt.cli.console import log, out, print_fidelity, show_warning
+from tetopt.cli.ending import is_ended, mesh_kept, signal_code
 from tetopt.cli.inputs import label_table, read_mesh, results_folder, set_threads
 from tetopt.cli.options import (
     DEFAULT_NODES,
@@ -44,7 +46,7 @@ from tetopt.engine.meshing import Run, mesh_image
 from tetopt.geometry.box import box_sides
 from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import centroids, squared_edges
-from tetopt.io.files import save_json
+from tetopt.io.files import TakenError, save_json
 from tetopt.io.formats import format_of
 from tetopt.io.meshes import MeshFile
 from tetopt.io.mni import mni_path
@@ -79,7 +81,6 @@ class Outcome(NamedTuple):
 
     result: Optimized
     initial: Mesh
-    is_interrupted: bool  # by Ctrl-C
     seconds: dict[str, float]  # up to the optimisation, and of it
     shapes: tuple[Quality, Quality]  # of the initial mesh and of the result
 
@@ -97,9 +98,11 @@ def mesh_command(
     plan = planned(source, sizes, start, engine, solver, output)
     set_threads(engine.threads)
     task = _read(plan)
-    outcome = _run(task, begin)
-    model, measured = _write(task, outcome, begin)
-    return _print(task, outcome, model, measured)
+    with mesh_kept() as begin_keeping:
+        outcome = _run(task, begin, begin_keeping)
+        model, measured = _write(task, outcome, begin)
+        code = _print(task, outcome, model, measured)
+        return signal_code() if is_ended() else code
 
 
 def _read(plan: Plan) -> Task:
@@ -130,13 +133,12 @@ def _check_place(mesh: Mesh, image: Image, path: str) -> None:
         show_warning(f"{path}: {np.mean(~is_in):.1%} of its cells lie beside the image, where it has no say")
 
 
-def _run(task: Task, begin: float) -> Outcome:
+def _run(task: Task, begin: float, begin_keeping: Callable[[], None]) -> Outcome:
     """The optimised mesh; a target error takes several runs, one after the other."""
     plan, content = task.plan, task.source.content
     solver, output, options = plan.solver, plan.output.mesh, plan.engine_options()
     ends = None if plan.engine.max_seconds is None else begin + plan.engine.max_seconds
     begun: list[float] = []
-    interrupted: list[bool] = []
 
     def watch(initial: Mesh, run: Run) -> Optimized:
         if not begun and (solver.are_any() or output.suffix.lower() != ".vtu"):
@@ -147,9 +149,8 @@ def _run(task: Task, begin: float) -> Outcome:
         begun.append(time.perf_counter())
         log.print(escape(_described(task, initial)))
         prepare(content, options["k_D"], plan.mode)
-        result, is_interrupted = watched_run(run, initial, options["iterations"], ends)
-        interrupted.append(is_interrupted)
-        return result
+        begin_keeping()
+        return watched_run(run, initial, options["iterations"], ends)
 
     kind = plan.kind(content.image.ndim) if plan.mode in ("uniform", "paper") else None
     start = None if task.started is None else task.started.mesh
@@ -160,7 +161,7 @@ def _run(task: Task, begin: float) -> Outcome:
     assert result.initial is not None
     seconds = {"load": begun[0] - begin, "optimize": time.perf_counter() - begun[0]}
     first, last = (quality(each.points, each.cells) for each in (result.initial, result.mesh))
-    return Outcome(result, result.initial, any(interrupted), seconds, (first, last))
+    return Outcome(result, result.initial, seconds, (first, last))
 
 
 def _described(task: Task, initial: Mesh) -> str:
@@ -211,9 +212,15 @@ def _write(task: Task, outcome: Outcome, begin: float) -> tuple[Model, dict[str,
     try:
         model = with_chosen_sets(_model(task, result.mesh, solver, about, labels=result.labels), output.mesh, solver)
         save_for_solver(output.mesh, model, solver)
-    except InputError as error:  # hours may have gone into the mesh
-        bare = _model(task, result.mesh, SolverOptions(), about, is_told=False, labels=result.labels)
-        raise save_anyway(output.mesh, bare, error) from error
+    except TakenError:  # it is kept beside its name
+        raise
+    except Exception as error:  # hours may have gone into the mesh
+
+        def bare() -> Model:
+            return _model(task, result.mesh, SolverOptions(), about, is_told=False, labels=result.labels)
+
+        save_anyway(output.mesh, result.mesh, bare, error)
+        raise
     measured = fidelity(source.labels, source.mask, result.mesh, model.cell_data.get("label"))
     if not source.content.is_plain or source.content.region is not None:
         measured["contrasts"] = source.by_contrast(model.cell_data)
@@ -275,7 +282,7 @@ def _print(task: Task, outcome: Outcome, model: Model, measured: dict[str, Any])
         out.print(escape(f"{output.json_path}: every number of the run"))
     for path in plan.pictures:
         out.print(escape(str(path)))
-    return 130 if outcome.is_interrupted else code
+    return code
 
 
 def _print_comparison(content: Content, outcome: Outcome, start: str, order: int) -> None:

@@ -28,7 +28,7 @@ from tetopt.engine.loop import (
     Boundary,
 )
 from tetopt.engine.paper import Retessellate
-from tetopt.io.files import checked_output
+from tetopt.io.files import checked_output, name_files
 from tetopt.io.formats import FORMATS
 from tetopt.model.averages import DEFAULT_AVERAGE
 from tetopt.model.materials import DEFAULT_NU
@@ -357,6 +357,7 @@ def from_records(command: Callable[..., int]) -> Callable[..., int]:
 
     @wraps(command)
     def called(**values: Any) -> int:
+        name_files(values.values())
         return command(**{name: _of_values(kinds[name], name, values) for name in defaults})
 
     parameters = [each for name, default in defaults.items() for each in _parameters(name, kinds[name], default)]

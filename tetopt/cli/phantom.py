@@ -8,7 +8,7 @@ from typing import Annotated
 import typer
 from rich.markup import escape
 
-from tetopt import InputError, load_phantom, save_image
+from tetopt import load_phantom, save_image
 from tetopt.cli.console import out
 from tetopt.cli.options import ForceOption, option
 from tetopt.io.files import checked_output
@@ -29,8 +29,6 @@ def phantom_command(
     output = checked_output(output, suffixes, force)
     if labels is not None:
         labels = checked_output(labels, suffixes, force)
-        if labels.resolve() == output.resolve():
-            raise InputError(f"{labels}: --labels and --output name the same file")
     phantom = load_phantom(name)
     image = phantom.image(voxel_mm=voxel_mm, blur_mm=blur_mm, noise_sd=noise_sd, seed=seed)
     save_image(output, image)

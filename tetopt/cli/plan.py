@@ -10,7 +10,7 @@ import numpy as np
 
 import tetopt
 from tetopt import InputError
-from tetopt.cli.inputs import check_no_input, checked_outputs, read_companion
+from tetopt.cli.inputs import checked_outputs, read_companion
 from tetopt.cli.options import (
     DEFAULT_NODES,
     EngineOptions,
@@ -92,8 +92,6 @@ def planned(
     if output.json_path is not None:
         checked_output(output.json_path, (".json",), output.force)
     mode = _mode(source, sizes, start, engine)
-    if start.start is not None:
-        check_no_input(output.mesh, start.start)
     for name in ("size_min", "size_max", "edge_max", "gradation", "sizing", "target_error"):
         if mode != "graded" and getattr(sizes, name) is not None:
             raise InputError(

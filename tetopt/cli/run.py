@@ -1,17 +1,16 @@
-"""One optimisation as a terminal shows it: kernels made ready, progress, Ctrl-C and the clock."""
+"""One optimisation as a terminal shows it: kernels made ready, progress and the clock."""
 
 from __future__ import annotations
 
 import contextlib
-import signal
 import time
 from collections.abc import Callable, Iterator
-from types import FrameType
 
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
 from tetopt import Mesh
 from tetopt.cli.console import log
+from tetopt.cli.ending import is_ended
 from tetopt.engine.fast import prepare_kernels
 from tetopt.engine.loop import Optimized, Record
 from tetopt.engine.meshing import Mode, Run
@@ -20,12 +19,11 @@ from tetopt.target.content import Content
 LONG_SECONDS = 3.0  # to make the kernels ready: they were compiled then, not loaded
 
 
-def watched_run(run: Run, initial: Mesh, iterations: int, ends: float | None) -> tuple[Optimized, bool]:
-    """A run with progress shown, ended in good order at a time or by Ctrl-C; whether by that."""
+def watched_run(run: Run, initial: Mesh, iterations: int, ends: float | None) -> Optimized:
+    """A run with progress shown, ended in good order at a time or by a signal (`tetopt.cli.ending.is_ended`)."""
     max_seconds = None if ends is None else max(ends - time.perf_counter(), 1e-9)
-    with _graceful_interrupt() as is_interrupted, _progress(iterations) as show:
-        result = run(max_seconds=max_seconds, callback=show, stop=is_interrupted)
-        was_interrupted = is_interrupted()
+    with _progress(iterations) as show:
+        result = run(max_seconds=max_seconds, callback=show, stop=is_ended)
     if iterations == 0:  # the initial mesh itself, not its nodes put on the sampling grid
         result = result._replace(mesh=initial)
     if result.ended != "iterations":
@@ -35,7 +33,7 @@ def watched_run(run: Run, initial: Mesh, iterations: int, ends: float | None) ->
             "stopped": "interrupted: the mesh so far is kept",
         }
         log.print(f"{words[result.ended]} (iteration {result.history[-1].iteration} of {iterations})")
-    return result, was_interrupted
+    return result
 
 
 def prepare(content: Content, k_D: float, mode: Mode) -> None:
@@ -46,29 +44,6 @@ def prepare(content: Content, k_D: float, mode: Mode) -> None:
     seconds = time.perf_counter() - begin
     if seconds > LONG_SECONDS:
         log.print(f"kernels compiled in {seconds:.0f} s; later runs on images of this kind load them from the cache")
-
-
-@contextlib.contextmanager
-def _graceful_interrupt() -> Iterator[Callable[[], bool]]:
-    """The first Ctrl-C only raises a flag, which the returned function tells; the second ends the program."""
-    pressed: list[int] = []
-
-    def on_interrupt(number: int, frame: FrameType | None) -> None:
-        if pressed:
-            log.print("interrupted again: no mesh is written")
-            raise KeyboardInterrupt
-        pressed.append(number)
-        log.print("interrupted: finishing the current nodes, then writing the mesh (again to give up)")
-
-    try:
-        before = signal.signal(signal.SIGINT, on_interrupt)
-    except ValueError:  # not in the main thread, where signals do not arrive either
-        yield lambda: False
-        return
-    try:
-        yield lambda: bool(pressed)
-    finally:
-        signal.signal(signal.SIGINT, before)
 
 
 @contextlib.contextmanager

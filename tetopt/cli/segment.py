@@ -12,7 +12,7 @@ from rich.markup import escape
 import tetopt
 from tetopt import Image, InputError, Mesh, save_image
 from tetopt.cli.console import out, show_warning
-from tetopt.cli.inputs import check_no_input, read_image, read_labels, read_mesh, warn_of_other_image
+from tetopt.cli.inputs import read_image, read_labels, read_mesh, warn_of_other_image
 from tetopt.cli.options import ImageArgument, ImagePart, NumberOptions, option
 from tetopt.io.files import checked_output, save_json
 from tetopt.report.tables import new_table
@@ -34,7 +34,6 @@ def segment_command(
     from tetopt.measure.segmentation import dice, segmented, stands_for, thresholded
 
     output = checked_output(output, (".nii", ".nii.gz"), numbers.force)
-    check_no_input(output, image_path, truth_path)
     json_path = numbers.checked()
     image = read_image(image_path, part)
     truth = None if truth_path is None else read_labels(truth_path, image, part)

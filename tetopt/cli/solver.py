@@ -6,7 +6,6 @@ import json
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
-from itertools import chain, count
 from pathlib import Path
 from typing import Any, cast, get_args
 
@@ -15,10 +14,11 @@ from numpy.typing import NDArray
 from rich.markup import escape
 
 import tetopt
-from tetopt import Image, InputError, Mesh
-from tetopt.cli.console import log, out, print_wide, show_warning
+from tetopt import Image, InputError, Mesh, save_mesh
+from tetopt.cli.console import error_words, log, out, print_wide, show_warning
 from tetopt.cli.inputs import label_table
 from tetopt.cli.options import ModelOptions, SolverOptions
+from tetopt.io.files import kept_places
 from tetopt.io.formats import FORMATS, file_bytes, format_of, save_model
 from tetopt.io.meshes import MeshFile
 from tetopt.model.averages import DEFAULT_AVERAGE, parse_average
@@ -368,12 +368,34 @@ def save_for_solver(output: Path, model: Model, solver: SolverOptions) -> None:
     save_model(output, model, space=solver.space, units=solver.units)
 
 
-def save_anyway(output: Path, model: Model, error: InputError) -> InputError:
-    """Keep an optimised mesh whose model was refused, as VTU; the error to raise, which says where it is."""
-    names = chain([output.stem], (f"{output.stem}_optimised_{number}" for number in count(1)))
-    kept = next(path for name in names if not (path := output.with_name(f"{name}.vtu")).exists())
-    save_model(kept, model)
-    return InputError(f"{error}; the optimised mesh is in {kept}: go on from there with tetopt convert")
+def save_anyway(output: Path, mesh: Mesh, build: Callable[[], Model], error: Exception) -> None:
+    """Keep an optimised mesh whose file was refused or failed, as VTU: beside it, else in a temporary folder.
+
+    `build` makes the model to keep; if that fails, too, the mesh is kept alone.
+
+    Raises
+    ------
+    InputError
+        If `error` is one that the user can mend; it says where the mesh is.
+    """
+    kept = _kept_mesh(output, (lambda path: save_model(path, build()), lambda path: save_mesh(path, mesh)))
+    where = "could not be kept anywhere" if kept is None else f"is in {kept}: go on from there with tetopt convert"
+    if isinstance(error, InputError | OSError | MemoryError):
+        raise InputError(f"{error_words(error)}; the optimised mesh {where}") from error
+    log.print(escape(f"the optimised mesh {where}"))
+
+
+def _kept_mesh(output: Path, ways: Sequence[Callable[[Path], None]]) -> Path | None:
+    """The first place where one of the ways to save a mesh does so."""
+    for path in kept_places(output, ".vtu"):
+        for save in ways:
+            try:
+                save(path)
+            except Exception as error:  # told; what ended the run before is raised in the end
+                log.print(escape(f"{path}: the optimised mesh cannot be kept here: {error_words(error)}"))
+            else:
+                return path
+    return None
 
 
 def print_model(output: Path, model: Model, solver: SolverOptions) -> None:

@@ -11,7 +11,7 @@ from rich.markup import escape
 
 from tetopt import InputError
 from tetopt.cli.console import log, out, show_error, show_warning
-from tetopt.cli.inputs import cell_field, check_no_input, label_table, read_mesh
+from tetopt.cli.inputs import cell_field, label_table, read_mesh
 from tetopt.cli.options import MeshArgument, NumberOptions, SurfacePart, option
 from tetopt.geometry.manifold import OUTSIDE_LABEL, LabelSurfaces, label_surfaces, surface_ridges
 from tetopt.geometry.simplex import volumes
@@ -38,7 +38,6 @@ def surface_command(
     """Write the boundary of a structure in a mesh, watertight, or interfaces of its labels; print volume and area."""
     output = checked_output(output, SURFACE_SUFFIXES, numbers.force)
     json_path = numbers.checked()
-    check_no_input(output, mesh_path)
     _check_part(part, output)
     loaded = read_mesh(mesh_path)
     if loaded.mesh.ndim != 3:

@@ -13,7 +13,7 @@ from rich.markup import escape
 
 from tetopt import InputError
 from tetopt.cli.console import out
-from tetopt.cli.inputs import check_no_input, label_table, read_image, read_mesh, warn_of_other_image
+from tetopt.cli.inputs import label_table, read_image, read_mesh, warn_of_other_image
 from tetopt.cli.options import BoxPart, ForceOption, LabelNamesOption, option
 from tetopt.cli.solver import all_sets
 from tetopt.io.files import checked_output
@@ -37,7 +37,6 @@ def view_command(
     """
     if html is not None:
         html = checked_output(html, (".html",), force)
-        check_no_input(html, mesh_path, image_path)
     loaded = read_mesh(mesh_path)
     mesh, fields = loaded.mesh, dict(loaded.cell_data)
     image = None

@@ -9,7 +9,7 @@ from typing import NamedTuple
 from tetopt.errors import InputError
 from tetopt.io.abaqus import abaqus
 from tetopt.io.febio import febio
-from tetopt.io.files import written_whole
+from tetopt.io.files import save_bytes
 from tetopt.io.gmsh import gmsh22, gmsh41
 from tetopt.io.medit import medit
 from tetopt.io.mfem import mfem
@@ -84,9 +84,7 @@ def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str
         An unknown suffix, or what the format cannot carry.
     """
     path = Path(path)
-    whole = file_bytes(path, model, space=space, units=units)
-    with written_whole(path) as temporary:
-        temporary.write_bytes(whole)
+    save_bytes(path, file_bytes(path, model, space=space, units=units))
 
 
 def file_bytes(path: Path, model: Model, *, space: str = "ras", units: str = "kPa") -> bytes:

@@ -13,7 +13,7 @@ from tetopt.errors import InputError
 from tetopt.geometry.quadratic import numbered_edges
 from tetopt.geometry.simplex import oriented
 from tetopt.incoming import regular_file
-from tetopt.io.files import written_whole
+from tetopt.io.files import save_bytes
 from tetopt.io.raw import CELL_DIMENSIONS, CORNER_KINDS, Raw, by_corners
 from tetopt.io.read_gmsh import read_msh
 from tetopt.io.read_vtk import Grid, read_vtk
@@ -76,8 +76,7 @@ def save_mesh(
     """
     grid = to_vtk(mesh, cell_data, point_data, order)
     add_texts(grid, about or {})
-    with written_whole(Path(path)) as temporary:
-        temporary.write_bytes(vtu_bytes(grid))
+    save_bytes(path, vtu_bytes(grid))
 
 
 def load_mesh(path: str | Path) -> MeshFile:

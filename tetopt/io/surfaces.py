@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.geometry.surface import Surface, surface_of
-from tetopt.io.files import written_whole
+from tetopt.io.files import save_bytes
 from tetopt.io.vtk import LEGACY_VERSION
 from tetopt.model.model import Model, half_turn
 
@@ -69,8 +69,7 @@ def save_surface(
     if space == "lps":
         surface = surface._replace(points=half_turn(surface.points))
     whole = writers[path.suffix.lower()](surface, about, space, labels or {})
-    with written_whole(path) as temporary:
-        temporary.write_bytes(whole)
+    save_bytes(path, whole)
 
 
 def boundary_stl(model: Model) -> bytes:

@@ -179,7 +179,7 @@ def add_texts(grid: vtkUnstructuredGrid, texts: dict[str, Any]) -> None:
     """Each entry as field data, as JSON unless it is a string already."""
     for name, value in texts.items():
         text = value if isinstance(value, str) else json.dumps(value)
-        _add(grid.GetFieldData(), name, np.frombuffer(text.encode(), dtype=np.uint8))
+        _add(grid.GetFieldData(), name, np.frombuffer(text.encode("utf-8", "backslashreplace"), dtype=np.uint8))
 
 
 def add_sets(grid: vtkUnstructuredGrid, mesh: Mesh, sets: Sets) -> None:

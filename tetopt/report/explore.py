@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from tetopt.fem.reference import averaged
 from tetopt.geometry.box import box_sides
 from tetopt.image import Image
-from tetopt.io.files import written_whole
+from tetopt.io.files import save_text
 from tetopt.report.colours import grey_limits
 from tetopt.report.exhibit import COLOUR_MAP, LABEL_FIELD, NO_VALUE, Exhibit, Field, first_axis, warp_factors
 from tetopt.report.page import data_html, packed, script_html
@@ -38,9 +38,7 @@ def save_explorer(path: str | Path, shown: Exhibit) -> None:
 
     Replaces an existing file; ask `tetopt.io.files.checked_output` first.
     """
-    page = explorer_html(shown)
-    with written_whole(Path(path)) as temporary:
-        temporary.write_text(page, encoding="utf-8")
+    save_text(path, explorer_html(shown))
 
 
 def explorer_html(shown: Exhibit) -> str:

@@ -13,7 +13,7 @@ from typing import Any
 
 from numpy.typing import NDArray
 
-from tetopt.io.files import written_whole
+from tetopt.io.files import save_text
 
 BROAD_RATIO = 1.4  # A picture wider than this many times its height keeps a readable width on a phone, and scrolls.
 
@@ -39,8 +39,7 @@ def write_page(path: Path, title: str, parts: Sequence[str], style: str = "") ->
     network access (Content-Security-Policy), so that a reference that slipped in is not followed.
     """
     head = _HEAD.replace("STYLE", style).replace("TITLE", html.escape(title))
-    with written_whole(path) as temporary:
-        temporary.write_text("\n".join([head, *parts, "</main></body></html>\n"]), encoding="utf-8")
+    save_text(path, "\n".join([head, *parts, "</main></body></html>\n"]))
 
 
 def section_html(title: str, parts: Sequence[str]) -> str:
