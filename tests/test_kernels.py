@@ -12,7 +12,7 @@ import numba
 import numpy as np
 import pytest
 
-from tetopt import cache, kernels
+from tetopt import cache, kernel_cache, kernels
 from tetopt.kernels import (
     Bools1,
     Floats1,
@@ -219,14 +219,16 @@ def test_the_cache_knows_all_sources(monkeypatch):
 @pytest.fixture
 def place(monkeypatch):
     cache.place_cache.cache_clear()
+    monkeypatch.setattr(numba.config, "CACHE_DIR", numba.config.CACHE_DIR)
     yield cache.place_cache
     cache.place_cache.cache_clear()
 
 
 def test_a_cache_that_can_be_written_is_left_alone(place, monkeypatch, tmp_path):
-    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "not" / "yet"))
-    assert place() is None
-    assert os.environ["NUMBA_CACHE_DIR"] == str(tmp_path / "not" / "yet")
+    folder = tmp_path / "not" / "yet"
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(folder))
+    assert place() == (folder, None)
+    assert os.environ["NUMBA_CACHE_DIR"] == str(folder)
 
 
 @pytest.mark.parametrize("is_chosen", [False, True])
@@ -240,13 +242,231 @@ def test_without_a_folder_kernels_are_kept_for_one_run(place, monkeypatch, tmp_p
         monkeypatch.setenv("NUMBA_CACHE_DIR", "")  # not `delenv`: what is set meanwhile has to go again
         monkeypatch.setattr(cache, "__file__", str(tmp_path / "file" / "cache.py"))
         monkeypatch.setattr(cache, "_user_cache", lambda: tmp_path / "file")
-    monkeypatch.setattr(numba.config, "CACHE_DIR", numba.config.CACHE_DIR)
-    notice = place()
-    assert "compiled anew in each run" in notice
+    folder, notice = place()
+    assert "compiled anew in each run, half a minute" in notice
     assert (chosen if is_chosen else "__pycache__") in notice
     assert "set NUMBA_CACHE_DIR" in notice
     assert "\n" not in notice
-    folder = os.environ["NUMBA_CACHE_DIR"]
-    assert folder != chosen
-    assert os.path.isdir(folder)
+    assert os.environ["NUMBA_CACHE_DIR"] == str(folder) != chosen
     os.rmdir(folder)
+
+
+def test_with_nowhere_to_write_nothing_is_kept(place, monkeypatch, tmp_path):
+    (tmp_path / "file").touch()
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path / "file" / "kernels"))
+
+    def refuse(**_):
+        raise FileNotFoundError("no usable temporary directory")
+
+    monkeypatch.setattr(cache.tempfile, "mkdtemp", refuse)
+    folder, notice = place()
+    assert folder is None
+    assert "compiled anew in each run, a minute" in notice
+    assert type(kernel_cache.cache_of(row_sum)).__name__ == "NullCache"
+
+
+@pytest.mark.skipif(os.name != "posix", reason="rights of folders")
+def test_a_folder_that_everybody_may_write_is_no_cache(place, monkeypatch, tmp_path):
+    """What numba reads there is code."""
+    tmp_path.chmod(0o777)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    folder, notice = place()
+    assert f"{tmp_path} can be written by everybody" in notice
+    assert folder != tmp_path
+    os.rmdir(folder)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", "")
+    monkeypatch.setattr(cache, "__file__", str(tmp_path / "cache.py"))
+    (tmp_path / "__pycache__").mkdir()
+    (tmp_path / "__pycache__").chmod(0o777)
+    monkeypatch.setattr(cache, "_user_cache", lambda: tmp_path / "own")
+    place.cache_clear()
+    mask = os.umask(0)
+    try:
+        assert place() == (tmp_path / "own" / "numba", None)
+    finally:
+        os.umask(mask)
+    assert (tmp_path / "own" / "numba").stat().st_mode & 0o777 == 0o755
+    assert os.environ["NUMBA_CACHE_DIR"] == str(tmp_path / "own" / "numba")
+
+
+# What the cache holds, or cannot take.
+
+USE = """
+import sys, warnings
+warnings.showwarning = lambda message, *_: print("warned:", message)
+import numpy as np
+import some_kernels as k
+from tetopt import kernels
+kernels._compile_apart = lambda *_: None  # what is compiled is compiled here
+{before}
+kernels.link([k.step_2])
+print(k.step_2(k.Row(np.ones(3)), 2), k.plain(2.0), [f.was_cached for f in (k.step_0, k.step_1, k.step_2)])
+"""
+PLAIN = """
+from tetopt.kernel_cache import njit
+
+@njit(cache=True)
+def plain(x):
+    return x + 1.0
+"""
+
+
+@pytest.fixture
+def use(tmp_path):
+    """A function that uses four kernels in a process of its own, after some statements; what that said."""
+    units = [UNIT.format(n, f"step_{n - 1}(row, i)" if n else "0.0") for n in range(3)]
+    (tmp_path / "some_kernels.py").write_text(MODULE + "".join(units) + PLAIN)
+    environment = os.environ | {
+        "NUMBA_CACHE_DIR": str(tmp_path / "cache"),
+        "PYTHONPATH": os.pathsep.join([str(tmp_path), *filter(None, sys.path)]),
+    }
+
+    def used(before=""):
+        program = [sys.executable, "-c", USE.format(before=before)]
+        return subprocess.run(
+            program, env=environment, capture_output=True, text=True, check=True, cwd=tmp_path
+        ).stdout.splitlines()
+
+    used.folder = tmp_path / "cache"
+    return used
+
+
+COMPILED, LOADED = "6.0 3.0 [False, False, False]", "6.0 3.0 [True, True, True]"
+
+
+def flipped(content):
+    middle = len(content) // 2
+    return content[:middle] + bytes([content[middle] ^ 1]) + content[middle + 1 :]
+
+
+DAMAGES = {
+    "empty": lambda content: b"",
+    "truncated": lambda content: content[: len(content) // 2],
+    "of one bit": flipped,
+    "of a byte at the end": lambda content: content[:-1],
+    "zeros": lambda content: bytes(len(content)),
+    "no pickle": lambda content: b"cos\nsystem\n(S'exit 3'\ntR.",
+}
+
+
+@compiled_only
+def test_damaged_files_of_the_cache_are_compiled_anew(use):
+    """An index or code, of a unit or of a function of numba's own: said once, mended, and the numbers are right."""
+    assert use() == [COMPILED]
+    assert use() == [LOADED]
+    for first, suffix in enumerate(("nbi", "nbc")):
+        paths = sorted(use.folder.rglob(f"*.{suffix}"))
+        assert len(paths) == 4 + first  # one is called from Python, too
+        for path, damage in zip(paths, list(DAMAGES.values())[first:], strict=False):
+            path.write_bytes(damage(path.read_bytes()))
+        said = use()
+        assert said[-1] == COMPILED
+        assert len(said) == 2
+        assert said[0].startswith("warned: damaged files in the cache of kernels")
+        assert use() == [LOADED]
+
+
+@compiled_only
+def test_code_under_the_name_of_other_code_is_not_run(use):
+    """Two processes that write an index at once may give one name to two compilations."""
+    assert use() == [COMPILED]
+    one, two = sorted(use.folder.rglob("*step_[01]*.nbc"))
+    one.write_bytes(two.read_bytes())
+    assert use() == ["6.0 3.0 [False, True, True]"]
+
+
+@compiled_only
+def test_a_full_disk_or_no_folder_keeps_nothing(use):
+    said = use("import resource; resource.setrlimit(resource.RLIMIT_FSIZE, (100, 100))")
+    assert said[-1] == COMPILED
+    assert len(said) == 2
+    assert "cannot be kept" in said[0]
+    assert not list(use.folder.rglob("*.tmp*"))
+    gone = "import shutil; shutil.rmtree({0!r}); open({0!r}, 'w').close()"
+    said = use(gone.format(str(use.folder)))
+    assert said[-1] == COMPILED
+    assert len(said) == 2
+    assert "no longer be written" in said[0] or "cannot be kept" in said[0]
+
+
+@compiled_only
+def test_a_cache_that_goes_while_it_is_used_is_made_again(use):
+    assert use() == [COMPILED]
+    said = use(f"k.step_0.link(); import shutil; shutil.rmtree({str(use.folder)!r})")
+    assert said == ["6.0 3.0 [True, False, False]"]
+
+
+@compiled_only
+def test_what_another_run_compiles_is_waited_for(tmp_path, monkeypatch):
+    """Else two first runs at once compile everything twice."""
+    pytest.importorskip("fcntl")
+    words, clock = [], [0.0]
+    with (tmp_path / "compiling.lock").open("ab") as other:
+        kernels.fcntl.flock(other, kernels.fcntl.LOCK_EX)
+
+        def sleep(seconds):
+            clock[0] += 1
+            if clock[0] == 3:
+                kernels.fcntl.flock(other, kernels.fcntl.LOCK_UN)
+
+        monkeypatch.setattr(kernels.time, "sleep", sleep)
+        with kernels._only_compiler(tmp_path, words.append) as has_waited:
+            assert has_waited
+    assert words == ["waiting for another run, which compiles the kernels"] * 3
+    with kernels._only_compiler(tmp_path, words.append) as has_waited:
+        assert not has_waited
+    with kernels._only_compiler(tmp_path / "none", words.append) as has_waited:
+        assert not has_waited
+
+
+# Memory.
+
+LARGE_UNIT = """
+from __future__ import annotations
+import sys
+from typing import NamedTuple
+import numpy as np
+from tetopt import kernels
+from tetopt.kernels import Floats1, entry, run, unit
+
+class Row(NamedTuple):
+    x: Floats1
+    n: int
+
+@unit
+def large(row: Row, i: int) -> None:
+    more = np.ones(row.n)
+    row.x[i] = more[i]
+
+@entry
+def over_it(row: Row) -> float:
+    large(row, 0)
+    return row.x[0]
+"""
+
+
+@compiled_only
+def test_a_unit_that_finds_no_memory_says_so(tmp_path, monkeypatch):
+    """numba would print it and go on."""
+    (tmp_path / "large_unit.py").write_text(LARGE_UNIT)
+    monkeypatch.syspath_prepend(tmp_path)
+    monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
+    from large_unit import Row, large, over_it  # type: ignore[import-not-found]
+
+    hook = sys.unraisablehook
+    row = Row(np.zeros(4), 1 << 45)  # more than addresses there are
+    with pytest.raises(MemoryError):
+        over_it(row)
+    with pytest.raises(MemoryError):
+        run(large, 4, row)
+    assert sys.unraisablehook is hook
+    assert over_it(row._replace(n=4)) == 1.0
+
+
+@compiled_only
+def test_kernels_are_not_begun_without_memory_for_their_arrays(monkeypatch):
+    monkeypatch.setattr(kernels, "address_room", lambda: kernels.UNIT_BYTES - 1)
+    with pytest.raises(MemoryError, match="are left for kernels"):
+        all_sums(whole(), 7)
+    monkeypatch.setattr(kernels, "address_room", lambda: kernels.UNIT_BYTES)
+    all_sums(whole(), 7)

@@ -3,39 +3,65 @@
 from __future__ import annotations
 
 import atexit
+import contextlib
 import os
 import shutil
+import stat
 import sys
 import tempfile
 from functools import cache
 from pathlib import Path
+from typing import NamedTuple
+
+FOLDER_MODE = 0o755  # of folders made here, whatever the mask: only their owner may write
+
+
+class Place(NamedTuple):
+    """Where numba keeps what it compiles."""
+
+    folder: Path | None  # None: nowhere
+    notice: str | None  # what to tell the user, if it is not kept for later runs
 
 
 @cache
-def place_cache() -> str | None:
-    """See to it that numba finds a folder for its cache; what to tell the user if that is only a temporary one.
+def place_cache() -> Place:
+    """See to it that numba finds a folder for its cache, at least a temporary one.
 
-    numba refuses to load a function whose result it cannot keep anywhere. It looks in NUMBA_CACHE_DIR, else beside the
-    source, else in the user's cache folder.
+    numba looks in NUMBA_CACHE_DIR, else beside the source, else in the user's cache folder. What it reads there is
+    code that it runs: a folder that everybody may write is not used, whoever it belongs to.
     """
     chosen = os.environ.get("NUMBA_CACHE_DIR")
     folders = [Path(chosen)] if chosen else [Path(__file__).parent / "__pycache__", _user_cache() / "numba"]
-    if any(_can_be_written(folder) for folder in folders):
-        return None
-    temporary = tempfile.mkdtemp(prefix="tetopt-kernels-")
-    atexit.register(shutil.rmtree, temporary, ignore_errors=True)
-    os.environ["NUMBA_CACHE_DIR"] = temporary
-    if "numba" in sys.modules:
-        sys.modules["numba"].config.CACHE_DIR = temporary
-    return (
-        f"kernels are compiled anew in each run, half a minute: {' and '.join(map(str, folders))} cannot be written; "
-        "set NUMBA_CACHE_DIR to a folder that can"
+    refusals = [(folder, _refusal(folder)) for folder in folders]
+    usable = [folder for folder, refusal in refusals if refusal is None]
+    if usable:
+        if not chosen and usable[0] != folders[0]:
+            _point_numba_to(usable[0])
+        return Place(usable[0], None)
+    temporary = None
+    with contextlib.suppress(OSError):  # there is nowhere to write at all
+        temporary = Path(tempfile.mkdtemp(prefix="tetopt-kernels-"))
+    if temporary is not None:
+        atexit.register(shutil.rmtree, temporary, ignore_errors=True)
+        _point_numba_to(temporary)
+    return Place(
+        temporary,
+        f"kernels are compiled anew in each run, {'half a minute' if temporary else 'a minute'}: "
+        f"{' and '.join(f'{folder} {refusal}' for folder, refusal in refusals)}; "
+        "set NUMBA_CACHE_DIR to a folder that only you can write",
     )
+
+
+def _point_numba_to(folder: Path) -> None:
+    os.environ["NUMBA_CACHE_DIR"] = str(folder)
+    if "numba" in sys.modules:
+        sys.modules["numba"].config.CACHE_DIR = str(folder)
 
 
 def _user_cache() -> Path:
     """As numba has it."""
-    home = Path(os.path.expanduser("~"))
+    home = Path(os.path.expanduser("~"))  # "~" itself where nobody knows one
+    home = home if home.is_absolute() else Path(os.devnull)
     if sys.platform == "win32":
         return Path(os.environ.get("LOCALAPPDATA", home / "AppData" / "Local"))
     if sys.platform == "darwin":
@@ -43,11 +69,15 @@ def _user_cache() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or home / ".cache")
 
 
-def _can_be_written(folder: Path) -> bool:
-    """Whether a folder takes new files, made if it is not there, as numba tries it: rights alone do not tell."""
+def _refusal(folder: Path) -> str | None:
+    """Why a folder is none for the cache, made if it is not there; numba's way to see: rights alone do not tell."""
     try:
-        folder.mkdir(parents=True, exist_ok=True)
+        for part in [*reversed(folder.parents), folder]:
+            if not part.exists():
+                part.mkdir(mode=FOLDER_MODE, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
-            return True
+            pass
+        is_open = os.name == "posix" and bool(folder.stat().st_mode & stat.S_IWOTH)
     except OSError:
-        return False
+        return "cannot be written"
+    return "can be written by everybody" if is_open else None

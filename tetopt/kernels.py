@@ -17,6 +17,7 @@ import os
 import subprocess
 import sys
 import tempfile
+import time
 import typing
 import warnings
 import zlib
@@ -31,7 +32,7 @@ import llvmlite.binding as llvm
 import numba
 import numpy as np
 from llvmlite import ir
-from numba import njit, prange, types
+from numba import prange, types
 from numba.core import cgutils
 from numba.core.datamodel.models import OpaqueModel
 from numba.core.extending import register_model, typeof_impl, unbox
@@ -41,7 +42,14 @@ from numba.extending import NativeValue, intrinsic
 from numba.np.arrayobj import populate_array
 from numpy.typing import NDArray
 
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
+from tetopt.budget import address_room
 from tetopt.cache import place_cache
+from tetopt.kernel_cache import NotKeptWarning, callback, njit, warn
 
 # Arrays in the signatures of units and in records: of so many axes, the last one contiguous.
 Floats1 = Annotated[NDArray[np.float64], types.float64[::1]]
@@ -59,6 +67,9 @@ Bools2 = Annotated[NDArray[np.bool_], types.boolean[:, ::1]]
 Bools3 = Annotated[NDArray[np.bool_], types.boolean[:, :, ::1]]
 
 SCALAR_TYPES = {int: types.int64, float: types.float64, bool: types.boolean, type(None): types.void}
+UNIT_BYTES = 1 << 25  # at once for all arrays that units make: a few KB each on each thread
+POLLED_SECONDS = 0.1  # between looks at processes that compile
+LONGEST_WAIT_SECONDS = 600.0  # for another run's: all kernels take 145 s on a busy machine
 MOST_COMPILING = 4  # processes at most: each loads numba first, 1 s and 200 MB
 WORD_BYTES = 8  # of a number, an address, or a length in a record's memory
 
@@ -323,7 +334,8 @@ class Kernel:
     def __call__(self, *values: Any) -> Any:
         """Call it from Python: records are laid out for it, and the units that it calls are linked before."""
         self.link()
-        return self.dispatcher(*map(packed, values))
+        with _whole_calls():
+            return self.dispatcher(*map(packed, values))
 
 
 class Unit(Kernel):
@@ -358,7 +370,7 @@ class Unit(Kernel):
     def compiled(self) -> Any:
         """The function for callers of machine code; compiled now, or taken from the cache."""
         function = _versioned(self.function)
-        return numba.cfunc(self.signature, cache=True, error_model="numpy", _nrt=_counts(self.function))(function)
+        return callback(function, self.signature, error_model="numpy", _nrt=_counts(self.function))
 
     @property
     def address(self) -> int:
@@ -418,24 +430,93 @@ def _parts(function: Callable[..., Any]) -> list[Any]:
     return parts
 
 
+@contextlib.contextmanager
+def _whole_calls() -> Iterator[None]:
+    """Raise what a unit raised, which numba prints and forgets, going on with numbers that mean nothing.
+
+    Units make small arrays only, so that memory for them is seen to before, where a limit lets allocations fail.
+    """
+    room = address_room()
+    if room is not None and room < UNIT_BYTES:
+        raise MemoryError(f"{room} bytes are left for kernels, which need {UNIT_BYTES}")
+    raised: list[BaseException] = []
+    before = sys.unraisablehook
+
+    def keep(unraisable: Any) -> None:
+        if unraisable.exc_value is None:
+            before(unraisable)
+        else:
+            raised.append(unraisable.exc_value)
+
+    sys.unraisablehook = keep
+    try:
+        yield
+    finally:
+        sys.unraisablehook = before
+    if raised:
+        raise raised[0]
+
+
 # Compiling in several processes.
 
 
-def link(kernels: Sequence[Any]) -> None:
-    """Link kernels and all that they call; what the cache does not hold is compiled in several processes."""
+def link(kernels: Sequence[Any], progress: Callable[[str], None] | None = None) -> None:
+    """Link kernels and all that they call; what the cache does not hold is compiled in several processes.
+
+    `progress` is called now and then with what is going on in words, if anything has to be compiled.
+    """
     if numba.config.DISABLE_JIT:
         return
+    say = progress or (lambda words: None)
     order = list(dict.fromkeys(inner for kernel in kernels for inner in _callees_first(kernel)))
+    n_ready = _n_kept(order, 0)
+    if n_ready < len(order):
+        place = place_cache()
+        if place.notice is not None:
+            warn(place.notice)
+        say(f"compiling the kernels, {n_ready + 1} of {len(order)}")
+        if place.folder is not None:
+            with _only_compiler(place.folder, say) as has_waited:
+                if has_waited:
+                    n_ready = _n_kept(order, n_ready + 1)
+                _compile_apart(order[n_ready + 1 :], place.folder, say)
     for number, kernel in enumerate(order):
         kernel.link()
-        if not kernel.was_cached:
-            if (notice := place_cache()) is not None:
-                warnings.warn(notice, RuntimeWarning, stacklevel=2)
-            _compile_apart(order[number + 1 :])
-            break
-    for kernel in order:
+        if not kernel.was_cached and number > n_ready:
+            say(f"compiling the kernels, {number + 1} of {len(order)}")
+
+
+def _n_kept(order: Sequence[Any], first: int) -> int:
+    """How many kernels from the first on need no compiling, up to the next that does, which is compiled by this."""
+    for number, kernel in enumerate(order[first:], start=first):
         kernel.link()
-        _ = kernel.compiled
+        if not kernel.was_cached:
+            return number
+    return len(order)
+
+
+@contextlib.contextmanager
+def _only_compiler(folder: Path, say: Callable[[str], None]) -> Iterator[bool]:
+    """Whether another run was compiling into this folder, for whose end this waits: not everything is done twice."""
+    has_waited = False
+    try:
+        lock = (folder / "compiling.lock").open("ab")
+    except OSError:  # then both compile
+        yield False
+        return
+    with lock:
+        give_up = time.monotonic() + LONGEST_WAIT_SECONDS
+        while fcntl is not None and time.monotonic() < give_up:
+            try:
+                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # the system ends it with the process
+                break
+            except BlockingIOError:
+                has_waited = True
+                say("waiting for another run, which compiles the kernels")
+                time.sleep(POLLED_SECONDS)
+            except OSError:  # a file system without locks
+                break
+        yield has_waited
 
 
 def roots() -> list[Kernel]:
@@ -444,20 +525,13 @@ def roots() -> list[Kernel]:
     return [kernel for kernel in ALL_KERNELS if kernel not in called]
 
 
-def cache_folder() -> Path:
-    """Where numba keeps what it compiled."""
-    folder = Path(next(kernel for kernel in ALL_KERNELS if isinstance(kernel, Entry)).dispatcher.stats.cache_path)
-    chosen = os.environ.get("NUMBA_CACHE_DIR")
-    return Path(chosen) if chosen and folder.is_relative_to(Path(chosen)) else folder
-
-
 def _callees_first(kernel: Any) -> Iterator[Any]:
     for inner in units_of(kernel.function):
         yield from _callees_first(inner)
     yield kernel
 
 
-def _compile_apart(kernels: Sequence[Any]) -> None:
+def _compile_apart(kernels: Sequence[Any], folder: Path, say: Callable[[str], None]) -> None:
     """Compile kernels into the cache in as many processes as there are cores, up to `MOST_COMPILING`."""
     n_processes = min(MOST_COMPILING, os.cpu_count() or 1)
     if n_processes < 2 or not kernels or not sys.executable:
@@ -468,7 +542,11 @@ def _compile_apart(kernels: Sequence[Any]) -> None:
     ]
     environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     processes: list[subprocess.Popen[bytes]] = []
-    with tempfile.TemporaryDirectory(prefix="tetopt-") as claims:
+    with contextlib.ExitStack() as stack:
+        try:
+            claims = stack.enter_context(tempfile.TemporaryDirectory(prefix="tetopt-", dir=folder))
+        except OSError:  # what cannot be shared is compiled by the caller
+            return
         # Ctrl-C is for this process, which then ends the others.
         code = (
             "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); "
@@ -477,18 +555,23 @@ def _compile_apart(kernels: Sequence[Any]) -> None:
         try:
             command = [sys.executable, "-c", code]
             processes.extend(subprocess.Popen(command, env=environment) for _ in range(n_processes))
-            for process in processes:
-                process.wait()  # what one has not done, the process that waits does next
+            while any(process.poll() is None for process in processes):
+                say(f"compiling the kernels, {len(os.listdir(claims))} of {len(kernels)}")
+                time.sleep(POLLED_SECONDS)
         finally:
             for process in processes:
                 process.kill()
+                process.wait()
 
 
 def compile_named(names: Sequence[str], claims: str, parent: int) -> None:
     """Compile kernels, `module:name` each, into numba's cache, unless another process has claimed them.
 
-    They know only the names of what they call, so that none may be called in this process. It ends when `parent` has.
+    They know only the names of what they call, so that none may be called in this process. It ends when `parent` has,
+    or when nothing can be kept for that; the user is told by `parent`, which meets what is left.
     """
+    warnings.simplefilter("ignore")
+    warnings.simplefilter("error", NotKeptWarning)
     chosen = [getattr(import_module(name.split(":")[0]), name.split(":")[1]) for name in names]
     numba.get_num_threads()
     for kernel in ALL_KERNELS:
@@ -498,8 +581,11 @@ def compile_named(names: Sequence[str], claims: str, parent: int) -> None:
         if os.getppid() != parent:
             return
         with contextlib.suppress(FileExistsError):
-            (Path(claims) / str(number)).touch(exist_ok=False)
-            _ = kernel.compiled
+            try:
+                (Path(claims) / str(number)).touch(exist_ok=False)
+                _ = kernel.compiled
+            except (NotKeptWarning, FileNotFoundError):
+                return
 
 
 @intrinsic
@@ -536,7 +622,8 @@ def run(task: Any, n: int, values: Any) -> None:
     laid_out = packed(values)
     if laid_out.type != task.signature.args[0]:
         raise TypeError(f"{task.__name__}: expected a {task.signature.args[0]}, got a {laid_out.type}")
-    _run(task.address, laid_out.address, n)
+    with _whole_calls():
+        _run(task.address, laid_out.address, n)
 
 
 def unit(function: Callable[..., Any]) -> Any:

@@ -13,6 +13,7 @@ from rich.markup import escape
 
 import tetopt
 from tetopt import Image, InputError, save_mesh
+from tetopt.budget import BYTES_PER_GB
 from tetopt.cli.console import log, out
 from tetopt.cli.inputs import checked_outputs, label_table, read_labels, read_volume, results_folder
 from tetopt.cli.options import (
@@ -44,7 +45,6 @@ ClassesOption = Annotated[int, option("K", "Classes of the segmentation (multi-O
 
 
 DEFAULT_SETTINGS = Settings(nodes=DEFAULT_NODES[3])
-BYTES_PER_GB = 1e9  # as --max-gb counts them
 
 
 @dataclass(frozen=True, kw_only=True)

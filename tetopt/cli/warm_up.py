@@ -11,7 +11,7 @@ from tetopt import Image, InputError, cell_fields, label_fidelity, mask_fidelity
 from tetopt.cache import place_cache
 from tetopt.cli.console import log, out
 from tetopt.fem.reference import reference
-from tetopt.kernels import cache_folder, link, roots
+from tetopt.kernels import link, roots
 from tetopt.target.content import content
 
 BALL_VOXELS = 24  # along each axis of the image that is meshed: an octree of 300 nodes needs as many
@@ -20,8 +20,9 @@ BALL_NODES = {2: 60, 3: 300}  # by its axes
 
 def warm_up_command() -> int:
     """Compile all kernels ahead, as for an image of a container or a cluster; later runs load them from the cache."""
-    if (notice := place_cache()) is not None:
-        raise InputError(f"warm-up: nothing can be kept: {notice}")
+    place = place_cache()
+    if place.notice is not None:
+        raise InputError(f"warm-up: nothing can be kept: {place.notice}")
     begin = time.perf_counter()
     with log.status("compiling all kernels, a minute on two cores ..."):
         link(roots())
@@ -29,7 +30,7 @@ def warm_up_command() -> int:
             _mesh_balls(n)
         reference(Image(1.0 + np.indices((8, 8, 8)).sum(axis=0)), nu=0.3)
     seconds = time.perf_counter() - begin
-    out.print(escape(f"all kernels are ready after {seconds:.0f} s, kept in {cache_folder()}"), soft_wrap=True)
+    out.print(escape(f"all kernels are ready after {seconds:.0f} s, kept in {place.folder}"), soft_wrap=True)
     return 0
 
 

@@ -12,11 +12,11 @@ which needs no origin and cannot cancel. E_G scales as s^(n+2) with the mesh's s
 from __future__ import annotations
 
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from tetopt.geometry.simplex import Cells, Points, squared_edges, volume_gradients, volumes
 from tetopt.geometry.vectors import cross, difference, dot
+from tetopt.kernel_cache import njit
 
 
 def cell_E_G(points: Points, cells: Cells) -> NDArray[np.float64]:

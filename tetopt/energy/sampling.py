@@ -28,13 +28,13 @@ from typing import Any, NamedTuple
 
 import numba
 import numpy as np
-from numba import njit
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.geometry.topology import Facets, facets
 from tetopt.geometry.vectors import cross, difference, dot, row
 from tetopt.image import Image
+from tetopt.kernel_cache import njit
 from tetopt.kernels import (
     Floats1,
     Floats2,

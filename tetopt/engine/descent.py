@@ -10,12 +10,13 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
 from tetopt.energy.geometric import volume_and_E_G
 from tetopt.energy.sampling import cell_orientation, facet_flux, few_threads
 from tetopt.engine.complex import FLAT_SHARE
+from tetopt.kernel_cache import njit
 
 LLOYD_HALVINGS = 4  # of a Lloyd step that inverts a cell or raises the ring's energy: then the node stays
 

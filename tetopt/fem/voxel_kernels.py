@@ -15,10 +15,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import numpy as np
-from numba import njit, prange
+from numba import prange
 from numpy.typing import NDArray
 
 from tetopt.energy.sampling import few_threads
+from tetopt.kernel_cache import njit
 
 CHUNK_VOXELS = 128  # of a row at once: 48 rows of them stay in the first cache
 SLAB_PLANES = 4  # a plane in this many is written by two slabs; more planes leave threads idle at the end

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
-import numba
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
 from tetopt.geometry.simplex import facet_nodes
+from tetopt.kernel_cache import njit
 
 
 class Rings(NamedTuple):
@@ -113,7 +113,7 @@ def stars(sides: Facets, around: Rings) -> Stars:
     return Stars(start, members, place)
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def _fill_places(
     place: NDArray, ring_start: NDArray, ring: NDArray, of_cell: NDArray, start: NDArray, members: NDArray
 ) -> None:
@@ -142,7 +142,7 @@ def boundary_facets(cells: NDArray[np.integer], shared: Facets | None = None) ->
     return outer
 
 
-@numba.njit(cache=True)
+@njit(cache=True)
 def greedy_colours(cells: NDArray, start: NDArray, ring_cells: NDArray) -> NDArray:
     """A colour for each node, (N,) int64 from 0, such that no two nodes of one cell share one.
 

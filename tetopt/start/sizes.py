@@ -6,12 +6,12 @@ from typing import NamedTuple
 
 import numpy as np
 import scipy
-from numba import njit
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides
 from tetopt.image import Image
+from tetopt.kernel_cache import njit
 from tetopt.start.lattice import near_cubes
 
 # A graded mesh's longest edge over that of a uniform mesh with as many nodes, where no other is set (`docs/sizes.md`).

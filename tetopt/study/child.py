@@ -25,12 +25,12 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt.budget import MAXRSS_UNIT_BYTES, peak_bytes
 from tetopt.errors import InputError
 from tetopt.mesh import Mesh
 from tetopt.study.pipelines import Job, Produced
 
 POLL_SECONDS = 0.05  # between two looks at a child's memory: a fraction of what even a short run takes
-MAXRSS_UNIT_BYTES = 1 if sys.platform == "darwin" else 1024  # of ru_maxrss, as getrusage(2) has it
 
 
 class Outcome(NamedTuple):
@@ -131,15 +131,8 @@ def _status_bytes(folder: Path, name: str) -> int:
 
 
 def _own_peak_bytes() -> int:
-    """Largest resident memory of this process or of one it has waited for.
-
-    On Linux VmHWM, not ru_maxrss: the latter begins at the resident memory of the parent that started the process.
-    """
-    waited = resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * MAXRSS_UNIT_BYTES
-    own = Path("/proc/self")
-    if own.exists():
-        return max(waited, _status_bytes(own, "VmHWM"))
-    return max(waited, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * MAXRSS_UNIT_BYTES)
+    """Largest resident memory of this process or of one it has waited for."""
+    return max(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * MAXRSS_UNIT_BYTES, peak_bytes())
 
 
 def _kill_group(child: subprocess.Popen) -> None:

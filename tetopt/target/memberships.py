@@ -14,10 +14,10 @@ from typing import NamedTuple
 import numba
 import numpy as np
 import scipy
-from numba import njit
 from numpy.typing import NDArray
 
 from tetopt.image import Image
+from tetopt.kernel_cache import njit
 from tetopt.target.labels import check_labels, label_channels
 
 FARTHEST_LEVEL = 6.0  # levels end there: nothing that moves by steps near an interface looks further

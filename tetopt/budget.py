@@ -1,0 +1,158 @@
+"""What memory there is, and that nothing is begun which needs more: it is said in one line, before it is taken.
+
+Limits of a process (RLIMIT_AS, RLIMIT_DATA, as `ulimit` and schedulers set them) make an allocation fail. Those of a
+control group (containers, clusters) and of the machine end the process without a word, so that only asking before
+helps.
+"""
+
+from __future__ import annotations
+
+import os
+import re
+import sys
+from pathlib import Path
+
+from tetopt.errors import InputError
+
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None  # type: ignore[assignment]
+
+BYTES_PER_GB = 1e9  # as of memory that is sold and of files
+MAXRSS_UNIT_BYTES = 1 if sys.platform == "darwin" else 1024  # of ru_maxrss, as getrusage(2) has it
+PROC_FOLDER = Path("/proc")
+GROUP_FOLDER = Path("/sys/fs/cgroup")
+UNLIMITED_BYTES = 1 << 60  # of a control group's: "no limit" is a number near 2^63 there
+
+
+def memory_words(n_bytes: float) -> str:
+    """A number of bytes in words."""
+    return f"{n_bytes / BYTES_PER_GB:.3g} GB" if n_bytes >= 1e8 else f"{n_bytes / 1e6:.3g} MB"
+
+
+def check_memory(n_bytes: float, what: str, advice: str, limit: float | None = None) -> None:
+    """InputError if what is about to be done needs more memory than there is, or than `limit`, bytes.
+
+    Parameters
+    ----------
+    n_bytes : float
+        What it will need besides what this process has.
+    what : str
+        That needs it, with its sizes, as a message begins.
+    advice : str
+        What to do instead, as a message ends.
+    limit : float, optional
+        Of the user's own, of all that this process has.
+    """
+    free = available_bytes()
+    if free is not None and n_bytes > free:
+        raise InputError(
+            f"{what}: needs about {memory_words(n_bytes)} of memory, {memory_words(free)} are free; {advice}"
+        )
+    if limit is not None and n_bytes + resident_bytes() > limit:
+        raise InputError(
+            f"{what}: needs about {memory_words(n_bytes + resident_bytes())} of memory in all, "
+            f"{memory_words(limit)} are allowed; {advice}"
+        )
+
+
+def available_bytes() -> int | None:
+    """Memory that could be had without swapping, within all limits; None where the system does not say."""
+    numbers = [_machine_bytes(), _group_bytes(), *_process_bytes()]
+    known = [max(number, 0) for number in numbers if number is not None]
+    return min(known, default=None)
+
+
+def resident_bytes() -> int:
+    """Memory that this process has now; where the system does not say, its peak."""
+    try:
+        pages = int((PROC_FOLDER / "self" / "statm").read_text(encoding="ascii").split()[1])
+    except OSError:
+        return peak_bytes()
+    return pages * os.sysconf("SC_PAGE_SIZE")
+
+
+def peak_bytes() -> int:
+    """The most memory that this process has had; 0 where the system does not say.
+
+    On Linux VmHWM, not ru_maxrss: the latter begins at the memory of the parent that started the process.
+    """
+    status = PROC_FOLDER / "self" / "status"
+    if status.is_file():
+        row = re.search(r"^VmHWM:\s+(\d+) kB", status.read_text(encoding="ascii", errors="replace"), re.M)
+        if row is not None:
+            return 1024 * int(row.group(1))
+    return 0 if resource is None else resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * MAXRSS_UNIT_BYTES
+
+
+def address_room() -> int | None:
+    """Address space that this process may still take, where there is a limit to it."""
+    rooms = _process_bytes()
+    return min(rooms, default=None)
+
+
+def _process_bytes() -> list[int]:
+    """What the limits of this process leave, of each that is set."""
+    rooms = []
+    # The names of the limits and, in pages, which number of statm tells what is used (proc_pid_statm(5)).
+    for name, column in (("RLIMIT_AS", 0), ("RLIMIT_DATA", 5)):
+        if resource is None or not hasattr(resource, name):
+            continue
+        limit = resource.getrlimit(getattr(resource, name))[0]
+        if limit == resource.RLIM_INFINITY:
+            continue
+        try:
+            used = int((PROC_FOLDER / "self" / "statm").read_text(encoding="ascii").split()[column])
+        except OSError:
+            continue
+        rooms.append(limit - used * os.sysconf("SC_PAGE_SIZE"))
+    return rooms
+
+
+def _machine_bytes() -> int | None:
+    table = PROC_FOLDER / "meminfo"
+    if table.is_file():
+        row = re.search(r"^MemAvailable: +(\d+) kB", table.read_text(encoding="ascii"), re.M)
+        if row is not None:
+            return 1024 * int(row.group(1))
+    if "SC_PHYS_PAGES" in getattr(os, "sysconf_names", {}):
+        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
+    return None
+
+
+def _group_bytes() -> int | None:
+    """What the control groups of this process leave, of version 2 or 1; what files take there can be had."""
+    try:
+        rows = (PROC_FOLDER / "self" / "cgroup").read_text(encoding="utf-8").splitlines()
+    except OSError:
+        return None
+    rooms = []
+    for row in rows:
+        _, controllers, path = row.split(":", 2)
+        if controllers == "":
+            root, names = GROUP_FOLDER, ("memory.max", "memory.current", "inactive_file")
+        elif "memory" in controllers.split(","):
+            root = GROUP_FOLDER / "memory"
+            names = ("memory.limit_in_bytes", "memory.usage_in_bytes", "total_inactive_file")
+        else:
+            continue
+        folder = root / path.lstrip("/")
+        # A container sees its own group as the root, whatever its path is called outside; parents limit, too.
+        for at in {root, *(part for part in (folder, *folder.parents) if part.is_relative_to(root))}:
+            room = _group_room(at, *names)
+            if room is not None:
+                rooms.append(room)
+    return min(rooms, default=None)
+
+
+def _group_room(folder: Path, limit_name: str, used_name: str, cached_name: str) -> int | None:
+    try:
+        limit = (folder / limit_name).read_text(encoding="ascii").strip()
+        used = int((folder / used_name).read_text(encoding="ascii"))
+        cached = re.search(rf"^{cached_name} (\d+)", (folder / "memory.stat").read_text(encoding="ascii"), re.M)
+    except OSError:
+        return None
+    if not limit.isdigit() or int(limit) > UNLIMITED_BYTES:
+        return None
+    return int(limit) - used + (int(cached.group(1)) if cached else 0)

@@ -1,0 +1,144 @@
+"""numba's cache of compiled functions, of which nothing that goes wrong ends a run.
+
+What is read has to have the checksum that was written with it, or else it is compiled anew: code that a damaged file
+holds would end the process. What cannot be written, on a full disk or in a folder that is gone, is not kept. Each of
+these is said once, on one line, by a `RuntimeWarning`.
+"""
+
+from __future__ import annotations
+
+import pickle
+import warnings
+import zlib
+from collections.abc import Callable
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import numba
+from numba.core.caching import FunctionCache, IndexDataCacheFile, NullCache
+from numba.core.ccallback import CFunc
+
+from tetopt.cache import place_cache
+
+
+class NotKeptWarning(RuntimeWarning):
+    """What was compiled cannot be written for later runs."""
+
+
+@cache  # once each
+def warn(notice: str, kind: type[RuntimeWarning] = RuntimeWarning) -> None:
+    """Warn of what went wrong with the cache, once in a process."""
+    warnings.warn(notice, kind, stacklevel=3)
+
+
+class DamagedFileError(Exception):
+    """A file of the cache is not what was written."""
+
+
+class SealedFile(IndexDataCacheFile):
+    """numba's index of a function's compilations and its files of code, each with version and checksum ahead.
+
+    A file of code holds its key, too: two processes that write at once may give the same name to different code.
+    """
+
+    def save(self, key: Any, data: Any) -> None:
+        """Keep what was compiled for a key."""
+        super().save(key, (key, data))
+
+    def load(self, key: Any) -> Any:
+        """What was compiled for a key, or None."""
+        pair = super().load(key)
+        return pair[1] if pair is not None and pair[0] == key else None
+
+    def _load_index(self) -> dict[Any, str]:
+        try:
+            stamp, names = self._unsealed(self._index_path)
+        except (FileNotFoundError, DamagedFileError):
+            return {}
+        return names if stamp == self._source_stamp else {}
+
+    def _save_index(self, overloads: dict[Any, str]) -> None:
+        self._seal(self._index_path, (self._source_stamp, overloads))
+
+    def _load_data(self, name: str) -> Any:
+        try:
+            return self._unsealed(self._data_path(name))
+        except DamagedFileError:
+            return None
+
+    def _save_data(self, name: str, data: Any) -> None:
+        self._seal(self._data_path(name), data)
+
+    def _seal(self, path: str, data: Any) -> None:
+        content = self._dump(data)
+        with self._open_for_write(path) as file:
+            file.write(b"%s %08x\n" % (self._version.encode(), zlib.crc32(content)) + content)
+
+    def _unsealed(self, path: str) -> Any:
+        """What a file holds; `DamagedFileError`, of which the user is told, if that is not what was written."""
+        head, _, content = Path(path).read_bytes().partition(b"\n")
+        version, _, checksum = head.partition(b" ")
+        if version == self._version.encode() and checksum == b"%08x" % zlib.crc32(content):
+            return pickle.loads(content)
+        if not checksum or version == self._version.encode():
+            warn(f"damaged files in the cache of kernels, {Path(path).parent}: what they held is compiled anew")
+        raise DamagedFileError(path)
+
+
+class SealedCache(FunctionCache):
+    """numba's cache of a function, which gives up where it cannot read or write."""
+
+    def __init__(self, function: Callable[..., Any]) -> None:
+        super().__init__(function)
+        self._cache_file: Any = SealedFile(
+            self._cache_path, self._impl.filename_base + "-s", self._impl.locator.get_source_stamp()
+        )
+
+    def load_overload(self, sig: Any, target_context: Any) -> Any:
+        """What was compiled for a signature, or None."""
+        try:
+            return super().load_overload(sig, target_context)
+        except OSError:  # if it can be written, all is well from then on, else that is said
+            return None
+        except (AttributeError, ImportError) as error:  # of classes that there are no more
+            warn(f"the cache of kernels cannot be read, they are compiled anew: {error}")
+            return None
+
+    def save_overload(self, sig: Any, data: Any) -> None:
+        """Keep what was compiled for a signature, if that can be."""
+        try:
+            super().save_overload(sig, data)
+        except OSError as error:
+            warn(f"compiled kernels cannot be kept, so that later runs compile them again: {error}", NotKeptWarning)
+
+
+def cache_of(function: Callable[..., Any]) -> Any:
+    """The cache of a function that numba compiles; one that keeps nothing, where there is no folder for it."""
+    if place_cache().folder is not None:
+        try:
+            return SealedCache(function)
+        except RuntimeError:  # no locator: the folder has gone, or takes no more files
+            warn("kernels are compiled anew: the folder of their cache can no longer be written", NotKeptWarning)
+    return NullCache()
+
+
+def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Decorate as `numba.njit` does; `cache=True` stands for this cache."""
+    is_kept = options.pop("cache", False)
+
+    def compiled(function: Callable[..., Any]) -> Any:
+        dispatcher = numba.njit(**options)(function)
+        if is_kept and not numba.config.DISABLE_JIT:
+            dispatcher._cache = cache_of(function)
+        return dispatcher
+
+    return compiled
+
+
+def callback(function: Callable[..., Any], signature: Any, **options: Any) -> Any:
+    """As `numba.cfunc`, compiled now or taken from this cache."""
+    compiled: Any = CFunc(function, (signature.args, signature.return_type), {}, options)
+    compiled._cache = cache_of(function)
+    compiled.compile()
+    return compiled
