@@ -19,10 +19,10 @@ if TYPE_CHECKING:
     from tetopt.engine.paper import optimize_paper
     from tetopt.errors import InputError
     from tetopt.image import Image
-    from tetopt.io.formats import save_model
+    from tetopt.io.formats import save_mesh, save_model
     from tetopt.io.images import load_image, save_image
     from tetopt.io.label_tables import load_label_table
-    from tetopt.io.meshes import load_mesh, save_mesh
+    from tetopt.io.meshes import load_mesh
     from tetopt.measure.fidelity import cell_labels, label_fidelity, mask_fidelity
     from tetopt.measure.interfaces import label_interfaces
     from tetopt.measure.quality import quality
@@ -46,10 +46,10 @@ _NAMES_OF = {  # by module
     "engine.paper": ("optimize_paper",),
     "errors": ("InputError",),
     "image": ("Image",),
-    "io.formats": ("save_model",),
+    "io.formats": ("save_mesh", "save_model"),
     "io.images": ("load_image", "save_image"),
     "io.label_tables": ("load_label_table",),
-    "io.meshes": ("load_mesh", "save_mesh"),
+    "io.meshes": ("load_mesh",),
     "measure.fidelity": ("cell_labels", "label_fidelity", "mask_fidelity"),
     "measure.interfaces": ("label_interfaces",),
     "measure.quality": ("quality",),

@@ -9,7 +9,7 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.io.tags import check_apart, material_names, without_data
-from tetopt.io.text import blocks, rows
+from tetopt.io.text import blocks, comment_lines, plain, rows
 from tetopt.model.fields import node_field
 from tetopt.model.loads import Load, count_of_steps, facet_forces, in_step, load_words, spring_constants
 from tetopt.model.materials import Materials, cells_of, without_moduli
@@ -71,7 +71,7 @@ def abaqus(model: Model) -> bytes:
         parts += _springs(model)
         for step in range(1, count_of_steps(model.loads) + 1):
             parts += _step(model, step)
-    return "".join(parts).encode("utf-8", "replace")
+    return "".join(parts).encode()
 
 
 def _check(model: Model) -> None:
@@ -95,8 +95,8 @@ def _check(model: Model) -> None:
 
 def _head(model: Model) -> str:
     lines = described(model) + without_data(model)
-    comments = [f"** {part}\n" for line in lines for part in textwrap.wrap(line, COMMENT_CHARACTERS)]
-    return "".join([*comments, "*HEADING\n", "; ".join(lines[:3]), "\n"])
+    short = (part for line in lines for part in textwrap.wrap(plain(line), COMMENT_CHARACTERS))
+    return f"{comment_lines(short, '** ')}*HEADING\n{comment_lines(['; '.join(lines[:3])])}"
 
 
 def _mesh(model: Model) -> list[str]:

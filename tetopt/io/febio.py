@@ -7,14 +7,13 @@ them here.
 from __future__ import annotations
 
 from typing import NamedTuple
-from xml.sax.saxutils import escape
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
-from tetopt.io.tags import as_scalars, check_one_step
-from tetopt.io.text import rows, xml_comment
+from tetopt.io.tags import as_columns, check_one_step
+from tetopt.io.text import rows, xml_attribute, xml_comment
 from tetopt.model.loads import Load, facet_forces, spring_constants
 from tetopt.model.materials import cells_of, density_of
 from tetopt.model.model import STRESS_UNITS, Model, described, element_facets, elements, mass_densities
@@ -112,7 +111,7 @@ def febio(model: Model) -> bytes:
         *(f'<var type="{name}"/>\n' for name in PLOT_VARIABLES),
         "</plotfile>\n</Output>\n</febio_spec>\n",
     ]
-    return "".join(sections).encode("utf-8", "replace")
+    return "".join(sections).encode()
 
 
 def _check(model: Model) -> None:
@@ -198,8 +197,8 @@ def _mesh_data(model: Model, parts: list[_Part]) -> list[str]:
     """
     fields: dict[str, NDArray[np.float64]] = {}
     for name, values in model.cell_data.items():
-        column = values.ravel() if values.size == len(values) else values
-        fields |= as_scalars(name, column.astype(np.float64))
+        fields[name] = (values.ravel() if values.size == len(values) else values).astype(np.float64)
+    fields = as_columns(fields)
     if model.materials is not None and parts[0].young == YOUNG_MAP:
         fields[YOUNG_MAP] = model.materials.young[model.materials.of_cell]
         if parts[0].nu == NU_MAP:
@@ -207,7 +206,7 @@ def _mesh_data(model: Model, parts: list[_Part]) -> list[str]:
         if parts[0].density == DENSITY_MAP:
             fields[DENSITY_MAP] = mass_densities(model)[model.materials.of_cell]
     data = [
-        f'<ElementData name="{_attribute(name)}" elem_set="{part.name}" data_type="scalar">\n'
+        f'<ElementData name="{xml_attribute(name)}" elem_set="{part.name}" data_type="scalar">\n'
         f"{_items('elem', values[part.cells], number='lid')}</ElementData>\n"
         for name, values in fields.items()
         for part in parts
@@ -328,10 +327,6 @@ def _items(tag: str, array: NDArray, ids: NDArray[np.int64] | None = None, numbe
     lines = rows(array, separator=",").splitlines()
     numbers = range(1, len(lines) + 1) if ids is None else ids.tolist()
     return "".join(f'<{tag} {number}="{k}">{line}</{tag}>\n' for k, line in zip(numbers, lines, strict=True))
-
-
-def _attribute(text: str) -> str:
-    return escape(text, {'"': "&quot;"})
 
 
 def _list(numbers: NDArray[np.int64]) -> str:

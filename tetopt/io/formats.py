@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable
 from pathlib import Path
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.io.abaqus import abaqus
@@ -15,9 +18,12 @@ from tetopt.io.medit import medit
 from tetopt.io.mfem import mfem
 from tetopt.io.sofa import sofa
 from tetopt.io.surfaces import boundary_ply, boundary_stl
+from tetopt.io.text import file_name, names_apart, plain, short_name
 from tetopt.io.vtk import vtk, vtu
 from tetopt.io.xdmf import xdmf
+from tetopt.mesh import Mesh
 from tetopt.model.model import Model, in_space, in_units
+from tetopt.model.sets import MOST_LETTERS, SET_NAME, Sets
 
 
 class Format(NamedTuple):
@@ -30,16 +36,17 @@ class Format(NamedTuple):
     is_surface: bool = False  # holds the boundary alone
     has_node_moduli: bool = False  # else a modulus that varies within cells is its mean over each
     has_large: bool = False  # whether a step can ask for large deformation
+    has_short_names: bool = False  # whether names of data have at most `MOST_NAME_CHARACTERS`
 
 
 FORMATS = {
     ".vtu": Format("VTK, ParaView", vtu, has_quadratic=True, has_node_moduli=True),
-    ".vtk": Format("legacy VTK, 3D Slicer", vtk, has_quadratic=True, has_node_moduli=True),
+    ".vtk": Format("legacy VTK, 3D Slicer", vtk, has_quadratic=True, has_node_moduli=True, has_short_names=True),
     ".xdmf": Format("XDMF with tags, FEniCSx", xdmf, has_quadratic=True, has_node_moduli=True),
-    ".msh": Format("gmsh 4.1", gmsh41, has_quadratic=True),
-    ".msh2": Format("gmsh 2.2", gmsh22, has_quadratic=True),
+    ".msh": Format("gmsh 4.1", gmsh41, has_quadratic=True, has_short_names=True),
+    ".msh2": Format("gmsh 2.2", gmsh22, has_quadratic=True, has_short_names=True),
     ".inp": Format("Abaqus, CalculiX", abaqus, has_quadratic=True, runs=True, has_node_moduli=True, has_large=True),
-    ".feb": Format("FEBio 4.0", febio, has_quadratic=True, runs=True, has_large=True),
+    ".feb": Format("FEBio 4.0", febio, has_quadratic=True, runs=True, has_large=True, has_short_names=True),
     ".scn": Format("SOFA scene", sofa, runs=True),
     ".mfem": Format("MFEM mesh", mfem, has_quadratic=True),
     ".mesh": Format("medit", medit, has_quadratic=True),
@@ -87,6 +94,31 @@ def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str
     save_bytes(path, file_bytes(path, model, space=space, units=units))
 
 
+def save_mesh(
+    path: str | Path,
+    mesh: Mesh,
+    cell_data: dict[str, NDArray] | None = None,
+    about: dict[str, Any] | None = None,
+    point_data: dict[str, NDArray] | None = None,
+    order: int = 1,
+) -> None:
+    """Write a mesh and its data in the format of the file's suffix (`FORMATS`), whole or not at all.
+
+    Points in world mm (RAS+), cells positively oriented, of order 1 or 2, `cell_data` and `point_data` by name, the
+    latter with a row for each mesh point or for each node of order 2; in VTK's formats each entry of `about` becomes a
+    field-data text, as JSON unless it is a string already. `save_model` writes sets, materials and loads, too. Replaces
+    an existing file; ask `tetopt.io.files.checked_output` first.
+
+    Raises
+    ------
+    InputError
+        As `save_model`.
+    """
+    save_model(
+        path, Model(mesh, cell_data or {}, Sets({}, {}), order=order, about=about or {}, point_data=point_data or {})
+    )
+
+
 def file_bytes(path: Path, model: Model, *, space: str = "ras", units: str = "kPa") -> bytes:
     """What `save_model` writes.
 
@@ -99,4 +131,30 @@ def file_bytes(path: Path, model: Model, *, space: str = "ras", units: str = "kP
     if model.order != 1 and not kind.has_quadratic:
         able = ", ".join(name for name, other in FORMATS.items() if other.has_quadratic)
         raise InputError(f"{path}: only {able} take quadratic cells; leave out --order 2")
-    return kind.write(in_units(in_space(model, space), units))
+    return kind.write(_named(path, in_units(in_space(model, space), units), kind))
+
+
+def _named(path: Path, model: Model, kind: Format) -> Model:
+    """The model, its data called as the format can hold it, which a warning tells where it changes a name.
+
+    Raises
+    ------
+    InputError
+        Sets with names that not every format can carry, or that differ by case alone.
+    """
+    sets = [*model.sets.facets, *model.sets.cells]
+    if odd := [name for name in sets if not SET_NAME.fullmatch(name)]:
+        words = f"letters, digits, _ and -, got {plain(odd[0])!r}"
+        raise InputError(f"{path}: the name of a set is a letter, then up to {MOST_LETTERS - 1} {words}")
+    if len({name.lower() for name in sets}) < len(sets):
+        twice = next(name for k, name in enumerate(sets) if name.lower() in {each.lower() for each in sets[:k]})
+        raise InputError(f"{path}: two sets are called {twice}; call one of them otherwise")
+    shown = short_name if kind.has_short_names else file_name
+    names = [names_apart(data, shown) for data in (model.cell_data, model.point_data, model.about)]
+    if changed := [new for each in names for old, new in each.items() if old != new]:
+        warnings.warn(f"{path}: data with names that it cannot hold are called {', '.join(changed)}", stacklevel=2)
+    cell_data, point_data, about = (
+        {new[name]: values for name, values in data.items()}
+        for new, data in zip(names, (model.cell_data, model.point_data, model.about), strict=True)
+    )
+    return model._replace(cell_data=cell_data, point_data=point_data, about=about)

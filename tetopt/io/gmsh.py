@@ -34,7 +34,7 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.io.tags import (
-    as_scalars,
+    as_columns,
     cell_tags,
     check_apart,
     facet_tags,
@@ -43,7 +43,7 @@ from tetopt.io.tags import (
     tag_lines,
     without_data,
 )
-from tetopt.io.text import rows
+from tetopt.io.text import comment_lines, names_apart, rows
 from tetopt.model.fields import node_field
 from tetopt.model.model import Model, element_facets, elements
 from tetopt.model.sets import facet_triples
@@ -182,7 +182,7 @@ def _file(header: str, comments: list[str], parts: list[Part], *sections: str) -
     return "".join(
         [
             _section("MeshFormat", f"{header}\n"),
-            _section("Comments", *(f"{line}\n" for line in comments)),
+            _section("Comments", comment_lines(comments)),
             _section("PhysicalNames", f"{len(names)}\n", *names),
             *sections,
         ]
@@ -322,11 +322,8 @@ def _view(section: str, name: str, numbers: NDArray[np.int64], values: NDArray) 
 
 def _view_columns(fields: dict[str, NDArray]) -> dict[str, NDArray[np.float64]]:
     """Fields as views hold them: numbers, vectors and tensors; the columns of others one by one."""
-    columns: dict[str, NDArray[np.float64]] = {}
-    for name, values in fields.items():
-        exact = values.astype(np.float64)
-        columns |= {name: exact} if exact.shape[1:] in VIEW_SHAPES else as_scalars(name, exact)
-    return columns
+    names = names_apart(fields, lambda name: name.replace('"', "'"))  # which gmsh knows no way to write
+    return as_columns({names[name]: values.astype(np.float64) for name, values in fields.items()}, VIEW_SHAPES)
 
 
 def _fields(model: Model) -> dict[str, NDArray[np.float64]]:

@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.io.tags import cell_tags, facet_tags, remarks, tag_lines, without_data
-from tetopt.io.text import rows
+from tetopt.io.text import comment_lines, rows
 from tetopt.model.model import Model, element_facets, elements
 
 ELEMENT_KEYWORDS = {1: "Edges", 2: "Triangles", 3: "Tetrahedra"}
@@ -38,7 +38,7 @@ def medit(model: Model) -> bytes:
     return "".join(
         [
             "MeshVersionFormatted 2\n\n",
-            *(f"# {line}\n" for line in comments),
+            comment_lines(comments, "# "),
             f"\nDimension {mesh.ndim}\n",
             _section("Vertices", points, np.zeros(len(points), dtype=np.int64)),
             _section(cells, nodes + 1, in_cells.tags),

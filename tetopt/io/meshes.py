@@ -1,10 +1,10 @@
-"""Meshes from files and into them: VTU and VTK through pyvista, and gmsh's MSH."""
+"""Meshes from files: VTU and VTK through pyvista, and gmsh's MSH."""
 
 from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,12 +13,11 @@ from tetopt.errors import InputError
 from tetopt.geometry.quadratic import numbered_edges
 from tetopt.geometry.simplex import oriented
 from tetopt.incoming import regular_file
-from tetopt.io.files import save_bytes
 from tetopt.io.raw import CELL_DIMENSIONS, CORNER_KINDS, Raw, by_corners
 from tetopt.io.read_gmsh import read_msh
 from tetopt.io.read_vtk import Grid, read_vtk
 from tetopt.io.text import plain
-from tetopt.io.vtk import ON_PREFIX, add_texts, box_in, sets_in, text_in, to_vtk, vtu_bytes
+from tetopt.io.vtk import ON_PREFIX, box_in, sets_in, text_in
 from tetopt.mesh import Mesh
 from tetopt.model.fields import half_turned_fields, is_stress, stresses_times
 from tetopt.model.model import STRESS_UNITS, half_turn
@@ -57,26 +56,6 @@ class MeshFile(NamedTuple):
     def text(self, name: str) -> str | None:
         """A text among the field data, if it is there."""
         return text_in(self.field_data, name)
-
-
-def save_mesh(
-    path: str | Path,
-    mesh: Mesh,
-    cell_data: dict[str, NDArray] | None = None,
-    about: dict[str, Any] | None = None,
-    point_data: dict[str, NDArray] | None = None,
-    order: int = 1,
-) -> None:
-    """Write a VTU file, whole or not at all.
-
-    Points in world mm (RAS+), cells positively oriented, of order 1 or 2, `cell_data` and `point_data` by name, the
-    latter with a row for each mesh point or for each node of order 2; each entry of `about` becomes a field-data text,
-    as JSON unless it is a string already. `tetopt.save_model` writes more, and other formats. Replaces an existing
-    file; ask `tetopt.io.files.checked_output` first.
-    """
-    grid = to_vtk(mesh, cell_data, point_data, order)
-    add_texts(grid, about or {})
-    save_bytes(path, vtu_bytes(grid))
 
 
 def load_mesh(path: str | Path) -> MeshFile:
@@ -280,7 +259,7 @@ def _space(path: Path, field_data: dict[str, NDArray]) -> str:
 
 
 def _decoded(values: NDArray) -> NDArray:
-    """`values`; if they are bytes of UTF-8, as `save_mesh` writes texts, that text as an array of one string."""
+    """`values`; if they are bytes of UTF-8, as we write texts, that text as an array of one string."""
     if values.dtype != np.uint8:
         return values
     try:

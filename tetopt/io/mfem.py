@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.io.tags import cell_tags, facet_tags, remarks, tag_lines, without_data
-from tetopt.io.text import blocks, rows
+from tetopt.io.text import blocks, comment_lines, rows
 from tetopt.mesh import Mesh
 from tetopt.model.model import Model
 from tetopt.model.sets import facet_triples
@@ -50,7 +50,7 @@ def mfem(model: Model) -> bytes:
     return "".join(
         [
             "MFEM mesh v1.3\n\n",
-            *(f"# {line}\n" for line in comments),
+            comment_lines(comments, "# "),
             f"\ndimension\n{mesh.ndim}\n",
             "\nelements\n",
             _elements(in_cells.tags, mesh.ndim, mesh.cells),

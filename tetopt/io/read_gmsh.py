@@ -112,9 +112,13 @@ def _by_value(tags: NDArray) -> dict[int, NDArray[np.int64]]:
 
 
 def _section(text: bytes, name: str) -> bytes:
-    """What stands between $NAME and $EndNAME, first of all."""
-    start = text.find(f"${name}".encode())
-    return b"" if start < 0 else text[text.index(b"\n", start) + 1 : text.find(f"$End{name}".encode(), start)]
+    """What stands between the lines $NAME and $EndNAME, first of all; names may hold such words."""
+    head = f"${name}".encode()
+    start = 0 if text.startswith(head) else text.find(b"\n" + head) + 1
+    if not text.startswith(head, start):
+        return b""
+    before = text.index(b"\n", start)
+    return text[before + 1 : text.find(f"\n$End{name}".encode(), before)]
 
 
 def _physical_names(text: bytes) -> dict[tuple[int, int], str]:

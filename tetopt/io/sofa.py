@@ -84,7 +84,7 @@ def sofa(model: Model) -> bytes:
         *_sets(model),
         "</Node>\n</Node>\n",
     ]
-    return "".join(scene).encode("utf-8", "replace")
+    return "".join(scene).encode()
 
 
 def _checked(model: Model) -> Materials:

@@ -12,8 +12,10 @@ from numpy.typing import NDArray
 from tetopt.errors import InputError
 from tetopt.geometry.surface import Surface, surface_of
 from tetopt.io.files import save_bytes
-from tetopt.io.vtk import LEGACY_VERSION
+from tetopt.io.text import plain
+from tetopt.io.vtk import LEGACY_VERSION, written_bytes, xml_bytes
 from tetopt.model.model import Model, half_turn
+from tetopt.model.sets import MOST_LETTERS, SET_NAME
 
 if TYPE_CHECKING:
     import pyvista
@@ -66,6 +68,11 @@ def save_surface(
         raise InputError(f"{path}: expected a surface named {' or '.join(SURFACE_SUFFIXES)}")
     if labels and path.suffix.lower() not in LABELLED_SUFFIXES:
         raise InputError(f"{path}: STL holds no labels of triangles; take {' or '.join(LABELLED_SUFFIXES)}")
+    if odd := [name for name in labels or {} if not SET_NAME.fullmatch(name)]:
+        raise InputError(
+            f"{path}: labels of triangles are called by a letter, then up to {MOST_LETTERS - 1} letters, digits, _ and "
+            f'-, got "{plain(odd[0])}"; call them otherwise'
+        )
     if space == "lps":
         surface = surface._replace(points=half_turn(surface.points))
     whole = writers[path.suffix.lower()](surface, about, space, labels or {})
@@ -129,14 +136,14 @@ def _from_vtk(path: str | Path) -> Any:
     return trimesh.Trimesh(np.asarray(grid.points, dtype=np.float64), grid.regular_faces)
 
 
-def _plain(about: str) -> str:
+def _ascii_line(about: str) -> str:
     """One line of ASCII."""
-    return " ".join(about.encode("ascii", "replace").decode().split())
+    return plain(" ".join(about.split())).encode("ascii", "replace").decode()
 
 
 def _stl(surface: Surface, about: str, space: str, labels: Labels) -> bytes:
     # A binary file must not begin with "solid", by which some readers know a file of text.
-    header = f"tetopt {SPACE_KEY}{space.upper()} mm {_plain(about)}".encode()[:80].ljust(80)
+    header = f"tetopt {SPACE_KEY}{space.upper()} mm {_ascii_line(about)}".encode()[:80].ljust(80)
     triangles = np.zeros(len(surface.triangles), dtype=STL_TRIANGLE)
     corners = surface.points[surface.triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -150,7 +157,7 @@ def _ply(surface: Surface, about: str, space: str, labels: Labels) -> bytes:
         "ply",
         "format binary_little_endian 1.0",
         f"comment {SPACE_KEY}{space.upper()}",
-        f"comment tetopt; mm; {_plain(about)}".rstrip("; "),
+        f"comment tetopt; mm; {_ascii_line(about)}".rstrip("; "),
         f"element vertex {len(surface.points)}",
         *(f"property double {axis}" for axis in "xyz"),
         f"element face {len(surface.triangles)}",
@@ -170,26 +177,17 @@ def _vtp(surface: Surface, about: str, space: str, labels: Labels) -> bytes:
 
     grid = _grid(surface, labels)
     grid.field_data[SPACE_KEY.rstrip("=")] = [space.upper()]
-    writer = vtkXMLPolyDataWriter()
-    writer.SetDataModeToBinary()
-    writer.SetInputData(grid)
-    writer.WriteToOutputStringOn()
-    writer.Write()
-    return writer.GetOutputString().encode()
+    return xml_bytes(vtkXMLPolyDataWriter(), grid)
 
 
 def _vtk(surface: Surface, about: str, space: str, labels: Labels) -> bytes:
     from vtkmodules.vtkIOLegacy import vtkPolyDataWriter
 
     writer = vtkPolyDataWriter()
-    writer.SetHeader(f"tetopt, mm, {SPACE_KEY}{space.upper()} {_plain(about)}"[:250])  # a line of 256 characters
+    writer.SetHeader(f"tetopt, mm, {SPACE_KEY}{space.upper()} {_ascii_line(about)}"[:250])  # a line of 256 characters
     writer.SetFileVersion(LEGACY_VERSION)
     writer.SetFileTypeToBinary()
-    writer.SetInputData(_grid(surface, labels))
-    writer.WriteToOutputStringOn()
-    writer.Write()
-    text = writer.GetOutputStdString()  # bytes, if they are no text
-    return text if isinstance(text, bytes) else text.encode()
+    return written_bytes(writer, _grid(surface, labels))
 
 
 def _grid(surface: Surface, labels: Labels) -> pyvista.PolyData:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Container
 from typing import NamedTuple
 
 import numpy as np
@@ -9,6 +10,7 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.geometry.topology import facets
+from tetopt.io.text import free_text
 from tetopt.mesh import Mesh
 from tetopt.model.loads import count_of_steps, load_words
 from tetopt.model.model import Model, described
@@ -122,11 +124,20 @@ def without_data(model: Model) -> list[str]:
     return [f"{what}, which this format has no place for: {', '.join(data)}" for what, data in left_out.items() if data]
 
 
-def as_scalars(name: str, values: NDArray) -> dict[str, NDArray]:
-    """Cell or point data as scalars by name: the columns of what has several are numbered, NAME_0, NAME_1, ..."""
-    if values.ndim == 1:
-        return {name: values}
-    return {f"{name}_{k}": column for k, column in enumerate(values.reshape(len(values), -1).T)}
+def as_columns(fields: dict[str, NDArray], shapes: Container[tuple[int, ...]] = ()) -> dict[str, NDArray]:
+    """Cell or point data as scalars by name: the columns of what has several are numbered, NAME_0, NAME_1, ...
+
+    Rows of one of the `shapes` stay as they are. A column that is then called as another field is takes another name.
+    """
+    whole = {name for name, values in fields.items() if values.ndim == 1 or values.shape[1:] in shapes}
+    columns: dict[str, NDArray] = {}
+    for name, values in fields.items():
+        if name in whole:
+            columns[name] = values
+            continue
+        for k, column in enumerate(values.reshape(len(values), -1).T):
+            columns[free_text(f"{name}_{k}", {*whole, *columns})] = column
+    return columns
 
 
 def tag_lines(tags_of: dict[str, list[int]], what: str) -> list[str]:

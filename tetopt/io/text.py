@@ -4,10 +4,17 @@ from __future__ import annotations
 
 import re
 import unicodedata
+from collections.abc import Callable, Container, Iterable
+from itertools import accumulate, chain, count
+from urllib.parse import quote
+from xml.sax.saxutils import escape
 
 from numpy.typing import NDArray
 
 NUMBERS_PER_LINE = 16  # Abaqus takes no more
+# Of a field's name where readers have lines of 256 characters: gmsh's, and legacy VTK's, percent-encoded there.
+MOST_NAME_CHARACTERS = 240
+UNNAMED_FIELD = "unnamed"  # VTK cannot read a file again that has a field without a name
 
 
 def rows(*columns: NDArray, separator: str = " ") -> str:
@@ -47,10 +54,58 @@ def _escaped(letter: str) -> str:
     return letter.encode("unicode_escape").decode("ascii")
 
 
-def xml_comment(lines: list[str]) -> str:
-    """Lines as a comment of XML, which has no two hyphens in one."""
-    text = re.sub("-(?=-)", "- ", "\n".join(lines))
-    return f"<!--\n{text}\n-->\n"
+def file_name(name: str) -> str:
+    """A field's name as every format can hold it: `plain`, and not without a letter."""
+    return plain(name) if name.strip() else UNNAMED_FIELD
+
+
+def short_name(name: str) -> str:
+    """The first letters of a `file_name`, as many as fit into `MOST_NAME_CHARACTERS`, percent-encoded."""
+    name = file_name(name)
+    if len(name) <= MOST_NAME_CHARACTERS and len(quote(name)) <= MOST_NAME_CHARACTERS:
+        return name
+    sizes = accumulate(len(quote(letter)) for letter in name[:MOST_NAME_CHARACTERS])
+    return name[: sum(size <= MOST_NAME_CHARACTERS for size in sizes)]
+
+
+def names_apart(names: Iterable[str], shown: Callable[[str], str]) -> dict[str, str]:
+    """What each of some names becomes: `shown` of it, numbered where another is called so.
+
+    Those that can keep their names do.
+
+    Examples
+    --------
+    >>> names_apart(["a b", "A B", "a-b"], lambda name: name.lower().replace(" ", "-"))
+    {'a b': 'a-b_2', 'A B': 'a-b_3', 'a-b': 'a-b'}
+    """
+    known = {name: shown(name) for name in names}
+    taken = {name for name, text in known.items() if text == name}
+    for name, text in known.items():
+        if text == name:
+            continue
+        known[name] = free_text(text, taken)
+        taken.add(known[name])
+    return known
+
+
+def free_text(text: str, taken: Container[str]) -> str:
+    """The text, numbered from 2 where it is taken."""
+    return next(each for each in chain([text], (f"{text}_{number}" for number in count(2))) if each not in taken)
+
+
+def comment_lines(lines: Iterable[str], mark: str = "") -> str:
+    """A line for each of some texts, whatever they hold, that begins with a format's mark of comments."""
+    return "".join(f"{mark}{plain(line)}\n" for line in lines)
+
+
+def xml_comment(lines: Iterable[str]) -> str:
+    """Lines as a comment of XML, which has no two hyphens in one, and holds no control characters."""
+    return f"<!--\n{re.sub('-(?=-)', '- ', comment_lines(lines))}-->\n"
+
+
+def xml_attribute(text: str) -> str:
+    """Text as it stands between an attribute's double quotes."""
+    return escape(plain(text), {'"': "&quot;"})
 
 
 def blocks(numbers: NDArray, separator: str = " ") -> str:

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from tetopt.geometry.quadratic import quadratic
 from tetopt.image import Image
+from tetopt.io.text import xml_attribute
 from tetopt.mesh import Mesh
 from tetopt.model.fields import GAUSS_MODULI, NODE_MODULI, is_stress, node_field
 from tetopt.model.loads import load_words
@@ -33,7 +34,7 @@ from tetopt.model.model import Model, element_facets, elements
 from tetopt.model.sets import SET_NAME, Box, Sets
 
 if TYPE_CHECKING:
-    from vtkmodules.vtkCommonDataModel import vtkFieldData, vtkUnstructuredGrid
+    from vtkmodules.vtkCommonDataModel import vtkDataSet, vtkFieldData, vtkUnstructuredGrid
 
 CELL_TYPES = {(2, 1): 5, (3, 1): 10, (2, 2): 22, (3, 2): 24}  # VTK's numbers, by dimension and order
 # Names of field data and of point data in our files, see above.
@@ -91,7 +92,9 @@ def _add(fields: vtkFieldData, name: str, values: NDArray) -> None:
 
 def vtu(model: Model) -> bytes:
     """A VTU file, exact, compressed."""
-    return vtu_bytes(model_grid(model))
+    from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
+
+    return xml_bytes(vtkXMLUnstructuredGridWriter(), model_grid(model))
 
 
 def vtk(model: Model) -> bytes:
@@ -107,7 +110,7 @@ def vtk(model: Model) -> bytes:
     writer.SetHeader(f"tetopt, mm, SPACE={model.space.upper()}")
     writer.SetFileVersion(LEGACY_VERSION)
     writer.SetFileTypeToBinary()
-    return _written(writer, grid)
+    return written_bytes(writer, grid)
 
 
 def _without_int64(values: NDArray) -> NDArray:
@@ -123,17 +126,21 @@ def _without_int64(values: NDArray) -> NDArray:
     return values.astype(np.int32 if fits else np.float64)
 
 
-def vtu_bytes(grid: vtkUnstructuredGrid) -> bytes:
-    """A grid as the bytes of a VTU file."""
-    from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
-
-    writer = vtkXMLUnstructuredGridWriter()
+def xml_bytes(writer: Any, grid: vtkDataSet) -> bytes:
+    """A grid as what one of VTK's XML writers makes of it, whose arrays take the names that stand in the file."""
+    for fields in (grid.GetCellData(), grid.GetPointData(), grid.GetFieldData()):
+        for number in range(fields.GetNumberOfArrays()):
+            array = fields.GetAbstractArray(number)
+            array.SetName(xml_attribute(array.GetName()))  # VTK 9.7 writes them as they are
     writer.SetDataModeToBinary()
-    return _written(writer, grid)
+    return written_bytes(writer, grid)
 
 
-def _written(writer: Any, grid: vtkUnstructuredGrid) -> bytes:
-    # VTK writes into memory and Python to the disk: on a full one VTK reports nothing, or ends the process.
+def written_bytes(writer: Any, grid: vtkDataSet) -> bytes:
+    """What one of VTK's writers makes of a grid.
+
+    VTK writes into memory and Python to the disk: on a full one VTK reports nothing, or ends the process.
+    """
     writer.SetInputData(grid)
     writer.WriteToOutputStringOn()
     if not writer.Write():

@@ -83,15 +83,13 @@ the cells is from some 400 000 tetrahedra on: take .vtu for those. meshio 5.3.5 
 
 from __future__ import annotations
 
-from xml.sax.saxutils import quoteattr
-
 import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.geometry.topology import facets
-from tetopt.io.tags import Tagged, as_scalars, tagged
-from tetopt.io.text import rows
+from tetopt.io.tags import Tagged, as_columns, tagged
+from tetopt.io.text import rows, xml_attribute
 from tetopt.model.fields import NODE_MODULI, node_field
 from tetopt.model.loads import load_words
 from tetopt.model.model import Model, described, element_facets, elements
@@ -163,10 +161,7 @@ def _mesh_grid(model: Model) -> str:
 
 def _columns(fields: dict[str, NDArray]) -> dict[str, NDArray]:
     """Fields as VTK takes them for what they are: scalars and vectors, no matrices."""
-    columns: dict[str, NDArray] = {}
-    for name, values in fields.items():
-        columns |= {name: values} if np.shape(values)[1:] == (3,) else as_scalars(name, np.asarray(values))
-    return columns
+    return as_columns(fields, shapes=((3,),))
 
 
 def _facet_grid(model: Model) -> str:
@@ -190,7 +185,7 @@ def _tag_grid(name: str, model: Model, dim: int, nodes: NDArray[np.int64], combi
 
 def _attributes(columns: dict[str, NDArray], center: str) -> str:
     return "".join(
-        f'<Attribute Name={_quoted(name)} AttributeType="{"Scalar" if values.ndim == 1 else "Vector"}" '
+        f'<Attribute Name="{xml_attribute(name)}" AttributeType="{"Scalar" if values.ndim == 1 else "Vector"}" '
         f'Center="{center}">\n{_item(values)}</Attribute>\n'
         for name, values in columns.items()
     )
@@ -216,12 +211,7 @@ def _item(values: NDArray) -> str:
 
 
 def _information(name: str, value: str) -> str:
-    return f"<Information Name={_quoted(name)} Value={_quoted(value)}/>\n"
-
-
-def _quoted(text: str) -> str:
-    """An attribute's value; XML has no place for control characters, nor UTF-8 for bytes that were none."""
-    return quoteattr("".join(letter if letter.isprintable() else "?" for letter in text))
+    return f'<Information Name="{xml_attribute(name)}" Value="{xml_attribute(value)}"/>\n'
 
 
 def _listed(values: NDArray[np.float64]) -> str:

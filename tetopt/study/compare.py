@@ -31,8 +31,9 @@ from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import dihedral_angles
 from tetopt.image import Image
 from tetopt.io.files import save_json
+from tetopt.io.formats import save_mesh
 from tetopt.io.images import sha256
-from tetopt.io.meshes import load_mesh, save_mesh
+from tetopt.io.meshes import load_mesh
 from tetopt.measure.fidelity import cell_labels, label_fidelity
 from tetopt.measure.interfaces import label_interfaces
 from tetopt.measure.quality import quality, rho_histogram
