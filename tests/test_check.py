@@ -44,6 +44,21 @@ def test_faults(mesh):
     assert inner >= 0
 
 
+def test_beyond_the_box(mesh):
+    """A mesh that need not fill the box still lies in it."""
+    part = tetopt.Mesh(mesh.points, mesh.cells)
+    shrunk = tetopt.Mesh(part.points * 0.9 + 0.1, part.cells)
+    assert tetopt.check_mesh(shrunk, IMAGE, is_filled=False) == []
+    index = IMAGE.to_index(part.points)
+    corner = int(np.flatnonzero((index == -0.5).all(axis=1))[0])
+    index[corner] -= (0.0, 0.25, 0.125)
+    out = tetopt.Mesh(IMAGE.to_world(index), part.cells)
+    words = f"nodes up to 0.25 voxels beyond the image's box: 1, the first [{corner}]"
+    assert tetopt.check_mesh(out, IMAGE, is_filled=False) == [words]
+    assert words in tetopt.check_mesh(out, IMAGE)
+    assert tetopt.check_mesh(out) == []
+
+
 def cubes(labels):
     """A block of cells for each voxel, and which of them have label 1."""
     image = tetopt.Image(labels)

@@ -25,6 +25,8 @@ import tetopt.cli.phantom
 import tetopt.engine.meshing
 from tetopt import Image, Mesh, lattice, load_image, load_mesh, load_phantom, quality, save_image, save_mesh
 from tetopt.cli.app import COMMANDS, loaded_command
+from tetopt.cli.promises import check_promises
+from tetopt.engine.loop import Optimized
 from tetopt.geometry.simplex import volumes
 from tetopt.measure.segmentation import dice, segmented
 from tetopt.phantom import phantom_names
@@ -341,21 +343,16 @@ def test_max_seconds_leaves_a_valid_mesh(tmp_path, inputs, capsys):
     assert "out of time: the mesh so far is kept" in capsys.readouterr().err
 
 
-def test_a_mesh_that_misses_voxels_is_told(run, capsys):
-    _, _, file, image = run
-    result = tetopt.optimize(image, file.mesh, iterations=0)
-    assert tetopt.cli.promises.check_promises(tetopt.content(image), result, 0.0, None, {}) == 0
+def test_a_promise_that_is_missed_ends_with_1(capsys):
+    result = Optimized(None, [], "iterations")
+    assert check_promises(result, {}) == 0
     assert capsys.readouterr().err == ""
-    row = result.history[-1]
-    fewer = result._replace(history=[row._replace(n_voxels=row.n_voxels - 1)])
-    assert tetopt.cli.promises.check_promises(tetopt.content(image), fewer, 0.0, None, {}) == 1
-    assert "1 voxels are outside" in capsys.readouterr().err
-    flat = result._replace(history=[row._replace(iteration=1)])
-    assert tetopt.cli.promises.check_promises(tetopt.content(image), flat, 60.0, None, {}) == 1
-    assert re.search(r"tetopt: \d+ of \d+ cells have an angle under 60 degrees", capsys.readouterr().err)
-    smaller = result._replace(mesh=Mesh(file.mesh.points * 0.999, file.mesh.cells))
-    assert tetopt.cli.promises.check_promises(tetopt.content(image), smaller, 0.0, None, {}) == 1
-    assert capsys.readouterr().err.count("\n") == 1
+    missed = {"floor": "2 of 9 cells; allow a lower k_D, or a lower min_dihedral", "box": "k_D.nii lies beyond"}
+    assert check_promises(result._replace(missed=missed), {}) == 1
+    said = capsys.readouterr().err
+    assert said == (
+        "tetopt: 2 of 9 cells; allow a lower --k-d, or a lower --min-dihedral\ntetopt: k_D.nii lies beyond\n"
+    )
 
 
 # --------------------------------------------------------------------------------------------------
@@ -459,8 +456,8 @@ BAD_OPTIONS = [
     ("--lattice fcc", "--lattice"),
     ("--method fast --n-t 2", "--n-t: only with --method paper"),
     ("--method paper --shape-power 3", "--shape-power: only with --method fast"),
-    ("--min-dihedral 80", "min_dihedral: expected 0 to below 70"),
-    ("--shape-power 0.5", "shape_power: expected 1"),
+    ("--min-dihedral 80", "--min-dihedral: expected 0 to below 70"),
+    ("--shape-power 0.5", "--shape-power: expected 1"),
     ("--boundary free", "--boundary"),
     ("--retessellate always", "--retessellate"),
     ("--slice z", 'slice: expected .* got "z"'),
@@ -932,10 +929,10 @@ def test_many_more_cells_than_voxels_are_said(tmp_path, capsys):
         (["--nodes", "100", "--size-max", "6"], "100 nodes are too few for 16 x 16 x 16 voxels and these limits"),
         (["--nodes", "100", "--edge-max", "6"], "100 nodes are too few for 16 x 16 x 16 voxels and these limits"),
         (["--size-max", "0.2"], "sizes: so short edges are asked for that cells are below voxels"),
-        (["--edge-max", "0"], "edge_max: expected a length above 0"),
-        (["--size-min", "9", "--edge-max", "8"], "edge_max: 8 mm is below the smallest size, 9 mm"),
-        (["--size-max", "-1"], "size_max: expected a length above 0"),
-        (["--size-min", "9", "--size-max", "8"], "size_max: 8 mm is below the smallest size, 9 mm"),
+        (["--edge-max", "0"], "--edge-max: expected a length above 0"),
+        (["--size-min", "9", "--edge-max", "8"], "--edge-max: 8 mm is below the smallest size, 9 mm"),
+        (["--size-max", "-1"], "--size-max: expected a length above 0"),
+        (["--size-min", "9", "--size-max", "8"], "--size-max: 8 mm is below the smallest size, 9 mm"),
         (["--gradation", "3"], "gradation: expected 0.05 (gentle) to 1, got 3"),
         (["--sizing", "missing.nii"], "missing.nii"),
     ],

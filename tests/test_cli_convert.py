@@ -12,7 +12,6 @@ from commands import exit_code, labelled_lattice_words, numbers_in
 from models import sample_image
 
 import tetopt
-from tetopt.cli.promises import check_promises
 from tetopt.geometry.quadratic import quadratic
 from tetopt.geometry.topology import boundary_facets, largest_component
 from tetopt.io.formats import FORMATS
@@ -461,19 +460,6 @@ def test_loads_of_another_kind_in_a_file_are_left(folder, tmp_path, text):
     grid.save(tmp_path / "a.vtu")
     assert exit_code("convert", tmp_path / "a.vtu", tmp_path / "b.inp", "--young", "2") == 0
     assert "*STEP" not in (tmp_path / "b.inp").read_text()
-
-
-def test_a_promise_is_broken_where_a_start_covers_less(folder):
-    image = sample_image(3)
-    start = tetopt.load_mesh(folder / "a.vtu").mesh
-    result = tetopt.optimize(image, start, boundary="fixed", iterations=1)
-    content = tetopt.content(image)
-    assert check_promises(content, result, 0.0, None, {}, start) == 0
-    smaller = result._replace(mesh=tetopt.Mesh(start.points * 0.999, start.cells))
-    assert check_promises(content, smaller, 0.0, None, {}, start) == 1
-    last = result.history[-1]
-    fewer = result._replace(history=[*result.history, last._replace(n_voxels=last.n_voxels - 1)])
-    assert check_promises(content, fewer, 0.0, None, {}, start) == 1
 
 
 def test_loads_run_or_are_said_to_be_in_comments(folder, tmp_path, capsys):

@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tetopt.errors import InputError
-from tetopt.geometry.box import box_sides, facets_on_sides
+from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides, facets_on_sides
 from tetopt.geometry.manifold import OUTSIDE_LABEL, label_surfaces, surface_fans, surface_ridges
 from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import Facets, boundary_facets, components, facets, folded
@@ -19,6 +19,7 @@ def check_mesh(
     image: Image | None = None,
     *,
     is_whole: bool = True,
+    is_filled: bool = True,
     is_manifold: bool = True,
     of_cell: ArrayLike | None = None,
 ) -> list[str]:
@@ -27,16 +28,19 @@ def check_mesh(
     In a mesh every node is used, and no two lie in the same place; every cell is positively oriented, has distinct
     corners and is there once; every facet is in one or two cells, which lie on its two sides (so the mesh conforms and
     does not fold); the boundary is closed, a manifold (`manifold_problems`), and one piece. With labels, so are their
-    interfaces manifolds. With an image also the boundary's facets lie on the faces of its box, and the cells' volumes
-    add up to it.
+    interfaces manifolds. With an image no node lies beyond its box; if the mesh fills that, the boundary's facets lie
+    on the box's faces, and the cells' volumes add up to it.
 
     Parameters
     ----------
     mesh : Mesh
     image : Image, optional
-        The image whose box the mesh should fill. Without it overlaps of cells that share no facet are not found.
+        The image whose box the mesh should fill, or lie in. Only where it fills it, overlaps of cells that share no
+        facet are found.
     is_whole : bool
         Whether it should be one piece; a mask may have several.
+    is_filled : bool
+        Whether it should fill the image's box; a mask's only lies within it.
     is_manifold : bool
         Whether its boundary should be one; a mask's may be none.
     of_cell : (M,) array of whole numbers, optional
@@ -59,7 +63,7 @@ def check_mesh(
     problems = _problems_of_pieces(mesh) if is_whole else []
     problems += manifold_problems(mesh) if is_manifold else []
     problems += [] if of_cell is None else manifold_problems(mesh, of_cell)
-    problems += [] if image is None else _problems_with_box(mesh, image)
+    problems += [] if image is None else _problems_with_box(mesh, image, is_filled)
     return problems
 
 
@@ -200,8 +204,20 @@ def filled_share(mesh: Mesh, image: Image) -> float:
     return float(volumes(mesh.points, mesh.cells).sum()) / image.volume
 
 
-def _problems_with_box(mesh: Mesh, image: Image) -> list[str]:
+def beyond_box(mesh: Mesh, image: Image) -> NDArray[np.float64]:
+    """How far each node lies beyond the image's box, voxels along an index axis, (N,); below 0 inside."""
+    low, high = box_sides(image.shape).T
+    index = image.to_index(mesh.points)
+    return np.asarray(np.maximum(low - index, index - high).max(axis=1))
+
+
+def _problems_with_box(mesh: Mesh, image: Image, is_filled: bool) -> list[str]:
     problems = []
+    beyond = beyond_box(mesh, image)
+    if len(outside := np.flatnonzero(beyond > ON_SIDE_VOXELS)):
+        problems.append(f"nodes up to {beyond.max():.3g} voxels beyond the image's box: {_first(outside)}")
+    if not is_filled:
+        return problems
     outer, is_on_box = facets_on_box(mesh, image)
     if not is_on_box.all():
         problems.append(f"boundary facets off the faces of the image's box; nodes: {_first(outer[~is_on_box])}")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import errno
 import os
+import re
 import sys
 from contextlib import suppress
 from typing import IO, Any
@@ -16,6 +17,17 @@ from rich.text import Text
 from tetopt.io.text import plain
 
 WIDEST_TABLE = 500  # characters in a line
+PARAMETER_OPTIONS = {  # of the library's functions: what the command line calls them
+    **{
+        name: f"--{name.replace('_', '-').lower()}"
+        for name in (
+            "k_D", "min_dihedral", "shape_power", "target_error", "label_weight", "smooth_interfaces", "n_t",
+            "retessellate", "gradation", "boundary", "iterations", "nodes", "weights",
+        )
+    },
+    "smallest": "--size-min", "largest": "--size-max", "longest": "--edge-max", "field": "--sizing",
+}  # fmt: skip
+PARAMETER_PATTERN = re.compile(rf"(?:(?<=a lower )|(?<=a higher )|^(?=\w+:))(?:{'|'.join(PARAMETER_OPTIONS)})\b")
 
 
 class _Stream:
@@ -117,8 +129,13 @@ def error_words(error: Exception) -> str:
 
 
 def show_error(message: object) -> None:
-    """Say what is wrong, on one line."""
-    log.print(f"[bold red]tetopt:[/] {escape(plain(str(message)))}")
+    """Say what is wrong, on one line, with the command's names for options."""
+    log.print(f"[bold red]tetopt:[/] {escape(plain(in_options(str(message))))}")
+
+
+def in_options(message: str) -> str:
+    """A message of the library with the command's options for its parameters, at its head and in its advice."""
+    return PARAMETER_PATTERN.sub(lambda name: PARAMETER_OPTIONS[name[0]], message)
 
 
 def show_warning(message: Warning | str, *_: Any, **__: Any) -> None:

@@ -264,8 +264,7 @@ def _print(task: Task, outcome: Outcome, model: Model, measured: dict[str, Any])
     """
     plan, content, result = task.plan, task.source.content, outcome.result
     solver, output = plan.solver, plan.output
-    start = None if task.started is None else task.started.mesh
-    code = check_promises(content, result, plan.engine.min_dihedral or 0.0, plan.sizes.target_error, measured, start)
+    code = check_promises(result, measured)
     is_constant = content.image.data.min() == content.image.data.max()
     n_empty = 0 if is_constant else int((model.cell_data["n_voxels"] == 0).sum())
     is_counted = plan.mode == "graded" and plan.sizes.target_error is None

@@ -98,7 +98,7 @@ def _checked(loaded: MeshFile, image: Image | None, mask: Image | None, is_maske
     """
     n_touching = 0 if mask is None else touching_voxels(mask.data >= INSIDE_SHARE)
     problems = tetopt.check_mesh(
-        loaded.mesh, None if is_masked else image, is_whole=not is_masked, is_manifold=n_touching == 0
+        loaded.mesh, image, is_whole=not is_masked, is_filled=not is_masked, is_manifold=n_touching == 0
     )
     if problems:
         return problems, []

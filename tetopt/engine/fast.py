@@ -34,6 +34,7 @@ from tetopt.engine.loop import (
     relative_movement,
 )
 from tetopt.engine.paper import optimize_paper
+from tetopt.engine.promises import promised
 from tetopt.engine.repair import n_cells_below, repair
 from tetopt.engine.smooth import _gradients, attract, blocks, sweep
 from tetopt.engine.state import content_energies, floor_of, state_of, with_floor
@@ -119,10 +120,11 @@ def optimize(
     Returns
     -------
     Optimized
-        Mesh, history and why it ended. The mesh covers the same domain, every cell is positively oriented. E never
-        rises from one record to the next, unless cells had to be lifted over the floor, for which nodes may be put in
-        or taken out, or nodes were exchanged, or brought between labels; it is another E once cells have labels. The
-        same bits on any number of threads.
+        Mesh, history, why it ended, and in `missed` which of its promises it does not keep (`tetopt.engine.promises`):
+        a floor that cells are under, voxels in two cells, a mask or labels that cells are too large for. The mesh
+        covers the same domain, every cell is positively oriented. E never rises from one record to the next, unless
+        cells had to be lifted over the floor, for which nodes may be put in or taken out, or nodes were exchanged, or
+        brought between labels; it is another E once cells have labels. The same bits on any number of threads.
 
     Raises
     ------
@@ -181,7 +183,7 @@ def optimize(
         if is_last and fall < tolerance:
             ended = "converged"
             break
-    return Optimized(run.mesh(), history, ended, labels=run.labels())
+    return promised(Optimized(run.mesh(), history, ended, labels=run.labels()), content, floor, mesh)
 
 
 def prepare_kernels(

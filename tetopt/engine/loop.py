@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from types import MappingProxyType
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -59,6 +60,8 @@ class Optimized(NamedTuple):
     seconds_start: float = 0.0  # for initial meshes, over all runs towards a target error
     seconds_run: float = 0.0  # for the optimisations, likewise
     labels: NDArray[np.int64] | None = None  # (M,) label of each cell, of a content with memberships
+    # What the mesh should be and is not, by name, a sentence each (`tetopt.engine.promises`); empty if it is all.
+    missed: Mapping[str, str] = MappingProxyType({})
 
 
 def deadline(begin: float, max_seconds: float | None, stop: Callable[[], bool] | None) -> Callable[[], bool]:

@@ -26,6 +26,7 @@ from tetopt.engine.loop import (
     Optimized,
 )
 from tetopt.engine.paper import optimize_paper
+from tetopt.engine.promises import requested
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import node_count
 from tetopt.image import Image
@@ -89,7 +90,7 @@ def mesh_image(
     target_error : float
         Instead of `nodes`, of a graded mesh: the share of the image's variance that may be left within cells, 0 to 1;
         as many nodes as that takes, found in a few runs, each with its own `max_seconds`. A run that ends above it
-        says so by its last record.
+        says so in `missed`.
     mode : {"graded", "uniform", "paper", "start"}
         "graded", the default: `octree`, then `optimize` with exchanges of nodes. "uniform": `lattice`, cut off at a
         mask, then `optimize`. "paper": `lattice`, then `optimize_paper`; of one image and its whole box. "start", the
@@ -121,7 +122,9 @@ def mesh_image(
     Returns
     -------
     Optimized
-        As `optimize`; its first record is of the initial mesh, which it holds, too.
+        As `optimize`; its first record is of the initial mesh, which it holds, too. A run that could not keep all that
+        it promises returns its mesh nevertheless, and says so in `missed`: empty if it did, else a sentence by name
+        (`floor`, `box`, `cover`, `overlap`, `mask`, `labels`, `error`; see `tetopt.engine.promises`).
 
     Raises
     ------
@@ -139,13 +142,11 @@ def mesh_image(
     """
     if mode is None:
         mode = "graded" if start is None else "start"
-    if order not in (1, 2):
-        raise InputError(f"mesh_image: expected order 1 or 2, got {order!r}")
     content = plain(image)
     values = {"nodes": nodes, "target_error": target_error, "spacing": spacing, "kind": kind, "start": start}
     if mode == "graded" and nodes is None and target_error is None and sizes is not None:
         nodes = values["nodes"] = _nodes_of(content, sizes, order)
-    _check_mode(mode, content, values | {"sizes": sizes})
+    _check_mode(mode, content, values | {"sizes": sizes}, order)
     default_k_D, default_iterations = MODE_DEFAULTS[mode]
     options["k_D"] = default_k_D if k_D is None else k_D
     options["iterations"] = default_iterations if iterations is None else iterations
@@ -186,6 +187,7 @@ def mesh_image(
     else:
         result = begun(nodes)
     seconds_run = sum(seconds)
+    result = requested(result, content, target_error, is_filled=mode != "start" and content.region is None)
     return result._replace(seconds_start=time.perf_counter() - begin - seconds_run, seconds_run=seconds_run)
 
 
@@ -197,10 +199,12 @@ def _nodes_of(content: Content, sizes: Sizes, order: int) -> int | None:
     return round(needed * (QUADRATIC_NODES[content.image.ndim] if order == 2 else 1.0))
 
 
-def _check_mode(mode: Mode, content: Content, values: dict[str, Any]) -> None:
+def _check_mode(mode: Mode, content: Content, values: dict[str, Any], order: int) -> None:
     """InputError for a mode that there is not, and for what does not belong to it."""
     if mode not in MODE_DEFAULTS:
         raise InputError(f"mesh_image: expected a mode of {', '.join(MODE_DEFAULTS)}, got {mode!r}")
+    if order not in (1, 2):
+        raise InputError(f"mesh_image: expected order 1 or 2, got {order!r}")
     names = [name for name, value in values.items() if value is not None]
     if strange := [name for name in names if name not in MODE_ARGUMENTS[mode]]:
         takes = ", ".join(MODE_ARGUMENTS[mode])

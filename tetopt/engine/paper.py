@@ -37,6 +37,7 @@ from tetopt.engine.loop import (
     relative_movement,
     side_ticks,
 )
+from tetopt.engine.promises import promised
 from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides, facets_on_sides
 from tetopt.geometry.simplex import squared_edges, volumes
@@ -44,6 +45,7 @@ from tetopt.geometry.topology import Facets, facets, greedy_colours, rings, star
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.start.delaunay import delaunay
+from tetopt.target.content import plain
 
 Retessellate = Literal["first", "accept", "never"]
 
@@ -156,7 +158,7 @@ def optimize_paper(
             ended = "converged"
             break
     points = image.to_world(from_ticks(tessellation.ticks, grid, image.ndim))
-    return Optimized(Mesh(points, tessellation.cells), history, ended)
+    return promised(Optimized(Mesh(points, tessellation.cells), history, ended), plain(image), 0.0, mesh)
 
 
 def default_n_t(k_D: float, iterations: int) -> int:

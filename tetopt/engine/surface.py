@@ -223,8 +223,13 @@ def slides(normal: Floats2, state: State, node: int) -> bool:
 
 @unit
 def put_on_surface(normal: Floats2, state: State, node: int) -> bool:
-    """Move a node to where its constraints are met, nearly the shortest way in its sides of the box; False if not."""
-    ticks, sides, scale = state.complex.ticks, state.sides, 2.0**-state.objective.bits
+    """Move a node to where its constraints are met, nearly the shortest way in its sides of the box; False if not.
+
+    A place beyond the box is brought back to its side first: there the level only goes on as it is at the side, and
+    would have its zero there, too.
+    """
+    ticks, scale = state.complex.ticks, 2.0**-state.objective.bits
+    _put_in_box(state, node)
     for step in range(CURVE_STEPS + 1):
         if is_on_surface(normal, state, node):
             return True
@@ -239,6 +244,14 @@ def put_on_surface(normal: Floats2, state: State, node: int) -> bool:
         if count > 1 and size > CURVE_STEP_VOXELS:
             way = scaled(CURVE_STEP_VOXELS / size, way)
         for d in range(3):
-            to = ticks[node, d] - np.int64(np.rint(way[d] / scale))
-            ticks[node, d] = min(max(to, sides.low[d]), sides.high[d])
+            ticks[node, d] -= np.int64(np.rint(way[d] / scale))
+        _put_in_box(state, node)
     return False
+
+
+@helper
+def _put_in_box(state: State, node: int) -> None:
+    """Move a node that is beyond a side of the box back to that side."""
+    ticks, sides = state.complex.ticks, state.sides
+    for d in range(3):
+        ticks[node, d] = min(max(ticks[node, d], sides.low[d]), sides.high[d])

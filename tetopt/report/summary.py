@@ -86,6 +86,7 @@ def run_summary(
         "history": result.history,
         "seconds": seconds,
         "mesh_sha256": mesh_hash(result.mesh),
+        "missed": dict(result.missed),
     }
 
 

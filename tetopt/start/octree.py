@@ -129,7 +129,7 @@ def _block_limits(content: Content, nodes: int, sizes: Sizes | None) -> _BlockLi
     sizes = (Sizes() if sizes is None else sizes).prepared(n)
     longest_side = float((image.spacing * image.shape).max())
     if sizes.smallest > longest_side:
-        raise InputError(f"size_min: {sizes.smallest:g} mm is longer than the box, {longest_side:.4g} mm")
+        raise InputError(f"smallest: {sizes.smallest:g} mm is longer than the box, {longest_side:.4g} mm")
     smallest = sizes.smallest / SHORTEST_IN_BLOCK[n]
     largest = max(sizes.longest_edge(image, nodes, content.volume) / LONGEST_IN_BLOCK[n], smallest)
     target = _target(image, sizes) if sizes.has_target else None
@@ -140,7 +140,7 @@ def _target(image: Image, sizes: Sizes) -> NDArray[np.float32]:
     """The target by voxel, mm; InputError where a field has none."""
     target = sizes.on_voxels(image)
     if target.min() >= NO_BOUND_MM:
-        raise InputError("sizing: no voxel above 0 lies in the image's box; do both lie in the same world mm?")
+        raise InputError("field: no voxel above 0 lies in the image's box; do both lie in the same world mm?")
     return target
 
 

@@ -91,8 +91,8 @@ class Sizes(NamedTuple):
             A value out of range, or a field of another dimension than n.
         """
         if not 0.0 <= self.smallest < np.inf:
-            raise InputError(f"size_min: expected 0 mm or more, got {self.smallest}")
-        for name, value in (("size_max", self.largest), ("edge_max", self.longest)):
+            raise InputError(f"smallest: expected 0 mm or more, got {self.smallest}")
+        for name, value in (("largest", self.largest), ("longest", self.longest)):
             if value is not None and not value > 0.0:
                 raise InputError(f"{name}: expected a length above 0 mm, got {value}")
             if value is not None and value < self.smallest:
@@ -100,9 +100,9 @@ class Sizes(NamedTuple):
         if not 0.05 <= self.gradation <= 1.0:
             raise InputError(f"gradation: expected 0.05 (gentle) to 1, got {self.gradation}")
         if self.field is not None and self.field.ndim != n:
-            raise InputError(f"sizing: expected a field in {n}-D, as the image, got {self.field.ndim}-D")
+            raise InputError(f"field: expected one in {n}-D, as the image is, got a {self.field.ndim}-D one")
         if self.field is not None and not (self.field.data > 0.0).any():
-            raise InputError("sizing: no voxel is above 0; give lengths in mm")
+            raise InputError("field: no voxel is above 0; give lengths in mm")
         return self if self.field is None else self._replace(field=_graded(self.field, self.gradation))
 
     def longest_edge(self, image: Image, nodes: int, volume: float | None = None) -> float:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from concurrent.futures import ThreadPoolExecutor
+from math import prod
 from typing import NamedTuple
 
 import numba
@@ -42,6 +43,7 @@ class Memberships(NamedTuple):
     channel: NDArray[np.int64]  # (K,) row of `levels` of each; labels nowhere near one another share one
     levels: NDArray[np.float32]  # (C, *shape) distance to the surface, voxels, below 0 inside
     partition: NDArray[np.int64]  # (*shape) row of `labels` of each voxel, that of the smallest level
+    parts: int = 1  # voxels of this grid to one of the labels'
 
 
 def supersampling(spacing: NDArray[np.float64]) -> tuple[int, ...]:
@@ -123,7 +125,7 @@ def memberships(labels: Image, factors: Sequence[int] | None = None) -> Membersh
             np.minimum(least, level, out=least)
     if off.any():
         _merge_crumbs(levels, partition, channel, off == 0.0)
-    return Memberships(values, channel, levels, partition)
+    return Memberships(values, channel, levels, partition, prod(factors))
 
 
 def _around(box: tuple[slice, ...], shape: tuple[int, ...]) -> tuple[slice, ...]:

@@ -1,0 +1,99 @@
+"""A result says what its mesh should be and is not; each promise broken by hand, one at a time."""
+
+import numpy as np
+import pytest
+from shapes import shaped
+
+import tetopt
+from tetopt.engine.promises import promised, requested
+from tetopt.target.content import content, plain
+
+
+def missed(target, result, min_dihedral=0.0, start=None):
+    return promised(result, plain(target), min_dihedral, result.mesh if start is None else start).missed
+
+
+def missed_request(image, result, target_error, is_filled):
+    return requested(result, plain(image), target_error, is_filled).missed
+
+
+@pytest.fixture(scope="module")
+def whole():
+    image, _ = shaped("ball")
+    return image, tetopt.mesh_image(image, 300, iterations=2)
+
+
+def test_a_run_that_keeps_all_misses_nothing(whole):
+    assert whole[1].missed == {}
+
+
+def test_the_floor(whole):
+    image, result = whole
+    words = missed(image, result, 60.0)
+    assert list(words) == ["floor"]
+    angles = tetopt.geometry.simplex.dihedral_angles(result.mesh.points, result.mesh.cells).min(axis=1)
+    assert words["floor"].startswith(f"{(angles < 60.0).sum()} of {len(angles)} cells have an angle under 60 degrees")
+    unmoved = result._replace(history=result.history[:1])
+    assert missed(image, unmoved, 60.0) == {}
+    # No mesh of tetrahedra has all angles so large: the run itself says so.
+    assert list(tetopt.mesh_image(image, 300, iterations=2, min_dihedral=65.0).missed) == ["floor"]
+
+
+def test_the_box_and_the_cover(whole):
+    image, result = whole
+    larger = result._replace(mesh=tetopt.Mesh(result.mesh.points * 1.01, result.mesh.cells))
+    assert list(missed(image, larger, start=result.mesh)) == ["box", "cover"]
+    assert list(missed(image, larger, start=larger.mesh)) == []  # as the user's own was
+    assert "0 voxels are outside" in missed_request(image, larger, None, True)["cover"]
+    last = result.history[-1]
+    fewer = result._replace(history=[*result.history, last._replace(n_voxels=last.n_voxels - 1)])
+    assert "-1 voxels" in missed(image, fewer)["cover"]
+    assert "1 voxels are outside" in missed_request(image, fewer, None, True)["cover"]
+    assert missed_request(image, fewer, None, False) == {}
+
+
+def test_the_error(whole):
+    image, result = whole
+    share = result.history[-1].E_D / (plain(image).variance * image.volume)
+    assert missed_request(image, result, 1.01 * share, True) == {}
+    assert list(missed_request(image, result, 0.99 * share, True)) == ["error"]
+    short = tetopt.mesh_image(image, target_error=0.3, iterations=3, k_D=0.0)
+    assert ("error" in short.missed) == (short.history[-1].E_D > 0.3 * plain(image).variance * image.volume)
+
+
+def test_a_mask_and_overlaps():
+    image, mask = shaped("ball")
+    target = content(image, mask=mask)
+    result = tetopt.mesh_image(target, 400, iterations=3)
+    assert result.missed == {}
+    last = result.history[-1]
+    twice = result._replace(history=[last._replace(n_voxels=last.n_voxels + 2)])
+    assert "2 voxels twice" in missed(target, twice)["overlap"]
+    half = result.mesh.cells[: len(result.mesh.cells) // 2]
+    used, cells = np.unique(half, return_inverse=True)
+    part = tetopt.Mesh(result.mesh.points[used], cells.reshape(half.shape))
+    n_voxels = int(tetopt.cell_moments(target.image, part).n_voxels.sum())
+    halved = result._replace(mesh=part, history=[last._replace(n_voxels=n_voxels)])
+    assert list(missed(target, halved)) == ["mask"]
+
+
+def test_labels_without_cells():
+    image, _ = shaped("ball")
+    labels = np.zeros(image.shape)
+    labels[4:10, 4:10, 4:10], labels[20, 20, 20:24], labels[14:, :8] = 7.0, 9.0, 3.0
+    target = content(image, tetopt.Image(labels, image.affine))
+    result = tetopt.mesh_image(target, 400, iterations=4)
+    assert result.labels is not None
+    assert "labels" not in result.missed
+    none = result._replace(labels=np.where(np.isin(result.labels, (7, 9)), 0, result.labels))
+    assert missed(target, none) == {
+        "labels": "no cell has label 7, of more than 200 voxels; allow more nodes, or a higher label_weight"
+    }
+    assert missed(target, result._replace(labels=None)) == {}
+
+
+def test_the_paper_s_scheme_and_a_start_say_theirs_too(whole):
+    image, result = whole
+    assert tetopt.mesh_image(image, 200, mode="paper", iterations=2).missed == {}
+    kept = tetopt.mesh_image(image, start=result.mesh, iterations=1, min_dihedral=65.0)
+    assert list(kept.missed) == ["floor"]

@@ -1,0 +1,132 @@
+"""What a mesh must keep, measured on the mesh itself, whatever the engine believes of it.
+
+A run that ends in time returns a mesh even where it could not keep them all; its result says which it missed, and the
+command line ends with 1 there.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tetopt.check import beyond_box
+from tetopt.energy.sampling import cell_of_voxel
+from tetopt.engine.loop import Optimized
+from tetopt.geometry.box import ON_SIDE_VOXELS
+from tetopt.geometry.simplex import dihedral_angles, volumes
+from tetopt.image import Image
+from tetopt.mesh import Mesh
+from tetopt.target.content import Content
+
+MASK_DICE = 0.9  # of a mesh with its mask, at least: below it the cells are larger than parts of the mask
+LABEL_VOXELS = 200  # a label of more may not be without cells
+ANGLE_ROUNDING = 1e-6  # degrees by which a measured angle may miss the floor that the kernels kept in ticks
+VOLUME_ROUNDING = 1e-9  # relative: the volume of cells that fill the box exactly, summed up
+BOUNDARY_ROUNDING = 1e-6  # relative: likewise of cells within a boundary in the user's own digits
+
+
+def promised(result: Optimized, content: Content, min_dihedral: float, start: Mesh) -> Optimized:
+    """The result of a run with the promises that its mesh misses, each in a sentence.
+
+    Parameters
+    ----------
+    result : Optimized
+        The run; of it mesh, history and labels are asked.
+    content : Content
+        What the mesh represents.
+    min_dihedral : float
+        The floor on dihedral angles, degrees; 0 for none, and in 2-D.
+    start : Mesh
+        The mesh that the run began with, whose domain it should cover, if there is no mask.
+
+    Returns
+    -------
+    Optimized
+        With `missed`, empty if there is nothing. `floor`: cells with an angle under the floor, of tetrahedra that were
+        moved at all. `box`: nodes further beyond the image's box than the initial mesh's. `cover`: voxels or volume of
+        the initial mesh lost or won. Within a mask instead `overlap`: voxels that lie in two cells, and `mask`: a Dice
+        with the mask below 0.9. `labels`: labels of more than 200 voxels that no cell has.
+    """
+    mesh, last = result.mesh, result.history[-1]
+    missed: dict[str, str] = {}
+    if content.image.ndim == 3 and last.iteration > 0:
+        angles = dihedral_angles(mesh.points, mesh.cells).min(axis=1)
+        if below := int((angles < min_dihedral - ANGLE_ROUNDING).sum()):
+            missed["floor"] = (
+                f"{below} of {len(angles)} cells have an angle under {min_dihedral:g} degrees, down to "
+                f"{angles.min():.2f}; allow more nodes, a lower k_D, or a lower min_dihedral"
+            )
+    beyond = float(beyond_box(mesh, content.image).max())
+    if beyond > max(float(beyond_box(start, content.image).max()), 0.0) + ON_SIDE_VOXELS:
+        missed["box"] = f"nodes lie up to {beyond:.3g} voxels beyond the image's box; please report this"
+    missed |= _missed_cover(result, start) if content.region is None else _missed_mask(content, result)
+    return result._replace(missed=missed | _missed_labels(content, result))
+
+
+def requested(result: Optimized, content: Content, target_error: float | None, is_filled: bool) -> Optimized:
+    """The result of a run with what it misses of what was asked of `mesh_image`, beside its promises.
+
+    `error`: more of the image's variance left in the cells than `target_error`. `cover`: if the mesh `is_filled`, which
+    the image's box should be, voxels or volume of that.
+    """
+    missed = dict(result.missed)
+    share = result.history[-1].E_D / (content.variance * content.volume or 1.0)
+    if target_error is not None and share > target_error:
+        missed["error"] = (
+            f"{share:.4g} of the image's variance is left in the cells, more than {target_error:g}; allow smaller "
+            "cells or more iterations, or ask for a number of nodes"
+        )
+    return result._replace(missed=missed | (_missed_box(content.image, result) if is_filled else {}))
+
+
+def _missed_box(image: Image, result: Optimized) -> dict[str, str]:
+    outside, volume = image.data.size - result.history[-1].n_voxels, _volume(result.mesh)
+    if outside == 0 and abs(volume / image.volume - 1.0) < VOLUME_ROUNDING:
+        return {}
+    words = f"the mesh does not cover the image: {outside} voxels are outside, its volume is {volume:.9g} of "
+    return {"cover": f"{words}{image.volume:.9g} mm^{image.ndim}; please report this"}
+
+
+def _missed_cover(result: Optimized, start: Mesh) -> dict[str, str]:
+    before, volume = _volume(start), _volume(result.mesh)
+    gained = result.history[-1].n_voxels - result.history[0].n_voxels
+    if gained == 0 and abs(volume / before - 1.0) <= BOUNDARY_ROUNDING:
+        return {}
+    words = f"the mesh no longer covers what it did: {gained:+d} voxels, its volume is {volume:.9g} of "
+    return {"cover": f"{words}{before:.9g} mm^{start.ndim}; please report this"}
+
+
+def _missed_mask(content: Content, result: Optimized) -> dict[str, str]:
+    assert content.region is not None
+    missed = {}
+    is_covered, inside = cell_of_voxel(content.image, result.mesh) >= 0, content.region.inside
+    if twice := result.history[-1].n_voxels - int(is_covered.sum()):
+        missed["overlap"] = (
+            f"cells overlap: together they hold {twice} voxels twice; allow more nodes, and please report this"
+        )
+    dice = 2.0 * int((is_covered & inside).sum()) / max(int(is_covered.sum() + inside.sum()), 1)
+    if dice < MASK_DICE:
+        missed["mask"] = (
+            f"the mesh and the mask overlap only by Dice {dice:.3f}: cells are larger than parts of the mask; "
+            "allow more nodes"
+        )
+    return missed
+
+
+def _missed_labels(content: Content, result: Optimized) -> dict[str, str]:
+    members = content.memberships
+    if members is None or result.labels is None:
+        return {}
+    inside = members.partition if content.region is None else members.partition[content.region.inside]
+    counts = np.bincount(inside.ravel(), minlength=len(members.labels))
+    is_large = counts > LABEL_VOXELS * members.parts
+    if content.region is not None:  # label 0 is the outside, too
+        is_large &= members.labels > 0
+    lost = [str(label) for label in members.labels[is_large] if label not in result.labels]
+    if not lost:
+        return {}
+    words = f"no cell has label {', '.join(lost)}, of more than {LABEL_VOXELS} voxels"
+    return {"labels": f"{words}; allow more nodes, or a higher label_weight"}
+
+
+def _volume(mesh: Mesh) -> float:
+    return float(volumes(mesh.points, mesh.cells).sum())
