@@ -9,7 +9,7 @@ TESTED = PYTHONUTF8=1 NUMBA_CACHE_DIR=$(NUMBA_CACHE) MPLBACKEND=agg $(BIN)/pytho
 
 SOLVERS = calculix-ccx python3-dolfinx
 
-.PHONY: demo test test-slow test-solvers test-nojit test-onethread lint bench fingerprints clean
+.PHONY: demo test test-slow test-solvers test-nojit test-onethread test-hostile lint bench fingerprints clean
 
 demo: $(VENV)/.demo
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt demo -o demo --force
@@ -28,6 +28,10 @@ test-nojit: $(VENV)/.test
 
 test-slow: $(VENV)/.test
 	$(TESTED) -m slow
+
+# 10,000 hostile inputs, of the seed in HOSTILE_SEED; the suite runs 200. What ended badly is kept, and its folder printed.
+test-hostile: $(VENV)/.test
+	PYTHONPATH=.:tests PYTHONUTF8=1 NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python -m hostile --inputs 10000 --workers 2
 
 # CalculiX and dolfinx from Debian, MFEM, gmsh (run beside the tests, never imported by tetopt) and pyfebio from PyPI.
 test-solvers: $(VENV)/.test
