@@ -198,6 +198,8 @@ def _problem(path: Path, suffix: str, case: Case) -> str:
             len(surface.faces) and np.isfinite(surface.vertices).all() and surface.faces.max() < len(surface.vertices)
         )
         return "" if sound else "no triangles, or nodes that are not finite"
+    if suffix == ".vtk" and b"POLYDATA" in data[:400]:  # which meshio does not read
+        return ""
     if suffix in (".vtu", ".vtk", ".msh", ".msh2", ".inp", ".mesh", ".xdmf"):
         return _mesh_problem(path, suffix, case)
     return ""
