@@ -30,7 +30,7 @@ BYTES_A_BYTE = 64  # of memory for each of the file, beyond: text grows eightfol
 BYTES_A_VALUE_BYTE = 4  # of memory for each that the voxels take by the header: the library's copy, numpy's, turned
 LEAST_SECONDS = 60.0  # for any file, also on a busy machine
 SECONDS_A_BYTE = 1e-6  # 1 MB/s, a twentieth of what the slowest of these files are read at
-PAGE_BYTES = 4096  # of a page in statm, where the system does not say
+DEFLATE_RATIO = 1032  # of a byte of zlib's: it packs no tighter; a header that tells of more is wrong
 
 
 def read_apart(

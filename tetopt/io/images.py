@@ -5,18 +5,16 @@ from __future__ import annotations
 import contextlib
 import gzip
 import hashlib
+import math
 import re
-import struct
 import warnings
 import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from types import ModuleType
 from typing import Any
 
 import nibabel
 import numpy as np
-import PIL.Image
 from nibabel.filebasedimages import ImageFileError
 from nibabel.spatialimages import HeaderDataError, SpatialImage
 from nibabel.wrapstruct import WrapStructError
@@ -24,34 +22,27 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.image import Image
+from tetopt.incoming import irregular
+from tetopt.io.apart import DEFLATE_RATIO
 from tetopt.io.files import written_whole
+from tetopt.io.pictures import PICTURE_SUFFIXES, read_picture
+from tetopt.io.read_itk import ITK_READERS, read_dicom_folder, read_itk
+from tetopt.io.volumes import DAMAGED_FILE, UNREADABLE_FILE, one_line, volume_index
 
 Bounds = Sequence[tuple[int | None, int | None]]
 """One half-open (start, stop) range of voxel indices for each axis; None is an open end."""
 
 _NIBABEL_SUFFIXES = (".nii.gz", ".nii", ".mgz", ".mgh")
-# ITK picks its reader by the name's case-sensitive ending; naming the reader also opens SCAN.MHA.
-_ITK_READERS = {
-    ".nrrd": "NrrdImageIO",
-    ".nhdr": "NrrdImageIO",
-    ".mha": "MetaImageIO",
-    ".mhd": "MetaImageIO",
-    ".dcm": "GDCMImageIO",
-}
-_PICTURE_SUFFIXES = (".png", ".tif", ".tiff", ".jpg", ".jpeg", ".bmp")
-_KNOWN_SUFFIXES = ", ".join((*_NIBABEL_SUFFIXES, *_ITK_READERS, *_PICTURE_SUFFIXES))
+_KNOWN_SUFFIXES = ", ".join((*_NIBABEL_SUFFIXES, *ITK_READERS, *PICTURE_SUFFIXES))
 
-# What to do about a file that ends too soon, and about one that may never have been an image.
-_DAMAGED_FILE = "the file is truncated or damaged; copy it again"
-_UNREADABLE_FILE = "truncated or damaged, or not an image of this kind; copy it again, or check its name"
 # What the two libraries raise on damaged files.
 _READER_ERRORS = (OSError, EOFError, ValueError, TypeError, KeyError)
 _NIBABEL_HEADER_ERRORS = (*_READER_ERRORS, ImageFileError, HeaderDataError, WrapStructError, OverflowError)
-_PILLOW_ERRORS = (*_READER_ERRORS, SyntaxError, struct.error, zlib.error, PIL.Image.DecompressionBombError)
+HEAD_BYTES_NIFTI = 1024  # of a file: the longest of the headers has 540
+EXTENSION_BYTES = 2**26  # 67 MB before the voxels: a NIfTI file's extensions are texts
+TRAILING_BYTES = 2**24  # 17 MB behind the last voxel: MGH's tags
 # NIfTI's units of length other than mm.
 _MM_PER_UNIT = {"meter": 1000.0, "micron": 0.001}
-# DICOM slices may be off an even spacing by this share of it, since positions are often rounded.
-_UNEVEN_SHARE = 0.05
 
 
 def load_image(
@@ -108,7 +99,7 @@ def load_image(
         data, affine = _read(path, volume)
         image = part_of(Image(data, affine), slice_, crop)
     except InputError as error:
-        raise InputError(f"{path}: {_one_line(error)}") from error
+        raise InputError(f"{path}: {one_line(error)}") from error
     low = image.data.min()
     if low == image.data.max():
         warnings.warn(f"{path}: the image is {low:g} everywhere, so E_D is 0 everywhere", stacklevel=2)
@@ -228,7 +219,7 @@ def parse_crop(text: str) -> list[tuple[int | None, int | None]]:
         match = re.fullmatch(r"\s*([0-9]*)\s*:\s*([0-9]*)\s*", part)
         if match is None:
             raise InputError(
-                f'crop: expected start:stop in voxels for each axis, such as "10:100,:,5:", got "{_one_line(text)}"'
+                f'crop: expected start:stop in voxels for each axis, such as "10:100,:,5:", got "{one_line(text)}"'
             )
         start, stop = (int(end) if end else None for end in match.groups())
         bounds.append((start, stop))
@@ -252,7 +243,7 @@ def parse_slice(text: str) -> tuple[int, int]:
     if match is None:
         raise InputError(
             "slice: expected an array axis (0, 1, 2 or i, j, k) and a voxel index, "
-            f'such as "2=90" or "k=90", got "{_one_line(text)}"'
+            f'such as "2=90" or "k=90", got "{one_line(text)}"'
         )
     axis, index = match.groups()
     return "012ijk".index(axis) % 3, int(index)
@@ -285,17 +276,19 @@ def _read(path: Path, volume: int | None) -> tuple[NDArray, NDArray[np.float64]]
     """Data and affine of the file, 2-D or 3-D; `Image` checks them."""
     with _os_errors_named():
         if path.is_dir():
-            return _read_dicom_folder(path, volume)
+            return read_dicom_folder(path, volume)
+        if (other := irregular(path)) is not None:
+            raise InputError(f"expected a regular file, got {other}; copy what it gives into a file")
         with path.open("rb") as stream:
             if not stream.read(1):
                 raise InputError("the file is empty; copy or export it again")
     name = path.name.lower()
     if name.endswith(_NIBABEL_SUFFIXES):
         return _read_nibabel(path, volume)
-    if name.endswith(tuple(_ITK_READERS)):
-        return _read_itk(path, volume)
-    if name.endswith(_PICTURE_SUFFIXES):
-        return _read_picture(path, volume)
+    if name.endswith(tuple(ITK_READERS)):
+        return read_itk(path, volume)
+    if name.endswith(PICTURE_SUFFIXES):
+        return read_picture(path, volume)
     raise InputError(f"unknown kind of image file; expected {_KNOWN_SUFFIXES}, or a folder of DICOM files")
 
 
@@ -313,65 +306,93 @@ def _os_errors_named(path: Path | None = None) -> Iterator[None]:
         raise InputError(f"{prefix}cannot be opened ({error.strerror or error})") from error
 
 
-def _volume_index(trailing: tuple[int, ...], volume: int | None) -> tuple[int, ...]:
-    """Index into the axes beyond the third (or beyond a picture's two) of the volume asked for."""
-    count = int(np.prod(trailing, dtype=np.int64))
-    if count == 0:
-        raise InputError(f"every axis needs a voxel, got trailing axes of lengths {trailing}")
-    if volume is None and count > 1:
-        raise InputError(
-            f"the file holds {count} volumes; choose one, 0 to {count - 1}: `volume=k`, "
-            "`--volume K` for the first image of a command, `FILE:K` for others"
-        )
-    volume = 0 if volume is None else volume
-    if not 0 <= volume < count:
-        volumes = "one volume" if count == 1 else f"{count} volumes"
-        raise InputError(f"volume {volume} asked for, but the file holds {volumes}; choose from 0 to {count - 1}")
-    return tuple(int(i) for i in np.unravel_index(volume, trailing, order="F"))
-
-
-def _one_line(words: object) -> str:
-    return " ".join(str(words).split())
-
-
 # NIfTI and MGZ
 
 
 def _read_nibabel(path: Path, volume: int | None) -> tuple[NDArray, NDArray[np.float64]]:
-    if path.name.lower().endswith((".gz", ".mgz")):
-        _check_gzip(path)
-    try:
-        file = nibabel.load(path)
-    except FileNotFoundError as error:
-        # The file is there: nibabel looked for another case of its ending.
-        raise InputError("nibabel cannot read an ending in mixed case; rename it to lower case") from error
-    except _NIBABEL_HEADER_ERRORS as error:
-        raise InputError(f"{_UNREADABLE_FILE} ({_one_line(error)})") from error
-    if not isinstance(file, SpatialImage):
-        raise InputError(f"expected an image on a grid of voxels, got a {type(file).__name__}")
+    is_packed = path.name.lower().endswith((".gz", ".mgz"))
+    _check_head(path, is_packed)
+    file = _nibabel_file(path)
     affine = _affine_in_mm(file)
-    index = _volume_index(file.shape[3:], volume)
+    index = volume_index(file.shape[3:], volume)
+    _check_size(path, file, 0 if volume is None else volume, is_packed)
     try:
         data = np.asanyarray(file.dataobj[(slice(None),) * 3 + index] if index else file.dataobj)
     except MemoryError as error:
         raise InputError(f"its {file.shape} voxels do not fit into memory; resample it first") from error
     except (OSError, EOFError, zlib.error, ValueError, TypeError, OverflowError) as error:
-        raise InputError(f"{_DAMAGED_FILE} ({_one_line(error)})") from error
+        raise InputError(f"{DAMAGED_FILE} ({one_line(error)})") from error
     if data.ndim == 2:
         return data, _plane_affine(affine[:3, :2], affine[:3, 3])
     return data, affine
 
 
-def _check_gzip(path: Path) -> None:
-    """Unpack the whole file once: nibabel stops before the checksum behind the last voxel."""
+def _check_head(path: Path, is_packed: bool) -> None:
+    """InputError if the file does not begin as a gzip file does, where it should, or has extensions without end.
+
+    nibabel reads those with the header, whole, before their sizes can be asked for.
+    """
+    try:
+        with gzip.open(path) if is_packed else path.open("rb") as stream:
+            head = stream.read(HEAD_BYTES_NIFTI)
+    except (OSError, EOFError, zlib.error) as error:
+        raise _of_gzip(error) from error
+    for header in (nibabel.Nifti1Header, nibabel.Nifti2Header):
+        if path.name.lower().endswith((".nii", ".nii.gz")) and header.may_contain_header(head):
+            offset = float(header(head[: header.sizeof_hdr], check=False)["vox_offset"])
+            if not 0.0 <= offset <= EXTENSION_BYTES:
+                raise InputError(f"{DAMAGED_FILE} (its voxels are to begin at byte {offset:g})")
+
+
+def _nibabel_file(path: Path) -> SpatialImage:
+    """The file with its header read, of one of the three kinds, as which of many more nibabel might take it."""
+    try:
+        if nibabel.Cifti2Image.path_maybe_image(path)[0]:
+            raise InputError("expected an image on a grid of voxels, got a Cifti2Image")
+        for kind in (nibabel.Nifti1Image, nibabel.Nifti2Image, nibabel.MGHImage):
+            if kind.path_maybe_image(path)[0]:
+                return kind.from_filename(path)
+    except InputError:
+        raise
+    except FileNotFoundError as error:
+        # The file is there: nibabel looked for another case of its ending.
+        raise InputError("nibabel cannot read an ending in mixed case; rename it to lower case") from error
+    except _NIBABEL_HEADER_ERRORS as error:
+        raise InputError(f"{UNREADABLE_FILE} ({one_line(error)})") from error
+    raise InputError(UNREADABLE_FILE)
+
+
+def _check_size(path: Path, file: SpatialImage, volume: int, is_packed: bool) -> None:
+    """InputError unless the file can hold all volumes up to the one asked for; before any memory is taken for it."""
+    proxy: Any = file.dataobj
+    volume_bytes = math.prod(file.shape[:3]) * proxy.dtype.itemsize
+    n_bytes, size = proxy.offset + (volume + 1) * volume_bytes, path.stat().st_size
+    if min(file.shape) < 0 or n_bytes > size * (DEFLATE_RATIO if is_packed else 1):
+        raise InputError(
+            f"{DAMAGED_FILE} (its header tells of {' x '.join(str(each) for each in file.shape)} voxels, "
+            f"{n_bytes:.4g} bytes, the file has {size})"
+        )
+    if is_packed:
+        _check_gzip(path, proxy.offset + math.prod(file.shape[3:]) * volume_bytes + TRAILING_BYTES)
+
+
+def _check_gzip(path: Path, most: int) -> None:
+    """Unpack the whole file once, in blocks: nibabel stops before the checksum behind the last voxel."""
+    n_bytes = 0
     try:
         with gzip.open(path) as stream:
-            while stream.read(1 << 20):
-                pass
+            while block := stream.read(1 << 20):
+                n_bytes += len(block)
+                if n_bytes > most:
+                    raise InputError(f"{DAMAGED_FILE} (it goes on far behind the last voxel, which ends at {most})")
     except (OSError, EOFError, zlib.error) as error:
-        if "Not a gzipped file" in str(error):
-            raise InputError("not a gzip file; if it is not compressed, drop .gz (or z) from its name") from error
-        raise InputError(f"{_DAMAGED_FILE} ({_one_line(error)})") from error
+        raise _of_gzip(error) from error
+
+
+def _of_gzip(error: Exception) -> InputError:
+    if "Not a gzipped file" in str(error):
+        return InputError("not a gzip file; if it is not compressed, drop .gz (or z) from its name")
+    return InputError(f"{DAMAGED_FILE} ({one_line(error)})")
 
 
 def _affine_in_mm(file: SpatialImage) -> NDArray[np.float64]:
@@ -381,169 +402,6 @@ def _affine_in_mm(file: SpatialImage) -> NDArray[np.float64]:
         with contextlib.suppress(KeyError):
             affine[:3] *= _MM_PER_UNIT.get(file.header.get_xyzt_units()[0], 1.0)
     return affine
-
-
-# NRRD, MetaImage and DICOM
-
-
-def _read_itk(path: Path, volume: int | None) -> tuple[NDArray, NDArray[np.float64]]:
-    sitk = _simple_itk()
-    with _itk_errors(sitk):
-        reader = sitk.ImageFileReader()
-        reader.SetFileName(str(path))
-        reader.SetImageIO(_ITK_READERS[path.suffix.lower()])
-        reader.ReadImageInformation()
-        _check_components(reader.GetNumberOfComponents())
-        size = reader.GetSize()
-        index = _volume_index(size[3:], volume)
-        if index:
-            reader.SetExtractSize([*size[:3], *(0 for _ in index)])
-            reader.SetExtractIndex([0, 0, 0, *index])
-        return sitk.GetArrayFromImage(reader.Execute()).T, _ras_affine(reader)
-
-
-def _read_dicom_folder(path: Path, volume: int | None) -> tuple[NDArray, NDArray[np.float64]]:
-    sitk = _simple_itk()
-    with _itk_errors(sitk):
-        reader = sitk.ImageSeriesReader()
-        files = _series_files(path, reader)
-        reader.SetFileNames(files)
-        # Keeps each slice's own position readable.
-        reader.MetaDataDictionaryArrayUpdateOn()
-        image = reader.Execute()
-        _check_components(image.GetNumberOfComponentsPerPixel())
-        index = _volume_index(image.GetSize()[3:], volume)
-        affine = _ras_affine(image)
-        _place_slices(affine, reader, len(files))
-        return sitk.GetArrayFromImage(image).T[(..., *index)], affine
-
-
-def _series_files(path: Path, reader: Any) -> tuple[str, ...]:
-    """The files of the one DICOM series in a folder, in the order of their positions."""
-    files = sorted(file for file in path.iterdir() if file.is_file())
-    series = {uid: reader.GetGDCMSeriesFileNames(str(path), uid) for uid in reader.GetGDCMSeriesIDs(str(path))}
-    known = {Path(file).name for names in series.values() for file in names}
-    for file in files:
-        # GDCM passes over a damaged file in silence, which would shorten the volume.
-        if file.name not in known and file.name.upper() != "DICOMDIR" and _is_dicom(file):
-            raise InputError(f"the DICOM file {file.name} is truncated or damaged; copy it again")
-    if not series:
-        raise InputError("no DICOM series in this folder (folders in it are not searched)")
-    if len(series) > 1:
-        listed = ", ".join(f"{uid} ({len(names)} files)" for uid, names in series.items())
-        raise InputError(f"{len(series)} DICOM series in this folder, put one into its own folder: {listed}")
-    return next(iter(series.values()))
-
-
-def _is_dicom(path: Path) -> bool:
-    """Whether a DICOM file's mark follows its 128 bytes of preamble."""
-    with path.open("rb") as stream:
-        return stream.read(132)[128:] == b"DICM"
-
-
-def _place_slices(affine: NDArray[np.float64], reader: Any, n_slices: int) -> None:
-    """Write the slice axis into `affine` from the slices' own positions, where the files have them.
-
-    ITK squares a tilted gantry's axes and only warns of a missing slice; both would move anatomy unnoticed.
-    """
-    position, orientation = "0020|0032", "0020|0037"
-    slices = range(n_slices)
-    if n_slices < 2 or not all(reader.HasMetaDataKey(i, tag) for i in slices for tag in (position, orientation)):
-        return
-    turns = np.array([_numbers(reader.GetMetaData(i, orientation), 6) for i in slices])
-    if not np.allclose(turns, turns[0], rtol=0.0, atol=1e-4):
-        raise InputError("the DICOM slices are not parallel (a localizer?); choose another series")
-    points = np.array([_numbers(reader.GetMetaData(i, position), 3) for i in slices]) * [-1.0, -1.0, 1.0]
-    step = (points[-1] - points[0]) / (n_slices - 1)
-    off = np.linalg.norm(points - points[0] - np.arange(n_slices)[:, None] * step, axis=1)
-    if off.max() > _UNEVEN_SHARE * np.linalg.norm(step):
-        raise InputError(
-            f"the DICOM slices are not evenly spaced (slice {off.argmax()} is {off.max():.3g} mm off: one is "
-            "missing, or several volumes are mixed); export the series again, or resample it to NIfTI"
-        )
-    affine[:3, 2] = step
-
-
-def _numbers(value: str, count: int) -> list[float]:
-    """The numbers in a DICOM tag's text."""
-    try:
-        numbers = [float(number) for number in value.split("\\")]
-    except ValueError:
-        numbers = []
-    if len(numbers) != count or not np.isfinite(numbers).all():
-        raise InputError(f'a DICOM slice\'s place should be {count} numbers, got "{value}"; export it again')
-    return numbers
-
-
-def _simple_itk() -> ModuleType:
-    try:
-        import SimpleITK
-    except ImportError as error:
-        raise InputError('NRRD, MetaImage and DICOM need SimpleITK; pip install "tetopt[itk]"') from error
-    return SimpleITK
-
-
-@contextlib.contextmanager
-def _itk_errors(sitk: ModuleType) -> Iterator[None]:
-    """Turn SimpleITK's errors into InputErrors, and keep ITK's own warnings off stderr."""
-    shown = sitk.ProcessObject.GetGlobalWarningDisplay()
-    sitk.ProcessObject.SetGlobalWarningDisplay(False)
-    try:
-        yield
-    except RuntimeError as error:
-        # The innermost cause stands last; the "Reason:" behind it is an unrelated errno.
-        words = re.split(r"ERROR: (?:\w+ ?\(0x[0-9a-f]+\): )?|\[nrrd\] ", _one_line(error))[-1]
-        words = words.split(" Reason: ")[0]
-        raise InputError(f"{_UNREADABLE_FILE} (SimpleITK: {words})") from error
-    finally:
-        sitk.ProcessObject.SetGlobalWarningDisplay(shown)
-
-
-def _check_components(count: int) -> None:
-    if count > 1:
-        raise InputError(f"expected one number a voxel, got {count} (RGB or vectors); convert it to grey first")
-
-
-def _ras_affine(source: Any) -> NDArray[np.float64]:
-    """RAS affine of a SimpleITK image or reader (LPS), of its first three axes or of its two."""
-    n = min(source.GetDimension(), 3)
-    direction = np.reshape(source.GetDirection(), (source.GetDimension(),) * 2)
-    affine = np.eye(n + 1)
-    affine[:n, :n] = direction[:n, :n] * source.GetSpacing()[:n]
-    affine[:n, n] = source.GetOrigin()[:n]
-    affine[:2] *= -1.0
-    return affine
-
-
-# Pictures
-
-
-def _read_picture(path: Path, volume: int | None) -> tuple[NDArray, NDArray[np.float64]]:
-    try:
-        with PIL.Image.open(path) as picture:
-            (frame,) = _volume_index((getattr(picture, "n_frames", 1),), volume)
-            picture.seek(frame)
-            data = _grey(picture)
-    except InputError:
-        raise
-    except PIL.UnidentifiedImageError as error:
-        raise InputError(f"{_UNREADABLE_FILE} (Pillow knows no such picture)") from error
-    except _PILLOW_ERRORS as error:
-        raise InputError(f"{_DAMAGED_FILE} ({_one_line(error)})") from error
-    return data, np.array([[0.0, 1.0, 0.0], [-1.0, 0.0, data.shape[0] - 1.0], [0.0, 0.0, 1.0]])
-
-
-def _grey(picture: PIL.Image.Image) -> NDArray:
-    """Grey values (rows, columns); of a colour picture only where it is grey and opaque throughout."""
-    values = np.asarray(picture)
-    if picture.mode in ("1", "L", "I", "F") or picture.mode.startswith("I;16"):
-        return values
-    if picture.mode in ("LA", "RGB", "RGBA"):
-        opaque = "A" not in picture.mode or bool((values[..., -1] == 255).all())
-        colours = values[..., :3] if picture.mode.startswith("RGB") else values[..., :1]
-        if opaque and bool((colours == colours[..., :1]).all()):
-            return values[..., 0]
-    raise InputError(f"a colour or transparent picture (mode {picture.mode}); convert it to grey first")
 
 
 # Geometry of parts

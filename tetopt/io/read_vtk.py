@@ -11,9 +11,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
-from tetopt.io.apart import read_apart
+from tetopt.io.apart import DEFLATE_RATIO, read_apart
 
-DEFLATE_RATIO = 1032  # zlib packs no tighter, and VTK's other two less so on numbers
 # Counts in a VTU file's tags, and in the lines of a VTK file: each thing counted takes a byte at least.
 XML_COUNT = re.compile(rb"<[^<>]{0,10000}?\b(NumberOf\w+)\s*=\s*[\"']\s*([-+]?[\d.eE+]+)")
 LEGACY_COUNT = re.compile(

@@ -1,0 +1,158 @@
+"""The headers of NRRD and MetaImage, read here before SimpleITK reads the file: sizes, and which file has the voxels.
+
+ITK takes what they tell: ``NDims = -1`` ends the process, sizes are allocated before the file is found to be too short,
+and a header may name any file of the machine, whose bytes become voxels of the mesh that goes back to its sender.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from pathlib import Path
+from typing import NamedTuple
+
+from tetopt.errors import InputError
+from tetopt.incoming import irregular
+from tetopt.io.apart import DEFLATE_RATIO
+from tetopt.io.volumes import DAMAGED_FILE, UNREADABLE_FILE
+
+HEADER_BYTES = 2**20  # of a header: 3D Slicer's with all its words have 10,000
+MOST_AXES = 8  # of a file: more than space, time, and what is measured
+TEXT_RATIO = 4  # "0 " becomes 8 bytes
+BZIP2_RATIO = 50_000  # bzip2 packs zeros 45,000 times
+BYTES_OF_TYPE = {
+    "MET_CHAR": 1, "MET_UCHAR": 1, "MET_SHORT": 2, "MET_USHORT": 2, "MET_INT": 4, "MET_UINT": 4, "MET_LONG": 4,
+    "MET_ULONG": 4, "MET_LONG_LONG": 8, "MET_ULONG_LONG": 8, "MET_FLOAT": 4, "MET_DOUBLE": 8,
+    "signed char": 1, "int8": 1, "int8_t": 1, "uchar": 1, "unsigned char": 1, "uint8": 1, "uint8_t": 1,
+    "short": 2, "short int": 2, "signed short": 2, "signed short int": 2, "int16": 2, "int16_t": 2,
+    "ushort": 2, "unsigned short": 2, "unsigned short int": 2, "uint16": 2, "uint16_t": 2,
+    "int": 4, "signed int": 4, "int32": 4, "int32_t": 4, "uint": 4, "unsigned int": 4, "uint32": 4, "uint32_t": 4,
+    "longlong": 8, "long long": 8, "long long int": 8, "signed long long": 8, "signed long long int": 8, "int64": 8,
+    "int64_t": 8, "ulonglong": 8, "unsigned long long": 8, "unsigned long long int": 8, "uint64": 8, "uint64_t": 8,
+    "float": 4, "double": 8,
+}  # fmt: skip
+
+
+class Told(NamedTuple):
+    """What a header tells."""
+
+    sizes: list[int]
+    value_bytes: int  # all voxels
+    files: list[str]  # that have the voxels; none if they follow the header
+    ratio: int  # the most that a byte of the file can become
+
+
+def checked_header(path: Path) -> tuple[int, int]:
+    """Bytes of all files of the image, and of all its voxels.
+
+    Raises
+    ------
+    InputError
+        Without the path before it: a header that cannot be read or tells of more than the files have; a data file that
+        is not beside the header, or no regular file.
+    """
+    with path.open("rb") as stream:
+        head = stream.read(HEADER_BYTES)
+    told = _nrrd(head) if path.suffix.lower() in (".nrrd", ".nhdr") else _metaimage(head)
+    n_bytes = path.stat().st_size
+    for name in told.files:
+        _check_beside(path, name)
+        n_bytes += (path.parent / name).stat().st_size
+    if told.value_bytes > n_bytes * told.ratio:
+        sizes = " x ".join(str(size) for size in told.sizes)
+        raise InputError(
+            f"{DAMAGED_FILE} (its header tells of {sizes} voxels, {told.value_bytes:.4g} bytes, the file has {n_bytes})"
+        )
+    return n_bytes, told.value_bytes
+
+
+def _check_beside(path: Path, name: str) -> None:
+    """InputError unless the name is that of a regular file in the header's folder."""
+    if name in ("", ".", "..") or re.search(r"[/\\:\0%*?]", name):
+        raise InputError(f'its voxels are in "{name}"; only a file beside the header, by its bare name, is read')
+    try:
+        other = irregular(path.parent / name)
+    except OSError as error:
+        raise InputError(f'{UNREADABLE_FILE} (its data file "{name}": {error.strerror})') from error
+    if other is not None:
+        raise InputError(f'its data file "{name}" is {other}; expected a regular file')
+
+
+def _sizes(text: str, n_axes: int) -> list[int]:
+    """Lengths of the axes."""
+    words = text.split()
+    if len(words) != n_axes or not all(re.fullmatch(r"\d{1,18}", word) for word in words):
+        raise InputError(f"{UNREADABLE_FILE} (expected {n_axes} sizes, got {text[:80]})")
+    return [int(word) for word in words]
+
+
+def _n_axes(text: str) -> int:
+    if re.fullmatch(r"\d{1,3}", text) is None or not 1 <= int(text) <= MOST_AXES:
+        raise InputError(f"{UNREADABLE_FILE} (expected 1 to {MOST_AXES} axes, got {text[:80]})")
+    return int(text)
+
+
+def _metaimage(head: bytes) -> Told:
+    fields: dict[str, str] = {}
+    files: list[str] = []
+    lines = head.split(b"\n")
+    for number, line in enumerate(lines):
+        key, equals, value = (part.strip() for part in line.decode("latin-1").partition("="))
+        if key and not equals:
+            raise InputError(UNREADABLE_FILE)
+        fields[key] = value
+        if key == "ElementDataFile":
+            rest = [each.decode("latin-1").strip() for each in lines[number + 1 :]]
+            if value.upper().startswith("LIST"):
+                files = [each for each in rest if each]
+            elif value.upper() != "LOCAL":
+                files = [value]
+            break
+    for key in ("NDims", "DimSize", "ElementType", "ElementDataFile"):
+        if key not in fields:
+            raise InputError(f"{UNREADABLE_FILE} (its header has no {key})")
+    sizes = _sizes(fields["DimSize"], _n_axes(fields["NDims"]))
+    channels = fields.get("ElementNumberOfChannels", "1")
+    if re.fullmatch(r"\d{1,9}", channels) is None:
+        raise InputError(f"{UNREADABLE_FILE} (ElementNumberOfChannels = {channels[:80]})")
+    is_packed = fields.get("CompressedData", "").lower() in ("true", "1")
+    is_text = fields.get("BinaryData", "True").lower() not in ("true", "1")
+    ratio = DEFLATE_RATIO if is_packed else TEXT_RATIO if is_text else 1
+    return Told(sizes, math.prod(sizes) * int(channels) * _bytes_of(fields["ElementType"]), files, ratio)
+
+
+def _nrrd(head: bytes) -> Told:
+    if not head.startswith(b"NRRD"):
+        raise InputError(UNREADABLE_FILE)
+    fields: dict[str, str] = {}
+    files: list[str] = []
+    lines = [line.decode("latin-1").rstrip("\r") for line in head.split(b"\n")]
+    for number, line in enumerate(lines[1:], 1):
+        if not line:
+            break
+        if line.startswith("#") or ":=" in line:
+            continue
+        key, _, value = (part.strip() for part in line.partition(":"))
+        key = key.lower()
+        fields[key] = value
+        if key in ("data file", "datafile"):
+            if value.upper().startswith("LIST"):
+                files += [each.strip() for each in lines[number + 1 :] if each.strip()]
+                break
+            files.append(value)
+    for key in ("dimension", "sizes", "type", "encoding"):
+        if key not in fields:
+            raise InputError(f"{UNREADABLE_FILE} (its header has no {key})")
+    sizes = _sizes(fields["sizes"], _n_axes(fields["dimension"]))
+    encoding = fields["encoding"].lower()
+    ratio = BZIP2_RATIO
+    for names, of_these in (("raw hex", 1), ("txt text ascii", TEXT_RATIO), ("gz gzip", DEFLATE_RATIO)):
+        if encoding in names.split():
+            ratio = of_these
+    return Told(sizes, math.prod(sizes) * _bytes_of(fields["type"]), files, ratio)
+
+
+def _bytes_of(kind: str) -> int:
+    if kind not in BYTES_OF_TYPE:
+        raise InputError(f"{UNREADABLE_FILE} (voxels of type {kind[:80]})")
+    return BYTES_OF_TYPE[kind]

@@ -1,0 +1,175 @@
+"""NRRD, MetaImage and DICOM by SimpleITK, in a process of its own; headers and names are looked at before."""
+
+from __future__ import annotations
+
+import importlib.util
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.errors import InputError
+from tetopt.incoming import irregular
+from tetopt.io.apart import read_apart
+from tetopt.io.itk_headers import checked_header
+from tetopt.io.volumes import UNREADABLE_FILE, one_line, volume_index
+
+# ITK picks its reader by the name's case-sensitive ending; naming the reader also opens SCAN.MHA.
+ITK_READERS = {
+    ".nrrd": "NrrdImageIO",
+    ".nhdr": "NrrdImageIO",
+    ".mha": "MetaImageIO",
+    ".mhd": "MetaImageIO",
+    ".dcm": "GDCMImageIO",
+}
+# DICOM slices may be off an even spacing by this share of it, since positions are often rounded.
+_UNEVEN_SHARE = 0.05
+
+
+def read_itk(path: Path, volume: int | None) -> tuple[NDArray, NDArray[np.float64]]:
+    """Data and affine of a file; InputError without the path before it."""
+    _check_installed()
+    size, value_bytes = (None, 0) if path.suffix.lower() == ".dcm" else checked_header(path)
+    data, affine = read_apart(_volume_of, path, volume, size=size, value_bytes=value_bytes, library="SimpleITK")
+    return data, affine
+
+
+def read_dicom_folder(path: Path, volume: int | None) -> tuple[NDArray, NDArray[np.float64]]:
+    """Data and affine of the one DICOM series in a folder; InputError without the path before it."""
+    _check_installed()
+    files = sorted(path.iterdir())
+    for file in files:
+        other = None if file.is_symlink() and not file.exists() else irregular(file)
+        if other not in (None, "a folder"):  # GDCM opens everything, and would wait for it
+            raise InputError(f"{file.name} is {other}; move it out of the folder of DICOM files")
+    size = sum(file.stat().st_size for file in files if file.is_file())
+    data, affine = read_apart(_series_of, path, volume, size=size, library="SimpleITK")
+    return data, affine
+
+
+def _check_installed() -> None:
+    if importlib.util.find_spec("SimpleITK") is None:
+        raise InputError('NRRD, MetaImage and DICOM need SimpleITK; pip install "tetopt[itk]"')
+
+
+# In the child
+
+
+def _volume_of(path: str, volume: int | None) -> tuple[NDArray, NDArray[np.float64]]:
+    import SimpleITK as sitk
+
+    try:
+        reader = sitk.ImageFileReader()
+        reader.SetFileName(path)
+        reader.SetImageIO(ITK_READERS[Path(path).suffix.lower()])
+        reader.ReadImageInformation()
+        _check_components(reader.GetNumberOfComponents())
+        size = reader.GetSize()
+        index = volume_index(size[3:], volume)
+        if index:
+            reader.SetExtractSize([*size[:3], *(0 for _ in index)])
+            reader.SetExtractIndex([0, 0, 0, *index])
+        return sitk.GetArrayFromImage(reader.Execute()).T, _ras_affine(reader)
+    except RuntimeError as error:
+        raise _in_words(error) from error
+
+
+def _series_of(path: str, volume: int | None) -> tuple[NDArray, NDArray[np.float64]]:
+    import SimpleITK as sitk
+
+    try:
+        reader = sitk.ImageSeriesReader()
+        files = _series_files(Path(path), reader)
+        reader.SetFileNames(files)
+        # Keeps each slice's own position readable.
+        reader.MetaDataDictionaryArrayUpdateOn()
+        image = reader.Execute()
+        _check_components(image.GetNumberOfComponentsPerPixel())
+        index = volume_index(image.GetSize()[3:], volume)
+        affine = _ras_affine(image)
+        _place_slices(affine, reader, len(files))
+        data: NDArray = sitk.GetArrayFromImage(image).T
+        return data[(slice(None),) * 3 + index] if index else data, affine
+    except RuntimeError as error:
+        raise _in_words(error) from error
+
+
+def _in_words(error: RuntimeError) -> InputError:
+    # The innermost cause stands last; the "Reason:" behind it is an unrelated errno.
+    words = re.split(r"ERROR: (?:\w+ ?\(0x[0-9a-f]+\): )?|\[nrrd\] ", one_line(error))[-1]
+    return InputError(f"{UNREADABLE_FILE} (SimpleITK: {words.split(' Reason: ')[0]})")
+
+
+def _series_files(path: Path, reader: Any) -> tuple[str, ...]:
+    """The files of the one DICOM series in a folder, in the order of their positions."""
+    files = sorted(file for file in path.iterdir() if file.is_file())
+    series = {uid: reader.GetGDCMSeriesFileNames(str(path), uid) for uid in reader.GetGDCMSeriesIDs(str(path))}
+    known = {Path(file).name for names in series.values() for file in names}
+    for file in files:
+        # GDCM passes over a damaged file in silence, which would shorten the volume.
+        if file.name not in known and file.name.upper() != "DICOMDIR" and _is_dicom(file):
+            raise InputError(f"the DICOM file {file.name} is truncated or damaged; copy it again")
+    if not series:
+        raise InputError("no DICOM series in this folder (folders in it are not searched)")
+    if len(series) > 1:
+        listed = ", ".join(f"{uid} ({len(names)} files)" for uid, names in series.items())
+        raise InputError(f"{len(series)} DICOM series in this folder, put one into its own folder: {listed}")
+    return next(iter(series.values()))
+
+
+def _is_dicom(path: Path) -> bool:
+    """Whether a DICOM file's mark follows its 128 bytes of preamble."""
+    with path.open("rb") as stream:
+        return stream.read(132)[128:] == b"DICM"
+
+
+def _place_slices(affine: NDArray[np.float64], reader: Any, n_slices: int) -> None:
+    """Write the slice axis into `affine` from the slices' own positions, where the files have them.
+
+    ITK squares a tilted gantry's axes and only warns of a missing slice; both would move anatomy unnoticed.
+    """
+    position, orientation = "0020|0032", "0020|0037"
+    slices = range(n_slices)
+    if n_slices < 2 or not all(reader.HasMetaDataKey(i, tag) for i in slices for tag in (position, orientation)):
+        return
+    turns = np.array([_numbers(reader.GetMetaData(i, orientation), 6) for i in slices])
+    if not np.allclose(turns, turns[0], rtol=0.0, atol=1e-4):
+        raise InputError("the DICOM slices are not parallel (a localizer?); choose another series")
+    points = np.array([_numbers(reader.GetMetaData(i, position), 3) for i in slices]) * [-1.0, -1.0, 1.0]
+    step = (points[-1] - points[0]) / (n_slices - 1)
+    off = np.linalg.norm(points - points[0] - np.arange(n_slices)[:, None] * step, axis=1)
+    if off.max() > _UNEVEN_SHARE * np.linalg.norm(step):
+        raise InputError(
+            f"the DICOM slices are not evenly spaced (slice {off.argmax()} is {off.max():.3g} mm off: one is "
+            "missing, or several volumes are mixed); export the series again, or resample it to NIfTI"
+        )
+    affine[:3, 2] = step
+
+
+def _numbers(value: str, count: int) -> list[float]:
+    """The numbers in a DICOM tag's text."""
+    try:
+        numbers = [float(number) for number in value.split("\\")]
+    except ValueError:
+        numbers = []
+    if len(numbers) != count or not np.isfinite(numbers).all():
+        raise InputError(f'a DICOM slice\'s place should be {count} numbers, got "{value}"; export it again')
+    return numbers
+
+
+def _check_components(count: int) -> None:
+    if count > 1:
+        raise InputError(f"expected one number a voxel, got {count} (RGB or vectors); convert it to grey first")
+
+
+def _ras_affine(source: Any) -> NDArray[np.float64]:
+    """RAS affine of a SimpleITK image or reader (LPS), of its first three axes or of its two."""
+    n = min(source.GetDimension(), 3)
+    direction = np.reshape(source.GetDirection(), (source.GetDimension(),) * 2)
+    affine = np.eye(n + 1)
+    affine[:n, :n] = direction[:n, :n] * source.GetSpacing()[:n]
+    affine[:n, n] = source.GetOrigin()[:n]
+    affine[:2] *= -1.0
+    return affine
