@@ -1,5 +1,6 @@
 """Files of strangers: whatever they hold, one line, in time, and nothing allocated that a header promises."""
 
+import gzip
 import os
 import struct
 import subprocess
@@ -7,6 +8,7 @@ import sys
 import zlib
 from pathlib import Path
 
+import nibabel
 import numpy as np
 import pytest
 
@@ -14,6 +16,7 @@ import tetopt
 from tetopt.errors import InputError
 from tetopt.io import apart
 from tetopt.io.apart import read_apart
+from tetopt.io.images import load_image, sha256
 from tetopt.io.meshes import load_mesh
 
 POINTS = struct.pack("<12d", 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1)
@@ -187,3 +190,146 @@ def test_cells_of_another_number_of_nodes(tmp_path):
 def test_a_pipe_does_not_block(tmp_path, name):
     os.mkfifo(tmp_path / name)
     refused(load_mesh, tmp_path / name, "expected a regular file, got a pipe")
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes with a name")
+@pytest.mark.parametrize("name", ["a.nii", "a.nii.gz", "a.nrrd", "a.dcm", "a.png", "a.xyz"])
+def test_a_pipe_for_an_image_does_not_block(tmp_path, name):
+    os.mkfifo(tmp_path / name)
+    refused(load_image, tmp_path / name, "expected a regular file, got a pipe")
+    with pytest.raises(InputError, match="expected a regular file, got a pipe"):
+        sha256(tmp_path / name)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="needs pipes with a name")
+def test_a_pipe_in_a_folder_of_dicom_does_not_block(tmp_path):
+    os.mkfifo(tmp_path / "slice.dcm")
+    refused(load_image, tmp_path, "slice.dcm is a pipe")
+
+
+def test_a_device_is_no_image():
+    if not Path("/dev/zero").exists():
+        pytest.skip("no /dev/zero")
+    refused(load_image, "/dev/zero", "got a device")
+
+
+# --------------------------------------------------------------------------------------------------
+# Images
+
+
+def mha(ndims="3", sizes="3 4 5", kind="MET_UCHAR", file="LOCAL", more="", data=bytes(60)):
+    head = f"ObjectType = Image\nNDims = {ndims}\nDimSize = {sizes}\nElementType = {kind}\n{more}"
+    head += f"ElementDataFile = {file}\n"
+    return head.encode() + data
+
+
+def nrrd(dimension="3", sizes="3 4 5", kind="uchar", more="", encoding="raw", data=bytes(60)):
+    head = f"NRRD0004\ntype: {kind}\ndimension: {dimension}\nsizes: {sizes}\nencoding: {encoding}\n{more}\n"
+    return head.encode() + data
+
+
+ITK_BOMBS = {
+    "good.mha": (mha(), None),
+    "good.nrrd": (nrrd(), None),
+    "axes.mha": (mha(ndims="-1"), "expected 1 to 8 axes, got -1"),
+    "many.mha": (mha(ndims="1000000000"), "expected 1 to 8 axes"),
+    "fewer.mha": (mha(sizes="3 4"), "expected 3 sizes, got 3 4"),
+    "minus.mha": (mha(sizes="3 4 -5"), "expected 3 sizes"),
+    "huge.mha": (mha(sizes="32767 32767 32767"), r"tells of 32767 x 32767 x 32767 voxels, 3.518e\+13 bytes, the file"),
+    "packed.mha": (mha(sizes="32767 32767 32767", more="CompressedData = True\n"), "tells of 32767 x"),
+    "channels.mha": (mha(more="ElementNumberOfChannels = 999999999\n"), "tells of 3 x 4 x 5 voxels, 6e.10 bytes"),
+    "type.mha": (mha(kind="MET_OTHER"), "voxels of type MET_OTHER"),
+    "none.mha": (b"NDims = 3\n", "its header has no DimSize"),
+    "axes.nrrd": (nrrd(dimension="-1"), "expected 1 to 8 axes, got -1"),
+    "huge.nrrd": (nrrd(sizes="99999999999 9 9"), "tells of 99999999999 x 9 x 9 voxels"),
+    "packed.nrrd": (nrrd(sizes="32767 32767 32767", encoding="gzip"), "tells of 32767 x"),
+    "long.nrrd": (nrrd(sizes="9" * 5000), "expected 3 sizes"),
+}
+
+
+@pytest.mark.parametrize("name", ITK_BOMBS)
+@pytest.mark.filterwarnings("ignore:.*the image is 0 everywhere")
+def test_itk_bombs(tmp_path, name):
+    pytest.importorskip("SimpleITK")
+    raw, words = ITK_BOMBS[name]
+    (tmp_path / name).write_bytes(raw)
+    if words is None:
+        assert load_image(tmp_path / name).shape == (3, 4, 5)
+    else:
+        refused(load_image, tmp_path / name, words)
+
+
+@pytest.mark.parametrize(
+    "name", ["/etc/passwd", "../a.raw", "folder/a.raw", "..", "http://x/a.raw", "a\\b.raw", "a%03d.raw 1 9 1", ""]
+)
+def test_voxels_lie_beside_their_header(tmp_path, name):
+    """Else the bytes of any file of the machine come back to the sender, as cells of a mesh."""
+    pytest.importorskip("SimpleITK")
+    inner = tmp_path / "inner"
+    (inner / "folder").mkdir(parents=True)
+    for path in (tmp_path / "a.raw", inner / "folder" / "a.raw"):
+        path.write_bytes(bytes(range(60)))
+    headers = {
+        "a.mhd": mha(file=name, data=b""),
+        "b.mhd": mha(file=f"LIST\n{name or '..'}", data=b""),
+        "a.nhdr": nrrd(more=f"data file: {name}\n", data=b""),
+        "b.nhdr": nrrd(more=f"data file: LIST\n{name or '..'}\n", data=b""),
+    }
+    for header, raw in headers.items():
+        (inner / header).write_bytes(raw)
+        refused(load_image, inner / header, "only a file beside the header, by its bare name, is read|damaged")
+
+
+@pytest.mark.parametrize("header", ["a.mhd", "a.nhdr"])
+def test_voxels_beside_their_header_are_read(tmp_path, header):
+    pytest.importorskip("SimpleITK")
+    (tmp_path / "a b.raw").write_bytes(bytes(range(60)))
+    raw = {"a.mhd": mha(file="a b.raw", data=b""), "a.nhdr": nrrd(more="data file: a b.raw\n", data=b"")}[header]
+    (tmp_path / header).write_bytes(raw)
+    np.testing.assert_array_equal(load_image(tmp_path / header).data.ravel(order="F"), np.arange(60))
+    if hasattr(os, "mkfifo"):
+        (tmp_path / "a b.raw").unlink()
+        os.mkfifo(tmp_path / "a b.raw")
+        refused(load_image, tmp_path / header, 'its data file "a b.raw" is a pipe')
+
+
+def nifti(path, shape=(3, 4, 5), offset=352.0, extension=b"\0\0\0\0", data=bytes(60)):
+    """A NIfTI file whose header may tell of anything."""
+    header = nibabel.Nifti1Header()
+    header.set_data_dtype(np.uint8)
+    header["dim"][: len(shape) + 1] = [len(shape), *shape]
+    header["vox_offset"], header["magic"] = offset, b"n+1"
+    raw = header.binaryblock + extension + data
+    path.write_bytes(gzip.compress(raw) if path.suffix == ".gz" else raw)
+    return path
+
+
+@pytest.mark.parametrize("name", ["a.nii", "a.nii.gz"])
+@pytest.mark.filterwarnings("ignore:.*the image is 0 everywhere")
+def test_nifti_bombs(tmp_path, name):
+    assert load_image(nifti(tmp_path / name)).shape == (3, 4, 5)
+    refused(load_image, nifti(tmp_path / name, (32767,) * 3), r"tells of 32767 x 32767 x 32767 voxels, 3.518e\+13")
+    refused(load_image, nifti(tmp_path / name, (3, 4, -5)), "damaged")
+    refused(load_image, nifti(tmp_path / name, offset=1e30), "its voxels are to begin at byte 1e.30")
+    refused(load_image, nifti(tmp_path / name, offset=np.nan), "its voxels are to begin at byte nan")
+
+
+def test_a_gzip_file_that_goes_on(tmp_path):
+    """Only as much is unpacked as the header tells of, and what may lie behind that."""
+    path = nifti(tmp_path / "a.nii.gz", data=bytes(2**25))
+    refused(load_image, path, "it goes on far behind the last voxel")
+
+
+def test_postscript_in_a_picture(tmp_path):
+    """Pillow goes by what a file holds, and gives PostScript to Ghostscript."""
+    (tmp_path / "a.png").write_bytes(b"%!PS-Adobe-3.0 EPSF-3.0\n%%BoundingBox: 0 0 9 9\n%%EndComments\nshowpage\n")
+    refused(load_image, tmp_path / "a.png", "Pillow knows no such picture")
+
+
+def test_a_picture_of_too_many_pixels(tmp_path):
+    chunk = b"IHDR" + struct.pack(">IIBBBBB", 2**20, 2**20, 8, 0, 0, 0, 0)
+    body = struct.pack(">I", 13) + chunk + struct.pack(">I", zlib.crc32(chunk))
+    data = zlib.compress(b"")
+    body += struct.pack(">I", len(data)) + b"IDAT" + data + struct.pack(">I", zlib.crc32(b"IDAT" + data))
+    (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + body)
+    refused(load_image, tmp_path / "a.png", "its 1048576 x 1048576 pixels are more than")

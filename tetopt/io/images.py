@@ -260,6 +260,8 @@ def sha256(path: str | Path) -> str:
     path = Path(path)
     digest = hashlib.sha256()
     with _os_errors_named(path):
+        if (other := irregular(path)) not in (None, "a folder"):
+            raise InputError(f"{path}: expected a regular file, got {other}; copy what it gives into a file")
         # A DICOM series is read from the folder itself and not from folders in it; so is its checksum.
         files = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
         for file in files:
