@@ -1,5 +1,9 @@
 """Models solved: closed forms, another library's answer for each kind of load, laws, and what cannot be solved."""
 
+import os
+import subprocess
+import sys
+
 import numpy as np
 import pytest
 import skfem
@@ -605,3 +609,31 @@ def test_reactions_of_a_set_add_up():
         assert list(solution.reactions) == ["inferior"]
         # The springs pull by 2 kPa/mm * 0.1 mm on 4 mm2; the support's part is what is left.
         np.testing.assert_allclose(solution.reactions["inferior"], [-4.0, 0.0, -12.0], atol=1e-7)
+
+
+CHILD = """
+import hashlib
+import numpy as np
+import tetopt
+from tetopt.fem.solution import solution_fields, solved_model
+from tetopt.model.build import model_of
+
+image = tetopt.Image(np.random.default_rng(0).uniform(1.0, 50.0, (12, 12, 12)))
+model = model_of(tetopt.lattice(image, nodes=4200), image, young="1 + h", loads=["compress:5%"])
+solution = solved_model(model)
+fields = solution_fields(model.mesh, solution)
+assert solution.n_iterations > 5 and len(solution.system.free) > 10_000
+numbers = [solution.u, solution.stress, fields.point_data["stress_nodes"], *solution.reactions.values()]
+print(hashlib.sha256(b"".join(each.tobytes() for each in numbers)).hexdigest(), repr(solution.strain_energy))
+"""
+
+
+def test_the_same_bits_on_any_number_of_blas_threads():
+    """BLAS and LAPACK share long sums among threads, and round otherwise; a solution by multigrid does not."""
+    results = set()
+    for threads in ("1", "2"):
+        environment = dict(os.environ) | dict.fromkeys(("OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"), threads)
+        words = [sys.executable, "-c", CHILD]
+        done = subprocess.run(words, env=environment, capture_output=True, check=True, text=True)
+        results.add(done.stdout)
+    assert len(results) == 1

@@ -17,7 +17,7 @@ from scipy.sparse import csr_array, diags_array
 from scipy.sparse.linalg import ArpackNoConvergence, LinearOperator, cg, eigsh, lobpcg
 
 from tetopt.errors import InputError
-from tetopt.fem.elasticity import RESIDUAL_SHARE, Method, System, factorized, is_direct, multigrid
+from tetopt.fem.elasticity import RESIDUAL_SHARE, Method, System, factorized, is_direct, multigrid, on_one_blas_thread
 
 DENSE_DOFS = 32  # up to so many a full matrix is taken: the Lanczos solver wants more dofs than it finds eigenvalues
 
@@ -31,6 +31,7 @@ class Conditioning(NamedTuple):
     cg_iterations: int  # see `cg_iterations`, for the system's load
 
 
+@on_one_blas_thread
 def conditioning(system: System, *, method: Method = "auto") -> Conditioning:
     """Extreme eigenvalues, condition number and iteration count of a constrained stiffness matrix.
 
@@ -45,7 +46,8 @@ def conditioning(system: System, *, method: Method = "auto") -> Conditioning:
     Returns
     -------
     Conditioning
-        Eigenvalues good to a relative 1e-7 or better. Nothing is random: the same in every run, up to rounding.
+        Eigenvalues good to a relative 1e-7 or better. Nothing is random: the same in every run, on any number of
+        threads.
 
     Raises
     ------

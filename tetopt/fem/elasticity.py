@@ -20,13 +20,15 @@ Degrees of freedom go node by node: component d of node i is number i n + d. Nod
 
 from __future__ import annotations
 
-from collections.abc import Iterable
-from typing import Any, Literal, NamedTuple
+from collections.abc import Callable, Iterable
+from functools import wraps
+from typing import Any, Literal, NamedTuple, ParamSpec, TypeVar
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from scipy.sparse import bsr_array, bsr_matrix, csr_array, diags_array, eye_array, kron
 from scipy.sparse.linalg import LinearOperator, cg, splu
+from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
 from tetopt.check import check_unfolded, facets_on_box, filled_share
 from tetopt.errors import InputError
@@ -39,11 +41,29 @@ from tetopt.mesh import Mesh
 from tetopt.model.laws import checked_young
 
 Method = Literal["auto", "direct", "amg"]
+Arguments = ParamSpec("Arguments")
+Result = TypeVar("Result")
 
 # Free dofs up to which the matrix is factorised. Filling in is what a factorisation costs: in 3-D 14 k dofs take
 # 3 s and 57 k take 140 s and 4 GB, where multigrid takes 0.3 s and 2 s; in 2-D 100 k take 1 s.
 DIRECT_DOFS = {2: 200_000, 3: 10_000}
 RESIDUAL_SHARE = 1e-10  # residual over load that an iterative solution goes down to; ten times as much is refused
+
+
+def on_one_blas_thread(function: Callable[Arguments, Result]) -> Callable[Arguments, Result]:
+    """The function, in which BLAS and LAPACK use one thread: how they round depends on how they share the work.
+
+    So the same bits come out on any number of threads. Nothing is lost: assembly, sparse products and relaxation are
+    serial anyway, and inner products and the coarsest grid too small; on a busy machine two threads took four times as
+    long as one.
+    """
+
+    @wraps(function)
+    def serial(*args: Arguments.args, **kwargs: Arguments.kwargs) -> Result:
+        with threadpool_limits(1, user_api="blas"):
+            return function(*args, **kwargs)
+
+    return serial
 
 
 class Outside(NamedTuple):
@@ -358,6 +378,7 @@ def _of_corners(elements: Elements, n_corners: int) -> csr_array:
     return csr_array((values, column, starts), shape=(n_nodes, n_corners))
 
 
+@on_one_blas_thread
 def compression(
     mesh: Mesh,
     young: ArrayLike,
@@ -492,6 +513,7 @@ def solved(system: System, method: Method = "auto") -> NDArray[np.float64]:
     return solved_in_steps(system, method)[0]
 
 
+@on_one_blas_thread
 def solved_in_steps(system: System, method: Method = "auto") -> tuple[NDArray[np.float64], int]:
     """What `solved` returns, and how many steps conjugate gradients took: 0 where the matrix was factorised."""
     n, n_steps = len(system.frame), 0

@@ -25,6 +25,7 @@ from tetopt.fem.elasticity import (
     constrained,
     gauss_strains,
     lame_constants,
+    on_one_blas_thread,
     solved_in_steps,
 )
 from tetopt.geometry.quadratic import cell_edges, gauss_rule, of_order
@@ -65,6 +66,7 @@ class _Task(NamedTuple):
     springs: dict[str, NDArray[np.float64]]  # (N,) mN/mm of each set
 
 
+@on_one_blas_thread
 def solved_model(model: Model, step: int = 1, method: Method = "auto") -> Solution:
     """The displacements of one step, and what follows from them.
 
@@ -265,6 +267,7 @@ class Fields(NamedTuple):
     point_data: dict[str, NDArray[np.float64]]  # (N, ...) a row a node of the order
 
 
+@on_one_blas_thread
 def solution_fields(mesh: Mesh, solution: Solution, step: int = 1) -> Fields:
     """Displacement, mm, strain, stress, kPa, and von Mises stress, on cells (means) and nodes; tensors row by row.
 
