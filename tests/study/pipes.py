@@ -10,6 +10,7 @@ from pathlib import Path
 import numpy as np
 
 import tetopt
+from tetopt.study.endings import Crashed, NotInstalled, signal_words
 from tetopt.study.pipelines import Produced
 
 
@@ -22,6 +23,55 @@ def sleep(job):
     child = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(600)"])
     Path(os.environ["PIPES_PID"]).write_text(str(child.pid))
     time.sleep(600)
+
+
+def crash_once(job):
+    """The first time; which one it is stands in the file named by PIPES_PID."""
+    path = Path(os.environ["PIPES_PID"])
+    if not path.exists():
+        path.write_text("once")
+        crash(job)
+    return fine(job)
+
+
+def crash_and_refuse(job):
+    crash_once(job)
+    refuse(job)
+
+
+def wrap(job):
+    """A shell whose program crashed."""
+    raise Crashed(f"mine crashed ({signal_words(subprocess.run(['sh', '-c', 'kill -11 $$; true']).returncode)})")
+
+
+def absent(job):
+    raise NotInstalled("thing: not installed")
+
+
+def quit_early(job):
+    """As a library that ends the process, content."""
+    os._exit(0)
+
+
+def escape(job):
+    """Orphans in sessions of their own, one of which takes memory; their ids stand in the file named by PIPES_PID."""
+    program = (
+        "import os, sys, time\n"
+        "if os.fork(): os._exit(0)\n"
+        "os.setsid()\n"
+        "if os.fork(): os._exit(0)\n"
+        "open(sys.argv[1], 'a').write(f'{os.getpid()} ')\n"
+        "time.sleep(600)"
+    )
+    for _ in range(2):
+        subprocess.run([sys.executable, "-c", program, os.environ["PIPES_PID"]])
+    time.sleep(600)
+
+
+def hoard_below(job):
+    """Memory of a process in a session of its own."""
+    program = "import time; a = bytearray(900_000_000); a[::4096] = b'x' * len(a[::4096]); time.sleep(600)"
+    subprocess.run([sys.executable, "-c", program], start_new_session=True)
 
 
 def hoard(job):

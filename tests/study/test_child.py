@@ -5,6 +5,7 @@ import pipes
 import signal
 import subprocess
 import sys
+import tempfile
 import time
 from pathlib import Path
 
@@ -13,6 +14,7 @@ import pytest
 
 import tetopt
 from tetopt.study.child import run_in_child
+from tetopt.study.endings import last_line, signal_words
 from tetopt.study.pipelines import PIPELINES, Job
 
 IMAGE = tetopt.load_phantom("sphere").image(voxel_mm=4.0)
@@ -46,7 +48,9 @@ def test_job_arrives_whole():
 @pytest.mark.parametrize(
     ("pipeline", "line"),
     [
-        (pipes.crash, "crashed: SIGSEGV"),
+        (pipes.crash, "twice crashed: signal 11, SIGSEGV"),
+        (pipes.wrap, "twice mine crashed (signal 11, SIGSEGV)"),
+        (pipes.quit_early, "ended with exit code 0 and no message"),
         (pipes.divide, "ZeroDivisionError: division by zero"),
         (pipes.refuse, "thing: expected a, got b; do c"),
         (pipes.missing, "ModuleNotFoundError: No module named 'tetopt_has_no_such_package'"),
@@ -57,6 +61,68 @@ def test_failure_is_one_line(pipeline, line):
     outcome = run_in_child(pipeline, JOB, max_seconds=60.0)
     assert outcome.mesh is None
     assert outcome.failure == line
+
+
+def test_a_crash_is_repeated_once(tmp_path, monkeypatch):
+    """And said; what else goes wrong is not repeated, and what is not installed is no failure like the others."""
+    monkeypatch.setenv("PIPES_PID", str(tmp_path / "pid"))
+    lines = []
+    outcome = run_in_child(pipes.crash_once, JOB, max_seconds=60.0, say=lines.append)
+    assert lines == ["crashed: signal 11, SIGSEGV; once more"]
+    assert outcome.failure is None
+    assert outcome.reason is None
+    assert outcome.crashes == ("crashed: signal 11, SIGSEGV",)
+    assert outcome.notes == ["the first run crashed: signal 11, SIGSEGV; this is the second", "a note"]
+    (tmp_path / "pid").unlink()
+    outcome = run_in_child(pipes.crash_and_refuse, JOB, max_seconds=60.0)
+    assert outcome.failure == "crashed: signal 11, SIGSEGV; then thing: expected a, got b; do c"
+    assert (outcome.reason, len(outcome.crashes)) == ("error", 1)
+    lines.clear()
+    for pipeline, reason, n_crashes in (
+        (pipes.crash, "crash", 2),
+        (pipes.refuse, "error", 0),
+        (pipes.absent, "missing", 0),
+    ):
+        outcome = run_in_child(pipeline, JOB, max_seconds=60.0, say=lines.append)
+        assert (outcome.reason, len(outcome.crashes)) == (reason, n_crashes)
+    assert len(lines) == 1
+
+
+@pytest.mark.parametrize(
+    ("code", "words"),
+    [
+        *((-11, "signal 11, SIGSEGV"), (139, "signal 11, SIGSEGV"), (137, "signal 9, SIGKILL")),
+        *((-15, "signal 15, SIGTERM"), (-99, "signal 99")),
+        *((code, None) for code in (0, 1, 127, 130, 143, 255)),
+    ],
+)
+def test_signals_in_words(code, words):
+    """A shell's 130 and 143 are of somebody who ended it, not of a crash."""
+    assert signal_words(code) == words
+
+
+def test_last_lines():
+    assert last_line("a\n  b\tc \x1b[31m\n\n") == r"b c \x1b[31m"
+    assert last_line("\n") == ""
+    assert last_line("x" * 1000) == "x" * 300 + "..."
+
+
+def test_what_escapes_its_group_ends_too(tmp_path, monkeypatch):
+    """Orphans in sessions of their own end with the child; the temporary folder has gone."""
+    monkeypatch.setenv("PIPES_PID", str(tmp_path / "pid"))
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    outcome = run_in_child(pipes.escape, JOB, max_seconds=6.0)
+    assert outcome.reason == "limit"
+    pids = [int(pid) for pid in (tmp_path / "pid").read_text().split()]
+    assert len(pids) == 2
+    assert [pid for pid in pids if is_running(pid)] == []
+    assert [path.name for path in tmp_path.iterdir()] == ["pid"]
+
+
+def test_memory_of_a_session_below_counts():
+    outcome = run_in_child(pipes.hoard_below, JOB, max_seconds=60.0, max_bytes=600_000_000)
+    assert outcome.failure.startswith("too much memory: ")
+    assert outcome.reason == "limit"
 
 
 def test_time_out_kills_the_whole_group(tmp_path, monkeypatch):
@@ -82,23 +148,31 @@ def test_peak_is_the_childs_own():
     assert outcome.peak_bytes < 0.7 * hoard.nbytes
 
 
-def test_interrupt_kills_the_child(tmp_path):
+@pytest.mark.parametrize("sent", [signal.SIGINT, signal.SIGKILL], ids=["Ctrl-C", "kill -9"])
+def test_the_end_of_the_parent_ends_the_child(tmp_path, sent):
+    """And what it started; and takes the temporary folder away."""
     program = (
         "import pipes, tetopt; from tetopt.study.child import run_in_child; from tetopt.study.pipelines import Job\n"
         "image = tetopt.load_phantom('sphere').image(voxel_mm=4.0)\n"
         "run_in_child(pipes.sleep, Job(image, None, 300), max_seconds=300.0)"
     )
-    pid_file = tmp_path / "pid"
+    pid_file, temporary = tmp_path / "pid", tmp_path / "temporary"
+    temporary.mkdir()
     paths = [str(Path(__file__).parent), str(Path(tetopt.__file__).parents[1])]
-    environment = os.environ | {"PIPES_PID": str(pid_file), "PYTHONPATH": os.pathsep.join(paths)}
+    environment = os.environ | {
+        "PIPES_PID": str(pid_file), "PYTHONPATH": os.pathsep.join(paths), "TMPDIR": str(temporary)
+    }  # fmt: skip
     parent = subprocess.Popen([sys.executable, "-c", program], env=environment, stderr=subprocess.PIPE)
     try:
-        wait_for(lambda: pid_file.exists() and pid_file.read_text(), 40.0)
-        parent.send_signal(signal.SIGINT)
-        assert b"KeyboardInterrupt" in parent.communicate(timeout=20.0)[1]
+        wait_for(lambda: pid_file.exists() and pid_file.read_text(), 60.0)
+        assert len(list(temporary.iterdir())) == 1
+        parent.send_signal(sent)
+        errors = parent.communicate(timeout=20.0)[1]
+        assert b"KeyboardInterrupt" in errors or sent == signal.SIGKILL
     finally:
         parent.kill()
     assert not is_running(int(pid_file.read_text()))
+    wait_for(lambda: not list(temporary.iterdir()), 20.0)
 
 
 def test_bad_requests():

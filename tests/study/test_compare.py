@@ -1,6 +1,7 @@
 """`tetopt compare` and `tetopt baseline`: files, numbers recomputed, failures, resuming, one line for bad input."""
 
 import json
+import pipes
 
 import numpy as np
 import pytest
@@ -13,9 +14,12 @@ from tetopt.fem.reference import Errors, averaged, nearest, reference, refined
 from tetopt.fem.reference import compare as reference_errors
 from tetopt.geometry.quadratic import quadratic
 from tetopt.model.averages import element_young, young_image
+from tetopt.model.laws import parse_law
 from tetopt.study import compare, tradeoff
 from tetopt.study.compare_files import COMPARE_PICTURES
-from tetopt.study.compare_report import Attempt, ImageSource, Settings, as_json, from_json
+from tetopt.study.compare_report import Attempt, ImageSource, LabelSource, Settings, as_json, from_json
+from tetopt.study.pipelines import PIPELINES
+from tetopt.study.program import Program
 
 SMALL = ["--nodes", "400", "--repeats", "2", "--reference-dofs", "6000"]
 
@@ -100,10 +104,14 @@ def test_the_keys_of_the_report(run):
     report = json.loads((run / "report.json").read_text())
     assert set(report) == {
         *("command", "curves", "image", "labels", "law", "machine", "options", "pipelines", "reference", "seconds"),
-        *("quadratic", "tradeoff", "versions"),
+        *("date", "headline", "quadratic", "tradeoff", "versions"),
     }
+    assert set(report["headline"]) == {"title", "remarks", "claims", "behind"}
+    assert report["headline"]["title"] == "tetopt against no peer: none was asked for"
+    assert {row["other_kind"] for row in report["headline"]["behind"]} <= {"control"}
     pipeline = report["pipelines"][0]
-    assert set(pipeline) == {"about", "failure", "high", "kind", "low", "median", "name", "notes", "runs", "title"}
+    keys = {"about", "failure", "high", "kind", "low", "median", "name", "notes", "runs", "title"}
+    assert set(pipeline) == {*keys, "reason", "crashes"}
     median = pipeline["median"]
     assert set(median) == {
         *("E_D", "E_D_share", "dihedral_histogram", "fem", "labels", "n_cells", "n_corners", "n_empty_cells"),
@@ -129,7 +137,7 @@ def test_the_keys_of_the_report(run):
 
 def test_runs_are_read_back_as_they_were_written(run):
     for path in (run / "runs").glob("*.json"):
-        row = json.loads(path.read_text())
+        row = json.loads(path.read_text())["content"]
         attempt = from_json(Attempt, row)
         assert as_json(attempt) == row
         assert sum(attempt.run.measurement.rho_histogram.share) == pytest.approx(1.0)
@@ -233,6 +241,76 @@ def test_resume_keeps_what_is_done(run, head, capsys):
     assert "exists already" in capsys.readouterr().err
 
 
+@pytest.mark.parametrize(
+    "damage",
+    [
+        lambda text: "",
+        lambda text: text[: len(text) // 2],
+        lambda text: "[" * 100_000,
+        lambda text: "{}",
+        lambda text: "null",
+        lambda text: "[1, 2]",
+        lambda text: '{"content": {"run": 3}, "sha256": "ab"}',
+        lambda text: text.replace('"n_nodes": ', '"n_nodes": 1', 1),  # a digit more: whole, and of the same mesh
+        lambda text: text.encode("utf-16").decode("latin-1"),
+        lambda text: text.replace('"order": 1', f'"order": {"9" * 5000}'),
+    ],
+    ids=["empty", "cut off", "deep", "an object", "null", "a list", "no run", "edited", "other bytes", "digits"],
+)
+def test_a_damaged_run_is_none(run, tmp_path, damage):
+    """It is run again, whatever its file holds; whole it is kept, but not with another mesh."""
+    name, mesh_name = "bcc-400-1.json", "bcc-400-1.vtu"
+    text = (run / "runs" / name).read_text()
+    key = json.loads(text)["content"]["key"]
+    (tmp_path / name).write_text(text)
+    (tmp_path / mesh_name).write_bytes((run / "runs" / mesh_name).read_bytes())
+    assert as_json(compare._kept(tmp_path / name, key)) == json.loads(text)["content"]
+    assert compare._kept(tmp_path / name, "another") is None
+    (tmp_path / name).write_text(damage(text))
+    assert compare._kept(tmp_path / name, key) is None
+    (tmp_path / name).write_text(text)
+    (tmp_path / mesh_name).write_bytes((run / "runs" / "odt-400-1.vtu").read_bytes())
+    assert compare._kept(tmp_path / name, key) is None
+    (tmp_path / mesh_name).unlink()
+    assert compare._kept(tmp_path / name, key) is None
+
+
+OTHER_SETTINGS = {  # of each setting that numbers depend on another value
+    "classes": 5, "k_D": 0.4, "iterations": 7, "nus": (0.3,), "percent": 2.0, "average": "hill", "reference_dofs": 7000,
+}  # fmt: skip
+
+
+def test_a_run_of_other_options_is_not_kept(head, tmp_path):
+    """Every setting either changes what a finished run is known by, or is one that no run's numbers depend on."""
+    image = tetopt.load_image(head / "image.nii.gz")
+    law = tmp_path / "law.csv"
+    law.write_text("intensity,young\n0,1\n100,10\n")
+
+    def key(settings=Settings(nodes=400), image=image, crop=None, labels=None):  # noqa: B008
+        source = ImageSource("image", "ab", None, crop)
+        of_labels = labels and LabelSource("labels", "given", labels)
+        comparison = compare.Comparison(image, None, parse_law(str(law)), settings, source, of_labels, str(law), "")
+        facts = compare._facts(comparison)
+        return compare._key(compare.Bench(comparison, None, {}, tmp_path, print, True, facts), "bcc")
+
+    assert set(Settings._fields) == set(OTHER_SETTINGS) | compare.FREE_SETTINGS
+    first = key()
+    assert key() == first
+    keys = [key(Settings(nodes=400)._replace(**{name: value})) for name, value in OTHER_SETTINGS.items()]
+    keys += [key(crop="0:5,:,:"), key(labels="cd"), key(labels="ef")]
+    law.write_text("intensity,young\n0,1\n100,20\n")  # the same words, another law
+    keys.append(key())
+    assert len({first, *keys}) == len(keys) + 1
+    program = Program("bcc", f"sh {law} {{image}} {{output}}")
+    of_program = [
+        key(Settings(400, programs=(program,))),
+        key(Settings(400, programs=(program._replace(command="a"),))),
+    ]
+    law.write_text("intensity,young\n0,1\n100,30\n")
+    of_program.append(key(Settings(400, programs=(program,))))
+    assert len({key(), *of_program}) == 4
+
+
 def test_when_all_fail_nothing_is_replaced(head, opengl, capsys):
     """No time at all for anything: one line, exit 2, no report."""
     out = head / "hurried"
@@ -287,6 +365,35 @@ def test_baseline(head, tmp_path, capsys):
     assert set(numbers["seconds"]) == {"surfaces", "tetrahedra", "search"}
 
 
+@pytest.mark.parametrize("n_crashes", [1, 2])
+def test_a_peer_that_crashes(head, opengl, tmp_path, monkeypatch, capsys, n_crashes):
+    """At first: run again, and said in the terminal, in the files and on the page. Twice: it failed."""
+    monkeypatch.setenv("PIPES_PID", str(tmp_path / "pid"))
+    pipe = pipes.crash_once if n_crashes == 1 else pipes.crash
+    monkeypatch.setitem(PIPELINES, "pytetwild", PIPELINES["pytetwild"]._replace(function=pipe, is_random=False))
+    image = str(head / "image.nii.gz")
+    mesh = tmp_path / "b.vtu"
+    assert main(["baseline", image, "-o", str(mesh), "--nodes", "150"]) == 2 * (n_crashes == 2)
+    err = capsys.readouterr().err
+    assert "pytetwild: crashed: signal 11, SIGSEGV; once more" in err
+    assert mesh.exists() == (n_crashes == 1)
+    assert ("tetopt: pytetwild: twice crashed: signal 11, SIGSEGV" in err) == (n_crashes == 2)
+    (tmp_path / "pid").unlink(missing_ok=True)
+    out = tmp_path / "out"
+    assert main(["compare", image, "-o", str(out), *SMALL, "--curve", "", "--pipelines", "bcc,pytetwild"]) == 0
+    assert "pytetwild: crashed: signal 11, SIGSEGV; once more" in capsys.readouterr().err
+    _, peer = json.loads((out / "report.json").read_text())["pipelines"]
+    assert peer["crashes"] == ["crashed: signal 11, SIGSEGV"] * n_crashes
+    assert peer["reason"] == (None if n_crashes == 1 else "crash")
+    assert ("median" in peer) == (n_crashes == 1)
+
+
+def test_a_missing_peer_is_no_failure_of_it(head, tmp_path, monkeypatch, capsys):
+    monkeypatch.setitem(PIPELINES, "pytetwild", PIPELINES["pytetwild"]._replace(function=pipes.absent))
+    assert main(["baseline", str(head / "image.nii.gz"), "-o", str(tmp_path / "b.vtu"), "--nodes", "150"]) == 2
+    assert "tetopt: pytetwild: thing: not installed" in capsys.readouterr().err
+
+
 @pytest.mark.parametrize(
     ("options", "words"),
     [
@@ -314,23 +421,28 @@ def test_the_reference_is_chosen_once(head, tmp_path, monkeypatch):
     comparison = compare.Comparison(
         image, None, [(0.0, 1.0), (100.0, 10.0)], settings, ImageSource("image", "ab", None, None), None, "law", ""
     )
-    sizes = iter([Budget(5000, False), Budget(6000, True), Budget(7000, False)])
+    sizes = iter(Budget(dofs, dofs == 6000) for dofs in range(5000, 10000, 1000))
     monkeypatch.setattr(compare, "affordable_dofs", lambda *arguments: next(sizes))
     lines = []
 
-    def chosen(settings=settings, resume=True):
-        once = compare._settled(comparison._replace(settings=settings), tmp_path, lines.append, resume=resume)
+    def chosen(comparison=comparison, resume=True, **changes):
+        settings = comparison.settings._replace(**changes)
+        facts = compare._facts(comparison)
+        once = compare._settled(comparison._replace(settings=settings), facts, tmp_path, lines.append, resume=resume)
         return once.settings.reference_dofs
 
-    assert chosen(settings._replace(reference_dofs=4000)) == 4000
+    assert chosen(reference_dofs=4000) == 4000
     assert not (tmp_path / "reference.json").exists()
     assert [chosen(), chosen()] == [5000, 5000]
     assert chosen(resume=False) == 6000
     assert chosen() == 6000
-    assert chosen(settings._replace(reference_seconds=9.0)) == 7000
+    assert chosen(reference_seconds=9.0) == 7000
     assert len(lines) == 3
     assert "in 5 s; --reference-dofs 5000" in lines[0]
     assert "in the free memory; --reference-dofs 6000" in lines[1]
+    # Of another part of the image, and with other moduli, the grid that fits is another.
+    assert chosen(comparison._replace(image_source=ImageSource("image", "ab", None, "0:5,:,:"))) == 8000
+    assert chosen(comparison._replace(law=[(0.0, 1.0), (100.0, 20.0)])) == 9000
     (tmp_path / "reference.json").write_text("{")
     with pytest.raises(StopIteration):
         chosen()

@@ -14,8 +14,10 @@ from tetopt.measure.quality import Quality, QualityErrors
 from tetopt.report.figures import save_figure
 from tetopt.report.viewer import view_of
 from tetopt.study.compare import elementwise
+from tetopt.study.compare_criteria import Entry, criteria, entry, number_text, winners
 from tetopt.study.compare_figures import curves_figure, histograms_figure, slices_figure, timing_figure
-from tetopt.study.compare_page import Entry, criteria, entry, number_text, save_compare_page, winners
+from tetopt.study.compare_headline import headline
+from tetopt.study.compare_page import save_compare_page
 from tetopt.study.compare_report import (
     Curve,
     CurvePoint,
@@ -117,8 +119,10 @@ def fake_report():
         n_runs = (1, 3, 0, 1, 1)[number]
         for order, pipelines in results.items():
             runs = [fake_run(10 * number + k, 1.0 + 0.3 * number, order) for k in range(n_runs)]
-            failure = None if runs else "crashed: signal 11 after 3 s"
-            result = PipelineResult(name, title, kind, f"{title}, its options", failure, [f"a note on {title}"], runs)
+            failure = None if runs else "twice crashed: signal 11, SIGSEGV"
+            about, notes = f"{title}, its options", [f"a note on {title}"]
+            reason, crashes = (None, []) if runs else ("crash", ["crashed: signal 11, SIGSEGV"] * 2)
+            result = PipelineResult(name, title, kind, about, failure, reason, crashes, notes, runs)
             pipelines.append(with_runs(result, runs))
     random = np.random.default_rng(0)
     curves = [
@@ -139,7 +143,7 @@ def fake_report():
         reference=ReferenceGrid(
             (49, 58, 47), 435000, "averaged", {"0.3": ReferenceEnergy(1.234, OwnError(0.01, 0.02), 17)}
         ),
-        pipelines=results[1], quadratic=results[2], tradeoff=[], curves=curves, seconds=812.0,
+        date="2026-11-22", pipelines=results[1], quadratic=results[2], tradeoff=[], curves=curves, seconds=812.0,
     )  # fmt: skip
 
 
@@ -151,24 +155,31 @@ def meshes_of(image, nodes, iterations):
 
 
 class Tables(HTMLParser):
-    """Rows of every table: for each cell its classes and its text, parts that stand apart divided by |."""
+    """Rows of every table: for each cell its classes and its text, parts that stand apart divided by |; its caption."""
 
     def __init__(self, page):
         super().__init__()
-        self.tables, self.cell = [], None
+        self.tables, self.kinds, self.captions, self.cell = [], [], [], None
         self.feed(page)
+
+    def of_kind(self, kind):
+        return [table for table, own in zip(self.tables, self.kinds, strict=True) if own == kind]
 
     def handle_starttag(self, tag, attrs):
         if tag == "table":
             self.tables.append([])
+            self.kinds.append(dict(attrs).get("class"))
+            self.captions.append([])
         if tag == "tr":
             self.tables[-1].append([])
+        if tag == "caption":
+            self.cell = [set(), self.captions[-1]]
         if tag in ("td", "th"):
             self.cell = [set((dict(attrs).get("class") or "").split()), []]
             self.tables[-1][-1].append(self.cell)
 
     def handle_endtag(self, tag):
-        if tag in ("td", "th"):
+        if tag in ("td", "th", "caption"):
             self.cell = None
 
     def handle_data(self, data):
@@ -181,16 +192,25 @@ def page_of(tmp_path, report, pictures=(), views=()):
     return (tmp_path / "report.html").read_text(encoding="utf-8")
 
 
-def headline(page):
-    """Rows of the headline table by the row's title; each cell (classes, texts)."""
-    rows = Tables(page).tables[0]
-    groups, rows_by_title = "", {}
-    for row in rows[1:]:
-        if len(row) == 1:
-            groups = "".join(row[0][1])
-        else:
-            rows_by_title[groups, row[0][1][0].rstrip(" ↓↑")] = row[1:]
+def measures(page):
+    """Rows of the groups' tables by their heading and the row's title; each cell (classes, texts)."""
+    parsed = Tables(page)
+    rows_by_title = {}
+    for table, kind, caption in zip(parsed.tables, parsed.kinds, parsed.captions, strict=True):
+        if kind == "measures":
+            part = "".join(caption).partition(":")[0]
+            for row in table[1:]:
+                if len(row) == 1:
+                    part = "".join(row[0][1])
+                else:
+                    rows_by_title[part, row[0][1][0].rstrip(" ↓↑")] = row[1:]
     return rows_by_title
+
+
+def claims(page):
+    """Rows of the first section's tables by the measure: the texts of each cell."""
+    tables = Tables(page).of_kind("claims")
+    return [{row[0][1][1].rstrip(" ↓↑"): [texts for _, texts in row] for row in table[1:]} for table in tables]
 
 
 # --------------------------------------------------------------------------------------------------
@@ -201,8 +221,8 @@ def headline(page):
 PATHS = {
     ("Image", "E_D, share of the image's variance"): ("E_D_share",),
     ("Image", "voxels outside the mesh"): ("n_missed_voxels",),
-    ("Size", "nodes"): ("n_nodes",),
-    ("Size", "tetrahedra"): ("n_cells",),
+    ("Cost", "nodes"): ("n_nodes",),
+    ("Cost", "tetrahedra"): ("n_cells",),
     ("Shape", "mean rho"): ("quality", "mean_rho"),
     ("Shape", "p1 rho"): ("quality", "p1_rho"),
     ("Shape", "min rho"): ("quality", "min_rho"),
@@ -223,11 +243,20 @@ PATHS = {
             ("strain-energy error", ("averages", "gauss", "errors", "strain_energy")),
             ("displacement error", ("averages", "gauss", "errors", "displacement")),
             ("interface-strain error", ("averages", "gauss", "errors", "interface_strain")),
+            *(
+                (f"{title} error, moduli by mean", ("averages", "mean", "errors", name))
+                for title, name in (
+                    ("strain-energy", "strain_energy"),
+                    ("displacement", "displacement"),
+                    ("interface-strain", "interface_strain"),
+                )
+            ),
             ("λ max", ("lambda_max",)),
             ("condition number", ("cond",)),
             ("CG iterations", ("cg_iterations",)),
         )
     },
+    ("Shape", "bad cells (3 rho < 0.3), %"): ("bad",),
     ("Cost", "wall time, s"): ("seconds_total",),
     ("Cost", "peak memory, MB"): ("peak_bytes",),
 }
@@ -262,6 +291,8 @@ DERIVED = {
 
 def dug(run, keys):
     value = as_json(run)
+    if keys == ("bad",):
+        return 100.0 * sum(value["quality"]["kinds"].values()) / value["quality"]["n_cells"]
     for key in keys:
         value = value[key]
     return value / 1e6 if keys == ("peak_bytes",) else value
@@ -274,43 +305,26 @@ def close(text, value):
 
 def test_every_number_is_the_reports(tmp_path):
     report = fake_report()
-    rows = headline(page_of(tmp_path, report))
+    rows = measures(page_of(tmp_path, report))
     assert set(rows) == set(PATHS) | set(DERIVED)
     for title, keys in PATHS.items():
         for pipeline, (_, texts) in zip(pipelines_of(report, title), rows[title], strict=True):
             if pipeline.median is None:
                 assert texts == ["failed"]
                 continue
-            assert close(texts[0], dug(pipeline.median, keys)), title
+            assert close(texts[0], np.median([dug(run, keys) for run in pipeline.runs])), title
             if len(pipeline.runs) > 1:
                 low, high = texts[1].split(" to ")
-                assert close(low, dug(pipeline.low, keys))
-                assert close(high, dug(pipeline.high, keys))
+                each = [dug(run, keys) for run in pipeline.runs]
+                assert close(low, min(each))
+                assert close(high, max(each))
             else:
                 assert not any(" to " in text for text in texts)
 
 
-def test_every_order_and_average_has_a_row(tmp_path):
-    """The errors of the report, and which of them is the smallest in one sentence."""
+def test_the_best_of_orders_and_averages_is_said(tmp_path):
     report = fake_report()
     page = page_of(tmp_path, report)
-    _, *rows = Tables(page).tables[1]
-    places = {}
-    for row in rows:
-        if len(row) == 1:
-            group = row[0][1][0]
-        else:
-            places[group, row[0][1][0].rstrip(" ↓")] = [texts[0] for _, texts in row[1:]]
-    assert len(places) == 2 * 3 * 4
-    for nu in ("0.3", "0.45"):
-        for title, name in (("strain-energy", "strain_energy"), ("displacement", "displacement")):
-            for cells, pipelines in (("linear", report.pipelines), ("quadratic", report.quadratic)):
-                for average in ("mean", "gauss"):
-                    texts = places[f"{title} error, ν = {nu}", f"{cells} cells, {average}"]
-                    for text, pipeline in zip(texts, pipelines, strict=True):
-                        if pipeline.median is not None:
-                            solved = pipeline.median.measurement.fem[nu].averages[average]
-                            assert close(text, getattr(solved.errors, name))
     best = report.quadratic[0].median.measurement.fem["0.3"].averages["gauss"].errors
     line = (
         "At about 5000 nodes in all and ν = 0.3, the displacement&#x27;s error is smallest with tetopt, quadratic "
@@ -321,10 +335,14 @@ def test_every_order_and_average_has_a_row(tmp_path):
     assert page.index("ν = 0.45, the displacement") > page.index(line)
 
 
+def equal_time_table(page):
+    return next(table for table in Tables(page).tables if [cell[1] for cell in table[0][1:3]] == [["ν"], ["seconds"]])
+
+
 def test_errors_at_equal_times(tmp_path):
     """Between two meshes of the curve, on logarithms; nothing beyond its ends."""
     report = fake_report()
-    _, *rows = Tables(page_of(tmp_path, report)).tables[2]
+    _, *rows = equal_time_table(page_of(tmp_path, report))
     shown = {(row[0][1][0], row[1][1][0]): [cell[1][0] for cell in row[2:]] for row in rows}
     assert len(shown) == 2 * len(finished(report))
     linear = report.pipelines[0].median.measurement.fem["0.3"].averages["gauss"]
@@ -337,7 +355,7 @@ def test_errors_at_equal_times(tmp_path):
     assert close(own, linear.errors.displacement)
     assert close(theirs, expected)
     report.pipelines[0].median.measurement.fem["0.3"].averages["gauss"] = linear._replace(seconds=5.0)
-    _, row, *_ = Tables(page_of(tmp_path, report)).tables[2]
+    _, row, *_ = equal_time_table(page_of(tmp_path, report))
     assert [cell[1][0] for cell in row[2:]] == ["5", number_text(linear.errors.displacement), "–"]
 
 
@@ -345,14 +363,14 @@ def test_quadratic_failures_are_named(tmp_path):
     report = fake_report()
     report.quadratic[1] = with_runs(report.quadratic[1]._replace(failure="timed out"), [])
     page = page_of(tmp_path, report)
-    assert "<strong>pytetwild, quadratic cells, failed:</strong> timed out" in page
-    assert headline(page)["Compression, ν = 0.3, quadratic cells", "displacement error"][1][1] == ["failed"]
-    assert headline(page)["Compression, ν = 0.3, linear cells", "displacement error"][1][1] != ["failed"]
+    assert "pytetwild, quadratic cells: failed: timed out." in page
+    assert measures(page)["Compression, ν = 0.3, quadratic cells", "displacement error"][1][1] == ["failed"]
+    assert measures(page)["Compression, ν = 0.3, linear cells", "displacement error"][1][1] != ["failed"]
 
 
 def test_label_rows_are_computed_from_the_runs(tmp_path):
     report = fake_report()
-    rows = headline(page_of(tmp_path, report))
+    rows = measures(page_of(tmp_path, report))
     for title, value in DERIVED.items():
         for pipeline, (_, texts) in zip(report.pipelines, rows[title], strict=True):
             if pipeline.runs:
@@ -365,8 +383,17 @@ def test_a_lost_label_is_not_averaged_away(tmp_path):
     report = fake_report()
     lose(report.pipelines[0].runs[0], 2)
     for title in ("mean label surface distance, mm", "label edges folded over 60°, mean by voxels"):
-        cell = headline(page_of(tmp_path, report))[JUDGED, title][0]
-        assert cell == [{"tetopt", "lost"}, ["–", "loses: no value"]]
+        cell = measures(page_of(tmp_path, report))[JUDGED, title][0]
+        assert cell == [{"tetopt", "lost"}, ["–", "no value"]]
+
+
+def folded_tables(parsed):
+    """Of the labels' pieces, and of their shares of E_D."""
+    return [
+        table
+        for table in parsed.tables
+        if table[0][0][1] == ["label"] and table[0][1][1][0] in ("in the image", "voxels")
+    ]
 
 
 def lose(run, label):
@@ -384,7 +411,8 @@ def test_labels_are_tabled_and_the_vanished_named(tmp_path):
     page = page_of(tmp_path, report)
     assert "<li>tetopt: label 3 (140 voxels)</li>" in page
     assert "<li>pytetwild: label 1 (2250 voxels, in 1 of 3 runs), label 3 (140 voxels)</li>" in page
-    head, *rows = Tables(page).tables[3]
+    parsed = Tables(page)
+    head, *rows = parsed.of_kind("labels")[0]
     done = finished(report)
     assert [cell[1][0] for cell in head] == ["label", *(p.title for p in done)]
     own = {row.label: row.dice for row in done[0].median.measurement.labels}
@@ -407,7 +435,7 @@ def test_labels_are_tabled_and_the_vanished_named(tmp_path):
             assert texts == expected + ["lost in 1 of 3 runs"] * (len(known) == 2)
         if dice:
             assert [("best" in classes) for classes, _ in cells] == [d == max(dice) for d in dice]
-    pieces, shares = Tables(page).tables[4:6]  # folded
+    pieces, shares = folded_tables(parsed)
     for k in range(4):
         for column, pipeline in enumerate(done, 2):
             of_runs = [run.measurement.labels[k] for run in pipeline.runs]
@@ -423,7 +451,7 @@ def test_most_of_many_labels_are_folded(tmp_path):
             row = run.measurement.labels[1]
             with_measured(report, number, labels=[row._replace(label=k, dice=0.9 - 0.01 * k) for k in range(40)])
     page = page_of(tmp_path, report)
-    open_, folded = ([int(row[0][1][0]) for row in table[1:]] for table in Tables(page).tables[3:5])
+    open_, folded = ([int(row[0][1][0]) for row in table[1:]] for table in Tables(page).of_kind("labels"))
     assert open_ == list(range(39, 27, -1))
     assert folded == list(range(27, -1, -1))
     assert "<details><summary>The other 28 labels</summary>" in page
@@ -453,8 +481,8 @@ def test_who_keeps_the_labels_is_said(tmp_path):
     assert "pytetwild's on label 2 left &lt;lung&gt; (0.61 against 0.62)." in page
     assert "larger than pytetwild's on label 2 left &lt;lung&gt;." in page
     assert "label 3 dot (140 voxels" in page
-    table, pieces, shares = Tables(page).tables[3:6]
-    for each in (table, pieces, shares):
+    parsed = Tables(page)
+    for each in (*parsed.of_kind("labels"), *folded_tables(parsed)):
         assert {row[0][1][0] for row in each[1:]} == {"0", "1", "2 left <lung>", "3 dot"}
     page = page_of(tmp_path, with_dice((0.1, 0.9, 0.62), (0.99, 0.8, 0.62)))
     assert "Dice is at least pytetwild's on 2<" in page
@@ -510,56 +538,105 @@ E_D_ROW = ("Image", "E_D, share of the image's variance")
 
 def test_a_loss_is_marked_and_said(tmp_path):
     page = page_of(tmp_path, with_values(tetopt=0.07, pytetwild=0.05, bcc=0.09, odt=0.08))
-    (tetopt_cell, peer, failed, control, _) = headline(page)[E_D_ROW]
-    assert tetopt_cell == [{"tetopt", "lost"}, ["0.07", "loses: 1.4× best"]]
+    (tetopt_cell, peer, failed, control, _) = measures(page)[E_D_ROW]
+    assert tetopt_cell == [{"tetopt", "lost"}, ["0.07", "1.4× the best"]]
     assert peer == [{"peer", "best"}, ["0.05", "0.05 to 0.05", "best"]]
     assert failed[0] == {"peer"}
     assert control == [{"control"}, ["0.09"]]
-    assert re.search(r"<li>to pytetwild: [^<]*E_D, share of the image&#x27;s variance", page)
-    assert '<tr class="loses"><th scope="row">E_D' in page
+    first, behind, _ = claims(page)
+    words = ["0.07"], ["0.05", "pytetwild"], ["1.4×", "worse"]
+    assert tuple(first[E_D_ROW[1]][1:]) == tuple(behind[E_D_ROW[1]][1:]) == words
 
 
 def test_a_control_can_win(tmp_path):
     page = page_of(tmp_path, with_values(tetopt=0.07, pytetwild=0.09, bcc=0.01, odt=0.08))
-    row = headline(page)[E_D_ROW]
+    row = measures(page)[E_D_ROW]
     assert [("best" in classes) for classes, _ in row] == [False, False, False, True, False]
-    assert re.search(r"<li>to BCC lattice: [^<]*E_D, share", page)
+    first, behind_peers, behind_others = claims(page)
+    assert first[E_D_ROW[1]][3] == ["0.778×", "better"]
+    assert E_D_ROW[1] not in behind_peers
+    assert behind_others[E_D_ROW[1]][2:] == [["0.01", "BCC lattice"], ["7×", "worse"]]
 
 
 def test_a_tie_is_shared(tmp_path):
-    row = headline(page_of(tmp_path, with_values(tetopt=0.05, pytetwild=0.05, bcc=0.09, odt=0.08)))[E_D_ROW]
+    row = measures(page_of(tmp_path, with_values(tetopt=0.05, pytetwild=0.05, bcc=0.09, odt=0.08)))[E_D_ROW]
     assert [texts[-1] for classes, texts in row if "best" in classes] == ["best, tied", "best, tied"]
     assert "lost" not in row[0][0]
 
 
 def test_no_value_loses(tmp_path):
-    row = headline(page_of(tmp_path, with_values(tetopt=None)))[E_D_ROW]
-    assert row[0] == [{"tetopt", "lost"}, ["–", "loses: no value"]]
+    row = measures(page_of(tmp_path, with_values(tetopt=None)))[E_D_ROW]
+    assert row[0] == [{"tetopt", "lost"}, ["–", "no value"]]
 
 
 def test_a_loss_to_zero_and_a_narrow_one(tmp_path):
-    row = headline(page_of(tmp_path, with_values(tetopt=0.07, pytetwild=0.0)))[E_D_ROW]
-    assert row[0][1] == ["0.07", "loses: 0.07 from best"]
-    row = headline(page_of(tmp_path, with_values(tetopt=0.05004, pytetwild=0.05)))[E_D_ROW]
-    assert row[0][1] == ["0.05004", "loses: within 0.1% of best"]
+    row = measures(page_of(tmp_path, with_values(tetopt=0.07, pytetwild=0.0)))[E_D_ROW]
+    assert row[0][1] == ["0.07", "0.07 from the best"]
+    row = measures(page_of(tmp_path, with_values(tetopt=0.05004, pytetwild=0.05)))[E_D_ROW]
+    assert row[0][1] == ["0.05004", "within 0.1% of the best"]
 
 
-def test_the_sentence_counts_what_the_table_marks(tmp_path):
-    page = page_of(tmp_path, fake_report())
-    cells = [row[0] for row in headline(page).values()]
-    n_best, n_lost = (sum(mark in classes for classes, _ in cells) for mark in ("best", "lost"))
-    assert f"tetopt is best in {n_best} of {n_best + n_lost} measures" in page
-    assert f"It loses in {n_lost}:" in page
-    assert n_best > 0 < n_lost
-    titles = {criterion.title for criterion in criteria(fake_report()) if criterion.better == 0}
+def test_the_headline_is_a_handful_of_numbers(tmp_path):
+    """Against the best peer: of every group, the kinds of bad cells as one; nowhere how many measures are won."""
+    report = fake_report()
+    page = page_of(tmp_path, report)
+    first, behind, others = claims(page)
+    assert [texts[0][0] for texts in first.values()] == ["Image", "Image", "Shape", "Simulation", "Simulation", "Cost"]
+    assert all(texts[2][-1] == "pytetwild" for texts in [*first.values(), *behind.values()])
+    assert {texts[2][-1] for texts in others.values()} <= {"BCC lattice", "ODT, image-blind"}
+    assert all(re.match("does not see .{10}", texts[0][2]) for texts in first.values())
+    assert not re.search(r"(best|loses) in \d+", page)
+    titles = {criterion.title for criterion in criteria(report) if criterion.better == 0}
     assert titles == {"nodes", "tetrahedra", "label area over smoothed voxels', mean by voxels", "λ max"}
+    assert all(row.blind for row in criteria(report) if not row.is_detail and row.better)
+
+
+def test_what_is_behind_is_worst_first(tmp_path):
+    """Group by group; and only what is worse than the runs' ranges and half a per cent."""
+    report = fake_report()
+    found = headline(report)
+    groups = ["Image", "Shape", "Simulation", "Cost"]
+    for rows in (found.behind_peers(), found.behind_others()):
+        assert rows
+        keys = [(groups.index(row.group), -row.factor) for row in rows]
+        assert keys == sorted(keys)
+    for row in found.behind:
+        own, other = row.ours.value, row.other.value
+        assert own is None or (own > other if row.smaller_is_better else own < other)
+    assert {row.verdict for row in found.behind} == {"worse"}
+    assert not [row for row in found.behind_others() if row.group == "Cost"]
+
+
+@pytest.mark.parametrize(
+    ("ours", "theirs", "verdict"),
+    [
+        (0.07, (0.04, 0.05, 0.06), "worse"),
+        (0.055, (0.04, 0.05, 0.06), "no different"),  # within the range of its runs
+        (0.045, (0.04, 0.05, 0.06), "no different"),
+        (0.03, (0.04, 0.05, 0.06), "better"),
+        (0.05002, (0.05, 0.05, 0.05), "no different"),  # by less than half a per cent
+        (0.0504, (0.05, 0.05, 0.05), "worse"),
+        (None, (0.05, 0.05, 0.05), "worse"),
+        (0.0, (0.05, 0.05, 0.05), "better"),
+    ],
+)
+def test_verdicts(tmp_path, ours, theirs, verdict):
+    report = with_values(tetopt=ours)
+    runs = [
+        run._replace(measurement=run.measurement._replace(E_D_share=value))
+        for run, value in zip(report.pipelines[1].runs, theirs, strict=True)
+    ]
+    report.pipelines[1] = with_runs(report.pipelines[1], runs)
+    claim = next(row for row in headline(report).claims if row.measure == E_D_ROW[1])
+    assert claim.verdict == verdict
+    assert claim.ratio == (pytest.approx(ours / 0.05) if ours else None)
 
 
 def test_different_sizes_are_said(tmp_path):
-    assert "meshes differ in nodes" not in page_of(tmp_path, fake_report())
+    assert "Nodes: tetopt 5000, pytetwild 5011." in page_of(tmp_path, fake_report())
     report = fake_report()
     with_measured(report, 1, n_nodes=9000)
-    assert "meshes differ in nodes (tetopt 5000, pytetwild 9000" in page_of(tmp_path, report)
+    assert "meshes differ in nodes: tetopt 5000, pytetwild 9000" in page_of(tmp_path, report)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -568,25 +645,79 @@ def test_different_sizes_are_said(tmp_path):
 
 def test_a_failed_pipeline_is_named(tmp_path):
     page = page_of(tmp_path, fake_report())
-    assert "<strong>itk-cleaver failed:</strong> crashed: signal 11 after 3 s" in page
-    assert all(row[2][1] == ["failed"] for row in headline(page).values())
-    assert "Failed, see under the table: itk-cleaver." in page
+    words = "tetopt against pytetwild at 5000 nodes; itk-cleaver failed twice (signal 11, SIGSEGV)"
+    assert f"<strong>{words}</strong>" in page
+    assert all(row[2][1] == ["failed"] for row in measures(page).values())
+
+
+def without(report, *places, reason="crash", failure="twice crashed: signal 11, SIGSEGV"):
+    """The report in which the pipelines at these places failed."""
+    for pipelines in (report.pipelines, report.quadratic):
+        for place in places:
+            failed = pipelines[place]._replace(failure=failure, reason=reason, crashes=[])
+            pipelines[place] = with_runs(failed, [])
+    return report
+
+
+def test_without_a_peer_nothing_is_claimed(tmp_path):
+    """The headline says why; what is not installed has not failed. The tables remain."""
+    twice = "failed twice (signal 11, SIGSEGV)"
+    title = f"tetopt against no peer: pytetwild {twice}; itk-cleaver {twice}"
+    report = without(fake_report(), 1)
+    page = page_of(tmp_path, report)
+    assert f"<strong>{title}</strong>" in page
+    assert headline(report).claims == []
+    assert "No peer is better" not in page
+    assert measures(page)[E_D_ROW][1][1] == ["failed"]
+    report = without(fake_report(), 1, 2, reason="missing", failure="not installed; install it")
+    page = page_of(tmp_path, report)
+    words = "tetopt against no peer: pytetwild is not installed; itk-cleaver is not installed"
+    assert f"<strong>{words}</strong>" in page
+    assert measures(page)[E_D_ROW][1][1] == ["not installed"]
+    assert "failed" not in headline(report).title
+    report = without(fake_report(), 1, 2, reason="limit", failure="out of time: killed after 4 s")
+    assert "pytetwild failed (out of time: killed after 4 s); " in headline(report).title
+    report = fake_report()
+    assert (
+        headline(report._replace(pipelines=report.pipelines[:1])).title == "tetopt against no peer: none was asked for"
+    )
+
+
+def test_a_crash_that_was_repeated_is_said(tmp_path):
+    report = fake_report()
+    report.pipelines[1] = report.pipelines[1]._replace(crashes=["crashed: signal 11, SIGSEGV"])
+    page = page_of(tmp_path, report)
+    assert "pytetwild: crashed once, and was run again (crashed: signal 11, SIGSEGV)." in page
+    assert "pytetwild: crashed once" not in page_of(tmp_path, fake_report())
 
 
 def test_tetopt_can_fail(tmp_path):
     report = fake_report()
-    report.pipelines[0] = with_runs(report.pipelines[0]._replace(failure="timed out"), [])
+    report.pipelines[0] = with_runs(report.pipelines[0]._replace(failure="timed out", reason="limit"), [])
     page = page_of(tmp_path, report)
-    assert "<strong>tetopt failed.</strong>" in page
-    assert "<strong>tetopt failed:</strong> timed out" in page
+    assert "<strong>nothing of tetopt&#x27;s to compare: tetopt failed (timed out)</strong>" in page
+    assert claims(page) == []
+
+
+def test_tetopt_by_its_defaults_is_in_the_headline(tmp_path):
+    """Also where another of its meshes comes first."""
+    report = fake_report()
+    uniform = report.pipelines[0]._replace(name="tetopt-uniform", title="tetopt, uniform")
+    again = report._replace(
+        pipelines=[uniform, *report.pipelines], quadratic=[report.quadratic[0], *report.quadratic]
+    )  # fmt: skip
+    assert headline(again).title.startswith("tetopt against pytetwild")
+    assert headline(again._replace(pipelines=[uniform, *report.pipelines[1:]])).title.startswith(
+        "tetopt, uniform against"
+    )
 
 
 def test_a_failed_repeat_is_named_beside_its_numbers(tmp_path):
     report = fake_report()
-    report.pipelines[1] = report.pipelines[1]._replace(failure="timed out after 3600 s")
+    report.pipelines[1] = report.pipelines[1]._replace(failure="timed out after 3600 s", reason="limit")
     page = page_of(tmp_path, report)
-    assert "<strong>pytetwild, a run failed:</strong> timed out after 3600 s" in page
-    assert headline(page)[E_D_ROW][1][1][0] == number_text(report.pipelines[1].median.measurement.E_D_share)
+    assert "pytetwild: a run failed: timed out after 3600 s." in page
+    assert measures(page)[E_D_ROW][1][1][0] == number_text(report.pipelines[1].median.measurement.E_D_share)
 
 
 def test_without_labels_and_finite_elements(tmp_path):
@@ -594,9 +725,9 @@ def test_without_labels_and_finite_elements(tmp_path):
     for number, pipeline in enumerate(report.pipelines):
         if pipeline.runs:
             with_measured(report, number, labels=[], fem={})
-    rows = headline(page_of(tmp_path, report))
+    rows = measures(page_of(tmp_path, report))
     assert set(rows) == {title for title in PATHS if not title[0].startswith("Compression")}
-    assert entry(criteria(report)[0], report.pipelines[2]) == Entry(None, None, None)
+    assert entry(criteria(report)[0].value, report.pipelines[2]) == Entry(None, None, None)
 
 
 # --------------------------------------------------------------------------------------------------
@@ -651,7 +782,7 @@ def test_nothing_points_outside(whole):
     assert "https:" not in page
     order = [page.index(f'alt="{name}"') for name in ("slices", "histograms", "curves", "timing")]
     assert order == sorted(order)
-    assert order[0] < page.index("<canvas") < order[1]
+    assert order[-1] < page.index("<canvas")
 
 
 @pytest.mark.parametrize("width", [1150, 500])  # Chromium has no narrower window

@@ -1,5 +1,6 @@
 """fTetWild's meshes fill the image's box exactly, with the requested number of nodes, in any orientation."""
 
+import sys
 from importlib.util import find_spec
 
 import numpy as np
@@ -9,6 +10,7 @@ import tetopt
 from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import boundary_facets
 from tetopt.study import tetwild
+from tetopt.study.endings import NotInstalled
 from tetopt.study.interfaces import interfaces
 from tetopt.study.pipelines import PIPELINES, Job
 
@@ -86,9 +88,14 @@ def test_too_few_nodes():
 
 
 def test_missing_package(monkeypatch):
-    monkeypatch.setitem(__import__("sys").modules, "pytetwild", None)
-    with pytest.raises(tetopt.InputError, match=r"pytetwild: not usable .* pip install"):
+    """One that is not there is no failure; one that cannot be imported is."""
+    monkeypatch.setitem(sys.modules, "pytetwild", None)
+    with pytest.raises(NotInstalled, match=r"pytetwild: not installed; .* pip install"):
         PIPELINES["pytetwild"].function(Job(IMAGE, None, 300, classes=2))
+    monkeypatch.setattr(tetwild.importlib, "import_module", lambda name: __import__("tetopt_has_no_such_package"))
+    with pytest.raises(tetopt.InputError, match=r"pytetwild: not usable \(No module .* pip install") as error:
+        PIPELINES["pytetwild"].function(Job(IMAGE, None, 300, classes=2))
+    assert not isinstance(error.value, NotInstalled)
 
 
 def test_shaken_boundary_is_put_back():

@@ -10,11 +10,12 @@ from typing import Annotated, ClassVar, Literal
 import numpy as np
 import typer
 from rich.markup import escape
+from rich.table import Table
 
 import tetopt
 from tetopt import Image, InputError, save_mesh
 from tetopt.budget import BYTES_PER_GB
-from tetopt.cli.console import log, out
+from tetopt.cli.console import log, out, print_wide
 from tetopt.cli.inputs import checked_outputs, label_table, read_labels, read_volume, results_folder
 from tetopt.cli.options import (
     DEFAULT_NODES,
@@ -37,6 +38,8 @@ from tetopt.model.fields import cell_fields
 from tetopt.model.labels import table_of_labels
 from tetopt.model.laws import parse_law
 from tetopt.report.tables import add_quality, new_table
+from tetopt.study.compare_criteria import number_text
+from tetopt.study.compare_headline import Headline, headline
 from tetopt.study.compare_report import ImageSource, LabelSource, Settings
 from tetopt.study.pipelines import PIPELINES, Job
 from tetopt.study.program import Program, parse_program
@@ -149,10 +152,16 @@ def baseline_command(
     numbers: NumberOptions,
 ) -> int:
     """Mesh an image the conventional way, to compare with: segment, extract surfaces, tetrahedralise."""
+    from tetopt.study.child import run_in_child
+
     output = checked_output(output, (".vtu",), numbers.force)
     json_path = numbers.checked()
     image, labels = _image_and_labels(image_path, labels_path, part)
-    made = PIPELINES[pipeline].function(Job(image, labels, nodes, classes))
+    title, function = PIPELINES[pipeline].title, PIPELINES[pipeline].function
+    job = Job(image, labels, nodes, classes)
+    made = run_in_child(function, job, say=lambda line: log.print(escape(f"{title}: {line}")))
+    if made.mesh is None:
+        raise InputError(f"{title}: {(made.failure or '').removeprefix(f'{title}: ')}")
     shape = quality(made.mesh.points, made.mesh.cells)
     options = {"pipeline": pipeline, "nodes": nodes, "classes": classes}
     about = {"image": image_path.name, "image_sha256": sha256(image_path), "options": options}
@@ -202,11 +211,25 @@ def compare_command(
     except KeyboardInterrupt:
         log.print(f"interrupted: {escape(str(output / 'runs'))} keeps the finished runs, --resume goes on from there")
         return 130
-    failed = [each.title for each in report.pipelines if each.failure is not None]
-    failed += [f"{each.title} for quadratic cells" for each in report.quadratic if each.failure is not None]
-    words = f", of which failed: {', '.join(failed)}" if failed else ""
-    out.print(escape(f"{paths['report.html']}: {len(settings.pipelines)} pipelines{words}, {report.seconds:.0f} s"))
+    _print_headline(headline(report))
+    out.print(escape(f"{paths['report.html']}: {len(settings.pipelines)} pipelines, {report.seconds:.0f} s"))
     return 0
+
+
+def _print_headline(first: Headline) -> None:
+    """The page's first section: who was compared, the few numbers, where tetopt is behind, and what to know of it."""
+    out.print(escape(first.title))
+    for title, claims in (("", first.claims), ("behind a peer", first.behind_peers())):
+        if claims:
+            table = Table(title=title, box=None, title_justify="left")
+            for heading in ("", "tetopt", "best peer", "", "tetopt over it", ""):
+                table.add_column(heading, justify="left" if not heading else "right")
+            for each in claims:
+                numbers = (f"{number_text(each.ours.value)}", f"{number_text(each.other.value)}")
+                table.add_row(escape(each.measure), *numbers, escape(each.other_title), each.ratio_text, each.verdict)
+            print_wide(table)
+    for line in first.remarks:
+        out.print(escape(line))
 
 
 def _image_and_labels(path: Path, labels_path: Path | None, part: BoxPart) -> tuple[Image, Image | None]:

@@ -28,6 +28,7 @@ from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import oriented
 from tetopt.image import Image
 from tetopt.mesh import Mesh
+from tetopt.study.endings import NotInstalled, last_line, signal_words
 from tetopt.study.search import corners_for, is_near, tries
 from tetopt.study.tetwild import TETWILD_RESPONSE, Filled, inside_box, node_spacing, put_on_box
 
@@ -119,7 +120,7 @@ def stuffed(image: Image, labels: Image, nodes: int, order: int = 1) -> Filled:
 
 def _check(image: Image, labels: Image, nodes: int) -> None:
     if find_spec("itk") is None or find_spec("itk.CleaverPython") is None:
-        raise InputError(f"itk-cleaver: not installed; {INSTALL_HINT}")
+        raise NotInstalled(f"itk-cleaver: not installed; {INSTALL_HINT}")
     if image.ndim != 3 or labels.shape != image.shape:
         raise InputError(f"labels: expected 3 axes and the image's shape {image.shape}, got {labels.shape}")
     if not np.array_equal(np.rint(labels.data), labels.data):
@@ -130,7 +131,7 @@ def _check(image: Image, labels: Image, nodes: int) -> None:
         raise InputError(f"nodes: a box needs 8 or more, got {nodes}")
     probe = _python("from itk import CleaverImageToMeshFilter")
     if probe.returncode != 0:
-        raise InputError(f"itk-cleaver: its import ends Python ({_ending(probe)}); {INSTALL_HINT}")
+        raise InputError(f"itk-cleaver: its import ends Python, {_ending(probe)}; {INSTALL_HINT}")
 
 
 def labels_in_cube(image: Image, labels: Image, voxel: float) -> Cube:
@@ -169,6 +170,5 @@ def _python(program: str, *arguments: str) -> subprocess.CompletedProcess[Any]:
 
 
 def _ending(done: subprocess.CompletedProcess[Any]) -> str:
-    """How a process ended, in a few words: its last line, or its signal."""
-    lines = (done.stderr.strip() or done.stdout.strip()).splitlines()
-    return f"signal {-done.returncode}" if done.returncode < 0 else lines[-1] if lines else "no message"
+    """How a process ended, in a few words: its signal, or its last line."""
+    return signal_words(done.returncode) or last_line(done.stderr) or last_line(done.stdout) or "no message"

@@ -71,6 +71,12 @@ from tetopt.study.program import file_checksums, pipelines_with
 from tetopt.study.tradeoff import tradeoff
 
 Say = Callable[[str], None]
+Facts = dict[str, Any]  # what the numbers of a comparison depend on besides its settings, as JSON has it
+# Settings that no finished run's numbers depend on: what else is compared, and limits that a finished run kept to. Its
+# own number of nodes and its program are told besides; the reference's size is, once it is decided.
+FREE_SETTINGS = {
+    "nodes", "pipelines", "programs", "repeats", "curve", "tradeoff", "max_seconds", "max_bytes", "reference_seconds"
+}  # fmt: skip
 
 
 class Comparison(NamedTuple):
@@ -107,6 +113,7 @@ class Bench(NamedTuple):
     folder: Path  # of the runs' files
     say: Say
     resume: bool
+    facts: Facts
 
 
 def default_law(image: Image) -> tuple[Law, str]:
@@ -154,27 +161,39 @@ def reference_dofs(image: Image, law: Law, settings: Settings, say: Say) -> int:
     return budget.dofs
 
 
-def _settled(comparison: Comparison, runs: Path, say: Say, *, resume: bool) -> Comparison:
+def _settled(comparison: Comparison, facts: Facts, runs: Path, say: Say, *, resume: bool) -> Comparison:
     """The size of the reference decided, and kept in the runs' folder for `resume`."""
     settings, path = comparison.settings, runs / "reference.json"
     if settings.reference_dofs is None:
-        choice = {"seconds": settings.reference_seconds, "image": comparison.image_source.sha256}
-        dofs = _earlier_dofs(path, choice) if resume else None
+        choice = facts | as_json({key: getattr(settings, key) for key in ("nus", "percent", "reference_seconds")})
+        before = _read_back(path) if resume else None
+        dofs = None if before is None or before[0] != choice else before[1]
         if dofs is None:
             dofs = reference_dofs(comparison.image, comparison.law, settings, say)
-            save_json(path, choice | {"dofs": dofs})
+            _write_down(path, [choice, dofs])
         comparison = comparison._replace(settings=settings._replace(reference_dofs=dofs))
     return comparison
 
 
-def _earlier_dofs(path: Path, choice: dict[str, Any]) -> int | None:
-    """What was decided before by the same choice, if the file is whole."""
+def _write_down(path: Path, content: Any) -> None:
+    """A file for `_read_back`: with a checksum, since what is resumed may have been cut off, or edited."""
+    save_json(path, {"content": content})
+    content = json.loads(path.read_text(encoding="utf-8"))["content"]  # as it will be read: what is not finite is null
+    save_json(path, {"content": content, "sha256": _checksum(content)})
+
+
+def _read_back(path: Path) -> Any:
+    """What was written down; None if there is no such file, or it is not as it was written."""
     try:
-        before = json.loads(path.read_text(encoding="utf-8"))
-        dofs = before.pop("dofs")
-    except (OSError, ValueError, LookupError, AttributeError):
+        row = json.loads(path.read_text(encoding="utf-8"))
+        return row["content"] if row["sha256"] == _checksum(row["content"]) else None
+    except (OSError, ValueError, LookupError, TypeError, RecursionError):
         return None
-    return dofs if before == choice and isinstance(dofs, int) else None
+
+
+def _checksum(content: Any) -> str:
+    """Of what is read from a JSON file."""
+    return hashlib.sha256(json.dumps(content, sort_keys=True).encode()).hexdigest()
 
 
 # One mesh, measured.
@@ -303,11 +322,12 @@ def run(
         _check_resumable(folder, comparison)
     runs = folder / "runs"
     runs.mkdir(exist_ok=True)
-    comparison = _settled(comparison, runs, say, resume=resume)
+    facts = _facts(comparison)
+    comparison = _settled(comparison, facts, runs, say, resume=resume)
     image, settings = comparison.image, comparison.settings
     standard = prepared(image, classes, comparison.law, settings, say)
     pipelines = pipelines_with(settings.programs)
-    bench = Bench(comparison, standard, pipelines, runs, say, resume)
+    bench = Bench(comparison, standard, pipelines, runs, say, resume, facts)
     results: dict[int, list[PipelineResult]] = {1: [], 2: []}
     meshes: dict[int, dict[str, Mesh]] = {1: {}, 2: {}}
     curves = []
@@ -332,7 +352,8 @@ def run(
         labels=comparison.label_source,
         law=comparison.law_words,
         versions=versions() | _peers(),
-        machine={"cores": os.cpu_count(), "system": platform.platform()},
+        machine={"cores": os.cpu_count(), "processor": _processor(), "system": platform.platform()},
+        date=time.strftime("%Y-%m-%d", time.gmtime()),
         options=settings,
         reference=_reference_grid(standard),
         pipelines=results[1],
@@ -344,6 +365,16 @@ def run(
     return report, meshes
 
 
+def _processor() -> str:
+    """What the processor is called: /proc knows on Linux, where `platform` often does not."""
+    with contextlib.suppress(OSError):
+        lines = Path("/proc/cpuinfo").read_text(encoding="utf-8").splitlines()
+        for line in lines:
+            if line.startswith("model name"):
+                return line.partition(":")[2].strip()
+    return platform.processor() or platform.machine()
+
+
 def _check_resumable(folder: Path, comparison: Comparison) -> None:
     """InputError if the folder holds the report of another comparison, which resuming would replace."""
     path = folder / "report.json"
@@ -352,7 +383,7 @@ def _check_resumable(folder: Path, comparison: Comparison) -> None:
     try:
         before = json.loads(path.read_text(encoding="utf-8"))
         earlier = before["options"]["nodes"], before["image"]["sha256"]
-    except (ValueError, KeyError, TypeError):
+    except (ValueError, KeyError, TypeError, RecursionError):
         earlier = None
     if earlier != (comparison.settings.nodes, comparison.image_source.sha256):
         raise InputError(f"{path}: is of another comparison (image or --nodes); take another folder, or --force")
@@ -367,29 +398,25 @@ def _peers() -> dict[str, str]:
     return installed
 
 
-def _key(comparison: Comparison, name: str) -> str:
-    """Changes with everything that a finished run's numbers depend on, but not with what else is compared."""
-    settings = comparison.settings
-    same = settings._replace(
-        pipelines=(),
-        programs=(),
-        repeats=0,
-        curve=(),
-        nodes=0,
-        tradeoff=False,
-        max_seconds=0.0,
-        max_bytes=None,
-        reference_seconds=0.0,
-    )
+def _facts(comparison: Comparison) -> Facts:
+    """Image, labels, moduli and versions: not the law's words, which may be the name of a file that has changed."""
     source = comparison.label_source
+    modulus = young_image(comparison.image, comparison.law).data
     facts = {
         "image": as_json(comparison.image_source),
         "labels": as_json(source and source._replace(names={})),
-        "law": comparison.law_words,
-        "program": [[each.command, file_checksums(each)] for each in settings.programs if each.name == name],
+        "modulus_sha256": hashlib.sha256(modulus.tobytes()).hexdigest(),
+        "versions": versions() | _peers(),
     }
-    tools = versions() | _peers()
-    return hashlib.sha256(json.dumps([facts, same, tools], sort_keys=True, default=str).encode()).hexdigest()
+    return json.loads(json.dumps(facts))
+
+
+def _key(bench: Bench, name: str) -> str:
+    """Changes with everything that a finished run's numbers depend on, but not with what else is compared."""
+    settings = bench.comparison.settings
+    same = {key: value for key, value in as_json(settings._asdict()).items() if key not in FREE_SETTINGS}
+    program = [[each.command, file_checksums(each)] for each in settings.programs if each.name == name]
+    return _checksum([bench.facts, same, program])
 
 
 def _run_path(bench: Bench, name: str, order: int, nodes: int, repeat: int) -> Path:
@@ -410,19 +437,21 @@ def _attempts(bench: Bench, name: str, order: int) -> list[Attempt]:
 
 def _kept(path: Path, key: str) -> Attempt | None:
     """A finished run's numbers, if they are whole, of the same key and of the mesh that lies beside them."""
+    content = _read_back(path)
+    if not isinstance(content, dict) or content.get("key") != key:
+        return None
     try:
-        attempt: Attempt = from_json(Attempt, json.loads(path.read_text(encoding="utf-8")))
-        mesh_hash = sha256(path.with_suffix(".vtu"))
+        is_same = content["mesh_file_sha256"] == sha256(path.with_suffix(".vtu"))
+        return from_json(Attempt, content) if is_same else None
     except (OSError, ValueError, LookupError, TypeError, AttributeError):
         return None
-    return attempt if (attempt.key, attempt.mesh_file_sha256) == (key, mesh_hash) else None
 
 
 def _attempt(bench: Bench, name: str, order: int, nodes: int, repeat: int) -> Attempt:
     """One pipeline once, from its file if that is finished and of the same key."""
     path = _run_path(bench, name, order, nodes, repeat)
     title = bench.pipelines[name].title + (", quadratic" if order == 2 else "")
-    key = _key(bench.comparison, name)
+    key = _key(bench, name)
     kept = _kept(path, key) if bench.resume else None
     if kept is not None:
         bench.say(f"{title}, {nodes} nodes: kept from before")
@@ -433,14 +462,16 @@ def _attempt(bench: Bench, name: str, order: int, nodes: int, repeat: int) -> At
         comparison.image, comparison.labels, nodes, settings.classes, settings.k_D, settings.iterations, order
     )  # fmt: skip
     outcome = run_in_child(
-        bench.pipelines[name].function, job, max_seconds=settings.max_seconds, max_bytes=settings.max_bytes
-    )
-    attempt = Attempt(key, outcome.failure, outcome.notes, run=None)
+        bench.pipelines[name].function, job, max_seconds=settings.max_seconds, max_bytes=settings.max_bytes,
+        say=lambda line: bench.say(f"{title}: {line}"),
+    )  # fmt: skip
+    failure = outcome.failure and outcome.failure.removeprefix(f"{bench.pipelines[name].title}: ")
+    attempt = Attempt(key, failure, outcome.notes, None, outcome.reason, list(outcome.crashes))
     if outcome.mesh is not None:
         try:
             measurement = measured(bench.standard, outcome.mesh, settings.percent, order, outcome.labels)
-        except (InputError, RuntimeError, ArithmeticError, np.linalg.LinAlgError) as error:
-            attempt = attempt._replace(failure=f"its mesh cannot be measured: {error}")
+        except (InputError, RuntimeError, ArithmeticError, MemoryError, np.linalg.LinAlgError) as error:
+            attempt = attempt._replace(failure=f"its mesh cannot be measured: {error}", reason="error")
     if outcome.mesh is None or attempt.failure is not None:
         bench.say(f"{title}: {attempt.failure}")
         return attempt
@@ -450,11 +481,11 @@ def _attempt(bench: Bench, name: str, order: int, nodes: int, repeat: int) -> At
     save_mesh(mesh_path, outcome.mesh, fields)
     total = sum(seconds for step, seconds in outcome.seconds.items() if step not in UNTIMED_STEPS)
     done = Run(outcome.seconds, total, outcome.peak_bytes, measurement)
-    save_json(path, as_json(attempt._replace(run=done, mesh_file_sha256=sha256(mesh_path))))
+    _write_down(path, as_json(attempt._replace(run=done, mesh_file_sha256=sha256(mesh_path))))
     share = "none" if measurement.E_D_share is None else f"{measurement.E_D_share:.4f}"
     bench.say(f"{title}: {measurement.n_nodes} nodes, E_D share {share}, {total:.0f} s")
     # Read back, so that a kept run and a new one are the same: what is not finite is None in both.
-    return from_json(Attempt, json.loads(path.read_text(encoding="utf-8")))
+    return from_json(Attempt, _read_back(path))
 
 
 def _summed_up(name: str, shown: Pipeline, attempts: list[Attempt]) -> PipelineResult:
@@ -462,7 +493,10 @@ def _summed_up(name: str, shown: Pipeline, attempts: list[Attempt]) -> PipelineR
     runs = [attempt.run for attempt in attempts if attempt.run is not None]
     failures = [attempt.failure for attempt in attempts if attempt.failure is not None]
     notes = list(dict.fromkeys(note for attempt in attempts for note in attempt.notes))
-    result = PipelineResult(name, shown.title, shown.kind, shown.about, failures[0] if failures else None, notes, runs)
+    crashes = [crash for attempt in attempts for crash in attempt.crashes]
+    reason = next((attempt.reason for attempt in attempts if attempt.failure is not None), None)
+    failure = failures[0] if failures else None
+    result = PipelineResult(name, shown.title, shown.kind, shown.about, failure, reason, crashes, notes, runs)
     if not runs:
         return result
     median, low, high = (elementwise(runs, of) for of in (np.median, np.min, np.max))

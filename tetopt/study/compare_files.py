@@ -22,6 +22,7 @@ from tetopt.study.compare_figures import (
     timing_figure,
     tradeoff_figure,
 )
+from tetopt.study.compare_headline import headline
 from tetopt.study.compare_page import save_compare_page
 from tetopt.study.compare_report import Report, as_json
 from tetopt.study.program import pipelines_with
@@ -66,7 +67,7 @@ def run(paths: dict[str, Path], comparison: compare.Comparison, say: compare.Say
     if not meshes[1]:
         how = "; ".join(f"{each.title}: {each.failure}" for each in report.pipelines)
         raise InputError(f"compare: every pipeline failed, nothing is reported: {how}")
-    save_json(paths["report.json"], as_json(report))
+    save_json(paths["report.json"], as_json(report) | {"headline": as_json(headline(report))})
     say("pictures and page")
     _draw(paths, report, image, meshes)
     return report

@@ -146,6 +146,8 @@ class Attempt(NamedTuple):
     failure: str | None
     notes: list[str]
     run: Run | None  # None after a failure
+    reason: str | None = None  # of the failure, as `tetopt.study.child.Reason`
+    crashes: list[str] = []  # noqa: RUF012 - nobody changes it; of the run and of the one that it repeats
     mesh_file_sha256: str | None = None
 
 
@@ -157,6 +159,8 @@ class PipelineResult(NamedTuple):
     kind: str
     about: str
     failure: str | None  # the first, if a run failed
+    reason: str | None  # of it, as `tetopt.study.child.Reason`
+    crashes: list[str]  # of all runs; each was run once more
     notes: list[str]
     runs: list[Run]
     median: Run | None = None  # None if no run ended with a mesh, as for the next two
@@ -225,7 +229,8 @@ class Report(NamedTuple):
     labels: LabelSource | None
     law: str
     versions: dict[str, str]
-    machine: dict[str, int | str | None]  # cores and system
+    machine: dict[str, int | str | None]  # cores, processor and system
+    date: str  # on which the comparison ended, UTC
     options: Settings
     reference: ReferenceGrid
     pipelines: list[PipelineResult]  # meshes of so many nodes, with linear cells

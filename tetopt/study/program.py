@@ -29,6 +29,7 @@ from tetopt.image import Image
 from tetopt.io.images import save_image, sha256
 from tetopt.io.meshes import MESH_SUFFIXES, MeshFile, load_mesh
 from tetopt.mesh import Mesh
+from tetopt.study.endings import Crashed, last_line, signal_words
 from tetopt.study.interfaces import class_labels
 from tetopt.study.pipelines import PIPELINES, Job, Pipeline, Produced
 from tetopt.study.search import LEAST_REQUEST, REQUEST_RESPONSE, corners_for, is_near, tries
@@ -180,11 +181,12 @@ def _run(name: str, command: list[str], output: Path) -> MeshFile:
         )
     except OSError as error:
         raise InputError(f"{name}: cannot be run ({error})") from error
-    lines = done.stderr.decode(errors="replace").strip().splitlines()
-    said = f": {lines[-1]}" if lines else ", and wrote nothing on its standard error"
+    line = last_line(done.stderr.decode(errors="replace"))
+    said = f": {line}" if line else ", and wrote nothing on its standard error"
+    if (crash := signal_words(done.returncode)) is not None:
+        raise Crashed(f"{name} crashed ({crash}){said}")
     if done.returncode != 0:
-        how = f"signal {-done.returncode}" if done.returncode < 0 else f"exit code {done.returncode}"
-        raise InputError(f"{name} ended with {how}{said}")
+        raise InputError(f"{name} ended with exit code {done.returncode}{said}")
     if not output.is_file():
         raise InputError(f"{name} wrote no mesh{said}")
     loaded = load_mesh(output)

@@ -31,6 +31,7 @@ from tetopt.geometry.topology import boundary_facets
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.start.lattice import lattice
+from tetopt.study.endings import NotInstalled
 from tetopt.study.interfaces import Surfaces, compacted
 from tetopt.study.search import Response, corners_for, is_near, tries
 
@@ -43,6 +44,7 @@ EDGE_GROWTH = 0.6  # mm by which edges lengthen per mm of distance from the inte
 EDGE_RATIO = 3.0  # edge far away over edge at the interfaces
 STOP_ENERGY = 10.0  # of fTetWild's cells (AMIPS; regular: 3), below which it stops: its own default
 LEAST_SHAPE = 2e-3  # volume over the longest edge's cube (regular: 0.118) under which a cell is mended
+TETWILD_HINT = "install it with: python -m pip install 'pytetwild>=0.4'"
 UNTANGLING_ROUNDS = 60  # after the boundary has been put on the box; what is inverted then cannot be mended so
 
 
@@ -119,9 +121,9 @@ def _tetrahedralize() -> Callable[..., tuple[NDArray, NDArray]]:
     try:
         return importlib.import_module("pytetwild").tetrahedralize
     except ImportError as error:
-        raise InputError(
-            f"pytetwild: not usable ({error}); install it with: python -m pip install 'pytetwild>=0.4'"
-        ) from error
+        if isinstance(error, ModuleNotFoundError) and error.name == "pytetwild":
+            raise NotInstalled(f"pytetwild: not installed; {TETWILD_HINT}") from error
+        raise InputError(f"pytetwild: not usable ({error}); {TETWILD_HINT}") from error
 
 
 def _run(

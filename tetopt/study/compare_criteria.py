@@ -1,0 +1,265 @@
+"""What a comparison's meshes are judged by: measures in four groups, who is best, and what each does not see."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from operator import attrgetter
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tetopt.study.compare_report import ORDER_WORDS, LabelRow, PipelineResult, Report, Run, averages_of
+
+GROUPS = ("Image", "Shape", "Simulation", "Cost")
+JUDGED_VOXELS = 500  # labels with more are judged; of smaller ones a mesh of few nodes can only keep some
+COMPRESSION_ERRORS = (  # of the compression, and the fields of `tetopt.fem.reference.Errors`
+    ("strain-energy", "strain_energy"),
+    ("displacement", "displacement"),
+    ("interface-strain", "interface_strain"),
+)
+MEBI_BYTES = 1e-6  # megabytes in a byte
+FULL_DIGITS = (1e4, 1e9)  # from which a number is printed without a fraction, and below which in full
+EQUAL_SHARE = 0.005  # of a value: one that differs by less is no different, and three digits do not show it
+
+
+class Criterion(NamedTuple):
+    """What a row of a table compares."""
+
+    group: str  # of `GROUPS`
+    part: str  # the heading that it stands under
+    title: str
+    value: Callable[[Run], float | None]
+    better: int  # -1 if smaller is better, +1 if larger, 0 if neither
+    order: int = 1  # of the cells whose meshes are compared
+    is_detail: bool = False  # in the table that is folded away
+    is_headline: bool = False
+    blind: str = ""  # what it does not see, in a line
+
+
+class Entry(NamedTuple):
+    """What a pipeline has for a criterion."""
+
+    value: float | None  # median
+    low: float | None
+    high: float | None
+
+
+def criteria(report: Report) -> list[Criterion]:
+    """The rows of all tables, in order."""
+    ratios = fem_ratios(report)
+    return [
+        Criterion("Image", "Image", "E_D, share of the image's variance", _at("E_D_share"), -1, is_headline=True,
+            blind="where the error lies, and whether it matters there: noise within a cell counts like an edge"),
+        Criterion("Image", "Image", "voxels outside the mesh", _at("n_missed_voxels"), -1, is_detail=True),
+        *_label_criteria(report),
+        *_shape_criteria(),
+        *(row for nu in ratios for order in ORDER_WORDS for row in _fem_criteria(report, nu, order, nu == ratios[0])),
+        Criterion("Cost", "Cost", "wall time, s", lambda run: run.seconds_total, -1, is_headline=True,
+            blind="the runs that only met the number of nodes, and the loading of compiled code (both below)"),
+        Criterion("Cost", "Cost", "peak memory, MB", lambda run: run.peak_bytes * MEBI_BYTES, -1,
+            blind="what the interpreter and its libraries take, which is in it, from what the mesh takes"),
+        Criterion("Cost", "Cost", "nodes", _at("n_nodes"), 0),
+        Criterion("Cost", "Cost", "tetrahedra", _at("n_cells"), 0),
+    ]  # fmt: skip
+
+
+def _at(*keys: str) -> Callable[[Run], float | None]:
+    """What stands at this place of a run's measurement; None where a table on the way has no such row."""
+
+    def value(run: Run) -> Any:
+        item: Any = run.measurement
+        for key in keys:
+            if item is not None:
+                item = item.get(key) if isinstance(item, dict) else getattr(item, key)
+        return item
+
+    return value
+
+
+def _shape_criteria() -> list[Criterion]:
+    def row(title: str, keys: tuple[str, ...], better: int, blind: str = "") -> Criterion:
+        return Criterion("Shape", "Shape", title, _at("quality", *keys), better, is_detail=not blind, blind=blind)
+
+    def bad_percent(run: Run) -> float:
+        shape = run.measurement.quality
+        return 100.0 * sum(shape.kinds.values()) / shape.n_cells
+
+    errors = {"mean": "(i) mean", "harmonic_mean": "(ii) harmonic mean", "l2": "(iii) L2", "worst": "(iv) worst"}
+    kinds = ("sliver", "cap", "needle", "wedge", "spade")
+    return [
+        row("mean rho", ("mean_rho",), 1, "the worst cells, on which a solver may fail; 1/3 is a regular tetrahedron"),
+        row("p1 rho", ("p1_rho",), 1, "the hundredth of the cells that is worse"),
+        row("smallest dihedral angle, °", ("min_dihedral",), 1, "how many cells are near it: it is that of one cell"),
+        Criterion("Shape", "Shape", "bad cells (3 rho < 0.3), %", bad_percent, -1, is_headline=True,
+            blind="how bad they are, and of which kind: slivers hurt a stiffness matrix more than needles (below)"),
+        row("min rho", ("min_rho",), 1),
+        *(row(f"error {title}", ("errors", name), -1) for name, title in errors.items()),
+        row("dihedral angle p1, °", ("p1_dihedral",), 1),
+        row("largest dihedral angle, °", ("max_dihedral",), -1),
+        row("cells under 10°", ("n_under_10_degrees",), -1),
+        *(row(f"{kind}s", ("kinds", kind), -1) for kind in kinds),
+    ]  # fmt: skip
+
+
+def _label_criteria(report: Report) -> list[Criterion]:
+    judged = judged_labels(report)
+
+    def over(of: Callable[[list[float]], float], value: Callable[[LabelRow], Any]) -> Callable[[Run], float | None]:
+        def of_run(run: Run) -> float | None:
+            values = [value(row) for row in run.measurement.labels if row.label in judged]
+            # Without a lost label, which has no surface, the mean over the others would flatter.
+            return of(values) if values and None not in values else None
+
+        return of_run
+
+    def by_voxels(value: Callable[[LabelRow], Any]) -> Callable[[Run], float | None]:
+        weighed = over(sum, lambda row: None if value(row) is None else judged[row.label] * value(row))
+        total = sum(judged.values())
+        return lambda run: None if (whole := weighed(run)) is None else whole / total
+
+    def mean(values: list[float]) -> float:
+        return sum(values) / len(values)
+
+    def largest_error(values: list[float]) -> float:
+        return max(map(abs, values))
+
+    rows: list[tuple[str, Callable[[Run], float | None], int, str]] = [
+        ("mean label Dice", over(mean, attrgetter("dice")), 1, "thin parts, which weigh by their volume alone"),
+        ("smallest label Dice", over(min, attrgetter("dice")), 1, "all labels but one"),
+        ("mean label surface distance, mm", over(mean, attrgetter("surface_mean_mm")), -1, "single spikes and holes"),
+        ("label surface distance p95, mm", over(mean, attrgetter("surface_p95_mm")), -1, "the twentieth beyond it"),
+        ("largest label volume error", over(largest_error, volume_error), -1, "where the volume is: lost and gained "
+            "parts make up for each other"),
+        ("labels lost (of any size)", _n_lost, -1, "labels of which a single cell is left"),
+        ("label area over smoothed voxels', mean by voxels", by_voxels(attrgetter("area_ratio")), 0, ""),
+        ("label edges folded over 60°, mean by voxels", by_voxels(attrgetter("folded")), -1, ""),
+        ("label edges in more than two facets", over(sum, attrgetter("nonmanifold_edges")), -1, ""),
+        ("of these, where two labels meet", over(sum, attrgetter("nonmanifold_edges_two_labels")), -1, ""),
+        ("labels in more or fewer pieces", over(sum, lambda row: row.mesh_components != row.components), -1, ""),
+    ]  # fmt: skip
+    part = f"Labels {which_labels(report)}"
+    return [
+        Criterion(
+            "Image", part, title, value, better, is_detail=not blind, blind=blind,
+            is_headline=title == "mean label Dice" and report.labels is not None,
+        )
+        for title, value, better, blind in rows
+    ]  # fmt: skip
+
+
+def judged_labels(report: Report) -> dict[int, int]:
+    """Voxels of the labels that are judged: the large ones if there are any, and no given segmentation's background."""
+    voxels = voxels_by_label(report)
+    if _has_background(report):
+        del voxels[0]
+    return {label: n for label, n in voxels.items() if n > JUDGED_VOXELS} or voxels
+
+
+def _has_background(report: Report) -> bool:
+    return report.labels is not None and {0} < set(voxels_by_label(report))
+
+
+def which_labels(report: Report) -> str:
+    """Which labels are judged, in words."""
+    is_large = any(n > JUDGED_VOXELS for n in judged_labels(report).values())
+    size = f"above {JUDGED_VOXELS} voxels" if is_large else "of any size"
+    return f"{size}, background 0 not counted" if _has_background(report) else size
+
+
+def voxels_by_label(report: Report) -> dict[int, int]:
+    """Voxels of each label in the image."""
+    return {row.label: row.voxels for each in report.pipelines for run in each.runs for row in run.measurement.labels}
+
+
+def volume_error(row: LabelRow) -> float | None:
+    """Of a label in the mesh, as a share of its volume in the image."""
+    return row.mesh_volume_mm3 / row.volume_mm3 - 1.0 if row.volume_mm3 else None
+
+
+def _n_lost(run: Run) -> int | None:
+    labels = run.measurement.labels
+    return sum(row.is_lost for row in labels) if labels else None
+
+
+def _fem_criteria(report: Report, nu: str, order: int, is_first: bool) -> list[Criterion]:
+    """Of one Poisson's ratio and one order of the cells; the first ratio's displacement is in the headline."""
+    word, average = ORDER_WORDS[order], report.options.average
+    part = f"Compression, ν = {nu}, {word} cells"
+    blind = {
+        "strain_energy": "errors that make up for each other: it is one number of the whole body",
+        "displacement": "strains, which may be wrong where displacements are right",
+        "interface_strain": "anything but the voxels beside interfaces of the labels or classes",
+    }
+    rows = [
+        Criterion("Simulation", part, f"{title} error", fem_error(nu, average, name), -1, order,
+            is_headline=is_first and name == "displacement", blind=blind[name])
+        for title, name in COMPRESSION_ERRORS
+    ]  # fmt: skip
+    more: list[tuple[str, Callable[[Run], float | None], int]] = [
+        (f"{title} error, moduli by {other}", fem_error(nu, other, name), -1)
+        for other in averages_of(report.options)
+        if other != average
+        for title, name in COMPRESSION_ERRORS
+    ]
+    more += [
+        ("λ max", _at("fem", nu, "lambda_max"), 0),
+        ("condition number", _at("fem", nu, "cond"), -1),
+        ("CG iterations", _at("fem", nu, "cg_iterations"), -1),
+    ]
+    return rows + [Criterion("Simulation", part, *each, order, is_detail=True) for each in more]
+
+
+def fem_error(nu: str, average: str, name: str) -> Callable[[Run], float | None]:
+    """An error of the compression, by its field's name."""
+    return _at("fem", nu, "averages", average, "errors", name)
+
+
+def fem_ratios(report: Report) -> list[str]:
+    """Poisson's ratios of which any pipeline has a result."""
+    return sorted({nu for each in report.pipelines for run in each.runs for nu in run.measurement.fem}, key=float)
+
+
+def of_order(report: Report, order: int) -> list[PipelineResult]:
+    """The pipelines with their meshes for cells of this order."""
+    return report.pipelines if order == 1 else report.quadratic
+
+
+def entries_of(criterion: Criterion, report: Report) -> list[Entry]:
+    """What each pipeline has for a criterion."""
+    return [entry(criterion.value, pipeline) for pipeline in of_order(report, criterion.order)]
+
+
+def entry(value_of: Callable[[Run], float | None], pipeline: PipelineResult) -> Entry:
+    """Median and range over a pipeline's runs; all None if no run has a value."""
+    values = [value for run in pipeline.runs if (value := value_of(run)) is not None]
+    return Entry(float(np.median(values)), min(values), max(values)) if values else Entry(None, None, None)
+
+
+def winners(better: int, values: Sequence[float | None]) -> list[int]:
+    """Places of the best values, equal ones as printed included; none if fewer than two differ."""
+    known = [(number, value) for number, value in enumerate(values) if value is not None]
+    if better == 0 or len({number_text(value) for _, value in known}) < 2:
+        return []
+    best = max(known, key=lambda pair: better * pair[1])[1]
+    return [number for number, value in known if number_text(value) == number_text(best)]
+
+
+def number_text(value: float | None) -> str:
+    """A number as the page prints it: whole ones in full, others to four digits; "–" for none."""
+    if value is None:
+        return "–"
+    rounded, full = FULL_DIGITS
+    if float(value).is_integer() and abs(value) < full:
+        return str(int(value))
+    return f"{value:.0f}" if rounded <= abs(value) < full else f"{value:.4g}"
+
+
+def loss_text(value: float | None, best: float) -> str:
+    """How far a value is from the best, in words."""
+    if value is None:
+        return "no value"
+    if best > 0.0 and value > 0.0:
+        ratio = value / best
+        far = abs(ratio - 1.0)
+        return f"{ratio:.3g}× the best" if far > EQUAL_SHARE else f"within {max(far, 1e-4):.1%} of the best"
+    return f"{number_text(abs(value - best))} from the best"

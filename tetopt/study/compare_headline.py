@@ -1,0 +1,178 @@
+"""What a comparison comes to: tetopt against the best peer in a handful of numbers, and where it is behind.
+
+The same for the page, the terminal and report.json.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator
+from typing import Literal, NamedTuple
+
+from tetopt.study.compare_criteria import (
+    EQUAL_SHARE,
+    GROUPS,
+    Criterion,
+    Entry,
+    criteria,
+    entries_of,
+    number_text,
+    winners,
+)
+from tetopt.study.compare_report import ORDER_WORDS, PipelineResult, Report
+
+SIZE_TOLERANCE = 1.1  # meshes whose numbers of nodes differ by a larger factor are not compared without a word
+
+Verdict = Literal["better", "worse", "no different"]
+
+
+class Claim(NamedTuple):
+    """A measure of tetopt's mesh beside that of another."""
+
+    group: str
+    measure: str
+    smaller_is_better: bool
+    ours: Entry
+    other: Entry
+    other_title: str
+    other_kind: str  # "peer", "control", or "tetopt" for another of its own meshes
+    ratio: float | None  # tetopt's over the other's; None where one is 0 or missing
+    verdict: Verdict  # on tetopt; "no different" within the runs' ranges, or by less than `EQUAL_SHARE`
+    blind: str  # what the measure does not see
+
+    @property
+    def factor(self) -> float:
+        """By how much the two differ, from 1 on."""
+        return math.inf if self.ratio is None else max(self.ratio, 1.0 / self.ratio)
+
+    @property
+    def ratio_text(self) -> str:
+        """The ratio to three digits, or the difference where there is none."""
+        if self.ratio is not None:
+            return f"{self.ratio:.3g}×"
+        if self.ours.value is None or self.other.value is None:
+            return "–"
+        return f"{self.ours.value - self.other.value:+.3g}".replace("-", "−")
+
+
+class Headline(NamedTuple):
+    """What is read first."""
+
+    title: str  # who is compared with whom, and who could not be
+    remarks: list[str]  # numbers of nodes, and of runs
+    claims: list[Claim]  # tetopt against the best peer of each measure
+    behind: list[Claim]  # all measures but details in which another mesh is better, group by group, the worst first
+
+    def behind_peers(self) -> list[Claim]:
+        """Where a peer is better."""
+        return [claim for claim in self.behind if claim.other_kind == "peer"]
+
+    def behind_others(self) -> list[Claim]:
+        """Where a control is, or another of tetopt's own meshes."""
+        return [claim for claim in self.behind if claim.other_kind != "peer"]
+
+
+def headline(report: Report) -> Headline:
+    """What the comparison comes to."""
+    ours = our_place(report)
+    peers = [place for place, each in enumerate(report.pipelines) if each.kind == "peer" and each.median is not None]
+    title, remarks = _title(report, ours, peers), _remarks(report, ours, peers)
+    if ours is None:
+        return Headline(title, remarks, [], [])
+    rows = [row for row in criteria(report) if not row.is_detail and row.better]
+    claims = [claim for row in rows if row.is_headline for claim in _claims(report, row, ours, peers)]
+    others = [place for place in range(len(report.pipelines)) if place not in (ours, *peers)]
+    behind = [
+        claim
+        for row in rows
+        for places in (peers, others if row.group != "Cost" else [])  # what makes no mesh of an image costs nothing
+        for claim in _claims(report, row, ours, places)
+        if claim.verdict == "worse"
+    ]
+    behind.sort(key=lambda claim: (GROUPS.index(claim.group), -claim.factor))
+    return Headline(title, remarks, claims, behind)
+
+
+def our_place(report: Report) -> int | None:
+    """Which of the pipelines the headline is of: tetopt by its defaults, else the first of its meshes."""
+    done = [place for place, each in enumerate(report.pipelines) if each.kind == "tetopt" and each.median is not None]
+    return min(done, key=lambda place: report.pipelines[place].name != "tetopt", default=None)
+
+
+def _claims(report: Report, row: Criterion, ours: int, places: list[int]) -> Iterator[Claim]:
+    """Of one measure, against the best of the meshes at these places; nothing if none has a value."""
+    entries = entries_of(row, report)
+    known = [place for place in places if entries[place].value is not None]
+    if not known:
+        return
+    best = max(known, key=lambda place: row.better * (entries[place].value or 0.0))
+    own, other = entries[ours], entries[best]
+    is_ratio = own.value is not None and other.value is not None and own.value > 0.0 and other.value > 0.0
+    title = row.title if row.part in GROUPS or row.group == "Image" else f"{row.title}, {row.part.split(', ', 1)[1]}"
+    yield Claim(
+        row.group, title, row.better < 0, own, other, report.pipelines[best].title, report.pipelines[best].kind,
+        own.value / other.value if is_ratio and own.value and other.value else None,
+        _verdict(row.better, own, other), row.blind,
+    )  # fmt: skip
+
+
+def _verdict(better: int, own: Entry, other: Entry) -> Verdict:
+    if own.value is None or own.low is None or own.high is None:
+        return "worse"
+    assert other.value is not None, "it was asked for"
+    assert other.low is not None, "there with the value"
+    assert other.high is not None, "there with the value"
+    is_near = abs(own.value - other.value) <= EQUAL_SHARE * max(abs(own.value), abs(other.value))
+    best = winners(better, [own.value, other.value])
+    if is_near or len(best) != 1 or (own.low <= other.high and other.low <= own.high):
+        return "no different"
+    return "better" if best == [0] else "worse"
+
+
+def failure_words(each: PipelineResult) -> str:
+    """That a pipeline failed, or that it is not installed."""
+    if each.reason == "missing":
+        return f"{each.title} is not installed"
+    is_crash = each.reason == "crash"  # which was run again
+    how = (each.failure or "no run").removeprefix("twice ").removeprefix("crashed: ") if is_crash else each.failure
+    return f"{each.title} failed{' twice' if is_crash else ''} ({how})"
+
+
+def _title(report: Report, ours: int | None, peers: list[int]) -> str:
+    tried = [each for each in report.pipelines if each.kind == "peer"]
+    void = [failure_words(each) for each in tried if each.median is None]
+    if ours is None:
+        failed = [failure_words(each) for each in report.pipelines if each.kind == "tetopt"]
+        return f"nothing of tetopt's to compare: {'; '.join(failed) or 'none of its pipelines was asked for'}"
+    title = report.pipelines[ours].title
+    if not peers:
+        return f"{title} against no peer: {'; '.join(void) or 'none was asked for'}"
+    names = " and ".join(report.pipelines[place].title for place in peers)
+    return "; ".join([f"{title} against {names} at {report.options.nodes} nodes", *void])
+
+
+def _remarks(report: Report, ours: int | None, peers: list[int]) -> list[str]:
+    shown = [report.pipelines[place] for place in ([] if ours is None else [ours]) + peers]
+    sizes = {each.title: each.median.measurement.n_nodes for each in shown if each.median is not None}
+    remarks = []
+    if sizes:
+        counts = ", ".join(f"{title} {number_text(nodes)}" for title, nodes in sizes.items())
+        is_equal = max(sizes.values()) <= SIZE_TOLERANCE * min(sizes.values())
+        more = "" if is_equal else "; more nodes alone make E_D and the errors smaller, see the curves"
+        remarks.append(f"{'Nodes' if is_equal else 'The meshes differ in nodes'}: {counts}{more}.")
+        runs = ", ".join(f"{each.title} {len(each.runs)}" for each in shown)
+        remarks.append(
+            f"Runs: {runs}. Numbers are medians; a difference within the runs' ranges counts as none, "
+            f"nor does one below {EQUAL_SHARE:.1%}."
+        )
+    for order, word in ORDER_WORDS.items():
+        for each in report.pipelines if order == 1 else report.quadratic:
+            where = each.title if order == 1 else f"{each.title}, {word} cells"
+            n_again = len(each.crashes) - (each.reason == "crash") * 2
+            if n_again > 0:
+                times = "once" if n_again == 1 else f"{n_again} times"
+                remarks.append(f"{where}: crashed {times}, and was run again ({each.crashes[0]}).")
+            if each.failure is not None and (each.median is not None or (order == 2 and each.reason != "missing")):
+                how = "a run failed" if each.median is not None else "failed"
+                remarks.append(f"{where}: {how}: {each.failure}.")
+    return remarks
