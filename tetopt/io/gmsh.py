@@ -186,7 +186,7 @@ def _file(header: str, comments: list[str], parts: list[Part], *sections: str) -
             _section("PhysicalNames", f"{len(names)}\n", *names),
             *sections,
         ]
-    ).encode()
+    ).encode("utf-8", "backslashreplace")
 
 
 def _section(name: str, *parts: str) -> str:

@@ -45,7 +45,7 @@ def medit(model: Model) -> bytes:
             _section(sides, element_facets(nodes, on_facets.items) + 1, on_facets.tags),
             "\nEnd\n",
         ]
-    ).encode()
+    ).encode("utf-8", "backslashreplace")
 
 
 def _section(keyword: str, values: NDArray, refs: NDArray[np.int64]) -> str:

@@ -64,7 +64,7 @@ def mfem(model: Model) -> bytes:
             f"{mesh.ndim}\n{rows(mesh.points)}" if model.order == 1 else _nodes(mesh),
             "\nmfem_mesh_end\n",
         ]
-    ).encode()
+    ).encode("utf-8", "backslashreplace")
 
 
 def _elements(attributes: NDArray[np.int64], dim: int, nodes: NDArray[np.int64]) -> str:

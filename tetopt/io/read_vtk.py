@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import mmap
+import os
 import re
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -93,7 +94,7 @@ def _arrays_of(path: str) -> tuple[str, str, dict[str, Any]]:
     if isinstance(reader, vtkDataSetReader):
         for kind in ("Scalars", "Vectors", "Normals", "Tensors", "ColorScalars", "TCoords", "Fields"):
             getattr(reader, f"ReadAll{kind}On")()
-    reader.SetFileName(path)
+    reader.SetFileName(os.fsencode(path))  # names that are not UTF-8, too
     reader.Update()
     grid = reader.GetOutput()
     errors = _first_error(window.GetOutput())
