@@ -87,7 +87,7 @@ class _Console(Console):
 
     def render_str(self, text: str, **options: Any) -> Text:
         """Text of a message or a table, in which names of files may hold anything."""
-        return super().render_str("\n".join(map(plain, text.split("\n"))), **options)
+        return super().render_str(plain(text), **options)
 
 
 log = _Console(stderr=True, highlight=False, soft_wrap=True, emoji=False)

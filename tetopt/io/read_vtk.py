@@ -94,7 +94,7 @@ def _arrays_of(path: str) -> tuple[str, str, dict[str, Any]]:
     if isinstance(reader, vtkDataSetReader):
         for kind in ("Scalars", "Vectors", "Normals", "Tensors", "ColorScalars", "TCoords", "Fields"):
             getattr(reader, f"ReadAll{kind}On")()
-    reader.SetFileName(os.fsencode(path))  # names that are not UTF-8, too
+    reader.SetFileName(os.fsencode(path))  # type: ignore[arg-type]  # as bytes names that are not UTF-8, too
     reader.Update()
     grid = reader.GetOutput()
     errors = _first_error(window.GetOutput())

@@ -1,0 +1,267 @@
+"""How the command ends when a signal comes, when its streams are closed, full or gone, and when memory is short."""
+
+import os
+import re
+import signal
+import sys
+from contextlib import contextmanager
+
+import numpy as np
+import pytest
+from commands import exit_code, mesh_words, numbers_in
+from models import sample_image
+
+import tetopt
+import tetopt.cli.mesh
+import tetopt.cli.phantom
+import tetopt.cli.run
+from tetopt.cli.ending import signals_heard
+
+NEEDS_SIGNALS = pytest.mark.skipif(os.name == "nt", reason="Windows has no such signals")
+NEEDS_FULL = pytest.mark.skipif(not os.path.exists("/dev/full"), reason="the system has no device that is always full")
+LATE_SIGNALS = [signal.SIGINT, signal.SIGTERM, getattr(signal, "SIGHUP", signal.SIGTERM)]
+QUICK = ["--spacing", "8", "--iterations", "2"]
+
+
+@pytest.fixture
+def image(tmp_path):
+    """The path of a tiny image, in a folder of its own."""
+    (tmp_path / "in").mkdir()
+    tetopt.save_image(tmp_path / "in" / "a.nii.gz", sample_image(3))
+    return tmp_path / "in" / "a.nii.gz"
+
+
+@pytest.fixture
+def folder(tmp_path):
+    """Where outputs go."""
+    (tmp_path / "out").mkdir()
+    return tmp_path / "out"
+
+
+def names_in(folder):
+    return sorted(path.name for path in folder.iterdir())
+
+
+# --------------------------------------------------------------------------------------------------
+# Signals
+
+
+@NEEDS_SIGNALS
+@pytest.mark.parametrize("number", LATE_SIGNALS)
+def test_a_signal_leaves_the_mesh_reached(image, folder, monkeypatch, capsys, number):
+    @contextmanager
+    def told(_):
+        yield lambda row: signal.raise_signal(number) if row.iteration == 1 else None
+
+    monkeypatch.setattr(tetopt.cli.run, "_progress", told)
+    before = signal.getsignal(number)
+    assert exit_code(*mesh_words(image, folder, *QUICK, "--iterations", "200")) == 128 + number
+    assert signal.getsignal(number) is before
+    assert numbers_in(folder / "a.json")["iterations_done"] < 5
+    assert len(tetopt.load_mesh(folder / "a.vtu").mesh.cells) > 100
+    assert "interrupted: the mesh so far is kept" in capsys.readouterr().err
+
+
+@NEEDS_SIGNALS
+def test_a_signal_while_the_mesh_is_written_waits_for_it(image, folder, monkeypatch):
+    save = tetopt.cli.mesh.save_for_solver
+
+    def interrupted(*arguments):
+        signal.raise_signal(signal.SIGTERM)
+        save(*arguments)
+
+    monkeypatch.setattr(tetopt.cli.mesh, "save_for_solver", interrupted)
+    assert exit_code(*mesh_words(image, folder, *QUICK)) == 143
+    assert names_in(folder) == ["a.json", "a.vtu"]
+
+
+@NEEDS_SIGNALS
+@pytest.mark.parametrize("number", LATE_SIGNALS)
+def test_other_commands_end_at_once(folder, monkeypatch, capsys, number):
+    def interrupted(*_):
+        signal.raise_signal(number)
+
+    monkeypatch.setattr(tetopt.cli.phantom, "save_image", interrupted)
+    assert exit_code("phantom", "disc_2d", "-o", folder / "a.nii", "--voxel-mm", "8") == 128 + number
+    assert names_in(folder) == []
+    assert capsys.readouterr().err == ""
+
+
+@NEEDS_SIGNALS
+def test_an_ignored_signal_stays_ignored():
+    """As nohup asks for, and shells of what runs in the background."""
+    before = signal.signal(signal.SIGHUP, signal.SIG_IGN)
+    try:
+        with signals_heard():
+            assert signal.getsignal(signal.SIGHUP) is signal.SIG_IGN
+            assert signal.getsignal(signal.SIGTERM) is not signal.SIG_DFL
+        assert signal.getsignal(signal.SIGTERM) is signal.SIG_DFL
+    finally:
+        signal.signal(signal.SIGHUP, before)
+
+
+# --------------------------------------------------------------------------------------------------
+# Streams
+
+
+@contextmanager
+def full_device():
+    """A stream to what is always full; what is left in its buffer must not fail when it is closed."""
+    with open("/dev/full", "w", encoding="utf-8") as stream:
+        yield stream
+
+
+@NEEDS_FULL
+@pytest.mark.parametrize(("names", "code"), [(["stderr"], 0), (["stdout"], 2), (["stdout", "stderr"], 2)])
+def test_full_streams_lose_no_file(image, folder, monkeypatch, capsys, names, code):
+    with full_device() as stream:
+        for name in names:
+            monkeypatch.setattr(sys, name, stream)
+        assert exit_code(*mesh_words(image, folder, *QUICK)) == code
+    monkeypatch.undo()
+    assert names_in(folder) == ["a.json", "a.vtu"]
+    if names == ["stdout"]:
+        said = capsys.readouterr().err
+        assert said.endswith(
+            "standard output: cannot be written: No space left on device; what was printed is incomplete\n"
+        )
+
+
+@NEEDS_FULL
+def test_an_error_on_a_full_stream_keeps_its_code(folder, monkeypatch):
+    with full_device() as stream:
+        monkeypatch.setattr(sys, "stderr", stream)
+        assert exit_code("quality", folder / "none.vtu") == 2
+
+
+def test_closed_streams_lose_no_file(image, folder, monkeypatch):
+    """Python has None for a stream that was closed before it began, and a closed one after."""
+    closed = open(os.devnull, "w", encoding="utf-8")  # noqa: SIM115, closed in the next line
+    closed.close()
+    for stream in (None, closed):
+        monkeypatch.setattr(sys, "stdout", stream)
+        monkeypatch.setattr(sys, "stderr", stream)
+        assert exit_code(*mesh_words(image, folder, *QUICK), "--force") == 0
+        assert names_in(folder) == ["a.json", "a.vtu"]
+
+
+@NEEDS_SIGNALS
+def test_closed_descriptors_are_not_taken_by_files(tmp_path):
+    """Else what libraries print on standard error would go into the file that was opened next."""
+    program = (
+        "import os, sys; from tetopt.cli.console import open_streams; open_streams(); "
+        f"f = open({str(tmp_path / 'a')!r}, 'w'); os.write(2, b'noise'); os.write(1, b'noise'); f.write('mine')"
+    )
+    child = os.fork()
+    if child == 0:
+        os.closerange(0, 3)
+        os.execve(
+            sys.executable, [sys.executable, "-c", program], os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)}
+        )
+    assert os.waitpid(child, 0)[1] == 0
+    assert (tmp_path / "a").read_text() == "mine"
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="names are of bytes on Linux alone")
+@pytest.mark.parametrize("suffix", ["vtu", "vtk", "xdmf", "msh", "msh2", "inp", "feb", "scn", "mfem", "mesh"])
+def test_names_that_are_not_utf_8(image, folder, suffix, capsys):
+    name = os.fsdecode(b"caf\xe9\x1b[31m\n")
+    os.rename(image, image.with_name(f"{name}.nii.gz"))
+    command = mesh_words(image.with_name(f"{name}.nii.gz"), folder, *QUICK, "--iterations", "0", "--force")
+    command[command.index("-o") + 1] = folder / f"{name}.{suffix}"
+    assert exit_code(*command, "--young", "3") == 0
+    assert numbers_in(folder / "a.json")["image"] == "caf\\udce9\x1b[31m\n.nii.gz"
+    said = "".join(capsys.readouterr())
+    assert "\x1b" not in said
+    assert r"caf\udce9\x1b[31m\n" in said
+    assert b"caf\xe9" not in (folder / f"{name}.{suffix}").read_bytes()
+    if suffix in ("vtu", "vtk", "msh"):
+        assert len(tetopt.load_mesh(folder / f"{name}.{suffix}").mesh.cells) > 100
+
+
+# --------------------------------------------------------------------------------------------------
+# Memory, and places that have gone
+
+
+@pytest.mark.parametrize(
+    ("error", "words"),
+    [
+        (MemoryError(), "not enough memory; take"),
+        (MemoryError("to lay out"), "not enough memory: to lay out; take"),
+        (np._core._exceptions._ArrayMemoryError((10**6, 10**6), np.dtype(float)), "not enough memory: .*7.28 TiB"),
+    ],
+)
+def test_short_memory_is_a_line(folder, monkeypatch, capsys, error, words):
+    def short(*_):
+        raise error
+
+    monkeypatch.setattr(tetopt.cli.phantom, "save_image", short)
+    assert exit_code("phantom", "disc_2d", "-o", folder / "a.nii", "--voxel-mm", "8") == 2
+    said = capsys.readouterr().err
+    assert said.count("\n") == 1
+    assert re.search(words, said)
+
+
+@pytest.mark.parametrize(
+    "error", [OSError(28, "No space left on device", "a.inp"), MemoryError("to lay out"), KeyError(7)]
+)
+def test_a_mesh_whose_file_fails_is_kept(image, folder, monkeypatch, capsys, error):
+    def failing(*_):
+        raise error
+
+    monkeypatch.setattr(tetopt.cli.mesh, "save_for_solver", failing)
+    command = ["mesh", image, "-o", folder / "a.inp", *QUICK]
+    if isinstance(error, KeyError):  # a fault of ours, which is not hidden
+        with pytest.raises(KeyError):
+            exit_code(*command)
+    else:
+        assert exit_code(*command) == 2
+    assert f"the optimised mesh is in {folder / 'a.vtu'}: go on from there" in capsys.readouterr().err
+    assert tetopt.load_mesh(folder / "a.vtu").cell_data["mean"].max() > 0.0
+
+
+def test_a_mesh_whose_folder_has_gone_is_kept_elsewhere(image, folder, tmp_path, monkeypatch, capsys):
+    """Whatever else fails: the model of the mesh, then the mesh beside its name."""
+    save = tetopt.cli.mesh.save_for_solver
+
+    def gone(*arguments):
+        folder.rmdir()
+        save(*arguments)
+
+    (tmp_path / "tmp").mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "tmp"))
+    monkeypatch.setattr(tetopt.cli.mesh, "save_for_solver", gone)
+    assert exit_code("mesh", image, "-o", folder / "a.vtu", *QUICK) == 2
+    (kept,) = (tmp_path / "tmp").rglob("*.vtu")
+    said = capsys.readouterr().err.splitlines()
+    assert (
+        f"{folder / 'a.vtu'}: cannot be written: No such file or directory; the optimised mesh is in {kept}" in said[-1]
+    )
+    assert kept.parent.stat().st_mode & 0o077 == 0
+    assert tetopt.load_mesh(kept).cell_data["mean"].max() > 0.0
+
+
+def test_an_output_that_came_meanwhile_stays(image, folder, monkeypatch, capsys):
+    save = tetopt.cli.mesh.save_for_solver
+
+    def raced(*arguments):
+        (folder / "a.vtu").write_text("theirs")
+        save(*arguments)
+
+    monkeypatch.setattr(tetopt.cli.mesh, "save_for_solver", raced)
+    assert exit_code("mesh", image, "-o", folder / "a.vtu", *QUICK) == 2
+    assert (folder / "a.vtu").read_text() == "theirs"
+    assert f"is in {folder / 'a_kept_1.vtu'}" in capsys.readouterr().err
+    assert len(tetopt.load_mesh(folder / "a_kept_1.vtu").mesh.cells) > 100
+
+
+def test_what_was_written_before_an_error_is_said(image, folder, monkeypatch, capsys):
+    def full(*_):
+        raise OSError(28, "No space left on device", str(folder / "a.json"))
+
+    monkeypatch.setattr(tetopt.cli.mesh, "save_json", full)
+    assert exit_code(*mesh_words(image, folder, *QUICK)) == 2
+    said = capsys.readouterr().err.splitlines()
+    assert said[-2:] == [
+        f"tetopt: {folder / 'a.json'}: No space left on device", f"written all the same: {folder / 'a.vtu'}"
+    ]  # fmt: skip
