@@ -1,5 +1,6 @@
 """All formats alike: chosen by the suffix, and well-formed whatever things are called."""
 
+import itertools
 import re
 import warnings
 from pathlib import Path
@@ -8,14 +9,17 @@ from xml.etree import ElementTree
 import meshio
 import numpy as np
 import pytest
-from models import sample_model
+from models import quadratic_model, sample_model
 
 import tetopt
 from tetopt import InputError
 from tetopt.geometry.surface import surface_of
+from tetopt.io import surfaces
 from tetopt.io.formats import FORMATS, file_bytes, save_mesh, save_model
+from tetopt.io.readback import OUTLINES, Outline, save_checked
 from tetopt.io.surfaces import checked_surface, save_surface
 from tetopt.io.text import plain
+from tetopt.model.model import elements
 from tetopt.model.sets import Sets
 
 XML_SUFFIXES = (".vtu", ".xdmf", ".feb", ".scn")
@@ -189,4 +193,100 @@ def test_labels_of_a_surface_that_its_file_cannot_name_are_refused(tmp_path):
             save_surface(
                 tmp_path / f"a{suffix}", surface, labels={"a\nproperty int b": np.zeros(len(surface.triangles), int)}
             )
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("suffix", FORMATS)
+def test_names_that_are_words_of_a_format(suffix, tmp_path):
+    """What was written is gone through before it takes its name, so that this alone would notice."""
+    words = ["METADATA", "SCALARS", "POINTS", "CELL_DATA", "FIELD", "LOOKUP_TABLE", "$EndNodes", "*NODE", "End", "last"]
+    model = sample_model()
+    fields = {name: np.arange(len(model.mesh.cells)) + 0.5 * k for k, name in enumerate(words)}
+    about = {"tetopt": "0.1.0", "image": "\n\nVertices\n7"}
+    save_model(tmp_path / f"a{suffix}", model._replace(cell_data=fields, about=about, loads=()))
+    if suffix in (".vtu", ".vtk"):
+        back = tetopt.load_mesh(tmp_path / f"a{suffix}").cell_data
+        assert all(np.array_equal(back[name], values) for name, values in fields.items())
+
+
+# What is written, read back
+
+
+def outlines():
+    """Each format with an outline, its bytes, and how many points and cells they hold; surfaces' own formats, too."""
+    model = sample_model()
+    surface = surface_of(model.mesh.points, model.mesh.cells, np.arange(len(model.mesh.cells)))
+    for order, suffix in itertools.product((1, 2), FORMATS):
+        if order == 1 or FORMATS[suffix].has_quadratic:
+            whole = quadratic_model() if order == 2 else model
+            yield (
+                suffix,
+                file_bytes(Path(f"a{suffix}"), whole),
+                len(elements(whole)[0]),
+                len(model.mesh.cells),
+                model.sets,
+            )
+    for suffix in (".vtp", ".vtk"):
+        labels = {"inside": np.zeros(len(surface.triangles), int), "b": np.ones(len(surface.triangles), int)}
+        writer = {".vtp": surfaces._vtp, ".vtk": surfaces._vtk}[suffix]
+        yield suffix, writer(surface, "about", "ras", labels), len(surface.points), len(surface.triangles), Sets({}, {})
+
+
+@pytest.mark.parametrize(("suffix", "whole", "n_points", "n_cells", "sets"), list(outlines()))
+def test_outlines_tell_what_a_file_holds(suffix, whole, n_points, n_cells, sets):
+    outline = OUTLINES[suffix](whole)
+    if suffix in (".stl", ".ply"):
+        return
+    assert outline.n_points == n_points
+    assert outline.n_cells == (None if suffix in (".msh", ".msh2") else n_cells)
+    assert outline.facet_sets >= sets.facets.keys()
+    if suffix not in (".msh", ".msh2"):
+        assert outline.cell_sets >= sets.cells.keys()
+
+
+@pytest.mark.parametrize(("suffix", "whole", "n_points", "n_cells", "sets"), list(outlines()))
+def test_damage_is_noticed(suffix, whole, n_points, n_cells, sets, tmp_path):
+    """Wherever a file is cut off, and whichever line a text lacks."""
+    path, rng = tmp_path / f"a{suffix}", np.random.default_rng(len(whole))
+    expected = Outline(n_points, n_cells, frozenset(sets.facets), frozenset(sets.cells))
+    if suffix in (".stl", ".ply"):
+        expected = OUTLINES[suffix](whole)
+    end = whole.index(b"*SURFACE, NAME=corner") if suffix == ".inp" else len(whole) - 8  # materials have no counts
+    damaged = [whole[:length] for length in [0, 1, 50, *rng.integers(0, end, 20)]]
+    if suffix in (".msh", ".msh2", ".mfem", ".mesh", ".xdmf"):
+        lines = whole.splitlines(keepends=True)
+        chosen = rng.choice([k for k, line in enumerate(lines) if line[:1].isdigit()], 20)
+        damaged += [b"".join(lines[:k] + lines[k + 1 :]) for k in chosen]
+    path.write_bytes(b"old")
+    for each in damaged:
+        with pytest.raises(OSError, match="cannot be written: what was made "):
+            save_checked(path, each, expected)
+    assert path.read_bytes() == b"old"
+    assert list(tmp_path.iterdir()) == [path]
+    save_checked(path, whole, expected)
+    assert path.read_bytes() == whole
+
+
+@pytest.mark.parametrize("suffix", [".vtu", ".inp"])
+def test_a_disk_that_loses_bytes_is_noticed(suffix, tmp_path, monkeypatch):
+    path, model = tmp_path / f"a{suffix}", sample_model()
+    path.write_bytes(b"old")
+    write = Path.write_bytes
+    monkeypatch.setattr(Path, "write_bytes", lambda self, whole: write(self, whole[:-1] + bytes([whole[-1] ^ 1])))
+    with pytest.raises(OSError, match="what was written reads back otherwise"):
+        save_model(path, model)
+    assert path.read_bytes() == b"old"
+
+
+def test_what_lacks_a_set_or_points_is_refused(tmp_path):
+    model = sample_model()
+    whole = file_bytes(tmp_path / "a.inp", model)
+    for expected, words in (
+        (Outline(facet_sets=frozenset({"boundary", "lost"})), "lacks the set lost"),
+        (Outline(cell_sets=frozenset({"lost"})), "lacks the set lost"),
+        (Outline(n_points=7), "holds .* points instead of 7"),
+        (Outline(n_cells=7), "holds .* cells instead of 7"),
+    ):
+        with pytest.raises(OSError, match=words):
+            save_checked(tmp_path / "a.inp", whole, expected)
     assert list(tmp_path.iterdir()) == []

@@ -4,6 +4,7 @@ import nibabel
 import numpy as np
 import pytest
 
+from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.io.images import load_image, save_image
 
@@ -80,3 +81,30 @@ def test_an_old_file_survives_a_failure(tmp_path, monkeypatch):
         save_image(tmp_path / "a.nii.gz", image)
     assert (tmp_path / "a.nii.gz").read_bytes() == before
     assert [p.name for p in tmp_path.iterdir()] == ["a.nii.gz"]
+
+
+@pytest.mark.parametrize("name", ["a", "a.mha", "a.nii.zip", "a.img", "a.hdr", "a.png", "nii"])
+def test_a_name_of_another_format_is_refused(name, tmp_path):
+    with pytest.raises(InputError, match=r"expected a name that ends in \.nii or \.nii\.gz"):
+        save_image(tmp_path / name, Image(np.arange(24.0).reshape(2, 3, 4)))
+    assert list(tmp_path.iterdir()) == []
+
+
+@pytest.mark.parametrize("name", ["a.nii", "a.nii.gz", "A.NII"])
+def test_an_image_that_reads_back_otherwise_does_not_replace_the_old_one(name, tmp_path, monkeypatch):
+    image = Image(np.arange(24.0).reshape(2, 3, 4))
+    save_image(tmp_path / name, image)
+    before, write = (tmp_path / name).read_bytes(), nibabel.save
+
+    def cut(file, path):
+        write(file, path)
+        path.write_bytes(path.read_bytes()[:-5])
+
+    def other(file, path):
+        write(nibabel.Nifti1Image(np.asarray(file.dataobj)[..., :-1], file.affine), path)
+
+    for damage in (cut, other):
+        monkeypatch.setattr(nibabel, "save", damage)
+        with pytest.raises(OSError, match="reads back otherwise"):
+            save_image(tmp_path / name, image)
+        assert (tmp_path / name).read_bytes() == before

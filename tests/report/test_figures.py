@@ -8,6 +8,7 @@ import pytest
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_rgb, to_rgba, to_rgba_array
+from matplotlib.figure import Figure
 
 from tetopt.energy.sampling import cell_moments, cell_of_voxel
 from tetopt.engine.loop import Optimized, Record
@@ -38,6 +39,7 @@ from tetopt.report.figures import (
     save_run_figures,
     slice_figure,
 )
+from tetopt.report.scene import save_scenes
 from tetopt.start.lattice import lattice
 
 DOLLARS = LabelTable({1: r"5 $\frac$ and a_b"}, {})
@@ -658,3 +660,12 @@ def test_a_constant_image_says_so(monkeypatch, tmp_path):
     monkeypatch.setattr(figures, "save_figure", lambda figure, path: saved.append(figure))
     save_run_figures([tmp_path / k for k in "abc"], image, initial, Optimized(initial, history(0.0), "iterations"))
     assert saved[0].axes[1].get_title() == "optimised, constant image"
+
+
+@pytest.mark.parametrize("name", ["a", "a.pdf", "a.jpg", "a.png.txt"])
+def test_a_picture_is_a_png_or_refused(name, tmp_path):
+    with pytest.raises(InputError, match=r"expected a name that ends in \.png"):
+        save_figure(Figure(), tmp_path / name)
+    with pytest.raises(InputError, match=r"expected a name that ends in \.png"):
+        save_scenes(tmp_path / name, [("", lambda plotter: None)])
+    assert list(tmp_path.iterdir()) == []

@@ -77,9 +77,7 @@ def checked_output(path: str | Path, suffixes: tuple[str, ...], force: bool = Fa
         A suffix not among `suffixes` (of any case), a missing or read-only folder, a folder or a device in the file's
         place, an existing file without `force`, an input of the command or another of its outputs.
     """
-    path = Path(path)
-    if not path.name.lower().endswith(suffixes):
-        raise InputError(f"{path}: expected a name that ends in {' or '.join(suffixes)}")
+    path = check_suffix(path, suffixes)
     if os.path.isdir(path):
         raise InputError(f"{path}: expected a file to write, found a folder")
     try:
@@ -99,6 +97,14 @@ def checked_output(path: str | Path, suffixes: tuple[str, ...], force: bool = Fa
     if (outputs := _OUTPUTS.get()) is not None:
         outputs.may_replace[_absolute(path)] = force
         outputs.places[_absolute(path)] = place
+    return path
+
+
+def check_suffix(path: str | Path, suffixes: tuple[str, ...]) -> Path:
+    """The path, if its name ends in one of the suffixes, of any case; else InputError."""
+    path = Path(path)
+    if not path.name.lower().endswith(suffixes):
+        raise InputError(f"{path}: expected a name that ends in {' or '.join(suffixes)}")
     return path
 
 

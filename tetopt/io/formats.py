@@ -12,17 +12,17 @@ from numpy.typing import NDArray
 from tetopt.errors import InputError
 from tetopt.io.abaqus import abaqus
 from tetopt.io.febio import febio
-from tetopt.io.files import save_bytes
 from tetopt.io.gmsh import gmsh22, gmsh41
 from tetopt.io.medit import medit
 from tetopt.io.mfem import mfem
+from tetopt.io.readback import Outline, save_checked
 from tetopt.io.sofa import sofa
 from tetopt.io.surfaces import boundary_ply, boundary_stl
 from tetopt.io.text import file_name, names_apart, plain, short_name
 from tetopt.io.vtk import vtk, vtu
 from tetopt.io.xdmf import xdmf
 from tetopt.mesh import Mesh
-from tetopt.model.model import Model, in_space, in_units
+from tetopt.model.model import Model, elements, in_space, in_units
 from tetopt.model.sets import MOST_LETTERS, SET_NAME, Sets
 
 
@@ -36,23 +36,23 @@ class Format(NamedTuple):
     is_surface: bool = False  # holds the boundary alone
     has_node_moduli: bool = False  # else a modulus that varies within cells is its mean over each
     has_large: bool = False  # whether a step can ask for large deformation
-    has_short_names: bool = False  # whether names of data have at most `MOST_NAME_CHARACTERS`
 
 
 FORMATS = {
     ".vtu": Format("VTK, ParaView", vtu, has_quadratic=True, has_node_moduli=True),
-    ".vtk": Format("legacy VTK, 3D Slicer", vtk, has_quadratic=True, has_node_moduli=True, has_short_names=True),
+    ".vtk": Format("legacy VTK, 3D Slicer", vtk, has_quadratic=True, has_node_moduli=True),
     ".xdmf": Format("XDMF with tags, FEniCSx", xdmf, has_quadratic=True, has_node_moduli=True),
-    ".msh": Format("gmsh 4.1", gmsh41, has_quadratic=True, has_short_names=True),
-    ".msh2": Format("gmsh 2.2", gmsh22, has_quadratic=True, has_short_names=True),
+    ".msh": Format("gmsh 4.1", gmsh41, has_quadratic=True),
+    ".msh2": Format("gmsh 2.2", gmsh22, has_quadratic=True),
     ".inp": Format("Abaqus, CalculiX", abaqus, has_quadratic=True, runs=True, has_node_moduli=True, has_large=True),
-    ".feb": Format("FEBio 4.0", febio, has_quadratic=True, runs=True, has_large=True, has_short_names=True),
+    ".feb": Format("FEBio 4.0", febio, has_quadratic=True, runs=True, has_large=True),
     ".scn": Format("SOFA scene", sofa, runs=True),
     ".mfem": Format("MFEM mesh", mfem, has_quadratic=True),
     ".mesh": Format("medit", medit, has_quadratic=True),
     ".stl": Format("the boundary as STL", boundary_stl, is_surface=True),
     ".ply": Format("the boundary as PLY", boundary_ply, is_surface=True),
 }
+SHORT_NAMES = (".vtk", ".msh", ".feb")  # whose readers take names of data of `MOST_NAME_CHARACTERS`
 
 
 def format_of(path: Path) -> Format:
@@ -91,7 +91,10 @@ def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str
         An unknown suffix, or what the format cannot carry.
     """
     path = Path(path)
-    save_bytes(path, file_bytes(path, model, space=space, units=units))
+    whole = file_bytes(path, model, space=space, units=units)
+    sets = (frozenset(each) for each in model.sets)
+    expected = Outline(len(elements(model)[0]), len(model.mesh.cells), *sets)
+    save_checked(path, whole, Outline() if format_of(path).is_surface else expected)
 
 
 def save_mesh(
@@ -131,10 +134,10 @@ def file_bytes(path: Path, model: Model, *, space: str = "ras", units: str = "kP
     if model.order != 1 and not kind.has_quadratic:
         able = ", ".join(name for name, other in FORMATS.items() if other.has_quadratic)
         raise InputError(f"{path}: only {able} take quadratic cells; leave out --order 2")
-    return kind.write(_named(path, in_units(in_space(model, space), units), kind))
+    return kind.write(_named(path, in_units(in_space(model, space), units)))
 
 
-def _named(path: Path, model: Model, kind: Format) -> Model:
+def _named(path: Path, model: Model) -> Model:
     """The model, its data called as the format can hold it, which a warning tells where it changes a name.
 
     Raises
@@ -149,7 +152,7 @@ def _named(path: Path, model: Model, kind: Format) -> Model:
     if len({name.lower() for name in sets}) < len(sets):
         twice = next(name for k, name in enumerate(sets) if name.lower() in {each.lower() for each in sets[:k]})
         raise InputError(f"{path}: two sets are called {twice}; call one of them otherwise")
-    shown = short_name if kind.has_short_names else file_name
+    shown = short_name if path.suffix.lower() in SHORT_NAMES else file_name
     names = [names_apart(data, shown) for data in (model.cell_data, model.point_data, model.about)]
     if changed := [new for each in names for old, new in each.items() if old != new]:
         warnings.warn(f"{path}: data with names that it cannot hold are called {', '.join(changed)}", stacklevel=2)

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import contextlib
+import errno
 import gzip
 import hashlib
 import math
+import os
 import re
 import warnings
 import zlib
@@ -24,7 +26,7 @@ from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.incoming import irregular
 from tetopt.io.apart import DEFLATE_RATIO
-from tetopt.io.files import written_whole
+from tetopt.io.files import check_suffix, written_whole
 from tetopt.io.pictures import PICTURE_SUFFIXES, read_picture
 from tetopt.io.read_itk import ITK_READERS, read_dicom_folder, read_itk
 from tetopt.io.volumes import DAMAGED_FILE, UNREADABLE_FILE, one_line, volume_index
@@ -32,6 +34,7 @@ from tetopt.io.volumes import DAMAGED_FILE, UNREADABLE_FILE, one_line, volume_in
 Bounds = Sequence[tuple[int | None, int | None]]
 """One half-open (start, stop) range of voxel indices for each axis; None is an open end."""
 
+OUTPUT_SUFFIXES = (".nii", ".nii.gz")
 _NIBABEL_SUFFIXES = (".nii.gz", ".nii", ".mgz", ".mgh")
 _KNOWN_SUFFIXES = ", ".join((*_NIBABEL_SUFFIXES, *ITK_READERS, *PICTURE_SUFFIXES))
 
@@ -113,14 +116,37 @@ def save_image(path: str | Path, image: Image) -> None:
 
     A 2-D image becomes a 2-D file in the plane z = 0, which `load_image` reads back as it was. Replaces an
     existing file; ask `tetopt.io.files.checked_output` first.
+
+    Raises
+    ------
+    InputError
+        A name that ends otherwise.
+    OSError
+        As `tetopt.io.files.written_whole`, or the file reads back with another head or cut off.
     """
+    path = check_suffix(path, OUTPUT_SUFFIXES)
     affine = np.eye(4)
     affine[: image.ndim, : image.ndim] = image.affine[:-1, :-1]
     affine[: image.ndim, 3] = image.affine[:-1, -1]
     file = nibabel.Nifti1Image(_for_file(image.data), affine)
     file.header.set_xyzt_units("mm")
-    with written_whole(Path(path)) as temporary:
+    with written_whole(path) as temporary:
         nibabel.save(file, temporary)
+        _check_written(temporary, file)
+
+
+def _check_written(path: Path, file: nibabel.Nifti1Image) -> None:
+    """OSError if the file is not what was written, as far as its head and its length tell."""
+    back = nibabel.Nifti1Image.from_filename(path)
+    n_bytes = path.stat().st_size
+    if path.suffix.lower() == ".gz":
+        with path.open("rb") as packed:
+            packed.seek(-4, os.SEEK_END)
+            n_bytes = int.from_bytes(packed.read(), "little")  # unpacked, below 2^32
+    length = nibabel.Nifti1Header.single_vox_offset + file.header.get_data_dtype().itemsize * int(np.prod(file.shape))
+    is_same = back.shape == file.shape and np.array_equal(back.affine, file.affine.astype(np.float32))
+    if not is_same or n_bytes != length % 2**32:
+        raise OSError(errno.EIO, "what was written reads back otherwise; is the disk sound?")
 
 
 def _for_file(data: NDArray[np.floating]) -> NDArray:

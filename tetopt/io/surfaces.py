@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.geometry.surface import Surface, surface_of
-from tetopt.io.files import save_bytes
+from tetopt.io.readback import Outline, save_checked
 from tetopt.io.text import plain
 from tetopt.io.vtk import LEGACY_VERSION, written_bytes, xml_bytes
 from tetopt.model.model import Model, half_turn
@@ -76,7 +76,7 @@ def save_surface(
     if space == "lps":
         surface = surface._replace(points=half_turn(surface.points))
     whole = writers[path.suffix.lower()](surface, about, space, labels or {})
-    save_bytes(path, whole)
+    save_checked(path, whole, Outline(len(surface.points), len(surface.triangles)))
 
 
 def boundary_stl(model: Model) -> bytes:

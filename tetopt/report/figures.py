@@ -24,7 +24,7 @@ from tetopt.geometry.cut import plane_cut
 from tetopt.geometry.simplex import rho
 from tetopt.geometry.topology import facets
 from tetopt.image import Image
-from tetopt.io.files import written_whole
+from tetopt.io.files import check_suffix, written_whole
 from tetopt.measure.fidelity import cell_labels, half_level_surface
 from tetopt.measure.quality import BAD_SHAPE, quality_errors, rho_histogram
 from tetopt.mesh import Mesh
@@ -32,6 +32,7 @@ from tetopt.model.labels import NO_TABLE, LabelTable
 from tetopt.report.colours import LISTED_LABELS, UNCOVERED_COLOUR, grey_limits, label_colours, legend_patches
 
 matplotlib.use("agg")
+FIGURE_SUFFIXES = (".png",)
 # Grey before, then ColorBrewer's Dark2, which the colour-blind tell apart: of histograms and curves.
 CURVE_COLOURS = ("#7f7f7f", "#d95f02", "#1b9e77", "#7570b3")
 MESH_LINE = "#ffb000"  # orange: it shows on every grey
@@ -44,8 +45,8 @@ NUMBER_RADIUS_SHARE = 0.014  # of that width: the radius that a label's number t
 
 
 def save_figure(figure: Figure, path: str | Path, dpi: int = 150) -> None:
-    """Write a PNG, whole or not at all."""
-    with written_whole(Path(path)) as temporary:
+    """Write a PNG, whole or not at all; InputError for a name that ends otherwise."""
+    with written_whole(check_suffix(path, FIGURE_SUFFIXES)) as temporary:
         figure.savefig(temporary, dpi=dpi, format="png", bbox_inches="tight", facecolor="white")
 
 

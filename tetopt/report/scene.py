@@ -13,10 +13,10 @@ from scipy import ndimage
 
 from tetopt.geometry.topology import boundary_facets
 from tetopt.image import Image
-from tetopt.io.files import written_whole
+from tetopt.io.files import check_suffix, written_whole
 from tetopt.mesh import Mesh
 from tetopt.report.colours import grey_limits
-from tetopt.report.figures import MESH_LINE
+from tetopt.report.figures import FIGURE_SUFFIXES, MESH_LINE
 from tetopt.report.viewer import View
 
 STRUCTURE_COLOUR = "#d95f02"  # orange: it stands out from the grey slices behind it
@@ -30,7 +30,7 @@ def save_scenes(path: str | Path, scenes: Sequence[tuple[str, Draw]], columns: i
     A scene is a function that adds its parts to a plotter, such as `structure_before_slices` returns.
     """
     # Without a display VTK complains of the missing one before it renders off screen.
-    with written_whole(Path(path)) as temporary, pyvista.vtk_verbosity("off"):
+    with written_whole(check_suffix(path, FIGURE_SUFFIXES)) as temporary, pyvista.vtk_verbosity("off"):
         columns = min(columns or len(scenes), len(scenes))
         rows = -(-len(scenes) // columns)
         plotter = pyvista.Plotter(
