@@ -17,7 +17,8 @@ import traceback
 from collections import Counter
 from importlib import import_module
 from pathlib import Path
-from typing import NamedTuple
+from types import SimpleNamespace
+from typing import Any, NamedTuple
 
 import numba.np.ufunc.parallel as numba_threads
 from hostile.cases import KINDS, Case, case_of
@@ -48,16 +49,9 @@ class Running(NamedTuple):
 def load_everything() -> None:
     """Import what any command imports, and link all kernels, without starting a thread that a fork would lose."""
     modules = [f"tetopt.cli.{module}" for module, _ in app.COMMANDS.values()]
-    modules += ["tetopt.report.exhibit", "tetopt.report.explore", "tetopt.report.figures", "tetopt.fem.reference"]
-    modules += [
-        "tetopt.fem.solution",
-        "tetopt.measure.segmentation",
-        "SimpleITK",
-        "meshio",
-        "pyvista",
-        "trimesh",
-        "pyamg",
-    ]
+    modules += [f"tetopt.report.{name}" for name in ("exhibit", "explore", "figures")]
+    modules += ["tetopt.fem.reference", "tetopt.fem.solution", "tetopt.measure.segmentation"]
+    modules += ["SimpleITK", "PIL.Image", "meshio", "pyvista", "trimesh"]
     for name in modules:
         import_module(name)
     kernels = import_module("tetopt.kernels")
@@ -103,6 +97,9 @@ def limited(words: tuple[str, ...], temporary: Path) -> int:
     resource.setrlimit(resource.RLIMIT_CPU, (MOST_CPU_SECONDS, MOST_CPU_SECONDS + 2))
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     sys.argv = ["tetopt", *words]
+    with contextlib.suppress(ImportError):  # an older tetopt reads in its own process
+        apart: Any = import_module("tetopt.io.apart")
+        apart.subprocess = SimpleNamespace(Popen=ForkedReader, PIPE=None, DEVNULL=None)
     return app.main(list(words))
 
 
@@ -127,11 +124,44 @@ def _is_hanging(child: int, seconds: float) -> bool:
     """Whether a child has had its time, or waits for something that does not come."""
     if seconds < IDLE_SECONDS:
         return False
-    with contextlib.suppress(OSError):  # it may end just now
-        fields = Path(f"/proc/{child}/stat").read_text().rpartition(")")[2].split()
-        used = sum(map(int, fields[11:15])) / os.sysconf("SC_CLK_TCK")
-        return used < IDLE_SHARE * seconds or seconds > MOST_SECONDS
-    return False
+    ticks = 0
+    for path in Path("/proc").glob("[0-9]*/stat"):  # its own children among them
+        with contextlib.suppress(OSError):  # it may end just now
+            fields = path.read_text().rpartition(")")[2].split()
+            ticks += sum(map(int, fields[11:15])) if int(fields[3]) == child else 0
+    return ticks / os.sysconf("SC_CLK_TCK") < IDLE_SHARE * seconds or seconds > MOST_SECONDS
+
+
+class ForkedReader:
+    """In place of the process in which `tetopt.io.apart` reads: forked, so that it need not load the libraries."""
+
+    def __init__(self, *_: Any, **__: Any) -> None:
+        job, answer = os.pipe(), os.pipe()
+        self.child = os.fork()
+        if self.child == 0:
+            os.dup2(job[0], 0)
+            os.dup2(answer[1], 1)
+            os.dup2(os.open(os.devnull, os.O_WRONLY), 2)
+            os.closerange(3, 100)
+            try:
+                import_module("tetopt.io.apart").main()
+            finally:
+                os._exit(1)
+        os.close(job[0])
+        os.close(answer[1])
+        self.stdin, self.stdout = os.fdopen(job[1], "wb"), os.fdopen(answer[0], "rb")
+        self.code: int | None = None
+
+    def wait(self) -> int:
+        """Its exit code."""
+        if self.code is None:
+            self.code = os.waitstatus_to_exitcode(os.waitpid(self.child, 0)[1])
+        return self.code
+
+    def kill(self) -> None:
+        """End it, if it has not ended."""
+        if self.code is None:
+            os.kill(self.child, signal.SIGKILL)
 
 
 class Campaign:
