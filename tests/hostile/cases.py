@@ -6,10 +6,11 @@ import zlib
 from collections.abc import Callable
 from typing import NamedTuple
 
+import nibabel
 import numpy as np
 from hostile import mutations as m
 from hostile.mutations import HOSTILE_NAMES, HOSTILE_NUMBERS, one_of
-from hostile.seeds import Seeds
+from hostile.seeds import VOXELS, Seeds, affine
 
 QUICK = ("--nodes", "50", "--iterations", "1")
 MESH_OUTPUTS = (".vtu", ".vtk", ".xdmf", ".msh", ".msh2", ".inp", ".feb", ".scn", ".mfem", ".mesh", ".stl", ".ply")
@@ -25,7 +26,6 @@ class Case(NamedTuple):
     files: dict[str, bytes]  # by path from the folder; b"special:..." is no regular file
     outputs: tuple[str, ...]  # what the command may write
     is_forbidden: bool = False  # whether it must be refused
-    is_our_box: bool = False  # whether a mesh must lie in the box of the seeds
 
 
 class Draw:
@@ -142,6 +142,32 @@ def nifti(draw):
     else:
         words = with_image(draw, image)
     return what, *words
+
+
+def odd_images(draw):
+    """Well-formed images of odd grids and intensities, with masks and labels that touch the box."""
+    rng, place, size = draw.rng, affine(), VOXELS
+    image = nibabel.Nifti1Image.from_bytes(draw.seeds.files["f.nii"])
+    index = np.indices((size,) * 3)
+    what = draw.one("sheared", "sheared", "affine", "affine", "voxels", "voxels", "shape")
+    if what == "sheared":
+        place[:3, :3] = place[:3, :3] @ (np.eye(3) + np.triu(rng.uniform(-2.0, 2.0, (3, 3)), 1))
+        name, data = "sheared", nibabel.Nifti1Image(image.get_fdata().astype(np.float32), place).to_bytes()
+    else:
+        mutation = {"affine": m.affines, "voxels": m.voxels, "shape": m.shapes}[what]
+        name, data = mutation(rng, draw.seeds.files["f.nii"])
+    draw.files["odd.nii"] = data
+    more = draw.one((), ("--mask", "beside.nii"), ("--labels", "beside.nii"), ("--background", "auto"), ("--uniform",))
+    if "beside.nii" in more:
+        normal, ball = rng.normal(size=3), rng.uniform(0, size, 3)
+        side = np.tensordot(normal, index - size / 2, 1) > rng.uniform(-6, 6)
+        inside = ((index - ball[:, None, None, None]) ** 2).sum(axis=0) < rng.uniform(4, 80)
+        values = {0: side, 1: inside, 2: side & ~inside, 3: side * 1 + inside * 2}[int(rng.integers(4))]
+        values = values > 0 if more[0] == "--mask" else values
+        other = bytearray(nibabel.Nifti1Image(np.asarray(values).astype(np.uint8), place).to_bytes())
+        other[76:108], other[252:328] = data[76:108], data[252:328]  # NIfTI's place, whatever it is
+        draw.files["beside.nii"] = bytes(other)
+    return f"{name} {' '.join(more)}", ("mesh", "odd.nii", "-o", "out.vtu", *more, *QUICK), ("out.vtu",)
 
 
 def mgh(draw):
@@ -556,6 +582,29 @@ OPTIONS = {
 }  # fmt: skip
 
 
+# What is taken where the rest of the line is sound: not everything should be refused at its first word.
+PLAUSIBLE = {
+    "--nodes": ("9", "30", "80"), "--target-error": ("0.5", "0.9"), "--size-min": ("1", "5"), "--size-max": ("6", "12"),
+    "--edge-max": ("9", "20"), "--gradation": ("0.3", "1"), "--lattice": ("bcc", "five-tet", "octree"),
+    "--spacing": ("6", "9"),
+    "--k-d": ("0", "0.5", "0.99"), "--boundary": ("slide", "fixed"), "--method": ("paper", "fast"),
+    "--shape-power": ("1", "10"),
+    "--min-dihedral": ("0", "5", "30", "69"), "--n-t": ("0", "1"), "--threads": ("1",), "--max-seconds": ("0.01", "1"),
+    "--weights": ("2", "0"), "--smooth-interfaces": ("0", "10"), "--label-weight": ("0", "100"),
+    "--crop": ("2:9,:,1:7", "0:1,:,:"),
+    "--slice": ("k=5", "i=0"), "--background": ("auto", "25"), "--iterations": ("0", "3"), "--young": ("3",
+    "1+abs(h)", "0:1,99:5"),
+    "--nu": ("0.3", "0.49"), "--density": ("1000",), "--average": ("harmonic", "mean"), "--bins": ("3", "4:log",
+    "2:quantile"),
+    "--set": ("a=below:50", "b=point:5,15,20:9"), "--load": ("hold:superior", "pressure:inferior:1",
+    "gravity:0,0,-9810"),
+    "--order": ("2", "1"), "--units": ("MPa",), "--space": ("lps",), "--compress": ("2",), "--below": ("50",),
+    "--label": ("1", "liver"),
+    "--interface": ("0,1",), "--classes": ("2", "3"), "--voxel-mm": ("3",), "--blur-mm": ("0", "3"),
+    "--noise-sd": ("1",),
+}  # fmt: skip
+
+
 def options(draw):
     """Numbers, words, formulas and laws on the command line."""
     command = draw.one(
@@ -584,7 +633,8 @@ def options(draw):
     for _ in range(int(draw.rng.choice([1, 1, 2, 3]))):
         name = one_of(draw.rng, sorted(OPTIONS[command]))
         pool = {WHOLE: HOSTILE_NUMBERS, REAL: HOSTILE_NUMBERS, LAW: FORMULAS, WORD: WORDS}[OPTIONS[command][name]]
-        value = one_of(draw.rng, pool if draw.rng.random() < 0.85 else HOSTILE_NAMES)
+        value = one_of(draw.rng, PLAUSIBLE[name] if name in PLAUSIBLE and draw.rng.random() < 0.4 else pool)
+        value = one_of(draw.rng, HOSTILE_NAMES) if draw.rng.random() < 0.1 else value
         value = value.replace("\ud800", "\udcff").replace("\0", "") if draw.rng.random() < 0.9 else value
         added += [name, value] if draw.rng.random() < 0.7 or not name.startswith("--") else [f"{name}={value}"]
     if "--iterations" in " ".join(added):
@@ -630,7 +680,8 @@ def lines(draw):
 
 
 KINDS: dict[str, tuple[int, Callable[[Draw], tuple]]] = {
-    "NIfTI": (6, nifti), "MGH": (2, mgh), "NRRD, MetaImage": (5, itk), "DICOM": (3, dicom), "pictures": (2, pictures),
+    "NIfTI": (6, nifti), "odd images": (6, odd_images), "MGH": (2, mgh), "NRRD, MetaImage": (5, itk), "DICOM": (3,
+    dicom), "pictures": (2, pictures),
     "VTU": (7, vtu), "legacy VTK": (4, vtk), "gmsh": (5, gmsh), "CalculiX's results": (2, results),
     "field names": (2, field_names),
     "texts in meshes": (3, texts_in_meshes), "label tables": (3, label_tables), "phantoms": (4, phantoms),
@@ -648,11 +699,4 @@ def case_of(seeds: Seeds, seed: int, number: int) -> Case:
     kind = WHEEL[(number * 37 + seed) % len(WHEEL)] if number < len(WHEEL) else one_of(draw.rng, WHEEL)
     what, words, outputs = KINDS[kind][1](draw)
     words = tuple(word.replace("\ud800", "\udcff") for word in words)
-    ours = ("i.nii", "f.nii", "i4.nii")
-    is_ours = kind in ("options", "label tables", "file names", "laws in files") and words[:1] == ("mesh",)
-    is_ours = is_ours and not any(word.startswith(("--crop", "--slice", "--space", "--volume")) for word in words)
-    used = [word for word in words if word in draw.files]
-    is_ours = is_ours and all(
-        word in (*ours, "mask.nii", "labels.nii", "lut.txt") or kind != "options" for word in used
-    )
-    return Case(kind, what, words, draw.files, outputs, kind == "outside", is_ours)
+    return Case(kind, what, words, draw.files, outputs, kind == "outside")

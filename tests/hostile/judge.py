@@ -24,7 +24,9 @@ BAD = (
 )  # fmt: skip
 LONGEST_LINE = 500  # characters of a refusal
 SHORTEST_LINE = 24  # "tetopt: " and less than two words say nothing
-MOST_BYTES = 1_200_000_000  # of memory beyond what the libraries take, for files of some kilobytes
+MOST_BYTES = 2_200_000_000  # of memory beyond the libraries: a reader in its own process may take 2 GiB
+OUTSIDE_VOXELS = 1e-3  # of digits that a text leaves out
+MOST_CONDITION = 1e6  # of an affine whose inverse tells where a node is
 # What a library has said itself, past tetopt.
 RAW_TEXT = re.compile(
     r"0x[0-9a-f]{8}|\.cxx|itk::|vtk\w+ \(|Generic Warning|^Warning|^ERROR|\.py:\d+|Traceback|terminate called|libpng|"
@@ -220,9 +222,7 @@ def _mesh_problem(path: Path, suffix: str, case: Case) -> str:
         return "nodes without a cell"
     cells = nodes[:, : corners[kind]]
     problem = cells_problem(points, cells)
-    if problem or not case.is_our_box:
-        return problem
-    return box_problem(points, case)
+    return problem or (box_problem(points, path.parent, case) if len(cells[0]) == 4 else "")
 
 
 def _meshio_parts(path: Path, suffix: str) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -264,15 +264,20 @@ def cells_problem(points: np.ndarray, cells: np.ndarray) -> str:
     return ""
 
 
-LOW, HIGH = np.array([-6.0, 6.0, 9.5]), np.array([18.0, 30.0, 45.5])  # the seeds' box, as `seeds.load_seeds` has it
-
-
-def box_problem(points: np.ndarray, case: Case) -> str:
-    """Nodes outside of the seeds' box, or, without a mask, a box that is not filled."""
-    if points.shape[1] == 3 and np.ptp(points[:, 2]) == 0.0:
+def box_problem(points: np.ndarray, folder: Path, case: Case) -> str:
+    """Nodes outside of the box of the NIfTI image that was meshed, if that is what was done."""
+    words = case.words
+    is_whole = not any(word.startswith(("--crop", "--slice", "--space", "--volume", "--start")) for word in words)
+    if words[0] != "mesh" or not is_whole or not words[1].endswith((".nii", ".nii.gz")):
         return ""
-    beyond = max(float((LOW - points).max()), float((points - HIGH).max()))
-    return f"nodes {beyond:.3g} mm outside of the box" if beyond > 1e-3 else ""
+    image = nibabel.load(folder / words[1])
+    matrix, unit = np.array(image.affine, dtype=np.float64), image.header.get_xyzt_units()[0]
+    matrix[:3] *= {"meter": 1000.0, "micron": 0.001}.get(unit, 1.0)
+    if len(image.shape) < 3 or np.linalg.cond(matrix[:3, :3]) > MOST_CONDITION:
+        return ""
+    index = np.linalg.solve(matrix[:3, :3], (points - matrix[:3, 3]).T).T
+    beyond = float(np.maximum(-0.5 - index, index - np.array(image.shape[:3]) + 0.5).max())
+    return f"nodes {beyond:.3g} voxels outside of the box" if beyond > OUTSIDE_VOXELS else ""
 
 
 def page_words(text: str) -> str:

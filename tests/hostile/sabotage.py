@@ -13,6 +13,8 @@ from pathlib import Path
 if __name__ == "__main__":
     import hostile.__main__  # noqa: F401 - one thread, before numpy comes
 
+import nibabel
+import numpy as np
 from hostile import campaign
 from hostile.cases import Case
 
@@ -55,7 +57,7 @@ def write_in_temporary() -> int:
 
 def allocate() -> int:
     """Take far more memory than the input has bytes."""
-    return len(b"x" * 1_300_000_000) and refuse()
+    return len(b"x" * 2_400_000_000) and refuse()
 
 
 def spin() -> int:
@@ -107,11 +109,14 @@ def main() -> int:
     """Do each of the deeds in a child, and print the outcomes as JSON."""
     campaign.MOST_CPU_SECONDS, campaign.IDLE_SECONDS = 2, 1
     deeds = list(DEEDS)
+    place = np.diag([2.0, 2.0, 3.0, 1.0])
+    place[:3, 3] = -5.0, 7.0, 11.0
+    box = nibabel.Nifti1Image(np.zeros((12, 12, 12), np.uint8), place).to_bytes()
     outputs = ("out.vtk", "out.vtu", "v.html", "o.json")
     campaign.case_of = lambda seeds, seed, number: Case(  # type: ignore[assignment]
-        "NIfTI", "", (deeds[number],), {"i.nii": b"1"}, outputs, is_our_box=True
+        "NIfTI", "", ("mesh", "box.nii", deeds[number]), {"i.nii": b"1", "box.nii": box}, outputs
     )
-    campaign.app.main = lambda words: DEEDS[words[0]][0]()  # type: ignore[assignment]
+    campaign.app.main = lambda words: DEEDS[words[2]][0]()  # type: ignore[assignment]
     campaign.Campaign.make_seeds = lambda self: None  # type: ignore[method-assign]
     outcomes = {}
     with tempfile.TemporaryDirectory() as scratch:

@@ -62,11 +62,9 @@ LAWS = {
 
 
 class Seeds(NamedTuple):
-    """The valid files by name, the box of the image that all meshes are of, and the bomb."""
+    """The valid files by name, and the bomb."""
 
     files: dict[str, bytes]
-    low: np.ndarray  # (3,), mm
-    high: np.ndarray
     bomb: bytes
 
 
@@ -197,10 +195,9 @@ def frd_of(mesh):
 def load_seeds(folder: Path) -> Seeds:
     """What `write_seeds` has left."""
     files = {path.name: path.read_bytes() for path in sorted(folder.iterdir()) if path.is_file()}
-    first = affine()[:3, 3] - 0.5 * np.array(EDGE_MM)
     packer = zlib.compressobj(9, zlib.DEFLATED, 31)
     member = b"".join(packer.compress(bytes(1 << 20)) for _ in range(MEMBER_BYTES >> 20)) + packer.flush()
-    return Seeds(files, first, first + VOXELS * np.array(EDGE_MM), member * N_MEMBERS)
+    return Seeds(files, member * N_MEMBERS)
 
 
 def special(path: Path, kind: str):
