@@ -198,7 +198,7 @@ def measures(page):
     rows_by_title = {}
     for table, kind, caption in zip(parsed.tables, parsed.kinds, parsed.captions, strict=True):
         if kind == "measures":
-            part = "".join(caption).partition(":")[0]
+            part = re.match(r"Table \d+\. (\w+):", "".join(caption))[1]
             for row in table[1:]:
                 if len(row) == 1:
                     part = "".join(row[0][1])
@@ -780,6 +780,10 @@ def test_nothing_points_outside(whole):
     assert not re.search(r"(src|href|url)\s*[=(]\s*[\"']?(?!data:)[a-z./]+", re.sub(r"base64,[^\"]*", "", page))
     assert "http:" not in page
     assert "https:" not in page
+    for word in ("Table", "Figure"):  # numbered through, those that are folded away with them
+        numbers = [int(number) for number in re.findall(rf"caption>{word} (\d+)\. ", page)]
+        assert numbers == list(range(1, len(numbers) + 1))
+        assert len(numbers) >= 4
     order = [page.index(f'alt="{name}"') for name in ("slices", "histograms", "curves", "timing")]
     assert order == sorted(order)
     assert order[-1] < page.index("<canvas")

@@ -1,12 +1,15 @@
 """A program of the user's own as a pipeline: its files, the number of nodes, the box, and every refusal."""
 
 import json
+import os
 import shlex
+import subprocess
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
+from test_child import is_running, wait_for
 
 import tetopt
 from tetopt.cli import main
@@ -136,6 +139,33 @@ def test_limits_hold_for_what_it_starts(tmp_path):
     outcome = run_in_child(pipeline.function, JOB, max_seconds=8.0)
     assert outcome.failure == "out of time: killed after 8 s"
     assert not Path((tmp_path / "path").read_text()).parent.exists()
+
+
+def test_sigterm_ends_the_comparison_and_its_programs(tmp_path):
+    """As a scheduler sends it: nothing is left running, no temporary folder stays, and finished runs are kept."""
+    tetopt.save_image(tmp_path / "image.nii.gz", IMAGE)
+    script, pid_file, temporary = tmp_path / "slow.sh", tmp_path / "pid", tmp_path / "temporary"
+    script.write_text(f"echo $$ > {pid_file}.new; mv {pid_file}.new {pid_file}; exec sleep 600\n")
+    temporary.mkdir()
+    words = ["compare", str(tmp_path / "image.nii.gz"), "-o", str(tmp_path / "out"), "--nodes", "150", "--curve", ""]
+    words += ["--reference-dofs", "1000", "--pipelines", "bcc", "--pipeline", f"mine=sh {script} {{image}} {{output}}"]
+    paths = os.pathsep.join([str(Path(tetopt.__file__).parents[1]), *filter(None, sys.path)])
+    command = subprocess.Popen(
+        [sys.executable, "-m", "tetopt", *words], stderr=subprocess.PIPE, stdout=subprocess.DEVNULL,
+        env=os.environ | {"PYTHONPATH": paths, "TMPDIR": str(temporary)},
+    )  # fmt: skip
+    try:
+        wait_for(pid_file.exists, 300.0)  # kernels may have to be compiled
+        command.terminate()
+        said = command.communicate(timeout=30.0)[1].decode()
+    finally:
+        command.kill()
+    assert command.returncode == 143
+    assert "--resume goes on from there" in said
+    assert not is_running(int(pid_file.read_text()))
+    wait_for(lambda: not list(temporary.iterdir()), 10.0)
+    assert (tmp_path / "out" / "runs" / "bcc-150-1.json").is_file()
+    assert not (tmp_path / "out" / "report.json").exists()
 
 
 @pytest.mark.parametrize(

@@ -226,7 +226,7 @@ def _print_headline(first: Headline) -> None:
                 table.add_column(heading, justify="left" if not heading else "right")
             for each in claims:
                 numbers = (f"{number_text(each.ours.value)}", f"{number_text(each.other.value)}")
-                table.add_row(escape(each.measure), *numbers, escape(each.other_title), each.ratio_text, each.verdict)
+                table.add_row(escape(each.measure), *numbers, escape(each.other_title), each.ratio_words, each.verdict)
             print_wide(table)
     for line in first.remarks:
         out.print(escape(line))

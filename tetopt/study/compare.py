@@ -352,7 +352,7 @@ def run(
         labels=comparison.label_source,
         law=comparison.law_words,
         versions=versions() | _peers(),
-        machine={"cores": os.cpu_count(), "processor": _processor(), "system": platform.platform()},
+        machine=_machine(),
         date=time.strftime("%Y-%m-%d", time.gmtime()),
         options=settings,
         reference=_reference_grid(standard),
@@ -363,6 +363,15 @@ def run(
         seconds=time.perf_counter() - begin,
     )
     return report, meshes
+
+
+def _machine() -> dict[str, int | str | None]:
+    """Where it ran, and how busy that was: times of a machine whose load is above its cores are not to be cited."""
+    load = f"{os.getloadavg()[2]:.1f}" if hasattr(os, "getloadavg") else None
+    return {
+        "cores": os.cpu_count(), "load, mean of 15 minutes": load, "processor": _processor(),
+        "system": platform.platform(),
+    }  # fmt: skip
 
 
 def _processor() -> str:

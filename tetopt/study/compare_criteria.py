@@ -254,6 +254,11 @@ def number_text(value: float | None) -> str:
     return f"{value:.0f}" if rounded <= abs(value) < full else f"{value:.4g}"
 
 
+def ratio_text(ratio: float) -> str:
+    """A ratio to three digits, as "0.8×"."""
+    return f"{number_text(float(f'{ratio:.3g}'))}×"
+
+
 def loss_text(value: float | None, best: float) -> str:
     """How far a value is from the best, in words."""
     if value is None:
@@ -261,5 +266,5 @@ def loss_text(value: float | None, best: float) -> str:
     if best > 0.0 and value > 0.0:
         ratio = value / best
         far = abs(ratio - 1.0)
-        return f"{ratio:.3g}× the best" if far > EQUAL_SHARE else f"within {max(far, 1e-4):.1%} of the best"
+        return f"{ratio_text(ratio)} the best" if far > EQUAL_SHARE else f"within {max(far, 1e-4):.1%} of the best"
     return f"{number_text(abs(value - best))} from the best"

@@ -17,6 +17,7 @@ from tetopt.study.compare_criteria import (
     criteria,
     entries_of,
     number_text,
+    ratio_text,
     winners,
 )
 from tetopt.study.compare_report import ORDER_WORDS, PipelineResult, Report
@@ -46,10 +47,10 @@ class Claim(NamedTuple):
         return math.inf if self.ratio is None else max(self.ratio, 1.0 / self.ratio)
 
     @property
-    def ratio_text(self) -> str:
+    def ratio_words(self) -> str:
         """The ratio to three digits, or the difference where there is none."""
         if self.ratio is not None:
-            return f"{self.ratio:.3g}×"
+            return ratio_text(self.ratio)
         if self.ours.value is None or self.other.value is None:
             return "–"
         return f"{self.ours.value - self.other.value:+.3g}".replace("-", "−")

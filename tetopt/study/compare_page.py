@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import html
+import re
 from collections.abc import Iterator, Sequence
+from itertools import count
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -77,8 +79,16 @@ def save_compare_page(path: Path, report: Report, pictures: Sequence[tuple[Path,
         ("Turn the meshes", [views_html(views)] if views else []),
         ("Where this comes from", _origin_html(report)),
     ]
-    parts = [section_html(title, content) for title, content in sections if content]
+    parts = _numbered([section_html(title, content) for title, content in sections if content])
     write_page(path, f"tetopt compared on {report.image.source.name}", parts, _COMPARE_STYLE + viewer.VIEWS_STYLE)
+
+
+def _numbered(parts: list[str]) -> list[str]:
+    """The page's parts with numbers before the captions, to cite them by; those that are folded away count, too."""
+    for tag, word in (("caption", "Table"), ("figcaption", "Figure")):
+        numbers = count(1)
+        parts = [re.sub(f"<{tag}>", lambda match: f"{match[0]}{word} {next(numbers)}. ", part) for part in parts]  # noqa: B023
+    return parts
 
 
 # --------------------------------------------------------------------------------------------------
@@ -123,7 +133,7 @@ def _claim_html(claim: Claim, is_first: bool) -> str:
     return (
         f'<tr><th scope="row"><small>{html.escape(claim.group)}</small>{html.escape(claim.measure)} {arrow}'
         f'{blind}</th>{both}<td class="{words[claim.verdict]}">'
-        f'{claim.ratio_text}<b class="mark">{claim.verdict}</b></td></tr>'
+        f'{claim.ratio_words}<b class="mark">{claim.verdict}</b></td></tr>'
     )
 
 
@@ -231,7 +241,13 @@ def _variants_html(report: Report) -> str:
         "take less and more (logarithms, linearly); – where the curve does not reach so far."
     )
     names = ["pipeline", "ν", "seconds", "linear", "quadratic"]
-    return "\n".join([paragraph_html(how), paragraph_html(again), table_html([names, *times])])
+    return "\n".join(
+        [
+            paragraph_html(how),
+            paragraph_html(again),
+            table_html([names, *times], "Error of displacement at equal time of a solve"),
+        ]
+    )
 
 
 def equal_times(report: Report) -> list[list[str]]:
@@ -271,7 +287,7 @@ def _seconds_html(report: Report) -> str:
             spread = f"{number_text(low.seconds[step])} to {number_text(high.seconds[step])}"
             spread = spread if len(pipeline.runs) > 1 else ""
             rows.append([pipeline.title, step, number_text(seconds), spread, UNTIMED_STEPS.get(step, "")])
-    return table_html(rows)
+    return table_html(rows, "Seconds by step, medians of the runs")
 
 
 # --------------------------------------------------------------------------------------------------
@@ -331,7 +347,7 @@ def _reference_text(reference: ReferenceGrid) -> str:
         for nu, row in reference.by_nu.items()
     ]
     return (
-        f"{size}; {reference.note}; strain energy, uJ, {', '.join(energies)}; at half the resolution energy and "
+        f"{size}; {reference.note}; strain energy, µJ, {', '.join(energies)}; at half the resolution energy and "
         f"displacement differ by {', '.join(own)}"
     )
 
@@ -339,7 +355,7 @@ def _reference_text(reference: ReferenceGrid) -> str:
 def _text(value: Any, between: str = ", ") -> str:
     """Any setting as text, sequences joined."""
     if isinstance(value, list | tuple):
-        return between.join(_text(item) for item in value)
+        return between.join(_text(item) for item in value) or "none"
     if isinstance(value, bool) or not isinstance(value, int | float):
         return "none" if value is None else str(value)
     return f"{value:.10g}"
@@ -351,9 +367,6 @@ _TABLE_KEY = (
     "which all are equal, or in which neither way is better, have no best.</p>"
 )
 _COMPARE_STYLE = """
-body { counter-reset: figure table; }
-figcaption::before { counter-increment: figure; content: "Figure " counter(figure) ". "; font-weight: 600; }
-caption::before { counter-increment: table; content: "Table " counter(table) ". "; }
 h1, p, li { overflow-wrap: anywhere; } .title { font-size: 1.15rem; }
 table.measures, table.labels, table.claims { border-collapse: separate; border-spacing: 0; width: 100%; }
 .measures th, .measures td, .labels th, .labels td, .claims th, .claims td {

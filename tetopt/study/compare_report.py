@@ -229,7 +229,7 @@ class Report(NamedTuple):
     labels: LabelSource | None
     law: str
     versions: dict[str, str]
-    machine: dict[str, int | str | None]  # cores, processor and system
+    machine: dict[str, int | str | None]  # cores, load, processor and system
     date: str  # on which the comparison ended, UTC
     options: Settings
     reference: ReferenceGrid
