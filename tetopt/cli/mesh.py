@@ -29,7 +29,7 @@ from tetopt.cli.options import (
     option,
 )
 from tetopt.cli.plan import Plan, planned, with_numbers
-from tetopt.cli.promises import check_promises, warn_of_result
+from tetopt.cli.promises import check_promises, warn_of_result, warn_of_sizes
 from tetopt.cli.run import prepare, watched_run
 from tetopt.cli.solver import (
     all_sets,
@@ -41,8 +41,9 @@ from tetopt.cli.solver import (
     with_chosen_sets,
 )
 from tetopt.cli.source import Source, read_source
+from tetopt.engine.interfaces import crowded_nodes
 from tetopt.engine.loop import Optimized
-from tetopt.engine.meshing import Run, mesh_image
+from tetopt.engine.meshing import QUADRATIC_NODES, Run, mesh_image
 from tetopt.geometry.box import box_sides
 from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import centroids, squared_edges
@@ -57,6 +58,7 @@ from tetopt.model.model import Model
 from tetopt.model.sets import Sets, box_of, label_set_names, surviving_sets
 from tetopt.report.summary import fidelity, image_summary, model_summary, run_summary, size_summary
 from tetopt.report.tables import add_quality, new_table, nodes_in_words
+from tetopt.start.octree import nodes_of_sizes
 from tetopt.start.sizes import edge_ratios
 from tetopt.target.content import Content
 from tetopt.target.domain import INSIDE_SHARE
@@ -230,6 +232,11 @@ def _write(task: Task, outcome: Outcome, begin: float) -> tuple[Model, dict[str,
         about |= {TABLE_TEXT: table_words(there)}
     if task.sizes is not None and (ratios := edge_ratios(result.mesh.points, result.mesh.cells, task.sizes)):
         measured["edges_over_target"] = ratios
+        needed = nodes_of_sizes(source.content, task.sizes)[0]
+        measured["nodes_of_sizes"] = round(needed * (QUADRATIC_NODES[source.image.ndim] if model.order == 2 else 1.0))
+    measured["cells_without_voxel"] = int((model.cell_data["n_voxels"] == 0).sum())
+    if result.labels is not None:
+        measured["nodes_of_many_labels"] = crowded_nodes(result.mesh.cells, result.labels)
     if output.json_path is not None:
         seconds = {**outcome.seconds, "all": time.perf_counter() - begin}
         summary = run_summary(source.content, outcome.initial, result, about, seconds, outcome.shapes)
@@ -265,12 +272,16 @@ def _print(task: Task, outcome: Outcome, model: Model, measured: dict[str, Any])
     plan, content, result = task.plan, task.source.content, outcome.result
     solver, output = plan.solver, plan.output
     code = check_promises(result, measured)
-    is_constant = content.image.data.min() == content.image.data.max()
-    n_empty = 0 if is_constant else int((model.cell_data["n_voxels"] == 0).sum())
+    if content.image.data.min() == content.image.data.max():
+        measured = {**measured, "cells_without_voxel": 0}  # whose values are right all the same
     is_counted = plan.mode == "graded" and plan.sizes.target_error is None
     n_nodes = node_count(model.mesh.points, model.mesh.cells, model.order)
-    warn_of_result(result, plan.engine.method, n_nodes, plan.sizes.nodes if is_counted else None, n_empty)
-    _print_comparison(content, outcome, task.start_name, model.order)
+    asked_nodes = plan.sizes.nodes if is_counted else None
+    warn_of_result(result, plan.engine.method, plan.mode, n_nodes, asked_nodes, measured)
+    if task.sizes is not None:
+        edges = outcome.shapes[1]
+        warn_of_sizes(task.sizes, edges.min_edge, edges.max_edge, measured.get("edges_over_target"))
+    _print_comparison(content, outcome, task.start_name, model.order, measured["cells_without_voxel"])
     print_fidelity(measured)
     if solver.are_any() or output.mesh.suffix.lower() != ".vtu":
         print_model(output.mesh, model, solver)
@@ -284,7 +295,7 @@ def _print(task: Task, outcome: Outcome, model: Model, measured: dict[str, Any])
     return code
 
 
-def _print_comparison(content: Content, outcome: Outcome, start: str, order: int) -> None:
+def _print_comparison(content: Content, outcome: Outcome, start: str, order: int, n_empty: int) -> None:
     mesh, initial = outcome.result.mesh, outcome.initial
     first, last = outcome.result.history[0], outcome.result.history[-1]
     table = new_table("", start, "optimised")
@@ -299,6 +310,8 @@ def _print_comparison(content: Content, outcome: Outcome, start: str, order: int
     meshes = (initial, mesh)
     in_all = [size_summary(each, order)["n_nodes_in_all"] for each in meshes] if order == 2 else []
     add_quality(table, *outcome.shapes, in_all=in_all)
+    if n_empty:
+        table.add_row("cells that hold no voxel centre", "", str(n_empty))
     out.print(table)
 
 

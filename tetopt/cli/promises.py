@@ -8,13 +8,21 @@ from typing import Any
 from tetopt.cli.console import show_error, show_warning
 from tetopt.cli.options import Method
 from tetopt.engine.loop import Optimized
+from tetopt.engine.meshing import Mode
 from tetopt.engine.promises import LABEL_VOXELS
+from tetopt.engine.surface import MOST_MEETING
 from tetopt.measure.fidelity import MaskFidelity
 from tetopt.model.labels import label_words
+from tetopt.start.sizes import LONG_EDGE, EdgeRatios, Sizes
 
 LABEL_DICE = 0.5  # of a label with its cells: below it they hardly show the label
 NODES_MISSED = 0.01  # of the number of nodes asked for: a larger miss is said
 ENERGY_RISE = 1e-3  # relative: E that ended higher above its least value than this is said
+LENGTH_ROUNDING = 1e-3  # relative: by which an edge may miss its limit before that is said
+TARGETS_MISSED = 0.1  # of the edges: so many far over their target are said
+FAR_VOXELS = 1.5  # between the surfaces of mesh and mask, 95th percentile: above it, details of the mask are not shown
+EULER_SHARE = 0.5  # of the mask's Euler number, by which that of the mesh may differ before it is said
+EULER_USUAL = 8  # an Euler number of less counts as this: single holes come and go with the cells' size
 EMPTY_CELLS = 0.02  # of the cells: if more hold no voxel, they are too many for the image
 
 
@@ -54,30 +62,74 @@ def _lost(measured: dict[str, Any]) -> Iterator[str]:
 
 
 def _warn_of_mask(mask: MaskFidelity | None) -> None:
-    if mask is not None and mask.components != mask.mesh_components:
+    if mask is None:
+        return
+    if mask.components != mask.mesh_components:
         show_warning(
             f"the mask has {mask.components} pieces, the mesh {mask.mesh_components}: cells are as large "
             "as parts, or gaps, of the mask; allow more nodes"
         )
+    if (far := max(mask.distance_p95, mask.reverse_p95)) > FAR_VOXELS:
+        show_warning(
+            f"the mesh's boundary and the mask's surface are {far:.1f} voxels apart at the 95th percentile, "
+            f"{max(mask.distance_mean, mask.reverse_mean):.1f} in the mean: cells are larger than the mask's details; "
+            "allow more nodes"
+        )
+    if abs(mask.mesh_euler - mask.euler) > EULER_SHARE * max(abs(mask.euler), EULER_USUAL):
+        show_warning(
+            f"the Euler number of the mask's surface is {mask.euler}, that of the mesh's boundary {mask.mesh_euler}: "
+            "the mesh has other holes and handles than the mask; allow more nodes"
+        )
 
 
-def warn_of_result(result: Optimized, method: Method, n_nodes: int, nodes: int | None, n_empty: int) -> None:
+def warn_of_result(
+    result: Optimized, method: Method, mode: Mode, n_nodes: int, nodes: int | None, measured: dict[str, Any]
+) -> None:
     """Say what is allowed but hardly meant.
 
-    There are `n_nodes` in all, where a graded mesh was to have `nodes`; `n_empty` cells hold no voxel.
+    There are `n_nodes` in all, where a graded mesh was to have `nodes`; `measured` has what was counted.
     """
     if nodes is not None and abs(n_nodes - nodes) > NODES_MISSED * nodes:
+        remedy = "more iterations, a --k-d above 0, or larger sizes come nearer"
+        if (needed := measured.get("nodes_of_sizes")) and needed > nodes:
+            remedy = f"the target sizes take about {needed}; ask for as many, or for larger sizes"
+        show_warning(f"{n_nodes} nodes instead of {nodes}: {remedy}")
+    lowest, first, last = min(row.E for row in result.history), result.history[0], result.history[-1]
+    if last.E > lowest * (1.0 + ENERGY_RISE) and method == "paper":
         show_warning(
-            f"{n_nodes} nodes instead of {nodes}: more iterations, a --k-d above 0, or larger sizes come nearer"
-        )
-    lowest, last = min(row.E for row in result.history), result.history[-1].E
-    if last > lowest * (1.0 + ENERGY_RISE) and method == "paper":
-        show_warning(
-            f"E ended at {last:.4f}, above {lowest:.4f} on the way: a tessellation taken in the first n_t iterations "
+            f"E ended at {last.E:.4f}, above {lowest:.4f} on the way: a tessellation taken in the first n_t iterations "
             "raised it; --retessellate accept takes only those that lower it"
         )
+    if mode == "start" and last.E_D > first.E_D * (1.0 + ENERGY_RISE):
+        rise = f"{last.E_D / first.E_D:.3f} times what it was" if first.E_D > 0.0 else "above 0, which it was"
+        show_warning(f"E_D ended at {rise}: the cells' shapes were improved at its cost; a higher --k-d lowers it")
+    n_empty = measured.get("cells_without_voxel", 0)
     if n_empty > EMPTY_CELLS * len(result.mesh.cells):
         show_warning(
             f"{n_empty} of {len(result.mesh.cells)} cells hold no voxel centre: E_D does not see them, and their "
             "values are the nearest voxel's; ask for fewer nodes"
+        )
+    if crowded := measured.get("nodes_of_many_labels"):
+        show_warning(
+            f"more than {MOST_MEETING} labels meet at {crowded} nodes, which are brought to where the first "
+            f"{MOST_MEETING} of them do"
+        )
+
+
+def warn_of_sizes(sizes: Sizes, shortest: float, longest: float, edges: EdgeRatios | None) -> None:
+    """Say which limits and targets of sizes the edges, from shortest to longest, mm, do not meet."""
+    if sizes.longest is not None and longest > sizes.longest * (1.0 + LENGTH_ROUNDING):
+        show_warning(
+            f"the longest edge is {longest:.4g} mm, {longest / sizes.longest - 1.0:.0%} over --edge-max "
+            f"{sizes.longest:g}: no split or collapse makes such an edge, but nodes move apart; ask for less"
+        )
+    if shortest < sizes.smallest * (1.0 - LENGTH_ROUNDING):
+        show_warning(
+            f"the shortest edge is {shortest:.4g} mm, {1.0 - shortest / sizes.smallest:.0%} under --size-min "
+            f"{sizes.smallest:g}: no split makes such an edge, but nodes move together; ask for more"
+        )
+    if edges is not None and edges.above > TARGETS_MISSED:
+        show_warning(
+            f"{edges.above:.0%} of the edges are over {LONG_EDGE:.2f} times their target size: there are too few "
+            "nodes; ask for more, or for larger sizes"
         )

@@ -65,6 +65,12 @@ def cell_counts(content: Content, mesh: Mesh) -> scipy.sparse.csr_array:
     return counts
 
 
+def crowded_nodes(cells: NDArray[np.int64], of_cell: NDArray[np.int64]) -> int:
+    """Nodes between more labels than they are brought to (`MOST_MEETING`); cells (M, n+1), their labels (M,)."""
+    pairs = np.unique(np.column_stack([cells.ravel(), np.repeat(of_cell, cells.shape[1])]), axis=0)
+    return int((np.bincount(pairs[:, 0]) > MOST_MEETING).sum())
+
+
 @unit
 def _meet(state: State, rings: NodeRings, node: int) -> None:
     """Note which labels the cells around a node have."""

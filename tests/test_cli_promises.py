@@ -1,0 +1,96 @@
+"""What `tetopt mesh` says of its mesh on standard error: promises missed, and what is allowed but hardly meant."""
+
+import numpy as np
+import pytest
+from commands import exit_code, numbers_in
+
+import tetopt
+from tetopt.cli.promises import check_promises, warn_of_result, warn_of_sizes
+from tetopt.engine.interfaces import crowded_nodes
+from tetopt.engine.loop import Optimized, Record
+from tetopt.measure.fidelity import MaskFidelity
+from tetopt.start.sizes import EdgeRatios, Sizes
+
+NEAR = MaskFidelity(9, 9.0, 9.0, 0.99, 0.1, 0.3, 0.1, 0.3, 0.1, 0.3, 0.1, 0.3, 1, 1, 2, 2)
+MESH = tetopt.Mesh([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], [[0, 1, 2]])
+
+
+def said(capsys):
+    return capsys.readouterr().err.replace("tetopt: warning: ", "")
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({}, ""),
+        ({"distance_p95": 8.0, "distance_mean": 2.0}, "8.0 voxels apart at the 95th percentile, 2.0 in the mean"),
+        ({"reverse_p95": 8.0}, "8.0 voxels apart"),
+        ({"distance_p95": np.nan, "reverse_p95": np.nan}, ""),
+        ({"mesh_euler": -47}, "Euler number of the mask's surface is 2, that of the mesh's boundary -47"),
+        ({"mesh_euler": 0}, ""),
+        ({"euler": -400, "mesh_euler": -390}, ""),
+        ({"mesh_components": 3}, "the mask has 1 pieces, the mesh 3"),
+    ],
+)
+def test_a_mask_that_the_mesh_does_not_show(capsys, change, words):
+    assert check_promises(Optimized(MESH, [], "iterations"), {"mask": NEAR._replace(**change)}) == 0
+    text = said(capsys)
+    assert words in text
+    assert text.count("\n") == (1 if words else 0)
+
+
+def ended(E=0.5, E_D=0.5):
+    history = [Record(0, 1.0, 1.0, 1.0, 0.0, False, 1, 1, 0.0), Record(1, E, 1.0, E_D, 0.1, False, 1, 1, 0.1)]
+    return Optimized(MESH, history, "iterations")
+
+
+@pytest.mark.parametrize(
+    ("result", "mode", "nodes", "measured", "words"),
+    [
+        (ended(), "graded", 100, {}, ""),
+        (ended(), "graded", 120, {}, "100 nodes instead of 120: more iterations"),
+        (ended(), "graded", 80, {"nodes_of_sizes": 107}, "the target sizes take about 107; ask for as many"),
+        (ended(E_D=1.2), "start", None, {}, "E_D ended at 1.200 times what it was"),
+        (ended(E_D=1.2), "graded", None, {}, ""),
+        (ended(), "graded", None, {"cells_without_voxel": 1}, "1 of 1 cells hold no voxel centre"),
+        (ended(), "graded", None, {"nodes_of_many_labels": 3}, "more than 4 labels meet at 3 nodes"),
+    ],
+)
+def test_what_is_hardly_meant(capsys, result, mode, nodes, measured, words):
+    warn_of_result(result, "fast", mode, 100, nodes, measured)
+    text = said(capsys)
+    assert words in text
+    assert text.count("\n") == (1 if words else 0)
+
+
+def test_limits_and_targets_that_edges_miss(capsys):
+    edges = EdgeRatios(1.2, 0.05, 0.0, (), [])
+    warn_of_sizes(Sizes(longest=24.0, smallest=2.0), 2.0, 24.0, edges)
+    assert said(capsys) == ""
+    warn_of_sizes(Sizes(longest=24.0), 1.0, 28.8, None)
+    assert "the longest edge is 28.8 mm, 20% over --edge-max 24" in said(capsys)
+    warn_of_sizes(Sizes(smallest=2.0), 1.5, 28.8, None)
+    assert "the shortest edge is 1.5 mm, 25% under --size-min 2" in said(capsys)
+    warn_of_sizes(Sizes(largest=5.0), 1.5, 28.8, edges._replace(above=0.4))
+    assert "40% of the edges are over 1.41 times their target size" in said(capsys)
+
+
+def test_nodes_between_many_labels():
+    fan = np.array([[0, k, k + 1] for k in range(1, 7)])
+    assert crowded_nodes(fan, np.array([5, 4, 3, 2, 2, 1])) == 1
+    assert crowded_nodes(fan, np.array([5, 4, 3, 2, 2, 2])) == 0
+
+
+def test_every_cell_without_a_voxel_is_told(tmp_path, capsys):
+    rng = np.random.default_rng(3)
+    path = tmp_path / "noise.nii.gz"
+    tetopt.save_image(path, tetopt.Image(rng.normal(size=(20, 20))))
+    command = ["mesh", path, "--uniform", "--nodes", "200", "-o", tmp_path / "a.vtu", "--json", tmp_path / "a.json"]
+    assert exit_code(*command) == 0
+    out = capsys.readouterr().out
+    numbers = numbers_in(tmp_path / "a.json")
+    n_empty = int((tetopt.load_mesh(tmp_path / "a.vtu").cell_data["n_voxels"] == 0).sum())
+    assert numbers["cells_without_voxel"] == n_empty > 0
+    row = next(line for line in out.splitlines() if line.startswith("cells that hold no voxel centre"))
+    assert row.split()[-1] == str(n_empty)
+    assert numbers["missed"] == {}
