@@ -134,6 +134,12 @@ def test_integers_beyond_single_precision(tmp_path):
     assert image.data.dtype == np.float64
 
 
+def test_mgh_of_no_voxels_is_refused(tmp_path):
+    (tmp_path / "a.mgh").write_bytes(b"\0\0\0\1" + bytes(400))
+    with pytest.raises(InputError, match="not an image of this kind"):
+        load_image(tmp_path / "a.mgh")
+
+
 @pytest.mark.parametrize("name", ["a.mgz", "a.mgh", "A.MGZ", "a.Mgz"])
 def test_mgh_round_trip(tmp_path, name):
     # MGH holds a rotation, voxel sizes and the centre; no shear.

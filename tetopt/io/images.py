@@ -18,6 +18,7 @@ from typing import Any
 import nibabel
 import numpy as np
 from nibabel.filebasedimages import ImageFileError
+from nibabel.freesurfer.mghformat import MGHError
 from nibabel.spatialimages import HeaderDataError, SpatialImage
 from nibabel.wrapstruct import WrapStructError
 from numpy.typing import NDArray
@@ -40,7 +41,7 @@ _KNOWN_SUFFIXES = ", ".join((*_NIBABEL_SUFFIXES, *ITK_READERS, *PICTURE_SUFFIXES
 
 # What the two libraries raise on damaged files.
 _READER_ERRORS = (OSError, EOFError, ValueError, TypeError, KeyError)
-_NIBABEL_HEADER_ERRORS = (*_READER_ERRORS, ImageFileError, HeaderDataError, WrapStructError, OverflowError)
+_NIBABEL_HEADER_ERRORS = (*_READER_ERRORS, ImageFileError, HeaderDataError, WrapStructError, OverflowError, MGHError)
 HEAD_BYTES_NIFTI = 1024  # of a file: the longest of the headers has 540
 EXTENSION_BYTES = 2**26  # 67 MB before the voxels: a NIfTI file's extensions are texts
 TRAILING_BYTES = 2**24  # 17 MB behind the last voxel: MGH's tags
