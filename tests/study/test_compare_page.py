@@ -10,6 +10,7 @@ from browser import browser, copied, document
 
 import tetopt
 from tetopt.fem.reference import Errors, OwnError
+from tetopt.io.text import plain
 from tetopt.measure.quality import Quality, QualityErrors
 from tetopt.report.figures import save_figure
 from tetopt.report.viewer import view_of
@@ -734,16 +735,27 @@ def test_without_labels_and_finite_elements(tmp_path):
 # The page as a file
 
 
-def test_names_are_escaped(tmp_path):
-    report = fake_report()
-    evil = "<script>alert(1)</script>\"'&"
-    report = report._replace(
+def with_names(report, evil):
+    return report._replace(
         command=evil, law=evil, labels=report.labels._replace(name=evil, names={1: evil, 3: evil}),
         options=report.options._replace(k_D=evil),
         image=report.image._replace(source=report.image.source._replace(name=evil)),
         pipelines=[p._replace(title=evil, about=evil, notes=[evil], failure=evil) for p in report.pipelines],
     )  # fmt: skip
-    page = page_of(tmp_path, report)
+
+
+def test_hostile_names_run_nothing_in_a_browser(tmp_path):
+    ran = "document.documentElement.dataset.xss=1"
+    evil = f"\"><img src=x onerror='{ran}'><script>{ran}</script>\u202e\x1b\udcff</title>"
+    text = page_of(tmp_path, with_names(fake_report(), evil))
+    shown = document(copied(text, tmp_path / "copy.html"))  # whose policy lets all scripts run
+    assert "data-xss" not in shown
+    assert html.unescape(shown).count(plain(evil)) > 10
+
+
+def test_names_are_escaped(tmp_path):
+    evil = "<script>alert(1)</script>\"'&"
+    page = page_of(tmp_path, with_names(fake_report(), evil))
     assert "<script>alert" not in page
     assert html.escape(evil) in page
 

@@ -10,6 +10,7 @@ from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from tetopt.image import Image
+from tetopt.io.text import plain
 from tetopt.target.labels import check_labels
 
 BACKGROUND_COLOUR = "#e6e6e6"  # of label 0
@@ -63,7 +64,7 @@ def label_colours(labels: Image, own: Mapping[int, tuple[float, float, float]] |
 
 def plain_text(text: str) -> str:
     """The text as matplotlib draws it letter by letter, and not as a formula between dollars."""
-    return text.replace("$", r"\$")
+    return plain(text).replace("$", r"\$")
 
 
 def grey_limits(values: Sequence[NDArray], brightest: float = 99.5) -> tuple[float, float]:

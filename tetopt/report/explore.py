@@ -20,9 +20,10 @@ from tetopt.fem.reference import averaged
 from tetopt.geometry.box import box_sides
 from tetopt.image import Image
 from tetopt.io.files import save_text
+from tetopt.io.text import plain
 from tetopt.report.colours import grey_limits
 from tetopt.report.exhibit import COLOUR_MAP, LABEL_FIELD, NO_VALUE, Exhibit, Field, first_axis, warp_factors
-from tetopt.report.page import data_html, packed, script_html
+from tetopt.report.page import data_html, packed, policy_html, printed, script_html
 
 PAGE_IMAGE_VOXELS = 2**24  # 16 MB, a byte each: an image with more is averaged
 PAGE_SIDE_VOXELS = 2048  # along an axis of it: what nearly every graphics card takes
@@ -69,8 +70,9 @@ def explorer_html(shown: Exhibit) -> str:
         "axis": first_axis(shown),
     }
     page = resources.files("tetopt.report").joinpath("explore.html").read_text(encoding="utf-8")
-    script = script_html("webgl.js", "explore_mesh.js", "explore_gl.js", "explore.js")
-    return string.Template(page).substitute(TITLE=html.escape(title), DATA=data_html("data", data), SCRIPT=script)
+    words = {"TITLE": html.escape(plain(title)), "POLICY": policy_html()}
+    whole = string.Template(page).substitute(words, DATA=data_html("data", data), SCRIPT=script_html("explorer"))
+    return printed(whole)
 
 
 def _packed_field(field: Field) -> dict[str, Any]:

@@ -3,10 +3,12 @@
 from __future__ import annotations
 
 import base64
+import hashlib
 import html
 import json
 import struct
 from collections.abc import Sequence
+from functools import cache
 from importlib import resources
 from pathlib import Path
 from typing import Any
@@ -14,7 +16,13 @@ from typing import Any
 from numpy.typing import NDArray
 
 from tetopt.io.files import save_text
+from tetopt.io.text import plain
 
+# Of pages: the files beside this one that each is made of.
+PAGE_SCRIPTS = {
+    "viewer": ("webgl.js", "viewer.js"),
+    "explorer": ("webgl.js", "explore_mesh.js", "explore_gl.js", "explore.js"),
+}
 BROAD_RATIO = 1.4  # A picture wider than this many times its height keeps a readable width on a phone, and scrolls.
 
 
@@ -35,11 +43,11 @@ def save_page(path: Path, title: str, sections: Sequence[dict[str, Any]]) -> Non
 def write_page(path: Path, title: str, parts: Sequence[str], style: str = "") -> None:
     """Write markup `parts` under a heading as one HTML file, whole or not at all.
 
-    `parts` and `style` (CSS after the page's own) go in as they are; `title` is text. The page forbids itself all
-    network access (Content-Security-Policy), so that a reference that slipped in is not followed.
+    `parts` and `style` (CSS after the page's own) go in as they are, but for what is not printed, such as marks that
+    turn the direction of writing, which is shown as Python escapes it; `title` is text. See `policy_html`.
     """
-    head = _HEAD.replace("STYLE", style).replace("TITLE", html.escape(title))
-    save_text(path, "\n".join([head, *parts, "</main></body></html>\n"]))
+    head = _HEAD.replace("POLICY", policy_html()).replace("STYLE", style).replace("TITLE", html.escape(plain(title)))
+    save_text(path, printed("\n".join([head, *parts, "</main></body></html>\n"])))
 
 
 def section_html(title: str, parts: Sequence[str]) -> str:
@@ -87,20 +95,53 @@ def packed(numbers: NDArray, kind: str) -> str:
 def data_html(name: str, data: Any) -> str:
     """Markup of data for a script, as JSON in the element `name`."""
     # An HTML parser ends a script at "</script" wherever it stands, also in a string.
-    text = json.dumps(data, allow_nan=False).replace("<", "\\u003c")
+    text = json.dumps(_shown(data), allow_nan=False).replace("<", "\\u003c")
     return f'<script type="application/json" id="{name}">{text}</script>'
 
 
-def script_html(*names: str) -> str:
-    """Markup of one script in a scope of its own: files beside this one, one after the other."""
-    texts = [resources.files("tetopt.report").joinpath(name).read_text(encoding="utf-8") for name in names]
-    return "\n".join(["<script>", '"use strict";', "(() => {", *texts, "})();", "</script>"])
+def _shown(data: Any) -> Any:
+    """The data with all its texts `plain`: a page shows names as they are."""
+    if isinstance(data, dict):
+        return {plain(str(key)): _shown(value) for key, value in data.items()}
+    if isinstance(data, list | tuple):
+        return [_shown(value) for value in data]
+    return plain(data) if isinstance(data, str) else data
+
+
+def script_html(name: str) -> str:
+    """Markup of one of `PAGE_SCRIPTS`."""
+    return f"<script>{_script(name)}</script>"
+
+
+@cache
+def _script(name: str) -> str:
+    """A script in a scope of its own: files beside this one, one after the other."""
+    folder = resources.files("tetopt.report")
+    texts = [folder.joinpath(part).read_text(encoding="utf-8") for part in PAGE_SCRIPTS[name]]
+    return "\n".join(["", '"use strict";', "(() => {", *texts, "})();", ""])
+
+
+def policy_html() -> str:
+    """Markup by which a page forbids itself the network, forms, and all scripts but our own.
+
+    What slipped in with a name neither runs nor is fetched: scripts are let in by the hash of their text.
+    W3C, Content Security Policy Level 3, https://www.w3.org/TR/CSP3/, 6.7.3 and 8.3.
+    """
+    digests = (hashlib.sha256(_script(name).encode()).digest() for name in PAGE_SCRIPTS)
+    scripts = " ".join(f"'sha256-{base64.b64encode(digest).decode('ascii')}'" for digest in digests)
+    rules = ["default-src 'none'", "img-src data:", "style-src 'unsafe-inline'", f"script-src {scripts}"]
+    rules += ["base-uri 'none'", "form-action 'none'"]
+    return f'<meta http-equiv="Content-Security-Policy" content="{"; ".join(rules)}">'
+
+
+def printed(markup: str) -> str:
+    """Markup in which all that is not printed, but line breaks, is shown as Python escapes it."""
+    return "\n".join(map(plain, markup.split("\n")))
 
 
 _HEAD = """<!doctype html>
 <html lang="en"><head><meta charset="utf-8"><meta name="viewport" content="width=device-width, initial-scale=1">
-<meta http-equiv="Content-Security-Policy"
- content="default-src 'none'; img-src data:; style-src 'unsafe-inline'; script-src 'unsafe-inline'">
+POLICY
 <title>TITLE</title>
 <style>
 body { font: 16px/1.5 system-ui, sans-serif; color: #222; margin: 0; }

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import centroids
 from tetopt.geometry.topology import boundary_facets, facets
+from tetopt.io.text import plain
 from tetopt.mesh import Mesh
 from tetopt.report.colours import grey_limits
 from tetopt.report.page import data_html, packed, script_html
@@ -85,7 +86,7 @@ def views_html(views: Sequence[View]) -> str:
     figures = [
         f'<figure><canvas tabindex="0" role="img" aria-label="3-D view of {title}, opened; drag or press the arrow '
         f'keys to turn it, plus and minus to zoom"></canvas><figcaption>{title}</figcaption></figure>'
-        for title in (html.escape(view.title) for view in views)
+        for title in (html.escape(plain(view.title)) for view in views)
     ]
     return "\n".join(
         [
@@ -93,7 +94,7 @@ def views_html(views: Sequence[View]) -> str:
             '<div class="views">', *figures, "</div>",
             "<noscript><p>The 3-D views need JavaScript, which is off here.</p></noscript>",
             data_html("views-data", _views_data(views)),
-            script_html("webgl.js", "viewer.js"),
+            script_html("viewer"),
         ]
     )  # fmt: skip
 
