@@ -33,7 +33,7 @@ BYTES_OF_TYPE = {
 }  # fmt: skip
 
 
-class Told(NamedTuple):
+class VoxelHeader(NamedTuple):
     """What a header tells."""
 
     sizes: list[int]
@@ -53,17 +53,17 @@ def checked_header(path: Path) -> tuple[int, int]:
     """
     with path.open("rb") as stream:
         head = stream.read(HEADER_BYTES)
-    told = _nrrd(head) if path.suffix.lower() in (".nrrd", ".nhdr") else _metaimage(head)
+    header = _nrrd(head) if path.suffix.lower() in (".nrrd", ".nhdr") else _metaimage(head)
     n_bytes = path.stat().st_size
-    for name in told.files:
+    for name in header.files:
         _check_beside(path, name)
         n_bytes += (path.parent / name).stat().st_size
-    if told.value_bytes > n_bytes * told.ratio:
-        sizes = " x ".join(str(size) for size in told.sizes)
+    if header.value_bytes > n_bytes * header.ratio:
+        sizes = " x ".join(str(size) for size in header.sizes)
         raise InputError(
-            f"{DAMAGED_FILE} (its header tells of {sizes} voxels, {told.value_bytes:.4g} bytes, the file has {n_bytes})"
+            f"{DAMAGED_FILE} (its header tells of {sizes} voxels, {header.value_bytes:.4g} bytes, the file has {n_bytes})"
         )
-    return n_bytes, told.value_bytes
+    return n_bytes, header.value_bytes
 
 
 def _check_beside(path: Path, name: str) -> None:
@@ -92,7 +92,7 @@ def _n_axes(text: str) -> int:
     return int(text)
 
 
-def _metaimage(head: bytes) -> Told:
+def _metaimage(head: bytes) -> VoxelHeader:
     fields: dict[str, str] = {}
     files: list[str] = []
     lines = head.split(b"\n")
@@ -118,10 +118,10 @@ def _metaimage(head: bytes) -> Told:
     is_packed = fields.get("CompressedData", "").lower() in ("true", "1")
     is_text = fields.get("BinaryData", "True").lower() not in ("true", "1")
     ratio = DEFLATE_RATIO if is_packed else TEXT_RATIO if is_text else 1
-    return Told(sizes, math.prod(sizes) * int(channels) * _bytes_of(fields["ElementType"]), files, ratio)
+    return VoxelHeader(sizes, math.prod(sizes) * int(channels) * _bytes_of(fields["ElementType"]), files, ratio)
 
 
-def _nrrd(head: bytes) -> Told:
+def _nrrd(head: bytes) -> VoxelHeader:
     if not head.startswith(b"NRRD"):
         raise InputError(UNREADABLE_FILE)
     fields: dict[str, str] = {}
@@ -149,7 +149,7 @@ def _nrrd(head: bytes) -> Told:
     for names, of_these in (("raw hex", 1), ("txt text ascii", TEXT_RATIO), ("gz gzip", DEFLATE_RATIO)):
         if encoding in names.split():
             ratio = of_these
-    return Told(sizes, math.prod(sizes) * _bytes_of(fields["type"]), files, ratio)
+    return VoxelHeader(sizes, math.prod(sizes) * _bytes_of(fields["type"]), files, ratio)
 
 
 def _bytes_of(kind: str) -> int:
