@@ -493,7 +493,7 @@ def test_bad_options_of_mesh(tmp_path, inputs, monkeypatch, capfd, options, matc
         ("mesh {disc}", "--output"),
         ("mesh -o a.vtu", r"Missing argument 'IMAGE\.\.\.'"),
         ("mesh {lattice} -o a.vtu", "unknown kind of image"),
-        ("quality no.vtu", "no such mesh file"),
+        ("quality no.vtu", "no such file"),
         ("quality {disc}", "named .vtu, .vtk, .msh or .msh2"),
         ("quality {lattice} --image no.nii", "no such file"),
         ("quality {lattice} --image {disc}", "3-D mesh and a 2-D image"),

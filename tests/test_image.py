@@ -80,7 +80,7 @@ def test_transformed_is_a_matrix_product_row_by_row(seed, n):
         (np.array([[2**24, 2**24 + 1]], dtype=np.int32), np.float64),
         (np.array([[0.1, 0.2]], dtype=np.float64), np.float64),
         (np.array([[0.1, 0.2]], dtype=np.float32), np.float32),
-        (np.array([[1e300, 0.0]], dtype=np.float64), np.float64),
+        (np.array([[1e90, 0.0]], dtype=np.float64), np.float64),
         (np.array([[0.5, 65504]], dtype=np.float16), np.float32),
         (np.array([[1.0, 2.0]], dtype=">f4"), np.float32),
         ([[1, 2], [3, 4]], np.float32),
@@ -169,3 +169,41 @@ def test_an_affine_that_places_nothing_is_refused(affine, message):
 def test_tiny_voxels_are_not_singular():
     """Micrometres in metres: 1e-6 along every axis."""
     assert Image(np.zeros((2, 2, 2)), np.diag([1e-6, 1e-6, 1e-6, 1.0])).voxel_volume == pytest.approx(1e-18)
+
+
+@pytest.mark.parametrize("factor", [1e-99, 1e99])
+def test_intensities_whose_squares_can_be_summed(factor):
+    assert Image(np.array([[0.0, 1.0]]) * factor).data.max() == factor
+
+
+@pytest.mark.parametrize("values", [(0.0, 1e-300), (0.0, 1e300), (-1e200, 0.0), (5e-324, 0.0), (1e300, 1e300)])
+def test_intensities_whose_squares_cannot_be_summed(values):
+    with pytest.raises(InputError, match=r"intensities up to 1e\+100 that differ by 1e-100 at least, .*scale"):
+        Image(np.array([values]))
+
+
+SHEARED = np.array([[1.0, 0.0, 1.0, 0.0], [0.0, 1.0, 0.0, 0.0], [0.0, 0.0, 1e-4, 0.0], [0.0, 0.0, 0.0, 1.0]])
+
+
+@pytest.mark.parametrize(
+    ("affine", "message"),
+    [
+        (np.diag([1.0, 1.0, 1e6, 1.0]), r"at most 1000 times as long as thick, got 1e\+06 mm by 1 mm"),
+        (np.diag([1.0, 1.0, 1e-6, 1.0]), "at most 1000 times as long as thick, got 1 mm by 1e-06 mm"),
+        (np.diag([1.0, 1.0, 1e20, 1.0]), r"voxels of up to 1e\+09 mm"),
+        (np.diag([1.0, 1.0, 1e300, 1.0]), r"voxels of up to 1e\+09 mm"),
+        (np.diag([1e-30, 1e-30, 1e-30, 1.0]), "expected voxels of 1e-09 to"),
+        (np.diag([5e-324, 1.0, 1.0, 1.0]), "expected voxels of 1e-09 to|singular"),
+        (SHEARED, "at most 1000 times as long as thick, got 1.414 mm by 7.071e-05 mm"),
+        (np.array([[1.0, 0, 0, 1e12], [0, 1, 0, 0], [0, 0, 1, 0], [0, 0, 0, 1]]), "within 1e.09 voxels of the world"),
+    ],
+)
+def test_voxels_that_cannot_be_computed_with(affine, message):
+    with pytest.raises(InputError, match=message) as caught:
+        Image(np.zeros((2, 2, 2)), affine)
+    assert "\n" not in str(caught.value)
+
+
+def test_real_extremes_of_voxels():
+    """Slices of 10 mm with pixels of 0.1 mm, and a tilted gantry."""
+    assert Image(np.zeros((2, 2, 2)), np.diag([0.1, 0.1, 10.0, 1.0])).spacing.tolist() == [0.1, 0.1, 10.0]

@@ -486,7 +486,7 @@ def test_shipped_by_name_and_by_path_are_the_same():
 @pytest.mark.parametrize(
     ("old", "new", "message"),
     [
-        ("name = ", "name ", "expected TOML in UTF-8, got Expected '=' after a key .*; mend that place"),
+        ("name = ", "name ", "expected TOML, got Expected '=' after a key .*; mend that place"),
         ("size_mm = [20, 20]", "", "missing size_mm; every one of name, description, size_mm, voxel_mm"),
         ('name = "test"\nd', 'd = "x"\nd', "missing name; "),
         ("voxel_mm = 1", "voxel_mm = 1\nvoxels = 3", "unknown 'voxels'; the keys known here are name, desc"),
@@ -575,10 +575,10 @@ def test_message_of_an_unknown_name_lists_the_known():
 def test_messages_of_a_file_that_cannot_be_read(tmp_path):
     with pytest.raises(InputError, match=r"nothing.toml: no such file; .* or one of the names constant"):
         load_phantom(tmp_path / "nothing.toml")
-    with pytest.raises(InputError, match=r"cannot be read, Is a directory; give a .toml file"):
+    with pytest.raises(InputError, match=r"no such file, it is a folder"):
         load_phantom(tmp_path)
     (tmp_path / "latin.toml").write_bytes(b'name = "M\xfcller"')
-    with pytest.raises(InputError, match=r"latin.toml: expected TOML in UTF-8, got 'utf-8' codec can't"):
+    with pytest.raises(InputError, match=r"latin.toml: expected text in UTF-8"):
         load_phantom(tmp_path / "latin.toml")
 
 

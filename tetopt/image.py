@@ -11,6 +11,13 @@ from numpy.typing import ArrayLike, NDArray
 from tetopt.errors import InputError
 
 SINGULAR_DETERMINANT = 1e-6  # of the axes' directions: with less they do not span the space
+# Of a voxel's longest to its shortest extent, shear included: slices of 10 mm with pixels of 0.1 mm have 100. At a
+# million the lattice has more cells across one voxel than fit memory.
+MOST_ASPECT = 1000.0
+LENGTH_RANGE = (1e-9, 1e9)  # mm, of a voxel's edge: their fifth powers, E_G, are far from where doubles end
+MOST_OFFSET = 1e9  # voxels from the world's origin: beyond, coordinates have no ten millionth of a voxel left
+# Of intensities, and of their range: squares, summed over 2^31 voxels, stay within doubles that have all their digits.
+INTENSITY_RANGE = (1e-100, 1e100)
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,6 +127,13 @@ def _checked_data(data: ArrayLike) -> NDArray[np.floating]:
             f"{first}; replace them (for example by the background's value) first"
         )
     values = _as_lossless_float(data)
+    low, high = float(values.min()), float(values.max())
+    least, most = INTENSITY_RANGE
+    if max(abs(low), abs(high)) > most or 0.0 < high - low < least:
+        raise InputError(
+            f"image data: expected intensities up to {most:g} that differ by {least:g} at least, as their squares are "
+            f"summed, got {low:g} to {high:g}; scale them"
+        )
     values.setflags(write=False)
     return values
 
@@ -147,11 +161,35 @@ def _checked_affine(affine: ArrayLike, n: int) -> NDArray[np.float64]:
     if not np.array_equal(affine[-1], np.eye(n + 1)[-1]):
         raise InputError(f"affine: the last row must be {np.eye(n + 1)[-1].tolist()}, got {affine[-1].tolist()}")
     columns = affine[:-1, :-1]
-    lengths = np.linalg.norm(columns, axis=0)
+    with np.errstate(over="ignore"):
+        lengths = np.linalg.norm(columns, axis=0)
+    if lengths.max() > LENGTH_RANGE[1]:
+        raise InputError(f"affine: expected voxels of up to {LENGTH_RANGE[1]:g} mm, got axes {columns.tolist()}")
     if lengths.min() == 0.0 or abs(np.linalg.det(columns / lengths)) < SINGULAR_DETERMINANT:
         raise InputError(
             f"affine: it is singular (voxel axes of lengths {lengths.tolist()} mm do not span {n}-D space); "
             "mend the file's header"
         )
+    _check_extents(columns, lengths, affine[:-1, -1])
     affine.setflags(write=False)
     return affine
+
+
+def _check_extents(columns: NDArray[np.float64], lengths: NDArray[np.float64], origin: NDArray[np.float64]) -> None:
+    """InputError unless voxels are of a size, a shape and in a place that can be computed with."""
+    least, most = LENGTH_RANGE
+    if lengths.min() < least:
+        raise InputError(
+            f"affine: expected voxels of {least:g} to {most:g} mm, got {lengths.tolist()} mm; mend the file's header"
+        )
+    extents = np.linalg.svd(columns, compute_uv=False)
+    if extents[0] > MOST_ASPECT * extents[-1]:
+        raise InputError(
+            f"affine: expected voxels at most {MOST_ASPECT:g} times as long as thick, got {extents[0]:.4g} mm by "
+            f"{extents[-1]:.4g} mm (edges of {lengths.tolist()} mm); mend the file's header, or resample it"
+        )
+    if np.abs(origin).max() > MOST_OFFSET * lengths.min():
+        raise InputError(
+            f"affine: expected the first voxel within {MOST_OFFSET:g} voxels of the world's origin, got "
+            f"{origin.tolist()} mm; mend the file's header"
+        )

@@ -52,11 +52,11 @@ def regular_file(path: str | Path, noun: str) -> Path:
     try:
         other = irregular(path)
     except (FileNotFoundError, NotADirectoryError):
-        raise InputError(f"{path}: no such {noun}; check the path") from None
+        raise InputError(f"{path}: no such file; expected a {noun}") from None
     except (OSError, ValueError) as error:  # ValueError: a zero among the letters
         raise InputError(f"{path}: cannot be opened ({getattr(error, 'strerror', None) or error})") from error
     if other == "a folder":
-        raise InputError(f"{path}: no such {noun}, it is a folder")
+        raise InputError(f"{path}: no such file, it is a folder; expected a {noun}")
     if other is not None:
         raise InputError(f"{path}: expected a regular file, got {other}; copy what it gives into a file")
     return path
@@ -81,7 +81,7 @@ def text_of(path: str | Path, noun: str) -> str:
     try:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: expected a {noun} in UTF-8 (byte {error.start} is not); save it again") from error
+        raise InputError(f"{path}: expected text in UTF-8, not at byte {error.start}; save the {noun} again") from error
 
 
 def toml_of(path: str | Path, noun: str) -> dict[str, Any]:
@@ -97,9 +97,9 @@ def toml_of(path: str | Path, noun: str) -> dict[str, Any]:
         table = tomllib.loads(text)
         _check_numbers(table)
     except ValueError as error:  # also int's, of more digits than it converts
-        raise InputError(f"{path}: expected a {noun} in TOML, got {_short(error)}; mend that place") from error
+        raise InputError(f"{path}: expected TOML, got {_short(error)}; mend that place") from error
     except RecursionError as error:
-        raise InputError(f"{path}: expected a {noun} in TOML, got brackets nested too deeply") from error
+        raise InputError(f"{path}: expected TOML, got brackets nested too deeply") from error
     return table
 
 

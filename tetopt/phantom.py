@@ -39,7 +39,6 @@ Shapes
 from __future__ import annotations
 
 import math
-import tomllib
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
@@ -51,6 +50,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tetopt.errors import InputError
 from tetopt.image import SINGULAR_DETERMINANT, Image
+from tetopt.incoming import toml_of
 
 MAX_PHANTOM_VOXELS = 2**31  # 17 GB in float64
 MAX_SUPERSAMPLE = 64  # sub-voxels along an axis: 262,144 to a voxel in 3-D, as many as fit one chunk of points
@@ -372,15 +372,10 @@ def load_phantom(name_or_path: str | Path) -> Phantom:
             )
         path = phantom_folder() / f"{name_or_path}.toml"
     try:
-        table = tomllib.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError as error:
-        raise InputError(
-            f"phantom {path}: no such file; give the path of one, or one of the names {', '.join(phantom_names())}"
-        ) from error
-    except OSError as error:
-        raise InputError(f"phantom {path}: cannot be read, {error.strerror}; give a .toml file") from error
-    except (tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
-        raise InputError(f"phantom {path}: expected TOML in UTF-8, got {error}; mend that place") from error
+        table = toml_of(path, "phantom's file")
+    except InputError as error:
+        known = f"; or give one of the names {', '.join(phantom_names())}" if not path.exists() else ""
+        raise InputError(f"phantom {error}{known}") from error
     return _phantom(table, f"phantom {path}")
 
 

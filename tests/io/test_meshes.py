@@ -526,8 +526,8 @@ def assert_refused(capfd, caplog):
 
 
 def test_a_missing_file(tmp_path, assert_refused):
-    assert_refused(tmp_path / "no.vtu", "no such mesh file")
-    assert_refused(tmp_path, "no such mesh file")
+    assert_refused(tmp_path / "no.vtu", "no such file")
+    assert_refused(tmp_path, "no such file")
 
 
 @pytest.mark.parametrize("name", ["a.stl", "a.nii.gz", "a.inp", "a"])

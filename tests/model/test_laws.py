@@ -145,7 +145,7 @@ def test_labels_from_a_file(tmp_path):
         ("a.toml", "intensity = [50, 0]\nyoung = [1, 2]", "must increase"),
         ("a.toml", "intensity = [0, 'x']\nyoung = [1, 2]", "columns of numbers"),
         ("a.toml", "intensity = 3\nyoung = [1]", "expected lists"),
-        ("a.toml", "not toml", "columns of numbers"),
+        ("a.toml", "not toml", "expected TOML"),
         (
             "a.toml",
             "h = [1]\nyoung = [1]",
@@ -162,7 +162,7 @@ def test_labels_from_a_file(tmp_path):
         ("a.csv", "label,young,young\n1,2,3\n", "each column once"),
         ("a.toml", "label = [1, nan]\nyoung = [1, 2]", "columns of numbers"),
         ("a.toml", "label = [1, inf]\nyoung = [1, 2]", "columns of numbers"),
-        ("a.toml", "young = " + 3000 * "[" + 3000 * "]", "columns of numbers"),
+        ("a.toml", "young = " + 3000 * "[" + 3000 * "]", "nested too deeply"),
         ("a.csv", "label,intensity,young\n1,2,3\n", "one of"),
     ],
 )

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -18,6 +17,7 @@ from tetopt.check import manifold_problems
 from tetopt.cli.console import out, print_fidelity, show_error, show_warning
 from tetopt.cli.inputs import image_and_others, label_table, read_mesh, warn_of_other_image
 from tetopt.cli.options import ImagePart, LabelNamesOption, NumberOptions, option
+from tetopt.incoming import json_of
 from tetopt.io.files import save_json
 from tetopt.io.meshes import MeshFile
 from tetopt.measure.fidelity import LabelFidelity
@@ -149,9 +149,9 @@ def _add_fit(table: Table, fit: Fit, n_voxels: int) -> None:
 def _was_masked(loaded: MeshFile) -> bool:
     """Whether the file says that it was made within a mask or without a background."""
     try:
-        inputs = json.loads(loaded.text("inputs") or "{}")
+        inputs = json_of(loaded.text("inputs") or "{}")
         return inputs.get("mask") is not None or inputs.get("background") is not None
-    except (ValueError, AttributeError, RecursionError):  # another program's
+    except (ValueError, AttributeError):  # another program's
         return False
 
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
@@ -18,6 +17,7 @@ from tetopt import Image, InputError, Mesh, save_mesh
 from tetopt.cli.console import error_words, log, out, print_wide, show_warning
 from tetopt.cli.inputs import label_table
 from tetopt.cli.options import ModelOptions, SolverOptions
+from tetopt.incoming import json_of
 from tetopt.io.files import kept_places
 from tetopt.io.formats import FORMATS, file_bytes, format_of, save_model
 from tetopt.io.meshes import MeshFile
@@ -180,7 +180,7 @@ def completed(model: Model, loaded: MeshFile, solver: ModelOptions) -> Model:
 def _binning_error(loaded: MeshFile) -> BinningError | None:
     """How far the moduli of a file of ours are from those that they stand for, if it tells."""
     try:
-        words = json.loads(loaded.text("binning") or "{}")
+        words = json_of(loaded.text("binning") or "{}")
         return BinningError(float(words["mean"]), float(words["largest"]))
     except (ValueError, TypeError, KeyError, RecursionError):  # there is none, or it is another program's
         return None
@@ -224,9 +224,9 @@ def without_stale_results(loaded: MeshFile, solver: ModelOptions) -> MeshFile:
 def loads_of(loaded: MeshFile) -> list[str]:
     """The loads that a file of ours holds, in the words of --load, in RAS+ and kPa, if their sets are there still."""
     try:
-        words = json.loads(loaded.text("loads") or "[]")
+        words = json_of(loaded.text("loads") or "[]")
         loads = [parse_load(text, loaded.mesh.ndim) for text in words]
-    except (ValueError, TypeError, AttributeError, RecursionError):  # another program's
+    except (ValueError, TypeError, AttributeError):  # another program's
         return []
     if lost := [load.set_name for load in loads if load.set_name and load.set_name not in loaded.sets.facets]:
         log.print(escape(f"the file's loads are left out: it no longer has the sets {', '.join(lost)}"))

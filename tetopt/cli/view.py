@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import json
 import re
 from pathlib import Path
 from typing import Annotated
@@ -16,6 +15,7 @@ from tetopt.cli.console import out
 from tetopt.cli.inputs import label_table, read_image, read_mesh, warn_of_other_image
 from tetopt.cli.options import BoxPart, ForceOption, LabelNamesOption, option
 from tetopt.cli.solver import all_sets
+from tetopt.incoming import json_of
 from tetopt.io.files import checked_output
 from tetopt.io.meshes import MeshFile
 from tetopt.model.fields import cell_fields
@@ -73,9 +73,9 @@ def _reactions(loaded: MeshFile) -> dict[int, dict[str, list[float]]]:
         if match is None:
             continue
         try:
-            by_set = json.loads(loaded.text(key) or "{}")
+            by_set = json_of(loaded.text(key) or "{}")
             forces = {str(name): [float(x) for x in force] for name, force in by_set.items() if len(force) == 3}
-        except (TypeError, ValueError, AttributeError, RecursionError):  # another program's
+        except (TypeError, ValueError, AttributeError):  # another program's
             continue
         if np.isfinite([*forces.values()]).all():
             reactions[int(match[1] or 1)] = forces

@@ -7,18 +7,21 @@ as far as it goes. Steps, numbers of nodes and the end are therefore taken from 
 
 from __future__ import annotations
 
+import importlib.util
 import re
 import warnings
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import pyvista
 from numpy.typing import NDArray
 
+from tetopt.budget import check_memory, memory_words
 from tetopt.errors import InputError
 from tetopt.fem.solution import von_mises
 from tetopt.geometry.quadratic import quadratic
+from tetopt.incoming import regular_file
+from tetopt.io.apart import read_apart
 from tetopt.mesh import Mesh
 from tetopt.model.fields import half_turned_fields, stresses_times
 from tetopt.model.model import SPACES, STRESS_UNITS, half_turn
@@ -30,6 +33,9 @@ LINES_BEFORE = re.compile(rb" {4}1PSTEP *\d+ +(\d+) +(\d+)| {2}100C.{18}(.{12})"
 TENSOR_ROWS = np.array([0, 3, 5, 3, 1, 4, 5, 4, 2])  # of xx, yy, zz, xy, yz, zx, row by row
 
 
+KNOWN_ARRAYS = ("DISP", "TOSTRAIN", "STRESS")  # of the file, by its names
+
+
 class Results(NamedTuple):
     """What a solver found, at the nodes of a mesh."""
 
@@ -39,6 +45,16 @@ class Results(NamedTuple):
     point_data: dict[str, NDArray[np.float64]]
     order: int
     notes: tuple[str, ...]  # what was assumed or left out, a line each
+
+
+class _Grid(NamedTuple):
+    """What the file holds."""
+
+    points: NDArray[np.float64]  # (N, 3)
+    ids: NDArray[np.int64]  # (N,)
+    cells: list[NDArray[np.int64]]  # by kind
+    n_times: int
+    arrays: list[dict[str, NDArray]]  # of each time that was asked for, by the file's names
 
 
 class _Stage(NamedTuple):
@@ -72,25 +88,30 @@ def read_frd(path: str | Path, mesh: Mesh) -> Results:
     """
     path = Path(path)
     whole = _checked_bytes(path)
-    reader = _reader(path)
-    grid = _read(path, reader)
+    stages = _stages(path, whole)
+    of_steps = {stage.step: number for number, stage in enumerate(stages)}  # the last increment of each
+    try:
+        grid = _Grid(*read_apart(_grid_of, path, sorted(of_steps.values()), library="pyvista-frd-reader"))
+    except InputError as error:
+        raise InputError(f"{path}: cannot be read as CalculiX's results ({error})") from error
+    if len(stages) != grid.n_times:
+        raise InputError(
+            f"{path}: expected one time for each increment, found {len(stages)} increments and {grid.n_times} times"
+        )
     head = whole[:HEAD_BYTES].decode("latin-1")
     spaces = re.findall(r"coordinates: (RAS|LPS)\+", head)
     order, space = _checked_mesh(path, mesh, grid, tuple(each.lower() for each in spaces[:1]) or SPACES)
     units = re.findall(rf"units: mm, ({'|'.join(STRESS_UNITS)}),", head)
     notes = [] if units else [f"{path.name} does not say its units: stresses are taken for kPa"]
-    stages = _stages(path, whole, reader.number_time_points)
     point_data: dict[str, NDArray[np.float64]] = {}
-    for step in sorted({stage.step for stage in stages}):
-        number = max(k for k, stage in enumerate(stages) if stage.step == step)
-        reader.set_active_time_point(number)
-        if stages[number].n_nodes != grid.n_points:
+    for step, number in sorted(of_steps.items()):
+        if stages[number].n_nodes != len(grid.points):
             raise InputError(
-                f"{path}: has results at {stages[number].n_nodes} of {grid.n_points} nodes in step {step}; ask for "
+                f"{path}: has results at {stages[number].n_nodes} of {len(grid.points)} nodes in step {step}; ask for "
                 "them at all nodes (*NODE FILE and *EL FILE without NSET)"
             )
         suffix = "" if step == 1 else f"_step{step}"
-        arrays = _on_mesh(_results_of_step(path, _read(path, reader), step))
+        arrays = _on_mesh(_results_of_step(path, grid.arrays[sorted(of_steps.values()).index(number)], step))
         point_data |= {f"{name}{suffix}": values for name, values in arrays.items()}
         if stages[number].increment > 1:
             notes.append(f"step {step}: increment {stages[number].increment}, the last that is in the file")
@@ -99,50 +120,51 @@ def read_frd(path: str | Path, mesh: Mesh) -> Results:
 
 
 def _checked_bytes(path: Path) -> bytes:
-    if not path.is_file():
-        raise InputError(f"{path}: no such file of results")
+    regular_file(path, "file of CalculiX's results (.frd)")
+    with path.open("rb") as stream:
+        if stream.read(6) != b"    1C":
+            raise InputError(f"{path}: expected CalculiX's results (.frd), found something else")
+    size = path.stat().st_size
+    check_memory(size, f"{path}: its {memory_words(size)} of results", "ask CalculiX for fewer steps or fields")
     whole = path.read_bytes()
-    if not whole.startswith(b"    1C"):
-        raise InputError(f"{path}: expected CalculiX's results (.frd), found something else")
     if not whole.rstrip().endswith(b"9999"):
         raise InputError(f"{path}: is cut off; is CalculiX still running, or did it break off?")
+    if importlib.util.find_spec("pyvista_frd") is None:  # an extra: few have CalculiX
+        raise InputError(f"{path}: reading it needs pyvista-frd-reader: pip install 'tetopt[calculix]'")
     return whole
 
 
-def _reader(path: Path) -> Any:
-    try:
-        import pyvista_frd  # an extra: few have CalculiX
-    except ImportError as error:
-        raise InputError(f"{path}: reading it needs pyvista-frd-reader: pip install 'tetopt[calculix]'") from error
-    try:
-        with warnings.catch_warnings():
-            warnings.simplefilter("ignore")  # of cells that it does not know; the mesh's are compared
-            return pyvista_frd.FRDReader(path)
-    except (OSError, RuntimeError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read as CalculiX's results ({error})") from error
+def _grid_of(path: str, numbers: list[int]) -> tuple[Any, ...]:
+    """A `_Grid` of the results at these of its times; in a child, as the reader is compiled code."""
+    import pyvista_frd
+
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of cells that it does not know; the mesh's are compared
+        reader = pyvista_frd.FRDReader(path)
+    grid, n_times, arrays = reader.read(), reader.number_time_points, []
+    for number in numbers:
+        if number < n_times:  # else the times are not the increments, which is told
+            reader.set_active_time_point(number)
+            at = reader.read()
+            arrays.append({name: np.asarray(at.point_data[name]) for name in KNOWN_ARRAYS if name in at.point_data})
+    cells = [np.asarray(each) for each in grid.cells_dict.values()]
+    ids = np.asarray(grid.point_data["original_node_ids"])
+    return np.asarray(grid.points), ids, cells, n_times, arrays
 
 
-def _read(path: Path, reader: Any) -> pyvista.UnstructuredGrid:
-    """Mesh and results of the reader's time, nodes ascending by their numbers."""
-    try:
-        return reader.read()
-    except (RuntimeError, ValueError) as error:
-        raise InputError(f"{path}: cannot be read as CalculiX's results ({error})") from error
-
-
-def _checked_mesh(path: Path, mesh: Mesh, grid: pyvista.UnstructuredGrid, spaces: tuple[str, ...]) -> tuple[int, str]:
+def _checked_mesh(path: Path, mesh: Mesh, grid: _Grid, spaces: tuple[str, ...]) -> tuple[int, str]:
     """Order of the cells and convention of the axes; InputError if the mesh is another one."""
     if mesh.ndim != 3:
         raise InputError(f"{path}: expected a mesh of tetrahedra beside CalculiX's results, got one of triangles")
     nodes_of_order = {1: (mesh.points, mesh.cells), 2: quadratic(mesh.points, mesh.cells)}
-    order = next((k for k, (points, _) in nodes_of_order.items() if len(points) == grid.n_points), None)
-    if order is None or grid.n_cells != len(mesh.cells):
+    order = next((k for k, (points, _) in nodes_of_order.items() if len(points) == len(grid.points)), None)
+    if order is None or sum(map(len, grid.cells)) != len(mesh.cells):
         raise InputError(
             f"{path}: is of another mesh: expected {len(mesh.cells)} cells and {len(mesh.points)} nodes, or "
-            f"{len(nodes_of_order[2][0])} of quadratic cells; it has {grid.n_cells} and {grid.n_points}"
+            f"{len(nodes_of_order[2][0])} of quadratic cells; it has {sum(map(len, grid.cells))} and {len(grid.points)}"
         )
     points, cells = nodes_of_order[order]
-    if not np.array_equal(grid.point_data["original_node_ids"], np.arange(1, len(points) + 1)):
+    if not np.array_equal(grid.ids, np.arange(1, len(points) + 1)):
         raise InputError(f"{path}: is of another mesh: its nodes are not numbered from 1 to {len(points)}")
     distances = {space: np.abs(grid.points - (half_turn(points) if space == "lps" else points)) for space in spaces}
     space = min(spaces, key=lambda each: float(distances[each].max()))
@@ -152,13 +174,13 @@ def _checked_mesh(path: Path, mesh: Mesh, grid: pyvista.UnstructuredGrid, spaces
             f"{path}: is of another mesh: {int(is_off.sum())} of {len(points)} nodes are elsewhere, by up to "
             f"{float(distances[space].max()):.3g} mm"
         )
-    theirs = next(iter(grid.cells_dict.values()))
-    if not np.array_equal(np.sort(theirs, axis=1), np.sort(cells, axis=1)):
+    theirs = grid.cells[0]
+    if theirs.shape != cells.shape or not np.array_equal(np.sort(theirs, axis=1), np.sort(cells, axis=1)):
         raise InputError(f"{path}: is of another mesh: its nodes are connected otherwise")
     return order, space
 
 
-def _stages(path: Path, whole: bytes, n_times: int) -> list[_Stage]:
+def _stages(path: Path, whole: bytes) -> list[_Stage]:
     """The increments in the order of the reader's times."""
     stages: dict[tuple[int, int], int] = {}
     present = (1, 1)
@@ -170,17 +192,11 @@ def _stages(path: Path, whole: bytes, n_times: int) -> list[_Stage]:
             stages[present] = min(int(count), stages.get(present, int(count)))
     if not stages:
         raise InputError(f"{path}: has no results; did CalculiX break off?")
-    if len(stages) != n_times:
-        raise InputError(
-            f"{path}: expected one time for each increment, found {len(stages)} increments and {n_times} times"
-        )
     return [_Stage(*key, count) for key, count in sorted(stages.items())]
 
 
-def _results_of_step(path: Path, grid: pyvista.UnstructuredGrid, step: int) -> dict[str, NDArray[np.float64]]:
-    """The file's own arrays of this step that are known here, by its names."""
-    known = [name for name in ("DISP", "TOSTRAIN", "STRESS") if name in grid.point_data]
-    arrays = {name: np.asarray(grid.point_data[name]) for name in known}
+def _results_of_step(path: Path, arrays: dict[str, NDArray], step: int) -> dict[str, NDArray[np.float64]]:
+    """The file's own arrays of this step that are known here, by its names; InputError unless they are usable."""
     if "DISP" not in arrays:
         raise InputError(f"{path}: has no displacements in step {step}; ask for U (*NODE FILE)")
     for name, values in arrays.items():

@@ -61,7 +61,8 @@ def checked_header(path: Path) -> tuple[int, int]:
     if header.value_bytes > n_bytes * header.ratio:
         sizes = " x ".join(str(size) for size in header.sizes)
         raise InputError(
-            f"{DAMAGED_FILE} (its header tells of {sizes} voxels, {header.value_bytes:.4g} bytes, the file has {n_bytes})"
+            f"{DAMAGED_FILE} (its header tells of {sizes} voxels, "
+            f"{header.value_bytes:.4g} bytes, the file has {n_bytes})"
         )
     return n_bytes, header.value_bytes
 

@@ -11,13 +11,13 @@ Lines that are empty, or begin with #, are comments. Opacities are left out.
 from __future__ import annotations
 
 import csv
-import json
 import re
 from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
 from tetopt.errors import InputError
+from tetopt.incoming import json_of, text_of
 from tetopt.model.labels import NO_TABLE, LabelTable, hex_colour, table_of_words
 
 __all__ = ["NO_TABLE", "LabelTable", "load_label_table", "table_in"]
@@ -51,12 +51,7 @@ def load_label_table(path: str | Path) -> LabelTable:
         two colours.
     """
     path = Path(path)
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; expected a table of labels' names")
-    try:
-        text = path.read_text(encoding="utf-8-sig")
-    except UnicodeDecodeError:
-        raise InputError(f"{path}: expected text in UTF-8; save the table of labels in that encoding") from None
+    text = text_of(path, "table of labels' names")
     lines = [(number, line.strip(" ")) for number, line in enumerate(text.split("\n"), 1)]
     lines = [(number, line) for number, line in lines if line.strip() and not line.startswith("#")]
     if not lines:
@@ -82,8 +77,8 @@ def load_label_table(path: str | Path) -> LabelTable:
 def table_in(text: str | None) -> LabelTable:
     """The table in a text of a mesh's file, as `tetopt.model.labels.table_words` has it; empty for any other text."""
     try:
-        return table_of_words(json.loads(text or "{}"))
-    except (ValueError, RecursionError):  # another program's
+        return table_of_words(json_of(text or "{}"))
+    except ValueError:  # another program's
         return NO_TABLE
 
 

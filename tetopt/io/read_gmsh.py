@@ -2,39 +2,51 @@
 
 from __future__ import annotations
 
-import contextlib
 import re
-import warnings
 from collections.abc import Callable
 from itertools import islice
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt.budget import check_memory, memory_words
 from tetopt.errors import InputError
+from tetopt.io.apart import read_apart
 from tetopt.io.gmsh import OwnComments, own_comments
 from tetopt.io.raw import CELL_DIMENSIONS, Group, Raw, by_corners
 
 if TYPE_CHECKING:
     import meshio
 
+BYTES_A_LETTER = 4  # of memory for each of a gmsh file: its text twice, its numbers
 # What groups without a name are called here, by their dimension; their number follows.
 DEFAULT_LABELS = {1: "edge", 2: "surface", 3: "volume"}
 
 
 def read_msh(path: Path) -> Raw:
-    """gmsh's file through meshio, whose complaints become one InputError."""
-    import meshio  # slow to load, and only needed here
+    """gmsh's file through meshio, in a child with limits: it allocates what a header tells of.
+
+    InputError, without the path before it, for whatever it stumbles over.
+    """
+    size = path.stat().st_size
+    check_memory(BYTES_A_LETTER * size, f"{memory_words(size)} of a gmsh mesh", "save it as .vtu")
+    fields = read_apart(_fields_of, path, library="meshio")
+    groups = [Group(*group) for group in fields.pop("groups")]
+    return Raw(**fields, groups=groups)
+
+
+def _fields_of(path: str) -> dict[str, Any]:
+    """Those of a `Raw`."""
+    import meshio
 
     try:
-        with warnings.catch_warnings(), contextlib.redirect_stdout(None), contextlib.redirect_stderr(None):
-            warnings.simplefilter("ignore")
-            file = meshio.gmsh.read(path)
-        return _msh(file, path.read_bytes())
-    except Exception as error:  # meshio raises whatever it stumbles over, and so do damaged sections of a file
-        raise InputError(f"{path}: cannot be read as a gmsh mesh ({type(error).__name__})") from error
+        file = meshio.gmsh.read(path)
+        raw = _msh(file, Path(path).read_bytes())
+    except (Exception, SystemExit) as error:  # meshio raises whatever it stumbles over, and so do damaged sections
+        raise InputError(f"cannot be read as a gmsh mesh ({type(error).__name__})") from error
+    return raw._asdict()
 
 
 def _msh(file: meshio.Mesh, text: bytes) -> Raw:

@@ -26,6 +26,7 @@ from numpy.typing import NDArray
 
 from tetopt.geometry.quadratic import quadratic
 from tetopt.image import Image
+from tetopt.incoming import json_of
 from tetopt.io.text import xml_attribute
 from tetopt.mesh import Mesh
 from tetopt.model.fields import GAUSS_MODULI, NODE_MODULI, is_stress, node_field
@@ -245,7 +246,7 @@ def text_in(field_data: dict[str, NDArray], name: str) -> str | None:
 def box_in(field_data: dict[str, NDArray], ndim: int) -> Box | None:
     """The box of the image that a mesh of so many dimensions was made from, if its file tells."""
     try:
-        box = json.loads(text_in(field_data, "box") or "")
+        box = json_of(text_in(field_data, "box") or "")
         shape = tuple(box["shape"])
         affine = Image(np.zeros((1,) * ndim), np.array(box["affine"], dtype=np.float64)).affine  # which checks it
     except (TypeError, ValueError, KeyError, OverflowError, RecursionError):  # another program's "box"

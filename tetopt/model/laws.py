@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import csv
-import tomllib
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,6 +12,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tetopt.errors import InputError
+from tetopt.incoming import text_of, toml_of
 from tetopt.model.formula import parse_formula
 
 Law = Callable[[NDArray[np.float64]], ArrayLike] | Sequence[Sequence[float]] | NDArray[np.floating] | None
@@ -248,20 +248,18 @@ def has_column(text: str, name: str) -> bool:
 
 
 def _columns(path: Path) -> dict[str, list[Any]]:
-    if not path.is_file():
-        raise InputError(f"{path}: no such file; a law's text that ends in .toml or .csv names one")
     return _toml_columns(path) if path.suffix.lower() == ".toml" else _csv_columns(path)
 
 
 def _toml_columns(path: Path) -> dict[str, list[Any]]:
-    columns = tomllib.loads(path.read_text(encoding="utf-8"))
+    columns = toml_of(path, "table")
     if wrong := [name for name, column in columns.items() if not isinstance(column, list)]:
         raise InputError(f'{path}: expected lists of numbers, "{wrong[0]}" is {type(columns[wrong[0]]).__name__}')
     return columns
 
 
 def _csv_columns(path: Path) -> dict[str, list[Any]]:
-    rows = [row for row in csv.reader(path.read_text(encoding="utf-8-sig").splitlines()) if row]
+    rows = [row for row in csv.reader(text_of(path, "table").splitlines()) if row]
     if not rows or any(len(row) != len(rows[0]) for row in rows):
         raise InputError(f"{path}: expected a row of names and then rows of as many numbers")
     names = [name.strip().lower() for name in rows[0]]
