@@ -17,7 +17,7 @@ MOST_ASPECT = 1000.0
 LENGTH_RANGE = (1e-9, 1e9)  # mm, of a voxel's edge: their fifth powers, E_G, are far from where doubles end
 MOST_OFFSET = 1e9  # voxels from the world's origin: beyond, coordinates have no ten millionth of a voxel left
 # Of intensities, and of their range: squares, summed over 2^31 voxels, stay within doubles that have all their digits.
-INTENSITY_RANGE = (1e-100, 1e100)
+INTENSITY_RANGE = (1e-152, 1e148)
 
 
 @dataclass(frozen=True, eq=False)
@@ -131,8 +131,8 @@ def _checked_data(data: ArrayLike) -> NDArray[np.floating]:
     least, most = INTENSITY_RANGE
     if max(abs(low), abs(high)) > most or 0.0 < high - low < least:
         raise InputError(
-            f"image data: expected intensities up to {most:g} that differ by {least:g} at least, as their squares are "
-            f"summed, got {low:g} to {high:g}; scale them"
+            f"image data: expected intensities up to {most:g} that differ by {least:g} at least, as their squares "
+            f"overflow or vanish, got {low:g} to {high:g}; scale them"
         )
     values.setflags(write=False)
     return values

@@ -176,8 +176,6 @@ def _scaled(images: list[Image], weights: list[float], region: Region | None) ->
     for image, weight in zip(images, weights, strict=True):
         data = image.data - np.mean(image.data if region is None else image.data[region.inside], dtype=np.float64)
         spread = _variance(data, region)
-        if not np.isfinite(spread):
-            raise InputError("image: squares of intensities overflow; rescale it first")
         if weight > 0.0 and spread > 0.0:
             scaled.append((np.sqrt(weight / spread) * data).astype(np.float32))
     return scaled
