@@ -9,7 +9,7 @@ TESTED = PYTHONUTF8=1 NUMBA_CACHE_DIR=$(NUMBA_CACHE) MPLBACKEND=agg $(BIN)/pytho
 
 SOLVERS = calculix-ccx python3-dolfinx
 
-.PHONY: demo test test-slow test-solvers test-nojit test-onethread test-hostile lint bench fingerprints clean
+.PHONY: demo test test-slow test-random test-solvers test-nojit test-onethread test-hostile lint bench fingerprints clean
 
 demo: $(VENV)/.demo
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt demo -o demo --force
@@ -25,6 +25,11 @@ test-onethread: $(VENV)/.test
 
 test-nojit: $(VENV)/.test
 	NUMBA_DISABLE_JIT=1 $(TESTED) -q -m kernel --no-header --durations=3
+
+# A million random operations of the engine and 500 random whole runs, an hour; a small share is in `make test`.
+test-random: $(VENV)/.test
+	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python tests/random/runs.py --seed 1 --runs 500
+	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python tests/random/operations.py --seed 1 --operations 1000000
 
 test-slow: $(VENV)/.test
 	$(TESTED) -m slow

@@ -39,6 +39,12 @@ def test_a_mask_that_the_mesh_does_not_show(capsys, change, words):
     assert text.count("\n") == (1 if words else 0)
 
 
+def test_a_boundary_that_is_no_manifold_is_said(capsys):
+    problem = "edges where the boundary has more than two facets; nodes: 1, the first [[3, 4]]"
+    assert check_promises(Optimized(MESH, [], "iterations"), {"mask": NEAR, "boundary_problems": [problem]}) == 0
+    assert said(capsys) == f"{problem}: cells are as large as parts, or gaps, of the mask; allow more nodes\n"
+
+
 def ended(E=0.5, E_D=0.5):
     history = [Record(0, 1.0, 1.0, 1.0, 0.0, False, 1, 1, 0.0), Record(1, E, 1.0, E_D, 0.1, False, 1, 1, 0.1)]
     return Optimized(MESH, history, "iterations")

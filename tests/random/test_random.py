@@ -2,6 +2,8 @@
 
 import numpy as np
 import pytest
+from operations import operations
+from runs import runs
 from worlds import random_world
 
 import tetopt
@@ -16,3 +18,18 @@ def test_no_node_leaves_a_box_that_a_mask_touches(seed):
     result = tetopt.mesh_image(world.content(), nodes, iterations=6, k_D=k_D)
     assert tetopt.check_mesh(result.mesh, world.image, is_whole=False, is_filled=False, is_manifold=False) == []
     assert "box" not in result.missed
+
+
+def test_operations_leave_a_mesh_and_exact_sums():
+    made, n_checks, faults, _ = operations(1, 15_000)
+    assert faults == []
+    assert made.total() >= 15_000
+    assert n_checks >= 10
+    assert all(made[kind] > 0 for kind in ("moves", "flips", "splits and collapses", "lifts", "moves to interfaces"))
+
+
+def test_runs_keep_their_promises_or_say_so():
+    outcomes, misses, faults = runs(1, 12)
+    assert faults == []
+    assert outcomes["done"] >= 9
+    assert sum(misses.values()) <= 6

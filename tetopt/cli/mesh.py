@@ -14,6 +14,7 @@ from rich.markup import escape
 
 import tetopt
 from tetopt import Image, InputError, Mesh
+from tetopt.check import manifold_problems
 from tetopt.cli.console import log, out, print_fidelity, show_warning
 from tetopt.cli.ending import is_ended, mesh_kept, signal_code
 from tetopt.cli.inputs import label_table, read_mesh, results_folder, set_threads
@@ -235,6 +236,8 @@ def _write(task: Task, outcome: Outcome, begin: float) -> tuple[Model, dict[str,
         needed = nodes_of_sizes(source.content, task.sizes)[0]
         measured["nodes_of_sizes"] = round(needed * (QUADRATIC_NODES[source.image.ndim] if model.order == 2 else 1.0))
     measured["cells_without_voxel"] = int((model.cell_data["n_voxels"] == 0).sum())
+    if source.mask is not None:
+        measured["boundary_problems"] = manifold_problems(result.mesh)
     if result.labels is not None:
         measured["nodes_of_many_labels"] = crowded_nodes(result.mesh.cells, result.labels)
     if output.json_path is not None:

@@ -36,6 +36,8 @@ def check_promises(result: Optimized, measured: dict[str, Any]) -> int:
     for problem in (*problems, *lost):
         show_error(problem)
     _warn_of_mask(measured.get("mask"))
+    for problem in measured.get("boundary_problems", []):
+        show_warning(f"{problem}: cells are as large as parts, or gaps, of the mask; allow more nodes")
     return 1 if problems or lost else 0
 
 

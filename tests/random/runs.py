@@ -1,0 +1,172 @@
+"""Random whole runs of `mesh_image`: what is promised is asked of the mesh by other means than the engine's own.
+
+    python tests/random/runs.py --seed 1 --runs 500
+
+A run may refuse its input, and may miss a promise, if it says so; it may not do so silently.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections import Counter
+
+import numba
+import numpy as np
+from worlds import random_world
+
+import tetopt
+from tetopt.check import manifold_problems
+from tetopt.measure.fidelity import mask_fidelity
+from tetopt.measure.interfaces import touching_voxels
+from tetopt.report.summary import mesh_hash
+from tetopt.start.octree import nearest_octree
+from tetopt.target.content import plain
+
+MODES = ("graded", "graded", "graded", "uniform", "paper", "start")
+THREADED_SHARE = 0.1  # of the runs: made again on another number of threads
+
+
+def random_request(rng, world):
+    """Arguments of `mesh_image` for a world: the mode, how many nodes or which error, the engine's options."""
+    target, n = world.content(), world.image.ndim
+    mode = str(rng.choice(MODES))
+    if mode == "paper":
+        target = world.image
+    k_D = float(rng.choice([0.0, 0.02, 0.2, 0.5, 0.85, 0.97]))
+    request = {"mode": mode, "k_D": k_D, "iterations": int(rng.integers(0, 9))}
+    floor = 12.0
+    if mode != "paper":
+        floor = request["min_dihedral"] = float(rng.choice([0.0, 5.0, 12.0, 12.0, 20.0, 40.0]))
+        request["shape_power"] = float(rng.choice([1.0, 3.0, 3.0, 5.0]))
+    if mode == "start":
+        request["start"] = nearest_octree(target, int(rng.integers(60, 200)))
+        request["boundary"] = str(rng.choice(["fixed", "slide"]))
+    elif mode == "graded" and rng.random() < 0.15:
+        request["target_error"] = float(rng.choice([0.02, 0.1, 0.3, 0.7]))
+    else:
+        request["nodes"] = int(rng.integers(60, 220))
+    if mode == "graded" and rng.random() < 0.3:
+        size = float((world.image.volume / 150.0) ** (1.0 / n))
+        request["sizes"] = tetopt.Sizes(
+            smallest=float(rng.choice([0.0, 0.3])) * size, gradation=float(rng.choice([1.0, 0.3])),
+            longest=float(rng.choice([2.0, 4.0])) * size,
+        )  # fmt: skip
+    return target, request, 0.0 if mode == "paper" else floor
+
+
+def angles_under(mesh, degrees):
+    """How many tetrahedra have a dihedral angle under so many degrees, from the normals of their faces."""
+    corners = mesh.points[mesh.cells]
+    n_below = np.zeros(len(corners), dtype=bool)
+    for i in range(4):
+        for j in range(i + 1, 4):
+            k, m = (d for d in range(4) if d not in (i, j))
+            axis = corners[:, j] - corners[:, i]
+            one, other = np.cross(axis, corners[:, k] - corners[:, i]), np.cross(axis, corners[:, m] - corners[:, i])
+            size = np.linalg.norm(np.cross(one, other), axis=1)
+            n_below |= np.degrees(np.arctan2(size, (one * other).sum(axis=1))) < degrees - 1e-6
+    return int(n_below.sum())
+
+
+def times_inside(image, mesh):
+    """In how many cells each voxel's centre lies, and how many are too near to a facet to tell: plain arithmetic."""
+    centres = image.to_world(np.indices(image.shape).reshape(image.ndim, -1).T.astype(float))
+    counts, is_unsure = np.zeros(len(centres), dtype=np.int64), np.zeros(len(centres), dtype=bool)
+    for cell in mesh.points[mesh.cells]:
+        near = np.flatnonzero(((centres >= cell.min(axis=0)) & (centres <= cell.max(axis=0))).all(axis=1))
+        share = np.linalg.solve((cell[1:] - cell[0]).T, (centres[near] - cell[0]).T)
+        least = np.minimum(share.min(axis=0), 1.0 - share.sum(axis=0))
+        counts[near] += least > 1e-7
+        is_unsure[near[np.abs(least) <= 1e-7]] = True
+    return counts, is_unsure
+
+
+def faults_of(world, target, request, floor, result):
+    """What the mesh of a run is that it should not be, and does not say."""
+    mesh, missed, region = result.mesh, set(result.missed), plain(target).region
+    is_filled = region is None
+    wrong = tetopt.check_mesh(mesh, world.image, is_whole=is_filled, is_filled=is_filled, is_manifold=is_filled)
+    counts, is_unsure = times_inside(world.image, mesh)
+    if (counts > 1).any() != ("overlap" in missed) and plain(target).image.shape == world.image.shape:
+        wrong.append(f"{(counts > 1).sum()} voxels lie in two cells, missed: {sorted(missed)}")
+    if is_filled and ((counts != 1) & ~is_unsure).any():
+        wrong.append(f"{((counts != 1) & ~is_unsure).sum()} voxels are not in one cell")
+    moved = result.history[-1].iteration > 0
+    if mesh.ndim == 3 and moved and (angles_under(mesh, floor) > 0) != ("floor" in missed):
+        wrong.append(f"{angles_under(mesh, floor)} cells under {floor} degrees, missed: {sorted(missed)}")
+    if "target_error" in request:
+        share = result.history[-1].E_D / (plain(target).variance * plain(target).volume or 1.0)
+        if (share > request["target_error"]) != ("error" in missed):
+            wrong.append(f"error {share} of {request['target_error']}, missed: {sorted(missed)}")
+    if not is_filled and world.labels is None and mask_fidelity(world.mask, mesh).dice < 0.9 - 1e-9:
+        wrong += [] if "mask" in missed else ["the mask is hardly covered"]
+    if request.get("boundary") == "fixed" and len(mesh.points) and moved:
+        outer = np.unique(tetopt.geometry.topology.boundary_facets(request["start"].cells))
+        kept = {tuple(place) for place in mesh.points.tolist()}
+        wrong += [] if all(tuple(p) in kept for p in request["start"].points[outer].tolist()) else ["a boundary moved"]
+    wrong += [f"promise missed: {name}" for name in ("box", "cover") if name in missed]
+    return wrong
+
+
+def folds_of(world, target, result):
+    """Where a mask's boundary or interfaces are no manifolds though its voxels are, as words; counted, no fault."""
+    region = plain(target).region
+    folds = []
+    if region is not None and touching_voxels(region.inside) == 0 and manifold_problems(result.mesh):
+        folds.append("boundaries that are no manifold")
+    if result.labels is not None and manifold_problems(result.mesh, result.labels):
+        folds.append("interfaces that are no manifold")
+    return folds
+
+
+def one_run(seed, number):
+    """What came of a run: "done" or "refused", its faults, its missed promises, what it was."""
+    rng = np.random.default_rng([21, seed, number])
+    world = random_world(rng)
+    words = world.words
+    try:
+        target, request, floor = random_request(rng, world)
+        words = f"{words}; { ({k: v for k, v in request.items() if k != 'start'}) }"
+        result = tetopt.mesh_image(target, **request)
+    except tetopt.InputError as error:
+        return "refused", [], [str(error).split(":")[0]], words
+    faults = faults_of(world, target, request, floor, result)
+    if rng.random() < THREADED_SHARE:
+        threads = numba.get_num_threads()
+        numba.set_num_threads(1 if threads > 1 else min(2, numba.config.NUMBA_NUM_THREADS))
+        again = tetopt.mesh_image(target, **request)
+        numba.set_num_threads(threads)
+        if mesh_hash(again.mesh) != mesh_hash(result.mesh):
+            faults.append("other bits on another number of threads")
+    return "done", faults, [*result.missed, *folds_of(world, target, result)], words
+
+
+def runs(seed, n_runs, report=print):
+    """Outcomes, missed promises and faults of so many runs."""
+    outcomes, misses, faults = Counter(), Counter(), []
+    for number in range(n_runs):
+        outcome, wrong, missed, words = one_run(seed, number)
+        outcomes[outcome] += 1
+        misses.update(f"{outcome}: {name}" for name in missed)
+        if wrong:
+            faults.append(f"run {number} ({words}): {'; '.join(wrong)}")
+            report(faults[-1])
+    return outcomes, misses, faults
+
+
+def main():
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seed", type=int, default=1)
+    parser.add_argument("--runs", type=int, default=500)
+    options = parser.parse_args()
+    begin = time.perf_counter()
+    outcomes, misses, faults = runs(options.seed, options.runs)
+    print(f"seed {options.seed}: {dict(outcomes)}, {len(faults)} with faults, {time.perf_counter() - begin:.0f} s")
+    for name, number in sorted(misses.items()):
+        print(f"  {number} {name}")
+    return 1 if faults else 0
+
+
+if __name__ == "__main__":
+    raise SystemExit(main())
