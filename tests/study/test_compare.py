@@ -365,27 +365,36 @@ def test_baseline(head, tmp_path, capsys):
     assert set(numbers["seconds"]) == {"surfaces", "tetrahedra", "search"}
 
 
-@pytest.mark.parametrize("n_crashes", [1, 2])
-def test_a_peer_that_crashes(head, opengl, tmp_path, monkeypatch, capsys, n_crashes):
+def test_a_peer_that_crashes(head, opengl, tmp_path, monkeypatch, capsys):
     """At first: run again, and said in the terminal, in the files and on the page. Twice: it failed."""
     monkeypatch.setenv("PIPES_PID", str(tmp_path / "pid"))
-    pipe = pipes.crash_once if n_crashes == 1 else pipes.crash
-    monkeypatch.setitem(PIPELINES, "pytetwild", PIPELINES["pytetwild"]._replace(function=pipe, is_random=False))
-    image = str(head / "image.nii.gz")
-    mesh = tmp_path / "b.vtu"
-    assert main(["baseline", image, "-o", str(mesh), "--nodes", "150"]) == 2 * (n_crashes == 2)
-    err = capsys.readouterr().err
-    assert "pytetwild: crashed: signal 11, SIGSEGV; once more" in err
-    assert mesh.exists() == (n_crashes == 1)
-    assert ("tetopt: pytetwild: twice crashed: signal 11, SIGSEGV" in err) == (n_crashes == 2)
-    (tmp_path / "pid").unlink(missing_ok=True)
+    for name, pipe in (("pytetwild", pipes.crash_once), ("cleaver", pipes.crash)):
+        monkeypatch.setitem(PIPELINES, name, PIPELINES[name]._replace(function=pipe, is_random=False))
+    crash, image = "crashed: signal 11, SIGSEGV", str(head / "image.nii.gz")
+    for name, code in (("pytetwild", 0), ("cleaver", 2)):
+        mesh, title = tmp_path / f"{name}.vtu", PIPELINES[name].title
+        assert main(["baseline", image, "-o", str(mesh), "--nodes", "150", "--pipeline", name]) == code
+        err = capsys.readouterr().err
+        assert f"{title}: {crash}; once more" in err
+        assert mesh.exists() == (code == 0)
+        assert (f"tetopt: {title}: twice {crash}" in err) == (code == 2)
+    (tmp_path / "pid").unlink()
     out = tmp_path / "out"
-    assert main(["compare", image, "-o", str(out), *SMALL, "--curve", "", "--pipelines", "bcc,pytetwild"]) == 0
-    assert "pytetwild: crashed: signal 11, SIGSEGV; once more" in capsys.readouterr().err
-    _, peer = json.loads((out / "report.json").read_text())["pipelines"]
-    assert peer["crashes"] == ["crashed: signal 11, SIGSEGV"] * n_crashes
-    assert peer["reason"] == (None if n_crashes == 1 else "crash")
-    assert ("median" in peer) == (n_crashes == 1)
+    words = [image, "-o", str(out), *SMALL, "--curve", "", "--pipelines", "tetopt,pytetwild,cleaver"]
+    assert main(["compare", *words]) == 0
+    said = capsys.readouterr()
+    assert said.err.count(f"{crash}; once more") == 3  # of the second also with quadratic cells
+    title = "tetopt against pytetwild at 400 nodes; itk-cleaver failed twice (signal 11, SIGSEGV)"
+    again = f"pytetwild: crashed once, and was run again ({crash})."
+    report, page = json.loads((out / "report.json").read_text()), (out / "report.html").read_text(encoding="utf-8")
+    assert report["headline"]["title"] == title
+    assert again in report["headline"]["remarks"]
+    for line in (title, again):
+        assert line in said.out
+        assert line in page
+    _, once, twice = report["pipelines"]
+    assert (once["crashes"], once["reason"], "median" in once) == ([crash], None, True)
+    assert (twice["crashes"], twice["reason"], "median" in twice) == ([crash] * 2, "crash", False)
 
 
 def test_a_missing_peer_is_no_failure_of_it(head, tmp_path, monkeypatch, capsys):

@@ -351,7 +351,7 @@ def run(
         ),
         labels=comparison.label_source,
         law=comparison.law_words,
-        versions=versions() | _peers(),
+        versions=versions() | _peers() | _programs(settings),
         machine=_machine(),
         date=time.strftime("%Y-%m-%d", time.gmtime()),
         options=settings,
@@ -405,6 +405,11 @@ def _peers() -> dict[str, str]:
         with contextlib.suppress(PackageNotFoundError):
             installed[name] = version(name)
     return installed
+
+
+def _programs(settings: Settings) -> dict[str, str]:
+    """What stands for a version of the user's own programs: checksums of the files that their command lines name."""
+    return {f"{each.name}, SHA-256 of its files": ", ".join(file_checksums(each)) for each in settings.programs}
 
 
 def _facts(comparison: Comparison) -> Facts:
