@@ -1017,6 +1017,9 @@ def test_target_error(tmp_path, inputs, capfd):
     command = mesh_words(inputs / "sphere.nii.gz", tmp_path)
     assert exit_code(*command, "--target-error", "0.2") == 0
     numbers = numbers_in(tmp_path / "a.json")
+    runs = re.findall(r"run (\d) of up to 6: (\d+) nodes leave ([\d.]+) of the variance", capfd.readouterr().err)
+    assert [int(number) for number, _, _ in runs] == list(range(1, len(runs) + 1))
+    assert float(runs[-1][2]) == pytest.approx(numbers["energies"]["E_D_share_of_variance"], rel=1e-3)
     assert numbers["energies"]["E_D_share_of_variance"] <= 0.2
     nodes = numbers["options"]["nodes"]
     assert numbers["options"]["target_error"] == 0.2

@@ -666,3 +666,42 @@ def test_no_window_without_a_display(folder, monkeypatch, capsys):
     monkeypatch.setattr("tetopt.report.window.has_display", lambda: False)
     assert exit_code("view", folder / "a.vtu") == 2
     assert "use --html" in capsys.readouterr().err
+
+
+def test_the_air_around_is_said_of_a_surface(folder, tmp_path, capsys):
+    mean = tetopt.load_mesh(folder / "a.vtu").cell_data["mean"]
+    threshold = float(np.median(mean))
+    assert exit_code("surface", folder / "a.vtu", "-o", tmp_path / "a.stl", "--below", threshold) == 0
+    assert "touches the box's faces left" in capsys.readouterr().err
+    assert exit_code("surface", folder / "a.vtu", "-o", tmp_path / "b.stl", "--label", "1") == 0
+    assert "touches" not in capsys.readouterr().err
+
+
+def test_a_table_of_other_labels_is_said(folder, tmp_path, capsys):
+    table = tmp_path / "names.csv"
+    for text, is_said in (("label,name\n7,liver\n", True), ("label,name\n7,liver\n1,lung\n", False)):
+        table.write_text(text)
+        for words in (
+            ["view", folder / "a.vtu", "--html", tmp_path / "a.html"],
+            ["convert", folder / "a.vtu", tmp_path / "b.vtu"],
+            ["quality", folder / "a.vtu", "--image", folder / "a.nii.gz", "--labels", folder / "l.nii.gz"],
+        ):
+            force = [] if words[0] == "quality" else ["--force"]
+            assert exit_code(*words, *force, "--label-names", table) == 0
+            assert ("names none of the mesh's labels, 0, 1" in capsys.readouterr().err) == is_said
+
+
+@pytest.mark.parametrize(
+    ("options", "said"),
+    [
+        (["--slice", "k=99"], "a.nii.gz: --slice: index along axis 2 must be"),
+        (["--nodes", "4"], "tetopt: --nodes: expected a whole number of nodes"),
+        (["--nodes=4"], "tetopt: --nodes: expected a whole number of nodes"),
+        (["--load", "hold:nowhere", "--young", "2"], 'tetopt: --load: there is no set of facets "nowhere"'),
+        (["--gradation", "3"], "tetopt: --gradation: expected 0.05"),
+        (["--size-max", "-1"], "tetopt: --size-max: expected a length above 0 mm"),
+    ],
+)
+def test_refusals_name_the_option_that_was_given(folder, tmp_path, options, said, capsys):
+    assert exit_code("mesh", folder / "a.nii.gz", "-o", tmp_path / "a.vtu", *options) == 2
+    assert said in capsys.readouterr().err

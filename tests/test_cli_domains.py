@@ -254,3 +254,20 @@ def test_refused(inputs, tmp_path, monkeypatch, capfd, options, match):
     assert match in lines[0]
     assert said.out == ""
     assert not out.exists()
+
+
+def test_quality_of_a_mask_beside_the_mesh(tmp_path, capsys):
+    """Exit 1, as of a run, and no distances of a boundary that is not there."""
+    image = tetopt.Image(np.random.default_rng(0).uniform(0.0, 50.0, (10, 10, 10)))
+    tetopt.save_image(tmp_path / "a.nii.gz", image)
+    tetopt.save_mesh(tmp_path / "a.vtu", tetopt.lattice(image, nodes=150))
+    for first, last, expected in ((4, 6, 1), (0, 10, 0)):
+        mask = np.zeros(image.shape)
+        mask[first:last] = 1.0
+        tetopt.save_image(tmp_path / "m.nii.gz", tetopt.Image(mask))
+        words = ["quality", tmp_path / "a.vtu", "--image", tmp_path / "a.nii.gz", "--mask", tmp_path / "m.nii.gz"]
+        assert exit_code(*words) == expected
+        said = capsys.readouterr()
+        assert ("overlap only by Dice 0.333" in said.err) == bool(expected)
+        assert "nan voxels" not in said.out
+        assert "one of them is not there" in said.out

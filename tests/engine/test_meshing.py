@@ -64,6 +64,9 @@ def test_longest_edge_of_order_2():
     assert sizes_of_order(content, 1000, None, 2).gradation == 0.5
     assert sizes_of_order(content, 1000, tetopt.Sizes(longest=9.0), 2).longest == 9.0
     assert sizes_of_order(content, 1000, None, 1) is None
+    stated = sizes_of_order(content, 1000, tetopt.Sizes(gradation=1.0, coarsest=1.4), 2)  # those of order 1, asked for
+    assert stated.gradation == 1.0
+    assert stated.longest == pytest.approx(1.4 * uniform)
     with pytest.raises(tetopt.InputError, match="expected order 1 or 2, got 3"):
         tetopt.mesh_image(IMAGE, 100, order=3)
 

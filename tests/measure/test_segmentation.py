@@ -7,6 +7,7 @@ import pytest
 
 import tetopt
 from tetopt.measure.segmentation import dice, segmented, thresholded
+from tetopt.target import otsu
 from tetopt.target.otsu import class_thresholds
 
 
@@ -39,6 +40,24 @@ def test_clear_clusters_are_found():
     values = np.repeat([10.0, 12.0, 50.0, 90.0, 91.0], [5, 5, 7, 3, 9])
     thresholds = class_thresholds(values, 3)
     assert 12.0 < thresholds[0] < 50.0 < thresholds[1] < 90.0
+
+
+def test_a_bright_voxel_leaves_the_classes_as_they_are(monkeypatch):
+    """One that is a million times brighter than the rest; values of ordinary spread have the bins of all of them."""
+    rng = np.random.default_rng(0)
+    values = np.concatenate([rng.normal(10.0, 1.0, 4000), rng.normal(20.0, 1.0, 3000), rng.normal(40.0, 2.0, 3000)])
+    thresholds = class_thresholds(values, 3)
+    assert 12.0 < thresholds[0] < 18.0
+    assert 23.0 < thresholds[1] < 35.0
+    for outliers in ([4e7], [-3e5, 2e6], [1e3, 1e6]):
+        np.testing.assert_allclose(class_thresholds(np.append(values, outliers), 3), thresholds, atol=1.5)
+    monkeypatch.setattr(otsu, "FEWEST_BINS", 1)
+    np.testing.assert_array_equal(class_thresholds(values, 3), thresholds)
+    with pytest.raises(tetopt.InputError, match="fill only 2 of 256 bins"):  # without narrower ones
+        class_thresholds(np.append(values, 4e7), 3)
+    monkeypatch.undo()
+    rare = np.append(np.zeros(10_000), [7.0])
+    assert class_thresholds(rare, 2).tolist() == [pytest.approx(3.5, abs=0.01)]
 
 
 @pytest.mark.parametrize(

@@ -64,6 +64,10 @@ COMMANDS = {
 }
 
 
+# Options by the names that messages of the library begin with, where these differ by more than a hyphen.
+ARGUMENT_OPTIONS = {"octree": "nodes", "modulus": "young"}
+
+
 def main(argv: Sequence[str] | None = None) -> int:
     """Run the command; the exit code.
 
@@ -90,7 +94,7 @@ def _run(arguments: list[str], outputs: Outputs) -> int:
             return signal_code()
         return code
     except (InputError, OSError, MemoryError) as error:
-        show_error(error_words(error))
+        show_error(_with_option(error_words(error), arguments))
         _say_written(outputs)
         return 2
     except typer.Exit as ended:
@@ -106,6 +110,17 @@ def _run(arguments: list[str], outputs: Outputs) -> int:
         if error.format_message():  # empty after the help that a bare `tetopt` prints
             show_error(f"{error.format_message()} (see --help)")
         return 2
+
+
+def _with_option(message: str, arguments: list[str]) -> str:
+    """A message that begins with an argument's name, as the library's do, perhaps after a file's: with the option that
+    the user gave for it."""
+    parts = message.split(": ")
+    for place, name in enumerate(parts[:2]):
+        option = f"--{ARGUMENT_OPTIONS.get(name, name).replace('_', '-')}"
+        if any(word == option or word.startswith(f"{option}=") for word in arguments):
+            return ": ".join([*parts[:place], option, *parts[place + 1 :]])
+    return message
 
 
 def _say_written(outputs: Outputs) -> None:

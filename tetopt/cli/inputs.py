@@ -19,11 +19,13 @@ from tetopt.io.files import checked_output
 from tetopt.io.images import parse_crop, parse_slice, part_of, sha256
 from tetopt.io.label_tables import LabelTable, load_label_table, table_in
 from tetopt.io.meshes import MeshFile
+from tetopt.model.build import labels_of
 from tetopt.model.labels import TABLE_TEXT
 from tetopt.target.align import aligned_contrast, is_same_grid
 from tetopt.target.labels import check_labels
 
 IN_IMAGE_SHARE = 0.95  # of a mask's or labels' volume: less of it in the image is more than the grids' difference
+UNNAMED_LISTED = 8  # of those that have no name: a line's worth
 AFFINE_MM = 1e-4  # affines that differ by less are the same: files round them to 32 bits
 
 
@@ -120,8 +122,18 @@ def read_mesh(path: Path) -> MeshFile:
 def label_table(path: Path | None, loaded: MeshFile | None = None) -> LabelTable:
     """Names and colours of labels: those of the file, else those that the mesh's file keeps, else none."""
     if path is not None:
-        return load_label_table(path)
+        table = load_label_table(path)
+        labels = None if loaded is None else labels_of(loaded.cell_data, len(loaded.mesh.cells))
+        if labels is not None and not np.isin(labels, [*table.names, *table.colours]).any():
+            show_warning(f"{path}: names none of the mesh's labels, {_first(np.unique(labels).tolist())}")
+        return table
     return table_in(None if loaded is None else loaded.text(TABLE_TEXT))
+
+
+def _first(labels: list[int]) -> str:
+    """The first of some labels, in words."""
+    more = f" and {len(labels) - UNNAMED_LISTED} more" if len(labels) > UNNAMED_LISTED else ""
+    return ", ".join(map(str, labels[:UNNAMED_LISTED])) + more
 
 
 def warn_of_other_image(loaded: MeshFile, mesh_path: Path, image_path: Path) -> bool:

@@ -44,7 +44,15 @@ from tetopt.cli.solver import (
 from tetopt.cli.source import Source, read_source
 from tetopt.engine.interfaces import crowded_nodes
 from tetopt.engine.loop import Optimized
-from tetopt.engine.meshing import QUADRATIC_NODES, Run, mesh_image
+from tetopt.engine.meshing import (
+    ERROR_REACHED,
+    ERROR_RUNS,
+    NODE_RUNS,
+    NODES_NEAR,
+    QUADRATIC_NODES,
+    Run,
+    mesh_image,
+)
 from tetopt.geometry.box import box_sides
 from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import centroids, squared_edges
@@ -153,7 +161,9 @@ def _run(task: Task, begin: float, begin_keeping: Callable[[], None]) -> Outcome
         log.print(escape(_described(task, initial)))
         prepare(content, options["k_D"], plan.mode)
         begin_keeping()
-        return watched_run(run, initial, options["iterations"], ends)
+        result = watched_run(run, initial, options["iterations"], ends)
+        _say_search(task, len(begun), result)
+        return result
 
     kind = plan.kind(content.image.ndim) if plan.mode in ("uniform", "paper") else None
     start = None if task.started is None else task.started.mesh
@@ -165,6 +175,23 @@ def _run(task: Task, begin: float, begin_keeping: Callable[[], None]) -> Outcome
     seconds = {"load": begun[0] - begin, "optimize": time.perf_counter() - begun[0]}
     first, last = (quality(each.points, each.cells) for each in (result.initial, result.mesh))
     return Outcome(result, result.initial, seconds, (first, last))
+
+
+def _say_search(task: Task, number: int, result: Optimized) -> None:
+    """A line for a run of several, which go on until one is near to an error, or to a number of nodes of order 2."""
+    plan, content = task.plan, task.source.content
+    n_nodes = node_count(result.mesh.points, result.mesh.cells, plan.solver.order or 1)
+    if (target := plan.sizes.target_error) is not None:
+        share = result.history[-1].E_D / (content.variance * content.volume or 1.0)
+        log.print(
+            f"run {number} of up to {ERROR_RUNS}: {n_nodes} nodes leave {share:.4g} of the variance in cells; "
+            f"{ERROR_REACHED * target:.4g} to {target:.4g} is near enough"
+        )
+    elif plan.solver.order == 2 and plan.sizes.nodes is not None and plan.mode != "start":
+        log.print(
+            f"run {number} of up to {NODE_RUNS}: {n_nodes} nodes with those in the middle of edges, of "
+            f"{plan.sizes.nodes}; {NODES_NEAR:.0%} off is near enough"
+        )
 
 
 def _described(task: Task, initial: Mesh) -> str:

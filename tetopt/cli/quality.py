@@ -18,6 +18,7 @@ from tetopt.cli.console import out, print_fidelity, show_error, show_warning
 from tetopt.cli.inputs import image_and_others, label_table, read_mesh, warn_of_other_image
 from tetopt.cli.options import ImagePart, LabelNamesOption, NumberOptions, option
 from tetopt.incoming import json_of
+from tetopt.engine.promises import MASK_DICE
 from tetopt.io.files import save_json
 from tetopt.io.meshes import MeshFile
 from tetopt.measure.fidelity import LabelFidelity
@@ -83,6 +84,9 @@ def quality_command(
     if check:
         _say_checked(mesh_path, image, is_masked, problems, remarks)
     if problems:
+        return 1
+    if mask is not None and measured["mask"].dice < MASK_DICE:
+        show_error(f"the mesh and the mask overlap only by Dice {measured['mask'].dice:.3f}: is it of this mask?")
         return 1
     if image is not None and fit is not None and fit.n_voxels > image.data.size:
         show_error(f"cells overlap: together they hold {fit.n_voxels} voxels, more than there are")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from itertools import chain
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -23,6 +24,7 @@ from tetopt.io.surfaces import LABELLED_SUFFIXES, SURFACE_SUFFIXES, SurfaceCheck
 from tetopt.measure.fidelity import FacetSurface, surface_areas
 from tetopt.model.labels import label_words, labels_named
 from tetopt.model.model import SPACES
+from tetopt.model.sets import FACE_NAMES, standard_sets
 from tetopt.report.tables import new_table
 
 MOST_LISTED = 12  # interfaces in the table; all are in the file of numbers
@@ -197,6 +199,14 @@ def _chosen(loaded: MeshFile, path: Path, part: SurfacePart) -> NDArray[np.int64
     chosen = largest_component(loaded.mesh.cells, mean < part.below)
     if len(chosen) == 0:
         raise InputError(f"{path}: no cell has a mean below {part.below:g}, they go from {mean.min():g} up")
+    faces = [*chain(*FACE_NAMES[3])]
+    of_faces = standard_sets(loaded.mesh, loaded.box).facets
+    touched = [name for name in faces if name in of_faces and np.isin(of_faces[name][:, 0], chosen).any()]
+    if touched and len(chosen) < len(mean):
+        log.print(
+            f"the largest connected set below {part.below:g} touches the box's faces {', '.join(touched)}: it is the "
+            "air around the body, perhaps; --label or --set take a structure by its name"
+        )
     if len(chosen) == len(mean):
         show_warning(f"every cell has a mean below {part.below:g}: this is the mesh's own boundary")
     return chosen

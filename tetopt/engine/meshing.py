@@ -33,7 +33,7 @@ from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.start.clip import lattice_within
 from tetopt.start.octree import is_near, nearest_octree, nodes_of_sizes, octree
-from tetopt.start.sizes import COARSEST_SHARE, Sizes
+from tetopt.start.sizes import Sizes
 from tetopt.target.content import Content, plain
 
 Mode = Literal["graded", "uniform", "paper", "start"]
@@ -224,9 +224,9 @@ def sizes_of_order(content: Content, nodes: int | None, sizes: Sizes | None, ord
     if order == 1:
         return sizes
     sizes = Sizes() if sizes is None else sizes
-    if sizes.coarsest == COARSEST_SHARE:
+    if sizes.coarsest is None:
         sizes = sizes._replace(coarsest=QUADRATIC_SHARE)
-    if sizes.gradation == 1.0:
+    if sizes.gradation is None:
         sizes = sizes._replace(gradation=QUADRATIC_GRADATION)
     if nodes is None:
         return sizes

@@ -67,14 +67,16 @@ def mask_table(mask: MaskFidelity) -> Table:
     change = 100.0 * (mask.mesh_volume / mask.volume - 1.0)
     table.add_row("size, mm^n", f"{mask.volume:.1f}", f"{mask.mesh_volume:.1f} ({change:+.1f} %)")
     table.add_row("Dice, by voxels", "", f"{mask.dice:.4f}")
-    table.add_row(
-        "boundary to the mask's surface, mean, 95 %", f"{mask.distance_mean:.3f}, {mask.distance_p95:.3f} voxels",
-        f"{mask.distance_mean_mm:.3f}, {mask.distance_p95_mm:.3f} mm",
-    )  # fmt: skip
-    table.add_row(
-        "the mask's surface to the boundary, mean, 95 %", f"{mask.reverse_mean:.3f}, {mask.reverse_p95:.3f} voxels",
-        f"{mask.reverse_mean_mm:.3f}, {mask.reverse_p95_mm:.3f} mm",
-    )  # fmt: skip
+    for title, *distances in (
+        ("boundary to the mask's surface, mean, 95 %", mask.distance_mean, mask.distance_p95, mask.distance_mean_mm,
+         mask.distance_p95_mm),
+        ("the mask's surface to the boundary, mean, 95 %", mask.reverse_mean, mask.reverse_p95, mask.reverse_mean_mm,
+         mask.reverse_p95_mm),
+    ):  # fmt: skip
+        mean, p95, mean_mm, p95_mm = (f"{distance:.3f}" for distance in distances)
+        is_there = not np.isnan(distances).any()  # both surfaces are, off the faces of the box
+        shown = (f"{mean}, {p95} voxels", f"{mean_mm}, {p95_mm} mm") if is_there else ("one of them is not there", "")
+        table.add_row(title, *shown)
     table.add_row("pieces", str(mask.components), str(mask.mesh_components))
     table.add_row("Euler number of the surface", str(mask.euler), str(mask.mesh_euler))
     return table

@@ -133,7 +133,7 @@ def _block_limits(content: Content, nodes: int, sizes: Sizes | None) -> _BlockLi
     smallest = sizes.smallest / SHORTEST_IN_BLOCK[n]
     largest = max(sizes.longest_edge(image, nodes, content.volume) / LONGEST_IN_BLOCK[n], smallest)
     target = _target(image, sizes) if sizes.has_target else None
-    return _BlockLimits(largest, target, smallest, int(np.ceil(1.0 / sizes.gradation - 1e-9)))
+    return _BlockLimits(largest, target, smallest, int(np.ceil(1.0 / sizes.slope - 1e-9)))
 
 
 def _target(image: Image, sizes: Sizes) -> NDArray[np.float32]:

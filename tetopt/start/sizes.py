@@ -53,16 +53,17 @@ class Sizes(NamedTuple):
         rather than `longest`. Nodes then move nearer: in one run a tenth of the edges ended shorter.
     largest : float, optional
         The largest target anywhere, mm; `inf` for none.
-    gradation : float
+    gradation : float, optional
         How gently sizes change: each size of the octree, between the next smaller and the next larger one, is at least
-        1 / gradation blocks wide; 1 to 0.05. Targets grow by no more than gradation x distance, and collapses make no
-        edge longer than 1.5 times the size that grows so from its surroundings. Where there are hardly two sizes it
-        changes little.
+        1 / gradation blocks wide; 1, the default, to 0.05. Targets grow by no more than gradation x distance, and
+        collapses make no edge longer than 1.5 times the size that grows so from its surroundings. Where there are
+        hardly two sizes it changes little.
     field : Image, optional
         The target, mm, by place: an image that need not lie on the voxels of the one to be meshed. Outside of it, and
         where it is 0 or below, only `largest` is one.
-    coarsest : float
-        Without `largest` and `longest`: the longest edge over that of a uniform mesh with as many nodes.
+    coarsest : float, optional
+        Without `largest` and `longest`: the longest edge over that of a uniform mesh with as many nodes, by default
+        1.4.
     longest : float, optional
         No block and no collapse makes a longer edge, mm. By default, without `largest`, `coarsest` times the longest
         edge of a uniform mesh with as many nodes: smaller cells in uniform regions do not represent the image any
@@ -72,10 +73,15 @@ class Sizes(NamedTuple):
 
     smallest: float = 0.0
     largest: float | None = None
-    gradation: float = 1.0
+    gradation: float | None = None
     field: Image | None = None
-    coarsest: float = COARSEST_SHARE
+    coarsest: float | None = None
     longest: float | None = None
+
+    @property
+    def slope(self) -> float:
+        """The gradation, or its default."""
+        return 1.0 if self.gradation is None else self.gradation
 
     @property
     def has_target(self) -> bool:
@@ -97,13 +103,13 @@ class Sizes(NamedTuple):
                 raise InputError(f"{name}: expected a length above 0 mm, got {value}")
             if value is not None and value < self.smallest:
                 raise InputError(f"{name}: {value:g} mm is below the smallest size, {self.smallest:g} mm")
-        if not 0.05 <= self.gradation <= 1.0:
+        if not 0.05 <= self.slope <= 1.0:
             raise InputError(f"gradation: expected 0.05 (gentle) to 1, got {self.gradation}")
         if self.field is not None and self.field.ndim != n:
             raise InputError(f"field: expected one in {n}-D, as the image is, got a {self.field.ndim}-D one")
         if self.field is not None and not (self.field.data > 0.0).any():
             raise InputError("field: no voxel is above 0; give lengths in mm")
-        return self if self.field is None else self._replace(field=_graded(self.field, self.gradation))
+        return self if self.field is None else self._replace(field=_graded(self.field, self.slope))
 
     def longest_edge(self, image: Image, nodes: int, volume: float | None = None) -> float:
         """The longest edge that any cell may have, mm; `volume`, mm^n, is that of the mesh, by default of the box."""
@@ -116,9 +122,8 @@ class Sizes(NamedTuple):
         if volume is not None:  # nodes of a lattice of the whole box
             nodes = int(nodes * image.volume / volume)
         uniform = float((lengths / near_cubes(kind, lengths, max(nodes, fewest))).max())
-        return LONGEST_IN_BLOCK[image.ndim] * max(
-            self.coarsest * uniform, self.smallest / SHORTEST_IN_BLOCK[image.ndim]
-        )
+        coarsest = COARSEST_SHARE if self.coarsest is None else self.coarsest
+        return LONGEST_IN_BLOCK[image.ndim] * max(coarsest * uniform, self.smallest / SHORTEST_IN_BLOCK[image.ndim])
 
     def on_voxels(self, image: Image) -> NDArray[np.float32]:
         """The target at each voxel's centre, of the image's shape, mm; `NO_BOUND_MM` where there is none."""
@@ -148,7 +153,7 @@ class Sizes(NamedTuple):
         target = self.at(points)
         if not np.isfinite(target).any() or np.isfinite(target).all():
             return target
-        return np.minimum(target, _around(target, points, cells, self.gradation))
+        return np.minimum(target, _around(target, points, cells, self.slope))
 
     def longest_edges(
         self, image: Image, nodes: int, points: NDArray, cells: NDArray, own: NDArray, target: NDArray,
@@ -159,7 +164,7 @@ class Sizes(NamedTuple):
         `own` (N,) is the mean size there now, `target` (N,) what it is to be (`around`).
         """
         bound = np.minimum(self.longest_edge(image, nodes, volume), LONG_EDGE * target)
-        return np.minimum(bound, UNEVEN_SHARE * _around(own, points, cells, self.gradation))
+        return np.minimum(bound, UNEVEN_SHARE * _around(own, points, cells, self.slope))
 
 
 def equilateral_nodes(target: NDArray, image: Image, inside: NDArray[np.bool_] | None = None) -> float:

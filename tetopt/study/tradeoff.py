@@ -13,7 +13,6 @@ from tetopt.start.sizes import COARSEST_SHARE, Sizes
 from tetopt.study.compare_report import ORDER_WORDS, Measurement, TradeoffRow
 
 # An option, its defaults and values around them by the order of the cells, and what `mesh_image` gets for a value.
-# With order 2 a gradation of 1 and a longest edge of `COARSEST_SHARE` stand for the defaults: neither is here.
 SweptOption = tuple[str, dict[int, float | None], dict[int, tuple[float, ...]], Callable[[float], dict[str, Any]]]
 SWEPT_OPTIONS: tuple[SweptOption, ...] = (
     ("k_D", dict.fromkeys((1, 2), GRADED_K_D), dict.fromkeys((1, 2), (0.3, 0.5, 0.7, GRADED_K_D, 0.93)),

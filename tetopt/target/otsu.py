@@ -8,12 +8,16 @@ from numpy.typing import NDArray
 from tetopt.errors import InputError
 
 HISTOGRAM_BINS = 256  # of the histogram whose classes are found: as many as 8-bit images have values
+TAIL_SHARE = 0.0005  # of the weight at either end, which may be some voxels far brighter than all others
+FEWEST_BINS = 64  # that all but the tails should spread over: with fewer, thresholds between classes are too coarse
 
 
 def class_thresholds(values: NDArray, classes: int, weights: NDArray | None = None) -> NDArray[np.float64]:
     """Thresholds between the classes that leave the least variance within them (Otsu 1979, for any number).
 
-    Exact on a histogram of 256 bins, by dynamic programming over the last bin of each class (Fisher 1958).
+    Exact on a histogram of 256 bins, by dynamic programming over the last bin of each class (Fisher 1958). The bins are
+    from the least value to the greatest, unless all but a thousandth of the weight lies in fewer than 64 of them, as
+    where one voxel is far brighter than the rest: then they are of these alone, and what lies beyond is in the last.
 
     Parameters
     ----------
@@ -36,7 +40,7 @@ def class_thresholds(values: NDArray, classes: int, weights: NDArray | None = No
     """
     if classes < 2:
         raise InputError(f"classes: expected 2 or more, got {classes}")
-    counts, edges = np.histogram(values, bins=HISTOGRAM_BINS, weights=weights)
+    counts, edges = _histogram(values, weights)
     is_filled = counts > 0
     if is_filled.sum() < classes:
         raise InputError(
@@ -60,6 +64,24 @@ def class_thresholds(values: NDArray, classes: int, weights: NDArray | None = No
     first = np.array(cuts[::-1])
     # Halfway between the last filled bin of one class and the first of the next.
     return 0.5 * (centres[first - 1] + centres[first])
+
+
+def _histogram(values: NDArray, weights: NDArray | None) -> tuple[NDArray, NDArray[np.float64]]:
+    """Counts and edges of the bins, see `class_thresholds`."""
+    counts, edges = np.histogram(values, bins=HISTOGRAM_BINS, weights=weights)
+    share = np.cumsum(counts) / counts.sum()
+    first, last = np.searchsorted(share, [TAIL_SHARE, 1.0 - TAIL_SHARE])
+    if last - first + 1 >= FEWEST_BINS:
+        return counts, edges
+    order = np.argsort(values)
+    share = np.cumsum(np.ones(len(values)) if weights is None else weights[order])
+    ends = np.searchsorted(share, share[-1] * np.array([TAIL_SHARE, 1.0 - TAIL_SHARE]))
+    low, high = values[order[np.minimum(ends, len(values) - 1)]]
+    if not low < high:
+        return counts, edges
+    narrow = np.histogram(np.clip(values, low, high), bins=HISTOGRAM_BINS, weights=weights)
+    # Of few values, as of two of which one is rare, there may be no more bins than before.
+    return narrow if (narrow[0] > 0).sum() > (counts > 0).sum() else (counts, edges)
 
 
 def _within_class_sums(counts: NDArray[np.float64], centres: NDArray[np.float64]) -> NDArray[np.float64]:
