@@ -17,8 +17,8 @@ from tetopt.check import manifold_problems
 from tetopt.cli.console import out, print_fidelity, show_error, show_warning
 from tetopt.cli.inputs import image_and_others, label_table, read_mesh, warn_of_other_image
 from tetopt.cli.options import ImagePart, LabelNamesOption, NumberOptions, option
-from tetopt.incoming import json_of
 from tetopt.engine.promises import MASK_DICE
+from tetopt.incoming import json_of
 from tetopt.io.files import save_json
 from tetopt.io.meshes import MeshFile
 from tetopt.measure.fidelity import LabelFidelity
