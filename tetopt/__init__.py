@@ -3,6 +3,7 @@
 __version__ = "0.1.0"
 
 from importlib import import_module
+from inspect import isfunction
 from typing import TYPE_CHECKING, Any
 
 from tetopt.cache import place_cache
@@ -105,7 +106,10 @@ def __getattr__(name: str) -> Any:
     """A public name, whose module is loaded when it is first used: `tetopt --help` needs none of the kernels."""
     for module, names in _NAMES_OF.items():
         if name in names:
-            value = globals()[name] = getattr(import_module(f"tetopt.{module}"), name)
+            value = getattr(import_module(f"tetopt.{module}"), name)
+            if isfunction(value):  # whoever calls it by this name may give it anything
+                value = import_module("tetopt.public").checked(value)
+            globals()[name] = value
             return value
     raise AttributeError(f"module 'tetopt' has no attribute {name!r}")
 

@@ -108,7 +108,10 @@ def transformed(vectors: NDArray[np.float64], matrix: NDArray[np.float64]) -> ND
 
 def _checked_data(data: ArrayLike) -> NDArray[np.floating]:
     """A read-only float32 or float64 C-ordered copy of `data`; InputError for what cannot be an image."""
-    data = np.asarray(data)
+    try:
+        data = np.asarray(data)
+    except (TypeError, ValueError) as error:  # rows of different length; nibabel's images
+        raise InputError(f"image data: expected an array of numbers, got {type(data).__name__} ({error})") from error
     if data.dtype.names is not None or data.dtype.kind == "O":
         raise InputError(f"image data: expected one number a voxel, got {data.dtype}; convert RGB to grey first")
     if data.dtype.kind == "c":

@@ -40,8 +40,11 @@ class Mesh:
     cells: NDArray[np.int64]
 
     def __init__(self, points: ArrayLike, cells: ArrayLike) -> None:
-        points = np.array(points, dtype=np.float64, order="C")
-        cells = np.asarray(cells)
+        try:
+            points = np.array(points, dtype=np.float64, order="C")
+            cells = np.asarray(cells)
+        except (TypeError, ValueError, OverflowError) as error:
+            raise InputError(f"mesh: expected arrays of numbers, points and cells ({error})") from error
         if points.ndim != 2 or points.shape[1] not in (2, 3):
             raise InputError(f"mesh points: expected shape (N, 2) or (N, 3), got {points.shape}")
         n = points.shape[1]

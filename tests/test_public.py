@@ -1,0 +1,117 @@
+"""Whatever is given to `tetopt.NAME`: one line that says what is expected, or it is taken."""
+
+import inspect
+from pathlib import Path
+
+import nibabel
+import numpy as np
+import pytest
+
+import tetopt
+from tetopt.public import check_arguments
+
+IMAGE = tetopt.Image(np.random.default_rng(0).normal(size=(6, 7, 8)))
+MESH = tetopt.Mesh([[0, 0, 0], [4, 0, 0], [0, 4, 0], [0, 0, 4]], [[0, 1, 2, 3]])
+LABELS = tetopt.Image(np.arange(6 * 7 * 8).reshape(6, 7, 8) % 3)
+# Right arguments of each function, by name; those of files are made by the tests of `tetopt.io`.
+RIGHT = {
+    "E_D": {"image": IMAGE, "mesh": MESH},
+    "E_G": {"points": MESH.points, "cells": MESH.cells},
+    "aligned_contrast": {"other": IMAGE, "image": IMAGE},
+    "aligned_labels": {"labels": LABELS, "image": IMAGE},
+    "aligned_mask": {"mask": LABELS, "image": IMAGE},
+    "cell_fields": {"mesh": MESH, "image": IMAGE},
+    "cell_labels": {"labels": LABELS, "mesh": MESH},
+    "cell_moments": {"image": IMAGE, "mesh": MESH},
+    "cell_of_voxel": {"image": IMAGE, "mesh": MESH},
+    "check_mesh": {"mesh": MESH, "image": None},
+    "content": {"images": [IMAGE], "weights": [1.0]},
+    "foreground": {"image": IMAGE, "level": 0.5},
+    "label_fidelity": {"labels": LABELS, "mesh": MESH},
+    "label_interfaces": {"labels": LABELS, "mesh": MESH, "of_cell": [1]},
+    "lattice": {"image": IMAGE, "nodes": 100, "spacing": None},
+    "load_image": {"path": "a.nii", "volume": 0},
+    "load_label_table": {"path": "a.txt"},
+    "load_mesh": {"path": "a.vtu"},
+    "load_phantom": {"name_or_path": "a.toml"},
+    "mask_fidelity": {"mask": LABELS, "mesh": MESH},
+    "mesh_image": {"image": IMAGE, "nodes": 100, "target_error": None, "start": None, "spacing": None, "sizes": None},
+    "model_of": {"mesh": MESH, "image": IMAGE, "sets": ["a=x<1"], "bins": 3, "order": 1},
+    "octree": {"image": IMAGE, "nodes": 100, "sizes": None},
+    "optimize": {"image": IMAGE, "mesh": MESH, "k_D": 0.2, "iterations": 1, "nodes": None},
+    "optimize_paper": {"image": IMAGE, "mesh": MESH, "k_D": 0.2, "iterations": 1},
+    "quality": {"points": MESH.points, "cells": MESH.cells},
+    "save_image": {"path": "a.nii", "image": IMAGE},
+    "save_mesh": {"path": "a.vtu", "mesh": MESH, "cell_data": {}, "order": 1},
+    "save_model": {"path": "a.inp", "space": "ras"},
+}
+WRONG = {
+    "a text": "x.nii.gz",
+    "a path": Path("x.nii.gz"),
+    "an array": np.zeros((3, 4, 5)),
+    "nibabel's": nibabel.Nifti1Image(np.zeros((3, 4, 5), np.float32), np.eye(4)),
+    "None": None,
+    "a list": [1, 2, 3],
+    "lists": [[1, 2], [3]],
+    "a number": 500,
+    "a fraction": 0.5,
+    "NaN": float("nan"),
+    "a bool": True,
+    "digits": 10**5000,
+    "a class": dict,
+    "a set": {1},
+}
+
+
+def test_every_public_function_is_in_the_table():
+    functions = {name for name in tetopt.__all__ if inspect.isfunction(getattr(tetopt, name))}
+    assert functions == set(RIGHT)
+    for name in functions:
+        assert set(RIGHT[name]) <= set(inspect.signature(getattr(tetopt, name)).parameters)
+
+
+@pytest.mark.parametrize("name", RIGHT)
+def test_right_kinds_are_taken(name):
+    check_arguments(inspect.unwrap(getattr(tetopt, name)), RIGHT[name])
+
+
+@pytest.mark.parametrize(("name", "argument"), [(name, argument) for name in RIGHT for argument in RIGHT[name]])
+def test_wrong_kinds_are_one_line(name, argument):
+    """Each argument is replaced by all that it can hardly be: no error but InputError, on one line that names it."""
+    lines = []
+    for value in WRONG.values():
+        try:
+            check_arguments(inspect.unwrap(getattr(tetopt, name)), {argument: value})
+        except tetopt.InputError as error:
+            lines.append(str(error))
+    assert len(lines) >= 8
+    assert all(line.startswith(f"{name}: {argument}: expected ") for line in lines)
+    assert all("\n" not in line and len(line) < 300 for line in lines)
+
+
+@pytest.mark.parametrize("what", ["a text", "a path", "an array", "nibabel's", "None", "a number", "a bool"])
+def test_what_is_no_image_is_told_how_to_become_one(what):
+    for call in (tetopt.mesh_image, tetopt.octree, tetopt.cell_fields):
+        with pytest.raises(tetopt.InputError, match=r"expected (an )?(Image|Mesh).*, got .*; tetopt\.(load|Image)"):
+            call(WRONG[what], 500) if call is not tetopt.cell_fields else call(WRONG[what])
+
+
+def test_records_are_looked_into():
+    with pytest.raises(tetopt.InputError, match=r"mesh_image: sizes\.largest: expected a number or None, got '5'"):
+        tetopt.mesh_image(IMAGE, 100, sizes=tetopt.Sizes(largest="5"))
+    with pytest.raises(tetopt.InputError, match=r"sizes\.field: expected Image or None, got 'a\.nii'"):
+        tetopt.octree(IMAGE, 100, tetopt.Sizes(field="a.nii"))
+
+
+@pytest.mark.parametrize(
+    "arrays", [("x", [[0, 1, 2]]), ([[0, 0], [1]], [[0, 1, 2]]), (None, None), ({}, set()), (dict, 1)]
+)
+def test_a_mesh_of_anything(arrays):
+    with pytest.raises(tetopt.InputError, match="mesh"):
+        tetopt.Mesh(*arrays)
+
+
+@pytest.mark.parametrize("what", [what for what in WRONG if what != "an array"])
+def test_an_image_of_anything(what):
+    with pytest.raises(tetopt.InputError, match="image data: "):
+        tetopt.Image(WRONG[what])

@@ -1,0 +1,116 @@
+"""What `tetopt.NAME` takes, by its annotations: one place for all public functions, one line for a mistake.
+
+Ranges (NaN is in none), shapes and what belongs together are the functions' own to check.
+"""
+
+from __future__ import annotations
+
+import functools
+import inspect
+import numbers
+import re
+from collections.abc import Callable, Iterable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from tetopt.errors import InputError
+
+ARRAY_WORDS = ("ArrayLike", "NDArray", "Points", "Cells")  # as annotations call them
+# How each is made, for who gives something else.
+REMEDIES = {
+    "Image": "tetopt.load_image(path) reads one, tetopt.Image(array, affine) makes one",
+    "Mesh": "tetopt.load_mesh(path).mesh reads one, tetopt.mesh_image(...).mesh is one",
+}
+NAMES_OF_KINDS = {"int": "a whole number", "float": "a number", "str": "a text", "bool": "True or False"}
+LARGEST_INTEGER = 2**63 - 1  # of numpy's: nothing that is counted here is more
+
+
+def checked(function: Callable[..., Any]) -> Callable[..., Any]:
+    """`function`, whose arguments are looked at by `check_arguments` before it is called."""
+    signature = inspect.signature(function)
+
+    @functools.wraps(function)
+    def call(*args: Any, **options: Any) -> Any:
+        check_arguments(function, signature.bind(*args, **options).arguments)
+        return function(*args, **options)
+
+    return call
+
+
+def check_arguments(function: Callable[..., Any], arguments: dict[str, Any]) -> None:
+    """InputError unless the arguments, by name, are of the kinds that the function's annotations name.
+
+    Annotations that name anything but Images, Meshes, numbers, texts, paths, arrays, sequences and tables of them, and
+    classes of the function's module, are not looked at.
+    """
+    for name, value in arguments.items():
+        parameter = inspect.signature(function).parameters[name]
+        if value is not parameter.default and parameter.kind is not parameter.VAR_KEYWORD:
+            _check(f"{function.__name__}: {name}", str(parameter.annotation), value, function.__globals__)
+
+
+def _check(what: str, annotation: str, value: Any, names: dict[str, Any]) -> None:
+    """InputError unless `value` is of one of the kinds between the annotation's bars, or one of them is not known."""
+    kinds = re.split(r" \| (?![^\[]*\])", annotation)
+    answers = [_is_of(kind, value, names) for kind in kinds]
+    if True in answers or None in answers:
+        if "Sizes" in kinds and isinstance(value, tuple):  # a record that its makers do not check
+            for field, kind in type(value).__annotations__.items():
+                _check(f"{what}.{field}", getattr(kind, "__forward_arg__", str(kind)), getattr(value, field), names)
+        return
+    expected = " or ".join(NAMES_OF_KINDS.get(kind, kind) for kind in kinds)
+    remedy = next((f"; {REMEDIES[kind]}" for kind in kinds if kind in REMEDIES), "")
+    raise InputError(f"{what}: expected {expected}, got {_shown(value)}{remedy}")
+
+
+def _is_of(kind: str, value: Any, names: dict[str, Any]) -> bool | None:
+    """Whether a value is of a kind; None if the kind is not known here."""
+    head, _, inner = kind.rstrip("]").partition("[")
+    if kind == "None":
+        return value is None
+    if kind in ("int", "float"):
+        return _is_number(value, is_whole=kind == "int")
+    if kind in ("str", "bool", "Path"):
+        return isinstance(value, {"str": str, "bool": bool | np.bool_, "Path": Path}[kind])
+    if head in ARRAY_WORDS:
+        return _is_array(value)
+    if head == "dict":
+        return isinstance(value, dict)
+    if head == "Callable":
+        return callable(value)
+    if head in ("Sequence", "Iterable", "tuple"):
+        if isinstance(value, str) or not isinstance(value, Iterable):
+            return False
+        item = inner.split(",")[0]
+        return not isinstance(value, list | tuple) or all(_is_of(item, each, names) is not False for each in value)
+    known = names.get(kind)
+    return isinstance(value, known) if isinstance(known, type) else None
+
+
+def _is_number(value: Any, is_whole: bool) -> bool:
+    if isinstance(value, bool | np.bool_) or not isinstance(value, numbers.Real):
+        return False
+    if isinstance(value, numbers.Integral):
+        return abs(int(value)) <= LARGEST_INTEGER
+    return float(value).is_integer() if is_whole else True
+
+
+def _is_array(value: Any) -> bool:
+    try:
+        return np.asarray(value).dtype.kind in "buif"
+    except (TypeError, ValueError):  # rows of different length, or what numpy cannot take
+        return False
+
+
+def _shown(value: Any) -> str:
+    """A value in a message: numbers and short texts themselves, else what they are."""
+    if isinstance(value, int) and abs(value) > LARGEST_INTEGER:
+        return f"one of {value.bit_length()} bits"
+    if isinstance(value, bool | int | float | str | np.number | None):
+        text = ascii(value) if isinstance(value, str) else str(value)
+        return text if len(text) <= 80 else f"{text[:77]}..."
+    if isinstance(value, list | tuple):
+        return f"{type(value).__name__} of {', '.join(sorted({type(each).__name__ for each in value})) or 'nothing'}"
+    return f"{type(value).__module__}.{type(value).__qualname__}".removeprefix("builtins.")
