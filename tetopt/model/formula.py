@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 
+MOST_FORMULA_LETTERS = 10_000  # far more than anyone writes; Python's parser takes half a minute for a million
 MOST_NESTED_OPERATIONS = 100  # more than anyone writes, and well within Python's own limit of recursion
 FORMULA_FUNCTIONS: dict[str, tuple[Callable[..., Any], int]] = {
     "abs": (np.abs, 1), "sqrt": (np.sqrt, 1), "exp": (np.exp, 1), "log": (np.log, 1),
@@ -41,6 +42,8 @@ def parse_formula(text: str) -> Callable[[NDArray[np.float64]], NDArray[np.float
     >>> parse_formula("1 / max(abs(h), 0.001)")(np.array([0.02, -0.01, 0.0]))
     array([  50.,  100., 1000.])
     """
+    if len(text) > MOST_FORMULA_LETTERS:
+        raise InputError(f'formula: more than {MOST_FORMULA_LETTERS} letters: "{_shown(text[:1000])}"')
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("error")  # of "1if h" Python only warns
