@@ -401,7 +401,7 @@ def test_what_another_run_compiles_is_waited_for(tmp_path, monkeypatch):
     """Else two first runs at once compile everything twice."""
     pytest.importorskip("fcntl")
     words, clock = [], [0.0]
-    with (tmp_path / "compiling.lock").open("ab") as other:
+    with (tmp_path / kernels.LOCK_NAME).open("ab") as other:
         kernels.fcntl.flock(other, kernels.fcntl.LOCK_EX)
 
         def sleep(seconds):

@@ -68,6 +68,8 @@ Bools3 = Annotated[NDArray[np.bool_], types.boolean[:, :, ::1]]
 
 SCALAR_TYPES = {int: types.int64, float: types.float64, bool: types.boolean, type(None): types.void}
 UNIT_BYTES = 1 << 25  # at once for all arrays that units make: a few KB each on each thread
+# In the cache's folder, of all runs of this package: those of another one compile other files.
+LOCK_NAME = f"compiling-{zlib.crc32(str(Path(__file__).parent).encode()):08x}.lock"
 POLLED_SECONDS = 0.1  # between looks at processes that compile
 LONGEST_WAIT_SECONDS = 600.0  # for another run's: all kernels take 145 s on a busy machine
 MOST_COMPILING = 4  # processes at most: each loads numba first, 1 s and 200 MB
@@ -500,7 +502,7 @@ def _only_compiler(folder: Path, say: Callable[[str], None]) -> Iterator[bool]:
     """Whether another run was compiling into this folder, for whose end this waits: not everything is done twice."""
     has_waited = False
     try:
-        lock = (folder / "compiling.lock").open("ab")
+        lock = (folder / LOCK_NAME).open("ab")
     except OSError:  # then both compile
         yield False
         return

@@ -48,10 +48,12 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
+from tetopt.budget import check_memory
 from tetopt.errors import InputError
 from tetopt.image import SINGULAR_DETERMINANT, Image
 from tetopt.incoming import toml_of
 
+PHANTOM_VOXEL_BYTES = 30.0  # intensities, noise or blur, labels, and what is written of them; 17 were measured
 MAX_PHANTOM_VOXELS = 2**31  # 17 GB in float64
 MAX_SUPERSAMPLE = 64  # sub-voxels along an axis: 262,144 to a voxel in 3-D, as many as fit one chunk of points
 POINTS_PER_CHUNK = 2**18  # evaluated at once, with a few tens of MB of temporaries
@@ -294,6 +296,8 @@ class Phantom:
                 f"{where}: voxel_mm: expected at most 2**31 voxels, got "
                 f"{' x '.join(f'{count:.6g}' for count in counts)} of {voxel.tolist()} mm; take larger ones"
             )
+        what = f"{where}: {' x '.join(f'{count:.6g}' for count in counts)} voxels"
+        check_memory(PHANTOM_VOXEL_BYTES * n_voxels, what, "take larger ones")
         linear = self.axes.T * (self.size_mm / counts)
         affine = np.eye(self.ndim + 1)
         affine[:-1, :-1] = linear

@@ -14,6 +14,7 @@ from rich.markup import escape
 
 import tetopt
 from tetopt import Image, InputError, Mesh
+from tetopt.budget import BYTES_PER_GB, NEXT_SHARE, NODE_BYTES, MemoryLimit, peak_bytes, resident_bytes
 from tetopt.check import manifold_problems
 from tetopt.cli.console import log, out, print_fidelity, show_warning
 from tetopt.cli.ending import is_ended, mesh_kept, signal_code
@@ -51,6 +52,8 @@ from tetopt.engine.meshing import (
     NODES_NEAR,
     QUADRATIC_NODES,
     Run,
+    bytes_of,
+    check_memory_of,
     mesh_image,
 )
 from tetopt.geometry.box import box_sides
@@ -93,6 +96,7 @@ class Outcome(NamedTuple):
     result: Optimized
     initial: Mesh
     seconds: dict[str, float]  # up to the optimisation, and of it
+    predicted_bytes: float  # of memory, at most, before it began
     shapes: tuple[Quality, Quality]  # of the initial mesh and of the result
 
 
@@ -149,6 +153,8 @@ def _run(task: Task, begin: float, begin_keeping: Callable[[], None]) -> Outcome
     plan, content = task.plan, task.source.content
     solver, output, options = plan.solver, plan.output.mesh, plan.engine_options()
     ends = None if plan.engine.max_seconds is None else begin + plan.engine.max_seconds
+    limit = _memory_limit(plan, content)
+    before = peak_bytes(), resident_bytes()
     begun: list[float] = []
 
     def watch(initial: Mesh, run: Run) -> Optimized:
@@ -161,7 +167,7 @@ def _run(task: Task, begin: float, begin_keeping: Callable[[], None]) -> Outcome
         log.print(escape(_described(task, initial)))
         prepare(content, options["k_D"], plan.mode)
         begin_keeping()
-        result = watched_run(run, initial, options["iterations"], ends)
+        result = watched_run(run, initial, options["iterations"], ends, limit)
         _say_search(task, len(begun), result)
         return result
 
@@ -174,7 +180,18 @@ def _run(task: Task, begin: float, begin_keeping: Callable[[], None]) -> Outcome
     assert result.initial is not None
     seconds = {"load": begun[0] - begin, "optimize": time.perf_counter() - begun[0]}
     first, last = (quality(each.points, each.cells) for each in (result.initial, result.mesh))
-    return Outcome(result, result.initial, seconds, (first, last))
+    n_nodes = max(result.nodes or 0, len(result.initial.points))
+    predicted = max(before[0], before[1] + bytes_of(content, n_nodes))
+    return Outcome(result, result.initial, seconds, predicted, (first, last))
+
+
+def _memory_limit(plan: Plan, content: Content) -> MemoryLimit | None:
+    """The user's; InputError if the image alone, or the mesh to begin with, needs more."""
+    if plan.engine.max_gb is None:
+        return None
+    n_bytes = plan.engine.max_gb * BYTES_PER_GB
+    check_memory_of(content, 0, n_bytes)
+    return MemoryLimit(n_bytes, NEXT_SHARE * NODE_BYTES * (plan.sizes.nodes or 0))
 
 
 def _say_search(task: Task, number: int, result: Optimized) -> None:
@@ -272,6 +289,7 @@ def _write(task: Task, outcome: Outcome, begin: float) -> tuple[Model, dict[str,
         summary = run_summary(source.content, outcome.initial, result, about, seconds, outcome.shapes)
         if source.image is not source.content.image:
             summary["image_properties"] = image_summary(source.image)  # on its own voxels, not on divided ones
+        summary["memory"] = {"predicted_bytes": outcome.predicted_bytes, "peak_bytes": peak_bytes()}
         save_json(output.json_path, summary | measured | model_summary(model))
     if plan.pictures:
         _draw(task, outcome, model)

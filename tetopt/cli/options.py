@@ -264,6 +264,7 @@ class EngineOptions:
     ] = None
     threads: Annotated[int | None, option("N", "Threads; the result is the same for any number.")] = None
     max_seconds: Annotated[float | None, option("S", "Stop after S seconds with the mesh reached.")] = None
+    max_gb: Annotated[float | None, option("GB", "Stop with the mesh reached before more than GB GB are taken.")] = None
 
 
 @dataclass(frozen=True, kw_only=True)

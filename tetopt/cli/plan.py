@@ -70,6 +70,7 @@ class Plan(NamedTuple):
             "edge_max": sizes.edge_max, "gradation": sizes.gradation,
             "sizing": None if sizes.sizing is None else sizes.sizing.name,
             **part.stated(), "method": self.engine.method, "max_seconds": self.engine.max_seconds,
+            "max_gb": self.engine.max_gb,
             "start": None if start.start is None else start.start.name, **self.engine_options(),
         }  # fmt: skip
 
@@ -144,6 +145,8 @@ def _completed(engine: EngineOptions, mode: Mode) -> EngineOptions:
         raise InputError(f"--k-d: expected 0 <= k_D < 1, got {k_D}")
     if engine.max_seconds is not None and not engine.max_seconds > 0.0:
         raise InputError(f"--max-seconds: expected more than 0, got {engine.max_seconds}")
+    if engine.max_gb is not None and not engine.max_gb > 0.0:
+        raise InputError(f"--max-gb: expected more than 0, got {engine.max_gb}")
     boundary = engine.boundary or ("fixed" if mode == "start" else "slide")
     engine = replace(engine, k_D=k_D, iterations=iterations, boundary=boundary)
     _check_method(engine, "paper", ("n_t", "retessellate"))

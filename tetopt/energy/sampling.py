@@ -21,15 +21,16 @@ The facets of triangles are segments and go the same way; a 2-D image is given a
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from math import ceil, isfinite, log2
+from math import ceil, isfinite, log2, prod
 from typing import Any, NamedTuple
 
 import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt.budget import check_memory
 from tetopt.errors import InputError
 from tetopt.geometry.topology import Facets, facets
 from tetopt.geometry.vectors import cross, difference, dot, row
@@ -54,6 +55,7 @@ from tetopt.mesh import Mesh
 from tetopt.target.content import Content
 
 EDGE_MARGIN = 0.5 - 1e-9  # voxels: between its ends an edge's cut is known to far less than the rest of 0.5
+SUM_BYTES = 12.0  # of each prefix sum at a voxel: 8, and temporary arrays
 CELLS_PER_CHUNK = 64  # cells, facets or nodes that a parallel task takes at once
 
 
@@ -240,6 +242,7 @@ def sampling_grid(image: Image, points: NDArray[np.float64]) -> SamplingGrid:
     # Whole numbers whose sums fit take half the memory, which is what the sampling of small cells waits for:
     # 1.4 times faster at 200 k tetrahedra.
     is_short = is_whole and shape[2] * max(largest, largest * largest) < 2**31
+    _check_grid(shape, 2)
     prefix = np.empty((shape[0], shape[1], shape[2] + 1, 2), dtype=np.int32 if is_short else np.float64)
     with few_threads(image.data.size // 50):
         data: Any = image.data.reshape(shape)
@@ -263,6 +266,7 @@ def channel_grid(content: Content, points: NDArray[np.float64]) -> SamplingGrid:
     grid = sampling_grid(content.image, points)
     if content.is_plain and content.region is None:
         return grid
+    _check_grid(grid.shape, len(content.values) + 2)
     if content.is_plain:
         rows, shift, is_short = [], grid.shift, grid.prefix.dtype == np.int32
     else:
@@ -277,6 +281,13 @@ def channel_grid(content: Content, points: NDArray[np.float64]) -> SamplingGrid:
     for number, values in enumerate(rows, first):
         np.cumsum(values.reshape(grid.shape), axis=2, out=prefix[:, :, 1:, number], dtype=prefix.dtype)
     return SamplingGrid(prefix, grid.bits, shift, len(content.values))
+
+
+def _check_grid(shape: Sequence[int], n_sums: int) -> None:
+    """InputError for prefix sums that there is no memory for: of 64 bits, and once more while they are made."""
+    n_voxels = prod(shape)
+    what = f"image: {n_sums} sums of {' x '.join(map(str, shape))} voxels"
+    check_memory(SUM_BYTES * n_sums * n_voxels, what, "crop it, or mesh it with larger voxels")
 
 
 def to_ticks(index: NDArray[np.float64], grid: SamplingGrid) -> NDArray[np.int64]:

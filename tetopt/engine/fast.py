@@ -187,11 +187,13 @@ def optimize(
 
 
 def prepare_kernels(
-    image: Image | Content, k_D: float, method: Literal["fast", "paper"] = "fast", is_graded: bool = False
-) -> None:
+    image: Image | Content, k_D: float, method: Literal["fast", "paper"] = "fast", is_graded: bool = False,
+    progress: Callable[[str], None] | None = None,
+) -> None:  # fmt: skip
     """Compile the kernels of a method for images of this kind, or load them, before a clock starts.
 
-    Several processes compile what the cache does not hold; a tiny run then loads what is left.
+    Several processes compile what the cache does not hold, of which `progress` is told as by `tetopt.kernels.link`; a
+    tiny run then loads what is left.
     """
     content = plain(image)
     image = content.image

@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 import numpy as np
 
+from tetopt.budget import check_memory, meshing_bytes
 from tetopt.engine.fast import optimize
 from tetopt.engine.loop import (
     GRADED_ITERATIONS,
@@ -57,6 +58,7 @@ NODE_RUNS = 3  # towards a number of nodes of order 2, at most; the second mostl
 FIRST_NODES = {2: 200, 3: 1500}  # of the first run towards an error, by dimension: so few that it takes no time
 ERROR_RATE = 0.7  # E_D falls with nodes^-0.7, on the MNI152 T1 from 5,000 to 40,000 nodes
 ERROR_REACHED = 0.85  # of the target error: from here to all of it a run is near enough, and the search ends
+CUT_SHORT = ("stopped", "max_seconds", "max_gb")  # runs that ended before their last iteration, not converged
 ERROR_RUNS = 6  # towards an error, at most
 
 
@@ -130,8 +132,8 @@ def mesh_image(
     ------
     InputError
         As `optimize` or `optimize_paper`; options that do not belong to the mode; neither or both of `nodes` and
-        `target_error`, or `spacing`; a number of nodes that the image is not worth (see `octree`), or an error that
-        its noise does not allow.
+        `target_error`, or `spacing`; a number of nodes that the image is not worth (see `octree`), or that there is no
+        memory for; an error that its noise does not allow.
 
     Examples
     --------
@@ -158,6 +160,8 @@ def mesh_image(
     seconds: list[float] = []
 
     def run(initial: Mesh, nodes: int | None) -> Optimized:
+        check_memory_of(content, max(nodes or 0, len(initial.points)))
+
         def optimized(**more: Any) -> Optimized:
             if mode == "paper":
                 return optimize_paper(content.image, initial, **options, **more)
@@ -189,6 +193,20 @@ def mesh_image(
     seconds_run = sum(seconds)
     result = requested(result, content, target_error, is_filled=mode != "start" and content.region is None)
     return result._replace(seconds_start=time.perf_counter() - begin - seconds_run, seconds_run=seconds_run)
+
+
+def bytes_of(content: Content, nodes: int) -> float:
+    """What meshing a content with so many nodes takes besides what there is; see `tetopt.budget.meshing_bytes`."""
+    return meshing_bytes(content.image.data.size, len(content.values) + (content.region is not None), nodes)
+
+
+def check_memory_of(content: Content, nodes: int, limit: float | None = None) -> None:
+    """InputError for more nodes than there is memory for, or than `limit` bytes in all allow."""
+    shape = " x ".join(map(str, content.image.shape))
+    what = f"{nodes} nodes on {shape} voxels" if nodes else f"an image of {shape} voxels"
+    if len(content.values) > 1:
+        what += f" of {len(content.values)} channels"
+    check_memory(bytes_of(content, nodes), what, "ask for fewer nodes, or mesh a part of the image", limit)
 
 
 def _nodes_of(content: Content, sizes: Sizes, order: int) -> int | None:
@@ -251,7 +269,7 @@ def meshed_in_all(ndim: int, nodes: int, run: Callable[[int], Optimized]) -> Opt
         miss = abs(count / nodes - 1.0)
         if best is None or miss < best[0]:
             best = miss, result
-        if miss <= NODES_NEAR or result.ended in ("stopped", "max_seconds"):
+        if miss <= NODES_NEAR or result.ended in CUT_SHORT:
             break
     assert best is not None
     return best[1]
@@ -299,7 +317,7 @@ def meshed_to_error(
         requests.add(nodes)
         result = run(initial, nodes)._replace(initial=initial, nodes=nodes)
         count, share = len(result.mesh.points), result.history[-1].E_D / (variance * content.volume)
-        if result.ended in ("stopped", "max_seconds"):
+        if result.ended in CUT_SHORT:
             return best if best is not None and shares[len(best.mesh.points)] <= target_error else result
         if count in shares:
             break

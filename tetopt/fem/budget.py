@@ -2,18 +2,16 @@
 
 from __future__ import annotations
 
-import os
-import re
 import time
 from collections.abc import Sequence
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt.budget import available_bytes
 from tetopt.errors import InputError
-from tetopt.fem.reference import averaged, reference
+from tetopt.fem.reference import DOF_BYTES, averaged, reference
 from tetopt.fem.voxels import Grid, grid_of, multigrid_of, preconditioned, stiffness_product
 from tetopt.image import Image
 
@@ -22,9 +20,6 @@ TRIAL_DOFS = 50_000  # of the grid whose iterations are counted: finer ones take
 TIMED_DOFS = 3_000_000  # of the grid on which an iteration is timed: larger than the processor's caches
 SOLUTION_SHARE = 1.6  # iterations of all of a reference over those of its solution: homogeneous block, half resolution
 LEAST_DOFS = 1_000  # however little time there is
-BYTES_PER_DOF = (
-    100  # resident, of a solution and all that is made of it; 70 were measured at 27 million, 110 at 3 million
-)
 FREE_SHARE = 0.8  # of the memory that is free may be taken
 
 
@@ -77,9 +72,9 @@ def affordable_dofs(modulus: Image, nus: Sequence[float], seconds: float, percen
     iterations = sum(reference(trial, nu, percent).work.iterations for nu in nus)
     timed = averaged(modulus, reference_shape(modulus.shape, modulus.spacing, TIMED_DOFS))
     in_time = seconds / (SOLUTION_SHARE * max(iterations, 1) * seconds_of_iteration(grid_of(timed, nus[0])))
-    free = free_bytes()
+    free = available_bytes()
     # The references stay, all of them, with two fields each.
-    in_memory = np.inf if free is None else FREE_SHARE * free / (BYTES_PER_DOF + 16.0 * (len(nus) - 1))
+    in_memory = np.inf if free is None else FREE_SHARE * free / (DOF_BYTES + 16.0 * (len(nus) - 1))
     return Budget(max(LEAST_DOFS, int(min(in_time, in_memory, whole))), bool(in_memory < min(in_time, whole)))
 
 
@@ -93,15 +88,3 @@ def seconds_of_iteration(grid: Grid) -> float:
         stiffness_product(grid, preconditioned(hierarchy, r, 1.0).astype(np.float64))
         times.append(time.perf_counter() - begin)
     return float(np.median(times[1:])) / r.size  # the first may compile
-
-
-def free_bytes() -> int | None:
-    """Memory that could be had without swapping, where the system says so."""
-    table = Path("/proc/meminfo")
-    if table.is_file():
-        row = re.search(r"^MemAvailable: +(\d+) kB", table.read_text(encoding="ascii"), re.M)
-        if row is not None:
-            return 1024 * int(row.group(1))
-    if "SC_PHYS_PAGES" in getattr(os, "sysconf_names", {}):
-        return os.sysconf("SC_PHYS_PAGES") * os.sysconf("SC_PAGE_SIZE")
-    return None

@@ -30,6 +30,7 @@ from scipy.sparse import bsr_array, bsr_matrix, csr_array, diags_array, eye_arra
 from scipy.sparse.linalg import LinearOperator, cg, splu
 from threadpoolctl import threadpool_limits  # type: ignore[import-untyped]
 
+from tetopt.budget import check_memory
 from tetopt.check import check_unfolded, facets_on_box, filled_share
 from tetopt.errors import InputError
 from tetopt.fem.rigidity import check_held, rigid_modes
@@ -47,6 +48,7 @@ Result = TypeVar("Result")
 # Free dofs up to which the matrix is factorised. Filling in is what a factorisation costs: in 3-D 14 k dofs take
 # 3 s and 57 k take 140 s and 4 GB, where multigrid takes 0.3 s and 2 s; in 2-D 100 k take 1 s.
 DIRECT_DOFS = {2: 200_000, 3: 10_000}
+PAIR_BYTES = 160.0  # of memory for each pair of a cell's nodes: numbers, entries, as they are sorted, and the matrix
 RESIDUAL_SHARE = 1e-10  # residual over load that an iterative solution goes down to; ten times as much is refused
 
 
@@ -156,6 +158,9 @@ def _stiffness(
     `young` (M, Q), `nu` (M,).
     """
     n_nodes, n = elements.points.shape
+    n_cells, n_corners = elements.cells.shape
+    what = f"elasticity: the stiffness of {n_cells} cells of {n_corners} nodes"
+    check_memory(PAIR_BYTES * n_cells * n_corners**2, what, "take a coarser mesh, or cells of order 1")
     pairs, slot = np.unique(elements.cells[:, :, None] * n_nodes + elements.cells[:, None, :], return_inverse=True)
     slot = slot.ravel()
     blocks = np.empty((len(pairs), n, n))

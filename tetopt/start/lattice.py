@@ -19,6 +19,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt.budget import check_memory
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import oriented
 from tetopt.image import Image
@@ -26,6 +27,7 @@ from tetopt.mesh import Mesh
 
 Kind = Literal["bcc", "five-tet", "criss-cross"]
 KINDS: dict[int, tuple[Kind, ...]] = {2: ("criss-cross",), 3: ("bcc", "five-tet")}  # by dimension; the default first
+LATTICE_NODE_BYTES = 800.0  # six cells of four node numbers, and as they are put together three times that
 MAX_NODES = 50_000_000  # six times as many cells, whose node numbers alone take 10 GB
 
 
@@ -97,6 +99,8 @@ def _checked_blocks(kind: str, counts: tuple[int, ...] | None, n: int) -> tuple[
         raise InputError(
             f"lattice: {blocks} blocks have {_node_count(kind, blocks)} nodes, more than {MAX_NODES}; ask for fewer"
         )
+    n_nodes = _node_count(kind, blocks)
+    check_memory(LATTICE_NODE_BYTES * n_nodes, f"lattice: {n_nodes} nodes", "ask for fewer")
     return blocks
 
 

@@ -22,6 +22,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from tetopt.budget import check_memory
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
 from tetopt.image import Image
@@ -56,6 +57,9 @@ SPREAD_OF_NOISE = 0.03  # of the noise's variance, likewise: chance does not dec
 NOISE_SIGMAS = 2.0  # standard deviations of a sum of squared noise that are not taken for content
 # Of a target's blocks to the n-th power: those larger by less are not divided, since a lattice seldom fits exactly.
 TARGET_SLACK = 0.25
+OCTREE_NODE_BYTES = 3000.0  # of Delaunay's hull in one dimension more, six or seven cells to a node
+BLOCK_FIELD_BYTES = 16.0  # of the smallest blocks, each field of which is held at all depths: twice 8, at most
+OTHER_FIELDS = 6  # besides the sums: targets, errors and what they are made of
 TIE_SPREAD = 0.05  # of a block's error: what decides between blocks that are alike
 TIE_BREAKS = (1e-5, 1e-4, 1e-3)  # see `delaunay`, tried in turn: with 1e-7, 2 of 88,661 cells were flat
 FLAT_VOLUME_SHARE = 1e-6  # of the mean volume: a cell with less is flat
@@ -126,6 +130,7 @@ def _block_limits(content: Content, nodes: int, sizes: Sizes | None) -> _BlockLi
     if nodes > max(image.data.size, ALWAYS_ALLOWED_NODES):
         shape = " x ".join(map(str, image.shape))
         raise InputError(f"octree: {nodes} nodes are too many for {shape} voxels; ask for fewer")
+    check_memory(OCTREE_NODE_BYTES * nodes, f"octree: {nodes} nodes", "ask for fewer")
     sizes = (Sizes() if sizes is None else sizes).prepared(n)
     longest_side = float((image.spacing * image.shape).max())
     if sizes.smallest > longest_side:
@@ -286,6 +291,9 @@ def _blocks_by_depth(
     variance = voxels.noise
     spread = SPREAD_OF_VARIANCE * float(voxels.sums[1].sum() / voxels.sums[0].sum()) + SPREAD_OF_NOISE * variance
     every = voxels.sums if voxels.outside is None else [*voxels.sums, voxels.outside]
+    n_blocks = float(np.prod(np.array(roots) * 2.0**depth))
+    need = BLOCK_FIELD_BYTES * n_blocks * (len(every) + OTHER_FIELDS)
+    check_memory(need, f"octree: {n_blocks:.3g} blocks", "allow longer edges, or crop the image")
     sums = [_block_totals(field, np.array(roots) << depth, np.add) for field in every]
     target = None
     if limits.target is not None:

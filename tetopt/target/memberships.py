@@ -17,10 +17,13 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from tetopt.budget import check_memory
 from tetopt.image import Image
 from tetopt.kernel_cache import njit
 from tetopt.target.labels import check_labels, label_channels
 
+PARTITION_BYTES = 40.0  # at each voxel besides levels: which label, which is nearest, and as they are found
+NO_ROOM = "crop the image, or give smooth_interfaces=0 (--smooth-interfaces 0)"  # what to do then
 FARTHEST_LEVEL = 6.0  # levels end there: nothing that moves by steps near an interface looks further
 FARTHEST_DISTANCE = 8  # voxels beyond which distances to a label do not count: more than levels and smoothing look at
 FINE_SIGMA, BROAD_SIGMA = 1.0, 3.0  # voxels: of the Gaussian where a label is thin, and where it and its gaps are not
@@ -102,6 +105,11 @@ def memberships(labels: Image, factors: Sequence[int] | None = None) -> Membersh
     assert all(factor % 2 == 1 for factor in factors), f"factors: expected odd numbers, got {factors}"
     values = np.flatnonzero(np.bincount(labels.data.astype(np.int64).ravel()))
     raw = start = np.searchsorted(values, labels.data).reshape(labels.shape)
+    n_voxels = labels.data.size * prod(factors)
+    what = f"labels: {len(values)} of them on {n_voxels} voxels"
+    if max(factors) > 1:
+        what += f", which are divided by {' x '.join(map(str, factors))}"
+    check_memory(PARTITION_BYTES * n_voxels, what, NO_ROOM)
     off = np.zeros(labels.shape, dtype=np.float32)
     for axis, factor in enumerate(factors):
         if factor > 1:
@@ -109,6 +117,7 @@ def memberships(labels: Image, factors: Sequence[int] | None = None) -> Membersh
             start = _between_slices(start, axis, factors)
             raw = np.repeat(raw, factor, axis)
     channel = label_channels(start, len(values))
+    check_memory((PARTITION_BYTES + 4.0 * (channel.max() + 1)) * n_voxels, what, NO_ROOM)
     levels = np.full((channel.max() + 1, *start.shape), FARTHEST_LEVEL, dtype=np.float32)
     smallest, partition = np.full(start.shape, np.inf, dtype=np.float32), np.zeros(start.shape, dtype=np.int64)
     boxes = [_around(box, start.shape) for box in scipy.ndimage.find_objects(start + 1)]

@@ -1,0 +1,199 @@
+"""Memory is asked for before it is taken: what there is, what things need, and one line where that is too much."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pytest
+from commands import exit_code, mesh_words, numbers_in
+from models import sample_image
+
+import tetopt
+from tetopt import budget
+from tetopt.cli import run as cli_run
+from tetopt.energy.sampling import sampling_grid
+from tetopt.engine.loop import Optimized, Record
+from tetopt.engine.meshing import bytes_of
+from tetopt.fem.elasticity import stiffness
+from tetopt.fem.reference import reference
+from tetopt.start.octree import _block_limits, _blocks_by_depth, _voxels
+from tetopt.target.content import content, plain
+from tetopt.target.memberships import memberships
+
+GIB = 1 << 30
+
+
+@pytest.fixture
+def system(monkeypatch, tmp_path):
+    """A machine whose files in /proc and /sys/fs/cgroup the test writes."""
+    monkeypatch.setattr(budget, "PROC_FOLDER", tmp_path / "proc")
+    monkeypatch.setattr(budget, "GROUP_FOLDER", tmp_path / "group")
+    monkeypatch.setattr(budget, "resource", None)
+
+    def write(path, text):
+        (tmp_path / path).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / path).write_text(text)
+
+    write("proc/meminfo", f"MemTotal: {9 << 20} kB\nMemFree: 5 kB\nMemAvailable:  {8 << 20} kB\n")
+    return write
+
+
+def test_the_machine_and_its_groups_limit_memory(system):
+    """The least of all is what there is: of the machine, of version 2 and 1, of a group and those above it."""
+    assert budget.available_bytes() == 8 * GIB
+    system("proc/self/cgroup", "0::/job/step\n")
+    assert budget.available_bytes() == 8 * GIB
+    system("group/job/memory.max", f"{4 * GIB}\n")
+    system("group/job/memory.current", f"{3 * GIB}\n")
+    system("group/job/memory.stat", f"anon 5\ninactive_file {GIB // 2}\n")
+    assert budget.available_bytes() == GIB + GIB // 2
+    system("group/job/step/memory.max", "max\n")
+    system("group/job/step/memory.current", f"{3 * GIB}\n")
+    system("group/job/step/memory.stat", "inactive_file 0\n")
+    assert budget.available_bytes() == GIB + GIB // 2
+    system("proc/self/cgroup", "3:cpu,memory:/docker/abc\n")
+    assert budget.available_bytes() == 8 * GIB
+    system("group/memory/memory.limit_in_bytes", f"{2 * GIB}\n")
+    system("group/memory/memory.usage_in_bytes", f"{3 * GIB}\n")
+    system("group/memory/memory.stat", "total_inactive_file 0\n")
+    assert budget.available_bytes() == 0
+    system("group/memory/memory.limit_in_bytes", f"{(1 << 63) - 4096}\n")
+    assert budget.available_bytes() == 8 * GIB
+
+
+def test_memory_is_known_here():
+    assert budget.available_bytes() is None or budget.available_bytes() > 10**7
+    assert 10**7 < budget.resident_bytes() <= budget.peak_bytes()
+
+
+def test_words_have_units():
+    assert budget.memory_words(2.5e9) == "2.5 GB"
+    assert budget.memory_words(1.26e8) == "0.126 GB"
+    assert budget.memory_words(7.5e6) == "7.5 MB"
+
+
+def test_a_limit_counts_what_there_is(monkeypatch):
+    monkeypatch.setattr(budget, "available_bytes", lambda: 1000)
+    monkeypatch.setattr(budget, "resident_bytes", lambda: 400)
+    budget.check_memory(1000, "a", "b")
+    with pytest.raises(tetopt.InputError, match=r"^a: needs about 0\.001 MB of memory, 0\.001 MB are free; b$"):
+        budget.check_memory(1001, "a", "b")
+    budget.check_memory(600, "a", "b", limit=1000)
+    with pytest.raises(
+        tetopt.InputError, match=r"^a: needs about 0\.001 MB of memory in all, 0\.001 MB are allowed; b$"
+    ):
+        budget.check_memory(601, "a", "b", limit=1000)
+    assert not budget.MemoryLimit(1000, 600).is_reached()
+    assert budget.MemoryLimit(1000, 601).is_reached()
+
+
+IMAGE = tetopt.Image(np.random.default_rng(0).integers(1, 4, (9, 8, 7)).astype(float), np.diag([1.0, 1.0, 3.0, 1.0]))
+LATTICE = tetopt.lattice(IMAGE, blocks=(2, 2, 2))
+LIMITS = _block_limits(plain(IMAGE), 100, None)
+TASKS = {
+    "lattice: .* nodes: needs.*ask for fewer": lambda: tetopt.lattice(IMAGE, spacing=0.1),
+    "octree: .* blocks: needs.*allow longer edges, or crop": lambda: _blocks_by_depth(
+        IMAGE, _voxels(plain(IMAGE)), (2, 2, 2), LIMITS
+    ),
+    "phantom 'sphere': .* voxels: needs.*take larger": lambda: tetopt.load_phantom("sphere").image(),
+    "image: 2 sums of 9 x 8 x 7 voxels: needs.*crop it": lambda: sampling_grid(IMAGE, LATTICE.points),
+    "labels: 3 of them on 1512 .*divided by 1 x 1 x 3: needs.*smooth": lambda: memberships(IMAGE, (1, 1, 3)),
+    "elasticity: the stiffness of .* cells of 10 nodes: needs.*coarser": lambda: stiffness(LATTICE, 1.0, 0.3, 2),
+    "reference: 2160 degrees of freedom: needs.*--reference-dofs": lambda: reference(IMAGE, 0.3),
+    "^octree: 100 nodes: needs.*ask for fewer": lambda: tetopt.mesh_image(IMAGE, 100),
+    "^.* nodes on 9 x 8 x 7 voxels: needs.*fewer": lambda: tetopt.mesh_image(IMAGE, start=LATTICE),
+}
+
+
+@pytest.mark.parametrize("words", TASKS)
+def test_what_needs_more_than_there_is_does_not_begin(monkeypatch, words):
+    monkeypatch.setattr(budget, "available_bytes", lambda: 1000)
+    with pytest.raises(tetopt.InputError, match=words.replace("needs", "needs about .* 0.001 MB are free; ")):
+        TASKS[words]()
+
+
+def test_what_is_kept_of_voxels_counts():
+    """Channels of a content, and a mask, take memory besides the image."""
+    ones = tetopt.Image(np.ones((6, 5, 4)))
+    kinds = [plain(IMAGE), content(IMAGE, mask=tetopt.Image(np.ones(IMAGE.shape), IMAGE.affine))]
+    first, masked = (bytes_of(kind, 0) for kind in kinds)
+    assert masked - first == budget.CHANNEL_BYTES * IMAGE.data.size
+    assert bytes_of(plain(ones), 50) - bytes_of(plain(ones), 0) == 50 * budget.NODE_BYTES
+
+
+def test_a_run_ends_before_the_limit_with_the_mesh_reached(tmp_path, monkeypatch, capsys):
+    """`--max-gb`: the image alone is refused at once, else what is reached is written, and said why."""
+    tetopt.save_image(tmp_path / "a.nii.gz", sample_image(3))
+    words = mesh_words(tmp_path / "a.nii.gz", tmp_path, "--nodes", "100", "--iterations", "3", "--force")
+    assert exit_code(*words, "--max-gb", "0.001") == 2
+    assert "GB of memory in all, 1 MB are allowed; ask for fewer nodes" in capsys.readouterr().err.replace("\n", " ")
+    assert not (tmp_path / "a.vtu").exists()
+    for value in ("0", "-1", "nan"):
+        assert exit_code(*words, "--max-gb", value) == 2
+        assert "--max-gb: expected more than 0" in capsys.readouterr().err
+    assert exit_code(*words, "--max-gb", "100") == 0
+    numbers = numbers_in(tmp_path / "a.json")
+    assert numbers["ended"] in ("iterations", "converged")
+    assert numbers["options"]["max_gb"] == 100.0
+    assert 0 < numbers["memory"]["peak_bytes"]
+    assert 0 < numbers["memory"]["predicted_bytes"]
+    now = budget.resident_bytes
+    monkeypatch.setattr("tetopt.cli.mesh.check_memory_of", lambda *_: None)
+    monkeypatch.setattr(budget.MemoryLimit, "is_reached", lambda self: now() > self.n_bytes)
+    capsys.readouterr()
+    exit_code(*words, "--max-gb", "0.001")
+    numbers = numbers_in(tmp_path / "a.json")
+    assert numbers["ended"] == "max_gb"
+    assert "no more memory is allowed: the mesh so far is kept" in capsys.readouterr().err
+    tetopt.check_mesh(tetopt.load_mesh(tmp_path / "a.vtu").mesh)
+
+
+# What is said meanwhile, where there is no terminal.
+
+
+def test_lines_are_rare_and_the_first_is_said_at_once(monkeypatch):
+    lines, clock = [], [0.0]
+    monkeypatch.setattr(cli_run.log, "print", lines.append)
+    monkeypatch.setattr(cli_run.time, "perf_counter", lambda: clock[0])
+    at_once, later = cli_run.rare_lines(is_first_said=True), cli_run.rare_lines()
+    for second in range(26):
+        clock[0] = float(second)
+        at_once(f"a {second}")
+        later(f"b {second}")
+    assert lines == ["a 0", "a 10", "b 10", "a 20", "b 20"]
+    monkeypatch.setattr(type(cli_run.log), "is_terminal", True)
+    clock[0] = 100.0
+    at_once("on a terminal there is a bar")
+    assert len(lines) == 5
+
+
+def test_compiling_and_long_iterations_are_told(monkeypatch):
+    """Before anything is compiled there is a line; and iterations, E, seconds and memory are told as they go."""
+    lines, clock = [], [0.0]
+    monkeypatch.setattr(cli_run.log, "print", lines.append)
+    monkeypatch.setattr(cli_run.time, "perf_counter", lambda: clock[0])
+
+    def prepare_kernels(*arguments):
+        arguments[-1]("compiling the kernels, 1 of 57")
+        assert lines == ["compiling the kernels, 1 of 57 (of the first run only), 0 s"]
+
+    monkeypatch.setattr(cli_run, "prepare_kernels", prepare_kernels)
+    cli_run.prepare(plain(IMAGE), 0.5, "graded")
+    lines.clear()
+    rows = [Record(number, 1.0 - 0.1 * number, 2.0, 1.0, 0.1, False, 48, 504, 3.0) for number in (0, 1)]
+
+    def optimized(max_seconds, callback, stop):
+        callback(rows[0])
+        for second in (5, 11, 12):
+            clock[0] = float(second)
+            assert not stop()
+        callback(rows[1])
+        return Optimized(LATTICE, rows, "iterations")
+
+    cli_run.watched_run(optimized, LATTICE, 1, None)
+    memory = r"0\.\d+ GB|\d+(\.\d+)? MB"
+    assert len(lines) == 3
+    assert re.fullmatch(rf"iteration   0/1  E 1\.0000  E_G 1.* cells  3\.0 s, ({memory})", lines[0])
+    assert re.fullmatch(rf"  in iteration 1, 11\.0 s, ({memory})", lines[1])
+    assert lines[2].startswith("iteration   1/1  E 0.9000")
