@@ -617,3 +617,19 @@ def test_messages_of_points(points, message):
     for method in (load_phantom("sphere").intensity, load_phantom("sphere").labels):
         with pytest.raises(InputError, match=f"^phantom 'sphere': {message}"):
             method(points)
+
+
+def test_voxels_that_no_image_has_are_refused_before_they_are_painted(tmp_path, monkeypatch):
+    text = "\n".join(
+        [
+            'name = "a"',
+            'description = "b"',
+            "size_mm = [9, 9]",
+            "voxel_mm = [9, 1e-6]",
+            "background = { intensity = 1 }",
+        ]
+    )
+    (tmp_path / "a.toml").write_text(text)
+    monkeypatch.setattr(tetopt.phantom, "_voxel_centers", None)  # nothing may be painted
+    with pytest.raises(InputError, match=r"phantom 'a': .*1000 times as long"):
+        load_phantom(tmp_path / "a.toml").image()

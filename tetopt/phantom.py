@@ -302,6 +302,10 @@ class Phantom:
         affine = np.eye(self.ndim + 1)
         affine[:-1, :-1] = linear
         affine[:-1, -1] = self.center_mm - linear @ ((counts - 1) / 2)
+        try:
+            Image(np.zeros((1,) * self.ndim), affine)  # whose voxels none may have, before they are painted
+        except InputError as error:
+            raise InputError(f"{where}: {error}") from error
         return tuple(int(c) for c in counts), affine
 
     def _voxel_means(

@@ -108,3 +108,12 @@ def test_an_image_that_reads_back_otherwise_does_not_replace_the_old_one(name, t
         with pytest.raises(OSError, match="reads back otherwise"):
             save_image(tmp_path / name, image)
         assert (tmp_path / name).read_bytes() == before
+
+
+def test_an_axis_too_long_for_nifti_1_goes_into_nifti_2(tmp_path):
+    image = Image(np.arange(32768.0 * 2).reshape(2, 32768), SHEARED)
+    save_image(tmp_path / "a.nii.gz", image)
+    assert isinstance(nibabel.load(tmp_path / "a.nii.gz"), nibabel.Nifti2Image)
+    back = load_image(tmp_path / "a.nii.gz")
+    np.testing.assert_array_equal(back.data, image.data)
+    np.testing.assert_array_equal(back.affine, image.affine)

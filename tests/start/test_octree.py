@@ -192,3 +192,10 @@ def test_same_bits_for_any_number_of_threads():
     for other in results[1:]:
         np.testing.assert_array_equal(other.points, results[0].points)
         np.testing.assert_array_equal(other.cells, results[0].cells)
+
+
+def test_a_bound_beyond_all_boxes_bounds_nothing():
+    """Its cube overflows, which is no error and no warning: the mesh is that under a bound that just holds the box."""
+    image = tetopt.Image(np.random.default_rng(1).normal(size=(6, 6, 6)))
+    meshes = [tetopt.mesh_image(image, 50, iterations=0, sizes=tetopt.Sizes(longest=mm)).mesh for mm in (1e3, 1e300)]
+    np.testing.assert_array_equal(meshes[0].points, meshes[1].points)

@@ -42,6 +42,7 @@ _KNOWN_SUFFIXES = ", ".join((*_NIBABEL_SUFFIXES, *ITK_READERS, *PICTURE_SUFFIXES
 # What the two libraries raise on damaged files.
 _READER_ERRORS = (OSError, EOFError, ValueError, TypeError, KeyError)
 _NIBABEL_HEADER_ERRORS = (*_READER_ERRORS, ImageFileError, HeaderDataError, WrapStructError, OverflowError, MGHError)
+MOST_OF_NIFTI_1 = 32767  # voxels along an axis, of 16 bits; NIfTI-2 has more
 HEAD_BYTES_NIFTI = 1024  # of a file: the longest of the headers has 540
 EXTENSION_BYTES = 2**26  # 67 MB before the voxels: a NIfTI file's extensions are texts
 TRAILING_BYTES = 2**24  # 17 MB behind the last voxel: MGH's tags
@@ -113,7 +114,8 @@ def load_image(
 def save_image(path: str | Path, image: Image) -> None:
     """Write a NIfTI file (.nii or .nii.gz), whole or not at all, with the full affine as sform, in mm.
 
-    Whole numbers are held as 8- or 16-bit integers where they fit, others as float32 or float64.
+    Whole numbers are held as 8- or 16-bit integers where they fit, others as float32 or float64. An axis of more voxels
+    than NIfTI-1 can number makes it a NIfTI-2 file.
 
     A 2-D image becomes a 2-D file in the plane z = 0, which `load_image` reads back as it was. Replaces an
     existing file; ask `tetopt.io.files.checked_output` first.
@@ -129,7 +131,8 @@ def save_image(path: str | Path, image: Image) -> None:
     affine = np.eye(4)
     affine[: image.ndim, : image.ndim] = image.affine[:-1, :-1]
     affine[: image.ndim, 3] = image.affine[:-1, -1]
-    file = nibabel.Nifti1Image(_for_file(image.data), affine)
+    kind = nibabel.Nifti1Image if max(image.shape) <= MOST_OF_NIFTI_1 else nibabel.Nifti2Image
+    file = kind(_for_file(image.data), affine)
     file.header.set_xyzt_units("mm")
     with written_whole(path) as temporary:
         nibabel.save(file, temporary)
@@ -138,14 +141,18 @@ def save_image(path: str | Path, image: Image) -> None:
 
 def _check_written(path: Path, file: nibabel.Nifti1Image) -> None:
     """OSError if the file is not what was written, as far as its head and its length tell."""
-    back = nibabel.Nifti1Image.from_filename(path)
+    back = type(file).from_filename(path)
     n_bytes = path.stat().st_size
     if path.suffix.lower() == ".gz":
         with path.open("rb") as packed:
             packed.seek(-4, os.SEEK_END)
             n_bytes = int.from_bytes(packed.read(), "little")  # unpacked, below 2^32
-    length = nibabel.Nifti1Header.single_vox_offset + file.header.get_data_dtype().itemsize * int(np.prod(file.shape))
-    is_same = back.shape == file.shape and np.array_equal(back.affine, file.affine.astype(np.float32))
+    length = int(type(file).header_class.single_vox_offset) + file.header.get_data_dtype().itemsize * int(
+        np.prod(file.shape)
+    )
+    is_same = back.shape == file.shape and np.array_equal(
+        back.affine.astype(np.float32), file.affine.astype(np.float32)
+    )
     if not is_same or n_bytes != length % 2**32:
         raise OSError(errno.EIO, "what was written reads back otherwise; is the disk sound?")
 

@@ -174,7 +174,8 @@ def nodes_of_sizes(image: Image | Content, sizes: Sizes) -> tuple[int, float]:
 
 def _fewest_nodes(content: Content, limits: _BlockLimits) -> float:
     """A lower bound of the nodes that the bounds need: two for each block as large as it may be."""
-    return 2.0 * content.volume / limits.largest**content.image.ndim
+    with np.errstate(over="ignore"):  # a bound of 1e300 mm needs none
+        return float(2.0 * content.volume / np.float64(limits.largest) ** content.image.ndim)
 
 
 def _target_nodes(content: Content, limits: _BlockLimits) -> float:
