@@ -199,7 +199,8 @@ def test_labels_of_a_surface_that_its_file_cannot_name_are_refused(tmp_path):
 @pytest.mark.parametrize("suffix", FORMATS)
 def test_names_that_are_words_of_a_format(suffix, tmp_path):
     """What was written is gone through before it takes its name, so that this alone would notice."""
-    words = ["METADATA", "SCALARS", "POINTS", "CELL_DATA", "FIELD", "LOOKUP_TABLE", "$EndNodes", "*NODE", "End", "last"]
+    words = ["METADATA", "SCALARS", "POINTS", "CELL_DATA", "FIELD", "LOOKUP_TABLE", "$EndNodes", "*NODE", "End"]
+    words += ["NumberOfPoints='1e99'", '<Piece NumberOfCells="7">', "last"]
     model = sample_model()
     fields = {name: np.arange(len(model.mesh.cells)) + 0.5 * k for k, name in enumerate(words)}
     about = {"tetopt": "0.1.0", "image": "\n\nVertices\n7"}

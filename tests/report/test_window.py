@@ -10,6 +10,7 @@ from tetopt.errors import InputError
 from tetopt.geometry.cut import plane_cut
 from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import boundary_facets, facets
+from tetopt.io.text import plain
 from tetopt.model.labels import LabelTable
 from tetopt.report.exhibit import exhibit
 from tetopt.report.window import has_display, plane_slice, plotter, show
@@ -251,3 +252,16 @@ def test_a_field_of_the_nodes_is_interpolated_and_goes_with_the_step(bent, mesh)
     assert window.actors["count"].get_text(2).endswith(held)
     press(window, "s")
     assert window.actors["count"].get_text(2).endswith("deformation x 1, step 1")
+
+
+def test_hostile_names_are_drawn_letter_by_letter(opengl, mesh, capfd):
+    """VTK takes what is between dollars for a formula, and fails at bytes that are no UTF-8."""
+    outside = boundary_facets(mesh.cells)
+    for name in ("$\\frac{", "$x^2$", "a\x1b[31m\nb\udcff\u202e\0c", "%s%n <b>"):
+        shown = exhibit(mesh, {name: np.arange(len(mesh.cells)) + 0.5}, None, name, {name: outside})
+        window = plotter(shown._replace(reactions={0: {name: [1.0, 2.0, 3.0]}}), off_screen=True)
+        press(window, "h")
+        assert f"\n{plain(name)} is held by" in window.actors["count"].get_text(2).replace(r"\$", "$")
+        window.screenshot(return_img=True)
+        window.close()
+    assert "MathText" not in capfd.readouterr().err

@@ -71,9 +71,12 @@ def format_of(path: Path) -> Format:
 
 
 def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str = "kPa") -> None:
-    """Write a model in the format of the file's suffix, whole or not at all.
+    """Write a model in the format of the file's suffix, whole or not at all; it is read back before it takes its name.
 
-    Replaces an existing file; ask `tetopt.io.files.checked_output` first.
+    Names of data, and that of the image, stand in the file as `tetopt.io.text.plain` shows them, escaped in XML; gmsh
+    has apostrophes for their quotes, and gmsh, legacy VTK and FEBio their first 240 characters. Those that become the
+    same are numbered, and a warning tells what changed. Replaces an existing file; ask
+    `tetopt.io.files.checked_output` first.
 
     Parameters
     ----------
@@ -88,7 +91,9 @@ def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str
     Raises
     ------
     InputError
-        An unknown suffix, or what the format cannot carry.
+        An unknown suffix, or what the format cannot carry; sets with names that some format cannot carry.
+    OSError
+        As `tetopt.io.readback.save_checked`.
     """
     path = Path(path)
     whole = file_bytes(path, model, space=space, units=units)

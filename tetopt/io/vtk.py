@@ -132,7 +132,8 @@ def xml_bytes(writer: Any, grid: vtkDataSet) -> bytes:
     for fields in (grid.GetCellData(), grid.GetPointData(), grid.GetFieldData()):
         for number in range(fields.GetNumberOfArrays()):
             array = fields.GetAbstractArray(number)
-            array.SetName(xml_attribute(array.GetName()))  # VTK 9.7 writes them as they are
+            # VTK 9.7 writes them as they are. `tetopt.io.read_vtk` takes counts between apostrophes for the file's own.
+            array.SetName(xml_attribute(array.GetName()).replace("'", "&apos;"))
     writer.SetDataModeToBinary()
     return written_bytes(writer, grid)
 

@@ -20,7 +20,8 @@ from tetopt.geometry.cut import plane_cut
 from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import facets
 from tetopt.image import Image
-from tetopt.report.colours import LISTED_LABELS, grey_limits
+from tetopt.io.text import plain
+from tetopt.report.colours import LISTED_LABELS, grey_limits, plain_text
 from tetopt.report.exhibit import COLOUR_MAP, LABEL_FIELD, NO_VALUE, Exhibit, Field, first_axis, warp_factors
 from tetopt.report.figures import MESH_LINE
 
@@ -73,11 +74,27 @@ def plotter(shown: Exhibit, off_screen: bool = False) -> pyvista.Plotter:
     Sliders move the plane (world mm) and the limits, choose the field, and multiply displacements, where there are any;
     the keys in `KEYS_TEXT` the rest. With `off_screen` it is to be photographed instead of shown.
     """
+    shown = _printable(shown)
     with pyvista.vtk_verbosity("off"):
         window = pyvista.Plotter(off_screen=off_screen, window_size=(1280, 850), title=f"tetopt: {shown.title}")
         window.set_background("white")
         _Scene(window, shown).open()
     return window
+
+
+def _printable(shown: Exhibit) -> Exhibit:
+    """With names as VTK draws them letter by letter: it, too, takes what is between dollars for a formula."""
+    fields = [
+        field._replace(
+            name=plain_text(field.name), names={label: plain_text(name) for label, name in field.names.items()}
+        )
+        for field in shown.fields
+    ]
+    sets = {plain_text(name): nodes for name, nodes in shown.sets.items()}
+    reactions = {
+        step: {plain_text(name): force for name, force in by_set.items()} for step, by_set in shown.reactions.items()
+    }
+    return shown._replace(title=plain(shown.title), fields=fields, sets=sets, reactions=reactions)
 
 
 class _Scene:
