@@ -13,11 +13,19 @@ import numpy as np
 import pytest
 
 import tetopt
+from tetopt import incoming
+from tetopt.cli import main
+from tetopt.cli.inputs import file_and_volume
+from tetopt.cli.solver import parsed_bins
 from tetopt.errors import InputError
+from tetopt.incoming import json_of, text_of, toml_of
 from tetopt.io import apart
 from tetopt.io.apart import read_apart
-from tetopt.io.images import load_image, sha256
+from tetopt.io.images import load_image, parse_crop, parse_slice, sha256
 from tetopt.io.meshes import load_mesh
+from tetopt.model.labels import labels_named
+from tetopt.model.laws import load_law
+from tetopt.phantom import load_phantom
 
 POINTS = struct.pack("<12d", 0, 0, 0, 1, 0, 0, 0, 1, 0, 0, 0, 1)
 PACKED = zlib.compress(POINTS)
@@ -333,3 +341,58 @@ def test_a_picture_of_too_many_pixels(tmp_path):
     body += struct.pack(">I", len(data)) + b"IDAT" + data + struct.pack(">I", zlib.crc32(b"IDAT" + data))
     (tmp_path / "a.png").write_bytes(b"\x89PNG\r\n\x1a\n" + body)
     refused(load_image, tmp_path / "a.png", "its 1048576 x 1048576 pixels are more than")
+
+
+# --------------------------------------------------------------------------------------------------
+# Texts, tables and options
+
+
+def test_texts_are_bounded(tmp_path, monkeypatch):
+    (tmp_path / "a.toml").write_text("x = 1\n")
+    assert toml_of(tmp_path / "a.toml", "table") == {"x": 1}
+    monkeypatch.setattr(incoming, "TEXT_BYTES", 5)
+    refused(lambda path: text_of(path, "table"), tmp_path / "a.toml", "expected a table of at most")
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        (f"x = {'9' * 5000}", "expected TOML, got "),
+        (f"x = 0x{'f' * 5000}", "expected TOML, got "),
+        (f"x = [1, {{y = {'9' * 400}}}]", "expected TOML, got a number of 400 digits"),
+        (f"x = {'[' * 10_000}", "nested too deeply|expected TOML"),
+        ("x", "expected TOML"),
+    ],
+)
+def test_toml_without_end(tmp_path, text, words):
+    (tmp_path / "a.toml").write_text(text)
+    refused(lambda path: toml_of(path, "table"), tmp_path / "a.toml", words)
+    for load in (load_phantom, load_law):
+        with pytest.raises(InputError) as caught:
+            load(tmp_path / "a.toml")
+        assert len(str(caught.value)) < 400
+
+
+@pytest.mark.parametrize("text", ["9" * 5000, "9" * 400, "[" * 100_000, '{"a": 1'])
+def test_json_without_end(text):
+    with pytest.raises(ValueError):
+        json_of(text)
+
+
+def test_numbers_of_thousands_of_digits_among_options():
+    digits = "9" * 5000
+    for parse in (parsed_bins, parse_crop, parse_slice):
+        for text in (digits, f"{digits}:", f"2={digits}"):
+            with pytest.raises(InputError) as caught:
+                parse(text)
+            assert len(str(caught.value)) < 300
+    assert file_and_volume(Path(f"a.nii:{digits}"))[1] is None
+    with pytest.raises(InputError):
+        labels_named(digits, {1: "liver"})
+
+
+@pytest.mark.parametrize("digits", [30, 400, 5000])
+def test_numbers_of_many_digits_on_the_command_line(tmp_path, capfd, digits):
+    arguments = ["mesh", str(tmp_path / "no.nii"), "-o", str(tmp_path / "a.vtu"), "--nodes", "9" * digits]
+    assert main(arguments) == 2
+    assert capfd.readouterr().err.count("\n") <= 2

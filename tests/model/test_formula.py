@@ -79,3 +79,15 @@ def test_one_over_strain_is_the_papers_law():
 def test_law_is_a_table_or_a_formula():
     np.testing.assert_array_equal(young_from(parse_law("0:1,100:5"), [50.0]), [3.0])
     np.testing.assert_array_equal(young_from(parse_law("max(h, 60)"), [50.0]), [60.0])
+
+
+@pytest.mark.parametrize("text", ["h" * 10**6, "+".join("h" * 10**5), "(" * 5000 + "h" + ")" * 5000, "9" * 10_001])
+def test_formulas_without_end(text):
+    with pytest.raises(tetopt.InputError, match="more than 10000 letters"):
+        parse_formula(text)
+
+
+@pytest.mark.parametrize("text", ["h.__class__", "__import__('os')", "(h:=1)", "[h for h in h]", "lambda: h", "h[0]"])
+def test_formulas_are_no_programs(text):
+    with pytest.raises(tetopt.InputError, match="formula"):
+        parse_formula(text)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import warnings
 from collections.abc import Callable, Iterable
 from dataclasses import replace
@@ -102,7 +103,7 @@ def read_companion(path: Path) -> Image:
 def file_and_volume(path: Path) -> tuple[Path, int | None]:
     """A file beside the first image, and the volume of it that `FILE:K` names."""
     name, colon, volume = str(path).rpartition(":")
-    if colon and volume.isdecimal() and not path.exists():
+    if colon and re.fullmatch("[0-9]{1,18}", volume) and not path.exists():
         return Path(name), int(volume)
     return path, None
 

@@ -28,10 +28,12 @@ from tetopt.engine.loop import (
     Boundary,
 )
 from tetopt.engine.paper import Retessellate
+from tetopt.errors import InputError
 from tetopt.io.files import checked_output, name_files
 from tetopt.io.formats import FORMATS
 from tetopt.model.averages import DEFAULT_AVERAGE
 from tetopt.model.materials import DEFAULT_NU
+from tetopt.public import LARGEST_INTEGER
 from tetopt.start.lattice import Kind
 
 Lattice = Literal[Kind, "octree"]
@@ -359,6 +361,9 @@ def from_records(command: Callable[..., int]) -> Callable[..., int]:
     @wraps(command)
     def called(**values: Any) -> int:
         name_files(values.values())
+        for name, value in values.items():
+            if isinstance(value, int) and abs(value) > LARGEST_INTEGER:
+                raise InputError(f"{name.replace('_', '-')}: expected a number that 64 bits hold, got a longer one")
         return command(**{name: _of_values(kinds[name], name, values) for name in defaults})
 
     parameters = [each for name, default in defaults.items() for each in _parameters(name, kinds[name], default)]

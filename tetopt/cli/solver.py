@@ -125,8 +125,8 @@ def parsed_bins(text: str | None) -> tuple[int | None, Spacing]:
         return None, "equal"
     count, _, spacing = text.partition(":")
     spacing = spacing or "equal"
-    if not count.isdecimal() or int(count) < 1 or spacing not in get_args(Spacing):
-        raise InputError(f'--bins: expected K, K:quantile or K:log with K of 1 or more, got "{text}"')
+    if re.fullmatch("0*[1-9][0-9]{0,8}", count) is None or spacing not in get_args(Spacing):
+        raise InputError(f'--bins: expected K, K:quantile or K:log with K from 1 to 999999999, got "{text[:80]}"')
     return int(count), cast(Spacing, spacing)
 
 

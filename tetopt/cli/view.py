@@ -69,7 +69,7 @@ def _reactions(loaded: MeshFile) -> dict[int, dict[str, list[float]]]:
     """The forces that hold sets, mN by step, that a file of `tetopt fem` states."""
     reactions = {}
     for key in loaded.field_data:
-        match = re.fullmatch(r"reactions(?:_step(\d+))?", key)
+        match = re.fullmatch(r"reactions(?:_step(\d{1,9}))?", key)
         if match is None:
             continue
         try:

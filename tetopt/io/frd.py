@@ -29,7 +29,9 @@ from tetopt.model.model import SPACES, STRESS_UNITS, half_turn
 # Relative, of a coordinate: half a unit of the sixth digit, which is the last that CalculiX writes, is 5e-6 at most.
 WRITTEN_DIGITS = 6e-6
 HEAD_BYTES = 4096  # The heading of the .inp, which says units and coordinates, is in the second line.
-LINES_BEFORE = re.compile(rb" {4}1PSTEP *\d+ +(\d+) +(\d+)| {2}100C.{18}(.{12})")  # anywhere: binary blocks end no line
+LINES_BEFORE = re.compile(
+    rb" {4}1PSTEP *\d+ +(\d{1,9}) +(\d{1,9})| {2}100C.{18}(.{12})"
+)  # anywhere: binary blocks end no line
 TENSOR_ROWS = np.array([0, 3, 5, 3, 1, 4, 5, 4, 2])  # of xx, yy, zz, xy, yz, zx, row by row
 
 

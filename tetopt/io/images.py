@@ -250,10 +250,10 @@ def parse_crop(text: str) -> list[tuple[int | None, int | None]]:
     """
     bounds = []
     for part in text.split(","):
-        match = re.fullmatch(r"\s*([0-9]*)\s*:\s*([0-9]*)\s*", part)
+        match = re.fullmatch(r"\s*([0-9]{0,18})\s*:\s*([0-9]{0,18})\s*", part)
         if match is None:
             raise InputError(
-                f'crop: expected start:stop in voxels for each axis, such as "10:100,:,5:", got "{one_line(text)}"'
+                f'crop: expected start:stop in voxels for each axis, such as "10:100,:,5:", got "{one_line(text)[:80]}"'
             )
         start, stop = (int(end) if end else None for end in match.groups())
         bounds.append((start, stop))
@@ -273,11 +273,11 @@ def parse_slice(text: str) -> tuple[int, int]:
     >>> parse_slice("2=90"), parse_slice("k=90")
     ((2, 90), (2, 90))
     """
-    match = re.fullmatch(r"\s*([012ijk])\s*=\s*([0-9]+)\s*", text)
+    match = re.fullmatch(r"\s*([012ijk])\s*=\s*([0-9]{1,18})\s*", text)
     if match is None:
         raise InputError(
             "slice: expected an array axis (0, 1, 2 or i, j, k) and a voxel index, "
-            f'such as "2=90" or "k=90", got "{one_line(text)}"'
+            f'such as "2=90" or "k=90", got "{one_line(text)[:80]}"'
         )
     axis, index = match.groups()
     return "012ijk".index(axis) % 3, int(index)

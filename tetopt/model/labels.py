@@ -12,6 +12,8 @@ from tetopt.model.sets import label_set_names
 
 TABLE_TEXT = "label_table"  # of a mesh's file, and of a model's `about`: what `table_words` makes
 
+LABEL_DIGITS = 18  # of a number that 64 bits hold; more are a name that nothing has
+
 
 class LabelTable(NamedTuple):
     """Names and colours of labels; a label may have one of them, or neither."""
@@ -46,7 +48,7 @@ def labels_named(text: str, names: Mapping[int, str]) -> list[int]:
     [10]
     """
     text = text.strip()
-    if text.isdecimal():
+    if text.isdecimal() and len(text) <= LABEL_DIGITS:
         return [int(text)]
     of_sets = label_set_names(names, names)
     for known in (names, of_sets):
