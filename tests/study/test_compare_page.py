@@ -634,10 +634,17 @@ def test_verdicts(tmp_path, ours, theirs, verdict):
 
 
 def test_different_sizes_are_said(tmp_path):
-    assert "Nodes: tetopt 5000, pytetwild 5011." in page_of(tmp_path, fake_report())
     report = fake_report()
+    assert "Nodes, linear cells: tetopt 5000, pytetwild 5011." in page_of(tmp_path, report)
+    assert "differ in nodes" not in page_of(tmp_path, report)
+    peer = report.quadratic[1]
+    runs = [run._replace(measurement=run.measurement._replace(n_nodes=4000)) for run in peer.runs]
+    report.quadratic[1] = with_runs(peer, runs)
+    page = page_of(tmp_path, report)
+    assert "Nodes, linear cells: tetopt 5000" in page
+    assert "The meshes differ in nodes, quadratic cells: tetopt 5000, pytetwild 4000; more nodes alone" in page
     with_measured(report, 1, n_nodes=9000)
-    assert "meshes differ in nodes: tetopt 5000, pytetwild 9000" in page_of(tmp_path, report)
+    assert "differ in nodes, linear cells: tetopt 5000, pytetwild 9000" in page_of(tmp_path, report)
 
 
 # --------------------------------------------------------------------------------------------------

@@ -17,6 +17,7 @@ from tetopt.study.compare_criteria import (
     criteria,
     entries_of,
     number_text,
+    of_order,
     ratio_text,
     winners,
 )
@@ -153,21 +154,24 @@ def _title(report: Report, ours: int | None, peers: list[int]) -> str:
 
 
 def _remarks(report: Report, ours: int | None, peers: list[int]) -> list[str]:
-    shown = [report.pipelines[place] for place in ([] if ours is None else [ours]) + peers]
-    sizes = {each.title: each.median.measurement.n_nodes for each in shown if each.median is not None}
+    places = [] if ours is None else [ours, *peers]
     remarks = []
-    if sizes:
-        counts = ", ".join(f"{title} {number_text(nodes)}" for title, nodes in sizes.items())
-        is_equal = max(sizes.values()) <= SIZE_TOLERANCE * min(sizes.values())
-        more = "" if is_equal else "; more nodes alone make E_D and the errors smaller, see the curves"
-        remarks.append(f"{'Nodes' if is_equal else 'The meshes differ in nodes'}: {counts}{more}.")
-        runs = ", ".join(f"{each.title} {len(each.runs)}" for each in shown)
+    for order, word in ORDER_WORDS.items():
+        shown = [of_order(report, order)[place] for place in places]
+        sizes = {each.title: each.median.measurement.n_nodes for each in shown if each.median is not None}
+        if sizes:
+            counts = ", ".join(f"{title} {number_text(nodes)}" for title, nodes in sizes.items())
+            is_equal = max(sizes.values()) <= SIZE_TOLERANCE * min(sizes.values())
+            more = "" if is_equal else "; more nodes alone make E_D and the errors smaller, see the curves"
+            remarks.append(f"{'Nodes' if is_equal else 'The meshes differ in nodes'}, {word} cells: {counts}{more}.")
+    if places:
+        runs = ", ".join(f"{report.pipelines[place].title} {len(report.pipelines[place].runs)}" for place in places)
         remarks.append(
             f"Runs: {runs}. Numbers are medians; a difference within the runs' ranges counts as none, "
-            f"nor does one below {EQUAL_SHARE:.1%}."
+            f"nor does one below {EQUAL_SHARE:.1%}; of one run no range is known."
         )
     for order, word in ORDER_WORDS.items():
-        for each in report.pipelines if order == 1 else report.quadratic:
+        for each in of_order(report, order):
             where = each.title if order == 1 else f"{each.title}, {word} cells"
             n_again = len(each.crashes) - (each.reason == "crash") * 2
             if n_again > 0:
