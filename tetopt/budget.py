@@ -22,6 +22,7 @@ except ImportError:  # Windows
 
 BYTES_PER_GB = 1e9  # as of memory that is sold and of files
 MAXRSS_UNIT_BYTES = 1 if sys.platform == "darwin" else 1024  # of ru_maxrss, as getrusage(2) has it
+LIBRARY_ADDRESSES = 1.2e9  # libraries, stacks and buffers of threads, all kernels: 1.1 GB on two cores, of 0.3 in use
 KERNEL_BYTES = 1.5e8  # numba's compiler and all kernels, if they are not loaded yet
 VOXEL_BYTES = 20.0  # of an image that has been read: the octree's squares, the count of the prefix sums
 CHANNEL_BYTES = 16.0  # of each function of the voxels: in the octree, later its prefix sums
@@ -85,6 +86,19 @@ class MemoryLimit(NamedTuple):
     def is_reached(self) -> bool:
         """Whether to end, lest it be exceeded."""
         return resident_bytes() + self.next_bytes > self.n_bytes
+
+
+def check_addresses() -> None:
+    """InputError where the limit of a process (`ulimit -v`) leaves too few addresses to load numba and the like.
+
+    Libraries end the process where they find none: OpenBLAS and LLVM exit, others cannot be imported.
+    """
+    room = address_room()
+    if room is not None and room < LIBRARY_ADDRESSES:
+        raise InputError(
+            f"the limit on this process leaves {memory_words(room)} of addresses, numba and the other libraries need "
+            f"{memory_words(LIBRARY_ADDRESSES)}; raise it (ulimit -v, ulimit -d)"
+        )
 
 
 def available_bytes() -> int | None:

@@ -13,6 +13,7 @@ import typer
 from rich.markup import escape
 
 import tetopt
+from tetopt.budget import check_addresses
 from tetopt.cli.console import error_words, log, open_streams, out, settle_streams, show_error, show_warning
 from tetopt.cli.ending import INTERRUPTED_CODE, signal_code, signals_heard
 from tetopt.errors import InputError
@@ -151,7 +152,8 @@ def _app(arguments: Sequence[str]) -> typer.Typer:
 
 
 def loaded_command(name: str) -> Callable[..., Any]:
-    """The function of a command, as typer takes it."""
+    """The function of a command, as typer takes it; InputError where not even the libraries that it loads have room."""
+    check_addresses()
     from tetopt.cli.options import from_records  # which loads what its defaults come from
 
     return from_records(getattr(import_module(f"tetopt.cli.{COMMANDS[name][0]}"), f"{name.replace('-', '_')}_command"))
