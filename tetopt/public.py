@@ -1,4 +1,4 @@
-"""What `tetopt.NAME` takes, by its annotations: one place for all public functions, one line for a mistake.
+"""What public functions take, by their annotations: one place for all public functions, one line for a mistake.
 
 Ranges (NaN is in none), shapes and what belongs together are the functions' own to check.
 """

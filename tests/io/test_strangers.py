@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 import tetopt
-from tetopt import incoming
+from tetopt import budget, incoming
 from tetopt.cli import main
 from tetopt.cli.inputs import file_and_volume
 from tetopt.cli.solver import parsed_bins
@@ -320,6 +320,15 @@ def test_nifti_bombs(tmp_path, name):
     refused(load_image, nifti(tmp_path / name, (3, 4, -5)), "damaged")
     refused(load_image, nifti(tmp_path / name, offset=1e30), "its voxels are to begin at byte 1e.30")
     refused(load_image, nifti(tmp_path / name, offset=np.nan), "its voxels are to begin at byte nan")
+
+
+@pytest.mark.parametrize("name", ["a.nii.gz", "a.nrrd"])
+def test_a_volume_that_does_not_fit_memory(tmp_path, monkeypatch, name):
+    pytest.importorskip("SimpleITK")
+    path = tmp_path / name
+    nifti(path) if name == "a.nii.gz" else path.write_bytes(nrrd())
+    monkeypatch.setattr(budget, "available_bytes", lambda: 60 * 9 - 1)
+    refused(load_image, path, "its 3 x 4 x 5 voxels: needs about .* of memory, .* are free; crop or resample it first")
 
 
 def test_a_gzip_file_that_goes_on(tmp_path):

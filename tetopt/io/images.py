@@ -30,7 +30,7 @@ from tetopt.io.apart import DEFLATE_RATIO
 from tetopt.io.files import check_suffix, written_whole
 from tetopt.io.pictures import PICTURE_SUFFIXES, read_picture
 from tetopt.io.read_itk import ITK_READERS, read_dicom_folder, read_itk
-from tetopt.io.volumes import DAMAGED_FILE, UNREADABLE_FILE, one_line, volume_index
+from tetopt.io.volumes import DAMAGED_FILE, UNREADABLE_FILE, check_room, one_line, volume_index
 
 Bounds = Sequence[tuple[int | None, int | None]]
 """One half-open (start, stop) range of voxel indices for each axis; None is an open end."""
@@ -408,6 +408,7 @@ def _check_size(path: Path, file: SpatialImage, volume: int, is_packed: bool) ->
             f"{DAMAGED_FILE} (its header tells of {' x '.join(str(each) for each in file.shape)} voxels, "
             f"{n_bytes:.4g} bytes, the file has {size})"
         )
+    check_room(file.shape, proxy.dtype.itemsize)
     if is_packed:
         _check_gzip(path, proxy.offset + math.prod(file.shape[3:]) * volume_bytes + TRAILING_BYTES)
 

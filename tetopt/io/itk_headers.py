@@ -14,7 +14,7 @@ from typing import NamedTuple
 from tetopt.errors import InputError
 from tetopt.incoming import irregular
 from tetopt.io.apart import DEFLATE_RATIO
-from tetopt.io.volumes import DAMAGED_FILE, UNREADABLE_FILE
+from tetopt.io.volumes import DAMAGED_FILE, UNREADABLE_FILE, check_room
 
 HEADER_BYTES = 2**20  # of a header: 3D Slicer's with all its words have 10,000
 MOST_AXES = 8  # of a file: more than space, time, and what is measured
@@ -64,6 +64,7 @@ def checked_header(path: Path) -> tuple[int, int]:
             f"{DAMAGED_FILE} (its header tells of {sizes} voxels, "
             f"{header.value_bytes:.4g} bytes, the file has {n_bytes})"
         )
+    check_room(header.sizes, header.value_bytes // max(math.prod(header.sizes), 1))
     return n_bytes, header.value_bytes
 
 

@@ -3,11 +3,14 @@
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 
 import numpy as np
 
+from tetopt.budget import check_memory
 from tetopt.errors import InputError
 
+IMAGE_BYTES = 8  # of a voxel of an `Image`, at most
 # What to do about a file that ends too soon, and about one that may never have been an image.
 DAMAGED_FILE = "the file is truncated or damaged; copy it again"
 UNREADABLE_FILE = "truncated or damaged, or not an image of this kind; copy it again, or check its name"
@@ -28,6 +31,13 @@ def volume_index(trailing: tuple[int, ...], volume: int | None) -> tuple[int, ..
         volumes = "one volume" if count == 1 else f"{count} volumes"
         raise InputError(f"volume {volume} asked for, but the file holds {volumes}; choose from 0 to {count - 1}")
     return tuple(int(i) for i in np.unravel_index(volume, trailing, order="F"))
+
+
+def check_room(sizes: Sequence[int], value_bytes: int) -> None:
+    """InputError if one volume, of its first three axes, does not fit memory, as it is read and as an `Image`."""
+    count = math.prod(sizes[:3])
+    shape = " x ".join(str(size) for size in sizes[:3])
+    check_memory(count * (value_bytes + IMAGE_BYTES), f"its {shape} voxels", "crop or resample it first")
 
 
 def one_line(words: object) -> str:
