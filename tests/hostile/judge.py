@@ -32,6 +32,7 @@ RAW_TEXT = re.compile(
     r"0x[0-9a-f]{8}|\.cxx|itk::|vtk\w+ \(|Generic Warning|^Warning|^ERROR|\.py:\d+|Traceback|terminate called|libpng|"
     r"TIFF|RuntimeWarning|UserWarning|DeprecationWarning|^WARNING"
 )
+SAID_WRITTEN = re.compile("^written all the same: |is kept", re.MULTILINE)  # outputs before the one that failed
 CONTROL = re.compile(r"[\x00-\x09\x0b-\x1f\x7f-\x9f]")
 TRACED = re.compile(r'File "[^"]*?(tetopt/[\w/]+\.py)", line (\d+), in (\w+)')
 
@@ -98,7 +99,7 @@ def _of_files(case: Case, folder: Path, before: dict[str, tuple], ending: Ending
     strays = sorted(name for name in new if not any(name == each or name.startswith(each + "/") for each in outputs))
     if strays:
         return "stray file", f"left behind: {strays[:3]}"
-    if ending.code == 2 and new and "is kept" not in ending.errors and "written" not in ending.errors:
+    if ending.code == 2 and new and not SAID_WRITTEN.search(ending.errors):
         return "half-written", f"refused, but wrote {sorted(new)[:3]}: {_last(ending)[:100]}"
     for name in sorted(new):
         path = folder / name
@@ -141,7 +142,11 @@ def _of_words(case: Case, ending: Ending) -> tuple[str, str]:
         return "promise missed", mistakes[0][:120]
     if len(mistakes) > 1:
         return "refused badly", f"{len(mistakes)} lines: {mistakes[0][:80]} / {mistakes[1][:80]}"
-    if not lines[-1].startswith("tetopt: ") or len(mistakes[0]) < SHORTEST_LINE or mistakes[0].endswith((": ", "()")):
+    if (
+        not lines[-1].startswith(("tetopt: ", "written all the same: "))
+        or len(mistakes[0]) < SHORTEST_LINE
+        or mistakes[0].endswith((": ", "()"))
+    ):
         return "refused badly", f"the line: {lines[-1][:120]}"
     if len(mistakes[0]) > LONGEST_LINE + sum(len(word) for word in case.words if len(word) > 60):
         return "refused badly", f"{len(mistakes[0])} characters: {mistakes[0][:90]}"

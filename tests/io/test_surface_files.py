@@ -174,3 +174,10 @@ def test_one_line_for_every_bad_file(tmp_path):
         (tmp_path / name).write_bytes(content)
         with pytest.raises(InputError, match=f"{name}: .*damaged\\?$"):
             checked_surface(tmp_path / name)
+
+
+@SUFFIXES
+def test_a_name_that_is_not_utf8_is_read_back(tmp_path, suffix):
+    points, cells = TWO_TETS
+    save_surface(tmp_path / f"caf\udce9{suffix}", surface_of(points, cells, np.arange(2)), "two")
+    assert checked_surface(tmp_path / f"caf\udce9{suffix}").is_watertight

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -107,12 +108,11 @@ def checked_surface(path: str | Path) -> SurfaceCheck:
     InputError
         A missing file, or one that holds no triangles or cannot be read.
     """
-    import trimesh  # takes most of a second
 
     if not Path(path).is_file():
         raise InputError(f"{path}: no such surface file")
     try:
-        surface = _from_vtk(path) if Path(path).suffix.lower() in (".vtp", ".vtk") else trimesh.load_mesh(path)
+        surface = _from_vtk(Path(path)) if Path(path).suffix.lower() in (".vtp", ".vtk") else _from_trimesh(Path(path))
         n_triangles = len(surface.faces)
     except Exception as error:  # trimesh raises whatever it pleases on damaged files
         raise InputError(f"{path}: cannot be read as a surface ({type(error).__name__}); damaged?") from error
@@ -127,12 +127,25 @@ def checked_surface(path: str | Path) -> SurfaceCheck:
     )
 
 
-def _from_vtk(path: str | Path) -> Any:
+def _from_trimesh(path: Path) -> Any:
+    """The triangles of an STL or PLY file, opened here, as names that are not UTF-8 are beyond trimesh."""
+    import trimesh
+
+    with path.open("rb") as stream:
+        return trimesh.load_mesh(stream, file_type=path.suffix[1:].lower())
+
+
+def _from_vtk(path: Path) -> Any:
     """The triangles of one of VTK's files as trimesh has them."""
     import pyvista
     import trimesh
+    from vtkmodules.vtkIOLegacy import vtkPolyDataReader
+    from vtkmodules.vtkIOXML import vtkXMLPolyDataReader
 
-    grid = pyvista.read(path)
+    reader = (vtkXMLPolyDataReader if path.suffix.lower() == ".vtp" else vtkPolyDataReader)()
+    reader.SetFileName(os.fsencode(path))  # type: ignore[arg-type]  # as bytes names that are not UTF-8, too
+    reader.Update()
+    grid = pyvista.wrap(reader.GetOutput())
     return trimesh.Trimesh(np.asarray(grid.points, dtype=np.float64), grid.regular_faces)
 
 
