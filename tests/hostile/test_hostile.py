@@ -29,7 +29,6 @@ def run(module, *words):
     )
 
 
-@pytest.mark.skip(reason="until what it finds is mended")
 @pytest.mark.skipif(os.environ.get("NUMBA_DISABLE_JIT") == "1", reason="slow as plain Python")
 def test_hostile_inputs_end_well(tmp_path):
     done = run(
