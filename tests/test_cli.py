@@ -25,6 +25,7 @@ import tetopt.cli.phantom
 import tetopt.engine.meshing
 from tetopt import Image, Mesh, lattice, load_image, load_mesh, load_phantom, quality, save_image, save_mesh
 from tetopt.cli.app import COMMANDS, loaded_command
+from tetopt.cli.console import show_error
 from tetopt.cli.promises import check_promises
 from tetopt.engine.loop import Optimized
 from tetopt.geometry.simplex import volumes
@@ -1107,3 +1108,11 @@ def test_segment_labels_must_lie_where_the_image_does(tmp_path, inputs, capfd):
     over = [*cut[:4], tmp_path / "truth.nii", *cut[5:], "--truth", tmp_path / "truth.nii", "--force"]
     assert exit_code(*over) == 2
     assert (tmp_path / "truth.nii").read_bytes() == kept
+
+
+def test_an_error_of_a_million_letters_is_cut(capsys):
+    show_error("a.txt, line 3: expected a label, got " + "x" * 1_000_000 + "; mend it")
+    error = capsys.readouterr().err
+    assert error.startswith("tetopt: a.txt, line 3: expected a label, got x")
+    assert error.endswith("x; mend it\n")
+    assert len(error) < 500

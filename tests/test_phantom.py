@@ -633,3 +633,10 @@ def test_voxels_that_no_image_has_are_refused_before_they_are_painted(tmp_path, 
     monkeypatch.setattr(tetopt.phantom, "_voxel_centers", None)  # nothing may be painted
     with pytest.raises(InputError, match=r"phantom 'a': .*1000 times as long"):
         load_phantom(tmp_path / "a.toml").image()
+
+
+def test_a_blur_wider_than_the_box_is_refused():
+    phantom = load_phantom("disc_2d")
+    assert np.ptp(phantom.image(voxel_mm=8, blur_mm=64).data) < 1.0
+    with pytest.raises(InputError, match="blur_mm: expected at most the box's 64 mm, got 1e\\+20"):
+        phantom.image(voxel_mm=8, blur_mm=1e20)

@@ -223,6 +223,8 @@ class Phantom:
         """
         where = f"phantom {self.name!r}"
         blur = _number(self.blur_mm if blur_mm is None else blur_mm, f"{where}: blur_mm", 0.0)
+        if blur > self.size_mm.max():  # beyond it nothing is left but the mean, and the filter is as long as it is wide
+            raise InputError(f"{where}: blur_mm: expected at most the box's {self.size_mm.max():g} mm, got {blur:g}")
         sd = _number(self.noise_sd if noise_sd is None else noise_sd, f"{where}: noise_sd", 0.0)
         seed = _integer(self.seed if seed is None else seed, f"{where}: seed")
         supersample = _integer(supersample, f"{where}: supersample", 1, MAX_SUPERSAMPLE)

@@ -511,7 +511,8 @@ def special_files(draw):
     if suffix == ".out":
         name = "special" + draw.one(*MESH_OUTPUTS)
         draw.files = {name: b"special:" + kind.encode()}
-        return what, ("convert", draw.good("m.vtu"), name, *draw.one((), ("--force",))), ()
+        through = (name, "nowhere") if kind == "gone" else ()  # --force writes where a link leads
+        return what, ("convert", draw.good("m.vtu"), name, *draw.one((), ("--force",))), through
     mesh = draw.good("m.vtu")
     words = {
         ".csv": ("convert", mesh, "out.vtu", "--young", name), ".txt": ("convert", mesh, "out.vtu", "--label-names",

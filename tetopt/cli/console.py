@@ -17,6 +17,7 @@ from rich.text import Text
 from tetopt.io.text import plain
 
 WIDEST_TABLE = 500  # characters in a line
+LONGEST_ERROR = 480  # characters: what to do stands at the end, what came may be a line of a million
 PARAMETER_OPTIONS = {  # of the library's functions: what the command line calls them
     **{
         name: f"--{name.replace('_', '-').lower()}"
@@ -129,8 +130,11 @@ def error_words(error: Exception) -> str:
 
 
 def show_error(message: object) -> None:
-    """Say what is wrong, on one line, with the command's names for options."""
-    log.print(f"[bold red]tetopt:[/] {escape(plain(in_options(str(message))))}")
+    """Say what is wrong, on one line that is not endless, with the command's names for options."""
+    line = plain(in_options(str(message)))
+    if len(line) > LONGEST_ERROR:  # of a file's own words
+        line = f"{line[: LONGEST_ERROR // 2]} ... {line[-LONGEST_ERROR // 3 :]}"
+    log.print(f"[bold red]tetopt:[/] {escape(line)}")
 
 
 def in_options(message: str) -> str:
