@@ -37,6 +37,7 @@ test-slow: $(VENV)/.test
 # 10,000 hostile inputs, of the seed in HOSTILE_SEED; the suite runs 200. What ended badly is kept, and its folder printed.
 test-hostile: $(VENV)/.test
 	PYTHONPATH=.:tests PYTHONUTF8=1 NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python -m hostile --inputs 10000 --workers 2
+	$(TESTED) -q -s --no-header tests/hostile/test_faults.py tests/hostile/test_kills.py
 
 # CalculiX and dolfinx from Debian, MFEM, gmsh (run beside the tests, never imported by tetopt) and pyfebio from PyPI.
 test-solvers: $(VENV)/.test

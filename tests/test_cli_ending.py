@@ -2,6 +2,7 @@
 
 import os
 import re
+import shutil
 import signal
 import sys
 from contextlib import contextmanager
@@ -265,3 +266,20 @@ def test_what_was_written_before_an_error_is_said(image, folder, monkeypatch, ca
     assert said[-2:] == [
         f"tetopt: {folder / 'a.json'}: No space left on device", f"written all the same: {folder / 'a.vtu'}"
     ]  # fmt: skip
+
+
+def test_a_mesh_that_the_disk_cannot_take_is_refused_before_the_run(image, folder, monkeypatch, capsys):
+    monkeypatch.setattr("shutil.disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 10**9, 5000))
+    monkeypatch.setattr(tetopt.cli.mesh, "watched_run", None)
+    assert exit_code("mesh", image, "-o", folder / "a.vtu", *QUICK) == 2
+    assert "a.vtu: takes some 8640 bytes or more, 5000 are free; make room first" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("name", ["quality", "edge_ratios", "run_summary"])
+def test_nothing_that_fails_after_the_run_loses_the_mesh(image, folder, monkeypatch, name):
+    def short(*_, **__):
+        raise MemoryError
+
+    monkeypatch.setattr(tetopt.cli.mesh, name, short)
+    assert exit_code(*mesh_words(image, folder, "--nodes", "60", "--size-max", "9", "--iterations", "1")) == 2
+    assert names_in(folder) == ["a.vtu"]

@@ -330,7 +330,9 @@ def test_an_error_names_the_file_and_a_full_disk_the_bytes(tmp_path, monkeypatch
 
 def test_space_is_asked_for(tmp_path):
     check_space(tmp_path / "a.vtu", 1)
-    with pytest.raises(InputError, match=r"a.vtu: takes some 1000000000000 MB, \d+ MB are free; make room"):
+    with pytest.raises(
+        InputError, match=r"a.vtu: takes some 1000000000000000000 bytes or more, \d+ are free; make room"
+    ):
         check_space(tmp_path / "a.vtu", 10**18)
 
 

@@ -59,7 +59,7 @@ from tetopt.engine.meshing import (
 from tetopt.geometry.box import box_sides
 from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import centroids, squared_edges
-from tetopt.io.files import TakenError, save_json
+from tetopt.io.files import TakenError, check_space, save_json
 from tetopt.io.formats import format_of
 from tetopt.io.meshes import MeshFile
 from tetopt.io.mni import mni_path
@@ -74,6 +74,8 @@ from tetopt.start.octree import nodes_of_sizes
 from tetopt.start.sizes import edge_ratios
 from tetopt.target.content import Content
 from tetopt.target.domain import INSIDE_SHARE
+
+CELL_BYTES = 40  # of a file, at least: a VTU with a cell's usual fields takes 48, other formats more
 
 
 class Task(NamedTuple):
@@ -114,8 +116,13 @@ def mesh_command(
     set_threads(engine.threads)
     task = _read(plan)
     with mesh_kept() as begin_keeping:
-        outcome = _run(task, begin, begin_keeping)
-        model, measured = _write(task, outcome, begin)
+        result, seconds, predicted = _run(task, begin, begin_keeping)
+        model, about = _save(task, result)
+        assert result.initial is not None
+        # Only from here on, as nothing may fail before the mesh is written.
+        first, last = (quality(each.points, each.cells) for each in (result.initial, result.mesh))
+        outcome = Outcome(result, result.initial, seconds, predicted, (first, last))
+        measured = _write(task, outcome, model, about, begin)
         code = _print(task, outcome, model, measured)
         return signal_code() if is_ended() else code
 
@@ -148,8 +155,8 @@ def _check_place(mesh: Mesh, image: Image, path: str) -> None:
         show_warning(f"{path}: {np.mean(~is_in):.1%} of its cells lie beside the image, where it has no say")
 
 
-def _run(task: Task, begin: float, begin_keeping: Callable[[], None]) -> Outcome:
-    """The optimised mesh; a target error takes several runs, one after the other."""
+def _run(task: Task, begin: float, begin_keeping: Callable[[], None]) -> tuple[Optimized, dict[str, float], float]:
+    """The optimised mesh, what took how long, and the bytes predicted; a target error takes several runs in turn."""
     plan, content = task.plan, task.source.content
     solver, output, options = plan.solver, plan.output.mesh, plan.engine_options()
     ends = None if plan.engine.max_seconds is None else begin + plan.engine.max_seconds
@@ -163,6 +170,7 @@ def _run(task: Task, begin: float, begin_keeping: Callable[[], None]) -> Outcome
             check_early(
                 output, solver, task.source.image, lambda early: _model(task, initial, early, about, is_told=False)
             )
+        check_space(output, CELL_BYTES * len(initial.cells))
         begun.append(time.perf_counter())
         log.print(escape(_described(task, initial)))
         prepare(content, options["k_D"], plan.mode)
@@ -179,10 +187,9 @@ def _run(task: Task, begin: float, begin_keeping: Callable[[], None]) -> Outcome
     )  # fmt: skip
     assert result.initial is not None
     seconds = {"load": begun[0] - begin, "optimize": time.perf_counter() - begun[0]}
-    first, last = (quality(each.points, each.cells) for each in (result.initial, result.mesh))
     n_nodes = max(result.nodes or 0, len(result.initial.points))
     predicted = max(before[0], before[1] + bytes_of(content, n_nodes))
-    return Outcome(result, result.initial, seconds, predicted, (first, last))
+    return result, seconds, predicted
 
 
 def _memory_limit(plan: Plan, content: Content) -> MemoryLimit | None:
@@ -248,9 +255,9 @@ def _model(
     return solver_model(mesh, source.image, solver, fields, about, known_sets)
 
 
-def _write(task: Task, outcome: Outcome, begin: float) -> tuple[Model, dict[str, Any]]:
-    """Write the mesh, the numbers and the pictures; the model, and how well mask, labels and contrasts are met."""
-    plan, source, result = task.plan, task.source, outcome.result
+def _save(task: Task, result: Optimized) -> tuple[Model, dict[str, Any]]:
+    """Write the mesh, or keep it elsewhere; the model, and what files say about the run."""
+    plan, source = task.plan, task.source
     solver, output = plan.solver, plan.output
     options = plan.stated(source.content.image.ndim)
     if plan.sizes.target_error is not None:
@@ -268,6 +275,14 @@ def _write(task: Task, outcome: Outcome, begin: float) -> tuple[Model, dict[str,
 
         save_anyway(output.mesh, result.mesh, bare, error)
         raise
+    return model, about
+
+
+def _write(
+    task: Task, outcome: Outcome, model: Model, about: dict[str, Any], begin: float
+) -> dict[str, Any]:  # fmt: skip
+    """Write the numbers and the pictures; how well mask, labels and contrasts are met."""
+    plan, source, result, output = task.plan, task.source, outcome.result, task.plan.output
     measured = fidelity(source.labels, source.mask, result.mesh, model.cell_data.get("label"))
     if not source.content.is_plain or source.content.region is not None:
         measured["contrasts"] = source.by_contrast(model.cell_data)
@@ -293,7 +308,7 @@ def _write(task: Task, outcome: Outcome, begin: float) -> tuple[Model, dict[str,
         save_json(output.json_path, summary | measured | model_summary(model))
     if plan.pictures:
         _draw(task, outcome, model)
-    return model, measured
+    return measured
 
 
 def _draw(task: Task, outcome: Outcome, model: Model) -> None:

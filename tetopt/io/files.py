@@ -135,7 +135,7 @@ def check_space(path: Path, n_bytes: int) -> None:
     """InputError if the disk of `path` has not so many bytes free, as far as it tells."""
     free = shutil.disk_usage(os.path.realpath(path.parent)).free
     if free < n_bytes:
-        raise InputError(f"{path}: takes some {n_bytes / 1e6:.0f} MB, {free / 1e6:.0f} MB are free; make room first")
+        raise InputError(f"{path}: takes some {n_bytes} bytes or more, {free} are free; make room first")
 
 
 @contextmanager

@@ -1,0 +1,43 @@
+"""kill -9 within the window of writing leaves the old file or the new one, whole, and confuses no later run."""
+
+import json
+import os
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[2]
+
+pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="open files are told by /proc")
+
+
+def test_a_killed_process_leaves_a_whole_file(tmp_path):
+    """Old or new; and at most one temporary file, of a hidden name."""
+    path = os.pathsep.join((str(ROOT), str(ROOT / "tests")))
+    done = subprocess.run(
+        [sys.executable, "-m", "hostile.kills", tmp_path], env=os.environ | {"PYTHONPATH": path}, capture_output=True,
+        text=True, check=False,
+    )  # fmt: skip
+    assert done.returncode == 0, done.stderr[-3000:]
+    counts = Counter()
+    for window, rows in json.loads(done.stdout).items():
+        has_old = "replaced" in window or "a link" in window
+        assert len(rows) > 8, window
+        for step, state, n_hidden, others, is_whole_again in rows:
+            where = (window, step, state, n_hidden, others)
+            # Where there are no links the name is taken by an empty file, for the one step in which that is replaced.
+            is_taken = "without links" in window and step == "replace" and state == "empty"
+            assert state in ("new", "old" if has_old else "none") or is_taken, where
+            assert n_hidden <= 1, where
+            assert others == [], where
+            assert is_whole_again, where
+            counts[step or "none", state, "a hidden file" if n_hidden else ""] += 1
+        assert rows[-1][:3] == [None, "new", 0], window
+        assert [row[1] for row in rows] == sorted((row[1] for row in rows), key=["none", "old", "empty", "new"].index)
+    print("\n| killed before | file | besides | times |\n|---|---|---|---|")
+    for row, times in sorted(counts.items()):
+        print(f"| {' | '.join(row)} | {times} |")
+    assert {state for _, state, _ in counts} == {"none", "old", "empty", "new"}
