@@ -1,5 +1,6 @@
 """Sizes: targets that a run comes near to, limits that it keeps but for a few edges; what they are made of."""
 
+import re
 import sys
 
 import numpy as np
@@ -265,6 +266,15 @@ def test_sizes_around_are_the_twin_s():
     np.minimum.at(back, ends.ravel(), np.repeat(0.6 * length, 2))
     expected = np.minimum((own[None] + ways).min(axis=1), own + back)
     np.testing.assert_allclose(_around(own, mesh.points, mesh.cells, 0.3), expected, rtol=1e-9)
+
+
+@pytest.mark.parametrize("sizes", [Sizes(longest=4.0), Sizes(longest=7.0), Sizes(largest=5.0)])
+def test_a_refusal_names_a_number_that_will_do(sizes):
+    image = tetopt.Image(100.0 * (np.indices((30, 30, 30)).sum(0) > 40))
+    with pytest.raises(tetopt.InputError, match="ask for") as refusal:
+        tetopt.octree(image, 60, sizes)
+    nodes = int(re.search(r"ask for (\d+)", str(refusal.value))[1])
+    assert len(tetopt.octree(image, nodes, sizes).points) > 0.5 * nodes
 
 
 @pytest.mark.parametrize(

@@ -59,6 +59,7 @@ class LabelFidelity(NamedTuple):
     components: int  # pieces of its voxels that hang together by faces
     mesh_components: int  # pieces of its cells that hang together by facets
     is_lost: bool  # nothing of the mesh carries it
+    distance_max: float = np.nan  # the largest of the distances: of single spikes, which a percentile does not see
 
 
 class MaskFidelity(NamedTuple):
@@ -170,6 +171,7 @@ def label_fidelity(labels: Image, mesh: Mesh, of_cell: ArrayLike | None = None) 
                 int(scipy.ndimage.label(part == label)[1]),
                 _n_components(mesh.cells[label_of_cell == label]),
                 bool(n_cells[label] == 0 and (label > 0 or owner.min() >= 0)),
+                float(distances.max(initial=0.0)) if len(distances) else np.nan,
             )
         )
     return rows

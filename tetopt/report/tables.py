@@ -93,14 +93,14 @@ def sizes_in_words(edges: EdgeRatios) -> str:
 def label_table(rows: Sequence[LabelFidelity], interfaces: Sequence[LabelInterface], names: Mapping[int, str]) -> Table:
     """How well a mesh represents labels, and what their surfaces are like, a row for each, with its name if any."""
     table = new_table(
-        "label", "voxels", "size, mm^n", "cells", "more, %", "Dice", "by volume", "apart, mm", "95 %", "area ratio",
-        "folded, %", "edges in > 2", "pieces", "of cells",
+        "label", "voxels", "size, mm^n", "cells", "more, %", "Dice", "by volume", "apart, mm", "95 %", "most",
+        "area ratio", "folded, %", "edges in > 2", "pieces", "of cells",
     )  # fmt: skip
     for row, surface in zip(rows, interfaces, strict=True):
         change = 100.0 * (row.mesh_volume / row.volume - 1.0)
         words = escape(f"{row.label} {names.get(row.label, '')}".strip())
         size = _decimals(row.volume, 1 if row.volume < LARGE_SIZE else 0)
-        apart = [_decimals(mm, 3) for mm in (row.distance_mean, row.distance_p95)]
+        apart = [_decimals(mm, 3) for mm in (row.distance_mean, row.distance_p95, row.distance_max)]
         table.add_row(
             words, str(row.voxels), size, str(row.n_cells), f"{change:+.1f}",
             f"{row.dice:.4f}", f"{row.volume_dice:.4f}", *apart, _decimals(surface.area_ratio, 3),

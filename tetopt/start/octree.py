@@ -96,6 +96,8 @@ def octree(image: Image | Content, nodes: int, sizes: Sizes | None = None) -> Me
     fewest, by_target = _fewest_nodes(content, limits), _target_nodes(content, limits)
     if max(fewest, by_target) > (1.0 + LARGEST_MISS) * nodes + LARGEST_MISS_NODES:
         least, enough = max(fewest, by_target), max(fewest, SIZED_OVER_EQUILATERAL * by_target)
+        if limits.target is None and enough <= content.image.data.size:  # the bound is low: the coarsest octree tells
+            enough = len(_octree_within(content, nodes, limits).points)
         raise InputError(
             f"octree: {nodes} nodes are too few for {shape} voxels{given_sizes}: they need {least:.4g} or more; "
             f"ask for {np.ceil(enough):.0f}, or allow longer edges"
