@@ -145,7 +145,7 @@ def _of_words(case: Case, ending: Ending) -> tuple[str, str]:
     if (
         not lines[-1].startswith(("tetopt: ", "written all the same: "))
         or len(mistakes[0]) < SHORTEST_LINE
-        or mistakes[0].endswith((": ", "()"))
+        or mistakes[0].endswith(": ")
     ):
         return "refused badly", f"the line: {lines[-1][:120]}"
     if len(mistakes[0]) > LONGEST_LINE + sum(len(word) for word in case.words if len(word) > 60):
