@@ -247,6 +247,7 @@ ITK_BOMBS = {
     "packed.mha": (mha(sizes="32767 32767 32767", more="CompressedData = True\n"), "tells of 32767 x"),
     "channels.mha": (mha(more="ElementNumberOfChannels = 999999999\n"), "tells of 3 x 4 x 5 voxels, 6e.10 bytes"),
     "type.mha": (mha(kind="MET_OTHER"), "voxels of type MET_OTHER"),
+    "colon.mha": (mha(more="DimSize : 3 2 2 =\n"), "not an image of this kind"),
     "none.mha": (b"NDims = 3\n", "its header has no DimSize"),
     "axes.nrrd": (nrrd(dimension="-1"), "expected 1 to 8 axes, got -1"),
     "huge.nrrd": (nrrd(sizes="99999999999 9 9"), "tells of 99999999999 x 9 x 9 voxels"),
@@ -286,6 +287,23 @@ def test_voxels_lie_beside_their_header(tmp_path, name):
     for header, raw in headers.items():
         (inner / header).write_bytes(raw)
         refused(load_image, inner / header, "only a file beside the header, by its bare name, is read|damaged")
+
+
+@pytest.mark.parametrize(
+    "header",
+    [
+        "data file: LIST 3 :=\n../a.raw\n",  # ":=" after a field is no key and value
+        "# 100 letters".ljust(99) + "\n",  # and more comments than are read here
+    ],
+)
+def test_no_header_hides_where_its_voxels_are(tmp_path, header):
+    pytest.importorskip("SimpleITK")
+    (tmp_path / "inner").mkdir()
+    (tmp_path / "a.raw").write_bytes(bytes(range(60)))
+    if header.startswith("#"):
+        header = header * 11_000 + "data file: ../a.raw\n"
+    (tmp_path / "inner" / "a.nhdr").write_bytes(nrrd(more=header, data=b""))
+    refused(load_image, tmp_path / "inner" / "a.nhdr", "by its bare name, is read|a header of more than 1048576 bytes")
 
 
 @pytest.mark.parametrize("header", ["a.mhd", "a.nhdr"])

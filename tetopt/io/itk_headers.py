@@ -54,6 +54,8 @@ def checked_header(path: Path) -> tuple[int, int]:
     with path.open("rb") as stream:
         head = stream.read(HEADER_BYTES)
     header = _nrrd(head) if path.suffix.lower() in (".nrrd", ".nhdr") else _metaimage(head)
+    if header.files and len(head) == HEADER_BYTES:  # what follows might name others
+        raise InputError(f"{UNREADABLE_FILE} (a header of more than {HEADER_BYTES} bytes, its voxels elsewhere)")
     n_bytes = path.stat().st_size
     for name in header.files:
         _check_beside(path, name)
@@ -100,7 +102,7 @@ def _metaimage(head: bytes) -> VoxelHeader:
     lines = head.split(b"\n")
     for number, line in enumerate(lines):
         key, equals, value = (part.strip() for part in line.decode("latin-1").partition("="))
-        if key and not equals:
+        if (key and not equals) or ":" in key:  # which ITK takes for the end of a key, too
             raise InputError(UNREADABLE_FILE)
         fields[key] = value
         if key == "ElementDataFile":
@@ -129,13 +131,15 @@ def _nrrd(head: bytes) -> VoxelHeader:
     fields: dict[str, str] = {}
     files: list[str] = []
     lines = [line.decode("latin-1").rstrip("\r") for line in head.split(b"\n")]
+    if len(head) == HEADER_BYTES and "" not in lines:
+        raise InputError(f"{UNREADABLE_FILE} (a header of more than {HEADER_BYTES} bytes)")
     for number, line in enumerate(lines[1:], 1):
         if not line:
             break
-        if line.startswith("#") or ":=" in line:
+        key, _, value = line.partition(":")
+        if line.startswith("#") or value.startswith("="):  # "key:=value"; of a field's value ":=" is a part
             continue
-        key, _, value = (part.strip() for part in line.partition(":"))
-        key = key.lower()
+        key, value = key.strip().lower(), value.strip()
         fields[key] = value
         if key in ("data file", "datafile"):
             if value.upper().startswith("LIST"):
