@@ -289,6 +289,17 @@ def test_a_folder_that_everybody_may_write_is_no_cache(place, monkeypatch, tmp_p
     assert os.environ["NUMBA_CACHE_DIR"] == str(tmp_path / "own" / "numba")
 
 
+def test_compilers_run_no_modules_of_the_current_folder(tmp_path, monkeypatch):
+    for name in ("numpy", "json", "tempfile"):
+        (tmp_path / f"{name}.py").write_text("open('executed', 'w')\n")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(os, "cpu_count", lambda: 2)
+    words = []
+    kernels._compile_apart(kernels.ALL_KERNELS[:1], tmp_path, words.append)
+    assert words[0].endswith("of 1")
+    assert not (tmp_path / "executed").exists()
+
+
 # What the cache holds, or cannot take.
 
 USE = """

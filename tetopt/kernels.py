@@ -555,7 +555,7 @@ def _compile_apart(kernels: Sequence[Any], folder: Path, say: Callable[[str], No
             f"from tetopt.kernels import compile_named; compile_named({names!r}, {claims!r}, {os.getpid()})"
         )
         try:
-            command = [sys.executable, "-c", code]
+            command = [sys.executable, "-P", "-c", code]
             processes.extend(subprocess.Popen(command, env=environment) for _ in range(n_processes))
             while any(process.poll() is None for process in processes):
                 say(f"compiling the kernels, {len(os.listdir(claims))} of {len(kernels)}")

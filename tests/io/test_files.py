@@ -276,8 +276,16 @@ def test_permissions_follow_the_umask(tmp_path, mask, mode):
 
 @pytest.mark.skipif(os.name == "nt", reason="Windows has no such rights")
 @pytest.mark.parametrize("mode", [0o600, 0o640, 0o444])
-def test_a_replaced_file_keeps_its_rights(tmp_path, mode):
-    """Patient data that nobody else may read stays so."""
+def test_a_replaced_file_keeps_its_rights(tmp_path, mode, monkeypatch):
+    """Patient data that nobody else may read stays so; what nobody may write is replaced by its owner, too."""
+    open_file = os.open
+
+    def opened(file, flags, *rest, **options):  # as for anybody but root
+        if flags & os.O_RDWR and os.path.exists(file) and not os.stat(file).st_mode & stat.S_IWUSR:
+            raise PermissionError(errno.EACCES, "Permission denied", file)
+        return open_file(file, flags, *rest, **options)
+
+    monkeypatch.setattr(os, "open", opened)
     path = tmp_path / "a.json"
     path.write_text("old")
     path.chmod(mode)

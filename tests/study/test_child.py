@@ -88,6 +88,15 @@ def test_a_crash_is_repeated_once(tmp_path, monkeypatch):
     assert len(lines) == 1
 
 
+def test_modules_of_the_current_folder_are_not_run(tmp_path, monkeypatch):
+    """A stranger's image may lie in one with a numpy.py."""
+    for name in ("numpy", "json", "tempfile"):
+        (tmp_path / f"{name}.py").write_text("open('executed', 'w')\n")
+    monkeypatch.chdir(tmp_path)
+    assert run_in_child(pipes.fine, JOB, max_seconds=60.0).failure is None
+    assert not (tmp_path / "executed").exists()
+
+
 @pytest.mark.parametrize(
     ("code", "words"),
     [

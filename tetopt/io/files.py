@@ -162,8 +162,7 @@ def written_whole(path: Path, n_bytes: int | None = None) -> Iterator[Path]:
         temporary = Path(name)
         os.close(handle)
         yield temporary
-        _take_rights(temporary, place)
-        _synchronise(temporary)
+        _synchronise(temporary, place)
         if outputs is None or outputs.may_replace.get(key, True):
             os.replace(temporary, place)
         elif not _linked(temporary, place):
@@ -238,10 +237,14 @@ def _take_rights(temporary: Path, place: Path) -> None:
     os.chmod(temporary, mode)
 
 
-def _synchronise(file: Path) -> None:
-    """Have the file on the disk itself: a power cut after the renaming would else leave an empty one."""
-    handle = os.open(file, os.O_RDWR)
+def _synchronise(temporary: Path, place: Path) -> None:
+    """Have the file, with its rights, on the disk itself: a power cut after the renaming would else leave an empty one.
+
+    It is opened before it takes the rights, with which nobody may perhaps write it.
+    """
+    handle = os.open(temporary, os.O_RDWR)
     try:
+        _take_rights(temporary, place)
         os.fsync(handle)
     finally:
         os.close(handle)

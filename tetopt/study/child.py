@@ -116,7 +116,7 @@ def _run_once(pipeline: Callable[[Job], Produced], job: Job, max_seconds: float,
         paths = os.pathsep.join(filter(None, sys.path))  # the same modules as here
         with open(folder / "stderr.txt", "wb") as errors:
             child = subprocess.Popen(
-                [sys.executable, "-m", "tetopt.study.child", str(folder)],
+                [sys.executable, "-P", "-m", "tetopt.study.child", str(folder)],
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=errors,

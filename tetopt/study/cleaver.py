@@ -166,7 +166,9 @@ def _run(cube: Cube, feature_scaling: float) -> tuple[NDArray[np.float64], NDArr
 
 
 def _python(program: str, *arguments: str) -> subprocess.CompletedProcess[Any]:
-    return subprocess.run([sys.executable, "-c", program, *arguments], capture_output=True, text=True, check=False)
+    return subprocess.run(
+        [sys.executable, "-P", "-c", program, *arguments], capture_output=True, text=True, check=False
+    )
 
 
 def _ending(done: subprocess.CompletedProcess[Any]) -> str:
