@@ -156,6 +156,7 @@ def legacy(points=4, cells=1, numbers=5, more=""):
 VTK_BOMBS = {
     "points.vtu": (vtu(points=2**62, head=struct.pack("<Q", 2**63)), f"NumberOfPoints is {2**62}, its .* at most"),
     "minus.vtu": (vtu(points=-4, head=struct.pack("<Q", 96)), "NumberOfPoints is -4"),
+    "digits.vtu": (vtu(points="+", head=struct.pack("<Q", 96)), "damaged, or not a VTK mesh"),
     "tuples.vtu": (vtu(extra=TUPLES.format(2**62), head=struct.pack("<Q", 96)), "NumberOfTuples is"),
     "blocks.vtu": (vtu(compressor=ZLIB, head=struct.pack("<4Q", 2**62, 96, 0, 50), data=PACKED), "VTK crashed at"),
     "sizes.vtu": (vtu(compressor=ZLIB, head=struct.pack("<4Q", 1, 2**36, 0, 50), data=PACKED), "VTK crashed at"),

@@ -15,7 +15,7 @@ from tetopt.errors import InputError
 from tetopt.io.apart import DEFLATE_RATIO, read_apart
 
 # Counts in a VTU file's tags, and in the lines of a VTK file: each thing counted takes a byte at least.
-XML_COUNT = re.compile(rb"<[^<>]{0,10000}?\b(NumberOf\w+)\s*=\s*[\"']\s*([-+]?[\d.eE+]+)")
+XML_COUNT = re.compile(rb"<[^<>]{0,10000}?\b(NumberOf\w+)\s*=\s*[\"']\s*([-+]?\d+(?:\.\d*)?(?:[eE]\+?\d+)?)")
 LEGACY_COUNT = re.compile(
     rb"^(POINTS|CELLS|CELL_TYPES|POINT_DATA|CELL_DATA|OFFSETS|VERTICES|LINES|POLYGONS|TRIANGLE_STRIPS|[^\s]+ \d+)"
     rb"[ \t]+(-?\d+)(?=[ \t]*\r?\n|[ \t]+(?:\d+|[a-z_0-9]+)[ \t]*\r?\n)",
