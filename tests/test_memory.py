@@ -15,7 +15,9 @@ from models import sample_image
 import tetopt
 from tetopt import budget
 from tetopt.cli import run as cli_run
+from tetopt.cli import warm_up
 from tetopt.energy.sampling import sampling_grid
+from tetopt.engine import fast
 from tetopt.engine.loop import Optimized, Record
 from tetopt.engine.meshing import bytes_of
 from tetopt.fem.elasticity import stiffness
@@ -217,3 +219,20 @@ def test_compiling_and_long_iterations_are_told(monkeypatch):
     assert re.fullmatch(rf"iteration   0/1  E 1\.0000  E_G 1.* cells  3\.0 s, ({memory})", lines[0])
     assert re.fullmatch(rf"  in iteration 1, 11\.0 s, ({memory})", lines[1])
     assert lines[2].startswith("iteration   1/1  E 0.9000")
+
+
+@pytest.mark.parametrize("command", ["mesh", "warm-up"])
+def test_commands_hear_how_compiling_goes(command, monkeypatch, capsys):
+    class Linked(Exception):
+        pass
+
+    def link(kernels, progress=None):
+        assert kernels
+        progress("compiling the kernels, 1 of 2")
+        raise Linked
+
+    monkeypatch.setattr(fast if command == "mesh" else warm_up, "link", link)
+    run = {"mesh": lambda: cli_run.prepare(plain(IMAGE), 0.5, "graded"), "warm-up": warm_up.warm_up_command}[command]
+    with pytest.raises(Linked):
+        run()
+    assert "compiling the kernels, 1 of 2 (of the first run only)" in capsys.readouterr().err

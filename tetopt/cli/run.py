@@ -63,17 +63,25 @@ def watched_run(
 def prepare(content: Content, k_D: float, mode: Mode) -> None:
     """Load the compiled kernels, or compile them, before the clock of the first iteration starts."""
     begin = time.perf_counter()
-    with log.status("preparing the kernels (the first run compiles them, half a minute) ...") as status:
+    with compiling("preparing the kernels (the first run compiles them, half a minute)") as progress:
+        prepare_kernels(content, k_D, "paper" if mode == "paper" else "fast", mode == "graded", progress)
+    seconds = time.perf_counter() - begin
+    if seconds > LONG_SECONDS:
+        log.print(f"kernels compiled in {seconds:.0f} s; later runs on images of this kind load them from the cache")
+
+
+@contextlib.contextmanager
+def compiling(title: str) -> Iterator[Callable[[str], None]]:
+    """A function that shows how far compiling is: a terminal's status, which begins with `title`, else lines."""
+    begin = time.perf_counter()
+    with log.status(f"{title} ...") as status:
         say = rare_lines(is_first_said=True)
 
         def progress(words: str) -> None:
             status.update(f"{words} ...")
             say(f"{words} (of the first run only), {time.perf_counter() - begin:.0f} s")
 
-        prepare_kernels(content, k_D, "paper" if mode == "paper" else "fast", mode == "graded", progress)
-    seconds = time.perf_counter() - begin
-    if seconds > LONG_SECONDS:
-        log.print(f"kernels compiled in {seconds:.0f} s; later runs on images of this kind load them from the cache")
+        yield progress
 
 
 def rare_lines(is_first_said: bool = False) -> Callable[[str], None]:

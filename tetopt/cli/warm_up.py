@@ -9,7 +9,8 @@ from rich.markup import escape
 
 from tetopt import Image, InputError, cell_fields, label_fidelity, mask_fidelity, mesh_image
 from tetopt.cache import place_cache
-from tetopt.cli.console import log, out
+from tetopt.cli.console import out
+from tetopt.cli.run import compiling
 from tetopt.fem.reference import reference
 from tetopt.kernels import link, roots
 from tetopt.target.content import content
@@ -24,8 +25,8 @@ def warm_up_command() -> int:
     if place.notice is not None:
         raise InputError(f"warm-up: nothing can be kept: {place.notice}")
     begin = time.perf_counter()
-    with log.status("compiling all kernels, a minute on two cores ..."):
-        link(roots())
+    with compiling("compiling all kernels, a minute on two cores") as progress:
+        link(roots(), progress)
         for n in (3, 2):
             _mesh_balls(n)
         reference(Image(1.0 + np.indices((8, 8, 8)).sum(axis=0)), nu=0.3)

@@ -206,7 +206,7 @@ def prepare_kernels(
             "interfaces": has_labels,
             "labelling": has_labels,
         }
-        link([kernel for kernel in roots() if kernel not in unused and purposes.get(kernel.room, True)])
+        link([kernel for kernel in roots() if kernel not in unused and purposes.get(kernel.room, True)], progress)
     is_whole = not content.is_plain or np.array_equal(np.rint(image.data), image.data)
     step = 1.0 if is_whole else 0.1
     tiny = Image(np.zeros((3,) * image.ndim) + step * np.arange(3))
