@@ -11,19 +11,27 @@ import numbers
 import re
 from collections.abc import Callable, Iterable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, get_args, get_origin
 
 import numpy as np
 
 from tetopt.errors import InputError
 
 ARRAY_WORDS = ("ArrayLike", "NDArray", "Points", "Cells")  # as annotations call them
+TABLE_WORDS = ("Points", "Cells")  # of these, those of a row each, which are taken as they are
 # How each is made, for who gives something else.
 REMEDIES = {
     "Image": "tetopt.load_image(path) reads one, tetopt.Image(array, affine) makes one",
     "Mesh": "tetopt.load_mesh(path).mesh reads one, tetopt.mesh_image(...).mesh is one",
 }
-NAMES_OF_KINDS = {"int": "a whole number", "float": "a number", "str": "a text", "bool": "True or False"}
+NAMES_OF_KINDS = {
+    "int": "a whole number",
+    "float": "a number",
+    "str": "a text",
+    "bool": "True or False",
+    "Points": "an array of a row a point",
+    "Cells": "an array of a row a cell",
+}
 LARGEST_INTEGER = 2**63 - 1  # of numpy's: nothing that is counted here is more
 
 
@@ -60,7 +68,7 @@ def _check(what: str, annotation: str, value: Any, names: dict[str, Any]) -> Non
             for field, kind in type(value).__annotations__.items():
                 _check(f"{what}.{field}", getattr(kind, "__forward_arg__", str(kind)), getattr(value, field), names)
         return
-    expected = " or ".join(NAMES_OF_KINDS.get(kind, kind) for kind in kinds)
+    expected = " or ".join(_in_words(kind, names) for kind in kinds)
     remedy = next((f"; {REMEDIES[kind]}" for kind in kinds if kind in REMEDIES), "")
     raise InputError(f"{what}: expected {expected}, got {_shown(value)}{remedy}")
 
@@ -75,7 +83,7 @@ def _is_of(kind: str, value: Any, names: dict[str, Any]) -> bool | None:
     if kind in ("str", "bool", "Path"):
         return isinstance(value, {"str": str, "bool": bool | np.bool_, "Path": Path}[kind])
     if head in ARRAY_WORDS:
-        return _is_array(value)
+        return _is_array(value) and (head not in TABLE_WORDS or (isinstance(value, np.ndarray) and value.ndim == 2))
     if head == "dict":
         return isinstance(value, dict)
     if head == "Callable":
@@ -86,7 +94,15 @@ def _is_of(kind: str, value: Any, names: dict[str, Any]) -> bool | None:
         item = inner.split(",")[0]
         return not isinstance(value, list | tuple) or all(_is_of(item, each, names) is not False for each in value)
     known = names.get(kind)
+    if get_origin(known) is Literal:  # which text, the function's own message tells
+        return isinstance(value, str)
     return isinstance(value, known) if isinstance(known, type) else None
+
+
+def _in_words(kind: str, names: dict[str, Any]) -> str:
+    if get_origin(names.get(kind)) is Literal:
+        return " or ".join(get_args(names[kind]))
+    return NAMES_OF_KINDS.get(kind, kind)
 
 
 def _is_number(value: Any, is_whole: bool) -> bool:
