@@ -76,6 +76,21 @@ def test_no_name_breaks_a_file(suffix, tmp_path):
         ElementTree.fromstring(text)
 
 
+@pytest.mark.parametrize("name", ["{", "}", "{x}", "${x}", "{{x}}", "{0:>9}", "%s%n"])
+def test_braces_in_names_end_no_process(name, tmp_path):
+    """VTK's writer of legacy files reads them as marks of its own, and ends the process."""
+    model = sample_model()._replace(loads=())
+    values = {name: np.arange(len(model.mesh.cells), dtype=float), "a": np.ones(len(model.mesh.cells))}
+    at_nodes = {name: model.mesh.points[:, 0], f"{name}2": model.mesh.points}
+    model = model._replace(cell_data=values, point_data=at_nodes, about={name: "x"})
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # they are called otherwise
+        for path in (tmp_path / "a.vtu", tmp_path / "a.vtk", tmp_path / "a.msh"):
+            save_model(path, model)
+            back = tetopt.load_mesh(path).cell_data
+            assert any(each.ndim == 1 and sorted(each) == sorted(values[name]) for each in back.values())
+
+
 @pytest.mark.parametrize("suffix", [".vtu", ".vtk", ".msh"])
 def test_names_come_back(suffix, tmp_path):
     """As they were where they are printable text, else as Python escapes them; gmsh has no quotes in its names."""

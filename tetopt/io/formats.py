@@ -18,7 +18,7 @@ from tetopt.io.mfem import mfem
 from tetopt.io.readback import Outline, save_checked
 from tetopt.io.sofa import sofa
 from tetopt.io.surfaces import boundary_ply, boundary_stl
-from tetopt.io.text import file_name, names_apart, plain, short_name
+from tetopt.io.text import file_name, legacy_name, names_apart, plain, short_name
 from tetopt.io.vtk import vtk, vtu
 from tetopt.io.xdmf import xdmf
 from tetopt.mesh import Mesh
@@ -52,7 +52,8 @@ FORMATS = {
     ".stl": Format("the boundary as STL", boundary_stl, is_surface=True),
     ".ply": Format("the boundary as PLY", boundary_ply, is_surface=True),
 }
-SHORT_NAMES = (".vtk", ".msh", ".feb")  # whose readers take names of data of `MOST_NAME_CHARACTERS`
+# How formats whose readers take names of data of `MOST_NAME_CHARACTERS` show them.
+SHOWN_NAMES = {".vtk": legacy_name, ".msh": short_name, ".feb": short_name}
 
 
 def format_of(path: Path) -> Format:
@@ -157,7 +158,7 @@ def _named(path: Path, model: Model) -> Model:
     if len({name.lower() for name in sets}) < len(sets):
         twice = next(name for k, name in enumerate(sets) if name.lower() in {each.lower() for each in sets[:k]})
         raise InputError(f"{path}: two sets are called {twice}; call one of them otherwise")
-    shown = short_name if path.suffix.lower() in SHORT_NAMES else file_name
+    shown = SHOWN_NAMES.get(path.suffix.lower(), file_name)
     names = [names_apart(data, shown) for data in (model.cell_data, model.point_data, model.about)]
     if changed := [new for each in names for old, new in each.items() if old != new]:
         warnings.warn(f"{path}: data with names that it cannot hold are called {', '.join(changed)}", stacklevel=2)

@@ -68,6 +68,17 @@ def short_name(name: str) -> str:
     return name[: sum(size <= MOST_NAME_CHARACTERS for size in sizes)]
 
 
+def legacy_name(name: str) -> str:
+    """A `short_name` without braces, which VTK's writer of legacy files takes for its own marks, and ends at.
+
+    Examples
+    --------
+    >>> legacy_name("{a}")
+    '(a)'
+    """
+    return short_name(name).translate(str.maketrans("{}", "()"))
+
+
 def names_apart(names: Iterable[str], shown: Callable[[str], str]) -> dict[str, str]:
     """What each of some names becomes: `shown` of it, numbered where another is called so.
 
