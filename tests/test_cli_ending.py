@@ -16,7 +16,7 @@ import tetopt
 import tetopt.cli.mesh
 import tetopt.cli.phantom
 import tetopt.cli.run
-from tetopt.cli.ending import signals_heard
+from tetopt.cli.ending import is_ended, mesh_kept, signal_code, signals_heard
 
 NEEDS_SIGNALS = pytest.mark.skipif(os.name == "nt", reason="Windows has no such signals")
 NEEDS_FULL = pytest.mark.skipif(not os.path.exists("/dev/full"), reason="the system has no device that is always full")
@@ -283,3 +283,14 @@ def test_nothing_that_fails_after_the_run_loses_the_mesh(image, folder, monkeypa
     monkeypatch.setattr(tetopt.cli.mesh, name, short)
     assert exit_code(*mesh_words(image, folder, "--nodes", "60", "--size-max", "9", "--iterations", "1")) == 2
     assert names_in(folder) == ["a.vtu"]
+
+
+def test_a_second_signal_gives_up():
+    """The first one waits until the mesh is written."""
+    with signals_heard(), mesh_kept() as begin:
+        begin()
+        signal.raise_signal(signal.SIGTERM)
+        assert is_ended()
+        with pytest.raises(KeyboardInterrupt):
+            signal.raise_signal(signal.SIGINT)
+    assert signal_code() == 128 + signal.SIGTERM

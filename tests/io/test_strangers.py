@@ -74,6 +74,12 @@ def writing(path):
     return 1
 
 
+def limits(path):
+    import resource  # not on Windows
+
+    return [resource.getrlimit(getattr(resource, f"RLIMIT_{name}"))[0] for name in ("CPU", "CORE", "AS")]
+
+
 @pytest.fixture
 def some_file(tmp_path, monkeypatch):
     monkeypatch.syspath_prepend(str(Path(__file__).parent))
@@ -91,6 +97,14 @@ def test_what_a_child_reads_comes_back(some_file):
         np.testing.assert_array_equal(array, expected)
         assert np.shape(array) == np.shape(expected)
     assert read_apart(writing, some_file, library="a test") == 1
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="limits are Linux's")
+def test_a_child_has_limits(some_file):
+    """The time also as the kernel's, since this process may be gone; and a scan is in no core file."""
+    seconds, core, n_bytes = read_apart(limits, some_file, library="a test")
+    assert (seconds, core) == (60, 0)
+    assert 2**31 < n_bytes < 2**33
 
 
 @pytest.mark.parametrize(
