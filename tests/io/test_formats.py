@@ -76,6 +76,13 @@ def test_no_name_breaks_a_file(suffix, tmp_path):
         ElementTree.fromstring(text)
 
 
+@pytest.mark.parametrize("order", [0, 3, -1])
+def test_an_order_that_there_is_not(order, tmp_path):
+    with pytest.raises(tetopt.InputError, match=f"order: expected 1 or 2, got {order}"):
+        save_model(tmp_path / "a.vtu", sample_model()._replace(order=order))
+    assert not (tmp_path / "a.vtu").exists()
+
+
 @pytest.mark.parametrize("name", ["{", "}", "{x}", "${x}", "{{x}}", "{0:>9}", "%s%n"])
 def test_braces_in_names_end_no_process(name, tmp_path):
     """VTK's writer of legacy files reads them as marks of its own, and ends the process."""

@@ -137,7 +137,9 @@ def file_bytes(path: Path, model: Model, *, space: str = "ras", units: str = "kP
         As `save_model`.
     """
     kind = format_of(path)
-    if model.order != 1 and not kind.has_quadratic:
+    if model.order not in (1, 2):
+        raise InputError(f"order: expected 1 or 2, got {model.order}")
+    if model.order == 2 and not kind.has_quadratic:
         able = ", ".join(name for name, other in FORMATS.items() if other.has_quadratic)
         raise InputError(f"{path}: only {able} take quadratic cells; leave out --order 2")
     return kind.write(_named(path, in_units(in_space(model, space), units)))
