@@ -18,7 +18,7 @@ from worlds import random_world
 import tetopt
 from tetopt.check import manifold_problems
 from tetopt.energy.sampling import cell_of_voxel
-from tetopt.engine.complex import build
+from tetopt.engine.complex import build, remeasure
 from tetopt.engine.fast import FAR_TICKS, Run
 from tetopt.engine.interfaces import relabel
 from tetopt.start.sizes import Sizes
@@ -82,6 +82,8 @@ def problems(run, is_manifold, n_folds):
     if run.has_labels and len(manifold_problems(mesh, run.state.complex.labels[: run.n_cells])) > n_folds:
         wrong.append("interfaces became no manifolds")
     state, cells = run.state, run.cells
+    if state.objective.image == 0.0:  # where cells begin uniform: moves leave their sums alone, and say so
+        remeasure(state)
     fresh = build(cells, state.complex.ticks, state.complex.is_frozen, state.objective, state.sides).complex
     for name in ("across", "fluxes", "sums", "E_shape"):
         if not np.array_equal(getattr(state.complex, name)[: len(cells)], getattr(fresh, name)[: len(cells)]):
@@ -119,7 +121,7 @@ def operations(seed, n_operations, report=print):
                     break
                 if wrong:
                     faults.append(f"world {number} ({world.words}), step {step}: {'; '.join(wrong)}")
-                    report(faults[-1])
+                    report(faults[-1], flush=True)
                     break
             if is_last:
                 break

@@ -151,7 +151,7 @@ def runs(seed, n_runs, report=print):
         misses.update(f"{outcome}: {name}" for name in missed)
         if wrong:
             faults.append(f"run {number} ({words}): {'; '.join(wrong)}")
-            report(faults[-1])
+            report(faults[-1], flush=True)
     return outcomes, misses, faults
 
 
