@@ -404,9 +404,10 @@ def test_a_second_ctrl_c_gives_up(tmp_path, inputs, monkeypatch, capsys):
     before = signal.getsignal(signal.SIGINT)
     assert exit_code("mesh", inputs / "disc.nii", "-o", tmp_path / "a.vtu") == 130
     assert signal.getsignal(signal.SIGINT) is before
-    assert capsys.readouterr().err.splitlines()[-2:] == [
+    assert capsys.readouterr().err.splitlines()[-3:] == [
         "interrupted: finishing the current nodes, then writing the mesh (again to give up)",
         "interrupted again: what is not yet written is given up",
+        "ended by Ctrl-C; written: nothing",
     ]
     assert list(tmp_path.iterdir()) == []
 

@@ -60,7 +60,10 @@ def test_a_signal_leaves_the_mesh_reached(image, folder, monkeypatch, capsys, nu
     assert signal.getsignal(number) is before
     assert numbers_in(folder / "a.json")["iterations_done"] < 5
     assert len(tetopt.load_mesh(folder / "a.vtu").mesh.cells) > 100
-    assert "interrupted: the mesh so far is kept" in capsys.readouterr().err
+    lines = capsys.readouterr().err.splitlines()
+    assert any(line.startswith("interrupted: the mesh so far is kept") for line in lines)
+    name = "Ctrl-C" if number == signal.SIGINT else number.name
+    assert lines[-1] == f"ended by {name}; written: {folder / 'a.vtu'}, {folder / 'a.json'}"
 
 
 @NEEDS_SIGNALS
@@ -85,7 +88,8 @@ def test_other_commands_end_at_once(folder, monkeypatch, capsys, number):
     monkeypatch.setattr(tetopt.cli.phantom, "save_image", interrupted)
     assert exit_code("phantom", "disc_2d", "-o", folder / "a.nii", "--voxel-mm", "8") == 128 + number
     assert names_in(folder) == []
-    assert capsys.readouterr().err == ""
+    name = "Ctrl-C" if number == signal.SIGINT else number.name
+    assert capsys.readouterr().err == f"ended by {name}; written: nothing\n"
 
 
 @NEEDS_SIGNALS

@@ -107,7 +107,7 @@ TASKS = {
     "elasticity: the stiffness of .* cells of 10 nodes: needs.*coarser": lambda: stiffness(LATTICE, 1.0, 0.3, 2),
     "reference: 2160 degrees of freedom: needs.*--reference-dofs": lambda: reference(IMAGE, 0.3),
     "^octree: 100 nodes: needs.*ask for fewer": lambda: tetopt.mesh_image(IMAGE, 100),
-    "^.* nodes on 9 x 8 x 7 voxels: needs.*fewer": lambda: tetopt.mesh_image(IMAGE, start=LATTICE),
+    "^an image of 9 x 8 x 7 voxels: needs.*--crop": lambda: tetopt.mesh_image(IMAGE, start=LATTICE),
 }
 
 
@@ -132,7 +132,9 @@ def test_a_run_ends_before_the_limit_with_the_mesh_reached(tmp_path, monkeypatch
     tetopt.save_image(tmp_path / "a.nii.gz", sample_image(3))
     words = mesh_words(tmp_path / "a.nii.gz", tmp_path, "--nodes", "100", "--iterations", "3", "--force")
     assert exit_code(*words, "--max-gb", "0.001") == 2
-    assert "GB of memory in all, 1 MB are allowed; ask for fewer nodes" in capsys.readouterr().err.replace("\n", " ")
+    assert "GB of memory in all, 1 MB are allowed; mesh a part of it (--crop)" in capsys.readouterr().err.replace(
+        "\n", " "
+    )
     assert not (tmp_path / "a.vtu").exists()
     for value in ("0", "-1", "nan"):
         assert exit_code(*words, "--max-gb", value) == 2

@@ -15,7 +15,7 @@ from rich.markup import escape
 import tetopt
 from tetopt.budget import check_addresses
 from tetopt.cli.console import error_words, log, open_streams, out, settle_streams, show_error, show_warning
-from tetopt.cli.ending import INTERRUPTED_CODE, signal_code, signals_heard
+from tetopt.cli.ending import INTERRUPTED_CODE, signal_code, signal_name, signals_heard
 from tetopt.errors import InputError
 from tetopt.io.files import Outputs, outputs_of_command
 
@@ -90,10 +90,7 @@ def _run(arguments: list[str], outputs: Outputs) -> int:
     """Run the command; the exit code. What went wrong is said, and what was written in spite of it."""
     try:
         code = _app(arguments)(args=arguments, obj=arguments, standalone_mode=False) or 0
-        if code == INTERRUPTED_CODE:
-            _say_written(outputs)
-            return signal_code()
-        return code
+        return _ended_by_signal(outputs) if code in (INTERRUPTED_CODE, signal_code()) else code
     except (InputError, OSError, MemoryError) as error:
         show_error(_with_option(error_words(error), arguments))
         _say_written(outputs)
@@ -101,8 +98,7 @@ def _run(arguments: list[str], outputs: Outputs) -> int:
     except typer.Exit as ended:
         return ended.exit_code
     except (typer.Abort, KeyboardInterrupt):  # newer versions of typer return 130 themselves
-        _say_written(outputs)
-        return signal_code()
+        return _ended_by_signal(outputs)
     except SystemExit:  # what typer and rich answer to a pipe that has closed, in which their help was to go
         return 0
     except Exception as error:
@@ -122,6 +118,13 @@ def _with_option(message: str, arguments: list[str]) -> str:
         if any(word == option or word.startswith(f"{option}=") for word in arguments):
             return ": ".join([*parts[:place], option, *parts[place + 1 :]])
     return message
+
+
+def _ended_by_signal(outputs: Outputs) -> int:
+    """Say what has ended the command, and what is there all the same; the exit code."""
+    names = ", ".join(map(str, outputs.written)) or "nothing"
+    log.print(escape(f"ended by {signal_name()}; written: {names}"))
+    return signal_code()
 
 
 def _say_written(outputs: Outputs) -> None:

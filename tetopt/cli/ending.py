@@ -75,6 +75,12 @@ def is_ended() -> bool:
     return bool(_ending.numbers)
 
 
+def signal_name() -> str:
+    """What has ended the command, in words."""
+    code = signal_code()
+    return "Ctrl-C" if code == INTERRUPTED_CODE else signal.Signals(code - SIGNAL_CODE).name
+
+
 def signal_code() -> int:
     """The exit code after the first signal that came, that of Ctrl-C if none did."""
     return SIGNAL_CODE + _ending.numbers[0] if _ending.numbers else INTERRUPTED_CODE

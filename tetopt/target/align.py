@@ -225,7 +225,7 @@ def _mask_values(name: str, data: NDArray[np.floating]) -> NDArray[np.float32]:
         some = ", ".join(f"{value:g}" for value in values[:5]) + (", ..." if len(values) > 5 else "")
         raise InputError(
             f"{name}: expected a mask, 0 and one other value or fractions from 0 to 1, got {len(values)} values from "
-            f"{values[0]:g} to {values[-1]:g} ({some}); choose one label of it, or a threshold"
+            f"{values[0]:g} to {values[-1]:g} ({some}); write the one that you mean as 0 and 1 first"
         )
     if top < INSIDE_SHARE:
         largest = "0 in every voxel" if top == 0 else f"fractions up to {top:g}"
