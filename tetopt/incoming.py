@@ -81,7 +81,10 @@ def text_of(path: str | Path, noun: str) -> str:
     try:
         return raw.decode("utf-8-sig")
     except UnicodeDecodeError as error:
-        raise InputError(f"{path}: expected text in UTF-8, not at byte {error.start}; save the {noun} again") from error
+        advice = ', in Excel as "CSV UTF-8"' if path.suffix.lower() == ".csv" else ""
+        raise InputError(
+            f"{path}: expected text in UTF-8, not at byte {error.start}; save the {noun} again{advice}"
+        ) from error
 
 
 def toml_of(path: str | Path, noun: str) -> dict[str, Any]:

@@ -17,7 +17,7 @@ import pytest
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.io.images import cropped, image_slice, load_image, parse_crop, parse_slice, sha256
-from tetopt.io.read_itk import _numbers
+from tetopt.io.read_itk import _numbers, _unevenness
 
 # Rotated, sheared, anisotropic and flipped (negative determinant), with an origin.
 OBLIQUE = np.array(
@@ -427,7 +427,16 @@ def test_single_dicom_file(tmp_path, sitk):
 
 def test_missing_dicom_slice(tmp_path, sitk):
     write_dicom(sitk, tmp_path / "d", ramp(6, 5, 5), skip=(3,))
-    assert_refused(tmp_path / "d", "not evenly spaced")
+    said = r"a step of 6 mm between slices 2 and 3, counted from 0, and 3 mm elsewhere: one is missing"
+    assert_refused(tmp_path / "d", rf"not evenly spaced \({said}")
+
+
+def test_uneven_dicom_slices_in_words():
+    points = np.column_stack([np.zeros(5), [0.0, 1.0, 2.0, 1.0, 0.0], 3.0 * np.arange(5)])  # even, but not on a line
+    off = np.abs(points[:, 1])
+    assert _unevenness(points, off) == "slice 2, counted from 0, is 2 mm off the line through the first and last"
+    points = np.outer([0.0, 3.0, 6.0, 9.0, 15.0, 24.0, 27.0], [0.0, 0.0, 1.0])
+    assert "9 mm between slices 4 and 5, counted from 0, and 3 mm at most places" in _unevenness(points, off)
 
 
 def test_dicom_slices_that_are_not_parallel(tmp_path, sitk):
@@ -588,6 +597,18 @@ def test_nii_gz_that_is_not_compressed(tmp_path):
     assert_refused(path, r"not a gzip file; .* drop \.gz")
 
 
+@pytest.mark.parametrize("name", ["a.nii.gz", "a.nii", "a.mgz", "a.nrrd", "a.png"])
+def test_web_page(tmp_path, name):
+    (tmp_path / name).write_text("\n<!DOCTYPE HTML>\n<html><body>Please log in</body></html>")
+    assert_refused(tmp_path / name, "it begins as a web page, not as an image; download")
+
+
+@pytest.mark.parametrize(("name", "better"), [("b.c.nii", "b.c.nii.gz"), ("b.mgh", "b.mgz")])
+def test_gzip_file_of_another_name(tmp_path, name, better):
+    save_nifti(tmp_path / "a.nii.gz", ramp(3, 4, 5)).rename(tmp_path / name)
+    assert_refused(tmp_path / name, f"it is a gzip file; name it {re.escape(better)}$")
+
+
 @pytest.mark.parametrize("kept", [0.99, 0.5, 0.001])
 def test_truncated_nii_gz(data_dir, tmp_path, kept):
     whole = (data_dir / "hippocampus_001.nii.gz").read_bytes()
@@ -692,6 +713,54 @@ def test_constant_image_warns(tmp_path):
     with pytest.warns(UserWarning, match=re.escape(f"{path}: the image is 7 everywhere, so E_D is 0 everywhere")):
         image = load_image(path)
     assert (image.data == 7).all()
+
+
+def warnings_of(path):
+    """The texts of `load_image`'s warnings."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        load_image(path)
+    return [str(each.message) for each in caught if each.category is UserWarning]  # not nibabel's unclosed files
+
+
+def test_no_orientation_warns(tmp_path):
+    file = nibabel.Nifti1Image(ramp(3, 4, 5), None)
+    nibabel.save(file, tmp_path / "a.nii.gz")
+    (said,) = warnings_of(tmp_path / "a.nii.gz")
+    assert said.startswith(f"{tmp_path / 'a.nii.gz'}: has no orientation: position and left/right are nibabel's guess;")
+    nibabel.save(nibabel.MGHImage(ramp(3, 4, 5), np.eye(4)), tmp_path / "a.mgh")
+    assert warnings_of(tmp_path / "a.mgh") == []
+    raw = bytearray((tmp_path / "a.mgh").read_bytes())
+    raw[28:30] = b"\0\0"
+    (tmp_path / "a.mgh").write_bytes(raw)
+    (said,) = warnings_of(tmp_path / "a.mgh")
+    assert "a.mgh: has no orientation: the sizes" in said
+
+
+@pytest.mark.parametrize(("step", "match"), [(800.0, "4000 mm"), (0.1, "0.5 mm"), (600.0, None), (0.2, None)])
+def test_box_of_another_unit_warns(tmp_path, step, match):
+    affine = np.diag([step, step, step, 1.0])
+    said = warnings_of(save_nifti(tmp_path / "a.nii", ramp(3, 4, 5), affine))
+    assert said == [] if match is None else f"a.nii: its box is {match} along its longest side" in said[0]
+
+
+def test_size_of_pictures_is_not_doubted(tmp_path):
+    pixels = np.arange(3100, dtype=np.uint8)[None].repeat(2, axis=0)
+    PIL.Image.fromarray(pixels).save(tmp_path / "a.png")
+    assert warnings_of(tmp_path / "a.png") == []
+
+
+def test_mended_header_is_a_warning_of_the_file(tmp_path, capfd):
+    path = save_nifti(tmp_path / "a.nii", ramp(3, 4, 5), np.diag([1.0, 1.0, 1.0, 1.0]))
+    raw = bytearray(path.read_bytes())
+    raw[88:92] = bytes(4)  # pixdim[3]
+    path.write_bytes(raw)
+    (said,) = warnings_of(path)
+    assert said.startswith(f"{path}: its header was mended (pixdim[1,2,3] should be non-zero; setting 0 dims to 1);")
+    raw[70:72] = (999).to_bytes(2, "little")  # datatype
+    path.write_bytes(raw)
+    assert_refused(path, "data code 999 not recognized")
+    assert capfd.readouterr().err == ""  # nibabel's logger
 
 
 def test_other_images_do_not_warn(tmp_path):

@@ -156,6 +156,8 @@ def test_labels_from_a_file(tmp_path):
         ("a.csv", "", "row of names"),
         ("a.csv", "intensity,young\n1,2,3\n", "row of names"),
         ("a.csv", "intensity,young\n1,x\n", "columns of numbers"),
+        ("a.csv", "intensity;young\n1;2,1\n", "write 2.1 for 2,1"),
+        ("a.csv", "intensity,young\n1,2,1\n", "row of names.* write 2.1 for 2,1"),
         ("a.csv", "intensity,young\n1,nan\n", "must be finite"),
         ("a.csv", "label,young\n1,2\n1,3\n", "label 1 has two values"),
         ("a.csv", "label,young\n1.5,2\n", "columns of numbers"),
@@ -173,6 +175,18 @@ def test_files_that_are_none(tmp_path, name, text, match):
     assert "\n" not in str(caught.value)
     with pytest.raises(InputError, match="no such file"):
         load_law(tmp_path / "no.csv")
+
+
+@pytest.mark.parametrize("separator", [",", ";", "\t"])
+def test_separators_of_csv(tmp_path, separator):
+    (tmp_path / "a.csv").write_text(CSV.replace(",", separator))
+    assert load_law(tmp_path / "a.csv", "nu") == [(0.0, 0.45), (50.0, 0.4), (200.0, 0.49)]
+
+
+def test_csv_of_another_encoding(tmp_path):
+    (tmp_path / "a.csv").write_bytes("name,young\nMäuse,2\n".encode("latin-1"))
+    with pytest.raises(InputError, match=r'expected text in UTF-8, .* in Excel as "CSV UTF-8"'):
+        load_law(tmp_path / "a.csv")
 
 
 def test_a_table_must_increase():

@@ -96,7 +96,7 @@ def read_companion(path: Path) -> Image:
     """A file beside the image; one value everywhere, which would be odd in an image, is not in sizes or a mask."""
     file, volume = file_and_volume(path)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
+        warnings.filterwarnings("ignore", "(?s).* everywhere, so E_D is 0")
         return load_image(file, volume=volume)
 
 

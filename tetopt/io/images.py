@@ -6,9 +6,11 @@ import contextlib
 import errno
 import gzip
 import hashlib
+import logging
 import math
 import os
 import re
+import threading
 import warnings
 import zlib
 from collections.abc import Iterator, Sequence
@@ -17,6 +19,7 @@ from typing import Any
 
 import nibabel
 import numpy as np
+from nibabel import imageglobals
 from nibabel.filebasedimages import ImageFileError
 from nibabel.freesurfer.mghformat import MGHError
 from nibabel.spatialimages import HeaderDataError, SpatialImage
@@ -46,6 +49,12 @@ MOST_OF_NIFTI_1 = 32767  # voxels along an axis, of 16 bits; NIfTI-2 has more
 HEAD_BYTES_NIFTI = 1024  # of a file: the longest of the headers has 540
 EXTENSION_BYTES = 2**26  # 67 MB before the voxels: a NIfTI file's extensions are texts
 TRAILING_BYTES = 2**24  # 17 MB behind the last voxel: MGH's tags
+MGH_FLAG = slice(28, 30)  # the bytes of an MGH header that are 0 where it has no sizes and directions
+# mm along the longest side of an image's box: a body is shorter than the one, micrometres and metres pass as mm beyond.
+LONGEST_BOX, SHORTEST_BOX = 3000.0, 1.0
+BEGINNING_BYTES = 512  # of a file: web pages begin with their kind, after blanks at most
+WEB_BEGINNINGS = (b"<!doctype html", b"<html", b"<head", b"<body")
+GZIP_BEGINNING = b"\x1f\x8b"
 # NIfTI's units of length other than mm.
 _MM_PER_UNIT = {"meter": 1000.0, "micron": 0.001}
 
@@ -97,14 +106,21 @@ def load_image(
     Warns
     -----
     UserWarning
-        The image is constant, so its discretization error is 0 on every mesh.
+        The image is constant, so its discretization error is 0 on every mesh; the file has no orientation; its header
+        was mended; its box is longer than 3 m or shorter than 1 mm, pictures aside.
     """
     path = Path(path)
+    notes: list[str] = []
     try:
-        data, affine = _read(path, volume)
-        image = part_of(Image(data, affine), slice_, crop)
+        data, affine = _read(path, volume, notes)
+        whole = Image(data, affine)
+        image = part_of(whole, slice_, crop)
     except InputError as error:
         raise InputError(f"{path}: {one_line(error)}") from error
+    if not path.name.lower().endswith(PICTURE_SUFFIXES):  # whose pixels are 1 mm, whatever they show
+        notes += _notes_of_size(whole)
+    for note in notes:
+        warnings.warn(f"{path}: {note}", stacklevel=2)
     low = image.data.min()
     if low == image.data.max():
         warnings.warn(f"{path}: the image is {low:g} everywhere, so E_D is 0 everywhere", stacklevel=2)
@@ -308,19 +324,25 @@ def sha256(path: str | Path) -> str:
 # Choosing the reader
 
 
-def _read(path: Path, volume: int | None) -> tuple[NDArray, NDArray[np.float64]]:
-    """Data and affine of the file, 2-D or 3-D; `Image` checks them."""
+def _read(path: Path, volume: int | None, notes: list[str]) -> tuple[NDArray, NDArray[np.float64]]:
+    """Data and affine of the file, 2-D or 3-D; `Image` checks them. What is to be warned of comes into `notes`."""
     with _os_errors_named():
         if path.is_dir():
             return read_dicom_folder(path, volume)
         if (other := irregular(path)) is not None:
             raise InputError(f"expected a regular file, got {other}; copy what it gives into a file")
         with path.open("rb") as stream:
-            if not stream.read(1):
-                raise InputError("the file is empty; copy or export it again")
+            beginning = stream.read(BEGINNING_BYTES)
+    if not beginning:
+        raise InputError("the file is empty; copy or export it again")
+    if beginning.removeprefix(b"\xef\xbb\xbf").lstrip().lower().startswith(WEB_BEGINNINGS):
+        raise InputError("it begins as a web page, not as an image; download the file itself again")
     name = path.name.lower()
+    if name.endswith((".nii", ".mgh")) and beginning.startswith(GZIP_BEGINNING):
+        ending = ".nii.gz" if name.endswith(".nii") else ".mgz"
+        raise InputError(f"it is a gzip file; name it {path.stem}{ending}")
     if name.endswith(_NIBABEL_SUFFIXES):
-        return _read_nibabel(path, volume)
+        return _read_nibabel(path, volume, notes)
     if name.endswith(tuple(ITK_READERS)):
         return read_itk(path, volume)
     if name.endswith(PICTURE_SUFFIXES):
@@ -345,10 +367,13 @@ def _os_errors_named(path: Path | None = None) -> Iterator[None]:
 # NIfTI and MGZ
 
 
-def _read_nibabel(path: Path, volume: int | None) -> tuple[NDArray, NDArray[np.float64]]:
+def _read_nibabel(path: Path, volume: int | None, notes: list[str]) -> tuple[NDArray, NDArray[np.float64]]:
     is_packed = path.name.lower().endswith((".gz", ".mgz"))
-    _check_head(path, is_packed)
-    file = _nibabel_file(path)
+    head = _checked_head(path, is_packed)
+    with _nibabel_heard() as words:
+        file = _nibabel_file(path)
+    notes += [f"its header was mended ({word}); check the sizes of its voxels and its place" for word in words]
+    notes += _notes_of_place(file, head)
     affine = _affine_in_mm(file)
     index = volume_index(file.shape[3:], volume)
     _check_size(path, file, 0 if volume is None else volume, is_packed)
@@ -363,10 +388,10 @@ def _read_nibabel(path: Path, volume: int | None) -> tuple[NDArray, NDArray[np.f
     return data, affine
 
 
-def _check_head(path: Path, is_packed: bool) -> None:
-    """InputError if the file does not begin as a gzip file does, where it should, or has extensions without end.
+def _checked_head(path: Path, is_packed: bool) -> bytes:
+    """The file's first bytes, unpacked; InputError if it is no gzip file, but should be, or has endless extensions.
 
-    nibabel reads those with the header, whole, before their sizes can be asked for.
+    nibabel reads extensions with the header, whole, before their sizes can be asked for.
     """
     try:
         with gzip.open(path) if is_packed else path.open("rb") as stream:
@@ -378,6 +403,50 @@ def _check_head(path: Path, is_packed: bool) -> None:
             offset = float(header(head[: header.sizeof_hdr], check=False)["vox_offset"])
             if not 0.0 <= offset <= EXTENSION_BYTES:
                 raise InputError(f"{DAMAGED_FILE} (its voxels are to begin at byte {offset:g})")
+    return head
+
+
+@contextlib.contextmanager
+def _nibabel_heard() -> Iterator[list[str]]:
+    """What nibabel logs in this thread, in place of its own lines on the terminal."""
+    words: list[str] = []
+    thread = threading.get_ident()
+
+    def keep(record: logging.LogRecord) -> bool:
+        if record.thread != thread:
+            return True
+        if record.levelno >= logging.WARNING:
+            words.append(one_line(record.getMessage()))
+        return False
+
+    imageglobals.logger.addFilter(keep)
+    try:
+        yield words
+    finally:
+        imageglobals.logger.removeFilter(keep)
+
+
+def _notes_of_place(file: SpatialImage, head: bytes) -> list[str]:
+    """What to warn of where the header does not say how the voxels lie, and nibabel guesses."""
+    if isinstance(file, nibabel.MGHImage):
+        if any(head[MGH_FLAG]):
+            return []
+        return ["has no orientation: the sizes of its voxels (1 mm), position and left/right are nibabel's guess"]
+    header: Any = file.header
+    if int(header["sform_code"]) or int(header["qform_code"]):
+        return []
+    guess = "has no orientation: position and left/right are nibabel's guess"
+    return [f"{guess}; if they matter, convert it again with its sform or qform"]
+
+
+def _notes_of_size(image: Image) -> list[str]:
+    """What to warn of where micrometres or metres were taken for mm."""
+    steps = np.linalg.norm(image.affine[:-1, :-1], axis=0)
+    longest = float((steps * image.shape).max())
+    if SHORTEST_BOX <= longest <= LONGEST_BOX:
+        return []
+    voxel = " x ".join(f"{step:.4g}" for step in steps)
+    return [f"its box is {longest:.4g} mm along its longest side; are its voxels {voxel} mm, or of another unit?"]
 
 
 def _nibabel_file(path: Path) -> SpatialImage:

@@ -142,10 +142,25 @@ def _place_slices(affine: NDArray[np.float64], reader: Any, n_slices: int) -> No
     off = np.linalg.norm(points - points[0] - np.arange(n_slices)[:, None] * step, axis=1)
     if off.max() > _UNEVEN_SHARE * np.linalg.norm(step):
         raise InputError(
-            f"the DICOM slices are not evenly spaced (slice {off.argmax()} is {off.max():.3g} mm off: one is "
-            "missing, or several volumes are mixed); export the series again, or resample it to NIfTI"
+            f"the DICOM slices are not evenly spaced ({_unevenness(points, off)}); export the series again, or "
+            "resample it to NIfTI"
         )
     affine[:3, 2] = step
+
+
+def _unevenness(points: NDArray[np.float64], off: NDArray[np.float64]) -> str:
+    """Where slices at `points`, (n, 3), mm, are not even: the step unlike the others, else the place `off` (n,)."""
+    steps = np.linalg.norm(np.diff(points, axis=0), axis=1)
+    usual = float(np.median(steps))
+    is_other = np.abs(steps - usual) > _UNEVEN_SHARE * usual
+    if not is_other.any():
+        return f"slice {off.argmax()}, counted from 0, is {off.max():.3g} mm off the line through the first and last"
+    k = int(np.abs(steps - usual).argmax())
+    where = "elsewhere" if is_other.sum() == 1 else "at most places"
+    return (
+        f"a step of {steps[k]:.3g} mm between slices {k} and {k + 1}, counted from 0, and {usual:.3g} mm {where}: "
+        "one is missing, or several volumes are mixed"
+    )
 
 
 def _numbers(value: str, count: int) -> list[float]:

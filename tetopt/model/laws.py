@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import contextlib
 import csv
+import re
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -199,6 +200,8 @@ def parse_any_law(text: str, quantity: str = "young") -> Law | ByLabel | float:
 def load_law(path: Path, quantity: str = "young") -> Law | ByLabel:
     """A law from a file: two columns, or more, as lists in TOML or under names in the first row of CSV.
 
+    Between the columns of CSV are commas, semicolons or tabs.
+
     One column is "intensity", or "label" (numbers or names, "*" for all that are not there), or in its place "name",
     and one the quantity, such as "young" (kPa) or "nu".
 
@@ -221,14 +224,22 @@ def load_law(path: Path, quantity: str = "young") -> Law | ByLabel:
         if len(columns[keys[0]]) != len(columns[quantity]):
             counts = f"{len(columns[keys[0]])} of {keys[0]} and {len(columns[quantity])} of {quantity}"
             raise InputError(f"{path}: {counts}; give one for each")
-        values = [float(value) for value in columns[quantity]]
+        values = [_number(value) for value in columns[quantity]]
         if keys != ["intensity"]:
             return _by_label([(str(label), value) for label, value in zip(columns[keys[0]], values, strict=True)])
-        return _checked_pairs([(float(h), value) for h, value in zip(columns["intensity"], values, strict=True)])
+        return _checked_pairs([(_number(h), value) for h, value in zip(columns["intensity"], values, strict=True)])
     except InputError as error:
         raise error if str(error).startswith(str(path)) else InputError(f"{path}: {error}") from error
     except (ValueError, TypeError, csv.Error, RecursionError) as error:
         raise InputError(f"{path}: expected columns of numbers ({' '.join(str(error).split())})") from error
+
+
+def _number(value: Any) -> float:
+    """As float; InputError for a decimal comma, which CSV of much of the world has."""
+    if isinstance(value, str) and re.fullmatch(r"\s*[+-]?\d+,\d+\s*", value):
+        text = value.strip()
+        raise InputError(f"expected numbers with a decimal point; write {text.replace(',', '.')} for {text}")
+    return float(value)
 
 
 def has_column(text: str, name: str) -> bool:
@@ -259,9 +270,12 @@ def _toml_columns(path: Path) -> dict[str, list[Any]]:
 
 
 def _csv_columns(path: Path) -> dict[str, list[Any]]:
-    rows = [row for row in csv.reader(text_of(path, "table").splitlines()) if row]
+    lines = [line for line in text_of(path, "table").splitlines() if line.strip()]
+    separator = max(",;\t", key=lines[0].count) if lines else ","
+    rows = [row for row in csv.reader(lines, delimiter=separator) if row]
     if not rows or any(len(row) != len(rows[0]) for row in rows):
-        raise InputError(f"{path}: expected a row of names and then rows of as many numbers")
+        comma = "" if separator != "," else "; if its decimals are commas, write 2.1 for 2,1"
+        raise InputError(f"{path}: expected a row of names and then rows of as many numbers{comma}")
     names = [name.strip().lower() for name in rows[0]]
     if len(set(names)) != len(names):
         raise InputError(f"{path}: expected each column once, found {', '.join(names)}")
