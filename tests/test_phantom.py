@@ -573,7 +573,7 @@ def test_message_of_an_unknown_name_lists_the_known():
 
 
 def test_messages_of_a_file_that_cannot_be_read(tmp_path):
-    with pytest.raises(InputError, match=r"nothing.toml: no such file; .* or one of the names constant"):
+    with pytest.raises(InputError, match=r"nothing.toml: no such file; .* or give one of the names constant"):
         load_phantom(tmp_path / "nothing.toml")
     with pytest.raises(InputError, match=r"no such file, it is a folder"):
         load_phantom(tmp_path)

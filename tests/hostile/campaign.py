@@ -219,8 +219,9 @@ class Campaign:
     def _count(self, one: Running, code: int, is_killed: bool, usage: resource.struct_rusage) -> None:
         log = self.scratch / f"{one.number}.log"
         texts = [Path(f"{log}.{end}").read_bytes().decode("utf-8", "backslashreplace") for end in ("out", "err")]
-        own = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss
-        used = max(usage.ru_maxrss - own, 0) * 1024
+        # Not ru_maxrss of its own, which begins at that of the program that has started it.
+        own = int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+        used = max(usage.ru_maxrss * 1024 - own, 0)
         ending = Ending(code, is_killed, time.monotonic() - one.begin, used, *texts)
         judged = verdict(one.case, one.folder, one.before, ending)
         self.counts[one.case.kind, judged.outcome] += 1
