@@ -47,9 +47,19 @@ def names_in(folder):
 # Signals
 
 
+@pytest.fixture
+def signals_not_ignored():
+    """As in a terminal: under nohup SIGHUP is ignored, and SIGINT in the background of a script."""
+    before = {number: signal.signal(number, signal.SIG_DFL) for number in LATE_SIGNALS}
+    signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    for number, handler in before.items():
+        signal.signal(number, handler)
+
+
 @NEEDS_SIGNALS
 @pytest.mark.parametrize("number", LATE_SIGNALS)
-def test_a_signal_leaves_the_mesh_reached(image, folder, monkeypatch, capsys, number):
+def test_a_signal_leaves_the_mesh_reached(image, folder, monkeypatch, capsys, signals_not_ignored, number):
     @contextmanager
     def told(_):
         yield lambda row: signal.raise_signal(number) if row.iteration == 1 else None
@@ -81,7 +91,7 @@ def test_a_signal_while_the_mesh_is_written_waits_for_it(image, folder, monkeypa
 
 @NEEDS_SIGNALS
 @pytest.mark.parametrize("number", LATE_SIGNALS)
-def test_other_commands_end_at_once(folder, monkeypatch, capsys, number):
+def test_other_commands_end_at_once(folder, monkeypatch, capsys, signals_not_ignored, number):
     def interrupted(*_):
         signal.raise_signal(number)
 

@@ -216,7 +216,7 @@ def test_compiling_and_long_iterations_are_told(monkeypatch):
         return Optimized(LATTICE, rows, "iterations")
 
     cli_run.watched_run(optimized, LATTICE, 1, None)
-    memory = r"0\.\d+ GB|\d+(\.\d+)? MB"
+    memory = r"\d+(\.\d+)? [GM]B"
     assert len(lines) == 3
     assert re.fullmatch(rf"iteration   0/1  E 1\.0000  E_G 1.* cells  3\.0 s, ({memory})", lines[0])
     assert re.fullmatch(rf"  in iteration 1, 11\.0 s, ({memory})", lines[1])

@@ -45,7 +45,7 @@ def summary(image, initial, result):
 def test_keys(summary):
     assert list(summary) == [
         *("image", "image_sha256", "options", "versions", "machine", "image_properties", "ended", "iterations_done"),
-        *("energies", "quality_initial", "quality", "history", "seconds", "mesh_sha256"),
+        *("energies", "quality_initial", "quality", "history", "seconds", "mesh_sha256", "missed"),
     ]
     assert summary["options"] == {"k_D": 0.2}
     assert summary["seconds"] == {"all": 1.5}

@@ -413,7 +413,7 @@ def test_a_missing_peer_is_no_failure_of_it(head, tmp_path, monkeypatch, capsys)
         (["--k-d", "1"], "--k-d"),
         (["--max-seconds", "0"], "--max-seconds"),
         (["--reference-seconds", "10"], "--reference-dofs sets the size of the reference already"),
-        (["--young", "h-1000"], "modulus: expected 0 kPa or more"),
+        (["--young", "h-1000"], "--young: expected 0 kPa or more"),
         (["--average", "voigt"], "average: expected mean, geometric, harmonic, hill"),
     ],
 )
