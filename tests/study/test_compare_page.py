@@ -545,7 +545,7 @@ def test_a_loss_is_marked_and_said(tmp_path):
     assert failed[0] == {"peer"}
     assert control == [{"control"}, ["0.09"]]
     first, behind, _ = claims(page)
-    words = ["0.07"], ["0.05", "pytetwild"], ["1.4×", "worse"]
+    words = ["0.07"], ["0.05", "pytetwild"], ["1.4×", "worse", "nodes 5000 and 5011"]
     assert tuple(first[E_D_ROW[1]][1:]) == tuple(behind[E_D_ROW[1]][1:]) == words
 
 
@@ -554,9 +554,9 @@ def test_a_control_can_win(tmp_path):
     row = measures(page)[E_D_ROW]
     assert [("best" in classes) for classes, _ in row] == [False, False, False, True, False]
     first, behind_peers, behind_others = claims(page)
-    assert first[E_D_ROW[1]][3] == ["0.778×", "better"]
+    assert first[E_D_ROW[1]][3] == ["0.778×", "better", "nodes 5000 and 5011"]
     assert E_D_ROW[1] not in behind_peers
-    assert behind_others[E_D_ROW[1]][2:] == [["0.01", "BCC lattice"], ["7×", "worse"]]
+    assert behind_others[E_D_ROW[1]][2:] == [["0.01", "BCC lattice"], ["7×", "worse", "nodes 5000 and 5030"]]
 
 
 def test_a_tie_is_shared(tmp_path):
@@ -595,17 +595,17 @@ def test_the_headline_is_a_handful_of_numbers(tmp_path):
 def test_what_is_behind_is_worst_first(tmp_path):
     """Group by group; and only what is worse than the runs' ranges and half a per cent."""
     report = fake_report()
-    found = headline(report)
+    first = headline(report)
     groups = ["Image", "Shape", "Simulation", "Cost"]
-    for rows in (found.behind_peers(), found.behind_others()):
+    for rows in (first.behind_peers(), first.behind_others()):
         assert rows
         keys = [(groups.index(row.group), -row.factor) for row in rows]
         assert keys == sorted(keys)
-    for row in found.behind:
+    for row in first.behind:
         own, other = row.ours.value, row.other.value
         assert own is None or (own > other if row.smaller_is_better else own < other)
-    assert {row.verdict for row in found.behind} == {"worse"}
-    assert not [row for row in found.behind_others() if row.group == "Cost"]
+    assert {row.verdict for row in first.behind} == {"worse"}
+    assert not [row for row in first.behind_others() if row.group == "Cost"]
 
 
 @pytest.mark.parametrize(
@@ -631,6 +631,83 @@ def test_verdicts(tmp_path, ours, theirs, verdict):
     claim = next(row for row in headline(report).claims if row.measure == E_D_ROW[1])
     assert claim.verdict == verdict
     assert claim.ratio == (pytest.approx(ours / 0.05) if ours else None)
+
+
+DISPLACEMENT = "displacement error, ν = 0.3, linear cells"
+
+
+def claim_of(report, measure):
+    return next(claim for claim in headline(report).claims if claim.measure == measure)
+
+
+@pytest.mark.parametrize(("change", "verdict"), [(0.02, "worse"), (0.03, "no verdict"), (None, "worse")])
+def test_no_verdict_below_the_references_own_change(tmp_path, change, verdict):
+    """The peer's displacement is off by 0.08, tetopt's by 0.104: nothing is decided if the reference is by 0.03."""
+    report = fake_report()
+    (own, *_), (peer, *_) = (report.pipelines[place].runs for place in (0, 1))
+    for pipelines in (report.pipelines, report.quadratic):
+        for place, run in ((0, peer), (1, own)):
+            fem = pipelines[place].runs[0].measurement._replace(fem=run.measurement.fem)
+            pipelines[place] = with_runs(pipelines[place], [run._replace(measurement=fem)])
+    known = report.reference.by_nu["0.3"]._replace(own_error=OwnError(0.001, change))
+    report = report._replace(reference=report.reference._replace(by_nu={"0.3": known}))
+    claim = claim_of(report, DISPLACEMENT)
+    assert (claim.verdict, claim.own_change) == (verdict, change)
+    is_void, why = verdict == "no verdict", "less than the reference's own change, 0.03"
+    known = why if is_void else f"reference's own change {change or 'not known'}"
+    assert claim.beside == [known, "nodes 5000 and 5010"]
+    first = headline(report)
+    assert (DISPLACEMENT in {row.measure for row in first.behind_peers()}) != is_void
+    assert is_void == any(f"{DISPLACEMENT} (1.3×, {why})" in line for line in first.remarks)
+    page = page_of(tmp_path, report)
+    (cell,) = (row[3] for row in Tables(page).of_kind("claims")[0][1:] if row[0][1][1].startswith(DISPLACEMENT))
+    assert cell == [set() if is_void else {"lost"}, ["1.3×", verdict, *claim.beside]]
+    cell = measures(page)["Compression, ν = 0.3, linear cells", "displacement error"][0]
+    assert cell == [
+        {"tetopt"} | set() if is_void else {"tetopt", "lost"},
+        ["0.104", f"1.3× the best{f', {why}' * is_void}"],
+    ]
+    strain = next(row for row in first.behind_peers() if row.measure.startswith("interface-strain error, ν = 0.3, lin"))
+    assert strain.beside[0] == "reference's own change not known"
+    assert not next(row for row in first.claims if row.group == "Image").beside[0].startswith("reference")
+
+
+@pytest.mark.parametrize(
+    ("seconds", "verdict"),
+    [
+        ((5.26,), "no verdict"),
+        ((5.2, 5.26, 5.3), "worse"),
+        ((4.0, 5.26, 6.0), "no different"),
+        ((4.4, 5.26, 5.3), "no different"),  # 5.98 is above all of these; 5.98 * 4.4 / 5.26 is not
+    ],
+)
+def test_no_verdict_on_time_and_memory_of_one_run(tmp_path, seconds, verdict):
+    """Of tetopt's single run it is taken that it scatters like the peer's repeats."""
+    report = fake_report()
+    for place, times in enumerate(((5.98,), seconds, (), (60.0,), (60.0,))):
+        if not times:
+            continue
+        run = report.pipelines[place].runs[0]
+        runs = [run._replace(seconds_total=each, peak_bytes=int(each * 1e8)) for each in times]
+        report.pipelines[place] = with_runs(report.pipelines[place], runs)
+    claim, first = claim_of(report, "wall time, s"), headline(report)
+    assert claim.verdict == verdict
+    assert claim.beside == ["one run each"] * (verdict == "no verdict") + ["nodes 5000 and 5010"]
+    behind = {row.measure for row in first.behind_peers()}
+    assert ({"wall time, s", "peak memory, MB"} <= behind) == (verdict == "worse")
+    (remark,) = (
+        (line for line in first.remarks if line.startswith("A peer's number")) if verdict == "no verdict" else ("",)
+    )
+    assert ("wall time, s (1.14×, one run each)" in remark) == (verdict == "no verdict")
+    assert ("peak memory, MB (1.14×, one run each)" in remark) == (verdict == "no verdict")
+    cell = measures(page_of(tmp_path, report))["Cost", "wall time, s"][0]
+    assert ("lost" in cell[0]) == (len(seconds) > 1)
+
+
+def test_equal_nodes_need_no_words():
+    report = fake_report()
+    with_measured(report, 1, n_nodes=5000)
+    assert claim_of(report, E_D_ROW[1]).beside == []
 
 
 def test_different_sizes_are_said(tmp_path):

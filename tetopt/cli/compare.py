@@ -222,11 +222,12 @@ def _print_headline(first: Headline) -> None:
     for title, claims in (("", first.claims), ("behind a peer", first.behind_peers())):
         if claims:
             table = Table(title=title, box=None, title_justify="left")
-            for heading in ("", "tetopt", "best peer", "", "tetopt over it", ""):
-                table.add_column(heading, justify="left" if not heading else "right")
+            for heading in ("", "tetopt", "best peer", "", "tetopt over it", "", "  "):
+                table.add_column(heading, justify="left" if not heading.strip() else "right")
             for each in claims:
-                numbers = (f"{number_text(each.ours.value)}", f"{number_text(each.other.value)}")
-                table.add_row(escape(each.measure), *numbers, escape(each.other_title), each.ratio_words, each.verdict)
+                numbers = (number_text(each.ours.value), number_text(each.other.value))
+                words = (escape(each.other_title), each.ratio_words, each.verdict, escape("; ".join(each.beside)))
+                table.add_row(escape(each.measure), *numbers, *words)
             print_wide(table)
     for line in first.remarks:
         out.print(escape(line))

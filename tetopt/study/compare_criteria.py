@@ -34,6 +34,9 @@ class Criterion(NamedTuple):
     is_detail: bool = False  # in the table that is folded away
     is_headline: bool = False
     blind: str = ""  # what it does not see, in a line
+    is_timed: bool = False  # of the machine as it was then: without repeats there is no verdict on it
+    is_error: bool = False  # against the reference
+    own_change: float | None = None  # of the reference, from its half resolution; None where that is not known
 
 
 class Entry(NamedTuple):
@@ -54,9 +57,9 @@ def criteria(report: Report) -> list[Criterion]:
         *_label_criteria(report),
         *_shape_criteria(),
         *(row for nu in ratios for order in ORDER_WORDS for row in _fem_criteria(report, nu, order, nu == ratios[0])),
-        Criterion("Cost", "Cost", "wall time, s", lambda run: run.seconds_total, -1, is_headline=True,
+        Criterion("Cost", "Cost", "wall time, s", lambda run: run.seconds_total, -1, is_headline=True, is_timed=True,
             blind="the runs that only met the number of nodes, and the loading of compiled code (both below)"),
-        Criterion("Cost", "Cost", "peak memory, MB", lambda run: run.peak_bytes * MEBI_BYTES, -1,
+        Criterion("Cost", "Cost", "peak memory, MB", lambda run: run.peak_bytes * MEBI_BYTES, -1, is_timed=True,
             blind="what the interpreter and its libraries take, which is in it, from what the mesh takes"),
         Criterion("Cost", "Cost", "nodes", _at("n_nodes"), 0),
         Criterion("Cost", "Cost", "tetrahedra", _at("n_cells"), 0),
@@ -190,18 +193,22 @@ def _fem_criteria(report: Report, nu: str, order: int, is_first: bool) -> list[C
         "displacement": "strains, which may be wrong where displacements are right",
         "interface_strain": "anything but the voxels beside interfaces of the labels or classes",
     }
+    known = report.reference.by_nu.get(nu)
+    own = {} if known is None else known.own_error._asdict()  # which has no strain
     rows = [
         Criterion("Simulation", part, f"{title} error", fem_error(nu, average, name), -1, order,
-            is_headline=is_first and name == "displacement", blind=blind[name])
+            is_headline=is_first and name == "displacement", blind=blind[name],
+            is_error=True, own_change=own.get(name))
         for title, name in COMPRESSION_ERRORS
     ]  # fmt: skip
-    more: list[tuple[str, Callable[[Run], float | None], int]] = [
-        (f"{title} error, moduli by {other}", fem_error(nu, other, name), -1)
+    rows += [
+        Criterion("Simulation", part, f"{title} error, moduli by {other}", fem_error(nu, other, name), -1, order,
+            is_detail=True, is_error=True, own_change=own.get(name))
         for other in averages_of(report.options)
         if other != average
         for title, name in COMPRESSION_ERRORS
-    ]
-    more += [
+    ]  # fmt: skip
+    more: list[tuple[str, Callable[[Run], float | None], int]] = [
         ("λ max", _at("fem", nu, "lambda_max"), 0),
         ("condition number", _at("fem", nu, "cond"), -1),
         ("CG iterations", _at("fem", nu, "cg_iterations"), -1),
@@ -235,6 +242,18 @@ def entry(value_of: Callable[[Run], float | None], pipeline: PipelineResult) -> 
     return Entry(float(np.median(values)), min(values), max(values)) if values else Entry(None, None, None)
 
 
+def undecided(criterion: Criterion, report: Report, one: int, other: int) -> str:
+    """Why a difference between the pipelines at two places says nothing of their meshes; "" where it does."""
+    a, b = (of_order(report, criterion.order)[place] for place in (one, other))
+    if criterion.is_timed and len(a.runs) == len(b.runs) == 1:
+        return "one run each"
+    first, second = entry(criterion.value, a).value, entry(criterion.value, b).value
+    if criterion.own_change is None or first is None or second is None:
+        return ""
+    is_below = abs(first - second) < criterion.own_change
+    return f"less than the reference's own change, {short_text(criterion.own_change)}" if is_below else ""
+
+
 def winners(better: int, values: Sequence[float | None]) -> list[int]:
     """Places of the best values, equal ones as printed included; none if fewer than two differ."""
     known = [(number, value) for number, value in enumerate(values) if value is not None]
@@ -254,9 +273,14 @@ def number_text(value: float | None) -> str:
     return f"{value:.0f}" if rounded <= abs(value) < full else f"{value:.4g}"
 
 
+def short_text(value: float | None) -> str:
+    """Three digits: as many as repeats of a run leave standing."""
+    return "–" if value is None else number_text(float(f"{value:.3g}"))
+
+
 def ratio_text(ratio: float) -> str:
     """A ratio to three digits, as "0.8×"."""
-    return f"{number_text(float(f'{ratio:.3g}'))}×"
+    return f"{short_text(ratio)}×"
 
 
 def loss_text(value: float | None, best: float) -> str:

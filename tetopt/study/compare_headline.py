@@ -19,13 +19,15 @@ from tetopt.study.compare_criteria import (
     number_text,
     of_order,
     ratio_text,
+    short_text,
+    undecided,
     winners,
 )
-from tetopt.study.compare_report import ORDER_WORDS, PipelineResult, Report
+from tetopt.study.compare_report import ORDER_WORDS, Measurement, PipelineResult, Report
 
 SIZE_TOLERANCE = 1.1  # meshes whose numbers of nodes differ by a larger factor are not compared without a word
 
-Verdict = Literal["better", "worse", "no different"]
+Verdict = Literal["better", "worse", "no different", "no verdict"]
 
 
 class Claim(NamedTuple):
@@ -40,12 +42,21 @@ class Claim(NamedTuple):
     other_kind: str  # "peer", "control", or "tetopt" for another of its own meshes
     ratio: float | None  # tetopt's over the other's; None where one is 0 or missing
     verdict: Verdict  # on tetopt; "no different" within the runs' ranges, or by less than `EQUAL_SHARE`
+    beside: list[str]  # what a reader must know with it: why there is no verdict, the reference's own change, nodes
+    own_change: float | None  # of the reference from its half resolution; None if not known, and for other measures
     blind: str  # what the measure does not see
 
     @property
     def factor(self) -> float:
         """By how much the two differ, from 1 on."""
         return math.inf if self.ratio is None else max(self.ratio, 1.0 / self.ratio)
+
+    @property
+    def is_lost(self) -> bool:
+        """Whether tetopt's number is the worse one, by however little."""
+        if self.ours.value is None or self.other.value is None:
+            return self.ours.value is None
+        return self.ours.value > self.other.value if self.smaller_is_better else self.ours.value < self.other.value
 
     @property
     def ratio_words(self) -> str:
@@ -84,15 +95,15 @@ def headline(report: Report) -> Headline:
     rows = [row for row in criteria(report) if not row.is_detail and row.better]
     claims = [claim for row in rows if row.is_headline for claim in _claims(report, row, ours, peers)]
     others = [place for place in range(len(report.pipelines)) if place not in (ours, *peers)]
-    behind = [
+    every = [
         claim
         for row in rows
         for places in (peers, others if row.group != "Cost" else [])  # what makes no mesh of an image costs nothing
         for claim in _claims(report, row, ours, places)
-        if claim.verdict == "worse"
     ]
+    behind = [claim for claim in every if claim.verdict == "worse"]
     behind.sort(key=lambda claim: (GROUPS.index(claim.group), -claim.factor))
-    return Headline(title, remarks, claims, behind)
+    return Headline(title, [*remarks, *_undecided_remark(every)], claims, behind)
 
 
 def our_place(report: Report) -> int | None:
@@ -110,23 +121,58 @@ def _claims(report: Report, row: Criterion, ours: int, places: list[int]) -> Ite
     best = max(known, key=lambda place: row.better * (entries[place].value or 0.0))
     own, other = entries[ours], entries[best]
     is_ratio = own.value is not None and other.value is not None and own.value > 0.0 and other.value > 0.0
+    why = undecided(row, report, ours, best)
+    verdict = _verdict(row, own, other)
+    if why and verdict != "no different":
+        verdict = "no verdict"
     title = row.title if row.part in GROUPS or row.group == "Image" else f"{row.title}, {row.part.split(', ', 1)[1]}"
     yield Claim(
         row.group, title, row.better < 0, own, other, report.pipelines[best].title, report.pipelines[best].kind,
         own.value / other.value if is_ratio and own.value and other.value else None,
-        _verdict(row.better, own, other), row.blind,
+        verdict, _beside(row, of_order(report, row.order), (ours, best), why if verdict == "no verdict" else ""),
+        row.own_change, row.blind,
     )  # fmt: skip
 
 
-def _verdict(better: int, own: Entry, other: Entry) -> Verdict:
+def _beside(row: Criterion, pipelines: list[PipelineResult], places: tuple[int, int], why: str) -> list[str]:
+    """What stands beside a claim: why it has no verdict, what is known of the reference, both numbers of nodes."""
+    words = [why] if why else []
+    if row.is_error and not why:  # which says it
+        change = "not known" if row.own_change is None else short_text(row.own_change)
+        words.append(f"reference's own change {change}")
+    nodes = [number_text(each.n_nodes) for place in places if (each := _measured(pipelines[place])) is not None]
+    if len(set(nodes)) > 1:
+        words.append(f"nodes {' and '.join(nodes)}")
+    return words
+
+
+def _measured(pipeline: PipelineResult) -> Measurement | None:
+    return None if pipeline.median is None else pipeline.median.measurement
+
+
+def _undecided_remark(claims: list[Claim]) -> Iterator[str]:
+    """Where a peer's number is the better one, and it does not count: so that no loss goes unsaid."""
+    lost = [
+        f"{claim.measure} ({claim.ratio_words}, {claim.beside[0]})"
+        for claim in claims
+        if claim.verdict == "no verdict" and claim.other_kind == "peer" and claim.is_lost
+    ]
+    if lost:
+        yield f"A peer's number is the better one, without a verdict: {'; '.join(lost)}."
+
+
+def _verdict(row: Criterion, own: Entry, other: Entry) -> Verdict:
     if own.value is None or own.low is None or own.high is None:
         return "worse"
     assert other.value is not None, "it was asked for"
     assert other.low is not None, "there with the value"
     assert other.high is not None, "there with the value"
+    low, high = own.low, own.high
+    if row.is_timed and low == high and other.value > 0.0:  # of one run: it scatters like the other's, at the least
+        low, high = (own.value * each / other.value for each in (other.low, other.high))
     is_near = abs(own.value - other.value) <= EQUAL_SHARE * max(abs(own.value), abs(other.value))
-    best = winners(better, [own.value, other.value])
-    if is_near or len(best) != 1 or (own.low <= other.high and other.low <= own.high):
+    best = winners(row.better, [own.value, other.value])
+    if is_near or len(best) != 1 or (low <= other.high and other.low <= high):
         return "no different"
     return "better" if best == [0] else "worse"
 
@@ -168,7 +214,9 @@ def _remarks(report: Report, ours: int | None, peers: list[int]) -> list[str]:
         runs = ", ".join(f"{report.pipelines[place].title} {len(report.pipelines[place].runs)}" for place in places)
         remarks.append(
             f"Runs: {runs}. Numbers are medians; a difference within the runs' ranges counts as none, "
-            f"nor does one below {EQUAL_SHARE:.1%}; of one run no range is known."
+            f"nor does one below {EQUAL_SHARE:.1%}; of one run no range is known. An error has no "
+            "verdict where the meshes differ by less than the reference does from its own half resolution, nor have "
+            "time and memory of one run each."
         )
     for order, word in ORDER_WORDS.items():
         for each in of_order(report, order):

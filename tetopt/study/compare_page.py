@@ -23,6 +23,7 @@ from tetopt.study.compare_criteria import (
     fem_ratios,
     number_text,
     of_order,
+    short_text,
 )
 from tetopt.study.compare_headline import Claim, Headline, headline
 from tetopt.study.compare_labels import labels_html
@@ -107,7 +108,7 @@ def _headline_html(first: Headline, report: Report) -> list[str]:
     others = "Where tetopt is behind a control, which does not see the image, or another of its own meshes"
     parts.append(folded_html(others, _claims_html(first.behind_others(), others, "best of these")))
     if first.claims and not first.behind_peers():
-        parts.append(paragraph_html("No peer is better in any measure of the four groups."))
+        parts.append(paragraph_html("No peer is better, by a verdict, in any measure of the four groups."))
     return [*parts, *map(paragraph_html, [*first.remarks, *_not_compressed(report)])]
 
 
@@ -124,26 +125,22 @@ def _claims_html(claims: Sequence[Claim], caption: str, other: str, is_first: bo
 
 def _claim_html(claim: Claim, is_first: bool) -> str:
     arrow = "↓" if claim.smaller_is_better else "↑"
-    words = {"better": "best", "worse": "lost", "no different": ""}
+    words = {"better": "best", "worse": "lost", "no different": "", "no verdict": ""}
     blind = f"<small>does not see {html.escape(claim.blind)}</small>" if is_first else ""
+    beside = "".join(f"<small>{html.escape(words)}</small>" for words in claim.beside)
     both = "".join(
-        f"<td>{_short(each.value)}{_range_html(each)}{name}</td>"
+        f"<td>{short_text(each.value)}{_range_html(each)}{name}</td>"
         for each, name in ((claim.ours, ""), (claim.other, f"<small>{html.escape(claim.other_title)}</small>"))
     )
     return (
         f'<tr><th scope="row"><small>{html.escape(claim.group)}</small>{html.escape(claim.measure)} {arrow}'
         f'{blind}</th>{both}<td class="{words[claim.verdict]}">'
-        f'{claim.ratio_words}<b class="mark">{claim.verdict}</b></td></tr>'
+        f'{claim.ratio_words}<b class="mark">{claim.verdict}</b>{beside}</td></tr>'
     )
 
 
-def _short(value: float | None) -> str:
-    """Three digits: as many as repeats of a run leave standing."""
-    return "–" if value is None else number_text(float(f"{value:.3g}"))
-
-
 def _range_html(each: Entry) -> str:
-    return "" if each.low == each.high else f"<small>{_short(each.low)} to {_short(each.high)}</small>"
+    return "" if each.low == each.high else f"<small>{short_text(each.low)} to {short_text(each.high)}</small>"
 
 
 def _not_compressed(report: Report) -> Iterator[str]:
@@ -363,8 +360,8 @@ def _text(value: Any, between: str = ", ") -> str:
 
 _TABLE_KEY = (
     '<p class="key">Here and below: ↓ smaller is better, ↑ larger is better; <b class="mark">best</b> marks the best '
-    "of a row, and a tetopt that is not says by how much. Under a median of several runs its range. Rows in "
-    "which all are equal, or in which neither way is better, have no best.</p>"
+    "of a row, and a tetopt that is not says by how much, red unless that decides nothing. Under a "
+    "median of several runs its range. Rows in which all are equal, or neither way is better, have no best.</p>"
 )
 _COMPARE_STYLE = """
 h1, p, li { overflow-wrap: anywhere; } .title { font-size: 1.15rem; }

@@ -12,6 +12,7 @@ from tetopt.study.compare_criteria import (
     loss_text,
     number_text,
     of_order,
+    undecided,
     winners,
 )
 from tetopt.study.compare_report import PipelineResult, Report
@@ -29,7 +30,7 @@ def measures_html(report: Report, rows: Sequence[Criterion], caption: str) -> st
             head = f'<th scope="rowgroup" colspan="{span}"><span>{html.escape(row.part)}</span></th>'
             lines.append(f'<tr class="part">{head}</tr>')
         part = row.part
-        lines.append(_row_html(row, of_order(report, row.order), entries))
+        lines.append(_row_html(row, report, entries))
     if not lines:
         return ""
     return "\n".join([*table_head("measures", "median of the runs", report.pipelines, caption), *lines, TABLE_END])
@@ -67,19 +68,19 @@ def _absence(pipeline: PipelineResult) -> str:
     return "not installed" if pipeline.reason == "missing" else "failed"
 
 
-def _row_html(row: Criterion, pipelines: Sequence[PipelineResult], entries: Sequence[Entry]) -> str:
+def _row_html(row: Criterion, report: Report, entries: Sequence[Entry]) -> str:
     best = winners(row.better, [each.value for each in entries])
     cells = []
-    for number, (pipeline, each) in enumerate(zip(pipelines, entries, strict=True)):
+    for number, (pipeline, each) in enumerate(zip(of_order(report, row.order), entries, strict=True)):
         kinds, mark = [pipeline.kind], ""
         if number in best:
             kinds.append("best")
             mark = '<b class="mark">best</b>' if len(best) == 1 else '<b class="mark">best, tied</b>'
         elif best and pipeline.kind == "tetopt":
-            kinds.append("lost")
-            top = entries[best[0]].value
+            top, why = entries[best[0]].value, undecided(row, report, number, best[0])
             assert top is not None, "a winner has a value"
-            mark = f'<b class="mark">{html.escape(loss_text(each.value, top))}</b>'
+            kinds += [] if why else ["lost"]
+            mark = f'<b class="mark">{html.escape(loss_text(each.value, top) + (why and f", {why}"))}</b>'
         cells.append(f'<td class="{html.escape(" ".join(kinds))}">{_value_html(pipeline, each)}{mark}</td>')
     arrow = {-1: " ↓", 1: " ↑", 0: ""}[row.better]
     return f'<tr><th scope="row">{html.escape(row.title)}{arrow}</th>{"".join(cells)}</tr>'
