@@ -70,10 +70,13 @@ def _absence(pipeline: PipelineResult) -> str:
 
 def _row_html(row: Criterion, report: Report, entries: Sequence[Entry]) -> str:
     best = winners(row.better, [each.value for each in entries])
+    open_words = _open_win(row, report, entries, best)
     cells = []
     for number, (pipeline, each) in enumerate(zip(of_order(report, row.order), entries, strict=True)):
         kinds, mark = [pipeline.kind], ""
-        if number in best:
+        if number in best and open_words:
+            mark = f'<b class="mark">{html.escape(open_words)}</b>'
+        elif number in best:
             kinds.append("best")
             mark = '<b class="mark">best</b>' if len(best) == 1 else '<b class="mark">best, tied</b>'
         elif best and pipeline.kind == "tetopt":
@@ -84,6 +87,15 @@ def _row_html(row: Criterion, report: Report, entries: Sequence[Entry]) -> str:
         cells.append(f'<td class="{html.escape(" ".join(kinds))}">{_value_html(pipeline, each)}{mark}</td>')
     arrow = {-1: " ↓", 1: " ↑", 0: ""}[row.better]
     return f'<tr><th scope="row">{html.escape(row.title)}{arrow}</th>{"".join(cells)}</tr>'
+
+
+def _open_win(row: Criterion, report: Report, entries: Sequence[Entry], best: Sequence[int]) -> str:
+    """Why the best value of a row is no verdict over the one after it; "" where it is one, or shared."""
+    others = [place for place, each in enumerate(entries) if each.value is not None and place not in best]
+    if len(best) != 1 or not others:
+        return ""
+    after = max(others, key=lambda place: row.better * (entries[place].value or 0.0))
+    return undecided(row, report, best[0], after)
 
 
 def _value_html(pipeline: PipelineResult, each: Entry) -> str:
