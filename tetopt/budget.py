@@ -110,11 +110,13 @@ def available_bytes() -> int | None:
 
 def resident_bytes() -> int:
     """Memory that this process has now; where the system does not say, its peak."""
-    try:
-        pages = int((PROC_FOLDER / "self" / "statm").read_text(encoding="ascii").split()[1])
-    except OSError:
-        return peak_bytes()
-    return pages * os.sysconf("SC_PAGE_SIZE")
+    resident = _statm_bytes(1)
+    return peak_bytes() if resident is None else resident
+
+
+def address_bytes() -> int:
+    """Address space that this process has taken; 0 where the system does not say."""
+    return _statm_bytes(0) or 0
 
 
 def peak_bytes() -> int:
@@ -122,12 +124,31 @@ def peak_bytes() -> int:
 
     On Linux VmHWM, not ru_maxrss: the latter begins at the memory of the parent that started the process.
     """
-    status = PROC_FOLDER / "self" / "status"
-    if status.is_file():
-        row = re.search(r"^VmHWM:\s+(\d+) kB", status.read_text(encoding="ascii", errors="replace"), re.M)
-        if row is not None:
-            return 1024 * int(row.group(1))
-    return 0 if resource is None else resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * MAXRSS_UNIT_BYTES
+    return status_bytes("VmHWM") or (
+        0 if resource is None else resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * MAXRSS_UNIT_BYTES
+    )
+
+
+def status_bytes(name: str, process: Path | None = None) -> int:
+    """An entry of the status of a process, a folder of /proc, e.g. VmRSS: of this one, if none is named.
+
+    0 if it has ended, or where the system does not say.
+    """
+    try:
+        text = ((process or PROC_FOLDER / "self") / "status").read_text(encoding="ascii", errors="replace")
+    except OSError:
+        return 0
+    row = re.search(rf"^{name}:\s+(\d+) kB", text, re.M)
+    return 1024 * int(row.group(1)) if row is not None else 0
+
+
+def _statm_bytes(column: int) -> int | None:
+    """A column of this process's statm (proc_pid_statm(5)), in bytes; None where there is none."""
+    try:
+        pages = int((PROC_FOLDER / "self" / "statm").read_text(encoding="ascii").split()[column])
+    except OSError:
+        return None
+    return pages * os.sysconf("SC_PAGE_SIZE")
 
 
 def address_room() -> int | None:
@@ -139,18 +160,15 @@ def address_room() -> int | None:
 def _process_bytes() -> list[int]:
     """What the limits of this process leave, of each that is set."""
     rooms = []
-    # The names of the limits and, in pages, which number of statm tells what is used (proc_pid_statm(5)).
+    # The names of the limits, and which column of statm tells what is used.
     for name, column in (("RLIMIT_AS", 0), ("RLIMIT_DATA", 5)):
         if resource is None or not hasattr(resource, name):
             continue
         limit = resource.getrlimit(getattr(resource, name))[0]
         if limit == resource.RLIM_INFINITY:
             continue
-        try:
-            used = int((PROC_FOLDER / "self" / "statm").read_text(encoding="ascii").split()[column])
-        except OSError:
-            continue
-        rooms.append(limit - used * os.sysconf("SC_PAGE_SIZE"))
+        if (used := _statm_bytes(column)) is not None:
+            rooms.append(limit - used)
     return rooms
 
 

@@ -49,6 +49,7 @@ except ImportError:  # Windows
 
 from tetopt.budget import address_room
 from tetopt.cache import place_cache
+from tetopt.interpreter import python_command, python_environment
 from tetopt.kernel_cache import NotKeptWarning, callback, njit, warn
 
 # Arrays in the signatures of units and in records: of so many axes, the last one contiguous.
@@ -542,7 +543,6 @@ def _compile_apart(kernels: Sequence[Any], folder: Path, say: Callable[[str], No
     names = [
         f"{kernel.__module__}:{kernel.__name__}" for kernel in sorted(kernels, key=sizes.__getitem__, reverse=True)
     ]
-    environment = os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))}
     processes: list[subprocess.Popen[bytes]] = []
     with contextlib.ExitStack() as stack:
         try:
@@ -555,7 +555,7 @@ def _compile_apart(kernels: Sequence[Any], folder: Path, say: Callable[[str], No
             f"from tetopt.kernels import compile_named; compile_named({names!r}, {claims!r}, {os.getpid()})"
         )
         try:
-            command = [sys.executable, "-P", "-c", code]
+            command, environment = python_command("-c", code), python_environment()
             processes.extend(subprocess.Popen(command, env=environment) for _ in range(n_processes))
             while any(process.poll() is None for process in processes):
                 say(f"compiling the kernels, {len(os.listdir(claims))} of {len(kernels)}")

@@ -431,20 +431,12 @@ def bombs(draw):
     elif how == "picture":
         _, data = m.damaged_picture(rng, draw.seeds.files["p.png"])
         name, draw.files["p.png"] = "p.png", data
-    elif how == "nrrd":
-        name = "i.nrrd"
-        data = draw.seeds.files["z.nrrd" if rng.random() < 0.5 else name]
-        draw.files[name] = data.replace(
-            b"sizes: 12 12 12",
-            draw.one(b"sizes: 9999999 9999999 9999999", b"sizes: 3000 3000 3000", b"sizes: 1000 1000 1000"),
-        )
-    elif how == "mha":
-        name = "i.mha"
-        data = draw.seeds.files["z.mha" if rng.random() < 0.5 else name]
-        draw.files[name] = data.replace(
-            b"DimSize = 12 12 12",
-            draw.one(b"DimSize = 99999 99999 99999", b"DimSize = 3000 3000 3000", b"DimSize = 1000 1000 1000"),
-        )
+    elif how in ("nrrd", "mha"):
+        name = f"i.{how}"
+        data = draw.seeds.files[f"z.{how}" if rng.random() < 0.5 else name]
+        key, longest = {"nrrd": ("sizes: ", 9999999), "mha": ("DimSize = ", 99999)}[how]
+        before, *sizes = (f"{key}{n} {n} {n}".encode() for n in (12, longest, 3000, 1000))
+        draw.files[name] = data.replace(before, draw.one(*sizes))
     elif how == "vtu":
         name = draw.one("ascii.vtu", "inline.vtu", "m.vtu", "appended.vtu")
         data = draw.seeds.files[name]

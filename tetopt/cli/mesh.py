@@ -278,9 +278,7 @@ def _save(task: Task, result: Optimized) -> tuple[Model, dict[str, Any]]:
     return model, about
 
 
-def _write(
-    task: Task, outcome: Outcome, model: Model, about: dict[str, Any], begin: float
-) -> dict[str, Any]:  # fmt: skip
+def _write(task: Task, outcome: Outcome, model: Model, about: dict[str, Any], begin: float) -> dict[str, Any]:
     """Write the numbers and the pictures; how well mask, labels and contrasts are met."""
     plan, source, result, output = task.plan, task.source, outcome.result, task.plan.output
     measured = fidelity(source.labels, source.mask, result.mesh, model.cell_data.get("label"))

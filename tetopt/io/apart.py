@@ -23,7 +23,9 @@ from typing import IO, Any
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt.budget import address_bytes
 from tetopt.errors import InputError
+from tetopt.interpreter import python_command, python_environment
 
 LEAST_BYTES = 2**31  # of memory for any file, libraries loaded: their buffers and the largest small file
 BYTES_A_BYTE = 64  # of memory for each of the file, beyond: text grows eightfold, zlib on meshes tenfold
@@ -65,12 +67,11 @@ def read_apart(
     name = f"{read.__module__}:{read.__qualname__}"
     job = {"read": name, "path": str(path), "rest": rest, "bytes": most_bytes, "seconds": int(seconds)}
     child = subprocess.Popen(
-        # -P: not the current folder's modules, which may be the stranger's as well.
-        [sys.executable, "-P", "-m", "tetopt.io.apart"],
+        python_command("-m", "tetopt.io.apart"),
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
-        env=os.environ | {"PYTHONPATH": os.pathsep.join(filter(None, sys.path))},  # the same modules as here
+        env=python_environment(),
     )
     assert child.stdin is not None
     assert child.stdout is not None
@@ -187,9 +188,7 @@ def _limit(most_bytes: int, seconds: int) -> None:
         import resource
     except ImportError:  # not on Windows
         return
-    statm = Path("/proc/self/statm")
-    taken = int(statm.read_text(encoding="ascii").split()[0]) * resource.getpagesize() if statm.exists() else 0
-    for limit, value in ((resource.RLIMIT_AS, taken + most_bytes), (resource.RLIMIT_CPU, seconds)):
+    for limit, value in ((resource.RLIMIT_AS, address_bytes() + most_bytes), (resource.RLIMIT_CPU, seconds)):
         _, hard = resource.getrlimit(limit)
         with contextlib.suppress(ValueError, OSError):  # macOS has no such limit of memory
             resource.setrlimit(limit, (value if hard == resource.RLIM_INFINITY else min(value, hard), hard))

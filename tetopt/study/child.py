@@ -29,8 +29,9 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.budget import MAXRSS_UNIT_BYTES, peak_bytes
+from tetopt.budget import MAXRSS_UNIT_BYTES, peak_bytes, status_bytes
 from tetopt.errors import InputError
+from tetopt.interpreter import python_command, python_environment
 from tetopt.mesh import Mesh
 from tetopt.study.endings import Crashed, NotInstalled, last_line, signal_words
 from tetopt.study.pipelines import Job, Produced
@@ -113,14 +114,13 @@ def _run_once(pipeline: Callable[[Job], Produced], job: Job, max_seconds: float,
     with tempfile.TemporaryDirectory(prefix="tetopt-") as name:
         folder = Path(name)
         (folder / "job.pickle").write_bytes(pickle.dumps((pipeline, job)))
-        paths = os.pathsep.join(filter(None, sys.path))  # the same modules as here
         with open(folder / "stderr.txt", "wb") as errors:
             child = subprocess.Popen(
-                [sys.executable, "-P", "-m", "tetopt.study.child", str(folder)],
+                python_command("-m", "tetopt.study.child", str(folder)),
                 stdin=subprocess.DEVNULL,
                 stdout=subprocess.DEVNULL,
                 stderr=errors,
-                env=os.environ | {"PYTHONPATH": paths, "TMPDIR": name, MARK_NAME: name},
+                env=python_environment(**{"TMPDIR": name, MARK_NAME: name}),
                 start_new_session=True,  # a group of its own, killed as a whole
             )
         try:
@@ -156,7 +156,7 @@ def _watched(child: subprocess.Popen, max_seconds: float, max_bytes: int | None)
         try:
             child.wait(max(min(POLL_SECONDS, left), 0.0))
         except subprocess.TimeoutExpired:
-            peak = max(peak, sum(_status_bytes(each, "VmRSS") for each in _family(child.pid)))
+            peak = max(peak, sum(status_bytes("VmRSS", each) for each in _family(child.pid)))
         else:
             return peak, None
         if max_bytes is not None and peak > max_bytes:
@@ -191,14 +191,6 @@ def _marked(folder: Path) -> list[Path]:
             if mark in (process / "environ").read_bytes().split(b"\0"):  # empty of one that has ended
                 processes.append(process)
     return processes
-
-
-def _status_bytes(folder: Path, name: str) -> int:
-    """An entry of a process's status in bytes, e.g. VmRSS; 0 if it has ended."""
-    lines: list[str] = []
-    with contextlib.suppress(OSError):  # it ended while we looked
-        lines = (folder / "status").read_text().splitlines()
-    return next((int(line.split()[1]) * 1024 for line in lines if line.startswith(f"{name}:")), 0)
 
 
 def _own_peak_bytes() -> int:

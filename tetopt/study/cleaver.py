@@ -12,7 +12,6 @@ numpy < 2, it works.
 from __future__ import annotations
 
 import subprocess
-import sys
 import tempfile
 import time
 from importlib.util import find_spec
@@ -27,6 +26,7 @@ from tetopt.geometry.box import box_sides
 from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import oriented
 from tetopt.image import Image
+from tetopt.interpreter import python_command
 from tetopt.mesh import Mesh
 from tetopt.study.endings import NotInstalled, last_line, signal_words
 from tetopt.study.search import corners_for, is_near, tries
@@ -166,9 +166,7 @@ def _run(cube: Cube, feature_scaling: float) -> tuple[NDArray[np.float64], NDArr
 
 
 def _python(program: str, *arguments: str) -> subprocess.CompletedProcess[Any]:
-    return subprocess.run(
-        [sys.executable, "-P", "-c", program, *arguments], capture_output=True, text=True, check=False
-    )
+    return subprocess.run(python_command("-c", program, *arguments), capture_output=True, text=True, check=False)
 
 
 def _ending(done: subprocess.CompletedProcess[Any]) -> str:
