@@ -32,6 +32,7 @@ from tetopt.cli.options import (
 )
 from tetopt.cli.plan import Plan, planned, with_numbers
 from tetopt.cli.promises import check_promises, warn_of_result, warn_of_sizes
+from tetopt.cli.request import requested
 from tetopt.cli.run import prepare, watched_run
 from tetopt.cli.solver import (
     all_sets,
@@ -85,6 +86,7 @@ class Task(NamedTuple):
     source: Source
     started: MeshFile | None  # the mesh to start from
     sizes: tetopt.Sizes | None
+    request: dict[str, Any] | None = None  # of `requested`, where the numbers are written
 
     @property
     def start_name(self) -> str:
@@ -115,6 +117,8 @@ def mesh_command(
     plan = planned(source, sizes, start, engine, solver, output)
     set_threads(engine.threads)
     task = _read(plan)
+    if output.json_path is not None:
+        task = task._replace(request=requested(source, sizes, start, engine, solver, output))
     with mesh_kept() as begin_keeping:
         result, seconds, predicted = _run(task, begin, begin_keeping)
         model, about = _save(task, result)
@@ -302,6 +306,7 @@ def _write(task: Task, outcome: Outcome, model: Model, about: dict[str, Any], be
         summary = run_summary(source.content, outcome.initial, result, about, seconds, outcome.shapes)
         if source.image is not source.content.image:
             summary["image_properties"] = image_summary(source.image)  # on its own voxels, not on divided ones
+        summary["request"] = task.request
         summary["memory"] = {"predicted_bytes": outcome.predicted_bytes, "peak_bytes": peak_bytes()}
         save_json(output.json_path, summary | measured | model_summary(model))
     if plan.pictures:

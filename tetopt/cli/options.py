@@ -133,16 +133,10 @@ class SurfacePart:
 
 
 @dataclass(frozen=True, kw_only=True)
-class SourceOptions:
-    """What `tetopt mesh` meshes."""
+class ContentOptions:
+    """What of an image is meshed, and what lies beside it."""
 
     panel: ClassVar[str] = "What is meshed"
-    images: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="IMAGE...", help="As for the other commands; further contrasts go to the first one's grid."
-        ),
-    ]
     mask: Annotated[
         Path | None, option("MASK", "Mesh this region only (0/1, or 0 to 1), its boundary on the mask's surface.")
     ] = None
@@ -161,6 +155,18 @@ class SourceOptions:
         float | None, option("W", "How much the labels count beside the first IMAGE (default 1).")
     ] = None
     part: ImagePart = WHOLE_IMAGE
+
+
+@dataclass(frozen=True, kw_only=True)
+class SourceOptions(ContentOptions):
+    """What `tetopt mesh` meshes."""
+
+    images: Annotated[
+        list[Path],
+        typer.Argument(
+            metavar="IMAGE...", help="As for the other commands; further contrasts go to the first one's grid."
+        ),
+    ]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -347,6 +353,40 @@ class OutputOptions:
         Path | None, option("DIR", "Draw slice.png, rho.png, energies.png and others in this folder.")
     ] = None
     force: ForceOption = False
+
+
+def option_name(name: str, kind: Any) -> str:
+    """What a record's field is called on the command line, without hyphens before it, e.g. "k-d"."""
+    own = get_args(kind)[1].default  # in an annotation typer takes the first name for a default
+    return (own if isinstance(own, str) else name.replace("_", "-")).lstrip("-")
+
+
+def given_options(*records: Any) -> dict[str, Any]:
+    """What the records give that is not the default, by the names of the command line; of arguments, by the field's.
+
+    Records of the same fields and values have equal dictionaries.
+    """
+    options: dict[str, Any] = {}
+    for record in records:
+        kinds = get_type_hints(type(record), include_extras=True)
+        for field in fields(record):
+            value = getattr(record, field.name)
+            if is_dataclass(value):
+                options |= given_options(value)
+            elif value != field.default:
+                options[option_name(field.name, kinds[field.name])] = value
+    return options
+
+
+def option_words(options: dict[str, Any]) -> list[str]:
+    """Options as `given_options` returns them, without arguments, as the words of a command."""
+    words = []
+    for name, value in options.items():
+        if value is True:
+            words.append(f"--{name}")
+        else:
+            words += [f"--{name}={each}" for each in (value if isinstance(value, list) else [value])]
+    return words
 
 
 def from_records(command: Callable[..., int]) -> Callable[..., int]:

@@ -87,6 +87,7 @@ def planned(
         Options that contradict each other or are out of range, as far as they tell without any file being read; an
         output that may not be written.
     """
+    _check_source(source, solver)
     format_of(output.mesh)
     checked_output(output.mesh, tuple(FORMATS), output.force)
     check_solver_options(output.mesh, solver)
@@ -105,6 +106,17 @@ def planned(
     if mode == "paper" and not is_plain:
         raise InputError("--method paper: takes one IMAGE and its whole box; leave out mask, labels and further ones")
     return Plan(mode, source, sizes, start, engine, solver, output, pictures)
+
+
+def _check_source(source: SourceOptions, solver: SolverOptions) -> None:
+    """InputError for what of mask and labels contradicts itself."""
+    if source.mask is not None and source.background is not None:
+        raise InputError("--mask and --background: give one of them")
+    if source.labels is None:
+        beside = {**vars(source), "label_names": solver.label_names}
+        for name in ("label_names", "label_weight", "smooth_interfaces"):
+            if beside[name] is not None:
+                raise InputError(f"--{name.replace('_', '-')}: there are no --labels")
 
 
 def _mode(source: SourceOptions, sizes: SizeOptions, start: StartOptions, engine: EngineOptions) -> Mode:

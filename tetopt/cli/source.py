@@ -77,15 +77,7 @@ class Source(NamedTuple):
 def read_source(options: SourceOptions, label_names: Path | None = None) -> Source:
     """Images, labels, what these are called, and mask as asked for, on the voxels of the first image."""
     paths = options.images
-    if label_names is not None and options.labels is None:
-        raise InputError("--label-names: there are no --labels")
     table = label_table(label_names)
-    if options.mask is not None and options.background is not None:
-        raise InputError("--mask and --background: give one of them")
-    if options.label_weight is not None and options.labels is None:
-        raise InputError("--label-weight: there are no --labels")
-    if options.smooth_interfaces is not None and options.labels is None:
-        raise InputError("--smooth-interfaces: there are no --labels")
     image, beside = image_and_others(paths[0], options.part)
     contrasts = [image, *(beside(path, aligned_contrast) for path in paths[1:])]
     labels = None if options.labels is None else beside(options.labels, aligned_labels)

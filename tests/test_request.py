@@ -1,0 +1,121 @@
+"""What was asked of a run: options as words and back, and checksums that tell when a run has to be made again."""
+
+from dataclasses import fields
+from pathlib import Path
+
+import pytest
+import typer
+from commands import exit_code, mesh_words, numbers_in
+
+import tetopt
+from tetopt.cli.options import (
+    EngineOptions,
+    ImagePart,
+    OutputOptions,
+    SizeOptions,
+    SolverOptions,
+    SourceOptions,
+    StartOptions,
+    from_records,
+    given_options,
+    option_words,
+)
+from tetopt.cli.request import requested
+
+# Of each field of the options of `tetopt mesh` a value that is not its default.
+VALUES = {
+    "images": [Path("/a/-b.nii"), Path("/c.nii")], "mask": Path("/m.nii"), "background": "-5", "labels": Path("/l.nii"),
+    "weights": "1,2", "smooth_interfaces": 0.25, "label_weight": 2.0, "volume": 1, "crop": "1:9,:,:", "slice_": "k=3",
+    "nodes": 77, "target_error": 0.1, "size_min": 1.0, "size_max": 9.0, "edge_max": 8.0, "gradation": 0.5,
+    "sizing": Path("/s.nii"), "lattice": "octree", "uniform": True, "spacing": 3.0, "start": Path("/m.vtu"), "k_D": 0.3,
+    "iterations": 3, "boundary": "fixed", "method": "paper", "shape_power": 2.0, "min_dihedral": 5.0, "n_t": 2,
+    "retessellate": "never", "threads": 1, "max_seconds": 5.0, "max_gb": 3.0, "young": "0.5 + 0.01*h", "nu": "0.3",
+    "density": "1000", "average": "hill", "bins": "5:log", "sets": ["A=below:1", "B=below:2"], "written_sets": "all",
+    "loads": ["compress:5%", "hold:xmin"], "label_names": Path("/t.csv"), "order": 2, "nonlinear": True, "units": "MPa",
+    "space": "lps",
+}  # fmt: skip
+KINDS = (SourceOptions, SizeOptions, StartOptions, EngineOptions, SolverOptions)
+
+
+def record(kind):
+    """A record whose fields all have another value than the default."""
+    part = {"part": ImagePart(**{each.name: VALUES[each.name] for each in fields(ImagePart)})}
+    return kind(**{each.name: (VALUES | part)[each.name] for each in fields(kind)})
+
+
+def test_words_give_the_options_back():
+    """Every option of `tetopt mesh`, as words of a command line, comes to the same records."""
+    before = [record(kind) for kind in KINDS]
+    after = []
+
+    def command(
+        source: SourceOptions, sizes: SizeOptions, start: StartOptions, engine: EngineOptions, solver: SolverOptions
+    ) -> int:
+        after.extend([source, sizes, start, engine, solver])
+        return 0
+
+    app = typer.Typer()
+    app.command()(from_records(command))
+    options = given_options(*before)
+    images = options.pop("images")
+    app([*option_words(options), "--", *map(str, images)], standalone_mode=False)
+    assert after == before
+
+
+def test_defaults_are_not_given():
+    assert given_options(*(kind() for kind in KINDS[1:])) == {}
+
+
+@pytest.fixture
+def request_of(tmp_path):
+    """A function from other values of options to what is then requested, of a mesh of an image with a mask."""
+    for name in ("a.nii", "m.nii", "young.csv"):
+        (tmp_path / name).write_text(name)
+
+    def request(folder=tmp_path, suffix=".vtu", **others):
+        """`others` by record's class name."""
+        source = {"images": [folder / "a.nii"], "mask": folder / "m.nii"} | others.get("source", {})
+        output = OutputOptions(mesh=folder / f"any{suffix}")
+        engine, solver = EngineOptions(**others.get("engine", {})), SolverOptions(**others.get("solver", {}))
+        return requested(SourceOptions(**source), SizeOptions(nodes=50), StartOptions(), engine, solver, output)
+
+    return request
+
+
+def test_a_request_states_what_was_given(request_of, tmp_path):
+    request = request_of(solver={"young": str(tmp_path / "young.csv"), "nu": "0.3"})
+    assert request["options"] == {"nodes": 50, "nu": "0.3", "format": ".vtu"}
+    assert [name for name, _ in request["files"]["images"]] == ["a.nii"]
+    assert sorted(request["files"]) == ["images", "mask", "young"]
+    assert request["tetopt"] == tetopt.__version__
+
+
+def test_a_request_changes_with_what_decides_the_mesh(request_of, tmp_path):
+    first = request_of()["sha256"]
+    assert request_of()["sha256"] == first
+    assert request_of(engine={"threads": 1})["sha256"] == first
+    others = [request_of(engine={"iterations": 3}), request_of(suffix=".inp"), request_of(source={"mask": None})]
+    (tmp_path / "m.nii").write_text("another")
+    others.append(request_of())
+    assert len({first, *(each["sha256"] for each in others)}) == 5
+
+
+def test_a_request_does_not_know_folders(request_of, tmp_path):
+    other = tmp_path / "elsewhere"
+    other.mkdir()
+    for name in ("a.nii", "m.nii"):
+        (other / name).write_bytes((tmp_path / name).read_bytes())
+    assert request_of(folder=other) == request_of()
+
+
+def test_run_json_states_the_request(tmp_path):
+    """It is the one that the options come to, so that whoever has them knows whether the mesh is that one."""
+    assert exit_code("phantom", "sphere", "-o", tmp_path / "sphere.nii.gz", "--voxel-mm", "5") == 0
+    words = mesh_words(tmp_path / "sphere.nii.gz", tmp_path, "--nodes", "60", "--iterations", "1", "--threads", "1")
+    assert exit_code(*words) == 0
+    source = SourceOptions(images=[tmp_path / "sphere.nii.gz"])
+    sizes, engine = SizeOptions(nodes=60), EngineOptions(iterations=1)
+    output = OutputOptions(mesh=tmp_path / "b.vtu")
+    assert numbers_in(tmp_path / "a.json")["request"] == requested(
+        source, sizes, StartOptions(), engine, SolverOptions(), output
+    )

@@ -1,0 +1,74 @@
+"""What was asked of a run, with checksums: equal for runs that come to the same mesh, and kept in their run.json."""
+
+from __future__ import annotations
+
+import hashlib
+import json
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import tetopt
+from tetopt.cli.inputs import file_and_volume
+from tetopt.cli.options import (
+    EngineOptions,
+    OutputOptions,
+    SizeOptions,
+    SolverOptions,
+    SourceOptions,
+    StartOptions,
+    given_options,
+)
+from tetopt.io.images import sha256
+
+WITHOUT_SAY = ("threads",)  # options on which no output depends
+LAW_OPTIONS = ("young", "nu", "density")  # whose text may name a file, by one of these suffixes
+LAW_SUFFIXES = (".toml", ".csv")
+
+
+def requested(
+    source: SourceOptions, sizes: SizeOptions, start: StartOptions, engine: EngineOptions, solver: SolverOptions,
+    output: OutputOptions,
+) -> dict[str, Any]:  # fmt: skip
+    """What decides the outputs of `tetopt mesh`: options, the files' names and checksums, the version.
+
+    Names of outputs and of folders are no part of it, nor is the number of threads.
+
+    Returns
+    -------
+    dict
+        `options`, those that were given, with `format`, the suffix of the mesh's file; `files`, of each option that
+        names any a list of [name, SHA-256]; `tetopt`, the version; and `sha256` of all this.
+
+    Raises
+    ------
+    InputError
+        A file is missing, or may not be read.
+    """
+    options = given_options(source, sizes, start, engine, solver)
+    files = {name: each for name in list(options) if (each := _files(name, options[name]))}
+    stated = {name: value for name, value in options.items() if name not in (*files, *WITHOUT_SAY)}
+    whole: dict[str, Any] = {
+        "options": {**stated, "format": output.mesh.suffix.lower()},
+        "files": {name: [[path.name, _checksum(path)] for path in paths] for name, paths in files.items()},
+        "tetopt": tetopt.__version__,
+    }
+    return whole | {"sha256": hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()}
+
+
+def _files(name: str, value: Any) -> list[Path]:
+    """The files among an option's values."""
+    if name in LAW_OPTIONS:
+        return [Path(value)] if value.lower().endswith(LAW_SUFFIXES) else []
+    return [each for each in (value if isinstance(value, list) else [value]) if isinstance(each, Path)]
+
+
+def _checksum(path: Path) -> str:
+    file, _ = file_and_volume(path)
+    status = file.stat() if file.is_file() else None
+    return sha256(file) if status is None else _kept_checksum(file, status.st_size, status.st_mtime_ns)
+
+
+@cache  # an atlas's mask may go with each of a thousand subjects
+def _kept_checksum(path: Path, _size: int, _changed: int) -> str:
+    return sha256(path)
