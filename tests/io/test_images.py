@@ -16,6 +16,7 @@ import pytest
 
 from tetopt.errors import InputError
 from tetopt.image import Image
+from tetopt.io import images
 from tetopt.io.images import cropped, image_slice, load_image, parse_crop, parse_slice, sha256
 from tetopt.io.read_itk import _numbers, _unevenness
 
@@ -64,6 +65,28 @@ def test_nifti_keeps_values_and_affine(tmp_path, name):
     np.testing.assert_array_equal(image.data, data)
     assert image.data.dtype == np.float32
     np.testing.assert_array_equal(image.affine, OBLIQUE.astype(np.float32))  # the header's precision
+
+
+@pytest.mark.parametrize("name", ["a.nii", "a.nii.gz", "a.mgz", "a.nrrd", "a.mha", "a.png"])
+def test_shape_without_voxels(tmp_path, name, monkeypatch):
+    """The header tells it; only what is read as a whole anyway is."""
+    path = tmp_path / name
+    if name.endswith(("nii", "gz", "mgz")):
+        kind = nibabel.MGHImage if name.endswith("mgz") else nibabel.Nifti1Image
+        nibabel.save(kind(np.zeros((5, 4, 3, 2), np.float32), np.eye(4)), path)
+    elif name.endswith("png"):
+        PIL.Image.fromarray(np.arange(20, dtype=np.uint8).reshape(5, 4)).save(path)
+    else:
+        sitk = pytest.importorskip("SimpleITK")
+        sitk.WriteImage(sitk.GetImageFromArray(np.zeros((3, 4, 5), np.int16)), str(path))
+        monkeypatch.setattr(images, "load_image", None)
+    expected = {"png": (5, 4), "rrd": (5, 4, 3), "mha": (5, 4, 3)}.get(name[-3:], (5, 4, 3, 2))
+    assert images.file_shape(path) == expected
+    damaged = tmp_path / f"damaged{name[1:]}"
+    damaged.write_bytes(b"something else")
+    monkeypatch.undo()
+    with pytest.raises(InputError, match=rf"^{re.escape(str(damaged))}: \S+ [^\n]+$"):
+        images.file_shape(damaged)
 
 
 def test_ending_in_mixed_case(tmp_path):

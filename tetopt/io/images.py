@@ -31,6 +31,7 @@ from tetopt.image import Image
 from tetopt.incoming import irregular
 from tetopt.io.apart import DEFLATE_RATIO
 from tetopt.io.files import check_suffix, written_whole
+from tetopt.io.itk_headers import header_sizes
 from tetopt.io.pictures import PICTURE_SUFFIXES, read_picture
 from tetopt.io.read_itk import ITK_READERS, read_dicom_folder, read_itk
 from tetopt.io.volumes import DAMAGED_FILE, UNREADABLE_FILE, check_room, one_line, volume_index
@@ -125,6 +126,33 @@ def load_image(
     if low == image.data.max():
         warnings.warn(f"{path}: the image is {low:g} everywhere, so E_D is 0 everywhere", stacklevel=2)
     return image
+
+
+def file_shape(path: str | Path) -> tuple[int, ...]:
+    """Lengths of all axes of the voxels in a file, by its header alone: of NIfTI, MGZ, NRRD and MetaImage.
+
+    Pictures, DICOM files and folders have theirs once they are read, and are. Those of an NRRD file may count the
+    components of its voxels.
+
+    Raises
+    ------
+    InputError
+        As `load_image`, as far as the header tells.
+    """
+    path = Path(path)
+    name = path.name.lower()
+    try:
+        with _os_errors_named():
+            if irregular(path) is None and name.endswith(_NIBABEL_SUFFIXES):
+                _checked_head(path, name.endswith((".gz", ".mgz")))
+                with _nibabel_heard():
+                    return tuple(int(size) for size in _nibabel_file(path).shape)
+            if irregular(path) is None and name.endswith((".nrrd", ".nhdr", ".mha", ".mhd")):
+                return header_sizes(path)
+        return load_image(path).shape
+    except InputError as error:
+        words = str(error).removeprefix(f"{path}: ")
+        raise InputError(f"{path}: {one_line(words)}") from error
 
 
 def save_image(path: str | Path, image: Image) -> None:

@@ -51,11 +51,7 @@ def checked_header(path: Path) -> tuple[int, int]:
         Without the path before it: a header that cannot be read or tells of more than the files have; a data file that
         is not beside the header, or no regular file.
     """
-    with path.open("rb") as stream:
-        head = stream.read(HEADER_BYTES)
-    header = _nrrd(head) if path.suffix.lower() in (".nrrd", ".nhdr") else _metaimage(head)
-    if header.files and len(head) == HEADER_BYTES:  # what follows might name others
-        raise InputError(f"{UNREADABLE_FILE} (a header of more than {HEADER_BYTES} bytes, its voxels elsewhere)")
+    header = _header(path)
     n_bytes = path.stat().st_size
     for name in header.files:
         _check_beside(path, name)
@@ -68,6 +64,20 @@ def checked_header(path: Path) -> tuple[int, int]:
         )
     check_room(header.sizes, header.value_bytes // max(math.prod(header.sizes), 1))
     return n_bytes, header.value_bytes
+
+
+def header_sizes(path: Path) -> tuple[int, ...]:
+    """Lengths of the axes as the header has them; InputError as `checked_header`, as far as the header alone tells."""
+    return tuple(_header(path).sizes)
+
+
+def _header(path: Path) -> VoxelHeader:
+    with path.open("rb") as stream:
+        head = stream.read(HEADER_BYTES)
+    header = _nrrd(head) if path.suffix.lower() in (".nrrd", ".nhdr") else _metaimage(head)
+    if header.files and len(head) == HEADER_BYTES:  # what follows might name others
+        raise InputError(f"{UNREADABLE_FILE} (a header of more than {HEADER_BYTES} bytes, its voxels elsewhere)")
+    return header
 
 
 def _check_beside(path: Path, name: str) -> None:
