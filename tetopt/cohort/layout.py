@@ -1,0 +1,178 @@
+"""Where a cohort's files lie, by the names of BIDS derivatives, and who may write there.
+
+OUT/dataset_description.json                   by which the folder is known to be a cohort's
+OUT/cohort.tsv, cohort.html                    all subjects
+OUT/sub-X[/ses-Y]/KEY_desc-tetopt_mesh.vtu     and the numbers of the run beside it, in a file of the same name in JSON
+OUT/sub-X[/ses-Y]/figures/                     its pictures
+OUT/logs/KEY.log, KEY.failed.json              what the last run said, and why it failed
+OUT/.work/                                     what is under way
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import socket
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import IO, Any
+
+import tetopt
+from tetopt.errors import InputError
+from tetopt.incoming import json_of, text_of
+from tetopt.io.files import save_json
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
+DESCRIPTION_NAME = "dataset_description.json"
+WORK_NAME, LOGS_NAME, FIGURES_NAME = ".work", "logs", "figures"
+BIDS_VERSION = "1.10.0"  # of the specification whose names are followed
+
+
+def subject_folder(out: Path, key: str) -> Path:
+    """Where the outputs of a subject lie."""
+    subject, _, session = key.partition("_")
+    return out / subject / session if session else out / subject
+
+
+def mesh_name(key: str, suffix: str) -> str:
+    """What the file of a subject's mesh is called; its numbers are in that of the suffix ".json"."""
+    return f"{key}_desc-tetopt_mesh{suffix}"
+
+
+def numbers_path(out: Path, key: str) -> Path:
+    """The numbers of a subject's run, as `tetopt mesh --json` writes them."""
+    return subject_folder(out, key) / mesh_name(key, ".json")
+
+
+def log_path(out: Path, key: str) -> Path:
+    """What the last run of a subject said."""
+    return out / LOGS_NAME / f"{key}.log"
+
+
+def failure_path(out: Path, key: str) -> Path:
+    """Why the last run of a subject failed; not there if it did not."""
+    return out / LOGS_NAME / f"{key}.failed.json"
+
+
+def check_out(out: Path) -> None:
+    """InputError for a folder that holds anything but a cohort of ours."""
+    if not os.path.lexists(out):
+        if not out.absolute().parent.is_dir():
+            raise InputError(f"{out}: its folder does not exist; make it first")
+        return
+    if not out.is_dir():
+        raise InputError(f"{out}: expected a folder for the cohort, got a file")
+    if not any(out.iterdir()) or is_cohort(out):
+        return
+    raise InputError(f"{out}: holds files that are no cohort's; name a new folder, or one that a cohort is in")
+
+
+def is_cohort(out: Path) -> bool:
+    """Whether a folder is one that `begin` made."""
+    path = out / DESCRIPTION_NAME
+    if not path.is_file():
+        return False
+    try:
+        table = json_of(text_of(path, "description of a dataset"))
+    except ValueError:
+        return False
+    makers = table.get("GeneratedBy") if isinstance(table, dict) else None
+    return isinstance(makers, list) and any(isinstance(each, dict) and each.get("Name") == "tetopt" for each in makers)
+
+
+def begin(out: Path, description: dict[str, Any]) -> None:
+    """Make the folder, and set down whose it is, if it is new."""
+    out.mkdir(exist_ok=True)
+    for name in (WORK_NAME, LOGS_NAME):
+        (out / name).mkdir(exist_ok=True)
+    if not (out / DESCRIPTION_NAME).exists():
+        save_json(out / DESCRIPTION_NAME, description)
+        # BIDS has no names for meshes of volumes yet, nor for pages and logs.
+        (out / ".bidsignore").write_text("*_mesh.*\n*.html\ncohort.*\nlogs/\nfigures/\n.work/\n", encoding="utf-8")
+
+
+def description(name: str, sources: list[str]) -> dict[str, Any]:
+    """What dataset_description.json says: BIDS 1.10, Dataset description, of a derivative."""
+    return {
+        "Name": name,
+        "BIDSVersion": BIDS_VERSION,
+        "DatasetType": "derivative",
+        "GeneratedBy": [{"Name": "tetopt", "Version": tetopt.__version__}],
+        "SourceDatasets": [{"URL": source} for source in sources],
+    }
+
+
+@contextmanager
+def locked(out: Path, keys: list[str] | None = None) -> Iterator[None]:
+    """Within it no other run writes to the folder, or, with `keys`, none that writes the whole or these subjects.
+
+    A lock ends with its process, also one that is killed.
+
+    Raises
+    ------
+    InputError
+        Another run has the lock.
+    """
+    with ExitStack() as stack:
+        _lock(stack, out / WORK_NAME / "lock", is_shared=keys is not None, what=str(out))
+        for key in keys or ():
+            _lock(stack, out / WORK_NAME / f"{key}.lock", is_shared=False, what=f"{out}: {key}")
+        yield
+
+
+def _lock(stack: ExitStack, path: Path, is_shared: bool, what: str) -> None:
+    if fcntl is None:
+        return
+    stream: IO[str] = stack.enter_context(path.open("a+", encoding="utf-8"))
+    try:
+        fcntl.flock(stream, (fcntl.LOCK_SH if is_shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+    except BlockingIOError:
+        stream.seek(0)
+        whose = stream.read(200).strip() or "another process"
+        raise InputError(f"{what}: another run writes there ({whose}); wait for its end, or end it") from None
+    if not is_shared:
+        stream.truncate(0)
+        stream.write(f"process {os.getpid()} on {socket.gethostname()}\n")
+        stream.flush()
+
+
+def publish(work: Path, out: Path, key: str) -> None:
+    """Give what lies in `work` the subject's place, in one step, instead of what is there; see `restore`."""
+    place, aside = subject_folder(out, key), out / WORK_NAME / f"{key}.before"
+    place.parent.mkdir(exist_ok=True)
+    shutil.rmtree(aside, ignore_errors=True)
+    if place.exists():
+        os.rename(place, aside)
+    os.rename(work, place)
+    shutil.rmtree(aside, ignore_errors=True)
+
+
+def restore(out: Path, keys: list[str] | None = None) -> None:
+    """Put back what a crash has left between the two renamings of `publish`, and take away what runs left behind.
+
+    Of these subjects, or, without `keys`, of all.
+    """
+    for each in sorted((out / WORK_NAME).iterdir()):
+        if keys is not None and each.name.partition(".")[0] not in keys:
+            continue
+        if each.name.endswith(".before"):
+            place = subject_folder(out, each.name.removesuffix(".before"))
+            if not place.exists():
+                os.rename(each, place)
+        if each.is_dir() and each.exists():
+            shutil.rmtree(each)
+
+
+def numbers_of(path: Path) -> dict[str, Any] | None:
+    """What a file of numbers holds; None if it is not there, or is not what a run of tetopt wrote."""
+    try:
+        table = json.loads(path.read_bytes())
+    except (OSError, ValueError, RecursionError):
+        return None
+    return table if isinstance(table, dict) else None

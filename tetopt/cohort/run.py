@@ -1,0 +1,133 @@
+"""One subject: meshed by a process of its own, whose outputs take their place together, or why not is set down.
+
+A worker runs it. All it takes and gives are names and numbers; what there is lies in files.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import time
+from contextlib import suppress
+from pathlib import Path
+from typing import Literal, NamedTuple
+
+from tetopt.budget import status_bytes
+from tetopt.cohort.layout import (
+    FIGURES_NAME,
+    WORK_NAME,
+    failure_path,
+    log_path,
+    mesh_name,
+    numbers_of,
+    publish,
+)
+from tetopt.interpreter import python_command, python_environment
+from tetopt.io.files import save_json
+from tetopt.processes import started
+from tetopt.study.endings import last_line, signal_words
+
+LOOK_SECONDS = 0.2  # between two looks at a run: a hundredth of the shortest that is meant
+MOST_ATTEMPTS = 2  # of a run that a signal ends: the second may find the memory that the first did not
+ERROR_MARK = "tetopt: "  # what a line begins with that says why nothing came of a run
+WARNING_MARK = "tetopt: warning: "
+THREAD_NAMES = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
+
+
+class Job(NamedTuple):
+    """A subject to be meshed."""
+
+    key: str
+    words: tuple[str, ...]  # of `tetopt mesh`, outputs left out
+    out: str  # the cohort's folder
+    suffix: str  # of the mesh's file
+    threads: int
+    n_bytes: float  # of memory that are predicted
+    seconds: float  # likewise, of one thread
+    run: str  # the name of a file in the folder of work: when it is gone, the run is given up
+
+
+class Ended(NamedTuple):
+    """How a subject's run ended."""
+
+    key: str
+    status: Literal["done", "missed", "failed", "given up"]
+    reason: str  # one line; empty if all went well
+    seconds: float
+    peak_bytes: int  # of resident memory
+
+
+def run_subject(job: Job) -> Ended:
+    """Mesh a subject; a run that a signal ends is repeated once."""
+    begin = time.monotonic()
+    for attempt in range(1, MOST_ATTEMPTS + 1):
+        ended, is_crash = _attempt(job, begin, attempt)
+        if not is_crash:
+            break
+    if ended.status == "failed":
+        set_down(Path(job.out), job, ended, attempt)
+    return ended
+
+
+def set_down(out: Path, job: Job, ended: Ended, attempts: int) -> None:
+    """Leave a file that says why a subject failed."""
+    save_json(
+        failure_path(out, job.key),
+        {
+            "key": job.key,
+            "reason": ended.reason,
+            "attempts": attempts,
+            "seconds": ended.seconds,
+            "peak_bytes": ended.peak_bytes,
+            "predicted_bytes": job.n_bytes,
+            "command": ["tetopt", "mesh", *job.words],
+        },
+    )
+
+
+def _attempt(job: Job, begin: float, attempt: int) -> tuple[Ended, bool]:
+    """Run once; how it ended, and whether by a signal that is not ours."""
+    out = Path(job.out)
+    work = out / WORK_NAME / f"{job.key}.{job.run}.{os.getpid()}"
+    shutil.rmtree(work, ignore_errors=True)
+    (work / FIGURES_NAME).mkdir(parents=True)
+    mesh = work / mesh_name(job.key, job.suffix)
+    outputs = ["-o", str(mesh), "--json", str(mesh.with_suffix(".json")), "--figures", str(work / FIGURES_NAME)]
+    command = python_command("-m", "tetopt", "mesh", *job.words, *outputs)
+    environment = python_environment(**dict.fromkeys(THREAD_NAMES, str(job.threads)), COLUMNS="120")
+    peak, log = 0, log_path(out, job.key)
+    with (
+        log.open("wb" if attempt == 1 else "ab") as stream,
+        started(command, work, environment, stdout=stream, stderr=stream) as child,
+    ):
+        while child.poll() is None:
+            with suppress(subprocess.TimeoutExpired):
+                child.wait(LOOK_SECONDS)
+            peak = max(peak, status_bytes("VmHWM", Path("/proc", str(child.pid))))
+            if not (out / WORK_NAME / job.run).exists():
+                return Ended(job.key, "given up", "given up", time.monotonic() - begin, peak), False
+    seconds = time.monotonic() - begin
+    numbers = numbers_of(mesh.with_suffix(".json"))
+    if child.returncode in (0, 1) and numbers is not None and mesh.is_file():
+        publish(work, out, job.key)
+        failure_path(out, job.key).unlink(missing_ok=True)
+        missed = "; ".join((numbers.get("missed") or {}).values())
+        return Ended(job.key, "missed" if missed else "done", missed, seconds, numbers["memory"]["peak_bytes"]), False
+    shutil.rmtree(work, ignore_errors=True)
+    words = signal_words(child.returncode)
+    reason = _reason(log, child.returncode) if words is None else f"ended by {words}"
+    if words is not None and "SIGKILL" in words:
+        reason += f", as systems do that are short of memory; it had {peak / 1e9:.2g} GB"
+    return Ended(job.key, "failed", reason, seconds, peak), words is not None
+
+
+def _reason(log: Path, code: int) -> str:
+    """Why a run ended, in one line: the last that says so, or else the last."""
+    text = log.read_text(encoding="utf-8", errors="replace")
+    errors = [
+        line.removeprefix(ERROR_MARK)
+        for line in text.splitlines()
+        if line.startswith(ERROR_MARK) and not line.startswith(WARNING_MARK)
+    ]
+    return last_line(errors[-1] if errors else text) or f"ended with exit code {code} and no message"

@@ -1,0 +1,74 @@
+"""What there is of each subject, by its outputs alone, and what is to be done and why."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any, Literal, NamedTuple
+
+from tetopt.cohort.layout import failure_path, mesh_name, numbers_of, numbers_path, subject_folder
+from tetopt.cohort.subjects import IMAGE_PATTERN
+
+Status = Literal["done", "missed", "failed", "changed", "missing"]  # "missed": a mesh that misses a promise
+WORDS_LISTED = 4  # of what has changed: a line's worth
+
+
+class State(NamedTuple):
+    """What there is of a subject."""
+
+    status: Status
+    why: str  # what has changed, why it failed; else empty
+
+
+def state_of(out: Path, key: str, suffix: str, request: dict[str, Any] | None) -> State:
+    """What there is of a subject.
+
+    Parameters
+    ----------
+    out : Path
+    key : str
+    suffix : str
+        Of its mesh's file.
+    request : dict, optional
+        What is asked for now, of `tetopt.cli.request.requested`; without it what is there is not compared.
+    """
+    numbers = numbers_of(numbers_path(out, key))
+    failure = numbers_of(failure_path(out, key))
+    before = {} if numbers is None else numbers.get("request") or {}
+    is_there = (
+        numbers is not None and (subject_folder(out, key) / mesh_name(key, before.get("format", suffix))).is_file()
+    )
+    if is_there and numbers is not None and (request is None or before.get("sha256") == request["sha256"]):
+        return State("missed" if numbers.get("missed") else "done", "; ".join((numbers.get("missed") or {}).values()))
+    if failure is not None:
+        return State("failed", str(failure.get("reason", "")))
+    if is_there and request is not None:
+        return State("changed", differences(before, request))
+    return State("missing", "")
+
+
+def differences(before: dict[str, Any], now: dict[str, Any]) -> str:
+    """In what two requests differ, in words."""
+    words = []
+    for name in sorted({*before.get("options", {}), *now["options"]}):
+        pair = [str(each.get("options", {}).get(name, "none")) for each in (before, now)]
+        words += [f"{name} was {pair[0]}, is {pair[1]}"] if pair[0] != pair[1] else []
+    for name in sorted({*before.get("files", {}), *now["files"]}):
+        if before.get("files", {}).get(name) != now["files"].get(name):
+            words.append(f"another {'image' if IMAGE_PATTERN.match(name) or name == 'images' else name}")
+    if before.get("tetopt") != now["tetopt"]:
+        words.append(f"tetopt was {before.get('tetopt', 'none')}, is {now['tetopt']}")
+    more = f" and {len(words) - WORDS_LISTED} more" if len(words) > WORDS_LISTED else ""
+    return "; ".join(words[:WORDS_LISTED]) + more
+
+
+def strangers(out: Path, key: str) -> str | None:
+    """What is wrong with what lies in a subject's place, if that is no subject's of ours."""
+    place = subject_folder(out, key)
+    if not place.exists():
+        return None
+    if numbers_path(out, key).is_file() and place.is_dir():
+        sessions = [each.name for each in place.iterdir() if each.name.startswith("ses-")]
+        return f"{place}: has sessions, {sessions[0]} among them; give the subject one" if sessions else None
+    if place.is_dir() and all(each.is_dir() and each.name.startswith("ses-") for each in place.iterdir()):
+        return f"{place}: has sessions; give the subject one" if "_" not in key and any(place.iterdir()) else None
+    return f"{place}: holds something that is no subject's of this cohort; move it away"

@@ -1,0 +1,214 @@
+"""The subjects of a cohort: what is meshed of each, from a table, and as a table."""
+
+from __future__ import annotations
+
+import csv
+import os
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from io import StringIO
+from pathlib import Path
+from typing import NamedTuple
+
+from tetopt.errors import InputError
+from tetopt.incoming import text_of
+from tetopt.io.files import save_text
+
+TABLE_SUFFIXES = (".tsv", ".csv")
+SUBJECT_COLUMNS = ("subject", "participant_id")  # the second is BIDS's
+SESSION_COLUMNS = ("session", "session_id")
+FILE_OPTIONS = ("mask", "labels", "sizing", "start", "label_names")  # of `tetopt mesh`, that name a file
+NO_VALUES = ("", "n/a")  # of a cell that says nothing; the second is BIDS's
+LEFT_OUT = "#"  # what the name of a column begins with that is a note of the user's own
+IMAGE_PATTERN = re.compile(r"image(?:_([1-9][0-9]{0,2}))?$")
+GLOB_LETTERS = "*?["
+
+
+class Subject(NamedTuple):
+    """A subject, or a session of one, and what is its own."""
+
+    subject: str  # without "sub-"
+    session: str  # without "ses-"; empty for none
+    images: tuple[Path, ...]
+    files: dict[str, Path]  # by `FILE_OPTIONS`
+    options: dict[str, str]  # by the names of `tetopt mesh`, with underscores, as text
+    place: str  # where it stands, for messages
+
+
+class Problems(InputError):
+    """All that is wrong with a cohort, a line each."""
+
+    def __init__(self, lines: Sequence[str]) -> None:
+        super().__init__("; ".join(lines))
+        self.lines = list(lines)
+
+
+def label_of(name: str) -> str:
+    """A name as a BIDS label: without what is neither letter nor digit.
+
+    BIDS 1.10, Common principles, https://bids-specification.readthedocs.io: entities' labels are alphanumeric.
+    """
+    return re.sub("[^0-9A-Za-z]", "", name)
+
+
+def key(subject: Subject) -> str:
+    """What its files are called, e.g. "sub-01_ses-a"."""
+    session = f"_ses-{label_of(subject.session)}" if subject.session else ""
+    return f"sub-{label_of(subject.subject)}{session}"
+
+
+def read_table(path: Path) -> list[Subject]:
+    """The subjects of a table, a line each; its first line has the columns' names.
+
+    `subject` (or `participant_id`), `session`, `image`, `image_2` and so on, `mask`, `labels`, and any other option of
+    `tetopt mesh` for the subject alone. Paths are relative to the table. Cells that are empty, or "n/a", say nothing;
+    a column whose name begins with # is left out.
+
+    Raises
+    ------
+    Problems
+        Everything that is wrong with the table as such.
+    """
+    folder = path.parent.resolve()
+    names, *lines = _cells(path)
+    columns = _columns(path, names)
+    problems: list[str] = []
+    subjects: list[Subject] = []
+    for number, line in lines:
+        place = f"{path}, line {number}"
+        if len(line) != len(columns):
+            problems.append(f"{place}: expected {len(columns)} cells, as the first line has, got {len(line)}")
+            continue
+        cells = {name: cell for name, cell in zip(columns, line, strict=True) if name and cell not in NO_VALUES}
+        images = sorted((name for name in cells if IMAGE_PATTERN.match(name)), key=_image_number)
+        if missing := [name for name in ("subject", "image") if name not in cells]:
+            problems.append(f"{place}: has no {' and no '.join(missing)}")
+            continue
+        options = {name: cell for name, cell in cells.items() if name not in ("subject", "session", *images)}
+        files = {name: _absolute(folder, options.pop(name)) for name in FILE_OPTIONS if name in options}
+        subjects.append(
+            Subject(
+                cells["subject"].removeprefix("sub-"), cells.get("session", "").removeprefix("ses-"),
+                tuple(_absolute(folder, cells[name]) for name in images), files, options, place,
+            )
+        )  # fmt: skip
+    if problems:
+        raise Problems(problems)
+    if not subjects:
+        raise InputError(f"{path}: has no subjects; expected a line for each below the columns' names")
+    return subjects
+
+
+def doubled(subjects: Iterable[Subject]) -> Iterator[str]:
+    """What is wrong with the subjects' names, a line each: none left, two alike, with and without a session."""
+    places: dict[str, str] = {}
+    for each in subjects:
+        if not label_of(each.subject) or (each.session and not label_of(each.session)):
+            yield f"{each.place}: expected letters or digits in the names of subject and session"
+            continue
+        name = key(each)
+        if name in places:
+            yield f"{each.place}: {name} is also that of {places[name]}; give each its own subject or session"
+        places.setdefault(name, each.place)
+    for name, place in places.items():
+        if "_ses-" in name and name.partition("_")[0] in places:
+            bare = name.partition("_")[0]
+            yield f"{place}: {name} has a session, {bare} ({places[bare]}) has none; give both one"
+
+
+def table_text(path: Path, subjects: Sequence[Subject]) -> str:
+    """The subjects as a table that lies at `path`, for `read_table`."""
+    folder = path.parent.resolve()
+    n_images = max((len(each.images) for each in subjects), default=1)
+    images = ["image", *(f"image_{number}" for number in range(2, n_images + 1))]
+    files = [name for name in FILE_OPTIONS if any(name in each.files for each in subjects)]
+    options = sorted({name for each in subjects for name in each.options})
+    session = ["session"] if any(each.session for each in subjects) else []
+    columns = ["subject", *session, *images, *files, *options]
+    stream = StringIO()
+    writer = csv.DictWriter(
+        stream, columns, restval="n/a", lineterminator="\n", delimiter="\t" if path.suffix.lower() == ".tsv" else ","
+    )
+    writer.writeheader()
+    for each in subjects:
+        row = {"subject": each.subject, **({"session": each.session} if each.session else {}), **each.options}
+        row |= {name: _relative(folder, image) for name, image in zip(images, each.images, strict=False)}
+        writer.writerow(row | {name: _relative(folder, file) for name, file in each.files.items()})
+    return stream.getvalue()
+
+
+def write_table(path: Path, subjects: Sequence[Subject]) -> None:
+    """Write the subjects as a table, whole or not at all."""
+    save_text(path, table_text(path, subjects))
+
+
+def matching(pattern: str, subject: Subject) -> Path:
+    """The one file that a pattern of all subjects means for this one.
+
+    {subject} and {session} stand for its names as in `key`; where it has no session, "ses-{session}" goes with the "_"
+    or "/" before or after it. *, ? and [...] are as in a shell.
+
+    Raises
+    ------
+    InputError
+        No file matches, or several do.
+    """
+    words = pattern
+    if not subject.session:
+        words = re.sub(r"_ses-\{session\}|ses-\{session\}[_/]?", "", words)
+    words = words.replace("{subject}", label_of(subject.subject)).replace("{session}", label_of(subject.session))
+    path = Path(words).absolute()
+    if path.exists() or not any(letter in words for letter in GLOB_LETTERS):
+        return path
+    matches = sorted(Path(path.anchor).glob(str(path.relative_to(path.anchor))))
+    if len(matches) == 1:
+        return matches[0]
+    named = ", ".join(match.name for match in matches[:3])
+    raise InputError(f"{words}: expected one file, " + (f"got {len(matches)}: {named}" if matches else "got none"))
+
+
+def _cells(path: Path) -> list[tuple[int, list[str]]]:
+    """The lines of a table with their numbers, as cells; those that are empty left out."""
+    text = text_of(path, "table of subjects")
+    first = text.partition("\n")[0]
+    separator = "\t" if path.suffix.lower() == ".tsv" else ";" if ";" in first and "," not in first else ","
+    reader = csv.reader(StringIO(text, newline=""), delimiter=separator, strict=True)
+    try:
+        lines = [(reader.line_num, [cell.strip() for cell in line]) for line in reader if any(map(str.strip, line))]
+    except csv.Error as error:
+        raise InputError(f"{path}, line {reader.line_num}: expected a table, {error}; mend that line") from error
+    if not lines:
+        raise InputError(f"{path}: is empty; expected a first line with the columns' names, such as subject and image")
+    return lines
+
+
+def _columns(path: Path, first: tuple[int, list[str]]) -> list[str]:
+    """The columns by the names that are used here; "" of those that are left out."""
+    columns = []
+    for cell in first[1]:
+        name = cell.lower().replace("-", "_")
+        name = "subject" if name in SUBJECT_COLUMNS else "session" if name in SESSION_COLUMNS else name
+        columns.append("" if name.startswith(LEFT_OUT) else name)
+    named = [name for name in columns if name]
+    if twice := sorted({name for name in named if named.count(name) > 1}):
+        raise InputError(f"{path}: the column {twice[0]} stands there {named.count(twice[0])} times; leave one")
+    if missing := [name for name in ("subject", "image") if name not in named]:
+        separator = "tabs" if path.suffix.lower() == ".tsv" else "commas"
+        raise InputError(
+            f"{path}: expected columns subject and image, between {separator}, got {', '.join(named) or 'none'}; "
+            f"there is no {' and no '.join(missing)}"
+        )
+    return columns
+
+
+def _image_number(name: str) -> int:
+    match = IMAGE_PATTERN.match(name)
+    return int(match[1] or 1) if match else 0
+
+
+def _absolute(folder: Path, cell: str) -> Path:
+    return Path(os.path.normpath(folder / Path(cell).expanduser()))
+
+
+def _relative(folder: Path, path: Path) -> str:
+    return os.path.relpath(path, folder)
