@@ -1,0 +1,216 @@
+"""Dask's workers for a cohort: processes of this machine, those of a cluster that runs, or jobs of a batch system.
+
+A worker holds names of files and watches a process of its own that meshes a subject; so it is small whatever the
+subject, and dask's limits on a worker's memory say nothing about that of the subject's process. What keeps subjects
+within memory is how many of them there are at a time: that is decided here, from what the largest is predicted to need.
+"""
+
+from __future__ import annotations
+
+import logging
+import os
+import shutil
+import warnings
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from tetopt.budget import available_bytes, memory_words
+from tetopt.cohort.crew import (
+    MEMORY_MARGIN,
+    WORKER_BYTES,
+    About,
+    Folders,
+    Need,
+    Newcomers,
+    Workers,
+    dashboard_address,
+    slots_of,
+)
+from tetopt.cohort.jobs import submitted
+from tetopt.errors import InputError
+
+CONNECT_SECONDS = 10  # until a scheduler that does not answer is given up: dask's own is 30
+LOGGER_NAMES = ("distributed", "dask_jobqueue", "bokeh", "tornado", "asyncio")  # of what speaks in dask
+
+
+@contextmanager
+def workers(
+    need: Need, folders: Folders, *, count: int | None, scheduler: str | None, cluster: Path | None
+) -> Iterator[Workers]:
+    """Workers for as long as the block lasts; none is left after it, however it ends, nor what they wrote into `work`.
+
+    A worker that dies fails its task with `distributed.KilledWorker` at once (with `scheduler`, as often as its own
+    configuration says), so that who submits decides whether it is run again.
+
+    Parameters
+    ----------
+    need : Need
+    folders : Folders
+        Both are there.
+    count : int, optional
+        The most subjects at a time on this machine, or jobs of a batch system; not with `scheduler`.
+    scheduler : str, optional
+        The address of a scheduler that runs, as "tcp://host:8786"; certificates are those of dask's configuration.
+    cluster : Path, optional
+        A file of dask-jobqueue's configuration, see `tetopt.cohort.jobs`.
+
+    Yields
+    ------
+    Workers
+
+    Raises
+    ------
+    InputError
+        dask is not installed; a scheduler that does not answer; workers of another version, that do not see `work` or
+        have too little memory (also while the block lasts, from `slots`); a file that is none, or asks for too little.
+    """
+    check_installed()
+    if scheduler is not None and cluster is not None:
+        raise InputError("--scheduler, --cluster: expected one of them, got both")
+    if scheduler is not None and count is not None:
+        raise InputError("--workers: expected none with --scheduler, whose workers are there; start more of them")
+    with ExitStack() as stack:
+        stack.enter_context(_quiet(folders.logs / "dask.log"))
+        if scheduler is not None:
+            yield _connected(stack, need, folders, scheduler)
+        elif cluster is not None:
+            yield submitted(stack, need, folders, cluster, count)
+        else:
+            yield _local(stack, need, folders, count)
+
+
+def check_installed() -> None:
+    """InputError where dask.distributed and what belongs to it is not installed."""
+    try:
+        import cryptography  # noqa: F401
+        import dask_jobqueue  # noqa: F401
+        import distributed  # noqa: F401
+    except ImportError as error:
+        raise InputError(f'{error.name} is not installed, cohorts need it; pip install "tetopt[cohort]"') from error
+
+
+class Share(NamedTuple):
+    """How this machine is divided."""
+
+    workers: int  # each with one subject at a time
+    threads: int  # of each subject
+    bytes: float  # for each subject
+
+
+def shares(need: Need, count: int | None, cores: int, free: float) -> Share:
+    """As many workers as cores, memory (bytes that are free), `count` and subjects allow, at least one."""
+    per_subject = MEMORY_MARGIN * need.subject_bytes + WORKER_BYTES
+    most = [need.n_subjects, cores // (need.threads or 1)]
+    if free < float("inf"):
+        most.append(int(free / per_subject))
+    if count is not None:
+        most.append(count)
+    number = max(1, min(most))
+    return Share(number, need.threads or max(1, cores // number), free / number - WORKER_BYTES)
+
+
+def _local(stack: ExitStack, need: Need, folders: Folders, count: int | None) -> Workers:
+    """A cluster within this machine, on its loopback, with certificates of its own: others here cannot submit code."""
+    import dask
+    from dask.system import CPU_COUNT
+    from distributed import Client, LocalCluster
+
+    free = available_bytes()
+    share = shares(need, count, CPU_COUNT, float("inf") if free is None else float(free))
+    stack.enter_context(dask.config.set({"distributed.scheduler.allowed-failures": 0}))
+    own_folder = folders.work / "dask"
+    stack.callback(shutil.rmtree, own_folder, ignore_errors=True)
+    cluster = stack.enter_context(
+        LocalCluster(
+            n_workers=share.workers,
+            threads_per_worker=1,  # subjects at a time
+            security=True,
+            memory_limit=0,  # the worker is small, and its limit would not be that of the subject's process
+            local_directory=str(own_folder),
+            dashboard_address=dashboard_address(),
+        )
+    )
+    client = stack.enter_context(Client(cluster))
+    client.register_plugin(_silencer(folders.logs / "dask.log"))
+    words = f"{share.workers} workers of {share.threads} thread{'s' * (share.threads != 1)}"
+    if free is not None:
+        words += f" and {memory_words(share.bytes)}"
+    words += f"; dashboard {client.dashboard_link}"
+    return Workers(client, lambda: slots_of(client), share.threads, share.bytes, words)
+
+
+# ---- A cluster that runs
+
+
+def _connected(stack: ExitStack, need: Need, folders: Folders, address: str) -> Workers:
+    """The workers of a scheduler that others started."""
+    from distributed import Client
+
+    try:
+        with warnings.catch_warnings():  # of versions that differ: what matters of them is checked, in one line
+            warnings.simplefilter("ignore")
+            client = stack.enter_context(Client(address, timeout=CONNECT_SECONDS))
+    except (OSError, ValueError, TypeError, RuntimeError) as error:
+        reason = " ".join(str(error).split()) or type(error).__name__
+        raise InputError(
+            f"--scheduler: {address} does not answer ({reason[:200]}); expected the address of a dask scheduler that "
+            "runs, as tcp://host:8786"
+        ) from error
+    newcomers = Newcomers(client, need, folders.work)
+    stack.callback(newcomers.probe.unlink, missing_ok=True)
+    slots = newcomers.slots()
+    if slots == 0:
+        raise InputError(f"--scheduler: {address} has no workers; start some: dask worker {address}")
+    threads = need.threads or _threads_each(list(newcomers.known.values()))
+    n_bytes = min((about.n_bytes / about.n_threads for about in newcomers.known.values()), default=float("inf"))
+    words = f"{len(newcomers.known)} workers at {address}, {slots} subjects at a time of {threads} threads"
+    return Workers(client, newcomers.slots, threads, n_bytes, f"{words}; dashboard {client.dashboard_link}")
+
+
+def _threads_each(abouts: list[About]) -> int:
+    """Of each host its cores by the subjects that run there at a time; the fewest of all hosts."""
+    hosts: dict[str, list[About]] = {}
+    for about in abouts:
+        hosts.setdefault(about.host, []).append(about)
+    shares_of_hosts = [some[0].cores // sum(about.n_threads for about in some) for some in hosts.values()]
+    return max(1, min(shares_of_hosts, default=1))
+
+
+# ---- What dask says
+
+
+@contextmanager
+def _quiet(log: Path) -> Iterator[None]:
+    """What dask's loggers say goes into a file, which is made when there is something, and not to the terminal."""
+    import distributed  # noqa: F401  (it puts the handlers there that are taken away here)
+
+    handler = logging.FileHandler(log, delay=True, encoding="utf-8", errors="backslashreplace")
+    handler.setFormatter(logging.Formatter("%(asctime)s %(name)s %(levelname)s %(message)s"))
+    before = []
+    for name in [*LOGGER_NAMES, *list(logging.root.manager.loggerDict)]:
+        logger = logging.getLogger(name)
+        if name in LOGGER_NAMES or (name.split(".")[0] in LOGGER_NAMES and logger.handlers):
+            before.append((logger, logger.handlers, logger.propagate))
+            logger.handlers, logger.propagate = [handler], False
+    try:
+        yield
+    finally:
+        for logger, handlers, propagate in before:
+            logger.handlers, logger.propagate = handlers, propagate
+        handler.close()
+
+
+def _silencer(log: Path) -> Any:
+    """A plugin by which workers, also those started again, write what they would have to the terminal into a file."""
+    from distributed import WorkerPlugin
+
+    class Silencer(WorkerPlugin):
+        def setup(self, worker: Any) -> None:
+            descriptor = os.open(log, os.O_WRONLY | os.O_CREAT | os.O_APPEND, 0o666)
+            os.dup2(descriptor, 1)
+            os.dup2(descriptor, 2)
+            os.close(descriptor)
+
+    return Silencer()
