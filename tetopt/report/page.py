@@ -22,6 +22,7 @@ from tetopt.io.text import plain
 PAGE_SCRIPTS = {
     "viewer": ("webgl.js", "viewer.js"),
     "explorer": ("webgl.js", "explore_mesh.js", "explore_gl.js", "explore.js"),
+    "cohort": ("cohort.js",),
 }
 BROAD_RATIO = 1.4  # A picture wider than this many times its height keeps a readable width on a phone, and scrolls.
 

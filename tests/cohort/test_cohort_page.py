@@ -1,0 +1,157 @@
+"""The page of a cohort: what is in it, also without scripts; how it sorts and filters, in a browser."""
+
+import json
+import re
+
+import numpy as np
+import pytest
+from browser import FRAMES, copied, document
+from cohorts import HOSTILE, key_of, save_cohort, save_run, thumbnail
+
+from tetopt.cohort import page
+from tetopt.cohort.flags import flags_of
+from tetopt.cohort.numbers import collect
+from tetopt.cohort.page import save_cohort_files, save_cohort_page
+
+
+@pytest.fixture(scope="module")
+def cohort(tmp_path_factory):
+    """Its folder and its page, of 100 subjects."""
+    out = tmp_path_factory.mktemp("cohort")
+    save_cohort_files(out, collect(out, save_cohort(out, 100)))
+    return out, (out / "cohort.html").read_text(encoding="utf-8")
+
+
+def data_of(text):
+    return json.loads(re.search(r'<script type="application/json" id="data">(.*?)</script>', text, re.S)[1])
+
+
+def test_the_three_files_lie_beside_the_subjects(cohort):
+    out, _ = cohort
+    assert sorted(path.name for path in out.glob("cohort.*")) == ["cohort.html", "cohort.json", "cohort.tsv"]
+    assert len((out / "cohort.tsv").read_text(encoding="utf-8").splitlines()) == 101
+
+
+def test_failures_are_on_top_with_their_logs(cohort):
+    _, text = cohort
+    assert "100 subjects: 94 done, 1 with a promise missed, 4 failed, 1 not run." in text
+    assert text.index("<h2>Failed: 4</h2>") < text.index("<h2>Distributions</h2>") < text.index("<h2>Subjects</h2>")
+    failures = re.findall(r"<tr><td>([^<]*)</td><td>([^<]*)<a href=\"([^\"]*)\">log</a>", text)
+    assert [key for key, _, _ in failures] == [key_of(k) for k in (22, 62, 2, 42)]  # by reason
+    assert [log for _, _, log in failures] == [f"logs/{key}.log" for key, _, _ in failures]
+
+
+def test_what_all_have_in_common_is_said_once(cohort):
+    _, text = cohort
+    assert "Of all meshes: tetopt 0.1.0, nodes 8000, k_D 0.85, method fast, young 3.0, format .vtu." in text
+    assert "options.nodes" not in {column["name"] for column in data_of(text)["columns"]}
+
+
+def test_names_do_no_harm(cohort):
+    _, text = cohort
+    assert HOSTILE not in text
+    assert "<img src=x" not in text
+    assert text.count("<script") == 2 == text.count("</script>")
+    assert all(line.isprintable() for line in text.splitlines())
+    assert "default-src 'none'" in text
+
+
+def test_the_page_has_what_the_rows_have(cohort):
+    out, text = cohort
+    data, rows = data_of(text), collect(out, [key_of(82)])
+    assert [row[0] for row in data["rows"]] == [row.key for row in rows]
+    names = [column["name"] for column in data["columns"]]
+    assert "labels.17.volume" in names
+    for row, shown in zip(rows, data["rows"], strict=True):
+        assert shown[5] == row.files.get("mesh", "")
+        rho, own = shown[7 + names.index("quality.mean_rho")], row.numbers.get("quality.mean_rho")
+        assert (rho is None) == (own is None)
+        assert own is None or rho == pytest.approx(own, rel=1e-3)
+    assert len(data["pictures"]) == sum("thumbnail" in row.files for row in rows) == 95
+
+
+def test_many_subjects_have_pictures_of_the_odd_and_of_a_sample(cohort, monkeypatch, tmp_path):
+    """The page stays small: fewer pictures, and fewer labels."""
+    out, whole = cohort
+    rows = collect(out)
+    plain = [each for each in data_of(whole)["columns"] if not each["name"].startswith("labels.")]
+    monkeypatch.setattr(page, "PAGE_PICTURES", 20)
+    monkeypatch.setattr(page, "PAGE_NUMBERS", len(rows) * (len(plain) + 3))
+    flags = flags_of(rows)
+    save_cohort_page(tmp_path / "a.html", out, rows, flags)
+    text = (tmp_path / "a.html").read_text(encoding="utf-8")
+    data = data_of(text)
+    pictured = {int(place) for place in data["pictures"]}
+    assert len(pictured) == 20
+    assert {place for place, own in enumerate(flags) if own} <= pictured
+    assert max(pictured) > 80
+    assert "The page has 20 of them" in text
+    assert "Numbers of 1 more labels are in cohort.tsv alone." in text
+    assert sum(column["name"].startswith("labels.") for column in data["columns"]) == 2
+
+
+def test_a_cohort_of_nothing_has_a_page(tmp_path):
+    save_cohort_files(tmp_path, [])
+    assert "0 subjects: none." in (tmp_path / "cohort.html").read_text(encoding="utf-8")
+    assert "0 subjects" in document(tmp_path / "cohort.html")
+
+
+# What a reader does, one step after the other, and what is there then.
+STEPS = """<script>
+const say = (words) => {
+  document.body.append(Object.assign(document.createElement("p"), {className: "said", textContent: words})); };
+const first = () => [...document.querySelectorAll(".name b")].slice(0, 3).map((e) => e.textContent).join(" ");
+const pick = (name, value) => { const e = document.querySelector(`[aria-label="${name}"]`);
+  e.value = value; e.dispatchEvent(new Event(e.type === "search" ? "input" : "change")); };
+const head = (words) =>
+  [...document.querySelectorAll("th button")].find((e) => e.textContent.startsWith(words)).click();
+const pager = () => document.querySelector(".pager").textContent;
+say(first());
+head("mean rho"); say(first()); head("mean rho"); say(first()); head("mean rho"); say(first());
+head("subject"); say(first());
+document.querySelectorAll(".pager button")[1].click(); say(first() + pager());
+pick("Which subjects", "odd"); say(pager());
+pick("Which subjects", "failed"); say(pager());
+pick("Which subjects", "all"); pick("Filter by text", "LPS"); say(first()); pick("Filter by text", "");
+document.querySelectorAll(".bar")[1].dispatchEvent(new Event("click")); say(first() + pager());
+document.querySelector(".chips button").click(); say(pager());
+pick("How", "pictures"); say(document.querySelectorAll(".tile img").length + " tiles");
+</script>"""
+
+
+def test_a_browser_sorts_and_filters(cohort, tmp_path):
+    out, text = cohort
+    made = document(copied(text, tmp_path / "a.html", FRAMES, STEPS))
+    said = re.findall(r'<p class="said">([^<]*)</p>', made)
+    rows = [row for row in collect(out) if row.numbers.get("quality.mean_rho") is not None]
+    rising = [row.key for row in sorted(rows, key=lambda row: float(f"{row.numbers['quality.mean_rho']:.4g}"))]
+    top = f"{key_of(2)} {key_of(22)} {key_of(42)}"
+    assert said[0] == said[3] == top
+    assert said[1].split()[0] == rising[0]
+    assert said[2].split()[0] == rising[-1]
+    assert said[4] == " ".join(map(key_of, range(3)))
+    assert said[5] == " ".join(map(key_of, range(50, 53))) + "‹ before 51 to 100 of 100 next ›"
+    n_odd = sum(bool(own) for own in flags_of(collect(out))) + 5
+    assert f" of {n_odd} (100 in all)" in said[6]
+    assert " of 4 (100 in all)" in said[7]
+    assert said[8] == key_of(7)
+    assert said[9].startswith(key_of(7) + "‹ before 1 to 1 of 1 (100 in all)")
+    assert "of 100 " in said[10]
+    assert said[11] == "95 tiles"
+
+
+def test_without_scripts_there_is_a_table(cohort):
+    """What the browser shows then is in the file as it is."""
+    _, text = cohort
+    table = text[text.index('<div id="subjects">') : text.index('<script type="application/json"')]
+    assert table.count("<tr>") == 101
+    assert "orientation LPS: 94 of 95 have RAS" in table
+    assert table.index("LPS") < table.index(key_of(0))
+
+
+def test_a_picture_that_is_none_of_ours_stays_out(tmp_path):
+    big = np.random.default_rng(0).bytes(40_000)
+    save_run(tmp_path, "sub-1", {"missed": {}}, big)
+    save_run(tmp_path, "sub-2", {"missed": {}}, thumbnail(np.random.default_rng(0)))
+    save_cohort_files(tmp_path, collect(tmp_path))
+    assert list(data_of((tmp_path / "cohort.html").read_text(encoding="utf-8"))["pictures"]) == ["1"]

@@ -1,0 +1,158 @@
+"""What is flagged, and how seldom what is not odd."""
+
+import numpy as np
+import pytest
+from cohorts import run_of, save_cohort
+
+from tetopt.cohort.flags import FEW_SUBJECTS, QUANTITIES, deviations, flags_of, limit, units
+from tetopt.cohort.numbers import Row, collect, flattened
+
+OBLIQUE = np.diag([1.0, 1.0, 1.2, 1.0])
+OBLIQUE[:3, :3] = [[0.9, -0.436, 0.0], [0.436, 0.9, 0.0], [0.0, 0.0, 1.2]]
+
+
+def row_of(k, run, **changes):
+    labels = run["labels"]
+    row = Row(
+        f"sub-{k}", f"sub-{k}", "", "done", "", (), {}, flattened(run), {17: "hippocampus"},
+        {each["label"]: each["volume"] for each in labels}, {each["label"]: 350 for each in labels if each["is_lost"]},
+    )  # fmt: skip
+    return row._replace(**changes)
+
+
+def flagged(odd, n=20, **changes):
+    """Columns and words of the flags of one odd subject among usual ones, which have none."""
+    rng = np.random.default_rng(4)
+    rows = [row_of(k, run_of(rng)) for k in range(n - 1)]
+    flags = flags_of([*rows, row_of(n - 1, run_of(rng, **odd), **changes)])
+    assert [each for each in flags[:-1] if each] == []
+    assert all(flag.words.isprintable() for flag in flags[-1])
+    return [(flag.column, flag.words) for flag in flags[-1]]
+
+
+def test_a_usual_cohort_has_no_flags():
+    assert flagged({}) == []
+
+
+def test_each_kind_of_odd_subject():
+    """With the reason in words."""
+    flipped = {"affine": np.diag([-1.0, -1.0, 1.2, 1.0])}
+    assert flagged(flipped) == [("grid.orientation", "orientation LPS: 19 of 20 have RAS")]
+    assert flagged({"lost": 17}) == [("label", "lost label 17 (hippocampus): no cell has it, 350 voxels do")]
+    assert flagged({"absent": 53}) == [("label", "no label 53 in its image: 19 of 20 have it")]
+    assert flagged({}, missed=("floor",)) == [("missed", "missed floor")]
+    [(column, words)] = flagged({"affine": OBLIQUE})
+    assert column == "grid.oblique_degrees"
+    assert words == "obliqueness 25.8 degrees: 12.9 robust deviations above the median 0 degrees"
+
+
+def test_a_small_mask_is_told_with_the_median():
+    words = dict(flagged({"mask_volume": 0.4e6}))["mask.volume"]
+    assert words.startswith("volume of the mask 400 ml: ")
+    assert words.endswith(" l")
+    assert " robust deviations below the median 1." in words
+
+
+def test_a_missed_label_is_told_once():
+    """Which one it is, not also that a promise about labels is missed."""
+    assert flagged({"lost": 17}, missed=("labels",)) == flagged({"lost": 17})
+
+
+def test_a_label_that_few_have():
+    rng = np.random.default_rng(4)
+    rows = [row_of(k, run_of(rng)) for k in range(20)]
+    rows[3] = rows[3]._replace(volumes={**rows[3].volumes, 99: 5.0})
+    flags = flags_of(rows)
+    assert [flag.words for flag in flags[3]] == ["label 99 in its image: 1 of 20 have it"]
+
+
+def test_the_same_image_twice_is_told_of_both():
+    rng = np.random.default_rng(4)
+    rows = [row_of(k, run_of(rng)) for k in range(4)]
+    for k in (1, 3):
+        rows[k].numbers["image_sha256"] = "same"
+    flags = flags_of(rows)
+    assert [[flag.words for flag in each] for each in flags] == [
+        [], ["the same image as sub-3"], [], ["the same image as sub-1"]
+    ]  # fmt: skip
+    rows[3].numbers["options.volume"] = 2  # another one of a file of several
+    assert flags_of(rows) == [[], [], [], []]
+
+
+def test_no_majority_no_odd_one():
+    rng = np.random.default_rng(4)
+    runs = [run_of(rng, affine=np.diag([sign, sign, 1.2, 1.0])) for sign in (1.0, 1.0, 1.0, -1.0, -1.0)]
+    rows = [row_of(k, run) for k, run in enumerate(runs)]
+    assert flags_of(rows) == [[]] * 5  # three of five
+    assert [bool(each) for each in flags_of(rows[1:4])] == [False, False, True]  # two of three
+    assert flags_of(rows[2:4]) == [[], []]  # one of two
+
+
+def test_few_subjects_have_no_medians():
+    usual = FEW_SUBJECTS - 1
+    assert flagged({"mask_volume": 1.0}, n=usual) == []
+    assert len(flagged({"mask_volume": 1.0}, n=usual + 1)) > 0
+
+
+def test_what_failed_says_nothing_of_others():
+    rng = np.random.default_rng(4)
+    rows = [row_of(k, run_of(rng)) for k in range(20)]
+    rows[0] = row_of(0, run_of(rng, mask_volume=1.0), status="failed")
+    assert flags_of(rows)[0] == []
+
+
+def test_planes_and_volumes_are_not_compared():
+    rng = np.random.default_rng(4)
+    rows = [row_of(k, run_of(rng)) for k in range(40)]
+    for row in rows[20:]:
+        row.numbers["quality.ndim"] = 2
+        row.numbers["mask.volume"] /= 1e3
+    rows[30].numbers["mask.volume"] *= 1e3
+    flags = flags_of(rows)
+    assert [k for k, each in enumerate(flags) if each] == [30]
+    assert "cm^2" in flags[30][0].words
+
+
+def test_deviations_are_scaled_by_the_median_absolute_deviation():
+    values = np.random.default_rng(0).normal(3.0, 2.0, 100_000)
+    np.testing.assert_allclose(deviations(values, False, 1e-9), (values - 3.0) / 2.0, rtol=0.02, atol=0.02)
+    np.testing.assert_allclose(deviations(np.exp(values), True, 1e-9), deviations(values, False, 1e-9), atol=1e-9)
+
+
+def test_numbers_that_are_the_same_are_measured_by_the_least_scale():
+    values = np.r_[np.ones(9), 1.2]
+    assert deviations(values, False, 0.1)[-1] == pytest.approx(2.0)
+    assert deviations(np.r_[np.ones(9), 0.0], True, 0.05)[-1] == -np.inf
+    assert [flag.words for flag in flags_of_column("mask.volume", np.r_[np.ones(9), 0.0])[-1]] == [
+        "volume of the mask 0 mm^3: far below the median 1 mm^3"
+    ]
+    assert flags_of_column("mask.volume", np.zeros(10)) == [[]] * 10
+
+
+def flags_of_column(column, values):
+    row = Row("sub-1", "sub-1", "", "done", "", (), {}, {}, {}, {}, {})
+    return flags_of([row._replace(numbers={"quality.ndim": 3, column: float(value)}) for value in values])
+
+
+@pytest.mark.parametrize("n", [8, 12, 20, 50, 500])
+def test_usual_numbers_are_seldom_flagged(n):
+    """Of normal ones at most 1 of 1000, of Student's t with 5 degrees of freedom 5 of 1000; see docs/cohorts.md."""
+    rng = np.random.default_rng(n)
+    columns = 100_000 // n
+    for numbers, most in ((rng.normal(size=(columns, n)), 1e-3), (rng.standard_t(5, size=(columns, n)), 5e-3)):
+        far = [np.abs(deviations(row, False, 1e-9)) > limit(n) for row in numbers]
+        assert np.mean(far) <= most
+
+
+def test_units_are_read_easily():
+    assert [units("mm", 3)(x) for x in (2.5, 999.0, 1430.0, 2e9)] == ["2.5 mm^3", "999 mm^3", "1.43 ml", "2,000 l"]
+    assert [units("s", 3)(x) for x in (0.0, 59.0, 61.0, 7200.0)] == ["0 s", "59 s", "1.02 min", "2 h"]
+    assert units("degrees", 3)(12.34) == "12.3 degrees"
+    assert len({each.column for each in QUANTITIES}) == len(QUANTITIES)
+
+
+def test_what_was_put_in_is_flagged_and_little_else(tmp_path):
+    rows = collect(tmp_path, save_cohort(tmp_path, 100))
+    odd = {row.key for row, flags in zip(rows, flags_of(rows), strict=True) if flags}
+    assert {"sub-0008", "sub-0020", "sub-0032", "sub-0044", "sub-0060"} <= odd
+    assert len(odd) <= 7

@@ -1,0 +1,189 @@
+"""The table of a cohort: what is read from its folder, by which names, and how it is written."""
+
+import csv
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from cohorts import HOSTILE, key_of, run_of, save_cohort, save_failure, save_run
+
+import tetopt.cohort
+from tetopt.cohort.layout import failure_path, mesh_name, numbers_path, subject_folder
+from tetopt.cohort.numbers import (
+    collect,
+    column_names,
+    description,
+    field_text,
+    flattened,
+    natural_order,
+    oblique_degrees,
+    orientation_code,
+    save_table,
+)
+from tetopt.incoming import toml_of
+from tetopt.measure.fidelity import LabelFidelity, MaskFidelity
+from tetopt.measure.interfaces import LabelInterface
+from tetopt.measure.quality import Quality
+
+RNG = np.random.default_rng(0)
+
+
+@pytest.fixture(scope="module")
+def cohort(tmp_path_factory):
+    out = tmp_path_factory.mktemp("cohort")
+    expected = save_cohort(out, 10)
+    return collect(out, [*expected, "sub-none_ses-b"])
+
+
+def test_rows_are_those_there_and_those_expected(cohort):
+    assert [row.key for row in cohort] == [*map(key_of, range(10)), "sub-none_ses-b"]
+    assert [row.status for row in cohort] == ["done"] * 2 + ["failed"] + ["done"] * 7 + ["missing"]
+    assert cohort[2].reason == "image.nii.gz: expected a NIfTI image, got a file that ends early"
+    assert cohort[2].files == {"log": "logs/sub-0003.log"}
+    assert cohort[2].numbers["failure.attempts"] == 2
+    assert (cohort[-1].subject, cohort[-1].session, cohort[-1].files) == ("sub-none", "ses-b", {})
+    first = "sub-0001/sub-0001_desc-tetopt_mesh"
+    assert cohort[0].files == {
+        "mesh": f"{first}.vtu", "numbers": f"{first}.json", "figures": "sub-0001/figures",
+        "thumbnail": "sub-0001/figures/thumbnail.png",
+    }  # fmt: skip
+
+
+def test_sessions_and_what_is_no_subject(tmp_path):
+    save_run(tmp_path, "sub-2_ses-b", run_of(RNG))
+    save_run(tmp_path, "sub-10", run_of(RNG))
+    save_run(tmp_path, "sub-2_ses-a", run_of(RNG, missed={"floor": "two\nlines", "box": "out"}))
+    save_failure(tmp_path, "sub-1", "x")
+    save_failure(tmp_path, "other", "x")
+    (tmp_path / "sub-<b>").mkdir()
+    (tmp_path / "sub-7").mkdir()
+    rows = collect(tmp_path)
+    assert [row.key for row in rows] == ["sub-1", "sub-2_ses-a", "sub-2_ses-b", "sub-10"]
+    assert rows[1].files["mesh"] == "sub-2/ses-a/sub-2_ses-a_desc-tetopt_mesh.vtu"
+    assert (rows[1].status, rows[1].missed) == ("missed", ("floor", "box"))
+    assert rows[1].reason == r"floor: two\nlines; box: out"
+
+
+@pytest.mark.parametrize("text", ["", "[]", "{", "[" * 100_000, '{"a": NaN', "\x00"])
+def test_numbers_that_are_none_are_a_failure(tmp_path, text):
+    save_run(tmp_path, "sub-1", run_of(RNG))
+    numbers_path(tmp_path, "sub-1").write_text(text)
+    [row] = collect(tmp_path)
+    assert (row.status, row.reason, row.numbers) == ("failed", "its numbers cannot be read; run it again", {})
+
+
+def test_a_failure_is_told_instead_of_an_older_mesh(tmp_path):
+    save_run(tmp_path, "sub-1", run_of(RNG))
+    save_failure(tmp_path, "sub-1", HOSTILE)
+    [row] = collect(tmp_path)
+    assert (row.status, set(row.numbers)) == (
+        "failed", {f"failure.{name}" for name in ("attempts", "seconds", "peak_bytes", "predicted_bytes")}
+    )  # fmt: skip
+    assert row.reason.isprintable()
+    failure_path(tmp_path, "sub-1").write_text("{")
+    assert collect(tmp_path)[0].reason == "sub-1.failed.json cannot be read"
+
+
+def test_numbers_without_a_mesh_are_a_failure(tmp_path):
+    save_run(tmp_path, "sub-1", run_of(RNG), suffix=".inp")
+    assert collect(tmp_path)[0].files["mesh"].endswith("_mesh.inp")
+    (subject_folder(tmp_path, "sub-1") / mesh_name("sub-1", ".inp")).unlink()
+    assert collect(tmp_path)[0].reason == "there are numbers and no mesh; run it again"
+
+
+def test_numbers_have_names_with_dots():
+    run = run_of(RNG)
+    run |= {"materials": {"young_kPa": [1.0, 2.0], "nu": [0.1] * 5, "binning": None}, "boundary_problems": ["a", "b"]}
+    run |= {"contrasts": [{"image": "a", "weight": 2.0}] * 6, "cells_without_voxel": 10**400, "ended": float("inf")}
+    columns = flattened(run)
+    assert columns["grid.orientation"] == "RAS"
+    assert columns["grid.spacing_mm"] == "1 x 1 x 1.2"
+    assert columns["grid.shape"] == "180 x 220 x 170"
+    assert columns["grid.volume_mm"] == pytest.approx(180 * 220 * 170 * 1.2)
+    assert columns["quality.errors.mean"] == 0.09
+    assert columns["materials.young_kPa.2"] == 2.0
+    assert not any(name.startswith("materials.nu") for name in columns)
+    assert columns["contrasts.6.weight"] == 2.0
+    assert columns["boundary_problems"] == "a; b"
+    assert (columns["cells_without_voxel"], columns["ended"]) == (None, None)  # no number to compute with
+    assert columns["labels.17.n_cells"] == 300
+    assert columns["interfaces.0.area"] == 1000.0
+    assert columns["request.options.young"] == "3.0"
+    assert "request.options.nodes" not in columns
+    left_out = ("history", "sets", "missed", "box", "label_names", "inputs.sha256", "labels.0.label")
+    assert [name for name in columns if name.startswith(left_out)] == []
+
+
+@pytest.mark.parametrize("box", [None, [], {}, {"affine": [[1]], "shape": [3, 3]}, {"affine": "x", "shape": None}])
+def test_a_grid_that_is_none_has_no_columns(box):
+    assert [name for name in flattened({"box": box, "ended": "x"}) if name.startswith("grid")] == []
+
+
+def test_orientation_is_that_of_nibabel():
+    from nibabel.orientations import aff2axcodes
+
+    for order in ([0, 1, 2], [2, 0, 1], [1, 0, 2]):
+        for signs in ([1, 1, 1], [-1, 1, -1], [-1, -1, 1]):
+            affine = np.eye(4)
+            affine[:3, :3] = (np.eye(3) * signs)[order] + 0.1
+            assert orientation_code(affine) == "".join(aff2axcodes(affine))
+    turn = np.radians(12.3)
+    turned = np.array([[np.cos(turn), -np.sin(turn), 0], [np.sin(turn), np.cos(turn), 0], [0, 0, 1]])
+    assert oblique_degrees(np.block([[turned * [1, 2, 3], np.ones((3, 1))], [0, 0, 0, 1]])) == 12.3
+
+
+def test_the_table_reads_back(cohort, tmp_path):
+    path = tmp_path / "cohort.tsv"
+    flags = [[HOSTILE, "b"]] + [[] for _ in cohort[1:]]
+    save_table(path, cohort, flags)
+    text = path.read_text(encoding="utf-8")
+    assert text.count("\n") == len(cohort) + 1
+    assert all(line.isprintable() for line in text.replace("\t", "").splitlines())
+    rows = list(csv.DictReader(text.splitlines(), delimiter="\t"))
+    assert [row["participant_id"] for row in rows] == [row.subject for row in cohort]
+    assert [row["session_id"] for row in rows] == ["n/a"] * 10 + ["ses-b"]
+    assert rows[0]["flags"].endswith("; b")
+    for row, line in zip(cohort, rows, strict=True):
+        for name in column_names(cohort):
+            value = row.numbers.get(name)
+            if isinstance(value, int | float) and not isinstance(value, bool):
+                assert float(line[name]) == value  # to the last bit
+            elif value is None:
+                assert line[name] == "n/a"
+    about = json.loads(path.with_suffix(".json").read_text())
+    assert list(about) == list(rows[0])
+    assert about["labels.17.volume"] == {
+        "Description": "Label 17 (hippocampus): volume of these voxels", "Units": "mm^n"
+    }  # fmt: skip
+
+
+def test_no_text_is_a_formula():
+    for first in "=+-@\uff1d":
+        assert field_text(f"{first}1+1") == f"'{first}1+1"
+    assert field_text("\t=1") == r"\t=1"
+    assert field_text(-4.5) == "-4.5"
+
+
+def test_every_column_is_described():
+    assert [name for name in flattened(run_of(RNG)) if description(name)["Description"].endswith("of run.json")] == []
+    assert description("options.k_D") == {"Description": "Option k_D"}
+    assert description("quality_initial.min_edge")["Units"] == "mm"
+    assert description("new.thing")["Description"] == "new.thing of run.json"
+
+
+@pytest.mark.parametrize(
+    ("beginning", "record"),
+    [("labels.N.", LabelFidelity), ("interfaces.N.", LabelInterface), ("mask.", MaskFidelity), ("quality.", Quality)],
+)
+def test_what_is_measured_is_described(beginning, record):
+    """A new number of a run has a line in the table of descriptions, and one that is gone has none."""
+    table = toml_of(Path(tetopt.cohort.__file__).parent / "columns.toml", "table")
+    described = {name.removeprefix(beginning).partition(".")[0] for name in table if name.startswith(beginning)}
+    assert described == set(record._fields) - {"label"}
+
+
+def test_names_are_in_the_order_of_numbers():
+    assert sorted(["sub-10", "sub-9", "sub-a", "sub-1_ses-2", "sub-1"], key=natural_order) == [
+        "sub-1", "sub-1_ses-2", "sub-9", "sub-10", "sub-a"
+    ]  # fmt: skip

@@ -1,0 +1,338 @@
+"""Every number of every subject, read from what their runs left behind, and as one table for other programs."""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterable, Iterator, Sequence
+from functools import cache
+from math import isfinite
+from pathlib import Path
+from sys import intern
+from typing import Any, Literal, NamedTuple
+
+import numpy as np
+
+from tetopt.cohort.layout import (
+    FIGURES_NAME,
+    LOGS_NAME,
+    failure_path,
+    log_path,
+    numbers_of,
+    numbers_path,
+    subject_folder,
+)
+from tetopt.geometry.box import world_axes
+from tetopt.incoming import toml_of
+from tetopt.io.files import save_json, save_text
+from tetopt.io.text import plain
+
+Status = Literal["done", "missed", "failed", "missing"]
+Value = float | int | str | bool | None
+# Of run.json, not in the table: rows by iteration; sizes of sets, of which those of labels are in `labels`; names and
+# loads in words; what has columns by other names; the sentences that `reason` has.
+UNLISTED_NUMBERS = (
+    "history", "sets", "label_names", "loads", "box", "image_properties.affine", "inputs.sha256", "missed",
+    "interfaces", "labels", "request",
+)  # fmt: skip
+SHORT_LIST = 4  # numbers of a list that have columns of their own: spacings, sides; more are moduli by the hundred
+NOT_AVAILABLE = "n/a"  # as BIDS writes a value that there is none of
+# Texts that a spreadsheet takes for formulas, by their first letter (OWASP, "CSV Injection"), in all widths.
+FORMULA_LETTERS = ("=", "+", "-", "@", "\uff1d", "\uff0b", "\uff0d", "\uff20")
+KEY_PATTERN = re.compile(r"(sub-[A-Za-z0-9]+)(?:_(ses-[A-Za-z0-9]+))?")
+FAILURE_COLUMNS = ("attempts", "seconds", "peak_bytes", "predicted_bytes")  # of a record of `tetopt.cohort.run`
+OBLIQUE_DIGITS = 1  # of degrees: an affine's float32 numbers hold no more of a turn
+COLUMN_GROUPS = {"options": "Option ", "request": "Option ", "versions": "Version of ", "machine": "Of the machine: "}
+LARGEST_COUNT = 2**63  # of whole numbers: more is no count of anything
+
+
+class Row(NamedTuple):
+    """One subject, as its run left it."""
+
+    key: str  # "sub-01_ses-a"
+    subject: str  # "sub-01"
+    session: str  # "ses-a", or ""
+    status: Status  # missed: a mesh, but a promise is missed; missing: expected, and neither a mesh nor a failure
+    reason: str  # what failed, or which promises are missed, on one line; "" for a subject that is done
+    missed: tuple[str, ...]  # the names of these promises
+    files: dict[str, str]  # "mesh", "numbers", "log", "thumbnail", "figures": paths relative to OUT, of those there
+    numbers: dict[str, Value]  # by column
+    label_names: dict[int, str]  # of its labels that have one
+    volumes: dict[int, float]  # of its labels' voxels, mm^n
+    n_lost: dict[int, int]  # voxels of its labels that no cell carries
+
+
+def collect(out: Path, expected: Sequence[str] | None = None) -> list[Row]:
+    """The rows of all subjects in the folder of a cohort, and of those expected there, in the order of their names.
+
+    Parameters
+    ----------
+    out : Path
+        A cohort's folder: `sub-X[/ses-Y]/sub-X[_ses-Y]_desc-tetopt_mesh.json`, `logs/`.
+    expected : sequence of str, optional
+        Keys, as "sub-01_ses-a".
+
+    Returns
+    -------
+    list of Row
+        Files that cannot be read make a row that failed. Where a run failed, the numbers of an older mesh beside it
+        are left out.
+    """
+    keys = {*_keys_there(out), *(expected or ())}
+    return [row_of(out, key) for key in sorted(keys, key=natural_order)]
+
+
+def natural_order(text: str) -> list[tuple[int, str]]:
+    """What to sort names by, so that "sub-2" comes before "sub-10"."""
+    return [(int(part), "") if part.isdecimal() else (-1, part) for part in re.split(r"(\d+)", text)]
+
+
+def _keys_there(out: Path) -> Iterator[str]:
+    """Keys of subjects with numbers or a failure in the cohort's folder."""
+    for folder in _folders(out, "sub-"):
+        for place in (folder, *_folders(folder, "ses-")):
+            key = folder.name if place == folder else f"{folder.name}_{place.name}"
+            if KEY_PATTERN.fullmatch(key) and numbers_path(out, key).is_file():
+                yield key
+    ending = failure_path(out, "").name
+    for path in (out / LOGS_NAME).iterdir() if (out / LOGS_NAME).is_dir() else ():
+        key = path.name.removesuffix(ending)
+        if path.name.endswith(ending) and KEY_PATTERN.fullmatch(key):
+            yield key
+
+
+def _folders(folder: Path, beginning: str) -> list[Path]:
+    return [path for path in folder.iterdir() if path.name.startswith(beginning) and path.is_dir()]
+
+
+def row_of(out: Path, key: str) -> Row:
+    """The row of one subject, by its key; see `collect`."""
+    match = KEY_PATTERN.fullmatch(key)
+    assert match is not None, key
+    figures = subject_folder(out, key) / FIGURES_NAME
+    places = {
+        "numbers": numbers_path(out, key), "log": log_path(out, key), "figures": figures,
+        "thumbnail": figures / "thumbnail.png",
+    }  # fmt: skip
+    files = {name: path.relative_to(out).as_posix() for name, path in places.items() if path.exists()}
+    row = Row(key, match[1], match[2] or "", "missing", "has not been run", (), files, {}, {}, {}, {})
+    if (path := failure_path(out, key)).exists():
+        failure = numbers_of(path) or {"reason": f"{path.name} cannot be read"}
+        numbers = {f"failure.{name}": _scalar(failure[name]) for name in FAILURE_COLUMNS if name in failure}
+        return row._replace(status="failed", reason=plain(str(failure.get("reason", ""))), numbers=numbers)
+    if "numbers" not in files:
+        return row
+    run = numbers_of(places["numbers"])
+    if run is None:
+        return row._replace(status="failed", reason="its numbers cannot be read; run it again")
+    return _row_of_run(out, row, run)
+
+
+def _row_of_run(out: Path, row: Row, run: dict[str, Any]) -> Row:
+    """The row with the numbers of run.json, and what is missed."""
+    path = numbers_path(out, row.key)
+    meshes = (each for each in path.parent.glob(f"{path.stem}.*") if each.suffix != ".json")
+    mesh = min(meshes, default=None)
+    if mesh is None:
+        return row._replace(status="failed", reason="there are numbers and no mesh; run it again")
+    missed = run["missed"] if isinstance(run.get("missed"), dict) else {}
+    labels = [each for each in _table(run, "labels") if isinstance(each.get("label"), int)]
+    names = run["label_names"] if isinstance(run.get("label_names"), dict) else {}
+    return row._replace(
+        status="missed" if missed else "done",
+        reason="; ".join(f"{plain(name)}: {plain(str(words))}" for name, words in missed.items()),
+        missed=tuple(plain(name) for name in missed),
+        files={"mesh": mesh.relative_to(out).as_posix(), **row.files},
+        numbers=flattened(run),
+        label_names={int(number): plain(str(name)) for number, name in names.items() if number.isdecimal()},
+        volumes={each["label"]: each["volume"] for each in labels if present([_scalar(each.get("volume"))])},
+        n_lost={each["label"]: each.get("voxels") or 0 for each in labels if each.get("is_lost") is True},
+    )
+
+
+def _table(run: dict[str, Any], name: str) -> list[dict[str, Any]]:
+    rows = run.get(name)
+    return [each for each in rows if isinstance(each, dict)] if isinstance(rows, list) else []
+
+
+def flattened(run: dict[str, Any]) -> dict[str, Value]:
+    """The numbers and texts of run.json by column, in its order.
+
+    Names of nested objects are joined by dots. Of labels there is a column a number, `labels.17.dice` and
+    `interfaces.17.area`; of contrasts `contrasts.1.weight` and so on; short lists of numbers have one each
+    (`spacing_mm.1`), lists of texts are joined. What was given as an option and is not among `options` anyway is in
+    `request.options`. Orientation and sides of the image are read from its affine. Left out are
+    `UNLISTED_NUMBERS`, and lists of more than four numbers.
+    """
+    columns: dict[str, Value] = {}
+    _put_grid(columns, run.get("box"))
+    for name, value in run.items():
+        _put(columns, plain(name), value)
+    request = run.get("request")
+    if isinstance(request, dict):
+        columns["request.sha256"] = _scalar(request.get("sha256"))
+        stated = request.get("options")
+        for name, value in stated.items() if isinstance(stated, dict) else ():
+            if f"options.{name.replace('-', '_')}" not in columns:
+                _put(columns, f"request.options.{name}", value)
+    for name in ("labels", "interfaces"):
+        for each in _table(run, name):
+            if isinstance(number := each.get("label"), int):
+                _put(columns, f"{name}.{number}", {key: value for key, value in each.items() if key != "label"})
+    return columns
+
+
+def _put(columns: dict[str, Value], name: str, value: Any) -> None:
+    """Enter a value, or those within it."""
+    if name in UNLISTED_NUMBERS:
+        return
+    if isinstance(value, dict):
+        for key, item in value.items():
+            _put(columns, f"{name}.{plain(key)}", item)
+    elif isinstance(value, list):
+        if all(isinstance(item, str) for item in value):
+            columns[intern(name)] = "; ".join(map(plain, value))
+        elif len(value) <= SHORT_LIST or isinstance(value[0], dict):
+            for number, item in enumerate(value, start=1):
+                _put(columns, f"{name}.{number}", item)
+    else:
+        columns[intern(name)] = _scalar(value)
+
+
+def _scalar(value: Any) -> Value:
+    """A text on one line; what is neither text nor a number that can be computed with as None."""
+    if isinstance(value, str):
+        return plain(value)
+    if isinstance(value, float):
+        return value if isfinite(value) else None
+    return value if isinstance(value, int) and abs(value) < LARGEST_COUNT else None
+
+
+def _put_grid(columns: dict[str, Value], box: Any) -> None:
+    """Enter how the image lies: its orientation, how oblique it is, its spacing and its shape."""
+    try:
+        affine = np.array(box["affine"], dtype=np.float64)
+        shape = [int(each) for each in box["shape"]]
+        steps = np.linalg.norm(affine[:-1, :-1], axis=0)
+    except (KeyError, TypeError, ValueError, IndexError):
+        return
+    if affine.shape != (len(shape) + 1, len(shape) + 1) or not np.isfinite(affine).all() or not steps.all():
+        return
+    columns["grid.orientation"] = orientation_code(affine)
+    columns["grid.oblique_degrees"] = oblique_degrees(affine)
+    columns["grid.spacing_mm"] = " x ".join(f"{step:.4g}" for step in steps)
+    columns["grid.volume_mm"] = abs(float(np.linalg.det(affine[:-1, :-1]))) * float(np.prod(shape))
+    columns["grid.shape"] = " x ".join(str(side) for side in shape)
+
+
+def orientation_code(affine: np.ndarray) -> str:
+    """The world direction that each index axis runs in most, as "RAS" or "LPS"; in 2-D as "+x+y".
+
+    Examples
+    --------
+    >>> orientation_code(np.diag([-1.0, -1.0, 2.0, 1.0])), orientation_code(np.eye(3))
+    ('LPS', '+x+y')
+    """
+    letters = (("L", "R"), ("P", "A"), ("I", "S")) if len(affine) == 4 else (("-x", "+x"), ("-y", "+y"))
+    return "".join(letters[world][int(affine[world, a] > 0.0)] for a, world in enumerate(world_axes(affine)))
+
+
+def oblique_degrees(affine: np.ndarray) -> float:
+    """The largest angle between an index axis and its world axis, degrees, to a tenth.
+
+    Examples
+    --------
+    >>> oblique_degrees(np.array([[0.0, 2.0, 0.0], [-1.0, 2.0, 0.0], [0.0, 0.0, 1.0]]))
+    45.0
+    """
+    columns = affine[:-1, :-1] / np.linalg.norm(affine[:-1, :-1], axis=0)
+    cosines = [abs(columns[world, a]) for a, world in enumerate(world_axes(affine))]
+    return round(float(np.degrees(np.arccos(np.clip(min(cosines), 0.0, 1.0)))), OBLIQUE_DIGITS)
+
+
+def column_names(rows: Sequence[Row]) -> list[str]:
+    """The columns that any of the rows has, in the order of run.json, those of labels last and by number."""
+    names = list(dict.fromkeys(name for row in rows for name in row.numbers))
+    is_of_label = [re.fullmatch(r"(labels|interfaces)\.\d+\..*", name) is not None for name in names]
+    of_labels = [name for name, is_one in zip(names, is_of_label, strict=True) if is_one]
+    places = {name: place for place, name in enumerate(of_labels)}
+
+    def order(name: str) -> tuple[bool, int, int]:
+        kind, number, _ = name.split(".", 2)
+        return kind == "interfaces", int(number), places[name]
+
+    return [name for name, is_one in zip(names, is_of_label, strict=True) if not is_one] + sorted(of_labels, key=order)
+
+
+def save_table(path: Path, rows: Sequence[Row], flags: Sequence[Sequence[str]]) -> None:
+    """Write every number of every subject as tab-separated text, whole or not at all, and beside it what they are.
+
+    Parameters
+    ----------
+    path : Path
+        Of the table, `.tsv`; its columns are described in a file of the same name in `.json`, as BIDS has it.
+    rows : sequence of Row
+    flags : sequence of sequence of str
+        What is odd about each of them.
+    """
+    names = column_names(rows)
+    heads = ["participant_id", "session_id", "status", "reason", "flags"]
+    lines = ["\t".join(map(field_text, [*heads, *names]))]
+    for row, reasons in zip(rows, flags, strict=True):
+        fixed = [row.subject, row.session or None, row.status, row.reason or None, "; ".join(reasons) or None]
+        values = map(row.numbers.get, names)
+        lines.append("\t".join(map(field_text, [*fixed, *values])))
+    save_text(path, "\n".join(lines) + "\n")
+    labels = {number: name for row in reversed(rows) for number, name in row.label_names.items()}
+    save_json(path.with_suffix(".json"), {name: description(name, labels) for name in (*heads, *names)})
+
+
+def field_text(value: Value) -> str:
+    r"""A value as a field of a table that pandas, R and spreadsheets read alike.
+
+    Texts are on one line and without tabs (`tetopt.io.text.plain`); one with quotes is quoted, as in CSV; one that a
+    spreadsheet would take for a formula begins with an apostrophe.
+
+    Examples
+    --------
+    >>> [field_text(each) for each in (None, 0.1, 3, True, "", "=1+1", 'a "b" c')]
+    ['n/a', '0.1', '3', 'true', 'n/a', "'=1+1", '"a ""b"" c"']
+    """
+    if value is None or value == "":
+        return NOT_AVAILABLE
+    if isinstance(value, bool):
+        return json.dumps(value)
+    if not isinstance(value, str):
+        return repr(value)
+    text = plain(value)
+    text = f"'{text}" if text.startswith(FORMULA_LETTERS) else text
+    return '"' + text.replace('"', '""') + '"' if '"' in text else text
+
+
+@cache
+def _descriptions() -> dict[str, list[str]]:
+    return dict(toml_of(Path(__file__).with_name("columns.toml"), "table of columns"))
+
+
+def description(column: str, label_names: dict[int, str] | None = None) -> dict[str, str]:
+    """What a column of the table is, and its unit, as BIDS's sidecars have it: "Description", "Units".
+
+    `label_names` are put into those of labels. A column that nothing is known of is described by its name alone.
+    """
+    known, general = _descriptions(), re.sub(r"\.\d+(?=\.|$)", ".N", column)
+    first, _, rest = general.partition(".")
+    if first == "quality_initial" and f"quality.{rest}" in known:
+        words, unit = known[f"quality.{rest}"]
+        words = f"Of the initial mesh: {words}"
+    else:
+        beginning = COLUMN_GROUPS.get(first)
+        words, unit = known.get(general) or [f"{column} of run.json" if beginning is None else beginning + rest, ""]
+    if (match := re.fullmatch(r"(?:labels|interfaces)\.(\d+)\..*", column)) is not None:
+        name = (label_names or {}).get(int(match[1]), "")
+        words = f"Label {match[1]}{f' ({name})' if name else ''}: {words}"
+    return {"Description": words} | ({"Units": unit} if unit else {})
+
+
+def present(values: Iterable[Value]) -> list[float]:
+    """The numbers among some values."""
+    return [float(each) for each in values if isinstance(each, int | float) and not isinstance(each, bool)]

@@ -1,0 +1,278 @@
+"""A cohort at a glance: one page with its failures, its distributions, and a table of all subjects with pictures."""
+
+from __future__ import annotations
+
+import base64
+import html
+from collections import Counter
+from collections.abc import Iterable, Sequence
+from itertools import chain
+from pathlib import Path
+from typing import Any
+from urllib.parse import quote
+
+from tetopt.cohort.flags import QUANTITIES, Flag, Quantity, flags_of, units
+from tetopt.cohort.numbers import Row, Status, Value, description, natural_order, present, save_table
+from tetopt.model.labels import label_words
+from tetopt.report.page import data_html, paragraph_html, script_html, section_html, table_html, write_page
+
+PAGE_NUMBERS = 1_500_000  # that the page holds at most, some 10 MB: a browser on a phone reads them in seconds
+PAGE_PICTURES = 600  # thumbnails of some 8 kB, 6 MB in base64; with more subjects the flagged ones, and a sample
+THUMBNAIL_BYTES = 32_768  # of one in the page: larger ones are none of ours
+LISTED_FAILURES = 200  # in a table above the others, in which all are
+LISTED_SUBJECTS = 100  # in the table for browsers without scripts
+LISTED_FLAGS = 6  # of a subject; the table in TSV has all
+SHOWN_DIGITS = 4  # of numbers in the page
+PICTURE_WORDS = "axial, left of the patient on the left, and sagittal, back on the left"
+# Columns of the page beside `QUANTITIES`, with their titles.
+PAGE_COLUMNS = {
+    "grid.orientation": "orientation", "grid.spacing_mm": "voxels, mm", "grid.shape": "voxels",
+    "size.n_nodes_in_all": "nodes", "quality.max_dihedral": "largest angle", "quality.n_under_10_degrees":
+    "cells with angles under 10 degrees", "cells_without_voxel": "cells without a voxel", "energies.E": "E",
+    "iterations_done": "iterations", "ended": "ended", "mask.distance_p95_mm": "distance to the mask, mm, 95 %",
+    "mask.components": "pieces of the mask", "mask.mesh_components": "pieces of the mesh",
+    "memory.predicted_bytes": "memory predicted", "image": "image", "versions.tetopt": "version",
+}  # fmt: skip
+# Columns that are shown at first; those of the other quantities and of labels can be chosen.
+FIRST_COLUMNS = (
+    "grid.orientation", "energies.E_D_share_of_variance", "quality.mean_rho", "quality.min_dihedral", "mask.volume",
+    "seconds.all", "memory.peak_bytes",
+)  # fmt: skip
+FILE_LETTERS = {"numbers": "n", "log": "l", "figures": "f", "thumbnail": "t"}  # by which the script knows what is there
+STATUS_WORDS: dict[Status, str] = {
+    "done": "done", "missed": "with a promise missed", "failed": "failed", "missing": "not run",
+}  # fmt: skip
+
+
+def save_cohort_files(out: Path, rows: Sequence[Row]) -> None:
+    """Write `cohort.tsv`, `cohort.json` with what its columns are, and `cohort.html` into a cohort's folder.
+
+    Each is written whole or not at all, over what is there.
+    """
+    flags = flags_of(rows)
+    save_table(out / "cohort.tsv", rows, [[flag.words for flag in each] for each in flags])
+    save_cohort_page(out / "cohort.html", out, rows, flags)
+
+
+def save_cohort_page(path: Path, out: Path, rows: Sequence[Row], flags: Sequence[Sequence[Flag]]) -> None:
+    """Write the page as one HTML file, whole or not at all.
+
+    Parameters
+    ----------
+    path : Path
+        In the cohort's folder, as links are relative to it.
+    out : Path
+        The cohort's folder, of the pictures.
+    rows : sequence of Row
+    flags : sequence of sequence of Flag
+        What is odd about each of them; see `tetopt.cohort.flags.flags_of`.
+
+    Notes
+    -----
+    Everything is in the page but what it links to, and it forbids itself all network access. Numbers are rounded to
+    four digits; above `PAGE_NUMBERS` of them labels are left out, those that most subjects have last. Above
+    `PAGE_PICTURES` subjects only these have pictures in it: those that are flagged, and of the others every so many.
+    """
+    parts = [*_summary(rows, flags), *_failures(rows)]
+    pictures = _pictures(out, rows, flags)
+    names, left_out = _columns(rows)
+    note = f"Pictures are {PICTURE_WORDS}, with the mesh over the image."
+    n_pictures = sum(picture is not None for picture in pictures)
+    if n_pictures < sum("thumbnail" in row.files for row in rows):
+        note += (
+            f" The page has {n_pictures} of them: those of subjects that are flagged, and of the others a sample; the "
+            "rest is linked."
+        )
+    if left_out:
+        note += f" Numbers of {left_out} more labels are in cohort.tsv alone."
+    parts.append(section_html("Distributions", ['<div id="charts"></div>', _SCRIPTLESS]))
+    table = ['<div id="controls"></div>', '<div id="subjects">', _first_subjects(rows, flags), "</div>"]
+    parts.append(section_html("Subjects", [paragraph_html(note), *table]))
+    parts.append(data_html("data", _data(rows, flags, pictures, names)))
+    parts.append(script_html("cohort"))
+    write_page(path, f"Cohort {out.resolve().name}", parts, _STYLE)
+
+
+def _summary(rows: Sequence[Row], flags: Sequence[Sequence[Flag]]) -> list[str]:
+    """How many subjects are done and so on, how long they took, and what they have in common."""
+    counts = Counter(row.status for row in rows)
+    words = [f"{counts[status]} {words}" for status, words in STATUS_WORDS.items() if counts[status]]
+    text = f"{len(rows)} subject{'s' if len(rows) != 1 else ''}: {', '.join(words) or 'none'}."
+    if n_odd := sum(bool(each) for each in flags):
+        text += f" {n_odd} {'is' if n_odd == 1 else 'are'} odd in something, see below."
+    for name, unit, total, beginning in (("seconds.all", "s", sum, "All runs together took"),
+                                         ("memory.peak_bytes", "bytes", max, "and the largest one had")):  # fmt: skip
+        if values := present(row.numbers.get(name) for row in rows):
+            text += f" {beginning} {units(unit, 3)(total(values))}" + ("" if unit == "s" else ".")
+    common = [f"{name.rpartition('.')[2]} {value}" for name, value in _common(rows).items()]
+    parts = [paragraph_html(text)]
+    if common:
+        parts.append(paragraph_html(f"Of all meshes: {', '.join(common)}."))
+    return parts
+
+
+def _common(rows: Sequence[Row]) -> dict[str, Value]:
+    """Version and options that all meshes have in common."""
+    meshes = [row.numbers for row in rows if row.status in ("done", "missed")]
+    names = [name for name in (meshes[0] if meshes else ()) if name.startswith(("options.", "request.options."))]
+    values = {name: {numbers.get(name) for numbers in meshes} for name in ("versions.tetopt", *names)}
+    return {name: next(iter(each)) for name, each in values.items() if len(each) == 1 and each != {None}}
+
+
+def _failures(rows: Sequence[Row]) -> list[str]:
+    """The subjects that failed, with reason and log; those of one reason together."""
+    failed = [row for row in rows if row.status == "failed"]
+    if not failed:
+        return []
+    counts = Counter(row.reason for row in failed)
+    failed.sort(key=lambda row: (-counts[row.reason], row.reason, natural_order(row.key)))
+    lines = ["<div class='wide'><table class='failures'><thead><tr><th>subject</th><th>why it failed</th></tr></thead>"]
+    for row in failed[:LISTED_FAILURES]:
+        log = f' <a href="{_link(row.files["log"])}">log</a>' if "log" in row.files else ""
+        lines.append(f"<tr><td>{html.escape(row.key)}</td><td>{html.escape(row.reason)}{log}</td></tr>")
+    lines.append("</table></div>")
+    if len(failed) > LISTED_FAILURES:
+        lines.append(paragraph_html(f"These are {LISTED_FAILURES} of {len(failed)}; the table of subjects has all."))
+    return [section_html(f"Failed: {len(failed)}", lines)]
+
+
+def _link(path: str) -> str:
+    return html.escape(quote(path))
+
+
+def _pictures(out: Path, rows: Sequence[Row], flags: Sequence[Sequence[Flag]]) -> list[str | None]:
+    """Thumbnails in base64, of as many rows as the page may have: flagged ones first, and of the rest evenly many."""
+    places = [place for place, row in enumerate(rows) if "thumbnail" in row.files]
+    odd = sorted((place for place in places if flags[place]), key=lambda place: -flags[place][0].score)
+    rest = [place for place in places if not flags[place]]
+    # At least a fifth shows what the usual ones are like.
+    n_odd = min(len(odd), max(PAGE_PICTURES - len(rest), 4 * PAGE_PICTURES // 5))
+    n_rest = min(len(rest), PAGE_PICTURES - n_odd)
+    chosen = chain(odd[:n_odd], (rest[k * len(rest) // n_rest] for k in range(n_rest)))
+    pictures: list[str | None] = [None] * len(rows)
+    for place in chosen:
+        png = (out / rows[place].files["thumbnail"]).read_bytes()
+        if len(png) <= THUMBNAIL_BYTES:
+            pictures[place] = base64.b64encode(png).decode("ascii")
+    return pictures
+
+
+def _columns(rows: Sequence[Row]) -> tuple[dict[str, Quantity], int]:
+    """The page's columns, by name, and how many labels are left out."""
+    known = {name for row in rows for name in row.numbers}
+    quantities = {each.column: each for each in QUANTITIES}
+    columns = {name: quantities.get(name) for name in dict.fromkeys((*FIRST_COLUMNS, *quantities, *PAGE_COLUMNS))}
+    shown = {
+        name: quantity or Quantity(name, PAGE_COLUMNS[name], _unit(name), "both", False, 0.0)
+        for name, quantity in columns.items()
+        if name in known
+    }
+    common = _common(rows)
+    for name in sorted(known):
+        if name.startswith(("options.", "request.options.")) and name not in common and _differs(name, rows):
+            shown[name] = Quantity(name, name.rpartition(".")[2], "", "both", False, 0.0)
+    counts = Counter(number for row in rows for number in row.volumes if number > 0)
+    names = {number: name for row in reversed(rows) for number, name in row.label_names.items()}
+    room = max(PAGE_NUMBERS // max(len(rows), 1) - len(shown), 0) // 2
+    labels = sorted(number for number, _ in counts.most_common(room))
+    for number in labels:
+        words = label_words(number, names)
+        shown[f"labels.{number}.volume"] = Quantity(
+            f"labels.{number}.volume", f"volume of label {words}", "mm", "both", True, 0.0
+        )
+        shown[f"labels.{number}.dice"] = Quantity(
+            f"labels.{number}.dice", f"Dice of label {words}", "", "below", False, 0.0
+        )
+    return shown, len(counts) - len(labels)
+
+
+def _unit(name: str) -> str:
+    return "bytes" if name.endswith("_bytes") else ""
+
+
+def _differs(name: str, rows: Sequence[Row]) -> bool:
+    return len({row.numbers.get(name) for row in rows if row.status in ("done", "missed")}) > 1
+
+
+def _data(
+    rows: Sequence[Row], flags: Sequence[Sequence[Flag]], pictures: Sequence[str | None], columns: dict[str, Quantity]
+) -> dict[str, Any]:
+    """What the script works on."""
+    is_flat = any(row.numbers.get("quality.ndim") == 2 for row in rows)
+    return {
+        "columns": [
+            {
+                "name": name, "title": quantity.words, "unit": quantity.unit, "isLog": quantity.is_log,
+                "isFirst": name in FIRST_COLUMNS, "about": description(name)["Description"],
+                "isChart": name in {each.column for each in QUANTITIES} or name == "grid.orientation"
+                or name.endswith(".volume"),
+            }
+            for name, quantity in columns.items()
+        ],
+        "volume": "mm^2" if is_flat else "mm^3",
+        "rows": [_row_data(row, own, columns) for row, own in zip(rows, flags, strict=True)],
+        "pictures": {str(place): picture for place, picture in enumerate(pictures) if picture is not None},
+    }  # fmt: skip
+
+
+def _row_data(row: Row, flags: Sequence[Flag], columns: Iterable[str]) -> list[Any]:
+    """A row as the script has it."""
+    letters = "".join(letter for name, letter in FILE_LETTERS.items() if name in row.files)
+    own = [[flag.words, flag.column] for flag in flags[:LISTED_FLAGS]]
+    fixed = [row.key, row.status, row.reason, own, len(flags), row.files.get("mesh", ""), letters]
+    return [*fixed, *(_shown(row.numbers.get(name)) for name in columns)]
+
+
+def _shown(value: Value) -> Value:
+    """A value as the page has it: of floats some digits."""
+    return float(f"{value:.{SHOWN_DIGITS}g}") if isinstance(value, float) else value
+
+
+def _first_subjects(rows: Sequence[Row], flags: Sequence[Sequence[Flag]]) -> str:
+    """Markup of the first subjects, the odd ones before the others, for browsers without scripts."""
+    order = sorted(range(len(rows)), key=lambda place: -len(flags[place]))[:LISTED_SUBJECTS]
+    lines = [["subject", "status", "what is odd"]]
+    for place in order:
+        row = rows[place]
+        odd = "; ".join(flag.words for flag in flags[place][:LISTED_FLAGS])
+        lines.append([row.key, STATUS_WORDS[row.status], row.reason if row.status == "failed" else odd])
+    more = f"The first {LISTED_SUBJECTS} of {len(rows)}." if len(rows) > LISTED_SUBJECTS else ""
+    return table_html(lines, more)
+
+
+_SCRIPTLESS = (
+    "<noscript><p>Distributions, sorting and pictures need scripts, which this browser does not run.</p></noscript>"
+)
+_STYLE = """
+main { max-width: 1500px; }
+table.failures td, table.failures th { text-align: left; vertical-align: top; }
+td:last-child { white-space: nowrap; } .failures td:last-child { white-space: normal; overflow-wrap: anywhere; }
+.charts { display: flex; flex-wrap: wrap; gap: 0.8rem 1.4rem; } .chart { width: 230px; font-size: 0.85rem; }
+.chart .title { font-weight: 600; line-height: 1.25; min-height: 2.5em; display: flex; align-items: flex-end; }
+.chart svg { display: block; width: 100%; border-bottom: 1px solid #999; }
+.foot { display: flex; justify-content: space-between; color: #555; font-size: 0.8rem; gap: 0.5rem; }
+.foot.texts { justify-content: flex-start; }
+.bar { cursor: pointer; } .bar .back { fill: transparent; } .bar .usual { fill: #7a8fa6; } .bar .far { fill: #d95f02; }
+.bar:hover .back, .bar:focus .back { fill: #e6ebf0; } .bar:focus { outline: none; }
+.controls { display: flex; flex-wrap: wrap; gap: 0.6rem; align-items: flex-start; }
+.controls input[type=search] { flex: 0 1 16rem; } .controls details { max-width: 100%; }
+.controls input, .controls select, .pager button, .chips button { font: inherit; padding: 0.2rem 0.5rem; }
+.boxes { display: flex; flex-wrap: wrap; gap: 0.1rem 1rem; max-height: 14rem; overflow-y: auto; font-size: 0.9rem; }
+.chips button { margin: 0.5rem 0.5rem 0 0; background: #e6ebf0; border: 1px solid #7a8fa6; border-radius: 1rem; }
+.pager { margin: 0.7rem 0; }
+.subjects td { vertical-align: top; } .subjects td.odd { text-align: left; white-space: normal; min-width: 16rem; }
+.subjects td.odd div { margin-bottom: 0.2rem; line-height: 1.3; overflow-wrap: anywhere; }
+.subjects th { vertical-align: bottom; white-space: normal; line-height: 1.2; }
+.subjects th button { font: inherit; font-weight: 600; background: none; border: 0; padding: 0; cursor: pointer; }
+.subjects th button { text-align: inherit; color: inherit; } .subjects th:nth-child(2) { text-align: left; }
+.flag { color: #a33f00; } td.flag { font-weight: 600; } .bad { color: #b00020; }
+.badge { font-size: 0.78rem; padding: 0 0.4rem; border-radius: 0.7rem; background: #eee; white-space: nowrap; }
+.badge.failed, .badge.missing { background: #b00020; color: #fff; } .badge.missed { background: #d95f02; color: #fff; }
+.badge.done { background: #e3efe6; } .picture img { display: block; margin-top: 0.2rem; background: #000; }
+.tiles { display: grid; grid-template-columns: repeat(auto-fill, minmax(256px, 1fr)); gap: 0.8rem; font-size: 0.85rem; }
+.tile { padding: 0.3rem; border: 1px solid #ddd; overflow-wrap: anywhere; } .tile.odd { border-color: #d95f02; }
+@media screen and (max-width: 700px) {
+  .chart { width: calc(50% - 0.7rem); } .subjects .picture img { width: 176px; } .subjects td.odd { min-width: 12rem; }
+  .controls input[type=search] { flex: 1 1 100%; }
+}
+"""
