@@ -401,6 +401,22 @@ def test_a_full_disk_or_no_folder_keeps_nothing(use):
 
 
 @compiled_only
+@pytest.mark.skipif(os.name != "posix", reason="rights of folders")
+def test_kernels_beside_the_source_are_read_where_others_are_kept(use):
+    """As in a container, compiled when it was built: but not where everybody may write."""
+    assert use() == [COMPILED]
+    beside = use.folder.parent / "__pycache__"
+    beside.mkdir(exist_ok=True)
+    for path in use.folder.glob("*/*.nb?"):
+        path.rename(beside / path.name)
+    assert use() == [LOADED]
+    assert not list(use.folder.rglob("*.nb?"))
+    assert cache.shipped_folder(beside.parent / "some_kernels.py") == beside
+    beside.chmod(0o777)
+    assert cache.shipped_folder(beside.parent / "some_kernels.py") is None
+
+
+@compiled_only
 def test_a_cache_that_goes_while_it_is_used_is_made_again(use):
     assert use() == [COMPILED]
     said = use(f"k.step_0.link(); import shutil; shutil.rmtree({str(use.folder)!r})")

@@ -1,4 +1,7 @@
-"""Where compiled kernels are kept: beside the package, else in the user's cache, else only as long as the process."""
+"""Where compiled kernels are kept: beside the package, else in the user's cache, else only as long as the process.
+
+Those beside the package are read in any case.
+"""
 
 from __future__ import annotations
 
@@ -52,6 +55,23 @@ def place_cache() -> Place:
     )
 
 
+def shipped_folder(source: str | Path) -> Path | None:
+    """The folder beside a source, from which kernels are read also where none can be kept there.
+
+    Whoever installed the package may have compiled them, for all users or for a container that only reads. None if
+    everybody may write there, or nobody look.
+    """
+    folder = Path(source).parent / "__pycache__"
+    with contextlib.suppress(OSError):
+        return None if _is_open(folder) else folder
+    return None
+
+
+def _is_open(folder: Path) -> bool:
+    """Whether everybody may write to a folder."""
+    return os.name == "posix" and bool(folder.stat().st_mode & stat.S_IWOTH)
+
+
 def _point_numba_to(folder: Path) -> None:
     os.environ["NUMBA_CACHE_DIR"] = str(folder)
     if "numba" in sys.modules:
@@ -77,7 +97,7 @@ def _refusal(folder: Path) -> str | None:
                 part.mkdir(mode=FOLDER_MODE, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
-        is_open = os.name == "posix" and bool(folder.stat().st_mode & stat.S_IWOTH)
+        is_open = _is_open(folder)
     except OSError:
         return "cannot be written"
     return "can be written by everybody" if is_open else None

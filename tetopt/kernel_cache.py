@@ -7,6 +7,7 @@ these is said once, on one line, by a `RuntimeWarning`.
 
 from __future__ import annotations
 
+import inspect
 import pickle
 import warnings
 import zlib
@@ -19,7 +20,7 @@ import numba
 from numba.core.caching import FunctionCache, IndexDataCacheFile, NullCache
 from numba.core.ccallback import CFunc
 
-from tetopt.cache import place_cache
+from tetopt.cache import place_cache, shipped_folder
 
 
 class NotKeptWarning(RuntimeWarning):
@@ -40,7 +41,12 @@ class SealedFile(IndexDataCacheFile):
     """numba's index of a function's compilations and its files of code, each with version and checksum ahead.
 
     A file of code holds its key, too: two processes that write at once may give the same name to different code.
+    What it lacks is looked for in `shipped`.
     """
+
+    def __init__(self, folder: str, name: str, stamp: Any, shipped: SealedFile | None = None) -> None:
+        super().__init__(folder, name, stamp)
+        self._shipped = shipped
 
     def save(self, key: Any, data: Any) -> None:
         """Keep what was compiled for a key."""
@@ -49,7 +55,9 @@ class SealedFile(IndexDataCacheFile):
     def load(self, key: Any) -> Any:
         """What was compiled for a key, or None."""
         pair = super().load(key)
-        return pair[1] if pair is not None and pair[0] == key else None
+        if pair is not None and pair[0] == key:
+            return pair[1]
+        return None if self._shipped is None else self._shipped.load(key)
 
     def _load_index(self) -> dict[Any, str]:
         try:
@@ -91,9 +99,10 @@ class SealedCache(FunctionCache):
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
-        self._cache_file: Any = SealedFile(
-            self._cache_path, self._impl.filename_base + "-s", self._impl.locator.get_source_stamp()
-        )
+        name, stamp = self._impl.filename_base + "-s", self._impl.locator.get_source_stamp()
+        beside = shipped_folder(inspect.getfile(function))
+        shipped = None if beside is None else SealedFile(str(beside), name, stamp)
+        self._cache_file: Any = SealedFile(self._cache_path, name, stamp, shipped)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """What was compiled for a signature, or None."""
