@@ -10,9 +10,10 @@ import inspect
 from collections.abc import Callable, Iterator
 from copy import copy
 from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
+from difflib import get_close_matches
 from functools import wraps
 from pathlib import Path
-from typing import Annotated, Any, ClassVar, Literal, cast, get_args, get_type_hints
+from typing import Annotated, Any, ClassVar, Literal, NamedTuple, cast, get_args, get_type_hints
 
 import typer
 from typer.models import OptionInfo
@@ -387,6 +388,144 @@ def option_words(options: dict[str, Any]) -> list[str]:
         else:
             words += [f"--{name}={each}" for each in (value if isinstance(value, list) else [value])]
     return words
+
+
+SubjectsArgument = Annotated[
+    Path,
+    typer.Argument(metavar="SUBJECTS", help="A table, .tsv or .csv: subject, image, ...; or a BIDS folder."),
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class CohortOptions:
+    """What of a cohort is run, where, and by whom."""
+
+    panel: ClassVar[str] = "The cohort"
+    output: Annotated[
+        Path, option("OUT", "The folder of all outputs; that of an earlier run goes on.", "-o", "--output")
+    ]
+    suffix: Annotated[
+        str, option("WORD", 'Of a BIDS folder: the images\' suffix, with entities before it "acq-mprage_T1w".')
+    ] = "T1w"
+    participants: Annotated[
+        list[str] | None, option("LABEL", "Of the subjects only this one. May be repeated.", "--participant-label")
+    ] = None
+    sessions: Annotated[
+        list[str] | None, option("LABEL", "Of the sessions only this one. May be repeated.", "--session-label")
+    ] = None
+    mesh_format: Annotated[str, option("SUFFIX", f"Of the meshes' files: {', '.join(FORMATS)}.", "--format")] = ".vtu"
+    write_table: Annotated[
+        Path | None, option("TABLE", "Write what would be run as a table, .tsv or .csv, and run nothing.")
+    ] = None
+    dry_run: Annotated[
+        bool, typer.Option("--dry-run", help="Tell what would be run, why, and what it takes; run nothing.")
+    ] = False
+    retry_failed: Annotated[
+        bool, typer.Option("--retry-failed", help="Run only those that failed; what has changed stays as it is.")
+    ] = False
+    count: Annotated[
+        int | None, option("N", "So many subjects at a time, or jobs of a --cluster, at most.", "--workers", min=1)
+    ] = None
+    scheduler: Annotated[
+        str | None, option("ADDRESS", "A scheduler of dask's that runs, with its workers: tcp://host:8786.")
+    ] = None
+    cluster: Annotated[
+        Path | None, option("FILE.yaml", "A batch system (SLURM, PBS, LSF, SGE, ...), as dask-jobqueue is configured.")
+    ] = None
+
+
+class Records(NamedTuple):
+    """All options of `tetopt mesh` but its images and outputs."""
+
+    content: ContentOptions
+    sizes: SizeOptions
+    start: StartOptions
+    engine: EngineOptions
+    solver: SolverOptions
+
+    def given(self) -> dict[str, Any]:
+        """As `given_options`."""
+        return given_options(*self)
+
+
+def record_names() -> dict[str, bool]:
+    """The options of `Records` by their names on the command line, and whether each is a switch, without a value."""
+    kinds = [each for kind in get_type_hints(Records).values() for each in _leaves(kind)]
+    return {option_name(name, kind): get_args(kind)[0] is bool for name, kind in kinds}
+
+
+def _leaves(kind: Any) -> Iterator[tuple[str, Any]]:
+    """The fields of a record and of those in it, with their annotations."""
+    kinds = get_type_hints(kind, include_extras=True)
+    for field in fields(kind):
+        if is_dataclass(kinds[field.name]):
+            yield from _leaves(kinds[field.name])
+        else:
+            yield field.name, kinds[field.name]
+
+
+def with_options(records: Records, texts: dict[str, str]) -> Records:
+    """The records with other values of options, as texts by their names on the command line.
+
+    A switch is on by "1", "true" or "yes" and off by "0", "false" or "no"; several values of an option that may be
+    repeated stand between semicolons.
+
+    Raises
+    ------
+    InputError
+        An option that there is not, or a value that is none of it.
+    """
+    names = record_names()
+    words, off = [], set()
+    for name, text in texts.items():
+        if name not in names:
+            near = get_close_matches(name, names, 1)
+            raise InputError(f"{name}: is no option of tetopt mesh" + (f"; is {near[0]} meant?" if near else ""))
+        if not names[name]:
+            several = name in ("set", "load")
+            words += [f"--{name}={part.strip()}" for part in (text.split(";") if several else [text])]
+        elif text.lower() in ("1", "true", "yes"):
+            words.append(f"--{name}")
+        elif text.lower() in ("0", "false", "no"):
+            off.add(name)
+        else:
+            raise InputError(f'{name}: expected true or false, got "{text}"')
+    parsed = _parsed(tuple(words))
+    return Records(*(_replaced(old, new, set(texts)) for old, new in zip(records, parsed, strict=True)))
+
+
+def _replaced(old: Any, new: Any, names: set[str]) -> Any:
+    """A record with the fields of another that have these names on the command line."""
+    kinds = get_type_hints(type(old), include_extras=True)
+    changes = {}
+    for field in fields(old):
+        value, other = getattr(old, field.name), getattr(new, field.name)
+        if is_dataclass(value):
+            changes[field.name] = _replaced(value, other, names)
+        elif option_name(field.name, kinds[field.name]) in names:
+            changes[field.name] = other
+    return replace(old, **changes)
+
+
+def _parsed(words: tuple[str, ...]) -> Records:
+    """The records that words of a command line come to."""
+    parsed: list[Records] = []
+
+    def command(
+        content: ContentOptions, sizes: SizeOptions, start: StartOptions, engine: EngineOptions, solver: SolverOptions
+    ) -> int:
+        parsed.append(Records(content, sizes, start, engine, solver))
+        return 0
+
+    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+    app.command()(from_records(command))
+    try:
+        app(args=list(words), standalone_mode=False)
+    except Exception as error:
+        if not hasattr(error, "format_message"):
+            raise
+        raise InputError(str(error.format_message())) from error
+    return parsed[0]
 
 
 def from_records(command: Callable[..., int]) -> Callable[..., int]:

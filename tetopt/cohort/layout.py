@@ -93,8 +93,8 @@ def begin(out: Path, description: dict[str, Any]) -> None:
         (out / name).mkdir(exist_ok=True)
     if not (out / DESCRIPTION_NAME).exists():
         save_json(out / DESCRIPTION_NAME, description)
-        # BIDS has no names for meshes of volumes yet, nor for pages and logs.
-        (out / ".bidsignore").write_text("*_mesh.*\n*.html\ncohort.*\nlogs/\nfigures/\n.work/\n", encoding="utf-8")
+        # BIDS has no names for meshes of volumes yet, nor for pages and logs; its patterns of folders have no "/".
+        (out / ".bidsignore").write_text("*_mesh.*\n*.html\ncohort.*\nlogs/\nfigures\n", encoding="utf-8")
 
 
 def description(name: str, sources: list[str]) -> dict[str, Any]:

@@ -94,7 +94,7 @@ def _attempt(job: Job, begin: float, attempt: int) -> tuple[Ended, bool]:
     (work / FIGURES_NAME).mkdir(parents=True)
     mesh = work / mesh_name(job.key, job.suffix)
     outputs = ["-o", str(mesh), "--json", str(mesh.with_suffix(".json")), "--figures", str(work / FIGURES_NAME)]
-    command = python_command("-m", "tetopt", "mesh", *job.words, *outputs)
+    command = python_command("-m", "tetopt", "mesh", *outputs, *job.words)
     environment = python_environment(**dict.fromkeys(THREAD_NAMES, str(job.threads)), COLUMNS="120")
     peak, log = 0, log_path(out, job.key)
     with (

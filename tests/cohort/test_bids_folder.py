@@ -1,0 +1,164 @@
+"""Rows of a cohort from a BIDS folder, and what a cohort's folder says of itself."""
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tetopt import InputError
+from tetopt.cohort.bids_folder import bids_subjects
+from tetopt.cohort.layout import begin, description
+from tetopt.cohort.subjects import Problems
+
+
+def filled(folder, *names):
+    """A BIDS folder with these empty files."""
+    folder.mkdir(exist_ok=True)
+    (folder / "dataset_description.json").write_text('{"Name": "x", "BIDSVersion": "1.8.0"}')
+    for name in names:
+        path = folder / name
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.touch()
+    return folder
+
+
+def rows(subjects, folder):
+    return [(each.subject, each.session, str(each.images[0].relative_to(folder))) for each in subjects]
+
+
+def test_raw_images_of_the_suffix_by_subject_and_session(tmp_path):
+    folder = filled(
+        tmp_path / "raw[1].v2",
+        "sub-02/anat/sub-02_T1w.nii.gz",
+        "sub-02/anat/sub-02_T1w.nii",
+        "sub-02/anat/sub-02_T1w.json",
+        "sub-02/anat/sub-02_T2w.nii.gz",
+        "sub-01/ses-b/anat/sub-01_ses-b_T1w.nii",
+        "sub-01/ses-a/anat/sub-01_ses-a_T1w.nii.gz",
+        "derivatives/fmriprep/sub-02/anat/sub-02_desc-preproc_T1w.nii.gz",
+        "sourcedata/sub-07/anat/sub-07_T1w.nii.gz",
+    )
+    (folder / "sub-02/anat/sub-02_T1w.json").write_text('{"a":')  # never opened
+    (folder / "sub-02" / "layout_config.json").write_text("[")  # nor pybids's own settings of a stranger
+    (folder / "sub-02" / "loop").symlink_to(folder / "sub-02")
+    subjects = bids_subjects(folder)
+    assert rows(subjects, folder) == [
+        ("01", "a", "sub-01/ses-a/anat/sub-01_ses-a_T1w.nii.gz"),
+        ("01", "b", "sub-01/ses-b/anat/sub-01_ses-b_T1w.nii"),
+        ("02", "", "sub-02/anat/sub-02_T1w.nii.gz"),
+    ]
+    assert subjects[2].place == "sub-02/anat/sub-02_T1w.nii.gz"
+    assert subjects[2].files == subjects[2].options == {}
+    assert rows(bids_subjects(folder, "T2w", ["sub-02"]), folder) == [("02", "", "sub-02/anat/sub-02_T2w.nii.gz")]
+    chosen = bids_subjects(folder, sessions=["ses-b"], participants=["01"])
+    assert rows(chosen, folder) == [("01", "b", "sub-01/ses-b/anat/sub-01_ses-b_T1w.nii")]
+
+
+def test_entities_choose_among_several(tmp_path):
+    folder = filled(
+        tmp_path / "raw",
+        "sub-1/anat/sub-1_acq-mprage_run-01_T1w.nii.gz",
+        "sub-1/anat/sub-1_acq-mprage_run-02_T1w.nii.gz",
+        "sub-2/anat/sub-2_T1w.nii.gz",
+        "sub-2/anat/sub-2_rec-norm_T1w.nii.gz",
+    )
+    with pytest.raises(InputError) as caught:
+        bids_subjects(folder)
+    message = str(caught.value)
+    assert "run-01_T1w.nii.gz, sub-1/anat/sub-1_acq-mprage_run-02_T1w.nii.gz" in message
+    assert "--suffix acq-mprage_run-01_T1w" in message
+    assert "sub-2" not in message  # of two images that without entities is what T1w says
+    with pytest.warns(UserWarning, match=r"left out, without _run-2_T1w: 1 \(sub-2\)"):
+        chosen = bids_subjects(folder, "run-2_T1w")
+    assert rows(chosen, folder) == [("1", "", "sub-1/anat/sub-1_acq-mprage_run-02_T1w.nii.gz")]
+    assert rows(bids_subjects(folder, "rec-norm_T1w", ["2"]), folder)[0][2] == "sub-2/anat/sub-2_rec-norm_T1w.nii.gz"
+
+
+def test_all_that_is_wrong_is_told_at_once(tmp_path):
+    folder = filled(
+        tmp_path / "raw", "sub-1/anat/sub-1_T1w.nii.gz", "sub-2/anat/sub-3_T1w.nii.gz", "sub-2/anat/\x1b_T1w.nii"
+    )
+    (folder / "sub-4" / "anat").mkdir(parents=True)
+    (folder / "sub-4" / "anat" / "sub-4_T1w.nii.gz").symlink_to("../../.git/annex/objects/none")
+    with pytest.raises(Problems) as caught:
+        bids_subjects(folder, participants=["1", "2", "4", "8", "9"])
+    message = str(caught.value)
+    assert "sub-2/anat/sub-3_T1w.nii.gz: its name is not that of an image in sub-2" in message
+    assert [line for line in caught.value.lines if "no image" in line] == [
+        f"{folder}: sub-{label}: no image _T1w" for label in (2, 8, 9)
+    ]
+    assert "datalad get sub-4/anat/sub-4_T1w.nii.gz" in message
+    assert "sub-1" not in message
+    assert message.isprintable()
+    with pytest.raises(InputError, match="ses-x: no image _T1w"):
+        bids_subjects(folder, participants=["1"], sessions=["x"])
+
+
+def test_folders_that_are_none(tmp_path):
+    with pytest.raises(InputError, match="no such folder"):
+        bids_subjects(tmp_path / "none")
+    with pytest.raises(InputError, match=r"with a dataset_description\.json; or give a table"):
+        bids_subjects(tmp_path)
+    file = tmp_path / "dataset_description.json"
+    file.write_text('{"a":')
+    with pytest.raises(InputError, match="expected JSON"):
+        bids_subjects(tmp_path)
+    file.write_text("[]")
+    with pytest.raises(InputError, match="a table in JSON, got list"):
+        bids_subjects(tmp_path)
+    file.write_text("{}")
+    with pytest.raises(InputError, match=r"no image _T1w\.nii\.gz of any subject; --suffix"):
+        bids_subjects(tmp_path)
+
+
+@pytest.mark.parametrize("suffix", ["", "T1w.nii.gz", "acq_T1w", "acq-_T1w", "sub-01_T1w", "run-1", ".*", "T1w\n"])
+def test_suffixes_that_are_none(tmp_path, suffix):
+    with pytest.raises(InputError, match="expected what a BIDS name ends in") as caught:
+        bids_subjects(filled(tmp_path / "raw"), suffix)
+    assert str(caught.value).isprintable()
+
+
+@pytest.mark.skipif(os.name != "posix", reason="names of any bytes")
+def test_names_that_are_no_text_are_no_images(tmp_path):
+    folder = filled(tmp_path / os.fsdecode(b"raw"), "sub-1/anat/sub-1_T1w.nii.gz")
+    (folder / "sub-1" / "anat" / os.fsdecode(b"sub-1_acq-\xff_T1w.nii.gz")).touch()
+    assert len(bids_subjects(folder)) == 1
+    odd = tmp_path / os.fsdecode(b"\xff")
+    shutil.copytree(folder, odd)
+    with pytest.raises(InputError, match="cannot be looked through"):
+        bids_subjects(odd)
+
+
+def test_without_the_library_one_line_says_what_to_install(tmp_path, monkeypatch):
+    monkeypatch.setitem(sys.modules, "bids", None)
+    with pytest.raises(InputError, match=r'pip install "tetopt\[cohort\]"'):
+        bids_subjects(filled(tmp_path / "raw"))
+
+
+def test_a_cohort_folder_passes_the_validator_of_bids(tmp_path):
+    """The field's own validator, with what BIDS has no names for told apart: no error, only advice."""
+    validator = shutil.which("bids-validator-deno", path=str(Path(sys.executable).parent))
+    if validator is None:
+        pytest.skip("no bids-validator-deno")
+    out = tmp_path / "out"
+    begin(out, description("meshes", [tmp_path.as_uri()]))
+    for name in [
+        "cohort.tsv", "cohort.html", "logs/sub-1_ses-a.log", "logs/sub-2.failed.json",
+        "sub-1/ses-a/sub-1_ses-a_desc-tetopt_mesh.vtu", "sub-1/ses-a/sub-1_ses-a_desc-tetopt_mesh.json",
+        "sub-1/ses-a/figures/slice.png", "sub-2/sub-2_desc-tetopt_mesh.inp", "sub-2/figures/slice.png",
+    ]:  # fmt: skip
+        (out / name).parent.mkdir(parents=True, exist_ok=True)
+        (out / name).write_text("x")
+
+    def codes():
+        run = subprocess.run([validator, "--format", "json", out], capture_output=True, text=True, check=False)
+        issues = json.loads(run.stdout)["issues"]["issues"]
+        return {(issue["severity"], issue["code"]) for issue in issues}
+
+    assert codes() == {("warning", "README_FILE_MISSING"), ("warning", "TOO_FEW_AUTHORS")}
+    (out / ".bidsignore").unlink()
+    assert ("error", "NOT_INCLUDED") in codes()

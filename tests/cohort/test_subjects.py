@@ -1,0 +1,101 @@
+"""Subjects: what a table says, what is wrong with one, and what patterns mean."""
+
+from pathlib import Path
+
+import pytest
+
+from tetopt.cohort.subjects import Problems, Subject, doubled, key, matching, read_table, write_table
+from tetopt.errors import InputError
+
+
+def table(path, *lines):
+    path.write_text("\n".join(lines) + "\n")
+    return path
+
+
+def subject(name, session="", **others):
+    values = {"images": (Path("/a.nii"),), "files": {}, "options": {}, "place": f"row {name}"}
+    return Subject(name, session, **(values | others))
+
+
+def test_a_table_says_what_is_meshed(tmp_path):
+    path = table(
+        tmp_path / "s.tsv", "subject\tsession\timage\timage_2\tmask\tnodes\tk-d\t#note",
+        "sub-01\tses-a\ta.nii\tb.nii\tn/a\t500\t\told", "02\t\t/c.nii\tn/a\tm.nii\tn/a\t0.3\t",
+    )  # fmt: skip
+    first, second = read_table(path)
+    assert first == Subject(
+        "01", "a", (tmp_path / "a.nii", tmp_path / "b.nii"), {}, {"nodes": "500"}, f"{path}, line 2"
+    )
+    assert second == Subject(
+        "02", "", (Path("/c.nii"),), {"mask": tmp_path / "m.nii"}, {"k_d": "0.3"}, f"{path}, line 3"
+    )
+    assert [key(first), key(second)] == ["sub-01_ses-a", "sub-02"]
+
+
+@pytest.mark.parametrize(("suffix", "lines"), [
+    (".csv", ['subject,image', '"a, b",x.nii']), (".csv", ["subject;image", '"a, b";x.nii']),
+    (".csv", ["\ufeffparticipant_id,image", '"a, b",x.nii']), (".tsv", ["subject\timage", "a, b\tx.nii", "", "\t"]),
+])  # fmt: skip
+def test_tables_as_programs_write_them(tmp_path, suffix, lines):
+    (row,) = read_table(table(tmp_path / f"t{suffix}", *lines))
+    assert (row.subject, key(row), row.images) == ("a, b", "sub-ab", (tmp_path / "x.nii",))
+
+
+@pytest.mark.parametrize(("lines", "words"), [
+    (["subject,file"], "there is no image"), (["subject,image,image"], "stands there 2 times"),
+    (["subject,image"], "has no subjects"), ([""], "is empty"), (['subject,image', '"a,b'], "mend that line"),
+])  # fmt: skip
+def test_what_is_no_table_is_refused(tmp_path, lines, words):
+    with pytest.raises(InputError, match=words):
+        read_table(table(tmp_path / "t.csv", *lines))
+
+
+def test_all_lines_that_are_wrong_are_said(tmp_path):
+    path = table(tmp_path / "t.csv", "subject,image", "a", ",x.nii", "b,n/a", "c,y.nii")
+    with pytest.raises(Problems) as raised:
+        read_table(path)
+    assert [line.removeprefix(f"{path}, ") for line in raised.value.lines] == [
+        "line 2: expected 2 cells, as the first line has, got 1", "line 3: has no subject", "line 4: has no image",
+    ]  # fmt: skip
+
+
+def test_names_that_come_to_the_same_are_said():
+    rows = [subject("a-1"), subject("a1"), subject("--"), subject("b"), subject("b", "x")]
+    words = list(doubled(rows))
+    assert [line.partition(":")[0] for line in words] == ["row a1", "row --", "row b"]
+    assert "sub-a1 is also that of row a-1" in words[0]
+    assert "sub-b_ses-x has a session, sub-b (row b) has none" in words[2]
+
+
+def test_a_table_that_was_written_reads_the_same(tmp_path):
+    rows = [
+        subject("01", "a", images=(tmp_path / "x.nii", Path("/far/y.nii")), options={"background": "-5"}),
+        subject("02", "b", images=(tmp_path / "z\tz.nii",), files={"labels": tmp_path / "l.nii"}),
+    ]
+    for name in ("t.tsv", "t.csv"):
+        write_table(tmp_path / name, rows)
+        assert [each._replace(place="") for each in read_table(tmp_path / name)] == [
+            each._replace(place="") for each in rows
+        ]
+
+
+@pytest.mark.parametrize(("pattern", "session", "name"), [
+    ("sub-{subject}/ses-{session}/sub-{subject}_ses-{session}_mask.nii", "b", "sub-01/ses-b/sub-01_ses-b_mask.nii"),
+    ("sub-{subject}/ses-{session}/sub-{subject}_ses-{session}_mask.nii", "", "sub-01/sub-01_mask.nii"),
+    ("sub-{subject}/**/*_mask.nii", "b", "sub-01/sub-01_mask.nii"), ("atlas.nii", "", "atlas.nii"),
+])  # fmt: skip
+def test_a_pattern_means_one_file(tmp_path, monkeypatch, pattern, session, name):
+    (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+    (tmp_path / name).touch()
+    monkeypatch.chdir(tmp_path)
+    assert matching(pattern, subject("0-1", session)) == tmp_path / name
+
+
+def test_a_pattern_of_none_or_two_files_is_refused(tmp_path):
+    with pytest.raises(InputError, match="expected one file, got none"):
+        matching(f"{tmp_path}/*.nii", subject("01"))
+    for name in ("a.nii", "b.nii"):
+        (tmp_path / name).touch()
+    with pytest.raises(InputError, match=r"expected one file, got 2: a\.nii, b\.nii"):
+        matching(f"{tmp_path}/*.nii", subject("01"))

@@ -1,0 +1,232 @@
+"""The raw images of a BIDS folder, as rows of a cohort.
+
+By pybids, the field's own library, and not by bids2table or ancpbids: of these three it alone keeps to the raw images
+(not those of `derivatives` and `sourcedata`), and to folders whose names have dots or brackets. It is the slowest, 6 s
+for 2,000 subjects of 21,000 files where they take 1 s, which is nothing beside one mesh, and 0.2 s for two of them by
+name. Only names of files are looked at: a broken or a hostile JSON beside an image is never opened.
+"""
+
+from __future__ import annotations
+
+import re
+import shlex
+import warnings
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+from tetopt.cohort.layout import DESCRIPTION_NAME
+from tetopt.cohort.subjects import Problems, Subject
+from tetopt.errors import InputError
+from tetopt.incoming import json_of, text_of
+from tetopt.io.text import plain
+
+BIDS_ENDINGS = (".nii.gz", ".nii")  # that of two with one name which is read comes first
+RAW_PLACE = "sub-[^/]+/(ses-[^/]+/)?(?!ses-)[^/]+/[^/]+"
+NAMED_SUBJECTS = 5  # so many are named where some have no image: whoever wants all counts the rows
+
+
+class Name(NamedTuple):
+    """A file's name as BIDS reads it, `acq-mprage_run-1_T1w` say."""
+
+    entities: dict[str, str]
+    suffix: str
+
+    def is_of(self, kind: Name) -> bool:
+        """Whether it has that suffix, and those entities among others; numbers with or without zeros ahead."""
+        same = (_same(self.entities.get(key), value) for key, value in kind.entities.items())
+        return self.suffix == kind.suffix and all(same)
+
+
+class Scan(NamedTuple):
+    """An image of a subject in one session, "" if there are none."""
+
+    subject: str
+    session: str
+    path: Path
+    name: Name  # without subject and session
+
+
+def bids_subjects(
+    folder: str | Path, suffix: str = "T1w", participants: Sequence[str] = (), sessions: Sequence[str] = ()
+) -> list[Subject]:
+    """The raw images of a BIDS folder, one of each subject and session.
+
+    Of names that end in .nii and .nii.gz the latter is taken, of several images that which has no other entities than
+    those of `suffix`. Subjects without any are left out, with a warning.
+
+    Parameters
+    ----------
+    folder : str or Path
+        With a `dataset_description.json`; what is in `derivatives` and `sourcedata` is not looked at.
+    suffix : str, default "T1w"
+        What comes last in the images' names; entities before it choose among several, as in `acq-mprage_T1w`.
+    participants, sessions : sequence of str
+        Only these, with or without `sub-` and `ses-`; all where there are none.
+
+    Returns
+    -------
+    list of Subject
+        By subject and session, in the order of their labels.
+
+    Raises
+    ------
+    InputError
+        No BIDS folder; pybids is not installed; no image.
+    Problems
+        All of these: participants or sessions that are not there, several images for one row, links to content that is
+        not here, files in another subject's folder.
+
+    References
+    ----------
+    K. J. Gorgolewski et al., The brain imaging data structure, Scientific Data 3, 160044 (2016).
+    """
+    folder = Path(folder).absolute()
+    dataset_description(folder)
+    kind = _kind(suffix)
+    labels = [label.removeprefix("sub-") for label in participants]
+    visits = {label.removeprefix("ses-") for label in sessions}
+    scans, problems = _scans(folder, kind.suffix, labels)
+    scans = [scan for scan in scans if scan.name.is_of(kind) and (not visits or scan.session in visits)]
+    rows: dict[tuple[str, str], list[Scan]] = {}
+    for scan in sorted(scans, key=lambda scan: (scan.subject, scan.session, scan.path.name)):
+        rows.setdefault((scan.subject, scan.session), []).append(scan)
+    problems += [f"sub-{label}: no image _{suffix}" for label in labels if label not in {key[0] for key in rows}]
+    problems += [f"ses-{visit}: no image _{suffix}" for visit in sorted(visits - {key[1] for key in rows})]
+    chosen = [_chosen(several, kind, folder, problems) for several in rows.values()]
+    if problems:
+        raise Problems([f"{_shown(folder)}: {plain(problem)}" for problem in problems])
+    if not chosen:
+        raise InputError(f"{_shown(folder)}: no image _{suffix}.nii.gz of any subject; --suffix names another kind")
+    if not labels:
+        _warn_of_others(folder, suffix, {scan.subject for scan in chosen})
+    return [_subject(scan, folder) for scan in chosen]
+
+
+def dataset_description(folder: Path) -> dict[str, Any]:
+    """What a BIDS folder says of itself.
+
+    Raises
+    ------
+    InputError
+        It is no folder, or has no `dataset_description.json` that holds a table.
+    """
+    file = folder / DESCRIPTION_NAME
+    if not folder.is_dir():
+        raise InputError(f"{_shown(folder)}: no such folder; expected a BIDS dataset")
+    if not file.exists():
+        raise InputError(f"{_shown(folder)}: expected a BIDS dataset, with a {DESCRIPTION_NAME}; or give a table")
+    text = text_of(file, "description of a BIDS dataset")
+    try:
+        table = json_of(text)
+    except ValueError as error:
+        raise InputError(f"{_shown(file)}: expected JSON, got {plain(str(error))}; mend that place") from error
+    if not isinstance(table, dict):
+        raise InputError(f"{_shown(file)}: expected a table in JSON, got {type(table).__name__}")
+    return table
+
+
+def _kind(suffix: str) -> Name:
+    name = _name(suffix)
+    if name is None or not re.fullmatch("[A-Za-z0-9]+", name.suffix) or {"sub", "ses"} & set(name.entities):
+        raise InputError(
+            f"--suffix {plain(suffix)}: expected what a BIDS name ends in, as T1w or acq-mprage_T1w, without .nii.gz; "
+            "--participant-label and --session-label choose subjects and sessions"
+        )
+    return name
+
+
+def _name(text: str) -> Name | None:
+    """A name without its ending; None if its parts are not those of BIDS."""
+    *parts, suffix = text.split("_")
+    pairs = [part.partition("-") for part in parts]
+    if not all(key and value for key, _, value in pairs):
+        return None
+    return Name({key: value for key, _, value in pairs}, suffix)
+
+
+def _same(value: str | None, other: str) -> bool:
+    if value is not None and value.isdecimal() and other.isdecimal():
+        return int(value) == int(other)
+    return value == other
+
+
+def _scans(folder: Path, suffix: str, labels: Iterable[str]) -> tuple[list[Scan], list[str]]:
+    """All images of a suffix, and what is wrong with the names of some."""
+    scans, problems = [], []
+    for path in _image_paths(folder, suffix, labels):
+        place = path.relative_to(folder)
+        *folders, _, file = place.parts
+        ending = next(ending for ending in BIDS_ENDINGS if file.endswith(ending))
+        name = _name(file.removesuffix(ending))
+        expected = dict(each.split("-", 1) for each in folders if "-" in each)
+        own = {key: value for key, value in (name.entities if name else {}).items() if key in ("sub", "ses")}
+        if name is None or own != expected:
+            problems.append(f"{place}: its name is not that of an image in {'/'.join(folders)}; rename or move it")
+            continue
+        others = {key: value for key, value in name.entities.items() if key not in own}
+        scans.append(Scan(own["sub"], own.get("ses", ""), path, Name(others, name.suffix)))
+    return scans, problems
+
+
+def _image_paths(folder: Path, suffix: str, labels: Iterable[str]) -> list[Path]:
+    """The raw files sub-X[/ses-Y]/kind/*_suffix.nii[.gz], by pybids, which is kept from all others."""
+    try:
+        from bids import BIDSLayout
+        from bids.layout import BIDSLayoutIndexer
+    except ImportError:
+        raise InputError('BIDS folders need pybids: pip install "tetopt[cohort]", or give a table') from None
+    ignored = [
+        "^/(?!sub-)",
+        "^(/[^/]*){5}",  # the way of links in a circle has no end
+        r"\.[^/]*(?<!\.nii)(?<!\.nii\.gz)$",
+        rf"_(?!{suffix}\.)[^/_]*\.nii(\.gz)?$",
+        "[\ud800-\udfff]",  # bytes that are no UTF-8 are no name of BIDS, and its index cannot hold them
+    ]
+    if some := "|".join(map(re.escape, labels)):
+        ignored.append(f"^/sub-(?!({some})(/|$))")
+    indexer = BIDSLayoutIndexer(
+        validate=False,
+        index_metadata=False,
+        ignore=[re.compile(each) for each in ignored],
+        config_filename=".no-layout_config.json",  # a folder's own would be code of a kind: patterns
+    )
+    try:
+        layout = BIDSLayout(str(folder), validate=False, indexer=indexer)
+    except (OSError, UnicodeError) as error:
+        raise InputError(f"{_shown(folder)}: cannot be looked through, {plain(str(error))}") from error
+    files = layout.get(suffix=suffix, extension=list(BIDS_ENDINGS), return_type="filename")
+    paths = map(Path, files)
+    return [path for path in paths if re.fullmatch(RAW_PLACE, path.relative_to(folder).as_posix(), re.DOTALL)]
+
+
+def _chosen(scans: list[Scan], kind: Name, folder: Path, problems: list[str]) -> Scan:
+    """The one image of a row, or a problem more; and another problem if it is a link to nothing."""
+    stems = {scan.path.name.removesuffix(".gz"): scan for scan in scans}  # name.nii.gz comes after name.nii
+    exact = [scan for scan in stems.values() if len(scan.name.entities) == len(kind.entities)]
+    first, *others = exact or stems.values()
+    places = [plain(str(scan.path.relative_to(folder))) for scan in (first, *others)]
+    if others:
+        own = [f"{key}-{value}" for key, value in first.name.entities.items()]
+        problems.append(
+            f"{len(places)} images for one row, {', '.join(places)}: choose by entities, "
+            f"as --suffix {'_'.join([*own, kind.suffix])}, or give a table of images"
+        )
+    elif not first.path.exists():
+        problems.append(f"{places[0]}: a link to content that is not here; run: datalad get {shlex.quote(places[0])}")
+    return first
+
+
+def _warn_of_others(folder: Path, suffix: str, subjects: set[str]) -> None:
+    others = sorted(path.name for path in folder.glob("sub-*") if path.is_dir() and path.name[4:] not in subjects)
+    if others:
+        some = ", ".join(others[:NAMED_SUBJECTS]) + (", ..." if len(others) > NAMED_SUBJECTS else "")
+        warnings.warn(f"{_shown(folder)}: left out, without _{suffix}: {len(others)} ({plain(some)})", stacklevel=3)
+
+
+def _subject(scan: Scan, folder: Path) -> Subject:
+    return Subject(scan.subject, scan.session, (scan.path,), {}, {}, plain(str(scan.path.relative_to(folder))))
+
+
+def _shown(path: Path) -> str:
+    return plain(str(path))
