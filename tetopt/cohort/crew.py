@@ -143,3 +143,13 @@ def dashboard_address() -> str:
         except OSError:
             return "127.0.0.1:0"
     return f"127.0.0.1:{DASHBOARD_PORT}"
+
+
+def dashboard_link(client: Any) -> str:
+    """The page that answers at `dashboard_address`; dask's own words have the scheduler's name in it."""
+    return f"http://127.0.0.1:{client.scheduler_info()['services']['dashboard']}/status"
+
+
+def counted(number: int, noun: str) -> str:
+    """A number of things in words."""
+    return f"{number} {noun}{'s' * (number != 1)}"

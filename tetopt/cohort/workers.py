@@ -25,6 +25,7 @@ from tetopt.cohort.crew import (
     Need,
     Newcomers,
     Workers,
+    counted,
     dashboard_address,
     slots_of,
 )
@@ -134,7 +135,7 @@ def _local(stack: ExitStack, need: Need, folders: Folders, count: int | None) ->
     )
     client = stack.enter_context(Client(cluster))
     client.register_plugin(_silencer(folders.logs / "dask.log"))
-    words = f"{share.workers} workers of {share.threads} thread{'s' * (share.threads != 1)}"
+    words = f"{counted(share.workers, 'worker')} of {counted(share.threads, 'thread')}"
     if free is not None:
         words += f" and {memory_words(share.bytes)}"
     words += f"; dashboard {client.dashboard_link}"
@@ -165,7 +166,8 @@ def _connected(stack: ExitStack, need: Need, folders: Folders, address: str) -> 
         raise InputError(f"--scheduler: {address} has no workers; start some: dask worker {address}")
     threads = need.threads or _threads_each(list(newcomers.known.values()))
     n_bytes = min((about.n_bytes / about.n_threads for about in newcomers.known.values()), default=float("inf"))
-    words = f"{len(newcomers.known)} workers at {address}, {slots} subjects at a time of {threads} threads"
+    words = f"{counted(len(newcomers.known), 'worker')} at {address}, {counted(slots, 'subject')} at a time of "
+    words += counted(threads, "thread")
     return Workers(client, newcomers.slots, threads, n_bytes, f"{words}; dashboard {client.dashboard_link}")
 
 
