@@ -829,7 +829,7 @@ def test_demo(tmp_path):
     pytest.importorskip("nilearn", reason="the demo's image comes in nilearn's wheel")
     folder = tmp_path / "new" / "demo"
     assert exit_code("demo", "-o", folder, "--nodes", "300", "--iterations", "2") == 0
-    pictures = ["slice.png", "rho.png", "energies.png"]
+    pictures = ["slice.png", "rho.png", "energies.png", "thumbnail.png"]
     assert sorted(p.name for p in folder.iterdir()) == sorted(["mesh.vtu", "run.json", *pictures])
     for name in pictures:
         with PIL.Image.open(folder / name) as picture:
@@ -907,7 +907,7 @@ def test_quality_of_a_part(tmp_path, inputs, part, capsys):
 def test_figures(tmp_path, inputs):
     command = small_run(inputs, tmp_path, 1)
     assert exit_code(*command, "--figures", tmp_path) == 0
-    assert {p.name for p in tmp_path.glob("*.png")} == {"slice.png", "rho.png", "energies.png"}
+    assert {p.name for p in tmp_path.glob("*.png")} == {"slice.png", "rho.png", "energies.png", "thumbnail.png"}
 
 
 def test_many_more_cells_than_voxels_are_said(tmp_path, capsys):

@@ -77,6 +77,7 @@ def test_commands(tmp_path, monkeypatch):
         "slice.png",
         "rho.png",
         "energies.png",
+        "thumbnail.png",
     }
     assert {path.name for path in tmp_path.iterdir()} == files
 

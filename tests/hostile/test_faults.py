@@ -38,7 +38,7 @@ MORE_COMMANDS = {
     "mesh, solver": ([*MESH, "--young", "3", "-o", "{out}/a.inp"], ["a.inp"]),
     "mesh, pictures": (
         [*MESH, "-o", "{out}/a.vtu", "--figures", "{out}"],
-        ["a.vtu", "slice.png", "rho.png", "energies.png"],
+        ["a.vtu", "slice.png", "rho.png", "energies.png", "thumbnail.png"],
     ),
     "convert": (
         ["convert", "{in}/m.vtu", "{out}/c.feb", "--young", "3", "--json", "{out}/c.json"], ["c.feb", "c.json"],

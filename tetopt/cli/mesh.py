@@ -316,18 +316,19 @@ def _write(task: Task, outcome: Outcome, model: Model, about: dict[str, Any], be
 
 def _draw(task: Task, outcome: Outcome, model: Model) -> None:
     """Draw the pictures."""
-    from tetopt.report import figures  # matplotlib is slow to load, and only needed here
+    from tetopt.report import figures, thumbnail  # matplotlib is slow to load, and only needed here
 
     source, pictures = task.source, task.plan.pictures
     image, mesh = source.contrasts[0], outcome.result.mesh
     figures.save_run_figures(pictures[:3], source.image, outcome.initial, outcome.result, task.start_name, image)
+    of_cell = model.cell_data.get("label")
     if source.mask is not None:
         figures.save_figure(figures.boundary_figure(image, source.mask, mesh), pictures[3])
     if source.labels is not None:
         other = None if np.array_equal(image.data, source.labels.data) else image
-        of_cell = model.cell_data["label"]
         figure = figures.label_figure(source.labels, mesh, of_cell, other, source.table)
-        figures.save_figure(figure, pictures[-1])
+        figures.save_figure(figure, pictures[-2])
+    thumbnail.save_thumbnail(pictures[-1], image, mesh, source.mask, source.labels, of_cell)
 
 
 def _print(task: Task, outcome: Outcome, model: Model, measured: dict[str, Any]) -> int:

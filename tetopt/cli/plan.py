@@ -43,7 +43,7 @@ class Plan(NamedTuple):
     engine: EngineOptions
     solver: SolverOptions
     output: OutputOptions
-    pictures: list[Path]  # slice, rho, energies, with a mask its boundary, with labels these
+    pictures: list[Path]  # slice, rho, energies, with a mask its boundary, with labels these, last a thumbnail
 
     def kind(self, ndim: int) -> str:
         """What the initial mesh is: a kind of lattice, octree or start."""
@@ -187,6 +187,7 @@ def _pictures(source: SourceOptions, output: OutputOptions) -> list[Path]:
     names = ["slice.png", "rho.png", "energies.png"]
     names += [] if source.mask is None and source.background is None else ["boundary.png"]
     names += [] if source.labels is None else ["labels.png"]
+    names += ["thumbnail.png"]
     return list(checked_outputs(output.figures, names, output.force).values())
 
 

@@ -1,4 +1,4 @@
-"""The polygons in which a plane cuts tetrahedra."""
+"""The polygons in which a plane cuts tetrahedra, and the segments in which it cuts triangles."""
 
 from __future__ import annotations
 
@@ -53,3 +53,19 @@ def plane_cut(points: Points, cells: Cells, height: NDArray[np.float64]) -> Cut:
     low, high = height[ends[..., 0]], height[ends[..., 1]]
     share = (low / (low - high))[..., None]
     return Cut(points[ends[..., 0]] * (1.0 - share) + points[ends[..., 1]] * share, cut)
+
+
+def triangle_cut(
+    points: NDArray[np.float64], triangles: NDArray[np.int64], height: NDArray[np.float64]
+) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
+    """Segments (K, 2, 3) in which the plane height = 0 cuts triangles, and the numbers (K,) of these.
+
+    A node on the plane counts as above it.
+    """
+    is_above = height[triangles] >= 0.0
+    n_above = is_above.sum(axis=1)
+    alone = (is_above == (n_above == 1)[:, None]).argmax(axis=1)  # the node with no other on its side
+    turned = np.take_along_axis(triangles, (alone[:, None] + np.arange(3)) % 3, axis=1)[(n_above % 3) > 0]
+    one, others = turned[:, :1], turned[:, 1:]
+    share = (height[one] / (height[one] - height[others]))[..., None]
+    return points[one] * (1.0 - share) + points[others] * share, np.flatnonzero(n_above % 3)

@@ -20,7 +20,7 @@ from tetopt.energy.sampling import cell_moments
 from tetopt.engine.loop import Optimized, Record
 from tetopt.errors import InputError
 from tetopt.geometry.box import world_axes
-from tetopt.geometry.cut import plane_cut
+from tetopt.geometry.cut import plane_cut, triangle_cut
 from tetopt.geometry.simplex import rho
 from tetopt.geometry.topology import facets
 from tetopt.image import Image
@@ -336,7 +336,7 @@ class SliceView:
         outer, is_on_box = facets_on_box(mesh, self.image)
         if self.across is None:
             return self._flat(index[outer[~is_on_box]])
-        return self._flat(_triangle_cut(index, outer[~is_on_box], index[:, self.across] - self.index)[0])
+        return self._flat(triangle_cut(index, outer[~is_on_box], index[:, self.across] - self.index)[0])
 
     def interfaces(self, mesh: Mesh, of_cell: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
         """Segments (K, 2, 2), in picture mm, of the facets between cells of two labels, and these labels (K, 2)."""
@@ -345,7 +345,7 @@ class SliceView:
         nodes, sides = shared.nodes[is_between], of_cell[shared.cells[is_between]]
         if self.across is None:
             return self._flat(index[nodes]), sides
-        lines, triangles = _triangle_cut(index, nodes, index[:, self.across] - self.index)
+        lines, triangles = triangle_cut(index, nodes, index[:, self.across] - self.index)
         return self._flat(lines), sides[triangles]
 
     def _flat(self, index: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -373,22 +373,6 @@ def _middle_views(image: Image) -> list[SliceView]:
     if image.ndim == 2:
         return [SliceView(image, None, None)]
     return [SliceView(image, world_axes(image.affine).index(world), None) for world in (2, 1, 0)]
-
-
-def _triangle_cut(
-    points: NDArray[np.float64], triangles: NDArray[np.int64], height: NDArray[np.float64]
-) -> tuple[NDArray[np.float64], NDArray[np.int64]]:
-    """Segments (K, 2, 3) in which the plane height = 0 cuts triangles, and the numbers (K,) of these.
-
-    A node on the plane counts as above it.
-    """
-    is_above = height[triangles] >= 0.0
-    n_above = is_above.sum(axis=1)
-    alone = (is_above == (n_above == 1)[:, None]).argmax(axis=1)  # the node with no other on its side
-    turned = np.take_along_axis(triangles, (alone[:, None] + np.arange(3)) % 3, axis=1)[(n_above % 3) > 0]
-    one, others = turned[:, :1], turned[:, 1:]
-    share = (height[one] / (height[one] - height[others]))[..., None]
-    return points[one] * (1.0 - share) + points[others] * share, np.flatnonzero(n_above % 3)
 
 
 def histogram_figure(meshes: Sequence[tuple[str, Mesh]]) -> Figure:

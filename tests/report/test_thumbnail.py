@@ -1,0 +1,143 @@
+"""The small picture of a subject: which side is which, proportions, what is drawn, and that it is small."""
+
+import io
+
+import numpy as np
+import PIL.Image
+import pytest
+
+from tetopt.errors import InputError
+from tetopt.image import Image
+from tetopt.mesh import Mesh
+from tetopt.report.thumbnail import SIDE_PIXELS, save_thumbnail, thumbnail_png
+from tetopt.start.lattice import lattice
+
+SHAPE, SPACING = (40, 50, 15), np.array([1.0, 1.0, 3.0])
+
+
+def pixels(*arguments):
+    """Red, green and blue (height, width, 3) of the picture, its upper row first."""
+    with PIL.Image.open(io.BytesIO(thumbnail_png(*arguments))) as picture:
+        assert (picture.format, picture.mode) == ("PNG", "P")
+        return np.asarray(picture.convert("RGB")).astype(int)
+
+
+def is_grey(rgb, least):
+    return (np.ptp(rgb, axis=-1) < 40) & (rgb.min(axis=-1) >= least)
+
+
+def ball(centre=(20.0, 25.0, 21.0), radius=8.0):
+    """A bright ball in mm of the world, x to the right, y to the front, z up."""
+    affine = np.diag([*SPACING, 1.0])
+    world = np.moveaxis(np.indices(SHAPE), 0, -1) * SPACING
+    return Image(100.0 * (((world - centre) ** 2).sum(axis=-1) <= radius**2), affine)
+
+
+def coarse(image):
+    """A mesh of the image's box of a few cells."""
+    return lattice(image, blocks=(1,) * image.ndim)
+
+
+def reordered(image, order, signs):
+    """The same image with its voxels in another order."""
+    data = np.transpose(image.data, order)
+    affine = image.affine[:, [*order, 3]].copy()
+    for axis, sign in enumerate(signs):
+        if sign < 0:
+            affine[:3, 3] += affine[:3, axis] * (data.shape[axis] - 1)
+            affine[:3, axis] *= -1.0
+            data = np.flip(data, axis)
+    return Image(np.ascontiguousarray(data), affine)
+
+
+def test_left_is_left_and_front_is_up():
+    """Of balls in the plane of one view each."""
+    left = ball(centre=(8.0, 38.0, 21.0), radius=7.0)
+    rgb = pixels(left, coarse(left))
+    assert rgb.shape == (SIDE_PIXELS, 2 * SIDE_PIXELS, 3)
+    y, x = np.nonzero(is_grey(rgb[:, :SIDE_PIXELS], 150))
+    assert x.mean() < SIDE_PIXELS / 2 - 10
+    assert y.mean() < SIDE_PIXELS / 2 - 10  # in front
+    high = ball(centre=(20.0, 38.0, 32.0), radius=7.0)
+    y, x = np.nonzero(is_grey(pixels(high, coarse(high))[:, SIDE_PIXELS:], 150))
+    assert x.mean() > SIDE_PIXELS / 2 + 10  # in front
+    assert y.mean() < SIDE_PIXELS / 2 - 10  # above
+
+
+@pytest.mark.parametrize(("order", "signs"), [((2, 0, 1), (1, -1, 1)), ((1, 0, 2), (-1, -1, -1))])
+def test_the_order_of_voxels_does_not_matter(order, signs):
+    image = ball(centre=(20.0, 30.0, 21.0), radius=8.0)
+    mesh = coarse(image)
+    change = np.abs(pixels(reordered(image, order, signs), mesh) - pixels(image, mesh)).max(axis=-1)
+    assert np.mean(change > 40) < 0.01  # single pixels at the ball's edge, by rounding
+
+
+def test_a_wrong_affine_is_seen():
+    """The same voxels with x and y turned around lie on the other sides."""
+    image = ball(centre=(8.0, 38.0, 21.0), radius=7.0)
+    wrong = Image(image.data, np.diag([-1.0, -1.0, 3.0, 1.0]))
+    sides = []
+    for each in (image, wrong):
+        y, x = np.nonzero(is_grey(pixels(each, coarse(each))[:, :SIDE_PIXELS], 150))
+        sides.append((x.mean() < SIDE_PIXELS / 2, y.mean() < SIDE_PIXELS / 2))
+    assert sides == [(True, True), (False, False)]
+
+
+def test_voxels_of_other_lengths_keep_a_ball_round():
+    image = ball(centre=(19.5, 24.5, 21.0), radius=12.0)
+    rgb = pixels(image, coarse(image))
+    for view in (rgb[:, :SIDE_PIXELS], rgb[:, SIDE_PIXELS:]):
+        y, x = np.nonzero(view[..., 2] > 90)  # orange has no blue
+        assert np.ptp(x) / np.ptp(y) == pytest.approx(1.0, abs=0.2)  # a fifth: voxels are 3 mm high
+        assert np.ptp(x) / SIDE_PIXELS == pytest.approx(24.0 / (1.16 * 50.0), abs=0.06)  # mm, of the side's
+
+
+def test_mesh_mask_and_labels_are_drawn():
+    image = ball(centre=(19.5, 24.5, 21.0), radius=12.0)
+    mesh, dark = coarse(image), Image(np.zeros(SHAPE), image.affine)
+    plain = pixels(dark, mesh)
+    red, green, blue = np.moveaxis(plain, -1, 0)
+    assert ((red > 200) & (green > 120) & (blue < 80)).sum() > 4 * 80  # the boundary, at least, in both views
+    masked = pixels(dark, mesh, Image(image.data / 100.0, image.affine))
+    assert (masked[..., 2] > 150).sum() > 60 > (plain[..., 2] > 150).sum()
+    labels = Image(image.data / 100.0, image.affine)
+    of_cell = np.arange(len(mesh.cells)) % 2
+    coloured = pixels(dark, mesh, None, labels, of_cell)
+    assert (np.abs(coloured - plain).max(axis=-1) > 40).sum() > 2000
+    np.testing.assert_array_equal(pixels(dark, mesh, None, labels, 0 * of_cell), plain)
+
+
+def test_two_lungs_are_cut_through_one():
+    """Where the middle is hollow, the sagittal view is not empty."""
+    left = lattice(Image(np.zeros((10, 10, 10)), np.eye(4)), blocks=(1, 1, 1))
+    points = np.concatenate([left.points, left.points + np.array([40.0, 0.0, 0.0])])
+    mesh = Mesh(points, np.concatenate([left.cells, left.cells + len(left.points)]))
+    rgb = pixels(Image(np.zeros((50, 10, 10)), np.eye(4)), mesh)
+    assert (rgb[:, SIDE_PIXELS:, 0] > 200).any()
+
+
+def test_an_image_in_the_plane_has_one_view(tmp_path):
+    image = Image(np.random.default_rng(0).normal(size=(20, 30)))
+    assert pixels(image, coarse(image)).shape == (SIDE_PIXELS, SIDE_PIXELS, 3)
+    flat = Image(np.full((20, 30), 7.0))
+    assert pixels(flat, coarse(flat)).shape == (SIDE_PIXELS, SIDE_PIXELS, 3)
+
+
+def test_a_mesh_beside_the_image_is_drawn_alone():
+    image = ball()
+    mesh = coarse(image)
+    rgb = pixels(image, Mesh(mesh.points + 1000.0, mesh.cells))
+    assert rgb[..., 0].max() > 200
+    assert is_grey(rgb, 100).sum() == 0
+
+
+def test_its_bytes_are_few_and_always_the_same(tmp_path):
+    rng = np.random.default_rng(0)
+    image = Image(rng.normal(size=(40, 50, 15)), np.diag([*SPACING, 1.0]))
+    mesh = lattice(image, nodes=2000)
+    for name in "ab":
+        save_thumbnail(tmp_path / f"{name}.png", image, mesh)
+    assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()
+    assert (tmp_path / "a.png").stat().st_size < 20_000  # of noise, which no method makes smaller
+    with pytest.raises(InputError, match=r"ends in \.png"):
+        save_thumbnail(tmp_path / "a.jpg", image, mesh)

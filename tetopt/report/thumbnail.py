@@ -1,0 +1,183 @@
+"""A picture of a few kB by which one of hundreds of subjects is judged at a glance: two slices in the world's axes.
+
+Slices are across the world's axes, not the voxels': an image whose affine is wrong lies wrongly in it, whatever the
+order of its voxels is, and one that is oblique is turned.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+import PIL.Image
+from matplotlib.axes import Axes
+from matplotlib.backends.backend_agg import FigureCanvasAgg
+from matplotlib.collections import LineCollection, PolyCollection
+from matplotlib.figure import Figure
+from numpy.typing import NDArray
+from scipy.ndimage import map_coordinates
+
+from tetopt.geometry.cut import plane_cut, triangle_cut
+from tetopt.geometry.simplex import volumes
+from tetopt.geometry.topology import facets
+from tetopt.image import Image
+from tetopt.io.files import check_suffix, save_bytes
+from tetopt.mesh import Mesh
+from tetopt.report.colours import grey_limits, label_colours
+from tetopt.report.figures import FIGURE_SUFFIXES, MASK_LINE, MESH_LINE
+
+SIDE_PIXELS = 128  # of a view: a head is seen, a page has 500 of them
+SAMPLES_PER_PIXEL = 2  # along each side: fine stripes would flicker in single samples
+MARGIN_SHARE = 0.08  # of the mesh's largest side, left around it on each side
+SLAB_COUNT = 20  # across the mesh, of which the fullest is where it is cut, if its middle is emptier than half of that
+PALETTE_COLOURS = 32  # greys and oranges, as the eye needs them: half of the bytes of 256
+EDGE_POINTS = 4.0  # width of edges times the root of how many cells are cut: however many, they tint the image alike
+LABEL_ALPHA = 0.45  # of cells' labels over the image
+VIEW_AXES = {
+    3: ((0, 1), (1, 2)),
+    2: ((0, 1),),
+}  # horizontal and vertical world axes: axial and sagittal; a 2-D image whole
+
+
+def save_thumbnail(
+    path: Path, image: Image, mesh: Mesh, mask: Image | None = None, labels: Image | None = None,
+    of_cell: NDArray[np.int64] | None = None,
+) -> None:  # fmt: skip
+    """Write the slices of an image with its mesh over them as PNG, whole or not at all; the same bytes for the same.
+
+    Of a volume an axial slice on the left and a sagittal one on the right, 256 x 128 pixels, through the mesh's middle
+    (or, where that is hollow, where most of it is); of a 2-D image one view. Both are in one scale, the same along both
+    sides, and centred on the mesh: x from left to right (left of the patient on the left), y upwards or, in the
+    sagittal view, to the right (back on the left), z upwards. What lies beside the image is black.
+
+    Parameters
+    ----------
+    path : Path
+        Ends in ".png".
+    image : Image
+    mesh : Mesh
+        Its edges are orange, its boundary more so.
+    mask : Image, optional
+        From 0 to 1; its outline is blue.
+    labels : Image, optional
+        Its colours are those of `tetopt.report.figures.label_figure`.
+    of_cell : (M,) int64, optional
+        Each cell's label, where there are `labels`: cells of others than 0 have their colours.
+
+    Raises
+    ------
+    InputError
+        A name that ends otherwise.
+    """
+    save_bytes(check_suffix(path, FIGURE_SUFFIXES), thumbnail_png(image, mesh, mask, labels, of_cell))
+
+
+def thumbnail_png(
+    image: Image, mesh: Mesh, mask: Image | None = None, labels: Image | None = None,
+    of_cell: NDArray[np.int64] | None = None,
+) -> bytes:  # fmt: skip
+    """The bytes of `save_thumbnail`."""
+    views = VIEW_AXES[image.ndim]
+    low, high = mesh.points[np.unique(mesh.cells)].min(axis=0), mesh.points[np.unique(mesh.cells)].max(axis=0)
+    half = (0.5 + MARGIN_SHARE) * float((high - low).max())
+    places = [(low + high) / 2.0] * len(views)
+    if image.ndim == 3:
+        places = [_at(place, axis, _fullest(mesh, axis)) for place, axis in zip(places, (2, 0), strict=True)]
+    pixels = [_sampled(image, place, axes, half) for place, axes in zip(places, views, strict=True)]
+    seen = [each[np.isfinite(each)] for each in pixels]
+    limits = grey_limits([np.concatenate(seen)] if sum(map(len, seen)) else [np.zeros(1)], brightest=99.8)
+    colours = None if labels is None or of_cell is None else label_colours(labels)
+    figure = Figure(figsize=(len(views), 1.0), dpi=SIDE_PIXELS, facecolor="black")
+    for k, (place, axes) in enumerate(zip(places, views, strict=True)):
+        panel = figure.add_axes((k / len(views), 0.0, 1.0 / len(views), 1.0))
+        centre = place[list(axes)]
+        panel.set_axis_off()
+        extent = (centre[0] - half, centre[0] + half, centre[1] - half, centre[1] + half)
+        shown = np.nan_to_num(pixels[k], nan=limits[0])
+        panel.imshow(shown.T, origin="lower", extent=extent, cmap="gray", vmin=limits[0], vmax=limits[1])
+        if mask is not None:
+            inside = np.nan_to_num(_sampled(mask, place, axes, half), nan=0.0)
+            if inside.min() < 0.5 <= inside.max():
+                panel.contour(inside.T, levels=[0.5], extent=extent, colors=MASK_LINE, linewidths=1.0)
+        _draw_mesh(panel, mesh, place, axes, colours, of_cell)
+        panel.set_xlim(extent[:2])
+        panel.set_ylim(extent[2:])
+    return _png(figure)
+
+
+def _at(place: NDArray[np.float64], axis: int, value: float) -> NDArray[np.float64]:
+    moved = place.copy()
+    moved[axis] = value
+    return moved
+
+
+def _fullest(mesh: Mesh, axis: int) -> float:
+    """Where along a world axis the mesh is cut, mm: its middle, if that is not hollow."""
+    x, v = mesh.points[mesh.cells][..., axis], volumes(mesh.points, mesh.cells)
+    first, last = x.min(axis=1), x.max(axis=1)
+    ends = np.linspace(first.min(), last.max(), SLAB_COUNT + 1)
+    # As if each cell's volume were spread evenly between its ends: a few large cells tell as well as many small ones.
+    filled = np.diff([float((v * np.clip((end - first) / (last - first), 0.0, 1.0)).sum()) for end in ends])
+    middle = SLAB_COUNT // 2
+    if filled[middle - 1 : middle + 1].mean() >= 0.5 * filled.max():
+        return float(ends[middle])
+    slab = int(filled.argmax())
+    return float(ends[slab : slab + 2].mean())
+
+
+def _sampled(image: Image, place: NDArray[np.float64], axes: Sequence[int], half: float) -> NDArray[np.float64]:
+    """The image in a square across the world's axes around a place, pixel by pixel; nan beside it."""
+    n = SIDE_PIXELS * SAMPLES_PER_PIXEL
+    steps = (np.arange(n) + 0.5) / n * 2.0 * half - half
+    points = np.broadcast_to(place, (n, n, len(place))).copy()
+    points[..., axes[0]] += steps[:, None]
+    points[..., axes[1]] += steps[None, :]
+    index = np.moveaxis(image.to_index(points), -1, 0)
+    sides = np.array(image.shape).reshape(-1, 1, 1)
+    is_in = ((index >= -0.5) & (index <= sides - 0.5)).all(axis=0)
+    values = map_coordinates(image.data, index, output=np.float64, order=1, mode="nearest")
+    values[~is_in] = np.nan
+    fine = values.reshape(SIDE_PIXELS, SAMPLES_PER_PIXEL, SIDE_PIXELS, SAMPLES_PER_PIXEL)
+    averaged: NDArray[np.float64] = fine.mean(axis=(1, 3))
+    return averaged
+
+
+def _draw_mesh(
+    panel: Axes, mesh: Mesh, place: NDArray[np.float64], axes: Sequence[int], colours: NDArray[np.float64] | None,
+    of_cell: NDArray[np.int64] | None,
+) -> None:  # fmt: skip
+    """Draw the cells that the plane through a place cuts, and the mesh's boundary."""
+    flat = list(axes)
+    if len(place) == 2:
+        corners, cells = mesh.points[mesh.cells], np.arange(len(mesh.cells))
+        shared = facets(mesh.cells)
+        boundary = mesh.points[shared.nodes[shared.n_cells == 1]]
+    else:
+        across = ({0, 1, 2} - set(flat)).pop()
+        height = mesh.points[:, across] - place[across]
+        corners, cells = plane_cut(mesh.points, mesh.cells, height)
+        # A facet that the plane cuts lies only in cells that it cuts: these alone tell which are on the boundary.
+        shared = facets(mesh.cells[cells]) if len(cells) else facets(mesh.cells)
+        boundary, _ = triangle_cut(mesh.points, shared.nodes[shared.n_cells == 1], height)
+    polygons = corners[..., flat]
+    if colours is not None and of_cell is not None:
+        is_shown = of_cell[cells] > 0
+        faces = np.column_stack([colours[of_cell[cells[is_shown]]], np.full(is_shown.sum(), LABEL_ALPHA)])
+        panel.add_collection(PolyCollection(list(polygons[is_shown]), facecolors=faces, edgecolors="none"))
+    width = min(0.25, EDGE_POINTS / np.sqrt(max(len(polygons), 1)))  # points
+    panel.add_collection(PolyCollection(list(polygons), facecolors="none", edgecolors=MESH_LINE, linewidths=width))
+    panel.add_collection(LineCollection(list(boundary[..., flat]), colors=MESH_LINE, linewidths=0.6))
+
+
+def _png(figure: Figure) -> bytes:
+    """A figure as PNG, in a palette."""
+    canvas = FigureCanvasAgg(figure)
+    canvas.draw()
+    whole = PIL.Image.fromarray(np.asarray(canvas.buffer_rgba())[..., :3].copy())
+    stream = io.BytesIO()
+    whole.quantize(PALETTE_COLOURS, PIL.Image.Quantize.MEDIANCUT, dither=PIL.Image.Dither.NONE).save(
+        stream, "PNG", optimize=True
+    )
+    return stream.getvalue()
