@@ -10,8 +10,10 @@ import re
 import shlex
 import shutil
 import sys
+import tempfile
 import time
-from contextlib import ExitStack
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from functools import cache
 from importlib.resources import files
 from pathlib import Path
@@ -32,10 +34,11 @@ from tetopt.cohort.crew import (
 from tetopt.errors import InputError
 from tetopt.incoming import text_of
 
-FILE_BYTES = 10**5  # of a configuration: those that are known have a thousand, and PyYAML takes a second for a million
+YAML_LETTERS = 20_000  # of a configuration: those that are known have a thousand
+YAML_BRACKETS = 500  # likewise: PyYAML's time grows with the square of brackets in one another, 4 s for 4000
 JOBS_AT_ONCE = 20  # where --workers does not say: a cluster's other users wait for as many cores
 JOB_CORES = 4  # of a job where neither its file nor --threads says
-LOOK_SECONDS = 5.0  # between two looks at the jobs: a scheduler starts them no faster
+QUEUE_SECONDS = 5.0  # between two looks at the jobs: a scheduler starts them no faster
 IDLE_SECONDS = 60.0  # without a subject to begin, after which jobs that run none are given back
 MOST_LOST = 3  # jobs that ended before their worker was there, one after the other: they are not going to be better
 # Keys that dask-jobqueue still takes under their old names, with a warning.
@@ -90,10 +93,7 @@ def submitted(stack: ExitStack, need: Need, folders: Folders, path: Path, count:
     own_folder = folders.work / "dask"
     own_folder.mkdir(mode=0o700, exist_ok=True)  # with the keys by which workers and scheduler know one another
     stack.callback(shutil.rmtree, own_folder, ignore_errors=True)
-    cluster = cluster_of(path, kind, job, own_folder, folders.logs)
-    for name in [name for name in vars(cluster) if name.startswith("_job_") and hasattr(vars(cluster)[name], "close")]:
-        stack.callback(vars(cluster)[name].close)  # files of keys, before their folder goes
-    stack.enter_context(cluster)
+    cluster = stack.enter_context(cluster_of(path, kind, job, own_folder, folders.logs))
     client = stack.enter_context(Client(cluster))
     n_jobs = min(count or JOBS_AT_ONCE, -(-need.n_subjects // job.processes))
     keeper = Keeper(cluster, n_jobs, Newcomers(client, need, folders.work), folders.logs)
@@ -186,8 +186,11 @@ def request(path: Path, kind: str, settings: dict[str, Any], need: Need) -> Requ
     return Request(cores, n_bytes, processes, threads, n_bytes / processes - WORKER_BYTES)
 
 
-def cluster_of(path: Path, kind: str, job: Request, folder: Path, logs: Path) -> Any:
+@contextmanager
+def cluster_of(path: Path, kind: str, job: Request, folder: Path, logs: Path) -> Iterator[Any]:
     """A cluster of dask-jobqueue's without jobs yet; its scheduler is in this process, with certificates of its own.
+
+    Their files lie in `folder` until the block ends.
 
     Raises
     ------
@@ -200,7 +203,7 @@ def cluster_of(path: Path, kind: str, job: Request, folder: Path, logs: Path) ->
     settings = dask.config.get(f"jobqueue.{kind}")
     options = (settings["scheduler-options"] or {}) | {"dashboard_address": dashboard_address()}
     try:
-        return cls(
+        cluster = cls(
             job_cls=_watched(cls.job_cls, folder, settings["job-script-prologue"]),
             security=True,
             shared_temp_directory=str(folder),
@@ -218,6 +221,13 @@ def cluster_of(path: Path, kind: str, job: Request, folder: Path, logs: Path) ->
         )
     except (ValueError, TypeError, OSError, RuntimeError) as error:
         raise InputError(f"{path}: {kind}: dask-jobqueue refuses it: {_short(error)}") from error
+    try:
+        with cluster:
+            yield cluster
+    finally:  # not when it is collected, which may be after its folder has gone
+        for value in list(vars(cluster).values()):
+            if isinstance(value, tempfile._TemporaryFileWrapper):
+                value.close()
 
 
 def _watched(job_cls: Any, folder: Path, prologue: list[str]) -> Any:
@@ -259,7 +269,7 @@ class Keeper:
         self.n_lost = 0  # jobs that ended before their worker was there, since one was
         self.failure: str | None = None
         self.asked_at = time.monotonic()
-        self.timer = PeriodicCallback(self.look, 1000.0 * LOOK_SECONDS)
+        self.timer = PeriodicCallback(self.look, 1000.0 * QUEUE_SECONDS)
         cluster.scale(jobs=n_jobs)
         cluster.loop.add_callback(self.timer.start)
 
@@ -333,8 +343,12 @@ def _yaml_of(path: Path) -> Any:
     import yaml
 
     text = text_of(path, "file of dask-jobqueue's configuration")
-    if len(text) > FILE_BYTES:
-        raise InputError(f"{path}: expected at most {FILE_BYTES} letters of YAML, got {len(text)}")
+    for most, count, noun in (
+        (YAML_LETTERS, len(text), "letters"),
+        (YAML_BRACKETS, text.count("[") + text.count("{"), "brackets"),
+    ):
+        if count > most:
+            raise InputError(f"{path}: expected at most {most} {noun} of YAML, got {count}")
     try:
         if any(isinstance(event, yaml.AliasEvent) for event in yaml.parse(text, Loader=yaml.SafeLoader)):
             raise InputError(

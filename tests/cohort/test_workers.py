@@ -1,0 +1,401 @@
+"""Dask's workers: how many, for whom, how safe, and what is left of them; jobs of batch systems as their scripts."""
+
+import os
+import signal
+import stat
+import subprocess
+import time
+from pathlib import Path
+from types import SimpleNamespace
+
+import dask
+import pytest
+from distributed import KilledWorker, LocalCluster
+
+from tetopt.cohort import jobs
+from tetopt.cohort.crew import About, Folders, Need, Newcomers
+from tetopt.cohort.jobs import cluster_of, configuration, request
+from tetopt.cohort.workers import shares, workers
+from tetopt.errors import InputError
+from tetopt.interpreter import python_command, python_environment
+
+GB = 1e9
+
+
+@pytest.fixture(scope="module")
+def folders(tmp_path_factory):
+    made = Folders(*(tmp_path_factory.mktemp(name) for name in ("work", "logs")))
+    return made
+
+
+def running(need, folders, *, count=None, scheduler=None, cluster=None):
+    return workers(need, folders, count=count, scheduler=scheduler, cluster=cluster)
+
+
+def killed():
+    os.kill(os.getpid(), signal.SIGKILL)
+
+
+def noisy():
+    os.write(2, b"a word of a worker\n")
+    return os.getpid()
+
+
+def processes():
+    """Of this process: those that were started by it, and have not ended."""
+    mine = []
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            words = (folder / "stat").read_text().rsplit(")", 1)[1].split()
+        except OSError:
+            continue
+        if int(words[1]) == os.getpid() and words[0] != "Z":
+            mine.append(b" ".join((folder / "cmdline").read_bytes().split(b"\0")))
+    return mine
+
+
+# ---- How many
+
+
+@pytest.mark.parametrize(
+    ("need", "count", "cores", "free", "expected"),
+    [
+        (Need(100, 0.0, None), None, 8, float("inf"), (8, 1)),  # cores
+        (Need(100, 2 * GB, None), None, 8, 11 * GB, (4, 2)),  # memory: 2.65 GB each
+        (Need(3, 2 * GB, None), None, 8, 100 * GB, (3, 2)),  # subjects
+        (Need(100, 2 * GB, None), 2, 8, 100 * GB, (2, 4)),  # count
+        (Need(100, 2 * GB, 4), None, 8, 100 * GB, (2, 4)),  # threads of each
+        (Need(100, 2 * GB, 16), None, 8, 100 * GB, (1, 16)),
+        (Need(100, 20 * GB, None), 5, 2, 11 * GB, (1, 2)),  # none fits: one, which its own check refuses
+    ],
+)
+def test_as_many_workers_as_cores_memory_and_subjects_allow(need, count, cores, free, expected):
+    share = shares(need, count, cores, free)
+    assert share[:2] == expected
+    assert share.bytes < free / share.workers or free == float("inf")
+
+
+# ---- Here
+
+
+def test_workers_of_this_machine(folders, capfd):
+    """A dead one costs its own task at once; nothing of them is on the terminal, nor left afterwards."""
+    before = processes()
+    with running(Need(2, 0.1 * GB, None), folders, count=1) as crew:
+        assert crew.slots() == 1
+        assert crew.words.startswith("1 worker of ")
+        assert "http://127.0.0.1:" in crew.words
+        addresses = [crew.client.scheduler.address, *crew.client.nthreads()]
+        assert all(address.startswith("tls://127.0.0.1:") for address in addresses)
+        # Another user of this machine, who knows the address but has no certificates.
+        with (
+            pytest.raises(InputError, match="does not answer"),
+            running(Need(1, 0.0, None), folders, scheduler=addresses[0]),
+        ):
+            pass
+        assert isinstance(crew.client.submit(killed, pure=False).exception(), KilledWorker)
+        ended = time.monotonic() + 30
+        while crew.slots() < 1 and time.monotonic() < ended:
+            time.sleep(0.05)
+        worker = crew.client.submit(noisy, pure=False).result()
+        assert Path("/proc", str(worker)).exists()
+    assert [words for words in processes() if words not in before and b"resource_tracker" not in words] == []
+    assert not Path("/proc", str(worker)).exists()
+    assert list(folders.work.iterdir()) == []
+    assert capfd.readouterr() == ("", "")
+    log = (folders.logs / "dask.log").read_text()
+    assert "a word of a worker" in log
+    assert "killed" in log
+
+
+# ---- A scheduler that runs
+
+
+@pytest.fixture(scope="module")
+def others():
+    """A cluster of somebody else's, within this process: 2 workers with 2 subjects at a time and 8 GB each."""
+    with LocalCluster(
+        n_workers=2, threads_per_worker=2, processes=False, protocol="tcp://", memory_limit="8GB",
+        dashboard_address="127.0.0.1:0", silence_logs=50,
+    ) as cluster:  # fmt: skip
+        yield cluster
+
+
+def test_workers_of_a_scheduler_that_runs(others, folders):
+    with running(Need(10, 3.9 * GB, None), folders, scheduler=others.scheduler.address) as crew:
+        assert crew.slots() == 4
+        assert crew.bytes == 4 * GB
+        assert crew.threads == max(1, dask.system.CPU_COUNT // 4)
+    with running(Need(10, 0.0, 3), folders, scheduler=others.scheduler.address) as crew:
+        assert crew.threads == 3
+    assert list(folders.work.iterdir()) == []
+    assert len(others.scheduler.workers) == 2  # they go on
+
+
+def test_workers_with_too_little_memory_are_refused(others, folders):
+    with pytest.raises(
+        InputError, match=r"has 4 GB for each of 2 subjects, the largest needs about 5 GB; .*--nthreads 1"
+    ):
+        running(Need(10, 5 * GB, None), folders, scheduler=others.scheduler.address).__enter__()
+
+
+@pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nonsense://x", "host", ""])
+def test_a_scheduler_that_does_not_answer_is_refused_in_one_line(address, folders, monkeypatch, capfd):
+    monkeypatch.setattr("tetopt.cohort.workers.CONNECT_SECONDS", 0.2)
+    with pytest.raises(InputError, match="does not answer") as refusal:
+        running(Need(1, 0.0, None), folders, scheduler=address).__enter__()
+    assert "\n" not in str(refusal.value)
+    assert capfd.readouterr() == ("", "")
+
+
+def test_contradictions_are_refused(folders, tmp_path):
+    with pytest.raises(InputError, match="--scheduler, --cluster: expected one of them"):
+        running(Need(1, 0.0, None), folders, scheduler="tcp://x:1", cluster=tmp_path).__enter__()
+    with pytest.raises(InputError, match="--workers: expected none with --scheduler"):
+        running(Need(1, 0.0, None), folders, scheduler="tcp://x:1", count=2).__enter__()
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"version": "0.0.1"}, r"expected tetopt .* as here, got 0.0.1"),
+        ({"python": "3.9"}, r"expected Python .* as here, got 3.9"),
+        ({"probe": None}, "does not see .*; expected an output folder on a file system that all workers share"),
+        ({"probe": "another folder's"}, "does not see"),
+        ({"n_threads": 4, "n_bytes": 4 * GB}, "has 1 GB for each of 4 subjects, the largest needs about 3 GB"),
+    ],
+)
+def test_a_worker_is_looked_at_when_it_comes(change, words, tmp_path):
+    """Also after the start: clusters' workers come and go."""
+    answers = {}
+    client = SimpleNamespace(nthreads=lambda: dict.fromkeys(answers, 1), run=lambda *_, **__: answers)
+    newcomers = Newcomers(client, Need(1, 3 * GB, None), tmp_path)
+    assert newcomers.slots() == 0
+    answers["tcp://good:1"] = About.of(newcomers.probe)
+    assert newcomers.slots() == 1
+    answers["tcp://bad:1"] = About.of(newcomers.probe)._replace(**change)
+    with pytest.raises(InputError, match=words):
+        newcomers.slots()
+
+
+def test_a_worker_without_tetopt_is_refused(tmp_path):
+    error = ModuleNotFoundError("No module named 'tetopt'")
+    client = SimpleNamespace(nthreads=lambda: {"tcp://a:1": 1}, run=lambda *_, **__: {"tcp://a:1": error})
+    with pytest.raises(InputError, match=r"expected one that has tetopt .* No module named 'tetopt'; install it there"):
+        Newcomers(client, Need(1, 0.0, None), tmp_path).slots()
+
+
+# ---- Batch systems
+
+
+def written(folder, text):
+    path = folder / "cluster.yaml"
+    path.write_text(text, encoding="utf-8")
+    return path
+
+
+@pytest.mark.parametrize(
+    ("text", "words"),
+    [
+        ("", "expected one batch system"),
+        ("[1, 2]", "expected one batch system"),
+        ("slurm: {queue: long}", "expected one batch system"),
+        ("jobqueue: {slurm: {}, pbs: {}}", "expected one batch system"),
+        ("jobqueue: {slurm: {}}\ndistributed: {}", "expected one batch system"),
+        ("jobqueue: {slum: {}}", "expected one of htcondor, lsf, moab, oar, pbs, sge, slurm, got slum"),
+        ("jobqueue: {slurm: [1]}", "slurm: expected keys with their values"),
+        ("jobqueue: {slurm: {qeue: long}}", "expected keys of account, .*, walltime.*, got qeue"),
+        ("jobqueue: {slurm: {1: long}}", "got 1"),
+        ("jobqueue: {slurm: {walltime: 12:00:00}}", 'walltime: expected it in quotes, as "12:00:00".*got 43200'),
+        ("jobqueue: {slurm: {cores: two}}", "cores: expected a whole number above 0, got two"),
+        ("jobqueue: {slurm: {cores: 0}}", "cores: expected a whole number above 0"),
+        ("jobqueue: {slurm: {processes: true}}", "processes: expected a whole number above 0"),
+        ("jobqueue: {slurm: {memory: lots}}", 'memory: expected memory, as "8 GB", got lots'),
+        (
+            "jobqueue: {slurm: {job-script-prologue: module load python}}",
+            "job-script-prologue: expected a list of texts",
+        ),
+        ("jobqueue: {slurm: {scheduler_options: 3}}", "scheduler-options: expected keys with their values"),
+        ("jobqueue: {slurm: {queue: [long]}}", "queue: expected one value"),
+        ("jobqueue: {slurm: {queue: &a long, account: *a}}", "without aliases"),
+        (
+            "jobqueue: {slurm: !!python/object/apply:os.system ['touch owned']}",
+            "expected YAML, got could not determine",
+        ),
+        ("jobqueue: {slurm: ", "expected YAML, got"),
+        ("[" * 400, "expected YAML"),
+        ("- " * 4000, "expected YAML"),
+        ("[" * 600, "at most 500 brackets"),
+        ("#" * 30_000, "at most 20000 letters"),
+    ],
+)
+def test_a_file_that_is_no_configuration_is_refused(text, words, tmp_path):
+    with pytest.raises(InputError, match=words) as refusal:
+        configuration(written(tmp_path, text))
+    assert "\n" not in str(refusal.value)
+    assert not Path("owned").exists()
+
+
+def requested(settings, need, kind="slurm"):
+    return request(Path("c.yaml"), kind, dask.config.get(f"jobqueue.{kind}") | settings, need)
+
+
+def test_a_job_asks_for_what_a_subject_needs():
+    plain = requested({}, Need(9, 4 * GB, None))
+    assert (plain.cores, plain.processes, plain.threads) == (4, 1, 4)
+    assert plain.bytes == pytest.approx(5.15 * GB)  # a quarter more than predicted, and the worker itself
+    assert plain.subject_bytes == pytest.approx(5 * GB)
+    packed = requested({"cores": 8, "processes": 2}, Need(9, 4 * GB, None))
+    assert (packed.cores, packed.threads) == (8, 4)
+    assert packed.bytes == pytest.approx(10.3 * GB)
+    assert requested({}, Need(9, 4 * GB, 2)).cores == 2
+    assert requested({"memory": "8GB"}, Need(9, 4 * GB, 2)).bytes == 8 * GB
+
+
+@pytest.mark.parametrize(
+    ("kind", "settings", "need", "words"),
+    [
+        ("slurm", {"memory": "4GB"}, Need(1, 4 * GB, None), "memory: expected at least 4.15 GB .*, got 4GB"),
+        ("slurm", {"memory": "6GB", "processes": 2}, Need(1, 4 * GB, None), "memory: expected at least 8.3 GB for 2"),
+        ("slurm", {"job-mem": "1GB"}, Need(1, 4 * GB, None), "job-mem: expected at least"),
+        ("lsf", {"mem": 10**9}, Need(1, 4 * GB, None), "mem: expected at least"),
+        ("slurm", {"cores": 2}, Need(1, 1.0, 4), "cores: expected at least 4 for 1 subjects of 4 threads, got 2"),
+        ("slurm", {"cores": 2, "processes": 3}, Need(1, 1.0, None), "cores: expected at least 3"),
+        ("sge", {}, Need(1, 4 * GB, None), "expected resource-spec, by which a job asks for 5.15 GB here"),
+        ("oar", {}, Need(1, 4 * GB, None), "expected memory-per-core-property-name"),
+    ],
+)
+def test_less_than_a_subject_needs_is_refused(kind, settings, need, words):
+    with pytest.raises(InputError, match=words):
+        requested(settings, need, kind)
+
+
+@pytest.mark.parametrize(
+    ("kind", "text", "lines"),
+    [
+        (
+            "slurm",
+            'queue: long, account: lab, walltime: "12:00:00", job_extra_directives: ["--gres=tmp:1"]',
+            ["#SBATCH -p long", "#SBATCH -A lab", "#SBATCH -t 12:00:00", "#SBATCH --gres=tmp:1", "#SBATCH --mem=5G",
+             "#SBATCH --cpus-per-task=2"],
+        ),
+        ("pbs", "queue: long", ["#PBS -q long", "#PBS -l select=1:ncpus=2:mem=4912MB"]),
+        ("lsf", "queue: long, lsf-units: mb", ["#BSUB -q long", "#BSUB -n 2", "#BSUB -M 5150"]),
+        ("sge", "queue: long, resource-spec: h_vmem=6G", ["#$ -q long", "#$ -l h_vmem=6G"]),
+    ],
+)  # fmt: skip
+def test_scripts_of_jobs(kind, text, lines, folders):
+    path = written(folders.work, f"jobqueue: {{{kind}: {{{text}, job-script-prologue: [module load x]}}}}")
+    named, settings = configuration(path)
+    with dask.config.set({f"jobqueue.{kind}.{key}": value for key, value in settings.items()}):
+        job = request(path, named, dask.config.get(f"jobqueue.{kind}"), Need(9, 4 * GB, 2))
+        with cluster_of(path, named, job, folders.work, folders.logs) as cluster:
+            script = cluster.job_script()
+            keys = [
+                name
+                for name in os.listdir(folders.work)
+                if name.endswith(tuple("_abcdefghijklmnopqrstuvwxyz0123456789"))
+            ]
+            assert keys
+            assert all(
+                stat.S_IMODE((folders.work / name).stat().st_mode) == 0o600 for name in keys if ".worker." in name
+            )
+    rows = script.splitlines()
+    assert set(lines) <= set(rows)
+    assert "module load x" in rows
+    command = rows[-1].split() if rows[-1] else rows[-2].split()
+    assert command[1:4] == ["-P", "-m", "distributed.cli.dask_worker"]
+    assert command[4].startswith("tls://")
+    assert command[len(command) - 1 - command[::-1].index("--nthreads") + 1] == "1"  # the last one is taken
+    assert f"--tls-key {folders.work}/" in script
+    path.unlink()
+    assert list(folders.work.iterdir()) == []
+
+
+@pytest.fixture
+def batch(tmp_path, monkeypatch):
+    """A folder of commands in front of all others; a test puts a batch system's there."""
+
+    def put(name, text):
+        path = tmp_path / "bin" / name
+        path.parent.mkdir(exist_ok=True)
+        path.write_text(f"#!/bin/sh\n{text}\n")
+        path.chmod(0o755)
+
+    monkeypatch.setenv("PATH", f"{tmp_path / 'bin'}:{os.environ['PATH']}")
+    monkeypatch.setattr(jobs, "QUEUE_SECONDS", 0.1)
+    return put
+
+
+def waited(crew):
+    ended = time.monotonic() + 60
+    while crew.slots() < 1 and time.monotonic() < ended:
+        time.sleep(0.05)
+
+
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [
+        ("echo no such partition >&2; exit 1", "the batch system takes no job: no such partition"),
+        (
+            "sh $1 >/dev/null 2>&1; echo Submitted batch job 7",
+            "jobs ended before their worker was there; their logs in",
+        ),
+    ],
+)
+def test_a_cluster_without_hope_is_given_up(command, words, batch, folders, tmp_path, capfd):
+    batch("sbatch", command)
+    batch("scancel", "exit 0")
+    path = written(tmp_path, "jobqueue: {slurm: {python: /bin/false}}")
+    with running(Need(9, 1.0, None), folders, count=2, cluster=path) as crew:
+        assert crew.words.startswith("up to 2 jobs of slurm, each of 4 cores and ")
+        with pytest.raises(InputError, match=words):
+            waited(crew)
+    assert list(folders.work.iterdir()) == []
+    assert capfd.readouterr() == ("", "")
+
+
+def test_a_cluster_whose_commands_are_not_there_is_refused(folders, tmp_path, monkeypatch):
+    monkeypatch.setenv("PATH", str(tmp_path))
+    with pytest.raises(InputError, match="slurm: sbatch is not there; run this where jobs are submitted"):
+        running(Need(9, 1.0, None), folders, cluster=written(tmp_path, "jobqueue: {slurm: {}}")).__enter__()
+
+
+def test_folders_that_directives_do_not_take_are_refused(batch, tmp_path):
+    batch("sbatch", "exit 1")
+    spaced = Folders(tmp_path / "my work", tmp_path)
+    with pytest.raises(InputError, match="expected an output folder of letters"):
+        running(Need(9, 1.0, None), spaced, cluster=written(tmp_path, "jobqueue: {slurm: {}}")).__enter__()
+
+
+@pytest.mark.slow
+def test_nothing_is_left_of_a_client_that_is_killed(tmp_path):
+    program = (
+        "import sys, time; from pathlib import Path; from tetopt.cohort.workers import *\n"
+        "from tetopt.cohort.crew import *\n"
+        "if __name__ == '__main__':\n"
+        "    one = Path(sys.argv[1])\n"
+        "    with workers(Need(2, 1.0, 1), Folders(one, one), count=2, scheduler=None, cluster=None) as crew:\n"
+        "        crew.client.submit(time.sleep, 100); print('up', flush=True); time.sleep(100)\n"
+    )
+    script = tmp_path / "client.py"
+    script.write_text(program)
+
+    with subprocess.Popen(
+        python_command(str(script), str(tmp_path)),
+        env=python_environment(),
+        stdout=subprocess.PIPE,
+        start_new_session=True,
+    ) as client:
+        assert client.stdout.readline() == b"up\n"
+        client.kill()
+        client.wait()
+        ended = time.monotonic() + 20
+        while time.monotonic() < ended and (left := _of_session(client.pid)):
+            time.sleep(0.1)
+        assert left == []
+
+
+def _of_session(number):
+    rows = subprocess.run(["ps", "-eo", "sess=,stat=,args="], capture_output=True, text=True, check=True).stdout
+    return [row for row in rows.splitlines() if row.split()[0] == str(number) and not row.split()[1].startswith("Z")]
