@@ -6,6 +6,7 @@ import json
 import re
 from collections.abc import Iterable, Iterator, Sequence
 from functools import cache
+from itertools import chain
 from math import isfinite
 from pathlib import Path
 from sys import intern
@@ -24,7 +25,7 @@ from tetopt.cohort.layout import (
 )
 from tetopt.geometry.box import world_axes
 from tetopt.incoming import toml_of
-from tetopt.io.files import save_json, save_text
+from tetopt.io.files import save_json, written_whole
 from tetopt.io.text import plain
 
 Status = Literal["done", "missed", "failed", "missing"]
@@ -277,12 +278,11 @@ def save_table(path: Path, rows: Sequence[Row], flags: Sequence[Sequence[str]]) 
     """
     names = column_names(rows)
     heads = ["participant_id", "session_id", "status", "reason", "flags"]
-    lines = ["\t".join(map(field_text, [*heads, *names]))]
-    for row, reasons in zip(rows, flags, strict=True):
-        fixed = [row.subject, row.session or None, row.status, row.reason or None, "; ".join(reasons) or None]
-        values = map(row.numbers.get, names)
-        lines.append("\t".join(map(field_text, [*fixed, *values])))
-    save_text(path, "\n".join(lines) + "\n")
+    with written_whole(path) as temporary, temporary.open("w", encoding="utf-8", newline="\n") as stream:
+        stream.write("\t".join(map(field_text, [*heads, *names])) + "\n")
+        for row, reasons in zip(rows, flags, strict=True):
+            fixed = [row.subject, row.session or None, row.status, row.reason or None, "; ".join(reasons) or None]
+            stream.write("\t".join(map(field_text, chain(fixed, map(row.numbers.get, names)))) + "\n")
     labels = {number: name for row in reversed(rows) for number, name in row.label_names.items()}
     save_json(path.with_suffix(".json"), {name: description(name, labels) for name in (*heads, *names)})
 

@@ -12,14 +12,14 @@ from typing import Any
 from urllib.parse import quote
 
 from tetopt.cohort.flags import QUANTITIES, Flag, Quantity, flags_of, units
-from tetopt.cohort.numbers import Row, Status, Value, description, natural_order, present, save_table
+from tetopt.cohort.numbers import Row, Status, Value, description, present, save_table
 from tetopt.model.labels import label_words
 from tetopt.report.page import data_html, paragraph_html, script_html, section_html, table_html, write_page
 
 PAGE_NUMBERS = 1_500_000  # that the page holds at most, some 10 MB: a browser on a phone reads them in seconds
 PAGE_PICTURES = 600  # thumbnails of some 8 kB, 6 MB in base64; with more subjects the flagged ones, and a sample
 THUMBNAIL_BYTES = 32_768  # of one in the page: larger ones are none of ours
-LISTED_FAILURES = 200  # in a table above the others, in which all are
+LISTED_FAILURES = 100  # reasons, and subjects of one, above the table that has all
 LISTED_SUBJECTS = 100  # in the table for browsers without scripts
 LISTED_FLAGS = 6  # of a subject; the table in TSV has all
 SHOWN_DIGITS = 4  # of numbers in the page
@@ -120,24 +120,28 @@ def _common(rows: Sequence[Row]) -> dict[str, Value]:
 
 
 def _failures(rows: Sequence[Row]) -> list[str]:
-    """The subjects that failed, with reason and log; those of one reason together."""
-    failed = [row for row in rows if row.status == "failed"]
-    if not failed:
+    """The subjects that failed, those of one reason together, each linked to its log."""
+    reasons: dict[str, list[Row]] = {}
+    for row in rows:
+        if row.status == "failed":
+            reasons.setdefault(row.reason, []).append(row)
+    if not reasons:
         return []
-    counts = Counter(row.reason for row in failed)
-    failed.sort(key=lambda row: (-counts[row.reason], row.reason, natural_order(row.key)))
-    lines = ["<div class='wide'><table class='failures'><thead><tr><th>subject</th><th>why it failed</th></tr></thead>"]
-    for row in failed[:LISTED_FAILURES]:
-        log = f' <a href="{_link(row.files["log"])}">log</a>' if "log" in row.files else ""
-        lines.append(f"<tr><td>{html.escape(row.key)}</td><td>{html.escape(row.reason)}{log}</td></tr>")
+    head = "<tr><th>why</th><th>subjects, with their logs</th></tr>"
+    lines = [f"<div class='wide'><table class='failures'><thead>{head}</thead>"]
+    for reason, failed in sorted(reasons.items(), key=lambda each: -len(each[1]))[:LISTED_FAILURES]:
+        names = [_linked(row.key, row.files.get("log")) for row in failed[:LISTED_FAILURES]]
+        more = f" and {len(failed) - len(names)} more" if len(failed) > len(names) else ""
+        lines.append(f"<tr><td>{html.escape(reason)}</td><td>{', '.join(names)}{more}</td></tr>")
     lines.append("</table></div>")
-    if len(failed) > LISTED_FAILURES:
-        lines.append(paragraph_html(f"These are {LISTED_FAILURES} of {len(failed)}; the table of subjects has all."))
-    return [section_html(f"Failed: {len(failed)}", lines)]
+    if len(reasons) > LISTED_FAILURES:
+        lines.append(paragraph_html(f"And {len(reasons) - LISTED_FAILURES} reasons more, in the table of subjects."))
+    return [section_html(f"Failed: {sum(map(len, reasons.values()))}", lines)]
 
 
-def _link(path: str) -> str:
-    return html.escape(quote(path))
+def _linked(text: str, path: str | None) -> str:
+    """Markup of a text, which is a link if there is a file for it."""
+    return html.escape(text) if path is None else f'<a href="{html.escape(quote(path))}">{html.escape(text)}</a>'
 
 
 def _pictures(out: Path, rows: Sequence[Row], flags: Sequence[Sequence[Flag]]) -> list[str | None]:
@@ -245,8 +249,10 @@ _SCRIPTLESS = (
 )
 _STYLE = """
 main { max-width: 1500px; }
-table.failures td, table.failures th { text-align: left; vertical-align: top; }
-td:last-child { white-space: nowrap; } .failures td:last-child { white-space: normal; overflow-wrap: anywhere; }
+table.failures td, table.failures th { text-align: left; vertical-align: top; white-space: normal; }
+table.failures td { overflow-wrap: anywhere; min-width: 7rem; }
+.same { color: #555; } #charts details { margin-top: 1rem; }
+.subjects td:last-child { white-space: nowrap; }
 .charts { display: flex; flex-wrap: wrap; gap: 0.8rem 1.4rem; } .chart { width: 230px; font-size: 0.85rem; }
 .chart .title { font-weight: 600; line-height: 1.25; min-height: 2.5em; display: flex; align-items: flex-end; }
 .chart svg { display: block; width: 100%; border-bottom: 1px solid #999; }

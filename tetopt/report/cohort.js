@@ -7,7 +7,8 @@ const PAGE_ROWS = 50; // drawn at once in the table: 50 pictures and some 20 col
 const PAGE_TILES = 120; // likewise of pictures alone, which are what takes the time
 const BINS = 24;
 const CHART = { width: 230, height: 74 };
-const STATUSES = ["failed", "missing", "missed", "done"]; // what is to be looked at first
+// What is to be looked at first; what failed has a table of its own above.
+const STATUSES = ["missed", "done", "missing", "failed"];
 const WORDS = { failed: "failed", missing: "not run", missed: "promise missed", done: "done" };
 const STEPS = {
   mm: data.volume === "mm^2" ? [[1e2, "cm²"], [1, "mm²"]] : [[1e6, "l"], [1e3, "ml"], [1, "mm³"]],
@@ -72,8 +73,8 @@ function textOf(row) {
 
 function compared(a, b) {
   if (state.sort === null) {
-    const rank = STATUSES.indexOf(a[STATUS]) - STATUSES.indexOf(b[STATUS]);
-    return rank || b[FLAG_COUNT] - a[FLAG_COUNT];
+    const rank = (row) => STATUSES.indexOf(row[STATUS]);
+    return rank(a) - rank(b) || b[FLAG_COUNT] - a[FLAG_COUNT];
   }
   const [x, y] = [a, b].map((row) => (state.sort < 0 ? row[KEY] : valueOf(row, state.sort)));
   if (x === null || y === null) return (x === null) - (y === null); // last, whichever way
@@ -207,7 +208,6 @@ function binsOf(c) {
   let [low, high] = [Math.max(values[0], share(0.25) - reach), Math.min(values[values.length - 1], share(0.75) + reach)];
   const isLog = column.isLog && low > 0 && high > 10 * low;
   const [to, from] = isLog ? [Math.log, Math.exp] : [(x) => x, (x) => x];
-  if (!(high > low)) return [{ words: written(low, column.unit), holds: (value) => value !== null }];
   [low, high] = [to(low), to(high)];
   return Array.from({ length: BINS }, (_, k) => {
     const ends = [from(low + ((high - low) * k) / BINS), from(low + ((high - low) * (k + 1)) / BINS)];
@@ -250,9 +250,16 @@ function chartOf(c) {
 
 function drawCharts() {
   const all = data.columns.map((_, c) => c).filter((c) => data.columns[c].isChart);
-  const filled = all.filter((c) => data.rows.some((row) => valueOf(row, c) !== null));
+  const filled = [];
+  const same = [];
+  for (const c of all) {
+    const values = data.rows.map((row) => valueOf(row, c)).filter((value) => value !== null);
+    if (new Set(values).size > 1) filled.push(c);
+    else if (values.length > 1) same.push(`${data.columns[c].title} ${written(values[0], data.columns[c].unit)}`);
+  }
   const [usual, labels] = [false, true].map((is) => filled.filter((c) => data.columns[c].name.startsWith("labels.") === is));
   charts.replaceChildren(element("div", { className: "charts" }, ...usual.map(chartOf)));
+  if (same.length) charts.append(element("p", { className: "same", textContent: `The same in all that have it: ${same.join(", ")}.` }));
   if (!labels.length) return;
   const box = element("div", { className: "charts" });
   const details = element("details", {}, element("summary", { textContent: `Volumes of ${labels.length} labels` }), box);
