@@ -55,6 +55,8 @@ lint: $(VENV)/.test
 
 bench: $(VENV)/.test
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python scripts/benchmark.py -o bench.json --force
+	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt warm-up
+	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python scripts/fit_cost.py --rows cost_runs.jsonl -o cost.toml --force
 
 # Whether meshes are still those of the version that wrote tests/fingerprints.json, to the last bit.
 fingerprints: $(VENV)/.test
@@ -74,4 +76,4 @@ $(VENV)/.test: $(VENV)/bin/python pyproject.toml
 	@touch $@
 
 clean:
-	rm -rf $(VENV) .numba_cache demo bench.json fingerprints.json
+	rm -rf $(VENV) .numba_cache demo bench.json cost.toml cost_runs.jsonl fingerprints.json

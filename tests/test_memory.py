@@ -17,7 +17,7 @@ from tetopt import budget
 from tetopt.cli import run as cli_run
 from tetopt.cli import warm_up
 from tetopt.energy.sampling import sampling_grid
-from tetopt.engine import fast
+from tetopt.engine import cost, fast
 from tetopt.engine.loop import Optimized, Record
 from tetopt.engine.meshing import bytes_of
 from tetopt.fem.elasticity import stiffness
@@ -123,8 +123,9 @@ def test_what_is_kept_of_voxels_counts():
     ones = tetopt.Image(np.ones((6, 5, 4)))
     kinds = [plain(IMAGE), content(IMAGE, mask=tetopt.Image(np.ones(IMAGE.shape), IMAGE.affine))]
     first, masked = (bytes_of(kind, 0) for kind in kinds)
-    assert masked - first == budget.CHANNEL_BYTES * IMAGE.data.size
-    assert bytes_of(plain(ones), 50) - bytes_of(plain(ones), 0) == 50 * budget.NODE_BYTES
+    of_one = {name: cost.BOUND_MARGIN * n_bytes for name, n_bytes in cost.cost_model().bytes.items()}
+    assert masked - first == pytest.approx(of_one["channel_voxels"] * IMAGE.data.size)
+    assert bytes_of(plain(ones), 50) - bytes_of(plain(ones), 0) == pytest.approx(300 * of_one["cells"])
 
 
 def test_a_run_ends_before_the_limit_with_the_mesh_reached(tmp_path, monkeypatch, capsys):

@@ -23,11 +23,6 @@ except ImportError:  # Windows
 BYTES_PER_GB = 1e9  # as of memory that is sold and of files
 MAXRSS_UNIT_BYTES = 1 if sys.platform == "darwin" else 1024  # of ru_maxrss, as getrusage(2) has it
 LIBRARY_ADDRESSES = 1.2e9  # libraries, stacks and buffers of threads, all kernels: 1.1 GB on two cores, of 0.3 in use
-KERNEL_BYTES = 1.5e8  # numba's compiler and all kernels, if they are not loaded yet
-VOXEL_BYTES = 20.0  # of an image that has been read: the octree's squares, the count of the prefix sums
-CHANNEL_BYTES = 16.0  # of each function of the voxels: in the octree, later its prefix sums
-NODE_BYTES = 6000.0  # six cells with fluxes and sums, some twice while nodes are exchanged
-NEXT_SHARE = 0.3  # of these: what an exchange or the end of a run takes besides
 PROC_FOLDER = Path("/proc")
 GROUP_FOLDER = Path("/sys/fs/cgroup")
 UNLIMITED_BYTES = 1 << 60  # of a control group's: "no limit" is a number near 2^63 there
@@ -62,19 +57,6 @@ def check_memory(n_bytes: float, what: str, advice: str, limit: float | None = N
             f"{what}: needs about {memory_words(n_bytes + resident_bytes())} of memory in all, "
             f"{memory_words(limit)} are allowed; {advice}"
         )
-
-
-def meshing_bytes(n_voxels: int, n_channels: int, n_nodes: int) -> float:
-    """What meshing takes at its peak besides what there is: above what was measured (docs/memory.md).
-
-    Parameters
-    ----------
-    n_voxels, n_channels : int
-        Of what is meshed, which has been read.
-    n_nodes : int
-        Of the mesh, of order 1; 0 for what the image takes alone.
-    """
-    return KERNEL_BYTES + n_voxels * (VOXEL_BYTES + CHANNEL_BYTES * n_channels) + NODE_BYTES * n_nodes
 
 
 class MemoryLimit(NamedTuple):

@@ -14,7 +14,7 @@ from rich.markup import escape
 
 import tetopt
 from tetopt import Image, InputError, Mesh
-from tetopt.budget import BYTES_PER_GB, NEXT_SHARE, NODE_BYTES, MemoryLimit, peak_bytes, resident_bytes
+from tetopt.budget import BYTES_PER_GB, MemoryLimit, peak_bytes, resident_bytes
 from tetopt.check import manifold_problems
 from tetopt.cli.console import log, out, print_fidelity, show_warning
 from tetopt.cli.ending import is_ended, mesh_kept, signal_code
@@ -31,6 +31,7 @@ from tetopt.cli.options import (
     option,
 )
 from tetopt.cli.plan import Plan, planned, with_numbers
+from tetopt.cli.predict import print_prediction, size_of_run, stated_prediction
 from tetopt.cli.promises import check_promises, warn_of_result, warn_of_sizes
 from tetopt.cli.request import requested
 from tetopt.cli.run import prepare, watched_run
@@ -44,6 +45,7 @@ from tetopt.cli.solver import (
     with_chosen_sets,
 )
 from tetopt.cli.source import Source, read_source
+from tetopt.engine.cost import RunSize, next_bytes
 from tetopt.engine.interfaces import crowded_nodes
 from tetopt.engine.loop import Optimized
 from tetopt.engine.meshing import (
@@ -86,6 +88,7 @@ class Task(NamedTuple):
     source: Source
     started: MeshFile | None  # the mesh to start from
     sizes: tetopt.Sizes | None
+    size: RunSize  # by which time and memory are predicted
     request: dict[str, Any] | None = None  # of `requested`, where the numbers are written
 
     @property
@@ -117,6 +120,9 @@ def mesh_command(
     plan = planned(source, sizes, start, engine, solver, output)
     set_threads(engine.threads)
     task = _read(plan)
+    if output.predict:
+        print_prediction(task.plan, task.size)
+        return 0
     if output.json_path is not None:
         task = task._replace(request=requested(source, sizes, start, engine, solver, output))
     with mesh_kept() as begin_keeping:
@@ -143,7 +149,8 @@ def _read(plan: Plan) -> Task:
         if source.labels is not None and not source.table.names:
             source = source.with_table(label_table(None, started))
     plan, sizes = with_numbers(plan, source.content)
-    return Task(plan, source, started, sizes)
+    n_started = None if started is None else len(started.mesh.points)
+    return Task(plan, source, started, sizes, size_of_run(plan, source.content, source.contrasts[0], n_started))
 
 
 def _check_place(mesh: Mesh, image: Image, path: str) -> None:
@@ -202,7 +209,7 @@ def _memory_limit(plan: Plan, content: Content) -> MemoryLimit | None:
         return None
     n_bytes = plan.engine.max_gb * BYTES_PER_GB
     check_memory_of(content, 0, n_bytes)
-    return MemoryLimit(n_bytes, NEXT_SHARE * NODE_BYTES * (plan.sizes.nodes or 0))
+    return MemoryLimit(n_bytes, next_bytes(plan.sizes.nodes or 0, content.image.ndim))
 
 
 def _say_search(task: Task, number: int, result: Optimized) -> None:
@@ -307,6 +314,7 @@ def _write(task: Task, outcome: Outcome, model: Model, about: dict[str, Any], be
         if source.image is not source.content.image:
             summary["image_properties"] = image_summary(source.image)  # on its own voxels, not on divided ones
         summary["request"] = task.request
+        summary["prediction"] = stated_prediction(task.size)
         summary["memory"] = {"predicted_bytes": outcome.predicted_bytes, "peak_bytes": peak_bytes()}
         save_json(output.json_path, summary | measured | model_summary(model))
     if plan.pictures:

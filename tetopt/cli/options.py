@@ -353,6 +353,9 @@ class OutputOptions:
     figures: Annotated[
         Path | None, option("DIR", "Draw slice.png, rho.png, energies.png and others in this folder.")
     ] = None
+    predict: Annotated[
+        bool, typer.Option("--predict", help="Tell how long the run takes and how much memory, and write nothing.")
+    ] = False
     force: ForceOption = False
 
 

@@ -1,16 +1,25 @@
 """What a run of `tetopt mesh` takes, seconds and memory, by sizes that are known before it.
 
 Both are sums of terms, each a size times what one of it costs. The costs are fitted to measured runs of whole
-processes by `scripts/benchmark.py` (non-negative least squares of relative errors) and stand in `cost.toml` beside this
+processes by `scripts/fit_cost.py` (non-negative least squares of relative errors) and stand in `cost.toml` beside this
 module, with the machine, its speed, and the errors of runs that were left out of the fit.
 """
 
 from __future__ import annotations
 
+import time
 import tomllib
 from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
+
+CALIBRATION_VOXELS = 96  # along each axis of a cube, whose sums, 28 MB, are more than most caches have
+CALIBRATION_NODES = 9_000  # of a lattice, in which they are summed up again and again
+CALIBRATION_TURNS = 30  # of which the fastest counts: about a second in all
+KERNEL_BYTES = 2.2e8  # numba's compiler and all kernels, if they are not loaded yet, and buffers: 200 MB at most
+BOUND_MARGIN = 1.5  # on what sizes take: above the peaks of all runs that were measured
+NEXT_SHARE = 0.3  # of what cells take: what an exchange or the end of a run takes besides
+CELLS_PER_NODE = {2: 2, 3: 6}  # of large meshes, by dimension
 
 
 class RunSize(NamedTuple):
@@ -21,6 +30,7 @@ class RunSize(NamedTuple):
     n_nodes: int  # corners of cells; of order 2 there are more nodes
     iterations: int  # sweeps, at most
     n_channels: int = 1  # functions of the voxels: contrasts, channels of labels, one more for a mask
+    elongation: float = 1.0  # of voxels: how long they are along the last axis, to the mean across
     ndim: int = 3
     mode: str = "graded"  # as `tetopt.engine.meshing.Mode`
     order: int = 1
@@ -81,6 +91,36 @@ def predicted(size: RunSize, threads: int = 1, speed: float = 1.0) -> Prediction
     return Prediction(seconds, alone + divided, n_bytes)
 
 
+def calibrated_speed() -> float:
+    """Speed of this machine, in that of the one on which the costs were fitted; it takes about a second."""
+    return cost_model().calibration_seconds / calibration()
+
+
+def calibration() -> float:
+    """Seconds of CPU time of a fixed piece of the engine's work, on one thread: voxels summed up and cells measured."""
+    import numba  # not before it is needed: who predicts for another machine loads no kernels
+    import numpy as np
+
+    from tetopt.energy.sampling import cell_moments
+    from tetopt.image import Image
+    from tetopt.start.lattice import lattice
+
+    voxels = np.arange(CALIBRATION_VOXELS**3, dtype=np.int64).reshape((CALIBRATION_VOXELS,) * 3)
+    image = Image((voxels * voxels % 1009).astype(np.float32))  # as irregular as an image is
+    mesh = lattice(image, nodes=CALIBRATION_NODES)
+    threads, seconds = numba.get_num_threads(), []
+    numba.set_num_threads(1)
+    try:
+        cell_moments(image, mesh)  # its kernels are loaded then
+        for _ in range(CALIBRATION_TURNS):
+            begin = time.process_time()
+            cell_moments(image, mesh)
+            seconds.append(time.process_time() - begin)
+    finally:
+        numba.set_num_threads(threads)
+    return min(seconds)
+
+
 def once_terms(size: RunSize) -> dict[str, float]:
     """What takes time once a run, in units of its cost, by name."""
     return {
@@ -90,24 +130,25 @@ def once_terms(size: RunSize) -> dict[str, float]:
         "voxels": float(size.n_voxels * size.n_channels),  # the octree's and the sampler's sums
         "region_voxels": float(size.n_voxels * size.has_region),  # distances to the mask's surface
         "membership_voxels": float(size.n_voxels * size.has_memberships),  # labels' levels
-        "nodes": float(size.n_nodes * size.runs),  # connected, measured, written
+        "cells": float(_cells(size) * size.runs),  # made, measured, written
     }
 
 
 def swept_terms(size: RunSize) -> dict[str, float]:
     """What takes time in each iteration, likewise."""
-    sweeps = size.iterations * size.runs
-    # Rows of voxels that the facets cross: as many facets as nodes, each as large as a cell's side.
-    rows = size.n_nodes ** (1.0 / size.ndim) * size.n_voxels ** (1.0 - 1.0 / size.ndim)
+    sweeps, cells = size.iterations * size.runs, _cells(size)
+    # Rows of voxels, along the last axis, that facets cross: as many facets as nodes, each as large as a cell's side.
+    share = 1.0 / size.ndim
+    rows = size.n_nodes**share * (size.n_voxels * size.elongation) ** (1.0 - share)
     has_surface = size.has_region or size.has_memberships
-    is_paper = size.mode == "paper"
-    return {
-        "sweep_nodes": float(sweeps * size.n_nodes * (not is_paper)),  # shapes, flips, exchanges
-        "sweep_rows": float(sweeps * rows * size.n_channels * (not is_paper)),  # voxels sampled again
-        "surface_nodes": float(sweeps * size.n_nodes * has_surface),  # steps along surfaces and back to them
-        "paper_nodes": float(sweeps * size.n_nodes * is_paper),  # numerical derivatives, Delaunay each time
-        "paper_rows": float(sweeps * rows * is_paper),
-    }
+    kind = {"graded": "graded", "paper": "paper"}.get(size.mode, "uniform")  # which has no nodes exchanged
+    terms = {}
+    for name in ("graded", "uniform", "paper"):
+        terms[f"{name}_cells"] = float(sweeps * cells * (name == kind))  # shapes, flips, exchanges
+        terms[f"{name}_rows"] = float(sweeps * rows * (name == kind))  # voxels sampled again, and again with each move
+    terms["channel_rows"] = float(sweeps * rows * (size.n_channels - 1))  # of each channel but the first
+    terms["surface_cells"] = float(sweeps * cells * has_surface)  # steps along surfaces and back to them
+    return terms
 
 
 def memory_terms(size: RunSize) -> dict[str, float]:
@@ -118,6 +159,34 @@ def memory_terms(size: RunSize) -> dict[str, float]:
         "voxels_read": float(size.n_read),
         "voxels": float(size.n_voxels),
         "channel_voxels": float(size.n_voxels * size.n_channels),  # in the octree, later prefix sums
+        "region_voxels": float(size.n_voxels * size.has_region),
         "membership_voxels": float(size.n_voxels * size.has_memberships),
-        "nodes": float(size.n_nodes),  # six cells with fluxes and sums
+        "cells": float(_cells(size)),  # with fluxes and sums
     }
+
+
+def meshing_bytes(n_voxels: int, n_channels: int, n_nodes: int, ndim: int = 3) -> float:
+    """What meshing takes at its peak besides what there is once the files are read: above all that was measured.
+
+    Parameters
+    ----------
+    n_voxels, n_channels : int
+        Of what is meshed.
+    n_nodes : int
+        Of the mesh, of order 1; 0 for what the image takes alone.
+    ndim : int
+        Of the image.
+    """
+    size = RunSize(0, n_voxels, n_nodes, 0, n_channels, ndim=ndim)
+    terms, costs = memory_terms(size), cost_model().bytes
+    n_bytes = sum(costs[name] * terms[name] for name in ("voxels", "channel_voxels", "cells"))
+    return KERNEL_BYTES + BOUND_MARGIN * n_bytes
+
+
+def next_bytes(n_nodes: int, ndim: int = 3) -> float:
+    """What the next steps of a run with so many nodes take besides what there is, at most."""
+    return NEXT_SHARE * (meshing_bytes(0, 0, n_nodes, ndim) - KERNEL_BYTES)
+
+
+def _cells(size: RunSize) -> int:
+    return CELLS_PER_NODE[size.ndim] * size.n_nodes

@@ -14,7 +14,8 @@ from typing import Any, Literal
 
 import numpy as np
 
-from tetopt.budget import check_memory, meshing_bytes
+from tetopt.budget import check_memory
+from tetopt.engine.cost import meshing_bytes
 from tetopt.engine.fast import optimize
 from tetopt.engine.loop import (
     GRADED_ITERATIONS,
@@ -196,8 +197,9 @@ def mesh_image(
 
 
 def bytes_of(content: Content, nodes: int) -> float:
-    """What meshing a content with so many nodes takes besides what there is; see `tetopt.budget.meshing_bytes`."""
-    return meshing_bytes(content.image.data.size, len(content.values) + (content.region is not None), nodes)
+    """What meshing a content with so many nodes takes besides what there is; see `tetopt.engine.cost.meshing_bytes`."""
+    image = content.image
+    return meshing_bytes(image.data.size, len(content.values) + (content.region is not None), nodes, image.ndim)
 
 
 def check_memory_of(content: Content, nodes: int, limit: float | None = None) -> None:

@@ -31,7 +31,7 @@ from tetopt.image import Image
 from tetopt.incoming import irregular
 from tetopt.io.apart import DEFLATE_RATIO
 from tetopt.io.files import check_suffix, written_whole
-from tetopt.io.itk_headers import header_sizes
+from tetopt.io.itk_headers import HEADED_SUFFIXES, header_sizes
 from tetopt.io.pictures import PICTURE_SUFFIXES, read_picture
 from tetopt.io.read_itk import ITK_READERS, read_dicom_folder, read_itk
 from tetopt.io.volumes import DAMAGED_FILE, UNREADABLE_FILE, check_room, one_line, volume_index
@@ -128,11 +128,10 @@ def load_image(
     return image
 
 
-def file_shape(path: str | Path) -> tuple[int, ...]:
-    """Lengths of all axes of the voxels in a file, by its header alone: of NIfTI, MGZ, NRRD and MetaImage.
+def file_shape(path: str | Path) -> tuple[int, ...] | None:
+    """Lengths of all axes of the voxels in a file, by its header alone; those of an NRRD file may count components.
 
-    Pictures, DICOM files and folders have theirs once they are read, and are. Those of an NRRD file may count the
-    components of its voxels.
+    None of a picture or DICOM, which have to be read.
 
     Raises
     ------
@@ -143,16 +142,17 @@ def file_shape(path: str | Path) -> tuple[int, ...]:
     name = path.name.lower()
     try:
         with _os_errors_named():
-            if irregular(path) is None and name.endswith(_NIBABEL_SUFFIXES):
-                _checked_head(path, name.endswith((".gz", ".mgz")))
-                with _nibabel_heard():
-                    return tuple(int(size) for size in _nibabel_file(path).shape)
-            if irregular(path) is None and name.endswith((".nrrd", ".nhdr", ".mha", ".mhd")):
+            if not name.endswith((*_NIBABEL_SUFFIXES, *HEADED_SUFFIXES)) or path.is_dir():
+                return None
+            if (other := irregular(path)) is not None:
+                raise InputError(f"expected a regular file, got {other}; copy what it gives into a file")
+            if name.endswith(HEADED_SUFFIXES):
                 return header_sizes(path)
-        return load_image(path).shape
+            _checked_head(path, name.endswith((".gz", ".mgz")))
+            with _nibabel_heard():
+                return tuple(int(size) for size in _nibabel_file(path).shape)
     except InputError as error:
-        words = str(error).removeprefix(f"{path}: ")
-        raise InputError(f"{path}: {one_line(words)}") from error
+        raise InputError(f"{path}: {one_line(error)}") from error
 
 
 def save_image(path: str | Path, image: Image) -> None:

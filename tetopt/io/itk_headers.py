@@ -16,6 +16,7 @@ from tetopt.incoming import irregular
 from tetopt.io.apart import DEFLATE_RATIO
 from tetopt.io.volumes import DAMAGED_FILE, UNREADABLE_FILE, check_room
 
+HEADED_SUFFIXES = (".nrrd", ".nhdr", ".mha", ".mhd")  # of files whose headers are read here
 HEADER_BYTES = 2**20  # of a header: 3D Slicer's with all its words have 10,000
 MOST_AXES = 8  # of a file: more than space, time, and what is measured
 TEXT_RATIO = 4  # "0 " becomes 8 bytes
