@@ -9,7 +9,7 @@ TESTED = PYTHONUTF8=1 NUMBA_CACHE_DIR=$(NUMBA_CACHE) MPLBACKEND=agg $(BIN)/pytho
 
 SOLVERS = calculix-ccx python3-dolfinx
 
-.PHONY: demo test test-slow test-random test-solvers test-nojit test-onethread test-hostile lint bench fingerprints clean
+.PHONY: demo test test-slow test-random test-solvers test-nojit test-onethread test-hostile test-container lint bench fingerprints clean
 
 demo: $(VENV)/.demo
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt demo -o demo --force
@@ -46,6 +46,10 @@ test-solvers: $(VENV)/.test
 	$(BIN)/python -m pip install --quiet --disable-pip-version-check mfem gmsh pyfebio
 	$(TESTED) tests/solvers tests/model tests/io/test_abaqus.py tests/io/test_febio.py tests/io/test_gmsh.py \
 	  tests/io/test_medit.py tests/io/test_mfem.py tests/io/test_sofa.py tests/io/test_vtk.py tests/io/test_xdmf.py
+
+# The Dockerfile's steps as a script in a fresh environment, and its entry point as another user; needs root.
+test-container: $(VENV)/.test
+	$(TESTED) -q -m "slow or not slow" --no-header tests/test_container.py
 
 lint: $(VENV)/.test
 	$(BIN)/ruff check .

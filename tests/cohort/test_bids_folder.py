@@ -2,6 +2,7 @@
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -12,7 +13,7 @@ import pytest
 from tetopt import InputError
 from tetopt.cohort.bids_folder import bids_subjects
 from tetopt.cohort.layout import begin, description
-from tetopt.cohort.subjects import Problems
+from tetopt.cohort.subjects import Problems, Subject, matching
 
 
 def filled(folder, *names):
@@ -44,6 +45,8 @@ def test_raw_images_of_the_suffix_by_subject_and_session(tmp_path):
     )
     (folder / "sub-02/anat/sub-02_T1w.json").write_text('{"a":')  # never opened
     (folder / "sub-02" / "layout_config.json").write_text("[")  # nor pybids's own settings of a stranger
+    (folder / "sub-01/ses-b/anat/sub-01_ses-b_T1w.nii").unlink()  # as where a DataLad dataset's content is not fetched
+    (folder / "sub-01/ses-b/anat/sub-01_ses-b_T1w.nii").symlink_to("../../../.git/annex/objects/none")
     (folder / "sub-02" / "loop").symlink_to(folder / "sub-02")
     subjects = bids_subjects(folder)
     assert rows(subjects, folder) == [
@@ -82,20 +85,44 @@ def test_all_that_is_wrong_is_told_at_once(tmp_path):
     folder = filled(
         tmp_path / "raw", "sub-1/anat/sub-1_T1w.nii.gz", "sub-2/anat/sub-3_T1w.nii.gz", "sub-2/anat/\x1b_T1w.nii"
     )
-    (folder / "sub-4" / "anat").mkdir(parents=True)
-    (folder / "sub-4" / "anat" / "sub-4_T1w.nii.gz").symlink_to("../../.git/annex/objects/none")
     with pytest.raises(Problems) as caught:
-        bids_subjects(folder, participants=["1", "2", "4", "8", "9"])
+        bids_subjects(folder, participants=["1", "2", "8", "9"])
     message = str(caught.value)
     assert "sub-2/anat/sub-3_T1w.nii.gz: its name is not that of an image in sub-2" in message
     assert [line for line in caught.value.lines if "no image" in line] == [
         f"{folder}: sub-{label}: no image _T1w" for label in (2, 8, 9)
     ]
-    assert "datalad get sub-4/anat/sub-4_T1w.nii.gz" in message
     assert "sub-1" not in message
     assert message.isprintable()
     with pytest.raises(InputError, match="ses-x: no image _T1w"):
         bids_subjects(folder, participants=["1"], sessions=["x"])
+
+
+PATTERNS = {  # by words of them: a session, and what matches
+    "aseg_dseg": ("a", "fmriprep/sub-1/ses-a/anat/sub-1_ses-a_desc-aseg_dseg.nii.gz"),
+    "{session}_desc-brain_mask": ("", "fmriprep/sub-1/anat/sub-1_desc-brain_mask.nii.gz"),
+    "{subject}_desc-brain_mask": ("b", "fmriprep/sub-1/anat/sub-1_desc-brain_mask.nii.gz"),
+    "aparc": ("b", "freesurfer/sub-1/mri/aparc+aseg.mgz"),
+    "{session}/mri/aseg": ("b", "freesurfer/sub-1_ses-b/mri/aseg.mgz"),
+    ".long": ("b", "freesurfer/sub-1_ses-b.long.sub-1/mri/aseg.mgz"),
+    "synthseg": ("", "synthseg/sub-1_T1w_synthseg.nii.gz"),
+}
+
+
+def test_patterns_of_the_documents_find_what_programs_write(tmp_path, monkeypatch):
+    """One file each, in folders as fMRIPrep, FreeSurfer and SynthSeg leave them, with other subjects and spaces."""
+    words = (Path(__file__).parents[2] / "docs" / "cohorts.md").read_text()
+    written = re.findall(r"^    --(?:mask|labels) (\S+)$", words, re.M)
+    others = [name.replace("sub-1", "sub-10") for _, name in PATTERNS.values()]
+    others += [name.replace("_desc", "_space-MNI152_desc") for _, name in PATTERNS.values()]
+    filled(tmp_path / "derivatives", *others, *(name for _, name in PATTERNS.values()))
+    monkeypatch.chdir(tmp_path)
+    assert len(written) == len(PATTERNS)
+    for pattern in written:
+        ((session, name),) = [each for part, each in PATTERNS.items() if part in pattern]
+        subject = Subject("1", session, (), {}, {}, "")
+        assert matching(pattern, subject) == tmp_path / "derivatives" / name
+        assert matching(pattern, subject).is_file()
 
 
 def test_folders_that_are_none(tmp_path):

@@ -9,7 +9,6 @@ name. Only names of files are looked at: a broken or a hostile JSON beside an im
 from __future__ import annotations
 
 import re
-import shlex
 import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -74,8 +73,8 @@ def bids_subjects(
     InputError
         No BIDS folder; pybids is not installed; no image.
     Problems
-        All of these: participants or sessions that are not there, several images for one row, links to content that is
-        not here, files in another subject's folder.
+        All of these: participants or sessions that are not there, several images for one row, files in another
+        subject's folder. Whether the images can be read is not asked.
 
     References
     ----------
@@ -201,7 +200,7 @@ def _image_paths(folder: Path, suffix: str, labels: Iterable[str]) -> list[Path]
 
 
 def _chosen(scans: list[Scan], kind: Name, folder: Path, problems: list[str]) -> Scan:
-    """The one image of a row, or a problem more; and another problem if it is a link to nothing."""
+    """The one image of a row, or a problem more."""
     stems = {scan.path.name.removesuffix(".gz"): scan for scan in scans}  # name.nii.gz comes after name.nii
     exact = [scan for scan in stems.values() if len(scan.name.entities) == len(kind.entities)]
     first, *others = exact or stems.values()
@@ -212,8 +211,6 @@ def _chosen(scans: list[Scan], kind: Name, folder: Path, problems: list[str]) ->
             f"{len(places)} images for one row, {', '.join(places)}: choose by entities, "
             f"as --suffix {'_'.join([*own, kind.suffix])}, or give a table of images"
         )
-    elif not first.path.exists():
-        problems.append(f"{places[0]}: a link to content that is not here; run: datalad get {shlex.quote(places[0])}")
     return first
 
 

@@ -1,0 +1,22 @@
+# The BIDS app of tetopt; docs/containers.md has how it is built and run.
+FROM python:3.12-slim
+
+# By these VTK draws boundaries where there is no screen.
+RUN apt-get update \
+ && apt-get install -y --no-install-recommends libegl1 libgl1 libgl1-mesa-dri \
+ && rm -rf /var/lib/apt/lists/*
+
+# Kernels are compiled once, below, for every processor of this architecture, not for that of the building machine alone.
+ENV NUMBA_CPU_NAME=generic
+ENV MPLBACKEND=agg
+
+WORKDIR /opt/tetopt
+COPY pyproject.toml README.md LICENSE ./
+COPY phantoms ./phantoms
+COPY tetopt ./tetopt
+RUN python -m pip install --no-cache-dir --disable-pip-version-check ".[cohort,itk]"
+# Into the folders of the installed package, from which any user reads them: nothing has to be written when it runs.
+RUN tetopt warm-up
+
+WORKDIR /
+ENTRYPOINT ["python", "-P", "-m", "tetopt.bids"]
