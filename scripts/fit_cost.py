@@ -262,11 +262,8 @@ def fitted(rows: Sequence[Row]) -> dict[str, dict[str, float]]:
     model = {"seconds": seconds, "bytes": n_bytes}
     left_out = [row for row in single if row.is_left_out]
     time_ratios = [summed(seconds, terms(row.size)) / row.cpu_seconds for row in left_out]
-    space_ratios = [
-        summed(n_bytes, memory_terms(row.size)) / row.peak_bytes
-        for row in left_out
-        if row.peak_bytes > BYTES_IN_BARS or len(left_out) == 1
-    ]
+    large = [row for row in left_out if row.peak_bytes > BYTES_IN_BARS] or left_out
+    space_ratios = [summed(n_bytes, memory_terms(row.size)) / row.peak_bytes for row in large]
     return model | {
         "threads": {"parallel_share": parallel_share(rows, seconds)},
         "machine": {"calibration_seconds": rows[0].calibration_seconds},

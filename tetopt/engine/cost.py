@@ -13,6 +13,7 @@ from functools import cache
 from pathlib import Path
 from typing import Any, NamedTuple
 
+MODEL_FILE = Path(__file__).with_name("cost.toml")
 CALIBRATION_VOXELS = 96  # along each axis of a cube, whose sums, 28 MB, are more than most caches have
 CALIBRATION_NODES = 9_000  # of a lattice, in which they are summed up again and again
 CALIBRATION_TURNS = 30  # of which the fastest counts: about a second in all
@@ -60,9 +61,9 @@ class CostModel(NamedTuple):
 
 
 @cache
-def cost_model() -> CostModel:
-    """The costs that this version comes with."""
-    table: dict[str, Any] = tomllib.loads((Path(__file__).with_name("cost.toml")).read_text(encoding="utf-8"))
+def cost_model(path: Path = MODEL_FILE) -> CostModel:
+    """The costs in a file, by default those that this version comes with."""
+    table: dict[str, Any] = tomllib.loads(path.read_text(encoding="utf-8"))
     return CostModel(
         table["seconds"], table["bytes"], table["threads"]["parallel_share"], table["machine"]["calibration_seconds"],
         table["errors"]["seconds_factor"], table["errors"]["bytes_share"],
