@@ -9,7 +9,7 @@ TESTED = PYTHONUTF8=1 NUMBA_CACHE_DIR=$(NUMBA_CACHE) MPLBACKEND=agg $(BIN)/pytho
 
 SOLVERS = calculix-ccx python3-dolfinx
 
-.PHONY: demo test test-slow test-random test-solvers test-nojit test-onethread test-hostile test-container lint bench fingerprints clean
+.PHONY: demo test test-slow test-random test-solvers test-nojit test-onethread test-hostile test-container test-slurm lint bench fingerprints clean
 
 demo: $(VENV)/.demo
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt demo -o demo --force
@@ -50,6 +50,12 @@ test-solvers: $(VENV)/.test
 # The Dockerfile's steps as a script in a fresh environment, and its entry point as another user; needs root.
 test-container: $(VENV)/.test
 	$(TESTED) -q -m "slow or not slow" --no-header tests/test_container.py
+
+# A SLURM of one node, started by hand in a folder of its own, runs six subjects; Debian's packages.
+test-slurm: $(VENV)/.test
+	@command -v apt-get >/dev/null || { echo "needs Debian's apt-get; install SLURM and munge, then run: TETOPT_SLURM=1 $(BIN)/python -m pytest tests/slurm"; exit 2; }
+	dpkg -s slurm-wlm munge >/dev/null 2>&1 || { apt-get update -qq && apt-get install -y -qq --no-install-recommends slurm-wlm munge; }
+	TETOPT_SLURM=1 $(TESTED) -q -s --no-header tests/slurm
 
 lint: $(VENV)/.test
 	$(BIN)/ruff check .

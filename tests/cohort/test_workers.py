@@ -339,7 +339,7 @@ def waited(crew):
         ("echo no such partition >&2; exit 1", "the batch system takes no job: no such partition"),
         (
             "sh $1 >/dev/null 2>&1; echo Submitted batch job 7",
-            "jobs ended before their worker was there; their logs in",
+            "jobs ended as they began; their logs in in",
         ),
     ],
 )

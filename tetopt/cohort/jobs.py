@@ -307,7 +307,7 @@ class Keeper:
         if refused and not cluster.workers:
             self.failure = f"the batch system takes no job: {refused[0]}"
         if self.n_lost >= MOST_LOST:
-            self.failure = f"{self.n_lost} jobs ended before their worker was there; their logs in {self.logs} say why"
+            self.failure = f"{self.n_lost} jobs ended as they began; their logs in {self.logs} say why"
         if self.failure is not None:
             return
         if time.monotonic() - self.asked_at > IDLE_SECONDS:
