@@ -193,6 +193,8 @@ def test_jobs_that_end_are_replaced(slurm, tmp_path):
         after = {number: row for number, row in jobs_of_slurm().items() if number not in before}
     assert sorted((each.key, each.status) for each in ended) == [(f"sub-{k}", "done") for k in range(1, 5)]
     assert [row[0] for _, row in sorted(after.items())] == ["CANCELLED", "RUNNING"]
+    # Told of by dask, and so counted: a subject that outlasts its job's wall time is not begun for ever.
+    assert "sub-2-run-1-1 marked as failed because 1 workers died" in (folders.logs / "dask.log").read_text()
     first, second = sorted(after)
     assert {each.key: int(each.reason) for each in ended} == {
         "sub-1": first, "sub-2": second, "sub-3": second, "sub-4": second
