@@ -437,13 +437,13 @@ def assert_refused(capfd, arguments, match, code=2):
 
 BAD_OPTIONS = [
     ("--nodes 100 --spacing 5", "--nodes and --spacing: give one of them"),
-    ("--nodes 2", "9 or more in 3-D, got 2"),
-    ("--uniform --nodes 2", "nodes must lie between 9 and"),
+    ("--nodes 6", "9 or more in 3-D, got 6"),
+    ("--uniform --nodes 6", "nodes must lie between 9 and"),
     ("--nodes 99999999999", "nodes must lie between 9 and"),
-    ("--nodes -5", "9 or more in 3-D, got -5"),
+    ("--nodes -5", "--nodes: expected a whole number, 5 or more, got -5"),
     ("--nodes 2.5", "--nodes"),
-    ("--spacing 0", "spacing must be a length above 0"),
-    ("--spacing nan", "spacing must be a length above 0"),
+    ("--spacing 0", "--spacing: expected a length above 0 mm"),
+    ("--spacing nan", "--spacing: expected a length above 0 mm"),
     ("--k-d 1", "--k-d: expected 0 <= k_D < 1, got 1.0"),
     ("--k-d -0.1", "--k-d: expected 0 <= k_D < 1, got -0.1"),
     ("--k-d nan", "--k-d: expected 0 <= k_D < 1, got nan"),

@@ -26,6 +26,10 @@ COMMANDS = {
         "mesh",
         "Mesh an image: nodes where it has content (or a uniform lattice), optimised, for a solver or as VTU.",
     ),
+    "cohort": (
+        "cohort",
+        "Mesh many subjects of a table or a BIDS folder, on this machine or a cluster; go on where it ended.",
+    ),
     "quality": ("quality", "Measure a mesh: shape, angles, bad cells, and how well its cells fit an image."),
     "convert": (
         "convert",

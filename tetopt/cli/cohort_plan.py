@@ -45,6 +45,12 @@ class Entry(NamedTuple):
         """What of it is meshed."""
         return self.plan.source
 
+    def row(self) -> Subject:
+        """The subject with the files that patterns mean for it."""
+        options = self.records.given()
+        files = {name: options[OPTION_NAMES[name]] for name in FILE_OPTIONS if OPTION_NAMES[name] in options}
+        return self.subject._replace(files=files)
+
     def words(self) -> tuple[str, ...]:
         """What follows `tetopt mesh`, without outputs and threads."""
         options = {name: value for name, value in self.records.given().items() if name != "threads"}

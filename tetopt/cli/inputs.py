@@ -15,7 +15,7 @@ from rich.markup import escape
 
 from tetopt import Image, InputError, load_image, load_mesh
 from tetopt.cli.console import log, show_warning
-from tetopt.cli.options import WHOLE_BOX, BoxPart, ImagePart
+from tetopt.cli.options import WHOLE_BOX, BoxPart, ImagePart, SourceOptions
 from tetopt.io.files import checked_output
 from tetopt.io.images import parse_crop, parse_slice, part_of, sha256
 from tetopt.io.label_tables import LabelTable, load_label_table, table_in
@@ -106,6 +106,21 @@ def file_and_volume(path: Path) -> tuple[Path, int | None]:
     if colon and re.fullmatch("[0-9]{1,18}", volume) and not path.exists():
         return Path(name), int(volume)
     return path, None
+
+
+def number_of(name: str, text: str) -> float:
+    """The number that an option's text is; InputError, with the option's name, if it is none."""
+    try:
+        return float(text)
+    except ValueError:
+        raise InputError(f'{name}: expected a number, got "{text}"') from None
+
+
+def weights_of(options: SourceOptions) -> list[float]:
+    """How much each image counts."""
+    if options.weights is None:
+        return [1.0] * len(options.images)
+    return [number_of("--weights", part) for part in options.weights.split(",")]
 
 
 def read_mesh(path: Path) -> MeshFile:

@@ -10,7 +10,7 @@ import numpy as np
 
 import tetopt
 from tetopt import InputError
-from tetopt.cli.inputs import checked_outputs, read_companion
+from tetopt.cli.inputs import checked_outputs, number_of, read_companion, weights_of
 from tetopt.cli.options import (
     DEFAULT_NODES,
     EngineOptions,
@@ -24,13 +24,16 @@ from tetopt.cli.options import (
 from tetopt.cli.solver import check_solver_options
 from tetopt.engine.fast import check_options
 from tetopt.engine.loop import MIN_DIHEDRAL, SHAPE_POWER
-from tetopt.engine.meshing import MODE_DEFAULTS, QUADRATIC_NODES, Mode, sizes_of_order
+from tetopt.engine.meshing import MODE_DEFAULTS, QUADRATIC_NODES, Mode, check_target_error, sizes_of_order
 from tetopt.engine.paper import default_n_t
 from tetopt.io.files import checked_output
 from tetopt.io.formats import FORMATS, format_of
+from tetopt.io.images import parse_crop, parse_slice
 from tetopt.start.lattice import KINDS
 from tetopt.start.octree import nodes_of_sizes
-from tetopt.target.content import Content
+from tetopt.target.content import SMOOTH_INTERFACES, Content, check_weights
+
+FEWEST_NODES = 5  # of the smallest mesh that there is, an octree in 2-D: a square's corners and its middle
 
 
 class Plan(NamedTuple):
@@ -88,6 +91,7 @@ def planned(
         output that may not be written.
     """
     _check_source(source, solver)
+    _check_numbers(source, sizes, start)
     format_of(output.mesh)
     checked_output(output.mesh, tuple(FORMATS), output.force)
     check_solver_options(output.mesh, solver)
@@ -117,6 +121,25 @@ def _check_source(source: SourceOptions, solver: SolverOptions) -> None:
         for name in ("label_names", "label_weight", "smooth_interfaces"):
             if beside[name] is not None:
                 raise InputError(f"--{name.replace('_', '-')}: there are no --labels")
+
+
+def _check_numbers(source: SourceOptions, sizes: SizeOptions, start: StartOptions) -> None:
+    """InputError for numbers that are none of their options', whatever the image is."""
+    tension = SMOOTH_INTERFACES if source.smooth_interfaces is None else source.smooth_interfaces
+    check_weights(len(source.images), weights_of(source), source.label_weight or 0.0, tension)
+    if source.background not in (None, "auto"):
+        number_of("--background", str(source.background))
+    if source.part.crop is not None:
+        parse_crop(source.part.crop)
+    if source.part.slice_ is not None:
+        parse_slice(source.part.slice_)
+    if sizes.nodes is not None and sizes.nodes < FEWEST_NODES:
+        raise InputError(f"--nodes: expected a whole number, {FEWEST_NODES} or more, got {sizes.nodes}")
+    if start.spacing is not None and not 0.0 < start.spacing < np.inf:
+        raise InputError(f"--spacing: expected a length above 0 mm, got {start.spacing}")
+    if sizes.target_error is not None:
+        check_target_error(sizes.target_error)
+    _limits(replace(sizes, sizing=None))
 
 
 def _mode(source: SourceOptions, sizes: SizeOptions, start: StartOptions, engine: EngineOptions) -> Mode:

@@ -9,9 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 import tetopt
-from tetopt import Image, InputError, Mesh
+from tetopt import Image, Mesh
 from tetopt.cli.console import log
-from tetopt.cli.inputs import file_and_volume, image_and_others, label_table
+from tetopt.cli.inputs import file_and_volume, image_and_others, label_table, number_of, weights_of
 from tetopt.cli.options import SourceOptions
 from tetopt.io.images import sha256
 from tetopt.io.label_tables import NO_TABLE, LabelTable
@@ -85,15 +85,13 @@ def read_source(options: SourceOptions, label_names: Path | None = None) -> Sour
     level = None
     if options.background is not None:
         is_auto = options.background == "auto"
-        level = background_level(image) if is_auto else _number("--background", options.background)
+        level = background_level(image) if is_auto else number_of("--background", options.background)
         mask = foreground(image, level)
         log.print(
             f"background: up to {level:g}, as far as it reaches the box; {mask.data.mean():.1%} of the voxels are left"
         )
-    weights = [1.0] * len(paths)
-    if options.weights is not None:
-        weights = [_number("--weights", part) for part in options.weights.split(",")]
-    elif labels is not None and len(paths) == 1 and np.array_equal(labels.data, image.data):
+    weights = weights_of(options)
+    if options.weights is None and labels is not None and len(paths) == 1 and np.array_equal(labels.data, image.data):
         log.print("the image is its own labels: only these count")
         weights = [0.0]
     label_weight = 1.0 if options.label_weight is None else options.label_weight
@@ -112,10 +110,3 @@ def read_source(options: SourceOptions, label_names: Path | None = None) -> Sour
     about = {"image": paths[0].name, "image_sha256": sha256(paths[0]), "inputs": inputs, "box": box_text(box_of(image))}
     source = Source(paths, weights, represented, contrasts, labels, mask, about, NO_TABLE)
     return source.with_table(table)
-
-
-def _number(name: str, text: str) -> float:
-    try:
-        return float(text)
-    except ValueError:
-        raise InputError(f'{name}: expected a number, got "{text}"') from None

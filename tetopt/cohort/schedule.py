@@ -26,7 +26,7 @@ class SchedulerLost(InputError):
 def run_all(
     jobs: Sequence[Job],
     client: Any,
-    slots: Callable[[int], int],
+    slots: Callable[[], int],
     room: float,
     task: Callable[[Job], Ended] = run_subject,
 ) -> Iterator[Ended]:
@@ -38,7 +38,7 @@ def run_all(
         In the order in which they begin.
     client : distributed.Client
     slots : callable
-        How many may run at the same time, of so many that are left; asked again and again.
+        How many may run at the same time, asked again and again.
     room : float
         Bytes of memory that one may take; a subject that is predicted to take more does not begin.
     task : callable
@@ -60,7 +60,7 @@ def run_all(
         yield _failed(job, f"{reason}; ask for fewer nodes, or for larger workers", 0)
     running: dict[Any, tuple[Job, int]] = {}
     while waiting or running:
-        while waiting and len(running) < slots(len(waiting) + len(running)):
+        while waiting and len(running) < slots():
             job, attempt = waiting.popleft()
             running[client.submit(task, job, key=f"{job.key}-{job.run}-{attempt}", pure=False)] = job, attempt
         if client.status not in ("running", "connecting"):

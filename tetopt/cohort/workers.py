@@ -10,6 +10,8 @@ from __future__ import annotations
 import logging
 import os
 import shutil
+import signal
+import threading
 import warnings
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
@@ -84,12 +86,16 @@ def workers(
 
 def check_installed() -> None:
     """InputError where dask.distributed and what belongs to it is not installed."""
+    before = signal.getsignal(signal.SIGINT)
     try:
         import cryptography  # noqa: F401
-        import dask_jobqueue  # noqa: F401
+        import dask_jobqueue  # noqa: F401, which ends the program by sys.exit at Ctrl-C as soon as it is imported
         import distributed  # noqa: F401
     except ImportError as error:
         raise InputError(f'{error.name} is not installed, cohorts need it; pip install "tetopt[cohort]"') from error
+    finally:
+        if threading.current_thread() is threading.main_thread():
+            signal.signal(signal.SIGINT, before)
 
 
 class Share(NamedTuple):

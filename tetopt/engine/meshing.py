@@ -202,6 +202,12 @@ def bytes_of(content: Content, nodes: int) -> float:
     return meshing_bytes(image.data.size, len(content.values) + (content.region is not None), nodes, image.ndim)
 
 
+def check_target_error(target_error: float) -> None:
+    """InputError for an error that is no share."""
+    if not 0.0 < target_error < 1.0:
+        raise InputError(f"target_error: expected a share of the image's variance, 0 to 1, got {target_error}")
+
+
 def check_memory_of(content: Content, nodes: int, limit: float | None = None) -> None:
     """InputError for more nodes than there is memory for, or than `limit` bytes in all allow."""
     shape = " x ".join(map(str, content.image.shape))
@@ -291,8 +297,7 @@ def meshed_to_error(
     InputError
         A share out of range, or one below that of the image's noise, which no mesh should follow; as `octree`.
     """
-    if not 0.0 < target_error < 1.0:
-        raise InputError(f"target_error: expected a share of the image's variance, 0 to 1, got {target_error}")
+    check_target_error(target_error)
     content = plain(image)
     variance = content.variance
     if variance == 0.0:

@@ -255,6 +255,21 @@ def _part(image: Image, part: tuple[slice, ...]) -> Image:
     return Image(image.data[part], affine)
 
 
+def check_weights(n_images: int, weights: list[float], label_weight: float, smooth_interfaces: float) -> None:
+    """InputError for weights of images and labels, or a tension of interfaces, that `content` does not take."""
+    low, high = WEIGHT_RANGE
+    if len(weights) != n_images or not all(w == 0.0 or low <= w <= high for w in weights):
+        raise InputError(
+            f"weights: expected one for each of {n_images} images, 0 or {low:g} to {high:g}, got {weights}"
+        )
+    if not 0.0 <= smooth_interfaces <= MOST_TENSION:
+        raise InputError(
+            f"smooth_interfaces: expected 0 to {MOST_TENSION:g} voxels, got {smooth_interfaces:g}; 0.3 is usual"
+        )
+    if not (label_weight == 0.0 or low <= label_weight <= high):
+        raise InputError(f"label_weight: expected 0 or {low:g} to {high:g}, got {label_weight}")
+
+
 def _check(
     images: list[Image],
     others: dict[str, Image | None],
@@ -274,17 +289,7 @@ def _check(
         last = np.array(first.shape) - 1
         if np.abs(first.to_index(image.to_world([0 * last, last])) - [0 * last, last]).max() > SAME_PLACE_VOXELS:
             raise InputError(f"{name}: expected voxels in the same place as the first image's; see tetopt.aligned_mask")
-    low, high = WEIGHT_RANGE
-    if len(weights) != len(images) or not all(w == 0.0 or low <= w <= high for w in weights):
-        raise InputError(
-            f"weights: expected one for each of {len(images)} images, 0 or {low:g} to {high:g}, got {weights}"
-        )
-    if not 0.0 <= smooth_interfaces <= MOST_TENSION:
-        raise InputError(
-            f"smooth_interfaces: expected 0 to {MOST_TENSION:g} voxels, got {smooth_interfaces:g}; 0.3 is usual"
-        )
-    if not (label_weight == 0.0 or low <= label_weight <= high):
-        raise InputError(f"label_weight: expected 0 or {low:g} to {high:g}, got {label_weight}")
+    check_weights(len(images), weights, label_weight, smooth_interfaces)
     if others["labels"] is not None:
         check_labels("labels", others["labels"])
 

@@ -1,0 +1,247 @@
+"""`tetopt cohort` as a user runs it: interrupted, a worker killed, resumed, changed; nothing lost or done twice."""
+
+import csv
+import json
+import os
+import re
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import numpy as np
+import pytest
+from commands import exit_code
+
+import tetopt
+
+COMMON = ("--iterations", "1", "--nodes", "60")
+N_SUBJECTS = 12
+BAD = {"03": "truncated image", "05": "mask beside the image", "07": "labels beside the image"}
+WAIT_SECONDS = 240  # a machine with much else to do still gets there
+
+
+def command(folder, *options):
+    return [sys.executable, "-m", "tetopt", "cohort", str(folder / "t.tsv"), "-o", str(folder / "out"), *options]
+
+
+def begun(folder, *options):
+    """A run that has begun, its words in a file."""
+    with open(folder / "words.txt", "w") as stream:
+        return subprocess.Popen(command(folder, *options), stdout=stream, stderr=stream, cwd=folder)
+
+
+def ended(run, folder):
+    """Its exit code and words."""
+    code = run.wait(WAIT_SECONDS)
+    return code, (folder / "words.txt").read_text()
+
+
+def meshes(folder):
+    """The subjects' meshes that are there, with when they were written."""
+    return {path.parent.name: path.stat().st_mtime_ns for path in sorted((folder / "out").glob("sub-*/*.vtu"))}
+
+
+def wait_for(folder, number, run):
+    """Wait until so many meshes are there."""
+    end = time.monotonic() + WAIT_SECONDS
+    while len(meshes(folder)) < number:
+        assert run.poll() is None, (folder / "words.txt").read_text()
+        assert time.monotonic() < end, "no mesh in time"
+        time.sleep(0.05)
+
+
+def table_rows(folder):
+    with open(folder / "out" / "cohort.tsv", newline="") as stream:
+        return {row["participant_id"]: row for row in csv.DictReader(stream, delimiter="\t")}
+
+
+def write_rows(folder, changes=None):
+    """The table: subjects 01 to 12, of which three are bad, one has labels on another grid, one nodes of its own."""
+    own = {"03": {"image": "cut.nii.gz"}, "05": {"mask": "far.nii.gz"}, "07": {"labels": "far.nii.gz"},
+           "08": {"labels": "coarse.nii.gz"}, "09": {"nodes": "80"}} | (changes or {})  # fmt: skip
+    columns = ("subject", "image", "mask", "labels", "nodes")
+    lines = ["\t".join(columns)]
+    for number in range(1, N_SUBJECTS + 1):
+        name = f"{number:02d}"
+        row = {"subject": name, "image": f"a{number % 3}.nii.gz"} | own.get(name, {})
+        lines.append("\t".join(row.get(column, "n/a") for column in columns))
+    (folder / "t.tsv").write_text("\n".join(lines) + "\n")
+
+
+@pytest.fixture(scope="module")
+def cohort(tmp_path_factory):
+    """A folder with a table of twelve subjects, run three times: ended by Ctrl-C, a worker killed, with changes."""
+    folder = tmp_path_factory.mktemp("cohort")
+    for number in range(3):
+        words = ["phantom", "sphere", "-o", folder / f"a{number}.nii.gz", "--voxel-mm", str(5 + 0.5 * number)]
+        assert exit_code(*words) == 0
+    whole = (folder / "a0.nii.gz").read_bytes()
+    (folder / "cut.nii.gz").write_bytes(whole[: len(whole) // 2])
+    image = tetopt.load_image(folder / "a0.nii.gz")
+    far = np.array(image.affine)
+    far[:3, 3] += 500.0
+    tetopt.save_image(folder / "far.nii.gz", tetopt.Image(1.0 * (image.data > 50), far))
+    coarse = tetopt.Image(1.0 * (image.data[::2, ::2, ::2] > 50), image.affine @ np.diag([2.0, 2.0, 2.0, 1.0]))
+    tetopt.save_image(folder / "coarse.nii.gz", coarse)
+    write_rows(folder)
+    return folder
+
+
+@pytest.fixture(scope="module")
+def interrupted(cohort):
+    """Ended by Ctrl-C after two subjects: exit code, words, the meshes there were."""
+    run = begun(cohort, *COMMON)
+    wait_for(cohort, 2, run)
+    run.send_signal(signal.SIGINT)
+    code, words = ended(run, cohort)
+    return code, words, meshes(cohort)
+
+
+@pytest.fixture(scope="module")
+def resumed(cohort, interrupted):
+    """The same command again, of which a worker is killed on the way: exit code, words, the meshes there are."""
+    run = begun(cohort, *COMMON)
+    wait_for(cohort, len(interrupted[2]) + 1, run)
+    victims = workers_of(run.pid)
+    os.kill(victims[0], signal.SIGKILL)
+    code, words = ended(run, cohort)
+    return code, words, meshes(cohort)
+
+
+def workers_of(pid):
+    """The worker processes of a run: those that have a run of `tetopt mesh` for a child, or could have."""
+    parents = {}
+    for path in Path("/proc").glob("[0-9]*"):
+        try:
+            parents[int(path.name)] = int((path / "stat").read_text().rpartition(")")[2].split()[1])
+        except OSError:
+            continue
+    children = [child for child, parent in parents.items() if parent == pid]
+    return [each for each in children if b"spawn_main" in Path(f"/proc/{each}/cmdline").read_bytes()]
+
+
+def test_ctrl_c_keeps_what_is_done(cohort, interrupted):
+    code, words, there = interrupted
+    assert code == 130
+    assert 2 <= len(there) < N_SUBJECTS - len(BAD)
+    assert "to go on" in words
+    assert "Traceback" not in words
+    assert not [path for path in (cohort / "out" / ".work").iterdir() if path.name != "lock"]
+
+
+def test_a_rerun_does_the_rest_though_a_worker_dies(cohort, interrupted, resumed):
+    code, words, there = resumed
+    assert code == 1, words
+    assert sorted(there) == [f"sub-{n:02d}" for n in range(1, N_SUBJECTS + 1) if f"{n:02d}" not in BAD]
+    for name, when in interrupted[2].items():
+        assert there[name] == when, f"{name} was made again"
+    assert f"{N_SUBJECTS} subjects: {len(interrupted[2])} done" in words
+
+
+def test_what_failed_is_a_row_with_its_reason(cohort, resumed):
+    reasons = {
+        name: json.loads((cohort / "out" / "logs" / f"sub-{name}.failed.json").read_text())["reason"] for name in BAD
+    }
+    assert "cut.nii.gz" in reasons["03"]
+    assert "far.nii.gz" in reasons["05"]
+    assert "far.nii.gz" in reasons["07"]
+    rows = table_rows(cohort)
+    assert len(rows) == N_SUBJECTS
+    for name, reason in reasons.items():
+        assert (rows[f"sub-{name}"]["status"], rows[f"sub-{name}"]["reason"]) == ("failed", reason)
+        assert reason in (cohort / "out" / "logs" / f"sub-{name}.log").read_text()
+    page = (cohort / "out" / "cohort.html").read_text()
+    assert all(f"sub-{name}" in page for name in BAD)
+
+
+def test_labels_on_another_grid_are_taken_to_the_images(cohort, resumed):
+    assert "taken to the image's voxels" in (cohort / "out" / "logs" / "sub-08.log").read_text()
+    assert table_rows(cohort)["sub-08"]["status"] == "done"
+
+
+def test_a_rerun_makes_what_changed_and_what_failed(cohort, resumed):
+    """Subject 09 has other options and 03 a whole image by now; 05 and 07 fail again; no other is touched."""
+    write_rows(cohort, {"03": {"image": "a0.nii.gz"}, "09": {"nodes": "90"}})
+    code, words = ended(begun(cohort, *COMMON), cohort)
+    assert code == 1
+    assert "1 changed: nodes was 80, is 90" in words
+    now = meshes(cohort)
+    assert {name for name, when in now.items() if resumed[2].get(name) != when} == {"sub-03", "sub-09"}
+    assert not (cohort / "out" / "logs" / "sub-03.failed.json").exists()
+
+
+def test_nothing_is_run_twice_and_failed_ones_alone_on_request(cohort, resumed):
+    write_rows(cohort, {"03": {"image": "a0.nii.gz"}, "09": {"nodes": "100"}, "05": {}, "07": {}})
+    before = meshes(cohort)
+    code, words = ended(begun(cohort, *COMMON, "--retry-failed"), cohort)
+    assert code == 0, words
+    assert {name for name, when in meshes(cohort).items() if before.get(name) != when} <= {"sub-03", "sub-05", "sub-07"}
+    assert "subjects stay as they are" in words
+    code, words = ended(begun(cohort, *COMMON, "--participant-label", "01"), cohort)
+    assert code == 0
+    assert "1 subjects: 1 done; 0 to run" in words
+
+
+def refused(folder, capsys, *options):
+    """The lines by which a cohort is refused, and that nothing was made."""
+    before = sorted(folder.rglob("*"))
+    assert exit_code("cohort", folder / "t.tsv", "-o", folder / "out", *options) == 2
+    assert sorted(folder.rglob("*")) == before
+    return [line for line in capsys.readouterr().err.splitlines() if line.startswith("tetopt: ")]
+
+
+@pytest.fixture
+def small(tmp_path):
+    assert exit_code("phantom", "sphere", "-o", tmp_path / "a.nii.gz", "--voxel-mm", "6") == 0
+    (tmp_path / "t.tsv").write_text("subject\timage\tnodes\n01\ta.nii.gz\t60\n02\ta.nii.gz\tn/a\n")
+    return tmp_path
+
+
+def test_all_that_is_wrong_is_said_before_anything_is_run(small, capsys):
+    lines = [
+        "subject\timage\tnodes\tmask\tnods\tk-d", "01\ta.nii.gz\t-4\tn/a\tn/a\tn/a", "02\tb.nii.gz\tn/a\tn/a\tn/a\tn/a",
+        "03\ta.nii.gz\tmany\tn/a\tn/a\tn/a", "0 1\ta.nii.gz\tn/a\tn/a\tn/a\tn/a", "05\ta.nii.gz\tn/a\tm.nii\tn/a\tn/a",
+        "06\ta.nii.gz\tn/a\tn/a\t5\tn/a", "07\ta.nii.gz\tn/a\tn/a\tn/a\t1.5", "08\ta.nii.gz\t60\tn/a\tn/a\t0.5",
+    ]  # fmt: skip
+    (small / "t.tsv").write_text("\n".join(lines) + "\n")
+    said = refused(small, capsys)
+    places = [int(number) for line in said for number in re.findall(r"^tetopt: \S+t\.tsv, line (\d+): ", line)]
+    assert sorted(places) == [2, 3, 4, 5, 6, 7, 8]
+    assert any("nods" in line and "is nodes meant?" in line for line in said)
+
+
+@pytest.mark.parametrize(("options", "words"), [
+    (("--nodes", "-1"), "nodes"), (("--format", "docx"), "--format: expected one of"),
+    (("--mask", "m-{subject}.nii"), "m-01.nii is not there"), (("--participant-label", "9"), "has no subject 9"),
+    (("--mask", "a.nii.gz", "--background", "3"), "give one of them"),
+])  # fmt: skip
+def test_options_of_all_that_cannot_be_are_refused(small, capsys, monkeypatch, options, words):
+    monkeypatch.chdir(small)
+    assert any(words in line for line in refused(small, capsys, *options))
+
+
+def test_a_folder_of_something_else_is_not_written_to(small, capsys):
+    (small / "out").mkdir()
+    (small / "out" / "thesis.txt").write_text("mine")
+    assert "no cohort's" in refused(small, capsys)[0]
+
+
+def test_the_table_of_what_would_be_run(small, capsys):
+    options = ("--mask", f"{small}/m-{{subject}}.nii.gz")
+    for name in ("01", "02"):
+        (small / f"m-{name}.nii.gz").write_bytes((small / "a.nii.gz").read_bytes())
+    words = ["cohort", small / "t.tsv", "-o", small / "out", "--write-table", small / "u.tsv", *options]
+    assert exit_code(*words) == 0
+    lines = (small / "u.tsv").read_text().splitlines()
+    assert lines == ["subject\timage\tmask\tnodes", "01\ta.nii.gz\tm-01.nii.gz\t60", "02\ta.nii.gz\tm-02.nii.gz\tn/a"]
+    assert not (small / "out").exists()
+
+
+def test_a_dry_run_tells_what_it_takes(small, capsys):
+    assert exit_code("cohort", small / "t.tsv", "-o", small / "out", "--dry-run") == 0
+    words = capsys.readouterr().out
+    assert re.search(r"sub-01: \d+ s on a thread, \d+ MB|sub-01: \d+ s on a thread, 0\.\d+ GB", words)
+    assert "in all" in words
+    assert not (small / "out").exists()

@@ -1,0 +1,277 @@
+"""``tetopt cohort``: many subjects, each as `tetopt mesh` alone would mesh it, on the workers of a cluster."""
+
+from __future__ import annotations
+
+import contextlib
+import secrets
+import shlex
+import sys
+import time
+from collections import Counter
+from collections.abc import Callable, Iterator, Sequence
+from io import StringIO
+from os import cpu_count
+from pathlib import Path
+from typing import NamedTuple
+
+from rich.markup import escape
+from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
+
+from tetopt.budget import available_bytes, memory_words
+from tetopt.cli.cohort_plan import Entry, checked_suffix, chosen, entries_of, subjects_of
+from tetopt.cli.console import log, out, show_error, show_warning
+from tetopt.cli.inputs import read_mesh
+from tetopt.cli.options import (
+    CohortOptions,
+    ContentOptions,
+    EngineOptions,
+    Records,
+    SizeOptions,
+    SolverOptions,
+    StartOptions,
+    SubjectsArgument,
+)
+from tetopt.cli.plan import with_numbers
+from tetopt.cli.predict import size_by_headers, size_of_run
+from tetopt.cli.source import read_source
+from tetopt.cohort.layout import LOGS_NAME, WORK_NAME, begin, check_out, description, locked, restore
+from tetopt.cohort.numbers import collect
+from tetopt.cohort.page import save_cohort_files
+from tetopt.cohort.run import Ended, Job
+from tetopt.cohort.schedule import SchedulerLost, run_all
+from tetopt.cohort.subjects import TABLE_SUFFIXES, Problems, write_table
+from tetopt.cohort.workers import Folders, Need, shares, workers
+from tetopt.engine.cost import Prediction, RunSize, calibrated_speed, predicted
+from tetopt.errors import InputError
+from tetopt.io.files import checked_output
+
+NAMED_FAILURES = 20  # on the terminal: the table and the page have all
+LIKE_TRIES = 3  # subjects of a kind that are read to see what headers do not tell, until one can be
+
+
+class Estimate(NamedTuple):
+    """What the subjects that are to be run are predicted to take."""
+
+    each: dict[str, Prediction]  # by key, on one thread
+    largest: float  # bytes
+
+    def seconds(self) -> float:
+        """Of all, one after the other."""
+        return sum(prediction.seconds for prediction in self.each.values())
+
+
+def cohort_command(
+    subjects: SubjectsArgument,
+    cohort: CohortOptions,
+    content: ContentOptions,
+    sizes: SizeOptions,
+    start: StartOptions,
+    engine: EngineOptions,
+    solver: SolverOptions,
+) -> int:
+    """Mesh many subjects of a table or a BIDS folder, on this machine or a cluster; go on where it ended."""
+    suffix = checked_suffix(cohort.mesh_format)
+    place, records = cohort.output, Records(content, sizes, start, engine, solver)
+    if cohort.write_table is not None:
+        checked_output(cohort.write_table, TABLE_SUFFIXES)
+    check_out(place)
+    try:
+        rows = subjects_of(subjects, cohort)
+        entries = entries_of(rows, records, place, suffix, log.print)
+    except Problems as problems:
+        for line in problems.lines:
+            show_error(line)
+        log.print(f"nothing was run: {len(problems.lines)} to mend")
+        return 2
+    if cohort.write_table is not None:
+        write_table(cohort.write_table, [entry.row() for entry in entries])
+        out.print(escape(f"{cohort.write_table}: {len(rows)} subjects"))
+        return 0
+    to_run = chosen(entries, cohort.retry_failed)
+    _say_plan(entries, to_run, cohort.retry_failed)
+    estimate = estimated(to_run)
+    if cohort.dry_run:
+        _say_estimate(to_run, estimate, cohort, engine.threads)
+        return 0
+    begin(place, description("Tetrahedral meshes by tetopt", [subjects.absolute().as_posix()]))
+    with locked(place):
+        restore(place)
+        try:
+            if to_run:
+                _run(to_run, estimate, cohort, suffix, engine.threads)
+                restore(place)
+        finally:  # also on Ctrl-C: what is done is seen
+            code = _close(place, [entry.key for entry in entries])
+            _say_rerun(code)
+    return code
+
+
+def _say_plan(entries: Sequence[Entry], to_run: Sequence[Entry], only_failed: bool) -> None:
+    """How many subjects there are of each kind, and why the ones are run that are there already."""
+    counts = Counter[str](entry.state.status for entry in entries)
+    words = {"done": "done", "missed": "done, but a promise missed", "failed": "failed", "changed": "changed"}
+    parts = [f"{counts[name]} {text}" for name, text in words.items() if counts[name]]
+    parts += [f"{counts['missing']} not yet run"] if counts["missing"] else []
+    log.print(f"{len(entries)} subjects: {', '.join(parts)}; {len(to_run)} to run")
+    reasons = Counter((e.state.status, e.state.why) for e in to_run if e.state.status in ("changed", "failed"))
+    for (status, why), number in reasons.most_common(NAMED_FAILURES):
+        log.print(escape(f"  {number} {status}: {why}"))
+    if only_failed and counts["changed"]:
+        show_warning(f"{counts['changed']} subjects stay as they are, of other options or inputs (--retry-failed)")
+
+
+def estimated(entries: Sequence[Entry]) -> Estimate:
+    """What subjects are predicted to take, each on one thread: by their headers, and one of each kind as it is."""
+    speed, like = calibrated_speed() if entries else 1.0, dict[object, RunSize | None]()
+    tries: Counter[object] = Counter()
+    each = {}
+    for entry in entries:
+        source = entry.source
+        kind = (
+            len(source.images),
+            source.mask is None,
+            source.labels is None,
+            source.background,
+            str(entry.plan.sizes),
+        )
+        if like.get(kind) is None and tries[kind] < LIKE_TRIES:
+            tries[kind] += 1
+            like[kind] = _read_size(entry)
+        try:
+            each[entry.key] = predicted(size_by_headers(entry.plan, like[kind]), 1, speed)
+        except InputError:  # its run will say it
+            continue
+    return Estimate(each, max((prediction.peak_bytes for prediction in each.values()), default=0.0))
+
+
+def _read_size(entry: Entry) -> RunSize | None:
+    """The sizes of a run whose files are read; None if they cannot be, which its run will say."""
+    try:
+        with contextlib.redirect_stderr(StringIO()):
+            source = read_source(entry.source, entry.plan.solver.label_names)
+            plan, _ = with_numbers(entry.plan, source.content)
+            begun = plan.start.start
+            n_started = None if begun is None else len(read_mesh(begun).mesh.points)
+    except (InputError, OSError):
+        return None
+    return size_of_run(plan, source.content, source.contrasts[0], n_started)
+
+
+def _say_estimate(to_run: Sequence[Entry], estimate: Estimate, cohort: CohortOptions, threads: int | None) -> None:
+    """What would be run, and what it takes."""
+    for entry in to_run:
+        if (one := estimate.each.get(entry.key)) is None:
+            out.print(escape(f"{entry.key}: sizes unknown: its image cannot be read"))
+        else:
+            out.print(escape(f"{entry.key}: {one.seconds:.0f} s on a thread, {memory_words(one.peak_bytes)}"))
+    free = available_bytes()
+    need = Need(len(to_run), estimate.largest, threads)
+    share = shares(need, cohort.count, cpu_count() or 1, float("inf") if free is None else float(free))
+    out.print(
+        f"in all {_time(estimate.seconds())} on one thread, at most {memory_words(estimate.largest)} each; on this "
+        f"machine {share.workers} at a time: about {_time(estimate.seconds() / share.workers)}"
+    )
+
+
+def _run(to_run: Sequence[Entry], estimate: Estimate, cohort: CohortOptions, suffix: str, threads: int | None) -> None:
+    """Run the subjects; what becomes of each is said."""
+    place = cohort.output.absolute()
+    work = place / WORK_NAME
+    alive = work / f"run-{secrets.token_hex(4)}"
+    alive.touch()
+    need = Need(len(to_run), estimate.largest, threads)
+    try:
+        with workers(
+            need,
+            Folders(work, place / LOGS_NAME),
+            count=cohort.count,
+            scheduler=cohort.scheduler,
+            cluster=cohort.cluster,
+        ) as pool:
+            log.print(escape(pool.words))
+            jobs = [_job(entry, estimate, place, suffix, pool.threads, alive.name) for entry in to_run]
+            with _progress(jobs) as show:
+                for ended in run_all(jobs, pool.client, pool.slots, pool.bytes):
+                    show(ended)
+    except SchedulerLost as lost:
+        show_error(f"{lost}; what was finished is in its place")
+    finally:
+        alive.unlink(missing_ok=True)
+
+
+def _job(entry: Entry, estimate: Estimate, place: Path, suffix: str, threads: int, run: str) -> Job:
+    one = estimate.each.get(entry.key, Prediction(0.0, 0.0, 0.0))
+    return Job(entry.key, entry.words(), str(place), suffix, threads, one.peak_bytes, one.seconds, run)
+
+
+@contextlib.contextmanager
+def _progress(jobs: Sequence[Job]) -> Iterator[Callable[[Ended], None]]:
+    """A function that shows how a subject ended: a bar on a terminal, else a line; both with an estimate of the end."""
+    begun = time.monotonic()
+    left = {job.key: max(job.seconds, 1.0) for job in jobs}
+    total, n_failed = sum(left.values()), 0
+
+    def words(ended: Ended) -> str:
+        left.pop(ended.key, None)
+        rest = sum(left.values())
+        spent = time.monotonic() - begun
+        about = f", about {_time(spent * rest / max(total - rest, 1.0))} left" if left else ""
+        return f"{n_failed} failed{about}"
+
+    def line(ended: Ended) -> str:
+        what = {"done": "done", "missed": f"a promise is missed: {ended.reason}"}.get(ended.status, ended.reason)
+        memory = f", {memory_words(ended.peak_bytes)}" if ended.peak_bytes else ""
+        return f"{ended.key}: {what} ({ended.seconds:.0f} s{memory})"
+
+    if log.is_terminal:
+        columns = TextColumn("subjects"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[words]}")
+        with Progress(*columns, console=log) as bar:
+            task = bar.add_task("", total=len(jobs), words="")
+
+            def show(ended: Ended) -> None:
+                nonlocal n_failed
+                n_failed += ended.status == "failed"
+                if ended.status != "done":
+                    bar.console.print(escape(line(ended)))
+                bar.update(task, advance=1, words=words(ended))
+
+            yield show
+    else:
+
+        def show_line(ended: Ended) -> None:
+            nonlocal n_failed
+            n_failed += ended.status == "failed"
+            rest = words(ended)
+            log.print(escape(f"{line(ended)}; {len(jobs) - len(left)} of {len(jobs)}, {rest}"))
+
+        yield show_line
+
+
+def _close(place: Path, keys: list[str]) -> int:
+    """Write the table and the page, and say what there is; the exit code."""
+    rows = collect(place, keys)
+    save_cohort_files(place, rows)
+    own = [row for row in rows if row.key in set(keys)]
+    counts = Counter[str](row.status for row in own)
+    for row in [row for row in own if row.status == "failed"][:NAMED_FAILURES]:
+        log.print(escape(f"{row.key}: {row.reason}"))
+    words = {"done": "done", "missed": "done, but a promise missed", "failed": "failed", "missing": "not run"}
+    out.print(
+        f"{len(own)} subjects: " + ", ".join(f"{counts[name]} {text}" for name, text in words.items() if counts[name])
+    )
+    for name in ("cohort.html", "cohort.tsv"):
+        out.print(escape(str(place / name)))
+    return 1 if counts["failed"] or counts["missing"] else 0
+
+
+def _say_rerun(code: int) -> None:
+    if code:
+        words = " ".join(shlex.quote(word) for word in sys.argv[1:])
+        log.print(escape(f"to go on with what is missing or failed, and with that alone: tetopt {words}"))
+
+
+def _time(seconds: float) -> str:
+    """A time in words."""
+    if seconds < 120.0:
+        return f"{seconds:.0f} s"
+    return f"{seconds / 60.0:.0f} min" if seconds < 7200.0 else f"{seconds / 3600.0:.1f} h"
