@@ -48,6 +48,7 @@ class Quantity(NamedTuple):
 
 # The least scales are differences that nobody would look at an image for: 5 % of a volume, 1 degree, 0.002 of rho.
 QUANTITIES = (
+    Quantity("thumbnail.likeness", "likeness of its picture to the others'", "", "below", False, 0.01),
     Quantity("energies.E_D_share_of_variance", "E_D's share of the variance", "", "both", True, 0.05),
     Quantity("quality.mean_rho", "mean rho", "", "both", False, 0.002),
     Quantity("quality.min_dihedral", "smallest angle", "degrees", "below", False, 1.0),

@@ -23,6 +23,7 @@ from tetopt.cohort.layout import (
     numbers_path,
     subject_folder,
 )
+from tetopt.cohort.likeness import likenesses
 from tetopt.geometry.box import world_axes
 from tetopt.incoming import toml_of
 from tetopt.io.files import save_json, written_whole
@@ -76,11 +77,16 @@ def collect(out: Path, expected: Sequence[str] | None = None) -> list[Row]:
     Returns
     -------
     list of Row
-        Files that cannot be read make a row that failed. Where a run failed, the numbers of an older mesh beside it
-        are left out.
+        With `thumbnail.likeness` among their numbers (`tetopt.cohort.likeness`). Files that cannot be read make a row
+        that failed. Where a run failed, the numbers of an older mesh beside it are left out.
     """
     keys = {*_keys_there(out), *(expected or ())}
-    return [row_of(out, key) for key in sorted(keys, key=natural_order)]
+    rows = [row_of(out, key) for key in sorted(keys, key=natural_order)]
+    meshes = [row for row in rows if row.status in ("done", "missed")]
+    names = [row.files.get("thumbnail") for row in meshes]
+    for row, likeness in zip(meshes, likenesses([None if name is None else out / name for name in names]), strict=True):
+        row.numbers["thumbnail.likeness"] = likeness
+    return rows
 
 
 def natural_order(text: str) -> list[tuple[int, str]]:

@@ -12,13 +12,13 @@ from typing import Any
 from urllib.parse import quote
 
 from tetopt.cohort.flags import QUANTITIES, Flag, Quantity, flags_of, units
+from tetopt.cohort.likeness import THUMBNAIL_BYTES
 from tetopt.cohort.numbers import Row, Status, Value, description, present, save_table
 from tetopt.model.labels import label_words
 from tetopt.report.page import data_html, paragraph_html, script_html, section_html, table_html, write_page
 
 PAGE_NUMBERS = 1_500_000  # that the page holds at most, some 10 MB: a browser on a phone reads them in seconds
 PAGE_PICTURES = 600  # thumbnails of some 8 kB, 6 MB in base64; with more subjects the flagged ones, and a sample
-THUMBNAIL_BYTES = 32_768  # of one in the page: larger ones are none of ours
 LISTED_FAILURES = 100  # reasons, and subjects of one, above the table that has all
 LISTED_SUBJECTS = 100  # in the table for browsers without scripts
 LISTED_FLAGS = 6  # of a subject; the table in TSV has all
@@ -255,7 +255,8 @@ table.failures td { overflow-wrap: anywhere; min-width: 7rem; }
 .subjects td:last-child { white-space: nowrap; }
 .charts { display: flex; flex-wrap: wrap; gap: 0.8rem 1.4rem; } .chart { width: 230px; font-size: 0.85rem; }
 .chart .title { font-weight: 600; line-height: 1.25; min-height: 2.5em; display: flex; align-items: flex-end; }
-.chart svg { display: block; width: 100%; border-bottom: 1px solid #999; }
+#subjects table:not(.subjects) :is(td, th) { text-align: left; }
+.chart .title { overflow-wrap: anywhere; } .chart svg { display: block; width: 100%; border-bottom: 1px solid #999; }
 .foot { display: flex; justify-content: space-between; color: #555; font-size: 0.8rem; gap: 0.5rem; }
 .foot.texts { justify-content: flex-start; }
 .bar { cursor: pointer; } .bar .back { fill: transparent; } .bar .usual { fill: #7a8fa6; } .bar .far { fill: #d95f02; }
@@ -278,7 +279,8 @@ table.failures td { overflow-wrap: anywhere; min-width: 7rem; }
 .tiles { display: grid; grid-template-columns: repeat(auto-fill, minmax(256px, 1fr)); gap: 0.8rem; font-size: 0.85rem; }
 .tile { padding: 0.3rem; border: 1px solid #ddd; overflow-wrap: anywhere; } .tile.odd { border-color: #d95f02; }
 @media screen and (max-width: 700px) {
-  .chart { width: calc(50% - 0.7rem); } .subjects .picture img { width: 176px; } .subjects td.odd { min-width: 12rem; }
+  .chart { width: calc(50% - 0.7rem); } .subjects .picture img { width: 150px; } .subjects td.odd { min-width: 10rem; }
+  .subjects td, .subjects th { padding: 0.25rem 0.4rem; } .name .badge { display: inline-block; }
   .controls input[type=search] { flex: 1 1 100%; }
 }
 """

@@ -1,0 +1,68 @@
+"""Pictures that are unlike the others: turned, cut off, of another contrast."""
+
+import numpy as np
+import PIL.Image
+import pytest
+from cohorts import run_of, save_run, thumbnail
+
+from tetopt.cohort.flags import flags_of
+from tetopt.cohort.likeness import THUMBNAIL_BYTES, likenesses
+from tetopt.cohort.numbers import collect
+
+
+def saved(path, pixels):
+    PIL.Image.fromarray(pixels.astype(np.uint8)).save(path, "PNG")
+    return path
+
+
+@pytest.fixture
+def usual(tmp_path):
+    """Ten pictures that differ a little."""
+    rng = np.random.default_rng(0)
+    smooth = 120.0 + 100.0 * np.sin(np.arange(128)[:, None] / 20.0) * np.cos(np.arange(256) / 31.0)
+    return [saved(tmp_path / f"{k}.png", np.clip(smooth + rng.normal(0, 9, (128, 256)), 0, 255)) for k in range(10)]
+
+
+def test_likeness_is_the_correlation_with_the_median(usual):
+    blocks = [np.asarray(PIL.Image.open(path), float).reshape(32, 4, 64, 4).mean(axis=(1, 3)).ravel() for path in usual]
+    centred = np.array([(each - each.mean()) / np.linalg.norm(each - each.mean()) for each in blocks])
+    expected = [np.corrcoef(each, np.median(centred, axis=0))[0, 1] for each in blocks]
+    np.testing.assert_allclose(likenesses(usual), expected, rtol=1e-5)
+    assert min(expected) > 0.99
+
+
+def test_contrast_and_brightness_do_not_count_but_turning_does(usual, tmp_path):
+    pixels = np.asarray(PIL.Image.open(usual[0]), float)
+    paler = saved(tmp_path / "paler.png", 100.0 + 0.3 * pixels)
+    turned, inverted = saved(tmp_path / "turned.png", pixels[::-1]), saved(tmp_path / "other.png", 255.0 - pixels)
+    likeness = likenesses([*usual, paler, turned, inverted])
+    assert likeness[-3] > 0.99
+    assert likeness[-1] < -0.9
+    assert likeness[-2] < 0.5
+
+
+def test_what_is_no_picture_of_ours_has_none(usual, tmp_path):
+    (tmp_path / "text.png").write_text("no picture")
+    (tmp_path / "cut.png").write_bytes(usual[0].read_bytes()[:300])
+    (tmp_path / "big.png").write_bytes(bytes(THUMBNAIL_BYTES + 1))
+    small = saved(tmp_path / "small.png", np.arange(64.0).reshape(8, 8))
+    flat = saved(tmp_path / "flat.png", np.full((128, 256), 7))
+    alone = saved(tmp_path / "alone.png", np.arange(128.0 * 128).reshape(128, 128) % 200)  # the only one of its size
+    names = [tmp_path / f"{name}.png" for name in ("text", "cut", "big", "missing")]
+    odd = [*names, small, flat, alone, None]
+    assert likenesses([*odd, *usual])[: len(odd)] == [None] * len(odd)
+    assert likenesses([flat, flat]) == [None, None]
+    assert likenesses([]) == []
+
+
+def test_a_subject_cut_off_is_flagged(tmp_path):
+    """Though its header and its numbers say nothing of it."""
+    rng = np.random.default_rng(3)
+    for k in range(20):
+        save_run(tmp_path, f"sub-{k}", run_of(rng), thumbnail(rng))
+    path = tmp_path / "sub-7" / "figures" / "thumbnail.png"
+    pixels = np.asarray(PIL.Image.open(path).convert("L"))
+    saved(path, np.where(np.arange(128)[:, None] < 64, pixels, 0))
+    flags = flags_of(collect(tmp_path))
+    assert [k for k, each in enumerate(flags) if each] == [7]
+    assert flags[7][0].words.startswith("likeness of its picture to the others' ")
