@@ -8,6 +8,9 @@ from cohorts import run_of, save_run, thumbnail
 from tetopt.cohort.flags import flags_of
 from tetopt.cohort.likeness import THUMBNAIL_BYTES, likenesses
 from tetopt.cohort.numbers import collect
+from tetopt.image import Image
+from tetopt.report.thumbnail import thumbnail_png
+from tetopt.start.lattice import lattice
 
 
 def saved(path, pixels):
@@ -27,7 +30,7 @@ def test_likeness_is_the_correlation_with_the_median(usual):
     blocks = [np.asarray(PIL.Image.open(path), float).reshape(32, 4, 64, 4).mean(axis=(1, 3)).ravel() for path in usual]
     centred = np.array([(each - each.mean()) / np.linalg.norm(each - each.mean()) for each in blocks])
     expected = [np.corrcoef(each, np.median(centred, axis=0))[0, 1] for each in blocks]
-    np.testing.assert_allclose(likenesses(usual), expected, rtol=1e-5)
+    np.testing.assert_allclose([each.likeness for each in likenesses(usual)], expected, rtol=1e-5)
     assert min(expected) > 0.99
 
 
@@ -35,7 +38,7 @@ def test_contrast_and_brightness_do_not_count_but_turning_does(usual, tmp_path):
     pixels = np.asarray(PIL.Image.open(usual[0]), float)
     paler = saved(tmp_path / "paler.png", 100.0 + 0.3 * pixels)
     turned, inverted = saved(tmp_path / "turned.png", pixels[::-1]), saved(tmp_path / "other.png", 255.0 - pixels)
-    likeness = likenesses([*usual, paler, turned, inverted])
+    likeness = [each.likeness for each in likenesses([*usual, paler, turned, inverted])]
     assert likeness[-3] > 0.99
     assert likeness[-1] < -0.9
     assert likeness[-2] < 0.5
@@ -66,3 +69,49 @@ def test_a_subject_cut_off_is_flagged(tmp_path):
     flags = flags_of(collect(tmp_path))
     assert [k for k, each in enumerate(flags) if each] == [7]
     assert flags[7][0].words.startswith("likeness of its picture to the others' ")
+
+
+def body(rng, x=1, y=1, z=1):
+    """A body without symmetry, seen from above and from the side; -1 turns an axis over."""
+    world = np.stack(np.meshgrid(*[np.arange(-20, 21)] * 3, indexing="ij"), axis=-1) + rng.normal(0, 0.7, 3)
+    data = 100.0 * (np.abs(world) < [12, 17, 14]).all(axis=-1)
+    for centre in ([8, 3, 0], [-2, 10, 4], [1, -3, 9]):
+        data += 80.0 * (np.linalg.norm(world - centre, axis=-1) < 5 + rng.normal(0, 0.2))
+    data = (data + rng.normal(0, 4, data.shape))[::x, ::y, ::z]
+    image = Image(np.ascontiguousarray(data), np.eye(4))
+    return thumbnail_png(image, lattice(image, blocks=(2, 2, 2)))
+
+
+@pytest.mark.parametrize(
+    ("turn", "words"), [({"x": -1}, "left and right"), ({"y": -1}, "back and front"), ({"z": -1}, "up and down")]
+)
+def test_a_subject_turned_over_is_flagged(tmp_path, turn, words):
+    """Though its header says nothing of it."""
+    rng = np.random.default_rng(5)
+    for k in range(10):
+        save_run(tmp_path, f"sub-{k}", run_of(rng), body(rng, **(turn if k == 4 else {})))
+    flags = flags_of(collect(tmp_path))
+    assert [flag.words for flag in flags[4]][:1] == [
+        f"its picture is more like the others' with {words} exchanged; 9 of 10 are less so"
+    ]
+    assert [k for k, each in enumerate(flags) if each] == [4]
+
+
+def test_what_is_symmetric_is_not_called_turned(tmp_path):
+    rng = np.random.default_rng(5)
+    for k in range(20):
+        pixels = 100.0 + 80.0 * np.cos((np.arange(256) % 128 - 63.5) / 20) * np.cos(
+            (np.arange(128)[:, None] - 63.5) / 30
+        )
+        save_run(tmp_path, f"sub-{k}", run_of(rng))
+        (tmp_path / f"sub-{k}" / "figures").mkdir(exist_ok=True)
+        saved(tmp_path / f"sub-{k}" / "figures" / "thumbnail.png", pixels + rng.normal(0, 5, (128, 256)))
+    assert flags_of(collect(tmp_path)) == [[]] * 20
+
+
+def test_pictures_of_planes_have_no_up_and_down(tmp_path):
+    flat = np.arange(128.0)[:, None] + np.arange(128) / 2
+    one, other = saved(tmp_path / "a.png", flat), saved(tmp_path / "b.png", flat[::-1])
+    third = likenesses([one, one, other])[2]
+    assert third.back_front > 0.5 > 0.0 > third.left_right
+    assert np.isnan(third.upside_down)

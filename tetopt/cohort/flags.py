@@ -18,7 +18,8 @@ FAR_DEVIATIONS = 5.0
 FEW_SUBJECTS = 8  # with fewer, nothing is said of numbers; also the 8 above
 MAD_OF_NORMAL = 1.482602218505602  # standard deviations of normal numbers to one MAD: 1 / Phi^-1(3/4)
 MAJORITY_SHARE = 2 / 3  # of subjects that agree: with fewer there is nothing that the others differ from
-COMMON_SHARE = 0.9  # of subjects that have a label which is missed in the others: in fewer it is a matter of choice
+COMMON_SHARE = 0.9  # of subjects that have what is missed in the others: in fewer it is a matter of choice
+LEAST_LIKENESS = 0.01  # of the scale of correlations: heads of one size, in one place, differ by as much
 FLOAT_ROUNDING = 1e-9  # deviations by which a number may be beside the limit that it is at
 
 Side = Literal["both", "above", "below"]
@@ -30,9 +31,6 @@ class Flag(NamedTuple):
     column: str  # of `tetopt.cohort.numbers`, or "missed", "label", "duplicate"
     words: str  # the reason, on one line
     score: float  # robust deviations; inf for what is odd without measuring
-    kind: str = (
-        ""  # of what others may have, too: "orientation", "lost label"; the words up to what is the subject's own
-    )
 
 
 class Quantity(NamedTuple):
@@ -48,7 +46,7 @@ class Quantity(NamedTuple):
 
 # The least scales are differences that nobody would look at an image for: 5 % of a volume, 1 degree, 0.002 of rho.
 QUANTITIES = (
-    Quantity("thumbnail.likeness", "likeness of its picture to the others'", "", "below", False, 0.01),
+    Quantity("thumbnail.likeness", "likeness of its picture to the others'", "", "below", False, LEAST_LIKENESS),
     Quantity("energies.E_D_share_of_variance", "E_D's share of the variance", "", "both", True, 0.05),
     Quantity("quality.mean_rho", "mean rho", "", "both", False, 0.002),
     Quantity("quality.min_dihedral", "smallest angle", "degrees", "below", False, 1.0),
@@ -65,6 +63,11 @@ GRID_COLUMNS = {
     "versions.tetopt": "version of tetopt",
 }  # fmt: skip
 
+TURN_WORDS = {
+    "thumbnail.left_right": "left and right exchanged", "thumbnail.back_front": "back and front exchanged",
+    "thumbnail.upside_down": "up and down exchanged",
+}  # fmt: skip
+
 
 def flags_of(rows: Sequence[Row]) -> list[list[Flag]]:
     """What is odd about each of the rows, the oddest first; nothing of those without a mesh.
@@ -78,8 +81,9 @@ def flags_of(rows: Sequence[Row]) -> list[list[Flag]]:
     list of list of Flag
         Of each row: promises that its mesh misses; labels that no cell carries, and labels that 9 of 10 others have
         and its image has not, or the other way round; an image that another subject has, too; another orientation,
-        spacing or shape than two thirds have; numbers more than `limit` robust deviations from the median, of 8 or
-        more subjects. 2-D and 3-D meshes are compared with their like.
+        spacing or shape than two thirds have; a picture that is more like the others' turned over; numbers more than
+        `limit` robust deviations from the median, of 8 or more subjects. 2-D and 3-D meshes are compared each with
+        their like.
     """
     flags: list[list[Flag]] = [[] for _ in rows]
     groups: dict[Value, list[int]] = defaultdict(list)
@@ -89,7 +93,7 @@ def flags_of(rows: Sequence[Row]) -> list[list[Flag]]:
     for ndim, places in groups.items():
         own = [rows[place] for place in places]
         names = {number: name for row in reversed(own) for number, name in row.label_names.items()}
-        for flagged_by in (_promises, _lost, _absent, _doubled, _grids):
+        for flagged_by in (_promises, _lost, _absent, _doubled, _grids, _turned):
             for place, flag in flagged_by(own, names):
                 flags[places[place]].append(flag)
         dimension = 2 if ndim == 2 else 3
@@ -164,6 +168,28 @@ def _grids(rows: Sequence[Row], names: dict[int, str]) -> Flagged:
         for place, text in enumerate(texts):
             if text is not None and text != usual:
                 yield place, Flag(column, f"{words} {text}: {count} of {len(known)} have {usual}", np.inf)
+
+
+def _turned(rows: Sequence[Row], names: dict[int, str]) -> Flagged:
+    """Pictures that are more like the others' turned over, where nearly all others are less so."""
+    for column, words in TURN_WORDS.items():
+        values = [row.numbers.get(column) for row in rows]
+        known = present(values)
+        n_usual = sum(value < 0.0 for value in known)
+        if len(known) < FEW_SUBJECTS or n_usual < COMMON_SHARE * len(known) - FLOAT_ROUNDING:
+            continue  # few, or of a shape that tells no sides apart
+        likeness = present(row.numbers.get("thumbnail.likeness") for row in rows)
+        for place, value in enumerate(values):
+            if isinstance(value, float) and value > 0.0 and _is_like(rows[place], value, likeness):
+                reason = f"its picture is more like the others' with {words}; {n_usual} of {len(known)} are less so"
+                yield place, Flag(column, reason, np.inf)
+
+
+def _is_like(row: Row, margin: float, likeness: list[float]) -> bool:
+    """Whether a picture that is turned over is as like the others' as those are: one that is cut off is not."""
+    turned = present([row.numbers.get("thumbnail.likeness")])[0] + margin
+    score = deviations(np.array([*likeness, turned]), False, LEAST_LIKENESS)[-1]
+    return bool(score > -limit(len(likeness)))
 
 
 def _far(rows: Sequence[Row], names: dict[int, str], ndim: int) -> Flagged:

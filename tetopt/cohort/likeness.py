@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections import defaultdict
 from collections.abc import Sequence
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 import PIL.Image
@@ -18,8 +19,17 @@ THUMBNAIL_BYTES = 32_768  # of one of ours at most: of noise they have half of t
 PICTURE_SIZES = ((SIDE_PIXELS, SIDE_PIXELS), (2 * SIDE_PIXELS, SIDE_PIXELS))  # width and height, in 2-D and 3-D
 
 
-def likenesses(paths: Sequence[Path | None]) -> list[float | None]:
-    """The correlation of each picture with the median of all.
+class Likeness(NamedTuple):
+    """How like a picture is to the median of all, as correlations from -1 to 1."""
+
+    likeness: float
+    left_right: float  # how much more it is like the median with left and right exchanged; usually below 0
+    back_front: float  # likewise
+    upside_down: float  # likewise; nan in 2-D, where front and back are up and down in the picture
+
+
+def likenesses(paths: Sequence[Path | None]) -> list[Likeness | None]:
+    """Compare each picture with the median of all.
 
     Parameters
     ----------
@@ -28,30 +38,45 @@ def likenesses(paths: Sequence[Path | None]) -> list[float | None]:
 
     Returns
     -------
-    list of float or None
-        From -1 to 1, of grey levels averaged over blocks of 4 x 4 pixels, each picture's mean taken off and its
-        norm made 1; None where there is no picture, no other of its size, or it is of one grey.
+    list of Likeness or None
+        Correlations of grey levels averaged over blocks of 4 x 4 pixels; None where there is no picture, no other of
+        its size, or it is of one grey.
     """
-    groups: dict[int, list[int]] = defaultdict(list)
+    groups: dict[tuple[int, ...], list[int]] = defaultdict(list)
     greys: dict[int, NDArray[np.float32]] = {}
     for place, path in enumerate(paths):
         if path is not None and (grey := _grey(path)) is not None:
-            groups[len(grey)].append(place)
+            groups[grey.shape].append(place)
             greys[place] = grey
-    likeness: list[float | None] = [None] * len(paths)
+    likeness: list[Likeness | None] = [None] * len(paths)
     for places in groups.values():
-        if len(places) > 1:
-            step = -(-len(places) // MEDIAN_PICTURES)
-            usual = np.median([greys[place] for place in places[::step]], axis=0)
-            usual = usual - usual.mean()
-            if (size := float(np.linalg.norm(usual))) > 0.0:
-                for place in places:
-                    likeness[place] = float(greys[place] @ usual) / size
+        step = -(-len(places) // MEDIAN_PICTURES)
+        usual = np.median([greys[place] for place in places[::step]], axis=0)
+        if len(places) > 1 and np.ptp(usual) > 0.0:
+            turned = np.array([_centred(each).ravel() for each in (usual, *_turned(usual))])
+            for place in places:
+                own, *others = (turned @ greys[place].ravel()).tolist()
+                margins = [other - own for other in others] + [float("nan")] * (4 - len(turned))
+                likeness[place] = Likeness(own, *margins)
     return likeness
 
 
+def _turned(picture: NDArray[np.floating]) -> list[NDArray[np.floating]]:
+    """The picture with left and right, back and front and, in 3-D, up and down exchanged."""
+    axial, sagittal = picture[:, : len(picture)], picture[:, len(picture) :]
+    pairs = [(axial[:, ::-1], sagittal), (axial[::-1], sagittal[:, ::-1])]
+    pairs += [(axial, sagittal[::-1])] if sagittal.size else []
+    return [np.hstack(pair) for pair in pairs]
+
+
+def _centred(picture: NDArray[np.floating]) -> NDArray[np.floating]:
+    """The picture with mean 0 and norm 1; zeros for one grey."""
+    centred = picture - picture.mean()
+    return centred / (np.linalg.norm(centred) or 1.0)
+
+
 def _grey(path: Path) -> NDArray[np.float32] | None:
-    """A picture's blocks (K,), of mean 0 and norm 1; None if it is none of ours, or the same everywhere."""
+    """A picture's blocks, (32, 32 or 64), of mean 0 and norm 1; None if it is none of ours, or the same everywhere."""
     try:
         if path.stat().st_size > THUMBNAIL_BYTES:
             return None
@@ -63,6 +88,4 @@ def _grey(path: Path) -> NDArray[np.float32] | None:
         return None
     height, width = grey.shape
     blocks = grey.reshape(height // BLOCK_PIXELS, BLOCK_PIXELS, width // BLOCK_PIXELS, BLOCK_PIXELS).mean(axis=(1, 3))
-    centred = (blocks - blocks.mean()).ravel()
-    size = float(np.linalg.norm(centred))
-    return centred / np.float32(size) if size > 0.0 else None
+    return _centred(blocks).astype(np.float32) if np.ptp(blocks) > 0.0 else None

@@ -77,15 +77,16 @@ def collect(out: Path, expected: Sequence[str] | None = None) -> list[Row]:
     Returns
     -------
     list of Row
-        With `thumbnail.likeness` among their numbers (`tetopt.cohort.likeness`). Files that cannot be read make a row
-        that failed. Where a run failed, the numbers of an older mesh beside it are left out.
+        With those of `tetopt.cohort.likeness` among their numbers. Files that cannot be read make a row that failed.
+        Where a run failed, the numbers of an older mesh beside it are left out.
     """
     keys = {*_keys_there(out), *(expected or ())}
     rows = [row_of(out, key) for key in sorted(keys, key=natural_order)]
     meshes = [row for row in rows if row.status in ("done", "missed")]
     names = [row.files.get("thumbnail") for row in meshes]
     for row, likeness in zip(meshes, likenesses([None if name is None else out / name for name in names]), strict=True):
-        row.numbers["thumbnail.likeness"] = likeness
+        if likeness is not None:
+            row.numbers.update((f"thumbnail.{name}", _scalar(value)) for name, value in likeness._asdict().items())
     return rows
 
 
