@@ -925,7 +925,7 @@ def test_many_more_cells_than_voxels_are_said(tmp_path, capsys):
         (["--method", "paper"], "only with --method fast"),
         (["--spacing", "3"], "no one spacing"),
         (["--uniform"], "--uniform and --lattice octree: give one of them"),
-        (["--nodes", "3"], "9 or more in 3-D, got 3"),
+        (["--nodes", "7"], "9 or more in 3-D, got 7"),
         (["--nodes", "900000"], "too many for 16 x 16 x 16 voxels"),
         (["--nodes", "500", "--target-error", "0.1"], "--nodes and --target-error: give one of them"),
         (["--target-error", "1.5"], "expected a share of the image's variance, 0 to 1, got 1.5"),
