@@ -39,14 +39,15 @@ def test_commands(tmp_path, monkeypatch):
     lines = [
         line
         for line in README.splitlines()
-        if re.match("tetopt (mesh|quality|phantom|fem|segment|convert|surface|view) ", line)
+        if re.match("tetopt (mesh|cohort|quality|phantom|fem|segment|convert|surface|view) ", line)
     ]
-    assert len(lines) == 19
+    assert len(lines) == 21
     monkeypatch.chdir(tmp_path)
     assert main(["phantom", "sphere", "-o", "T1.nii.gz", "--voxel-mm", "2", "--labels", "mask.nii.gz"]) == 0
     shutil.copy("T1.nii.gz", "T2.nii.gz")
     shutil.copy("mask.nii.gz", "tissues.nii.gz")
     Path("tissues.csv").write_text("label,name\n1,grey matter\n")
+    Path("subjects.tsv").write_text("subject\timage\n01\tT1.nii.gz\n02\tT2.nii.gz\n")
     for line in lines:
         words = shlex.split(line, comments=True)[1:]
         words = ["200" if before == "--nodes" else word for before, word in zip(["", *words], words, strict=False)]
@@ -74,6 +75,8 @@ def test_commands(tmp_path, monkeypatch):
         "look.html",
         "run.json",
         "sphere.nii.gz",
+        "subjects.tsv",
+        "OUT",
         "slice.png",
         "rho.png",
         "energies.png",
