@@ -57,7 +57,8 @@ def test_raw_images_of_the_suffix_by_subject_and_session(tmp_path):
     assert subjects[2].place == "sub-02/anat/sub-02_T1w.nii.gz"
     assert subjects[2].files == subjects[2].options == {}
     assert rows(bids_subjects(folder, "T2w", ["sub-02"]), folder) == [("02", "", "sub-02/anat/sub-02_T2w.nii.gz")]
-    chosen = bids_subjects(folder, sessions=["ses-b"], participants=["01"])
+    with pytest.warns(UserWarning, match=r"left out, without _T1w in ses-b: 1 \(sub-02\)"):
+        chosen = bids_subjects(folder, sessions=["ses-b"])
     assert rows(chosen, folder) == [("01", "b", "sub-01/ses-b/anat/sub-01_ses-b_T1w.nii")]
 
 
