@@ -1,10 +1,12 @@
 """The BIDS app's arguments, as those of `tetopt cohort`."""
 
 import pytest
+from models import sample_image
 
 import tetopt
 from tetopt import InputError
 from tetopt.bids import cohort_words, main
+from tetopt.cohort.layout import begin, description, locked
 
 PLACES = ["/data", "/out", "participant"]
 
@@ -42,6 +44,31 @@ def test_arguments_that_are_none(arguments, capsys):
         cohort_words(arguments)
     assert main(arguments) == 2
     assert capsys.readouterr().err.count("\n") >= 1
+
+
+def test_runs_beside_others_and_the_group_after_them(tmp_path, capsys):
+    """One subject while another run has another's lock; the group waits for that, and tells of it."""
+    raw, out = tmp_path / "raw", tmp_path / "out"
+    for label in ("01", "02"):
+        (raw / f"sub-{label}" / "anat").mkdir(parents=True)
+        tetopt.save_image(raw / f"sub-{label}" / "anat" / f"sub-{label}_T1w.nii", sample_image(3))
+    (raw / "dataset_description.json").write_text('{"Name": "x", "BIDSVersion": "1.8.0"}')
+    begin(out, description("meshes", []))
+    with locked(out, ["sub-02"]):
+        options = ["--nodes", "60", "--iterations", "1"]
+        assert main([str(raw), str(out), "participant", "--participant_label", "02", *options]) == 2
+        assert "sub-02: another run writes there" in capsys.readouterr().err
+        assert main([str(raw), str(out), "participant", "--participant_label", "01", *options]) == 0
+        capsys.readouterr()
+        assert main([str(raw), str(out), "group"]) == 2
+        assert "another run writes there" in capsys.readouterr().err
+    (out / "cohort.tsv").unlink()
+    assert main([str(raw), str(out), "group"]) == 1
+    assert "1 done, 1 not run" in capsys.readouterr().out
+    assert [line.split("\t")[0] for line in (out / "cohort.tsv").read_text().splitlines()[1:]] == ["sub-01", "sub-02"]
+    assert (out / "sub-01" / "sub-01_desc-tetopt_mesh.vtu").exists()
+    assert main([str(raw), str(out), "group", "--dry-run"]) == 2
+    assert "--collect runs nothing" in capsys.readouterr().err
 
 
 def test_help_and_version(capsys):

@@ -5,7 +5,6 @@ from __future__ import annotations
 import contextlib
 import secrets
 import shlex
-import sys
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
@@ -14,6 +13,7 @@ from os import cpu_count
 from pathlib import Path
 from typing import NamedTuple
 
+import typer
 from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
@@ -39,13 +39,14 @@ from tetopt.cohort.numbers import collect
 from tetopt.cohort.page import save_cohort_files
 from tetopt.cohort.run import Ended, Job
 from tetopt.cohort.schedule import SchedulerLost, run_all
-from tetopt.cohort.subjects import TABLE_SUFFIXES, Problems, write_table
+from tetopt.cohort.subjects import TABLE_SUFFIXES, Problems, key, write_table
 from tetopt.cohort.workers import Folders, Need, shares, workers
 from tetopt.engine.cost import Prediction, RunSize, calibrated_speed, predicted
 from tetopt.errors import InputError
 from tetopt.io.files import checked_output
 
 NAMED_FAILURES = 20  # on the terminal: the table and the page have all
+MOST_BESIDE = 200  # subjects of a run beside others in one folder, each with a lock: a process has 1024 files at most
 LIKE_TRIES = 3  # subjects of a kind that are read to see what headers do not tell, until one can be
 
 
@@ -61,6 +62,7 @@ class Estimate(NamedTuple):
 
 
 def cohort_command(
+    context: typer.Context,
     subjects: SubjectsArgument,
     cohort: CohortOptions,
     content: ContentOptions,
@@ -72,11 +74,15 @@ def cohort_command(
     """Mesh many subjects of a table or a BIDS folder, on this machine or a cluster; go on where it ended."""
     suffix = checked_suffix(cohort.mesh_format)
     place, records = cohort.output, Records(content, sizes, start, engine, solver)
+    if cohort.collect and (cohort.write_table is not None or cohort.dry_run or cohort.retry_failed):
+        raise InputError("--collect runs nothing; leave it out, or --write-table, --dry-run and --retry-failed")
     if cohort.write_table is not None:
         checked_output(cohort.write_table, TABLE_SUFFIXES)
     check_out(place)
     try:
         rows = subjects_of(subjects, cohort)
+        if cohort.collect:
+            return _collected(place, subjects, [key(row) for row in rows])
         entries = entries_of(rows, records, place, suffix, log.print)
     except Problems as problems:
         for line in problems.lines:
@@ -93,17 +99,31 @@ def cohort_command(
     if cohort.dry_run:
         _say_estimate(to_run, estimate, cohort, engine.threads)
         return 0
-    begin(place, description("Tetrahedral meshes by tetopt", [subjects.absolute().as_posix()]))
-    with locked(place):
-        restore(place)
+    keys = [entry.key for entry in entries]
+    alone = keys if cohort.participants and len(keys) <= MOST_BESIDE else None  # beside runs of others, one folder's
+    _begin(place, subjects)
+    with locked(place, alone):
+        restore(place, alone)
         try:
             if to_run:
                 _run(to_run, estimate, cohort, suffix, engine.threads)
-                restore(place)
+                restore(place, alone)
         finally:  # also on Ctrl-C: what is done is seen
-            code = _close(place, [entry.key for entry in entries])
-            _say_rerun(code)
+            code = _close(place, keys)
+            _say_rerun(code, context.obj)
     return code
+
+
+def _begin(place: Path, subjects: Path) -> None:
+    begin(place, description("Tetrahedral meshes by tetopt", [subjects.absolute().as_uri()]))
+
+
+def _collected(place: Path, subjects: Path, keys: list[str]) -> int:
+    """The table and the page of what is there, with nothing run; the exit code."""
+    _begin(place, subjects)
+    with locked(place):
+        restore(place)
+        return _close(place, keys)
 
 
 def _say_plan(entries: Sequence[Entry], to_run: Sequence[Entry], only_failed: bool) -> None:
@@ -264,9 +284,9 @@ def _close(place: Path, keys: list[str]) -> int:
     return 1 if counts["failed"] or counts["missing"] else 0
 
 
-def _say_rerun(code: int) -> None:
+def _say_rerun(code: int, arguments: Sequence[str]) -> None:
     if code:
-        words = " ".join(shlex.quote(word) for word in sys.argv[1:])
+        words = " ".join(map(shlex.quote, arguments))
         log.print(escape(f"to go on with what is missing or failed, and with that alone: tetopt {words}"))
 
 

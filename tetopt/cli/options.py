@@ -426,6 +426,9 @@ class CohortOptions:
     retry_failed: Annotated[
         bool, typer.Option("--retry-failed", help="Run only those that failed; what has changed stays as it is.")
     ] = False
+    collect: Annotated[
+        bool, typer.Option("--collect", help="Write the table and the page of what is there; run nothing.")
+    ] = False
     count: Annotated[
         int | None, option("N", "So many subjects at a time, or jobs of a --cluster, at most.", "--workers", min=1)
     ] = None
