@@ -94,9 +94,7 @@ def test_workers_of_this_machine(folders, capfd):
         ):
             pass
         assert isinstance(crew.client.submit(killed, pure=False).exception(), KilledWorker)
-        ended = time.monotonic() + 30
-        while crew.slots() < 1 and time.monotonic() < ended:
-            time.sleep(0.05)
+        until(lambda: crew.slots() == 1)
         worker = crew.client.submit(noisy, pure=False).result()
         assert Path("/proc", str(worker)).exists()
     assert [words for words in processes() if words not in before and b"resource_tracker" not in words] == []
@@ -327,19 +325,13 @@ def batch(tmp_path, monkeypatch):
     return put
 
 
-def waited(crew):
-    ended = time.monotonic() + 60
-    while crew.slots() < 1 and time.monotonic() < ended:
-        time.sleep(0.05)
-
-
 @pytest.mark.parametrize(
     ("command", "words"),
     [
         ("echo no such partition >&2; exit 1", "the batch system takes no job: no such partition"),
         (
             "sh $1 >/dev/null 2>&1; echo Submitted batch job 7",
-            "jobs ended as they began; their logs in in",
+            "jobs ended as they began; their logs in",
         ),
     ],
 )
@@ -350,9 +342,48 @@ def test_a_cluster_without_hope_is_given_up(command, words, batch, folders, tmp_
     with running(Need(9, 1.0, None), folders, count=2, cluster=path) as crew:
         assert crew.words.startswith("up to 2 jobs of slurm, each of 4 cores and ")
         with pytest.raises(InputError, match=words):
-            waited(crew)
+            until(lambda: crew.slots() > 0)
     assert list(folders.work.iterdir()) == []
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.mark.slow
+def test_jobs_are_replaced_and_given_back(batch, folders, tmp_path, monkeypatch):
+    """A batch system of two scripts. A job that is killed has a successor; one that nothing is left for goes."""
+    mine = tmp_path / "jobs"
+    mine.mkdir()
+    copied = f"script={tmp_path}/$$.sh; cp $1 $script"  # as sbatch does: dask-jobqueue removes its own
+    batch("sbatch", f"{copied}; setsid bash $script >/dev/null 2>&1 & touch {mine}/$!; echo Submitted batch job $!")
+    batch("scancel", f"rm -f {mine}/$1; kill -9 -$1")
+    monkeypatch.setattr(jobs, "IDLE_SECONDS", 2.0)
+    path = written(tmp_path, "jobqueue: {slurm: {processes: 2, cores: 2}}")
+    with (
+        dask.config.set({"distributed.deploy.lost-worker-timeout": "1s"}),
+        running(Need(5, 1.0, None), folders, count=1, cluster=path) as crew,
+    ):
+        until(lambda: crew.slots() == 2)
+        (first,) = mine.iterdir()
+        os.killpg(int(first.name), signal.SIGKILL)
+        until(lambda: crew.slots() == 0)
+        until(lambda: crew.slots() == 2)
+        assert not first.exists()
+    assert list(mine.iterdir()) == []
+    path = written(tmp_path, "jobqueue: {slurm: {cores: 1}}")
+    with running(Need(2, 1.0, None), folders, count=2, cluster=path) as crew:
+        until(lambda: crew.slots() == 2)
+        last = crew.client.submit(time.sleep, 6)
+        until(lambda: len(list(mine.iterdir())) == 1)
+        assert last.result() is None
+        assert last.status == "finished"
+        until(lambda: crew.slots() == 2)  # as many again, once there is something to begin
+    assert list(mine.iterdir()) == []
+
+
+def until(condition):
+    ended = time.monotonic() + 60
+    while not condition():
+        assert time.monotonic() < ended
+        time.sleep(0.1)
 
 
 def test_a_cluster_whose_commands_are_not_there_is_refused(folders, tmp_path, monkeypatch):

@@ -40,6 +40,7 @@ JOBS_AT_ONCE = 20  # where --workers does not say: a cluster's other users wait 
 JOB_CORES = 4  # of a job where neither its file nor --threads says
 QUEUE_SECONDS = 5.0  # between two looks at the jobs: a scheduler starts them no faster
 IDLE_SECONDS = 60.0  # without a subject to begin, after which jobs that run none are given back
+AGAIN_SECONDS = 60.0  # after a job that was refused when others were not, until the next is submitted
 MOST_LOST = 3  # jobs that ended before their worker was there, one after the other: they are not going to be better
 # Keys that dask-jobqueue still takes under their old names, with a warning.
 OLD_KEYS = {"extra", "job-extra", "env-extra"}
@@ -237,7 +238,7 @@ def _watched(job_cls: Any, folder: Path, prologue: list[str]) -> Any:
     class Watched(job_cls):
         def __init__(self, *arguments: Any, name: Any = None, **names: Any) -> None:
             self.failure: str | None = None
-            self.is_seen = False  # whether its worker was there
+            self.seen_at: float | None = None  # when one of its workers was there last
             self.ended = folder / f"{name}.ended"
             lines = [f"trap 'touch {self.ended} 2>/dev/null' EXIT", *prologue]
             super().__init__(*arguments, name=name, job_script_prologue=lines, **names)
@@ -262,12 +263,18 @@ class Keeper:
     """Sees to it that there are as many jobs as are needed; it looks at them in the event loop of the cluster."""
 
     def __init__(self, cluster: Any, n_jobs: int, newcomers: Newcomers, logs: Path) -> None:
+        import dask
+        from dask.utils import parse_timedelta
         from tornado.ioloop import PeriodicCallback
 
         self.cluster, self.n_most, self.n_jobs = cluster, n_jobs, n_jobs
         self.newcomers, self.logs = newcomers, logs
         self.n_lost = 0  # jobs that ended before their worker was there, since one was
         self.failure: str | None = None
+        self.has_begun = False  # whether a worker ever came
+        self.again_at = 0.0  # when to submit again
+        # Of a job all of whose workers have gone; a nanny starts those again that crash, in a second.
+        self.patience = parse_timedelta(dask.config.get("distributed.deploy.lost-worker-timeout"))
         self.asked_at = time.monotonic()
         self.timer = PeriodicCallback(self.look, 1000.0 * QUEUE_SECONDS)
         cluster.scale(jobs=n_jobs)
@@ -292,25 +299,26 @@ class Keeper:
         cluster = self.cluster
         connected = {str(worker.name) for worker in cluster.scheduler.workers.values()}
         busy = {str(worker.name) for worker in cluster.scheduler.workers.values() if worker.processing}
-        refused = []
+        now, refused = time.monotonic(), []
         for name, job in list(cluster.workers.items()):
             if connected & self._names(name):
-                if not job.is_seen:
-                    self.n_lost, self.failure, job.is_seen = 0, None, True
+                self.n_lost, self.failure, self.has_begun, job.seen_at = 0, None, True, now
             elif job.failure is not None:
                 refused.append(job.failure)
                 del cluster.workers[name]
-            elif job.ended.exists() and not job.is_seen:
-                self.n_lost += 1
+            elif job.ended.exists() if job.seen_at is None else now - job.seen_at > self.patience:
+                self.n_lost += job.seen_at is None
                 del cluster.workers[name]
                 await job.close()
-        if refused and not cluster.workers:
+        if refused:  # once more later: a batch system may restart, or take no more at a time
+            self.again_at = now + AGAIN_SECONDS
+        if refused and not cluster.workers and not self.has_begun:
             self.failure = f"the batch system takes no job: {refused[0]}"
         if self.n_lost >= MOST_LOST:
             self.failure = f"{self.n_lost} jobs ended as they began; their logs in {self.logs} say why"
-        if self.failure is not None:
+        if self.failure is not None or now < self.again_at:
             return
-        if time.monotonic() - self.asked_at > IDLE_SECONDS:
+        if now - self.asked_at > IDLE_SECONDS:
             idle = [name for name in cluster.worker_spec if not busy & self._names(name)]
             self.n_jobs = max(1, len(cluster.worker_spec) - len(idle))
             await cluster.scale_down(idle[: len(cluster.worker_spec) - self.n_jobs])
