@@ -15,6 +15,8 @@ import pytest
 from commands import exit_code
 
 import tetopt
+import tetopt.cli.cohort
+from tetopt.cohort.layout import begin, description
 
 COMMON = ("--iterations", "1", "--nodes", "60")
 N_SUBJECTS = 12
@@ -245,3 +247,15 @@ def test_a_dry_run_tells_what_it_takes(small, capsys):
     assert re.search(r"sub-01: \d+ s on a thread, \d+ MB|sub-01: \d+ s on a thread, 0\.\d+ GB", words)
     assert "in all" in words
     assert not (small / "out").exists()
+
+
+def test_the_page_of_a_run_under_way(tmp_path, monkeypatch):
+    """It is written now and then: not at each subject, and again when its time has come."""
+    place = tmp_path / "out"
+    begin(place, description("test", []))
+    refresh = tetopt.cli.cohort._refresher(place)
+    refresh()
+    assert not (place / "cohort.html").exists()
+    monkeypatch.setattr(tetopt.cli.cohort, "PAGE_SECONDS", 0.0)
+    refresh()
+    assert (place / "cohort.html").exists()

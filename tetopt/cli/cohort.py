@@ -47,6 +47,8 @@ from tetopt.io.files import checked_output
 
 NAMED_FAILURES = 20  # on the terminal: the table and the page have all
 MOST_BESIDE = 200  # subjects of a run beside others in one folder, each with a lock: a process has 1024 files at most
+PAGE_SECONDS = 60.0  # between the table and page of a run under way and the next: nobody looks more often
+PAGE_SHARE = 0.05  # of the run's time that they may take
 LIKE_TRIES = 3  # subjects of a kind that are read to see what headers do not tell, until one can be
 
 
@@ -210,13 +212,31 @@ def _run(to_run: Sequence[Entry], estimate: Estimate, cohort: CohortOptions, suf
         ) as pool:
             log.print(escape(pool.words))
             jobs = [_job(entry, estimate, place, suffix, pool.threads, alive.name) for entry in to_run]
-            with _progress(jobs) as show:
+            jobs.sort(key=lambda job: -job.seconds)  # so that no long one is left alone at the end
+            refresh = _refresher(place)
+            with _progress(jobs, pool.slots()) as show:
                 for ended in run_all(jobs, pool.client, pool.slots, pool.bytes):
                     show(ended)
+                    refresh()
     except SchedulerLost as lost:
         show_error(f"{lost}; what was finished is in its place")
     finally:
         alive.unlink(missing_ok=True)
+
+
+def _refresher(place: Path) -> Callable[[], None]:
+    """A function that writes the table and the page of what is there by now, now and then."""
+    last, spent = time.monotonic(), 0.0
+
+    def refresh() -> None:
+        nonlocal last, spent
+        begun = time.monotonic()
+        if begun - last > max(PAGE_SECONDS, spent / PAGE_SHARE):
+            save_cohort_files(place, collect(place))
+            last = time.monotonic()
+            spent = last - begun
+
+    return refresh
 
 
 def _job(entry: Entry, estimate: Estimate, place: Path, suffix: str, threads: int, run: str) -> Job:
@@ -225,11 +245,12 @@ def _job(entry: Entry, estimate: Estimate, place: Path, suffix: str, threads: in
 
 
 @contextlib.contextmanager
-def _progress(jobs: Sequence[Job]) -> Iterator[Callable[[Ended], None]]:
+def _progress(jobs: Sequence[Job], n_at_once: int) -> Iterator[Callable[[Ended], None]]:
     """A function that shows how a subject ended: a bar on a terminal, else a line; both with an estimate of the end."""
     begun = time.monotonic()
     left = {job.key: max(job.seconds, 1.0) for job in jobs}
     total, n_failed = sum(left.values()), 0
+    at_first = f"about {_time(total / max(n_at_once, 1))} left, as predicted"
 
     def words(ended: Ended) -> str:
         left.pop(ended.key, None)
@@ -246,7 +267,7 @@ def _progress(jobs: Sequence[Job]) -> Iterator[Callable[[Ended], None]]:
     if log.is_terminal:
         columns = TextColumn("subjects"), BarColumn(), MofNCompleteColumn(), TextColumn("{task.fields[words]}")
         with Progress(*columns, console=log) as bar:
-            task = bar.add_task("", total=len(jobs), words="")
+            task = bar.add_task("", total=len(jobs), words=at_first)
 
             def show(ended: Ended) -> None:
                 nonlocal n_failed
@@ -257,6 +278,7 @@ def _progress(jobs: Sequence[Job]) -> Iterator[Callable[[Ended], None]]:
 
             yield show
     else:
+        log.print(at_first)
 
         def show_line(ended: Ended) -> None:
             nonlocal n_failed
