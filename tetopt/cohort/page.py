@@ -76,7 +76,8 @@ def save_cohort_page(path: Path, out: Path, rows: Sequence[Row], flags: Sequence
     parts = [*_summary(rows, flags), *_failures(rows)]
     pictures = _pictures(out, rows, flags)
     names, left_out = _columns(rows)
-    note = f"Pictures are {PICTURE_WORDS}, with the mesh over the image."
+    is_solid = any(row.numbers.get("quality.ndim") == 3 for row in rows)
+    note = f"Pictures are {PICTURE_WORDS}, with the mesh over the image." if is_solid else ""
     n_pictures = sum(picture is not None for picture in pictures)
     if n_pictures < sum("thumbnail" in row.files for row in rows):
         note += (
@@ -104,7 +105,7 @@ def _summary(rows: Sequence[Row], flags: Sequence[Sequence[Flag]]) -> list[str]:
                                          ("memory.peak_bytes", "bytes", max, "and the largest one had")):  # fmt: skip
         if values := present(row.numbers.get(name) for row in rows):
             text += f" {beginning} {units(unit, 3)(total(values))}" + ("" if unit == "s" else ".")
-    common = [f"{name.rpartition('.')[2]} {value}" for name, value in _common(rows).items()]
+    common = [f"{name.rpartition('.')[2]} {_shown(value)}" for name, value in _common(rows).items()]
     parts = [paragraph_html(text)]
     if common:
         parts.append(paragraph_html(f"Of all meshes: {', '.join(common)}."))
@@ -281,6 +282,7 @@ table.failures td { overflow-wrap: anywhere; min-width: 7rem; }
 @media screen and (max-width: 700px) {
   .chart { width: calc(50% - 0.7rem); } .subjects .picture img { width: 150px; } .subjects td.odd { min-width: 10rem; }
   .subjects td, .subjects th { padding: 0.25rem 0.4rem; } .name .badge { display: inline-block; }
+  .subjects td:first-child { min-width: 150px; white-space: normal; overflow-wrap: anywhere; }
   .controls input[type=search] { flex: 1 1 100%; }
 }
 """

@@ -40,12 +40,12 @@ function drawing(name, attributes, ...children) {
 const isNumber = (value) => typeof value === "number";
 const valueOf = (row, c) => row[FIRST + c];
 
-function written(value, unit) {
+function written(value, unit, digits = 3) {
   if (!isNumber(value)) return value === null || value === "" ? "–" : String(value);
   const steps = STEPS[unit] || [[1, ""]];
   const [factor, word] = steps.find(([least]) => Math.abs(value) >= least) || steps[steps.length - 1];
   const number = value / factor;
-  const text = Number.isInteger(number) ? number.toLocaleString("en") : String(Number(number.toPrecision(3)));
+  const text = Number.isInteger(number) ? number.toLocaleString("en") : String(Number(number.toPrecision(digits)));
   return word === "°" ? text + word : word ? `${text} ${word}` : text;
 }
 
@@ -242,7 +242,9 @@ function chartOf(c) {
     bar.onkeydown = (event) => { if (event.key === "Enter" || event.key === " ") { event.preventDefault(); choose(); } };
     svg.append(bar);
   });
-  const feet = isText ? bins.slice(0, 4).map((bin) => bin.words) : [written(bins[0].ends[0], column.unit), written(bins[bins.length - 1].ends[1], column.unit)];
+  const ends = (digits) => [bins[0].ends[0], bins[bins.length - 1].ends[1]].map((end) => written(end, column.unit, digits));
+  const isNear = !isText && ends(3)[0] === ends(3)[1];
+  const feet = isText ? bins.slice(0, 4).map((bin) => bin.words) : ends(isNear ? 5 : 3);
   const foot = element("div", { className: isText ? "foot texts" : "foot" }, ...feet.map((words) => element("span", { textContent: words })));
   const title = element("div", { className: "title", textContent: column.title, title: column.about });
   return element("div", { className: "chart" }, title, svg, foot);
