@@ -44,6 +44,21 @@ def test_contrast_and_brightness_do_not_count_but_turning_does(usual, tmp_path):
     assert likeness[-2] < 0.5
 
 
+def test_each_turn_is_that_of_both_views(usual, tmp_path):
+    """A picture turned over is as like the others' turned over as it was like them before."""
+    pixels = np.asarray(PIL.Image.open(usual[0]), float)
+    axial, sagittal = pixels[:, :128], pixels[:, 128:]
+    turned = {
+        "left_right": (axial[:, ::-1], sagittal), "back_front": (axial[::-1], sagittal[:, ::-1]),
+        "upside_down": (axial, sagittal[::-1]),
+    }  # fmt: skip
+    before = likenesses(usual)[0].likeness
+    for name, views in turned.items():
+        own = likenesses([*usual, saved(tmp_path / f"{name}.png", np.hstack(views))])[-1]
+        assert getattr(own, name) > 0.0
+        assert own.likeness + getattr(own, name) == pytest.approx(before, abs=0.01)
+
+
 def test_what_is_no_picture_of_ours_has_none(usual, tmp_path):
     (tmp_path / "text.png").write_text("no picture")
     (tmp_path / "cut.png").write_bytes(usual[0].read_bytes()[:300])
@@ -52,7 +67,7 @@ def test_what_is_no_picture_of_ours_has_none(usual, tmp_path):
     flat = saved(tmp_path / "flat.png", np.full((128, 256), 7))
     alone = saved(tmp_path / "alone.png", np.arange(128.0 * 128).reshape(128, 128) % 200)  # the only one of its size
     names = [tmp_path / f"{name}.png" for name in ("text", "cut", "big", "missing")]
-    odd = [*names, small, flat, alone, None]
+    odd = [*names, small, small, flat, alone, None]
     assert likenesses([*odd, *usual])[: len(odd)] == [None] * len(odd)
     assert likenesses([flat, flat]) == [None, None]
     assert likenesses([]) == []
@@ -107,6 +122,13 @@ def test_what_is_symmetric_is_not_called_turned(tmp_path):
         (tmp_path / f"sub-{k}" / "figures").mkdir(exist_ok=True)
         saved(tmp_path / f"sub-{k}" / "figures" / "thumbnail.png", pixels + rng.normal(0, 5, (128, 256)))
     assert flags_of(collect(tmp_path)) == [[]] * 20
+
+
+def test_where_many_are_turned_over_none_is_the_odd_one(tmp_path):
+    rng = np.random.default_rng(5)
+    for k in range(10):
+        save_run(tmp_path, f"sub-{k}", run_of(rng), body(rng, y=-1 if k < 3 else 1))
+    assert [flag for each in flags_of(collect(tmp_path)) for flag in each if "exchanged" in flag.words] == []
 
 
 def test_pictures_of_planes_have_no_up_and_down(tmp_path):
