@@ -127,6 +127,8 @@ def test_numbers_that_are_the_same_are_measured_by_the_least_scale():
         "volume of the mask 0 mm^3: far below the median 1 mm^3"
     ]
     assert flags_of_column("mask.volume", np.zeros(10)) == [[]] * 10
+    with np.errstate(all="raise"):
+        assert flags_of_column("mask.volume", np.r_[np.zeros(6), np.ones(4)]) == [[]] * 10
 
 
 def flags_of_column(column, values):

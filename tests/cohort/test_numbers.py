@@ -74,9 +74,10 @@ def test_numbers_that_are_none_are_a_failure(tmp_path, text):
 
 
 def test_a_failure_is_told_instead_of_an_older_mesh(tmp_path):
-    save_run(tmp_path, "sub-1", run_of(RNG))
+    save_run(tmp_path, "sub-1", run_of(RNG), b"")
     save_failure(tmp_path, "sub-1", HOSTILE)
     [row] = collect(tmp_path)
+    assert row.files == {"log": "logs/sub-1.log"}
     assert (row.status, set(row.numbers)) == (
         "failed", {f"failure.{name}" for name in ("attempts", "seconds", "peak_bytes", "predicted_bytes")}
     )  # fmt: skip

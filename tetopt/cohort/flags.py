@@ -245,11 +245,10 @@ def deviations(values: np.ndarray, is_log: bool, least: float) -> np.ndarray:
     >>> deviations(np.array([1.0, 1.0, 1.0, 2.0]), False, 0.1).tolist()
     [0.0, 0.0, 0.0, 10.0]
     """
-    with np.errstate(divide="ignore"):
+    with np.errstate(divide="ignore", invalid="ignore"):  # most at -inf: nan, which is not far
         x = np.log(np.maximum(values, 0.0)) if is_log else values
-    middle = np.median(x[np.isfinite(x)])
-    distance = x - middle
-    return distance / max(MAD_OF_NORMAL * float(np.median(np.abs(distance))), least)
+        distance = x - np.median(x[np.isfinite(x)])
+        return distance / max(MAD_OF_NORMAL * float(np.median(np.abs(distance))), least)
 
 
 def limit(n: int) -> float:

@@ -127,7 +127,8 @@ def row_of(out: Path, key: str) -> Row:
     if (path := failure_path(out, key)).exists():
         failure = numbers_of(path) or {"reason": f"{path.name} cannot be read"}
         numbers = {f"failure.{name}": _scalar(failure[name]) for name in FAILURE_COLUMNS if name in failure}
-        return row._replace(status="failed", reason=plain(str(failure.get("reason", ""))), numbers=numbers)
+        own = {name: file for name, file in files.items() if name == "log"}  # the rest is of an older mesh
+        return row._replace(status="failed", reason=plain(str(failure.get("reason", ""))), numbers=numbers, files=own)
     if "numbers" not in files:
         return row
     run = numbers_of(places["numbers"])
