@@ -37,8 +37,13 @@ from tetopt.io.images import cropped
 from tetopt.io.mni import mni_path, mni_tissue
 
 # Name and words of each run; those with a star are left out of the fit. {data} is the folder of development data.
+# Of those that are bare no pictures are drawn.
 RUNS = """
 crop48_1k            {crop48} --nodes 1000
+crop48_1k_bare       {crop48} --nodes 1000
+half_5k_bare         {half} --nodes 5000
+half_labels_5k_bare  {half} --labels {half_labels} --nodes 5000
+t1_5k_bare           {t1}
 half_5k              {half} --nodes 5000
 half_20k             {half} --nodes 20000
 half_mask_5k         {half} --mask {half_mask} --nodes 5000
@@ -214,8 +219,9 @@ def run(name: str, threads: int, words: list[str], base: Path) -> Row:
     """One run as a process of its own; what it took, and the sizes that it says it had."""
     base.mkdir(exist_ok=True)
     numbers = base / "run.json"
+    numbers.unlink(missing_ok=True)
     command = python_command("-m", "tetopt", "mesh", *words, "-o", str(base / "mesh.vtu"), "--json", str(numbers))
-    command += ["--figures", str(base), "--threads", str(threads), "--force"]
+    command += ["--threads", str(threads), "--force", *([] if name.endswith("_bare") else ["--figures", str(base)])]
     pace, main_seconds, peak = calibration(), 0.0, 0
     begin = time.perf_counter()
     with (base / "log").open("w") as log:
@@ -229,7 +235,7 @@ def run(name: str, threads: int, words: list[str], base: Path) -> Row:
             main_seconds = max(main_seconds, thread_seconds(process.pid))
             time.sleep(POLL_SECONDS)
     process.returncode = code = os.waitstatus_to_exitcode(status)
-    if code not in (0, 1):  # 1: a promise is missed, which costs as much
+    if not numbers.exists():  # the code is 1 if a promise is missed, too, which costs as much
         last = (base / "log").read_text(encoding="utf-8", errors="replace").strip().splitlines()[-1:]
         raise tetopt.InputError(f"{name}: ended with code {code}: {' '.join(last)}")
     size = json.loads(numbers.read_text(encoding="utf-8"))["prediction"]["size"]
@@ -296,8 +302,8 @@ def costs(
     """
     names = list(terms(rows[0].size))
     table = np.array([[terms(row.size)[name] for name in names] for row in rows])
-    scale = np.maximum(table.max(axis=0), 1e-300)
     goal = np.array(measured)
+    scale = np.maximum(table.max(axis=0), 1e-300) / goal.mean()  # as nnls's tolerance is not relative
     weight = 1.0 / goal
     for _ in range(FIT_TURNS):
         solution, _ = scipy.optimize.nnls(table / scale * weight[:, None], goal * weight)

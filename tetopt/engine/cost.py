@@ -17,7 +17,7 @@ MODEL_FILE = Path(__file__).with_name("cost.toml")
 CALIBRATION_VOXELS = 96  # along each axis of a cube, whose sums, 28 MB, are more than most caches have
 CALIBRATION_NODES = 9_000  # of a lattice, in which they are summed up again and again
 CALIBRATION_TURNS = 30  # of which the fastest counts: about a second in all
-KERNEL_BYTES = 2.2e8  # numba's compiler and all kernels, if they are not loaded yet, and buffers: 200 MB at most
+KERNEL_BYTES = 2.5e8  # numba's compiler and all kernels, if they are not loaded yet, and buffers: 220 MB at most
 BOUND_MARGIN = 1.5  # on what sizes take: above the peaks of all runs that were measured
 NEXT_SHARE = 0.3  # of what cells take: what an exchange or the end of a run takes besides
 CELLS_PER_NODE = {2: 2, 3: 6}  # of large meshes, by dimension
@@ -128,8 +128,6 @@ def once_terms(size: RunSize) -> dict[str, float]:
         "process": 1.0,  # Python, libraries, kernels loaded
         "pictures": float(size.is_drawn),
         "voxels_read": float(size.n_read),  # unpacked, aligned, summed up for their checksum
-        "voxels": float(size.n_voxels * size.n_channels),  # the octree's and the sampler's sums
-        "region_voxels": float(size.n_voxels * size.has_region),  # distances to the mask's surface
         "membership_voxels": float(size.n_voxels * size.has_memberships),  # labels' levels
         "cells": float(_cells(size) * size.runs),  # made, measured, written
     }
@@ -142,14 +140,16 @@ def swept_terms(size: RunSize) -> dict[str, float]:
     share = 1.0 / size.ndim
     rows = size.n_nodes**share * (size.n_voxels * size.elongation) ** (1.0 - share)
     has_surface = size.has_region or size.has_memberships
-    kind = {"graded": "graded", "paper": "paper"}.get(size.mode, "uniform")  # which has no nodes exchanged
-    terms = {}
-    for name in ("graded", "uniform", "paper"):
-        terms[f"{name}_cells"] = float(sweeps * cells * (name == kind))  # shapes, flips, exchanges
-        terms[f"{name}_rows"] = float(sweeps * rows * (name == kind))  # voxels sampled again, and again with each move
-    terms["channel_rows"] = float(sweeps * rows * (size.n_channels - 1))  # of each channel but the first
-    terms["surface_cells"] = float(sweeps * cells * has_surface)  # steps along surfaces and back to them
-    return terms
+    is_graded, is_paper = size.mode == "graded", size.mode == "paper"
+    return {
+        "graded_cells": float(sweeps * cells * is_graded),  # shapes, flips, exchanges
+        "graded_rows": float(sweeps * rows * is_graded),  # voxels sampled again, and again with each move
+        "uniform_cells": float(sweeps * cells * (not is_graded and not is_paper)),  # no exchanges, small moves: no rows
+        "paper_cells": float(sweeps * cells * is_paper),  # Delaunay each time
+        "paper_rows": float(sweeps * rows * is_paper),  # numerical derivatives
+        "channel_rows": float(sweeps * rows * (size.n_channels - 1)),  # of each channel but the first
+        "surface_cells": float(sweeps * cells * has_surface),  # steps along surfaces and back to them
+    }
 
 
 def memory_terms(size: RunSize) -> dict[str, float]:
@@ -158,7 +158,6 @@ def memory_terms(size: RunSize) -> dict[str, float]:
         "process": 1.0,
         "pictures": float(size.is_drawn),
         "voxels_read": float(size.n_read),
-        "voxels": float(size.n_voxels),
         "channel_voxels": float(size.n_voxels * size.n_channels),  # in the octree, later prefix sums
         "region_voxels": float(size.n_voxels * size.has_region),
         "membership_voxels": float(size.n_voxels * size.has_memberships),
@@ -180,7 +179,7 @@ def meshing_bytes(n_voxels: int, n_channels: int, n_nodes: int, ndim: int = 3) -
     """
     size = RunSize(0, n_voxels, n_nodes, 0, n_channels, ndim=ndim)
     terms, costs = memory_terms(size), cost_model().bytes
-    n_bytes = sum(costs[name] * terms[name] for name in ("voxels", "channel_voxels", "cells"))
+    n_bytes = sum(costs[name] * terms[name] for name in ("channel_voxels", "cells"))
     return KERNEL_BYTES + BOUND_MARGIN * n_bytes
 
 
