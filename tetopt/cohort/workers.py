@@ -7,6 +7,7 @@ within memory is how many of them there are at a time: that is decided here, fro
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import os
 import shutil
@@ -156,6 +157,7 @@ def _connected(stack: ExitStack, need: Need, folders: Folders, address: str) -> 
     from distributed import Client
 
     try:
+        asyncio.run(_reached(address))
         with warnings.catch_warnings():  # of versions that differ: what matters of them is checked, in one line
             warnings.simplefilter("ignore")
             client = stack.enter_context(Client(address, timeout=CONNECT_SECONDS))
@@ -175,6 +177,15 @@ def _connected(stack: ExitStack, need: Need, folders: Folders, address: str) -> 
     words = f"{counted(len(newcomers.known), 'worker')} at {address}, {counted(slots, 'subject')} at a time of "
     words += counted(threads, "thread")
     return Workers(client, newcomers.slots, threads, n_bytes, f"{words}; dashboard {client.dashboard_link}")
+
+
+async def _reached(address: str) -> None:
+    """A connection, closed again. A client that cannot make one may be left half begun, and hangs when collected."""
+    from distributed.comm import connect
+    from distributed.security import Security
+
+    comm = await connect(address, timeout=CONNECT_SECONDS, **Security().get_connection_args("client"))
+    await comm.close()
 
 
 def _threads_each(abouts: list[About]) -> int:
