@@ -9,7 +9,7 @@ TESTED = PYTHONUTF8=1 NUMBA_CACHE_DIR=$(NUMBA_CACHE) MPLBACKEND=agg $(BIN)/pytho
 
 SOLVERS = calculix-ccx python3-dolfinx
 
-.PHONY: demo test test-slow test-random test-solvers test-nojit test-onethread test-hostile test-container test-slurm lint bench fingerprints clean
+.PHONY: demo test test-slow test-random test-solvers test-nojit test-onethread test-hostile test-container test-slurm test-cohort lint bench fingerprints clean
 
 demo: $(VENV)/.demo
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt demo -o demo --force
@@ -56,6 +56,11 @@ test-slurm: $(VENV)/.test
 	@command -v apt-get >/dev/null || { echo "needs Debian's apt-get; install SLURM and munge, then run: TETOPT_SLURM=1 $(BIN)/python -m pytest tests/slurm"; exit 2; }
 	dpkg -s slurm-wlm munge >/dev/null 2>&1 || { apt-get update -qq && apt-get install -y -qq --no-install-recommends slurm-wlm munge; }
 	TETOPT_SLURM=1 $(TESTED) -q -s --no-header tests/slurm
+
+# Two hundred subjects with failures put in, the client killed on the way: a quarter of an hour on two idle cores.
+test-cohort: $(VENV)/.test
+	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt warm-up
+	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python tests/cohort/campaign.py
 
 lint: $(VENV)/.test
 	$(BIN)/ruff check .
