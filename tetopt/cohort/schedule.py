@@ -6,8 +6,10 @@ and the scheduler holds as little of 20,000 subjects as of 20.
 
 from __future__ import annotations
 
+import time
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +51,7 @@ def run_all(
     SchedulerLost
         The scheduler is gone; what was finished is in its place.
     """
-    from distributed import wait
+    from distributed import CancelledError, wait
 
     waiting: deque[tuple[Job, int]] = deque()
     for job in jobs:
@@ -60,26 +62,31 @@ def run_all(
         yield _failed(job, f"{reason}; ask for fewer nodes, or for larger workers", 0)
     running: dict[Any, tuple[Job, int]] = {}
     while waiting or running:
-        while waiting and len(running) < slots():
+        _check_scheduler(client)
+        n_slots = slots() if waiting else 0
+        while waiting and len(running) < n_slots:
             job, attempt = waiting.popleft()
             running[client.submit(task, job, key=f"{job.key}-{job.run}-{attempt}", pure=False)] = job, attempt
-        if client.status not in ("running", "connecting"):
-            raise SchedulerLost("the scheduler of the cluster does not answer any more")
-        try:
-            ready = wait(list(running), timeout=WAIT_SECONDS, return_when="FIRST_COMPLETED").done if running else ()
-        except TimeoutError:
+        if not running:  # jobs of a batch system may come in hours
+            time.sleep(WAIT_SECONDS)
             continue
-        for future in ready:
+        with suppress(TimeoutError, CancelledError):  # dask's word for some of them; each is looked at below
+            wait(list(running), timeout=WAIT_SECONDS, return_when="FIRST_COMPLETED")
+        for future in [each for each in running if each.status != "pending"]:
+            if future.status != "finished":
+                _check_scheduler(client)  # a client that loses it cancels what it waits for
             job, attempt = running.pop(future)
             if future.status == "finished":
                 yield future.result()
-                continue
-            if client.status != "running":
-                raise SchedulerLost("the scheduler of the cluster does not answer any more")
-            if attempt < MOST_ATTEMPTS:
+            elif attempt < MOST_ATTEMPTS:
                 waiting.appendleft((job, attempt + 1))
-                continue
-            yield _failed(job, _cause(future), attempt)
+            else:
+                yield _failed(job, _cause(future), attempt)
+
+
+def _check_scheduler(client: Any) -> None:
+    if client.status != "running":
+        raise SchedulerLost("the scheduler of the cluster does not answer any more")
 
 
 def _cause(future: Any) -> str:
@@ -89,7 +96,7 @@ def _cause(future: Any) -> str:
     error = None if future.status == "cancelled" else future.exception()
     if error is None or isinstance(error, KilledWorker):
         return f"the worker that ran it ended, {MOST_ATTEMPTS} times, as systems do to those that take too much memory"
-    return last_line(f"{type(error).__name__}: {error}")
+    return last_line(" ".join(f"{type(error).__name__}: {error}".split()))
 
 
 def _failed(job: Job, reason: str, attempts: int) -> Ended:
