@@ -145,31 +145,29 @@ def file_of(folder, walltime="00:10:00"):
     return path
 
 
-def jobs_of(out, image, count):
-    begin(out, description("test", []))
-    (out / ".work" / "run-1").touch()
-    words = ("--nodes=500", "--iterations=3", "--", str(image))
-    return [Job(f"sub-{k}", words, str(out), ".vtu", 1, 4e8, 1.0, "run-1") for k in range(1, count + 1)]
-
-
 def test_six_subjects(slurm, image, tmp_path):
-    """In two jobs, each of the memory that a subject is predicted to need, a quarter more, and the worker's own."""
-    out = tmp_path / "out"
-    jobs = jobs_of(out, image, 6)
-    before = set(jobs_of_slurm()) if told("squeue", "-h") else set()
-    folders = Folders(out / ".work", out / "logs")
-    with workers(Need(len(jobs), 4e8, None), folders, count=2, scheduler=None, cluster=file_of(tmp_path)) as crew:
-        ended = list(run_all(jobs, crew.client, crew.slots, crew.bytes))
-        requested = {number: row for number, row in jobs_of_slurm().items() if number not in before}
-    assert sorted((each.key, each.status) for each in ended) == [(f"sub-{k}", "done") for k in range(1, 7)]
+    """In two jobs; each asks for what a subject is predicted to need, a quarter more, and the worker's own."""
+    rows = [f"{k}\t{image}" for k in range(1, 7)]
+    (tmp_path / "subjects.tsv").write_text("\n".join(["subject\timage", *rows, ""]))
+    out, before = tmp_path / "out", set(jobs_of_slurm())
+    words = ["--workers", 2, "--cluster", file_of(tmp_path), "--nodes", 500, "--iterations", 3]
+    assert exit_code("cohort", tmp_path / "subjects.tsv", "-o", out, *words) == 0
+    peak = max(numbers_in(numbers_path(out, f"sub-{k}"))["memory"]["peak_bytes"] for k in range(1, 7))
+    requested = {number: row for number, row in jobs_of_slurm().items() if number not in before}
     assert len(requested) == 2
-    assert {row[1:] for row in requested.values()} == {(1, -(-int(1.25 * 4e8 + 1.5e8) // 2**20), "00:10:00")}
-    for job in jobs:
-        numbers = numbers_in(numbers_path(out, job.key))
+    assert {(cores, time) for _, cores, _, time in requested.values()} == {(1, "00:10:00")}
+    (megabytes,) = {row[2] for row in requested.values()}
+    assert peak + 1.5e8 < megabytes * 2**20 < 2 * (peak + 1.5e8)
+    for k in range(1, 7):
+        path = numbers_path(out, f"sub-{k}")
+        numbers = numbers_in(path)
         assert numbers["missed"] == {}
-        assert load_mesh(numbers_path(out, job.key).with_suffix(".vtu")).mesh.cells.shape[0] > 500
-        assert 1e8 < numbers["memory"]["peak_bytes"] < 1.25 * 4e8
-    assert {path.name.split("-")[0] for path in (out / "logs").glob("tetopt-*.err")} == {"tetopt"}
+        assert load_mesh(path.with_suffix(".vtu")).mesh.cells.shape[0] > 500
+    assert (out / "cohort.html").is_file()
+    assert {path.name for path in (out / ".work").iterdir()} <= {"lock"}
+    # Nothing left to do, and so nothing is submitted.
+    assert exit_code("cohort", tmp_path / "subjects.tsv", "-o", out, *words) == 0
+    assert set(jobs_of_slurm()) == before | set(requested)
 
 
 def test_jobs_that_end_are_replaced(slurm, tmp_path):
