@@ -35,8 +35,8 @@ def test_the_floor(whole):
     assert words["floor"].startswith(f"{(angles < 60.0).sum()} of {len(angles)} cells have an angle under 60 degrees")
     unmoved = result._replace(history=result.history[:1])
     assert missed(image, unmoved, 60.0) == {}
-    # No mesh of tetrahedra has all angles so large: the run itself says so.
-    assert list(tetopt.mesh_image(image, 300, iterations=2, min_dihedral=65.0).missed) == ["floor"]
+    # No mesh of tetrahedra has all angles so large: the run itself says so. Of few nodes, since it tries them all.
+    assert list(tetopt.mesh_image(image, 60, iterations=2, min_dihedral=65.0).missed) == ["floor"]
 
 
 def test_the_box_and_the_cover(whole):
@@ -93,7 +93,8 @@ def test_labels_without_cells():
 
 
 def test_the_paper_s_scheme_and_a_start_say_theirs_too(whole):
-    image, result = whole
+    image, _ = whole
     assert tetopt.mesh_image(image, 200, mode="paper", iterations=2).missed == {}
-    kept = tetopt.mesh_image(image, start=result.mesh, iterations=1, min_dihedral=65.0)
+    start = tetopt.mesh_image(image, 60, iterations=1).mesh
+    kept = tetopt.mesh_image(image, start=start, iterations=1, min_dihedral=65.0)
     assert list(kept.missed) == ["floor"]

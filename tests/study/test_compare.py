@@ -4,6 +4,7 @@ import json
 import pipes
 
 import numpy as np
+import PIL.Image
 import pytest
 
 import tetopt
@@ -15,7 +16,8 @@ from tetopt.fem.reference import compare as reference_errors
 from tetopt.geometry.quadratic import quadratic
 from tetopt.model.averages import element_young, young_image
 from tetopt.model.laws import parse_law
-from tetopt.study import compare, tradeoff
+from tetopt.report.figures import save_figure
+from tetopt.study import compare, compare_files, tradeoff
 from tetopt.study.compare_files import COMPARE_PICTURES
 from tetopt.study.compare_report import Attempt, ImageSource, LabelSource, Settings, as_json, from_json
 from tetopt.study.pipelines import PIPELINES
@@ -39,6 +41,21 @@ def head(tmp_path_factory):
     tetopt.save_image(folder / "image.nii.gz", phantom.image(voxel_mm=4.0))
     tetopt.save_image(folder / "labels.nii.gz", phantom.label_image(voxel_mm=4.0))
     return folder
+
+
+@pytest.fixture
+def undrawn(monkeypatch):
+    """Pictures of one pixel: where a test is of other things, nothing is drawn. Those that are: `test_files`."""
+
+    def dot(path):
+        PIL.Image.new("L", (1, 1)).save(path)
+
+    for name in ("slices", "labels", "histograms", "curves", "timing"):
+        monkeypatch.setattr(compare_files, f"{name}_figure", lambda *_, **__: None)
+    monkeypatch.setattr(compare_files, "cutaways", lambda titled, means, path: dot(path))
+    monkeypatch.setattr(
+        compare_files, "save_figure", lambda figure, path: dot(path) if figure is None else save_figure(figure, path)
+    )
 
 
 @pytest.fixture(scope="module")
@@ -195,13 +212,17 @@ def without_seconds(fem):
     }
 
 
-def test_tradeoff(head, opengl, tmp_path, monkeypatch):
+def test_tradeoff(head, undrawn, tmp_path, monkeypatch):
     """The defaults' row is the pipeline's own mesh; more of the image costs shape; the picture is on the page."""
-    few = [option for option in tradeoff.SWEPT_OPTIONS if option[0] in ("k_D", "gradation")]
+    few = [  # of two options the first value and the default, which is another one
+        (name, defaults, {order: (some[0], defaults[order]) for order, some in values.items()}, arguments)
+        for name, defaults, values, arguments in tradeoff.SWEPT_OPTIONS
+        if name in ("k_D", "gradation")
+    ]
     monkeypatch.setattr(tradeoff, "SWEPT_OPTIONS", few)
     out = tmp_path / "out"
-    words = [str(head / "image.nii.gz"), "-o", str(out), *SMALL, "--pipelines", "tetopt,bcc", "--curve", ""]
-    assert main(["compare", *words, "--tradeoff"]) == 0
+    words = [str(head / "image.nii.gz"), "-o", str(out), *SMALL, "--curve", ""]
+    assert main(["compare", *words, "--pipelines", "tetopt", "--tradeoff"]) == 0
     report = json.loads((out / "report.json").read_text())
     rows = report["tradeoff"]
     for order, results in ((1, report["pipelines"]), (2, report["quadratic"])):
@@ -218,12 +239,12 @@ def test_tradeoff(head, opengl, tmp_path, monkeypatch):
     assert by_k_D[0]["quality"]["mean_rho"] > by_k_D[-1]["quality"]["mean_rho"]
     assert (out / "tradeoff.png").stat().st_size > 20_000
     assert "What tetopt&#x27;s options trade" in (out / "report.html").read_text()
-    assert main(["compare", *words, "--force"]) == 0
+    assert main(["compare", *words, "--pipelines", "bcc", "--force"]) == 0
     assert not (out / "tradeoff.png").exists()
     assert "options trade" not in (out / "report.html").read_text()
 
 
-def test_resume_keeps_what_is_done(run, head, capsys):
+def test_resume_keeps_what_is_done(run, head, undrawn, capsys):
     """Finished runs of the same settings are kept; a run taken away, or other settings, are run again."""
     inputs = [str(head / "image.nii.gz"), "--labels", str(head / "labels.nii.gz")]
     again = ["compare", *inputs, "-o", str(run), *SMALL, "--pipelines", "tetopt,bcc,odt", "--curve", "0.5", "--resume"]
@@ -339,7 +360,7 @@ def test_resume_refuses_another_comparison(run, head, capsys):
     assert (run / "report.json").read_bytes() == kept
 
 
-def test_pytetwild_in_the_comparison(head, opengl):
+def test_pytetwild_in_the_comparison(head, undrawn):
     """The conventional pipeline beside ours, two repeats: node counts near the wish, the range in the report."""
     pytest.importorskip("pytetwild", reason="the conventional pipeline needs pytetwild")
     out = head / "peer"
@@ -365,9 +386,10 @@ def test_baseline(head, tmp_path, capsys):
     assert set(numbers["seconds"]) == {"surfaces", "tetrahedra", "search"}
 
 
-def test_a_peer_that_crashes(head, opengl, tmp_path, monkeypatch, capsys):
+def test_a_peer_that_crashes(head, undrawn, tmp_path, monkeypatch, capsys):
     """At first: run again, and said in the terminal, in the files and on the page. Twice: it failed."""
     monkeypatch.setenv("PIPES_PID", str(tmp_path / "pid"))
+    monkeypatch.setitem(PIPELINES, "tetopt", PIPELINES["tetopt"]._replace(function=pipes.fine))  # only beside them
     for name, pipe in (("pytetwild", pipes.crash_once), ("cleaver", pipes.crash)):
         monkeypatch.setitem(PIPELINES, name, PIPELINES[name]._replace(function=pipe, is_random=False))
     crash, image = "crashed: signal 11, SIGSEGV", str(head / "image.nii.gz")

@@ -1,5 +1,6 @@
 """fTetWild's meshes fill the image's box exactly, with the requested number of nodes, in any orientation."""
 
+import re
 import sys
 from importlib.util import find_spec
 
@@ -53,9 +54,18 @@ def assert_fills(image, mesh):
     ids=["flipped and oblique", "anisotropic and oblique", "sheared"],
 )
 def test_fills_the_box_with_the_wanted_nodes(image, capfd):
+    """Within 5 % of the number of nodes, or its note says how many they are: fTetWild is random.
+
+    20 runs of each image gave 286 to 314 nodes, in 1 to 4 runs of fTetWild; an earlier one was 16 off.
+    """
     produced = PIPELINES["pytetwild"].function(Job(image, None, 300, classes=2))
     assert_fills(image, produced.mesh)
-    assert abs(len(produced.mesh.points) - 300) <= 15  # 5 %
+    n_nodes = len(produced.mesh.points)
+    is_noted = any(
+        re.fullmatch(f"{n_nodes} nodes after . runs of fTetWild, 300 were.*", note) for note in produced.notes
+    )
+    assert (abs(n_nodes - 300) > 15) == is_noted
+    assert abs(n_nodes - 300) <= 45  # 15 %: three times the most that was seen
     assert list(produced.seconds) == ["surfaces", "tetrahedra", "search"]
     assert capfd.readouterr().out == ""
 
