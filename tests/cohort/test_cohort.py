@@ -8,14 +8,19 @@ import signal
 import subprocess
 import sys
 import time
+from contextlib import contextmanager
 from pathlib import Path
 
 import numpy as np
 import pytest
+from cohorts import save_run
 from commands import exit_code
 
 import tetopt
 import tetopt.cli.cohort
+from tetopt.cli import cohort as cohort_module
+from tetopt.cli import cohort_plan
+from tetopt.cli.cohort import Estimate
 from tetopt.cohort.layout import begin, description
 
 COMMON = ("--iterations", "1", "--nodes", "60")
@@ -259,3 +264,20 @@ def test_the_page_of_a_run_under_way(tmp_path, monkeypatch):
     monkeypatch.setattr(tetopt.cli.cohort, "PAGE_SECONDS", 0.0)
     refresh()
     assert (place / "cohort.html").exists()
+
+
+def test_what_another_run_has_done_meanwhile_is_not_done_again(small, monkeypatch):
+    """It may end between the plan of this one and its lock."""
+
+    @contextmanager
+    def locked(place, _keys):
+        save_run(place, "sub-01", {"request": {"sha256": "1", "format": ".vtu"}, "missed": {}})
+        yield
+
+    keys = []
+    monkeypatch.setattr(cohort_module, "locked", locked)
+    monkeypatch.setattr(cohort_plan, "requested", lambda *_: {"sha256": "1"})
+    monkeypatch.setattr(cohort_module, "estimated", lambda _: Estimate({}, 0.0))
+    monkeypatch.setattr(cohort_module, "_run", lambda to_run, *_: keys.extend(entry.key for entry in to_run))
+    exit_code("cohort", small / "t.tsv", "-o", small / "out")
+    assert keys == ["sub-02"]

@@ -18,7 +18,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from tetopt.budget import available_bytes, memory_words
-from tetopt.cli.cohort_plan import Entry, checked_suffix, chosen, entries_of, subjects_of
+from tetopt.cli.cohort_plan import Entry, checked_suffix, chosen, entries_of, subjects_of, with_states
 from tetopt.cli.console import log, out, show_error, show_warning
 from tetopt.cli.inputs import read_mesh
 from tetopt.cli.options import (
@@ -106,6 +106,8 @@ def cohort_command(
     _begin(place, subjects)
     with locked(place, alone):
         restore(place, alone)
+        # Once more: another run may have ended since.
+        to_run = chosen(with_states(to_run, place, suffix, lambda _: None), cohort.retry_failed)
         try:
             if to_run:
                 _run(to_run, estimate, cohort, suffix, engine.threads)

@@ -110,7 +110,7 @@ def entries_of(
         entries.append(Entry(subject, key(subject), own, plan, State("missing", "")))
     if problems:
         raise Problems(list(dict.fromkeys(problems)))
-    return _with_states(entries, out, suffix, say)
+    return with_states(entries, out, suffix, say)
 
 
 class _Plans:
@@ -169,8 +169,8 @@ def _missing(source: SourceOptions, records: Records) -> Iterator[str]:
             yield f"{name}: {path} cannot be opened: {error.strerror}"
 
 
-def _with_states(entries: list[Entry], out: Path, suffix: str, say: Callable[[str], None]) -> list[Entry]:
-    """What there is of each; files are summed up where there is a mesh to compare with."""
+def with_states(entries: list[Entry], out: Path, suffix: str, say: Callable[[str], None]) -> list[Entry]:
+    """The subjects with what there is of each; files are summed up where there is a mesh to compare with."""
 
     def state(entry: Entry) -> Entry:
         request = None

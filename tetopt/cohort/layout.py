@@ -167,6 +167,8 @@ def restore(out: Path, keys: list[str] | None = None) -> None:
                 os.rename(each, place)
         if each.is_dir() and each.exists():
             shutil.rmtree(each)
+        elif keys is None and each.is_file() and not each.name.endswith("lock"):
+            each.unlink()  # by which a run was known to go on: what a cluster still does for one that was killed ends
 
 
 def numbers_of(path: Path) -> dict[str, Any] | None:
