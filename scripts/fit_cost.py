@@ -74,6 +74,7 @@ slice_labels_1k      {t1} --slice k=90 --labels {labels} --nodes 1000
 parcels_8k           {parcels} --labels {parcels} --nodes 8000
 thick_labels_5k      {thick} --labels {thick_labels} --nodes 5000
 big_5k               {big} --nodes 5000
+t1_float_5k          {t1_float}
 big_60k              {big} --nodes 60000
 colin_5k             {data}/brain_t1_colin27.nii.gz
 flair_8k             {data}/brain_flair_oblique_aniso.nii.gz --nodes 8000
@@ -83,6 +84,7 @@ slab_labels_10k      {data}/ct_abdomen_slab_3mm.nii.gz --labels {data}/ct_abdome
 *half_10k            {half} --nodes 10000
 *crop96_labels_8k    {crop96} --labels {crop96_labels} --nodes 8000
 *t1_mask_labels_20k  {t1} --labels {labels} --mask {mask} --nodes 20000
+*big_float_5k        {big_float} --nodes 5000
 *balls_100k_0        {balls} --nodes 100000 --iterations 0
 *colin_30k           {data}/brain_t1_colin27.nii.gz --nodes 30000
 *colin_order2_20k    {data}/brain_t1_colin27.nii.gz --order 2 --nodes 20000
@@ -188,8 +190,9 @@ def inputs(folder: Path, is_quick: bool) -> dict[str, Path]:
 
 
 def larger_inputs(t1: tetopt.Image, tissue: tetopt.Image) -> dict[str, tetopt.Image]:
-    """The T1 at half the resolution, in slices of 4 mm, and in noise on 256^3 voxels; its mask; parcels of
-    places nearest to 60 points; spheres in noise.
+    """The T1 at half the resolution, in slices of 4 mm, in noise on 256^3 voxels; its mask; as fractions; others.
+
+    These are parcels of places nearest to 60 points, and spheres in noise.
     """
     noise = np.random.default_rng(1)
     halved = t1.affine @ np.diag([2.0, 2.0, 2.0, 1.0])
@@ -206,6 +209,8 @@ def larger_inputs(t1: tetopt.Image, tissue: tetopt.Image) -> dict[str, tetopt.Im
         "thick_labels": tetopt.Image(tissue.data[:, :, ::4], thick),
         "big": tetopt.Image(np.clip(np.rint(padded + noise.normal(0.0, 6.0, padded.shape)), 0.0, 255.0), t1.affine),
     }
+    for name, whole in (("t1", t1), ("big", images["big"])):
+        images[f"{name}_float"] = tetopt.Image((whole.data * 1.1).astype(np.float32), whole.affine)
     places = np.indices((128, 128, 128)).reshape(3, -1).T
     nearest = scipy.spatial.cKDTree(128.0 * noise.random((60, 3))).query(places)[1]
     images["parcels"] = tetopt.Image(1.0 + nearest.reshape(128, 128, 128))

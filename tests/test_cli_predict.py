@@ -86,6 +86,7 @@ def test_sizes_of_what_was_read(image_path, tmp_path, sizes):
     assert exit_code(*labelled_lattice_words(tmp_path), "-o", tmp_path / "a.vtu", "--predict") == 0
     masked, quadratic, lattice, slice_, labelled = sizes
     whole = RunSize(n_voxels, n_voxels, 150, 16)
+    assert not any(size.is_fractional for size in sizes)
     assert masked == whole._replace(n_read=2 * n_voxels, n_channels=2, has_region=True, elongation=masked.elongation)
     assert (quadratic.n_nodes, quadratic.runs, quadratic.order, quadratic.iterations) == (100, 2, 2, 3)
     assert (lattice.mode, lattice.is_drawn, lattice.iterations) == ("uniform", True, 20)
@@ -95,6 +96,16 @@ def test_sizes_of_what_was_read(image_path, tmp_path, sizes):
     assert labelled.has_memberships
     assert labelled.n_read == 2 * n_voxels
     assert labelled.n_channels > 1
+
+
+def test_fractions_take_more(tmp_path, sizes):
+    """Sums of what is no whole number take twice the bits; labels make whole numbers of all."""
+    image = sample_image(3)
+    tetopt.save_image(tmp_path / "a.nii.gz", tetopt.Image(image.data + 0.25, image.affine))
+    assert exit_code(*mesh_words(tmp_path / "a.nii.gz", tmp_path, "--predict")) == 0
+    assert sizes[0].is_fractional
+    whole, fractional = (cost.predicted(sizes[0]._replace(is_fractional=each)).peak_bytes for each in (False, True))
+    assert fractional > whole
 
 
 def test_sizes_by_headers(image_path, tmp_path, monkeypatch):

@@ -23,6 +23,7 @@ from tetopt.target.content import Content
 
 SEARCH_RUNS = 4  # towards an error, mostly, each of about the default number of nodes
 QUADRATIC_RUNS = 2  # towards a number of nodes of order 2: the second mostly meets it
+SAMPLED_VALUES = 10_000  # of an image: one that is no whole number tells that most are none
 
 
 def size_of_run(plan: Plan, content: Content, whole: Image, n_started: int | None = None) -> RunSize:
@@ -50,6 +51,7 @@ def size_of_run(plan: Plan, content: Content, whole: Image, n_started: int | Non
         n_channels=len(content.values) + (content.region is not None),
         elongation=_elongation(content.image.spacing),
         has_memberships=content.memberships is not None,
+        is_fractional=content.is_plain and not np.array_equal(np.rint(some := _sample(content)), some),
     )
 
 
@@ -80,8 +82,13 @@ def size_by_headers(plan: Plan, like: RunSize | None = None) -> RunSize:
     n_nodes = like.n_nodes if plan.sizes.nodes is None else size.n_nodes
     return size._replace(
         n_voxels=n_voxels, n_nodes=n_nodes, n_channels=like.n_channels, elongation=like.elongation,
-        has_memberships=like.has_memberships,
+        has_memberships=like.has_memberships, is_fractional=like.is_fractional,
     )  # fmt: skip
+
+
+def _sample(content: Content) -> NDArray:
+    """Some of the image's voxels."""
+    return content.image.data.ravel()[:: max(content.image.data.size // SAMPLED_VALUES, 1)]
 
 
 def _elongation(spacing: Sequence[float] | NDArray[np.float64]) -> float:

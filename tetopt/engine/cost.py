@@ -38,6 +38,7 @@ class RunSize(NamedTuple):
     runs: int = 1  # optimisations in turn, towards an error or a number of nodes of order 2
     has_region: bool = False  # a mask, or background left out
     has_memberships: bool = False  # labels with smooth interfaces
+    is_fractional: bool = False  # one image, not of whole numbers, whose sums take 64 bits
     is_drawn: bool = False  # pictures
 
 
@@ -159,6 +160,7 @@ def memory_terms(size: RunSize) -> dict[str, float]:
         "pictures": float(size.is_drawn),
         "voxels_read": float(size.n_read),
         "channel_voxels": float(size.n_voxels * size.n_channels),  # in the octree, later prefix sums
+        "fractional_voxels": float(size.n_voxels * size.is_fractional),
         "region_voxels": float(size.n_voxels * size.has_region),
         "membership_voxels": float(size.n_voxels * size.has_memberships),
         "cells": float(_cells(size)),  # with fluxes and sums
