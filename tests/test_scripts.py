@@ -142,7 +142,7 @@ def measured_rows(module):
         size = RunSize(*map(int, numbers), iterations=int(rng.integers(0, 20)), n_channels=int(rng.integers(1, 6)))
         mode = ("graded", "uniform", "paper")[number % 3]
         size = size._replace(mode=mode, has_region=number % 2 == 0, has_memberships=number % 5 < 2)
-        size = size._replace(is_drawn=number % 7 < 3)
+        size = size._replace(is_drawn=number % 7 < 3, is_fractional=number % 11 < 5)
         once, swept = (module.summed(seconds, terms(size)) for terms in (once_terms, swept_terms))
         pace = 1.0 + (number % 4 == 0)
         row = module.Row(
