@@ -188,7 +188,19 @@ def test_nothing_is_run_twice_and_failed_ones_alone_on_request(cohort, resumed):
     assert "subjects stay as they are" in words
     code, words = ended(begun(cohort, *COMMON, "--participant-label", "01"), cohort)
     assert code == 0
-    assert "1 subjects: 1 done; 0 to run" in words
+    assert "1 subject: 1 done; 0 to run" in words
+
+
+def test_a_failure_is_forgotten_where_the_mesh_is_what_is_asked_for(cohort, resumed):
+    """Options that fail, and then those again of the mesh that is there: it is done, though nothing is run."""
+    write_rows(cohort, {"01": {"nodes": "6"}})
+    one = (*COMMON, "--participant-label", "01")
+    code, words = ended(begun(cohort, *one), cohort)
+    assert code == 1, words
+    write_rows(cohort)
+    code, words = ended(begun(cohort, *one), cohort)
+    assert code == 0, words
+    assert "1 subject: 1 done; 0 to run" in words
 
 
 def refused(folder, capsys, *options):

@@ -34,7 +34,7 @@ from tetopt.cli.options import (
 from tetopt.cli.plan import with_numbers
 from tetopt.cli.predict import size_by_headers, size_of_run
 from tetopt.cli.source import read_source
-from tetopt.cohort.layout import LOGS_NAME, WORK_NAME, begin, check_out, description, locked, restore
+from tetopt.cohort.layout import LOGS_NAME, WORK_NAME, begin, check_out, description, failure_path, locked, restore
 from tetopt.cohort.numbers import collect
 from tetopt.cohort.page import save_cohort_files
 from tetopt.cohort.run import Ended, Job
@@ -44,12 +44,13 @@ from tetopt.cohort.workers import Folders, Need, shares, workers
 from tetopt.engine.cost import Prediction, RunSize, calibrated_speed, predicted
 from tetopt.errors import InputError
 from tetopt.io.files import checked_output
+from tetopt.io.images import file_shape
 
 NAMED_FAILURES = 20  # on the terminal: the table and the page have all
 MOST_BESIDE = 200  # subjects of a run beside others in one folder, each with a lock: a process has 1024 files at most
 PAGE_SECONDS = 60.0  # between the table and page of a run under way and the next: nobody looks more often
 PAGE_SHARE = 0.05  # of the run's time that they may take
-LIKE_TRIES = 3  # subjects of a kind that are read to see what headers do not tell, until one can be
+LIKE_READS = 8  # subjects of a kind that are read to see what headers do not tell: half a minute of large ones
 
 
 class Estimate(NamedTuple):
@@ -108,6 +109,9 @@ def cohort_command(
         restore(place, alone)
         # Once more: another run may have ended since.
         to_run = chosen(with_states(to_run, place, suffix, lambda _: None), cohort.retry_failed)
+        for entry in entries:
+            if entry.state.status in ("done", "missed"):  # what failed since was of other options or inputs
+                failure_path(place, entry.key).unlink(missing_ok=True)
         try:
             if to_run:
                 _run(to_run, estimate, cohort, suffix, engine.threads)
@@ -136,7 +140,7 @@ def _say_plan(entries: Sequence[Entry], to_run: Sequence[Entry], only_failed: bo
     words = {"done": "done", "missed": "done, but a promise missed", "failed": "failed", "changed": "changed"}
     parts = [f"{counts[name]} {text}" for name, text in words.items() if counts[name]]
     parts += [f"{counts['missing']} not yet run"] if counts["missing"] else []
-    log.print(f"{len(entries)} subjects: {', '.join(parts)}; {len(to_run)} to run")
+    log.print(f"{_counted(len(entries))}: {', '.join(parts)}; {len(to_run)} to run")
     reasons = Counter((e.state.status, e.state.why) for e in to_run if e.state.status in ("changed", "failed"))
     for (status, why), number in reasons.most_common(NAMED_FAILURES):
         log.print(escape(f"  {number} {status}: {why}"))
@@ -145,24 +149,28 @@ def _say_plan(entries: Sequence[Entry], to_run: Sequence[Entry], only_failed: bo
 
 
 def estimated(entries: Sequence[Entry]) -> Estimate:
-    """What subjects are predicted to take, each on one thread: by their headers, and one of each kind as it is."""
-    speed, like = calibrated_speed() if entries else 1.0, dict[object, RunSize | None]()
-    tries: Counter[object] = Counter()
+    """What subjects are predicted to take, each on one thread: by their headers, and some of each kind as they are.
+
+    Of the same kind are those of as many files and the same options; of one whose images have several shapes, one of
+    each shape is read, up to `LIKE_READS`, as what labels take differs more between than within.
+    """
+    speed = calibrated_speed() if entries else 1.0
+    like: dict[tuple[object, ...], dict[tuple[int, ...], RunSize]] = {}
+    reads: Counter[tuple[object, ...]] = Counter()
     each = {}
     for entry in entries:
         source = entry.source
-        kind = (
-            len(source.images),
-            source.mask is None,
-            source.labels is None,
-            source.background,
-            str(entry.plan.sizes),
-        )
-        if like.get(kind) is None and tries[kind] < LIKE_TRIES:
-            tries[kind] += 1
-            like[kind] = _read_size(entry)
+        files = len(source.images), source.mask is None, source.labels is None
+        kind = (*files, source.background, str(entry.plan.sizes))
+        known = like.setdefault(kind, {})
         try:
-            each[entry.key] = predicted(size_by_headers(entry.plan, like[kind]), 1, speed)
+            shape = file_shape(source.images[0]) or ()
+            if shape not in known and reads[kind] < LIKE_READS:
+                reads[kind] += 1
+                if (size := _read_size(entry)) is not None:
+                    known[shape] = size
+            nearest = known.get(shape) or next(iter(known.values()), None)
+            each[entry.key] = predicted(size_by_headers(entry.plan, nearest), 1, speed)
         except InputError:  # its run will say it
             continue
     return Estimate(each, max((prediction.peak_bytes for prediction in each.values()), default=0.0))
@@ -301,7 +309,7 @@ def _close(place: Path, keys: list[str]) -> int:
         log.print(escape(f"{row.key}: {row.reason}"))
     words = {"done": "done", "missed": "done, but a promise missed", "failed": "failed", "missing": "not run"}
     out.print(
-        f"{len(own)} subjects: " + ", ".join(f"{counts[name]} {text}" for name, text in words.items() if counts[name])
+        f"{_counted(len(own))}: " + ", ".join(f"{counts[name]} {text}" for name, text in words.items() if counts[name])
     )
     for name in ("cohort.html", "cohort.tsv"):
         out.print(escape(str(place / name)))
@@ -312,6 +320,11 @@ def _say_rerun(code: int, arguments: Sequence[str]) -> None:
     if code:
         words = " ".join(map(shlex.quote, arguments))
         log.print(escape(f"to go on with what is missing or failed, and with that alone: tetopt {words}"))
+
+
+def _counted(number: int) -> str:
+    """So many subjects, in words."""
+    return f"{number} subject{'s' * (number != 1)}"
 
 
 def _time(seconds: float) -> str:
