@@ -75,7 +75,7 @@ def save_run(out, key, run, picture=None, suffix=".vtu"):
     """One subject that was meshed."""
     folder = subject_folder(out, key)
     (folder / "figures").mkdir(parents=True, exist_ok=True)
-    (folder / mesh_name(key, suffix)).write_bytes(b"")
+    (folder / mesh_name(key, suffix)).write_bytes(b"a mesh")
     numbers_path(out, key).write_text(json.dumps(run))
     if picture is not None:
         (folder / "figures" / "thumbnail.png").write_bytes(picture)

@@ -283,7 +283,7 @@ def test_what_another_run_has_done_meanwhile_is_not_done_again(small, monkeypatc
 
     @contextmanager
     def locked(place, _keys):
-        save_run(place, "sub-01", {"request": {"sha256": "1", "format": ".vtu"}, "missed": {}})
+        save_run(place, "sub-01", {"request": {"options": {}, "files": {}, "sha256": "1"}, "missed": {}})
         yield
 
     keys = []

@@ -101,3 +101,16 @@ def test_what_a_killed_run_went_on_by_is_taken_away(out):
     assert len(list((out / ".work").iterdir())) == 4
     restore(out)
     assert sorted(each.name for each in (out / ".work").iterdir()) == ["lock", "sub-1.lock"]
+
+
+def test_what_a_user_has_put_beside_a_mesh_stays(out):
+    publish(work_of(out, "sub-1", "first"), out, "sub-1")
+    place = subject_folder(out, "sub-1")
+    (place / "sub-1_desc-tetopt_mesh.inp").write_text("of another format")
+    (place / "results").mkdir()
+    (place / "results" / "stress.frd").write_text("mine")
+    work = work_of(out, "sub-1", "second")
+    (work / "a.txt").rename(work / "sub-1_desc-tetopt_mesh.vtu")
+    publish(work, out, "sub-1")
+    assert sorted(each.name for each in place.iterdir()) == ["a.txt", "results", "sub-1_desc-tetopt_mesh.vtu"]
+    assert (place / "results" / "stress.frd").read_text() == "mine"

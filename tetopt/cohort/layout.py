@@ -150,6 +150,10 @@ def publish(work: Path, out: Path, key: str) -> None:
     if place.exists():
         os.rename(place, aside)
     os.rename(work, place)
+    own = mesh_name(key, "")
+    for each in aside.iterdir() if aside.exists() else ():
+        if not each.name.startswith(own) and each.name != FIGURES_NAME:  # the user's, as notes or results of a solver
+            os.rename(each, place / each.name)
     shutil.rmtree(aside, ignore_errors=True)
 
 

@@ -33,10 +33,9 @@ def state_of(out: Path, key: str, suffix: str, request: dict[str, Any] | None) -
     """
     numbers = numbers_of(numbers_path(out, key))
     failure = numbers_of(failure_path(out, key))
-    before = {} if numbers is None else numbers.get("request") or {}
-    is_there = (
-        numbers is not None and (subject_folder(out, key) / mesh_name(key, before.get("format", suffix))).is_file()
-    )
+    before = _request_of(numbers or {})
+    mesh = subject_folder(out, key) / mesh_name(key, str(before["options"].get("format", suffix)))
+    is_there = numbers is not None and mesh.is_file() and mesh.stat().st_size > 0
     if is_there and numbers is not None and (request is None or before.get("sha256") == request["sha256"]):
         return State("missed" if numbers.get("missed") else "done", "; ".join((numbers.get("missed") or {}).values()))
     if failure is not None:
@@ -46,14 +45,22 @@ def state_of(out: Path, key: str, suffix: str, request: dict[str, Any] | None) -
     return State("missing", "")
 
 
+def _request_of(numbers: dict[str, Any]) -> dict[str, Any]:
+    """What was asked of a run, empty where its numbers do not say so in the way that ours do."""
+    request = numbers.get("request")
+    if isinstance(request, dict) and all(isinstance(request.get(name), dict) for name in ("options", "files")):
+        return request
+    return {"options": {}, "files": {}}
+
+
 def differences(before: dict[str, Any], now: dict[str, Any]) -> str:
     """In what two requests differ, in words."""
     words = []
-    for name in sorted({*before.get("options", {}), *now["options"]}):
-        pair = [str(each.get("options", {}).get(name, "none")) for each in (before, now)]
+    for name in sorted({*before["options"], *now["options"]}):
+        pair = [str(each["options"].get(name, "none")) for each in (before, now)]
         words += [f"{name} was {pair[0]}, is {pair[1]}"] if pair[0] != pair[1] else []
-    for name in sorted({*before.get("files", {}), *now["files"]}):
-        if before.get("files", {}).get(name) != now["files"].get(name):
+    for name in sorted({*before["files"], *now["files"]}):
+        if before["files"].get(name) != now["files"].get(name):
             words.append(f"another {'image' if IMAGE_PATTERN.match(name) or name == 'images' else name}")
     if before.get("tetopt") != now["tetopt"]:
         words.append(f"tetopt was {before.get('tetopt', 'none')}, is {now['tetopt']}")

@@ -1,0 +1,95 @@
+"""What there is of a subject, by its files alone: each status, why, and what a rerun makes of it."""
+
+import json
+
+import pytest
+from cohorts import save_failure, save_run
+
+from tetopt.cohort.layout import begin, description, mesh_name, numbers_path, subject_folder
+from tetopt.cohort.state import State, differences, state_of, strangers
+
+KEY = "sub-1"
+
+
+def request(**changes):
+    whole = {"options": {"nodes": 60, "format": ".vtu"}, "files": {"images": [["a.nii", "0"]]}, "tetopt": "0.1.0"}
+    return {**whole, **changes, "sha256": json.dumps({**whole, **changes})}
+
+
+@pytest.fixture
+def out(tmp_path):
+    begin(tmp_path / "out", description("test", []))
+    return tmp_path / "out"
+
+
+def saved(out, key=KEY, suffix=".vtu", missed=None, **changes):
+    save_run(out, key, {"request": request(**changes), "missed": missed or {}}, suffix=suffix)
+
+
+def status(out, now=None, key=KEY):
+    return state_of(out, key, ".vtu", now if now is not None else request())
+
+
+def test_each_status_has_its_reason(out):
+    assert status(out) == State("missing", "")
+    saved(out)
+    assert status(out) == State("done", "")
+    other = request(options={"nodes": 70, "format": ".vtu"})
+    assert status(out, other) == State("changed", "nodes was 60, is 70")
+    assert state_of(out, KEY, ".vtu", None) == State("done", "")
+    saved(out, missed={"floor": "too flat", "mask": "too coarse"})
+    assert status(out) == State("missed", "too flat; too coarse")
+
+
+def test_a_failure_counts_until_there_is_what_is_asked_for(out):
+    save_failure(out, KEY, "cut short")
+    assert status(out) == State("failed", "cut short")
+    saved(out, tetopt="0.0.9")
+    assert status(out) == State("failed", "cut short")
+    saved(out)
+    assert status(out) == State("done", "")
+
+
+@pytest.mark.parametrize("harm", [
+    lambda mesh, numbers: mesh.unlink(), lambda mesh, numbers: numbers.unlink(),
+    lambda mesh, numbers: numbers.write_text('{"request": '), lambda mesh, numbers: numbers.write_text("[]"),
+    lambda mesh, numbers: numbers.write_bytes(b""), lambda mesh, numbers: mesh.write_bytes(b""),
+    lambda mesh, numbers: numbers.write_text('{"request": 3}'),
+    lambda mesh, numbers: numbers.write_text('{"request": {"format": 3}, "missed": 4}'),
+])  # fmt: skip
+def test_what_is_damaged_is_made_again(out, harm):
+    saved(out)
+    harm(subject_folder(out, KEY) / mesh_name(KEY, ".vtu"), numbers_path(out, KEY))
+    assert status(out).status in ("missing", "changed")
+
+
+def test_a_mesh_of_another_format_is_a_change(out):
+    saved(out, suffix=".inp", options={"nodes": 60, "format": ".inp"})
+    assert status(out) == State("changed", "format was .inp, is .vtu")
+
+
+def test_differences_are_said_and_the_line_is_short():
+    before = request()
+    assert differences(before, request(files={"images": [["a.nii", "1"]]})) == "another image"
+    assert differences(before, request(files={**before["files"], "mask": [["m", "1"]]})) == "another mask"
+    assert differences(before, request(tetopt="0.2.0")) == "tetopt was 0.1.0, is 0.2.0"
+    many = request(options={"nodes": 60, "format": ".vtu"} | {f"o{k}": k for k in range(6)})
+    assert differences(before, many) == (
+        "o0 was none, is 0; o1 was none, is 1; o2 was none, is 2; o3 was none, is 3 and 2 more"
+    )
+
+
+def test_strangers_in_a_subjects_place(out):
+    assert strangers(out, KEY) is None
+    saved(out)
+    assert strangers(out, KEY) is None
+    (out / KEY / "ses-a").mkdir()
+    assert "has sessions, ses-a among them" in strangers(out, KEY)
+    (out / "sub-2" / "ses-a").mkdir(parents=True)
+    assert "has sessions" in strangers(out, "sub-2")
+    assert strangers(out, "sub-2_ses-b") is None
+    (out / "sub-3").mkdir()
+    (out / "sub-3" / "thesis.txt").touch()
+    assert "no subject's of this cohort" in strangers(out, "sub-3")
+    (out / "sub-4").touch()
+    assert "no subject's of this cohort" in strangers(out, "sub-4")
