@@ -10,7 +10,9 @@ from types import SimpleNamespace
 
 import dask
 import pytest
+from commands import exit_code
 from distributed import KilledWorker, LocalCluster
+from models import sample_image
 
 from tetopt.cohort import jobs
 from tetopt.cohort.crew import About, Folders, Need, Newcomers
@@ -18,6 +20,7 @@ from tetopt.cohort.jobs import cluster_of, configuration, request
 from tetopt.cohort.workers import shares, workers
 from tetopt.errors import InputError
 from tetopt.interpreter import python_command, python_environment
+from tetopt.io.images import save_image
 
 GB = 1e9
 
@@ -151,6 +154,17 @@ def test_contradictions_are_refused(folders, tmp_path):
         running(Need(1, 0.0, None), folders, scheduler="tcp://x:1", cluster=tmp_path).__enter__()
     with pytest.raises(InputError, match="--workers: expected none with --scheduler"):
         running(Need(1, 0.0, None), folders, scheduler="tcp://x:1", count=2).__enter__()
+
+
+def test_nothing_is_written_where_workers_are_refused(tmp_path, capsys):
+    save_image(tmp_path / "a.nii.gz", sample_image(3))
+    (tmp_path / "t.tsv").write_text("subject\timage\n1\ta.nii.gz\n")
+    command = ["cohort", tmp_path / "t.tsv", "-o", tmp_path / "out", "--nodes", 60]
+    assert exit_code(*command, "--cluster", written(tmp_path, "jobqueue: {slum: {}}")) == 2
+    assert "expected one of htcondor" in capsys.readouterr().err
+    assert exit_code(*command, "--scheduler", "tcp://127.0.0.1:1", "--workers", 2) == 2
+    assert "--workers: expected none with --scheduler" in capsys.readouterr().err
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(

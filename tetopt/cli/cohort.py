@@ -40,7 +40,7 @@ from tetopt.cohort.page import save_cohort_files
 from tetopt.cohort.run import Ended, Job
 from tetopt.cohort.schedule import SchedulerLost, run_all
 from tetopt.cohort.subjects import TABLE_SUFFIXES, Problems, key, write_table
-from tetopt.cohort.workers import Folders, Need, shares, workers
+from tetopt.cohort.workers import Folders, Need, check_choice, shares, workers
 from tetopt.engine.cost import Prediction, RunSize, calibrated_speed, predicted
 from tetopt.errors import InputError
 from tetopt.io.files import checked_output
@@ -102,6 +102,7 @@ def cohort_command(
     if cohort.dry_run:
         _say_estimate(to_run, estimate, cohort, engine.threads)
         return 0
+    check_choice(cohort.count, cohort.scheduler, cohort.cluster)
     keys = [entry.key for entry in entries]
     alone = keys if cohort.participants and len(keys) <= MOST_BESIDE else None  # beside runs of others, one folder's
     _begin(place, subjects)

@@ -32,7 +32,7 @@ from tetopt.cohort.crew import (
     dashboard_address,
     slots_of,
 )
-from tetopt.cohort.jobs import submitted
+from tetopt.cohort.jobs import configuration, submitted
 from tetopt.errors import InputError
 
 CONNECT_SECONDS = 10  # until a scheduler that does not answer is given up: dask's own is 30
@@ -70,11 +70,7 @@ def workers(
         dask is not installed; a scheduler that does not answer; workers of another version, that do not see `work` or
         have too little memory (also while the block lasts, from `slots`); a file that is none, or asks for too little.
     """
-    check_installed()
-    if scheduler is not None and cluster is not None:
-        raise InputError("--scheduler, --cluster: expected one of them, got both")
-    if scheduler is not None and count is not None:
-        raise InputError("--workers: expected none with --scheduler, whose workers are there; start more of them")
+    check_choice(count, scheduler, cluster)
     with ExitStack() as stack:
         stack.enter_context(_quiet(folders.logs / "dask.log"))
         if scheduler is not None:
@@ -83,6 +79,17 @@ def workers(
             yield submitted(stack, need, folders, cluster, count)
         else:
             yield _local(stack, need, folders, count)
+
+
+def check_choice(count: int | None, scheduler: str | None, cluster: Path | None) -> None:
+    """InputError for what `workers` refuses without asking anybody: to be called before anything is written."""
+    check_installed()
+    if scheduler is not None and cluster is not None:
+        raise InputError("--scheduler, --cluster: expected one of them, got both")
+    if scheduler is not None and count is not None:
+        raise InputError("--workers: expected none with --scheduler, whose workers are there; start more of them")
+    if cluster is not None:
+        configuration(cluster)
 
 
 def check_installed() -> None:
