@@ -150,9 +150,8 @@ def publish(work: Path, out: Path, key: str) -> None:
     if place.exists():
         os.rename(place, aside)
     os.rename(work, place)
-    own = mesh_name(key, "")
-    for each in aside.iterdir() if aside.exists() else ():
-        if not each.name.startswith(own) and each.name != FIGURES_NAME:  # the user's, as notes or results of a solver
+    for each in aside.iterdir() if aside.exists() else ():  # the user's own, as notes or results of a solver
+        if not each.name.startswith(mesh_name(key, "")) and not (place / each.name).exists():
             os.rename(each, place / each.name)
     shutil.rmtree(aside, ignore_errors=True)
 
