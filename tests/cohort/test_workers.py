@@ -64,7 +64,7 @@ def processes():
     ("need", "count", "cores", "free", "expected"),
     [
         (Need(100, 0.0, None), None, 8, float("inf"), (8, 1)),  # cores
-        (Need(100, 2 * GB, None), None, 8, 11 * GB, (4, 2)),  # memory: 2.65 GB each
+        (Need(100, 2 * GB, None), None, 8, 12 * GB, (4, 2)),  # memory: 2.85 GB each
         (Need(3, 2 * GB, None), None, 8, 100 * GB, (3, 2)),  # subjects
         (Need(100, 2 * GB, None), 2, 8, 100 * GB, (2, 4)),  # count
         (Need(100, 2 * GB, 4), None, 8, 100 * GB, (2, 4)),  # threads of each
@@ -255,11 +255,11 @@ def requested(settings, need, kind="slurm"):
 def test_a_job_asks_for_what_a_subject_needs():
     plain = requested({}, Need(9, 4 * GB, None))
     assert (plain.cores, plain.processes, plain.threads) == (4, 1, 4)
-    assert plain.bytes == pytest.approx(5.15 * GB)  # a quarter more than predicted, and the worker itself
-    assert plain.subject_bytes == pytest.approx(5 * GB)
+    assert plain.bytes == pytest.approx(5.55 * GB)  # 1.35 times what is predicted, and the worker itself
+    assert plain.subject_bytes == pytest.approx(5.4 * GB)
     packed = requested({"cores": 8, "processes": 2}, Need(9, 4 * GB, None))
     assert (packed.cores, packed.threads) == (8, 4)
-    assert packed.bytes == pytest.approx(10.3 * GB)
+    assert packed.bytes == pytest.approx(11.1 * GB)
     assert requested({}, Need(9, 4 * GB, 2)).cores == 2
     assert requested({"memory": "8GB"}, Need(9, 4 * GB, 2)).bytes == 8 * GB
 
@@ -273,7 +273,7 @@ def test_a_job_asks_for_what_a_subject_needs():
         ("lsf", {"mem": 10**9}, Need(1, 4 * GB, None), "mem: expected at least"),
         ("slurm", {"cores": 2}, Need(1, 1.0, 4), "cores: expected at least 4 for 1 subjects of 4 threads, got 2"),
         ("slurm", {"cores": 2, "processes": 3}, Need(1, 1.0, None), "cores: expected at least 3"),
-        ("sge", {}, Need(1, 4 * GB, None), "expected resource-spec, by which a job asks for 5.15 GB here"),
+        ("sge", {}, Need(1, 4 * GB, None), "expected resource-spec, by which a job asks for 5.55 GB here"),
         ("oar", {}, Need(1, 4 * GB, None), "expected memory-per-core-property-name"),
     ],
 )
@@ -288,11 +288,11 @@ def test_less_than_a_subject_needs_is_refused(kind, settings, need, words):
         (
             "slurm",
             'queue: long, account: lab, walltime: "12:00:00", job_extra_directives: ["--gres=tmp:1"]',
-            ["#SBATCH -p long", "#SBATCH -A lab", "#SBATCH -t 12:00:00", "#SBATCH --gres=tmp:1", "#SBATCH --mem=5G",
+            ["#SBATCH -p long", "#SBATCH -A lab", "#SBATCH -t 12:00:00", "#SBATCH --gres=tmp:1", "#SBATCH --mem=6G",
              "#SBATCH --cpus-per-task=2"],
         ),
-        ("pbs", "queue: long", ["#PBS -q long", "#PBS -l select=1:ncpus=2:mem=4912MB"]),
-        ("lsf", "queue: long, lsf-units: mb", ["#BSUB -q long", "#BSUB -n 2", "#BSUB -M 5150"]),
+        ("pbs", "queue: long", ["#PBS -q long", "#PBS -l select=1:ncpus=2:mem=5293MB"]),
+        ("lsf", "queue: long, lsf-units: mb", ["#BSUB -q long", "#BSUB -n 2", "#BSUB -M 5550"]),
         ("sge", "queue: long, resource-spec: h_vmem=6G", ["#$ -q long", "#$ -l h_vmem=6G"]),
     ],
 )  # fmt: skip

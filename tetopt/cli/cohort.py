@@ -9,7 +9,6 @@ import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from io import StringIO
-from os import cpu_count
 from pathlib import Path
 from typing import NamedTuple
 
@@ -75,6 +74,7 @@ def cohort_command(
     solver: SolverOptions,
 ) -> int:
     """Mesh many subjects of a table or a BIDS folder, on this machine or a cluster; go on where it ended."""
+    check_choice(cohort.count, cohort.scheduler, cohort.cluster)
     suffix = checked_suffix(cohort.mesh_format)
     place, records = cohort.output, Records(content, sizes, start, engine, solver)
     if cohort.collect and (cohort.write_table is not None or cohort.dry_run or cohort.retry_failed):
@@ -102,7 +102,6 @@ def cohort_command(
     if cohort.dry_run:
         _say_estimate(to_run, estimate, cohort, engine.threads)
         return 0
-    check_choice(cohort.count, cohort.scheduler, cohort.cluster)
     keys = [entry.key for entry in entries]
     alone = keys if cohort.participants and len(keys) <= MOST_BESIDE else None  # beside runs of others, one folder's
     _begin(place, subjects)
@@ -197,9 +196,11 @@ def _say_estimate(to_run: Sequence[Entry], estimate: Estimate, cohort: CohortOpt
             out.print(escape(f"{entry.key}: sizes unknown: its image cannot be read"))
         else:
             out.print(escape(f"{entry.key}: {one.seconds:.0f} s on a thread, {memory_words(one.peak_bytes)}"))
+    from dask.system import CPU_COUNT  # as affinity and containers leave them
+
     free = available_bytes()
     need = Need(len(to_run), estimate.largest, threads)
-    share = shares(need, cohort.count, cpu_count() or 1, float("inf") if free is None else float(free))
+    share = shares(need, cohort.count, CPU_COUNT, float("inf") if free is None else float(free))
     out.print(
         f"in all {_time(estimate.seconds())} on one thread, at most {memory_words(estimate.largest)} each; on this "
         f"machine {share.workers} at a time: about {_time(estimate.seconds() / share.workers)}"
@@ -225,14 +226,15 @@ def _run(to_run: Sequence[Entry], estimate: Estimate, cohort: CohortOptions, suf
             jobs = [_job(entry, estimate, place, suffix, pool.threads, alive.name) for entry in to_run]
             jobs.sort(key=lambda job: -job.seconds)  # so that no long one is left alone at the end
             refresh = _refresher(place)
-            with _progress(jobs, pool.slots()) as show:
-                for ended in run_all(jobs, pool.client, pool.slots, pool.bytes):
-                    show(ended)
-                    refresh()
+            try:
+                with _progress(jobs, pool.slots()) as show:
+                    for ended in run_all(jobs, pool.client, pool.slots, pool.bytes):
+                        show(ended)
+                        refresh()
+            finally:  # before the workers are closed, which give up what they run as soon as they see it
+                alive.unlink(missing_ok=True)
     except SchedulerLost as lost:
         show_error(f"{lost}; what was finished is in its place")
-    finally:
-        alive.unlink(missing_ok=True)
 
 
 def _refresher(place: Path) -> Callable[[], None]:

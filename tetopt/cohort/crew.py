@@ -14,7 +14,7 @@ import tetopt
 from tetopt.budget import memory_words
 from tetopt.errors import InputError
 
-MEMORY_MARGIN = 1.25  # of a subject's memory over its prediction, which is within 25 %
+MEMORY_MARGIN = 1.35  # of a subject's memory over its prediction, which may be 25 % too low: 1 / 0.75
 WORKER_BYTES = 1.5e8  # of a dask worker itself with its nanny: 65 MB each, and what they exchange
 DASHBOARD_PORT = 8787  # dask's own, which its users know; another where that is taken
 
