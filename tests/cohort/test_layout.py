@@ -114,3 +114,13 @@ def test_what_a_user_has_put_beside_a_mesh_stays(out):
     publish(work, out, "sub-1")
     assert sorted(each.name for each in place.iterdir()) == ["a.txt", "results", "sub-1_desc-tetopt_mesh.vtu"]
     assert (place / "results" / "stress.frd").read_text() == "mine"
+
+
+def test_what_an_earlier_crash_has_put_aside_is_not_in_the_way(out):
+    """A run beside others restores its own subjects alone, and may find this after its last look."""
+    publish(work_of(out, "sub-1", "second"), out, "sub-1")
+    (out / ".work" / "sub-1.before").mkdir()
+    (out / ".work" / "sub-1.before" / "a.txt").write_text("first")
+    publish(work_of(out, "sub-1", "third"), out, "sub-1")
+    assert (out / "sub-1" / "a.txt").read_text() == "third"
+    assert not [each for each in (out / ".work").iterdir() if each.is_dir()]

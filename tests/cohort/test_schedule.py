@@ -151,6 +151,10 @@ def test_a_scheduler_that_is_lost_ends_the_run_and_no_subject_fails_by_it(play, 
     with pytest.raises(SchedulerLost):
         play(client)
     assert not list((tmp_path / "out" / "logs").iterdir())
+    client = FakeClient({("sub-a", 1): killed(), ("sub-a", 2): "lost"})
+    with pytest.raises(SchedulerLost):
+        play(client)
+    assert failure(tmp_path, "sub-a") is None
     client = FakeClient()
     client.status = status
     with pytest.raises(SchedulerLost):
