@@ -115,8 +115,8 @@ def cohort_command(
         try:
             if to_run:
                 _run(to_run, estimate, cohort, suffix, engine.threads)
-                restore(place, alone)
         finally:  # also on Ctrl-C: what is done is seen
+            restore(place, alone)
             code = _close(place, keys)
             _say_rerun(code, context.obj)
     return code

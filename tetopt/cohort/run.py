@@ -96,7 +96,7 @@ def _attempt(job: Job, begin: float, attempt: int) -> tuple[Ended, bool]:
     outputs = ["-o", str(mesh), "--json", str(mesh.with_suffix(".json")), "--figures", str(work / FIGURES_NAME)]
     command = python_command("-m", "tetopt", "mesh", *outputs, *job.words)
     environment = python_environment(**dict.fromkeys(THREAD_NAMES, str(job.threads)), COLUMNS="120")
-    peak, log = 0, log_path(out, job.key)
+    peak, log, is_given_up = 0, log_path(out, job.key), False
     with (
         log.open("wb" if attempt == 1 else "ab") as stream,
         started(command, work, environment, stdout=stream, stderr=stream) as child,
@@ -106,8 +106,12 @@ def _attempt(job: Job, begin: float, attempt: int) -> tuple[Ended, bool]:
                 child.wait(LOOK_SECONDS)
             peak = max(peak, status_bytes("VmHWM", Path("/proc", str(child.pid))))
             if not (out / WORK_NAME / job.run).exists():
-                return Ended(job.key, "given up", "given up", time.monotonic() - begin, peak), False
+                is_given_up = True
+                break
     seconds = time.monotonic() - begin
+    if is_given_up:
+        shutil.rmtree(work, ignore_errors=True)
+        return Ended(job.key, "given up", "given up", seconds, peak), False
     numbers = numbers_of(mesh.with_suffix(".json"))
     if child.returncode in (0, 1) and numbers is not None and mesh.is_file():
         publish(work, out, job.key)
