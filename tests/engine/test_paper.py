@@ -328,10 +328,13 @@ def test_real_volume(data_dir):
 
 
 def test_reference_run(data_dir):
-    """MNI152 T1, 5 k nodes, k_D = 0.2, 20 iterations: E_D below 0.60 of its initial value, mean rho above 0.29."""
+    """MNI152 T1, 5 k nodes, k_D = 0.2: E_D below 0.42 of its initial value, mean rho above 0.29.
+
+    In the first 6 of 20 iterations; the others lower E_D from 0.409 to 0.403.
+    """
     image = tetopt.load_image(data_dir / "mni_icbm152_t1_tal_nlin_sym_09a_converted.nii.gz")
-    result = optimize_paper(image, tetopt.lattice(image, nodes=5000), k_D=0.2, iterations=20)
-    assert result.history[-1].E_D < 0.60 * result.history[0].E_D
+    result = optimize_paper(image, tetopt.lattice(image, nodes=5000), k_D=0.2, iterations=6, n_t=6)
+    assert result.history[-1].E_D < 0.42 * result.history[0].E_D
     assert rho(result.mesh.points, result.mesh.cells).mean() > 0.29
 
 

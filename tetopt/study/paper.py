@@ -7,6 +7,7 @@ stated in the function's docstring; nothing is chosen to make a number match.
 from __future__ import annotations
 
 import tomllib
+from functools import cache
 from importlib.resources import files
 from typing import Any, NamedTuple
 
@@ -121,29 +122,37 @@ class Landscape(NamedTuple):
     E_minimum: float
 
 
+@cache
+def _energies_2b(n_places: int) -> tuple[Image, Mesh, NDArray[np.float64], NDArray[np.float64], NDArray[np.float64]]:
+    """Image, mesh, coordinates of the places along an axis, and both energies there, (n, n): the same for any k_D."""
+    size = 60
+    index = np.stack(np.meshgrid(np.arange(size), np.arange(size), indexing="ij"), axis=-1)
+    image = Image(np.where(index @ [1.0, 0.45] > 58.0, 200.0, 60.0))
+    mesh = lattice(image, blocks=(1, 1))
+    places = np.linspace(0.12, 0.88, n_places) * size - 0.5
+    energies = np.empty((2, n_places, n_places))
+    for i, x in enumerate(places):
+        for k, y in enumerate(places):
+            points = mesh.points.copy()
+            points[-1] = x, y
+            energies[:, i, k] = E_G(points, mesh.cells), E_D(image, Mesh(points, mesh.cells))
+    for kept in (places, energies):
+        kept.setflags(write=False)
+    return image, mesh, places, *energies
+
+
 def figure_2b(k_D: float, n_places: int = 41) -> Landscape:
     """The combined energy as a function of the centre node's position, and the minimum that the descent finds.
 
     The image, "simple" in the paper, is a square whose corner is bright along a slanted line.
     """
-    size = 60
-    index = np.stack(np.meshgrid(np.arange(size), np.arange(size), indexing="ij"), axis=-1)
-    image = Image(np.where(index @ [1.0, 0.45] > 58.0, 200.0, 60.0))
-    mesh = lattice(image, blocks=(1, 1))
-    centre = len(mesh.points) - 1
-    places = np.linspace(0.12, 0.88, n_places) * size - 0.5
-    E_G0, E_D0 = E_G(mesh.points, mesh.cells), E_D(image, mesh)
-    E = np.empty((n_places, n_places))
-    for i, x in enumerate(places):
-        for k, y in enumerate(places):
-            points = mesh.points.copy()
-            points[centre] = x, y
-            moved = Mesh(points, mesh.cells)
-            E[i, k] = combined(E_G(points, mesh.cells), E_D(image, moved), E_G0, E_D0, k_D)
+    image, mesh, places, E_G_there, E_D_there = _energies_2b(n_places)
+    initial = E_G(mesh.points, mesh.cells), E_D(image, mesh)
+    E = np.vectorize(combined)(E_G_there, E_D_there, *initial, k_D)
     result = optimize_paper(
         image, mesh, k_D=k_D, iterations=100, retessellate="never", boundary="fixed", tolerance=1e-6, step_ratio=0.1
     )
-    return Landscape(image, k_D, places, E, result.mesh.points[centre], result.history[-1].E)
+    return Landscape(image, k_D, places, E, result.mesh.points[-1], result.history[-1].E)
 
 
 # Fig. 3: brain MR and prostate elastography.
