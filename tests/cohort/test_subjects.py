@@ -68,6 +68,12 @@ def test_names_that_come_to_the_same_are_said():
     assert "sub-b_ses-x has a session, sub-b (row b) has none" in words[2]
 
 
+def test_names_that_no_file_can_have_are_refused():
+    assert list(doubled([subject("n" * 196)])) == []
+    (line,) = doubled([subject("n" * 100, "s" * 100)])
+    assert "has 209 letters" in line
+
+
 def test_a_table_that_was_written_reads_the_same(tmp_path):
     rows = [
         subject("01", "a", images=(tmp_path / "x.nii", Path("/far/y.nii")), options={"background": "-5"}),

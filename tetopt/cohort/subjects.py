@@ -21,6 +21,7 @@ FILE_OPTIONS = ("mask", "labels", "sizing", "start", "label_names")  # of `tetop
 NO_VALUES = ("", "n/a")  # of a cell that says nothing; the second is BIDS's
 LEFT_OUT = "#"  # what the name of a column begins with that is a note of the user's own
 IMAGE_PATTERN = re.compile(r"image(?:_([1-9][0-9]{0,2}))?$")
+MOST_LETTERS = 200  # of a subject's key: file systems take names of 255 bytes, and the longest adds 40 to it
 GLOB_LETTERS = "*?["
 
 
@@ -100,13 +101,17 @@ def read_table(path: Path) -> list[Subject]:
 
 
 def doubled(subjects: Iterable[Subject]) -> Iterator[str]:
-    """What is wrong with the subjects' names, a line each: none left, two alike, with and without a session."""
+    """What is wrong with the subjects' names, a line each: none left, too long, alike, with and without a session."""
     places: dict[str, str] = {}
     for each in subjects:
         if not label_of(each.subject) or (each.session and not label_of(each.session)):
             yield f"{each.place}: expected letters or digits in the names of subject and session"
             continue
         name = key(each)
+        if len(name) > MOST_LETTERS:
+            words = f"{name[:20]}... has {len(name)} letters, by which files are called"
+            yield f"{each.place}: {words}; expected at most {MOST_LETTERS}"
+            continue
         if name in places:
             yield f"{each.place}: {name} is also that of {places[name]}; give each its own subject or session"
         places.setdefault(name, each.place)
