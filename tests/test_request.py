@@ -8,10 +8,13 @@ import typer
 from commands import exit_code, mesh_words, numbers_in
 
 import tetopt
+from tetopt import InputError
 from tetopt.cli.options import (
+    ContentOptions,
     EngineOptions,
     ImagePart,
     OutputOptions,
+    Records,
     SizeOptions,
     SolverOptions,
     SourceOptions,
@@ -19,6 +22,7 @@ from tetopt.cli.options import (
     from_records,
     given_options,
     option_words,
+    with_options,
 )
 from tetopt.cli.request import requested
 
@@ -119,3 +123,24 @@ def test_run_json_states_the_request(tmp_path):
     assert numbers_in(tmp_path / "a.json")["request"] == requested(
         source, sizes, StartOptions(), engine, SolverOptions(), output
     )
+
+
+def test_options_of_a_row_replace_those_of_all():
+    """Of values that may be repeated all are the row's; a switch can be off; what is not named stays."""
+    solver = SolverOptions(sets=["C=below:3"], nonlinear=True, units="MPa", average="hill")
+    texts = {"set": "A=below:1; B=below:2;", "nonlinear": "No", "nodes": "70", "crop": "1:9,:,:", "average": "voigt"}
+    own = with_options(Records(ContentOptions(), SizeOptions(), StartOptions(), EngineOptions(), solver), texts)
+    assert own.given() == {
+        "crop": "1:9,:,:", "nodes": 70, "average": "voigt", "set": ["A=below:1", "B=below:2"], "units": "MPa",
+    }  # fmt: skip
+
+
+@pytest.mark.parametrize(("texts", "words"), [
+    ({"nods": "1"}, "is nodes meant"), ({"nodes": "1e3"}, "--nodes"),
+    ({"nonlinear": "maybe"}, "expected true or false"),
+    ({"json": "a.json"}, "is no option"), ({"help": "1"}, "is no option"),
+])  # fmt: skip
+def test_options_of_a_row_that_cannot_be(texts, words):
+    records = Records(ContentOptions(), SizeOptions(), StartOptions(), EngineOptions(), SolverOptions())
+    with pytest.raises(InputError, match=words):
+        with_options(records, texts)

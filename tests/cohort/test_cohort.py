@@ -21,7 +21,9 @@ import tetopt.cli.cohort
 from tetopt.cli import cohort as cohort_module
 from tetopt.cli import cohort_plan
 from tetopt.cli.cohort import Estimate
+from tetopt.cli.options import ContentOptions, EngineOptions, Records, SizeOptions, SolverOptions, StartOptions
 from tetopt.cohort.layout import begin, description
+from tetopt.cohort.subjects import read_table
 
 COMMON = ("--iterations", "1", "--nodes", "60")
 N_SUBJECTS = 12
@@ -239,6 +241,26 @@ def test_all_that_is_wrong_is_said_before_anything_is_run(small, capsys):
 def test_options_of_all_that_cannot_be_are_refused(small, capsys, monkeypatch, options, words):
     monkeypatch.chdir(small)
     assert any(words in line for line in refused(small, capsys, *options))
+
+
+def test_words_of_a_run_mean_the_same_in_any_folder(small, monkeypatch):
+    """A worker of a scheduler that others started may be in another one."""
+    (small / "law.csv").write_text("intensity,young\n0,1\n100,5\n")
+    monkeypatch.chdir(small)
+    records = Records(ContentOptions(), SizeOptions(), StartOptions(), EngineOptions(), SolverOptions(young="law.csv"))
+    (entry, _) = cohort_plan.entries_of(read_table(Path("t.tsv")), records, small / "out", ".vtu", print)
+    assert entry.words() == ("--nodes=60", f"--young={small / 'law.csv'}", "--", str(small / "a.nii.gz"))
+
+
+def test_threads_are_of_all_subjects(small, capsys):
+    """They are a share of the machine; those of one subject would be passed over."""
+    (small / "t.tsv").write_text("subject\timage\tthreads\n01\ta.nii.gz\t1\n")
+    assert "leave the column out" in refused(small, capsys)[0]
+
+
+def test_a_volume_of_the_first_image_is_an_option(small, capsys):
+    (small / "t.tsv").write_text("subject\timage\timage_2\n01\ta.nii.gz:0\ta.nii.gz:0\n")
+    assert [line.rpartition("/")[2] for line in refused(small, capsys)] == ["a.nii.gz:0 is not there"]
 
 
 def test_a_folder_of_something_else_is_not_written_to(small, capsys):

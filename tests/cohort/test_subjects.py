@@ -33,6 +33,16 @@ def test_a_table_says_what_is_meshed(tmp_path):
     assert [key(first), key(second)] == ["sub-01_ses-a", "sub-02"]
 
 
+def test_files_of_laws_are_relative_to_the_table(tmp_path):
+    path = table(tmp_path / "s.tsv", "subject\timage\tyoung\tnu\tdensity", "1\ta.nii\tlaw.csv\t0.3\t../rho.TOML")
+    (row,) = read_table(path)
+    laws = {"young": str(tmp_path / "law.csv"), "nu": "0.3", "density": str(tmp_path.parent / "rho.TOML")}
+    assert row.options == laws
+    (tmp_path / "inner").mkdir()
+    write_table(tmp_path / "inner" / "u.tsv", [row])
+    assert "\t../../rho.TOML\t0.3\t../law.csv\n" in (tmp_path / "inner" / "u.tsv").read_text()
+
+
 @pytest.mark.parametrize(("suffix", "lines"), [
     (".csv", ['subject,image', '"a, b",x.nii']), (".csv", ["subject;image", '"a, b";x.nii']),
     (".csv", ["\ufeffparticipant_id,image", '"a, b",x.nii']), (".tsv", ["subject\timage", "a, b\tx.nii", "", "\t"]),

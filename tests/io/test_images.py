@@ -1011,6 +1011,16 @@ def test_sha256_of_a_folder(tmp_path):
     assert sha256(tmp_path) == hashlib.sha256(b"firstsecondthird").hexdigest()
 
 
+@pytest.mark.parametrize(("name", "data"), [("a.mhd", "a.raw"), ("a.nhdr", "a.raw")])
+def test_sha256_of_a_header_is_that_of_its_voxels_too(tmp_path, sitk, name, data):
+    """They lie in a file beside it, which may be another while the header stays the same."""
+    sitk.WriteImage(sitk.GetImageFromArray(ramp(4, 5, 6)), str(tmp_path / name))
+    header, voxels = (tmp_path / name).read_bytes(), (tmp_path / data).read_bytes()
+    assert sha256(tmp_path / name) == hashlib.sha256(header + voxels).hexdigest()
+    (tmp_path / name).write_bytes(b"no header")
+    assert sha256(tmp_path / name) == hashlib.sha256(b"no header").hexdigest()
+
+
 def test_sha256_of_nothing():
     with pytest.raises(InputError, match=r"^nowhere: no such file or folder"):
         sha256(Path("nowhere"))

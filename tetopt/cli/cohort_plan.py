@@ -27,6 +27,7 @@ from tetopt.cohort.state import State, state_of, strangers
 from tetopt.cohort.subjects import FILE_OPTIONS, Problems, Subject, doubled, key, matching, read_table
 from tetopt.errors import InputError
 from tetopt.io.formats import FORMATS
+from tetopt.model.laws import LAW_OPTIONS, law_file
 
 OPTION_NAMES = {name: name.replace("_", "-") for name in FILE_OPTIONS}
 
@@ -117,7 +118,10 @@ class _Plans:
     """Plans of subjects; options that several share are checked once."""
 
     def __init__(self, records: Records, suffix: str) -> None:
-        self._records, self._suffix = records, suffix
+        laws = {name: law_file(getattr(records.solver, name) or "") for name in LAW_OPTIONS}
+        # A worker may be started in another folder.
+        placed: dict[str, Any] = {name: str(file.absolute()) for name, file in laws.items() if file is not None}
+        self._records, self._suffix = records._replace(solver=replace(records.solver, **placed)), suffix
         self._patterns = {
             name: path for name in FILE_OPTIONS if (path := records.given().get(OPTION_NAMES[name])) is not None
         }
@@ -128,6 +132,8 @@ class _Plans:
         files = {name: matching(str(pattern), subject) for name, pattern in self._patterns.items()} | subject.files
         kind = (tuple(sorted(subject.options.items())), tuple(sorted(files)), len(subject.images))
         if kind not in self._known:
+            if "threads" in subject.options:
+                raise InputError("threads: all subjects have the same number, of --threads; leave the column out")
             options = {name.replace("_", "-"): text for name, text in subject.options.items()}
             self._known[kind] = self._planned(_with_files(with_options(self._records, options), files), subject)
         records, plan = self._known[kind]
@@ -156,8 +162,8 @@ def _missing(source: SourceOptions, records: Records) -> Iterator[str]:
     named = [("image", path) for path in source.images]
     options = given_options(*records)
     named += [(name, options[OPTION_NAMES[name]]) for name in FILE_OPTIONS if OPTION_NAMES[name] in options]
-    for name, path in named:
-        file = file_and_volume(path)[0]
+    for number, (name, path) in enumerate(named):
+        file = path if number == 0 else file_and_volume(path)[0]  # of the first, --volume tells which
         try:
             if not os.path.lexists(file):
                 yield f"{name}: {path} is not there"

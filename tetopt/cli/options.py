@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterator
 from copy import copy
 from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from difflib import get_close_matches
-from functools import wraps
+from functools import cache, wraps
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, cast, get_args, get_type_hints
 
@@ -372,7 +372,7 @@ def given_options(*records: Any) -> dict[str, Any]:
     """
     options: dict[str, Any] = {}
     for record in records:
-        kinds = get_type_hints(type(record), include_extras=True)
+        kinds = _kinds(record.__class__)
         for field in fields(record):
             value = getattr(record, field.name)
             if is_dataclass(value):
@@ -454,6 +454,7 @@ class Records(NamedTuple):
         return given_options(*self)
 
 
+@cache  # as is what else takes as long, since each of 20,000 subjects may have options of its own
 def record_names() -> dict[str, bool]:
     """The options of `Records` by their names on the command line, and whether each is a switch, without a value."""
     kinds = [each for kind in get_type_hints(Records).values() for each in _leaves(kind)]
@@ -462,7 +463,7 @@ def record_names() -> dict[str, bool]:
 
 def _leaves(kind: Any) -> Iterator[tuple[str, Any]]:
     """The fields of a record and of those in it, with their annotations."""
-    kinds = get_type_hints(kind, include_extras=True)
+    kinds = _kinds(kind)
     for field in fields(kind):
         if is_dataclass(kinds[field.name]):
             yield from _leaves(kinds[field.name])
@@ -482,19 +483,18 @@ def with_options(records: Records, texts: dict[str, str]) -> Records:
         An option that there is not, or a value that is none of it.
     """
     names = record_names()
-    words, off = [], set()
+    words = []
     for name, text in texts.items():
         if name not in names:
             near = get_close_matches(name, names, 1)
             raise InputError(f"{name}: is no option of tetopt mesh" + (f"; is {near[0]} meant?" if near else ""))
         if not names[name]:
             several = name in ("set", "load")
-            words += [f"--{name}={part.strip()}" for part in (text.split(";") if several else [text])]
+            parts = [part.strip() for part in text.split(";") if part.strip()] if several else [text]
+            words += [f"--{name}={part}" for part in parts]
         elif text.lower() in ("1", "true", "yes"):
             words.append(f"--{name}")
-        elif text.lower() in ("0", "false", "no"):
-            off.add(name)
-        else:
+        elif text.lower() not in ("0", "false", "no"):
             raise InputError(f'{name}: expected true or false, got "{text}"')
     parsed = _parsed(tuple(words))
     return Records(*(_replaced(old, new, set(texts)) for old, new in zip(records, parsed, strict=True)))
@@ -502,7 +502,7 @@ def with_options(records: Records, texts: dict[str, str]) -> Records:
 
 def _replaced(old: Any, new: Any, names: set[str]) -> Any:
     """A record with the fields of another that have these names on the command line."""
-    kinds = get_type_hints(type(old), include_extras=True)
+    kinds = _kinds(old.__class__)
     changes = {}
     for field in fields(old):
         value, other = getattr(old, field.name), getattr(new, field.name)
@@ -516,22 +516,35 @@ def _replaced(old: Any, new: Any, names: set[str]) -> Any:
 def _parsed(words: tuple[str, ...]) -> Records:
     """The records that words of a command line come to."""
     parsed: list[Records] = []
-
-    def command(
-        content: ContentOptions, sizes: SizeOptions, start: StartOptions, engine: EngineOptions, solver: SolverOptions
-    ) -> int:
-        parsed.append(Records(content, sizes, start, engine, solver))
-        return 0
-
-    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
-    app.command()(from_records(command))
     try:
-        app(args=list(words), standalone_mode=False)
+        _parser()(list(words), standalone_mode=False, obj=parsed)
     except Exception as error:
         if not hasattr(error, "format_message"):
             raise
         raise InputError(str(error.format_message())) from error
     return parsed[0]
+
+
+@cache
+def _kinds(kind: type) -> dict[str, Any]:
+    """The fields of a record with their annotations."""
+    return get_type_hints(kind, include_extras=True)
+
+
+@cache
+def _parser() -> Any:
+    """A command that puts the records that its words come to into its context's list."""
+
+    def command(
+        context: typer.Context, content: ContentOptions, sizes: SizeOptions, start: StartOptions,
+        engine: EngineOptions, solver: SolverOptions,
+    ) -> int:  # fmt: skip
+        context.obj.append(Records(content, sizes, start, engine, solver))
+        return 0
+
+    app = typer.Typer(add_completion=False, pretty_exceptions_enable=False)
+    app.command()(from_records(command))
+    return typer.main.get_command(app)
 
 
 def from_records(command: Callable[..., int]) -> Callable[..., int]:

@@ -20,10 +20,9 @@ from tetopt.cli.options import (
     given_options,
 )
 from tetopt.io.images import sha256
+from tetopt.model.laws import LAW_OPTIONS, law_file
 
 WITHOUT_SAY = ("threads",)  # options on which no output depends
-LAW_OPTIONS = ("young", "nu", "density")  # whose text may name a file, by one of these suffixes
-LAW_SUFFIXES = (".toml", ".csv")
 
 
 def requested(
@@ -59,7 +58,7 @@ def requested(
 def _files(name: str, value: Any) -> list[Path]:
     """The files among an option's values."""
     if name in LAW_OPTIONS:
-        return [Path(value)] if value.lower().endswith(LAW_SUFFIXES) else []
+        return [] if (file := law_file(value)) is None else [file]
     return [each for each in (value if isinstance(value, list) else [value]) if isinstance(each, Path)]
 
 

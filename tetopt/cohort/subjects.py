@@ -13,6 +13,7 @@ from typing import NamedTuple
 from tetopt.errors import InputError
 from tetopt.incoming import text_of
 from tetopt.io.files import save_text
+from tetopt.model.laws import LAW_OPTIONS, law_file
 
 TABLE_SUFFIXES = (".tsv", ".csv")
 SUBJECT_COLUMNS = ("subject", "participant_id")  # the second is BIDS's
@@ -87,6 +88,7 @@ def read_table(path: Path) -> list[Subject]:
             continue
         options = {name: cell for name, cell in cells.items() if name not in ("subject", "session", *images)}
         files = {name: _absolute(folder, options.pop(name)) for name in FILE_OPTIONS if name in options}
+        options |= {name: str(_absolute(folder, str(file))) for name, file in _law_files(options)}
         subjects.append(
             Subject(
                 cells["subject"].removeprefix("sub-"), cells.get("session", "").removeprefix("ses-"),
@@ -137,6 +139,7 @@ def table_text(path: Path, subjects: Sequence[Subject]) -> str:
     writer.writeheader()
     for each in subjects:
         row = {"subject": each.subject, **({"session": each.session} if each.session else {}), **each.options}
+        row |= {name: _relative(folder, file) for name, file in _law_files(each.options)}
         row |= {name: _relative(folder, image) for name, image in zip(images, each.images, strict=False)}
         writer.writerow(row | {name: _relative(folder, file) for name, file in each.files.items()})
     return stream.getvalue()
@@ -204,6 +207,13 @@ def _columns(path: Path, first: tuple[int, list[str]]) -> list[str]:
             f"there is no {' and no '.join(missing)}"
         )
     return columns
+
+
+def _law_files(options: dict[str, str]) -> Iterator[tuple[str, Path]]:
+    """The files that laws among a subject's options name."""
+    for name in LAW_OPTIONS:
+        if (file := law_file(options.get(name, ""))) is not None:
+            yield name, file
 
 
 def _image_number(name: str) -> int:

@@ -31,7 +31,7 @@ from tetopt.image import Image
 from tetopt.incoming import irregular
 from tetopt.io.apart import DEFLATE_RATIO
 from tetopt.io.files import check_suffix, written_whole
-from tetopt.io.itk_headers import HEADED_SUFFIXES, header_sizes
+from tetopt.io.itk_headers import HEADED_SUFFIXES, data_files, header_sizes
 from tetopt.io.pictures import PICTURE_SUFFIXES, read_picture
 from tetopt.io.read_itk import ITK_READERS, read_dicom_folder, read_itk
 from tetopt.io.volumes import DAMAGED_FILE, UNREADABLE_FILE, check_room, one_line, volume_index
@@ -330,6 +330,8 @@ def parse_slice(text: str) -> tuple[int, int]:
 def sha256(path: str | Path) -> str:
     """SHA-256 of a file, or of the contents of a folder's files joined in the order of their names.
 
+    Of a header whose voxels are in files beside it, with these.
+
     Raises
     ------
     InputError
@@ -342,6 +344,9 @@ def sha256(path: str | Path) -> str:
             raise InputError(f"{path}: expected a regular file, got {other}; copy what it gives into a file")
         # A DICOM series is read from the folder itself and not from folders in it; so is its checksum.
         files = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
+        if path.name.lower().endswith(HEADED_SUFFIXES):
+            with contextlib.suppress(InputError):  # a header that cannot be read has none
+                files += data_files(path)
         for file in files:
             with file.open("rb") as stream:
                 while block := stream.read(1 << 20):

@@ -53,10 +53,7 @@ def checked_header(path: Path) -> tuple[int, int]:
         is not beside the header, or no regular file.
     """
     header = _header(path)
-    n_bytes = path.stat().st_size
-    for name in header.files:
-        _check_beside(path, name)
-        n_bytes += (path.parent / name).stat().st_size
+    n_bytes = sum(file.stat().st_size for file in (path, *_data_files(path, header)))
     if header.value_bytes > n_bytes * header.ratio:
         sizes = " x ".join(str(size) for size in header.sizes)
         raise InputError(
@@ -65,6 +62,17 @@ def checked_header(path: Path) -> tuple[int, int]:
         )
     check_room(header.sizes, header.value_bytes // max(math.prod(header.sizes), 1))
     return n_bytes, header.value_bytes
+
+
+def data_files(path: Path) -> list[Path]:
+    """The files beside a header that have its voxels; InputError as `checked_header`, none where they follow it."""
+    return _data_files(path, _header(path))
+
+
+def _data_files(path: Path, header: VoxelHeader) -> list[Path]:
+    for name in header.files:
+        _check_beside(path, name)
+    return [path.parent / name for name in header.files]
 
 
 def header_sizes(path: Path) -> tuple[int, ...]:

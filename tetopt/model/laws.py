@@ -16,6 +16,9 @@ from tetopt.errors import InputError
 from tetopt.incoming import text_of, toml_of
 from tetopt.model.formula import parse_formula
 
+LAW_OPTIONS = ("young", "nu", "density")  # of commands, whose text is a law
+LAW_SUFFIXES = (".toml", ".csv")  # of files that a law's text may name
+
 Law = Callable[[NDArray[np.float64]], ArrayLike] | Sequence[Sequence[float]] | NDArray[np.floating] | None
 
 
@@ -187,14 +190,19 @@ def parse_any_law(text: str, quantity: str = "young") -> Law | ByLabel | float:
     InputError
         As `parse_table`, `parse_labels`, `parse_formula` and `load_law`.
     """
-    if text.lower().endswith((".toml", ".csv")):
-        return load_law(Path(text), quantity)
+    if (file := law_file(text)) is not None:
+        return load_law(file, quantity)
     if "=" in text:
         return parse_labels(text)
     with contextlib.suppress(ValueError):
         if np.isfinite(value := float(text)):
             return value
     return _checked_pairs(parse_table(text)) if ":" in text else parse_formula(text)
+
+
+def law_file(text: str) -> Path | None:
+    """The file that a law's text names; None if the text is the law."""
+    return Path(text) if text.lower().endswith(LAW_SUFFIXES) else None
 
 
 def load_law(path: Path, quantity: str = "young") -> Law | ByLabel:
@@ -250,10 +258,10 @@ def has_column(text: str, name: str) -> bool:
     InputError
         As `load_law`, of files.
     """
-    if not text.lower().endswith((".toml", ".csv")):
+    if (file := law_file(text)) is None:
         return False
     try:
-        return name in _columns(Path(text))
+        return name in _columns(file)
     except (ValueError, RecursionError):  # reported when the column that must be there is read
         return False
 
