@@ -6,11 +6,13 @@ import signal
 import threading
 import time
 
+import numpy as np
 import pytest
 from commands import exit_code, numbers_in
 
+import tetopt
 from tetopt.cohort.layout import begin, description, failure_path, log_path, numbers_path, subject_folder
-from tetopt.cohort.run import Job, run_subject
+from tetopt.cohort.run import Job, _reason, run_subject
 
 WORDS = ("--nodes=60", "--iterations=1", "--")
 
@@ -66,6 +68,29 @@ def test_a_refused_subject_is_one_line_and_no_files(job, tmp_path):
     failure = json.loads(failure_path(out, "sub-1").read_text())
     assert (failure["reason"], failure["attempts"]) == (ended.reason, 1)
     assert ended.reason in log_path(out, "sub-1").read_text()
+
+
+def test_a_mesh_that_misses_a_promise_is_a_mesh(job, tmp_path):
+    """A mask of two thin plates, and too few nodes for it: `tetopt mesh` ends with 1."""
+    inside = np.zeros((24, 24, 24))
+    inside[4:20, 4:20, 11:13] = inside[11:13, 4:20, 4:20] = 1.0
+    tetopt.save_image(tmp_path / "thin.nii.gz", tetopt.Image(100.0 * inside + np.arange(24.0)))
+    tetopt.save_image(tmp_path / "mask.nii.gz", tetopt.Image(inside))
+    words = (f"--mask={tmp_path}/mask.nii.gz", *WORDS, str(tmp_path / "thin.nii.gz"))
+    ended = run_subject(job._replace(words=words))
+    assert ended.status == "missed"
+    assert "overlap only by Dice" in ended.reason
+    assert subject_folder(tmp_path / "out", "sub-1").is_dir()
+    assert not failure_path(tmp_path / "out", "sub-1").exists()
+
+
+@pytest.mark.parametrize(("text", "reason"), [
+    ("tetopt: a.nii: too short\ntetopt: warning: slow\nTraceback\n", "a.nii: too short"),
+    ("one\nlast words\n\n", "last words"), ("", "ended with exit code 2 and no message"),
+])  # fmt: skip
+def test_the_reason_is_the_last_line_that_says_one(tmp_path, text, reason):
+    (tmp_path / "a.log").write_text(text)
+    assert _reason(tmp_path / "a.log", 2) == reason
 
 
 def test_what_was_there_stays_where_a_run_fails(job, tmp_path):

@@ -162,6 +162,15 @@ def test_a_scheduler_that_is_lost_ends_the_run_and_no_subject_fails_by_it(play, 
     assert client.submitted == []
 
 
+def test_a_scheduler_that_is_lost_while_it_is_asked_is_said_so(play, tmp_path):
+    def no_answer():
+        raise ConnectionResetError(104, "in <TCP (closed) ConnectionPool.gather>: Connection reset by peer")
+
+    with pytest.raises(SchedulerLost, match="does not answer any more"):
+        play(FakeClient(), slots=no_answer)
+    assert not list((tmp_path / "out" / "logs").iterdir())
+
+
 def slow(job):
     time.sleep(0.4)
     return Ended(job.key, "done", "", 0.4, 0)

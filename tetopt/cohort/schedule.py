@@ -19,6 +19,7 @@ from tetopt.errors import InputError
 from tetopt.study.endings import last_line
 
 WAIT_SECONDS = 1.0  # between two looks at the workers, which come and go
+LOST_WORDS = "the scheduler of the cluster does not answer any more"
 
 
 class SchedulerLost(InputError):
@@ -63,7 +64,7 @@ def run_all(
     running: dict[Any, tuple[Job, int]] = {}
     while waiting or running:
         _check_scheduler(client)
-        n_slots = slots() if waiting else 0
+        n_slots = _answer(slots) if waiting else 0
         while waiting and len(running) < n_slots:
             job, attempt = waiting.popleft()
             running[client.submit(task, job, key=f"{job.key}-{job.run}-{attempt}", pure=False)] = job, attempt
@@ -77,7 +78,7 @@ def run_all(
                 _check_scheduler(client)  # a client that loses it cancels what it waits for
             job, attempt = running.pop(future)
             if future.status == "finished":
-                yield future.result()
+                yield _answer(future.result)
             elif attempt < MOST_ATTEMPTS:
                 waiting.appendleft((job, attempt + 1))
             else:
@@ -86,7 +87,15 @@ def run_all(
 
 def _check_scheduler(client: Any) -> None:
     if client.status != "running":
-        raise SchedulerLost("the scheduler of the cluster does not answer any more")
+        raise SchedulerLost(LOST_WORDS)
+
+
+def _answer(question: Callable[[], Any]) -> Any:
+    """What the scheduler says, which may be lost just then, before its client knows."""
+    try:
+        return question()
+    except OSError as error:
+        raise SchedulerLost(LOST_WORDS) from error
 
 
 def _cause(future: Any) -> str:
