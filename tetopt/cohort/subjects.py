@@ -22,7 +22,7 @@ FILE_OPTIONS = ("mask", "labels", "sizing", "start", "label_names")  # of `tetop
 NO_VALUES = ("", "n/a")  # of a cell that says nothing; the second is BIDS's
 LEFT_OUT = "#"  # what the name of a column begins with that is a note of the user's own
 IMAGE_PATTERN = re.compile(r"image(?:_([1-9][0-9]{0,2}))?$")
-MOST_LETTERS = 200  # of a subject's key: file systems take names of 255 bytes, and the longest adds 40 to it
+KEY_LETTERS = 200  # of a subject's key: file systems take names of 255 bytes, and the longest adds 40 to it
 GLOB_LETTERS = "*?["
 
 
@@ -110,9 +110,9 @@ def doubled(subjects: Iterable[Subject]) -> Iterator[str]:
             yield f"{each.place}: expected letters or digits in the names of subject and session"
             continue
         name = key(each)
-        if len(name) > MOST_LETTERS:
+        if len(name) > KEY_LETTERS:
             words = f"{name[:20]}... has {len(name)} letters, by which files are called"
-            yield f"{each.place}: {words}; expected at most {MOST_LETTERS}"
+            yield f"{each.place}: {words}; expected at most {KEY_LETTERS}"
             continue
         if name in places:
             yield f"{each.place}: {name} is also that of {places[name]}; give each its own subject or session"
