@@ -21,9 +21,18 @@ import tetopt.cli.cohort
 from tetopt.cli import cohort as cohort_module
 from tetopt.cli import cohort_plan
 from tetopt.cli.cohort import Estimate
-from tetopt.cli.options import ContentOptions, EngineOptions, Records, SizeOptions, SolverOptions, StartOptions
+from tetopt.cli.options import (
+    CohortOptions,
+    ContentOptions,
+    EngineOptions,
+    Records,
+    SizeOptions,
+    SolverOptions,
+    StartOptions,
+)
 from tetopt.cohort.layout import begin, description
 from tetopt.cohort.subjects import read_table
+from tetopt.engine.cost import Prediction
 
 COMMON = ("--iterations", "1", "--nodes", "60")
 N_SUBJECTS = 12
@@ -286,6 +295,14 @@ def test_a_dry_run_tells_what_it_takes(small, capsys):
     assert re.search(r"sub-01: \d+ s on a thread, \d+ MB|sub-01: \d+ s on a thread, 0\.\d+ GB", words)
     assert "in all" in words
     assert not (small / "out").exists()
+
+
+def test_what_is_larger_than_the_machine_takes_no_workers_from_others(monkeypatch):
+    """It does not begin here; jobs of a batch system may still have that memory."""
+    monkeypatch.setattr(cohort_module, "available_bytes", lambda: 8e9)
+    estimate = Estimate({"a": Prediction(1.0, 1.0, 1e9), "b": Prediction(1.0, 1.0, 1e11)}, 1e11)
+    here, there = CohortOptions(output=Path("out")), CohortOptions(output=Path("out"), cluster=Path("c.yaml"))
+    assert [cohort_module._need(2, estimate, each, None).subject_bytes for each in (here, there)] == [1e9, 1e11]
 
 
 def test_the_page_of_a_run_under_way(tmp_path, monkeypatch):

@@ -33,6 +33,18 @@ def test_more_takes_no_less(mode, name):
         assert second.peak_bytes >= first.peak_bytes
 
 
+def test_what_is_swept():
+    """1000 nodes in 20^3 voxels: facets cross 10 x 20 x 20 rows, in each iteration and run, for each channel more."""
+    size = RunSize(0, 8000, 1000, 10)
+    known = {"graded_cells": 60_000.0, "graded_rows": 40_000.0}
+    others = {"runs": (2, 2.0), "iterations": (30, 3.0), "elongation": (8.0, 4.0)}
+    terms = {name: value for name, value in cost.swept_terms(size).items() if value}
+    assert terms == pytest.approx(known)
+    for name, (value, factor) in others.items():
+        assert cost.swept_terms(size._replace(**{name: value}))["graded_rows"] == pytest.approx(40_000.0 * factor)
+    assert cost.swept_terms(size._replace(n_channels=3, mode="paper"))["channel_rows"] == pytest.approx(80_000.0)
+
+
 def test_voxels_and_channels_cost_something():
     """At least where many of them are read and kept."""
     small, large = RunSize(10**4, 10**4, 5000, 16), RunSize(10**7, 10**7, 5000, 16, 9, has_memberships=True)

@@ -189,6 +189,15 @@ def _read_size(entry: Entry) -> RunSize | None:
     return size_of_run(plan, source.content, source.contrasts[0], n_started)
 
 
+def _need(n_subjects: int, estimate: Estimate, cohort: CohortOptions, threads: int | None) -> Need:
+    """What workers are to have room for: on this machine not for what is larger than all of it, and will not begin."""
+    sizes = [each.peak_bytes for each in estimate.each.values()]
+    free = available_bytes()
+    if free is not None and cohort.scheduler is None and cohort.cluster is None:
+        sizes = [each for each in sizes if each <= free]
+    return Need(n_subjects, max(sizes, default=0.0), threads)
+
+
 def _say_estimate(to_run: Sequence[Entry], estimate: Estimate, cohort: CohortOptions, threads: int | None) -> None:
     """What would be run, and what it takes."""
     for entry in to_run:
@@ -199,7 +208,7 @@ def _say_estimate(to_run: Sequence[Entry], estimate: Estimate, cohort: CohortOpt
     from dask.system import CPU_COUNT  # as affinity and containers leave them
 
     free = available_bytes()
-    need = Need(len(to_run), estimate.largest, threads)
+    need = _need(len(to_run), estimate, cohort, threads)
     share = shares(need, cohort.count, CPU_COUNT, float("inf") if free is None else float(free))
     out.print(
         f"in all {_time(estimate.seconds())} on one thread, at most {memory_words(estimate.largest)} each; on this "
@@ -213,7 +222,7 @@ def _run(to_run: Sequence[Entry], estimate: Estimate, cohort: CohortOptions, suf
     work = place / WORK_NAME
     alive = work / f"run-{secrets.token_hex(4)}"
     alive.touch()
-    need = Need(len(to_run), estimate.largest, threads)
+    need = _need(len(to_run), estimate, cohort, threads)
     try:
         with workers(
             need,
