@@ -30,7 +30,7 @@ from tetopt.cli.options import (
     SolverOptions,
     StartOptions,
 )
-from tetopt.cohort.layout import begin, description
+from tetopt.cohort.layout import begin, description, locked
 from tetopt.cohort.subjects import read_table
 from tetopt.engine.cost import Prediction
 
@@ -276,6 +276,17 @@ def test_a_folder_of_something_else_is_not_written_to(small, capsys):
     (small / "out").mkdir()
     (small / "out" / "thesis.txt").write_text("mine")
     assert "no cohort's" in refused(small, capsys)[0]
+
+
+def test_a_second_run_is_refused_before_it_plans(small, capsys, monkeypatch):
+    begin(small / "out", description("test", []))
+
+    def fail(*_):
+        raise AssertionError("planned")
+
+    monkeypatch.setattr(tetopt.cli.cohort, "subjects_of", fail)
+    with locked(small / "out"):
+        assert "another run writes there" in refused(small, capsys)[0]
 
 
 def test_the_table_of_what_would_be_run(small, capsys):

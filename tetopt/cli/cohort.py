@@ -82,6 +82,9 @@ def cohort_command(
     if cohort.write_table is not None:
         checked_output(cohort.write_table, TABLE_SUFFIXES)
     check_out(place)
+    if (place / WORK_NAME).is_dir() and cohort.write_table is None and not cohort.dry_run:
+        with locked(place, []):  # said here as well, as the plan of many subjects takes minutes
+            pass
     try:
         rows = subjects_of(subjects, cohort)
         if cohort.collect:
