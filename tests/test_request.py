@@ -104,6 +104,14 @@ def test_a_request_changes_with_what_decides_the_mesh(request_of, tmp_path):
     assert len({first, *(each["sha256"] for each in others)}) == 5
 
 
+def test_a_volume_of_a_file_is_part_of_a_request(request_of, tmp_path):
+    first, second = (request_of(source={"mask": tmp_path / f"m.nii:{volume}"}) for volume in (0, 1))
+    (name, checksum), (other, same) = (each["files"]["mask"][0] for each in (first, second))
+    assert (name, other) == ("m.nii:0", "m.nii:1")
+    assert checksum == same == request_of()["files"]["mask"][0][1]
+    assert first["sha256"] != second["sha256"]
+
+
 def test_a_request_does_not_know_folders(request_of, tmp_path):
     other = tmp_path / "elsewhere"
     other.mkdir()

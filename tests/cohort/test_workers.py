@@ -17,7 +17,7 @@ from models import sample_image
 from tetopt.cohort import jobs
 from tetopt.cohort.crew import About, Folders, Need, Newcomers
 from tetopt.cohort.jobs import cluster_of, configuration, request
-from tetopt.cohort.workers import shares, workers
+from tetopt.cohort.workers import _threads_each, shares, workers
 from tetopt.errors import InputError
 from tetopt.interpreter import python_command, python_environment
 from tetopt.io.images import save_image
@@ -76,6 +76,13 @@ def test_as_many_workers_as_cores_memory_and_subjects_allow(need, count, cores, 
     share = shares(need, count, cores, free)
     assert share[:2] == expected
     assert share.bytes < free / share.workers or free == float("inf")
+
+
+def test_threads_of_a_subject_are_those_of_the_busiest_host():
+    """Its cores by all that run there at a time, of several workers too."""
+    abouts = [About("0", "3.11", "", host, cores, n_threads, 1.0) for host, cores, n_threads in
+              (("a", 16, 1), ("a", 16, 3), ("b", 12, 2), ("c", 2, 1))]  # fmt: skip
+    assert [_threads_each(some) for some in (abouts[:3], abouts, abouts[2:3], [])] == [4, 2, 6, 1]
 
 
 # ---- Here
