@@ -31,6 +31,7 @@ from tetopt.cli.options import (
     StartOptions,
 )
 from tetopt.cohort.layout import begin, description, locked
+from tetopt.cohort.state import State
 from tetopt.cohort.subjects import read_table
 from tetopt.engine.cost import Prediction
 
@@ -272,6 +273,45 @@ def test_a_volume_of_the_first_image_is_an_option(small, capsys):
     assert [line.rpartition("/")[2] for line in refused(small, capsys)] == ["a.nii.gz:0 is not there"]
 
 
+def test_files_and_places_that_cannot_be_are_all_said(small, capsys):
+    """A link to nothing, a file without a byte, a mask where others leave the background out, a place that is taken."""
+    (small / "link.nii").symlink_to("nothing")
+    (small / "empty.nii").touch()
+    lines = ("subject\timage\tmask", "1\ta.nii.gz\t", "2\ta.nii.gz\ta.nii.gz", "3\tlink.nii\t", "4\tempty.nii\t")
+    (small / "t.tsv").write_text("\n".join((*lines, "a_b\ta.nii.gz\t")) + "\n")
+    begin(small / "out", description("test", []))
+    (small / "out" / ".work" / "lock").touch()
+    (small / "out" / "sub-ab").mkdir()
+    (small / "out" / "sub-ab" / "thesis.txt").touch()
+    said = refused(small, capsys, "--background", "3")
+    assert len(said) == 4
+    for line, words in zip(said, ("line 3: --mask", "datalad get", "is empty", "sub-ab: holds something"), strict=True):
+        assert words in line
+
+
+def test_each_subject_has_files_of_its_own(small, monkeypatch):
+    """Though options that several share are checked once; threads are no words of a run, which gets its share."""
+    monkeypatch.chdir(small)
+    for name in ("s1.nii", "s2.nii", "m1.nii", "m2.nii"):
+        (small / name).write_bytes(b"1")
+    content, sizes = ContentOptions(mask=Path("m{subject}.nii")), SizeOptions(sizing=Path("s{subject}.nii"))
+    records = Records(content, sizes, StartOptions(), EngineOptions(threads=2), SolverOptions())
+    (small / "t.tsv").write_text("subject\timage\tmask\n1\ta.nii.gz\t\n2\ta.nii.gz\ts1.nii\n")
+    first, second = cohort_plan.entries_of(read_table(Path("t.tsv")), records, small / "out", ".vtu", print)
+    assert [each.plan.sizes.sizing for each in (first, second)] == [small / "s1.nii", small / "s2.nii"]
+    assert [each.source.mask for each in (first, second)] == [small / "m1.nii", small / "s1.nii"]
+    assert second.words() == (
+        f"--mask={small / 's1.nii'}", f"--sizing={small / 's2.nii'}", "--", str(small / "a.nii.gz")
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize(("only_failed", "keys"), [(False, ["b", "c", "d"]), (True, ["b"])])
+def test_what_is_chosen(only_failed, keys):
+    states = {"a": "done", "b": "failed", "c": "changed", "d": "missing", "e": "missed"}
+    entries = [cohort_plan.Entry(None, key, None, None, State(status, "")) for key, status in states.items()]
+    assert [each.key for each in cohort_plan.chosen(entries, only_failed)] == keys
+
+
 def test_a_folder_of_something_else_is_not_written_to(small, capsys):
     (small / "out").mkdir()
     (small / "out" / "thesis.txt").write_text("mine")
@@ -280,6 +320,7 @@ def test_a_folder_of_something_else_is_not_written_to(small, capsys):
 
 def test_a_second_run_is_refused_before_it_plans(small, capsys, monkeypatch):
     begin(small / "out", description("test", []))
+    (small / "out" / ".work" / "lock").touch()
 
     def fail(*_):
         raise AssertionError("planned")
