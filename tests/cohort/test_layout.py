@@ -116,6 +116,21 @@ def test_what_a_user_has_put_beside_a_mesh_stays(out):
     assert (place / "results" / "stress.frd").read_text() == "mine"
 
 
+@pytest.mark.parametrize("is_published_again", [False, True])
+def test_what_a_user_has_put_beside_a_mesh_outlives_a_crash(out, is_published_again):
+    """It may come when the new mesh is in its place and the user's files are not yet."""
+    publish(work_of(out, "sub-1", "new"), out, "sub-1")
+    aside = work_of(out, "sub-1", "old").rename(out / ".work" / "sub-1.before")
+    (aside / "note.txt").write_text("mine")
+    if is_published_again:
+        publish(work_of(out, "sub-1", "newer"), out, "sub-1")
+    restore(out)
+    place = subject_folder(out, "sub-1")
+    assert (place / "note.txt").read_text() == "mine"
+    assert (place / "a.txt").read_text() == ("newer" if is_published_again else "new")
+    assert not aside.exists()
+
+
 def test_what_an_earlier_crash_has_put_aside_is_not_in_the_way(out):
     """A run beside others restores its own subjects alone, and may find this after its last look."""
     publish(work_of(out, "sub-1", "second"), out, "sub-1")

@@ -146,11 +146,16 @@ def publish(work: Path, out: Path, key: str) -> None:
     """Give what lies in `work` the subject's place, in one step, instead of what is there; see `restore`."""
     place, aside = subject_folder(out, key), out / WORK_NAME / f"{key}.before"
     place.parent.mkdir(exist_ok=True)
-    shutil.rmtree(aside, ignore_errors=True)
     if place.exists():
+        _clear(aside, place, key)
         os.rename(place, aside)
     os.rename(work, place)
-    for each in aside.iterdir() if aside.exists() else ():  # the user's own, as notes or results of a solver
+    _clear(aside, place, key)
+
+
+def _clear(aside: Path, place: Path, key: str) -> None:
+    """Take away what was in a subject's place before; the user's own, as notes or results of a solver, stays there."""
+    for each in aside.iterdir() if aside.exists() else ():
         if not each.name.startswith(mesh_name(key, "")) and not (place / each.name).exists():
             os.rename(each, place / each.name)
     shutil.rmtree(aside, ignore_errors=True)
@@ -165,8 +170,10 @@ def restore(out: Path, keys: list[str] | None = None) -> None:
         if keys is not None and each.name.partition(".")[0] not in keys:
             continue
         if each.name.endswith(".before"):
-            place = subject_folder(out, each.name.removesuffix(".before"))
-            if not place.exists():
+            key = each.name.removesuffix(".before")
+            if (place := subject_folder(out, key)).exists():
+                _clear(each, place, key)
+            else:
                 os.rename(each, place)
         if each.is_dir() and each.exists():
             shutil.rmtree(each)
