@@ -244,7 +244,8 @@ def test_all_that_is_wrong_is_said_before_anything_is_run(small, capsys):
 
 
 @pytest.mark.parametrize(("options", "words"), [
-    (("--nodes", "-1"), "nodes"), (("--format", "docx"), "--format: expected one of"),
+    (("--nodes", "-1"), "nodes"), (("--threads", "0"), "--threads: expected 1 or more"),
+    (("--format", "docx"), "--format: expected one of"),
     (("--mask", "m-{subject}.nii"), "m-01.nii is not there"), (("--participant-label", "9"), "has no subject 9"),
     (("--mask", "a.nii.gz", "--background", "3"), "give one of them"),
 ])  # fmt: skip

@@ -77,6 +77,8 @@ def cohort_command(
     check_choice(cohort.count, cohort.scheduler, cohort.cluster)
     suffix = checked_suffix(cohort.mesh_format)
     place, records = cohort.output, Records(content, sizes, start, engine, solver)
+    if engine.threads is not None and engine.threads < 1:
+        raise InputError(f"--threads: expected 1 or more, got {engine.threads}")
     if cohort.collect and (cohort.write_table is not None or cohort.dry_run or cohort.retry_failed):
         raise InputError("--collect runs nothing; leave it out, or --write-table, --dry-run and --retry-failed")
     if cohort.write_table is not None:
