@@ -144,7 +144,7 @@ def test_options_of_a_row_replace_those_of_all():
 
 
 @pytest.mark.parametrize(("texts", "words"), [
-    ({"nods": "1"}, "is nodes meant"), ({"nodes": "1e3"}, "--nodes"),
+    ({"nods": "1"}, "is nodes meant"), ({"nodes": "1e3"}, "nodes: .1e3. is no value of it"),
     ({"nonlinear": "maybe"}, "expected true or false"),
     ({"json": "a.json"}, "is no option"), ({"help": "1"}, "is no option"),
 ])  # fmt: skip

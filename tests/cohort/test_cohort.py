@@ -313,6 +313,22 @@ def test_what_is_chosen(only_failed, keys):
     assert [each.key for each in cohort_plan.chosen(entries, only_failed)] == keys
 
 
+def test_the_same_fault_of_many_subjects_is_said_once(small, capsys):
+    said = refused(small, capsys, "--k-d", "1.5")
+    assert len(said) == 1
+    assert "t.tsv, line 2 and 1 more: --k-d: expected 0 <= k_D < 1, got 1.5" in said[0]
+
+
+def test_all_values_of_a_row_that_are_none_are_said(small, capsys):
+    (small / "t.tsv").write_text("subject\timage\tnodes\tk-d\tuniform\n01\ta.nii.gz\tmany\t0,9\ttrue\n")
+    (line,) = refused(small, capsys)
+    assert 'nodes: "many" is no value of it; k-d: "0,9" is no value of it; write 0.9' in line
+
+
+def test_a_pattern_of_another_name_is_refused(small, capsys):
+    assert "there is no {sub}; write {subject} and {session}" in refused(small, capsys, "--mask", "m-{sub}.nii")[0]
+
+
 def test_a_folder_of_something_else_is_not_written_to(small, capsys):
     (small / "out").mkdir()
     (small / "out" / "thesis.txt").write_text("mine")

@@ -127,7 +127,8 @@ def _with_option(message: str, arguments: list[str]) -> str:
 def _ended_by_signal(outputs: Outputs) -> int:
     """Say what has ended the command, and what is there all the same; the exit code."""
     names = ", ".join(map(str, outputs.written)) or "nothing"
-    log.print(escape(f"ended by {signal_name()}; written: {names}"))
+    written = f"; written: {names}" if outputs.places else ""  # without any, the command has said what is there
+    log.print(escape(f"ended by {signal_name()}{written}"))
     return signal_code()
 
 

@@ -210,15 +210,16 @@ def _say_estimate(to_run: Sequence[Entry], estimate: Estimate, cohort: CohortOpt
             out.print(escape(f"{entry.key}: sizes unknown: its image cannot be read"))
         else:
             out.print(escape(f"{entry.key}: {one.seconds:.0f} s on a thread, {memory_words(one.peak_bytes)}"))
+    whole = f"in all {_time(estimate.seconds())} on one thread, at most {memory_words(estimate.largest)} each"
+    if cohort.cluster is not None or cohort.scheduler is not None or not to_run:
+        out.print(f"{whole}; divided by as many as the cluster runs at a time" if to_run else "nothing to run")
+        return
     from dask.system import CPU_COUNT  # as affinity and containers leave them
 
     free = available_bytes()
     need = _need(len(to_run), estimate, cohort, threads)
     share = shares(need, cohort.count, CPU_COUNT, float("inf") if free is None else float(free))
-    out.print(
-        f"in all {_time(estimate.seconds())} on one thread, at most {memory_words(estimate.largest)} each; on this "
-        f"machine {share.workers} at a time: about {_time(estimate.seconds() / share.workers)}"
-    )
+    out.print(f"{whole}; on this machine {share.workers} at a time: about {_time(estimate.seconds() / share.workers)}")
 
 
 def _run(to_run: Sequence[Entry], estimate: Estimate, cohort: CohortOptions, suffix: str, threads: int | None) -> None:
@@ -328,6 +329,8 @@ def _close(place: Path, keys: list[str]) -> int:
     out.print(
         f"{_counted(len(own))}: " + ", ".join(f"{counts[name]} {text}" for name, text in words.items() if counts[name])
     )
+    if len(rows) > len(own):
+        log.print(escape(f"{_counted(len(rows) - len(own))} more in {place}, from other tables, are shown with these"))
     for name in ("cohort.html", "cohort.tsv"):
         out.print(escape(str(place / name)))
     return 1 if counts["failed"] or counts["missing"] else 0

@@ -24,7 +24,7 @@ from tetopt.cli.plan import Plan, planned
 from tetopt.cli.request import requested
 from tetopt.cohort.layout import mesh_name, numbers_path
 from tetopt.cohort.state import State, state_of, strangers
-from tetopt.cohort.subjects import FILE_OPTIONS, Problems, Subject, doubled, key, matching, read_table
+from tetopt.cohort.subjects import FILE_OPTIONS, Problems, Subject, doubled, key, label_of, matching, read_table
 from tetopt.errors import InputError
 from tetopt.io.formats import FORMATS
 from tetopt.model.laws import LAW_OPTIONS, law_file
@@ -69,10 +69,10 @@ def subjects_of(path: Path, cohort: CohortOptions) -> list[Subject]:
     subjects = read_table(path)
     for kind, chosen in (("subject", cohort.participants), ("session", cohort.sessions)):
         if chosen is not None:
-            names = {name.removeprefix("sub-").removeprefix("ses-") for name in chosen}
-            if lost := sorted(names - {getattr(each, kind) for each in subjects}):
+            names = {label_of(name.removeprefix("sub-").removeprefix("ses-")) for name in chosen}
+            if lost := sorted(names - {label_of(getattr(each, kind)) for each in subjects}):
                 raise Problems([f"{path}: has no {kind} {name}" for name in lost])
-            subjects = [each for each in subjects if getattr(each, kind) in names]
+            subjects = [each for each in subjects if label_of(getattr(each, kind)) in names]
     if not subjects:
         raise InputError(f"{path}: no subject has that session")
     return subjects
@@ -96,22 +96,32 @@ def entries_of(
     Problems
         All that is wrong, of all subjects.
     """
-    problems = list(doubled(subjects))
+    problems = [("", line) for line in doubled(subjects)]
     plans = _Plans(records, suffix)
     entries = []
     for subject in subjects:
         try:
             own, plan = plans.of(subject)
         except InputError as error:
-            problems.append(f"{subject.place}: {error}")
+            problems.append((subject.place, str(error)))
             continue
-        problems += [f"{subject.place}: {words}" for words in _missing(plan.source, own)]
-        if (words := strangers(out, key(subject))) is not None:
-            problems.append(words)
+        problems += [(subject.place, words) for words in _missing(plan.source, own)]
+        if (stranger := strangers(out, key(subject))) is not None:
+            problems.append(("", stranger))
         entries.append(Entry(subject, key(subject), own, plan, State("missing", "")))
     if problems:
-        raise Problems(list(dict.fromkeys(problems)))
+        raise Problems(list(_lines(problems)))
     return with_states(entries, out, suffix, say)
+
+
+def _lines(problems: Iterable[tuple[str, str]]) -> Iterator[str]:
+    """A line for each problem, of (place, words); for those of the same words, one with the first place."""
+    places: dict[str, list[str]] = {}
+    for place, words in problems:
+        places.setdefault(words, []).append(place)
+    for words, own in places.items():
+        more = f" and {len(own) - 1} more" if len(own) > 1 else ""
+        yield f"{own[0]}{more}: {words}" if own[0] else words
 
 
 class _Plans:

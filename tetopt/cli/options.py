@@ -7,6 +7,7 @@ record's options in a panel of the help. The help's words stand here alone.
 from __future__ import annotations
 
 import inspect
+import re
 from collections.abc import Callable, Iterator
 from copy import copy
 from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
@@ -496,8 +497,22 @@ def with_options(records: Records, texts: dict[str, str]) -> Records:
             words.append(f"--{name}")
         elif text.lower() not in ("0", "false", "no"):
             raise InputError(f'{name}: expected true or false, got "{text}"')
-    parsed = _parsed(tuple(words))
+    try:
+        parsed = _parsed(tuple(words))
+    except InputError:
+        raise InputError("; ".join(_wrong_values(texts))) from None
     return Records(*(_replaced(old, new, set(texts)) for old, new in zip(records, parsed, strict=True)))
+
+
+def _wrong_values(texts: dict[str, str]) -> Iterator[str]:
+    """Which of the options' texts are no values of theirs, in words."""
+    for name, text in ((name, text) for name, text in texts.items() if not record_names()[name]):
+        try:
+            _parsed((f"--{name}={text}",))
+        except InputError:
+            point = text.replace(",", ".")
+            is_comma = point != text and re.fullmatch(r"-?[0-9]*\.[0-9]+", point)
+            yield f'{name}: "{text}" is no value of it' + (f"; write {point}" if is_comma else "")
 
 
 def _replaced(old: Any, new: Any, names: set[str]) -> Any:

@@ -6,6 +6,7 @@ A worker runs it. All it takes and gives are names and numbers; what there is li
 from __future__ import annotations
 
 import os
+import shlex
 import shutil
 import subprocess
 import time
@@ -22,9 +23,10 @@ from tetopt.cohort.layout import (
     mesh_name,
     numbers_of,
     publish,
+    subject_folder,
 )
 from tetopt.interpreter import python_command, python_environment
-from tetopt.io.files import save_json
+from tetopt.io.files import save_json, save_text
 from tetopt.processes import started
 from tetopt.study.endings import last_line, signal_words
 
@@ -81,7 +83,7 @@ def set_down(out: Path, job: Job, ended: Ended, attempts: int) -> None:
             "seconds": ended.seconds,
             "peak_bytes": ended.peak_bytes,
             "predicted_bytes": job.n_bytes,
-            "command": ["tetopt", "mesh", *job.words],
+            "command": shlex.join(["tetopt", "mesh", "-o", f"{job.key}{job.suffix}", *job.words]),
         },
     )
 
@@ -115,6 +117,8 @@ def _attempt(job: Job, begin: float, attempt: int) -> tuple[Ended, bool]:
     numbers = numbers_of(mesh.with_suffix(".json"))
     if child.returncode in (0, 1) and numbers is not None and mesh.is_file():
         publish(work, out, job.key)
+        text = log.read_text(encoding="utf-8", errors="replace")
+        save_text(log, text.replace(str(work), str(subject_folder(out, job.key))))  # where its files are by now
         failure_path(out, job.key).unlink(missing_ok=True)
         missed = "; ".join((numbers.get("missed") or {}).values())
         return Ended(job.key, "missed" if missed else "done", missed, seconds, numbers["memory"]["peak_bytes"]), False

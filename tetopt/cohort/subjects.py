@@ -162,6 +162,8 @@ def matching(pattern: str, subject: Subject) -> Path:
         No file matches, or several do.
     """
     words = pattern
+    if strange := [name for name in re.findall(r"\{[a-z_]+\}", pattern) if name not in ("{subject}", "{session}")]:
+        raise InputError(f"{pattern}: there is no {strange[0]}; write {{subject}} and {{session}}")
     if not subject.session:
         words = re.sub(r"_ses-\{session\}|ses-\{session\}[_/]?", "", words)
     words = words.replace("{subject}", label_of(subject.subject)).replace("{session}", label_of(subject.session))
@@ -172,7 +174,7 @@ def matching(pattern: str, subject: Subject) -> Path:
     if len(matches) == 1:
         return matches[0]
     named = ", ".join(match.name for match in matches[:3])
-    raise InputError(f"{words}: expected one file, " + (f"got {len(matches)}: {named}" if matches else "got none"))
+    raise InputError(f"{path}: expected one file, " + (f"got {len(matches)}: {named}" if matches else "got none"))
 
 
 def _cells(path: Path) -> list[tuple[int, list[str]]]:
