@@ -7,7 +7,7 @@ import re
 import numpy as np
 import pytest
 from browser import FRAMES, copied, document
-from cohorts import HOSTILE, key_of, save_cohort, save_run, thumbnail
+from cohorts import HOSTILE, key_of, run_of, save_cohort, save_run, thumbnail
 
 from tetopt.cohort import page
 from tetopt.cohort.flags import flags_of
@@ -145,6 +145,31 @@ def test_a_browser_sorts_and_filters(cohort, tmp_path):
     assert said[9].startswith(key_of(7) + "‹ before 1 to 1 of 1 (100 in all)")
     assert "of 100 " in said[10]
     assert said[11] == "95 tiles"
+
+
+BARS = """<script>
+const chart = [...document.querySelectorAll(".chart")].find((e) => e.textContent.includes("volume of the mask"));
+const bars = [...chart.querySelectorAll("title")].map((e) => e.textContent);
+const feet = [...chart.querySelectorAll(".foot span")].map((e) => e.textContent);
+for (const words of [bars[0], bars[bars.length - 1], ...feet])
+  document.body.append(Object.assign(document.createElement("p"), {className: "said", textContent: words}));
+</script>"""
+
+
+def test_a_bar_says_what_lies_beyond_it(tmp_path):
+    """The bars at the ends hold what is far out, and say so, with the numbers themselves."""
+    rng = np.random.default_rng(0)
+    volumes = [3.05e3, *np.linspace(1.0e6, 1.2e6, 18), 9.0e6]
+    for k, volume in enumerate(volumes):
+        save_run(tmp_path, key_of(k), run_of(rng, mask_volume=volume))
+    save_cohort_files(tmp_path, collect(tmp_path))
+    text = (tmp_path / "cohort.html").read_text(encoding="utf-8")
+    made = document(copied(text, tmp_path / "a.html", FRAMES, BARS))
+    lowest, highest, left, right = re.findall(r'<p class="said">([^<]*)</p>', made)
+    assert re.fullmatch(r"up to (0.\d+ l|\d+ ml): 1 subject, 1 flagged \(sub-0001 3.05 ml\)", lowest)
+    assert re.fullmatch(r"1.\d+ l and more: 1 subject, 1 flagged \(sub-0020 9 l\)", highest)
+    assert left == "≤ " + lowest[len("up to ") : lowest.index(":")]
+    assert right == "≥ " + highest[: highest.index(" and")]
 
 
 def test_without_scripts_there_is_a_table(cohort):

@@ -206,14 +206,17 @@ function binsOf(c) {
   // What lies far off would leave one bar for all others: it goes into the first and the last.
   const reach = 3 * (share(0.75) - share(0.25)) || Infinity;
   let [low, high] = [Math.max(values[0], share(0.25) - reach), Math.min(values[values.length - 1], share(0.75) + reach)];
+  const [isCutBelow, isCutAbove] = [values[0] < low, values[values.length - 1] > high];
   const isLog = column.isLog && low > 0 && high > 10 * low;
   const [to, from] = isLog ? [Math.log, Math.exp] : [(x) => x, (x) => x];
   [low, high] = [to(low), to(high)];
   return Array.from({ length: BINS }, (_, k) => {
     const ends = [from(low + ((high - low) * k) / BINS), from(low + ((high - low) * (k + 1)) / BINS)];
     const [first, last] = [k === 0 ? -Infinity : ends[0], k === BINS - 1 ? Infinity : ends[1]];
-    const words = `${written(ends[0], column.unit)} to ${written(ends[1], column.unit)}`;
-    return { words, ends, holds: (value) => isNumber(value) && value >= first && value < last };
+    const isOpen = { low: k === 0 && isCutBelow, high: k === BINS - 1 && isCutAbove };
+    const [least, most] = ends.map((end) => written(end, column.unit));
+    const words = isOpen.low ? `up to ${most}` : isOpen.high ? `${least} and more` : `${least} to ${most}`;
+    return { words, ends, isOpen, holds: (value) => isNumber(value) && value >= first && value < last };
   });
 }
 
@@ -231,7 +234,9 @@ function chartOf(c) {
     if (!rows.length) return;
     const n = rows.filter((row) => row[FLAGS].some(([, name]) => name === column.name)).length;
     const tall = (count) => (count ? Math.max((count / most) * (height - 4), 2) : 0); // a single subject is seen
-    const names = rows.slice(0, 8).map((row) => row[KEY]).join(", ") + (rows.length > 8 ? ", ..." : "");
+    const isOpen = bin.isOpen && (bin.isOpen.low || bin.isOpen.high); // how far out they are, the bar does not show
+    const nameIn = (row) => (isOpen ? `${row[KEY]} ${written(valueOf(row, c), column.unit)}` : row[KEY]);
+    const names = rows.slice(0, 8).map(nameIn).join(", ") + (rows.length > 8 ? ", ..." : "");
     const words = `${bin.words}: ${rows.length} subject${rows.length > 1 ? "s" : ""}${n ? `, ${n} flagged` : ""} (${names})`;
     const bar = drawing("g", { class: "bar", tabindex: 0, role: "button", "aria-label": words }, drawing("title", {}));
     bar.firstChild.textContent = words;
@@ -242,8 +247,12 @@ function chartOf(c) {
     bar.onkeydown = (event) => { if (event.key === "Enter" || event.key === " ") { event.preventDefault(); choose(); } };
     svg.append(bar);
   });
-  const ends = (digits) => [bins[0].ends[0], bins[bins.length - 1].ends[1]].map((end) => written(end, column.unit, digits));
-  const isNear = !isText && ends(3)[0] === ends(3)[1];
+  const ends = (digits) => {
+    const [{ ends: [low, below], isOpen: lowest }, { ends: [above, high], isOpen: highest }] = [bins[0], bins[bins.length - 1]];
+    return [[lowest.low, "≤ ", below, low], [highest.high, "≥ ", above, high]].map(([isOpen, sign, cut, end]) =>
+      isOpen ? sign + written(cut, column.unit, digits) : written(end, column.unit, digits));
+  };
+  const isNear = !isText && ends(3)[0].replace("≤ ", "") === ends(3)[1].replace("≥ ", "");
   const feet = isText ? bins.slice(0, 4).map((bin) => bin.words) : ends(isNear ? 5 : 3);
   const foot = element("div", { className: isText ? "foot texts" : "foot" }, ...feet.map((words) => element("span", { textContent: words })));
   const title = element("div", { className: "title", textContent: column.title, title: column.about });
