@@ -7,7 +7,7 @@ from cohorts import run_of, save_run, thumbnail
 
 from tetopt.cohort.flags import flags_of
 from tetopt.cohort.likeness import THUMBNAIL_BYTES, likenesses
-from tetopt.cohort.numbers import collect
+from tetopt.cohort.numbers import Row, collect
 from tetopt.image import Image
 from tetopt.report.thumbnail import thumbnail_png
 from tetopt.start.lattice import lattice
@@ -124,10 +124,40 @@ def test_what_is_symmetric_is_not_called_turned(tmp_path):
     assert flags_of(collect(tmp_path)) == [[]] * 20
 
 
+def row_of(likeness, **margins):
+    numbers = {f"thumbnail.{name}": value for name, value in {"likeness": likeness, **margins}.items()}
+    return Row("sub-1", "sub-1", "", "done", "", (), {}, {"quality.ndim": 3, **numbers}, {}, {}, {})
+
+
+def turned_of(rows):
+    return [(k, flag.column) for k, each in enumerate(flags_of(rows)) for flag in each if "exchanged" in flag.words]
+
+
+def test_another_organ_does_not_hide_what_is_turned_over():
+    """Numbers of ten real heads, one turned over, and beside it one that is like nothing, turned over or not."""
+    others = [row_of(0.98, back_front=-0.11 + 0.002 * k) for k in range(8)]
+    turned, organ = row_of(0.88, back_front=0.104), row_of(0.22, back_front=0.0095)
+    assert turned_of([*others, turned, organ]) == [(8, "thumbnail.back_front")]
+    assert turned_of([*others[:6], turned, organ]) == [(6, "thumbnail.back_front")]
+    assert turned_of([*others[:5], turned, organ]) == []  # of seven nothing is said
+
+
+def test_the_sign_alone_is_no_turn():
+    """Of what is symmetric, or about as like the others' either way."""
+    others = [row_of(0.98, left_right=-0.0001 - 0.001 * k) for k in range(8)]
+    assert turned_of([*others, row_of(0.98, left_right=0.0008)]) == []
+    assert turned_of([*others, row_of(0.98, left_right=0.05)]) == []  # turned over it would be at 0.004
+    sided = [row_of(0.98, left_right=-0.1 - 0.001 * k) for k in range(8)]
+    assert turned_of([*sided, row_of(0.98, left_right=0.019)]) == []
+    assert turned_of([*sided, row_of(0.98, left_right=0.021)]) == [(8, "thumbnail.left_right")]
+    spread = [row_of(0.98, left_right=-0.15 + 0.03 * k) for k in range(8)]
+    assert turned_of([*spread, row_of(0.98, left_right=0.04)]) == []
+
+
 def test_where_many_are_turned_over_none_is_the_odd_one(tmp_path):
     rng = np.random.default_rng(5)
     for k in range(10):
-        save_run(tmp_path, f"sub-{k}", run_of(rng), body(rng, y=-1 if k < 3 else 1))
+        save_run(tmp_path, f"sub-{k}", run_of(rng), body(rng, y=-1 if k < 5 else 1))
     assert [flag for each in flags_of(collect(tmp_path)) for flag in each if "exchanged" in flag.words] == []
 
 

@@ -20,6 +20,12 @@ MAD_OF_NORMAL = 1.482602218505602  # standard deviations of normal numbers to on
 MAJORITY_SHARE = 2 / 3  # of subjects that agree: with fewer there is nothing that the others differ from
 COMMON_SHARE = 0.9  # of subjects that have what is missed in the others: in fewer it is a matter of choice
 LEAST_LIKENESS = 0.01  # of the scale of correlations: heads of one size, in one place, differ by as much
+# Of correlations, by which a picture is more like the others' turned over, and they are less so: pictures that tell
+# sides apart have 0.06 to 0.12 there (heads), those of a brain's left and right -0.008 to 0.001.
+TURN_MARGIN = 0.02
+# Beyond the median, likewise: normal numbers with a deviation of 0.02 about -0.05 are flagged in 2 of 10,000, and a
+# picture that is turned over, at 0.05, is flagged where the deviation is below 0.04.
+TURN_DEVIATIONS = 2.5
 FLOAT_ROUNDING = 1e-9  # deviations by which a number may be beside the limit that it is at
 
 Side = Literal["both", "above", "below"]
@@ -81,9 +87,9 @@ def flags_of(rows: Sequence[Row]) -> list[list[Flag]]:
     list of list of Flag
         Of each row: promises that its mesh misses; labels that no cell carries, and labels that 9 of 10 others have
         and its image has not, or the other way round; an image that another subject has, too; another orientation,
-        spacing or shape than two thirds have; a picture that is more like the others' turned over; numbers more than
-        `limit` robust deviations from the median, of 8 or more subjects. 2-D and 3-D meshes are compared each with
-        their like.
+        spacing or shape than two thirds have; of 8 or more subjects, a picture that is clearly more like the others'
+        turned over, and numbers more than `limit` robust deviations from the median. 2-D and 3-D meshes are compared
+        each with their like.
     """
     flags: list[list[Flag]] = [[] for _ in rows]
     groups: dict[Value, list[int]] = defaultdict(list)
@@ -171,18 +177,21 @@ def _grids(rows: Sequence[Row], names: dict[int, str]) -> Flagged:
 
 
 def _turned(rows: Sequence[Row], names: dict[int, str]) -> Flagged:
-    """Pictures that are more like the others' turned over, where nearly all others are less so."""
+    """Pictures that are more like the others' turned over, where the others are clearly less so."""
     for column, words in TURN_WORDS.items():
-        values = [row.numbers.get(column) for row in rows]
-        known = present(values)
-        n_usual = sum(value < 0.0 for value in known)
-        if len(known) < FEW_SUBJECTS or n_usual < COMMON_SHARE * len(known) - FLOAT_ROUNDING:
-            continue  # few, or of a shape that tells no sides apart
+        places = [place for place, row in enumerate(rows) if present([row.numbers.get(column)])]
+        values = np.array(present(row.numbers.get(column) for row in rows))
+        n_usual = int((values < 0.0).sum())
+        if len(values) < FEW_SUBJECTS or n_usual < MAJORITY_SHARE * len(values) - FLOAT_ROUNDING:
+            continue  # few, or no telling which of them are turned over
+        if np.median(values) > -TURN_MARGIN:
+            continue  # of a shape that tells no sides apart
+        scores = deviations(values, False, FLOAT_ROUNDING)
         likeness = present(row.numbers.get("thumbnail.likeness") for row in rows)
-        for place, value in enumerate(values):
-            if isinstance(value, float) and value > 0.0 and _is_like(rows[place], value, likeness):
-                reason = f"its picture is more like the others' with {words}; {n_usual} of {len(known)} are less so"
-                yield place, Flag(column, reason, np.inf)
+        for k in np.flatnonzero((values >= TURN_MARGIN) & (scores > TURN_DEVIATIONS)).tolist():
+            if _is_like(rows[places[k]], values[k], likeness):
+                reason = f"its picture is more like the others' with {words}; {n_usual} of {len(values)} are less so"
+                yield places[k], Flag(column, reason, np.inf)
 
 
 def _is_like(row: Row, margin: float, likeness: list[float]) -> bool:
