@@ -54,6 +54,36 @@ def test_what_all_have_in_common_is_said_once(cohort):
     assert "options.nodes" not in {column["name"] for column in data_of(text)["columns"]}
 
 
+def test_what_differs_is_said_with_how_many(tmp_path):
+    rng = np.random.default_rng(0)
+    for k in range(10):
+        run = run_of(rng)
+        run["options"]["nodes"] = 250 if k < 2 else 300
+        run["options"]["k_D"] = k / 10
+        if k == 9:
+            run["request"]["options"]["gradation"] = HOSTILE
+        save_run(tmp_path, key_of(k), run, thumbnail(rng))
+    save_cohort_files(tmp_path, collect(tmp_path))
+    text = (tmp_path / "cohort.html").read_text(encoding="utf-8")
+    hostile = html.escape(plain(plain(HOSTILE)))
+    words = f"nodes: 300 (8), 250 (2); k_D: 10 values; gradation: none (9), {hostile} (1)."
+    assert f"Different, with how many subjects have each: {words}" in text
+    assert {"options.nodes", "options.k_D", "request.options.gradation"} <= {
+        column["name"] for column in data_of(text)["columns"]
+    }
+    assert "Of all meshes: tetopt 0.1.0, method fast, young 3.0, format .vtu." in text
+    assert re.search(r"Meshing took [\d.]+ min of all runs together; start-up and pictures come on top.", text)
+
+
+def test_the_colours_of_pictures_are_told_above_them(cohort, tmp_path):
+    _, text = cohort
+    words = "Orange is the mesh, blue the outline of the mask, other colours are labels."
+    assert text.index("<h2>Subjects</h2>") < text.index(words) < text.index('<div id="subjects">')
+    save_run(tmp_path, "sub-1", {"missed": {}})
+    save_cohort_files(tmp_path, collect(tmp_path))
+    assert words not in (tmp_path / "cohort.html").read_text(encoding="utf-8")  # there is no picture
+
+
 def test_names_do_no_harm(cohort):
     _, text = cohort
     assert HOSTILE not in text

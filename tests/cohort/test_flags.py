@@ -1,5 +1,7 @@
 """What is flagged, and how seldom what is not odd."""
 
+import re
+
 import numpy as np
 import pytest
 from cohorts import run_of, save_cohort
@@ -43,14 +45,21 @@ def test_each_kind_of_odd_subject():
     assert flagged({}, missed=("floor",)) == [("missed", "missed floor")]
     [(column, words)] = flagged({"affine": OBLIQUE})
     assert column == "grid.oblique_degrees"
-    assert words == "obliqueness 25.8 degrees: 12.9 robust deviations above the median 0 degrees"
+    assert words == "obliqueness is 25.8 degrees, far above the others' median 0 degrees (13 robust deviations)"
 
 
 def test_a_small_mask_is_told_with_the_median():
-    words = dict(flagged({"mask_volume": 0.4e6}))["mask.volume"]
-    assert words.startswith("volume of the mask 400 ml: ")
-    assert words.endswith(" l")
-    assert " robust deviations below the median 1." in words
+    """In one unit, if that is short."""
+    beside = r", far below the others' median 1.\d\d l \(\d+ robust deviations\)"
+    for volume, words in ((0.4e6, "0.4 l"), (3.05e3, "3.05 ml")):
+        flag = dict(flagged({"mask_volume": volume}))["mask.volume"]
+        assert re.fullmatch(f"volume of the mask is {words}{beside}", flag)
+
+
+def test_the_median_is_that_of_the_others():
+    values = np.r_[np.full(4, 1.0), np.full(4, 1.02), 9.0]
+    [flag] = flags_of_column("mask.volume", 1e6 * values)[-1]
+    assert "the others' median 1.01 l" in flag.words
 
 
 def test_a_missed_label_is_told_once():
@@ -124,7 +133,7 @@ def test_numbers_that_are_the_same_are_measured_by_the_least_scale():
     assert deviations(values, False, 0.1)[-1] == pytest.approx(2.0)
     assert deviations(np.r_[np.ones(9), 0.0], True, 0.05)[-1] == -np.inf
     assert [flag.words for flag in flags_of_column("mask.volume", np.r_[np.ones(9), 0.0])[-1]] == [
-        "volume of the mask 0 mm^3: far below the median 1 mm^3"
+        "volume of the mask is 0 mm^3, far below the others' median 1 mm^3"
     ]
     assert flags_of_column("mask.volume", np.zeros(10)) == [[]] * 10
     with np.errstate(all="raise"):

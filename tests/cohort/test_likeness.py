@@ -83,7 +83,7 @@ def test_a_subject_cut_off_is_flagged(tmp_path):
     saved(path, np.where(np.arange(128)[:, None] < 64, pixels, 0))
     flags = flags_of(collect(tmp_path))
     assert [k for k, each in enumerate(flags) if each] == [7]
-    assert flags[7][0].words.startswith("likeness of its picture to the others' ")
+    assert flags[7][0].words.startswith("likeness of its picture to the others' is ")
 
 
 def body(rng, x=1, y=1, z=1):

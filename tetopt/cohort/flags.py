@@ -26,6 +26,7 @@ TURN_MARGIN = 0.02
 # Beyond the median, likewise: normal numbers with a deviation of 0.02 about -0.05 are flagged in 2 of 10,000, and a
 # picture that is turned over, at 0.05, is flagged where the deviation is below 0.04.
 TURN_DEVIATIONS = 2.5
+SHORT_RATIO = 20.0  # of two numbers in one unit: beyond, the smaller one has too many zeros behind the point
 FLOAT_ROUNDING = 1e-9  # deviations by which a number may be beside the limit that it is at
 
 Side = Literal["both", "above", "below"]
@@ -221,14 +222,14 @@ def _far_in(quantity: Quantity, values: Sequence[Value], ndim: int) -> Flagged:
     scores = deviations(known, quantity.is_log, quantity.least)
     far = limit(len(known))
     written = units(quantity.unit, ndim)
-    middle = float(np.median(known))
     places = [place for place, value in enumerate(values) if present([value])]
-    for place, value, score in zip(places, known.tolist(), scores.tolist(), strict=True):
+    for k, (place, value, score) in enumerate(zip(places, known.tolist(), scores.tolist(), strict=True)):
         side = "above" if score > 0.0 else "below"
         if abs(score) > far and quantity.side in ("both", side):
-            far_off = f"{abs(score):.1f} robust deviations {side}" if np.isfinite(score) else f"far {side}"
-            words = f"{quantity.words} {written(value)}: {far_off} the median {written(middle)}"
-            yield place, Flag(quantity.column, words, abs(score))
+            usual = float(np.median(np.delete(known, k)))
+            measure = f" ({abs(score):.0f} robust deviations)" if np.isfinite(score) else ""
+            beside = f"far {side} the others' median {written(usual, value)}{measure}"
+            yield place, Flag(quantity.column, f"{quantity.words} is {written(value, usual)}, {beside}", abs(score))
 
 
 def deviations(values: np.ndarray, is_log: bool, least: float) -> np.ndarray:
@@ -271,13 +272,18 @@ def limit(n: int) -> float:
     return FAR_DEVIATIONS * (1.0 + FEW_SUBJECTS / n)
 
 
-def units(unit: str, ndim: int) -> Callable[[float], str]:
+def units(unit: str, ndim: int) -> Callable[..., str]:
     """How a number of that unit is written: volumes in mm^n as ml or l, bytes as MB or GB, seconds as min or h.
+
+    What is returned takes the number, and as a second one, if there is one, what it stands beside: of two numbers of
+    which neither is `SHORT_RATIO` times the other both are written in the larger one's unit.
 
     Examples
     --------
     >>> units("mm", 3)(1.43e6), units("bytes", 3)(2.5e9), units("s", 3)(90.0), units("", 3)(0.123456)
     ('1.43 l', '2.5 GB', '1.5 min', '0.123')
+    >>> units("mm", 3)(4e5, 1.43e6), units("mm", 3)(1.43e6, 4e5), units("mm", 3)(3e3, 1.43e6)
+    ('0.4 l', '1.43 l', '3 ml')
     """
     steps = {
         "mm": [(1e6, "l"), (1e3, "ml"), (1.0, "mm^3")] if ndim == 3 else [(1e2, "cm^2"), (1.0, "mm^2")],
@@ -285,8 +291,9 @@ def units(unit: str, ndim: int) -> Callable[[float], str]:
         "s": [(3600.0, "h"), (60.0, "min"), (1.0, "s")],
     }.get(unit, [(1.0, unit)])
 
-    def written(value: float) -> str:
-        factor, word = next((step for step in steps if abs(value) >= step[0]), steps[-1])
+    def written(value: float, beside: float = 0.0) -> str:
+        size = max(abs(value), abs(beside) if abs(beside) < SHORT_RATIO * abs(value) else 0.0)
+        factor, word = next((step for step in steps if size >= step[0]), steps[-1])
         number = value / factor
         return f"{number:.3g} {word}".strip() if abs(number) < 1e3 else f"{number:,.0f} {word}".strip()
 

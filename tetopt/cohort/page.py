@@ -23,7 +23,9 @@ LISTED_FAILURES = 100  # reasons, and subjects of one, above the table that has 
 LISTED_SUBJECTS = 100  # in the table for browsers without scripts
 LISTED_FLAGS = 6  # of a subject; the table in TSV has all
 SHOWN_DIGITS = 4  # of numbers in the page
+LISTED_VALUES = 6  # of an option that differs; of more it is said how many there are
 PICTURE_WORDS = "axial, left of the patient on the left, and sagittal, back on the left"
+COLOUR_WORDS = "Orange is the mesh, blue the outline of the mask, other colours are labels."
 # Columns of the page beside `QUANTITIES`, with their titles.
 PAGE_COLUMNS = {
     "grid.orientation": "orientation", "grid.spacing_mm": "voxels, mm", "grid.shape": "voxels",
@@ -38,6 +40,7 @@ FIRST_COLUMNS = (
     "grid.orientation", "energies.E_D_share_of_variance", "quality.mean_rho", "quality.min_dihedral", "mask.volume",
     "seconds.all", "memory.peak_bytes",
 )  # fmt: skip
+OPTION_BEGINNINGS = ("options.", "request.options.")  # of the columns of a run's options
 FILE_LETTERS = {"numbers": "n", "log": "l", "figures": "f", "thumbnail": "t"}  # by which the script knows what is there
 STATUS_WORDS: dict[Status, str] = {
     "done": "done", "missed": "with a promise missed", "failed": "failed", "missing": "not run",
@@ -77,8 +80,9 @@ def save_cohort_page(path: Path, out: Path, rows: Sequence[Row], flags: Sequence
     pictures = _pictures(out, rows, flags)
     names, left_out = _columns(rows)
     is_solid = any(row.numbers.get("quality.ndim") == 3 for row in rows)
-    note = f"Pictures are {PICTURE_WORDS}, with the mesh over the image." if is_solid else ""
     n_pictures = sum(picture is not None for picture in pictures)
+    note = f"Pictures are {PICTURE_WORDS}, with the mesh over the image. " if is_solid else ""
+    note += COLOUR_WORDS if n_pictures else ""
     if n_pictures < sum("thumbnail" in row.files for row in rows):
         note += (
             f" The page has {n_pictures} of them: those of subjects that are flagged, and of the others a sample; the "
@@ -101,23 +105,39 @@ def _summary(rows: Sequence[Row], flags: Sequence[Sequence[Flag]]) -> list[str]:
     text = f"{len(rows)} subject{'s' if len(rows) != 1 else ''}: {', '.join(words) or 'none'}."
     if n_odd := sum(bool(each) for each in flags):
         text += f" {n_odd} {'is' if n_odd == 1 else 'are'} odd in something, see below."
-    for name, unit, total, beginning in (("seconds.all", "s", sum, "All runs together took"),
-                                         ("memory.peak_bytes", "bytes", max, "and the largest one had")):  # fmt: skip
-        if values := present(row.numbers.get(name) for row in rows):
-            text += f" {beginning} {units(unit, 3)(total(values))}" + ("" if unit == "s" else ".")
-    common = [f"{name.rpartition('.')[2]} {_shown(value)}" for name, value in _common(rows).items()]
+    if seconds := present(row.numbers.get("seconds.all") for row in rows):
+        text += f" Meshing took {units('s', 3)(sum(seconds))} of all runs together; start-up and pictures come on top."
+    if peaks := present(row.numbers.get("memory.peak_bytes") for row in rows):
+        text += f" The largest run had {units('bytes', 3)(max(peaks))} of memory."
+    options = _options(rows)
+    common = [f"{_option(name)} {_shown(next(iter(each)))}" for name, each in options.items() if len(each) == 1]
+    different = [f"{_option(name)}: {_counted(each)}" for name, each in options.items() if len(each) > 1]
     parts = [paragraph_html(text)]
     if common:
         parts.append(paragraph_html(f"Of all meshes: {', '.join(common)}."))
+    if different:
+        parts.append(paragraph_html(f"Different, with how many subjects have each: {'; '.join(different)}."))
     return parts
 
 
-def _common(rows: Sequence[Row]) -> dict[str, Value]:
-    """Version and options that all meshes have in common."""
+def _option(name: str) -> str:
+    """An option's name as the command line has it, or whose version it is."""
+    return name.rpartition(".")[2]
+
+
+def _counted(counts: Counter[Value]) -> str:
+    """Values and how many subjects have each, the most frequent first."""
+    if len(counts) > LISTED_VALUES:
+        return f"{len(counts)} values"
+    return ", ".join(f"{'none' if value is None else _shown(value)} ({n})" for value, n in counts.most_common())
+
+
+def _options(rows: Sequence[Row]) -> dict[str, Counter[Value]]:
+    """Version and options of the meshes: of each how many have which value; None where it is not stated."""
     meshes = [row.numbers for row in rows if row.status in ("done", "missed")]
-    names = [name for name in (meshes[0] if meshes else ()) if name.startswith(("options.", "request.options."))]
-    values = {name: {numbers.get(name) for numbers in meshes} for name in ("versions.tetopt", *names)}
-    return {name: next(iter(each)) for name, each in values.items() if len(each) == 1 and each != {None}}
+    stated = dict.fromkeys(name for numbers in meshes for name in numbers if name.startswith(OPTION_BEGINNINGS))
+    counts = {name: Counter(numbers.get(name) for numbers in meshes) for name in ("versions.tetopt", *stated)}
+    return {name: each for name, each in counts.items() if set(each) != {None}}
 
 
 def _failures(rows: Sequence[Row]) -> list[str]:
@@ -172,10 +192,9 @@ def _columns(rows: Sequence[Row]) -> tuple[dict[str, Quantity], int]:
         for name, quantity in columns.items()
         if name in known
     }
-    common = _common(rows)
-    for name in sorted(known):
-        if name.startswith(("options.", "request.options.")) and name not in common and _differs(name, rows):
-            shown[name] = Quantity(name, name.rpartition(".")[2], "", "both", False, 0.0)
+    for name, each in sorted(_options(rows).items()):
+        if name.startswith(OPTION_BEGINNINGS) and len(each) > 1:
+            shown[name] = Quantity(name, _option(name), "", "both", False, 0.0)
     counts = Counter(number for row in rows for number in row.volumes if number > 0)
     names = {number: name for row in reversed(rows) for number, name in row.label_names.items()}
     room = max(PAGE_NUMBERS // max(len(rows), 1) - len(shown), 0) // 2
@@ -193,10 +212,6 @@ def _columns(rows: Sequence[Row]) -> tuple[dict[str, Quantity], int]:
 
 def _unit(name: str) -> str:
     return "bytes" if name.endswith("_bytes") else ""
-
-
-def _differs(name: str, rows: Sequence[Row]) -> bool:
-    return len({row.numbers.get(name) for row in rows if row.status in ("done", "missed")}) > 1
 
 
 def _data(
