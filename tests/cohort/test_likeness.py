@@ -148,8 +148,11 @@ def test_the_sign_alone_is_no_turn():
     assert turned_of([*others, row_of(0.98, left_right=0.0008)]) == []
     assert turned_of([*others, row_of(0.98, left_right=0.05)]) == []  # turned over it would be at 0.004
     sided = [row_of(0.98, left_right=-0.1 - 0.001 * k) for k in range(8)]
-    assert turned_of([*sided, row_of(0.98, left_right=0.019)]) == []
-    assert turned_of([*sided, row_of(0.98, left_right=0.021)]) == [(8, "thumbnail.left_right")]
+    assert turned_of([*sided, row_of(0.98, left_right=0.02)]) == []  # a fifth of what it would be at: cut off
+    assert turned_of([*sided, row_of(0.98, left_right=0.04)]) == [(8, "thumbnail.left_right")]
+    little = [row_of(0.98, left_right=-0.008 - 1e-4 * k) for k in range(8)]
+    assert turned_of([*little, row_of(0.98, left_right=0.0049)]) == []
+    assert turned_of([*little, row_of(0.98, left_right=0.0051)]) == [(8, "thumbnail.left_right")]
     spread = [row_of(0.98, left_right=-0.15 + 0.03 * k) for k in range(8)]
     assert turned_of([*spread, row_of(0.98, left_right=0.04)]) == []
 

@@ -20,12 +20,13 @@ MAD_OF_NORMAL = 1.482602218505602  # standard deviations of normal numbers to on
 MAJORITY_SHARE = 2 / 3  # of subjects that agree: with fewer there is nothing that the others differ from
 COMMON_SHARE = 0.9  # of subjects that have what is missed in the others: in fewer it is a matter of choice
 LEAST_LIKENESS = 0.01  # of the scale of correlations: heads of one size, in one place, differ by as much
-# Of correlations, by which a picture is more like the others' turned over, and they are less so: pictures that tell
-# sides apart have 0.06 to 0.12 there (heads), those of a brain's left and right -0.008 to 0.001.
-TURN_MARGIN = 0.02
-# Beyond the median, likewise: normal numbers with a deviation of 0.02 about -0.05 are flagged in 2 of 10,000, and a
-# picture that is turned over, at 0.05, is flagged where the deviation is below 0.04.
-TURN_DEVIATIONS = 2.5
+# Of correlations, by which a picture is more like the others' turned over: those of a symmetric head, meshed anew, lie
+# within 0.001 on either side, those of heads with back and front exchanged at 0.01 (whole) to 0.12 (brains).
+TURN_MARGIN = 0.005
+# Turned over, the others' median would be about as far on the other side of 0; what is cut off is at a fifth of that.
+TURN_SHARE = 1 / 3
+SIDED_DEVIATIONS = 1.5  # by which the others' median is below 0: normal numbers are there in 9 of 10 at least
+TURN_DEVIATIONS = 2.5  # beyond the median: 6 of 1000 normal numbers, most of which are below the margin
 SHORT_RATIO = 20.0  # of two numbers in one unit: beyond, the smaller one has too many zeros behind the point
 FLOAT_ROUNDING = 1e-9  # deviations by which a number may be beside the limit that it is at
 
@@ -185,11 +186,13 @@ def _turned(rows: Sequence[Row], names: dict[int, str]) -> Flagged:
         n_usual = int((values < 0.0).sum())
         if len(values) < FEW_SUBJECTS or n_usual < MAJORITY_SHARE * len(values) - FLOAT_ROUNDING:
             continue  # few, or no telling which of them are turned over
-        if np.median(values) > -TURN_MARGIN:
+        middle = float(np.median(values))
+        spread = MAD_OF_NORMAL * float(np.median(np.abs(values - middle)))
+        if middle + SIDED_DEVIATIONS * spread > -TURN_MARGIN:
             continue  # of a shape that tells no sides apart
-        scores = deviations(values, False, FLOAT_ROUNDING)
+        least = max(TURN_MARGIN, -TURN_SHARE * middle, middle + TURN_DEVIATIONS * spread)
         likeness = present(row.numbers.get("thumbnail.likeness") for row in rows)
-        for k in np.flatnonzero((values >= TURN_MARGIN) & (scores > TURN_DEVIATIONS)).tolist():
+        for k in np.flatnonzero(values >= least).tolist():
             if _is_like(rows[places[k]], values[k], likeness):
                 reason = f"its picture is more like the others' with {words}; {n_usual} of {len(values)} are less so"
                 yield places[k], Flag(column, reason, np.inf)
