@@ -610,7 +610,7 @@ def test_help_of_mesh_is_in_six_groups(monkeypatch, capsys):
     sizes = {name: len(re.findall(r"^│ [ *]*--[a-z]", text, re.M)) for name, text in pairs}
     assert sizes.pop("Arguments") == 0
     assert sizes == {
-        "Options": 5, "What is meshed": 9, "Number and size of cells": 7, "The mesh it begins with": 4,
+        "Options": 6, "What is meshed": 9, "Number and size of cells": 7, "The mesh it begins with": 4,
         "Optimisation": 11, "For the solver": 13,
     }  # fmt: skip
 

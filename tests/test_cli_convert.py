@@ -695,8 +695,8 @@ def test_a_table_of_other_labels_is_said(folder, tmp_path, capsys):
     ("options", "said"),
     [
         (["--slice", "k=99"], "a.nii.gz: --slice: index along axis 2 must be"),
-        (["--nodes", "4"], "tetopt: --nodes: expected a whole number of nodes"),
-        (["--nodes=4"], "tetopt: --nodes: expected a whole number of nodes"),
+        (["--nodes", "6"], "tetopt: --nodes: expected a whole number of nodes"),
+        (["--nodes=6"], "tetopt: --nodes: expected a whole number of nodes"),
         (["--load", "hold:nowhere", "--young", "2"], 'tetopt: --load: there is no set of facets "nowhere"'),
         (["--gradation", "3"], "tetopt: --gradation: expected 0.05"),
         (["--size-max", "-1"], "tetopt: --size-max: expected a length above 0 mm"),
