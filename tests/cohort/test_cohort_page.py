@@ -61,7 +61,7 @@ def test_what_differs_is_said_with_how_many(tmp_path):
         run["options"]["nodes"] = 250 if k < 2 else 300
         run["options"]["k_D"] = k / 10
         if k == 9:
-            run["request"]["options"]["gradation"] = HOSTILE
+            run["request"]["options"] |= {"gradation": HOSTILE, "k-d": "0.9"}  # the latter is options.k_D
         save_run(tmp_path, key_of(k), run, thumbnail(rng))
     save_cohort_files(tmp_path, collect(tmp_path))
     text = (tmp_path / "cohort.html").read_text(encoding="utf-8")
@@ -72,7 +72,7 @@ def test_what_differs_is_said_with_how_many(tmp_path):
         column["name"] for column in data_of(text)["columns"]
     }
     assert "Of all meshes: tetopt 0.1.0, method fast, young 3.0, format .vtu." in text
-    assert re.search(r"Meshing took [\d.]+ min of all runs together; start-up and pictures come on top.", text)
+    assert re.search(r"Meshing took [\d.]+ min of computing; start-up and pictures of each come on top[.]", text)
 
 
 def test_the_colours_of_pictures_are_told_above_them(cohort, tmp_path):

@@ -181,8 +181,9 @@ def flattened(run: dict[str, Any]) -> dict[str, Value]:
     if isinstance(request, dict):
         columns["request.sha256"] = _scalar(request.get("sha256"))
         stated = request.get("options")
+        known = {name.lower() for name in columns}  # "k-d" on the command line is k_D
         for name, value in stated.items() if isinstance(stated, dict) else ():
-            if f"options.{name.replace('-', '_')}" not in columns:
+            if f"options.{name.replace('-', '_')}".lower() not in known:
                 _put(columns, f"request.options.{name}", value)
     for name in ("labels", "interfaces"):
         for each in _table(run, name):

@@ -106,7 +106,7 @@ def _summary(rows: Sequence[Row], flags: Sequence[Sequence[Flag]]) -> list[str]:
     if n_odd := sum(bool(each) for each in flags):
         text += f" {n_odd} {'is' if n_odd == 1 else 'are'} odd in something, see below."
     if seconds := present(row.numbers.get("seconds.all") for row in rows):
-        text += f" Meshing took {units('s', 3)(sum(seconds))} of all runs together; start-up and pictures come on top."
+        text += f" Meshing took {units('s', 3)(sum(seconds))} of computing; start-up and pictures of each come on top."
     if peaks := present(row.numbers.get("memory.peak_bytes") for row in rows):
         text += f" The largest run had {units('bytes', 3)(max(peaks))} of memory."
     options = _options(rows)
