@@ -155,6 +155,10 @@ def test_the_sign_alone_is_no_turn():
     assert turned_of([*little, row_of(0.98, left_right=0.0051)]) == [(8, "thumbnail.left_right")]
     spread = [row_of(0.98, left_right=-0.15 + 0.03 * k) for k in range(8)]
     assert turned_of([*spread, row_of(0.98, left_right=0.04)]) == []
+    steps = [0.0, 0.0, *[0.041, -0.041] * 4, *[0.06, -0.06] * 2]  # 1.4826 * 0.041 is a deviation: 2.5 end at 0.052
+    wide = [row_of(0.98, left_right=-0.1 + step) for step in steps]
+    assert turned_of([*wide, row_of(0.98, left_right=0.05)]) == []
+    assert turned_of([*wide, row_of(0.98, left_right=0.054)]) == [(14, "thumbnail.left_right")]
 
 
 def test_where_many_are_turned_over_none_is_the_odd_one(tmp_path):
