@@ -17,7 +17,6 @@ from cohorts import save_run
 from commands import exit_code
 
 import tetopt
-import tetopt.cli.cohort
 from tetopt.cli import cohort as cohort_module
 from tetopt.cli import cohort_plan
 from tetopt.cli.cohort import Estimate
@@ -342,7 +341,7 @@ def test_a_second_run_is_refused_before_it_plans(small, capsys, monkeypatch):
     def fail(*_):
         raise AssertionError("planned")
 
-    monkeypatch.setattr(tetopt.cli.cohort, "subjects_of", fail)
+    monkeypatch.setattr(cohort_module, "subjects_of", fail)
     with locked(small / "out"):
         assert "another run writes there" in refused(small, capsys)[0]
 
@@ -369,7 +368,7 @@ def test_a_dry_run_tells_what_it_takes(small, capsys):
 def test_what_is_larger_than_the_machine_takes_no_workers_from_others(monkeypatch):
     """It does not begin here; jobs of a batch system may still have that memory."""
     monkeypatch.setattr(cohort_module, "available_bytes", lambda: 8e9)
-    estimate = Estimate({"a": Prediction(1.0, 1.0, 1e9), "b": Prediction(1.0, 1.0, 1e11)}, 1e11)
+    estimate = Estimate({"a": Prediction(1.0, 1.0, 1e9), "b": Prediction(1.0, 1.0, 1e11)})
     here, there = CohortOptions(output=Path("out")), CohortOptions(output=Path("out"), cluster=Path("c.yaml"))
     assert [cohort_module._need(2, estimate, each, None).subject_bytes for each in (here, there)] == [1e9, 1e11]
 
@@ -378,10 +377,10 @@ def test_the_page_of_a_run_under_way(tmp_path, monkeypatch):
     """It is written now and then: not at each subject, and again when its time has come."""
     place = tmp_path / "out"
     begin(place, description("test", []))
-    refresh = tetopt.cli.cohort._refresher(place)
+    refresh = cohort_module._refresher(place)
     refresh()
     assert not (place / "cohort.html").exists()
-    monkeypatch.setattr(tetopt.cli.cohort, "PAGE_SECONDS", 0.0)
+    monkeypatch.setattr(cohort_module, "PAGE_SECONDS", 0.0)
     refresh()
     assert (place / "cohort.html").exists()
 
@@ -397,7 +396,7 @@ def test_what_another_run_has_done_meanwhile_is_not_done_again(small, monkeypatc
     keys = []
     monkeypatch.setattr(cohort_module, "locked", locked)
     monkeypatch.setattr(cohort_plan, "requested", lambda *_: {"sha256": "1"})
-    monkeypatch.setattr(cohort_module, "estimated", lambda _: Estimate({}, 0.0))
+    monkeypatch.setattr(cohort_module, "estimated", lambda _: Estimate({}))
     monkeypatch.setattr(cohort_module, "_run", lambda to_run, *_: keys.extend(entry.key for entry in to_run))
     exit_code("cohort", small / "t.tsv", "-o", small / "out")
     assert keys == ["sub-02"]

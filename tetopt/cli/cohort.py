@@ -33,13 +33,14 @@ from tetopt.cli.options import (
 from tetopt.cli.plan import with_numbers
 from tetopt.cli.predict import size_by_headers, size_of_run
 from tetopt.cli.source import read_source
+from tetopt.cohort.crew import counted
 from tetopt.cohort.layout import LOGS_NAME, WORK_NAME, begin, check_out, description, failure_path, locked, restore
 from tetopt.cohort.numbers import collect
 from tetopt.cohort.page import save_cohort_files
 from tetopt.cohort.run import Ended, Job
 from tetopt.cohort.schedule import SchedulerLost, run_all
 from tetopt.cohort.subjects import TABLE_SUFFIXES, Problems, key, write_table
-from tetopt.cohort.workers import Folders, Need, check_choice, shares, workers
+from tetopt.cohort.workers import Folders, Need, check_choice, local_share, workers
 from tetopt.engine.cost import Prediction, RunSize, calibrated_speed, predicted
 from tetopt.errors import InputError
 from tetopt.io.files import checked_output
@@ -56,7 +57,10 @@ class Estimate(NamedTuple):
     """What the subjects that are to be run are predicted to take."""
 
     each: dict[str, Prediction]  # by key, on one thread
-    largest: float  # bytes
+
+    def largest(self) -> float:
+        """Bytes of the one that takes most, 0 of none."""
+        return max((prediction.peak_bytes for prediction in self.each.values()), default=0.0)
 
     def seconds(self) -> float:
         """Of all, one after the other."""
@@ -145,7 +149,7 @@ def _say_plan(entries: Sequence[Entry], to_run: Sequence[Entry], only_failed: bo
     words = {"done": "done", "missed": "done, but a promise missed", "failed": "failed", "changed": "changed"}
     parts = [f"{counts[name]} {text}" for name, text in words.items() if counts[name]]
     parts += [f"{counts['missing']} not yet run"] if counts["missing"] else []
-    log.print(f"{_counted(len(entries))}: {', '.join(parts)}; {len(to_run)} to run")
+    log.print(f"{counted(len(entries), 'subject')}: {', '.join(parts)}; {len(to_run)} to run")
     reasons = Counter((e.state.status, e.state.why) for e in to_run if e.state.status in ("changed", "failed"))
     for (status, why), number in reasons.most_common(NAMED_FAILURES):
         log.print(escape(f"  {number} {status}: {why}"))
@@ -178,7 +182,7 @@ def estimated(entries: Sequence[Entry]) -> Estimate:
             each[entry.key] = predicted(size_by_headers(entry.plan, nearest), 1, speed)
         except InputError:  # its run will say it
             continue
-    return Estimate(each, max((prediction.peak_bytes for prediction in each.values()), default=0.0))
+    return Estimate(each)
 
 
 def _read_size(entry: Entry) -> RunSize | None:
@@ -210,15 +214,11 @@ def _say_estimate(to_run: Sequence[Entry], estimate: Estimate, cohort: CohortOpt
             out.print(escape(f"{entry.key}: sizes unknown: its image cannot be read"))
         else:
             out.print(escape(f"{entry.key}: {one.seconds:.0f} s on a thread, {memory_words(one.peak_bytes)}"))
-    whole = f"in all {_time(estimate.seconds())} on one thread, at most {memory_words(estimate.largest)} each"
+    whole = f"in all {_time(estimate.seconds())} on one thread, at most {memory_words(estimate.largest())} each"
     if cohort.cluster is not None or cohort.scheduler is not None or not to_run:
         out.print(f"{whole}; divided by as many as the cluster runs at a time" if to_run else "nothing to run")
         return
-    from dask.system import CPU_COUNT  # as affinity and containers leave them
-
-    free = available_bytes()
-    need = _need(len(to_run), estimate, cohort, threads)
-    share = shares(need, cohort.count, CPU_COUNT, float("inf") if free is None else float(free))
+    share = local_share(_need(len(to_run), estimate, cohort, threads), cohort.count)
     out.print(f"{whole}; on this machine {share.workers} at a time: about {_time(estimate.seconds() / share.workers)}")
 
 
@@ -326,11 +326,14 @@ def _close(place: Path, keys: list[str]) -> int:
     for row in [row for row in own if row.status == "failed"][:NAMED_FAILURES]:
         log.print(escape(f"{row.key}: {row.reason}"))
     words = {"done": "done", "missed": "done, but a promise missed", "failed": "failed", "missing": "not run"}
-    out.print(
-        f"{_counted(len(own))}: " + ", ".join(f"{counts[name]} {text}" for name, text in words.items() if counts[name])
-    )
+    parts = [f"{counts[name]} {text}" for name, text in words.items() if counts[name]]
+    out.print(f"{counted(len(own), 'subject')}: {', '.join(parts)}")
     if len(rows) > len(own):
-        log.print(escape(f"{_counted(len(rows) - len(own))} more in {place}, from other tables, are shown with these"))
+        log.print(
+            escape(
+                f"{counted(len(rows) - len(own), 'subject')} more in {place}, from other tables, are shown with these"
+            )
+        )
     for name in ("cohort.html", "cohort.tsv"):
         out.print(escape(str(place / name)))
     return 1 if counts["failed"] or counts["missing"] else 0
@@ -340,11 +343,6 @@ def _say_rerun(code: int, arguments: Sequence[str]) -> None:
     if code:
         words = " ".join(map(shlex.quote, arguments))
         log.print(escape(f"to go on with what is missing or failed, and with that alone: tetopt {words}"))
-
-
-def _counted(number: int) -> str:
-    """So many subjects, in words."""
-    return f"{number} subject{'s' * (number != 1)}"
 
 
 def _time(seconds: float) -> str:

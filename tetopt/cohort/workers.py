@@ -126,14 +126,20 @@ def shares(need: Need, count: int | None, cores: int, free: float) -> Share:
     return Share(number, need.threads or max(1, cores // number), free / number - WORKER_BYTES)
 
 
+def local_share(need: Need, count: int | None) -> Share:
+    """How this machine, as affinity and containers leave it, is divided."""
+    from dask.system import CPU_COUNT
+
+    free = available_bytes()
+    return shares(need, count, CPU_COUNT, float("inf") if free is None else float(free))
+
+
 def _local(stack: ExitStack, need: Need, folders: Folders, count: int | None) -> Workers:
     """A cluster within this machine, on its loopback, with certificates of its own: others here cannot submit code."""
     import dask
-    from dask.system import CPU_COUNT
     from distributed import Client, LocalCluster
 
-    free = available_bytes()
-    share = shares(need, count, CPU_COUNT, float("inf") if free is None else float(free))
+    share = local_share(need, count)
     stack.enter_context(dask.config.set({"distributed.scheduler.allowed-failures": 0}))
     own_folder = folders.work / "dask"
     stack.callback(shutil.rmtree, own_folder, ignore_errors=True)
@@ -150,7 +156,7 @@ def _local(stack: ExitStack, need: Need, folders: Folders, count: int | None) ->
     client = stack.enter_context(Client(cluster))
     client.register_plugin(_silencer(folders.logs / "dask.log"))
     words = f"{counted(share.workers, 'worker')} of {counted(share.threads, 'thread')}"
-    if free is not None:
+    if share.bytes < float("inf"):
         words += f" and {memory_words(share.bytes)}"
     words += f"; dashboard {client.dashboard_link}"
     return Workers(client, lambda: slots_of(client), share.threads, share.bytes, words)
