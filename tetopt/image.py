@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import warnings
 from dataclasses import dataclass
+from math import prod
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -20,8 +21,52 @@ MOST_OFFSET = 1e9  # voxels from the world's origin: beyond, coordinates have no
 INTENSITY_RANGE = (1e-152, 1e148)
 
 
+class VoxelGrid:
+    """Where voxels lie in the world: what an `Image` shares with images that are read in parts.
+
+    Voxel *centres* sit at the integer indices (the NIfTI convention), so the domain runs from index -0.5 to
+    ``shape - 0.5`` along every axis.
+    """
+
+    affine: NDArray[np.float64]
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        """Number of voxels along each axis."""
+        raise NotImplementedError
+
+    @property
+    def ndim(self) -> int:
+        """Number of axes n, 2 or 3."""
+        return len(self.shape)
+
+    @property
+    def spacing(self) -> NDArray[np.float64]:
+        """Length of a voxel's edge along each axis, (n,) float64, mm."""
+        return np.sqrt((self.affine[:-1, :-1] ** 2).sum(axis=0))
+
+    @property
+    def voxel_volume(self) -> float:
+        """Volume of one voxel, mm^n."""
+        return float(abs(np.linalg.det(self.affine[:-1, :-1])))
+
+    @property
+    def volume(self) -> float:
+        """Volume of the domain, index -0.5 to shape - 0.5, mm^n."""
+        return self.voxel_volume * prod(self.shape)
+
+    def to_world(self, index: ArrayLike) -> NDArray[np.float64]:
+        """World coordinates, (..., n) mm, of index coordinates (..., n)."""
+        return transformed(np.asarray(index, dtype=np.float64), self.affine[:-1, :-1]) + self.affine[:-1, -1]
+
+    def to_index(self, points: ArrayLike) -> NDArray[np.float64]:
+        """Index coordinates (..., n) of world points (..., n) in mm; the inverse of `to_world`."""
+        shifted = np.asarray(points, dtype=np.float64) - self.affine[:-1, -1]
+        return transformed(shifted, np.asarray(np.linalg.inv(self.affine[:-1, :-1]), dtype=np.float64))
+
+
 @dataclass(frozen=True, eq=False)
-class Image:
+class Image(VoxelGrid):
     """Scalar intensities h on a grid of voxels, in two or three dimensions.
 
     Voxel *centres* sit at the integer indices (the NIfTI convention), so the domain runs from index -0.5 to
@@ -55,43 +100,14 @@ class Image:
 
     def __init__(self, data: ArrayLike, affine: ArrayLike | None = None) -> None:
         data = _checked_data(data)
-        affine = _checked_affine(np.eye(data.ndim + 1) if affine is None else affine, data.ndim)
+        affine = checked_affine(np.eye(data.ndim + 1) if affine is None else affine, data.ndim)
         object.__setattr__(self, "data", data)
         object.__setattr__(self, "affine", affine)
-
-    @property
-    def ndim(self) -> int:
-        """Number of axes n, 2 or 3."""
-        return self.data.ndim
 
     @property
     def shape(self) -> tuple[int, ...]:
         """Number of voxels along each axis."""
         return self.data.shape
-
-    @property
-    def spacing(self) -> NDArray[np.float64]:
-        """Length of a voxel's edge along each axis, (n,) float64, mm."""
-        return np.sqrt((self.affine[:-1, :-1] ** 2).sum(axis=0))
-
-    @property
-    def voxel_volume(self) -> float:
-        """Volume of one voxel, mm^n."""
-        return float(abs(np.linalg.det(self.affine[:-1, :-1])))
-
-    @property
-    def volume(self) -> float:
-        """Volume of the domain, index -0.5 to shape - 0.5, mm^n."""
-        return self.voxel_volume * self.data.size
-
-    def to_world(self, index: ArrayLike) -> NDArray[np.float64]:
-        """World coordinates, (..., n) mm, of index coordinates (..., n)."""
-        return transformed(np.asarray(index, dtype=np.float64), self.affine[:-1, :-1]) + self.affine[:-1, -1]
-
-    def to_index(self, points: ArrayLike) -> NDArray[np.float64]:
-        """Index coordinates (..., n) of world points (..., n) in mm; the inverse of `to_world`."""
-        shifted = np.asarray(points, dtype=np.float64) - self.affine[:-1, -1]
-        return transformed(shifted, np.asarray(np.linalg.inv(self.affine[:-1, :-1]), dtype=np.float64))
 
 
 def transformed(vectors: NDArray[np.float64], matrix: NDArray[np.float64]) -> NDArray[np.float64]:
@@ -151,7 +167,7 @@ def _as_lossless_float(data: NDArray) -> NDArray[np.floating]:
     return np.array(data, dtype=np.float64, order="C")
 
 
-def _checked_affine(affine: ArrayLike, n: int) -> NDArray[np.float64]:
+def checked_affine(affine: ArrayLike, n: int) -> NDArray[np.float64]:
     """A read-only copy of the affine; InputError unless it is (n+1, n+1), finite, homogeneous and regular."""
     try:
         affine = np.array(affine, dtype=np.float64)
