@@ -9,10 +9,10 @@ import time
 from pathlib import Path
 
 from tetopt.budget import resident_bytes
-from tetopt.cohort.crew import Folders, Need
+from tetopt.cluster.crew import Folders, Need
+from tetopt.cluster.workers import workers
 from tetopt.cohort.run import Ended, Job
 from tetopt.cohort.schedule import run_all
-from tetopt.cohort.workers import workers
 
 
 def nothing(job: Job) -> Ended:

@@ -370,7 +370,7 @@ def test_what_is_larger_than_the_machine_takes_no_workers_from_others(monkeypatc
     monkeypatch.setattr(cohort_module, "available_bytes", lambda: 8e9)
     estimate = Estimate({"a": Prediction(1.0, 1.0, 1e9), "b": Prediction(1.0, 1.0, 1e11)})
     here, there = CohortOptions(output=Path("out")), CohortOptions(output=Path("out"), cluster=Path("c.yaml"))
-    assert [cohort_module._need(2, estimate, each, None).subject_bytes for each in (here, there)] == [1e9, 1e11]
+    assert [cohort_module._need(2, estimate, each, None).task_bytes for each in (here, there)] == [1e9, 1e11]
 
 
 def test_the_page_of_a_run_under_way(tmp_path, monkeypatch):

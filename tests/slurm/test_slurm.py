@@ -17,11 +17,11 @@ from pathlib import Path
 import pytest
 from commands import exit_code, numbers_in
 
-from tetopt.cohort.crew import Folders, Need
+from tetopt.cluster.crew import Folders, Need
+from tetopt.cluster.workers import workers
 from tetopt.cohort.layout import begin, description, numbers_path
 from tetopt.cohort.run import Ended, Job
 from tetopt.cohort.schedule import run_all
-from tetopt.cohort.workers import workers
 from tetopt.io.meshes import load_mesh
 
 pytestmark = [

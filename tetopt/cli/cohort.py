@@ -33,14 +33,14 @@ from tetopt.cli.options import (
 from tetopt.cli.plan import with_numbers
 from tetopt.cli.predict import size_by_headers, size_of_run
 from tetopt.cli.source import read_source
-from tetopt.cohort.crew import counted
+from tetopt.cluster.crew import counted
+from tetopt.cluster.workers import Folders, Need, check_choice, local_share, workers
 from tetopt.cohort.layout import LOGS_NAME, WORK_NAME, begin, check_out, description, failure_path, locked, restore
 from tetopt.cohort.numbers import collect
 from tetopt.cohort.page import save_cohort_files
 from tetopt.cohort.run import Ended, Job
 from tetopt.cohort.schedule import SchedulerLost, run_all
 from tetopt.cohort.subjects import TABLE_SUFFIXES, Problems, key, write_table
-from tetopt.cohort.workers import Folders, Need, check_choice, local_share, workers
 from tetopt.engine.cost import Prediction, RunSize, calibrated_speed, predicted
 from tetopt.errors import InputError
 from tetopt.io.files import checked_output
@@ -198,13 +198,13 @@ def _read_size(entry: Entry) -> RunSize | None:
     return size_of_run(plan, source.content, source.contrasts[0], n_started)
 
 
-def _need(n_subjects: int, estimate: Estimate, cohort: CohortOptions, threads: int | None) -> Need:
+def _need(n_tasks: int, estimate: Estimate, cohort: CohortOptions, threads: int | None) -> Need:
     """What workers are to have room for: on this machine not for what is larger than all of it, and will not begin."""
     sizes = [each.peak_bytes for each in estimate.each.values()]
     free = available_bytes()
     if free is not None and cohort.scheduler is None and cohort.cluster is None:
         sizes = [each for each in sizes if each <= free]
-    return Need(n_subjects, max(sizes, default=0.0), threads)
+    return Need(n_tasks, max(sizes, default=0.0), threads)
 
 
 def _say_estimate(to_run: Sequence[Entry], estimate: Estimate, cohort: CohortOptions, threads: int | None) -> None:

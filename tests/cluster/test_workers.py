@@ -14,10 +14,10 @@ from commands import exit_code
 from distributed import KilledWorker, LocalCluster
 from models import sample_image
 
-from tetopt.cohort import jobs
-from tetopt.cohort.crew import About, Folders, Need, Newcomers
-from tetopt.cohort.jobs import cluster_of, configuration, request
-from tetopt.cohort.workers import _threads_each, shares, workers
+from tetopt.cluster import jobs
+from tetopt.cluster.crew import About, Folders, Need, Newcomers
+from tetopt.cluster.jobs import cluster_of, configuration, request
+from tetopt.cluster.workers import _threads_each, shares, workers
 from tetopt.errors import InputError
 from tetopt.interpreter import python_command, python_environment
 from tetopt.io.images import save_image
@@ -65,7 +65,7 @@ def processes():
     [
         (Need(100, 0.0, None), None, 8, float("inf"), (8, 1)),  # cores
         (Need(100, 2 * GB, None), None, 8, 12 * GB, (4, 2)),  # memory: 2.85 GB each
-        (Need(3, 2 * GB, None), None, 8, 100 * GB, (3, 2)),  # subjects
+        (Need(3, 2 * GB, None), None, 8, 100 * GB, (3, 2)),  # tasks
         (Need(100, 2 * GB, None), 2, 8, 100 * GB, (2, 4)),  # count
         (Need(100, 2 * GB, 4), None, 8, 100 * GB, (2, 4)),  # threads of each
         (Need(100, 2 * GB, 16), None, 8, 100 * GB, (1, 16)),
@@ -121,7 +121,7 @@ def test_workers_of_this_machine(folders, capfd):
 
 @pytest.fixture(scope="module")
 def others():
-    """A cluster of somebody else's, within this process: 2 workers with 2 subjects at a time and 8 GB each."""
+    """A cluster of somebody else's, within this process: 2 workers with 2 tasks at a time and 8 GB each."""
     with LocalCluster(
         n_workers=2, threads_per_worker=2, processes=False, protocol="tcp://", memory_limit="8GB",
         dashboard_address="127.0.0.1:0", silence_logs=50,
@@ -141,15 +141,13 @@ def test_workers_of_a_scheduler_that_runs(others, folders):
 
 
 def test_workers_with_too_little_memory_are_refused(others, folders):
-    with pytest.raises(
-        InputError, match=r"has 4 GB for each of 2 subjects, the largest needs about 5 GB; .*--nthreads 1"
-    ):
+    with pytest.raises(InputError, match=r"has 4 GB for each of 2 tasks, the largest needs about 5 GB; .*--nthreads 1"):
         running(Need(10, 5 * GB, None), folders, scheduler=others.scheduler.address).__enter__()
 
 
 @pytest.mark.parametrize("address", ["tcp://127.0.0.1:1", "nonsense://x", "host", ""])
 def test_a_scheduler_that_does_not_answer_is_refused_in_one_line(address, folders, monkeypatch, capfd):
-    monkeypatch.setattr("tetopt.cohort.workers.CONNECT_SECONDS", 0.2)
+    monkeypatch.setattr("tetopt.cluster.workers.CONNECT_SECONDS", 0.2)
     with pytest.raises(InputError, match="does not answer") as refusal:
         running(Need(1, 0.0, None), folders, scheduler=address).__enter__()
     assert "\n" not in str(refusal.value)
@@ -165,7 +163,7 @@ def test_contradictions_are_refused(folders, tmp_path):
 
 def test_nothing_is_written_where_workers_are_refused(tmp_path, capsys):
     save_image(tmp_path / "a.nii.gz", sample_image(3))
-    (tmp_path / "t.tsv").write_text("subject\timage\n1\ta.nii.gz\n")
+    (tmp_path / "t.tsv").write_text("task\timage\n1\ta.nii.gz\n")
     command = ["cohort", tmp_path / "t.tsv", "-o", tmp_path / "out", "--nodes", 60]
     assert exit_code(*command, "--cluster", written(tmp_path, "jobqueue: {slum: {}}")) == 2
     assert "expected one of htcondor" in capsys.readouterr().err
@@ -181,7 +179,7 @@ def test_nothing_is_written_where_workers_are_refused(tmp_path, capsys):
         ({"python": "3.9"}, r"expected Python .* as here, got 3.9"),
         ({"probe": None}, "does not see .*; expected an output folder on a file system that all workers share"),
         ({"probe": "another folder's"}, "does not see"),
-        ({"n_threads": 4, "n_bytes": 4 * GB}, "has 1 GB for each of 4 subjects, the largest needs about 3 GB"),
+        ({"n_threads": 4, "n_bytes": 4 * GB}, "has 1 GB for each of 4 tasks, the largest needs about 3 GB"),
     ],
 )
 def test_a_worker_is_looked_at_when_it_comes(change, words, tmp_path):
@@ -263,7 +261,7 @@ def test_a_job_asks_for_what_a_subject_needs():
     plain = requested({}, Need(9, 4 * GB, None))
     assert (plain.cores, plain.processes, plain.threads) == (4, 1, 4)
     assert plain.bytes == pytest.approx(5.55 * GB)  # 1.35 times what is predicted, and the worker itself
-    assert plain.subject_bytes == pytest.approx(5.4 * GB)
+    assert plain.task_bytes == pytest.approx(5.4 * GB)
     packed = requested({"cores": 8, "processes": 2}, Need(9, 4 * GB, None))
     assert (packed.cores, packed.threads) == (8, 4)
     assert packed.bytes == pytest.approx(11.1 * GB)
@@ -278,7 +276,7 @@ def test_a_job_asks_for_what_a_subject_needs():
         ("slurm", {"memory": "6GB", "processes": 2}, Need(1, 4 * GB, None), "memory: expected at least 8.3 GB for 2"),
         ("slurm", {"job-mem": "1GB"}, Need(1, 4 * GB, None), "job-mem: expected at least"),
         ("lsf", {"mem": 10**9}, Need(1, 4 * GB, None), "mem: expected at least"),
-        ("slurm", {"cores": 2}, Need(1, 1.0, 4), "cores: expected at least 4 for 1 subjects of 4 threads, got 2"),
+        ("slurm", {"cores": 2}, Need(1, 1.0, 4), "cores: expected at least 4 for 1 tasks of 4 threads, got 2"),
         ("slurm", {"cores": 2, "processes": 3}, Need(1, 1.0, None), "cores: expected at least 3"),
         ("sge", {}, Need(1, 4 * GB, None), "expected resource-spec, by which a job asks for 5.55 GB here"),
         ("oar", {}, Need(1, 4 * GB, None), "expected memory-per-core-property-name"),
@@ -423,8 +421,8 @@ def test_folders_that_directives_do_not_take_are_refused(batch, tmp_path):
 @pytest.mark.slow
 def test_nothing_is_left_of_a_client_that_is_killed(tmp_path):
     program = (
-        "import sys, time; from pathlib import Path; from tetopt.cohort.workers import *\n"
-        "from tetopt.cohort.crew import *\n"
+        "import sys, time; from pathlib import Path; from tetopt.cluster.workers import *\n"
+        "from tetopt.cluster.crew import *\n"
         "if __name__ == '__main__':\n"
         "    one = Path(sys.argv[1])\n"
         "    with workers(Need(2, 1.0, 1), Folders(one, one), count=2, scheduler=None, cluster=None) as crew:\n"

@@ -1,4 +1,4 @@
-"""What a cohort needs of dask's workers, what it has of them, and what is looked at when one comes."""
+"""What is needed of dask's workers, what there is of them, and what is looked at when one comes."""
 
 from __future__ import annotations
 
@@ -14,17 +14,17 @@ import tetopt
 from tetopt.budget import memory_words
 from tetopt.errors import InputError
 
-MEMORY_MARGIN = 1.35  # of a subject's memory over its prediction, which may be 25 % too low: 1 / 0.75
+MEMORY_MARGIN = 1.35  # of a task's memory over its prediction, which may be 25 % too low: 1 / 0.75
 WORKER_BYTES = 1.5e8  # of a dask worker itself with its nanny: 65 MB each, and what they exchange
 DASHBOARD_PORT = 8787  # dask's own, which its users know; another where that is taken
 
 
 class Need(NamedTuple):
-    """What a cohort needs of its workers."""
+    """What is needed of workers."""
 
-    n_subjects: int  # that are to be run
-    subject_bytes: float  # of the largest, predicted, 0 if nothing is known
-    threads: int | None  # for each subject, None: its share of the cores
+    n_tasks: int  # that are to be run
+    task_bytes: float  # of the largest, predicted, 0 if nothing is known
+    threads: int | None  # for each task, None: its share of the cores
 
 
 class Folders(NamedTuple):
@@ -38,9 +38,9 @@ class Workers(NamedTuple):
     """Workers that run, or that have been asked for."""
 
     client: Any  # distributed.Client
-    slots: Callable[[], int]  # how many subjects may run now; asked again as long as there are some to begin
-    threads: int  # for each subject
-    bytes: float  # memory that one subject may take, infinite if nothing is known
+    slots: Callable[[], int]  # how many tasks may run now; asked again as long as there are some to begin
+    threads: int  # for each task
+    bytes: float  # memory that one task may take, infinite if nothing is known
     words: str  # one line to print
 
 
@@ -121,22 +121,22 @@ class Newcomers:
                 "expected an output folder on a file system that all workers share"
             )
         share = about.n_bytes / about.n_threads
-        if share < self.need.subject_bytes:
-            fitting = int(about.n_bytes / self.need.subject_bytes)
+        if share < self.need.task_bytes:
+            fitting = int(about.n_bytes / self.need.task_bytes)
             advice = f"dask worker --nthreads {fitting}" if fitting else "a larger --memory-limit"
             raise InputError(
-                f"worker {address} on {about.host}: has {memory_words(share)} for each of {about.n_threads} subjects, "
-                f"the largest needs about {memory_words(self.need.subject_bytes)}; start it with {advice}"
+                f"worker {address} on {about.host}: has {memory_words(share)} for each of {about.n_threads} tasks, "
+                f"the largest needs about {memory_words(self.need.task_bytes)}; start it with {advice}"
             )
 
 
 def slots_of(client: Any) -> int:
-    """The threads of all workers that are there: each runs one subject at a time."""
+    """The threads of all workers that are there: each runs one task at a time."""
     return sum(client.nthreads().values())
 
 
 def dashboard_address() -> str:
-    """Where the dashboard answers, to this machine only: it shows the subjects' names."""
+    """Where the dashboard answers, to this machine only: it shows the tasks' names."""
     with socket.socket() as one:
         try:
             one.bind(("127.0.0.1", DASHBOARD_PORT))

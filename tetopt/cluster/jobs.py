@@ -1,7 +1,7 @@
 """Jobs of a batch system as dask's workers, by dask-jobqueue and in its own configuration.
 
-A job runs one subject at a time, or `processes` of them, and what it asks for is what the largest subject is predicted
-to need. Jobs that end, by their wall time or otherwise, are replaced as long as there are subjects to begin.
+A job runs one task at a time, or `processes` of them, and what it asks for is what the largest task is predicted
+to need. Jobs that end, by their wall time or otherwise, are replaced as long as there are tasks to begin.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from tetopt.budget import memory_words
-from tetopt.cohort.crew import (
+from tetopt.cluster.crew import (
     MEMORY_MARGIN,
     WORKER_BYTES,
     Folders,
@@ -39,7 +39,7 @@ YAML_BRACKETS = 500  # likewise: PyYAML's time grows with the square of brackets
 JOBS_AT_ONCE = 20  # where --workers does not say: a cluster's other users wait for as many cores
 JOB_CORES = 4  # of a job where neither its file nor --threads says
 QUEUE_SECONDS = 5.0  # between two looks at the jobs: a scheduler starts them no faster
-IDLE_SECONDS = 60.0  # without a subject to begin, after which jobs that run none are given back
+IDLE_SECONDS = 60.0  # without a task to begin, after which jobs that run none are given back
 AGAIN_SECONDS = 60.0  # after a job that was refused when others were not, until the next is submitted
 MOST_LOST = 3  # jobs that ended before their worker was there, one after the other: they are not going to be better
 # Keys that dask-jobqueue still takes under their old names, with a warning.
@@ -55,9 +55,9 @@ class Request(NamedTuple):
 
     cores: int
     bytes: float
-    processes: int  # subjects at a time
+    processes: int  # tasks at a time
     threads: int  # of each
-    subject_bytes: float  # that each may take
+    task_bytes: float  # that each may take
 
 
 def submitted(stack: ExitStack, need: Need, folders: Folders, path: Path, count: int | None) -> Workers:
@@ -96,16 +96,16 @@ def submitted(stack: ExitStack, need: Need, folders: Folders, path: Path, count:
     stack.callback(shutil.rmtree, own_folder, ignore_errors=True)
     cluster = stack.enter_context(cluster_of(path, kind, job, own_folder, folders.logs))
     client = stack.enter_context(Client(cluster))
-    n_jobs = min(count or JOBS_AT_ONCE, -(-need.n_subjects // job.processes))
+    n_jobs = min(count or JOBS_AT_ONCE, -(-need.n_tasks // job.processes))
     keeper = Keeper(cluster, n_jobs, Newcomers(client, need, folders.work), folders.logs)
     stack.callback(keeper.stop)
     walltime = dask.config.get(f"jobqueue.{kind}.walltime", None)
     words = (
         f"up to {counted(n_jobs, 'job')} of {kind}, each of {counted(job.cores, 'core')} and {memory_words(job.bytes)}"
-        f"{f' for {walltime}' if walltime else ''}, with {counted(job.processes, 'subject')} at a time of "
+        f"{f' for {walltime}' if walltime else ''}, with {counted(job.processes, 'task')} at a time of "
         f"{counted(job.threads, 'thread')}; logs in {folders.logs}; dashboard {dashboard_link(client)}"
     )
-    return Workers(client, keeper.slots, job.threads, job.subject_bytes, words)
+    return Workers(client, keeper.slots, job.threads, job.task_bytes, words)
 
 
 def configuration(path: Path) -> tuple[str, dict[str, Any]]:
@@ -153,23 +153,23 @@ def configuration(path: Path) -> tuple[str, dict[str, Any]]:
 
 
 def request(path: Path, kind: str, settings: dict[str, Any], need: Need) -> Request:
-    """What a job asks for: what its file says, and for the rest what a subject needs.
+    """What a job asks for: what its file says, and for the rest what a task needs.
 
     Raises
     ------
     InputError
-        Fewer cores or less memory than a subject needs, or no memory where dask-jobqueue cannot tell the system.
+        Fewer cores or less memory than a task needs, or no memory where dask-jobqueue cannot tell the system.
     """
     processes = settings["processes"] or 1
     cores = settings["cores"] or (need.threads or JOB_CORES) * processes
     threads = need.threads or cores // processes
     if threads * processes > cores or threads < 1:
         raise InputError(
-            f"{path}: {kind}: cores: expected at least {max(threads, 1) * processes} for {processes} subjects "
+            f"{path}: {kind}: cores: expected at least {max(threads, 1) * processes} for {processes} tasks "
             f"of {max(threads, 1)} threads, got {cores}; lower processes or --threads"
         )
-    least = (need.subject_bytes + WORKER_BYTES) * processes
-    asked_for = (MEMORY_MARGIN * need.subject_bytes + WORKER_BYTES) * processes
+    least = (need.task_bytes + WORKER_BYTES) * processes
+    asked_for = (MEMORY_MARGIN * need.task_bytes + WORKER_BYTES) * processes
     n_bytes = asked_for
     for key in ("memory", "job-mem", "mem"):  # for dask; what SLURM and LSF are asked for instead
         if settings.get(key) is not None:
@@ -177,7 +177,7 @@ def request(path: Path, kind: str, settings: dict[str, Any], need: Need) -> Requ
             if n_bytes < least:
                 raise InputError(
                     f"{path}: {kind}: {key}: expected at least {memory_words(least)} for {processes} of the largest "
-                    f"subjects at a time, got {settings[key]}; leave it out, and jobs ask for what subjects need"
+                    f"tasks at a time, got {settings[key]}; leave it out, and jobs ask for what tasks need"
                 )
     if (name := MEMORY_KEYS.get(kind)) is not None and settings[name] is None:
         raise InputError(
@@ -215,7 +215,7 @@ def cluster_of(path: Path, kind: str, job: Request, folder: Path, logs: Path) ->
             processes=job.processes,
             # Not from the folder that a job begins in: it may hold a stranger's modules (see tetopt.interpreter).
             python=settings["python"] or f"{shlex.quote(sys.executable)} -P",
-            # dask's threads are subjects at a time; the last of two is taken.
+            # dask's threads are tasks at a time; the last of two is taken.
             worker_extra_args=[*settings["worker-extra-args"], "--nthreads", "1"],
             log_directory=settings["log-directory"] or str(logs),
             job_name="tetopt" if settings["name"] == "dask-worker" else settings["name"],
@@ -281,7 +281,7 @@ class Keeper:
         cluster.loop.add_callback(self.timer.start)
 
     def slots(self) -> int:
-        """How many subjects may run now; InputError if there is no hope that it becomes more than none."""
+        """How many tasks may run now; InputError if there is no hope that it becomes more than none."""
         self.asked_at = time.monotonic()
         self.n_jobs = self.n_most
         slots = self.newcomers.slots()

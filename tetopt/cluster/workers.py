@@ -1,8 +1,8 @@
-"""Dask's workers for a cohort: processes of this machine, those of a cluster that runs, or jobs of a batch system.
+"""Dask's workers: processes of this machine, those of a cluster that runs, or jobs of a batch system.
 
-A worker holds names of files and watches a process of its own that meshes a subject; so it is small whatever the
-subject, and dask's limits on a worker's memory say nothing about that of the subject's process. What keeps subjects
-within memory is how many of them there are at a time: that is decided here, from what the largest is predicted to need.
+A task is given names of files. Where it watches a process of its own, as a cohort's does, its worker is small whatever
+the task, and dask's limits on a worker's memory say nothing about that of the process. What keeps tasks within memory
+is how many of them there are at a time: that is decided here, from what the largest is predicted to need.
 """
 
 from __future__ import annotations
@@ -20,7 +20,7 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 from tetopt.budget import available_bytes, memory_words
-from tetopt.cohort.crew import (
+from tetopt.cluster.crew import (
     MEMORY_MARGIN,
     WORKER_BYTES,
     About,
@@ -32,7 +32,7 @@ from tetopt.cohort.crew import (
     dashboard_address,
     slots_of,
 )
-from tetopt.cohort.jobs import configuration, submitted
+from tetopt.cluster.jobs import configuration, submitted
 from tetopt.errors import InputError
 
 CONNECT_SECONDS = 10  # until a scheduler that does not answer is given up: dask's own is 30
@@ -54,11 +54,11 @@ def workers(
     folders : Folders
         Both are there.
     count : int, optional
-        The most subjects at a time on this machine, or jobs of a batch system; not with `scheduler`.
+        The most tasks at a time on this machine, or jobs of a batch system; not with `scheduler`.
     scheduler : str, optional
         The address of a scheduler that runs, as "tcp://host:8786"; certificates are those of dask's configuration.
     cluster : Path, optional
-        A file of dask-jobqueue's configuration, see `tetopt.cohort.jobs`.
+        A file of dask-jobqueue's configuration, see `tetopt.cluster.jobs`.
 
     Yields
     ------
@@ -109,17 +109,17 @@ def check_installed() -> None:
 class Share(NamedTuple):
     """How this machine is divided."""
 
-    workers: int  # each with one subject at a time
-    threads: int  # of each subject
-    bytes: float  # for each subject
+    workers: int  # each with one task at a time
+    threads: int  # of each task
+    bytes: float  # for each task
 
 
 def shares(need: Need, count: int | None, cores: int, free: float) -> Share:
-    """As many workers as cores, memory (bytes that are free), `count` and subjects allow, at least one."""
-    per_subject = MEMORY_MARGIN * need.subject_bytes + WORKER_BYTES
-    most = [need.n_subjects, cores // (need.threads or 1)]
+    """As many workers as cores, memory (bytes that are free), `count` and tasks allow, at least one."""
+    per_task = MEMORY_MARGIN * need.task_bytes + WORKER_BYTES
+    most = [need.n_tasks, cores // (need.threads or 1)]
     if free < float("inf"):
-        most.append(int(free / per_subject))
+        most.append(int(free / per_task))
     if count is not None:
         most.append(count)
     number = max(1, min(most))
@@ -146,9 +146,9 @@ def _local(stack: ExitStack, need: Need, folders: Folders, count: int | None) ->
     cluster = stack.enter_context(
         LocalCluster(
             n_workers=share.workers,
-            threads_per_worker=1,  # subjects at a time
+            threads_per_worker=1,  # tasks at a time
             security=True,
-            memory_limit=0,  # the worker is small, and its limit would not be that of the subject's process
+            memory_limit=0,  # the worker is small, and its limit would not be that of the task's process
             local_directory=str(own_folder),
             dashboard_address=dashboard_address(),
         )
@@ -187,7 +187,7 @@ def _connected(stack: ExitStack, need: Need, folders: Folders, address: str) -> 
         raise InputError(f"--scheduler: {address} has no workers; start some: dask worker {address}")
     threads = need.threads or _threads_each(list(newcomers.known.values()))
     n_bytes = min((about.n_bytes / about.n_threads for about in newcomers.known.values()), default=float("inf"))
-    words = f"{counted(len(newcomers.known), 'worker')} at {address}, {counted(slots, 'subject')} at a time of "
+    words = f"{counted(len(newcomers.known), 'worker')} at {address}, {counted(slots, 'task')} at a time of "
     words += counted(threads, "thread")
     return Workers(client, newcomers.slots, threads, n_bytes, f"{words}; dashboard {client.dashboard_link}")
 
@@ -202,7 +202,7 @@ async def _reached(address: str) -> None:
 
 
 def _threads_each(abouts: list[About]) -> int:
-    """Of each host its cores by the subjects that run there at a time; the fewest of all hosts."""
+    """Of each host its cores by the tasks that run there at a time; the fewest of all hosts."""
     hosts: dict[str, list[About]] = {}
     for about in abouts:
         hosts.setdefault(about.host, []).append(about)

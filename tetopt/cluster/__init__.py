@@ -1,0 +1,1 @@
+"""Dask's workers, here or on a cluster, and the tasks that they are given."""
