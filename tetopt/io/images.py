@@ -27,7 +27,7 @@ from nibabel.wrapstruct import WrapStructError
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
-from tetopt.image import Image
+from tetopt.image import Image, VoxelGrid
 from tetopt.incoming import irregular
 from tetopt.io.apart import DEFLATE_RATIO
 from tetopt.io.files import check_suffix, written_whole
@@ -119,7 +119,7 @@ def load_image(
     except InputError as error:
         raise InputError(f"{path}: {one_line(error)}") from error
     if not path.name.lower().endswith(PICTURE_SUFFIXES):  # whose pixels are 1 mm, whatever they show
-        notes += _notes_of_size(whole)
+        notes += notes_of_size(whole)
     for note in notes:
         warnings.warn(f"{path}: {note}", stacklevel=2)
     low = image.data.min()
@@ -141,7 +141,7 @@ def file_shape(path: str | Path) -> tuple[int, ...] | None:
     path = Path(path)
     name = path.name.lower()
     try:
-        with _os_errors_named():
+        with os_errors_named():
             if not name.endswith((*_NIBABEL_SUFFIXES, *HEADED_SUFFIXES)) or path.is_dir():
                 return None
             if (other := irregular(path)) is not None:
@@ -273,7 +273,7 @@ def cropped(image: Image, bounds: Bounds) -> Image:
     >>> small.shape, small.to_world([0, 0])
     ((20, 50), array([10.,  0.]))
     """
-    ranges = _checked_bounds(image.shape, bounds)
+    ranges = checked_bounds(image.shape, bounds)
     affine = image.affine.copy()
     affine[:-1, -1] = image.to_world([start for start, _ in ranges])
     return Image(image.data[tuple(slice(*r) for r in ranges)], affine)
@@ -339,7 +339,7 @@ def sha256(path: str | Path) -> str:
     """
     path = Path(path)
     digest = hashlib.sha256()
-    with _os_errors_named(path):
+    with os_errors_named(path):
         if (other := irregular(path)) not in (None, "a folder"):
             raise InputError(f"{path}: expected a regular file, got {other}; copy what it gives into a file")
         # A DICOM series is read from the folder itself and not from folders in it; so is its checksum.
@@ -359,9 +359,22 @@ def sha256(path: str | Path) -> str:
 
 def _read(path: Path, volume: int | None, notes: list[str]) -> tuple[NDArray, NDArray[np.float64]]:
     """Data and affine of the file, 2-D or 3-D; `Image` checks them. What is to be warned of comes into `notes`."""
-    with _os_errors_named():
+    with os_errors_named():
         if path.is_dir():
             return read_dicom_folder(path, volume)
+    name = check_beginning(path)
+    if name.endswith(_NIBABEL_SUFFIXES):
+        return _read_nibabel(path, volume, notes)
+    if name.endswith(tuple(ITK_READERS)):
+        return read_itk(path, volume)
+    if name.endswith(PICTURE_SUFFIXES):
+        return read_picture(path, volume)
+    raise InputError(f"unknown kind of image file; expected {_KNOWN_SUFFIXES}, or a folder of DICOM files")
+
+
+def check_beginning(path: Path) -> str:
+    """The file's name in small letters; InputError where its first bytes already tell that it is no such image."""
+    with os_errors_named():
         if (other := irregular(path)) is not None:
             raise InputError(f"expected a regular file, got {other}; copy what it gives into a file")
         with path.open("rb") as stream:
@@ -374,17 +387,11 @@ def _read(path: Path, volume: int | None, notes: list[str]) -> tuple[NDArray, ND
     if name.endswith((".nii", ".mgh")) and beginning.startswith(GZIP_BEGINNING):
         ending = ".nii.gz" if name.endswith(".nii") else ".mgz"
         raise InputError(f"it is a gzip file; name it {path.stem}{ending}")
-    if name.endswith(_NIBABEL_SUFFIXES):
-        return _read_nibabel(path, volume, notes)
-    if name.endswith(tuple(ITK_READERS)):
-        return read_itk(path, volume)
-    if name.endswith(PICTURE_SUFFIXES):
-        return read_picture(path, volume)
-    raise InputError(f"unknown kind of image file; expected {_KNOWN_SUFFIXES}, or a folder of DICOM files")
+    return name
 
 
 @contextlib.contextmanager
-def _os_errors_named(path: Path | None = None) -> Iterator[None]:
+def os_errors_named(path: Path | None = None) -> Iterator[None]:
     """Turn the operating system's errors into InputErrors, after the path if given."""
     prefix = "" if path is None else f"{path}: "
     try:
@@ -401,6 +408,23 @@ def _os_errors_named(path: Path | None = None) -> Iterator[None]:
 
 
 def _read_nibabel(path: Path, volume: int | None, notes: list[str]) -> tuple[NDArray, NDArray[np.float64]]:
+    proxy, index, affine = nibabel_voxels(path, volume, notes)
+    check_room(proxy.shape, proxy.dtype.itemsize)
+    try:
+        data = np.asanyarray(proxy[(slice(None),) * 3 + index] if index else proxy)
+    except MemoryError as error:
+        raise InputError(f"its {proxy.shape} voxels do not fit into memory; resample it first") from error
+    except (OSError, EOFError, zlib.error, ValueError, TypeError, OverflowError) as error:
+        raise InputError(f"{DAMAGED_FILE} ({one_line(error)})") from error
+    if data.ndim == 2:
+        return data, _plane_affine(affine[:3, :2], affine[:3, 3])
+    return data, affine
+
+
+def nibabel_voxels(
+    path: Path, volume: int | None, notes: list[str]
+) -> tuple[Any, tuple[int, ...], NDArray[np.float64]]:
+    """Nibabel's proxy of the voxels, the index of the volume behind the third axis, and the affine in mm, (4, 4)."""
     is_packed = path.name.lower().endswith((".gz", ".mgz"))
     head = _checked_head(path, is_packed)
     with _nibabel_heard() as words:
@@ -410,15 +434,7 @@ def _read_nibabel(path: Path, volume: int | None, notes: list[str]) -> tuple[NDA
     affine = _affine_in_mm(file)
     index = volume_index(file.shape[3:], volume)
     _check_size(path, file, 0 if volume is None else volume, is_packed)
-    try:
-        data = np.asanyarray(file.dataobj[(slice(None),) * 3 + index] if index else file.dataobj)
-    except MemoryError as error:
-        raise InputError(f"its {file.shape} voxels do not fit into memory; resample it first") from error
-    except (OSError, EOFError, zlib.error, ValueError, TypeError, OverflowError) as error:
-        raise InputError(f"{DAMAGED_FILE} ({one_line(error)})") from error
-    if data.ndim == 2:
-        return data, _plane_affine(affine[:3, :2], affine[:3, 3])
-    return data, affine
+    return file.dataobj, index, affine
 
 
 def _checked_head(path: Path, is_packed: bool) -> bytes:
@@ -472,7 +488,7 @@ def _notes_of_place(file: SpatialImage, head: bytes) -> list[str]:
     return [f"{guess}; if they matter, convert it again with its sform or qform"]
 
 
-def _notes_of_size(image: Image) -> list[str]:
+def notes_of_size(image: VoxelGrid) -> list[str]:
     """What to warn of where micrometres or metres were taken for mm."""
     steps = np.linalg.norm(image.affine[:-1, :-1], axis=0)
     longest = float((steps * image.shape).max())
@@ -510,7 +526,6 @@ def _check_size(path: Path, file: SpatialImage, volume: int, is_packed: bool) ->
             f"{DAMAGED_FILE} (its header tells of {' x '.join(str(each) for each in file.shape)} voxels, "
             f"{n_bytes:.4g} bytes, the file has {size})"
         )
-    check_room(file.shape, proxy.dtype.itemsize)
     if is_packed:
         _check_gzip(path, proxy.offset + math.prod(file.shape[3:]) * volume_bytes + TRAILING_BYTES)
 
@@ -554,14 +569,14 @@ def part_of(image: Image, slice_: tuple[int, int] | None, crop: Bounds | None) -
     if crop is None:
         return plane
     axis, index = slice_
-    bounds = _checked_bounds(image.shape, crop)
+    bounds = checked_bounds(image.shape, crop)
     start, stop = bounds.pop(axis)
     if not start <= index < stop:
         raise InputError(f"slice: index {index} along axis {axis} lies outside of the crop {start}:{stop}")
     return cropped(plane, bounds)
 
 
-def _checked_bounds(shape: tuple[int, ...], bounds: Bounds) -> list[tuple[int, int]]:
+def checked_bounds(shape: tuple[int, ...], bounds: Bounds) -> list[tuple[int, int]]:
     """The bounds with their open ends filled in."""
     if len(bounds) != len(shape):
         raise InputError(f"crop: expected {len(shape)} ranges for shape {shape}, got {len(bounds)}")

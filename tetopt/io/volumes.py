@@ -4,8 +4,11 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from tetopt.budget import check_memory
 from tetopt.errors import InputError
@@ -16,19 +19,75 @@ DAMAGED_FILE = "the file is truncated or damaged; copy it again"
 UNREADABLE_FILE = "truncated or damaged, or not an image of this kind; copy it again, or check its name"
 
 
-def volume_index(trailing: tuple[int, ...], volume: int | None) -> tuple[int, ...]:
-    """Index into the axes beyond the third (or beyond a picture's two) of the volume asked for."""
+class VoxelsInFile:
+    """Three axes of an array in a file, whose other axes stay at an index each; boxes are read by slices.
+
+    Parameters
+    ----------
+    path : Path
+        What messages name.
+    array : Any
+        Gives an array of numpy for a tuple of slices and indices, one for each of its axes.
+    picks : tuple
+        Of each axis of the array an index, or the slice (start, stop) of it that is one of the three.
+    chunks : tuple of int, optional
+        Edges, along all axes of the array, of what is read at once at the least.
+    """
+
+    def __init__(
+        self, path: Path, array: Any, picks: tuple[int | slice, ...], chunks: Sequence[int] | None = None
+    ) -> None:
+        self.path, self.array, self.picks = path, array, picks
+        spans = [(axis, pick) for axis, pick in enumerate(picks) if isinstance(pick, slice)]
+        self.shape = tuple(pick.stop - pick.start for _, pick in spans)
+        self.chunks = None if chunks is None else tuple(int(chunks[axis]) for axis, _ in spans)
+        self.dtype = array.dtype
+
+    def within(self, ranges: Sequence[tuple[int, int]]) -> VoxelsInFile:
+        """The voxels in a box of indices, start to before stop along each of the three axes."""
+        bounds = iter(ranges)
+        picks = []
+        for pick in self.picks:
+            if isinstance(pick, slice):
+                start, stop = next(bounds)
+                pick = slice(pick.start + start, pick.start + stop)
+            picks.append(pick)
+        part = VoxelsInFile(self.path, self.array, tuple(picks))
+        part.chunks, part.dtype = self.chunks, self.dtype
+        return part
+
+    def __getitem__(self, box: tuple[slice, ...]) -> NDArray:
+        """The voxels of a box of indices, in memory; InputError where the file has none that can be read."""
+        ranges = [each.indices(size)[:2] for each, size in zip(box, self.shape, strict=True)]
+        picks = self.within(ranges).picks
+        try:
+            return np.asarray(self.array[picks])
+        except MemoryError:
+            raise
+        except Exception as error:  # whatever a codec raises at a damaged chunk
+            place = ", ".join(f"{start}:{stop}" for start, stop in ranges)
+            raise InputError(
+                f"{self.path}: its voxels {place} cannot be read ({one_line(error)[:200]}); copy it again"
+            ) from error
+
+
+def volume_index(trailing: Sequence[int], volume: int | None, axes: str = "") -> tuple[int, ...]:
+    """Index into the axes beyond the third (or beyond a picture's two) of the volume asked for.
+
+    `axes` has their names and lengths, where they have names.
+    """
+    axes = f" along {axes}" if axes else ""
     count = math.prod(int(size) for size in trailing)
     if count <= 0:
         raise InputError(f"every axis needs a voxel, got trailing axes of lengths {trailing}")
     if volume is None and count > 1:
         raise InputError(
-            f"the file holds {count} volumes; choose one, 0 to {count - 1}: `volume=k`, "
+            f"the file holds {count} volumes{axes}; choose one, 0 to {count - 1}: `volume=k`, "
             "`--volume K` for the first image of a command, `FILE:K` for others"
         )
     volume = 0 if volume is None else volume
     if not 0 <= volume < count:
-        volumes = "one volume" if count == 1 else f"{count} volumes"
+        volumes = "one volume" if count == 1 else f"{count} volumes{axes}"
         raise InputError(f"volume {volume} asked for, but the file holds {volumes}; choose from 0 to {count - 1}")
     return tuple(int(i) for i in np.unravel_index(volume, trailing, order="F"))
 

@@ -1,0 +1,99 @@
+"""Stored volumes: each voxel with its value and place as where they are read whole; one line for what cannot be."""
+
+import re
+import shutil
+
+import nibabel
+import numpy as np
+import pytest
+
+from tetopt.errors import InputError
+from tetopt.io.images import load_image
+from tetopt.io.stored_images import open_stored
+
+zarr = pytest.importorskip("zarr")
+
+RAS = {"x": "left-to-right", "y": "posterior-to-anterior", "z": "inferior-to-superior"}
+OBLIQUE = [[-0.75, 0.31, 1.1, 12.5], [0.12, 0.68, -0.9, -33.0], [0.05, -0.22, 5.1, 7.25], [0, 0, 0, 1.0]]
+
+
+def ramp(*shape, dtype=np.int16):
+    """Every voxel another value, so that no swap of axes goes unseen."""
+    return (np.arange(np.prod(shape)) + 1).reshape(shape).astype(dtype)
+
+
+def axes_of(names, unit="micrometer", turned=RAS):
+    kinds = {"t": "time", "c": "channel"}
+    axes = [{"name": name, "type": kinds.get(name, "space")} for name in names]
+    for axis in axes:
+        if axis["type"] == "space":
+            axis |= {"unit": unit} if unit else {}
+            axis |= {"orientation": {"type": "anatomical", "value": turned[axis["name"]]}} if turned else {}
+    return axes
+
+
+def transforms(scale, shift=None):
+    return [{"type": "scale", "scale": scale}] + ([{"type": "translation", "translation": shift}] if shift else [])
+
+
+def write_ome(path, levels, axes, after=None, fmt=3, **options):
+    """An OME-Zarr image; levels are of (voxels, transforms)."""
+    group = zarr.open_group(path, mode="w", zarr_format=fmt)
+    for number, (voxels, _) in enumerate(levels):
+        options.setdefault("chunks", tuple(min(size, 4) for size in voxels.shape))
+        group.create_array(str(number), data=voxels, **options)
+    datasets = [{"path": str(k), "coordinateTransformations": each} for k, (_, each) in enumerate(levels)]
+    scales = {"axes": axes, "datasets": datasets}
+    if after:
+        scales["coordinateTransformations"] = after
+    group.attrs.update({"ome": {"version": "0.5", "multiscales": [scales]}} if fmt == 3 else {"multiscales": [scales]})
+    return path
+
+
+def assert_refused(path, match, **options):
+    with pytest.raises(InputError, match=re.escape(f"{path}: ") + ".*" + match) as caught:
+        open_stored(path, **options)
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("fmt", [2, 3])
+@pytest.mark.parametrize("dtype", ["<i2", ">u2", "u1", "<f4", "<f8"])
+def test_ome_zarr_keeps_values_and_place(tmp_path, fmt, dtype):
+    voxels = ramp(6, 5, 4, dtype=dtype)
+    place = transforms([300.0, 200.0, 100.0], [3.0, 2.0, 1.0])
+    path = write_ome(tmp_path / "a.zarr", [(voxels, place)], axes_of("zyx"), fmt=fmt)
+    image = open_stored(path)
+    np.testing.assert_array_equal(image.read((0, 0, 0), image.shape), voxels)
+    np.testing.assert_array_equal(image.box((1, 2, 0), (5, 4, 3)).data, voxels[1:5, 2:4, 0:3])
+    expected = [[0, 0, 0.1, 0.001], [0, 0.2, 0, 0.002], [0.3, 0, 0, 0.003], [0, 0, 0, 1]]
+    np.testing.assert_allclose(image.affine, expected, rtol=1e-15)
+    np.testing.assert_allclose(image.box((1, 2, 0), (5, 4, 3)).affine[:3, 3], image.to_world([1, 2, 0]))
+    assert image.voxels.chunks == (4, 4, 4)
+
+
+def test_uncompressed_nifti_is_as_read_whole(tmp_path):
+    file = nibabel.Nifti1Image(ramp(7, 6, 5, 2, dtype=">i2"), np.array(OBLIQUE))
+    file.header.set_slope_inter(0.5, -3.0)
+    nibabel.save(file, tmp_path / "a.nii")
+    image, whole = open_stored(tmp_path / "a.nii", volume=1), load_image(tmp_path / "a.nii", volume=1)
+    assert image.affine.tobytes() == whole.affine.tobytes()
+    assert image.box((0, 0, 0), image.shape).data.tobytes() == whole.data.tobytes()
+    assert image.read((1, 2, 3), (2, 3, 4)).dtype == image.voxels.dtype
+    part = open_stored(tmp_path / "a.nii", volume=1, crop=[(2, 5), (None, None), (1, 4)])
+    other = load_image(tmp_path / "a.nii", volume=1, crop=[(2, 5), (None, None), (1, 4)])
+    assert part.box((0, 0, 0), part.shape).data.tobytes() == other.data.tobytes()
+    np.testing.assert_array_equal(part.affine, other.affine)
+
+
+def test_places_on_the_network_are_refused():
+    for path in ("s3://bucket/a.zarr", "https://host/a.zarr", "gs://bucket/a.zarr"):
+        assert_refused(path, "not on this machine")
+
+
+def test_chunks_that_are_missing(tmp_path):
+    path = write_ome(tmp_path / "a.zarr", [(ramp(8, 4, 4), transforms([1, 1, 1]))], axes_of("zyx"))
+    (path / "0" / "c" / "1" / "0" / "0").unlink()
+    with pytest.warns(UserWarning, match="1 of its 2 chunks are not there, and their voxels are taken as 0"):
+        open_stored(path)
+    shutil.rmtree(path / "0" / "c")
+    assert_refused(path, "none of its 2 chunks is there")

@@ -1,0 +1,98 @@
+"""Images that need not fit into memory: folders of Zarr and files that are not compressed, opened but not read."""
+
+from __future__ import annotations
+
+import re
+import warnings
+from pathlib import Path
+
+from tetopt.errors import InputError
+from tetopt.io.images import Bounds, check_beginning, checked_bounds, nibabel_voxels, notes_of_size, os_errors_named
+from tetopt.io.volumes import VoxelsInFile, one_line
+from tetopt.io.zarr_images import is_zarr, open_zarr, zarr_levels
+from tetopt.stored import StoredImage
+
+STORED_SUFFIXES = (".zarr", ".nii")
+_PACKED_SUFFIXES = (".nii.gz", ".mgz", ".mgh", ".zarr.zip")
+
+
+def open_stored(path: str | Path, *, volume: int | None = None, crop: Bounds | None = None) -> StoredImage:
+    """An image whose voxels are left where they are.
+
+    Parameters
+    ----------
+    path : str or Path
+        A folder of Zarr: an OME-Zarr image (NGFF 0.4, 0.5; Zarr's format 2 or 3), of whose multiscale the first level
+        is taken, or an array with the attribute "affine". An uncompressed NIfTI file (.nii).
+    volume : int, optional
+        Which of several, from 0: of a NIfTI file as in `tetopt.load_image`, of Zarr along its axes of time, channels
+        and others, of which the last runs fastest.
+    crop : sequence of three (start, stop), optional
+        Keep a box of voxels, as in `tetopt.load_image`.
+
+    Returns
+    -------
+    StoredImage
+        What it reads of a NIfTI file is what `tetopt.load_image` has there, to the bit, and so is the affine. A box
+        that cannot be read is an InputError that names the voxels.
+
+    Raises
+    ------
+    InputError
+        ``"<path>: ..."`` in one line: as `tetopt.load_image`; a kind of file that cannot be read in parts; a place on
+        the network; Zarr's metadata damaged, without a scale, with other than three axes in space or units that are no
+        lengths; values that are no real numbers; codecs that are not known; chunks that are missing where nothing says
+        what stands for them, or all of them.
+
+    Warns
+    -----
+    UserWarning
+        No orientation, no unit; chunks that are missing and have a fill value; a box of an odd size.
+    """
+    _check_local(path)
+    path = Path(path)
+    notes: list[str] = []
+    try:
+        image = _opened(path, volume, notes)
+        if crop is not None:
+            image = _cropped(image, checked_bounds(image.shape, crop))
+    except InputError as error:
+        raise InputError(f"{path}: {one_line(error)}") from error
+    for note in [*notes, *notes_of_size(image)]:
+        warnings.warn(f"{path}: {note}", stacklevel=2)
+    return image
+
+
+def _check_local(path: str | Path) -> None:
+    """InputError for a place on the network, whatever becomes of its slashes in a `Path`."""
+    if re.match(r"[A-Za-z][A-Za-z0-9+.-]+:/", str(path)):
+        raise InputError(f"{path}: is not on this machine; download it, only folders and files here are read")
+
+
+def _opened(path: Path, volume: int | None, notes: list[str]) -> StoredImage:
+    with os_errors_named():
+        if is_zarr(path):
+            return open_zarr(zarr_levels(path, notes)[0], volume, notes)
+        if path.is_dir():
+            raise InputError("a folder that is none of Zarr's; convert it to .zarr or .nii first")
+    name = check_beginning(path)
+    if name.endswith(".nii"):
+        return _mapped_nifti(path, volume, notes)
+    if name.endswith(_PACKED_SUFFIXES):
+        raise InputError("is compressed, and cannot be read in parts; unpack it, or convert it to .zarr, first")
+    raise InputError(f"cannot be read in parts; expected {', '.join(STORED_SUFFIXES)}")
+
+
+def _cropped(image: StoredImage, ranges: list[tuple[int, int]]) -> StoredImage:
+    affine = image.affine.copy()
+    affine[:-1, -1] = image.to_world([start for start, _ in ranges])
+    return StoredImage(image.voxels.within(ranges), affine)
+
+
+def _mapped_nifti(path: Path, volume: int | None, notes: list[str]) -> StoredImage:
+    proxy, index, affine = nibabel_voxels(path, volume, notes)
+    if len(proxy.shape) < 3:
+        raise InputError(f"expected a volume, got a plane of {proxy.shape} voxels")
+    voxels = VoxelsInFile(path, proxy, (*(slice(0, int(size)) for size in proxy.shape[:3]), *index))
+    voxels.dtype = voxels[(slice(0, 1),) * 3].dtype  # scaled, which its own does not tell
+    return StoredImage(voxels, affine)
