@@ -4,6 +4,7 @@ import os
 import signal
 import stat
 import subprocess
+import sys
 import time
 from pathlib import Path
 from types import SimpleNamespace
@@ -161,6 +162,13 @@ def test_contradictions_are_refused(folders, tmp_path):
         running(Need(1, 0.0, None), folders, scheduler="tcp://x:1", count=2).__enter__()
 
 
+@pytest.mark.parametrize(("is_within", "extra"), [(True, "blocks"), (False, "cohort")])
+def test_a_missing_package_is_said_with_the_extra_that_has_it(is_within, extra, folders, monkeypatch):
+    monkeypatch.setitem(sys.modules, "dask_jobqueue", None)
+    with pytest.raises(InputError, match=rf'dask_jobqueue is not installed, .*; pip install "tetopt\[{extra}\]"$'):
+        running(Need(1, 0.0, None, is_within), folders).__enter__()
+
+
 def test_nothing_is_written_where_workers_are_refused(tmp_path, capsys):
     save_image(tmp_path / "a.nii.gz", sample_image(3))
     (tmp_path / "t.tsv").write_text("task\timage\n1\ta.nii.gz\n")
@@ -192,6 +200,22 @@ def test_a_worker_is_looked_at_when_it_comes(change, words, tmp_path):
     assert newcomers.slots() == 1
     answers["tcp://bad:1"] = About.of(newcomers.probe)._replace(**change)
     with pytest.raises(InputError, match=words):
+        newcomers.slots()
+
+
+def test_a_worker_that_runs_several_tasks_in_one_process_is_refused(tmp_path):
+    """Where it runs them itself: kernels take all threads of a process."""
+    answers = {}
+    client = SimpleNamespace(nthreads=lambda: dict.fromkeys(answers, 1), run=lambda *_, **__: answers)
+    newcomers = Newcomers(client, Need(1, 3 * GB, None, is_within=True), tmp_path)
+    good = About.of(newcomers.probe)._replace(n_bytes=4 * GB)
+    answers["tcp://good:1"] = good
+    assert newcomers.slots() == 1
+    answers["tcp://bad:1"] = good._replace(n_bytes=3.4 * GB)
+    with pytest.raises(InputError, match=r"has 2.83 GB for each of 1 tasks, the largest needs about 3 GB"):
+        newcomers.slots()
+    answers["tcp://bad:1"] = good._replace(n_threads=4)
+    with pytest.raises(InputError, match=r"runs one task at a time, got 4; .* --nthreads 1 --nworkers 4"):
         newcomers.slots()
 
 
@@ -269,6 +293,15 @@ def test_a_job_asks_for_what_a_subject_needs():
     assert requested({"memory": "8GB"}, Need(9, 4 * GB, 2)).bytes == 8 * GB
 
 
+def test_a_job_whose_workers_run_tasks_themselves_has_their_limits():
+    job = requested({"cores": 4, "processes": 2}, Need(9, GB, None, is_within=True))
+    assert job.bytes == pytest.approx(2 * (1.35 + 0.4) / 0.95 * GB)
+    assert job.task_bytes == pytest.approx(1.35 * GB)
+    assert "export NUMBA_NUM_THREADS=2" in job.exports
+    assert "export DASK_DISTRIBUTED__WORKER__MEMORY__PAUSE=False" in job.exports
+    assert requested({}, Need(9, GB, None)).exports == ()
+
+
 @pytest.mark.parametrize(
     ("kind", "settings", "need", "words"),
     [
@@ -306,6 +339,7 @@ def test_scripts_of_jobs(kind, text, lines, folders):
     named, settings = configuration(path)
     with dask.config.set({f"jobqueue.{kind}.{key}": value for key, value in settings.items()}):
         job = request(path, named, dask.config.get(f"jobqueue.{kind}"), Need(9, 4 * GB, 2))
+        job = job._replace(exports=("export NUMBA_NUM_THREADS=2",))
         with cluster_of(path, named, job, folders.work, folders.logs) as cluster:
             script = cluster.job_script()
             keys = [
@@ -319,7 +353,7 @@ def test_scripts_of_jobs(kind, text, lines, folders):
             )
     rows = script.splitlines()
     assert set(lines) <= set(rows)
-    assert "module load x" in rows
+    assert rows.index("export NUMBA_NUM_THREADS=2") < rows.index("module load x")
     command = rows[-1].split() if rows[-1] else rows[-2].split()
     assert command[1:4] == ["-P", "-m", "distributed.cli.dask_worker"]
     assert command[4].startswith("tls://")

@@ -8,10 +8,11 @@ import distributed
 import pytest
 from distributed import Client, KilledWorker, LocalCluster
 
-from tetopt.cohort import schedule
+from tetopt.cluster import tasks
+from tetopt.cluster.tasks import SchedulerLost
 from tetopt.cohort.layout import begin, description, failure_path
 from tetopt.cohort.run import Ended, Job
-from tetopt.cohort.schedule import SchedulerLost, run_all
+from tetopt.cohort.schedule import run_all
 
 GB = 1e9
 
@@ -134,7 +135,7 @@ def test_where_there_is_no_worker_it_waits_and_where_there_are_more_it_uses_them
     monkeypatch.setattr(time, "sleep", slept.append)
     client = FakeClient()
     assert len(play(client, "abcd", slots=lambda: next(numbers))) == 4
-    assert slept == [schedule.WAIT_SECONDS] * 3
+    assert slept == [tasks.WAIT_SECONDS] * 3
     assert client.most == 3
 
 

@@ -34,12 +34,13 @@ from tetopt.cli.plan import with_numbers
 from tetopt.cli.predict import size_by_headers, size_of_run
 from tetopt.cli.source import read_source
 from tetopt.cluster.crew import counted
+from tetopt.cluster.tasks import SchedulerLost
 from tetopt.cluster.workers import Folders, Need, check_choice, local_share, workers
 from tetopt.cohort.layout import LOGS_NAME, WORK_NAME, begin, check_out, description, failure_path, locked, restore
 from tetopt.cohort.numbers import collect
 from tetopt.cohort.page import save_cohort_files
 from tetopt.cohort.run import Ended, Job
-from tetopt.cohort.schedule import SchedulerLost, run_all
+from tetopt.cohort.schedule import run_all
 from tetopt.cohort.subjects import TABLE_SUFFIXES, Problems, key, write_table
 from tetopt.engine.cost import Prediction, RunSize, calibrated_speed, predicted
 from tetopt.errors import InputError
@@ -78,7 +79,7 @@ def cohort_command(
     solver: SolverOptions,
 ) -> int:
     """Mesh many subjects of a table or a BIDS folder, on this machine or a cluster; go on where it ended."""
-    check_choice(cohort.count, cohort.scheduler, cohort.cluster)
+    check_choice(cohort.count, cohort.scheduler, cohort.cluster, "cohort")
     suffix = checked_suffix(cohort.mesh_format)
     place, records = cohort.output, Records(content, sizes, start, engine, solver)
     if engine.threads is not None and engine.threads < 1:

@@ -14,8 +14,27 @@ import tetopt
 from tetopt.budget import memory_words
 from tetopt.errors import InputError
 
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None  # type: ignore[assignment]
+
 MEMORY_MARGIN = 1.35  # of a task's memory over its prediction, which may be 25 % too low: 1 / 0.75
 WORKER_BYTES = 1.5e8  # of a dask worker itself with its nanny: 65 MB each, and what they exchange
+# The same of one that runs tasks itself: 240 MB with all kernels loaded, its nanny, zarr and buffers of threads.
+WITHIN_BYTES = 4e8
+# Of its limit, at which a nanny ends a worker: 5 % are left for what is taken until it looks again, 0.1 s later.
+TERMINATE_SHARE = 0.95
+# Dask's configuration of its own scheduler: a worker that dies fails its task at once.
+SCHEDULER_SETTINGS = {"distributed.scheduler.allowed-failures": 0}
+# Where workers run tasks themselves: these hold nothing that dask could put elsewhere, so that there is one limit, and
+# a process that is in a kernel, which lets no other thread of Python run, is not taken for dead.
+WITHIN_SETTINGS = {f"distributed.worker.memory.{name}": False for name in ("target", "spill", "pause")} | {
+    "distributed.worker.memory.terminate": TERMINATE_SHARE,
+    "distributed.scheduler.worker-ttl": None,
+}
+# Not those of BLAS, which dask leaves one: its rounding depends on them.
+THREADS_NAME = "NUMBA_NUM_THREADS"
 DASHBOARD_PORT = 8787  # dask's own, which its users know; another where that is taken
 
 
@@ -25,6 +44,22 @@ class Need(NamedTuple):
     n_tasks: int  # that are to be run
     task_bytes: float  # of the largest, predicted, 0 if nothing is known
     threads: int | None  # for each task, None: its share of the cores
+    is_within: bool = False  # tasks are run by the workers themselves, in whose processes kernels stay loaded
+    most_bytes: float | None = None  # of a worker of this machine, which its tasks share
+
+    def settings(self) -> dict[str, Any]:
+        """Of dask's configuration, where its scheduler is ours."""
+        return SCHEDULER_SETTINGS | (WITHIN_SETTINGS if self.is_within else {})
+
+    def limit_for(self, task_bytes: float) -> float:
+        """Memory of a worker whose task may take so much, bytes."""
+        if self.is_within:
+            return (task_bytes + WITHIN_BYTES) / TERMINATE_SHARE
+        return task_bytes + WORKER_BYTES
+
+    def room_of(self, limit: float) -> float:
+        """Memory for the task of a worker that has so much in all, bytes."""
+        return max(0.0, limit * TERMINATE_SHARE - WITHIN_BYTES if self.is_within else limit - WORKER_BYTES)
 
 
 class Folders(NamedTuple):
@@ -42,6 +77,7 @@ class Workers(NamedTuple):
     threads: int  # for each task
     bytes: float  # memory that one task may take, infinite if nothing is known
     words: str  # one line to print
+    limit: float = float("inf")  # memory of a worker in all
 
 
 class About(NamedTuple):
@@ -99,6 +135,11 @@ class Newcomers:
                 self.known[address] = about
         return sum(threads.values())
 
+    def room_of(self, about: About) -> float:
+        """Memory that one task may take there, bytes."""
+        share = about.n_bytes / about.n_threads
+        return self.need.room_of(share) if self.need.is_within else share
+
     def _check(self, address: str, about: Any) -> None:
         ours = About.of(self.probe)
         if not isinstance(about, About):
@@ -120,7 +161,12 @@ class Newcomers:
                 f"worker {address} on {about.host}: does not see {self.probe.parent}; "
                 "expected an output folder on a file system that all workers share"
             )
-        share = about.n_bytes / about.n_threads
+        if self.need.is_within and about.n_threads > 1:  # kernels take all of a process's threads
+            raise InputError(
+                f"worker {address} on {about.host}: expected one that runs one task at a time, got "
+                f"{about.n_threads}; start it with dask worker --nthreads 1 --nworkers {about.n_threads}"
+            )
+        share = self.room_of(about)
         if share < self.need.task_bytes:
             fitting = int(about.n_bytes / self.need.task_bytes)
             advice = f"dask worker --nthreads {fitting}" if fitting else "a larger --memory-limit"
@@ -128,6 +174,25 @@ class Newcomers:
                 f"worker {address} on {about.host}: has {memory_words(share)} for each of {about.n_threads} tasks, "
                 f"the largest needs about {memory_words(self.need.task_bytes)}; start it with {advice}"
             )
+
+
+def limiter() -> Any:
+    """A plugin by which an allocation that would take a worker over its limit of memory fails, where systems have that.
+
+    A nanny ends its worker after the fact, when it next looks. RLIMIT_DATA counts what the process may write to and
+    has not got from a file, touched or not; files' pages, which can be had again, count for the nanny alone.
+    """
+    from distributed import WorkerPlugin
+
+    class Limiter(WorkerPlugin):
+        def setup(self, worker: Any) -> None:
+            limit = worker.memory_manager.memory_limit
+            if resource is not None and limit:
+                hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
+                soft = limit if hard == resource.RLIM_INFINITY else min(limit, hard)
+                resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
+
+    return Limiter()
 
 
 def slots_of(client: Any) -> int:

@@ -22,7 +22,8 @@ from typing import Any, NamedTuple
 from tetopt.budget import memory_words
 from tetopt.cluster.crew import (
     MEMORY_MARGIN,
-    WORKER_BYTES,
+    THREADS_NAME,
+    WITHIN_SETTINGS,
     Folders,
     Need,
     Newcomers,
@@ -30,6 +31,7 @@ from tetopt.cluster.crew import (
     counted,
     dashboard_address,
     dashboard_link,
+    limiter,
 )
 from tetopt.errors import InputError
 from tetopt.incoming import text_of
@@ -58,6 +60,7 @@ class Request(NamedTuple):
     processes: int  # tasks at a time
     threads: int  # of each
     task_bytes: float  # that each may take
+    exports: tuple[str, ...] = ()  # lines of its script: names in the environment of its workers
 
 
 def submitted(stack: ExitStack, need: Need, folders: Folders, path: Path, count: int | None) -> Workers:
@@ -85,10 +88,7 @@ def submitted(stack: ExitStack, need: Need, folders: Folders, path: Path, count:
             )
     # Its own keys on top of the user's configuration of dask, as if they stood there.
     stack.enter_context(
-        dask.config.set(
-            {f"jobqueue.{kind}.{key}": value for key, value in settings.items()}
-            | {"distributed.scheduler.allowed-failures": 0}
-        )
+        dask.config.set({f"jobqueue.{kind}.{key}": value for key, value in settings.items()} | need.settings())
     )
     job = request(path, kind, dask.config.get(f"jobqueue.{kind}"), need)
     own_folder = folders.work / "dask"
@@ -96,6 +96,8 @@ def submitted(stack: ExitStack, need: Need, folders: Folders, path: Path, count:
     stack.callback(shutil.rmtree, own_folder, ignore_errors=True)
     cluster = stack.enter_context(cluster_of(path, kind, job, own_folder, folders.logs))
     client = stack.enter_context(Client(cluster))
+    if need.is_within:
+        client.register_plugin(limiter())
     n_jobs = min(count or JOBS_AT_ONCE, -(-need.n_tasks // job.processes))
     keeper = Keeper(cluster, n_jobs, Newcomers(client, need, folders.work), folders.logs)
     stack.callback(keeper.stop)
@@ -105,7 +107,7 @@ def submitted(stack: ExitStack, need: Need, folders: Folders, path: Path, count:
         f"{f' for {walltime}' if walltime else ''}, with {counted(job.processes, 'task')} at a time of "
         f"{counted(job.threads, 'thread')}; logs in {folders.logs}; dashboard {dashboard_link(client)}"
     )
-    return Workers(client, keeper.slots, job.threads, job.task_bytes, words)
+    return Workers(client, keeper.slots, job.threads, job.task_bytes, words, job.bytes / job.processes)
 
 
 def configuration(path: Path) -> tuple[str, dict[str, Any]]:
@@ -168,8 +170,8 @@ def request(path: Path, kind: str, settings: dict[str, Any], need: Need) -> Requ
             f"{path}: {kind}: cores: expected at least {max(threads, 1) * processes} for {processes} tasks "
             f"of {max(threads, 1)} threads, got {cores}; lower processes or --threads"
         )
-    least = (need.task_bytes + WORKER_BYTES) * processes
-    asked_for = (MEMORY_MARGIN * need.task_bytes + WORKER_BYTES) * processes
+    least = need.limit_for(need.task_bytes) * processes
+    asked_for = need.limit_for(MEMORY_MARGIN * need.task_bytes) * processes
     n_bytes = asked_for
     for key in ("memory", "job-mem", "mem"):  # for dask; what SLURM and LSF are asked for instead
         if settings.get(key) is not None:
@@ -184,7 +186,15 @@ def request(path: Path, kind: str, settings: dict[str, Any], need: Need) -> Requ
             f"{path}: {kind}: expected {name}, by which a job asks for {memory_words(asked_for)} here "
             "(dask-jobqueue asks for none by itself), got none; your cluster's manual says how"
         )
-    return Request(cores, n_bytes, processes, threads, n_bytes / processes - WORKER_BYTES)
+    return Request(cores, n_bytes, processes, threads, need.room_of(n_bytes / processes), _exports(need, threads))
+
+
+def _exports(need: Need, threads: int) -> tuple[str, ...]:
+    """What workers that run tasks themselves are told by their environment."""
+    if not need.is_within:
+        return ()
+    settings = {f"DASK_{key.upper().replace('.', '__')}": value for key, value in WITHIN_SETTINGS.items()}
+    return tuple(f"export {name}={value}" for name, value in {**settings, THREADS_NAME: threads}.items())
 
 
 @contextmanager
@@ -205,7 +215,7 @@ def cluster_of(path: Path, kind: str, job: Request, folder: Path, logs: Path) ->
     options = (settings["scheduler-options"] or {}) | {"dashboard_address": dashboard_address()}
     try:
         cluster = cls(
-            job_cls=_watched(cls.job_cls, folder, settings["job-script-prologue"]),
+            job_cls=_watched(cls.job_cls, folder, [*job.exports, *settings["job-script-prologue"]]),
             security=True,
             shared_temp_directory=str(folder),
             scheduler_options=options,

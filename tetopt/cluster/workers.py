@@ -1,8 +1,9 @@
 """Dask's workers: processes of this machine, those of a cluster that runs, or jobs of a batch system.
 
-A task is given names of files. Where it watches a process of its own, as a cohort's does, its worker is small whatever
-the task, and dask's limits on a worker's memory say nothing about that of the process. What keeps tasks within memory
-is how many of them there are at a time: that is decided here, from what the largest is predicted to need.
+A task is given names of files. What keeps tasks within memory is how many of them there are at a time: that is decided
+here, from what the largest is predicted to need. Where a task watches a process of its own, as a cohort's does, its
+worker is small whatever the task, and a limit of its memory would say nothing about that of the process. A worker that
+runs tasks itself has a limit, which its nanny and the system enforce.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from typing import Any, NamedTuple
 from tetopt.budget import available_bytes, memory_words
 from tetopt.cluster.crew import (
     MEMORY_MARGIN,
-    WORKER_BYTES,
+    THREADS_NAME,
     About,
     Folders,
     Need,
@@ -30,6 +31,7 @@ from tetopt.cluster.crew import (
     Workers,
     counted,
     dashboard_address,
+    limiter,
     slots_of,
 )
 from tetopt.cluster.jobs import configuration, submitted
@@ -70,7 +72,7 @@ def workers(
         dask is not installed; a scheduler that does not answer; workers of another version, that do not see `work` or
         have too little memory (also while the block lasts, from `slots`); a file that is none, or asks for too little.
     """
-    check_choice(count, scheduler, cluster)
+    check_choice(count, scheduler, cluster, "blocks" if need.is_within else "cohort")
     with ExitStack() as stack:
         stack.enter_context(_quiet(folders.logs / "dask.log"))
         if scheduler is not None:
@@ -81,9 +83,12 @@ def workers(
             yield _local(stack, need, folders, count)
 
 
-def check_choice(count: int | None, scheduler: str | None, cluster: Path | None) -> None:
-    """InputError for what `workers` refuses without asking anybody: to be called before anything is written."""
-    check_installed()
+def check_choice(count: int | None, scheduler: str | None, cluster: Path | None, extra: str) -> None:
+    """InputError for what `workers` refuses without asking anybody: to be called before anything is written.
+
+    `extra` is that of tetopt's which installs what the caller needs: "cohort" or "blocks".
+    """
+    check_installed(extra)
     if scheduler is not None and cluster is not None:
         raise InputError("--scheduler, --cluster: expected one of them, got both")
     if scheduler is not None and count is not None:
@@ -92,15 +97,17 @@ def check_choice(count: int | None, scheduler: str | None, cluster: Path | None)
         configuration(cluster)
 
 
-def check_installed() -> None:
-    """InputError where dask.distributed and what belongs to it is not installed."""
+def check_installed(extra: str) -> None:
+    """InputError where dask.distributed and what belongs to it is not installed, which an extra of tetopt's is for."""
     before = signal.getsignal(signal.SIGINT)
     try:
         import cryptography  # noqa: F401
         import dask_jobqueue  # noqa: F401, which ends the program by sys.exit at Ctrl-C as soon as it is imported
         import distributed  # noqa: F401
     except ImportError as error:
-        raise InputError(f'{error.name} is not installed, cohorts need it; pip install "tetopt[cohort]"') from error
+        raise InputError(
+            f'{error.name} is not installed, by which dask runs tasks; pip install "tetopt[{extra}]"'
+        ) from error
     finally:
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGINT, before)
@@ -112,18 +119,20 @@ class Share(NamedTuple):
     workers: int  # each with one task at a time
     threads: int  # of each task
     bytes: float  # for each task
+    limit: float  # of a worker in all
 
 
 def shares(need: Need, count: int | None, cores: int, free: float) -> Share:
     """As many workers as cores, memory (bytes that are free), `count` and tasks allow, at least one."""
-    per_task = MEMORY_MARGIN * need.task_bytes + WORKER_BYTES
+    per_task = need.limit_for(MEMORY_MARGIN * need.task_bytes)
     most = [need.n_tasks, cores // (need.threads or 1)]
     if free < float("inf"):
         most.append(int(free / per_task))
     if count is not None:
         most.append(count)
     number = max(1, min(most))
-    return Share(number, need.threads or max(1, cores // number), free / number - WORKER_BYTES)
+    limit = min(free / number, need.most_bytes or float("inf"))
+    return Share(number, need.threads or max(1, cores // number), need.room_of(limit), limit)
 
 
 def local_share(need: Need, count: int | None) -> Share:
@@ -140,26 +149,31 @@ def _local(stack: ExitStack, need: Need, folders: Folders, count: int | None) ->
     from distributed import Client, LocalCluster
 
     share = local_share(need, count)
-    stack.enter_context(dask.config.set({"distributed.scheduler.allowed-failures": 0}))
+    stack.enter_context(dask.config.set(need.settings()))
     own_folder = folders.work / "dask"
     stack.callback(shutil.rmtree, own_folder, ignore_errors=True)
+    # Where a task is a process of its own the worker is small, and its limit would not be that process's.
+    limit = int(share.limit) if need.is_within and share.limit < float("inf") else 0
     cluster = stack.enter_context(
         LocalCluster(
             n_workers=share.workers,
             threads_per_worker=1,  # tasks at a time
             security=True,
-            memory_limit=0,  # the worker is small, and its limit would not be that of the task's process
+            memory_limit=limit,
             local_directory=str(own_folder),
             dashboard_address=dashboard_address(),
+            env={THREADS_NAME: str(share.threads)} if need.is_within else None,
         )
     )
     client = stack.enter_context(Client(cluster))
     client.register_plugin(_silencer(folders.logs / "dask.log"))
+    if need.is_within:
+        client.register_plugin(limiter())
     words = f"{counted(share.workers, 'worker')} of {counted(share.threads, 'thread')}"
     if share.bytes < float("inf"):
         words += f" and {memory_words(share.bytes)}"
     words += f"; dashboard {client.dashboard_link}"
-    return Workers(client, lambda: slots_of(client), share.threads, share.bytes, words)
+    return Workers(client, lambda: slots_of(client), share.threads, share.bytes, words, share.limit)
 
 
 # ---- A cluster that runs
@@ -186,7 +200,7 @@ def _connected(stack: ExitStack, need: Need, folders: Folders, address: str) -> 
     if slots == 0:
         raise InputError(f"--scheduler: {address} has no workers; start some: dask worker {address}")
     threads = need.threads or _threads_each(list(newcomers.known.values()))
-    n_bytes = min((about.n_bytes / about.n_threads for about in newcomers.known.values()), default=float("inf"))
+    n_bytes = min(map(newcomers.room_of, newcomers.known.values()), default=float("inf"))
     words = f"{counted(len(newcomers.known), 'worker')} at {address}, {counted(slots, 'task')} at a time of "
     words += counted(threads, "thread")
     return Workers(client, newcomers.slots, threads, n_bytes, f"{words}; dashboard {client.dashboard_link}")
