@@ -38,8 +38,9 @@ Shapes
 
 from __future__ import annotations
 
+import itertools
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -50,12 +51,13 @@ from numpy.typing import ArrayLike, NDArray
 
 from tetopt.budget import check_memory
 from tetopt.errors import InputError
-from tetopt.image import SINGULAR_DETERMINANT, Image
+from tetopt.image import SINGULAR_DETERMINANT, Image, transformed
 from tetopt.incoming import toml_of
 
 PHANTOM_VOXEL_BYTES = 30.0  # intensities, noise or blur, labels, and what is written of them; 17 were measured
-MAX_PHANTOM_VOXELS = 2**31  # 17 GB in float64
+MAX_PHANTOM_VOXELS = 2**36  # 4096^3: 137 GB of 16 bits, box by box
 MAX_SUPERSAMPLE = 64  # sub-voxels along an axis: 262,144 to a voxel in 3-D, as many as fit one chunk of points
+BLUR_SIGMAS = 4.0  # standard deviations that a blur reaches: beyond is less than a ten thousandth of it
 POINTS_PER_CHUNK = 2**18  # evaluated at once, with a few tens of MB of temporaries
 
 _TOP_KEYS = ("name", "description", "size_mm", "voxel_mm", "background")
@@ -219,7 +221,26 @@ class Phantom:
         Raises
         ------
         InputError
-            An option out of range, or more than ``2**31`` voxels.
+            An option out of range, more than ``2**36`` voxels, or than fit into memory.
+        """
+        voxels = self.voxels(voxel_mm, blur_mm, noise_sd, seed, supersample)
+        self._check_whole(voxels.shape)
+        return Image(voxels[tuple(slice(None) for _ in voxels.shape)], voxels.affine)
+
+    def voxels(
+        self,
+        voxel_mm: ArrayLike | None = None,
+        blur_mm: float | None = None,
+        noise_sd: float | None = None,
+        seed: int | None = None,
+        supersample: int = 4,
+    ) -> PhantomVoxels:
+        """The voxels of `image`, painted box by box when they are asked for: together they need not fit into memory.
+
+        Raises
+        ------
+        InputError
+            As `image`, but for the number of voxels.
         """
         where = f"phantom {self.name!r}"
         blur = _number(self.blur_mm if blur_mm is None else blur_mm, f"{where}: blur_mm", 0.0)
@@ -228,30 +249,15 @@ class Phantom:
         sd = _number(self.noise_sd if noise_sd is None else noise_sd, f"{where}: noise_sd", 0.0)
         seed = _integer(self.seed if seed is None else seed, f"{where}: seed")
         supersample = _integer(supersample, f"{where}: supersample", 1, MAX_SUPERSAMPLE)
-        shape, affine = self._grid(voxel_mm)
-        linear = affine[:-1, :-1]
-        sub_index = _index_block(0, supersample**self.ndim, (supersample,) * self.ndim)
-        offsets = ((sub_index + 0.5) / supersample - 0.5) @ linear.T
-        corners = _index_block(0, 2**self.ndim, (2,) * self.ndim) - 0.5
-        # The 1e-9 keeps a voxel that only just touches a surface, whichever way the distances are rounded.
-        reach = np.linalg.norm(corners @ linear.T, axis=1).max() * (1.0 + 1e-9)
-        data = np.empty(shape)
-        flat = data.reshape(-1)
-        for part, centers in _voxel_centers(shape, affine):
-            flat[part] = self._voxel_means(centers, offsets, reach)
-        if blur > 0.0:
-            data = scipy.ndimage.gaussian_filter(data, blur / np.linalg.norm(linear, axis=0), mode="nearest")
-        if sd > 0.0:
-            data += np.random.default_rng(seed).normal(0.0, sd, shape)
-        return Image(data, affine)
+        return PhantomVoxels(self, *self._grid(voxel_mm), blur, sd, seed, supersample)
 
     def label_image(self, voxel_mm: ArrayLike | None = None) -> Image:
         """The label at every voxel's centre, on the same voxels as `image`."""
         shape, affine = self._grid(voxel_mm)
+        self._check_whole(shape)
         data = np.empty(shape, dtype=np.int64)
-        flat = data.reshape(-1)
-        for part, centers in _voxel_centers(shape, affine):
-            flat[part] = self._labels()[self._top_shape(centers)]
+        for part, centers in _voxel_centers((0,) * len(shape), shape, affine):
+            data[part] = self._labels()[self._top_shape(centers)].reshape(data[part].shape)
         return Image(data, affine)
 
     def _intensities(self) -> NDArray[np.float64]:
@@ -294,12 +300,11 @@ class Phantom:
             counts = np.maximum(1.0, np.rint(self.size_mm / voxel))
             n_voxels = counts.prod()
         if n_voxels > MAX_PHANTOM_VOXELS:
+            power = MAX_PHANTOM_VOXELS.bit_length() - 1
             raise InputError(
-                f"{where}: voxel_mm: expected at most 2**31 voxels, got "
+                f"{where}: voxel_mm: expected at most 2**{power} voxels, got "
                 f"{' x '.join(f'{count:.6g}' for count in counts)} of {voxel.tolist()} mm; take larger ones"
             )
-        what = f"{where}: {' x '.join(f'{count:.6g}' for count in counts)} voxels"
-        check_memory(PHANTOM_VOXEL_BYTES * n_voxels, what, "take larger ones")
         linear = self.axes.T * (self.size_mm / counts)
         affine = np.eye(self.ndim + 1)
         affine[:-1, :-1] = linear
@@ -310,6 +315,11 @@ class Phantom:
             raise InputError(f"{where}: {error}") from error
         return tuple(int(c) for c in counts), affine
 
+    def _check_whole(self, shape: tuple[int, ...]) -> None:
+        """InputError unless so many voxels fit into memory, with what is made of them."""
+        what = f"phantom {self.name!r}: {' x '.join(map(str, shape))} voxels"
+        check_memory(PHANTOM_VOXEL_BYTES * math.prod(shape), what, "take larger ones, or write it as .zarr")
+
     def _voxel_means(
         self, centers: NDArray[np.float64], offsets: NDArray[np.float64], reach: float
     ) -> NDArray[np.float64]:
@@ -318,10 +328,11 @@ class Phantom:
         `offsets` (S, n) lead from a centre to its sub-voxels' midpoints; no point of a voxel is farther from
         its centre than `reach`.
         """
-        top = np.zeros(len(centers), dtype=np.int64)  # last shape that holds the centre
-        base = np.zeros(len(centers), dtype=np.int64)  # last shape that holds the whole voxel
-        is_cut = np.empty((len(self.shapes), len(centers)), dtype=bool)
-        for k, shape in enumerate(self.shapes, start=1):
+        lowest, near = self._shapes_near(centers, reach)
+        top = np.full(len(centers), lowest)  # last shape that holds the centre
+        base = np.full(len(centers), lowest)  # last shape that holds the whole voxel
+        is_cut = np.zeros((len(self.shapes), len(centers)), dtype=bool)
+        for k, shape in near:
             distance = signed_distance(shape, centers)
             top[distance <= 0.0] = k
             base[distance < -reach] = k
@@ -336,7 +347,7 @@ class Phantom:
         for start in range(0, len(cut), step):
             voxels = cut[start : start + step]
             paint = np.repeat(base[voxels, None], len(offsets), axis=1)
-            for k, shape in enumerate(self.shapes, start=1):
+            for k, shape in near:
                 rows = np.flatnonzero(is_cut[k - 1, voxels])
                 if rows.size == 0:
                     continue
@@ -346,6 +357,103 @@ class Phantom:
             # Relative to the first sub-voxel: a voxel found whole keeps its value to the last bit.
             means[voxels] = values[:, 0] + (values - values[:, :1]).mean(axis=1)
         return means
+
+    def _shapes_near(self, centers: NDArray[np.float64], reach: float) -> tuple[int, list[tuple[int, Shape]]]:
+        """The last shape that holds all voxels with these centres, and those painted over it that meet any.
+
+        By one distance from the middle of all: most boxes of a large image are in the midst of one shape.
+        """
+        middle = (centers[0] + centers[-1]) / 2
+        # The 1e-9 is for what rounding does to distances.
+        radius = (np.linalg.norm(centers - middle, axis=1).max() + reach) * (1.0 + 1e-9)
+        lowest: int = 0
+        near: list[tuple[int, Shape]] = []
+        for k, shape in enumerate(self.shapes, start=1):
+            distance = signed_distance(shape, middle)
+            if distance < -radius:
+                lowest, near = k, []
+            elif distance <= radius:
+                near.append((k, shape))
+        return lowest, near
+
+
+class PhantomVoxels:
+    """The voxels of a phantom, as an array whose boxes are painted when they are asked for by slices.
+
+    A box has the same values whichever else is asked for, to the last bit. Noise is one stream of numbers in the order
+    of the voxels: boxes are asked for best in the order of the first axis, and take memory for all planes that they
+    lie on.
+
+    Parameters
+    ----------
+    phantom : Phantom
+    shape : tuple of int
+        Number of voxels along each axis.
+    affine : (n+1, n+1) float64
+        Index -> world mm.
+    blur_mm, noise_sd : float
+    seed, supersample : int
+        As `Phantom.image`'s.
+    """
+
+    dtype = np.dtype(np.float64)
+
+    def __init__(
+        self, phantom: Phantom, shape: tuple[int, ...], affine: NDArray[np.float64], blur_mm: float, noise_sd: float,
+        seed: int, supersample: int,
+    ) -> None:  # fmt: skip
+        self.phantom, self.shape, self.affine = phantom, shape, affine
+        self.noise_sd, self.seed = noise_sd, seed
+        linear, n = affine[:-1, :-1], len(shape)
+        self._sigmas = blur_mm / np.linalg.norm(linear, axis=0)
+        sub_index = _index_block((supersample,) * n)
+        self._offsets = ((sub_index + 0.5) / supersample - 0.5) @ linear.T
+        corners = _index_block((2,) * n) - 0.5
+        # The 1e-9 keeps a voxel that only just touches a surface, whichever way the distances are rounded.
+        self._reach = np.linalg.norm(corners @ linear.T, axis=1).max() * (1.0 + 1e-9)
+        self._stream, self._next_plane = np.random.default_rng(seed), 0
+        self._planes, self._noise = (0, 0), np.empty(0)
+
+    def __getitem__(self, box: tuple[slice, ...]) -> NDArray[np.float64]:
+        """The voxels of a box of indices, float64."""
+        ranges = [each.indices(size)[:2] for each, size in zip(box, self.shape, strict=True)]
+        values = self._blurred([start for start, _ in ranges], [stop for _, stop in ranges])
+        if self.noise_sd > 0.0:
+            values += self._noise_of(*ranges[0])[(slice(None), *(slice(*each) for each in ranges[1:]))]
+        return values
+
+    def _blurred(self, start: list[int], stop: list[int]) -> NDArray[np.float64]:
+        """A box without noise; with a blur, around it is painted what this reaches."""
+        if not self._sigmas.any():
+            return self._painted(start, stop)
+        reach = [int(BLUR_SIGMAS * sigma + 0.5) for sigma in self._sigmas]
+        low = [max(a - r, 0) for a, r in zip(start, reach, strict=True)]
+        high = [min(b + r, size) for b, r, size in zip(stop, reach, self.shape, strict=True)]
+        values = scipy.ndimage.gaussian_filter(
+            self._painted(low, high), self._sigmas, mode="nearest", truncate=BLUR_SIGMAS
+        )
+        return values[tuple(slice(a - at, b - at) for a, b, at in zip(start, stop, low, strict=True))].copy()
+
+    def _painted(self, start: list[int], stop: list[int]) -> NDArray[np.float64]:
+        values = np.empty([b - a for a, b in zip(start, stop, strict=True)])
+        for part, centers in _voxel_centers(start, stop, self.affine):
+            means = self.phantom._voxel_means(centers, self._offsets, self._reach)
+            values[part] = means.reshape(values[part].shape)
+        return values
+
+    def _noise_of(self, start: int, stop: int) -> NDArray[np.float64]:
+        """Noise of planes along the first axis; numbers before them in the stream are drawn, and left."""
+        if self._planes != (start, stop):
+            self._noise = np.empty(0)  # before the next is made
+            if start < self._next_plane:
+                self._stream, self._next_plane = np.random.default_rng(self.seed), 0
+            n_bytes = 8 * (stop - start) * math.prod(self.shape[1:])  # of float64
+            check_memory(n_bytes, f"phantom {self.phantom.name!r}: noise of {stop - start} planes", "take less of it")
+            for _ in range(self._next_plane, start):
+                self._stream.normal(0.0, self.noise_sd, self.shape[1:])
+            self._noise = self._stream.normal(0.0, self.noise_sd, (stop - start, *self.shape[1:]))
+            self._planes, self._next_plane = (start, stop), stop
+        return self._noise
 
 
 def phantom_folder() -> Path:
@@ -492,17 +600,24 @@ def _voxel_edges(voxel_mm: Any, size_mm: NDArray[np.float64], where: str) -> NDA
     return voxel
 
 
-def _index_block(start: int, stop: int, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    """Index coordinates, (stop - start, n), of the voxels with these positions in C order."""
-    return np.stack(np.unravel_index(np.arange(start, stop), shape), axis=-1).astype(np.float64)
+def _index_block(shape: Sequence[int]) -> NDArray[np.float64]:
+    """Index coordinates, (product of shape, n), of all voxels in C order."""
+    return np.stack(np.unravel_index(np.arange(math.prod(shape)), shape), axis=-1).astype(np.float64)
 
 
-def _voxel_centers(shape: tuple[int, ...], affine: NDArray[np.float64]) -> Iterator[tuple[slice, NDArray[np.float64]]]:
-    """Slices of the flattened grid with the world centres (M, n) of their voxels, in bounded pieces."""
-    total = math.prod(shape)
-    for start in range(0, total, POINTS_PER_CHUNK):
-        stop = min(start + POINTS_PER_CHUNK, total)
-        yield slice(start, stop), _index_block(start, stop, shape) @ affine[:-1, :-1].T + affine[:-1, -1]
+def _voxel_centers(
+    start: Sequence[int], stop: Sequence[int], affine: NDArray[np.float64]
+) -> Iterator[tuple[tuple[slice, ...], NDArray[np.float64]]]:
+    """Parts of a box of indices, counted from its start, with the world centres (M, n) of their voxels in C order.
+
+    Term by term, not by BLAS, whose rounding depends on the number of rows: a voxel is the same in every box.
+    """
+    edge = round(POINTS_PER_CHUNK ** (1 / len(start)))
+    for corner in itertools.product(*(range(a, b, edge) for a, b in zip(start, stop, strict=True))):
+        ends = [min(at + edge, b) for at, b in zip(corner, stop, strict=True)]
+        index = _index_block([b - a for a, b in zip(corner, ends, strict=True)]) + corner
+        part = tuple(slice(a - at, b - at) for a, b, at in zip(corner, ends, start, strict=True))
+        yield part, transformed(index, affine[:-1, :-1]) + affine[:-1, -1]
 
 
 def _check_keys(table: dict[str, Any], needed: Iterable[str], optional: Iterable[str], where: str) -> None:

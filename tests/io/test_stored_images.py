@@ -6,10 +6,16 @@ import shutil
 import nibabel
 import numpy as np
 import pytest
+from commands import exit_code
 
 from tetopt.errors import InputError
+from tetopt.image import Image
+from tetopt.io import zarr_images
 from tetopt.io.images import load_image
 from tetopt.io.stored_images import open_stored
+from tetopt.io.zarr_images import save_zarr
+from tetopt.phantom import load_phantom
+from tetopt.stored import StoredImage
 
 zarr = pytest.importorskip("zarr")
 
@@ -97,3 +103,52 @@ def test_chunks_that_are_missing(tmp_path):
         open_stored(path)
     shutil.rmtree(path / "0" / "c")
     assert_refused(path, "none of its 2 chunks is there")
+
+
+def test_a_phantom_by_chunks_is_the_one_in_memory(tmp_path, monkeypatch):
+    monkeypatch.setattr(zarr_images, "CHUNK_EDGE", 16)
+    phantom, options = load_phantom("layered_oblique"), {"voxel_mm": [2, 2, 3], "blur_mm": 1.0, "noise_sd": 5.0}
+    voxels, path = phantom.voxels(**options), tmp_path / "a.zarr"
+    low, high = save_zarr(path, StoredImage(voxels, voxels.affine), voxels, np.int16)
+    image, whole = open_stored(path), phantom.image(**options)
+    stored = image.read((0, 0, 0), image.shape)
+    np.testing.assert_array_equal(stored, np.rint(whole.data))
+    assert (low, high) == (stored.min(), stored.max())
+    assert image.voxels.chunks == (16, 16, 16)
+    assert image.voxels.dtype == np.int16
+    np.testing.assert_array_equal(image.affine, whole.affine)  # sheared, which scale and translation are not
+    assert [each.name for each in tmp_path.iterdir()] == ["a.zarr"]
+
+
+def test_what_does_not_fit_leaves_the_old_folder(tmp_path):
+    path = tmp_path / "a.zarr"
+    image = Image(ramp(4, 4, 4))
+    save_zarr(path, image, image.data, np.int16)
+    with pytest.raises(InputError, match="expected values from -32768 to 32767, as int16 holds them, got 1 to 64000"):
+        save_zarr(path, image, image.data * 1000.0 - 999.0 * (image.data == 1), np.int16)
+    np.testing.assert_array_equal(open_stored(path).read((0, 0, 0), (4, 4, 4)), image.data)
+    assert [each.name for each in tmp_path.iterdir()] == ["a.zarr"]
+    with pytest.raises(InputError, match="expected a volume to write as Zarr, got a 2-D image"):
+        save_zarr(path, Image(ramp(4, 4)), ramp(4, 4), np.int16)
+
+
+def test_only_a_folder_of_zarr_is_replaced(tmp_path, monkeypatch, capfd):
+    def command_refused(capfd, words, match):
+        assert exit_code(*words) == 2
+        assert re.search(match, capfd.readouterr().err)
+
+    command = ["phantom", "sphere", "--voxel-mm", "8", "-o", tmp_path / "a.zarr"]
+    assert exit_code(*command) == 0
+    before = sorted((tmp_path / "a.zarr").rglob("*"))
+    command_refused(capfd, command, "exists already; pass --force")
+    assert exit_code(*command, "--force") == 0
+    assert sorted((tmp_path / "a.zarr").rglob("*")) == before
+    (tmp_path / "b.zarr").mkdir()
+    (tmp_path / "b.zarr" / "precious").write_text("mine")
+    (tmp_path / "c.zarr").write_text("mine")
+    monkeypatch.chdir(tmp_path)
+    command_refused(capfd, [*command[:-1], "c.zarr", "--force"], "expected a folder to write, found something else")
+    command_refused(capfd, [*command[:-1], "b.zarr", "--force"], "expected a file to write, found a folder of others")
+    command_refused(capfd, [*command[:-1], "no/c.zarr"], "its folder does not exist")
+    command_refused(capfd, ["phantom", "disc_2d", "-o", "d.zarr"], "expected a phantom in three dimensions")
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["a.zarr", "b.zarr", "c.zarr"]

@@ -5,18 +5,24 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import typer
 from rich.markup import escape
 
-from tetopt import load_phantom, save_image
+from tetopt import InputError, load_phantom, save_image
 from tetopt.cli.console import out
 from tetopt.cli.options import ForceOption, option
 from tetopt.io.files import checked_output
+from tetopt.io.images import OUTPUT_SUFFIXES
+from tetopt.io.zarr_images import ZARR_SUFFIX, is_node, save_zarr
+from tetopt.stored import StoredImage
 
 
 def phantom_command(
     name: Annotated[str, typer.Argument(metavar="NAME_OR_TOML", help="A phantom's name, or a TOML file of your own.")],
-    output: Annotated[Path, option("IMAGE.nii.gz", "The image to write.", "-o", "--output")],
+    output: Annotated[
+        Path, option("IMAGE.nii.gz", "The image to write; X.zarr by chunks, as 16-bit whole numbers.", "-o", "--output")
+    ],
     voxel_mm: Annotated[float | None, option("MM", "Voxel size instead of the phantom's.")] = None,
     blur_mm: Annotated[float | None, option("MM", "Standard deviation of a Gaussian blur.")] = None,
     noise_sd: Annotated[float | None, option("SD", "Standard deviation of added noise.")] = None,
@@ -25,15 +31,22 @@ def phantom_command(
     force: ForceOption = False,
 ) -> int:
     """Write a phantom as an image: known shapes, known intensities."""
-    suffixes = (".nii", ".nii.gz")
-    output = checked_output(output, suffixes, force)
     if labels is not None:
-        labels = checked_output(labels, suffixes, force)
+        labels = checked_output(labels, OUTPUT_SUFFIXES, force)
+    is_folder = output.name.lower().endswith(ZARR_SUFFIX)
+    output = checked_output(output, (*OUTPUT_SUFFIXES, ZARR_SUFFIX), force, is_node if is_folder else None)
     phantom = load_phantom(name)
-    image = phantom.image(voxel_mm=voxel_mm, blur_mm=blur_mm, noise_sd=noise_sd, seed=seed)
-    save_image(output, image)
+    voxels = phantom.voxels(voxel_mm=voxel_mm, blur_mm=blur_mm, noise_sd=noise_sd, seed=seed)
+    if is_folder:
+        if phantom.ndim != 3:
+            raise InputError(f"{output}: expected a phantom in three dimensions; write a plane as .nii.gz")
+        low, high = save_zarr(output, StoredImage(voxels, voxels.affine), voxels, np.int16)
+    else:
+        image = phantom.image(voxel_mm=voxel_mm, blur_mm=blur_mm, noise_sd=noise_sd, seed=seed)
+        low, high = image.data.min(), image.data.max()
+        save_image(output, image)
     if labels is not None:
         save_image(labels, phantom.label_image(voxel_mm=voxel_mm))
-    size = " x ".join(str(s) for s in image.shape)
-    out.print(escape(f"{output}: {phantom.name}, {size} voxels, {image.data.min():g} to {image.data.max():g}"))
+    size = " x ".join(str(s) for s in voxels.shape)
+    out.print(escape(f"{output}: {phantom.name}, {size} voxels, {low:g} to {high:g}"))
     return 0

@@ -12,7 +12,7 @@ import os
 import shutil
 import stat
 import tempfile
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager, suppress
 from contextvars import ContextVar
 from itertools import chain, count
@@ -66,10 +66,13 @@ def name_files(values: Iterable[Any]) -> None:
         outputs.named.extend(each for each in flat if isinstance(each, Path))
 
 
-def checked_output(path: str | Path, suffixes: tuple[str, ...], force: bool = False) -> Path:
+def checked_output(
+    path: str | Path, suffixes: tuple[str, ...], force: bool = False, is_ours: Callable[[Path], bool] | None = None
+) -> Path:
     """`path` if a file may be written there, asked before the work starts; a file is made in its folder, and removed.
 
-    With `force` the file that a symbolic link points to is what is written, and the link stays.
+    With `force` the file that a symbolic link points to is what is written, and the link stays. `is_ours` is of an
+    output that is a folder: whether a folder is of its kind, as which alone `force` replaces it.
 
     Raises
     ------
@@ -78,8 +81,8 @@ def checked_output(path: str | Path, suffixes: tuple[str, ...], force: bool = Fa
         place, an existing file without `force`, an input of the command or another of its outputs.
     """
     path = check_suffix(path, suffixes)
-    if os.path.isdir(path):
-        raise InputError(f"{path}: expected a file to write, found a folder")
+    if os.path.isdir(path) and (is_ours is None or not is_ours(path)):
+        raise InputError(f"{path}: expected a file to write, found a folder{'' if is_ours is None else ' of others'}")
     try:
         place = Path(os.path.realpath(path))
         before = _state(place)
@@ -88,7 +91,9 @@ def checked_output(path: str | Path, suffixes: tuple[str, ...], force: bool = Fa
     through = f"is a link to {place}: " if path.is_symlink() else ""
     if not place.parent.is_dir():
         raise InputError(f"{path}: {through}its folder does not exist; make it first")
-    if before is not None and not stat.S_ISREG(before.st_mode):
+    if before is not None and is_ours is not None and not stat.S_ISDIR(before.st_mode):
+        raise InputError(f"{path}: {through}expected a folder to write, found something else; remove it first")
+    if before is not None and is_ours is None and not stat.S_ISREG(before.st_mode):
         raise InputError(f"{path}: {through}expected a file to write, found a device, a pipe or a link in a circle")
     if os.path.lexists(path) and not force:
         raise InputError(f"{path}: exists already; pass --force (force=True) to replace it")
@@ -183,6 +188,51 @@ def written_whole(path: Path, n_bytes: int | None = None) -> Iterator[Path]:
         outputs.written.append(path)
 
 
+@contextmanager
+def folder_written_whole(path: Path) -> Iterator[Path]:
+    """As `written_whole`, an output that is a folder: a temporary one beside it, which takes its place in the end.
+
+    A folder that is there is moved aside for that; between the two moves, and if the process is killed there, its
+    name is free.
+
+    Raises
+    ------
+    TakenError
+        `checked_output` saw nothing there, and now there is something.
+    OSError
+        As `written_whole`.
+    """
+    outputs, key = _OUTPUTS.get(), _absolute(path)
+    place = Path(os.path.realpath(path)) if outputs is None else outputs.places.get(key, Path(os.path.realpath(path)))
+    start = f".{path.name[:TEMPORARY_LETTERS]}."
+    temporary, aside = None, None
+    try:
+        temporary = Path(tempfile.mkdtemp(prefix=start, suffix=path.suffix[-20:], dir=place.parent))
+        yield temporary
+        for folder, _, names in os.walk(temporary):
+            for name in names:
+                _on_disk(Path(folder) / name)
+        _take_rights(temporary, place)
+        if outputs is not None and not outputs.may_replace.get(key, True) and os.path.lexists(place):
+            raise TakenError(f"{path}: another program has written it in the meantime, and without --force it stays")
+        if place.is_dir():
+            aside = Path(tempfile.mkdtemp(prefix=start, dir=place.parent))
+            os.rename(place, aside / "old")
+        os.rename(temporary, place)
+        _synchronise_folder(place.parent)
+    except OSError as error:
+        if aside is not None and (aside / "old").exists() and not os.path.lexists(place):
+            os.rename(aside / "old", place)
+        raise OSError(error.errno or errno.EIO, _reason(error, place.parent, None), str(path)) from error
+    finally:
+        for each in (temporary, aside):
+            if each is not None:  # what cannot be removed stays, hidden: what is told is what went wrong before
+                shutil.rmtree(each, ignore_errors=True)
+    if outputs is not None and key in outputs.places:
+        outputs.may_replace[key] = True
+        outputs.written.append(path)
+
+
 def save_bytes(path: str | Path, whole: bytes) -> None:
     """Write a file, whole or not at all; errors as `written_whole`."""
     with written_whole(Path(path), len(whole)) as temporary:
@@ -226,7 +276,8 @@ def _take_rights(temporary: Path, place: Path) -> None:
     if before is None:
         mask = os.umask(0)
         os.umask(mask)
-        os.chmod(temporary, 0o666 & ~mask)  # mkstemp's 0600 would keep colleagues out
+        # mkstemp's 0600 would keep colleagues out, and mkdtemp's 0700
+        os.chmod(temporary, (0o777 if temporary.is_dir() else 0o666) & ~mask)
         return
     mode = stat.S_IMODE(before.st_mode) & 0o777
     if hasattr(os, "chown") and os.stat(temporary).st_gid != before.st_gid:
@@ -242,9 +293,15 @@ def _synchronise(temporary: Path, place: Path) -> None:
 
     It is opened before it takes the rights, with which nobody may perhaps write it.
     """
-    handle = os.open(temporary, os.O_RDWR)
+    _on_disk(temporary, place)
+
+
+def _on_disk(path: Path, place: Path | None = None) -> None:
+    """Write out a file, which takes the rights of what is in its `place` once it is open."""
+    handle = os.open(path, os.O_RDWR)
     try:
-        _take_rights(temporary, place)
+        if place is not None:
+            _take_rights(path, place)
         os.fsync(handle)
     finally:
         os.close(handle)

@@ -16,20 +16,23 @@ from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import DTypeLike, NDArray
 
 from tetopt.budget import check_memory
 from tetopt.errors import InputError
-from tetopt.image import checked_affine
+from tetopt.image import VoxelGrid, checked_affine
 from tetopt.incoming import TEXT_BYTES, irregular
+from tetopt.io.files import folder_written_whole
 from tetopt.io.text import plain
 from tetopt.io.volumes import DAMAGED_FILE, VoxelsInFile, one_line, volume_index
 from tetopt.stored import StoredImage
 
+ZARR_SUFFIX = ".zarr"
 BLOCKS_NEEDED = 'needs the zarr library; pip install "tetopt[blocks]"'
 NODE_FILES = ("zarr.json", ".zarray", ".zgroup")  # one of which every array and group of Zarr has, of version 3 and 2
 METADATA_FILES = (*NODE_FILES, ".zattrs", ".zmetadata")
 MOST_CHUNKS = 2**24  # of one image: as many names are looked up in a minute or two; 2048^3 voxels have 4,096 of 128^3
+CHUNK_EDGE = 128  # voxels, of what is written: 4 MB of 16 bits, and a part of a mesh reads a few
 MOST_LEVELS = 64  # of a multiscale: each is at least half of the one before
 # NGFF's units of length, names of UDUNITS-2, in mm.
 MM_PER_LENGTH = {
@@ -74,9 +77,12 @@ class ZarrLevel(NamedTuple):
 
 def is_zarr(path: Path) -> bool:
     """Whether it is a folder of Zarr's, by its name or by what lies in it."""
-    if not path.is_dir():
-        return False
-    return path.name.lower().endswith(".zarr") or any((path / name).exists() for name in NODE_FILES)
+    return path.is_dir() and (path.name.lower().endswith(ZARR_SUFFIX) or is_node(path))
+
+
+def is_node(path: Path) -> bool:
+    """Whether it is an array or a group of Zarr, by what lies in it."""
+    return any((path / name).exists() for name in NODE_FILES)
 
 
 def open_zarr(level: ZarrLevel, volume: int | None, notes: list[str]) -> StoredImage:
@@ -113,7 +119,7 @@ def zarr_levels(path: Path, notes: list[str]) -> list[ZarrLevel]:
     ome = attributes.get("ome", attributes)
     scales = ome.get("multiscales") if isinstance(ome, dict) else None
     if not isinstance(scales, list) or not scales or not isinstance(scales[0], dict):
-        inside = sorted(child.name for child in path.iterdir() if is_zarr(child))
+        inside = sorted(child.name for child in path.iterdir() if is_node(child))
         listed = f"; name what is in it: {', '.join(inside[:8])}" if inside else ", and nothing in it"
         raise InputError(f"a group of Zarr without an OME-Zarr image (multiscales){listed}")
     datasets, axes = scales[0].get("datasets"), scales[0].get("axes")
@@ -133,6 +139,88 @@ def zarr_levels(path: Path, notes: list[str]) -> list[ZarrLevel]:
     return [levels[0]._replace(affine=own), *(each._replace(affine=turn @ each.affine) for each in levels[1:])]
 
 
+def save_zarr(path: Path, image: VoxelGrid, voxels: Any, dtype: DTypeLike) -> tuple[float, float]:
+    """Write an OME-Zarr image (NGFF 0.5, Zarr's format 3) chunk by chunk, whole or not at all.
+
+    Its axes are named x, y, z in the order of the indices. Scale and translation are the lengths of a voxel's edges and
+    the first voxel's place, which NGFF has no more than; the attribute "affine" of the array has it all.
+
+    Parameters
+    ----------
+    path : Path
+        Replaces a folder of Zarr's that is there; ask `tetopt.io.files.checked_output` first.
+    image : VoxelGrid
+        Whose place they have, three-dimensional.
+    voxels : Any
+        What gives them for a tuple of slices, chunk after chunk.
+    dtype : dtype
+        That they are stored in; rounded to whole numbers if it is of these.
+
+    Returns
+    -------
+    tuple of float
+        The least value and the largest.
+
+    Raises
+    ------
+    InputError
+        zarr is not installed; not three axes; values beyond the dtype's.
+    OSError
+        As `tetopt.io.files.folder_written_whole`.
+    """
+    zarr = _library()
+    if image.ndim != 3:
+        raise InputError(f"{path}: expected a volume to write as Zarr, got a {image.ndim}-D image; write it as .nii.gz")
+    low, high = np.inf, -np.inf
+    with folder_written_whole(path) as folder:
+        group = zarr.open_group(folder, mode="w", zarr_format=3)
+        array = group.create_array(
+            "0", shape=image.shape, chunks=[min(size, CHUNK_EDGE) for size in image.shape], dtype=dtype, fill_value=0,
+            dimension_names=["x", "y", "z"], attributes={"affine": image.affine.tolist()},
+            config={"write_empty_chunks": True},
+        )  # fmt: skip
+        group.attrs.update({"ome": {"version": "0.5", "multiscales": [_multiscale(image)]}})
+        for corner in itertools.product(*(range(0, size, CHUNK_EDGE) for size in image.shape)):
+            ends = [min(at + CHUNK_EDGE, size) for at, size in zip(corner, image.shape, strict=True)]
+            box = tuple(slice(*each) for each in zip(corner, ends, strict=True))
+            block = _stored_values(path, np.asarray(voxels[box]), array.dtype)
+            low, high = min(low, float(block.min())), max(high, float(block.max()))
+            array[box] = block
+    return low, high
+
+
+def _stored_values(path: Path, block: NDArray, dtype: np.dtype) -> NDArray:
+    """Values as they are stored; InputError where they do not fit."""
+    if dtype.kind not in "iu":
+        return block.astype(dtype)
+    block, limits = np.rint(block), np.iinfo(dtype)
+    if block.min() < limits.min or block.max() > limits.max:
+        raise InputError(
+            f"{path}: expected values from {limits.min} to {limits.max}, as {dtype} holds them, got {block.min():g} to "
+            f"{block.max():g}; scale them"
+        )
+    return block.astype(dtype)
+
+
+def _multiscale(image: VoxelGrid) -> dict[str, Any]:
+    """NGFF's words for one array of voxels."""
+    axes = [{"name": name, "type": "space", "unit": "millimeter"} for name in "xyz"]
+    transforms = [
+        {"type": "scale", "scale": image.spacing.tolist()},
+        {"type": "translation", "translation": image.affine[:3, 3].tolist()},
+    ]
+    return {"axes": axes, "datasets": [{"path": "0", "coordinateTransformations": transforms}]}
+
+
+def _library() -> Any:
+    try:
+        import zarr
+        import zarr.storage
+    except ImportError as error:
+        raise InputError(f"a folder of Zarr {BLOCKS_NEEDED}") from error
+    return zarr
+
+
 def _level(path: Path, dataset: Any, after: Any, axes: list[dict], places: _Places) -> ZarrLevel:
     """One dataset of a multiscale."""
     name = dataset.get("path") if isinstance(dataset, dict) else None
@@ -142,7 +230,7 @@ def _level(path: Path, dataset: Any, after: Any, axes: list[dict], places: _Plac
     if not parts or ".." in parts or parts[0] == "/" or "\\" in name or ":" in name or "\0" in name:
         raise _unusable("path", name, "the name of an array within the folder")
     folder = path.joinpath(*parts)
-    if not is_zarr(folder):
+    if not is_node(folder):
         raise InputError(f'{DAMAGED_FILE} (its array "{plain(name)}" is not there)')
     array = _node(folder)
     if not hasattr(array, "shape"):
@@ -177,21 +265,17 @@ def _own_affine(array: Any) -> NDArray[np.float64] | None:
 
 def _node(path: Path) -> Any:
     """The array or group in a folder, as zarr reads it."""
-    try:
-        import zarr
-        from zarr.storage import LocalStore
-    except ImportError as error:
-        raise InputError(f"a folder of Zarr {BLOCKS_NEEDED}") from error
+    zarr = _library()
     for name in METADATA_FILES:
         file = path / name
         if file.exists() and ((other := irregular(file)) is not None or file.stat().st_size > TEXT_BYTES):
             raise InputError(f"its {name} is {other or 'longer than any'}; expected a text of JSON")
-    if not any((path / name).exists() for name in NODE_FILES):
+    if not is_node(path):
         raise InputError(f"no array of Zarr in this folder: it has none of {', '.join(NODE_FILES)}")
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")  # of what else lies in the folder
-            return zarr.open(LocalStore(path, read_only=True), mode="r", use_consolidated=False)
+            return zarr.open(zarr.storage.LocalStore(path, read_only=True), mode="r", use_consolidated=False)
     except Exception as error:  # zarr raises whatever comes up at damaged metadata; a codec that is missing is named
         raise InputError(f"its Zarr metadata cannot be read ({plain(one_line(error)[:200])}); copy it again") from error
 
