@@ -481,3 +481,17 @@ def smooth_level(inside):
         smooth = smooth - volume_missing(smooth, inside)
         level = sign * np.clip(sign * smooth, least, most)
     return np.clip(level, -6.0, 6.0)
+
+
+# Sums over blocks
+
+
+def row_totals(field, block_of_row, ends, totals):
+    """Sums of a box of voxels over each plane's blocks of rows and columns, added to `totals`, voxel after voxel."""
+    totals = [[list(row) for row in plane] for plane in totals]
+    for p, plane in enumerate(field):
+        for r, row in enumerate(plane):
+            for k, value in enumerate(row):
+                block = next(c for c in range(len(ends) - 1) if ends[c] <= k < ends[c + 1])
+                totals[p][block_of_row[r]][block] += float(value)
+    return totals

@@ -128,33 +128,47 @@ def _checked_data(data: ArrayLike) -> NDArray[np.floating]:
         data = np.asarray(data)
     except (TypeError, ValueError) as error:  # rows of different length; nibabel's images
         raise InputError(f"image data: expected an array of numbers, got {type(data).__name__} ({error})") from error
-    if data.dtype.names is not None or data.dtype.kind == "O":
-        raise InputError(f"image data: expected one number a voxel, got {data.dtype}; convert RGB to grey first")
-    if data.dtype.kind == "c":
-        raise InputError("image data: expected real numbers, got complex ones; take the magnitude first")
-    if data.dtype.kind not in "buif":
-        raise InputError(f"image data: expected numbers, got dtype {data.dtype}")
+    check_kind(data.dtype)
     if data.ndim not in (2, 3):
         raise InputError(f"image data: expected 2 or 3 axes, got shape {data.shape}; pick one volume or slice")
     if 0 in data.shape:
         raise InputError(f"image data: every axis needs a voxel, got shape {data.shape}")
-    is_finite = np.isfinite(data)
-    if not is_finite.all():
-        first = tuple(int(i) for i in np.argwhere(~is_finite)[0])
-        raise InputError(
-            f"image data: {int(np.count_nonzero(~is_finite))} voxels are NaN or infinite, the first at index "
-            f"{first}; replace them (for example by the background's value) first"
-        )
+    is_bad = ~np.isfinite(data)
+    if is_bad.any():
+        check_finite(int(np.count_nonzero(is_bad)), tuple(int(i) for i in np.argwhere(is_bad)[0]))
     values = _as_lossless_float(data)
-    low, high = float(values.min()), float(values.max())
+    check_intensities(float(values.min()), float(values.max()))
+    values.setflags(write=False)
+    return values
+
+
+def check_kind(dtype: np.dtype) -> None:
+    """InputError unless the voxels are real numbers."""
+    if dtype.names is not None or dtype.kind == "O":
+        raise InputError(f"image data: expected one number a voxel, got {dtype}; convert RGB to grey first")
+    if dtype.kind == "c":
+        raise InputError("image data: expected real numbers, got complex ones; take the magnitude first")
+    if dtype.kind not in "buif":
+        raise InputError(f"image data: expected numbers, got dtype {dtype}")
+
+
+def check_finite(n_bad: int, first: tuple[int, ...]) -> None:
+    """InputError if there are voxels without a number, the first of them at this index."""
+    if n_bad > 0:
+        raise InputError(
+            f"image data: {n_bad} voxels are NaN or infinite, the first at index {first}; replace them (for example "
+            "by the background's value) first"
+        )
+
+
+def check_intensities(low: float, high: float) -> None:
+    """InputError for a range of intensities whose squares cannot be computed with."""
     least, most = INTENSITY_RANGE
     if max(abs(low), abs(high)) > most or 0.0 < high - low < least:
         raise InputError(
             f"image data: expected intensities up to {most:g} that differ by {least:g} at least, as their squares "
             f"overflow or vanish, got {low:g} to {high:g}; scale them"
         )
-    values.setflags(write=False)
-    return values
 
 
 def _as_lossless_float(data: NDArray) -> NDArray[np.floating]:

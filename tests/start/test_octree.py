@@ -9,7 +9,7 @@ from scipy import ndimage
 
 import tetopt
 from tetopt.start.octree import octree
-from tetopt.target.content import noise_level
+from tetopt.target.noise import noise_level
 
 OBLIQUE = np.array([[0.9, 0.3, 0.2, -7.0], [-0.25, 1.1, 0.1, 3.0], [0.0, 0.4, -1.5, 11.0], [0.0, 0.0, 0.0, 1.0]])
 
@@ -108,7 +108,7 @@ def test_nodes_do_not_follow_noise(monkeypatch):
         return float((index[:, 0] < 31.5).sum()) / len(index)
 
     known = share_in_wave()
-    monkeypatch.setattr(sys.modules["tetopt.target.content"], "noise_level", lambda data, inside: 0.0)
+    monkeypatch.setattr(sys.modules["tetopt.start.sums"], "sampled_noise", lambda sample, inside: 0.0)
     assert known > 0.75
     assert share_in_wave() < 0.7
 

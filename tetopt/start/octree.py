@@ -16,6 +16,7 @@ The depth of a block is the number of divisions that it takes to get to it: 0 of
 from __future__ import annotations
 
 from collections.abc import Iterator
+from math import prod
 from typing import NamedTuple
 
 import numpy as np
@@ -25,7 +26,7 @@ from numpy.typing import NDArray
 from tetopt.budget import check_memory
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
-from tetopt.image import Image
+from tetopt.image import Image, VoxelGrid
 from tetopt.mesh import Mesh
 from tetopt.start.clip import clipped
 from tetopt.start.delaunay import delaunay
@@ -39,7 +40,10 @@ from tetopt.start.sizes import (
     Sizes,
     equilateral_nodes,
 )
+from tetopt.start.sums import BlockSums, Channels, Source, block_starts, block_sums, channels_of, halved, source_of
+from tetopt.stored import StoredImage
 from tetopt.target.content import Content, plain
+from tetopt.target.statistics import READ_BYTES, Statistics
 
 # Nodes of the undivided blocks, over the requested number: tried in turn, the largest blocks first.
 ROOT_SHARES = tuple(1.0 / k for k in (60, 45, 30, 20, 12, 8, 6, 4, 2.5, 1.6, 1))
@@ -58,25 +62,37 @@ NOISE_SIGMAS = 2.0  # standard deviations of a sum of squared noise that are not
 # Of a target's blocks to the n-th power: those larger by less are not divided, since a lattice seldom fits exactly.
 TARGET_SLACK = 0.25
 OCTREE_NODE_BYTES = 3000.0  # of Delaunay's hull in one dimension more, six or seven cells to a node
-BLOCK_FIELD_BYTES = 16.0  # of the smallest blocks, each field of which is held at all depths: twice 8, at most
-OTHER_FIELDS = 6  # besides the sums: targets, errors and what they are made of
+BLOCK_FIELD_BYTES = 8.0  # of the smallest blocks, for each field
+OTHER_FIELDS = 4  # besides the sums: targets, the errors of all depths, and half of a field while it is halved
+# For the content's sake no more are looked at: 0.8 GB. Leaves of 2 to 4 voxels of 512^3 are as many, and of 1024^3
+# those of 4 to 8 voxels, 30 for each of 500,000 nodes.
+MOST_BLOCKS = 2**24
+LAYER_BLOCKS = 2**16  # computed with at a time: half a megabyte a field, which a processor's cache has room for
+UNEVEN_FACTORS = (0.8191725133961645, 0.6710436067037893, 0.5497004779019703)  # the plastic number's powers -1 to -3
+SKIPPED_SHARE = 2.0  # of the requested nodes: with more leaves, nodes are not counted one by one
+NODES_OF_LEAF = 9  # its corners and its centre, in 3-D
 TIE_SPREAD = 0.05  # of a block's error: what decides between blocks that are alike
 TIE_BREAKS = (1e-5, 1e-4, 1e-3)  # see `delaunay`, tried in turn: with 1e-7, 2 of 88,661 cells were flat
 FLAT_VOLUME_SHARE = 1e-6  # of the mean volume: a cell with less is flat
 
 
-def octree(image: Image | Content, nodes: int, sizes: Sizes | None = None) -> Mesh:
+def octree(
+    image: Image | Content | StoredImage, nodes: int, sizes: Sizes | None = None, statistics: Statistics | None = None
+) -> Mesh:
     """A graded mesh of the image's box, or of the mask's region.
 
     Parameters
     ----------
-    image : Image or Content
+    image : Image, Content or StoredImage
         Its box, index -0.5 to shape - 0.5 along each axis, is covered exactly; or, with a mask, its region up to the
-        surface, on which nodes are put.
+        surface, on which nodes are put. A stored image is read box by box, once, and once for each of the sizes of
+        undivided blocks that are tried, up to eleven; the mesh is that of the same voxels in memory, to the last bit.
     nodes : int
         Number of nodes to come near to. The nearest octree has a few per cent more or less, of few a few dozen.
     sizes : Sizes, optional
-        Targets and limits for the blocks' edges.
+        Targets and limits for the blocks' edges. Targets take voxels in memory.
+    statistics : Statistics, optional
+        Of a stored image, where they are known (`stored_statistics`), so that it is read once less.
 
     Returns
     -------
@@ -87,25 +103,25 @@ def octree(image: Image | Content, nodes: int, sizes: Sizes | None = None) -> Me
     ------
     InputError
         More nodes than leaves of 2 voxels, or of the smallest size, can have, or fewer than the sizes need; or
-        intensities whose squares overflow.
+        intensities whose squares overflow; targets for a stored image.
     """
-    content = plain(image)
-    shape = " x ".join(map(str, content.image.shape))
+    source = source_of(image, statistics)
+    shape = " x ".join(map(str, source.grid.shape))
     given_sizes = "" if sizes is None or sizes == Sizes() else " and these limits on sizes"
-    limits = _block_limits(content, nodes, sizes)
-    fewest, by_target = _fewest_nodes(content, limits), _target_nodes(content, limits)
+    limits = _block_limits(source, nodes, sizes)
+    fewest, by_target = _fewest_nodes(source, limits), _target_nodes(source, limits)
     if max(fewest, by_target) > (1.0 + LARGEST_MISS) * nodes + LARGEST_MISS_NODES:
         least, enough = max(fewest, by_target), max(fewest, SIZED_OVER_EQUILATERAL * by_target)
-        if limits.target is None and enough <= content.image.data.size:  # the bound is low: the coarsest octree tells
-            enough = len(_octree_within(content, nodes, limits).points)
+        if limits.target is None and enough <= prod(source.grid.shape):  # the bound is low: the coarsest octree tells
+            enough = len(_octree_within(source, nodes, limits).points)
         raise InputError(
             f"octree: {nodes} nodes are too few for {shape} voxels{given_sizes}: they need {least:.4g} or more; "
             f"ask for {np.ceil(enough):.0f}, or allow longer edges"
         )
-    mesh = _octree_within(content, nodes, limits)
+    mesh = _octree_within(source, nodes, limits)
     count = len(mesh.points)
     # Exchanges take care of the rest.
-    if is_near(count, nodes) or content.region is not None or limits.target is not None:
+    if is_near(count, nodes) or source.inside is not None or limits.target is not None:
         return mesh
     raise InputError(
         f"octree: {nodes} nodes are too {'many' if count < nodes else 'few'} for {shape} voxels{given_sizes}: the "
@@ -122,14 +138,14 @@ class _BlockLimits(NamedTuple):
     n_rings: int  # blocks of a divided block's size around it, in every direction
 
 
-def _block_limits(content: Content, nodes: int, sizes: Sizes | None) -> _BlockLimits:
+def _block_limits(source: Source, nodes: int, sizes: Sizes | None) -> _BlockLimits:
     """The limits that the number of nodes and the sizes set; InputError where they cannot be kept."""
-    image = content.image
+    image = source.grid
     n = image.ndim
     fewest = 2**n + 1
     if not (isinstance(nodes, int | np.integer) and nodes >= fewest):
         raise InputError(f"octree: expected a whole number of nodes, {fewest} or more in {n}-D, got {nodes!r}")
-    if nodes > max(image.data.size, ALWAYS_ALLOWED_NODES):
+    if nodes > max(prod(image.shape), ALWAYS_ALLOWED_NODES):
         shape = " x ".join(map(str, image.shape))
         raise InputError(f"octree: {nodes} nodes are too many for {shape} voxels; ask for fewer")
     check_memory(OCTREE_NODE_BYTES * nodes, f"octree: {nodes} nodes", "ask for fewer")
@@ -138,8 +154,15 @@ def _block_limits(content: Content, nodes: int, sizes: Sizes | None) -> _BlockLi
     if sizes.smallest > longest_side:
         raise InputError(f"smallest: {sizes.smallest:g} mm is longer than the box, {longest_side:.4g} mm")
     smallest = sizes.smallest / SHORTEST_IN_BLOCK[n]
-    largest = max(sizes.longest_edge(image, nodes, content.volume) / LONGEST_IN_BLOCK[n], smallest)
-    target = _target(image, sizes) if sizes.has_target else None
+    largest = max(sizes.longest_edge(image, nodes, source.volume) / LONGEST_IN_BLOCK[n], smallest)
+    target = None
+    if sizes.has_target:
+        if not isinstance(image, Image):
+            raise InputError(
+                "sizes: largest and field are for each voxel of an image in memory, and this one is stored; "
+                "use smallest, longest, coarsest and gradation, or crop it"
+            )
+        target = _target(image, sizes)
     return _BlockLimits(largest, target, smallest, int(np.ceil(1.0 / sizes.slope - 1e-9)))
 
 
@@ -174,23 +197,23 @@ def nodes_of_sizes(image: Image | Content, sizes: Sizes) -> tuple[int, float]:
     return enough, float(np.mean(has_one if inside is None else has_one[inside]))
 
 
-def _fewest_nodes(content: Content, limits: _BlockLimits) -> float:
+def _fewest_nodes(source: Source, limits: _BlockLimits) -> float:
     """A lower bound of the nodes that the bounds need: two for each block as large as it may be."""
     with np.errstate(over="ignore"):  # a bound of 1e300 mm needs none
-        return float(2.0 * content.volume / np.float64(limits.largest) ** content.image.ndim)
+        return float(2.0 * source.volume / np.float64(limits.largest) ** source.grid.ndim)
 
 
-def _target_nodes(content: Content, limits: _BlockLimits) -> float:
+def _target_nodes(source: Source, limits: _BlockLimits) -> float:
     """The nodes of equilateral cells of the targets, where there are any."""
     if limits.target is None:
         return 0.0
-    inside = None if content.region is None else content.region.inside
-    return equilateral_nodes(limits.target, content.image, inside)
+    assert isinstance(source.grid, Image)
+    return equilateral_nodes(limits.target, source.grid, source.inside)
 
 
-def _check_not_below_voxels(image: Image, nodes: float) -> None:
+def _check_not_below_voxels(image: VoxelGrid, nodes: float) -> None:
     """InputError if there are more nodes than voxels."""
-    if nodes > max(image.data.size, ALWAYS_ALLOWED_NODES):
+    if nodes > max(prod(image.shape), ALWAYS_ALLOWED_NODES):
         raise InputError(
             "sizes: so short edges are asked for that cells are below voxels, and see nothing; allow longer ones"
         )
@@ -201,20 +224,25 @@ def is_near(count: int, nodes: int) -> bool:
     return abs(count - nodes) <= max(LARGEST_MISS * nodes, LARGEST_MISS_NODES)
 
 
-def nearest_octree(image: Image | Content, nodes: int, sizes: Sizes | None = None) -> Mesh:
+def nearest_octree(
+    image: Image | Content | StoredImage, nodes: int, sizes: Sizes | None = None, statistics: Statistics | None = None
+) -> Mesh:
     """As `octree`, but with any number of nodes, if the image or the limits on sizes allow no nearer one."""
-    return _octree_within(plain(image), nodes, _block_limits(plain(image), nodes, sizes))
+    source = source_of(image, statistics)
+    return _octree_within(source, nodes, _block_limits(source, nodes, sizes))
 
 
-def _octree_within(content: Content, nodes: int, limits: _BlockLimits) -> Mesh:
+def _octree_within(source: Source, nodes: int, limits: _BlockLimits) -> Mesh:
     """The octree within the limits that has most nearly so many nodes, cut off at the mask's surface."""
-    if content.region is None:
-        return _octree_of_box(content, nodes, limits)
+    region = None if source.content is None else source.content.region
+    if source.content is None or region is None:
+        return _octree_of_box(source, nodes, limits)
     # The surface takes away nodes and adds others; how many is known only afterwards.
-    best, in_box, fewest = None, nodes, 2**content.image.ndim + 1
+    image = source.content.image
+    best, in_box, fewest = None, nodes, 2**image.ndim + 1
     for trial in range(MASK_TRIALS):
         try:
-            mesh = clipped(_octree_of_box(content, in_box, limits), content.image, content.region)
+            mesh = clipped(_octree_of_box(source, in_box, limits), image, region)
         except InputError:  # the region is thinner than the cells
             if best is None and trial == MASK_TRIALS - 1:
                 raise
@@ -230,11 +258,11 @@ def _octree_within(content: Content, nodes: int, limits: _BlockLimits) -> Mesh:
     return best
 
 
-def _octree_of_box(content: Content, nodes: int, limits: _BlockLimits) -> Mesh:
+def _octree_of_box(source: Source, nodes: int, limits: _BlockLimits) -> Mesh:
     """The octree of the whole box that has most nearly so many nodes."""
-    image = content.image
-    _check_not_below_voxels(image, max(_fewest_nodes(content, limits), _target_nodes(content, limits)))
-    roots, divided = _best_division(content, nodes, limits)
+    image = source.grid
+    _check_not_below_voxels(image, max(_fewest_nodes(source, limits), _target_nodes(source, limits)))
+    roots, divided = _best_division(source, nodes, limits)
     index = _leaf_nodes(divided, roots) / np.array(roots) * image.shape - 0.5
     points = image.to_world(index)
     for tie_break in TIE_BREAKS:
@@ -242,39 +270,6 @@ def _octree_of_box(content: Content, nodes: int, limits: _BlockLimits) -> Mesh:
         if cells is not None and (size := volumes(points, cells)).min() > FLAT_VOLUME_SHARE * size.mean():
             return Mesh(points, cells)
     raise InputError(f"octree: Delaunay left flat cells on {len(index)} nodes; ask for another number")
-
-
-class _Voxels(NamedTuple):
-    """The fields of voxels that are summed over blocks."""
-
-    sums: list[NDArray[np.float64]]  # of each voxel: 1, all channels' squares, and each channel; 0 outside of the mask
-    outside: NDArray[np.float64] | None  # 1 for each voxel outside of the mask
-    noise: float  # variance
-    step: float  # squared difference between the two sides of the mask's surface
-
-
-def _voxels(content: Content) -> _Voxels:
-    """The channels less their means, at most 1: numbers of nodes do not depend on the unit of intensity."""
-    means = [float(np.mean(v, dtype=np.float64)) for v in content.values]
-    extremes = [abs(float(end) - m) for v, m in zip(content.values, means, strict=True) for end in (v.min(), v.max())]
-    scale = max(extremes)
-    if not np.isfinite(scale * scale * content.values[0].size):
-        raise InputError(f"image: squares of deviations up to {scale:.3g} overflow; rescale it first")
-    scale = scale or 1.0
-    inside = None if content.region is None else content.region.inside.astype(np.float64)
-    channels = []
-    for values, mean in zip(content.values, means, strict=True):
-        channel = np.subtract(values, mean, dtype=np.float64)
-        channel /= scale
-        channels.append(channel if inside is None else inside * channel)
-    square = channels[0] * channels[0]
-    for channel in channels[1:]:
-        square += channel * channel
-    # The noise is that of values at most 1, too: its estimate rounds differently otherwise.
-    noise = content.noise_of(channels)
-    if inside is None:
-        return _Voxels([np.broadcast_to(1.0, square.shape), square, *channels], None, noise, 0.0)
-    return _Voxels([inside, square, *channels], 1.0 - inside, noise, content.wrong_side / scale**2)
 
 
 class _Blocks(NamedTuple):
@@ -286,51 +281,76 @@ class _Blocks(NamedTuple):
 
 
 def _blocks_by_depth(
-    image: Image, voxels: _Voxels, roots: tuple[int, ...], limits: _BlockLimits
+    source: Source, channels: Channels, roots: tuple[int, ...], limits: _BlockLimits
 ) -> list[_Blocks]:  # fmt: skip
     """The blocks of each depth, the coarsest first, with their errors and whether they exceed the limits."""
+    image = source.grid
     edge = image.spacing * image.shape / np.array(roots)
-    depth, n_by_content = _depths(edge, image.spacing, limits)
-    variance = voxels.noise
-    spread = SPREAD_OF_VARIANCE * float(voxels.sums[1].sum() / voxels.sums[0].sum()) + SPREAD_OF_NOISE * variance
-    every = voxels.sums if voxels.outside is None else [*voxels.sums, voxels.outside]
-    n_blocks = float(np.prod(np.array(roots) * 2.0**depth))
-    need = BLOCK_FIELD_BYTES * n_blocks * (len(every) + OTHER_FIELDS)
+    depth, n_by_content = _depths(edge, roots, image.spacing, limits)
+    counts = np.array(roots) << depth
+    n_blocks, n_fields = float(np.prod(counts, dtype=np.float64)), len(channels.means) + 1 + (source.inside is not None)
+    need = BLOCK_FIELD_BYTES * n_blocks * (n_fields + OTHER_FIELDS) + (source.stored is not None) * 2.0 * READ_BYTES
     check_memory(need, f"octree: {n_blocks:.3g} blocks", "allow longer edges, or crop the image")
-    sums = [_block_totals(field, np.array(roots) << depth, np.add) for field in every]
-    target = None
-    if limits.target is not None:
-        target = _block_totals(limits.target, np.array(roots) << depth, np.minimum, NO_BOUND_MM)
+    sums = block_sums(source, channels, counts)
+    spread = SPREAD_OF_VARIANCE * float(sums.second.sum() / source.n_voxels) + SPREAD_OF_NOISE * channels.noise
+    target = None if limits.target is None else _least_targets(limits.target, counts)
     blocks = []
     for d in range(depth, -1, -1):
-        count, second, *firsts = sums[: len(voxels.sums)]
-        free = np.maximum(count - 1.0, 0.0)
-        noise = variance * (free + NOISE_SIGMAS * np.sqrt(2.0 * free))  # a chi-squared sum, and deviations of it
-        squares = sum(first**2 for first in firsts)
-        error = np.maximum(second - squares / np.maximum(count, 1.0) - noise, 0.0)
-        if voxels.outside is not None:
-            error += voxels.step * count * sums[-1] / np.maximum(count + sums[-1], 1.0)
-        may_be_divided = edge.min() / 2 ** (d + 1) >= limits.smallest
-        is_too_large = np.full(count.shape, limits.largest * (1.0 + 1e-9) < edge.max() / 2**d and may_be_divided)
+        may_be_divided = _may_be_divided(edge, d, limits)
+        is_too_large = np.full(sums.second.shape, _is_too_large(edge, d, limits))
         if target is not None and d < depth and may_be_divided:
             is_too_large |= _divided_for(target, float(np.prod(edge)) ** (1 / image.ndim) / 2**d)
-        is_in_region = count > 0.0 if voxels.outside is not None else np.ones(count.shape, dtype=bool)
-        error = (error + spread * count) * _uneven(error.shape) * (d < n_by_content)
+        is_in_region = np.ones(is_too_large.shape, dtype=bool) if sums.inside is None else sums.inside > 0.0
+        error = _errors(sums, channels, spread) if d < n_by_content else np.zeros(is_too_large.shape)
         blocks.append(_Blocks(error, is_too_large & is_in_region, is_in_region))
         if d > 0:
-            half = np.array(count.shape) // 2
-            sums = [_block_totals(total, half, np.add) for total in sums]
-            target = None if target is None else _block_totals(target, half, np.minimum, NO_BOUND_MM)
+            sums = sums.coarser()
+            target = None if target is None else halved(target, np.minimum)
     return blocks[::-1]
 
 
-def _depths(edge: NDArray[np.float64], spacing: NDArray[np.float64], limits: _BlockLimits) -> tuple[int, int]:
+def _errors(sums: BlockSums, channels: Channels, spread: float) -> NDArray[np.float64]:
+    """What each block counts: its sum of squared deviations less the noise's, and the spread; layer by layer."""
+    errors = np.empty(sums.second.shape)
+    others = tuple(slice(0, size) for size in sums.second.shape[1:])
+    step = max(LAYER_BLOCKS // prod(errors.shape[1:]), 1)
+    for start in range(0, len(errors), step):
+        layers = slice(start, min(start + step, len(errors)))
+        voxels = sums.voxels(layers)
+        count = voxels if sums.inside is None else sums.inside[layers]
+        free = np.maximum(count - 1.0, 0.0)
+        # A chi-squared sum, and deviations of it.
+        noise = channels.noise * (free + NOISE_SIGMAS * np.sqrt(2.0 * free))
+        squares = sum(first[layers] ** 2 for first in sums.firsts)
+        error = np.maximum(sums.second[layers] - squares / np.maximum(count, 1.0) - noise, 0.0)
+        if sums.inside is not None:
+            error += channels.step * count * (voxels - count) / np.maximum(voxels, 1.0)
+        place = np.ogrid[layers, *others]
+        errors[layers] = (error + spread * count) * _uneven(*place)
+    return errors
+
+
+def _may_be_divided(edge: NDArray[np.float64], depth: int, limits: _BlockLimits) -> bool:
+    """Whether halves of blocks of this depth, of roots of these edges (n,), mm, are as long as the smallest."""
+    return bool(edge.min() / 2 ** (depth + 1) >= limits.smallest)
+
+
+def _is_too_large(edge: NDArray[np.float64], depth: int, limits: _BlockLimits) -> bool:
+    """Whether all blocks of this depth must be divided."""
+    return bool(limits.largest * (1.0 + 1e-9) < edge.max() / 2**depth) and _may_be_divided(edge, depth, limits)
+
+
+def _depths(
+    edge: NDArray[np.float64], roots: tuple[int, ...], spacing: NDArray[np.float64], limits: _BlockLimits
+) -> tuple[int, int]:
     """The depths to which roots of these edges (n,), mm, may be divided at all, and for the content's sake."""
     n_by_content = 0
     while True:
         half = edge / 2 ** (n_by_content + 1)
         voxels = half / spacing
         if voxels.max() < LEAF_VOXELS or voxels.min() < 0.25 * LEAF_VOXELS or half.min() < limits.smallest:
+            break
+        if prod(roots) * 2 ** (len(roots) * (n_by_content + 1)) > MOST_BLOCKS:
             break
         n_by_content += 1
     depth = n_by_content
@@ -355,55 +375,52 @@ def _divided_for(target: NDArray, edge: float) -> NDArray[np.bool_]:
     """
     n = target.ndim
     more = (USUAL_IN_BLOCK[n] * edge / target) ** n - 1.0
-    share = (_uneven(target.shape) - 1.0) / TIE_SPREAD
+    share = (_uneven(*np.ogrid[tuple(slice(0, size) for size in target.shape)]) - 1.0) / TIE_SPREAD
     return np.asarray(more > np.maximum((2**n - 1) * share, TARGET_SLACK))
 
 
-def _uneven(shape: tuple[int, ...]) -> NDArray[np.float64]:
+def _uneven(*index: NDArray[np.int64]) -> NDArray[np.float64]:
     """Factors 1 to 1 + `TIE_SPREAD`, all different: of blocks that are alike first some are divided, here and there.
 
-    The fractional parts of multiples of the plastic number's powers fill any region evenly (Roberts 2018).
+    `index` has the blocks' places along each axis. The fractional parts of multiples of the plastic number's powers
+    fill any region evenly (Roberts 2018).
     """
-    place = np.stack(np.meshgrid(*[np.arange(s) for s in shape], indexing="ij"), axis=-1)
-    return 1.0 + TIE_SPREAD * np.mod(
-        place @ np.array([0.8191725133961645, 0.6710436067037893, 0.5497004779019703])[: place.shape[-1]], 1.0
-    )
+    place = sum(factor * along for factor, along in zip(UNEVEN_FACTORS, index, strict=False))
+    return 1.0 + TIE_SPREAD * np.mod(place, 1.0)
 
 
-def _block_totals(data: NDArray, counts: NDArray[np.int64], total_of: np.ufunc, empty: float = 0.0) -> NDArray:
-    """Sums, or minima, over equal blocks: a voxel counts where its centre is; a block without centres is `empty`."""
+def _least_targets(data: NDArray, counts: NDArray[np.int64]) -> NDArray:
+    """Minima over equal blocks: a voxel counts where its centre is; a block without centres has no target."""
     for axis, count in enumerate(counts):
         size = data.shape[axis]
-        start = np.ceil(np.arange(count) * (size / count) - 0.5).astype(np.int64)
-        length = np.append(start[1:], size) - start
+        start = block_starts(size, count)
+        length = np.diff(start, append=size)
         # The first voxel of each block, the second of each that has one, ...: five times as fast as `reduceat`.
         data = np.moveaxis(data, axis, 0)
-        total = data[np.minimum(start, size - 1)]
-        total[length == 0] = empty
+        least = data[np.minimum(start, size - 1)]
+        least[length == 0] = NO_BOUND_MM
         for k in range(1, length.max()):
             longer = length > k
-            of_longer = slice(None) if longer.all() else longer
-            total[of_longer] = total_of(total[of_longer], data[start[longer] + k])
-        data = np.moveaxis(total, 0, axis)
+            least[longer] = np.minimum(least[longer], data[start[longer] + k])
+        data = np.moveaxis(least, 0, axis)
     return data
 
 
-def _best_division(
-    content: Content, nodes: int, limits: _BlockLimits
-) -> tuple[tuple[int, ...], list[NDArray[np.bool_]]]:
+def _best_division(source: Source, nodes: int, limits: _BlockLimits) -> tuple[tuple[int, ...], list[NDArray[np.bool_]]]:
     """Numbers of roots along each axis, and which blocks are divided, of the octree with most nearly so many nodes.
 
     Where many blocks are alike, they are all divided or none, and some numbers cannot be reached from one size of
     undivided blocks: then others are tried, at last the lattice that has the number by itself.
     """
     best: tuple[int, tuple[int, ...], list[NDArray[np.bool_]]] | None = None
-    image, voxels = content.image, _voxels(content)
+    image, channels = source.grid, channels_of(source)
     for roots in _root_counts(image, nodes, limits):
         if (np.array(image.shape) / roots).max() < LEAF_VOXELS and best is not None:
             break
-        blocks = _blocks_by_depth(image, voxels, roots, limits)
-        if blocks[-1].is_too_large.any():
+        edge = image.spacing * image.shape / np.array(roots)
+        if _is_too_large(edge, _depths(edge, roots, image.spacing, limits)[0], limits):
             continue
+        blocks = _blocks_by_depth(source, channels, roots, limits)
         count, divided = _division(blocks, roots, nodes, limits.n_rings)
         if best is None or abs(count - nodes) < abs(best[0] - nodes):
             best = count, roots, divided
@@ -418,7 +435,7 @@ def _best_division(
     return best[1:]
 
 
-def _root_counts(image: Image, nodes: int, limits: _BlockLimits) -> Iterator[tuple[int, ...]]:
+def _root_counts(image: VoxelGrid, nodes: int, limits: _BlockLimits) -> Iterator[tuple[int, ...]]:
     """Numbers of roots along each axis to try, within the limits: the largest blocks first."""
     largest, smallest = limits.largest, limits.smallest
     lengths = image.spacing * image.shape
@@ -444,19 +461,26 @@ def _division(
     The threshold is found by bisection.
     """
     # A finer block may hold the largest error: noise is taken off the coarser ones, too.
-    above = np.concatenate([at_depth.error[at_depth.error > 0.0] for at_depth in blocks])
-    low, high = (0.5 * float(above.min()), 2.0 * float(above.max())) if len(above) else (0.5, 1.0)
-    best_count, best = -1, []
+    above = [at_depth.error[at_depth.error > 0.0] for at_depth in blocks]
+    ends = [(float(errors.min()), float(errors.max())) for errors in above if len(errors)]
+    low, high = (0.5 * min(ends)[0], 2.0 * max(high for _, high in ends)) if ends else (0.5, 1.0)
+    del above
+    is_in_region = [at_depth.is_in_region for at_depth in blocks]
+    best_count, best, is_bound = -1, [], False
     for _ in range(BISECTION_STEPS):
         middle = np.sqrt(max(low, 1e-300) * high)
         divided = _divided(blocks, middle, n_rings)
-        count = len(_leaf_nodes(divided, roots, [at_depth.is_in_region for at_depth in blocks]))
+        # Of far too many leaves, each with its centre, a bound of the nodes is enough: it is no nearer than any number
+        # that is counted, and it rises as the threshold falls.
+        n_leaves = _n_leaves(divided, roots, is_in_region)
+        is_skipped = n_leaves > SKIPPED_SHARE * nodes
+        count = NODES_OF_LEAF * n_leaves if is_skipped else len(_leaf_nodes(divided, roots, is_in_region))
         if best_count < 0 or abs(count - nodes) < abs(best_count - nodes):
-            best_count, best = count, divided
+            best_count, best, is_bound = count, divided, is_skipped
         if abs(count - nodes) <= BISECTION_MISS * nodes or high <= low * (1.0 + 1e-9):
             break
         low, high = (middle, high) if count > nodes else (low, middle)
-    return best_count, best
+    return len(_leaf_nodes(best, roots, is_in_region)) if is_bound else best_count, best
 
 
 def _divided(blocks: list[_Blocks], threshold: float, n_rings: int) -> list[NDArray[np.bool_]]:
@@ -475,6 +499,25 @@ def _divided(blocks: list[_Blocks], threshold: float, n_rings: int) -> list[NDAr
     return divided
 
 
+def _leaves(divided: list[NDArray[np.bool_]], roots: tuple[int, ...]) -> Iterator[NDArray[np.bool_]]:
+    """Which blocks of each depth are leaves, the coarsest first."""
+    exists = np.ones(roots, dtype=bool)
+    for is_divided in divided:
+        yield exists & ~is_divided
+        exists = is_divided
+        for axis in range(len(roots)):
+            exists = np.repeat(exists, 2, axis=axis)
+    yield exists
+
+
+def _n_leaves(
+    divided: list[NDArray[np.bool_]], roots: tuple[int, ...], is_in_region: list[NDArray[np.bool_]]
+) -> int:  # fmt: skip
+    """The number of leaves in the region."""
+    leaves = zip(_leaves(divided, roots), is_in_region, strict=True)
+    return sum(int(np.count_nonzero(is_leaf & is_in)) for is_leaf, is_in in leaves)
+
+
 def _leaf_nodes(
     divided: list[NDArray[np.bool_]], roots: tuple[int, ...], is_in_region: list[NDArray[np.bool_]] | None = None
 ) -> NDArray[np.float64]:
@@ -485,17 +528,11 @@ def _leaf_nodes(
     n, depth = len(roots), len(divided)
     corner = np.stack(np.meshgrid(*[[0, 2]] * n, indexing="ij"), axis=-1).reshape(-1, n)
     of_leaf = np.vstack([corner, np.ones((1, n), dtype=np.int64)])  # in halves of a leaf
-    exists = np.ones(roots, dtype=bool)
-    halves = []  # of the smallest leaves
-    for d in range(depth + 1):
-        is_divided = divided[d] if d < depth else np.zeros(exists.shape, dtype=bool)
-        is_leaf = exists & ~is_divided
-        leaves = np.argwhere(is_leaf if is_in_region is None else is_leaf & is_in_region[d])
-        halves.append(((2 * leaves[:, None, :] + of_leaf) << (depth - d)).reshape(-1, n))
-        exists = is_divided
-        for axis in range(n):
-            exists = np.repeat(exists, 2, axis=axis)
-    every = np.concatenate(halves)
-    size = (np.array(roots) << (depth + 1)) + 1
-    code = np.unique(np.ravel_multi_index(tuple(every.T), tuple(size)))
-    return np.stack(np.unravel_index(code, tuple(size)), axis=-1) / 2.0 ** (depth + 1)
+    size = (np.array(roots) << (depth + 1)) + 1  # in halves of the smallest leaves
+    steps = np.append(np.cumprod(size[:0:-1])[::-1], 1)  # in a node's number, which has its place along all axes
+    codes = []
+    for d, is_leaf in enumerate(_leaves(divided, roots)):
+        leaves = np.nonzero(is_leaf if is_in_region is None else is_leaf & is_in_region[d])
+        first = sum(2 * int(step) * along for step, along in zip(steps, leaves, strict=True))
+        codes.append(((np.asarray(first)[:, None] + of_leaf @ steps) << (depth - d)).ravel())
+    return np.stack(np.unravel_index(np.unique(np.concatenate(codes)), tuple(size)), axis=-1) / 2.0 ** (depth + 1)

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides
-from tetopt.image import Image
+from tetopt.image import Image, VoxelGrid
 from tetopt.kernel_cache import njit
 from tetopt.start.lattice import near_cubes
 
@@ -111,7 +111,7 @@ class Sizes(NamedTuple):
             raise InputError("field: no voxel is above 0; give lengths in mm")
         return self if self.field is None else self._replace(field=_graded(self.field, self.slope))
 
-    def longest_edge(self, image: Image, nodes: int, volume: float | None = None) -> float:
+    def longest_edge(self, image: VoxelGrid, nodes: int, volume: float | None = None) -> float:
         """The longest edge that any cell may have, mm; `volume`, mm^n, is that of the mesh, by default of the box."""
         if self.longest is not None:
             return self.longest

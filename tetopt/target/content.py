@@ -19,10 +19,8 @@ from tetopt.image import Image
 from tetopt.target.domain import INSIDE_SHARE, Region, region_of
 from tetopt.target.labels import check_labels, label_channels
 from tetopt.target.memberships import Memberships, finer, memberships, supersampling
+from tetopt.target.noise import noise_level
 
-SAMPLED_VOXELS = 100_000  # of these the most frequent value is taken for the background's
-NOISE_VOXELS = 1_000_000  # of these, or more, the noise is estimated; all of a smaller image's
-MOST_LABEL_VALUES = 32  # an image of no more values than this is one of labels, and has no noise
 RARITY_POWER = 0.5  # of a label's share of the voxels, by which each of its voxels counts less
 SAME_PLACE_VOXELS = 1e-2  # voxel centres that lie no further apart are in the same place
 STEPS_PER_SIGMA = 256.0  # whole numbers in a contrast's standard deviation, at least
@@ -80,12 +78,8 @@ class Content(NamedTuple):
     @property
     def noise(self) -> float:
         """Variance of the contrasts' noise, in the unit of `values`; labels have none."""
-        return self.noise_of(self.values)
-
-    def noise_of(self, channels: NDArray | Sequence[NDArray]) -> float:
-        """The same of the channels in another unit."""
         inside = None if self.region is None else self.region.inside
-        return float(sum(noise_level(v, inside) ** 2 for v in channels[: self.n_contrasts]))
+        return float(sum(noise_level(values, inside) ** 2 for values in self.values[: self.n_contrasts]))
 
 
 def content(
@@ -311,38 +305,3 @@ def _one_hot(labels: NDArray[np.int64], region: Region | None) -> tuple[NDArray[
     codes = np.where(channel == np.arange(channel.max() + 1)[:, None], size, 0.0)
     spread = float((codes**2 @ share - (codes @ share) ** 2).sum())
     return number, (codes / np.sqrt(spread) if len(share) > 1 else codes[:0])
-
-
-def noise_level(data: NDArray, inside: NDArray[np.bool_] | None = None) -> float:
-    """Standard deviation of the noise in an image's data, from what second differences along every axis leave of it.
-
-    Structure wider than a voxel cancels in (1, -2, 1) taken along all axes (Immerkaer 1996, here in n-D); the lower
-    quartile of its size is that of noise in most of the volume. A background of one value, cut out, does not count;
-    what is left in less than a tenth of the voxels are edges, not noise, and labels have none. Noise that was smoothed
-    is underestimated. With `inside` only the voxels there, and not beside others, are looked at. Of a large image these
-    are about `NOISE_VOXELS`, in slices an odd number apart along the first axis: four real volumes came out within
-    0.7 % of what all of their voxels say, to the last bit where intensities are whole numbers.
-    """
-    if min(data.shape) < 3:
-        return 0.0
-    # An image of few values is one of labels, which have no noise.
-    values, often = np.unique(data.ravel()[:: max(data.size // SAMPLED_VOXELS, 1)], return_counts=True)
-    if len(values) <= MOST_LABEL_VALUES:
-        return 0.0
-    step = max((data.size // NOISE_VOXELS - 1) // 2 * 2 + 1, 1)
-    middles = np.arange(1 + (data.shape[0] - 3) % step // 2, data.shape[0] - 1, step)
-    before, at, after = (data[middles + k].astype(np.float64) for k in (-1, 0, 1))
-    rest = (after - at) - (at - before)
-    for axis in range(1, data.ndim):
-        rest = np.diff(rest, n=2, axis=axis)
-    middle = (slice(None), *(slice(1, -1),) * (data.ndim - 1))
-    is_counted = (rest != 0.0) | (data[middles][middle] != values[often.argmax()])
-    n_voxels = rest.size
-    if inside is not None:
-        n_voxels = int(inside[middles].sum())
-        within = inside[middles - 1] & inside[middles] & inside[middles + 1]
-        is_counted &= scipy.ndimage.minimum_filter(within, (1, *(3,) * (data.ndim - 1)))[middle]
-    size = np.abs(rest[is_counted])
-    if np.count_nonzero(size) < 0.1 * n_voxels:
-        return 0.0
-    return float(np.quantile(size, 0.25) / 0.31864 / 6.0 ** (data.ndim / 2))
