@@ -22,7 +22,8 @@ from tetopt.engine.loop import Optimized, Record
 from tetopt.engine.meshing import bytes_of
 from tetopt.fem.elasticity import stiffness
 from tetopt.fem.reference import reference
-from tetopt.start.octree import _block_limits, _blocks_by_depth, _voxels
+from tetopt.start.octree import _block_limits, _blocks_by_depth
+from tetopt.start.sums import channels_of, source_of
 from tetopt.target.content import content, plain
 from tetopt.target.memberships import memberships
 
@@ -95,11 +96,11 @@ def test_a_limit_counts_what_there_is(monkeypatch):
 
 IMAGE = tetopt.Image(np.random.default_rng(0).integers(1, 4, (9, 8, 7)).astype(float), np.diag([1.0, 1.0, 3.0, 1.0]))
 LATTICE = tetopt.lattice(IMAGE, blocks=(2, 2, 2))
-LIMITS = _block_limits(plain(IMAGE), 100, None)
+LIMITS = _block_limits(source_of(IMAGE), 100, None)
 TASKS = {
     "lattice: .* nodes: needs.*ask for fewer": lambda: tetopt.lattice(IMAGE, spacing=0.1),
     "octree: .* blocks: needs.*allow longer edges, or crop": lambda: _blocks_by_depth(
-        IMAGE, _voxels(plain(IMAGE)), (2, 2, 2), LIMITS
+        source_of(IMAGE), channels_of(source_of(IMAGE)), (2, 2, 2), LIMITS
     ),
     "phantom 'sphere': .* voxels: needs.*take larger": lambda: tetopt.load_phantom("sphere").image(),
     "image: 2 sums of 9 x 8 x 7 voxels: needs.*crop it": lambda: sampling_grid(IMAGE, LATTICE.points),
