@@ -597,7 +597,7 @@ def test_missing_file(tmp_path, name):
 def test_unknown_suffix(tmp_path):
     path = tmp_path / "a.xyz"
     path.write_bytes(b"hello")
-    known = ".nii.gz, .nii, .mgz, .mgh, .nrrd, .nhdr, .mha, .mhd, .dcm, .png, .tif, .tiff, .jpg, .jpeg, .bmp"
+    known = ".nii.gz, .nii, .mgz, .mgh, .nrrd, .nhdr, .mha, .mhd, .dcm, .png, .tif, .tiff, .jpg, .jpeg, .bmp, .zarr"
     assert_refused(path, f"unknown kind .*{re.escape(known)}, or a folder of DICOM files")
 
 

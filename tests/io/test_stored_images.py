@@ -1,5 +1,6 @@
 """Stored volumes: each voxel with its value and place as where they are read whole; one line for what cannot be."""
 
+import os
 import re
 import shutil
 
@@ -8,11 +9,12 @@ import numpy as np
 import pytest
 from commands import exit_code
 
+from tetopt import budget
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.io import zarr_images
-from tetopt.io.images import load_image
-from tetopt.io.stored_images import open_stored
+from tetopt.io.images import file_shape, load_image, sha256
+from tetopt.io.stored_images import coarse_image, open_stored, stored_checksum
 from tetopt.io.zarr_images import save_zarr
 from tetopt.phantom import load_phantom
 from tetopt.stored import StoredImage
@@ -152,3 +154,135 @@ def test_only_a_folder_of_zarr_is_replaced(tmp_path, monkeypatch, capfd):
     command_refused(capfd, [*command[:-1], "no/c.zarr"], "its folder does not exist")
     command_refused(capfd, ["phantom", "disc_2d", "-o", "d.zarr"], "expected a phantom in three dimensions")
     assert sorted(each.name for each in tmp_path.iterdir()) == ["a.zarr", "b.zarr", "c.zarr"]
+
+
+# What the rest of the package asks of a folder of Zarr
+
+
+@pytest.fixture(scope="module")
+def pyramid(tmp_path_factory):
+    """Two channels, two levels and an anisotropic place."""
+    voxels = ramp(2, 6, 5, 4)
+    levels = [
+        (voxels, transforms([1, 3, 2, 1], [0, 30, 20, 10])),
+        (voxels[:, ::2, ::2, ::2], transforms([1, 6, 4, 2], [0, 30, 20, 10])),
+    ]
+    folder = tmp_path_factory.mktemp("pyramid")
+    return write_ome(folder / "a.ome.zarr", levels, axes_of("czyx", "millimeter")), voxels
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        {},
+        {"crop": [(1, 5), (None, 3), (2, None)]},
+        {"slice_": (1, 2)},
+        {"slice_": (0, 3), "crop": [(1, 5), (1, 3), (0, 2)]},
+    ],
+)
+def test_loaded_as_a_nifti_file_of_the_same_voxels(pyramid, tmp_path, options):
+    path, voxels = pyramid
+    affine = [[0, 0, 1, 10], [0, 2, 0, 20], [3, 0, 0, 30], [0, 0, 0, 1]]
+    nibabel.save(nibabel.Nifti1Image(voxels[1], np.array(affine)), tmp_path / "a.nii")
+    image, other = load_image(path, volume=1, **options), load_image(tmp_path / "a.nii", **options)
+    np.testing.assert_array_equal(image.data, other.data)
+    np.testing.assert_allclose(image.affine, other.affine, rtol=1e-15)
+
+
+def test_only_the_box_that_is_asked_for_is_read(pyramid, tmp_path):
+    """A chunk that is damaged is seen only where it is needed, and told with the voxels that cannot be read."""
+    path = tmp_path / "a.zarr"
+    shutil.copytree(pyramid[0], path)
+    chunk = path / "0" / "c" / "0" / "1" / "0" / "0"
+    chunk.write_bytes(chunk.read_bytes()[:9])
+    assert load_image(path, volume=0, crop=[(0, 4), (None, None), (None, None)]).shape == (4, 5, 4)
+    message = rf"^{re.escape(str(path / '0'))}: its voxels 0:6, 0:5, 0:4 cannot be read \(.*\); copy it again$"
+    with pytest.raises(InputError, match=message):
+        load_image(path, volume=0)
+    with pytest.raises(InputError, match=message.replace("0:6", "4:6")):
+        open_stored(path, volume=0).box((4, 0, 0), (6, 5, 4))
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({}, r"2 volumes along c \(2\); choose one, 0 to 1"),
+        ({"volume": 2}, "volume 2 asked for"),
+        ({"volume": 0, "crop": [(0, 9), (0, 1), (0, 1)]}, "crop: along axis 0 expected"),
+        ({"volume": 0, "crop": [(0, 1)]}, "crop: expected 3 ranges"),
+        ({"volume": 0, "slice_": (3, 1)}, "slice: the axis must be"),
+        ({"volume": 0, "slice_": (0, 6)}, "slice: index along axis 0 must be"),
+        ({"volume": 0, "slice_": (0, 1), "crop": [(2, 5), (1, 3), (0, 2)]}, "slice: index 1 along axis 0 lies outside"),
+    ],
+)
+def test_bad_parts_of_a_folder(pyramid, options, match):
+    with pytest.raises(InputError, match=re.escape(f"{pyramid[0]}: ") + ".*" + match):
+        load_image(pyramid[0], **options)
+    if "slice_" not in options:
+        assert_refused(pyramid[0], match, **options)
+
+
+def test_what_does_not_fit_into_memory_is_not_read(pyramid, monkeypatch):
+    monkeypatch.setattr(budget, "available_bytes", lambda: 1000)
+    with pytest.raises(InputError, match="its 6 x 5 x 4 voxels: needs about"):
+        load_image(pyramid[0], volume=0)
+    assert load_image(pyramid[0], volume=0, crop=[(0, 2)] * 3).shape == (2, 2, 2)
+
+
+def test_shape_of_a_folder_begins_with_space(pyramid, tmp_path):
+    assert file_shape(pyramid[0]) == (6, 5, 4, 2)
+    (tmp_path / "b.zarr").mkdir()
+    with pytest.raises(InputError, match=r"b\.zarr: no array of Zarr in this folder"):
+        file_shape(tmp_path / "b.zarr")
+
+
+def test_checksums_of_a_folder(pyramid, tmp_path):
+    path = shutil.copytree(pyramid[0], tmp_path / "a.zarr")
+    whole, cheap = sha256(path), stored_checksum(path)
+    assert whole == sha256(pyramid[0])
+    assert cheap == stored_checksum(path)
+    chunk = path / "0" / "c" / "0" / "1" / "0" / "0"
+    voxels = chunk.read_bytes()
+    chunk.write_bytes(bytes([*voxels[:-1], voxels[-1] ^ 1]))
+    assert sha256(path) != whole
+    assert stored_checksum(path) != cheap  # by its time
+    chunk.write_bytes(voxels)
+    chunk.rename(chunk.with_name("7"))
+    assert sha256(path) != whole  # names count
+    (path / "again").symlink_to(path)  # ends
+    sha256(path)
+    os.mkfifo(path / "pipe")
+    with pytest.raises(InputError, match="pipe: expected a regular file, got a pipe"):
+        stored_checksum(path)
+
+
+def test_cheap_checksum_of_a_file(tmp_path):
+    path = tmp_path / "a.nii"
+    nibabel.save(nibabel.Nifti1Image(ramp(3, 3, 3), np.eye(4)), path)
+    before = stored_checksum(path)
+    os.utime(path, ns=(0, 12345))
+    assert stored_checksum(path) != before
+    with pytest.raises(InputError, match="no such file"):
+        stored_checksum(tmp_path / "b.nii")
+
+
+def test_coarse_levels(pyramid, tmp_path):
+    path, voxels = pyramid
+    coarse = coarse_image(path, 119, volume=1)
+    np.testing.assert_array_equal(coarse.data, voxels[1, ::2, ::2, ::2])
+    np.testing.assert_array_equal(coarse.affine, [[0, 0, 2, 10], [0, 4, 0, 20], [6, 0, 0, 30], [0, 0, 0, 1]])
+    np.testing.assert_array_equal(coarse_image(path, 120, volume=1).data, voxels[1])
+    assert coarse_image(path, 17, volume=1) is None
+    nibabel.save(nibabel.Nifti1Image(ramp(3, 3, 3), np.eye(4)), tmp_path / "a.nii")
+    assert coarse_image(tmp_path / "a.nii", 1000) is None
+
+
+def test_coarse_levels_of_an_oblique_image(tmp_path):
+    """The finest level's own affine turns the others with it."""
+    levels = [(ramp(4, 4, 4), transforms([1, 1, 1])), (ramp(2, 2, 2), transforms([2, 2, 2], [0.5] * 3))]
+    path = write_ome(tmp_path / "a.zarr", levels, axes_of("xyz", "millimeter", turned=None))
+    zarr.open(path / "0").attrs["affine"] = OBLIQUE
+    np.testing.assert_array_equal(open_stored(path).affine, OBLIQUE)
+    coarse = coarse_image(path, 8)
+    np.testing.assert_allclose(coarse.to_world([0, 0, 0]), open_stored(path).to_world([0.5, 0.5, 0.5]))
+    np.testing.assert_allclose(coarse.to_world([1, 1, 1]), open_stored(path).to_world([2.5, 2.5, 2.5]))

@@ -13,7 +13,7 @@ import re
 import threading
 import warnings
 import zlib
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -35,13 +35,15 @@ from tetopt.io.itk_headers import HEADED_SUFFIXES, data_files, header_sizes
 from tetopt.io.pictures import PICTURE_SUFFIXES, read_picture
 from tetopt.io.read_itk import ITK_READERS, read_dicom_folder, read_itk
 from tetopt.io.volumes import DAMAGED_FILE, UNREADABLE_FILE, check_room, one_line, volume_index
+from tetopt.io.zarr_images import ZARR_SUFFIX, is_zarr, open_zarr, zarr_levels
+from tetopt.stored import StoredImage
 
 Bounds = Sequence[tuple[int | None, int | None]]
 """One half-open (start, stop) range of voxel indices for each axis; None is an open end."""
 
 OUTPUT_SUFFIXES = (".nii", ".nii.gz")
 _NIBABEL_SUFFIXES = (".nii.gz", ".nii", ".mgz", ".mgh")
-_KNOWN_SUFFIXES = ", ".join((*_NIBABEL_SUFFIXES, *ITK_READERS, *PICTURE_SUFFIXES))
+_KNOWN_SUFFIXES = ", ".join((*_NIBABEL_SUFFIXES, *ITK_READERS, *PICTURE_SUFFIXES, ZARR_SUFFIX))
 
 # What the two libraries raise on damaged files.
 _READER_ERRORS = (OSError, EOFError, ValueError, TypeError, KeyError)
@@ -67,11 +69,12 @@ def load_image(
     slice_: tuple[int, int] | None = None,
     crop: Bounds | None = None,
 ) -> Image:
-    """The image in a file, or in a folder of DICOM slices, placed in RAS+ millimetres.
+    """The image in a file, in a folder of Zarr or of DICOM slices, placed in RAS+ millimetres.
 
     The suffix, in any case, decides the format: NIfTI and MGZ are read by nibabel; NRRD, MetaImage and DICOM
-    by SimpleITK (the extra ``tetopt[itk]``); 2-D pictures by Pillow. Axes of length 1 beyond the third are
-    dropped.
+    by SimpleITK (the extra ``tetopt[itk]``); 2-D pictures by Pillow; OME-Zarr and arrays of Zarr by zarr (the extra
+    ``tetopt[blocks]``), of which only the part that is asked for is read; `tetopt.io.stored_images.open_stored` tells
+    how they are placed. Axes of length 1 beyond the third are dropped.
 
     NIfTI's scaling, its sform (else qform) and its spatial unit are honoured. ITK's LPS world is turned to
     RAS. A DICOM series takes its slice axis from the positions of its first and last slice, so a tilted
@@ -81,10 +84,10 @@ def load_image(
     Parameters
     ----------
     path : str or Path
-        File, or folder with one DICOM series.
+        File, or folder of Zarr or with one DICOM series.
     volume : int, optional
         Which volume of a 4-D file or frame of a picture, from 0; it is the only one held in memory. With more
-        than four axes the fourth runs fastest, as in the file.
+        than four axes the fourth runs fastest, as in the file; of Zarr's axes that are none of space the last.
     slice_ : (axis, index), optional
         Take one slice of a 3-D volume as a 2-D image, see `image_slice`.
     crop : sequence of (start, stop), optional
@@ -101,23 +104,30 @@ def load_image(
     InputError
         ``"<path>: ..."`` in one line: a file that is missing, unreadable, empty, of unknown kind, truncated
         or damaged; SimpleITK needed and not installed; a folder without a DICOM series, with several, or with
-        uneven slices; several volumes and no `volume`, or one out of range; a bad `slice_` or `crop`; RGB,
-        complex, NaN or infinite values; an empty axis; a singular affine.
+        uneven slices; a folder of Zarr that `open_stored` refuses; several volumes and no `volume`, or one out of
+        range; a bad `slice_` or `crop`; RGB, complex, NaN or infinite values; an empty axis; a singular affine.
 
     Warns
     -----
     UserWarning
         The image is constant, so its discretization error is 0 on every mesh; the file has no orientation; its header
-        was mended; its box is longer than 3 m or shorter than 1 mm, pictures aside.
+        was mended; its box is longer than 3 m or shorter than 1 mm, pictures aside; chunks are missing that stand for a
+        value.
     """
     path = Path(path)
     notes: list[str] = []
+    whole: VoxelGrid
     try:
-        data, affine = _read(path, volume, notes)
-        whole = Image(data, affine)
-        image = part_of(whole, slice_, crop)
+        with os_errors_named():
+            is_stored = is_zarr(path)
+        if is_stored:
+            whole = open_zarr(zarr_levels(path, notes)[0], volume, notes)
+            image = _part_of_stored(whole, slice_, crop)
+        else:
+            whole = image = Image(*_read(path, volume, notes))
+            image = part_of(image, slice_, crop)
     except InputError as error:
-        raise InputError(f"{path}: {one_line(error)}") from error
+        raise named_error(path, error) from error
     if not path.name.lower().endswith(PICTURE_SUFFIXES):  # whose pixels are 1 mm, whatever they show
         notes += notes_of_size(whole)
     for note in notes:
@@ -128,10 +138,16 @@ def load_image(
     return image
 
 
+def named_error(path: Path, error: InputError) -> InputError:
+    """The error in one line that begins with the path, which it may do already."""
+    words = one_line(error)
+    return InputError(words if words.startswith(str(path)) else f"{path}: {words}")
+
+
 def file_shape(path: str | Path) -> tuple[int, ...] | None:
     """Lengths of all axes of the voxels in a file, by its header alone; those of an NRRD file may count components.
 
-    None of a picture or DICOM, which have to be read.
+    None of a picture or DICOM, which have to be read. Those of Zarr begin with the three in space.
 
     Raises
     ------
@@ -142,6 +158,9 @@ def file_shape(path: str | Path) -> tuple[int, ...] | None:
     name = path.name.lower()
     try:
         with os_errors_named():
+            if is_zarr(path):
+                level = zarr_levels(path, [])[0]
+                return (*level.shape, *(int(level.array.shape[axis]) for axis in level.others))
             if not name.endswith((*_NIBABEL_SUFFIXES, *HEADED_SUFFIXES)) or path.is_dir():
                 return None
             if (other := irregular(path)) is not None:
@@ -239,17 +258,20 @@ def image_slice(image: Image, axis: int, index: int) -> Image:
            [0., 3., 0.],
            [0., 0., 1.]])
     """
-    if image.ndim != 3:
-        raise InputError(f"slice: only a 3-D image has slices, this one is {image.ndim}-D; leave the slice out")
-    if axis not in (0, 1, 2):
-        raise InputError(f"slice: the axis must be 0, 1 or 2, got {axis}")
-    size = image.shape[axis]
-    if not 0 <= index < size:
-        raise InputError(f"slice: index along axis {axis} must be from 0 to {size - 1}, got {index}")
+    _check_slice(image.shape, axis, index)
     corner = np.zeros(3)
     corner[axis] = index
     columns = np.delete(image.affine[:3, :3], axis, axis=1)
     return Image(np.take(image.data, index, axis=axis), _plane_affine(columns, image.to_world(corner)))
+
+
+def _check_slice(shape: tuple[int, ...], axis: int, index: int) -> None:
+    if len(shape) != 3:
+        raise InputError(f"slice: only a 3-D image has slices, this one is {len(shape)}-D; leave the slice out")
+    if axis not in (0, 1, 2):
+        raise InputError(f"slice: the axis must be 0, 1 or 2, got {axis}")
+    if not 0 <= index < shape[axis]:
+        raise InputError(f"slice: index along axis {axis} must be from 0 to {shape[axis] - 1}, got {index}")
 
 
 def cropped(image: Image, bounds: Bounds) -> Image:
@@ -330,7 +352,8 @@ def parse_slice(text: str) -> tuple[int, int]:
 def sha256(path: str | Path) -> str:
     """SHA-256 of a file, or of the contents of a folder's files joined in the order of their names.
 
-    Of a header whose voxels are in files beside it, with these.
+    Of a header whose voxels are in files beside it, with these. Of a folder of Zarr it is that of all files in it and
+    in folders of it, each after its name and its length; `tetopt.io.stored_images.stored_checksum` is the cheap one.
 
     Raises
     ------
@@ -340,18 +363,66 @@ def sha256(path: str | Path) -> str:
     path = Path(path)
     digest = hashlib.sha256()
     with os_errors_named(path):
-        if (other := irregular(path)) not in (None, "a folder"):
-            raise InputError(f"{path}: expected a regular file, got {other}; copy what it gives into a file")
-        # A DICOM series is read from the folder itself and not from folders in it; so is its checksum.
-        files = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
-        if path.name.lower().endswith(HEADED_SUFFIXES):
-            with contextlib.suppress(InputError):  # a header that cannot be read has none
-                files += data_files(path)
-        for file in files:
-            with file.open("rb") as stream:
-                while block := stream.read(1 << 20):
-                    digest.update(block)
+        if is_zarr(path):
+            return folder_checksum(path, lambda _: True)
+        for file in image_files(path):
+            _digest_file(digest, file)
     return digest.hexdigest()
+
+
+def image_files(path: Path) -> list[Path]:
+    """The files that an image is in, other than one of Zarr's: itself, those beside a header, those in a folder.
+
+    Raises
+    ------
+    InputError
+        With the path: something in its place that is neither a regular file nor a folder.
+    """
+    if (other := irregular(path)) not in (None, "a folder"):
+        raise InputError(f"{path}: expected a regular file, got {other}; copy what it gives into a file")
+    # A DICOM series is read from the folder itself and not from folders in it; so is its checksum.
+    files = sorted(p for p in path.iterdir() if p.is_file()) if path.is_dir() else [path]
+    if path.name.lower().endswith(HEADED_SUFFIXES):
+        with contextlib.suppress(InputError):  # a header that cannot be read has none
+            files += data_files(path)
+    return files
+
+
+def folder_checksum(path: Path, is_read: Callable[[Path], bool]) -> str:
+    """SHA-256 of the relative names and lengths of all files in a folder, in their order, and of what is in them.
+
+    Of those that are not read, by `is_read`, the time of their last change stands for what is in them. Links are
+    followed, to no folder twice.
+    """
+    digest, known = hashlib.sha256(), set()
+    files: dict[str, Path] = {}
+    for folder, folders, names in os.walk(path, followlinks=True, onerror=_raised):
+        status = os.stat(folder)
+        if (status.st_dev, status.st_ino) in known:
+            folders.clear()
+            continue
+        known.add((status.st_dev, status.st_ino))
+        files |= {(Path(folder) / name).relative_to(path).as_posix(): Path(folder) / name for name in names}
+    for name, file in sorted(files.items()):
+        if (other := irregular(file)) is not None:
+            raise InputError(f"{file}: expected a regular file, got {other}; copy what it gives into a file")
+        status = file.stat()
+        digest.update(f"{name}\0{status.st_size}\0".encode("utf-8", "surrogateescape"))
+        if is_read(file):
+            _digest_file(digest, file)
+        else:
+            digest.update(f"{status.st_mtime_ns}\0".encode())
+    return digest.hexdigest()
+
+
+def _digest_file(digest: Any, file: Path) -> None:
+    with file.open("rb") as stream:
+        while block := stream.read(1 << 20):
+            digest.update(block)
+
+
+def _raised(error: OSError) -> None:
+    raise error
 
 
 # Choosing the reader
@@ -568,12 +639,28 @@ def part_of(image: Image, slice_: tuple[int, int] | None, crop: Bounds | None) -
     plane = image_slice(image, *slice_)
     if crop is None:
         return plane
-    axis, index = slice_
     bounds = checked_bounds(image.shape, crop)
-    start, stop = bounds.pop(axis)
+    _check_in_crop(bounds, *slice_)
+    return cropped(plane, [each for axis, each in enumerate(bounds) if axis != slice_[0]])
+
+
+def _part_of_stored(image: StoredImage, slice_: tuple[int, int] | None, crop: Bounds | None) -> Image:
+    """The same of an image that is stored: only this part of it is read."""
+    bounds = checked_bounds(image.shape, [(None, None)] * 3 if crop is None else crop)
+    if slice_ is not None:
+        axis, index = slice_
+        _check_slice(image.shape, axis, index)
+        _check_in_crop(bounds, axis, index)
+        bounds[axis] = (index, index + 1)
+    check_room([stop - start for start, stop in bounds], image.voxels.dtype.itemsize)
+    part = image.box(*zip(*bounds, strict=True))
+    return part if slice_ is None else image_slice(part, slice_[0], 0)
+
+
+def _check_in_crop(bounds: list[tuple[int, int]], axis: int, index: int) -> None:
+    start, stop = bounds[axis]
     if not start <= index < stop:
         raise InputError(f"slice: index {index} along axis {axis} lies outside of the crop {start}:{stop}")
-    return cropped(plane, bounds)
 
 
 def checked_bounds(shape: tuple[int, ...], bounds: Bounds) -> list[tuple[int, int]]:

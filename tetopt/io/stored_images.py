@@ -2,14 +2,27 @@
 
 from __future__ import annotations
 
+import hashlib
+import math
 import re
 import warnings
 from pathlib import Path
 
 from tetopt.errors import InputError
-from tetopt.io.images import Bounds, check_beginning, checked_bounds, nibabel_voxels, notes_of_size, os_errors_named
-from tetopt.io.volumes import VoxelsInFile, one_line
-from tetopt.io.zarr_images import is_zarr, open_zarr, zarr_levels
+from tetopt.image import Image
+from tetopt.io.images import (
+    Bounds,
+    check_beginning,
+    checked_bounds,
+    folder_checksum,
+    image_files,
+    named_error,
+    nibabel_voxels,
+    notes_of_size,
+    os_errors_named,
+)
+from tetopt.io.volumes import VoxelsInFile, check_room
+from tetopt.io.zarr_images import METADATA_FILES, is_zarr, open_zarr, zarr_levels
 from tetopt.stored import StoredImage
 
 STORED_SUFFIXES = (".zarr", ".nii")
@@ -57,10 +70,58 @@ def open_stored(path: str | Path, *, volume: int | None = None, crop: Bounds | N
         if crop is not None:
             image = _cropped(image, checked_bounds(image.shape, crop))
     except InputError as error:
-        raise InputError(f"{path}: {one_line(error)}") from error
+        raise named_error(path, error) from error
     for note in [*notes, *notes_of_size(image)]:
         warnings.warn(f"{path}: {note}", stacklevel=2)
     return image
+
+
+def coarse_image(path: str | Path, most_voxels: float, *, volume: int | None = None) -> Image | None:
+    """For pictures: the finest level of an OME-Zarr image of at most so many voxels, whole in memory, in its own place.
+
+    None of an image without such a level, and of files that have no levels.
+
+    Raises
+    ------
+    InputError
+        As `open_stored`.
+    """
+    _check_local(path)
+    path = Path(path)
+    try:
+        if not is_zarr(path):
+            return None
+        few = [level for level in zarr_levels(path, []) if math.prod(level.shape) <= most_voxels]
+        if not few:
+            return None
+        image = open_zarr(max(few, key=lambda level: math.prod(level.shape)), volume, [])
+        check_room(image.shape, image.voxels.dtype.itemsize)
+        return image.box((0, 0, 0), image.shape)
+    except InputError as error:
+        raise named_error(path, error) from error
+
+
+def stored_checksum(path: str | Path) -> str:
+    """SHA-256 of what shows whether an image has changed, without its voxels being read.
+
+    Of a folder of Zarr: names, lengths and times of the last change of all its files, and what is in those of metadata.
+    Of a file, and of those beside a header that have its voxels: name, length and time. Two copies of an image have two
+    of these; `tetopt.io.images.sha256` is the same for both, and takes as long as reading them.
+
+    Raises
+    ------
+    InputError
+        As `tetopt.io.images.sha256`.
+    """
+    path = Path(path)
+    with os_errors_named(path):
+        if is_zarr(path):
+            return folder_checksum(path, lambda file: file.name in METADATA_FILES)
+        words = []
+        for file in image_files(path):
+            status = file.stat()
+            words.append(f"{file.name}\0{status.st_size}\0{status.st_mtime_ns}\0")
+    return hashlib.sha256("".join(words).encode("utf-8", "surrogateescape")).hexdigest()
 
 
 def _check_local(path: str | Path) -> None:
