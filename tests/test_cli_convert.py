@@ -51,7 +51,7 @@ def test_every_format_is_written(folder, tmp_path, suffix, capsys):
     out = tmp_path / f"out{suffix}"
     more = [] if FORMATS[suffix].is_surface else ["--young", LAW, "--bins", "3", "--set", "dark=below:20"]
     assert exit_code("convert", folder / "a.vtu", out, *more, "--space", "lps") == 0
-    assert out.stat().st_size > 1000
+    assert out.stat().st_size > 900
     said = capsys.readouterr().out
     units = "" if FORMATS[suffix].is_surface else ", kPa, "
     assert f"{out}: {FORMATS[suffix].what}, LPS+ mm{units}" in said
@@ -59,7 +59,8 @@ def test_every_format_is_written(folder, tmp_path, suffix, capsys):
         assert "3 materials" in said or "6 materials" in said or "4 materials" in said
         assert "off by" in said
         assert "dark_surface" in said
-    assert [path.name for path in tmp_path.iterdir()] == [out.name]
+    pieces = ["out", "out/out_0.vtu"] if suffix == ".pvtu" else []
+    assert sorted(str(path.relative_to(tmp_path)) for path in tmp_path.rglob("*")) == sorted([out.name, *pieces])
     assert exit_code("convert", folder / "a.vtu", out) == 2  # is there already
 
 
@@ -68,7 +69,7 @@ def test_mesh_writes_every_format(folder, tmp_path, suffix):
     out = tmp_path / f"out{suffix}"
     more = [] if FORMATS[suffix].is_surface else ["--young", "2.5"]
     assert exit_code("mesh", folder / "a.nii.gz", "-o", out, "--spacing", "8", "--iterations", "0", *more) == 0
-    assert out.stat().st_size > 1000
+    assert out.stat().st_size > 900
 
 
 @pytest.fixture(scope="module")
@@ -98,7 +99,7 @@ def test_convert_keeps_the_order_unless_told_otherwise(folder, quadratic_path, t
         if order == 2:
             assert f"{n_corners} corner nodes, {n_all} in all, {len(mesh.cells)} cells" in said
         assert ("has no quadratic cells; the mesh's are written as linear ones" in said) == (suffix == ".scn")
-    for name in ("kept.vtu", "kept.vtk", "kept.msh"):
+    for name in ("kept.vtu", "kept.vtk", "kept.vtkhdf", "kept.pvtu", "kept.msh"):
         loaded = tetopt.load_mesh(tmp_path / name)
         assert loaded.order == 2
         points = quadratic(loaded.mesh.points, loaded.mesh.cells)[0]
@@ -215,7 +216,7 @@ def test_a_file_has_one_modulus_a_cell_of_those_at_gauss_points(folder, tmp_path
         assert exit_code("convert", folder / "a.vtu", tmp_path / f"{average}.vtu", *options) == 0
         assert ("one modulus a cell, its geometric mean" in capsys.readouterr().out) == (average == "gauss")
         assert exit_code("convert", tmp_path / f"{average}.vtu", tmp_path / f"{average}.inp") == 0
-        assert (".vtu and .vtk files have one at each Gauss point" in capsys.readouterr().out) == (average == "gauss")
+        assert ("VTK's files have one at each Gauss point" in capsys.readouterr().out) == (average == "gauss")
     first, second = (tetopt.load_mesh(tmp_path / f"{each}.vtu").cell_data["young"] for each in ("geometric", "gauss"))
     np.testing.assert_array_equal(first, second)
 

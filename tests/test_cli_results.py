@@ -77,7 +77,12 @@ def test_refusals_write_nothing(folder, capsys):
         assert words in re.sub(r"\s+", " ", said)
         assert {path.name for path in folder.iterdir()} == before
 
-    refused("--results: expected OUT named .vtu or .vtk, got", folder / "b.inp", "--results", folder / "a.frd")
+    refused(
+        "--results: expected OUT named .vtu or .vtk or .vtkhdf or .pvtu, got",
+        folder / "b.inp",
+        "--results",
+        folder / "a.frd",
+    )
     refused("no such file", folder / "b.vtu", "--results", folder / "c.frd")
     refused("is of another mesh", folder / "b.vtu", "--results", FOLDER / "order_2.frd")
     refused("expected CalculiX's results", folder / "b.vtu", "--results", folder / "a.vtu")

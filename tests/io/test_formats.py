@@ -6,6 +6,7 @@ import warnings
 from pathlib import Path
 from xml.etree import ElementTree
 
+import h5py
 import meshio
 import numpy as np
 import pytest
@@ -19,10 +20,11 @@ from tetopt.io.formats import FORMATS, file_bytes, save_mesh, save_model
 from tetopt.io.readback import OUTLINES, Outline, save_checked
 from tetopt.io.surfaces import checked_surface, save_surface
 from tetopt.io.text import plain
+from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.model.model import elements
 from tetopt.model.sets import Sets
 
-XML_SUFFIXES = (".vtu", ".xdmf", ".feb", ".scn")
+XML_SUFFIXES = (".vtu", ".pvtu", ".xdmf", ".feb", ".scn")
 # What every format with a place for names can hold, and what none can: by what that is called instead.
 KEPT = [
     "<x>",
@@ -68,6 +70,9 @@ def test_no_name_breaks_a_file(suffix, tmp_path):
     text = saved(tmp_path / f"a{suffix}", hostile_model(suffix))
     head = text[: text.index(b"CELLS")] if suffix == ".vtk" else text[:80] if suffix == ".stl" else text
     head = head[: head.index(b"end_header")] if suffix == ".ply" else head
+    if suffix == ".vtkhdf":
+        with h5py.File(tmp_path / "a.vtkhdf") as file:
+            head = "".join([*file["VTKHDF/CellData"], *file["VTKHDF/PointData"], *file["VTKHDF/FieldData"]]).encode()
     if suffix == ".vtk":
         head = b"\n".join(re.findall(rb"\n([\x20-\x7e]+ \d+ \d+ (?:double|vtktypeint64|unsigned_char|int))\n", text))
     shown = head.decode()
@@ -98,15 +103,17 @@ def test_braces_in_names_end_no_process(name, tmp_path):
             assert any(each.ndim == 1 and sorted(each) == sorted(values[name]) for each in back.values())
 
 
-@pytest.mark.parametrize("suffix", [".vtu", ".vtk", ".msh"])
+@pytest.mark.parametrize("suffix", [".vtu", ".vtk", ".vtkhdf", ".pvtu", ".msh"])
 def test_names_come_back(suffix, tmp_path):
-    """As they were where they are printable text, else as Python escapes them; gmsh has no quotes in its names."""
+    """As they were where they are printable text, else as Python escapes them; gmsh has no quotes, HDF5 no slashes."""
     model = hostile_model(suffix)
     saved(tmp_path / f"a{suffix}", model)
     back = tetopt.load_mesh(tmp_path / f"a{suffix}")
     expected = {name: name for name in KEPT} | SHOWN
     if suffix == ".msh":
         expected['a"b'] = "a'b"
+    if suffix == ".vtkhdf":
+        expected = {name: new.replace("/", "_") for name, new in expected.items()}
     assert {*expected.values()} == back.cell_data.keys() - {"young", "nu", "material"}
     assert {*expected.values()} == back.point_data.keys()
     for name, new in expected.items():
@@ -153,7 +160,7 @@ def test_two_names_never_become_one():
     assert len(columns) == 10
 
 
-@pytest.mark.parametrize("suffix", [".vtk", ".msh", ".feb"])
+@pytest.mark.parametrize("suffix", [".vtk", ".vtkhdf", ".msh", ".feb"])
 def test_names_of_any_length(suffix, tmp_path):
     mesh = sample_model().mesh
     values = np.arange(len(mesh.cells), dtype=float)
@@ -196,6 +203,7 @@ def test_a_mesh_is_written_by_its_suffix(suffix, tmp_path):
     heads = {
         ".vtu": b"<?xml", ".vtk": b"# vtk", ".xdmf": b"<?xml", ".msh": b"$MeshFormat\n4.1", ".inp": b"** tetopt",
         ".msh2": b"$MeshFormat\n2.2", ".mfem": b"MFEM", ".mesh": b"MeshVersion", ".stl": b"tetopt", ".ply": b"ply",
+        ".vtkhdf": b"\x89HDF", ".pvtu": b"<?xml",
     }  # fmt: skip
     assert path.read_bytes().startswith(heads[suffix.lower()])
 
@@ -227,7 +235,7 @@ def test_names_that_are_words_of_a_format(suffix, tmp_path):
     fields = {name: np.arange(len(model.mesh.cells)) + 0.5 * k for k, name in enumerate(words)}
     about = {"tetopt": "0.1.0", "image": "\n\nVertices\n7"}
     save_model(tmp_path / f"a{suffix}", model._replace(cell_data=fields, about=about, loads=()))
-    if suffix in (".vtu", ".vtk"):
+    if suffix in VTK_SUFFIXES:
         back = tetopt.load_mesh(tmp_path / f"a{suffix}").cell_data
         assert all(np.array_equal(back[name], values) for name, values in fields.items())
 
@@ -258,7 +266,7 @@ def outlines():
 @pytest.mark.parametrize(("suffix", "whole", "n_points", "n_cells", "sets"), list(outlines()))
 def test_outlines_tell_what_a_file_holds(suffix, whole, n_points, n_cells, sets):
     outline = OUTLINES[suffix](whole)
-    if suffix in (".stl", ".ply"):
+    if suffix in (".stl", ".ply", ".pvtu"):
         return
     assert outline.n_points == n_points
     assert outline.n_cells == (None if suffix in (".msh", ".msh2") else n_cells)

@@ -34,14 +34,13 @@ from tetopt.io.formats import FORMATS, format_of
 from tetopt.io.frd import read_frd
 from tetopt.io.images import sha256
 from tetopt.io.meshes import MeshFile
-from tetopt.io.vtk import box_text
+from tetopt.io.vtk import VTK_SUFFIXES, box_text
 from tetopt.model.fields import cell_fields, is_result, is_stress
 from tetopt.model.sets import box_of
 from tetopt.report.summary import model_summary, versions
 from tetopt.target.align import aligned_mask
 from tetopt.target.content import continued
 
-RESULT_SUFFIXES = (".vtu", ".vtk")  # of the files that hold results
 TEXTS_KEPT = ("image", "image_sha256", "inputs", "options")  # of a mesh's file that go on into the new one
 
 
@@ -55,7 +54,8 @@ def convert_command(
     ] = None,
     mask_path: Annotated[Path | None, option("MASK", "With --image: only what lies in it counts.", "--mask")] = None,
     results_path: Annotated[
-        Path | None, option("JOB.frd", "Bring CalculiX's results of this mesh back onto it (.vtu, .vtk).", "--results")
+        Path | None,
+        option("JOB.frd", "Bring CalculiX's results of this mesh back onto it (VTK's formats).", "--results"),
     ] = None,
     *,
     part: ImagePart,
@@ -66,8 +66,8 @@ def convert_command(
     format_of(output)
     output = checked_output(output, tuple(FORMATS), numbers.force)
     json_path = numbers.checked()
-    if results_path is not None and output.suffix.lower() not in RESULT_SUFFIXES:
-        raise InputError(f"--results: expected OUT named {' or '.join(RESULT_SUFFIXES)}, got {output}")
+    if results_path is not None and output.suffix.lower() not in VTK_SUFFIXES:
+        raise InputError(f"--results: expected OUT named {' or '.join(VTK_SUFFIXES)}, got {output}")
     needs_image = {"--mask": mask_path, "--volume": part.volume, "--crop": part.crop, "--slice": part.slice_}
     if image_path is None and (lost := [name for name, value in needs_image.items() if value is not None]):
         raise InputError(f"{lost[0]}: there is no --image")

@@ -29,7 +29,7 @@ from tetopt.io.files import checked_output, save_json
 from tetopt.io.formats import save_model
 from tetopt.io.images import sha256
 from tetopt.io.meshes import MeshFile
-from tetopt.io.vtk import box_text
+from tetopt.io.vtk import VTK_SUFFIXES, box_text
 from tetopt.model.averages import DEFAULT_AVERAGE
 from tetopt.model.fields import cell_fields, is_result
 from tetopt.model.loads import MOST_COMPRESSION_PERCENT, count_of_steps
@@ -86,7 +86,7 @@ def fem_command(
     image_path, mesh_path = (None, paths[0]) if len(paths) == 1 else (paths[0], paths[1])
     json_path = numbers.checked()
     if output is not None:
-        output = checked_output(output, (".vtu", ".vtk"), numbers.force)
+        output = checked_output(output, VTK_SUFFIXES, numbers.force)
     if image_path is not None:
         model = replace(model, young=model.young or INTENSITY_LAW, average=model.average or DEFAULT_AVERAGE)
     if output is None and model.written_sets is not None:

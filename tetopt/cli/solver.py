@@ -21,6 +21,7 @@ from tetopt.incoming import json_of
 from tetopt.io.files import kept_places
 from tetopt.io.formats import FORMATS, file_bytes, format_of, save_model
 from tetopt.io.meshes import MeshFile
+from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.model.averages import DEFAULT_AVERAGE, parse_average
 from tetopt.model.build import labels_of, model_of
 from tetopt.model.fields import GAUSS_MODULI, NODE_MODULI, is_result
@@ -272,7 +273,7 @@ def all_sets(
 def with_chosen_sets(model: Model, output: Path, options: ModelOptions) -> Model:
     """The model with those sets that its file is to get; a line if interfaces are left out unasked.
 
-    Of the sets that every mesh has those of --sets are written, by default all, but into a VTU or VTK file no more
+    Of the sets that every mesh has those of --sets are written, by default all, but into a file of VTK's no more
     interfaces than `MANY_INTERFACES`. Others, and those that loads name, always are.
     """
     groups = set(parsed_groups(options.written_sets))
@@ -282,7 +283,7 @@ def with_chosen_sets(model: Model, output: Path, options: ModelOptions) -> Model
     pairs = [(a, b) for a in of_label for b in of_label if a < b]
     between = {*interface_names(pairs, of_label).values(), *(f"interface_{a}_{b}" for a, b in pairs)}
     interfaces = between & set(model.sets.facets)
-    if options.written_sets is None and output.suffix.lower() in (".vtu", ".vtk") and len(interfaces) > MANY_INTERFACES:
+    if options.written_sets is None and output.suffix.lower() in VTK_SUFFIXES and len(interfaces) > MANY_INTERFACES:
         log.print(
             f"{len(interfaces)} interfaces are not written as sets, which --sets all does; convert, fem and view have "
             "them anyway, from the cells' labels"
@@ -444,8 +445,8 @@ def _lines(output: Path, model: Model, solver: SolverOptions) -> Iterator[str]:
     if materials is not None and model.gauss_young is not None:
         yield (
             f"one modulus a cell, its geometric mean, and, for tetopt fem, one at each Gauss point ({GAUSS_MODULI})"
-            if output.suffix.lower() in (".vtu", ".vtk")
-            else "one modulus a cell, its geometric mean; .vtu and .vtk files have one at each Gauss point, too"
+            if output.suffix.lower() in VTK_SUFFIXES
+            else "one modulus a cell, its geometric mean; VTK's files have one at each Gauss point, too"
         )
     if materials is not None and materials.binning is not None:
         mean, largest = materials.binning.mean, materials.binning.largest
@@ -464,7 +465,7 @@ def _lines(output: Path, model: Model, solver: SolverOptions) -> Iterator[str]:
     if model.loads and not (form.runs or form.is_surface):
         yield "the format runs no step: the loads are in the file as text"
     if (lost := _only_in_vtu(model)) and not form.is_surface and output.suffix.lower() in READ_WITHOUT_TEXTS:
-        yield f"{lost} are not read back from {output.suffix}: tetopt takes them from .vtu and .vtk files alone"
+        yield f"{lost} are not read back from {output.suffix}: tetopt takes them from VTK's files alone"
     low, high = model.mesh.points.min(axis=0), model.mesh.points.max(axis=0)
     ranges = zip("xyz", low, high, strict=False)
     yield (

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import warnings
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -15,11 +15,13 @@ from tetopt.io.febio import febio
 from tetopt.io.gmsh import gmsh22, gmsh41
 from tetopt.io.medit import medit
 from tetopt.io.mfem import mfem
-from tetopt.io.readback import Outline, save_checked
+from tetopt.io.pvtu import pvtu, pvtu_files
+from tetopt.io.readback import Outline, save_checked, save_pieces
 from tetopt.io.sofa import sofa
 from tetopt.io.surfaces import boundary_ply, boundary_stl
 from tetopt.io.text import file_name, legacy_name, names_apart, plain, short_name
 from tetopt.io.vtk import vtk, vtu
+from tetopt.io.vtkhdf import hdf_name, vtkhdf
 from tetopt.io.xdmf import xdmf
 from tetopt.mesh import Mesh
 from tetopt.model.model import Model, elements, in_space, in_units
@@ -36,11 +38,15 @@ class Format(NamedTuple):
     is_surface: bool = False  # holds the boundary alone
     has_node_moduli: bool = False  # else a modulus that varies within cells is its mean over each
     has_large: bool = False  # whether a step can ask for large deformation
+    # Of a mesh in several files, of which `write` makes the one that lists them: all of them by name, that one last.
+    write_files: Callable[[Model, str], Iterator[tuple[str, bytes]]] | None = None
 
 
 FORMATS = {
     ".vtu": Format("VTK, ParaView", vtu, has_quadratic=True, has_node_moduli=True),
     ".vtk": Format("legacy VTK, 3D Slicer", vtk, has_quadratic=True, has_node_moduli=True),
+    ".vtkhdf": Format("VTKHDF, ParaView", vtkhdf, has_quadratic=True, has_node_moduli=True),
+    ".pvtu": Format("VTU in pieces", pvtu, has_quadratic=True, has_node_moduli=True, write_files=pvtu_files),
     ".xdmf": Format("XDMF with tags, FEniCSx", xdmf, has_quadratic=True, has_node_moduli=True),
     ".msh": Format("gmsh 4.1", gmsh41, has_quadratic=True),
     ".msh2": Format("gmsh 2.2", gmsh22, has_quadratic=True),
@@ -53,7 +59,7 @@ FORMATS = {
     ".ply": Format("the boundary as PLY", boundary_ply, is_surface=True),
 }
 # How formats whose readers take names of data of `MOST_NAME_CHARACTERS` show them.
-SHOWN_NAMES = {".vtk": legacy_name, ".msh": short_name, ".feb": short_name}
+SHOWN_NAMES = {".vtk": legacy_name, ".vtkhdf": hdf_name, ".msh": short_name, ".feb": short_name}
 
 
 def format_of(path: Path) -> Format:
@@ -75,9 +81,9 @@ def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str
     """Write a model in the format of the file's suffix, whole or not at all; it is read back before it takes its name.
 
     Names of data, and that of the image, stand in the file as `tetopt.io.text.plain` shows them, escaped in XML; gmsh
-    has apostrophes for their quotes, and gmsh, legacy VTK and FEBio their first 240 characters. Those that become the
-    same are numbered, and a warning tells what changed. Replaces an existing file; ask
-    `tetopt.io.files.checked_output` first.
+    has apostrophes for their quotes, and gmsh, legacy VTK, VTKHDF and FEBio their first 240 characters. Those that
+    become the same are numbered, and a warning tells what changed. Replaces an existing file, of .pvtu with its folder
+    of pieces; ask `tetopt.io.files.checked_output` first.
 
     Parameters
     ----------
@@ -97,10 +103,13 @@ def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str
         As `tetopt.io.readback.save_checked`.
     """
     path = Path(path)
-    whole = file_bytes(path, model, space=space, units=units)
+    kind, ready = format_of(path), _ready(path, model, space, units)
     sets = (frozenset(each) for each in model.sets)
     expected = Outline(len(elements(model)[0]), len(model.mesh.cells), *sets)
-    save_checked(path, whole, Outline() if format_of(path).is_surface else expected)
+    if kind.write_files is None:
+        save_checked(path, kind.write(ready), Outline() if kind.is_surface else expected)
+    else:
+        save_pieces(path, kind.write_files(ready, path.stem), expected)
 
 
 def save_mesh(
@@ -129,20 +138,25 @@ def save_mesh(
 
 
 def file_bytes(path: Path, model: Model, *, space: str = "ras", units: str = "kPa") -> bytes:
-    """What `save_model` writes.
+    """What `save_model` writes; of a format in several files that which lists the others, as if it were called "mesh".
 
     Raises
     ------
     InputError
         As `save_model`.
     """
+    return format_of(path).write(_ready(path, model, space, units))
+
+
+def _ready(path: Path, model: Model, space: str, units: str) -> Model:
+    """The model as it is to be written; InputError for what the format cannot carry."""
     kind = format_of(path)
     if model.order not in (1, 2):
         raise InputError(f"order: expected 1 or 2, got {model.order}")
     if model.order == 2 and not kind.has_quadratic:
         able = ", ".join(name for name, other in FORMATS.items() if other.has_quadratic)
         raise InputError(f"{path}: only {able} take quadratic cells; leave out --order 2")
-    return kind.write(_named(path, in_units(in_space(model, space), units)))
+    return _named(path, in_units(in_space(model, space), units))
 
 
 def _named(path: Path, model: Model) -> Model:

@@ -1,4 +1,4 @@
-"""Meshes from files: VTU and VTK through pyvista, and gmsh's MSH."""
+"""Meshes from files: VTK's formats, and gmsh's MSH."""
 
 from __future__ import annotations
 
@@ -13,17 +13,19 @@ from tetopt.errors import InputError
 from tetopt.geometry.quadratic import numbered_edges
 from tetopt.geometry.simplex import oriented
 from tetopt.incoming import regular_file
-from tetopt.io.raw import CELL_DIMENSIONS, CORNER_KINDS, Raw, by_corners
+from tetopt.io.pvtu import read_pvtu
+from tetopt.io.raw import CELL_DIMENSIONS, CORNER_KINDS, Grid, Raw, by_corners
 from tetopt.io.read_gmsh import read_msh
-from tetopt.io.read_vtk import Grid, read_vtk
+from tetopt.io.read_vtk import read_vtk
 from tetopt.io.text import plain
-from tetopt.io.vtk import ON_PREFIX, box_in, sets_in, text_in
+from tetopt.io.vtk import ON_PREFIX, VTK_SUFFIXES, box_in, sets_in, text_in
+from tetopt.io.vtkhdf import read_vtkhdf
 from tetopt.mesh import Mesh
 from tetopt.model.fields import half_turned_fields, is_stress, stresses_times
 from tetopt.model.model import STRESS_UNITS, half_turn
 from tetopt.model.sets import SET_NAME, Box, Sets, free_name, rows_of
 
-MESH_SUFFIXES = (".vtu", ".vtk", ".msh", ".msh2")
+MESH_SUFFIXES = (*VTK_SUFFIXES, ".msh", ".msh2")
 # VTK's kinds of any order, with a number of nodes, that are numbered as kinds of one order; dolfinx writes them.
 LAGRANGE_KINDS = {
     "lagrange_curve 2": "line", "lagrange_triangle 3": "triangle", "lagrange_tetrahedron 4": "tetra",
@@ -59,7 +61,7 @@ class MeshFile(NamedTuple):
 
 
 def load_mesh(path: str | Path) -> MeshFile:
-    """Read triangles or tetrahedra, linear or quadratic, from a VTU, VTK or gmsh MSH file.
+    """Read triangles or tetrahedra, linear or quadratic, from a file of VTK's or gmsh's, see `MESH_SUFFIXES`.
 
     Of cells of order 2 the corners are the mesh, so that curved edges become straight, which a note then tells; point
     data has a row for each node of order 2, in the order of `tetopt.geometry.quadratic.quadratic`.
@@ -68,9 +70,12 @@ def load_mesh(path: str | Path) -> MeshFile:
     are taken for RAS+ unless the file says LPS, as those of `tetopt convert --space lps` and of 3D Slicer do; these are
     turned, and moduli and stresses that it holds in MPa taken to kPa. Data other than numbers are left out.
 
-    The sets of a VTU or VTK file of ours are taken if its cells are still those that they were written for. gmsh's
-    physical groups (files named .msh or .msh2) become sets, with names that every format can carry; in files of ours
-    the cell sets are those that were written.
+    Of a file in pieces, points that several of them hold become one: by their numbers, where the file has them, so that
+    a file of ours gives back the same mesh; else where they lie at the same place.
+
+    The sets of a file of ours in one of VTK's formats are taken if its cells are still those that they were written
+    for. gmsh's physical groups (files named .msh or .msh2) become sets, with names that every format can carry; in
+    files of ours the cell sets are those that were written.
 
     Raises
     ------
@@ -119,7 +124,7 @@ def load_mesh(path: str | Path) -> MeshFile:
         sets,
         box_in(raw.field_data, n),
         raw.space,
-        notes + of_sets + of_edges,
+        (*raw.notes, *notes, *of_sets, *of_edges),
         2 if kind in raw.middles else 1,
         {name: values[np.concatenate([used, middles])] for name, values in point_data.items()},
     )
@@ -212,7 +217,7 @@ def _sets_of_groups(raw: Raw, mesh: Mesh, kind: str, used: NDArray[np.int64]) ->
 
 
 def _read_vtk(path: Path) -> Raw:
-    grid = read_vtk(path)
+    grid = {".vtkhdf": read_vtkhdf, ".pvtu": read_pvtu}.get(path.suffix.lower(), read_vtk)(path)
     rows_of_kind = _rows_by_kind(grid)
     sizes = np.diff(grid.offsets)
     cells = {}
@@ -226,7 +231,8 @@ def _read_vtk(path: Path) -> Raw:
     }
     field_data = {name: _decoded(values) for name, values in grid.field_data.items()}
     own = {name: values for name, values in grid.point_data.items() if not name.startswith("vtk")}  # as vtkGhostType
-    return by_corners(Raw(grid.points, cells, cell_data, own, field_data, [], _space(path, field_data)))
+    raw = Raw(grid.points, cells, cell_data, own, field_data, [], _space(path, field_data), notes=grid.notes)
+    return by_corners(raw)
 
 
 def _rows_by_kind(grid: Grid) -> dict[str, NDArray[np.int64]]:

@@ -16,6 +16,19 @@ CORNER_KINDS = {
 }  # fmt: skip
 
 
+class Grid(NamedTuple):
+    """An unstructured grid of VTK's as plain arrays."""
+
+    points: NDArray[np.float64]  # (N, 3)
+    connectivity: NDArray[np.int64]
+    offsets: NDArray[np.int64]  # (M + 1,), into the connectivity
+    cell_types: NDArray[np.uint8]  # (M,)
+    point_data: dict[str, NDArray]
+    cell_data: dict[str, NDArray]
+    field_data: dict[str, NDArray]
+    notes: tuple[str, ...] = ()  # what was left out, a line each
+
+
 class Group(NamedTuple):
     """Cells of one kind that gmsh's file calls by a name."""
 
@@ -35,6 +48,7 @@ class Raw(NamedTuple):
     groups: list[Group]
     space: str
     middles: dict[str, NDArray[np.int64]] = {}  # noqa: RUF012 - nobody changes it; see `by_corners`
+    notes: tuple[str, ...] = ()  # what was left out, a line each
 
 
 def by_corners(raw: Raw) -> Raw:

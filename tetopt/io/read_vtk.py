@@ -6,13 +6,17 @@ import mmap
 import os
 import re
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.io.apart import DEFLATE_RATIO, read_apart
+from tetopt.io.raw import Grid
+
+if TYPE_CHECKING:
+    from vtkmodules.vtkCommonDataModel import vtkUnstructuredGrid
 
 # Counts in a VTU file's tags, and in the lines of a VTK file: each thing counted takes a byte at least.
 XML_COUNT = re.compile(rb"<[^<>]{0,10000}?\b(NumberOf\w+)\s*=\s*[\"']\s*([-+]?\d+(?:\.\d*)?(?:[eE]\+?\d+)?)")
@@ -24,18 +28,6 @@ LEGACY_COUNT = re.compile(
 ENTITIES = re.compile(rb"<!(?:DOCTYPE|ENTITY)", re.I)
 
 
-class Grid(NamedTuple):
-    """An unstructured grid of VTK's as plain arrays, checked to fit one another."""
-
-    points: NDArray[np.float64]  # (N, 3)
-    connectivity: NDArray[np.int64]
-    offsets: NDArray[np.int64]  # (M + 1,), into the connectivity
-    cell_types: NDArray[np.uint8]  # (M,)
-    point_data: dict[str, NDArray]
-    cell_data: dict[str, NDArray]
-    field_data: dict[str, NDArray]
-
-
 def read_vtk(path: Path) -> Grid:
     """The unstructured grid in a VTU or VTK file.
 
@@ -45,8 +37,18 @@ def read_vtk(path: Path) -> Grid:
         Without the path before it: a damaged file, or one that VTK crashes at; another data set; counts that the file
         is too short for; a document type or entities; no cells.
     """
-    _check_counts(path)
-    kind, errors, arrays = read_apart(_arrays_of, path, library="VTK")
+    check_counts(path)
+    return checked_grid(*read_apart(arrays_of, path, library="VTK"))
+
+
+def checked_grid(kind: str, errors: str, arrays: dict[str, Any]) -> Grid:
+    """What `arrays_of` gives as a grid whose arrays fit one another.
+
+    Raises
+    ------
+    InputError
+        As `read_vtk`.
+    """
     if errors:
         raise InputError(f"damaged, or not a VTK mesh ({errors})")
     if kind != "UnstructuredGrid" or not len(arrays.get("cell_types", ())):
@@ -61,7 +63,7 @@ def read_vtk(path: Path) -> Grid:
     return grid
 
 
-def _check_counts(path: Path) -> None:
+def check_counts(path: Path) -> None:
     """InputError if the head tells of more than the file can have."""
     size = path.stat().st_size
     if size == 0:
@@ -81,7 +83,7 @@ def _check_counts(path: Path) -> None:
 # In the child
 
 
-def _arrays_of(path: str) -> tuple[str, str, dict[str, Any]]:
+def arrays_of(path: str) -> tuple[str, str, dict[str, Any]]:
     """The kind of data set, VTK's first complaint, and the arrays of a `Grid`."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
     from vtkmodules.vtkCommonCore import vtkOutputWindow, vtkStringOutputWindow, vtkUnsignedCharArray
@@ -103,18 +105,24 @@ def _arrays_of(path: str) -> tuple[str, str, dict[str, Any]]:
     kind = grid.GetClassName().removeprefix("vtk")
     if kind != "UnstructuredGrid" or grid.GetNumberOfCells() == 0:
         return kind, "", {}
-    cells, types = grid.GetCells(), vtkUnsignedCharArray()
+    types = vtkUnsignedCharArray()
     types.DeepCopy(grid.GetCellTypesArray())  # which of cells of one kind may hold its number once
-    arrays = {
+    return kind, "", plain_arrays(grid) | {"cell_types": vtk_to_numpy(types).astype(np.uint8)}
+
+
+def plain_arrays(grid: vtkUnstructuredGrid) -> dict[str, Any]:
+    """The arrays of a `Grid`, by name, of VTK's own, but for the types of cells."""
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+
+    cells = grid.GetCells()
+    return {
         "points": vtk_to_numpy(grid.GetPoints().GetData()).astype(np.float64),
         "connectivity": vtk_to_numpy(cells.GetConnectivityArray()).astype(np.int64),
         "offsets": vtk_to_numpy(cells.GetOffsetsArray()).astype(np.int64),
-        "cell_types": vtk_to_numpy(types).astype(np.uint8),
         "point_data": _data_of(grid.GetPointData()),
         "cell_data": _data_of(grid.GetCellData()),
         "field_data": _data_of(grid.GetFieldData()),
     }
-    return kind, "", arrays
 
 
 def _first_error(output: str | bytes | None) -> str:

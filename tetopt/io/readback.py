@@ -9,13 +9,14 @@ from __future__ import annotations
 import errno
 import re
 from collections.abc import Iterable, Iterator
+from io import BytesIO
 from itertools import pairwise
 from pathlib import Path
 from typing import NamedTuple
 from urllib.parse import unquote
 from xml.parsers import expat
 
-from tetopt.io.files import written_whole
+from tetopt.io.files import pieces_written_whole, telling, written_whole
 from tetopt.io.text import plain
 
 COMPARED_BYTES = 2**24  # of the file and of what was written, at a time: so much more memory
@@ -54,8 +55,32 @@ def save_checked(path: Path, whole: bytes, expected: Outline) -> None:
         check_written(temporary, path.suffix.lower(), whole, expected)
 
 
-def check_written(path: Path, suffix: str, whole: bytes, expected: Outline) -> None:
+def save_pieces(path: Path, files: Iterable[tuple[str, bytes]], expected: Outline) -> None:
+    """Write a file in pieces: VTU files in a folder of its name, the last of `files` beside it; whole or not at all.
+
+    Raises
+    ------
+    OSError
+        As `save_checked`.
+    """
+    outlines = []
+    with pieces_written_whole(path) as (folder, moved_in):
+        for name, whole in files:
+            if name.endswith(".vtu"):
+                place = folder / name.rpartition("/")[2]
+                with telling(path, len(whole)):
+                    place.write_bytes(whole)
+                outlines.append(check_written(place, ".vtu", whole, Outline()))
+        n_cells = sum(each.n_cells or 0 for each in outlines)
+        _check_outline(outlines[0]._replace(n_points=None, n_cells=n_cells), expected)
+        with moved_in():
+            save_checked(path, whole, Outline())
+
+
+def check_written(path: Path, suffix: str, whole: bytes, expected: Outline) -> Outline:
     """Compare a file of a suffix's format with what was to be written into it, and that with what it is to hold.
+
+    What it does hold comes back.
 
     Raises
     ------
@@ -73,6 +98,11 @@ def check_written(path: Path, suffix: str, whole: bytes, expected: Outline) -> N
         raise OSError(
             errno.EIO, f"what was made is not well-formed ({plain(str(error))}); please report this"
         ) from error
+    _check_outline(outline, expected)
+    return outline
+
+
+def _check_outline(outline: Outline, expected: Outline) -> None:
     for what, count, target in (
         ("points", outline.n_points, expected.n_points),
         ("cells", outline.n_cells, expected.n_cells),
@@ -93,6 +123,13 @@ def vtk_xml_outline(whole: bytes) -> Outline:
     piece = next(attributes for tag, attributes in tags if tag == "Piece")
     names = [attributes["Name"] for tag, attributes in tags if tag == "DataArray" and "Name" in attributes]
     return _of_vtk(int(piece["NumberOfPoints"]), int(piece.get("NumberOfCells", piece.get("NumberOfPolys", -1))), names)
+
+
+def pvtu_outline(whole: bytes) -> Outline:
+    """Of the master of a PVTU file, which does not tell what its pieces hold."""
+    if not any(tag == "Piece" for tag, _ in _tags([whole])):
+        raise ValueError("it has no pieces")
+    return Outline()
 
 
 def febio_outline(whole: bytes) -> Outline:
@@ -197,7 +234,26 @@ def vtk_outline(whole: bytes) -> Outline:
     return _of_vtk(counts["POINTS"], counts["CELLS"], names)
 
 
-def _of_vtk(n_points: int, n_cells: int, names: Iterable[str]) -> Outline:
+def vtkhdf_outline(whole: bytes) -> Outline:
+    """Of a VTKHDF file, each of whose arrays is as long as its pieces say; in several, points are listed repeatedly."""
+    import h5py
+
+    try:
+        with h5py.File(BytesIO(whole), "r") as file:
+            root = file["VTKHDF"]
+            points, cells, nodes = (root[f"NumberOf{name}"][()] for name in ("Points", "Cells", "ConnectivityIds"))
+            n_points, n_cells = int(points.sum()), int(cells.sum())
+            lengths = {"Points": n_points, "Types": n_cells, "Connectivity": nodes.sum(), "Offsets": (cells + 1).sum()}
+            lengths |= {f"PointData/{name}": n_points for name in root["PointData"]}
+            lengths |= {f"CellData/{name}": n_cells for name in root["CellData"]}
+            if odd := [name for name, length in lengths.items() if len(root[name]) != length]:
+                raise ValueError(f"{odd[0]} is not as long as it says")
+            return _of_vtk(n_points if len(points) == 1 else None, n_cells, root["FieldData"])
+    except OSError as error:  # of HDF5, about bytes in memory
+        raise ValueError(str(error)) from error
+
+
+def _of_vtk(n_points: int | None, n_cells: int, names: Iterable[str]) -> Outline:
     """Sets are field data, see `tetopt.io.vtk`."""
     sets: dict[str, set[str]] = {"facets": set(), "cells": set()}
     for name in names:
@@ -335,6 +391,7 @@ def _listed(part: bytes) -> tuple[int, int]:
 
 
 OUTLINES = {  # by suffix
+    ".vtkhdf": vtkhdf_outline, ".pvtu": pvtu_outline,
     ".vtu": vtk_xml_outline, ".vtp": vtk_xml_outline, ".vtk": vtk_outline, ".xdmf": xdmf_outline,
     ".msh": gmsh_outline, ".msh2": gmsh_outline, ".inp": abaqus_outline, ".feb": febio_outline,
     ".scn": sofa_outline, ".mfem": mfem_outline, ".mesh": medit_outline, ".stl": stl_outline, ".ply": ply_outline,

@@ -1,5 +1,7 @@
 """Meshes and models as VTK's files: XML (.vtu) and legacy (.vtk), through VTK's own writers.
 
+What they hold is in `tetopt.io.vtkhdf` and `tetopt.io.pvtu`, too.
+
 Points in world mm, cells positively oriented, of one type: linear, or quadratic with straight edges, whose corners come
 first among the points. What is on each cell is cell data, on each point point data; with materials there is cell data
 `young`, `nu`, `material`, from 1, and, if there is one, `density`, kg/m3; of moduli that vary in a cell also
@@ -27,6 +29,7 @@ from numpy.typing import NDArray
 from tetopt.geometry.quadratic import quadratic
 from tetopt.image import Image
 from tetopt.incoming import json_of
+from tetopt.io.raw import Grid
 from tetopt.io.text import xml_attribute
 from tetopt.mesh import Mesh
 from tetopt.model.fields import GAUSS_MODULI, NODE_MODULI, is_stress, node_field
@@ -37,6 +40,7 @@ from tetopt.model.sets import SET_NAME, Box, Sets
 if TYPE_CHECKING:
     from vtkmodules.vtkCommonDataModel import vtkDataSet, vtkFieldData, vtkUnstructuredGrid
 
+VTK_SUFFIXES = (".vtu", ".vtk", ".vtkhdf", ".pvtu")  # of files of ours that hold all of a model, and are read
 CELL_TYPES = {(2, 1): 5, (3, 1): 10, (2, 2): 22, (3, 2): 24}  # VTK's numbers, by dimension and order
 # Names of field data and of point data in our files, see above.
 FACETS_PREFIX, CELLS_PREFIX, ON_PREFIX, CHECKSUM_NAME = "facets:", "cells:", "on_", "cells_sha256"
@@ -53,14 +57,38 @@ def to_vtk(
 
     Point data of the mesh's nodes alone are interpolated to those of order 2, see `tetopt.model.fields.node_field`.
     """
+    places, cells = quadratic(mesh.points, mesh.cells) if order == 2 else (mesh.points, mesh.cells)
+    points = np.zeros((len(places), 3))
+    points[:, : mesh.ndim] = places
+    grid = _bare_grid(points, cells, CELL_TYPES[mesh.ndim, order])
+    for name, values in (cell_data or {}).items():
+        _add(grid.GetCellData(), name, values)
+    for name, values in (point_data or {}).items():
+        _add(grid.GetPointData(), name, node_field(values, mesh, order))
+    return grid
+
+
+def vtk_of(grid: Grid) -> vtkUnstructuredGrid:
+    """A grid of plain arrays, whose cells are all of one kind, as VTK's."""
+    cells = grid.connectivity.reshape(len(grid.cell_types), -1)
+    of_vtk = _bare_grid(grid.points, cells, int(grid.cell_types[0]))
+    for fields, values_of in (
+        (of_vtk.GetCellData(), grid.cell_data),
+        (of_vtk.GetPointData(), grid.point_data),
+        (of_vtk.GetFieldData(), grid.field_data),
+    ):
+        for name, values in values_of.items():
+            _add(fields, name, values)
+    return of_vtk
+
+
+def _bare_grid(points: NDArray[np.float64], cells: NDArray[np.int64], kind: int) -> vtkUnstructuredGrid:
+    """Cells of one of VTK's kinds, without data."""
     # VTK without pyvista, and only here: files are written by the quickest of runs, too.
     from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
     from vtkmodules.vtkCommonCore import vtkPoints
     from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkUnstructuredGrid
 
-    places, cells = quadratic(mesh.points, mesh.cells) if order == 2 else (mesh.points, mesh.cells)
-    points = np.zeros((len(places), 3))
-    points[:, : mesh.ndim] = places
     nodes = vtkPoints()
     nodes.SetData(numpy_to_vtk(points, deep=True))
     listed = vtkCellArray()
@@ -69,11 +97,7 @@ def to_vtk(
     )
     grid = vtkUnstructuredGrid()
     grid.SetPoints(nodes)
-    grid.SetCells(CELL_TYPES[mesh.ndim, order], listed)
-    for name, values in (cell_data or {}).items():
-        _add(grid.GetCellData(), name, values)
-    for name, values in (point_data or {}).items():
-        _add(grid.GetPointData(), name, node_field(values, mesh, order))
+    grid.SetCells(kind, listed)
     return grid
 
 
@@ -93,9 +117,14 @@ def _add(fields: vtkFieldData, name: str, values: NDArray) -> None:
 
 def vtu(model: Model) -> bytes:
     """A VTU file, exact, compressed."""
+    return vtu_bytes(model_grid(model))
+
+
+def vtu_bytes(grid: vtkUnstructuredGrid) -> bytes:
+    """A grid as a VTU file."""
     from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
 
-    return xml_bytes(vtkXMLUnstructuredGridWriter(), model_grid(model))
+    return xml_bytes(vtkXMLUnstructuredGridWriter(), grid)
 
 
 def vtk(model: Model) -> bytes:
@@ -132,10 +161,14 @@ def xml_bytes(writer: Any, grid: vtkDataSet) -> bytes:
     for fields in (grid.GetCellData(), grid.GetPointData(), grid.GetFieldData()):
         for number in range(fields.GetNumberOfArrays()):
             array = fields.GetAbstractArray(number)
-            # VTK 9.7 writes them as they are. `tetopt.io.read_vtk` takes counts between apostrophes for the file's own.
-            array.SetName(xml_attribute(array.GetName()).replace("'", "&apos;"))
+            array.SetName(name_in_xml(array.GetName()))  # VTK 9.7 writes them as they are
     writer.SetDataModeToBinary()
     return written_bytes(writer, grid)
+
+
+def name_in_xml(name: str) -> str:
+    """A name as it stands in a file of VTK's: `tetopt.io.read_vtk` takes counts between apostrophes for the file's."""
+    return xml_attribute(name).replace("'", "&apos;")
 
 
 def written_bytes(writer: Any, grid: vtkDataSet) -> bytes:
