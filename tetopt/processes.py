@@ -8,9 +8,11 @@ does.
 from __future__ import annotations
 
 import contextlib
+import ctypes
 import os
 import signal
 import subprocess
+import sys
 import time
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -21,6 +23,7 @@ from tetopt.budget import status_bytes
 POLL_SECONDS = 0.05  # between two looks at a child's memory: a fraction of what even a short run takes
 KILL_ROUNDS = 40  # of looking for what is left of a child, `POLL_SECONDS` apart: what was killed may have forked before
 MARK_NAME = "TETOPT_CHILD"  # in the environment of whatever a child starts: the child's folder
+DEATH_OPTION = 1  # PR_SET_PDEATHSIG, of prctl(2)
 # Waits until its standard input closes, which the parent's end does, however it comes.
 WATCHDOG = 'read -r _; kill -9 -"$1"; sleep 0.2; rm -rf "$2"'
 
@@ -68,6 +71,16 @@ def _guarded(child: subprocess.Popen, folder: Path) -> Iterator[None]:
         shell.wait()
         assert shell.stdin is not None, "opened above"
         shell.stdin.close()
+
+
+def end_with_parent() -> None:
+    """From now on this process is killed as soon as the one that started it ends, on Linux; elsewhere nothing happens.
+
+    Where a thread started it, with that thread. A process sees such an end by itself only when it comes to look, which
+    one in a compiled kernel does not.
+    """
+    if sys.platform == "linux":
+        ctypes.CDLL(None).prctl(DEATH_OPTION, signal.SIGKILL)
 
 
 def watched(child: subprocess.Popen, max_seconds: float, max_bytes: int | None) -> tuple[int, str | None]:

@@ -1,9 +1,12 @@
 """Tasks that workers run themselves: again where a worker dies, within limits, with their errors in one line."""
 
+import ctypes
 import errno
 import mmap
 import os
 import signal
+import subprocess
+import sys
 import time
 from functools import partial
 
@@ -16,6 +19,7 @@ from tetopt.cluster.crew import Folders, Need
 from tetopt.cluster.tasks import SchedulerLost, run_tasks
 from tetopt.cluster.workers import workers
 from tetopt.errors import InputError
+from tetopt.interpreter import python_command, python_environment
 
 LIMIT = 0.8e9  # of a worker, which has 0.24 GB with numba loaded
 
@@ -52,6 +56,30 @@ def test_each_name_is_run_with_the_threads_of_its_share_and_measured(run, crew, 
     assert {each.worker for each in done.values()} <= set(crew.client.nthreads())
     if PROC_FOLDER.exists():
         assert all(5e7 < each.peak_bytes < LIMIT for each in done.values())
+
+
+def test_threads_are_those_of_the_environment_though_numba_was_loaded_before_it_was_set():
+    """A main program that loads kernels is loaded in workers, too, before their environment is set."""
+    program = (
+        "import os, numba; os.environ['NUMBA_NUM_THREADS'] = '1'\n"
+        "from tetopt.cluster.tasks import limit_threads; limit_threads(2)\n"
+        "numba.njit(lambda: 0)(); print(numba.config.NUMBA_NUM_THREADS, numba.get_num_threads())\n"
+    )
+    environment = {name: text for name, text in python_environment().items() if name != "NUMBA_NUM_THREADS"}
+    answer = subprocess.run(python_command("-c", program), env=environment, capture_output=True, text=True, check=True)
+    assert answer.stdout == "1 1\n"
+
+
+def death_signal():
+    """Of the thread that asks: that in which workers begin."""
+    number = ctypes.c_int()
+    ctypes.CDLL(None).prctl(2, ctypes.byref(number))  # PR_GET_PDEATHSIG
+    return number.value
+
+
+@pytest.mark.skipif(sys.platform != "linux", reason="prctl is Linux's")
+def test_the_system_ends_a_worker_with_its_nanny(run, crew):
+    assert set(crew.client.run(death_signal).values()) == {signal.SIGKILL}
 
 
 def begun(folder, name):

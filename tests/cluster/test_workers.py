@@ -453,14 +453,22 @@ def test_folders_that_directives_do_not_take_are_refused(batch, tmp_path):
 
 
 @pytest.mark.slow
-def test_nothing_is_left_of_a_client_that_is_killed(tmp_path):
+@pytest.mark.parametrize(
+    ("is_within", "task"),
+    [(False, "time.sleep"), (True, "time.sleep"), (True, "ctypes.PyDLL(None).sleep")],  # the last as kernels are
+)
+def test_nothing_is_left_of_a_client_that_is_killed(is_within, task, tmp_path):
     program = (
-        "import sys, time; from pathlib import Path; from tetopt.cluster.workers import *\n"
+        "import ctypes, os, sys, time; from pathlib import Path; from tetopt.cluster.workers import *\n"
         "from tetopt.cluster.crew import *\n"
+        f"def task(mark): mark.touch(); {task}(100)\n"
         "if __name__ == '__main__':\n"
         "    one = Path(sys.argv[1])\n"
-        "    with workers(Need(2, 1.0, 1), Folders(one, one), count=2, scheduler=None, cluster=None) as crew:\n"
-        "        crew.client.submit(time.sleep, 100); print('up', flush=True); time.sleep(100)\n"
+        f"    need = Need(2, 1.0, 1, {is_within})\n"
+        "    with workers(need, Folders(one, one), count=2, scheduler=None, cluster=None) as crew:\n"
+        "        future = crew.client.submit(task, one / 'mark')\n"
+        "        while not (one / 'mark').exists(): time.sleep(0.01)\n"
+        "        print('up', flush=True); time.sleep(100)\n"
     )
     script = tmp_path / "client.py"
     script.write_text(program)

@@ -13,6 +13,7 @@ from typing import Any, NamedTuple
 import tetopt
 from tetopt.budget import memory_words
 from tetopt.errors import InputError
+from tetopt.processes import end_with_parent
 
 try:
     import resource
@@ -179,6 +180,7 @@ class Newcomers:
 def limiter() -> Any:
     """A plugin by which an allocation that would take a worker over its limit of memory fails, where systems have that.
 
+    And by which it ends with its nanny, whatever it does just then.
     A nanny ends its worker after the fact, when it next looks. RLIMIT_DATA counts what the process may write to and
     has not got from a file, touched or not; files' pages, which can be had again, count for the nanny alone.
     """
@@ -186,6 +188,7 @@ def limiter() -> Any:
 
     class Limiter(WorkerPlugin):
         def setup(self, worker: Any) -> None:
+            end_with_parent()
             limit = worker.memory_manager.memory_limit
             if resource is not None and limit:
                 hard = resource.getrlimit(resource.RLIMIT_DATA)[1]

@@ -170,13 +170,21 @@ def lost_words(attempts: int) -> str:
 
 def _measured(function: Callable[[Any], Any], threads: int, name: Any) -> Done:
     """What a worker runs."""
-    import numba
     from distributed import get_worker
 
-    numba.set_num_threads(min(threads, numba.config.NUMBA_NUM_THREADS))
+    limit_threads(threads)
     begin = time.monotonic()
     result = function(name)
     return Done(name, result, time.monotonic() - begin, get_worker().address, peak_bytes())
+
+
+def limit_threads(number: int) -> None:
+    """Numba's threads from now on, in this thread of Python: so many, or fewer if the process has no more."""
+    import numba
+
+    # What the environment says by now: the main program may have loaded numba before dask set it.
+    numba.config.reload_config()
+    numba.set_num_threads(min(number, numba.config.NUMBA_NUM_THREADS))
 
 
 def _raise(workers: Workers, name: Any, error: BaseException, attempts: int) -> NoReturn:

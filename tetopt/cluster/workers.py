@@ -38,6 +38,7 @@ from tetopt.cluster.jobs import configuration, submitted
 from tetopt.errors import InputError
 
 CONNECT_SECONDS = 10  # until a scheduler that does not answer is given up: dask's own is 30
+CLOSE_SECONDS = 1.0  # for a worker to end by itself, and as much until one that is killed is gone: dask's own is 5
 LOGGER_NAMES = ("distributed", "dask_jobqueue", "bokeh", "tornado", "asyncio")  # of what speaks in dask
 
 
@@ -165,6 +166,8 @@ def _local(stack: ExitStack, need: Need, folders: Folders, count: int | None) ->
             env={THREADS_NAME: str(share.threads)} if need.is_within else None,
         )
     )
+    if need.is_within:
+        stack.callback(cluster.sync, _closed, cluster)
     client = stack.enter_context(Client(cluster))
     client.register_plugin(_silencer(folders.logs / "dask.log"))
     if need.is_within:
@@ -174,6 +177,11 @@ def _local(stack: ExitStack, need: Need, folders: Folders, count: int | None) ->
         words += f" and {memory_words(share.bytes)}"
     words += f"; dashboard {client.dashboard_link}"
     return Workers(client, lambda: slots_of(client), share.threads, share.bytes, words, share.limit)
+
+
+async def _closed(cluster: Any) -> None:
+    """Soon, whatever runs there: of tasks that workers run themselves, those left lose nothing but time."""
+    await asyncio.gather(*(nanny.close(timeout=CLOSE_SECONDS) for nanny in cluster.workers.values()))
 
 
 # ---- A cluster that runs
