@@ -11,6 +11,8 @@ import re
 from pathlib import Path
 from typing import NamedTuple
 
+import numpy as np
+
 from tetopt.errors import InputError
 from tetopt.incoming import irregular
 from tetopt.io.apart import DEFLATE_RATIO
@@ -21,16 +23,23 @@ HEADER_BYTES = 2**20  # of a header: 3D Slicer's with all its words have 10,000
 MOST_AXES = 8  # of a file: more than space, time, and what is measured
 TEXT_RATIO = 4  # "0 " becomes 8 bytes
 BZIP2_RATIO = 50_000  # bzip2 packs zeros 45,000 times
-BYTES_OF_TYPE = {
-    "MET_CHAR": 1, "MET_UCHAR": 1, "MET_SHORT": 2, "MET_USHORT": 2, "MET_INT": 4, "MET_UINT": 4, "MET_LONG": 4,
-    "MET_ULONG": 4, "MET_LONG_LONG": 8, "MET_ULONG_LONG": 8, "MET_FLOAT": 4, "MET_DOUBLE": 8,
-    "signed char": 1, "int8": 1, "int8_t": 1, "uchar": 1, "unsigned char": 1, "uint8": 1, "uint8_t": 1,
-    "short": 2, "short int": 2, "signed short": 2, "signed short int": 2, "int16": 2, "int16_t": 2,
-    "ushort": 2, "unsigned short": 2, "unsigned short int": 2, "uint16": 2, "uint16_t": 2,
-    "int": 4, "signed int": 4, "int32": 4, "int32_t": 4, "uint": 4, "unsigned int": 4, "uint32": 4, "uint32_t": 4,
-    "longlong": 8, "long long": 8, "long long int": 8, "signed long long": 8, "signed long long int": 8, "int64": 8,
-    "int64_t": 8, "ulonglong": 8, "unsigned long long": 8, "unsigned long long int": 8, "uint64": 8, "uint64_t": 8,
-    "float": 4, "double": 8,
+DTYPE_OF_TYPE = {
+    "MET_CHAR": "i1", "MET_UCHAR": "u1", "MET_SHORT": "i2", "MET_USHORT": "u2", "MET_INT": "i4", "MET_UINT": "u4",
+    "MET_LONG": "i4", "MET_ULONG": "u4", "MET_LONG_LONG": "i8", "MET_ULONG_LONG": "u8", "MET_FLOAT": "f4",
+    "MET_DOUBLE": "f8",
+    "signed char": "i1", "int8": "i1", "int8_t": "i1", "uchar": "u1", "unsigned char": "u1", "uint8": "u1",
+    "uint8_t": "u1", "short": "i2", "short int": "i2", "signed short": "i2", "signed short int": "i2", "int16": "i2",
+    "int16_t": "i2", "ushort": "u2", "unsigned short": "u2", "unsigned short int": "u2", "uint16": "u2",
+    "uint16_t": "u2", "int": "i4", "signed int": "i4", "int32": "i4", "int32_t": "i4", "uint": "u4",
+    "unsigned int": "u4", "uint32": "u4", "uint32_t": "u4", "longlong": "i8", "long long": "i8", "long long int": "i8",
+    "signed long long": "i8", "signed long long int": "i8", "int64": "i8", "int64_t": "i8", "ulonglong": "u8",
+    "unsigned long long": "u8", "unsigned long long int": "u8", "uint64": "u8", "uint64_t": "u8", "float": "f4",
+    "double": "f8",
+}  # fmt: skip
+# Fields that tell of values that are packed, text or several a voxel, and what they say of others.
+PLAIN_FIELDS = {
+    "CompressedData": ("false", "0"), "BinaryData": ("true", "1"), "ElementNumberOfChannels": ("1",),
+    "encoding": ("raw",), "line skip": ("0",), "lineskip": ("0",),
 }  # fmt: skip
 
 
@@ -41,6 +50,18 @@ class VoxelHeader(NamedTuple):
     value_bytes: int  # all voxels
     files: list[str]  # that have the voxels; none if they follow the header
     ratio: int  # the most that a byte of the file can become
+    dtype: str  # of a value, without its order of bytes
+    fields: dict[str, str]  # all, as they are written
+    n_bytes: int  # of the header itself, where voxels follow
+
+
+class RawVoxels(NamedTuple):
+    """Where in a file voxels lie one after the other, the first axis the fastest."""
+
+    file: Path
+    dtype: np.dtype
+    offset: int  # bytes
+    sizes: tuple[int, ...]
 
 
 def checked_header(path: Path) -> tuple[int, int]:
@@ -53,6 +74,13 @@ def checked_header(path: Path) -> tuple[int, int]:
         is not beside the header, or no regular file.
     """
     header = _header(path)
+    n_bytes = _checked_bytes(path, header)
+    check_room(header.sizes, header.value_bytes // max(math.prod(header.sizes), 1))
+    return n_bytes, header.value_bytes
+
+
+def _checked_bytes(path: Path, header: VoxelHeader) -> int:
+    """Bytes of all files of the image; InputError if its header tells of more."""
     n_bytes = sum(file.stat().st_size for file in (path, *_data_files(path, header)))
     if header.value_bytes > n_bytes * header.ratio:
         sizes = " x ".join(str(size) for size in header.sizes)
@@ -60,8 +88,46 @@ def checked_header(path: Path) -> tuple[int, int]:
             f"{DAMAGED_FILE} (its header tells of {sizes} voxels, "
             f"{header.value_bytes:.4g} bytes, the file has {n_bytes})"
         )
-    check_room(header.sizes, header.value_bytes // max(math.prod(header.sizes), 1))
-    return n_bytes, header.value_bytes
+    return n_bytes
+
+
+def raw_voxels(path: Path) -> RawVoxels:
+    """Where the voxels are, of an image that is not compressed and in one file.
+
+    Raises
+    ------
+    InputError
+        As `checked_header`, but for the memory; voxels that are compressed, text, or in several files.
+    """
+    header = _header(path)
+    for key, plain in PLAIN_FIELDS.items():
+        if header.fields.get(key, plain[0]).lower() not in plain:
+            raise InputError(
+                f"its voxels cannot be read in parts ({key}: {header.fields[key][:80]}); write it uncompressed, or "
+                "convert it to .zarr, first"
+            )
+    if len(header.files) > 1 or any("%" in name for name in header.files):
+        raise InputError("its voxels are in several files, and cannot be read in parts; convert it to one first")
+    file = (_data_files(path, header) or [path])[0]
+    _checked_bytes(path, header)
+    skip = header.fields.get("byte skip", header.fields.get("byteskip", header.fields.get("HeaderSize", "0")))
+    if re.fullmatch(r"-1|\d{1,18}", skip) is None or (not header.files and "HeaderSize" in header.fields):
+        raise InputError(f"its voxels cannot be read in parts (they begin after {skip[:80]} bytes); write it again")
+    n_bytes = file.stat().st_size
+    offset = int(skip) + (0 if header.files else header.n_bytes) if skip != "-1" else n_bytes - header.value_bytes
+    if not 0 <= offset <= n_bytes - header.value_bytes:
+        raise InputError(f"{DAMAGED_FILE} (its voxels are to begin at byte {offset} of {n_bytes})")
+    return RawVoxels(file, np.dtype(_order(header) + header.dtype), offset, tuple(header.sizes))
+
+
+def _order(header: VoxelHeader) -> str:
+    """Of the bytes of a value: "<" or ">"."""
+    fields = header.fields
+    msb = fields.get("ElementByteOrderMSB", fields.get("BinaryDataByteOrderMSB"))
+    order = fields.get("endian", "").lower() if msb is None else ("big" if msb.lower() in ("true", "1") else "little")
+    if order not in ("big", "little") and not header.dtype.endswith("1"):
+        raise InputError(f"{UNREADABLE_FILE} (its header does not tell the order of bytes)")
+    return ">" if order == "big" else "<"
 
 
 def data_files(path: Path) -> list[Path]:
@@ -141,7 +207,9 @@ def _metaimage(head: bytes) -> VoxelHeader:
     is_packed = fields.get("CompressedData", "").lower() in ("true", "1")
     is_text = fields.get("BinaryData", "True").lower() not in ("true", "1")
     ratio = DEFLATE_RATIO if is_packed else TEXT_RATIO if is_text else 1
-    return VoxelHeader(sizes, math.prod(sizes) * int(channels) * _bytes_of(fields["ElementType"]), files, ratio)
+    dtype, end = _dtype_of(fields["ElementType"]), len(b"\n".join(lines[: number + 1])) + 1
+    value_bytes = math.prod(sizes) * int(channels) * np.dtype(dtype).itemsize
+    return VoxelHeader(sizes, value_bytes, files, ratio, dtype, fields, end)
 
 
 def _nrrd(head: bytes) -> VoxelHeader:
@@ -149,7 +217,8 @@ def _nrrd(head: bytes) -> VoxelHeader:
         raise InputError(UNREADABLE_FILE)
     fields: dict[str, str] = {}
     files: list[str] = []
-    lines = [line.decode("latin-1").rstrip("\r") for line in head.split(b"\n")]
+    raw = head.split(b"\n")
+    lines = [line.decode("latin-1").rstrip("\r") for line in raw]
     if len(head) == HEADER_BYTES and "" not in lines:
         raise InputError(f"{UNREADABLE_FILE} (a header of more than {HEADER_BYTES} bytes)")
     for number, line in enumerate(lines[1:], 1):
@@ -174,10 +243,11 @@ def _nrrd(head: bytes) -> VoxelHeader:
     for names, of_these in (("raw hex", 1), ("txt text ascii", TEXT_RATIO), ("gz gzip", DEFLATE_RATIO)):
         if encoding in names.split():
             ratio = of_these
-    return VoxelHeader(sizes, math.prod(sizes) * _bytes_of(fields["type"]), files, ratio)
+    dtype, end = _dtype_of(fields["type"]), len(b"\n".join(raw[: number + 1])) + 1
+    return VoxelHeader(sizes, math.prod(sizes) * np.dtype(dtype).itemsize, files, ratio, dtype, fields, end)
 
 
-def _bytes_of(kind: str) -> int:
-    if kind not in BYTES_OF_TYPE:
+def _dtype_of(kind: str) -> str:
+    if kind not in DTYPE_OF_TYPE:
         raise InputError(f"{UNREADABLE_FILE} (voxels of type {kind[:80]})")
-    return BYTES_OF_TYPE[kind]
+    return DTYPE_OF_TYPE[kind]

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from tetopt.errors import InputError
 from tetopt.incoming import irregular
 from tetopt.io.apart import read_apart
-from tetopt.io.itk_headers import checked_header
+from tetopt.io.itk_headers import HEADER_BYTES, checked_header
 from tetopt.io.volumes import UNREADABLE_FILE, one_line, volume_index
 
 # ITK picks its reader by the name's case-sensitive ending; naming the reader also opens SCAN.MHA.
@@ -34,6 +34,13 @@ def read_itk(path: Path, volume: int | None) -> tuple[NDArray, NDArray[np.float6
     size, value_bytes = (None, 0) if path.suffix.lower() == ".dcm" else checked_header(path)
     data, affine = read_apart(_volume_of, path, volume, size=size, value_bytes=value_bytes, library="SimpleITK")
     return data, affine
+
+
+def itk_place(path: Path) -> tuple[tuple[int, ...], NDArray[np.float64]]:
+    """Lengths of a file's axes and its affine, of which only the header is read; InputError as `read_itk`."""
+    _check_installed()
+    sizes, affine = read_apart(_place_of, path, size=HEADER_BYTES, library="SimpleITK")
+    return tuple(sizes), affine
 
 
 def read_dicom_folder(path: Path, volume: int | None) -> tuple[NDArray, NDArray[np.float64]]:
@@ -61,11 +68,7 @@ def _volume_of(path: str, volume: int | None) -> tuple[NDArray, NDArray[np.float
     import SimpleITK as sitk
 
     try:
-        reader = sitk.ImageFileReader()
-        reader.SetFileName(path)
-        reader.SetImageIO(ITK_READERS[Path(path).suffix.lower()])
-        reader.ReadImageInformation()
-        _check_components(reader.GetNumberOfComponents())
+        reader = _reader_of(path)
         size = reader.GetSize()
         index = volume_index(size[3:], volume)
         if index:
@@ -74,6 +77,26 @@ def _volume_of(path: str, volume: int | None) -> tuple[NDArray, NDArray[np.float
         return sitk.GetArrayFromImage(reader.Execute()).T, _ras_affine(reader)
     except RuntimeError as error:
         raise _in_words(error) from error
+
+
+def _place_of(path: str) -> tuple[list[int], NDArray[np.float64]]:
+    try:
+        reader = _reader_of(path)
+        return [int(size) for size in reader.GetSize()], _ras_affine(reader)
+    except RuntimeError as error:
+        raise _in_words(error) from error
+
+
+def _reader_of(path: str) -> Any:
+    """A reader that has read the header."""
+    import SimpleITK as sitk
+
+    reader = sitk.ImageFileReader()
+    reader.SetFileName(path)
+    reader.SetImageIO(ITK_READERS[Path(path).suffix.lower()])
+    reader.ReadImageInformation()
+    _check_components(reader.GetNumberOfComponents())
+    return reader
 
 
 def _series_of(path: str, volume: int | None) -> tuple[NDArray, NDArray[np.float64]]:

@@ -61,7 +61,8 @@ class VoxelsInFile:
         ranges = [each.indices(size)[:2] for each, size in zip(box, self.shape, strict=True)]
         picks = self.within(ranges).picks
         try:
-            return np.asarray(self.array[picks])
+            values = self.array[picks]
+            return np.array(values) if isinstance(values, np.memmap) else np.asarray(values)
         except MemoryError:
             raise
         except Exception as error:  # whatever a codec raises at a damaged chunk
