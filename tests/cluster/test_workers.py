@@ -133,7 +133,7 @@ def others():
 def test_workers_of_a_scheduler_that_runs(others, folders):
     with running(Need(10, 3.9 * GB, None), folders, scheduler=others.scheduler.address) as crew:
         assert crew.slots() == 4
-        assert crew.bytes == 4 * GB
+        assert (crew.bytes, crew.limit) == (4 * GB, 8 * GB)
         assert crew.threads == max(1, dask.system.CPU_COUNT // 4)
     with running(Need(10, 0.0, 3), folders, scheduler=others.scheduler.address) as crew:
         assert crew.threads == 3

@@ -211,7 +211,8 @@ def _connected(stack: ExitStack, need: Need, folders: Folders, address: str) -> 
     n_bytes = min(map(newcomers.room_of, newcomers.known.values()), default=float("inf"))
     words = f"{counted(len(newcomers.known), 'worker')} at {address}, {counted(slots, 'task')} at a time of "
     words += counted(threads, "thread")
-    return Workers(client, newcomers.slots, threads, n_bytes, f"{words}; dashboard {client.dashboard_link}")
+    limit = min((about.n_bytes for about in newcomers.known.values()), default=float("inf"))
+    return Workers(client, newcomers.slots, threads, n_bytes, f"{words}; dashboard {client.dashboard_link}", limit)
 
 
 async def _reached(address: str) -> None:
