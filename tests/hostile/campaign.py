@@ -51,7 +51,7 @@ def load_everything() -> None:
     modules = [f"tetopt.cli.{module}" for module, _ in app.COMMANDS.values()]
     modules += [f"tetopt.report.{name}" for name in ("exhibit", "explore", "figures")]
     modules += ["tetopt.fem.reference", "tetopt.fem.solution", "tetopt.measure.segmentation"]
-    modules += ["SimpleITK", "PIL.Image", "meshio", "pyvista", "trimesh"]
+    modules += ["SimpleITK", "PIL.Image", "meshio", "pyvista", "trimesh", "h5py"]
     for name in modules:
         import_module(name)
     kernels = import_module("tetopt.kernels")

@@ -13,7 +13,9 @@ from hostile.mutations import HOSTILE_NAMES, HOSTILE_NUMBERS, one_of
 from hostile.seeds import VOXELS, Seeds, affine
 
 QUICK = ("--nodes", "50", "--iterations", "1")
-MESH_OUTPUTS = (".vtu", ".vtk", ".xdmf", ".msh", ".msh2", ".inp", ".feb", ".scn", ".mfem", ".mesh", ".stl", ".ply")
+MESH_OUTPUTS = (
+    ".vtu", ".vtk", ".vtkhdf", ".xdmf", ".msh", ".msh2", ".inp", ".feb", ".scn", ".mfem", ".mesh", ".stl", ".ply",
+)  # fmt: skip
 SPECIAL_KINDS = ("fifo", "zero", "loop", "folder", "stdin", "gone")
 
 
@@ -70,7 +72,7 @@ def with_image(draw: Draw, image: str, *, is_main: bool = False) -> tuple[tuple[
     how = "mesh" if is_main else draw.one(*["mesh"] * 4, "mask", "labels", "sizing", "second", "uniform", "quality",
                                           "quality mask", "segment", "fem", "view", "convert", "paper",
                                           "error")  # fmt: skip
-    out = f"out{draw.one('.vtu', '.vtu', *MESH_OUTPUTS[:3])}"
+    out = f"out{draw.one('.vtu', '.vtu', *MESH_OUTPUTS[:4])}"
     if how in ("mesh", "uniform", "paper", "error"):
         more = {"uniform": ("--uniform",), "paper": ("--method", "paper"), "error": ("--target-error", "0.5")}.get(
             how, ()
@@ -194,8 +196,11 @@ def outside(draw):
         what = f"data outside: {draw.files[name][-60:]!r}"
         draw.files.pop("i.raw")
         return what, *with_image(draw, name, is_main=True)
-    name = draw.one("ascii.vtu", "m.vtu", "inline.vtu")
+    name = draw.one("ascii.vtu", "m.vtu", "inline.vtu", "p.pvtu")
     draw.good(name)
+    if name == "p.pvtu":
+        what, draw.files[name] = m.piece_outside(draw.rng, draw.files[name])
+        return what, *with_mesh(draw, name)
     what, draw.files[name] = m.xml_bomb(draw.rng, draw.files[name])
     return what, *with_mesh(draw, name)
 
@@ -250,6 +255,17 @@ def vtu(draw):
     known = (m.xml, m.xml, m.xml, m.array_values, m.array_values, m.payload, m.xml_depth)
     mesh, what = draw.bad(name, (*known, *m.ANY, *m.TEXT) if name == "ascii.vtu" else (*known, *m.ANY))
     return what, *with_mesh(draw, mesh)
+
+
+def pieces(draw):
+    """VTKHDF; a PVTU, one of whose files is damaged."""
+    names = ("h.vtkhdf",) if draw.rng.random() < 0.5 else ("p.pvtu", "p_0.vtu", "p_1.vtu")
+    for each in names:
+        draw.good(each)
+    name = draw.one(*names)
+    known = m.ANY if name == "h.vtkhdf" else (m.xml, m.xml, m.xml_depth, *m.ANY)
+    _, what = draw.bad(name, known)
+    return f"{name}: {what}", *with_mesh(draw, names[0])
 
 
 def field_names(draw):
@@ -675,7 +691,8 @@ def lines(draw):
 KINDS: dict[str, tuple[int, Callable[[Draw], tuple]]] = {
     "NIfTI": (6, nifti), "odd images": (6, odd_images), "MGH": (2, mgh), "NRRD, MetaImage": (5, itk), "DICOM": (3,
     dicom), "pictures": (2, pictures),
-    "VTU": (7, vtu), "legacy VTK": (4, vtk), "gmsh": (5, gmsh), "CalculiX's results": (2, results),
+    "VTU": (7, vtu), "meshes in pieces": (4, pieces), "legacy VTK": (4, vtk), "gmsh": (5, gmsh),
+    "CalculiX's results": (2, results),
     "field names": (2, field_names),
     "texts in meshes": (3, texts_in_meshes), "label tables": (3, label_tables), "phantoms": (4, phantoms),
     "laws in files": (3, laws),

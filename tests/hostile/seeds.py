@@ -12,6 +12,7 @@ import nibabel
 import numpy as np
 import PIL.Image
 
+import tetopt
 from tetopt.cli.app import main
 
 VOXELS = 12  # along each axis: an octree of some fifty nodes
@@ -145,6 +146,14 @@ def _write_meshes():
         _tetopt("convert", "m.vtu", name, "--order", "2")
     _tetopt("fem", "m.vtu", "-o", "solved.vtu")
     _tetopt("mesh", "i.nii", "--slice", "k=5", "--nodes", "40", "--iterations", "1", "-o", "flat.vtu")
+    loaded = tetopt.load_mesh("m.vtu")
+    cell_data = loaded.cell_data | {"part": np.arange(len(loaded.mesh.cells)) % 2}
+    for name in ("h.vtkhdf", "p.pvtu"):
+        tetopt.save_mesh(name, loaded.mesh, cell_data, {"tetopt": "0.1.0"})
+    for piece in sorted(Path("p").iterdir()):  # beside their master, where all files of a case are
+        piece.rename(piece.name)
+    Path("p.pvtu").write_bytes(Path("p.pvtu").read_bytes().replace(b'"p/p_', b'"p_'))
+    Path("p").rmdir()
     mesh = meshio.read("m.vtu")
     bare = meshio.Mesh(
         mesh.points, mesh.cells, cell_data={"mean": mesh.cell_data["mean"], "label": mesh.cell_data["label"]}
