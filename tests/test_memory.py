@@ -100,7 +100,7 @@ LIMITS = _block_limits(source_of(IMAGE), 100, None)
 TASKS = {
     "lattice: .* nodes: needs.*ask for fewer": lambda: tetopt.lattice(IMAGE, spacing=0.1),
     "octree: .* blocks: needs.*allow longer edges, or crop": lambda: _blocks_by_depth(
-        source_of(IMAGE), channels_of(source_of(IMAGE)), (2, 2, 2), LIMITS
+        source_of(IMAGE), channels_of(source_of(IMAGE)), (4, 4, 4), LIMITS
     ),
     "phantom 'sphere': .* voxels: needs.*take larger": lambda: tetopt.load_phantom("sphere").image(),
     "image: 2 sums of 9 x 8 x 7 voxels: needs.*crop it": lambda: sampling_grid(IMAGE, LATTICE.points),

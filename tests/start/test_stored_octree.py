@@ -189,10 +189,10 @@ def test_targets_take_voxels_in_memory(sizes):
 
 def test_blocks_are_bounded(monkeypatch):
     """The bound is the same in memory and stored, and where it bounds, leaves are larger."""
-    data = noisy((40, 40, 40), np.uint16)
-    monkeypatch.setattr(sys.modules["tetopt.start.octree"], "MOST_BLOCKS", 512)
-    mesh = nearest_octree(StoredImage(data), 1500, tetopt.Sizes(longest=np.inf))
-    assert_same(mesh, nearest_octree(tetopt.Image(data), 1500, tetopt.Sizes(longest=np.inf)))
-    monkeypatch.undo()
-    finer = nearest_octree(StoredImage(data), 1500, tetopt.Sizes(longest=np.inf))
-    assert len(mesh.points) != len(finer.points)
+    data, sizes, shortest = noisy((40, 40, 40), np.uint16), tetopt.Sizes(longest=np.inf), []
+    for most in (64, 2**24):
+        monkeypatch.setattr(sys.modules["tetopt.start.octree"], "MOST_BLOCKS", most)
+        mesh = nearest_octree(StoredImage(data), 1500, sizes)
+        assert_same(mesh, nearest_octree(tetopt.Image(data), 1500, sizes))
+        shortest.append(np.linalg.norm(mesh.points[mesh.cells[:, 1]] - mesh.points[mesh.cells[:, 0]], axis=1).min())
+    assert shortest[0] > 1.5 * shortest[1]

@@ -15,7 +15,7 @@ The depth of a block is the number of divisions that it takes to get to it: 0 of
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from math import prod
 from typing import NamedTuple
 
@@ -64,8 +64,8 @@ TARGET_SLACK = 0.25
 OCTREE_NODE_BYTES = 3000.0  # of Delaunay's hull in one dimension more, six or seven cells to a node
 BLOCK_FIELD_BYTES = 8.0  # of the smallest blocks, for each field
 OTHER_FIELDS = 4  # besides the sums: targets, the errors of all depths, and half of a field while it is halved
-# For the content's sake no more are looked at: 0.8 GB. Leaves of 2 to 4 voxels of 512^3 are as many, and of 1024^3
-# those of 4 to 8 voxels, 30 for each of 500,000 nodes.
+# For the content's sake no more blocks are summed up, whose halves are the smallest leaves: 0.5 GB. Of 1024^3 voxels
+# there are never more; of 2048^3 leaves are 4 voxels at the least.
 MOST_BLOCKS = 2**24
 LAYER_BLOCKS = 2**16  # computed with at a time: half a megabyte a field, which a processor's cache has room for
 UNEVEN_FACTORS = (0.8191725133961645, 0.6710436067037893, 0.5497004779019703)  # the plastic number's powers -1 to -3
@@ -277,7 +277,7 @@ class _Blocks(NamedTuple):
 
     error: NDArray[np.float64]  # sums of squared deviations less the noise's, and the spread
     is_too_large: NDArray[np.bool_]  # must be divided
-    is_in_region: NDArray[np.bool_]  # in part at least; all are without a mask
+    is_in_region: NDArray[np.bool_] | None  # in part at least; without a mask all are
 
 
 def _blocks_by_depth(
@@ -287,25 +287,30 @@ def _blocks_by_depth(
     image = source.grid
     edge = image.spacing * image.shape / np.array(roots)
     depth, n_by_content = _depths(edge, roots, image.spacing, limits)
-    counts = np.array(roots) << depth
-    n_blocks, n_fields = float(np.prod(counts, dtype=np.float64)), len(channels.means) + 1 + (source.inside is not None)
-    need = BLOCK_FIELD_BYTES * n_blocks * (n_fields + OTHER_FIELDS) + (source.stored is not None) * 2.0 * READ_BYTES
+    # Errors say whether a block is divided: those of the smallest are not needed, but which of them a mask has.
+    summed = depth if source.inside is not None else max(n_by_content - 1, 0)
+    n_blocks, n_summed = (float(prod(roots)) * 2.0 ** (image.ndim * d) for d in (depth, summed))
+    n_fields = len(channels.means) + 1 + (source.inside is not None) + OTHER_FIELDS
+    need = BLOCK_FIELD_BYTES * (n_summed * n_fields + n_blocks * (limits.target is not None))
+    need += 2.0 * READ_BYTES * (source.stored is not None)
     check_memory(need, f"octree: {n_blocks:.3g} blocks", "allow longer edges, or crop the image")
-    sums = block_sums(source, channels, counts)
+    sums = block_sums(source, channels, np.array(roots) << summed)
     spread = SPREAD_OF_VARIANCE * float(sums.second.sum() / source.n_voxels) + SPREAD_OF_NOISE * channels.noise
-    target = None if limits.target is None else _least_targets(limits.target, counts)
+    target = None if limits.target is None else _least_targets(limits.target, np.array(roots) << depth)
     blocks = []
     for d in range(depth, -1, -1):
-        may_be_divided = _may_be_divided(edge, d, limits)
-        is_too_large = np.full(sums.second.shape, _is_too_large(edge, d, limits))
-        if target is not None and d < depth and may_be_divided:
-            is_too_large |= _divided_for(target, float(np.prod(edge)) ** (1 / image.ndim) / 2**d)
-        is_in_region = np.ones(is_too_large.shape, dtype=bool) if sums.inside is None else sums.inside > 0.0
-        error = _errors(sums, channels, spread) if d < n_by_content else np.zeros(is_too_large.shape)
-        blocks.append(_Blocks(error, is_too_large & is_in_region, is_in_region))
-        if d > 0:
+        shape = tuple(root << d for root in roots)
+        is_too_large = np.broadcast_to(_is_too_large(edge, d, limits), shape)
+        if target is not None and d < depth and _may_be_divided(edge, d, limits):
+            is_too_large = is_too_large | _divided_for(target, float(np.prod(edge)) ** (1 / image.ndim) / 2**d)
+        is_in_region = None if sums.inside is None else sums.inside > 0.0
+        if is_in_region is not None:
+            is_too_large = is_too_large & is_in_region
+        error = _errors(sums, channels, spread) if d < n_by_content else np.broadcast_to(0.0, shape)
+        blocks.append(_Blocks(error, is_too_large, is_in_region))
+        if 0 < d <= summed:
             sums = sums.coarser()
-            target = None if target is None else halved(target, np.minimum)
+        target = None if target is None or d == 0 else halved(target, np.minimum)
     return blocks[::-1]
 
 
@@ -350,7 +355,7 @@ def _depths(
         voxels = half / spacing
         if voxels.max() < LEAF_VOXELS or voxels.min() < 0.25 * LEAF_VOXELS or half.min() < limits.smallest:
             break
-        if prod(roots) * 2 ** (len(roots) * (n_by_content + 1)) > MOST_BLOCKS:
+        if prod(roots) * 2 ** (len(roots) * n_by_content) > MOST_BLOCKS:
             break
         n_by_content += 1
     depth = n_by_content
@@ -461,26 +466,26 @@ def _division(
     The threshold is found by bisection.
     """
     # A finer block may hold the largest error: noise is taken off the coarser ones, too.
-    above = [at_depth.error[at_depth.error > 0.0] for at_depth in blocks]
+    above = [at_depth.error[at_depth.error > 0.0] for at_depth in blocks[:-1]]
     ends = [(float(errors.min()), float(errors.max())) for errors in above if len(errors)]
     low, high = (0.5 * min(ends)[0], 2.0 * max(high for _, high in ends)) if ends else (0.5, 1.0)
     del above
-    is_in_region = [at_depth.is_in_region for at_depth in blocks]
+    regions = [at_depth.is_in_region for at_depth in blocks if at_depth.is_in_region is not None]
     best_count, best, is_bound = -1, [], False
     for _ in range(BISECTION_STEPS):
         middle = np.sqrt(max(low, 1e-300) * high)
         divided = _divided(blocks, middle, n_rings)
         # Of far too many leaves, each with its centre, a bound of the nodes is enough: it is no nearer than any number
         # that is counted, and it rises as the threshold falls.
-        n_leaves = _n_leaves(divided, roots, is_in_region)
-        is_skipped = n_leaves > SKIPPED_SHARE * nodes
-        count = NODES_OF_LEAF * n_leaves if is_skipped else len(_leaf_nodes(divided, roots, is_in_region))
+        n_leaves = prod(roots) + (2 ** len(roots) - 1) * sum(int(np.count_nonzero(each)) for each in divided)
+        is_skipped = not regions and n_leaves > SKIPPED_SHARE * nodes
+        count = NODES_OF_LEAF * n_leaves if is_skipped else len(_leaf_nodes(divided, roots, regions))
         if best_count < 0 or abs(count - nodes) < abs(best_count - nodes):
             best_count, best, is_bound = count, divided, is_skipped
         if abs(count - nodes) <= BISECTION_MISS * nodes or high <= low * (1.0 + 1e-9):
             break
         low, high = (middle, high) if count > nodes else (low, middle)
-    return len(_leaf_nodes(best, roots, is_in_region)) if is_bound else best_count, best
+    return len(_leaf_nodes(best, roots)) if is_bound else best_count, best
 
 
 def _divided(blocks: list[_Blocks], threshold: float, n_rings: int) -> list[NDArray[np.bool_]]:
@@ -499,31 +504,22 @@ def _divided(blocks: list[_Blocks], threshold: float, n_rings: int) -> list[NDAr
     return divided
 
 
-def _leaves(divided: list[NDArray[np.bool_]], roots: tuple[int, ...]) -> Iterator[NDArray[np.bool_]]:
-    """Which blocks of each depth are leaves, the coarsest first."""
-    exists = np.ones(roots, dtype=bool)
+def _leaves(divided: list[NDArray[np.bool_]], roots: tuple[int, ...]) -> Iterator[NDArray[np.int64]]:
+    """Places of the leaves of each depth, (K, n), the coarsest first."""
+    blocks = np.argwhere(np.ones(roots, dtype=bool))
+    half = np.argwhere(np.ones((2,) * len(roots), dtype=bool))
     for is_divided in divided:
-        yield exists & ~is_divided
-        exists = is_divided
-        for axis in range(len(roots)):
-            exists = np.repeat(exists, 2, axis=axis)
-    yield exists
-
-
-def _n_leaves(
-    divided: list[NDArray[np.bool_]], roots: tuple[int, ...], is_in_region: list[NDArray[np.bool_]]
-) -> int:  # fmt: skip
-    """The number of leaves in the region."""
-    leaves = zip(_leaves(divided, roots), is_in_region, strict=True)
-    return sum(int(np.count_nonzero(is_leaf & is_in)) for is_leaf, is_in in leaves)
+        yield blocks[~is_divided[tuple(blocks.T)]]
+        blocks = (2 * np.argwhere(is_divided)[:, None] + half).reshape(-1, len(roots))
+    yield blocks
 
 
 def _leaf_nodes(
-    divided: list[NDArray[np.bool_]], roots: tuple[int, ...], is_in_region: list[NDArray[np.bool_]] | None = None
+    divided: list[NDArray[np.bool_]], roots: tuple[int, ...], regions: Sequence[NDArray[np.bool_]] = ()
 ) -> NDArray[np.float64]:
     """Corners and centres of the leaves, (N, n), in units of an undivided block; each once, in lexicographic order.
 
-    With `is_in_region`, by depth, those of the other leaves are left out.
+    With regions, by depth, those of the leaves outside are left out.
     """
     n, depth = len(roots), len(divided)
     corner = np.stack(np.meshgrid(*[[0, 2]] * n, indexing="ij"), axis=-1).reshape(-1, n)
@@ -531,8 +527,7 @@ def _leaf_nodes(
     size = (np.array(roots) << (depth + 1)) + 1  # in halves of the smallest leaves
     steps = np.append(np.cumprod(size[:0:-1])[::-1], 1)  # in a node's number, which has its place along all axes
     codes = []
-    for d, is_leaf in enumerate(_leaves(divided, roots)):
-        leaves = np.nonzero(is_leaf if is_in_region is None else is_leaf & is_in_region[d])
-        first = sum(2 * int(step) * along for step, along in zip(steps, leaves, strict=True))
-        codes.append(((np.asarray(first)[:, None] + of_leaf @ steps) << (depth - d)).ravel())
+    for d, leaves in enumerate(_leaves(divided, roots)):
+        inside = leaves[regions[d][tuple(leaves.T)]] if regions else leaves
+        codes.append(((2 * inside @ steps)[:, None] + of_leaf @ steps << (depth - d)).ravel())
     return np.stack(np.unravel_index(np.unique(np.concatenate(codes)), tuple(size)), axis=-1) / 2.0 ** (depth + 1)
