@@ -1,8 +1,11 @@
 """Stored volumes: each voxel with its value and place as where they are read whole; one line for what cannot be."""
 
+import json
 import os
 import re
 import shutil
+import sys
+import warnings
 
 import nibabel
 import numpy as np
@@ -20,6 +23,7 @@ from tetopt.phantom import load_phantom
 from tetopt.stored import StoredImage
 
 zarr = pytest.importorskip("zarr")
+numcodecs = pytest.importorskip("numcodecs")
 
 RAS = {"x": "left-to-right", "y": "posterior-to-anterior", "z": "inferior-to-superior"}
 OBLIQUE = [[-0.75, 0.31, 1.1, 12.5], [0.12, 0.68, -0.9, -33.0], [0.05, -0.22, 5.1, 7.25], [0, 0, 0, 1.0]]
@@ -125,9 +129,11 @@ def test_raw_voxels_of_the_other_order_of_bytes(tmp_path):
     meta += "ElementByteOrderMSB = True\n"
     (tmp_path / "c.mha").write_bytes(f"{meta}ElementDataFile = LOCAL\n".encode() + voxels)
     (tmp_path / "d.mhd").write_text(f"{meta}HeaderSize = 9\nElementDataFile = b.raw\n")
-    for name in ("a.nrrd", "b.nhdr", "c.mha", "d.mhd"):
+    plain = meta.replace("ElementByteOrderMSB = True", "ElementToIntensityFunctionSlope = 2")
+    (tmp_path / "e.mha").write_bytes(f"{plain}ElementDataFile = LOCAL\n".encode() + voxels)
+    for name in ("a.nrrd", "b.nhdr", "c.mha", "d.mhd", "e.mha"):
         assert_as_read_whole(tmp_path / name, volume=1)
-        assert_refused(tmp_path / name, "2 volumes")
+    assert_refused(tmp_path / "e.mha", "2 volumes")
 
 
 @pytest.mark.parametrize(
@@ -162,7 +168,7 @@ def test_places_on_the_network_are_refused():
 
 
 def test_chunks_that_are_missing(tmp_path):
-    path = write_ome(tmp_path / "a.zarr", [(ramp(8, 4, 4), transforms([1, 1, 1]))], axes_of("zyx"))
+    path = write_ome(tmp_path / "a.zarr", [(ramp(8, 4, 4), transforms([1, 1, 1]))], axes_of("zyx", "millimeter"))
     (path / "0" / "c" / "1" / "0" / "0").unlink()
     with pytest.warns(UserWarning, match="1 of its 2 chunks are not there, and their voxels are taken as 0"):
         open_stored(path)
@@ -349,3 +355,214 @@ def test_coarse_levels_of_an_oblique_image(tmp_path):
     coarse = coarse_image(path, 8)
     np.testing.assert_allclose(coarse.to_world([0, 0, 0]), open_stored(path).to_world([0.5, 0.5, 0.5]))
     np.testing.assert_allclose(coarse.to_world([1, 1, 1]), open_stored(path).to_world([2.5, 2.5, 2.5]))
+
+
+# Folders that are no image
+
+
+def changed(path, change):
+    """The metadata of a group of Zarr 3, changed by a function of its multiscale and all of it."""
+    file = path / "zarr.json"
+    table = json.loads(file.read_text())
+    change(table["attributes"]["ome"]["multiscales"][0], table)
+    file.write_text(json.dumps(table))
+
+
+def set_in(*keys):
+    """A function that sets what is under these keys, but for the last, to the last, in a multiscale."""
+
+    def change(scales, _):
+        *way, key, value = keys
+        for each in way:
+            scales = scales[each]
+        scales[key] = value
+
+    return change
+
+
+PLACE = ("datasets", 0, "coordinateTransformations")
+BAD_METADATA = {
+    "no multiscales": (lambda _, table: table["attributes"].clear(), "a group of Zarr without an OME-Zarr image .* 0"),
+    "empty": (lambda _, table: table["attributes"]["ome"].update(multiscales=[]), "without an OME-Zarr image"),
+    "attributes of another kind": (lambda _, table: table["attributes"].update(ome=[1]), "without an OME-Zarr image"),
+    "no datasets": (set_in("datasets", []), "datasets: expected a list of its arrays, got \\[\\]"),
+    "many datasets": (set_in("datasets", [{}] * 65), "datasets: expected"),
+    "NGFF 0.3": (set_in("axes", ["z", "y", "x"]), "axes: expected a list of axes with names, as NGFF 0.4 and 0.5"),
+    "NGFF 0.6": (lambda scales, _: scales.pop("axes"), "axes: expected .* got None"),
+    "too few axes": (set_in("axes", axes_of("xyz")[:2] + axes_of("c")), "expected three axes in space, got 2"),
+    "too many axes": (set_in("axes", axes_of("txyz")), "names 4 axes, its array has 3"),
+    "axes of other names": (
+        set_in("axes", [dict(each, name="q", orientation=None) for each in axes_of("xyz")]),
+        "names of axes: expected x, y and z",
+    ),
+    "one direction twice": (set_in("axes", axes_of("xyx")), "orientation: expected three different directions"),
+    "unit": (set_in("axes", axes_of("xyz", "second")), "unit: expected a length as NGFF names it"),
+    "unit of no text": (set_in("axes", axes_of("xyz", ["mm"])), "unit: expected"),
+    "no scale": (set_in(*PLACE, []), "has no scale"),
+    "a file of scales": (set_in(*PLACE, [{"type": "scale", "path": "x"}]), "scale: expected 3 numbers, got None"),
+    "short scale": (set_in(*PLACE, transforms([1, 1])), "scale: expected 3 numbers"),
+    "scale of texts": (set_in(*PLACE, transforms(["1", "1", "1"])), "scale: expected 3 numbers"),
+    "scale of nothing": (set_in(*PLACE, transforms([0, 1, 1])), "affine: it is singular"),
+    "scale beyond floats": (set_in(*PLACE, transforms([float("inf"), 1, 1])), "scale: expected 3 numbers"),
+    "whole number beyond floats": (set_in(*PLACE, transforms([10**400, 1, 1])), "scale: expected 3 numbers"),
+    "rotation": (set_in(*PLACE, [{"type": "rotation"}]), "expected scales and translations, got 'rotation'"),
+    "way out": (set_in("datasets", 0, "path", "../b.zarr"), "path: expected the name of an array within the folder"),
+    "absolute": (set_in("datasets", 0, "path", "/etc"), "path: expected the name"),
+    "no path": (set_in("datasets", 0, {}), "path: expected the name"),
+    "link to elsewhere": (set_in("datasets", 0, "path", "s3://a/b"), "path: expected the name"),
+    "array that is not there": (set_in("datasets", 0, "path", "no\nthing"), re.escape(r'its array "no\nthing" is not')),
+    "group in place of an array": (set_in("datasets", 0, "path", "."), "path: expected"),
+}
+
+
+@pytest.mark.parametrize("case", BAD_METADATA)
+def test_metadata_that_is_of_no_image(tmp_path, case):
+    path = write_ome(tmp_path / "a.zarr", [(ramp(3, 3, 3), transforms([1, 1, 1]))], axes_of("xyz"))
+    change, match = BAD_METADATA[case]
+    changed(path, change)
+    assert_refused(path, match)
+
+
+@pytest.mark.parametrize("text", ["", "{", "[]", "null", '{"zarr_format": 9}', "\\0", '{"a": ' + "[" * 100_000])
+@pytest.mark.parametrize("name", ["zarr.json", "0/zarr.json", "0/.zarray", ".zgroup"])
+def test_metadata_that_is_damaged(tmp_path, name, text):
+    fmt = 3 if name.endswith("json") else 2
+    path = write_ome(tmp_path / "a.zarr", [(ramp(3, 3, 3), transforms([1, 1, 1]))], axes_of("xyz"), fmt=fmt)
+    (path / name).write_text(text)
+    assert_refused(path, ".")
+
+
+@pytest.mark.parametrize(
+    ("options", "match"),
+    [
+        ({"dtype": "complex64"}, "expected one real number a voxel, got complex64"),
+        ({"dtype": "bool"}, None),
+        ({"dtype": "float16"}, None),
+        ({"dtype": "S3"}, r"expected one real number a voxel, got \|S3"),
+        ({"dtype": [("r", "u1"), ("g", "u1")]}, "expected one real number a voxel, got .*'r'"),
+        ({"compressors": [numcodecs.Pickle()], "dtype": "i2"}, "pickle"),
+        ({"filters": [numcodecs.Base64()], "dtype": "i2"}, "packed by base64, which is not read"),
+        ({"filters": [numcodecs.Delta("i2")], "dtype": "i2"}, None),
+        ({"compressors": [numcodecs.LZ4()], "dtype": "i2"}, None),
+        ({"chunks": (1, 1, 1), "dtype": "i2"}, None),
+    ],
+)
+def test_kinds_of_values_and_codecs(tmp_path, options, match):
+    """What is packed by a codec that runs what the file says must not be unpacked."""
+    path = tmp_path / "a.zarr"
+    array = zarr.create_array(path, shape=(3, 3, 3), zarr_format=2, fill_value=None, **{"chunks": (2, 2, 2)} | options)
+    array.attrs["affine"] = np.eye(4).tolist()
+    if match:
+        assert_refused(path, match)
+    else:
+        array[:] = np.ones((3, 3, 3), array.dtype)
+        assert open_stored(path).box((0, 0, 0), (3, 3, 3)).data.sum() == 27
+
+
+def test_a_codec_that_is_missing_is_named(tmp_path):
+    path = write_ome(tmp_path / "a.zarr", [(ramp(3, 3, 3), transforms([1, 1, 1]))], axes_of("xyz"))
+    file = path / "0" / "zarr.json"
+    file.write_text(file.read_text().replace('"zstd"', '"jpeg2000"'))
+    assert_refused(path, "Zarr metadata cannot be read .*jpeg2000")
+
+
+def test_arrays_by_themselves(tmp_path):
+    array = zarr.create_array(tmp_path / "a", shape=(3, 4, 5, 2), chunks=(2, 2, 2, 1), dtype="i2", fill_value=0)
+    array[:] = voxels = ramp(3, 4, 5, 2)
+    assert_refused(tmp_path / "a", 'an array of Zarr without a scale; .* attribute "affine"')
+    array.attrs["affine"] = OBLIQUE
+    assert_refused(tmp_path / "a", r"2 volumes along axis 3 \(2\)")
+    image = open_stored(tmp_path / "a", volume=1)
+    np.testing.assert_array_equal(image.read((0, 0, 0), (3, 4, 5)), voxels[..., 1])
+    np.testing.assert_array_equal(image.affine, OBLIQUE)
+    for affine, match in (
+        (np.eye(3).tolist(), "expected shape"),
+        ("x", "expected a"),
+        (np.zeros((4, 4)).tolist(), "last"),
+    ):
+        array.attrs["affine"] = affine
+        assert_refused(tmp_path / "a", match, volume=1)
+    zarr.create_array(tmp_path / "b.zarr", shape=(3, 4), dtype="i2")
+    assert_refused(tmp_path / "b.zarr", r"expected an array of three axes, got shape \(3, 4\)")
+
+
+def test_chunks_that_cannot_be(tmp_path, monkeypatch):
+    levels = [(ramp(8, 4, 4, dtype="f4"), transforms([1, 1, 1]))]
+    path = write_ome(tmp_path / "a.zarr", levels, axes_of("xyz", "millimeter"), fill_value=np.nan)
+    chunk = path / "0" / "c" / "1" / "0" / "0"
+    packed = chunk.read_bytes()
+    for damaged in (b"", packed[:7], packed[:-3], b"\0" * len(packed)):
+        chunk.write_bytes(damaged)
+        with pytest.raises(InputError, match=r"a\.zarr/0: its voxels 4:8, 0:4, 0:4 cannot be read"):
+            open_stored(path).read((4, 0, 0), (8, 4, 4))
+    chunk.unlink()
+    os.mkfifo(chunk)
+    assert_refused(path, "its chunk c/1/0/0 is no regular file")
+    chunk.unlink()
+    assert_refused(path, "1 of its 2 chunks are missing, and it has no value for them")
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        open_stored(path, crop=[(0, 4), (0, 4), (0, 4)])  # which do not need it
+    monkeypatch.setattr(zarr_images, "MOST_CHUNKS", 1)
+    assert_refused(path, "expected at most 1 chunks, got 2")
+    monkeypatch.setattr(budget, "available_bytes", lambda: 100)
+    assert_refused(path, "one of its chunks of 4 x 4 x 4 voxels: needs about")
+
+
+def test_raw_chunks_and_shards_that_are_cut(tmp_path):
+    place = transforms([1, 1, 1])
+    write_ome(tmp_path / "raw.zarr", [(ramp(4, 4, 4), place)], axes_of("xyz"), compressors=None)
+    write_ome(tmp_path / "shards.zarr", [(ramp(4, 4, 4), place)], axes_of("xyz"), chunks=(2, 2, 2), shards=(4, 4, 4))
+    for path in (tmp_path / "raw.zarr", tmp_path / "shards.zarr"):
+        np.testing.assert_array_equal(open_stored(path).read((1, 0, 2), (3, 4, 4)), ramp(4, 4, 4)[1:3, :, 2:])
+        chunk = path / "0" / "c" / "0" / "0" / "0"
+        chunk.write_bytes(chunk.read_bytes()[:-5])
+        with pytest.raises(InputError, match="cannot be read"):
+            open_stored(path).read((0, 0, 0), (4, 4, 4))
+
+
+def test_metadata_that_is_no_file(tmp_path):
+    (tmp_path / "a.zarr").mkdir()
+    os.mkfifo(tmp_path / "a.zarr" / "zarr.json")
+    assert_refused(tmp_path / "a.zarr", "its zarr.json is a pipe")
+
+
+def test_without_the_library(pyramid, monkeypatch):
+    monkeypatch.setitem(sys.modules, "zarr", None)
+    assert_refused(pyramid[0], re.escape('a folder of Zarr needs the zarr library; pip install "tetopt[blocks]"'))
+
+
+def test_what_axes_do_not_say(tmp_path):
+    """Where left and right are, and the unit: taken, and said; types of axes, by their names."""
+    axes = [{"name": name} for name in "zyx"]
+    place, after = transforms([3, 2, 1]), transforms([2, 2, 2], [5, 6, 7])
+    path = write_ome(tmp_path / "a.zarr", [(ramp(3, 4, 5), place)], axes, after)
+    with warnings.catch_warnings(record=True) as heard:
+        warnings.simplefilter("always")
+        image = open_stored(path)
+    words = " ".join(str(each.message) for each in heard)
+    assert "has no orientation: x, y and z of its axes are taken as right, anterior and superior" in words
+    assert "has no unit on its axes: its scale is taken as mm" in words
+    np.testing.assert_array_equal(image.affine, [[0, 0, 2, 7], [0, 4, 0, 6], [6, 0, 0, 5], [0, 0, 0, 1]])
+
+
+def test_orientation_turns_axes_to_ras(tmp_path):
+    """NGFF's RFC-4, whatever the names are: the first axis goes to the back, the second to the left, the third down."""
+    turned = {"x": "anterior-to-posterior", "y": "right-to-left", "z": "superior-to-inferior"}
+    levels = [(ramp(3, 4, 5), transforms([1, 2, 3], [7, 8, 9]))]
+    path = write_ome(tmp_path / "a.zarr", levels, axes_of("xyz", "millimeter", turned))
+    np.testing.assert_array_equal(
+        open_stored(path).affine, [[0, -2, 0, -8], [-1, 0, 0, -7], [0, 0, -3, -9], [0, 0, 0, 1]]
+    )
+
+
+@pytest.mark.parametrize("name", ["a.nii.gz", "a.mgz", "a.png", "a.zarr.zip", "a.xyz"])
+def test_files_that_cannot_be_read_in_parts(tmp_path, name):
+    (tmp_path / name).write_bytes(b"something")
+    assert_refused(tmp_path / name, "cannot be read in parts")
+
+
+def test_a_plane_is_no_volume(tmp_path):
+    nibabel.save(nibabel.Nifti1Image(ramp(3, 3), np.eye(4)), tmp_path / "a.nii")
+    assert_refused(tmp_path / "a.nii", "expected a volume, got a plane")
+    assert_refused(tmp_path, "a folder that is none of Zarr's")

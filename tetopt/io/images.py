@@ -35,7 +35,7 @@ from tetopt.io.itk_headers import HEADED_SUFFIXES, data_files, header_sizes
 from tetopt.io.pictures import PICTURE_SUFFIXES, read_picture
 from tetopt.io.read_itk import ITK_READERS, read_dicom_folder, read_itk
 from tetopt.io.volumes import DAMAGED_FILE, UNREADABLE_FILE, check_room, one_line, volume_index
-from tetopt.io.zarr_images import ZARR_SUFFIX, is_zarr, open_zarr, zarr_levels
+from tetopt.io.zarr_images import ZARR_SUFFIX, check_chunks, is_zarr, open_zarr, zarr_levels
 from tetopt.stored import StoredImage
 
 Bounds = Sequence[tuple[int | None, int | None]]
@@ -121,8 +121,8 @@ def load_image(
         with os_errors_named():
             is_stored = is_zarr(path)
         if is_stored:
-            whole = open_zarr(zarr_levels(path, notes)[0], volume, notes)
-            image = _part_of_stored(whole, slice_, crop)
+            whole = open_zarr(zarr_levels(path, notes)[0], volume)
+            image = _part_of_stored(whole, slice_, crop, notes)
         else:
             whole = image = Image(*_read(path, volume, notes))
             image = part_of(image, slice_, crop)
@@ -644,8 +644,8 @@ def part_of(image: Image, slice_: tuple[int, int] | None, crop: Bounds | None) -
     return cropped(plane, [each for axis, each in enumerate(bounds) if axis != slice_[0]])
 
 
-def _part_of_stored(image: StoredImage, slice_: tuple[int, int] | None, crop: Bounds | None) -> Image:
-    """The same of an image that is stored: only this part of it is read."""
+def _part_of_stored(image: StoredImage, slice_: tuple[int, int] | None, crop: Bounds | None, notes: list[str]) -> Image:
+    """The same of an image of Zarr's: only this part of it is read."""
     bounds = checked_bounds(image.shape, [(None, None)] * 3 if crop is None else crop)
     if slice_ is not None:
         axis, index = slice_
@@ -653,6 +653,7 @@ def _part_of_stored(image: StoredImage, slice_: tuple[int, int] | None, crop: Bo
         _check_in_crop(bounds, axis, index)
         bounds[axis] = (index, index + 1)
     check_room([stop - start for start, stop in bounds], image.voxels.dtype.itemsize)
+    check_chunks(image.voxels.within(bounds), notes)
     part = image.box(*zip(*bounds, strict=True))
     return part if slice_ is None else image_slice(part, slice_[0], 0)
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import math
 import re
+import sys
 from pathlib import Path
 from typing import NamedTuple
 
@@ -121,10 +122,12 @@ def raw_voxels(path: Path) -> RawVoxels:
 
 
 def _order(header: VoxelHeader) -> str:
-    """Of the bytes of a value: "<" or ">"."""
+    """Of the bytes of a value: "<" or ">"; a MetaImage that does not tell is of a machine like this one, as in ITK."""
     fields = header.fields
-    msb = fields.get("ElementByteOrderMSB", fields.get("BinaryDataByteOrderMSB"))
-    order = fields.get("endian", "").lower() if msb is None else ("big" if msb.lower() in ("true", "1") else "little")
+    order = fields.get("endian", "").lower()
+    if "ElementType" in fields:
+        is_big = fields.get("ElementByteOrderMSB", fields.get("BinaryDataByteOrderMSB", str(sys.byteorder == "big")))
+        order = "big" if is_big.lower() in ("true", "1") else "little"
     if order not in ("big", "little") and not header.dtype.endswith("1"):
         raise InputError(f"{UNREADABLE_FILE} (its header does not tell the order of bytes)")
     return ">" if order == "big" else "<"

@@ -26,7 +26,7 @@ from tetopt.io.images import (
 from tetopt.io.itk_headers import HEADED_SUFFIXES, raw_voxels
 from tetopt.io.read_itk import itk_place
 from tetopt.io.volumes import VoxelsInFile, check_room, volume_index
-from tetopt.io.zarr_images import METADATA_FILES, ZARR_SUFFIX, is_zarr, open_zarr, zarr_levels
+from tetopt.io.zarr_images import METADATA_FILES, ZARR_SUFFIX, check_chunks, is_zarr, open_zarr, zarr_levels
 from tetopt.stored import StoredImage
 
 STORED_SUFFIXES = (ZARR_SUFFIX, ".nii", *HEADED_SUFFIXES)
@@ -71,11 +71,14 @@ def open_stored(path: str | Path, *, volume: int | None = None, crop: Bounds | N
     notes: list[str] = []
     try:
         image = _opened(path, volume, notes)
+        notes += notes_of_size(image)
         if crop is not None:
             image = _cropped(image, checked_bounds(image.shape, crop))
+        if image.voxels.chunks is not None:
+            check_chunks(image.voxels, notes)
     except InputError as error:
         raise named_error(path, error) from error
-    for note in [*notes, *notes_of_size(image)]:
+    for note in notes:
         warnings.warn(f"{path}: {note}", stacklevel=2)
     return image
 
@@ -98,7 +101,8 @@ def coarse_image(path: str | Path, most_voxels: float, *, volume: int | None = N
         few = [level for level in zarr_levels(path, []) if math.prod(level.shape) <= most_voxels]
         if not few:
             return None
-        image = open_zarr(max(few, key=lambda level: math.prod(level.shape)), volume, [])
+        image = open_zarr(max(few, key=lambda level: math.prod(level.shape)), volume)
+        check_chunks(image.voxels, [])
         check_room(image.shape, image.voxels.dtype.itemsize)
         return image.box((0, 0, 0), image.shape)
     except InputError as error:
@@ -137,7 +141,7 @@ def _check_local(path: str | Path) -> None:
 def _opened(path: Path, volume: int | None, notes: list[str]) -> StoredImage:
     with os_errors_named():
         if is_zarr(path):
-            return open_zarr(zarr_levels(path, notes)[0], volume, notes)
+            return open_zarr(zarr_levels(path, notes)[0], volume)
         if path.is_dir():
             raise InputError("a folder that is none of Zarr's; convert it to .zarr or .nii first")
     name = check_beginning(path)

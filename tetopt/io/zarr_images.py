@@ -11,7 +11,6 @@ import math
 import os
 import stat
 import warnings
-from collections.abc import Sequence
 from pathlib import Path, PurePosixPath
 from typing import Any, NamedTuple
 
@@ -21,7 +20,7 @@ from numpy.typing import DTypeLike, NDArray
 from tetopt.budget import check_memory
 from tetopt.errors import InputError
 from tetopt.image import VoxelGrid, checked_affine
-from tetopt.incoming import TEXT_BYTES, irregular
+from tetopt.incoming import LARGEST_NUMBER, TEXT_BYTES, irregular
 from tetopt.io.files import folder_written_whole
 from tetopt.io.text import plain
 from tetopt.io.volumes import DAMAGED_FILE, VoxelsInFile, one_line, volume_index
@@ -85,13 +84,13 @@ def is_node(path: Path) -> bool:
     return any((path / name).exists() for name in NODE_FILES)
 
 
-def open_zarr(level: ZarrLevel, volume: int | None, notes: list[str]) -> StoredImage:
-    """One volume of a level; its chunks are counted, but not read. What is to be warned of comes into `notes`.
+def open_zarr(level: ZarrLevel, volume: int | None) -> StoredImage:
+    """One volume of a level, of which nothing is read.
 
     Raises
     ------
     InputError
-        Without the path before it: several volumes and no `volume`, or one out of range; chunks that cannot be.
+        Without the path before it: several volumes and no `volume`, or one out of range.
     """
     words = ", ".join(f"{level.names[axis]} ({level.array.shape[axis]})" for axis in level.others)
     # The last axis runs fastest, as in the file.
@@ -99,7 +98,6 @@ def open_zarr(level: ZarrLevel, volume: int | None, notes: list[str]) -> StoredI
     picks: list[int | slice] = [slice(0, int(size)) for size in level.array.shape]
     for axis, at in zip(level.others, index, strict=True):
         picks[axis] = at
-    _check_chunks(level, picks, notes)
     return StoredImage(VoxelsInFile(level.folder, level.array, tuple(picks), level.array.chunks), level.affine)
 
 
@@ -308,20 +306,26 @@ def _codec_names(metadata: Any) -> list[str]:
     return names
 
 
-def _check_chunks(level: ZarrLevel, picks: Sequence[int | slice], notes: list[str]) -> None:
-    """Look whether the files of the chunks are there, and are files.
+def check_chunks(voxels: VoxelsInFile, notes: list[str]) -> None:
+    """Look whether the files of the chunks that these voxels are in are there, and are files.
 
-    Writers leave out chunks of nothing but the fill value, so that some that are missing are no error; all are.
+    Writers leave out chunks of nothing but the fill value, so that some that are missing are no error, but one of the
+    `notes`; all are.
+
+    Raises
+    ------
+    InputError
+        Without the path before it: chunks that cannot be.
     """
-    array = level.array
+    array = voxels.array
     ranges = [
         range(pick.start // size, -(-pick.stop // size)) if isinstance(pick, slice) else [pick // size]
-        for pick, size in zip(picks, array.shards or array.chunks, strict=True)
+        for pick, size in zip(voxels.picks, array.shards or array.chunks, strict=True)
     ]
     n_chunks, n_missing = math.prod(map(len, ranges)), 0
     if n_chunks > MOST_CHUNKS:
         raise InputError(f"expected at most {MOST_CHUNKS} chunks, got {n_chunks}; write it again in larger ones")
-    folder = str(level.folder)
+    folder = str(voxels.path)
     for place in itertools.product(*ranges):
         name = array.metadata.encode_chunk_key(place)
         try:
@@ -373,9 +377,7 @@ class _Places:
                 "matters, give its axes an orientation (NGFF's RFC-4)"
             )
         if len({row for row, _ in self.ways}) < 3:
-            raise _unusable(
-                "orientation of axes", [_orientation(axis) for axis in inside], "three different directions"
-            )
+            raise _unusable("orientation", [_orientation(axis) for axis in inside], "three different directions")
 
     def affine(self, scale: NDArray[np.float64], shift: NDArray[np.float64]) -> NDArray[np.float64]:
         """Index -> world mm, (4, 4), of axes with this scale and translation in their own units."""
@@ -417,7 +419,7 @@ def _scale_and_shift(lists: list[Any], n_axes: int) -> tuple[NDArray[np.float64]
                 raise _unusable("coordinateTransformations", kind, "scales and translations")
             values = each.get(kind)
             is_row = isinstance(values, list) and len(values) == n_axes
-            if not is_row or not all(type(value) in (int, float) and abs(value) < np.inf for value in values):
+            if not is_row or not all(type(value) in (int, float) and abs(value) < LARGEST_NUMBER for value in values):
                 raise _unusable(kind, values, f"{n_axes} numbers")
             if kind == "scale":
                 scale, shift, has_scale = scale * values, shift * values, True
