@@ -16,6 +16,7 @@ from tetopt.errors import InputError
 from tetopt.io import files
 from tetopt.io.files import checked_output, outputs_of_command
 from tetopt.io.formats import save_model
+from tetopt.io.images import sha256
 from tetopt.io.meshes import load_mesh
 from tetopt.io.pvtu import read_pvtu
 
@@ -50,6 +51,13 @@ def test_a_piece_alone_tells_its_axes_and_units(tmp_path):
     piece = load_mesh(tmp_path / "a" / "a_2.vtu")
     assert (piece.space, piece.text("units")) == ("lps", "MPa")
     assert len(piece.sets.facets) == 0
+
+
+def test_the_checksum_is_of_all_files(path):
+    """So that a cohort makes a mesh again whose start has changed in a piece alone."""
+    before, piece = sha256(path), path.with_suffix("") / "a_2.vtu"
+    piece.write_bytes(piece.read_bytes() + b" ")
+    assert sha256(path) != before
 
 
 def test_names_are_escaped(tmp_path):

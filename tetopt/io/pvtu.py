@@ -80,7 +80,7 @@ def read_pvtu(path: Path) -> Grid:
         Without the path before it: no such XML, a document type; a piece that lies elsewhere than beside the file or in
         a folder there, is listed twice, missing, or as `tetopt.io.read_vtk.read_vtk` refuses it.
     """
-    sources = _sources(path)
+    sources = piece_names(path)
     places = [regular_file(path.parent / source, "piece of the mesh") for source in sources]
     for place, source in zip(places, sources, strict=True):
         try:
@@ -102,8 +102,8 @@ def read_pvtu(path: Path) -> Grid:
     return joined(pieces)
 
 
-def _sources(path: Path) -> list[str]:
-    """The files of the pieces that a master lists."""
+def piece_names(path: Path) -> list[str]:
+    """The files of the pieces that a master lists, as seen from its folder; InputError as `read_pvtu`."""
     tags: list[tuple[str, dict[str, str]]] = []
 
     def refuse(*_: object) -> None:
