@@ -4,6 +4,7 @@ Version 2.0 of the format, type UnstructuredGrid (docs.vtk.org, "VTKHDF file for
 sizes (NumberOfPoints, NumberOfCells, NumberOfConnectivityIds) and their arrays one after another (Points, Connectivity,
 Offsets, Types), and the groups PointData, CellData and FieldData, in which is what `tetopt.io.vtk` says of .vtu, in
 pieces as `tetopt.io.pieces` cuts them. HDF5 has no slash in a name: data have "_" for it.
+VTK 9.7 reads field data from files of one piece alone; of several it shows sets by their point data `on_NAME`.
 """
 
 from __future__ import annotations
