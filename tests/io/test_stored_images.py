@@ -16,7 +16,7 @@ from tetopt import budget
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.io import zarr_images
-from tetopt.io.images import file_shape, load_image, sha256
+from tetopt.io.images import file_shape, load_image, save_image, sha256
 from tetopt.io.stored_images import coarse_image, open_stored, stored_checksum
 from tetopt.io.zarr_images import save_zarr
 from tetopt.phantom import load_phantom
@@ -201,6 +201,33 @@ def test_what_does_not_fit_leaves_the_old_folder(tmp_path):
     assert [each.name for each in tmp_path.iterdir()] == ["a.zarr"]
     with pytest.raises(InputError, match="expected a volume to write as Zarr, got a 2-D image"):
         save_zarr(path, Image(ramp(4, 4)), ramp(4, 4), np.int16)
+
+
+@pytest.mark.parametrize("dtype", ["u1", "i2", "f4", "f8"])
+def test_an_image_written_as_zarr_comes_back(tmp_path, dtype):
+    """Also what is nothing but the fill value, which zarr leaves out by itself."""
+    data = np.zeros((4, 5, 6)) if dtype == "u1" else ramp(4, 5, 6) * -10.0 + (0.1 if dtype == "f8" else 0)
+    image = Image(data if dtype != "f4" else np.float32(data) / 4, OBLIQUE)
+    save_image(tmp_path / "a.zarr", image)
+    stored = open_stored(tmp_path / "a.zarr")
+    assert stored.voxels.dtype == dtype
+    assert stored.box((0, 0, 0), (4, 5, 6)).data.tobytes() == image.data.tobytes()
+    assert stored.affine.tobytes() == image.affine.tobytes()
+
+
+def test_a_full_disk_leaves_the_old_folder(tmp_path):
+    class Full:
+        def __getitem__(self, box):
+            raise OSError(28, "No space left on device")
+
+    image = Image(ramp(4, 4, 4))
+    save_image(tmp_path / "a.zarr", image)
+    before = sha256(tmp_path / "a.zarr")
+    for name in ("a.zarr", "b.zarr"):
+        with pytest.raises(OSError, match=f"cannot be written: No space left on device.*{name}"):
+            save_zarr(tmp_path / name, image, Full(), np.int16)
+    assert sha256(tmp_path / "a.zarr") == before
+    assert [each.name for each in tmp_path.iterdir()] == ["a.zarr"]
 
 
 def test_only_a_folder_of_zarr_is_replaced(tmp_path, monkeypatch, capfd):

@@ -36,7 +36,7 @@ from tetopt.io.pictures import PICTURE_SUFFIXES, read_picture
 from tetopt.io.pvtu import piece_names
 from tetopt.io.read_itk import ITK_READERS, read_dicom_folder, read_itk
 from tetopt.io.volumes import DAMAGED_FILE, UNREADABLE_FILE, check_room, one_line, volume_index
-from tetopt.io.zarr_images import ZARR_SUFFIX, check_chunks, is_zarr, open_zarr, zarr_levels
+from tetopt.io.zarr_images import ZARR_SUFFIX, check_chunks, is_zarr, open_zarr, save_zarr, zarr_levels
 from tetopt.stored import StoredImage
 
 Bounds = Sequence[tuple[int | None, int | None]]
@@ -176,22 +176,26 @@ def file_shape(path: str | Path) -> tuple[int, ...] | None:
 
 
 def save_image(path: str | Path, image: Image) -> None:
-    """Write a NIfTI file (.nii or .nii.gz), whole or not at all, with the full affine as sform, in mm.
+    """Write a NIfTI file (.nii or .nii.gz), whole or not at all, with the full affine as sform, in mm; or OME-Zarr.
 
     Whole numbers are held as 8- or 16-bit integers where they fit, others as float32 or float64. An axis of more voxels
     than NIfTI-1 can number makes it a NIfTI-2 file.
 
     A 2-D image becomes a 2-D file in the plane z = 0, which `load_image` reads back as it was. Replaces an
-    existing file; ask `tetopt.io.files.checked_output` first.
+    existing file; ask `tetopt.io.files.checked_output` first. A folder of Zarr (.zarr), of a 3-D image, is
+    `tetopt.io.zarr_images.save_zarr`'s, in chunks that `tetopt.io.stored_images.open_stored` reads one by one.
 
     Raises
     ------
     InputError
-        A name that ends otherwise.
+        A name that ends otherwise; as `save_zarr`.
     OSError
         As `tetopt.io.files.written_whole`, or the file reads back with another head or cut off.
     """
-    path = check_suffix(path, OUTPUT_SUFFIXES)
+    path = check_suffix(path, (*OUTPUT_SUFFIXES, ZARR_SUFFIX))
+    if path.name.lower().endswith(ZARR_SUFFIX):
+        save_zarr(path, image, image.data, _for_file(image.data).dtype)
+        return
     affine = np.eye(4)
     affine[: image.ndim, : image.ndim] = image.affine[:-1, :-1]
     affine[: image.ndim, 3] = image.affine[:-1, -1]
