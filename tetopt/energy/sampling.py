@@ -34,7 +34,7 @@ from tetopt.budget import check_memory
 from tetopt.errors import InputError
 from tetopt.geometry.topology import Facets, facets
 from tetopt.geometry.vectors import cross, difference, dot, row
-from tetopt.image import Image
+from tetopt.image import Image, VoxelGrid
 from tetopt.kernel_cache import njit
 from tetopt.kernels import (
     Floats1,
@@ -207,8 +207,10 @@ class SamplingGrid(NamedTuple):
         return self.prefix.shape[0], self.prefix.shape[1], self.prefix.shape[2] - 1
 
 
-def sampling_grid(image: Image, points: NDArray[np.float64]) -> SamplingGrid:
+def sampling_grid(image: Image, points: NDArray[np.float64], bits: int | None = None) -> SamplingGrid:
     """The image and the fixed-point grid for nodes near `points`, (N, n) world mm.
+
+    Of an image that is a part of another one `bits` are those of the other one's grid, which are no more.
 
     Differences of coordinates stay below 2**29 units, so that their products, areas and determinants are exact
     in 64- and 128-bit integers. On an image of whole numbers whose sums of squares along a row stay below 2**31,
@@ -223,13 +225,7 @@ def sampling_grid(image: Image, points: NDArray[np.float64]) -> SamplingGrid:
         raise InputError(
             f"mesh and image: expected the same dimension, got a {points.shape[1]}-D mesh and a {image.ndim}-D image"
         )
-    index = image.to_index(points)
-    reach = max(float(np.abs(index).max()), float(max(image.shape))) + 1.0
-    bits = 28 - ceil(log2(reach))
-    if bits < 8:
-        raise InputError(
-            f"mesh and image: the mesh reaches {reach:.3g} voxels from the image's origin; are both in the same mm?"
-        )
+    bits = grid_bits(image, points) if bits is None else bits
     shape = (1,) * (3 - image.ndim) + image.shape
     low, high = float(image.data.min()), float(image.data.max())
     is_whole = np.array_equal(np.rint(image.data), image.data)
@@ -250,7 +246,18 @@ def sampling_grid(image: Image, points: NDArray[np.float64]) -> SamplingGrid:
     return SamplingGrid(prefix, bits, float(shift))
 
 
-def channel_grid(content: Content, points: NDArray[np.float64]) -> SamplingGrid:
+def grid_bits(image: VoxelGrid, points: NDArray[np.float64]) -> int:
+    """The bits of the fixed-point grid for nodes near points, (N, n) world mm; InputError as `sampling_grid`."""
+    reach = max(float(np.abs(image.to_index(points)).max()), float(max(image.shape))) + 1.0
+    bits = 28 - ceil(log2(reach))
+    if bits < 8:
+        raise InputError(
+            f"mesh and image: the mesh reaches {reach:.3g} voxels from the image's origin; are both in the same mm?"
+        )
+    return bits
+
+
+def channel_grid(content: Content, points: NDArray[np.float64], bits: int | None = None) -> SamplingGrid:
     """`sampling_grid` of all channels of a content: sums of the first, of all channels' squares, of the others.
 
     With a region last those of 1 for each voxel outside of it and -1 for each inside.
@@ -260,7 +267,7 @@ def channel_grid(content: Content, points: NDArray[np.float64]) -> SamplingGrid:
     InputError
         As `sampling_grid`.
     """
-    grid = sampling_grid(content.image, points)
+    grid = sampling_grid(content.image, points, bits)
     if content.is_plain and content.region is None:
         return grid
     _check_grid(grid.shape, len(content.values) + 2)

@@ -12,7 +12,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -30,6 +30,7 @@ from tetopt.engine.loop import (
     Boundary,
     Optimized,
     Record,
+    Whole,
     deadline,
     relative_movement,
 )
@@ -141,26 +142,50 @@ def optimize(
     floor = min_dihedral if run.n == 3 else 0.0
     # Iterations in which nodes may be exchanged: shape alone does not say where there should be more.
     n_early = int(EXCHANGING_SHARE * iterations) if k_D > 0.0 or sizes.has_target else 0
+    course = Course(1, iterations, iterations, n_early, floor, tolerance, nodes, sizes)
+    history, ended = followed(run, course, is_over, begin, callback)
+    if ended == "over":
+        ended = "stopped" if stop is not None and stop() else "max_seconds"
+    return promised(Optimized(run.mesh(), history, ended, labels=run.labels()), content, floor, mesh)
+
+
+class Course(NamedTuple):
+    """The iterations that a run does: all of them, or those of one round on a part of a mesh."""
+
+    first: int
+    last: int
+    iterations: int  # in all: in the last of them cells are lifted over the floor
+    n_early: int  # the first of them, in which nodes are exchanged
+    floor: float  # degrees
+    tolerance: float  # as of `optimize`
+    nodes: int | None  # as of `optimize`
+    sizes: Sizes
+
+
+def followed(
+    run: Run, course: Course, is_over: Callable[[], bool], begin: float, callback: Callable[[Record], None] | None
+) -> tuple[list[Record], str]:
+    """Do the iterations of a course; the records, and why it ended: "iterations", "converged" or "over"."""
     history: list[Record] = []
+    floor, nodes = course.floor, course.nodes
 
     def record(iteration: int, movement: float, is_changed: bool) -> None:
         history.append(run.record(iteration, movement, is_changed, time.perf_counter() - begin))
         if callback is not None:
             callback(history[-1])
 
-    record(0, 0.0, False)
-    ended = "iterations"
-    if iterations > 0:
+    record(course.first - 1, 0.0, False)
+    if course.iterations > 0:
         run.keep_floor(floor)
-    has_labels = content.memberships is not None and run.state.objective.image > 0.0
-    for iteration in range(1, iterations + 1):
+    has_labels = run.content.memberships is not None and run.state.objective.image > 0.0
+    for iteration in range(course.first, course.last + 1):
         before = run.state.complex.ticks.copy()
-        if has_labels and iteration == min(LABELLED_AT, iterations):
+        if has_labels and iteration == min(LABELLED_AT, course.iterations):
             run.give_labels()
         if run.has_labels:
-            run.attract(min(ATTRACTED_FLOOR, floor) if iteration <= n_early else floor)
+            run.attract(min(ATTRACTED_FLOOR, floor) if iteration <= course.n_early else floor)
         # 1. Move the nodes.
-        is_early = nodes is not None and iteration <= n_early
+        is_early = nodes is not None and iteration <= course.n_early
         is_finished = run.sweep(is_over, EARLY_HOPE_SHARE if is_early else HOPE_SHARE)
         # 2. Exchange cells: where nodes are exchanged next, only at first, for cells change around them anyway.
         does_exchange = is_early and is_finished and iteration % 2 == 1
@@ -170,20 +195,18 @@ def optimize(
         fall = np.inf if is_new else 1.0 - run.E() / history[-1].E if history[-1].E > 0.0 else 0.0
         # 3. Exchange nodes: in every other one of the first iterations.
         if nodes is not None and does_exchange:
-            n_changes += run.exchange_towards(nodes, sizes)
+            n_changes += run.exchange_towards(nodes, course.sizes)
         # 4. Lift what is under the floor: in the last iteration.
-        is_last = iteration == iterations or not is_finished or (fall < tolerance and not is_early)
+        is_last = iteration == course.iterations or not is_finished or (fall < course.tolerance and not is_early)
         if is_last and run.n_below(floor) > 0 and run.lift(floor) > 0:
             n_changes, fall = n_changes + 1, np.inf
         # 5. Measure.
         record(iteration, movement, n_changes > 0)
         if not is_finished:
-            ended = "stopped" if stop is not None and stop() else "max_seconds"
-            break
-        if is_last and fall < tolerance:
-            ended = "converged"
-            break
-    return promised(Optimized(run.mesh(), history, ended, labels=run.labels()), content, floor, mesh)
+            return history, "over"
+        if is_last and fall < course.tolerance:
+            return history, "converged"
+    return history, "iterations"
 
 
 def prepare_kernels(
@@ -227,18 +250,19 @@ class Run:
 
     def __init__(
         self, content: Content, mesh: Mesh, k_D: float, power: float = SHAPE_POWER, boundary: Boundary = "slide",
-        is_graded: bool = False,
+        is_graded: bool = False, whole: Whole | None = None,
     ) -> None:  # fmt: skip
         """As `tetopt.engine.state.state_of`."""
         self.content, self.image, self.n = content, content.image, content.image.ndim
-        self.grid = channel_grid(content, mesh.points)
-        self.state: State = state_of(content, mesh, self.grid, k_D, power, boundary, is_graded)
+        self.grid = channel_grid(content, mesh.points, None if whole is None else whole.bits)
+        self.state: State = state_of(content, mesh, self.grid, k_D, power, boundary, is_graded, whole)
         ticks = self.state.complex.ticks
         is_kept = self.is_still if boundary == "fixed" else np.zeros(len(ticks), dtype=bool)
         self.kept = dict(zip(map(tuple, ticks[is_kept].tolist()), mesh.points[is_kept], strict=True))
         self.groups, self.edge = blocks(ticks), _edges(mesh.points, mesh.cells)
         self.has_labels = False
-        self.image_noise: float | None = None  # its variance, estimated when it is first needed
+        # Its variance, estimated when it is first needed.
+        self.image_noise: float | None = None if whole is None else whole.noise
         self.ticks_flipped = np.full_like(ticks, FAR_TICKS)  # where nodes were when their flips were last looked at
         self.hope = np.full(len(ticks), np.inf)  # what each node's next move may win, (N,); see `sweep`
 

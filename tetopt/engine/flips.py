@@ -328,14 +328,16 @@ def _fourth_node(cells: NDArray, cell: int, a: int, b: int, c: int) -> int:
 
 @helper
 def in_one_face(state: State, a: int, b: int, c: int, d: int) -> bool:
-    """Whether four boundary nodes have one index coordinate in common, so that they lie in one face of the box.
+    """Whether four boundary nodes lie in one face of the box.
 
-    Not if the boundary is to be kept: their facets are not to be exchanged then.
+    Not if the boundary is to be kept: their facets are not to be exchanged then. Nor are facets beside the box's faces,
+    though in a plane: a part of a mesh shares them with the next one.
     """
-    t = state.complex.ticks
+    t, low, high = state.complex.ticks, state.sides.low, state.sides.high
     for axis in range(3):
         at = t[a, axis]
-        if not state.sides.is_fixed and t[b, axis] == at and t[c, axis] == at and t[d, axis] == at:
+        is_side = not state.sides.is_fixed and (at == low[axis] or at == high[axis])
+        if is_side and t[b, axis] == at and t[c, axis] == at and t[d, axis] == at:
             return True
     return False
 

@@ -49,6 +49,17 @@ class Record(NamedTuple):
     seconds: float  # since the start
 
 
+class Whole(NamedTuple):
+    """What a part of a mesh takes over from the whole: where it lies in it, and what it is measured by."""
+
+    start: tuple[int, ...]  # the voxel of the whole image with which that of the part begins, by axis
+    shape: tuple[int, ...]  # of the whole image
+    bits: int  # of its sampling grid
+    E_G: float  # shape energy of the initial mesh
+    squares: float  # its sum of squares, in the unit of the content's values
+    noise: float  # variance of the image's noise, likewise
+
+
 class Optimized(NamedTuple):
     """What `optimize` returns, and, with all fields, `mesh_image`."""
 
@@ -77,20 +88,22 @@ def deadline(begin: float, max_seconds: float | None, stop: Callable[[], bool] |
 
 def frozen_axes(
     image: Image, ticks: NDArray[np.int64], cells: NDArray[np.int64], grid: SamplingGrid, boundary: Boundary,
-    has_surface: bool = False, shared: Facets | None = None,
+    has_surface: bool = False, shared: Facets | None = None, sides: NDArray[np.int64] | None = None,
 ) -> NDArray[np.bool_]:  # fmt: skip
     """Index axes along which each node must stay, (N, 4) bool; the leading axis of a 2-D image counts as free.
 
     A node on a face of the box, index -0.5 or shape - 0.5, keeps its coordinate across it. A node of a boundary
     facet that lies on no face of the box keeps all of them, as every boundary node does with "fixed"; or, with a
-    surface on which such nodes slide, is marked in the last column. `shared` are the cells' facets, if known.
+    surface on which such nodes slide, is marked in the last column. `shared` are the cells' facets, if known; `sides`
+    (3, 2) those of the box, if they are not the image's own.
     """
     is_frozen = np.zeros((len(ticks), 4), dtype=bool)
     facets_out = boundary_facets(cells, shared)
     if boundary == "fixed":
         is_frozen[facets_out.ravel(), :3] = True
         return is_frozen
-    is_across = np.any(facets_on_sides(ticks, facets_out, side_ticks(grid), tolerance=0), axis=2)  # (B, 3)
+    sides = side_ticks(grid) if sides is None else sides
+    is_across = np.any(facets_on_sides(ticks, facets_out, sides, tolerance=0), axis=2)  # (B, 3)
     for axis in range(3):
         is_frozen[facets_out[is_across[:, axis]].ravel(), axis] = True
     elsewhere = facets_out[~np.any(is_across, axis=1)].ravel()
@@ -101,10 +114,17 @@ def frozen_axes(
     return is_frozen
 
 
-def side_ticks(grid: SamplingGrid) -> NDArray[np.int64]:
-    """`tetopt.geometry.box.box_sides` in ticks, (3, 2), where they are whole numbers; a slice is one voxel thick."""
+def side_ticks(grid: SamplingGrid, whole: Whole | None = None) -> NDArray[np.int64]:
+    """`tetopt.geometry.box.box_sides` in ticks, (3, 2), where they are whole numbers; a slice is one voxel thick.
+
+    With `whole` the sides of its box, as the part counts ticks.
+    """
     half = 1 << (grid.bits - 1)
-    return np.array([(-half, (size << grid.bits) - half) for size in grid.shape], dtype=np.int64)
+    if whole is None:
+        return np.array([(-half, (size << grid.bits) - half) for size in grid.shape], dtype=np.int64)
+    low = -np.array(whole.start, dtype=np.int64) << grid.bits
+    sides = np.column_stack([low - half, low + (np.array(whole.shape, dtype=np.int64) << grid.bits) - half])
+    return sides if len(sides) == 3 else np.vstack([[(-half, half)], sides])
 
 
 def relative_movement(

@@ -9,7 +9,7 @@ from tetopt.check import check_unfolded
 from tetopt.energy.sampling import SamplingGrid, check_orientations, to_ticks, volume_of
 from tetopt.engine.complex import Objective, Sides, State, build, energies
 from tetopt.engine.descent import free_projections
-from tetopt.engine.loop import E_D_ROUNDING, SHAPE_POWER, Boundary, frozen_axes, side_ticks
+from tetopt.engine.loop import E_D_ROUNDING, SHAPE_POWER, Boundary, Whole, frozen_axes, side_ticks
 from tetopt.errors import InputError
 from tetopt.geometry.topology import facets
 from tetopt.image import Image
@@ -19,9 +19,12 @@ from tetopt.target.content import Content
 
 def state_of(
     content: Content, mesh: Mesh, grid: SamplingGrid, k_D: float, power: float = SHAPE_POWER,
-    boundary: Boundary = "slide", is_graded: bool = False,
+    boundary: Boundary = "slide", is_graded: bool = False, whole: Whole | None = None,
 ) -> State:  # fmt: skip
     """The state of an initial mesh, which normalises the two energies; no floor yet. `grid` is the content's.
+
+    A part of a mesh is normalised by the `whole`; what it shares with the rest stays as it is, node for node and facet
+    for facet, as boundary nodes beside the box's sides do.
 
     Raises
     ------
@@ -35,8 +38,9 @@ def state_of(
     shared = facets(mesh.cells)
     check_unfolded(mesh, shared)
     matrix = matrix_of(image)
-    is_frozen = frozen_axes(image, ticks, mesh.cells, grid, boundary, region is not None, shared)
-    sides = sides_of(grid, matrix, boundary == "fixed", None if region is None else region.level)
+    own_sides = side_ticks(grid, whole)
+    is_frozen = frozen_axes(image, ticks, mesh.cells, grid, boundary, region is not None, shared, own_sides)
+    sides = sides_of(grid, matrix, boundary == "fixed", None if region is None else region.level, own_sides)
     # Where every cell is uniform, what rounding leaves of E_D must not become the unit that E_D is measured in.
     rounding = float(E_D_ROUNDING * content.variance / content.unit * content.n_voxels)
     wrong_side = 0.0 if region is None else float(content.wrong_side)
@@ -49,7 +53,7 @@ def state_of(
             f"mesh: {len(flat)} cells are too flat to be improved, the first are {flat[:5].tolist()}; "
             "remove them or move their nodes apart"
         )
-    E_G0, squares0 = content_energies(state, content)
+    E_G0, squares0 = content_energies(state, content) if whole is None else (whole.E_G, whole.squares)
     weight = k_D / squares0 if squares0 > 0.0 else 0.0
     if not (0.0 < E_G0 < np.inf and np.isfinite(squares0) and np.isfinite(weight)):
         raise InputError("mesh and image: their energies overflow; are lengths in mm and intensities of usual size?")
@@ -83,10 +87,14 @@ def matrix_of(image: Image) -> NDArray[np.float64]:
 
 
 def sides_of(
-    grid: SamplingGrid, matrix: NDArray[np.float64], is_fixed: bool, level: NDArray[np.float32] | None = None
-) -> Sides:
-    """Sides of the box of an image, `matrix` (3, 3) taking index vectors to mm, and the surface of a level function."""
-    low, high = np.ascontiguousarray(side_ticks(grid).T)
+    grid: SamplingGrid, matrix: NDArray[np.float64], is_fixed: bool, level: NDArray[np.float32] | None = None,
+    own_sides: NDArray[np.int64] | None = None,
+) -> Sides:  # fmt: skip
+    """Sides of the box of an image, `matrix` (3, 3) taking index vectors to mm, and the surface of a level function.
+
+    `own_sides` are the box's, (3, 2) ticks, if not the image's own.
+    """
+    low, high = np.ascontiguousarray((side_ticks(grid) if own_sides is None else own_sides).T)
     has_surface = level is not None
     level = np.zeros((1, 1, 1), dtype=np.float32) if level is None else level.reshape(grid.shape)
     inverse = np.asarray(np.linalg.inv(matrix), dtype=np.float64)

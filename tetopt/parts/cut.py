@@ -1,0 +1,121 @@
+"""Which cells go to which part in a round, and the whole put together again.
+
+Parts are boxes of about equal work: the cells' centroids are divided by planes across the axes, one axis after the
+other, each time into shares of equal weight (recursive coordinate bisection, Berger and Bokhari 1987, with more than
+two at a time). A part's surface follows its cells. Every round the planes lie elsewhere, so that what a part shared
+with others, and had to leave as it was, is inside of one in the next. A curve through the cells (Morton's) would be one
+sort, but its parts have ragged surfaces or two pieces, and boxes of voxels up to the whole volume.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+# By which share of a part's width the planes of each round lie further along every axis.
+ROUND_SHIFTS = (0.0, 0.5, 0.25, 0.75)
+
+
+class Shared(NamedTuple):
+    """A mesh on a grid of ticks, and of which part each cell is."""
+
+    ticks: NDArray[np.int64]  # (N, 3)
+    cells: NDArray[np.int64]  # (M, 4)
+    part: NDArray[np.int64]  # (M,) from 0, each with a cell at least
+
+
+class Piece(NamedTuple):
+    """One part of a mesh."""
+
+    ticks: NDArray[np.int64]  # (n, 3)
+    cells: NDArray[np.int64]  # (m, 4) rows of `ticks`
+    nodes: NDArray[np.int64]  # (n,) rows of the whole mesh's
+
+
+def counts_of(n_parts: int, lengths: Sequence[float]) -> tuple[int, ...]:
+    """Numbers of shares along each axis, at least `n_parts` parts in all, so that these are as near to cubes as can be.
+
+    Examples
+    --------
+    >>> counts_of(4, (200.0, 230.0, 190.0)), counts_of(1, (1.0, 1.0, 1.0)), counts_of(12, (10.0, 20.0, 10.0))
+    ((2, 2, 1), (1, 1, 1), (2, 3, 2))
+    """
+    counts = np.ones(len(lengths), dtype=np.int64)
+    while np.prod(counts) < n_parts:
+        counts[np.argmax(np.asarray(lengths) / counts)] += 1
+    return tuple(int(count) for count in counts)
+
+
+def cut(
+    centroids: NDArray[np.float64], weights: NDArray[np.float64], counts: Sequence[int], shift: float
+) -> NDArray[np.int64]:
+    """The part of each cell, (M,) int64, numbered from 0 without gaps.
+
+    Parameters
+    ----------
+    centroids : (M, 3) float64
+        Of the cells, in any unit.
+    weights : (M,) float64
+        What each cell is of a part's work.
+    counts : sequence of three int
+        Shares along each axis.
+    shift : float
+        0 to 1, of a share: where the first plane lies. Unless it is 0 there is one more share along each axis that is
+        divided at all, the first and the last of which are smaller.
+    """
+    part = np.zeros(len(centroids), dtype=np.int64)
+    for axis, count in enumerate(counts):
+        if count == 1:
+            continue
+        # Within each part so far, cells in the order of their place along the axis; ties in that of their numbers.
+        order = np.lexsort((centroids[:, axis], part))
+        total = np.cumsum(weights[order])
+        start = np.flatnonzero(np.diff(part[order], prepend=-1))
+        before = np.repeat(np.concatenate([[0.0], total[start[1:] - 1]]), np.diff(np.append(start, len(order))))
+        whole = np.bincount(part, weights)
+        at = (total - 0.5 * weights[order] - before) / whole[part[order]]  # 0 to 1 within its part
+        share = np.empty(len(order), dtype=np.int64)
+        share[order] = np.floor(at * count + (1.0 - shift) * (shift > 0.0)).astype(np.int64)
+        part = part * (count + 1) + share
+    return np.unique(part, return_inverse=True)[1].astype(np.int64)
+
+
+def pieces(mesh: Shared) -> list[Piece]:
+    """The parts of a mesh, their nodes and cells in the order that these have in the whole."""
+    order = np.argsort(mesh.part, kind="stable")
+    bounds = np.searchsorted(mesh.part[order], np.arange(mesh.part.max() + 2))
+    result = []
+    for first, last in zip(bounds[:-1], bounds[1:], strict=True):
+        nodes, cells = np.unique(mesh.cells[order[first:last]], return_inverse=True)
+        result.append(Piece(mesh.ticks[nodes], cells.reshape(-1, mesh.cells.shape[1]).astype(np.int64), nodes))
+    return result
+
+
+def shared_nodes(mesh: Shared) -> NDArray[np.bool_]:
+    """Nodes of more than one part, (N,)."""
+    first = np.full(len(mesh.ticks), -1, dtype=np.int64)
+    first[mesh.cells.ravel()] = np.repeat(mesh.part, mesh.cells.shape[1])
+    is_shared = np.zeros(len(mesh.ticks), dtype=bool)
+    other = first[mesh.cells] != mesh.part[:, None]
+    is_shared[mesh.cells[other]] = True
+    return is_shared
+
+
+def joined(ticks: Sequence[NDArray[np.int64]], cells: Sequence[NDArray[np.int64]]) -> Shared:
+    """Parts put together: nodes in the same place, which parts share, become one.
+
+    Nodes are numbered part by part, those that came with an earlier part left out; cells, too, go part by part.
+    """
+    every = np.concatenate(ticks)
+    # Rows as one key each; ticks are below 2^31 in size, so that three of them take 93 bits.
+    _, first, inverse = np.unique(every, axis=0, return_index=True, return_inverse=True)
+    rank = np.empty(len(first), dtype=np.int64)
+    rank[np.argsort(first, kind="stable")] = np.arange(len(first))
+    number = rank[inverse.ravel()]
+    offsets = np.cumsum([0, *map(len, ticks[:-1])])
+    whole = np.concatenate([number[each + offset] for each, offset in zip(cells, offsets, strict=True)])
+    part = np.repeat(np.arange(len(cells)), [len(each) for each in cells])
+    return Shared(every[np.sort(first)], whole, part)
