@@ -13,21 +13,16 @@ from __future__ import annotations
 import json
 import os
 import shutil
-import socket
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
-from typing import IO, Any
+from typing import Any
 
 import tetopt
 from tetopt.errors import InputError
 from tetopt.incoming import json_of, text_of
 from tetopt.io.files import save_json
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]
+from tetopt.io.locks import lock
 
 DESCRIPTION_NAME = "dataset_description.json"
 WORK_NAME, LOGS_NAME, FIGURES_NAME = ".work", "logs", "figures"
@@ -120,26 +115,10 @@ def locked(out: Path, keys: list[str] | None = None) -> Iterator[None]:
         Another run has the lock.
     """
     with ExitStack() as stack:
-        _lock(stack, out / WORK_NAME / "lock", is_shared=keys is not None, what=str(out))
+        lock(stack, out / WORK_NAME / "lock", is_shared=keys is not None, what=str(out))
         for key in keys or ():
-            _lock(stack, out / WORK_NAME / f"{key}.lock", is_shared=False, what=f"{out}: {key}")
+            lock(stack, out / WORK_NAME / f"{key}.lock", is_shared=False, what=f"{out}: {key}")
         yield
-
-
-def _lock(stack: ExitStack, path: Path, is_shared: bool, what: str) -> None:
-    if fcntl is None:
-        return
-    stream: IO[str] = stack.enter_context(path.open("a+", encoding="utf-8"))
-    try:
-        fcntl.flock(stream, (fcntl.LOCK_SH if is_shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
-    except BlockingIOError:
-        stream.seek(0)
-        whose = stream.read(200).strip() or "another process"
-        raise InputError(f"{what}: another run writes there ({whose}); wait for its end, or end it") from None
-    if not is_shared:
-        stream.truncate(0)
-        stream.write(f"process {os.getpid()} on {socket.gethostname()}\n")
-        stream.flush()
 
 
 def publish(work: Path, out: Path, key: str) -> None:

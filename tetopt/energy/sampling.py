@@ -83,10 +83,10 @@ def cell_moments(image: Image, mesh: Mesh) -> CellMoments:
 
 
 def cell_moments_and_ranges(
-    image: Image, mesh: Mesh
+    image: Image, mesh: Mesh, bits: int | None = None
 ) -> tuple[CellMoments, tuple[NDArray[np.float64], NDArray[np.float64]]]:
-    """`cell_moments` and `cell_ranges` in two thirds of the time."""
-    sampled = _sampled(image, mesh)
+    """`cell_moments` and `cell_ranges` in two thirds of the time; `bits` as of `sampling_grid`."""
+    sampled = _sampled(image, mesh, bits)
     return _moments(image, mesh, sampled), _ranges(image, mesh, sampled)
 
 
@@ -98,8 +98,8 @@ class _Sampled(NamedTuple):
     sides: Facets
 
 
-def _sampled(image: Image, mesh: Mesh) -> _Sampled:
-    grid = sampling_grid(image, mesh.points)
+def _sampled(image: Image, mesh: Mesh, bits: int | None = None) -> _Sampled:
+    grid = sampling_grid(image, mesh.points, bits)
     ticks = to_ticks(image.to_index(mesh.points), grid)
     check_orientations(image, ticks, mesh.cells)
     return _Sampled(grid, ticks, facets(mesh.cells))

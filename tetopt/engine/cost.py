@@ -185,6 +185,22 @@ def meshing_bytes(n_voxels: int, n_channels: int, n_nodes: int, ndim: int = 3) -
     return KERNEL_BYTES + BOUND_MARGIN * n_bytes
 
 
+def part_bytes(n_voxels: int, n_cells: int, is_whole: bool) -> float:
+    """What a part of a mesh takes at its peak besides what a process that runs parts has, above all that was measured.
+
+    Parameters
+    ----------
+    n_voxels : int
+        Of the box around its cells.
+    n_cells : int
+    is_whole : bool
+        Whether intensities are whole numbers of 8 bits or few more, whose sums take 32 bits.
+    """
+    costs = cost_model().bytes
+    of_voxel = costs["voxels_read"] + costs["channel_voxels"] + costs["fractional_voxels"] * (not is_whole)
+    return BOUND_MARGIN * (of_voxel * n_voxels + costs["cells"] * n_cells)
+
+
 def next_bytes(n_nodes: int, ndim: int = 3) -> float:
     """What the next steps of a run with so many nodes take besides what there is, at most."""
     return NEXT_SHARE * (meshing_bytes(0, 0, n_nodes, ndim) - KERNEL_BYTES)

@@ -6,6 +6,8 @@ command line ends with 1 there.
 
 from __future__ import annotations
 
+from math import prod
+
 import numpy as np
 
 from tetopt.check import beyond_box
@@ -13,7 +15,7 @@ from tetopt.energy.sampling import cell_of_voxel
 from tetopt.engine.loop import Optimized
 from tetopt.geometry.box import ON_SIDE_VOXELS
 from tetopt.geometry.simplex import dihedral_angles, volumes
-from tetopt.image import Image
+from tetopt.image import VoxelGrid
 from tetopt.mesh import Mesh
 from tetopt.target.content import Content
 
@@ -21,6 +23,7 @@ MASK_DICE = 0.9  # of a mesh with its mask, at least: below it the cells are lar
 LABEL_VOXELS = 200  # a label of more may not be without cells
 ANGLE_ROUNDING = 1e-6  # degrees by which a measured angle may miss the floor that the kernels kept in ticks
 VOLUME_ROUNDING = 1e-9  # relative: the volume of cells that fill the box exactly, summed up
+BEYOND_WORDS = "nodes lie up to {:.3g} voxels beyond the image's box; please report this"
 BOUNDARY_ROUNDING = 1e-6  # relative: likewise of cells within a boundary in the user's own digits
 
 
@@ -46,20 +49,31 @@ def promised(result: Optimized, content: Content, min_dihedral: float, start: Me
         the initial mesh lost or won. Within a mask instead `overlap`: voxels that lie in two cells, and `mask`: a Dice
         with the mask below 0.9. `labels`: labels of more than 200 voxels that no cell has.
     """
-    mesh, last = result.mesh, result.history[-1]
-    missed: dict[str, str] = {}
-    if content.image.ndim == 3 and last.iteration > 0:
-        angles = dihedral_angles(mesh.points, mesh.cells).min(axis=1)
-        if below := int((angles < min_dihedral - ANGLE_ROUNDING).sum()):
-            missed["floor"] = (
-                f"{below} of {len(angles)} cells have an angle under {min_dihedral:g} degrees, down to "
-                f"{angles.min():.2f}; allow more nodes, a lower k_D, or a lower min_dihedral"
-            )
+    mesh, missed = result.mesh, _missed_floor(result, min_dihedral)
     beyond = float(beyond_box(mesh, content.image).max())
     if beyond > max(float(beyond_box(start, content.image).max()), 0.0) + ON_SIDE_VOXELS:
-        missed["box"] = f"nodes lie up to {beyond:.3g} voxels beyond the image's box; please report this"
+        missed["box"] = BEYOND_WORDS.format(beyond)
     missed |= _missed_cover(result, start) if content.region is None else _missed_mask(content, result)
     return result._replace(missed=missed | _missed_labels(content, result))
+
+
+def promised_in_box(result: Optimized, grid: VoxelGrid, min_dihedral: float) -> Optimized:
+    """As `promised`, of a mesh that fills the box of an image, whose voxels need not be in memory."""
+    missed = _missed_floor(result, min_dihedral) | _missed_box(grid, result)
+    beyond = float(beyond_box(result.mesh, grid).max())
+    if beyond > ON_SIDE_VOXELS:
+        missed["box"] = BEYOND_WORDS.format(beyond)
+    return result._replace(missed=missed)
+
+
+def _missed_floor(result: Optimized, min_dihedral: float) -> dict[str, str]:
+    mesh = result.mesh
+    if mesh.ndim != 3 or result.history[-1].iteration == 0:
+        return {}
+    angles = dihedral_angles(mesh.points, mesh.cells).min(axis=1)
+    below = int((angles < min_dihedral - ANGLE_ROUNDING).sum())
+    words = f"{below} of {len(angles)} cells have an angle under {min_dihedral:g} degrees, down to {angles.min():.2f}"
+    return {"floor": f"{words}; allow more nodes, a lower k_D, or a lower min_dihedral"} if below else {}
 
 
 def requested(result: Optimized, content: Content, target_error: float | None, is_filled: bool) -> Optimized:
@@ -78,8 +92,8 @@ def requested(result: Optimized, content: Content, target_error: float | None, i
     return result._replace(missed=missed | (_missed_box(content.image, result) if is_filled else {}))
 
 
-def _missed_box(image: Image, result: Optimized) -> dict[str, str]:
-    outside, volume = image.data.size - result.history[-1].n_voxels, _volume(result.mesh)
+def _missed_box(image: VoxelGrid, result: Optimized) -> dict[str, str]:
+    outside, volume = prod(image.shape) - result.history[-1].n_voxels, _volume(result.mesh)
     if outside == 0 and abs(volume / image.volume - 1.0) < VOLUME_ROUNDING:
         return {}
     words = f"the mesh does not cover the image: {outside} voxels are outside, its volume is {volume:.9g} of "

@@ -1,1 +1,1 @@
-"""A mesh too large for one memory, optimised in parts: each a mesh of its own, whose shared nodes stay, round by round."""
+"""A mesh too large for one memory, optimised in parts, round by round: what they share stays, and is inside next."""

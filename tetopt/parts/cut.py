@@ -10,6 +10,7 @@ sort, but its parts have ragged surfaces or two pieces, and boxes of voxels up t
 from __future__ import annotations
 
 from collections.abc import Sequence
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -88,7 +89,7 @@ def pieces(mesh: Shared) -> list[Piece]:
     order = np.argsort(mesh.part, kind="stable")
     bounds = np.searchsorted(mesh.part[order], np.arange(mesh.part.max() + 2))
     result = []
-    for first, last in zip(bounds[:-1], bounds[1:], strict=True):
+    for first, last in pairwise(bounds):
         nodes, cells = np.unique(mesh.cells[order[first:last]], return_inverse=True)
         result.append(Piece(mesh.ticks[nodes], cells.reshape(-1, mesh.cells.shape[1]).astype(np.int64), nodes))
     return result

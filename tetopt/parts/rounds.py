@@ -1,0 +1,321 @@
+"""A mesh in rounds of parts: cut, optimised part by part, joined, and cut elsewhere.
+
+Each round moves and exchanges everything but what parts share, which is a fifth of the nodes in parts of 5,000; the
+next one's planes lie elsewhere. Each part is normalised by the whole initial mesh, so that what it wins is what E falls
+by, and keeps as many nodes as it has, or its share of those that are still to come. What came of a round does not
+depend on who ran its parts, nor on how many at a time.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from math import ceil
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.energy.sampling import grid_bits
+from tetopt.engine.cost import part_bytes
+from tetopt.engine.fast import EXCHANGING_SHARE
+from tetopt.engine.loop import Optimized, Record
+from tetopt.engine.promises import promised_in_box
+from tetopt.errors import InputError
+from tetopt.geometry.simplex import volumes
+from tetopt.mesh import Mesh
+from tetopt.parts.cut import ROUND_SHIFTS, Piece, Shared, counts_of, cut, joined, pieces
+from tetopt.parts.part import Kind, Numbers, Settings, box_of_ticks, work_on
+from tetopt.parts.work import (
+    State,
+    done_path,
+    load_arrays,
+    load_mesh_of,
+    load_state,
+    locked,
+    open_volume,
+    round_folder,
+    save_arrays,
+    save_state,
+)
+from tetopt.start.octree import octree
+from tetopt.start.sizes import Sizes
+from tetopt.stored import StoredImage
+from tetopt.target.statistics import Statistics, stored_statistics
+
+MOST_CELLS = 100_000  # of a part: 17,000 nodes, of which a tenth to a fifth are shared, and some seconds of a round
+MOST_VOXELS = 2**25  # of the cells of a part, 34 million: with its sums below 1.5 GB
+# Sweeps in a round. Four rounds of 4 left 3.5 % more E_D than one piece of 16 sweeps (MNI152, 40,000 nodes, 4 parts),
+# six of 3 2.4 %: what is shared in the last round, and stays, has had more of its sweeps before.
+ROUND_SWEEPS = 3
+BOX_EXCESS = 1.5  # of the voxels in a part's box over those in its cells, as its surface follows cells
+
+INITIAL_NAME = "initial.npz"  # in the folder of work: the mesh to begin with
+
+Runner = Callable[[Sequence[str]], Iterator[Any]]
+"""Runs `work_on` for each of the files of parts, and yields as they end."""
+
+
+class Request(NamedTuple):
+    """What is asked of a run in parts."""
+
+    nodes: int
+    n_parts: int  # at least
+    k_D: float
+    iterations: int  # rounded up to whole rounds
+    shape_power: float
+    min_dihedral: float  # degrees
+    tolerance: float  # E that falls by less in a sweep, in the mean of a round, ends the run
+    sizes: Sizes | None
+    checksum: str  # of all this and of the image: of the same a run is gone on with
+
+
+class Round(NamedTuple):
+    """What a round is about to do, for who watches."""
+
+    number: int  # from 0, which measures the initial mesh
+    n_rounds: int  # at most, with the last one, which takes the cells' fields
+    kind: Kind
+    n_parts: int
+    done: int  # parts of it that are done
+    task_bytes: float  # the most memory that one of them takes, by prediction
+
+
+class Parted(NamedTuple):
+    """What came of a run in parts."""
+
+    result: Optimized  # with a record for each round
+    fields: dict[str, NDArray]  # of each cell what the image is there: n_voxels, mean, variance, min, max
+    part: NDArray[np.int64]  # (M,) of each cell, rising
+    statistics: Statistics  # of the image
+    image: StoredImage
+
+
+def in_turn(names: Sequence[str]) -> Iterator[Any]:
+    """One part after the other, in this process."""
+    for name in names:
+        yield work_on(name)
+
+
+def mesh_in_parts(
+    request: Request, folder: Path, *,
+    crew: Callable[[int, float], AbstractContextManager[Runner]] = lambda n_parts, task_bytes: nullcontext(in_turn),
+    is_over: Callable[[], bool] = lambda: False,
+    watch: Callable[[Round, list[Record]], None] = lambda now, history: None,
+) -> Parted:  # fmt: skip
+    """A graded mesh of an image's box, optimised in parts, as `mesh_image` does in one piece.
+
+    Parameters
+    ----------
+    request : Request
+    folder : Path
+        Of work, in which `tetopt.parts.work.save_volume` has noted where the voxels are. All that is done stays in it,
+        so that the same request goes on where it ended, whatever ended it.
+    crew : callable
+        Given how many parts there are, and the bytes that the largest takes, for as long as its block lasts what runs
+        them.
+    is_over : callable
+        Asked when a part is done. Once it is true the mesh of the last complete round is the result.
+    watch : callable
+        Told of each part that is done.
+
+    Returns
+    -------
+    Parted
+        The same bits whatever runs the parts.
+
+    Raises
+    ------
+    InputError
+        As `octree`; a folder of another request or of another run; what `crew` and the parts raise; an end before the
+        initial mesh is measured.
+    """
+    begin = time.perf_counter()
+    with locked(folder):
+        image = open_volume(folder)
+        state = load_state(folder, request.checksum) or _begun(request, folder, image)
+        run = _Run(request, folder, image, begin - state.known["seconds"], is_over, watch)
+        counts = _counts(run, state)
+        largest = max(part_bytes(*sizes, is_whole=False) for sizes in _part_sizes(run, state, counts))
+        with crew(int(np.prod(counts)), largest) as runner:
+            ended = "iterations"
+            while state.n_rounds <= _n_rounds(request):
+                after = _round(run, state, counts, runner, largest)
+                if after is None:
+                    ended = "stopped"
+                    break
+                state = after
+                if _is_converged(request, state):
+                    ended = "converged"
+                    break
+            return _finished(run, state, counts, in_turn if ended == "stopped" else runner, ended, largest)
+
+
+class _Run(NamedTuple):
+    request: Request
+    folder: Path
+    image: StoredImage
+    begin: float
+    is_over: Callable[[], bool]
+    watch: Callable[[Round, list[Record]], None]
+
+
+def _n_rounds(request: Request) -> int:
+    """Rounds that improve the mesh."""
+    return ceil(request.iterations / ROUND_SWEEPS)
+
+
+def _begun(request: Request, folder: Path, image: StoredImage) -> State:
+    """The state before the first round: the octree, on the grid of ticks."""
+    begin = time.perf_counter()
+    statistics = stored_statistics(image)
+    mesh = octree(image, request.nodes, request.sizes, statistics)
+    bits = grid_bits(image, mesh.points)
+    ticks = np.rint(image.to_index(mesh.points) * 2.0**bits).astype(np.int64)
+    sizes = (Sizes() if request.sizes is None else request.sizes).prepared(3)
+    settings = Settings(
+        request.k_D, request.shape_power, request.min_dihedral, request.tolerance,
+        _n_rounds(request) * ROUND_SWEEPS, int(EXCHANGING_SHARE * request.iterations) if request.k_D > 0.0 else 0,
+        sizes.smallest, sizes.longest_edge(image, request.nodes), sizes.gradation, image.shape, bits, statistics.noise,
+    )  # fmt: skip
+    known = {"settings": settings._asdict(), "statistics": statistics._asdict(), "history": []}
+    state = State(request.checksum, 0, known | {"seconds": time.perf_counter() - begin})
+    arrays = {"ticks": ticks, "cells": mesh.cells}
+    save_arrays(folder / INITIAL_NAME, arrays, {})
+    save_state(folder, state, arrays)
+    return state
+
+
+def _settings(state: State) -> Settings:
+    return Settings(**state.known["settings"])
+
+
+def _history(state: State) -> list[Record]:
+    return [Record(*row) for row in state.known["history"]]
+
+
+def _cut(run: _Run, state: State, counts: tuple[int, ...], shift: float) -> list[Piece]:
+    """The parts of the mesh as it stands."""
+    mesh = load_mesh_of(run.folder, state)
+    index = mesh["ticks"] * 2.0 ** -_settings(state).bits
+    part = cut(index[mesh["cells"]].mean(axis=1), _weights(index, mesh["cells"]), counts, shift)
+    return pieces(Shared(mesh["ticks"], mesh["cells"], part))
+
+
+def _weights(index: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.float64]:
+    """What each cell is of the most that a part may hold: one of its cells, and its voxels."""
+    return 1.0 / MOST_CELLS + np.abs(volumes(index, cells)) / MOST_VOXELS
+
+
+def _counts(run: _Run, state: State) -> tuple[int, ...]:
+    """Shares along each axis: so many that no part holds too much, whatever machine it is."""
+    mesh = load_arrays(run.folder / INITIAL_NAME)[0]
+    index = mesh["ticks"] * 2.0 ** -_settings(state).bits
+    fewest = ceil(_weights(index, mesh["cells"]).sum())
+    return counts_of(max(run.request.n_parts, fewest), tuple(run.image.spacing * run.image.shape))
+
+
+def _part_sizes(run: _Run, state: State, counts: tuple[int, ...]) -> Iterator[tuple[int, int]]:
+    """Voxels of the box and cells of each part, by the mesh as it stands."""
+    for piece in _cut(run, state, counts, ROUND_SHIFTS[0]):
+        start, stop = box_of_ticks(piece.ticks, _settings(state))
+        n_voxels = int(np.prod(np.subtract(stop, start)))
+        yield int(BOX_EXCESS * n_voxels), len(piece.cells)
+
+
+def _round(run: _Run, state: State, counts: tuple[int, ...], runner: Runner, task_bytes: float) -> State | None:
+    """One round; None if it was cut short."""
+    number = state.n_rounds
+    kind: Kind = "measure" if number == 0 else "improve"
+    parts = _cut(run, state, counts, ROUND_SHIFTS[max(number - 1, 0) % len(ROUND_SHIFTS)])
+    done = _ran(run, state, parts, kind, runner, task_bytes)
+    if done is None:
+        return None
+    arrays, numbers = zip(*done, strict=True)
+    mesh = joined([each["ticks"] for each in arrays], [each["cells"] for each in arrays])
+    return _completed(run, state, mesh, [Numbers(**each) for each in numbers])
+
+
+def _completed(run: _Run, state: State, mesh: Shared, numbers: list[Numbers]) -> State:
+    """The state after a round, on disk."""
+    number, settings, history = state.n_rounds, _settings(state), _history(state)
+    E_G, squares = sum(each.E_G for each in numbers), sum(each.squares for each in numbers)
+    E_D = sum(each.E_D for each in numbers)
+    if number == 0:
+        settings = settings._replace(E_G=E_G, squares=squares)
+        E = 1.0 if squares > 0.0 else 1.0 - settings.k_D
+    else:
+        E = sum(each.E for each in numbers)
+    n_nodes = sum(each.n_nodes for each in numbers)
+    movement = np.sqrt(sum(each.n_nodes * each.movement**2 for each in numbers) / n_nodes)
+    seconds, n_voxels = time.perf_counter() - run.begin, sum(each.n_voxels for each in numbers)
+    history.append(
+        Record(
+            number * ROUND_SWEEPS, float(E), float(E_G), float(E_D), float(movement), number > 0, len(mesh.cells),
+            n_voxels, seconds,
+        )
+    )  # fmt: skip
+    known = state.known | {"settings": settings._asdict(), "history": [list(row) for row in history]}
+    after = State(state.request, number + 1, known | {"seconds": seconds})
+    save_state(run.folder, after, {"ticks": mesh.ticks, "cells": mesh.cells})
+    return after
+
+
+def _ran(
+    run: _Run, state: State, parts: list[Piece], kind: Kind, runner: Runner, task_bytes: float
+) -> list[tuple[dict[str, NDArray], dict[str, Any]]] | None:
+    """What came of each part, in their order; None if the run was cut short before all were done."""
+    folder, number = round_folder(run.folder, state.n_rounds), state.n_rounds
+    folder.mkdir(exist_ok=True)
+    n_nodes = len(load_mesh_of(run.folder, state)["ticks"])
+    first = (number - 1) * ROUND_SWEEPS + 1
+    iterations = (first, first + ROUND_SWEEPS - 1) if kind == "improve" else (1, 0)
+    paths = [folder / f"part-{at}.npz" for at in range(len(parts))]
+    for path, piece in zip(paths, parts, strict=True):
+        nodes = round(len(piece.ticks) * run.request.nodes / n_nodes) if kind == "improve" else len(piece.ticks)
+        text = {"kind": kind, "settings": _settings(state)._asdict(), "iterations": iterations, "nodes": nodes}
+        save_arrays(path, {"ticks": piece.ticks, "cells": piece.cells}, text)
+    # The largest first, as it is last to end.
+    order = sorted(range(len(parts)), key=lambda at: (-len(parts[at].cells), at))
+    now = Round(number, _n_rounds(run.request) + 2, kind, len(parts), 0, task_bytes)
+    run.watch(now, _history(state))
+    for done, _ in enumerate(runner([str(paths[at]) for at in order]), 1):
+        run.watch(now._replace(done=done), _history(state))
+        if done < len(parts) and run.is_over():
+            break
+    if not all(done_path(path).exists() for path in paths):
+        return None
+    return [load_arrays(done_path(path)) for path in paths]
+
+
+def _is_converged(request: Request, state: State) -> bool:
+    """Whether E has fallen by too little in the last round, once nodes are exchanged no more."""
+    history, settings = _history(state), _settings(state)
+    if len(history) < 2 or history[-2].iteration < settings.n_early or history[-2].E <= 0.0:
+        return False
+    return 1.0 - history[-1].E / history[-2].E < request.tolerance * ROUND_SWEEPS
+
+
+def _finished(
+    run: _Run, state: State, counts: tuple[int, ...], runner: Runner, ended: str, task_bytes: float
+) -> Parted:  # fmt: skip
+    """The result of the rounds that are complete, its cells in the order of the parts that took their fields."""
+    history = _history(state)
+    if not history:
+        raise InputError(f"{run.folder}: ended before the first round was complete; run this again to go on with it")
+    parts = _cut(run, state, counts, ROUND_SHIFTS[0])
+    done = _ran(run._replace(is_over=lambda: False), state, parts, "fields", runner, task_bytes)
+    assert done is not None, "nothing cuts it short"
+    mesh = joined([piece.ticks for piece in parts], [piece.cells for piece in parts])
+    scale = 2.0 ** -_settings(state).bits
+    before = load_arrays(run.folder / INITIAL_NAME)[0]
+    fields = {name: np.concatenate([each[name] for each, _ in done]) for name in done[0][0]}
+    result = Optimized(
+        Mesh(run.image.to_world(mesh.ticks * scale), mesh.cells), history, ended,
+        initial=Mesh(run.image.to_world(before["ticks"] * scale), before["cells"]), nodes=run.request.nodes,
+        seconds_run=time.perf_counter() - run.begin,
+    )  # fmt: skip
+    result = promised_in_box(result, run.image, run.request.min_dihedral)
+    return Parted(result, fields, mesh.part, Statistics(**state.known["statistics"]), run.image)

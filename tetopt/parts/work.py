@@ -1,0 +1,165 @@
+"""The folder of work of a run in parts: all that there is of it, so that a rerun goes on where another one ended.
+
+volume.json, voxels.npy       where the voxels are: of an image that is in memory, in the folder itself
+state.json                    what was asked, and what is known after the last complete round
+mesh-R.npz                    the mesh after round R; of the rounds only the last
+round-R/part-P.npz            what a part of the next round is to be made of
+round-R/done-P.npz            and what came of it
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import shutil
+import zipfile
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.errors import InputError
+from tetopt.image import Image
+from tetopt.incoming import json_of, text_of
+from tetopt.io.files import save_json, written_whole
+from tetopt.io.images import Bounds
+from tetopt.io.locks import lock
+from tetopt.io.stored_images import open_stored
+from tetopt.stored import StoredImage
+
+VOXELS_NAME, VOLUME_NAME, STATE_NAME, LOCK_NAME = "voxels.npy", "volume.json", "state.json", "lock"
+TEXT_NAME = "text"  # of the entry of a file of arrays that has what else is to be known, in JSON
+
+
+class VolumeFile(NamedTuple):
+    """Where the voxels of a run in parts are."""
+
+    path: Path
+    volume: int | None = None  # which of several, as of `tetopt.io.stored_images.open_stored`
+    crop: Bounds | None = None  # likewise
+
+    def opened(self) -> StoredImage:
+        """The image; InputError as `open_stored`."""
+        return open_stored(self.path, volume=self.volume, crop=self.crop)
+
+
+@contextmanager
+def locked(folder: Path) -> Iterator[None]:
+    """The folder of work, made if it is not there, for one run alone; InputError if another one has it."""
+    folder.mkdir(exist_ok=True)
+    with ExitStack() as stack:
+        lock(stack, folder / LOCK_NAME, is_shared=False, what=str(folder))
+        yield
+
+
+def save_volume(folder: Path, volume: VolumeFile | Image) -> None:
+    """Note where the voxels are, or leave those of an image in memory in the folder, from where they are mapped."""
+    if isinstance(volume, Image):
+        with written_whole(folder / VOXELS_NAME, volume.data.nbytes) as temporary, temporary.open("wb") as stream:
+            np.save(stream, volume.data)
+        words: dict[str, Any] = {"path": None, "affine": volume.affine.tolist()}
+    else:
+        words = {"path": str(volume.path.resolve()), "volume": volume.volume, "crop": volume.crop}
+    save_json(folder / VOLUME_NAME, words)
+
+
+def open_volume(folder: Path) -> StoredImage:
+    """The image whose voxels a folder of work is about."""
+    words = json_of(text_of(folder / VOLUME_NAME, "a note of where voxels are"))
+    if words["path"] is None:
+        return StoredImage(np.load(folder / VOXELS_NAME, mmap_mode="r"), words["affine"])
+    crop = None if words["crop"] is None else [tuple(each) for each in words["crop"]]
+    return VolumeFile(Path(words["path"]), words["volume"], crop).opened()
+
+
+def save_arrays(path: Path, arrays: dict[str, NDArray], text: dict[str, Any]) -> None:
+    """Write arrays and what else is to be known of them, whole or not at all; each with its checksum (CRC-32)."""
+    words = np.frombuffer(json.dumps(text, sort_keys=True).encode(), dtype=np.uint8)
+    size = sum(array.nbytes for array in arrays.values())
+    with written_whole(path, size) as temporary, temporary.open("wb") as stream:
+        np.savez(stream, **{TEXT_NAME: words}, **arrays)  # type: ignore[arg-type]
+
+
+def load_arrays(path: Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
+    """What `save_arrays` wrote; InputError if the file is damaged."""
+    try:
+        with np.load(path, allow_pickle=False) as file:
+            arrays = {name: file[name] for name in file.files}
+        text = json.loads(arrays.pop(TEXT_NAME).tobytes())
+    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
+        words = " ".join(str(error).split())
+        raise InputError(f"{path}: the file is damaged ({words}); remove it, and run this again") from error
+    return arrays, text
+
+
+def checksum(arrays: dict[str, NDArray], text: dict[str, Any]) -> str:
+    """SHA-256 of arrays and what else is to be known of them."""
+    digest = hashlib.sha256(json.dumps(text, sort_keys=True).encode())
+    for name in sorted(arrays):
+        array = np.ascontiguousarray(arrays[name])
+        digest.update(f"{name} {array.dtype.str} {array.shape}".encode())
+        digest.update(array.tobytes())
+    return digest.hexdigest()
+
+
+class State(NamedTuple):
+    """What is known after a round that is complete."""
+
+    request: str  # checksum of what was asked
+    n_rounds: int  # that are complete; the first one measures the initial mesh
+    known: dict[str, Any]  # numbers by name
+
+
+def save_state(folder: Path, state: State, mesh: dict[str, NDArray]) -> None:
+    """Note that a round is complete: its mesh first, then the state, by which alone it counts, then the rest goes."""
+    save_arrays(mesh_path(folder, state.n_rounds), mesh, {})
+    save_json(folder / STATE_NAME, state._asdict())
+    for old in folder.glob("mesh-*.npz"):
+        if old != mesh_path(folder, state.n_rounds):
+            old.unlink()
+    for old in folder.glob("round-*"):
+        if old != round_folder(folder, state.n_rounds):
+            shutil.rmtree(old)
+
+
+def load_state(folder: Path, request: str) -> State | None:
+    """What is known after the last complete round of a run of this request; None if there is none.
+
+    Raises
+    ------
+    InputError
+        The folder is that of another request.
+    """
+    path = folder / STATE_NAME
+    if not path.exists():
+        return None
+    state = State(**json_of(text_of(path, "a state of rounds")))
+    if state.request != request:
+        raise InputError(
+            f"{folder}: is the folder of work of another run, which has not ended; give the same options and image to "
+            "go on with it, or remove it"
+        )
+    return state
+
+
+def load_mesh_of(folder: Path, state: State) -> dict[str, NDArray]:
+    """The mesh after the last complete round."""
+    return load_arrays(mesh_path(folder, state.n_rounds))[0]
+
+
+def mesh_path(folder: Path, number: int) -> Path:
+    """Where the mesh after so many rounds is."""
+    return folder / f"mesh-{number}.npz"
+
+
+def round_folder(folder: Path, number: int) -> Path:
+    """Where the parts of a round are, by how many rounds are complete."""
+    return folder / f"round-{number}"
+
+
+def done_path(part: Path) -> Path:
+    """Where what comes of a part is, by where it is itself."""
+    return part.with_name(part.name.replace("part-", "done-"))
