@@ -88,6 +88,7 @@ def test_uncompressed_nifti_is_as_read_whole(tmp_path):
     file.header.set_slope_inter(0.5, -3.0)
     nibabel.save(file, tmp_path / "a.nii")
     image, whole = open_stored(tmp_path / "a.nii", volume=1), load_image(tmp_path / "a.nii", volume=1)
+    assert list(np.argsort(image.voxels.strides)) == [0, 1, 2]  # passes go over it as it lies in the file
     assert image.affine.tobytes() == whole.affine.tobytes()
     assert image.box((0, 0, 0), image.shape).data.tobytes() == whole.data.tobytes()
     assert image.read((1, 2, 3), (2, 3, 4)).dtype == image.voxels.dtype

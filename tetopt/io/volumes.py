@@ -43,6 +43,14 @@ class VoxelsInFile:
         self.chunks = None if chunks is None else tuple(int(chunks[axis]) for axis, _ in spans)
         self.dtype = array.dtype
 
+    @property
+    def strides(self) -> tuple[int, ...] | None:
+        """Bytes from voxel to voxel along each axis of a mapped file, where the first runs fastest; None of chunks."""
+        if self.chunks is not None:
+            return None
+        steps = np.cumprod([np.dtype(self.dtype).itemsize, *self.array.shape[:-1]])
+        return tuple(int(step) for step, pick in zip(steps, self.picks, strict=True) if isinstance(pick, slice))
+
     def within(self, ranges: Sequence[tuple[int, int]]) -> VoxelsInFile:
         """The voxels in a box of indices, start to before stop along each of the three axes."""
         bounds = iter(ranges)
