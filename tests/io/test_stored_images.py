@@ -83,9 +83,12 @@ def test_ome_zarr_keeps_values_and_place(tmp_path, fmt, dtype):
     assert image.voxels.chunks == (4, 4, 4)
 
 
-def test_uncompressed_nifti_is_as_read_whole(tmp_path):
-    file = nibabel.Nifti1Image(ramp(7, 6, 5, 2, dtype=">i2"), np.array(OBLIQUE))
-    file.header.set_slope_inter(0.5, -3.0)
+@pytest.mark.parametrize("scaling", [(0.5, -3.0), (1.0, 0.0), (1e-3, 1e5)])
+@pytest.mark.parametrize("dtype", [">i2", "<u1", "<i4", ">f4", "<f8"])
+@pytest.mark.parametrize("kind", [nibabel.Nifti1Image, nibabel.Nifti2Image])
+def test_uncompressed_nifti_is_as_read_whole(tmp_path, kind, dtype, scaling):
+    file = kind(ramp(7, 6, 5, 2, dtype=dtype), np.array(OBLIQUE), dtype=np.dtype(dtype))
+    file.header.set_slope_inter(*scaling)
     nibabel.save(file, tmp_path / "a.nii")
     image, whole = open_stored(tmp_path / "a.nii", volume=1), load_image(tmp_path / "a.nii", volume=1)
     assert list(np.argsort(image.voxels.strides)) == [0, 1, 2]  # passes go over it as it lies in the file

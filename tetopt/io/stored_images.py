@@ -9,6 +9,8 @@ import warnings
 from pathlib import Path
 
 import numpy as np
+from nibabel.volumeutils import apply_read_scaling
+from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.image import Image
@@ -160,11 +162,25 @@ def _cropped(image: StoredImage, ranges: list[tuple[int, int]]) -> StoredImage:
     return StoredImage(image.voxels.within(ranges), affine)
 
 
+class _Scaled:
+    """A mapped array whose values are scaled as nibabel scales them; its own slices take 30 times as long, if thin."""
+
+    def __init__(self, mapped: np.memmap, slope: float, inter: float) -> None:
+        self.mapped, self.dtype, self.slope, self.inter = mapped, mapped.dtype, np.float64(slope), np.float64(inter)
+
+    def __getitem__(self, picks: tuple[int | slice, ...]) -> NDArray:
+        return apply_read_scaling(np.array(self.mapped[picks]), self.slope, self.inter)
+
+
 def _mapped_nifti(path: Path, volume: int | None, notes: list[str]) -> StoredImage:
     proxy, index, affine = nibabel_voxels(path, volume, notes)
     if len(proxy.shape) < 3:
         raise InputError(f"expected a volume, got a plane of {proxy.shape} voxels")
-    voxels = VoxelsInFile(path, proxy, (*(slice(0, int(size)) for size in proxy.shape[:3]), *index))
+    shape = tuple(int(size) for size in proxy.shape)
+    with os_errors_named():
+        mapped = np.memmap(path, proxy.dtype, "r", int(proxy.offset), shape, order="F")
+    scaled = _Scaled(mapped, proxy.slope, proxy.inter)
+    voxels = VoxelsInFile(path, scaled, (*(slice(0, size) for size in shape[:3]), *index))
     voxels.dtype = voxels[(slice(0, 1),) * 3].dtype  # scaled, which its own does not tell
     return StoredImage(voxels, affine)
 
