@@ -101,6 +101,12 @@ def test_uncompressed_nifti_is_as_read_whole(tmp_path, kind, dtype, scaling):
     np.testing.assert_array_equal(part.affine, other.affine)
 
 
+def test_a_real_file_is_as_read_whole(data_dir, tmp_path):
+    packed = nibabel.load(data_dir / "mr_abdomen_slab_3mm.nii.gz")
+    nibabel.save(packed, tmp_path / "a.nii")
+    assert_as_read_whole(tmp_path / "a.nii")
+
+
 @pytest.mark.parametrize(
     ("name", "dtype"), [("a.nrrd", np.int16), ("a.nhdr", np.uint8), ("a.mha", np.float32), ("a.mhd", np.float64)]
 )

@@ -166,7 +166,8 @@ class _Scaled:
     """A mapped array whose values are scaled as nibabel scales them; its own slices take 30 times as long, if thin."""
 
     def __init__(self, mapped: np.memmap, slope: float, inter: float) -> None:
-        self.mapped, self.dtype, self.slope, self.inter = mapped, mapped.dtype, np.float64(slope), np.float64(inter)
+        self.mapped, self.shape, self.dtype = mapped, mapped.shape, mapped.dtype
+        self.slope, self.inter = np.float64(slope), np.float64(inter)
 
     def __getitem__(self, picks: tuple[int | slice, ...]) -> NDArray:
         return apply_read_scaling(np.array(self.mapped[picks]), self.slope, self.inter)

@@ -1,0 +1,49 @@
+"""An image whose voxels stay where they are: boxes of it are images in their own place."""
+
+import numpy as np
+import pytest
+
+from tetopt.errors import InputError
+from tetopt.image import Image
+from tetopt.io.volumes import VoxelsInFile
+from tetopt.stored import StoredImage
+
+AFFINE = np.array([[0.0, -2.0, 0.5, 3.0], [1.0, 0.0, 0.0, -7.0], [0.0, 0.25, 3.0, 11.0], [0.0, 0.0, 0.0, 1.0]])
+
+
+def ramp(*shape):
+    return np.arange(np.prod(shape), dtype=np.int16).reshape(shape)
+
+
+def test_a_box_keeps_its_place():
+    stored, whole = StoredImage(ramp(5, 6, 7), AFFINE), Image(ramp(5, 6, 7), AFFINE)
+    box = stored.box((1, 2, 3), (4, 4, 7))
+    np.testing.assert_array_equal(box.data, whole.data[1:4, 2:4, 3:7])
+    np.testing.assert_array_equal(box.to_world([0, 0, 0]), whole.to_world([1, 2, 3]))
+    assert (stored.shape, stored.volume) == (whole.shape, whole.volume)
+    assert stored.read((0, 0, 0), (1, 1, 2)).dtype == np.int16
+
+
+@pytest.mark.parametrize("shape", [(5, 6), (5, 6, 7, 2), (5, 0, 7)])
+def test_other_than_three_axes_are_refused(shape):
+    with pytest.raises(InputError, match="expected three axes with a voxel at least"):
+        StoredImage(ramp(*shape))
+
+
+def test_values_that_no_image_takes_are_seen_in_their_box():
+    voxels = np.zeros((4, 4, 4))
+    voxels[3, 0, 0] = np.nan
+    stored = StoredImage(voxels)
+    stored.box((0, 0, 0), (3, 4, 4))
+    with pytest.raises(InputError, match="NaN"):
+        stored.box((2, 0, 0), (4, 4, 4))
+
+
+def test_three_axes_of_more(tmp_path):
+    """A box of a box, of axes in the midst of others."""
+    array = ramp(2, 5, 3, 6, 7)
+    voxels = VoxelsInFile(tmp_path, array, (1, slice(0, 5), 2, slice(1, 6), slice(0, 7)), (1, 4, 1, 3, 2))
+    assert (voxels.shape, voxels.chunks, voxels.dtype) == ((5, 5, 7), (4, 3, 2), np.int16)
+    part = voxels.within([(1, 4), (2, 5), (0, 6)])
+    assert (part.shape, part.chunks) == ((3, 3, 6), (4, 3, 2))
+    np.testing.assert_array_equal(part[slice(1, 3), slice(None), slice(2, -1)], array[1, 2:4, 2, 3:6, 2:5])
