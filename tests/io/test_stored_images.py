@@ -6,6 +6,7 @@ import re
 import shutil
 import sys
 import warnings
+from pathlib import Path
 
 import nibabel
 import numpy as np
@@ -237,6 +238,23 @@ def test_a_full_disk_leaves_the_old_folder(tmp_path):
         with pytest.raises(OSError, match=f"cannot be written: No space left on device.*{name}"):
             save_zarr(tmp_path / name, image, Full(), np.int16)
     assert sha256(tmp_path / "a.zarr") == before
+    assert [each.name for each in tmp_path.iterdir()] == ["a.zarr"]
+
+
+def test_the_old_folder_comes_back_where_the_new_one_cannot_take_its_place(tmp_path, monkeypatch):
+    path, image = tmp_path / "a.zarr", Image(ramp(4, 4, 4))
+    save_image(path, image)
+    before, rename = sha256(path), os.rename
+
+    def refused(old, new):
+        if new == path and (Path(old) / "zarr.json").exists() and Path(old).name != "old":
+            raise OSError(13, "Permission denied")
+        rename(old, new)
+
+    monkeypatch.setattr(os, "rename", refused)
+    with pytest.raises(OSError, match="cannot be written: Permission denied"):
+        save_image(path, Image(ramp(4, 4, 4) + 1))
+    assert sha256(path) == before
     assert [each.name for each in tmp_path.iterdir()] == ["a.zarr"]
 
 
@@ -572,7 +590,7 @@ def test_without_the_library(pyramid, monkeypatch):
 def test_what_axes_do_not_say(tmp_path):
     """Where left and right are, and the unit: taken, and said; types of axes, by their names."""
     axes = [{"name": name} for name in "zyx"]
-    place, after = transforms([3, 2, 1]), transforms([2, 2, 2], [5, 6, 7])
+    place, after = transforms([3, 2, 1], [1, 1, 1]), transforms([2, 2, 2], [5, 6, 7])
     path = write_ome(tmp_path / "a.zarr", [(ramp(3, 4, 5), place)], axes, after)
     with warnings.catch_warnings(record=True) as heard:
         warnings.simplefilter("always")
@@ -580,7 +598,7 @@ def test_what_axes_do_not_say(tmp_path):
     words = " ".join(str(each.message) for each in heard)
     assert "has no orientation: x, y and z of its axes are taken as right, anterior and superior" in words
     assert "has no unit on its axes: its scale is taken as mm" in words
-    np.testing.assert_array_equal(image.affine, [[0, 0, 2, 7], [0, 4, 0, 6], [6, 0, 0, 5], [0, 0, 0, 1]])
+    np.testing.assert_array_equal(image.affine, [[0, 0, 2, 9], [0, 4, 0, 8], [6, 0, 0, 7], [0, 0, 0, 1]])
 
 
 def test_orientation_turns_axes_to_ras(tmp_path):
