@@ -17,6 +17,7 @@ from tetopt.energy.sampling import cell_moments_and_ranges
 from tetopt.engine.fast import Course, Run, followed
 from tetopt.engine.loop import Whole
 from tetopt.engine.state import content_energies
+from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.parts.work import checksum, done_path, load_arrays, open_volume, save_arrays
@@ -102,10 +103,13 @@ def work_on(name: str) -> Numbers:
 
 
 def numbers_in(path: Path, of: str) -> Numbers | None:
-    """The numbers of a part that is done, if it was made of what has this checksum."""
+    """The numbers of a part that is done, if it was made of what has this checksum, and is not damaged since."""
     if not path.exists():
         return None
-    numbers = Numbers(**load_arrays(path)[1])
+    try:
+        numbers = Numbers(**load_arrays(path)[1])
+    except InputError:
+        return None
     return numbers if numbers.of == of else None
 
 

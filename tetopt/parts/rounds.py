@@ -141,15 +141,15 @@ def mesh_in_parts(
         largest = max(part_bytes(*sizes, is_whole=False) for sizes in _part_sizes(run, state, counts))
         with crew(int(np.prod(counts)), largest) as runner:
             ended = "iterations"
-            while state.n_rounds <= _n_rounds(request):
+            # Asked before a round, also of a run that went on: it may have ended when it had converged.
+            while not _is_converged(request, state) and state.n_rounds <= _n_rounds(request):
                 after = _round(run, state, counts, runner, largest)
                 if after is None:
                     ended = "stopped"
                     break
                 state = after
-                if _is_converged(request, state):
-                    ended = "converged"
-                    break
+            if _is_converged(request, state):
+                ended = "converged"
             return _finished(run, state, counts, in_turn if ended == "stopped" else runner, ended, largest)
 
 
@@ -269,7 +269,7 @@ def _ran(
     """What came of each part, in their order; None if the run was cut short before all were done."""
     folder, number = round_folder(run.folder, state.n_rounds), state.n_rounds
     folder.mkdir(exist_ok=True)
-    n_nodes = len(load_mesh_of(run.folder, state)["ticks"])
+    n_nodes = 1 + max(int(piece.nodes[-1]) for piece in parts)
     first = (number - 1) * ROUND_SWEEPS + 1
     iterations = (first, first + ROUND_SWEEPS - 1) if kind == "improve" else (1, 0)
     paths = [folder / f"part-{at}.npz" for at in range(len(parts))]
@@ -281,11 +281,13 @@ def _ran(
     order = sorted(range(len(parts)), key=lambda at: (-len(parts[at].cells), at))
     now = Round(number, _n_rounds(run.request) + 2, kind, len(parts), 0, task_bytes)
     run.watch(now, _history(state))
-    for done, _ in enumerate(runner([str(paths[at]) for at in order]), 1):
-        run.watch(now._replace(done=done), _history(state))
-        if done < len(parts) and run.is_over():
+    n_done = 0
+    for n_done, _ in enumerate(runner([str(paths[at]) for at in order]), 1):
+        run.watch(now._replace(done=n_done), _history(state))
+        if n_done < len(parts) and run.is_over():
             break
-    if not all(done_path(path).exists() for path in paths):
+    # By their number and not by their files, which may be those of a run that was stopped here and took its fields.
+    if n_done < len(parts):
         return None
     return [load_arrays(done_path(path)) for path in paths]
 

@@ -12,7 +12,9 @@ from __future__ import annotations
 import hashlib
 import json
 import shutil
+import struct
 import zipfile
+import zlib
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -28,10 +30,18 @@ from tetopt.io.files import save_json, written_whole
 from tetopt.io.images import Bounds
 from tetopt.io.locks import lock
 from tetopt.io.stored_images import open_stored
+from tetopt.io.text import plain
 from tetopt.stored import StoredImage
 
 VOXELS_NAME, VOLUME_NAME, STATE_NAME, LOCK_NAME = "voxels.npy", "volume.json", "state.json", "lock"
 TEXT_NAME = "text"  # of the entry of a file of arrays that has what else is to be known, in JSON
+
+
+# What zipfile and numpy say of files with other bytes than were written. A number of a length may stand for any memory.
+DAMAGE_ERRORS = (
+    OSError, EOFError, ValueError, KeyError, TypeError, MemoryError, OverflowError, RuntimeError, struct.error,
+    zipfile.BadZipFile, zlib.error,
+)  # fmt: skip
 
 
 class VolumeFile(NamedTuple):
@@ -80,7 +90,8 @@ def save_arrays(path: Path, arrays: dict[str, NDArray], text: dict[str, Any]) ->
     words = np.frombuffer(json.dumps(text, sort_keys=True).encode(), dtype=np.uint8)
     size = sum(array.nbytes for array in arrays.values())
     with written_whole(path, size) as temporary, temporary.open("wb") as stream:
-        np.savez(stream, **{TEXT_NAME: words}, **arrays)  # type: ignore[arg-type]
+        # The text last: a length that is damaged may swallow what comes behind, and without the text is noticed.
+        np.savez(stream, **arrays, **{TEXT_NAME: words})  # type: ignore[arg-type]
 
 
 def load_arrays(path: Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
@@ -89,10 +100,15 @@ def load_arrays(path: Path) -> tuple[dict[str, NDArray], dict[str, Any]]:
         with np.load(path, allow_pickle=False) as file:
             arrays = {name: file[name] for name in file.files}
         text = json.loads(arrays.pop(TEXT_NAME).tobytes())
-    except (OSError, EOFError, ValueError, KeyError, zipfile.BadZipFile) as error:
-        words = " ".join(str(error).split())
-        raise InputError(f"{path}: the file is damaged ({words}); remove it, and run this again") from error
+    except DAMAGE_ERRORS as error:
+        raise _damaged(path, error) from error
     return arrays, text
+
+
+def _damaged(path: Path, error: Exception) -> InputError:
+    """What is done without a file: a part is made again, and without the mesh or the state there is no way on."""
+    words = plain(" ".join(str(error).split()))
+    return InputError(f"{path}: the file is damaged ({words}); remove {path.parent}, and run this again")
 
 
 def checksum(arrays: dict[str, NDArray], text: dict[str, Any]) -> str:
@@ -116,7 +132,7 @@ class State(NamedTuple):
 def save_state(folder: Path, state: State, mesh: dict[str, NDArray]) -> None:
     """Note that a round is complete: its mesh first, then the state, by which alone it counts, then the rest goes."""
     save_arrays(mesh_path(folder, state.n_rounds), mesh, {})
-    save_json(folder / STATE_NAME, state._asdict())
+    save_json(folder / STATE_NAME, {"state": state._asdict(), "checksum": checksum({}, state._asdict())})
     for old in folder.glob("mesh-*.npz"):
         if old != mesh_path(folder, state.n_rounds):
             old.unlink()
@@ -131,12 +147,18 @@ def load_state(folder: Path, request: str) -> State | None:
     Raises
     ------
     InputError
-        The folder is that of another request.
+        The folder is that of another request, or the file is damaged.
     """
     path = folder / STATE_NAME
     if not path.exists():
         return None
-    state = State(**json_of(text_of(path, "a state of rounds")))
+    try:
+        words = json_of(path.read_text(encoding="utf-8"))
+        state = State(**words["state"])
+        if words["checksum"] != checksum({}, state._asdict()):
+            raise ValueError("its checksum is another one")
+    except DAMAGE_ERRORS as error:
+        raise _damaged(path, error) from error
     if state.request != request:
         raise InputError(
             f"{folder}: is the folder of work of another run, which has not ended; give the same options and image to "
