@@ -24,12 +24,14 @@ from tetopt.cli.options import (
     EngineOptions,
     ForceOption,
     OutputOptions,
+    PartsOptions,
     SizeOptions,
     SolverOptions,
     SourceOptions,
     StartOptions,
     option,
 )
+from tetopt.cli.parts import StoredSource, chosen_parts, end_work, is_left_stored, read_stored, run_in_parts
 from tetopt.cli.plan import Plan, planned, with_numbers
 from tetopt.cli.predict import print_prediction, size_of_run, stated_prediction
 from tetopt.cli.promises import check_promises, warn_of_result, warn_of_sizes
@@ -67,7 +69,7 @@ from tetopt.io.formats import format_of
 from tetopt.io.meshes import MeshFile
 from tetopt.io.mni import mni_path
 from tetopt.measure.quality import Quality, quality
-from tetopt.model.fields import is_result
+from tetopt.model.fields import cell_fields, is_result
 from tetopt.model.labels import TABLE_TEXT, table_of_labels, table_words
 from tetopt.model.model import Model
 from tetopt.model.sets import Sets, box_of, label_set_names, surviving_sets
@@ -75,7 +77,7 @@ from tetopt.report.summary import fidelity, image_summary, model_summary, run_su
 from tetopt.report.tables import add_quality, new_table, nodes_in_words
 from tetopt.start.octree import nodes_of_sizes
 from tetopt.start.sizes import edge_ratios
-from tetopt.target.content import Content
+from tetopt.target.content import Content, StoredContent
 from tetopt.target.domain import INSIDE_SHARE
 
 CELL_BYTES = 40  # of a file, at least: a VTU with a cell's usual fields takes 48, other formats more
@@ -85,11 +87,12 @@ class Task(NamedTuple):
     """What a run works on: the plan, and the files that it names, as read."""
 
     plan: Plan
-    source: Source
+    source: Source | StoredSource
     started: MeshFile | None  # the mesh to start from
     sizes: tetopt.Sizes | None
     size: RunSize  # by which time and memory are predicted
     request: dict[str, Any] | None = None  # of `requested`, where the numbers are written
+    parts: PartsOptions | None = None  # of a run in parts
 
     @property
     def start_name(self) -> str:
@@ -112,6 +115,7 @@ def mesh_command(
     sizes: SizeOptions,
     start: StartOptions,
     engine: EngineOptions,
+    parts: PartsOptions,
     solver: SolverOptions,
     output: OutputOptions,
 ) -> int:
@@ -119,26 +123,32 @@ def mesh_command(
     begin = time.perf_counter()
     plan = planned(source, sizes, start, engine, solver, output)
     set_threads(engine.threads)
-    task = _read(plan)
+    task = _read(plan, chosen_parts(plan, parts))
     if output.predict:
         print_prediction(task.plan, task.size)
         return 0
     if output.json_path is not None:
-        task = task._replace(request=requested(source, sizes, start, engine, solver, output))
+        task = task._replace(request=requested(source, sizes, start, engine, solver, output, parts.parts))
     with mesh_kept() as begin_keeping:
-        result, seconds, predicted = _run(task, begin, begin_keeping)
-        model, about = _save(task, result)
+        result, seconds, predicted, fields = _run(task, begin, begin_keeping)
+        model, about = _save(task, result, fields)
         assert result.initial is not None
         # Only from here on, as nothing may fail before the mesh is written.
         first, last = (quality(each.points, each.cells) for each in (result.initial, result.mesh))
         outcome = Outcome(result, result.initial, seconds, predicted, (first, last))
         measured = _write(task, outcome, model, about, begin)
         code = _print(task, outcome, model, measured)
+        if task.parts is not None:
+            end_work(task.plan, result)
         return signal_code() if is_ended() else code
 
 
-def _read(plan: Plan) -> Task:
+def _read(plan: Plan, parts: PartsOptions | None) -> Task:
     """The files that the plan names, and the defaults that depend on them."""
+    if parts is not None and is_left_stored(plan):
+        stored = read_stored(plan)
+        plan, sizes = with_numbers(plan, stored.content)
+        return Task(plan, stored, None, sizes, size_of_run(plan, stored.content, stored.content.image), parts=parts)
     source = read_source(plan.source, plan.solver.label_names)
     started = None
     if plan.start.start is not None:
@@ -150,7 +160,8 @@ def _read(plan: Plan) -> Task:
             source = source.with_table(label_table(None, started))
     plan, sizes = with_numbers(plan, source.content)
     n_started = None if started is None else len(started.mesh.points)
-    return Task(plan, source, started, sizes, size_of_run(plan, source.content, source.contrasts[0], n_started))
+    size = size_of_run(plan, source.content, source.contrasts[0], n_started)
+    return Task(plan, source, started, sizes, size, parts=parts)
 
 
 def _check_place(mesh: Mesh, image: Image, path: str) -> None:
@@ -166,9 +177,16 @@ def _check_place(mesh: Mesh, image: Image, path: str) -> None:
         show_warning(f"{path}: {np.mean(~is_in):.1%} of its cells lie beside the image, where it has no say")
 
 
-def _run(task: Task, begin: float, begin_keeping: Callable[[], None]) -> tuple[Optimized, dict[str, float], float]:
+Ran = tuple[Optimized, dict[str, float], float, dict[str, NDArray] | None]
+"""A result, seconds by name, the bytes predicted, and fields of cells, if they are known."""
+
+
+def _run(task: Task, begin: float, begin_keeping: Callable[[], None]) -> Ran:
     """The optimised mesh, what took how long, and the bytes predicted; a target error takes several runs in turn."""
+    if task.parts is not None:
+        return _run_in_parts(task, begin, begin_keeping)
     plan, content = task.plan, task.source.content
+    assert isinstance(content, Content)
     solver, output, options = plan.solver, plan.output.mesh, plan.engine_options()
     ends = None if plan.engine.max_seconds is None else begin + plan.engine.max_seconds
     limit = _memory_limit(plan, content)
@@ -178,9 +196,11 @@ def _run(task: Task, begin: float, begin_keeping: Callable[[], None]) -> tuple[O
     def watch(initial: Mesh, run: Run) -> Optimized:
         if not begun and (solver.are_any() or output.suffix.lower() != ".vtu"):
             about = task.source.about
-            check_early(
-                output, solver, task.source.image, lambda early: _model(task, initial, early, about, is_told=False)
-            )
+
+            def build(early: SolverOptions) -> Model:
+                return _model(task, initial, early, about, is_told=False)
+
+            check_early(output, solver, initial.ndim, task.source.low, build)
         check_space(output, CELL_BYTES * len(initial.cells))
         begun.append(time.perf_counter())
         log.print(escape(_described(task, initial)))
@@ -200,7 +220,30 @@ def _run(task: Task, begin: float, begin_keeping: Callable[[], None]) -> tuple[O
     seconds = {"load": begun[0] - begin, "optimize": time.perf_counter() - begun[0]}
     n_nodes = max(result.nodes or 0, len(result.initial.points))
     predicted = max(before[0], before[1] + bytes_of(content, n_nodes))
-    return result, seconds, predicted
+    return result, seconds, predicted, None
+
+
+def _run_in_parts(task: Task, begin: float, begin_keeping: Callable[[], None]) -> Ran:
+    """The same in parts, which take the fields of their cells as well."""
+    assert task.parts is not None
+    loaded, before = time.perf_counter() - begin, peak_bytes()
+
+    def check(initial: Mesh) -> None:
+        output, solver = task.plan.output.mesh, task.plan.solver
+        if solver.are_any() or output.suffix.lower() != ".vtu":
+            fields = cell_fields(initial)
+            early = {name: np.zeros(len(initial.cells)) for name in ("mean", "variance", "n_voxels", "min", "max")}
+
+            def build(options: SolverOptions) -> Model:
+                return _model(task, initial, options, task.source.about, is_told=False, fields=early | fields)
+
+            check_early(output, solver, initial.ndim, task.source.low, build)
+        check_space(output, CELL_BYTES * len(initial.cells))
+
+    parted, n_bytes = run_in_parts(task.plan, task.source, task.sizes, task.parts, check, begin_keeping)
+    seconds = {"load": loaded, "optimize": time.perf_counter() - begin - loaded}
+    fields = {**parted.fields, **cell_fields(parted.result.mesh), "part": parted.part}
+    return parted.result, seconds, max(before, n_bytes), fields
 
 
 def _memory_limit(plan: Plan, content: Content) -> MemoryLimit | None:
@@ -231,6 +274,7 @@ def _say_search(task: Task, number: int, result: Optimized) -> None:
 
 def _described(task: Task, initial: Mesh) -> str:
     source = task.source
+    assert isinstance(source, Source)
     image = source.contrasts[0]
     size = " x ".join(str(s) for s in image.shape)
     spacing = " x ".join(f"{s:.4g}" for s in image.spacing)
@@ -245,11 +289,13 @@ def _described(task: Task, initial: Mesh) -> str:
 
 def _model(
     task: Task, mesh: Mesh, solver: SolverOptions, about: dict[str, Any], is_told: bool = True,
-    labels: NDArray[np.int64] | None = None,
+    labels: NDArray[np.int64] | None = None, fields: dict[str, NDArray] | None = None,
 ) -> Model:  # fmt: skip
-    """The mesh with all that the options say of it."""
+    """The mesh with all that the options say of it; `fields` of its cells are found, if they are not known."""
     source, started = task.source, task.started
-    fields = source.fields(mesh, labels)
+    if fields is None:
+        assert isinstance(source, Source)
+        fields = source.fields(mesh, labels)
     own = Sets({}, {}) if started is None else surviving_sets(started.mesh, started.sets, mesh)
     if started is not None and is_told:
         lost = [name for kind in (0, 1) for name in started.sets[kind] if name not in own[kind]]
@@ -266,23 +312,29 @@ def _model(
     return solver_model(mesh, source.image, solver, fields, about, known_sets)
 
 
-def _save(task: Task, result: Optimized) -> tuple[Model, dict[str, Any]]:
+def _save(
+    task: Task, result: Optimized, fields: dict[str, NDArray] | None
+) -> tuple[Model, dict[str, Any]]:  # fmt: skip
     """Write the mesh, or keep it elsewhere; the model, and what files say about the run."""
     plan, source = task.plan, task.source
     solver, output = plan.solver, plan.output
     options = plan.stated(source.content.image.ndim)
     if plan.sizes.target_error is not None:
         options["nodes"] = result.nodes
+    if task.parts is not None:
+        options["parts"] = task.parts.parts or 1
     about = {**source.about, "options": options}
     try:
-        model = with_chosen_sets(_model(task, result.mesh, solver, about, labels=result.labels), output.mesh, solver)
+        whole = _model(task, result.mesh, solver, about, labels=result.labels, fields=fields)
+        model = with_chosen_sets(whole, output.mesh, solver)
         save_for_solver(output.mesh, model, solver)
     except TakenError:  # it is kept beside its name
         raise
     except Exception as error:  # hours may have gone into the mesh
 
         def bare() -> Model:
-            return _model(task, result.mesh, SolverOptions(), about, is_told=False, labels=result.labels)
+            options = SolverOptions()
+            return _model(task, result.mesh, options, about, is_told=False, labels=result.labels, fields=fields)
 
         save_anyway(output.mesh, result.mesh, bare, error)
         raise
@@ -293,7 +345,7 @@ def _write(task: Task, outcome: Outcome, model: Model, about: dict[str, Any], be
     """Write the numbers and the pictures; how well mask, labels and contrasts are met."""
     plan, source, result, output = task.plan, task.source, outcome.result, task.plan.output
     measured = fidelity(source.labels, source.mask, result.mesh, model.cell_data.get("label"))
-    if not source.content.is_plain or source.content.region is not None:
+    if isinstance(source, Source) and not (source.content.is_plain and source.content.region is None):
         measured["contrasts"] = source.by_contrast(model.cell_data)
     if source.labels is not None and source.table.names:
         there = table_of_labels(source.table, np.unique(source.labels.data).astype(np.int64).tolist())
@@ -301,6 +353,7 @@ def _write(task: Task, outcome: Outcome, model: Model, about: dict[str, Any], be
         about |= {TABLE_TEXT: table_words(there)}
     if task.sizes is not None and (ratios := edge_ratios(result.mesh.points, result.mesh.cells, task.sizes)):
         measured["edges_over_target"] = ratios
+        assert isinstance(source, Source), "no targets for the voxels of others"
         needed = nodes_of_sizes(source.content, task.sizes)[0]
         measured["nodes_of_sizes"] = round(needed * (QUADRATIC_NODES[source.image.ndim] if model.order == 2 else 1.0))
     measured["cells_without_voxel"] = int((model.cell_data["n_voxels"] == 0).sum())
@@ -311,7 +364,7 @@ def _write(task: Task, outcome: Outcome, model: Model, about: dict[str, Any], be
     if output.json_path is not None:
         seconds = {**outcome.seconds, "all": time.perf_counter() - begin}
         summary = run_summary(source.content, outcome.initial, result, about, seconds, outcome.shapes)
-        if source.image is not source.content.image:
+        if isinstance(source, Source) and source.image is not source.content.image:
             summary["image_properties"] = image_summary(source.image)  # on its own voxels, not on divided ones
         summary["request"] = task.request
         summary["prediction"] = stated_prediction(task.size)
@@ -326,8 +379,13 @@ def _draw(task: Task, outcome: Outcome, model: Model) -> None:
     """Draw the pictures."""
     from tetopt.report import figures, thumbnail  # matplotlib is slow to load, and only needed here
 
-    source, pictures = task.source, task.plan.pictures
-    image, mesh = source.contrasts[0], outcome.result.mesh
+    pictures, mesh, source = task.plan.pictures, outcome.result.mesh, task.source
+    if isinstance(source, StoredSource):
+        image = source.coarse()
+        figures.save_run_figures(pictures[:3], image, outcome.initial, outcome.result, task.start_name, image)
+        thumbnail.save_thumbnail(pictures[-1], image, mesh, None, None, None)
+        return
+    image = source.contrasts[0]
     figures.save_run_figures(pictures[:3], source.image, outcome.initial, outcome.result, task.start_name, image)
     of_cell = model.cell_data.get("label")
     if source.mask is not None:
@@ -347,7 +405,7 @@ def _print(task: Task, outcome: Outcome, model: Model, measured: dict[str, Any])
     plan, content, result = task.plan, task.source.content, outcome.result
     solver, output = plan.solver, plan.output
     code = check_promises(result, measured)
-    if content.image.data.min() == content.image.data.max():
+    if task.source.is_constant:
         measured = {**measured, "cells_without_voxel": 0}  # whose values are right all the same
     is_counted = plan.mode == "graded" and plan.sizes.target_error is None
     n_nodes = node_count(model.mesh.points, model.mesh.cells, model.order)
@@ -370,7 +428,7 @@ def _print(task: Task, outcome: Outcome, model: Model, measured: dict[str, Any])
     return code
 
 
-def _print_comparison(content: Content, outcome: Outcome, start: str, order: int, n_empty: int) -> None:
+def _print_comparison(content: Content | StoredContent, outcome: Outcome, start: str, order: int, n_empty: int) -> None:
     mesh, initial = outcome.result.mesh, outcome.initial
     first, last = outcome.result.history[0], outcome.result.history[-1]
     table = new_table("", start, "optimised")
@@ -380,7 +438,8 @@ def _print_comparison(content: Content, outcome: Outcome, start: str, order: int
     if first.E_D > 0.0:
         table.add_row("E_D, of initial", "1.0000", f"{last.E_D / first.E_D:.4f}")
     if first.E_D > 0.0 and (spread := content.variance * content.volume) > 0.0:
-        whose = "the image's variance" if content.is_plain and content.region is None else "all channels' variance"
+        is_one = isinstance(content, StoredContent) or (content.is_plain and content.region is None)
+        whose = "the image's variance" if is_one else "all channels' variance"
         table.add_row(f"E_D, share of {whose}", f"{first.E_D / spread:.5f}", f"{last.E_D / spread:.5f}")
     meshes = (initial, mesh)
     in_all = [size_summary(each, order)["n_nodes_in_all"] for each in meshes] if order == 2 else []
@@ -401,5 +460,6 @@ def demo_command(
     folder = results_folder(output)
     files = OutputOptions(mesh=folder / "mesh.vtu", json_path=folder / "run.json", figures=folder, force=force)
     return mesh_command(
-        source, SizeOptions(nodes=nodes), StartOptions(), EngineOptions(iterations=iterations), SolverOptions(), files
-    )
+        source, SizeOptions(nodes=nodes), StartOptions(), EngineOptions(iterations=iterations), PartsOptions(),
+        SolverOptions(), files,
+    )  # fmt: skip

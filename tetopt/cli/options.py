@@ -50,7 +50,7 @@ def option(metavar: str, text: str, *names: str, **more: Any) -> Any:
 
 ImageArgument = Annotated[
     Path,
-    typer.Argument(metavar="IMAGE", help="NIfTI, MGZ, NRRD, MetaImage, a DICOM folder, or a 2-D picture."),
+    typer.Argument(metavar="IMAGE", help="NIfTI, MGZ, NRRD, MetaImage, OME-Zarr, a DICOM folder, or a 2-D picture."),
 ]
 MeshArgument = Annotated[
     Path, typer.Argument(metavar="MESH", help="VTU, VTK or gmsh MSH file of tetrahedra or triangles.")
@@ -277,6 +277,32 @@ class EngineOptions:
     max_gb: Annotated[float | None, option("GB", "Stop with the mesh reached before more than GB GB are taken.")] = None
 
 
+WorkersOption = Annotated[
+    int | None, option("N", "So many parts at a time, or jobs of a --cluster, at most.", "--workers", min=1)
+]
+SchedulerOption = Annotated[
+    str | None, option("ADDRESS", "A scheduler of dask's that runs, with its workers: tcp://host:8786.")
+]
+ClusterOption = Annotated[
+    Path | None, option("FILE.yaml", "A batch system (SLURM, PBS, LSF, SGE, ...), as dask-jobqueue is configured.")
+]
+
+
+@dataclass(frozen=True, kw_only=True)
+class PartsOptions:
+    """How a mesh is made in parts, and by whom."""
+
+    panel: ClassVar[str] = "Beyond one memory"
+    parts: Annotated[
+        int | None,
+        option("K", "In K parts or more, each on its own voxels (default 1, or as many as memory asks for).", min=1),
+    ] = None
+    count: WorkersOption = None
+    worker_gb: Annotated[float | None, option("GB", "Memory of each worker on this machine, enforced.")] = None
+    scheduler: SchedulerOption = None
+    cluster: ClusterOption = None
+
+
 @dataclass(frozen=True, kw_only=True)
 class ModelOptions:
     """What a solver is told besides the mesh."""
@@ -433,12 +459,8 @@ class CohortOptions:
     count: Annotated[
         int | None, option("N", "So many subjects at a time, or jobs of a --cluster, at most.", "--workers", min=1)
     ] = None
-    scheduler: Annotated[
-        str | None, option("ADDRESS", "A scheduler of dask's that runs, with its workers: tcp://host:8786.")
-    ] = None
-    cluster: Annotated[
-        Path | None, option("FILE.yaml", "A batch system (SLURM, PBS, LSF, SGE, ...), as dask-jobqueue is configured.")
-    ] = None
+    scheduler: SchedulerOption = None
+    cluster: ClusterOption = None
 
 
 class Records(NamedTuple):

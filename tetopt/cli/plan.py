@@ -31,7 +31,7 @@ from tetopt.io.formats import FORMATS, format_of
 from tetopt.io.images import parse_crop, parse_slice
 from tetopt.start.lattice import KINDS
 from tetopt.start.octree import nodes_of_sizes
-from tetopt.target.content import SMOOTH_INTERFACES, Content, check_weights
+from tetopt.target.content import SMOOTH_INTERFACES, Content, StoredContent, check_weights
 
 FEWEST_NODES = 5  # of the smallest mesh that there is, an octree in 2-D: a square's corners and its middle
 
@@ -214,7 +214,7 @@ def _pictures(source: SourceOptions, output: OutputOptions) -> list[Path]:
     return list(checked_outputs(output.figures, names, output.force).values())
 
 
-def with_numbers(plan: Plan, content: Content) -> tuple[Plan, tetopt.Sizes | None]:
+def with_numbers(plan: Plan, content: Content | StoredContent) -> tuple[Plan, tetopt.Sizes | None]:
     """The plan with the defaults that depend on the image, and the sizes.
 
     These are the number of nodes, as many as the sizes take or fewer on small images, and the longest edge, which holds
@@ -238,7 +238,7 @@ def with_numbers(plan: Plan, content: Content) -> tuple[Plan, tetopt.Sizes | Non
     return plan._replace(sizes=replace(sizes, nodes=nodes, edge_max=longest)), limits
 
 
-def _default_nodes(content: Content, limits: tetopt.Sizes | None, many: float) -> int:
+def _default_nodes(content: Content | StoredContent, limits: tetopt.Sizes | None, many: float) -> int:
     """As many nodes as the targets take, where there are any, and elsewhere their share of the usual number.
 
     `many` are the nodes in all to a corner of cells.
@@ -246,7 +246,7 @@ def _default_nodes(content: Content, limits: tetopt.Sizes | None, many: float) -
     corners = float(
         np.clip(content.n_voxels // 8, 2 ** (content.image.ndim + 2), DEFAULT_NODES[content.image.ndim] / many)
     )
-    if limits is not None and limits.has_target:
+    if limits is not None and limits.has_target and isinstance(content, Content):
         needed, share = nodes_of_sizes(content, limits)
         corners = needed + (1.0 - share) * corners
     return int(np.rint(many * corners))

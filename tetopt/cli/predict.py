@@ -17,16 +17,18 @@ from tetopt.cli.options import DEFAULT_NODES
 from tetopt.cli.plan import Plan
 from tetopt.engine.cost import RunSize, calibrated_speed, cost_model, predicted
 from tetopt.engine.meshing import QUADRATIC_NODES
-from tetopt.image import Image
+from tetopt.image import VoxelGrid
 from tetopt.io.images import file_shape, load_image, parse_crop, parse_slice
-from tetopt.target.content import Content
+from tetopt.target.content import Content, StoredContent
 
 SEARCH_RUNS = 4  # towards an error, mostly, each of about the default number of nodes
 QUADRATIC_RUNS = 2  # towards a number of nodes of order 2: the second mostly meets it
 SAMPLED_VALUES = 10_000  # of an image: one that is no whole number tells that most are none
 
 
-def size_of_run(plan: Plan, content: Content, whole: Image, n_started: int | None = None) -> RunSize:
+def size_of_run(
+    plan: Plan, content: Content | StoredContent, whole: VoxelGrid, n_started: int | None = None
+) -> RunSize:
     """The sizes of a run whose files have been read.
 
     Parameters
@@ -45,6 +47,9 @@ def size_of_run(plan: Plan, content: Content, whole: Image, n_started: int | Non
         per_block = 1 if plan.start.lattice == "five-tet" else 2
         nodes = max(round(per_block * content.volume / spacing**content.image.ndim), 1)
     size = _size(plan, whole.shape, nodes)
+    if isinstance(content, StoredContent):
+        elongation = _elongation(whole.spacing)
+        return size._replace(elongation=elongation, is_fractional=not content.statistics.is_whole)
     return size._replace(
         n_voxels=content.image.data.size,
         n_nodes=size.n_nodes if n_started is None else n_started,

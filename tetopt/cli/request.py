@@ -13,6 +13,7 @@ from tetopt.cli.inputs import file_and_volume
 from tetopt.cli.options import (
     EngineOptions,
     OutputOptions,
+    PartsOptions,
     SizeOptions,
     SolverOptions,
     SourceOptions,
@@ -27,11 +28,11 @@ WITHOUT_SAY = ("threads",)  # options on which no output depends
 
 def requested(
     source: SourceOptions, sizes: SizeOptions, start: StartOptions, engine: EngineOptions, solver: SolverOptions,
-    output: OutputOptions,
+    output: OutputOptions, parts: int | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """What decides the outputs of `tetopt mesh`: options, the files' names and checksums, the version.
 
-    Names of outputs and of folders are no part of it, nor is the number of threads.
+    Names of outputs and of folders are no part of it, nor is the number of threads, nor who works on `parts`.
 
     Returns
     -------
@@ -44,7 +45,7 @@ def requested(
     InputError
         A file is missing, or may not be read.
     """
-    options = given_options(source, sizes, start, engine, solver)
+    options = given_options(source, sizes, start, engine, PartsOptions(parts=parts), solver)
     files = {name: each for name in list(options) if (each := _files(name, options[name]))}
     stated = {name: value for name, value in options.items() if name not in (*files, *WITHOUT_SAY)}
     whole: dict[str, Any] = {

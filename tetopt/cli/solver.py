@@ -309,21 +309,23 @@ def sets_and_table(
     return sets, {TABLE_TEXT: table_words(table)} if table.names else {}
 
 
-def check_early(output: Path, solver: SolverOptions, image: Image, build: Callable[[SolverOptions], Model]) -> None:
+def check_early(
+    output: Path, solver: SolverOptions, ndim: int, low: float, build: Callable[[SolverOptions], Model]
+) -> None:
     """InputError for what would be refused after the optimisation, as far as the initial mesh can tell.
 
-    `build` makes a model of the initial mesh. Further sets, and interfaces, may have members in the final one alone: of
-    them, and of loads on them, only the words and names are looked at.
+    `low` is the image's least intensity; `build` makes a model of the initial mesh. Further sets, and interfaces, may
+    have members in the final one alone: of them, and of loads on them, only the words and names are looked at.
     """
-    requests = [parse_set(text, image.ndim) for text in solver.sets or ()]
+    requests = [parse_set(text, ndim) for text in solver.sets or ()]
     for request in requests:
-        if request.kind == "below" and request.vectors[0][0] <= image.data.min():
+        if request.kind == "below" and request.vectors[0][0] <= low:
             raise InputError(
                 f"set {request.name}: no cell can have a mean below {request.vectors[0][0]:g}, the image begins at "
-                f"{image.data.min():g}"
+                f"{low:g}"
             )
     names = {name for request in requests for name in request.names()}
-    loads = [parse_load(text, image.ndim) for text in solver.loads or ()]
+    loads = [parse_load(text, ndim) for text in solver.loads or ()]
     check_steps(loads)
     loaded = [load.set_name for load in loads]
     is_certain = not any(name in names or name.startswith(INTERFACE_PREFIX) for name in loaded)

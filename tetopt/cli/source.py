@@ -41,6 +41,17 @@ class Source(NamedTuple):
         """The first contrast on its own voxels; beyond a mask, around which alone they are kept, continued."""
         return continued(self.contrasts[0], self.content.continuation)
 
+    @property
+    def low(self) -> float:
+        """The least intensity."""
+        return float(self.image.data.min())
+
+    @property
+    def is_constant(self) -> bool:
+        """Whether what is meshed has one value everywhere."""
+        data = self.content.image.data
+        return bool(data.min() == data.max())
+
     def fields(self, mesh: Mesh, labels: NDArray[np.int64] | None = None) -> dict[str, NDArray]:
         """What the mesh's file holds of each cell: as `cell_fields`, means of further contrasts, and the label.
 

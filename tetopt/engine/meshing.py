@@ -36,7 +36,7 @@ from tetopt.mesh import Mesh
 from tetopt.start.clip import lattice_within
 from tetopt.start.octree import is_near, nearest_octree, nodes_of_sizes, octree
 from tetopt.start.sizes import Sizes
-from tetopt.target.content import Content, plain
+from tetopt.target.content import Content, StoredContent, plain
 
 Mode = Literal["graded", "uniform", "paper", "start"]
 Run = Callable[..., Optimized]  # an optimisation that is ready to begin; takes further options of `optimize`
@@ -244,7 +244,9 @@ def _check_mode(mode: Mode, content: Content, values: dict[str, Any], order: int
         raise InputError("mesh_image: the paper's scheme takes one image and its whole box")
 
 
-def sizes_of_order(content: Content, nodes: int | None, sizes: Sizes | None, order: int) -> Sizes | None:
+def sizes_of_order(
+    content: Content | StoredContent, nodes: int | None, sizes: Sizes | None, order: int
+) -> Sizes | None:
     """The limits on sizes of a graded mesh for cells of an order; with `nodes` of order 2 the longest edge, too."""
     if order == 1:
         return sizes

@@ -100,10 +100,11 @@ def in_turn(names: Sequence[str]) -> Iterator[Any]:
 
 
 def mesh_in_parts(
-    request: Request, folder: Path, *,
+    request: Request, folder: Path, statistics: Statistics | None = None, *,
     crew: Callable[[int, float], AbstractContextManager[Runner]] = lambda n_parts, task_bytes: nullcontext(in_turn),
     is_over: Callable[[], bool] = lambda: False,
     watch: Callable[[Round, list[Record]], None] = lambda now, history: None,
+    check: Callable[[Mesh], None] = lambda initial: None,
 ) -> Parted:  # fmt: skip
     """A graded mesh of an image's box, optimised in parts, as `mesh_image` does in one piece.
 
@@ -113,6 +114,8 @@ def mesh_in_parts(
     folder : Path
         Of work, in which `tetopt.parts.work.save_volume` has noted where the voxels are. All that is done stays in it,
         so that the same request goes on where it ended, whatever ended it.
+    statistics : Statistics, optional
+        Of the image, if they are known.
     crew : callable
         Given how many parts there are, and the bytes that the largest takes, for as long as its block lasts what runs
         them.
@@ -120,6 +123,8 @@ def mesh_in_parts(
         Asked when a part is done. Once it is true the mesh of the last complete round is the result.
     watch : callable
         Told of each part that is done.
+    check : callable
+        Given the initial mesh before a part begins, to refuse what it can tell.
 
     Returns
     -------
@@ -135,8 +140,9 @@ def mesh_in_parts(
     begin = time.perf_counter()
     with locked(folder):
         image = open_volume(folder)
-        state = load_state(folder, request.checksum) or _begun(request, folder, image)
+        state = load_state(folder, request.checksum) or _begun(request, folder, image, statistics)
         run = _Run(request, folder, image, begin - state.known["seconds"], is_over, watch)
+        check(_initial(run, state))
         counts = _counts(run, state)
         largest = max(part_bytes(*sizes, is_whole=False) for sizes in _part_sizes(run, state, counts))
         with crew(int(np.prod(counts)), largest) as runner:
@@ -167,10 +173,10 @@ def _n_rounds(request: Request) -> int:
     return ceil(request.iterations / ROUND_SWEEPS)
 
 
-def _begun(request: Request, folder: Path, image: StoredImage) -> State:
+def _begun(request: Request, folder: Path, image: StoredImage, statistics: Statistics | None) -> State:
     """The state before the first round: the octree, on the grid of ticks."""
     begin = time.perf_counter()
-    statistics = stored_statistics(image)
+    statistics = stored_statistics(image) if statistics is None else statistics
     mesh = octree(image, request.nodes, request.sizes, statistics)
     bits = grid_bits(image, mesh.points)
     ticks = np.rint(image.to_index(mesh.points) * 2.0**bits).astype(np.int64)
@@ -202,6 +208,11 @@ def _cut(run: _Run, state: State, counts: tuple[int, ...], shift: float) -> list
     index = mesh["ticks"] * 2.0 ** -_settings(state).bits
     part = cut(index[mesh["cells"]].mean(axis=1), _weights(index, mesh["cells"]), counts, shift)
     return pieces(Shared(mesh["ticks"], mesh["cells"], part))
+
+
+def _initial(run: _Run, state: State) -> Mesh:
+    arrays = load_arrays(run.folder / INITIAL_NAME)[0]
+    return Mesh(run.image.to_world(arrays["ticks"] * 2.0 ** -_settings(state).bits), arrays["cells"])
 
 
 def _weights(index: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.float64]:
@@ -312,11 +323,10 @@ def _finished(
     assert done is not None, "nothing cuts it short"
     mesh = joined([piece.ticks for piece in parts], [piece.cells for piece in parts])
     scale = 2.0 ** -_settings(state).bits
-    before = load_arrays(run.folder / INITIAL_NAME)[0]
     fields = {name: np.concatenate([each[name] for each, _ in done]) for name in done[0][0]}
     result = Optimized(
         Mesh(run.image.to_world(mesh.ticks * scale), mesh.cells), history, ended,
-        initial=Mesh(run.image.to_world(before["ticks"] * scale), before["cells"]), nodes=run.request.nodes,
+        initial=_initial(run, state), nodes=run.request.nodes,
         seconds_run=time.perf_counter() - run.begin,
     )  # fmt: skip
     result = promised_in_box(result, run.image, run.request.min_dihedral)

@@ -13,6 +13,7 @@ import hashlib
 import json
 import shutil
 import struct
+import warnings
 import zipfile
 import zlib
 from collections.abc import Iterator
@@ -53,7 +54,9 @@ class VolumeFile(NamedTuple):
 
     def opened(self) -> StoredImage:
         """The image; InputError as `open_stored`."""
-        return open_stored(self.path, volume=self.volume, crop=self.crop)
+        with warnings.catch_warnings():  # which were said when the image was first opened
+            warnings.simplefilter("ignore")
+            return open_stored(self.path, volume=self.volume, crop=self.crop)
 
 
 @contextmanager

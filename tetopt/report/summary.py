@@ -15,14 +15,14 @@ from numpy.typing import NDArray
 import tetopt
 from tetopt.engine.loop import Optimized
 from tetopt.geometry.quadratic import node_count
-from tetopt.image import Image
+from tetopt.image import Image, VoxelGrid
 from tetopt.measure.fidelity import cell_labels, label_fidelity, mask_fidelity
 from tetopt.measure.interfaces import label_interfaces
 from tetopt.measure.quality import Quality, quality
 from tetopt.mesh import Mesh
 from tetopt.model.loads import load_words
 from tetopt.model.model import Model
-from tetopt.target.content import Content, plain
+from tetopt.target.content import Content, StoredContent, plain
 
 SHOWN_VERSIONS = ("numpy", "scipy", "numba", "nibabel", "pyvista")
 
@@ -40,23 +40,29 @@ def mesh_hash(mesh: Mesh) -> str:
     return digest.hexdigest()
 
 
-def image_summary(image: Image) -> dict[str, Any]:
+def image_summary(image: Image | StoredContent) -> dict[str, Any]:
     """Shape, place and spread of an image; `total_variation` is E_D of one cell around everything."""
+    grid: VoxelGrid
+    if isinstance(image, StoredContent):
+        grid, (mean, low, high, variance, *_) = image.image, image.statistics
+    else:
+        grid, low, high = image, float(image.data.min()), float(image.data.max())
+        mean, variance = float(image.data.mean(dtype=np.float64)), float(np.var(image.data, dtype=np.float64))
     return {
-        "shape": image.shape,
-        "spacing_mm": image.spacing,
-        "affine": image.affine,
-        "min": float(image.data.min()),
-        "max": float(image.data.max()),
-        "mean": float(image.data.mean(dtype=np.float64)),
-        "volume_mm": image.volume,
-        "total_variation": float(np.var(image.data, dtype=np.float64)) * image.volume,
+        "shape": grid.shape,
+        "spacing_mm": grid.spacing,
+        "affine": grid.affine,
+        "min": low,
+        "max": high,
+        "mean": mean,
+        "volume_mm": grid.volume,
+        "total_variation": variance * grid.volume,
     }
 
 
 def run_summary(
-    image: Image | Content, initial: Mesh, result: Optimized, about: dict[str, Any], seconds: dict[str, float],
-    shapes: tuple[Quality, Quality] | None = None,
+    image: Image | Content | StoredContent, initial: Mesh, result: Optimized, about: dict[str, Any],
+    seconds: dict[str, float], shapes: tuple[Quality, Quality] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Every number of a run: options and file (`about`), versions, energies by iteration, quality before and after.
 
@@ -65,13 +71,13 @@ def run_summary(
     if shapes is None:
         shapes = quality(initial.points, initial.cells), quality(result.mesh.points, result.mesh.cells)
     first, last = result.history[0], result.history[-1]
-    content = plain(image)
+    content = image if isinstance(image, StoredContent) else plain(image)
     spread = content.variance * content.volume
     return {
         **about,
         "versions": versions(),
         "machine": {"cores": os.cpu_count(), "threads": numba.get_num_threads(), "system": platform.platform()},
-        "image_properties": image_summary(content.image),
+        "image_properties": image_summary(content if isinstance(content, StoredContent) else content.image),
         "ended": result.ended,
         "iterations_done": last.iteration,
         "energies": {

@@ -8,6 +8,7 @@ weights: with weight 1 a channel's variance over the domain counts as much as th
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import prod
 from typing import NamedTuple
 
 import numpy as np
@@ -16,10 +17,12 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.image import Image
+from tetopt.stored import StoredImage
 from tetopt.target.domain import INSIDE_SHARE, Region, region_of
 from tetopt.target.labels import check_labels, label_channels
 from tetopt.target.memberships import Memberships, finer, memberships, supersampling
 from tetopt.target.noise import noise_level
+from tetopt.target.statistics import Statistics
 
 RARITY_POWER = 0.5  # of a label's share of the voxels, by which each of its voxels counts less
 SAME_PLACE_VOXELS = 1e-2  # voxel centres that lie no further apart are in the same place
@@ -80,6 +83,28 @@ class Content(NamedTuple):
         """Variance of the contrasts' noise, in the unit of `values`; labels have none."""
         inside = None if self.region is None else self.region.inside
         return float(sum(noise_level(values, inside) ** 2 for values in self.values[: self.n_contrasts]))
+
+
+class StoredContent(NamedTuple):
+    """One image whose voxels stay in their file, as what a mesh of its box is to represent."""
+
+    image: StoredImage
+    statistics: Statistics
+
+    @property
+    def n_voxels(self) -> int:
+        """As of `Content`."""
+        return prod(self.image.shape)
+
+    @property
+    def volume(self) -> float:
+        """As of `Content`."""
+        return self.image.volume
+
+    @property
+    def variance(self) -> float:
+        """As of `Content`."""
+        return self.statistics.variance
 
 
 def content(

@@ -1,0 +1,327 @@
+"""``tetopt mesh`` in parts: asked for by ``--parts``, or chosen where an image does not fit into memory."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import json
+import shutil
+import time
+from collections.abc import Callable, Iterator, Sequence
+from math import prod
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from rich.markup import escape
+from rich.progress import BarColumn, Progress, TextColumn
+
+import tetopt
+from tetopt import Image, InputError, Mesh
+from tetopt.budget import BYTES_PER_GB, available_bytes, memory_words
+from tetopt.cli.console import log
+from tetopt.cli.ending import is_ended
+from tetopt.cli.options import DEFAULT_NODES, PartsOptions
+from tetopt.cli.plan import Plan
+from tetopt.cli.run import compiling, rare_lines
+from tetopt.cli.source import Source
+from tetopt.cluster.crew import Folders, Need, counted
+from tetopt.cluster.tasks import run_tasks
+from tetopt.cluster.workers import check_choice, workers
+from tetopt.engine.cost import meshing_bytes
+from tetopt.engine.fast import prepare_kernels
+from tetopt.engine.loop import Optimized, Record
+from tetopt.io.images import file_shape, parse_crop, sha256
+from tetopt.io.label_tables import NO_TABLE, LabelTable
+from tetopt.io.stored_images import STORED_SUFFIXES, coarse_image, open_stored, stored_checksum
+from tetopt.io.vtk import box_text
+from tetopt.model.averages import DEFAULT_AVERAGE
+from tetopt.model.sets import box_of
+from tetopt.parts.part import work_on
+from tetopt.parts.rounds import Parted, Request, Round, Runner, mesh_in_parts
+from tetopt.parts.work import VolumeFile, save_volume
+from tetopt.start.sizes import Sizes
+from tetopt.stored import StoredImage
+from tetopt.target.content import StoredContent
+from tetopt.target.statistics import stored_statistics
+
+MOST_LOADED = 2**28  # voxels of an image that a run in parts reads whole: with it all that one piece offers is there
+MOST_DRAWN = 2**27  # voxels of the level of an image that pictures are drawn of
+VOXEL_BYTES = 16.0  # of an image that is read whole, besides what meshing takes
+WORK_SUFFIX = ".work"  # of the folder beside the mesh, after its name
+WHOLE_ONLY = "looks at all cells or voxels at once, parts do not; leave it out, or --parts"
+
+
+class StoredSource(NamedTuple):
+    """As `Source`, an image whose voxels stay in its file."""
+
+    paths: list[Path]
+    content: StoredContent
+    about: dict[str, Any]
+    table: LabelTable = NO_TABLE
+    labels: None = None
+    mask: None = None
+    image: None = None  # in memory
+
+    @property
+    def contrasts(self) -> list[StoredImage]:
+        """The one image."""
+        return [self.content.image]
+
+    @property
+    def low(self) -> float:
+        """The least intensity."""
+        return self.content.statistics.low
+
+    @property
+    def is_constant(self) -> bool:
+        """Whether it has one value everywhere."""
+        return self.content.statistics.low == self.content.statistics.high
+
+    def coarse(self) -> Image:
+        """A level of it for pictures, in memory."""
+        image = coarse_image(self.paths[0], MOST_DRAWN)
+        assert image is not None, "asked for in `read_stored`"
+        return image
+
+
+def chosen_parts(plan: Plan, parts: PartsOptions) -> PartsOptions | None:
+    """The options of a run in parts, if it is to be one: asked for, or as the image does not fit into memory.
+
+    Raises
+    ------
+    InputError
+        Options that parts do not have, or that only they have; dask not installed.
+    """
+    given = [field.name for field in dataclasses.fields(parts) if getattr(parts, field.name) is not None]
+    needed, free = _whole_bytes(plan), available_bytes()
+    is_too_large = needed is not None and free is not None and needed > free
+    if parts.parts is None and not is_too_large:
+        if given:
+            name = "workers" if given[0] == "count" else given[0].replace("_", "-")
+            raise InputError(f"--{name}: only of a mesh in parts; give --parts, or leave it out")
+        return None
+    if parts.parts is None and needed is not None and free is not None:
+        log.print(
+            f"in one piece it would take {memory_words(needed)} of memory, {memory_words(free)} are free: it is made "
+            "in parts"
+        )
+    _check_plan(plan)
+    if parts.worker_gb is not None and not parts.worker_gb > 0.0:
+        raise InputError(f"--worker-gb: expected more than 0, got {parts.worker_gb}")
+    if parts.worker_gb is not None and (parts.scheduler or parts.cluster):
+        raise InputError("--worker-gb: of workers on this machine; those of --scheduler and --cluster have their own")
+    check_choice(parts.count, parts.scheduler, parts.cluster, "blocks")
+    return parts
+
+
+def _is_storable(path: Path) -> bool:
+    return path.name.lower().endswith(STORED_SUFFIXES)
+
+
+def _whole_bytes(plan: Plan) -> float | None:
+    """What a graded mesh of an image that could be left in its file takes in one piece; None of others."""
+    path = plan.source.images[0]
+    if not _is_storable(path) or plan.source.part.slice_ is not None or plan.mode != "graded":
+        return None
+    n_voxels = _n_voxels(plan)
+    nodes = plan.sizes.nodes or DEFAULT_NODES[3]
+    return VOXEL_BYTES * n_voxels + meshing_bytes(n_voxels, len(plan.source.images), nodes)
+
+
+def _n_voxels(plan: Plan) -> int:
+    """Of the image, by its header, cropped."""
+    shape = (file_shape(plan.source.images[0]) or (0,))[:3]
+    if plan.source.part.crop is not None:
+        bounds = zip(shape, parse_crop(plan.source.part.crop), strict=False)
+        shape = tuple(len(range(length)[slice(*ends)]) for length, ends in bounds)
+    return prod(shape)
+
+
+def _check_plan(plan: Plan) -> None:
+    """InputError for what a mesh in parts cannot be."""
+    source, sizes, engine = plan.source, plan.sizes, plan.engine
+    if plan.mode != "graded":
+        raise InputError(
+            "--parts: of a graded mesh; leave out --uniform, --spacing, --lattice, --method, --start, or --parts"
+        )
+    if len(source.images) > 1:
+        raise InputError(f"--parts: expected one IMAGE, got {len(source.images)}; leave the others out, or --parts")
+    whole = {
+        "mask": source.mask, "background": source.background, "labels": source.labels, "slice": source.part.slice_,
+        "target-error": sizes.target_error, "size-max": sizes.size_max, "sizing": sizes.sizing,
+        "max-gb": engine.max_gb, "order": plan.solver.order if plan.solver.order == 2 else None,
+        "boundary": "fixed" if engine.boundary == "fixed" else None,
+    }  # fmt: skip
+    for name, value in whole.items():
+        if value is not None:
+            raise InputError(f"--{name}: {WHOLE_ONLY}")
+
+
+def is_left_stored(plan: Plan) -> bool:
+    """Whether the image of a run in parts is left in its file: a large one, or one that does not fit into memory."""
+    if not _is_storable(plan.source.images[0]):
+        return False
+    needed, free = _whole_bytes(plan), available_bytes()
+    return _n_voxels(plan) > MOST_LOADED or (needed is not None and free is not None and needed > free)
+
+
+def read_stored(plan: Plan) -> StoredSource:
+    """The image of a run in parts, left in its file, of which one pass takes the statistics."""
+    path = plan.source.images[0]
+    if plan.solver.average not in (None, DEFAULT_AVERAGE):
+        raise InputError(f"--average: {WHOLE_ONLY}")
+    if plan.solver.young is not None:
+        log.print("--young: a formula or a table is taken of each cell's mean, as the voxels stay in their file")
+    if plan.pictures and (plan.source.part.crop is not None or coarse_image(path, MOST_DRAWN) is None):
+        raise InputError(
+            f"--figures: {path} has no level of {MOST_DRAWN:.3g} voxels or fewer to draw, or is cropped; leave it out"
+        )
+    part = plan.source.part
+    image = open_stored(path, volume=part.volume, crop=None if part.crop is None else parse_crop(part.crop))
+    log.print(escape(f"{path}: {' x '.join(map(str, image.shape))} voxels, which stay in the file"))
+    about = {
+        "image": path.name, "image_sha256": sha256(path), "box": box_text(box_of(image)),
+        "inputs": {"images": [path.name], "weights": [1.0], "mask": None, "background": None, "labels": None,
+                   "label_weight": None, "sha256": {}},
+    }  # fmt: skip
+    return StoredSource([path], StoredContent(image, stored_statistics(image)), about)
+
+
+def _volume_file(plan: Plan) -> VolumeFile:
+    part = plan.source.part
+    return VolumeFile(plan.source.images[0], part.volume, None if part.crop is None else parse_crop(part.crop))
+
+
+def work_folder(plan: Plan) -> Path:
+    """Where what a run in parts has done lies until it is complete."""
+    mesh = plan.output.mesh
+    return mesh.with_name(mesh.name + WORK_SUFFIX)
+
+
+def run_in_parts(
+    plan: Plan, source: Source | StoredSource, sizes: Sizes | None, parts: PartsOptions,
+    check: Callable[[Mesh], None], begin_keeping: Callable[[], None],
+) -> tuple[Parted, float]:  # fmt: skip
+    """Run, or go on with, a mesh in parts; what came of it, and the memory predicted for each worker's task, bytes.
+
+    `check` is given the initial mesh before a part begins; `begin_keeping` is called as soon as there is a mesh that is
+    worth keeping.
+    """
+    folder, request = work_folder(plan), _request(plan, source, sizes, parts)
+    ends = None if plan.engine.max_seconds is None else time.perf_counter() + plan.engine.max_seconds
+    task_bytes = 0.0
+
+    def is_over() -> bool:
+        return is_ended() or (ends is not None and time.perf_counter() > ends)
+
+    @contextlib.contextmanager
+    def crew(n_parts: int, n_bytes: float) -> Iterator[Runner]:
+        nonlocal task_bytes
+        task_bytes = n_bytes
+        log.print(f"{counted(n_parts, 'part')} or more in a round, each of up to {memory_words(n_bytes)}")
+        with compiling("preparing the kernels (the first run compiles them, half a minute)") as progress:
+            prepare_kernels(Image(np.zeros((3, 3, 3)) + np.arange(3)), request.k_D, is_graded=True, progress=progress)
+        most = None if parts.worker_gb is None else parts.worker_gb * BYTES_PER_GB
+        need = Need(n_parts, n_bytes, plan.engine.threads, is_within=True, most_bytes=most)
+        folders = Folders(folder, folder)
+        with workers(
+            need, folders, count=parts.count, scheduler=parts.scheduler, cluster=parts.cluster
+        ) as team:  # fmt: skip
+            log.print(escape(team.words))
+            if n_bytes > team.bytes:
+                raise InputError(
+                    f"a part needs about {memory_words(n_bytes)} of memory, a worker has {memory_words(team.bytes)}; "
+                    "ask for more --parts, for fewer --workers, or give them more memory"
+                )
+
+            def run(names: Sequence[str]) -> Iterator[Any]:
+                return run_tasks(team, work_on, names, is_over=is_over)
+
+            yield run
+
+    with _shown(begin_keeping) as watch:
+        folder.mkdir(exist_ok=True)
+        if not (folder / "volume.json").exists():
+            save_volume(folder, _volume_file(plan) if isinstance(source, StoredSource) else source.contrasts[0])
+        statistics = source.content.statistics if isinstance(source, StoredSource) else None
+        parted = mesh_in_parts(
+            request, folder, statistics, check=check, crew=crew, is_over=is_over, watch=watch
+        )  # fmt: skip
+    result = parted.result
+    if result.ended == "stopped" and not is_ended():
+        parted = parted._replace(result=result._replace(ended="max_seconds"))
+    if parted.result.ended != "iterations":
+        words = {
+            "converged": "converged: hardly anything changes any more",
+            "max_seconds": "out of time: the mesh of the last complete round is kept",
+            "stopped": "interrupted: the mesh of the last complete round is kept",
+        }
+        log.print(words[parted.result.ended])
+    return parted, task_bytes
+
+
+def _request(plan: Plan, source: Source | StoredSource, sizes: Sizes | None, parts: PartsOptions) -> Request:
+    """What is asked for, with a checksum of all on which the mesh depends."""
+    engine, nodes = plan.engine_options(), plan.sizes.nodes
+    assert nodes is not None, "filled in by `with_numbers`"
+    path = plan.source.images[0]
+    values: dict[str, Any] = {
+        "nodes": nodes, "n_parts": parts.parts or 1, "k_D": engine["k_D"], "iterations": engine["iterations"],
+        "shape_power": engine["shape_power"], "min_dihedral": engine["min_dihedral"], "tolerance": 5e-4,
+    }  # fmt: skip
+    image = stored_checksum(path) if isinstance(source, StoredSource) else source.about["image_sha256"]
+    whole = {
+        **values, "image": image, "part": plan.source.part.stated(), "tetopt": tetopt.__version__,
+        "sizes": None if sizes is None else [sizes.smallest, sizes.longest, sizes.gradation],
+        "place": str(path.resolve()) if isinstance(source, StoredSource) else None,
+    }  # fmt: skip
+    checksum = hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()
+    return Request(**values, sizes=sizes, checksum=checksum)
+
+
+@contextlib.contextmanager
+def _shown(begin_keeping: Callable[[], None]) -> Iterator[Callable[[Round, list[Record]], None]]:
+    """A function that shows how far a run is: a bar on a terminal, else lines."""
+    say, number = rare_lines(), -1
+
+    def words(now: Round, history: list[Record]) -> str:
+        kind = {"measure": "measuring", "improve": f"round {now.number}", "fields": "fields of cells"}[now.kind]
+        energies = f", E {history[-1].E:.4f}" if history else ""
+        return f"{kind} of {now.n_rounds - 2}{energies}" if now.kind == "improve" else f"{kind}{energies}"
+
+    def follow(now: Round, history: list[Record], show: Callable[[Round, str], None]) -> None:
+        nonlocal number
+        if history:
+            begin_keeping()
+        show(now, words(now, history))
+        number = now.number
+
+    if log.is_terminal:
+        columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total} parts")
+        with Progress(*columns, console=log, transient=True) as bar:
+            task = bar.add_task("", total=1)
+
+            def show(now: Round, text: str) -> None:
+                bar.update(task, description=text, completed=now.done, total=now.n_parts)
+
+            yield lambda now, history: follow(now, history, show)
+    else:
+
+        def tell(now: Round, text: str) -> None:
+            if now.number != number:
+                log.print(f"{text}: {counted(now.n_parts, 'part')}")
+            else:
+                say(f"  {now.done} of {counted(now.n_parts, 'part')} done")
+
+        yield lambda now, history: follow(now, history, tell)
+
+
+def end_work(plan: Plan, result: Optimized) -> None:
+    """Remove the folder of work of a run that is complete; say what becomes of that of another."""
+    folder = work_folder(plan)
+    if result.ended in ("iterations", "converged"):
+        shutil.rmtree(folder)
+    else:
+        log.print(escape(f"{folder}: run this again with --force to go on, or remove it"))
