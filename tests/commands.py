@@ -1,6 +1,7 @@
 """The command as its tests call it."""
 
 import json
+import re
 
 from models import sample_image
 
@@ -29,3 +30,12 @@ def labelled_lattice_words(folder):
 def numbers_in(path):
     """What a JSON file holds."""
     return json.loads(path.read_text())
+
+
+def assert_refused(capfd, arguments, match, code=2):
+    assert exit_code(*arguments) == code
+    captured = capfd.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1, captured.err
+    assert captured.err.startswith("tetopt: ")
+    assert re.search(match, captured.err), captured.err

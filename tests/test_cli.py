@@ -17,7 +17,7 @@ import numba
 import numpy as np
 import PIL.Image
 import pytest
-from commands import exit_code, mesh_words, numbers_in
+from commands import assert_refused, exit_code, mesh_words, numbers_in
 
 import tetopt
 import tetopt.cli.mesh
@@ -426,15 +426,6 @@ def test_ctrl_c_while_reading(tmp_path, inputs, monkeypatch):
 # Inputs to mend
 
 
-def assert_refused(capfd, arguments, match, code=2):
-    assert exit_code(*arguments) == code
-    captured = capfd.readouterr()
-    assert captured.out == ""
-    assert captured.err.count("\n") == 1, captured.err
-    assert captured.err.startswith("tetopt: ")
-    assert re.search(match, captured.err), captured.err
-
-
 BAD_OPTIONS = [
     ("--nodes 100 --spacing 5", "--nodes and --spacing: give one of them"),
     ("--nodes 6", "9 or more in 3-D, got 6"),
@@ -497,7 +488,7 @@ def test_bad_options_of_mesh(tmp_path, inputs, monkeypatch, capfd, options, matc
         ("mesh -o a.vtu", r"Missing argument 'IMAGE\.\.\.'"),
         ("mesh {lattice} -o a.vtu", "unknown kind of image"),
         ("quality no.vtu", "no such file"),
-        ("quality {disc}", "named .vtu, .vtk, .msh or .msh2"),
+        ("quality {disc}", "named .vtu, .vtk, .vtkhdf, .pvtu, .msh or .msh2"),
         ("quality {lattice} --image no.nii", "no such file"),
         ("quality {lattice} --image {disc}", "3-D mesh and a 2-D image"),
         ("quality {lattice} --json no/a.json", "folder does not exist"),
@@ -601,7 +592,7 @@ def test_help_lists_the_options(monkeypatch, capsys, command, flag):
     assert captured.err == ""
 
 
-def test_help_of_mesh_is_in_six_groups(monkeypatch, capsys):
+def test_help_of_mesh_is_in_seven_groups(monkeypatch, capsys):
     """Each of at most thirteen options, and the help."""
     monkeypatch.setenv("COLUMNS", "80")
     assert exit_code("mesh", "--help") == 0
@@ -611,7 +602,7 @@ def test_help_of_mesh_is_in_six_groups(monkeypatch, capsys):
     assert sizes.pop("Arguments") == 0
     assert sizes == {
         "Options": 6, "What is meshed": 9, "Number and size of cells": 7, "The mesh it begins with": 4,
-        "Optimisation": 11, "For the solver": 13,
+        "Optimisation": 11, "Beyond one memory": 5, "For the solver": 13,
     }  # fmt: skip
 
 

@@ -278,7 +278,7 @@ class EngineOptions:
 
 
 WorkersOption = Annotated[
-    int | None, option("N", "So many parts at a time, or jobs of a --cluster, at most.", "--workers", min=1)
+    int | None, option("N", "Tasks at a time, at most; of a --cluster its jobs.", "--workers", min=1)
 ]
 SchedulerOption = Annotated[
     str | None, option("ADDRESS", "A scheduler of dask's that runs, with its workers: tcp://host:8786.")

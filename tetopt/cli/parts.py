@@ -94,12 +94,12 @@ def chosen_parts(plan: Plan, parts: PartsOptions) -> PartsOptions | None:
     InputError
         Options that parts do not have, or that only they have; dask not installed.
     """
-    given = [field.name for field in dataclasses.fields(parts) if getattr(parts, field.name) is not None]
+    names = [field.name for field in dataclasses.fields(parts) if getattr(parts, field.name) is not None]
     needed, free = _whole_bytes(plan), available_bytes()
     is_too_large = needed is not None and free is not None and needed > free
     if parts.parts is None and not is_too_large:
-        if given:
-            name = "workers" if given[0] == "count" else given[0].replace("_", "-")
+        if names:
+            name = "workers" if names[0] == "count" else names[0].replace("_", "-")
             raise InputError(f"--{name}: only of a mesh in parts; give --parts, or leave it out")
         return None
     if parts.parts is None and needed is not None and free is not None:

@@ -1,0 +1,104 @@
+"""``tetopt mesh`` in parts: what it refuses, a stored image to a file of pieces, a run cut short that goes on."""
+
+import json
+
+import numpy as np
+import pytest
+from commands import assert_refused, exit_code
+
+import tetopt
+from tetopt import load_mesh
+from tetopt.cli import parts as cli_parts
+from tetopt.io.images import load_image, save_image
+from tetopt.model.fields import cell_fields
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory):
+    """A ball in noise, 24 x 26 x 28 voxels of 16 bits in a sheared place, as .nii, and as .nii.gz."""
+    folder = tmp_path_factory.mktemp("inputs")
+    place = np.indices((24, 26, 28)) - np.array([12.0, 13.0, 14.0])[:, None, None, None]
+    h = np.rint(400.0 * ((place**2).sum(axis=0) < 60.0) + np.random.default_rng(5).normal(500.0, 9.0, place[0].shape))
+    affine = np.array([[-2.0, 0.3, 0.0, 20.0], [0.0, 2.1, 0.0, -5.0], [0.0, 0.2, 2.4, 3.0], [0.0, 0.0, 0.0, 1.0]])
+    for name in ("ball.nii", "ball.nii.gz"):
+        save_image(folder / name, tetopt.Image(h, affine))
+    return folder
+
+
+REFUSED = [
+    ("--parts 0", "--parts"),
+    ("--parts 2 --uniform", "--parts: of a graded mesh"),
+    ("--parts 2 --mask ball.nii.gz", "--mask: looks at all cells or voxels at once"),
+    ("--parts 2 --labels ball.nii.gz", "--labels: looks at all"),
+    ("--parts 2 --background auto", "--background: looks at all"),
+    ("--parts 2 --slice 2=9", "--slice: looks at all"),
+    ("--parts 2 --target-error 0.1", "--target-error: looks at all"),
+    ("--parts 2 --size-max 9", "--size-max: looks at all"),
+    ("--parts 2 --order 2", "--order: looks at all"),
+    ("--parts 2 --boundary fixed", "--boundary: looks at all"),
+    ("--parts 2 --max-gb 3", "--max-gb: looks at all"),
+    ("ball.nii.gz --parts 2", "--parts: expected one IMAGE, got 2"),
+    ("--workers 2", "--workers: only of a mesh in parts; give --parts"),
+    ("--worker-gb 2", "--worker-gb: only of a mesh in parts"),
+    ("--scheduler tcp://127.0.0.1:9", "--scheduler: only of a mesh in parts"),
+    ("--parts 2 --worker-gb 0", "--worker-gb: expected more than 0"),
+    ("--parts 2 --worker-gb 2 --scheduler tcp://127.0.0.1:9", "--worker-gb: of workers on this machine"),
+    ("--parts 2 --workers 2 --scheduler tcp://127.0.0.1:9", "--workers: expected none with --scheduler"),
+]
+
+
+@pytest.mark.parametrize(("options", "match"), REFUSED, ids=[options for options, _ in REFUSED])
+def test_refused(tmp_path, inputs, monkeypatch, capfd, options, match):
+    monkeypatch.chdir(inputs)
+    number = [] if "--target-error" in options else ["--nodes", "300"]
+    assert_refused(capfd, ["mesh", "ball.nii", *options.split(), "-o", tmp_path / "a.vtu", *number], match)
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_stored_images_are_meshed_as_those_in_memory(tmp_path, inputs, monkeypatch):
+    """Left in its file and read whole, on one worker and on two: the same mesh, and the same numbers of its cells."""
+    command = ["mesh", inputs / "ball.nii", "--nodes", 300, "--parts", 2, "--iterations", 3]
+    assert exit_code(*command, "-o", tmp_path / "a.vtu", "--json", tmp_path / "a.json", "--workers", 1) == 0
+    monkeypatch.setattr(cli_parts, "MOST_LOADED", 0)
+    files = ["-o", tmp_path / "b.vtkhdf", "--json", tmp_path / "b.json"]
+    assert exit_code(*command, *files, "--workers", 2, "--worker-gb", 2, "--young", "2 + 0.01*h") == 0
+    one, other = (json.loads((tmp_path / name).read_text()) for name in ("a.json", "b.json"))
+    assert one["mesh_sha256"] == other["mesh_sha256"]
+    for name, value in one["image_properties"].items():
+        assert np.allclose(value, other["image_properties"][name], rtol=1e-12), name
+    assert one["options"]["parts"] == 2
+    loaded = load_mesh(tmp_path / "b.vtkhdf")
+    direct = cell_fields(loaded.mesh, load_image(inputs / "ball.nii"))
+    assert np.array_equal(loaded.cell_data["n_voxels"], direct["n_voxels"])
+    assert np.array_equal(loaded.cell_data["max"], direct["max"])
+    np.testing.assert_allclose(loaded.cell_data["mean"], direct["mean"], rtol=1e-12)
+    assert set(loaded.cell_data["part"]) == {0, 1}
+    assert not list(tmp_path.glob("*.work"))
+
+
+def test_images_beyond_the_memory_are_meshed_in_parts(tmp_path, inputs, monkeypatch, capfd):
+    monkeypatch.setattr(cli_parts, "available_bytes", lambda: 1000)
+    chosen = []
+    monkeypatch.setattr("tetopt.cli.mesh.run_in_parts", lambda *arguments: chosen.append(arguments) or 1 / 0)
+    with pytest.raises(ZeroDivisionError):
+        exit_code("mesh", inputs / "ball.nii", "-o", tmp_path / "a.vtu", "--nodes", 300)
+    assert "in one piece it would take" in capfd.readouterr().err
+    assert chosen[0][3].parts is None
+    assert exit_code("mesh", inputs / "ball.nii", "-o", tmp_path / "a.vtu", "--order", "2") == 2
+    assert "tetopt: --order: looks at all" in capfd.readouterr().err
+
+
+def test_a_run_out_of_time_goes_on(tmp_path, inputs, capfd):
+    """One that is cut short leaves the mesh of the last complete round, and the same request goes on from there."""
+    command = ["mesh", inputs / "ball.nii.gz", "--nodes", 300, "--parts", 2, "--iterations", 6, "--workers", 1]
+    assert exit_code(*command, "-o", tmp_path / "whole.vtu") == 0
+    assert exit_code(*command, "-o", tmp_path / "a.vtu", "--max-seconds", "1e-6") == 2
+    assert "a.vtu.work: ended before the first round was complete; run this again" in capfd.readouterr().err
+    assert not (tmp_path / "a.vtu").exists()
+    assert exit_code(*command, "-o", tmp_path / "a.vtu", "--k-d", "0.5") == 2
+    assert "a.vtu.work: is the folder of work of another run" in capfd.readouterr().err
+    assert exit_code(*command, "-o", tmp_path / "a.vtu") == 0
+    one, other = (load_mesh(tmp_path / name).mesh for name in ("whole.vtu", "a.vtu"))
+    assert np.array_equal(one.points, other.points)
+    assert np.array_equal(one.cells, other.cells)
+    assert not list(tmp_path.glob("*.work"))
