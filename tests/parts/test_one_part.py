@@ -7,10 +7,12 @@ import pytest
 from parted import SKEW, balls
 
 import tetopt
+from tetopt.energy.sampling import grid_bits
 from tetopt.engine.fast import Run
 from tetopt.engine.loop import Whole
 from tetopt.engine.state import content_energies
 from tetopt.geometry.topology import boundary_facets
+from tetopt.model.fields import cell_fields
 from tetopt.parts.cut import Shared, joined, pieces
 from tetopt.parts.part import Settings, work_on
 from tetopt.parts.work import done_path, load_arrays, round_folder, save_arrays, save_volume
@@ -56,32 +58,59 @@ def measured_whole(image, mesh, settings):
     return Run(plain(image), tetopt.Mesh(points, mesh.cells), settings["k_D"], is_graded=True, whole=whole)
 
 
+def slabs_done(folder, image, ticks, cells, kind, bits):
+    """Three parts of a mesh, across the first axis: each, and what came of it."""
+    save_volume(folder, image)
+    settings = Settings(0.85, 3.0, 12.0, 5e-4, 9, 4, 0.0, 99.0, None, image.shape, bits, 0.0)
+    place = ticks[cells].mean(axis=1)[:, 0] / 2.0**bits / image.shape[0]
+    round_folder(folder, 0).mkdir()
+    for number, piece in enumerate(pieces(Shared(ticks, cells, np.digitize(place, [0.3, 0.6])))):
+        path = round_folder(folder, 0) / f"part-{number}.npz"
+        text = {"kind": kind, "settings": settings._asdict(), "iterations": (1, 0), "nodes": len(piece.ticks)}
+        save_arrays(path, {"ticks": piece.ticks, "cells": piece.cells}, text)
+        work_on(str(path))
+        yield piece, *load_arrays(done_path(path))
+
+
 @pytest.mark.parametrize("name", list(AFFINES))
 def test_ticks_of_a_part_are_those_of_the_whole_to_the_last_one(name, tmp_path):
     """Each part of a mesh is measured on its own box of voxels, and comes back as it went."""
-    image = balls((21, 17, 19), AFFINES[name])
-    save_volume(tmp_path, image)
+    image, bits = balls((21, 17, 19), AFFINES[name]), 20
     mesh = tetopt.octree(image, 300)
-    bits = 20
     ticks = np.rint(image.to_index(mesh.points) * 2.0**bits).astype(np.int64)
     # Not on a lattice: what a part's own origin and the world's mm leave of them has to be all.
     inner = ((ticks > 0) & (ticks < (np.array(image.shape) - 1) << bits)).all(axis=1)
     ticks[inner] += np.random.default_rng(2).integers(-99_999, 99_999, (inner.sum(), 3))
-    settings = Settings(0.85, 3.0, 12.0, 5e-4, 9, 4, 0.0, 99.0, None, image.shape, bits, 0.0)
-    part = np.digitize(ticks[mesh.cells].mean(axis=1)[:, 0] / 2.0**bits, [7.0, 13.0])
-    folder = round_folder(tmp_path, 0)
-    folder.mkdir()
-    n_voxels = 0
-    for number, piece in enumerate(pieces(Shared(ticks, mesh.cells, part))):
-        path = folder / f"part-{number}.npz"
-        text = {"kind": "measure", "settings": settings._asdict(), "iterations": (1, 0), "nodes": len(piece.ticks)}
-        save_arrays(path, {"ticks": piece.ticks, "cells": piece.cells}, text)
-        numbers, after = work_on(str(path)), load_arrays(done_path(path))[0]
+    n_voxels = []
+    for piece, after, numbers in slabs_done(tmp_path, image, ticks, mesh.cells, "measure", bits):
         np.testing.assert_array_equal(after["ticks"], piece.ticks)
         np.testing.assert_array_equal(after["cells"], piece.cells)
-        n_voxels += numbers.n_voxels
-    assert number == 2
-    assert n_voxels == image.data.size
+        n_voxels.append(numbers["n_voxels"])
+    assert len(n_voxels) == 3
+    assert sum(n_voxels) == image.data.size
+
+
+@pytest.mark.parametrize("name", list(AFFINES))
+def test_a_cell_without_a_voxel_has_the_value_that_it_has_in_the_whole(name, tmp_path):
+    """Also where its middle lies between two voxels, and rounding to even numbers depends on the first one."""
+    image = balls((12, 10, 11), AFFINES[name])
+    mesh = tetopt.lattice(image, blocks=(8, 8, 8))
+    bits = grid_bits(image, mesh.points)
+    ticks = np.rint(image.to_index(mesh.points) * 2.0**bits).astype(np.int64)
+    mesh = tetopt.Mesh(image.to_world(ticks * 2.0**-bits), mesh.cells)
+    done = list(slabs_done(tmp_path, image, ticks, mesh.cells, "fields", bits))
+    order = np.concatenate([_rows_of(mesh.cells, piece.nodes[piece.cells]) for piece, _, _ in done])
+    expected = cell_fields(mesh, image)
+    assert (expected["n_voxels"] == 0).mean() > 0.3
+    for field in ("n_voxels", "mean", "min", "max"):
+        ours = np.concatenate([after[field] for _, after, _ in done])
+        np.testing.assert_array_equal(ours, expected[field][order], field)
+
+
+def _rows_of(cells, some):
+    """Which of the cells some are."""
+    rows = {tuple(cell): row for row, cell in enumerate(cells.tolist())}
+    return [rows[tuple(cell)] for cell in some.tolist()]
 
 
 def test_what_parts_share_stays_node_for_node_and_facet_for_facet(run):

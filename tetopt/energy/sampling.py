@@ -187,7 +187,7 @@ def nearest_values(image: Image, points: NDArray[np.float64]) -> NDArray[np.floa
     return image.data[tuple(nearest_voxels(image, points).T)].astype(np.float64)
 
 
-def nearest_voxels(image: Image, points: NDArray[np.float64]) -> NDArray[np.int64]:
+def nearest_voxels(image: VoxelGrid, points: NDArray[np.float64]) -> NDArray[np.int64]:
     """Index of the voxel nearest to each world point, (K, n) int64; points outside take the border's."""
     index = np.rint(image.to_index(points)).astype(np.int64)
     return np.clip(index, 0, np.array(image.shape) - 1)

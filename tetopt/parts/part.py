@@ -13,7 +13,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.energy.sampling import cell_moments_and_ranges
+from tetopt.energy.sampling import cell_moments_and_ranges, nearest_voxels
 from tetopt.engine.fast import Course, Run, followed
 from tetopt.engine.loop import Whole
 from tetopt.engine.state import content_energies
@@ -89,12 +89,15 @@ def work_on(name: str) -> Numbers:
         return before
     settings = Settings(**text["settings"])
     start, stop = box_of_ticks(arrays["ticks"], settings)
-    image = open_volume(path.parents[1]).box(start, stop)
+    stored = open_volume(path.parents[1])
+    image = stored.box(start, stop)
     index = arrays["ticks"] * 2.0**-settings.bits - np.array(start)
     mesh = Mesh(image.to_world(index), arrays["cells"])
     whole = Whole(start, settings.shape, settings.bits, settings.E_G, settings.squares, settings.noise)
     if text["kind"] == "fields":
-        result, numbers = _fields(image, mesh, whole), Numbers(of, 0.0, 0.0, 0.0, 0.0, 0, len(index), 0.0, 0.0)
+        centroids = stored.to_world(arrays["ticks"] * 2.0**-settings.bits)[mesh.cells].mean(axis=1)
+        nearest = nearest_voxels(stored, centroids) - np.array(start)
+        result, numbers = _fields(image, mesh, whole, nearest), Numbers(of, 0.0, 0.0, 0.0, 0.0, 0, len(index), 0.0, 0.0)
     else:
         result, numbers = _improved(image, mesh, whole, settings, text)
         numbers = numbers._replace(of=of)
@@ -113,9 +116,16 @@ def numbers_in(path: Path, of: str) -> Numbers | None:
     return numbers if numbers.of == of else None
 
 
-def _fields(image: Image, mesh: Mesh, whole: Whole) -> dict[str, NDArray]:
-    """What the image is in each cell, as of `tetopt.model.fields.cell_fields`."""
+def _fields(image: Image, mesh: Mesh, whole: Whole, nearest: NDArray[np.int64]) -> dict[str, NDArray]:
+    """What the image is in each cell, as of `tetopt.model.fields.cell_fields`.
+
+    `nearest`, (M, 3), are the voxels that stand for cells without any: those of the whole, since rounding goes to
+    even numbers in the middle between two voxels, and which are even depends on where the part begins.
+    """
     moments, (low, high) = cell_moments_and_ranges(image, mesh, whole.bits)
+    is_empty = moments.n_voxels == 0
+    for values in (moments.mean, low, high):
+        values[is_empty] = image.data[tuple(nearest[is_empty].T)]
     return {**moments._asdict(), "min": low, "max": high}
 
 
