@@ -31,7 +31,15 @@ from tetopt.cli.options import (
     StartOptions,
     option,
 )
-from tetopt.cli.parts import StoredSource, chosen_parts, end_work, is_left_stored, read_stored, run_in_parts
+from tetopt.cli.parts import (
+    StoredSource,
+    chosen_parts,
+    end_work,
+    is_left_stored,
+    print_parts,
+    read_stored,
+    run_in_parts,
+)
 from tetopt.cli.plan import Plan, planned, with_numbers
 from tetopt.cli.predict import print_prediction, size_of_run, stated_prediction
 from tetopt.cli.promises import check_promises, warn_of_result, warn_of_sizes
@@ -125,7 +133,10 @@ def mesh_command(
     set_threads(engine.threads)
     task = _read(plan, chosen_parts(plan, parts))
     if output.predict:
-        print_prediction(task.plan, task.size)
+        if task.parts is not None:
+            print_parts(task.plan, task.source, task.parts)
+        else:
+            print_prediction(task.plan, task.size)
         return 0
     if output.json_path is not None:
         task = task._replace(request=requested(source, sizes, start, engine, solver, output, parts.parts))

@@ -20,7 +20,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 import tetopt
 from tetopt import Image, InputError, Mesh
 from tetopt.budget import BYTES_PER_GB, available_bytes, memory_words
-from tetopt.cli.console import log
+from tetopt.cli.console import log, out
 from tetopt.cli.ending import is_ended
 from tetopt.cli.options import DEFAULT_NODES, PartsOptions
 from tetopt.cli.plan import Plan
@@ -39,7 +39,7 @@ from tetopt.io.vtk import box_text
 from tetopt.model.averages import DEFAULT_AVERAGE
 from tetopt.model.sets import box_of
 from tetopt.parts.part import work_on
-from tetopt.parts.rounds import Parted, Request, Round, Runner, mesh_in_parts
+from tetopt.parts.rounds import Parted, Request, Round, Runner, expected_parts, mesh_in_parts
 from tetopt.parts.work import VolumeFile, save_volume
 from tetopt.start.sizes import Sizes
 from tetopt.stored import StoredImage
@@ -192,6 +192,13 @@ def read_stored(plan: Plan) -> StoredSource:
 def _volume_file(plan: Plan) -> VolumeFile:
     part = plan.source.part
     return VolumeFile(plan.source.images[0], part.volume, None if part.crop is None else parse_crop(part.crop))
+
+
+def print_parts(plan: Plan, source: Source | StoredSource, parts: PartsOptions) -> None:
+    """Say how many parts there will be, and what each takes."""
+    assert plan.sizes.nodes is not None, "filled in by `with_numbers`"
+    number, n_bytes = expected_parts(source.contrasts[0], plan.sizes.nodes, parts.parts or 1)
+    out.print(f"about {counted(number, 'part')} in a round, each of up to {memory_words(n_bytes)} of a worker's memory")
 
 
 def work_folder(plan: Plan) -> Path:

@@ -11,7 +11,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
-from math import ceil
+from math import ceil, prod
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -19,12 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.energy.sampling import grid_bits
-from tetopt.engine.cost import part_bytes
+from tetopt.engine.cost import CELLS_PER_NODE, part_bytes
 from tetopt.engine.fast import EXCHANGING_SHARE
 from tetopt.engine.loop import Optimized, Record
 from tetopt.engine.promises import promised_in_box
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
+from tetopt.image import VoxelGrid
 from tetopt.mesh import Mesh
 from tetopt.parts.cut import ROUND_SHIFTS, Piece, Shared, counts_of, cut, joined, pieces
 from tetopt.parts.part import Kind, Numbers, Settings, box_of_ticks, work_on
@@ -226,6 +227,14 @@ def _counts(run: _Run, state: State) -> tuple[int, ...]:
     index = mesh["ticks"] * 2.0 ** -_settings(state).bits
     fewest = ceil(_weights(index, mesh["cells"]).sum())
     return counts_of(max(run.request.n_parts, fewest), tuple(run.image.spacing * run.image.shape))
+
+
+def expected_parts(grid: VoxelGrid, request_nodes: int, n_parts: int) -> tuple[int, float]:
+    """About how many parts a round will have, and the bytes that one takes, before there is a mesh."""
+    n_cells, n_voxels = CELLS_PER_NODE[3] * request_nodes, prod(grid.shape)
+    fewest = ceil(n_cells / MOST_CELLS + n_voxels / MOST_VOXELS)
+    number = prod(counts_of(max(n_parts, fewest), tuple(grid.spacing * grid.shape)))
+    return number, part_bytes(int(BOX_EXCESS * n_voxels / number), n_cells // number, is_whole=False)
 
 
 def _part_sizes(run: _Run, state: State, counts: tuple[int, ...]) -> Iterator[tuple[int, int]]:
