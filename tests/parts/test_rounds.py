@@ -1,8 +1,10 @@
 """Rounds of parts: the mesh that comes of them, beside one in one piece, and the same bits however they are run."""
 
+import time
+
 import numpy as np
 import pytest
-from parted import one_thread
+from parted import one_thread, recorded_run, request
 from seams import beside_one_piece, seam_layers
 
 import tetopt
@@ -68,3 +70,10 @@ def test_fields_are_those_of_the_whole_mesh(run, image):
         np.testing.assert_allclose(fields[name], expected[name], rtol=1e-10, atol=1e-9)
     assert (np.diff(run[0].part) >= 0).all()
     assert run[0].part.max() == 3
+
+
+def test_seconds_are_those_of_the_clock(image, tmp_path):
+    """The octree's were counted twice."""
+    begin = time.perf_counter()
+    result = recorded_run(tmp_path, image, request(100, 1, iterations=1))[0].result
+    assert 0.0 < result.history[0].seconds < result.seconds_run < time.perf_counter() - begin

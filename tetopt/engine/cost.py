@@ -19,6 +19,9 @@ CALIBRATION_NODES = 9_000  # of a lattice, in which they are summed up again and
 CALIBRATION_TURNS = 30  # of which the fastest counts: about a second in all
 KERNEL_BYTES = 2.5e8  # numba's compiler and all kernels, if they are not loaded yet, and buffers: 220 MB at most
 BOUND_MARGIN = 1.5  # on what sizes take: above the peaks of all runs that were measured
+# Of a part's box: its values as stored and as an image's, their sums, and a field of doubles besides. 32 were measured
+# of doubles, 28 of single precision, 20 of whole numbers of 16 bits (parts of 8 to 27 million voxels).
+PART_VOXEL_BYTES = 34.0
 NEXT_SHARE = 0.3  # of what cells take: what an exchange or the end of a run takes besides
 CELLS_PER_NODE = {2: 2, 3: 6}  # of large meshes, by dimension
 
@@ -185,7 +188,7 @@ def meshing_bytes(n_voxels: int, n_channels: int, n_nodes: int, ndim: int = 3) -
     return KERNEL_BYTES + BOUND_MARGIN * n_bytes
 
 
-def part_bytes(n_voxels: int, n_cells: int, is_whole: bool) -> float:
+def part_bytes(n_voxels: int, n_cells: int) -> float:
     """What a part of a mesh takes at its peak besides what a process that runs parts has, above all that was measured.
 
     Parameters
@@ -193,12 +196,8 @@ def part_bytes(n_voxels: int, n_cells: int, is_whole: bool) -> float:
     n_voxels : int
         Of the box around its cells.
     n_cells : int
-    is_whole : bool
-        Whether intensities are whole numbers of 8 bits or few more, whose sums take 32 bits.
     """
-    costs = cost_model().bytes
-    of_voxel = costs["voxels_read"] + costs["channel_voxels"] + costs["fractional_voxels"] * (not is_whole)
-    return BOUND_MARGIN * (of_voxel * n_voxels + costs["cells"] * n_cells)
+    return PART_VOXEL_BYTES * n_voxels + BOUND_MARGIN * cost_model().bytes["cells"] * n_cells
 
 
 def next_bytes(n_nodes: int, ndim: int = 3) -> float:
