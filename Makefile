@@ -9,7 +9,7 @@ TESTED = PYTHONUTF8=1 NUMBA_CACHE_DIR=$(NUMBA_CACHE) MPLBACKEND=agg $(BIN)/pytho
 
 SOLVERS = calculix-ccx python3-dolfinx
 
-.PHONY: demo test test-slow test-random test-solvers test-nojit test-onethread test-hostile test-container test-slurm test-cohort lint bench bench-blocks fingerprints clean
+.PHONY: demo test test-slow test-random test-solvers test-nojit test-onethread test-hostile test-container test-slurm test-cohort test-parts lint bench bench-blocks fingerprints clean
 
 demo: $(VENV)/.demo
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt demo -o demo --force
@@ -61,6 +61,12 @@ test-slurm: $(VENV)/.test
 test-cohort: $(VENV)/.test
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt warm-up
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python tests/cohort/campaign.py
+
+# The MNI152 brain in parts on dask's workers, which are killed, interrupted and out of disk: five minutes on two idle cores.
+test-parts: $(VENV)/.test
+	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt warm-up
+	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python tests/parts/campaign.py
+	NUMBA_CACHE_DIR=$(NUMBA_CACHE) PYTHONPATH=tests $(BIN)/python tests/parts/seams.py
 
 lint: $(VENV)/.test
 	$(BIN)/ruff check .
