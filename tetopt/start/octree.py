@@ -29,7 +29,7 @@ from tetopt.geometry.simplex import volumes
 from tetopt.image import Image, VoxelGrid
 from tetopt.mesh import Mesh
 from tetopt.start.clip import clipped
-from tetopt.start.delaunay import delaunay
+from tetopt.start.delaunay import delaunay, without_flat
 from tetopt.start.lattice import near_cubes
 from tetopt.start.sizes import (
     LONGEST_IN_BLOCK,
@@ -267,7 +267,14 @@ def _octree_of_box(source: Source, nodes: int, limits: _BlockLimits) -> Mesh:
     points = image.to_world(index)
     for tie_break in TIE_BREAKS:
         cells = delaunay(index, image.affine, tie_break)
-        if cells is not None and (size := volumes(points, cells)).min() > FLAT_VOLUME_SHARE * size.mean():
+        if cells is None:
+            continue
+        size = volumes(points, cells)
+        least = FLAT_VOLUME_SHARE * float(size.mean())
+        if size.min() <= least and image.ndim == 3:
+            cells = without_flat(points, cells, least)
+            size = volumes(points, cells)
+        if size.min() > least:
             return Mesh(points, cells)
     raise InputError(f"octree: Delaunay left flat cells on {len(index)} nodes; ask for another number")
 
