@@ -225,5 +225,6 @@ def main(size):
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)  # ignored where a shell runs this in the background
     numbers = [int(word) for word in sys.argv[1:]]
     sys.exit(main((*numbers, *(8000, 4)[len(numbers) :])))
