@@ -196,8 +196,11 @@ def test_what_came_of_a_part_is_made_again_if_it_is_damaged(copy, in_one_go):
     assert content(run(copy)) == in_one_go
 
 
-@pytest.mark.parametrize("name", ["state.json", "mesh-1.npz", "initial.npz"])
-@pytest.mark.parametrize("way", ["a bit", "cut short"])
+@pytest.mark.parametrize(
+    ("name", "way"),
+    [(name, "a bit") for name in ("state.json", "mesh-1.npz", "initial.npz")]
+    + [(name, "cut short") for name in ("state.json", "mesh-1.npz", "initial.npz", "volume.json", "voxels.npy")],
+)
 def test_a_damaged_state_is_said_in_a_line(copy, name, way):
     damaged(copy / name, way)
     with pytest.raises(
@@ -207,11 +210,7 @@ def test_a_damaged_state_is_said_in_a_line(copy, name, way):
 
 
 def test_no_bit_of_a_file_of_arrays_changes_unseen(tmp_path):
-    path, arrays, text = (
-        tmp_path / "a.npz",
-        {"ticks": np.arange(6), "cells": np.eye(2)},
-        {"kind": "measure", "nodes": 3},
-    )
+    path, arrays, text = tmp_path / "a.npz", {"ticks": np.arange(6), "cells": np.eye(2)}, {"kind": "measure"}
     work.save_arrays(path, arrays, text)
     raw = path.read_bytes()
     n_seen = 0

@@ -26,7 +26,7 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.image import Image
-from tetopt.incoming import json_of, text_of
+from tetopt.incoming import json_of
 from tetopt.io.files import save_json, written_whole
 from tetopt.io.images import Bounds
 from tetopt.io.locks import lock
@@ -80,12 +80,18 @@ def save_volume(folder: Path, volume: VolumeFile | Image) -> None:
 
 
 def open_volume(folder: Path) -> StoredImage:
-    """The image whose voxels a folder of work is about."""
-    words = json_of(text_of(folder / VOLUME_NAME, "a note of where voxels are"))
-    if words["path"] is None:
-        return StoredImage(np.load(folder / VOXELS_NAME, mmap_mode="r"), words["affine"])
-    crop = None if words["crop"] is None else [tuple(each) for each in words["crop"]]
-    return VolumeFile(Path(words["path"]), words["volume"], crop).opened()
+    """The image whose voxels a folder of work is about; InputError as `open_stored`, or the folder is damaged."""
+    path = folder / VOLUME_NAME
+    try:
+        words = json_of(path.read_text(encoding="utf-8"))
+        if words["path"] is None:
+            path = folder / VOXELS_NAME
+            return StoredImage(np.load(path, mmap_mode="r"), words["affine"])
+        crop = None if words["crop"] is None else [tuple(each) for each in words["crop"]]
+        volume = VolumeFile(Path(words["path"]), words["volume"], crop)
+    except DAMAGE_ERRORS as error:
+        raise _damaged(path, error) from error
+    return volume.opened()
 
 
 def save_arrays(path: Path, arrays: dict[str, NDArray], text: dict[str, Any]) -> None:
