@@ -62,7 +62,7 @@ test-cohort: $(VENV)/.test
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt warm-up
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python tests/cohort/campaign.py
 
-# The MNI152 brain in parts on dask's workers, which are killed, interrupted and out of disk: five minutes on two idle cores.
+# The MNI152 brain in parts on dask's workers, which are killed, interrupted and out of disk; then its seams: ten minutes.
 test-parts: $(VENV)/.test
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt warm-up
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python tests/parts/campaign.py
