@@ -11,6 +11,7 @@ from tetopt import load_mesh
 from tetopt.cli import parts as cli_parts
 from tetopt.io.images import load_image, save_image
 from tetopt.model.fields import cell_fields
+from tetopt.parts.work import save_volume
 
 
 @pytest.fixture(scope="module")
@@ -102,3 +103,51 @@ def test_a_run_out_of_time_goes_on(tmp_path, inputs, capfd):
     assert np.array_equal(one.points, other.points)
     assert np.array_equal(one.cells, other.cells)
     assert not list(tmp_path.glob("*.work"))
+
+
+OF_TWO = ["--nodes", 300, "--parts", 2, "--iterations", 3, "--workers", 1]
+
+
+def test_what_was_refused_leaves_nothing_and_stands_in_no_way(tmp_path, inputs, monkeypatch, capfd):
+    """Before there is an octree, by what a solver is told of it, and by the memory of the workers."""
+    command = ["mesh", inputs / "ball.nii.gz", *OF_TWO, "-o", tmp_path / "a.vtu"]
+    for more, match in [
+        (["--nodes", 6], "--nodes: expected a whole number of nodes, 9 or more"),
+        (["--young", "2", "--load", "hold:nowhere"], "nowhere"),
+    ]:
+        assert_refused(capfd, [*command, *more], match)
+        assert list(tmp_path.iterdir()) == []
+    monkeypatch.setattr(cli_parts, "prepare_kernels", lambda *_, **__: None)
+    assert exit_code(*command, "--worker-gb", 0.3) == 2
+    assert "tetopt: a part needs about 1." in capfd.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_voxels_that_a_run_without_an_octree_left_are_not_those_of_another_image(tmp_path, inputs, capfd):
+    """What a run had noted, that was killed before it had a mesh, is noted anew."""
+    folder = tmp_path / "a.vtu.work"
+    folder.mkdir()
+    save_volume(folder, tetopt.Image(np.full((9, 9, 9), 3.0)))
+    assert exit_code("mesh", inputs / "ball.nii.gz", *OF_TWO, "-o", tmp_path / "a.vtu") == 0
+    loaded = load_mesh(tmp_path / "a.vtu")
+    direct = cell_fields(loaded.mesh, load_image(inputs / "ball.nii.gz"))
+    assert np.array_equal(loaded.cell_data["max"], direct["max"])
+    assert not folder.exists()
+
+
+@pytest.mark.parametrize("kind", ["file", "folder", "link", "dangling"])
+def test_what_has_the_name_of_the_folder_of_work_stays(tmp_path, inputs, capfd, kind):
+    place, other = tmp_path / "a.vtu.work", tmp_path / "other"
+    if kind == "file":
+        place.write_text("mine")
+    elif kind == "folder":
+        place.mkdir()
+        (place / "mine.txt").write_text("mine")
+    else:
+        if kind == "link":
+            other.mkdir()
+        place.symlink_to(other)
+    before = sorted(tmp_path.rglob("*"))
+    command = ["mesh", inputs / "ball.nii.gz", *OF_TWO, "-o", tmp_path / "a.vtu"]
+    assert_refused(capfd, command, "a.vtu.work: is no folder of work of a mesh in parts; move it away")
+    assert sorted(tmp_path.rglob("*")) == before

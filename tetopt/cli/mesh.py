@@ -251,7 +251,7 @@ def _run_in_parts(task: Task, begin: float, begin_keeping: Callable[[], None]) -
             check_early(output, solver, initial.ndim, task.source.low, build)
         check_space(output, CELL_BYTES * len(initial.cells))
 
-    parted, n_bytes = run_in_parts(task.plan, task.source, task.sizes, task.parts, check, begin_keeping)
+    parted, n_bytes = run_in_parts(task.plan, task.source, task.sizes, task.parts, check, begin_keeping, begin)
     seconds = {"load": loaded, "optimize": time.perf_counter() - begin - loaded}
     fields = {**parted.fields, **cell_fields(parted.result.mesh), "part": parted.part}
     return parted.result, seconds, max(before, n_bytes), fields

@@ -28,7 +28,7 @@ from tetopt.cli.run import compiling, rare_lines
 from tetopt.cli.source import Source
 from tetopt.cluster.crew import Folders, Need, counted
 from tetopt.cluster.tasks import run_tasks
-from tetopt.cluster.workers import check_choice, workers
+from tetopt.cluster.workers import check_choice, local_share, workers
 from tetopt.engine.cost import meshing_bytes
 from tetopt.engine.fast import prepare_kernels
 from tetopt.engine.loop import Optimized, Record
@@ -40,7 +40,7 @@ from tetopt.model.averages import DEFAULT_AVERAGE
 from tetopt.model.sets import box_of
 from tetopt.parts.part import work_on
 from tetopt.parts.rounds import Parted, Request, Round, Runner, expected_parts, mesh_in_parts
-from tetopt.parts.work import VolumeFile, save_volume
+from tetopt.parts.work import VolumeFile
 from tetopt.start.sizes import Sizes
 from tetopt.stored import StoredImage
 from tetopt.target.content import StoredContent
@@ -209,15 +209,15 @@ def work_folder(plan: Plan) -> Path:
 
 def run_in_parts(
     plan: Plan, source: Source | StoredSource, sizes: Sizes | None, parts: PartsOptions,
-    check: Callable[[Mesh], None], begin_keeping: Callable[[], None],
+    check: Callable[[Mesh], None], begin_keeping: Callable[[], None], begin: float,
 ) -> tuple[Parted, float]:  # fmt: skip
     """Run, or go on with, a mesh in parts; what came of it, and the memory predicted for each worker's task, bytes.
 
     `check` is given the initial mesh before a part begins; `begin_keeping` is called as soon as there is a mesh that is
-    worth keeping.
+    worth keeping. `--max-seconds` count from `begin`, as of `time.perf_counter`.
     """
     folder, request = work_folder(plan), _request(plan, source, sizes, parts)
-    ends = None if plan.engine.max_seconds is None else time.perf_counter() + plan.engine.max_seconds
+    ends = None if plan.engine.max_seconds is None else begin + plan.engine.max_seconds
     task_bytes = 0.0
 
     def is_over() -> bool:
@@ -232,29 +232,26 @@ def run_in_parts(
             prepare_kernels(Image(np.zeros((3, 3, 3)) + np.arange(3)), request.k_D, is_graded=True, progress=progress)
         most = None if parts.worker_gb is None else parts.worker_gb * BYTES_PER_GB
         need = Need(n_parts, n_bytes, plan.engine.threads, is_within=True, most_bytes=most)
-        folders = Folders(folder, folder)
+        here = folder.absolute()  # workers that others started have folders of their own to begin with
+        folders = Folders(here, here)
+        if parts.scheduler is None and parts.cluster is None:
+            _check_room(need, local_share(need, parts.count).bytes)  # with too little a worker does not even start
         with workers(
             need, folders, count=parts.count, scheduler=parts.scheduler, cluster=parts.cluster
         ) as team:  # fmt: skip
             log.print(escape(team.words))
-            if n_bytes > team.bytes:
-                raise InputError(
-                    f"a part needs about {memory_words(n_bytes)} of memory, a worker has {memory_words(team.bytes)}; "
-                    "ask for more --parts, for fewer --workers, or give them more memory"
-                )
+            _check_room(need, team.bytes)
 
             def run(names: Sequence[str]) -> Iterator[Any]:
-                return run_tasks(team, work_on, names, is_over=is_over)
+                return run_tasks(team, work_on, [str(Path(name).absolute()) for name in names], is_over=is_over)
 
             yield run
 
     with _shown(begin_keeping) as watch:
-        folder.mkdir(exist_ok=True)
-        if not (folder / "volume.json").exists():
-            save_volume(folder, _volume_file(plan) if isinstance(source, StoredSource) else source.contrasts[0])
-        statistics = source.content.statistics if isinstance(source, StoredSource) else None
         parted = mesh_in_parts(
-            request, folder, statistics, check=check, crew=crew, is_over=is_over, watch=watch
+            request, folder, source.content.statistics if isinstance(source, StoredSource) else None,
+            volume=_volume_file(plan) if isinstance(source, StoredSource) else source.contrasts[0],
+            check=check, crew=crew, is_over=is_over, watch=watch,
         )  # fmt: skip
     result = parted.result
     if result.ended == "stopped" and not is_ended():
@@ -267,6 +264,16 @@ def run_in_parts(
         }
         log.print(words[parted.result.ended])
     return parted, task_bytes
+
+
+def _check_room(need: Need, room: float) -> None:
+    """InputError if a part needs more memory than a worker has for it."""
+    if need.task_bytes > room:
+        raise InputError(
+            f"a part needs about {memory_words(need.task_bytes)} of memory, its worker "
+            f"{memory_words(need.limit_for(need.task_bytes))} in all, and has too little; ask for more --parts, for "
+            "fewer --workers, or give them more memory"
+        )
 
 
 def _request(plan: Plan, source: Source | StoredSource, sizes: Sizes | None, parts: PartsOptions) -> Request:

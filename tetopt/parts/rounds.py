@@ -25,13 +25,15 @@ from tetopt.engine.loop import Optimized, Record
 from tetopt.engine.promises import promised_in_box
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
-from tetopt.image import VoxelGrid
+from tetopt.image import Image, VoxelGrid
 from tetopt.mesh import Mesh
 from tetopt.parts.cut import ROUND_SHIFTS, Piece, Shared, counts_of, cut, joined, pieces
 from tetopt.parts.part import Kind, Numbers, Settings, box_of_ticks, work_on
 from tetopt.parts.work import (
     State,
+    VolumeFile,
     done_path,
+    gone_if_refused,
     load_arrays,
     load_mesh_of,
     load_state,
@@ -40,6 +42,7 @@ from tetopt.parts.work import (
     round_folder,
     save_arrays,
     save_state,
+    save_volume,
 )
 from tetopt.start.octree import octree
 from tetopt.start.sizes import Sizes
@@ -101,7 +104,7 @@ def in_turn(names: Sequence[str]) -> Iterator[Any]:
 
 
 def mesh_in_parts(
-    request: Request, folder: Path, statistics: Statistics | None = None, *,
+    request: Request, folder: Path, statistics: Statistics | None = None, *, volume: VolumeFile | Image | None = None,
     crew: Callable[[int, float], AbstractContextManager[Runner]] = lambda n_parts, task_bytes: nullcontext(in_turn),
     is_over: Callable[[], bool] = lambda: False,
     watch: Callable[[Round, list[Record]], None] = lambda now, history: None,
@@ -113,10 +116,12 @@ def mesh_in_parts(
     ----------
     request : Request
     folder : Path
-        Of work, in which `tetopt.parts.work.save_volume` has noted where the voxels are. All that is done stays in it,
-        so that the same request goes on where it ended, whatever ended it.
+        Of work. All that is done stays in it, so that the same request goes on where it ended, whatever ended it;
+        unless it is refused before a part begins.
     statistics : Statistics, optional
         Of the image, if they are known.
+    volume : VolumeFile or Image, optional
+        The image, unless `tetopt.parts.work.save_volume` has noted in the folder where its voxels are.
     crew : callable
         Given how many parts there are, and the bytes that the largest takes, for as long as its block lasts what runs
         them.
@@ -138,14 +143,18 @@ def mesh_in_parts(
         As `octree`; a folder of another request or of another run; what `crew` and the parts raise; an end before the
         initial mesh is measured.
     """
-    with locked(folder):
+    with locked(folder), gone_if_refused(folder) as keep:
+        state = load_state(folder, request.checksum)
+        if state is None and volume is not None:  # what a run that got no further has noted may be of another image
+            save_volume(folder, volume)
         image = open_volume(folder)
-        state = load_state(folder, request.checksum) or _begun(request, folder, image, statistics)
+        state = state or _begun(request, folder, image, statistics)
         run = _Run(request, folder, image, time.perf_counter() - state.known["seconds"], is_over, watch)
         check(_initial(run, state))
         counts = _counts(run, state)
         largest = max(part_bytes(*sizes) for sizes in _part_sizes(run, state, counts))
         with crew(int(np.prod(counts)), largest) as runner:
+            keep()
             ended = "iterations"
             # Asked before a round, also of a run that went on: it may have ended when it had converged.
             while not _is_converged(request, state) and state.n_rounds <= _n_rounds(request):
@@ -327,7 +336,10 @@ def _finished(
     if not history:
         raise InputError(f"{run.folder}: ended before the first round was complete; run this again to go on with it")
     parts = _cut(run, state, counts, ROUND_SHIFTS[0])
-    done = _ran(run._replace(is_over=lambda: False), state, parts, "fields", runner, task_bytes)
+    whole = run._replace(is_over=lambda: False)
+    done = _ran(whole, state, parts, "fields", runner, task_bytes)
+    if done is None:  # the runner knows of the end as well, and may have begun no more parts
+        done = _ran(whole, state, parts, "fields", in_turn, task_bytes)
     assert done is not None, "nothing cuts it short"
     mesh = joined([piece.ticks for piece in parts], [piece.cells for piece in parts])
     scale = 2.0 ** -_settings(state).bits

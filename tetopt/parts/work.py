@@ -11,12 +11,13 @@ from __future__ import annotations
 
 import hashlib
 import json
+import os
 import shutil
 import struct
 import warnings
 import zipfile
 import zlib
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -61,11 +62,43 @@ class VolumeFile(NamedTuple):
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """The folder of work, made if it is not there, for one run alone; InputError if another one has it."""
+    """The folder of work, made if it is not there, for one run alone.
+
+    Raises
+    ------
+    InputError
+        Another run has it, or what has its name is something else, which the end of a run would remove.
+    """
+    is_ours = not os.path.lexists(folder) or (folder.is_dir() and not folder.is_symlink())
+    if is_ours and folder.exists():
+        names = {each.name for each in folder.iterdir()}
+        is_ours = not names or not names.isdisjoint((LOCK_NAME, VOLUME_NAME))
+    if not is_ours:
+        raise InputError(f"{folder}: is no folder of work of a mesh in parts; move it away, or give another output")
     folder.mkdir(exist_ok=True)
     with ExitStack() as stack:
         lock(stack, folder / LOCK_NAME, is_shared=False, what=str(folder))
         yield
+
+
+@contextmanager
+def gone_if_refused(folder: Path) -> Iterator[Callable[[], None]]:
+    """A folder of work without a state goes again with an InputError, unless what is yielded has been called by then.
+
+    Otherwise what was refused would stand in the way of the request that is mended.
+    """
+    is_kept = (folder / STATE_NAME).exists()
+
+    def keep() -> None:
+        nonlocal is_kept
+        is_kept = True
+
+    try:
+        yield keep
+    except InputError:
+        if not is_kept:
+            shutil.rmtree(folder)
+        raise
 
 
 def save_volume(folder: Path, volume: VolumeFile | Image) -> None:
