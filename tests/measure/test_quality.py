@@ -24,7 +24,7 @@ from meshes import (
 )
 
 from tetopt import Image, lattice
-from tetopt.geometry.simplex import dihedral_angles, rho, volumes
+from tetopt.geometry.simplex import dihedral_angles, rho, squared_edges, volumes
 from tetopt.measure.quality import bad_kinds, quality, quality_errors, rho_histogram
 
 seeds = st.integers(0, 2**32 - 1)
@@ -242,3 +242,14 @@ def test_quality_of_an_obtuse_triangle():
     measured = quality(*OBTUSE_TRIANGLE)
     assert measured.max_dihedral == pytest.approx(120)
     assert measured.min_dihedral == pytest.approx(30)
+
+
+def test_quality_by_blocks_of_cells_is_that_of_all(monkeypatch):
+    """Blocks bound the memory, and each of them has its say."""
+    points, cells = FIVE_TET_CUBE
+    points = points + 0.1 * np.random.default_rng(1).random(points.shape)
+    whole = quality(points, cells)
+    monkeypatch.setattr("tetopt.measure.quality.BLOCK_CELLS", 2)
+    assert quality(points, cells) == whole
+    assert whole.max_dihedral == dihedral_angles(points, cells).max()
+    assert whole.max_edge == pytest.approx(np.sqrt(squared_edges(points, cells).max()))
