@@ -96,8 +96,17 @@ def test_a_run_out_of_time_goes_on(tmp_path, inputs, capfd):
     assert exit_code(*command, "-o", tmp_path / "a.vtu", "--max-seconds", "1e-6") == 2
     assert "a.vtu.work: ended before the first round was complete; run this again" in capfd.readouterr().err
     assert not (tmp_path / "a.vtu").exists()
-    assert exit_code(*command, "-o", tmp_path / "a.vtu", "--k-d", "0.5") == 2
-    assert "a.vtu.work: is the folder of work of another run" in capfd.readouterr().err
+    other = tmp_path / "ball.nii.gz"
+    save_image(
+        other, tetopt.Image(load_image(inputs / "ball.nii.gz").data[::-1], load_image(inputs / "ball.nii.gz").affine)
+    )
+    changes = [
+        ("--k-d", 0.5), ("--nodes", 310), ("--parts", 3), ("--iterations", 9), ("--shape-power", 2),
+        ("--min-dihedral", 9), ("--size-min", 3), ("--edge-max", 20), ("--gradation", 0.2), ("--crop", "0:22,:,:"),
+    ]  # fmt: skip
+    for each in [[*command, *change] for change in changes] + [["mesh", other, *command[2:]]]:
+        assert exit_code(*each, "-o", tmp_path / "a.vtu") == 2, each
+        assert "a.vtu.work: is the folder of work of another run" in capfd.readouterr().err
     assert exit_code(*command, "-o", tmp_path / "a.vtu") == 0
     one, other = (load_mesh(tmp_path / name).mesh for name in ("whole.vtu", "a.vtu"))
     assert np.array_equal(one.points, other.points)

@@ -4,10 +4,11 @@ import time
 
 import numpy as np
 import pytest
-from parted import one_thread, recorded_run, request
+from parted import balls, one_thread, recorded_run, request
 from seams import beside_one_piece, compared, other_layers, seam_layers
 
 import tetopt
+from tetopt.engine.promises import promised_in_box
 from tetopt.geometry.simplex import dihedral_angles, rho
 from tetopt.io.images import load_image
 from tetopt.io.mni import mni_path
@@ -31,6 +32,30 @@ def test_the_mesh_is_valid_fills_the_box_and_keeps_the_floor(run, image):
 
 def test_there_are_as_many_nodes_as_asked_for(run):
     assert len(run[0].result.mesh.points) == pytest.approx(1500, rel=0.01)
+
+
+def test_a_promise_that_is_missed_is_noticed(run, image):
+    result = run[0].result
+    assert promised_in_box(result, image, 12.0).missed == {}
+    assert set(promised_in_box(result, image, 60.0).missed) == {"floor"}
+    larger = tetopt.Image(np.concatenate([image.data, image.data[:1]]), image.affine)
+    assert "floor" not in promised_in_box(result, larger, 12.0).missed
+    assert promised_in_box(result, larger, 12.0).missed
+
+
+def test_nodes_that_the_octree_lacks_are_shared_among_the_parts(tmp_path):
+    with one_thread():
+        result = recorded_run(tmp_path, balls((20, 18, 16)), request(200, 4, iterations=6))[0].result
+    assert len(result.initial.points) < 195
+    assert len(result.mesh.points) == pytest.approx(200, abs=4)  # each part comes as near as it can
+
+
+def test_no_run_converges_while_nodes_are_exchanged(tmp_path):
+    with one_thread():
+        result = recorded_run(tmp_path, balls((20, 18, 16)), request(200, 4, iterations=12, tolerance=1.0))[0].result
+    assert result.ended == "converged"
+    # Nodes are exchanged in the first 8, so that the first round without any is the fourth.
+    assert [record.iteration for record in result.history] == [0, 3, 6, 9, 12]
 
 
 def test_parts_lie_elsewhere_in_each_round(run):
