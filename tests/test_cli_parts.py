@@ -56,6 +56,12 @@ def test_refused(tmp_path, inputs, monkeypatch, capfd, options, match):
     assert list(tmp_path.iterdir()) == []
 
 
+def test_planes_are_refused(tmp_path, capfd):
+    save_image(tmp_path / "plane.nii.gz", tetopt.Image(np.arange(400.0).reshape(20, 20)))
+    command = ["mesh", tmp_path / "plane.nii.gz", "--parts", 2, "-o", tmp_path / "a.vtu"]
+    assert_refused(capfd, command, "--parts: of a volume, and the image is a plane; leave it out")
+
+
 def test_stored_images_are_meshed_as_those_in_memory(tmp_path, inputs, monkeypatch):
     """Left in its file and read whole, on one worker and on two: the same mesh, and the same numbers of its cells."""
     command = ["mesh", inputs / "ball.nii", "--nodes", 300, "--parts", 2, "--iterations", 3]

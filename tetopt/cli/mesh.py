@@ -161,6 +161,8 @@ def _read(plan: Plan, parts: PartsOptions | None) -> Task:
         plan, sizes = with_numbers(plan, stored.content)
         return Task(plan, stored, None, sizes, size_of_run(plan, stored.content, stored.content.image), parts=parts)
     source = read_source(plan.source, plan.solver.label_names)
+    if parts is not None and source.content.image.ndim != 3:
+        raise InputError("--parts: of a volume, and the image is a plane; leave it out")
     started = None
     if plan.start.start is not None:
         started = read_mesh(plan.start.start)
