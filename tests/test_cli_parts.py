@@ -39,9 +39,8 @@ REFUSED = [
     ("--parts 2 --boundary fixed", "--boundary: looks at all"),
     ("--parts 2 --max-gb 3", "--max-gb: looks at all"),
     ("ball.nii.gz --parts 2", "--parts: expected one IMAGE, got 2"),
-    ("--workers 2", "--workers: only of a mesh in parts; give --parts"),
-    ("--worker-gb 2", "--worker-gb: only of a mesh in parts"),
-    ("--scheduler tcp://127.0.0.1:9", "--scheduler: only of a mesh in parts"),
+    ("--parts 4", "--parts: expected up to 3 of 300 nodes, 100 each, got 4; ask for fewer"),
+    ("--parts 4 --predict", "--parts: expected up to 3 of 300 nodes"),
     ("--parts 2 --worker-gb 0", "--worker-gb: expected more than 0"),
     ("--parts 2 --worker-gb 2 --scheduler tcp://127.0.0.1:9", "--worker-gb: of workers on this machine"),
     ("--parts 2 --workers 2 --scheduler tcp://127.0.0.1:9", "--workers: expected none with --scheduler"),
@@ -74,6 +73,8 @@ def test_stored_images_are_meshed_as_those_in_memory(tmp_path, inputs, monkeypat
     for name, value in one["image_properties"].items():
         assert np.allclose(value, other["image_properties"][name], rtol=1e-12), name
     assert one["options"]["parts"] == 2
+    assert one["prediction"]["task_bytes"] > 1e5
+    assert one["memory"].keys() == {"peak_bytes"}
     loaded = load_mesh(tmp_path / "b.vtkhdf")
     direct = cell_fields(loaded.mesh, load_image(inputs / "ball.nii"))
     assert np.array_equal(loaded.cell_data["n_voxels"], direct["n_voxels"])
@@ -127,7 +128,7 @@ def test_what_was_refused_leaves_nothing_and_stands_in_no_way(tmp_path, inputs, 
     """Before there is an octree, by what a solver is told of it, and by the memory of the workers."""
     command = ["mesh", inputs / "ball.nii.gz", *OF_TWO, "-o", tmp_path / "a.vtu"]
     for more, match in [
-        (["--nodes", 6], "--nodes: expected a whole number of nodes, 9 or more"),
+        (["--nodes", 50000], "--nodes: 50000 nodes are too many for 24 x 26 x 28 voxels"),
         (["--young", "2", "--load", "hold:nowhere"], "nowhere"),
     ]:
         assert_refused(capfd, [*command, *more], match)
@@ -166,3 +167,25 @@ def test_what_has_the_name_of_the_folder_of_work_stays(tmp_path, inputs, capfd, 
     command = ["mesh", inputs / "ball.nii.gz", *OF_TWO, "-o", tmp_path / "a.vtu"]
     assert_refused(capfd, command, "a.vtu.work: is no folder of work of a mesh in parts; move it away")
     assert sorted(tmp_path.rglob("*")) == before
+
+
+def test_options_of_parts_have_no_say_in_one_piece(tmp_path, inputs, capfd):
+    command = ["mesh", inputs / "ball.nii", "-o", tmp_path / "a.vtu", "--nodes", 300, "--predict"]
+    assert exit_code(*command, "--worker-gb", 2) == 0
+    captured = capfd.readouterr()
+    assert "--worker-gb: has no say, as the mesh is made in one piece" in captured.err
+    assert "at its peak" in captured.out
+
+
+def test_predicted_parts(tmp_path, inputs, capfd):
+    command = ["mesh", inputs / "ball.nii", "-o", tmp_path / "a.vtu", "--nodes", 300, "--predict", "--parts", 2]
+    assert exit_code(*command, "--worker-gb", 0.1) == 0
+    captured = capfd.readouterr()
+    assert captured.out.startswith("about 2 parts in a round, each of up to ")
+    assert "--worker-gb 0.1: less than a worker takes" in captured.err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_places_on_the_network_are_refused(tmp_path, capfd):
+    words = ["mesh", "s3://bucket/x.zarr", "-o", tmp_path / "a.vtu"]
+    assert_refused(capfd, words, "s3:/bucket/x.zarr: is not on this machine; download it")

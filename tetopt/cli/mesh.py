@@ -239,7 +239,7 @@ def _run(task: Task, begin: float, begin_keeping: Callable[[], None]) -> Ran:
 def _run_in_parts(task: Task, begin: float, begin_keeping: Callable[[], None]) -> Ran:
     """The same in parts, which take the fields of their cells as well."""
     assert task.parts is not None
-    loaded, before = time.perf_counter() - begin, peak_bytes()
+    loaded = time.perf_counter() - begin
 
     def check(initial: Mesh) -> None:
         output, solver = task.plan.output.mesh, task.plan.solver
@@ -256,7 +256,7 @@ def _run_in_parts(task: Task, begin: float, begin_keeping: Callable[[], None]) -
     parted, n_bytes = run_in_parts(task.plan, task.source, task.sizes, task.parts, check, begin_keeping, begin)
     seconds = {"load": loaded, "optimize": time.perf_counter() - begin - loaded}
     fields = {**parted.fields, **cell_fields(parted.result.mesh), "part": parted.part}
-    return parted.result, seconds, max(before, n_bytes), fields
+    return parted.result, seconds, n_bytes, fields
 
 
 def _memory_limit(plan: Plan, content: Content) -> MemoryLimit | None:
@@ -380,8 +380,12 @@ def _write(task: Task, outcome: Outcome, model: Model, about: dict[str, Any], be
         if isinstance(source, Source) and source.image is not source.content.image:
             summary["image_properties"] = image_summary(source.image)  # on its own voxels, not on divided ones
         summary["request"] = task.request
-        summary["prediction"] = stated_prediction(task.size)
-        summary["memory"] = {"predicted_bytes": outcome.predicted_bytes, "peak_bytes": peak_bytes()}
+        summary["memory"] = {"peak_bytes": peak_bytes()}
+        if task.parts is None:
+            summary["prediction"] = stated_prediction(task.size)
+            summary["memory"] |= {"predicted_bytes": outcome.predicted_bytes}
+        else:  # of each worker's largest task
+            summary["prediction"] = {"task_bytes": outcome.predicted_bytes}
         save_json(output.json_path, summary | measured | model_summary(model))
     if plan.pictures:
         _draw(task, outcome, model)

@@ -20,7 +20,7 @@ from rich.progress import BarColumn, Progress, TextColumn
 import tetopt
 from tetopt import Image, InputError, Mesh
 from tetopt.budget import BYTES_PER_GB, available_bytes, memory_words
-from tetopt.cli.console import log, out
+from tetopt.cli.console import log, out, show_warning
 from tetopt.cli.ending import is_ended
 from tetopt.cli.options import DEFAULT_NODES, PartsOptions
 from tetopt.cli.plan import Plan
@@ -34,13 +34,14 @@ from tetopt.engine.fast import prepare_kernels
 from tetopt.engine.loop import Optimized, Record
 from tetopt.io.images import file_shape, parse_crop, sha256
 from tetopt.io.label_tables import NO_TABLE, LabelTable
-from tetopt.io.stored_images import STORED_SUFFIXES, coarse_image, open_stored, stored_checksum
+from tetopt.io.stored_images import STORED_SUFFIXES, check_local, coarse_image, open_stored, stored_checksum
 from tetopt.io.vtk import box_text
 from tetopt.model.averages import DEFAULT_AVERAGE
 from tetopt.model.sets import box_of
 from tetopt.parts.part import work_on
 from tetopt.parts.rounds import Parted, Request, Round, Runner, expected_parts, mesh_in_parts
-from tetopt.parts.work import VolumeFile
+from tetopt.parts.work import STATE_NAME, VolumeFile
+from tetopt.start.octree import OCTREE_NODE_BYTES
 from tetopt.start.sizes import Sizes
 from tetopt.stored import StoredImage
 from tetopt.target.content import StoredContent
@@ -49,6 +50,7 @@ from tetopt.target.statistics import stored_statistics
 MOST_LOADED = 2**28  # voxels of an image that a run in parts reads whole: with it all that one piece offers is there
 MOST_DRAWN = 2**27  # voxels of the level of an image that pictures are drawn of
 VOXEL_BYTES = 16.0  # of an image that is read whole, besides what meshing takes
+FEWEST_NODES_EACH = 100  # of a part: of 150 half are shared, and stay
 WORK_SUFFIX = ".work"  # of the folder beside the mesh, after its name
 WHOLE_ONLY = "looks at all cells or voxels at once, parts do not; leave it out, or --parts"
 
@@ -100,7 +102,7 @@ def chosen_parts(plan: Plan, parts: PartsOptions) -> PartsOptions | None:
     if parts.parts is None and not is_too_large:
         if names:
             name = "workers" if names[0] == "count" else names[0].replace("_", "-")
-            raise InputError(f"--{name}: only of a mesh in parts; give --parts, or leave it out")
+            log.print(f"--{name}: has no say, as the mesh is made in one piece, which fits; --parts asks for parts")
         return None
     if parts.parts is None and needed is not None and free is not None:
         log.print(
@@ -123,6 +125,7 @@ def _is_storable(path: Path) -> bool:
 def _whole_bytes(plan: Plan) -> float | None:
     """What a graded mesh of an image that could be left in its file takes in one piece; None of others."""
     path = plan.source.images[0]
+    check_local(path)
     if not _is_storable(path) or plan.source.part.slice_ is not None or plan.mode != "graded":
         return None
     n_voxels = _n_voxels(plan)
@@ -157,6 +160,15 @@ def _check_plan(plan: Plan) -> None:
     for name, value in whole.items():
         if value is not None:
             raise InputError(f"--{name}: {WHOLE_ONLY}")
+
+
+def _check_number(n_parts: int | None, nodes: int) -> None:
+    """InputError for so many parts that hardly a node of them is their own."""
+    most = max(nodes // FEWEST_NODES_EACH, 1)
+    if n_parts is not None and n_parts > most:
+        raise InputError(
+            f"--parts: expected up to {most} of {nodes} nodes, {FEWEST_NODES_EACH} each, got {n_parts}; ask for fewer"
+        )
 
 
 def is_left_stored(plan: Plan) -> bool:
@@ -196,9 +208,22 @@ def _volume_file(plan: Plan) -> VolumeFile:
 
 def print_parts(plan: Plan, source: Source | StoredSource, parts: PartsOptions) -> None:
     """Say how many parts there will be, and what each takes."""
-    assert plan.sizes.nodes is not None, "filled in by `with_numbers`"
-    number, n_bytes = expected_parts(source.contrasts[0], plan.sizes.nodes, parts.parts or 1)
-    out.print(f"about {counted(number, 'part')} in a round, each of up to {memory_words(n_bytes)} of a worker's memory")
+    nodes = plan.sizes.nodes
+    assert nodes is not None, "filled in by `with_numbers`"
+    _check_number(parts.parts, nodes)
+    number, n_bytes = expected_parts(source.contrasts[0], nodes, parts.parts or 1)
+    need = Need(number, n_bytes, plan.engine.threads, is_within=True)
+    own = OCTREE_NODE_BYTES * nodes
+    out.print(
+        f"about {counted(number, 'part')} in a round, each of up to {memory_words(n_bytes)} of memory, a worker "
+        f"{memory_words(need.limit_for(n_bytes))} in all; about {memory_words(own)} for this command, whose octree is "
+        "made in one piece"
+    )
+    free = available_bytes()
+    if free is not None and own > free:
+        show_warning(f"{memory_words(free)} of memory are free, less than the octree takes; ask for fewer nodes")
+    if parts.worker_gb is not None and parts.worker_gb * BYTES_PER_GB < need.limit_for(n_bytes):
+        show_warning(f"--worker-gb {parts.worker_gb:g}: less than a worker takes; give more, or ask for more --parts")
 
 
 def work_folder(plan: Plan) -> Path:
@@ -248,11 +273,16 @@ def run_in_parts(
             yield run
 
     with _shown(begin_keeping) as watch:
-        parted = mesh_in_parts(
-            request, folder, source.content.statistics if isinstance(source, StoredSource) else None,
-            volume=_volume_file(plan) if isinstance(source, StoredSource) else source.contrasts[0],
-            check=check, crew=crew, is_over=is_over, watch=watch,
-        )  # fmt: skip
+        try:
+            parted = mesh_in_parts(
+                request, folder, source.content.statistics if isinstance(source, StoredSource) else None,
+                volume=_volume_file(plan) if isinstance(source, StoredSource) else source.contrasts[0],
+                check=check, crew=crew, is_over=is_over, watch=watch,
+            )  # fmt: skip
+        except BaseException:  # Ctrl-C among them
+            if task_bytes > 0.0 and (folder / STATE_NAME).exists():  # there were workers
+                log.print(escape(f"{folder} has what is done: run this again to go on, or remove it"))
+            raise
     result = parted.result
     if result.ended == "stopped" and not is_ended():
         parted = parted._replace(result=result._replace(ended="max_seconds"))
@@ -280,6 +310,7 @@ def _request(plan: Plan, source: Source | StoredSource, sizes: Sizes | None, par
     """What is asked for, with a checksum of all on which the mesh depends."""
     engine, nodes = plan.engine_options(), plan.sizes.nodes
     assert nodes is not None, "filled in by `with_numbers`"
+    _check_number(parts.parts, nodes)
     path = plan.source.images[0]
     values: dict[str, Any] = {
         "nodes": nodes, "n_parts": parts.parts or 1, "k_D": engine["k_D"], "iterations": engine["iterations"],

@@ -19,6 +19,7 @@ from tetopt.engine.cost import RunSize, calibrated_speed, cost_model, predicted
 from tetopt.engine.meshing import QUADRATIC_NODES
 from tetopt.image import VoxelGrid
 from tetopt.io.images import file_shape, load_image, parse_crop, parse_slice
+from tetopt.io.zarr_images import is_zarr
 from tetopt.target.content import Content, StoredContent
 
 SEARCH_RUNS = 4  # towards an error, mostly, each of about the default number of nodes
@@ -111,7 +112,7 @@ def _size(plan: Plan, shape: tuple[int, ...], nodes: int | None) -> RunSize:
     if order == 2 and plan.mode != "start":
         corners /= QUADRATIC_NODES[ndim] if nodes is not None else 1.0
         runs = runs if plan.start.spacing is not None else max(runs, QUADRATIC_RUNS)
-    n_read = sum(prod(file_shape(file_and_volume(path)[0]) or shape) for path in files)
+    n_read = sum(prod(shape if is_zarr(path) else file_shape(file_and_volume(path)[0]) or shape) for path in files)
     has_region = source.mask is not None or source.background is not None
     return RunSize(
         n_read=n_read, n_voxels=prod(shape), n_nodes=round(corners), iterations=plan.engine.iterations or 0,

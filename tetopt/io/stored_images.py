@@ -68,7 +68,7 @@ def open_stored(path: str | Path, *, volume: int | None = None, crop: Bounds | N
     UserWarning
         No orientation, no unit; chunks that are missing and have a fill value; a box of an odd size.
     """
-    _check_local(path)
+    check_local(path)
     path = Path(path)
     notes: list[str] = []
     try:
@@ -95,7 +95,7 @@ def coarse_image(path: str | Path, most_voxels: float, *, volume: int | None = N
     InputError
         As `open_stored`.
     """
-    _check_local(path)
+    check_local(path)
     path = Path(path)
     try:
         if not is_zarr(path):
@@ -134,7 +134,7 @@ def stored_checksum(path: str | Path) -> str:
     return hashlib.sha256("".join(words).encode("utf-8", "surrogateescape")).hexdigest()
 
 
-def _check_local(path: str | Path) -> None:
+def check_local(path: str | Path) -> None:
     """InputError for a place on the network, whatever becomes of its slashes in a `Path`."""
     if re.match(r"[A-Za-z][A-Za-z0-9+.-]+:/", str(path)):
         raise InputError(f"{path}: is not on this machine; download it, only folders and files here are read")
