@@ -139,7 +139,8 @@ def mesh_command(
             print_prediction(task.plan, task.size)
         return 0
     if output.json_path is not None:
-        task = task._replace(request=requested(source, sizes, start, engine, solver, output, parts.parts))
+        n_parts = None if task.parts is None else task.parts.parts
+        task = task._replace(request=requested(source, sizes, start, engine, solver, output, n_parts))
     with mesh_kept() as begin_keeping:
         result, seconds, predicted, fields = _run(task, begin, begin_keeping)
         model, about = _save(task, result, fields)

@@ -99,17 +99,20 @@ def chosen_parts(plan: Plan, parts: PartsOptions) -> PartsOptions | None:
     names = [field.name for field in dataclasses.fields(parts) if getattr(parts, field.name) is not None]
     needed, free = _whole_bytes(plan), available_bytes()
     is_too_large = needed is not None and free is not None and needed > free
-    if parts.parts is None and not is_too_large:
+    is_chosen = is_too_large and parts.parts is None and _strange_option(plan) is None
+    if parts.parts is None and not is_chosen:
         if names:
             name = "workers" if names[0] == "count" else names[0].replace("_", "-")
-            log.print(f"--{name}: has no say, as the mesh is made in one piece, which fits; --parts asks for parts")
+            log.print(f"--{name}: has no say, as the mesh is made in one piece; --parts asks for parts")
         return None
-    if parts.parts is None and needed is not None and free is not None:
+    if is_chosen and needed is not None and free is not None:
         log.print(
             f"in one piece it would take {memory_words(needed)} of memory, {memory_words(free)} are free: it is made "
             "in parts"
         )
-    _check_plan(plan)
+        parts = dataclasses.replace(parts, parts=1)
+    elif (strange := _strange_option(plan)) is not None:
+        raise InputError(strange)
     if parts.worker_gb is not None and not parts.worker_gb > 0.0:
         raise InputError(f"--worker-gb: expected more than 0, got {parts.worker_gb}")
     if parts.worker_gb is not None and (parts.scheduler or parts.cluster):
@@ -142,24 +145,20 @@ def _n_voxels(plan: Plan) -> int:
     return prod(shape)
 
 
-def _check_plan(plan: Plan) -> None:
-    """InputError for what a mesh in parts cannot be."""
+def _strange_option(plan: Plan) -> str | None:
+    """What a mesh in parts cannot be, in words; None if there is nothing."""
     source, sizes, engine = plan.source, plan.sizes, plan.engine
     if plan.mode != "graded":
-        raise InputError(
-            "--parts: of a graded mesh; leave out --uniform, --spacing, --lattice, --method, --start, or --parts"
-        )
+        return "--parts: of a graded mesh; leave out --uniform, --spacing, --lattice, --method, --start, or --parts"
     if len(source.images) > 1:
-        raise InputError(f"--parts: expected one IMAGE, got {len(source.images)}; leave the others out, or --parts")
+        return f"--parts: expected one IMAGE, got {len(source.images)}; leave the others out, or --parts"
     whole = {
         "mask": source.mask, "background": source.background, "labels": source.labels, "slice": source.part.slice_,
         "target-error": sizes.target_error, "size-max": sizes.size_max, "sizing": sizes.sizing,
         "max-gb": engine.max_gb, "order": plan.solver.order if plan.solver.order == 2 else None,
         "boundary": "fixed" if engine.boundary == "fixed" else None,
     }  # fmt: skip
-    for name, value in whole.items():
-        if value is not None:
-            raise InputError(f"--{name}: {WHOLE_ONLY}")
+    return next((f"--{name}: {WHOLE_ONLY}" for name, value in whole.items() if value is not None), None)
 
 
 def _check_number(n_parts: int | None, nodes: int) -> None:

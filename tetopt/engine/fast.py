@@ -154,7 +154,7 @@ class Course(NamedTuple):
 
     first: int
     last: int
-    iterations: int  # in all: in the last of them cells are lifted over the floor
+    iterations: int  # in all
     n_early: int  # the first of them, in which nodes are exchanged
     floor: float  # degrees
     tolerance: float  # as of `optimize`
@@ -196,8 +196,9 @@ def followed(
         # 3. Exchange nodes: in every other one of the first iterations.
         if nodes is not None and does_exchange:
             n_changes += run.exchange_towards(nodes, course.sizes)
-        # 4. Lift what is under the floor: in the last iteration.
-        is_last = iteration == course.iterations or not is_finished or (fall < course.tolerance and not is_early)
+        # 4. Lift what is under the floor: in the last iteration. Parts do so in every round, as in the next one what is
+        # under it may have nodes that stay.
+        is_last = iteration == course.last or not is_finished or (fall < course.tolerance and not is_early)
         if is_last and run.n_below(floor) > 0 and run.lift(floor) > 0:
             n_changes, fall = n_changes + 1, np.inf
         # 5. Measure.
