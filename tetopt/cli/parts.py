@@ -24,6 +24,7 @@ from tetopt.cli.console import log, out, show_warning
 from tetopt.cli.ending import is_ended
 from tetopt.cli.options import DEFAULT_NODES, PartsOptions
 from tetopt.cli.plan import Plan
+from tetopt.cli.predict import cropped_shape
 from tetopt.cli.run import compiling, rare_lines
 from tetopt.cli.source import Source
 from tetopt.cluster.crew import Folders, Need, counted
@@ -138,11 +139,7 @@ def _whole_bytes(plan: Plan) -> float | None:
 
 def _n_voxels(plan: Plan) -> int:
     """Of the image, by its header, cropped."""
-    shape = (file_shape(plan.source.images[0]) or (0,))[:3]
-    if plan.source.part.crop is not None:
-        bounds = zip(shape, parse_crop(plan.source.part.crop), strict=False)
-        shape = tuple(len(range(length)[slice(*ends)]) for length, ends in bounds)
-    return prod(shape)
+    return prod(cropped_shape(plan, (file_shape(plan.source.images[0]) or (0,))[:3]))
 
 
 def _strange_option(plan: Plan) -> str | None:
@@ -189,8 +186,8 @@ def read_stored(plan: Plan) -> StoredSource:
         raise InputError(
             f"--figures: {path} has no level of {MOST_DRAWN:.3g} voxels or fewer to draw, or is cropped; leave it out"
         )
-    part = plan.source.part
-    image = open_stored(path, volume=part.volume, crop=None if part.crop is None else parse_crop(part.crop))
+    file = _volume_file(plan)
+    image = open_stored(file.path, volume=file.volume, crop=file.crop)
     log.print(escape(f"{path}: {' x '.join(map(str, image.shape))} voxels, which stay in the file"))
     about = {
         "image": path.name, "image_sha256": sha256(path), "box": box_text(box_of(image)),

@@ -74,10 +74,7 @@ def size_by_headers(plan: Plan, like: RunSize | None = None) -> RunSize:
         As `tetopt.io.images.file_shape`, or `load_image` of a picture or DICOM, which is read.
     """
     part, path = plan.source.part, plan.source.images[0]
-    shape = (file_shape(path) or load_image(path, volume=part.volume).shape)[:3]
-    if part.crop is not None:
-        bounds = zip(shape, parse_crop(part.crop), strict=False)
-        shape = tuple(len(range(length)[slice(*ends)]) for length, ends in bounds)
+    shape = cropped_shape(plan, (file_shape(path) or load_image(path, volume=part.volume).shape)[:3])
     if part.slice_ is not None:
         axis, _ = parse_slice(part.slice_)
         shape = shape[:axis] + shape[axis + 1 :]
@@ -90,6 +87,14 @@ def size_by_headers(plan: Plan, like: RunSize | None = None) -> RunSize:
         n_voxels=n_voxels, n_nodes=n_nodes, n_channels=like.n_channels, elongation=like.elongation,
         has_memberships=like.has_memberships, is_fractional=like.is_fractional,
     )  # fmt: skip
+
+
+def cropped_shape(plan: Plan, shape: tuple[int, ...]) -> tuple[int, ...]:
+    """What the crop that is asked for leaves of voxels of this shape."""
+    if plan.source.part.crop is None:
+        return shape
+    bounds = zip(shape, parse_crop(plan.source.part.crop), strict=False)
+    return tuple(len(range(length)[slice(*ends)]) for length, ends in bounds)
 
 
 def _sample(content: Content) -> NDArray:
