@@ -1,4 +1,4 @@
-# The BIDS app of tetopt; docs/containers.md has how it is built and run.
+# The BIDS app of tetopt; docs/howto/containers.md has how it is built and run.
 FROM python:3.12-slim
 
 # By these VTK draws boundaries where there is no screen.

@@ -9,7 +9,7 @@ TESTED = PYTHONUTF8=1 NUMBA_CACHE_DIR=$(NUMBA_CACHE) MPLBACKEND=agg $(BIN)/pytho
 
 SOLVERS = calculix-ccx python3-dolfinx
 
-.PHONY: demo test test-slow test-random test-solvers test-nojit test-onethread test-hostile test-container test-slurm test-cohort test-parts lint bench bench-blocks fingerprints clean
+.PHONY: demo test test-slow test-random test-solvers test-nojit test-onethread test-hostile test-container test-slurm test-cohort test-parts lint bench bench-blocks fingerprints docs clean
 
 demo: $(VENV)/.demo
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt demo -o demo --force
@@ -68,6 +68,12 @@ test-parts: $(VENV)/.test
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python tests/parts/campaign.py
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) PYTHONPATH=tests $(BIN)/python tests/parts/seams.py
 
+# The site, into docs/_build/html, without the network; warnings are errors. The gallery's programs run, for minutes.
+docs: $(VENV)/.test
+	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt warm-up
+	NUMBA_CACHE_DIR=$(NUMBA_CACHE) PYTHONUTF8=1 $(BIN)/python -m sphinx -W --keep-going -q -b html -d docs/_build/doctrees docs docs/_build/html
+	@echo "docs/_build/html/index.html"
+
 lint: $(VENV)/.test
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -104,4 +110,4 @@ $(VENV)/.test: $(VENV)/bin/python pyproject.toml
 	@touch $@
 
 clean:
-	rm -rf $(VENV) .numba_cache demo bench.json bench_blocks.json cost.toml cost_runs.jsonl fingerprints.json
+	rm -rf $(VENV) .numba_cache demo docs/_build docs/gallery bench.json bench_blocks.json cost.toml cost_runs.jsonl fingerprints.json

@@ -1,6 +1,6 @@
 """A mesh of tetrahedra cut open: its cells in the grey of their means and in the colours of their labels.
 
-The README's picture of a brain, `docs/organ.png`, is one. Image and labels are of the same voxels.
+The README's picture of a brain, `docs/pictures/organ.png`, is one. Image and labels are of the same voxels.
 
     python scripts/cut_open.py organ.vtu --image T1.nii.gz --labels tissues.nii.gz -o organ.png
 """

@@ -12,7 +12,7 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 SOURCES = sorted((ROOT / "tetopt").rglob("*.py"))
-DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("*.md")), ROOT / "tests" / "benchmarks" / "README.md"]
+DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("**/*.md")), ROOT / "tests" / "benchmarks" / "README.md"]
 # More than 8 parameters: public functions, whose signature is a contract, and fluxes of numbers with no common noun.
 WIDE = {
     "tetopt.fem.elasticity.compression": 9,

@@ -6,7 +6,7 @@ linker's symbol, as a function of another file is in C; a *record* (a NamedTuple
 block of memory whose address is passed. Helpers are plain numba functions that go into the units that use them;
 *entries* are what Python calls; and a parallel loop is a unit run for each number of a range (`run`).
 
-docs/kernels.md tells what each of these bought.
+docs/develop/kernels.md tells what each of these bought.
 """
 
 from __future__ import annotations

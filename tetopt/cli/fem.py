@@ -46,7 +46,7 @@ INTENSITY_LAW = "h"  # an image without --young: its intensities are the moduli,
 PAPER_PERCENT = 1.0  # how far the paper's test compresses, for a linear law only a scale
 SHOWN_SHARE = 1e-9  # of a force's largest component: less is what an iterative solution leaves
 SMALL_SHARE = 0.1  # of the mesh's length: displacements beyond it are not small, at strains of some 10 %
-LOCKING_NU = 0.45  # from where on linear cells are far behind quadratic ones, see docs/order.md
+LOCKING_NU = 0.45  # from where on linear cells are far behind quadratic ones, see docs/understand/order.md
 
 
 def fem_command(
@@ -210,7 +210,7 @@ def _advise(model: Model, solutions: list[Solution]) -> None:
         log.print(
             f"nu is up to {largest:g}, where linear cells are too stiff: their displacements were off by 1.6 to 1.8 "
             "times as much as those of quadratic cells on as many nodes at 0.45, 2.4 to 2.8 times at 0.49; try "
-            "--order 2 (docs/order.md)"
+            "--order 2 (docs/understand/order.md)"
         )
     size = float(np.ptp(model.mesh.points, axis=0).max())
     moved = max(float(np.sqrt((solution.u**2).sum(axis=1).max())) for solution in solutions)

@@ -16,7 +16,7 @@ from tetopt.geometry.topology import Facets, boundary_facets
 from tetopt.image import Image, transformed
 from tetopt.mesh import Mesh
 
-# The defaults of every way in, and their evidence (docs/default_k_d.md, docs/sizes.md).
+# The defaults of every way in, and their evidence (docs/measured/k_d.md, docs/understand/sizes.md).
 UNIFORM_K_D = 0.2  # nearly all that the displacement gains by the image, at hardly any cost in shape
 UNIFORM_ITERATIONS = 20  # sweeps over all nodes, as in the paper's figures
 GRADED_K_D = 0.85  # on the MNI152 T1 with 15,000 nodes: a third of the uniform mesh's E_D, mean rho 0.255
@@ -26,8 +26,8 @@ GRADED_ITERATIONS = 16  # sweeps; four more would lower E_D by 2 % there
 START_K_D = 0.02
 SHAPE_POWER = 3.0  # p: from 3 on the energy itself keeps angles above the floor at the uniform k_D
 MIN_DIHEDRAL = 12.0  # degrees: the floor
-# The longest edge over a uniform mesh's for cells of order 2 (docs/order.md): there are seven times fewer cells, and
-# the displacement suffers sooner from those that grow where the image is uniform.
+# The longest edge over a uniform mesh's for cells of order 2 (docs/understand/order.md): there are seven times fewer
+# cells, and the displacement suffers sooner from those that grow where the image is uniform.
 QUADRATIC_SHARE = 1.15
 QUADRATIC_GRADATION = 0.5  # of sizes, likewise: gentler changes lower the displacement's error and the interfaces'
 E_D_ROUNDING = 1e-12  # of the image's own variance x volume: less E_D than this is rounding

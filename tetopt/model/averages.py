@@ -26,7 +26,7 @@ from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.model.laws import Law, law_values, young_from
 
-DEFAULT_AVERAGE = "gauss"  # of moduli (docs/moduli.md), but in `tetopt paper`, which keeps Eq. (2)
+DEFAULT_AVERAGE = "gauss"  # of moduli (docs/understand/moduli.md), but in `tetopt paper`, which keeps Eq. (2)
 POWER_WORDS = {"mean": 1.0, "geometric": 0.0, "harmonic": -1.0}
 LARGEST_POWER = 10.0  # either way; beyond it a mean of powers is hardly but the greatest or the least value
 VOXELS_PER_CHUNK = 2**20  # whose places in their cells are computed at once, 100 MB

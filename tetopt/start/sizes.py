@@ -14,7 +14,8 @@ from tetopt.image import Image, VoxelGrid
 from tetopt.kernel_cache import njit
 from tetopt.start.lattice import near_cubes
 
-# A graded mesh's longest edge over that of a uniform mesh with as many nodes, where no other is set (`docs/sizes.md`).
+# A graded mesh's longest edge over that of a uniform mesh with as many nodes, where no other is set
+# (`docs/understand/sizes.md`).
 COARSEST_SHARE = 1.4
 # By dimension, the shortest, the mean and the longest edge of the cells in a block over the block's own edge: from a
 # corner to the centre; over 8 of these and 6 sides (in 2-D 4 and 2); and, in 3-D, the diagonal of a block's side on the

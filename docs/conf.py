@@ -1,0 +1,63 @@
+"""The documentation's site, which `make docs` builds into docs/_build/html; nothing is fetched for it."""
+
+import os
+import sys
+from importlib.metadata import version as installed_version
+from pathlib import Path
+
+HERE = Path(__file__).parent
+sys.path.insert(0, str(HERE / "_extensions"))
+os.environ.setdefault("PYVISTA_OFF_SCREEN", "true")
+os.environ.setdefault("MPLBACKEND", "agg")
+os.environ["PYVISTA_BUILDING_GALLERY"] = "true"  # before pyvista is loaded
+
+project = "tetopt"
+author = "The tetopt developers"
+copyright = "2026, the tetopt developers; BSD-3-Clause"
+version = release = installed_version("tetopt")
+
+extensions = [
+    "myst_parser",
+    "sphinx.ext.autodoc",
+    "sphinx.ext.autosummary",
+    "numpydoc",
+    "sphinx_copybutton",
+    "sphinx_design",
+    "sphinx_gallery.gen_gallery",
+    "mathml",
+]
+exclude_patterns = ["_build", "_extensions", "examples/GALLERY_HEADER.rst"]
+myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
+myst_heading_anchors = 3
+nitpicky = False
+numpydoc_show_class_members = False
+autodoc_typehints = "none"  # the docstrings say types, shapes and units
+copybutton_exclude = ".linenos, .gp, .go"
+
+sphinx_gallery_conf = {
+    "examples_dirs": "examples",
+    "gallery_dirs": "gallery",
+    "filename_pattern": r"\.py$",
+    "image_scrapers": ("matplotlib", "pyvista"),
+    "remove_config_comments": True,
+    "abort_on_example_error": True,
+    "show_memory": False,
+    "download_all_examples": False,
+    "min_reported_time": 1_000_000,  # seconds of this machine are no news of the examples
+}
+
+html_theme = "pydata_sphinx_theme"
+html_title = f"tetopt {release}"
+html_static_path = ["_static"]
+html_css_files = ["tetopt.css"]
+html_copy_source = False
+html_show_sourcelink = False
+html_theme_options = {
+    "navbar_align": "left",
+    "navbar_end": ["theme-switcher"],
+    "show_prev_next": True,
+    "show_toc_level": 2,
+    "footer_start": ["copyright"],
+    "footer_end": [],
+    "secondary_sidebar_items": ["page-toc"],
+}
