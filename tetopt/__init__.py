@@ -14,63 +14,120 @@ if TYPE_CHECKING:
     from tetopt.check import check_mesh
     from tetopt.energy.discretization import E_D
     from tetopt.energy.geometric import E_G
-    from tetopt.energy.sampling import cell_moments, cell_of_voxel
+    from tetopt.energy.sampling import CellMoments, cell_moments, cell_of_voxel
     from tetopt.engine.fast import optimize
+    from tetopt.engine.loop import Optimized, Record
     from tetopt.engine.meshing import mesh_image
     from tetopt.engine.paper import optimize_paper
     from tetopt.errors import InputError
-    from tetopt.image import Image
+    from tetopt.fem.solution import Solution, SolutionFields, solution_fields, solved_model
+    from tetopt.geometry.surface import Surface, surface_of
+    from tetopt.image import Image, VoxelGrid
     from tetopt.io.formats import save_mesh, save_model
+    from tetopt.io.frd import Results, read_frd
     from tetopt.io.images import load_image, save_image
     from tetopt.io.label_tables import load_label_table
-    from tetopt.io.meshes import load_mesh
-    from tetopt.measure.fidelity import cell_labels, label_fidelity, mask_fidelity
-    from tetopt.measure.interfaces import label_interfaces
-    from tetopt.measure.quality import quality
+    from tetopt.io.meshes import MeshFile, load_mesh
+    from tetopt.io.stored_images import open_stored
+    from tetopt.io.surfaces import save_surface
+    from tetopt.measure.fidelity import LabelFidelity, MaskFidelity, cell_labels, label_fidelity, mask_fidelity
+    from tetopt.measure.interfaces import LabelInterface, label_interfaces
+    from tetopt.measure.quality import Quality, QualityErrors, quality
+    from tetopt.measure.segmentation import segmented
     from tetopt.mesh import Mesh
     from tetopt.model.build import model_of
     from tetopt.model.fields import cell_fields
-    from tetopt.phantom import load_phantom
+    from tetopt.model.labels import LabelTable
+    from tetopt.model.laws import ByLabel
+    from tetopt.model.loads import Load
+    from tetopt.model.materials import BinningError, Materials
+    from tetopt.model.model import Model
+    from tetopt.model.sets import Box, Sets
+    from tetopt.phantom import Phantom, Shape, load_phantom
     from tetopt.start.lattice import lattice
     from tetopt.start.octree import octree
     from tetopt.start.sizes import Sizes
+    from tetopt.stored import StoredImage
     from tetopt.target.align import aligned_contrast, aligned_labels, aligned_mask, foreground
-    from tetopt.target.content import content
+    from tetopt.target.content import Content, content
+    from tetopt.target.statistics import Statistics
 
 _NAMES_OF = {  # by module
     "check": ("check_mesh",),
     "energy.discretization": ("E_D",),
     "energy.geometric": ("E_G",),
-    "energy.sampling": ("cell_moments", "cell_of_voxel"),
+    "energy.sampling": ("CellMoments", "cell_moments", "cell_of_voxel"),
     "engine.fast": ("optimize",),
+    "engine.loop": ("Optimized", "Record"),
     "engine.meshing": ("mesh_image",),
     "engine.paper": ("optimize_paper",),
     "errors": ("InputError",),
-    "image": ("Image",),
+    "fem.solution": ("Solution", "SolutionFields", "solution_fields", "solved_model"),
+    "geometry.surface": ("Surface", "surface_of"),
+    "image": ("Image", "VoxelGrid"),
     "io.formats": ("save_mesh", "save_model"),
+    "io.frd": ("Results", "read_frd"),
     "io.images": ("load_image", "save_image"),
     "io.label_tables": ("load_label_table",),
-    "io.meshes": ("load_mesh",),
-    "measure.fidelity": ("cell_labels", "label_fidelity", "mask_fidelity"),
-    "measure.interfaces": ("label_interfaces",),
-    "measure.quality": ("quality",),
+    "io.meshes": ("MeshFile", "load_mesh"),
+    "io.stored_images": ("open_stored",),
+    "io.surfaces": ("save_surface",),
+    "measure.fidelity": ("LabelFidelity", "MaskFidelity", "cell_labels", "label_fidelity", "mask_fidelity"),
+    "measure.interfaces": ("LabelInterface", "label_interfaces"),
+    "measure.quality": ("Quality", "QualityErrors", "quality"),
+    "measure.segmentation": ("segmented",),
     "mesh": ("Mesh",),
     "model.build": ("model_of",),
     "model.fields": ("cell_fields",),
-    "phantom": ("load_phantom",),
+    "model.labels": ("LabelTable",),
+    "model.laws": ("ByLabel",),
+    "model.loads": ("Load",),
+    "model.materials": ("BinningError", "Materials"),
+    "model.model": ("Model",),
+    "model.sets": ("Box", "Sets"),
+    "phantom": ("Phantom", "Shape", "load_phantom"),
     "start.lattice": ("lattice",),
     "start.octree": ("octree",),
     "start.sizes": ("Sizes",),
+    "stored": ("StoredImage",),
     "target.align": ("aligned_contrast", "aligned_labels", "aligned_mask", "foreground"),
-    "target.content": ("content",),
+    "target.content": ("Content", "content"),
+    "target.statistics": ("Statistics",),
 }
 __all__ = [
     "E_D",
     "E_G",
+    "BinningError",
+    "Box",
+    "ByLabel",
+    "CellMoments",
+    "Content",
     "Image",
     "InputError",
+    "LabelFidelity",
+    "LabelInterface",
+    "LabelTable",
+    "Load",
+    "MaskFidelity",
+    "Materials",
     "Mesh",
+    "MeshFile",
+    "Model",
+    "Optimized",
+    "Phantom",
+    "Quality",
+    "QualityErrors",
+    "Record",
+    "Results",
+    "Sets",
+    "Shape",
     "Sizes",
+    "Solution",
+    "SolutionFields",
+    "Statistics",
+    "StoredImage",
+    "Surface",
+    "VoxelGrid",
     "__version__",
     "aligned_contrast",
     "aligned_labels",
@@ -93,12 +150,19 @@ __all__ = [
     "mesh_image",
     "model_of",
     "octree",
+    "open_stored",
     "optimize",
     "optimize_paper",
     "quality",
+    "read_frd",
     "save_image",
     "save_mesh",
     "save_model",
+    "save_surface",
+    "segmented",
+    "solution_fields",
+    "solved_model",
+    "surface_of",
 ]
 
 

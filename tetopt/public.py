@@ -23,6 +23,9 @@ TABLE_WORDS = ("Points", "Cells")  # of these, those of a row each, which are ta
 REMEDIES = {
     "Image": "tetopt.load_image(path) reads one, tetopt.Image(array, affine) makes one",
     "Mesh": "tetopt.load_mesh(path).mesh reads one, tetopt.mesh_image(...).mesh is one",
+    "Model": "tetopt.model_of(mesh, ...) makes one",
+    "Solution": "tetopt.solved_model(model) returns one",
+    "Surface": "tetopt.surface_of(points, cells, chosen) returns one",
 }
 NAMES_OF_KINDS = {
     "int": "a whole number",
@@ -56,7 +59,8 @@ def check_arguments(function: Callable[..., Any], arguments: dict[str, Any]) -> 
     for name, value in arguments.items():
         parameter = inspect.signature(function).parameters[name]
         if value is not parameter.default and parameter.kind is not parameter.VAR_KEYWORD:
-            _check(f"{function.__name__}: {name}", str(parameter.annotation), value, function.__globals__)
+            names = inspect.unwrap(function).__globals__  # not those of a decorator's module
+            _check(f"{function.__name__}: {name}", str(parameter.annotation), value, names)
 
 
 def _check(what: str, annotation: str, value: Any, names: dict[str, Any]) -> None:

@@ -260,7 +260,7 @@ def node_means(mesh: Mesh, values: NDArray[np.float64]) -> NDArray[np.float64]:
     return np.stack(columns, axis=1).reshape(n_nodes, *values.shape[2:])
 
 
-class Fields(NamedTuple):
+class SolutionFields(NamedTuple):
     """What a solution puts on a mesh's file, by name."""
 
     cell_data: dict[str, NDArray[np.float64]]  # (M, ...)
@@ -268,7 +268,7 @@ class Fields(NamedTuple):
 
 
 @on_one_blas_thread
-def solution_fields(mesh: Mesh, solution: Solution, step: int = 1) -> Fields:
+def solution_fields(mesh: Mesh, solution: Solution, step: int = 1) -> SolutionFields:
     """Displacement, mm, strain, stress, kPa, and von Mises stress, on cells (means) and nodes; tensors row by row.
 
     Names of steps after the first end in "_step2" and so on.
@@ -287,7 +287,7 @@ def solution_fields(mesh: Mesh, solution: Solution, step: int = 1) -> Fields:
         "stress_nodes": stress_nodes.reshape(-1, n * n),
         "von_mises_nodes": von_mises(stress_nodes),
     }
-    return Fields(
+    return SolutionFields(
         {name + suffix: values for name, values in cell_data.items()},
         {name + suffix: values for name, values in point_data.items()},
     )
