@@ -25,6 +25,7 @@ extensions = [
     "sphinx_design",
     "sphinx_gallery.gen_gallery",
     "mathml",
+    "command_pages",
 ]
 exclude_patterns = ["_build", "_extensions", "examples/GALLERY_HEADER.rst"]
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
