@@ -52,3 +52,11 @@ def test_marked():
     """Signs that mean something in Markdown are escaped; what is quoted and options are code."""
     text = 'a*b <c>, "0.5 + 0.01*h", --load, -o, two-way, [d]'
     assert command_pages.marked(text) == r"a\*b \<c\>, `0.5 + 0.01*h`, `--load`, `-o`, two-way, \[d\]"
+
+
+def test_all_commands_are_listed():
+    """Each with a link to its page and its line."""
+    lines = command_pages.listed()
+    assert len(lines) == len(COMMANDS) + 1
+    assert "- [`tetopt phantom`](phantom.md): Write a phantom as an image: known shapes, known intensities." in lines
+    assert lines[-1].startswith("- [`python -m tetopt.bids`](bids.md): `tetopt cohort` with the arguments")

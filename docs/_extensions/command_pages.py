@@ -198,10 +198,14 @@ class CommandsDirective(SphinxDirective):
 
     def run(self) -> list[nodes.Node]:
         """The nodes in the page's place."""
-        lines = ["| command | what it does |", "|---|---|"]
-        lines += [f"| [`tetopt {name}`]({name}.md) | {marked(summary(name))} |" for name in COMMANDS.items()]
-        lines += [f"| [`python -m tetopt.bids`]({BIDS}.md) | {marked(summary(BIDS))} |"]
-        return self.parse_text_to_nodes("\n".join(lines))
+        _note_sources(self)
+        return self.parse_text_to_nodes("\n".join(listed()))
+
+
+def listed() -> list[str]:
+    """A line of Markdown for each command."""
+    names = {**{name: f"tetopt {name}" for name in COMMANDS}, BIDS: "python -m tetopt.bids"}
+    return [f"- [`{words}`]({name}.md): {marked(summary(name))}" for name, words in names.items()]
 
 
 def setup(app: Sphinx) -> dict[str, bool]:
