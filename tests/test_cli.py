@@ -837,7 +837,7 @@ def test_demo(tmp_path):
 
 def test_demo_without_nilearn(tmp_path, monkeypatch, capfd):
     monkeypatch.setattr(tetopt.io.mni.importlib.util, "find_spec", lambda name: None)
-    assert_refused(capfd, ["demo", "-o", tmp_path / "demo"], r'pip install "tetopt\[demo\]"')
+    assert_refused(capfd, ["demo", "-o", tmp_path / "demo"], r'pip install "nilearn(>=[0-9.]+)?"')
     assert list(tmp_path.iterdir()) == []
 
 
@@ -899,6 +899,18 @@ def test_figures(tmp_path, inputs):
     command = small_run(inputs, tmp_path, 1)
     assert exit_code(*command, "--figures", tmp_path) == 0
     assert {p.name for p in tmp_path.glob("*.png")} == {"slice.png", "rho.png", "energies.png", "thumbnail.png"}
+
+
+def test_folders_of_pictures_and_results_are_made_and_none_is_left_where_a_run_is_refused(tmp_path, inputs, capfd):
+    mesh = ["mesh", inputs / "sphere.nii.gz", "-o", tmp_path / "a.vtu", "--iterations", "0", "--spacing", "16"]
+    assert_refused(capfd, [*mesh, "--figures", tmp_path / "new" / "deep", "--mask", tmp_path / "no.nii"], "no.nii")
+    assert_refused(capfd, ["compare", inputs / "disc.nii", "-o", tmp_path / "new"], "expected a volume")
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "file").write_text("a file")
+    assert_refused(capfd, [*mesh, "--figures", tmp_path / "file"], "expected a folder for the results, found a file")
+    assert_refused(capfd, [*mesh, "--figures", tmp_path / "file" / "a"], "a: the folder for the results cannot be made")
+    assert exit_code(*mesh, "--figures", tmp_path / "new" / "deep") == 0
+    assert "slice.png" in {each.name for each in (tmp_path / "new" / "deep").iterdir()}
 
 
 def test_many_more_cells_than_voxels_are_said(tmp_path, capsys):

@@ -99,7 +99,8 @@ def test_measured_again(run, inputs, tmp_path, capsys):
             assert one == pytest.approx(other, nan_ok=True)
     said = capsys.readouterr().out
     assert "boundary to the mask's surface, mean, 95 %" in said
-    assert "by volume" in said
+    for words in ("volume, mm3", "larger by, %", "Dice by volume"):
+        assert words in said
     assert f"{again['interfaces'][0]['area_ratio']:.3f}" in said
 
 
@@ -113,6 +114,7 @@ def test_background(inputs, tmp_path, background, capsys):
     numbers = numbers_in(tmp_path / "a.json")
     assert 0.0 < numbers["inputs"]["background"] < 400.0
     assert tetopt.quality(mesh.points, mesh.cells).volume == pytest.approx(ball, rel=0.05)  # the cavity stays in
+    assert "E_D, share of the image's variance" in capsys.readouterr().out
 
 
 def test_labels_alone(inputs, tmp_path, capsys):
@@ -121,7 +123,9 @@ def test_labels_alone(inputs, tmp_path, capsys):
     command = ["mesh", path, "--labels", path, "--nodes", "300", "--iterations", "3", "-o", tmp_path / "a.vtu"]
     assert exit_code(*command, "--json", tmp_path / "a.json") == 0
     assert numbers_in(tmp_path / "a.json")["inputs"]["weights"] == [0.0]
-    assert "only these count" in capsys.readouterr().err
+    captured = capsys.readouterr()
+    assert "only these count" in captured.err
+    assert "E_D, share of the labels' variance" in captured.out
 
 
 def test_a_label_never_vanishes_silently(tmp_path, capsys):

@@ -112,7 +112,7 @@ PATTERNS = {  # by words of them: a session, and what matches
 
 def test_patterns_of_the_documents_find_what_programs_write(tmp_path, monkeypatch):
     """One file each, in folders as fMRIPrep, FreeSurfer and SynthSeg leave them, with other subjects and spaces."""
-    words = (Path(__file__).parents[2] / "docs" / "cohorts.md").read_text()
+    words = (Path(__file__).parents[2] / "docs" / "howto" / "cohorts.md").read_text()
     written = re.findall(r"^    --(?:mask|labels) (\S+)$", words, re.M)
     others = [name.replace("sub-1", "sub-10") for _, name in PATTERNS.values()]
     others += [name.replace("_desc", "_space-MNI152_desc") for _, name in PATTERNS.values()]
@@ -163,7 +163,7 @@ def test_names_that_are_no_text_are_no_images(tmp_path):
 
 def test_without_the_library_one_line_says_what_to_install(tmp_path, monkeypatch):
     monkeypatch.setitem(sys.modules, "bids", None)
-    with pytest.raises(InputError, match=r'pip install "tetopt\[cohort\]"'):
+    with pytest.raises(InputError, match=r'pip install "pybids(>=[0-9.]+)?"'):
         bids_subjects(filled(tmp_path / "raw"))
 
 

@@ -383,7 +383,7 @@ def test_without_simpleitk(tmp_path, monkeypatch, name):
         path.mkdir()
     else:
         path.write_bytes(b"hello")
-    assert_refused(path, re.escape('pip install "tetopt[itk]"'))
+    assert_refused(path, 'pip install "SimpleITK(>=[0-9.]+)?"')
 
 
 def test_nifti_does_not_need_simpleitk(tmp_path, monkeypatch):

@@ -16,7 +16,7 @@ import tetopt
 from tetopt import Image, InputError, save_mesh
 from tetopt.budget import BYTES_PER_GB
 from tetopt.cli.console import log, out, print_wide
-from tetopt.cli.inputs import checked_outputs, label_table, read_labels, read_volume, results_folder
+from tetopt.cli.inputs import checked_outputs, label_table, read_labels, read_volume
 from tetopt.cli.options import (
     DEFAULT_NODES,
     WHOLE_BOX,
@@ -29,7 +29,7 @@ from tetopt.cli.options import (
     option,
 )
 from tetopt.cli.quality import image_fit
-from tetopt.io.files import checked_output, save_json
+from tetopt.io.files import checked_output, results_folder, save_json
 from tetopt.io.images import sha256
 from tetopt.io.mni import mni_path, mni_tissue
 from tetopt.measure.quality import quality

@@ -161,14 +161,6 @@ def warn_of_other_image(loaded: MeshFile, mesh_path: Path, image_path: Path) -> 
     return is_other
 
 
-def results_folder(path: Path) -> Path:
-    """`path`, made if it is not there."""
-    if path.exists() and not path.is_dir():
-        raise InputError(f"{path}: expected a folder for the results, found a file")
-    path.mkdir(parents=True, exist_ok=True)
-    return path
-
-
 def checked_outputs(folder: Path, names: Iterable[str], force: bool) -> dict[str, Path]:
     """Files in a folder by their names; InputError as `checked_output`."""
     return {name: checked_output(folder / name, (Path(name).suffix,), force) for name in names}

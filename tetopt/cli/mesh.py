@@ -18,7 +18,7 @@ from tetopt.budget import BYTES_PER_GB, MemoryLimit, peak_bytes, resident_bytes
 from tetopt.check import manifold_problems
 from tetopt.cli.console import log, out, print_fidelity, show_warning
 from tetopt.cli.ending import is_ended, mesh_kept, signal_code
-from tetopt.cli.inputs import label_table, read_mesh, results_folder, set_threads
+from tetopt.cli.inputs import label_table, read_mesh, set_threads
 from tetopt.cli.options import (
     DEFAULT_NODES,
     EngineOptions,
@@ -72,7 +72,7 @@ from tetopt.engine.meshing import (
 from tetopt.geometry.box import box_sides
 from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import centroids, squared_edges
-from tetopt.io.files import TakenError, check_space, save_json
+from tetopt.io.files import TakenError, check_space, results_folder, save_json
 from tetopt.io.formats import format_of
 from tetopt.io.meshes import MeshFile
 from tetopt.io.mni import mni_path
@@ -433,7 +433,7 @@ def _print(task: Task, outcome: Outcome, model: Model, measured: dict[str, Any])
         edges = outcome.shapes[1]
         warn_of_sizes(task.sizes, edges.min_edge, edges.max_edge, measured.get("edges_over_target"))
     _print_comparison(content, outcome, task.start_name, model.order, measured["cells_without_voxel"])
-    print_fidelity(measured)
+    print_fidelity(measured, model.mesh.ndim)
     if solver.are_any() or output.mesh.suffix.lower() != ".vtu":
         print_model(output.mesh, model, solver)
     else:
@@ -456,15 +456,22 @@ def _print_comparison(content: Content | StoredContent, outcome: Outcome, start:
     if first.E_D > 0.0:
         table.add_row("E_D, of initial", "1.0000", f"{last.E_D / first.E_D:.4f}")
     if first.E_D > 0.0 and (spread := content.variance * content.volume) > 0.0:
-        is_one = isinstance(content, StoredContent) or (content.is_plain and content.region is None)
-        whose = "the image's variance" if is_one else "all channels' variance"
-        table.add_row(f"E_D, share of {whose}", f"{first.E_D / spread:.5f}", f"{last.E_D / spread:.5f}")
+        table.add_row(
+            f"E_D, share of {_whose_variance(content)}", f"{first.E_D / spread:.5f}", f"{last.E_D / spread:.5f}"
+        )
     meshes = (initial, mesh)
     in_all = [size_summary(each, order)["n_nodes_in_all"] for each in meshes] if order == 2 else []
     add_quality(table, *outcome.shapes, in_all=in_all)
     if n_empty:
         table.add_row("cells that hold no voxel centre", "", str(n_empty))
     out.print(table)
+
+
+def _whose_variance(content: Content | StoredContent) -> str:
+    """Of what E_D is a share, in words; labels that are an image of their own are its only channels."""
+    if isinstance(content, StoredContent) or (content.n_contrasts == 1 and len(content.values) == 1):
+        return "the image's variance"
+    return "the labels' variance" if content.n_contrasts == 0 else "the variance of all images and labels"
 
 
 def demo_command(

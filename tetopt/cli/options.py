@@ -48,10 +48,8 @@ def option(metavar: str, text: str, *names: str, **more: Any) -> Any:
     return typer.Option(*names, metavar=metavar, help=text, **more)
 
 
-ImageArgument = Annotated[
-    Path,
-    typer.Argument(metavar="IMAGE", help="NIfTI, MGZ, NRRD, MetaImage, OME-Zarr, a DICOM folder, or a 2-D picture."),
-]
+IMAGE_FILES = "NIfTI, MGZ, NRRD, MetaImage, OME-Zarr, a DICOM folder, or a 2-D picture."
+ImageArgument = Annotated[Path, typer.Argument(metavar="IMAGE", help=IMAGE_FILES)]
 MeshArgument = Annotated[
     Path, typer.Argument(metavar="MESH", help="VTU, VTK or gmsh MSH file of tetrahedra or triangles.")
 ]
@@ -166,7 +164,7 @@ class SourceOptions(ContentOptions):
     images: Annotated[
         list[Path],
         typer.Argument(
-            metavar="IMAGE...", help="As for the other commands; further contrasts go to the first one's grid."
+            metavar="IMAGE...", help=f"{IMAGE_FILES} Further ones are contrasts, taken to the first one's grid."
         ),
     ]
 
@@ -378,7 +376,7 @@ class OutputOptions:
     mesh: Annotated[Path, option("MESH", f"The mesh to write: {', '.join(FORMATS)}.", "-o", "--output")]
     json_path: JsonOption = None
     figures: Annotated[
-        Path | None, option("DIR", "Draw slice.png, rho.png, energies.png and others in this folder.")
+        Path | None, option("DIR", "Draw slice.png, rho.png, energies.png and others in this folder, made if need be.")
     ] = None
     predict: Annotated[
         bool, typer.Option("--predict", help="Tell how long the run takes and how much memory, and write nothing.")

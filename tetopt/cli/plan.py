@@ -26,7 +26,7 @@ from tetopt.engine.fast import check_options
 from tetopt.engine.loop import MIN_DIHEDRAL, SHAPE_POWER
 from tetopt.engine.meshing import MODE_DEFAULTS, QUADRATIC_NODES, Mode, check_target_error, sizes_of_order
 from tetopt.engine.paper import default_n_t
-from tetopt.io.files import checked_output
+from tetopt.io.files import checked_output, results_folder
 from tetopt.io.formats import FORMATS, format_of
 from tetopt.io.images import parse_crop, parse_slice
 from tetopt.start.lattice import KINDS
@@ -211,7 +211,7 @@ def _pictures(source: SourceOptions, output: OutputOptions) -> list[Path]:
     names += [] if source.mask is None and source.background is None else ["boundary.png"]
     names += [] if source.labels is None else ["labels.png"]
     names += ["thumbnail.png"]
-    return list(checked_outputs(output.figures, names, output.force).values())
+    return list(checked_outputs(results_folder(output.figures), names, output.force).values())
 
 
 def with_numbers(plan: Plan, content: Content | StoredContent) -> tuple[Plan, tetopt.Sizes | None]:

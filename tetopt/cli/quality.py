@@ -80,7 +80,7 @@ def quality_command(
     if json_path is not None:
         save_json(json_path, report)
     out.print(table)
-    print_fidelity(measured)
+    print_fidelity(measured, loaded.mesh.ndim)
     if check:
         _say_checked(mesh_path, image, is_masked, problems, remarks)
     if problems:

@@ -36,10 +36,12 @@ from tetopt.cluster.crew import (
 )
 from tetopt.cluster.jobs import configuration, submitted
 from tetopt.errors import InputError
+from tetopt.extras import install_hint
 
 CONNECT_SECONDS = 10  # until a scheduler that does not answer is given up: dask's own is 30
 CLOSE_SECONDS = 1.0  # for a worker to end by itself, and as much until one that is killed is gone: dask's own is 5
 LOGGER_NAMES = ("distributed", "dask_jobqueue", "bokeh", "tornado", "asyncio")  # of what speaks in dask
+DASK_PACKAGES = ("distributed", "dask-jobqueue", "bokeh", "cryptography")  # of the extras "cohort" and "blocks"
 
 
 @contextmanager
@@ -106,9 +108,8 @@ def check_installed(extra: str) -> None:
         import dask_jobqueue  # noqa: F401, which ends the program by sys.exit at Ctrl-C as soon as it is imported
         import distributed  # noqa: F401
     except ImportError as error:
-        raise InputError(
-            f'{error.name} is not installed, by which dask runs tasks; pip install "tetopt[{extra}]"'
-        ) from error
+        hint = install_hint(extra, *DASK_PACKAGES)
+        raise InputError(f"{error.name} is not installed, by which dask runs tasks; {hint}") from error
     finally:
         if threading.current_thread() is threading.main_thread():
             signal.signal(signal.SIGINT, before)

@@ -17,6 +17,7 @@ from typing import Any, NamedTuple
 from tetopt.cohort.layout import DESCRIPTION_NAME
 from tetopt.cohort.subjects import Problems, Subject
 from tetopt.errors import InputError
+from tetopt.extras import install_hint
 from tetopt.incoming import json_of, text_of
 from tetopt.io.text import plain
 
@@ -175,7 +176,7 @@ def _image_paths(folder: Path, suffix: str, labels: Iterable[str]) -> list[Path]
         from bids import BIDSLayout
         from bids.layout import BIDSLayoutIndexer
     except ImportError:
-        raise InputError('BIDS folders need pybids: pip install "tetopt[cohort]", or give a table') from None
+        raise InputError(f"BIDS folders need pybids: {install_hint('cohort', 'pybids')}, or give a table") from None
     ignored = [
         "^/(?!sub-)",
         "^(/[^/]*){5}",  # the way of links in a circle has no end

@@ -293,7 +293,13 @@ def save_table(path: Path, rows: Sequence[Row], flags: Sequence[Sequence[str]]) 
             fixed = [row.subject, row.session or None, row.status, row.reason or None, "; ".join(reasons) or None]
             stream.write("\t".join(map(field_text, chain(fixed, map(row.numbers.get, names)))) + "\n")
     labels = {number: name for row in reversed(rows) for number, name in row.label_names.items()}
-    save_json(path.with_suffix(".json"), {name: description(name, labels) for name in (*heads, *names)})
+    dimensions = {row.numbers.get("quality.ndim") for row in rows} - {None}
+    ndim = dimensions.pop() if len(dimensions) == 1 else "n"
+    about = {name: description(name, labels) for name in (*heads, *names)}
+    for words in about.values():
+        if words.get("Units") == "mm^n":
+            words["Units"] = f"mm^{ndim}"
+    save_json(path.with_suffix(".json"), about)
 
 
 def field_text(value: Value) -> str:

@@ -41,6 +41,7 @@ class Outputs(NamedTuple):
     may_replace: dict[Path, bool]  # of each output that was checked, whether what lies there by now may go
     places: dict[Path, Path]  # where it really lies, links followed
     written: list[Path]  # of those checked
+    made: list[Path]  # folders for the outputs that were not there before
 
 
 _OUTPUTS: ContextVar[Outputs | None] = ContextVar("outputs", default=None)
@@ -51,14 +52,18 @@ def outputs_of_command() -> Iterator[Outputs]:
     """Within it, outputs checked by `checked_output` are a command's.
 
     None of them may be one of its inputs, nor two of them the same; one that was not there when it was checked is not
-    replaced if it is there when it is written, unless by `force`.
+    replaced if it is there when it is written, unless by `force`. Of the folders that `results_folder` made none stays
+    that is empty at the end.
     """
-    outputs = Outputs([], {}, {}, [])
+    outputs = Outputs([], {}, {}, [], [])
     token = _OUTPUTS.set(outputs)
     try:
         yield outputs
     finally:
         _OUTPUTS.reset(token)
+        for folder in reversed(outputs.made):
+            with suppress(OSError):  # it holds something, or is another's by now
+                folder.rmdir()
 
 
 def name_files(values: Iterable[Any]) -> None:
@@ -66,6 +71,23 @@ def name_files(values: Iterable[Any]) -> None:
     if (outputs := _OUTPUTS.get()) is not None:
         flat = (each for value in values for each in (value if isinstance(value, list) else [value]))
         outputs.named.extend(each for each in flat if isinstance(each, Path))
+
+
+def results_folder(path: Path) -> Path:
+    """`path`, made with the folders above it if it is not there; InputError for a file, or where none can be made.
+
+    Of a command that is refused afterwards no empty folder is left.
+    """
+    if os.path.lexists(path) and not path.is_dir():
+        raise InputError(f"{path}: expected a folder for the results, found a file")
+    new = [each for each in (path, *path.parents) if not os.path.lexists(each)][::-1]
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise InputError(f"{path}: the folder for the results cannot be made: {error.strerror}") from error
+    if (outputs := _OUTPUTS.get()) is not None:
+        outputs.made.extend(new)
+    return path
 
 
 def checked_output(

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from tetopt.budget import check_memory, memory_words
 from tetopt.errors import InputError
+from tetopt.extras import install_hint
 from tetopt.fem.solution import von_mises
 from tetopt.geometry.quadratic import quadratic
 from tetopt.incoming import regular_file
@@ -132,7 +133,8 @@ def _checked_bytes(path: Path) -> bytes:
     if not whole.rstrip().endswith(b"9999"):
         raise InputError(f"{path}: is cut off; is CalculiX still running, or did it break off?")
     if importlib.util.find_spec("pyvista_frd") is None:  # an extra: few have CalculiX
-        raise InputError(f"{path}: reading it needs pyvista-frd-reader: pip install 'tetopt[calculix]'")
+        hint = install_hint("calculix", "pyvista-frd-reader", "pyvista")
+        raise InputError(f"{path}: reading it needs pyvista-frd-reader; {hint}")
     return whole
 
 

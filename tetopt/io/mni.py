@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 
 from tetopt.errors import InputError
+from tetopt.extras import install_hint
 from tetopt.image import Image
 from tetopt.io.images import load_image
 
@@ -19,7 +20,7 @@ def mni_path(contrast: Literal["t1", "gm", "wm"]) -> Path:
     name = f"datasets/data/mni_icbm152_{contrast}_tal_nlin_sym_09a_converted.nii.gz"
     path = Path(package.origin).parent / name if package is not None and package.origin else Path(name)
     if not path.is_file():
-        raise InputError('the MNI152 brain is in nilearn\'s wheel: pip install "tetopt[demo]", or give an image')
+        raise InputError(f"the MNI152 brain is in nilearn's wheel: {install_hint('demo', 'nilearn')}, or give an image")
     return path
 
 

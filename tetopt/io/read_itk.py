@@ -11,6 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
+from tetopt.extras import install_hint
 from tetopt.incoming import irregular
 from tetopt.io.apart import read_apart
 from tetopt.io.itk_headers import HEADER_BYTES, checked_header
@@ -58,7 +59,7 @@ def read_dicom_folder(path: Path, volume: int | None) -> tuple[NDArray, NDArray[
 
 def _check_installed() -> None:
     if importlib.util.find_spec("SimpleITK") is None:
-        raise InputError('NRRD, MetaImage and DICOM need SimpleITK; pip install "tetopt[itk]"')
+        raise InputError(f"NRRD, MetaImage and DICOM need SimpleITK; {install_hint('itk', 'SimpleITK')}")
 
 
 # In the child

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
+from tetopt.extras import install_hint
 from tetopt.io.apart import DEFLATE_RATIO, read_apart
 from tetopt.io.pieces import MOST_PIECES, joined, model_pieces
 from tetopt.io.raw import Grid
@@ -42,7 +43,7 @@ def check_h5py() -> None:
     try:
         import h5py  # noqa: F401
     except ImportError:
-        raise InputError('.vtkhdf files need h5py: pip install "tetopt[blocks]", or take .vtu') from None
+        raise InputError(f".vtkhdf files need h5py: {install_hint('blocks', 'h5py')}, or take .vtu") from None
 
 
 def hdf_name(name: str) -> str:

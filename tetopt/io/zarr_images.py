@@ -19,6 +19,7 @@ from numpy.typing import DTypeLike, NDArray
 
 from tetopt.budget import check_memory
 from tetopt.errors import InputError
+from tetopt.extras import install_hint
 from tetopt.image import VoxelGrid, checked_affine
 from tetopt.incoming import LARGEST_NUMBER, TEXT_BYTES, irregular
 from tetopt.io.files import folder_written_whole
@@ -27,7 +28,6 @@ from tetopt.io.volumes import DAMAGED_FILE, VoxelsInFile, one_line, volume_index
 from tetopt.stored import StoredImage
 
 ZARR_SUFFIX = ".zarr"
-BLOCKS_NEEDED = 'needs the zarr library; pip install "tetopt[blocks]"'
 NODE_FILES = ("zarr.json", ".zarray", ".zgroup")  # one of which every array and group of Zarr has, of version 3 and 2
 METADATA_FILES = (*NODE_FILES, ".zattrs", ".zmetadata")
 MOST_CHUNKS = 2**24  # of one image: as many names are looked up in a minute or two; 2048^3 voxels have 4,096 of 128^3
@@ -215,7 +215,7 @@ def _library() -> Any:
         import zarr
         import zarr.storage
     except ImportError as error:
-        raise InputError(f"a folder of Zarr {BLOCKS_NEEDED}") from error
+        raise InputError(f"a folder of Zarr needs the zarr library; {install_hint('blocks', 'zarr')}") from error
     return zarr
 
 

@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
+from tetopt.extras import install_hint
 from tetopt.mesh import Mesh
 from tetopt.model.sets import Sets
 
@@ -43,7 +44,7 @@ def skfem_mesh(mesh: Mesh, sets: Sets) -> skfem.Mesh:
     try:
         import skfem
     except ImportError as error:
-        raise InputError("to_skfem: scikit-fem is not installed; pip install scikit-fem") from error
+        raise InputError(f"to_skfem: scikit-fem is not installed; {install_hint('test', 'scikit-fem')}") from error
     kind = skfem.MeshTet if mesh.ndim == 3 else skfem.MeshTri
     # Contiguous, or scikit-fem warns of making them so.
     bare = kind(np.ascontiguousarray(mesh.points.T), np.ascontiguousarray(mesh.cells.T))

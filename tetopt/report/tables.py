@@ -16,7 +16,7 @@ from tetopt.mesh import Mesh
 from tetopt.start.sizes import LONG_EDGE, SHORT_EDGE_SHARE, EdgeRatios
 
 CHANGED_SHARE = 0.2  # of a label's size: what cells have more or less is said in words
-LARGE_SIZE = 1e4  # mm^n: of a label so large its tenths are not shown
+LARGE_SIZE = 1e4  # mm3 or mm2: of a label so large its tenths are not shown
 
 
 def new_table(*columns: str) -> Table:
@@ -25,6 +25,11 @@ def new_table(*columns: str) -> Table:
     for number, column in enumerate(columns):
         table.add_column(column, justify="left" if number == 0 else "right")
     return table
+
+
+def size_words(ndim: int) -> str:
+    """What the size of something is called, and its unit."""
+    return "volume, mm3" if ndim == 3 else "area, mm2"
 
 
 def nodes_in_words(mesh: Mesh, order: int) -> str:
@@ -42,7 +47,7 @@ def add_quality(table: Table, *meshes: Quality, in_all: Sequence[int] = ()) -> N
         table.add_row("nodes in all", *map(str, in_all))
     rows: list[tuple[str, Callable[[Quality], str]]] = [
         ("cells", lambda q: str(q.n_cells)),
-        ("volume, mm3" if meshes[0].ndim == 3 else "area, mm2", lambda q: f"{q.volume:.2f}"),
+        (size_words(meshes[0].ndim), lambda q: f"{q.volume:.2f}"),
         ("rho, mean", lambda q: f"{q.mean_rho:.4f}"),
         ("rho, 1st percentile", lambda q: f"{q.p1_rho:.4f}"),
         ("rho, smallest", lambda q: f"{q.min_rho:.4f}"),
@@ -61,11 +66,11 @@ def add_quality(table: Table, *meshes: Quality, in_all: Sequence[int] = ()) -> N
         table.add_row(name, *(text(q) for q in meshes))
 
 
-def mask_table(mask: MaskFidelity) -> Table:
-    """How well a mesh fills its mask."""
+def mask_table(mask: MaskFidelity, ndim: int) -> Table:
+    """How well a mesh of so many dimensions fills its mask."""
     table = new_table("mask", "in voxels", "in the mesh")
     change = 100.0 * (mask.mesh_volume / mask.volume - 1.0)
-    table.add_row("size, mm^n", f"{mask.volume:.1f}", f"{mask.mesh_volume:.1f} ({change:+.1f} %)")
+    table.add_row(size_words(ndim), f"{mask.volume:.1f}", f"{mask.mesh_volume:.1f} ({change:+.1f} %)")
     table.add_row("Dice, by voxels", "", f"{mask.dice:.4f}")
     for title, *distances in (
         ("boundary to the mask's surface, mean, 95 %", mask.distance_mean, mask.distance_p95, mask.distance_mean_mm,
@@ -90,11 +95,16 @@ def sizes_in_words(edges: EdgeRatios) -> str:
     )
 
 
-def label_table(rows: Sequence[LabelFidelity], interfaces: Sequence[LabelInterface], names: Mapping[int, str]) -> Table:
-    """How well a mesh represents labels, and what their surfaces are like, a row for each, with its name if any."""
+def label_table(
+    rows: Sequence[LabelFidelity], interfaces: Sequence[LabelInterface], names: Mapping[int, str], ndim: int
+) -> Table:
+    """How well a mesh of so many dimensions represents labels, and what their surfaces are like.
+
+    There is a row for each, with its name if any. "larger by" is of its cells beside its voxels.
+    """
     table = new_table(
-        "label", "voxels", "size, mm^n", "cells", "more, %", "Dice", "by volume", "apart, mm", "95 %", "most",
-        "area ratio", "folded, %", "edges in > 2", "pieces", "of cells",
+        "label", "voxels", size_words(ndim), "cells", "larger by, %", "Dice", "Dice by volume", "distance, mm", "95 %",
+        "largest", "area ratio", "folded, %", "edges in > 2", "pieces of voxels", "of cells",
     )  # fmt: skip
     for row, surface in zip(rows, interfaces, strict=True):
         change = 100.0 * (row.mesh_volume / row.volume - 1.0)

@@ -22,6 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
+from tetopt.extras import pip_install
 from tetopt.geometry.box import box_sides
 from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import oriented
@@ -37,7 +38,8 @@ FIRST_SCALING = 2.0  # of features, in the first run: on the coarse side, where 
 VOXELS_PER_SPACING = 3.0  # of the cube that Cleaver gets, at least, unless the image itself is coarser
 CUBE_VOXELS = 256  # along an edge of the cube, at most: the next power of two takes eight times the memory
 LIPSCHITZ_BOUND = 0.5  # how fast its cells may grow away from the interfaces
-INSTALL_HINT = "install it with: python -m pip install itk-cleaver 'itk==5.3.0' 'numpy<2'"
+# With ITK 5.4 its import ends Python.
+INSTALL_HINT = f"install it with: {pip_install('itk-cleaver', 'itk==5.3.0', 'numpy<2')}"
 
 
 class Cube(NamedTuple):

@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
 from tetopt.errors import InputError
+from tetopt.extras import install_hint
 from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import oriented, volumes
 from tetopt.geometry.topology import boundary_facets
@@ -44,7 +45,6 @@ EDGE_GROWTH = 0.6  # mm by which edges lengthen per mm of distance from the inte
 EDGE_RATIO = 3.0  # edge far away over edge at the interfaces
 STOP_ENERGY = 10.0  # of fTetWild's cells (AMIPS; regular: 3), below which it stops: its own default
 LEAST_SHAPE = 2e-3  # volume over the longest edge's cube (regular: 0.118) under which a cell is mended
-TETWILD_HINT = "install it with: python -m pip install 'pytetwild>=0.4'"
 UNTANGLING_ROUNDS = 60  # after the boundary has been put on the box; what is inverted then cannot be mended so
 
 
@@ -121,9 +121,10 @@ def _tetrahedralize() -> Callable[..., tuple[NDArray, NDArray]]:
     try:
         return importlib.import_module("pytetwild").tetrahedralize
     except ImportError as error:
+        hint = f"install it with: {install_hint('compare', 'pytetwild')}"
         if isinstance(error, ModuleNotFoundError) and error.name == "pytetwild":
-            raise NotInstalled(f"pytetwild: not installed; {TETWILD_HINT}") from error
-        raise InputError(f"pytetwild: not usable ({error}); {TETWILD_HINT}") from error
+            raise NotInstalled(f"pytetwild: not installed; {hint}") from error
+        raise InputError(f"pytetwild: not usable ({error}); {hint}") from error
 
 
 def _run(
