@@ -86,18 +86,6 @@ def test_commands(tmp_path, monkeypatch):
     assert {path.name for path in tmp_path.iterdir()} == files
 
 
-def test_phantom_table(tmp_path):
-    """The TOML table is rendered by the command beside it; intensities and the ellipsoid's volume are as written."""
-    (table,) = re.findall(r"```toml\n(.*?)```", README, re.DOTALL)
-    (tmp_path / "tissue.toml").write_text(table, encoding="utf-8")
-    assert "tetopt phantom tissue.toml -o tissue.nii.gz" in README
-    assert main(["phantom", str(tmp_path / "tissue.toml"), "-o", str(tmp_path / "tissue.nii.gz")]) == 0
-    image = tetopt.load_image(tmp_path / "tissue.nii.gz")
-    assert image.shape == (40, 40, 30)
-    volume = (image.data - 10.0).sum() / 50.0
-    assert volume == pytest.approx(4.0 / 3.0 * 3.141592653589793 * 9 * 6 * 6, rel=2e-3)
-
-
 @pytest.mark.parametrize("target", ["demo", "test", "bench", "lint"])
 def test_make_targets(target):
     assert re.search(rf"^{target}:", (ROOT / "Makefile").read_text(encoding="utf-8"), re.MULTILINE)
