@@ -2,7 +2,8 @@
 
 What a process starts is its own, too, whatever process group or session that makes for itself: it counts for the
 limits, and ends with it. Where the parent is killed and can see to nothing any more, a shell that waits for its end
-does.
+does. Windows has neither groups nor that shell: there a process ends with those that descend from it, as far as they
+are known when it does, and is left alone by a parent that is killed.
 """
 
 from __future__ import annotations
@@ -60,6 +61,9 @@ def started(
 @contextlib.contextmanager
 def _guarded(child: subprocess.Popen, folder: Path) -> Iterator[None]:
     """A shell beside that ends the child's group, and takes its folder away, if this process ends before the block."""
+    if sys.platform == "win32":
+        yield
+        return
     shell = subprocess.Popen(
         ["sh", "-c", WATCHDOG, "tetopt", str(child.pid), str(folder)],
         stdin=subprocess.PIPE, stdout=subprocess.DEVNULL, stderr=subprocess.DEVNULL, start_new_session=True,
@@ -131,6 +135,12 @@ def _marked(folder: Path) -> list[Path]:
 
 def _kill_all(child: subprocess.Popen, folder: Path) -> None:
     """End whatever is left of the child and of all that it started, and collect the child."""
+    if sys.platform == "win32":
+        if child.poll() is None:
+            subprocess.run(["taskkill", "/F", "/T", "/PID", str(child.pid)], capture_output=True, check=False)
+        child.kill()
+        child.wait()
+        return
     for _ in range(KILL_ROUNDS):
         with contextlib.suppress(ProcessLookupError):  # raised where it ended by itself and left nothing behind
             os.killpg(child.pid, signal.SIGKILL)

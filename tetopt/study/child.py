@@ -9,7 +9,6 @@ end runs that need little.
 from __future__ import annotations
 
 import pickle
-import resource
 import subprocess
 import sys
 import tempfile
@@ -28,6 +27,11 @@ from tetopt.mesh import Mesh
 from tetopt.processes import started, watched
 from tetopt.study.endings import Crashed, NotInstalled, last_line, signal_words
 from tetopt.study.pipelines import Job, Produced
+
+try:
+    import resource
+except ImportError:  # Windows
+    resource = None  # type: ignore[assignment]
 
 Reason = Literal["crash", "limit", "missing", "error"]  # of a failure; "missing": it is not installed
 CRASH_CODE, MISSING_CODE = 93, 94  # of a child whose pipeline says so: codes that no program ends with by itself
@@ -111,6 +115,8 @@ def _run_once(pipeline: Callable[[Job], Produced], job: Job, max_seconds: float,
 
 def _own_peak_bytes() -> int:
     """Largest resident memory of this process or of one it has waited for."""
+    if resource is None:
+        return peak_bytes()
     return max(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * MAXRSS_UNIT_BYTES, peak_bytes())
 
 
