@@ -72,6 +72,7 @@ test-parts: $(VENV)/.test
 docs: $(VENV)/.test
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt warm-up
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) PYTHONUTF8=1 $(BIN)/python -m sphinx -W --keep-going -q -b html -d docs/_build/doctrees docs docs/_build/html
+	$(BIN)/python docs/check_site.py docs/_build/html
 	@echo "docs/_build/html/index.html"
 
 lint: $(VENV)/.test

@@ -45,6 +45,7 @@ sphinx_gallery_conf = {
     "show_memory": False,
     "download_all_examples": False,
     "min_reported_time": 1_000_000,  # seconds of this machine are no news of the examples
+    "write_computation_times": False,
 }
 
 html_theme = "pydata_sphinx_theme"
