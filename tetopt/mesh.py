@@ -3,12 +3,21 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tetopt import conversions
+from tetopt.conversions import MESHIO_KINDS, VTK_KINDS, Fields
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
+
+if TYPE_CHECKING:
+    import meshio
+    import pyvista
+    import skfem
+    import trimesh
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,3 +83,194 @@ class Mesh:
     def ndim(self) -> int:
         """Number of space dimensions n, 2 or 3."""
         return self.points.shape[1]
+
+    def to_pyvista(self, cell_data: Fields | None = None, point_data: Fields | None = None) -> pyvista.UnstructuredGrid:
+        """The mesh for pyvista, with data; a 2-D mesh lies in the plane z = 0.
+
+        Parameters
+        ----------
+        cell_data, point_data : dict of arrays, optional
+            Numbers by name, a row a cell, or a row a node; the first of each is the active one. Rows of more
+            than one axis become rows of numbers, True and False 1 and 0.
+
+        Returns
+        -------
+        pyvista.UnstructuredGrid
+            Of VTK's kind triangle or tetra, a copy. Nodes and cells keep their order.
+
+        Raises
+        ------
+        InputError
+            Data that are no numbers, or have other numbers of rows.
+
+        Examples
+        --------
+        >>> mesh = Mesh([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]])
+        >>> grid = mesh.to_pyvista({"mean": [3.5]})
+        >>> grid.n_points, grid.cell_data["mean"].tolist()
+        (3, [3.5])
+        """
+        return conversions.to_pyvista(self.points, self.cells, VTK_KINDS[self.ndim, 1], cell_data, point_data)
+
+    @classmethod
+    def from_pyvista(cls, grid: pyvista.DataSet) -> Mesh:
+        """The tetrahedra of one of pyvista's grids, or of VTK's; without any, its triangles.
+
+        Cells keep their order, inverted ones are turned (two of their nodes change places), and nodes that no cell uses
+        are left out. Vertices and lines, and triangles beside tetrahedra, are left out. Of quadratic cells the corners
+        are taken, so that curved edges become straight. Data are not taken: `grid.cell_data` fits if the grid has no
+        other cells, `grid.point_data` if each of its nodes is a corner of one.
+
+        Parameters
+        ----------
+        grid : pyvista.DataSet
+            Such as an `UnstructuredGrid`, or a `PolyData` of triangles in the plane z = 0.
+
+        Returns
+        -------
+        Mesh
+
+        Raises
+        ------
+        InputError
+            Other kinds of cells, cells of both orders, no cells, flat cells, triangles out of the plane z = 0.
+
+        Examples
+        --------
+        >>> mesh = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 2, 3]])
+        >>> Mesh.from_pyvista(mesh.to_pyvista()).cells.tolist()
+        [[0, 1, 2, 3]]
+        """
+        picked = conversions.from_pyvista(grid)
+        return cls(picked.points, picked.cells)
+
+    def to_meshio(self, cell_data: Fields | None = None, point_data: Fields | None = None) -> meshio.Mesh:
+        """The mesh for meshio, with data, as one block of triangles or tetrahedra.
+
+        Parameters
+        ----------
+        cell_data, point_data : dict of arrays, optional
+            Numbers by name, a row a cell, or a row a node.
+
+        Returns
+        -------
+        meshio.Mesh
+            A copy; of a 2-D mesh its points have two coordinates. Nodes and cells keep their order.
+
+        Raises
+        ------
+        InputError
+            Data that are no numbers, or have other numbers of rows.
+
+        Examples
+        --------
+        >>> mesh = Mesh([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]])
+        >>> mesh.to_meshio({"mean": [3.5]}).cells_dict["triangle"].tolist()
+        [[0, 1, 2]]
+        """
+        return conversions.to_meshio(self.points, self.cells, MESHIO_KINDS[self.ndim, 1], cell_data, point_data)
+
+    @classmethod
+    def from_meshio(cls, mesh: meshio.Mesh) -> Mesh:
+        """The tetrahedra of one of meshio's meshes, block by block; without any, its triangles.
+
+        What is taken, turned and left out is as with `from_pyvista`.
+
+        Parameters
+        ----------
+        mesh : meshio.Mesh
+
+        Returns
+        -------
+        Mesh
+
+        Raises
+        ------
+        InputError
+            As `from_pyvista`.
+
+        Examples
+        --------
+        >>> mesh = Mesh([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]])
+        >>> Mesh.from_meshio(mesh.to_meshio()).points.tolist()
+        [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]
+        """
+        picked = conversions.from_meshio(mesh)
+        return cls(picked.points, picked.cells)
+
+    def to_skfem(self) -> skfem.Mesh:
+        """The mesh for scikit-fem; `Model.to_skfem` has the sets, too.
+
+        Returns
+        -------
+        skfem.MeshTri or skfem.MeshTet
+            A copy. Nodes and cells keep their order; scikit-fem sorts the three nodes of a triangle.
+
+        Raises
+        ------
+        InputError
+            scikit-fem is not installed.
+
+        Examples
+        --------
+        >>> mesh = Mesh([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]])
+        >>> mesh.to_skfem().p.tolist()
+        [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
+        """
+        return conversions.to_skfem(self.points, self.cells)
+
+    @classmethod
+    def from_skfem(cls, mesh: skfem.Mesh) -> Mesh:
+        """One of scikit-fem's meshes of triangles or tetrahedra; of quadratic ones the corners.
+
+        What is turned and left out is as with `from_pyvista`.
+
+        Parameters
+        ----------
+        mesh : skfem.MeshTri or skfem.MeshTet
+
+        Returns
+        -------
+        Mesh
+
+        Raises
+        ------
+        InputError
+            Another kind of mesh, flat cells, or scikit-fem is not installed.
+
+        Examples
+        --------
+        >>> import skfem
+        >>> len(Mesh.from_skfem(skfem.MeshTet()).cells)
+        5
+        """
+        picked = conversions.from_skfem(mesh)
+        return cls(picked.points, picked.cells)
+
+    def to_trimesh(self) -> trimesh.Trimesh:
+        """The boundary of a 3-D mesh for trimesh, as it is in the mesh.
+
+        Where cells touch in an edge or a node alone, this is no manifold; `tetopt.surface_of` parts them.
+
+        Returns
+        -------
+        trimesh.Trimesh
+            Of the boundary's nodes, in the mesh's order; its triangles have their normals out.
+
+        Raises
+        ------
+        InputError
+            A 2-D mesh, whose boundary are edges.
+
+        Examples
+        --------
+        >>> mesh = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 2, 3]])
+        >>> boundary = mesh.to_trimesh()
+        >>> boundary.is_watertight, round(boundary.volume, 6)
+        (True, 0.166667)
+        """
+        if self.ndim != 3:
+            raise InputError("to_trimesh: expected tetrahedra, got triangles, whose boundary are edges")
+        from tetopt.geometry.topology import boundary_facets
+
+        return conversions.to_trimesh(self.points, boundary_facets(self.cells))

@@ -23,7 +23,6 @@ from tetopt.image import Image
 from tetopt.io.formats import save_mesh
 from tetopt.io.images import save_image
 from tetopt.io.meshes import load_mesh
-from tetopt.io.vtk import to_vtk
 from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields
 from tetopt.model.sets import MOST_LETTERS
@@ -147,7 +146,7 @@ def test_files_of_meshio(tmp_path, file_format):
 
 
 def test_field_data_that_is_no_text_stays(tmp_path):
-    grid = pyvista.wrap(to_vtk(bent(3)))
+    grid = bent(3).to_pyvista()
     grid.field_data["numbers"] = np.array([1.5, 2.5])
     grid.field_data["bytes"] = np.array([255, 254], dtype=np.uint8)
     grid.field_data["string"] = ["of VTK"]

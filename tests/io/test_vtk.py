@@ -12,7 +12,7 @@ from tetopt.errors import InputError
 from tetopt.geometry.quadratic import quadratic, quadratic_facet_nodes
 from tetopt.io.formats import save_model
 from tetopt.io.meshes import load_mesh
-from tetopt.io.vtk import model_grid, to_vtk, vtu
+from tetopt.io.vtk import model_grid, vtu
 from tetopt.model.loads import load_words
 from tetopt.model.sets import nodes_of
 
@@ -272,7 +272,7 @@ BOX = {"shape": [9, 8, 7], "affine": np.diag([2.0, 2.0, 3.0, 1.0]).tolist()}
     ],
 )  # fmt: skip
 def test_a_box_of_another_program_s_is_none(tmp_path, box):
-    grid = pyvista.wrap(to_vtk(sample_model(3).mesh))
+    grid = sample_model(3).mesh.to_pyvista()
     grid.field_data["box"] = box
     grid.save(tmp_path / "a.vtu")
     assert load_mesh(tmp_path / "a.vtu").box is None
@@ -302,7 +302,7 @@ def test_meshio_reads_a_legacy_file_of_data_that_came_from_a_vtu_file(tmp_path):
 
 
 def test_cell_data_other_than_numbers_are_left_out(tmp_path):
-    grid = pyvista.wrap(to_vtk(sample_model(3).mesh, {"k": np.ones(len(sample_model(3).mesh.cells))}))
+    grid = sample_model(3).mesh.to_pyvista({"k": np.ones(len(sample_model(3).mesh.cells))})
     grid.cell_data["names"] = np.array(["a"] * grid.n_cells)
     grid.save(tmp_path / "a.vtu")
     back = load_mesh(tmp_path / "a.vtu")
@@ -312,7 +312,7 @@ def test_cell_data_other_than_numbers_are_left_out(tmp_path):
 
 @pytest.mark.parametrize("values", [np.array([1.5]), np.empty(0)])
 def test_a_space_that_is_no_text_is_not_looked_at(tmp_path, values):
-    grid = pyvista.wrap(to_vtk(sample_model(3).mesh))
+    grid = sample_model(3).mesh.to_pyvista()
     grid.field_data["space"] = values
     grid.save(tmp_path / "a.vtu")
     assert load_mesh(tmp_path / "a.vtu").space == "ras"

@@ -9,34 +9,23 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt.conversions import CELL_DIMENSIONS, cells_of_rows, kind_of_cells, rows_by_kind, simplices_of
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import numbered_edges
-from tetopt.geometry.simplex import oriented
 from tetopt.incoming import regular_file
 from tetopt.io.pvtu import read_pvtu
-from tetopt.io.raw import CELL_DIMENSIONS, CORNER_KINDS, Grid, Raw, by_corners
+from tetopt.io.raw import Raw, by_corners
 from tetopt.io.read_gmsh import read_msh
 from tetopt.io.read_vtk import read_vtk
 from tetopt.io.text import plain
-from tetopt.io.vtk import ON_PREFIX, VTK_SUFFIXES, box_in, sets_in, text_in
+from tetopt.io.vtk import VTK_SUFFIXES, box_in, sets_in, text_in
 from tetopt.io.vtkhdf import read_vtkhdf
 from tetopt.mesh import Mesh
 from tetopt.model.fields import half_turned_fields, is_stress, stresses_times
-from tetopt.model.model import STRESS_UNITS, half_turn
+from tetopt.model.model import ON_PREFIX, STRESS_UNITS, half_turn
 from tetopt.model.sets import SET_NAME, Box, Sets, free_name, rows_of
 
 MESH_SUFFIXES = (*VTK_SUFFIXES, ".msh", ".msh2")
-# VTK's kinds of any order, with a number of nodes, that are numbered as kinds of one order; dolfinx writes them.
-LAGRANGE_KINDS = {
-    "lagrange_curve 2": "line", "lagrange_triangle 3": "triangle", "lagrange_tetrahedron 4": "tetra",
-    "lagrange_curve 3": "quadratic_edge", "lagrange_triangle 6": "quadratic_triangle",
-    "lagrange_tetrahedron 10": "quadratic_tetra",
-}  # fmt: skip
-# Nodes of a cell, of the kinds that have a fixed number; without pyvista's other kinds, which are refused by name.
-NODES_OF_KIND = {
-    "vertex": 1, "line": 2, "triangle": 3, "tetra": 4,
-    "quadratic_edge": 3, "quadratic_triangle": 6, "quadratic_tetra": 10,
-}  # fmt: skip
 STRAIGHT_SHARE = 1e-6  # of an edge: a middle node that is less off its middle was rounded, as in files of few digits
 
 
@@ -89,26 +78,15 @@ def load_mesh(path: str | Path) -> MeshFile:
         raw = read_msh(path) if path.suffix.lower() in (".msh", ".msh2") else _read_vtk(path)
     except InputError as error:
         raise InputError(f"{path}: {plain(str(error))}") from error
-    kind = _kind_of_cells(path, raw)
-    n = CELL_DIMENSIONS[kind]
-    cells, points = raw.cells[kind], raw.points
-    nodes = np.column_stack([cells, raw.middles[kind]]) if kind in raw.middles else cells
-    if nodes.min() < 0 or nodes.max() >= len(points):
-        raise InputError(
-            f"{path}: its cells use nodes {nodes.min()}..{nodes.max()}, it holds 0..{len(points) - 1}; damaged?"
-        )
-    used, compact = np.unique(cells, return_inverse=True)
-    if n == 2 and np.any(points[nodes, 2] != 0.0):
-        raise InputError(f"{path}: a mesh of triangles must lie in the plane z = 0; surfaces in space are not meshed")
-    if n == 3 and raw.space == "lps":
-        points = half_turn(points)
-    corners, cells = points[used, :n], compact.reshape(cells.shape)
-    with np.errstate(invalid="ignore"):  # infinite coordinates, which Mesh refuses in words
-        turned = oriented(corners, cells)
     try:
-        mesh = Mesh(corners, turned)
+        kind = kind_of_cells(raw.cells)
+        n = CELL_DIMENSIONS[kind]
+        points = half_turn(raw.points) if n == 3 and raw.space == "lps" else raw.points
+        picked = simplices_of(points, raw.cells[kind], raw.middles.get(kind))
+        mesh = Mesh(picked.points, picked.cells)
     except InputError as error:
         raise InputError(f"{path}: {error}") from error
+    used = picked.used
     middles, of_edges = _middles(raw, kind)
     sets, of_sets = _sets_of_groups(raw, mesh, kind, used) if raw.groups else sets_in(raw.field_data, mesh)
     shown = {f"{ON_PREFIX}{name}" for name in sets.facets}  # which only tell the sets again
@@ -119,7 +97,7 @@ def load_mesh(path: str | Path) -> MeshFile:
         mesh,
         cell_data,
         raw.field_data,
-        int((turned != cells).any(axis=1).sum()),
+        picked.n_turned,
         sum(len(others) for name, others in raw.cells.items() if name != kind),
         sets,
         box_in(raw.field_data, n),
@@ -175,20 +153,6 @@ def _numbers(
     return fields, tuple(notes)
 
 
-def _kind_of_cells(path: Path, raw: Raw) -> str:
-    unknown = sorted(set(raw.cells) - set(CELL_DIMENSIONS))
-    if both := sorted(CORNER_KINDS[name] for name in unknown if name in CORNER_KINDS):
-        raise InputError(f"{path}: expected cells of one order, found {both[0]} cells of order 1 and of order 2")
-    if unknown:
-        raise InputError(f"{path}: expected tetrahedra or triangles, of order 1 or 2, found {', '.join(unknown)}")
-    kind = max(raw.cells, key=lambda name: CELL_DIMENSIONS[name], default="none")
-    if kind not in ("tetra", "triangle"):
-        raise InputError(
-            f"{path}: expected tetrahedra or triangles, found {', '.join(sorted(raw.cells)) or 'no cells'}"
-        )
-    return kind
-
-
 def _sets_of_groups(raw: Raw, mesh: Mesh, kind: str, used: NDArray[np.int64]) -> tuple[Sets, tuple[str, ...]]:
     """gmsh's groups of cells and of facets, and notes on those whose names had to change."""
     place = np.full(len(raw.points), -1)
@@ -218,14 +182,8 @@ def _sets_of_groups(raw: Raw, mesh: Mesh, kind: str, used: NDArray[np.int64]) ->
 
 def _read_vtk(path: Path) -> Raw:
     grid = {".vtkhdf": read_vtkhdf, ".pvtu": read_pvtu}.get(path.suffix.lower(), read_vtk)(path)
-    rows_of_kind = _rows_by_kind(grid)
-    sizes = np.diff(grid.offsets)
-    cells = {}
-    for kind, chosen in rows_of_kind.items():
-        width = int(sizes[chosen].min())  # of a polyline, which may be of several, the first nodes are enough
-        if kind in NODES_OF_KIND and (sizes[chosen] != NODES_OF_KIND[kind]).any():
-            raise InputError(f"damaged: cells of {NODES_OF_KIND[kind]} nodes ({kind}) have another number of them")
-        cells[kind] = grid.connectivity[grid.offsets[chosen][:, None] + np.arange(width)]
+    rows_of_kind = rows_by_kind(np.diff(grid.offsets), grid.cell_types)
+    cells = cells_of_rows(grid.connectivity, grid.offsets, rows_of_kind)
     cell_data = {
         name: {kind: values[chosen] for kind, chosen in rows_of_kind.items()} for name, values in grid.cell_data.items()
     }
@@ -233,25 +191,6 @@ def _read_vtk(path: Path) -> Raw:
     own = {name: values for name, values in grid.point_data.items() if not name.startswith("vtk")}  # as vtkGhostType
     raw = Raw(grid.points, cells, cell_data, own, field_data, [], _space(path, field_data), notes=grid.notes)
     return by_corners(raw)
-
-
-def _rows_by_kind(grid: Grid) -> dict[str, NDArray[np.int64]]:
-    """Which cells are of each kind; those of any number of nodes are of the kinds of fixed size that they stand for."""
-    import pyvista
-
-    sizes = np.diff(grid.offsets)
-    stride = int(sizes.max()) + 1
-    sorts, which = np.unique(grid.cell_types.astype(np.int64) * stride + sizes, return_inverse=True)
-    parts: dict[str, list[NDArray[np.int64]]] = {}
-    for number, sort in enumerate(sorts.tolist()):
-        vtk_type, size = divmod(sort, stride)
-        try:
-            name = pyvista.CellType(vtk_type).name.lower()
-        except ValueError:
-            raise InputError(f"damaged: VTK has no cells of type {vtk_type}") from None
-        kind = LAGRANGE_KINDS.get(f"{name} {size}", name)
-        parts.setdefault(kind, []).append(np.flatnonzero(which.ravel() == number))
-    return {kind: np.sort(np.concatenate(rows)) for kind, rows in parts.items()}
 
 
 def _space(path: Path, field_data: dict[str, NDArray]) -> str:

@@ -11,11 +11,12 @@ from collections.abc import Iterator, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt.conversions import VTK_KINDS
 from tetopt.errors import InputError
 from tetopt.io.raw import Grid
 from tetopt.io.read_vtk import plain_arrays
 from tetopt.io.text import free_text
-from tetopt.io.vtk import CELL_TYPES, CELLS_PREFIX, FACETS_PREFIX, model_grid
+from tetopt.io.vtk import CELLS_PREFIX, FACETS_PREFIX, model_grid
 from tetopt.model.model import Model
 
 PART_FIELD, POINT_IDS, CELL_IDS, GHOST_FIELD = "part", "GlobalPointIds", "GlobalCellIds", "vtkGhostType"
@@ -33,7 +34,7 @@ def model_pieces(model: Model) -> Iterator[Grid]:
     InputError
         More than `MOST_PIECES` parts.
     """
-    types = np.full(len(model.mesh.cells), CELL_TYPES[model.mesh.ndim, model.order], dtype=np.uint8)
+    types = np.full(len(model.mesh.cells), VTK_KINDS[model.mesh.ndim, model.order], dtype=np.uint8)
     grid = Grid(**plain_arrays(model_grid(model)), cell_types=types)
     part = _whole_numbers(grid.cell_data.get(PART_FIELD))
     numbers, sizes = np.unique(np.zeros(1) if part is None else part, return_counts=True)

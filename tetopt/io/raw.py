@@ -7,13 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-# The dimension of each kind of cell that a mesh may consist of, or that may lie on it.
-CELL_DIMENSIONS = {"vertex": 0, "poly_vertex": 0, "line": 1, "poly_line": 1, "triangle": 2, "tetra": 3}
-# What the kinds of order 2 are by their corners; pyvista's names and meshio's. All have the nodes of VTK's order.
-CORNER_KINDS = {
-    "quadratic_edge": "line", "quadratic_triangle": "triangle", "quadratic_tetra": "tetra",
-    "line3": "line", "triangle6": "triangle", "tetra10": "tetra",
-}  # fmt: skip
+from tetopt.conversions import CELL_DIMENSIONS, corner_kinds
 
 
 class Grid(NamedTuple):
@@ -56,8 +50,7 @@ def by_corners(raw: Raw) -> Raw:
 
     Where a kind comes in both orders, that of order 2 keeps its name.
     """
-    kinds = {kind: CORNER_KINDS[kind] for kind in raw.cells if kind in CORNER_KINDS}
-    kinds = {kind: corner for kind, corner in kinds.items() if corner not in raw.cells}
+    kinds = corner_kinds(raw.cells)
     n_corners = {corner: CELL_DIMENSIONS[corner] + 1 for corner in kinds.values()}
 
     def renamed(by_kind: dict[str, NDArray]) -> dict[str, NDArray]:

@@ -12,10 +12,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.budget import check_memory, memory_words
+from tetopt.conversions import CELL_DIMENSIONS
 from tetopt.errors import InputError
 from tetopt.io.apart import read_apart
 from tetopt.io.gmsh import OwnComments, own_comments
-from tetopt.io.raw import CELL_DIMENSIONS, Group, Raw, by_corners
+from tetopt.io.raw import Group, Raw, by_corners
 
 if TYPE_CHECKING:
     import meshio

@@ -26,93 +26,33 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.geometry.quadratic import quadratic
+from tetopt.conversions import VTK_KINDS, add_array, vtk_grid
 from tetopt.image import Image
 from tetopt.incoming import json_of
 from tetopt.io.raw import Grid
 from tetopt.io.text import xml_attribute
 from tetopt.mesh import Mesh
-from tetopt.model.fields import GAUSS_MODULI, NODE_MODULI, is_stress, node_field
+from tetopt.model.fields import is_stress
 from tetopt.model.loads import load_words
-from tetopt.model.model import Model, element_facets, elements
+from tetopt.model.model import Model, elements, grid_fields
 from tetopt.model.sets import SET_NAME, Box, Sets
 
 if TYPE_CHECKING:
-    from vtkmodules.vtkCommonDataModel import vtkDataSet, vtkFieldData, vtkUnstructuredGrid
+    from vtkmodules.vtkCommonDataModel import vtkDataSet, vtkUnstructuredGrid
 
 VTK_SUFFIXES = (".vtu", ".vtk", ".vtkhdf", ".pvtu")  # of files of ours that hold all of a model, and are read
-CELL_TYPES = {(2, 1): 5, (3, 1): 10, (2, 2): 22, (3, 2): 24}  # VTK's numbers, by dimension and order
-# Names of field data and of point data in our files, see above.
-FACETS_PREFIX, CELLS_PREFIX, ON_PREFIX, CHECKSUM_NAME = "facets:", "cells:", "on_", "cells_sha256"
+# Names of field data in our files, see above.
+FACETS_PREFIX, CELLS_PREFIX, CHECKSUM_NAME = "facets:", "cells:", "cells_sha256"
 LEGACY_VERSION = 42  # version 4.2: 5.1 is not read by older programs, 3D Slicer among them
-
-
-def to_vtk(
-    mesh: Mesh,
-    cell_data: dict[str, NDArray] | None = None,
-    point_data: dict[str, NDArray] | None = None,
-    order: int = 1,
-) -> vtkUnstructuredGrid:
-    """The mesh as VTK's grid in world mm, of cells of an order; a 2-D mesh lies in the plane z = 0.
-
-    Point data of the mesh's nodes alone are interpolated to those of order 2, see `tetopt.model.fields.node_field`.
-    """
-    places, cells = quadratic(mesh.points, mesh.cells) if order == 2 else (mesh.points, mesh.cells)
-    points = np.zeros((len(places), 3))
-    points[:, : mesh.ndim] = places
-    grid = _bare_grid(points, cells, CELL_TYPES[mesh.ndim, order])
-    for name, values in (cell_data or {}).items():
-        _add(grid.GetCellData(), name, values)
-    for name, values in (point_data or {}).items():
-        _add(grid.GetPointData(), name, node_field(values, mesh, order))
-    return grid
 
 
 def vtk_of(grid: Grid) -> vtkUnstructuredGrid:
     """A grid of plain arrays, whose cells are all of one kind, as VTK's."""
     cells = grid.connectivity.reshape(len(grid.cell_types), -1)
-    of_vtk = _bare_grid(grid.points, cells, int(grid.cell_types[0]))
-    for fields, values_of in (
-        (of_vtk.GetCellData(), grid.cell_data),
-        (of_vtk.GetPointData(), grid.point_data),
-        (of_vtk.GetFieldData(), grid.field_data),
-    ):
-        for name, values in values_of.items():
-            _add(fields, name, values)
+    of_vtk = vtk_grid(grid.points, cells, int(grid.cell_types[0]), grid.cell_data, grid.point_data)
+    for name, values in grid.field_data.items():
+        add_array(of_vtk.GetFieldData(), name, values)
     return of_vtk
-
-
-def _bare_grid(points: NDArray[np.float64], cells: NDArray[np.int64], kind: int) -> vtkUnstructuredGrid:
-    """Cells of one of VTK's kinds, without data."""
-    # VTK without pyvista, and only here: files are written by the quickest of runs, too.
-    from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
-    from vtkmodules.vtkCommonCore import vtkPoints
-    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkUnstructuredGrid
-
-    nodes = vtkPoints()
-    nodes.SetData(numpy_to_vtk(points, deep=True))
-    listed = vtkCellArray()
-    listed.SetData(
-        cells.shape[1], numpy_to_vtkIdTypeArray(np.ascontiguousarray(cells, dtype=np.int64).ravel(), deep=True)
-    )
-    grid = vtkUnstructuredGrid()
-    grid.SetPoints(nodes)
-    grid.SetCells(kind, listed)
-    return grid
-
-
-def _add(fields: vtkFieldData, name: str, values: NDArray) -> None:
-    """Add an array of numbers; the first on cells, or on points, is the one that programs show."""
-    from vtkmodules.util.numpy_support import numpy_to_vtk
-    from vtkmodules.vtkCommonDataModel import vtkDataSetAttributes
-
-    values = np.asarray(values)
-    values = values.reshape(len(values), -1) if values.ndim > 1 else values
-    array = numpy_to_vtk(np.ascontiguousarray(values.view(np.uint8) if values.dtype == bool else values), deep=True)
-    array.SetName(name)
-    fields.AddArray(array)
-    if isinstance(fields, vtkDataSetAttributes) and fields.GetScalars() is None:
-        fields.SetActiveScalars(name)
 
 
 def vtu(model: Model) -> bytes:
@@ -188,26 +128,11 @@ def written_bytes(writer: Any, grid: vtkDataSet) -> bytes:
 
 def model_grid(model: Model) -> vtkUnstructuredGrid:
     """All of a model on one grid."""
-    grid = to_vtk(model.mesh, model.cell_data, model.point_data, model.order)
-    cells = elements(model)[1]
-    for name, rows in model.sets.facets.items():
-        is_on = np.zeros(grid.GetNumberOfPoints(), dtype=np.uint8)
-        is_on[element_facets(cells, rows)] = 1
-        _add(grid.GetPointData(), f"{ON_PREFIX}{name}", is_on)
+    on_cells, on_nodes = grid_fields(model)
+    grid = vtk_grid(*elements(model), VTK_KINDS[model.mesh.ndim, model.order], on_cells, on_nodes)
     texts = dict(model.about) | {"space": model.space}
-    if model.materials is not None:
-        of_cell, on_cells = model.materials.of_cell, grid.GetCellData()
-        _add(on_cells, "young", model.materials.young[of_cell])
-        _add(on_cells, "nu", model.materials.nu[of_cell])
-        _add(on_cells, "material", of_cell + 1)
-        if model.materials.density is not None:
-            _add(on_cells, "density", model.materials.density[of_cell])
-        if model.materials.binning is not None:
-            texts["binning"] = model.materials.binning._asdict()
-    if model.gauss_young is not None:
-        _add(grid.GetCellData(), GAUSS_MODULI, model.gauss_young)
-    if model.node_young is not None:
-        _add(grid.GetPointData(), NODE_MODULI, node_field(model.node_young, model.mesh, model.order))
+    if model.materials is not None and model.materials.binning is not None:
+        texts["binning"] = model.materials.binning._asdict()
     if model.materials is not None or model.loads or any(map(is_stress, [*model.cell_data, *model.point_data])):
         texts["units"] = model.units
     if model.loads:
@@ -221,15 +146,15 @@ def add_texts(grid: vtkUnstructuredGrid, texts: dict[str, Any]) -> None:
     """Each entry as field data, as JSON unless it is a string already."""
     for name, value in texts.items():
         text = value if isinstance(value, str) else json.dumps(value)
-        _add(grid.GetFieldData(), name, np.frombuffer(text.encode("utf-8", "backslashreplace"), dtype=np.uint8))
+        add_array(grid.GetFieldData(), name, np.frombuffer(text.encode("utf-8", "backslashreplace"), dtype=np.uint8))
 
 
 def add_sets(grid: vtkUnstructuredGrid, mesh: Mesh, sets: Sets) -> None:
     """The sets as field data, with the checksum of the cells that they are of."""
     for name, rows in sets.facets.items():
-        _add(grid.GetFieldData(), f"{FACETS_PREFIX}{name}", rows)
+        add_array(grid.GetFieldData(), f"{FACETS_PREFIX}{name}", rows)
     for name, members in sets.cells.items():
-        _add(grid.GetFieldData(), f"{CELLS_PREFIX}{name}", members)
+        add_array(grid.GetFieldData(), f"{CELLS_PREFIX}{name}", members)
     if sets.facets or sets.cells:
         add_texts(grid, {CHECKSUM_NAME: _checksum(mesh)})
 

@@ -8,16 +8,27 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt import conversions
+from tetopt.conversions import MESHIO_KINDS, VTK_KINDS
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import of_order, quadratic_facet_nodes
 from tetopt.mesh import Mesh
-from tetopt.model.fields import HALF_TURN, half_turned_fields, stresses_times
+from tetopt.model.fields import (
+    GAUSS_MODULI,
+    HALF_TURN,
+    NODE_MODULI,
+    half_turned_fields,
+    node_field,
+    stresses_times,
+)
 from tetopt.model.loads import FACET_FORCES, Load
 from tetopt.model.materials import Materials
 from tetopt.model.sets import Sets, facet_triples
 from tetopt.model.skfem import skfem_mesh
 
 if TYPE_CHECKING:
+    import meshio
+    import pyvista
     import skfem
 
 
@@ -40,6 +51,7 @@ MEGAPASCAL_MOST = 0.05
 GRAM_DENSITY_MOST = 20.0  # kg/m3: gold has so many g/cm3, and nothing but gases so few kg/m3
 METRE_GRAVITY = (1.0, 100.0)  # mm/s2: the moon's to ten times the earth's in m/s2, of which 9.81 are 9810 mm/s2
 SPACES = ("ras", "lps")  # conventions of the world's axes
+ON_PREFIX, IN_PREFIX = "on_", "in_"  # of data that are 1 on the nodes of a set of facets, in the cells of a set
 
 
 class Model(NamedTuple):
@@ -72,6 +84,51 @@ class Model(NamedTuple):
                 "to_skfem: expected linear cells, got order 2; leave out the order and take P2 elements in scikit-fem"
             )
         return skfem_mesh(self.mesh, self.sets)
+
+    def to_pyvista(self) -> pyvista.UnstructuredGrid:
+        """The mesh for pyvista, with all that is on its cells and nodes.
+
+        Returns
+        -------
+        pyvista.UnstructuredGrid
+            Of cells of the model's order. Its data are `cell_data` and `point_data`, of the materials "young", in
+            `units`, "nu", "material" (from 1) and "density" (kg/m3), and of each set "in_NAME" (1 in its cells), or
+            "on_NAME" (1 on its nodes).
+
+        Examples
+        --------
+        >>> import tetopt
+        >>> mesh = tetopt.Mesh([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]])
+        >>> tetopt.model_of(mesh, young=3.0).to_pyvista().cell_data["young"].tolist()
+        [3.0]
+        """
+        on_cells, on_nodes = grid_fields(self)
+        for name, members in self.sets.cells.items():
+            on_cells[f"{IN_PREFIX}{name}"] = np.isin(np.arange(len(self.mesh.cells)), members)
+        return conversions.to_pyvista(*elements(self), VTK_KINDS[self.mesh.ndim, self.order], on_cells, on_nodes)
+
+    def to_meshio(self) -> meshio.Mesh:
+        """The mesh for meshio, with all that is on its cells and nodes.
+
+        Returns
+        -------
+        meshio.Mesh
+            One block of cells of the model's order, with data as `to_pyvista` has them; sets of cells are `cell_sets`,
+            the nodes of sets of facets `point_sets`.
+
+        Examples
+        --------
+        >>> import tetopt
+        >>> mesh = tetopt.Mesh([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]])
+        >>> tetopt.model_of(mesh).to_meshio().point_sets["x_min"].tolist()
+        [0, 2]
+        """
+        on_cells, on_nodes = grid_fields(self)
+        sets = {name: np.flatnonzero(on_nodes.pop(f"{ON_PREFIX}{name}")) for name in self.sets.facets}
+        other = conversions.to_meshio(*elements(self), MESHIO_KINDS[self.mesh.ndim, self.order], on_cells, on_nodes)
+        other.point_sets = sets
+        other.cell_sets = {name: [members.copy()] for name, members in self.sets.cells.items()}
+        return other
 
 
 def in_space(model: Model, space: str) -> Model:
@@ -189,6 +246,26 @@ def mass_densities(model: Model) -> NDArray[np.float64]:
     assert model.materials is not None
     density, water = model.materials.density, STRESS_UNITS[model.units].water
     return np.full(len(model.materials.young), water) if density is None else density / WATER_DENSITY * water
+
+
+def grid_fields(model: Model) -> tuple[dict[str, NDArray], dict[str, NDArray]]:
+    """What is on each cell, and on each node of the model's order: its data, sets of facets, and materials."""
+    on_cells = dict(model.cell_data)
+    on_nodes = {name: node_field(values, model.mesh, model.order) for name, values in model.point_data.items()}
+    points, cells = elements(model)
+    for name, rows in model.sets.facets.items():
+        is_on = np.zeros(len(points), dtype=np.uint8)
+        is_on[element_facets(cells, rows)] = 1
+        on_nodes[f"{ON_PREFIX}{name}"] = is_on
+    if (table := model.materials) is not None:
+        on_cells |= {"young": table.young[table.of_cell], "nu": table.nu[table.of_cell], "material": table.of_cell + 1}
+        if table.density is not None:
+            on_cells["density"] = table.density[table.of_cell]
+    if model.gauss_young is not None:
+        on_cells[GAUSS_MODULI] = model.gauss_young
+    if model.node_young is not None:
+        on_nodes[NODE_MODULI] = node_field(model.node_young, model.mesh, model.order)
+    return on_cells, on_nodes
 
 
 def element_facets(cells: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[np.int64]:

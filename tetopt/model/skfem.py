@@ -7,8 +7,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.errors import InputError
-from tetopt.extras import install_hint
 from tetopt.mesh import Mesh
 from tetopt.model.sets import Sets
 
@@ -41,13 +39,7 @@ def skfem_mesh(mesh: Mesh, sets: Sets) -> skfem.Mesh:
     >>> converted.subdomains["label_7"].tolist()
     [0]
     """
-    try:
-        import skfem
-    except ImportError as error:
-        raise InputError(f"to_skfem: scikit-fem is not installed; {install_hint('test', 'scikit-fem')}") from error
-    kind = skfem.MeshTet if mesh.ndim == 3 else skfem.MeshTri
-    # Contiguous, or scikit-fem warns of making them so.
-    bare = kind(np.ascontiguousarray(mesh.points.T), np.ascontiguousarray(mesh.cells.T))
+    bare = mesh.to_skfem()
     boundaries = {name: _boundary(bare, mesh.cells, rows) for name, rows in sets.facets.items()}
     subdomains = {name: cells.copy() for name, cells in sets.cells.items()}
     return bare.with_boundaries(boundaries).with_subdomains(subdomains)

@@ -1,0 +1,189 @@
+"""Meshes to pyvista, meshio, scikit-fem and trimesh, and back."""
+
+import sys
+
+import meshio
+import numpy as np
+import pytest
+import pyvista
+import skfem
+from models import quadratic_model, sample_model
+
+import tetopt
+from tetopt import InputError, Mesh
+from tetopt.geometry.quadratic import quadratic
+from tetopt.geometry.simplex import volumes
+
+VTK_NUMBERS = {2: (pyvista.CellType.TRIANGLE, pyvista.CellType.QUADRATIC_TRIANGLE),
+               3: (pyvista.CellType.TETRA, pyvista.CellType.QUADRATIC_TETRA)}  # fmt: skip
+THERE_AND_BACK = {
+    "pyvista": lambda mesh: Mesh.from_pyvista(mesh.to_pyvista()),
+    "meshio": lambda mesh: Mesh.from_meshio(mesh.to_meshio()),
+    "skfem": lambda mesh: Mesh.from_skfem(mesh.to_skfem()),
+}
+
+
+def in_space(points):
+    """Points with z = 0, where they have none."""
+    return np.column_stack([points, np.zeros((len(points), 3 - points.shape[1]))])
+
+
+@pytest.mark.parametrize("n", [2, 3])
+@pytest.mark.parametrize("name", THERE_AND_BACK)
+def test_there_and_back_is_the_same_mesh(name, n):
+    mesh = sample_model(n).mesh
+    back = THERE_AND_BACK[name](mesh)
+    assert back.points.tobytes() == mesh.points.tobytes()
+    if (name, n) == ("skfem", 2):  # which sorts the nodes of a triangle
+        assert (np.sort(back.cells, axis=1) == np.sort(mesh.cells, axis=1)).all()
+    else:
+        assert back.cells.tobytes() == mesh.cells.tobytes()
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_data_go_with_the_mesh(n):
+    mesh, rng = sample_model(n).mesh, np.random.default_rng(n)
+    on_cells = {"mean": rng.normal(size=len(mesh.cells)), "is_in": rng.random(len(mesh.cells)) < 0.5}
+    on_nodes = {"moved": rng.normal(size=mesh.points.shape), "count": np.arange(len(mesh.points))}
+    grid, other = mesh.to_pyvista(on_cells, on_nodes), mesh.to_meshio(on_cells, on_nodes)
+    assert (grid.points == in_space(mesh.points)).all()
+    assert (other.points == mesh.points).all()
+    assert set(grid.celltypes) == {VTK_NUMBERS[n][0]}
+    for name, values in on_cells.items():
+        assert (grid.cell_data[name] == values).all()
+        assert (other.cell_data[name][0] == values).all()
+    for name, values in on_nodes.items():
+        assert (grid.point_data[name] == values).all()
+        assert (other.point_data[name] == values).all()
+    assert (grid.cell_data.active_scalars_name, grid.point_data.active_scalars_name) == ("mean", "moved")
+    other.points[:] = 0.0  # copies
+    grid.points[:] = 0.0
+    assert np.ptp(mesh.points) > 0
+
+
+@pytest.mark.parametrize("convert", ["to_pyvista", "to_meshio"])
+def test_data_that_do_not_fit_are_one_line(convert):
+    mesh = sample_model(3).mesh
+    for data in ([1.0, 2.0], ["a"] * len(mesh.cells), 3.0, None):
+        with pytest.raises(InputError, match=r"^cell_data: 'a\\nb': expected an array of numbers with \d+ rows, got "):
+            getattr(mesh, convert)({"a\nb": data})
+    with pytest.raises(InputError, match=r"^point_data: 'u': expected an array of numbers with \d+ rows"):
+        getattr(mesh, convert)(point_data={"u": np.zeros(len(mesh.cells) + 1)})
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_of_quadratic_cells_the_corners_are_taken(n):
+    mesh = sample_model(n).mesh
+    points, cells = quadratic(mesh.points, mesh.cells)
+    kind = {2: "triangle6", 3: "tetra10"}[n]
+    curved = (skfem.MeshTri2 if n == 2 else skfem.MeshTet2).from_mesh(mesh.to_skfem())
+    backs = [
+        Mesh.from_pyvista(pyvista.UnstructuredGrid({VTK_NUMBERS[n][1]: cells}, in_space(points))),
+        Mesh.from_meshio(meshio.Mesh(points, [(kind, cells)])),
+        Mesh.from_skfem(curved),
+    ]
+    for back in backs:
+        assert (back.points == mesh.points).all()
+        assert (np.sort(back.cells, axis=1) == np.sort(mesh.cells, axis=1)).all()
+
+
+def test_inverted_cells_are_turned_and_others_left_out():
+    mesh = sample_model(3).mesh
+    cells = mesh.cells.copy()
+    cells[::2] = cells[::2][:, [1, 0, 2, 3]]
+    points = np.vstack([np.full((1, 3), 99.0), mesh.points])  # the first is used by none
+    blocks = [
+        ("triangle", cells[:3, :3] + 1), ("tetra", cells[:7] + 1), ("vertex", np.array([[0]])), ("tetra", cells[7:] + 1)
+    ]  # fmt: skip
+    other = meshio.Mesh(points, blocks)
+    for back in (Mesh.from_meshio(other), Mesh.from_pyvista(pyvista.from_meshio(other))):
+        assert (back.points == mesh.points).all()
+        assert (volumes(back.points, back.cells) > 0.0).all()
+        assert (np.sort(back.cells, axis=1) == np.sort(mesh.cells, axis=1)).all()
+
+
+def test_a_surface_in_the_plane_is_a_mesh():
+    sheet = pyvista.Plane(i_resolution=3, j_resolution=2).triangulate()
+    assert len(Mesh.from_pyvista(sheet).cells) == 12
+    with pytest.raises(InputError, match="from_pyvista: a mesh of triangles must lie in the plane z = 0"):
+        Mesh.from_pyvista(pyvista.Sphere())
+
+
+TETRA = ("tetra", [[0, 1, 2, 3]])
+CORNERS = np.vstack([np.zeros(3), np.eye(3), np.ones((6, 3))])
+
+
+@pytest.mark.parametrize(
+    ("convert", "other", "message"),
+    [
+        ("pyvista", pyvista.ImageData(dimensions=(2, 2, 2)), "of order 1 or 2, found voxel"),
+        ("pyvista", pyvista.PolyData(), "found no cells"),
+        ("pyvista", pyvista.MultiBlock(), "expected one of pyvista's grids of cells, got MultiBlock"),
+        ("pyvista", CORNERS, "expected one of pyvista's grids of cells, got ndarray"),
+        ("pyvista", "a.vtu", "expected one of pyvista's grids of cells, got str"),
+        ("pyvista", None, "expected one of pyvista's grids of cells, got NoneType"),
+        ("meshio", meshio.Mesh(CORNERS, [TETRA, ("hexahedron", [range(8)])]), "found hexahedron"),
+        ("meshio", meshio.Mesh(CORNERS, [TETRA, ("tetra10", [range(10)])]), "found tetra cells of order 1 and of"),
+        ("meshio", meshio.Mesh(CORNERS, [("line", [[0, 1]])]), "found line"),
+        ("meshio", meshio.Mesh(CORNERS, []), "found no cells"),
+        ("meshio", meshio.Mesh(CORNERS, [("tetra", [[0, 1, 2, 44]])]), r"uses? nodes 0\.\.44, it holds 0\.\.9"),
+        ("meshio", 3, "expected a meshio.Mesh, got int"),
+        ("skfem", skfem.MeshQuad(), "expected one of scikit-fem's MeshTri or MeshTet, got MeshQuad"),
+        ("skfem", skfem.MeshLine(), "got MeshLine"),
+        ("skfem", sample_model(3).mesh, "got Mesh"),
+    ],
+)
+def test_what_is_no_mesh_is_refused_in_one_line(convert, other, message):
+    with pytest.raises(InputError, match=rf"^from_{convert}: .*{message}") as caught:
+        getattr(Mesh, f"from_{convert}")(other)
+    assert "\n" not in str(caught.value)
+
+
+def test_the_boundary_in_trimesh():
+    mesh = sample_model(3).mesh
+    boundary = mesh.to_trimesh()
+    assert boundary.is_watertight
+    assert boundary.is_winding_consistent
+    np.testing.assert_allclose(boundary.volume, volumes(mesh.points, mesh.cells).sum(), rtol=1e-12)
+    with pytest.raises(InputError, match="to_trimesh: expected tetrahedra"):
+        sample_model(2).mesh.to_trimesh()
+
+
+@pytest.mark.parametrize(
+    ("name", "package", "convert"),
+    [
+        ("skfem", "scikit-fem", lambda mesh: mesh.to_skfem()),
+        ("trimesh", "trimesh", lambda mesh: mesh.to_trimesh()),
+        ("meshio", "meshio", Mesh.from_meshio),
+        ("pyvista", "pyvista", lambda mesh: mesh.to_pyvista()),
+    ],
+)
+def test_a_library_that_is_missing_is_named(monkeypatch, name, package, convert):
+    monkeypatch.setitem(sys.modules, name, None)
+    with pytest.raises(InputError, match=f"{package} is not installed; pip install {package}$"):
+        convert(sample_model(3).mesh)
+
+
+@pytest.mark.parametrize("model", [sample_model(2), sample_model(3), quadratic_model(2), quadratic_model(3)])
+def test_a_model_has_its_sets_and_materials_with_it(model, tmp_path):
+    """As a file of ours that is read by the library has them, but sets of cells, which files have in words of ours."""
+    tetopt.save_model(tmp_path / "a.vtu", model)
+    saved, grid, other = pyvista.read(tmp_path / "a.vtu"), model.to_pyvista(), model.to_meshio()
+    assert (grid.points == saved.points).all()
+    assert (grid.cells == saved.cells).all()
+    assert set(grid.celltypes) == {VTK_NUMBERS[model.mesh.ndim][model.order - 1]}
+    of_sets = {f"in_{name}" for name in model.sets.cells}
+    assert set(grid.cell_data.keys()) - of_sets == set(saved.cell_data.keys())
+    assert set(grid.point_data.keys()) == set(saved.point_data.keys())
+    for name in saved.cell_data:
+        assert (grid.cell_data[name] == saved.cell_data[name]).all()
+        assert (other.cell_data[name][0] == saved.cell_data[name]).all()
+    for name in saved.point_data:
+        assert (grid.point_data[name] == saved.point_data[name]).all()
+    for name, members in model.sets.cells.items():
+        assert np.flatnonzero(grid.cell_data[f"in_{name}"]).tolist() == members.tolist()
+        assert other.cell_sets[name][0].tolist() == members.tolist()
+    for name in model.sets.facets:
+        assert other.point_sets[name].tolist() == np.flatnonzero(saved.point_data[f"on_{name}"]).tolist()
+    assert (other.cells[0].data == grid.cells_dict[VTK_NUMBERS[model.mesh.ndim][model.order - 1]]).all()
+    assert (Mesh.from_meshio(other).cells == model.mesh.cells).all()

@@ -1,0 +1,314 @@
+"""Meshes as other libraries hold them, and back: plain arrays, so that `tetopt.mesh` and the readers of files share it.
+
+The libraries are imported where they are needed: a mesh alone takes none of them.
+"""
+
+from __future__ import annotations
+
+import importlib
+from collections.abc import Collection, Mapping
+from typing import TYPE_CHECKING, Any, NamedTuple
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tetopt.errors import InputError
+from tetopt.extras import install_hint
+from tetopt.geometry.simplex import oriented
+
+if TYPE_CHECKING:
+    from vtkmodules.vtkCommonDataModel import vtkFieldData, vtkUnstructuredGrid
+
+# The dimension of each kind of cell that a mesh may consist of, or that may lie on it.
+CELL_DIMENSIONS = {"vertex": 0, "poly_vertex": 0, "line": 1, "poly_line": 1, "triangle": 2, "tetra": 3}
+# What the kinds of order 2 are by their corners; pyvista's names and meshio's. All have the nodes of VTK's order.
+CORNER_KINDS = {
+    "quadratic_edge": "line", "quadratic_triangle": "triangle", "quadratic_tetra": "tetra",
+    "line3": "line", "triangle6": "triangle", "tetra10": "tetra",
+}  # fmt: skip
+# VTK's kinds of any order, with a number of nodes, that are numbered as kinds of one order; dolfinx writes them.
+LAGRANGE_KINDS = {
+    "lagrange_curve 2": "line", "lagrange_triangle 3": "triangle", "lagrange_tetrahedron 4": "tetra",
+    "lagrange_curve 3": "quadratic_edge", "lagrange_triangle 6": "quadratic_triangle",
+    "lagrange_tetrahedron 10": "quadratic_tetra",
+}  # fmt: skip
+# Nodes of a cell, of the kinds that have a fixed number; without pyvista's other kinds, which are refused by name.
+NODES_OF_KIND = {
+    "vertex": 1, "line": 2, "triangle": 3, "tetra": 4,
+    "quadratic_edge": 3, "quadratic_triangle": 6, "quadratic_tetra": 10,
+}  # fmt: skip
+VTK_KINDS = {(2, 1): 5, (3, 1): 10, (2, 2): 22, (3, 2): 24}  # VTK's numbers of cells, by dimension and order
+MESHIO_KINDS = {(2, 1): "triangle", (3, 1): "tetra", (2, 2): "triangle6", (3, 2): "tetra10"}  # meshio's, likewise
+PACKAGES = {"skfem": "scikit-fem"}  # what is installed under another name than it is imported by
+
+Fields = Mapping[str, ArrayLike]  # by name, a row a cell or a row a node
+
+
+class Simplices(NamedTuple):
+    """The cells of the highest dimension among others, and their corners."""
+
+    points: NDArray[np.float64]  # (N, n), those that the cells use, in their order
+    cells: NDArray[np.int64]  # (M, n+1), turned where they were inverted
+    used: NDArray[np.int64]  # (N,) numbers of the points among all
+    n_turned: int
+
+
+def library(name: str, caller: str) -> Any:
+    """A library by the name that it is imported by; InputError if it is not installed."""
+    try:
+        return importlib.import_module(name)
+    except ImportError as error:
+        package = PACKAGES.get(name, name)
+        raise InputError(f"{caller}: {package} is not installed; {install_hint('test', package)}") from error
+
+
+# --- from others
+
+
+def corner_kinds(kinds: Collection[str]) -> dict[str, str]:
+    """The kinds of order 2 that are to be called as what they are by their corners, as none of these is there."""
+    renamed = {kind: CORNER_KINDS[kind] for kind in kinds if kind in CORNER_KINDS}
+    return {kind: corner for kind, corner in renamed.items() if corner not in kinds}
+
+
+def kind_of_cells(kinds: Collection[str]) -> str:
+    """ "tetra" or "triangle": that of the highest dimension, those of order 2 being called by `corner_kinds`.
+
+    Raises
+    ------
+    InputError
+        Neither is there; another kind is; or cells of both orders.
+    """
+    unknown = sorted(set(kinds) - set(CELL_DIMENSIONS))
+    if both := sorted(CORNER_KINDS[name] for name in unknown if name in CORNER_KINDS):
+        raise InputError(f"expected cells of one order, found {both[0]} cells of order 1 and of order 2")
+    if unknown:
+        raise InputError(f"expected tetrahedra or triangles, of order 1 or 2, found {', '.join(unknown)}")
+    kind = max(kinds, key=lambda name: CELL_DIMENSIONS[name], default="none")
+    if kind not in ("tetra", "triangle"):
+        raise InputError(f"expected tetrahedra or triangles, found {', '.join(sorted(kinds)) or 'no cells'}")
+    return kind
+
+
+def simplices_of(
+    points: NDArray[np.float64], cells: NDArray[np.int64], middles: NDArray[np.int64] | None = None
+) -> Simplices:
+    """Cells over points in space as a mesh takes them.
+
+    Parameters
+    ----------
+    points : (P, 3) float64
+        Also those that no cell uses.
+    cells : (M, 4) or (M, 3) int64
+        Corners of tetrahedra, or of triangles in the plane z = 0.
+    middles : (M, 6 or 3) int64, optional
+        Further nodes of cells of order 2.
+
+    Raises
+    ------
+    InputError
+        Nodes that there are not, triangles out of the plane.
+    """
+    n = cells.shape[1] - 1
+    nodes = cells if middles is None else np.column_stack([cells, middles])
+    if nodes.min() < 0 or nodes.max() >= len(points):
+        raise InputError(f"its cells use nodes {nodes.min()}..{nodes.max()}, it holds 0..{len(points) - 1}; damaged?")
+    if n == 2 and np.any(points[nodes, 2] != 0.0):
+        raise InputError("a mesh of triangles must lie in the plane z = 0; surfaces in space are not meshed")
+    used, compact = np.unique(cells, return_inverse=True)
+    corners, compact = points[used, :n], compact.reshape(cells.shape)
+    with np.errstate(invalid="ignore"):  # infinite coordinates, which Mesh refuses in words
+        turned = oriented(corners, compact)
+    return Simplices(corners, turned, used, int((turned != compact).any(axis=1).sum()))
+
+
+def rows_by_kind(sizes: NDArray[np.int64], cell_types: NDArray[np.uint8]) -> dict[str, NDArray[np.int64]]:
+    """Which cells, of `sizes` nodes and VTK's types, are of each kind by pyvista's names.
+
+    Those of any number of nodes are of the kinds of fixed size that they stand for.
+    """
+    import pyvista
+
+    stride = int(sizes.max()) + 1
+    sorts, which = np.unique(cell_types.astype(np.int64) * stride + sizes, return_inverse=True)
+    parts: dict[str, list[NDArray[np.int64]]] = {}
+    for number, sort in enumerate(sorts.tolist()):
+        vtk_type, size = divmod(sort, stride)
+        try:
+            name = pyvista.CellType(vtk_type).name.lower()
+        except ValueError:
+            raise InputError(f"damaged: VTK has no cells of type {vtk_type}") from None
+        kind = LAGRANGE_KINDS.get(f"{name} {size}", name)
+        parts.setdefault(kind, []).append(np.flatnonzero(which.ravel() == number))
+    return {kind: np.sort(np.concatenate(rows)) for kind, rows in parts.items()}
+
+
+def cells_of_rows(
+    connectivity: NDArray[np.int64], offsets: NDArray[np.int64], rows_of_kind: Mapping[str, NDArray[np.int64]]
+) -> dict[str, NDArray[np.int64]]:
+    """The nodes of VTK's cells, (M, w) of each kind; of a polyline, which may be of several widths, the first ones."""
+    sizes, cells = np.diff(offsets), {}
+    for kind, chosen in rows_of_kind.items():
+        width = int(sizes[chosen].min())
+        if kind in NODES_OF_KIND and (sizes[chosen] != NODES_OF_KIND[kind]).any():
+            raise InputError(f"damaged: cells of {NODES_OF_KIND[kind]} nodes ({kind}) have another number of them")
+        cells[kind] = connectivity[offsets[chosen][:, None] + np.arange(width)]
+    return cells
+
+
+def _picked(caller: str, points: ArrayLike, cells: Mapping[str, NDArray[np.int64]]) -> Simplices:
+    """The tetrahedra, else the triangles, among cells by kind; of order 2 by their corners."""
+    places = np.asarray(points, dtype=np.float64)
+    in_space = np.zeros((len(places), 3))
+    in_space[:, : places.shape[1]] = places
+    renamed = corner_kinds(cells)
+    try:
+        kind = kind_of_cells([renamed.get(name, name) for name in cells])
+        nodes = next(rows for name, rows in cells.items() if renamed.get(name, name) == kind)
+        n_corners = CELL_DIMENSIONS[kind] + 1
+        nodes = np.asarray(nodes, dtype=np.int64)
+        return simplices_of(in_space, nodes[:, :n_corners], nodes[:, n_corners:])
+    except InputError as error:
+        raise InputError(f"{caller}: {error}") from error
+
+
+def from_pyvista(grid: Any) -> Simplices:
+    """The simplices of one of pyvista's or VTK's grids; see `tetopt.mesh.Mesh.from_pyvista`."""
+    pyvista = library("pyvista", "from_pyvista")
+    from vtkmodules.util.numpy_support import vtk_to_numpy
+    from vtkmodules.vtkCommonDataModel import vtkDataSet
+
+    if not isinstance(grid, vtkDataSet):
+        raise InputError(f"from_pyvista: expected one of pyvista's grids of cells, got {type(grid).__name__}")
+    shown = pyvista.wrap(grid)
+    whole = shown if isinstance(shown, pyvista.UnstructuredGrid) else shown.cast_to_unstructured_grid()
+    if whole.n_cells == 0:
+        raise InputError("from_pyvista: expected tetrahedra or triangles, found no cells")
+    listed = whole.GetCells()
+    offsets = vtk_to_numpy(listed.GetOffsetsArray()).astype(np.int64)
+    rows = rows_by_kind(np.diff(offsets), np.asarray(whole.celltypes))
+    cells = cells_of_rows(vtk_to_numpy(listed.GetConnectivityArray()).astype(np.int64), offsets, rows)
+    return _picked("from_pyvista", whole.points, cells)
+
+
+def from_meshio(mesh: Any) -> Simplices:
+    """The simplices of a `meshio.Mesh`; see `tetopt.mesh.Mesh.from_meshio`."""
+    meshio = library("meshio", "from_meshio")
+    if not isinstance(mesh, meshio.Mesh):
+        raise InputError(f"from_meshio: expected a meshio.Mesh, got {type(mesh).__name__}; meshio.read(path) reads one")
+    cells: dict[str, NDArray[np.int64]] = {}
+    for block in mesh.cells:
+        if len(block.data):
+            earlier = [cells[block.type]] if block.type in cells else []
+            cells[block.type] = np.concatenate([*earlier, block.data])
+    return _picked("from_meshio", mesh.points, cells)
+
+
+def from_skfem(mesh: Any) -> Simplices:
+    """The simplices of one of scikit-fem's meshes; see `tetopt.mesh.Mesh.from_skfem`."""
+    skfem = library("skfem", "from_skfem")
+    if not isinstance(mesh, skfem.Mesh) or len(mesh.t) != mesh.dim() + 1 or mesh.dim() not in (2, 3):
+        kind = type(mesh).__name__
+        raise InputError(f"from_skfem: expected one of scikit-fem's MeshTri or MeshTet, got {kind}")
+    return _picked("from_skfem", mesh.p.T, {"tetra" if mesh.dim() == 3 else "triangle": mesh.t.T})
+
+
+# --- to others
+
+
+def checked_fields(what: str, fields: Fields | None, n_rows: int) -> dict[str, NDArray]:
+    """Arrays of numbers by name; InputError unless each has so many rows."""
+    arrays = {name: np.asarray(values) for name, values in (fields or {}).items()}
+    for name, values in arrays.items():
+        if values.dtype.kind not in "biuf" or values.ndim == 0 or len(values) != n_rows:
+            raise InputError(
+                f"{what}: {name!a}: expected an array of numbers with {n_rows} rows, got {values.dtype} of shape "
+                f"{values.shape}"
+            )
+    return arrays
+
+
+def vtk_grid(
+    points: NDArray[np.float64],
+    cells: NDArray[np.int64],
+    kind: int,
+    cell_data: Mapping[str, NDArray],
+    point_data: Mapping[str, NDArray],
+) -> vtkUnstructuredGrid:
+    """Cells of one of VTK's kinds over points in the plane, which is z = 0, or in space, with their data."""
+    # VTK without pyvista, and only here: files are written by the quickest of runs, too.
+    from vtkmodules.util.numpy_support import numpy_to_vtk, numpy_to_vtkIdTypeArray
+    from vtkmodules.vtkCommonCore import vtkPoints
+    from vtkmodules.vtkCommonDataModel import vtkCellArray, vtkUnstructuredGrid
+
+    places = np.zeros((len(points), 3))
+    places[:, : points.shape[1]] = points
+    nodes = vtkPoints()
+    nodes.SetData(numpy_to_vtk(places, deep=True))
+    listed = vtkCellArray()
+    listed.SetData(
+        cells.shape[1], numpy_to_vtkIdTypeArray(np.ascontiguousarray(cells, dtype=np.int64).ravel(), deep=True)
+    )
+    grid = vtkUnstructuredGrid()
+    grid.SetPoints(nodes)
+    grid.SetCells(kind, listed)
+    for fields, arrays in ((grid.GetCellData(), cell_data), (grid.GetPointData(), point_data)):
+        for name, values in arrays.items():
+            add_array(fields, name, values)
+    return grid
+
+
+def add_array(fields: vtkFieldData, name: str, values: NDArray) -> None:
+    """Add an array of numbers; the first on cells, or on points, is the one that programs show."""
+    from vtkmodules.util.numpy_support import numpy_to_vtk
+    from vtkmodules.vtkCommonDataModel import vtkDataSetAttributes
+
+    values = np.asarray(values)
+    values = values.reshape(len(values), -1) if values.ndim > 1 else values
+    array = numpy_to_vtk(np.ascontiguousarray(values.view(np.uint8) if values.dtype == bool else values), deep=True)
+    array.SetName(name)
+    fields.AddArray(array)
+    if isinstance(fields, vtkDataSetAttributes) and fields.GetScalars() is None:
+        fields.SetActiveScalars(name)
+
+
+def to_pyvista(
+    points: NDArray[np.float64], cells: NDArray[np.int64], kind: int, cell_data: Fields | None,
+    point_data: Fields | None,
+) -> Any:  # fmt: skip
+    """Cells of one of VTK's kinds and their data as a `pyvista.UnstructuredGrid`."""
+    pyvista = library("pyvista", "to_pyvista")
+    on_cells = checked_fields("cell_data", cell_data, len(cells))
+    on_points = checked_fields("point_data", point_data, len(points))
+    return pyvista.wrap(vtk_grid(points, cells, kind, on_cells, on_points))
+
+
+def to_meshio(
+    points: NDArray[np.float64], cells: NDArray[np.int64], kind: str, cell_data: Fields | None,
+    point_data: Fields | None,
+) -> Any:  # fmt: skip
+    """Cells of one of meshio's kinds and their data as a `meshio.Mesh`, of copies."""
+    meshio = library("meshio", "to_meshio")
+    on_cells = checked_fields("cell_data", cell_data, len(cells))
+    on_points = checked_fields("point_data", point_data, len(points))
+    return meshio.Mesh(
+        points.copy(),
+        [(kind, cells.copy())],
+        point_data={name: values.copy() for name, values in on_points.items()},
+        cell_data={name: [values.copy()] for name, values in on_cells.items()},
+    )
+
+
+def to_skfem(points: NDArray[np.float64], cells: NDArray[np.int64]) -> Any:
+    """A `skfem.MeshTri` or `skfem.MeshTet`."""
+    skfem = library("skfem", "to_skfem")
+    kind = skfem.MeshTet if points.shape[1] == 3 else skfem.MeshTri
+    # Contiguous, or scikit-fem warns of making them so.
+    return kind(np.ascontiguousarray(points.T), np.ascontiguousarray(cells.T))
+
+
+def to_trimesh(points: NDArray[np.float64], triangles: NDArray[np.int64]) -> Any:
+    """Triangles in space, and the points that they use, as a `trimesh.Trimesh`."""
+    trimesh = library("trimesh", "to_trimesh")
+    used, faces = np.unique(triangles, return_inverse=True)
+    return trimesh.Trimesh(points[used], faces.reshape(triangles.shape), process=False)
