@@ -266,7 +266,7 @@ class Mesh:
         --------
         >>> mesh = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 2, 3]])
         >>> boundary = mesh.to_trimesh()
-        >>> boundary.is_watertight, round(boundary.volume, 6)
+        >>> bool(boundary.is_watertight), round(float(boundary.volume), 6)
         (True, 0.166667)
         """
         if self.ndim != 3:
