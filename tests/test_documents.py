@@ -1,0 +1,97 @@
+"""What the documents tell a reader to type is what tetopt takes: Start is run, all the rest is parsed to the end."""
+
+import ast
+import re
+import shlex
+from pathlib import Path
+
+import pytest
+import typer
+
+import tetopt
+from tetopt.cli import main
+from tetopt.cli.app import COMMANDS, loaded_command
+
+DOCS = Path(__file__).resolve().parents[1] / "docs"
+PAGES = sorted(page for page in DOCS.rglob("*.md") if "_build" not in page.parts and "gallery" not in page.parts)
+LESSON = [DOCS / "start" / f"{name}.md" for name in ("install", "first_mesh", "what_came_out")]
+FENCE = re.compile(r"^(`{3,}|~{3,})(bash|python)$\n(.*?)^\1$", re.DOTALL | re.MULTILINE)
+
+
+def blocks(page, language):
+    """The text of each block of code of this language on a page."""
+    return [text for _, name, text in FENCE.findall(page.read_text(encoding="utf-8")) if name == language]
+
+
+def commands(page):
+    """The words after `tetopt` of each command in the page's bash blocks; a line that ends in a backslash goes on."""
+    lines = "\n".join(blocks(page, "bash")).replace("\\\n", " ").splitlines()
+    return [words[1:] for words in (shlex.split(line, comments=True) for line in lines) if words[:1] == ["tetopt"]]
+
+
+def names_of_tetopt(tree):
+    """What a program takes from tetopt, as dotted names: `tetopt.x` and `from tetopt.y import x`."""
+    for node in ast.walk(tree):
+        if isinstance(node, ast.Attribute) and isinstance(node.value, ast.Name) and node.value.id == "tetopt":
+            yield node.attr
+
+
+@pytest.fixture(scope="module")
+def parsers():
+    """Of each command its parser, made once, as the command line makes it."""
+    made = {}
+
+    def parser(name):
+        if name not in made:
+            app = typer.Typer(add_completion=False)
+            app.command(name)(loaded_command(name))
+            made[name] = typer.main.get_command(app)
+        return made[name]
+
+    return parser
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if commands(page)], ids=lambda page: page.stem)
+def test_commands_are_parsed(page, parsers):
+    """An option that is gone, a value of another kind, an argument too many: all refused by the parser."""
+    for name, *words in commands(page):
+        if name != "--version":
+            assert name in COMMANDS, name
+            parsers(name).make_context(name, words)
+
+
+def test_a_command_that_is_wrong_is_refused(parsers):
+    for wrong in (["--nodes", "many"], ["--no-such-option"]):
+        with pytest.raises(Exception) as refused:
+            parsers("mesh").make_context("mesh", ["a.nii", "-o", "a.vtu", *wrong])
+        assert wrong[0] in refused.value.format_message()
+
+
+@pytest.mark.parametrize("page", [page for page in PAGES if blocks(page, "python")], ids=lambda page: page.stem)
+def test_programs_are_compiled_and_their_names_exist(page):
+    for program in blocks(page, "python"):
+        for name in names_of_tetopt(ast.parse(program, page.name)):
+            assert hasattr(tetopt, name), f"tetopt.{name}"
+
+
+def test_the_lesson_runs(tmp_path, monkeypatch, capsys):
+    """Start, from its first command to its last program, on a phantom in the place of the T1, with fewer nodes."""
+    monkeypatch.chdir(tmp_path)
+    assert main(["phantom", "sphere", "-o", "T1.nii.gz", "--voxel-mm", "4"]) == 0
+    for page in LESSON:
+        for language, text in [(name, text) for _, name, text in FENCE.findall(page.read_text(encoding="utf-8"))]:
+            text = text.replace("5000", "150")
+            if language == "bash":
+                for line in text.splitlines():
+                    words = shlex.split(line)
+                    if words[0] == "tetopt" and words[1] != "warm-up":
+                        assert main(words[1:]) == 0, line
+            elif "nilearn" not in text:
+                exec(compile(text, page.name, "exec"), {})
+    printed = capsys.readouterr().out
+    assert "150 nodes, " in printed
+    assert "checked: conforming, oriented, in one piece, fills the box" in printed
+    assert "share of the variance in cells: 0." in printed
+    written = {path.name for path in tmp_path.iterdir()} - {"T1.nii.gz"}
+    pictures = {"slice.png", "rho.png", "energies.png", "thumbnail.png"}
+    assert written == {"brain.vtu", "brain_too.vtu", "run.json", "look.html"} | pictures
