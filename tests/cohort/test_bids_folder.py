@@ -113,7 +113,7 @@ PATTERNS = {  # by words of them: a session, and what matches
 def test_patterns_of_the_documents_find_what_programs_write(tmp_path, monkeypatch):
     """One file each, in folders as fMRIPrep, FreeSurfer and SynthSeg leave them, with other subjects and spaces."""
     words = (Path(__file__).parents[2] / "docs" / "howto" / "cohorts.md").read_text()
-    written = re.findall(r"^    --(?:mask|labels) (\S+)$", words, re.M)
+    written = re.findall(r"^--(?:mask|labels) (\S+)$", words, re.M)
     others = [name.replace("sub-1", "sub-10") for _, name in PATTERNS.values()]
     others += [name.replace("_desc", "_space-MNI152_desc") for _, name in PATTERNS.values()]
     filled(tmp_path / "derivatives", *others, *(name for _, name in PATTERNS.values()))
