@@ -41,7 +41,8 @@ def test_figures_have_captions_and_words_for_those_who_cannot_see_them():
             n_figures += 1
             assert re.search(r"^:alt: \S+ \S+", body, re.MULTILINE), (path.name, target)
             caption = re.sub(r"^:.*$", "", body, flags=re.MULTILINE).strip()
-            assert len(caption.split()) > 5 and caption.endswith("."), (path.name, target)
+            assert len(caption.split()) > 5, (path.name, target)
+            assert caption.endswith("."), (path.name, target)
     assert n_figures >= len(drawing.PICTURES)
 
 
