@@ -147,7 +147,7 @@ def flags_of_column(column, values):
 
 @pytest.mark.parametrize("n", [8, 12, 20, 50, 500])
 def test_usual_numbers_are_seldom_flagged(n):
-    """Of normal ones at most 1 of 1000, of Student's t with 5 degrees of freedom 5 of 1000; docs/measured/cohorts.md."""
+    """At most 1 normal one of 1000, of Student's t with 5 degrees of freedom 5 of 1000; docs/measured/cohorts.md."""
     rng = np.random.default_rng(n)
     columns = 100_000 // n
     for numbers, most in ((rng.normal(size=(columns, n)), 1e-3), (rng.standard_t(5, size=(columns, n)), 5e-3)):
