@@ -34,6 +34,7 @@ def check_mesh(
     Parameters
     ----------
     mesh : Mesh
+        Points in world mm.
     image : Image, optional
         The image whose box the mesh should fill, or lie in. Only where it fills it, overlaps of cells that share no
         facet are found.
@@ -46,10 +47,27 @@ def check_mesh(
     of_cell : (M,) array of whole numbers, optional
         Label of each cell, 0 or more.
 
+    Returns
+    -------
+    list of str
+        Empty if nothing is wrong.
+
     Raises
     ------
     InputError
         Mesh and image of different dimension, or labels that are not one whole number a cell.
+
+    Examples
+    --------
+    >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> tetopt.check_mesh(mesh, image)
+    []
+    >>> for line in tetopt.check_mesh(tetopt.Mesh(mesh.points, mesh.cells[1:]), image):
+    ...     print(line)
+    edges where the boundary has more than two facets; nodes: 1, the first [[36, 42]]
+    boundary facets off the faces of the image's box; nodes: 4, ...
+    volume: 0.999166666667 of the image's box
     """
     if image is not None and image.ndim != mesh.ndim:
         raise InputError(

@@ -56,11 +56,46 @@ class VoxelGrid:
         return self.voxel_volume * prod(self.shape)
 
     def to_world(self, index: ArrayLike) -> NDArray[np.float64]:
-        """World coordinates, (..., n) mm, of index coordinates (..., n)."""
+        """World coordinates of index coordinates.
+
+        Parameters
+        ----------
+        index : (..., n) array
+            Voxel centres have whole numbers.
+
+        Returns
+        -------
+        (..., n) float64
+            World mm, RAS+ in 3-D.
+
+        Examples
+        --------
+        >>> image = tetopt.Image(np.zeros((4, 5, 6)), np.diag([2.0, 2.0, 3.0, 1.0]))
+        >>> image.to_world([[0, 0, 1], [-0.5, -0.5, -0.5]])  # a voxel's centre, and the box's corner
+        array([[ 0. ,  0. ,  3. ],
+               [-1. , -1. , -1.5]])
+        """
         return transformed(np.asarray(index, dtype=np.float64), self.affine[:-1, :-1]) + self.affine[:-1, -1]
 
     def to_index(self, points: ArrayLike) -> NDArray[np.float64]:
-        """Index coordinates (..., n) of world points (..., n) in mm; the inverse of `to_world`."""
+        """Index coordinates of world points, the inverse of `to_world`.
+
+        Parameters
+        ----------
+        points : (..., n) array
+            World mm, RAS+ in 3-D.
+
+        Returns
+        -------
+        (..., n) float64
+            Voxel centres have whole numbers.
+
+        Examples
+        --------
+        >>> image = tetopt.Image(np.zeros((4, 5, 6)), np.diag([2.0, 2.0, 3.0, 1.0]))
+        >>> image.to_index([2.0, 4.0, 9.0])
+        array([1., 2., 3.])
+        """
         shifted = np.asarray(points, dtype=np.float64) - self.affine[:-1, -1]
         return transformed(shifted, np.asarray(np.linalg.inv(self.affine[:-1, :-1]), dtype=np.float64))
 
@@ -76,9 +111,9 @@ class Image(VoxelGrid):
     Parameters
     ----------
     data : (s_0, ..., s_{n-1}) array of real numbers
-        Intensities, n = 2 or 3. Held as float32 where that loses nothing, else as float64; read-only.
+        Intensities, n = 2 or 3. Kept as float32 where that loses nothing, else as float64; read-only.
     affine : (n+1, n+1) array, optional
-        Index -> world mm, homogeneous. The identity (1 mm voxels) by default. Held as float64; read-only.
+        Index -> world mm, homogeneous. The identity (1 mm voxels) by default. Kept as float64; read-only.
 
     Raises
     ------
@@ -86,13 +121,15 @@ class Image(VoxelGrid):
         Wrong number of axes, an empty axis, complex, RGB or non-finite data, or an affine that is singular or
         of another size.
 
+    See Also
+    --------
+    load_image : Read one from a file.
+
     Examples
     --------
-    >>> image = Image(np.zeros((4, 5, 6)), np.diag([2.0, 2.0, 3.0, 1.0]))
-    >>> image.voxel_volume
-    12.0
-    >>> image.to_world(np.array([[0.0, 0.0, 1.0]]))
-    array([[0., 0., 3.]])
+    >>> image = tetopt.Image(np.zeros((4, 5, 6)), np.diag([2.0, 2.0, 3.0, 1.0]))
+    >>> image.ndim, image.spacing.tolist(), round(image.voxel_volume, 6)
+    (3, [2.0, 2.0, 3.0], 12.0)
     """
 
     data: NDArray[np.floating]

@@ -38,11 +38,17 @@ class Mesh:
         Wrong shapes, non-finite points, no cells, indices out of range, or a cell that is flat or inverted
         (`tetopt.geometry.simplex.oriented` turns inverted ones).
 
+    See Also
+    --------
+    load_mesh : Read one from a file, with its data.
+    mesh_image : Make one of an image.
+    check_mesh : What is wrong with one.
+
     Examples
     --------
-    >>> mesh = Mesh([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]])
-    >>> mesh.ndim, len(mesh.cells)
-    (2, 1)
+    >>> mesh = tetopt.Mesh([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]])
+    >>> mesh.ndim, len(mesh.points), len(mesh.cells)
+    (2, 3, 1)
     """
 
     points: NDArray[np.float64]

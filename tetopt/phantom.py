@@ -137,6 +137,7 @@ class Phantom:
     Parameters
     ----------
     name, description : str
+        As the file has them.
     size_mm : (n,) float64
         Edge lengths of the box along the voxel axes, n = 2 or 3.
     voxel_mm : (n,) float64
@@ -146,8 +147,11 @@ class Phantom:
     axes : (n, n) float64
         Unit rows: world direction of each voxel axis.
     background_intensity : float
+        Of what no shape covers.
     background_label : int
+        Of what no shape covers.
     shapes : tuple of Shape
+        In the order in which they are painted.
     blur_mm, noise_sd : float
         Standard deviations of the rendered image's blur and noise.
     seed : int
@@ -155,11 +159,9 @@ class Phantom:
 
     Examples
     --------
-    >>> phantom = load_phantom("sphere")
-    >>> phantom.intensity([[0.0, 0.0, 19.9], [0.0, 0.0, 20.1]])
-    array([100.,  20.])
-    >>> phantom.image(voxel_mm=2).shape
-    (32, 32, 32)
+    >>> phantom = tetopt.load_phantom("sphere")
+    >>> phantom.ndim, phantom.size_mm.tolist(), phantom.background_intensity
+    (3, [64.0, 64.0, 64.0], 20.0)
     """
 
     name: str
@@ -181,11 +183,53 @@ class Phantom:
         return len(self.size_mm)
 
     def intensity(self, points: ArrayLike) -> NDArray[np.float64]:
-        """The exact h, (...) float64, at world points (..., n) mm, also outside the box."""
+        """The exact intensity at points, also outside the box.
+
+        Parameters
+        ----------
+        points : (..., n) array
+            World mm.
+
+        Returns
+        -------
+        (...) float64
+            h of the top shape there.
+
+        Raises
+        ------
+        InputError
+            Points that are not finite, or not n numbers each.
+
+        Examples
+        --------
+        >>> tetopt.load_phantom("sphere").intensity([[0.0, 0.0, 19.9], [0.0, 0.0, 20.1]]).tolist()
+        [100.0, 20.0]
+        """
         return self._intensities()[self._top_shape(self._checked_points(points))]
 
     def labels(self, points: ArrayLike) -> NDArray[np.int64]:
-        """Label, (...) int64, of the top shape at world points (..., n) in mm."""
+        """The label at points, also outside the box.
+
+        Parameters
+        ----------
+        points : (..., n) array
+            World mm.
+
+        Returns
+        -------
+        (...) int64
+            Label of the top shape there.
+
+        Raises
+        ------
+        InputError
+            Points that are not finite, or not n numbers each.
+
+        Examples
+        --------
+        >>> tetopt.load_phantom("sphere").labels([[0.0, 0.0, 19.9], [0.0, 0.0, 20.1]]).tolist()
+        [1, 0]
+        """
         return self._labels()[self._top_shape(self._checked_points(points))]
 
     def image(
@@ -218,10 +262,24 @@ class Phantom:
         supersample : int
             Sub-voxels along each axis, 1 to 64; 1 gives the intensity at the voxel centres.
 
+        Returns
+        -------
+        Image
+            Of float64, in the phantom's box.
+
         Raises
         ------
         InputError
             An option out of range, more than ``2**36`` voxels, or than fit into memory.
+
+        Examples
+        --------
+        >>> phantom = tetopt.load_phantom("sphere")
+        >>> phantom.image(voxel_mm=4).shape
+        (16, 16, 16)
+        >>> noisy = phantom.image(voxel_mm=4, noise_sd=5, seed=1)
+        >>> print(f"{(noisy.data - phantom.image(voxel_mm=4).data).std():.1f}")
+        5.0
         """
         voxels = self.voxels(voxel_mm, blur_mm, noise_sd, seed, supersample)
         self._check_whole(voxels.shape)
@@ -237,10 +295,26 @@ class Phantom:
     ) -> PhantomVoxels:
         """The voxels of `image`, painted box by box when they are asked for: together they need not fit into memory.
 
+        Parameters
+        ----------
+        voxel_mm, blur_mm, noise_sd, seed, supersample
+            As of `image`.
+
+        Returns
+        -------
+        PhantomVoxels
+            An array of which slices are painted when they are asked for.
+
         Raises
         ------
         InputError
             As `image`, but for the number of voxels.
+
+        Examples
+        --------
+        >>> voxels = tetopt.load_phantom("sphere").voxels(voxel_mm=0.25)
+        >>> voxels.shape, float(voxels[128:129, 128:129, 128:129].item())
+        ((256, 256, 256), 100.0)
         """
         where = f"phantom {self.name!r}"
         blur = _number(self.blur_mm if blur_mm is None else blur_mm, f"{where}: blur_mm", 0.0)
@@ -252,7 +326,29 @@ class Phantom:
         return PhantomVoxels(self, *self._grid(voxel_mm), blur, sd, seed, supersample)
 
     def label_image(self, voxel_mm: ArrayLike | None = None) -> Image:
-        """The label at every voxel's centre, on the same voxels as `image`."""
+        """The label at every voxel's centre, on the same voxels as `image`.
+
+        Parameters
+        ----------
+        voxel_mm : float or (n,) floats, optional
+            As of `image`.
+
+        Returns
+        -------
+        Image
+            Whole numbers.
+
+        Raises
+        ------
+        InputError
+            As `image`.
+
+        Examples
+        --------
+        >>> labels = tetopt.load_phantom("sphere").label_image(voxel_mm=4)
+        >>> int(labels.data.sum())  # voxels whose centre lies in the ball
+        552
+        """
         shape, affine = self._grid(voxel_mm)
         self._check_whole(shape)
         data = np.empty(shape, dtype=np.int64)
@@ -469,17 +565,30 @@ def phantom_names() -> list[str]:
 
 
 def load_phantom(name_or_path: str | Path) -> Phantom:
-    """Read a phantom.
+    """A phantom by its name, or from a file.
 
     Parameters
     ----------
     name_or_path : str or Path
         One of `phantom_names`, or the path of a ``.toml`` file.
 
+    Returns
+    -------
+    Phantom
+        A box with shapes, of exactly known intensity.
+
     Raises
     ------
     InputError
         No such phantom or file, or a file that does not describe a phantom; the message says where and why.
+
+    Examples
+    --------
+    >>> phantom = tetopt.load_phantom("two_spheres")
+    >>> phantom.size_mm.tolist(), [shape.name for shape in phantom.shapes]
+    ([64.0, 64.0, 64.0], ['soft', 'stiff'])
+    >>> tetopt.phantom.phantom_names()[:3]
+    ['constant', 'disc_2d', 'ellipsoids_brain']
     """
     path = Path(name_or_path)
     if isinstance(name_or_path, str) and path.suffix != ".toml":

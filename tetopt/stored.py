@@ -29,6 +29,17 @@ class StoredImage(VoxelGrid):
     ------
     InputError
         Other than three axes, an empty axis, or an affine that no `Image` takes.
+
+    See Also
+    --------
+    load_image : Reads one into memory.
+
+    Examples
+    --------
+    >>> voxels = np.memmap("scan.raw", dtype=np.int16, mode="w+", shape=(64, 64, 64))
+    >>> stored = tetopt.StoredImage(voxels, np.diag([0.5, 0.5, 0.5, 1.0]))
+    >>> stored.shape, stored.box((0, 0, 0), (8, 8, 8)).shape
+    ((64, 64, 64), (8, 8, 8))
     """
 
     voxels: Any
@@ -47,16 +58,50 @@ class StoredImage(VoxelGrid):
         return tuple(int(size) for size in self.voxels.shape)
 
     def read(self, start: Sequence[int], stop: Sequence[int]) -> NDArray:
-        """The voxels of a box of indices, start to before stop (3,) each, in memory, as they are stored."""
+        """The voxels of a box of indices, in memory, as they are stored.
+
+        Parameters
+        ----------
+        start, stop : (3,) sequences of int
+            The first index of the box along each axis, and the one after its last.
+
+        Returns
+        -------
+        (stop - start) array
+            Of the type that is stored.
+
+        Examples
+        --------
+        >>> stored = tetopt.StoredImage(np.arange(64, dtype=np.int16).reshape(4, 4, 4))
+        >>> stored.read((0, 0, 0), (1, 2, 4)).tolist()
+        [[[0, 1, 2, 3], [4, 5, 6, 7]]]
+        """
         return np.asarray(self.voxels[tuple(slice(int(a), int(b)) for a, b in zip(start, stop, strict=True))])
 
     def box(self, start: Sequence[int], stop: Sequence[int]) -> Image:
         """The voxels of a box of indices as an image; every voxel keeps its place in the world.
 
+        Parameters
+        ----------
+        start, stop : (3,) sequences of int
+            The first index of the box along each axis, and the one after its last.
+
+        Returns
+        -------
+        Image
+            The box, in memory.
+
         Raises
         ------
         InputError
             Values that no `Image` takes, NaN among them.
+
+        Examples
+        --------
+        >>> stored = tetopt.StoredImage(np.arange(64, dtype=np.int16).reshape(4, 4, 4))
+        >>> corner = stored.box((2, 2, 2), (4, 4, 4))
+        >>> corner.to_world([0, 0, 0]).tolist() == stored.to_world([2, 2, 2]).tolist()
+        True
         """
         affine = self.affine.copy()
         affine[:-1, -1] = self.to_world(start)

@@ -26,7 +26,35 @@ def cell_E_G(points: Points, cells: Cells) -> NDArray[np.float64]:
 
 
 def E_G(points: Points, cells: Cells) -> float:
-    """The geometric energy of Eq. (1), mm^(n+2)."""
+    """The geometric energy of Eq. (1), mm^(n+2).
+
+    The sum over cells of the volume times the squared lengths of all edges, over (n + 1) (n + 2): small where cells are
+    round and of one size. It does not look at the image.
+
+    Parameters
+    ----------
+    points : (N, n) array of float64
+        Node positions, mm, n = 2 or 3.
+    cells : (M, n+1) array of int64
+        Node indices of each cell.
+
+    Returns
+    -------
+    float
+        mm^(n+2).
+
+    Raises
+    ------
+    InputError
+        Points or cells that are no tables of numbers.
+
+    Examples
+    --------
+    >>> equilateral = np.array([[0.0, 0.0], [1.0, 0.0], [0.5, np.sqrt(0.75)]])
+    >>> flatter = np.array([[0.0, 0.0], [1.0, 0.0], [0.0, np.sqrt(0.75)]])  # of the same area
+    >>> [round(tetopt.E_G(points, np.array([[0, 1, 2]])), 3) for points in (equilateral, flatter)]
+    [0.108, 0.126]
+    """
     return float(cell_E_G(points, cells).sum())
 
 

@@ -36,17 +36,47 @@ Boundary = Literal["slide", "fixed"]
 
 
 class Record(NamedTuple):
-    """One row of the history; row 0 is the initial mesh."""
+    """One row of the history; row 0 is the initial mesh.
+
+    Parameters
+    ----------
+    iteration : int
+        From 0, the initial mesh.
+    E : float
+        Normalised by the initial mesh, Eq. (4) and Section 4.
+    E_G : float
+        mm^(n+2).
+    E_D : float
+        intensity^2 mm^n.
+    movement : float
+        `|x^t - x^(t-1)| / |x^(t-1)|`, x from the box's centre.
+    is_retessellated : bool
+        A new tessellation was taken in this iteration.
+    n_cells : int
+        Triangles or tetrahedra.
+    n_voxels : int
+        Voxel centres inside the cells; the same in every row.
+    seconds : float
+        Since the start.
+
+    Examples
+    --------
+    >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> result = tetopt.optimize(image, mesh, k_D=0.5, iterations=3)
+    >>> [f"{record.iteration}: {record.E:.2f}" for record in result.history]
+    ['0: 1.00', '1: 0.77', '2: 0.73', '3: 0.71']
+    """
 
     iteration: int
-    E: float  # normalised by the initial mesh, Eq. (4) and Section 4
-    E_G: float  # mm^(n+2)
-    E_D: float  # intensity^2 mm^n
-    movement: float  # |x^t - x^(t-1)| / |x^(t-1)|, x from the box's centre
-    is_retessellated: bool  # a new tessellation was taken in this iteration
+    E: float
+    E_G: float
+    E_D: float
+    movement: float
+    is_retessellated: bool
     n_cells: int
-    n_voxels: int  # voxel centres inside the cells; the same in every row
-    seconds: float  # since the start
+    n_voxels: int
+    seconds: float
 
 
 class Whole(NamedTuple):
@@ -61,17 +91,47 @@ class Whole(NamedTuple):
 
 
 class Optimized(NamedTuple):
-    """What `optimize` returns, and, with all fields, `mesh_image`."""
+    """What `optimize` returns, and, with all fields, `mesh_image`.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        The result.
+    history : list of Record
+        A row an iteration, the initial mesh's first.
+    ended : {"iterations", "converged", "max_seconds", "stopped"}
+        Why.
+    initial : Mesh, optional
+        The mesh that the run began with.
+    nodes : int, optional
+        The number that the run was to have, asked for or what a target error takes.
+    seconds_start : float
+        For initial meshes, over all runs towards a target error.
+    seconds_run : float
+        For the optimisations, likewise.
+    labels : (M,) int64, optional
+        Label of each cell, of a content with memberships.
+    missed : mapping of str to str
+        What the mesh should be and is not, by name, a sentence each (`tetopt.engine.promises`); empty if it is all.
+
+    Examples
+    --------
+    >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+    >>> result = tetopt.mesh_image(image, 300)
+    >>> len(result.mesh.points), result.ended, len(result.missed)
+    (300, 'iterations', 0)
+    >>> result.history[-1].E < result.history[0].E
+    True
+    """
 
     mesh: Mesh
     history: list[Record]
-    ended: str  # "iterations", "converged", "max_seconds" or "stopped"
-    initial: Mesh | None = None  # the mesh that the run began with
-    nodes: int | None = None  # the number that the run was to have, asked for or found to have a target error
-    seconds_start: float = 0.0  # for initial meshes, over all runs towards a target error
-    seconds_run: float = 0.0  # for the optimisations, likewise
-    labels: NDArray[np.int64] | None = None  # (M,) label of each cell, of a content with memberships
-    # What the mesh should be and is not, by name, a sentence each (`tetopt.engine.promises`); empty if it is all.
+    ended: str
+    initial: Mesh | None = None
+    nodes: int | None = None
+    seconds_start: float = 0.0
+    seconds_run: float = 0.0
+    labels: NDArray[np.int64] | None = None
     missed: Mapping[str, str] = MappingProxyType({})
 
 

@@ -136,12 +136,31 @@ def mesh_image(
         `target_error`, or `spacing`; a number of nodes that the image is not worth (see `octree`), or that there is no
         memory for; an error that its noise does not allow.
 
+    See Also
+    --------
+    content : Several contrasts, labels and a mask.
+    save_mesh, model_of : What follows.
+
     Examples
     --------
-    >>> ball = np.fromfunction(lambda i, j, k: 100.0 * ((i - 20)**2 + (j - 20)**2 + (k - 20)**2 < 90), (41, 41, 41))
-    >>> result = mesh_image(Image(ball), 800)
-    >>> len(result.mesh.points)
-    800
+    >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+    >>> result = tetopt.mesh_image(image, 300)
+    >>> uniform = tetopt.mesh_image(image, 300, mode="uniform")
+    >>> ratio = tetopt.E_D(image, uniform.mesh) / tetopt.E_D(image, result.mesh)
+    >>> len(result.mesh.points), dict(result.missed), ratio > 100
+    (300, {}, True)
+
+    As many nodes as an error takes, here a fifth of the image's variance:
+
+    >>> result = tetopt.mesh_image(image, target_error=0.2)
+    >>> tetopt.E_D(image, result.mesh) < 0.2 * image.data.var() * image.volume
+    True
+
+    A mesh of yours, made better:
+
+    >>> result = tetopt.mesh_image(image, start=tetopt.lattice(image, nodes=300), iterations=3)
+    >>> result.history[-1].E < 1
+    True
     """
     if mode is None:
         mode = "graded" if start is None else "start"

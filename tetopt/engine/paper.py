@@ -108,6 +108,18 @@ def optimize_paper(
     InputError
         An option out of range, a mesh that the sampling cannot take (see `cell_moments`), with doubled cells, or,
         unless `retessellate` is "never", one that does not fill the image's box.
+
+    See Also
+    --------
+    optimize : The default engine.
+
+    Examples
+    --------
+    >>> image = tetopt.load_phantom("disc_2d").image(voxel_mm=4)
+    >>> mesh = tetopt.lattice(image, nodes=100)
+    >>> result = tetopt.optimize_paper(image, mesh, k_D=0.02, iterations=4)
+    >>> [round(record.E, 2) for record in result.history]
+    [1.0, 0.92, 0.91, 0.91, 0.91]
     """
     _check_options(k_D, iterations, n_t, retessellate, boundary, step_ratio)
     n_t = default_n_t(k_D, iterations) if n_t is None else n_t

@@ -88,8 +88,9 @@ def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str
     Parameters
     ----------
     path : str or Path
-        See `FORMATS`.
+        Its suffix decides the format, see `tetopt.io.formats.FORMATS`.
     model : Model
+        As `model_of` makes it.
     space : {"ras", "lps"}
         Convention of the file's coordinates; NIfTI's is RAS+, DICOM's, ITK's and 3D Slicer's files' LPS+.
     units : {"kPa", "MPa"}
@@ -101,6 +102,19 @@ def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str
         An unknown suffix, or what the format cannot carry; sets with names that some format cannot carry.
     OSError
         As `tetopt.io.readback.save_checked`.
+
+    See Also
+    --------
+    model_of : Makes a model.
+
+    Examples
+    --------
+    >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> loads = ["hold:inferior", "pressure:superior:1"]
+    >>> model = tetopt.model_of(mesh, image, young="0.1*h", nu=0.45, loads=loads)
+    >>> for name in ("ball.inp", "ball.feb", "ball.vtu"):  # CalculiX and Abaqus, FEBio, ParaView
+    ...     tetopt.save_model(name, model)
     """
     path = Path(path)
     kind, ready = format_of(path), _ready(path, model, space, units)
@@ -127,10 +141,38 @@ def save_mesh(
     field-data text, as JSON unless it is a string already. `save_model` writes sets, materials and loads, too. Replaces
     an existing file; ask `tetopt.io.files.checked_output` first.
 
+    Parameters
+    ----------
+    path : str or Path
+        Its suffix decides the format, see `tetopt.io.formats.FORMATS`.
+    mesh : Mesh
+        Points in world mm.
+    cell_data : dict of arrays, optional
+        By name, one row a cell.
+    about : dict, optional
+        Texts for the file's head, by name.
+    point_data : dict of arrays, optional
+        By name, a row for each mesh point, or each node of order 2.
+    order : {1, 2}
+        2: straight-edged quadratic cells.
+
     Raises
     ------
     InputError
         As `save_model`.
+
+    See Also
+    --------
+    load_mesh : Reads one.
+    save_model : Writes sets, materials and loads, too.
+
+    Examples
+    --------
+    >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> tetopt.save_mesh("ball.vtu", mesh, tetopt.cell_fields(mesh, image))
+    >>> sorted(tetopt.load_mesh("ball.vtu").cell_data)
+    ['max', 'mean', 'min', 'min_dihedral', 'n_voxels', 'rho', 'variance', 'volume']
     """
     save_model(
         path, Model(mesh, cell_data or {}, Sets({}, {}), order=order, about=about or {}, point_data=point_data or {})

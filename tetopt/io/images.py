@@ -114,6 +114,22 @@ def load_image(
         The image is constant, so its discretization error is 0 on every mesh; the file has no orientation; its header
         was mended; its box is longer than 3 m or shorter than 1 mm, pictures aside; chunks are missing that stand for a
         value.
+
+    See Also
+    --------
+    save_image : Writes one.
+    load_label_table : Names and colours of labels.
+
+    Examples
+    --------
+    >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+    >>> tetopt.save_image("ball.nii.gz", image)
+    >>> tetopt.load_image("ball.nii.gz").shape
+    (16, 16, 16)
+    >>> tetopt.load_image("ball.nii.gz", crop=[(2, 14)] * 3).shape
+    (12, 12, 12)
+    >>> tetopt.load_image("ball.nii.gz", slice_=(2, 8)).shape
+    (16, 16)
     """
     path = Path(path)
     notes: list[str] = []
@@ -185,12 +201,26 @@ def save_image(path: str | Path, image: Image) -> None:
     existing file; ask `tetopt.io.files.checked_output` first. A folder of Zarr (.zarr), of a 3-D image, is
     `tetopt.io.zarr_images.save_zarr`'s, in chunks that `tetopt.io.stored_images.open_stored` reads one by one.
 
+    Parameters
+    ----------
+    path : str or Path
+        Its name ends in .nii, .nii.gz or .zarr.
+    image : Image
+        Two- or three-dimensional.
+
     Raises
     ------
     InputError
         A name that ends otherwise; as `save_zarr`.
     OSError
         As `tetopt.io.files.written_whole`, or the file reads back with another head or cut off.
+
+    Examples
+    --------
+    >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+    >>> tetopt.save_image("ball.nii.gz", image)
+    >>> bool((tetopt.load_image("ball.nii.gz").data == image.data).all())
+    True
     """
     path = check_suffix(path, (*OUTPUT_SUFFIXES, ZARR_SUFFIX))
     if path.name.lower().endswith(ZARR_SUFFIX):

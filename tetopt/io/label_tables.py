@@ -42,13 +42,34 @@ class Entry(NamedTuple):
 
 
 def load_label_table(path: str | Path) -> LabelTable:
-    """Names and colours of labels from a file, see the module.
+    """Names and colours of labels from a file.
+
+    FreeSurfer's and 3D Slicer's tables of colours, ITK-SNAP's descriptions, BIDS's `*_dseg.tsv` and any CSV with a
+    first row of names are told apart by what they hold; `tetopt.io.label_tables` has the columns.
+
+    Parameters
+    ----------
+    path : str or Path
+        A text file.
+
+    Returns
+    -------
+    LabelTable
+        Names and colours by label.
 
     Raises
     ------
     InputError
         No such file, one that is not of these kinds, a line that is not like the others, or a label with two names or
         two colours.
+
+    Examples
+    --------
+    >>> from pathlib import Path
+    >>> _ = Path("labels.csv").write_text("label,name,color\\n1,liver,#b02020\\n2,spleen,#802060\\n")
+    >>> table = tetopt.load_label_table("labels.csv")
+    >>> table.names
+    {1: 'liver', 2: 'spleen'}
     """
     path = Path(path)
     text = text_of(path, "table of labels' names")

@@ -30,46 +30,109 @@ STRAIGHT_SHARE = 1e-6  # of an edge: a middle node that is less off its middle w
 
 
 class MeshFile(NamedTuple):
-    """A mesh read from a file and what came with it."""
+    """A mesh read from a file and what came with it.
 
-    mesh: Mesh  # RAS+ mm
-    cell_data: dict[str, NDArray]  # by name, one row a cell; "young", if the file has it, in kPa
-    field_data: dict[str, NDArray]  # by name, of any length; bytes of UTF-8 have become one string
-    n_turned: int  # cells that were oriented the other way in the file
-    n_left: int = 0  # cells of lower dimension, triangles on tetrahedra among them, that were left out
+    Parameters
+    ----------
+    mesh : Mesh
+        RAS+ mm.
+    cell_data : dict of arrays
+        By name, one row a cell; "young", if the file has it, in kPa.
+    field_data : dict of arrays
+        By name, of any length; bytes of UTF-8 have become one string.
+    n_turned : int
+        Cells that were oriented the other way in the file.
+    n_left : int
+        Cells of lower dimension, triangles on tetrahedra among them, that were left out.
+    sets : Sets
+        Of facets and cells, by name.
+    box : Box, optional
+        Of the image that the mesh was made from.
+    space : {"ras", "lps"}
+        Of the file: from "lps" the mesh has been turned to RAS+.
+    notes : tuple of str
+        What was left out or renamed, a line each.
+    order : {1, 2}
+        Of the file's cells; of those of order 2 the mesh has the corners.
+    point_data : dict of arrays
+        By name, a row for each node of the order.
+
+    Examples
+    --------
+    >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> tetopt.save_mesh("ball.vtk", mesh)
+    >>> file = tetopt.load_mesh("ball.vtk")
+    >>> len(file.mesh.cells), file.n_turned, file.space, file.order
+    (1200, 0, 'ras', 1)
+    """
+
+    mesh: Mesh
+    cell_data: dict[str, NDArray]
+    field_data: dict[str, NDArray]
+    n_turned: int
+    n_left: int = 0
     sets: Sets = Sets({}, {})
-    box: Box | None = None  # of the image that the mesh was made from
-    space: str = "ras"  # of the file: from "lps" the mesh has been turned to RAS+
-    notes: tuple[str, ...] = ()  # what was left out or renamed, a line each
-    order: int = 1  # of the file's cells; of those of order 2 the mesh has the corners
-    point_data: dict[str, NDArray] = {}  # noqa: RUF012 - nobody changes it; a row for each node of the order
+    box: Box | None = None
+    space: str = "ras"
+    notes: tuple[str, ...] = ()
+    order: int = 1
+    point_data: dict[str, NDArray] = {}  # noqa: RUF012 - nobody changes it
 
     def text(self, name: str) -> str | None:
-        """A text among the field data, if it is there."""
+        """A text among the field data, if it is there.
+
+        Parameters
+        ----------
+        name : str
+            Of the field data.
+
+        Returns
+        -------
+        str or None
+            None if it is not there, or no text.
+
+        Examples
+        --------
+        >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+        >>> mesh = tetopt.lattice(image, nodes=300)
+        >>> tetopt.save_mesh("ball.vtu", mesh, about={"subject": "sub-01"})
+        >>> tetopt.load_mesh("ball.vtu").text("subject")
+        'sub-01'
+        """
         return text_in(self.field_data, name)
 
 
 def load_mesh(path: str | Path) -> MeshFile:
-    """Read triangles or tetrahedra, linear or quadratic, from a file of VTK's or gmsh's, see `MESH_SUFFIXES`.
+    """Read triangles or tetrahedra, linear or quadratic, from a file of VTK's or gmsh's.
 
-    Of cells of order 2 the corners are the mesh, so that curved edges become straight, which a note then tells; point
-    data has a row for each node of order 2, in the order of `tetopt.geometry.quadratic.quadratic`.
-    Cells oriented the other way are turned and counted; cells of lower dimension are left out and counted, and so are
-    nodes that no cell uses. Without tetrahedra, a file of triangles is 2-D and must lie in the plane z = 0. Coordinates
-    are taken for RAS+ unless the file says LPS, as those of `tetopt convert --space lps` and of 3D Slicer do; these are
-    turned, and moduli and stresses that it holds in MPa taken to kPa. Data other than numbers are left out.
+    Parameters
+    ----------
+    path : str or Path
+        Its name ends as one of `tetopt.io.meshes.MESH_SUFFIXES`: .vtu, .vtk, .vtkhdf, .pvtu, .msh, .msh2.
 
-    Of a file in pieces, points that several of them hold become one: by their numbers, where the file has them, so that
-    a file of ours gives back the same mesh; else where they lie at the same place.
-
-    The sets of a file of ours in one of VTK's formats are taken if its cells are still those that they were written
-    for. gmsh's physical groups (files named .msh or .msh2) become sets, with names that every format can carry; in
-    files of ours the cell sets are those that were written.
+    Returns
+    -------
+    MeshFile
+        The mesh, its data by name, sets, and what was turned or left out.
 
     Raises
     ------
     InputError
         A missing or unreadable file, no cells, other cell types, triangles out of the plane, flat cells.
+
+    See Also
+    --------
+    save_mesh : Writes one.
+
+    Examples
+    --------
+    >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> tetopt.save_mesh("ball.vtu", mesh, tetopt.cell_fields(mesh, image))
+    >>> file = tetopt.load_mesh("ball.vtu")
+    >>> bool((file.mesh.points == mesh.points).all()), file.cell_data["mean"].shape
+    (True, (1200,))
     """
     path = regular_file(path, "mesh file")
     if path.suffix.lower() not in MESH_SUFFIXES:

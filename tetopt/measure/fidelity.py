@@ -44,22 +44,62 @@ class FacetSurface(NamedTuple):
 
 
 class LabelFidelity(NamedTuple):
-    """What the mesh makes of one label. Volumes are areas in 2-D."""
+    """What the mesh makes of one label. Volumes are areas in 2-D.
+
+    Parameters
+    ----------
+    label : int
+        Which one.
+    voxels : int
+        That have it.
+    volume : float
+        Of these voxels, mm^n.
+    mesh_volume : float
+        Of the cells that carry it, mm^n.
+    n_cells : int
+        That carry it.
+    n_empty_cells : int
+        Those of them that hold no voxel centre.
+    dice : float
+        Of the voxels in these cells with the voxels that have it, 0 to 1.
+    volume_dice : float
+        Of the cells with the voxels as boxes: what cells as small as voxels cannot get around.
+    distance_mean : float
+        Between its surface in the mesh and in the image, both ways, mm; nan without one of them.
+    distance_p95 : float
+        95th percentile of the same, mm.
+    components : int
+        Pieces of its voxels that hang together by faces.
+    mesh_components : int
+        Pieces of its cells that hang together by facets.
+    is_lost : bool
+        Nothing of the mesh carries it.
+    distance_max : float
+        The largest of the distances, mm: of single spikes, which a percentile does not see.
+
+    Examples
+    --------
+    >>> phantom = tetopt.load_phantom("sphere")
+    >>> labels = phantom.label_image(voxel_mm=4)
+    >>> ball = tetopt.label_fidelity(labels, tetopt.lattice(labels, nodes=300))[1]
+    >>> ball.label, ball.voxels, ball.components, ball.is_lost
+    (1, 552, 1, False)
+    """
 
     label: int
-    voxels: int  # that have it
-    volume: float  # of these voxels, mm^n
-    mesh_volume: float  # of the cells that carry it, mm^n
-    n_cells: int  # that carry it
-    n_empty_cells: int  # those of them that hold no voxel centre
-    dice: float  # of the voxels in these cells with the voxels that have it, 0 to 1
-    volume_dice: float  # of the cells with the voxels as boxes: what cells as small as voxels cannot get around
-    distance_mean: float  # between its surface in the mesh and in the image, both ways, mm; nan without one of them
-    distance_p95: float  # 95th percentile of the same, mm
-    components: int  # pieces of its voxels that hang together by faces
-    mesh_components: int  # pieces of its cells that hang together by facets
-    is_lost: bool  # nothing of the mesh carries it
-    distance_max: float = np.nan  # the largest of the distances: of single spikes, which a percentile does not see
+    voxels: int
+    volume: float
+    mesh_volume: float
+    n_cells: int
+    n_empty_cells: int
+    dice: float
+    volume_dice: float
+    distance_mean: float
+    distance_p95: float
+    components: int
+    mesh_components: int
+    is_lost: bool
+    distance_max: float = np.nan
 
 
 class MaskFidelity(NamedTuple):
@@ -67,24 +107,58 @@ class MaskFidelity(NamedTuple):
 
     Distances are between the mesh's boundary and the mask's half level, off the faces of the box; nan without one of
     them. Those in voxels are measured in index space, where every voxel is a unit cube, those in mm in the world.
+
+    Parameters
+    ----------
+    voxels : int
+        With 1/2 or more.
+    volume : float
+        Of these voxels, mm^n.
+    mesh_volume : float
+        Of all cells, mm^n.
+    dice : float
+        Of the voxels inside the mesh with those of 1/2 or more, 0 to 1.
+    distance_mean, distance_p95 : float
+        From the mesh's boundary to the mask's, voxels: the mean and the 95th percentile.
+    reverse_mean, reverse_p95 : float
+        From the mask's boundary to the mesh's, voxels.
+    distance_mean_mm, distance_p95_mm, reverse_mean_mm, reverse_p95_mm : float
+        The same four in mm.
+    components : int
+        Pieces of the voxels that hang together by faces.
+    mesh_components : int
+        Pieces of the cells that hang together by facets.
+    euler : int
+        Euler characteristic of the mask's half level: 2 for each closed piece, 2 less for each handle.
+    mesh_euler : int
+        Of the mesh's boundary; both without what lies on the box, 1 for a disc that ends there.
+
+    Examples
+    --------
+    >>> phantom = tetopt.load_phantom("sphere")
+    >>> labels = phantom.label_image(voxel_mm=4)
+    >>> mask = tetopt.Image(labels.data == 1, labels.affine)
+    >>> box = tetopt.mask_fidelity(mask, tetopt.lattice(labels, nodes=300))  # a mesh of the whole box
+    >>> round(box.dice, 2), box.components, box.euler
+    (0.24, 1, 2)
     """
 
-    voxels: int  # with 1/2 or more
-    volume: float  # of these voxels, mm^n
-    mesh_volume: float  # of all cells, mm^n
-    dice: float  # of the voxels inside the mesh with those of 1/2 or more, 0 to 1
-    distance_mean: float  # from the mesh's boundary to the mask's, voxels
-    distance_p95: float  # 95th percentile of the same
-    reverse_mean: float  # from the mask's boundary to the mesh's, voxels
+    voxels: int
+    volume: float
+    mesh_volume: float
+    dice: float
+    distance_mean: float
+    distance_p95: float
+    reverse_mean: float
     reverse_p95: float
-    distance_mean_mm: float  # the same four in mm
+    distance_mean_mm: float
     distance_p95_mm: float
     reverse_mean_mm: float
     reverse_p95_mm: float
-    components: int  # pieces of the voxels that hang together by faces
-    mesh_components: int  # pieces of the cells that hang together by facets
-    euler: int  # Euler characteristic of the mask's half level: 2 for each closed piece, 2 less for each handle
-    mesh_euler: int  # of the mesh's boundary; both without what lies on the box, 1 for a disc that ends there
+    components: int
+    mesh_components: int
+    euler: int
+    mesh_euler: int
 
 
 def cell_labels(labels: Image, mesh: Mesh) -> NDArray[np.int64]:
@@ -97,15 +171,26 @@ def cell_labels(labels: Image, mesh: Mesh) -> NDArray[np.int64]:
     labels : Image
         Whole numbers from 0 to `tetopt.target.labels.LARGEST_LABEL`.
     mesh : Mesh
+        Points in world mm.
 
     Returns
     -------
     (M,) int64
+        Label of each cell.
 
     Raises
     ------
     InputError
         Labels that are none, or as `tetopt.energy.sampling.cell_moments`.
+
+    Examples
+    --------
+    >>> phantom = tetopt.load_phantom("sphere")
+    >>> labels = phantom.label_image(voxel_mm=4)
+    >>> mesh = tetopt.lattice(labels, nodes=300)
+    >>> of_cell = tetopt.cell_labels(labels, mesh)
+    >>> np.bincount(of_cell).tolist()
+    [1063, 137]
     """
     check_labels("labels", labels)
     return _majority(labels, mesh, cell_of_voxel(labels, mesh))
@@ -122,6 +207,7 @@ def label_fidelity(labels: Image, mesh: Mesh, of_cell: ArrayLike | None = None) 
     labels : Image
         Whole numbers from 0 to `tetopt.target.labels.LARGEST_LABEL`.
     mesh : Mesh
+        Points in world mm.
     of_cell : (M,) array of whole numbers, optional
         Label that each cell carries; `cell_labels` by default.
 
@@ -134,6 +220,17 @@ def label_fidelity(labels: Image, mesh: Mesh, of_cell: ArrayLike | None = None) 
     ------
     InputError
         Labels that are none, not one label a cell, or as `tetopt.energy.sampling.cell_moments`.
+
+    Examples
+    --------
+    >>> phantom = tetopt.load_phantom("sphere")
+    >>> labels = phantom.label_image(voxel_mm=4)
+    >>> image = phantom.image(voxel_mm=4)
+    >>> result = tetopt.mesh_image(tetopt.content(image, labels), 300)
+    >>> for each in tetopt.label_fidelity(labels, result.mesh, result.labels):
+    ...     print(f"label {each.label}: Dice {each.dice:.2f}, surface off by {each.distance_mean:.1f} mm")
+    label 0: Dice 1.00, surface off by 0.5 mm
+    label 1: Dice 1.00, surface off by 0.5 mm
     """
     check_labels("labels", labels)
     owner = cell_of_voxel(labels, mesh)
@@ -206,11 +303,27 @@ def mask_fidelity(mask: Image, mesh: Mesh) -> MaskFidelity:
     mask : Image
         From 0, outside, to 1, inside; fractions are partial volumes.
     mesh : Mesh
+        Points in world mm.
+
+    Returns
+    -------
+    MaskFidelity
+        Volumes, Dice, distances both ways, pieces, Euler characteristics.
 
     Raises
     ------
     InputError
         A mask with other values, or as `tetopt.energy.sampling.cell_moments`.
+
+    Examples
+    --------
+    >>> phantom = tetopt.load_phantom("sphere")
+    >>> labels = phantom.label_image(voxel_mm=4)
+    >>> mask = tetopt.Image(labels.data == 1, labels.affine)
+    >>> what = tetopt.content(phantom.image(voxel_mm=4), mask=mask)
+    >>> fidelity = tetopt.mask_fidelity(mask, tetopt.mesh_image(what, 200).mesh)
+    >>> print(f"Dice {fidelity.dice:.2f}, {fidelity.distance_mean:.2f} voxels off")
+    Dice 1.00, 0.12 voxels off
     """
     low, high = float(mask.data.min()), float(mask.data.max())
     if low < 0.0 or high > 1.0:

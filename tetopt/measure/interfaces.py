@@ -33,22 +33,63 @@ NET_RELAXATION = 0.5  # the share of the way to the neighbours' mean that a poin
 
 
 class LabelInterface(NamedTuple):
-    """What a label's surface is like. In 2-D areas are lengths, and edges are nodes."""
+    """What a label's surface is like. In 2-D areas are lengths, and edges are nodes.
+
+    Parameters
+    ----------
+    label : int
+        Which one.
+    area : float
+        Of its surface in the mesh, mm^(n-1).
+    smooth_area : float
+        Of the smooth surface of its voxels, mm^(n-1).
+    area_ratio : float
+        Of the two; nan without cells, or of fewer voxels than `NET_VOXELS`.
+    folded : float
+        Share of the surface's edges at which it turns by more than 60 degrees; nan without cells.
+    n_facets : int
+        Of its surface.
+    nonmanifold_edges : int
+        In more than two of its facets.
+    nonmanifold_edges_two_labels : int
+        Those around which it meets one other label alone, or the outside alone.
+    nonmanifold_nodes : int
+        Around which its facets form more than one fan, over edges; 0 in 2-D.
+    nonmanifold_nodes_two_labels : int
+        Those around which it meets one other label alone, or the outside alone.
+    euler : int
+        Of its voxels' closed surface: 2 (pieces - holes + cavities); the same in 2-D, where no curve has one.
+    mesh_euler : int
+        Of its cells' closed surface.
+    cavities : int
+        Shut in within its voxels; 0 in 2-D, where they are holes.
+    mesh_cavities : int
+        Shut in within its cells, likewise.
+
+    Examples
+    --------
+    >>> phantom = tetopt.load_phantom("sphere")
+    >>> labels = phantom.label_image(voxel_mm=4)
+    >>> mesh = tetopt.lattice(labels, nodes=300)
+    >>> background, ball = tetopt.label_interfaces(labels, mesh, tetopt.cell_labels(labels, mesh))
+    >>> background.cavities, background.mesh_cavities, ball.euler
+    (1, 1, 2)
+    """
 
     label: int
-    area: float  # of its surface in the mesh, mm^(n-1)
-    smooth_area: float  # of the smooth surface of its voxels, mm^(n-1)
-    area_ratio: float  # of the two; nan without cells, or of fewer voxels than `NET_VOXELS`
-    folded: float  # share of the surface's edges at which it turns by more than 60 degrees; nan without cells
-    n_facets: int  # of its surface
-    nonmanifold_edges: int  # in more than two of its facets
-    nonmanifold_edges_two_labels: int  # those around which it meets one other label alone, or the outside alone
-    nonmanifold_nodes: int  # around which its facets form more than one fan, over edges; 0 in 2-D
-    nonmanifold_nodes_two_labels: int  # likewise
-    euler: int  # of its voxels' closed surface: 2 (pieces - holes + cavities); the same in 2-D, where no curve has one
-    mesh_euler: int  # of its cells' closed surface
-    cavities: int  # shut in within its voxels; 0 in 2-D, where they are holes
-    mesh_cavities: int  # likewise of its cells
+    area: float
+    smooth_area: float
+    area_ratio: float
+    folded: float
+    n_facets: int
+    nonmanifold_edges: int
+    nonmanifold_edges_two_labels: int
+    nonmanifold_nodes: int
+    nonmanifold_nodes_two_labels: int
+    euler: int
+    mesh_euler: int
+    cavities: int
+    mesh_cavities: int
 
 
 def label_interfaces(labels: Image, mesh: Mesh, of_cell: ArrayLike) -> list[LabelInterface]:
@@ -72,6 +113,15 @@ def label_interfaces(labels: Image, mesh: Mesh, of_cell: ArrayLike) -> list[Labe
     ------
     InputError
         Labels that are none, or not one label a cell.
+
+    Examples
+    --------
+    >>> phantom = tetopt.load_phantom("sphere")
+    >>> labels = phantom.label_image(voxel_mm=4)
+    >>> result = tetopt.mesh_image(tetopt.content(phantom.image(voxel_mm=4), labels), 300)
+    >>> ball = tetopt.label_interfaces(labels, result.mesh, result.labels)[1]
+    >>> ball.nonmanifold_edges, ball.nonmanifold_nodes, ball.mesh_euler  # a closed surface without handles
+    (0, 0, 2)
     """
     check_labels("labels", labels)
     of_cell = checked_cell_labels(of_cell, mesh)

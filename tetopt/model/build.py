@@ -45,6 +45,7 @@ def model_of(
     Parameters
     ----------
     mesh : Mesh
+        Points in world mm.
     image : Image, optional
         Its intensities are what laws are of, and its box's faces become sets.
     young, nu : number, (M,) array, law or text, optional
@@ -64,8 +65,10 @@ def model_of(
     loads : iterable of str
         See `tetopt.model.loads.parse_loads`.
     bins : int, optional
-        Group cells into so many materials, by `spacing`: "equal", "quantile" or "log"; the error that this makes is in
-        the materials. See `tetopt.model.materials.binned`.
+        Group cells into so many materials; the error that this makes is in the materials. See
+        `tetopt.model.materials.binned`.
+    spacing : {"equal", "quantile", "log"}
+        How the bins divide the moduli.
     order : {1, 2}
         2: straight-edged quadratic cells in the file, where a format has them.
     cell_data : dict, optional
@@ -78,10 +81,34 @@ def model_of(
         Texts for the file's head. Its "label_table" (`tetopt.model.labels.table_words`) is what labels are called, in
         laws and in the standard sets.
 
+    Returns
+    -------
+    Model
+        For `save_model` or `Model.to_skfem`.
+
     Raises
     ------
     InputError
         As the functions named above; a dimension or an order that there is not; gravity without a density.
+
+    See Also
+    --------
+    save_model : Writes it for a solver.
+
+    Examples
+    --------
+    >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> loads = ["hold:inferior", "pressure:superior:1"]
+    >>> model = tetopt.model_of(mesh, image, young="0.1*h", nu=0.45, loads=loads)
+    >>> tetopt.save_model("ball.inp", model)  # for CalculiX or Abaqus
+
+    Moduli by label:
+
+    >>> labels = tetopt.load_phantom("sphere").label_image(voxel_mm=4)
+    >>> data = {"label": tetopt.cell_labels(labels, mesh)}
+    >>> tetopt.model_of(mesh, young="1=10,*=2", cell_data=data).materials.young.tolist()
+    [2.0, 10.0]
     """
     if order not in (1, 2):
         raise InputError(f"order: expected 1 or 2, got {order}")

@@ -24,9 +24,34 @@ HALF_TURN = np.array([-1.0, -1.0, 1.0])  # about z, from RAS+ to LPS+ or back
 
 
 def cell_fields(mesh: Mesh, image: Image | None = None) -> dict[str, NDArray]:
-    """What the mesh file holds of each cell: volume, rho, min_dihedral, and what the image is there.
+    """What the mesh file holds of each cell.
 
-    Of the image: mean, variance, n_voxels, min, max, in its unit. Volumes in mm^n, angles in degrees.
+    Parameters
+    ----------
+    mesh : Mesh
+        Points in world mm.
+    image : Image, optional
+        Without it the fields of the image are left out.
+
+    Returns
+    -------
+    dict of (M,) arrays
+        "volume", mm^n; "rho", the radius ratio; "min_dihedral", the smallest angle, degrees; of the image, in its unit,
+        "mean", "variance" (squared), "n_voxels", "min" and "max".
+
+    Raises
+    ------
+    InputError
+        As `cell_moments`.
+
+    Examples
+    --------
+    >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> fields = tetopt.cell_fields(mesh, image)
+    >>> sorted(fields)
+    ['max', 'mean', 'min', 'min_dihedral', 'n_voxels', 'rho', 'variance', 'volume']
+    >>> tetopt.save_mesh("ball.vtu", mesh, fields)
     """
     fields: dict[str, NDArray] = {}
     if image is not None:

@@ -16,10 +16,23 @@ LABEL_DIGITS = 18  # of a number that 64 bits hold; more are a name that nothing
 
 
 class LabelTable(NamedTuple):
-    """Names and colours of labels; a label may have one of them, or neither."""
+    """Names and colours of labels; a label may have one of them, or neither.
 
-    names: dict[int, str]  # any text on one line; two labels may have the same
-    colours: dict[int, tuple[float, float, float]]  # red, green and blue, 0 to 1
+    Parameters
+    ----------
+    names : dict of int to str
+        Any text on one line; two labels may have the same.
+    colours : dict of int to (float, float, float)
+        Red, green and blue, 0 to 1.
+
+    Examples
+    --------
+    >>> tetopt.LabelTable({1: "liver", 2: "spleen"}, {1: (0.7, 0.1, 0.1)}).names[1]
+    'liver'
+    """
+
+    names: dict[int, str]
+    colours: dict[int, tuple[float, float, float]]
 
 
 NO_TABLE = LabelTable({}, {})  # of labels that only have numbers

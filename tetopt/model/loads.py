@@ -42,12 +42,35 @@ class Load(NamedTuple):
     - "traction": (n,) kPa, force by undeformed area along the world's axes.
     - "spring": (1,) kPa/mm, stiffness by area of what surrounds the set, the same in all directions.
     - "gravity": (n,) mm/s2, acts on all cells, whose materials have a density.
+
+    Parameters
+    ----------
+    kind : {"displacement", "pressure", "traction", "spring", "gravity"}
+        As above.
+    set_name : str
+        A facet set; "" for gravity.
+    numbers : (n,) or (1,) float64
+        In the model's units and space.
+    step : int
+        0: in every step; 1, 2, ...: in that one alone.
+
+    Examples
+    --------
+    >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> loads = ["hold:inferior", "pressure:superior:1"]
+    >>> model = tetopt.model_of(mesh, image, young="0.1*h", nu=0.45, loads=loads)
+    >>> support, pressure = model.loads
+    >>> support.kind, support.set_name, support.numbers.tolist()
+    ('displacement', 'inferior', [0.0, 0.0, 0.0])
+    >>> pressure.kind, pressure.numbers.tolist()
+    ('pressure', [1.0])
     """
 
     kind: str
-    set_name: str  # a facet set; "" for gravity
-    numbers: NDArray[np.float64]  # in the model's units and space
-    step: int = 0  # 0: in every step; 1, 2, ...: in that one alone
+    set_name: str
+    numbers: NDArray[np.float64]
+    step: int = 0
 
 
 def parse_loads(texts: Iterable[str], mesh: Mesh, sets: Sets) -> tuple[Load, ...]:

@@ -29,13 +29,35 @@ class BinningError(NamedTuple):
 
 
 class Materials(NamedTuple):
-    """The distinct materials, softest first, and which one each cell is made of."""
+    """The distinct materials, softest first, and which one each cell is made of.
 
-    young: NDArray[np.float64]  # (K,) Young's modulus, in the model's unit of stress
-    nu: NDArray[np.float64]  # (K,) Poisson's ratio
-    of_cell: NDArray[np.int64]  # (M,) 0 to K - 1
-    binning: BinningError | None = None  # if they stand for more moduli
-    density: NDArray[np.float64] | None = None  # (K,) kg/m3 in every system of units
+    Parameters
+    ----------
+    young : (K,) float64
+        Young's modulus, in the model's unit of stress.
+    nu : (K,) float64
+        Poisson's ratio.
+    of_cell : (M,) int64
+        Which material each cell is made of, 0 to K - 1.
+    binning : BinningError, optional
+        If they stand for more moduli.
+    density : (K,) float64, optional
+        kg/m3 in every system of units.
+
+    Examples
+    --------
+    >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> table = tetopt.model_of(mesh, image, young="0.1*h", bins=3).materials
+    >>> table.young.round(1).tolist(), table.of_cell.shape, f"{table.binning.mean:.1%}"
+    ([2.1, 6.1, 9.5], (1200,), '1.7%')
+    """
+
+    young: NDArray[np.float64]
+    nu: NDArray[np.float64]
+    of_cell: NDArray[np.int64]
+    binning: BinningError | None = None
+    density: NDArray[np.float64] | None = None
 
 
 def materials(young: ArrayLike, nu: ArrayLike, n_cells: int, density: ArrayLike | None = None) -> Materials:

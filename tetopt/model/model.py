@@ -55,29 +55,83 @@ ON_PREFIX, IN_PREFIX = "on_", "in_"  # of data that are 1 on the nodes of a set 
 
 
 class Model(NamedTuple):
-    """What is written for a solver. Lengths in mm; moduli in `units`."""
+    """What is written for a solver. Lengths in mm; moduli in `units`.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        Points in mm, in the axes of `space`.
+    cell_data : dict of arrays
+        By name, one row a cell.
+    sets : Sets
+        Of facets and cells, by name.
+    materials : Materials, optional
+        The distinct ones, and which each cell is made of.
+    loads : tuple of Load
+        Supports, displacements, pressures, tractions, springs, gravity.
+    order : {1, 2}
+        2: straight-edged quadratic cells, see `tetopt.geometry.quadratic`.
+    units : {"kPa", "MPa"}
+        Of moduli and pressures.
+    space : {"ras", "lps"}
+        "lps": x and y have changed sign.
+    node_young : (N,) float64, optional
+        A modulus at each corner, linear within cells, instead of those of the materials.
+    gauss_young : (M, Q) float64, optional
+        One at each Gauss point of the order, for `tetopt.fem`.
+    is_nonlinear : bool
+        Whether steps ask for large deformation.
+    about : dict
+        By name a text, or what JSON can hold, for the file's head.
+    point_data : dict of arrays
+        By name, a row a mesh point, or a node of order 2.
+
+    Examples
+    --------
+    >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> loads = ["hold:inferior", "pressure:superior:1"]
+    >>> model = tetopt.model_of(mesh, image, young="0.1*h", nu=0.45, loads=loads)
+    >>> len(model.materials.young), [load.kind for load in model.loads]
+    (21, ['displacement', 'pressure'])
+    """
 
     mesh: Mesh
-    cell_data: dict[str, NDArray]  # by name, one row a cell
+    cell_data: dict[str, NDArray]
     sets: Sets
     materials: Materials | None = None
     loads: tuple[Load, ...] = ()
-    order: int = 1  # 2: straight-edged quadratic cells, see `quadratic`
+    order: int = 1
     units: str = "kPa"
-    space: str = "ras"  # "lps": x and y have changed sign
-    node_young: NDArray[np.float64] | None = None  # (N,) a modulus at each corner, linear within cells, instead
-    gauss_young: NDArray[np.float64] | None = None  # (M, Q) one at each Gauss point of the order, for `tetopt.fem`
-    is_nonlinear: bool = False  # whether steps ask for large deformation
-    about: dict[str, Any] = {}  # noqa: RUF012 - a default that nobody changes; name -> text, or what JSON can hold
-    point_data: dict[str, NDArray] = {}  # noqa: RUF012 - likewise; by name, a row a mesh point, or a node of order 2
+    space: str = "ras"
+    node_young: NDArray[np.float64] | None = None
+    gauss_young: NDArray[np.float64] | None = None
+    is_nonlinear: bool = False
+    about: dict[str, Any] = {}  # noqa: RUF012 - nobody changes it
+    point_data: dict[str, NDArray] = {}  # noqa: RUF012 - nobody changes it
 
     def to_skfem(self) -> skfem.Mesh:
         """The mesh for scikit-fem, with the sets; see `tetopt.model.skfem.skfem_mesh`.
+
+        Returns
+        -------
+        skfem.MeshTri or skfem.MeshTet
+            Facet sets are its boundaries, cell sets its subdomains.
 
         Raises
         ------
         InputError
             The model is quadratic: elements of any order are chosen in scikit-fem; or scikit-fem is not installed.
+
+        Examples
+        --------
+        >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+        >>> mesh = tetopt.lattice(image, nodes=300)
+        >>> loads = ["hold:inferior", "pressure:superior:1"]
+        >>> model = tetopt.model_of(mesh, image, young="0.1*h", nu=0.45, loads=loads)
+        >>> skfem_mesh = model.to_skfem()
+        >>> len(skfem_mesh.boundaries["superior"])
+        40
         """
         if self.order != 1:
             raise InputError(

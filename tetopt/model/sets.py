@@ -36,17 +36,51 @@ RESERVED_NAME = re.compile(r"label_\d+|interface_.*|material_\d+|unnamed|all_cel
 
 
 class Sets(NamedTuple):
-    """Sets by name; all names differ, and by more than case, as some formats have one list of names for everything."""
+    """Sets by name; all names differ, and by more than case, as some formats have one list of names for everything.
 
-    facets: dict[str, NDArray[np.int64]]  # (K, 2) rows (cell, local node opposite), ascending
-    cells: dict[str, NDArray[np.int64]]  # (K,) ascending
+    Parameters
+    ----------
+    facets : dict of (K, 2) int64
+        Rows (cell, local node opposite), ascending.
+    cells : dict of (K,) int64
+        Ascending.
+
+    Examples
+    --------
+    >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> sets = tetopt.model_of(mesh, image).sets
+    >>> list(sets.facets)
+    ['boundary', 'left', 'right', 'posterior', 'anterior', 'inferior', 'superior']
+    >>> sets.facets["left"].shape
+    (50, 2)
+    """
+
+    facets: dict[str, NDArray[np.int64]]
+    cells: dict[str, NDArray[np.int64]]
 
 
 class Box(NamedTuple):
-    """An image's domain without its voxels: from index -0.5 to shape - 0.5."""
+    """An image's domain without its voxels: from index -0.5 to shape - 0.5.
+
+    Parameters
+    ----------
+    shape : tuple of int
+        Number of voxels along each axis.
+    affine : (n+1, n+1) float64
+        Index -> world mm.
+
+    Examples
+    --------
+    >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> box = tetopt.Box(image.shape, image.affine)
+    >>> "left" in tetopt.model_of(mesh, box=box).sets.facets
+    True
+    """
 
     shape: tuple[int, ...]
-    affine: NDArray[np.float64]  # (n+1, n+1)
+    affine: NDArray[np.float64]
 
 
 def standard_names(ndim: int) -> set[str]:

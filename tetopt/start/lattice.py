@@ -64,12 +64,20 @@ def lattice(
     InputError
         Unknown kind for the dimension, not exactly one size, or a size that no lattice has.
 
+    See Also
+    --------
+    octree : A graded mesh.
+    mesh_image : Begins with one, in its mode "uniform".
+
     Examples
     --------
-    >>> square = Image(np.zeros((70, 70)))
-    >>> mesh = lattice(square, blocks=(7, 7))  # Fig. 2(a)
+    >>> square = tetopt.Image(np.zeros((70, 70)))
+    >>> mesh = tetopt.lattice(square, blocks=(7, 7))  # Fig. 2(a)
     >>> len(mesh.points), len(mesh.cells)
     (113, 196)
+    >>> cube = tetopt.Image(np.zeros((40, 40, 40)))
+    >>> [len(tetopt.lattice(cube, kind, nodes=1000).points) for kind in ("bcc", "five-tet")]
+    [1241, 1000]
     """
     n = image.ndim
     kind = KINDS[n][0] if kind is None else kind

@@ -70,6 +70,19 @@ class Sizes(NamedTuple):
         edge of a uniform mesh with as many nodes: smaller cells in uniform regions do not represent the image any
         better, but the displacement. `inf` for none. Most edges are 0.6 times the longest, which are the diagonals of
         blocks on the box's faces.
+
+    Raises
+    ------
+    InputError
+        Where they are used: a value out of range, a size that contradicts another, a field of another dimension.
+
+    Examples
+    --------
+    >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+    >>> coarse = tetopt.mesh_image(image, sizes=tetopt.Sizes(largest=16.0), iterations=4).mesh
+    >>> fine = tetopt.mesh_image(image, sizes=tetopt.Sizes(largest=12.0), iterations=4).mesh
+    >>> len(coarse.points) < len(fine.points)
+    True
     """
 
     smallest: float = 0.0
@@ -92,10 +105,29 @@ class Sizes(NamedTuple):
     def prepared(self, n: int) -> Sizes:
         """The same sizes, checked; the field's steps are lowered to the gradation.
 
+        Parameters
+        ----------
+        n : {2, 3}
+            Dimension of the image.
+
+        Returns
+        -------
+        Sizes
+            With a field whose neighbouring voxels differ by no more than gradation x distance.
+
         Raises
         ------
         InputError
             A value out of range, or a field of another dimension than n.
+
+        Examples
+        --------
+        >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+        >>> field = tetopt.Image(np.where(image.data > 60.0, 6.0, 0.0), image.affine)  # fine in the ball
+        >>> sizes = tetopt.Sizes(largest=20.0, field=field)
+        >>> place = np.array([[24.0, 0.0, 0.0]])  # 4 mm off the ball
+        >>> sizes.at(place).tolist(), sizes.prepared(3).at(place).tolist()
+        ([20.0], [10.0])
         """
         if not 0.0 <= self.smallest < np.inf:
             raise InputError(f"smallest: expected 0 mm or more, got {self.smallest}")
@@ -113,7 +145,28 @@ class Sizes(NamedTuple):
         return self if self.field is None else self._replace(field=_graded(self.field, self.slope))
 
     def longest_edge(self, image: VoxelGrid, nodes: int, volume: float | None = None) -> float:
-        """The longest edge that any cell may have, mm; `volume`, mm^n, is that of the mesh, by default of the box."""
+        """The longest edge that any cell may have, mm.
+
+        Parameters
+        ----------
+        image : VoxelGrid
+            Whose box the mesh covers.
+        nodes : int
+            Number of nodes of the mesh.
+        volume : float, optional
+            Of the mesh, mm^n; by default of the box.
+
+        Returns
+        -------
+        float
+            mm; `inf` where there is a largest target.
+
+        Examples
+        --------
+        >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+        >>> [round(sizes.longest_edge(image, 300), 1) for sizes in (tetopt.Sizes(), tetopt.Sizes(longest=20.0))]
+        [31.7, 20.0]
+        """
         if self.longest is not None:
             return self.longest
         if self.largest is not None:
@@ -127,7 +180,25 @@ class Sizes(NamedTuple):
         return LONGEST_IN_BLOCK[image.ndim] * max(coarsest * uniform, self.smallest / SHORTEST_IN_BLOCK[image.ndim])
 
     def on_voxels(self, image: Image) -> NDArray[np.float32]:
-        """The target at each voxel's centre, of the image's shape, mm; `NO_BOUND_MM` where there is none."""
+        """The target at each voxel's centre.
+
+        Parameters
+        ----------
+        image : Image
+            Whose voxels are taken.
+
+        Returns
+        -------
+        (s_0, ..., s_{n-1}) float32
+            Of the image's shape, mm; `NO_BOUND_MM` where there is none.
+
+        Examples
+        --------
+        >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+        >>> targets = tetopt.Sizes(largest=12.0).on_voxels(image)
+        >>> targets.shape, float(targets.max())
+        ((16, 16, 16), 12.0)
+        """
         largest = np.float32(NO_BOUND_MM if self.largest is None else np.clip(self.largest, 1e-30, NO_BOUND_MM))
         smallest = np.float32(self.smallest)
         if self.field is None:
@@ -139,7 +210,26 @@ class Sizes(NamedTuple):
         return np.asarray(np.clip(np.where(by_place > 0.0, by_place, NO_BOUND_MM), smallest, largest))
 
     def at(self, points: NDArray) -> NDArray[np.float64]:
-        """The target at points, (N,) mm; `inf` where there is none."""
+        """The target at points.
+
+        Parameters
+        ----------
+        points : (N, n) array of float64
+            World mm.
+
+        Returns
+        -------
+        (N,) float64
+            mm; `inf` where there is none.
+
+        Examples
+        --------
+        >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+        >>> field = tetopt.Image(np.where(image.data > 60.0, 6.0, 0.0), image.affine)  # fine in the ball
+        >>> sizes = tetopt.Sizes(largest=20.0, field=field)
+        >>> sizes.at(np.array([[0.0, 0.0, 0.0], [30.0, 30.0, 30.0]])).tolist()
+        [6.0, 20.0]
+        """
         target = np.full(len(points), np.inf if self.largest is None else self.largest)
         if self.field is not None:
             index, (low, high) = self.field.to_index(points), box_sides(self.field.shape).T
@@ -150,7 +240,29 @@ class Sizes(NamedTuple):
         return np.maximum(target, self.smallest)
 
     def around(self, points: NDArray, cells: NDArray) -> NDArray[np.float64]:
-        """The target at nodes, (N,) mm; where there is none, what grows by the gradation from where there are."""
+        """The target at nodes; where there is none, what grows by the gradation from where there are.
+
+        Parameters
+        ----------
+        points : (N, n) array of float64
+            World mm.
+        cells : (M, n+1) array of int64
+            Along whose edges it grows.
+
+        Returns
+        -------
+        (N,) float64
+            mm.
+
+        Examples
+        --------
+        >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+        >>> mesh = tetopt.lattice(image, nodes=300)
+        >>> field = tetopt.Image(np.where(image.data > 60.0, 6.0, 0.0), image.affine)
+        >>> targets = tetopt.Sizes(field=field).around(mesh.points, mesh.cells)
+        >>> float(targets.min()), bool(np.isfinite(targets).all())
+        (6.0, True)
+        """
         target = self.at(points)
         if not np.isfinite(target).any() or np.isfinite(target).all():
             return target
@@ -160,9 +272,37 @@ class Sizes(NamedTuple):
         self, image: Image, nodes: int, points: NDArray, cells: NDArray, own: NDArray, target: NDArray,
         volume: float | None = None,
     ) -> NDArray[np.float64]:  # fmt: skip
-        """The longest edge that a cell at each node may be given, (N,) mm.
+        """The longest edge that a cell at each node may be given.
 
-        `own` (N,) is the mean size there now, `target` (N,) what it is to be (`around`).
+        Parameters
+        ----------
+        image : Image
+            Whose box the mesh covers.
+        nodes : int
+            Number of nodes of the mesh.
+        points, cells : (N, n) float64, (M, n+1) int64
+            Nodes in world mm, and which of them each cell has.
+        own : (N,) float64
+            The mean size there now, mm.
+        target : (N,) float64
+            What it is to be, mm (`around`).
+        volume : float, optional
+            Of the mesh, mm^n; by default of the box.
+
+        Returns
+        -------
+        (N,) float64
+            mm.
+
+        Examples
+        --------
+        >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+        >>> mesh = tetopt.lattice(image, nodes=300)
+        >>> sizes, own = tetopt.Sizes(largest=12.0), np.full(len(mesh.points), 16.0)
+        >>> target = sizes.around(mesh.points, mesh.cells)
+        >>> longest = sizes.longest_edges(image, 300, mesh.points, mesh.cells, own, target)
+        >>> bool((longest <= 1.5 * 12.0).all())
+        True
         """
         bound = np.minimum(self.longest_edge(image, nodes, volume), LONG_EDGE * target)
         return np.minimum(bound, UNEVEN_SHARE * _around(own, points, cells, self.slope))

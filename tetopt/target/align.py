@@ -36,6 +36,7 @@ def aligned_mask(mask: Image, image: Image, name: str = "mask") -> Image:
         Either two values, 0 and any other above it (bool, 0 and 255), or fractions in [0, 1], a probability map
         whose level 0.5 counts as the border. One value above 0 everywhere is a mask too: the whole box.
     image : Image
+        Whose voxels are taken.
     name : str, optional
         What the mask is called in messages, for example its file.
 
@@ -48,6 +49,14 @@ def aligned_mask(mask: Image, image: Image, name: str = "mask") -> Image:
     ------
     InputError
         Another number of axes than the image, other values, nothing inside, or nothing of it in the image's box.
+
+    Examples
+    --------
+    >>> phantom = tetopt.load_phantom("sphere")
+    >>> fine = phantom.label_image(voxel_mm=2)
+    >>> mask = tetopt.aligned_mask(tetopt.Image(fine.data == 1, fine.affine), phantom.image(voxel_mm=4))
+    >>> mask.shape, np.unique(mask.data).tolist()
+    ((16, 16, 16), [0.0, 1.0])
     """
     _check_axes(name, mask, image)
     inside = _mask_values(name, mask.data)
@@ -65,6 +74,7 @@ def aligned_labels(labels: Image, image: Image, name: str = "labels") -> Image:
     labels : Image
         Whole numbers from 0 to `tetopt.target.labels.LARGEST_LABEL`, 0 the background.
     image : Image
+        Whose voxels are taken.
     name : str, optional
         What the labels are called in messages.
 
@@ -78,6 +88,13 @@ def aligned_labels(labels: Image, image: Image, name: str = "labels") -> Image:
     InputError
         Another number of axes than the image, values that are not such numbers, no label above 0 in the image's box,
         or one value everywhere in it.
+
+    Examples
+    --------
+    >>> phantom = tetopt.load_phantom("sphere")
+    >>> labels = tetopt.aligned_labels(phantom.label_image(voxel_mm=2), phantom.image(voxel_mm=4))
+    >>> labels.shape, np.unique(labels.data).tolist()
+    ((16, 16, 16), [0.0, 1.0])
     """
     _check_axes(name, labels, image)
     check_labels(name, labels)
@@ -105,6 +122,7 @@ def aligned_contrast(other: Image, image: Image, name: str = "contrast") -> Imag
     other : Image
         Intensities.
     image : Image
+        Whose voxels are taken.
     name : str, optional
         What the contrast is called in messages.
 
@@ -117,6 +135,17 @@ def aligned_contrast(other: Image, image: Image, name: str = "contrast") -> Imag
     ------
     InputError
         Another number of axes than the image, or less than half of the image's voxel centres in its box.
+
+    See Also
+    --------
+    content : Takes contrasts on the same voxels.
+
+    Examples
+    --------
+    >>> phantom = tetopt.load_phantom("sphere")
+    >>> t1, t2 = phantom.image(voxel_mm=4), phantom.image(voxel_mm=8)
+    >>> tetopt.aligned_contrast(t2, t1).shape
+    (16, 16, 16)
     """
     _check_axes(name, other, image)
     if is_same_grid(other, image):
@@ -154,6 +183,16 @@ def foreground(image: Image, level: float | None = None) -> Image:
     ------
     InputError
         No background (see `background_level`), or no foreground.
+
+    Examples
+    --------
+    >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+    >>> mask = tetopt.foreground(image, 60.0)
+    >>> print(f"{mask.data.mean():.1%} of the box")
+    13.5% of the box
+    >>> result = tetopt.mesh_image(tetopt.content(image, mask=mask), 200, iterations=4)
+    >>> result.missed
+    mappingproxy({})
     """
     limit = background_level(image) if level is None else float(level)
     is_outside = _large_pieces(image.data <= limit, at_border=True)

@@ -44,19 +44,53 @@ class Continuation(NamedTuple):
 
 
 class Content(NamedTuple):
-    """What a mesh is to represent; made by `content`."""
+    """What a mesh is to represent; made by `content`.
 
-    image: Image  # the voxels, and the first contrast; only those around the mask; divided where slices are thick
-    values: NDArray  # (C, *image.shape) what is to be one value in a cell, in one unit
-    n_contrasts: int  # the first of them: images, not labels
-    unit: float  # squared intensity of the image for 1 squared of `values`
-    is_plain: bool  # whether `values` is the image's own data, else whole numbers
-    region: Region | None  # what is to be covered; None for the image's box
-    continuation: Continuation | None = None  # of the mask that the region is of; see `continued`
-    memberships: Memberships | None = None  # of labels whose interfaces are to be smooth
-    smoothness: float = 0.0  # of these: how far an interface would move to save itself, in voxels
-    own_channel: NDArray[np.int64] | None = None  # (K,) each of these labels' channel, a row of `values`
-    own_value: NDArray[np.int32] | None = None  # (K,) and what its voxels have there
+    Parameters
+    ----------
+    image : Image
+        The voxels, and the first contrast; only those around the mask; divided where slices are thick.
+    values : (C, s_0, ..., s_{n-1}) array
+        What is to be one value in a cell, in one unit: a channel for each contrast, and channels of the labels.
+    n_contrasts : int
+        The first of them: images, not labels.
+    unit : float
+        Squared intensity of the image for 1 squared of `values`.
+    is_plain : bool
+        Whether `values` is the image's own data, else whole numbers.
+    region : Region or None
+        What is to be covered; None for the image's box.
+    continuation : Continuation, optional
+        Of the mask that the region is of; see `tetopt.target.content.continued`.
+    memberships : Memberships, optional
+        Of labels whose interfaces are to be smooth.
+    smoothness : float
+        Of these: how far an interface would move to save itself, in voxels.
+    own_channel : (K,) int64, optional
+        Each of these labels' channel, a row of `values`.
+    own_value : (K,) int32, optional
+        What its voxels have there.
+
+    Examples
+    --------
+    >>> phantom = tetopt.load_phantom("sphere")
+    >>> labels = phantom.label_image(voxel_mm=4)
+    >>> what = tetopt.content(phantom.image(voxel_mm=4), labels)
+    >>> what.n_voxels, what.n_contrasts, what.region is None
+    (4096, 1, True)
+    """
+
+    image: Image
+    values: NDArray
+    n_contrasts: int
+    unit: float
+    is_plain: bool
+    region: Region | None
+    continuation: Continuation | None = None
+    memberships: Memberships | None = None
+    smoothness: float = 0.0
+    own_channel: NDArray[np.int64] | None = None
+    own_value: NDArray[np.int32] | None = None
 
     @property
     def n_voxels(self) -> int:
@@ -133,10 +167,29 @@ def content(
         voxels (`tetopt.target.memberships`), which are divided where slices are thick; nodes between labels lie where
         these meet. 0 leaves labels their stairs, and cells the label of most of their voxels.
 
+    Returns
+    -------
+    Content
+        For `mesh_image`, `octree` or `optimize`, in place of an image.
+
     Raises
     ------
     InputError
         Images of different shapes, wrong weights, labels that are not whole numbers from 0, nothing that counts.
+
+    See Also
+    --------
+    aligned_contrast, aligned_labels, aligned_mask : What lies on other voxels.
+    foreground : A mask of what is not background.
+
+    Examples
+    --------
+    >>> phantom = tetopt.load_phantom("sphere")
+    >>> t1, t2 = phantom.image(voxel_mm=4), phantom.image(voxel_mm=4, noise_sd=5)
+    >>> what = tetopt.content([t1, t2], phantom.label_image(voxel_mm=4), weights=[1, 0.5])
+    >>> result = tetopt.mesh_image(what, 300, iterations=4)
+    >>> np.unique(result.labels).tolist()
+    [0, 1]
     """
     images = [images] if isinstance(images, Image) else list(images)
     weights = [1.0] * len(images) if weights is None else [float(w) for w in weights]
