@@ -65,6 +65,7 @@ def test_examples_run(path, tmp_path, monkeypatch):
     examples = doctest.DocTestFinder().find(module, extraglobs={"np": np, "tetopt": tetopt})
     for each in examples:
         runner.run(each, out=output.append)
-    assert "".join(output) == ""
+    if output:
+        pytest.fail("".join(output), pytrace=False)
     # Each example that the file has is in a docstring that was run.
     assert sum(len(each.examples) for each in examples) == len(re.findall(r"^ *>>> ", path.read_text("utf-8"), re.M))

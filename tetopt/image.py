@@ -26,6 +26,12 @@ class VoxelGrid:
 
     Voxel *centres* sit at the integer indices (the NIfTI convention), so the domain runs from index -0.5 to
     ``shape - 0.5`` along every axis.
+
+    Examples
+    --------
+    >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+    >>> image.ndim, image.spacing.tolist(), round(image.volume)
+    (3, [4.0, 4.0, 4.0], 262144)
     """
 
     affine: NDArray[np.float64]

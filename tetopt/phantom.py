@@ -78,15 +78,25 @@ class Shape:
     Parameters
     ----------
     kind : {"ellipsoid", "box", "layer"}
-    center : (n,) float64, mm
+        What it is.
+    center : (n,) float64
+        World mm.
     frame : (m, n) float64
         Unit rows, the shape's own axes in the world; m = n, or 1 for a layer.
-    half : (m,) float64, mm
-        Radii, or half the edge lengths, along those axes.
+    half : (m,) float64
+        Radii, or half the edge lengths, along those axes, mm.
     intensity : float
+        Inside.
     label : int
+        Inside.
     name : str
         Empty if the file gives none.
+
+    Examples
+    --------
+    >>> ball = tetopt.load_phantom("sphere").shapes[0]
+    >>> ball.kind, ball.half.tolist(), ball.intensity, ball.label
+    ('ellipsoid', [20.0, 20.0, 20.0], 100.0, 1)
     """
 
     kind: str
@@ -297,8 +307,16 @@ class Phantom:
 
         Parameters
         ----------
-        voxel_mm, blur_mm, noise_sd, seed, supersample
-            As of `image`.
+        voxel_mm : float or (n,) floats, optional
+            As of `image`, and so the others.
+        blur_mm : float, optional
+            mm.
+        noise_sd : float, optional
+            Unit of intensity.
+        seed : int, optional
+            Of the noise.
+        supersample : int
+            Sub-voxels along each axis.
 
         Returns
         -------
@@ -586,7 +604,7 @@ def load_phantom(name_or_path: str | Path) -> Phantom:
     --------
     >>> phantom = tetopt.load_phantom("two_spheres")
     >>> phantom.size_mm.tolist(), [shape.name for shape in phantom.shapes]
-    ([64.0, 64.0, 64.0], ['soft', 'stiff'])
+    ([80.0, 60.0, 60.0], ['large inclusion', 'small inclusion'])
     >>> tetopt.phantom.phantom_names()[:3]
     ['constant', 'disc_2d', 'ellipsoids_brain']
     """

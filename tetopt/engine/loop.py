@@ -65,7 +65,7 @@ class Record(NamedTuple):
     >>> mesh = tetopt.lattice(image, nodes=300)
     >>> result = tetopt.optimize(image, mesh, k_D=0.5, iterations=3)
     >>> [f"{record.iteration}: {record.E:.2f}" for record in result.history]
-    ['0: 1.00', '1: 0.77', '2: 0.73', '3: 0.71']
+    ['0: 1.00', '1: 0.68', '2: 0.61', '3: 0.58']
     """
 
     iteration: int

@@ -153,8 +153,8 @@ def mesh_image(
     As many nodes as an error takes, here a fifth of the image's variance:
 
     >>> result = tetopt.mesh_image(image, target_error=0.2)
-    >>> tetopt.E_D(image, result.mesh) < 0.2 * image.data.var() * image.volume
-    True
+    >>> print(f"{tetopt.E_D(image, result.mesh) / (image.data.var() * image.volume):.2f}")
+    0.14
 
     A mesh of yours, made better:
 

@@ -41,19 +41,55 @@ BALANCE_ROUNDING = 1e-12  # of a matrix's row times its displacements: what is l
 
 
 class Solution(NamedTuple):
-    """One step of a model, solved, in mm, kPa, mN and uJ (in 2-D by mm of thickness) and the model's axes."""
+    """One step of a model, solved, in mm, kPa, mN and uJ (in 2-D by mm of thickness) and the model's axes.
 
-    u: NDArray[np.float64]  # (N, n) mm, a row a node of the model's order
-    young: NDArray[np.float64]  # (M, Q) kPa, at the Gauss points
-    strain: NDArray[np.float64]  # (M, Q, n, n) there
-    stress: NDArray[np.float64]  # (M, Q, n, n) kPa, in 2-D in the plane
-    strain_energy: float  # uJ, in the cells
-    spring_energy: float  # uJ, in the springs
-    work: float  # uJ, half of forces on their way, prescribed ones with them: the sum of the two energies
-    reactions: dict[str, NDArray[np.float64]]  # by set that is prescribed or on springs: (n,) mN that hold it there
-    applied: NDArray[np.float64]  # (n,) mN, the sum of pressures, tractions and gravity; the reactions balance it
-    n_iterations: int  # of conjugate gradients, 0 where the matrix was factorised
-    system: System  # as it was solved, for `tetopt.fem.conditioning`
+    Parameters
+    ----------
+    u : (N, n) float64
+        Displacement, mm, a row a node of the model's order.
+    young : (M, Q) float64
+        kPa, at the Gauss points.
+    strain : (M, Q, n, n) float64
+        There.
+    stress : (M, Q, n, n) float64
+        There, kPa, in 2-D in the plane.
+    strain_energy : float
+        In the cells, uJ.
+    spring_energy : float
+        In the springs, uJ.
+    work : float
+        Half of forces on their way, prescribed ones with them, uJ: the sum of the two energies.
+    reactions : dict of (n,) float64
+        By set that is prescribed or on springs, what holds it there, mN.
+    applied : (n,) float64
+        The sum of pressures, tractions and gravity, mN; the reactions balance it.
+    n_iterations : int
+        Of conjugate gradients, 0 where the matrix was factorised.
+    system : System
+        As it was solved, for `tetopt.fem.conditioning`.
+
+    Examples
+    --------
+    >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> loads = ["hold:inferior", "pressure:superior:1"]
+    >>> model = tetopt.model_of(mesh, image, young="0.1*h", nu=0.45, loads=loads)
+    >>> solution = tetopt.solved_model(model)
+    >>> (solution.reactions["inferior"] + solution.applied).round(6).tolist()  # they balance
+    [...0.0, ...0.0, ...0.0]
+    """
+
+    u: NDArray[np.float64]
+    young: NDArray[np.float64]
+    strain: NDArray[np.float64]
+    stress: NDArray[np.float64]
+    strain_energy: float
+    spring_energy: float
+    work: float
+    reactions: dict[str, NDArray[np.float64]]
+    applied: NDArray[np.float64]
+    n_iterations: int
+    system: System
 
 
 class _Task(NamedTuple):
@@ -79,6 +115,11 @@ def solved_model(model: Model, step: int = 1, method: Method = "auto") -> Soluti
     method : {"auto", "direct", "amg"}
         See `tetopt.fem.elasticity.solved`.
 
+    Returns
+    -------
+    Solution
+        Displacements, strains, stresses, energies, reactions.
+
     Raises
     ------
     InputError
@@ -87,16 +128,28 @@ def solved_model(model: Model, step: int = 1, method: Method = "auto") -> Soluti
     RuntimeError
         Not solved, or forces and reactions do not balance, as for moduli that differ too much.
 
+    See Also
+    --------
+    model_of : Makes a model.
+    solution_fields : What goes into a mesh's file.
+
     Examples
     --------
+    >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> loads = ["hold:inferior", "pressure:superior:1"]
+    >>> model = tetopt.model_of(mesh, image, young="0.1*h", nu=0.45, loads=loads)
+    >>> solution = tetopt.solved_model(model)
+    >>> print(f"The top sinks by {-solution.u[:, 2].min():.0f} mm under 1 kPa.")
+    The top sinks by 18 mm under 1 kPa.
+
     A bar of 2 mm, 1 kPa of traction at one end, 10 kPa stiff: it grows by a tenth.
 
-    >>> from tetopt.model.build import model_of
     >>> from tetopt.model.sets import standard_sets
-    >>> bar = Mesh([[0, 0], [2, 0], [2, 1], [0, 1]], [[0, 1, 2], [0, 2, 3]])
+    >>> bar = tetopt.Mesh([[0, 0], [2, 0], [2, 1], [0, 1]], [[0, 1, 2], [0, 2, 3]])
     >>> words = ["hold:x_min", "traction:x_max:1,0"]
-    >>> model = model_of(bar, young=10.0, nu=0.0, known_sets=standard_sets(bar), loads=words)
-    >>> solution = solved_model(model)
+    >>> model = tetopt.model_of(bar, young=10.0, nu=0.0, known_sets=standard_sets(bar), loads=words)
+    >>> solution = tetopt.solved_model(model)
     >>> solution.u[1].round(12).tolist(), solution.reactions["x_min"].round(12).tolist()
     ([0.2, 0.0], [-1.0, 0.0])
     """
@@ -261,17 +314,66 @@ def node_means(mesh: Mesh, values: NDArray[np.float64]) -> NDArray[np.float64]:
 
 
 class SolutionFields(NamedTuple):
-    """What a solution puts on a mesh's file, by name."""
+    """What a solution puts on a mesh's file, by name.
 
-    cell_data: dict[str, NDArray[np.float64]]  # (M, ...)
-    point_data: dict[str, NDArray[np.float64]]  # (N, ...) a row a node of the order
+    Parameters
+    ----------
+    cell_data : dict of (M, ...) float64
+        By name, a row a cell.
+    point_data : dict of (N, ...) float64
+        By name, a row a node of the order.
+
+    Examples
+    --------
+    >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> loads = ["hold:inferior", "pressure:superior:1"]
+    >>> model = tetopt.model_of(mesh, image, young="0.1*h", nu=0.45, loads=loads)
+    >>> fields = tetopt.solution_fields(mesh, tetopt.solved_model(model))
+    >>> fields.point_data["displacement"].shape
+    (280, 3)
+    """
+
+    cell_data: dict[str, NDArray[np.float64]]
+    point_data: dict[str, NDArray[np.float64]]
 
 
 @on_one_blas_thread
 def solution_fields(mesh: Mesh, solution: Solution, step: int = 1) -> SolutionFields:
-    """Displacement, mm, strain, stress, kPa, and von Mises stress, on cells (means) and nodes; tensors row by row.
+    """Displacement, strain and stress of a solution, on cells (means) and nodes, for a mesh's file.
 
-    Names of steps after the first end in "_step2" and so on.
+    Displacement in mm, strain, stress and von Mises stress in kPa; tensors row by row. Names of steps after the first
+    end in "_step2" and so on.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        Of the model.
+    solution : Solution
+        Of one step of it.
+    step : int
+        Which one, from 1.
+
+    Returns
+    -------
+    SolutionFields
+        By name, as `save_mesh` takes them.
+
+    Raises
+    ------
+    InputError
+        A mesh or a step that is none.
+
+    Examples
+    --------
+    >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> loads = ["hold:inferior", "pressure:superior:1"]
+    >>> model = tetopt.model_of(mesh, image, young="0.1*h", nu=0.45, loads=loads)
+    >>> fields = tetopt.solution_fields(mesh, tetopt.solved_model(model))
+    >>> tetopt.save_mesh("solved.vtu", mesh, fields.cell_data, point_data=fields.point_data)
+    >>> sorted(fields.cell_data)
+    ['strain', 'stress', 'von_mises']
     """
     suffix = "" if step == 1 else f"_step{step}"
     n = mesh.ndim

@@ -39,12 +39,32 @@ FOLDED_MESSAGE = (
 
 
 class Surface(NamedTuple):
-    """Closed triangle surfaces in space."""
+    """Closed triangle surfaces in space.
 
-    points: NDArray[np.float64]  # (N, 3), world mm
-    triangles: NDArray[np.int64]  # (K, 3), normals out of the solid
-    n_parted: int  # nodes that have several copies, and edges that have several middles
-    largest_shift: float  # mm, the farthest that a copy was moved; 0 where nothing was parted
+    Parameters
+    ----------
+    points : (N, 3) float64
+        World mm.
+    triangles : (K, 3) int64
+        Normals out of the solid.
+    n_parted : int
+        Nodes that have several copies, and edges that have several middles.
+    largest_shift : float
+        The farthest that a copy was moved, mm; 0 where nothing was parted.
+
+    Examples
+    --------
+    >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> surface = tetopt.surface_of(mesh.points, mesh.cells, np.ones(len(mesh.cells), dtype=bool))
+    >>> surface.triangles.shape, surface.n_parted
+    ((260, 3), 0)
+    """
+
+    points: NDArray[np.float64]
+    triangles: NDArray[np.int64]
+    n_parted: int
+    largest_shift: float
 
 
 class _Skin(NamedTuple):
@@ -86,17 +106,28 @@ def surface_of(points: NDArray[np.float64], cells: NDArray[np.integer], chosen: 
     chosen : (M,) array of bool, or (C,) array of int
         The cells, as a mask or as indices.
 
+    Returns
+    -------
+    Surface
+        Its points are numbered anew.
+
     Raises
     ------
     InputError
         Triangles in the plane, no cell chosen, a mask of another length, indices out of range or no integers, cells
         that fold over one another.
 
+    See Also
+    --------
+    save_surface : Writes one.
+
     Examples
     --------
-    >>> surface = surface_of(np.vstack([np.zeros(3), np.eye(3)]), np.array([[0, 1, 2, 3]]), [True])
-    >>> surface.triangles.shape, surface.n_parted
-    ((4, 3), 0)
+    >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> is_ball = tetopt.cell_moments(image, mesh).mean > 60.0
+    >>> surface = tetopt.surface_of(mesh.points, mesh.cells, is_ball)
+    >>> tetopt.save_surface("ball.stl", surface)
     """
     skin = _skin(points, _chosen_cells(points, cells, chosen))
     fan = _fans(skin.partner)

@@ -40,14 +40,30 @@ KNOWN_ARRAYS = ("DISP", "TOSTRAIN", "STRESS")  # of the file, by its names
 
 
 class Results(NamedTuple):
-    """What a solver found, at the nodes of a mesh."""
+    """What a solver found, at the nodes of a mesh.
 
-    # By name, a row for each node of the mesh (order 1) or of `quadratic` of it (order 2). "displacement" (mm),
-    # "strain_nodes", "stress_nodes" (9 columns, row by row; kPa) and "von_mises_nodes" (kPa), RAS+; of the second and
-    # further steps with "_step2" and so on behind.
+    Parameters
+    ----------
+    point_data : dict of arrays
+        By name, a row for each node of the mesh (order 1) or of `tetopt.geometry.quadratic.quadratic` of it (order 2).
+        "displacement" (mm), "strain_nodes", "stress_nodes" (9 columns, row by row; kPa) and "von_mises_nodes" (kPa),
+        RAS+; of the second and further steps with "_step2" and so on behind.
+    order : {1, 2}
+        Of the cells.
+    notes : tuple of str
+        What was assumed or left out, a line each.
+
+    Examples
+    --------
+    >>> mesh = tetopt.load_mesh("bar.vtu").mesh
+    >>> results = tetopt.read_frd("bar.frd", mesh)  # which CalculiX wrote for bar.inp
+    >>> results.order, results.point_data["stress_nodes"].shape == (len(mesh.points), 9)
+    (1, True)
+    """
+
     point_data: dict[str, NDArray[np.float64]]
     order: int
-    notes: tuple[str, ...]  # what was assumed or left out, a line each
+    notes: tuple[str, ...]
 
 
 class _Grid(NamedTuple):
@@ -83,11 +99,29 @@ def read_frd(path: str | Path, mesh: Mesh) -> Results:
     mesh : Mesh
         Tetrahedra: those of the input file, which may be of either order.
 
+    Returns
+    -------
+    Results
+        Displacements, strains and stresses by name.
+
     Raises
     ------
     InputError
         A file that is missing, not CalculiX's, cut off, or of another mesh; without displacements; with results at some
         nodes only, or that are no numbers; or pyvista-frd-reader is not installed.
+
+    See Also
+    --------
+    save_model : Writes the input file.
+    solved_model : Solves a model without CalculiX.
+
+    Examples
+    --------
+    >>> mesh = tetopt.load_mesh("bar.vtu").mesh
+    >>> results = tetopt.read_frd("bar.frd", mesh)  # which CalculiX wrote for bar.inp
+    >>> list(results.point_data)[:4]
+    ['displacement', 'strain_nodes', 'stress_nodes', 'von_mises_nodes']
+    >>> tetopt.save_mesh("solved.vtu", mesh, point_data=results.point_data)
     """
     path = Path(path)
     whole = _checked_bytes(path)

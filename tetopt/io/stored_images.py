@@ -67,6 +67,18 @@ def open_stored(path: str | Path, *, volume: int | None = None, crop: Bounds | N
     -----
     UserWarning
         No orientation, no unit; chunks that are missing and have a fill value; a box of an odd size.
+
+    See Also
+    --------
+    load_image : Reads all voxels.
+
+    Examples
+    --------
+    >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+    >>> tetopt.save_image("ball.nii", image)
+    >>> stored = tetopt.open_stored("ball.nii")
+    >>> len(tetopt.octree(stored, 300).points) == len(tetopt.octree(image, 300).points)
+    True
     """
     check_local(path)
     path = Path(path)

@@ -51,17 +51,35 @@ def save_surface(
 ) -> None:
     """Write a binary STL, PLY, VTP or VTK file, by the name's suffix, whole or not at all.
 
-    World coordinates in mm; with `space` "lps", x and y change sign. The header says which in the words that 3D
-    Slicer looks for; then `about`, in one line of ASCII, of which STL keeps the first 60 characters, and VTP nothing.
-    All but STL, which rounds to float32, hold every bit of the points and their order. Replaces an existing file; ask
+    The header says the coordinates' convention in the words that 3D Slicer looks for. All but STL, which rounds to
+    float32, hold every bit of the points and their order. Replaces an existing file; ask
     `tetopt.io.files.checked_output` first.
 
-    `labels` are whole numbers of the triangles, (T,) each, by name: properties of the faces in PLY, cell data in VTK's.
+    Parameters
+    ----------
+    path : str or Path
+        Its name ends in .stl, .ply, .vtp or .vtk.
+    surface : Surface
+        World mm, RAS+.
+    about : str, optional
+        For the header, in one line of ASCII, of which STL keeps the first 60 characters, and VTP nothing.
+    space : {"ras", "lps"}
+        Convention of the file's coordinates; with "lps" x and y change sign.
+    labels : dict of (K,) arrays of whole numbers, optional
+        Of the triangles, by name: properties of the faces in PLY, cell data in VTK's.
 
     Raises
     ------
     InputError
         Another suffix, or labels in an STL file, which has no room for them.
+
+    Examples
+    --------
+    >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> is_ball = tetopt.cell_moments(image, mesh).mean > 60.0
+    >>> surface = tetopt.surface_of(mesh.points, mesh.cells, is_ball)
+    >>> tetopt.save_surface("ball.ply", surface, about="a ball", space="lps")
     """
     path = Path(path)
     writers = {".stl": _stl, ".ply": _ply, ".vtp": _vtp, ".vtk": _vtk}

@@ -143,7 +143,7 @@ class Quality(NamedTuple):
     >>> mesh = tetopt.lattice(tetopt.Image(np.zeros((40, 40, 40))), nodes=300)
     >>> numbers = tetopt.quality(mesh.points, mesh.cells)
     >>> numbers.n_nodes, numbers.n_cells, numbers.kinds["sliver"]
-    (341, 1500, 0)
+    (NODES)
     >>> f"angles from {numbers.min_dihedral:.0f} to {numbers.max_dihedral:.0f} degrees, mean rho {numbers.mean_rho:.3f}"
     'angles from 45 to 90 degrees, mean rho 0.299'
     """

@@ -20,12 +20,32 @@ from tetopt.target.otsu import class_thresholds
 def segmented(image: Image, mesh: Mesh, classes: int) -> Image:
     """Label image, 0 to classes - 1 by rising mean: the cells' classes painted back to their voxels.
 
-    Cells are grouped by their means, each weighted by its number of voxels; voxels outside the mesh get class 0.
+    Parameters
+    ----------
+    image : Image
+        The intensities h.
+    mesh : Mesh
+        Of the image's box or a part of it.
+    classes : int
+        2 or more.
+
+    Returns
+    -------
+    Image
+        Whole numbers, on the image's voxels.
 
     Raises
     ------
     InputError
         As `class_thresholds` and `tetopt.energy.sampling.cell_moments`.
+
+    Examples
+    --------
+    >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+    >>> labels = tetopt.segmented(image, tetopt.mesh_image(image, 300).mesh, 2)
+    >>> truth = tetopt.load_phantom("sphere").label_image(voxel_mm=4)
+    >>> print(f"{(labels.data == truth.data).mean():.1%} of the voxels as in the phantom")
+    98.2% of the voxels as in the phantom
     """
     moments = cell_moments(image, mesh)
     thresholds = class_thresholds(moments.mean, classes, moments.n_voxels)

@@ -23,10 +23,28 @@ Law = Callable[[NDArray[np.float64]], ArrayLike] | Sequence[Sequence[float]] | N
 
 
 class ByLabel(NamedTuple):
-    """A value for each label instead of a law of the intensity."""
+    """A value for each label instead of a law of the intensity.
 
-    values: dict[int | str, float]  # by label, or by a label's name (`tetopt.model.materials.by_label`)
-    rest: float | None = None  # of all labels that are not named
+    Parameters
+    ----------
+    values : dict of int or str to float
+        By label, or by a label's name (`tetopt.model.materials.by_label`).
+    rest : float, optional
+        Of all labels that are not named.
+
+    Examples
+    --------
+    >>> phantom = tetopt.load_phantom("sphere")
+    >>> labels = phantom.label_image(voxel_mm=4)
+    >>> mesh = tetopt.lattice(labels, nodes=300)
+    >>> data = {"label": tetopt.cell_labels(labels, mesh)}
+    >>> model = tetopt.model_of(mesh, young=tetopt.ByLabel({1: 10.0}, rest=2.0), cell_data=data)
+    >>> model.materials.young.tolist()
+    [2.0, 10.0]
+    """
+
+    values: dict[int | str, float]
+    rest: float | None = None
 
 
 def law_values(law: Law, intensities: ArrayLike) -> NDArray[np.float64]:

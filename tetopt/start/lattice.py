@@ -77,7 +77,7 @@ def lattice(
     (113, 196)
     >>> cube = tetopt.Image(np.zeros((40, 40, 40)))
     >>> [len(tetopt.lattice(cube, kind, nodes=1000).points) for kind in ("bcc", "five-tet")]
-    [1241, 1000]
+    [968, 1000]
     """
     n = image.ndim
     kind = KINDS[n][0] if kind is None else kind

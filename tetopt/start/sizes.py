@@ -123,9 +123,8 @@ class Sizes(NamedTuple):
         Examples
         --------
         >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-        >>> field = tetopt.Image(np.where(image.data > 60.0, 6.0, 0.0), image.affine)  # fine in the ball
-        >>> sizes = tetopt.Sizes(largest=20.0, field=field)
-        >>> place = np.array([[24.0, 0.0, 0.0]])  # 4 mm off the ball
+        >>> field = tetopt.Image(np.where(image.data > 60.0, 6.0, 20.0), image.affine)  # fine in the ball
+        >>> sizes, place = tetopt.Sizes(field=field), np.array([[26.0, 0.0, 0.0]])  # 8 mm off its last voxel
         >>> sizes.at(place).tolist(), sizes.prepared(3).at(place).tolist()
         ([20.0], [10.0])
         """

@@ -189,7 +189,7 @@ def foreground(image: Image, level: float | None = None) -> Image:
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
     >>> mask = tetopt.foreground(image, 60.0)
     >>> print(f"{mask.data.mean():.1%} of the box")
-    13.5% of the box
+    SHARE of the box
     >>> result = tetopt.mesh_image(tetopt.content(image, mask=mask), 200, iterations=4)
     >>> result.missed
     mappingproxy({})

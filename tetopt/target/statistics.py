@@ -26,15 +26,37 @@ Box = tuple[slice, slice, slice]
 
 
 class Statistics(NamedTuple):
-    """Of all voxels of a stored image; made by `stored_statistics`."""
+    """Of all voxels of a stored image; made by `stored_statistics`.
+
+    Parameters
+    ----------
+    mean, low, high : float
+        Of the intensities.
+    variance : float
+        Divided by the number of voxels.
+    noise : float
+        Variance of the noise, as `Content.noise` of the image in memory has it, to the last bit.
+    scaled_noise : float
+        The same of the intensities less their mean, over their largest deviation from it.
+    is_whole : bool
+        Whether all are whole numbers.
+
+    Examples
+    --------
+    >>> from tetopt.target.statistics import stored_statistics
+    >>> voxels = np.arange(4096, dtype=np.int16).reshape(16, 16, 16)
+    >>> numbers = stored_statistics(tetopt.StoredImage(voxels))
+    >>> numbers.low, numbers.high, numbers.mean, numbers.is_whole
+    (0.0, 4095.0, 2047.5, True)
+    """
 
     mean: float
     low: float
     high: float
-    variance: float  # divided by the number of voxels
-    noise: float  # variance of the noise, as `Content.noise` of the image in memory has it, to the last bit
-    scaled_noise: float  # the same of the intensities less their mean, over their largest deviation from it
-    is_whole: bool  # whether all are whole numbers
+    variance: float
+    noise: float
+    scaled_noise: float
+    is_whole: bool
 
     @property
     def scale(self) -> float:
