@@ -1,9 +1,14 @@
 """The documentation's site, which `make docs` builds into docs/_build/html; nothing is fetched for it."""
 
+import inspect
 import os
 import sys
 from importlib.metadata import version as installed_version
 from pathlib import Path
+
+import numpydoc.xref
+
+import tetopt
 
 HERE = Path(__file__).parent
 sys.path.insert(0, str(HERE / "_extensions"))
@@ -27,12 +32,22 @@ extensions = [
     "mathml",
     "command_pages",
 ]
-exclude_patterns = ["_build", "_extensions", "examples/GALLERY_HEADER.rst"]
+exclude_patterns = ["_build", "_extensions", "_templates", "examples/GALLERY_HEADER.rst"]
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]
 myst_heading_anchors = 3
 nitpicky = False
+default_role = "py:obj"  # names in docstrings are links where they are public
+templates_path = ["_templates"]
 numpydoc_show_class_members = False
+numpydoc_xref_param_type = True
+numpydoc_xref_aliases = {name: f"tetopt.{name}" for name in tetopt.__all__ if inspect.isclass(getattr(tetopt, name))}
+numpydoc_xref_ignore = "all"  # words of types that are not ours
+numpydoc.xref.DEFAULT_LINKS.clear()  # to Python's own pages, which are not fetched
 autodoc_typehints = "none"  # the docstrings say types, shapes and units
+autodoc_member_order = "bysource"
+python_maximum_signature_line_length = 72  # longer ones have a line for each parameter
+# Names that differ by case alone would be one file on Windows and macOS.
+autosummary_filename_map = {f"tetopt.{name}": f"tetopt.{name}_record" for name in ("Content", "Quality")}
 copybutton_exclude = ".linenos, .gp, .go"
 
 sphinx_gallery_conf = {
@@ -64,3 +79,11 @@ html_theme_options = {
     "footer_end": [],
     "secondary_sidebar_items": ["page-toc"],
 }
+
+
+def setup(app):
+    """Fields of records are in their docstring; what Python says of them ("Alias for field number 0") is left out."""
+    app.connect(
+        "autodoc-skip-member",
+        lambda app, what, name, value, skip, options: True if type(value).__name__ == "_tuplegetter" else None,
+    )

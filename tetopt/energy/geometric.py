@@ -74,7 +74,7 @@ def E_G_gradient(points: Points, cells: Cells) -> NDArray[np.float64]:
 
 
 def ring_volumes(points: Points, cells: Cells) -> NDArray[np.float64]:
-    """|Omega_i|, the volume of the cells around each node, (N,) float64, mm^n."""
+    """``|Omega_i|``, the volume of the cells around each node, (N,) float64, mm^n."""
     v = np.broadcast_to(volumes(points, cells)[:, None], cells.shape)
     return np.bincount(cells.ravel(), weights=v.ravel(), minlength=len(points)).astype(np.float64)
 

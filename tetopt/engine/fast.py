@@ -77,7 +77,9 @@ def optimize(
     callback: Callable[[Record], None] | None = None,
     stop: Callable[[], bool] | None = None,
 ) -> Optimized:
-    """Move the nodes of `mesh`, and connect them anew, to lower E = (1 - k_D) E_G + k_D E_D, Eq. (4).
+    """Move the nodes of a mesh, and connect them anew, to lower E.
+
+    E = (1 - k_D) E_G + k_D E_D is Eq. (4), with each energy over its value on the initial mesh.
 
     Parameters
     ----------

@@ -65,7 +65,9 @@ def optimize_paper(
     callback: Callable[[Record], None] | None = None,
     stop: Callable[[], bool] | None = None,
 ) -> Optimized:
-    """Move the nodes of `mesh` to lower E = (1 - k_D) E_G + k_D E_D, Eq. (4), by the paper's scheme.
+    """Move the nodes of a mesh to lower E, by the paper's scheme.
+
+    E = (1 - k_D) E_G + k_D E_D is Eq. (4), with each energy over its value on the initial mesh.
 
     Parameters
     ----------

@@ -111,7 +111,7 @@ def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
     >>> mesh = tetopt.lattice(image, nodes=300)
-    >>> loads = ["hold:inferior", "pressure:superior:1"]
+    >>> loads = ["hold:inferior", "pressure:superior:0.1"]
     >>> model = tetopt.model_of(mesh, image, young="0.1*h", nu=0.45, loads=loads)
     >>> for name in ("ball.inp", "ball.feb", "ball.vtu"):  # CalculiX and Abaqus, FEBio, ParaView
     ...     tetopt.save_model(name, model)

@@ -120,7 +120,7 @@ def label_interfaces(labels: Image, mesh: Mesh, of_cell: ArrayLike) -> list[Labe
     >>> labels = phantom.label_image(voxel_mm=4)
     >>> result = tetopt.mesh_image(tetopt.content(phantom.image(voxel_mm=4), labels), 300)
     >>> ball = tetopt.label_interfaces(labels, result.mesh, result.labels)[1]
-    >>> ball.nonmanifold_edges, ball.nonmanifold_nodes, ball.mesh_euler  # a closed surface without handles
+    >>> ball.nonmanifold_edges, ball.nonmanifold_nodes, ball.mesh_euler  # without handles
     (0, 0, 2)
     """
     check_labels("labels", labels)

@@ -44,8 +44,8 @@ def segmented(image: Image, mesh: Mesh, classes: int) -> Image:
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
     >>> labels = tetopt.segmented(image, tetopt.mesh_image(image, 300).mesh, 2)
     >>> truth = tetopt.load_phantom("sphere").label_image(voxel_mm=4)
-    >>> print(f"{(labels.data == truth.data).mean():.1%} of the voxels as in the phantom")
-    98.2% of the voxels as in the phantom
+    >>> int((labels.data != truth.data).sum())  # voxels that are not as in the phantom
+    0
     """
     moments = cell_moments(image, mesh)
     thresholds = class_thresholds(moments.mean, classes, moments.n_voxels)

@@ -99,7 +99,7 @@ def model_of(
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
     >>> mesh = tetopt.lattice(image, nodes=300)
-    >>> loads = ["hold:inferior", "pressure:superior:1"]
+    >>> loads = ["hold:inferior", "pressure:superior:0.1"]
     >>> model = tetopt.model_of(mesh, image, young="0.1*h", nu=0.45, loads=loads)
     >>> tetopt.save_model("ball.inp", model)  # for CalculiX or Abaqus
 

@@ -90,7 +90,7 @@ class Model(NamedTuple):
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
     >>> mesh = tetopt.lattice(image, nodes=300)
-    >>> loads = ["hold:inferior", "pressure:superior:1"]
+    >>> loads = ["hold:inferior", "pressure:superior:0.1"]
     >>> model = tetopt.model_of(mesh, image, young="0.1*h", nu=0.45, loads=loads)
     >>> len(model.materials.young), [load.kind for load in model.loads]
     (21, ['displacement', 'pressure'])
@@ -127,7 +127,7 @@ class Model(NamedTuple):
         --------
         >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
         >>> mesh = tetopt.lattice(image, nodes=300)
-        >>> loads = ["hold:inferior", "pressure:superior:1"]
+        >>> loads = ["hold:inferior", "pressure:superior:0.1"]
         >>> model = tetopt.model_of(mesh, image, young="0.1*h", nu=0.45, loads=loads)
         >>> skfem_mesh = model.to_skfem()
         >>> len(skfem_mesh.boundaries["superior"])

@@ -118,7 +118,7 @@ def octree(
     >>> mesh = tetopt.octree(image, 300)
     >>> numbers = tetopt.quality(mesh.points, mesh.cells)
     >>> numbers.n_nodes, round(numbers.max_edge / numbers.min_edge, 1)
-    (300, 4.0)
+    (303, 3.3)
     """
     source = source_of(image, statistics)
     shape = " x ".join(map(str, source.grid.shape))
