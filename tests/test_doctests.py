@@ -51,6 +51,12 @@ def test_public_names_are_documented(name):
         assert list(getattr(value, "_fields", [])) == fields_of(value)
 
 
+def test_public_names_are_on_the_site():
+    """Once each, on the page of the API."""
+    page = (ROOT / "docs" / "reference" / "api" / "index.md").read_text(encoding="utf-8")
+    assert sorted(re.findall(r"^   (\w+)$", page, re.M)) == sorted(NAMES)
+
+
 def fields_of(record):
     """The fields of a NamedTuple that its docstring lists, in its order; none of another class."""
     names = [each.name for each in ClassDoc(record)["Parameters"]] if hasattr(record, "_fields") else []
