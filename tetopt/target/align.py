@@ -189,7 +189,7 @@ def foreground(image: Image, level: float | None = None) -> Image:
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
     >>> mask = tetopt.foreground(image, 60.0)
     >>> int(mask.data.sum())  # voxels
-    552
+    504
     >>> result = tetopt.mesh_image(tetopt.content(image, mask=mask), 200, iterations=4)
     >>> dict(result.missed)
     {}
