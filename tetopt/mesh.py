@@ -111,7 +111,7 @@ class Mesh:
 
         Examples
         --------
-        >>> mesh = Mesh([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]])
+        >>> mesh = tetopt.Mesh([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]])
         >>> grid = mesh.to_pyvista({"mean": [3.5]})
         >>> grid.n_points, grid.cell_data["mean"].tolist()
         (3, [3.5])
@@ -143,8 +143,8 @@ class Mesh:
 
         Examples
         --------
-        >>> mesh = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 2, 3]])
-        >>> Mesh.from_pyvista(mesh.to_pyvista()).cells.tolist()
+        >>> mesh = tetopt.Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 2, 3]])
+        >>> tetopt.Mesh.from_pyvista(mesh.to_pyvista()).cells.tolist()
         [[0, 1, 2, 3]]
         """
         picked = conversions.from_pyvista(grid)
@@ -170,7 +170,7 @@ class Mesh:
 
         Examples
         --------
-        >>> mesh = Mesh([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]])
+        >>> mesh = tetopt.Mesh([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]])
         >>> mesh.to_meshio({"mean": [3.5]}).cells_dict["triangle"].tolist()
         [[0, 1, 2]]
         """
@@ -185,6 +185,7 @@ class Mesh:
         Parameters
         ----------
         mesh : meshio.Mesh
+            Coordinates in mm.
 
         Returns
         -------
@@ -197,8 +198,8 @@ class Mesh:
 
         Examples
         --------
-        >>> mesh = Mesh([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]])
-        >>> Mesh.from_meshio(mesh.to_meshio()).points.tolist()
+        >>> mesh = tetopt.Mesh([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]])
+        >>> tetopt.Mesh.from_meshio(mesh.to_meshio()).points.tolist()
         [[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]]
         """
         picked = conversions.from_meshio(mesh)
@@ -219,7 +220,7 @@ class Mesh:
 
         Examples
         --------
-        >>> mesh = Mesh([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]])
+        >>> mesh = tetopt.Mesh([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]])
         >>> mesh.to_skfem().p.tolist()
         [[0.0, 1.0, 0.0], [0.0, 0.0, 1.0]]
         """
@@ -234,6 +235,7 @@ class Mesh:
         Parameters
         ----------
         mesh : skfem.MeshTri or skfem.MeshTet
+            Coordinates in mm.
 
         Returns
         -------
@@ -247,7 +249,7 @@ class Mesh:
         Examples
         --------
         >>> import skfem
-        >>> len(Mesh.from_skfem(skfem.MeshTet()).cells)
+        >>> len(tetopt.Mesh.from_skfem(skfem.MeshTet()).cells)
         5
         """
         picked = conversions.from_skfem(mesh)
@@ -270,7 +272,7 @@ class Mesh:
 
         Examples
         --------
-        >>> mesh = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 2, 3]])
+        >>> mesh = tetopt.Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 2, 3]])
         >>> boundary = mesh.to_trimesh()
         >>> bool(boundary.is_watertight), round(float(boundary.volume), 6)
         (True, 0.166667)
