@@ -23,10 +23,15 @@ def blocks(page, language):
     return [text for _, name, text in FENCE.findall(page.read_text(encoding="utf-8")) if name == language]
 
 
-def commands(page):
-    """The words after `tetopt` of each command in the page's bash blocks; a line that ends in a backslash goes on."""
-    lines = "\n".join(blocks(page, "bash")).replace("\\\n", " ").splitlines()
+def commands_in(text):
+    """The words after `tetopt` of each command; a line that ends in a backslash goes on."""
+    lines = text.replace("\\\n", " ").splitlines()
     return [words[1:] for words in (shlex.split(line, comments=True) for line in lines) if words[:1] == ["tetopt"]]
+
+
+def commands(page):
+    """Those of all of a page's bash blocks."""
+    return commands_in("\n".join(blocks(page, "bash")))
 
 
 def names_of_tetopt(tree):
@@ -82,10 +87,9 @@ def test_the_lesson_runs(tmp_path, monkeypatch, capsys):
         for language, text in [(name, text) for _, name, text in FENCE.findall(page.read_text(encoding="utf-8"))]:
             text = text.replace("5000", "150")
             if language == "bash":
-                for line in text.splitlines():
-                    words = shlex.split(line)
-                    if words[0] == "tetopt" and words[1] != "warm-up":
-                        assert main(words[1:]) == 0, line
+                for words in commands_in(text):
+                    if words[0] != "warm-up":
+                        assert main(words) == 0, words
             elif "nilearn" not in text:
                 exec(compile(text, page.name, "exec"), {})
     printed = capsys.readouterr().out
