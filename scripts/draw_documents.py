@@ -40,6 +40,7 @@ PICTURE_DPI = 110  # a figure of ten inches fills the column of a page on a scre
 # The pictures that other commands draw, which stand beside these.
 COMMANDS = {
     "demo.png": "tetopt demo -o demo, then --shrink demo/demo.png",
+    "first_mesh.png": "tetopt mesh T1.nii.gz -o brain.vtu --nodes 5000 --figures ., then --shrink of slice.png",
     "organ.png": "python scripts/cut_open.py organ.vtu --image T1.nii.gz --labels tissues.nii.gz, then --shrink",
     "tradeoff.png": "tetopt compare T1.nii.gz -o compared --nodes 5000 --tradeoff",
     "view.png": "tetopt view brain.vtu --image T1.nii.gz --html look.html, photographed in a browser",
