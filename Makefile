@@ -9,7 +9,7 @@ TESTED = PYTHONUTF8=1 NUMBA_CACHE_DIR=$(NUMBA_CACHE) MPLBACKEND=agg $(BIN)/pytho
 
 SOLVERS = calculix-ccx python3-dolfinx
 
-.PHONY: demo test test-slow test-random test-solvers test-nojit test-onethread test-hostile test-container test-slurm test-cohort test-parts lint bench bench-blocks fingerprints docs clean
+.PHONY: demo test dist test-lowest test-slow test-random test-solvers test-nojit test-onethread test-hostile test-container test-slurm test-cohort test-parts lint bench bench-blocks fingerprints docs clean
 
 demo: $(VENV)/.demo
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt demo -o demo --force
@@ -19,12 +19,27 @@ test: $(VENV)/.test
 	$(TESTED) -m "not slow" -n auto --dist loadfile
 	$(MAKE) --no-print-directory test-onethread test-nojit
 
-# The small cases again on one thread, and with the kernels run as plain Python.
+# The small cases again on one thread, and with the kernels run as plain Python; no other file is read for that.
+KERNEL_TESTS = $(shell grep -rl --include='test_*.py' 'mark\.kernel' tests)
 test-onethread: $(VENV)/.test
-	NUMBA_NUM_THREADS=1 $(TESTED) -q -m kernel --no-header --durations=3
+	NUMBA_NUM_THREADS=1 $(TESTED) -q -m kernel --no-header --durations=3 $(KERNEL_TESTS)
 
 test-nojit: $(VENV)/.test
-	NUMBA_DISABLE_JIT=1 $(TESTED) -q -m kernel --no-header --durations=3
+	NUMBA_DISABLE_JIT=1 $(TESTED) -q -m kernel --no-header --durations=3 $(KERNEL_TESTS)
+
+# The wheel and the archive of sources, into dist/: checked, each installed into a fresh environment, and run there.
+dist: $(VENV)/bin/python
+	$(BIN)/python scripts/dist.py dist
+
+# The suite with the lowest versions of all packages that pyproject.toml allows, in an environment of its own.
+LOWEST = .venv-lowest
+test-lowest:
+	$(PYTHON) -m venv $(LOWEST)
+	$(LOWEST)/bin/python -m pip install --quiet --disable-pip-version-check uv
+	$(LOWEST)/bin/python -m uv pip install --quiet --python $(LOWEST)/bin/python --resolution lowest-direct -e ".[test]"
+	NUMBA_CACHE_DIR=$(NUMBA_CACHE)-lowest $(LOWEST)/bin/tetopt warm-up
+	PYTHONUTF8=1 NUMBA_CACHE_DIR=$(NUMBA_CACHE)-lowest MPLBACKEND=agg \
+	  $(LOWEST)/bin/python -m pytest -m "not slow" -n auto --dist loadfile
 
 # A million random operations of the engine and 500 random whole runs, an hour; a small share is in `make test`.
 test-random: $(VENV)/.test
@@ -111,4 +126,4 @@ $(VENV)/.test: $(VENV)/bin/python pyproject.toml
 	@touch $@
 
 clean:
-	rm -rf $(VENV) .numba_cache demo docs/_build docs/gallery bench.json bench_blocks.json cost.toml cost_runs.jsonl fingerprints.json
+	rm -rf $(VENV) $(LOWEST) dist .numba_cache demo docs/_build docs/gallery bench.json bench_blocks.json cost.toml cost_runs.jsonl fingerprints.json
