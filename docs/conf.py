@@ -54,6 +54,7 @@ sphinx_gallery_conf = {
     "examples_dirs": "examples",
     "gallery_dirs": "gallery",
     "filename_pattern": r"\.py$",
+    "within_subsection_order": "gallery_order.position",
     "image_scrapers": ("matplotlib", "pyvista"),
     "remove_config_comments": True,
     "abort_on_example_error": True,

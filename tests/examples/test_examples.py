@@ -1,0 +1,90 @@
+"""Each program of the gallery, as it stands: it runs without a warning, leaves nothing, and prints the number below."""
+
+import contextlib
+import io
+import runpy
+import shutil
+import warnings
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+import pytest
+import pyvista
+from matplotlib import pyplot
+
+import tetopt
+
+EXAMPLES = Path(__file__).resolve().parents[2] / "docs" / "examples"
+RESULT = EXAMPLES / "plot_calculix.frd"
+
+
+class Number(NamedTuple):
+    """What a program computes and prints."""
+
+    variable: str
+    form: str  # of its printing
+    printed: str
+    tolerance: float = 0.0  # meshes are the same bits everywhere, so that all digits are
+
+
+NUMBERS = {
+    "first_mesh": Number("share", ".5f", "0.00064"),
+    "ventricles": Number("volume_ml", ".2f", "16.96"),
+    "organ_from_mask": Number("dice", ".4f", "0.9946"),
+    "tissues_from_labels": Number("white_dice", ".4f", "0.8477"),
+    "two_contrasts": Number("worst", ".4f", "0.0084"),
+    "target_error": Number("needed", "d", "125"),
+    "k_d": Number("gain", ".1%", "54.4%"),
+    "quadratic_cells": Number("factor", ".2f", "8.19"),
+    "calculix": Number("largest_stress", ".2f", "2.22"),
+    "scikit_fem": Number("energy", ".2f", "17034.72"),
+    "fenicsx": Number("largest_kPa", ".2f", "7.63"),
+    "improve_pytetwild": Number("remaining", ".2f", "0.30", 0.1),  # its meshes are not the same everywhere
+    "elastography": Number("contrast", ".2f", "3.67"),
+    "own_phantom": Number("volume_mm3", ".1f", "1120.7"),
+    "other_libraries": Number("volume_mm3", ".1f", "33719.5"),
+    "fields_on_voxels": Number("off_mm", ".4f", "0.0097"),
+    "slice_2d": Number("left_of_lattice", ".3f", "0.243"),
+}
+PROGRAMS = sorted(path.stem.removeprefix("plot_") for path in EXAMPLES.glob("*.py"))
+
+
+def test_every_program_has_its_number():
+    """And its place in the gallery."""
+    assert sorted(NUMBERS) == PROGRAMS
+
+
+@pytest.mark.parametrize("name", PROGRAMS)
+def test_program(name, tmp_path, monkeypatch, opengl):
+    """Run in a folder with what lies beside it, the pictures drawn off screen."""
+    names, printed = _run(name, tmp_path, monkeypatch)
+    number = NUMBERS[name]
+    value = format(names[number.variable], number.form)
+    assert value in printed  # the page says it
+    if number.tolerance:
+        assert float(value) == pytest.approx(float(number.printed), abs=number.tolerance)
+    else:
+        assert value == number.printed
+    if name == "calculix":  # the kept result is of this mesh, whether or not ccx is here
+        kept = tetopt.read_frd(RESULT, names["mesh"]).point_data
+        assert np.abs(kept["displacement"] - names["displacement"]).max() < 1e-4
+        assert np.abs(kept["von_mises_nodes"] - names["stress_kPa"]).max() < 1e-3
+
+
+def _run(name, folder, monkeypatch):
+    """The program's names, and what it prints."""
+    beside = {path.name for path in EXAMPLES.iterdir() if path.suffix not in (".py", ".rst") and path.is_file()}
+    for file in beside:
+        shutil.copy(EXAMPLES / file, folder)
+    monkeypatch.chdir(folder)
+    monkeypatch.setattr(pyvista, "OFF_SCREEN", True)
+    output = io.StringIO()
+    # Without a display VTK complains of the missing one before it renders off screen.
+    with warnings.catch_warnings(), contextlib.redirect_stdout(output), pyvista.vtk_verbosity("off"):
+        warnings.simplefilter("error", UserWarning)
+        warnings.simplefilter("error", RuntimeWarning)
+        names = runpy.run_path(str(EXAMPLES / f"plot_{name}.py"))
+    pyplot.close("all")
+    assert {path.name for path in folder.iterdir()} == beside
+    return names, output.getvalue()
