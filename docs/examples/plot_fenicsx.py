@@ -26,8 +26,8 @@ path = Path(folder.name) / "head.xdmf"
 tetopt.save_model(path, model)
 
 # %%
-# These lines of dolfinx read the mesh, the numbers of the cells' materials, and the tags of the facets. A tag stands for
-# one combination of sets, and the file says which tags a set has. :doc:`/reference/formats` says more.
+# These lines of dolfinx read the mesh, the numbers of the cells' materials, and the tags of the facets. A tag stands
+# for one combination of sets, and the file says which tags a set has. :doc:`/reference/formats` says more.
 
 PROGRAM = """
 from xml.etree import ElementTree

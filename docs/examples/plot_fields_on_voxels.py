@@ -37,8 +37,8 @@ difference = np.abs(cells.mean - fields.cell_data["von_mises"])[has_voxels].max(
 print(f"stress: off by {difference:.1e} kPa after voxels and back")
 
 # %%
-# Displacements are linear in each cell. pyvista's ``sample`` evaluates them at voxel centres, and nibabel writes them as
-# an image of three volumes.
+# Displacements are linear in each cell. pyvista's ``sample`` evaluates them at voxel centres, and nibabel writes them
+# as an image of three volumes.
 
 grid = mesh.to_pyvista(point_data={"displacement": solution.u})
 centres = image.to_world(np.argwhere(np.ones(image.shape)))
