@@ -13,8 +13,8 @@ from nilearn.datasets import load_mni152_gm_template, load_mni152_template, load
 import tetopt
 
 # %%
-# nilearn's wheel has the probabilities of grey and white matter beside the T1. The likeliest tissue of each voxel of the
-# brain is its label: 1 is fluid and what else there is, 2 grey, 3 white matter.
+# nilearn's wheel has the probabilities of grey and white matter beside the T1. The likeliest tissue of each voxel of
+# the brain is its label: 1 is fluid and what else there is, 2 grey, 3 white matter.
 
 load = (load_mni152_template, load_mni152_gm_template, load_mni152_wm_template)
 t1, grey, white = (of_tissue(resolution=1).get_fdata()[::3, ::3, ::3] for of_tissue in load)
