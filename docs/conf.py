@@ -31,6 +31,7 @@ extensions = [
     "sphinx_gallery.gen_gallery",
     "mathml",
     "command_pages",
+    "schema_pages",
 ]
 exclude_patterns = ["_build", "_extensions", "_templates", "examples/GALLERY_HEADER.rst"]
 myst_enable_extensions = ["colon_fence", "deflist", "dollarmath"]

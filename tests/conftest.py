@@ -1,5 +1,6 @@
 """Fixtures shared by all tests."""
 
+import json
 import os
 import subprocess
 import sys
@@ -7,7 +8,10 @@ from pathlib import Path
 
 import numba
 import pytest
+import schemas
 from hypothesis import settings
+
+import tetopt.io.files
 
 # The same examples in every run; few where the kernels run as plain Python.
 settings.register_profile("tetopt", deadline=None, derandomize=True, max_examples=4 if numba.config.DISABLE_JIT else 30)
@@ -33,3 +37,18 @@ def opengl() -> None:
     )
     if subprocess.run([sys.executable, "-c", program], capture_output=True, check=False).returncode != 0:
         pytest.skip("no OpenGL that renders off screen")
+
+
+@pytest.fixture(scope="session", autouse=True)
+def described_numbers():
+    """Whatever JSON a test has tetopt write in this process keeps to its schema, if its kind has one."""
+    save_text = tetopt.io.files.save_text
+
+    def checked(path, text):
+        if Path(path).suffix == ".json":
+            schemas.assert_described(json.loads(text))
+        save_text(path, text)
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tetopt.io.files, "save_text", checked)
+        yield
