@@ -36,7 +36,7 @@ from tetopt.report.figures import CURVE_COLOURS, MESH_LINE, save_figure
 PALETTE_COLOURS = (256, 128, 64, 32)  # as many as the bytes allow, of PNGs whose pixels are numbers of colours
 LARGEST_BYTES = 250_000  # of a picture, so that a page loads at once
 LARGEST_WIDTH = 1400  # pixels: the column of a page on a screen of twice the usual density
-PICTURE_DPI = 110  # a figure of ten inches fills the column of a page on a screen of usual density
+PICTURE_DPI = 140  # a figure of nine inches fills the column of a page on a screen of usual density
 # The pictures that other commands draw, which stand beside these.
 COMMANDS = {
     "demo.png": "tetopt demo -o demo, then --shrink demo/demo.png",
@@ -98,7 +98,7 @@ def method_figure() -> Figure:
     lattice = tetopt.lattice(image, nodes=113)
     moved = {n: tetopt.optimize(image, lattice, k_D=0.5, iterations=n, tolerance=0.0) for n in (1, 20)}
     graded = tetopt.mesh_image(image, nodes=113)
-    figure = Figure(figsize=(12.5, 6.4), layout="constrained")
+    figure = Figure(figsize=(9.4, 5.9), layout="constrained")
     panels = figure.subplots(2, 3)
     panels[0, 0].imshow(image.data.T, origin="lower", cmap="gray", extent=_extent(image), vmin=0, vmax=255)
     panels[0, 0].set_title(f"the image, {image.shape[0]} x {image.shape[1]} pixels\n", fontsize=10)
@@ -134,14 +134,14 @@ def octree_figure() -> Figure:
     image = tetopt.load_phantom("fig2_2d").image()
     result = tetopt.mesh_image(image, nodes=400)
     assert result.initial is not None, "mesh_image returns the mesh that it began with"
-    figure = Figure(figsize=(12.5, 4.4), layout="constrained")
+    figure = Figure(figsize=(9.6, 3.7), layout="constrained")
     image_panel, first, last = figure.subplots(1, 3)
     for axes, mesh in ((image_panel, result.initial), (first, result.initial), (last, result.mesh)):
-        title = f"{len(mesh.points)} nodes, E_D {share_of(image, mesh):.4f} of the variance"
+        title = f"{len(mesh.points)} nodes\nE_D {share_of(image, mesh):.4f} of the variance"
         if axes is image_panel:
             axes.imshow(image.data.T, origin="lower", cmap="gray", extent=_extent(image), vmin=0, vmax=255)
             axes.plot(*mesh.points.T, ".", color=MESH_LINE, markersize=3)
-            axes.set_title("corners of the quadtree's blocks", fontsize=10)
+            axes.set_title("corners and centres of blocks\n", fontsize=10)
             axes.set_axis_off()
         else:
             means_panel(axes, image, mesh, ("initial mesh" if axes is first else "after 16 iterations") + ": " + title)
@@ -162,7 +162,7 @@ def move_figure() -> Figure:
             energies[at] = _ring_energy(image, _ring(corners, node), before)
     least = np.unravel_index(np.nanargmin(energies), energies.shape)
     after = _ring(corners, np.array([x[least], y[least]]))
-    figure = Figure(figsize=(12.5, 4.3), layout="constrained")
+    figure = Figure(figsize=(9.4, 3.5), layout="constrained")
     left, middle, right = figure.subplots(1, 3)
     means_panel(left, image, before, "before: E = 1")
     lines = middle.contour(x, y, energies, np.arange(0.9, 1.6, 0.06), cmap="viridis")
@@ -191,7 +191,7 @@ def flip_figure() -> Figure:
          [[0, 1, 5], [0, 5, 4], [1, 2, 5], [5, 2, 4], [2, 3, 4], [3, 0, 4]], middle,
          [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]]),
     ]  # fmt: skip
-    figure = Figure(figsize=(10.5, 7.2), layout="constrained")
+    figure = Figure(figsize=(9.4, 6.6), layout="constrained")
     for (title, *old_and_new), panels in zip(cases, figure.subplots(2, 3).T, strict=True):
         first = tetopt.E_D(image, tetopt.Mesh(*old_and_new[:2]))
         for axes, points, cells in zip(panels, old_and_new[::2], old_and_new[1::2], strict=True):
@@ -214,7 +214,7 @@ def shapes_figure() -> Figure:
         "spade": [*triangle, [0.26, 0.44, 0.2]],
         "sliver": [[1.0, 0.0, 0.06], [0.0, 1.0, -0.06], [-1.0, 0.0, 0.06], [0.0, -1.0, -0.06]],
     }
-    figure = Figure(figsize=(12.0, 5.2), layout="constrained")
+    figure = Figure(figsize=(9.0, 4.6), layout="constrained")
     for number, (name, corners) in enumerate(cells.items()):
         points = np.array(corners)
         mesh = tetopt.Mesh(points, oriented(points, np.array([[0, 1, 2, 3]])))
@@ -240,7 +240,7 @@ def exactness_figure() -> Figure:
     corners = points[mesh.cells]
     sides = np.stack([_signed_area(corners[:, k], corners[:, (k + 1) % 3], places) for k in range(3)])
     on_edge = (np.isclose(sides, 0.0) & (sides > -1e-9).all(axis=0)).any(axis=(0, 1))
-    figure = Figure(figsize=(10.5, 4.2), layout="constrained")
+    figure = Figure(figsize=(8.6, 3.9), layout="constrained")
     left, right = figure.subplots(1, 2, width_ratios=(1.1, 1.0))
     for axes, is_shown in ((left, np.ones(len(places), dtype=bool)), (right, np.abs(places - 4).max(axis=1) < 3)):
         axes.triplot(*points.T, mesh.cells, color="black", linewidth=0.8)
@@ -260,7 +260,7 @@ def exactness_figure() -> Figure:
 def k_d_figure() -> Figure:
     """The same image, the same number of nodes, and four weights of the image."""
     image = tetopt.load_phantom("fig2_2d").image()
-    figure = Figure(figsize=(12.5, 3.7), layout="constrained")
+    figure = Figure(figsize=(10.4, 3.3), layout="constrained")
     for axes, k_D in zip(figure.subplots(1, 4), (0.0, 0.2, 0.5, 0.9), strict=True):
         mesh = tetopt.mesh_image(image, nodes=113, mode="uniform", k_D=k_D, iterations=20).mesh
         shape = tetopt.quality(mesh.points, mesh.cells)
