@@ -117,6 +117,34 @@ def test_an_image_with_loads_of_the_user_s(path, tmp_path, capsys):
     assert f"{written['cond']:.6g}" in out
 
 
+@pytest.mark.parametrize("n", [2, 3])
+def test_labels_of_an_image_for_a_mesh_that_has_none(n, tmp_path, capsys):
+    """Each cell has the modulus of the label that most of its voxels have; by number and by name, and in convert."""
+    image, mesh = sample_image(n), sample_model(n).mesh
+    labels = tetopt.Image(np.where(image.data > 25.0, 4, 7), image.affine)
+    tetopt.save_mesh(tmp_path / "bare.vtu", mesh)
+    tetopt.save_image(tmp_path / "image.nii", image)
+    tetopt.save_image(tmp_path / "labels.nii", labels)
+    (tmp_path / "names.csv").write_text("label,name\n4,stiff part\n7,rest\n")
+    bare, out = str(tmp_path / "bare.vtu"), str(tmp_path / "out.vtu")
+    of_cell = tetopt.cell_labels(tetopt.load_image(tmp_path / "labels.nii"), mesh)
+    assert set(of_cell.tolist()) == {4, 7}
+    named = ["--labels", str(tmp_path / "labels.nii"), "--label-names", str(tmp_path / "names.csv")]
+    for words in (
+        ["fem", bare, "--young", "4=2.1,*=0.1", *named[:2]],
+        ["fem", bare, "--young", "stiff part=2.1,*=0.1", *named],
+        ["fem", str(tmp_path / "image.nii"), bare, "--young", "stiff part=2.1,rest=0.1", *named],
+        ["convert", bare, out, "--young", "stiff part=2.1,*=0.1", *named],
+    ):
+        load = ["--load", "hold:boundary", "--force"]
+        assert main([*words, *load, *(["-o", out] if words[0] == "fem" else [])]) == 0
+        loaded = tetopt.load_mesh(out)
+        np.testing.assert_array_equal(loaded.cell_data["label"], of_cell)
+        np.testing.assert_allclose(loaded.cell_data["young"], np.where(of_cell == 4, 2.1, 0.1), rtol=1e-12)
+        assert ("label_7" if words[-1] != named[-1] else "rest") in loaded.sets.cells
+        assert "average over a cell" not in capsys.readouterr().out  # each cell has one label
+
+
 def test_triangles(tmp_path, capsys):
     save_model(tmp_path / "plane.vtu", sample_model(2))
     for order in (1, 2):
@@ -150,6 +178,9 @@ def test_advice_where_linear_cells_lock(options, is_advised, path, capsys):
         (["{model}", "--compress", "nan"], "--compress: expected a percentage above 0 and up to 50, got nan"),
         (["{model}", "--crop", "0:2,0:2,0:2"], "--crop: there is no IMAGE, only a mesh"),
         (["{model}", "--slice", "k=1"], "--slice: there is no IMAGE, only a mesh"),
+        (["{mesh}", "--young", "1=2,*=1", "--load", "compress:5%"], "the mesh has no labels; give the label image"),
+        (["{model}", "--labels", "half.nii"], "half.nii: labels must be whole numbers from 0"),
+        (["{model}", "--labels", "plane.nii"], "plane.nii: expected 3-D labels, as the mesh is, got a 2-D image"),
         (["{model}", "--order", "3"], "--order: expected 1 or 2, got 3"),
         (["{model}", "--average", "gauss"], "--average: it is over an image's voxels; give the IMAGE before the MESH"),
         (["{model}", "--average", "mean"], "--average: it is over an image's voxels; give the IMAGE before the MESH"),
@@ -169,6 +200,8 @@ def test_advice_where_linear_cells_lock(options, is_advised, path, capsys):
 def test_bad_input_is_one_line_and_nothing_is_written(words, message, path, tmp_path, capsys, monkeypatch):
     monkeypatch.chdir(tmp_path)
     tetopt.save_mesh(tmp_path / "mesh.vtu", sample_model().mesh)
+    tetopt.save_image(tmp_path / "half.nii", tetopt.Image(np.arange(24.0).reshape(2, 3, 4) / 2))
+    tetopt.save_image(tmp_path / "plane.nii", tetopt.Image(np.arange(6.0).reshape(2, 3)))
     before = (tmp_path / "model.vtu").read_bytes()
     words = [word.format(mesh="mesh.vtu", model="model.vtu") for word in words]
     output = [] if "-o" in words else ["-o", "out.vtu"]
@@ -176,7 +209,7 @@ def test_bad_input_is_one_line_and_nothing_is_written(words, message, path, tmp_
     err = capsys.readouterr().err.strip().splitlines()
     assert message in err[-1]
     assert sum(line.startswith("tetopt:") for line in err) == 1
-    assert sorted(each.name for each in tmp_path.iterdir()) == ["mesh.vtu", "model.vtu"]
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["half.nii", "mesh.vtu", "model.vtu", "plane.nii"]
     assert (tmp_path / "model.vtu").read_bytes() == before
 
 

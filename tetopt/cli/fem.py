@@ -14,8 +14,8 @@ from rich.markup import escape
 
 from tetopt import Image, InputError
 from tetopt.cli.console import log, print_wide
-from tetopt.cli.inputs import read_image, read_mesh, warn_of_other_image
-from tetopt.cli.options import ImagePart, ModelOptions, NumberOptions, option
+from tetopt.cli.inputs import read_image, read_mesh, warn_of_other_image, with_labels
+from tetopt.cli.options import CellLabelsOption, ImagePart, ModelOptions, NumberOptions, option
 from tetopt.cli.solver import (
     check_model_options,
     completed,
@@ -32,6 +32,7 @@ from tetopt.io.meshes import MeshFile
 from tetopt.io.vtk import VTK_SUFFIXES, box_text
 from tetopt.model.averages import DEFAULT_AVERAGE
 from tetopt.model.fields import cell_fields, is_result
+from tetopt.model.laws import ByLabel, parse_any_law
 from tetopt.model.loads import MOST_COMPRESSION_PERCENT, count_of_steps
 from tetopt.model.model import Model
 from tetopt.model.sets import box_of
@@ -70,6 +71,7 @@ def fem_command(
     output: Annotated[
         Path | None, option("SOLVED.vtu", "Write displacements, strains and stresses on the mesh.", "-o", "--output")
     ] = None,
+    labels: CellLabelsOption = None,
     *,
     model: ModelOptions,
     part: ImagePart,
@@ -93,7 +95,7 @@ def fem_command(
         raise InputError("--sets: no file is written; give -o SOLVED.vtu, too")
     _check_options(image_path, compress, model, part)
     image = None if image_path is None else read_image(image_path, part)
-    loaded = read_mesh(mesh_path)
+    loaded = with_labels(read_mesh(mesh_path), labels)
     if image_path is not None and image is not None:
         warn_of_other_image(loaded, mesh_path, image_path)
     of_box = image is not None and not model.loads
@@ -108,7 +110,7 @@ def fem_command(
     if json_path is not None:
         options = {**asdict(model), "compress_percent": compress, **part.stated()}
         options["label_names"] = None if model.label_names is None else model.label_names.name
-        files = {"mesh": mesh_path.name}
+        files = {"mesh": mesh_path.name} | ({} if labels is None else {"labels": labels.name})
         if image_path is not None:
             files |= {"image": image_path.name, "image_sha256": sha256(image_path)}
         about = {**files, "versions": versions(), "options": options}
@@ -230,7 +232,7 @@ def _of_what(model: Model, options: ModelOptions) -> Iterator[tuple[str, str]]:
         yield "modulus within a cell", "linear between its nodes"
     elif model.gauss_young is not None:
         yield "modulus within a cell", "one around each Gauss point"
-    elif options.average is not None:
+    elif options.average is not None and not isinstance(parse_any_law(str(options.young)), ByLabel):
         yield "average over a cell", options.average
     low, high = model.materials.nu.min(), model.materials.nu.max()
     yield "Poisson's ratio", f"{low:.4g}" if low == high else f"{low:.4g} to {high:.4g}"

@@ -20,6 +20,7 @@ from tetopt.io.files import checked_output
 from tetopt.io.images import parse_crop, parse_slice, part_of, sha256
 from tetopt.io.label_tables import LabelTable, load_label_table, table_in
 from tetopt.io.meshes import MeshFile
+from tetopt.measure.fidelity import cell_labels
 from tetopt.model.build import labels_of
 from tetopt.model.labels import TABLE_TEXT
 from tetopt.target.align import aligned_contrast, is_same_grid
@@ -133,6 +134,20 @@ def read_mesh(path: Path) -> MeshFile:
     for note in loaded.notes:
         log.print(escape(f"{path}: {note}"))
     return loaded
+
+
+def with_labels(loaded: MeshFile, path: Path | None) -> MeshFile:
+    """The mesh with the labels of an image on its cells, those of most of their voxels, instead of its file's own."""
+    if path is None:
+        return loaded
+    labels = read_companion(path)
+    check_labels(str(path), labels)
+    if labels.ndim != loaded.mesh.ndim:
+        raise InputError(f"{path}: expected {loaded.mesh.ndim}-D labels, as the mesh is, got a {labels.ndim}-D image")
+    try:
+        return loaded._replace(cell_data={**loaded.cell_data, "label": cell_labels(labels, loaded.mesh)})
+    except InputError as error:
+        raise InputError(f"{path}: {error}") from error
 
 
 def label_table(path: Path | None, loaded: MeshFile | None = None) -> LabelTable:

@@ -73,6 +73,10 @@ LabelNamesOption = Annotated[
         "--label-names",
     ),
 ]
+CellLabelsOption = Annotated[
+    Path | None,
+    option("LABELS", "Label image, of a mesh made without: a cell gets the label of most of its voxels.", "--labels"),
+]
 SpaceOption = Annotated[str, option("ras|lps", "Convention of the file's coordinates.")]
 
 

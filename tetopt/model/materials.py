@@ -164,7 +164,7 @@ def by_label(
         No labels, one that has no value or two, or a name that no label has.
     """
     if labels is None:
-        raise InputError("values by label: the mesh has no labels; mesh it with --labels")
+        raise InputError("values by label: the mesh has no labels; give the label image (--labels)")
     names = names or {}
     values: dict[int, float] = {}
     for key, value in law.values.items():
