@@ -14,7 +14,7 @@ from rich.markup import escape
 from tetopt import Image, InputError
 from tetopt.cli.console import log, out
 from tetopt.cli.inputs import image_and_others, read_mesh, warn_of_other_image, with_labels
-from tetopt.cli.options import CellLabelsOption, ImagePart, MeshArgument, NumberOptions, SolverOptions, option
+from tetopt.cli.options import ImagePart, LabelledPart, MeshArgument, NumberOptions, SolverOptions, option
 from tetopt.cli.solver import (
     MATERIAL_FIELDS,
     REACTIONS_TEXT,
@@ -57,9 +57,8 @@ def convert_command(
         Path | None,
         option("JOB.frd", "Bring CalculiX's results of this mesh back onto it (VTK's formats).", "--results"),
     ] = None,
-    labels: CellLabelsOption = None,
     *,
-    part: ImagePart,
+    part: LabelledPart,
     solver: SolverOptions,
     numbers: NumberOptions,
 ) -> int:
@@ -72,7 +71,7 @@ def convert_command(
     needs_image = {"--mask": mask_path, "--volume": part.volume, "--crop": part.crop, "--slice": part.slice_}
     if image_path is None and (lost := [name for name, value in needs_image.items() if value is not None]):
         raise InputError(f"{lost[0]}: there is no --image")
-    loaded = with_labels(read_mesh(mesh_path), labels)
+    loaded = with_labels(read_mesh(mesh_path), part.labels)
     loaded = without_stale_results(loaded, solver) if results_path is None else _with_results(loaded, results_path)
     solver = replace(solver, order=_order_of(loaded, solver, output))
     check_solver_options(output, solver, has_materials="young" in loaded.cell_data)
@@ -102,7 +101,7 @@ def convert_command(
     if json_path is not None:
         files = {"mesh": mesh_path.name, "output": output.name, "units": solver.units, "space": solver.space}
         files |= {} if results_path is None else {"results": results_path.name}
-        files |= {} if labels is None else {"labels": labels.name}
+        files |= {} if part.labels is None else {"labels": part.labels.name}
         save_json(json_path, files | {"versions": versions()} | model_summary(model))
     print_model(output, model, solver)
     return 0

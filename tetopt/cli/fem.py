@@ -15,7 +15,7 @@ from rich.markup import escape
 from tetopt import Image, InputError
 from tetopt.cli.console import log, print_wide
 from tetopt.cli.inputs import read_image, read_mesh, warn_of_other_image, with_labels
-from tetopt.cli.options import CellLabelsOption, ImagePart, ModelOptions, NumberOptions, option
+from tetopt.cli.options import ImagePart, LabelledPart, ModelOptions, NumberOptions, option
 from tetopt.cli.solver import (
     check_model_options,
     completed,
@@ -71,10 +71,9 @@ def fem_command(
     output: Annotated[
         Path | None, option("SOLVED.vtu", "Write displacements, strains and stresses on the mesh.", "-o", "--output")
     ] = None,
-    labels: CellLabelsOption = None,
     *,
     model: ModelOptions,
-    part: ImagePart,
+    part: LabelledPart,
     numbers: NumberOptions,
 ) -> int:
     """Solve a mesh with its loads: displacements, stresses, strain energy, reactions.
@@ -95,7 +94,7 @@ def fem_command(
         raise InputError("--sets: no file is written; give -o SOLVED.vtu, too")
     _check_options(image_path, compress, model, part)
     image = None if image_path is None else read_image(image_path, part)
-    loaded = with_labels(read_mesh(mesh_path), labels)
+    loaded = with_labels(read_mesh(mesh_path), part.labels)
     if image_path is not None and image is not None:
         warn_of_other_image(loaded, mesh_path, image_path)
     of_box = image is not None and not model.loads
@@ -110,7 +109,7 @@ def fem_command(
     if json_path is not None:
         options = {**asdict(model), "compress_percent": compress, **part.stated()}
         options["label_names"] = None if model.label_names is None else model.label_names.name
-        files = {"mesh": mesh_path.name} | ({} if labels is None else {"labels": labels.name})
+        files = {"mesh": mesh_path.name} | ({} if part.labels is None else {"labels": part.labels.name})
         if image_path is not None:
             files |= {"image": image_path.name, "image_sha256": sha256(image_path)}
         about = {**files, "versions": versions(), "options": options}

@@ -73,10 +73,6 @@ LabelNamesOption = Annotated[
         "--label-names",
     ),
 ]
-CellLabelsOption = Annotated[
-    Path | None,
-    option("LABELS", "Label image, of a mesh made without: a cell gets the label of most of its voxels.", "--labels"),
-]
 SpaceOption = Annotated[str, option("ras|lps", "Convention of the file's coordinates.")]
 
 
@@ -97,6 +93,15 @@ class ImagePart(BoxPart):
     def stated(self) -> dict[str, int | str | None]:
         """The part as files of numbers state it."""
         return {"volume": self.volume, "crop": self.crop, "slice": self.slice_}
+
+
+@dataclass(frozen=True, kw_only=True)
+class LabelledPart(ImagePart):
+    """Which part of an image file is read, and what gives labels to a mesh that was made without."""
+
+    labels: Annotated[
+        Path | None, option("LABELS", "Label image: a cell gets the label of most of its voxels, for laws and sets.")
+    ] = None
 
 
 WHOLE_BOX, WHOLE_IMAGE = BoxPart(), ImagePart()
