@@ -655,6 +655,24 @@ def test_a_page_to_look_at(folder, tmp_path, capsys):
     assert exit_code("view", folder / "a.vtu", "--html", tmp_path / "a.png") == 2
 
 
+def test_a_page_opens_on_the_field_and_the_range_asked_for(folder, tmp_path, capsys):
+    words = ["view", folder / "a.vtu", "--html", tmp_path / "a.html"]
+    assert exit_code(*words, "--field", "rho", "--range", "0.1,0.3") == 0
+    data = json.loads(re.search(r'id="data">(.*?)</script>', (tmp_path / "a.html").read_text(), re.DOTALL).group(1))
+    assert (data["fields"][0]["name"], data["fields"][0]["limits"]) == ("rho", [0.1, 0.3])
+    capsys.readouterr()
+    for options, message in (
+        (["--field", "young"], '--field: the mesh has no "young"; it has mean'),
+        (["--range", "3"], "--range: expected LOW,HIGH, such as 0,120"),
+        (["--range", "low,3"], '--range: expected a number, got "low"'),
+        (["--range", "3,2"], "--range: expected LOW,HIGH with LOW below HIGH"),
+        (["--screenshot", tmp_path / "a.jpg"], "ends in .png"),
+    ):
+        assert exit_code(*words[:3], tmp_path / "b.html", *options) == 2
+        assert message in capsys.readouterr().err
+    assert [each.name for each in tmp_path.iterdir()] == ["a.html"]
+
+
 def test_what_is_refused_leaves_no_page(folder, tmp_path, capsys):
     tetopt.save_image(tmp_path / "flat.nii.gz", tetopt.Image(np.zeros((4, 5))))
     options = ["--image", tmp_path / "flat.nii.gz", "--html", tmp_path / "a.html"]

@@ -1,5 +1,7 @@
 """The command with masks, backgrounds, labels and several contrasts."""
 
+import re
+
 import nibabel
 import numpy as np
 import pytest
@@ -126,6 +128,9 @@ def test_labels_alone(inputs, tmp_path, capsys):
     captured = capsys.readouterr()
     assert "only these count" in captured.err
     assert "E_D, share of the labels' variance" in captured.out
+    assert exit_code("view", tmp_path / "a.vtu", "--html", tmp_path / "a.html") == 0
+    first = re.search(r'"fields": \[\{"name": "(\w+)"', (tmp_path / "a.html").read_text())[1]
+    assert first == "label"  # not the means of their numbers
 
 
 def test_a_label_never_vanishes_silently(tmp_path, capsys):

@@ -16,7 +16,7 @@ from tetopt.geometry.simplex import centroids, volumes
 from tetopt.geometry.topology import boundary_facets, facets
 from tetopt.model.labels import LabelTable
 from tetopt.report import explore
-from tetopt.report.exhibit import exhibit, first_axis, warp_factors
+from tetopt.report.exhibit import exhibit, first_axis, opened_on, warp_factors
 from tetopt.report.explore import colour_table, explorer_html, save_explorer
 
 
@@ -46,6 +46,24 @@ def test_fields_are_labels_or_quantities(mesh, cell_data):
     n = len(mesh.cells)
     for name, values in (("n_voxels", np.full(n, 8)), ("depth", np.full(n, -1)), ("many", np.arange(n))):
         assert exhibit(mesh, {name: values}).fields[0].categories == []
+
+
+def test_a_field_is_the_first_within_limits(mesh, cell_data):
+    shown = exhibit(mesh, cell_data)
+    assert opened_on(shown) == shown
+    labels, _ = opened_on(shown, "label").fields
+    assert labels == shown.fields[1]
+    mean, label = opened_on(shown, "mean", (-5.0, 120.0)).fields
+    assert (mean.limits, label.limits) == ((-5.0, 120.0), shown.fields[1].limits)
+    np.testing.assert_array_equal(mean.values, shown.fields[0].values)
+    for words, match in (
+        (("rho",), 'field: the mesh has no "rho"; it has mean, label'),
+        (("mean", (3.0, 3.0)), "range: expected LOW,HIGH with LOW below HIGH, got 3,3"),
+        (("mean", (np.nan, 3.0)), "range: expected LOW,HIGH"),
+        (("label", (0.0, 3.0)), 'range: "label" are labels, which have a colour each'),
+    ):
+        with pytest.raises(InputError, match=match):
+            opened_on(shown, *words)
 
 
 def test_a_field_without_range_or_values_has_limits(mesh):

@@ -4,6 +4,7 @@ import os
 import sys
 
 import numpy as np
+import PIL.Image
 import pytest
 
 from tetopt.errors import InputError
@@ -12,8 +13,8 @@ from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import boundary_facets, facets
 from tetopt.io.text import plain
 from tetopt.model.labels import LabelTable
-from tetopt.report.exhibit import exhibit
-from tetopt.report.window import has_display, plane_slice, plotter, show
+from tetopt.report.exhibit import exhibit, opened_on
+from tetopt.report.window import has_display, plane_slice, plotter, save_screenshot, show
 
 
 @pytest.fixture(scope="module")
@@ -265,3 +266,19 @@ def test_hostile_names_are_drawn_letter_by_letter(opengl, mesh, capfd):
         window.screenshot(return_img=True)
         window.close()
     assert "MathText" not in capfd.readouterr().err
+
+
+def test_a_picture_of_it_is_in_the_colours_asked_for(opengl, mesh, tmp_path):
+    """All cells in the colour of 50, at the ends of two ranges; no slider and no text about keys is in it."""
+    shown = exhibit(mesh, {"mean": np.full(len(mesh.cells), 50.0)})
+    bright = []
+    for name, limits in (("a", (50.0, 80.0)), ("b", (20.0, 50.0))):
+        save_screenshot(tmp_path / f"{name}.png", opened_on(shown, "mean", limits))
+        with PIL.Image.open(tmp_path / f"{name}.png") as picture:
+            pixels = np.asarray(picture.convert("RGB")).astype(int)
+        height, width = pixels.shape[:2]
+        assert (pixels[int(0.88 * height) :, : width // 5] == 255).all()
+        middle = pixels[height // 3 : 2 * height // 3, width // 3 : 2 * width // 3]
+        bright.append(np.median(middle[..., 1]))
+    assert bright[0] < 80 < 150 < bright[1]  # viridis runs from dark violet to yellow
+    assert sorted(each.name for each in tmp_path.iterdir()) == ["a.png", "b.png"]

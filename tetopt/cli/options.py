@@ -142,6 +142,22 @@ class SurfacePart:
 
 
 @dataclass(frozen=True, kw_only=True)
+class ShownOptions:
+    """How `tetopt view` shows a mesh, and where."""
+
+    html: Annotated[Path | None, option("OUT.html", "Write one page for a browser, open no window.", "--html")] = None
+    screenshot: Annotated[Path | None, option("OUT.png", "Write a picture of it, open no window.")] = None
+    field: Annotated[
+        str | None, option("NAME", "Colour by this at first: mean, label, von_mises, ... (default: the first).")
+    ] = None
+    limits: Annotated[
+        str | None,
+        option("LOW,HIGH", "What its colours go from and to (default: all but 1 % at either end).", "--range"),
+    ] = None
+    label_names: LabelNamesOption = None
+
+
+@dataclass(frozen=True, kw_only=True)
 class ContentOptions:
     """What of an image is meshed, and what lies beside it."""
 

@@ -12,8 +12,8 @@ from rich.markup import escape
 
 from tetopt import InputError
 from tetopt.cli.console import out
-from tetopt.cli.inputs import label_table, read_image, read_mesh, warn_of_other_image
-from tetopt.cli.options import BoxPart, ForceOption, LabelNamesOption, option
+from tetopt.cli.inputs import label_table, number_of, read_image, read_mesh, warn_of_other_image
+from tetopt.cli.options import BoxPart, ForceOption, ShownOptions, option
 from tetopt.cli.solver import all_sets
 from tetopt.incoming import json_of
 from tetopt.io.files import checked_output
@@ -25,9 +25,8 @@ from tetopt.model.sets import facet_triples
 def view_command(
     mesh_path: Annotated[Path, typer.Argument(metavar="MESH", help="VTU, VTK or gmsh MSH file of tetrahedra.")],
     image_path: Annotated[Path | None, option("IMAGE", "Show its slice behind the mesh's section.", "--image")] = None,
-    html: Annotated[Path | None, option("OUT.html", "Write one page for a browser, open no window.", "--html")] = None,
-    label_names: LabelNamesOption = None,
     *,
+    how: ShownOptions,
     part: BoxPart,
     force: ForceOption = False,
 ) -> int:
@@ -35,8 +34,9 @@ def view_command(
 
     A mesh with displacements is drawn deformed, by a factor that a slider changes; of quadratic cells the corners are.
     """
-    if html is not None:
-        html = checked_output(html, (".html",), force)
+    html = None if how.html is None else checked_output(how.html, (".html",), force)
+    screenshot = None if how.screenshot is None else checked_output(how.screenshot, (".png",), force)
+    limits = None if how.limits is None else _limits(how.limits)
     loaded = read_mesh(mesh_path)
     mesh, fields = loaded.mesh, dict(loaded.cell_data)
     image = None
@@ -47,22 +47,53 @@ def view_command(
         warn_of_other_image(loaded, mesh_path, image_path)
         if "mean" not in fields:
             fields = cell_fields(mesh, image) | fields
-    table, former = label_table(label_names, loaded), label_table(None, loaded).names
+    table, former = label_table(how.label_names, loaded), label_table(None, loaded).names
     sets = all_sets(mesh, loaded.box, fields, loaded.sets, table.names, former, is_told=False).facets
     triples = {name: facet_triples(mesh.cells, rows) for name, rows in sets.items()}
-    from tetopt.report.exhibit import exhibit  # matplotlib and pyvista are slow to load, and only needed here
+    from tetopt.report.exhibit import (  # matplotlib and pyvista are slow to load, and only needed here
+        exhibit,
+        opened_on,
+    )
 
     shown = exhibit(mesh, fields, image, mesh_path.name, triples, loaded.point_data, _reactions(loaded), table)
-    if html is None:
+    shown = opened_on(shown, how.field or _only_labels(loaded), limits)
+    if html is None and screenshot is None:
         from tetopt.report.window import show
 
         show(shown)
-        return 0
-    from tetopt.report.explore import save_explorer
+    if screenshot is not None:
+        from tetopt.report.window import save_screenshot
 
-    save_explorer(html, shown)
-    out.print(escape(f"{html}: open it in a browser; {html.stat().st_size / 1e6:.1f} MB, needs nothing else"))
+        save_screenshot(screenshot, shown)
+        out.print(escape(str(screenshot)))
+    if html is not None:
+        from tetopt.report.explore import save_explorer
+
+        save_explorer(html, shown)
+        out.print(escape(f"{html}: open it in a browser; {html.stat().st_size / 1e6:.1f} MB, needs nothing else"))
     return 0
+
+
+def _limits(text: str) -> tuple[float, float]:
+    """The two numbers of --range."""
+    parts = text.split(",")
+    if len(parts) != 2:
+        raise InputError(f'--range: expected LOW,HIGH, such as 0,120, got "{text}"')
+    return number_of("--range", parts[0]), number_of("--range", parts[1])
+
+
+def _only_labels(loaded: MeshFile) -> str | None:
+    """The field of labels, if the file says that the mesh was made of these alone: means of their numbers tell little.
+
+    A mesh with results on its nodes opens on these.
+    """
+    try:
+        inputs = json_of(loaded.text("inputs") or "{}")
+        weights = [float(each) for each in inputs.get("weights") or [1.0]]
+    except (TypeError, ValueError, AttributeError):  # another program's
+        return None
+    is_told = "label" in loaded.cell_data and not any(weights) and not loaded.point_data
+    return "label" if is_told else None
 
 
 def _reactions(loaded: MeshFile) -> dict[int, dict[str, list[float]]]:

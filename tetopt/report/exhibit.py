@@ -133,6 +133,28 @@ def exhibit(
     return Exhibit(mesh, shown, skipped, image, title, checked, displacements, n_nodes, forces)
 
 
+def opened_on(shown: Exhibit, name: str | None = None, limits: tuple[float, float] | None = None) -> Exhibit:
+    """The exhibit with a field of this name as the first, in whose colours it opens, and these limits of its colours.
+
+    Raises
+    ------
+    InputError
+        No field of that name; limits that are not apart, or of labels, which have a colour each.
+    """
+    names = [field.name for field in shown.fields]
+    if name is not None and name not in names:
+        raise InputError(f'field: the mesh has no "{name}"; it has {", ".join(dict.fromkeys(names))}')
+    fields = sorted(shown.fields, key=lambda field: field.name != (names[0] if name is None else name))
+    if limits is not None:
+        if not -np.inf < limits[0] < limits[1] < np.inf:
+            raise InputError(f"range: expected LOW,HIGH with LOW below HIGH, got {limits[0]:g},{limits[1]:g}")
+        if fields[0].categories:
+            raise InputError(f'range: "{fields[0].name}" are labels, which have a colour each; give a --field')
+        first = fields[0].name
+        fields = [field._replace(limits=limits) if field.name == first else field for field in fields]
+    return shown._replace(fields=fields)
+
+
 def warp_factors(shown: Exhibit) -> tuple[float, float]:
     """By what displacements are multiplied at first, so that they are seen (1 or more), and at most."""
     largest = max((float(np.sqrt((u**2).sum(axis=1)).max()) for u in shown.displacements.values()), default=0.0)

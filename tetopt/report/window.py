@@ -7,6 +7,7 @@ import ctypes.util
 import os
 import sys
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -20,10 +21,11 @@ from tetopt.geometry.cut import plane_cut
 from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import facets
 from tetopt.image import Image
+from tetopt.io.files import check_suffix, written_whole
 from tetopt.io.text import plain
 from tetopt.report.colours import LISTED_LABELS, grey_limits, plain_text
 from tetopt.report.exhibit import COLOUR_MAP, LABEL_FIELD, NO_VALUE, Exhibit, Field, first_axis, warp_factors
-from tetopt.report.figures import MESH_LINE
+from tetopt.report.figures import FIGURE_SUFFIXES, MESH_LINE
 
 KEYS_TEXT = "x y z: plane   k: side kept   m: mesh, image, both   n: next field   h: next set of facets   q: close"
 LABEL_KEY_TEXT = "   l: next label alone"  # likewise
@@ -46,8 +48,23 @@ def show(shown: Exhibit) -> None:
         No display to open it on.
     """
     if not has_display():
-        raise InputError("view: no display to open a window on; use --html to write the same view as a page")
+        raise InputError(
+            "view: no display to open a window on; use --html to write the same view as a page, or "
+            "--screenshot for a picture"
+        )
     plotter(shown).show()
+
+
+def save_screenshot(path: str | Path, shown: Exhibit) -> None:
+    """Write what the window shows at first as PNG, without its sliders, whole or not at all; no display is needed."""
+    with written_whole(check_suffix(path, FIGURE_SUFFIXES)) as temporary:
+        window = plotter(shown, off_screen=True)
+        with pyvista.vtk_verbosity("off"):
+            window.clear_slider_widgets()
+            window.remove_actor("keys", render=False)
+            window.camera.SetWindowCenter(0.0, 0.0)
+            window.screenshot(temporary)
+            window.close()
 
 
 def has_display() -> bool:
