@@ -62,9 +62,9 @@ def E_D(image: Image, mesh: Mesh) -> float:
     >>> whole = float(image.data.var()) * image.volume  # what one cell for all would have
     >>> print(f"{tetopt.E_D(image, mesh) / whole:.2f}")
     0.07
-    >>> graded = tetopt.mesh_image(image, 300).mesh
-    >>> print(f"{tetopt.E_D(image, graded) / whole:.4f}")
-    0.0001
+    >>> graded = tetopt.mesh_image(image, 300, iterations=4).mesh
+    >>> print(f"{tetopt.E_D(image, graded) / whole:.3f}")
+    0.002
     """
     return float(cell_E_D(image, mesh).sum())
 

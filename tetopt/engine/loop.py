@@ -57,7 +57,7 @@ class Record(NamedTuple):
     n_voxels : int
         Voxel centres inside the cells; the same in every row.
     seconds : float
-        Since the start.
+        Since the run began.
 
     Examples
     --------
@@ -100,7 +100,7 @@ class Optimized(NamedTuple):
     history : list of Record
         A row an iteration, the initial mesh's first.
     ended : {"iterations", "converged", "max_seconds", "stopped"}
-        Why.
+        Why the run ended.
     initial : Mesh, optional
         The mesh that the run began with.
     nodes : int, optional
@@ -117,7 +117,7 @@ class Optimized(NamedTuple):
     Examples
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-    >>> result = tetopt.mesh_image(image, 300)
+    >>> result = tetopt.mesh_image(image, 300, iterations=8)
     >>> len(result.mesh.points), result.ended, len(result.missed)
     (300, 'iterations', 0)
     >>> result.history[-1].E < result.history[0].E

@@ -50,9 +50,9 @@ class Solution(NamedTuple):
     young : (M, Q) float64
         kPa, at the Gauss points.
     strain : (M, Q, n, n) float64
-        There.
+        At the Gauss points.
     stress : (M, Q, n, n) float64
-        There, kPa, in 2-D in the plane.
+        At the Gauss points, kPa, in 2-D in the plane.
     strain_energy : float
         In the cells, uJ.
     spring_energy : float

@@ -49,17 +49,17 @@ class LabelFidelity(NamedTuple):
     Parameters
     ----------
     label : int
-        Which one.
+        The label's number.
     voxels : int
-        That have it.
+        How many voxels have it.
     volume : float
         Of these voxels, mm^n.
     mesh_volume : float
         Of the cells that carry it, mm^n.
     n_cells : int
-        That carry it.
+        How many cells carry it.
     n_empty_cells : int
-        Those of them that hold no voxel centre.
+        How many of them hold no voxel centre.
     dice : float
         Of the voxels in these cells with the voxels that have it, 0 to 1.
     volume_dice : float
@@ -111,7 +111,7 @@ class MaskFidelity(NamedTuple):
     Parameters
     ----------
     voxels : int
-        With 1/2 or more.
+        How many voxels are of 1/2 or more.
     volume : float
         Of these voxels, mm^n.
     mesh_volume : float

@@ -38,7 +38,7 @@ class LabelInterface(NamedTuple):
     Parameters
     ----------
     label : int
-        Which one.
+        The label's number.
     area : float
         Of its surface in the mesh, mm^(n-1).
     smooth_area : float
@@ -48,13 +48,13 @@ class LabelInterface(NamedTuple):
     folded : float
         Share of the surface's edges at which it turns by more than 60 degrees; nan without cells.
     n_facets : int
-        Of its surface.
+        How many facets its surface has.
     nonmanifold_edges : int
-        In more than two of its facets.
+        How many edges are in more than two of its facets.
     nonmanifold_edges_two_labels : int
         Those around which it meets one other label alone, or the outside alone.
     nonmanifold_nodes : int
-        Around which its facets form more than one fan, over edges; 0 in 2-D.
+        How many nodes there are around which its facets form more than one fan, over edges; 0 in 2-D.
     nonmanifold_nodes_two_labels : int
         Those around which it meets one other label alone, or the outside alone.
     euler : int
@@ -118,7 +118,8 @@ def label_interfaces(labels: Image, mesh: Mesh, of_cell: ArrayLike) -> list[Labe
     --------
     >>> phantom = tetopt.load_phantom("sphere")
     >>> labels = phantom.label_image(voxel_mm=4)
-    >>> result = tetopt.mesh_image(tetopt.content(phantom.image(voxel_mm=4), labels), 300)
+    >>> what = tetopt.content(phantom.image(voxel_mm=4), labels)
+    >>> result = tetopt.mesh_image(what, 300, iterations=4)
     >>> ball = tetopt.label_interfaces(labels, result.mesh, result.labels)[1]
     >>> ball.nonmanifold_edges, ball.nonmanifold_nodes, ball.mesh_euler  # without handles
     (0, 0, 2)

@@ -203,7 +203,7 @@ def quality(points: Points, cells: Cells) -> Quality:
     Examples
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-    >>> mesh = tetopt.mesh_image(image, 300).mesh
+    >>> mesh = tetopt.mesh_image(image, 300, iterations=4).mesh
     >>> numbers = tetopt.quality(mesh.points, mesh.cells)
     >>> numbers.n_nodes, numbers.min_dihedral > 12
     (300, True)

@@ -27,9 +27,9 @@ class BinningError(NamedTuple):
     Parameters
     ----------
     mean : float
-        By volume.
+        The mean by volume.
     largest : float
-        Of all cells.
+        The largest of all cells.
 
     Examples
     --------
