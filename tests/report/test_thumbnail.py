@@ -1,6 +1,7 @@
 """The small picture of a subject: which side is which, proportions, what is drawn, and that it is small."""
 
 import io
+from itertools import pairwise
 
 import numpy as np
 import PIL.Image
@@ -12,6 +13,7 @@ from tetopt.mesh import Mesh
 from tetopt.report.thumbnail import SIDE_PIXELS, save_thumbnail, thumbnail_png
 from tetopt.start.lattice import lattice
 
+LETTER_ROWS = 12  # lowest, with the letters of the sides
 SHAPE, SPACING = (40, 50, 15), np.array([1.0, 1.0, 3.0])
 
 
@@ -23,7 +25,9 @@ def pixels(*arguments):
 
 
 def is_grey(rgb, least):
-    return (np.ptp(rgb, axis=-1) < 40) & (rgb.min(axis=-1) >= least)
+    grey = (np.ptp(rgb, axis=-1) < 40) & (rgb.min(axis=-1) >= least)
+    grey[-LETTER_ROWS:] = False
+    return grey
 
 
 def ball(centre=(20.0, 25.0, 21.0), radius=8.0):
@@ -64,6 +68,23 @@ def test_left_is_left_and_front_is_up():
     assert y.mean() < SIDE_PIXELS / 2 - 10  # above
 
 
+def test_letters_say_which_side_is_which():
+    """L and P on the left of the views, R and A on the right; their shapes: an L has most of itself on its left."""
+    image = ball()
+    rgb = pixels(image, coarse(image))
+    is_letter = rgb[-LETTER_ROWS:].min(axis=-1) > 60  # the mesh's orange has no blue
+    ends = [0, 12, SIDE_PIXELS - 12, SIDE_PIXELS, SIDE_PIXELS + 12, 2 * SIDE_PIXELS - 12, 2 * SIDE_PIXELS]
+    left, between, right, back, middle, front = (is_letter[:, a:b] for a, b in pairwise(ends))
+    assert not between.any()
+    assert not middle.any()
+    assert min(each.sum() for each in (left, right, back, front)) >= 5
+    of_left, of_back = (np.flatnonzero(each.any(axis=1)) for each in (left, back))
+    assert left[of_left[-1]].sum() > left[of_left[0]].sum()  # an L stands on its long side
+    assert back[of_back[-1]].sum() < back[of_back[0] : of_back[-1]].sum(axis=1).max()  # a P on its short one
+    plane = Image(image.data[:, :, 7], np.diag([1.0, 1.0, 1.0]))
+    assert not (pixels(plane, coarse(plane))[-LETTER_ROWS:].min(axis=-1) > 60).any()
+
+
 @pytest.mark.parametrize(("order", "signs"), [((2, 0, 1), (1, -1, 1)), ((1, 0, 2), (-1, -1, -1))])
 def test_the_order_of_voxels_does_not_matter(order, signs):
     image = ball(centre=(20.0, 30.0, 21.0), radius=8.0)
@@ -87,7 +108,7 @@ def test_voxels_of_other_lengths_keep_a_ball_round():
     image = ball(centre=(19.5, 24.5, 21.0), radius=12.0)
     rgb = pixels(image, coarse(image))
     for view in (rgb[:, :SIDE_PIXELS], rgb[:, SIDE_PIXELS:]):
-        y, x = np.nonzero(view[..., 2] > 90)  # orange has no blue
+        y, x = np.nonzero(view[:-LETTER_ROWS, :, 2] > 90)  # orange has no blue
         assert np.ptp(x) / np.ptp(y) == pytest.approx(1.0, abs=0.2)  # a fifth: voxels are 3 mm high
         assert np.ptp(x) / SIDE_PIXELS == pytest.approx(24.0 / (1.16 * 50.0), abs=0.06)  # mm, of the side's
 

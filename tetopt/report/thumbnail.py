@@ -35,6 +35,8 @@ SLAB_COUNT = 20  # across the mesh, of which the fullest is where it is cut, if 
 PALETTE_COLOURS = 32  # greys and oranges, as the eye needs them: half of the bytes of 256
 EDGE_POINTS = 4.0  # width of edges times the root of how many cells are cut: however many, they tint the image alike
 LABEL_ALPHA = 0.45  # of cells' labels over the image
+SIDE_LETTERS = ("LR", "PA")  # at the left and the right of a view along this world axis
+LETTER_POINTS = 4.5  # 8 pixels: the smallest that is read
 VIEW_AXES = {
     3: ((0, 1), (1, 2)),
     2: ((0, 1),),
@@ -50,7 +52,8 @@ def save_thumbnail(
     Of a volume an axial slice on the left and a sagittal one on the right, 256 x 128 pixels, through the mesh's middle
     (or, where that is hollow, where most of it is); of a 2-D image one view. Both are in one scale, the same along both
     sides, and centred on the mesh: x from left to right (left of the patient on the left), y upwards or, in the
-    sagittal view, to the right (back on the left), z upwards. What lies beside the image is black.
+    sagittal view, to the right (back on the left), z upwards. Letters in the lower corners say so: L and R, P and A.
+    What lies beside the image is black.
 
     Parameters
     ----------
@@ -104,6 +107,12 @@ def thumbnail_png(
         _draw_mesh(panel, mesh, place, axes, colours, of_cell)
         panel.set_xlim(extent[:2])
         panel.set_ylim(extent[2:])
+        if image.ndim == 3:
+            for letter, x in zip(SIDE_LETTERS[axes[0]], (0.04, 0.96), strict=True):
+                panel.text(
+                    x, 0.05, letter, transform=panel.transAxes, color="white", ha="center", va="center",
+                    fontsize=LETTER_POINTS,
+                )  # fmt: skip
     return _png(figure)
 
 
