@@ -2,7 +2,7 @@
 
     python scripts/draw_documents.py -o docs/pictures --force
     python scripts/draw_documents.py -o docs/pictures --force --only flip
-    python scripts/draw_documents.py -o docs/pictures --force --shrink demo/demo.png
+    python scripts/draw_documents.py -o docs/pictures --force --shrink compared/slices.png
 
 With `--shrink` pictures of other commands are kept in a third of their bytes, with few colours; `COMMANDS` says which
 command draws each.
@@ -39,7 +39,8 @@ LARGEST_WIDTH = 1400  # pixels: the column of a page on a screen of twice the us
 PICTURE_DPI = 140  # a figure of nine inches fills the column of a page on a screen of usual density
 # The pictures that other commands draw, which stand beside these.
 COMMANDS = {
-    "demo.png": "tetopt demo -o demo, then --shrink demo/demo.png",
+    "demo.png": "tetopt compare T1.nii.gz -o compared --nodes 15000 --pipelines tetopt-uniform,tetopt,pytetwild,"
+    " then --shrink of slices.png",
     "first_mesh.png": "tetopt mesh T1.nii.gz -o brain.vtu --nodes 5000 --figures ., then --shrink of slice.png",
     "organ.png": "python scripts/cut_open.py organ.vtu --image T1.nii.gz --labels tissues.nii.gz, then --shrink",
     "tradeoff.png": "tetopt compare T1.nii.gz -o compared --nodes 5000 --tradeoff",
