@@ -54,7 +54,7 @@ print(f"largest von Mises stress {largest_stress:.2f} kPa")
 
 grid = mesh.to_pyvista(point_data={"displacement": displacement, "von Mises stress, kPa": stress_kPa})
 half = grid.clip("y", crinkle=True).warp_by_vector("displacement", factor=2.0)
-plotter = pyvista.Plotter(window_size=(1000, 720))
+plotter = pyvista.Plotter(window_size=(1000, 700))
 plotter.set_background("#171a21")
 bar = {"color": "#e6e6e6", "vertical": False, "width": 0.5, "position_x": 0.25, "position_y": 0.03, "fmt": "%.1f"}
 plotter.add_mesh(

@@ -72,7 +72,7 @@ print(f"Young's modulus from {young.min():.2f} to {largest_kPa:.2f} kPa in {read
 grid = mesh.to_pyvista({"Young's modulus, kPa": young})
 is_cut = (grid.cell_centers().points[:, :2] * (-1, 1) > 0).all(axis=1)
 opened = grid.extract_cells(np.flatnonzero(~is_cut))
-plotter = pyvista.Plotter(window_size=(1000, 800))
+plotter = pyvista.Plotter(window_size=(1000, 700))
 plotter.set_background("#171a21")
 bar = {"color": "#e6e6e6", "vertical": False, "width": 0.5, "position_x": 0.25, "position_y": 0.03, "fmt": "%.0f"}
 plotter.add_mesh(opened, cmap="YlGnBu_r", show_edges=True, edge_color="#20242c", scalar_bar_args=bar, ambient=0.2)

@@ -41,7 +41,7 @@ middle = np.array([0.0, -18.0, 10.0])
 is_cut = (grid.cell_centers().points > middle).all(axis=1)
 opened = grid.extract_cells(np.flatnonzero(~is_cut))
 
-plotter = pyvista.Plotter(window_size=(1000, 800))
+plotter = pyvista.Plotter(window_size=(1000, 700))
 plotter.set_background("#171a21")
 plotter.add_mesh(
     opened, scalars="mean", cmap="bone", clim=(0.1, 0.95), show_edges=True, edge_color="#2a3140", line_width=1,

@@ -53,7 +53,7 @@ print(f"trimesh: watertight {surface.is_watertight}, {volume_mm3:.1f} mm3")
 # %%
 # The cells that pyvista read, cut through the middle, and before them the surface that trimesh holds.
 
-plotter = pyvista.Plotter(window_size=(1000, 760))
+plotter = pyvista.Plotter(window_size=(1000, 700))
 plotter.set_background("#171a21")
 half = of_pyvista.clip("y", crinkle=True)
 plotter.add_mesh(

@@ -52,7 +52,7 @@ grid = mesh.to_pyvista({"young": materials.young[materials.of_cell]}, {"u": disp
 deformed = grid.warp_by_vector("u", factor=2.0)
 sphere = deformed.extract_cells(np.flatnonzero(deformed["young"] > 50))
 shell = deformed.clip("y", crinkle=True)
-plotter = pyvista.Plotter(window_size=(1000, 760))
+plotter = pyvista.Plotter(window_size=(1000, 700))
 plotter.set_background("#171a21")
 bar = {"color": "#e6e6e6", "vertical": False, "width": 0.5, "position_x": 0.25, "position_y": 0.03, "fmt": "%.0f"}
 look = {"scalars": "displacement, mm", "cmap": "viridis", "clim": (0, length.max()), "show_edges": True}

@@ -40,7 +40,7 @@ print(f"Dice of grey matter {grey_dice:.4f}, of white matter {white_dice:.4f}")
 
 grid = result.mesh.to_pyvista({"label": result.labels})
 half = grid.clip("z", origin=(0.0, 0.0, 14.0), crinkle=True)
-plotter = pyvista.Plotter(window_size=(1000, 750))
+plotter = pyvista.Plotter(window_size=(1000, 700))
 plotter.set_background("#171a21")
 for label, colour in ((1, "#3f7fbf"), (2, "#c9867b"), (3, "#f4ead5")):
     cells = half.extract_cells(np.flatnonzero(half["label"] == label))

@@ -43,12 +43,12 @@ ventricles = pyvista.PolyData.from_regular_faces(surface.points, surface.triangl
 voxels = pyvista.ImageData(dimensions=image.shape, spacing=(step,) * 3, origin=affine[:3, 3])
 voxels["T1"] = image.data.ravel(order="F")
 
-plotter = pyvista.Plotter(window_size=(1000, 800))
+plotter = pyvista.Plotter(window_size=(1000, 700))
 plotter.set_background("#171a21")
 low, high = affine[:3, 3], affine[:3, 3] + step * (np.array(image.shape) - 1)
 for normal, origin in (("x", low), ("y", low), ("z", low)):
     plotter.add_mesh(voxels.slice(normal, origin=origin + 1e-3), cmap="gray", clim=(0, 1), show_scalar_bar=False)
 plotter.add_mesh(ventricles, color="#f2913d", show_edges=True, edge_color="#7a3f0c", line_width=0.5)
 plotter.view_vector((0.5, 1.0, 0.75), viewup=(0, 0, 1))
-plotter.camera.zoom(1.2)
+plotter.camera.zoom(1.1)
 plotter.show()
