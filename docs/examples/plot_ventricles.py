@@ -50,5 +50,4 @@ for normal, origin in (("x", low), ("y", low), ("z", low)):
     plotter.add_mesh(voxels.slice(normal, origin=origin + 1e-3), cmap="gray", clim=(0, 1), show_scalar_bar=False)
 plotter.add_mesh(ventricles, color="#f2913d", show_edges=True, edge_color="#7a3f0c", line_width=0.5)
 plotter.view_vector((0.5, 1.0, 0.75), viewup=(0, 0, 1))
-plotter.camera.zoom(1.1)
 plotter.show()
