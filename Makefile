@@ -16,8 +16,8 @@ demo: $(VENV)/.demo
 
 test: $(VENV)/.test
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt warm-up
-	$(TESTED) -m "not slow" -n auto --dist loadfile
-	$(MAKE) --no-print-directory test-onethread test-nojit
+	$(TESTED) -m "not slow" -n auto --dist loadfile --no-loadscope-reorder
+	$(MAKE) --no-print-directory -j 2 test-onethread test-nojit
 
 # The small cases again on one thread, and with the kernels run as plain Python; no other file is read for that.
 KERNEL_TESTS = $(shell grep -rl --include='test_*.py' 'mark\.kernel' tests)
@@ -39,7 +39,7 @@ test-lowest:
 	$(LOWEST)/bin/python -m uv pip install --quiet --python $(LOWEST)/bin/python --resolution lowest-direct -e ".[test]"
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE)-lowest $(LOWEST)/bin/tetopt warm-up
 	PYTHONUTF8=1 NUMBA_CACHE_DIR=$(NUMBA_CACHE)-lowest MPLBACKEND=agg \
-	  $(LOWEST)/bin/python -m pytest -m "not slow" -n auto --dist loadfile
+	  $(LOWEST)/bin/python -m pytest -m "not slow" -n auto --dist loadfile --no-loadscope-reorder
 
 # A million random operations of the engine and 500 random whole runs, an hour; a small share is in `make test`.
 test-random: $(VENV)/.test

@@ -10,12 +10,20 @@ import numba
 import pytest
 import schemas
 from hypothesis import settings
+from order import LONGEST_FILES
 
 import tetopt.io.files
 
 # The same examples in every run; few where the kernels run as plain Python.
 settings.register_profile("tetopt", deadline=None, derandomize=True, max_examples=4 if numba.config.DISABLE_JIT else 30)
 settings.load_profile("tetopt")
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """The tests of the longest files first, which `--no-loadscope-reorder` keeps so; the others as they were."""
+    folder = Path(__file__).resolve().parent
+    ranks = {folder / name: rank for rank, name in enumerate(LONGEST_FILES)}
+    items.sort(key=lambda item: ranks.get(item.path, len(ranks)))
 
 
 @pytest.fixture(scope="session")

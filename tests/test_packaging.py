@@ -10,6 +10,7 @@ from pathlib import Path
 
 import pytest
 import yaml
+from order import LONGEST_FILES
 
 import tetopt
 
@@ -73,6 +74,15 @@ def test_the_workflow_runs_what_there_is():
     assert systems >= {"ubuntu-latest", "macos-latest", "windows-latest"}
     for job in jobs.values():  # by the major version, which its makers keep compatible
         assert all(re.fullmatch(r"[\w/-]+@v\d+", step["uses"]) for step in job["steps"] if "uses" in step)
+
+
+def test_long_files_begin_first():
+    """Each is there, and each run on several processes keeps the order."""
+    assert [name for name in LONGEST_FILES if not (ROOT / "tests" / name).exists()] == []
+    for path in (ROOT / "Makefile", ROOT / ".github" / "workflows" / "ci.yml"):
+        lines = [line for line in path.read_text(encoding="utf-8").splitlines() if "--dist loadfile" in line]
+        assert lines
+        assert all("--no-loadscope-reorder" in line for line in lines)
 
 
 @pytest.mark.slow

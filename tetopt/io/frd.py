@@ -167,7 +167,7 @@ def _checked_bytes(path: Path) -> bytes:
     if not whole.rstrip().endswith(b"9999"):
         raise InputError(f"{path}: is cut off; is CalculiX still running, or did it break off?")
     if importlib.util.find_spec("pyvista_frd") is None:  # an extra: few have CalculiX
-        hint = install_hint("calculix", "pyvista-frd-reader", "pyvista")
+        hint = install_hint("calculix", "pyvista-frd-reader")
         raise InputError(f"{path}: reading it needs pyvista-frd-reader; {hint}")
     return whole
 
