@@ -85,6 +85,7 @@ test-parts: $(VENV)/.test
 
 # The site, into docs/_build/html, without the network; warnings are errors. The gallery's programs run, for minutes.
 docs: $(VENV)/.test
+	rm -rf docs/_build docs/reference/api/generated
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt warm-up
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) PYTHONUTF8=1 $(BIN)/python -m sphinx -W --keep-going -q -b html -d docs/_build/doctrees docs docs/_build/html
 	$(BIN)/python docs/check_site.py docs/_build/html
