@@ -20,6 +20,7 @@ from tetopt.io.files import (
     checked_output,
     name_files,
     outputs_of_command,
+    results_folder,
     save_bytes,
     save_json,
     save_text,
@@ -102,6 +103,16 @@ def test_what_is_no_file_is_not_replaced(tmp_path):
     (tmp_path / "a.vtu").symlink_to("b.vtu")
     (tmp_path / "b.vtu").symlink_to("a.vtu")
     assert_refused(tmp_path / "a.vtu", "a link in a circle|Too many levels", force=True)
+
+
+def test_a_folder_that_cannot_be_made_is_refused(tmp_path):
+    (tmp_path / "file").write_text("x")
+    for name in ("a" * 300, "a\0b", "file/b"):
+        with pytest.raises(InputError, match="the folder for the results cannot be made"), outputs_of_command():
+            results_folder(tmp_path / "new" / ".." / name)
+    with pytest.raises(InputError, match="found a file"):
+        results_folder(tmp_path / "file")
+    assert [each.name for each in tmp_path.iterdir()] == ["file"]
 
 
 def test_a_link_is_written_through(tmp_path):

@@ -81,12 +81,13 @@ def results_folder(path: Path) -> Path:
     if os.path.lexists(path) and not path.is_dir():
         raise InputError(f"{path}: expected a folder for the results, found a file")
     new = [each for each in (path, *path.parents) if not os.path.lexists(each)][::-1]
-    try:
-        path.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise InputError(f"{path}: the folder for the results cannot be made: {error.strerror}") from error
     if (outputs := _OUTPUTS.get()) is not None:
         outputs.made.extend(new)
+    try:
+        path.mkdir(parents=True, exist_ok=True)
+    except (OSError, ValueError) as error:  # a name too long, or with letters that the file system does not take
+        reason = getattr(error, "strerror", None) or error
+        raise InputError(f"{path}: the folder for the results cannot be made: {reason}") from error
     return path
 
 
