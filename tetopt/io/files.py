@@ -62,7 +62,7 @@ def outputs_of_command() -> Iterator[Outputs]:
     finally:
         _OUTPUTS.reset(token)
         for folder in reversed(outputs.made):
-            with suppress(OSError):  # it holds something, or is another's by now
+            with suppress(OSError, ValueError):  # it holds something, is another's by now, or has no such name
                 folder.rmdir()
 
 
