@@ -9,7 +9,6 @@ from commands import exit_code, labelled_lattice_words, numbers_in
 
 import tetopt
 from tetopt.cli.solver import MANY_INTERFACES
-from tetopt.io.label_tables import table_in
 
 TABLE = "label,name,color\n0,soft tissue,\n1,bright/ball [é],#ff8000\n9,spleen,#00ff00\n"
 FACES = {"boundary", "left", "right", "posterior", "anterior", "inferior", "superior"}
@@ -39,7 +38,7 @@ def refused(capsys, *words):
 
 def test_a_mesh_s_file_keeps_the_table(folder):
     loaded, plain = (tetopt.load_mesh(folder / name) for name in ("named.vtu", "plain.vtu"))
-    table = table_in(loaded.text("label_table"))
+    table = loaded.label_table
     assert table.names == {0: "soft tissue", 1: "bright/ball [é]", 9: "spleen"}
     assert table.colours == {1: (1.0, 128 / 255, 0.0), 9: (0.0, 1.0, 0.0)}
     assert set(loaded.sets.cells) == {"soft_tissue", "bright_ball_e"}
@@ -93,14 +92,14 @@ def test_laws_and_loads_by_name(folder, tmp_path, mesh, capsys):
     assert "label_1" not in text
     assert exit_code("fem", tmp_path / "a.vtu", "-o", tmp_path / "s.vtu", "--json", tmp_path / "s.json") == 0
     assert INTERFACE in numbers_in(tmp_path / "s.json")["steps"][0]["reactions"]
-    assert table_in(tetopt.load_mesh(tmp_path / "s.vtu").text("label_table")).names[9] == "spleen"
+    assert tetopt.load_mesh(tmp_path / "s.vtu").label_table.names[9] == "spleen"
 
 
 def test_an_improved_mesh_keeps_the_names(folder, tmp_path, capsys):
     words = ["mesh", folder / "a.nii.gz", "--labels", folder / "l.nii.gz", "--iterations", "0"]
     assert exit_code(*words, "--start", folder / "named.vtu", "-o", tmp_path / "a.vtu") == 0
     loaded = tetopt.load_mesh(tmp_path / "a.vtu")
-    assert table_in(loaded.text("label_table")).names[9] == "spleen"
+    assert loaded.label_table.names[9] == "spleen"
     assert set(loaded.sets.cells) == {"soft_tissue", "bright_ball_e"}
     assert "not kept" not in capsys.readouterr().err
 

@@ -27,7 +27,7 @@ if TYPE_CHECKING:
     from tetopt.io.frd import Results, read_frd
     from tetopt.io.images import load_image, save_image
     from tetopt.io.label_tables import load_label_table
-    from tetopt.io.meshes import MeshFile, load_mesh
+    from tetopt.io.meshes import load_mesh
     from tetopt.io.stored_images import open_stored
     from tetopt.io.surfaces import save_surface
     from tetopt.measure.fidelity import LabelFidelity, MaskFidelity, cell_labels, label_fidelity, mask_fidelity
@@ -37,6 +37,7 @@ if TYPE_CHECKING:
     from tetopt.mesh import Mesh
     from tetopt.model.build import model_of
     from tetopt.model.fields import cell_fields
+    from tetopt.model.file import MeshFile
     from tetopt.model.labels import LabelTable
     from tetopt.model.laws import ByLabel
     from tetopt.model.loads import Load
@@ -69,7 +70,7 @@ _NAMES_OF = {  # by module
     "io.frd": ("Results", "read_frd"),
     "io.images": ("load_image", "save_image"),
     "io.label_tables": ("load_label_table",),
-    "io.meshes": ("MeshFile", "load_mesh"),
+    "io.meshes": ("load_mesh",),
     "io.stored_images": ("open_stored",),
     "io.surfaces": ("save_surface",),
     "measure.fidelity": ("LabelFidelity", "MaskFidelity", "cell_labels", "label_fidelity", "mask_fidelity"),
@@ -79,6 +80,7 @@ _NAMES_OF = {  # by module
     "mesh": ("Mesh",),
     "model.build": ("model_of",),
     "model.fields": ("cell_fields",),
+    "model.file": ("MeshFile",),
     "model.labels": ("LabelTable",),
     "model.laws": ("ByLabel",),
     "model.loads": ("Load",),

@@ -16,7 +16,6 @@ from tetopt.cli.console import log, out
 from tetopt.cli.inputs import image_and_others, read_mesh, warn_of_other_image, with_labels
 from tetopt.cli.options import ImagePart, LabelledPart, MeshArgument, NumberOptions, SolverOptions, option
 from tetopt.cli.solver import (
-    MATERIAL_FIELDS,
     REACTIONS_TEXT,
     check_solver_options,
     completed,
@@ -33,15 +32,13 @@ from tetopt.io.files import checked_output, save_json
 from tetopt.io.formats import FORMATS, format_of
 from tetopt.io.frd import read_frd
 from tetopt.io.images import sha256
-from tetopt.io.meshes import MeshFile
-from tetopt.io.vtk import VTK_SUFFIXES, box_text
+from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.model.fields import cell_fields, is_result, is_stress
-from tetopt.model.sets import box_of
+from tetopt.model.file import MATERIAL_FIELDS, TEXTS_KEPT, MeshFile
+from tetopt.model.sets import box_of, box_text
 from tetopt.report.summary import model_summary, versions
 from tetopt.target.align import aligned_mask
 from tetopt.target.content import continued
-
-TEXTS_KEPT = ("image", "image_sha256", "inputs", "options")  # of a mesh's file that go on into the new one
 
 
 def convert_command(

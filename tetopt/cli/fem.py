@@ -28,14 +28,14 @@ from tetopt.cli.solver import (
 from tetopt.io.files import checked_output, save_json
 from tetopt.io.formats import save_model
 from tetopt.io.images import sha256
-from tetopt.io.meshes import MeshFile
-from tetopt.io.vtk import VTK_SUFFIXES, box_text
+from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.model.averages import DEFAULT_AVERAGE
 from tetopt.model.fields import cell_fields, is_result
+from tetopt.model.file import MeshFile
 from tetopt.model.laws import ByLabel, parse_any_law
 from tetopt.model.loads import MOST_COMPRESSION_PERCENT, count_of_steps
 from tetopt.model.model import Model
-from tetopt.model.sets import box_of
+from tetopt.model.sets import box_of, box_text
 from tetopt.report.summary import model_summary, versions
 from tetopt.report.tables import new_table, nodes_in_words
 

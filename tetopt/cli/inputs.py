@@ -18,11 +18,10 @@ from tetopt.cli.console import log, show_warning
 from tetopt.cli.options import WHOLE_BOX, BoxPart, ImagePart, SourceOptions
 from tetopt.io.files import checked_output
 from tetopt.io.images import parse_crop, parse_slice, part_of, sha256
-from tetopt.io.label_tables import LabelTable, load_label_table, table_in
-from tetopt.io.meshes import MeshFile
+from tetopt.io.label_tables import LabelTable, load_label_table
 from tetopt.measure.fidelity import cell_labels
-from tetopt.model.build import labels_of
-from tetopt.model.labels import TABLE_TEXT
+from tetopt.model.file import MeshFile
+from tetopt.model.labels import NO_TABLE, labels_of
 from tetopt.target.align import aligned_contrast, is_same_grid
 from tetopt.target.labels import check_labels
 
@@ -158,7 +157,7 @@ def label_table(path: Path | None, loaded: MeshFile | None = None) -> LabelTable
         if labels is not None and not np.isin(labels, [*table.names, *table.colours]).any():
             show_warning(f"{path}: names none of the mesh's labels, {_first(np.unique(labels).tolist())}")
         return table
-    return table_in(None if loaded is None else loaded.text(TABLE_TEXT))
+    return NO_TABLE if loaded is None else loaded.label_table
 
 
 def _first(labels: list[int]) -> str:

@@ -74,10 +74,10 @@ from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import centroids, squared_edges
 from tetopt.io.files import TakenError, check_space, results_folder, save_json
 from tetopt.io.formats import format_of
-from tetopt.io.meshes import MeshFile
 from tetopt.io.mni import mni_path
 from tetopt.measure.quality import Quality, quality
 from tetopt.model.fields import cell_fields, is_result
+from tetopt.model.file import MeshFile
 from tetopt.model.labels import TABLE_TEXT, table_of_labels, table_words
 from tetopt.model.model import Model
 from tetopt.model.sets import Sets, box_of, label_set_names, surviving_sets

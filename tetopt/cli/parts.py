@@ -36,9 +36,8 @@ from tetopt.engine.loop import Optimized, Record
 from tetopt.io.images import file_shape, parse_crop, sha256
 from tetopt.io.label_tables import NO_TABLE, LabelTable
 from tetopt.io.stored_images import STORED_SUFFIXES, check_local, coarse_image, open_stored, stored_checksum
-from tetopt.io.vtk import box_text
 from tetopt.model.averages import DEFAULT_AVERAGE
-from tetopt.model.sets import box_of
+from tetopt.model.sets import box_of, box_text
 from tetopt.parts.part import work_on
 from tetopt.parts.rounds import Parted, Request, Round, Runner, expected_parts, mesh_in_parts
 from tetopt.parts.work import STATE_NAME, VolumeFile

@@ -20,10 +20,10 @@ from tetopt.cli.options import ImagePart, LabelNamesOption, NumberOptions, optio
 from tetopt.engine.promises import MASK_DICE
 from tetopt.incoming import json_of
 from tetopt.io.files import save_json
-from tetopt.io.meshes import MeshFile
 from tetopt.measure.fidelity import LabelFidelity
 from tetopt.measure.interfaces import touching_voxels
 from tetopt.measure.quality import quality
+from tetopt.model.file import MeshFile
 from tetopt.report.summary import fidelity, size_summary
 from tetopt.report.tables import add_quality, new_table
 from tetopt.target.align import aligned_labels, aligned_mask

@@ -17,16 +17,16 @@ from tetopt import Image, InputError, Mesh, save_mesh
 from tetopt.cli.console import error_words, log, out, print_wide, show_warning
 from tetopt.cli.inputs import label_table
 from tetopt.cli.options import ModelOptions, SolverOptions
-from tetopt.incoming import json_of
 from tetopt.io.files import kept_places
 from tetopt.io.formats import FORMATS, file_bytes, format_of, save_model
-from tetopt.io.meshes import MeshFile
 from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.model.averages import DEFAULT_AVERAGE, parse_average
-from tetopt.model.build import labels_of, model_of
-from tetopt.model.fields import GAUSS_MODULI, NODE_MODULI, is_result
-from tetopt.model.labels import TABLE_TEXT, table_of_words, table_words
-from tetopt.model.laws import checked_young, parse_any_law
+from tetopt.model.build import model_of
+from tetopt.model.fields import GAUSS_MODULI, is_result
+from tetopt.model.file import MATERIAL_FIELDS, MeshFile, loads_in, moduli_in, sets_beside
+from tetopt.model.file import completed as with_rest_of_file
+from tetopt.model.labels import TABLE_TEXT, labels_of, table_of_words, table_words
+from tetopt.model.laws import parse_any_law
 from tetopt.model.loads import (
     FACET_FORCES,
     check_steps,
@@ -36,8 +36,8 @@ from tetopt.model.loads import (
     other_orders,
     parse_load,
 )
-from tetopt.model.materials import DEFAULT_NU, BinningError, Materials, Spacing
-from tetopt.model.model import SPACES, STRESS_UNITS, Model, element_facets, elements, half_turned, odd_units, scaled
+from tetopt.model.materials import DEFAULT_NU, Materials, Spacing
+from tetopt.model.model import SPACES, STRESS_UNITS, Model, element_facets, elements, odd_units
 from tetopt.model.sets import (
     BOUNDARY_SET,
     Box,
@@ -46,17 +46,12 @@ from tetopt.model.sets import (
     check_free_names,
     interface_names,
     label_set_names,
-    label_sets,
-    merged_sets,
     parse_set,
     standard_names,
-    standard_sets,
 )
 from tetopt.report.tables import new_table, nodes_in_words
 
-MATERIAL_FIELDS = ("young", "nu", "density", "material", GAUSS_MODULI)  # of cells of a file of ours
 REACTIONS_TEXT = r"reactions(_step\d+)?"  # of a solved mesh's file: the forces that hold sets
-MODULUS_ROUNDING = 1e-9  # relative: of a cell's modulus beside those at its Gauss points, in files of other units
 SET_GROUPS = ("labels", "interfaces", "boundary")  # of the sets that every mesh has
 # Each is an array more on the nodes of a VTU or VTK file; labels and their sets can be made anew of its cells.
 MANY_INTERFACES = 24
@@ -146,15 +141,9 @@ def solver_model(
     known_sets: Sets,
 ) -> Model:  # fmt: skip
     """The model that the options ask for, of a mesh with the sets `known_sets`."""
-    young: Any = solver.young
-    nu: Any = solver.nu
-    density: Any = solver.density
-    if young is None and "young" in cell_data:  # painted before
-        young = np.asarray(cell_data["young"], dtype=np.float64)
-        nu = np.asarray(cell_data["nu"], dtype=np.float64) if nu is None and "nu" in cell_data else nu
-        if density is None and "density" in cell_data:
-            density = np.asarray(cell_data["density"], dtype=np.float64)
-    elif nu is None and "nu" in cell_data:
+    young, nu, density = moduli_in(cell_data, solver.young, solver.nu, solver.density)
+    is_of_file = solver.young is None and "young" in cell_data
+    if not is_of_file and nu is None and "nu" in cell_data:
         log.print(f"nu: of --young or {DEFAULT_NU:g}; what the mesh's file has is left")
     fields = {name: values for name, values in cell_data.items() if name not in MATERIAL_FIELDS}
     bins, spacing = parsed_bins(solver.bins)
@@ -167,40 +156,11 @@ def solver_model(
 
 
 def completed(model: Model, loaded: MeshFile, solver: ModelOptions) -> Model:
-    """The model with what the mesh's file alone has: data at nodes and, unless --young or --bins makes others, moduli
-    that vary within cells, and the error of those that stand for more."""
-    model = model._replace(point_data={name: rows for name, rows in loaded.point_data.items() if name != NODE_MODULI})
-    if model.materials is None or solver.young is not None or solver.bins is not None:
-        return model
-    if (moduli := loaded.point_data.get(NODE_MODULI)) is not None:
-        model = model._replace(node_young=checked_young(moduli[: len(model.mesh.points)]))
-    table = model.materials and model.materials._replace(binning=_binning_error(loaded))
-    return model._replace(materials=table, gauss_young=_gauss_moduli(model, loaded))
-
-
-def _binning_error(loaded: MeshFile) -> BinningError | None:
-    """How far the moduli of a file of ours are from those that they stand for, if it tells."""
-    try:
-        words = json_of(loaded.text("binning") or "{}")
-        return BinningError(float(words["mean"]), float(words["largest"]))
-    except (ValueError, TypeError, KeyError, RecursionError):  # there is none, or it is another program's
-        return None
-
-
-def _gauss_moduli(model: Model, loaded: MeshFile) -> NDArray[np.float64] | None:
-    """The moduli at Gauss points (M, Q) that a file of ours holds, if they are still those of its cells."""
-    moduli = loaded.cell_data.get(GAUSS_MODULI)
-    if moduli is None or model.order == 1 or model.materials is None:
-        return None
-    of_cell, shape = model.materials.young[model.materials.of_cell], (len(model.mesh.cells), model.mesh.ndim + 1)
-    # A cell's own modulus is a mean of these; columns go by a cell's nodes, which turning exchanges.
-    if moduli.shape == shape and not loaded.n_turned:
-        low, high = moduli.min(axis=1), moduli.max(axis=1)
-        if ((1.0 - MODULUS_ROUNDING) * low <= of_cell).all() and (of_cell <= (1.0 + MODULUS_ROUNDING) * high).all():
-            checked_young(low)
-            return np.asarray(moduli, dtype=np.float64)
-    log.print(f"{GAUSS_MODULI} of the mesh's file is left out: it does not belong to its cells and their young")
-    return None
+    """The model with what the mesh's file alone has; see `tetopt.model.file.completed`."""
+    model, lost = with_rest_of_file(model, loaded, is_of_file=solver.young is None and solver.bins is None)
+    if lost:
+        log.print(lost)
+    return model
 
 
 def without_stale_results(loaded: MeshFile, solver: ModelOptions) -> MeshFile:
@@ -223,18 +183,11 @@ def without_stale_results(loaded: MeshFile, solver: ModelOptions) -> MeshFile:
 
 
 def loads_of(loaded: MeshFile) -> list[str]:
-    """The loads that a file of ours holds, in the words of --load, in RAS+ and kPa, if their sets are there still."""
-    try:
-        words = json_of(loaded.text("loads") or "[]")
-        loads = [parse_load(text, loaded.mesh.ndim) for text in words]
-    except (ValueError, TypeError, AttributeError):  # another program's
-        return []
-    if lost := [load.set_name for load in loads if load.set_name and load.set_name not in loaded.sets.facets]:
-        log.print(escape(f"the file's loads are left out: it no longer has the sets {', '.join(lost)}"))
-        return []
-    factor = STRESS_UNITS.get(loaded.text("units") or "", STRESS_UNITS["kPa"]).kPa
-    turned = [half_turned(load) if loaded.space == "lps" else load for load in loads]
-    return [load_words(scaled(load, factor)) for load in turned]
+    """The loads that a file of ours holds, see `tetopt.model.file.loads_in`; a line where they are left out."""
+    loads, lost = loads_in(loaded)
+    if lost:
+        log.print(escape(lost))
+    return loads
 
 
 def all_sets(
@@ -247,23 +200,8 @@ def all_sets(
     kept: Iterable[str] = (),
     is_told: bool = True,
 ) -> Sets:
-    """The standard sets and the mesh's own; a line for each of the latter that had to be called otherwise.
-
-    Labels are called as `names` says. Sets of labels, and interfaces, under their numbers or `former` names are not
-    there a second time, but those that loads name (`kept`).
-    """
-    labels = labels_of(fields, len(mesh.cells))
-    if labels is not None and names and (own.facets or own.cells):
-        for others in {id(each): each for each in ({}, former or {}) if each != names}.values():
-            of_labels = label_sets(mesh, labels, others)
-            own = Sets(*(
-                {
-                    name: rows for name, rows in mine.items()
-                    if name in kept or not np.array_equal(rows, anew.get(name, np.empty(0)))
-                }
-                for mine, anew in zip(own, of_labels, strict=True)
-            ))  # fmt: skip
-    sets, renamed = merged_sets(standard_sets(mesh, box, labels, names), own)
+    """`tetopt.model.file.sets_beside`; a line for each of the mesh's own that had to be called otherwise."""
+    sets, renamed = sets_beside(mesh, box, fields, own, names, former, kept)
     if is_told:
         for old, new in renamed.items():
             log.print(f'the mesh came with a set "{old}" of its own: it is {new} here')

@@ -15,11 +15,10 @@ from tetopt.cli.inputs import file_and_volume, image_and_others, label_table, nu
 from tetopt.cli.options import SourceOptions
 from tetopt.io.images import sha256
 from tetopt.io.label_tables import NO_TABLE, LabelTable
-from tetopt.io.vtk import box_text
 from tetopt.measure.fidelity import cell_labels
 from tetopt.model.fields import cell_fields
 from tetopt.model.labels import TABLE_TEXT, table_words
-from tetopt.model.sets import box_of
+from tetopt.model.sets import box_of, box_text
 from tetopt.target.align import aligned_contrast, aligned_labels, aligned_mask, background_level, foreground
 from tetopt.target.content import SMOOTH_INTERFACES, Content, content, continued
 

@@ -19,9 +19,9 @@ from tetopt.geometry.simplex import volumes
 from tetopt.geometry.surface import Surface, surface_of
 from tetopt.geometry.topology import facets, largest_component
 from tetopt.io.files import checked_output, save_json
-from tetopt.io.meshes import MeshFile
 from tetopt.io.surfaces import LABELLED_SUFFIXES, SURFACE_SUFFIXES, SurfaceCheck, checked_surface, save_surface
 from tetopt.measure.fidelity import FacetSurface, surface_areas
+from tetopt.model.file import MeshFile
 from tetopt.model.labels import label_words, labels_named
 from tetopt.model.model import SPACES
 from tetopt.model.sets import FACE_NAMES, standard_sets

@@ -17,8 +17,8 @@ from tetopt.cli.options import BoxPart, ForceOption, ShownOptions, option
 from tetopt.cli.solver import all_sets
 from tetopt.incoming import json_of
 from tetopt.io.files import checked_output
-from tetopt.io.meshes import MeshFile
 from tetopt.model.fields import cell_fields
+from tetopt.model.file import MeshFile
 from tetopt.model.sets import facet_triples
 
 

@@ -17,10 +17,10 @@ from pathlib import Path
 from typing import NamedTuple
 
 from tetopt.errors import InputError
-from tetopt.incoming import json_of, text_of
-from tetopt.model.labels import NO_TABLE, LabelTable, hex_colour, table_of_words
+from tetopt.incoming import text_of
+from tetopt.model.labels import NO_TABLE, LabelTable, hex_colour
 
-__all__ = ["NO_TABLE", "LabelTable", "load_label_table", "table_in"]
+__all__ = ["NO_TABLE", "LabelTable", "load_label_table"]
 
 SNAP_LINE = re.compile(r'\s*(\d{1,9})\s+(\d+)\s+(\d+)\s+(\d+)\s+([\d.eE+-]+)\s+([01])\s+([01])\s+"(.*)"\s*')
 LUT_LINE = re.compile(r"\s*(\d{1,9})\s+(\S.*?)\s+(\d+)\s+(\d+)\s+(\d+)(?:\s+([\d.]+))?\s*")
@@ -93,14 +93,6 @@ def load_label_table(path: str | Path) -> LabelTable:
     if not table.names:
         raise InputError(f"{path}: expected names of labels, found none")
     return table
-
-
-def table_in(text: str | None) -> LabelTable:
-    """The table in a text of a mesh's file, as `tetopt.model.labels.table_words` has it; empty for any other text."""
-    try:
-        return table_of_words(json_of(text or "{}"))
-    except ValueError:  # another program's
-        return NO_TABLE
 
 
 def _entries(path: Path, lines: list[tuple[int, str]]) -> Iterator[Entry]:

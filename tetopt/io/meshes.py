@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import re
 from pathlib import Path
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,89 +17,16 @@ from tetopt.io.raw import Raw, by_corners
 from tetopt.io.read_gmsh import read_msh
 from tetopt.io.read_vtk import read_vtk
 from tetopt.io.text import plain
-from tetopt.io.vtk import VTK_SUFFIXES, box_in, sets_in, text_in
+from tetopt.io.vtk import VTK_SUFFIXES, box_in, sets_in
 from tetopt.io.vtkhdf import read_vtkhdf
 from tetopt.mesh import Mesh
 from tetopt.model.fields import half_turned_fields, is_stress, stresses_times
+from tetopt.model.file import MeshFile, text_in
 from tetopt.model.model import ON_PREFIX, STRESS_UNITS, half_turn
-from tetopt.model.sets import SET_NAME, Box, Sets, free_name, rows_of
+from tetopt.model.sets import SET_NAME, Sets, free_name, rows_of
 
 MESH_SUFFIXES = (*VTK_SUFFIXES, ".msh", ".msh2")
 STRAIGHT_SHARE = 1e-6  # of an edge: a middle node that is less off its middle was rounded, as in files of few digits
-
-
-class MeshFile(NamedTuple):
-    """A mesh read from a file and what came with it.
-
-    Parameters
-    ----------
-    mesh : Mesh
-        RAS+ mm.
-    cell_data : dict of arrays
-        By name, one row a cell; "young", if the file has it, in kPa.
-    field_data : dict of arrays
-        By name, of any length; bytes of UTF-8 have become one string.
-    n_turned : int
-        Cells that were oriented the other way in the file.
-    n_left : int
-        Cells of lower dimension, triangles on tetrahedra among them, that were left out.
-    sets : Sets
-        Of facets and cells, by name.
-    box : Box, optional
-        Of the image that the mesh was made from.
-    space : {"ras", "lps"}
-        Of the file: from "lps" the mesh has been turned to RAS+.
-    notes : tuple of str
-        What was left out or renamed, a line each.
-    order : {1, 2}
-        Of the file's cells; of those of order 2 the mesh has the corners.
-    point_data : dict of arrays
-        By name, a row for each node of the order.
-
-    Examples
-    --------
-    >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-    >>> mesh = tetopt.lattice(image, nodes=300)
-    >>> tetopt.save_mesh("ball.vtk", mesh)
-    >>> file = tetopt.load_mesh("ball.vtk")
-    >>> len(file.mesh.cells), file.n_turned, file.space, file.order
-    (1200, 0, 'ras', 1)
-    """
-
-    mesh: Mesh
-    cell_data: dict[str, NDArray]
-    field_data: dict[str, NDArray]
-    n_turned: int
-    n_left: int = 0
-    sets: Sets = Sets({}, {})
-    box: Box | None = None
-    space: str = "ras"
-    notes: tuple[str, ...] = ()
-    order: int = 1
-    point_data: dict[str, NDArray] = {}  # noqa: RUF012 - nobody changes it
-
-    def text(self, name: str) -> str | None:
-        """A text among the field data, if it is there.
-
-        Parameters
-        ----------
-        name : str
-            Of the field data.
-
-        Returns
-        -------
-        str or None
-            None if it is not there, or no text.
-
-        Examples
-        --------
-        >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-        >>> mesh = tetopt.lattice(image, nodes=300)
-        >>> tetopt.save_mesh("ball.vtu", mesh, about={"subject": "sub-01"})
-        >>> tetopt.load_mesh("ball.vtu").text("subject")
-        'sub-01'
-        """
-        return text_in(self.field_data, name)
 
 
 def load_mesh(path: str | Path) -> MeshFile:

@@ -33,6 +33,7 @@ from tetopt.io.raw import Grid
 from tetopt.io.text import xml_attribute
 from tetopt.mesh import Mesh
 from tetopt.model.fields import is_stress
+from tetopt.model.file import text_in
 from tetopt.model.loads import load_words
 from tetopt.model.model import Model, elements, grid_fields
 from tetopt.model.sets import SET_NAME, Box, Sets
@@ -196,12 +197,6 @@ def _checksum(mesh: Mesh) -> str:
     return hashlib.sha256(np.ascontiguousarray(mesh.cells, dtype="<i8").tobytes()).hexdigest()
 
 
-def text_in(field_data: dict[str, NDArray], name: str) -> str | None:
-    """A text among a file's field data."""
-    values = field_data.get(name, np.empty(0))
-    return str(values.ravel()[0]) if values.dtype.kind == "U" and values.size else None
-
-
 def box_in(field_data: dict[str, NDArray], ndim: int) -> Box | None:
     """The box of the image that a mesh of so many dimensions was made from, if its file tells."""
     try:
@@ -212,8 +207,3 @@ def box_in(field_data: dict[str, NDArray], ndim: int) -> Box | None:
         return None
     is_shape = len(shape) == ndim and all(type(size) is int and size > 0 for size in shape)
     return Box(shape, affine) if is_shape else None
-
-
-def box_text(box: Box) -> dict[str, Any]:
-    """What `box_in` reads, for a mesh's `about`."""
-    return {"shape": list(box.shape), "affine": box.affine.tolist()}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
@@ -14,16 +15,26 @@ from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.model.averages import DEFAULT_AVERAGE, cell_values, cell_young, element_young, node_young, parse_average
 from tetopt.model.fields import cell_fields
-from tetopt.model.labels import TABLE_TEXT, table_of_words
+from tetopt.model.file import (
+    MATERIAL_FIELDS,
+    TEXTS_KEPT,
+    MeshFile,
+    completed,
+    loads_in,
+    moduli_in,
+    sets_beside,
+    without_results,
+)
+from tetopt.model.labels import TABLE_TEXT, LabelTable, labels_of, table_of_words, table_words
 from tetopt.model.laws import ByLabel, Law, has_column, law_values, parse_any_law, young_from
-from tetopt.model.loads import parse_loads
-from tetopt.model.materials import DEFAULT_NU, Spacing, binned, by_label, density_of, materials
+from tetopt.model.loads import parse_load, parse_loads
+from tetopt.model.materials import DEFAULT_NU, Materials, Spacing, binned, by_label, density_of, materials
 from tetopt.model.model import Model
-from tetopt.model.sets import Box, Sets, box_of, standard_sets, with_requested
+from tetopt.model.sets import Box, Sets, box_of, box_text, standard_sets, with_requested
 
 
 def model_of(
-    mesh: Mesh,
+    mesh: Mesh | MeshFile,
     image: Image | None = None,
     *,
     young: str | float | NDArray[np.float64] | Law | ByLabel = None,
@@ -34,7 +45,7 @@ def model_of(
     loads: Iterable[str] = (),
     bins: int | None = None,
     spacing: Spacing = "equal",
-    order: int = 1,
+    order: int | None = None,
     cell_data: dict[str, NDArray] | None = None,
     known_sets: Sets | None = None,
     box: Box | None = None,
@@ -44,8 +55,10 @@ def model_of(
 
     Parameters
     ----------
-    mesh : Mesh
-        Points in world mm.
+    mesh : Mesh or MeshFile
+        Of a file (`tetopt.load_mesh`) what it holds goes into the model unless it is stated here: data of cells and
+        nodes, labels and their names, sets, moduli, loads, the image's box, and texts of what it was made from. What a
+        solver found stays if moduli and loads do.
     image : Image, optional
         Its intensities are what laws are of, and its box's faces become sets.
     young, nu : number, (M,) array, law or text, optional
@@ -69,17 +82,18 @@ def model_of(
         `tetopt.model.materials.binned`.
     spacing : {"equal", "quantile", "log"}
         How the bins divide the moduli.
-    order : {1, 2}
-        2: straight-edged quadratic cells in the file, where a format has them.
+    order : {1, 2}, optional
+        By default the file's, or 1. 2: straight-edged quadratic cells in the file, where a format has them.
     cell_data : dict, optional
-        What is known of each cell, by name; "mean" and "label" are used. By default `tetopt.cell_fields`.
+        What is known of each cell, by name; "mean" and "label" are used. By default `tetopt.cell_fields`, and what the
+        file has.
     known_sets : Sets, optional
         Sets that came with the mesh, instead of the standard ones.
     box : Box, optional
         Of the image that the mesh was made from; by default of `image`.
     about : dict, optional
-        Texts for the file's head. Its "label_table" (`tetopt.model.labels.table_words`) is what labels are called, in
-        laws and in the standard sets.
+        Texts for the file's head. Its "label_table", a `LabelTable` or what `tetopt.model.labels.table_words` makes of
+        one, is what labels are called, in laws and in the standard sets.
 
     Returns
     -------
@@ -90,6 +104,11 @@ def model_of(
     ------
     InputError
         As the functions named above; a dimension or an order that there is not; gravity without a density.
+
+    Warns
+    -----
+    UserWarning
+        Sets of the file that have to be called otherwise; loads or moduli of it that no longer fit.
 
     See Also
     --------
@@ -110,37 +129,39 @@ def model_of(
     >>> tetopt.model_of(mesh, young="1=10,*=2", cell_data=data).materials.young.tolist()
     [2.0, 10.0]
     """
+    loaded, loads = None, tuple(loads)
+    if isinstance(mesh, MeshFile):
+        loaded, is_of_file = _to_be_kept(mesh, [young, nu, density, bins], loads), young is None and bins is None
+        mesh, order = loaded.mesh, loaded.order if order is None else order
+        if cell_data is None:
+            cell_data = loaded.cell_data | ({} if image is None else cell_fields(mesh, image))
+        young, nu, density = moduli_in(cell_data, young, nu, density)
+        cell_data = {name: values for name, values in cell_data.items() if name not in MATERIAL_FIELDS}
+        loads = loads or _said(loads_in(loaded))
+        box = loaded.box if box is None else box
+        about = _texts_of(loaded, box) | (about or {})
+    order = 1 if order is None else order
     if order not in (1, 2):
         raise InputError(f"order: expected 1 or 2, got {order}")
     parse_average(average)
     if image is not None and image.ndim != mesh.ndim:
         raise InputError(f"image: expected a {mesh.ndim}-D one, as the mesh is, got a {image.ndim}-D one")
     cell_data = cell_fields(mesh, image) if cell_data is None else dict(cell_data)
+    about = _with_table_in_words(about or {})
     mean = cell_data.get("mean")
     mean = mean if mean is not None and mean.ndim == 1 else None
-    labels = labels_of(cell_data, len(mesh.cells))
-    names = table_of_words((about or {}).get(TABLE_TEXT)).names
-    if nu is None:
-        nu = young if isinstance(young, str) and has_column(young, "nu") else DEFAULT_NU
-    if density is None and isinstance(young, str) and has_column(young, "density"):
-        density = young
+    cells = _Cells(
+        mesh, image, mean, labels_of(cell_data, len(mesh.cells)), table_of_words(about.get(TABLE_TEXT)).names
+    )
     if known_sets is None:
         box = box_of(image) if box is None and image is not None else box
-        known_sets = standard_sets(mesh, box, labels, names)
+        known_sets = _sets(cells, box, cell_data, loaded, loads)
     all_sets = with_requested(mesh, known_sets, sets, mean)
     table, nodal, at_gauss = None, None, None
     if young is not None:
-        nodal, at_gauss = _varying_moduli(young, mesh, image, average, order)
-        if bins is not None and nodal is not None:
-            raise InputError(f"bins: moduli that vary in a cell have no groups; take another average than {average}")
-        at_gauss = None if bins is not None else at_gauss
-        cells = _Cells(mesh, image, mean, labels, names)
-        moduli = _values(young, "young", cells, average)
-        ratios = _values(nu, "nu", cells)
-        masses = None if density is None else _values(density, "density", cells)
-        table = materials(moduli, ratios, len(mesh.cells), masses)
-        if bins is not None:
-            table = binned(table, volumes(mesh.points, mesh.cells), bins, spacing)
+        nodal, at_gauss = _varying_moduli(young, mesh, image, average, order, bins)
+        table = _materials(cells, young, nu, density, average)
+        table = table if bins is None else binned(table, volumes(mesh.points, mesh.cells), bins, spacing)
     elif bins is not None:
         raise InputError("bins: there are no moduli to group; give --young")
     elif density is not None:
@@ -148,31 +169,75 @@ def model_of(
     parsed = parse_loads(loads, mesh, all_sets)
     if any(load.kind == "gravity" for load in parsed):
         density_of(table)  # or it is refused
-    return Model(
-        mesh, cell_data, all_sets, table, parsed, order, node_young=nodal, gauss_young=at_gauss, about=dict(about or {})
-    )
+    model = Model(mesh, cell_data, all_sets, table, parsed, order, node_young=nodal, gauss_young=at_gauss, about=about)
+    return model if loaded is None else _said(completed(model, loaded, is_of_file=is_of_file))
 
 
-def labels_of(cell_data: dict[str, NDArray], n_cells: int) -> NDArray[np.int64] | None:
-    """The field "label", (M,) int64, if it is there and holds whole numbers from 0, as other programs' may not."""
-    labels = cell_data.get("label")
-    if labels is None or labels.shape != (n_cells,) or not np.isfinite(labels).all():
-        return None
-    whole = labels.astype(np.int64)
-    return whole if (whole == labels).all() and whole.min() >= 0 else None
+def _said(answer: tuple[Any, str]) -> Any:
+    """An answer, of which what was left out becomes a warning."""
+    if answer[1]:
+        warnings.warn(answer[1], stacklevel=3)
+    return answer[0]
+
+
+def _to_be_kept(loaded: MeshFile, laws: list[Any], loads: Iterable[str]) -> MeshFile:
+    """The file without what a solver found, if moduli, densities or loads are to be others."""
+    return without_results(loaded) if loads or any(law is not None for law in laws) else loaded
+
+
+def _texts_of(loaded: MeshFile, box: Box | None) -> dict[str, Any]:
+    """The texts of a mesh's file that go on into the model."""
+    texts: dict[str, Any] = {name: text for name in TEXTS_KEPT if (text := loaded.text(name)) is not None}
+    if loaded.label_table.names or loaded.label_table.colours:
+        texts[TABLE_TEXT] = loaded.label_table
+    return texts if box is None else texts | {"box": box_text(box)}
+
+
+def _with_table_in_words(about: dict[str, Any]) -> dict[str, Any]:
+    """The texts with a table of labels as JSON can hold it."""
+    table = about.get(TABLE_TEXT)
+    return about | {TABLE_TEXT: table_words(table)} if isinstance(table, LabelTable) else dict(about)
+
+
+def _sets(
+    cells: _Cells, box: Box | None, cell_data: dict[str, NDArray], loaded: MeshFile | None, loads: Iterable[str]
+) -> Sets:
+    """The standard sets, and those of the mesh's file beside them."""
+    if loaded is None:
+        return standard_sets(cells.mesh, box, cells.labels, cells.names)
+    of_loads = {parse_load(text, cells.mesh.ndim).set_name for text in loads}
+    former = loaded.label_table.names
+    sets, renamed = sets_beside(cells.mesh, box, cell_data, loaded.sets, cells.names, former, of_loads)
+    for old, new in renamed.items():
+        warnings.warn(f'the mesh came with a set "{old}" of its own: it is {new} here', stacklevel=3)
+    return sets
+
+
+def _materials(cells: _Cells, young: Any, nu: Any, density: Any, average: str) -> Materials:
+    """The materials of laws; ratio and density by default of the columns of the file that the modulus names."""
+    if nu is None:
+        nu = young if isinstance(young, str) and has_column(young, "nu") else DEFAULT_NU
+    if density is None and isinstance(young, str) and has_column(young, "density"):
+        density = young
+    moduli = _values(young, "young", cells, average)
+    ratios = _values(nu, "nu", cells)
+    masses = None if density is None else _values(density, "density", cells)
+    return materials(moduli, ratios, len(cells.mesh.cells), masses)
 
 
 def _varying_moduli(
-    young: Any, mesh: Mesh, image: Image | None, average: str, order: int
+    young: Any, mesh: Mesh, image: Image | None, average: str, order: int, bins: int | None
 ) -> tuple[NDArray[np.float64] | None, NDArray[np.float64] | None]:
     """`node_young`, and moduli at Gauss points, of a law of the intensity; None but where the average has them."""
     law: Any = parse_any_law(young) if isinstance(young, str) else young
     place = parse_average(average).place
     if image is None or not (callable(law) or np.ndim(law) == 2):
         return None, None
+    if place == "nodes" and bins is not None:
+        raise InputError(f"bins: moduli that vary in a cell have no groups; take another average than {average}")
     return (
         node_young(image, mesh, law) if place == "nodes" else None,
-        element_young(image, mesh, law, average, order) if place == "gauss" and order == 2 else None,
+        element_young(image, mesh, law, average, order) if place == "gauss" and order == 2 and bins is None else None,
     )
 
 

@@ -7,6 +7,9 @@ import re
 from collections.abc import Iterable, Mapping
 from typing import Any, NamedTuple
 
+import numpy as np
+from numpy.typing import NDArray
+
 from tetopt.errors import InputError
 from tetopt.model.sets import label_set_names
 
@@ -75,6 +78,15 @@ def labels_named(text: str, names: Mapping[int, str]) -> list[int]:
     first = ", ".join(list(names.values())[:8]) + (", ..." if len(names) > 8 else "")
     hint = f"did you mean {' or '.join(near)}?" if near else f"there are {first}"
     raise InputError(f'label "{text}": no label is called so; {hint}')
+
+
+def labels_of(cell_data: Mapping[str, NDArray], n_cells: int) -> NDArray[np.int64] | None:
+    """The field "label", (M,) int64, if it is there and holds whole numbers from 0, as other programs' may not."""
+    labels = cell_data.get("label")
+    if labels is None or labels.shape != (n_cells,) or not np.isfinite(labels).all():
+        return None
+    whole = labels.astype(np.int64)
+    return whole if (whole == labels).all() and whole.min() >= 0 else None
 
 
 def table_words(table: LabelTable) -> dict[str, dict[str, str]]:

@@ -10,7 +10,7 @@ import re
 import unicodedata
 from collections import Counter
 from collections.abc import Iterable, Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -455,6 +455,11 @@ def merged_sets(standard: Sets, own: Sets) -> tuple[Sets, dict[str, str]]:
             if free != name:
                 renamed[name] = free
     return Sets(*parts), renamed
+
+
+def box_text(box: Box) -> dict[str, Any]:
+    """What `tetopt.io.vtk.box_in` reads, for a mesh's `about`."""
+    return {"shape": list(box.shape), "affine": box.affine.tolist()}
 
 
 def box_of(image: VoxelGrid) -> Box:

@@ -27,8 +27,9 @@ from tetopt.geometry.simplex import oriented
 from tetopt.geometry.topology import boundary_facets
 from tetopt.image import Image
 from tetopt.io.images import save_image, sha256
-from tetopt.io.meshes import MESH_SUFFIXES, MeshFile, load_mesh
+from tetopt.io.meshes import MESH_SUFFIXES, load_mesh
 from tetopt.mesh import Mesh
+from tetopt.model.file import MeshFile
 from tetopt.study.endings import Crashed, last_line, signal_words
 from tetopt.study.interfaces import class_labels
 from tetopt.study.pipelines import PIPELINES, Job, Pipeline, Produced

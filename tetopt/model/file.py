@@ -1,0 +1,218 @@
+"""What came with a mesh from its file, and what of it a model takes over."""
+
+from __future__ import annotations
+
+from collections.abc import Iterable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.incoming import json_of
+from tetopt.mesh import Mesh
+from tetopt.model.fields import GAUSS_MODULI, NODE_MODULI, is_result
+from tetopt.model.labels import TABLE_TEXT, LabelTable, labels_of, table_of_words
+from tetopt.model.laws import checked_young
+from tetopt.model.loads import load_words, parse_load
+from tetopt.model.materials import BinningError
+from tetopt.model.model import STRESS_UNITS, Model, half_turned, scaled
+from tetopt.model.sets import Box, Sets, label_sets, merged_sets, standard_sets
+
+MATERIAL_FIELDS = ("young", "nu", "density", "material", GAUSS_MODULI)  # of cells of a file of ours
+MODULUS_ROUNDING = 1e-9  # relative: of a cell's modulus beside those at its Gauss points, in files of other units
+TEXTS_KEPT = ("image", "image_sha256", "inputs", "options")  # of a mesh's file that go on into the new one
+
+
+class MeshFile(NamedTuple):
+    """A mesh read from a file and what came with it.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        RAS+ mm.
+    cell_data : dict of arrays
+        By name, one row a cell; "young", if the file has it, in kPa.
+    field_data : dict of arrays
+        By name, of any length; bytes of UTF-8 have become one string.
+    n_turned : int
+        Cells that were oriented the other way in the file.
+    n_left : int
+        Cells of lower dimension, triangles on tetrahedra among them, that were left out.
+    sets : Sets
+        Of facets and cells, by name.
+    box : Box, optional
+        Of the image that the mesh was made from.
+    space : {"ras", "lps"}
+        Of the file: from "lps" the mesh has been turned to RAS+.
+    notes : tuple of str
+        What was left out or renamed, a line each.
+    order : {1, 2}
+        Of the file's cells; of those of order 2 the mesh has the corners.
+    point_data : dict of arrays
+        By name, a row for each node of the order.
+
+    Examples
+    --------
+    >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> tetopt.save_mesh("ball.vtk", mesh)
+    >>> file = tetopt.load_mesh("ball.vtk")
+    >>> len(file.mesh.cells), file.n_turned, file.space, file.order
+    (1200, 0, 'ras', 1)
+    """
+
+    mesh: Mesh
+    cell_data: dict[str, NDArray]
+    field_data: dict[str, NDArray]
+    n_turned: int
+    n_left: int = 0
+    sets: Sets = Sets({}, {})
+    box: Box | None = None
+    space: str = "ras"
+    notes: tuple[str, ...] = ()
+    order: int = 1
+    point_data: dict[str, NDArray] = {}  # noqa: RUF012 - nobody changes it
+
+    def text(self, name: str) -> str | None:
+        """A text among the field data, if it is there.
+
+        Parameters
+        ----------
+        name : str
+            Of the field data.
+
+        Returns
+        -------
+        str or None
+            None if it is not there, or no text.
+
+        Examples
+        --------
+        >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+        >>> mesh = tetopt.lattice(image, nodes=300)
+        >>> tetopt.save_mesh("ball.vtu", mesh, about={"subject": "sub-01"})
+        >>> tetopt.load_mesh("ball.vtu").text("subject")
+        'sub-01'
+        """
+        return text_in(self.field_data, name)
+
+    @property
+    def label_table(self) -> LabelTable:
+        """Names and colours of labels that the file keeps; empty without any."""
+        return table_in(self.text(TABLE_TEXT))
+
+
+def text_in(field_data: dict[str, NDArray], name: str) -> str | None:
+    """A text among a file's field data."""
+    values = field_data.get(name, np.empty(0))
+    return str(values.ravel()[0]) if values.dtype.kind == "U" and values.size else None
+
+
+def table_in(text: str | None) -> LabelTable:
+    """The table in a text of a mesh's file, as `tetopt.model.labels.table_words` has it; empty for any other text."""
+    try:
+        return table_of_words(json_of(text or "{}"))
+    except ValueError:  # another program's
+        return table_of_words({})
+
+
+def sets_beside(
+    mesh: Mesh,
+    box: Box | None,
+    fields: Mapping[str, NDArray],
+    own: Sets,
+    names: Mapping[int, str],
+    former: Mapping[int, str] | None = None,
+    kept: Iterable[str] = (),
+) -> tuple[Sets, dict[str, str]]:
+    """The standard sets and the mesh's own; and which of the latter had to be called otherwise, by old name.
+
+    Labels are called as `names` says. Sets of labels, and interfaces, under their numbers or `former` names are not
+    there a second time, but those that loads name (`kept`).
+    """
+    labels = labels_of(fields, len(mesh.cells))
+    if labels is not None and names and (own.facets or own.cells):
+        for others in {id(each): each for each in ({}, former or {}) if each != names}.values():
+            of_labels = label_sets(mesh, labels, others)
+            own = Sets(*(
+                {
+                    name: rows for name, rows in mine.items()
+                    if name in kept or not np.array_equal(rows, anew.get(name, np.empty(0)))
+                }
+                for mine, anew in zip(own, of_labels, strict=True)
+            ))  # fmt: skip
+    return merged_sets(standard_sets(mesh, box, labels, names), own)
+
+
+def loads_in(loaded: MeshFile) -> tuple[list[str], str]:
+    """The loads that a file of ours holds, in the words of --load, in RAS+ and kPa, if their sets are there still; and
+    in words why there are none, if so."""
+    try:
+        words = json_of(loaded.text("loads") or "[]")
+        loads = [parse_load(text, loaded.mesh.ndim) for text in words]
+    except (ValueError, TypeError, AttributeError):  # another program's
+        return [], ""
+    if lost := [load.set_name for load in loads if load.set_name and load.set_name not in loaded.sets.facets]:
+        return [], f"the file's loads are left out: it no longer has the sets {', '.join(lost)}"
+    factor = STRESS_UNITS.get(loaded.text("units") or "", STRESS_UNITS["kPa"]).kPa
+    turned = [half_turned(load) if loaded.space == "lps" else load for load in loads]
+    return [load_words(scaled(load, factor)) for load in turned], ""
+
+
+def moduli_in(cell_data: Mapping[str, NDArray], young: Any, nu: Any, density: Any) -> tuple[Any, Any, Any]:
+    """Laws of modulus, ratio and density; without the first those that the cells have, whichever is not stated."""
+    if young is not None or "young" not in cell_data:
+        return young, nu, density
+    stated = {"nu": nu, "density": density}
+    for name, law in stated.items():
+        if law is None and name in cell_data:
+            stated[name] = np.asarray(cell_data[name], dtype=np.float64)
+    return np.asarray(cell_data["young"], dtype=np.float64), stated["nu"], stated["density"]
+
+
+def completed(model: Model, loaded: MeshFile, *, is_of_file: bool) -> tuple[Model, str]:
+    """The model with what the mesh's file alone has: data at nodes and, if the moduli are the file's, those that vary
+    within cells, and the error of those that stand for more; and in words what of it does not fit."""
+    model = model._replace(point_data={name: rows for name, rows in loaded.point_data.items() if name != NODE_MODULI})
+    if (table := model.materials) is None or not is_of_file:
+        return model, ""
+    if (moduli := loaded.point_data.get(NODE_MODULI)) is not None:
+        model = model._replace(node_young=checked_young(moduli[: len(model.mesh.points)]))
+    table = table._replace(binning=_binning_error(loaded))
+    at_gauss = _gauss_moduli(model, loaded)
+    lost = at_gauss is None and model.order == 2 and GAUSS_MODULI in loaded.cell_data
+    words = f"{GAUSS_MODULI} of the mesh's file is left out: it does not belong to its cells and their young"
+    return model._replace(materials=table, gauss_young=at_gauss), words if lost else ""
+
+
+def _binning_error(loaded: MeshFile) -> BinningError | None:
+    """How far the moduli of a file of ours are from those that they stand for, if it tells."""
+    try:
+        words = json_of(loaded.text("binning") or "{}")
+        return BinningError(float(words["mean"]), float(words["largest"]))
+    except (ValueError, TypeError, KeyError, RecursionError):  # there is none, or it is another program's
+        return None
+
+
+def _gauss_moduli(model: Model, loaded: MeshFile) -> NDArray[np.float64] | None:
+    """The moduli at Gauss points (M, Q) that a file of ours holds, if they are still those of its cells."""
+    moduli = loaded.cell_data.get(GAUSS_MODULI)
+    if moduli is None or model.order == 1 or model.materials is None:
+        return None
+    of_cell, shape = model.materials.young[model.materials.of_cell], (len(model.mesh.cells), model.mesh.ndim + 1)
+    # A cell's own modulus is a mean of these; columns go by a cell's nodes, which turning exchanges.
+    if moduli.shape == shape and not loaded.n_turned:
+        low, high = moduli.min(axis=1), moduli.max(axis=1)
+        if ((1.0 - MODULUS_ROUNDING) * low <= of_cell).all() and (of_cell <= (1.0 + MODULUS_ROUNDING) * high).all():
+            checked_young(low)
+            return np.asarray(moduli, dtype=np.float64)
+    return None
+
+
+def without_results(loaded: MeshFile) -> MeshFile:
+    """The mesh's file without what a solver found on its cells and nodes."""
+    cell_data, point_data = (
+        {name: rows for name, rows in data.items() if not is_result(name)}
+        for data in (loaded.cell_data, loaded.point_data)
+    )
+    return loaded._replace(cell_data=cell_data, point_data=point_data)
