@@ -6,7 +6,11 @@ The libraries are imported where they are needed: a mesh alone takes none of the
 from __future__ import annotations
 
 import importlib
+import importlib.util
+import os
+import sys
 from collections.abc import Collection, Mapping
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
@@ -15,6 +19,7 @@ from numpy.typing import ArrayLike, NDArray
 from tetopt.errors import InputError
 from tetopt.extras import install_hint
 from tetopt.geometry.simplex import oriented
+from tetopt.notebook import in_kernel
 
 if TYPE_CHECKING:
     from vtkmodules.vtkCommonDataModel import vtkFieldData, vtkUnstructuredGrid
@@ -312,3 +317,25 @@ def to_trimesh(points: NDArray[np.float64], triangles: NDArray[np.int64]) -> Any
     trimesh = library("trimesh", "to_trimesh")
     used, faces = np.unique(triangles, return_inverse=True)
     return trimesh.Trimesh(points[used], faces.reshape(triangles.shape), process=False)
+
+
+def show_grid(
+    grid: Any, name: str | None, screenshot: str | Path | None, off_screen: bool | None, look: dict[str, Any]
+) -> Any:
+    """Show one of pyvista's grids, coloured by its field of a name; see `tetopt.mesh.Mesh.plot`."""
+    pyvista = library("pyvista", "plot")
+    if off_screen is None:
+        has_none = sys.platform == "linux" and not (os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+        off_screen = pyvista.OFF_SCREEN or (has_none and not in_kernel())
+    plotter = pyvista.Plotter(off_screen=off_screen or screenshot is not None)
+    colour = {"scalars": name} if name is not None else {"color": "lightblue"}
+    plotter.add_mesh(grid, **({"show_edges": True} | colour | look))
+    if grid.bounds[4] == grid.bounds[5]:  # a 2-D mesh
+        plotter.view_xy()
+    if off_screen or screenshot is not None:
+        picture = plotter.screenshot(None if screenshot is None else str(screenshot), return_img=True)
+        plotter.close()
+        return picture
+    has_trame = importlib.util.find_spec("trame") is not None
+    plotter.show(jupyter_backend="static" if in_kernel() and not has_trame else None)
+    return None

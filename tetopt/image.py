@@ -9,6 +9,7 @@ from math import prod
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from tetopt import notebook
 from tetopt.errors import InputError
 
 SINGULAR_DETERMINANT = 1e-6  # of the axes' directions: with less they do not span the space
@@ -151,6 +152,21 @@ class Image(VoxelGrid):
     def shape(self) -> tuple[int, ...]:
         """Number of voxels along each axis."""
         return self.data.shape
+
+    def __repr__(self) -> str:
+        return f"Image({self._size()}, {self.data.dtype}, {self.data.min():.4g} to {self.data.max():.4g})"
+
+    def _size(self) -> str:
+        """Number and size of voxels."""
+        counts, sides = (" x ".join(f"{each:.4g}" for each in numbers) for numbers in (self.shape, self.spacing))
+        return f"{counts} voxels of {sides} mm"
+
+    def _repr_html_(self) -> str:
+        """Numbers and the middle slice, for a notebook."""
+        low, high, mean = self.data.min(), self.data.max(), self.data.mean(dtype=np.float64)
+        rows = [("size", self._size()), ("intensities", f"{low:.4g} to {high:.4g}, mean {mean:.4g}")]
+        rows += [("kind", str(self.data.dtype))]
+        return notebook.card_html("Image", rows, notebook.slice_html(self.data, self.affine))
 
 
 def transformed(vectors: NDArray[np.float64], matrix: NDArray[np.float64]) -> NDArray[np.float64]:

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from tetopt import conversions
+from tetopt import conversions, notebook
 from tetopt.conversions import MESHIO_KINDS, VTK_KINDS, Fields
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
@@ -89,6 +90,68 @@ class Mesh:
     def ndim(self) -> int:
         """Number of space dimensions n, 2 or 3."""
         return self.points.shape[1]
+
+    def __repr__(self) -> str:
+        kind = "tetrahedra" if self.ndim == 3 else "triangles"
+        return f"Mesh({len(self.points)} nodes, {len(self.cells)} {kind}, {notebook.extent_words(self.points)})"
+
+    def _repr_html_(self) -> str:
+        """Numbers and the middle section, for a notebook."""
+        picture = notebook.section_html(self.points, self.cells)
+        return notebook.card_html("Mesh", notebook.mesh_rows(self.points, self.cells), picture)
+
+    def plot(
+        self,
+        values: ArrayLike | None = None,
+        *,
+        cut: bool = True,
+        name: str = "values",
+        screenshot: str | Path | None = None,
+        off_screen: bool | None = None,
+        **look: Any,
+    ) -> Any:
+        """Show the mesh in 3-D by pyvista: in a window, in a notebook, or as a picture.
+
+        Parameters
+        ----------
+        values : (M,) or (N,) array, optional
+            A number for each cell, or else each node, that colours it.
+        cut : bool
+            Leave out the cells of the right, front, upper octant of a 3-D mesh, so that its inside shows.
+        name : str
+            What the values are called beside the scale of colours.
+        screenshot : str or Path, optional
+            A picture file to write, such as ".png"; no window opens.
+        off_screen : bool, optional
+            True: open no window and return a picture. By default pyvista's own setting, and True where Linux has no
+            display.
+        **look
+            Further options of `pyvista.Plotter.add_mesh`, such as `cmap="gray"` or `show_edges=False`.
+
+        Returns
+        -------
+        (height, width, 3) array of uint8, or None
+            The picture, if no window opened. A notebook has a view that turns where trame is installed, else a picture.
+
+        Raises
+        ------
+        InputError
+            Neither a number for each cell nor for each node.
+
+        Examples
+        --------
+        >>> mesh = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 2, 3]])
+        >>> mesh.plot([2.5], off_screen=True).shape  # doctest: +SKIP
+        (768, 1024, 3)
+        """
+        colours = {} if values is None else {name: np.asarray(values)}
+        on_cells = values is None or len(colours[name]) == len(self.cells)
+        grid = self.to_pyvista(colours) if on_cells else self.to_pyvista(point_data=colours)
+        if cut and self.ndim == 3:
+            centres = self.points[self.cells].mean(axis=1)
+            is_beyond = (centres > 0.5 * (self.points.min(axis=0) + self.points.max(axis=0))).all(axis=1)
+            grid = grid if is_beyond.all() else grid.extract_cells(np.flatnonzero(~is_beyond))
+        return conversions.show_grid(grid, next(iter(colours), None), screenshot, off_screen, look)
 
     def to_pyvista(self, cell_data: Fields | None = None, point_data: Fields | None = None) -> pyvista.UnstructuredGrid:
         """The mesh for pyvista, with data; a 2-D mesh lies in the plane z = 0.

@@ -17,6 +17,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt import notebook
 from tetopt.energy.sampling import cell_moments, cell_of_voxel, channel_grid, from_ticks
 from tetopt.engine.complex import State, copied, interface_energy, node_rings, remeasure
 from tetopt.engine.density import Limits, exchange
@@ -116,7 +117,8 @@ def optimize(
         Stop at the next colour of nodes after this time; the mesh is valid, and its floor is seen to, which, like the
         flips of an iteration, takes its time besides.
     callback : callable, optional
-        Called with each `Record`. Its E_G is the weighted one, its `is_retessellated` whether cells were exchanged.
+        Called with each `Record`; without one a notebook shows a bar. Its E_G is the weighted one, its
+        `is_retessellated` whether cells were exchanged.
     stop : callable, optional
         Asked between colours of nodes; True ends the run there.
 
@@ -160,9 +162,12 @@ def optimize(
     # Iterations in which nodes may be exchanged: shape alone does not say where there should be more.
     n_early = int(EXCHANGING_SHARE * iterations) if k_D > 0.0 or sizes.has_target else 0
     course = Course(1, iterations, iterations, n_early, floor, tolerance, nodes, sizes)
-    history, ended = followed(run, course, is_over, begin, callback)
+    bar = notebook.bar_of_run(iterations) if callback is None else None
+    history, ended = followed(run, course, is_over, begin, callback if bar is None else bar)
     if ended == "over":
         ended = "stopped" if stop is not None and stop() else "max_seconds"
+    if bar is not None:
+        bar.end(history[-1], ended)
     return promised(Optimized(run.mesh(), history, ended, labels=run.labels()), content, floor, mesh)
 
 

@@ -10,6 +10,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt import notebook
 from tetopt.energy.sampling import SamplingGrid
 from tetopt.geometry.box import facets_on_sides
 from tetopt.geometry.topology import Facets, boundary_facets
@@ -133,6 +134,20 @@ class Optimized(NamedTuple):
     seconds_run: float = 0.0
     labels: NDArray[np.int64] | None = None
     missed: Mapping[str, str] = MappingProxyType({})
+    share: float | None = None  # of the content's variance that is left in the cells: E_D over variance times volume
+
+    def _repr_html_(self) -> str:
+        """Numbers of the run and of its mesh, with the middle section, for a notebook."""
+        last, mesh = self.history[-1], self.mesh
+        share = "" if self.share is None else f", {self.share:.4g} of the variance is left within cells"
+        rows = [
+            ("E", f"{last.E:.4g} of the initial mesh's, after {last.iteration} iterations ({self.ended})"),
+            ("E_D", f"{last.E_D:.4g} intensity^2 mm^{mesh.ndim}{share}"),
+            ("time", f"{self.seconds_start + (self.seconds_run or last.seconds):.1f} s"),
+            *notebook.mesh_rows(mesh.points, mesh.cells),
+            *(("misses", f"{name}: {words}") for name, words in self.missed.items()),
+        ]
+        return notebook.card_html("Optimized", rows, notebook.section_html(mesh.points, mesh.cells))
 
 
 def deadline(begin: float, max_seconds: float | None, stop: Callable[[], bool] | None) -> Callable[[], bool]:

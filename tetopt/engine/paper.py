@@ -9,6 +9,7 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt import notebook
 from tetopt.check import filled_share
 from tetopt.energy.discretization import E_D_of_sums, combined
 from tetopt.energy.geometric import cell_E_G
@@ -137,6 +138,8 @@ def optimize_paper(
     E_G0, E_D0 = _energies(tessellation, image, rounding)
     scheme = _scheme(image, grid, k_D, E_G0, E_D0, step_ratio)
     history: list[Record] = []
+    bar = notebook.bar_of_run(iterations) if callback is None else None
+    callback = callback or bar
 
     def record(iteration: int, movement: float, is_new: bool) -> None:
         E_G, E_D = _energies(tessellation, image, rounding)
@@ -171,6 +174,8 @@ def optimize_paper(
         if movement < tolerance and not is_new:
             ended = "converged"
             break
+    if bar is not None:
+        bar.end(history[-1], ended)
     points = image.to_world(from_ticks(tessellation.ticks, grid, image.ndim))
     return promised(Optimized(Mesh(points, tessellation.cells), history, ended), plain(image), 0.0, mesh)
 

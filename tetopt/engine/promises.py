@@ -89,7 +89,8 @@ def requested(result: Optimized, content: Content, target_error: float | None, i
             f"{share:.4g} of the image's variance is left in the cells, more than {target_error:g}; allow smaller "
             "cells or more iterations, or ask for a number of nodes"
         )
-    return result._replace(missed=missed | (_missed_box(content.image, result) if is_filled else {}))
+    missed |= _missed_box(content.image, result) if is_filled else {}
+    return result._replace(missed=missed, share=share)
 
 
 def _missed_box(image: VoxelGrid, result: Optimized) -> dict[str, str]:

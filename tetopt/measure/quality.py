@@ -7,6 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt import notebook
 from tetopt.geometry.simplex import Cells, Points, dihedral_angles, rho, squared_edges, volumes
 
 BAD_SHAPE = 0.3  # n rho below which a cell counts as bad: 1 is the regular simplex
@@ -164,6 +165,20 @@ class Quality(NamedTuple):
     kinds: dict[str, int]
     min_edge: float
     max_edge: float
+
+    def _repr_html_(self) -> str:
+        """The numbers as a table, for a notebook."""
+        rows = [
+            ("nodes", f"{self.n_nodes:,}"),
+            ("cells", f"{self.n_cells:,}"),
+            ("volume", f"{self.volume:.6g} mm^{self.ndim}"),
+            ("rho", f"mean {self.mean_rho:.3f}, 1st percentile {self.p1_rho:.3f}, least {self.min_rho:.3f}"),
+            ("angles", f"{self.min_dihedral:.1f} to {self.max_dihedral:.1f} degrees"),
+            ("under 10 degrees", f"{self.n_under_10_degrees:,} cells"),
+            ("badly shaped", ", ".join(f"{count:,} {kind}s" for kind, count in self.kinds.items() if count) or "none"),
+            ("edges", f"{self.min_edge:.4g} to {self.max_edge:.4g} mm"),
+        ]
+        return notebook.card_html("Quality", rows)
 
 
 def _of_cells(points: Points, cells: Cells) -> tuple[NDArray[np.float64], ...]:

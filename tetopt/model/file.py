@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt import notebook
 from tetopt.incoming import json_of
 from tetopt.mesh import Mesh
 from tetopt.model.fields import GAUSS_MODULI, NODE_MODULI, is_result
@@ -95,6 +96,18 @@ class MeshFile(NamedTuple):
         'sub-01'
         """
         return text_in(self.field_data, name)
+
+    def _repr_html_(self) -> str:
+        """What the file holds, with the middle section by its means, for a notebook."""
+        mesh, means = self.mesh, self.cell_data.get("mean")
+        rows = notebook.mesh_rows(mesh.points, mesh.cells)
+        rows += [("data of cells", ", ".join(self.cell_data) or "none")]
+        rows += [("data of nodes", ", ".join(self.point_data) or "none")]
+        rows += [("sets", ", ".join([*self.sets.facets, *self.sets.cells]) or "none")]
+        rows += [("labels", ", ".join(self.label_table.names.values()))] if self.label_table.names else []
+        rows += [("note", note) for note in self.notes]
+        values = means if means is not None and means.ndim == 1 else None
+        return notebook.card_html("MeshFile", rows, notebook.section_html(mesh.points, mesh.cells, values))
 
     @property
     def label_table(self) -> LabelTable:

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt import conversions
+from tetopt import conversions, notebook
 from tetopt.conversions import MESHIO_KINDS, VTK_KINDS
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import of_order, quadratic_facet_nodes
@@ -21,7 +21,7 @@ from tetopt.model.fields import (
     node_field,
     stresses_times,
 )
-from tetopt.model.loads import FACET_FORCES, Load
+from tetopt.model.loads import FACET_FORCES, Load, load_words
 from tetopt.model.materials import Materials
 from tetopt.model.sets import Sets, facet_triples
 from tetopt.model.skfem import skfem_mesh
@@ -109,6 +109,20 @@ class Model(NamedTuple):
     is_nonlinear: bool = False
     about: dict[str, Any] = {}  # noqa: RUF012 - nobody changes it
     point_data: dict[str, NDArray] = {}  # noqa: RUF012 - nobody changes it
+
+    def _repr_html_(self) -> str:
+        """What the model holds, with the middle section by mean or modulus, for a notebook."""
+        mesh, table = self.mesh, self.materials
+        rows = notebook.mesh_rows(mesh.points, mesh.cells)
+        rows += [("order", str(self.order)), ("sets of facets", ", ".join(self.sets.facets) or "none")]
+        rows += [("sets of cells", ", ".join(self.sets.cells) or "none")]
+        if table is not None:
+            rows += [("materials", str(len(table.young)))]
+            rows += [("Young's modulus", f"{table.young.min():.4g} to {table.young.max():.4g} {self.units}")]
+            rows += [("Poisson's ratio", f"{table.nu.min():.4g} to {table.nu.max():.4g}")]
+        rows += [("loads", ", ".join(load_words(load) for load in self.loads) or "none")]
+        values = self.cell_data.get("mean") if table is None else table.young[table.of_cell]
+        return notebook.card_html("Model", rows, notebook.section_html(mesh.points, mesh.cells, values))
 
     def to_skfem(self) -> skfem.Mesh:
         """The mesh for scikit-fem, with the sets; see `tetopt.model.skfem.skfem_mesh`.
