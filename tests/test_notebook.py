@@ -28,9 +28,8 @@ def ball():
 def test_a_mesh_is_one_line_and_a_card(n):
     mesh = sample_model(n).mesh
     kind = {2: "triangles", 3: "tetrahedra"}[n]
-    assert re.fullmatch(
-        rf"Mesh\({len(mesh.points)} nodes, {len(mesh.cells)} {kind}, [\d.]+( x [\d.]+)+ mm\)", repr(mesh)
-    )
+    counts = f"{len(mesh.points)} nodes, {len(mesh.cells)} {kind}"
+    assert re.fullmatch(rf"Mesh\({counts}, [\d.]+( x [\d.]+)+ mm\)", repr(mesh))
     card = mesh._repr_html_()
     assert "<td" in card
     assert f"{len(mesh.cells):,}" in card
@@ -61,14 +60,14 @@ def test_pictures_are_small_however_many_cells_there_are():
 
 
 def test_values_that_are_no_numbers_are_dark():
-    assert notebook.greys(np.array([np.nan, 0.0, np.inf, 1.0]))[[0, 2]].tolist() == [notebook.DARKEST_GREY] * 2
+    assert notebook.greys(np.array([np.nan, 0.0, -np.inf, 1.0]))[[0, 2]].tolist() == [notebook.DARKEST_GREY] * 2
     assert len(set(notebook.greys(np.full(4, np.nan)).tolist())) == 1
     assert len(set(notebook.greys(np.ones(4)).tolist())) == 1
 
 
 def test_a_plane_between_two_pieces_has_no_picture():
     points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
-    mesh = tetopt.Mesh(np.vstack([points, points + [0.0, 0.0, 9.0]]), [[0, 1, 2, 3], [4, 5, 6, 7]])
+    mesh = tetopt.Mesh(np.vstack([points, points + np.array([0.0, 0.0, 9.0])]), [[0, 1, 2, 3], [4, 5, 6, 7]])
     assert "<img" not in mesh._repr_html_()
     assert "<table" in mesh._repr_html_()
 
@@ -106,7 +105,7 @@ def test_models_files_and_qualities_show_what_they_hold(tmp_path):
     assert "min_dihedral" in card
     assert "Materials" not in quadratic_model(2)._replace(materials=None)._repr_html_()
     card = tetopt.quality(model.mesh.points, model.mesh.cells)._repr_html_()
-    assert f"{len(model.mesh.cells):,} cells" in card or "<td" in card
+    assert f"{len(model.mesh.cells):,}" in card
     assert "1st percentile" in card
 
 
@@ -159,6 +158,7 @@ def test_a_mesh_is_plotted_off_screen(opengl, tmp_path):
         mesh.plot([1.0, 2.0], off_screen=True)
 
 
+@pytest.mark.slow
 def test_in_a_real_kernel():
     """A cell shows a card, a bar that ends, and a static picture without trame; nothing is printed."""
     nbformat = pytest.importorskip("nbformat")

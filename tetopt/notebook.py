@@ -114,7 +114,7 @@ def _drawn(corners: NDArray[np.float64], values: NDArray | None) -> PIL.Image.Im
 
 
 def greys(values: NDArray) -> NDArray[np.int64]:
-    """Numbers as greys between the darkest and the brightest; what is no number is the darkest."""
+    """Numbers as greys between the darkest and the brightest; NaN is the darkest."""
     finite = values[np.isfinite(values)]
     low, high = np.quantile(finite, GREY_QUANTILES) if finite.size else (0.0, 0.0)
     share = np.clip((values - low) / (high - low), 0.0, 1.0) if high > low else np.full(values.shape, 0.5)
