@@ -31,7 +31,7 @@ MANY_SECTIONED = 4000  # cells of a section beyond which their edges would hide 
 CELL_COLOUR, EDGE_COLOUR = (150, 190, 225, 255), (40, 90, 160, 255)
 DARKEST_GREY, BRIGHTEST_GREY = 30, 245  # of values: neither is the page's black or white
 GREY_QUANTILES = (0.01, 0.99)  # of values, drawn as those two: single cells do not take the contrast away
-TABLE_STYLE = "border-collapse:collapse;margin:0"
+TABLE_STYLE = "border-collapse:collapse;margin:0;color:inherit"
 CELL_STYLE = "text-align:left;padding:0.15em 0.8em 0.15em 0;vertical-align:top;background:none;color:inherit"
 
 
