@@ -7,11 +7,13 @@ cells there are.
 from __future__ import annotations
 
 import base64
+import functools
 import html
+import inspect
 import io
 import sys
-from collections.abc import Iterable
-from typing import TYPE_CHECKING, Any
+from collections.abc import Callable, Iterable
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,6 +23,8 @@ from tetopt.geometry.simplex import dihedral_angles, rho
 
 if TYPE_CHECKING:
     import PIL.Image
+
+R = TypeVar("R")
 
 PICTURE_PIXELS = 320  # the longer side of a picture: beside a table of numbers
 DRAWN_SCALE = 2  # drawn so many times larger, and made smaller: smooth edges
@@ -186,6 +190,20 @@ class Bar:
         return {"text/plain": f"tetopt: {words}", "text/html": f"<div>{bar} {_escaped(words)}</div>"}
 
 
-def bar_of_run(iterations: int) -> Bar | None:
-    """A bar in a notebook; None elsewhere."""
-    return Bar(iterations) if in_kernel() else None
+def with_bar(function: Callable[..., R]) -> Callable[..., R]:
+    """A function of a `callback` of records that in a notebook, without another callback, shows a bar.
+
+    It takes `iterations` and `callback` by name, and returns what has `history` and `ended`.
+    """
+    default = inspect.signature(function).parameters["iterations"].default
+
+    @functools.wraps(function)
+    def call(*args: Any, **options: Any) -> R:
+        if options.get("callback") is not None or not in_kernel():
+            return function(*args, **options)
+        bar = Bar(options.get("iterations", default))
+        result: Any = function(*args, **(options | {"callback": bar}))
+        bar.end(result.history[-1], result.ended)
+        return result
+
+    return call

@@ -17,7 +17,6 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt import notebook
 from tetopt.energy.sampling import cell_moments, cell_of_voxel, channel_grid, from_ticks
 from tetopt.engine.complex import State, copied, interface_energy, node_rings, remeasure
 from tetopt.engine.density import Limits, exchange
@@ -45,6 +44,7 @@ from tetopt.geometry.simplex import volumes
 from tetopt.image import Image, transformed
 from tetopt.kernels import link, roots
 from tetopt.mesh import Mesh
+from tetopt.notebook import with_bar
 from tetopt.start.lattice import lattice
 from tetopt.start.sizes import Sizes
 from tetopt.target.content import Content, plain
@@ -62,6 +62,7 @@ ATTRACTED_FLOOR = 4.0  # degrees: cells may be as flat, if not the floor is lowe
 FAR_TICKS = -(1 << 40)  # a place far from any other
 
 
+@with_bar
 def optimize(
     image: Image | Content,
     mesh: Mesh,
@@ -162,12 +163,9 @@ def optimize(
     # Iterations in which nodes may be exchanged: shape alone does not say where there should be more.
     n_early = int(EXCHANGING_SHARE * iterations) if k_D > 0.0 or sizes.has_target else 0
     course = Course(1, iterations, iterations, n_early, floor, tolerance, nodes, sizes)
-    bar = notebook.bar_of_run(iterations) if callback is None else None
-    history, ended = followed(run, course, is_over, begin, callback if bar is None else bar)
+    history, ended = followed(run, course, is_over, begin, callback)
     if ended == "over":
         ended = "stopped" if stop is not None and stop() else "max_seconds"
-    if bar is not None:
-        bar.end(history[-1], ended)
     return promised(Optimized(run.mesh(), history, ended, labels=run.labels()), content, floor, mesh)
 
 

@@ -9,7 +9,6 @@ from typing import Literal
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt import notebook
 from tetopt.check import filled_share
 from tetopt.energy.discretization import E_D_of_sums, combined
 from tetopt.energy.geometric import cell_E_G
@@ -45,12 +44,14 @@ from tetopt.geometry.simplex import squared_edges, volumes
 from tetopt.geometry.topology import Facets, facets, greedy_colours, rings, stars
 from tetopt.image import Image
 from tetopt.mesh import Mesh
+from tetopt.notebook import with_bar
 from tetopt.start.delaunay import delaunay
 from tetopt.target.content import plain
 
 Retessellate = Literal["first", "accept", "never"]
 
 
+@with_bar
 def optimize_paper(
     image: Image,
     mesh: Mesh,
@@ -138,8 +139,6 @@ def optimize_paper(
     E_G0, E_D0 = _energies(tessellation, image, rounding)
     scheme = _scheme(image, grid, k_D, E_G0, E_D0, step_ratio)
     history: list[Record] = []
-    bar = notebook.bar_of_run(iterations) if callback is None else None
-    callback = callback or bar
 
     def record(iteration: int, movement: float, is_new: bool) -> None:
         E_G, E_D = _energies(tessellation, image, rounding)
@@ -174,8 +173,6 @@ def optimize_paper(
         if movement < tolerance and not is_new:
             ended = "converged"
             break
-    if bar is not None:
-        bar.end(history[-1], ended)
     points = image.to_world(from_ticks(tessellation.ticks, grid, image.ndim))
     return promised(Optimized(Mesh(points, tessellation.cells), history, ended), plain(image), 0.0, mesh)
 
