@@ -142,7 +142,8 @@ def test_what_is_named_exists(path):
     files = {name for name in names if re.search(r"\.(vtu|toml|scn|nii|inp|feb|py|md|json|html)$", name)}
     assert sorted(name for name in names - files if not exists(name)) == []
     named = re.findall(r"`((?:tetopt|tests|docs|scripts|phantoms)/[\w./]+)`", text_of(path))
-    assert sorted({name for name in named if not (ROOT / name).exists()}) == []
+    built = {name for name in named if name.startswith("docs/_build")}  # by `make docs`
+    assert sorted({name for name in named if not (ROOT / name).exists()} - built) == []
 
 
 def test_variables_are_nouns():
