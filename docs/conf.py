@@ -69,6 +69,7 @@ html_theme = "pydata_sphinx_theme"
 html_title = f"tetopt {release}"
 html_static_path = ["_static"]
 html_css_files = ["tetopt.css"]
+html_favicon = "_static/favicon.svg"
 html_copy_source = False
 html_show_sourcelink = False
 html_theme_options = {
