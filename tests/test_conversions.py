@@ -64,11 +64,26 @@ def test_data_go_with_the_mesh(n):
 @pytest.mark.parametrize("convert", ["to_pyvista", "to_meshio"])
 def test_data_that_do_not_fit_are_one_line(convert):
     mesh = sample_model(3).mesh
-    for data in ([1.0, 2.0], ["a"] * len(mesh.cells), 3.0, None):
+    ragged = [[1.0, 2.0]] + [[1.0]] * (len(mesh.cells) - 1)
+    for data in ([1.0, 2.0], ["a"] * len(mesh.cells), 3.0, None, ragged, np.zeros((len(mesh.cells), 0))):
         with pytest.raises(InputError, match=r"^cell_data: 'a\\nb': expected an array of numbers with \d+ rows, got "):
             getattr(mesh, convert)({"a\nb": data})
     with pytest.raises(InputError, match=r"^point_data: 'u': expected an array of numbers with \d+ rows"):
         getattr(mesh, convert)(point_data={"u": np.zeros(len(mesh.cells) + 1)})
+    with pytest.raises(InputError, match=r"^cell_data: expected a text as the name of data, got 3"):
+        getattr(mesh, convert)({3: np.zeros(len(mesh.cells))})
+    with pytest.raises(InputError, match=r"^point_data: expected a dict of arrays by name, got ndarray"):
+        getattr(mesh, convert)(point_data=np.zeros(len(mesh.points)))
+
+
+@pytest.mark.parametrize("kind", [">f8", ">f4", ">i4", ">u2", "f2", "g"])
+def test_numbers_of_any_bytes_are_the_same_numbers(kind, tmp_path):
+    """As files of other machines have them; VTK would take their bytes for others."""
+    mesh = sample_model(3).mesh
+    values = np.arange(len(mesh.cells)).astype(kind)
+    assert mesh.to_pyvista({"a": values}).cell_data["a"].tolist() == values.tolist()
+    tetopt.save_mesh(tmp_path / "a.vtu", mesh, {"a": values})
+    assert tetopt.load_mesh(tmp_path / "a.vtu").cell_data["a"].tolist() == values.tolist()
 
 
 @pytest.mark.parametrize("n", [2, 3])
@@ -127,9 +142,17 @@ CORNERS = np.vstack([np.zeros(3), np.eye(3), np.ones((6, 3))])
         ("meshio", meshio.Mesh(CORNERS, [("line", [[0, 1]])]), "found line"),
         ("meshio", meshio.Mesh(CORNERS, []), "found no cells"),
         ("meshio", meshio.Mesh(CORNERS, [("tetra", [[0, 1, 2, 44]])]), r"uses? nodes 0\.\.44, it holds 0\.\.9"),
+        ("meshio", meshio.Mesh(CORNERS, [("tetra", [[0.0, 1.0, 2.5, 3.0]])]), "4 whole numbers each, got float64"),
+        ("meshio", meshio.Mesh(CORNERS, [("tetra", [[0, 1, 2]])]), r"tetra cells of 4 whole numbers each, got .*1, 3"),
+        ("meshio", meshio.Mesh(CORNERS, [("tetra10", [range(9)])]), r"tetra10 cells of 10 whole numbers"),
+        ("meshio", meshio.Mesh(np.zeros((10, 4)), [TETRA]), r"two or three real numbers, got float64 of shape \(10, 4"),
+        ("meshio", meshio.Mesh(CORNERS[:, :1], [TETRA]), "two or three real numbers"),
+        ("meshio", meshio.Mesh(CORNERS * 1j, [TETRA]), "real numbers, got complex128"),
+        ("meshio", meshio.Mesh([["a"] * 3] * 4, [TETRA]), "points of real numbers"),
         ("meshio", 3, "expected a meshio.Mesh, got int"),
         ("skfem", skfem.MeshQuad(), "expected one of scikit-fem's MeshTri or MeshTet, got MeshQuad"),
         ("skfem", skfem.MeshLine(), "got MeshLine"),
+        ("skfem", skfem.MeshTet(np.zeros((3, 4)), np.zeros((4, 0), dtype=int)), r"4 whole numbers each.*\(0, 4\)"),
         ("skfem", sample_model(3).mesh, "got Mesh"),
     ],
 )

@@ -163,15 +163,28 @@ def cells_of_rows(
 
 def _picked(caller: str, points: ArrayLike, cells: Mapping[str, NDArray[np.int64]]) -> Simplices:
     """The tetrahedra, else the triangles, among cells by kind; of order 2 by their corners."""
-    places = np.asarray(points, dtype=np.float64)
+    try:
+        places = np.asarray(points)
+        places = np.asarray(places, dtype=None if places.dtype.kind == "c" else np.float64)
+    except (TypeError, ValueError) as error:
+        raise InputError(f"{caller}: expected points of real numbers ({error})") from error
+    if places.dtype.kind == "c" or places.ndim != 2 or places.shape[1] not in (2, 3):
+        words = f"got {places.dtype} of shape {places.shape}"
+        raise InputError(f"{caller}: expected points of two or three real numbers, {words}")
     in_space = np.zeros((len(places), 3))
     in_space[:, : places.shape[1]] = places
     renamed = corner_kinds(cells)
     try:
         kind = kind_of_cells([renamed.get(name, name) for name in cells])
-        nodes = next(rows for name, rows in cells.items() if renamed.get(name, name) == kind)
+        name = next(name for name in cells if renamed.get(name, name) == kind)
         n_corners = CELL_DIMENSIONS[kind] + 1
-        nodes = np.asarray(nodes, dtype=np.int64)
+        width = n_corners if name == kind else n_corners * (n_corners + 1) // 2  # a node in the middle of each edge
+        nodes = np.asarray(cells[name])
+        if nodes.dtype.kind not in "iu" or nodes.ndim != 2 or nodes.shape[1] != width or len(nodes) == 0:
+            raise InputError(
+                f"expected {name} cells of {width} whole numbers each, got {nodes.dtype} of shape {nodes.shape}"
+            )
+        nodes = nodes.astype(np.int64)
         return simplices_of(in_space, nodes[:, :n_corners], nodes[:, n_corners:])
     except InputError as error:
         raise InputError(f"{caller}: {error}") from error
@@ -223,13 +236,20 @@ def from_skfem(mesh: Any) -> Simplices:
 
 def checked_fields(what: str, fields: Fields | None, n_rows: int) -> dict[str, NDArray]:
     """Arrays of numbers by name; InputError unless each has so many rows."""
-    arrays = {name: np.asarray(values) for name, values in (fields or {}).items()}
-    for name, values in arrays.items():
-        if values.dtype.kind not in "biuf" or values.ndim == 0 or len(values) != n_rows:
-            raise InputError(
-                f"{what}: {name!a}: expected an array of numbers with {n_rows} rows, got {values.dtype} of shape "
-                f"{values.shape}"
-            )
+    if not isinstance(fields, Mapping | None):
+        raise InputError(f"{what}: expected a dict of arrays by name, got {type(fields).__name__}")
+    arrays: dict[str, NDArray] = {}
+    for name, rows in (fields or {}).items():
+        line = f"{what}: {name!a}: expected an array of numbers with {n_rows} rows"
+        try:
+            values = np.asarray(rows)
+        except (TypeError, ValueError) as error:  # rows of different lengths
+            raise InputError(f"{line}, got {type(rows).__name__} ({error})") from error
+        if values.dtype.kind not in "biuf" or values.ndim == 0 or len(values) != n_rows or values.size == 0:
+            raise InputError(f"{line}, got {values.dtype} of shape {values.shape}")
+        if not isinstance(name, str):
+            raise InputError(f"{what}: expected a text as the name of data, got {name!a}")
+        arrays[name] = values
     return arrays
 
 
@@ -269,6 +289,9 @@ def add_array(fields: vtkFieldData, name: str, values: NDArray) -> None:
     from vtkmodules.vtkCommonDataModel import vtkDataSetAttributes
 
     values = np.asarray(values)
+    # VTK takes numbers in the machine's order of bytes, whatever their type says, and floats of four or eight bytes.
+    is_odd = values.dtype.kind == "f" and values.dtype.itemsize not in (4, 8)
+    values = values.astype(np.float64 if is_odd else values.dtype.newbyteorder("="), copy=False)
     values = values.reshape(len(values), -1) if values.ndim > 1 else values
     array = numpy_to_vtk(np.ascontiguousarray(values.view(np.uint8) if values.dtype == bool else values), deep=True)
     array.SetName(name)
