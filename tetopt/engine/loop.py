@@ -114,6 +114,8 @@ class Optimized(NamedTuple):
         Label of each cell, of a content with memberships.
     missed : mapping of str to str
         What the mesh should be and is not, by name, a sentence each (`tetopt.engine.promises`); empty if it is all.
+    share : float, optional
+        Of the content's variance, that is left in the cells: E_D over variance times volume. Of `mesh_image` alone.
 
     Examples
     --------
@@ -134,7 +136,7 @@ class Optimized(NamedTuple):
     seconds_run: float = 0.0
     labels: NDArray[np.int64] | None = None
     missed: Mapping[str, str] = MappingProxyType({})
-    share: float | None = None  # of the content's variance that is left in the cells: E_D over variance times volume
+    share: float | None = None
 
     def _repr_html_(self) -> str:
         """Numbers of the run and of its mesh, with the middle section, for a notebook."""
