@@ -65,6 +65,14 @@ def test_values_that_are_no_numbers_are_dark():
     assert len(set(notebook.greys(np.ones(4)).tolist())) == 1
 
 
+def test_data_of_any_kind_are_no_reason_for_a_card_to_fail():
+    """As another program's file may call them "mean"."""
+    model = sample_model(3)
+    n_cells = len(model.mesh.cells)
+    for values in (np.arange(n_cells) < 3, np.zeros((n_cells, 3)), np.arange(n_cells, dtype=np.uint64)):
+        assert "<img" in model._replace(materials=None, cell_data={"mean": values})._repr_html_()
+
+
 def test_a_plane_between_two_pieces_has_no_picture():
     points = np.array([[0.0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]])
     mesh = tetopt.Mesh(np.vstack([points, points + np.array([0.0, 0.0, 9.0])]), [[0, 1, 2, 3], [4, 5, 6, 7]])
@@ -154,8 +162,10 @@ def test_a_mesh_is_plotted_off_screen(opengl, tmp_path):
     assert (np.asarray(PIL.Image.open(tmp_path / "a.png").convert("RGB")) == by_cells[..., :3]).all()
     assert np.ptp(mesh.plot(mesh.points[:, 0], off_screen=True, cmap="gray", show_edges=False)) > 0
     assert np.ptp(sample_model(2).mesh.plot(off_screen=True)) > 0
-    with pytest.raises(tetopt.InputError, match="expected an array of numbers with"):
-        mesh.plot([1.0, 2.0], off_screen=True)
+    line = r"^plot: expected a number for each of \d+ cells or \d+ nodes, got"
+    for values in ([1.0, 2.0], 3.0, "mean"):
+        with pytest.raises(tetopt.InputError, match=line):
+            mesh.plot(values, off_screen=True)
 
 
 @pytest.mark.slow

@@ -145,7 +145,12 @@ class Mesh:
         (768, 1024, 3)
         """
         colours = {} if values is None else {name: np.asarray(values)}
-        on_cells = values is None or len(colours[name]) == len(self.cells)
+        rows = len(self.cells) if values is None else (np.shape(values) or (1,))[0]
+        if rows not in (len(self.cells), len(self.points)):
+            raise InputError(
+                f"plot: expected a number for each of {len(self.cells)} cells or {len(self.points)} nodes, got {rows}"
+            )
+        on_cells = rows == len(self.cells)
         grid = self.to_pyvista(colours) if on_cells else self.to_pyvista(point_data=colours)
         if cut and self.ndim == 3:
             centres = self.points[self.cells].mean(axis=1)

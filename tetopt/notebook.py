@@ -86,6 +86,7 @@ def section_html(points: NDArray[np.float64], cells: NDArray[np.int64], values: 
 
     With a number for each cell, (M,), cells are grey by it, else all have one colour.
     """
+    values = None if values is None or values.shape != (len(cells),) else values.astype(np.float64)
     if points.shape[1] == 3:
         middle = 0.5 * (points[:, 2].min() + points[:, 2].max())
         cut = plane_cut(points, cells, points[:, 2] - middle)
@@ -94,7 +95,7 @@ def section_html(points: NDArray[np.float64], cells: NDArray[np.int64], values: 
         corners, owner, where = points[cells], np.arange(len(cells)), "the mesh"
     if len(owner) == 0:  # of pieces on both sides
         return ""
-    return _picture_html(_drawn(corners, None if values is None else np.asarray(values)[owner]), f"{where}: its cells")
+    return _picture_html(_drawn(corners, None if values is None else values[owner]), f"{where}: its cells")
 
 
 def _drawn(corners: NDArray[np.float64], values: NDArray | None) -> PIL.Image.Image:

@@ -99,15 +99,16 @@ class MeshFile(NamedTuple):
 
     def _repr_html_(self) -> str:
         """What the file holds, with the middle section by its means, for a notebook."""
-        mesh, means = self.mesh, self.cell_data.get("mean")
+        mesh = self.mesh
         rows = notebook.mesh_rows(mesh.points, mesh.cells)
         rows += [("data of cells", ", ".join(self.cell_data) or "none")]
         rows += [("data of nodes", ", ".join(self.point_data) or "none")]
         rows += [("sets", ", ".join([*self.sets.facets, *self.sets.cells]) or "none")]
         rows += [("labels", ", ".join(self.label_table.names.values()))] if self.label_table.names else []
         rows += [("note", note) for note in self.notes]
-        values = means if means is not None and means.ndim == 1 else None
-        return notebook.card_html("MeshFile", rows, notebook.section_html(mesh.points, mesh.cells, values))
+        return notebook.card_html(
+            "MeshFile", rows, notebook.section_html(mesh.points, mesh.cells, self.cell_data.get("mean"))
+        )
 
     @property
     def label_table(self) -> LabelTable:
