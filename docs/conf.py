@@ -1,5 +1,6 @@
 """The documentation's site, which `make docs` builds into docs/_build/html; nothing is fetched for it."""
 
+import html
 import inspect
 import os
 import sys
@@ -84,8 +85,20 @@ html_theme_options = {
 }
 
 
+def described(app, doctree):
+    """The gallery's pictures say in their alt text what the paragraph before them says."""
+    text = ""
+    for node in doctree.findall():
+        if node.tagname == "paragraph":
+            text = node.astext().replace("\n", " ")
+        elif node.tagname == "imgsgnode" and text:
+            titles = "" if node["alt"].startswith("plot ") else f" {node['alt']}"  # else the program's own name
+            node["alt"] = html.escape(text) + titles  # sphinx-gallery escapes nothing
+
+
 def setup(app):
     """Fields of records are in their docstring; what Python says of them ("Alias for field number 0") is left out."""
+    app.connect("doctree-read", described)
     app.connect(
         "autodoc-skip-member",
         lambda app, what, name, value, skip, options: True if type(value).__name__ == "_tuplegetter" else None,

@@ -56,7 +56,8 @@ grid = mesh.to_pyvista(point_data={"displacement": displacement, "von Mises stre
 half = grid.clip("y", crinkle=True).warp_by_vector("displacement", factor=2.0)
 plotter = pyvista.Plotter(window_size=(1000, 700))
 plotter.set_background("#171a21")
-bar = {"color": "#e6e6e6", "vertical": False, "width": 0.5, "position_x": 0.25, "position_y": 0.03, "fmt": "%.1f"}
+bar = {"title": "von Mises stress, kPa\n", "color": "#e6e6e6", "fmt": "%.1f", "vertical": False}
+bar |= {"width": 0.5, "position_x": 0.25, "position_y": 0.03}
 plotter.add_mesh(
     half, scalars="von Mises stress, kPa", cmap="inferno", show_edges=True, edge_color="#30343d", scalar_bar_args=bar,
     ambient=0.2,

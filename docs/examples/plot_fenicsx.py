@@ -74,7 +74,8 @@ is_cut = (grid.cell_centers().points[:, :2] * (-1, 1) > 0).all(axis=1)
 opened = grid.extract_cells(np.flatnonzero(~is_cut))
 plotter = pyvista.Plotter(window_size=(1000, 700))
 plotter.set_background("#171a21")
-bar = {"color": "#e6e6e6", "vertical": False, "width": 0.5, "position_x": 0.25, "position_y": 0.03, "fmt": "%.0f"}
+bar = {"title": "Young's modulus, kPa\n", "color": "#e6e6e6", "fmt": "%.0f", "vertical": False}
+bar |= {"width": 0.5, "position_x": 0.25, "position_y": 0.03}
 plotter.add_mesh(opened, cmap="YlGnBu_r", show_edges=True, edge_color="#20242c", scalar_bar_args=bar, ambient=0.2)
 plotter.view_vector((-0.8, 1.1, 0.6), viewup=(0, 0, 1))
 plotter.camera.zoom(1.25)

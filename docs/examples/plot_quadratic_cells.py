@@ -54,6 +54,8 @@ print(f"{nodes[0]} nodes: the error of quadratic cells is {factor:.2f} times sma
 figure, (left, right) = plt.subplots(1, 2, figsize=(10.5, 4.8), layout="constrained")
 for order, name, colour in ((1, "linear", "#2f6db5"), (2, "quadratic", "#d95f02")):
     left.loglog(unknowns[order], errors[order], "o-", color=colour, label=f"{name} cells")
+left.set_xticks([200, 500, 1000, 2000], ["200", "500", "1000", "2000"])
+left.set_xticks([], minor=True)
 left.set(xlabel="unknowns", ylabel="relative error of the strain energy")
 left.legend()
 mesh = meshes[3]

@@ -54,7 +54,8 @@ sphere = deformed.extract_cells(np.flatnonzero(deformed["young"] > 50))
 shell = deformed.clip("y", crinkle=True)
 plotter = pyvista.Plotter(window_size=(1000, 700))
 plotter.set_background("#171a21")
-bar = {"color": "#e6e6e6", "vertical": False, "width": 0.5, "position_x": 0.25, "position_y": 0.03, "fmt": "%.0f"}
+bar = {"title": "displacement, mm\n", "color": "#e6e6e6", "fmt": "%.0f", "vertical": False}
+bar |= {"width": 0.5, "position_x": 0.25, "position_y": 0.03}
 look = {"scalars": "displacement, mm", "cmap": "viridis", "clim": (0, length.max()), "show_edges": True}
 plotter.add_mesh(shell, edge_color="#20242c", scalar_bar_args=bar, ambient=0.2, **look)
 plotter.add_mesh(sphere, edge_color="#ffffff", line_width=1.5, show_scalar_bar=False, ambient=0.2, **look)
