@@ -27,7 +27,7 @@ def cell_E_D(image: Image, mesh: Mesh) -> NDArray[np.float64]:
 
 
 def E_D(image: Image, mesh: Mesh) -> float:
-    """The discretization energy of Eq. (3), intensity^2 mm^n.
+    """The discretization energy of equation (3), intensity^2 mm^n.
 
     The sum over cells of the integral of (h - hbar)^2, hbar the mean of h over the cell. h is constant on a voxel, and
     each voxel counts whole in the cell that holds its centre. It lies between 0 and the image's variance times its

@@ -26,7 +26,7 @@ def cell_E_G(points: Points, cells: Cells) -> NDArray[np.float64]:
 
 
 def E_G(points: Points, cells: Cells) -> float:
-    """The geometric energy of Eq. (1), mm^(n+2).
+    """The geometric energy of equation (1), mm^(n+2).
 
     The sum over cells of the volume times the squared lengths of all edges, over (n + 1) (n + 2): small where cells are
     round and of one size. It does not look at the image.
