@@ -166,6 +166,9 @@ def test_a_mesh_is_plotted_off_screen(opengl, tmp_path):
     for values in ([1.0, 2.0], 3.0, "mean"):
         with pytest.raises(tetopt.InputError, match=line):
             mesh.plot(values, off_screen=True)
+    for path in (tmp_path / "no folder" / "a.png", tmp_path / "a.xyz"):
+        with pytest.raises(tetopt.InputError, match=r"^plot: .*: the picture cannot be written \(.*\)$"):
+            mesh.plot(screenshot=path)
 
 
 @pytest.mark.slow

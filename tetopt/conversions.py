@@ -356,9 +356,13 @@ def show_grid(
     if grid.bounds[4] == grid.bounds[5]:  # a 2-D mesh
         plotter.view_xy()
     if off_screen or screenshot is not None:
-        picture = plotter.screenshot(None if screenshot is None else str(screenshot), return_img=True)
-        plotter.close()
-        return picture
+        try:
+            return plotter.screenshot(None if screenshot is None else str(screenshot), return_img=True)
+        except (OSError, ValueError) as error:  # no such folder, or no such kind of picture
+            words = " ".join(str(error).split())
+            raise InputError(f"plot: {screenshot}: the picture cannot be written ({words})") from error
+        finally:
+            plotter.close()
     has_trame = importlib.util.find_spec("trame") is not None
     plotter.show(jupyter_backend="static" if in_kernel() and not has_trame else None)
     return None
