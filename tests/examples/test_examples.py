@@ -79,12 +79,15 @@ def _run(name, folder, monkeypatch):
         shutil.copy(EXAMPLES / file, folder)
     monkeypatch.chdir(folder)
     monkeypatch.setattr(pyvista, "OFF_SCREEN", True)
+    show, shown = pyvista.Plotter.show, []
+    monkeypatch.setattr(pyvista.Plotter, "show", lambda *args, **look: shown.append(show(*args, **look)))
     output = io.StringIO()
     # Without a display VTK complains of the missing one before it renders off screen.
     with warnings.catch_warnings(), contextlib.redirect_stdout(output), pyvista.vtk_verbosity("off"):
         warnings.simplefilter("error", UserWarning)
         warnings.simplefilter("error", RuntimeWarning)
         names = runpy.run_path(str(EXAMPLES / f"plot_{name}.py"))
+    assert shown or pyplot.get_fignums(), "it draws no picture"
     pyplot.close("all")
     assert {path.name for path in folder.iterdir()} == beside
     return names, output.getvalue()
