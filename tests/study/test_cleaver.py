@@ -15,7 +15,9 @@ IMAGE, LABELS = PHANTOM.image(voxel_mm=4.0), PHANTOM.label_image(voxel_mm=4.0)
 def test_unusable_package_is_told(monkeypatch):
     """Not installed; installed, but its import ends the interpreter."""
     monkeypatch.setattr(cleaver, "find_spec", lambda name: None)
-    with pytest.raises(tetopt.InputError, match=r"itk-cleaver: not installed; install it with: python -m pip"):
+    with pytest.raises(
+        tetopt.InputError, match=r"itk-cleaver: not installed; install it with: pip install \"itk-cleaver\" "
+    ):
         PIPELINES["cleaver"].function(Job(IMAGE, LABELS, 300))
     monkeypatch.setattr(cleaver, "find_spec", lambda name: name)
     python = cleaver._python
