@@ -7,7 +7,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides, facets_on_sides
-from tetopt.geometry.manifold import OUTSIDE_LABEL, label_surfaces, surface_fans, surface_ridges
+from tetopt.geometry.manifold import OUTSIDE_LABEL, pinches
 from tetopt.geometry.simplex import volumes
 from tetopt.geometry.topology import Facets, boundary_facets, components, facets, folded
 from tetopt.image import Image, VoxelGrid
@@ -164,25 +164,17 @@ def manifold_problems(mesh: Mesh, of_cell: ArrayLike | None = None) -> list[str]
     labels = np.zeros(len(mesh.cells), dtype=np.int64) if of_cell is None else np.asarray(of_cell)
     if labels.shape != (len(mesh.cells),) or not ((np.rint(labels) == labels) & (labels >= 0)).all():
         raise InputError(f"of_cell: expected a whole number from 0 for each of the mesh's {len(mesh.cells)} cells")
-    surfaces = label_surfaces(facets(mesh.cells), labels.astype(np.int64))
-    ridges = surface_ridges(surfaces)
-    fans = surface_fans(surfaces, ridges)
-    noun = "edges" if mesh.ndim == 3 else "nodes"
+    at_ridges, at_nodes = pinches(facets(mesh.cells), labels.astype(np.int64))
     whose = "the boundary" if of_cell is None else "the interface of two labels"
     problems = []
-    for label, places, is_bad, words in (
-        (ridges.label, ridges.nodes, (ridges.n_facets > 2) & (ridges.n_labels == 2), "has more than two facets"),
-        (fans.label, fans.node[:, None], (fans.n_fans > 1) & (fans.n_labels == 2), "touches itself"),
+    for found, noun, words in (
+        (at_ridges, "edges" if mesh.ndim == 3 else "nodes", "has more than two facets"),
+        (at_nodes, "nodes", "touches itself"),
     ):
-        rows = np.flatnonzero(is_bad)
-        rows = rows[np.lexsort((label[rows], *places[rows].T[::-1]))]
-        # Where two labels meet, they share all facets: each place is there twice, once for either.
-        pairs, at = label[rows].reshape(-1, 2), places[rows[::2]]
-        is_meant = (pairs[:, 0] == OUTSIDE_LABEL) == (of_cell is None)
+        is_meant = (found.labels[:, 0] == OUTSIDE_LABEL) == (of_cell is None)
         if is_meant.any():
-            which = "" if of_cell is None else f" ({_most_frequent(pairs[is_meant])})"
-            kind = noun if words.startswith("has") else "nodes"
-            problems.append(f"{kind} where {whose} {words}{which}; nodes: {_first(at[is_meant])}")
+            which = "" if of_cell is None else f" ({_most_frequent(found.labels[is_meant])})"
+            problems.append(f"{noun} where {whose} {words}{which}; nodes: {_first(found.nodes[is_meant])}")
     return problems
 
 

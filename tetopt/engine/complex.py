@@ -156,6 +156,21 @@ def grown(state: State, least: int = 64) -> State:
     return state._replace(complex=mesh._replace(**wide))
 
 
+def without_cells(state: State, is_gone: NDArray[np.bool_]) -> State:
+    """The state without some cells, (M,); their nodes stay, those on the new boundary marked as on a mask's surface."""
+    mesh, n_cells = state.complex, len(is_gone)
+    kept = np.flatnonzero(~is_gone)
+    rows = np.append(kept, np.arange(n_cells, len(mesh.cells)))
+    number = np.full(n_cells + 1, -1, dtype=np.int64)  # its last row is that of -1, the outside
+    number[kept] = np.arange(len(kept))
+    beyond = mesh.cells[:n_cells][is_gone]
+    complex_ = mesh._replace(**{name: getattr(mesh, name)[rows] for name in CELL_ROWS}, n_cells=np.array([len(kept)]))
+    complex_.across[: len(kept)] = number[complex_.across[: len(kept)]]
+    is_frozen = mesh.is_frozen.copy()
+    is_frozen[beyond.ravel(), 3] = True
+    return state._replace(complex=complex_._replace(is_frozen=is_frozen))
+
+
 @entry
 def fill_across(across: Ints2, cells: Ints2, n_cells: int, n_nodes: int) -> None:
     """The cell beyond each facet, by counting sort over the facets' lowest nodes."""

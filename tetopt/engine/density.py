@@ -140,7 +140,7 @@ def exchange(state: State, n_nodes: int, most: int, limits: Limits) -> Exchanged
     is_dirty = np.zeros(len(state.complex.cells), dtype=np.bool_)
     out = _best_first(collapses)
     n_split, n_collapsed = make_exchanges(state, rings, splits, collapses, in_, out, (more, most, least), is_dirty)
-    return _compacted(state, is_dirty, n_before, n_split, n_collapsed)
+    return compacted(state, is_dirty, n_before, n_split, n_collapsed)
 
 
 def too_long(state: State, target: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -191,9 +191,14 @@ def roomy(state: State, n_nodes: int, n_cells: int) -> State:
     return state._replace(complex=state.complex._replace(ticks=ticks, is_frozen=is_frozen, meeting=meeting))
 
 
-def _compacted(state: State, is_dirty: NDArray[np.bool_], n_before: int, n_split: int, n_collapsed: int) -> Exchanged:
+def compacted(
+    state: State, is_dirty: NDArray[np.bool_] | None = None, n_before: int | None = None, n_split: int = 0,
+    n_collapsed: int = 0,
+) -> Exchanged:  # fmt: skip
     """Nodes without cells left out, and the others numbered anew in their order."""
     n_cells = int(state.complex.n_cells[0])
+    is_dirty = np.zeros(n_cells, dtype=np.bool_) if is_dirty is None else is_dirty
+    n_before = len(state.complex.ticks) if n_before is None else n_before
     cells = state.complex.cells[:n_cells]
     is_used = np.zeros(n_before + n_split, dtype=bool)
     is_used[cells] = True
@@ -396,7 +401,7 @@ def mend(state: State, bad: NDArray[np.int64], target: float) -> Exchanged:
     state = roomy(state, len(bad), 16 * len(bad))
     is_dirty = np.zeros(len(state.complex.cells), dtype=np.bool_)
     n_split, n_collapsed = _mend(state, rings, bad, target, is_dirty)
-    return _compacted(state, is_dirty, n_before, n_split, n_collapsed)
+    return compacted(state, is_dirty, n_before, n_split, n_collapsed)
 
 
 @entry

@@ -18,10 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.energy.sampling import cell_moments, cell_of_voxel, channel_grid, from_ticks
-from tetopt.engine.complex import State, copied, interface_energy, node_rings, remeasure
-from tetopt.engine.density import Limits, exchange
+from tetopt.engine.complex import State, copied, interface_energy, node_rings, remeasure, without_cells
+from tetopt.engine.density import Limits, compacted, exchange
 from tetopt.engine.flips import _evaluate_cells, _evaluate_triangles, flip
-from tetopt.engine.interfaces import relabel, with_labels
+from tetopt.engine.interfaces import mend_pinches, relabel, with_labels
 from tetopt.engine.loop import (
     MIN_DIHEDRAL,
     SHAPE_POWER,
@@ -45,6 +45,7 @@ from tetopt.image import Image, transformed
 from tetopt.kernels import link, roots
 from tetopt.mesh import Mesh
 from tetopt.notebook import with_bar
+from tetopt.start.carve import carved
 from tetopt.start.lattice import lattice
 from tetopt.start.sizes import Sizes
 from tetopt.target.content import Content, plain
@@ -162,11 +163,12 @@ def optimize(
     floor = min_dihedral if run.n == 3 else 0.0
     # Iterations in which nodes may be exchanged: shape alone does not say where there should be more.
     n_early = int(EXCHANGING_SHARE * iterations) if k_D > 0.0 or sizes.has_target else 0
-    course = Course(1, iterations, iterations, n_early, floor, tolerance, nodes, sizes)
+    course = Course(1, iterations, iterations, n_early, floor, tolerance, nodes, sizes, carves=boundary != "fixed")
     history, ended = followed(run, course, is_over, begin, callback)
     if ended == "over":
         ended = "stopped" if stop is not None and stop() else "max_seconds"
-    return promised(Optimized(run.mesh(), history, ended, labels=run.labels()), content, floor, mesh)
+    result = Optimized(run.mesh(), history, ended, labels=run.labels(), n_dropped=run.n_dropped)
+    return promised(result, content, floor, mesh)
 
 
 class Course(NamedTuple):
@@ -180,6 +182,7 @@ class Course(NamedTuple):
     tolerance: float  # as of `optimize`
     nodes: int | None  # as of `optimize`
     sizes: Sizes
+    carves: bool = False  # whether cells at pinches of a mask's boundary are taken out in the last iteration
 
 
 def followed(
@@ -221,7 +224,10 @@ def followed(
         is_last = iteration == course.last or not is_finished or (fall < course.tolerance and not is_early)
         if is_last and run.n_below(floor) > 0 and run.lift(floor) > 0:
             n_changes, fall = n_changes + 1, np.inf
-        # 5. Measure.
+        # 5. Mend what is not a manifold, by cells taken out and labels changed: no angle gets smaller.
+        if is_last:
+            n_changes += run.mend_surfaces(course.carves)
+        # 6. Measure.
         record(iteration, movement, n_changes > 0)
         if not is_finished:
             return history, "over"
@@ -286,6 +292,7 @@ class Run:
         self.image_noise: float | None = None if whole is None else whole.noise
         self.ticks_flipped = np.full_like(ticks, FAR_TICKS)  # where nodes were when their flips were last looked at
         self.hope = np.full(len(ticks), np.inf)  # what each node's next move may win, (N,); see `sweep`
+        self.n_dropped = 0  # connected components that the mask does not have, taken out
 
     @property
     def is_still(self) -> NDArray[np.bool_]:
@@ -412,6 +419,22 @@ class Run:
         self._renumber(made.state, made.source)
         self.hope[:] = np.inf
         return made.n_moves
+
+    def mend_surfaces(self, carves: bool) -> int:
+        """Mend pinches: of a mask's boundary, if it `carves`, by taking out cells, and how many; then of interfaces.
+
+        An octree within a mask has none to begin with; a mesh of the user's may.
+        """
+        n_gone = 0
+        if carves and self.content.region is not None:
+            kept = carved(self.mesh(), self.image, self.content.region, self.content.keeps_components)
+            n_gone, self.n_dropped = int((~kept.is_kept).sum()), self.n_dropped + kept.n_dropped
+            if n_gone:
+                made = compacted(without_cells(self.state, ~kept.is_kept))
+                self._renumber(made.state, made.source)
+        if self.has_labels:
+            mend_pinches(self.state, self.content, self.mesh())
+        return n_gone
 
     def _overlaps(self, state: State) -> bool:
         """Whether a voxel centre lies in two cells."""

@@ -13,9 +13,11 @@ from numpy.typing import NDArray
 
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.engine.complex import NodeRings, State, facet_area, image_energy, node_rings, outward, pair_tension
-from tetopt.engine.labelling import keeps_topology, labelled, voxel_pieces
+from tetopt.engine.labelling import keeps_topology, labelled, unpinched, voxel_pieces
 from tetopt.engine.surface import MOST_MEETING
+from tetopt.geometry.manifold import OUTSIDE_LABEL, pinches
 from tetopt.geometry.simplex import centroids, volumes
+from tetopt.geometry.topology import facets
 from tetopt.kernels import Floats1, Ints1, entry, helper, unit
 from tetopt.mesh import Mesh
 from tetopt.target.content import Content
@@ -47,6 +49,15 @@ def with_labels(state: State, content: Content, mesh: Mesh) -> State:
     state = state._replace(objective=objective, sides=state.sides._replace(levels=levels, channel=members.channel))
     _meet_everywhere(state, node_rings(state))
     return state
+
+
+def mend_pinches(state: State, content: Content, mesh: Mesh) -> None:
+    """Give cells other labels where an interface of two labels is not a manifold; no node moves."""
+    labels, across = (array[: len(mesh.cells)] for array in (state.complex.labels, state.complex.across))
+    of_ridges, of_nodes = pinches(facets(mesh.cells), labels)
+    if any((found.labels[:, 0] != OUTSIDE_LABEL).any() for found in (of_ridges, of_nodes)):
+        labels[:] = unpinched(mesh.points, mesh.cells, across, cell_counts(content, mesh), labels)
+        _meet_everywhere(state, node_rings(state))
 
 
 def cell_counts(content: Content, mesh: Mesh) -> scipy.sparse.csr_array:

@@ -121,6 +121,19 @@ def labelled(
     )
 
 
+def unpinched(
+    points: NDArray[np.float64], cells: NDArray[np.int64], across: NDArray[np.int64], counts: scipy.sparse.csr_array,
+    labels: NDArray[np.int64],
+) -> NDArray[np.int64]:  # fmt: skip
+    """Labels of cells, (M,), with as few changed as make interfaces of two labels manifold, whatever they cost.
+
+    Arguments as of `labelled`; no label loses its last cell. What cannot be mended is left.
+    """
+    dual, labels = _dual(points, cells, across, counts, None), labels.copy()
+    _mend_pairs(dual, labels, np.full(counts.shape[1], float(dual.size.min())))
+    return labels
+
+
 def voxel_pieces(partition: NDArray[np.int64], n_labels: int) -> list[NDArray[np.int64]]:
     """Voxels in each piece of each label of a grid, falling; linked by faces."""
     boxes = scipy.ndimage.find_objects(partition + 1, n_labels)

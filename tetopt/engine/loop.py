@@ -116,6 +116,8 @@ class Optimized(NamedTuple):
         What the mesh should be and is not, by name, a sentence each (`tetopt.engine.promises`); empty if it is all.
     share : float, optional
         Of the content's variance, that is left in the cells: E_D over variance times volume. Of `mesh_image` alone.
+    n_dropped : int
+        Connected components that were left out of the mesh, since the mask does not have them.
 
     Examples
     --------
@@ -137,6 +139,7 @@ class Optimized(NamedTuple):
     labels: NDArray[np.int64] | None = None
     missed: Mapping[str, str] = MappingProxyType({})
     share: float | None = None
+    n_dropped: int = 0
 
     def _repr_html_(self) -> str:
         """Numbers of the run and of its mesh, with the middle section, for a notebook."""

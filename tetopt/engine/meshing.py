@@ -33,6 +33,7 @@ from tetopt.errors import InputError
 from tetopt.geometry.quadratic import node_count
 from tetopt.image import Image
 from tetopt.mesh import Mesh
+from tetopt.start.carve import carved, part_of
 from tetopt.start.clip import lattice_within
 from tetopt.start.octree import is_near, nearest_octree, nodes_of_sizes, octree
 from tetopt.start.sizes import Sizes
@@ -180,6 +181,10 @@ def mesh_image(
     seconds: list[float] = []
 
     def run(initial: Mesh, nodes: int | None) -> Optimized:
+        n_dropped = 0
+        if content.region is not None and mode != "start":
+            kept = carved(initial, content.image, content.region, content.keeps_components)
+            initial, n_dropped = part_of(initial, kept.is_kept), kept.n_dropped
         check_memory_of(content, max(nodes or 0, len(initial.points)))
 
         def optimized(**more: Any) -> Optimized:
@@ -191,7 +196,7 @@ def mesh_image(
         begin = time.perf_counter()
         result = optimized() if watch is None else watch(initial, optimized)
         seconds.append(time.perf_counter() - begin)
-        return result._replace(initial=initial, nodes=nodes)
+        return result._replace(initial=initial, nodes=nodes, n_dropped=n_dropped + result.n_dropped)
 
     def begun(corners: int | None) -> Optimized:
         if mode == "graded":

@@ -10,13 +10,15 @@ from math import prod
 
 import numpy as np
 
-from tetopt.check import beyond_box
+from tetopt.check import beyond_box, manifold_problems
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.engine.loop import Optimized
 from tetopt.geometry.box import ON_SIDE_VOXELS
 from tetopt.geometry.simplex import dihedral_angles, volumes
+from tetopt.geometry.topology import components
 from tetopt.image import VoxelGrid
 from tetopt.mesh import Mesh
+from tetopt.start.carve import n_components
 from tetopt.target.content import Content
 
 MASK_DICE = 0.9  # of a mesh with its mask, at least: below it the cells are larger than parts of the mask
@@ -46,14 +48,17 @@ def promised(result: Optimized, content: Content, min_dihedral: float, start: Me
     Optimized
         With `missed`, empty if there is nothing. `floor`: cells with an angle under the floor, of tetrahedra that were
         moved at all. `box`: nodes further beyond the image's box than the initial mesh's. `cover`: voxels or volume of
-        the initial mesh lost or won. Within a mask instead `overlap`: voxels that lie in two cells, and `mask`: a Dice
-        with the mask below 0.9. `labels`: labels of more than 200 voxels that no cell has.
+        the initial mesh lost or won. Within a mask instead `overlap`: voxels that lie in two cells, `mask`: a Dice
+        with the mask below 0.9, and `components`: more connected components than the mask has. `manifold`: edges or
+        nodes at which the boundary, within a mask, or the interface of two labels is not a manifold. `labels`: labels
+        of more than 200 voxels that no cell has.
     """
     mesh, missed = result.mesh, _missed_floor(result, min_dihedral)
     beyond = float(beyond_box(mesh, content.image).max())
     if beyond > max(float(beyond_box(start, content.image).max()), 0.0) + ON_SIDE_VOXELS:
         missed["box"] = BEYOND_WORDS.format(beyond)
     missed |= _missed_cover(result, start) if content.region is None else _missed_mask(content, result)
+    missed |= _missed_manifold(content, result)
     return result._replace(missed=missed | _missed_labels(content, result))
 
 
@@ -124,7 +129,23 @@ def _missed_mask(content: Content, result: Optimized) -> dict[str, str]:
             f"the mesh and the mask overlap only by Dice {dice:.3f}: cells are larger than parts of the mask; "
             "allow more nodes"
         )
-    return missed
+    return missed | _missed_components(content, result.mesh)
+
+
+def _missed_components(content: Content, mesh: Mesh) -> dict[str, str]:
+    assert content.region is not None
+    n_cells = np.sort(np.bincount(components(mesh.cells)))[::-1]
+    if len(n_cells) == 1 or len(n_cells) <= (n_mask := n_components(content.region)):
+        return {}
+    words = f"the mesh has {len(n_cells)} connected components, the mask {n_mask}; the smallest have"
+    return {"components": f"{words} {', '.join(map(str, n_cells[:-4:-1]))} cells; allow more nodes"}
+
+
+def _missed_manifold(content: Content, result: Optimized) -> dict[str, str]:
+    problems = [] if content.region is None else manifold_problems(result.mesh)
+    if result.labels is not None:
+        problems += manifold_problems(result.mesh, result.labels)
+    return {"manifold": "; ".join([*problems, "allow more nodes"])} if problems else {}
 
 
 def _missed_labels(content: Content, result: Optimized) -> dict[str, str]:

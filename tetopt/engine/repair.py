@@ -97,10 +97,17 @@ def repair(state: State, floor: float) -> Repaired:
             mended = mend(state, bad, target)
             state, n_made = mended.state, mended.n_split + mended.n_collapsed
             source = np.where(mended.source >= 0, source[mended.source], -1)
+        if n_made == 0 and len(bad):  # nodes between labels may leave the surfaces that they lie on
+            n_made = _displace(_released(state), node_rings(state), bad, target)
         n_moves += n_made
         if n_made == 0:
             break
     return Repaired(state, source, len(_worst_first(state, target)), n_moves)
+
+
+def _released(state: State) -> State:
+    """The state in which nodes between labels slide on no surface; those on a mask's still do."""
+    return state._replace(complex=state.complex._replace(meeting=np.full_like(state.complex.meeting, -1)))
 
 
 def n_cells_below(state: State, floor: float) -> int:

@@ -7,14 +7,19 @@ node of segments. In a manifold without a rim two facets meet at each ridge, and
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections import deque
+from collections.abc import Hashable, Iterable
+from itertools import combinations
+from typing import NamedTuple, TypeVar
 
 import numpy as np
 import scipy
 from numpy.typing import NDArray
 
 from tetopt.geometry.simplex import facet_nodes
-from tetopt.geometry.topology import Facets
+from tetopt.geometry.topology import Facets, facets, rings
+
+_Key = TypeVar("_Key", bound=Hashable)
 
 OUTSIDE_LABEL = -1  # what lies beyond the boundary, among labels, which are 0 and more
 
@@ -106,6 +111,132 @@ def surface_fans(surfaces: LabelSurfaces, ridges: Ridges) -> Fans:
     distinct, count = np.unique(key, return_counts=True)
     label, node = np.divmod(distinct, base)
     return Fans(label + OUTSIDE_LABEL, node, count, _times(node))
+
+
+class Pinches(NamedTuple):
+    """Ridges, or nodes, at which a surface between exactly two labels is not a manifold."""
+
+    labels: NDArray[np.int64]  # (K, 2), ascending, `OUTSIDE_LABEL` among them
+    nodes: NDArray[np.int64]  # (K, n-1) of ridges, (K, 1) of nodes
+
+
+def pinches(shared: Facets, of_cell: NDArray[np.integer]) -> tuple[Pinches, Pinches]:
+    """Ridges in more than two facets of a surface, and nodes around which its facets form several fans.
+
+    Where three labels or more meet, surfaces end: those places are left out. Arguments as of `label_surfaces`.
+    """
+    surfaces = label_surfaces(shared, of_cell)
+    ridges = surface_ridges(surfaces)
+    fans = surface_fans(surfaces, ridges)
+    found = []
+    for label, nodes, is_bad in (
+        (ridges.label, ridges.nodes, (ridges.n_facets > 2) & (ridges.n_labels == 2)),
+        (fans.label, fans.node[:, None], (fans.n_fans > 1) & (fans.n_labels == 2)),
+    ):
+        rows = np.flatnonzero(is_bad)
+        rows = rows[np.lexsort((label[rows], *nodes[rows].T[::-1]))]
+        # The surfaces of the two labels have all facets there in common: each place is listed once for either.
+        found.append(Pinches(label[rows].reshape(-1, 2), nodes[rows[::2]]))
+    return found[0], found[1]
+
+
+def manifold_part(cells: NDArray[np.int64], size: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Cells that stay, (M,), so that the boundary of a conforming mesh is a manifold; few others are left out.
+
+    Of several fans of cells around an edge or a node of the boundary the largest stays; where the cells around a node
+    are one fan, and the outside is not, the cells between two parts of the outside go.
+
+    Parameters
+    ----------
+    cells : (M, n+1) int64
+        Positively oriented.
+    size : (M,) float64
+        Volume of each cell.
+    """
+    shared, is_kept, n = facets(cells), np.ones(len(cells), dtype=bool), cells.shape[1] - 1
+    at_ridges, at_nodes = pinches(shared, np.zeros(len(cells), dtype=np.int64))
+    if len(at_ridges.nodes) + len(at_nodes.nodes) == 0:
+        return is_kept
+    sides = shared.cells[shared.of_cell]  # (M, n+1, 2)
+    across = np.where(sides[..., 0] == np.arange(len(cells))[:, None], sides[..., 1], sides[..., 0])
+    around = rings(cells, int(cells.max()) + 1)
+    ridges, nodes = (deque(map(tuple, places.nodes.tolist())) for places in (at_ridges, at_nodes))
+    while ridges or nodes:  # ridges first: at a node, those of the boundary are manifold
+        place = ridges.popleft() if ridges else nodes.popleft()
+        ring = around.cells[around.start[place[0]] : around.start[place[0] + 1]].tolist()
+        corners = {cell: cells[cell].tolist() for cell in ring if is_kept[cell]}
+        star = {cell: Corners(at, across[cell].tolist()) for cell, at in corners.items() if set(place) <= set(at)}
+        for cell in _cells_at_pinch(place, star, size):
+            is_kept[cell] = False
+            beyond = across[across[cell][across[cell] >= 0]]
+            across[across[cell][across[cell] >= 0]] = np.where(beyond == cell, -1, beyond)
+            nodes.extend((node,) for node in star[cell].nodes)
+            if n == 3:
+                ridges.extend(combinations(sorted(star[cell].nodes), 2))
+    return is_kept
+
+
+class Corners(NamedTuple):
+    """A cell around a node or an edge."""
+
+    nodes: list[int]
+    across: list[int]  # cell beyond the facet opposite each node; -1 outside
+
+
+def _cells_at_pinch(place: tuple[int, ...], star: dict[int, Corners], size: NDArray[np.float64]) -> Iterable[int]:
+    """Cells of the star of an edge or a node that go for the boundary to be a manifold there; none if it is."""
+    links = {
+        cell: [other for node, other in zip(*corners, strict=True) if node not in place and other in star]
+        for cell, corners in star.items()
+    }
+    fans = _linked(links)
+    if len(fans) > 1:
+        largest = max(fans, key=lambda fan: (size[fan].sum(), -fan[0]))
+        return [cell for fan in fans if fan is not largest for cell in fan]
+    if len(place) > 1:
+        return []
+    # Facets of the boundary, by what they are opposite to; two are linked by an edge that ends in the node.
+    outer = [
+        (cell, node)
+        for cell, (nodes, across) in star.items()
+        for node, other in zip(nodes, across, strict=True)
+        if other < 0 and node not in place
+    ]
+    ends = {facet: {*star[facet[0]].nodes} - {facet[1], *place} for facet in outer}
+    patches = _linked({facet: [other for other in outer if ends[facet] & ends[other]] for facet in outer})
+    if len(patches) < 2:
+        return []
+    return _way(links, {cell for cell, _ in patches[0]}, {cell for patch in patches[1:] for cell, _ in patch})
+
+
+def _linked(links: dict[_Key, list[_Key]]) -> list[list[_Key]]:
+    """Connected sets of a graph, each from its first member on."""
+    found: list[list[_Key]] = []
+    seen: set[_Key] = set()
+    for first in links:
+        if first not in seen:
+            members = [first]
+            seen.add(first)
+            for member in members:  # grows as it goes
+                members += (new := [other for other in dict.fromkeys(links[member]) if other not in seen])
+                seen.update(new)
+            found.append(members)
+    return found
+
+
+def _way(links: dict[int, list[int]], begin: set[int], end: set[int]) -> list[int]:
+    """The shortest way in a connected graph from one set of cells to another, both ends among it."""
+    before: dict[int, int | None] = dict.fromkeys(sorted(begin))
+    for cell in (queue := list(before)):
+        if cell in end:
+            way = [cell]
+            while (at := before[way[-1]]) is not None:
+                way.append(at)
+            return way
+        new = [other for other in links[cell] if other not in before]
+        before.update(dict.fromkeys(new, cell))
+        queue += new
+    return []
 
 
 def _times(values: NDArray[np.int64]) -> NDArray[np.int64]:

@@ -70,6 +70,8 @@ class Content(NamedTuple):
         Each of these labels' channel, a row of `values`.
     own_value : (K,) int32, optional
         What its voxels have there.
+    keeps_components : bool
+        Keep connected components of a mesh that the mask does not have.
 
     Examples
     --------
@@ -91,6 +93,7 @@ class Content(NamedTuple):
     smoothness: float = 0.0
     own_channel: NDArray[np.int64] | None = None
     own_value: NDArray[np.int32] | None = None
+    keeps_components: bool = False
 
     @property
     def n_voxels(self) -> int:
@@ -144,6 +147,7 @@ class StoredContent(NamedTuple):
 def content(
     images: Image | Sequence[Image], labels: Image | None = None, mask: Image | None = None, *,
     weights: Sequence[float] | None = None, label_weight: float = 1.0, smooth_interfaces: float = SMOOTH_INTERFACES,
+    keep_components: bool = False,
 ) -> Content:  # fmt: skip
     """Contrasts, labels and a mask on the voxels of the first image, for `mesh_image`, `octree` or `optimize`.
 
@@ -166,6 +170,8 @@ def content(
         Surface tension of interfaces, voxels: how far one would move to save itself. Labels are then smooth between
         voxels (`tetopt.target.memberships`), which are divided where slices are thick; nodes between labels lie where
         these meet. 0 leaves labels their stairs, and cells the label of most of their voxels.
+    keep_components : bool
+        Keep connected components of the mesh that the mask does not have. By default small ones are dropped.
 
     Returns
     -------
@@ -201,7 +207,7 @@ def content(
         images = [continued(image, beyond) for image in images]
         labels = None if labels is None else continued(labels, beyond)
     if len(images) == 1 and labels is None and weights[0] > 0.0:
-        return plain(images[0])._replace(region=region, continuation=beyond)
+        return plain(images[0])._replace(region=region, continuation=beyond, keeps_components=keep_components)
     members = None
     if labels is not None and label_weight > 0.0 and smooth_interfaces > 0.0:
         factors = supersampling(labels.spacing)
@@ -224,6 +230,7 @@ def content(
     values, scale = _whole_numbers(contrasts, number, codes)
     unit = _variance(images[0].data, region) or 1.0
     result = Content(images[0], values, len(contrasts), unit / scale**2, False, region, beyond)
+    result = result._replace(keeps_components=keep_components)
     if members is None:
         return result
     channel, value = len(contrasts) + codes.argmax(axis=0), np.rint(scale * codes).astype(np.int32).max(axis=0)

@@ -1,0 +1,76 @@
+"""Cells within a mask that are left out: at pinches of the boundary, and in components that the mask does not have."""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+import scipy
+from numpy.typing import NDArray
+
+from tetopt.geometry.manifold import manifold_part
+from tetopt.geometry.simplex import centroids, volumes
+from tetopt.geometry.topology import components
+from tetopt.image import Image
+from tetopt.mesh import Mesh
+from tetopt.target.domain import Region
+
+DROPPED_SHARE = 0.1  # of the largest connected component of cells in one of voxels: smaller ones beside it are dropped
+
+
+class Carved(NamedTuple):
+    """Which cells stay."""
+
+    is_kept: NDArray[np.bool_]  # (M,)
+    n_dropped: int  # connected components left out
+
+
+def carved(mesh: Mesh, image: Image, region: Region, keeps_components: bool = False) -> Carved:
+    """Cells of a mesh within a region that stay, so that its boundary is a manifold, its components those of the mask.
+
+    Cells at pinches of the boundary go (`manifold_part`). Of the connected components of cells within one of voxels,
+    linked by faces, the largest stays, and those of a tenth of its volume or more; with `keeps_components` all do.
+    """
+    size = volumes(mesh.points, mesh.cells)
+    is_kept = manifold_part(mesh.cells, size)
+    chosen = np.flatnonzero(is_kept)
+    number = components(mesh.cells[chosen])
+    volume = np.bincount(number, size[chosen])
+    if keeps_components or len(volume) < 2:
+        return Carved(is_kept, 0)
+    home = _home(mesh, chosen, number, size, image, region)
+    largest = np.zeros(home.max() + 1)
+    np.maximum.at(largest, home, volume)
+    is_dropped = (home == 0) | (volume < DROPPED_SHARE * largest[home])
+    is_dropped[np.argmax(volume)] = False
+    is_kept[chosen[is_dropped[number]]] = False
+    return Carved(is_kept, int(is_dropped.sum()))
+
+
+def part_of(mesh: Mesh, is_kept: NDArray[np.bool_]) -> Mesh:
+    """The cells of a mesh that stay, (M,), without the nodes that no cell uses then."""
+    if is_kept.all():
+        return mesh
+    used, compact = np.unique(mesh.cells[is_kept], return_inverse=True)
+    return Mesh(mesh.points[used], compact.reshape(-1, mesh.ndim + 1))
+
+
+def n_components(region: Region) -> int:
+    """Connected components of a mask's voxels, linked by faces."""
+    return int(scipy.ndimage.label(region.inside)[1])
+
+
+def _home(
+    mesh: Mesh, chosen: NDArray[np.int64], number: NDArray[np.int64], size: NDArray[np.float64], image: Image,
+    region: Region,
+) -> NDArray[np.int64]:  # fmt: skip
+    """The component of voxels, from 1, that most of each component of the chosen cells lies in, (C,); 0 for none."""
+    of_voxel, n_homes = scipy.ndimage.label(region.inside)
+    index = np.rint(image.to_index(centroids(mesh.points, mesh.cells[chosen]))).astype(np.int64)
+    at = of_voxel[tuple(np.clip(index, 0, np.array(image.shape) - 1).T)].astype(np.int64)
+    held = scipy.sparse.coo_array((size[chosen], (number, at)), shape=(int(number.max()) + 1, n_homes + 1)).tocsr()
+    held = held[:, 1:]  # a component that lies outside in part has its home inside
+    home = np.zeros(held.shape[0], dtype=np.int64)
+    has_home = np.diff(held.indptr) > 0
+    home[has_home] = np.asarray(held.argmax(axis=1)).ravel()[has_home] + 1
+    return home
