@@ -867,9 +867,16 @@ def test_a_reader_that_goes_away_loses_no_file(tmp_path, inputs):
 
 def test_quality_of_overlapping_cells(tmp_path, inputs, capsys):
     mesh = lattice(load_image(inputs / "sphere.nii.gz"), nodes=60)
-    save_mesh(tmp_path / "twice.vtu", Mesh(mesh.points, np.vstack([mesh.cells, mesh.cells[:9]])))
-    assert exit_code("quality", tmp_path / "twice.vtu", "--image", inputs / "sphere.nii.gz") == 1
-    assert "cells overlap: together they hold" in capsys.readouterr().err
+    # Once more a few of them, and not all of the others: together they hold no more voxels than there are.
+    save_mesh(tmp_path / "twice.vtu", Mesh(mesh.points, np.vstack([mesh.cells[3:], mesh.cells[4:5]])))
+    words = [tmp_path / "twice.vtu", "--image", inputs / "sphere.nii.gz"]
+    assert exit_code("quality", *words, "--json", tmp_path / "q.json") == 1
+    overlap = numbers_in(tmp_path / "q.json")["fit"]["overlap"]
+    assert overlap["cells"] == [1, len(mesh.cells) - 3]
+    assert f"cells 1 and {len(mesh.cells) - 3} both hold voxel {overlap['voxel']}" in capsys.readouterr().err
+    assert exit_code("segment", words[2], words[0], "-o", tmp_path / "s.nii.gz") == 2
+    assert "twice.vtu: cells overlap: " in capsys.readouterr().err
+    assert not (tmp_path / "s.nii.gz").exists()
 
 
 def test_quality_with_another_image(tmp_path, inputs, capsys):

@@ -99,7 +99,9 @@ class SealedCache(FunctionCache):
 
     def __init__(self, function: Callable[..., Any]) -> None:
         super().__init__(function)
-        name, stamp = self._impl.filename_base + "-s", self._impl.locator.get_source_stamp()
+        # Indices are checked, or not, by the code itself, of which numba's keys know nothing.
+        kind = "-sb" if numba.config.BOUNDSCHECK else "-s"
+        name, stamp = self._impl.filename_base + kind, self._impl.locator.get_source_stamp()
         beside = shipped_folder(inspect.getfile(function))
         shipped = None if beside is None else SealedFile(str(beside), name, stamp)
         self._cache_file: Any = SealedFile(self._cache_path, name, stamp, shipped)

@@ -17,6 +17,7 @@ from tetopt.check import manifold_problems
 from tetopt.cli.console import out, print_fidelity, show_error, show_warning
 from tetopt.cli.inputs import image_and_others, label_table, read_mesh, warn_of_other_image
 from tetopt.cli.options import ImagePart, LabelNamesOption, NumberOptions, option
+from tetopt.energy.sampling import Overlap, overlap_of
 from tetopt.engine.promises import MASK_DICE
 from tetopt.incoming import json_of
 from tetopt.io.files import save_json
@@ -88,8 +89,8 @@ def quality_command(
     if mask is not None and measured["mask"].dice < MASK_DICE:
         show_error(f"the mesh and the mask overlap only by Dice {measured['mask'].dice:.3f}: is it of this mask?")
         return 1
-    if image is not None and fit is not None and fit.n_voxels > image.data.size:
-        show_error(f"cells overlap: together they hold {fit.n_voxels} voxels, more than there are")
+    if fit is not None and fit.overlap is not None:
+        show_error(f"{mesh_path}: {fit.overlap}")
         return 1
     return 0
 
@@ -166,6 +167,7 @@ class Fit(NamedTuple):
     E_D_share_of_variance: float | None  # of the voxels that the mesh covers; None where they are all alike
     n_voxels: int  # voxel centres inside
     n_empty_cells: int  # cells without one
+    overlap: Overlap | None  # voxels that lie in several cells
 
 
 def image_fit(image: Image, mesh: Mesh) -> Fit:
@@ -183,4 +185,5 @@ def image_fit(image: Image, mesh: Mesh) -> Fit:
         raise InputError("mesh and image: no voxel centre lies inside the mesh; do both lie in the same world mm?")
     mean = float((moments.n_voxels * moments.mean).sum()) / n_voxels
     spread = E_D + float((moments.n_voxels * (moments.mean - mean) ** 2).sum()) * image.voxel_volume
-    return Fit(E_D, E_D / spread if spread > 0.0 else None, n_voxels, int((moments.n_voxels == 0).sum()))
+    n_empty = int((moments.n_voxels == 0).sum())
+    return Fit(E_D, E_D / spread if spread > 0.0 else None, n_voxels, n_empty, overlap_of(image, mesh))

@@ -14,6 +14,7 @@ from tetopt import Image, InputError, Mesh, save_image
 from tetopt.cli.console import out, show_warning
 from tetopt.cli.inputs import read_image, read_labels, read_mesh, warn_of_other_image
 from tetopt.cli.options import ImageArgument, ImagePart, NumberOptions, option
+from tetopt.energy.sampling import overlap_of
 from tetopt.io.files import checked_output, save_json
 from tetopt.report.tables import new_table
 
@@ -75,8 +76,8 @@ def _mesh_over(path: Path, image: Image, image_path: Path) -> Mesh:
     """The mesh of a file, whose cells hold each of the image's voxels once; a warning tells of voxels outside."""
     loaded = read_mesh(path)
     warn_of_other_image(loaded, path, image_path)
-    if tetopt.cell_moments(image, loaded.mesh).n_voxels.sum() > image.data.size:
-        raise InputError(f"{path}: its cells overlap: together they hold more voxels than there are")
+    if (overlap := overlap_of(image, loaded.mesh)) is not None:
+        raise InputError(f"{path}: {overlap}; remove one of each such pair, or mesh the image again")
     outside = int((tetopt.cell_of_voxel(image, loaded.mesh) < 0).sum())
     if outside == image.data.size:
         raise InputError(f"{path}: no voxel of {image_path} lies in it; was it made from another image?")

@@ -37,7 +37,7 @@ def segmented(image: Image, mesh: Mesh, classes: int) -> Image:
     Raises
     ------
     InputError
-        As `class_thresholds` and `tetopt.energy.sampling.cell_moments`.
+        As `class_thresholds` and `tetopt.energy.sampling.cell_moments`; a mesh in which no voxel lies.
 
     Examples
     --------
@@ -48,6 +48,8 @@ def segmented(image: Image, mesh: Mesh, classes: int) -> Image:
     11
     """
     moments = cell_moments(image, mesh)
+    if not moments.n_voxels.any():
+        raise InputError("mesh and image: no voxel centre lies in the mesh; do both lie in the same world mm?")
     thresholds = class_thresholds(moments.mean, classes, moments.n_voxels)
     class_of_cell = np.digitize(moments.mean, thresholds)
     owner = cell_of_voxel(image, mesh)
