@@ -74,7 +74,42 @@ def test_a_mask_and_overlaps():
     part = tetopt.Mesh(result.mesh.points[used], cells.reshape(half.shape))
     n_voxels = int(tetopt.cell_moments(target.image, part).n_voxels.sum())
     halved = result._replace(mesh=part, history=[last._replace(n_voxels=n_voxels)])
-    assert list(missed(target, halved)) == ["mask"]
+    assert set(missed(target, halved)) - {"components", "manifold"} == {"mask"}
+
+
+def test_a_boundary_that_is_no_manifold_and_more_components_than_the_mask_has():
+    """Two tetrahedra of the mesh that share a node, and two far apart, are all that is left."""
+    image, mask = shaped("ball")
+    target = content(image, mask=mask)
+    result = tetopt.mesh_image(target, 400, iterations=1)
+    cells = result.mesh.cells
+    n_shared = (cells[:, :, None] == cells[0]).any(axis=2).sum(axis=1)
+    for chosen, names in ((1, ["components", "manifold"]), (0, ["components"])):
+        pair = cells[[0, np.flatnonzero(n_shared == chosen)[0]]]
+        used, rows = np.unique(pair, return_inverse=True)
+        part = tetopt.Mesh(result.mesh.points[used], rows.reshape(pair.shape))
+        n_voxels = int(tetopt.cell_moments(target.image, part).n_voxels.sum())
+        row = result.history[-1]._replace(n_voxels=n_voxels)
+        found = missed(target, result._replace(mesh=part, history=[row]))
+        assert sorted(set(found) - {"mask"}) == names
+        assert "2 connected components, the mask 1" in found["components"]
+
+
+def test_an_interface_that_touches_itself():
+    image, _ = shaped("ball")
+    target = content(image, tetopt.Image(1.0 * (image.data > 50.0), image.affine))
+    result = tetopt.mesh_image(target, 400, iterations=4)
+    assert result.missed == {}
+    cells = result.mesh.cells
+    node = int(np.bincount(cells.ravel()).argmax())
+    star = np.flatnonzero((cells == node).any(axis=1))
+    shared = (cells[star][:, :, None, None] == cells[star]).any(axis=1).sum(axis=2)
+    one, other = np.argwhere(shared == 1)[0]  # two cells with the node alone in common
+    labels = np.zeros_like(result.labels)
+    labels[star[[one, other]]] = 1
+    words = missed(target, result._replace(labels=labels))
+    assert list(words) == ["manifold"]
+    assert f"[[{node}]]" in words["manifold"]
 
 
 def test_labels_without_cells():

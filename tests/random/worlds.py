@@ -44,6 +44,14 @@ def random_affine(rng, n):
     return affine
 
 
+def sharpest_edge(affine):
+    """The smallest dihedral angle of a grid's box, degrees: no mesh of it has a larger one."""
+    inward = np.linalg.inv(affine[:-1, :-1])
+    inward /= np.linalg.norm(inward, axis=1, keepdims=True)
+    cosines = np.abs(inward @ inward.T)[np.triu_indices(len(inward), 1)]
+    return float(np.degrees(np.arccos(np.clip(cosines, 0.0, 1.0))).min())
+
+
 def field(rng, shape, sigma):
     """A smooth random function, of variance 1."""
     data = scipy.ndimage.gaussian_filter(rng.normal(size=shape), sigma, mode="nearest")
@@ -101,7 +109,7 @@ def random_labels(rng, shape):
     return labels.astype(float)
 
 
-def random_world(rng, n=None, largest=22, needs_mask=False):
+def random_world(rng, n=None, largest=22, needs_mask=False, needs_labels=False):
     """A world of 2 or 3 dimensions."""
     n = int(rng.choice([2, 3, 3])) if n is None else n
     shape = tuple(rng.integers(9, (largest if n == 3 else 2 * largest) + 1, n).tolist())
@@ -113,7 +121,7 @@ def random_world(rng, n=None, largest=22, needs_mask=False):
     mask = None
     if of_mask != "none" and (inside := random_mask(rng, shape, of_mask)).sum() > 200:
         mask = tetopt.Image(1.0 * inside, affine)
-    labels = tetopt.Image(random_labels(rng, shape), affine) if rng.random() < 0.35 else None
+    labels = tetopt.Image(random_labels(rng, shape), affine) if needs_labels or rng.random() < 0.35 else None
     if labels is not None and len(np.unique(labels.data if mask is None else labels.data[inside])) < 2:
         labels = None
     words = f"{n}-D {shape} {kind}, mask {of_mask if mask is not None else 'none'}"

@@ -413,7 +413,7 @@ class Run:
         """
         before = self.state if self.content.region is None else copied(self.state)
         made = repair(self.state, degrees)
-        if self.content.region is not None and self._overlaps(made.state):
+        if self.content.region is not None and self._overlapping(made.state).any():
             self.state = before
             return 0
         self._renumber(made.state, made.source)
@@ -421,27 +421,33 @@ class Run:
         return made.n_moves
 
     def mend_surfaces(self, carves: bool) -> int:
-        """Mend pinches: of a mask's boundary, if it `carves`, by taking out cells, and how many; then of interfaces.
+        """Mend overlaps and pinches: of a mask's boundary, if it `carves`, by taking out cells; then of interfaces.
 
-        An octree within a mask has none to begin with; a mesh of the user's may.
+        Cells overlap where parts of the boundary slid through one another, across a gap of a voxel or two; the octree
+        within a mask has no pinch, but a mesh of the user's may. Returns how many cells were taken out.
         """
         n_gone = 0
         if carves and self.content.region is not None:
+            n_gone = self._take_out(self._overlapping(self.state))
             kept = carved(self.mesh(), self.image, self.content.region, self.content.keeps_components)
-            n_gone, self.n_dropped = int((~kept.is_kept).sum()), self.n_dropped + kept.n_dropped
-            if n_gone:
-                made = compacted(without_cells(self.state, ~kept.is_kept))
-                self._renumber(made.state, made.source)
+            n_gone, self.n_dropped = n_gone + self._take_out(~kept.is_kept), self.n_dropped + kept.n_dropped
         if self.has_labels:
             mend_pinches(self.state, self.content, self.mesh())
         return n_gone
 
-    def _overlaps(self, state: State) -> bool:
-        """Whether a voxel centre lies in two cells."""
+    def _take_out(self, is_gone: NDArray[np.bool_]) -> int:
+        if is_gone.any():
+            made = compacted(without_cells(self.state, is_gone))
+            self._renumber(made.state, made.source)
+        return int(is_gone.sum())
+
+    def _overlapping(self, state: State) -> NDArray[np.bool_]:
+        """Cells, (M,), that hold a voxel centre which a cell before them holds, too."""
         points = self.image.to_world(from_ticks(state.complex.ticks, self.grid, self.n))
         mesh = Mesh(points, state.complex.cells[: int(state.complex.n_cells[0])].copy())
-        covered = int((cell_of_voxel(self.image, mesh) >= 0).sum())
-        return int(cell_moments(self.image, mesh).n_voxels.sum()) != covered
+        owner = cell_of_voxel(self.image, mesh)
+        n_owned = np.bincount(owner[owner >= 0], minlength=len(mesh.cells))
+        return np.asarray(cell_moments(self.image, mesh).n_voxels > n_owned)
 
     def _renumber(self, state: State, source: NDArray[np.int64]) -> None:
         """Take over a state with other nodes: where each comes from, -1 for new ones."""

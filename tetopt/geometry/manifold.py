@@ -193,8 +193,8 @@ def _cells_at_pinch(place: tuple[int, ...], star: dict[int, Corners], size: NDAr
     if len(fans) > 1:
         largest = max(fans, key=lambda fan: (size[fan].sum(), -fan[0]))
         return [cell for fan in fans if fan is not largest for cell in fan]
-    if len(place) > 1:
-        return []
+    if len(place) > 1 or not star or len(next(iter(star.values())).nodes) == 3:
+        return []  # around an edge, or a node of triangles, a fan has two ends or none
     # Facets of the boundary, by what they are opposite to; two are linked by an edge that ends in the node.
     outer = [
         (cell, node)

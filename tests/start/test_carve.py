@@ -1,0 +1,66 @@
+"""Which cells within a mask stay: connected components as the mask has them."""
+
+import numpy as np
+import pytest
+from shapes import distance, shaped
+
+import tetopt
+from tetopt.geometry.topology import components
+from tetopt.start.carve import carved, n_components, part_of
+from tetopt.target.content import content
+
+
+@pytest.fixture(scope="module")
+def pieces():
+    """Two balls, and a mesh of them."""
+    image, mask = shaped("pieces")
+    target = content(image, mask=mask)
+    return target, mask, tetopt.mesh_image(target, 300, iterations=1)
+
+
+def test_each_component_of_the_mask_keeps_its_largest(pieces):
+    target, _, result = pieces
+    assert components(result.mesh.cells).max() + 1 == n_components(target.region) == 2
+    assert result.n_dropped == 0
+    assert carved(result.mesh, target.image, target.region).is_kept.all()
+
+
+def test_components_that_the_mask_does_not_have_are_dropped_unless_they_are_kept(pieces):
+    """Loose cells beside the ball: small ones go, a half of the ball stays."""
+    image, _ = shaped("ball")
+    mask = tetopt.Image(1.0 * (distance(image.shape, 13.3, 14.1, 15.7) < 11.0))
+    target = content(image, mask=mask)
+    whole = tetopt.mesh_image(target, 300, iterations=1).mesh
+    cut = np.abs(whole.points[whole.cells].mean(axis=1)[:, 2] - 12.0)  # a slab of cells is left out
+    halves = part_of(whole, cut > 1.5)
+    number = components(halves.cells)
+    sizes = np.sort(np.bincount(number))[::-1]
+    assert len(sizes) >= 2
+    kept = carved(halves, target.image, target.region)
+    left = part_of(halves, kept.is_kept)
+    large = sizes[sizes > 0.2 * sizes[0]]
+    assert components(left.cells).max() + 1 == len(large) == 2
+    assert kept.n_dropped == len(sizes) - len(large)
+    every = carved(halves, target.image, target.region, keeps_components=True)
+    assert every.n_dropped == 0
+    assert every.is_kept.sum() >= kept.is_kept.sum()
+
+
+def test_what_a_mesh_tears_off_is_dropped_and_told():
+    """A ball with a bulb at a thin winding tail, which octree cells of that size tear."""
+    image, _ = shaped("ball")
+    inside = (distance(image.shape, 13.3, 14.1, 9.7) < 8.0) | (distance(image.shape, 10.5, 16.6, 24.5) < 2.3)
+    for k in range(7):
+        i, j = k // 2, (k + 1) // 2
+        inside[13 - j, 14 + i, 16 + k] = inside[13 - i, 14 + i, 16 + k] = inside[13 - j, 14 + j, 16 + k] = True
+    mask = tetopt.Image(1.0 * inside)
+    target = content(image, mask=mask)
+    assert n_components(target.region) == 1
+    result = tetopt.mesh_image(target, 400, iterations=3)
+    assert result.n_dropped == 1
+    assert components(result.mesh.cells).max() == 0
+    assert result.missed == {}
+    kept = tetopt.mesh_image(content(image, mask=mask, keep_components=True), 400, iterations=3)
+    assert kept.n_dropped == 0
+    assert components(kept.mesh.cells).max() == 1
+    assert list(kept.missed) == ["components"]
