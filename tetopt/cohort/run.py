@@ -99,8 +99,10 @@ def _attempt(job: Job, begin: float, attempt: int) -> tuple[Ended, bool]:
     command = python_command("-m", "tetopt", "mesh", *outputs, *job.words)
     environment = python_environment(**dict.fromkeys(THREAD_NAMES, str(job.threads)), COLUMNS="120")
     peak, log, is_given_up = 0, log_path(out, job.key), False
+    if attempt == 1:
+        log.unlink(missing_ok=True)
     with (
-        log.open("wb" if attempt == 1 else "ab") as stream,
+        log.open("ab") as stream,
         started(command, work, environment, stdout=stream, stderr=stream) as child,
     ):
         while child.poll() is None:
