@@ -114,7 +114,7 @@ def test_a_run_out_of_time_goes_on(tmp_path, inputs, capfd):
     ]  # fmt: skip
     for each in [[*command, *change] for change in changes] + [["mesh", other, *command[2:]]]:
         assert exit_code(*each, "-o", tmp_path / "a.vtu") == 2, each
-        assert "a.vtu.work: is the folder of work of another run" in capfd.readouterr().err
+        assert "a.vtu.work: work directory of another run" in capfd.readouterr().err
     assert exit_code(*command, "-o", tmp_path / "a.vtu") == 0
     one, other = (load_mesh(tmp_path / name).mesh for name in ("whole.vtu", "a.vtu"))
     assert np.array_equal(one.points, other.points)

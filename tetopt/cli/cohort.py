@@ -17,7 +17,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from tetopt.budget import available_bytes, memory_words
-from tetopt.cli.cohort_plan import Entry, check_places, checked_suffix, chosen, entries_of, subjects_of, with_states
+from tetopt.cli.cohort_plan import Entry, checked_suffix, chosen, entries_of, subjects_of, with_places, with_states
 from tetopt.cli.console import log, out, show_error, show_warning
 from tetopt.cli.inputs import read_mesh
 from tetopt.cli.options import (
@@ -109,8 +109,7 @@ def cohort_command(
         if cohort.collect:
             return _collected(place, subjects, [key(row) for row in rows])
         entries = entries_of(rows, records, place, suffix, log.print)
-        to_run = chosen(entries, cohort.retry_failed)
-        check_places(to_run, place)
+        to_run = with_places(chosen(entries, cohort.retry_failed), place)
     except Problems as problems:
         for line in problems.lines:
             show_error(line)

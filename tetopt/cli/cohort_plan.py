@@ -203,8 +203,8 @@ def with_states(entries: list[Entry], out: Path, suffix: str, say: Callable[[str
         return list(pool.map(state, entries))
 
 
-def check_places(entries: Iterable[Entry], out: Path) -> None:
-    """Problems for subjects whose folder a run cannot replace."""
+def with_places(entries: list[Entry], out: Path) -> list[Entry]:
+    """The subjects to be run; Problems for those whose folder a run cannot replace."""
     problems = []
     for entry in entries:
         try:
@@ -213,6 +213,7 @@ def check_places(entries: Iterable[Entry], out: Path) -> None:
             problems.append(str(error))
     if problems:
         raise Problems(list(dict.fromkeys(problems)))
+    return entries
 
 
 def chosen(entries: Iterable[Entry], only_failed: bool) -> list[Entry]:

@@ -50,7 +50,7 @@ MOST_LOADED = 2**28  # voxels of an image that a run in parts reads whole: with 
 MOST_DRAWN = 2**27  # voxels of the level of an image that pictures are drawn of
 VOXEL_BYTES = 16.0  # of an image that is read whole, besides what meshing takes
 FEWEST_NODES_EACH = 100  # of a part: of 150 half are shared, and stay
-WORK_SUFFIX = ".work"  # of the folder beside the mesh, after its name
+WORK_SUFFIX = ".work"  # of the work directory beside the mesh, after its name
 WHOLE_ONLY = "looks at all cells or voxels at once, parts do not; leave it out, or --parts"
 
 
@@ -359,7 +359,7 @@ def _shown(begin_keeping: Callable[[], None]) -> Iterator[Callable[[Round, list[
 
 
 def end_work(plan: Plan, result: Optimized) -> None:
-    """Remove the folder of work of a run that is complete; say what becomes of that of another."""
+    """Remove the work directory of a run that is complete; say what becomes of that of another."""
     folder = work_folder(plan)
     if result.ended in ("iterations", "converged"):
         if left := removed(folder):

@@ -158,7 +158,7 @@ def locked(out: Path, keys: list[str] | None = None) -> Iterator[None]:
     Raises
     ------
     InputError
-        Another run has the lock; in the folder of work lies what is not tetopt's.
+        Another run has the lock; the work directory holds what is not tetopt's.
     """
     with ExitStack() as stack:
         work = stack.enter_context(opened(out / WORK_NAME, WORK))

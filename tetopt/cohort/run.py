@@ -47,7 +47,7 @@ class Job(NamedTuple):
     threads: int
     n_bytes: float  # of memory that are predicted
     seconds: float  # likewise, of one thread
-    run: str  # the name of a file in the folder of work: when it is gone, the run is given up
+    run: str  # the name of a file in the work directory: when it is gone, the run is given up
 
 
 class Ended(NamedTuple):

@@ -30,9 +30,11 @@ except ImportError:  # Windows
 
 HAS_DESCRIPTORS = hasattr(os, "O_DIRECTORY")  # of folders: Windows has none
 MANIFEST_NAME, LOCK_NAME = "tetopt-manifest", "lock"
-MANIFEST_BYTES = 10_000
+MANIFEST_BYTES = 10_000  # at most: those that tetopt writes have some 200
 # As `tetopt.io.files.written_whole` names files under way; a killed run leaves them.
 TEMPORARY = re.compile(rf"\.(.{{1,{TEMPORARY_LETTERS}}})\.[a-z0-9_]{{8}}.{{0,20}}")
+# What systems put into folders: files removed while open on NFS, and macOS's Finder.
+SYSTEM_NAMES = r"\.nfs[0-9a-f]+|\.DS_Store"
 ADVICE = "move it away, and run this again"
 
 
@@ -47,7 +49,7 @@ class Layout(NamedTuple):
         """What is wrong with an entry of this name and mode; None for one of ours."""
         if any(re.fullmatch(folder, name) for folder in self.folders):
             return None if stat.S_ISDIR(mode) else f"expected a folder, got {_kind(mode)}"
-        if re.fullmatch(f"{MANIFEST_NAME}|{self.files}", name) or self._is_temporary(name):
+        if re.fullmatch(f"{MANIFEST_NAME}|{SYSTEM_NAMES}|{self.files}", name) or self._is_temporary(name):
             return None if stat.S_ISREG(mode) else f"expected a regular file, got {_kind(mode)}"
         return f"not a file of tetopt's work directory ({self.work})"
 

@@ -41,7 +41,7 @@ VOXELS_NAME, VOLUME_NAME, STATE_NAME, INITIAL_NAME = "voxels.npy", "volume.json"
 LOGS_NAME = "logs"
 LAYOUT = Layout(
     "a mesh in parts",
-    rf"{LOCK_NAME}|voxels\.npy|(volume|state)\.json|(initial|mesh-\d+)\.npz",
+    rf"{LOCK_NAME}|voxels\.npy|(volume|state)\.json|(initial|mesh-\d+)\.npz|seen-\d+",
     {r"round-\d+": r"(part|done)-\d+\.npz", LOGS_NAME: ".+", "dask": None},
 )
 TEXT_NAME = "text"  # of the entry of a file of arrays that has what else is to be known, in JSON
@@ -92,7 +92,7 @@ def removed(folder: Path) -> list[str]:
 
 @contextmanager
 def gone_if_refused(folder: Path) -> Iterator[Callable[[], None]]:
-    """A folder of work without a state goes again with an InputError, unless what is yielded has been called by then.
+    """A work directory without a state goes again with an InputError, unless what is yielded has been called by then.
 
     Otherwise what was refused would stand in the way of the request that is mended.
     """
@@ -123,7 +123,7 @@ def save_volume(folder: Path, volume: VolumeFile | Image) -> None:
 
 
 def open_volume(folder: Path) -> StoredImage:
-    """The image whose voxels a folder of work is about; InputError as `open_stored`, or the folder is damaged."""
+    """The image whose voxels a work directory is about; InputError as `open_stored`, or the folder is damaged."""
     path = folder / VOLUME_NAME
     try:
         words = json_of(own_bytes(path).decode())
@@ -213,8 +213,8 @@ def load_state(folder: Path, request: str) -> State | None:
         raise _damaged(path, error) from error
     if state.request != request:
         raise InputError(
-            f"{folder}: is the folder of work of another run, which has not ended; give the same options and image to "
-            "go on with it, or remove it"
+            f"{folder}: work directory of another run that has not finished; continue it with the same options and "
+            "image, or remove it"
         )
     return state
 
