@@ -93,6 +93,13 @@ def test_a_folder_of_a_version_without_manifests_is_refused(out, capfd):
     assert exit_code(*words(out, "--collect")) == 0
 
 
+def test_an_empty_work_directory_is_taken(out):
+    shutil.rmtree(out / ".work")
+    (out / ".work").mkdir()
+    for _ in range(2):
+        assert exit_code(*words(out, "--collect")) == 0
+
+
 def moved(out, place):
     """A folder of results, moved to another disk, and a link in its place."""
     elsewhere = outside(out.parent)

@@ -7,6 +7,7 @@ import pytest
 from attacks import KINDS, content, outside, planted
 
 from tetopt.errors import InputError
+from tetopt.incoming import own_bytes
 from tetopt.io import work_directory
 from tetopt.io.files import save_text
 from tetopt.io.work_directory import Layout, check_files, create, discard, opened
@@ -49,6 +50,15 @@ def test_an_empty_folder_becomes_one(tmp_path):
     create(tmp_path / "empty", LAYOUT)
     checked(tmp_path / "empty")
     assert stat.S_IMODE((tmp_path / "empty").stat().st_mode) == 0o700
+
+
+def test_a_run_that_was_killed_as_it_created_it_is_not_in_the_way(tmp_path):
+    (tmp_path / "work").mkdir()
+    (tmp_path / "work" / ".tetopt-manifest.abcd_123").write_text("half")
+    checked(tmp_path / "work")
+    create(tmp_path / "work", LAYOUT)
+    checked(tmp_path / "work")
+    assert (tmp_path / "work" / "tetopt-manifest").read_text().startswith("{")
 
 
 # Where there is something wrong, and with what.
@@ -138,3 +148,14 @@ def test_files_that_a_killed_run_was_writing_are_its_own(work, monkeypatch, name
         save_text(work / name, "half")
     assert len(set(content(work)) - before) == 1
     checked(work)
+
+
+@pytest.mark.parametrize("kind", ["file link", "device link", "pipe", "folder", "long"])
+def test_own_files_are_regular_and_of_bounded_size(tmp_path, kind):
+    path = tmp_path / "numbers.json"
+    path.write_bytes(b"1234")
+    assert own_bytes(path, 4) == b"1234"
+    if kind != "long":
+        planted(kind, path, outside(tmp_path))
+    with pytest.raises(InputError, match=f"^{path}: expected "):
+        own_bytes(path, 3)

@@ -160,6 +160,7 @@ def locked(out: Path, keys: list[str] | None = None) -> Iterator[None]:
     InputError
         Another run has the lock; the work directory holds what is not tetopt's.
     """
+    create(out / WORK_NAME, WORK)
     with ExitStack() as stack:
         work = stack.enter_context(opened(out / WORK_NAME, WORK))
         work.check()

@@ -75,10 +75,9 @@ class WorkDirectory(NamedTuple):
         InputError
             No manifest, or another one; a name that it does not list; a link, a pipe, a device.
         """
-        modes = _modes(self.path, self.descriptor)
-        if modes:
+        if not self.is_new():
             self._check_manifest()
-        for name, mode in sorted(modes.items()):
+        for name, mode in sorted(_modes(self.path, self.descriptor).items()):
             if (problem := self.layout.problem(name, mode)) is not None:
                 raise InputError(f"{self.path / name}: {problem}; {ADVICE}")
             inner = next((files for each, files in self.layout.folders.items() if re.fullmatch(each, name)), None)
@@ -98,6 +97,11 @@ class WorkDirectory(NamedTuple):
                 f"{self.path}: not a work directory of this version of tetopt ({self.layout.work}): "
                 f"{MANIFEST_NAME} {'is missing' if listed is None else 'lists other names'}; {ADVICE}"
             )
+
+    def is_new(self) -> bool:
+        """Whether it is empty but for the temporary files of a run that creates it just now, or was killed there."""
+        own = self.own()
+        return all(name in own and TEMPORARY.fullmatch(name) for name in _modes(self.path, self.descriptor))
 
     def own(self) -> dict[str, int]:
         """The modes of the entries that are tetopt's, by name."""
@@ -147,8 +151,8 @@ def create(path: Path, layout: Layout) -> None:
         path.mkdir(mode=0o700)
     if irregular(path, follow=False) != "a folder":
         return
-    with opened(path, layout) as work:  # a run that begins at the same time may have come as far as the temporary file
-        if all(TEMPORARY.fullmatch(name) and name in work.own() for name in _modes(path, work.descriptor)):
+    with opened(path, layout) as work:
+        if work.is_new():
             os.chmod(path if work.descriptor is None else work.descriptor, 0o700)
             save_json(path / MANIFEST_NAME, layout._asdict())
 
