@@ -103,6 +103,13 @@ def test_what_was_there_stays_where_a_run_fails(job, tmp_path):
     assert not failure_path(out, "sub-1").exists()
 
 
+def test_a_log_with_a_second_name_is_not_written_to(job, tmp_path):
+    (tmp_path / "notes.txt").write_text("years of work")
+    os.link(tmp_path / "notes.txt", log_path(tmp_path / "out", "sub-1"))
+    assert run_subject(job._replace(words=("--nodes=0", *job.words[1:]))).status == "failed"
+    assert (tmp_path / "notes.txt").read_text() == "years of work"
+
+
 def processes_of(folder):
     """The runs of a cohort's folder that are under way."""
     found = []
