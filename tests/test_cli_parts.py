@@ -4,6 +4,7 @@ import json
 
 import numpy as np
 import pytest
+from attacks import KINDS, content, outside, planted
 from commands import assert_refused, exit_code
 
 import tetopt
@@ -113,7 +114,7 @@ def test_a_run_out_of_time_goes_on(tmp_path, inputs, capfd):
     ]  # fmt: skip
     for each in [[*command, *change] for change in changes] + [["mesh", other, *command[2:]]]:
         assert exit_code(*each, "-o", tmp_path / "a.vtu") == 2, each
-        assert "a.vtu.work: is the folder of work of another run" in capfd.readouterr().err
+        assert "a.vtu.work: work directory of another run" in capfd.readouterr().err
     assert exit_code(*command, "-o", tmp_path / "a.vtu") == 0
     one, other = (load_mesh(tmp_path / name).mesh for name in ("whole.vtu", "a.vtu"))
     assert np.array_equal(one.points, other.points)
@@ -151,22 +152,43 @@ def test_voxels_that_a_run_without_an_octree_left_are_not_those_of_another_image
     assert not folder.exists()
 
 
-@pytest.mark.parametrize("kind", ["file", "folder", "link", "dangling"])
-def test_what_has_the_name_of_the_folder_of_work_stays(tmp_path, inputs, capfd, kind):
-    place, other = tmp_path / "a.vtu.work", tmp_path / "other"
-    if kind == "file":
-        place.write_text("mine")
-    elif kind == "folder":
+@pytest.mark.parametrize("kind", [*KINDS, "a lock"])
+def test_what_has_the_name_of_the_work_directory_stays(tmp_path, inputs, capfd, kind):
+    place, elsewhere = tmp_path / "a.vtu.work", outside(tmp_path)
+    if kind == "a lock":  # of another program's
         place.mkdir()
-        (place / "mine.txt").write_text("mine")
+        (place / "lock").write_text("mine")
     else:
-        if kind == "link":
-            other.mkdir()
-        place.symlink_to(other)
-    before = sorted(tmp_path.rglob("*"))
+        planted(kind, place, elsewhere)
+    before = content(tmp_path)
     command = ["mesh", inputs / "ball.nii.gz", *OF_TWO, "-o", tmp_path / "a.vtu"]
-    assert_refused(capfd, command, "a.vtu.work: is no folder of work of a mesh in parts; move it away")
-    assert sorted(tmp_path.rglob("*")) == before
+    assert_refused(capfd, command, r"a\.vtu\.work: [^\n]*; move it away, and run this again")
+    assert content(tmp_path) == before
+
+
+@pytest.mark.parametrize(("name", "kind"), [
+    ("lock", "hard link"), ("lock", "file link"), ("lock", "pipe"), ("voxels.npy", "file link"), ("voxels.npy", "pipe"),
+    ("volume.json", "device link"), ("state.json", "device link"), ("state.json", "pipe"), ("round-0", "folder link"),
+    ("round-0/done-0.npz", "pipe"), ("mesh-0.npz", "file link"), ("thesis.txt", "file"), ("dask", "folder link"),
+    ("logs/dask.log", "file link"),
+])  # fmt: skip
+def test_what_lies_in_the_work_directory_and_is_not_tetopts_stays(tmp_path, inputs, capfd, name, kind):
+    place, elsewhere = tmp_path / "a.vtu.work", outside(tmp_path)
+    save_volume(place, tetopt.Image(np.full((9, 9, 9), 3.0)))
+    (place / name).parent.mkdir(exist_ok=True)
+    planted(kind, place / name, elsewhere)
+    before = content(tmp_path)
+    command = ["mesh", inputs / "ball.nii.gz", *OF_TWO, "-o", tmp_path / "a.vtu"]
+    assert_refused(capfd, command, rf"{place / name}: [^\n]*; move it away, and run this again")
+    assert content(tmp_path) == before
+
+
+def test_a_file_that_comes_into_the_work_directory_during_the_run_stays(tmp_path, inputs, monkeypatch, capfd):
+    folder = tmp_path / "a.vtu.work"
+    monkeypatch.setattr(cli_parts, "prepare_kernels", lambda *_, **__: (folder / "note.txt").write_text("mine"))
+    assert exit_code("mesh", inputs / "ball.nii.gz", *OF_TWO, "-o", tmp_path / "a.vtu") == 0
+    assert "a.vtu.work: stays with what is not tetopt's in it: note.txt" in capfd.readouterr().err
+    assert content(folder) == {"note.txt": b"mine"}
 
 
 def test_options_of_parts_have_no_say_in_one_piece(tmp_path, inputs, capfd):

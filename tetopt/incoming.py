@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import stat
 import tomllib
 from collections.abc import Iterator
@@ -16,19 +17,21 @@ LARGEST_NUMBER = 1e300  # of a table: its square root is still far beyond anythi
 # What stands in a file's place and is none; a pipe that nobody writes to blocks for ever, /dev/zero never ends.
 KINDS_OF_FILES = {
     stat.S_IFIFO: "a pipe", stat.S_IFSOCK: "a socket", stat.S_IFCHR: "a device", stat.S_IFBLK: "a device",
-    stat.S_IFDIR: "a folder",
+    stat.S_IFDIR: "a folder", stat.S_IFLNK: "a link",
 }  # fmt: skip
+# How tetopt opens its own files: not through a link, and without waiting at a pipe. Windows has neither flag.
+UNFOLLOWED = getattr(os, "O_NOFOLLOW", 0) | getattr(os, "O_NONBLOCK", 0) | getattr(os, "O_BINARY", 0)
 
 
-def irregular(path: Path) -> str | None:
-    """What `path` is, links followed, if it is there and no regular file: "a pipe", "a device", "a folder".
+def irregular(path: Path, *, follow: bool = True) -> str | None:
+    """What `path` is if it is there and no regular file: "a pipe", "a device", "a folder", unfollowed also "a link".
 
     Raises
     ------
     OSError
         Nothing is there, or it may not be looked at.
     """
-    mode = path.stat().st_mode
+    mode = path.stat(follow_symlinks=follow).st_mode
     return None if stat.S_ISREG(mode) else KINDS_OF_FILES.get(stat.S_IFMT(mode), "no regular file")
 
 
@@ -60,6 +63,25 @@ def regular_file(path: str | Path, noun: str) -> Path:
     if other is not None:
         raise InputError(f"{path}: expected a regular file, got {other}; copy what it gives into a file")
     return path
+
+
+def own_bytes(path: Path, most_bytes: int = TEXT_BYTES) -> bytes:
+    """The content of a file that tetopt wrote; links are not followed, as tetopt makes none.
+
+    Raises
+    ------
+    OSError
+        Nothing is there, or it cannot be read.
+    InputError
+        A link, no regular file, or one of more bytes.
+    """
+    if (other := irregular(path, follow=False)) is not None:
+        raise InputError(f"{path}: expected a regular file, got {other}; replace it by the file itself, or remove it")
+    with open(os.open(path, os.O_RDONLY | UNFOLLOWED), "rb") as stream:
+        whole = stream.read(most_bytes + 1)
+    if len(whole) > most_bytes:
+        raise InputError(f"{path}: expected at most {most_bytes} bytes, got {_size(path)}; remove it")
+    return whole
 
 
 def text_of(path: str | Path, noun: str) -> str:

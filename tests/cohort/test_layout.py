@@ -17,7 +17,7 @@ def out(tmp_path):
 
 
 def work_of(out, key, text):
-    folder = out / ".work" / f"{key}.run"
+    folder = out / ".work" / f"{key}.run-1.7"
     folder.mkdir()
     (folder / "a.txt").write_text(text)
     return folder
@@ -98,9 +98,9 @@ def test_what_a_killed_run_went_on_by_is_taken_away(out):
     for name in ("run-1", "seen-7", "lock", "sub-1.lock"):
         (out / ".work" / name).touch()
     restore(out, ["sub-1"])
-    assert len(list((out / ".work").iterdir())) == 4
+    assert len(list((out / ".work").iterdir())) == 5
     restore(out)
-    assert sorted(each.name for each in (out / ".work").iterdir()) == ["lock", "sub-1.lock"]
+    assert sorted(each.name for each in (out / ".work").iterdir()) == ["lock", "sub-1.lock", "tetopt-manifest"]
 
 
 def test_what_a_user_has_put_beside_a_mesh_stays(out):

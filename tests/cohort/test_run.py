@@ -103,6 +103,13 @@ def test_what_was_there_stays_where_a_run_fails(job, tmp_path):
     assert not failure_path(out, "sub-1").exists()
 
 
+def test_a_log_with_a_second_name_is_not_written_to(job, tmp_path):
+    (tmp_path / "notes.txt").write_text("years of work")
+    os.link(tmp_path / "notes.txt", log_path(tmp_path / "out", "sub-1"))
+    assert run_subject(job._replace(words=("--nodes=0", *job.words[1:]))).status == "failed"
+    assert (tmp_path / "notes.txt").read_text() == "years of work"
+
+
 def processes_of(folder):
     """The runs of a cohort's folder that are under way."""
     found = []
@@ -146,6 +153,6 @@ def test_a_run_that_is_given_up_ends(job, tmp_path):
     """As when Ctrl-C has ended the cohort: workers of a cluster do not hear it."""
     ended, n_runs = with_a_run_under_way(job, lambda _: (tmp_path / "out" / ".work" / "run-1").unlink())
     assert (ended.status, n_runs) == ("given up", 1)
-    assert not list((tmp_path / "out" / ".work").iterdir())
+    assert [each.name for each in (tmp_path / "out" / ".work").iterdir()] == ["tetopt-manifest"]
     assert not processes_of(job.out)
     assert not failure_path(tmp_path / "out", "sub-1").exists()

@@ -238,15 +238,29 @@ def test_a_state_of_other_words_is_said_in_a_line(folder, words):
 
 
 def test_a_folder_of_another_request_is_refused(copy):
-    with pytest.raises(
-        InputError, match=r"^[^\n]*: is the folder of work of another run, which has not ended; [^\n]*$"
-    ):
+    with pytest.raises(InputError, match=r"^[^\n]*: work directory of another run that has not finished; [^\n]*$"):
         run(copy, asked_for=REQUEST._replace(checksum="of another image"))
 
 
 def test_a_folder_of_another_run_is_refused(folder):
     with locked(folder), pytest.raises(InputError, match=f"^{folder}: another run writes there [^\n]*$"):
         run(folder)
+
+
+def test_what_a_killed_run_has_left_is_not_in_the_way(copy, in_one_go):
+    names = (
+        "seen-7",
+        ".state.json.abcd_123.json",
+        "round-1/.done-3.npz.abcd_123.npz",
+        "logs/job-1.out",
+        "dask/a/b",
+        ".nfs01a",
+    )
+    for name in names:
+        (copy / name).parent.mkdir(parents=True, exist_ok=True)
+        (copy / name).write_text("half")
+    assert content(run(copy)) == in_one_go
+    assert work.removed(copy) == []
 
 
 def test_a_run_that_ends_before_anything_is_measured_says_so(folder):

@@ -164,7 +164,7 @@ def test_six_subjects(slurm, image, tmp_path):
         assert numbers["missed"] == {}
         assert load_mesh(path.with_suffix(".vtu")).mesh.cells.shape[0] > 500
     assert (out / "cohort.html").is_file()
-    assert {path.name for path in (out / ".work").iterdir()} <= {"lock"}
+    assert {path.name for path in (out / ".work").iterdir()} <= {"lock", "tetopt-manifest"}
     # Nothing left to do, and so nothing is submitted.
     assert exit_code("cohort", tmp_path / "subjects.tsv", "-o", out, *words) == 0
     assert set(jobs_of_slurm()) == before | set(requested)

@@ -6,6 +6,8 @@ import pipes
 import numpy as np
 import PIL.Image
 import pytest
+from attacks import content, outside, planted
+from commands import assert_refused
 
 import tetopt
 from tetopt.cli import main
@@ -14,6 +16,7 @@ from tetopt.fem.elasticity import box_faces, compression, push_of
 from tetopt.fem.reference import Errors, averaged, nearest, reference, refined
 from tetopt.fem.reference import compare as reference_errors
 from tetopt.geometry.quadratic import quadratic
+from tetopt.io.work_directory import create
 from tetopt.model.averages import element_young, young_image
 from tetopt.model.laws import parse_law
 from tetopt.report.figures import save_figure
@@ -71,7 +74,7 @@ def test_files(run):
     pictures = set(COMPARE_PICTURES) - {"tradeoff.png"}
     assert {p.name for p in run.iterdir()} == {"report.json", "report.html", "runs", *pictures}
     names = {p.stem for p in (run / "runs").iterdir()}
-    assert names == {
+    assert names == {"tetopt-manifest", "lock"} | {
         f"{name}-{nodes}{order}-1"
         for name in ("tetopt", "bcc", "odt")
         for nodes in (400, 200)
@@ -351,6 +354,20 @@ def test_a_mesh_that_cannot_be_measured_is_a_row(head, opengl, monkeypatch):
     command = ["compare", str(head / "image.nii.gz"), "-o", str(out), *SMALL, "--curve", "", "--pipelines", "bcc"]
     assert main(command) == 2
     assert not (out / "report.json").exists()
+
+
+@pytest.mark.parametrize("name", ["", "lock", "reference.json", "bcc-400-1.json", "bcc-400-1.vtu", "thesis.txt"])
+@pytest.mark.parametrize("kind", ["file link", "folder link", "device link", "pipe", "folder"])
+def test_what_lies_among_the_runs_and_is_not_tetopts_stays(head, tmp_path, capfd, name, kind):
+    out, elsewhere = tmp_path / "out", outside(tmp_path)
+    out.mkdir()
+    create(out / "runs", compare.RUNS)
+    planted(kind, out / "runs" / name, elsewhere)
+    before = content(tmp_path)
+    inputs = [head / "image.nii.gz", "--labels", head / "labels.nii.gz", "-o", out, *SMALL, "--pipelines", "bcc"]
+    for option in ("--resume", "--force"):
+        assert_refused(capfd, ["compare", *inputs, option], rf"{out / 'runs' / name}: [^\n]*; move it away")
+    assert content(tmp_path) == before
 
 
 def test_resume_refuses_another_comparison(run, head, capsys):

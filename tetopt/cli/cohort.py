@@ -17,7 +17,7 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from tetopt.budget import available_bytes, memory_words
-from tetopt.cli.cohort_plan import Entry, checked_suffix, chosen, entries_of, subjects_of, with_states
+from tetopt.cli.cohort_plan import Entry, checked_suffix, chosen, entries_of, subjects_of, with_places, with_states
 from tetopt.cli.console import log, out, show_error, show_warning
 from tetopt.cli.inputs import read_mesh
 from tetopt.cli.options import (
@@ -36,7 +36,19 @@ from tetopt.cli.source import read_source
 from tetopt.cluster.crew import counted
 from tetopt.cluster.tasks import SchedulerLost
 from tetopt.cluster.workers import Folders, Need, check_choice, local_share, workers
-from tetopt.cohort.layout import LOGS_NAME, WORK_NAME, begin, check_out, description, failure_path, locked, restore
+from tetopt.cohort.layout import (
+    LOGS_NAME,
+    PAGE_NAME,
+    TABLE_NAME,
+    WORK_NAME,
+    begin,
+    check_out,
+    description,
+    failure_path,
+    locked,
+    not_our_files,
+    restore,
+)
 from tetopt.cohort.numbers import collect
 from tetopt.cohort.page import save_cohort_files
 from tetopt.cohort.run import Ended, Job
@@ -97,6 +109,7 @@ def cohort_command(
         if cohort.collect:
             return _collected(place, subjects, [key(row) for row in rows])
         entries = entries_of(rows, records, place, suffix, log.print)
+        to_run = with_places(chosen(entries, cohort.retry_failed), place)
     except Problems as problems:
         for line in problems.lines:
             show_error(line)
@@ -106,7 +119,6 @@ def cohort_command(
         write_table(cohort.write_table, [entry.row() for entry in entries])
         out.print(escape(f"{cohort.write_table}: {len(rows)} subjects"))
         return 0
-    to_run = chosen(entries, cohort.retry_failed)
     _say_plan(entries, to_run, cohort.retry_failed)
     estimate = estimated(to_run)
     if cohort.dry_run:
@@ -138,6 +150,8 @@ def _begin(place: Path, subjects: Path) -> None:
 
 def _collected(place: Path, subjects: Path, keys: list[str]) -> int:
     """The table and the page of what is there, with nothing run; the exit code."""
+    if problems := [wrong for key in keys if (wrong := not_our_files(place, key)) is not None]:
+        raise Problems(problems)
     _begin(place, subjects)
     with locked(place):
         restore(place)
@@ -335,7 +349,7 @@ def _close(place: Path, keys: list[str]) -> int:
                 f"{counted(len(rows) - len(own), 'subject')} more in {place}, from other tables, are shown with these"
             )
         )
-    for name in ("cohort.html", "cohort.tsv"):
+    for name in (PAGE_NAME, TABLE_NAME):
         out.print(escape(str(place / name)))
     return 1 if counts["failed"] or counts["missing"] else 0
 

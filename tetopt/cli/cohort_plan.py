@@ -22,7 +22,7 @@ from tetopt.cli.options import (
 )
 from tetopt.cli.plan import Plan, planned
 from tetopt.cli.request import requested
-from tetopt.cohort.layout import mesh_name, numbers_path
+from tetopt.cohort.layout import check_place, mesh_name, numbers_path
 from tetopt.cohort.state import State, state_of, strangers
 from tetopt.cohort.subjects import FILE_OPTIONS, Problems, Subject, doubled, key, label_of, matching, read_table
 from tetopt.errors import InputError
@@ -201,6 +201,19 @@ def with_states(entries: list[Entry], out: Path, suffix: str, say: Callable[[str
         say(f"comparing the inputs and options of {n_there} subjects that are there with what is asked for")
     with ThreadPoolExecutor() as pool:
         return list(pool.map(state, entries))
+
+
+def with_places(entries: list[Entry], out: Path) -> list[Entry]:
+    """The subjects to be run; Problems for those whose folder a run cannot replace."""
+    problems = []
+    for entry in entries:
+        try:
+            check_place(out, entry.key)
+        except InputError as error:
+            problems.append(str(error))
+    if problems:
+        raise Problems(list(dict.fromkeys(problems)))
+    return entries
 
 
 def chosen(entries: Iterable[Entry], only_failed: bool) -> list[Entry]:

@@ -6,7 +6,6 @@ import contextlib
 import dataclasses
 import hashlib
 import json
-import shutil
 import time
 from collections.abc import Callable, Iterator, Sequence
 from math import prod
@@ -40,7 +39,7 @@ from tetopt.model.averages import DEFAULT_AVERAGE
 from tetopt.model.sets import box_of, box_text
 from tetopt.parts.part import work_on
 from tetopt.parts.rounds import Parted, Request, Round, Runner, expected_parts, mesh_in_parts
-from tetopt.parts.work import STATE_NAME, VolumeFile
+from tetopt.parts.work import LOGS_NAME, STATE_NAME, VolumeFile, removed
 from tetopt.start.octree import OCTREE_NODE_BYTES
 from tetopt.start.sizes import Sizes
 from tetopt.stored import StoredImage
@@ -51,7 +50,7 @@ MOST_LOADED = 2**28  # voxels of an image that a run in parts reads whole: with 
 MOST_DRAWN = 2**27  # voxels of the level of an image that pictures are drawn of
 VOXEL_BYTES = 16.0  # of an image that is read whole, besides what meshing takes
 FEWEST_NODES_EACH = 100  # of a part: of 150 half are shared, and stay
-WORK_SUFFIX = ".work"  # of the folder beside the mesh, after its name
+WORK_SUFFIX = ".work"  # of the work directory beside the mesh, after its name
 WHOLE_ONLY = "looks at all cells or voxels at once, parts do not; leave it out, or --parts"
 
 
@@ -253,7 +252,8 @@ def run_in_parts(
         most = None if parts.worker_gb is None else parts.worker_gb * BYTES_PER_GB
         need = Need(n_parts, n_bytes, plan.engine.threads, is_within=True, most_bytes=most)
         here = folder.absolute()  # workers that others started have folders of their own to begin with
-        folders = Folders(here, here)
+        folders = Folders(here, here / LOGS_NAME)
+        folders.logs.mkdir(exist_ok=True)
         if parts.scheduler is None and parts.cluster is None:
             _check_room(need, local_share(need, parts.count).bytes)  # with too little a worker does not even start
         with workers(
@@ -359,9 +359,10 @@ def _shown(begin_keeping: Callable[[], None]) -> Iterator[Callable[[Round, list[
 
 
 def end_work(plan: Plan, result: Optimized) -> None:
-    """Remove the folder of work of a run that is complete; say what becomes of that of another."""
+    """Remove the work directory of a run that is complete; say what becomes of that of another."""
     folder = work_folder(plan)
     if result.ended in ("iterations", "converged"):
-        shutil.rmtree(folder)
+        if left := removed(folder):
+            show_warning(f"{folder}: stays with what is not tetopt's in it: {', '.join(left)}")
     else:
         log.print(escape(f"{folder}: run this again with --force to go on, or remove it"))

@@ -5,14 +5,16 @@ OUT/cohort.tsv, cohort.html                    all subjects
 OUT/sub-X[/ses-Y]/KEY_desc-tetopt_mesh.vtu     and the numbers of the run beside it, in a file of the same name in JSON
 OUT/sub-X[/ses-Y]/figures/                     its pictures
 OUT/logs/KEY.log, KEY.failed.json              what the last run said, and why it failed
-OUT/.work/                                     what is under way
+OUT/.work/                                     what is under way (`tetopt.io.work_directory`)
 """
 
 from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
+import stat
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
 from pathlib import Path
@@ -20,13 +22,23 @@ from typing import Any
 
 import tetopt
 from tetopt.errors import InputError
-from tetopt.incoming import json_of, text_of
+from tetopt.incoming import irregular, json_of, own_bytes, text_of
 from tetopt.io.files import save_json
-from tetopt.io.locks import lock
+from tetopt.io.work_directory import LOCK_NAME, MANIFEST_NAME, Layout, check_files, create, opened
 
 DESCRIPTION_NAME = "dataset_description.json"
 WORK_NAME, LOGS_NAME, FIGURES_NAME = ".work", "logs", "figures"
+TABLE_NAME, PAGE_NAME = "cohort.tsv", "cohort.html"
+OWN_NAMES = (DESCRIPTION_NAME, ".bidsignore", TABLE_NAME, "cohort.json", PAGE_NAME)  # files that runs write into OUT
 BIDS_VERSION = "1.10.0"  # of the specification whose names are followed
+KEY_PATTERN = re.compile(r"(sub-[A-Za-z0-9]+)(?:_(ses-[A-Za-z0-9]+))?")
+# Of a subject before its new outputs take their place, with what users put there; its outputs under way; what dask
+# leaves. Nothing in these is opened, it is moved or removed.
+WORK = Layout(
+    "cohort",
+    rf"{LOCK_NAME}|{KEY_PATTERN.pattern}\.lock|run-\w+|seen-\d+",
+    {rf"{KEY_PATTERN.pattern}\.before": None, rf"{KEY_PATTERN.pattern}\.run-\w+\.\d+": None, "dask": None},
+)
 
 
 def subject_folder(out: Path, key: str) -> Path:
@@ -55,17 +67,51 @@ def failure_path(out: Path, key: str) -> Path:
     return out / LOGS_NAME / f"{key}.failed.json"
 
 
+def thumbnail_path(out: Path, key: str) -> Path:
+    """The picture of a subject that the page has."""
+    return subject_folder(out, key) / FIGURES_NAME / "thumbnail.png"
+
+
 def check_out(out: Path) -> None:
-    """InputError for a folder that holds anything but a cohort of ours."""
+    """InputError for a folder that holds anything but a cohort of ours, or links where runs write."""
     if not os.path.lexists(out):
         if not out.absolute().parent.is_dir():
             raise InputError(f"{out}: its folder does not exist; make it first")
         return
     if not out.is_dir():
         raise InputError(f"{out}: expected a folder for the cohort, got a file")
-    if not any(out.iterdir()) or is_cohort(out):
-        return
-    raise InputError(f"{out}: holds files that are no cohort's; name a new folder, or one that a cohort is in")
+    if any(out.iterdir()) and not is_cohort(out):
+        raise InputError(f"{out}: holds files that are no cohort's; name a new folder, or one that a cohort is in")
+    for name in OWN_NAMES:
+        if (wrong := not_our_file(out / name)) is not None:
+            raise InputError(wrong)
+    if os.path.lexists(out / LOGS_NAME):
+        check_files(out / LOGS_NAME, "cohort")
+    if os.path.lexists(out / WORK_NAME):
+        with opened(out / WORK_NAME, WORK) as work:
+            work.check()
+
+
+def not_our_file(path: Path) -> str | None:
+    """What is wrong with a file of ours, if it is there and a link, a pipe or the like."""
+    other = irregular(path, follow=False) if os.path.lexists(path) else None
+    return other and f"{path}: expected a regular file, got {other}; put the file itself there, or remove it"
+
+
+def not_our_files(out: Path, key: str) -> str | None:
+    """The same of what is read of a subject's outputs."""
+    return not_our_file(numbers_path(out, key)) or not_our_file(thumbnail_path(out, key))
+
+
+def check_place(out: Path, key: str) -> None:
+    """InputError for a subject's folder that is a link: a run gives it another content by renaming."""
+    place = subject_folder(out, key)
+    for each in (place, place.parent):
+        if each != out and each.is_symlink():
+            raise InputError(
+                f"{each}: expected the subject's folder, got a link to {os.readlink(each)}; a run would replace what "
+                "is there: move that folder back, or remove the link"
+            )
 
 
 def is_cohort(out: Path) -> bool:
@@ -84,8 +130,8 @@ def is_cohort(out: Path) -> bool:
 def begin(out: Path, description: dict[str, Any]) -> None:
     """Make the folder, and set down whose it is, if it is new."""
     out.mkdir(exist_ok=True)
-    for name in (WORK_NAME, LOGS_NAME):
-        (out / name).mkdir(exist_ok=True)
+    (out / LOGS_NAME).mkdir(exist_ok=True)
+    create(out / WORK_NAME, WORK)
     if not (out / DESCRIPTION_NAME).exists():
         save_json(out / DESCRIPTION_NAME, description)
         # BIDS has no names for meshes of volumes yet, nor for pages and logs; its patterns of folders have no "/".
@@ -112,17 +158,21 @@ def locked(out: Path, keys: list[str] | None = None) -> Iterator[None]:
     Raises
     ------
     InputError
-        Another run has the lock.
+        Another run has the lock; the work directory holds what is not tetopt's.
     """
+    create(out / WORK_NAME, WORK)
     with ExitStack() as stack:
-        lock(stack, out / WORK_NAME / "lock", is_shared=keys is not None, what=str(out))
+        work = stack.enter_context(opened(out / WORK_NAME, WORK))
+        work.check()
+        work.lock(stack, LOCK_NAME, is_shared=keys is not None, what=str(out))
         for key in keys or ():
-            lock(stack, out / WORK_NAME / f"{key}.lock", is_shared=False, what=f"{out}: {key}")
+            work.lock(stack, f"{key}.lock", is_shared=False, what=f"{out}: {key}")
         yield
 
 
 def publish(work: Path, out: Path, key: str) -> None:
     """Give what lies in `work` the subject's place, in one step, instead of what is there; see `restore`."""
+    check_place(out, key)
     place, aside = subject_folder(out, key), out / WORK_NAME / f"{key}.before"
     place.parent.mkdir(exist_ok=True)
     if place.exists():
@@ -145,25 +195,32 @@ def restore(out: Path, keys: list[str] | None = None) -> None:
 
     Of these subjects, or, without `keys`, of all.
     """
-    for each in sorted((out / WORK_NAME).iterdir()):
-        if keys is not None and each.name.partition(".")[0] not in keys:
-            continue
-        if each.name.endswith(".before"):
-            key = each.name.removesuffix(".before")
-            if (place := subject_folder(out, key)).exists():
-                _clear(each, place, key)
-            else:
-                os.rename(each, place)
-        if each.is_dir() and each.exists():
-            shutil.rmtree(each)
-        elif keys is None and each.is_file() and not each.name.endswith("lock"):
-            each.unlink()  # by which a run was known to go on: what a cluster still does for one that was killed ends
+    with opened(out / WORK_NAME, WORK) as work:
+        for name, mode in sorted(work.own().items()):
+            if keys is not None and name.partition(".")[0] not in keys:
+                continue
+            if name.endswith(".before"):
+                _put_back(out / WORK_NAME / name, out, name.removesuffix(".before"))
+            # Without their files (run-..., seen-...) what a cluster still does for runs that were killed ends.
+            if stat.S_ISDIR(mode) or (keys is None and name != MANIFEST_NAME and not name.endswith(LOCK_NAME)):
+                work.remove(name, mode)
+
+
+def _put_back(aside: Path, out: Path, key: str) -> None:
+    """Give a subject its folder again, or only what the user had put there, if a new one has its place."""
+    check_place(out, key)
+    place = subject_folder(out, key)
+    if place.exists():
+        _clear(aside, place, key)
+    else:
+        place.parent.mkdir(exist_ok=True)
+        os.rename(aside, place)
 
 
 def numbers_of(path: Path) -> dict[str, Any] | None:
     """What a file of numbers holds; None if it is not there, or is not what a run of tetopt wrote."""
     try:
-        table = json.loads(path.read_bytes())
+        table = json.loads(own_bytes(path))
     except (OSError, ValueError, RecursionError):
         return None
     return table if isinstance(table, dict) else None

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections import defaultdict
 from collections.abc import Sequence
+from io import BytesIO
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,6 +12,7 @@ import numpy as np
 import PIL.Image
 from numpy.typing import NDArray
 
+from tetopt.incoming import own_bytes
 from tetopt.report.thumbnail import SIDE_PIXELS
 
 BLOCK_PIXELS = 4  # that are averaged along each side: the mesh's edges, which lie anywhere, are hardly seen then
@@ -78,9 +80,7 @@ def _centred(picture: NDArray[np.floating]) -> NDArray[np.floating]:
 def _grey(path: Path) -> NDArray[np.float32] | None:
     """A picture's blocks, (32, 32 or 64), of mean 0 and norm 1; None if it is none of ours, or the same everywhere."""
     try:
-        if path.stat().st_size > THUMBNAIL_BYTES:
-            return None
-        with PIL.Image.open(path, formats=["PNG"]) as picture:
+        with PIL.Image.open(BytesIO(own_bytes(path, THUMBNAIL_BYTES)), formats=["PNG"]) as picture:
             if picture.size not in PICTURE_SIZES:
                 return None
             grey = np.asarray(picture.convert("L"), dtype=np.float32)

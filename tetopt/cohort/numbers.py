@@ -16,12 +16,15 @@ import numpy as np
 
 from tetopt.cohort.layout import (
     FIGURES_NAME,
+    KEY_PATTERN,
     LOGS_NAME,
     failure_path,
     log_path,
+    not_our_file,
     numbers_of,
     numbers_path,
     subject_folder,
+    thumbnail_path,
 )
 from tetopt.cohort.likeness import likenesses
 from tetopt.geometry.box import world_axes
@@ -41,7 +44,6 @@ SHORT_LIST = 4  # numbers of a list that have columns of their own: spacings, si
 NOT_AVAILABLE = "n/a"  # as BIDS writes a value that there is none of
 # Texts that a spreadsheet takes for formulas, by their first letter (OWASP, "CSV Injection"), in all widths.
 FORMULA_LETTERS = ("=", "+", "-", "@", "\uff1d", "\uff0b", "\uff0d", "\uff20")
-KEY_PATTERN = re.compile(r"(sub-[A-Za-z0-9]+)(?:_(ses-[A-Za-z0-9]+))?")
 FAILURE_COLUMNS = ("attempts", "seconds", "peak_bytes", "predicted_bytes")  # of a record of `tetopt.cohort.run`
 OBLIQUE_DIGITS = 1  # of degrees: an affine's float32 numbers hold no more of a turn
 COLUMN_GROUPS = {"options": "Option ", "request": "Option ", "versions": "Version of ", "machine": "Of the machine: "}
@@ -117,12 +119,16 @@ def row_of(out: Path, key: str) -> Row:
     """The row of one subject, by its key; see `collect`."""
     match = KEY_PATTERN.fullmatch(key)
     assert match is not None, key
-    figures = subject_folder(out, key) / FIGURES_NAME
     places = {
-        "numbers": numbers_path(out, key), "log": log_path(out, key), "figures": figures,
-        "thumbnail": figures / "thumbnail.png",
-    }  # fmt: skip
-    files = {name: path.relative_to(out).as_posix() for name, path in places.items() if path.exists()}
+        "numbers": numbers_path(out, key),
+        "log": log_path(out, key),
+        "figures": subject_folder(out, key) / FIGURES_NAME,
+        "thumbnail": thumbnail_path(out, key),
+    }
+    there = {name: path for name, path in places.items() if path.exists()}
+    if "thumbnail" in there and not_our_file(there["thumbnail"]) is not None:
+        del there["thumbnail"]
+    files = {name: path.relative_to(out).as_posix() for name, path in there.items()}
     row = Row(key, match[1], match[2] or "", "missing", "has not been run", (), files, {}, {}, {}, {})
     if (path := failure_path(out, key)).exists():
         failure = numbers_of(path) or {"reason": f"{path.name} cannot be read"}

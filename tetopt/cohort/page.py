@@ -6,14 +6,18 @@ import base64
 import html
 from collections import Counter
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from itertools import chain
 from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
 from tetopt.cohort.flags import QUANTITIES, Flag, Quantity, flags_of, units
+from tetopt.cohort.layout import PAGE_NAME, TABLE_NAME
 from tetopt.cohort.likeness import THUMBNAIL_BYTES
 from tetopt.cohort.numbers import Row, Status, Value, description, present, save_table
+from tetopt.errors import InputError
+from tetopt.incoming import own_bytes
 from tetopt.model.labels import label_words
 from tetopt.report.page import data_html, paragraph_html, script_html, section_html, table_html, write_page
 
@@ -53,8 +57,8 @@ def save_cohort_files(out: Path, rows: Sequence[Row]) -> None:
     Each is written whole or not at all, over what is there.
     """
     flags = flags_of(rows)
-    save_table(out / "cohort.tsv", rows, [[flag.words for flag in each] for each in flags])
-    save_cohort_page(out / "cohort.html", out, rows, flags)
+    save_table(out / TABLE_NAME, rows, [[flag.words for flag in each] for each in flags])
+    save_cohort_page(out / PAGE_NAME, out, rows, flags)
 
 
 def save_cohort_page(path: Path, out: Path, rows: Sequence[Row], flags: Sequence[Sequence[Flag]]) -> None:
@@ -176,8 +180,8 @@ def _pictures(out: Path, rows: Sequence[Row], flags: Sequence[Sequence[Flag]]) -
     chosen = chain(odd[:n_odd], (rest[k * len(rest) // n_rest] for k in range(n_rest)))
     pictures: list[str | None] = [None] * len(rows)
     for place in chosen:
-        png = (out / rows[place].files["thumbnail"]).read_bytes()
-        if len(png) <= THUMBNAIL_BYTES:
+        with suppress(OSError, InputError):  # a page without it
+            png = own_bytes(out / rows[place].files["thumbnail"], THUMBNAIL_BYTES)
             pictures[place] = base64.b64encode(png).decode("ascii")
     return pictures
 

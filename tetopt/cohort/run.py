@@ -47,7 +47,7 @@ class Job(NamedTuple):
     threads: int
     n_bytes: float  # of memory that are predicted
     seconds: float  # likewise, of one thread
-    run: str  # the name of a file in the folder of work: when it is gone, the run is given up
+    run: str  # the name of a file in the work directory: when it is gone, the run is given up
 
 
 class Ended(NamedTuple):
@@ -99,8 +99,10 @@ def _attempt(job: Job, begin: float, attempt: int) -> tuple[Ended, bool]:
     command = python_command("-m", "tetopt", "mesh", *outputs, *job.words)
     environment = python_environment(**dict.fromkeys(THREAD_NAMES, str(job.threads)), COLUMNS="120")
     peak, log, is_given_up = 0, log_path(out, job.key), False
+    if attempt == 1:
+        log.unlink(missing_ok=True)
     with (
-        log.open("wb" if attempt == 1 else "ab") as stream,
+        log.open("ab") as stream,
         started(command, work, environment, stdout=stream, stderr=stream) as child,
     ):
         while child.poll() is None:

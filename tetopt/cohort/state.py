@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from tetopt.cohort.layout import failure_path, mesh_name, numbers_of, numbers_path, subject_folder
+from tetopt.cohort.layout import failure_path, mesh_name, not_our_files, numbers_of, numbers_path, subject_folder
 from tetopt.cohort.subjects import IMAGE_PATTERN
 
 Status = Literal["done", "missed", "failed", "changed", "missing"]  # "missed": a mesh that misses a promise
@@ -73,6 +73,8 @@ def strangers(out: Path, key: str) -> str | None:
     place = subject_folder(out, key)
     if not place.exists():
         return None
+    if (wrong := not_our_files(out, key)) is not None:
+        return wrong
     if numbers_path(out, key).is_file() and place.is_dir():
         sessions = [each.name for each in place.iterdir() if each.name.startswith("ses-")]
         return f"{place}: has sessions, {sessions[0]} among them; give the subject one" if sessions else None

@@ -30,6 +30,7 @@ from tetopt.mesh import Mesh
 from tetopt.parts.cut import ROUND_SHIFTS, Piece, Shared, counts_of, cut, joined, pieces
 from tetopt.parts.part import Kind, Numbers, Settings, box_of_ticks, work_on
 from tetopt.parts.work import (
+    INITIAL_NAME,
     State,
     VolumeFile,
     done_path,
@@ -55,8 +56,6 @@ MOST_VOXELS = 2**25  # of the cells of a part, 34 million: with its sums below 1
 # six of 3 2.4 %: what is shared in the last round, and stays, has had more of its sweeps before.
 ROUND_SWEEPS = 3
 BOX_EXCESS = 1.25  # of the largest box of any round over that of the first cut: 1.08 was measured
-
-INITIAL_NAME = "initial.npz"  # in the folder of work: the mesh to begin with
 
 Runner = Callable[[Sequence[str]], Iterator[Any]]
 """Runs `work_on` for each of the files of parts, and yields as they end."""

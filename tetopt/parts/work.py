@@ -1,17 +1,19 @@
-"""The folder of work of a run in parts: all that there is of it, so that a rerun goes on where another one ended.
+"""The work directory of a run in parts: all that there is of it, so that a rerun goes on where another one ended.
 
 volume.json, voxels.npy       where the voxels are: of an image that is in memory, in the folder itself
 state.json                    what was asked, and what is known after the last complete round
 mesh-R.npz                    the mesh after round R; of the rounds only the last
 round-R/part-P.npz            what a part of the next round is to be made of
 round-R/done-P.npz            and what came of it
+logs/                         what dask and a batch system's jobs say
+
+`tetopt.io.work_directory` says what else may not lie there.
 """
 
 from __future__ import annotations
 
 import hashlib
 import json
-import os
 import shutil
 import struct
 import warnings
@@ -27,15 +29,21 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.image import Image
-from tetopt.incoming import json_of
+from tetopt.incoming import json_of, own_bytes
 from tetopt.io.files import save_json, written_whole
 from tetopt.io.images import Bounds
-from tetopt.io.locks import lock
 from tetopt.io.stored_images import open_stored
 from tetopt.io.text import plain
+from tetopt.io.work_directory import LOCK_NAME, Layout, create, discard, opened
 from tetopt.stored import StoredImage
 
-VOXELS_NAME, VOLUME_NAME, STATE_NAME, LOCK_NAME = "voxels.npy", "volume.json", "state.json", "lock"
+VOXELS_NAME, VOLUME_NAME, STATE_NAME, INITIAL_NAME = "voxels.npy", "volume.json", "state.json", "initial.npz"
+LOGS_NAME = "logs"
+LAYOUT = Layout(
+    "a mesh in parts",
+    rf"{LOCK_NAME}|voxels\.npy|(volume|state)\.json|(initial|mesh-\d+)\.npz|seen-\d+",
+    {r"round-\d+": r"(part|done)-\d+\.npz", LOGS_NAME: ".+", "dask": None},
+)
 TEXT_NAME = "text"  # of the entry of a file of arrays that has what else is to be known, in JSON
 
 
@@ -62,28 +70,29 @@ class VolumeFile(NamedTuple):
 
 @contextmanager
 def locked(folder: Path) -> Iterator[None]:
-    """The folder of work, made if it is not there, for one run alone.
+    """The work directory, created if it is not there, for one run alone.
 
     Raises
     ------
     InputError
-        Another run has it, or what has its name is something else, which the end of a run would remove.
+        Another run has it, or it holds what is not tetopt's.
     """
-    is_ours = not os.path.lexists(folder) or (folder.is_dir() and not folder.is_symlink())
-    if is_ours and folder.exists():
-        names = {each.name for each in folder.iterdir()}
-        is_ours = not names or not names.isdisjoint((LOCK_NAME, VOLUME_NAME))
-    if not is_ours:
-        raise InputError(f"{folder}: is no folder of work of a mesh in parts; move it away, or give another output")
-    folder.mkdir(exist_ok=True)
+    create(folder, LAYOUT)
     with ExitStack() as stack:
-        lock(stack, folder / LOCK_NAME, is_shared=False, what=str(folder))
+        work = stack.enter_context(opened(folder, LAYOUT))
+        work.check()
+        work.lock(stack, LOCK_NAME, is_shared=False, what=str(folder))
         yield
+
+
+def removed(folder: Path) -> list[str]:
+    """Remove the work directory; the names of what stays, which is not tetopt's."""
+    return discard(folder, LAYOUT)
 
 
 @contextmanager
 def gone_if_refused(folder: Path) -> Iterator[Callable[[], None]]:
-    """A folder of work without a state goes again with an InputError, unless what is yielded has been called by then.
+    """A work directory without a state goes again with an InputError, unless what is yielded has been called by then.
 
     Otherwise what was refused would stand in the way of the request that is mended.
     """
@@ -97,12 +106,13 @@ def gone_if_refused(folder: Path) -> Iterator[Callable[[], None]]:
         yield keep
     except InputError:
         if not is_kept:
-            shutil.rmtree(folder)
+            removed(folder)
         raise
 
 
 def save_volume(folder: Path, volume: VolumeFile | Image) -> None:
     """Note where the voxels are, or leave those of an image in memory in the folder, from where they are mapped."""
+    create(folder, LAYOUT)
     if isinstance(volume, Image):
         with written_whole(folder / VOXELS_NAME, volume.data.nbytes) as temporary, temporary.open("wb") as stream:
             np.save(stream, volume.data)
@@ -113,10 +123,10 @@ def save_volume(folder: Path, volume: VolumeFile | Image) -> None:
 
 
 def open_volume(folder: Path) -> StoredImage:
-    """The image whose voxels a folder of work is about; InputError as `open_stored`, or the folder is damaged."""
+    """The image whose voxels a work directory is about; InputError as `open_stored`, or the folder is damaged."""
     path = folder / VOLUME_NAME
     try:
-        words = json_of(path.read_text(encoding="utf-8"))
+        words = json_of(own_bytes(path).decode())
         if words["path"] is None:
             path = folder / VOXELS_NAME
             return StoredImage(np.load(path, mmap_mode="r"), words["affine"])
@@ -195,7 +205,7 @@ def load_state(folder: Path, request: str) -> State | None:
     if not path.exists():
         return None
     try:
-        words = json_of(path.read_text(encoding="utf-8"))
+        words = json_of(own_bytes(path).decode())
         state = State(**words["state"])
         if words["checksum"] != checksum({}, state._asdict()):
             raise ValueError("its checksum is another one")
@@ -203,8 +213,8 @@ def load_state(folder: Path, request: str) -> State | None:
         raise _damaged(path, error) from error
     if state.request != request:
         raise InputError(
-            f"{folder}: is the folder of work of another run, which has not ended; give the same options and image to "
-            "go on with it, or remove it"
+            f"{folder}: work directory of another run that has not finished; continue it with the same options and "
+            "image, or remove it"
         )
     return state
 

@@ -13,6 +13,7 @@ import os
 import platform
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from importlib.metadata import PackageNotFoundError, version
 from itertools import product
 from pathlib import Path
@@ -30,10 +31,12 @@ from tetopt.fem.reference import Reference, averaged, compare, nearest, referenc
 from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import dihedral_angles
 from tetopt.image import Image
+from tetopt.incoming import own_bytes, text_of
 from tetopt.io.files import save_json
 from tetopt.io.formats import save_mesh
 from tetopt.io.images import sha256
 from tetopt.io.meshes import load_mesh
+from tetopt.io.work_directory import LOCK_NAME, Layout, create, opened
 from tetopt.measure.fidelity import cell_labels, label_fidelity
 from tetopt.measure.interfaces import label_interfaces
 from tetopt.measure.quality import quality, rho_histogram
@@ -77,6 +80,9 @@ Facts = dict[str, Any]  # what the numbers of a comparison depend on besides its
 FREE_SETTINGS = {
     "nodes", "pipelines", "programs", "repeats", "curve", "tradeoff", "max_seconds", "max_bytes", "reference_seconds"
 }  # fmt: skip
+
+RUNS_NAME = "runs"  # the work directory
+RUNS = Layout("a comparison", rf"{LOCK_NAME}|reference\.json|[\w-]+-\d+(-quadratic)?-\d+\.(json|vtu)")
 
 
 class Comparison(NamedTuple):
@@ -185,7 +191,7 @@ def _write_down(path: Path, content: Any) -> None:
 def _read_back(path: Path) -> Any:
     """What was written down; None if there is no such file, or it is not as it was written."""
     try:
-        row = json.loads(path.read_text(encoding="utf-8"))
+        row = json.loads(own_bytes(path))
         return row["content"] if row["sha256"] == _checksum(row["content"]) else None
     except (OSError, ValueError, LookupError, TypeError, RecursionError):
         return None
@@ -315,13 +321,25 @@ def run(
     Raises
     ------
     InputError
-        As `prepared`, or `folder` holds the report of another comparison that `resume` would replace.
+        As `prepared`; `folder` holds the report of another comparison that `resume` would replace; another run has
+        `folder/runs`, or it holds what is not tetopt's.
     """
-    begin = time.perf_counter()
     if resume:
         _check_resumable(folder, comparison)
-    runs = folder / "runs"
-    runs.mkdir(exist_ok=True)
+    runs = folder / RUNS_NAME
+    create(runs, RUNS)
+    with ExitStack() as stack:
+        work = stack.enter_context(opened(runs, RUNS))
+        work.check()
+        work.lock(stack, LOCK_NAME, is_shared=False, what=str(runs))
+        return _run(runs, comparison, classes, say, resume=resume)
+
+
+def _run(
+    runs: Path, comparison: Comparison, classes: Image, say: Say, *, resume: bool
+) -> tuple[Report, dict[int, dict[str, Mesh]]]:
+    """The comparison, with the work directory of its runs."""
+    begin = time.perf_counter()
     facts = _facts(comparison)
     comparison = _settled(comparison, facts, runs, say, resume=resume)
     image, settings = comparison.image, comparison.settings
@@ -390,7 +408,7 @@ def _check_resumable(folder: Path, comparison: Comparison) -> None:
     if not path.is_file():
         return
     try:
-        before = json.loads(path.read_text(encoding="utf-8"))
+        before = json.loads(text_of(path, "report"))
         earlier = before["options"]["nodes"], before["image"]["sha256"]
     except (ValueError, KeyError, TypeError, RecursionError):
         earlier = None

@@ -1,0 +1,224 @@
+"""Work directories: what unfinished runs keep on disk, trusted only as far as it has been checked.
+
+A cohort (OUT/.work), a mesh in parts (MESH.work) and a comparison (OUT/runs) each have one. It is for the owner alone
+(0700), and its manifest lists the names that tetopt writes and removes there. A run begins only if it holds nothing but
+files and folders of these names: no link, pipe or device, and no file of somebody else's. It is opened, looked at and
+removed by its descriptor, which no link takes elsewhere; Windows has none, so that there paths are checked instead.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import shutil
+import socket
+import stat
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager, suppress
+from pathlib import Path
+from typing import NamedTuple
+
+from tetopt.errors import InputError
+from tetopt.incoming import KINDS_OF_FILES, UNFOLLOWED, irregular, own_bytes
+from tetopt.io.files import TEMPORARY_LETTERS, save_json
+
+try:
+    import fcntl
+except ImportError:  # Windows
+    fcntl = None  # type: ignore[assignment]
+
+HAS_DESCRIPTORS = hasattr(os, "O_DIRECTORY")  # of folders: Windows has none
+MANIFEST_NAME, LOCK_NAME = "tetopt-manifest", "lock"
+MANIFEST_BYTES = 10_000  # at most: those that tetopt writes have some 200
+# As `tetopt.io.files.written_whole` names files under way; a killed run leaves them.
+TEMPORARY = re.compile(rf"\.(.{{1,{TEMPORARY_LETTERS}}})\.[a-z0-9_]{{8}}.{{0,20}}")
+# What systems put into folders: files removed while open on NFS, and macOS's Finder.
+SYSTEM_NAMES = r"\.nfs[0-9a-f]+|\.DS_Store"
+ADVICE = "move it away, and run this again"
+
+
+class Layout(NamedTuple):
+    """The names in a work directory, as regular expressions."""
+
+    work: str  # what it is of
+    files: str
+    folders: dict[str, str | None] = {}  # noqa: RUF012 (not changed): of each the names of its files; None: unopened
+
+    def problem(self, name: str, mode: int) -> str | None:
+        """What is wrong with an entry of this name and mode; None for one of ours."""
+        if any(re.fullmatch(folder, name) for folder in self.folders):
+            return None if stat.S_ISDIR(mode) else f"expected a folder, got {_kind(mode)}"
+        if re.fullmatch(f"{MANIFEST_NAME}|{SYSTEM_NAMES}|{self.files}", name) or self._is_temporary(name):
+            return None if stat.S_ISREG(mode) else f"expected a regular file, got {_kind(mode)}"
+        return f"not a file of tetopt's work directory ({self.work})"
+
+    def _is_temporary(self, name: str) -> bool:
+        match = TEMPORARY.fullmatch(name)
+        return match is not None and (
+            len(match[1]) == TEMPORARY_LETTERS or re.fullmatch(f"{MANIFEST_NAME}|{self.files}", match[1]) is not None
+        )
+
+
+class WorkDirectory(NamedTuple):
+    """A work directory that is open."""
+
+    path: Path
+    layout: Layout
+    descriptor: int | None  # None on Windows
+
+    def check(self) -> None:
+        """Find anything that is not tetopt's.
+
+        Raises
+        ------
+        InputError
+            No manifest, or another one; a name that it does not list; a link, a pipe, a device.
+        """
+        if not self.is_new():
+            self._check_manifest()
+        for name, mode in sorted(_modes(self.path, self.descriptor).items()):
+            if (problem := self.layout.problem(name, mode)) is not None:
+                raise InputError(f"{self.path / name}: {problem}; {ADVICE}")
+            inner = next((files for each, files in self.layout.folders.items() if re.fullmatch(each, name)), None)
+            if inner is not None:
+                with _descriptor(self.path / name, name, self.descriptor) as descriptor:
+                    _check_files(self.path / name, descriptor, Layout(self.layout.work, inner))
+
+    def _check_manifest(self) -> None:
+        try:
+            listed = json.loads(own_bytes(self.path / MANIFEST_NAME, MANIFEST_BYTES))
+        except FileNotFoundError:
+            listed = None
+        except (OSError, ValueError, RecursionError) as error:
+            raise InputError(f"{self.path / MANIFEST_NAME}: cannot be read ({error}); {ADVICE}") from error
+        if listed != self.layout._asdict():
+            raise InputError(
+                f"{self.path}: not a work directory of this version of tetopt ({self.layout.work}): "
+                f"{MANIFEST_NAME} {'is missing' if listed is None else 'lists other names'}; {ADVICE}"
+            )
+
+    def is_new(self) -> bool:
+        """Whether it is empty but for the temporary files of a run that creates it just now, or was killed there."""
+        own = self.own()
+        return all(name in own and TEMPORARY.fullmatch(name) for name in _modes(self.path, self.descriptor))
+
+    def own(self) -> dict[str, int]:
+        """The modes of the entries that are tetopt's, by name."""
+        modes = _modes(self.path, self.descriptor)
+        return {name: mode for name, mode in modes.items() if self.layout.problem(name, mode) is None}
+
+    def remove(self, name: str, mode: int) -> None:
+        """Remove an entry of `own`; links within it are removed, and not followed."""
+        with suppress(FileNotFoundError):
+            if stat.S_ISDIR(mode):
+                shutil.rmtree(self._place(name), dir_fd=self.descriptor)
+            else:
+                os.unlink(self._place(name), dir_fd=self.descriptor)
+
+    def _place(self, name: str) -> str:
+        """The name by which an entry is found from the descriptor, or without one from anywhere."""
+        return str(self.path / name) if self.descriptor is None else name
+
+    def lock(self, stack: ExitStack, name: str, *, is_shared: bool, what: str) -> None:
+        """Take the lock of a file until the stack is unwound, or the process ends; its owner stands in the file.
+
+        Raises
+        ------
+        InputError
+            Another run has it, which is said of `what`; the file has a second name, under which it would be changed.
+        """
+        if fcntl is None:
+            return
+        handle = os.open(self._place(name), os.O_RDWR | os.O_CREAT | UNFOLLOWED, 0o600, dir_fd=self.descriptor)
+        stream = stack.enter_context(os.fdopen(handle, "r+", encoding="utf-8", errors="replace"))
+        if os.fstat(handle).st_nlink > 1:
+            raise InputError(f"{self.path / name}: expected a file of one name, got one with a hard link; {ADVICE}")
+        try:
+            fcntl.flock(stream, (fcntl.LOCK_SH if is_shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
+        except BlockingIOError:
+            whose = stream.read(200).strip() or "another process"
+            raise InputError(f"{what}: another run writes there ({whose}); wait for its end, or end it") from None
+        if not is_shared:
+            stream.truncate(0)
+            stream.write(f"process {os.getpid()} on {socket.gethostname()}\n")
+            stream.flush()
+
+
+def create(path: Path, layout: Layout) -> None:
+    """Create a work directory with its manifest; an empty folder becomes one, and anything else stays as it is."""
+    with suppress(FileExistsError):
+        path.mkdir(mode=0o700)
+    if irregular(path, follow=False) != "a folder":
+        return
+    with opened(path, layout) as work:
+        if work.is_new():
+            os.chmod(path if work.descriptor is None else work.descriptor, 0o700)
+            save_json(path / MANIFEST_NAME, layout._asdict())
+
+
+@contextmanager
+def opened(path: Path, layout: Layout) -> Iterator[WorkDirectory]:
+    """Open a work directory, unchecked.
+
+    Raises
+    ------
+    InputError
+        A link, no folder, or one that may not be opened.
+    """
+    with _descriptor(path, str(path)) as descriptor:
+        yield WorkDirectory(path, layout, descriptor)
+
+
+def discard(path: Path, layout: Layout) -> list[str]:
+    """Remove a work directory; what is not tetopt's stays, the folder with it, and is returned by name."""
+    with opened(path, layout) as work:
+        for name, mode in work.own().items():
+            work.remove(name, mode)
+        others = sorted(_modes(path, work.descriptor))
+    if not others:
+        path.rmdir()
+    return others
+
+
+def check_files(path: Path, work: str) -> None:
+    """InputError for a folder that is a link, or holds anything but regular files."""
+    with _descriptor(path, str(path)) as descriptor:
+        _check_files(path, descriptor, Layout(work, ".+"))
+
+
+def _check_files(path: Path, descriptor: int | None, layout: Layout) -> None:
+    for name, mode in sorted(_modes(path, descriptor).items()):
+        if (problem := layout.problem(name, mode)) is not None:
+            raise InputError(f"{path / name}: {problem}; {ADVICE}")
+
+
+@contextmanager
+def _descriptor(path: Path, name: str, parent: int | None = None) -> Iterator[int | None]:
+    """A descriptor of the folder of this name in the parent's, or of this path; None on Windows."""
+    try:
+        kind = irregular(path, follow=False) or "a file"
+        if kind != "a folder":
+            raise InputError(f"{path}: expected a folder, got {kind}; {ADVICE}")
+        descriptor = os.open(name, os.O_DIRECTORY | UNFOLLOWED, dir_fd=parent) if HAS_DESCRIPTORS else None
+    except OSError as error:
+        raise InputError(f"{path}: cannot be opened: {error.strerror}; {ADVICE}") from error
+    try:
+        yield descriptor
+    finally:
+        if descriptor is not None:
+            os.close(descriptor)
+
+
+def _modes(path: Path, descriptor: int | None) -> dict[str, int]:
+    """The modes of what is in a folder, links not followed, by name."""
+    modes = {}
+    with os.scandir(path if descriptor is None else descriptor) as entries:
+        for entry in entries:
+            with suppress(FileNotFoundError):  # another run has removed it in between
+                modes[entry.name] = entry.stat(follow_symlinks=False).st_mode
+    return modes
+
+
+def _kind(mode: int) -> str:
+    return KINDS_OF_FILES.get(stat.S_IFMT(mode), "a file")
