@@ -300,7 +300,7 @@ def test_a_job_whose_workers_run_tasks_themselves_has_their_limits():
     assert job.task_bytes == pytest.approx(1.35 * GB)
     assert "export NUMBA_NUM_THREADS=2" in job.exports
     assert "export DASK_DISTRIBUTED__WORKER__MEMORY__PAUSE=False" in job.exports
-    assert requested({}, Need(9, GB, None)).exports == ()
+    assert requested({}, Need(9, GB, None)).exports == ("export PYTHONSAFEPATH=1",)
 
 
 @pytest.mark.parametrize(

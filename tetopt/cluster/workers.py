@@ -37,6 +37,7 @@ from tetopt.cluster.crew import (
 from tetopt.cluster.jobs import configuration, submitted
 from tetopt.errors import InputError
 from tetopt.extras import install_hint
+from tetopt.interpreter import safe_path
 
 CONNECT_SECONDS = 10  # until a scheduler that does not answer is given up: dask's own is 30
 CLOSE_SECONDS = 1.0  # for a worker to end by itself, and as much until one that is killed is gone: dask's own is 5
@@ -151,6 +152,7 @@ def _local(stack: ExitStack, need: Need, folders: Folders, count: int | None) ->
     from distributed import Client, LocalCluster
 
     share = local_share(need, count)
+    stack.enter_context(safe_path())
     stack.enter_context(dask.config.set(need.settings()))
     own_folder = folders.work / "dask"
     stack.callback(shutil.rmtree, own_folder, ignore_errors=True)
