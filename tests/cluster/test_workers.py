@@ -2,6 +2,7 @@
 
 import os
 import signal
+import socket
 import stat
 import subprocess
 import sys
@@ -153,6 +154,28 @@ def test_a_scheduler_that_does_not_answer_is_refused_in_one_line(address, folder
         running(Need(1, 0.0, None), folders, scheduler=address).__enter__()
     assert "\n" not in str(refusal.value)
     assert capfd.readouterr() == ("", "")
+
+
+@pytest.fixture
+def silent():
+    """The address of a socket that takes connections and says nothing."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        yield f"tcp://127.0.0.1:{server.getsockname()[1]}"
+
+
+@pytest.mark.parametrize("command", ["cohort t.tsv -o out", "mesh large.nii -o out --parts 2"])
+def test_a_scheduler_that_says_nothing_is_refused_before_images_are_read(command, silent, tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr("tetopt.cluster.workers.CONNECT_SECONDS", 0.3)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "t.tsv").write_text("task\timage\n1\tnone.nii\n")
+    save_image(tmp_path / "large.nii", sample_image(3))
+    os.truncate(tmp_path / "large.nii", 400)  # a header alone
+    assert exit_code(*command.replace("-o out", "-o out.vtu").split(), "--nodes", 200, "--scheduler", silent) == 2
+    said = capfd.readouterr()
+    assert said.out == ""
+    assert said.err.count("\n") == 1
+    assert f"{silent} does not answer (nothing within 0.3 s)" in said.err
+    assert not (tmp_path / "out.vtu").exists()
 
 
 def test_contradictions_are_refused(folders, tmp_path):
