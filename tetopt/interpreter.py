@@ -11,6 +11,8 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 
+# Numba's, read as it is loaded. Not those of BLAS, which dask leaves one: its rounding depends on them.
+THREADS_NAME = "NUMBA_NUM_THREADS"
 SAFE_PATH_NAME = "PYTHONSAFEPATH"  # python -P, also of whatever a process starts
 
 

@@ -18,6 +18,7 @@ from tetopt.budget import check_addresses
 from tetopt.cli.console import error_words, log, open_streams, out, settle_streams, show_error, show_warning
 from tetopt.cli.ending import INTERRUPTED_CODE, signal_code, signal_name, signals_heard
 from tetopt.errors import InputError
+from tetopt.interpreter import THREADS_NAME
 from tetopt.io.files import Outputs, outputs_of_command
 
 # In the order of the help: the module that has NAME_command, and the first line of that function's docstring, which is
@@ -70,8 +71,7 @@ COMMANDS = {
 }
 
 
-THREADS_NAME = "NUMBA_NUM_THREADS"  # in the environment, which numba reads as it is loaded
-MOST_DIGITS = 4  # of its value: no machine has more threads
+MOST_DIGITS = 4  # of a number of threads: no machine has more
 
 # Options by the names that messages of the library begin with, where these differ by more than a hyphen.
 ARGUMENT_OPTIONS = {"octree": "nodes", "modulus": "young"}

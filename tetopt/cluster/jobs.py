@@ -21,7 +21,6 @@ from typing import Any, NamedTuple
 from tetopt.budget import memory_words
 from tetopt.cluster.crew import (
     MEMORY_MARGIN,
-    THREADS_NAME,
     WITHIN_SETTINGS,
     Folders,
     Need,
@@ -34,7 +33,7 @@ from tetopt.cluster.crew import (
 )
 from tetopt.errors import InputError
 from tetopt.incoming import text_of
-from tetopt.interpreter import SAFE_PATH_NAME, python_command
+from tetopt.interpreter import SAFE_PATH_NAME, THREADS_NAME, python_command
 
 YAML_LETTERS = 20_000  # of a configuration: those that are known have a thousand
 YAML_BRACKETS = 500  # likewise: PyYAML's time grows with the square of brackets in one another, 4 s for 4000

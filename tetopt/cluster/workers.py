@@ -23,7 +23,6 @@ from typing import Any, NamedTuple
 from tetopt.budget import available_bytes, memory_words
 from tetopt.cluster.crew import (
     MEMORY_MARGIN,
-    THREADS_NAME,
     About,
     Folders,
     Need,
@@ -37,7 +36,7 @@ from tetopt.cluster.crew import (
 from tetopt.cluster.jobs import configuration, submitted
 from tetopt.errors import InputError
 from tetopt.extras import install_hint
-from tetopt.interpreter import safe_path
+from tetopt.interpreter import THREADS_NAME, safe_path
 
 CONNECT_SECONDS = 10  # until a scheduler that does not answer is given up: dask's own is 30
 CLOSE_SECONDS = 1.0  # for a worker to end by itself, and as much until one that is killed is gone: dask's own is 5
