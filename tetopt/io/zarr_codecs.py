@@ -6,6 +6,7 @@ are looked at here, and streams are unpacked up to what is expected.
 
 from __future__ import annotations
 
+import asyncio
 import bz2
 import lzma
 import math
@@ -135,7 +136,8 @@ def _classes() -> tuple[Any, Any]:
 
         async def _decode_single(self, chunk_bytes: Any, chunk_spec: Any) -> Any:
             n_bytes = math.prod(chunk_spec.shape) * chunk_spec.dtype.item_size
-            value = unpacked(_name_of(self.inner), chunk_bytes.to_bytes(), n_bytes)
+            name = _name_of(self.inner)
+            value = await asyncio.to_thread(unpacked, name, chunk_bytes.to_bytes(), n_bytes)
             return chunk_spec.prototype.buffer.from_bytes(value)
 
         def compute_encoded_size(self, input_byte_length: int, _chunk_spec: Any) -> int:
