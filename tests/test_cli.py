@@ -643,6 +643,14 @@ def test_nothing_is_loaded_before_it_is_used(code, needed):
     assert done.stdout.splitlines()[-1].split()[1:] == sorted(needed.split(), key=HEAVY.split().index)
 
 
+@pytest.mark.parametrize("threads", ["0", "-1", "abc", "1.5", "1000000", "9" * 5000])
+def test_threads_that_cannot_be_are_refused(inputs, tmp_path, monkeypatch, capfd, threads):
+    """numba ends with a traceback, or takes another number."""
+    monkeypatch.setenv("NUMBA_NUM_THREADS", threads)
+    command = ["mesh", inputs / "sphere.nii.gz", "-o", tmp_path / "a.vtu", "--nodes", "60"]
+    assert_refused(capfd, command, "NUMBA_NUM_THREADS: expected a whole number of threads from 1 to 9999, got")
+
+
 def test_the_list_of_commands_has_their_first_lines():
     for name, (_, text) in COMMANDS.items():
         assert loaded_command(name).__doc__.splitlines()[0] == text

@@ -6,6 +6,7 @@ import os
 import pickle
 import subprocess
 import sys
+import zlib
 from typing import NamedTuple
 
 import numba
@@ -403,7 +404,7 @@ def test_a_full_disk_or_no_folder_keeps_nothing(use):
 @compiled_only
 @pytest.mark.skipif(os.name != "posix", reason="rights of folders")
 def test_kernels_beside_the_source_are_read_where_others_are_kept(use):
-    """As in a container, compiled when it was built: but not where everybody may write."""
+    """As in a container, compiled when it was built: but not where others may write."""
     assert use() == [COMPILED]
     beside = use.folder.parent / "__pycache__"
     beside.mkdir(exist_ok=True)
@@ -411,9 +412,50 @@ def test_kernels_beside_the_source_are_read_where_others_are_kept(use):
         path.rename(beside / path.name)
     assert use() == [LOADED]
     assert not list(use.folder.rglob("*.nb?"))
-    assert cache.shipped_folder(beside.parent / "some_kernels.py") == beside
     beside.chmod(0o777)
-    assert cache.shipped_folder(beside.parent / "some_kernels.py") is None
+    said = use()
+    assert said[-1] == COMPILED
+    assert f"kernels in {beside} are not loaded" in said[0]
+
+
+def link(path):
+    path.rename(path.with_name("elsewhere"))
+    path.symlink_to(path.with_name("elsewhere"))
+
+
+STRANGERS = {
+    "can be written by others than its owner": lambda path: path.chmod(path.stat().st_mode | 0o020),
+    "is a link": link,
+    "belongs to user 12345": lambda path: os.chown(path, 12345, -1),
+}
+
+
+@compiled_only
+@pytest.mark.skipif(os.name != "posix", reason="rights of files")
+def test_what_others_can_have_written_is_not_loaded(use):
+    """It is code. A file is replaced, and with it all is well; into a folder of others nothing is written."""
+    assert use("import os; os.umask(0o002)") == [COMPILED]
+    indices = sorted(use.folder.glob("*/*.nbi"))
+    folder = indices[0].parent
+    assert {path.stat().st_mode & 0o022 for path in [folder, *folder.iterdir()]} == {0}
+    executed = use.folder / "executed"
+    trap = b"cbuiltins\nopen\n(V" + str(executed).encode() + b"\nVw\ntR."
+    kinds = [words for words in STRANGERS if os.geteuid() == 0 or "belongs" not in words]
+    for words, path in zip(kinds, indices, strict=False):
+        path.write_bytes(path.read_bytes().split(b" ")[0] + b" %08x\n" % zlib.crc32(trap) + trap)
+        STRANGERS[words](path)
+    *said, _ = use()
+    assert all(any(words in line and f"kernels in {folder} are not" in line for line in said) for words in kinds)
+    assert not executed.exists()
+    assert use() == [LOADED]
+    indices[0].write_bytes(indices[0].read_bytes().split(b" ")[0] + b" %08x\n" % zlib.crc32(trap) + trap)
+    folder.chmod(0o775)
+    said = use()
+    assert said[-1] == COMPILED
+    assert len(said) == 3
+    assert f"{folder.name} can be written by others" in said[0]
+    assert "cannot be kept" in said[1]
+    assert not executed.exists()
 
 
 @compiled_only
@@ -480,14 +522,50 @@ def test_a_unit_that_finds_no_memory_says_so(tmp_path, monkeypatch):
     monkeypatch.setenv("NUMBA_CACHE_DIR", str(tmp_path))
     from large_unit import Row, large, over_it  # type: ignore[import-not-found]
 
-    hook = sys.unraisablehook
     row = Row(np.zeros(4), 1 << 45)  # more than addresses there are
     with pytest.raises(MemoryError):
         over_it(row)
-    with pytest.raises(MemoryError):
+    with pytest.raises(MemoryError, match="large: 4 of 4 calls found no memory"):
         run(large, 4, row)
-    assert sys.unraisablehook is hook
     assert over_it(row._replace(n=4)) == 1.0
+
+
+THREADS = """
+import sys, threading
+from large_unit import *
+
+hook = sys.unraisablehook
+begin, failed, seen = threading.Barrier(4), [0, 0, 0, 0], []
+
+def work(number):
+    row = Row(np.zeros(64), 64 if number % 2 else 1 << 45)
+    begin.wait()
+    for _ in range(100):
+        try:
+            run(large, 64, row) if number < 2 else over_it(row)
+        except MemoryError:
+            failed[number] += 1
+        seen.append(sys.unraisablehook is hook)
+
+threads = [threading.Thread(target=work, args=(number,)) for number in range(4)]
+for each in threads: each.start()
+for each in threads: each.join()
+print(failed, all(seen))
+"""
+
+
+@compiled_only
+@pytest.mark.parametrize("layer", ["default", "workqueue"])  # the latter ends a process that loops in two threads
+def test_each_thread_of_python_gets_its_own_errors(tmp_path, layer):
+    (tmp_path / "large_unit.py").write_text(LARGE_UNIT)
+    environment = os.environ | {
+        "NUMBA_CACHE_DIR": str(tmp_path),
+        "NUMBA_THREADING_LAYER": layer,
+        "PYTHONPATH": os.pathsep.join([str(tmp_path), *filter(None, sys.path)]),
+    }
+    done = subprocess.run([sys.executable, "-c", THREADS], env=environment, capture_output=True, text=True, check=True)
+    assert done.stdout == "[100, 0, 100, 0] True\n"
+    assert done.stderr == ""
 
 
 @compiled_only

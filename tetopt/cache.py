@@ -16,7 +16,8 @@ from functools import cache
 from pathlib import Path
 from typing import NamedTuple
 
-FOLDER_MODE = 0o755  # of folders made here, whatever the mask: only their owner may write
+# Of what is made here, whatever the mask: only the owner may write.
+FOLDER_MODE, FILE_MODE = 0o755, 0o644
 
 
 class Place(NamedTuple):
@@ -31,11 +32,13 @@ def place_cache() -> Place:
     """See to it that numba finds a folder for its cache, at least a temporary one.
 
     numba looks in NUMBA_CACHE_DIR, else beside the source, else in the user's cache folder. What it reads there is
-    code that it runs: a folder that everybody may write is not used, whoever it belongs to.
+    code that it runs: a folder that everybody may write is not used, whoever it belongs to. In folders within it, and
+    beside the source, nobody else may write at all (`untrusted`).
     """
     chosen = os.environ.get("NUMBA_CACHE_DIR")
-    folders = [Path(chosen)] if chosen else [Path(__file__).parent / "__pycache__", _user_cache() / "numba"]
-    refusals = [(folder, _refusal(folder)) for folder in folders]
+    beside = Path(__file__).parent / "__pycache__"
+    folders = [Path(chosen)] if chosen else [beside, _user_cache() / "numba"]
+    refusals = [(folder, _refusal(folder, is_within=folder == beside)) for folder in folders]
     usable = [folder for folder, refusal in refusals if refusal is None]
     if usable:
         if not chosen and usable[0] != folders[0]:
@@ -55,21 +58,20 @@ def place_cache() -> Place:
     )
 
 
-def shipped_folder(source: str | Path) -> Path | None:
-    """The folder beside a source, from which kernels are read also where none can be kept there.
+def untrusted(status: os.stat_result) -> str | None:
+    """Return who else can have written a file or folder of the cache, in words; None if nobody can.
 
-    Whoever installed the package may have compiled them, for all users or for a container that only reads. None if
-    everybody may write there, or nobody look.
+    This user, root and the owner of the package can: each of them may run code in this process anyway. The status is
+    that of `os.lstat`, as a link is not followed.
     """
-    folder = Path(source).parent / "__pycache__"
-    with contextlib.suppress(OSError):
-        return None if _is_open(folder) else folder
-    return None
-
-
-def _is_open(folder: Path) -> bool:
-    """Whether everybody may write to a folder."""
-    return os.name == "posix" and bool(folder.stat().st_mode & stat.S_IWOTH)
+    if os.name != "posix":
+        return None
+    if stat.S_ISLNK(status.st_mode):
+        return "is a link"
+    if status.st_uid not in (os.geteuid(), 0, os.stat(__file__).st_uid):
+        return f"belongs to user {status.st_uid}"
+    is_open = status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+    return "can be written by others than its owner" if is_open else None
 
 
 def _point_numba_to(folder: Path) -> None:
@@ -89,15 +91,20 @@ def _user_cache() -> Path:
     return Path(os.environ.get("XDG_CACHE_HOME") or home / ".cache")
 
 
-def _refusal(folder: Path) -> str | None:
-    """Why a folder is none for the cache, made if it is not there; numba's way to see: rights alone do not tell."""
+def _refusal(folder: Path, *, is_within: bool) -> str | None:
+    """Why a folder is none for the cache, made if it is not there; numba's way to see: rights alone do not tell.
+
+    `is_within`: it has the files itself, not folders of them.
+    """
     try:
         for part in [*reversed(folder.parents), folder]:
             if not part.exists():
                 part.mkdir(mode=FOLDER_MODE, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
-        is_open = _is_open(folder)
+        if is_within:
+            return untrusted(os.lstat(folder))
+        is_open = os.name == "posix" and folder.stat().st_mode & stat.S_IWOTH
     except OSError:
         return "cannot be written"
     return "can be written by everybody" if is_open else None

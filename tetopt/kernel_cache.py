@@ -1,13 +1,16 @@
 """numba's cache of compiled functions, of which nothing that goes wrong ends a run.
 
-What is read has to have the checksum that was written with it, or else it is compiled anew: code that a damaged file
-holds would end the process. What cannot be written, on a full disk or in a folder that is gone, is not kept. Each of
-these is said once, on one line, by a `RuntimeWarning`.
+What is read has to have the checksum that was written with it, or else it is compiled again: code that a damaged file
+holds would end the process. A file that somebody else can have written is not read either: pickles run code. What
+cannot be written, on a full disk or in a folder that is gone, is not kept. Each of these is said once, on one line, by
+a `RuntimeWarning`.
 """
 
 from __future__ import annotations
 
+import contextlib
 import inspect
+import os
 import pickle
 import warnings
 import zlib
@@ -18,9 +21,8 @@ from typing import Any
 
 import numba
 from numba.core.caching import FunctionCache, IndexDataCacheFile, NullCache
-from numba.core.ccallback import CFunc
 
-from tetopt.cache import place_cache, shipped_folder
+from tetopt.cache import FILE_MODE, FOLDER_MODE, place_cache, untrusted
 
 
 class NotKeptWarning(RuntimeWarning):
@@ -34,7 +36,7 @@ def warn(notice: str, kind: type[RuntimeWarning] = RuntimeWarning) -> None:
 
 
 class DamagedFileError(Exception):
-    """A file of the cache is not what was written."""
+    """A file of the cache is not what was written, or not by whom."""
 
 
 class SealedFile(IndexDataCacheFile):
@@ -80,18 +82,32 @@ class SealedFile(IndexDataCacheFile):
 
     def _seal(self, path: str, data: Any) -> None:
         content = self._dump(data)
+        if (words := untrusted(os.lstat(self._cache_path))) is not None:  # it would not be read
+            raise PermissionError(f"{self._cache_path} {words}")
         with self._open_for_write(path) as file:
+            os.chmod(file.name, FILE_MODE)
             file.write(b"%s %08x\n" % (self._version.encode(), zlib.crc32(content)) + content)
 
     def _unsealed(self, path: str) -> Any:
         """What a file holds; `DamagedFileError`, of which the user is told, if that is not what was written."""
-        head, _, content = Path(path).read_bytes().partition(b"\n")
+        head, _, content = self._trusted_bytes(path).partition(b"\n")
         version, _, checksum = head.partition(b" ")
         if version == self._version.encode() and checksum == b"%08x" % zlib.crc32(content):
             return pickle.loads(content)
         if not checksum or version == self._version.encode():
-            warn(f"damaged files in the cache of kernels, {Path(path).parent}: what they held is compiled anew")
+            warn(f"damaged files in the cache of kernels, {self._cache_path}: what they held is compiled again")
         raise DamagedFileError(path)
+
+    def _trusted_bytes(self, path: str) -> bytes:
+        """The bytes of a file; `DamagedFileError`, of which the user is told, if somebody else can have written it."""
+        for name in (path, self._cache_path):
+            if (words := untrusted(os.lstat(name))) is not None:
+                warn(
+                    f"kernels in {self._cache_path} are not loaded but compiled again, as somebody else can have "
+                    f"written them: {Path(name).name} {words}; remove that folder"
+                )
+                raise DamagedFileError(path)
+        return Path(path).read_bytes()
 
 
 class SealedCache(FunctionCache):
@@ -102,9 +118,12 @@ class SealedCache(FunctionCache):
         # Indices are checked, or not, by the code itself, of which numba's keys know nothing.
         kind = "-sb" if numba.config.BOUNDSCHECK else "-s"
         name, stamp = self._impl.filename_base + kind, self._impl.locator.get_source_stamp()
-        beside = shipped_folder(inspect.getfile(function))
-        shipped = None if beside is None else SealedFile(str(beside), name, stamp)
+        # Whoever installed the package may have compiled them, for all users or for a container that only reads.
+        shipped = SealedFile(str(Path(inspect.getfile(function)).parent / "__pycache__"), name, stamp)
         self._cache_file: Any = SealedFile(self._cache_path, name, stamp, shipped)
+        with contextlib.suppress(OSError), os.scandir(self._cache_path) as entries:
+            if not any(entries):  # numba has just made it, as the user's mask has it
+                os.chmod(self._cache_path, FOLDER_MODE)
 
     def load_overload(self, sig: Any, target_context: Any) -> Any:
         """What was compiled for a signature, or None."""
@@ -144,12 +163,4 @@ def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
             dispatcher._cache = cache_of(function)
         return dispatcher
 
-    return compiled
-
-
-def callback(function: Callable[..., Any], signature: Any, **options: Any) -> Any:
-    """As `numba.cfunc`, compiled now or taken from this cache."""
-    compiled: Any = CFunc(function, (signature.args, signature.return_type), {}, options)
-    compiled._cache = cache_of(function)
-    compiled.compile()
     return compiled

@@ -17,12 +17,13 @@ import os
 import subprocess
 import sys
 import tempfile
+import threading
 import time
 import typing
 import warnings
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from functools import cache, cached_property
+from functools import cache, cached_property, partial
 from importlib import import_module
 from pathlib import Path
 from types import CellType, FunctionType
@@ -50,7 +51,7 @@ except ImportError:  # Windows
 from tetopt.budget import address_room
 from tetopt.cache import place_cache
 from tetopt.interpreter import python_command, python_environment
-from tetopt.kernel_cache import NotKeptWarning, callback, njit, warn
+from tetopt.kernel_cache import NotKeptWarning, njit, warn
 
 # Arrays in the signatures of units and in records: of so many axes, the last one contiguous.
 Floats1 = Annotated[NDArray[np.float64], types.float64[::1]]
@@ -263,6 +264,8 @@ def _unbox_packed(_type: RecordType, value: Any, context: Any) -> NativeValue:
 # Functions.
 
 ALL_KERNELS: list[Any] = []  # all that were defined, in the modules imported so far
+_LINKING = threading.RLock()  # of Python's threads one links at a time: the first's code is what others call
+_LOOPING = threading.Lock()  # held by the one that runs a loop, where numba's threads can serve only one
 
 
 ALLOCATING_NAMES = frozenset(("empty", "empty_like", "full", "zeros", "ones", "array", "arange", "copy"))
@@ -320,7 +323,9 @@ class Kernel:
 
     def link(self) -> None:
         """Make its symbol known, and those of what it calls before."""
-        if not self.is_linked:
+        if self.is_linked:
+            return
+        with _LINKING:
             numba.get_num_threads()  # the threads' own functions are known to the linker from then on
             for unit in units_of(self.function):
                 unit.link()
@@ -338,8 +343,19 @@ class Kernel:
     def __call__(self, *values: Any) -> Any:
         """Call it from Python: records are laid out for it, and the units that it calls are linked before."""
         self.link()
-        with _whole_calls():
-            return self.dispatcher(*map(packed, values))
+        _check_room()
+        return self.dispatcher(*map(packed, values))
+
+    @cached_property
+    def compiled(self) -> Any:
+        """The dispatcher whose code other kernels or Python call; compiled now, or taken from the cache."""
+        self.dispatcher.compile(self.signature.args)
+        return self.dispatcher
+
+    @property
+    def was_cached(self) -> bool:
+        """Whether it was compiled before this process."""
+        return bool(sum(self.compiled.stats.cache_hits.values()) > 0)
 
 
 class Unit(Kernel):
@@ -352,15 +368,18 @@ class Unit(Kernel):
 
     @cached_property
     def type(self) -> types.Function:
-        """How other kernels call it: to numba an operation of its own."""
+        """How other kernels call it: to numba an operation of its own, which raises what the unit raises."""
 
         def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            kinds = [context.get_value_type(kind) for kind in signature.args]
-            returns = signature.return_type
-            result = ir.VoidType() if returns == types.void else context.get_value_type(returns)
-            function = cgutils.get_or_insert_function(builder.module, ir.FunctionType(result, kinds), self.symbol)
-            value = builder.call(function, arguments)
-            return context.get_constant_null(types.none) if returns == types.void else value
+            convention = context.call_conv
+            kind = convention.get_function_type(signature.return_type, signature.args)
+            function = cgutils.get_or_insert_function(builder.module, kind, self.symbol)
+            status, value = convention.call_function(
+                builder, function, signature.return_type, signature.args, arguments
+            )
+            with cgutils.if_unlikely(builder, status.is_error):
+                convention.return_status_propagate(builder, status)
+            return value
 
         def typed(_context: Any, *_arguments: Any) -> Any:
             return self.signature, generate
@@ -372,37 +391,23 @@ class Unit(Kernel):
 
     @cached_property
     def compiled(self) -> Any:
-        """The function for callers of machine code; compiled now, or taken from the cache."""
-        function = _versioned(self.function)
-        return callback(function, self.signature, error_model="numpy", _nrt=_counts(self.function))
+        """The same for callers of machine code only."""
+        dispatcher = _machine_code(cache=True, _nrt=_counts(self.function))(_versioned(self.function))
+        dispatcher.compile(self.signature)
+        return dispatcher
 
-    @property
+    @cached_property
     def address(self) -> int:
         """Where it is in memory."""
-        return int(self.compiled.address)
+        (result,) = self.compiled.overloads.values()
+        return int(result.library.get_pointer_to_function(result.fndesc.llvm_func_name))
 
     def _make_known(self) -> None:
         llvm.add_symbol(self.symbol, self.address)
 
-    @property
-    def was_cached(self) -> bool:
-        """Whether it was compiled before this process."""
-        return bool(self.compiled.cache_hits > 0)
-
 
 class Entry(Kernel):
     """A function that Python calls."""
-
-    @cached_property
-    def compiled(self) -> Any:
-        """The same, compiled now for its signature, or taken from the cache."""
-        self.dispatcher.compile(self.signature.args)
-        return self.dispatcher
-
-    @property
-    def was_cached(self) -> bool:
-        """Whether it was compiled before this process."""
-        return bool(sum(self.compiled.stats.cache_hits.values()) > 0)
 
 
 @typeof_impl.register(Unit)
@@ -434,31 +439,11 @@ def _parts(function: Callable[..., Any]) -> list[Any]:
     return parts
 
 
-@contextlib.contextmanager
-def _whole_calls() -> Iterator[None]:
-    """Raise what a unit raised, which numba prints and forgets, going on with numbers that mean nothing.
-
-    Units make small arrays only, so that memory for them is seen to before, where a limit lets allocations fail.
-    """
+def _check_room() -> None:
+    """MemoryError where a limit leaves too little for the arrays that units make, which are all small."""
     room = address_room()
     if room is not None and room < UNIT_BYTES:
         raise MemoryError(f"{room} bytes are left for kernels, which need {UNIT_BYTES}")
-    raised: list[BaseException] = []
-    before = sys.unraisablehook
-
-    def keep(unraisable: Any) -> None:
-        if unraisable.exc_value is None:
-            before(unraisable)
-        else:
-            raised.append(unraisable.exc_value)
-
-    sys.unraisablehook = keep
-    try:
-        yield
-    finally:
-        sys.unraisablehook = before
-    if raised:
-        raise raised[0]
 
 
 # Compiling in several processes.
@@ -592,30 +577,32 @@ def compile_named(names: Sequence[str], claims: str, parent: int) -> None:
 
 
 @intrinsic
-def _call(_context: Any, address: Any, values: Any, number: Any) -> Any:
-    """Call the task at an address, void (record, number)."""
+def _fails(_context: Any, address: Any, values: Any, number: Any) -> Any:
+    """Call the task at an address, with that of a record and a number: whether it raised an error."""
 
     def generate(context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
-        pointer = ir.IntType(8).as_pointer()
-        kind = ir.FunctionType(ir.VoidType(), [pointer, ir.IntType(64)])
-        task = builder.inttoptr(arguments[0], kind.as_pointer())
-        builder.call(task, [builder.inttoptr(arguments[1], pointer), arguments[2]])
-        return context.get_constant_null(types.none)
+        convention, kinds = context.call_conv, (types.voidptr, types.int64)
+        task = builder.inttoptr(arguments[0], convention.get_function_type(types.void, kinds).as_pointer())
+        record = builder.inttoptr(arguments[1], cgutils.voidptr_t)
+        status, _ = convention.call_function(builder, task, types.void, kinds, [record, arguments[2]])
+        return status.is_error
 
-    return types.void(types.int64, types.int64, types.int64), generate
+    return types.boolean(types.int64, types.int64, types.int64), generate
 
 
 # The one parallel loop: each loop of its own took 2 s to compile.
 @njit(cache=True, parallel=True)
-def _run(task: int, values: int, n: int) -> None:
+def _run(task: int, values: int, n: int) -> int:
+    n_failed = 0
     for number in prange(n):
-        _call(task, values, np.int64(number))
+        n_failed += _fails(task, values, np.int64(number))
+    return n_failed
 
 
 def run(task: Any, n: int, values: Any) -> None:
     """Call a unit `task(values, number)` for all numbers up to n, on as many threads as numba is set to.
 
-    `values` is a record. The calls must not depend on one another.
+    `values` is a record. The calls must not depend on one another. MemoryError where one fails: units raise no other.
     """
     if numba.config.DISABLE_JIT:
         for number in range(n):
@@ -625,8 +612,15 @@ def run(task: Any, n: int, values: Any) -> None:
     laid_out = packed(values)
     if laid_out.type != task.signature.args[0]:
         raise TypeError(f"{task.__name__}: expected a {task.signature.args[0]}, got a {laid_out.type}")
-    with _whole_calls():
-        _run(task.address, laid_out.address, n)
+    _check_room()
+    with _LOOPING if numba.threading_layer() == "workqueue" else contextlib.nullcontext():
+        n_failed = _run(task.address, laid_out.address, n)
+    if n_failed > 0:
+        raise MemoryError(f"{task.__name__}: {n_failed} of {n} calls found no memory for their arrays")
+
+
+# Of functions that Python does not call.
+_machine_code = partial(njit, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 
 def unit(function: Callable[..., Any]) -> Any:
@@ -641,7 +635,7 @@ def entry(function: Callable[..., Any]) -> Any:
 
 def helper(function: Callable[..., Any]) -> Any:
     """What goes into the functions that call it."""
-    return njit(error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=_counts(function))(function)
+    return _machine_code(_nrt=_counts(function))(function)
 
 
 inlined = njit(error_model="numpy", inline="always")  # likewise, as numba reads it, before LLVM does

@@ -2,6 +2,7 @@
 
 import os
 import signal
+import socket
 import stat
 import subprocess
 import sys
@@ -155,6 +156,28 @@ def test_a_scheduler_that_does_not_answer_is_refused_in_one_line(address, folder
     assert capfd.readouterr() == ("", "")
 
 
+@pytest.fixture
+def silent():
+    """The address of a socket that takes connections and says nothing."""
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        yield f"tcp://127.0.0.1:{server.getsockname()[1]}"
+
+
+@pytest.mark.parametrize("command", ["cohort t.tsv -o out", "mesh large.nii -o out --parts 2"])
+def test_a_scheduler_that_says_nothing_is_refused_before_images_are_read(command, silent, tmp_path, monkeypatch, capfd):
+    monkeypatch.setattr("tetopt.cluster.workers.CONNECT_SECONDS", 0.3)
+    monkeypatch.chdir(tmp_path)
+    (tmp_path / "t.tsv").write_text("task\timage\n1\tnone.nii\n")
+    save_image(tmp_path / "large.nii", sample_image(3))
+    os.truncate(tmp_path / "large.nii", 400)  # a header alone
+    assert exit_code(*command.replace("-o out", "-o out.vtu").split(), "--nodes", 200, "--scheduler", silent) == 2
+    said = capfd.readouterr()
+    assert said.out == ""
+    assert said.err.count("\n") == 1
+    assert f"{silent} does not answer (nothing within 0.3 s)" in said.err
+    assert not (tmp_path / "out.vtu").exists()
+
+
 def test_contradictions_are_refused(folders, tmp_path):
     with pytest.raises(InputError, match="--scheduler, --cluster: expected one of them"):
         running(Need(1, 0.0, None), folders, scheduler="tcp://x:1", cluster=tmp_path).__enter__()
@@ -300,7 +323,7 @@ def test_a_job_whose_workers_run_tasks_themselves_has_their_limits():
     assert job.task_bytes == pytest.approx(1.35 * GB)
     assert "export NUMBA_NUM_THREADS=2" in job.exports
     assert "export DASK_DISTRIBUTED__WORKER__MEMORY__PAUSE=False" in job.exports
-    assert requested({}, Need(9, GB, None)).exports == ()
+    assert requested({}, Need(9, GB, None)).exports == ("export PYTHONSAFEPATH=1",)
 
 
 @pytest.mark.parametrize(

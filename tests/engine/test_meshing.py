@@ -1,5 +1,9 @@
 """The front door: each mode is what its parts make, and watching changes nothing."""
 
+import sys
+import threading
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 
@@ -25,6 +29,22 @@ def test_graded():
     assert result.initial.points.tobytes() == initial.points.tobytes()
     assert result.nodes == 200
     assert min(result.seconds_start, result.seconds_run) > 0.0
+
+
+def test_threads_of_python_mesh_at_once():
+    """Each to the bits of a run alone; what nobody catches (`sys.unraisablehook`) stays the user's to see."""
+    hook, nodes = sys.unraisablehook, [150, 200, 150, 200]
+    begin = threading.Barrier(len(nodes))
+
+    def meshed(number):
+        begin.wait()
+        return tetopt.mesh_image(IMAGE, number, iterations=3)
+
+    with ThreadPoolExecutor(len(nodes)) as pool:
+        results = list(pool.map(meshed, nodes))
+    for number, result in zip(nodes, results, strict=True):
+        assert_same(result, tetopt.mesh_image(IMAGE, number, iterations=3))
+    assert sys.unraisablehook is hook
 
 
 @pytest.mark.parametrize("mask", [None, MASK])

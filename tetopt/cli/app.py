@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import os
 import sys
 import warnings
 from collections.abc import Callable, Sequence
@@ -17,6 +18,7 @@ from tetopt.budget import check_addresses
 from tetopt.cli.console import error_words, log, open_streams, out, settle_streams, show_error, show_warning
 from tetopt.cli.ending import INTERRUPTED_CODE, signal_code, signal_name, signals_heard
 from tetopt.errors import InputError
+from tetopt.interpreter import THREADS_NAME
 from tetopt.io.files import Outputs, outputs_of_command
 
 # In the order of the help: the module that has NAME_command, and the first line of that function's docstring, which is
@@ -68,6 +70,8 @@ COMMANDS = {
     "demo": ("mesh", "Mesh the MNI152 T1 that nilearn's wheel carries; leave mesh, numbers and pictures in a folder."),
 }
 
+
+MOST_DIGITS = 4  # of a number of threads: no machine has more
 
 # Options by the names that messages of the library begin with, where these differ by more than a hyphen.
 ARGUMENT_OPTIONS = {"octree": "nodes", "modulus": "young"}
@@ -160,8 +164,20 @@ def _app(arguments: Sequence[str]) -> typer.Typer:
 
 
 def loaded_command(name: str) -> Callable[..., Any]:
-    """The function of a command, as typer takes it; InputError where not even the libraries that it loads have room."""
+    """Return the function of a command, as typer takes it.
+
+    Raises
+    ------
+    InputError
+        The libraries that it loads have no room, or numba cannot have the threads that the environment asks for.
+    """
     check_addresses()
+    threads = os.environ.get(THREADS_NAME, "").strip()
+    if threads and not (threads.isdecimal() and len(threads) <= MOST_DIGITS and int(threads) >= 1):
+        raise InputError(
+            f"{THREADS_NAME}: expected a whole number of threads from 1 to {10**MOST_DIGITS - 1}, got "
+            f"{threads[:20]}; set it to one, or unset it"
+        )
     from tetopt.cli.options import from_records  # which loads what its defaults come from
 
     return from_records(getattr(import_module(f"tetopt.cli.{COMMANDS[name][0]}"), f"{name.replace('-', '_')}_command"))

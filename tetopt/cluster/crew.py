@@ -34,8 +34,6 @@ WITHIN_SETTINGS = {f"distributed.worker.memory.{name}": False for name in ("targ
     "distributed.worker.memory.terminate": TERMINATE_SHARE,
     "distributed.scheduler.worker-ttl": None,
 }
-# Not those of BLAS, which dask leaves one: its rounding depends on them.
-THREADS_NAME = "NUMBA_NUM_THREADS"
 DASHBOARD_PORT = 8787  # dask's own, which its users know; another where that is taken
 
 

@@ -9,7 +9,6 @@ from __future__ import annotations
 import re
 import shlex
 import shutil
-import sys
 import tempfile
 import time
 from collections.abc import Iterator
@@ -22,7 +21,6 @@ from typing import Any, NamedTuple
 from tetopt.budget import memory_words
 from tetopt.cluster.crew import (
     MEMORY_MARGIN,
-    THREADS_NAME,
     WITHIN_SETTINGS,
     Folders,
     Need,
@@ -35,6 +33,7 @@ from tetopt.cluster.crew import (
 )
 from tetopt.errors import InputError
 from tetopt.incoming import text_of
+from tetopt.interpreter import SAFE_PATH_NAME, THREADS_NAME, python_command
 
 YAML_LETTERS = 20_000  # of a configuration: those that are known have a thousand
 YAML_BRACKETS = 500  # likewise: PyYAML's time grows with the square of brackets in one another, 4 s for 4000
@@ -190,11 +189,12 @@ def request(path: Path, kind: str, settings: dict[str, Any], need: Need) -> Requ
 
 
 def _exports(need: Need, threads: int) -> tuple[str, ...]:
-    """What workers that run tasks themselves are told by their environment."""
-    if not need.is_within:
-        return ()
-    settings = {f"DASK_{key.upper().replace('.', '__')}": value for key, value in WITHIN_SETTINGS.items()}
-    return tuple(f"export {name}={value}" for name, value in {**settings, THREADS_NAME: threads}.items())
+    """What workers are told by their environment; more where they run tasks themselves."""
+    names: dict[str, Any] = {SAFE_PATH_NAME: 1}  # a job begins in a folder that may hold a stranger's modules
+    if need.is_within:
+        names |= {f"DASK_{key.upper().replace('.', '__')}": value for key, value in WITHIN_SETTINGS.items()}
+        names[THREADS_NAME] = threads
+    return tuple(f"export {name}={value}" for name, value in names.items())
 
 
 @contextmanager
@@ -223,8 +223,7 @@ def cluster_of(path: Path, kind: str, job: Request, folder: Path, logs: Path) ->
             cores=job.cores,
             memory=int(job.bytes),
             processes=job.processes,
-            # Not from the folder that a job begins in: it may hold a stranger's modules (see tetopt.interpreter).
-            python=settings["python"] or f"{shlex.quote(sys.executable)} -P",
+            python=settings["python"] or shlex.join(python_command()),
             # dask's threads are tasks at a time; the last of two is taken.
             worker_extra_args=[*settings["worker-extra-args"], "--nthreads", "1"],
             log_directory=settings["log-directory"] or str(logs),

@@ -23,7 +23,6 @@ from typing import Any, NamedTuple
 from tetopt.budget import available_bytes, memory_words
 from tetopt.cluster.crew import (
     MEMORY_MARGIN,
-    THREADS_NAME,
     About,
     Folders,
     Need,
@@ -37,6 +36,7 @@ from tetopt.cluster.crew import (
 from tetopt.cluster.jobs import configuration, submitted
 from tetopt.errors import InputError
 from tetopt.extras import install_hint
+from tetopt.interpreter import THREADS_NAME, safe_path
 
 CONNECT_SECONDS = 10  # until a scheduler that does not answer is given up: dask's own is 30
 CLOSE_SECONDS = 1.0  # for a worker to end by itself, and as much until one that is killed is gone: dask's own is 5
@@ -87,9 +87,10 @@ def workers(
 
 
 def check_choice(count: int | None, scheduler: str | None, cluster: Path | None, extra: str) -> None:
-    """InputError for what `workers` refuses without asking anybody: to be called before anything is written.
+    """InputError for what `workers` refuses at once: to be called before images are read and anything is written.
 
-    `extra` is that of tetopt's which installs what the caller needs: "cohort" or "blocks".
+    A scheduler is asked, for `CONNECT_SECONDS` at most. `extra` is that of tetopt's which installs what the caller
+    needs: "cohort" or "blocks".
     """
     check_installed(extra)
     if scheduler is not None and cluster is not None:
@@ -98,6 +99,9 @@ def check_choice(count: int | None, scheduler: str | None, cluster: Path | None,
         raise InputError("--workers: expected none with --scheduler, whose workers are there; start more of them")
     if cluster is not None:
         configuration(cluster)
+    if scheduler is not None:
+        with _answering(scheduler):
+            asyncio.run(_reached(scheduler))
 
 
 def check_installed(extra: str) -> None:
@@ -151,6 +155,7 @@ def _local(stack: ExitStack, need: Need, folders: Folders, count: int | None) ->
     from distributed import Client, LocalCluster
 
     share = local_share(need, count)
+    stack.enter_context(safe_path())
     stack.enter_context(dask.config.set(need.settings()))
     own_folder = folders.work / "dask"
     stack.callback(shutil.rmtree, own_folder, ignore_errors=True)
@@ -192,17 +197,9 @@ def _connected(stack: ExitStack, need: Need, folders: Folders, address: str) -> 
     """The workers of a scheduler that others started."""
     from distributed import Client
 
-    try:
-        asyncio.run(_reached(address))
-        with warnings.catch_warnings():  # of versions that differ: what matters of them is checked, in one line
-            warnings.simplefilter("ignore")
-            client = stack.enter_context(Client(address, timeout=CONNECT_SECONDS))
-    except (OSError, ValueError, TypeError, RuntimeError) as error:
-        reason = " ".join(str(error).split()) or type(error).__name__
-        raise InputError(
-            f"--scheduler: {address} does not answer ({reason[:200]}); expected the address of a dask scheduler that "
-            "runs, as tcp://host:8786"
-        ) from error
+    with _answering(address), warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # of versions that differ: what matters of them is checked, in one line
+        client = stack.enter_context(Client(address, timeout=CONNECT_SECONDS))
     newcomers = Newcomers(client, need, folders.work)
     stack.callback(newcomers.probe.unlink, missing_ok=True)
     slots = newcomers.slots()
@@ -216,13 +213,27 @@ def _connected(stack: ExitStack, need: Need, folders: Folders, address: str) -> 
     return Workers(client, newcomers.slots, threads, n_bytes, f"{words}; dashboard {client.dashboard_link}", limit)
 
 
+@contextmanager
+def _answering(address: str) -> Iterator[None]:
+    """InputError where a connection to a scheduler fails in the block."""
+    try:
+        yield
+    except (OSError, ValueError, TypeError, RuntimeError) as error:
+        reason = " ".join(str(error).split()) or f"nothing within {CONNECT_SECONDS:g} s"
+        raise InputError(
+            f"--scheduler: {address} does not answer ({reason[:200]}); expected the address of a dask scheduler that "
+            "runs, as tcp://host:8786"
+        ) from error
+
+
 async def _reached(address: str) -> None:
     """A connection, closed again. A client that cannot make one may be left half begun, and hangs when collected."""
     from distributed.comm import connect
     from distributed.security import Security
 
-    comm = await connect(address, timeout=CONNECT_SECONDS, **Security().get_connection_args("client"))
-    await comm.close()
+    async with asyncio.timeout(CONNECT_SECONDS):  # dask's own ends before the first words of the other side
+        comm = await connect(address, timeout=CONNECT_SECONDS, **Security().get_connection_args("client"))
+        await comm.close()
 
 
 def _threads_each(abouts: list[About]) -> int:

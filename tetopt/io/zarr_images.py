@@ -25,12 +25,16 @@ from tetopt.incoming import LARGEST_NUMBER, TEXT_BYTES, irregular
 from tetopt.io.files import folder_written_whole
 from tetopt.io.text import plain
 from tetopt.io.volumes import DAMAGED_FILE, VoxelsInFile, one_line, volume_index
+from tetopt.io.zarr_codecs import PACKERS, bounded
 from tetopt.stored import StoredImage
 
 ZARR_SUFFIX = ".zarr"
 NODE_FILES = ("zarr.json", ".zarray", ".zgroup")  # one of which every array and group of Zarr has, of version 3 and 2
 METADATA_FILES = (*NODE_FILES, ".zattrs", ".zmetadata")
 MOST_CHUNKS = 2**24  # of one image: as many names are looked up in a minute or two; 2048^3 voxels have 4,096 of 128^3
+MOST_SPARSE = 1000  # chunks to each that is there: an image of nothing would be long work
+# Of a chunk's file: headers of codecs, and for each voxel a number of 8 bytes and what shards and codecs add to it.
+PACKED_BYTES, PACKED_VOXEL_BYTES = 2**16, 32
 CHUNK_EDGE = 128  # voxels, of what is written: 4 MB of 16 bits, and a part of a mesh reads a few
 MOST_LEVELS = 64  # of a multiscale: each is at least half of the one before
 # NGFF's units of length, names of UDUNITS-2, in mm.
@@ -46,11 +50,11 @@ WAYS_OF_BODY = {
     "left-to-right": (0, 1.0), "right-to-left": (0, -1.0), "posterior-to-anterior": (1, 1.0),
     "anterior-to-posterior": (1, -1.0), "inferior-to-superior": (2, 1.0), "superior-to-inferior": (2, -1.0),
 }  # fmt: skip
-# Numbers to numbers, or bytes to bytes. Others, such as numcodecs' pickle, can make a file run whatever it likes.
+ARRAY_AXES = 32  # of an array, the fewest that a numpy which is supported can have
+# Numbers to as many numbers. Others, such as numcodecs' pickle, can make a file run whatever it likes.
 KNOWN_CODECS = (
-    "bytes", "endian", "transpose", "sharding_indexed", "blosc", "zstd", "gzip", "zlib", "bz2", "lzma", "lz4", "crc32",
-    "crc32c", "adler32", "fletcher32", "jenkins_lookup3", "shuffle", "delta", "bitround", "fixedscaleoffset",
-    "quantize", "packbits", "astype", "pcodec", "zfpy",
+    *PACKERS, "bytes", "endian", "transpose", "sharding_indexed", "crc32c", "shuffle", "delta", "bitround",
+    "fixedscaleoffset", "quantize", "astype",
 )  # fmt: skip
 
 
@@ -98,7 +102,8 @@ def open_zarr(level: ZarrLevel, volume: int | None) -> StoredImage:
     picks: list[int | slice] = [slice(0, int(size)) for size in level.array.shape]
     for axis, at in zip(level.others, index, strict=True):
         picks[axis] = at
-    return StoredImage(VoxelsInFile(level.folder, level.array, tuple(picks), level.array.chunks), level.affine)
+    voxels = VoxelsInFile(level.folder, bounded(level.array), tuple(picks), level.array.chunks)
+    return StoredImage(voxels, level.affine)
 
 
 def zarr_levels(path: Path, notes: list[str]) -> list[ZarrLevel]:
@@ -283,11 +288,17 @@ def _check_array(array: Any) -> None:
     dtype = array.dtype
     if getattr(dtype, "kind", "") not in tuple("buif") or dtype.names is not None:
         raise InputError(f"expected one real number a voxel, got {plain(str(dtype))}; convert it first")
-    if 0 in array.shape:
-        raise InputError(f"every axis needs a voxel, got shape {array.shape}")
-    unknown = sorted({name for name in _codec_names(array.metadata.to_dict()) if name not in KNOWN_CODECS})
+    if len(array.shape) > ARRAY_AXES:
+        raise InputError(f"expected at most {ARRAY_AXES} axes, got {len(array.shape)}; write it again with fewer")
+    if 0 in (*array.shape, *array.chunks, *(array.shards or ())):
+        raise InputError(f"every axis needs a voxel, got shape {array.shape} in chunks of {array.chunks}")
+    names = _codec_names(array.metadata.to_dict())
+    unknown = sorted({name for name in names if name not in KNOWN_CODECS})
     if unknown:
         raise InputError(f"its chunks are packed by {plain(', '.join(unknown))}, which is not read; write it again")
+    packers = [name for name in names if name in PACKERS]
+    if len(packers) > 1:
+        raise InputError(f"its chunks are packed several times, by {', '.join(packers)}; write it again")
     shape = " x ".join(str(size) for size in array.chunks)
     n_bytes = math.prod(array.chunks) * dtype.itemsize
     check_memory(n_bytes, f"one of its chunks of {shape} voxels", "write it again in smaller ones")
@@ -318,10 +329,12 @@ def check_chunks(voxels: VoxelsInFile, notes: list[str]) -> None:
         Without the path before it: chunks that cannot be.
     """
     array = voxels.array
+    edges = array.shards or array.chunks
     ranges = [
         range(pick.start // size, -(-pick.stop // size)) if isinstance(pick, slice) else [pick // size]
-        for pick, size in zip(voxels.picks, array.shards or array.chunks, strict=True)
+        for pick, size in zip(voxels.picks, edges, strict=True)
     ]
+    most_bytes = PACKED_BYTES + PACKED_VOXEL_BYTES * math.prod(edges)
     n_chunks, n_missing = math.prod(map(len, ranges)), 0
     if n_chunks > MOST_CHUNKS:
         raise InputError(f"expected at most {MOST_CHUNKS} chunks, got {n_chunks}; write it again in larger ones")
@@ -329,16 +342,22 @@ def check_chunks(voxels: VoxelsInFile, notes: list[str]) -> None:
     for place in itertools.product(*ranges):
         name = array.metadata.encode_chunk_key(place)
         try:
-            mode = os.stat(f"{folder}/{name}").st_mode
+            status = os.stat(f"{folder}/{name}")
         except (FileNotFoundError, NotADirectoryError):
             n_missing += 1
             continue
-        if not stat.S_ISREG(mode):
+        if not stat.S_ISREG(status.st_mode):
             raise InputError(f"its chunk {name} is no regular file; copy what it gives into a file")
+        if status.st_size > most_bytes:
+            raise InputError(f"its chunk {name} has {status.st_size} bytes, at most {most_bytes} can be; copy it again")
     if n_missing == 0:
         return
     if n_missing == n_chunks:
         raise InputError(f"none of its {n_chunks} chunks is there; copy it again, with all that is in its folder")
+    if n_chunks > MOST_SPARSE * (n_chunks - n_missing):
+        raise InputError(
+            f"only {n_chunks - n_missing} of its {n_chunks} chunks are there; copy it again, or crop it to them"
+        )
     fill = array.fill_value
     if fill is None or not np.isfinite(fill):
         raise InputError(

@@ -26,6 +26,7 @@ from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import oriented
 from tetopt.geometry.topology import boundary_facets
 from tetopt.image import Image
+from tetopt.interpreter import others_environment
 from tetopt.io.images import save_image, sha256
 from tetopt.io.meshes import MESH_SUFFIXES, load_mesh
 from tetopt.mesh import Mesh
@@ -178,8 +179,9 @@ def _run(name: str, command: list[str], output: Path) -> MeshFile:
     output.unlink(missing_ok=True)
     try:
         done = subprocess.run(
-            command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, check=False
-        )
+            command, stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL, stderr=subprocess.PIPE, check=False,
+            env=others_environment(),
+        )  # fmt: skip
     except OSError as error:
         raise InputError(f"{name}: cannot be run ({error})") from error
     line = last_line(done.stderr.decode(errors="replace"))

@@ -1,0 +1,161 @@
+"""Chunks of Zarr that lie: of their own length, of what they unpack to, of how many there are."""
+
+import bz2
+import json
+import lzma
+import struct
+import tracemalloc
+import zlib
+
+import numcodecs
+import numpy as np
+import pytest
+import zarr
+from numcodecs import AsType, Blosc, Delta, GZip, Shuffle, Zlib, Zstd
+from zarr.codecs import BloscCodec, Crc32cCodec, GzipCodec, ZstdCodec
+
+from tetopt.errors import InputError
+from tetopt.io.images import load_image
+from tetopt.io.stored_images import open_stored
+from tetopt.io.zarr_codecs import PACKERS, unpacked
+
+VALUES = np.arange(1000, dtype="i2").reshape(10, 10, 10)
+CHUNK = VALUES[:4, :4, :4].tobytes()  # 128 bytes
+BOMB = bytes(2**25)
+# Of unknown length: Zstandard's frame without a size, of blocks that repeat one byte 128 times.
+FRAME, BLOCK, LAST_BLOCK = b"\x28\xb5\x2f\xfd\0\0", b"\x02\x04\0\x07", b"\x03\x04\0\x07"
+pytestmark = pytest.mark.filterwarnings("ignore")  # of sizes of boxes, and codecs that Zarr 3 has not specified
+
+
+def packer(name):
+    return numcodecs.get_codec({"id": name})
+
+
+def written(path, fmt, **options):
+    """An image of 10^3 voxels in chunks of 4^3, and the file of its first chunk."""
+    array = zarr.create_array(
+        store=path, shape=VALUES.shape, chunks=(4, 4, 4), dtype="i2", zarr_format=fmt, fill_value=0,
+        attributes={"affine": np.eye(4).tolist()}, **options,
+    )  # fmt: skip
+    array[:] = VALUES
+    return path / array.metadata.encode_chunk_key((0, 0, 0))
+
+
+KINDS = {
+    **{f"2 {name}": (2, {"compressors": packer(name)}) for name in PACKERS},
+    "2 none": (2, {"compressors": None}),
+    "2 filters": (2, {"compressors": Zlib(), "filters": [Delta("<i2", "<i4"), Shuffle(4)]}),
+    "2 other numbers": (2, {"compressors": Blosc(), "filters": [AsType("<i8", "<i2")]}),
+    "3 blosc": (3, {"compressors": BloscCodec(cname="lz4")}),
+    "3 zstd": (3, {"compressors": ZstdCodec()}),
+    "3 gzip": (3, {"compressors": GzipCodec()}),
+    "3 checksum": (3, {"compressors": [BloscCodec(), Crc32cCodec()]}),
+    "3 shards": (3, {"compressors": BloscCodec(), "shards": (8, 8, 8)}),
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_voxels_come_back(tmp_path, kind):
+    fmt, options = KINDS[kind]
+    written(tmp_path / "a.zarr", fmt, **options)
+    np.testing.assert_array_equal(load_image(tmp_path / "a.zarr").data, VALUES)
+    np.testing.assert_array_equal(open_stored(tmp_path / "a.zarr").read((1, 2, 3), (9, 6, 10)), VALUES[1:9, 2:6, 3:])
+
+
+def refused(path, words):
+    with pytest.raises(InputError, match=words) as caught:
+        load_image(path)
+    assert str(caught.value).startswith(f"{path}: ")
+    assert "\n" not in str(caught.value)
+
+
+@pytest.mark.parametrize("kind", ["2 blosc", "3 blosc", "3 shards"])
+@pytest.mark.parametrize(
+    ("offset", "number"),
+    [(3, 0), (4, 2**31 - 1), (4, 2000), (4, 127), (4, 0), (8, 0), (8, 2**31), (12, 2**31 - 1), (12, 100_000), (12, 0)],
+)
+def test_a_blosc_header_that_lies(tmp_path, kind, offset, number):
+    """Blosc would read beyond the chunk's end: a crash, or memory of the process for voxels."""
+    fmt, options = KINDS[kind]
+    chunk = written(tmp_path / "a.zarr", fmt, **options)
+    content = bytearray(chunk.read_bytes())
+    struct.pack_into("<B" if offset == 3 else "<I", content, offset, number)
+    chunk.write_bytes(content)
+    refused(tmp_path / "a.zarr", "its voxels .* cannot be read .*chunk")
+
+
+@pytest.mark.parametrize("name", PACKERS)
+def test_chunks_that_are_cut(tmp_path, name):
+    chunk = written(tmp_path / "a.zarr", 2, compressors=packer(name))
+    content = chunk.read_bytes()
+    for length in (0, 1, 4, 5, 6, 15, 16, len(content) - 1):
+        chunk.write_bytes(content[:length])
+        refused(tmp_path / "a.zarr", "cannot be read")
+
+
+BOMBS = {
+    **{name: bytes(packer(name).encode(BOMB)) for name in ("blosc", "zstd", "lz4")},
+    "gzip": zlib.compress(BOMB, wbits=31),
+    "zlib": zlib.compress(BOMB),
+    "bz2": bz2.compress(BOMB),
+    "lzma": lzma.compress(BOMB, preset=1),
+}
+
+
+@pytest.mark.parametrize("name", PACKERS)
+def test_a_bomb_takes_no_memory(name):
+    """32 MB for 128 bytes."""
+    for packed in (BOMBS[name], BOMBS[name] * 2):
+        tracemalloc.start()
+        with pytest.raises(ValueError, match=r"^a chunk "):
+            unpacked(name, packed, 128)
+        peak = tracemalloc.get_traced_memory()[1]
+        tracemalloc.stop()
+        assert peak < 2**24
+
+
+def test_zstandard_without_its_length():
+    assert unpacked("zstd", FRAME + LAST_BLOCK, 128) == b"\x07" * 128
+    for packed in (FRAME + BLOCK * 1000 + LAST_BLOCK, bytes(Zstd().encode(CHUNK)) + bytes(Zstd().encode(BOMB))):
+        with pytest.raises((ValueError, RuntimeError)):
+            unpacked("zstd", packed, 128)
+
+
+def changed(path, fmt, **values):
+    """The same with other numbers in its metadata."""
+    file = path / ("zarr.json" if fmt == 3 else ".zarray")
+    metadata = json.loads(file.read_text())
+    if fmt == 3 and "chunks" in values:
+        metadata["chunk_grid"]["configuration"]["chunk_shape"] = values.pop("chunks")
+    file.write_text(json.dumps(metadata | values))
+
+
+@pytest.mark.parametrize("fmt", [2, 3])
+@pytest.mark.parametrize(
+    ("values", "words"),
+    [
+        ({"chunks": [0, 4, 4]}, "every axis needs a voxel"),
+        ({"shape": [1] * 62 + [10] * 3, "chunks": [1] * 62 + [4] * 3}, "expected at most 32 axes, got 65"),
+        ({"shape": [2000] * 3}, "expected at most 16777216 chunks, got 125000000|memory"),
+        ({"shape": [10**6] * 3, "chunks": [10**6] * 3}, "one of its chunks .* memory"),
+        ({"shape": [3200] * 3, "chunks": [100] * 3}, "only 27 of its 32768 chunks are there|memory"),
+    ],
+)
+def test_metadata_that_promises_too_much(tmp_path, fmt, values, words):
+    written(tmp_path / "a.zarr", fmt)
+    changed(tmp_path / "a.zarr", fmt, **values)
+    for read in (load_image, open_stored):
+        with pytest.raises(InputError, match=words):
+            read(tmp_path / "a.zarr")
+
+
+def test_a_chunk_of_any_length(tmp_path):
+    chunk = written(tmp_path / "a.zarr", 2, compressors=None)
+    with chunk.open("r+b") as file:
+        file.truncate(2**40)  # a hole, which takes no room
+    refused(tmp_path / "a.zarr", "its chunk 0.0.0 has 1099511627776 bytes")
+
+
+def test_chunks_that_are_packed_twice_are_refused(tmp_path):
+    written(tmp_path / "a.zarr", 2, compressors=GZip(), filters=[Zlib()])
+    refused(tmp_path / "a.zarr", "packed several times, by gzip, zlib")
