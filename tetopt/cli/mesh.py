@@ -466,7 +466,8 @@ def _print(task: Task, outcome: Outcome, model: Model, measured: dict[str, Any])
     solver, output = plan.solver, plan.output
     code = check_promises(result, measured)
     for name, reason in outcome.failed.items():
-        show_error(f"{name} could not be measured: {reason}; the mesh is complete, and so are the other numbers")
+        left = "the mesh's file has no means of its cells" if name == "fields" else "all other numbers are written"
+        show_error(f"{name} could not be measured: {reason}; {left}")
     if task.source.is_constant:
         measured = {**measured, "cells_without_voxel": 0}  # whose values are right all the same
     is_counted = plan.mode == "graded" and plan.sizes.target_error is None
