@@ -9,7 +9,7 @@ TESTED = PYTHONUTF8=1 NUMBA_CACHE_DIR=$(NUMBA_CACHE) MPLBACKEND=agg $(BIN)/pytho
 
 SOLVERS = calculix-ccx python3-dolfinx
 
-.PHONY: demo test dist test-lowest test-slow test-random test-solvers test-nojit test-onethread test-hostile test-container test-slurm test-cohort test-parts lint bench bench-blocks fingerprints docs clean
+.PHONY: demo test dist test-lowest test-slow test-random test-solvers test-nojit test-onethread test-bounds test-hostile test-container test-slurm test-cohort test-parts lint bench bench-blocks fingerprints docs clean
 
 demo: $(VENV)/.demo
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt demo -o demo --force
@@ -26,6 +26,14 @@ test-onethread: $(VENV)/.test
 
 test-nojit: $(VENV)/.test
 	NUMBA_DISABLE_JIT=1 $(TESTED) -q -m kernel --no-header --durations=3 $(KERNEL_TESTS)
+
+# The same, and a run of each kind, stopped here and there, with each index of compiled code checked: none that lies
+# beyond its array is survived. Negative ones count from the end there as in numpy, and are not seen.
+test-bounds: export NUMBA_BOUNDSCHECK = 1
+test-bounds: $(VENV)/.test
+	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt warm-up
+	$(TESTED) -q -m kernel --no-header --durations=3 $(KERNEL_TESTS)
+	$(TESTED) -q -m "not slow" --no-header --durations=3 tests/engine/test_ended_early.py tests/test_any_mesh.py tests/test_kernels.py
 
 # The wheel and the archive of sources, into dist/: checked, each installed into a fresh environment, and run there.
 dist: $(VENV)/bin/python

@@ -4,6 +4,7 @@ import os
 import re
 import shutil
 import signal
+import subprocess
 import sys
 from contextlib import contextmanager
 
@@ -16,6 +17,8 @@ import tetopt
 import tetopt.cli.mesh
 import tetopt.cli.phantom
 import tetopt.cli.run
+import tetopt.cli.source
+import tetopt.report.summary
 from tetopt.cli.ending import is_ended, mesh_kept, signal_code, signals_heard
 
 NEEDS_SIGNALS = pytest.mark.skipif(os.name == "nt", reason="Windows has no such signals")
@@ -244,7 +247,7 @@ def test_a_mesh_whose_folder_has_gone_is_kept_elsewhere(image, folder, tmp_path,
     save = tetopt.cli.mesh.save_for_solver
 
     def gone(*arguments):
-        folder.rmdir()
+        shutil.rmtree(folder)
         save(*arguments)
 
     (tmp_path / "tmp").mkdir()
@@ -293,14 +296,111 @@ def test_a_mesh_that_the_disk_cannot_take_is_refused_before_the_run(image, folde
     assert "a.vtu: takes some 8640 bytes or more, 5000 are free; make room first" in capsys.readouterr().err
 
 
-@pytest.mark.parametrize("name", ["quality", "edge_ratios", "run_summary"])
-def test_nothing_that_fails_after_the_run_loses_the_mesh(image, folder, monkeypatch, name):
-    def short(*_, **__):
-        raise MemoryError
-
-    monkeypatch.setattr(tetopt.cli.mesh, name, short)
-    assert exit_code(*mesh_words(image, folder, "--nodes", "60", "--size-max", "9", "--iterations", "1")) == 2
+def test_numbers_that_fail_lose_no_mesh(image, folder, monkeypatch):
+    monkeypatch.setattr(tetopt.cli.mesh, "run_summary", failing(MemoryError()))
+    assert exit_code(*mesh_words(image, folder, *QUICK)) == 2
     assert names_in(folder) == ["a.vtu"]
+
+
+# --------------------------------------------------------------------------------------------------
+# Measures that fail
+
+
+def failing(error):
+    """A function that does nothing but raise."""
+
+    def fail(*_, **__):
+        raise error
+
+    return fail
+
+
+ERRORS = [MemoryError(), IndexError("index 7 is out of bounds"), tetopt.InputError("mesh: too flat")]
+MEASURES = {  # where each is called, and its keys in run.json
+    "quality": (tetopt.cli.mesh, {"quality_initial", "quality"}),
+    "edge_ratios": (tetopt.cli.mesh, {"edges_over_target"}),
+    "nodes_of_sizes": (tetopt.cli.mesh, {"nodes_of_sizes"}),
+    "manifold_problems": (tetopt.cli.mesh, {"boundary_problems"}),
+    "crowded_nodes": (tetopt.cli.mesh, {"nodes_of_many_labels"}),
+    "mask_fidelity": (tetopt.report.summary, {"mask"}),
+    "label_fidelity": (tetopt.report.summary, {"labels"}),
+    "label_interfaces": (tetopt.report.summary, {"interfaces"}),
+    "by_contrast": (tetopt.cli.source.Source, {"contrasts"}),
+    "fields": (tetopt.cli.source.Source, {"cells_without_voxel"}),
+}
+
+
+@pytest.fixture(scope="module")
+def measured_run(tmp_path_factory):
+    """Words of a run of which everything is measured, and its numbers; the optimisation is done once."""
+    folder = tmp_path_factory.mktemp("measured")
+    image = sample_image(3)
+    for name, values in (("a", image.data), ("l", image.data > 30), ("m", np.ones(image.shape))):
+        tetopt.save_image(folder / f"{name}.nii", tetopt.Image(1.0 * values, image.affine))
+    words = ["mesh", folder / "a.nii", "--labels", folder / "l.nii", "--mask", folder / "m.nii", "--size-max", "9"]
+    words += ["--nodes", "60", "--iterations", "3"]
+    real, once = tetopt.cli.mesh.mesh_image, []
+
+    def remembered(*arguments, watch, **options):
+        if once:  # what is said and checked before goes on in each run
+            watch(once[0].initial, lambda **_: once[0])
+        else:
+            once.append(real(*arguments, watch=watch, **options))
+        return once[0]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(tetopt.cli.mesh, "mesh_image", remembered)
+        code = exit_code(*words, "-o", folder / "a.vtu", "--json", folder / "a.json")
+        numbers = numbers_in(folder / "a.json")
+        assert numbers["failed"] == {}
+        yield words, code, numbers
+
+
+@pytest.mark.parametrize("error", ERRORS, ids=["memory", "index", "input"])
+@pytest.mark.parametrize("name", MEASURES)
+def test_a_measure_that_fails_is_a_line(measured_run, folder, monkeypatch, capsys, name, error):
+    """All other numbers are written, and the mesh as it is without the failure."""
+    words, _, whole = measured_run
+    where, keys = MEASURES[name]
+    monkeypatch.setattr(where, name, failing(error))
+    assert exit_code(*words, "-o", folder / "a.vtu", "--json", folder / "a.json") == 1
+    assert names_in(folder) == ["a.json", "a.vtu"]
+    numbers, said = numbers_in(folder / "a.json"), capsys.readouterr().err
+    assert keys <= {key for key, value in numbers.items() if value is None}
+    more = {"contrasts"} if name == "fields" else set()
+    assert set(numbers) | more == set(whole)
+    known = {"failed", "seconds", "memory", "request", *keys}
+    assert all(numbers[key] == whole[key] for key in set(numbers) - known)
+    reason = "MemoryError" if isinstance(error, MemoryError) else str(error)
+    assert set(numbers["failed"]) == ({"fields"} if name == "fields" else keys)
+    for key, words_of_key in numbers["failed"].items():
+        assert reason in words_of_key
+        lines = [line for line in said.splitlines() if line.startswith(f"tetopt: {key} could not be measured")]
+        assert len(lines) == 1
+        assert reason in lines[0]
+    loaded = tetopt.load_mesh(folder / "a.vtu")
+    assert len(loaded.mesh.cells) == whole["size"]["n_cells"]
+    assert ("mean" in loaded.cell_data) == (name != "fields")
+    assert "label" in loaded.cell_data
+
+
+KILLED = """
+import os, sys
+import tetopt.cli.source
+from tetopt.cli import main
+tetopt.cli.source.Source.fields = lambda *_: os.kill(os.getpid(), 9)
+main(sys.argv[1:])
+"""
+
+
+@NEEDS_SIGNALS
+def test_a_process_that_is_killed_while_it_measures_leaves_the_mesh(image, folder):
+    """As the system does where memory is short, or a fault of compiled code."""
+    words = ["mesh", image, "-o", folder / "a.vtu", *QUICK]
+    done = subprocess.run([sys.executable, "-c", KILLED, *map(str, words)], capture_output=True, check=False)
+    assert done.returncode == -signal.SIGKILL
+    assert names_in(folder) == ["a_optimised_1.vtu"]
+    assert len(tetopt.load_mesh(folder / "a_optimised_1.vtu").mesh.cells) > 100
 
 
 def test_a_second_signal_gives_up():

@@ -7,6 +7,7 @@ import errno
 import io
 import json
 import os
+import re
 import sys
 import tempfile
 from collections import Counter
@@ -124,7 +125,10 @@ def _check_left(out, other, outputs, before, expected, words):
         elif content == before.get(name):
             states.append("old")
         else:
-            assert _is_new(name, content, expected[name]), f"{name} is not whole ({words})"
+            if "fields could not be measured" in words and name.endswith(".vtu"):  # it is as told without them
+                assert len(tetopt.load_mesh(out / name).mesh.cells) > 100
+            else:
+                assert _is_new(name, content, expected[name]), f"{name} is not whole ({words})"
             states.append("new")
     kept = [out / name for name in there if not Path(name).name.startswith(".")]
     kept += [other / name for name in left_in(other)]
@@ -222,9 +226,13 @@ def _every_allocation(name, inputs, tmp_path, runs, table, stride):
         if allocations.reached is None:
             assert (code, kept) == (0, [])
             return
-        line = words.strip().splitlines()[-2 if "written all the same" in words else -1]
-        assert (code, line[:8]) == (2, "tetopt: "), (allocations.reached, code, words)
-        assert "emory" in line, (allocations.reached, words)
+        if code == 1:  # a number that could not be measured: the others are written
+            assert states[0] == "new"
+            assert re.search("^tetopt: .* could not be measured: .*Memory", words, re.MULTILINE)
+        else:
+            line = words.strip().splitlines()[-2 if "written all the same" in words else -1]
+            assert (code, line[:8]) == (2, "tetopt: "), (allocations.reached, code, words)
+            assert "emory" in line, (allocations.reached, words)
         if name.startswith("mesh") and "is_there" in runs:
             assert "new" in states[0] or kept, (allocations.reached, words)
         table[name, "memory", allocations.reached.split(":")[0], code, ", ".join([*states, *["kept"] * len(kept)])] += 1

@@ -162,7 +162,7 @@ def print_fidelity(measured: dict[str, Any], ndim: int) -> None:
         out.print(escape(f"{row['image']}: weight {row['weight']:g}, share of its own variance in cells {share}"))
     if "mask" in measured:
         print_wide(mask_table(measured["mask"], ndim))
-    if "labels" in measured:
+    if "labels" in measured and "interfaces" in measured:
         rows, interfaces, names = measured["labels"], measured["interfaces"], measured.get("label_names", {})
         print_wide(label_table(rows, interfaces, names, ndim))
         for line in label_differences(rows, interfaces, names):

@@ -5,6 +5,7 @@ from __future__ import annotations
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
 
@@ -16,7 +17,7 @@ import tetopt
 from tetopt import Image, InputError, Mesh
 from tetopt.budget import BYTES_PER_GB, MemoryLimit, peak_bytes, resident_bytes
 from tetopt.check import manifold_problems
-from tetopt.cli.console import log, out, print_fidelity, show_warning
+from tetopt.cli.console import log, out, print_fidelity, show_error, show_warning
 from tetopt.cli.ending import is_ended, mesh_kept, signal_code
 from tetopt.cli.inputs import label_table, read_mesh, set_threads
 from tetopt.cli.options import (
@@ -48,6 +49,8 @@ from tetopt.cli.run import prepare, watched_run
 from tetopt.cli.solver import (
     all_sets,
     check_early,
+    drop_early,
+    keep_early,
     print_model,
     save_anyway,
     save_for_solver,
@@ -81,7 +84,7 @@ from tetopt.model.file import MeshFile
 from tetopt.model.labels import TABLE_TEXT, table_of_labels, table_words
 from tetopt.model.model import Model
 from tetopt.model.sets import Sets, box_of, label_set_names, surviving_sets
-from tetopt.report.summary import fidelity, image_summary, model_summary, run_summary, size_summary
+from tetopt.report.summary import fidelity, image_summary, measured_each, model_summary, run_summary, size_summary
 from tetopt.report.tables import add_quality, new_table, nodes_in_words
 from tetopt.start.octree import nodes_of_sizes
 from tetopt.start.sizes import edge_ratios
@@ -115,7 +118,8 @@ class Outcome(NamedTuple):
     initial: Mesh
     seconds: dict[str, float]  # up to the optimisation, and of it
     predicted_bytes: float  # of memory, at most, before it began
-    shapes: tuple[Quality, Quality]  # of the initial mesh and of the result
+    shapes: tuple[Quality | None, Quality | None]  # of the initial mesh and of the result, if they could be measured
+    failed: dict[str, str]  # why what could not be measured could not, by its name in run.json
 
 
 def mesh_command(
@@ -143,11 +147,17 @@ def mesh_command(
         task = task._replace(request=requested(source, sizes, start, engine, solver, output, n_parts))
     with mesh_kept() as begin_keeping:
         result, seconds, predicted, fields = _run(task, begin, begin_keeping)
-        model, about = _save(task, result, fields)
+        failed: dict[str, str] = {}
+        model, about = _save(task, result, fields, failed)
         assert result.initial is not None
         # Only from here on, as nothing may fail before the mesh is written.
-        first, last = (quality(each.points, each.cells) for each in (result.initial, result.mesh))
-        outcome = Outcome(result, result.initial, seconds, predicted, (first, last))
+        meshes = {"quality_initial": result.initial, "quality": result.mesh}
+        shapes = measured_each(
+            {name: partial(quality, each.points, each.cells) for name, each in meshes.items()}, failed
+        )
+        outcome = Outcome(
+            result, result.initial, seconds, predicted, (shapes.get("quality_initial"), shapes.get("quality")), failed
+        )
         measured = _write(task, outcome, model, about, begin)
         code = _print(task, outcome, model, measured)
         if task.parts is not None:
@@ -327,9 +337,13 @@ def _model(
 
 
 def _save(
-    task: Task, result: Optimized, fields: dict[str, NDArray] | None
-) -> tuple[Model, dict[str, Any]]:  # fmt: skip
-    """Write the mesh, or keep it elsewhere; the model, and what files say about the run."""
+    task: Task, result: Optimized, fields: dict[str, NDArray] | None, failed: dict[str, str]
+) -> tuple[Model, dict[str, Any]]:
+    """Write the mesh, or keep it elsewhere; the model, and what files say about the run.
+
+    Until its file is there, the mesh is kept beside it, as what the file has of each cell is measured before. What of
+    that could not be is left out, and noted in `failed`. A run in parts has its folder of work.
+    """
     plan, source = task.plan, task.source
     solver, output = plan.solver, plan.output
     options = plan.stated(source.content.image.ndim)
@@ -338,6 +352,9 @@ def _save(
     if task.parts is not None:
         options["parts"] = task.parts.parts or 1
     about = {**source.about, "options": options}
+    early = None if task.parts is not None else keep_early(output.mesh, result.mesh, result.labels)
+    if fields is None:
+        fields = _measured_fields(source, result, failed)
     try:
         whole = _model(task, result.mesh, solver, about, labels=result.labels, fields=fields)
         model = with_chosen_sets(whole, output.mesh, solver)
@@ -350,31 +367,34 @@ def _save(
             options = SolverOptions()
             return _model(task, result.mesh, options, about, is_told=False, labels=result.labels, fields=fields)
 
-        save_anyway(output.mesh, result.mesh, bare, error)
+        kept, early = early, None
+        save_anyway(output.mesh, result.mesh, bare, error, kept)
         raise
+    finally:
+        if early is not None:
+            drop_early(early)
     return model, about
+
+
+def _measured_fields(source: Source | StoredSource, result: Optimized, failed: dict[str, str]) -> dict[str, NDArray]:
+    """The fields of the result's cells; those of their shape and their labels alone, if the image's cannot be had."""
+    assert isinstance(source, Source)
+    if measured := measured_each({"fields": partial(source.fields, result.mesh, result.labels)}, failed):
+        return dict(measured["fields"])
+    return cell_fields(result.mesh) | ({} if result.labels is None else {"label": result.labels})
 
 
 def _write(task: Task, outcome: Outcome, model: Model, about: dict[str, Any], begin: float) -> dict[str, Any]:
     """Write the numbers and the pictures; how well mask, labels and contrasts are met."""
     plan, source, result, output = task.plan, task.source, outcome.result, task.plan.output
-    measured = fidelity(source.labels, source.mask, result.mesh, model.cell_data.get("label"))
-    if isinstance(source, Source) and not (source.content.is_plain and source.content.region is None):
-        measured["contrasts"] = source.by_contrast(model.cell_data)
+    failed = outcome.failed
+    measured = fidelity(source.labels, source.mask, result.mesh, model.cell_data.get("label"), failed)
     if source.labels is not None and source.table.names:
         there = table_of_labels(source.table, np.unique(source.labels.data).astype(np.int64).tolist())
         measured["label_names"] = there.names
         about |= {TABLE_TEXT: table_words(there)}
-    if task.sizes is not None and (ratios := edge_ratios(result.mesh.points, result.mesh.cells, task.sizes)):
-        measured["edges_over_target"] = ratios
-        assert isinstance(source, Source), "no targets for the voxels of others"
-        needed = nodes_of_sizes(source.content, task.sizes)[0]
-        measured["nodes_of_sizes"] = round(needed * (QUADRATIC_NODES[source.image.ndim] if model.order == 2 else 1.0))
-    measured["cells_without_voxel"] = int((model.cell_data["n_voxels"] == 0).sum())
-    if source.mask is not None:
-        measured["boundary_problems"] = manifold_problems(result.mesh)
-    if result.labels is not None:
-        measured["nodes_of_many_labels"] = crowded_nodes(result.mesh.cells, result.labels)
+    counted = measured_each(_counts(task, result, model), failed)
+    measured |= {name: value for name, value in counted.items() if value is not None}
     if output.json_path is not None:
         seconds = {**outcome.seconds, "all": time.perf_counter() - begin}
         summary = run_summary(source.content, outcome.initial, result, about, seconds, outcome.shapes)
@@ -387,10 +407,32 @@ def _write(task: Task, outcome: Outcome, model: Model, about: dict[str, Any], be
             summary["memory"] |= {"predicted_bytes": outcome.predicted_bytes}
         else:  # of each worker's largest task
             summary["prediction"] = {"task_bytes": outcome.predicted_bytes}
-        save_json(output.json_path, summary | measured | model_summary(model))
+        missing = {name: None for name in (*failed, "cells_without_voxel") if name != "fields"}
+        save_json(output.json_path, summary | missing | measured | {"failed": failed} | model_summary(model))
     if plan.pictures:
         _draw(task, outcome, model)
     return measured
+
+
+def _counts(task: Task, result: Optimized, model: Model) -> dict[str, Callable[[], Any]]:
+    """What else is measured of a mesh, by name; None where there is nothing to tell."""
+    source, sizes, mesh, fields = task.source, task.sizes, result.mesh, model.cell_data
+    measures: dict[str, Callable[[], Any]] = {}
+    has_image = "n_voxels" in fields
+    if has_image:
+        measures["cells_without_voxel"] = lambda: int((fields["n_voxels"] == 0).sum())
+    if has_image and isinstance(source, Source) and not (source.content.is_plain and source.content.region is None):
+        measures["contrasts"] = lambda: source.by_contrast(fields)
+    if sizes is not None and sizes.has_target:
+        assert isinstance(source, Source), "no targets for the voxels of others"
+        content, share = source.content, QUADRATIC_NODES[source.image.ndim] if model.order == 2 else 1.0
+        measures["edges_over_target"] = lambda: edge_ratios(mesh.points, mesh.cells, sizes)
+        measures["nodes_of_sizes"] = lambda: round(nodes_of_sizes(content, sizes)[0] * share)
+    if source.mask is not None:
+        measures["boundary_problems"] = lambda: manifold_problems(mesh)
+    if (labels := result.labels) is not None:
+        measures["nodes_of_many_labels"] = lambda: crowded_nodes(mesh.cells, labels)
+    return measures
 
 
 def _draw(task: Task, outcome: Outcome, model: Model) -> None:
@@ -423,16 +465,18 @@ def _print(task: Task, outcome: Outcome, model: Model, measured: dict[str, Any])
     plan, content, result = task.plan, task.source.content, outcome.result
     solver, output = plan.solver, plan.output
     code = check_promises(result, measured)
+    for name, reason in outcome.failed.items():
+        left = "the mesh's file has no means of its cells" if name == "fields" else "all other numbers are written"
+        show_error(f"{name} could not be measured: {reason}; {left}")
     if task.source.is_constant:
         measured = {**measured, "cells_without_voxel": 0}  # whose values are right all the same
     is_counted = plan.mode == "graded" and plan.sizes.target_error is None
     n_nodes = node_count(model.mesh.points, model.mesh.cells, model.order)
     asked_nodes = plan.sizes.nodes if is_counted else None
     warn_of_result(result, plan.engine.method, plan.mode, n_nodes, asked_nodes, measured)
-    if task.sizes is not None:
-        edges = outcome.shapes[1]
+    if task.sizes is not None and (edges := outcome.shapes[1]) is not None:
         warn_of_sizes(task.sizes, edges.min_edge, edges.max_edge, measured.get("edges_over_target"))
-    _print_comparison(content, outcome, task.start_name, model.order, measured["cells_without_voxel"])
+    _print_comparison(content, outcome, task.start_name, model.order, measured.get("cells_without_voxel", 0))
     print_fidelity(measured, model.mesh.ndim)
     if solver.are_any() or output.mesh.suffix.lower() != ".vtu":
         print_model(output.mesh, model, solver)
@@ -443,7 +487,7 @@ def _print(task: Task, outcome: Outcome, model: Model, measured: dict[str, Any])
         out.print(escape(f"{output.json_path}: every number of the run"))
     for path in plan.pictures:
         out.print(escape(str(path)))
-    return code
+    return 1 if outcome.failed else code
 
 
 def _print_comparison(content: Content | StoredContent, outcome: Outcome, start: str, order: int, n_empty: int) -> None:
@@ -461,7 +505,9 @@ def _print_comparison(content: Content | StoredContent, outcome: Outcome, start:
         )
     meshes = (initial, mesh)
     in_all = [size_summary(each, order)["n_nodes_in_all"] for each in meshes] if order == 2 else []
-    add_quality(table, *outcome.shapes, in_all=in_all)
+    first_shape, last_shape = outcome.shapes
+    if first_shape is not None and last_shape is not None:
+        add_quality(table, first_shape, last_shape, in_all=in_all)
     if n_empty:
         table.add_row("cells that hold no voxel centre", "", str(n_empty))
     out.print(table)

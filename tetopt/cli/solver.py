@@ -5,6 +5,7 @@ from __future__ import annotations
 import re
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from itertools import chain
 from pathlib import Path
 from typing import Any, cast, get_args
 
@@ -309,26 +310,48 @@ def save_for_solver(output: Path, model: Model, solver: SolverOptions) -> None:
     save_model(output, model, space=solver.space, units=solver.units)
 
 
-def save_anyway(output: Path, mesh: Mesh, build: Callable[[], Model], error: Exception) -> None:
+def keep_early(output: Path, mesh: Mesh, labels: NDArray[np.int64] | None) -> Path | None:
+    """Keep an optimised mesh beside its file until that is written, whatever may end the process before; the place."""
+    early = next(kept_places(output, ".vtu"))
+    try:
+        save_mesh(early, mesh, {} if labels is None else {"label": labels})
+    except (OSError, MemoryError) as error:
+        log.print(escape(f"the optimised mesh cannot be kept before its file is written: {error_words(error)}"))
+        return None
+    return early
+
+
+def drop_early(early: Path) -> None:
+    """Remove what `keep_early` kept, as the mesh is elsewhere by now."""
+    try:
+        early.unlink(missing_ok=True)
+    except OSError as error:
+        log.print(
+            escape(f"{early}: holds the nodes and cells of the mesh, too; it cannot be removed: {error.strerror}")
+        )
+
+
+def save_anyway(output: Path, mesh: Mesh, build: Callable[[], Model], error: Exception, early: Path | None) -> None:
     """Keep an optimised mesh whose file was refused or failed, as VTU: beside it, else in a temporary folder.
 
-    `build` makes the model to keep; if that fails, too, the mesh is kept alone.
+    `build` makes the model to keep; if that fails, too, the mesh is kept alone, as it is `early`, if that is a place.
 
     Raises
     ------
     InputError
         If `error` is one that the user can mend; it says where the mesh is.
     """
-    kept = _kept_mesh(output, (lambda path: save_model(path, build()), lambda path: save_mesh(path, mesh)))
+    places = chain([] if early is None else [early], kept_places(output, ".vtu"))
+    kept = _kept_mesh(places, (lambda path: save_model(path, build()), lambda path: save_mesh(path, mesh)))
     where = "could not be kept anywhere" if kept is None else f"is in {kept}: go on from there with tetopt convert"
     if isinstance(error, InputError | OSError | MemoryError):
         raise InputError(f"{error_words(error)}; the optimised mesh {where}") from error
     log.print(escape(f"the optimised mesh {where}"))
 
 
-def _kept_mesh(output: Path, ways: Sequence[Callable[[Path], None]]) -> Path | None:
-    """The first place where one of the ways to save a mesh does so."""
-    for path in kept_places(output, ".vtu"):
+def _kept_mesh(places: Iterable[Path], ways: Sequence[Callable[[Path], None]]) -> Path | None:
+    """The first place where one of the ways to save a mesh does so, or where it was saved before."""
+    for path in places:
         for save in ways:
             try:
                 save(path)
@@ -336,6 +359,8 @@ def _kept_mesh(output: Path, ways: Sequence[Callable[[Path], None]]) -> Path | N
                 log.print(escape(f"{path}: the optimised mesh cannot be kept here: {error_words(error)}"))
             else:
                 return path
+        if path.exists():
+            return path
     return None
 
 

@@ -374,7 +374,8 @@ def save_json(path: Path, value: Any) -> None:
 def kept_places(path: Path, suffix: str) -> Iterator[Path]:
     """Free names where what `path` cannot take may be kept: beside it, then in temporary folders of one's own."""
     names = chain([path.stem], (f"{path.stem}_optimised_{number}" for number in count(1)))
-    yield next(beside for name in names if not os.path.lexists(beside := path.with_name(f"{name}{suffix}")))
+    places = (path.with_name(f"{name}{suffix}") for name in names)
+    yield next(place for place in places if place != path and not os.path.lexists(place))
     for folder in (tempfile.gettempdir(), os.getcwd(), os.path.expanduser("~")):
         with suppress(OSError):  # the next one
             yield Path(tempfile.mkdtemp(prefix="tetopt-", dir=folder)) / f"{path.stem}{suffix}"

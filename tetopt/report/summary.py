@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
+from collections.abc import Callable, Mapping
 from importlib.metadata import version
 from typing import Any
 
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 import tetopt
 from tetopt.engine.loop import Optimized
+from tetopt.errors import InputError
 from tetopt.geometry.quadratic import node_count
 from tetopt.image import Image, VoxelGrid
 from tetopt.measure.fidelity import cell_labels, label_fidelity, mask_fidelity
@@ -62,11 +64,11 @@ def image_summary(image: Image | StoredContent) -> dict[str, Any]:
 
 def run_summary(
     image: Image | Content | StoredContent, initial: Mesh, result: Optimized, about: dict[str, Any],
-    seconds: dict[str, float], shapes: tuple[Quality, Quality] | None = None,
+    seconds: dict[str, float], shapes: tuple[Quality | None, Quality | None] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Every number of a run: options and file (`about`), versions, energies by iteration, quality before and after.
 
-    `shapes` are those qualities, if they are known.
+    `shapes` are those qualities, if they were measured before; None for one that could not be.
     """
     if shapes is None:
         shapes = quality(initial.points, initial.cells), quality(result.mesh.points, result.mesh.cells)
@@ -120,22 +122,44 @@ def model_summary(model: Model) -> dict[str, Any]:
     return summary
 
 
-def fidelity(labels: Image | None, mask: Image | None, mesh: Mesh, of_cell: NDArray | None) -> dict[str, Any]:
+def fidelity(
+    labels: Image | None, mask: Image | None, mesh: Mesh, of_cell: NDArray | None, failed: dict[str, str] | None = None
+) -> dict[str, Any]:
     """How well a mesh represents a mask and labels.
 
     A `MaskFidelity` in `mask`, and for each label a `LabelFidelity` in `labels` and a `LabelInterface` in `interfaces`;
     each is there only if the image is. With a mask, labels count inside of it alone, and label 0, which is the outside
-    as well, is left out. `of_cell` (M,) is each cell's label, by default that of most of its voxels.
+    as well, is left out. `of_cell` (M,) is each cell's label, by default that of most of its voxels; `failed` as of
+    `measured_each`.
     """
-    measured: dict[str, Any] = {}
+    measures: dict[str, Callable[[], Any]] = {}
     if mask is not None:
-        measured["mask"] = mask_fidelity(mask, mesh)
+        measures["mask"] = lambda: mask_fidelity(mask, mesh)
     if labels is not None:
-        if mask is not None:
-            labels = Image(np.where(mask.data >= 0.5, labels.data, 0.0), labels.affine)
-        of_cell = cell_labels(labels, mesh) if of_cell is None else of_cell
-        measured["labels"] = label_fidelity(labels, mesh, of_cell)
-        measured["interfaces"] = label_interfaces(labels, mesh, of_cell)
-        if mask is not None:
-            measured |= {name: [row for row in measured[name] if row.label > 0] for name in ("labels", "interfaces")}
+        inside = labels if mask is None else Image(np.where(mask.data >= 0.5, labels.data, 0.0), labels.affine)
+        first = 0 if mask is None else 1
+
+        def measured_labels(measure: Callable[[Image, Mesh, NDArray], list[Any]]) -> list[Any]:
+            own = cell_labels(inside, mesh) if of_cell is None else of_cell
+            return [row for row in measure(inside, mesh, own) if row.label >= first]
+
+        measures["labels"] = lambda: measured_labels(label_fidelity)
+        measures["interfaces"] = lambda: measured_labels(label_interfaces)
+    return measured_each(measures, failed)
+
+
+def measured_each(measures: Mapping[str, Callable[[], Any]], failed: dict[str, str] | None) -> dict[str, Any]:
+    """Take measures, one after the other; what each returns, by name.
+
+    With `failed`, a measure that raises anything is left out and its reason noted there, so that the others are taken.
+    """
+    measured = {}
+    for name, measure in measures.items():
+        try:
+            measured[name] = measure()
+        except Exception as error:
+            if failed is None:
+                raise
+            words = str(error) if isinstance(error, InputError) else f"{type(error).__name__}: {error}"
+            failed[name] = words.removesuffix(": ")
     return measured
