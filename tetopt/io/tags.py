@@ -46,10 +46,10 @@ def tagged(sets: dict[str, NDArray[np.int64]]) -> Tagged:
     return Tagged(items, rank[kind.ravel()], tags_of)
 
 
-def cell_tags(model: Model) -> Tagged:
-    """Every cell, with one tag for each combination of a material ("material_1", ...) and cell sets.
+def cell_tags(model: Model, labels: NDArray[np.int64] | None = None) -> Tagged:
+    """Every cell, with one tag for each combination of a label, a material ("material_1", ...) and cell sets.
 
-    Tags go by material: they are the materials' numbers from 1 where no set divides one.
+    Without `labels` (M,) tags go by material: they are the materials' numbers from 1 where no set divides one.
 
     Raises
     ------
@@ -61,11 +61,13 @@ def cell_tags(model: Model) -> Tagged:
     combination = np.zeros(len(model.mesh.cells), dtype=np.int64)
     combination[combined.items] = combined.tags
     material = np.zeros_like(combination) if model.materials is None else model.materials.of_cell
-    kinds, which = np.unique(np.column_stack([material, combination]), axis=0, return_inverse=True)
-    ends = np.searchsorted(kinds[:, 0], np.arange(len(names) + 1))
-    tags_of = {name: list(range(ends[k] + 1, ends[k + 1] + 1)) for k, name in enumerate(names)}
+    columns = [np.zeros_like(combination) if labels is None else labels, material, combination]
+    kinds, which = np.unique(np.column_stack(columns), axis=0, return_inverse=True)
+    ends = np.cumsum(np.bincount(kinds[:, 1], minlength=len(names)))[:-1]
+    of_material = np.split(np.argsort(kinds[:, 1], kind="stable") + 1, ends)
+    tags_of = {name: tags.tolist() for name, tags in zip(names, of_material, strict=False)}  # without names, one part
     for name, tags in combined.tags_of.items():
-        tags_of[name] = (np.flatnonzero(np.isin(kinds[:, 1], tags)) + 1).tolist()
+        tags_of[name] = (np.flatnonzero(np.isin(kinds[:, 2], tags)) + 1).tolist()
     return Tagged(np.arange(len(material)), which.ravel() + 1, tags_of)
 
 
