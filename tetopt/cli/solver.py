@@ -245,7 +245,7 @@ def sets_and_table(
     table, former = label_table(options.label_names, loaded), label_table(None, loaded)
     of_loads = {parse_load(text, loaded.mesh.ndim).set_name for text in options.loads or ()}
     sets = all_sets(loaded.mesh, box, fields, loaded.sets, table.names, former.names, of_loads)
-    return sets, {TABLE_TEXT: table_words(table)} if table.names else {}
+    return sets, {TABLE_TEXT: table_words(table)} if table.names or table.colours else {}
 
 
 def check_early(
