@@ -39,7 +39,7 @@ with XDMFFile(MPI.COMM_WORLD, "head.xdmf", "r", encoding=XDMFFile.Encoding.ASCII
     mesh = file.read_mesh(name="mesh")
     mesh.topology.create_connectivity(2, 3)
     materials = file.read_meshtags(mesh, name="mesh")
-    facets = file.read_meshtags(mesh, name="facets")
+    facets = file.read_meshtags(mesh, name="facets", xpath="/Xdmf/Domain/Grid/Information/Grid")
 
 root = ElementTree.parse("head.xdmf").getroot()
 tags = root.find(".//Grid[@Name='facets']/Information[@Name='superior']").get("Value")
@@ -51,9 +51,9 @@ print(PROGRAM)
 # The file's text says which grids it has, and which sets and loads there are by name.
 
 root = ET.parse(path).getroot()
-for grid in root.iter("Grid"):
+for grid in root.findall("./Domain/Grid/Information/Grid/Grid"):
     print("grid", grid.get("Name"))
-for load in root.findall("./Domain/Information[@Name='load']"):
+for load in root.findall("./Domain/Grid/Information[@Name='load']"):
     print("load", load.get("Value"))
 
 # %%

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Container
+from itertools import count
 from typing import NamedTuple
 
 import numpy as np
@@ -12,8 +14,10 @@ from tetopt.errors import InputError
 from tetopt.geometry.topology import facets
 from tetopt.io.text import free_text
 from tetopt.mesh import Mesh
+from tetopt.model.labels import TABLE_TEXT, labels_of, table_of_words
 from tetopt.model.loads import count_of_steps, load_words
 from tetopt.model.model import Model, described
+from tetopt.model.sets import MOST_LETTERS, free_name, label_set_names
 
 
 class Tagged(NamedTuple):
@@ -89,6 +93,37 @@ def material_names(model: Model, taken: dict[str, NDArray[np.int64]]) -> list[st
     """ "material_1", ... of the model's materials; InputError if a set among `taken` is called that."""
     names = [] if model.materials is None else [f"material_{k + 1}" for k in range(len(model.materials.young))]
     check_apart(names, taken)
+    return names
+
+
+def named_materials(model: Model) -> list[str]:
+    """Names of the model's materials by their labels: "liver", or "label_5" of one without a name.
+
+    A material of several whole labels has their names joined, and those that divide a label have its name and a number.
+    What remains, as of materials that are parts of several labels, is "material_1", ...
+    """
+    names = material_names(model, {})
+    labels = labels_of(model.cell_data, len(model.mesh.cells))
+    if model.materials is None or labels is None:
+        return names
+    called = label_set_names(np.unique(labels).tolist(), table_of_words(model.about.get(TABLE_TEXT)).names)
+    labels_in: dict[int, list[int]] = {}
+    for material, label in np.unique(np.column_stack([model.materials.of_cell, labels]), axis=0).tolist():
+        labels_in.setdefault(material, []).append(label)
+    n_materials = Counter(label for those in labels_in.values() for label in those)
+    own = {called[label]: np.flatnonzero(labels == label) for label in called}
+    number_in = {name: count(1) for name in own}
+    taken = {name.lower() for name in (*model.sets.facets, *model.sets.cells, *called.values())}
+    for material, those in labels_in.items():
+        name = "_".join(called[label] for label in those)
+        is_whole = all(n_materials[label] == 1 for label in those)
+        if len(name) > MOST_LETTERS or not (is_whole or len(those) == 1):
+            continue
+        is_set = is_whole and len(those) == 1 and name not in model.sets.facets
+        if not is_set or not np.array_equal(model.sets.cells.get(name, own[name]), own[name]):
+            name = free_name(name if is_whole else f"{name}_{next(number_in[name])}", taken)
+        names[material] = name
+        taken.add(name.lower())
     return names
 
 
