@@ -133,11 +133,11 @@ def _with_results(loaded: MeshFile, path: Path) -> MeshFile:
 
 def _sets_with_input(loaded: MeshFile, path: Path) -> Sets:
     """The mesh's sets and those of the solver's input file, if it is there and of this mesh; a line."""
-    given = input_sets(path, loaded.mesh) if path.is_file() else None
-    if given is None:
+    from_input = input_sets(path, loaded.mesh) if path.is_file() else None
+    if from_input is None:
         log.print(escape(f"{path}: not the input file of this mesh, or missing: its sets are not added"))
         return loaded.sets
-    sets, renamed = merged_sets(loaded.sets, given)
+    sets, renamed = merged_sets(loaded.sets, from_input)
     for old, new in renamed.items():
         log.print(escape(f'{path}: renamed set "{old}" to "{new}" (name already in use)'))
     return sets

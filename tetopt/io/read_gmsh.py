@@ -116,12 +116,12 @@ def _of_ours(raw: Raw, comments: OwnComments) -> Raw:
     sets = [Group(name, kind, of_set) for name, of_set in members.items()]
     for side in {group.kind for group in raw.groups} - {kind}:  # in 2.2 a facet is in one group alone
         sets += [Group(name, side, of_set) for name, of_set in _members(raw, side, comments.facets).items()]
-    told = {each.label for each in sets}
+    labels_of_sets = {each.label for each in sets}
     dropped = {*members, "gmsh:physical", "gmsh:geometrical"}
     return raw._replace(
         cell_data={name: values for name, values in (painted | raw.cell_data).items() if name not in dropped},
         field_data=raw.field_data | {name: np.array([text]) for name, text in comments.texts.items()},
-        groups=[group for group in raw.groups if group.kind != kind and group.label not in told] + sets,
+        groups=[group for group in raw.groups if group.kind != kind and group.label not in labels_of_sets] + sets,
         space=comments.space,
     )
 

@@ -24,7 +24,7 @@ LABEL_PALETTE = (
     "#e15a3c", "#690f96", "#3cf096", "#f0964b", "#1e4b2d", "#2d6978", "#c32d00", "#a52dd2", "#3c00d2", "#e178d2",
     "#f0d25a", "#a569d2", "#78b496", "#d2a5d2", "#870f2d", "#d2a578", "#965a3c", "#78d2f0", "#a569a5", "#d21e87",
 )  # fmt: skip
-TINTS = (0.0, -0.4, 0.4)  # of the palette when it begins again: as it is, mixed with black, mixed with white
+LABEL_TINTS = (0.0, -0.4, 0.4)  # of the palette when it begins again: as it is, mixed with black, mixed with white
 LABEL_DIGITS = 18  # of a number that 64 bits hold; more are a name that nothing has
 
 
@@ -141,7 +141,7 @@ def colours_by_number(labels: NDArray[np.int64]) -> NDArray[np.float64]:
     """
     palette = np.array([hex_colour(text) for text in LABEL_PALETTE])
     rounds, place = np.divmod(labels - 1, len(palette))
-    tint = np.array(TINTS)[rounds % len(TINTS)][:, None]
+    tint = np.array(LABEL_TINTS)[rounds % len(LABEL_TINTS)][:, None]
     mixed = (1.0 - np.abs(tint)) * palette[place] + np.maximum(tint, 0.0)
     return np.rint(255.0 * mixed) / 255.0
 

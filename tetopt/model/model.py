@@ -294,8 +294,8 @@ def locking_words(model: Model) -> str:
         return ""
     return (
         f"nu is up to {largest:g}, where linear cells are too stiff: the error of their displacements was 1.6 to 1.8 "
-        "times that of quadratic cells on as many nodes at 0.45, 2.4 to 2.8 times at 0.49; use quadratic cells "
-        "(--order 2, docs/understand/order.md)"
+        "times that of quadratic cells on as many nodes at 0.45, 2.4 to 2.8 times at 0.49; use quadratic ones "
+        "(--order 2, or chosen in the solver; docs/understand/order.md)"
     )
 
 

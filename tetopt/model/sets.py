@@ -409,15 +409,15 @@ def rows_of(mesh: Mesh, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
     distinct, which = np.unique(np.concatenate([shared.nodes, np.sort(nodes, axis=1)]), axis=0, return_inverse=True)
     place = np.full(len(distinct), -1)
     place[which.ravel()[: len(shared.nodes)]] = np.arange(len(shared.nodes))
-    number, given = np.unique(place[which.ravel()[len(shared.nodes) :]], return_index=True)
-    number, given = number[number >= 0], nodes[given[number >= 0]]
+    number, listed = np.unique(place[which.ravel()[len(shared.nodes) :]], return_index=True)
+    number, listed = number[number >= 0], nodes[listed[number >= 0]]
 
     def held_by(cell: NDArray[np.int64]) -> NDArray[np.int64]:
         return np.column_stack([cell, (shared.of_cell[cell] == number[:, None]).argmax(axis=1)])
 
     first, second = shared.cells[number].T
     rows = held_by(first)
-    rolled = [np.roll(given, k, axis=1) for k in range(1 if mesh.ndim == 2 else 3)]  # which face the same way
+    rolled = [np.roll(listed, k, axis=1) for k in range(1 if mesh.ndim == 2 else 3)]  # which face the same way
     faces_out = np.any([(facet_triples(mesh.cells, rows) == each).all(axis=1) for each in rolled], axis=0)
     rows = np.where((faces_out | (second < 0))[:, None], rows, held_by(second))
     return rows[np.lexsort(rows.T[::-1])]
