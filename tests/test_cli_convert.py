@@ -258,9 +258,19 @@ def test_what_msh_files_do_not_bring_back_is_said(folder, tmp_path, capsys):
     for suffix, is_said in ((".msh", True), (".msh2", True), (".vtu", False), (".inp", False)):
         assert exit_code("convert", folder / "a.vtu", tmp_path / f"a{suffix}", *more) == 0
         said = capsys.readouterr().out
-        assert (f"loads and labels' names are not read back from {suffix}" in said) == is_said
+        assert (f"loads are not read back from {suffix}" in said) == is_said
     assert exit_code("convert", folder / "a.vtu", tmp_path / "b.msh") == 0
     assert "are not read back" not in capsys.readouterr().out
+
+
+def test_the_group_of_label_0_and_incomplete_groups_are_said(folder, tmp_path, capsys):
+    labels = tetopt.load_mesh(folder / "a.vtu").cell_data["label"].astype(int)
+    assert labels.min() == 0
+    for suffix in (".msh", ".msh2"):
+        assert exit_code("convert", folder / "a.vtu", tmp_path / f"a{suffix}") == 0
+        said = capsys.readouterr().out
+        assert f"label 0 is physical group {labels.max() + 1}, as gmsh has no group 0" in said
+        assert ("those of smaller sets are missing from boundary" in said) == (suffix == ".msh2")
 
 
 @pytest.mark.parametrize(

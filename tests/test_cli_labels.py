@@ -3,12 +3,14 @@
 import json
 
 import numpy as np
+import PIL.Image
 import pytest
 import pyvista
 from commands import exit_code, labelled_lattice_words, numbers_in
 
 import tetopt
 from tetopt.cli.solver import MANY_INTERFACES
+from tetopt.model.labels import LABEL_PALETTE, hex_colour
 
 TABLE = "label,name,color\n0,soft tissue,\n1,bright/ball [é],#ff8000\n9,spleen,#00ff00\n"
 FACES = {"boundary", "left", "right", "posterior", "anterior", "inferior", "superior"}
@@ -44,10 +46,25 @@ def test_a_mesh_s_file_keeps_the_table(folder):
     assert set(loaded.sets.cells) == {"soft_tissue", "bright_ball_e"}
     assert set(loaded.sets.facets) == {*FACES, INTERFACE}
     np.testing.assert_array_equal(loaded.sets.facets[INTERFACE], plain.sets.facets["interface_0_1"])
-    assert plain.text("label_table") is None
+    assert plain.label_table == ({}, {1: hex_colour(LABEL_PALETTE[0])})
     numbers = numbers_in(folder / "named.json")
     assert numbers["label_names"] == {"0": "soft tissue", "1": "bright/ball [é]"}
     assert list(numbers["label_table"]) == ["0", "1"]  # those that the image has
+
+
+def test_a_label_has_one_colour_in_pictures_page_and_file(folder, tmp_path):
+    """Without a table of colours, and with one."""
+    words = ["mesh", folder / "a.nii.gz", "--labels", folder / "l.nii.gz", "--spacing", "8", "--iterations", "0"]
+    for more, colour in (([], LABEL_PALETTE[0]), (["--label-names", folder / "t.csv"], "#ff8000")):
+        assert exit_code(*words, *more, "-o", tmp_path / "a.vtu", "--figures", tmp_path / "r", "--force") == 0
+        assert exit_code("convert", tmp_path / "a.vtu", tmp_path / "b.vtu", "--force") == 0
+        for name in ("a.vtu", "b.vtu"):
+            assert tetopt.load_mesh(tmp_path / name).label_table.colours[1] == hex_colour(colour)
+        picture = np.asarray(PIL.Image.open(tmp_path / "r" / "labels.png"))[..., :3].reshape(-1, 3)
+        tones = np.rint(255.0 * np.array(hex_colour(colour)))
+        assert (np.abs(picture - tones).max(axis=1) <= 1).sum() > 1000
+        assert exit_code("view", tmp_path / "b.vtu", "--html", tmp_path / "v.html", "--force") == 0
+        assert f'[1, "{colour}"]' in (tmp_path / "v.html").read_text()
 
 
 def test_the_table_prints_names(folder, capsys):

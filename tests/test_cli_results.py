@@ -2,6 +2,7 @@
 
 import json
 import re
+import warnings
 
 import numpy as np
 import pytest
@@ -9,6 +10,7 @@ from commands import exit_code, numbers_in
 from results import FOLDER, our_displacement, solved_model
 
 import tetopt
+from tetopt.io.abaqus import input_sets
 
 
 @pytest.fixture(params=[1, 2])
@@ -88,3 +90,42 @@ def test_refusals_write_nothing(folder, capsys):
     refused("expected CalculiX's results", folder / "b.vtu", "--results", folder / "a.vtu")
     (folder / "c.vtu").write_bytes((folder / "a.frd").read_bytes())
     refused("is an input of this command", folder / "c.vtu", "--results", folder / "c.vtu", "--force")
+
+
+def test_sets_of_the_solver_s_file_are_in_the_mesh_with_results(folder, order, capsys):
+    corner = ",".join(f"{x:.3f}" for x in solved_model(order).mesh.points[0])
+    asked = ["--young", "2", "--set", f"tip=point:{corner}:40", "--set", "soft=below:2.5", "--order", str(order)]
+    results = ["--results", folder / "a.frd", "--force"]
+    assert exit_code("convert", folder / "a.vtu", folder / "b.vtu", *results) == 0
+    assert "a.inp: not the input file of this mesh, or missing" in capsys.readouterr().err
+    assert "tip" not in tetopt.load_mesh(folder / "b.vtu").sets.facets
+    assert exit_code("convert", folder / "a.vtu", folder / "a.inp", *asked) == 0
+    assert exit_code("convert", folder / "a.vtu", folder / "b.vtu", *results) == 0
+    given, sets = input_sets(folder / "a.inp", solved_model(order).mesh), tetopt.load_mesh(folder / "b.vtu").sets
+    np.testing.assert_array_equal(sets.facets["tip"], given.facets["tip"])
+    np.testing.assert_array_equal(sets.cells["soft"], given.cells["soft"])
+    assert set(sets.cells) == {"soft"}
+
+
+@pytest.mark.parametrize("nu", [0.45, 0.44])
+@pytest.mark.parametrize("suffix", [".inp", ".feb", ".scn", ".xdmf", ".vtu"])
+def test_stiff_linear_cells_are_warned_of_where_a_solver_s_file_is_written(tmp_path, suffix, nu, capsys):
+    mesh = solved_model(1).mesh
+    tetopt.save_mesh(tmp_path / "a.vtu", mesh)
+    out, is_said = tmp_path / f"b{suffix}", suffix != ".vtu" and nu == 0.45
+    assert exit_code("convert", tmp_path / "a.vtu", out, "--young", "2", "--nu", str(nu)) == 0
+    said = capsys.readouterr().err
+    assert said.count("linear cells are too stiff") == is_said
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always")
+        tetopt.save_model(out, tetopt.model_of(mesh, young=2.0, nu=nu))
+        if suffix not in (".scn",):
+            tetopt.save_model(out, tetopt.model_of(mesh, young=2.0, nu=nu, order=2))
+    assert ["linear cells are too stiff" in str(each.message) for each in caught] == [True] * is_said
+
+
+def test_fem_warns_of_stiff_linear_cells_once_in_the_same_words(tmp_path, capsys):
+    tetopt.save_mesh(tmp_path / "a.vtu", solved_model(1).mesh)
+    words = ["--young", "2", "--nu", "0.45", "--load", "compress:2%"]
+    assert exit_code("fem", tmp_path / "a.vtu", *words, "-o", tmp_path / "b.vtu") == 0
+    assert capsys.readouterr().err.count("linear cells are too stiff") == 1

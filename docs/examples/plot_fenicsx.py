@@ -20,7 +20,7 @@ import tetopt
 
 image = tetopt.load_phantom("ellipsoids_brain").image(voxel_mm=4.0)
 mesh = tetopt.mesh_image(image, nodes=1500).mesh
-model = tetopt.model_of(mesh, image, young="0.5 + 0.05*h", nu=0.45, loads=["compress:5%"])
+model = tetopt.model_of(mesh, image, young="0.5 + 0.05*h", nu=0.4, loads=["compress:5%"])
 folder = tempfile.TemporaryDirectory()
 path = Path(folder.name) / "head.xdmf"
 tetopt.save_model(path, model)
@@ -39,7 +39,7 @@ with XDMFFile(MPI.COMM_WORLD, "head.xdmf", "r", encoding=XDMFFile.Encoding.ASCII
     mesh = file.read_mesh(name="mesh")
     mesh.topology.create_connectivity(2, 3)
     materials = file.read_meshtags(mesh, name="mesh")
-    facets = file.read_meshtags(mesh, name="facets")
+    facets = file.read_meshtags(mesh, name="facets", xpath="/Xdmf/Domain/Grid/Information/Grid")
 
 root = ElementTree.parse("head.xdmf").getroot()
 tags = root.find(".//Grid[@Name='facets']/Information[@Name='superior']").get("Value")
@@ -51,9 +51,9 @@ print(PROGRAM)
 # The file's text says which grids it has, and which sets and loads there are by name.
 
 root = ET.parse(path).getroot()
-for grid in root.iter("Grid"):
+for grid in root.findall("./Domain/Grid/Information/Grid/Grid"):
     print("grid", grid.get("Name"))
-for load in root.findall("./Domain/Information[@Name='load']"):
+for load in root.findall("./Domain/Grid/Information[@Name='load']"):
     print("load", load.get("Value"))
 
 # %%

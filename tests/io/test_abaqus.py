@@ -11,7 +11,8 @@ from models import loaded_model, sample_model, young_of
 
 from tetopt import InputError, Mesh
 from tetopt.geometry.quadratic import quadratic
-from tetopt.io.abaqus import abaqus
+from tetopt.io.abaqus import abaqus, input_sets
+from tetopt.io.tags import named_materials
 from tetopt.model.loads import Load, facet_forces, spring_constants
 from tetopt.model.materials import materials
 from tetopt.model.model import Model, in_space, in_units
@@ -91,7 +92,7 @@ def test_meshio_reads_node_and_cell_sets_back(model):
         np.testing.assert_allclose(
             np.unique(file.points[nodes[~is_corner]], axis=0), np.unique(middles, axis=0), rtol=1e-15, atol=1e-17
         )
-    own = {name for name in file.cell_sets if name == "all_cells" or name.startswith("material_")}
+    own = {"all_cells", *named_materials(model)} - set(model.sets.cells)
     assert [name for name in file.cell_sets if name not in own] == list(model.sets.cells)
     for name, cells in {**model.sets.cells, "all_cells": np.arange(len(model.mesh.cells))}.items():
         np.testing.assert_array_equal(file.cell_sets[name][0], cells)
@@ -114,7 +115,7 @@ def test_each_cell_has_its_material_and_no_other(model):
     elements, sections = named(raw, "*ELSET"), named(raw, "*SOLID SECTION")
     words = blocks_of(raw)
     elastic = {words[k - 1][1]["NAME"]: data for k, (word, _, data) in enumerate(words) if word == "*ELASTIC"}
-    assert list(elastic) == list(sections) == [f"material_{k + 1}" for k in range(len(model.materials.young))]
+    assert list(elastic) == list(sections) == named_materials(model)
     links = [parameters for word, parameters, _ in words if word == "*SOLID SECTION"]
     assert all(parameters["ELSET"] == parameters["MATERIAL"] for parameters in links)
     constants = np.full((len(model.mesh.cells), 2), np.nan)
@@ -216,6 +217,7 @@ def test_what_the_format_cannot_carry_is_refused():
     with pytest.raises(InputError, match="loads, but no materials"):
         abaqus(model._replace(materials=None))
     for name in ("all_cells", "Material_2"):
+        model = model._replace(cell_data={})  # without labels, whose names materials would have
         sets = Sets(model.sets.facets, {**model.sets.cells, name: np.array([0])})
         with pytest.raises(InputError, match=f'the file calls something else "{name}"'):
             abaqus(model._replace(sets=sets))
@@ -275,3 +277,19 @@ def test_steps_that_a_file_cannot_tell_apart_are_refused():
     ):
         with pytest.raises(InputError, match=match):
             abaqus(loaded_model(words)._replace(is_nonlinear=nonlinear))
+
+
+# Reading
+
+
+def test_sets_are_read_back(model, tmp_path):
+    (tmp_path / "a.inp").write_bytes(abaqus(model))
+    read = input_sets(tmp_path / "a.inp", model.mesh)
+    assert (list(read.facets), list(read.cells)) == (list(model.sets.facets), list(model.sets.cells))
+    for kind, others in zip(read, model.sets, strict=True):
+        for name, members in kind.items():
+            np.testing.assert_array_equal(members, others[name])
+    turned = Mesh(model.mesh.points, model.mesh.cells[::-1])
+    assert input_sets(tmp_path / "a.inp", turned) is None
+    (tmp_path / "b.inp").write_text("** by hand\n" + abaqus(model).decode())
+    assert input_sets(tmp_path / "b.inp", model.mesh) is None

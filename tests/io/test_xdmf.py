@@ -2,6 +2,7 @@
 
 from xml.etree import ElementTree
 
+import meshio
 import numpy as np
 import pytest
 import pyvista
@@ -44,13 +45,15 @@ def item(node):
 
 def named(node):
     """What a node's Information tells, lists of words by name."""
-    return {each.get("Name"): each.get("Value").split() for each in node.findall("Information")}
+    return {each.get("Name"): each.get("Value").split() for each in node.findall("Information") if each.get("Value")}
 
 
 def grids(model):
     """The file's grids by name."""
     root = ElementTree.fromstring(xdmf(model))
-    return {grid.get("Name"): grid for grid in root.findall("./Domain/Grid")}
+    inner = {grid.get("Name"): grid for grid in root.findall("./Domain/Grid/Information/Grid/Grid")}
+    (whole,) = root.find("Domain")
+    return {**inner, "mesh": whole}
 
 
 def fields(grid, center="Cell"):
@@ -96,7 +99,8 @@ def test_mesh_and_cell_data_are_the_models_own(model):
         assert np.array_equal(columns.pop("material"), table.of_cell + 1)
         assert np.array_equal(columns.pop("young"), table.young[table.of_cell])
         assert np.array_equal(columns.pop("nu"), table.nu[table.of_cell])
-        assert {name: [float(word) for word in words] for name, words in named(mesh).items()} == {
+        lists = {name: words for name, words in named(mesh).items() if name not in ("about", "load")}
+        assert {name: [float(word) for word in words] for name, words in lists.items()} == {
             "young": table.young.tolist(),
             "nu": table.nu.tolist(),
         }
@@ -165,7 +169,7 @@ def test_point_data_are_on_every_node(n, tmp_path):
 
 def test_loads_and_origin_are_told():
     model = sample_model()
-    head = ElementTree.fromstring(xdmf(model)).findall("./Domain/Information")
+    head = ElementTree.fromstring(xdmf(model)).findall("./Domain/Grid/Information")
     loads = [each.get("Value") for each in head if each.get("Name") == "load"]
     assert loads == [load_words(load) for load in model.loads]
     about = [each.get("Value") for each in head if each.get("Name") == "about"]
@@ -221,7 +225,7 @@ def test_cell_data_of_any_name_shape_and_kind(tmp_path):
 
 def test_names_that_xml_cannot_carry_are_mended():
     model = sample_model()._replace(about={"tetopt": "0.1.0", "image": "a\x01\udc80 -- ]]>.nii"})
-    head = ElementTree.fromstring(xdmf(model)).findall("./Domain/Information[@Name='about']")
+    head = ElementTree.fromstring(xdmf(model)).findall("./Domain/Grid/Information[@Name='about']")
     assert head[3].get("Value") == r"image: a\x01\udc80 -- ]]>.nii, sha256 unknown"
 
 
@@ -235,3 +239,17 @@ def test_values_that_vtk_cannot_read_are_refused(value):
         xdmf(model._replace(cell_data=data))
     with pytest.raises(InputError, match=r'^xdmf: expected finite point data, got 1 values of "odd" that are not'):
         xdmf(model._replace(point_data={"odd": np.array([value] + [1.0] * (len(model.mesh.points) - 1))}))
+
+
+def test_meshio_reads_the_mesh_and_its_data(model, tmp_path):
+    (tmp_path / "model.xdmf").write_bytes(xdmf(model))
+    read, (points, cells) = meshio.read(tmp_path / "model.xdmf"), elements(model)
+    (block,) = read.cells
+    assert np.array_equal(block.data, cells)
+    assert np.array_equal(read.points, points)
+    whole = grids(model)["mesh"]
+    of_cells = {name: np.concatenate(values) for name, values in read.cell_data.items()}
+    for center, theirs in (("Cell", of_cells), ("Node", read.point_data)):
+        ours = fields(whole, center)
+        assert set(ours) == set(theirs)
+        assert all(np.array_equal(theirs[name], values) for name, values in ours.items())

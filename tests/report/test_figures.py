@@ -18,11 +18,10 @@ from tetopt.image import Image
 from tetopt.measure.fidelity import cell_labels
 from tetopt.measure.quality import rho_histogram
 from tetopt.mesh import Mesh
-from tetopt.model.labels import LabelTable
+from tetopt.model.labels import LABEL_PALETTE, LabelTable, coloured, table_words
 from tetopt.report import figures
 from tetopt.report.colours import (
     BACKGROUND_COLOUR,
-    LABEL_PALETTE,
     LISTED_LABELS,
     UNCOVERED_COLOUR,
     label_colours,
@@ -332,11 +331,14 @@ def test_colours_are_told_apart_by_the_colour_blind(seen):
     assert apart[-1].min() > 20.0
 
 
-def test_the_largest_labels_have_the_first_colours():
-    colours = label_colours(Image(np.array([[7, 7, 7, 0], [2, 2, 5, 0], [0, 0, 0, 0]])))
-    assert colours.shape == (8, 3)
-    for label, colour in ((0, BACKGROUND_COLOUR), (7, LABEL_PALETTE[0]), (2, LABEL_PALETTE[1]), (5, LABEL_PALETTE[2])):
-        np.testing.assert_array_equal(colours[label], to_rgb(colour))
+def test_a_label_has_one_colour_whatever_else_is_there():
+    """So that the cells' labels look as the voxels', and a subject's as another's; in the file's table, too."""
+    few, many = (label_colours(Image(np.array(rows))) for rows in ([[7, 7, 7, 0]], [[1, 2, 7, 0], [9, 9, 9, 9]]))
+    assert (few.shape, many.shape) == ((8, 3), (10, 3))
+    np.testing.assert_array_equal(few, many[:8])
+    np.testing.assert_array_equal(many, to_rgba_array([BACKGROUND_COLOUR, *LABEL_PALETTE[:9]])[:, :3])
+    words = table_words(coloured(LabelTable({}, {2: (1.0, 0.0, 0.0)}), np.array([0, 7, 2, 7])))
+    assert words == {"2": {"colour": "#ff0000"}, "7": {"colour": LABEL_PALETTE[6]}}
 
 
 def test_labels_keep_colours_of_their_own_but_the_background():
@@ -346,11 +348,11 @@ def test_labels_keep_colours_of_their_own_but_the_background():
     np.testing.assert_array_equal(np.delete(colours, 2, axis=0), np.delete(label_colours(labels), 2, axis=0))
 
 
-def test_colours_begin_again_after_the_last():
+def test_colours_begin_again_in_other_tints():
     n = len(LABEL_PALETTE)
-    colours = label_colours(Image(np.arange(n + 2)[:, None]))
-    np.testing.assert_array_equal(colours[n + 1], to_rgb(LABEL_PALETTE[0]))
-    assert len(np.unique(colours[: n + 1], axis=0)) == n + 1
+    colours = label_colours(Image(np.arange(3 * n + 2)[:, None]))
+    assert len(np.unique(colours[: 3 * n + 1], axis=0)) == 3 * n + 1
+    np.testing.assert_array_equal(colours[3 * n + 1], to_rgb(LABEL_PALETTE[0]))
     with pytest.raises(InputError, match="whole numbers"):
         label_colours(Image(np.array([[0.5, 1.0]])))
 

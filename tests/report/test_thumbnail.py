@@ -10,6 +10,7 @@ import pytest
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.mesh import Mesh
+from tetopt.model.labels import LabelTable
 from tetopt.report.thumbnail import SIDE_PIXELS, save_thumbnail, thumbnail_png
 from tetopt.start.lattice import lattice
 
@@ -126,6 +127,8 @@ def test_mesh_mask_and_labels_are_drawn():
     coloured = pixels(dark, mesh, None, labels, of_cell)
     assert (np.abs(coloured - plain).max(axis=-1) > 40).sum() > 2000
     np.testing.assert_array_equal(pixels(dark, mesh, None, labels, 0 * of_cell), plain)
+    green = pixels(dark, mesh, None, labels, of_cell, LabelTable({}, {1: (0.0, 1.0, 0.0)}))
+    assert (green[..., 1] - coloured[..., 1] > 40).sum() > 2000  # blue by its number
 
 
 def test_two_lungs_are_cut_through_one():

@@ -67,7 +67,7 @@ if hasattr(fem, "VectorFunctionSpace"):
 else:
     V = fem.functionspace(mesh, ("Lagrange", 1, (dim,)))
 bcs = []
-for load in root.findall("./Domain/Information[@Name='load']"):
+for load in root.findall("./Domain/Grid/Information[@Name='load']"):
     kind, name, *displacement = load.get("Value").split(":")
     values = np.array(displacement[0].split(","), dtype=float) if kind == "move" else np.zeros(dim)
     dofs = fem.locate_dofs_topological(V, dim - 1, members(facet_tags, "facets", name))

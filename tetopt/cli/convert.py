@@ -28,6 +28,7 @@ from tetopt.cli.solver import (
     with_chosen_sets,
     without_stale_results,
 )
+from tetopt.io.abaqus import input_sets
 from tetopt.io.files import checked_output, save_json
 from tetopt.io.formats import FORMATS, format_of
 from tetopt.io.frd import read_frd
@@ -35,7 +36,7 @@ from tetopt.io.images import sha256
 from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.model.fields import cell_fields, is_result, is_stress
 from tetopt.model.file import MATERIAL_FIELDS, TEXTS_KEPT, MeshFile
-from tetopt.model.sets import box_of, box_text
+from tetopt.model.sets import Sets, box_of, box_text, merged_sets
 from tetopt.report.summary import model_summary, versions
 from tetopt.target.align import aligned_mask
 from tetopt.target.content import continued
@@ -124,7 +125,22 @@ def _with_results(loaded: MeshFile, path: Path) -> MeshFile:
         {name: values for name, values in data.items() if not is_result(name)}
         for data in (loaded.cell_data, loaded.point_data)
     )
-    return loaded._replace(cell_data=cell_data, point_data=point_data | results.point_data, order=results.order)
+    sets = _sets_with_input(loaded, path.with_suffix(".inp"))
+    return loaded._replace(
+        cell_data=cell_data, point_data=point_data | results.point_data, order=results.order, sets=sets
+    )
+
+
+def _sets_with_input(loaded: MeshFile, path: Path) -> Sets:
+    """The mesh's sets and those of the solver's input file, if it is there and of this mesh; a line."""
+    from_input = input_sets(path, loaded.mesh) if path.is_file() else None
+    if from_input is None:
+        log.print(escape(f"{path}: not the input file of this mesh, or missing: its sets are not added"))
+        return loaded.sets
+    sets, renamed = merged_sets(loaded.sets, from_input)
+    for old, new in renamed.items():
+        log.print(escape(f'{path}: renamed set "{old}" to "{new}" (name already in use)'))
+    return sets
 
 
 def _order_of(loaded: MeshFile, solver: SolverOptions, output: Path) -> int:

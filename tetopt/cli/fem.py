@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from rich.markup import escape
 
 from tetopt import Image, InputError
-from tetopt.cli.console import log, print_wide
+from tetopt.cli.console import log, print_wide, show_warning
 from tetopt.cli.inputs import read_image, read_mesh, warn_of_other_image, with_labels
 from tetopt.cli.options import ImagePart, LabelledPart, ModelOptions, NumberOptions, option
 from tetopt.cli.solver import (
@@ -34,7 +34,7 @@ from tetopt.model.fields import cell_fields, is_result
 from tetopt.model.file import MeshFile
 from tetopt.model.laws import ByLabel, parse_any_law
 from tetopt.model.loads import MOST_COMPRESSION_PERCENT, count_of_steps
-from tetopt.model.model import Model
+from tetopt.model.model import Model, locking_words
 from tetopt.model.sets import box_of, box_text
 from tetopt.report.summary import model_summary, versions
 from tetopt.report.tables import new_table, nodes_in_words
@@ -47,7 +47,6 @@ INTENSITY_LAW = "h"  # an image without --young: its intensities are the moduli,
 PAPER_PERCENT = 1.0  # how far the paper's test compresses, for a linear law only a scale
 SHOWN_SHARE = 1e-9  # of a force's largest component: less is what an iterative solution leaves
 SMALL_SHARE = 0.1  # of the mesh's length: displacements beyond it are not small, at strains of some 10 %
-LOCKING_NU = 0.45  # from where on linear cells are far behind quadratic ones, see docs/understand/order.md
 
 
 def fem_command(
@@ -205,14 +204,8 @@ def _lists(reactions: dict[str, NDArray[np.float64]]) -> dict[str, list[float]]:
 
 def _advise(model: Model, solutions: list[Solution]) -> None:
     """Lines where the cells are of the wrong order for the material, or the displacements too large for the method."""
-    assert model.materials is not None, "it has been solved"
-    largest = float(model.materials.nu.max())
-    if model.order == 1 and largest >= LOCKING_NU:
-        log.print(
-            f"nu is up to {largest:g}, where linear cells are too stiff: their displacements were off by 1.6 to 1.8 "
-            "times as much as those of quadratic cells on as many nodes at 0.45, 2.4 to 2.8 times at 0.49; try "
-            "--order 2 (docs/understand/order.md)"
-        )
+    if words := locking_words(model):
+        show_warning(words)
     size = float(np.ptp(model.mesh.points, axis=0).max())
     moved = max(float(np.sqrt((solution.u**2).sum(axis=1).max())) for solution in solutions)
     if moved > SMALL_SHARE * size:

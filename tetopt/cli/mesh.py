@@ -81,7 +81,7 @@ from tetopt.io.mni import mni_path
 from tetopt.measure.quality import Quality, quality
 from tetopt.model.fields import cell_fields, is_result
 from tetopt.model.file import MeshFile
-from tetopt.model.labels import TABLE_TEXT, table_of_labels, table_words
+from tetopt.model.labels import TABLE_TEXT, coloured, table_of_labels, table_words
 from tetopt.model.model import Model
 from tetopt.model.sets import Sets, box_of, label_set_names, surviving_sets
 from tetopt.report.summary import fidelity, image_summary, measured_each, model_summary, run_summary, size_summary
@@ -389,9 +389,10 @@ def _write(task: Task, outcome: Outcome, model: Model, about: dict[str, Any], be
     plan, source, result, output = task.plan, task.source, outcome.result, task.plan.output
     failed = outcome.failed
     measured = fidelity(source.labels, source.mask, result.mesh, model.cell_data.get("label"), failed)
-    if source.labels is not None and source.table.names:
-        there = table_of_labels(source.table, np.unique(source.labels.data).astype(np.int64).tolist())
-        measured["label_names"] = there.names
+    if source.labels is not None:
+        labels = np.unique(source.labels.data).astype(np.int64)
+        there = coloured(table_of_labels(source.table, labels.tolist()), labels)
+        measured |= {"label_names": there.names} if there.names else {}
         about |= {TABLE_TEXT: table_words(there)}
     counted = measured_each(_counts(task, result, model), failed)
     measured |= {name: value for name, value in counted.items() if value is not None}
@@ -443,7 +444,7 @@ def _draw(task: Task, outcome: Outcome, model: Model) -> None:
     if isinstance(source, StoredSource):
         image = source.coarse()
         figures.save_run_figures(pictures[:3], image, outcome.initial, outcome.result, task.start_name, image)
-        thumbnail.save_thumbnail(pictures[-1], image, mesh, None, None, None)
+        thumbnail.save_thumbnail(pictures[-1], image, mesh)
         return
     image = source.contrasts[0]
     figures.save_run_figures(pictures[:3], source.image, outcome.initial, outcome.result, task.start_name, image)
@@ -454,7 +455,7 @@ def _draw(task: Task, outcome: Outcome, model: Model) -> None:
         other = None if np.array_equal(image.data, source.labels.data) else image
         figure = figures.label_figure(source.labels, mesh, of_cell, other, source.table)
         figures.save_figure(figure, pictures[-2])
-    thumbnail.save_thumbnail(pictures[-1], image, mesh, source.mask, source.labels, of_cell)
+    thumbnail.save_thumbnail(pictures[-1], image, mesh, source.mask, source.labels, of_cell, source.table)
 
 
 def _print(task: Task, outcome: Outcome, model: Model, measured: dict[str, Any]) -> int:

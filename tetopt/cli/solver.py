@@ -20,6 +20,7 @@ from tetopt.cli.inputs import label_table
 from tetopt.cli.options import ModelOptions, SolverOptions
 from tetopt.io.files import kept_places
 from tetopt.io.formats import FORMATS, file_bytes, format_of, save_model
+from tetopt.io.gmsh import group_of_zero, incomplete_groups
 from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.model.averages import DEFAULT_AVERAGE, parse_average
 from tetopt.model.build import model_of
@@ -56,7 +57,7 @@ REACTIONS_TEXT = r"reactions(_step\d+)?"  # of a solved mesh's file: the forces 
 SET_GROUPS = ("labels", "interfaces", "boundary")  # of the sets that every mesh has
 # Each is an array more on the nodes of a VTU or VTK file; labels and their sets can be made anew of its cells.
 MANY_INTERFACES = 24
-READ_WITHOUT_TEXTS = (".msh", ".msh2")  # read back with sets and fields, but without our texts
+GMSH_SUFFIXES = (".msh", ".msh2")
 INTERFACE_PREFIX = "interface_"  # of the names of facet sets between two labels
 LISTED_NAMES = 8  # of labels of one material: a line's worth
 SLOW_MATERIALS = 30_000  # CalculiX takes three times as long with as many as there are cells (tests/benchmarks)
@@ -245,7 +246,7 @@ def sets_and_table(
     table, former = label_table(options.label_names, loaded), label_table(None, loaded)
     of_loads = {parse_load(text, loaded.mesh.ndim).set_name for text in options.loads or ()}
     sets = all_sets(loaded.mesh, box, fields, loaded.sets, table.names, former.names, of_loads)
-    return sets, {TABLE_TEXT: table_words(table)} if table.names else {}
+    return sets, {TABLE_TEXT: table_words(table)} if table.names or table.colours else {}
 
 
 def check_early(
@@ -392,10 +393,17 @@ def _materials_by_name(model: Model, materials: Materials) -> Iterator[str]:
         yield f"  {young:.4g} kPa, nu {nu:.4g}: {', '.join(made_of[:LISTED_NAMES])}{more}"
 
 
-def _only_in_vtu(model: Model) -> str:
-    """What of a model only a VTU or VTK file of ours tells when it is read, in words; nothing if there is none."""
-    names = model.about.get(TABLE_TEXT)
-    return " and ".join(["loads"] * bool(model.loads) + ["labels' names"] * bool(names))
+def _gmsh_lines(model: Model, suffix: str) -> Iterator[str]:
+    """What gmsh's formats cannot hold as it is: loads, label 0, and, in 2.2, a facet in several groups."""
+    if model.loads:
+        yield f"loads are not read back from {suffix}: tetopt reads them from VTK files only"
+    labels = labels_of(model.cell_data, len(model.mesh.cells))
+    if labels is not None and labels.min() == 0:
+        yield f"label 0 is physical group {group_of_zero(labels)}, as gmsh has no group 0"
+    if suffix == ".msh2" and (short := incomplete_groups(model)):
+        yield (
+            f"gmsh 2.2 has one group per facet: those of smaller sets are missing from {', '.join(short)} (use .msh)"
+        )
 
 
 def _lines(output: Path, model: Model, solver: SolverOptions) -> Iterator[str]:
@@ -429,8 +437,8 @@ def _lines(output: Path, model: Model, solver: SolverOptions) -> Iterator[str]:
         yield f"{n_steps} steps, each from the undeformed state"
     if model.loads and not (form.runs or form.is_surface):
         yield "the format runs no step: the loads are in the file as text"
-    if (lost := _only_in_vtu(model)) and not form.is_surface and output.suffix.lower() in READ_WITHOUT_TEXTS:
-        yield f"{lost} are not read back from {output.suffix}: tetopt takes them from VTK's files alone"
+    if output.suffix.lower() in GMSH_SUFFIXES:
+        yield from _gmsh_lines(model, output.suffix.lower())
     low, high = model.mesh.points.min(axis=0), model.mesh.points.max(axis=0)
     ranges = zip("xyz", low, high, strict=False)
     yield (

@@ -68,7 +68,7 @@ class Source(NamedTuple):
 
     def with_table(self, table: LabelTable) -> Source:
         """The same with other names and colours of labels."""
-        words = {TABLE_TEXT: table_words(table)} if table.names else {}
+        words = {TABLE_TEXT: table_words(table)} if table.names or table.colours else {}
         return self._replace(table=table, about=self.about | words)
 
     def by_contrast(self, fields: dict[str, NDArray]) -> list[dict[str, Any]]:

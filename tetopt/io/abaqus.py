@@ -2,18 +2,23 @@
 
 from __future__ import annotations
 
+import re
 import textwrap
+from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
-from tetopt.io.tags import check_apart, material_names, without_data
+from tetopt.incoming import regular_file
+from tetopt.io.tags import check_apart, named_materials, without_data
 from tetopt.io.text import blocks, comment_lines, plain, rows
+from tetopt.mesh import Mesh
 from tetopt.model.fields import node_field
 from tetopt.model.loads import Load, count_of_steps, facet_forces, in_step, load_words, spring_constants
 from tetopt.model.materials import Materials, cells_of, without_moduli
 from tetopt.model.model import Model, described, element_facets, elements, mass_densities
+from tetopt.model.sets import Sets
 
 ALL_ELEMENTS = "all_cells"  # the set that results are asked for
 SPRING_PREFIX = "spring-"  # of the sets of one spring each, which are elements behind the cells
@@ -43,10 +48,10 @@ def abaqus(model: Model) -> bytes:
     """The bytes of an Abaqus input file (.inp), for Abaqus/Standard and CalculiX.
 
     Linear (C3D4) or quadratic (C3D10) tetrahedra. Each facet set is a surface and a node set of its name, the latter
-    with midside nodes if there are; each cell set is an element set. "all_cells" are all elements, "material_1", ...
-    those of each material. A modulus that varies within cells is a material whose modulus depends on the temperature:
-    at each node the temperature is the modulus, as thousandths of the largest; both solvers take it linearly from the
-    corners, and nothing expands.
+    with midside nodes if there are; each cell set is an element set. "all_cells" are all elements. Materials, and the
+    element set of each, are called as their labels are (`tetopt.io.tags.named_materials`). A modulus that varies within
+    cells is a material whose modulus depends on the temperature: at each node the temperature is the modulus, as
+    thousandths of the largest; both solvers take it linearly from the corners, and nothing expands.
 
     With loads there is a static step for each of theirs, a load case of its own, whose strain energy and reaction
     forces both solvers print: pressure on faces, tractions as forces at nodes and springs from nodes to the ground
@@ -62,6 +67,8 @@ def abaqus(model: Model) -> bytes:
         A 2-D model, loads without materials, springs in some of the steps alone, or a set with the name of one of the
         file's own.
     """
+    if model.materials is not None and model.node_young is not None:
+        model = model._replace(materials=without_moduli(model.materials))
     _check(model)
     parts = [_head(model), *_mesh(model)]
     parts += [f"*ELSET, ELSET={name}\n{_list(cells)}" for name, cells in model.sets.cells.items()]
@@ -90,7 +97,16 @@ def _check(model: Model) -> None:
             f"abaqus: expected one nonlinear step, got {count}, each of which would go on from the one before; write a "
             "file for each"
         )
-    check_apart([ALL_ELEMENTS, *material_names(model, {})], model.sets.cells)
+    others = {name: cells for name, cells in model.sets.cells.items() if name not in _shared_sets(model)}
+    check_apart([ALL_ELEMENTS, *named_materials(model)], others)
+
+
+def _shared_sets(model: Model) -> set[str]:
+    """The names of materials that are those of sets of the same cells."""
+    if model.materials is None:
+        return set()
+    of_material = zip(named_materials(model), cells_of(model.materials), strict=True)
+    return {name for name, cells in of_material if np.array_equal(model.sets.cells.get(name, -1), cells)}
 
 
 def _head(model: Model) -> str:
@@ -115,12 +131,12 @@ def _mesh(model: Model) -> list[str]:
 def _materials(model: Model) -> list[str]:
     if model.materials is None:
         return []
-    materials = model.materials if model.node_young is None else without_moduli(model.materials)
     parts = []
-    densities = [] if materials.density is None else mass_densities(model._replace(materials=materials)).tolist()
-    for k, members in enumerate(cells_of(materials)):
-        name = f"material_{k + 1}"
-        parts.append(f"*ELSET, ELSET={name}\n{_list(members)}*MATERIAL, NAME={name}\n{_law(model, materials, k)}")
+    densities = [] if model.materials.density is None else mass_densities(model).tolist()
+    names, shared = named_materials(model), _shared_sets(model)
+    for k, (name, members) in enumerate(zip(names, cells_of(model.materials), strict=True)):
+        parts += [] if name in shared else [f"*ELSET, ELSET={name}\n{_list(members)}"]
+        parts.append(f"*MATERIAL, NAME={name}\n{_law(model, model.materials, k)}")
         if densities:
             parts.append(f"*DENSITY\n{_number(densities[k])}\n")
         parts.append(f"*SOLID SECTION, ELSET={name}, MATERIAL={name}\n")
@@ -264,3 +280,32 @@ def _shortened(value: float) -> float:
         return value
     texts = (f"{value:.{digits}g}" for digits in range(16, 0, -1))
     return float(next(text for text in texts if len(text) <= NUMBER_CHARACTERS))
+
+
+# Reading
+
+
+def input_sets(path: Path, mesh: Mesh) -> Sets | None:
+    """The sets of an input file of ours, but for materials and "all_cells"; None of others' files and other meshes."""
+    text = regular_file(path, "Abaqus file").read_text("utf-8", "replace")
+    facets, cells, own = {}, {}, {ALL_ELEMENTS}
+    if not text.startswith("** tetopt"):
+        return None
+    for block in text.split("\n*")[1:]:
+        card, _, body = block.partition("\n")
+        if match := re.fullmatch(r"ELEMENT, TYPE=C3D(\d+), .*", card):
+            corners = _integers(body).reshape(-1, 1 + int(match[1]))[:, 1 : 2 + mesh.ndim] - 1
+            if not np.array_equal(corners, mesh.cells):
+                return None
+        elif match := re.fullmatch(r"ELSET, ELSET=(\S+)", card):
+            cells[match[1]] = _integers(body) - 1
+        elif match := re.fullmatch(r"SURFACE, NAME=(\S+), TYPE=ELEMENT", card):
+            cell, face = _integers(body.replace("S", "")).reshape(-1, 2).T
+            facets[match[1]] = np.column_stack([cell - 1, np.argsort(FACE_NUMBERS)[face - 1]])
+        elif match := re.fullmatch(r"SOLID SECTION, ELSET=(\S+), .*", card):
+            own.add(match[1])
+    return Sets(facets, {name: members for name, members in cells.items() if name not in own})
+
+
+def _integers(text: str) -> NDArray[np.int64]:
+    return np.array(text.replace(",", " ").split(), dtype=np.int64)

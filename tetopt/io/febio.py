@@ -12,7 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
-from tetopt.io.tags import as_columns, check_one_step
+from tetopt.io.tags import as_columns, check_one_step, named_materials
 from tetopt.io.text import rows, xml_attribute, xml_comment
 from tetopt.model.loads import Load, facet_forces, spring_constants
 from tetopt.model.materials import cells_of, density_of
@@ -20,7 +20,7 @@ from tetopt.model.model import STRESS_UNITS, Model, described, element_facets, e
 
 MOST_MATERIAL_PARTS = 100  # with more, FEBio Studio's list of parts is no use
 STUDIO_UNITS = {"kPa": "mm-kg-s", "MPa": "mm-N-s"}  # FEBio's own words for what is consistent with them
-# A set's name has no spaces, so that neither these nor the names of parts ("material 1") are ever a set's.
+# A set's name has no spaces, so that neither these nor the names of parts ("cells of liver") are ever a set's.
 ALL_NODES, ALL_CELLS = "all nodes", "all cells"
 YOUNG_MAP, NU_MAP, DENSITY_MAP = "E", "v", "density"  # maps, named as the parameters they stand for
 DEAD_FORCES = "dead forces"  # the set of the nodes that tractions and weight act on, and the map of their forces
@@ -64,7 +64,8 @@ PLOT_VARIABLES = ("displacement", "stress", "Lagrange strain", "strain energy de
 class _Part(NamedTuple):
     """Cells that are of one material."""
 
-    name: str  # the material's, too
+    name: str
+    material: str  # its name
     young: str  # a number, or the name of a map of it
     nu: str
     density: str
@@ -77,7 +78,8 @@ def febio(model: Model) -> bytes:
     Linear (tet4) or quadratic (tet10) tetrahedra. Each facet set is a surface and a node set of its name, the latter
     with midside nodes if there are; each cell set is an element set. A cell's id is its number in the mesh plus 1.
 
-    Up to 100 materials are parts of their own, "material 1", ..., whose cells come one part after the other. More are
+    Up to 100 materials are parts of their own, called as their labels are (`tetopt.io.tags.named_materials`): material
+    "liver", part "cells of liver". Their cells come one part after the other. More are
     one part, "all cells", with E, and v where it varies, mapped by element data. Cell data are element data, too, for
     FEBio Studio to show or parameters to be mapped from.
 
@@ -103,7 +105,7 @@ def febio(model: Model) -> bytes:
         _materials(parts),
         *_mesh(model, parts),
         "<MeshDomains>\n",
-        *(f'<SolidDomain name="{part.name}" mat="{part.name}"/>\n' for part in parts),
+        *(f'<SolidDomain name="{part.name}" mat="{part.material}"/>\n' for part in parts),
         "</MeshDomains>\n",
         *_mesh_data(model, parts),
         *_loads(model),
@@ -133,9 +135,17 @@ def _parts(model: Model) -> list[_Part]:
             name if np.ptp(values) > 0.0 else repr(float(values[0]))
             for name, values in ((NU_MAP, nu), (DENSITY_MAP, density))
         )
-        return [_Part(ALL_CELLS, YOUNG_MAP, ratio, mass, np.arange(len(of_cell)))]
+        return [_Part(ALL_CELLS, ALL_CELLS, YOUNG_MAP, ratio, mass, np.arange(len(of_cell)))]
+    names = named_materials(model)
     return [
-        _Part(f"material {k + 1}", repr(float(young[k])), repr(float(nu[k])), repr(float(density[k])), members)
+        _Part(
+            f"cells of {names[k]}",
+            names[k],
+            repr(float(young[k])),
+            repr(float(nu[k])),
+            repr(float(density[k])),
+            members,
+        )
         for k, members in enumerate(cells_of(model.materials))
         if len(members)
     ]
@@ -153,7 +163,7 @@ def _materials(parts: list[_Part]) -> str:
         [
             "<Material>\n",
             *(
-                f'<material id="{k}" name="{part.name}" type="neo-Hookean">\n'
+                f'<material id="{k}" name="{part.material}" type="neo-Hookean">\n'
                 f"{_parameter('density', part.density, DENSITY_MAP)}"
                 f"{_parameter('E', part.young, YOUNG_MAP)}{_parameter('v', part.nu, NU_MAP)}</material>\n"
                 for k, part in enumerate(parts, start=1)

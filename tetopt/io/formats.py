@@ -20,11 +20,11 @@ from tetopt.io.readback import Outline, save_checked, save_pieces
 from tetopt.io.sofa import sofa
 from tetopt.io.surfaces import boundary_ply, boundary_stl
 from tetopt.io.text import file_name, legacy_name, names_apart, plain, short_name
-from tetopt.io.vtk import vtk, vtu
+from tetopt.io.vtk import VTK_SUFFIXES, vtk, vtu
 from tetopt.io.vtkhdf import hdf_name, vtkhdf
 from tetopt.io.xdmf import xdmf
 from tetopt.mesh import Mesh
-from tetopt.model.model import Model, elements, in_space, in_units
+from tetopt.model.model import Model, elements, in_space, in_units, locking_words
 from tetopt.model.sets import MOST_LETTERS, SET_NAME, Sets
 
 
@@ -103,6 +103,11 @@ def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str
     OSError
         As `tetopt.io.readback.save_checked`.
 
+    Warns
+    -----
+    UserWarning
+        Data that have other names in the file; linear cells of a Poisson's ratio of 0.45 or more in a solver's file.
+
     See Also
     --------
     model_of : Makes a model.
@@ -118,6 +123,9 @@ def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str
     """
     path = Path(path)
     kind, ready = format_of(path), _ready(path, model, space, units)
+    is_for_solver = not kind.is_surface and path.suffix.lower() not in VTK_SUFFIXES
+    if is_for_solver and (words := locking_words(model)):
+        warnings.warn(f"{path}: {words}", stacklevel=2)
     sets = (frozenset(each) for each in model.sets)
     expected = Outline(len(elements(model)[0]), len(model.mesh.cells), *sets)
     if kind.write_files is None:

@@ -1,16 +1,20 @@
 """Meshes for gmsh and all that reads its files: MSH 4.1 and 2.2, as text.
 
-Cells: each is in one physical group, as dolfinx wants it: that of its material, "material_1", ..., or without materials
-that of its cell set, and "unnamed" if it has none. A cell set that overlaps one before it, or is called as a facet set
-is, is no group then (dolfinx and meshio know groups by name alone). The entity of a cell tells all of its sets: the
-$Comments say which entities make up each.
+Cells: each is in one physical group, as dolfinx wants it. Where cells have labels, the group's number is the label, and
+its name that of the label's set; gmsh has no group 0, so that label 0 has the number after the largest label. Otherwise
+the group is that of its material, "material_1", ..., or without materials that of its cell set, and "unnamed" if it has
+none; a cell set that overlaps one before it, or has the name of a facet set, is no group then (dolfinx and meshio know
+groups by name alone). An entity has the number of its group; only where sets, or in 2.2 materials, divide a group is it
+several entities, numbered behind all groups. The $Comments say which entities make up each set.
 
-Facets: each set is a physical group of triangles, in 2-D of lines, and such groups overlap. In 4.1 a facet is one
-element, in an entity that belongs to all of its groups; in 2.2, where an element has one group, it is an element of
-each of its sets, which is what gmsh does when it writes 2.2. Groups are numbered from the smallest. dolfinx keeps one
-group of each facet, that of the smallest number: nothing then is left of "boundary", and a face of the box lacks what
-is also in a smaller set; our XDMF files lose nothing there. A facet inside the mesh that two sets hold from opposite
-sides is turned, in 4.1, as in the first of them. The nodes of a group are those of its elements.
+Facets: each is one element, in an entity that belongs to the groups of all of its sets. Their numbers are free among
+those of the cells' groups and do not depend on the mesh: from R + 1 in the order of the sets, and, up to 2 R - 1, those
+of the box's faces, "mask_surface" and "boundary", the last; R is 1000, or the power of ten that is above all labels. An
+entity tells the smallest set first, which alone meshio has as "gmsh:physical"; in 2.2 an element has one group, so that
+it is in the smallest of its sets: a group such as "boundary" then lacks what is also in a smaller one, and the
+$Comments tell the whole set. dolfinx keeps one group of each facet, that of the smallest number; our XDMF files lose
+nothing there. A facet inside the mesh that two sets hold from opposite sides is turned as in the first of them. The
+nodes of a group are those of its elements.
 
 Views ($ElementData), in 4.1 only, as meshio 5.3.5 reads no 2.2 that has them: the cell data, "young" and "nu" of the
 materials in place of cell data of these names, and each cell set as 0 and 1. Facets have the values of the cell that
@@ -26,7 +30,8 @@ own reader goes by them, see `own_comments`.
 from __future__ import annotations
 
 import re
-from itertools import pairwise
+from collections import Counter
+from itertools import count, pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -34,6 +39,7 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.io.tags import (
+    Tagged,
     as_columns,
     cell_tags,
     check_apart,
@@ -45,15 +51,19 @@ from tetopt.io.tags import (
 )
 from tetopt.io.text import comment_lines, names_apart, rows
 from tetopt.model.fields import node_field
+from tetopt.model.labels import TABLE_TEXT, labels_of, table_of_words
 from tetopt.model.model import Model, element_facets, elements
-from tetopt.model.sets import facet_triples
+from tetopt.model.sets import BOUNDARY_SET, FACE_NAMES, MASK_SURFACE_SET, facet_triples, label_set_names
 
 # gmsh's numbers for elements of a dimension and an order: line, triangle, tetrahedron, and again.
 ELEMENT_TYPES = {(1, 1): 1, (2, 1): 2, (3, 1): 4, (1, 2): 8, (2, 2): 9, (3, 2): 11}
 TET10_ORDER = np.array([0, 1, 2, 3, 4, 5, 6, 7, 9, 8])  # gmsh has the midpoint of edge (2, 3) before that of (1, 3)
 VIEW_SHAPES = ((3,), (9,))  # of a row: a view holds vectors and tensors
+LABEL_COMMENT = "physical groups of cells are the labels; label 0 is {}"
 UNNAMED_GROUP = "unnamed"  # the group of cells that are in no other
 MOST_MATERIAL_GROUPS = 1000  # gmsh takes minutes to open a 2.2 file with 200,000, meshio hours for a 4.1
+LEAST_ROOM = 1000  # so many numbers are the labels' alone
+LARGEST_GROUP = 10**8 - 1  # of labels: twice the power of ten behind it still fits into the format's 32 bits
 
 
 class Part(NamedTuple):
@@ -62,9 +72,9 @@ class Part(NamedTuple):
     dim: int
     numbers: NDArray[np.int64]  # (E,) from 1
     rows: NDArray[np.int64]  # (E,) cells, or (E, 2) facets
-    entities: NDArray[np.int64]  # (E,) the entity of each, from 1
-    groups_of: list[list[int]]  # the physical groups of each entity, ascending
-    names: list[str]  # of the groups, from 1
+    entities: NDArray[np.int64]  # (E,) the number of each one's entity
+    groups_of: dict[int, list[int]]  # the numbers of each entity's physical groups, the smallest set first; ascending
+    names: dict[int, str]  # of the groups by number
     sets: dict[str, list[int]]  # the entities that make up each set
 
 
@@ -73,8 +83,10 @@ class OwnComments(NamedTuple):
 
     space: str
     texts: dict[str, str]  # "units", "image", "image_sha256", as far as known
-    constants: dict[str, tuple[float, float]]  # young and nu of each material that is a group
-    entities: dict[str, list[int]]  # those that make up each of these materials and each cell set
+    constants: dict[str, tuple[float, float]]  # young and nu of each material that is told by entities
+    cells: dict[str, list[int]]  # entities that make up each of these materials and each cell set
+    facets: dict[str, list[int]]  # and each facet set
+    zero: int | None = None  # the group of label 0, where groups are labels
 
 
 def own_comments(lines: list[str]) -> OwnComments | None:
@@ -84,7 +96,8 @@ def own_comments(lines: list[str]) -> OwnComments | None:
         return None
     texts: dict[str, str] = {}
     constants: dict[str, tuple[float, float]] = {}
-    entities: dict[str, list[int]] = {}
+    entities: dict[str, dict[str, list[int]]] = {"cells": {}, "facets": {}}
+    zero = None
     for line in lines:
         if match := re.fullmatch(r"units: mm, (\w+), .*", line):
             texts["units"] = match[1]
@@ -92,10 +105,25 @@ def own_comments(lines: list[str]) -> OwnComments | None:
             texts |= {"image": match[1]} | ({} if match[2] == "unknown" else {"image_sha256": match[2]})
         elif match := re.fullmatch(r"(material_\d+): young (\S+) \w+, nu (\S+)", line):
             constants[match[1]] = float(match[2]), float(match[3])
-        elif match := re.fullmatch(r"entity of cells (\d+): (.*)", line):
-            for name in match[2].split():
-                entities.setdefault(name, []).append(int(match[1]))
-    return OwnComments("lps" if coordinates[0].startswith("coordinates: LPS") else "ras", texts, constants, entities)
+        elif match := re.fullmatch(r"entity of (cells|facets) (\d+): (.*)", line):
+            for name in match[3].split():
+                entities[match[1]].setdefault(name, []).append(int(match[2]))
+        elif match := re.fullmatch(LABEL_COMMENT.format(r"(\d+)"), line):
+            zero = int(match[1])
+    space = "lps" if coordinates[0].startswith("coordinates: LPS") else "ras"
+    return OwnComments(space, texts, constants, entities["cells"], entities["facets"], zero)
+
+
+def group_of_zero(labels: NDArray[np.int64]) -> int:
+    """The physical group of label 0, which is no number of one: the first behind all labels."""
+    return int(labels.max()) + 1
+
+
+def incomplete_groups(model: Model) -> list[str]:
+    """The facet sets whose group in 2.2 lacks what is in a smaller set, too."""
+    (*_, facets) = _parts(model)
+    in_several = [groups[1:] for groups in facets.groups_of.values()] if model.sets.facets else []
+    return [facets.names[number] for number in sorted({each for groups in in_several for each in groups})]
 
 
 def gmsh41(model: Model) -> bytes:
@@ -112,11 +140,12 @@ def gmsh41(model: Model) -> bytes:
     if _n_materials(model) > MOST_MATERIAL_GROUPS:
         grouped = model._replace(materials=None)
         comments = [f"{_n_materials(model)} materials: in the views young, {model.units}, and nu; not groups"]
+    labels = _labels(model)
+    if labels is not None and not _is_of_labels(grouped, labels):  # an entity is a label: the moduli are views
+        grouped = grouped._replace(materials=None)
     points, cells = _geometry(model)
-    parts = [_by_entity(part) for part in (_cells(grouped), _facets_once(model)) if len(part.numbers)]
-    comments = remarks(grouped) + comments
-    for part, what in zip(parts, ("cells", "facets"), strict=False):
-        comments += tag_lines(part.sets, f"entity of {what}")
+    parts = [_by_entity(part) for part in _parts(grouped)]
+    comments = [*remarks(model if labels is not None else grouped), *comments, *_entity_comments(model, parts)]
     counts = {part.dim: len(part.groups_of) for part in parts}
     n_elements = sum(len(part.numbers) for part in parts)
     return _file(
@@ -130,7 +159,7 @@ def gmsh41(model: Model) -> bytes:
         ),
         _section(
             "Nodes",
-            f"1 {len(points)} 1 {len(points)}\n{model.mesh.ndim} 1 0 {len(points)}\n",
+            f"1 {len(points)} 1 {len(points)}\n{model.mesh.ndim} {min(parts[0].groups_of)} 0 {len(points)}\n",
             rows(np.arange(1, len(points) + 1)),
             rows(points),
         ),
@@ -146,7 +175,7 @@ def gmsh41(model: Model) -> bytes:
 def gmsh22(model: Model) -> bytes:
     """A MSH 2.2 file, without cell data; see the module for what is where.
 
-    Elements 1 to M are the cells, in their order; then come the facets, set by set.
+    Elements 1 to M are the cells, in their order; then come the facets.
 
     Raises
     ------
@@ -159,10 +188,10 @@ def gmsh22(model: Model) -> bytes:
             f"{_n_materials(model)}; group them with --bins 32, or name the file .msh"
         )
     points, cells = _geometry(model)
-    parts = [part for part in (_cells(model), _facets_each(model)) if len(part.numbers)]
+    parts = _parts(model)
     return _file(
         "2.2 0 8",
-        [*remarks(model), *without_data(model), *tag_lines(parts[0].sets, "entity of cells")],
+        [*remarks(model), *without_data(_without_labels(model)), *_entity_comments(model, parts)],
         parts,
         _section("Nodes", f"{len(points)}\n", rows(np.arange(1, len(points) + 1), points)),
         _section(
@@ -178,7 +207,7 @@ def _n_materials(model: Model) -> int:
 
 
 def _file(header: str, comments: list[str], parts: list[Part], *sections: str) -> bytes:
-    names = [f'{part.dim} {tag} "{name}"\n' for part in reversed(parts) for tag, name in enumerate(part.names, 1)]
+    names = [f'{part.dim} {number} "{name}"\n' for part in reversed(parts) for number, name in part.names.items()]
     return "".join(
         [
             _section("MeshFormat", f"{header}\n"),
@@ -209,16 +238,84 @@ def _nodes(model: Model, cells: NDArray[np.int64], part: Part) -> NDArray[np.int
 # Which elements there are
 
 
-def _cells(model: Model) -> Part:
-    """Every cell; an entity is what is of the same material and in the same sets."""
-    tagged = cell_tags(model)
+def _labels(model: Model) -> NDArray[np.int64] | None:
+    """The cells' labels (M,), if they have any; InputError for one that is too large for a number of gmsh's."""
+    labels = labels_of(model.cell_data, len(model.mesh.cells))
+    if labels is not None and labels.max() > LARGEST_GROUP:
+        raise InputError(f"gmsh: expected labels up to {LARGEST_GROUP}, got {labels.max()}; number them from 1")
+    return labels
+
+
+def _is_of_labels(model: Model, labels: NDArray[np.int64]) -> bool:
+    """Whether all cells of a label are of one material."""
     if model.materials is None:
-        names, group = _disjoint_sets(model)
+        return True
+    pairs = np.unique(np.column_stack([labels, model.materials.of_cell]), axis=0)
+    return len(pairs) == len(np.unique(labels))
+
+
+def _without_labels(model: Model) -> Model:
+    """The model without the labels, where physical groups tell them."""
+    of_cells = model.cell_data.items()
+    return model if _labels(model) is None else model._replace(cell_data={k: v for k, v in of_cells if k != "label"})
+
+
+def _entity_comments(model: Model, parts: list[Part]) -> list[str]:
+    """Which entities make up each set, and that groups are labels, if they are."""
+    labels = _labels(model)
+    lines = [] if labels is None else [LABEL_COMMENT.format(group_of_zero(labels))]
+    for part, what in zip(parts, ("cells", "facets"), strict=False):
+        lines += tag_lines(part.sets, f"entity of {what}")
+    return lines
+
+
+def _parts(model: Model) -> list[Part]:
+    """The cells and, if there are sets of them, the facets."""
+    labels, n_facets = _labels(model), len(model.sets.facets)
+    names, group = _cell_groups(model, labels)
+    room = LEAST_ROOM
+    while room <= max(names, default=0) or room <= n_facets + 2 * model.mesh.ndim + 2:
+        room *= 10
+    of_cells = cell_tags(model, labels)
+    _, first = np.unique(of_cells.tags, return_index=True)
+    cells = _part(model.mesh.ndim, of_cells, [[each] for each in group[first].tolist()], names, 1, 2 * room)
+    facets = _facets(model, room)
+    return [cells, facets] if len(facets.numbers) else [cells]
+
+
+def _part(dim: int, of_items: Tagged, groups_of: list[list[int]], names: dict[int, str], first: int, room: int) -> Part:
+    """The elements, numbered from `first`, of each tag an entity.
+
+    It has the number of its first group; where that is several, each has one from `room` on.
+    """
+    counts, free = Counter(groups[0] for groups in groups_of), count(room + 1)
+    number = np.array([groups[0] if counts[groups[0]] == 1 else next(free) for groups in groups_of], dtype=np.int64)
+    sets = {name: number[np.array(tags, dtype=np.int64) - 1].tolist() for name, tags in of_items.tags_of.items()}
+    numbers = first + np.arange(len(of_items.items))
+    by_number = dict(sorted(zip(number.tolist(), groups_of, strict=True)))
+    return Part(dim, numbers, of_items.items, number[of_items.tags - 1], by_number, names, sets)
+
+
+def _cell_groups(model: Model, labels: NDArray[np.int64] | None) -> tuple[dict[int, str], NDArray[np.int64]]:
+    """The names of the cells' groups by number, ascending, and the number of each cell's."""
+    if labels is not None:
+        kinds = np.unique(labels).tolist()
+        called = label_set_names(kinds, table_of_words(model.about.get(TABLE_TEXT)).names)
+        zero = group_of_zero(labels)
+        others = {
+            name: members
+            for name, members in model.sets.cells.items()
+            if not any(
+                name == called[kind] and np.array_equal(members, np.flatnonzero(labels == kind)) for kind in kinds
+            )
+        }
+        check_apart(list(called.values()), {**model.sets.facets, **others})
+        return dict(sorted((kind or zero, called[kind]) for kind in kinds)), np.where(labels == 0, zero, labels)
+    if model.materials is None:
+        listed, group = _disjoint_sets(model)
     else:
-        names, group = material_names(model, model.sets.facets), model.materials.of_cell + 1
-    _, first = np.unique(tagged.tags, return_index=True)
-    groups_of = [[number] for number in group[first].tolist()]
-    return Part(model.mesh.ndim, tagged.items + 1, tagged.items, tagged.tags, groups_of, names, tagged.tags_of)
+        listed, group = material_names(model, model.sets.facets), model.materials.of_cell + 1
+    return dict(enumerate(listed, 1)), group
 
 
 def _disjoint_sets(model: Model) -> tuple[list[str], NDArray[np.int64]]:
@@ -236,30 +333,20 @@ def _disjoint_sets(model: Model) -> tuple[list[str], NDArray[np.int64]]:
     return names, number
 
 
-def _facets_once(model: Model) -> Part:
+def _facets(model: Model, room: int) -> Part:
     """Every facet of a set; an entity is what is in the same sets."""
-    names = list(_from_smallest(model))
-    tagged = facet_tags(model.mesh, model.sets.facets)
-    groups_of: list[list[int]] = [[] for _ in range(tagged.tags.max(initial=0))]
-    for group, name in enumerate(names, 1):
-        for tag in tagged.tags_of[name]:
-            groups_of[tag - 1].append(group)
-    numbers = len(model.mesh.cells) + 1 + np.arange(len(tagged.items))
-    return Part(model.mesh.ndim - 1, numbers, tagged.items, tagged.tags, groups_of, names, tagged.tags_of)
-
-
-def _facets_each(model: Model) -> Part:
-    """The facets of each set, one set after the other, each an entity."""
-    sets = _from_smallest(model)
-    members = np.concatenate([np.empty((0, 2), dtype=np.int64), *sets.values()])
-    entities = np.repeat(np.arange(1, len(sets) + 1), [len(facet_rows) for facet_rows in sets.values()])
-    numbers = len(model.mesh.cells) + 1 + np.arange(len(members))
-    of_set = {name: [k] for k, name in enumerate(sets, 1)}
-    return Part(model.mesh.ndim - 1, numbers, members, entities, list(of_set.values()), list(sets), of_set)
-
-
-def _from_smallest(model: Model) -> dict[str, NDArray[np.int64]]:
-    return dict(sorted(model.sets.facets.items(), key=lambda item: len(item[1])))
+    sets = model.sets.facets
+    last = [*(name for pair in FACE_NAMES[model.mesh.ndim] for name in pair), MASK_SURFACE_SET, BOUNDARY_SET]
+    of_box = dict(zip(last, count(2 * room - len(last)), strict=False))
+    free = count(room + 1)
+    number = {name: of_box[name] if name in of_box else next(free) for name in sets}
+    of_facets = facet_tags(model.mesh, sets)
+    groups_of: list[list[int]] = [[] for _ in range(of_facets.tags.max(initial=0))]
+    for name in sorted(sets, key=lambda name: (len(sets[name]), number[name])):
+        for tag in of_facets.tags_of[name]:
+            groups_of[tag - 1].append(number[name])
+    names = {number[name]: name for name in sorted(sets, key=number.__getitem__)}
+    return _part(model.mesh.ndim - 1, of_facets, groups_of, names, len(model.mesh.cells) + 1, 2 * room)
 
 
 def _by_entity(part: Part) -> Part:
@@ -272,7 +359,7 @@ def _by_entity(part: Part) -> Part:
 
 def _starts(part: Part) -> NDArray[np.int64]:
     """Where each entity starts in a part that is in their order."""
-    return np.searchsorted(part.entities, np.arange(1, len(part.groups_of) + 1))
+    return np.searchsorted(part.entities, list(part.groups_of))
 
 
 def _entity_lines(model: Model, part: Part) -> str:
@@ -284,7 +371,7 @@ def _entity_lines(model: Model, part: Part) -> str:
     boxes[:, 1, : mesh.ndim] = np.maximum.reduceat(corners.max(axis=1), _starts(part))
     return "".join(
         f"{tag} {' '.join(map(repr, box))} {len(groups)} {' '.join(map(str, groups))} 0\n"
-        for tag, (box, groups) in enumerate(zip(boxes.reshape(-1, 6).tolist(), part.groups_of, strict=True), 1)
+        for (tag, groups), box in zip(part.groups_of.items(), boxes.reshape(-1, 6).tolist(), strict=True)
     )
 
 
@@ -293,15 +380,16 @@ def _element_blocks(model: Model, cells: NDArray[np.int64], part: Part) -> str:
     ends = np.append(_starts(part), len(lines)).tolist()
     kind = ELEMENT_TYPES[part.dim, model.order]
     return "".join(
-        f"{part.dim} {k + 1} {kind} {stop - start}\n{''.join(lines[start:stop])}"
-        for k, (start, stop) in enumerate(pairwise(ends))
+        f"{part.dim} {number} {kind} {stop - start}\n{''.join(lines[start:stop])}"
+        for number, (start, stop) in zip(part.groups_of, pairwise(ends), strict=True)
     )
 
 
 def _element_lines(model: Model, cells: NDArray[np.int64], part: Part) -> str:
     """Number, type, two tags: group, entity; nodes."""
     kind = np.full(len(part.numbers), ELEMENT_TYPES[part.dim, model.order])
-    group = np.array([groups[0] for groups in part.groups_of])[part.entities - 1]
+    place = np.searchsorted(list(part.groups_of), part.entities)
+    group = np.array([groups[0] for groups in part.groups_of.values()])[place]
     return rows(part.numbers, kind, np.full_like(kind, 2), group, part.entities, _nodes(model, cells, part) + 1)
 
 

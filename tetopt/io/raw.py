@@ -29,6 +29,7 @@ class Group(NamedTuple):
     label: str  # in the file
     kind: str
     members: NDArray[np.int64]  # ascending
+    number: int = 0  # in the file
 
 
 class Raw(NamedTuple):

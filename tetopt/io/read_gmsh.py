@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import re
 from collections.abc import Callable
 from itertools import islice
@@ -17,6 +18,7 @@ from tetopt.errors import InputError
 from tetopt.io.apart import read_apart
 from tetopt.io.gmsh import OwnComments, own_comments
 from tetopt.io.raw import Group, Raw, by_corners
+from tetopt.model.labels import TABLE_TEXT, LabelTable, table_words
 
 if TYPE_CHECKING:
     import meshio
@@ -66,32 +68,72 @@ def _msh(file: meshio.Mesh, text: bytes) -> Raw:
     point_data = {name: values for name, values in file.point_data.items() if not name.startswith("gmsh:")}
     raw = by_corners(Raw(points, cells, cell_data, point_data, {}, [], "ras"))
     groups = _groups(raw.cells, raw.cell_data, _physical_names(text), _groups_of_entities(text))
-    raw = raw._replace(groups=groups)
     comments = own_comments(_section(text, "Comments").decode("utf-8", "replace").splitlines())
+    raw = _labelled(raw._replace(groups=groups), comments)
     return raw if comments is None else _of_ours(raw, comments)
+
+
+def _labelled(raw: Raw, comments: OwnComments | None) -> Raw:
+    """The file with the numbers of groups as labels of cells, and their names, if each cell is in one group.
+
+    Not so if there are other labels already, or groups of a file of ours are no labels.
+    """
+    kind = _kind_of_cells(raw)
+    groups = [group for group in raw.groups if group.kind == kind]
+    are_materials = any(re.fullmatch(r"material_\d+|unnamed", group.label) for group in groups)
+    is_other = are_materials if comments is None else comments.zero is None
+    labels, n_groups = np.zeros((2, len(raw.cells[kind])), dtype=np.int64)
+    for group in groups:
+        labels[group.members] = group.number
+        n_groups[group.members] += 1
+    if is_other or not (n_groups == 1).all():
+        return raw
+    zero = None if comments is None else comments.zero
+    labels[labels == zero] = 0
+    if "label" in raw.cell_data and not np.array_equal(raw.cell_data["label"][kind], labels):
+        return raw
+    names = {group.number: group.label for group in groups if group.label != f"label_{group.number}"}
+    names = {0 if number == zero else number: name for number, name in names.items() if name != "label_0"}
+    table = {TABLE_TEXT: np.array([json.dumps(table_words(LabelTable(names, {})))])} if names else {}
+    cell_data = raw.cell_data | {"label": {kind: labels}}
+    return raw._replace(cell_data=cell_data, field_data=raw.field_data | table)
+
+
+def _kind_of_cells(raw: Raw) -> str:
+    """The kind of largest dimension."""
+    return max(raw.cells, key=lambda name: CELL_DIMENSIONS.get(name, -1))
 
 
 def _of_ours(raw: Raw, comments: OwnComments) -> Raw:
     """A file of ours with what its comments tell: cell sets and materials are no longer groups and views."""
-    kind = max(raw.cells, key=lambda name: CELL_DIMENSIONS.get(name, -1))
-    entity = _by_value(raw.cell_data["gmsh:geometrical"][kind])
-    blocks_of = {  # gmsh keeps our comments and entities when it writes a file again, if not all of their cells
-        name: [entity[number] for number in numbers if number in entity] for name, numbers in comments.entities.items()
-    }
-    members = {name: np.sort(np.concatenate(parts)) for name, parts in blocks_of.items() if parts}
+    kind = _kind_of_cells(raw)
+    members = _members(raw, kind, comments.cells)
     constants = np.full((2, len(raw.cells[kind])), np.nan)
     for name in comments.constants.keys() & members.keys():
         constants[:, members[name]] = np.array(comments.constants[name])[:, None]
     is_painted = bool(comments.constants) and np.isfinite(constants).all()
     painted = {"young": {kind: constants[0]}, "nu": {kind: constants[1]}} if is_painted else {}
     sets = [Group(name, kind, of_set) for name, of_set in members.items()]
+    for side in {group.kind for group in raw.groups} - {kind}:  # in 2.2 a facet is in one group alone
+        sets += [Group(name, side, of_set) for name, of_set in _members(raw, side, comments.facets).items()]
+    labels_of_sets = {each.label for each in sets}
     dropped = {*members, "gmsh:physical", "gmsh:geometrical"}
     return raw._replace(
         cell_data={name: values for name, values in (painted | raw.cell_data).items() if name not in dropped},
-        field_data={name: np.array([text]) for name, text in comments.texts.items()},
-        groups=[group for group in raw.groups if group.kind != kind] + sets,
+        field_data=raw.field_data | {name: np.array([text]) for name, text in comments.texts.items()},
+        groups=[group for group in raw.groups if group.kind != kind and group.label not in labels_of_sets] + sets,
         space=comments.space,
     )
+
+
+def _members(raw: Raw, kind: str, entities_of: dict[str, list[int]]) -> dict[str, NDArray[np.int64]]:
+    """The elements of a kind in each set, ascending, by the entities that make it up.
+
+    gmsh keeps our comments and entities when it writes a file again, if not all of their elements.
+    """
+    entity = _by_value(raw.cell_data["gmsh:geometrical"][kind])
+    blocks_of = {name: [entity[each] for each in numbers if each in entity] for name, numbers in entities_of.items()}
+    return {name: np.sort(np.concatenate(parts)) for name, parts in blocks_of.items() if parts}
 
 
 def _groups(
@@ -113,7 +155,7 @@ def _groups(
         parts.pop(0, None)  # which stands for no group
         for tag, blocks in sorted(parts.items()):
             label = names.get((dim, tag)) or f"{DEFAULT_LABELS[dim]}_{tag}"
-            groups.append(Group(label, kind, np.sort(np.concatenate(blocks))))
+            groups.append(Group(label, kind, np.sort(np.concatenate(blocks)), tag))
     return groups
 
 

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Container
+from itertools import count
 from typing import NamedTuple
 
 import numpy as np
@@ -12,8 +14,10 @@ from tetopt.errors import InputError
 from tetopt.geometry.topology import facets
 from tetopt.io.text import free_text
 from tetopt.mesh import Mesh
+from tetopt.model.labels import TABLE_TEXT, labels_of, table_of_words
 from tetopt.model.loads import count_of_steps, load_words
 from tetopt.model.model import Model, described
+from tetopt.model.sets import MOST_LETTERS, free_name, label_set_names
 
 
 class Tagged(NamedTuple):
@@ -46,10 +50,10 @@ def tagged(sets: dict[str, NDArray[np.int64]]) -> Tagged:
     return Tagged(items, rank[kind.ravel()], tags_of)
 
 
-def cell_tags(model: Model) -> Tagged:
-    """Every cell, with one tag for each combination of a material ("material_1", ...) and cell sets.
+def cell_tags(model: Model, labels: NDArray[np.int64] | None = None) -> Tagged:
+    """Every cell, with one tag for each combination of a label, a material ("material_1", ...) and cell sets.
 
-    Tags go by material: they are the materials' numbers from 1 where no set divides one.
+    Without `labels` (M,) tags go by material: they are the materials' numbers from 1 where no set divides one.
 
     Raises
     ------
@@ -61,11 +65,13 @@ def cell_tags(model: Model) -> Tagged:
     combination = np.zeros(len(model.mesh.cells), dtype=np.int64)
     combination[combined.items] = combined.tags
     material = np.zeros_like(combination) if model.materials is None else model.materials.of_cell
-    kinds, which = np.unique(np.column_stack([material, combination]), axis=0, return_inverse=True)
-    ends = np.searchsorted(kinds[:, 0], np.arange(len(names) + 1))
-    tags_of = {name: list(range(ends[k] + 1, ends[k + 1] + 1)) for k, name in enumerate(names)}
+    columns = [np.zeros_like(combination) if labels is None else labels, material, combination]
+    kinds, which = np.unique(np.column_stack(columns), axis=0, return_inverse=True)
+    ends = np.cumsum(np.bincount(kinds[:, 1], minlength=len(names)))[:-1]
+    of_material = np.split(np.argsort(kinds[:, 1], kind="stable") + 1, ends)
+    tags_of = {name: tags.tolist() for name, tags in zip(names, of_material, strict=False)}  # without names, one part
     for name, tags in combined.tags_of.items():
-        tags_of[name] = (np.flatnonzero(np.isin(kinds[:, 1], tags)) + 1).tolist()
+        tags_of[name] = (np.flatnonzero(np.isin(kinds[:, 2], tags)) + 1).tolist()
     return Tagged(np.arange(len(material)), which.ravel() + 1, tags_of)
 
 
@@ -87,6 +93,37 @@ def material_names(model: Model, taken: dict[str, NDArray[np.int64]]) -> list[st
     """ "material_1", ... of the model's materials; InputError if a set among `taken` is called that."""
     names = [] if model.materials is None else [f"material_{k + 1}" for k in range(len(model.materials.young))]
     check_apart(names, taken)
+    return names
+
+
+def named_materials(model: Model) -> list[str]:
+    """Names of the model's materials by their labels: "liver", or "label_5" of one without a name.
+
+    A material of several whole labels has their names joined, and those that divide a label have its name and a number.
+    What remains, as of materials that are parts of several labels, is "material_1", ...
+    """
+    names = material_names(model, {})
+    labels = labels_of(model.cell_data, len(model.mesh.cells))
+    if model.materials is None or labels is None:
+        return names
+    called = label_set_names(np.unique(labels).tolist(), table_of_words(model.about.get(TABLE_TEXT)).names)
+    labels_in: dict[int, list[int]] = {}
+    for material, label in np.unique(np.column_stack([model.materials.of_cell, labels]), axis=0).tolist():
+        labels_in.setdefault(material, []).append(label)
+    n_materials = Counter(label for those in labels_in.values() for label in those)
+    own = {called[label]: np.flatnonzero(labels == label) for label in called}
+    number_in = {name: count(1) for name in own}
+    taken = {name.lower() for name in (*model.sets.facets, *model.sets.cells, *called.values())}
+    for material, those in labels_in.items():
+        name = "_".join(called[label] for label in those)
+        is_whole = all(n_materials[label] == 1 for label in those)
+        if len(name) > MOST_LETTERS or not (is_whole or len(those) == 1):
+            continue
+        is_set = is_whole and len(those) == 1 and name not in model.sets.facets
+        if not is_set or not np.array_equal(model.sets.cells.get(name, own[name]), own[name]):
+            name = free_name(name if is_whole else f"{name}_{next(number_in[name])}", taken)
+        names[material] = name
+        taken.add(name.lower())
     return names
 
 

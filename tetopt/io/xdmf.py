@@ -1,9 +1,9 @@
-"""XDMF for FEniCSx (dolfinx) and ParaView: one file of text with the mesh, its moduli and tags of its sets.
+"""XDMF for FEniCSx (dolfinx), ParaView and meshio: one file of text with the mesh, its moduli and tags of its sets.
 
-There are three grids: "mesh" with what is on each cell, first `material` from 1, then `young` and `nu`; "facets" and
-"cells", if there are such sets, with one integer for each facet or cell that is in any set. A tag stands for one
-combination of sets, so a set is several tags: <Information Name="superior" Value="2 5"/> in the grid names them. This
-reads all of it, on any number of processes::
+The domain has one grid, "mesh", as meshio wants it, with what is on each cell, first `material` from 1, then `young`
+and `nu`. An <Information> in it holds the others: "facets" and "cells", if there are such sets, with one integer for
+each facet or cell that is in any set. A tag stands for one combination of sets, so a set is several tags:
+<Information Name="superior" Value="2 5"> in the grid names them. This reads all of it, on any number of processes::
 
     from xml.etree import ElementTree
 
@@ -12,12 +12,13 @@ reads all of it, on any number of processes::
     from dolfinx.io import XDMFFile
     from mpi4py import MPI
 
+    inner = "/Xdmf/Domain/Grid/Information/Grid"
     with XDMFFile(MPI.COMM_WORLD, "model.xdmf", "r", encoding=XDMFFile.Encoding.ASCII) as file:
         mesh = file.read_mesh(name="mesh")
         dim = mesh.topology.dim
         mesh.topology.create_connectivity(dim - 1, dim)
-        facet_tags = file.read_meshtags(mesh, name="facets")
-        cell_tags = file.read_meshtags(mesh, name="cells")
+        facet_tags = file.read_meshtags(mesh, name="facets", xpath=inner)
+        cell_tags = file.read_meshtags(mesh, name="cells", xpath=inner)
         material_tags = file.read_meshtags(mesh, name="mesh")
 
     root = ElementTree.parse("model.xdmf").getroot()
@@ -41,9 +42,9 @@ beside this one. It reads no floating point numbers of cells from XDMF, hence th
 there, on cells of either order: a file of order 2 has the nodes of order 2, too, of cells that are as straight, which
 dolfinx integrates as if they were curved.
 
-In the grid "mesh" <Information Name="young"/> and <Information Name="nu"/> list what the materials 1, 2, ... have. In
-the domain <Information Name="load" Value="hold:superior"/> is a load in the words of `tetopt.model.loads`, and
-<Information Name="about"/> says where the file comes from, in what coordinates and units. With a test function `v` of a
+In the grid "mesh" <Information Name="young"> and <Information Name="nu"> list what the materials 1, 2, ... have,
+<Information Name="load" Value="hold:superior"> is a load in the words of `tetopt.model.loads`, and
+<Information Name="about"> says where the file comes from, in what coordinates and units. With a test function `v` of a
 space `V` of vectors, on from the program above, this applies the loads of step 1::
 
     import ufl
@@ -51,7 +52,7 @@ space `V` of vectors, on from the program above, this applies the loads of step 
     normal, ds = ufl.FacetNormal(mesh), ufl.Measure("ds", mesh, subdomain_data=facet_tags)
     per_mm3 = 1e-9  # kg in a kg/m3; 1e-12 t if moduli are in MPa
     conditions, forces, springs = [], [], []
-    for load in root.findall("./Domain/Information[@Name='load']"):
+    for load in root.findall("./Domain/Grid/Information[@Name='load']"):
         step, _, words = load.get("Value").rpartition("/")
         kind, *rest = words.split(":")
         if step not in ("", "1"):
@@ -77,8 +78,9 @@ space `V` of vectors, on from the program above, this applies the loads of step 
 
 Moduli that are linear within cells are the attribute `young_nodes`, one for each node.
 
-VTK, and with it pyvista and ParaView, reads the grids as blocks, as long as no list is longer than 10 MB, which that of
-the cells is from some 400 000 tetrahedra on: take .vtu for those. meshio 5.3.5 reads no XDMF with more than one grid.
+VTK, and with it pyvista and ParaView, follows the grid's Reference to a tree of the same grids, which it reads as
+blocks, as long as no list is longer than 10 MB, which that of the cells is from some 400 000 tetrahedra on: use .vtu
+for those. meshio ignores the Reference and reads the mesh and its data, without the sets.
 """
 
 from __future__ import annotations
@@ -100,9 +102,9 @@ TOPOLOGY_TYPES = {
     (1, 2): '"Edge_3"', (2, 2): '"Triangle_6"', (3, 2): '"Tetrahedron_10"',
 }  # fmt: skip
 GEOMETRY_TYPES = {2: "XY", 3: "XYZ"}
-# Not by XInclude, as dolfinx writes it: VTK 9.7 crashes on the address that dolfinx gives for that.
-POINTS_REFERENCE = '<DataItem Reference="XML">/Xdmf/Domain/Grid[@Name="mesh"]/Geometry/DataItem</DataItem>\n'
-TIME_ELEMENT = '<Time Value="0"/>\n'  # pyvista 0.49 reads no XDMF without
+TREE_PATH = "/Xdmf/Domain/Grid/Information/Grid"
+TIME_ELEMENT = '<Time Value="0"/>\n'  # pyvista 0.49 reads no XDMF without, meshio 5.3.5 none with it
+INFORMATION_TEXT = "&lt;main/&gt;"  # meshio takes an Information's text for XML
 
 
 def xdmf(model: Model) -> bytes:
@@ -119,16 +121,14 @@ def xdmf(model: Model) -> bytes:
         Data of cells or points that is not finite, since VTK stops reading there and makes up the rest.
     """
     _check(model)
-    parts = [_information("about", line) for line in described(model)]
-    parts += [_information("load", load_words(load)) for load in model.loads]
-    parts.append(_mesh_grid(model))
+    grids = []
     if model.sets.facets:
-        parts.append(_facet_grid(model))
+        grids.append(_facet_grid(model))
     if model.sets.cells:
         combined, dim = tagged(model.sets.cells), model.mesh.ndim
         nodes = elements(model)[1][combined.items]
-        parts.append(_tag_grid("cells", model, dim, nodes, combined))
-    text = "".join(parts)
+        grids.append(_tag_grid("cells", model, dim, nodes, combined))
+    text = _mesh_grid(model, "".join(grids))
     return (
         f'<?xml version="1.0" encoding="utf-8"?>\n<Xdmf Version="3.0">\n<Domain>\n{text}</Domain>\n</Xdmf>\n'.encode()
     )
@@ -142,21 +142,34 @@ def _check(model: Model) -> None:
                 raise InputError(f"xdmf: expected finite {what} data, {words}")
 
 
-def _mesh_grid(model: Model) -> str:
-    fields, table = model.cell_data, ""
+def _mesh_grid(model: Model, others: str) -> str:
+    """The domain's grid, with the tree of all grids that VTK reads instead: itself by references, and `others`."""
+    fields = model.cell_data
+    named = [("about", line) for line in described(model)] + [("load", load_words(load)) for load in model.loads]
     if model.materials is not None:
         young, nu, of_cell = model.materials.young, model.materials.nu, model.materials.of_cell
         own = {"material": of_cell + 1, "young": young[of_cell], "nu": nu[of_cell]}
         if model.materials.density is not None:
             own["density"] = model.materials.density[of_cell]
         fields = own | {name: values for name, values in fields.items() if name not in own}
-        table = _information("young", _listed(young)) + _information("nu", _listed(nu))
+        named += [("young", _listed(young)), ("nu", _listed(nu))]
     points, cells = elements(model)
     nodal = {} if model.node_young is None else {NODE_MODULI: model.node_young}
     nodal |= model.point_data
     at_nodes = {name: node_field(values, model.mesh, model.order) for name, values in nodal.items()}
-    attributes = "".join(_attributes(_columns(each), of) for each, of in ((fields, "Cell"), (at_nodes, "Node")))
-    return _grid("mesh", model, model.mesh.ndim, cells, _item(points), attributes, table)
+    columns = [(*item, "Cell") for item in _columns(fields).items()]
+    columns += [(*item, "Node") for item in _columns(at_nodes).items()]
+    whole = _body(model, model.mesh.ndim, cells, _item(cells), _item(points))
+    whole += "".join(_attribute(name, values, center, _item(values)) for name, values, center in columns)
+    shown = _body(model, model.mesh.ndim, cells, _reference("Topology"), _reference("Geometry"))
+    shown += "".join(
+        _attribute(name, values, center, _reference(f"Attribute[{k}]"))
+        for k, (name, values, center) in enumerate(columns, 1)
+    )
+    tree = f'<Grid Name="all" GridType="Tree">\n<Grid Name="mesh">\n{TIME_ELEMENT}{shown}</Grid>\n{others}</Grid>\n'
+    tree = f'<Information Name="grids">{INFORMATION_TEXT}\n{tree}</Information>\n'
+    texts = "".join(_information(*each) for each in named)
+    return f'<Grid Name="mesh" GridType="Uniform" Reference="{TREE_PATH}">\n{texts}{whole}{tree}</Grid>\n'
 
 
 def _columns(fields: dict[str, NDArray]) -> dict[str, NDArray]:
@@ -180,38 +193,51 @@ def _facet_grid(model: Model) -> str:
 
 def _tag_grid(name: str, model: Model, dim: int, nodes: NDArray[np.int64], combined: Tagged) -> str:
     named = "".join(_information(each, " ".join(map(str, those))) for each, those in combined.tags_of.items())
-    return _grid(name, model, dim, nodes, POINTS_REFERENCE, _attributes({name: combined.tags}, "Cell"), named)
+    body = _body(model, dim, nodes, _item(nodes), _reference("Geometry"))
+    tags = _attribute(name, combined.tags, "Cell", _item(combined.tags))
+    return f'<Grid Name="{name}" GridType="Uniform">\n{named}{TIME_ELEMENT}{body}{tags}</Grid>\n'
 
 
-def _attributes(columns: dict[str, NDArray], center: str) -> str:
-    return "".join(
-        f'<Attribute Name="{xml_attribute(name)}" AttributeType="{"Scalar" if values.ndim == 1 else "Vector"}" '
-        f'Center="{center}">\n{_item(values)}</Attribute>\n'
-        for name, values in columns.items()
-    )
-
-
-def _grid(name: str, model: Model, dim: int, nodes: NDArray[np.int64], points: str, attributes: str, named: str) -> str:
+def _body(model: Model, dim: int, nodes: NDArray[np.int64], node_item: str, point_item: str) -> str:
     return (
-        f'<Grid Name="{name}" GridType="Uniform">\n{named}{TIME_ELEMENT}'
         f'<Topology TopologyType={TOPOLOGY_TYPES[dim, model.order]} NumberOfElements="{len(nodes)}">\n'
-        f"{_item(nodes)}</Topology>\n"
-        f'<Geometry GeometryType="{GEOMETRY_TYPES[model.mesh.ndim]}">\n{points}</Geometry>\n'
-        f"{attributes}</Grid>\n"
+        f"{node_item}</Topology>\n"
+        f'<Geometry GeometryType="{GEOMETRY_TYPES[model.mesh.ndim]}">\n{point_item}</Geometry>\n'
     )
+
+
+def _attribute(name: str, values: NDArray, center: str, item: str) -> str:
+    return (
+        f'<Attribute Name="{xml_attribute(name)}" AttributeType="{"Scalar" if values.ndim == 1 else "Vector"}" '
+        f'Center="{center}" Dimensions="{_sizes(values)}">\n{item}</Attribute>\n'
+    )
+
+
+def _reference(part: str) -> str:
+    """The item of a part of the domain's grid.
+
+    Not by XInclude, as dolfinx writes it: VTK 9.7 crashes on the address that dolfinx gives for that.
+    """
+    return f'<DataItem Reference="XML">/Xdmf/Domain/Grid/{part}/DataItem</DataItem>\n'
+
+
+def _sizes(values: NDArray) -> str:
+    return " ".join(map(str, values.shape))
 
 
 def _item(values: NDArray) -> str:
     is_float = values.dtype.kind == "f"
     exact = values.astype(np.float64 if is_float else np.int64)
     return (
-        f'<DataItem Dimensions="{" ".join(map(str, values.shape))}" NumberType="{"Float" if is_float else "Int"}" '
+        f'<DataItem Dimensions="{_sizes(values)}" NumberType="{"Float" if is_float else "Int"}" '
         f'Precision="8" Format="XML">\n{rows(exact)}</DataItem>\n'
     )
 
 
 def _information(name: str, value: str) -> str:
-    return f'<Information Name="{xml_attribute(name)}" Value="{xml_attribute(value)}"/>\n'
+    return (
+        f'<Information Name="{xml_attribute(name)}" Value="{xml_attribute(value)}">{INFORMATION_TEXT}</Information>\n'
+    )
 
 
 def _listed(values: NDArray[np.float64]) -> str:

@@ -25,7 +25,7 @@ from tetopt.model.file import (
     sets_beside,
     without_results,
 )
-from tetopt.model.labels import TABLE_TEXT, LabelTable, labels_of, table_of_words, table_words
+from tetopt.model.labels import TABLE_TEXT, LabelTable, coloured, labels_of, table_of_words, table_words
 from tetopt.model.laws import ByLabel, Law, has_column, law_values, parse_any_law, young_from
 from tetopt.model.loads import parse_load, parse_loads
 from tetopt.model.materials import DEFAULT_NU, Materials, Spacing, binned, by_label, density_of, materials
@@ -147,12 +147,11 @@ def model_of(
     if image is not None and image.ndim != mesh.ndim:
         raise InputError(f"image: expected a {mesh.ndim}-D one, as the mesh is, got a {image.ndim}-D one")
     cell_data = cell_fields(mesh, image) if cell_data is None else dict(cell_data)
-    about = _with_table_in_words(about or {})
+    labels = labels_of(cell_data, len(mesh.cells))
+    about = _with_table_in_words(about or {}, labels)
     mean = cell_data.get("mean")
     mean = mean if mean is not None and mean.ndim == 1 else None
-    cells = _Cells(
-        mesh, image, mean, labels_of(cell_data, len(mesh.cells)), table_of_words(about.get(TABLE_TEXT)).names
-    )
+    cells = _Cells(mesh, image, mean, labels, table_of_words(about.get(TABLE_TEXT)).names)
     if known_sets is None:
         box = box_of(image) if box is None and image is not None else box
         known_sets = _sets(cells, box, cell_data, loaded, loads)
@@ -193,10 +192,13 @@ def _texts_of(loaded: MeshFile, box: Box | None) -> dict[str, Any]:
     return texts if box is None else texts | {"box": box_text(box)}
 
 
-def _with_table_in_words(about: dict[str, Any]) -> dict[str, Any]:
-    """The texts with a table of labels as JSON can hold it."""
+def _with_table_in_words(about: dict[str, Any], labels: NDArray[np.int64] | None) -> dict[str, Any]:
+    """The texts with a table of labels as JSON can hold it, in which all labels of cells have a colour."""
     table = about.get(TABLE_TEXT)
-    return about | {TABLE_TEXT: table_words(table)} if isinstance(table, LabelTable) else dict(about)
+    if table is None and labels is None:
+        return dict(about)
+    known = table if isinstance(table, LabelTable) else table_of_words(table)
+    return about | {TABLE_TEXT: table_words(known if labels is None else coloured(known, labels))}
 
 
 def _sets(

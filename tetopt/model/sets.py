@@ -401,18 +401,25 @@ def finite_numbers(text: str) -> NDArray[np.float64]:
 
 
 def rows_of(mesh: Mesh, nodes: NDArray[np.int64]) -> NDArray[np.int64]:
-    """Rows (cell, k), ascending, of facets given by their nodes (K, n) in any order; what is no facet is left out.
+    """Rows (cell, k), ascending, of facets given by their nodes (K, n); what is no facet is left out.
 
-    A facet between two cells is held by the first of them.
+    A facet between two cells is held by the one that its nodes, as those of `facet_triples`, face out of.
     """
     shared = facets(mesh.cells)
     distinct, which = np.unique(np.concatenate([shared.nodes, np.sort(nodes, axis=1)]), axis=0, return_inverse=True)
     place = np.full(len(distinct), -1)
     place[which.ravel()[: len(shared.nodes)]] = np.arange(len(shared.nodes))
-    number = np.unique(place[which.ravel()[len(shared.nodes) :]])
-    number = number[number >= 0]
-    cell = shared.cells[number, 0]
-    rows = np.column_stack([cell, (shared.of_cell[cell] == number[:, None]).argmax(axis=1)])
+    number, listed = np.unique(place[which.ravel()[len(shared.nodes) :]], return_index=True)
+    number, listed = number[number >= 0], nodes[listed[number >= 0]]
+
+    def held_by(cell: NDArray[np.int64]) -> NDArray[np.int64]:
+        return np.column_stack([cell, (shared.of_cell[cell] == number[:, None]).argmax(axis=1)])
+
+    first, second = shared.cells[number].T
+    rows = held_by(first)
+    rolled = [np.roll(listed, k, axis=1) for k in range(1 if mesh.ndim == 2 else 3)]  # which face the same way
+    faces_out = np.any([(facet_triples(mesh.cells, rows) == each).all(axis=1) for each in rolled], axis=0)
+    rows = np.where((faces_out | (second < 0))[:, None], rows, held_by(second))
     return rows[np.lexsort(rows.T[::-1])]
 
 

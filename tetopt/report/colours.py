@@ -11,28 +11,20 @@ from numpy.typing import NDArray
 
 from tetopt.image import Image
 from tetopt.io.text import plain
+from tetopt.model.labels import colours_by_number
 from tetopt.target.labels import check_labels
 
 BACKGROUND_COLOUR = "#e6e6e6"  # of label 0
 UNCOVERED_COLOUR = "#cfe3f5"  # where a mesh leaves the image uncovered
 LISTED_LABELS = 12  # labels in a legend: more would not be told apart by their colours alone
-# Okabe and Ito's, then always the colour farthest in CIELAB from all before, and twice as far from the background,
-# black and white, as seen with normal, no red or no green cones (Machado et al. 2009): any two are 10 or more apart, of
-# the first 20 any two 14, and all are 20 from the background.
-LABEL_PALETTE = (
-    "#0072b2", "#e69f00", "#009e73", "#d55e00", "#56b4e9", "#cc79a7", "#f0e442", "#0000ff", "#6969ff", "#5a00b4",
-    "#963c1e", "#87d269", "#781e78", "#7896ff", "#f02d5a", "#a51e69", "#d200b4", "#004bff", "#b40f4b", "#f07887",
-    "#e15a3c", "#690f96", "#3cf096", "#f0964b", "#1e4b2d", "#2d6978", "#c32d00", "#a52dd2", "#3c00d2", "#e178d2",
-    "#f0d25a", "#a569d2", "#78b496", "#d2a5d2", "#870f2d", "#d2a578", "#965a3c", "#78d2f0", "#a569a5", "#d21e87",
-)  # fmt: skip
 
 
 def label_colours(labels: Image, own: Mapping[int, tuple[float, float, float]] | None = None) -> NDArray[np.float64]:
     """Colour of each label, so that ``label_colours(labels)[label]`` paints an array of labels.
 
-    The labels with most voxels have the colours that are told apart best; after the palette's last they begin again.
-    Those that have colours of their `own`, such as `tetopt.model.labels.LabelTable.colours`, keep these. 0 is the
-    background, always in light grey: tables have it in black.
+    A label has the same colour in all pictures: its `own`, such as `tetopt.model.labels.LabelTable.colours` has it, or
+    that of its number (`tetopt.model.labels.colours_by_number`). 0 is the background, always in light grey: tables have
+    it in black.
 
     Parameters
     ----------
@@ -51,11 +43,8 @@ def label_colours(labels: Image, own: Mapping[int, tuple[float, float, float]] |
         Labels that are not whole numbers in this range.
     """
     check_labels("labels", labels)
-    counts = np.bincount(labels.data.astype(np.int64).ravel())
-    by_size = np.argsort(-counts[1:], kind="stable") + 1
-    colours = np.empty((len(counts), 3))
+    colours = colours_by_number(np.arange(int(labels.data.max()) + 1))
     colours[0] = to_rgba_array(BACKGROUND_COLOUR)[0, :3]
-    colours[by_size] = to_rgba_array(LABEL_PALETTE)[np.arange(len(by_size)) % len(LABEL_PALETTE), :3]
     for label, colour in (own or {}).items():
         if 0 < label < len(colours):
             colours[label] = colour

@@ -25,6 +25,7 @@ from tetopt.geometry.topology import facets
 from tetopt.image import Image
 from tetopt.io.files import check_suffix, save_bytes
 from tetopt.mesh import Mesh
+from tetopt.model.labels import NO_TABLE, LabelTable
 from tetopt.report.colours import grey_limits, label_colours
 from tetopt.report.figures import FIGURE_SUFFIXES, MASK_LINE, MESH_LINE
 
@@ -45,7 +46,7 @@ VIEW_AXES = {
 
 def save_thumbnail(
     path: Path, image: Image, mesh: Mesh, mask: Image | None = None, labels: Image | None = None,
-    of_cell: NDArray[np.int64] | None = None,
+    of_cell: NDArray[np.int64] | None = None, table: LabelTable = NO_TABLE,
 ) -> None:  # fmt: skip
     """Write the slices of an image with its mesh over them as PNG, whole or not at all; the same bytes for the same.
 
@@ -68,18 +69,20 @@ def save_thumbnail(
         Its colours are those of `tetopt.report.figures.label_figure`.
     of_cell : (M,) int64, optional
         Each cell's label, where there are `labels`: cells of others than 0 have their colours.
+    table : LabelTable
+        Colours of labels.
 
     Raises
     ------
     InputError
         A name that ends otherwise.
     """
-    save_bytes(check_suffix(path, FIGURE_SUFFIXES), thumbnail_png(image, mesh, mask, labels, of_cell))
+    save_bytes(check_suffix(path, FIGURE_SUFFIXES), thumbnail_png(image, mesh, mask, labels, of_cell, table))
 
 
 def thumbnail_png(
     image: Image, mesh: Mesh, mask: Image | None = None, labels: Image | None = None,
-    of_cell: NDArray[np.int64] | None = None,
+    of_cell: NDArray[np.int64] | None = None, table: LabelTable = NO_TABLE,
 ) -> bytes:  # fmt: skip
     """The bytes of `save_thumbnail`."""
     views = VIEW_AXES[image.ndim]
@@ -91,7 +94,7 @@ def thumbnail_png(
     pixels = [_sampled(image, place, axes, half) for place, axes in zip(places, views, strict=True)]
     seen = [each[np.isfinite(each)] for each in pixels]
     limits = grey_limits([np.concatenate(seen)] if sum(map(len, seen)) else [np.zeros(1)], brightest=99.8)
-    colours = None if labels is None or of_cell is None else label_colours(labels)
+    colours = None if labels is None or of_cell is None else label_colours(labels, table.colours)
     figure = Figure(figsize=(len(views), 1.0), dpi=SIDE_PIXELS, facecolor="black")
     for k, (place, axes) in enumerate(zip(places, views, strict=True)):
         panel = figure.add_axes((k / len(views), 0.0, 1.0 / len(views), 1.0))

@@ -165,9 +165,12 @@ def _output(words: list[str], stem: str) -> Path:
 
 
 def _own_labels(loaded: MeshFile, kept: NDArray[np.int64], job: Job) -> tuple[NDArray[np.int64] | None, list[str]]:
-    """The label that a program gives each cell kept, as "label" in its file, -1 if it is none of the image's."""
+    """The label that a program gives each cell kept, as "label" in its file, -1 if it is none of the image's.
+
+    A label that all cells have is the number of a file's only part.
+    """
     labels = loaded.cell_data.get("label")
-    if labels is None or job.labels is None or labels.ndim != 1:
+    if labels is None or job.labels is None or labels.ndim != 1 or len(np.unique(labels)) == 1:
         return None, []
     is_known = np.isin(labels[kept], np.unique(job.labels.data))
     note = f'{is_known.sum()} of {len(kept)} cells count for the "label" that its file gives them'
