@@ -9,6 +9,7 @@ from commands import exit_code, numbers_in
 from shapes import OBLIQUE, distance, grid, shaped
 
 import tetopt
+from tetopt.model.sets import nodes_of
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +46,7 @@ def run(inputs, tmp_path_factory):
     command = ["mesh", inputs / "image.nii.gz", inputs / "square.nii.gz", "--weights", "1,0.5"]
     command += ["--mask", inputs / "mask.nii.gz", "--labels", inputs / "labels.nii.gz", "--nodes", "600"]
     command += ["-o", out / "mesh.vtu", "--json", out / "run.json", "--figures", out]
+    command += ["--young", "2", "--load", "compress:2%"]
     assert exit_code(*command) == 0
     return out
 
@@ -83,6 +85,26 @@ def test_the_numbers(run):
     assert 0.0 < numbers["energies"]["E_D_share_of_variance"] < 0.5
 
 
+def test_an_organ_is_compressed_between_its_own_top_and_bottom(run, tmp_path, capsys):
+    """By `mesh`, `convert` and `fem` alike, though nothing of it lies on the box's faces."""
+    loaded = tetopt.load_mesh(run / "mesh.vtu")
+    push = 0.02 * np.ptp(loaded.mesh.points[:, 2])
+    assert exit_code("convert", run / "mesh.vtu", tmp_path / "a.inp", "--young", "3", "--load", "compress:2%") == 0
+    assert re.search(r"\ninferior +\d+ +\d+ *\n", capsys.readouterr().out)
+    more = ["--load", "compress:2%", "-o", tmp_path / "solved.vtu"]
+    for words in ([], more):  # first the loads that `mesh` wrote
+        assert exit_code("fem", run / "mesh.vtu", *words, "--json", tmp_path / "a.json", "--force") == 0
+        (step,) = numbers_in(tmp_path / "a.json")["steps"]
+        assert step["largest_displacement"] == pytest.approx(push, rel=0.1)
+        assert step["reactions"]["superior"][2] < 0.0 < step["reactions"]["inferior"][2]
+    solved = tetopt.load_mesh(tmp_path / "solved.vtu")
+    pressed = nodes_of(solved.mesh, solved.sets.facets["inferior"])
+    assert solved.mesh.points[pressed, 2].max() < np.percentile(loaded.mesh.points[:, 2], 25)
+    assert exit_code("convert", run / "mesh.vtu", tmp_path / "b.inp", "--load", "hold:top") == 2
+    names = "boundary, left, right, posterior, anterior, inferior, superior, mask_surface, interface"
+    assert f'no set of facets "top"; there are {names}' in " ".join(capsys.readouterr().err.split())
+
+
 def test_the_pictures(run):
     for name in ("slice", "rho", "energies", "boundary", "labels"):
         assert (run / f"{name}.png").stat().st_size > 10_000
@@ -116,7 +138,10 @@ def test_background(inputs, tmp_path, background, capsys):
     numbers = numbers_in(tmp_path / "a.json")
     assert 0.0 < numbers["inputs"]["background"] < 400.0
     assert tetopt.quality(mesh.points, mesh.cells).volume == pytest.approx(ball, rel=0.05)  # the cavity stays in
-    assert "E_D, share of the image's variance" in capsys.readouterr().out
+    captured = capsys.readouterr()
+    assert "E_D, share of the image's variance" in captured.out
+    assert "boundary to the foreground's surface" in captured.out
+    assert "mask" not in captured.out + captured.err
 
 
 def test_labels_alone(inputs, tmp_path, capsys):
@@ -201,6 +226,17 @@ def test_files_on_other_grids_are_told(inputs, tmp_path, capsys):
     assert "square.nii.gz: taken to the image's voxels, linearly" in said
     assert "half.nii.gz: taken to the image's voxels, nearest neighbour" in said
     assert "% of it lies in the image; is it of the same scan?" in said
+
+
+def test_a_crop_is_no_other_scan(inputs, tmp_path, capsys):
+    """What a crop leaves out of labels on the same voxels is no fault, and they are not resampled."""
+    mask = shaped("ball", OBLIQUE)[1]
+    tetopt.save_image(tmp_path / "m.nii.gz", mask)
+    command = ["mesh", inputs / "image.nii.gz", "--crop", "14:,:,2:30", "--nodes", "300", "--iterations", "0"]
+    assert exit_code(*command, "--mask", tmp_path / "m.nii.gz", "-o", tmp_path / "a.vtu") in (0, 1)
+    said = capsys.readouterr().err
+    assert "m.nii.gz" not in said
+    assert f"within a mask of {int(mask.data[14:, :, 2:30].sum())} voxels" in said
 
 
 def test_a_mesh_of_a_mask_is_checked_as_one(run, inputs, capsys):

@@ -297,7 +297,7 @@ def _described(task: Task, initial: Mesh) -> str:
     more = [f"and {len(source.paths) - 1} more"] if len(source.paths) > 1 else []
     more += ["labels"] if source.labels is not None else []
     if source.mask is not None:
-        more += [f"within a mask of {int((source.mask.data >= INSIDE_SHARE).sum())} voxels"]
+        more += [f"within a {source.mask_word} of {int((source.mask.data >= INSIDE_SHARE).sum())} voxels"]
     return ", ".join([f"{source.paths[0]}: {size} voxels of {spacing} mm", *more]) + f"; {start}"
 
 
@@ -407,7 +407,7 @@ def _draw(task: Task, outcome: Outcome, model: Model) -> None:
     figures.save_run_figures(pictures[:3], source.image, outcome.initial, outcome.result, task.start_name, image)
     of_cell = model.cell_data.get("label")
     if source.mask is not None:
-        figures.save_figure(figures.boundary_figure(image, source.mask, mesh), pictures[3])
+        figures.save_figure(figures.boundary_figure(image, source.mask, mesh, word=source.mask_word), pictures[3])
     if source.labels is not None:
         other = None if np.array_equal(image.data, source.labels.data) else image
         figure = figures.label_figure(source.labels, mesh, of_cell, other, source.table)
@@ -422,18 +422,19 @@ def _print(task: Task, outcome: Outcome, model: Model, measured: dict[str, Any])
     """
     plan, content, result = task.plan, task.source.content, outcome.result
     solver, output = plan.solver, plan.output
-    code = check_promises(result, measured)
+    code = check_promises(result, measured, task.source.mask_word)
     if task.source.is_constant:
         measured = {**measured, "cells_without_voxel": 0}  # whose values are right all the same
     is_counted = plan.mode == "graded" and plan.sizes.target_error is None
     n_nodes = node_count(model.mesh.points, model.mesh.cells, model.order)
     asked_nodes = plan.sizes.nodes if is_counted else None
-    warn_of_result(result, plan.engine.method, plan.mode, n_nodes, asked_nodes, measured)
+    spacing = task.source.contrasts[0].spacing
+    warn_of_result(result, plan.engine.method, plan.mode, n_nodes, asked_nodes, measured, spacing)
     if task.sizes is not None:
         edges = outcome.shapes[1]
         warn_of_sizes(task.sizes, edges.min_edge, edges.max_edge, measured.get("edges_over_target"))
     _print_comparison(content, outcome, task.start_name, model.order, measured["cells_without_voxel"])
-    print_fidelity(measured, model.mesh.ndim)
+    print_fidelity(measured, model.mesh.ndim, task.source.mask_word)
     if solver.are_any() or output.mesh.suffix.lower() != ".vtu":
         print_model(output.mesh, model, solver)
     else:

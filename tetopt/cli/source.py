@@ -41,6 +41,11 @@ class Source(NamedTuple):
         return continued(self.contrasts[0], self.content.continuation)
 
     @property
+    def mask_word(self) -> str:
+        """The word of messages for the part of the image that is meshed."""
+        return "mask" if self.about["inputs"]["background"] is None else "foreground"
+
+    @property
     def low(self) -> float:
         """The least intensity."""
         return float(self.image.data.min())
