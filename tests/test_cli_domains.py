@@ -9,6 +9,7 @@ from commands import exit_code, numbers_in
 from shapes import OBLIQUE, distance, grid, shaped
 
 import tetopt
+from tetopt.cli import run as cli_run
 from tetopt.model.sets import nodes_of
 
 
@@ -83,6 +84,18 @@ def test_the_numbers(run):
     assert [row["weight"] for row in numbers["contrasts"]] == [1.0, 0.5]
     assert 0.0 < numbers["contrasts"][1]["E_D_share_of_variance"] < 0.5
     assert 0.0 < numbers["energies"]["E_D_share_of_variance"] < 0.5
+
+
+def test_the_wait_for_a_start_is_said(inputs, tmp_path, monkeypatch, capsys):
+    """Where there is no terminal a line from time to time, of what is read and of the mesh that a run begins with."""
+    monkeypatch.setattr(cli_run, "LINE_SECONDS", 0.01)
+    command = ["mesh", inputs / "image.nii.gz", "--mask", inputs / "mask.nii.gz", "--nodes", "600", "--iterations", "0"]
+    assert exit_code(*command, "-o", tmp_path / "a.vtu") == 0
+    begun, octree, rest = capsys.readouterr().err.partition("octree of ")
+    assert octree
+    assert "reading and preparing the image" in begun
+    assert "making the initial mesh, " in begun
+    assert "making the initial mesh" not in rest
 
 
 def test_an_organ_is_compressed_between_its_own_top_and_bottom(run, tmp_path, capsys):

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple
@@ -44,7 +45,7 @@ from tetopt.cli.plan import Plan, planned, with_numbers
 from tetopt.cli.predict import print_prediction, size_of_run, stated_prediction
 from tetopt.cli.promises import check_promises, warn_of_result, warn_of_sizes
 from tetopt.cli.request import requested
-from tetopt.cli.run import prepare, watched_run
+from tetopt.cli.run import prepare, waiting, watched_run
 from tetopt.cli.solver import (
     all_sets,
     check_early,
@@ -131,7 +132,8 @@ def mesh_command(
     begin = time.perf_counter()
     plan = planned(source, sizes, start, engine, solver, output)
     set_threads(engine.threads)
-    task = _read(plan, chosen_parts(plan, parts))
+    with waiting("reading and preparing the image, with its mask and labels"):
+        task = _read(plan, chosen_parts(plan, parts))
     if output.predict:
         if task.parts is not None:
             print_parts(task.plan, task.source, task.parts)
@@ -206,8 +208,10 @@ def _run(task: Task, begin: float, begin_keeping: Callable[[], None]) -> Ran:
     limit = _memory_limit(plan, content)
     before = peak_bytes(), resident_bytes()
     begun: list[float] = []
+    shown, words = ExitStack(), "making the initial mesh"
 
     def watch(initial: Mesh, run: Run) -> Optimized:
+        shown.close()
         if not begun and (solver.are_any() or output.suffix.lower() != ".vtu"):
             about = task.source.about
 
@@ -222,14 +226,18 @@ def _run(task: Task, begin: float, begin_keeping: Callable[[], None]) -> Ran:
         begin_keeping()
         result = watched_run(run, initial, options["iterations"], ends, limit)
         _say_search(task, len(begun), result)
+        if plan.sizes.target_error is not None or solver.order == 2:  # of which there may be a next run
+            shown.enter_context(waiting(words))
         return result
 
     kind = plan.kind(content.image.ndim) if plan.mode in ("uniform", "paper") else None
     start = None if task.started is None else task.started.mesh
-    result = mesh_image(
-        content, plan.sizes.nodes, target_error=plan.sizes.target_error, mode=plan.mode, start=start,
-        spacing=plan.start.spacing, kind=kind, sizes=task.sizes, order=solver.order or 1, watch=watch, **options,
-    )  # fmt: skip
+    with shown:
+        shown.enter_context(waiting(words))
+        result = mesh_image(
+            content, plan.sizes.nodes, target_error=plan.sizes.target_error, mode=plan.mode, start=start,
+            spacing=plan.start.spacing, kind=kind, sizes=task.sizes, order=solver.order or 1, watch=watch, **options,
+        )  # fmt: skip
     assert result.initial is not None
     seconds = {"load": begun[0] - begin, "optimize": time.perf_counter() - begun[0]}
     n_nodes = max(result.nodes or 0, len(result.initial.points))
