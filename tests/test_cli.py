@@ -592,6 +592,17 @@ def test_help_lists_the_options(monkeypatch, capsys, command, flag):
     assert captured.err == ""
 
 
+@pytest.mark.parametrize("width", ["80", "120"])
+def test_help_names_no_value_of_a_switch_and_breaks_no_word(monkeypatch, capsys, width):
+    monkeypatch.setenv("COLUMNS", width)
+    for words in ((), ("mesh",), ("fem",)):
+        assert exit_code(*words, "--help") == 0
+        text = capsys.readouterr().out
+        assert "bool" not in text
+        assert re.search(r"--help +-h +Show this message", text)
+        assert not words or {"octree", "bcc", "five-tet"} <= set(re.findall(r"[\w-]+", text)) or words == ("fem",)
+
+
 def test_help_of_mesh_is_in_seven_groups(monkeypatch, capsys):
     """Each of at most thirteen options, and the help."""
     monkeypatch.setenv("COLUMNS", "80")

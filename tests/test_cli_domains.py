@@ -141,6 +141,29 @@ def test_measured_again(run, inputs, tmp_path, capsys):
     assert f"{again['interfaces'][0]['area_ratio']:.3f}" in said
 
 
+@pytest.mark.parametrize("more", [["--mask", "mask.nii.gz"], ["--background", "60"], ["--labels", "labels.nii.gz"]])
+def test_quality_and_mesh_judge_alike(inputs, tmp_path, monkeypatch, capsys, more):
+    """One name and one value of E_D's fraction, the same verdicts, and the same exit code."""
+    monkeypatch.chdir(inputs)
+    image = "head.nii.gz" if more[0] == "--background" else "image.nii.gz"
+    mesh, numbers, again = (tmp_path / name for name in ("a.vtu", "a.json", "q.json"))
+    command = ["mesh", image, *more, "--target-error", "0.02", "--size-min", "5", "--iterations", "2"]
+    code = exit_code(*command, "-o", mesh, "--json", numbers)
+    said = capsys.readouterr()
+    more = [] if more[0] == "--background" else more
+    assert exit_code("quality", mesh, "--image", image, *more, "--check", "--json", again) == code == 1
+    judged = capsys.readouterr()
+    first, second = numbers_in(numbers), numbers_in(again)
+    share = second["fit"]["E_D_share_of_variance"]
+    assert share == pytest.approx(first["energies"]["E_D_share_of_variance"], rel=1e-9)
+    assert set(second["missed"]) == set(first["missed"]) >= {"error"}
+    assert [line for line in said.err.splitlines() if "variance is left" in line] == judged.err.splitlines()[-1:]
+    name = re.search("E_D, share of .* variance(?= )", said.out)[0]
+    assert f"{name} " in judged.out
+    assert f"{share:.5f}" in judged.out
+    assert re.findall("share of its own variance.*", said.out) == re.findall("share of its own variance.*", judged.out)
+
+
 @pytest.mark.parametrize("background", ["auto", "60"])
 def test_background(inputs, tmp_path, background, capsys):
     out = tmp_path / "a.vtu"

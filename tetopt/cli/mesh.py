@@ -55,7 +55,7 @@ from tetopt.cli.solver import (
     solver_model,
     with_chosen_sets,
 )
-from tetopt.cli.source import Source, read_source
+from tetopt.cli.source import Source, read_source, whose_variance
 from tetopt.engine.cost import RunSize, next_bytes
 from tetopt.engine.interfaces import crowded_nodes
 from tetopt.engine.loop import Optimized
@@ -466,7 +466,7 @@ def _print_comparison(content: Content | StoredContent, outcome: Outcome, start:
         table.add_row("E_D, of initial", "1.0000", f"{last.E_D / first.E_D:.4f}")
     if first.E_D > 0.0 and (spread := content.variance * content.volume) > 0.0:
         table.add_row(
-            f"E_D, share of {_whose_variance(content)}", f"{first.E_D / spread:.5f}", f"{last.E_D / spread:.5f}"
+            f"E_D, share of {whose_variance(content)}", f"{first.E_D / spread:.5f}", f"{last.E_D / spread:.5f}"
         )
     meshes = (initial, mesh)
     in_all = [size_summary(each, order)["n_nodes_in_all"] for each in meshes] if order == 2 else []
@@ -474,13 +474,6 @@ def _print_comparison(content: Content | StoredContent, outcome: Outcome, start:
     if n_empty:
         table.add_row("cells that hold no voxel centre", "", str(n_empty))
     out.print(table)
-
-
-def _whose_variance(content: Content | StoredContent) -> str:
-    """Of what E_D is a share, in words; labels that are an image of their own are its only channels."""
-    if isinstance(content, StoredContent) or (content.n_contrasts == 1 and len(content.values) == 1):
-        return "the image's variance"
-    return "the labels' variance" if content.n_contrasts == 0 else "the variance of all images and labels"
 
 
 def demo_command(
