@@ -1,5 +1,6 @@
 """The command, run as a user runs it: files in, files out, exit codes, one line for every bad input."""
 
+import functools
 import hashlib
 import json
 import os
@@ -556,6 +557,7 @@ def test_the_checksum_is_of_what_was_read(tmp_path, inputs, monkeypatch):
     """The image may be gone, or another, when the optimisation ends."""
     shutil.copy(inputs / "disc.nii", tmp_path / "disc.nii")
 
+    @functools.wraps(tetopt.optimize)
     def slow(*arguments, **options):
         (tmp_path / "disc.nii").unlink()
         return tetopt.optimize(*arguments, **options)

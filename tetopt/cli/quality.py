@@ -19,6 +19,7 @@ from tetopt.cli.inputs import label_table, read_mesh, warn_of_other_image
 from tetopt.cli.options import ImagePart, LabelNamesOption, NumberOptions, SourceOptions, option
 from tetopt.cli.promises import check_promises
 from tetopt.cli.source import Source, read_source, whose_variance
+from tetopt.engine.loop import Optimized
 from tetopt.incoming import json_of
 from tetopt.io.files import save_json
 from tetopt.measure.fidelity import LabelFidelity
@@ -64,15 +65,7 @@ def quality_command(
     measured: dict[str, Any] = {}
     if image_path is not None:
         source = _source(loaded, image_path, mask_path, labels_path, part)
-        of_cell = loaded.cell_data.get("label")
-        fit = image_fit(source.image, loaded.mesh)
-        result = judged(loaded.mesh, source.content, of_cell, **_requirements(loaded, source))
-        is_uniform = source.content.variance == 0.0
-        fit = fit._replace(E_D=result.history[-1].E_D, E_D_share_of_variance=None if is_uniform else result.share)
-        measured = fidelity(source.labels, source.mask, loaded.mesh, of_cell)
-        if not (source.content.is_plain and source.content.region is None):
-            moments = tetopt.cell_moments(source.image, loaded.mesh)
-            measured["contrasts"] = source.by_contrast(moments._asdict())
+        fit, result, measured = _measured(loaded, source)
         measured |= _names(measured.get("labels", []), label_table(label_names, loaded).names)
         warn_of_other_image(loaded, mesh_path, image_path)
         report |= {**measured, "image": image_path.name, "fit": fit}
@@ -90,9 +83,8 @@ def quality_command(
         return 1 if problems else 0
     if not check:  # what makes the numbers above meaningless
         missed = {name: words for name, words in result.missed.items() if name in ("mask", "overlap")}
-        if source.mask is None and result.history[-1].n_voxels > source.content.n_voxels:
-            held = result.history[-1].n_voxels
-            missed["overlap"] = f"cells overlap: together they hold {held} voxels, more than there are"
+        if source.mask is None and (count := result.history[-1].n_voxels) > source.content.n_voxels:
+            missed["overlap"] = f"cells overlap: together they hold {count} voxels, more than there are"
         result, measured = result._replace(missed=missed), {}
     return max(int(bool(problems)), check_promises(result, measured, source.mask_word))
 
@@ -111,6 +103,19 @@ def _source(loaded: MeshFile, image: Path, mask: Path | None, labels: Path | Non
         smooth_interfaces=None if labels is None else tension,
     )  # fmt: skip
     return read_source(options)
+
+
+def _measured(loaded: MeshFile, source: Source) -> tuple[Fit, Optimized, dict[str, Any]]:
+    """How well the cells fit the image; the mesh as the result of a run; how well mask, labels and image are met."""
+    mesh, of_cell = loaded.mesh, loaded.cell_data.get("label")
+    fit = image_fit(source.image, mesh)
+    result = judged(mesh, source.content, of_cell, **_requirements(loaded, source))
+    is_uniform = source.content.variance == 0.0
+    fit = fit._replace(E_D=result.history[-1].E_D, E_D_share_of_variance=None if is_uniform else result.share)
+    measured = fidelity(source.labels, source.mask, mesh, of_cell)
+    if not (source.content.is_plain and source.content.region is None):
+        measured["contrasts"] = source.by_contrast(tetopt.cell_moments(source.image, mesh)._asdict())
+    return fit, result, measured
 
 
 def _requirements(loaded: MeshFile, source: Source) -> dict[str, Any]:

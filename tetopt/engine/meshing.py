@@ -166,8 +166,7 @@ def mesh_image(
     >>> result.history[-1].E < 1
     True
     """
-    if mode is None:
-        mode = "graded" if start is None else "start"
+    mode = ("graded" if start is None else "start") if mode is None else mode
     _check_names(options, optimize_paper if mode == "paper" else optimize)
     content = plain(image)
     values = {"nodes": nodes, "target_error": target_error, "spacing": spacing, "kind": kind, "start": start}

@@ -142,8 +142,8 @@ def _series_files(path: Path, reader: Any) -> tuple[str, ...]:
         if file.name not in known and file.name.upper() != "DICOMDIR" and _is_dicom(file):
             raise InputError(f"the DICOM file {file.name} is truncated or damaged; copy it again")
     if not series:
-        found = islice(_dicom_folders(path), LISTED_FOLDERS)
-        if below := ", ".join(f"{folder.relative_to(path)} ({count} files)" for folder, count in found):
+        folders = islice(_dicom_folders(path), LISTED_FOLDERS)
+        if below := ", ".join(f"{folder.relative_to(path)} ({count} files)" for folder, count in folders):
             raise InputError(f"no DICOM series in this folder itself; choose a folder in it: {below}")
         raise InputError("no DICOM series in this folder, nor in the folders in it; check the path")
     if len(series) > 1:

@@ -21,7 +21,7 @@ from tetopt.geometry.topology import facets
 from tetopt.mesh import Mesh
 from tetopt.model.sets import FACE_NAMES, Sets, area_vectors, facet_triples, finite_numbers, nodes_of
 
-FLAT_SHARE = 1.0 - 1e-6  # of a set's area, that its facets' normals sum up to, at least, where it is flat
+PLANE_SHARE = 1.0 - 1e-6  # of a set's area, that its facets' normals sum up to, at least, where it is flat
 MOST_COMPRESSION_PERCENT = 50.0  # a linear step presses no further
 FREE_WORD = "free"  # a component of move:SET:X,Y,Z that is not prescribed
 # By kind, what follows SET: how the numbers are written (n stands for one a dimension), and their unit.
@@ -252,7 +252,7 @@ def _upwards(mesh: Mesh, sets: Sets, low: str, high: str) -> NDArray[np.float64]
         areas = area_vectors(mesh, sets.facets[name])
         total = sign * areas.sum(axis=0)
         size = float(np.sqrt((total**2).sum()))
-        if size >= FLAT_SHARE * float(np.sqrt((areas**2).sum(axis=1)).sum()):
+        if size >= PLANE_SHARE * float(np.sqrt((areas**2).sum(axis=1)).sum()):
             return np.asarray(total / size)
     return np.eye(mesh.ndim)[-1]
 
