@@ -44,7 +44,9 @@ def quality_command(
     check: Annotated[
         bool,
         typer.Option(
-            "--check", help="Is it a mesh, with a manifold boundary? With --image, does it fill the box? Exit 1 if not."
+            "--check",
+            help="Is it a mesh, with a manifold boundary? With --image, does it fill the box, and meet what its run was "
+            "asked for? Exit 1 if not.",
         ),
     ] = False,
     label_names: LabelNamesOption = None,
