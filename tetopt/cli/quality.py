@@ -45,8 +45,8 @@ def quality_command(
         bool,
         typer.Option(
             "--check",
-            help="Is it a mesh, with a manifold boundary? With --image, does it fill the box, and meet what its run was "
-            "asked for? Exit 1 if not.",
+            help="Is it a mesh, with a manifold boundary? With --image, does it fill the box, and meet what its "
+            "run was asked for? Exit 1 if not.",
         ),
     ] = False,
     label_names: LabelNamesOption = None,
