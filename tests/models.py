@@ -32,6 +32,16 @@ def sample_image(n=3):
 
 
 @cache
+def ball_mesh(n=3):
+    """A ball (a disk) of 40 mm around (30, 30, 30) mm: a lattice of a cube, each shell of it made round."""
+    cube = tetopt.lattice(tetopt.Image(np.zeros((20,) * n)), blocks=(8,) * n)
+    offset = cube.points - cube.points.mean(axis=0)
+    length = np.sqrt((offset**2).sum(axis=1, keepdims=True))
+    round_ = offset * np.abs(offset).max(axis=1, keepdims=True) / np.where(length > 0.0, length, 1.0)
+    return tetopt.Mesh(30.0 + 2.0 * round_, cube.cells)
+
+
+@cache
 def sample_model(n=3, bins=3):
     """A model in RAS and kPa with `bins` materials (None: as many as cells have), a compression by 5 %."""
     image = sample_image(n)

@@ -1,5 +1,6 @@
 """The command, run as a user runs it: files in, files out, exit codes, one line for every bad input."""
 
+import functools
 import hashlib
 import json
 import os
@@ -556,6 +557,7 @@ def test_the_checksum_is_of_what_was_read(tmp_path, inputs, monkeypatch):
     """The image may be gone, or another, when the optimisation ends."""
     shutil.copy(inputs / "disc.nii", tmp_path / "disc.nii")
 
+    @functools.wraps(tetopt.optimize)
     def slow(*arguments, **options):
         (tmp_path / "disc.nii").unlink()
         return tetopt.optimize(*arguments, **options)
@@ -590,6 +592,17 @@ def test_help_lists_the_options(monkeypatch, capsys, command, flag):
     words = set(re.findall(r"(?<!\w)--?[a-z-]+", captured.out))
     assert words >= {*OPTIONS[command].split(), "--help", "-h"}
     assert captured.err == ""
+
+
+@pytest.mark.parametrize("width", ["80", "120"])
+def test_help_names_no_value_of_a_switch_and_breaks_no_word(monkeypatch, capsys, width):
+    monkeypatch.setenv("COLUMNS", width)
+    for words in ((), ("mesh",), ("fem",)):
+        assert exit_code(*words, "--help") == 0
+        text = capsys.readouterr().out
+        assert "bool" not in text
+        assert re.search(r"--help +-h +Show this message", text)
+        assert not words or {"octree", "bcc", "five-tet"} <= set(re.findall(r"[\w-]+", text)) or words == ("fem",)
 
 
 def test_help_of_mesh_is_in_seven_groups(monkeypatch, capsys):

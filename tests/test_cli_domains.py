@@ -9,6 +9,8 @@ from commands import exit_code, numbers_in
 from shapes import OBLIQUE, distance, grid, shaped
 
 import tetopt
+from tetopt.cli import run as cli_run
+from tetopt.model.sets import nodes_of
 
 
 @pytest.fixture(scope="module")
@@ -45,6 +47,7 @@ def run(inputs, tmp_path_factory):
     command = ["mesh", inputs / "image.nii.gz", inputs / "square.nii.gz", "--weights", "1,0.5"]
     command += ["--mask", inputs / "mask.nii.gz", "--labels", inputs / "labels.nii.gz", "--nodes", "600"]
     command += ["-o", out / "mesh.vtu", "--json", out / "run.json", "--figures", out]
+    command += ["--young", "2", "--load", "compress:2%"]
     assert exit_code(*command) == 0
     return out
 
@@ -83,6 +86,38 @@ def test_the_numbers(run):
     assert 0.0 < numbers["energies"]["E_D_share_of_variance"] < 0.5
 
 
+def test_the_wait_for_a_start_is_said(inputs, tmp_path, monkeypatch, capsys):
+    """Where there is no terminal a line from time to time, of what is read and of the mesh that a run begins with."""
+    monkeypatch.setattr(cli_run, "LINE_SECONDS", 0.01)
+    command = ["mesh", inputs / "image.nii.gz", "--mask", inputs / "mask.nii.gz", "--nodes", "600", "--iterations", "0"]
+    assert exit_code(*command, "-o", tmp_path / "a.vtu") == 0
+    begun, octree, rest = capsys.readouterr().err.partition("octree of ")
+    assert octree
+    assert "reading and preparing the image" in begun
+    assert "making the initial mesh, " in begun
+    assert "making the initial mesh" not in rest
+
+
+def test_an_organ_is_compressed_between_its_own_top_and_bottom(run, tmp_path, capsys):
+    """By `mesh`, `convert` and `fem` alike, though nothing of it lies on the box's faces."""
+    loaded = tetopt.load_mesh(run / "mesh.vtu")
+    push = 0.02 * np.ptp(loaded.mesh.points[:, 2])
+    assert exit_code("convert", run / "mesh.vtu", tmp_path / "a.inp", "--young", "3", "--load", "compress:2%") == 0
+    assert re.search(r"\ninferior +\d+ +\d+ *\n", capsys.readouterr().out)
+    more = ["--load", "compress:2%", "-o", tmp_path / "solved.vtu"]
+    for words in ([], more):  # first the loads that `mesh` wrote
+        assert exit_code("fem", run / "mesh.vtu", *words, "--json", tmp_path / "a.json", "--force") == 0
+        (step,) = numbers_in(tmp_path / "a.json")["steps"]
+        assert step["largest_displacement"] == pytest.approx(push, rel=0.1)
+        assert step["reactions"]["superior"][2] < 0.0 < step["reactions"]["inferior"][2]
+    solved = tetopt.load_mesh(tmp_path / "solved.vtu")
+    pressed = nodes_of(solved.mesh, solved.sets.facets["inferior"])
+    assert solved.mesh.points[pressed, 2].max() < np.percentile(loaded.mesh.points[:, 2], 25)
+    assert exit_code("convert", run / "mesh.vtu", tmp_path / "b.inp", "--load", "hold:top") == 2
+    names = "boundary, left, right, posterior, anterior, inferior, superior, mask_surface, interface"
+    assert f'no set of facets "top"; there are {names}' in " ".join(capsys.readouterr().err.split())
+
+
 def test_the_pictures(run):
     for name in ("slice", "rho", "energies", "boundary", "labels"):
         assert (run / f"{name}.png").stat().st_size > 10_000
@@ -106,6 +141,29 @@ def test_measured_again(run, inputs, tmp_path, capsys):
     assert f"{again['interfaces'][0]['area_ratio']:.3f}" in said
 
 
+@pytest.mark.parametrize("more", [["--mask", "mask.nii.gz"], ["--background", "60"], ["--labels", "labels.nii.gz"]])
+def test_quality_and_mesh_judge_alike(inputs, tmp_path, monkeypatch, capsys, more):
+    """One name and one value of E_D's fraction, the same verdicts, and the same exit code."""
+    monkeypatch.chdir(inputs)
+    image = "head.nii.gz" if more[0] == "--background" else "image.nii.gz"
+    mesh, numbers, again = (tmp_path / name for name in ("a.vtu", "a.json", "q.json"))
+    command = ["mesh", image, *more, "--target-error", "0.02", "--size-min", "5", "--iterations", "2"]
+    code = exit_code(*command, "-o", mesh, "--json", numbers)
+    said = capsys.readouterr()
+    more = [] if more[0] == "--background" else more
+    assert exit_code("quality", mesh, "--image", image, *more, "--check", "--json", again) == code == 1
+    judged = capsys.readouterr()
+    first, second = numbers_in(numbers), numbers_in(again)
+    share = second["fit"]["E_D_share_of_variance"]
+    assert share == pytest.approx(first["energies"]["E_D_share_of_variance"], rel=1e-9)
+    assert set(second["missed"]) == set(first["missed"]) >= {"error"}
+    assert [line for line in said.err.splitlines() if "variance is left" in line] == judged.err.splitlines()[-1:]
+    name = re.search("E_D, share of .* variance(?= )", said.out)[0]
+    assert f"{name} " in judged.out
+    assert f"{share:.5f}" in judged.out
+    assert re.findall("share of its own variance.*", said.out) == re.findall("share of its own variance.*", judged.out)
+
+
 @pytest.mark.parametrize("background", ["auto", "60"])
 def test_background(inputs, tmp_path, background, capsys):
     out = tmp_path / "a.vtu"
@@ -116,7 +174,10 @@ def test_background(inputs, tmp_path, background, capsys):
     numbers = numbers_in(tmp_path / "a.json")
     assert 0.0 < numbers["inputs"]["background"] < 400.0
     assert tetopt.quality(mesh.points, mesh.cells).volume == pytest.approx(ball, rel=0.05)  # the cavity stays in
-    assert "E_D, share of the image's variance" in capsys.readouterr().out
+    captured = capsys.readouterr()
+    assert "E_D, share of the image's variance" in captured.out
+    assert "boundary to the foreground's surface" in captured.out
+    assert "mask" not in captured.out + captured.err
 
 
 def test_labels_alone(inputs, tmp_path, capsys):
@@ -201,6 +262,17 @@ def test_files_on_other_grids_are_told(inputs, tmp_path, capsys):
     assert "square.nii.gz: taken to the image's voxels, linearly" in said
     assert "half.nii.gz: taken to the image's voxels, nearest neighbour" in said
     assert "% of it lies in the image; is it of the same scan?" in said
+
+
+def test_a_crop_is_no_other_scan(inputs, tmp_path, capsys):
+    """What a crop leaves out of labels on the same voxels is no fault, and they are not resampled."""
+    mask = shaped("ball", OBLIQUE)[1]
+    tetopt.save_image(tmp_path / "m.nii.gz", mask)
+    command = ["mesh", inputs / "image.nii.gz", "--crop", "14:,:,2:30", "--nodes", "300", "--iterations", "0"]
+    assert exit_code(*command, "--mask", tmp_path / "m.nii.gz", "-o", tmp_path / "a.vtu") in (0, 1)
+    said = capsys.readouterr().err
+    assert "m.nii.gz" not in said
+    assert f"within a mask of {int(mask.data[14:, :, 2:30].sum())} voxels" in said
 
 
 def test_a_mesh_of_a_mask_is_checked_as_one(run, inputs, capsys):

@@ -39,6 +39,15 @@ def test_a_mask_that_the_mesh_does_not_show(capsys, change, words):
     assert text.count("\n") == (1 if words else 0)
 
 
+def test_what_background_leaves_is_no_mask(capsys):
+    missed = {"mask": "the mesh and the mask overlap only by Dice 0.5"}
+    far = {"mask": NEAR._replace(distance_p95=8.0, mesh_components=3, mesh_euler=99), "boundary_problems": ["an edge"]}
+    assert check_promises(Optimized(MESH, [], "iterations", missed=missed), far, "foreground") == 1
+    text = said(capsys)
+    assert "mask" not in text
+    assert text.count("foreground") >= text.count("\n") == 5
+
+
 def test_a_boundary_that_is_no_manifold_is_said(capsys):
     problem = "edges where the boundary has more than two facets; nodes: 1, the first [[3, 4]]"
     assert check_promises(Optimized(MESH, [], "iterations"), {"mask": NEAR, "boundary_problems": [problem]}) == 0
@@ -63,10 +72,18 @@ def ended(E=0.5, E_D=0.5):
     ],
 )
 def test_what_is_hardly_meant(capsys, result, mode, nodes, measured, words):
-    warn_of_result(result, "fast", mode, 100, nodes, measured)
+    warn_of_result(result, "fast", mode, 100, nodes, measured, np.ones(2))
     text = said(capsys)
     assert words in text
     assert text.count("\n") == (1 if words else 0)
+
+
+def test_cells_between_thick_slices_are_no_reason_for_fewer_nodes(capsys):
+    for slices, words in ((1.5, "fewer nodes"), (5.5, "slices are 5.5 mm apart")):
+        warn_of_result(ended(), "fast", "graded", 100, None, {"cells_without_voxel": 1}, np.array([1.0, 1.0, slices]))
+        text = said(capsys)
+        assert words in text
+        assert ("fewer nodes" in text) == (slices < 2.0)
 
 
 def test_limits_and_targets_that_edges_miss(capsys):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from cohorts import run_of, save_cohort
 
-from tetopt.cohort.flags import FEW_SUBJECTS, QUANTITIES, deviations, flags_of, limit, units
+from tetopt.cohort.flags import FEW_SUBJECTS, QUANTITIES, deviations, flags_of, limit, units, unjudged
 from tetopt.cohort.numbers import Row, collect, flattened
 
 OBLIQUE = np.diag([1.0, 1.0, 1.2, 1.0])
@@ -95,6 +95,17 @@ def test_no_majority_no_odd_one():
     assert flags_of(rows) == [[]] * 5  # three of five
     assert [bool(each) for each in flags_of(rows[1:4])] == [False, False, True]  # two of three
     assert flags_of(rows[2:4]) == [[], []]  # one of two
+
+
+def test_a_mixed_cohort_says_that_it_is_not_judged():
+    """By what has no majority alone; and of few subjects, that they are few."""
+    rng = np.random.default_rng(4)
+    signs = [1.0, 1.0, 1.0, 1.0, 1.0, -1.0, -1.0, -1.0, -1.0]
+    rows = [row_of(k, run_of(rng, affine=np.diag([sign, sign, 1.2, 1.0]))) for k, sign in enumerate(signs)]
+    [words] = unjudged(rows)
+    assert re.match("The 9 3-D meshes are too mixed to judge by orientation: ", words)
+    assert unjudged([rows[0], *rows[:4], *rows[:4]]) == []
+    assert [each[:21] for each in unjudged([rows[0], rows[-1]])] == ["2 3-D meshes are too ", "The 2 3-D meshes are "]
 
 
 def test_few_subjects_have_no_medians():

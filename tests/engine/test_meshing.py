@@ -140,6 +140,19 @@ def test_contradictions(arguments, words):
         tetopt.mesh_image(IMAGE, **arguments)
 
 
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        ({"node": 300}, "'node'; did you mean 'nodes'"),
+        ({"nodes": 300, "iteration": 3}, "'iteration'; did you mean 'iterations'"),
+        ({"nodes": 300, "mode": "paper", "shape_power": 3.0}, "'shape_power'"),
+    ],
+)
+def test_an_argument_of_another_name_is_named(arguments, words):
+    with pytest.raises(TypeError, match=f"^mesh_image.* got an unexpected keyword argument {words}"):
+        tetopt.mesh_image(tetopt.Image(np.zeros((8, 8, 8))), **arguments)
+
+
 def test_the_paper_takes_one_image():
     with pytest.raises(tetopt.InputError, match="one image and its whole box"):
         tetopt.mesh_image(tetopt.content(IMAGE, mask=MASK), 100, mode="paper")

@@ -391,7 +391,7 @@ def test_nifti_does_not_need_simpleitk(tmp_path, monkeypatch):
     assert load_image(save_nifti(tmp_path / "a.nii", ramp(3, 4, 5))).shape == (3, 4, 5)
 
 
-def write_dicom(sitk, folder, data, *, uid="1.2.3.4", step=None, skip=(), turned=()):
+def write_dicom(sitk, folder, data, *, uid="1.2.3.4", step=None, skip=(), turned=(), places=99):
     """A series of oblique slices, named in another order than they lie; returns the RAS affine."""
     folder.mkdir(exist_ok=True)
     spacing, origin, axes = np.array([0.5, 0.75, 3.0]), np.array([10.0, -20.0, 30.0]), rotation()
@@ -408,7 +408,7 @@ def write_dicom(sitk, folder, data, *, uid="1.2.3.4", step=None, skip=(), turned
             "0020|000d": "1.2.3",
             "0020|000e": uid,
             "0020|0013": str(k + 1),
-            "0020|0032": "\\".join(f"{x:.9f}" for x in origin + k * step),
+            "0020|0032": "\\".join(f"{x:.9f}" for x in origin + k % places * step),
             "0020|0037": "\\".join(f"{x:.11f}" for x in in_plane.T.ravel()),
         }
         for tag, value in tags.items():
@@ -462,6 +462,13 @@ def test_uneven_dicom_slices_in_words():
     assert "9 mm between slices 4 and 5, counted from 0, and 3 mm at most places" in _unevenness(points, off)
 
 
+@pytest.mark.parametrize(("places", "words"), [(1, "at 1 place"), (2, "at 2 places")])
+def test_dicom_series_of_several_volumes(tmp_path, sitk, places, words):
+    """Of one slice in time the first and last place are the same, which is no singular affine."""
+    write_dicom(sitk, tmp_path / "d", ramp(6, 5, 4), places=places)
+    assert_refused(tmp_path / "d", f"the 4 slices of this DICOM series lie {words}: it holds several volumes")
+
+
 def test_dicom_slices_that_are_not_parallel(tmp_path, sitk):
     write_dicom(sitk, tmp_path / "d", ramp(6, 5, 4), turned=(2,))
     assert_refused(tmp_path / "d", "not parallel")
@@ -484,6 +491,14 @@ def test_several_dicom_series(tmp_path, sitk):
     write_dicom(sitk, tmp_path / "d", ramp(6, 5, 4))
     write_dicom(sitk, tmp_path / "d", ramp(6, 5, 3), uid="1.2.3.5")
     assert_refused(tmp_path / "d", r"2 DICOM series .*1\.2\.3\.4 \(4 files\), 1\.2\.3\.5 \(3 files\)")
+
+
+def test_a_folder_above_dicom_series_lists_them(tmp_path, sitk):
+    for name, count in (("t1", 4), ("flair", 3)):
+        (tmp_path / "scan").mkdir(exist_ok=True)
+        write_dicom(sitk, tmp_path / "scan" / name, ramp(6, 5, count))
+    (tmp_path / "report.txt").write_text("nothing to see")
+    assert_refused(tmp_path, r"choose a folder in it: scan.flair \(3 files\), scan.t1 \(4 files\)$")
 
 
 @pytest.mark.usefixtures("sitk")

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from models import sample_image, sample_model
+from models import ball_mesh, sample_image, sample_model
 
 import tetopt
 from tetopt.errors import InputError
@@ -11,7 +11,6 @@ from tetopt.geometry.quadratic import quadratic
 from tetopt.geometry.simplex import volumes
 from tetopt.model.loads import (
     Load,
-    area_vectors,
     count_of_steps,
     facet_forces,
     facet_weights,
@@ -21,7 +20,7 @@ from tetopt.model.loads import (
     parse_loads,
     spring_constants,
 )
-from tetopt.model.sets import box_of, nodes_of, standard_sets
+from tetopt.model.sets import FACE_NAMES, area_vectors, box_of, nodes_of, standard_sets
 
 
 @pytest.mark.parametrize("n", [2, 3])
@@ -158,14 +157,24 @@ def test_loads_that_are_none(texts, match):
     assert "\n" not in str(caught.value)
 
 
-def test_no_face_to_press():
-    image = sample_image(3)
-    mesh = sample_model(3).mesh
-    is_inner = (np.abs(image.to_index(mesh.points)[mesh.cells][:, :, 2] - 3.0) < 3.0).all(axis=1)
-    used, cells = np.unique(mesh.cells[is_inner], return_inverse=True)
-    part = tetopt.Mesh(mesh.points[used], cells.reshape(-1, 4))
-    with pytest.raises(InputError, match="no facets on the box's face inferior and superior; give hold:SET"):
-        parse_loads(["compress:5%"], part, standard_sets(part, box_of(image)))
+@pytest.mark.parametrize("n", [2, 3])
+def test_an_organ_is_pressed_along_the_world_axis(n):
+    """Between its own outermost nodes, though the areas of neither side sum up to exactly that direction."""
+    mesh = ball_mesh(n)
+    turn = np.eye(n)
+    turn[-2:, -2:] = [[0.8, 0.6], [-0.6, 0.8]]
+    mesh = tetopt.Mesh((mesh.points * np.linspace(1.0, 0.7, n)) @ turn, mesh.cells)
+    top, bottom = parse_loads(["compress:5%"], mesh, standard_sets(mesh))
+    assert [top.set_name, bottom.set_name] == list(FACE_NAMES[n][-1])[::-1]
+    assert not top.numbers.any()
+    np.testing.assert_allclose(bottom.numbers, 0.05 * np.ptp(mesh.points, axis=0) * np.eye(n)[-1], rtol=1e-12)
+
+
+def test_no_side_to_press():
+    """A tetrahedron has a tip and no top; the sets that it has are named."""
+    mesh = tetopt.Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1]], [[0, 1, 2, 3]])
+    with pytest.raises(InputError, match=r"no facet of the mesh is superior; .* boundary, left, posterior, inferior"):
+        parse_loads(["compress:5%"], mesh, standard_sets(mesh))
 
 
 # Forces on facets

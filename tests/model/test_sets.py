@@ -4,7 +4,7 @@ from itertools import permutations, product
 
 import numpy as np
 import pytest
-from models import sample_image, sample_model
+from models import ball_mesh, sample_image, sample_model
 from scipy.spatial.transform import Rotation
 
 import tetopt
@@ -13,9 +13,12 @@ from tetopt.fem.elasticity import box_faces
 from tetopt.geometry.box import world_axes
 from tetopt.geometry.simplex import volumes
 from tetopt.mesh import Mesh
+from tetopt.model.file import sets_beside
 from tetopt.model.sets import (
+    FACE_NAMES,
     Box,
     Sets,
+    area_vectors,
     boundary_rows,
     box_of,
     enclosing_facets,
@@ -99,9 +102,10 @@ def test_an_oblique_box_is_known_by_its_affine_alone():
     with_box = standard_sets(mesh, box_of(image)).facets
     assert sum(len(with_box[name]) for pair in NAMES for name in pair) == len(with_box["boundary"])
     without = standard_sets(mesh).facets  # turned about z, so that only those two faces lie in planes of the world
-    assert set(without) == {"boundary", "inferior", "superior"}
     for name in ("inferior", "superior"):
         np.testing.assert_array_equal(without[name], with_box[name])
+    for name in ("left", "right", "posterior", "anterior"):  # what is outermost along the world's axes
+        assert 0 < len(without[name]) < len(with_box[name])
 
 
 def test_the_surface_of_a_mask_is_the_boundary_off_the_box():
@@ -111,10 +115,41 @@ def test_the_surface_of_a_mask_is_the_boundary_off_the_box():
     used, cells = np.unique(mesh.cells[is_low], return_inverse=True)
     lower = Mesh(mesh.points[used], cells.reshape(-1, 4))
     sets = standard_sets(lower, box_of(image)).facets
-    assert "superior" not in sets
     assert (lower.points[nodes_of(lower, sets["mask_surface"])][:, 2] > -0.5).all()
     np.testing.assert_allclose(outward_areas(lower, sets["inferior"]).sum(axis=0), [0.0, 0.0, -16.0])
     assert len(sets["boundary"]) == sum(len(rows) for name, rows in sets.items() if name != "boundary")
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_a_ball_within_the_box_has_sides_by_its_own_extent(n):
+    """Caps a tenth of it deep, each a tenth of a ball's surface, which face their side; no facet is on two."""
+    mesh = ball_mesh(n)
+    box = Box((60,) * n, np.eye(n + 1))
+    sets = standard_sets(mesh, box).facets
+    np.testing.assert_array_equal(sets.pop("mask_surface"), sets["boundary"])
+    assert {name: rows.tolist() for name, rows in sets.items()} == {
+        name: rows.tolist() for name, rows in standard_sets(mesh).facets.items()
+    }
+    centre, size = 30.0, np.sqrt((area_vectors(mesh, sets.pop("boundary")) ** 2).sum(axis=1)).sum()
+    assert list(sets) == [name for pair in FACE_NAMES[n] for name in pair]
+    for axis, pair in enumerate(FACE_NAMES[n]):
+        for name, sign in zip(pair, (-1.0, 1.0), strict=True):
+            areas = area_vectors(mesh, sets[name])
+            assert (sign * areas[:, axis] >= np.abs(areas).max(axis=1)).all()
+            share = np.sqrt((areas**2).sum(axis=1)).sum() / size
+            assert share == pytest.approx(0.1 if n == 3 else np.arccos(0.8) / np.pi, rel=0.35)  # by whole facets
+            assert (sign * (mesh.points[nodes_of(mesh, sets[name])][:, axis] - centre) > 0.6 * 20.0).all()
+    rows = np.concatenate(list(sets.values()))
+    assert len(np.unique(rows, axis=0)) == len(rows)
+
+
+def test_sides_by_extent_make_way_for_sets_of_the_mesh():
+    """A set "superior" that came with an organ keeps its name, and its members."""
+    mesh = ball_mesh(3)
+    own = Sets({"superior": boundary_rows(mesh)[:5]}, {})
+    sets, renamed = sets_beside(mesh, None, {}, own, {})
+    assert renamed == {}
+    np.testing.assert_array_equal(sets.facets["superior"], own.facets["superior"])
 
 
 def test_interfaces_are_held_by_the_smaller_label():

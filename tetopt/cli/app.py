@@ -12,6 +12,7 @@ from typing import Annotated, Any
 
 import typer
 from rich.markup import escape
+from typer.core import TyperCommand, TyperGroup
 
 import tetopt
 from tetopt.budget import check_addresses
@@ -75,6 +76,26 @@ MOST_DIGITS = 4  # of a number of threads: no machine has more
 
 # Options by the names that messages of the library begin with, where these differ by more than a hyphen.
 ARGUMENT_OPTIONS = {"octree": "nodes", "modulus": "young"}
+
+
+class _Plain:
+    """A part of the command line whose help has nothing beside switches, which take no value."""
+
+    def get_params(self, ctx: Any) -> list[Any]:
+        """The parameters, switches without a name for a value."""
+        parameters: list[Any] = super().get_params(ctx)  # type: ignore[misc]
+        for each in parameters:
+            if getattr(each, "is_flag", False):
+                each.metavar = ""
+        return parameters
+
+
+class _Command(_Plain, TyperCommand):
+    pass
+
+
+class _Group(_Plain, TyperGroup):
+    pass
 
 
 def main(argv: Sequence[str] | None = None) -> int:
@@ -151,13 +172,14 @@ def _app(arguments: Sequence[str]) -> typer.Typer:
         add_completion=False,
         pretty_exceptions_enable=False,
         rich_markup_mode="rich",
+        cls=_Group,
         context_settings={"help_option_names": ["-h", "--help"]},
     )
     app.callback()(_common)
     chosen = next((word for word in arguments if not word.startswith("-")), None)  # no option before it takes a value
     for name, (_, text) in COMMANDS.items():
         if name == chosen:
-            app.command(name)(loaded_command(name))
+            app.command(name, cls=_Command)(loaded_command(name))
         else:
             app.command(name, help=text)(lambda: None)
     return app

@@ -147,10 +147,10 @@ def show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
     log.print(f"[yellow]tetopt: warning:[/] {escape(plain(str(message)))}")
 
 
-def print_fidelity(measured: dict[str, Any], ndim: int) -> None:
+def print_fidelity(measured: dict[str, Any], ndim: int, word: str = "mask") -> None:
     """How well sizes, contrasts, mask and labels are met, as far as `measured` has them (`tetopt.report.summary`).
 
-    `ndim` is the mesh's.
+    `ndim` is the mesh's; `word` is what the mask is called.
     """
     # numba and more come with these
     from tetopt.report.tables import label_differences, label_table, mask_table, sizes_in_words
@@ -161,7 +161,7 @@ def print_fidelity(measured: dict[str, Any], ndim: int) -> None:
         share = "constant" if row["E_D_share_of_variance"] is None else f"{row['E_D_share_of_variance']:.5f}"
         out.print(escape(f"{row['image']}: weight {row['weight']:g}, share of its own variance in cells {share}"))
     if "mask" in measured:
-        print_wide(mask_table(measured["mask"], ndim))
+        print_wide(mask_table(measured["mask"], ndim, word))
     if "labels" in measured and "interfaces" in measured:
         rows, interfaces, names = measured["labels"], measured["interfaces"], measured.get("label_names", {})
         print_wide(label_table(rows, interfaces, names, ndim))

@@ -59,7 +59,7 @@ def fem_command(
     ],
     compress: Annotated[
         float | None,
-        option("PERCENT", f"Push the bottom of the box in, its top held (with IMAGE by default {PAPER_PERCENT:g})."),
+        option("PERCENT", f"Push the bottom in by this much, the top held (with IMAGE by default {PAPER_PERCENT:g})."),
     ] = None,
     conditioning: Annotated[
         bool | None,

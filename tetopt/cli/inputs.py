@@ -72,8 +72,9 @@ def image_and_others(
     def beside(other: Path, aligned: Callable[[Image, Image, str], Image]) -> Image:
         original = read_companion(other)
         moved = aligned(original, whole, str(other))
-        if not is_same_grid(original, whole):
-            _say_resampled(other, original, moved, is_contrast=aligned is aligned_contrast)
+        is_cropped = part.slice_ is None and part.crop is not None
+        if not is_same_grid(original, whole, is_cropped=is_cropped):
+            _say_resampled(other, original, moved, is_contrast=aligned is aligned_contrast, is_cropped=is_cropped)
         if part.slice_ is None:
             return moved
         return part_of(moved, parse_slice(part.slice_), None if part.crop is None else parse_crop(part.crop))
@@ -81,14 +82,14 @@ def image_and_others(
     return image, beside
 
 
-def _say_resampled(path: Path, original: Image, moved: Image, is_contrast: bool) -> None:
-    """That a file lay on another grid, and how much of a mask or of labels is in the image."""
+def _say_resampled(path: Path, original: Image, moved: Image, *, is_contrast: bool, is_cropped: bool) -> None:
+    """That a file lay on another grid, and how much of a mask or of labels is in the image unless that is cropped."""
     if is_contrast:
         log.print(escape(f"{path}: taken to the image's voxels, linearly"))
         return
     whole, inside = (np.count_nonzero(each.data) * each.voxel_volume for each in (original, moved))
     log.print(escape(f"{path}: taken to the image's voxels, nearest neighbour"))
-    if inside < IN_IMAGE_SHARE * whole:
+    if not is_cropped and inside < IN_IMAGE_SHARE * whole:
         show_warning(f"{path}: only {inside / whole:.0%} of it lies in the image; is it of the same scan?")
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
+from contextlib import ExitStack
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -45,7 +46,7 @@ from tetopt.cli.plan import Plan, planned, with_numbers
 from tetopt.cli.predict import print_prediction, size_of_run, stated_prediction
 from tetopt.cli.promises import check_promises, warn_of_result, warn_of_sizes
 from tetopt.cli.request import requested
-from tetopt.cli.run import prepare, watched_run
+from tetopt.cli.run import prepare, waiting, watched_run
 from tetopt.cli.solver import (
     all_sets,
     check_early,
@@ -57,7 +58,7 @@ from tetopt.cli.solver import (
     solver_model,
     with_chosen_sets,
 )
-from tetopt.cli.source import Source, read_source
+from tetopt.cli.source import Source, read_source, whose_variance
 from tetopt.engine.cost import RunSize, next_bytes
 from tetopt.engine.interfaces import crowded_nodes
 from tetopt.engine.loop import Optimized
@@ -135,7 +136,8 @@ def mesh_command(
     begin = time.perf_counter()
     plan = planned(source, sizes, start, engine, solver, output)
     set_threads(engine.threads)
-    task = _read(plan, chosen_parts(plan, parts))
+    with waiting("reading and preparing the image, with its mask and labels"):
+        task = _read(plan, chosen_parts(plan, parts))
     if output.predict:
         if task.parts is not None:
             print_parts(task.plan, task.source, task.parts)
@@ -216,8 +218,10 @@ def _run(task: Task, begin: float, begin_keeping: Callable[[], None]) -> Ran:
     limit = _memory_limit(plan, content)
     before = peak_bytes(), resident_bytes()
     begun: list[float] = []
+    shown, words = ExitStack(), "making the initial mesh"
 
     def watch(initial: Mesh, run: Run) -> Optimized:
+        shown.close()
         if not begun and (solver.are_any() or output.suffix.lower() != ".vtu"):
             about = task.source.about
 
@@ -232,14 +236,18 @@ def _run(task: Task, begin: float, begin_keeping: Callable[[], None]) -> Ran:
         begin_keeping()
         result = watched_run(run, initial, options["iterations"], ends, limit)
         _say_search(task, len(begun), result)
+        if plan.sizes.target_error is not None or solver.order == 2:  # of which there may be a next run
+            shown.enter_context(waiting(words))
         return result
 
     kind = plan.kind(content.image.ndim) if plan.mode in ("uniform", "paper") else None
     start = None if task.started is None else task.started.mesh
-    result = mesh_image(
-        content, plan.sizes.nodes, target_error=plan.sizes.target_error, mode=plan.mode, start=start,
-        spacing=plan.start.spacing, kind=kind, sizes=task.sizes, order=solver.order or 1, watch=watch, **options,
-    )  # fmt: skip
+    with shown:
+        shown.enter_context(waiting(words))
+        result = mesh_image(
+            content, plan.sizes.nodes, target_error=plan.sizes.target_error, mode=plan.mode, start=start,
+            spacing=plan.start.spacing, kind=kind, sizes=task.sizes, order=solver.order or 1, watch=watch, **options,
+        )  # fmt: skip
     assert result.initial is not None
     seconds = {"load": begun[0] - begin, "optimize": time.perf_counter() - begun[0]}
     n_nodes = max(result.nodes or 0, len(result.initial.points))
@@ -307,7 +315,7 @@ def _described(task: Task, initial: Mesh) -> str:
     more = [f"and {len(source.paths) - 1} more"] if len(source.paths) > 1 else []
     more += ["labels"] if source.labels is not None else []
     if source.mask is not None:
-        more += [f"within a mask of {int((source.mask.data >= INSIDE_SHARE).sum())} voxels"]
+        more += [f"within a {source.mask_word} of {int((source.mask.data >= INSIDE_SHARE).sum())} voxels"]
     return ", ".join([f"{source.paths[0]}: {size} voxels of {spacing} mm", *more]) + f"; {start}"
 
 
@@ -450,7 +458,7 @@ def _draw(task: Task, outcome: Outcome, model: Model) -> None:
     figures.save_run_figures(pictures[:3], source.image, outcome.initial, outcome.result, task.start_name, image)
     of_cell = model.cell_data.get("label")
     if source.mask is not None:
-        figures.save_figure(figures.boundary_figure(image, source.mask, mesh), pictures[3])
+        figures.save_figure(figures.boundary_figure(image, source.mask, mesh, word=source.mask_word), pictures[3])
     if source.labels is not None:
         other = None if np.array_equal(image.data, source.labels.data) else image
         figure = figures.label_figure(source.labels, mesh, of_cell, other, source.table)
@@ -465,7 +473,7 @@ def _print(task: Task, outcome: Outcome, model: Model, measured: dict[str, Any])
     """
     plan, content, result = task.plan, task.source.content, outcome.result
     solver, output = plan.solver, plan.output
-    code = check_promises(result, measured)
+    code = check_promises(result, measured, task.source.mask_word)
     for name, reason in outcome.failed.items():
         left = "the mesh's file has no means of its cells" if name == "fields" else "all other numbers are written"
         show_error(f"{name} could not be measured: {reason}; {left}")
@@ -474,11 +482,12 @@ def _print(task: Task, outcome: Outcome, model: Model, measured: dict[str, Any])
     is_counted = plan.mode == "graded" and plan.sizes.target_error is None
     n_nodes = node_count(model.mesh.points, model.mesh.cells, model.order)
     asked_nodes = plan.sizes.nodes if is_counted else None
-    warn_of_result(result, plan.engine.method, plan.mode, n_nodes, asked_nodes, measured)
+    spacing = task.source.contrasts[0].spacing
+    warn_of_result(result, plan.engine.method, plan.mode, n_nodes, asked_nodes, measured, spacing)
     if task.sizes is not None and (edges := outcome.shapes[1]) is not None:
         warn_of_sizes(task.sizes, edges.min_edge, edges.max_edge, measured.get("edges_over_target"))
     _print_comparison(content, outcome, task.start_name, model.order, measured.get("cells_without_voxel", 0))
-    print_fidelity(measured, model.mesh.ndim)
+    print_fidelity(measured, model.mesh.ndim, task.source.mask_word)
     if solver.are_any() or output.mesh.suffix.lower() != ".vtu":
         print_model(output.mesh, model, solver)
     else:
@@ -502,7 +511,7 @@ def _print_comparison(content: Content | StoredContent, outcome: Outcome, start:
         table.add_row("E_D, of initial", "1.0000", f"{last.E_D / first.E_D:.4f}")
     if first.E_D > 0.0 and (spread := content.variance * content.volume) > 0.0:
         table.add_row(
-            f"E_D, share of {_whose_variance(content)}", f"{first.E_D / spread:.5f}", f"{last.E_D / spread:.5f}"
+            f"E_D, share of {whose_variance(content)}", f"{first.E_D / spread:.5f}", f"{last.E_D / spread:.5f}"
         )
     meshes = (initial, mesh)
     in_all = [size_summary(each, order)["n_nodes_in_all"] for each in meshes] if order == 2 else []
@@ -512,13 +521,6 @@ def _print_comparison(content: Content | StoredContent, outcome: Outcome, start:
     if n_empty:
         table.add_row("cells that hold no voxel centre", "", str(n_empty))
     out.print(table)
-
-
-def _whose_variance(content: Content | StoredContent) -> str:
-    """Of what E_D is a share, in words; labels that are an image of their own are its only channels."""
-    if isinstance(content, StoredContent) or (content.n_contrasts == 1 and len(content.values) == 1):
-        return "the image's variance"
-    return "the labels' variance" if content.n_contrasts == 0 else "the variance of all images and labels"
 
 
 def demo_command(

@@ -230,8 +230,10 @@ class StartOptions:
     panel: ClassVar[str] = "The mesh it begins with"
     lattice: Annotated[
         Lattice | None,
-        typer.Option(
-            help="Initial mesh. octree, the default, puts nodes where the image has content; the others are uniform."
+        option(
+            "KIND",
+            "Initial mesh: octree (the default), with nodes where the image has detail; or uniform: bcc, five-tet, or "
+            "in 2-D criss-cross.",
         ),
     ] = None
     uniform: Annotated[

@@ -63,6 +63,7 @@ class StoredSource(NamedTuple):
     table: LabelTable = NO_TABLE
     labels: None = None
     mask: None = None
+    mask_word: str = "mask"
     image: None = None  # in memory
 
     @property

@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterator
 from typing import Any
 
+import numpy as np
+from numpy.typing import NDArray
+
 from tetopt.cli.console import show_error, show_warning
 from tetopt.cli.options import Method
 from tetopt.engine.loop import Optimized
@@ -24,20 +27,22 @@ FAR_VOXELS = 1.5  # between the surfaces of mesh and mask, 95th percentile: abov
 EULER_SHARE = 0.5  # of the mask's Euler number, by which that of the mesh may differ before it is said
 EULER_USUAL = 8  # an Euler number of less counts as this: single holes come and go with the cells' size
 EMPTY_CELLS = 0.02  # of the cells: if more hold no voxel, they are too many for the image
+THICK_SLICES = 2.0  # times a voxel's shortest edge: where slices are so far apart, cells lie between them
 
 
-def check_promises(result: Optimized, measured: dict[str, Any]) -> int:
+def check_promises(result: Optimized, measured: dict[str, Any], word: str = "mask") -> int:
     """0 if the mesh is all that it should be (`tetopt.engine.promises`), and each large label has cells; else 1.
 
-    Each promise that is missed is said in a line of its own. Warns of lesser misses.
+    Each promise that is missed is said in a line of its own. Warns of lesser misses. Messages call what is meshed
+    `word`.
     """
     lost = list(_lost(measured))
     problems = [words for name, words in result.missed.items() if not (name == "labels" and lost)]
     for problem in (*problems, *lost):
-        show_error(problem)
-    _warn_of_mask(measured.get("mask"))
+        show_error(problem.replace("the mask", f"the {word}"))
+    _warn_of_mask(measured.get("mask"), word)
     for problem in measured.get("boundary_problems", []):
-        show_warning(f"{problem}: cells are as large as parts, or gaps, of the mask; allow more nodes")
+        show_warning(f"{problem}: cells are as large as parts, or gaps, of the {word}; allow more nodes")
     return 1 if problems or lost else 0
 
 
@@ -63,33 +68,35 @@ def _lost(measured: dict[str, Any]) -> Iterator[str]:
         )
 
 
-def _warn_of_mask(mask: MaskFidelity | None) -> None:
+def _warn_of_mask(mask: MaskFidelity | None, word: str) -> None:
     if mask is None:
         return
     if mask.components != mask.mesh_components:
         show_warning(
-            f"the mask has {mask.components} pieces, the mesh {mask.mesh_components}: cells are as large "
-            "as parts, or gaps, of the mask; allow more nodes"
+            f"the {word} has {mask.components} pieces, the mesh {mask.mesh_components}: cells are as large "
+            f"as parts, or gaps, of the {word}; allow more nodes"
         )
     if (far := max(mask.distance_p95, mask.reverse_p95)) > FAR_VOXELS:
         show_warning(
-            f"the mesh's boundary and the mask's surface are {far:.1f} voxels apart at the 95th percentile, "
-            f"{max(mask.distance_mean, mask.reverse_mean):.1f} in the mean: cells are larger than the mask's details; "
+            f"the mesh's boundary and the {word}'s surface are {far:.1f} voxels apart at the 95th percentile, "
+            f"{max(mask.distance_mean, mask.reverse_mean):.1f} in the mean: cells are larger than its details; "
             "allow more nodes"
         )
     if abs(mask.mesh_euler - mask.euler) > EULER_SHARE * max(abs(mask.euler), EULER_USUAL):
         show_warning(
-            f"the Euler number of the mask's surface is {mask.euler}, that of the mesh's boundary {mask.mesh_euler}: "
-            "the mesh has other holes and handles than the mask; allow more nodes"
+            f"the Euler number of the {word}'s surface is {mask.euler}, that of the mesh's boundary {mask.mesh_euler}: "
+            f"the mesh has other holes and handles than the {word}; allow more nodes"
         )
 
 
 def warn_of_result(
-    result: Optimized, method: Method, mode: Mode, n_nodes: int, nodes: int | None, measured: dict[str, Any]
-) -> None:
+    result: Optimized, method: Method, mode: Mode, n_nodes: int, nodes: int | None, measured: dict[str, Any],
+    spacing: NDArray[np.float64],
+) -> None:  # fmt: skip
     """Say what is allowed but hardly meant.
 
-    There are `n_nodes` in all, where a graded mesh was to have `nodes`; `measured` has what was counted.
+    There are `n_nodes` in all, where a graded mesh was to have `nodes`; `measured` has what was counted, and `spacing`
+    (n,) the edges of the image's voxels, mm.
     """
     if nodes is not None and abs(n_nodes - nodes) > NODES_MISSED * nodes:
         remedy = "more iterations, a --k-d above 0, or larger sizes come nearer"
@@ -107,9 +114,12 @@ def warn_of_result(
         show_warning(f"E_D ended at {rise}: the cells' shapes were improved at its cost; a higher --k-d lowers it")
     n_empty = measured.get("cells_without_voxel", 0)
     if n_empty > EMPTY_CELLS * len(result.mesh.cells):
+        remedy = "ask for fewer nodes (--nodes)"
+        if spacing.max() >= THICK_SLICES * spacing.min():
+            remedy = f"slices are {spacing.max():.3g} mm apart, and cells between them are usual there"
         show_warning(
-            f"{n_empty} of {len(result.mesh.cells)} cells hold no voxel centre: E_D does not see them, and their "
-            "values are the nearest voxel's; ask for fewer nodes"
+            f"{n_empty} of {len(result.mesh.cells)} cells hold no voxel centre: these contribute nothing to E_D and "
+            f"take the nearest voxel's value; {remedy}"
         )
     if crowded := measured.get("nodes_of_many_labels"):
         show_warning(

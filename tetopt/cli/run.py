@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import threading
 import time
 from collections.abc import Callable, Iterator
 
@@ -82,6 +83,28 @@ def compiling(title: str) -> Iterator[Callable[[str], None]]:
             say(f"{words} (of the first run only), {time.perf_counter() - begin:.0f} s")
 
         yield progress
+
+
+@contextlib.contextmanager
+def waiting(words: str) -> Iterator[None]:
+    """Show that something is being done: a terminal's status, else a line from time to time."""
+    begin, is_done = time.perf_counter(), threading.Event()
+
+    def lines() -> None:
+        while not is_done.wait(LINE_SECONDS):
+            log.print(f"{words}, {_spent(time.perf_counter() - begin)}")
+
+    if log.is_terminal:
+        with log.status(f"{words} ..."):
+            yield
+        return
+    thread = threading.Thread(target=lines, daemon=True)
+    thread.start()
+    try:
+        yield
+    finally:
+        is_done.set()
+        thread.join()
 
 
 def rare_lines(is_first_said: bool = False) -> Callable[[str], None]:

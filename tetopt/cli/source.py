@@ -20,7 +20,7 @@ from tetopt.model.fields import cell_fields
 from tetopt.model.labels import TABLE_TEXT, table_words
 from tetopt.model.sets import box_of, box_text
 from tetopt.target.align import aligned_contrast, aligned_labels, aligned_mask, background_level, foreground
-from tetopt.target.content import SMOOTH_INTERFACES, Content, content, continued
+from tetopt.target.content import SMOOTH_INTERFACES, Content, StoredContent, content, continued
 
 
 class Source(NamedTuple):
@@ -39,6 +39,11 @@ class Source(NamedTuple):
     def image(self) -> Image:
         """The first contrast on its own voxels; beyond a mask, around which alone they are kept, continued."""
         return continued(self.contrasts[0], self.content.continuation)
+
+    @property
+    def mask_word(self) -> str:
+        """The word of messages for the part of the image that is meshed."""
+        return "mask" if self.about["inputs"]["background"] is None else "foreground"
 
     @property
     def low(self) -> float:
@@ -120,3 +125,10 @@ def read_source(options: SourceOptions, label_names: Path | None = None) -> Sour
     about = {"image": paths[0].name, "image_sha256": sha256(paths[0]), "inputs": inputs, "box": box_text(box_of(image))}
     source = Source(paths, weights, represented, contrasts, labels, mask, about, NO_TABLE)
     return source.with_table(table)
+
+
+def whose_variance(content: Content | StoredContent) -> str:
+    """Of what E_D is a share, in words; labels that are an image of their own are its only channels."""
+    if isinstance(content, StoredContent) or (content.n_contrasts == 1 and len(content.values) == 1):
+        return "the image's variance"
+    return "the labels' variance" if content.n_contrasts == 0 else "the variance of all images and labels"

@@ -24,7 +24,7 @@ from tetopt.measure.fidelity import FacetSurface, surface_areas
 from tetopt.model.file import MeshFile
 from tetopt.model.labels import label_words, labels_named
 from tetopt.model.model import SPACES
-from tetopt.model.sets import FACE_NAMES, standard_sets
+from tetopt.model.sets import FACE_NAMES, boundary_rows, face_sets
 from tetopt.report.tables import new_table
 
 MOST_LISTED = 12  # interfaces in the table; all are in the file of numbers
@@ -199,9 +199,8 @@ def _chosen(loaded: MeshFile, path: Path, part: SurfacePart) -> NDArray[np.int64
     chosen = largest_component(loaded.mesh.cells, mean < part.below)
     if len(chosen) == 0:
         raise InputError(f"{path}: no cell has a mean below {part.below:g}, they go from {mean.min():g} up")
-    faces = [*chain(*FACE_NAMES[3])]
-    of_faces = standard_sets(loaded.mesh, loaded.box).facets
-    touched = [name for name in faces if name in of_faces and np.isin(of_faces[name][:, 0], chosen).any()]
+    of_faces = face_sets(loaded.mesh, boundary_rows(loaded.mesh), loaded.box)
+    touched = [name for name in chain(*FACE_NAMES[3]) if np.isin(of_faces[name][:, 0], chosen).any()]
     if touched and len(chosen) < len(mean):
         log.print(
             f"the largest connected set below {part.below:g} touches the box's faces {', '.join(touched)}: it is the "

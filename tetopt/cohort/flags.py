@@ -94,11 +94,7 @@ def flags_of(rows: Sequence[Row]) -> list[list[Flag]]:
         each with their like.
     """
     flags: list[list[Flag]] = [[] for _ in rows]
-    groups: dict[Value, list[int]] = defaultdict(list)
-    for place, row in enumerate(rows):
-        if row.status in ("done", "missed"):
-            groups[row.numbers.get("quality.ndim")].append(place)
-    for ndim, places in groups.items():
+    for ndim, places in _groups(rows).items():
         own = [rows[place] for place in places]
         names = {number: name for row in reversed(own) for number, name in row.label_names.items()}
         for flagged_by in (_promises, _lost, _absent, _doubled, _grids, _turned):
@@ -108,6 +104,53 @@ def flags_of(rows: Sequence[Row]) -> list[list[Flag]]:
         for place, flag in _far(own, names, dimension):
             flags[places[place]].append(flag)
     return [sorted(each, key=lambda flag: -flag.score) for each in flags]
+
+
+def unjudged(rows: Sequence[Row]) -> list[str]:
+    """What rows are not compared in, a sentence each: they are too few, or so mixed that none of them is the odd one.
+
+    Parameters
+    ----------
+    rows : sequence of Row
+
+    Returns
+    -------
+    list of str
+        Of all 2-D and all 3-D meshes, as of `flags_of`.
+    """
+    sentences = []
+    for ndim, places in _groups(rows).items():
+        own, kind = [rows[place] for place in places], f"{'2-D' if ndim == 2 else '3-D'} meshes"
+        if len(own) < FEW_SUBJECTS:
+            sentences.append(f"{len(own)} {kind} are too few to compare their numbers; {FEW_SUBJECTS} are enough.")
+        mixed = [words for column, words in GRID_COLUMNS.items() if _is_mixed(_known(own, column))]
+        if mixed:
+            sentences.append(
+                f"The {len(own)} {kind} are too mixed to judge by {', '.join(mixed)}: no value is shared by "
+                "two thirds of them."
+            )
+    return sentences
+
+
+def _groups(rows: Sequence[Row]) -> dict[Value, list[int]]:
+    """Places of the rows that have a mesh, by its dimension."""
+    groups: dict[Value, list[int]] = defaultdict(list)
+    for place, row in enumerate(rows):
+        if row.status in ("done", "missed"):
+            groups[row.numbers.get("quality.ndim")].append(place)
+    return groups
+
+
+def _known(rows: Sequence[Row], column: str) -> list[Value]:
+    return [text for row in rows if (text := row.numbers.get(column)) is not None]
+
+
+def _is_mixed(texts: Sequence[Value]) -> bool:
+    """Whether there are several, and no one is that of a majority; two against each other are mixed."""
+    if len(set(texts)) < 2:
+        return False
+    count = Counter(texts).most_common(1)[0][1]
+    return len(texts) < 3 or count < MAJORITY_SHARE * len(texts) - FLOAT_ROUNDING
 
 
 Flagged = Iterator[tuple[int, Flag]]
@@ -166,13 +209,10 @@ def _whole_image(row: Row) -> str:
 def _grids(rows: Sequence[Row], names: dict[int, str]) -> Flagged:
     """Orientations and the like that a majority does not have."""
     for column, words in GRID_COLUMNS.items():
-        texts = [row.numbers.get(column) for row in rows]
-        known = [text for text in texts if text is not None]
-        if len(known) < 3:  # two against each other: neither is the odd one
+        texts, known = [row.numbers.get(column) for row in rows], _known(rows, column)
+        if len(set(known)) < 2 or _is_mixed(known):
             continue
         usual, count = Counter(known).most_common(1)[0]
-        if count < MAJORITY_SHARE * len(known) - FLOAT_ROUNDING:
-            continue
         for place, text in enumerate(texts):
             if text is not None and text != usual:
                 yield place, Flag(column, f"{words} {text}: {count} of {len(known)} have {usual}", np.inf)

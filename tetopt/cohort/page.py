@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any
 from urllib.parse import quote
 
-from tetopt.cohort.flags import QUANTITIES, Flag, Quantity, flags_of, units
+from tetopt.cohort.flags import QUANTITIES, Flag, Quantity, flags_of, units, unjudged
 from tetopt.cohort.layout import PAGE_NAME, TABLE_NAME
 from tetopt.cohort.likeness import THUMBNAIL_BYTES
 from tetopt.cohort.numbers import Row, Status, Value, description, present, save_table
@@ -116,7 +116,7 @@ def _summary(rows: Sequence[Row], flags: Sequence[Sequence[Flag]]) -> list[str]:
     options = _options(rows)
     common = [f"{_option(name)} {_shown(next(iter(each)))}" for name, each in options.items() if len(each) == 1]
     different = [f"{_option(name)}: {_counted(each)}" for name, each in options.items() if len(each) > 1]
-    parts = [paragraph_html(text)]
+    parts = [paragraph_html(text), *map(paragraph_html, unjudged(rows))]
     if common:
         parts.append(paragraph_html(f"Of all meshes: {', '.join(common)}."))
     if different:

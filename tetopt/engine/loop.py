@@ -5,10 +5,10 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Mapping
 from types import MappingProxyType
-from typing import Literal, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from tetopt import notebook
 from tetopt.energy.sampling import SamplingGrid
@@ -140,6 +140,36 @@ class Optimized(NamedTuple):
     missed: Mapping[str, str] = MappingProxyType({})
     share: float | None = None
     n_dropped: int = 0
+
+    def plot(self, values: ArrayLike | None = None, **options: Any) -> Any:
+        """Show the mesh in 3-D by pyvista, as `Mesh.plot` does; by default in the colours of its labels, if it has any.
+
+        Parameters
+        ----------
+        values : (M,) or (N,) array, optional
+            A number for each cell, or else each node, that colours it.
+        **options
+            Further ones of `Mesh.plot`.
+
+        Returns
+        -------
+        (height, width, 3) array of uint8, or None
+            The picture, if no window opened.
+
+        Raises
+        ------
+        InputError
+            As `Mesh.plot`.
+
+        Examples
+        --------
+        >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
+        >>> tetopt.mesh_image(image, 300, iterations=0).plot(off_screen=True).shape  # doctest: +SKIP
+        (768, 1024, 3)
+        """
+        if values is None and self.labels is not None:
+            values, options = self.labels, {"name": "label"} | options
+        return self.mesh.plot(values, **options)
 
     def _repr_html_(self) -> str:
         """Numbers of the run and of its mesh, with the middle section, for a notebook."""

@@ -8,8 +8,10 @@ start    a mesh of the user's own, improved by the fast engine within its bounda
 
 from __future__ import annotations
 
+import inspect
 import time
 from collections.abc import Callable
+from difflib import get_close_matches
 from typing import Any, Literal
 
 import numpy as np
@@ -136,6 +138,8 @@ def mesh_image(
         As `optimize` or `optimize_paper`; options that do not belong to the mode; neither or both of `nodes` and
         `target_error`, or `spacing`; a number of nodes that the image is not worth (see `octree`), or that there is no
         memory for; an error that its noise does not allow.
+    TypeError
+        An option of another name.
 
     See Also
     --------
@@ -163,8 +167,8 @@ def mesh_image(
     >>> result.history[-1].E < 1
     True
     """
-    if mode is None:
-        mode = "graded" if start is None else "start"
+    mode = ("graded" if start is None else "start") if mode is None else mode
+    _check_names(options, optimize_paper if mode == "paper" else optimize)
     content = plain(image)
     values = {"nodes": nodes, "target_error": target_error, "spacing": spacing, "kind": kind, "start": start}
     if mode == "graded" and nodes is None and target_error is None and sizes is not None:
@@ -238,6 +242,16 @@ def check_memory_of(content: Content, nodes: int, limit: float | None = None) ->
     what = f"an image of {shape} voxels" + (f" of {len(content.values)} channels" if len(content.values) > 1 else "")
     check_memory(bytes_of(content, 0), what, "mesh a part of it (--crop), or allow more", limit)
     check_memory(bytes_of(content, nodes), f"{nodes} nodes on {what}", "ask for fewer", limit)
+
+
+def _check_names(options: dict[str, Any], optimisation: Run) -> None:
+    """TypeError, as of Python's own calls, for options that neither `mesh_image` nor the optimisation takes."""
+    known = inspect.signature(optimisation).parameters
+    for name in options:
+        if name not in known:
+            near = get_close_matches(name, [*inspect.signature(mesh_image).parameters, *known], 1)
+            hint = f"; did you mean {near[0]!r}?" if near else ""
+            raise TypeError(f"mesh_image() got an unexpected keyword argument {name!r}{hint}")
 
 
 def _nodes_of(content: Content, sizes: Sizes, order: int) -> int | None:

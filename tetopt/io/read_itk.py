@@ -3,7 +3,10 @@
 from __future__ import annotations
 
 import importlib.util
+import os
 import re
+from collections.abc import Iterator
+from itertools import islice
 from pathlib import Path
 from typing import Any
 
@@ -27,6 +30,9 @@ ITK_READERS = {
 }
 # DICOM slices may be off an even spacing by this share of it, since positions are often rounded.
 _UNEVEN_SHARE = 0.05
+_SAME_PLACE_MM = 1e-3  # slices nearer to each other are of one place
+# Below a folder without DICOM files, so many are looked into, by so many of their files, and so many are listed.
+WALKED_FOLDERS, TRIED_FILES, LISTED_FOLDERS = 1000, 3, 8
 
 
 def read_itk(path: Path, volume: int | None) -> tuple[NDArray, NDArray[np.float64]]:
@@ -136,11 +142,23 @@ def _series_files(path: Path, reader: Any) -> tuple[str, ...]:
         if file.name not in known and file.name.upper() != "DICOMDIR" and _is_dicom(file):
             raise InputError(f"the DICOM file {file.name} is truncated or damaged; copy it again")
     if not series:
-        raise InputError("no DICOM series in this folder (folders in it are not searched)")
+        folders = islice(_dicom_folders(path), LISTED_FOLDERS)
+        if below := ", ".join(f"{folder.relative_to(path)} ({count} files)" for folder, count in folders):
+            raise InputError(f"no DICOM series in this folder itself; choose a folder in it: {below}")
+        raise InputError("no DICOM series in this folder, nor in the folders in it; check the path")
     if len(series) > 1:
         listed = ", ".join(f"{uid} ({len(names)} files)" for uid, names in series.items())
         raise InputError(f"{len(series)} DICOM series in this folder, put one into its own folder: {listed}")
     return next(iter(series.values()))
+
+
+def _dicom_folders(path: Path) -> Iterator[tuple[Path, int]]:
+    """The folders below one that hold DICOM files, as far as a look goes, with their numbers of files."""
+    for name, folders, files in islice(os.walk(path), WALKED_FOLDERS):
+        folders.sort()  # the order in which the walk goes on
+        first = [Path(name, file) for file in sorted(files)[:TRIED_FILES]]
+        if any(file.is_file() and _is_dicom(file) for file in first):
+            yield Path(name), len(files)
 
 
 def _is_dicom(path: Path) -> bool:
@@ -162,6 +180,13 @@ def _place_slices(affine: NDArray[np.float64], reader: Any, n_slices: int) -> No
     if not np.allclose(turns, turns[0], rtol=0.0, atol=1e-4):
         raise InputError("the DICOM slices are not parallel (a localizer?); choose another series")
     points = np.array([_numbers(reader.GetMetaData(i, position), 3) for i in slices]) * [-1.0, -1.0, 1.0]
+    n_places = len(np.unique(np.rint(points / _SAME_PLACE_MM), axis=0))
+    if n_places < n_slices:
+        raise InputError(
+            f"the {n_slices} slices of this DICOM series lie at {n_places} place{'s' * (n_places > 1)}: it holds "
+            "several volumes (times, echoes or repeats); convert it to a 4-D NIfTI file, or put the slices of one "
+            "volume into a folder of their own"
+        )
     step = (points[-1] - points[0]) / (n_slices - 1)
     off = np.linalg.norm(points - points[0] - np.arange(n_slices)[:, None] * step, axis=1)
     if off.max() > _UNEVEN_SHARE * np.linalg.norm(step):

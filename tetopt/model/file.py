@@ -155,7 +155,7 @@ def sets_beside(
                 }
                 for mine, anew in zip(own, of_labels, strict=True)
             ))  # fmt: skip
-    return merged_sets(standard_sets(mesh, box, labels, names), own)
+    return merged_sets(standard_sets(mesh, box, labels, names, own.facets), own)
 
 
 def loads_in(loaded: MeshFile) -> tuple[list[str], str]:

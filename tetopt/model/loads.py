@@ -19,8 +19,9 @@ from tetopt.errors import InputError
 from tetopt.geometry.quadratic import quadratic, quadratic_facet_nodes
 from tetopt.geometry.topology import facets
 from tetopt.mesh import Mesh
-from tetopt.model.sets import FACE_NAMES, Sets, facet_triples, finite_numbers, nodes_of
+from tetopt.model.sets import FACE_NAMES, Sets, area_vectors, facet_triples, finite_numbers, nodes_of
 
+PLANE_SHARE = 1.0 - 1e-6  # of a set's area, that its facets' normals sum up to, at least, where it is flat
 MOST_COMPRESSION_PERCENT = 50.0  # a linear step presses no further
 FREE_WORD = "free"  # a component of move:SET:X,Y,Z that is not prescribed
 # By kind, what follows SET: how the numbers are written (n stands for one a dimension), and their unit.
@@ -79,8 +80,8 @@ def parse_loads(texts: Iterable[str], mesh: Mesh, sets: Sets) -> tuple[Load, ...
     Parameters
     ----------
     texts : iterable of str
-        "hold:SET"; "move:SET:X,Y,Z", mm, where a component may be "free"; "compress:5%", which holds the face of the
-        box with the largest z and moves the opposite one towards it by 5 % of the distance between the two, as `tetopt
+        "hold:SET"; "move:SET:X,Y,Z", mm, where a component may be "free"; "compress:5%", which holds the side
+        with the largest z and moves the opposite one towards it by 5 % of the distance between the two, as `tetopt
         fem` does; "pressure:SET:P", kPa, inwards; "traction:SET:X,Y,Z", kPa; "spring:SET:K", kPa/mm;
         "gravity:X,Y,Z", mm/s2. A prefix "2/" puts a load into step 2 alone; others are in every step. Forces on the
         same facets add up.
@@ -228,8 +229,8 @@ def _compression(load: Load, mesh: Mesh, sets: Sets) -> list[Load]:
     low, high = FACE_NAMES[mesh.ndim][-1]
     if missing := [name for name in (low, high) if name not in sets.facets]:
         raise InputError(
-            f"load: the mesh has no facets on the box's face {' and '.join(missing)}; give hold:SET and move:SET:X,Y,Z "
-            f"of {', '.join(sets.facets)}"
+            f"load: compress presses {low} towards {high}, but no facet of the mesh is {' or '.join(missing)}; use "
+            f"hold:SET and move:SET:X,Y,Z with sets of {', '.join(sets.facets)}"
         )
     push = 0.01 * float(load.numbers[0]) * _across(mesh, sets, low, high)
     return [
@@ -239,13 +240,21 @@ def _compression(load: Load, mesh: Mesh, sets: Sets) -> list[Load]:
 
 
 def _across(mesh: Mesh, sets: Sets, low: str, high: str) -> NDArray[np.float64]:
-    """From one of two parallel faces to the other along their normal, (n,) mm."""
-    areas = area_vectors(mesh, sets.facets[low])
-    inward = -areas.sum(axis=0)
-    inward /= np.sqrt((inward**2).sum())
-    corner = mesh.points[facet_triples(mesh.cells, sets.facets[low])[0, 0]]
-    across = mesh.points[nodes_of(mesh, sets.facets[high])[0]] - corner
-    return inward * float((across * inward).sum()) + 0.0  # + 0.0: no -0
+    """From the outermost node of one side to that of the opposite one, along `_upwards`, (n,) mm."""
+    upwards = _upwards(mesh, sets, low, high)
+    bottom, top = ((mesh.points[nodes_of(mesh, sets.facets[name])] * upwards).sum(axis=1) for name in (low, high))
+    return upwards * float(top.max() - bottom.min()) + 0.0  # + 0.0: no -0
+
+
+def _upwards(mesh: Mesh, sets: Sets, low: str, high: str) -> NDArray[np.float64]:
+    """The direction from one side to the opposite one, (n,): the normal of one that is flat, else the world's axis."""
+    for name, sign in ((low, -1.0), (high, 1.0)):
+        areas = area_vectors(mesh, sets.facets[name])
+        total = sign * areas.sum(axis=0)
+        size = float(np.sqrt((total**2).sum()))
+        if size >= PLANE_SHARE * float(np.sqrt((areas**2).sum(axis=1)).sum()):
+            return np.asarray(total / size)
+    return np.eye(mesh.ndim)[-1]
 
 
 def _check_outer(load: Load, mesh: Mesh, sets: Sets) -> None:
@@ -272,15 +281,6 @@ def _check_apart(loads: list[Load], mesh: Mesh, sets: Sets) -> None:
 
 
 # Forces on facets
-
-
-def area_vectors(mesh: Mesh, rows: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Outward normals of facets (K, 2), as long as each is large, (K, n), mm2 (in 2-D mm)."""
-    corners = mesh.points[facet_triples(mesh.cells, rows)]
-    edges = corners[:, 1:] - corners[:, :1]
-    if mesh.ndim == 3:
-        return 0.5 * np.cross(edges[:, 0], edges[:, 1])
-    return edges[:, 0, ::-1] * np.array([1.0, -1.0])
 
 
 def facet_weights(mesh: Mesh, rows: NDArray[np.int64], order: int = 1) -> tuple[NDArray[np.int64], NDArray[np.float64]]:

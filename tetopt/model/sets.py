@@ -24,6 +24,7 @@ from tetopt.mesh import Mesh
 
 BOUNDARY_SET = "boundary"  # every facet of one cell only
 MASK_SURFACE_SET = "mask_surface"  # those of them off the faces of the image's box
+SIDE_DEPTH = 0.1  # of a mesh's extent: a side that is off the box is the outermost tenth (a tenth of a ball's surface)
 # By RAS+: the side of smaller and of larger world coordinate. A slice's two axes may be any of the three.
 FACE_NAMES: dict[int, tuple[tuple[str, str], ...]] = {
     2: (("x_min", "x_max"), ("y_min", "y_max")),
@@ -96,6 +97,15 @@ def facet_triples(cells: NDArray[np.int64], rows: NDArray[np.int64]) -> NDArray[
     return cells[rows[:, :1], outward_facet_nodes(cells.shape[1] - 1)[rows[:, 1]]]
 
 
+def area_vectors(mesh: Mesh, rows: NDArray[np.int64]) -> NDArray[np.float64]:
+    """Outward normals of facets (K, 2), as long as each is large, (K, n), mm2 (in 2-D mm)."""
+    corners = mesh.points[facet_triples(mesh.cells, rows)]
+    edges = corners[:, 1:] - corners[:, :1]
+    if mesh.ndim == 3:
+        return 0.5 * np.cross(edges[:, 0], edges[:, 1])
+    return edges[:, 0, ::-1] * np.array([1.0, -1.0])
+
+
 def nodes_of(mesh: Mesh, rows: NDArray[np.int64]) -> NDArray[np.int64]:
     """The nodes of a facet set, (P,) int64, ascending."""
     return np.unique(facet_triples(mesh.cells, rows))
@@ -112,6 +122,7 @@ def standard_sets(
     box: Box | None = None,
     labels: NDArray[np.integer] | None = None,
     names: Mapping[int, str] | None = None,
+    own: Mapping[str, NDArray[np.int64]] | None = None,
 ) -> Sets:
     """The sets that every mesh comes with.
 
@@ -125,13 +136,17 @@ def standard_sets(
         Label of each cell.
     names : mapping of label to text, optional
         What labels are called.
+    own : mapping of (K, 2) int64, optional
+        Sets of facets that the mesh brings along; they replace sides by its own extent.
 
     Returns
     -------
     Sets
         Facets "boundary", "left", "right", "posterior", "anterior", "inferior", "superior" (in 2-D "x_min", "x_max",
         "y_min", "y_max"), and, with a box, "mask_surface" for the boundary off its faces; sets without facets are
-        left out. With labels also those of `label_sets`.
+        left out. A side is the boundary on that face of the box; where there is none, as on an organ within the box,
+        the facets of the outermost tenth of the mesh along the world axis that face that way more than any other.
+        With labels also those of `label_sets`.
 
     Raises
     ------
@@ -139,7 +154,11 @@ def standard_sets(
         Labels that are not one whole number from 0 for each cell.
     """
     boundary = boundary_rows(mesh)
-    named = {BOUNDARY_SET: boundary, **_face_sets(mesh, boundary, box)}
+    faces = face_sets(mesh, boundary, box)
+    for name, rows in _extent_sets(mesh, boundary).items():
+        if len(faces[name]) == 0:
+            faces[name] = (own or {}).get(name, rows)
+    named = {BOUNDARY_SET: boundary, **faces}
     of_labels = Sets({}, {}) if labels is None else label_sets(mesh, labels, names)
     return Sets({name: rows for name, rows in named.items() if len(rows)} | of_labels.facets, of_labels.cells)
 
@@ -213,7 +232,7 @@ def interface_names(pairs: Iterable[tuple[int, int]], of_label: Mapping[int, str
     }
 
 
-def _face_sets(mesh: Mesh, boundary: NDArray[np.int64], box: Box | None) -> dict[str, NDArray[np.int64]]:
+def face_sets(mesh: Mesh, boundary: NDArray[np.int64], box: Box | None) -> dict[str, NDArray[np.int64]]:
     """The boundary's facets on each face of the box, and, with a box, those on none of them."""
     n = mesh.ndim
     if box is None:
@@ -233,6 +252,23 @@ def _face_sets(mesh: Mesh, boundary: NDArray[np.int64], box: Box | None) -> dict
         sides = is_on[:, axis].T if directions[axis] > 0.0 else is_on[:, axis, ::-1].T
         sets |= {name: boundary[side] for name, side in zip(name_pair, sides, strict=True)}
     return sets if box is None else {**sets, MASK_SURFACE_SET: boundary[~np.any(is_on, axis=(1, 2))]}
+
+
+def _extent_sets(mesh: Mesh, boundary: NDArray[np.int64]) -> dict[str, NDArray[np.int64]]:
+    """The boundary's facets in the outermost tenth of the mesh along each world axis, of those that face that way.
+
+    No facet is on two sides: each faces the side that its normal is nearest to.
+    """
+    low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
+    centres = mesh.points[facet_triples(mesh.cells, boundary)].mean(axis=1)
+    areas, share = area_vectors(mesh, boundary), (centres - low) / (high - low)
+    faced = np.abs(areas).argmax(axis=1)
+    sets = {}
+    for axis, (name_low, name_high) in enumerate(FACE_NAMES[mesh.ndim]):
+        is_faced = faced == axis
+        sets[name_low] = boundary[is_faced & (areas[:, axis] < 0.0) & (share[:, axis] <= SIDE_DEPTH)]
+        sets[name_high] = boundary[is_faced & (areas[:, axis] > 0.0) & (share[:, axis] >= 1.0 - SIDE_DEPTH)]
+    return sets
 
 
 def _interfaces(mesh: Mesh, labels: NDArray[np.int64]) -> dict[tuple[int, int], NDArray[np.int64]]:

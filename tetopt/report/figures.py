@@ -219,7 +219,9 @@ def _write_numbers(
             axes.text(x, y, f"{label}", color=colour, ha="center", va="center", fontsize=5)
 
 
-def boundary_figure(image: Image, mask: Image, mesh: Mesh, axis: int | None = None, index: int | None = None) -> Figure:
+def boundary_figure(
+    image: Image, mask: Image, mesh: Mesh, axis: int | None = None, index: int | None = None, word: str = "mask"
+) -> Figure:
     """The outline of a mask and the boundary of a mesh that follows it, over a slice and enlarged in a part of it.
 
     Parameters
@@ -232,6 +234,8 @@ def boundary_figure(image: Image, mask: Image, mesh: Mesh, axis: int | None = No
         Its boundary is drawn without what lies on the faces of the image's box.
     axis, index : int, optional
         The slice, in voxel indices; by default the axial one in the middle of the mask.
+    word : str
+        What the legend calls the mask.
 
     Returns
     -------
@@ -266,7 +270,7 @@ def boundary_figure(image: Image, mask: Image, mesh: Mesh, axis: int | None = No
     whole.add_patch(Rectangle((low[0], low[1]), *(high - low), fill=False, edgecolor="white", linewidth=1.2))
     detail.set_xlim(low[0], high[0])
     detail.set_ylim(low[1], high[1])
-    lines = ((MASK_LINE, "outline of the mask"), (MESH_LINE, "boundary of the mesh"))
+    lines = ((MASK_LINE, f"outline of the {word}"), (MESH_LINE, "boundary of the mesh"))
     handles = [Line2D([], [], color=colour, linewidth=2.0, label=label) for colour, label in lines]
     figure.legend(handles=handles, loc="outside lower center", ncols=2, fontsize=10, frameon=False)
     return figure

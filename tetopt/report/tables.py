@@ -66,16 +66,16 @@ def add_quality(table: Table, *meshes: Quality, in_all: Sequence[int] = ()) -> N
         table.add_row(name, *(text(q) for q in meshes))
 
 
-def mask_table(mask: MaskFidelity, ndim: int) -> Table:
-    """How well a mesh of so many dimensions fills its mask."""
-    table = new_table("mask", "in voxels", "in the mesh")
+def mask_table(mask: MaskFidelity, ndim: int, word: str = "mask") -> Table:
+    """How well a mesh of so many dimensions fills its mask, which the table calls `word`."""
+    table = new_table(word, "in voxels", "in the mesh")
     change = 100.0 * (mask.mesh_volume / mask.volume - 1.0)
     table.add_row(size_words(ndim), f"{mask.volume:.1f}", f"{mask.mesh_volume:.1f} ({change:+.1f} %)")
     table.add_row("Dice, by voxels", "", f"{mask.dice:.4f}")
     for title, *distances in (
-        ("boundary to the mask's surface, mean, 95 %", mask.distance_mean, mask.distance_p95, mask.distance_mean_mm,
+        (f"boundary to the {word}'s surface, mean, 95 %", mask.distance_mean, mask.distance_p95, mask.distance_mean_mm,
          mask.distance_p95_mm),
-        ("the mask's surface to the boundary, mean, 95 %", mask.reverse_mean, mask.reverse_p95, mask.reverse_mean_mm,
+        (f"the {word}'s surface to the boundary, mean, 95 %", mask.reverse_mean, mask.reverse_p95, mask.reverse_mean_mm,
          mask.reverse_p95_mm),
     ):  # fmt: skip
         mean, p95, mean_mm, p95_mm = (f"{distance:.3f}" for distance in distances)

@@ -277,11 +277,14 @@ def _moved(other: Image, image: Image) -> NDArray[np.floating]:
     return other.data if is_same_grid(other, image) else _resampled(other.data, other, image, 0, "grid-constant")
 
 
-def is_same_grid(other: Image, image: Image) -> bool:
-    """Whether two images have the same voxels, to within 1e-4 voxel."""
+def is_same_grid(other: Image, image: Image, *, is_cropped: bool = False) -> bool:
+    """Whether two images have the same voxels, to within 1e-4 voxel; a cropped image has some of the other's."""
     corners = _corners(image)
-    return other.shape == image.shape and bool(
-        np.abs(other.to_index(image.to_world(corners)) - corners).max() <= SAME_GRID_VOXELS
+    offset = other.to_index(image.to_world(corners)) - corners
+    start = np.rint(offset[0]) if is_cropped else np.zeros(image.ndim)
+    is_within = bool((start >= 0.0).all() and (start + image.shape <= other.shape).all())
+    return (is_within if is_cropped else other.shape == image.shape) and bool(
+        np.abs(offset - start).max() <= SAME_GRID_VOXELS
     )
 
 

@@ -1,0 +1,59 @@
+"""The requirements of `tetopt mesh`, judged on a mesh of any origin."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.check import beyond_box
+from tetopt.energy.discretization import content_E_D
+from tetopt.engine.loop import Optimized, Record
+from tetopt.engine.promises import BEYOND_WORDS, promised, requested
+from tetopt.geometry.box import ON_SIDE_VOXELS
+from tetopt.mesh import Mesh
+from tetopt.target.content import Content
+
+
+def judged(
+    mesh: Mesh,
+    content: Content,
+    labels: NDArray[np.int64] | None = None,
+    *,
+    min_dihedral: float = 0.0,
+    target_error: float | None = None,
+    is_filled: bool = False,
+) -> Optimized:
+    """A mesh as the result of a run that ended with it: its `missed` and `share` are those of that run.
+
+    Parameters
+    ----------
+    mesh : Mesh
+    content : Content
+        What the mesh represents.
+    labels : (M,) int64, optional
+        Label of each cell.
+    min_dihedral : float
+        The floor on dihedral angles, degrees; 0 for none.
+    target_error : float, optional
+        The fraction of the variance that cells may leave unexplained.
+    is_filled : bool
+        The mesh should fill the image's box.
+
+    Returns
+    -------
+    Optimized
+        Its history has one row, with E_D and the number of voxels.
+
+    Raises
+    ------
+    InputError
+        As `tetopt.energy.sampling.cell_moments`.
+    """
+    E_D, n_voxels = content_E_D(content, mesh)
+    row = Record(1, np.nan, np.nan, E_D, 0.0, False, len(mesh.cells), n_voxels, 0.0)
+    result = promised(Optimized(mesh, [row], "iterations", labels=labels), content, min_dihedral, mesh)
+    result = requested(result, content, target_error, is_filled)
+    beyond = float(beyond_box(mesh, content.image).max())
+    if (is_filled or content.region is not None) and beyond > ON_SIDE_VOXELS:
+        return result._replace(missed={**result.missed, "box": BEYOND_WORDS.format(beyond)})
+    return result
