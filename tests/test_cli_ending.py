@@ -320,7 +320,6 @@ MEASURES = {  # where each is called, and its keys in run.json
     "quality": (tetopt.cli.mesh, {"quality_initial", "quality"}),
     "edge_ratios": (tetopt.cli.mesh, {"edges_over_target"}),
     "nodes_of_sizes": (tetopt.cli.mesh, {"nodes_of_sizes"}),
-    "manifold_problems": (tetopt.cli.mesh, {"boundary_problems"}),
     "crowded_nodes": (tetopt.cli.mesh, {"nodes_of_many_labels"}),
     "mask_fidelity": (tetopt.report.summary, {"mask"}),
     "label_fidelity": (tetopt.report.summary, {"labels"}),

@@ -95,7 +95,7 @@ def test_numbers_without_a_mesh_are_a_failure(tmp_path):
 
 def test_numbers_have_names_with_dots():
     run = run_of(RNG)
-    run |= {"materials": {"young_kPa": [1.0, 2.0], "nu": [0.1] * 5, "binning": None}, "boundary_problems": ["a", "b"]}
+    run |= {"materials": {"young_kPa": [1.0, 2.0], "nu": [0.1] * 5, "binning": None}, "dropped_components": 2}
     run |= {"contrasts": [{"image": "a", "weight": 2.0}] * 6, "cells_without_voxel": 10**400, "ended": float("inf")}
     columns = flattened(run)
     assert columns["grid.orientation"] == "RAS"
@@ -106,7 +106,7 @@ def test_numbers_have_names_with_dots():
     assert columns["materials.young_kPa.2"] == 2.0
     assert not any(name.startswith("materials.nu") for name in columns)
     assert columns["contrasts.6.weight"] == 2.0
-    assert columns["boundary_problems"] == "a; b"
+    assert columns["dropped_components"] == 2
     assert (columns["cells_without_voxel"], columns["ended"]) == (None, None)  # no number to compute with
     assert columns["labels.17.n_cells"] == 300
     assert columns["interfaces.0.area"] == 1000.0

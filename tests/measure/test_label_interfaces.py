@@ -17,7 +17,6 @@ from tetopt.measure.interfaces import (
     LabelInterface,
     label_interfaces,
     smooth_surface,
-    touching_voxels,
     voxel_cavities,
     voxel_euler,
 )
@@ -246,24 +245,6 @@ def test_the_numbers_of_an_independent_program():
         assert row.folded == pytest.approx(np.mean(np.array(cosines) < 0.5))
         assert row.nonmanifold_edges == sum(len(side) > 2 for side in sides.values()) > 0
         assert row.n_facets == len(triangles)
-
-
-def test_voxels_that_touch():
-    """At an edge, at a corner, at what is between two holes; not where they share a face, nor at the rim."""
-    labels = np.zeros((4, 4, 4), dtype=bool)
-    labels[0, 0, 0] = True
-    for corner, count in {(1, 0, 0): 0, (1, 1, 0): 1, (1, 1, 1): 1, (2, 2, 2): 0}.items():
-        both = labels.copy()
-        both[corner] = True
-        assert touching_voxels(both) == count
-        assert touching_voxels(~np.pad(both, 1)) == count
-    assert touching_voxels(np.eye(3) > 0) == 2
-    rng = np.random.default_rng(0)
-    for n in (2, 3):
-        noise = rng.random((6,) * n) < 0.4
-        image, mesh, of_cell = blocky(np.pad(noise, 1))
-        row = label_interfaces(image, mesh, of_cell)[1]
-        assert touching_voxels(noise) >= row.nonmanifold_edges + row.nonmanifold_nodes > 3
 
 
 def test_one_label_a_cell():

@@ -17,7 +17,6 @@ from rich.markup import escape
 import tetopt
 from tetopt import Image, InputError, Mesh
 from tetopt.budget import BYTES_PER_GB, MemoryLimit, peak_bytes, resident_bytes
-from tetopt.check import manifold_problems
 from tetopt.cli.console import log, out, print_fidelity, show_error, show_warning
 from tetopt.cli.ending import is_ended, mesh_kept, signal_code
 from tetopt.cli.inputs import label_table, read_mesh, set_threads
@@ -438,7 +437,7 @@ def _counts(task: Task, result: Optimized, model: Model) -> dict[str, Callable[[
         measures["edges_over_target"] = lambda: edge_ratios(mesh.points, mesh.cells, sizes)
         measures["nodes_of_sizes"] = lambda: round(nodes_of_sizes(content, sizes)[0] * share)
     if source.mask is not None:
-        measures["boundary_problems"] = lambda: manifold_problems(mesh)
+        measures["dropped_components"] = lambda: result.n_dropped
     if (labels := result.labels) is not None:
         measures["nodes_of_many_labels"] = lambda: crowded_nodes(mesh.cells, labels)
     return measures

@@ -168,6 +168,9 @@ class ContentOptions:
     background: Annotated[
         str | None, option("VALUE|auto", "Leave out what is up to VALUE and reaches the box: the air.")
     ] = None
+    keep_components: Annotated[
+        bool, typer.Option("--keep-components", help="Keep small components of the mesh that the mask does not have.")
+    ] = False
     labels: Annotated[Path | None, option("LABELS", "Label image: each cell is to be of one label.")] = None
     weights: Annotated[str | None, option("W,...", "How much each IMAGE counts (default 1 each; 0: not at all).")] = (
         None

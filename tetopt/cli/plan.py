@@ -116,6 +116,8 @@ def _check_source(source: SourceOptions, solver: SolverOptions) -> None:
     """InputError for what of mask and labels contradicts itself."""
     if source.mask is not None and source.background is not None:
         raise InputError("--mask and --background: give one of them")
+    if source.keep_components and source.mask is None and source.background is None:
+        raise InputError("--keep-components: needs --mask or --background; leave it out")
     if source.labels is None:
         beside = {**vars(source), "label_names": solver.label_names}
         for name in ("label_names", "label_weight", "smooth_interfaces"):

@@ -41,8 +41,11 @@ def check_promises(result: Optimized, measured: dict[str, Any], word: str = "mas
     for problem in (*problems, *lost):
         show_error(problem.replace("the mask", f"the {word}"))
     _warn_of_mask(measured.get("mask"), word)
-    for problem in measured.get("boundary_problems", []):
-        show_warning(f"{problem}: cells are as large as parts, or gaps, of the {word}; allow more nodes")
+    if n_dropped := measured.get("dropped_components"):
+        show_warning(
+            f"dropped {n_dropped} connected components of the mesh that the {word} does not have (--keep-components "
+            "keeps them)"
+        )
     return 1 if problems or lost else 0
 
 
@@ -71,10 +74,10 @@ def _lost(measured: dict[str, Any]) -> Iterator[str]:
 def _warn_of_mask(mask: MaskFidelity | None, word: str) -> None:
     if mask is None:
         return
-    if mask.components != mask.mesh_components:
+    if mask.components > mask.mesh_components:  # more of the mesh than of the mask is a requirement that is missed
         show_warning(
-            f"the {word} has {mask.components} pieces, the mesh {mask.mesh_components}: cells are as large "
-            f"as parts, or gaps, of the {word}; allow more nodes"
+            f"the {word} has {mask.components} connected components, the mesh {mask.mesh_components}: elements are too "
+            f"large for the {word}'s detail here; allow more nodes"
         )
     if (far := max(mask.distance_p95, mask.reverse_p95)) > FAR_VOXELS:
         show_warning(

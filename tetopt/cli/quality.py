@@ -24,13 +24,11 @@ from tetopt.engine.loop import Optimized
 from tetopt.incoming import json_of
 from tetopt.io.files import save_json
 from tetopt.measure.fidelity import LabelFidelity
-from tetopt.measure.interfaces import touching_voxels
 from tetopt.measure.quality import quality
 from tetopt.measure.requirements import judged
 from tetopt.model.file import MeshFile
 from tetopt.report.summary import fidelity, size_summary
 from tetopt.report.tables import add_quality, new_table
-from tetopt.target.domain import INSIDE_SHARE
 
 
 def quality_command(
@@ -87,7 +85,8 @@ def quality_command(
         show_error(f"{mesh_path}: {overlap}")
     if source is None or result is None:
         return 1 if problems else 0
-    missed = {name: words for name, words in result.missed.items() if name != "overlap"}  # said, with the cells' names
+    told = ("overlap", "manifold") if problems else ("overlap",)  # with the cells' or nodes' numbers
+    missed = {name: words for name, words in result.missed.items() if name not in told}
     if not check:  # what makes the numbers above meaningless
         missed, measured = {name: words for name, words in missed.items() if name == "mask"}, {}
     result = result._replace(missed=missed)
@@ -106,6 +105,7 @@ def _source(loaded: MeshFile, image: Path, mask: Path | None, labels: Path | Non
         weights=None if labels is None or own is None else repr(own),
         label_weight=None if labels is None else weight,
         smooth_interfaces=None if labels is None else tension,
+        keep_components=False,
     )  # fmt: skip
     return read_source(options)
 
@@ -156,23 +156,19 @@ def _number(value: Any) -> float | None:
 def _checked(loaded: MeshFile, source: Source | None) -> tuple[list[str], list[str]]:
     """What is wrong with a mesh; and if nothing is, what is no fault, and yet good to know.
 
-    That is a boundary which is no manifold where the mask's own voxels only touch, and interfaces of labels, which
-    voxels seldom make manifolds.
+    That are interfaces of labels which are not manifolds; of a run that smoothed them, it is wrong.
     """
     image, mask = (None, None) if source is None else (source.contrasts[0], source.mask)
-    n_touching = 0 if mask is None else touching_voxels(mask.data >= INSIDE_SHARE)
     is_whole = mask is None and not _was_masked(loaded)
-    problems = tetopt.check_mesh(
-        loaded.mesh, image, is_whole=is_whole, is_filled=_fills_box(loaded, source), is_manifold=n_touching == 0
-    )
-    if problems:
-        return problems, []
-    remarks = manifold_problems(loaded.mesh) if n_touching else []
-    remarks = [f"{each}; the mask's voxels touch like that at {n_touching} edges and corners" for each in remarks]
+    is_filled = _fills_box(loaded, source)
+    problems, found = tetopt.check_mesh(loaded.mesh, image, is_whole=is_whole, is_filled=is_filled), []
     labels = loaded.cell_data.get("label")
-    if labels is not None and labels.ndim == 1 and ((np.rint(labels) == labels) & (labels >= 0)).all():
-        remarks += manifold_problems(loaded.mesh, labels)
-    return [], remarks
+    if problems or labels is None:
+        return problems, []
+    if labels.ndim == 1 and ((np.rint(labels) == labels) & (labels >= 0)).all():
+        found = manifold_problems(loaded.mesh, labels)
+    is_smooth = (_number(_texts(loaded, "inputs").get("smooth_interfaces")) or 0.0) > 0.0
+    return (found, []) if is_smooth else ([], found)
 
 
 def _say_checked(

@@ -112,14 +112,16 @@ def read_source(options: SourceOptions, label_names: Path | None = None) -> Sour
     label_weight = 1.0 if options.label_weight is None else options.label_weight
     tension = SMOOTH_INTERFACES if options.smooth_interfaces is None else options.smooth_interfaces
     represented = content(
-        contrasts, labels, mask, weights=weights, label_weight=label_weight, smooth_interfaces=tension
-    )
+        contrasts, labels, mask, weights=weights, label_weight=label_weight, smooth_interfaces=tension,
+        keep_components=options.keep_components,
+    )  # fmt: skip
     files = [*paths[1:], *(path for path in (options.mask, options.labels) if path is not None)]
     inputs = {
         "images": [path.name for path in paths], "weights": weights,
         "mask": None if options.mask is None else options.mask.name, "background": level,
         "labels": None if options.labels is None else options.labels.name, "label_weight": options.label_weight,
         **({} if labels is None else {"smooth_interfaces": tension}),
+        **({} if mask is None else {"keep_components": options.keep_components}),
         "sha256": {path.name: sha256(file_and_volume(path)[0]) for path in files},
     }  # fmt: skip
     about = {"image": paths[0].name, "image_sha256": sha256(paths[0]), "inputs": inputs, "box": box_text(box_of(image))}

@@ -143,7 +143,7 @@ def _missed_components(content: Content, mesh: Mesh) -> dict[str, str]:
 
 def _missed_manifold(content: Content, result: Optimized) -> dict[str, str]:
     problems = [] if content.region is None else manifold_problems(result.mesh)
-    if result.labels is not None:
+    if result.labels is not None and content.memberships is not None:
         problems += manifold_problems(result.mesh, result.labels)
     return {"manifold": "; ".join([*problems, "allow more nodes"])} if problems else {}
 

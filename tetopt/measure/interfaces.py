@@ -11,7 +11,7 @@ by faces (6 neighbours, and 26 outside), so that a ring that closes in an edge o
 
 from __future__ import annotations
 
-from itertools import chain, combinations, product
+from itertools import product
 from typing import NamedTuple
 
 import numpy as np
@@ -236,29 +236,6 @@ def voxel_cavities(is_label: NDArray[np.bool_]) -> int:
     if is_label.ndim == 2:
         return 0
     return int(scipy.ndimage.label(~np.pad(is_label, 1), np.ones((3,) * is_label.ndim))[1]) - 1
-
-
-def touching_voxels(is_label: NDArray[np.bool_]) -> int:
-    """At how many edges and corners voxels, or what is around them, only touch: where their surface is no manifold.
-
-    Around an edge (in 2-D a corner) two of four lie across it from one another, and the others are not of the label;
-    around a corner two of eight, or all but two.
-    """
-    n, padded, count = is_label.ndim, np.pad(is_label, 1), 0
-    for axes in chain(*(combinations(range(n), size) for size in range(2, n + 1))):
-        around = []
-        for steps in product((0, 1), repeat=len(axes)):
-            part = [slice(None)] * n
-            for axis, step in zip(axes, steps, strict=True):
-                part[axis] = slice(step, padded.shape[axis] - 1 + step)
-            around.append(padded[tuple(part)])
-        total = np.sum(around, axis=0, dtype=np.uint8)
-        for k in range(len(around) // 2):
-            one, other = around[k], around[-1 - k]  # across from one another
-            count += int(np.count_nonzero((total == 2) & one & other))
-            if len(around) == 8:
-                count += int(np.count_nonzero((total == 6) & ~one & ~other))
-    return count
 
 
 def _turns(points: NDArray[np.float64], surfaces: LabelSurfaces, ridges: Ridges) -> NDArray[np.float64]:
