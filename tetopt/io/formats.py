@@ -123,15 +123,15 @@ def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str
     """
     path = Path(path)
     kind, ready = format_of(path), _ready(path, model, space, units)
-    is_for_solver = not kind.is_surface and path.suffix.lower() not in VTK_SUFFIXES
-    if is_for_solver and (words := locking_words(model)):
-        warnings.warn(f"{path}: {words}", stacklevel=2)
     sets = (frozenset(each) for each in model.sets)
     expected = Outline(len(elements(model)[0]), len(model.mesh.cells), *sets)
     if kind.write_files is None:
         save_checked(path, kind.write(ready), Outline() if kind.is_surface else expected)
     else:
         save_pieces(path, kind.write_files(ready, path.stem), expected)
+    is_for_solver = not kind.is_surface and path.suffix.lower() not in VTK_SUFFIXES
+    if is_for_solver and (words := locking_words(model)):
+        warnings.warn(f"{path}: {words}", stacklevel=2)
 
 
 def save_mesh(
