@@ -95,6 +95,19 @@ def test_a_boundary_that_is_no_manifold_and_more_components_than_the_mask_has():
         assert "2 connected components, the mask 1" in found["components"]
 
 
+@pytest.mark.parametrize("name", ["dihedral_angles", "beyond_box", "cell_of_voxel", "manifold_problems"])
+def test_a_requirement_that_cannot_be_checked_is_missed_and_the_mesh_is_there(name, monkeypatch):
+    def fail(*_):
+        raise MemoryError
+
+    image, mask = shaped("ball")
+    target = content(image, mask=mask)
+    result = tetopt.mesh_image(target, 400, iterations=1)
+    monkeypatch.setattr(tetopt.engine.promises, name, fail)
+    names = {"dihedral_angles": "floor", "beyond_box": "box", "cell_of_voxel": "mask", "manifold_problems": "manifold"}
+    assert missed(target, result) == {names[name]: f"{names[name]} could not be checked: MemoryError"}
+
+
 def test_an_interface_that_touches_itself():
     image, _ = shaped("ball")
     target = content(image, tetopt.Image(1.0 * (image.data > 50.0), image.affine))

@@ -6,6 +6,7 @@ command line ends with 1 there.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from math import prod
 
 import numpy as np
@@ -13,10 +14,11 @@ import numpy as np
 from tetopt.check import beyond_box, manifold_problems
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.engine.loop import Optimized
+from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS
 from tetopt.geometry.simplex import dihedral_angles, volumes
 from tetopt.geometry.topology import components
-from tetopt.image import VoxelGrid
+from tetopt.image import Image, VoxelGrid
 from tetopt.mesh import Mesh
 from tetopt.start.carve import n_components
 from tetopt.target.content import Content
@@ -51,15 +53,35 @@ def promised(result: Optimized, content: Content, min_dihedral: float, start: Me
         the initial mesh lost or won. Within a mask instead `overlap`: voxels that lie in two cells, `mask`: a Dice
         with the mask below 0.9, and `components`: more connected components than the mask has. `manifold`: edges or
         nodes at which the boundary, within a mask, or the interface of two labels is not a manifold. `labels`: labels
-        of more than 200 voxels that no cell has.
+        of more than 200 voxels that no cell has. A requirement that could not be checked, for want of memory, is
+        missed, too, with the reason: the mesh is not lost for it.
     """
-    mesh, missed = result.mesh, _missed_floor(result, min_dihedral)
-    beyond = float(beyond_box(mesh, content.image).max())
-    if beyond > max(float(beyond_box(start, content.image).max()), 0.0) + ON_SIDE_VOXELS:
-        missed["box"] = BEYOND_WORDS.format(beyond)
-    missed |= _missed_cover(result, start) if content.region is None else _missed_mask(content, result)
-    missed |= _missed_manifold(content, result)
-    return result._replace(missed=missed | _missed_labels(content, result))
+    of_domain = {"cover": lambda: _missed_cover(result, start)} if content.region is None else {
+        "mask": lambda: _missed_mask(content, result),
+        "components": lambda: _missed_components(content, result.mesh),
+    }  # fmt: skip
+    checks: dict[str, Callable[[], dict[str, str]]] = {
+        "floor": lambda: _missed_floor(result, min_dihedral),
+        "box": lambda: _beyond(result.mesh, start, content.image),
+        **of_domain,
+        "manifold": lambda: _missed_manifold(content, result),
+        "labels": lambda: _missed_labels(content, result),
+    }
+    missed: dict[str, str] = {}
+    for name, check in checks.items():
+        try:
+            missed |= check()
+        except InputError:
+            raise
+        except Exception as error:
+            missed[name] = f"{name} could not be checked: {type(error).__name__} {error}".rstrip()
+    return result._replace(missed=missed)
+
+
+def _beyond(mesh: Mesh, start: Mesh, image: Image) -> dict[str, str]:
+    beyond = float(beyond_box(mesh, image).max())
+    allowed = max(float(beyond_box(start, image).max()), 0.0) + ON_SIDE_VOXELS
+    return {"box": BEYOND_WORDS.format(beyond)} if beyond > allowed else {}
 
 
 def promised_in_box(result: Optimized, grid: VoxelGrid, min_dihedral: float) -> Optimized:
@@ -129,7 +151,7 @@ def _missed_mask(content: Content, result: Optimized) -> dict[str, str]:
             f"the mesh and the mask overlap only by Dice {dice:.3f}: cells are larger than parts of the mask; "
             "allow more nodes"
         )
-    return missed | _missed_components(content, result.mesh)
+    return missed
 
 
 def _missed_components(content: Content, mesh: Mesh) -> dict[str, str]:
