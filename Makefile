@@ -49,9 +49,10 @@ test-lowest:
 	PYTHONUTF8=1 NUMBA_CACHE_DIR=$(NUMBA_CACHE)-lowest MPLBACKEND=agg \
 	  $(LOWEST)/bin/python -m pytest -m "not slow" -n auto --dist loadfile --no-loadscope-reorder
 
-# A million random operations of the engine and 500 random whole runs, an hour; a small share is in `make test`.
+# A million random operations of the engine, 500 random whole runs and 500 of labels by the defaults, two hours.
 test-random: $(VENV)/.test
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python tests/random/runs.py --seed 1 --runs 500
+	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python tests/random/runs.py --seed 1 --runs 500 --labelled
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/python tests/random/operations.py --seed 1 --operations 1000000
 
 test-slow: $(VENV)/.test
