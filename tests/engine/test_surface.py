@@ -8,12 +8,13 @@ import pytest
 from shapes import OBLIQUE, distance, grid, shaped
 
 import tetopt
-from tetopt.energy.sampling import cell_of_voxel, channel_grid, moment_sums, to_ticks
+from tetopt.check import manifold_problems
+from tetopt.energy.sampling import cell_of_voxel, channel_grid, moment_sums, overlap_of, to_ticks
 from tetopt.engine.complex import build
 from tetopt.engine.fast import Run
 from tetopt.engine.state import objective_of, sides_of
 from tetopt.engine.surface import level_at, put_on_surface
-from tetopt.geometry.topology import boundary_facets
+from tetopt.geometry.topology import boundary_facets, components
 from tetopt.measure.fidelity import cell_labels, label_fidelity, mask_fidelity
 from tetopt.start.clip import lattice_within
 from tetopt.target.content import content
@@ -152,7 +153,58 @@ def test_a_lift_that_lays_cells_over_one_another_is_undone(monkeypatch):
     assert tetopt.check_mesh(kept.mesh) == []
 
 
+def test_cells_that_overlap_across_a_gap_are_taken_out():
+    """Two balls, one of them moved into the other by some voxels."""
+    image, mask = shaped("pieces")
+    target = content(image, mask=mask)
+    mesh = tetopt.mesh_image(target, 400, iterations=1).mesh
+    number = components(mesh.cells)
+    far = np.unique(mesh.cells[number == 1])
+    near = np.unique(mesh.cells[number == 0])
+    way = mesh.points[near].mean(axis=0) - mesh.points[far].mean(axis=0)
+    points = mesh.points.copy()
+    points[far] += (1.0 - 10.0 / np.linalg.norm(way)) * way
+    moved = tetopt.Mesh(points, mesh.cells)
+    n_shared = overlap_of(target.image, moved).n_voxels
+    assert n_shared > 20
+    run = Run(target, moved, 0.5)
+    n_gone = run.mend_surfaces(True)
+    assert overlap_of(target.image, run.mesh()) is None
+    assert 0 < n_gone < 0.3 * len(mesh.cells)
+    assert manifold_problems(run.mesh()) == []
+    record = run.record(0, 0.0, False, 0.0)
+    assert record.n_cells == len(run.mesh().cells)
+    assert record.n_voxels == tetopt.cell_moments(target.image, run.mesh()).n_voxels.sum()
+    untouched = Run(target, moved, 0.5)
+    assert untouched.mend_surfaces(False) == 0
+    assert overlap_of(target.image, untouched.mesh()).n_voxels == n_shared
+
+
 # Labels.
+
+
+def test_an_interface_that_touches_itself_is_mended_by_labels_alone():
+    """Two cells with one node in common get the other label."""
+    labels = corners()
+    target = content(labels, labels, weights=[0.0])
+    mesh = tetopt.mesh_image(target, 400, iterations=1).mesh
+    run = Run(target, mesh, 0.5)
+    run.give_labels()
+    assert manifold_problems(mesh, run.labels()) == []
+    of_cell = run.state.complex.labels
+    whole = [
+        n for n in range(len(mesh.points)) if len(set(of_cell[np.flatnonzero((mesh.cells == n).any(axis=1))])) == 1
+    ]
+    n_cells = np.bincount(mesh.cells.ravel())
+    node = max(whole, key=lambda n: n_cells[n])
+    star = np.flatnonzero((mesh.cells == node).any(axis=1))
+    shared = (mesh.cells[star][:, :, None, None] == mesh.cells[star]).any(axis=1).sum(axis=2)
+    pair = star[np.argwhere(shared == 1)[0]]
+    of_cell[pair] = (of_cell[pair] + 1) % len(target.memberships.labels)
+    assert any("touches itself" in line for line in manifold_problems(mesh, run.labels()))
+    assert run.mend_surfaces(True) == 0
+    assert manifold_problems(run.mesh(), run.labels()) == []
+    np.testing.assert_array_equal(run.mesh().points, mesh.points)
 
 
 def corners(shape=(24, 24, 24)):
