@@ -16,6 +16,11 @@ QUICK = ("--nodes", "50", "--iterations", "1")
 MESH_OUTPUTS = (
     ".vtu", ".vtk", ".vtkhdf", ".xdmf", ".msh", ".msh2", ".inp", ".feb", ".scn", ".mfem", ".mesh", ".stl", ".ply",
 )  # fmt: skip
+# What a second mutation meets in a file whose format the first has damaged.
+LOST_FORMAT = (
+    ValueError, OSError, EOFError, zlib.error, nibabel.wrapstruct.WrapStructError,
+    nibabel.spatialimages.HeaderDataError, nibabel.filebasedimages.ImageFileError,
+)  # fmt: skip
 SPECIAL_KINDS = ("fifo", "zero", "loop", "folder", "stdin", "gone")
 
 
@@ -58,7 +63,7 @@ class Draw:
             mutation = one_of(self.rng, mutations)
             try:
                 word, self.files[name] = mutation(self.rng, self.files[name])
-            except (ValueError, OSError, EOFError, zlib.error):  # the first has left nothing of the format
+            except LOST_FORMAT:  # the first has left nothing of the format
                 break
             words.append(word)
         return name, "; ".join(words)
