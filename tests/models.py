@@ -10,6 +10,7 @@ import tetopt
 from tetopt.fem.elasticity import compression, lame_constants, stiffness, strains
 from tetopt.geometry.quadratic import cell_edges, quadratic
 from tetopt.geometry.simplex import volumes
+from tetopt.model.labels import TABLE_TEXT, LabelTable, table_words
 from tetopt.model.loads import parse_loads
 from tetopt.model.materials import binned, materials
 from tetopt.model.model import Model
@@ -57,6 +58,23 @@ def sample_model(n=3, bins=3):
         table = binned(table, volumes(mesh.points, mesh.cells), bins)
     loads = parse_loads(["compress:5%"], mesh, sets)
     return Model(mesh, fields, sets, table, loads, about=dict(ABOUT))
+
+
+def unlabelled(model):
+    return model._replace(cell_data={name: values for name, values in model.cell_data.items() if name != "label"})
+
+
+def labelled_model(n=3):
+    """Cells of the labels 0, 2, 3 and 7 with their sets, 7 by name; a set of the user's within one."""
+    model = sample_model(n)._replace(materials=None, loads=())
+    height = model.mesh.points[model.mesh.cells].mean(axis=1)[:, -1]
+    labels = np.array([0, 2, 3, 7])[np.searchsorted(np.quantile(height, [0.25, 0.5, 0.75]), height)]
+    names = {7: "Right kidney"}
+    sets = standard_sets(model.mesh, box_of(sample_image(n)), labels, names)
+    return model._replace(
+        cell_data=model.cell_data | {"label": labels}, sets=sets,
+        about=ABOUT | {TABLE_TEXT: table_words(LabelTable(names, {}))},
+    )  # fmt: skip
 
 
 @cache

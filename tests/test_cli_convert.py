@@ -273,6 +273,17 @@ def test_the_group_of_label_0_and_incomplete_groups_are_said(folder, tmp_path, c
         assert ("those of smaller sets are missing from boundary" in said) == (suffix == ".msh2")
 
 
+def test_numbers_that_are_not_a_label_s_are_said(folder, tmp_path, capsys):
+    labels = tetopt.load_mesh(folder / "a.vtu").cell_data["label"].astype(int)
+    for suffix, word in ((".mfem", "attribute"), (".mesh", "reference")):
+        assert exit_code("convert", folder / "a.vtu", tmp_path / f"a{suffix}") == 0
+        said = capsys.readouterr().out
+        assert f"label 0 is {word} {labels.max() + 1}" in said
+        assert "2001" not in said
+        assert exit_code("convert", folder / "a.vtu", tmp_path / f"b{suffix}", "--young", LAW) == 0
+        assert "number from 2001 on (label_1, label_0)" in " ".join(capsys.readouterr().out.split())
+
+
 @pytest.mark.parametrize(
     ("options", "said"),
     [

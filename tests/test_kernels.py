@@ -488,6 +488,66 @@ def test_what_another_run_compiles_is_waited_for(tmp_path, monkeypatch):
         assert not has_waited
 
 
+BEYOND = """
+from __future__ import annotations
+from typing import NamedTuple
+import numpy as np
+from tetopt.kernels import Floats1, entry, run, unit
+
+class Row(NamedTuple):
+    x: Floats1
+    offset: int
+
+@unit
+def value(row: Row, i: int) -> float:
+    return row.x[i + row.offset]
+
+@unit
+def zero(row: Row, i: int) -> None:
+    row.x[i + row.offset] = 0.0
+
+@entry
+def own(row: Row) -> float:
+    return row.x[row.offset]
+
+@entry
+def of_unit(row: Row) -> float:
+    return value(row, 0)
+
+def caught(call, row):
+    try:
+        call(row)
+    except (IndexError, MemoryError):  # `run` knows no causes and takes each for the latter
+        return True
+    return False
+
+calls = own, of_unit, lambda row: value(row, 0), lambda row: run(zero, 4, row)
+
+def main():
+    memory = np.ones(64)
+    print([[caught(call, Row(memory[:4], offset)) for call in calls] for offset in (0, 9)])
+"""
+
+
+@compiled_only
+def test_an_index_beyond_its_array_is_caught_where_each_is_checked(tmp_path):
+    """Also after kernels without checks were kept in the same cache; these are not run then."""
+    (tmp_path / "beyond.py").write_text(BEYOND)
+    environment = os.environ | {
+        "NUMBA_CACHE_DIR": str(tmp_path / "cache"),
+        "PYTHONPATH": os.pathsep.join([str(tmp_path), *filter(None, sys.path)]),
+    }
+    said = [
+        subprocess.run(
+            [sys.executable, "-c", "import beyond; beyond.main()"],
+            env=environment | {"NUMBA_BOUNDSCHECK": is_checked}, capture_output=True, text=True, check=True,
+        ).stdout.strip()
+        for is_checked in "011"
+    ]  # fmt: skip
+    survived, checked = str([[False] * 4, [False] * 4]), str([[False] * 4, [True] * 4])
+    assert said == [survived, checked, checked]
+
+
 # Memory.
 
 LARGE_UNIT = """

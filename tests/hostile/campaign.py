@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import itertools
 import json
 import os
 import resource
@@ -51,7 +52,7 @@ def load_everything() -> None:
     modules = [f"tetopt.cli.{module}" for module, _ in app.COMMANDS.values()]
     modules += [f"tetopt.report.{name}" for name in ("exhibit", "explore", "figures")]
     modules += ["tetopt.fem.reference", "tetopt.fem.solution", "tetopt.measure.segmentation"]
-    modules += ["SimpleITK", "PIL.Image", "meshio", "pyvista", "trimesh", "h5py"]
+    modules += ["SimpleITK", "PIL.Image", "meshio", "pyvista", "trimesh", "h5py", "zarr", "zarr.codecs"]
     for name in modules:
         import_module(name)
     kernels = import_module("tetopt.kernels")
@@ -110,7 +111,7 @@ def laid_out(case: Case, folder: Path) -> None:
     (folder / "outside.raw").write_bytes(bytes(1) * 10_000)
     for name, data in case.files.items():
         path = folder / "cwd" / name
-        path.parent.mkdir(exist_ok=True)
+        path.parent.mkdir(parents=True, exist_ok=True)
         if data.startswith(b"special:sparse:"):
             path.write_bytes(data[15:])
             os.truncate(path, SPARSE_SIZE)
@@ -243,7 +244,7 @@ class Campaign:
         for path, data in one.case.files.items():
             place = target / path
             with contextlib.suppress(OSError):
-                place.parent.mkdir(exist_ok=True)
+                place.parent.mkdir(parents=True, exist_ok=True)
                 place.write_bytes(data if len(data) < 2_000_000 else data[:1000])
         lines = [
             f"outcome: {judged.outcome}: {judged.why}",
@@ -283,6 +284,7 @@ def main() -> int:
     parser.add_argument("--inputs", type=int, default=200, help="how many")
     parser.add_argument("--seed", type=int, default=int(os.environ.get("HOSTILE_SEED", "1")), help="also HOSTILE_SEED")
     parser.add_argument("--only", type=int, nargs="*", help="these numbers alone")
+    parser.add_argument("--kind", choices=list(KINDS), help="of this kind alone")
     parser.add_argument("--first", type=int, default=0, help="the first number")
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--max-seconds", type=float, default=1e9, help="start no more after this time")
@@ -299,7 +301,10 @@ def main() -> int:
     load_everything()
     with tempfile.TemporaryDirectory(prefix="hostile-") as scratch:
         campaign = Campaign(chosen.seed, chosen.workers, Path(scratch), chosen.failures)
-        numbers = list(range(chosen.first, chosen.first + chosen.inputs)) if chosen.only is None else chosen.only
+        if (numbers := chosen.only) is None:
+            cases = (case_of(campaign.seeds, chosen.seed, number) for number in itertools.count(chosen.first))
+            own = (number for number, case in enumerate(cases, chosen.first) if chosen.kind in (None, case.kind))
+            numbers = list(itertools.islice(own, chosen.inputs))
         count = campaign.run(numbers, chosen.max_seconds)
     print("\n".join(campaign.table()))
     print(f"\n{count} inputs of seed {chosen.seed} in {time.monotonic() - begin:.0f} s, {campaign.n_bad} ended badly")

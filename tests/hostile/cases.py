@@ -16,6 +16,11 @@ QUICK = ("--nodes", "50", "--iterations", "1")
 MESH_OUTPUTS = (
     ".vtu", ".vtk", ".vtkhdf", ".xdmf", ".msh", ".msh2", ".inp", ".feb", ".scn", ".mfem", ".mesh", ".stl", ".ply",
 )  # fmt: skip
+# What a second mutation meets in a file whose format the first has damaged.
+LOST_FORMAT = (
+    ValueError, OSError, EOFError, zlib.error, nibabel.wrapstruct.WrapStructError,
+    nibabel.spatialimages.HeaderDataError, nibabel.filebasedimages.ImageFileError,
+)  # fmt: skip
 SPECIAL_KINDS = ("fifo", "zero", "loop", "folder", "stdin", "gone")
 
 
@@ -58,7 +63,7 @@ class Draw:
             mutation = one_of(self.rng, mutations)
             try:
                 word, self.files[name] = mutation(self.rng, self.files[name])
-            except (ValueError, OSError, EOFError, zlib.error):  # the first has left nothing of the format
+            except LOST_FORMAT:  # the first has left nothing of the format
                 break
             words.append(word)
         return name, "; ".join(words)
@@ -230,6 +235,29 @@ def dicom(draw):
         draw.files = {"s.dcm": draw.files[name]}
         return what, *with_image(draw, "s.dcm", is_main=True)
     return f"folder: {what}", *with_image(draw, "d", is_main=draw.rng.random() < 0.7)
+
+
+def zarr_volumes(draw):
+    """Arrays of Zarr, one of whose chunks, or its metadata, is damaged, gone or of another array."""
+    files = draw.seeds.files
+    folder = draw.one(*sorted({name.partition("/")[0] for name in files if ".zarr/" in name}))
+    names = [draw.good(name) for name in files if name.startswith(f"{folder}/")]
+    texts = [name for name in names if name.endswith((".json", ".zarray", ".zattrs", ".zgroup", ".zmetadata"))]
+    chunks = [name for name in names if name not in texts]
+    how = draw.one("chunk", "chunk", "chunk", "text", "text", "gone", "another", "special")
+    if how == "chunk":
+        name, what = draw.bad(draw.one(*chunks), (m.packed_head, m.packed_head, m.packed_head, *m.ANY))
+    elif how == "text":
+        name, what = draw.bad(draw.one(*texts), (*m.TEXT, *m.TEXT, *m.ANY))
+    else:
+        name, what = draw.one(*(names if how == "gone" else chunks)), how
+        others = [other for other in files if ".zarr/" in other and other.rsplit("/", 1)[1].strip("0.1") == ""]
+        draw.files[name] = (
+            b"special:" + draw.one(*SPECIAL_KINDS).encode() if how == "special" else files[draw.one(*others)]
+        )
+        if how == "gone":
+            del draw.files[name]
+    return f"{name}: {what}", *with_image(draw, folder, is_main=draw.rng.random() < 0.7)
 
 
 def pictures(draw):
@@ -690,7 +718,7 @@ def lines(draw):
 
 KINDS: dict[str, tuple[int, Callable[[Draw], tuple]]] = {
     "NIfTI": (6, nifti), "odd images": (6, odd_images), "MGH": (2, mgh), "NRRD, MetaImage": (5, itk), "DICOM": (3,
-    dicom), "pictures": (2, pictures),
+    dicom), "Zarr": (4, zarr_volumes), "pictures": (2, pictures),
     "VTU": (7, vtu), "meshes in pieces": (4, pieces), "legacy VTK": (4, vtk), "gmsh": (5, gmsh),
     "CalculiX's results": (2, results),
     "field names": (2, field_names),

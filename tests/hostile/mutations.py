@@ -125,6 +125,17 @@ def replaced(rng, data):
     return what, choices[what]
 
 
+def packed_head(rng, data):
+    """A byte or a number in the head that a codec puts before what it has packed."""
+    array, at = bytearray(data), int(rng.integers(min(len(data), 20) or 1))
+    size = int(one_of(rng, [1, 1, 2, 4, 8]))
+    number = int(
+        one_of(rng, [0, 1, 2, 127, 255, 2**15, 2**31 - 1, 2**31, 2**32 - 1, 2**63 - 1, len(data), 5 * len(data)])
+    )
+    array[at : at + size] = (number % 256**size).to_bytes(size, "little")
+    return f"{number} in {size} bytes at {at}", bytes(array)
+
+
 def packed_worse(rng, data):
     """Packed by gzip, with that file damaged, or twice, or with rubbish behind it."""
     packed = gzip.compress(data, mtime=0)

@@ -85,6 +85,7 @@ def write_seeds(folder: Path):
     place = affine()
     _write_nibabel(folder, data, labels, inside, place)
     _write_itk(folder, data)
+    _write_zarr(folder, data, place)
     for name in ("p.png", "p.tif", "p.bmp", "p.jpg"):
         PIL.Image.fromarray(data[:, :, 5].astype(np.uint8)).save(folder / name)
     for name, content in ({"phantom.toml": PHANTOM} | TABLES | LAWS).items():
@@ -133,6 +134,33 @@ def _write_itk(folder, data):
             plane.SetMetaData(tag, value)
         writer.SetFileName(str(folder / f"s{k}.dcm"))
         writer.Execute(plane)
+
+
+def _write_zarr(folder, data, place):
+    """Arrays by themselves, of both formats and each packer, in two chunks; and an OME-Zarr image by tetopt."""
+    import numcodecs
+    import zarr
+    from zarr import codecs
+
+    of_format_2 = {
+        "blosc": numcodecs.Blosc("lz4", 5, numcodecs.Blosc.SHUFFLE), "bits": numcodecs.Blosc("zstd", 1, 2),
+        "zstd": numcodecs.Zstd(), "lz4": numcodecs.LZ4(), "zlib": numcodecs.Zlib(), "gzip": numcodecs.GZip(),
+        "bz2": numcodecs.BZ2(), "lzma": numcodecs.LZMA(), "bare": None,
+    }  # fmt: skip
+    of_format_3 = {
+        "blosc": codecs.BloscCodec(typesize=2, cname="zstd", shuffle="bitshuffle"), "zstd": codecs.ZstdCodec(),
+        "gzip": codecs.GzipCodec(), "shards": codecs.BloscCodec(typesize=2),
+    }  # fmt: skip
+    half = (data.shape[0] // 2, *data.shape[1:])
+    for number, packers in ((2, of_format_2), (3, of_format_3)):
+        for name, packer in packers.items():
+            array = zarr.create_array(
+                folder / f"{name}{number}.zarr", shape=data.shape, dtype=data.dtype, zarr_format=number,
+                chunks=(half[0] // 2, *half[1:]) if name == "shards" else half, compressors=packer,
+                shards=half if name == "shards" else None, attributes={"affine": place.tolist()},
+            )  # fmt: skip
+            array[...] = data
+    tetopt.save_image(folder / "ome.zarr", tetopt.Image(data, place))
 
 
 def _write_meshes():
@@ -203,7 +231,7 @@ def frd_of(mesh):
 
 def load_seeds(folder: Path) -> Seeds:
     """What `write_seeds` has left."""
-    files = {path.name: path.read_bytes() for path in sorted(folder.iterdir()) if path.is_file()}
+    files = {str(path.relative_to(folder)): path.read_bytes() for path in sorted(folder.rglob("*")) if path.is_file()}
     packer = zlib.compressobj(9, zlib.DEFLATED, 31)
     member = b"".join(packer.compress(bytes(1 << 20)) for _ in range(MEMBER_BYTES >> 20)) + packer.flush()
     return Seeds(files, member * N_MEMBERS)

@@ -9,7 +9,17 @@ import sys
 import meshio
 import numpy as np
 import pytest
-from models import ABOUT, all_nodes, each_once, quadratic_model, sample_image, sample_model, young_of
+from models import (
+    ABOUT,
+    all_nodes,
+    each_once,
+    labelled_model,
+    quadratic_model,
+    sample_image,
+    sample_model,
+    unlabelled,
+    young_of,
+)
 
 import tetopt.io.gmsh
 from tetopt.errors import InputError
@@ -19,11 +29,10 @@ from tetopt.io.formats import save_model
 from tetopt.io.gmsh import gmsh22, gmsh41, own_comments
 from tetopt.io.meshes import load_mesh
 from tetopt.model.build import model_of
-from tetopt.model.labels import TABLE_TEXT, LabelTable, table_words
 from tetopt.model.loads import load_words
 from tetopt.model.materials import materials
 from tetopt.model.model import element_facets, elements, in_space, in_units
-from tetopt.model.sets import FACE_NAMES, Sets, box_of, facet_triples, standard_sets
+from tetopt.model.sets import FACE_NAMES, Sets, box_of, facet_triples
 
 WRITERS = {"4.1": gmsh41, "2.2": gmsh22}
 MODELS = [(3, 3), (3, None), (2, 3), (2, None)]
@@ -127,23 +136,6 @@ class Read:
         entities = {int(line[1]) for line in lines if line and name in line[2].split()}
         n = max(dim for dim, _ in self.groups) - (what == "facets")
         return [k for k, (kind, entity, _) in self.elements.items() if DIM_OF_TYPE[kind] == n and entity in entities]
-
-
-def unlabelled(model):
-    return model._replace(cell_data={name: values for name, values in model.cell_data.items() if name != "label"})
-
-
-def labelled_model(n=3):
-    """Cells of the labels 0, 2, 3 and 7 with their sets, 7 by name; a set of the user's within one."""
-    model = sample_model(n)._replace(materials=None, loads=())
-    height = model.mesh.points[model.mesh.cells].mean(axis=1)[:, -1]
-    labels = np.array([0, 2, 3, 7])[np.searchsorted(np.quantile(height, [0.25, 0.5, 0.75]), height)]
-    names = {7: "Right kidney"}
-    sets = standard_sets(model.mesh, box_of(sample_image(n)), labels, names)
-    return model._replace(
-        cell_data=model.cell_data | {"label": labels}, sets=sets,
-        about=ABOUT | {TABLE_TEXT: table_words(LabelTable(names, {}))},
-    )  # fmt: skip
 
 
 def cell_numbers(model):

@@ -9,7 +9,7 @@ import sys
 import meshio
 import numpy as np
 import pytest
-from models import ABOUT, each_once, quadratic_model, sample_model, young_of
+from models import ABOUT, each_once, labelled_model, quadratic_model, sample_model, unlabelled, young_of
 
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import quadratic
@@ -89,8 +89,26 @@ def test_boundary_faces_out(n):
 
 def test_references_are_the_materials_where_no_set_divides_one():
     model = sample_model()
-    read = Read(medit(model._replace(sets=model.sets._replace(cells={}))))
+    read = Read(medit(unlabelled(model)._replace(sets=model.sets._replace(cells={}))))
     assert np.array_equal(read.refs["Tetrahedra"], model.materials.of_cell + 1)
+
+
+@pytest.mark.parametrize("n", [3, 2])
+def test_the_reference_is_the_label(n):
+    """And that of each part of a label that a set divides has a number behind all others."""
+    model = labelled_model(n)
+    labels = model.cell_data["label"]
+    read = Read(medit(model))
+    assert np.array_equal(read.refs[KEYWORD[n]], np.where(labels == 0, 8, labels))
+    assert any(line.startswith("label 0 is reference 8") for line in read.comments)
+    assert read.refs[KEYWORD[n - 1]].min() > 1000
+    within = np.flatnonzero(labels == 3)[::3]
+    read = Read(medit(model._replace(sets=Sets({"boundary": model.sets.facets["boundary"]}, {"within": within}))))
+    refs = read.refs[KEYWORD[n]]
+    assert np.array_equal(refs[labels != 3], np.where(labels == 0, 8, labels)[labels != 3])
+    assert set(refs[labels == 3]) == {2001, 2002}
+    assert np.array_equal(read.cells_of("label_3"), np.flatnonzero(labels == 3))
+    assert set(read.refs[KEYWORD[n - 1]]) == {1999}
 
 
 def test_constants_image_and_loads_are_in_comments():
@@ -104,7 +122,10 @@ def test_constants_image_and_loads_are_in_comments():
     assert np.array_equal(nu, model.materials.nu[model.materials.of_cell])
     assert f"image: {ABOUT['image']}, sha256 {ABOUT['image_sha256']}" in read.comments
     assert any(line.endswith("load, which this format has no place for: hold:superior") for line in read.comments)
-    assert any(line.startswith("cell data") and line.endswith(", ".join(model.cell_data)) for line in read.comments)
+    assert any(
+        line.startswith("cell data") and line.endswith(", ".join(name for name in model.cell_data if name != "label"))
+        for line in read.comments
+    )
 
 
 def test_lps():

@@ -4,12 +4,13 @@ import re
 
 import numpy as np
 import pytest
-from models import ABOUT, each_once, quadratic_model, sample_model, young_of
+from models import ABOUT, each_once, labelled_model, quadratic_model, sample_model, unlabelled, young_of
 
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import quadratic
 from tetopt.geometry.simplex import volumes
 from tetopt.io.mfem import mfem
+from tetopt.model.materials import materials
 from tetopt.model.model import in_space, in_units
 from tetopt.model.sets import Sets, facet_triples
 
@@ -101,17 +102,40 @@ def test_boundary_elements_face_out(n):
 
 def test_attributes_are_the_materials_where_no_set_divides_one():
     model = sample_model()
-    read = Read(mfem(model._replace(sets=model.sets._replace(cells={}))))
+    read = Read(mfem(unlabelled(model)._replace(sets=model.sets._replace(cells={}))))
     assert np.array_equal(read.attributes, model.materials.of_cell + 1)
 
 
-def test_attributes_run_from_one_by_material():
-    model = sample_model()
-    read = Read(mfem(model))
-    distinct, first = np.unique(read.attributes, return_index=True)
-    assert distinct.tolist() == list(range(1, len(distinct) + 1))
-    assert (np.diff(model.materials.of_cell[first]) >= 0).all()
-    assert len(distinct) > len(model.materials.young)  # or else the sets divide none
+@pytest.mark.parametrize("n", [3, 2])
+@pytest.mark.parametrize("has_sets", [True, False])
+def test_the_attribute_is_the_label(n, has_sets):
+    """Also where labels are no sets: these are named in the file all the same."""
+    model = labelled_model(n)
+    labels = model.cell_data["label"]
+    read = Read(mfem(model if has_sets else model._replace(sets=Sets({}, {}))))
+    assert np.array_equal(read.attributes, np.where(labels == 0, 8, labels))
+    assert read.cell_sets == {"label_0": [8], "label_2": [2], "label_3": [3], "Right_kidney": [7]}
+    assert any(line.startswith("label 0 is attribute 8") for line in read.comments)
+    boundary = model.sets.facets["boundary"]
+    fewer = Read(mfem(model._replace(sets=Sets({"boundary": boundary}, {}))))
+    assert fewer.facet_sets == {"boundary": [1999]}  # of whatever mesh
+
+
+def test_parts_of_divided_labels_have_attributes_behind_all_others():
+    model = labelled_model()
+    labels = model.cell_data["label"]
+    within = np.flatnonzero(labels == 3)[::3]
+    read = Read(mfem(model._replace(sets=model.sets._replace(cells=model.sets.cells | {"within": within}))))
+    assert set(read.attributes[labels == 3]) == {2001, 2002}
+    assert np.array_equal(read.attributes[labels != 3], np.where(labels == 0, 8, labels)[labels != 3])
+    assert np.array_equal(read.cells_of("within"), within)
+    assert any(" 2001 " in line and line.endswith("(label_3)") for line in read.comments)
+    table = materials(1.0 + np.arange(len(labels)) % 2, 0.3, len(labels))
+    divided = Read(mfem(model._replace(materials=table, sets=Sets({}, {}))))
+    assert divided.attributes.min() > 2000
+    for name, label in (("label_0", 0), ("label_3", 3), ("Right_kidney", 7)):
+        assert np.array_equal(divided.cells_of(name), np.flatnonzero(labels == label))
+    assert not any(line.startswith("label 0 is") for line in divided.comments)  # two attributes are
 
 
 def test_constants_and_what_attributes_mean_are_in_comments():
@@ -129,7 +153,10 @@ def test_constants_and_what_attributes_mean_are_in_comments():
             assert f"{what} {attribute}: {' '.join(names)}" in read.comments
     assert f"image: {ABOUT['image']}, sha256 {ABOUT['image_sha256']}" in read.comments
     assert any(line.endswith("load, which this format has no place for: hold:superior") for line in read.comments)
-    assert any(line.startswith("cell data") and line.endswith(", ".join(model.cell_data)) for line in read.comments)
+    assert any(
+        line.startswith("cell data") and line.endswith(", ".join(name for name in model.cell_data if name != "label"))
+        for line in read.comments
+    )
 
 
 def test_lps():

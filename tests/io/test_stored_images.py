@@ -378,6 +378,10 @@ def test_checksums_of_a_folder(pyramid, tmp_path):
     os.mkfifo(path / "pipe")
     with pytest.raises(InputError, match="pipe: expected a regular file, got a pipe"):
         stored_checksum(path)
+    (path / "pipe").unlink()
+    (path / "link").symlink_to("nowhere")
+    with pytest.raises(InputError, match="link: no such file"):  # not the whole folder
+        sha256(path)
 
 
 def test_cheap_checksum_of_a_file(tmp_path):

@@ -6,11 +6,12 @@ import meshio
 import numpy as np
 import pytest
 import pyvista
-from models import ABOUT, all_nodes, quadratic_model, sample_model, with_two_sides
+from models import ABOUT, all_nodes, labelled_model, quadratic_model, sample_model, with_two_sides
 
 from tetopt.errors import InputError
 from tetopt.io.xdmf import xdmf
 from tetopt.model.loads import load_words
+from tetopt.model.materials import materials
 from tetopt.model.model import described, elements, in_space, in_units
 from tetopt.model.sets import Sets, facet_triples, standard_sets
 
@@ -150,6 +151,16 @@ def test_every_cell_set_comes_back(model):
     for name, cells in model.sets.cells.items():
         own = elements(model)[1][cells]
         assert np.array_equal(members[np.isin(tags, np.array(tags_of[name], dtype=int))], own), name
+
+
+def test_the_tag_of_a_cell_is_its_label():
+    model = labelled_model()
+    labels, within = model.cell_data["label"], np.flatnonzero(model.cell_data["label"] == 3)[::3]
+    table = materials(1.0 + np.arange(len(labels)), 0.3, len(labels))
+    sets = model.sets._replace(cells=model.sets.cells | {"within": within})
+    tags = fields(grids(model._replace(materials=table, sets=sets))["cells"])["cells"]
+    assert np.array_equal(tags[labels != 3], np.where(labels == 0, 8, labels)[labels != 3])
+    assert tags[labels == 3].min() > 2000
 
 
 @pytest.mark.parametrize("n", [2, 3])

@@ -20,7 +20,8 @@ from tetopt.cli.inputs import label_table
 from tetopt.cli.options import ModelOptions, SolverOptions
 from tetopt.io.files import kept_places
 from tetopt.io.formats import FORMATS, file_bytes, format_of, save_model
-from tetopt.io.gmsh import group_of_zero, incomplete_groups
+from tetopt.io.gmsh import incomplete_groups
+from tetopt.io.tags import group_of_zero, label_lines, numbered_parts
 from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.model.averages import DEFAULT_AVERAGE, parse_average
 from tetopt.model.build import model_of
@@ -58,6 +59,7 @@ SET_GROUPS = ("labels", "interfaces", "boundary")  # of the sets that every mesh
 # Each is an array more on the nodes of a VTU or VTK file; labels and their sets can be made anew of its cells.
 MANY_INTERFACES = 24
 GMSH_SUFFIXES = (".msh", ".msh2")
+CELL_NUMBERS = {".mfem": "attribute", ".mesh": "reference"}  # what the formats call the number of a cell
 INTERFACE_PREFIX = "interface_"  # of the names of facet sets between two labels
 LISTED_NAMES = 8  # of labels of one material: a line's worth
 SLOW_MATERIALS = 30_000  # CalculiX takes three times as long with as many as there are cells (tests/benchmarks)
@@ -437,8 +439,10 @@ def _lines(output: Path, model: Model, solver: SolverOptions) -> Iterator[str]:
         yield f"{n_steps} steps, each from the undeformed state"
     if model.loads and not (form.runs or form.is_surface):
         yield "the format runs no step: the loads are in the file as text"
-    if output.suffix.lower() in GMSH_SUFFIXES:
-        yield from _gmsh_lines(model, output.suffix.lower())
+    if (suffix := output.suffix.lower()) in GMSH_SUFFIXES:
+        yield from _gmsh_lines(model, suffix)
+    elif suffix in CELL_NUMBERS:
+        yield from label_lines(model, numbered_parts(model)[0], CELL_NUMBERS[suffix])
     low, high = model.mesh.points.min(axis=0), model.mesh.points.max(axis=0)
     ranges = zip("xyz", low, high, strict=False)
     yield (

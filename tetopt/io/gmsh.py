@@ -30,8 +30,7 @@ own reader goes by them, see `own_comments`.
 from __future__ import annotations
 
 import re
-from collections import Counter
-from itertools import count, pairwise
+from itertools import pairwise
 from typing import NamedTuple
 
 import numpy as np
@@ -39,43 +38,28 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.io.tags import (
-    Tagged,
+    Part,
     as_columns,
-    cell_tags,
     check_apart,
-    facet_tags,
-    material_names,
+    group_labels,
+    group_of_zero,
+    numbered_parts,
     remarks,
     tag_lines,
     without_data,
+    without_labels,
 )
 from tetopt.io.text import comment_lines, names_apart, rows
 from tetopt.model.fields import node_field
-from tetopt.model.labels import TABLE_TEXT, labels_of, table_of_words
 from tetopt.model.model import Model, element_facets, elements
-from tetopt.model.sets import BOUNDARY_SET, FACE_NAMES, MASK_SURFACE_SET, facet_triples, label_set_names
+from tetopt.model.sets import facet_triples
 
 # gmsh's numbers for elements of a dimension and an order: line, triangle, tetrahedron, and again.
 ELEMENT_TYPES = {(1, 1): 1, (2, 1): 2, (3, 1): 4, (1, 2): 8, (2, 2): 9, (3, 2): 11}
 TET10_ORDER = np.array([0, 1, 2, 3, 4, 5, 6, 7, 9, 8])  # gmsh has the midpoint of edge (2, 3) before that of (1, 3)
 VIEW_SHAPES = ((3,), (9,))  # of a row: a view holds vectors and tensors
 LABEL_COMMENT = "physical groups of cells are the labels; label 0 is {}"
-UNNAMED_GROUP = "unnamed"  # the group of cells that are in no other
 MOST_MATERIAL_GROUPS = 1000  # gmsh takes minutes to open a 2.2 file with 200,000, meshio hours for a 4.1
-LEAST_ROOM = 1000  # so many numbers are the labels' alone
-LARGEST_GROUP = 10**8 - 1  # of labels: twice the power of ten behind it still fits into the format's 32 bits
-
-
-class Part(NamedTuple):
-    """The elements of one dimension."""
-
-    dim: int
-    numbers: NDArray[np.int64]  # (E,) from 1
-    rows: NDArray[np.int64]  # (E,) cells, or (E, 2) facets
-    entities: NDArray[np.int64]  # (E,) the number of each one's entity
-    groups_of: dict[int, list[int]]  # the numbers of each entity's physical groups, the smallest set first; ascending
-    names: dict[int, str]  # of the groups by number
-    sets: dict[str, list[int]]  # the entities that make up each set
 
 
 class OwnComments(NamedTuple):
@@ -114,15 +98,10 @@ def own_comments(lines: list[str]) -> OwnComments | None:
     return OwnComments(space, texts, constants, entities["cells"], entities["facets"], zero)
 
 
-def group_of_zero(labels: NDArray[np.int64]) -> int:
-    """The physical group of label 0, which is no number of one: the first behind all labels."""
-    return int(labels.max()) + 1
-
-
 def incomplete_groups(model: Model) -> list[str]:
     """The facet sets whose group in 2.2 lacks what is in a smaller set, too."""
-    (*_, facets) = _parts(model)
-    in_several = [groups[1:] for groups in facets.groups_of.values()] if model.sets.facets else []
+    _, facets = numbered_parts(model)
+    in_several = [groups[1:] for groups in facets.groups_of.values()]
     return [facets.names[number] for number in sorted({each for groups in in_several for each in groups})]
 
 
@@ -140,7 +119,7 @@ def gmsh41(model: Model) -> bytes:
     if _n_materials(model) > MOST_MATERIAL_GROUPS:
         grouped = model._replace(materials=None)
         comments = [f"{_n_materials(model)} materials: in the views young, {model.units}, and nu; not groups"]
-    labels = _labels(model)
+    labels = group_labels(model)
     if labels is not None and not _is_of_labels(grouped, labels):  # an entity is a label: the moduli are views
         grouped = grouped._replace(materials=None)
     points, cells = _geometry(model)
@@ -191,7 +170,7 @@ def gmsh22(model: Model) -> bytes:
     parts = _parts(model)
     return _file(
         "2.2 0 8",
-        [*remarks(model), *without_data(_without_labels(model)), *_entity_comments(model, parts)],
+        [*remarks(model), *without_data(without_labels(model)), *_entity_comments(model, parts)],
         parts,
         _section("Nodes", f"{len(points)}\n", rows(np.arange(1, len(points) + 1), points)),
         _section(
@@ -238,12 +217,9 @@ def _nodes(model: Model, cells: NDArray[np.int64], part: Part) -> NDArray[np.int
 # Which elements there are
 
 
-def _labels(model: Model) -> NDArray[np.int64] | None:
-    """The cells' labels (M,), if they have any; InputError for one that is too large for a number of gmsh's."""
-    labels = labels_of(model.cell_data, len(model.mesh.cells))
-    if labels is not None and labels.max() > LARGEST_GROUP:
-        raise InputError(f"gmsh: expected labels up to {LARGEST_GROUP}, got {labels.max()}; number them from 1")
-    return labels
+def _parts(model: Model) -> list[Part]:
+    """The cells and, if there are sets of them, the facets."""
+    return [part for part in numbered_parts(model) if len(part.numbers)]
 
 
 def _is_of_labels(model: Model, labels: NDArray[np.int64]) -> bool:
@@ -254,99 +230,13 @@ def _is_of_labels(model: Model, labels: NDArray[np.int64]) -> bool:
     return len(pairs) == len(np.unique(labels))
 
 
-def _without_labels(model: Model) -> Model:
-    """The model without the labels, where physical groups tell them."""
-    of_cells = model.cell_data.items()
-    return model if _labels(model) is None else model._replace(cell_data={k: v for k, v in of_cells if k != "label"})
-
-
 def _entity_comments(model: Model, parts: list[Part]) -> list[str]:
     """Which entities make up each set, and that groups are labels, if they are."""
-    labels = _labels(model)
+    labels = group_labels(model)
     lines = [] if labels is None else [LABEL_COMMENT.format(group_of_zero(labels))]
     for part, what in zip(parts, ("cells", "facets"), strict=False):
         lines += tag_lines(part.sets, f"entity of {what}")
     return lines
-
-
-def _parts(model: Model) -> list[Part]:
-    """The cells and, if there are sets of them, the facets."""
-    labels, n_facets = _labels(model), len(model.sets.facets)
-    names, group = _cell_groups(model, labels)
-    room = LEAST_ROOM
-    while room <= max(names, default=0) or room <= n_facets + 2 * model.mesh.ndim + 2:
-        room *= 10
-    of_cells = cell_tags(model, labels)
-    _, first = np.unique(of_cells.tags, return_index=True)
-    cells = _part(model.mesh.ndim, of_cells, [[each] for each in group[first].tolist()], names, 1, 2 * room)
-    facets = _facets(model, room)
-    return [cells, facets] if len(facets.numbers) else [cells]
-
-
-def _part(dim: int, of_items: Tagged, groups_of: list[list[int]], names: dict[int, str], first: int, room: int) -> Part:
-    """The elements, numbered from `first`, of each tag an entity.
-
-    It has the number of its first group; where that is several, each has one from `room` on.
-    """
-    counts, free = Counter(groups[0] for groups in groups_of), count(room + 1)
-    number = np.array([groups[0] if counts[groups[0]] == 1 else next(free) for groups in groups_of], dtype=np.int64)
-    sets = {name: number[np.array(tags, dtype=np.int64) - 1].tolist() for name, tags in of_items.tags_of.items()}
-    numbers = first + np.arange(len(of_items.items))
-    by_number = dict(sorted(zip(number.tolist(), groups_of, strict=True)))
-    return Part(dim, numbers, of_items.items, number[of_items.tags - 1], by_number, names, sets)
-
-
-def _cell_groups(model: Model, labels: NDArray[np.int64] | None) -> tuple[dict[int, str], NDArray[np.int64]]:
-    """The names of the cells' groups by number, ascending, and the number of each cell's."""
-    if labels is not None:
-        kinds = np.unique(labels).tolist()
-        called = label_set_names(kinds, table_of_words(model.about.get(TABLE_TEXT)).names)
-        zero = group_of_zero(labels)
-        others = {
-            name: members
-            for name, members in model.sets.cells.items()
-            if not any(
-                name == called[kind] and np.array_equal(members, np.flatnonzero(labels == kind)) for kind in kinds
-            )
-        }
-        check_apart(list(called.values()), {**model.sets.facets, **others})
-        return dict(sorted((kind or zero, called[kind]) for kind in kinds)), np.where(labels == 0, zero, labels)
-    if model.materials is None:
-        listed, group = _disjoint_sets(model)
-    else:
-        listed, group = material_names(model, model.sets.facets), model.materials.of_cell + 1
-    return dict(enumerate(listed, 1)), group
-
-
-def _disjoint_sets(model: Model) -> tuple[list[str], NDArray[np.int64]]:
-    """Cell sets that do not overlap those before, and the number from 1 of each cell's, or of "unnamed"."""
-    names: list[str] = []
-    number = np.zeros(len(model.mesh.cells), dtype=np.int64)
-    for name, members in model.sets.cells.items():
-        if name not in model.sets.facets and not number[members].any():
-            names.append(name)
-            number[members] = len(names)
-    if (number == 0).any():
-        check_apart([UNNAMED_GROUP], {**model.sets.facets, **model.sets.cells})
-        names.append(UNNAMED_GROUP)
-        number[number == 0] = len(names)
-    return names, number
-
-
-def _facets(model: Model, room: int) -> Part:
-    """Every facet of a set; an entity is what is in the same sets."""
-    sets = model.sets.facets
-    last = [*(name for pair in FACE_NAMES[model.mesh.ndim] for name in pair), MASK_SURFACE_SET, BOUNDARY_SET]
-    of_box = dict(zip(last, count(2 * room - len(last)), strict=False))
-    free = count(room + 1)
-    number = {name: of_box[name] if name in of_box else next(free) for name in sets}
-    of_facets = facet_tags(model.mesh, sets)
-    groups_of: list[list[int]] = [[] for _ in range(of_facets.tags.max(initial=0))]
-    for name in sorted(sets, key=lambda name: (len(sets[name]), number[name])):
-        for tag in of_facets.tags_of[name]:
-            groups_of[tag - 1].append(number[name])
-    names = {number[name]: name for name in sorted(sets, key=number.__getitem__)}
-    return _part(model.mesh.ndim - 1, of_facets, groups_of, names, len(model.mesh.cells) + 1, 2 * room)
 
 
 def _by_entity(part: Part) -> Part:

@@ -503,16 +503,16 @@ def check_beginning(path: Path) -> str:
 
 @contextlib.contextmanager
 def os_errors_named(path: Path | None = None) -> Iterator[None]:
-    """Turn the operating system's errors into InputErrors, after the path if given."""
-    prefix = "" if path is None else f"{path}: "
+    """Turn the operating system's errors into InputErrors, after the file that they tell of, or the path, if given."""
     try:
         yield
-    except FileNotFoundError as error:
-        raise InputError(f"{prefix}no such file or folder; check the path") from error
-    except PermissionError as error:
-        raise InputError(f"{prefix}permission denied; make the file readable for your user") from error
     except OSError as error:
-        raise InputError(f"{prefix}cannot be opened ({error.strerror or error})") from error
+        words = f"cannot be opened ({error.strerror or error})"
+        if isinstance(error, FileNotFoundError):
+            words = "no such file or folder; check the path"
+        elif isinstance(error, PermissionError):
+            words = "permission denied; make the file readable for your user"
+        raise InputError(words if path is None else f"{error.filename or path}: {words}") from error
 
 
 # NIfTI and MGZ

@@ -1,10 +1,10 @@
 """Meshes for MFEM and what is built on it: mesh format v1.3, with named sets of attributes (read by MFEM 4.10).
 
-An element has one attribute. So there is one for each combination of a material and cell sets, by material: the
-material's number where no set divides one. The named sets "material_1", ... and those of the cell sets tell which
-attributes make them up. A boundary element's attribute stands in the same way for a combination of facet sets. Facets
-inside the mesh that are in a set are boundary elements, too, as MFEM allows; one that two sets hold from opposite sides
-is turned as in the first of them.
+An element has one attribute, a number of `tetopt.io.tags.numbered_parts`: its label, or without labels its material's
+number. Where materials or cell sets divide a label, each part has its own. The named sets of the labels, "material_1",
+... and those of the cell sets tell which attributes make them up. A boundary element's attribute stands in the same way
+for a combination of facet sets. Facets inside the mesh that are in a set are boundary elements, too, as MFEM allows;
+one that two sets hold from opposite sides is turned as in the first of them.
 
 A mesh of order 2 has a nodal function of MFEM's quadratic H1 space, as `Mesh::SetCurvature(2)` makes one: vertices,
 then the middles of edges in the order in which the elements first name them. MFEM takes elements with such a function
@@ -19,7 +19,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.io.tags import cell_tags, facet_tags, remarks, tag_lines, without_data
+from tetopt.io.tags import all_sets, label_lines, numbered_parts, remarks, tag_lines, without_data, without_labels
 from tetopt.io.text import blocks, comment_lines, rows
 from tetopt.mesh import Mesh
 from tetopt.model.model import Model
@@ -41,25 +41,26 @@ def mfem(model: Model) -> bytes:
     Raises
     ------
     InputError
-        A cell set that is called as a material is.
+        As `tetopt.io.tags.numbered_parts`.
     """
     mesh = model.mesh
-    in_cells, on_facets = cell_tags(model), facet_tags(mesh, model.sets.facets)
-    comments = [*remarks(model), *without_data(model)]
-    comments += tag_lines(in_cells.tags_of, "attribute") + tag_lines(on_facets.tags_of, "boundary attribute")
+    in_cells, on_facets = numbered_parts(model)
+    cell_sets = all_sets(in_cells)
+    comments = [*remarks(model), *without_data(without_labels(model)), *label_lines(model, in_cells, "attribute")]
+    comments += tag_lines(cell_sets, "attribute") + tag_lines(on_facets.sets, "boundary attribute")
     return "".join(
         [
             "MFEM mesh v1.3\n\n",
             comment_lines(comments, "# "),
             f"\ndimension\n{mesh.ndim}\n",
             "\nelements\n",
-            _elements(in_cells.tags, mesh.ndim, mesh.cells),
+            _elements(in_cells.entities, mesh.ndim, mesh.cells),
             "\nattribute_sets\n",
-            _sets(in_cells.tags_of),
+            _sets(cell_sets),
             "\nboundary\n",
-            _elements(on_facets.tags, mesh.ndim - 1, facet_triples(mesh.cells, on_facets.items)),
+            _elements(on_facets.entities, mesh.ndim - 1, facet_triples(mesh.cells, on_facets.rows)),
             "\nbdr_attribute_sets\n",
-            _sets(on_facets.tags_of),
+            _sets(on_facets.sets),
             f"\nvertices\n{len(mesh.points)}\n",
             f"{mesh.ndim}\n{rows(mesh.points)}" if model.order == 1 else _nodes(mesh),
             "\nmfem_mesh_end\n",

@@ -3,7 +3,8 @@
 The domain has one grid, "mesh", as meshio wants it, with what is on each cell, first `material` from 1, then `young`
 and `nu`. An <Information> in it holds the others: "facets" and "cells", if there are such sets, with one integer for
 each facet or cell that is in any set. A tag stands for one combination of sets, so a set is several tags:
-<Information Name="superior" Value="2 5"> in the grid names them. This reads all of it, on any number of processes::
+<Information Name="superior" Value="2 5"> in the grid names them. The tag of a cell is its label, or another number if
+sets divide the label (`tetopt.io.tags.numbered_parts`). This reads all of it, on any number of processes::
 
     from xml.etree import ElementTree
 
@@ -90,11 +91,12 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.geometry.topology import facets
-from tetopt.io.tags import Tagged, as_columns, tagged
+from tetopt.io.tags import Tagged, as_columns, group_labels, numbered_parts, tagged
 from tetopt.io.text import rows, xml_attribute
 from tetopt.model.fields import NODE_MODULI, node_field
 from tetopt.model.loads import load_words
 from tetopt.model.model import Model, described, element_facets, elements
+from tetopt.model.sets import Sets
 
 # By dimension and order; lines need their number of nodes stated. VTK's order of nodes.
 TOPOLOGY_TYPES = {
@@ -125,9 +127,7 @@ def xdmf(model: Model) -> bytes:
     if model.sets.facets:
         grids.append(_facet_grid(model))
     if model.sets.cells:
-        combined, dim = tagged(model.sets.cells), model.mesh.ndim
-        nodes = elements(model)[1][combined.items]
-        grids.append(_tag_grid("cells", model, dim, nodes, combined))
+        grids.append(_cell_grid(model))
     text = _mesh_grid(model, "".join(grids))
     return (
         f'<?xml version="1.0" encoding="utf-8"?>\n<Xdmf Version="3.0">\n<Domain>\n{text}</Domain>\n</Xdmf>\n'.encode()
@@ -175,6 +175,15 @@ def _mesh_grid(model: Model, others: str) -> str:
 def _columns(fields: dict[str, NDArray]) -> dict[str, NDArray]:
     """Fields as VTK takes them for what they are: scalars and vectors, no matrices."""
     return as_columns(fields, shapes=((3,),))
+
+
+def _cell_grid(model: Model) -> str:
+    """The cells that are in any set; where they have labels, a tag is the label."""
+    combined = tagged(model.sets.cells)
+    if group_labels(model) is not None:
+        part, _ = numbered_parts(model._replace(materials=None, sets=Sets({}, model.sets.cells)))
+        combined = Tagged(combined.items, part.entities[combined.items], part.sets)
+    return _tag_grid("cells", model, model.mesh.ndim, elements(model)[1][combined.items], combined)
 
 
 def _facet_grid(model: Model) -> str:
