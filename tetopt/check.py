@@ -167,14 +167,14 @@ def manifold_problems(mesh: Mesh, of_cell: ArrayLike | None = None) -> list[str]
     at_ridges, at_nodes = pinches(facets(mesh.cells), labels.astype(np.int64))
     whose = "the boundary" if of_cell is None else "the interface of two labels"
     problems = []
-    for found, noun, words in (
+    for places, noun, words in (
         (at_ridges, "edges" if mesh.ndim == 3 else "nodes", "has more than two facets"),
         (at_nodes, "nodes", "touches itself"),
     ):
-        is_meant = (found.labels[:, 0] == OUTSIDE_LABEL) == (of_cell is None)
+        is_meant = (places.labels[:, 0] == OUTSIDE_LABEL) == (of_cell is None)
         if is_meant.any():
-            which = "" if of_cell is None else f" ({_most_frequent(found.labels[is_meant])})"
-            problems.append(f"{noun} where {whose} {words}{which}; nodes: {_first(found.nodes[is_meant])}")
+            which = "" if of_cell is None else f" ({_most_frequent(places.labels[is_meant])})"
+            problems.append(f"{noun} where {whose} {words}{which}; nodes: {_first(places.nodes[is_meant])}")
     return problems
 
 

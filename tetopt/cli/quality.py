@@ -85,8 +85,8 @@ def quality_command(
         show_error(f"{mesh_path}: {overlap}")
     if source is None or result is None:
         return 1 if problems else 0
-    told = ("overlap", "manifold") if problems else ("overlap",)  # with the cells' or nodes' numbers
-    missed = {name: words for name, words in result.missed.items() if name not in told}
+    known = ("overlap", "manifold") if problems else ("overlap",)  # with the cells' or nodes' numbers
+    missed = {name: words for name, words in result.missed.items() if name not in known}
     if not check:  # what makes the numbers above meaningless
         missed, measured = {name: words for name, words in missed.items() if name == "mask"}, {}
     result = result._replace(missed=missed)
@@ -161,14 +161,14 @@ def _checked(loaded: MeshFile, source: Source | None) -> tuple[list[str], list[s
     image, mask = (None, None) if source is None else (source.contrasts[0], source.mask)
     is_whole = mask is None and not _was_masked(loaded)
     is_filled = _fills_box(loaded, source)
-    problems, found = tetopt.check_mesh(loaded.mesh, image, is_whole=is_whole, is_filled=is_filled), []
+    problems, touching = tetopt.check_mesh(loaded.mesh, image, is_whole=is_whole, is_filled=is_filled), []
     labels = loaded.cell_data.get("label")
     if problems or labels is None:
         return problems, []
     if labels.ndim == 1 and ((np.rint(labels) == labels) & (labels >= 0)).all():
-        found = manifold_problems(loaded.mesh, labels)
+        touching = manifold_problems(loaded.mesh, labels)
     is_smooth = (_number(_texts(loaded, "inputs").get("smooth_interfaces")) or 0.0) > 0.0
-    return (found, []) if is_smooth else ([], found)
+    return (touching, []) if is_smooth else ([], touching)
 
 
 def _say_checked(

@@ -55,7 +55,7 @@ def mend_pinches(state: State, content: Content, mesh: Mesh) -> None:
     """Give cells other labels where an interface of two labels is not a manifold; no node moves."""
     labels, across = (array[: len(mesh.cells)] for array in (state.complex.labels, state.complex.across))
     of_ridges, of_nodes = pinches(facets(mesh.cells), labels)
-    if any((found.labels[:, 0] != OUTSIDE_LABEL).any() for found in (of_ridges, of_nodes)):
+    if any((places.labels[:, 0] != OUTSIDE_LABEL).any() for places in (of_ridges, of_nodes)):
         labels[:] = unpinched(mesh.points, mesh.cells, across, cell_counts(content, mesh), labels)
         _meet_everywhere(state, node_rings(state))
 

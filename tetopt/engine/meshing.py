@@ -179,16 +179,12 @@ def mesh_image(
     options["iterations"] = default_iterations if iterations is None else iterations
     if mode == "start":
         options.setdefault("boundary", "fixed")
-
     if mode == "graded":
         sizes = sizes_of_order(content, nodes, sizes, order)
     seconds: list[float] = []
 
     def run(initial: Mesh, nodes: int | None) -> Optimized:
-        n_dropped = 0
-        if content.region is not None and mode != "start":
-            kept = carved(initial, content.image, content.region, content.keeps_components)
-            initial, n_dropped = part_of(initial, kept.is_kept), kept.n_dropped
+        initial, n_dropped = (initial, 0) if mode == "start" else _carved(initial, content)
         check_memory_of(content, max(nodes or 0, len(initial.points)))
 
         def optimized(**more: Any) -> Optimized:
@@ -219,9 +215,16 @@ def mesh_image(
         result = meshed_in_all(content.image.ndim, nodes, begun)
     else:
         result = begun(nodes)
-    seconds_run = sum(seconds)
     result = requested(result, content, target_error, is_filled=mode != "start" and content.region is None)
-    return result._replace(seconds_start=time.perf_counter() - begin - seconds_run, seconds_run=seconds_run)
+    return result._replace(seconds_start=time.perf_counter() - begin - sum(seconds), seconds_run=sum(seconds))
+
+
+def _carved(initial: Mesh, content: Content) -> tuple[Mesh, int]:
+    """An initial mesh without what is carved off within a mask, and how many connected components were dropped."""
+    if content.region is None:
+        return initial, 0
+    carving = carved(initial, content.image, content.region, content.keeps_components)
+    return part_of(initial, carving.is_kept), carving.n_dropped
 
 
 def bytes_of(content: Content, nodes: int) -> float:

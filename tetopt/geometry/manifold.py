@@ -128,7 +128,7 @@ def pinches(shared: Facets, of_cell: NDArray[np.integer]) -> tuple[Pinches, Pinc
     surfaces = label_surfaces(shared, of_cell)
     ridges = surface_ridges(surfaces)
     fans = surface_fans(surfaces, ridges)
-    found = []
+    both = []
     for label, nodes, is_bad in (
         (ridges.label, ridges.nodes, (ridges.n_facets > 2) & (ridges.n_labels == 2)),
         (fans.label, fans.node[:, None], (fans.n_fans > 1) & (fans.n_labels == 2)),
@@ -136,8 +136,8 @@ def pinches(shared: Facets, of_cell: NDArray[np.integer]) -> tuple[Pinches, Pinc
         rows = np.flatnonzero(is_bad)
         rows = rows[np.lexsort((label[rows], *nodes[rows].T[::-1]))]
         # The surfaces of the two labels have all facets there in common: each place is listed once for either.
-        found.append(Pinches(label[rows].reshape(-1, 2), nodes[rows[::2]]))
-    return found[0], found[1]
+        both.append(Pinches(label[rows].reshape(-1, 2), nodes[rows[::2]]))
+    return both[0], both[1]
 
 
 def manifold_part(cells: NDArray[np.int64], size: NDArray[np.float64]) -> NDArray[np.bool_]:
@@ -211,7 +211,7 @@ def _cells_at_pinch(place: tuple[int, ...], star: dict[int, Corners], size: NDAr
 
 def _linked(links: dict[_Key, list[_Key]]) -> list[list[_Key]]:
     """Connected sets of a graph, each from its first member on."""
-    found: list[list[_Key]] = []
+    sets: list[list[_Key]] = []
     seen: set[_Key] = set()
     for first in links:
         if first not in seen:
@@ -220,8 +220,8 @@ def _linked(links: dict[_Key, list[_Key]]) -> list[list[_Key]]:
             for member in members:  # grows as it goes
                 members += (new := [other for other in dict.fromkeys(links[member]) if other not in seen])
                 seen.update(new)
-            found.append(members)
-    return found
+            sets.append(members)
+    return sets
 
 
 def _way(links: dict[int, list[int]], begin: set[int], end: set[int]) -> list[int]:

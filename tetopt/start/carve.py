@@ -68,9 +68,9 @@ def _home(
     of_voxel, n_homes = scipy.ndimage.label(region.inside)
     index = np.rint(image.to_index(centroids(mesh.points, mesh.cells[chosen]))).astype(np.int64)
     at = of_voxel[tuple(np.clip(index, 0, np.array(image.shape) - 1).T)].astype(np.int64)
-    held = scipy.sparse.coo_array((size[chosen], (number, at)), shape=(int(number.max()) + 1, n_homes + 1)).tocsr()
-    held = held[:, 1:]  # a component that lies outside in part has its home inside
-    home = np.zeros(held.shape[0], dtype=np.int64)
-    has_home = np.diff(held.indptr) > 0
-    home[has_home] = np.asarray(held.argmax(axis=1)).ravel()[has_home] + 1
+    shares = scipy.sparse.coo_array((size[chosen], (number, at)), shape=(int(number.max()) + 1, n_homes + 1)).tocsr()
+    shares = shares[:, 1:]  # a component that lies outside in part has its home inside
+    home = np.zeros(shares.shape[0], dtype=np.int64)
+    has_home = np.diff(shares.indptr) > 0
+    home[has_home] = np.asarray(shares.argmax(axis=1)).ravel()[has_home] + 1
     return home
