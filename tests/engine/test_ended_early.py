@@ -7,7 +7,7 @@ import pytest
 from states import ball
 
 import tetopt
-from tetopt.check import check_unfolded
+from tetopt.check import check_unfolded, manifold_problems
 from tetopt.energy.sampling import overlap_of
 from tetopt.io.formats import file_bytes
 from tetopt.parts.rounds import Request, mesh_in_parts
@@ -84,7 +84,9 @@ def assert_sound(result, image, labels, mask, order=1):
         assert last.E_D == pytest.approx(tetopt.E_D(image, mesh), rel=1e-6)
     assert tetopt.quality(mesh.points, mesh.cells).n_cells == len(mesh.cells)
     fields = tetopt.cell_fields(mesh, image)
-    if result.labels is not None:
+    if labels is not None:  # at whatever iteration it ended
+        problems = manifold_problems(mesh, result.labels) + ([] if mask is None else manifold_problems(mesh))
+        assert bool(problems) == ("manifold" in result.missed)
         assert set(result.labels.tolist()) <= set(labels.data.astype(int).ravel().tolist())
         fields["label"] = result.labels
     measured = fidelity(labels, mask, mesh, result.labels)

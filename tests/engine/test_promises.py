@@ -5,6 +5,7 @@ import pytest
 from shapes import shaped
 
 import tetopt
+from tetopt.check import manifold_problems
 from tetopt.engine.promises import promised, requested
 from tetopt.target.content import content, plain
 
@@ -138,6 +139,24 @@ def test_labels_without_cells():
         "labels": "no cell has label 7, of more than 200 voxels; allow more nodes, or a higher label_weight"
     }
     assert missed(target, result._replace(labels=None)) == {}
+
+
+@pytest.mark.parametrize("options", [{"k_D": 0.0}, {"iterations": 0}, {"iterations": 1, "stop": lambda: True}])
+def test_labels_are_given_and_judged_however_few_iterations_there_are(options):
+    image, mask = shaped("ball")
+    labels = tetopt.Image(1.0 * (image.data > 50.0) + 1.0 * (image.data > 65.0), image.affine)
+    result = tetopt.mesh_image(content(image, labels, mask), 300, **({"iterations": 4} | options))
+    assert set(result.labels.tolist()) == {0, 1, 2}
+    assert manifold_problems(result.mesh, result.labels) == []
+    assert not {"manifold", "labels"} & set(result.missed)
+
+
+def test_a_label_outside_of_a_start_is_none_that_it_lost(whole):
+    image, mask = shaped("ball")
+    start = tetopt.mesh_image(content(image, mask=mask), 300, iterations=1).mesh
+    target = content(mask, mask, weights=[0.0])
+    result = tetopt.mesh_image(target, start=start, iterations=1)
+    assert "labels" not in result.missed
 
 
 def test_the_paper_s_scheme_and_a_start_say_theirs_too(whole):

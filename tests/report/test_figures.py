@@ -338,7 +338,11 @@ def test_a_label_has_one_colour_whatever_else_is_there():
     np.testing.assert_array_equal(few, many[:8])
     np.testing.assert_array_equal(many, to_rgba_array([BACKGROUND_COLOUR, *LABEL_PALETTE[:9]])[:, :3])
     words = table_words(coloured(LabelTable({}, {2: (1.0, 0.0, 0.0)}), np.array([0, 7, 2, 7])))
-    assert words == {"2": {"colour": "#ff0000"}, "7": {"colour": LABEL_PALETTE[6]}}
+    assert words == {
+        "0": {"colour": BACKGROUND_COLOUR}, "2": {"colour": "#ff0000"}, "7": {"colour": LABEL_PALETTE[6]}
+    }  # fmt: skip
+    black = coloured(LabelTable({}, {0: (0.0, 0.0, 0.0)}), np.array([0, 7]))
+    assert table_words(black)["0"] == {"colour": BACKGROUND_COLOUR}
 
 
 def test_labels_keep_colours_of_their_own_but_the_background():

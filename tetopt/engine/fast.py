@@ -165,6 +165,9 @@ def optimize(
     n_early = int(EXCHANGING_SHARE * iterations) if k_D > 0.0 or sizes.has_target else 0
     course = Course(1, iterations, iterations, n_early, floor, tolerance, nodes, sizes, carves=boundary != "fixed")
     history, ended = followed(run, course, is_over, begin, callback)
+    if content.memberships is not None and not run.has_labels:  # too few iterations, or k_D is 0
+        run.give_labels()
+        run.mend_surfaces(False)
     if ended == "over":
         ended = "stopped" if stop is not None and stop() else "max_seconds"
     result = Optimized(run.mesh(), history, ended, labels=run.labels(), n_dropped=run.n_dropped)
@@ -247,7 +250,7 @@ def prepare_kernels(
     """
     content = plain(image)
     image = content.image
-    has_labels = content.memberships is not None and k_D > 0.0
+    has_labels = content.memberships is not None
     if method == "fast":
         unused = {_gradients, _evaluate_triangles if image.ndim == 3 else _evaluate_cells}
         purposes = {

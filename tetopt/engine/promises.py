@@ -174,7 +174,8 @@ def _missed_labels(content: Content, result: Optimized) -> dict[str, str]:
     members = content.memberships
     if members is None or result.labels is None:
         return {}
-    inside = members.partition if content.region is None else members.partition[content.region.inside]
+    is_inside = cell_of_voxel(content.image, result.mesh) >= 0 if content.region is None else content.region.inside
+    inside = members.partition[is_inside]
     counts = np.bincount(inside.ravel(), minlength=len(members.labels))
     is_large = counts > LABEL_VOXELS * members.parts
     if content.region is not None:  # label 0 is the outside, too

@@ -18,6 +18,7 @@ TABLE_TEXT = "label_table"  # of a mesh's file, and of a model's `about`: what `
 # Okabe and Ito's, then always the colour farthest in CIELAB from all before, and twice as far from the background,
 # black and white, as seen with normal, no red or no green cones (Machado et al. 2009): any two are 10 or more apart, of
 # the first 20 any two 14, and all are 20 from the background.
+BACKGROUND_COLOUR = "#e6e6e6"  # of label 0
 LABEL_PALETTE = (
     "#0072b2", "#e69f00", "#009e73", "#d55e00", "#56b4e9", "#cc79a7", "#f0e442", "#0000ff", "#6969ff", "#5a00b4",
     "#963c1e", "#87d269", "#781e78", "#7896ff", "#f02d5a", "#a51e69", "#d200b4", "#004bff", "#b40f4b", "#f07887",
@@ -147,10 +148,12 @@ def colours_by_number(labels: NDArray[np.int64]) -> NDArray[np.float64]:
 
 
 def coloured(table: LabelTable, labels: NDArray[np.int64]) -> LabelTable:
-    """The table with a colour for each of these labels but 0."""
+    """The table with the colour that each of these labels has in pictures; 0, the background, is light grey there."""
     those = np.unique(labels[labels > 0])
     by_number = dict(zip(those.tolist(), map(tuple, colours_by_number(those).tolist()), strict=True))
-    return LabelTable(table.names, by_number | table.colours)
+    grey = hex_colour(BACKGROUND_COLOUR)
+    own = {label: colour for label, colour in table.colours.items() if label != 0}
+    return LabelTable(table.names, by_number | own | ({0: grey} if grey and (labels == 0).any() else {}))
 
 
 def table_of_labels(table: LabelTable, labels: Iterable[int]) -> LabelTable:

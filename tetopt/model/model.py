@@ -293,9 +293,8 @@ def locking_words(model: Model) -> str:
     if model.order != 1 or largest < LOCKING_NU:
         return ""
     return (
-        f"nu is up to {largest:g}, where linear cells are too stiff: the error of their displacements was 1.6 to 1.8 "
-        "times that of quadratic cells on as many nodes at 0.45, 2.4 to 2.8 times at 0.49; use quadratic ones "
-        "(--order 2, or chosen in the solver; docs/understand/order.md)"
+        f"nu = {largest:g}: linear elements are too stiff near incompressibility; use quadratic elements (order 2), or "
+        "choose them in the solver (docs/understand/order.md)"
     )
 
 

@@ -11,10 +11,9 @@ from numpy.typing import NDArray
 
 from tetopt.image import Image
 from tetopt.io.text import plain
-from tetopt.model.labels import colours_by_number
+from tetopt.model.labels import BACKGROUND_COLOUR, colours_by_number
 from tetopt.target.labels import check_labels
 
-BACKGROUND_COLOUR = "#e6e6e6"  # of label 0
 UNCOVERED_COLOUR = "#cfe3f5"  # where a mesh leaves the image uncovered
 LISTED_LABELS = 12  # labels in a legend: more would not be told apart by their colours alone
 

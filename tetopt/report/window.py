@@ -307,7 +307,8 @@ class _Scene:
         values = self.field.values[np.asarray(polygons.cell_data["cell"])]
         if self.field.categories:
             polygons.cell_data["colour"] = _label_colours(self.field, values)
-            self._add(name, polygons, scalars="colour", rgb=True, **drawn)
+            # Light would make them other colours than those of the legend and of the other pictures.
+            self._add(name, polygons, scalars="colour", rgb=True, **drawn | {"lighting": False})
             return
         if self.field.nodes is None:
             polygons.cell_data["value"] = values
