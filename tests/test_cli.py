@@ -402,7 +402,7 @@ def test_a_second_ctrl_c_gives_up(tmp_path, inputs, monkeypatch, capsys):
         signal.raise_signal(signal.SIGINT)
 
     monkeypatch.setattr(tetopt.cli.mesh, "prepare", lambda *_: None)
-    monkeypatch.setattr(tetopt.engine.meshing, "optimize", impatient)
+    monkeypatch.setattr(tetopt.engine.meshing, "optimize", functools.wraps(tetopt.engine.meshing.optimize)(impatient))
     before = signal.getsignal(signal.SIGINT)
     assert exit_code("mesh", inputs / "disc.nii", "-o", tmp_path / "a.vtu") == 130
     assert signal.getsignal(signal.SIGINT) is before
@@ -614,7 +614,7 @@ def test_help_of_mesh_is_in_seven_groups(monkeypatch, capsys):
     sizes = {name: len(re.findall(r"^│ [ *]*--[a-z]", text, re.M)) for name, text in pairs}
     assert sizes.pop("Arguments") == 0
     assert sizes == {
-        "Options": 6, "What is meshed": 9, "Number and size of cells": 7, "The mesh it begins with": 4,
+        "Options": 6, "What is meshed": 10, "Number and size of cells": 7, "The mesh it begins with": 4,
         "Optimisation": 11, "Beyond one memory": 5, "For the solver": 13,
     }  # fmt: skip
 

@@ -29,7 +29,8 @@ def said(capsys):
         ({"mesh_euler": -47}, "Euler number of the mask's surface is 2, that of the mesh's boundary -47"),
         ({"mesh_euler": 0}, ""),
         ({"euler": -400, "mesh_euler": -390}, ""),
-        ({"mesh_components": 3}, "the mask has 1 pieces, the mesh 3"),
+        ({"mesh_components": 3}, ""),  # a requirement of its own
+        ({"components": 3}, "the mask has 3 connected components, the mesh 1"),
     ],
 )
 def test_a_mask_that_the_mesh_does_not_show(capsys, change, words):
@@ -41,17 +42,18 @@ def test_a_mask_that_the_mesh_does_not_show(capsys, change, words):
 
 def test_what_background_leaves_is_no_mask(capsys):
     missed = {"mask": "the mesh and the mask overlap only by Dice 0.5"}
-    far = {"mask": NEAR._replace(distance_p95=8.0, mesh_components=3, mesh_euler=99), "boundary_problems": ["an edge"]}
+    far = {"mask": NEAR._replace(distance_p95=8.0, components=3, mesh_euler=99), "dropped_components": 2}
     assert check_promises(Optimized(MESH, [], "iterations", missed=missed), far, "foreground") == 1
     text = said(capsys)
     assert "mask" not in text
     assert text.count("foreground") >= text.count("\n") == 5
 
 
-def test_a_boundary_that_is_no_manifold_is_said(capsys):
-    problem = "edges where the boundary has more than two facets; nodes: 1, the first [[3, 4]]"
-    assert check_promises(Optimized(MESH, [], "iterations"), {"mask": NEAR, "boundary_problems": [problem]}) == 0
-    assert said(capsys) == f"{problem}: cells are as large as parts, or gaps, of the mask; allow more nodes\n"
+def test_components_that_were_dropped_are_told(capsys):
+    assert check_promises(Optimized(MESH, [], "iterations"), {"mask": NEAR, "dropped_components": 0}) == 0
+    assert said(capsys) == ""
+    assert check_promises(Optimized(MESH, [], "iterations"), {"mask": NEAR, "dropped_components": 2}) == 0
+    assert "dropped 2 connected components" in said(capsys)
 
 
 def ended(E=0.5, E_D=0.5):

@@ -150,8 +150,8 @@ def solved_model(model: Model, step: int = 1, method: Method = "auto") -> Soluti
     >>> words = ["hold:x_min", "traction:x_max:1,0"]
     >>> model = tetopt.model_of(bar, young=10.0, nu=0.0, known_sets=standard_sets(bar), loads=words)
     >>> solution = tetopt.solved_model(model)
-    >>> solution.u[1].round(12).tolist(), solution.reactions["x_min"].round(12).tolist()
-    ([0.2, 0.0], [-1.0, 0.0])
+    >>> [(each.round(12) + 0.0).tolist() for each in (solution.u[1], solution.reactions["x_min"])]
+    [[0.2, 0.0], [-1.0, 0.0]]
     """
     model = in_units(model, "kPa")
     n_steps = count_of_steps(model.loads)
