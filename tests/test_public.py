@@ -9,6 +9,7 @@ import numpy as np
 import pytest
 
 import tetopt
+from tetopt.io.images import load_image
 from tetopt.public import check_arguments
 
 IMAGE = tetopt.Image(np.random.default_rng(0).normal(size=(6, 7, 8)))
@@ -171,3 +172,30 @@ def test_an_image_of_anything(what):
 def test_a_decorated_function_is_looked_at():
     with pytest.raises(tetopt.InputError, match=r"^solved_model: model: expected Model, got .*; tetopt\.model_of"):
         tetopt.solved_model("x.vtu")
+
+
+def warning_calls(folder):
+    """Calls that warn, at several depths within tetopt."""
+    tetopt.save_image(folder / "even.nii", tetopt.Image(np.ones((3, 4, 5))))
+    tetopt.save_image(folder / "large.nii", tetopt.Image(IMAGE.data, np.diag([900.0, 900.0, 900.0, 1.0])))
+    sets, loads = ["low=plane:0,0,0:0,0,1:0.1"], ["hold:low"]
+    tetopt.save_model(folder / "a.vtu", tetopt.model_of(MESH, young=3.0, sets=sets, loads=loads))
+    loaded = tetopt.load_mesh(folder / "a.vtu")
+    own = loaded._replace(sets=loaded.sets._replace(facets={}))
+    return {
+        "save_model": lambda: tetopt.save_model(folder / "a.inp", tetopt.model_of(MESH, young=3.0, nu=0.46)),
+        "save_mesh": lambda: tetopt.save_mesh(folder / "b.vtk", MESH, {"a\nb": np.ones(1)}),
+        "load_image": lambda: tetopt.load_image(folder / "even.nii"),
+        "load_image, of a large one": lambda: tetopt.load_image(folder / "large.nii"),
+        "open_stored": lambda: tetopt.open_stored(folder / "large.nii"),
+        "model_of": lambda: tetopt.model_of(own),
+    }
+
+
+def test_a_warning_names_the_line_of_who_called(tmp_path):
+    """Whichever of tetopt's functions issued it, and also without the one that checks arguments."""
+    calls = warning_calls(tmp_path) | {"not checked": lambda: load_image(tmp_path / "even.nii")}
+    for name, call in calls.items():
+        with pytest.warns(UserWarning, match=r"\w: ") as caught:
+            call()
+        assert {Path(each.filename) for each in caught} == {Path(__file__)}, name

@@ -1,4 +1,7 @@
-"""The one exception for everything the user can fix."""
+"""The one exception for everything the user can fix, and warnings that name the user's own line."""
+
+import inspect
+import warnings
 
 
 class InputError(ValueError):
@@ -14,3 +17,11 @@ class InputError(ValueError):
     ...     print(error)
     phantom 'spehre': no such phantom; give one of constant, disc_2d, ...
     """
+
+
+def warn(message: str) -> None:
+    """Issue a UserWarning that names the first line outside tetopt, however many calls within tetopt led here."""
+    n_inside, frame = 0, inspect.currentframe()
+    while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] == "tetopt":
+        n_inside, frame = n_inside + 1, frame.f_back
+    warnings.warn(message, stacklevel=n_inside + 1)

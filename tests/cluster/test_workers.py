@@ -7,6 +7,7 @@ import stat
 import subprocess
 import sys
 import time
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -176,6 +177,25 @@ def test_a_scheduler_that_says_nothing_is_refused_before_images_are_read(command
     assert said.err.count("\n") == 1
     assert f"{silent} does not answer (nothing within 0.3 s)" in said.err
     assert not (tmp_path / "out.vtu").exists()
+
+
+def test_another_service_at_the_address_is_no_scheduler(folders, capfd):
+    """The first eight bytes of its answer, read as a length, are more than any memory."""
+
+    def answer():
+        connection, _ = server.accept()
+        with connection:
+            connection.sendall(b"HTTP/1.1 400 Bad Request\r\n\r\n" + bytes(1000))
+            connection.recv(10**6)
+
+    with socket.create_server(("127.0.0.1", 0)) as server, ThreadPoolExecutor(1) as pool:
+        server.settimeout(10)
+        pool.submit(answer)
+        address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
+        with pytest.raises(InputError, match=f"^--scheduler: {address} is not a dask scheduler") as refusal:
+            running(Need(1, 0.0, None), folders, scheduler=address).__enter__()
+    assert "\n" not in str(refusal.value)
+    assert capfd.readouterr() == ("", "")
 
 
 def test_contradictions_are_refused(folders, tmp_path):

@@ -45,6 +45,12 @@ def words(out, *options):
     return ["cohort", out.parent / "t.tsv", "-o", out, *options]
 
 
+def pictures(out):
+    """Those that the page has, by the places of their subjects."""
+    page = (out / "cohort.html").read_text()
+    return json.loads(page.partition('"pictures":')[2].partition("}")[0] + "}")
+
+
 ATTACKS = [
     *((".work", kind) for kind in ("file link", "folder link", "hanging link", "pipe", "file", "folder")),
     *((".work/lock", kind) for kind in ("hard link", "file link", "device link", "pipe", "folder")),
@@ -59,6 +65,7 @@ ATTACKS = [
     *((f"cohort.{each}", kind) for each in ("tsv", "json", "html") for kind in ("file link", "hanging link", "pipe")),
     *((f"{KEY}/{KEY}_desc-tetopt_mesh.json", kind) for kind in ("file link", "device link", "pipe")),
     *((f"{KEY}/figures/thumbnail.png", kind) for kind in ("file link", "device link", "pipe")),
+    (f"{KEY}/figures", "folder link"),
 ]  # fmt: skip
 
 
@@ -182,8 +189,24 @@ def test_a_picture_of_another_table_that_is_a_link_is_not_in_the_page(out, kind)
     (elsewhere / "notes.txt").write_bytes(thumbnail_path(out, KEY).read_bytes())
     planted(kind, thumbnail_path(out, KEY), elsewhere)
     assert exit_code(*words(out, "--collect")) == 1
-    page = (out / "cohort.html").read_text()
-    assert json.loads(page.partition('"pictures":')[2].partition("}")[0] + "}") == {}
+    assert pictures(out) == {}
+
+
+def test_a_picture_of_another_table_in_a_folder_that_is_a_link_is_not_in_the_page(out):
+    (out.parent / "t.tsv").write_text("subject\timage\n02\tb.nii.gz\n")
+    assert exit_code(*words(out, "--collect")) == 1
+    assert len(pictures(out)) == 1
+    elsewhere = outside(out.parent)
+    shutil.copy(thumbnail_path(out, KEY), elsewhere)
+    planted("folder link", out / KEY / "figures", elsewhere)
+    assert exit_code(*words(out, "--collect")) == 1
+    assert pictures(out) == {}
+
+
+def test_a_picture_that_is_no_png_is_not_in_the_page(out):
+    thumbnail_path(out, KEY).write_text("a password")
+    assert exit_code(*words(out, "--collect")) == 0
+    assert pictures(out) == {}
 
 
 @pytest.mark.parametrize("kind", ["file link", "device link", "pipe"])

@@ -218,6 +218,11 @@ def _answering(address: str) -> Iterator[None]:
     """InputError where a connection to a scheduler fails in the block."""
     try:
         yield
+    except MemoryError as error:  # the first bytes of another service's answer, read as the length of a message
+        raise InputError(
+            f"--scheduler: {address} is not a dask scheduler, another service answers there; expected the address of "
+            "a dask scheduler that runs, as tcp://host:8786"
+        ) from error
     except (OSError, ValueError, TypeError, RuntimeError) as error:
         reason = " ".join(str(error).split()) or f"nothing within {CONNECT_SECONDS:g} s"
         raise InputError(

@@ -9,14 +9,13 @@ for two by name. Only names of files are looked at: a broken or a hostile JSON b
 from __future__ import annotations
 
 import re
-import warnings
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from tetopt.cohort.layout import DESCRIPTION_NAME
 from tetopt.cohort.subjects import Problems, Subject
-from tetopt.errors import InputError
+from tetopt.errors import InputError, warn
 from tetopt.extras import install_hint
 from tetopt.incoming import json_of, text_of
 from tetopt.io.text import plain
@@ -220,7 +219,7 @@ def _warn_of_others(folder: Path, what: str, subjects: set[str]) -> None:
     others = sorted(path.name for path in folder.glob("sub-*") if path.is_dir() and path.name[4:] not in subjects)
     if others:
         some = ", ".join(others[:NAMED_SUBJECTS]) + (", ..." if len(others) > NAMED_SUBJECTS else "")
-        warnings.warn(f"{_shown(folder)}: left out, without {plain(what)}: {len(others)} ({plain(some)})", stacklevel=3)
+        warn(f"{_shown(folder)}: left out, without {plain(what)}: {len(others)} ({plain(some)})")
 
 
 def _subject(scan: Scan, folder: Path) -> Subject:

@@ -100,7 +100,15 @@ def not_our_file(path: Path) -> str | None:
 
 def not_our_files(out: Path, key: str) -> str | None:
     """The same of what is read of a subject's outputs."""
-    return not_our_file(numbers_path(out, key)) or not_our_file(thumbnail_path(out, key))
+    return not_our_file(numbers_path(out, key)) or not_our_picture(out, key)
+
+
+def not_our_picture(out: Path, key: str) -> str | None:
+    """The same of a subject's thumbnail, and of its folder, which tetopt makes inside the subject's."""
+    path = thumbnail_path(out, key)
+    if path.parent.is_symlink():
+        return f"{path.parent}: expected a folder, got a link; put the folder itself there, or remove the link"
+    return not_our_file(path)
 
 
 def check_place(out: Path, key: str) -> None:

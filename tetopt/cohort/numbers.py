@@ -20,7 +20,7 @@ from tetopt.cohort.layout import (
     LOGS_NAME,
     failure_path,
     log_path,
-    not_our_file,
+    not_our_picture,
     numbers_of,
     numbers_path,
     subject_folder,
@@ -126,7 +126,7 @@ def row_of(out: Path, key: str) -> Row:
         "thumbnail": thumbnail_path(out, key),
     }
     there = {name: path for name, path in places.items() if path.exists()}
-    if "thumbnail" in there and not_our_file(there["thumbnail"]) is not None:
+    if "thumbnail" in there and not_our_picture(out, key) is not None:
         del there["thumbnail"]
     files = {name: path.relative_to(out).as_posix() for name, path in there.items()}
     row = Row(key, match[1], match[2] or "", "missing", "has not been run", (), files, {}, {}, {}, {})

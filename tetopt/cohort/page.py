@@ -26,6 +26,7 @@ PAGE_PICTURES = 600  # thumbnails of some 8 kB, 6 MB in base64; with more subjec
 LISTED_FAILURES = 100  # reasons, and subjects of one, above the table that has all
 LISTED_SUBJECTS = 100  # in the table for browsers without scripts
 LISTED_FLAGS = 6  # of a subject; the table in TSV has all
+PNG_SIGNATURE = b"\x89PNG\r\n\x1a\n"  # of other files no byte comes into the page
 SHOWN_DIGITS = 4  # of numbers in the page
 LISTED_VALUES = 6  # of an option that differs; of more it is said how many there are
 PICTURE_WORDS = "axial, left of the patient on the left, and sagittal, back on the left"
@@ -182,7 +183,8 @@ def _pictures(out: Path, rows: Sequence[Row], flags: Sequence[Sequence[Flag]]) -
     for place in chosen:
         with suppress(OSError, InputError):  # a page without it
             png = own_bytes(out / rows[place].files["thumbnail"], THUMBNAIL_BYTES)
-            pictures[place] = base64.b64encode(png).decode("ascii")
+            if png.startswith(PNG_SIGNATURE):
+                pictures[place] = base64.b64encode(png).decode("ascii")
     return pictures
 
 

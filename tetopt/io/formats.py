@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
 
-from tetopt.errors import InputError
+from tetopt.errors import InputError, warn
 from tetopt.io.abaqus import abaqus
 from tetopt.io.febio import febio
 from tetopt.io.gmsh import gmsh22, gmsh41
@@ -131,7 +130,7 @@ def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str
         save_pieces(path, kind.write_files(ready, path.stem), expected)
     is_for_solver = not kind.is_surface and path.suffix.lower() not in VTK_SUFFIXES
     if is_for_solver and (words := locking_words(model)):
-        warnings.warn(f"{path}: {words}", stacklevel=2)
+        warn(f"{path}: {words}")
 
 
 def save_mesh(
@@ -227,7 +226,7 @@ def _named(path: Path, model: Model) -> Model:
     shown = SHOWN_NAMES.get(path.suffix.lower(), file_name)
     names = [names_apart(data, shown) for data in (model.cell_data, model.point_data, model.about)]
     if changed := [new for each in names for old, new in each.items() if old != new]:
-        warnings.warn(f"{path}: data with names that it cannot hold are called {', '.join(changed)}", stacklevel=2)
+        warn(f"{path}: data with names that it cannot hold are called {', '.join(changed)}")
     cell_data, point_data, about = (
         {new[name]: values for name, values in data.items()}
         for new, data in zip(names, (model.cell_data, model.point_data, model.about), strict=True)

@@ -11,7 +11,6 @@ import math
 import os
 import re
 import threading
-import warnings
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
@@ -26,7 +25,7 @@ from nibabel.spatialimages import HeaderDataError, SpatialImage
 from nibabel.wrapstruct import WrapStructError
 from numpy.typing import NDArray
 
-from tetopt.errors import InputError
+from tetopt.errors import InputError, warn
 from tetopt.image import Image, VoxelGrid
 from tetopt.incoming import irregular
 from tetopt.io.apart import DEFLATE_RATIO
@@ -148,10 +147,10 @@ def load_image(
     if not path.name.lower().endswith(PICTURE_SUFFIXES):  # whose pixels are 1 mm, whatever they show
         notes += notes_of_size(whole)
     for note in notes:
-        warnings.warn(f"{path}: {note}", stacklevel=2)
+        warn(f"{path}: {note}")
     low = image.data.min()
     if low == image.data.max():
-        warnings.warn(f"{path}: the image is {low:g} everywhere, so E_D is 0 everywhere", stacklevel=2)
+        warn(f"{path}: the image is {low:g} everywhere, so E_D is 0 everywhere")
     return image
 
 

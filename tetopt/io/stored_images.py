@@ -5,14 +5,13 @@ from __future__ import annotations
 import hashlib
 import math
 import re
-import warnings
 from pathlib import Path
 
 import numpy as np
 from nibabel.volumeutils import apply_read_scaling
 from numpy.typing import NDArray
 
-from tetopt.errors import InputError
+from tetopt.errors import InputError, warn
 from tetopt.image import Image
 from tetopt.io.images import (
     Bounds,
@@ -93,7 +92,7 @@ def open_stored(path: str | Path, *, volume: int | None = None, crop: Bounds | N
     except InputError as error:
         raise named_error(path, error) from error
     for note in notes:
-        warnings.warn(f"{path}: {note}", stacklevel=2)
+        warn(f"{path}: {note}")
     return image
 
 

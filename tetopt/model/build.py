@@ -2,14 +2,13 @@
 
 from __future__ import annotations
 
-import warnings
 from collections.abc import Iterable
 from typing import Any, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.errors import InputError
+from tetopt.errors import InputError, warn
 from tetopt.geometry.simplex import volumes
 from tetopt.image import Image
 from tetopt.mesh import Mesh
@@ -175,7 +174,7 @@ def model_of(
 def _said(answer: tuple[Any, str]) -> Any:
     """An answer, of which what was left out becomes a warning."""
     if answer[1]:
-        warnings.warn(answer[1], stacklevel=3)
+        warn(answer[1])
     return answer[0]
 
 
@@ -211,7 +210,7 @@ def _sets(
     former = loaded.label_table.names
     sets, renamed = sets_beside(cells.mesh, box, cell_data, loaded.sets, cells.names, former, of_loads)
     for old, new in renamed.items():
-        warnings.warn(f'the mesh came with a set "{old}" of its own: it is {new} here', stacklevel=3)
+        warn(f'the mesh came with a set "{old}" of its own: it is {new} here')
     return sets
 
 
