@@ -36,7 +36,7 @@ from tetopt.engine.loop import (
 )
 from tetopt.engine.paper import optimize_paper
 from tetopt.engine.promises import promised
-from tetopt.engine.repair import n_cells_below, repair
+from tetopt.engine.repair import cell_cosines, n_cells_below, repair
 from tetopt.engine.smooth import _gradients, attract, blocks, sweep
 from tetopt.engine.state import content_energies, floor_of, state_of, with_floor
 from tetopt.errors import InputError
@@ -60,6 +60,8 @@ EXCHANGE_SHAPE_WEIGHT = 0.1  # of the shape energy's weight: what a shape costs 
 LABELLED_AT = 3  # the iteration from which cells have labels: exchanges have found thin parts, and not yet folds
 LEAST_EDGE_VOXELS = 1.0  # with labels no exchange makes a shorter edge, beside the limits on sizes
 ATTRACTED_FLOOR = 4.0  # degrees: cells may be as flat, if not the floor is lower, until nodes have come between labels
+# As many cells on a mask's boundary may be taken out where nothing lifts them: a share of all cells, or this number.
+FLAT_SHARE, FLAT_CELLS = 0.005, 10
 FAR_TICKS = -(1 << 40)  # a place far from any other
 
 
@@ -167,7 +169,7 @@ def optimize(
     history, ended = followed(run, course, is_over, begin, callback)
     if content.memberships is not None and not run.has_labels:  # too few iterations, or k_D is 0
         run.give_labels()
-        run.mend_surfaces(False)
+        run.mend_surfaces(False, floor)
     if ended == "over":
         ended = "stopped" if stop is not None and stop() else "max_seconds"
     result = Optimized(run.mesh(), history, ended, labels=run.labels(), n_dropped=run.n_dropped)
@@ -229,7 +231,7 @@ def followed(
             n_changes, fall = n_changes + 1, np.inf
         # 5. Mend what is not a manifold, by cells taken out and labels changed: no angle gets smaller.
         if is_last:
-            n_changes += run.mend_surfaces(course.carves)
+            n_changes += run.mend_surfaces(course.carves, floor)
         # 6. Measure.
         record(iteration, movement, n_changes > 0)
         if not is_finished:
@@ -423,15 +425,21 @@ class Run:
         self.hope[:] = np.inf
         return made.n_moves
 
-    def mend_surfaces(self, carves: bool) -> int:
+    def mend_surfaces(self, carves: bool, floor: float = 0.0) -> int:
         """Mend overlaps and pinches: of a mask's boundary, if it `carves`, by taking out cells; then of interfaces.
 
         Cells overlap where parts of the boundary slid through one another, across a gap of a voxel or two; the octree
-        within a mask has no pinch, but a mesh of the user's may. Returns how many cells were taken out.
+        within a mask has no pinch, but a mesh of the user's may. A few cells on the boundary that nothing lifted over
+        the floor, degrees, go, too. Returns how many cells were taken out.
         """
         n_gone = 0
         if carves and self.content.region is not None:
             n_gone = self._take_out(self._overlapping(self.state))
+            if self.n == 3 and floor > 0.0:
+                is_outer = (self.state.complex.across[: self.n_cells] < 0).any(axis=1)
+                is_flat = is_outer & (cell_cosines(self.state) < floor_of(floor)[0])
+                if is_flat.sum() <= max(FLAT_SHARE * self.n_cells, FLAT_CELLS):
+                    n_gone += self._take_out(is_flat)
             kept = carved(self.mesh(), self.image, self.content.region, self.content.keeps_components)
             n_gone, self.n_dropped = n_gone + self._take_out(~kept.is_kept), self.n_dropped + kept.n_dropped
         if self.has_labels:
