@@ -10,7 +10,7 @@ from commands import exit_code, labelled_lattice_words, numbers_in
 
 import tetopt
 from tetopt.cli.solver import MANY_INTERFACES
-from tetopt.model.labels import LABEL_PALETTE, hex_colour
+from tetopt.target.labels import LABEL_PALETTE, hex_colour
 
 TABLE = "label,name,color\n0,soft tissue,\n1,bright/ball [é],#ff8000\n9,spleen,#00ff00\n"
 FACES = {"boundary", "left", "right", "posterior", "anterior", "inferior", "superior"}

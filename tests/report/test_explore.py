@@ -14,10 +14,11 @@ from tetopt.errors import InputError
 from tetopt.geometry.cut import plane_cut
 from tetopt.geometry.simplex import centroids, volumes
 from tetopt.geometry.topology import boundary_facets, facets
-from tetopt.model.labels import LABEL_PALETTE, LabelTable
+from tetopt.model.labels import LabelTable
 from tetopt.report import explore
 from tetopt.report.exhibit import exhibit, first_axis, opened_on, warp_factors
 from tetopt.report.explore import colour_table, explorer_html, save_explorer
+from tetopt.target.labels import LABEL_PALETTE
 
 
 @pytest.fixture(scope="module")

@@ -18,10 +18,9 @@ from tetopt.image import Image
 from tetopt.measure.fidelity import cell_labels
 from tetopt.measure.quality import rho_histogram
 from tetopt.mesh import Mesh
-from tetopt.model.labels import LABEL_PALETTE, LabelTable, coloured, table_words
+from tetopt.model.labels import LabelTable, coloured, table_words
 from tetopt.report import figures
 from tetopt.report.colours import (
-    BACKGROUND_COLOUR,
     LISTED_LABELS,
     UNCOVERED_COLOUR,
     label_colours,
@@ -40,6 +39,7 @@ from tetopt.report.figures import (
 )
 from tetopt.report.scene import save_scenes
 from tetopt.start.lattice import lattice
+from tetopt.target.labels import BACKGROUND_COLOUR, LABEL_PALETTE
 
 DOLLARS = LabelTable({1: r"5 $\frac$ and a_b"}, {})
 SHAPE = (5, 7, 9)

@@ -32,6 +32,7 @@ from tetopt.model.labels import TABLE_TEXT, labels_of, table_of_words, table_wor
 from tetopt.model.laws import parse_any_law
 from tetopt.model.loads import (
     FACET_FORCES,
+    SHOWN_LOAD_DIGITS,
     check_steps,
     count_of_steps,
     known_set,
@@ -434,7 +435,7 @@ def _lines(output: Path, model: Model, solver: SolverOptions) -> Iterator[str]:
             else "the format has one modulus a cell: the mean of what is linear between the corners"
         )
     for load in () if form.is_surface else model.loads:
-        yield f"load: {load_words(load)}"
+        yield f"load: {load_words(load, SHOWN_LOAD_DIGITS)}"
     if (n_steps := count_of_steps(model.loads)) > 1 and not form.is_surface:
         yield f"{n_steps} steps, each from the undeformed state"
     if model.loads and not (form.runs or form.is_surface):

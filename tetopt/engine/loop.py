@@ -16,6 +16,7 @@ from tetopt.geometry.box import facets_on_sides
 from tetopt.geometry.topology import Facets, boundary_facets
 from tetopt.image import Image, transformed
 from tetopt.mesh import Mesh
+from tetopt.target.labels import colours_by_number
 
 # The defaults of every way in, and their evidence (docs/measured/k_d.md, docs/understand/sizes.md).
 UNIFORM_K_D = 0.2  # nearly all that the displacement gains by the image, at hardly any cost in shape
@@ -144,6 +145,9 @@ class Optimized(NamedTuple):
     def plot(self, values: ArrayLike | None = None, **options: Any) -> Any:
         """Show the mesh in 3-D by pyvista, as `Mesh.plot` does; by default in the colours of its labels, if it has any.
 
+        A label has the colour of its number, as in all pictures and files; ``plot(result.labels, cmap="tab20")`` takes
+        a colour map instead.
+
         Parameters
         ----------
         values : (M,) or (N,) array, optional
@@ -168,7 +172,7 @@ class Optimized(NamedTuple):
         (768, 1024, 3)
         """
         if values is None and self.labels is not None:
-            values, options = self.labels, {"name": "label"} | options
+            values, options = colours_by_number(self.labels), {"rgb": True} | options
         return self.mesh.plot(values, **options)
 
     def _repr_html_(self) -> str:

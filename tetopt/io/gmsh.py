@@ -7,14 +7,15 @@ none; a cell set that overlaps one before it, or has the name of a facet set, is
 groups by name alone). An entity has the number of its group; only where sets, or in 2.2 materials, divide a group is it
 several entities, numbered behind all groups. The $Comments say which entities make up each set.
 
-Facets: each is one element, in an entity that belongs to the groups of all of its sets. Their numbers are free among
-those of the cells' groups and do not depend on the mesh: from R + 1 in the order of the sets, and, up to 2 R - 1, those
-of the box's faces, "mask_surface" and "boundary", the last; R is 1000, or the power of ten that is above all labels. An
-entity tells the smallest set first, which alone meshio has as "gmsh:physical"; in 2.2 an element has one group, so that
-it is in the smallest of its sets: a group such as "boundary" then lacks what is also in a smaller one, and the
-$Comments tell the whole set. dolfinx keeps one group of each facet, that of the smallest number; our XDMF files lose
-nothing there. A facet inside the mesh that two sets hold from opposite sides is turned as in the first of them. The
-nodes of a group are those of its elements.
+Facets: each is one element, in an entity that belongs to the groups of all of its sets. The numbers of facet groups
+differ from those of the cells' groups. For a given R, those of the box's faces, "mask_surface" and "boundary", up to 2
+R - 1, are the same for every mesh; interfaces and other sets count from R + 1 in their order, so that their numbers
+depend on the sets that the mesh has. R is 1000, or the power of ten that is above all labels. An entity tells the
+smallest set first, which alone meshio has as "gmsh:physical"; in 2.2 an element has one group, so that it is in the
+smallest of its sets: a group such as "boundary" then lacks what is also in a smaller one, and the $Comments tell the
+whole set. dolfinx keeps one group of each facet, that of the smallest number; our XDMF files lose nothing there. A
+facet inside the mesh that two sets hold from opposite sides is turned as in the first of them. The nodes of a group are
+those of its elements.
 
 Views ($ElementData), in 4.1 only, as meshio 5.3.5 reads no 2.2 that has them: the cell data, "young" and "nu" of the
 materials in place of cell data of these names, and each cell set as 0 and 1. Facets have the values of the cell that

@@ -18,7 +18,8 @@ from typing import NamedTuple
 
 from tetopt.errors import InputError
 from tetopt.incoming import text_of
-from tetopt.model.labels import NO_TABLE, LabelTable, hex_colour
+from tetopt.model.labels import NO_TABLE, LabelTable
+from tetopt.target.labels import hex_colour
 
 __all__ = ["NO_TABLE", "LabelTable", "load_label_table"]
 

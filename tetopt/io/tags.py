@@ -3,9 +3,10 @@
 `numbered_parts` gives each cell and each facet of a set one number. Where cells have labels, that of a cell is its
 label; label 0, which formats take for none, has the number after the largest label. Otherwise it is that of its
 material, or without materials that of its cell set. What sets, or materials, divide has a number for each of its parts,
-behind all others. The numbers of facets are free among those of cells and do not depend on the mesh: from R + 1 in the
-order of the sets, and, up to 2 R - 1, those of the box's faces, "mask_surface" and "boundary", the last; R is 1000, or
-the power of ten that is above all labels. Parts have those from 2 R + 1 on.
+behind all others. The numbers of facets differ from those of cells. For a given R, those of the box's faces,
+"mask_surface" and "boundary", up to 2 R - 1, are the same for every mesh; interfaces and other sets count from R + 1 in
+their order, so that their numbers depend on the sets that the mesh has. R is 1000, or the power of ten that is above
+all labels. Parts have those from 2 R + 1 on.
 """
 
 from __future__ import annotations

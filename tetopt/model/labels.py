@@ -12,20 +12,10 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.model.sets import label_set_names
+from tetopt.target.labels import colours_by_number, hex_colour
 
 TABLE_TEXT = "label_table"  # of a mesh's file, and of a model's `about`: what `table_words` makes
 
-# Okabe and Ito's, then always the colour farthest in CIELAB from all before, and twice as far from the background,
-# black and white, as seen with normal, no red or no green cones (Machado et al. 2009): any two are 10 or more apart, of
-# the first 20 any two 14, and all are 20 from the background.
-BACKGROUND_COLOUR = "#e6e6e6"  # of label 0
-LABEL_PALETTE = (
-    "#0072b2", "#e69f00", "#009e73", "#d55e00", "#56b4e9", "#cc79a7", "#f0e442", "#0000ff", "#6969ff", "#5a00b4",
-    "#963c1e", "#87d269", "#781e78", "#7896ff", "#f02d5a", "#a51e69", "#d200b4", "#004bff", "#b40f4b", "#f07887",
-    "#e15a3c", "#690f96", "#3cf096", "#f0964b", "#1e4b2d", "#2d6978", "#c32d00", "#a52dd2", "#3c00d2", "#e178d2",
-    "#f0d25a", "#a569d2", "#78b496", "#d2a5d2", "#870f2d", "#d2a578", "#965a3c", "#78d2f0", "#a569a5", "#d21e87",
-)  # fmt: skip
-LABEL_TINTS = (0.0, -0.4, 0.4)  # of the palette when it begins again: as it is, mixed with black, mixed with white
 LABEL_DIGITS = 18  # of a number that 64 bits hold; more are a name that nothing has
 
 
@@ -123,37 +113,11 @@ def table_of_words(words: Any) -> LabelTable:
     return LabelTable(names, colours)
 
 
-def hex_colour(text: Any) -> tuple[float, float, float] | None:
-    """Red, green and blue, 0 to 1, of "#rrggbb"; None of anything else."""
-    if not isinstance(text, str) or len(text) != 7 or text[0] != "#":
-        return None
-    try:
-        parts = bytes.fromhex(text[1:])
-    except ValueError:
-        return None
-    return (parts[0] / 255.0, parts[1] / 255.0, parts[2] / 255.0)
-
-
-def colours_by_number(labels: NDArray[np.int64]) -> NDArray[np.float64]:
-    """The colours (K, 3) of labels from 0 that have none of their own: red, green and blue, 0 to 1.
-
-    They depend on the number alone, so that a label has one colour in every picture and file. Of three times the
-    palette's length in a row any two differ.
-    """
-    palette = np.array([hex_colour(text) for text in LABEL_PALETTE])
-    rounds, place = np.divmod(labels - 1, len(palette))
-    tint = np.array(LABEL_TINTS)[rounds % len(LABEL_TINTS)][:, None]
-    mixed = (1.0 - np.abs(tint)) * palette[place] + np.maximum(tint, 0.0)
-    return np.rint(255.0 * mixed) / 255.0
-
-
 def coloured(table: LabelTable, labels: NDArray[np.int64]) -> LabelTable:
     """The table with the colour that each of these labels has in pictures; 0, the background, is light grey there."""
-    those = np.unique(labels[labels > 0])
+    those = np.unique(labels)
     by_number = dict(zip(those.tolist(), map(tuple, colours_by_number(those).tolist()), strict=True))
-    grey = hex_colour(BACKGROUND_COLOUR)
-    own = {label: colour for label, colour in table.colours.items() if label != 0}
-    return LabelTable(table.names, by_number | own | ({0: grey} if grey and (labels == 0).any() else {}))
+    return LabelTable(table.names, by_number | {label: own for label, own in table.colours.items() if label != 0})
 
 
 def table_of_labels(table: LabelTable, labels: Iterable[int]) -> LabelTable:

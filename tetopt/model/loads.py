@@ -32,6 +32,7 @@ LOAD_FORMS = {
     "spring": ("SET:K", "1", "kPa/mm"),
     "gravity": ("X,Y,Z", "n", "mm/s2"),
 }
+SHOWN_LOAD_DIGITS = 10  # of a load's numbers where they are printed: rounding, as in 9.450000000000001, is not seen
 FACET_FORCES = ("pressure", "traction", "spring")  # kinds that act on facets from outside
 
 
@@ -158,20 +159,24 @@ def parse_load(text: str, ndim: int) -> Load:
     return Load("displacement" if kind == "move" else kind, name, numbers, step)
 
 
-def load_words(load: Load) -> str:
-    """A load in the words of `parse_loads`, to the last bit.
+def load_words(load: Load, digits: int = 17) -> str:
+    """A load in the words of `parse_loads`, to the last bit, or with so many significant digits to be read.
 
     Examples
     --------
     >>> load_words(Load("displacement", "left", np.array([0.5, np.nan, 0.0]), 2))
     '2/move:left:0.5,free,0.0'
+    >>> load_words(Load("pressure", "left", np.array([0.1 * 3])), SHOWN_LOAD_DIGITS)
+    'pressure:left:0.3'
     """
     prefix = f"{load.step}/" if load.step else ""
     if load.kind == "displacement" and (load.numbers == 0.0).all():
         return f"{prefix}hold:{load.set_name}"
     kind = "move" if load.kind == "displacement" else load.kind
     name = "" if load.kind == "gravity" else f"{load.set_name}:"
-    numbers = [FREE_WORD if np.isnan(number) else repr(number) for number in load.numbers.tolist()]
+    numbers = [
+        FREE_WORD if np.isnan(number) else repr(float(f"{number:.{digits}g}")) for number in load.numbers.tolist()
+    ]
     return f"{prefix}{kind}:{name}{','.join(numbers)}"
 
 

@@ -21,7 +21,7 @@ from tetopt.model.fields import (
     node_field,
     stresses_times,
 )
-from tetopt.model.loads import FACET_FORCES, Load, load_words
+from tetopt.model.loads import FACET_FORCES, SHOWN_LOAD_DIGITS, Load, load_words
 from tetopt.model.materials import Materials
 from tetopt.model.sets import Sets, facet_triples
 from tetopt.model.skfem import skfem_mesh
@@ -121,7 +121,7 @@ class Model(NamedTuple):
             rows += [("materials", str(len(table.young)))]
             rows += [("Young's modulus", f"{table.young.min():.4g} to {table.young.max():.4g} {self.units}")]
             rows += [("Poisson's ratio", f"{table.nu.min():.4g} to {table.nu.max():.4g}")]
-        rows += [("loads", ", ".join(load_words(load) for load in self.loads) or "none")]
+        rows += [("loads", ", ".join(load_words(load, SHOWN_LOAD_DIGITS) for load in self.loads) or "none")]
         values = self.cell_data.get("mean") if table is None else table.young[table.of_cell]
         return notebook.card_html("Model", rows, notebook.section_html(mesh.points, mesh.cells, values))
 

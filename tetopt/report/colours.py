@@ -5,14 +5,12 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 
 import numpy as np
-from matplotlib.colors import to_rgba_array
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
 from tetopt.image import Image
 from tetopt.io.text import plain
-from tetopt.model.labels import BACKGROUND_COLOUR, colours_by_number
-from tetopt.target.labels import check_labels
+from tetopt.target.labels import check_labels, colours_by_number
 
 UNCOVERED_COLOUR = "#cfe3f5"  # where a mesh leaves the image uncovered
 LISTED_LABELS = 12  # labels in a legend: more would not be told apart by their colours alone
@@ -22,8 +20,8 @@ def label_colours(labels: Image, own: Mapping[int, tuple[float, float, float]] |
     """Colour of each label, so that ``label_colours(labels)[label]`` paints an array of labels.
 
     A label has the same colour in all pictures: its `own`, such as `tetopt.model.labels.LabelTable.colours` has it, or
-    that of its number (`tetopt.model.labels.colours_by_number`). 0 is the background, always in light grey: tables have
-    it in black.
+    that of its number (`tetopt.target.labels.colours_by_number`). 0 is the background, always in light grey: tables
+    have it in black.
 
     Parameters
     ----------
@@ -43,7 +41,6 @@ def label_colours(labels: Image, own: Mapping[int, tuple[float, float, float]] |
     """
     check_labels("labels", labels)
     colours = colours_by_number(np.arange(int(labels.data.max()) + 1))
-    colours[0] = to_rgba_array(BACKGROUND_COLOUR)[0, :3]
     for label, colour in (own or {}).items():
         if 0 < label < len(colours):
             colours[label] = colour
