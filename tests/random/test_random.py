@@ -50,3 +50,10 @@ def test_a_few_cells_on_a_mask_s_boundary_go_where_nothing_lifts_them():
     assert "floor" not in result.missed
     assert tetopt.quality(result.mesh.points, result.mesh.cells).min_dihedral >= 12.0 - 1e-6
     assert tetopt.check_mesh(result.mesh, is_whole=False) == []
+
+
+def test_parts_of_a_boundary_do_not_touch_in_one_place():
+    """Two nodes of this world's mask slid into one place."""
+    target = labelled_world(np.random.default_rng([21, 7, 263])).content()
+    result = tetopt.mesh_image(target, 135)
+    assert tetopt.check_mesh(result.mesh, is_whole=False) == []

@@ -32,7 +32,7 @@ def carved(mesh: Mesh, image: Image, region: Region, keeps_components: bool = Fa
     linked by faces, the largest stays, and those of a tenth of its volume or more; with `keeps_components` all do.
     """
     size = volumes(mesh.points, mesh.cells)
-    is_kept = manifold_part(mesh.cells, size)
+    is_kept = manifold_part(_welded(mesh), size)
     chosen = np.flatnonzero(is_kept)
     number = components(mesh.cells[chosen])
     volume = np.bincount(number, size[chosen])
@@ -45,6 +45,15 @@ def carved(mesh: Mesh, image: Image, region: Region, keeps_components: bool = Fa
     is_dropped[np.argmax(volume)] = False
     is_kept[chosen[is_dropped[number]]] = False
     return Carved(is_kept, int(is_dropped.sum()))
+
+
+def _welded(mesh: Mesh) -> NDArray[np.int64]:
+    """The cells with one number for all nodes in one place: parts of a boundary may touch there without sharing one."""
+    order = np.lexsort(mesh.points.T)
+    is_new = np.append(True, (mesh.points[order[1:]] != mesh.points[order[:-1]]).any(axis=1))
+    first = np.empty(len(order), dtype=np.int64)
+    first[order] = order[np.flatnonzero(is_new)][np.cumsum(is_new) - 1]
+    return first[mesh.cells]
 
 
 def part_of(mesh: Mesh, is_kept: NDArray[np.bool_]) -> Mesh:
