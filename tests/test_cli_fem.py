@@ -164,7 +164,7 @@ def test_triangles(tmp_path, capsys):
 )
 def test_advice_where_linear_cells_lock(options, is_advised, path, capsys):
     _, err = run(capsys, path, "--young", "3", "--density", "1000", *options)
-    assert ("linear cells are too stiff" in err) == is_advised
+    assert ("linear elements are too stiff" in err) == is_advised
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from commands import exit_code, labelled_lattice_words, numbers_in
 
 import tetopt
 from tetopt.cli.solver import MANY_INTERFACES
-from tetopt.target.labels import LABEL_PALETTE, hex_colour
+from tetopt.target.labels import BACKGROUND_COLOUR, LABEL_PALETTE, hex_colour
 
 TABLE = "label,name,color\n0,soft tissue,\n1,bright/ball [é],#ff8000\n9,spleen,#00ff00\n"
 FACES = {"boundary", "left", "right", "posterior", "anterior", "inferior", "superior"}
@@ -42,11 +42,12 @@ def test_a_mesh_s_file_keeps_the_table(folder):
     loaded, plain = (tetopt.load_mesh(folder / name) for name in ("named.vtu", "plain.vtu"))
     table = loaded.label_table
     assert table.names == {0: "soft tissue", 1: "bright/ball [é]", 9: "spleen"}
-    assert table.colours == {1: (1.0, 128 / 255, 0.0), 9: (0.0, 1.0, 0.0)}
+    grey = hex_colour(BACKGROUND_COLOUR)
+    assert table.colours == {0: grey, 1: (1.0, 128 / 255, 0.0), 9: (0.0, 1.0, 0.0)}
     assert set(loaded.sets.cells) == {"soft_tissue", "bright_ball_e"}
     assert set(loaded.sets.facets) == {*FACES, INTERFACE}
     np.testing.assert_array_equal(loaded.sets.facets[INTERFACE], plain.sets.facets["interface_0_1"])
-    assert plain.label_table == ({}, {1: hex_colour(LABEL_PALETTE[0])})
+    assert plain.label_table == ({}, {0: grey, 1: hex_colour(LABEL_PALETTE[0])})
     numbers = numbers_in(folder / "named.json")
     assert numbers["label_names"] == {"0": "soft tissue", "1": "bright/ball [é]"}
     assert list(numbers["label_table"]) == ["0", "1"]  # those that the image has

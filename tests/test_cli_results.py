@@ -115,17 +115,17 @@ def test_stiff_linear_cells_are_warned_of_where_a_solver_s_file_is_written(tmp_p
     out, is_said = tmp_path / f"b{suffix}", suffix != ".vtu" and nu == 0.45
     assert exit_code("convert", tmp_path / "a.vtu", out, "--young", "2", "--nu", str(nu)) == 0
     said = capsys.readouterr().err
-    assert said.count("linear cells are too stiff") == is_said
+    assert said.count("linear elements are too stiff") == is_said
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
         tetopt.save_model(out, tetopt.model_of(mesh, young=2.0, nu=nu))
         if suffix not in (".scn",):
             tetopt.save_model(out, tetopt.model_of(mesh, young=2.0, nu=nu, order=2))
-    assert ["linear cells are too stiff" in str(each.message) for each in caught] == [True] * is_said
+    assert ["linear elements are too stiff" in str(each.message) for each in caught] == [True] * is_said
 
 
 def test_fem_warns_of_stiff_linear_cells_once_in_the_same_words(tmp_path, capsys):
     tetopt.save_mesh(tmp_path / "a.vtu", solved_model(1).mesh)
     words = ["--young", "2", "--nu", "0.45", "--load", "compress:2%"]
     assert exit_code("fem", tmp_path / "a.vtu", *words, "-o", tmp_path / "b.vtu") == 0
-    assert capsys.readouterr().err.count("linear cells are too stiff") == 1
+    assert capsys.readouterr().err.count("linear elements are too stiff") == 1
