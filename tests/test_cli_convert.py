@@ -572,6 +572,15 @@ def test_conversions_that_are_refused(folder, tmp_path, out, more, match, capsys
     assert list(tmp_path.iterdir()) == []
 
 
+@pytest.mark.parametrize("suffix", [".inp", ".vtu", ".stl"])
+def test_a_mesh_whose_cells_are_there_several_times_is_no_solver_s(folder, tmp_path, suffix, capsys):
+    mesh = tetopt.load_mesh(folder / "a.vtu").mesh
+    tetopt.save_mesh(tmp_path / "thrice.vtu", tetopt.Mesh(mesh.points, np.vstack([mesh.cells, mesh.cells[[5, 5]]])))
+    assert exit_code("convert", tmp_path / "thrice.vtu", tmp_path / f"out{suffix}") == 2
+    assert re.search(r"thrice\.vtu: \d+ facets have cells that overlap", capsys.readouterr().err)
+    assert not (tmp_path / f"out{suffix}").exists()
+
+
 def test_what_will_not_do_is_said_before_the_optimisation(folder, tmp_path, capsys):
     for out, more in (
         ("a.inp", ["--young", "h - 20"]),

@@ -186,8 +186,10 @@ def _most_frequent(pairs: NDArray[np.int64]) -> str:
     return ", ".join([*words, *(["others"] if len(kinds) > len(most) else [])])
 
 
-def check_unfolded(mesh: Mesh, shared: Facets | None = None) -> None:
+def check_unfolded(mesh: Mesh, shared: Facets | None = None, source: str = "mesh") -> None:
     """InputError if cells overlap at a facet, or more than two share one; `shared` are its facets, if known.
+
+    The message names the mesh by `source`.
 
     Raises
     ------
@@ -197,7 +199,7 @@ def check_unfolded(mesh: Mesh, shared: Facets | None = None) -> None:
     pairs = folded(mesh.cells, shared)
     if len(pairs):
         raise InputError(
-            f"mesh: {len(pairs)} facets have cells that overlap there, as inverted ones do, or more than two; the "
+            f"{source}: {len(pairs)} facets have cells that overlap there, as inverted ones do, or more than two; the "
             f"first are of cells {pairs[:3].tolist()}; mend the mesh"
         )
 

@@ -107,7 +107,7 @@ DEEDS = {
 
 def main() -> int:
     """Do each of the deeds in a child, and print the outcomes as JSON."""
-    campaign.MOST_CPU_SECONDS, campaign.IDLE_SECONDS = 2, 1
+    campaign.IDLE_SECONDS = 1
     deeds = list(DEEDS)
     place = np.diag([2.0, 2.0, 3.0, 1.0])
     place[:3, 3] = -5.0, 7.0, 11.0
@@ -121,6 +121,7 @@ def main() -> int:
     outcomes = {}
     with tempfile.TemporaryDirectory() as scratch:
         for number, deed in enumerate(deeds):
+            campaign.MOST_CPU_SECONDS = 2 if deed == "spinning" else 60  # a slow machine takes seconds to fill memory
             one = campaign.Campaign(1, 1, Path(scratch), Path(scratch) / "failures")
             one.run([number], 100.0)
             outcomes[deed] = next(outcome for _, outcome in one.counts)

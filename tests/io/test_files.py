@@ -224,8 +224,9 @@ def test_no_output_is_an_input_or_another_output(tmp_path, monkeypatch):
 # Whole or not at all
 
 
-def test_the_file_appears_only_at_the_end(tmp_path):
-    path = tmp_path / "image.nii.gz"
+@pytest.mark.parametrize("name", ["image.nii.gz", "..nii.gz", ".nii.gz", "a.b.nii.gz"])
+def test_the_file_appears_only_at_the_end(tmp_path, name):
+    path = tmp_path / name
     with written_whole(path) as temporary:
         assert temporary.parent == tmp_path  # of the same file system, so that the renaming is atomic
         assert temporary.name.endswith(".nii.gz")  # from which writers tell the format

@@ -12,6 +12,7 @@ import typer
 from rich.markup import escape
 
 from tetopt import Image, InputError
+from tetopt.check import check_unfolded
 from tetopt.cli.console import log, out
 from tetopt.cli.inputs import image_and_others, read_mesh, warn_of_other_image, with_labels
 from tetopt.cli.options import ImagePart, LabelledPart, MeshArgument, NumberOptions, SolverOptions, option
@@ -69,7 +70,7 @@ def convert_command(
     needs_image = {"--mask": mask_path, "--volume": part.volume, "--crop": part.crop, "--slice": part.slice_}
     if image_path is None and (lost := [name for name, value in needs_image.items() if value is not None]):
         raise InputError(f"{lost[0]}: there is no --image")
-    loaded = with_labels(read_mesh(mesh_path), part.labels)
+    loaded = with_labels(_unfolded(mesh_path), part.labels)
     loaded = without_stale_results(loaded, solver) if results_path is None else _with_results(loaded, results_path)
     solver = replace(solver, order=_order_of(loaded, solver, output))
     check_solver_options(output, solver, has_materials="young" in loaded.cell_data)
@@ -103,6 +104,13 @@ def convert_command(
         save_json(json_path, files | {"versions": versions()} | model_summary(model))
     print_model(output, model, solver)
     return 0
+
+
+def _unfolded(path: Path) -> MeshFile:
+    """A mesh from a file; InputError if its cells overlap."""
+    loaded = read_mesh(path)
+    check_unfolded(loaded.mesh, source=str(path))
+    return loaded
 
 
 def _texts_of(loaded: MeshFile, solver: SolverOptions, *, has_new_results: bool) -> dict[str, Any]:

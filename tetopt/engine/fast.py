@@ -62,6 +62,7 @@ LEAST_EDGE_VOXELS = 1.0  # with labels no exchange makes a shorter edge, beside 
 ATTRACTED_FLOOR = 4.0  # degrees: cells may be as flat, if not the floor is lower, until nodes have come between labels
 # As many cells on a mask's boundary may be taken out where nothing lifts them: a share of all cells, or this number.
 FLAT_SHARE, FLAT_CELLS = 0.005, 10
+MEND_ROUNDS = 3  # of lifting and taking out, at the end
 FAR_TICKS = -(1 << 40)  # a place far from any other
 
 
@@ -224,15 +225,12 @@ def followed(
         # 3. Exchange nodes: in every other one of the first iterations.
         if nodes is not None and does_exchange:
             n_changes += run.exchange_towards(nodes, course.sizes)
-        # 4. Lift what is under the floor: in the last iteration. Parts do so in every round, as in the next one what is
-        # under it may have nodes that stay.
+        # 4. Lift what is under the floor and mend what is not a manifold: in the last iteration. Parts do so in every
+        # round, as in the next one what is under it may have nodes that stay.
         is_last = iteration == course.last or not is_finished or (fall < course.tolerance and not is_early)
-        if is_last and run.n_below(floor) > 0 and run.lift(floor) > 0:
-            n_changes, fall = n_changes + 1, np.inf
-        # 5. Mend what is not a manifold, by cells taken out and labels changed: no angle gets smaller.
-        if is_last:
-            n_changes += run.mend_surfaces(course.carves, floor)
-        # 6. Measure.
+        n_lifted, n_gone = run.mend(course.carves, floor) if is_last else (0, 0)
+        n_changes, fall = n_changes + n_lifted + n_gone, np.inf if n_lifted > 0 else fall
+        # 5. Measure.
         record(iteration, movement, n_changes > 0)
         if not is_finished:
             return history, "over"
@@ -410,17 +408,33 @@ class Run:
         """Tetrahedra with an angle under `degrees`."""
         return n_cells_below(self.state, degrees) if degrees > 0.0 else 0
 
-    def lift(self, degrees: float) -> int:
+    def mend(self, carves: bool, floor: float) -> tuple[int, int]:
+        """Lift cells over the floor, degrees, and mend surfaces: again where cells that were taken out made room.
+
+        Returns the number of moves, and of cells taken out.
+        """
+        n_lifted = n_gone = 0
+        for _ in range(MEND_ROUNDS):
+            n_lifted += self.lift(floor, carves) if self.n_below(floor) > 0 else 0
+            n_new = self.mend_surfaces(carves, floor)
+            n_gone += n_new
+            if n_new == 0 or self.n_below(floor) == 0:
+                break
+        return n_lifted, n_gone
+
+    def lift(self, degrees: float, carves: bool = False) -> int:
         """Lift the worst cells over `degrees`, or as far as they go; the number of moves. It may raise E.
 
-        On the surface of a mask whose details are as small as the cells it may lay cells over one another; then none
-        of it is done, and the floor is missed.
+        On the surface of a mask whose details are as small as the cells it may lay cells over one another: more than
+        may be taken out (none, unless it `carves`). Then none of it is done, and the floor is missed.
         """
         before = self.state if self.content.region is None else copied(self.state)
         made = repair(self.state, degrees)
-        if self.content.region is not None and self._overlapping(made.state).any():
-            self.state = before
-            return 0
+        if self.content.region is not None:
+            n_over = int(self._overlapping(made.state).sum())
+            if n_over > (self.most_gone if carves else 0):
+                self.state = before
+                return 0
         self._renumber(made.state, made.source)
         self.hope[:] = np.inf
         return made.n_moves
@@ -438,13 +452,18 @@ class Run:
             if self.n == 3 and floor > 0.0:
                 is_outer = (self.state.complex.across[: self.n_cells] < 0).any(axis=1)
                 is_flat = is_outer & (cell_cosines(self.state) < floor_of(floor)[0])
-                if is_flat.sum() <= max(FLAT_SHARE * self.n_cells, FLAT_CELLS):
+                if is_flat.sum() <= self.most_gone:
                     n_gone += self._take_out(is_flat)
             kept = carved(self.mesh(), self.image, self.content.region, self.content.keeps_components)
             n_gone, self.n_dropped = n_gone + self._take_out(~kept.is_kept), self.n_dropped + kept.n_dropped
         if self.has_labels:
             mend_pinches(self.state, self.content, self.mesh())
         return n_gone
+
+    @property
+    def most_gone(self) -> float:
+        """How many cells may be taken out for the floor."""
+        return max(FLAT_SHARE * self.n_cells, FLAT_CELLS)
 
     def _take_out(self, is_gone: NDArray[np.bool_]) -> int:
         if is_gone.any():

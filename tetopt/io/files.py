@@ -214,7 +214,8 @@ def written_whole(path: Path, n_bytes: int | None = None) -> Iterator[Path]:
     """
     outputs, key = _OUTPUTS.get(), _absolute(path)
     place = Path(os.path.realpath(path)) if outputs is None else outputs.places.get(key, Path(os.path.realpath(path)))
-    suffix = "".join(path.suffixes[-2:])[-20:]
+    # not `path.suffixes`, which passes over dots that lead: of "..nii.gz" it knows .gz alone
+    suffix = "".join(f".{part}" for part in path.name.split(".")[1:][-2:])[-20:]
     temporary = None
     try:
         handle, name = tempfile.mkstemp(prefix=f".{path.name[:TEMPORARY_LETTERS]}.", suffix=suffix, dir=place.parent)

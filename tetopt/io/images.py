@@ -52,6 +52,7 @@ MOST_OF_NIFTI_1 = 32767  # voxels along an axis, of 16 bits; NIfTI-2 has more
 HEAD_BYTES_NIFTI = 1024  # of a file: the longest of the headers has 540
 EXTENSION_BYTES = 2**26  # 67 MB before the voxels: a NIfTI file's extensions are texts
 TRAILING_BYTES = 2**24  # 17 MB behind the last voxel: MGH's tags
+TOO_LONG = f"{DAMAGED_FILE} (it goes on far behind the last voxel, beyond byte {{}})"
 MGH_FLAG = slice(28, 30)  # the bytes of an MGH header that are 0 where it has no sizes and directions
 # mm along the longest side of an image's box: a body is shorter than the one, micrometres and metres pass as mm beyond.
 LONGEST_BOX, SHORTEST_BOX = 3000.0, 1.0
@@ -636,8 +637,11 @@ def _check_size(path: Path, file: SpatialImage, volume: int, is_packed: bool) ->
             f"{DAMAGED_FILE} (its header tells of {' x '.join(str(each) for each in file.shape)} voxels, "
             f"{n_bytes:.4g} bytes, the file has {size})"
         )
+    most = proxy.offset + math.prod(file.shape[3:]) * volume_bytes + TRAILING_BYTES
     if is_packed:
-        _check_gzip(path, proxy.offset + math.prod(file.shape[3:]) * volume_bytes + TRAILING_BYTES)
+        _check_gzip(path, most)
+    elif size > most:  # its checksum would be made of all of it
+        raise InputError(TOO_LONG.format(most))
 
 
 def _check_gzip(path: Path, most: int) -> None:
@@ -648,7 +652,7 @@ def _check_gzip(path: Path, most: int) -> None:
             while block := stream.read(1 << 20):
                 n_bytes += len(block)
                 if n_bytes > most:
-                    raise InputError(f"{DAMAGED_FILE} (it goes on far behind the last voxel, which ends at {most})")
+                    raise InputError(TOO_LONG.format(most))
     except (OSError, EOFError, zlib.error) as error:
         raise _of_gzip(error) from error
 
