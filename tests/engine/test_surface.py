@@ -143,7 +143,7 @@ def test_a_lift_that_lays_cells_over_one_another_is_undone(monkeypatch):
     target = content(image, mask=mask)
     start = lattice_within(target.image, target.region, nodes=150)
     lifted = tetopt.optimize(target, start, iterations=2, min_dihedral=35.0)
-    monkeypatch.setattr(Run, "_overlapping", lambda self, state: np.ones(1, dtype=bool))
+    monkeypatch.setattr(Run, "_overlapping", lambda self, state: np.ones(100, dtype=bool))
     monkeypatch.setattr(Run, "mend_surfaces", lambda self, carves, floor: 0)
     kept = tetopt.optimize(target, start, iterations=2, min_dihedral=35.0)
     angles = [tetopt.quality(each.mesh.points, each.mesh.cells).min_dihedral for each in (lifted, kept)]

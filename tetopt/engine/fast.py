@@ -17,7 +17,7 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.energy.sampling import cell_moments, cell_of_voxel, channel_grid, from_ticks
+from tetopt.energy.sampling import cell_of_voxel, channel_grid, from_ticks
 from tetopt.engine.complex import State, copied, interface_energy, node_rings, remeasure, without_cells
 from tetopt.engine.density import Limits, compacted, exchange
 from tetopt.engine.flips import _evaluate_cells, _evaluate_triangles, flip
@@ -477,7 +477,9 @@ class Run:
         mesh = Mesh(points, state.complex.cells[: int(state.complex.n_cells[0])].copy())
         owner = cell_of_voxel(self.image, mesh)
         n_owned = np.bincount(owner[owner >= 0], minlength=len(mesh.cells))
-        return np.asarray(cell_moments(self.image, mesh).n_voxels > n_owned)
+        if state.objective.image == 0.0:  # the moves have left the sums alone
+            remeasure(state)
+        return np.asarray(state.complex.sums[: len(n_owned), 0] > n_owned)
 
     def _renumber(self, state: State, source: NDArray[np.int64]) -> None:
         """Take over a state with other nodes: where each comes from, -1 for new ones."""
