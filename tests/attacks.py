@@ -3,6 +3,7 @@
 import os
 import shutil
 import stat
+from contextlib import suppress
 
 KINDS = ("file link", "folder link", "hanging link", "device link", "pipe", "file", "folder")
 
@@ -13,6 +14,8 @@ def outside(folder):
     (place / "deep").mkdir(parents=True)
     (place / "notes.txt").write_text("years of work")
     (place / "deep" / "more.txt").write_text("and more")
+    with suppress(PermissionError):  # as root: a device of its own, which code that follows links may ruin
+        os.mknod(place / "zero", stat.S_IFCHR | 0o666, os.makedev(1, 5))
     return place
 
 
@@ -22,7 +25,7 @@ def planted(kind, place, elsewhere):
         shutil.rmtree(place)
     place.unlink(missing_ok=True)
     targets = {"file link": elsewhere / "notes.txt", "folder link": elsewhere, "hanging link": elsewhere / "new",
-               "device link": "/dev/zero"}  # fmt: skip
+               "device link": elsewhere / "zero" if (elsewhere / "zero").exists() else "/dev/zero"}  # fmt: skip
     if kind in targets:
         place.symlink_to(targets[kind])
     elif kind == "hard link":
