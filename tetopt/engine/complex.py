@@ -90,7 +90,7 @@ class Sides(NamedTuple):
     level: Singles3  # (s_0, s_1, s_2) its level function; (1, 1, 1) without
     levels: Singles4  # (L, s_0, s_1, s_2) level functions of labels; (1, 1, 1, 1) without
     channel: Ints1  # (K,) which of them is each label's
-    projections: Floats3  # see `tetopt.engine.descent.free_projections`
+    projections: Floats3  # see `tetopt.engine.state.free_projections`
     inverse: Floats2  # (3, 3) mm to index vectors
 
 

@@ -258,6 +258,7 @@ def prepare_kernels(
             "repair": image.ndim == 3,
             "interfaces": has_labels,
             "labelling": has_labels,
+            "paper_moves": False,
         }
         link([kernel for kernel in roots() if kernel not in unused and purposes.get(kernel.room, True)], progress)
     is_whole = not content.is_plain or np.array_equal(np.rint(image.data), image.data)

@@ -10,39 +10,29 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.check import filled_share
-from tetopt.energy.discretization import E_D_of_sums, combined
+from tetopt.energy.discretization import combined
 from tetopt.energy.geometric import cell_E_G
-from tetopt.energy.sampling import (
-    SamplingGrid,
-    check_orientations,
-    facet_fluxes,
-    from_ticks,
-    moment_sums,
-    orientations,
-    sampling_grid,
-    sums_of_fluxes,
-    to_ticks,
-)
-from tetopt.engine.complex import FLAT_SHARE
-from tetopt.engine.descent import Scheme, Tessellation, descend, free_projections, relocate
+from tetopt.energy.sampling import SamplingGrid, from_ticks, moment_sums, orientations, sampling_grid
+from tetopt.engine.complex import FLAT_SHARE, State, build, cell_squares, energies, node_rings
 from tetopt.engine.loop import (
-    E_D_ROUNDING,
     UNIFORM_ITERATIONS,
     UNIFORM_K_D,
     Boundary,
     Optimized,
     Record,
     deadline,
-    frozen_axes,
     relative_movement,
     side_ticks,
 )
+from tetopt.engine.paper_moves import Moves, descend, relocate
 from tetopt.engine.promises import promised
+from tetopt.engine.state import unweighted, weighted
 from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides, facets_on_sides
 from tetopt.geometry.simplex import squared_edges, volumes
-from tetopt.geometry.topology import Facets, facets, greedy_colours, rings, stars
+from tetopt.geometry.topology import facets, folded, greedy_colours
 from tetopt.image import Image
+from tetopt.kernels import packed
 from tetopt.mesh import Mesh
 from tetopt.notebook import with_bar
 from tetopt.start.delaunay import delaunay
@@ -131,20 +121,17 @@ def optimize_paper(
     is_over = deadline(begin, max_seconds, stop)
 
     grid = sampling_grid(image, mesh.points)
-    tessellation = _initial(image, mesh, grid, boundary)
+    state = _initial(image, mesh, grid, k_D, boundary)
     if iterations > 0 and (retessellate == "accept" or (retessellate == "first" and n_t > 0)):
         _check_fills_box(image, mesh)
-    # Where every cell is uniform, what rounding leaves of E_D must not become the unit that E_D is measured in.
-    rounding = E_D_ROUNDING * float(np.var(image.data, dtype=np.float64)) * image.volume
-    E_G0, E_D0 = _energies(tessellation, image, rounding)
-    scheme = _scheme(image, grid, k_D, E_G0, E_D0, step_ratio)
+    E_G0, E_D0 = _energies(state, image)
     history: list[Record] = []
 
     def record(iteration: int, movement: float, is_new: bool) -> None:
-        E_G, E_D = _energies(tessellation, image, rounding)
-        E, n_voxels = combined(E_G, E_D, E_G0, E_D0, k_D), int(tessellation.sums[:, 0].sum())
-        seconds = time.perf_counter() - begin
-        history.append(Record(iteration, E, E_G, E_D, movement, is_new, len(tessellation.cells), n_voxels, seconds))
+        E_G, E_D = _energies(state, image)
+        n_cells, seconds = len(_cells(state)), time.perf_counter() - begin
+        E, n_voxels = combined(E_G, E_D, E_G0, E_D0, k_D), int(state.complex.sums[:n_cells, 0].sum())
+        history.append(Record(iteration, E, E_G, E_D, movement, is_new, n_cells, n_voxels, seconds))
         if callback is not None:
             callback(history[-1])
 
@@ -154,18 +141,18 @@ def optimize_paper(
         # 1. Connect the nodes anew.
         is_new = False
         if retessellate == "accept" or (retessellate == "first" and iteration <= n_t):
-            candidate = _retessellated(image, grid, tessellation, scheme.hand)
+            candidate = _retessellated(image, grid, state)
             limit = history[-1].E if retessellate == "accept" else np.inf
-            if candidate and limit > combined(*_energies(candidate, image, rounding), E_G0, E_D0, k_D):
-                is_new = not np.array_equal(candidate.cells, tessellation.cells)
-                tessellation = candidate
+            if candidate and limit > combined(*_energies(candidate, image), E_G0, E_D0, k_D):
+                is_new = not np.array_equal(_cells(candidate), _cells(state))
+                state = candidate
         # 2. Move the nodes, one colour at a time.
-        before = tessellation.ticks.copy()
-        is_finished = _sweep(tessellation, scheme, relocate if k_D == 0.0 else descend, is_over)
+        before = state.complex.ticks.copy()
+        is_finished = _sweep(state, step_ratio, k_D, is_over)
         # 3. Measure.
-        if k_D == 0.0:
-            tessellation.sums[:] = moment_sums(grid, tessellation.ticks, tessellation.cells)
-        movement = relative_movement(before, tessellation.ticks, image, grid, scheme.matrix)
+        if state.objective.image == 0.0:  # moves did not look at the voxels
+            state.complex.sums[: len(_cells(state))] = moment_sums(grid, state.complex.ticks, _cells(state))
+        movement = relative_movement(before, state.complex.ticks, image, grid, state.objective.matrix)
         record(iteration, movement, is_new)
         if not is_finished:
             ended = "stopped" if stop is not None and stop() else "max_seconds"
@@ -173,8 +160,13 @@ def optimize_paper(
         if movement < tolerance and not is_new:
             ended = "converged"
             break
-    points = image.to_world(from_ticks(tessellation.ticks, grid, image.ndim))
-    return promised(Optimized(Mesh(points, tessellation.cells), history, ended), plain(image), 0.0, mesh)
+    points = image.to_world(from_ticks(state.complex.ticks, grid, image.ndim))
+    return promised(Optimized(Mesh(points, _cells(state)), history, ended), plain(image), 0.0, mesh)
+
+
+def _cells(state: State) -> NDArray[np.int64]:
+    """The cells of a state, (M, n+1)."""
+    return state.complex.cells[: int(state.complex.n_cells[0])]
 
 
 def default_n_t(k_D: float, iterations: int) -> int:
@@ -211,80 +203,50 @@ def _check_fills_box(image: Image, mesh: Mesh) -> None:
         )
 
 
-def _initial(image: Image, mesh: Mesh, grid: SamplingGrid, boundary: Boundary) -> Tessellation:
-    """The tessellation of the initial mesh."""
-    ticks = to_ticks(image.to_index(mesh.points), grid)
-    check_orientations(image, ticks, mesh.cells)
-    is_frozen = frozen_axes(image, ticks, mesh.cells, grid, boundary)
-    shared = facets(mesh.cells)
-    if shared.n_cells.max() > 2:
-        raise InputError("mesh: a facet is shared by more than two cells; remove doubled or overlapping cells")
-    return _tessellation(image, grid, ticks, mesh.cells, is_frozen, shared)
-
-
-def _tessellation(
-    image: Image, grid: SamplingGrid, ticks: NDArray[np.int64], cells: NDArray[np.int64], is_frozen: NDArray[np.bool_],
-    shared: Facets,
-) -> Tessellation:  # fmt: skip
-    """Everything that a sweep reads and writes, measured afresh; `shared` are the cells' facets."""
-    points = image.to_world(from_ticks(ticks, grid, image.ndim))
-    cells, around = np.ascontiguousarray(cells, dtype=np.int64), rings(cells, len(ticks))
-    fluxes = facet_fluxes(grid, ticks, shared.nodes)
-    return Tessellation(
-        ticks,
-        cells,
-        is_frozen,
-        *around,
-        shared.nodes,
-        shared.of_cell,
-        shared.sign,
-        *stars(shared, around),
-        sums_of_fluxes(fluxes, shared, _hand(image)),
-        cell_E_G(points, cells),
-        fluxes,
-    )
-
-
-def _scheme(image: Image, grid: SamplingGrid, k_D: float, E_G0: float, E_D0: float, step_ratio: float) -> Scheme:
-    """The scheme of plain numbers, as the kernels are compiled for."""
-    matrix = np.eye(3)
-    matrix[3 - image.ndim :, 3 - image.ndim :] = image.affine[:-1, :-1]
+def _initial(image: Image, mesh: Mesh, grid: SamplingGrid, k_D: float, boundary: Boundary) -> State:
+    """The state of the initial mesh, which normalises the two energies."""
+    state = _with_E_G(unweighted(plain(image), mesh, grid, 1.0, boundary), image, grid)
+    E_G0, E_D0 = _energies(state, image)
+    if k_D == 0.0:
+        return weighted(state, 1.0, 0.0)
     weight = k_D * image.voxel_volume / E_D0 if E_D0 > 0.0 else 0.0
-    weights = float((1.0 - k_D) / E_G0), float(weight), float(step_ratio)
-    return Scheme(grid.prefix, int(grid.bits), _hand(image), matrix, free_projections(matrix), *weights)
+    return weighted(state, float((1.0 - k_D) / E_G0), float(weight))
 
 
-def _hand(image: Image) -> int:
-    """The sign in index space of the cells' volumes."""
-    return 1 if np.linalg.det(image.affine[:-1, :-1]) > 0 else -1
+def _with_E_G(state: State, image: Image, grid: SamplingGrid) -> State:
+    """The state with E_G of its cells as `tetopt.energy.geometric` has it."""
+    points, cells = image.to_world(from_ticks(state.complex.ticks, grid, image.ndim)), _cells(state)
+    state.complex.E_shape[: len(cells)] = cell_E_G(points, cells)
+    return state
 
 
-def _energies(mesh: Tessellation, image: Image, rounding: float) -> tuple[float, float]:
-    """E_G and E_D of the mesh; an E_D up to `rounding` is 0."""
-    E_D = float(E_D_of_sums(mesh.sums, image.voxel_volume).sum())
-    return float(mesh.E_G.sum()), E_D if E_D > rounding else 0.0
+def _energies(state: State, image: Image) -> tuple[float, float]:
+    """E_G and E_D of the mesh; an E_D that is only rounding is 0."""
+    E_D = float((cell_squares(state) * image.voxel_volume).sum())
+    return energies(state)[0], E_D if E_D > state.objective.rounding * image.voxel_volume else 0.0
 
 
-def _retessellated(image: Image, grid: SamplingGrid, mesh: Tessellation, hand: int) -> Tessellation | None:
-    """The tessellation by Delaunay's cells; None where they would not be a mesh of the same box.
+def _retessellated(image: Image, grid: SamplingGrid, state: State) -> State | None:
+    """The state with Delaunay's cells; None where they would not be a mesh of the same box.
 
-    Checked exactly: every cell oriented on the fixed-point grid, every facet in one or two cells, the boundary's
-    facets on the box, and every voxel in one cell.
+    Checked exactly: every cell oriented on the fixed-point grid, every facet between two cells or on the box, and
+    every voxel in one cell.
     """
+    mesh = state.complex
     index = from_ticks(mesh.ticks, grid, image.ndim)
     cells = delaunay(index, image.affine)
     if cells is None:
         return None
-    if (orientations(mesh.ticks, cells) != hand).any() or _is_flat(image.to_world(index), cells).any():
+    if (orientations(mesh.ticks, cells) != state.objective.hand).any() or _is_flat(image.to_world(index), cells).any():
         return None
     shared = facets(cells)
-    if shared.n_cells.max() > 2:
+    if len(folded(cells, shared)):
         return None
     outer = shared.nodes[shared.n_cells == 1]
     if not facets_on_sides(mesh.ticks, outer, side_ticks(grid), tolerance=0).any(axis=(1, 2)).all():
         return None
-    candidate = _tessellation(image, grid, mesh.ticks, cells, mesh.is_frozen, shared)
-    return candidate if candidate.sums[:, 0].sum() == image.data.size else None
+    candidate = _with_E_G(build(cells, mesh.ticks, mesh.is_frozen, state.objective, state.sides), image, grid)
+    return candidate if candidate.complex.sums[: len(cells), 0].sum() == image.data.size else None
 
 
 def _is_flat(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -293,17 +255,14 @@ def _is_flat(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[n
     return volumes(points, cells) <= FLAT_SHARE * size
 
 
-def _sweep(
-    mesh: Tessellation,
-    scheme: Scheme,
-    move: Callable[[Tessellation, NDArray[np.int64], Scheme], None],
-    is_over: Callable[[], bool],
-) -> bool:
+def _sweep(state: State, step_ratio: float, k_D: float, is_over: Callable[[], bool]) -> bool:
     """Move every node once; False if `is_over` cut it short, between two colours."""
-    n, colours = mesh.cells.shape[1] - 1, greedy_colours(mesh.cells, mesh.start, mesh.ring)
-    is_free = ~mesh.is_frozen[:, 3 - n : 3].all(axis=1)
+    rings, cells = node_rings(state), _cells(state)
+    colours = greedy_colours(cells, rings.start, rings.cells)
+    is_free = ~state.complex.is_frozen[:, 4 - cells.shape[1] : 3].all(axis=1)
+    move, laid_out = relocate if k_D == 0.0 else descend, (packed(state), packed(rings))
     for colour in range(colours.max() + 1):
         if is_over():
             return False
-        move(mesh, np.flatnonzero((colours == colour) & is_free), scheme)
+        move(Moves(*laid_out, np.flatnonzero((colours == colour) & is_free), step_ratio))
     return True

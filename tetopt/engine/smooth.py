@@ -453,23 +453,17 @@ def ring_shape(
     return energy
 
 
-@unit
-def ring_energy(
-    trial: TrialByValue, limit: float, least: float, node: int, state: State, rings: NodeRings, joined: int
-) -> float:
-    """Energy of a node's ring as the ticks stand, all that was measured in `trial`; infinite as `ring_shape`.
+@inlined
+def ring_image(
+    sums: NDArray, trial: Trial, energy: float, misfit: float, bound: float, node: int, state: State, rings: NodeRings
+) -> tuple:
+    """Add the image's energy in a node's ring as the ticks stand to `energy`, and what it has of the misfit to that.
 
-    What the ring's misfit to the mask is more than it was is added.
+    Infinite once the energy is above `bound`. Fluxes go to `trial`, in whose `shapes` cells that are gone are
+    negative; `sums` (1, D) is room for those of a cell.
     """
     cells, objective, shapes, fluxes = state.complex.cells, state.objective, trial.shapes, trial.fluxes
     n, D, first = cells.shape[1], fluxes.shape[2], rings.start[node]
-    misfit, has_misfit = ring_misfit(state, rings, node)
-    bound = np.inf if has_misfit else limit  # no sum says anything before all of the misfit is in it
-    energy = ring_shape(trial, bound, least, node, state, rings, joined)  # cheap refusals before any voxel is read
-    if energy == np.inf or objective.image == 0.0:
-        return energy
-    energy += ring_tension(state, rings, node)
-    sums = np.empty((1, D))
     for r in range(first, rings.start[node + 1]):
         if shapes[r - first] < 0.0:
             continue
@@ -493,7 +487,26 @@ def ring_energy(
         energy += objective.image * image_energy(sums, 0, state.complex.labels[cell], objective)
         misfit += wrong_side(sums, 0, objective)
         if energy > bound:
-            return np.inf
+            return np.inf, misfit
+    return energy, misfit
+
+
+@unit
+def ring_energy(
+    trial: TrialByValue, limit: float, least: float, node: int, state: State, rings: NodeRings, joined: int
+) -> float:
+    """Energy of a node's ring as the ticks stand, all that was measured in `trial`; infinite as `ring_shape`.
+
+    What the ring's misfit to the mask is more than it was is added.
+    """
+    misfit, has_misfit = ring_misfit(state, rings, node)
+    bound = np.inf if has_misfit else limit  # no sum says anything before all of the misfit is in it
+    energy = ring_shape(trial, bound, least, node, state, rings, joined)  # cheap refusals before any voxel is read
+    if energy == np.inf or state.objective.image == 0.0:
+        return energy
+    sums = np.empty((1, trial.fluxes.shape[2]))
+    energy += ring_tension(state, rings, node)
+    energy, misfit = ring_image(sums, trial, energy, misfit, bound, node, state, rings)
     if has_misfit:
         energy += misfit
     return energy if energy <= limit else np.inf

@@ -8,7 +8,6 @@ from numpy.typing import NDArray
 from tetopt.check import check_unfolded
 from tetopt.energy.sampling import SamplingGrid, check_orientations, to_ticks, volume_of
 from tetopt.engine.complex import Objective, Sides, State, build, energies
-from tetopt.engine.descent import free_projections
 from tetopt.engine.loop import E_D_ROUNDING, SHAPE_POWER, Boundary, Whole, frozen_axes, side_ticks
 from tetopt.errors import InputError
 from tetopt.geometry.topology import facets
@@ -32,6 +31,26 @@ def state_of(
         A mesh that the sampling cannot take, that is folded, or a cell too flat to have a shape energy; or energies
         that overflow.
     """
+    state = unweighted(content, mesh, grid, power, boundary, is_graded, whole)
+    flat = np.flatnonzero(~np.isfinite(state.complex.E_shape[: len(mesh.cells)]))
+    if len(flat):
+        raise InputError(
+            f"mesh: {len(flat)} cells are too flat to be improved, the first are {flat[:5].tolist()}; "
+            "remove them or move their nodes apart"
+        )
+    E_G0, squares0 = content_energies(state, content) if whole is None else (whole.E_G, whole.squares)
+    weight = k_D / squares0 if squares0 > 0.0 else 0.0
+    if not (0.0 < E_G0 < np.inf and np.isfinite(squares0) and np.isfinite(weight)):
+        raise InputError("mesh and image: their energies overflow; are lengths in mm and intensities of usual size?")
+    geometry, surface = float((1.0 - k_D) / E_G0), float(weight * state.objective.wrong_side)
+    return weighted(state, geometry, float(weight), surface)
+
+
+def unweighted(
+    content: Content, mesh: Mesh, grid: SamplingGrid, power: float, boundary: Boundary, is_graded: bool = False,
+    whole: Whole | None = None,
+) -> State:  # fmt: skip
+    """The state of a mesh with both energies of weight 1; InputError as `state_of`, but flat cells are taken."""
     image, region = content.image, content.region
     ticks = to_ticks(image.to_index(mesh.points), grid)
     check_orientations(image, ticks, mesh.cells)
@@ -46,20 +65,12 @@ def state_of(
     wrong_side = 0.0 if region is None else float(content.wrong_side)
     objective = objective_of(grid, matrix, power, is_graded)
     objective = objective._replace(rounding=rounding, wrong_side=wrong_side)
-    state = build(mesh.cells, ticks, is_frozen, objective, sides)
-    flat = np.flatnonzero(~np.isfinite(state.complex.E_shape[: len(mesh.cells)]))
-    if len(flat):
-        raise InputError(
-            f"mesh: {len(flat)} cells are too flat to be improved, the first are {flat[:5].tolist()}; "
-            "remove them or move their nodes apart"
-        )
-    E_G0, squares0 = content_energies(state, content) if whole is None else (whole.E_G, whole.squares)
-    weight = k_D / squares0 if squares0 > 0.0 else 0.0
-    if not (0.0 < E_G0 < np.inf and np.isfinite(squares0) and np.isfinite(weight)):
-        raise InputError("mesh and image: their energies overflow; are lengths in mm and intensities of usual size?")
-    geometry, surface = float((1.0 - k_D) / E_G0), float(weight * wrong_side)
-    objective = objective._replace(geometry=geometry, image=float(weight), surface=surface)
-    return state._replace(objective=objective)
+    return build(mesh.cells, ticks, is_frozen, objective, sides)
+
+
+def weighted(state: State, geometry: float, image: float, surface: float = 0.0) -> State:
+    """The state with other weights of E_G, of squares and of voxels on the wrong side."""
+    return state._replace(objective=state.objective._replace(geometry=geometry, image=image, surface=surface))
 
 
 def content_energies(state: State, content: Content, n_means: int | None = None) -> tuple[float, float]:
@@ -100,6 +111,17 @@ def sides_of(
     inverse = np.asarray(np.linalg.inv(matrix), dtype=np.float64)
     levels, channel = np.zeros((1, 1, 1, 1), dtype=np.float32), np.zeros(0, dtype=np.int64)
     return Sides(low, high, is_fixed, has_surface, level, levels, channel, free_projections(matrix), inverse)
+
+
+def free_projections(matrix: NDArray[np.float64]) -> NDArray[np.float64]:
+    """For each set of frozen axes (bit d: axis d), the (3, 3) map from a vector in mm to the index vector along
+    the free axes that comes nearest to it: least squares in mm, so right for oblique and sheared axes.
+    """
+    maps = np.zeros((8, 3, 3))
+    for frozen in range(8):
+        free = [d for d in range(3) if not frozen >> d & 1]
+        maps[frozen, free] = np.linalg.pinv(matrix[:, free])
+    return maps
 
 
 def objective_of(grid: SamplingGrid, matrix: NDArray[np.float64], power: float, is_graded: bool = False) -> Objective:

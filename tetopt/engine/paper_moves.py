@@ -1,0 +1,187 @@
+"""The two moves of the paper's scheme: descent with numerical derivatives, and Lloyd's relocation.
+
+Each is made for all nodes of one colour at the same time: they share no cell. A node moves only if no cell of its ring
+loses its orientation (exactly, in integers) and the ring's energy falls. The shape energy of the state is the paper's
+E_G here, not bounded for slivers as the fast engine's.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.energy.geometric import volume_and_E_G, volume_gradient
+from tetopt.energy.sampling import cell_orientation, few_threads
+from tetopt.engine.complex import FLAT_SHARE, NodeRings, State, cell_energy
+from tetopt.engine.smooth import Trial, TrialByValue, ring_image, store, trial_of
+from tetopt.engine.surface import projection_at
+from tetopt.geometry.vectors import difference, minus, put_row, row, scaled, times
+from tetopt.kernels import Floats2, Ints1, helper, run, unit
+
+LLOYD_HALVINGS = 4  # of a Lloyd step that inverts a cell or raises the ring's energy: then the node stays
+
+
+class Moves(NamedTuple):
+    """The nodes of one colour, which are to be moved."""
+
+    state: State
+    rings: NodeRings
+    nodes: Ints1
+    step_ratio: float  # step length of the descent over the distance to the nearest cell centroid
+
+
+def descend(moves: Moves) -> None:
+    """Move nodes along the image's axes to lower the energy of their rings (Section 2.2).
+
+    Per axis the ring's energy is measured at one step forwards and backwards, the step a ratio of the distance to
+    the nearest centroid of the ring's cells; the vertex of the parabola through the three values is tried as well;
+    the best of them is taken if it lies below the present energy.
+    """
+    with few_threads(len(moves.nodes) * 100):
+        run(_descend, len(moves.nodes), moves)
+
+
+def relocate(moves: Moves) -> None:
+    """Move nodes to the minimisers of E_G over their rings (Section 2.1), the objective's weights being 1 and 0.
+
+    Inside, that is the volume-weighted mean of the ring's circumcentres. A node on a face or an edge of the box
+    goes to the minimiser within it. A step that inverts a cell or, by rounding, raises E_G is halved up to four
+    times, then left out. Sums and fluxes are not kept up.
+    """
+    with few_threads(len(moves.nodes) * 10):
+        run(_relocate, len(moves.nodes), moves)
+
+
+@helper
+def _load_cell(x: NDArray, state: State, cell: int) -> None:
+    """A cell's corners in mm from the middle of the first voxel, to x (4, 3)."""
+    mesh, objective = state.complex, state.objective
+    for k in range(mesh.cells.shape[1]):
+        place = scaled(2.0**-objective.bits, row(mesh.ticks, mesh.cells[cell, k]))
+        put_row(x, k, times(objective.matrix, place))
+
+
+@helper
+def _shape(x: NDArray, state: State, cell: int) -> float:
+    """E_G of a cell; infinite if it is flat or inverted."""
+    mesh, n_corners = state.complex, state.complex.cells.shape[1]
+    if cell_orientation(mesh.ticks, mesh.cells, cell) != state.objective.hand:
+        return np.inf
+    _load_cell(x, state, cell)
+    volume, E_G = volume_and_E_G(x, n_corners)
+    squares = E_G * (n_corners * (n_corners + 1)) / max(volume, 1e-300)
+    return np.inf if volume <= FLAT_SHARE * squares ** (0.5 * (n_corners - 1)) else E_G
+
+
+@unit
+def _ring_energy(trial: TrialByValue, limit: float, node: int, state: State, rings: NodeRings) -> float:
+    """Energy of a node's ring as the ticks stand; what is measured goes to `trial`.
+
+    Infinite if a cell is flat or inverted, or once the energy is above `limit`.
+    """
+    first, energy = rings.start[node], 0.0
+    for r in range(first, rings.start[node + 1]):  # cheap refusals before any voxel is read
+        trial.shapes[r - first] = _shape(trial.x, state, rings.cells[r])
+        if trial.shapes[r - first] == np.inf:
+            return np.inf
+        energy += state.objective.geometry * trial.shapes[r - first]
+    if energy > limit:
+        return np.inf
+    if state.objective.image > 0.0:
+        sums = np.empty((1, trial.fluxes.shape[2]))
+        energy, _ = ring_image(sums, trial, energy, 0.0, limit, node, state, rings)
+    return energy
+
+
+@unit
+def _nearest_centroid(x: Floats2, node: int, state: State, rings: NodeRings) -> float:
+    """Distance in mm from a node to the nearest centroid of its ring's cells."""
+    nearest, n_corners = np.inf, state.complex.cells.shape[1]
+    for r in range(rings.start[node], rings.start[node + 1]):
+        _load_cell(x, state, rings.cells[r])
+        squared = 0.0
+        for d in range(3):
+            mean = 0.0
+            for k in range(n_corners):
+                mean += x[k, d] / n_corners
+            squared += (mean - x[rings.corner[r], d]) ** 2
+        nearest = min(nearest, squared)
+    return np.sqrt(nearest)
+
+
+@unit
+def _descend(moves: Moves, number: int) -> None:
+    """Move one node along the axes in turn, wherever that lowers its ring's energy."""
+    node, state, rings = moves.nodes[number], moves.state, moves.rings
+    ticks, matrix, fluxes = state.complex.ticks, state.objective.matrix, state.complex.fluxes
+    size, x = rings.start[node + 1] - rings.start[node], np.empty((4, 3))
+    # Two trials: the best so far is in row `kept`, the next goes to the other.
+    shapes, sides, kept = np.empty((2, size)), np.empty((2, size, fluxes.shape[1], fluxes.shape[2])), 0
+    energy = 0.0
+    for r in range(rings.start[node], rings.start[node + 1]):
+        energy += cell_energy(state, rings.cells[r])
+    reach = moves.step_ratio * _nearest_centroid(x, node, state, rings)
+    for axis in range(4 - state.complex.cells.shape[1], 3):
+        length = np.sqrt(matrix[0, axis] ** 2 + matrix[1, axis] ** 2 + matrix[2, axis] ** 2)
+        step = np.int64(np.rint(reach / (length * 2.0**-state.objective.bits)))
+        if state.complex.is_frozen[node, axis] or step == 0:
+            continue
+        here = ticks[node, axis]
+        best, best_there = energy, here
+        forwards, backwards = np.inf, np.inf
+        for attempt in range(3):
+            if attempt < 2:  # the numerical derivative: one step forwards, one backwards
+                there = here + step * (1 - 2 * attempt)
+                limit = np.inf  # the parabola needs both values whole
+            else:  # the vertex of the parabola through the three values
+                bend = forwards + backwards - 2.0 * energy
+                if not (np.isfinite(bend) and bend > 0.0):
+                    break
+                vertex = 0.5 * (backwards - forwards) / bend
+                there = here + np.int64(np.rint(min(max(vertex, -1.0), 1.0) * step))
+                limit = best
+                if there == here:
+                    break
+            ticks[node, axis] = there
+            value = _ring_energy(Trial(x, shapes[1 - kept], sides[1 - kept]), limit, node, state, rings)
+            if attempt == 0:
+                forwards = value
+            elif attempt == 1:
+                backwards = value
+            if value < best:
+                best, best_there, kept = value, there, 1 - kept
+        ticks[node, axis] = best_there
+        if best_there != here:
+            energy = best
+            store(Trial(x, shapes[kept], sides[kept]), node, state, rings)
+
+
+@unit
+def _relocate(moves: Moves, number: int) -> None:
+    """Move one node to the minimiser of its ring's E_G, or as far towards it as no cell is inverted."""
+    node, state, rings = moves.nodes[number], moves.state, moves.rings
+    ticks, n_corners, trial = state.complex.ticks, state.complex.cells.shape[1], trial_of(state, rings, node)
+    weight, gradient, energy, ring_volume = 1.0 / (n_corners * (n_corners + 1)), np.zeros(3), 0.0, 0.0
+    for r in range(rings.start[node], rings.start[node + 1]):
+        _load_cell(trial.x, state, rings.cells[r])
+        volume, E_G = volume_and_E_G(trial.x, n_corners)
+        edges, slope = E_G / (volume * weight), volume_gradient(trial.x, rings.corner[r], n_corners)
+        apart = (0.0, 0.0, 0.0)
+        for k in range(n_corners):
+            apart = minus(apart, difference(trial.x, k, rings.corner[r]))
+        for d in range(3):
+            gradient[d] += weight * (slope[d] * edges + 2.0 * volume * apart[d])
+        ring_volume += volume
+        energy += state.complex.E_shape[rings.cells[r]]
+    # E_G over the ring is |Omega| / (n+1) |x - minimiser|^2 + constant.
+    step, here = times(projection_at(state, node), gradient), row(ticks, node)
+    step = scaled(-n_corners / (2.0 * ring_volume), step)
+    for halving in range(LLOYD_HALVINGS + 1):
+        for d in range(3):
+            ticks[node, d] = here[d] + np.int64(np.rint(step[d] * 0.5**halving / 2.0**-state.objective.bits))
+        if _ring_energy(trial, np.inf, node, state, rings) < energy:
+            store(trial, node, state, rings)
+            return
+    put_row(ticks, node, here)
