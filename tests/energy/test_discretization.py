@@ -10,8 +10,7 @@ from hypothesis import strategies as st
 from meshes import TWO_TRIANGLES, delaunay_box, random_affine, split_box
 
 from tetopt import E_D, Image, Mesh, cell_moments, cell_of_voxel, lattice, load_phantom
-from tetopt.energy.discretization import E_D_of_sums, cell_E_D, combined
-from tetopt.energy.sampling import moment_sums, sampling_grid, to_ticks
+from tetopt.energy.discretization import cell_E_D, combined
 from tetopt.geometry.simplex import oriented, volumes
 
 kernel = pytest.mark.kernel
@@ -201,23 +200,6 @@ def test_E_D_is_the_sum_of_squares_around_each_cell_s_mean(seed, n):
         cell_E_D(image, mesh), np.array(expected) * image.voxel_volume, rtol=1e-9, atol=1e-8 * image.voxel_volume
     )
     assert E_D(image, mesh) == pytest.approx(cell_E_D(image, mesh).sum(), rel=1e-15)
-
-
-@given(seeds, dimensions)
-@kernel
-def test_E_D_of_sums_is_cell_E_D(seed, n):
-    image, mesh = random_case(seed, n)
-    grid = sampling_grid(image, mesh.points)
-    sums = moment_sums(grid, to_ticks(image.to_index(mesh.points), grid), mesh.cells)
-    of_cells = E_D_of_sums(sums, image.voxel_volume)
-    np.testing.assert_allclose(of_cells, cell_E_D(image, mesh), rtol=1e-9, atol=1e-9 * image.voxel_volume)
-    assert (of_cells >= 0).all()
-
-
-def test_E_D_of_sums_by_hand():
-    """No voxel; one; 1, 2 and 6 (mean 3, squares 4 + 1 + 9); a rounding below 0."""
-    sums = np.array([[0.0, 0, 0], [1, 5, 25], [3, 9, 41], [2, 2, 2 - 1e-15]])
-    assert E_D_of_sums(sums, 0.5).tolist() == [0, 0, 7, 0]
 
 
 # Eq. (4)

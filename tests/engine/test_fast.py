@@ -10,10 +10,11 @@ from scipy.spatial import Delaunay
 from states import CASES, OBLIQUE, Engine, assumed_case, ball, random_case
 
 import tetopt
+from tetopt.energy.discretization import cell_E_D
 from tetopt.energy.geometric import E_G_gradient, cell_E_G
 from tetopt.energy.sampling import from_ticks
 from tetopt.engine import flips
-from tetopt.engine.complex import build, cosine_up_to_floor, energies, node_rings, remeasure
+from tetopt.engine.complex import build, cell_squares, cosine_up_to_floor, energies, node_rings, remeasure
 from tetopt.engine.fast import Run
 from tetopt.engine.repair import n_cells_below
 from tetopt.engine.smooth import _add_image_gradient, _add_shape_gradient, gradient
@@ -56,6 +57,16 @@ def test_cells_that_are_surely_above_a_floor():
         np.testing.assert_allclose(cosines[cosines < cosine], -np.cos(np.radians(angles[cosines < cosine])), atol=1e-9)
     objective = objective._replace(floor=-0.97, safe=floor_of(12.0)[1])
     assert (np.array([cosine_up_to_floor(x, objective) for x in corners[:2000]]) == -0.97).mean() > 0.5
+
+
+@pytest.mark.parametrize("n", [2, 3])
+def test_squares_of_cells(n):
+    """E_D of each cell; and by hand, of no voxel, one, three (1, 2 and 6) and a rounding below 0."""
+    engine = random_case(5, n)
+    squares = cell_squares(engine.state) * engine.image.voxel_volume
+    np.testing.assert_allclose(squares, cell_E_D(engine.image, engine.mesh), rtol=1e-9, atol=1e-9 * squares.max())
+    engine.complex.sums[:4] = [[0.0, 0, 0], [1, 5, 25], [3, 9, 41], [2, 2, 2 - 1e-15]]
+    assert cell_squares(engine.state)[:4].tolist() == [0, 0, 14, 0]
 
 
 # Gradients.

@@ -397,11 +397,15 @@ def test_accept_needs_a_full_box_for_any_n_t():
             optimize_paper(image, holed, iterations=2, retessellate="accept", n_t=n_t)
 
 
-def test_doubled_cells_are_refused():
+def test_doubled_and_overlapping_cells_are_refused():
+    """Each cell twice; two triangles on the same side of an edge."""
     image, blocks = CASES["2-D"]
     mesh = tetopt.lattice(image, blocks=blocks)
-    with pytest.raises(tetopt.InputError, match="shared by more than two cells"):
-        optimize_paper(image, tetopt.Mesh(mesh.points, np.vstack([mesh.cells, mesh.cells])), iterations=1)
+    doubled = tetopt.Mesh(mesh.points, np.vstack([mesh.cells, mesh.cells]))
+    folded = tetopt.Mesh([[2.0, 2.0], [30.0, 2.0], [10.0, 20.0], [20.0, 20.0]], [[0, 1, 2], [0, 1, 3]])
+    for spoiled in (doubled, folded):
+        with pytest.raises(tetopt.InputError, match="cells that overlap there"):
+            optimize_paper(image, spoiled, iterations=1, retessellate="never")
 
 
 def missing_cell(cells):
@@ -429,6 +433,17 @@ def test_spoiled_tessellations_are_not_taken(name, spoil, monkeypatch):
     assert not any(row.is_retessellated for row in result.history)
     monkeypatch.setattr(sys.modules["tetopt.engine.paper"], "delaunay", lambda *_: good[::-1])
     np.testing.assert_array_equal(optimize_paper(image, mesh, k_D=0.3, iterations=1, n_t=1).mesh.cells, good[::-1])
+
+
+def test_flat_cells_are_left_but_not_made(monkeypatch):
+    """A mesh with a flat triangle is improved by moving its nodes; a tessellation that has one is not taken."""
+    points = np.array([[-0.5, -0.5], [11.5, -0.5], [11.5, 11.5], [-0.5, 11.5], [5.5, -0.499997]])
+    image, mesh = ball((12, 12)), tetopt.Mesh(points, [[0, 1, 4], [1, 2, 4], [2, 3, 4], [3, 0, 4]])
+    monkeypatch.setattr(sys.modules["tetopt.engine.paper"], "delaunay", lambda *_: mesh.cells[::-1])
+    result = optimize_paper(image, mesh, k_D=0.0, iterations=1, n_t=1)
+    np.testing.assert_array_equal(result.mesh.cells, mesh.cells)
+    assert not result.history[1].is_retessellated
+    np.testing.assert_allclose(result.mesh.points[4], [5.5, 5.5], atol=1e-5)
 
 
 def test_step_length_is_a_ratio_of_the_nearest_centroid():

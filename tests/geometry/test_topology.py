@@ -17,7 +17,6 @@ from tetopt.geometry.topology import (
     greedy_colours,
     largest_component,
     rings,
-    stars,
 )
 
 pytestmark = pytest.mark.kernel
@@ -110,23 +109,6 @@ def test_the_two_cells_of_a_facet_hold_it_with_opposite_signs(seed, n):
     np.testing.assert_array_equal(total[sides.n_cells == 2], 0)
     np.testing.assert_array_equal(np.abs(total[sides.n_cells == 1]), 1)
     np.testing.assert_array_equal(np.bincount(sides.of_cell.ravel()), sides.n_cells)
-
-
-@given(seeds, dimensions)
-def test_stars_are_the_facets_of_each_node(seed, n):
-    points, cells = random_mesh(seed, n)
-    sides, around = facets(cells), rings(cells, len(points))
-    star = stars(sides, around)
-    for node in range(len(points)):
-        row = star.facets[star.start[node] : star.start[node + 1]].tolist()
-        assert row == [f for f, nodes in enumerate(sides.nodes.tolist()) if node in nodes]
-        for entry in range(around.start[node], around.start[node + 1]):
-            cell = around.cells[entry]
-            for k, place in enumerate(star.place[entry].tolist()):
-                if cells[cell, k] == node:  # the facet opposite the node is the one not around it
-                    assert place == -1
-                else:
-                    assert row[place] == sides.of_cell[cell, k]
 
 
 def test_facets_of_cells_that_do_not_conform_are_counted():

@@ -93,12 +93,6 @@ def content_E_D(content: Content, mesh: Mesh) -> tuple[float, int]:
     return squares * content.unit * content.image.voxel_volume, int(sums[:, 0].sum())
 
 
-def E_D_of_sums(sums: NDArray[np.float64], voxel_volume: float) -> NDArray[np.float64]:
-    """Each cell's E_D, (M,) float64, from the rows of `tetopt.energy.sampling.moment_sums`."""
-    within = sums[:, 2] - sums[:, 1] ** 2 / np.maximum(sums[:, 0], 1.0)
-    return np.where(sums[:, 0] > 0.0, np.maximum(within, 0.0), 0.0) * voxel_volume
-
-
 def combined(E_G: float, E_D: float, E_G0: float, E_D0: float, k_D: float) -> float:
     """E = (1 - k_D) E_G / E_G0 + k_D E_D / E_D0, Eq. (4) normalised by the initial mesh as in Section 4.
 

@@ -469,27 +469,14 @@ def moment_sums(
     the cells' facets where they are known already.
     """
     sides = facets(cells) if sides is None else sides
-    return sums_of_fluxes(facet_fluxes(grid, ticks, sides.nodes), sides, _hand(ticks, cells))
-
-
-def facet_fluxes(grid: SamplingGrid, ticks: NDArray[np.int64], nodes: NDArray[np.int64]) -> NDArray[np.float64]:
-    """Flux of each facet (F, n), (F, D) float64: sums of k and of each P(k) of the grid over the rows that cross it.
-
-    Positive where the facet, its nodes as listed, faces up the last axis.
-    """
-    fluxes = np.empty((len(nodes), 1, grid.prefix.shape[3] + 1))
-    with few_threads(len(nodes)):
-        work = _Fluxes(fluxes, ticks, np.ascontiguousarray(nodes), volume_of(grid))
-        run(_fill_fluxes, -(-len(nodes) // CELLS_PER_CHUNK), work)
-    return fluxes[:, 0]
-
-
-def sums_of_fluxes(fluxes: NDArray[np.float64], sides: Facets, hand: int) -> NDArray[np.float64]:
-    """Moment sums of the cells, (M, D), from their facets' fluxes; `hand` is the cells' sign in index space."""
-    sums = np.empty((len(sides.of_cell), fluxes.shape[1]))
+    n_sums = grid.prefix.shape[3] + 1
+    fluxes, sums = np.empty((len(sides.nodes), 1, n_sums)), np.empty((len(cells), n_sums))
+    with few_threads(len(fluxes)):
+        work = _Fluxes(fluxes, ticks, np.ascontiguousarray(sides.nodes), volume_of(grid))
+        run(_fill_fluxes, -(-len(fluxes) // CELLS_PER_CHUNK), work)
     with few_threads(len(sums)):
-        work = _Sums(sums, np.ascontiguousarray(fluxes), sides.of_cell, sides.sign, hand)
-        run(_fill_sums, -(-len(sums) // CELLS_PER_CHUNK), work)
+        summed = _Sums(sums, fluxes[:, 0], sides.of_cell, sides.sign, _hand(ticks, cells))
+        run(_fill_sums, -(-len(sums) // CELLS_PER_CHUNK), summed)
     return sums
 
 
@@ -635,8 +622,9 @@ def triangle_flux(
 ) -> None:  # fmt: skip
     """Flux of the triangle of three nodes: sums of k and of each P(k) over the rows that cross it.
 
-    It goes to out[p, q, :], one entry more than `prefix` has. Or, where `scatter` is an array of steps and a change,
-    the change, signed as the flux, is added to the steps at each crossing.
+    It is positive where the triangle, its nodes as listed, faces up the last axis, and goes to out[p, q, :], one entry
+    more than `prefix` has. Or, where `scatter` is an array of steps and a change, the change, signed as the flux, is
+    added to the steps at each crossing.
     """
     n_more = out.shape[2] - 3
     out[p, q, :] = 0.0
@@ -734,7 +722,7 @@ def segment_flux(
 def facet_flux(
     ticks: NDArray, nodes: NDArray, facet: int, bits: int, prefix: NDArray, scatter: tuple | None, out: NDArray, p: int
 ) -> None:
-    """Flux of one of the facets `nodes` (F, n) to out[p, 0, :]; see `facet_fluxes` and `triangle_flux`."""
+    """Flux of one of the facets `nodes` (F, n) to out[p, 0, :]; see `triangle_flux`."""
     a, b = nodes[facet, 0], nodes[facet, 1]
     if nodes.shape[1] == 2:
         segment_flux(ticks, a, b, bits, prefix, scatter, out, p, 0)

@@ -13,7 +13,7 @@ from tetopt.check import filled_share
 from tetopt.energy.discretization import combined
 from tetopt.energy.geometric import cell_E_G
 from tetopt.energy.sampling import SamplingGrid, from_ticks, moment_sums, orientations, sampling_grid
-from tetopt.engine.complex import FLAT_SHARE, State, build, cell_squares, energies, node_rings
+from tetopt.engine.complex import State, build, cell_squares, node_rings
 from tetopt.engine.loop import (
     UNIFORM_ITERATIONS,
     UNIFORM_K_D,
@@ -29,7 +29,6 @@ from tetopt.engine.promises import promised
 from tetopt.engine.state import unweighted, weighted
 from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS, box_sides, facets_on_sides
-from tetopt.geometry.simplex import squared_edges, volumes
 from tetopt.geometry.topology import facets, folded, greedy_colours
 from tetopt.image import Image
 from tetopt.kernels import packed
@@ -100,8 +99,8 @@ def optimize_paper(
     Raises
     ------
     InputError
-        An option out of range, a mesh that the sampling cannot take (see `cell_moments`), with doubled cells, or,
-        unless `retessellate` is "never", one that does not fill the image's box.
+        An option out of range, a mesh that the sampling cannot take (see `cell_moments`), with cells that overlap at a
+        facet, or, unless `retessellate` is "never", one that does not fill the image's box.
 
     See Also
     --------
@@ -222,37 +221,31 @@ def _with_E_G(state: State, image: Image, grid: SamplingGrid) -> State:
 
 def _energies(state: State, image: Image) -> tuple[float, float]:
     """E_G and E_D of the mesh; an E_D that is only rounding is 0."""
-    E_D = float((cell_squares(state) * image.voxel_volume).sum())
-    return energies(state)[0], E_D if E_D > state.objective.rounding * image.voxel_volume else 0.0
+    E_G = state.complex.E_shape[: len(_cells(state))].sum()
+    E_D = (cell_squares(state) * image.voxel_volume).sum()
+    return float(E_G), float(E_D) if E_D > state.objective.rounding * image.voxel_volume else 0.0
 
 
 def _retessellated(image: Image, grid: SamplingGrid, state: State) -> State | None:
     """The state with Delaunay's cells; None where they would not be a mesh of the same box.
 
     Checked exactly: every cell oriented on the fixed-point grid, every facet between two cells or on the box, and
-    every voxel in one cell.
+    every voxel in one cell; and no cell is flat.
     """
     mesh = state.complex
-    index = from_ticks(mesh.ticks, grid, image.ndim)
-    cells = delaunay(index, image.affine)
-    if cells is None:
-        return None
-    if (orientations(mesh.ticks, cells) != state.objective.hand).any() or _is_flat(image.to_world(index), cells).any():
+    cells = delaunay(from_ticks(mesh.ticks, grid, image.ndim), image.affine)
+    if cells is None or (orientations(mesh.ticks, cells) != state.objective.hand).any():
         return None
     shared = facets(cells)
-    if len(folded(cells, shared)):
-        return None
     outer = shared.nodes[shared.n_cells == 1]
-    if not facets_on_sides(mesh.ticks, outer, side_ticks(grid), tolerance=0).any(axis=(1, 2)).all():
+    is_on_box = facets_on_sides(mesh.ticks, outer, side_ticks(grid), tolerance=0).any(axis=(1, 2))
+    if len(folded(cells, shared)) or not is_on_box.all():
         return None
-    candidate = _with_E_G(build(cells, mesh.ticks, mesh.is_frozen, state.objective, state.sides), image, grid)
-    return candidate if candidate.complex.sums[: len(cells), 0].sum() == image.data.size else None
-
-
-def _is_flat(points: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Cells so thin that no optimisation may make them, (M,) bool; see `tetopt.engine.complex.FLAT_SHARE`."""
-    size = squared_edges(points, cells).sum(axis=1) ** (points.shape[1] / 2)
-    return volumes(points, cells) <= FLAT_SHARE * size
+    candidate = build(cells, mesh.ticks, mesh.is_frozen, state.objective, state.sides)
+    is_flat = ~np.isfinite(candidate.complex.E_shape[: len(cells)])
+    if is_flat.any() or candidate.complex.sums[: len(cells), 0].sum() != image.data.size:
+        return None
+    return _with_E_G(candidate, image, grid)
 
 
 def _sweep(state: State, step_ratio: float, k_D: float, is_over: Callable[[], bool]) -> bool:
@@ -260,7 +253,8 @@ def _sweep(state: State, step_ratio: float, k_D: float, is_over: Callable[[], bo
     rings, cells = node_rings(state), _cells(state)
     colours = greedy_colours(cells, rings.start, rings.cells)
     is_free = ~state.complex.is_frozen[:, 4 - cells.shape[1] : 3].all(axis=1)
-    move, laid_out = relocate if k_D == 0.0 else descend, (packed(state), packed(rings))
+    move = relocate if k_D == 0.0 else descend
+    laid_out = packed(state), packed(rings)
     for colour in range(colours.max() + 1):
         if is_over():
             return False

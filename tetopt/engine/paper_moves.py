@@ -1,8 +1,8 @@
 """The two moves of the paper's scheme: descent with numerical derivatives, and Lloyd's relocation.
 
-Each is made for all nodes of one colour at the same time: they share no cell. A node moves only if no cell of its ring
-loses its orientation (exactly, in integers) and the ring's energy falls. The shape energy of the state is the paper's
-E_G here, not bounded for slivers as the fast engine's.
+Nodes of one colour share no cell and move at the same time, so the result does not depend on the threads. A node moves
+only if no cell of its ring loses its orientation (exactly, in integers) and the ring's energy falls. The state's shape
+energy is E_G, measured as `tetopt.energy.geometric` measures it.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ LLOYD_HALVINGS = 4  # of a Lloyd step that inverts a cell or raises the ring's e
 
 
 class Moves(NamedTuple):
-    """The nodes of one colour, which are to be moved."""
+    """The nodes of one colour, and what their moves read and write."""
 
     state: State
     rings: NodeRings

@@ -50,7 +50,7 @@ def unweighted(
     content: Content, mesh: Mesh, grid: SamplingGrid, power: float, boundary: Boundary, is_graded: bool = False,
     whole: Whole | None = None,
 ) -> State:  # fmt: skip
-    """The state of a mesh with both energies of weight 1; InputError as `state_of`, but flat cells are taken."""
+    """The state of a mesh, both energies of weight 1. Raises InputError as `state_of`, but accepts flat cells."""
     image, region = content.image, content.region
     ticks = to_ticks(image.to_index(mesh.points), grid)
     check_orientations(image, ticks, mesh.cells)

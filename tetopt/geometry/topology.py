@@ -92,40 +92,6 @@ def folded(cells: NDArray[np.integer], shared: Facets | None = None) -> NDArray[
     return shared.cells[(shared.n_cells > 2) | ((shared.n_cells == 2) & (sides != 0.0))]
 
 
-class Stars(NamedTuple):
-    """The facets around each node, as compressed rows, and where the ring's cells find theirs among them."""
-
-    start: NDArray[np.int64]  # (N+1,)
-    facets: NDArray[np.int64]  # (F * n,), those of node i at start[i]:start[i + 1], ascending
-    place: NDArray[np.int64]  # (M * (n+1), n+1), by entry of `Rings`: place in the node's row, -1 if not in it
-
-
-def stars(sides: Facets, around: Rings) -> Stars:
-    """The facets that contain each node; see `facets` and `rings`."""
-    n_nodes = len(around.start) - 1
-    n = sides.nodes.shape[1]
-    order = np.argsort(sides.nodes.ravel(), kind="stable")
-    counts = np.bincount(sides.nodes.ravel(), minlength=n_nodes)
-    start = np.concatenate([[0], np.cumsum(counts)]).astype(np.int64)
-    place = np.empty((len(around.cells), n + 1), dtype=np.int64)
-    members = (order // n).astype(np.int64)
-    _fill_places(place, around.start, around.cells, sides.of_cell, start, members)
-    return Stars(start, members, place)
-
-
-@njit(cache=True)
-def _fill_places(
-    place: NDArray, ring_start: NDArray, ring: NDArray, of_cell: NDArray, start: NDArray, members: NDArray
-) -> None:
-    for node in range(len(start) - 1):
-        row = members[start[node] : start[node + 1]]
-        for r in range(ring_start[node], ring_start[node + 1]):
-            for k in range(of_cell.shape[1]):
-                facet = of_cell[ring[r], k]
-                at = np.searchsorted(row, facet)
-                place[r, k] = at if at < len(row) and row[at] == facet else -1
-
-
 def boundary_facets(cells: NDArray[np.integer], shared: Facets | None = None) -> NDArray[np.int64]:
     """Nodes of the facets that belong to one cell only, (B, n) int64, turned to face outwards.
 
