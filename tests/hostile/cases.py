@@ -422,8 +422,7 @@ def names(draw):
         and len(stem.encode("utf-8", "surrogateescape" if "\ud800" not in stem else "surrogatepass")) < 240
     ):
         is_input = False
-    if "\ud800" in stem:
-        stem = stem.replace("\ud800", "\udcff")
+    stem = stem.lstrip("/").replace("\ud800", "\udcff")  # what is written lies below the case's folder
     bad, out = (stem, "out" + suffix) if is_input else ("", stem + suffix)
     image = draw.good("i.nii", (bad or "i") + ".nii") if how in ("mesh", "figures") else ""
     mesh = draw.good("m.vtu", (bad or "m") + ".vtu") if how in ("convert", "view", "quality", "surface") else ""

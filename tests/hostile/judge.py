@@ -213,7 +213,12 @@ def _problem(path: Path, suffix: str, case: Case) -> str:
 
 
 def _mesh_problem(path: Path, suffix: str, case: Case) -> str:
-    points, blocks = _xdmf_parts(path) if suffix == ".xdmf" else _meshio_parts(path, suffix)
+    if suffix == ".xdmf":
+        points, blocks = _xdmf_parts(path)
+    elif suffix == ".mesh" and b"\nTetrahedraP2\n" in path.read_bytes():
+        points, blocks = _medit_parts(path)
+    else:
+        points, blocks = _meshio_parts(path, suffix)
     if not np.isfinite(points).all():
         return "nodes are not finite"
     corners = {"tetra": 4, "tetra10": 4, "triangle": 3, "triangle6": 3}
@@ -240,6 +245,17 @@ def _meshio_parts(path: Path, suffix: str) -> tuple[np.ndarray, dict[str, np.nda
         by_kind.setdefault(block.type, []).append(np.asarray(block.data, dtype=np.int64))
     blocks = {kind: np.concatenate(parts) for kind, parts in by_kind.items()}
     return np.asarray(mesh.points, dtype=np.float64), blocks
+
+
+def _medit_parts(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
+    """As `_meshio_parts`, of quadratic cells, which it does not read from this format."""
+    tables: dict[str, np.ndarray] = {}
+    lines = iter([line for line in path.read_text().splitlines() if line and not line.startswith("#")])
+    for line in lines:
+        if line in ("Vertices", "TetrahedraP2"):
+            rows = [next(lines).split() for _ in range(int(next(lines)))]
+            tables[line] = np.array(rows, dtype=np.float64)[:, :-1]
+    return tables["Vertices"], {"tetra10": tables["TetrahedraP2"].astype(np.int64) - 1}
 
 
 def _xdmf_parts(path: Path) -> tuple[np.ndarray, dict[str, np.ndarray]]:
@@ -276,8 +292,8 @@ def box_problem(points: np.ndarray, folder: Path, case: Case) -> str:
     if words[0] != "mesh" or not is_whole or not words[1].endswith((".nii", ".nii.gz")):
         return ""
     image = nibabel.load(folder / words[1])
-    matrix, unit = np.array(image.affine, dtype=np.float64), image.header.get_xyzt_units()[0]
-    matrix[:3] *= {"meter": 1000.0, "micron": 0.001}.get(unit, 1.0)
+    matrix, unit = np.array(image.affine, dtype=np.float64), int(image.header["xyzt_units"]) & 7
+    matrix[:3] *= {1: 1000.0, 3: 0.001}.get(unit, 1.0)  # metres and micrometres; others are taken for mm
     if len(image.shape) < 3 or np.linalg.cond(matrix[:3, :3]) > MOST_CONDITION:
         return ""
     index = np.linalg.solve(matrix[:3, :3], (points - matrix[:3, 3]).T).T

@@ -17,7 +17,7 @@ import pytest
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.io import images
-from tetopt.io.images import cropped, image_slice, load_image, parse_crop, parse_slice, sha256
+from tetopt.io.images import cropped, file_shape, image_slice, load_image, parse_crop, parse_slice, save_image, sha256
 from tetopt.io.read_itk import _numbers, _unevenness
 
 # Rotated, sheared, anisotropic and flipped (negative determinant), with an origin.
@@ -1039,3 +1039,15 @@ def test_sha256_of_a_header_is_that_of_its_voxels_too(tmp_path, sitk, name, data
 def test_sha256_of_nothing():
     with pytest.raises(InputError, match=r"^nowhere: no such file or folder"):
         sha256(Path("nowhere"))
+
+
+@pytest.mark.parametrize("name", ["~a.nii", "~a.nii.gz", "~root/a.nii", "~\udc80.nii.gz"])
+def test_a_name_that_begins_with_a_tilde_is_no_home(tmp_path, monkeypatch, name):
+    """Not even of a user that there is: nibabel would read, and write, what lies there."""
+    monkeypatch.chdir(tmp_path)
+    Path("~root").mkdir()
+    image = Image(np.arange(24.0).reshape(2, 3, 4))
+    save_image(name, image)
+    assert (tmp_path / name).is_file()
+    assert np.array_equal(load_image(name).data, image.data)
+    assert file_shape(Path(name)) == (2, 3, 4)

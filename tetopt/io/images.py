@@ -233,7 +233,7 @@ def save_image(path: str | Path, image: Image) -> None:
     file = kind(_for_file(image.data), affine)
     file.header.set_xyzt_units("mm")
     with written_whole(path) as temporary:
-        nibabel.save(file, temporary)
+        nibabel.save(file, temporary.absolute())  # as in `_nibabel_file`
         _check_written(temporary, file)
 
 
@@ -611,6 +611,7 @@ def notes_of_size(image: VoxelGrid) -> list[str]:
 
 def _nibabel_file(path: Path) -> SpatialImage:
     """The file with its header read, of one of the three kinds, as which of many more nibabel might take it."""
+    path = path.absolute()  # nibabel takes a name that begins with ~ for a home
     try:
         if nibabel.Cifti2Image.path_maybe_image(path)[0]:
             raise InputError("expected an image on a grid of voxels, got a Cifti2Image")
