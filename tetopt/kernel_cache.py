@@ -4,6 +4,9 @@ What is read has to have the checksum that was written with it, or else it is co
 holds would end the process. A file that somebody else can have written is not read either: pickles run code. What
 cannot be written, on a full disk or in a folder that is gone, is not kept. Each of these is said once, on one line, by
 a `RuntimeWarning`.
+
+That rests on the inside of numba's cache. Where a name is missing there, or on request, the cache is numba's own, in
+a folder that only this user can open.
 """
 
 from __future__ import annotations
@@ -12,6 +15,7 @@ import contextlib
 import inspect
 import os
 import pickle
+import stat
 import warnings
 import zlib
 from collections.abc import Callable
@@ -20,9 +24,26 @@ from pathlib import Path
 from typing import Any
 
 import numba
-from numba.core.caching import FunctionCache, IndexDataCacheFile, NullCache
+
+try:
+    from numba.core.caching import FunctionCache, IndexDataCacheFile
+    from numba.core.options import DefaultOptions
+except ImportError:  # by `MISSING` below
+    FunctionCache = IndexDataCacheFile = DefaultOptions = object
 
 from tetopt.cache import FILE_MODE, FOLDER_MODE, place_cache, untrusted
+
+INSIDE_OPTIONS = ("_nrt", "forceinline", "no_cfunc_wrapper", "no_cpython_wrapper")
+FILE_METHODS = ("_data_path", "_dump", "_load_data", "_load_index", "_open_for_write", "_save_data", "_save_index")
+INSIDE = {
+    FunctionCache: ("load_overload", "save_overload"),
+    IndexDataCacheFile: FILE_METHODS,
+    DefaultOptions: INSIDE_OPTIONS,
+}
+MISSING = sorted(name for owner, names in INSIDE.items() for name in names if not hasattr(owner, name))
+# Whether functions are compiled with what numba's documents have, and nothing else.
+IS_PLAIN = bool(MISSING) or os.environ.get("TETOPT_PLAIN_NUMBA") == "1" or bool(numba.config.DISABLE_JIT)
+PLAIN_NOTICE = "kernels are compiled more slowly, as this numba is not like those that tetopt knows: {}"
 
 
 class NotKeptWarning(RuntimeWarning):
@@ -144,23 +165,56 @@ class SealedCache(FunctionCache):
 
 
 def cache_of(function: Callable[..., Any]) -> Any:
-    """The cache of a function that numba compiles; one that keeps nothing, where there is no folder for it."""
+    """The cache of a function that numba compiles; None where there is no folder for it."""
     if place_cache().folder is not None:
         try:
             return SealedCache(function)
         except RuntimeError:  # no locator: the folder has gone, or takes no more files
             warn("kernels are compiled anew: the folder of their cache can no longer be written", NotKeptWarning)
-    return NullCache()
+    return None
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Decorate as `numba.njit` does; `cache=True` stands for this cache."""
+    if IS_PLAIN:
+        return plain_njit(**options)
     is_kept = options.pop("cache", False)
 
     def compiled(function: Callable[..., Any]) -> Any:
         dispatcher = numba.njit(**options)(function)
-        if is_kept and not numba.config.DISABLE_JIT:
-            dispatcher._cache = cache_of(function)
+        if is_kept and (kept := cache_of(function)) is not None:
+            dispatcher._cache = kept
         return dispatcher
 
     return compiled
+
+
+def plain_njit(*signature: Any, **options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Decorate as `numba.njit` does, without the options that its documents do not have; `cache=True` is its cache."""
+    known = {name: value for name, value in options.items() if name not in INSIDE_OPTIONS}
+    return numba.njit(*signature, **known | {"cache": known.get("cache", False) and has_own_folder()})
+
+
+@cache
+def has_own_folder() -> bool:
+    """Point numba's own cache, which trusts what it reads, to a folder that only this user can open, if that can be."""
+    place = place_cache()
+    if place.folder is None or numba.config.DISABLE_JIT:
+        return False
+    folder = place.folder / (
+        "plain-checked" if numba.config.BOUNDSCHECK else "plain"
+    )  # its keys do not tell them apart
+    try:
+        folder.mkdir(mode=0o700, exist_ok=True)
+        status = os.lstat(folder)
+    except OSError:
+        return False
+    is_own = os.name != "posix" or (status.st_uid == os.geteuid() and status.st_mode & 0o077 == 0)
+    if is_own and stat.S_ISDIR(status.st_mode):
+        numba.config.CACHE_DIR = str(folder)
+        return True
+    return False
+
+
+if MISSING and not numba.config.DISABLE_JIT:
+    warn(PLAIN_NOTICE.format(f"no {', '.join(MISSING)}"))
