@@ -5,8 +5,8 @@ holds would end the process. A file that somebody else can have written is not r
 cannot be written, on a full disk or in a folder that is gone, is not kept. Each of these is said once, on one line, by
 a `RuntimeWarning`.
 
-That rests on the inside of numba's cache. Where a name is missing there, or on request, the cache is numba's own, in
-a folder that only this user can open.
+That rests on the inside of numba. Where it lacks a name, or on request (`IS_PLAIN`), functions are compiled and kept
+by what numba's documents have alone, in a folder that only this user can open.
 """
 
 from __future__ import annotations
@@ -15,7 +15,6 @@ import contextlib
 import inspect
 import os
 import pickle
-import stat
 import warnings
 import zlib
 from collections.abc import Callable
@@ -35,15 +34,27 @@ from tetopt.cache import FILE_MODE, FOLDER_MODE, place_cache, untrusted
 
 INSIDE_OPTIONS = ("_nrt", "forceinline", "no_cfunc_wrapper", "no_cpython_wrapper")
 FILE_METHODS = ("_data_path", "_dump", "_load_data", "_load_index", "_open_for_write", "_save_data", "_save_index")
-INSIDE = {
-    FunctionCache: ("load_overload", "save_overload"),
-    IndexDataCacheFile: FILE_METHODS,
-    DefaultOptions: INSIDE_OPTIONS,
-}
-MISSING = sorted(name for owner, names in INSIDE.items() for name in names if not hasattr(owner, name))
+INSIDE = (
+    (FunctionCache, ("load_overload", "save_overload")),
+    (IndexDataCacheFile, FILE_METHODS),
+    (DefaultOptions, INSIDE_OPTIONS),
+    (numba.njit(lambda: None), ("_cache",)),
+)
+MISSING = sorted(name for owner, names in INSIDE for name in names if not hasattr(owner, name))
 # Whether functions are compiled with what numba's documents have, and nothing else.
 IS_PLAIN = bool(MISSING) or os.environ.get("TETOPT_PLAIN_NUMBA") == "1" or bool(numba.config.DISABLE_JIT)
-PLAIN_NOTICE = "kernels are compiled more slowly, as this numba is not like those that tetopt knows: {}"
+PLAIN_NOTICE = f"kernels take longer to compile: tetopt cannot use the internals of numba {numba.__version__} ({{}})"
+NOT_KEPT = "compiled kernels cannot be kept, so that later runs compile them again: {}"
+
+
+@cache
+def checksum() -> str:
+    """Of the sources of all kernels and of their constants: what is compiled of others is not taken from the cache."""
+    folder, total = Path(__file__).parent, 0
+    patterns = ["kernel*.py", *(f"{room}/*.py" for room in ("geometry", "energy", "engine", "start", "target"))]
+    for path in sorted(path for pattern in patterns for path in folder.glob(pattern)):
+        total = zlib.crc32(path.read_bytes(), total)
+    return f"{total:08x}"
 
 
 class NotKeptWarning(RuntimeWarning):
@@ -152,7 +163,7 @@ class SealedCache(FunctionCache):
             return super().load_overload(sig, target_context)
         except OSError:  # if it can be written, all is well from then on, else that is said
             return None
-        except (AttributeError, ImportError) as error:  # of classes that there are no more
+        except (AttributeError, ImportError, TypeError) as error:  # of classes that there are no more
             warn(f"the cache of kernels cannot be read, they are compiled anew: {error}")
             return None
 
@@ -160,8 +171,8 @@ class SealedCache(FunctionCache):
         """Keep what was compiled for a signature, if that can be."""
         try:
             super().save_overload(sig, data)
-        except OSError as error:
-            warn(f"compiled kernels cannot be kept, so that later runs compile them again: {error}", NotKeptWarning)
+        except (AttributeError, OSError, TypeError) as error:
+            warn(NOT_KEPT.format(error), NotKeptWarning)
 
 
 def cache_of(function: Callable[..., Any]) -> Any:
@@ -171,6 +182,8 @@ def cache_of(function: Callable[..., Any]) -> Any:
             return SealedCache(function)
         except RuntimeError:  # no locator: the folder has gone, or takes no more files
             warn("kernels are compiled anew: the folder of their cache can no longer be written", NotKeptWarning)
+        except (AttributeError, TypeError) as error:
+            warn(NOT_KEPT.format(error), NotKeptWarning)
     return None
 
 
@@ -198,21 +211,17 @@ def plain_njit(*signature: Any, **options: Any) -> Callable[[Callable[..., Any]]
 @cache
 def has_own_folder() -> bool:
     """Point numba's own cache, which trusts what it reads, to a folder that only this user can open, if that can be."""
-    place = place_cache()
-    if place.folder is None or numba.config.DISABLE_JIT:
+    place = place_cache().folder
+    if place is None or numba.config.DISABLE_JIT:
         return False
-    folder = place.folder / (
-        "plain-checked" if numba.config.BOUNDSCHECK else "plain"
-    )  # its keys do not tell them apart
-    try:
+    # Its keys know neither the code of other files nor whether indices are checked.
+    folder = place / f"plain-{checksum()}{'-checked' * bool(numba.config.BOUNDSCHECK)}"
+    with contextlib.suppress(OSError):
         folder.mkdir(mode=0o700, exist_ok=True)
         status = os.lstat(folder)
-    except OSError:
-        return False
-    is_own = os.name != "posix" or (status.st_uid == os.geteuid() and status.st_mode & 0o077 == 0)
-    if is_own and stat.S_ISDIR(status.st_mode):
-        numba.config.CACHE_DIR = str(folder)
-        return True
+        if untrusted(status) is None and (os.name != "posix" or status.st_mode & 0o077 == 0):
+            numba.config.CACHE_DIR = str(folder)
+            return True
     return False
 
 

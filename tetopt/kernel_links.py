@@ -24,8 +24,8 @@ from numba.core.typing.templates import AttributeTemplate, infer_getattr, make_i
 from numba.extending import NativeValue, intrinsic
 from numba.np.arrayobj import populate_array
 
-from tetopt.kernel_cache import njit
-from tetopt.kernel_types import check_array, checksum, numpy_dtype, type_of
+from tetopt.kernel_cache import checksum, njit
+from tetopt.kernel_types import check_array, numpy_dtype, type_of
 
 WORD_BYTES = 8  # of a number, an address, or a length in a record's memory
 

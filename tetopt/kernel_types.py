@@ -3,10 +3,7 @@
 from __future__ import annotations
 
 import typing
-import zlib
 from collections.abc import Callable
-from functools import cache
-from pathlib import Path
 from typing import Annotated, Any
 
 import numba
@@ -14,37 +11,11 @@ import numpy as np
 from numba import types
 from numpy.typing import NDArray
 
-# Arrays in the signatures of units and in records: of so many axes, the last one contiguous.
-Floats1 = Annotated[NDArray[np.float64], types.float64[::1]]
-Floats2 = Annotated[NDArray[np.float64], types.float64[:, ::1]]
-Floats3 = Annotated[NDArray[np.float64], types.float64[:, :, ::1]]
-Floats4 = Annotated[NDArray[np.float64], types.float64[:, :, :, ::1]]
-Singles3 = Annotated[NDArray[np.float32], types.float32[:, :, ::1]]
-Singles4 = Annotated[NDArray[np.float32], types.float32[:, :, :, ::1]]
-Shorts4 = Annotated[NDArray[np.int32], types.int32[:, :, :, ::1]]
-Ints1 = Annotated[NDArray[np.int64], types.int64[::1]]
-Ints2 = Annotated[NDArray[np.int64], types.int64[:, ::1]]
-Ints3 = Annotated[NDArray[np.int64], types.int64[:, :, ::1]]
-Ints4 = Annotated[NDArray[np.int64], types.int64[:, :, :, ::1]]
-Bools1 = Annotated[NDArray[np.bool_], types.boolean[::1]]
-Bools2 = Annotated[NDArray[np.bool_], types.boolean[:, ::1]]
-Bools3 = Annotated[NDArray[np.bool_], types.boolean[:, :, ::1]]
-
 SCALAR_TYPES = {int: types.int64, float: types.float64, bool: types.boolean, type(None): types.void}
 
 
-@cache
-def checksum() -> str:
-    """Of the sources of all kernels and of their constants: what is compiled of others is not taken from the cache."""
-    folder, total = Path(__file__).parent, 0
-    patterns = ["kernel*.py", *(f"{room}/*.py" for room in ("geometry", "energy", "engine", "start", "target"))]
-    for path in sorted(path for pattern in patterns for path in folder.glob(pattern)):
-        total = zlib.crc32(path.read_bytes(), total)
-    return f"{total:08x}"
-
-
 def type_of(hint: Any, of_record: Callable[[Any], types.Type]) -> types.Type:
-    """Return numba's type of an annotation: a number, one of the arrays above, a record, or a tuple of these."""
+    """Return numba's type of an annotation: a number, an annotated array, a record, or a tuple of these."""
     if typing.get_origin(hint) is Annotated:
         return typing.get_args(hint)[1]
     if typing.get_origin(hint) is tuple:

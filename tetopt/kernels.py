@@ -26,16 +26,17 @@ import warnings
 import zlib
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from functools import cached_property
+from functools import cached_property, partial
 from importlib import import_module
 from pathlib import Path
 from types import CellType, FunctionType
-from typing import Any, NamedTuple
+from typing import Annotated, Any, NamedTuple
 
 import numba
 import numpy as np
 from numba import types
 from numba.extending import overload, typeof_impl
+from numpy.typing import NDArray
 
 try:
     import fcntl
@@ -45,59 +46,50 @@ except ImportError:  # Windows
 from tetopt.budget import address_room
 from tetopt.cache import place_cache
 from tetopt.interpreter import python_command, python_environment
-from tetopt.kernel_cache import IS_PLAIN, PLAIN_NOTICE, NotKeptWarning, njit, plain_njit, warn
-from tetopt.kernel_types import (  # noqa: F401
-    Bools1,
-    Bools2,
-    Bools3,
-    Floats1,
-    Floats2,
-    Floats3,
-    Floats4,
-    Ints1,
-    Ints2,
-    Ints3,
-    Ints4,
-    Shorts4,
-    Singles3,
-    Singles4,
-    by_value,
-    cast,
-    checksum,
-    type_of,
-)
+from tetopt.kernel_cache import IS_PLAIN, PLAIN_NOTICE, NotKeptWarning, checksum, njit, plain_njit, warn
+from tetopt.kernel_types import by_value, cast, type_of
+
+# Arrays in the signatures of units and in records: of so many axes, the last one contiguous.
+Floats1 = Annotated[NDArray[np.float64], types.float64[::1]]
+Floats2 = Annotated[NDArray[np.float64], types.float64[:, ::1]]
+Floats3 = Annotated[NDArray[np.float64], types.float64[:, :, ::1]]
+Floats4 = Annotated[NDArray[np.float64], types.float64[:, :, :, ::1]]
+Singles3 = Annotated[NDArray[np.float32], types.float32[:, :, ::1]]
+Singles4 = Annotated[NDArray[np.float32], types.float32[:, :, :, ::1]]
+Shorts4 = Annotated[NDArray[np.int32], types.int32[:, :, :, ::1]]
+Ints1 = Annotated[NDArray[np.int64], types.int64[::1]]
+Ints2 = Annotated[NDArray[np.int64], types.int64[:, ::1]]
+Ints3 = Annotated[NDArray[np.int64], types.int64[:, :, ::1]]
+Ints4 = Annotated[NDArray[np.int64], types.int64[:, :, :, ::1]]
+Bools1 = Annotated[NDArray[np.bool_], types.boolean[::1]]
+Bools2 = Annotated[NDArray[np.bool_], types.boolean[:, ::1]]
+Bools3 = Annotated[NDArray[np.bool_], types.boolean[:, :, ::1]]
 
 UNIT_BYTES = 1 << 25  # at once for all arrays that units make: a few KB each on each thread
 # In the cache's folder, of all runs of this package: those of another one compile other files.
 LOCK_NAME = f"compiling-{zlib.crc32(str(Path(__file__).parent).encode()):08x}.lock"
-PIECES = 8  # of a loop for each thread, where it is plain: some take longer than others
+PIECES_PER_THREAD = 8  # of a plain loop: some take longer than others
 POLLED_SECONDS = 0.1  # between looks at processes that compile
 LONGEST_WAIT_SECONDS = 600.0  # for another run's: all kernels take 145 s on a busy machine
 MOST_COMPILING = 4  # processes at most: each loads numba first, 1 s and 200 MB
 
-
-try:
-    from tetopt import kernel_links
-except Exception as error:  # names that are imported may be gone, or do something else
-    kernel_links = None  # type: ignore[assignment]
-    if not IS_PLAIN:
-        warn(PLAIN_NOTICE.format(error))
 
 _LINKING = threading.RLock()  # of Python's threads one links at a time: the first's code is what others call
 _links: list[Any] = []  # what `links` returns, once it is known
 
 
 def links() -> Any:
-    """`tetopt.kernel_links`, if it works, as is tried once; else None: kernels are plain functions of numba's."""
+    """Return `tetopt.kernel_links` if it works, which is tested once; else None: kernels are plain `numba.njit`."""
     with _LINKING:
         if not _links:
-            _links.append(None if IS_PLAIN else kernel_links)
-            try:
-                if _links[0] is not None:
+            _links.append(None)
+            if not IS_PLAIN:
+                try:
+                    _links[0] = import_module("tetopt.kernel_links")
                     check_links()
-            except Exception as error:
-                _links[0] = None
-                warn(PLAIN_NOTICE.format(f"{type(error).__name__}: {error}".splitlines()[0]))
+                except Exception as error:  # of any kind: what is imported may be gone, or do something else
+                    _links[0] = None
+                    warn(PLAIN_NOTICE.format(f"{type(error).__name__}: {error}".splitlines()[0]))
     return _links[0]
 
 
@@ -185,7 +177,8 @@ class Kernel:
     @cached_property
     def dispatcher(self) -> Any:
         """How Python calls it: numba's."""
-        return njit(cache=True, error_model="numpy")(_versioned(self.function))
+        compiled_by = plain_njit if links() is None else njit  # their caches are apart: only one has symbols
+        return compiled_by(cache=True, error_model="numpy")(_versioned(self.function))
 
     def __call__(self, *values: Any) -> Any:
         """Call it from Python: records are laid out for it, and the units that it calls are linked before."""
@@ -226,7 +219,7 @@ class Unit(Kernel):
         if links() is None:
             options = {"cache": True, "error_model": "numpy", "nogil": True}
             return plain_njit(self.signature, **options)(_versioned(self.function))
-        dispatcher = _machine_code(self.function, cache=True)(_versioned(self.function))
+        dispatcher = _machine_code(cache=True, _nrt=_counts(self.function))(_versioned(self.function))
         dispatcher.compile(self.signature)
         return dispatcher
 
@@ -304,12 +297,12 @@ def link(kernels: Sequence[Any], progress: Callable[[str], None] | None = None) 
     say = progress or (lambda words: None)
     order = list(dict.fromkeys(inner for kernel in kernels for inner in _callees_first(kernel)))
     n_ready = _n_kept(order, 0)
-    if n_ready < len(order) and links() is not None:
+    if n_ready < len(order):
         place = place_cache()
         if place.notice is not None:
             warn(place.notice)
         say(f"compiling the kernels, {n_ready + 1} of {len(order)}")
-        if place.folder is not None:
+        if place.folder is not None and links() is not None:
             with _only_compiler(place.folder, say) as has_waited:
                 if has_waited:
                     n_ready = _n_kept(order, n_ready + 1)
@@ -421,7 +414,8 @@ def compile_named(names: Sequence[str], claims: str, parent: int) -> None:
                 return
 
 
-_task: Any = None  # in `_loop` the unit, of each its own
+_task: Any = None  # a unit, of each function below that is compiled its own; see `_versioned`
+_fails: Any = None
 
 
 def _loop(values: Any, first: int, last: int) -> int:
@@ -436,18 +430,13 @@ def _loop(values: Any, first: int, last: int) -> int:
 
 def _run_plain(task: Unit, n: int, values: Any) -> int:
     """How many calls of a unit fail, on threads of Python's: numba's own take no records."""
-    n_threads = numba.get_num_threads()
-    step = max(1, n // (PIECES * n_threads))
+    n_threads, loop = numba.get_num_threads(), task.loop
+    step = max(1, n // (PIECES_PER_THREAD * n_threads))
 
     def share(thread: int) -> int:
         record = cast(values, task.signature.args[0], task.__name__, thread)
-        return sum(
-            task.loop(record, first, min(first + step, n)) for first in range(thread * step, n, n_threads * step)
-        )
+        return sum(loop(record, first, min(first + step, n)) for first in range(thread * step, n, n_threads * step))
 
-    _ = task.loop  # compiled by one
-    if n_threads == 1:
-        return share(0)
     with ThreadPoolExecutor(n_threads) as threads:
         return sum(threads.map(share, range(n_threads)))
 
@@ -475,10 +464,8 @@ def run(task: Any, n: int, values: Any) -> None:
         raise MemoryError(f"{task.__name__}: {n_failed} of {n} calls found no memory for their arrays")
 
 
-def _machine_code(function: Callable[..., Any], **options: Any) -> Any:
-    """numba's decorator for a function that Python does not call."""
-    inside = {} if IS_PLAIN else {"no_cpython_wrapper": True, "no_cfunc_wrapper": True, "_nrt": _counts(function)}
-    return njit(error_model="numpy", **options, **inside)
+# Of functions that Python does not call.
+_machine_code = partial(njit, error_model="numpy", no_cpython_wrapper=True, no_cfunc_wrapper=True)
 
 
 def unit(function: Callable[..., Any]) -> Any:
@@ -493,10 +480,23 @@ def entry(function: Callable[..., Any]) -> Any:
 
 def helper(function: Callable[..., Any]) -> Any:
     """What goes into the functions that call it."""
-    return _machine_code(function)(function)
+    return _machine_code(_nrt=_counts(function))(function)
 
 
 inlined = njit(error_model="numpy", inline="always")  # likewise, as numba reads it, before LLVM does
+
+
+def own(records: Any) -> Any:
+    """The record of the thread that runs a task, of a list with one for each."""
+    return records[0]
+
+
+@overload(own, strict=False)  # else annotations count as names of arguments
+def _own_compiled(records: Any) -> Any:
+    if isinstance(records, types.BaseTuple):  # by value, of the thread alone; see `_run_plain`
+        return lambda records: records
+    nth = links().nth
+    return lambda records: nth(records, numba.get_thread_id())
 
 
 # Whether the inside of numba does what it is used for.
@@ -513,8 +513,8 @@ def _double(row: _Row, number: int) -> None:
 
 
 def _double_both(row: Any, address: int, place: int) -> tuple[bool, bool]:
-    _doubled(row, 0)  # type: ignore[name-defined]  # noqa: F821
-    return _fails(address, place, 1), _fails(address, place, -1)  # type: ignore[name-defined]  # noqa: F821
+    _task(row, 0)
+    return _fails(address, place, 1), _fails(address, place, -1)
 
 
 def check_links() -> None:
@@ -522,20 +522,8 @@ def check_links() -> None:
     doubled = Unit(_double)
     ALL_KERNELS.remove(doubled)
     doubled._make_known()
-    both = njit(cache=True)(_versioned(_double_both, _doubled=doubled, _fails=links().fails))
+    both = njit(cache=True)(_versioned(_double_both, _task=doubled, _fails=links().fails))
     row = packed(_Row(np.ones(2)))
     failures = both(row, doubled.address, row.address)
     if failures != (False, True) or list(row.kept[0].x) != [2.0, 2.0]:
         raise RuntimeError(f"a unit doubled ones to {row.kept[0].x}, its failures are {failures}")
-
-
-def own(records: Any) -> Any:
-    """The record of the thread that runs a task, of a list with one for each."""
-    return records[0]
-
-
-@overload(own, strict=False)  # else annotations count as names of arguments
-def _own_compiled(records: Any) -> Any:
-    if isinstance(records, types.BaseTuple):  # by value, of the thread alone; see `_run_plain`
-        return lambda records: records
-    return lambda records: kernel_links.nth(records, numba.get_thread_id())
