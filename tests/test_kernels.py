@@ -634,9 +634,11 @@ CHANGES = (
 def test_kernels_hold_where_numba_has_changed(tmp_path):
     """They are plain functions of numba's then, as on request: the same numbers; one line if nobody asked for it.
 
-    All share one folder for their caches.
+    All share one folder for their caches, and what was compiled with symbols is beside the source, too.
     """
     (tmp_path / "large_unit.py").write_text(LARGE_UNIT)
+    beside = tmp_path / "__pycache__"
+    beside.mkdir()
     environment = os.environ | {
         "NUMBA_CACHE_DIR": str(tmp_path),
         "TETOPT_PLAIN_NUMBA": "",
@@ -649,8 +651,11 @@ def test_kernels_hold_where_numba_has_changed(tmp_path):
         ).stdout.splitlines()
         assert failure == "large: 4 of 4 calls found no memory for their arrays"
         assert numbers == f"1.0 [1. 1. 1. 1.] 2.0 {before != ''}"
+        for path in tmp_path.glob("*/large_unit*.nb?"):
+            path.rename(beside / path.name)
         assert len(notices) == (reason is not None)
         assert all(line.startswith("warned: kernels take longer to compile") and reason in line for line in notices)
+    assert len(list(beside.glob("*.nbi"))) == 4
 
 
 SMALL_RUN = """
