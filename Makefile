@@ -9,7 +9,7 @@ TESTED = PYTHONUTF8=1 NUMBA_CACHE_DIR=$(NUMBA_CACHE) MPLBACKEND=agg $(BIN)/pytho
 
 SOLVERS = calculix-ccx python3-dolfinx
 
-.PHONY: demo test dist test-lowest test-slow test-random test-solvers test-nojit test-onethread test-bounds test-hostile test-container test-slurm test-cohort test-parts lint bench bench-blocks fingerprints docs clean
+.PHONY: demo test dist test-lowest test-slow test-random test-solvers test-nojit test-onethread test-plain test-bounds test-hostile test-container test-slurm test-cohort test-parts lint bench bench-blocks fingerprints docs clean
 
 demo: $(VENV)/.demo
 	NUMBA_CACHE_DIR=$(NUMBA_CACHE) $(BIN)/tetopt demo -o demo --force
@@ -26,6 +26,11 @@ test-onethread: $(VENV)/.test
 
 test-nojit: $(VENV)/.test
 	NUMBA_DISABLE_JIT=1 $(TESTED) -q -m kernel --no-header --durations=3 $(KERNEL_TESTS)
+
+# The same without the internals of numba.
+test-plain: $(VENV)/.test
+	TETOPT_PLAIN_NUMBA=1 $(TESTED) -q -m kernel --no-header --durations=3 $(KERNEL_TESTS)
+	TETOPT_PLAIN_NUMBA=1 $(TESTED) -q -m "not slow" --no-header --durations=3 tests/test_kernels.py
 
 # The same, and a run of each kind, stopped here and there, with each index of compiled code checked: none that lies
 # beyond its array is survived. Negative ones count from the end there as in numpy, and are not seen.

@@ -4,6 +4,9 @@ What is read has to have the checksum that was written with it, or else it is co
 holds would end the process. A file that somebody else can have written is not read either: pickles run code. What
 cannot be written, on a full disk or in a folder that is gone, is not kept. Each of these is said once, on one line, by
 a `RuntimeWarning`.
+
+That rests on the inside of numba. Where it lacks a name, or on request (`IS_PLAIN`), functions are compiled and kept
+by what numba's documents have alone, in a folder that only this user can open.
 """
 
 from __future__ import annotations
@@ -20,9 +23,38 @@ from pathlib import Path
 from typing import Any
 
 import numba
-from numba.core.caching import FunctionCache, IndexDataCacheFile, NullCache
+
+try:
+    from numba.core.caching import FunctionCache, IndexDataCacheFile
+    from numba.core.options import DefaultOptions
+except ImportError:  # by `MISSING` below
+    FunctionCache = IndexDataCacheFile = DefaultOptions = object
 
 from tetopt.cache import FILE_MODE, FOLDER_MODE, place_cache, untrusted
+
+INSIDE_OPTIONS = ("_nrt", "forceinline", "no_cfunc_wrapper", "no_cpython_wrapper")
+FILE_METHODS = ("_data_path", "_dump", "_load_data", "_load_index", "_open_for_write", "_save_data", "_save_index")
+INSIDE = (
+    (FunctionCache, ("load_overload", "save_overload")),
+    (IndexDataCacheFile, FILE_METHODS),
+    (DefaultOptions, INSIDE_OPTIONS),
+    (numba.njit(lambda: None), ("_cache",)),
+)
+MISSING = sorted(name for owner, names in INSIDE for name in names if not hasattr(owner, name))
+# Whether functions are compiled with what numba's documents have, and nothing else.
+IS_PLAIN = bool(MISSING) or os.environ.get("TETOPT_PLAIN_NUMBA") == "1" or bool(numba.config.DISABLE_JIT)
+PLAIN_NOTICE = f"kernels take longer to compile: tetopt cannot use the internals of numba {numba.__version__} ({{}})"
+NOT_KEPT = "compiled kernels cannot be kept, so that later runs compile them again: {}"
+
+
+@cache
+def checksum() -> str:
+    """Of the sources of all kernels and of their constants: what is compiled of others is not taken from the cache."""
+    folder, total = Path(__file__).parent, 0
+    patterns = ["kernel*.py", *(f"{room}/*.py" for room in ("geometry", "energy", "engine", "start", "target"))]
+    for path in sorted(path for pattern in patterns for path in folder.glob(pattern)):
+        total = zlib.crc32(path.read_bytes(), total)
+    return f"{total:08x}"
 
 
 class NotKeptWarning(RuntimeWarning):
@@ -131,7 +163,7 @@ class SealedCache(FunctionCache):
             return super().load_overload(sig, target_context)
         except OSError:  # if it can be written, all is well from then on, else that is said
             return None
-        except (AttributeError, ImportError) as error:  # of classes that there are no more
+        except (AttributeError, ImportError, TypeError) as error:  # of classes that there are no more
             warn(f"the cache of kernels cannot be read, they are compiled anew: {error}")
             return None
 
@@ -139,28 +171,59 @@ class SealedCache(FunctionCache):
         """Keep what was compiled for a signature, if that can be."""
         try:
             super().save_overload(sig, data)
-        except OSError as error:
-            warn(f"compiled kernels cannot be kept, so that later runs compile them again: {error}", NotKeptWarning)
+        except (AttributeError, OSError, TypeError) as error:
+            warn(NOT_KEPT.format(error), NotKeptWarning)
 
 
 def cache_of(function: Callable[..., Any]) -> Any:
-    """The cache of a function that numba compiles; one that keeps nothing, where there is no folder for it."""
+    """The cache of a function that numba compiles; None where there is no folder for it."""
     if place_cache().folder is not None:
         try:
             return SealedCache(function)
         except RuntimeError:  # no locator: the folder has gone, or takes no more files
             warn("kernels are compiled anew: the folder of their cache can no longer be written", NotKeptWarning)
-    return NullCache()
+        except (AttributeError, TypeError) as error:
+            warn(NOT_KEPT.format(error), NotKeptWarning)
+    return None
 
 
 def njit(**options: Any) -> Callable[[Callable[..., Any]], Any]:
     """Decorate as `numba.njit` does; `cache=True` stands for this cache."""
+    if IS_PLAIN:
+        return plain_njit(**options)
     is_kept = options.pop("cache", False)
 
     def compiled(function: Callable[..., Any]) -> Any:
         dispatcher = numba.njit(**options)(function)
-        if is_kept and not numba.config.DISABLE_JIT:
-            dispatcher._cache = cache_of(function)
+        if is_kept and (kept := cache_of(function)) is not None:
+            dispatcher._cache = kept
         return dispatcher
 
     return compiled
+
+
+def plain_njit(*signature: Any, **options: Any) -> Callable[[Callable[..., Any]], Any]:
+    """Decorate as `numba.njit` does, without the options that its documents do not have; `cache=True` is its cache."""
+    known = {name: value for name, value in options.items() if name not in INSIDE_OPTIONS}
+    return numba.njit(*signature, **known | {"cache": known.get("cache", False) and has_own_folder()})
+
+
+@cache
+def has_own_folder() -> bool:
+    """Point numba's own cache, which trusts what it reads, to a folder that only this user can open, if that can be."""
+    place = place_cache().folder
+    if place is None or numba.config.DISABLE_JIT:
+        return False
+    # Its keys know neither the code of other files nor whether indices are checked.
+    folder = place / f"plain-{checksum()}{'-checked' * bool(numba.config.BOUNDSCHECK)}"
+    with contextlib.suppress(OSError):
+        folder.mkdir(mode=0o700, exist_ok=True)
+        status = os.lstat(folder)
+        if untrusted(status) is None and (os.name != "posix" or status.st_mode & 0o077 == 0):
+            numba.config.CACHE_DIR = str(folder)
+            return True
+    return False
+
+
+if MISSING and not numba.config.DISABLE_JIT:
+    warn(PLAIN_NOTICE.format(f"no {', '.join(MISSING)}"))

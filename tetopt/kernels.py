@@ -6,13 +6,15 @@ linker's symbol, as a function of another file is in C; a *record* (a NamedTuple
 block of memory whose address is passed. Helpers are plain numba functions that go into the units that use them;
 *entries* are what Python calls; and a parallel loop is a unit run for each number of a range (`run`).
 
+Symbols and addresses are the inside of numba (`tetopt.kernel_links`). Where that fails its test below, or on request,
+kernels are plain functions of numba's, of the same signatures, that take records by value: slower, the same bits.
+
 docs/develop/kernels.md tells what each of these bought.
 """
 
 from __future__ import annotations
 
 import contextlib
-import inspect
 import os
 import subprocess
 import sys
@@ -23,24 +25,17 @@ import typing
 import warnings
 import zlib
 from collections.abc import Callable, Iterator, Sequence
-from functools import cache, cached_property, partial
+from concurrent.futures import ThreadPoolExecutor
+from functools import cached_property, partial
 from importlib import import_module
 from pathlib import Path
 from types import CellType, FunctionType
-from typing import Annotated, Any
+from typing import Annotated, Any, NamedTuple
 
-import llvmlite.binding as llvm
 import numba
 import numpy as np
-from llvmlite import ir
-from numba import prange, types
-from numba.core import cgutils
-from numba.core.datamodel.models import OpaqueModel
-from numba.core.extending import register_model, typeof_impl, unbox
-from numba.core.imputils import impl_ret_borrowed, lower_getattr_generic
-from numba.core.typing.templates import AttributeTemplate, infer_getattr, make_intrinsic_template
-from numba.extending import NativeValue, intrinsic
-from numba.np.arrayobj import populate_array
+from numba import types
+from numba.extending import overload, typeof_impl
 from numpy.typing import NDArray
 
 try:
@@ -51,7 +46,8 @@ except ImportError:  # Windows
 from tetopt.budget import address_room
 from tetopt.cache import place_cache
 from tetopt.interpreter import python_command, python_environment
-from tetopt.kernel_cache import NotKeptWarning, njit, warn
+from tetopt.kernel_cache import IS_PLAIN, PLAIN_NOTICE, NotKeptWarning, checksum, njit, plain_njit, warn
+from tetopt.kernel_types import by_value, cast, type_of
 
 # Arrays in the signatures of units and in records: of so many axes, the last one contiguous.
 Floats1 = Annotated[NDArray[np.float64], types.float64[::1]]
@@ -69,202 +65,42 @@ Bools1 = Annotated[NDArray[np.bool_], types.boolean[::1]]
 Bools2 = Annotated[NDArray[np.bool_], types.boolean[:, ::1]]
 Bools3 = Annotated[NDArray[np.bool_], types.boolean[:, :, ::1]]
 
-SCALAR_TYPES = {int: types.int64, float: types.float64, bool: types.boolean, type(None): types.void}
 UNIT_BYTES = 1 << 25  # at once for all arrays that units make: a few KB each on each thread
 # In the cache's folder, of all runs of this package: those of another one compile other files.
 LOCK_NAME = f"compiling-{zlib.crc32(str(Path(__file__).parent).encode()):08x}.lock"
+PIECES_PER_THREAD = 8  # of a plain loop: some take longer than others
 POLLED_SECONDS = 0.1  # between looks at processes that compile
 LONGEST_WAIT_SECONDS = 600.0  # for another run's: all kernels take 145 s on a busy machine
 MOST_COMPILING = 4  # processes at most: each loads numba first, 1 s and 200 MB
-WORD_BYTES = 8  # of a number, an address, or a length in a record's memory
 
 
-@cache
-def checksum() -> str:
-    """Of the sources of all kernels and of their constants: what is compiled of others is not taken from the cache."""
-    folder, total = Path(__file__).parent, 0
-    for room in ("geometry", "energy", "engine", "start", "target"):
-        for path in sorted((folder / room).glob("*.py")):
-            total = zlib.crc32(path.read_bytes(), total)
-    return f"{zlib.crc32(Path(__file__).read_bytes(), total):08x}"
+_LINKING = threading.RLock()  # of Python's threads one links at a time: the first's code is what others call
+_links: list[Any] = []  # what `links` returns, once it is known
 
 
-# Records.
-
-
-class RecordType(types.Type):
-    """What numba knows of a NamedTuple whose address it gets."""
-
-    def __init__(self, record: type) -> None:
-        self.record = record
-        self.fields = {name: type_of(hint) for name, hint in typing.get_type_hints(record, include_extras=True).items()}
-        self.offsets: dict[str, int] = {}
-        self.n_words = 0
-        for name, field in self.fields.items():
-            self.offsets[name] = self.n_words
-            self.n_words += 1 + 2 * field.ndim if isinstance(field, types.Array) else 1
-        super().__init__(f"{record.__module__}.{record.__qualname__}-{checksum()}")
-
-    def __reduce__(self) -> tuple[Any, ...]:
-        """In the keys of numba's cache, by name: the record of another version may be gone."""
-        return _type_of_name, (self.record.__module__, self.record.__qualname__, checksum())
-
-
-def _type_of_name(module: str, name: str, version: str) -> types.Type:
-    record = getattr(sys.modules.get(module), name, None)
-    is_same = version == checksum() and record is not None
-    return record_type(record) if is_same else types.Opaque(f"{module}.{name}-{version}")
-
-
-@cache
-def record_type(record: Any) -> RecordType:
-    """The one type of a NamedTuple."""
-    return RecordType(record)
-
-
-def type_of(hint: Any) -> types.Type:
-    """numba's type of an annotation: a number, one of the arrays above, a record, or a tuple of these."""
-    if typing.get_origin(hint) is Annotated:
-        return typing.get_args(hint)[1]
-    if typing.get_origin(hint) is tuple:
-        return types.BaseTuple.from_types([type_of(part) for part in typing.get_args(hint)])
-    if typing.get_origin(hint) is list:  # of records, of which kernels get the first; see `nth`
-        return record_type(typing.get_args(hint)[0])
-    return SCALAR_TYPES[hint] if hint in SCALAR_TYPES else record_type(hint)
-
-
-def by_value(record: type) -> types.NamedTuple:
-    """numba's own type of a NamedTuple, which kernels make and pass on in all its numbers."""
-    hints = typing.get_type_hints(record, include_extras=True)
-    return types.NamedTuple([type_of(hint) for hint in hints.values()], record)
-
-
-register_model(RecordType)(OpaqueModel)
-
-
-@intrinsic
-def _nth(_context: Any, records: Any, number: Any) -> Any:
-    def generate(_context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-        step = ir.Constant(ir.IntType(64), WORD_BYTES * signature.return_type.n_words)
-        return builder.gep(arguments[0], [builder.mul(arguments[1], step)])
-
-    return records(records, types.int64), generate
-
-
-def _entry_of(records: list[Any], number: int) -> Any:
-    return records[number]
-
-
-# The record of that number in a list of them, of which kernels have the address of the first.
-nth = _entry_of if numba.config.DISABLE_JIT else _nth
-
-
-@infer_getattr
-class _RecordFields(AttributeTemplate):
-    key = RecordType
-
-    def generic_resolve(self, record: RecordType, name: str) -> types.Type | None:
-        return record.fields.get(name)
-
-
-@lower_getattr_generic(RecordType)
-def _load_field(context: Any, builder: Any, record: RecordType, value: Any, name: str) -> Any:
-    """A field of a record. Its memory never changes while kernels run, which LLVM is told: loads leave the loops."""
-    field, first = record.fields[name], record.offsets[name]
-    words = builder.bitcast(value, ir.IntType(64).as_pointer())
-    constant = builder.module.add_metadata([])
-
-    def word(number: int, of: Any = ir.IntType(64)) -> Any:  # noqa: B008
-        place = builder.gep(words, [ir.Constant(ir.IntType(64), first + number)], inbounds=True)
-        loaded = builder.load(builder.bitcast(place, of.as_pointer()))
-        loaded.set_metadata("invariant.load", constant)
-        return loaded
-
-    if isinstance(field, types.Array):
-        array, n = context.make_array(field)(context, builder), field.ndim
-        shape, strides = [word(1 + d) for d in range(n)], [word(1 + n + d) for d in range(n)]
-        data, itemsize = word(0, array.data.type), context.get_constant(types.intp, numpy_dtype(field).itemsize)
-        populate_array(array, data, shape, strides, itemsize, meminfo=None)
-        return impl_ret_borrowed(context, builder, field, array._getvalue())
-    if field == types.boolean:
-        return builder.trunc(word(0), ir.IntType(1))
-    return word(0, context.get_value_type(field))
-
-
-def numpy_dtype(array: types.Array) -> np.dtype[Any]:
-    """The dtype of numpy of one of numba's types of arrays."""
-    return np.dtype(np.bool_ if array.dtype == types.boolean else array.dtype.name)
-
-
-class Packed:
-    """A record laid out in memory, of which kernels get the address. It keeps what it points to."""
-
-    __slots__ = ("address", "kept", "type", "words")
-
-    def __init__(self, record: Any) -> None:
-        record_class: Any = type(record)
-        self.type: RecordType = record_type(record_class)
-        self.words = np.empty(self.type.n_words, dtype=np.int64)
-        self.kept = record, [self._put(getattr(record, name), name) for name in self.type.fields]
-        self.address = self.words.ctypes.data
-
-    def _put(self, value: Any, name: str) -> Any:
-        """Lay out one field; what has to be kept for it besides the record itself."""
-        field, first = self.type.fields[name], self.type.offsets[name]
-        if isinstance(field, types.Array):
-            if not (value.flags.c_contiguous and value.ndim == field.ndim and value.dtype == numpy_dtype(field)):
-                raise TypeError(f"{self.type.record.__name__}.{name}: expected {field}, got {numba.typeof(value)}")
-            self.words[first] = value.ctypes.data
-            self.words[first + 1 : first + 1 + field.ndim] = value.shape
-            self.words[first + 1 + field.ndim : first + 1 + 2 * field.ndim] = value.strides
-        elif isinstance(value, list):
-            rows = [Packed(record) for record in value]
-            for row in rows:
-                self._check(row, name)
-            words = np.concatenate([row.words for row in rows])
-            self.words[first] = words.ctypes.data
-            return rows, words
-        elif isinstance(field, RecordType):
-            inner = packed(value)
-            self._check(inner, name)
-            self.words[first] = inner.address
-            return inner
-        elif field == types.float64:
-            self.words[first : first + 1].view(np.float64)[0] = value
-        else:
-            self.words[first] = int(value)
-        return None
-
-    def _check(self, inner: Any, name: str) -> None:
-        """TypeError unless a field gets the record that it is for: kernels would read another one's memory."""
-        if getattr(inner, "type", None) != self.type.fields[name]:
-            raise TypeError(f"{self.type.record.__name__}.{name}: expected {self.type.fields[name]}, got {inner!r}")
+def links() -> Any:
+    """Return `tetopt.kernel_links` if it works, which is tested once; else None: kernels are plain `numba.njit`."""
+    with _LINKING:
+        if not _links:
+            _links.append(None)
+            if not IS_PLAIN:
+                try:
+                    _links[0] = import_module("tetopt.kernel_links")
+                    check_links()
+                except Exception as error:  # of any kind: what is imported may be gone, or do something else
+                    _links[0] = None
+                    warn(PLAIN_NOTICE.format(f"{type(error).__name__}: {error}".splitlines()[0]))
+    return _links[0]
 
 
 def packed(value: Any) -> Any:
     """A record laid out for kernels; anything else as it is, one that is laid out already among it."""
-    if numba.config.DISABLE_JIT:
+    if numba.config.DISABLE_JIT or not (isinstance(value, tuple) and hasattr(value, "_fields")):
         return value
-    return Packed(value) if isinstance(value, tuple) and hasattr(value, "_fields") else value
+    return cast(value, by_value(type(value)), "argument") if links() is None else links().Packed(value)
 
-
-@typeof_impl.register(Packed)
-def _typeof_packed(value: Packed, _context: Any) -> types.Type:
-    return value.type
-
-
-@unbox(RecordType)
-def _unbox_packed(_type: RecordType, value: Any, context: Any) -> NativeValue:
-    number = context.pyapi.object_getattr_string(value, "address")
-    address = context.pyapi.long_as_voidptr(number)
-    context.pyapi.decref(number)
-    return NativeValue(address, is_error=cgutils.is_not_null(context.builder, context.pyapi.err_occurred()))
-
-
-# Functions.
 
 ALL_KERNELS: list[Any] = []  # all that were defined, in the modules imported so far
-_LINKING = threading.RLock()  # of Python's threads one links at a time: the first's code is what others call
 _LOOPING = threading.Lock()  # held by the one that runs a loop, where numba's threads can serve only one
 
 
@@ -283,7 +119,7 @@ def _counts(function: Callable[..., Any]) -> bool:
     """
     if ALLOCATING_NAMES.intersection(function.__code__.co_names):
         return True
-    inner = [value.py_func for value in _named(function) if isinstance(value, numba.core.dispatcher.Dispatcher)]
+    inner = [value.py_func for value in _named(function) if hasattr(value, "py_func")]
     return any(_returns_arrays(part) for part in [function, *inner])
 
 
@@ -292,20 +128,22 @@ def _returns_arrays(function: Callable[..., Any]) -> bool:
     return result not in ("None", "bool", "int", "float", "Any") and not str(result).startswith("tuple")
 
 
-def _versioned(function: Callable[..., Any]) -> Callable[..., Any]:
-    """A function for numba to compile that closes over the checksum of all kernels.
+def _versioned(function: Callable[..., Any], **values: Any) -> Callable[..., Any]:
+    """A function for numba to compile that closes over the checksum of all kernels, with global values of its own.
 
     numba's cache is keyed by the code of one function and what that closes over, so that it would return a function
     compiled with others as they were before.
     """
     code = function.__code__.replace(co_freevars=("checksum",))
-    version = FunctionType(code, function.__globals__, function.__name__, None, (CellType(checksum()),))
+    version = FunctionType(code, function.__globals__ | values, function.__name__, None, (CellType(checksum()),))
     version.__qualname__, version.__module__ = function.__qualname__, function.__module__
     return version
 
 
 class Kernel:
     """A function that numba compiles, with a signature from its annotations."""
+
+    type: types.Type  # how other kernels call it
 
     def __init__(self, function: Callable[..., Any]) -> None:
         self.function = function
@@ -318,8 +156,9 @@ class Kernel:
     def signature(self) -> Any:
         """numba's, of the annotations."""
         hints = typing.get_type_hints(self.function, include_extras=True)
-        result = type_of(hints.pop("return"))
-        return result(*(type_of(hint) for hint in hints.values()))
+        of_record = by_value if links() is None else links().record_type
+        result = type_of(hints.pop("return"), of_record)
+        return result(*(type_of(hint, of_record) for hint in hints.values()))
 
     def link(self) -> None:
         """Make its symbol known, and those of what it calls before."""
@@ -338,7 +177,8 @@ class Kernel:
     @cached_property
     def dispatcher(self) -> Any:
         """How Python calls it: numba's."""
-        return njit(cache=True, error_model="numpy")(_versioned(self.function))
+        compiled_by = plain_njit if links() is None else njit  # their caches are apart: only one has symbols
+        return compiled_by(cache=True, error_model="numpy")(_versioned(self.function))
 
     def __call__(self, *values: Any) -> Any:
         """Call it from Python: records are laid out for it, and the units that it calls are linked before."""
@@ -367,31 +207,18 @@ class Unit(Kernel):
         return f"{self.__module__}.{self.__name__}.{checksum()}"
 
     @cached_property
-    def type(self) -> types.Function:
-        """How other kernels call it: to numba an operation of its own, which raises what the unit raises."""
-
-        def generate(context: Any, builder: Any, signature: Any, arguments: Any) -> Any:
-            convention = context.call_conv
-            kind = convention.get_function_type(signature.return_type, signature.args)
-            function = cgutils.get_or_insert_function(builder.module, kind, self.symbol)
-            status, value = convention.call_function(
-                builder, function, signature.return_type, signature.args, arguments
-            )
-            with cgutils.if_unlikely(builder, status.is_error):
-                convention.return_status_propagate(builder, status)
-            return value
-
-        def typed(_context: Any, *_arguments: Any) -> Any:
-            return self.signature, generate
-
-        parameters = inspect.signature(self.function).parameters.values()
-        first = inspect.Parameter("_context", inspect.Parameter.POSITIONAL_OR_KEYWORD)
-        typed.__signature__ = inspect.Signature([first, *parameters])  # type: ignore[attr-defined]
-        return types.Function(make_intrinsic_template(self, typed, self.symbol))
+    def type(self) -> types.Type:
+        """How other kernels call it."""
+        if links() is None:
+            return types.Dispatcher(self.compiled)
+        return links().function_type(self.symbol, self.function, self.signature)
 
     @cached_property
     def compiled(self) -> Any:
         """The same for callers of machine code only."""
+        if links() is None:
+            options = {"cache": True, "error_model": "numpy", "nogil": True}
+            return plain_njit(self.signature, **options)(_versioned(self.function))
         dispatcher = _machine_code(cache=True, _nrt=_counts(self.function))(_versioned(self.function))
         dispatcher.compile(self.signature)
         return dispatcher
@@ -399,25 +226,36 @@ class Unit(Kernel):
     @cached_property
     def address(self) -> int:
         """Where it is in memory."""
-        (result,) = self.compiled.overloads.values()
-        return int(result.library.get_pointer_to_function(result.fndesc.llvm_func_name))
+        return links().address_of(self.compiled)
+
+    @cached_property
+    def loop(self) -> Any:
+        """A plain function that calls it for a record and the numbers from one up to another: how many calls fail."""
+        version = _versioned(_loop, _task=self)
+        version.__qualname__ = f"_loop.{self.symbol}"
+        signature = types.int64(self.signature.args[0], types.int64, types.int64)
+        return plain_njit(signature, cache=True, nogil=True)(version)
 
     def _make_known(self) -> None:
-        llvm.add_symbol(self.symbol, self.address)
+        if links() is None:
+            _ = self.compiled
+        else:
+            links().add_symbol(self.symbol, self.address)
 
 
 class Entry(Kernel):
     """A function that Python calls."""
 
+    @cached_property
+    def type(self) -> types.Type:
+        """How other kernels call it."""
+        return types.Dispatcher(self.dispatcher)
+
 
 @typeof_impl.register(Unit)
-def _typeof_unit(unit: Unit, context: Any) -> types.Type:
-    return unit.type
-
-
 @typeof_impl.register(Entry)
-def _typeof_entry(entry: Entry, context: Any) -> types.Type:
-    return types.Dispatcher(entry.dispatcher)
+def _typeof_kernel(kernel: Kernel, _context: Any) -> types.Type:
+    return kernel.type
 
 
 def units_of(function: Callable[..., Any]) -> Iterator[Unit]:
@@ -432,7 +270,7 @@ def _parts(function: Callable[..., Any]) -> list[Any]:
     for part in parts:
         for value in _named(part):
             is_entry = isinstance(value, Entry)
-            if is_entry or isinstance(value, numba.core.dispatcher.Dispatcher):
+            if is_entry or hasattr(value, "py_func"):
                 inner = value.function if is_entry else value.py_func
                 if inner not in parts:
                     parts.append(inner)
@@ -464,7 +302,7 @@ def link(kernels: Sequence[Any], progress: Callable[[str], None] | None = None) 
         if place.notice is not None:
             warn(place.notice)
         say(f"compiling the kernels, {n_ready + 1} of {len(order)}")
-        if place.folder is not None:
+        if place.folder is not None and links() is not None:
             with _only_compiler(place.folder, say) as has_waited:
                 if has_waited:
                     n_ready = _n_kept(order, n_ready + 1)
@@ -564,7 +402,7 @@ def compile_named(names: Sequence[str], claims: str, parent: int) -> None:
     numba.get_num_threads()
     for kernel in ALL_KERNELS:
         if isinstance(kernel, Unit):
-            llvm.add_symbol(kernel.symbol, 1)
+            links().add_symbol(kernel.symbol, 1)
     for number, kernel in enumerate(chosen):
         if os.getppid() != parent and sys.platform != "win32":  # there a launcher stands between
             return
@@ -576,27 +414,31 @@ def compile_named(names: Sequence[str], claims: str, parent: int) -> None:
                 return
 
 
-@intrinsic
-def _fails(_context: Any, address: Any, values: Any, number: Any) -> Any:
-    """Call the task at an address, with that of a record and a number: whether it raised an error."""
-
-    def generate(context: Any, builder: Any, _signature: Any, arguments: Any) -> Any:
-        convention, kinds = context.call_conv, (types.voidptr, types.int64)
-        task = builder.inttoptr(arguments[0], convention.get_function_type(types.void, kinds).as_pointer())
-        record = builder.inttoptr(arguments[1], cgutils.voidptr_t)
-        status, _ = convention.call_function(builder, task, types.void, kinds, [record, arguments[2]])
-        return status.is_error
-
-    return types.boolean(types.int64, types.int64, types.int64), generate
+_task: Any = None  # a unit, of each function below that is compiled its own; see `_versioned`
+_fails: Any = None
 
 
-# The one parallel loop: each loop of its own took 2 s to compile.
-@njit(cache=True, parallel=True)
-def _run(task: int, values: int, n: int) -> int:
+def _loop(values: Any, first: int, last: int) -> int:
     n_failed = 0
-    for number in prange(n):
-        n_failed += _fails(task, values, np.int64(number))
+    for number in range(first, last):
+        try:
+            _task(values, number)
+        except Exception:
+            n_failed += 1
     return n_failed
+
+
+def _run_plain(task: Unit, n: int, values: Any) -> int:
+    """How many calls of a unit fail, on threads of Python's: numba's own take no records."""
+    n_threads, loop = numba.get_num_threads(), task.loop
+    step = max(1, n // (PIECES_PER_THREAD * n_threads))
+
+    def share(thread: int) -> int:
+        record = cast(values, task.signature.args[0], task.__name__, thread)
+        return sum(loop(record, first, min(first + step, n)) for first in range(thread * step, n, n_threads * step))
+
+    with ThreadPoolExecutor(n_threads) as threads:
+        return sum(threads.map(share, range(n_threads)))
 
 
 def run(task: Any, n: int, values: Any) -> None:
@@ -609,12 +451,15 @@ def run(task: Any, n: int, values: Any) -> None:
             task(values, number)
         return
     task.link()
-    laid_out = packed(values)
-    if laid_out.type != task.signature.args[0]:
-        raise TypeError(f"{task.__name__}: expected a {task.signature.args[0]}, got a {laid_out.type}")
     _check_room()
-    with _LOOPING if numba.threading_layer() == "workqueue" else contextlib.nullcontext():
-        n_failed = _run(task.address, laid_out.address, n)
+    if links() is None:
+        n_failed = _run_plain(task, n, values)
+    else:
+        laid_out = packed(values)
+        if laid_out.type != task.signature.args[0]:
+            raise TypeError(f"{task.__name__}: expected a {task.signature.args[0]}, got a {laid_out.type}")
+        with _LOOPING if numba.threading_layer() == "workqueue" else contextlib.nullcontext():
+            n_failed = links().run(task.address, laid_out.address, n)
     if n_failed > 0:
         raise MemoryError(f"{task.__name__}: {n_failed} of {n} calls found no memory for their arrays")
 
@@ -641,7 +486,44 @@ def helper(function: Callable[..., Any]) -> Any:
 inlined = njit(error_model="numpy", inline="always")  # likewise, as numba reads it, before LLVM does
 
 
-@helper
-def thread() -> int:
-    """The number of the thread that runs a task."""
-    return numba.get_thread_id()
+def own(records: Any) -> Any:
+    """The record of the thread that runs a task, of a list with one for each."""
+    return records[0]
+
+
+@overload(own, strict=False)  # else annotations count as names of arguments
+def _own_compiled(records: Any) -> Any:
+    if isinstance(records, types.BaseTuple):  # by value, of the thread alone; see `_run_plain`
+        return lambda records: records
+    nth = links().nth
+    return lambda records: nth(records, numba.get_thread_id())
+
+
+# Whether the inside of numba does what it is used for.
+
+
+class _Row(NamedTuple):
+    x: Floats1
+
+
+def _double(row: _Row, number: int) -> None:
+    if number < 0:
+        raise MemoryError
+    row.x[number] *= 2.0
+
+
+def _double_both(row: Any, address: int, place: int) -> tuple[bool, bool]:
+    _task(row, 0)
+    return _fails(address, place, 1), _fails(address, place, -1)
+
+
+def check_links() -> None:
+    """Compile a unit and call it by its symbol and its address; an error of any kind if that fails."""
+    doubled = Unit(_double)
+    ALL_KERNELS.remove(doubled)
+    doubled._make_known()
+    both = njit(cache=True)(_versioned(_double_both, _task=doubled, _fails=links().fails))
+    row = packed(_Row(np.ones(2)))
+    failures = both(row, doubled.address, row.address)
+    if failures != (False, True) or list(row.kept[0].x) != [2.0, 2.0]:
+        raise RuntimeError(f"a unit doubled ones to {row.kept[0].x}, its failures are {failures}")

@@ -55,9 +55,8 @@ from tetopt.kernels import (
     entry,
     helper,
     inlined,
-    nth,
+    own,
     run,
-    thread,
     unit,
 )
 
@@ -175,7 +174,7 @@ class Evaluation(NamedTuple):
 def _evaluate_cells(search: Evaluation, chunk: int) -> None:
     """Moves 0 to 3 flip that facet, 4 to 9 remove an edge of `TET_EDGES`."""
     gain, move, near, is_dirty, state = search.gain, search.move, search.near, search.is_dirty, search.state
-    work, complex_ = nth(search.rooms, thread()), state.complex
+    work, complex_ = own(search.rooms), state.complex
     first = chunk * CELLS_PER_CHUNK
     for number in range(first, min(first + CELLS_PER_CHUNK, len(near))):
         cell = near[number]

@@ -6,8 +6,9 @@ and all kernels took a fifth longer to compile.
 
 from __future__ import annotations
 
-from numba import njit
 from numpy.typing import NDArray
+
+from tetopt.kernel_cache import njit
 
 
 @njit(forceinline=True, no_cpython_wrapper=True, no_cfunc_wrapper=True, _nrt=False)
