@@ -16,12 +16,8 @@ import tetopt
 from tetopt import Image, InputError, save_mesh
 from tetopt.budget import BYTES_PER_GB
 from tetopt.cli.console import log, out, print_wide
-from tetopt.cli.inputs import checked_outputs, label_table, read_labels, read_volume
 from tetopt.cli.options import (
-    DEFAULT_NODES,
-    WHOLE_BOX,
     AverageOption,
-    BoxPart,
     ForceOption,
     ImageArgument,
     LabelNamesOption,
@@ -32,6 +28,8 @@ from tetopt.cli.quality import image_fit
 from tetopt.io.files import checked_output, results_folder, save_json
 from tetopt.io.images import sha256
 from tetopt.io.mni import mni_path, mni_tissue
+from tetopt.job.inputs import checked_outputs, label_table, read_labels, read_volume
+from tetopt.job.job import DEFAULT_NODES, WHOLE_BOX, BoxPart
 from tetopt.measure.quality import quality
 from tetopt.model.averages import parse_average
 from tetopt.model.fields import cell_fields
