@@ -19,6 +19,7 @@ import numpy as np
 import PIL.Image
 import pytest
 from commands import assert_refused, exit_code, mesh_words, numbers_in
+from tetopt.cli.promises import check_promises
 
 import tetopt
 import tetopt.cli.mesh
@@ -27,7 +28,6 @@ import tetopt.engine.meshing
 from tetopt import Image, Mesh, lattice, load_image, load_mesh, load_phantom, quality, save_image, save_mesh
 from tetopt.cli.app import COMMANDS, loaded_command
 from tetopt.cli.console import show_error
-from tetopt.cli.promises import check_promises
 from tetopt.engine.loop import Optimized
 from tetopt.geometry.simplex import volumes
 from tetopt.measure.segmentation import dice, segmented

@@ -10,6 +10,7 @@ from contextlib import contextmanager
 
 import numpy as np
 import pytest
+import tetopt.cli.source
 from commands import exit_code, mesh_words, numbers_in
 from models import sample_image
 
@@ -17,7 +18,6 @@ import tetopt
 import tetopt.cli.mesh
 import tetopt.cli.phantom
 import tetopt.cli.run
-import tetopt.cli.source
 import tetopt.report.summary
 from tetopt.cli.ending import is_ended, mesh_kept, signal_code, signals_heard
 

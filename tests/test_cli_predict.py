@@ -7,6 +7,7 @@ import numpy as np
 import pytest
 from commands import exit_code, labelled_lattice_words, mesh_words, numbers_in
 from models import sample_image
+from tetopt.cli.plan import planned
 
 import tetopt
 from tetopt.cli import mesh as cli_mesh
@@ -20,7 +21,6 @@ from tetopt.cli.options import (
     SourceOptions,
     StartOptions,
 )
-from tetopt.cli.plan import planned
 from tetopt.engine import cost
 from tetopt.engine.cost import RunSize
 from tetopt.interpreter import python_command, python_environment

@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 from commands import exit_code, numbers_in
+from tetopt.cli.promises import check_promises, warn_of_result, warn_of_sizes
 
 import tetopt
-from tetopt.cli.promises import check_promises, warn_of_result, warn_of_sizes
 from tetopt.engine.interfaces import crowded_nodes
 from tetopt.engine.loop import Optimized, Record
 from tetopt.measure.fidelity import MaskFidelity

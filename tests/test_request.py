@@ -6,6 +6,7 @@ from pathlib import Path
 import pytest
 import typer
 from commands import exit_code, mesh_words, numbers_in
+from tetopt.cli.request import requested
 
 import tetopt
 from tetopt import InputError
@@ -24,7 +25,6 @@ from tetopt.cli.options import (
     option_words,
     with_options,
 )
-from tetopt.cli.request import requested
 
 # Of each field of the options of `tetopt mesh` a value that is not its default.
 VALUES = {

@@ -11,11 +11,11 @@ from pathlib import Path
 import nibabel
 import numpy as np
 import pytest
+from tetopt.cli.inputs import file_and_volume
 
 import tetopt
 from tetopt import budget, incoming
 from tetopt.cli import main
-from tetopt.cli.inputs import file_and_volume
 from tetopt.cli.solver import parsed_bins
 from tetopt.errors import InputError
 from tetopt.incoming import json_of, text_of, toml_of
