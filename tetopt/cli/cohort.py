@@ -39,7 +39,7 @@ from tetopt.cohort.layout import (
 )
 from tetopt.cohort.numbers import collect
 from tetopt.cohort.page import save_cohort_files
-from tetopt.cohort.run import Ended, Job
+from tetopt.cohort.run import Ended, SubjectTask
 from tetopt.cohort.schedule import run_all
 from tetopt.cohort.subjects import TABLE_SUFFIXES, Problems, key, write_table
 from tetopt.engine.cost import Prediction, RunSize, calibrated_speed, predicted
@@ -48,7 +48,7 @@ from tetopt.io.files import checked_output
 from tetopt.io.images import file_shape
 from tetopt.job.events import listened
 from tetopt.job.inputs import read_mesh
-from tetopt.job.job import RunOptions, SizeOptions
+from tetopt.job.options import RunOptions, SizeOptions
 from tetopt.job.plan import with_numbers
 from tetopt.job.predict import size_by_headers, size_of_run
 from tetopt.job.source import read_source
@@ -272,13 +272,13 @@ def _refresher(place: Path) -> Callable[[], None]:
     return refresh
 
 
-def _job(entry: Entry, estimate: Estimate, place: Path, suffix: str, threads: int, run: str) -> Job:
+def _job(entry: Entry, estimate: Estimate, place: Path, suffix: str, threads: int, run: str) -> SubjectTask:
     one = estimate.each.get(entry.key, Prediction(0.0, 0.0, 0.0))
-    return Job(entry.key, entry.words(), str(place), suffix, threads, one.peak_bytes, one.seconds, run)
+    return SubjectTask(entry.key, entry.words(), str(place), suffix, threads, one.peak_bytes, one.seconds, run)
 
 
 @contextlib.contextmanager
-def _progress(jobs: Sequence[Job], n_at_once: int) -> Iterator[Callable[[Ended], None]]:
+def _progress(jobs: Sequence[SubjectTask], n_at_once: int) -> Iterator[Callable[[Ended], None]]:
     """A function that shows how a subject ended: a bar on a terminal, else a line; both with an estimate of the end."""
     begun = time.monotonic()
     left = {job.key: max(job.seconds, 1.0) for job in jobs}

@@ -16,7 +16,7 @@ from tetopt.cohort.subjects import FILE_OPTIONS, Problems, Subject, doubled, key
 from tetopt.errors import InputError
 from tetopt.io.formats import FORMATS
 from tetopt.job.inputs import file_and_volume
-from tetopt.job.job import Job, RunOptions, given_options
+from tetopt.job.options import JobOptions, RunOptions, given_options
 from tetopt.job.plan import Plan, changed, resolved
 from tetopt.job.request import requested
 from tetopt.model.laws import LAW_OPTIONS, law_file
@@ -32,7 +32,7 @@ class Entry(NamedTuple):
     state: State
 
     @property
-    def job(self) -> Job:
+    def job(self) -> JobOptions:
         """What is asked for, with its images."""
         return self.plan.job
 
@@ -142,12 +142,12 @@ class _Plans:
         return replace(own, **files), plan.with_files(subject.images, files)
 
 
-def job_of(options: RunOptions, images: Sequence[Path], output: Path) -> Job:
-    """The job of a subject."""
-    return Job(images=list(images), output=output, figures=Path(FIGURES_NAME), **vars(options))
+def job_of(options: RunOptions, images: Sequence[Path], output: Path) -> JobOptions:
+    """All options of the run of a subject."""
+    return JobOptions(images=list(images), output=output, figures=Path(FIGURES_NAME), **vars(options))
 
 
-def _missing(job: Job) -> Iterator[str]:
+def _missing(job: JobOptions) -> Iterator[str]:
     """What is wrong with the files that a subject names: not there, or a text where an image should be."""
     named = [("image", path) for path in job.images]
     named += [(name, path) for name in FILE_OPTIONS if (path := getattr(job, name)) is not None]
@@ -170,7 +170,7 @@ def with_states(entries: list[Entry], out: Path, suffix: str, say: Callable[[str
     def state(entry: Entry) -> Entry:
         request = None
         if numbers_path(out, entry.key).is_file():
-            request = requested(changed(entry.plan.asked, output=Path(mesh_name(entry.key, suffix))))
+            request = requested(changed(entry.plan.bare, output=Path(mesh_name(entry.key, suffix))))
         return entry._replace(state=state_of(out, entry.key, suffix, request))
 
     if (n_there := sum(numbers_path(out, entry.key).is_file() for entry in entries)) > 0:

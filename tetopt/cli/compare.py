@@ -29,7 +29,7 @@ from tetopt.io.files import checked_output, results_folder, save_json
 from tetopt.io.images import sha256
 from tetopt.io.mni import mni_path, mni_tissue
 from tetopt.job.inputs import checked_outputs, label_table, read_labels, read_volume
-from tetopt.job.job import DEFAULT_NODES, WHOLE_BOX, BoxPart
+from tetopt.job.options import DEFAULT_NODES, WHOLE_BOX, BoxPart
 from tetopt.measure.quality import quality
 from tetopt.model.averages import parse_average
 from tetopt.model.fields import cell_fields
@@ -39,7 +39,7 @@ from tetopt.report.tables import add_quality, new_table
 from tetopt.study.compare_criteria import number_text
 from tetopt.study.compare_headline import Headline, headline
 from tetopt.study.compare_report import ImageSource, LabelSource, Settings
-from tetopt.study.pipelines import PIPELINES, Job
+from tetopt.study.pipelines import PIPELINES, PipelineInput
 from tetopt.study.program import Program, parse_program
 
 ClassesOption = Annotated[int, option("K", "Classes of the segmentation (multi-Otsu).", min=2)]
@@ -156,7 +156,7 @@ def baseline_command(
     json_path = numbers.checked()
     image, labels = _image_and_labels(image_path, labels_path, part)
     title, function = PIPELINES[pipeline].title, PIPELINES[pipeline].function
-    job = Job(image, labels, nodes, classes)
+    job = PipelineInput(image, labels, nodes, classes)
     made = run_in_child(function, job, say=lambda line: log.print(escape(f"{title}: {line}")))
     if made.mesh is None:
         raise InputError(f"{title}: {(made.failure or '').removeprefix(f'{title}: ')}")

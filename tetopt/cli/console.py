@@ -140,9 +140,9 @@ def with_hyphens(message: str) -> str:
     """A message with the command's options for the arguments of a job between backticks."""
     if "`" not in message:
         return message
-    from tetopt.job.job import Job, kinds_of, option_name  # loaded by now, if that is of it
+    from tetopt.job.options import JobOptions, kinds_of, option_name
 
-    names = {name: f"--{option_name(name, kind)}" for name, kind in kinds_of(Job).items()}
+    names = {name: f"--{option_name(name, kind)}" for name, kind in kinds_of(JobOptions).items()}
     return re.sub(r"`(\w+)`", lambda match: names.get(match[1], match[0]), message)
 
 

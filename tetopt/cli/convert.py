@@ -23,7 +23,6 @@ from tetopt.io.frd import read_frd
 from tetopt.io.images import sha256
 from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.job.inputs import image_and_others, read_mesh, warn_of_other_image, with_labels
-from tetopt.job.job import ImagePart, SolverOptions
 from tetopt.job.model import (
     REACTIONS_TEXT,
     check_solver_options,
@@ -36,6 +35,7 @@ from tetopt.job.model import (
     with_chosen_sets,
     without_stale_results,
 )
+from tetopt.job.options import ImagePart, SolverOptions
 from tetopt.model.fields import cell_fields, is_result, is_stress
 from tetopt.model.file import MATERIAL_FIELDS, TEXTS_KEPT, MeshFile
 from tetopt.model.sets import Sets, box_of, box_text, merged_sets

@@ -20,7 +20,6 @@ from tetopt.io.formats import save_model
 from tetopt.io.images import sha256
 from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.job.inputs import read_image, read_mesh, warn_of_other_image, with_labels
-from tetopt.job.job import ImagePart, ModelOptions
 from tetopt.job.model import (
     check_model_options,
     completed,
@@ -30,6 +29,7 @@ from tetopt.job.model import (
     warn_of_units,
     with_chosen_sets,
 )
+from tetopt.job.options import ImagePart, ModelOptions
 from tetopt.model.averages import DEFAULT_AVERAGE
 from tetopt.model.fields import cell_fields, is_result
 from tetopt.model.file import MeshFile

@@ -18,7 +18,8 @@ from tetopt.io.mni import mni_path
 from tetopt.job.events import listened, started
 from tetopt.job.in_parts import with_parts
 from tetopt.job.inputs import set_threads
-from tetopt.job.job import DEFAULT_NODES, Job
+from tetopt.job.job import Job
+from tetopt.job.options import DEFAULT_NODES
 from tetopt.job.plan import planned
 from tetopt.job.read import read
 from tetopt.job.run import Result, run

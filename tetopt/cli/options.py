@@ -9,6 +9,7 @@ from __future__ import annotations
 import inspect
 import re
 from collections.abc import Callable, Iterator
+from copy import copy
 from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
 from difflib import get_close_matches
 from functools import cache, wraps
@@ -16,12 +17,13 @@ from pathlib import Path
 from typing import Annotated, Any, ClassVar, cast, get_args, get_type_hints
 
 import typer
+from typer.models import OptionInfo
 
 from tetopt.cli.console import with_hyphens
 from tetopt.errors import InputError
 from tetopt.io.files import checked_output, name_files
 from tetopt.io.formats import FORMATS
-from tetopt.job.job import (
+from tetopt.job.options import (
     AVERAGE_OPTION,
     IMAGE_FILES,
     ClusterOption,
@@ -39,7 +41,7 @@ from tetopt.job.job import (
 from tetopt.public import LARGEST_INTEGER
 
 
-def option(metavar: str, text: str, *names: str, **more: Any) -> Any:
+def option(metavar: str | None, text: str, *names: str, **more: Any) -> Any:
     """`typer.Option` in one line: what its value is called, and what the help says of it."""
     return typer.Option(*names, metavar=metavar, help=text, **more)
 
@@ -267,37 +269,39 @@ def from_records(command: Callable[..., int]) -> Callable[..., int]:
     return called
 
 
-def _parameters(name: str, kind: Any, default: Any) -> Iterator[inspect.Parameter]:
+def _parameters(name: str, kind: Any, default: Any, panel: str | None = None) -> Iterator[inspect.Parameter]:
     """The parameters that stand for one of a command, or for a field of a record."""
     if not is_dataclass(kind):
-        yield inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=_typed(name, kind))
+        annotation = _typed(name, kind, panel)
+        yield inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
         return
-    defaults = {
-        each.name: inspect.Parameter.empty if each.default is MISSING else each.default for each in fields(kind)
-    }
-    for each, own in kinds_of(cast(type, kind)).items():
-        yield inspect.Parameter(
-            each, inspect.Parameter.KEYWORD_ONLY, default=defaults[each],
-            annotation=_typed(each, own, _panel_of(cast(type, kind), each)),
-        )  # fmt: skip
+    record = cast(type, kind)
+    for field in fields(record):
+        default = inspect.Parameter.empty if field.default is MISSING else field.default
+        own = kinds_of(record)[field.name]
+        yield from _parameters(field.name, own, default, _panel_of(record, field.name) or panel)
 
 
 def _panel_of(record: type, name: str) -> str | None:
     """The panel of the help that a field of a record stands in: that of the first class with one that brings it."""
     bringing = [each for each in reversed(record.__mro__) if name in getattr(each, "__dataclass_fields__", {})]
-    return next((vars(each)["panel"] for each in bringing if "panel" in vars(each)), None)
+    return next((each.panel for each in bringing if hasattr(each, "panel")), None)
 
 
-def _typed(name: str, kind: Any, panel: str | None = None) -> Any:
-    """The annotation as typer takes it: an `Option` in it becomes one of typer's."""
-    own = next((each for each in get_args(kind)[1:] if isinstance(each, Option)), None)
-    if own is None:
+def _typed(name: str, kind: Any, panel: str | None) -> Any:
+    """The annotation as typer takes it, its option in a panel of the help; arguments have one of their own."""
+    own = next((each for each in get_args(kind)[1:] if isinstance(each, Option | OptionInfo)), None)
+    if isinstance(own, Option):
+        text = with_hyphens(own.text)
+        if own.is_argument:
+            return Annotated[get_args(kind)[0], typer.Argument(metavar=own.metavar, help=text)]
+        names = [f"-{own.letter}"] * bool(own.letter) + [f"--{option_name(name, kind)}"]
+        made = option(own.metavar, text, *names, min=own.least)
+    elif own is None or panel is None:
         return kind
-    text = with_hyphens(own.text)
-    if own.is_argument:
-        return Annotated[get_args(kind)[0], typer.Argument(metavar=own.metavar, help=text)]
-    names = [f"-{own.letter}"] * bool(own.letter) + [f"--{option_name(name, kind)}"]
-    made = typer.Option(*names, metavar=own.metavar, help=text, min=own.least, rich_help_panel=panel)
+    else:
+        made = copy(own)
+    made.rich_help_panel = panel
     return Annotated[get_args(kind)[0], made]
 
 
@@ -305,4 +309,5 @@ def _of_values(kind: Any, name: str, values: dict[str, Any]) -> Any:
     """A parameter's value: one of `values`, or the record that is made of them."""
     if not is_dataclass(kind):
         return values[name]
-    return cast(Callable[..., Any], kind)(**{field.name: values[field.name] for field in fields(kind)})
+    kinds = kinds_of(cast(type, kind))
+    return cast(Callable[..., Any], kind)(**{each: _of_values(own, each, values) for each, own in kinds.items()})

@@ -10,7 +10,7 @@ from tetopt.cluster.crew import Need, counted
 from tetopt.engine.cost import RunSize, calibrated_speed, cost_model, predicted
 from tetopt.job.in_parts import parts_of
 from tetopt.job.plan import Plan
-from tetopt.job.read import Task
+from tetopt.job.task import Task
 from tetopt.start.octree import OCTREE_NODE_BYTES
 
 

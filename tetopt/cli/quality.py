@@ -22,7 +22,7 @@ from tetopt.incoming import json_of
 from tetopt.io.files import save_json
 from tetopt.job.advice import tell_violated
 from tetopt.job.inputs import label_table, read_mesh, warn_of_other_image
-from tetopt.job.job import ImagePart, LabelNamesOption, SourceOptions
+from tetopt.job.options import ImagePart, LabelNamesOption, SourceOptions
 from tetopt.job.source import Source, read_source, whose_variance
 from tetopt.measure.fidelity import LabelFidelity
 from tetopt.measure.quality import quality

@@ -13,7 +13,7 @@ from tetopt.io.formats import format_of
 from tetopt.io.gmsh import incomplete_groups
 from tetopt.io.tags import group_of_zero, label_lines, numbered_parts
 from tetopt.io.vtk import VTK_SUFFIXES
-from tetopt.job.job import SolverOptions
+from tetopt.job.options import SolverOptions
 from tetopt.model.fields import GAUSS_MODULI
 from tetopt.model.labels import TABLE_TEXT, labels_of, table_of_words
 from tetopt.model.loads import SHOWN_LOAD_DIGITS, count_of_steps, load_words

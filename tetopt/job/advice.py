@@ -13,7 +13,7 @@ from tetopt.engine.meshing import Mode
 from tetopt.engine.promises import LABEL_VOXELS
 from tetopt.engine.surface import MOST_MEETING
 from tetopt.job.events import violated, warning
-from tetopt.job.job import Method
+from tetopt.job.options import Method
 from tetopt.measure.fidelity import MaskFidelity
 from tetopt.model.labels import label_words
 from tetopt.start.sizes import LONG_EDGE, EdgeRatios, Sizes

@@ -28,7 +28,7 @@ from tetopt.io.images import file_shape, parse_crop, sha256
 from tetopt.io.label_tables import NO_TABLE, LabelTable
 from tetopt.io.stored_images import STORED_SUFFIXES, check_local, coarse_image, open_stored, stored_checksum
 from tetopt.job.events import note, progress, started, warning
-from tetopt.job.job import DEFAULT_NODES, PartsOptions
+from tetopt.job.options import DEFAULT_NODES, PartsOptions
 from tetopt.job.plan import Plan
 from tetopt.job.predict import cropped_shape
 from tetopt.job.source import Source

@@ -19,7 +19,7 @@ from tetopt.io.images import load_image, parse_crop, parse_slice, part_of, sha25
 from tetopt.io.label_tables import LabelTable, load_label_table
 from tetopt.io.meshes import load_mesh
 from tetopt.job.events import note, warning
-from tetopt.job.job import WHOLE_BOX, BoxPart, ImagePart, SourceOptions
+from tetopt.job.options import WHOLE_BOX, BoxPart, ImagePart, SourceOptions
 from tetopt.measure.fidelity import cell_labels
 from tetopt.model.file import MeshFile
 from tetopt.model.labels import NO_TABLE, labels_of

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from typing import Any, NamedTuple
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -28,10 +28,10 @@ from tetopt.geometry.simplex import squared_edges
 from tetopt.io.files import check_space
 from tetopt.job.events import note, progress, started
 from tetopt.job.in_parts import run_in_parts
-from tetopt.job.job import SolverOptions
 from tetopt.job.model import check_early
-from tetopt.job.read import Task
+from tetopt.job.options import SolverOptions
 from tetopt.job.source import Source
+from tetopt.job.task import Meshed, Task
 from tetopt.job.write import model_with
 from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields
@@ -48,16 +48,6 @@ ENDED_WORDS = {
     "max_gb": "no more memory is allowed: the mesh so far is kept",
     "stopped": "interrupted: the mesh so far is kept",
 }
-
-
-class Meshed(NamedTuple):
-    """What came of the optimisation."""
-
-    result: Optimized
-    initial: Mesh
-    seconds: dict[str, float]  # up to the optimisation, and of it
-    predicted_bytes: float  # of memory, at most, before it began; in parts of each worker's largest task
-    fields: dict[str, NDArray] | None  # of the cells, if they are known
 
 
 def meshed(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:

@@ -20,7 +20,7 @@ from tetopt.io.formats import FORMATS, file_bytes, format_of, save_mesh, save_mo
 from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.job.events import note, warning
 from tetopt.job.inputs import label_table
-from tetopt.job.job import ModelOptions, SolverOptions
+from tetopt.job.options import ModelOptions, SolverOptions
 from tetopt.mesh import Mesh
 from tetopt.model.averages import DEFAULT_AVERAGE, parse_average
 from tetopt.model.build import model_of

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from copy import copy
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -18,8 +17,8 @@ from tetopt.io.files import checked_output, results_folder
 from tetopt.io.formats import FORMATS
 from tetopt.io.images import parse_crop, parse_slice
 from tetopt.job.inputs import checked_outputs, number_of, read_companion, weights_of
-from tetopt.job.job import DEFAULT_NODES, Job, Method
 from tetopt.job.model import check_solver_options
+from tetopt.job.options import DEFAULT_NODES, JobOptions, Method
 from tetopt.start.lattice import KINDS
 from tetopt.start.octree import nodes_of_sizes
 from tetopt.start.sizes import Sizes
@@ -32,8 +31,8 @@ class Plan(NamedTuple):
     """A run without contradictions: options whose default does not depend on the image have their value."""
 
     mode: Mode
-    job: Job
-    asked: Job  # as it came, without defaults
+    job: JobOptions
+    bare: JobOptions  # as they came, without defaults
     n_parts: int | None = None  # at least so many, if it is made in parts
     pictures: Sequence[Path] = ()  # slice, rho, energies, with a mask its boundary, with labels these, last a thumbnail
 
@@ -72,11 +71,11 @@ class Plan(NamedTuple):
     def with_files(self, images: Sequence[Path], files: Mapping[str, Path]) -> Plan:
         """The same of other images and other files, as many and of the same options."""
         return self._replace(
-            job=changed(self.job, images=list(images), **files), asked=changed(self.asked, images=list(images), **files)
+            job=changed(self.job, images=list(images), **files), bare=changed(self.bare, images=list(images), **files)
         )
 
 
-def planned(job: Job) -> Plan:
+def planned(job: JobOptions) -> Plan:
     """The run that a job asks for.
 
     Raises
@@ -90,7 +89,7 @@ def planned(job: Job) -> Plan:
     return resolved(job)._replace(pictures=_pictures(job))
 
 
-def resolved(job: Job) -> Plan:
+def resolved(job: JobOptions) -> Plan:
     """The same without a look at any file.
 
     Raises
@@ -114,15 +113,12 @@ def resolved(job: Job) -> Plan:
     return Plan(mode, completed, job)
 
 
-def changed(job: Job, **values: Any) -> Job:
-    """The job with other values, which are those of a plan, and not looked at."""
-    other = copy(job)
-    for name, value in values.items():
-        object.__setattr__(other, name, value)
-    return other
+def changed(job: JobOptions, **values: Any) -> JobOptions:
+    """The options with other values, which are those of a plan, and not looked at."""
+    return JobOptions(**(vars(job) | values))
 
 
-def _check_source(job: Job) -> None:
+def _check_source(job: JobOptions) -> None:
     """InputError for what of mask and labels contradicts itself."""
     if job.mask is not None and job.background is not None:
         raise InputError("`mask` and `background`: give one of them")
@@ -134,7 +130,7 @@ def _check_source(job: Job) -> None:
                 raise InputError(f"`{name}`: there are no `labels`")
 
 
-def _check_numbers(job: Job) -> None:
+def _check_numbers(job: JobOptions) -> None:
     """InputError for numbers that are none of their options', whatever the image is."""
     tension = SMOOTH_INTERFACES if job.smooth_interfaces is None else job.smooth_interfaces
     check_weights(len(job.images), weights_of(job), job.label_weight or 0.0, tension)
@@ -153,7 +149,7 @@ def _check_numbers(job: Job) -> None:
     _limits(changed(job, sizing=None))
 
 
-def _mode(job: Job) -> Mode:
+def _mode(job: JobOptions) -> Mode:
     """Which of the four ways the options ask for; a graded mesh is the default."""
     numbers = {"`nodes`": job.nodes, "`spacing`": job.spacing, "`target_error`": job.target_error}
     if len(names := [name for name, value in numbers.items() if value is not None]) > 1:
@@ -182,7 +178,7 @@ def _mode(job: Job) -> Mode:
     return "uniform" if is_lattice else "graded"
 
 
-def _completed(job: Job, mode: Mode) -> Job:
+def _completed(job: JobOptions, mode: Mode) -> JobOptions:
     """The engine's options with the defaults of the mode; InputError where they cannot be."""
     k_D, iterations = MODE_DEFAULTS[mode]
     k_D = k_D if job.k_D is None else job.k_D
@@ -206,14 +202,14 @@ def _completed(job: Job, mode: Mode) -> Job:
     return changed(job, shape_power=shape_power, min_dihedral=min_dihedral)
 
 
-def _check_method(job: Job, method: Method, names: tuple[str, ...]) -> None:
+def _check_method(job: JobOptions, method: Method, names: tuple[str, ...]) -> None:
     """InputError for an option of the other method."""
     wrong = [name for name in names if getattr(job, name) is not None]
     if wrong and job.method != method:
         raise InputError(f"`{wrong[0]}`: only with `method` {method}, got `method` {job.method}")
 
 
-def _pictures(job: Job) -> list[Path]:
+def _pictures(job: JobOptions) -> list[Path]:
     """The pictures to draw, as far as they may be written."""
     if job.figures is None:
         return []
@@ -262,7 +258,7 @@ def _default_nodes(content: Content | StoredContent, limits: Sizes | None, many:
     return int(np.rint(many * corners))
 
 
-def _limits(job: Job) -> Sizes | None:
+def _limits(job: JobOptions) -> Sizes | None:
     """The limits on sizes, if the options ask for any."""
     field = None if job.sizing is None else read_companion(job.sizing)
     values = {

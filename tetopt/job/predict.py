@@ -16,7 +16,7 @@ from tetopt.image import VoxelGrid
 from tetopt.io.images import file_shape, load_image, parse_crop, parse_slice
 from tetopt.io.zarr_images import is_zarr
 from tetopt.job.inputs import file_and_volume
-from tetopt.job.job import DEFAULT_NODES
+from tetopt.job.options import DEFAULT_NODES
 from tetopt.job.plan import Plan
 from tetopt.target.content import Content, StoredContent
 

@@ -2,40 +2,21 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
-
 import numpy as np
 
-from tetopt.engine.cost import RunSize
 from tetopt.errors import InputError
 from tetopt.geometry.box import box_sides
 from tetopt.geometry.simplex import centroids
 from tetopt.image import Image
 from tetopt.io.formats import format_of
 from tetopt.job.events import warning
-from tetopt.job.in_parts import StoredSource, is_left_stored, read_stored
+from tetopt.job.in_parts import is_left_stored, read_stored
 from tetopt.job.inputs import label_table, read_mesh
 from tetopt.job.plan import Plan, with_numbers
 from tetopt.job.predict import size_of_run
-from tetopt.job.source import Source, read_source
+from tetopt.job.source import read_source
+from tetopt.job.task import Task
 from tetopt.mesh import Mesh
-from tetopt.model.file import MeshFile
-from tetopt.start.sizes import Sizes
-
-
-class Task(NamedTuple):
-    """What a run works on: the plan, and the files that it names, as read."""
-
-    plan: Plan
-    source: Source | StoredSource
-    started: MeshFile | None  # the mesh to start from
-    sizes: Sizes | None
-    size: RunSize  # by which time and memory are predicted
-
-    @property
-    def start_name(self) -> str:
-        """What the initial mesh is called."""
-        return {"graded": "octree", "start": "start"}.get(self.plan.mode, "lattice")
 
 
 def read(plan: Plan) -> Task:

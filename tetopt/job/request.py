@@ -12,7 +12,7 @@ from typing import Any
 import tetopt
 from tetopt.io.images import sha256
 from tetopt.job.inputs import file_and_volume
-from tetopt.job.job import Job, OutputOptions, PartsOptions, given_options, kinds_of, option_name
+from tetopt.job.options import JobOptions, OutputOptions, PartsOptions, given_options, kinds_of, option_name
 from tetopt.model.laws import LAW_OPTIONS, law_file
 
 # Options on which no output depends: names of outputs, threads, and who works on parts.
@@ -22,7 +22,7 @@ WITHOUT_SAY = (
 )
 
 
-def requested(job: Job) -> dict[str, Any]:
+def requested(job: JobOptions) -> dict[str, Any]:
     """What decides the outputs of a run: options, the files' names and checksums, the version.
 
     Names of outputs and of folders are no part of it, nor is the number of threads, nor who works on parts.
@@ -38,7 +38,7 @@ def requested(job: Job) -> dict[str, Any]:
     InputError
         A file is missing, or may not be read.
     """
-    kinds = kinds_of(Job)
+    kinds = kinds_of(JobOptions)
     left_out = {option_name(name, kinds[name]) for name in WITHOUT_SAY}
     options = {name: value for name, value in given_options(job).items() if name not in left_out}
     files = {name: each for name in list(options) if (each := _files(name, options[name]))}

@@ -15,10 +15,11 @@ from tetopt.job.events import Listener, listened, started, violated
 from tetopt.job.in_parts import end_work, with_parts
 from tetopt.job.inputs import set_threads
 from tetopt.job.job import Job
-from tetopt.job.meshing import Meshed, meshed
+from tetopt.job.meshing import meshed
 from tetopt.job.plan import planned
-from tetopt.job.read import Task, read
-from tetopt.job.write import Shapes, draw, measured_of, numbers_of, saved
+from tetopt.job.read import read
+from tetopt.job.task import Meshed, Shapes, Task
+from tetopt.job.write import draw, measured_of, numbers_of, saved
 from tetopt.measure.quality import quality
 from tetopt.mesh import Mesh
 from tetopt.model.model import Model
@@ -141,10 +142,10 @@ def _judged(result: Result, failed: dict[str, str]) -> list[str]:
     if task.source.is_constant:
         measured = {**measured, "cells_without_voxel": 0}  # whose values are right all the same
     job, mode = task.plan.job, task.plan.mode
-    asked = job.nodes if mode == "graded" and job.target_error is None else None
+    expected = job.nodes if mode == "graded" and job.target_error is None else None
     n_nodes = node_count(result.model.mesh.points, result.model.mesh.cells, result.model.order)
     spacing = task.source.contrasts[0].spacing
-    warn_of_result(came.result, job.method, mode, n_nodes, asked, measured, spacing)
+    warn_of_result(came.result, job.method, mode, n_nodes, expected, measured, spacing)
     if task.sizes is not None and (edges := result.shapes[1]) is not None:
         warn_of_sizes(task.sizes, edges.min_edge, edges.max_edge, measured.get("edges_over_target"))
     return problems

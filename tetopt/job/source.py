@@ -14,7 +14,7 @@ from tetopt.io.images import sha256
 from tetopt.io.label_tables import NO_TABLE, LabelTable
 from tetopt.job.events import note
 from tetopt.job.inputs import file_and_volume, image_and_others, label_table, number_of, weights_of
-from tetopt.job.job import SourceOptions
+from tetopt.job.options import SourceOptions
 from tetopt.measure.fidelity import cell_labels
 from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields

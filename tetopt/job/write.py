@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from functools import partial
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,7 +17,6 @@ from tetopt.io.files import TakenError
 from tetopt.job.events import note
 from tetopt.job.in_parts import StoredSource
 from tetopt.job.inputs import label_table
-from tetopt.job.job import SolverOptions
 from tetopt.job.model import (
     all_sets,
     drop_early,
@@ -27,12 +26,12 @@ from tetopt.job.model import (
     solver_model,
     with_chosen_sets,
 )
+from tetopt.job.options import SolverOptions
 from tetopt.job.plan import changed
 from tetopt.job.predict import stated_prediction
-from tetopt.job.read import Task
 from tetopt.job.request import requested
 from tetopt.job.source import Source
-from tetopt.measure.quality import Quality
+from tetopt.job.task import Meshed, Shapes, Task
 from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields, is_result
 from tetopt.model.labels import TABLE_TEXT, LabelTable, coloured, table_of_labels, table_words
@@ -41,12 +40,6 @@ from tetopt.model.sets import Sets, box_of, label_set_names, surviving_sets
 from tetopt.report.summary import fidelity, image_summary, measured_each, run_summary
 from tetopt.start.octree import nodes_of_sizes
 from tetopt.start.sizes import edge_ratios
-
-if TYPE_CHECKING:
-    from tetopt.job.meshing import Meshed
-
-Shapes = tuple[Quality | None, Quality | None]
-"""Of the initial mesh and of the result, if they could be measured."""
 
 
 def model_with(
@@ -147,7 +140,7 @@ def numbers_of(
     summary = run_summary(source.content, came.initial, came.result, texts, {**came.seconds, "all": seconds}, shapes)
     if isinstance(source, Source) and source.image is not source.content.image:
         summary["image_properties"] = image_summary(source.image)  # on its own voxels, not on divided ones
-    summary["request"] = requested(changed(task.plan.asked, parts=task.plan.n_parts))
+    summary["request"] = requested(changed(task.plan.bare, parts=task.plan.n_parts))
     summary["memory"] = {"peak_bytes": peak_bytes()}
     if task.plan.n_parts is None:
         summary["prediction"] = stated_prediction(task.size)
