@@ -26,10 +26,11 @@ import tetopt.cli.phantom
 import tetopt.engine.meshing
 from tetopt import Image, Mesh, lattice, load_image, load_mesh, load_phantom, quality, save_image, save_mesh
 from tetopt.cli.app import COMMANDS, loaded_command
-from tetopt.cli.console import show_error
-from tetopt.cli.promises import check_promises
+from tetopt.cli.console import show_error, show_event
 from tetopt.engine.loop import Optimized
 from tetopt.geometry.simplex import volumes
+from tetopt.job.advice import tell_violated
+from tetopt.job.events import listened
 from tetopt.measure.segmentation import dice, segmented
 from tetopt.phantom import phantom_names
 from tetopt.report.summary import mesh_hash
@@ -346,12 +347,13 @@ def test_max_seconds_leaves_a_valid_mesh(tmp_path, inputs, capsys):
     assert "out of time: the mesh so far is kept" in capsys.readouterr().err
 
 
-def test_a_promise_that_is_missed_ends_with_1(capsys):
+def test_what_is_violated_is_told_in_the_commands_options(capsys):
     result = Optimized(None, [], "iterations")
-    assert check_promises(result, {}) == 0
-    assert capsys.readouterr().err == ""
-    missed = {"floor": "2 of 9 cells; allow a lower k_D, or a lower min_dihedral", "box": "k_D.nii lies beyond"}
-    assert check_promises(result._replace(missed=missed), {}) == 1
+    missed = {"floor": "2 of 9 cells; allow a lower `k_D`, or a lower `min_dihedral`", "box": "k_D.nii lies beyond"}
+    with listened(show_event):
+        assert tell_violated(result, {}) == []
+        assert capsys.readouterr().err == ""
+        assert tell_violated(result._replace(missed=missed), {}) == list(missed.values())
     said = capsys.readouterr().err
     assert said == (
         "tetopt: 2 of 9 cells; allow a lower --k-d, or a lower --min-dihedral\ntetopt: k_D.nii lies beyond\n"
@@ -401,7 +403,7 @@ def test_a_second_ctrl_c_gives_up(tmp_path, inputs, monkeypatch, capsys):
         assert stop()
         signal.raise_signal(signal.SIGINT)
 
-    monkeypatch.setattr(tetopt.cli.mesh, "prepare", lambda *_: None)
+    monkeypatch.setattr(tetopt.job.meshing, "prepare", lambda *_: None)
     monkeypatch.setattr(tetopt.engine.meshing, "optimize", functools.wraps(tetopt.engine.meshing.optimize)(impatient))
     before = signal.getsignal(signal.SIGINT)
     assert exit_code("mesh", inputs / "disc.nii", "-o", tmp_path / "a.vtu") == 130
@@ -418,7 +420,7 @@ def test_ctrl_c_while_reading(tmp_path, inputs, monkeypatch):
     def interrupted(*_, **__):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(tetopt.cli.inputs, "load_image", interrupted)
+    monkeypatch.setattr(tetopt.job.inputs, "load_image", interrupted)
     assert exit_code("mesh", inputs / "disc.nii", "-o", tmp_path / "a.vtu") == 130
     assert list(tmp_path.iterdir()) == []
 
@@ -520,7 +522,7 @@ def test_bad_inputs(tmp_path, inputs, monkeypatch, capfd, arguments, match):
 
 @pytest.mark.parametrize("name", ["a.vtu", "a.json"])
 def test_existing_outputs_are_refused_before_the_work(tmp_path, inputs, monkeypatch, capfd, name):
-    monkeypatch.setattr(tetopt.cli.inputs, "load_image", None)  # a call would fail
+    monkeypatch.setattr(tetopt.job.inputs, "load_image", None)  # a call would fail
     (tmp_path / name).write_text("old")
     command = mesh_words(inputs / "sphere.nii.gz", tmp_path)
     assert_refused(capfd, command, f"{name}: exists already; pass --force")
@@ -562,7 +564,7 @@ def test_the_checksum_is_of_what_was_read(tmp_path, inputs, monkeypatch):
         (tmp_path / "disc.nii").unlink()
         return tetopt.optimize(*arguments, **options)
 
-    monkeypatch.setattr(tetopt.cli.mesh, "prepare", lambda *_: None)
+    monkeypatch.setattr(tetopt.job.meshing, "prepare", lambda *_: None)
     monkeypatch.setattr(tetopt.engine.meshing, "optimize", slow)
     command = ["mesh", tmp_path / "disc.nii", "-o", tmp_path / "a.vtu", "--nodes", "30", "--iterations", "1"]
     assert exit_code(*command) == 0

@@ -17,7 +17,7 @@ import tetopt
 import tetopt.cli.mesh
 import tetopt.cli.phantom
 import tetopt.cli.run
-import tetopt.cli.source
+import tetopt.job.source
 import tetopt.report.summary
 from tetopt.cli.ending import is_ended, mesh_kept, signal_code, signals_heard
 
@@ -67,7 +67,7 @@ def test_a_signal_leaves_the_mesh_reached(image, folder, monkeypatch, capsys, si
     def told(_):
         yield lambda row: signal.raise_signal(number) if row.iteration == 1 else None
 
-    monkeypatch.setattr(tetopt.cli.run, "_progress", told)
+    monkeypatch.setattr(tetopt.cli.run, "_bar", told)
     before = signal.getsignal(number)
     assert exit_code(*mesh_words(image, folder, *QUICK, "--iterations", "200")) == 128 + number
     assert signal.getsignal(number) is before
@@ -81,13 +81,13 @@ def test_a_signal_leaves_the_mesh_reached(image, folder, monkeypatch, capsys, si
 
 @NEEDS_SIGNALS
 def test_a_signal_while_the_mesh_is_written_waits_for_it(image, folder, monkeypatch):
-    save = tetopt.cli.mesh.save_for_solver
+    save = tetopt.job.write.save_for_solver
 
     def interrupted(*arguments):
         signal.raise_signal(signal.SIGTERM)
         save(*arguments)
 
-    monkeypatch.setattr(tetopt.cli.mesh, "save_for_solver", interrupted)
+    monkeypatch.setattr(tetopt.job.write, "save_for_solver", interrupted)
     assert exit_code(*mesh_words(image, folder, *QUICK)) == 143
     assert names_in(folder) == ["a.json", "a.vtu"]
 
@@ -231,7 +231,7 @@ def test_a_mesh_whose_file_fails_is_kept(image, folder, monkeypatch, capsys, err
     def failing(*_):
         raise error
 
-    monkeypatch.setattr(tetopt.cli.mesh, "save_for_solver", failing)
+    monkeypatch.setattr(tetopt.job.write, "save_for_solver", failing)
     command = ["mesh", image, "-o", folder / "a.inp", *QUICK]
     if isinstance(error, KeyError):  # a fault of ours, which is not hidden
         with pytest.raises(KeyError):
@@ -244,7 +244,7 @@ def test_a_mesh_whose_file_fails_is_kept(image, folder, monkeypatch, capsys, err
 
 def test_a_mesh_whose_folder_has_gone_is_kept_elsewhere(image, folder, tmp_path, monkeypatch, capsys):
     """Whatever else fails: the model of the mesh, then the mesh beside its name."""
-    save = tetopt.cli.mesh.save_for_solver
+    save = tetopt.job.write.save_for_solver
 
     def gone(*arguments):
         shutil.rmtree(folder)
@@ -252,7 +252,7 @@ def test_a_mesh_whose_folder_has_gone_is_kept_elsewhere(image, folder, tmp_path,
 
     (tmp_path / "tmp").mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "tmp"))
-    monkeypatch.setattr(tetopt.cli.mesh, "save_for_solver", gone)
+    monkeypatch.setattr(tetopt.job.write, "save_for_solver", gone)
     assert exit_code("mesh", image, "-o", folder / "a.vtu", *QUICK) == 2
     (kept,) = (tmp_path / "tmp").rglob("*.vtu")
     said = capsys.readouterr().err.splitlines()
@@ -264,13 +264,13 @@ def test_a_mesh_whose_folder_has_gone_is_kept_elsewhere(image, folder, tmp_path,
 
 
 def test_an_output_that_came_meanwhile_stays(image, folder, monkeypatch, capsys):
-    save = tetopt.cli.mesh.save_for_solver
+    save = tetopt.job.write.save_for_solver
 
     def raced(*arguments):
         (folder / "a.vtu").write_text("theirs")
         save(*arguments)
 
-    monkeypatch.setattr(tetopt.cli.mesh, "save_for_solver", raced)
+    monkeypatch.setattr(tetopt.job.write, "save_for_solver", raced)
     assert exit_code("mesh", image, "-o", folder / "a.vtu", *QUICK) == 2
     assert (folder / "a.vtu").read_text() == "theirs"
     assert f"is in {folder / 'a_kept_1.vtu'}" in capsys.readouterr().err
@@ -281,7 +281,7 @@ def test_what_was_written_before_an_error_is_said(image, folder, monkeypatch, ca
     def full(*_):
         raise OSError(28, "No space left on device", str(folder / "a.json"))
 
-    monkeypatch.setattr(tetopt.cli.mesh, "save_json", full)
+    monkeypatch.setattr(tetopt.job.run, "save_json", full)
     assert exit_code(*mesh_words(image, folder, *QUICK)) == 2
     said = capsys.readouterr().err.splitlines()
     assert said[-2:] == [
@@ -291,13 +291,13 @@ def test_what_was_written_before_an_error_is_said(image, folder, monkeypatch, ca
 
 def test_a_mesh_that_the_disk_cannot_take_is_refused_before_the_run(image, folder, monkeypatch, capsys):
     monkeypatch.setattr("shutil.disk_usage", lambda _: shutil._ntuple_diskusage(10**9, 10**9, 5000))
-    monkeypatch.setattr(tetopt.cli.mesh, "watched_run", None)
+    monkeypatch.setattr(tetopt.job.meshing, "watched", None)
     assert exit_code("mesh", image, "-o", folder / "a.vtu", *QUICK) == 2
     assert "a.vtu: takes some 8640 bytes or more, 5000 are free; make room first" in capsys.readouterr().err
 
 
 def test_numbers_that_fail_lose_no_mesh(image, folder, monkeypatch):
-    monkeypatch.setattr(tetopt.cli.mesh, "run_summary", failing(MemoryError()))
+    monkeypatch.setattr(tetopt.job.write, "run_summary", failing(MemoryError()))
     assert exit_code(*mesh_words(image, folder, *QUICK)) == 2
     assert names_in(folder) == ["a.vtu"]
 
@@ -317,15 +317,15 @@ def failing(error):
 
 ERRORS = [MemoryError(), IndexError("index 7 is out of bounds"), tetopt.InputError("mesh: too flat")]
 MEASURES = {  # where each is called, and its keys in run.json
-    "quality": (tetopt.cli.mesh, {"quality_initial", "quality"}),
-    "edge_ratios": (tetopt.cli.mesh, {"edges_over_target"}),
-    "nodes_of_sizes": (tetopt.cli.mesh, {"nodes_of_sizes"}),
-    "crowded_nodes": (tetopt.cli.mesh, {"nodes_of_many_labels"}),
+    "quality": (tetopt.job.run, {"quality_initial", "quality"}),
+    "edge_ratios": (tetopt.job.write, {"edges_over_target"}),
+    "nodes_of_sizes": (tetopt.job.write, {"nodes_of_sizes"}),
+    "crowded_nodes": (tetopt.job.write, {"nodes_of_many_labels"}),
     "mask_fidelity": (tetopt.report.summary, {"mask"}),
     "label_fidelity": (tetopt.report.summary, {"labels"}),
     "label_interfaces": (tetopt.report.summary, {"interfaces"}),
-    "by_contrast": (tetopt.cli.source.Source, {"contrasts"}),
-    "fields": (tetopt.cli.source.Source, {"cells_without_voxel"}),
+    "by_contrast": (tetopt.job.source.Source, {"contrasts"}),
+    "fields": (tetopt.job.source.Source, {"cells_without_voxel"}),
 }
 
 
@@ -338,7 +338,7 @@ def measured_run(tmp_path_factory):
         tetopt.save_image(folder / f"{name}.nii", tetopt.Image(1.0 * values, image.affine))
     words = ["mesh", folder / "a.nii", "--labels", folder / "l.nii", "--mask", folder / "m.nii", "--size-max", "9"]
     words += ["--nodes", "60", "--iterations", "3"]
-    real, once = tetopt.cli.mesh.mesh_image, []
+    real, once = tetopt.job.meshing.mesh_image, []
 
     def remembered(*arguments, watch, **options):
         if once:  # what is said and checked before goes on in each run
@@ -348,7 +348,7 @@ def measured_run(tmp_path_factory):
         return once[0]
 
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(tetopt.cli.mesh, "mesh_image", remembered)
+        patch.setattr(tetopt.job.meshing, "mesh_image", remembered)
         code = exit_code(*words, "-o", folder / "a.vtu", "--json", folder / "a.json")
         numbers = numbers_in(folder / "a.json")
         assert numbers["failed"] == {}
@@ -385,9 +385,9 @@ def test_a_measure_that_fails_is_a_line(measured_run, folder, monkeypatch, capsy
 
 KILLED = """
 import os, sys
-import tetopt.cli.source
+import tetopt.job.source
 from tetopt.cli import main
-tetopt.cli.source.Source.fields = lambda *_: os.kill(os.getpid(), 9)
+tetopt.job.source.Source.fields = lambda *_: os.kill(os.getpid(), 9)
 main(sys.argv[1:])
 """
 

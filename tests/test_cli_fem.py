@@ -10,9 +10,9 @@ from models import sample_image, sample_model
 
 import tetopt
 from tetopt.cli.app import main
-from tetopt.cli.options import ModelOptions
 from tetopt.fem.solution import solution_fields, solved_model
 from tetopt.io.formats import save_model
+from tetopt.job.options import ModelOptions
 from tetopt.model.build import model_of
 from tetopt.model.loads import parse_loads
 

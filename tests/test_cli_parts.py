@@ -9,8 +9,8 @@ from commands import assert_refused, exit_code
 
 import tetopt
 from tetopt import load_mesh
-from tetopt.cli import parts as cli_parts
 from tetopt.io.images import load_image, save_image
+from tetopt.job import in_parts
 from tetopt.model.fields import cell_fields
 from tetopt.parts.work import save_volume
 
@@ -66,7 +66,7 @@ def test_stored_images_are_meshed_as_those_in_memory(tmp_path, inputs, monkeypat
     """Left in its file and read whole, on one worker and on two: the same mesh, and the same numbers of its cells."""
     command = ["mesh", inputs / "ball.nii", "--nodes", 300, "--parts", 2, "--iterations", 3]
     assert exit_code(*command, "-o", tmp_path / "a.vtu", "--json", tmp_path / "a.json", "--workers", 1) == 0
-    monkeypatch.setattr(cli_parts, "MOST_LOADED", 0)
+    monkeypatch.setattr(in_parts, "MOST_LOADED", 0)
     files = ["-o", tmp_path / "b.vtkhdf", "--json", tmp_path / "b.json"]
     assert exit_code(*command, *files, "--workers", 2, "--worker-gb", 2, "--young", "2 + 0.01*h") == 0
     one, other = (json.loads((tmp_path / name).read_text()) for name in ("a.json", "b.json"))
@@ -86,13 +86,13 @@ def test_stored_images_are_meshed_as_those_in_memory(tmp_path, inputs, monkeypat
 
 
 def test_images_beyond_the_memory_are_meshed_in_parts(tmp_path, inputs, monkeypatch, capfd):
-    monkeypatch.setattr(cli_parts, "available_bytes", lambda: 1000)
+    monkeypatch.setattr(in_parts, "available_bytes", lambda: 1000)
     chosen = []
-    monkeypatch.setattr("tetopt.cli.mesh.run_in_parts", lambda *arguments: chosen.append(arguments) or 1 / 0)
+    monkeypatch.setattr("tetopt.job.meshing.run_in_parts", lambda *arguments: chosen.append(arguments) or 1 / 0)
     with pytest.raises(ZeroDivisionError):
         exit_code("mesh", inputs / "ball.nii", "-o", tmp_path / "a.vtu", "--nodes", 300)
     assert "in one piece it would take" in capfd.readouterr().err
-    assert chosen[0][3].parts == 1  # as run.json's request has it
+    assert chosen[0][0].n_parts == 1  # as run.json's request has it
     # What parts do not do is tried in one piece, as ever: the bound on its memory is a rough one.
     assert exit_code("mesh", inputs / "ball.nii", "-o", tmp_path / "a.vtu", "--nodes", 300, "--order", 2) == 0
 
@@ -134,7 +134,7 @@ def test_what_was_refused_leaves_nothing_and_stands_in_no_way(tmp_path, inputs, 
     ]:
         assert_refused(capfd, [*command, *more], match)
         assert list(tmp_path.iterdir()) == []
-    monkeypatch.setattr(cli_parts, "prepare_kernels", lambda *_, **__: None)
+    monkeypatch.setattr(in_parts, "prepare_kernels", lambda *_, **__: None)
     assert exit_code(*command, "--worker-gb", 0.3) == 2
     assert "tetopt: a part needs about 1." in capfd.readouterr().err
     assert list(tmp_path.iterdir()) == []
@@ -185,7 +185,7 @@ def test_what_lies_in_the_work_directory_and_is_not_tetopts_stays(tmp_path, inpu
 
 def test_a_file_that_comes_into_the_work_directory_during_the_run_stays(tmp_path, inputs, monkeypatch, capfd):
     folder = tmp_path / "a.vtu.work"
-    monkeypatch.setattr(cli_parts, "prepare_kernels", lambda *_, **__: (folder / "note.txt").write_text("mine"))
+    monkeypatch.setattr(in_parts, "prepare_kernels", lambda *_, **__: (folder / "note.txt").write_text("mine"))
     assert exit_code("mesh", inputs / "ball.nii.gz", *OF_TWO, "-o", tmp_path / "a.vtu") == 0
     assert "a.vtu.work: stays with what is not tetopt's in it: note.txt" in capfd.readouterr().err
     assert content(folder) == {"note.txt": b"mine"}

@@ -22,6 +22,8 @@ from tetopt.engine.loop import Optimized, Record
 from tetopt.engine.meshing import bytes_of
 from tetopt.fem.elasticity import stiffness
 from tetopt.fem.reference import reference
+from tetopt.job.events import listened, started
+from tetopt.job.meshing import prepare, watched
 from tetopt.start.octree import _block_limits, _blocks_by_depth
 from tetopt.start.sums import channels_of, source_of
 from tetopt.target.content import content, plain
@@ -148,7 +150,7 @@ def test_a_run_ends_before_the_limit_with_the_mesh_reached(tmp_path, monkeypatch
     assert 0 < numbers["memory"]["peak_bytes"]
     assert 0 < numbers["memory"]["predicted_bytes"]
     now = budget.resident_bytes
-    monkeypatch.setattr("tetopt.cli.mesh.check_memory_of", lambda *_: None)
+    monkeypatch.setattr("tetopt.job.meshing.check_memory_of", lambda *_: None)
     monkeypatch.setattr(budget.MemoryLimit, "is_reached", lambda self: now() > self.n_bytes)
     capsys.readouterr()
     exit_code(*words, "--max-gb", "0.001")
@@ -200,13 +202,10 @@ def test_compiling_and_long_iterations_are_told(monkeypatch):
     monkeypatch.setattr(cli_run.log, "print", lines.append)
     monkeypatch.setattr(cli_run.time, "perf_counter", lambda: clock[0])
 
-    def prepare_kernels(*arguments):
-        arguments[-1]("compiling the kernels, 1 of 57")
+    def make(say):
+        say("compiling the kernels, 1 of 57")
         assert lines == ["compiling the kernels, 1 of 57 (of the first run only), 0 s"]
 
-    monkeypatch.setattr(cli_run, "prepare_kernels", prepare_kernels)
-    cli_run.prepare(plain(IMAGE), 0.5, "graded")
-    lines.clear()
     rows = [Record(number, 1.0 - 0.1 * number, 2.0, 1.0, 0.1, False, 48, 504, 3.0) for number in (0, 1)]
 
     def optimized(max_seconds, callback, stop):
@@ -217,7 +216,11 @@ def test_compiling_and_long_iterations_are_told(monkeypatch):
         callback(rows[1])
         return Optimized(LATTICE, rows, "iterations")
 
-    cli_run.watched_run(optimized, LATTICE, 1, None)
+    with cli_run.Display(lambda: None) as display, listened(display):
+        prepare(make)
+        lines.clear()
+        started("optimise", "optimising", 1)
+        watched(optimized, LATTICE, 1, None, display.is_over)
     memory = r"\d+(\.\d+)? [GM]B"
     assert len(lines) == 3
     assert re.fullmatch(rf"iteration   0/1  E 1\.0000  E_G 1.* cells  3\.0 s, ({memory})", lines[0])
@@ -236,7 +239,11 @@ def test_commands_hear_how_compiling_goes(command, monkeypatch, capsys):
         raise Linked
 
     monkeypatch.setattr(fast if command == "mesh" else warm_up, "link", link)
-    run = {"mesh": lambda: cli_run.prepare(plain(IMAGE), 0.5, "graded"), "warm-up": warm_up.warm_up_command}[command]
+
+    def mesh():
+        with cli_run.Display(lambda: None) as display, listened(display):
+            prepare(lambda say: fast.prepare_kernels(plain(IMAGE), 0.5, is_graded=True, progress=say))
+
     with pytest.raises(Linked):
-        run()
+        mesh() if command == "mesh" else warm_up.warm_up_command()
     assert "compiling the kernels, 1 of 2 (of the first run only)" in capsys.readouterr().err

@@ -186,12 +186,12 @@ def _ends_children():
 
     import tetopt
     from tetopt.study.child import run_in_child
-    from tetopt.study.pipelines import Job
+    from tetopt.study.pipelines import PipelineInput
 
     Path("taskkill").write_text('#!/bin/sh\necho "$@" > ended.txt\nkill -9 "$4"\n', encoding="utf-8")
     Path("taskkill").chmod(0o755)
     os.environ["PATH"] = os.pathsep.join((os.getcwd(), os.environ["PATH"]))
-    outcome = run_in_child(_asleep, Job(tetopt.Image(np.zeros((4, 4)), np.eye(3)), None, 10), max_seconds=0.5)
+    outcome = run_in_child(_asleep, PipelineInput(tetopt.Image(np.zeros((4, 4)), np.eye(3)), None, 10), max_seconds=0.5)
     return int(outcome.reason != "limit" or not Path("ended.txt").read_text(encoding="utf-8").startswith("/F /T /PID"))
 
 

@@ -30,6 +30,9 @@ if TYPE_CHECKING:
     from tetopt.io.meshes import load_mesh
     from tetopt.io.stored_images import open_stored
     from tetopt.io.surfaces import save_surface
+    from tetopt.job.events import Event
+    from tetopt.job.job import Job
+    from tetopt.job.run import Result, run
     from tetopt.measure.fidelity import LabelFidelity, MaskFidelity, cell_labels, label_fidelity, mask_fidelity
     from tetopt.measure.interfaces import LabelInterface, label_interfaces
     from tetopt.measure.quality import Quality, QualityErrors, quality
@@ -73,6 +76,9 @@ _NAMES_OF = {  # by module
     "io.meshes": ("load_mesh",),
     "io.stored_images": ("open_stored",),
     "io.surfaces": ("save_surface",),
+    "job.events": ("Event",),
+    "job.job": ("Job",),
+    "job.run": ("Result", "run"),
     "measure.fidelity": ("LabelFidelity", "MaskFidelity", "cell_labels", "label_fidelity", "mask_fidelity"),
     "measure.interfaces": ("LabelInterface", "label_interfaces"),
     "measure.quality": ("Quality", "QualityErrors", "quality"),
@@ -104,8 +110,10 @@ __all__ = [
     "ByLabel",
     "CellMoments",
     "Content",
+    "Event",
     "Image",
     "InputError",
+    "Job",
     "LabelFidelity",
     "LabelInterface",
     "LabelTable",
@@ -120,6 +128,7 @@ __all__ = [
     "Quality",
     "QualityErrors",
     "Record",
+    "Result",
     "Results",
     "Sets",
     "Shape",
@@ -157,6 +166,7 @@ __all__ = [
     "optimize_paper",
     "quality",
     "read_frd",
+    "run",
     "save_image",
     "save_mesh",
     "save_model",

@@ -1,6 +1,7 @@
-"""The one exception for everything the user can fix, and warnings that name the user's own line."""
+"""The one exception for everything the user can fix, errors in words, warnings that name the user's own line."""
 
 import inspect
+import os
 import warnings
 
 
@@ -25,3 +26,12 @@ def warn(message: str) -> None:
     while frame is not None and frame.f_globals.get("__name__", "").partition(".")[0] == "tetopt":
         n_inside, frame = n_inside + 1, frame.f_back
     warnings.warn(message, stacklevel=n_inside + 1)
+
+
+def error_words(error: Exception) -> str:
+    """What went wrong: of a file with its name first, of memory with what was to be laid out."""
+    if isinstance(error, MemoryError):
+        return f"not enough memory: {error}".removesuffix(": ") + "; take fewer nodes, a part of the image or `max_gb`"
+    if isinstance(error, OSError) and error.filename is not None:
+        return f"{os.fsdecode(error.filename)}: {error.strerror}"
+    return str(error)

@@ -11,11 +11,11 @@ from pathlib import Path
 from tetopt.budget import resident_bytes
 from tetopt.cluster.crew import Folders, Need
 from tetopt.cluster.workers import workers
-from tetopt.cohort.run import Ended, Job
+from tetopt.cohort.run import Ended, SubjectTask
 from tetopt.cohort.schedule import run_all
 
 
-def nothing(job: Job) -> Ended:
+def nothing(job: SubjectTask) -> Ended:
     return Ended(job.key, "done", "", 0.0, 0)
 
 
@@ -23,7 +23,9 @@ def main(n_subjects: int) -> None:
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         words = ("--nodes=100000", "--iterations=20", "--", f"{folder}/a-usual-name-of-an-image_T1w.nii.gz")
-        jobs = [Job(f"sub-{k:06d}", words, str(folder), ".vtu", 1, 1.0, 1.0, "run-1") for k in range(n_subjects)]
+        jobs = [
+            SubjectTask(f"sub-{k:06d}", words, str(folder), ".vtu", 1, 1.0, 1.0, "run-1") for k in range(n_subjects)
+        ]
         with workers(Need(n_subjects, 1.0, 1), Folders(folder, folder), count=2, scheduler=None, cluster=None) as crew:
             list(run_all(jobs[:100], crew.client, crew.slots, crew.bytes, task=nothing))  # what is imported once
             for part in range(1, 5):

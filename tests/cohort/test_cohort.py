@@ -20,19 +20,12 @@ import tetopt
 from tetopt.cli import cohort as cohort_module
 from tetopt.cli import cohort_plan
 from tetopt.cli.cohort import Estimate
-from tetopt.cli.options import (
-    CohortOptions,
-    ContentOptions,
-    EngineOptions,
-    Records,
-    SizeOptions,
-    SolverOptions,
-    StartOptions,
-)
+from tetopt.cli.options import CohortOptions
 from tetopt.cohort.layout import begin, description, locked
 from tetopt.cohort.state import State
 from tetopt.cohort.subjects import read_table
 from tetopt.engine.cost import Prediction
+from tetopt.job.options import RunOptions
 
 COMMON = ("--iterations", "1", "--nodes", "60")
 N_SUBJECTS = 12
@@ -257,8 +250,8 @@ def test_words_of_a_run_mean_the_same_in_any_folder(small, monkeypatch):
     """A worker of a scheduler that others started may be in another one."""
     (small / "law.csv").write_text("intensity,young\n0,1\n100,5\n")
     monkeypatch.chdir(small)
-    records = Records(ContentOptions(), SizeOptions(), StartOptions(), EngineOptions(), SolverOptions(young="law.csv"))
-    (entry, _) = cohort_plan.entries_of(read_table(Path("t.tsv")), records, small / "out", ".vtu", print)
+    options = RunOptions(young="law.csv")
+    (entry, _) = cohort_plan.entries_of(read_table(Path("t.tsv")), options, small / "out", ".vtu", print)
     assert entry.words() == ("--nodes=60", f"--young={small / 'law.csv'}", "--", str(small / "a.nii.gz"))
 
 
@@ -294,12 +287,11 @@ def test_each_subject_has_files_of_its_own(small, monkeypatch):
     monkeypatch.chdir(small)
     for name in ("s1.nii", "s2.nii", "m1.nii", "m2.nii"):
         (small / name).write_bytes(b"1")
-    content, sizes = ContentOptions(mask=Path("m{subject}.nii")), SizeOptions(sizing=Path("s{subject}.nii"))
-    records = Records(content, sizes, StartOptions(), EngineOptions(threads=2), SolverOptions())
+    options = RunOptions(mask=Path("m{subject}.nii"), sizing=Path("s{subject}.nii"), threads=2)
     (small / "t.tsv").write_text("subject\timage\tmask\n1\ta.nii.gz\t\n2\ta.nii.gz\ts1.nii\n")
-    first, second = cohort_plan.entries_of(read_table(Path("t.tsv")), records, small / "out", ".vtu", print)
-    assert [each.plan.sizes.sizing for each in (first, second)] == [small / "s1.nii", small / "s2.nii"]
-    assert [each.source.mask for each in (first, second)] == [small / "m1.nii", small / "s1.nii"]
+    first, second = cohort_plan.entries_of(read_table(Path("t.tsv")), options, small / "out", ".vtu", print)
+    assert [each.plan.job.sizing for each in (first, second)] == [small / "s1.nii", small / "s2.nii"]
+    assert [each.plan.job.mask for each in (first, second)] == [small / "m1.nii", small / "s1.nii"]
     assert second.words() == (
         f"--mask={small / 's1.nii'}", f"--sizing={small / 's2.nii'}", "--", str(small / "a.nii.gz")
     )  # fmt: skip

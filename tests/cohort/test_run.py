@@ -12,7 +12,7 @@ from commands import exit_code, numbers_in
 
 import tetopt
 from tetopt.cohort.layout import begin, description, failure_path, log_path, numbers_path, subject_folder
-from tetopt.cohort.run import Job, _reason, run_subject
+from tetopt.cohort.run import SubjectTask, _reason, run_subject
 
 WORDS = ("--nodes=60", "--iterations=1", "--")
 
@@ -29,7 +29,7 @@ def job(tmp_path, image):
     out = tmp_path / "out"
     begin(out, description("test", []))
     (out / ".work" / "run-1").touch()
-    return Job("sub-1", (*WORDS, str(image)), str(out), ".vtu", 1, 0.0, 0.0, "run-1")
+    return SubjectTask("sub-1", (*WORDS, str(image)), str(out), ".vtu", 1, 0.0, 0.0, "run-1")
 
 
 def test_a_subject_is_what_mesh_alone_writes(job, image, tmp_path):

@@ -11,7 +11,7 @@ from distributed import Client, KilledWorker, LocalCluster
 from tetopt.cluster import tasks
 from tetopt.cluster.tasks import SchedulerLost
 from tetopt.cohort.layout import begin, description, failure_path
-from tetopt.cohort.run import Ended, Job
+from tetopt.cohort.run import Ended, SubjectTask
 from tetopt.cohort.schedule import run_all
 
 GB = 1e9
@@ -70,7 +70,10 @@ def play(tmp_path, monkeypatch):
     def run(client, letters="abcd", slots=lambda: 2, room=GB, n_bytes=None):
         monkeypatch.setattr(distributed, "wait", client.wait)
         sizes = n_bytes or {}
-        jobs = [Job(f"sub-{x}", (), str(tmp_path / "out"), ".vtu", 1, sizes.get(x, 1.0), 1.0, "run-1") for x in letters]
+        jobs = [
+            SubjectTask(f"sub-{x}", (), str(tmp_path / "out"), ".vtu", 1, sizes.get(x, 1.0), 1.0, "run-1")
+            for x in letters
+        ]
         return list(run_all(jobs, client, slots, room))
 
     return run
@@ -179,7 +182,7 @@ def slow(job):
 
 def test_what_dask_itself_cancels_is_run_again(tmp_path):
     """Dask says so by an error of the wait, not only of the future."""
-    jobs = [Job(f"sub-{x}", (), str(tmp_path), ".vtu", 1, 1.0, 1.0, "run-1") for x in "ab"]
+    jobs = [SubjectTask(f"sub-{x}", (), str(tmp_path), ".vtu", 1, 1.0, 1.0, "run-1") for x in "ab"]
     cancelled = []
 
     def cancel(client):

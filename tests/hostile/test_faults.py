@@ -21,7 +21,7 @@ from hostile.faults import Allocations, Steps, left_in
 from models import sample_image
 
 import tetopt
-import tetopt.cli.mesh
+import tetopt.job.meshing
 
 pytestmark = pytest.mark.skipif(sys.platform != "linux", reason="open files are told by /proc")
 
@@ -82,7 +82,7 @@ def table():
 @pytest.fixture
 def runs(monkeypatch):
     """The optimisation once; whether a mesh is there, which may then not be lost."""
-    once, real = {}, tetopt.cli.mesh.mesh_image
+    once, real = {}, tetopt.job.meshing.mesh_image
 
     def remembered(*arguments, watch, **options):
         if not once:
@@ -92,7 +92,7 @@ def runs(monkeypatch):
         once["is_there"] = True
         return once["result"]
 
-    monkeypatch.setattr(tetopt.cli.mesh, "mesh_image", remembered)
+    monkeypatch.setattr(tetopt.job.meshing, "mesh_image", remembered)
     return once
 
 

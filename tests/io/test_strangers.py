@@ -15,14 +15,14 @@ import pytest
 import tetopt
 from tetopt import budget, incoming
 from tetopt.cli import main
-from tetopt.cli.inputs import file_and_volume
-from tetopt.cli.solver import parsed_bins
 from tetopt.errors import InputError
 from tetopt.incoming import json_of, text_of, toml_of
 from tetopt.io import apart
 from tetopt.io.apart import read_apart
 from tetopt.io.images import load_image, parse_crop, parse_slice, sha256
 from tetopt.io.meshes import load_mesh
+from tetopt.job.inputs import file_and_volume
+from tetopt.job.model import parsed_bins
 from tetopt.model.labels import labels_named
 from tetopt.model.laws import load_law
 from tetopt.phantom import load_phantom

@@ -15,10 +15,10 @@ import pytest
 import tetopt
 from tetopt.study.child import run_in_child
 from tetopt.study.endings import last_line, signal_words
-from tetopt.study.pipelines import PIPELINES, Job
+from tetopt.study.pipelines import PIPELINES, PipelineInput
 
 IMAGE = tetopt.load_phantom("sphere").image(voxel_mm=4.0)
-JOB = Job(IMAGE, None, 300, classes=2, iterations=3)
+JOB = PipelineInput(IMAGE, None, 300, classes=2, iterations=3)
 LABELS = tetopt.Image((IMAGE.data > 50) + (np.indices(IMAGE.shape)[0] > 12), IMAGE.affine)
 
 
@@ -39,7 +39,7 @@ def test_job_arrives_whole():
     """Affine, labels, seconds in their order, and notes."""
     image = tetopt.Image(IMAGE.data + 0.1, np.array([[0, -2.0, 0, 5], [3, 0, 0.5, 1], [0, 0, 1.5, 2], [0, 0, 0, 1]]))
     labels = tetopt.Image((IMAGE.data > 50).astype(int), image.affine)
-    outcome = run_in_child(pipes.fine, Job(image, labels, 200), max_seconds=60.0)
+    outcome = run_in_child(pipes.fine, PipelineInput(image, labels, 200), max_seconds=60.0)
     assert outcome.mesh.points.tobytes() == tetopt.lattice(image, nodes=200).points.tobytes()
     assert list(outcome.seconds.items()) == [("first", 1.5), ("second", 0.25)]
     assert outcome.notes == ["a note"]
@@ -161,9 +161,10 @@ def test_peak_is_the_childs_own():
 def test_the_end_of_the_parent_ends_the_child(tmp_path, sent):
     """And what it started; and takes the temporary folder away."""
     program = (
-        "import pipes, tetopt; from tetopt.study.child import run_in_child; from tetopt.study.pipelines import Job\n"
+        "import pipes, tetopt; from tetopt.study.child import run_in_child\n"
+        "from tetopt.study.pipelines import PipelineInput\n"
         "image = tetopt.load_phantom('sphere').image(voxel_mm=4.0)\n"
-        "run_in_child(pipes.sleep, Job(image, None, 300), max_seconds=300.0)"
+        "run_in_child(pipes.sleep, PipelineInput(image, None, 300), max_seconds=300.0)"
     )
     pid_file, temporary = tmp_path / "pid", tmp_path / "temporary"
     temporary.mkdir()

@@ -6,7 +6,7 @@ import pytest
 import tetopt
 from tetopt.geometry.simplex import volumes
 from tetopt.study import cleaver
-from tetopt.study.pipelines import PIPELINES, Job
+from tetopt.study.pipelines import PIPELINES, PipelineInput
 
 PHANTOM = tetopt.load_phantom("sphere")
 IMAGE, LABELS = PHANTOM.image(voxel_mm=4.0), PHANTOM.label_image(voxel_mm=4.0)
@@ -18,12 +18,12 @@ def test_unusable_package_is_told(monkeypatch):
     with pytest.raises(
         tetopt.InputError, match=r"itk-cleaver: not installed; install it with: pip install \"itk-cleaver\" "
     ):
-        PIPELINES["cleaver"].function(Job(IMAGE, LABELS, 300))
+        PIPELINES["cleaver"].function(PipelineInput(IMAGE, LABELS, 300))
     monkeypatch.setattr(cleaver, "find_spec", lambda name: name)
     python = cleaver._python
     monkeypatch.setattr(cleaver, "_python", lambda program: python("import os; os.kill(os.getpid(), 11)"))
     with pytest.raises(tetopt.InputError, match=r"its import ends Python, signal 11, SIGSEGV; install"):
-        PIPELINES["cleaver"].function(Job(IMAGE, LABELS, 300))
+        PIPELINES["cleaver"].function(PipelineInput(IMAGE, LABELS, 300))
 
 
 def test_cube_holds_the_labels():
@@ -57,7 +57,7 @@ def test_sphere():
     pytest.importorskip("itk", reason="itk-cleaver is not installed")
     if cleaver._python("from itk import CleaverImageToMeshFilter").returncode != 0:
         pytest.skip("itk-cleaver cannot be loaded into this ITK")
-    mesh = PIPELINES["cleaver"].function(Job(IMAGE, LABELS, 1500)).mesh
+    mesh = PIPELINES["cleaver"].function(PipelineInput(IMAGE, LABELS, 1500)).mesh
     assert volumes(mesh.points, mesh.cells).min() > 0.0
     assert volumes(mesh.points, mesh.cells).sum() == pytest.approx(IMAGE.volume, rel=1e-9)
     assert tetopt.cell_moments(IMAGE, mesh).n_voxels.sum() == IMAGE.data.size

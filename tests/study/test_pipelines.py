@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 import tetopt
-from tetopt.study.pipelines import PIPELINES, Job
+from tetopt.study.pipelines import PIPELINES, PipelineInput
 from tetopt.target.content import content
 
 IMAGE = tetopt.load_phantom("sphere").image(voxel_mm=4.0)
@@ -22,7 +22,7 @@ EQUAL, AS_LABELS = (
 )
 def test_labels_that_are_given_are_meshed(image, labels, content, notes):
     """Besides the image, alone if the image is the labels; without any the image alone."""
-    made = PIPELINES["tetopt-uniform"].function(Job(image, labels, 200, iterations=2))
+    made = PIPELINES["tetopt-uniform"].function(PipelineInput(image, labels, 200, iterations=2))
     expected = tetopt.optimize(content, tetopt.lattice(image, nodes=200), k_D=0.2, iterations=2)
     assert made.mesh.points.tobytes() == expected.mesh.points.tobytes()
     assert made.mesh.cells.tobytes() == expected.mesh.cells.tobytes()
@@ -30,7 +30,7 @@ def test_labels_that_are_given_are_meshed(image, labels, content, notes):
 
 
 def test_the_graded_mesh_is_that_of_mesh_image():
-    made = PIPELINES["tetopt"].function(Job(IMAGE, LABELS, 300))
+    made = PIPELINES["tetopt"].function(PipelineInput(IMAGE, LABELS, 300))
     assert made.mesh.points.tobytes() == tetopt.mesh_image(BOTH, 300).mesh.points.tobytes()
     assert made.notes[1:] == [EQUAL]
 
@@ -38,6 +38,6 @@ def test_the_graded_mesh_is_that_of_mesh_image():
 def test_the_other_pipelines_do_not_see_labels():
     for name in ("tetopt-paper", "odt", "bcc"):
         with_labels, without = (
-            PIPELINES[name].function(Job(IMAGE, labels, 100, iterations=1)) for labels in (LABELS, None)
+            PIPELINES[name].function(PipelineInput(IMAGE, labels, 100, iterations=1)) for labels in (LABELS, None)
         )
         assert with_labels.mesh.points.tobytes() == without.mesh.points.tobytes()

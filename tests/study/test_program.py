@@ -17,12 +17,12 @@ from tetopt.fem.elasticity import check_fills_box
 from tetopt.io.images import sha256
 from tetopt.study.child import run_in_child
 from tetopt.study.interfaces import class_labels
-from tetopt.study.pipelines import Job
+from tetopt.study.pipelines import PipelineInput
 from tetopt.study.program import by_program, file_checksums, parse_program, pipelines_with
 
 PHANTOM = tetopt.load_phantom("sphere")
 IMAGE = PHANTOM.image(voxel_mm=4.0)
-JOB = Job(IMAGE, None, 1000, classes=3)
+JOB = PipelineInput(IMAGE, None, 1000, classes=3)
 PYTHON, MESHER = shlex.quote(sys.executable), shlex.quote(str(Path(__file__).with_name("mesher.py")))
 
 

@@ -13,7 +13,7 @@ from tetopt.geometry.topology import boundary_facets
 from tetopt.study import tetwild
 from tetopt.study.endings import NotInstalled
 from tetopt.study.interfaces import interfaces
-from tetopt.study.pipelines import PIPELINES, Job
+from tetopt.study.pipelines import PIPELINES, PipelineInput
 
 needs_pytetwild = pytest.mark.skipif(
     find_spec("pytetwild") is None, reason="pytetwild is not installed: pip install 'pytetwild>=0.4'"
@@ -58,7 +58,7 @@ def test_fills_the_box_with_the_wanted_nodes(image, capfd):
 
     20 runs of each image gave 286 to 314 nodes, in 1 to 4 runs of fTetWild; an earlier one was 16 off.
     """
-    produced = PIPELINES["pytetwild"].function(Job(image, None, 300, classes=2))
+    produced = PIPELINES["pytetwild"].function(PipelineInput(image, None, 300, classes=2))
     assert_fills(image, produced.mesh)
     n_nodes = len(produced.mesh.points)
     is_noted = any(
@@ -74,7 +74,7 @@ def test_fills_the_box_with_the_wanted_nodes(image, capfd):
 def test_facets_follow_the_interface():
     """A better E_D than the lattice with as many nodes, by far, on a sphere that cells can follow."""
     labels = PHANTOM.label_image(voxel_mm=4.0)
-    mesh = PIPELINES["pytetwild"].function(Job(IMAGE, labels, 600)).mesh
+    mesh = PIPELINES["pytetwild"].function(PipelineInput(IMAGE, labels, 600)).mesh
     assert_fills(IMAGE, mesh)
     assert tetopt.E_D(IMAGE, mesh) < 0.6 * tetopt.E_D(IMAGE, tetopt.lattice(IMAGE, nodes=600))
 
@@ -101,10 +101,10 @@ def test_missing_package(monkeypatch):
     """One that is not there is no failure; one that cannot be imported is."""
     monkeypatch.setitem(sys.modules, "pytetwild", None)
     with pytest.raises(NotInstalled, match=r"pytetwild: not installed; .* pip install"):
-        PIPELINES["pytetwild"].function(Job(IMAGE, None, 300, classes=2))
+        PIPELINES["pytetwild"].function(PipelineInput(IMAGE, None, 300, classes=2))
     monkeypatch.setattr(tetwild.importlib, "import_module", lambda name: __import__("tetopt_has_no_such_package"))
     with pytest.raises(tetopt.InputError, match=r"pytetwild: not usable \(No module .* pip install") as error:
-        PIPELINES["pytetwild"].function(Job(IMAGE, None, 300, classes=2))
+        PIPELINES["pytetwild"].function(PipelineInput(IMAGE, None, 300, classes=2))
     assert not isinstance(error.value, NotInstalled)
 
 

@@ -16,11 +16,12 @@ from typer.core import TyperCommand, TyperGroup
 
 import tetopt
 from tetopt.budget import check_addresses
-from tetopt.cli.console import error_words, log, open_streams, out, settle_streams, show_error, show_warning
+from tetopt.cli.console import log, open_streams, out, settle_streams, show_error, show_event, show_warning
 from tetopt.cli.ending import INTERRUPTED_CODE, signal_code, signal_name, signals_heard
-from tetopt.errors import InputError
+from tetopt.errors import InputError, error_words
 from tetopt.interpreter import THREADS_NAME
 from tetopt.io.files import Outputs, outputs_of_command
+from tetopt.job.events import listened
 
 # In the order of the help: the module that has NAME_command, and the first line of that function's docstring, which is
 # the command's help. It is here as well so that `tetopt --help` takes no second: only the command that runs is loaded.
@@ -105,7 +106,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     output among them; 130, 143 and 129: ended by Ctrl-C, SIGTERM and SIGHUP.
     """
     open_streams()
-    with warnings.catch_warnings(), outputs_of_command() as outputs, signals_heard():
+    with warnings.catch_warnings(), outputs_of_command() as outputs, signals_heard(), listened(show_event):
         warnings.showwarning = show_warning
         logging.getLogger("matplotlib").setLevel(logging.ERROR)  # its font-cache notice is not the user's business
         code = _run(list(sys.argv[1:] if argv is None else argv), outputs)

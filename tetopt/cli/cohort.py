@@ -8,6 +8,7 @@ import shlex
 import time
 from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
+from dataclasses import fields
 from io import StringIO
 from pathlib import Path
 from typing import NamedTuple
@@ -19,20 +20,7 @@ from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 from tetopt.budget import available_bytes, memory_words
 from tetopt.cli.cohort_plan import Entry, checked_suffix, chosen, entries_of, subjects_of, with_places, with_states
 from tetopt.cli.console import log, out, show_error, show_warning
-from tetopt.cli.inputs import read_mesh
-from tetopt.cli.options import (
-    CohortOptions,
-    ContentOptions,
-    EngineOptions,
-    Records,
-    SizeOptions,
-    SolverOptions,
-    StartOptions,
-    SubjectsArgument,
-)
-from tetopt.cli.plan import with_numbers
-from tetopt.cli.predict import size_by_headers, size_of_run
-from tetopt.cli.source import read_source
+from tetopt.cli.options import CohortOptions, SubjectsArgument
 from tetopt.cluster.crew import counted
 from tetopt.cluster.tasks import SchedulerLost
 from tetopt.cluster.workers import Folders, Need, check_choice, local_share, workers
@@ -51,13 +39,19 @@ from tetopt.cohort.layout import (
 )
 from tetopt.cohort.numbers import collect
 from tetopt.cohort.page import save_cohort_files
-from tetopt.cohort.run import Ended, Job
+from tetopt.cohort.run import Ended, SubjectTask
 from tetopt.cohort.schedule import run_all
 from tetopt.cohort.subjects import TABLE_SUFFIXES, Problems, key, write_table
 from tetopt.engine.cost import Prediction, RunSize, calibrated_speed, predicted
 from tetopt.errors import InputError
 from tetopt.io.files import checked_output
 from tetopt.io.images import file_shape
+from tetopt.job.events import listened
+from tetopt.job.inputs import read_mesh
+from tetopt.job.options import RunOptions, SizeOptions
+from tetopt.job.plan import with_numbers
+from tetopt.job.predict import size_by_headers, size_of_run
+from tetopt.job.source import read_source
 
 NAMED_FAILURES = 20  # on the terminal: the table and the page have all
 MOST_BESIDE = 200  # subjects of a run beside others in one folder, each with a lock: a process has 1024 files at most
@@ -84,18 +78,14 @@ def cohort_command(
     context: typer.Context,
     subjects: SubjectsArgument,
     cohort: CohortOptions,
-    content: ContentOptions,
-    sizes: SizeOptions,
-    start: StartOptions,
-    engine: EngineOptions,
-    solver: SolverOptions,
+    options: RunOptions,
 ) -> int:
     """Mesh many subjects of a table or a BIDS folder, on this machine or a cluster; go on where it ended."""
     check_choice(cohort.count, cohort.scheduler, cohort.cluster, "cohort")
     suffix = checked_suffix(cohort.mesh_format)
-    place, records = cohort.output, Records(content, sizes, start, engine, solver)
-    if engine.threads is not None and engine.threads < 1:
-        raise InputError(f"--threads: expected 1 or more, got {engine.threads}")
+    place = cohort.output
+    if options.threads is not None and options.threads < 1:
+        raise InputError(f"--threads: expected 1 or more, got {options.threads}")
     if cohort.collect and (cohort.write_table is not None or cohort.dry_run or cohort.retry_failed):
         raise InputError("--collect runs nothing; leave it out, or --write-table, --dry-run and --retry-failed")
     if cohort.write_table is not None:
@@ -108,7 +98,7 @@ def cohort_command(
         rows = subjects_of(subjects, cohort)
         if cohort.collect:
             return _collected(place, subjects, [key(row) for row in rows])
-        entries = entries_of(rows, records, place, suffix, log.print)
+        entries = entries_of(rows, options, place, suffix, log.print)
         to_run = with_places(chosen(entries, cohort.retry_failed), place)
     except Problems as problems:
         for line in problems.lines:
@@ -122,7 +112,7 @@ def cohort_command(
     _say_plan(entries, to_run, cohort.retry_failed)
     estimate = estimated(to_run)
     if cohort.dry_run:
-        _say_estimate(to_run, estimate, cohort, engine.threads)
+        _say_estimate(to_run, estimate, cohort, options.threads)
         return 0
     keys = [entry.key for entry in entries]
     alone = keys if cohort.participants and len(keys) <= MOST_BESIDE else None  # beside runs of others, one folder's
@@ -136,7 +126,7 @@ def cohort_command(
                 failure_path(place, entry.key).unlink(missing_ok=True)
         try:
             if to_run:
-                _run(to_run, estimate, cohort, suffix, engine.threads)
+                _run(to_run, estimate, cohort, suffix, options.threads)
         finally:  # also on Ctrl-C: what is done is seen
             restore(place, alone)
             code = _close(place, keys)
@@ -183,12 +173,12 @@ def estimated(entries: Sequence[Entry]) -> Estimate:
     reads: Counter[tuple[object, ...]] = Counter()
     each = {}
     for entry in entries:
-        source = entry.source
-        files = len(source.images), source.mask is None, source.labels is None
-        kind = (*files, source.background, str(entry.plan.sizes))
+        job = entry.job
+        files = len(job.images), job.mask is None, job.labels is None
+        kind = (*files, job.background, *(getattr(job, field.name) for field in fields(SizeOptions)))
         known = like.setdefault(kind, {})
         try:
-            shape = file_shape(source.images[0]) or ()
+            shape = file_shape(job.images[0]) or ()
             if shape not in known and reads[kind] < LIKE_READS:
                 reads[kind] += 1
                 if (size := _read_size(entry)) is not None:
@@ -203,10 +193,10 @@ def estimated(entries: Sequence[Entry]) -> Estimate:
 def _read_size(entry: Entry) -> RunSize | None:
     """The sizes of a run whose files are read; None if they cannot be, which its run will say."""
     try:
-        with contextlib.redirect_stderr(StringIO()):
-            source = read_source(entry.source, entry.plan.solver.label_names)
+        with listened(lambda event: None), contextlib.redirect_stderr(StringIO()):
+            source = read_source(entry.job, entry.job.label_names)
             plan, _ = with_numbers(entry.plan, source.content)
-            begun = plan.start.start
+            begun = plan.job.start
             n_started = None if begun is None else len(read_mesh(begun).mesh.points)
     except (InputError, OSError):
         return None
@@ -282,13 +272,13 @@ def _refresher(place: Path) -> Callable[[], None]:
     return refresh
 
 
-def _job(entry: Entry, estimate: Estimate, place: Path, suffix: str, threads: int, run: str) -> Job:
+def _job(entry: Entry, estimate: Estimate, place: Path, suffix: str, threads: int, run: str) -> SubjectTask:
     one = estimate.each.get(entry.key, Prediction(0.0, 0.0, 0.0))
-    return Job(entry.key, entry.words(), str(place), suffix, threads, one.peak_bytes, one.seconds, run)
+    return SubjectTask(entry.key, entry.words(), str(place), suffix, threads, one.peak_bytes, one.seconds, run)
 
 
 @contextlib.contextmanager
-def _progress(jobs: Sequence[Job], n_at_once: int) -> Iterator[Callable[[Ended], None]]:
+def _progress(jobs: Sequence[SubjectTask], n_at_once: int) -> Iterator[Callable[[Ended], None]]:
     """A function that shows how a subject ended: a bar on a terminal, else a line; both with an estimate of the end."""
     begun = time.monotonic()
     left = {job.key: max(job.seconds, 1.0) for job in jobs}

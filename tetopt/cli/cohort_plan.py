@@ -3,33 +3,23 @@
 from __future__ import annotations
 
 import os
-import tempfile
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import replace
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from tetopt.cli.inputs import file_and_volume
-from tetopt.cli.options import (
-    CohortOptions,
-    OutputOptions,
-    Records,
-    SourceOptions,
-    given_options,
-    option_words,
-    with_options,
-)
-from tetopt.cli.plan import Plan, planned
-from tetopt.cli.request import requested
-from tetopt.cohort.layout import check_place, mesh_name, numbers_path
+from tetopt.cli.options import CohortOptions, option_words, with_options
+from tetopt.cohort.layout import FIGURES_NAME, check_place, mesh_name, numbers_path
 from tetopt.cohort.state import State, state_of, strangers
 from tetopt.cohort.subjects import FILE_OPTIONS, Problems, Subject, doubled, key, label_of, matching, read_table
 from tetopt.errors import InputError
 from tetopt.io.formats import FORMATS
+from tetopt.job.inputs import file_and_volume
+from tetopt.job.options import JobOptions, RunOptions, given_options
+from tetopt.job.plan import Plan, changed, resolved
+from tetopt.job.request import requested
 from tetopt.model.laws import LAW_OPTIONS, law_file
-
-OPTION_NAMES = {name: name.replace("_", "-") for name in FILE_OPTIONS}
 
 
 class Entry(NamedTuple):
@@ -37,24 +27,23 @@ class Entry(NamedTuple):
 
     subject: Subject
     key: str
-    records: Records
+    options: RunOptions
     plan: Plan  # of its run, as far as it is known without its files
     state: State
 
     @property
-    def source(self) -> SourceOptions:
-        """What of it is meshed."""
-        return self.plan.source
+    def job(self) -> JobOptions:
+        """What is asked for, with its images."""
+        return self.plan.job
 
     def row(self) -> Subject:
         """The subject with the files that patterns mean for it."""
-        options = self.records.given()
-        files = {name: options[OPTION_NAMES[name]] for name in FILE_OPTIONS if OPTION_NAMES[name] in options}
+        files = {name: path for name in FILE_OPTIONS if (path := getattr(self.options, name)) is not None}
         return self.subject._replace(files=files)
 
     def words(self) -> tuple[str, ...]:
         """What follows `tetopt mesh`, without outputs and threads."""
-        options = {name: value for name, value in self.records.given().items() if name != "threads"}
+        options = {name: value for name, value in given_options(self.options).items() if name != "threads"}
         return (*option_words(options), "--", *map(str, self.subject.images))
 
 
@@ -89,7 +78,7 @@ def checked_suffix(text: str) -> str:
 
 
 def entries_of(
-    subjects: Sequence[Subject], records: Records, out: Path, suffix: str, say: Callable[[str], None]
+    subjects: Sequence[Subject], options: RunOptions, out: Path, suffix: str, say: Callable[[str], None]
 ) -> list[Entry]:
     """The subjects with their options, and what there is of each.
 
@@ -99,7 +88,7 @@ def entries_of(
         All that is wrong, of all subjects.
     """
     problems = [("", line) for line in doubled(subjects)]
-    plans = _Plans(records, suffix)
+    plans = _Plans(options, suffix)
     entries = []
     for subject in subjects:
         try:
@@ -107,7 +96,7 @@ def entries_of(
         except InputError as error:
             problems.append((subject.place, str(error)))
             continue
-        problems += [(subject.place, words) for words in _missing(plan.source, own)]
+        problems += [(subject.place, words) for words in _missing(plan.job)]
         if (stranger := strangers(out, key(subject))) is not None:
             problems.append(("", stranger))
         entries.append(Entry(subject, key(subject), own, plan, State("missing", "")))
@@ -129,51 +118,39 @@ def _lines(problems: Iterable[tuple[str, str]]) -> Iterator[str]:
 class _Plans:
     """Plans of subjects; options that several share are checked once."""
 
-    def __init__(self, records: Records, suffix: str) -> None:
-        laws = {name: law_file(getattr(records.solver, name) or "") for name in LAW_OPTIONS}
+    def __init__(self, options: RunOptions, suffix: str) -> None:
+        laws = {name: law_file(getattr(options, name) or "") for name in LAW_OPTIONS}
         # A worker may be started in another folder.
         placed: dict[str, Any] = {name: str(file.absolute()) for name, file in laws.items() if file is not None}
-        self._records, self._suffix = records._replace(solver=replace(records.solver, **placed)), suffix
-        self._patterns = {
-            name: path for name in FILE_OPTIONS if (path := records.given().get(OPTION_NAMES[name])) is not None
-        }
-        self._known: dict[Any, tuple[Records, Plan]] = {}
+        self._options, self._output = replace(options, **placed), Path(f"mesh{suffix}")
+        self._patterns = {name: path for name in FILE_OPTIONS if (path := getattr(options, name)) is not None}
+        self._known: dict[Any, tuple[RunOptions, Plan]] = {}
 
-    def of(self, subject: Subject) -> tuple[Records, Plan]:
+    def of(self, subject: Subject) -> tuple[RunOptions, Plan]:
         """The options of a subject with its files, and its plan; InputError for options that cannot be."""
-        files = {name: matching(str(pattern), subject) for name, pattern in self._patterns.items()} | subject.files
+        files: dict[str, Any] = {
+            name: matching(str(pattern), subject) for name, pattern in self._patterns.items()
+        } | subject.files
         kind = (tuple(sorted(subject.options.items())), tuple(sorted(files)), len(subject.images))
         if kind not in self._known:
             if "threads" in subject.options:
-                raise InputError("threads: all subjects have the same number, of --threads; leave the column out")
-            options = {name.replace("_", "-"): text for name, text in subject.options.items()}
-            self._known[kind] = self._planned(_with_files(with_options(self._records, options), files), subject)
-        records, plan = self._known[kind]
-        records = _with_files(records, files)
-        source = SourceOptions(images=list(subject.images), **vars(records.content))
-        return records, plan._replace(source=source, sizes=replace(plan.sizes, sizing=records.sizes.sizing))
-
-    def _planned(self, records: Records, subject: Subject) -> tuple[Records, Plan]:
-        source = SourceOptions(images=list(subject.images), **vars(records.content))
-        with tempfile.TemporaryDirectory(prefix="tetopt-") as folder:
-            output = OutputOptions(
-                mesh=Path(folder) / f"mesh{self._suffix}", json_path=Path(folder) / "mesh.json", figures=Path(folder)
-            )
-            return records, planned(source, *records[1:], output)
+                raise InputError("threads: all subjects have the same number, of `threads`; leave the column out")
+            own = with_options(self._options, {name.replace("_", "-"): text for name, text in subject.options.items()})
+            own = replace(own, **files)
+            self._known[kind] = own, resolved(job_of(own, subject.images, self._output))
+        own, plan = self._known[kind]
+        return replace(own, **files), plan.with_files(subject.images, files)
 
 
-def _with_files(records: Records, files: dict[str, Path]) -> Records:
-    """The records with these files."""
-    own = {name: {field: path for field, path in files.items() if hasattr(record, field)}
-           for name, record in records._asdict().items()}  # fmt: skip
-    return Records(**{name: replace(record, **own[name]) for name, record in records._asdict().items()})
+def job_of(options: RunOptions, images: Sequence[Path], output: Path) -> JobOptions:
+    """All options of the run of a subject."""
+    return JobOptions(images=list(images), output=output, figures=Path(FIGURES_NAME), **vars(options))
 
 
-def _missing(source: SourceOptions, records: Records) -> Iterator[str]:
+def _missing(job: JobOptions) -> Iterator[str]:
     """What is wrong with the files that a subject names: not there, or a text where an image should be."""
-    named = [("image", path) for path in source.images]
-    options = given_options(*records)
-    named += [(name, options[OPTION_NAMES[name]]) for name in FILE_OPTIONS if OPTION_NAMES[name] in options]
+    named = [("image", path) for path in job.images]
+    named += [(name, path) for name in FILE_OPTIONS if (path := getattr(job, name)) is not None]
     for number, (name, path) in enumerate(named):
         file = path if number == 0 else file_and_volume(path)[0]  # of the first, --volume tells which
         try:
@@ -193,8 +170,7 @@ def with_states(entries: list[Entry], out: Path, suffix: str, say: Callable[[str
     def state(entry: Entry) -> Entry:
         request = None
         if numbers_path(out, entry.key).is_file():
-            output = OutputOptions(mesh=Path(mesh_name(entry.key, suffix)))
-            request = requested(entry.source, *entry.records[1:], output)
+            request = requested(changed(entry.plan.bare, output=Path(mesh_name(entry.key, suffix))))
         return entry._replace(state=state_of(out, entry.key, suffix, request))
 
     if (n_there := sum(numbers_path(out, entry.key).is_file() for entry in entries)) > 0:

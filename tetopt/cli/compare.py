@@ -16,12 +16,8 @@ import tetopt
 from tetopt import Image, InputError, save_mesh
 from tetopt.budget import BYTES_PER_GB
 from tetopt.cli.console import log, out, print_wide
-from tetopt.cli.inputs import checked_outputs, label_table, read_labels, read_volume
 from tetopt.cli.options import (
-    DEFAULT_NODES,
-    WHOLE_BOX,
     AverageOption,
-    BoxPart,
     ForceOption,
     ImageArgument,
     LabelNamesOption,
@@ -32,6 +28,8 @@ from tetopt.cli.quality import image_fit
 from tetopt.io.files import checked_output, results_folder, save_json
 from tetopt.io.images import sha256
 from tetopt.io.mni import mni_path, mni_tissue
+from tetopt.job.inputs import checked_outputs, label_table, read_labels, read_volume
+from tetopt.job.options import DEFAULT_NODES, WHOLE_BOX, BoxPart
 from tetopt.measure.quality import quality
 from tetopt.model.averages import parse_average
 from tetopt.model.fields import cell_fields
@@ -41,7 +39,7 @@ from tetopt.report.tables import add_quality, new_table
 from tetopt.study.compare_criteria import number_text
 from tetopt.study.compare_headline import Headline, headline
 from tetopt.study.compare_report import ImageSource, LabelSource, Settings
-from tetopt.study.pipelines import PIPELINES, Job
+from tetopt.study.pipelines import PIPELINES, PipelineInput
 from tetopt.study.program import Program, parse_program
 
 ClassesOption = Annotated[int, option("K", "Classes of the segmentation (multi-Otsu).", min=2)]
@@ -158,7 +156,7 @@ def baseline_command(
     json_path = numbers.checked()
     image, labels = _image_and_labels(image_path, labels_path, part)
     title, function = PIPELINES[pipeline].title, PIPELINES[pipeline].function
-    job = Job(image, labels, nodes, classes)
+    job = PipelineInput(image, labels, nodes, classes)
     made = run_in_child(function, job, say=lambda line: log.print(escape(f"{title}: {line}")))
     if made.mesh is None:
         raise InputError(f"{title}: {(made.failure or '').removeprefix(f'{title}: ')}")

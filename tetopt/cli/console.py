@@ -7,7 +7,7 @@ import os
 import re
 import sys
 from contextlib import suppress
-from typing import IO, Any
+from typing import IO, TYPE_CHECKING, Any
 
 from rich.console import Console
 from rich.markup import escape
@@ -15,6 +15,9 @@ from rich.table import Table
 from rich.text import Text
 
 from tetopt.io.text import plain
+
+if TYPE_CHECKING:
+    from tetopt.job.events import Event
 
 WIDEST_TABLE = 500  # characters in a line
 LONGEST_ERROR = 480  # characters: what to do stands at the end, what came may be a line of a million
@@ -120,15 +123,6 @@ def settle_streams() -> str | None:
     return reason
 
 
-def error_words(error: Exception) -> str:
-    """What went wrong: of a file with its name first, of memory with what was to be laid out."""
-    if isinstance(error, MemoryError):
-        return f"not enough memory: {error}".removesuffix(": ") + "; take fewer nodes, a part of the image or --max-gb"
-    if isinstance(error, OSError) and error.filename is not None:
-        return f"{os.fsdecode(error.filename)}: {error.strerror}"
-    return str(error)
-
-
 def show_error(message: object) -> None:
     """Say what is wrong, on one line that is not endless, with the command's names for options."""
     line = plain(in_options(str(message)))
@@ -139,12 +133,32 @@ def show_error(message: object) -> None:
 
 def in_options(message: str) -> str:
     """A message of the library with the command's options for its parameters, at its head and in its advice."""
-    return PARAMETER_PATTERN.sub(lambda name: PARAMETER_OPTIONS[name[0]], message)
+    return PARAMETER_PATTERN.sub(lambda name: PARAMETER_OPTIONS[name[0]], with_hyphens(message))
+
+
+def with_hyphens(message: str) -> str:
+    """A message with the command's options for the arguments of a job between backticks."""
+    if "`" not in message:
+        return message
+    from tetopt.job.options import JobOptions, kinds_of, option_name
+
+    names = {name: f"--{option_name(name, kind)}" for name, kind in kinds_of(JobOptions).items()}
+    return re.sub(r"`(\w+)`", lambda match: names.get(match[1], match[0]), message)
+
+
+def show_event(event: Event) -> None:
+    """Say a note, a warning, or a requirement that is not met."""
+    if event.kind == "note":
+        log.print(escape(with_hyphens(event.text)))
+    elif event.kind == "warning":
+        show_warning(event.text)
+    elif event.kind == "violated":
+        show_error(event.text)
 
 
 def show_warning(message: Warning | str, *_: Any, **__: Any) -> None:
     """Say a warning on one line; also in place of `warnings.showwarning`."""
-    log.print(f"[yellow]tetopt: warning:[/] {escape(plain(str(message)))}")
+    log.print(f"[yellow]tetopt: warning:[/] {escape(plain(with_hyphens(str(message))))}")
 
 
 def print_fidelity(measured: dict[str, Any], ndim: int, word: str = "mask") -> None:

@@ -14,14 +14,20 @@ from rich.markup import escape
 from tetopt import Image, InputError
 from tetopt.check import check_unfolded
 from tetopt.cli.console import log, out
-from tetopt.cli.inputs import image_and_others, read_mesh, warn_of_other_image, with_labels
-from tetopt.cli.options import ImagePart, LabelledPart, MeshArgument, NumberOptions, SolverOptions, option
-from tetopt.cli.solver import (
+from tetopt.cli.options import LabelledPart, MeshArgument, NumberOptions, option
+from tetopt.cli.solver import print_model
+from tetopt.io.abaqus import input_sets
+from tetopt.io.files import checked_output, save_json
+from tetopt.io.formats import FORMATS, format_of
+from tetopt.io.frd import read_frd
+from tetopt.io.images import sha256
+from tetopt.io.vtk import VTK_SUFFIXES
+from tetopt.job.inputs import image_and_others, read_mesh, warn_of_other_image, with_labels
+from tetopt.job.model import (
     REACTIONS_TEXT,
     check_solver_options,
     completed,
     loads_of,
-    print_model,
     save_for_solver,
     sets_and_table,
     solver_model,
@@ -29,12 +35,7 @@ from tetopt.cli.solver import (
     with_chosen_sets,
     without_stale_results,
 )
-from tetopt.io.abaqus import input_sets
-from tetopt.io.files import checked_output, save_json
-from tetopt.io.formats import FORMATS, format_of
-from tetopt.io.frd import read_frd
-from tetopt.io.images import sha256
-from tetopt.io.vtk import VTK_SUFFIXES
+from tetopt.job.options import ImagePart, SolverOptions
 from tetopt.model.fields import cell_fields, is_result, is_stress
 from tetopt.model.file import MATERIAL_FIELDS, TEXTS_KEPT, MeshFile
 from tetopt.model.sets import Sets, box_of, box_text, merged_sets

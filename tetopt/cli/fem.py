@@ -14,9 +14,13 @@ from rich.markup import escape
 
 from tetopt import Image, InputError
 from tetopt.cli.console import log, print_wide, show_warning
-from tetopt.cli.inputs import read_image, read_mesh, warn_of_other_image, with_labels
-from tetopt.cli.options import ImagePart, LabelledPart, ModelOptions, NumberOptions, option
-from tetopt.cli.solver import (
+from tetopt.cli.options import LabelledPart, NumberOptions, option
+from tetopt.io.files import checked_output, save_json
+from tetopt.io.formats import save_model
+from tetopt.io.images import sha256
+from tetopt.io.vtk import VTK_SUFFIXES
+from tetopt.job.inputs import read_image, read_mesh, warn_of_other_image, with_labels
+from tetopt.job.model import (
     check_model_options,
     completed,
     loads_of,
@@ -25,10 +29,7 @@ from tetopt.cli.solver import (
     warn_of_units,
     with_chosen_sets,
 )
-from tetopt.io.files import checked_output, save_json
-from tetopt.io.formats import save_model
-from tetopt.io.images import sha256
-from tetopt.io.vtk import VTK_SUFFIXES
+from tetopt.job.options import ImagePart, ModelOptions
 from tetopt.model.averages import DEFAULT_AVERAGE
 from tetopt.model.fields import cell_fields, is_result
 from tetopt.model.file import MeshFile

@@ -15,14 +15,15 @@ import tetopt
 from tetopt import Image, InputError, Mesh
 from tetopt.check import manifold_problems
 from tetopt.cli.console import out, print_fidelity, show_error, show_warning
-from tetopt.cli.inputs import label_table, read_mesh, warn_of_other_image
-from tetopt.cli.options import ImagePart, LabelNamesOption, NumberOptions, SourceOptions, option
-from tetopt.cli.promises import check_promises
-from tetopt.cli.source import Source, read_source, whose_variance
+from tetopt.cli.options import NumberOptions, option
 from tetopt.energy.sampling import Overlap, overlap_of
 from tetopt.engine.loop import Optimized
 from tetopt.incoming import json_of
 from tetopt.io.files import save_json
+from tetopt.job.advice import tell_violated
+from tetopt.job.inputs import label_table, read_mesh, warn_of_other_image
+from tetopt.job.options import ImagePart, LabelNamesOption, SourceOptions
+from tetopt.job.source import Source, read_source, whose_variance
 from tetopt.measure.fidelity import LabelFidelity
 from tetopt.measure.quality import quality
 from tetopt.measure.requirements import judged
@@ -90,7 +91,7 @@ def quality_command(
     if not check:  # what makes the numbers above meaningless
         missed, measured = {name: words for name, words in missed.items() if name == "mask"}, {}
     result = result._replace(missed=missed)
-    return max(int(bool(problems) or overlap is not None), check_promises(result, measured, source.mask_word))
+    return max(int(bool(problems) or overlap is not None), int(bool(tell_violated(result, measured, source.mask_word))))
 
 
 def _source(loaded: MeshFile, image: Path, mask: Path | None, labels: Path | None, part: ImagePart) -> Source:
@@ -100,7 +101,7 @@ def _source(loaded: MeshFile, image: Path, mask: Path | None, labels: Path | Non
     weights = inputs.get("weights")
     own = _number(weights[0]) if isinstance(weights, list) and len(weights) == 1 else None
     options = SourceOptions(
-        images=[image], mask=mask, part=part, labels=labels,
+        images=[image], mask=mask, labels=labels, **vars(part),
         background=None if mask is not None or level is None else repr(level),
         weights=None if labels is None or own is None else repr(own),
         label_weight=None if labels is None else weight,

@@ -1,4 +1,4 @@
-"""One optimisation as a terminal shows it: kernels made ready, progress and the clock."""
+"""A run as a terminal shows it: what it is at, its progress, the clock."""
 
 from __future__ import annotations
 
@@ -6,69 +6,86 @@ import contextlib
 import threading
 import time
 from collections.abc import Callable, Iterator
+from contextlib import ExitStack
+from types import TracebackType
+from typing import Any
 
 import numpy as np
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn, TimeRemainingColumn
 
-from tetopt import Mesh
-from tetopt.budget import MemoryLimit, memory_words, resident_bytes
-from tetopt.cli.console import log
+from tetopt.budget import memory_words, resident_bytes
+from tetopt.cli.console import log, show_event
 from tetopt.cli.ending import is_ended
-from tetopt.engine.fast import prepare_kernels
-from tetopt.engine.loop import Optimized, Record
-from tetopt.engine.meshing import Mode, Run
-from tetopt.target.content import Content
+from tetopt.cluster.crew import counted
+from tetopt.engine.loop import Record
+from tetopt.job.events import Event, Stage
+from tetopt.job.in_parts import PartsProgress
 
-LONG_SECONDS = 3.0  # to make the kernels ready: they were compiled then, not loaded
 LINE_SECONDS = 10.0  # between lines, where there is no terminal to show a bar on
 
 
-def watched_run(
-    run: Run, initial: Mesh, iterations: int, ends: float | None, limit: MemoryLimit | None = None
-) -> Optimized:
-    """A run with progress shown, ended in good order at a time, before a limit of memory, or by a signal.
+class Display:
+    """The listener of a run: each stage has its bar or status on a terminal, and lines from time to time elsewhere.
 
-    See `tetopt.cli.ending.is_ended`.
+    `begin_keeping` is called as soon as there is a mesh that is worth keeping.
     """
-    max_seconds = None if ends is None else max(ends - time.perf_counter(), 1e-9)
-    begin, rows = time.perf_counter(), list[Record]()
-    say = rare_lines()
 
-    def is_stopped() -> bool:
-        if rows:
-            say(f"  in iteration {len(rows)}, {_spent(time.perf_counter() - begin)}")
-        return is_ended() or (limit is not None and limit.is_reached())
+    def __init__(self, begin_keeping: Callable[[], None]) -> None:
+        self._begin_keeping = begin_keeping
+        self._shown = ExitStack()
+        self._tell: Callable[[Event], None] = lambda event: None
+        self._begin = 0.0
+        self._rows: list[Record] = []
+        self._say = rare_lines()
 
-    with _progress(iterations) as show:
+    def __enter__(self) -> Display:
+        return self
 
-        def recorded(row: Record) -> None:
-            rows.append(row)
-            show(row)
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
 
-        result = run(max_seconds=max_seconds, callback=recorded, stop=is_stopped)
-    if iterations == 0:  # the initial mesh itself, not its nodes put on the sampling grid
-        result = result._replace(mesh=initial)
-    if result.ended == "stopped" and not is_ended():
-        result = result._replace(ended="max_gb")
-    if result.ended != "iterations":
-        words = {
-            "converged": "converged: hardly anything changes any more",
-            "max_seconds": "out of time: the mesh so far is kept",
-            "max_gb": "no more memory is allowed: the mesh so far is kept",
-            "stopped": "interrupted: the mesh so far is kept",
-        }
-        log.print(f"{words[result.ended]} (iteration {result.history[-1].iteration} of {iterations})")
-    return result
+    def close(self) -> None:
+        """End what is shown."""
+        self._shown.close()
 
+    def __call__(self, event: Event) -> None:
+        """Show an event."""
+        if event.kind == "started":
+            self.close()
+            self._start(event.data, event.text)
+        elif event.kind == "progress":
+            self._tell(event)
+        else:
+            show_event(event)
 
-def prepare(content: Content, k_D: float, mode: Mode) -> None:
-    """Load the compiled kernels, or compile them, before the clock of the first iteration starts."""
-    begin = time.perf_counter()
-    with compiling("preparing the kernels (the first run compiles them, half a minute)") as progress:
-        prepare_kernels(content, k_D, "paper" if mode == "paper" else "fast", mode == "graded", progress)
-    seconds = time.perf_counter() - begin
-    if seconds > LONG_SECONDS:
-        log.print(f"kernels compiled in {seconds:.0f} s; later runs on images of this kind load them from the cache")
+    def is_over(self) -> bool:
+        """Whether a signal has asked for the end; between iterations, a line says from time to time how far it is."""
+        if self._rows:
+            self._say(f"  in iteration {len(self._rows)}, {_spent(time.perf_counter() - self._begin)}")
+        return is_ended()
+
+    def _start(self, stage: Stage, text: str) -> None:
+        if stage.name in ("read", "start"):
+            self._shown.enter_context(waiting(text))
+        elif stage.name == "kernels":
+            say = self._shown.enter_context(compiling(text))
+            self._tell = lambda event: say(event.text)
+        elif stage.name == "optimise":
+            self._begin_keeping()
+            self._begin, self._rows, self._say = time.perf_counter(), [], rare_lines()
+            show = self._shown.enter_context(_bar(stage.number or 0))
+
+            def recorded(event: Event) -> None:
+                self._rows.append(event.data)
+                show(event.data)
+
+            self._tell = recorded
+        elif stage.name == "parts":
+            self._tell = self._shown.enter_context(_parts_bar(self._begin_keeping))
+        if stage.name in ("optimised", "write"):
+            self._rows = []
 
 
 @contextlib.contextmanager
@@ -127,7 +144,7 @@ def _spent(seconds: float) -> str:
 
 
 @contextlib.contextmanager
-def _progress(iterations: int) -> Iterator[Callable[[Record], None]]:
+def _bar(iterations: int) -> Iterator[Callable[[Record], None]]:
     """A function that shows each record: a bar with the remaining time on a terminal, else a line."""
     first: list[Record] = []
 
@@ -148,3 +165,41 @@ def _progress(iterations: int) -> Iterator[Callable[[Record], None]]:
         yield lambda row: log.print(
             f"iteration {row.iteration:3d}/{iterations}  {words(row)}  {row.n_cells} cells  {_spent(row.seconds)}"
         )
+
+
+@contextlib.contextmanager
+def _parts_bar(begin_keeping: Callable[[], None]) -> Iterator[Callable[[Event], None]]:
+    """A function that shows how far a run in parts is: a bar on a terminal, else lines."""
+    say, number = rare_lines(), -1
+
+    def words(at: PartsProgress) -> str:
+        now, history = at
+        kind = {"measure": "measuring", "improve": f"round {now.number}", "fields": "fields of cells"}[now.kind]
+        energies = f", E {history[-1].E:.4f}" if history else ""
+        return f"{kind} of {now.n_rounds - 2}{energies}" if now.kind == "improve" else f"{kind}{energies}"
+
+    def follow(event: Event, show: Callable[[Any, str], None]) -> None:
+        nonlocal number
+        if event.data.history:
+            begin_keeping()
+        show(event.data.now, words(event.data))
+        number = event.data.now.number
+
+    if log.is_terminal:
+        columns = TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total} parts")
+        with Progress(*columns, console=log, transient=True) as bar:
+            task = bar.add_task("", total=1)
+
+            def show(now: Any, text: str) -> None:
+                bar.update(task, description=text, completed=now.done, total=now.n_parts)
+
+            yield lambda event: follow(event, show)
+    else:
+
+        def tell(now: Any, text: str) -> None:
+            if now.number != number:
+                log.print(f"{text}: {counted(now.n_parts, 'part')}")
+            else:
+                say(f"  {now.done} of {counted(now.n_parts, 'part')} done")
+
+        yield lambda event: follow(event, tell)

@@ -12,7 +12,6 @@ from rich.markup import escape
 
 from tetopt import InputError
 from tetopt.cli.console import log, out, show_error, show_warning
-from tetopt.cli.inputs import cell_field, label_table, read_mesh
 from tetopt.cli.options import MeshArgument, NumberOptions, SurfacePart, option
 from tetopt.geometry.manifold import OUTSIDE_LABEL, LabelSurfaces, label_surfaces, surface_ridges
 from tetopt.geometry.simplex import volumes
@@ -20,6 +19,7 @@ from tetopt.geometry.surface import Surface, surface_of
 from tetopt.geometry.topology import facets, largest_component
 from tetopt.io.files import checked_output, save_json
 from tetopt.io.surfaces import LABELLED_SUFFIXES, SURFACE_SUFFIXES, SurfaceCheck, checked_surface, save_surface
+from tetopt.job.inputs import cell_field, label_table, read_mesh
 from tetopt.measure.fidelity import FacetSurface, surface_areas
 from tetopt.model.file import MeshFile
 from tetopt.model.labels import label_words, labels_named

@@ -7,10 +7,10 @@ import secrets
 import socket
 import sys
 from collections.abc import Callable
+from importlib.metadata import version
 from pathlib import Path
 from typing import Any, NamedTuple
 
-import tetopt
 from tetopt.budget import memory_words
 from tetopt.errors import InputError
 from tetopt.processes import end_with_parent
@@ -101,7 +101,7 @@ class About(NamedTuple):
             text = None
         limit = None if dask_worker is None else dask_worker.memory_manager.memory_limit
         return cls(
-            version=tetopt.__version__,
+            version=version("tetopt"),
             python=".".join(map(str, sys.version_info[:2])),
             probe=text,
             host=socket.gethostname(),

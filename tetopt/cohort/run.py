@@ -37,7 +37,7 @@ WARNING_MARK = "tetopt: warning: "
 THREAD_NAMES = ("NUMBA_NUM_THREADS", "OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 
 
-class Job(NamedTuple):
+class SubjectTask(NamedTuple):
     """A subject to be meshed."""
 
     key: str
@@ -60,7 +60,7 @@ class Ended(NamedTuple):
     peak_bytes: int  # of resident memory
 
 
-def run_subject(job: Job) -> Ended:
+def run_subject(job: SubjectTask) -> Ended:
     """Mesh a subject; a run that a signal ends is repeated once."""
     begin = time.monotonic()
     for attempt in range(1, MOST_ATTEMPTS + 1):
@@ -72,7 +72,7 @@ def run_subject(job: Job) -> Ended:
     return ended
 
 
-def set_down(out: Path, job: Job, ended: Ended, attempts: int) -> None:
+def set_down(out: Path, job: SubjectTask, ended: Ended, attempts: int) -> None:
     """Leave a file that says why a subject failed."""
     save_json(
         failure_path(out, job.key),
@@ -88,7 +88,7 @@ def set_down(out: Path, job: Job, ended: Ended, attempts: int) -> None:
     )
 
 
-def _attempt(job: Job, begin: float, attempt: int) -> tuple[Ended, bool]:
+def _attempt(job: SubjectTask, begin: float, attempt: int) -> tuple[Ended, bool]:
     """Run once; how it ended, and whether by a signal that is not ours."""
     out = Path(job.out)
     work = out / WORK_NAME / f"{job.key}.{job.run}.{os.getpid()}"

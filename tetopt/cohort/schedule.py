@@ -8,22 +8,22 @@ from typing import Any
 
 from tetopt.budget import memory_words
 from tetopt.cluster.tasks import is_lost, lost_words, outcomes
-from tetopt.cohort.run import MOST_ATTEMPTS, Ended, Job, run_subject, set_down
+from tetopt.cohort.run import MOST_ATTEMPTS, Ended, SubjectTask, run_subject, set_down
 from tetopt.study.endings import last_line
 
 
 def run_all(
-    jobs: Sequence[Job],
+    jobs: Sequence[SubjectTask],
     client: Any,
     slots: Callable[[], int],
     room: float,
-    task: Callable[[Job], Ended] = run_subject,
+    task: Callable[[SubjectTask], Ended] = run_subject,
 ) -> Iterator[Ended]:
     """Run subjects on a cluster of dask's; how each ended, as they do.
 
     Parameters
     ----------
-    jobs : sequence of Job
+    jobs : sequence of SubjectTask
         In the order in which they begin.
     client : distributed.Client
     slots : callable
@@ -58,7 +58,7 @@ def _cause(error: BaseException) -> str:
     return last_line(" ".join(f"{type(error).__name__}: {error}".split()))
 
 
-def _failed(job: Job, reason: str, attempts: int) -> Ended:
+def _failed(job: SubjectTask, reason: str, attempts: int) -> Ended:
     ended = Ended(job.key, "failed", reason, 0.0, 0)
     set_down(Path(job.out), job, ended, attempts)
     return ended

@@ -29,7 +29,7 @@ def state_of(out: Path, key: str, suffix: str, request: dict[str, Any] | None) -
     suffix : str
         Of its mesh's file.
     request : dict, optional
-        What is asked for now, of `tetopt.cli.request.requested`; without it what is there is not compared.
+        What is asked for now, of `tetopt.job.request.requested`; without it what is there is not compared.
     """
     numbers = numbers_of(numbers_path(out, key))
     failure = numbers_of(failure_path(out, key))

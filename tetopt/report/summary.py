@@ -13,7 +13,6 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-import tetopt
 from tetopt.engine.loop import Optimized
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import node_count
@@ -31,7 +30,7 @@ SHOWN_VERSIONS = ("numpy", "scipy", "numba", "nibabel", "pyvista")
 
 def versions() -> dict[str, str]:
     """Versions of tetopt, Python and the libraries that the numbers rest on."""
-    ours = {"tetopt": tetopt.__version__, "python": platform.python_version()}
+    ours = {"tetopt": version("tetopt"), "python": platform.python_version()}
     return ours | {name: version(name) for name in SHOWN_VERSIONS}
 
 

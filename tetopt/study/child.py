@@ -26,7 +26,7 @@ from tetopt.interpreter import python_command, python_environment
 from tetopt.mesh import Mesh
 from tetopt.processes import started, watched
 from tetopt.study.endings import Crashed, NotInstalled, last_line, signal_words
-from tetopt.study.pipelines import Job, Produced
+from tetopt.study.pipelines import PipelineInput, Produced
 
 try:
     import resource
@@ -51,8 +51,8 @@ class Outcome(NamedTuple):
 
 
 def run_in_child(
-    pipeline: Callable[[Job], Produced],
-    job: Job,
+    pipeline: Callable[[PipelineInput], Produced],
+    job: PipelineInput,
     *,
     max_seconds: float = float("inf"),
     max_bytes: int | None = None,
@@ -68,7 +68,7 @@ def run_in_child(
     pipeline : callable
         The function of a `tetopt.study.pipelines.Pipeline`, or any other that can be pickled. Its temporary files, and
         those of programs that it runs, lie in a folder that goes away with the child, however it ends.
-    job : Job
+    job : PipelineInput
     max_seconds : float
         Wall time of one run, the child's start included, after which it is killed with all that it started.
     max_bytes : int, optional
@@ -101,7 +101,9 @@ def run_in_child(
     return again._replace(failure=f"twice {crash}" if again.failure == crash else f"{crash}; then {again.failure}")
 
 
-def _run_once(pipeline: Callable[[Job], Produced], job: Job, max_seconds: float, max_bytes: int | None) -> Outcome:
+def _run_once(
+    pipeline: Callable[[PipelineInput], Produced], job: PipelineInput, max_seconds: float, max_bytes: int | None
+) -> Outcome:
     with tempfile.TemporaryDirectory(prefix="tetopt-") as name:
         folder = Path(name)
         (folder / "job.pickle").write_bytes(pickle.dumps((pipeline, job)))

@@ -69,7 +69,7 @@ from tetopt.study.compare_report import (
     averages_of,
     from_json,
 )
-from tetopt.study.pipelines import UNTIMED_STEPS, Job, Pipeline
+from tetopt.study.pipelines import UNTIMED_STEPS, Pipeline, PipelineInput
 from tetopt.study.program import file_checksums, pipelines_with
 from tetopt.study.tradeoff import tradeoff
 
@@ -490,7 +490,7 @@ def _attempt(bench: Bench, name: str, order: int, nodes: int, repeat: int) -> At
         return kept
     bench.say(f"{title}, {nodes} nodes")
     comparison, settings = bench.comparison, bench.comparison.settings
-    job = Job(
+    job = PipelineInput(
         comparison.image, comparison.labels, nodes, settings.classes, settings.k_D, settings.iterations, order
     )  # fmt: skip
     outcome = run_in_child(

@@ -27,7 +27,7 @@ from tetopt.target.content import Content, content
 LATTICE_RUNS = 4  # of the search for a lattice of order 2, at most; there are few so coarse, and it takes milliseconds
 
 
-class Job(NamedTuple):
+class PipelineInput(NamedTuple):
     """What every pipeline gets."""
 
     image: Image  # 3-D
@@ -62,7 +62,7 @@ def _timed(seconds: dict[str, float], step: str) -> Iterator[None]:
     seconds[step] = time.perf_counter() - begin
 
 
-def bcc(job: Job) -> Produced:
+def bcc(job: PipelineInput) -> Produced:
     """The body-centred cubic lattice, untouched.
 
     Raises
@@ -81,7 +81,7 @@ def bcc(job: Job) -> Produced:
     return Produced(runs[0].result, seconds, [])
 
 
-def ours(job: Job, mode: Mode) -> Produced:
+def ours(job: PipelineInput, mode: Mode) -> Produced:
     """`tetopt.mesh_image`: graded with its defaults, else as the job says; the paper's scheme takes the image alone.
 
     Raises
@@ -100,7 +100,7 @@ def ours(job: Job, mode: Mode) -> Produced:
     return Produced(result.mesh, seconds, [f"ended by: {result.ended}", *notes], result.labels)
 
 
-def image_blind(job: Job) -> Produced:
+def image_blind(job: PipelineInput) -> Produced:
     """The paper's scheme with k_D = 0: optimal Delaunay triangulation, whatever the image is.
 
     Raises
@@ -111,7 +111,7 @@ def image_blind(job: Job) -> Produced:
     return ours(job._replace(k_D=0.0), "paper")
 
 
-def _content(job: Job, seconds: dict[str, float]) -> tuple[Image | Content, list[str]]:
+def _content(job: PipelineInput, seconds: dict[str, float]) -> tuple[Image | Content, list[str]]:
     """What the mesh is to represent, and what to note of it: the image, with labels if they are given."""
     if job.labels is None:
         return job.image, []
@@ -122,7 +122,7 @@ def _content(job: Job, seconds: dict[str, float]) -> tuple[Image | Content, list
         return content(job.image, labels=job.labels), ["meshed from the image and the labels given, equally weighted"]
 
 
-def pytetwild(job: Job) -> Produced:
+def pytetwild(job: PipelineInput) -> Produced:
     """Interfaces of the classes or labels, and fTetWild with a sizing field around them; see `tetwild`.
 
     Raises
@@ -139,7 +139,7 @@ def pytetwild(job: Job) -> Produced:
     return _searched(result, seconds, surfaces.notes)
 
 
-def cleaver(job: Job) -> Produced:
+def cleaver(job: PipelineInput) -> Produced:
     """Labels, given or by thresholds, and Cleaver's lattice stuffing; see `cleaver`.
 
     Raises
@@ -168,7 +168,7 @@ class Pipeline(NamedTuple):
     title: str
     kind: str  # "tetopt", "peer" or "control"
     about: str
-    function: Callable[[Job], Produced]
+    function: Callable[[PipelineInput], Produced]
     is_random: bool = False
 
 

@@ -33,7 +33,7 @@ from tetopt.mesh import Mesh
 from tetopt.model.file import MeshFile
 from tetopt.study.endings import Crashed, last_line, signal_words
 from tetopt.study.interfaces import class_labels
-from tetopt.study.pipelines import PIPELINES, Job, Pipeline, Produced
+from tetopt.study.pipelines import PIPELINES, Pipeline, PipelineInput, Produced
 from tetopt.study.search import LEAST_REQUEST, REQUEST_RESPONSE, corners_for, is_near, tries
 from tetopt.study.tetwild import node_spacing, put_on_box
 
@@ -100,7 +100,7 @@ def _suffix(word: str) -> str | None:
     return None if match is None else match[1] or ".vtu"
 
 
-def by_program(job: Job, program: Program) -> Produced:
+def by_program(job: PipelineInput, program: Program) -> Produced:
     """The program's mesh of about as many nodes as the job says, its boundary on the box if it lies near.
 
     What it is told to make is corrected up to four times until the number of nodes is within 5 %.
@@ -144,7 +144,7 @@ def by_program(job: Job, program: Program) -> Produced:
     return Produced(mesh, seconds, [f"{len(runs)} runs", *notes, *on_box, *of_labels], labels)
 
 
-def _inputs(folder: Path, job: Job, command: str) -> dict[str, str]:
+def _inputs(folder: Path, job: PipelineInput, command: str) -> dict[str, str]:
     """Paths by placeholder; of the files that the program reads those are written that it is to read."""
     paths = {"image": str(folder / "image.nii.gz"), "labels": str(folder / "labels.nii.gz")}
     if "{image}" in command:
@@ -164,7 +164,9 @@ def _output(words: list[str], stem: str) -> Path:
     return Path(stem + next(suffix for word in words if (suffix := _suffix(word)) is not None))
 
 
-def _own_labels(loaded: MeshFile, kept: NDArray[np.int64], job: Job) -> tuple[NDArray[np.int64] | None, list[str]]:
+def _own_labels(
+    loaded: MeshFile, kept: NDArray[np.int64], job: PipelineInput
+) -> tuple[NDArray[np.int64] | None, list[str]]:
     """The label that a program gives each cell kept, as "label" in its file, -1 if it is none of the image's.
 
     A label that all cells have is the number of a file's only part.

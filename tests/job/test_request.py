@@ -8,23 +8,10 @@ import typer
 from commands import exit_code, mesh_words, numbers_in
 
 import tetopt
-from tetopt import InputError
-from tetopt.cli.options import (
-    ContentOptions,
-    EngineOptions,
-    ImagePart,
-    OutputOptions,
-    Records,
-    SizeOptions,
-    SolverOptions,
-    SourceOptions,
-    StartOptions,
-    from_records,
-    given_options,
-    option_words,
-    with_options,
-)
-from tetopt.cli.request import requested
+from tetopt import InputError, Job
+from tetopt.cli.options import from_records, option_words, with_options
+from tetopt.job.options import RunOptions, given_options
+from tetopt.job.request import requested
 
 # Of each field of the options of `tetopt mesh` a value that is not its default.
 VALUES = {
@@ -38,56 +25,41 @@ VALUES = {
     "loads": ["compress:5%", "hold:xmin"], "label_names": Path("/t.csv"), "order": 2, "nonlinear": True, "units": "MPa",
     "space": "lps", "keep_components": True,
 }  # fmt: skip
-KINDS = (SourceOptions, SizeOptions, StartOptions, EngineOptions, SolverOptions)
-
-
-def record(kind):
-    """A record whose fields all have another value than the default."""
-    part = {"part": ImagePart(**{each.name: VALUES[each.name] for each in fields(ImagePart)})}
-    return kind(**{each.name: (VALUES | part)[each.name] for each in fields(kind)})
 
 
 def test_words_give_the_options_back():
-    """Every option of `tetopt mesh`, as words of a command line, comes to the same records."""
-    before = [record(kind) for kind in KINDS]
-    after = []
+    """Every option that runs of many subjects have, as words of a command line, comes to the same record."""
+    before, after = RunOptions(**{each.name: VALUES[each.name] for each in fields(RunOptions)}), []
 
-    def command(
-        source: SourceOptions, sizes: SizeOptions, start: StartOptions, engine: EngineOptions, solver: SolverOptions
-    ) -> int:
-        after.extend([source, sizes, start, engine, solver])
+    def command(options: RunOptions) -> int:
+        after.append(options)
         return 0
 
     app = typer.Typer()
     app.command()(from_records(command))
-    options = given_options(*before)
-    images = options.pop("images")
-    app([*option_words(options), "--", *map(str, images)], standalone_mode=False)
-    assert after == before
+    app(list(option_words(given_options(before))), standalone_mode=False)
+    assert after == [before]
 
 
 def test_defaults_are_not_given():
-    assert given_options(*(kind() for kind in KINDS[1:])) == {}
+    assert given_options(RunOptions()) == {}
 
 
 @pytest.fixture
 def request_of(tmp_path):
     """A function from other values of options to what is then requested, of a mesh of an image with a mask."""
     for name in ("a.nii", "m.nii", "young.csv"):
-        (tmp_path / name).write_text(name)
+        (tmp_path / name).write_text("intensity,young\n0,1\n100,5\n")
 
     def request(folder=tmp_path, suffix=".vtu", **others):
-        """`others` by record's class name."""
-        source = {"images": [folder / "a.nii"], "mask": folder / "m.nii"} | others.get("source", {})
-        output = OutputOptions(mesh=folder / f"any{suffix}")
-        engine, solver = EngineOptions(**others.get("engine", {})), SolverOptions(**others.get("solver", {}))
-        return requested(SourceOptions(**source), SizeOptions(nodes=50), StartOptions(), engine, solver, output)
+        options = {"mask": folder / "m.nii", "nodes": 50, **others}
+        return requested(Job(images=[folder / "a.nii"], output=folder / f"any{suffix}", **options))
 
     return request
 
 
 def test_a_request_states_what_was_given(request_of, tmp_path):
-    request = request_of(solver={"young": str(tmp_path / "young.csv"), "nu": "0.3"})
+    request = request_of(young=str(tmp_path / "young.csv"), nu="0.3")
     assert request["options"] == {"nodes": 50, "nu": "0.3", "format": ".vtu"}
     assert [name for name, _ in request["files"]["images"]] == ["a.nii"]
     assert sorted(request["files"]) == ["images", "mask", "young"]
@@ -97,15 +69,15 @@ def test_a_request_states_what_was_given(request_of, tmp_path):
 def test_a_request_changes_with_what_decides_the_mesh(request_of, tmp_path):
     first = request_of()["sha256"]
     assert request_of()["sha256"] == first
-    assert request_of(engine={"threads": 1})["sha256"] == first
-    others = [request_of(engine={"iterations": 3}), request_of(suffix=".inp"), request_of(source={"mask": None})]
+    assert request_of(threads=1)["sha256"] == first
+    others = [request_of(iterations=3), request_of(suffix=".inp"), request_of(mask=None)]
     (tmp_path / "m.nii").write_text("another")
     others.append(request_of())
     assert len({first, *(each["sha256"] for each in others)}) == 5
 
 
 def test_a_volume_of_a_file_is_part_of_a_request(request_of, tmp_path):
-    first, second = (request_of(source={"mask": tmp_path / f"m.nii:{volume}"}) for volume in (0, 1))
+    first, second = (request_of(mask=tmp_path / f"m.nii:{volume}") for volume in (0, 1))
     (name, checksum), (other, same) = (each["files"]["mask"][0] for each in (first, second))
     assert (name, other) == ("m.nii:0", "m.nii:1")
     assert checksum == same == request_of()["files"]["mask"][0][1]
@@ -125,20 +97,16 @@ def test_run_json_states_the_request(tmp_path):
     assert exit_code("phantom", "sphere", "-o", tmp_path / "sphere.nii.gz", "--voxel-mm", "5") == 0
     words = mesh_words(tmp_path / "sphere.nii.gz", tmp_path, "--nodes", "60", "--iterations", "1", "--threads", "1")
     assert exit_code(*words) == 0
-    source = SourceOptions(images=[tmp_path / "sphere.nii.gz"])
-    sizes, engine = SizeOptions(nodes=60), EngineOptions(iterations=1)
-    output = OutputOptions(mesh=tmp_path / "b.vtu")
-    assert numbers_in(tmp_path / "a.json")["request"] == requested(
-        source, sizes, StartOptions(), engine, SolverOptions(), output
-    )
+    job = Job(images=[tmp_path / "sphere.nii.gz"], nodes=60, iterations=1, output=tmp_path / "b.vtu")
+    assert numbers_in(tmp_path / "a.json")["request"] == requested(job)
 
 
 def test_options_of_a_row_replace_those_of_all():
     """Of values that may be repeated all are the row's; a switch can be off; what is not named stays."""
-    solver = SolverOptions(sets=["C=below:3"], nonlinear=True, units="MPa", average="hill")
+    options = RunOptions(sets=["C=below:3"], nonlinear=True, units="MPa", average="hill")
     texts = {"set": "A=below:1; B=below:2;", "nonlinear": "No", "nodes": "70", "crop": "1:9,:,:", "average": "voigt"}
-    own = with_options(Records(ContentOptions(), SizeOptions(), StartOptions(), EngineOptions(), solver), texts)
-    assert own.given() == {
+    own = with_options(options, texts)
+    assert given_options(own) == {
         "crop": "1:9,:,:", "nodes": 70, "average": "voigt", "set": ["A=below:1", "B=below:2"], "units": "MPa",
     }  # fmt: skip
 
@@ -149,6 +117,5 @@ def test_options_of_a_row_replace_those_of_all():
     ({"json": "a.json"}, "is no option"), ({"help": "1"}, "is no option"),
 ])  # fmt: skip
 def test_options_of_a_row_that_cannot_be(texts, words):
-    records = Records(ContentOptions(), SizeOptions(), StartOptions(), EngineOptions(), SolverOptions())
     with pytest.raises(InputError, match=words):
-        with_options(records, texts)
+        with_options(RunOptions(), texts)

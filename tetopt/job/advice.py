@@ -1,4 +1,4 @@
-"""What a mesh that `tetopt mesh` made must keep, and what is odd about it; both are said on standard error."""
+"""What the mesh of a run must keep, and what is odd about it: told as events."""
 
 from __future__ import annotations
 
@@ -8,12 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.cli.console import show_error, show_warning
-from tetopt.cli.options import Method
 from tetopt.engine.loop import Optimized
 from tetopt.engine.meshing import Mode
 from tetopt.engine.promises import LABEL_VOXELS
 from tetopt.engine.surface import MOST_MEETING
+from tetopt.job.events import violated, warning
+from tetopt.job.options import Method
 from tetopt.measure.fidelity import MaskFidelity
 from tetopt.model.labels import label_words
 from tetopt.start.sizes import LONG_EDGE, EdgeRatios, Sizes
@@ -30,23 +30,23 @@ EMPTY_CELLS = 0.02  # of the cells: if more hold no voxel, they are too many for
 THICK_SLICES = 2.0  # times a voxel's shortest edge: where slices are so far apart, cells lie between them
 
 
-def check_promises(result: Optimized, measured: dict[str, Any], word: str = "mask") -> int:
-    """0 if the mesh is all that it should be (`tetopt.engine.promises`), and each large label has cells; else 1.
+def tell_violated(result: Optimized, measured: dict[str, Any], word: str = "mask") -> list[str]:
+    """The requirements that the mesh does not meet (`tetopt.engine.promises`), large labels without cells among them.
 
-    Each promise that is missed is said in a line of its own. Warns of lesser misses. Messages call what is meshed
-    `word`.
+    Each is told, and lesser misses are warned of. Messages call what is meshed `word`.
     """
     lost = list(_lost(measured))
-    problems = [words for name, words in result.missed.items() if not (name == "labels" and lost)]
-    for problem in (*problems, *lost):
-        show_error(problem.replace("the mask", f"the {word}"))
+    missed = [words for name, words in result.missed.items() if not (name == "labels" and lost)]
+    problems = [words.replace("the mask", f"the {word}") for words in (*missed, *lost)]
+    for problem in problems:
+        violated(problem)
     _warn_of_mask(measured.get("mask"), word)
     if n_dropped := measured.get("dropped_components"):
-        show_warning(
-            f"dropped {n_dropped} connected components of the mesh that the {word} does not have (--keep-components "
+        warning(
+            f"dropped {n_dropped} connected components of the mesh that the {word} does not have (`keep_components` "
             "keeps them)"
         )
-    return 1 if problems or lost else 0
+    return problems
 
 
 def _lost(measured: dict[str, Any]) -> Iterator[str]:
@@ -58,16 +58,16 @@ def _lost(measured: dict[str, Any]) -> Iterator[str]:
     if large:
         yield (
             f"no cell has label {', '.join(large)}, of more than {LABEL_VOXELS} voxels; allow more nodes, or a higher "
-            "--label-weight"
+            "`label_weight`"
         )
     if small := [words[row.label] for row in lost if row.voxels <= LABEL_VOXELS]:
-        show_warning(f"no cell has label {', '.join(small)}, of {LABEL_VOXELS} voxels or fewer")
+        warning(f"no cell has label {', '.join(small)}, of {LABEL_VOXELS} voxels or fewer")
     poor = [words[row.label] for row in labels if row.voxels > LABEL_VOXELS and row.dice < LABEL_DICE]
     if poor := [label for label in poor if label not in large]:
         first = ", ".join(poor[:5]) + (f" and {len(poor) - 5} more" if len(poor) > 5 else "")
-        show_warning(
+        warning(
             f"Dice below {LABEL_DICE} for label {first}: cells are too large for them, or these are no labels; allow "
-            "more nodes, or follow every voxel by --smooth-interfaces 0"
+            "more nodes, or follow every voxel by `smooth_interfaces` 0"
         )
 
 
@@ -75,18 +75,18 @@ def _warn_of_mask(mask: MaskFidelity | None, word: str) -> None:
     if mask is None:
         return
     if mask.components > mask.mesh_components:  # more of the mesh than of the mask is a requirement that is missed
-        show_warning(
+        warning(
             f"the {word} has {mask.components} connected components, the mesh {mask.mesh_components}: elements are too "
             f"large for the {word}'s detail here; allow more nodes"
         )
     if (far := max(mask.distance_p95, mask.reverse_p95)) > FAR_VOXELS:
-        show_warning(
+        warning(
             f"the mesh's boundary and the {word}'s surface are {far:.1f} voxels apart at the 95th percentile, "
             f"{max(mask.distance_mean, mask.reverse_mean):.1f} in the mean: cells are larger than its details; "
             "allow more nodes"
         )
     if abs(mask.mesh_euler - mask.euler) > EULER_SHARE * max(abs(mask.euler), EULER_USUAL):
-        show_warning(
+        warning(
             f"the Euler number of the {word}'s surface is {mask.euler}, that of the mesh's boundary {mask.mesh_euler}: "
             f"the mesh has other holes and handles than the {word}; allow more nodes"
         )
@@ -102,30 +102,30 @@ def warn_of_result(
     (n,) the edges of the image's voxels, mm.
     """
     if nodes is not None and abs(n_nodes - nodes) > NODES_MISSED * nodes:
-        remedy = "more iterations, a --k-d above 0, or larger sizes come nearer"
+        remedy = "more iterations, a `k_D` above 0, or larger sizes come nearer"
         if (needed := measured.get("nodes_of_sizes")) and needed > nodes:
             remedy = f"the target sizes take about {needed}; ask for as many, or for larger sizes"
-        show_warning(f"{n_nodes} nodes instead of {nodes}: {remedy}")
+        warning(f"{n_nodes} nodes instead of {nodes}: {remedy}")
     lowest, first, last = min(row.E for row in result.history), result.history[0], result.history[-1]
     if last.E > lowest * (1.0 + ENERGY_RISE) and method == "paper":
-        show_warning(
+        warning(
             f"E ended at {last.E:.4f}, above {lowest:.4f} on the way: a tessellation taken in the first n_t iterations "
-            "raised it; --retessellate accept takes only those that lower it"
+            "raised it; `retessellate` accept takes only those that lower it"
         )
     if mode == "start" and last.E_D > first.E_D * (1.0 + ENERGY_RISE):
         rise = f"{last.E_D / first.E_D:.3f} times what it was" if first.E_D > 0.0 else "above 0, which it was"
-        show_warning(f"E_D ended at {rise}: the cells' shapes were improved at its cost; a higher --k-d lowers it")
+        warning(f"E_D ended at {rise}: the cells' shapes were improved at its cost; a higher `k_D` lowers it")
     n_empty = measured.get("cells_without_voxel", 0)
     if n_empty > EMPTY_CELLS * len(result.mesh.cells):
-        remedy = "ask for fewer nodes (--nodes)"
+        remedy = "ask for fewer nodes (`nodes`)"
         if spacing.max() >= THICK_SLICES * spacing.min():
             remedy = f"slices are {spacing.max():.3g} mm apart, and cells between them are usual there"
-        show_warning(
+        warning(
             f"{n_empty} of {len(result.mesh.cells)} cells hold no voxel centre: these contribute nothing to E_D and "
             f"take the nearest voxel's value; {remedy}"
         )
     if crowded := measured.get("nodes_of_many_labels"):
-        show_warning(
+        warning(
             f"more than {MOST_MEETING} labels meet at {crowded} nodes, which are brought to where the first "
             f"{MOST_MEETING} of them do"
         )
@@ -134,17 +134,17 @@ def warn_of_result(
 def warn_of_sizes(sizes: Sizes, shortest: float, longest: float, edges: EdgeRatios | None) -> None:
     """Say which limits and targets of sizes the edges, from shortest to longest, mm, do not meet."""
     if sizes.longest is not None and longest > sizes.longest * (1.0 + LENGTH_ROUNDING):
-        show_warning(
-            f"the longest edge is {longest:.4g} mm, {longest / sizes.longest - 1.0:.0%} over --edge-max "
+        warning(
+            f"the longest edge is {longest:.4g} mm, {longest / sizes.longest - 1.0:.0%} over `edge_max` "
             f"{sizes.longest:g}: no split or collapse makes such an edge, but nodes move apart; ask for less"
         )
     if shortest < sizes.smallest * (1.0 - LENGTH_ROUNDING):
-        show_warning(
-            f"the shortest edge is {shortest:.4g} mm, {1.0 - shortest / sizes.smallest:.0%} under --size-min "
+        warning(
+            f"the shortest edge is {shortest:.4g} mm, {1.0 - shortest / sizes.smallest:.0%} under `size_min` "
             f"{sizes.smallest:g}: no split makes such an edge, but nodes move together; ask for more"
         )
     if edges is not None and edges.above > TARGETS_MISSED:
-        show_warning(
+        warning(
             f"{edges.above:.0%} of the edges are over {LONG_EDGE:.2f} times their target size: there are too few "
             "nodes; ask for more, or for larger sizes"
         )

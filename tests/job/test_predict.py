@@ -9,21 +9,14 @@ from commands import exit_code, labelled_lattice_words, mesh_words, numbers_in
 from models import sample_image
 
 import tetopt
+from tetopt import Job
 from tetopt.cli import mesh as cli_mesh
-from tetopt.cli import predict
-from tetopt.cli.options import (
-    EngineOptions,
-    ImagePart,
-    OutputOptions,
-    SizeOptions,
-    SolverOptions,
-    SourceOptions,
-    StartOptions,
-)
-from tetopt.cli.plan import planned
+from tetopt.cli import predict as cli_predict
 from tetopt.engine import cost
 from tetopt.engine.cost import RunSize
 from tetopt.interpreter import python_command, python_environment
+from tetopt.job import predict
+from tetopt.job.plan import planned
 
 
 @pytest.fixture
@@ -40,11 +33,9 @@ def sizes(monkeypatch):
     return rows
 
 
-def plan_of(folder, images, *, mask=None, labels=None, part=None, order=None, start=None, **sizes):
+def plan_of(folder, images, **options):
     """A plan of options; nothing is read."""
-    source = SourceOptions(images=images, mask=mask, labels=labels, part=part or ImagePart())
-    options = SizeOptions(**sizes), start or StartOptions(), EngineOptions(), SolverOptions(order=order)
-    return planned(source, *options, OutputOptions(mesh=folder / "a.vtu"))
+    return planned(Job(images=images, output=folder / "a.vtu", **options))
 
 
 def test_a_prediction_writes_nothing(image_path, tmp_path, monkeypatch, capsys):
@@ -56,8 +47,8 @@ def test_a_prediction_writes_nothing(image_path, tmp_path, monkeypatch, capsys):
     assert "s on 1 thread, in nine of ten cases" in lines
     assert "MB of memory at its peak" in lines or "GB of memory at its peak" in lines
     assert sorted(tmp_path.rglob("*")) == before
-    monkeypatch.setattr(predict, "calibrated_speed", lambda: 1e-3)
-    monkeypatch.setattr(predict, "available_bytes", lambda: 1000)
+    monkeypatch.setattr(cli_predict, "calibrated_speed", lambda: 1e-3)
+    monkeypatch.setattr(cli_predict, "available_bytes", lambda: 1000)
     assert exit_code(*words[:2], "-o", tmp_path / "a.vtu", "--target-error", "0.5", "--predict") == 0
     said = capsys.readouterr()
     assert "of 4 runs with 5000 nodes" in said.out
@@ -120,8 +111,7 @@ def test_sizes_by_headers(image_path, tmp_path, monkeypatch):
     more = predict.size_by_headers(plan, like)
     assert more == like._replace(n_read=3 * n_voxels, n_voxels=round(0.6 * n_voxels), n_nodes=150)
     assert predict.size_by_headers(plan_of(tmp_path, [image_path]), like).n_nodes == 7
-    part = ImagePart(crop="1:3,:,0:2", slice_="j=2")
-    assert predict.size_by_headers(plan_of(tmp_path, [image_path], part=part)).n_voxels == 4
+    assert predict.size_by_headers(plan_of(tmp_path, [image_path], crop="1:3,:,0:2", slice_="j=2")).n_voxels == 4
     with pytest.raises(tetopt.InputError, match="no such file"):
         predict.size_by_headers(plan_of(tmp_path, [tmp_path / "none.nii.gz"]))
     (tmp_path / "b.png").touch()

@@ -1,4 +1,4 @@
-"""What `tetopt mesh` meshes: contrasts, labels and mask, on the voxels of the first image."""
+"""What is meshed: contrasts, labels and mask, on the voxels of the first image."""
 
 from __future__ import annotations
 
@@ -8,14 +8,15 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-import tetopt
-from tetopt import Image, Mesh
-from tetopt.cli.console import log
-from tetopt.cli.inputs import file_and_volume, image_and_others, label_table, number_of, weights_of
-from tetopt.cli.options import SourceOptions
+from tetopt.energy.sampling import cell_moments
+from tetopt.image import Image
 from tetopt.io.images import sha256
 from tetopt.io.label_tables import NO_TABLE, LabelTable
+from tetopt.job.events import note
+from tetopt.job.inputs import file_and_volume, image_and_others, label_table, number_of, weights_of
+from tetopt.job.options import SourceOptions
 from tetopt.measure.fidelity import cell_labels
+from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields
 from tetopt.model.labels import TABLE_TEXT, table_words
 from tetopt.model.sets import box_of, box_text
@@ -63,7 +64,7 @@ class Source(NamedTuple):
         """
         fields = cell_fields(mesh, self.image)
         for number, contrast in enumerate(self.contrasts[1:], 2):
-            moments = tetopt.cell_moments(continued(contrast, self.content.continuation), mesh)
+            moments = cell_moments(continued(contrast, self.content.continuation), mesh)
             fields |= {f"mean_{number}": moments.mean, f"variance_{number}": moments.variance}
         if labels is not None:
             fields["label"] = labels
@@ -93,21 +94,21 @@ def read_source(options: SourceOptions, label_names: Path | None = None) -> Sour
     """Images, labels, what these are called, and mask as asked for, on the voxels of the first image."""
     paths = options.images
     table = label_table(label_names)
-    image, beside = image_and_others(paths[0], options.part)
+    image, beside = image_and_others(paths[0], options)
     contrasts = [image, *(beside(path, aligned_contrast) for path in paths[1:])]
     labels = None if options.labels is None else beside(options.labels, aligned_labels)
     mask = None if options.mask is None else beside(options.mask, aligned_mask)
     level = None
     if options.background is not None:
         is_auto = options.background == "auto"
-        level = background_level(image) if is_auto else number_of("--background", options.background)
+        level = background_level(image) if is_auto else number_of("`background`", options.background)
         mask = foreground(image, level)
-        log.print(
+        note(
             f"background: up to {level:g}, as far as it reaches the box; {mask.data.mean():.1%} of the voxels are left"
         )
     weights = weights_of(options)
     if options.weights is None and labels is not None and len(paths) == 1 and np.array_equal(labels.data, image.data):
-        log.print("the image is its own labels: only these count")
+        note("the image is its own labels: only these count")
         weights = [0.0]
     label_weight = 1.0 if options.label_weight is None else options.label_weight
     tension = SMOOTH_INTERFACES if options.smooth_interfaces is None else options.smooth_interfaces

@@ -11,14 +11,15 @@ from pathlib import Path
 import numba
 import numpy as np
 from numpy.typing import NDArray
-from rich.markup import escape
 
-from tetopt import Image, InputError, load_image, load_mesh
-from tetopt.cli.console import log, show_warning
-from tetopt.cli.options import WHOLE_BOX, BoxPart, ImagePart, SourceOptions
+from tetopt.errors import InputError
+from tetopt.image import Image
 from tetopt.io.files import checked_output
-from tetopt.io.images import parse_crop, parse_slice, part_of, sha256
+from tetopt.io.images import load_image, parse_crop, parse_slice, part_of, sha256
 from tetopt.io.label_tables import LabelTable, load_label_table
+from tetopt.io.meshes import load_mesh
+from tetopt.job.events import note, warning
+from tetopt.job.options import WHOLE_BOX, BoxPart, ImagePart, SourceOptions
 from tetopt.measure.fidelity import cell_labels
 from tetopt.model.file import MeshFile
 from tetopt.model.labels import NO_TABLE, labels_of
@@ -85,12 +86,12 @@ def image_and_others(
 def _say_resampled(path: Path, original: Image, moved: Image, *, is_contrast: bool, is_cropped: bool) -> None:
     """That a file lay on another grid, and how much of a mask or of labels is in the image unless that is cropped."""
     if is_contrast:
-        log.print(escape(f"{path}: taken to the image's voxels, linearly"))
+        note(f"{path}: taken to the image's voxels, linearly")
         return
     whole, inside = (np.count_nonzero(each.data) * each.voxel_volume for each in (original, moved))
-    log.print(escape(f"{path}: taken to the image's voxels, nearest neighbour"))
+    note(f"{path}: taken to the image's voxels, nearest neighbour")
     if not is_cropped and inside < IN_IMAGE_SHARE * whole:
-        show_warning(f"{path}: only {inside / whole:.0%} of it lies in the image; is it of the same scan?")
+        warning(f"{path}: only {inside / whole:.0%} of it lies in the image; is it of the same scan?")
 
 
 def read_companion(path: Path) -> Image:
@@ -121,18 +122,18 @@ def weights_of(options: SourceOptions) -> list[float]:
     """How much each image counts."""
     if options.weights is None:
         return [1.0] * len(options.images)
-    return [number_of("--weights", part) for part in options.weights.split(",")]
+    return [number_of("`weights`", part) for part in options.weights.split(",")]
 
 
 def read_mesh(path: Path) -> MeshFile:
     """A mesh of the user's; what had to be turned, left out or renamed is said."""
     loaded = load_mesh(path)
     if loaded.n_turned:
-        show_warning(f"{path}: {loaded.n_turned} cells were inverted in the file and have been turned")
+        warning(f"{path}: {loaded.n_turned} cells were inverted in the file and have been turned")
     if loaded.n_left:
-        log.print(escape(f"{path}: {loaded.n_left} cells of lower dimension are left out"))
-    for note in loaded.notes:
-        log.print(escape(f"{path}: {note}"))
+        note(f"{path}: {loaded.n_left} cells of lower dimension are left out")
+    for line in loaded.notes:
+        note(f"{path}: {line}")
     return loaded
 
 
@@ -156,7 +157,7 @@ def label_table(path: Path | None, loaded: MeshFile | None = None) -> LabelTable
         table = load_label_table(path)
         labels = None if loaded is None else labels_of(loaded.cell_data, len(loaded.mesh.cells))
         if labels is not None and not np.isin(labels, [*table.names, *table.colours]).any():
-            show_warning(f"{path}: names none of the mesh's labels, {_first(np.unique(labels).tolist())}")
+            warning(f"{path}: names none of the mesh's labels, {_first(np.unique(labels).tolist())}")
         return table
     return NO_TABLE if loaded is None else loaded.label_table
 
@@ -172,7 +173,7 @@ def warn_of_other_image(loaded: MeshFile, mesh_path: Path, image_path: Path) -> 
     made_from = loaded.text("image_sha256")
     is_other = made_from is not None and made_from != sha256(image_path)
     if is_other:
-        show_warning(f"{mesh_path} was made from another image than {image_path}")
+        warning(f"{mesh_path} was made from another image than {image_path}")
     return is_other
 
 
@@ -187,7 +188,7 @@ def set_threads(threads: int | None) -> None:
         return
     most = int(numba.config.NUMBA_NUM_THREADS)
     if not 1 <= threads <= most:
-        raise InputError(f"--threads: expected 1 to {most} on this machine, got {threads}")
+        raise InputError(f"`threads`: expected 1 to {most} on this machine, got {threads}")
     numba.set_num_threads(threads)
 
 

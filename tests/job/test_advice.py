@@ -1,13 +1,14 @@
-"""What `tetopt mesh` says of its mesh on standard error: promises missed, and what is allowed but hardly meant."""
+"""What a run tells of its mesh: requirements that it violates, and what is allowed but hardly meant."""
 
 import numpy as np
 import pytest
 from commands import exit_code, numbers_in
 
 import tetopt
-from tetopt.cli.promises import check_promises, warn_of_result, warn_of_sizes
 from tetopt.engine.interfaces import crowded_nodes
 from tetopt.engine.loop import Optimized, Record
+from tetopt.job.advice import tell_violated, warn_of_result, warn_of_sizes
+from tetopt.job.events import listened
 from tetopt.measure.fidelity import MaskFidelity
 from tetopt.start.sizes import EdgeRatios, Sizes
 
@@ -15,8 +16,18 @@ NEAR = MaskFidelity(9, 9.0, 9.0, 0.99, 0.1, 0.3, 0.1, 0.3, 0.1, 0.3, 0.1, 0.3, 1
 MESH = tetopt.Mesh([[0.0, 0.0], [1.0, 0.0], [0.0, 1.0]], [[0, 1, 2]])
 
 
-def said(capsys):
-    return capsys.readouterr().err.replace("tetopt: warning: ", "")
+@pytest.fixture
+def said():
+    """A function that returns the texts of the events so far, a line each, and forgets them."""
+    events = []
+
+    def texts(kind=None):
+        lines = [event.text + "\n" for event in events if kind in (None, event.kind)]
+        events.clear()
+        return "".join(lines)
+
+    with listened(events.append):
+        yield texts
 
 
 @pytest.mark.parametrize(
@@ -33,27 +44,28 @@ def said(capsys):
         ({"components": 3}, "the mask has 3 connected components, the mesh 1"),
     ],
 )
-def test_a_mask_that_the_mesh_does_not_show(capsys, change, words):
-    assert check_promises(Optimized(MESH, [], "iterations"), {"mask": NEAR._replace(**change)}) == 0
-    text = said(capsys)
+def test_a_mask_that_the_mesh_does_not_show(said, change, words):
+    assert tell_violated(Optimized(MESH, [], "iterations"), {"mask": NEAR._replace(**change)}) == []
+    text = said()
     assert words in text
     assert text.count("\n") == (1 if words else 0)
 
 
-def test_what_background_leaves_is_no_mask(capsys):
+def test_what_background_leaves_is_no_mask(said):
     missed = {"mask": "the mesh and the mask overlap only by Dice 0.5"}
     far = {"mask": NEAR._replace(distance_p95=8.0, components=3, mesh_euler=99), "dropped_components": 2}
-    assert check_promises(Optimized(MESH, [], "iterations", missed=missed), far, "foreground") == 1
-    text = said(capsys)
+    words = "the mesh and the foreground overlap only by Dice 0.5"
+    assert tell_violated(Optimized(MESH, [], "iterations", missed=missed), far, "foreground") == [words]
+    text = said()
     assert "mask" not in text
     assert text.count("foreground") >= text.count("\n") == 5
 
 
-def test_components_that_were_dropped_are_told(capsys):
-    assert check_promises(Optimized(MESH, [], "iterations"), {"mask": NEAR, "dropped_components": 0}) == 0
-    assert said(capsys) == ""
-    assert check_promises(Optimized(MESH, [], "iterations"), {"mask": NEAR, "dropped_components": 2}) == 0
-    assert "dropped 2 connected components" in said(capsys)
+def test_components_that_were_dropped_are_told(said):
+    assert tell_violated(Optimized(MESH, [], "iterations"), {"mask": NEAR, "dropped_components": 0}) == []
+    assert said() == ""
+    assert tell_violated(Optimized(MESH, [], "iterations"), {"mask": NEAR, "dropped_components": 2}) == []
+    assert "dropped 2 connected components" in said()
 
 
 def ended(E=0.5, E_D=0.5):
@@ -73,31 +85,31 @@ def ended(E=0.5, E_D=0.5):
         (ended(), "graded", None, {"nodes_of_many_labels": 3}, "more than 4 labels meet at 3 nodes"),
     ],
 )
-def test_what_is_hardly_meant(capsys, result, mode, nodes, measured, words):
+def test_what_is_hardly_meant(said, result, mode, nodes, measured, words):
     warn_of_result(result, "fast", mode, 100, nodes, measured, np.ones(2))
-    text = said(capsys)
+    text = said()
     assert words in text
     assert text.count("\n") == (1 if words else 0)
 
 
-def test_cells_between_thick_slices_are_no_reason_for_fewer_nodes(capsys):
+def test_cells_between_thick_slices_are_no_reason_for_fewer_nodes(said):
     for slices, words in ((1.5, "fewer nodes"), (5.5, "slices are 5.5 mm apart")):
         warn_of_result(ended(), "fast", "graded", 100, None, {"cells_without_voxel": 1}, np.array([1.0, 1.0, slices]))
-        text = said(capsys)
+        text = said()
         assert words in text
         assert ("fewer nodes" in text) == (slices < 2.0)
 
 
-def test_limits_and_targets_that_edges_miss(capsys):
+def test_limits_and_targets_that_edges_miss(said):
     edges = EdgeRatios(1.2, 0.05, 0.0, (), [])
     warn_of_sizes(Sizes(longest=24.0, smallest=2.0), 2.0, 24.0, edges)
-    assert said(capsys) == ""
+    assert said() == ""
     warn_of_sizes(Sizes(longest=24.0), 1.0, 28.8, None)
-    assert "the longest edge is 28.8 mm, 20% over --edge-max 24" in said(capsys)
+    assert "the longest edge is 28.8 mm, 20% over `edge_max` 24" in said()
     warn_of_sizes(Sizes(smallest=2.0), 1.5, 28.8, None)
-    assert "the shortest edge is 1.5 mm, 25% under --size-min 2" in said(capsys)
+    assert "the shortest edge is 1.5 mm, 25% under `size_min` 2" in said()
     warn_of_sizes(Sizes(largest=5.0), 1.5, 28.8, edges._replace(above=0.4))
-    assert "40% of the edges are over 1.41 times their target size" in said(capsys)
+    assert "40% of the edges are over 1.41 times their target size" in said()
 
 
 def test_nodes_between_many_labels():

@@ -4,35 +4,28 @@ from __future__ import annotations
 
 import hashlib
 import json
+from dataclasses import fields
 from functools import cache
 from pathlib import Path
 from typing import Any
 
 import tetopt
-from tetopt.cli.inputs import file_and_volume
-from tetopt.cli.options import (
-    EngineOptions,
-    OutputOptions,
-    PartsOptions,
-    SizeOptions,
-    SolverOptions,
-    SourceOptions,
-    StartOptions,
-    given_options,
-)
 from tetopt.io.images import sha256
+from tetopt.job.inputs import file_and_volume
+from tetopt.job.options import JobOptions, OutputOptions, PartsOptions, given_options, kinds_of, option_name
 from tetopt.model.laws import LAW_OPTIONS, law_file
 
-WITHOUT_SAY = ("threads",)  # options on which no output depends
+# Options on which no output depends: names of outputs, threads, and who works on parts.
+WITHOUT_SAY = (
+    "threads",
+    *(each.name for each in (*fields(OutputOptions), *fields(PartsOptions)) if each.name != "parts"),
+)
 
 
-def requested(
-    source: SourceOptions, sizes: SizeOptions, start: StartOptions, engine: EngineOptions, solver: SolverOptions,
-    output: OutputOptions, parts: int | None = None,
-) -> dict[str, Any]:  # fmt: skip
-    """What decides the outputs of `tetopt mesh`: options, the files' names and checksums, the version.
+def requested(job: JobOptions) -> dict[str, Any]:
+    """What decides the outputs of a run: options, the files' names and checksums, the version.
 
-    Names of outputs and of folders are no part of it, nor is the number of threads, nor who works on `parts`.
+    Names of outputs and of folders are no part of it, nor is the number of threads, nor who works on parts.
 
     Returns
     -------
@@ -45,11 +38,13 @@ def requested(
     InputError
         A file is missing, or may not be read.
     """
-    options = given_options(source, sizes, start, engine, PartsOptions(parts=parts), solver)
+    kinds = kinds_of(JobOptions)
+    left_out = {option_name(name, kinds[name]) for name in WITHOUT_SAY}
+    options = {name: value for name, value in given_options(job).items() if name not in left_out}
     files = {name: each for name in list(options) if (each := _files(name, options[name]))}
-    stated = {name: value for name, value in options.items() if name not in (*files, *WITHOUT_SAY)}
+    stated = {name: value for name, value in options.items() if name not in files}
     whole: dict[str, Any] = {
-        "options": {**stated, "format": output.mesh.suffix.lower()},
+        "options": {**stated, "format": job.output.suffix.lower()},
         "files": {name: [[path.name, _checksum(path)] for path in paths] for name, paths in files.items()},
         "tetopt": tetopt.__version__,
     }

@@ -1,0 +1,141 @@
+"""`tetopt.run` from Python: the files of the command, to the byte, and what it tells meanwhile."""
+
+import warnings
+
+import numpy as np
+import pytest
+from commands import exit_code, numbers_in
+from models import sample_image
+
+import tetopt
+from tetopt.io.formats import FORMATS
+
+UNLIKE = ("seconds", "memory")  # in run.json and in its rows, from run to run
+OF_PARTS = {"parts": 2, "nodes": 300, "workers": 1}
+
+
+@pytest.fixture(scope="module")
+def inputs(tmp_path_factory):
+    """An image of 3-D with a mask, labels and a second contrast, one of 2-D, one for parts, a mesh to start from."""
+    folder = tmp_path_factory.mktemp("inputs")
+    image = sample_image(3)
+    values = {
+        "a": image.data, "b": image.data**2, "l": image.data > 30, "m": image.data > -np.inf, "p": sample_image(2).data,
+    }  # fmt: skip
+    for name, data in values.items():
+        tetopt.save_image(folder / f"{name}.nii.gz", tetopt.Image(1.0 * data, image.affine if data.ndim == 3 else None))
+    ball = 400.0 * ((np.indices((24, 24, 24)) - 12.0) ** 2).sum(axis=0) < 400.0 * 60.0
+    tetopt.save_image(folder / "c.nii", tetopt.Image(500.0 + 400.0 * ball))
+    assert exit_code("mesh", folder / "a.nii.gz", "-o", folder / "s.vtu", "--nodes", 60, "--iterations", 1) == 0
+    return folder
+
+
+KINDS = {
+    "image": ("a.nii.gz", {}),
+    "mask": ("a.nii.gz", {"mask": "m.nii.gz", "keep_components": True}),
+    "labels": ("a.nii.gz", {"labels": "l.nii.gz", "smooth_interfaces": 0.2}),
+    "contrasts": (["a.nii.gz", "b.nii.gz"], {"weights": [1.0, 0.5]}),
+    "order 2": ("a.nii.gz", {"order": 2, "nodes": 300}),
+    "start": ("a.nii.gz", {"start": "s.vtu", "nodes": None}),
+    "plane": ("p.nii.gz", {}),
+    "paper": ("a.nii.gz", {"method": "paper"}),
+    "target error": ("a.nii.gz", {"target_error": 0.5, "nodes": None}),
+    "parts": ("c.nii", OF_PARTS),
+}
+FILES = {"mask", "labels", "start"}  # options that are files
+DRAWN = ("image", "labels")  # of the kinds; pictures take longer than all else
+OF_FORMAT = {
+    ".scn": {"young": "2"},
+    ".inp": {"young": "1 + 0.01*h", "loads": "compress:5%"},
+    ".feb": {"young": "2", "loads": ["hold:superior"]},
+}
+
+
+def words_of(options):
+    """Options of a job as those of the command."""
+    for name, value in options.items():
+        option = {"loads": "load"}.get(name, name.replace("_", "-"))
+        if value is True:
+            yield f"--{option}"
+        elif value is not None:
+            texts = (
+                [",".join(f"{each:g}" for each in value)]
+                if name == "weights"
+                else value
+                if isinstance(value, list)
+                else [value]
+            )
+            yield from (f"--{option}={text}" for text in texts)
+
+
+def both(inputs, folder, monkeypatch, images, options, name="x.vtu", is_drawn=False):
+    """The exit code of the command, and the result of the same run from Python, each in a folder of its own."""
+    paths = [inputs / each for each in ([images] if isinstance(images, str) else images)]
+    options = {"nodes": 60, "iterations": 2} | {
+        key: inputs / value if key in FILES else value for key, value in options.items()
+    }
+    for place in ("command", "python"):
+        (folder / place).mkdir()
+    monkeypatch.chdir(folder / "command")
+    options |= {"figures": "f"} if is_drawn else {}
+    code = exit_code("mesh", *paths, "-o", name, "--json", "r.json", *words_of(options))
+    monkeypatch.chdir(folder / "python")
+    events = []
+    result = tetopt.run(tetopt.Job(images=paths, output=name, json_path="r.json", **options), on=events.append)
+    return code, result, events
+
+
+def files_in(folder):
+    return {str(path.relative_to(folder)): path for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def alike(value):
+    """What of numbers is the same from run to run."""
+    if isinstance(value, list):
+        return [alike(each) for each in value]
+    if isinstance(value, dict):
+        return {key: alike(each) for key, each in value.items() if key not in UNLIKE}
+    return value
+
+
+def assert_equal_files(folder):
+    """Those of both, but for what differs from run to run."""
+    command, python = (files_in(folder / place) for place in ("command", "python"))
+    assert list(command) == list(python)
+    assert len(command) >= 2
+    for name in command:
+        if name == "r.json":
+            one, other = (alike(numbers_in(files[name])) for files in (command, python))
+            assert one == other
+            assert list(one) == list(other)
+        elif name != "f/energies.png":  # whose axis is time
+            assert command[name].read_bytes() == python[name].read_bytes(), name
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_a_run_leaves_the_files_of_the_command(inputs, tmp_path, monkeypatch, kind):
+    code, result, events = both(inputs, tmp_path, monkeypatch, *KINDS[kind], is_drawn=kind in DRAWN)
+    assert_equal_files(tmp_path)
+    assert code == bool(result.violated)
+    numbers = numbers_in(tmp_path / "python" / "r.json")
+    assert numbers["size"]["n_cells"] == len(result.mesh.cells)
+    assert set(numbers) == set(result.numbers)
+    stages = [event.data.name for event in events if event.kind == "started"]
+    assert stages[0] == "read"
+    assert {"parts" if kind == "parts" else "optimise", "write"} <= set(stages)
+    assert [event.text for event in events if event.kind == "violated"] == result.violated
+
+
+@pytest.mark.parametrize("suffix", sorted(set(FORMATS) - {".vtu"}))
+def test_a_run_writes_every_format_as_the_command_does(inputs, tmp_path, monkeypatch, suffix):
+    options = {"iterations": 0, **OF_FORMAT.get(suffix, {})}
+    both(inputs, tmp_path, monkeypatch, "a.nii.gz", options, f"x{suffix}")
+    assert_equal_files(tmp_path)
+
+
+def test_the_library_prints_nothing(inputs, tmp_path, capfd):
+    job = tetopt.Job(images=inputs / "a.nii.gz", output=tmp_path / "x.vtu", nodes=60, iterations=1)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        tetopt.run(job)
+    assert capfd.readouterr() == ("", "")

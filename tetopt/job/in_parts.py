@@ -1,0 +1,327 @@
+"""A run in parts: asked for, or chosen where an image does not fit into memory."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import hashlib
+import json
+import time
+from collections.abc import Callable, Iterator, Sequence
+from math import prod
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+import tetopt
+from tetopt.budget import BYTES_PER_GB, available_bytes, memory_words
+from tetopt.cluster.crew import Folders, Need, counted
+from tetopt.cluster.tasks import run_tasks
+from tetopt.cluster.workers import check_choice, local_share, workers
+from tetopt.engine.cost import meshing_bytes
+from tetopt.engine.fast import prepare_kernels
+from tetopt.engine.loop import Optimized, Record
+from tetopt.errors import InputError
+from tetopt.image import Image, VoxelGrid
+from tetopt.io.images import file_shape, parse_crop, sha256
+from tetopt.io.label_tables import NO_TABLE, LabelTable
+from tetopt.io.stored_images import STORED_SUFFIXES, check_local, coarse_image, open_stored, stored_checksum
+from tetopt.job.events import note, progress, started, warning
+from tetopt.job.options import DEFAULT_NODES, PartsOptions
+from tetopt.job.plan import Plan
+from tetopt.job.predict import cropped_shape
+from tetopt.job.source import Source
+from tetopt.mesh import Mesh
+from tetopt.model.averages import DEFAULT_AVERAGE
+from tetopt.model.sets import box_of, box_text
+from tetopt.parts.part import work_on
+from tetopt.parts.rounds import Parted, Request, Round, Runner, expected_parts, mesh_in_parts
+from tetopt.parts.work import LOGS_NAME, STATE_NAME, VolumeFile, removed
+from tetopt.start.sizes import Sizes
+from tetopt.stored import StoredImage
+from tetopt.target.content import StoredContent
+from tetopt.target.statistics import stored_statistics
+
+MOST_LOADED = 2**28  # voxels of an image that a run in parts reads whole: with it all that one piece offers is there
+MOST_DRAWN = 2**27  # voxels of the level of an image that pictures are drawn of
+VOXEL_BYTES = 16.0  # of an image that is read whole, besides what meshing takes
+FEWEST_NODES_EACH = 100  # of a part: of 150 half are shared, and stay
+WORK_SUFFIX = ".work"  # of the work directory beside the mesh, after its name
+WHOLE_ONLY = "looks at all cells or voxels at once, parts do not; leave it out, or `parts`"
+
+
+class StoredSource(NamedTuple):
+    """As `Source`, an image whose voxels stay in its file."""
+
+    paths: list[Path]
+    content: StoredContent
+    about: dict[str, Any]
+    table: LabelTable = NO_TABLE
+    labels: None = None
+    mask: None = None
+    mask_word: str = "mask"
+    image: None = None  # in memory
+
+    @property
+    def contrasts(self) -> list[StoredImage]:
+        """The one image."""
+        return [self.content.image]
+
+    @property
+    def low(self) -> float:
+        """The least intensity."""
+        return self.content.statistics.low
+
+    @property
+    def is_constant(self) -> bool:
+        """Whether it has one value everywhere."""
+        return self.content.statistics.low == self.content.statistics.high
+
+    def coarse(self) -> Image:
+        """A level of it for pictures, in memory."""
+        image = coarse_image(self.paths[0], MOST_DRAWN)
+        assert image is not None, "asked for in `read_stored`"
+        return image
+
+
+def with_parts(plan: Plan) -> Plan:
+    """The plan with a number of parts, if it is to be made in some: as asked for, or for want of memory.
+
+    Raises
+    ------
+    InputError
+        Options that parts do not have, or that only they have; dask not installed.
+    """
+    job = plan.job
+    names = [field.name for field in dataclasses.fields(PartsOptions) if getattr(job, field.name) is not None]
+    needed, free = _whole_bytes(plan), available_bytes()
+    is_too_large = needed is not None and free is not None and needed > free
+    is_chosen = is_too_large and job.parts is None and _strange_option(plan) is None
+    if job.parts is None and not is_chosen:
+        if names:
+            note(f"`{names[0]}`: has no say, as the mesh is made in one piece; `parts` asks for parts")
+        return plan
+    if is_chosen and needed is not None and free is not None:
+        note(
+            f"in one piece it would take {memory_words(needed)} of memory, {memory_words(free)} are free: it is made "
+            "in parts"
+        )
+    elif (strange := _strange_option(plan)) is not None:
+        raise InputError(strange)
+    if job.worker_gb is not None and not job.worker_gb > 0.0:
+        raise InputError(f"`worker_gb`: expected more than 0, got {job.worker_gb}")
+    if job.worker_gb is not None and (job.scheduler or job.cluster):
+        raise InputError("`worker_gb`: of workers on this machine; those of `scheduler` and `cluster` have their own")
+    check_choice(job.workers, job.scheduler, job.cluster, "blocks")
+    return plan._replace(n_parts=job.parts or 1)
+
+
+def _is_storable(path: Path) -> bool:
+    return path.name.lower().endswith(STORED_SUFFIXES)
+
+
+def _whole_bytes(plan: Plan) -> float | None:
+    """What a graded mesh of an image that could be left in its file takes in one piece; None of others."""
+    path = plan.job.images[0]
+    check_local(path)
+    if not _is_storable(path) or plan.job.slice_ is not None or plan.mode != "graded":
+        return None
+    n_voxels = _n_voxels(plan)
+    nodes = plan.job.nodes or DEFAULT_NODES[3]
+    return VOXEL_BYTES * n_voxels + meshing_bytes(n_voxels, len(plan.job.images), nodes)
+
+
+def _n_voxels(plan: Plan) -> int:
+    """Of the image, by its header, cropped."""
+    return prod(cropped_shape(plan, (file_shape(plan.job.images[0]) or (0,))[:3]))
+
+
+def _strange_option(plan: Plan) -> str | None:
+    """What a mesh in parts cannot be, in words; None if there is nothing."""
+    job = plan.job
+    if plan.mode != "graded":
+        return "`parts`: of a graded mesh; leave out `uniform`, `spacing`, `lattice`, `method`, `start`, or `parts`"
+    if len(job.images) > 1:
+        return f"`parts`: expected one IMAGE, got {len(job.images)}; leave the others out, or `parts`"
+    whole = {
+        "mask": job.mask, "background": job.background, "labels": job.labels, "slice_": job.slice_,
+        "target_error": job.target_error, "size_max": job.size_max, "sizing": job.sizing,
+        "max_gb": job.max_gb, "order": job.order if job.order == 2 else None,
+        "boundary": "fixed" if job.boundary == "fixed" else None,
+    }  # fmt: skip
+    return next((f"`{name}`: {WHOLE_ONLY}" for name, value in whole.items() if value is not None), None)
+
+
+def _check_number(n_parts: int | None, nodes: int) -> None:
+    """InputError for so many parts that hardly a node of them is their own."""
+    most = max(nodes // FEWEST_NODES_EACH, 1)
+    if n_parts is not None and n_parts > most:
+        raise InputError(
+            f"`parts`: expected up to {most} of {nodes} nodes, {FEWEST_NODES_EACH} each, got {n_parts}; ask for fewer"
+        )
+
+
+def is_left_stored(plan: Plan) -> bool:
+    """Whether the image of a run in parts is left in its file: a large one, or one that does not fit into memory."""
+    if not _is_storable(plan.job.images[0]):
+        return False
+    needed, free = _whole_bytes(plan), available_bytes()
+    return _n_voxels(plan) > MOST_LOADED or (needed is not None and free is not None and needed > free)
+
+
+def read_stored(plan: Plan) -> StoredSource:
+    """The image of a run in parts, left in its file, of which one pass takes the statistics."""
+    path = plan.job.images[0]
+    if plan.job.average not in (None, DEFAULT_AVERAGE):
+        raise InputError(f"`average`: {WHOLE_ONLY}")
+    if plan.job.young is not None:
+        note("`young`: a formula or a table is taken of each cell's mean, as the voxels stay in their file")
+    if plan.pictures and (plan.job.crop is not None or coarse_image(path, MOST_DRAWN) is None):
+        raise InputError(
+            f"`figures`: {path} has no level of {MOST_DRAWN:.3g} voxels or fewer to draw, or is cropped; leave it out"
+        )
+    file = _volume_file(plan)
+    image = open_stored(file.path, volume=file.volume, crop=file.crop)
+    note(f"{path}: {' x '.join(map(str, image.shape))} voxels, which stay in the file")
+    about = {
+        "image": path.name, "image_sha256": sha256(path), "box": box_text(box_of(image)),
+        "inputs": {"images": [path.name], "weights": [1.0], "mask": None, "background": None, "labels": None,
+                   "label_weight": None, "sha256": {}},
+    }  # fmt: skip
+    return StoredSource([path], StoredContent(image, stored_statistics(image)), about)
+
+
+def _volume_file(plan: Plan) -> VolumeFile:
+    job = plan.job
+    return VolumeFile(job.images[0], job.volume, None if job.crop is None else parse_crop(job.crop))
+
+
+def parts_of(plan: Plan, image: VoxelGrid) -> tuple[int, float]:
+    """How many parts there will be in a round, and the memory that each takes, bytes; InputError for too many."""
+    nodes = plan.job.nodes
+    assert nodes is not None, "filled in by `with_numbers`"
+    _check_number(plan.n_parts, nodes)
+    return expected_parts(image, nodes, plan.n_parts or 1)
+
+
+def work_folder(plan: Plan) -> Path:
+    """Where what a run in parts has done lies until it is complete."""
+    mesh = plan.job.output
+    return mesh.with_name(mesh.name + WORK_SUFFIX)
+
+
+class PartsProgress(NamedTuple):
+    """How far a run in parts is."""
+
+    now: Round
+    history: list[Record]  # of the rounds that are done
+
+
+def run_in_parts(
+    plan: Plan, source: Source | StoredSource, sizes: Sizes | None, check: Callable[[Mesh], None],
+    stop: Callable[[], bool], begin: float,
+) -> tuple[Parted, float]:  # fmt: skip
+    """Run, or go on with, a mesh in parts; what came of it, and the memory predicted for each worker's task, bytes.
+
+    `check` is given the initial mesh before a part begins; `stop` says when to end. The seconds of the job count from
+    `begin`, as of `time.perf_counter`.
+    """
+    job = plan.job
+    folder, request = work_folder(plan), _request(plan, source, sizes)
+    ends = None if job.max_seconds is None else begin + job.max_seconds
+    task_bytes = 0.0
+
+    def is_over() -> bool:
+        return stop() or (ends is not None and time.perf_counter() > ends)
+
+    @contextlib.contextmanager
+    def crew(n_parts: int, n_bytes: float) -> Iterator[Runner]:
+        nonlocal task_bytes
+        task_bytes = n_bytes
+        note(f"{counted(n_parts, 'part')} or more in a round, each of up to {memory_words(n_bytes)}")
+        started("kernels", "preparing the kernels (the first run compiles them, half a minute)")
+        prepare_kernels(Image(np.zeros((3, 3, 3)) + np.arange(3)), request.k_D, is_graded=True, progress=progress)
+        started("parts")
+        most = None if job.worker_gb is None else job.worker_gb * BYTES_PER_GB
+        need = Need(n_parts, n_bytes, job.threads, is_within=True, most_bytes=most)
+        here = folder.absolute()  # workers that others started have folders of their own to begin with
+        folders = Folders(here, here / LOGS_NAME)
+        folders.logs.mkdir(exist_ok=True)
+        if job.scheduler is None and job.cluster is None:
+            _check_room(need, local_share(need, job.workers).bytes)  # with too little a worker does not even start
+        with workers(
+            need, folders, count=job.workers, scheduler=job.scheduler, cluster=job.cluster
+        ) as team:  # fmt: skip
+            note(team.words)
+            _check_room(need, team.bytes)
+
+            def run(names: Sequence[str]) -> Iterator[Any]:
+                return run_tasks(team, work_on, [str(Path(name).absolute()) for name in names], is_over=is_over)
+
+            yield run
+
+    started("parts")
+    try:
+        parted = mesh_in_parts(
+            request, folder, source.content.statistics if isinstance(source, StoredSource) else None,
+            volume=_volume_file(plan) if isinstance(source, StoredSource) else source.contrasts[0],
+            check=check, crew=crew, is_over=is_over,
+            watch=lambda now, history: progress("", PartsProgress(now, history)),
+        )  # fmt: skip
+    except BaseException:  # Ctrl-C among them
+        if task_bytes > 0.0 and (folder / STATE_NAME).exists():  # there were workers
+            note(f"{folder} has what is done: run this again to go on, or remove it")
+        raise
+    started("optimised")
+    result = parted.result
+    if result.ended == "stopped" and not stop():
+        parted = parted._replace(result=result._replace(ended="max_seconds"))
+    if parted.result.ended != "iterations":
+        words = {
+            "converged": "converged: hardly anything changes any more",
+            "max_seconds": "out of time: the mesh of the last complete round is kept",
+            "stopped": "interrupted: the mesh of the last complete round is kept",
+        }
+        note(words[parted.result.ended])
+    return parted, task_bytes
+
+
+def _check_room(need: Need, room: float) -> None:
+    """InputError if a part needs more memory than a worker has for it."""
+    if need.task_bytes > room:
+        raise InputError(
+            f"a part needs about {memory_words(need.task_bytes)} of memory, its worker "
+            f"{memory_words(need.limit_for(need.task_bytes))} in all, and has too little; ask for more `parts`, for "
+            "fewer `workers`, or give them more memory"
+        )
+
+
+def _request(plan: Plan, source: Source | StoredSource, sizes: Sizes | None) -> Request:
+    """What is asked for, with a checksum of all on which the mesh depends."""
+    engine, nodes = plan.engine_options(), plan.job.nodes
+    assert nodes is not None, "filled in by `with_numbers`"
+    _check_number(plan.n_parts, nodes)
+    path = plan.job.images[0]
+    values: dict[str, Any] = {
+        "nodes": nodes, "n_parts": plan.n_parts, "k_D": engine["k_D"], "iterations": engine["iterations"],
+        "shape_power": engine["shape_power"], "min_dihedral": engine["min_dihedral"], "tolerance": 5e-4,
+    }  # fmt: skip
+    image = stored_checksum(path) if isinstance(source, StoredSource) else source.about["image_sha256"]
+    whole = {
+        **values, "image": image, "part": plan.job.stated(), "tetopt": tetopt.__version__,
+        "sizes": None if sizes is None else [sizes.smallest, sizes.longest, sizes.gradation],
+        "place": str(path.resolve()) if isinstance(source, StoredSource) else None,
+    }  # fmt: skip
+    checksum = hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()
+    return Request(**values, sizes=sizes, checksum=checksum)
+
+
+def end_work(plan: Plan, result: Optimized) -> None:
+    """Remove the work directory of a run that is complete; say what becomes of that of another."""
+    folder = work_folder(plan)
+    if result.ended in ("iterations", "converged"):
+        if left := removed(folder):
+            warning(f"{folder}: stays with what is not tetopt's in it: {', '.join(left)}")
+    else:
+        note(f"{folder}: run this again with `force` to go on, or remove it")

@@ -1,0 +1,179 @@
+"""A run as one record: every option of `tetopt mesh`, checked, in JSON and back."""
+
+from __future__ import annotations
+
+import json
+import os
+from dataclasses import MISSING, dataclass, fields
+from difflib import get_close_matches
+from numbers import Real
+from pathlib import Path
+from types import UnionType
+from typing import Any, Literal, Union, get_args, get_origin
+
+from tetopt.errors import InputError
+from tetopt.job.options import JobOptions, kinds_of, option_of
+from tetopt.job.plan import resolved
+from tetopt.model.laws import LAW_OPTIONS
+
+MOST_SAID = 80  # letters of a value in a message
+KIND_WORDS = {Path: "a path", float: "a number", int: "a whole number", str: "a text", bool: "True or False"}
+
+
+@dataclass(frozen=True, kw_only=True)
+class Job(JobOptions):
+    """A run, from files to files: each option of `tetopt mesh` once, under its own name.
+
+    Parameters
+    ----------
+    images : path or list of paths
+        The image, and further contrasts, which are taken to its grid.
+    output : path
+        The mesh to write, in the format of its suffix.
+    **options
+        All others of `tetopt mesh`, with underscores; `help(tetopt.Job)` lists them. Files are paths, laws and loads
+        the texts of the command line; numbers may stand for laws of one value. None is the default, which may depend on
+        the image.
+
+    Raises
+    ------
+    InputError
+        Values of another kind, out of range or that contradict each other, as far as no file has to be read.
+
+    See Also
+    --------
+    run : Runs it.
+
+    Examples
+    --------
+    >>> job = tetopt.Job(images="T1.nii.gz", output="brain.vtu", nodes=5000, young="0.5 + 0.01*h", loads="compress:5%")
+    >>> tetopt.Job.from_json(job.to_json()) == job
+    True
+    >>> tetopt.Job(images="T1.nii.gz", output="brain.vtu", nodes=5000, target_error=0.1)
+    Traceback (most recent call last):
+    ...
+    tetopt.errors.InputError: `nodes` and `target_error`: give one of them
+    """
+
+    def __post_init__(self) -> None:
+        """Bring values to the kinds of their fields, and refuse those that cannot be."""
+        for name, kind in kinds_of(Job).items():
+            value, least = _of_kind(name, get_args(kind)[0], getattr(self, name)), option_of(kind).least
+            if value is not None and least is not None and value < least:
+                raise InputError(f"`{name}`: expected {least} or more, got {value}")
+            object.__setattr__(self, name, value)
+        resolved(self)
+
+    def given(self) -> dict[str, Any]:
+        """Options that are not the default, by name; paths as texts.
+
+        Returns
+        -------
+        dict
+            Of what JSON holds.
+
+        Examples
+        --------
+        >>> tetopt.Job(images="T1.nii.gz", output="brain.vtu", nodes=5000).given()
+        {'images': ['T1.nii.gz'], 'nodes': 5000, 'output': 'brain.vtu'}
+        """
+        values = {field.name: getattr(self, field.name) for field in fields(self)}
+        defaults = {field.name: field.default for field in fields(self)}
+        return {name: _in_words(value) for name, value in values.items() if value != defaults[name]}
+
+    def to_json(self) -> str:
+        """The options as JSON, which `from_json` reads.
+
+        Returns
+        -------
+        str
+            An object of the options that are not the default.
+
+        Examples
+        --------
+        >>> tetopt.Job(images="T1.nii.gz", output="brain.vtu").to_json()
+        '{"images": ["T1.nii.gz"], "output": "brain.vtu"}'
+        """
+        return json.dumps(self.given())
+
+    @classmethod
+    def from_json(cls, text: str) -> Job:
+        """The job of a text of JSON.
+
+        Parameters
+        ----------
+        text : str
+            An object of options, as of `to_json`.
+
+        Returns
+        -------
+        Job
+
+        Raises
+        ------
+        InputError
+            Not JSON, an option that there is not, or values that no `Job` takes.
+
+        Examples
+        --------
+        >>> tetopt.Job.from_json('{"images": ["T1.nii.gz"], "output": "brain.vtu", "nodes": 300}').nodes
+        300
+        """
+        try:
+            table = json.loads(text)
+        except ValueError as error:
+            raise InputError(f"job: expected JSON ({error})") from error
+        if not isinstance(table, dict):
+            raise InputError(f"job: expected an object of options, got {type(table).__name__}")
+        for name in table:
+            if name not in kinds_of(cls):
+                near = get_close_matches(name, kinds_of(cls), 1)
+                raise InputError(f"job: has no option {name[:80]!r}" + (f"; is {near[0]} meant?" if near else ""))
+        if lost := [each.name for each in fields(cls) if each.default is MISSING and each.name not in table]:
+            raise InputError(f"job: needs {' and '.join(lost)}")
+        return cls(**table)
+
+
+def _of_kind(name: str, kind: Any, value: Any) -> Any:
+    """A value of the kind of its field, made of what may stand for it; InputError if it cannot be."""
+    is_optional = get_origin(kind) in (Union, UnionType)
+    if value is None and is_optional:
+        return None
+    own = get_args(kind)[0] if is_optional else kind
+    if get_origin(own) is list:
+        (of_each,) = get_args(own)
+        many = [value] if isinstance(value, str | Path) else value
+        if not isinstance(many, list | tuple) or not many:
+            raise InputError(f"`{name}`: expected a list of {of_each.__name__}, got {_said(value)}")
+        return [_of_kind(name, of_each, each) for each in many]
+    is_number = isinstance(value, Real) and not isinstance(value, bool)
+    if own is Path and isinstance(value, str | os.PathLike):
+        return Path(value)
+    if own is float and is_number:
+        return float(value)
+    if own is int and is_number and float(value).is_integer():
+        return int(value)
+    if own is str and (isinstance(value, str) or (is_number and name in (*LAW_OPTIONS, "background", "bins"))):
+        return value if isinstance(value, str) else f"{value!r}"
+    if own is str and name == "weights" and isinstance(value, list | tuple):
+        return ",".join(f"{_of_kind(name, float, each):g}" for each in value)
+    if own is bool and isinstance(value, bool):
+        return value
+    choices = get_args(own)
+    if get_origin(own) is Literal and value in choices:
+        return value
+    expected = " or ".join(map(str, choices)) if choices else KIND_WORDS[own]
+    raise InputError(f"`{name}`: expected {expected}, got {_said(value)}")
+
+
+def _said(value: Any) -> str:
+    """A value in a message."""
+    text = repr(value)
+    return text if len(text) <= MOST_SAID else f"{text[:MOST_SAID]}..."
+
+
+def _in_words(value: Any) -> Any:
+    """A value as JSON holds it."""
+    if isinstance(value, list):
+        return [_in_words(each) for each in value]
+    return str(value) if isinstance(value, Path) else value

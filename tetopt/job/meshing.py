@@ -1,0 +1,198 @@
+"""The optimised mesh of a run: in one piece, or in parts; a target error takes several runs in turn."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.budget import BYTES_PER_GB, MemoryLimit, peak_bytes, resident_bytes
+from tetopt.engine.cost import next_bytes
+from tetopt.engine.fast import prepare_kernels
+from tetopt.engine.loop import Optimized, Record
+from tetopt.engine.meshing import (
+    ERROR_REACHED,
+    ERROR_RUNS,
+    NODE_RUNS,
+    NODES_NEAR,
+    Run,
+    bytes_of,
+    check_memory_of,
+    mesh_image,
+)
+from tetopt.geometry.quadratic import node_count
+from tetopt.geometry.simplex import squared_edges
+from tetopt.io.files import check_space
+from tetopt.job.events import note, progress, started
+from tetopt.job.in_parts import run_in_parts
+from tetopt.job.model import check_early
+from tetopt.job.options import SolverOptions
+from tetopt.job.source import Source
+from tetopt.job.task import Meshed, Task
+from tetopt.job.write import model_with
+from tetopt.mesh import Mesh
+from tetopt.model.fields import cell_fields
+from tetopt.model.model import Model
+from tetopt.target.content import Content
+from tetopt.target.domain import INSIDE_SHARE
+
+CELL_BYTES = 40  # of a file, at least: a VTU with a cell's usual fields takes 48, other formats more
+LONG_SECONDS = 3.0  # to make the kernels ready: they were compiled then, not loaded
+START_WORDS = "making the initial mesh"
+ENDED_WORDS = {
+    "converged": "converged: hardly anything changes any more",
+    "max_seconds": "out of time: the mesh so far is kept",
+    "max_gb": "no more memory is allowed: the mesh so far is kept",
+    "stopped": "interrupted: the mesh so far is kept",
+}
+
+
+def meshed(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
+    """The optimised mesh; `begin` is when the run began, as of `time.perf_counter`."""
+    if task.plan.n_parts is not None:
+        return _meshed_in_parts(task, stop, begin)
+    job, content = task.plan.job, task.source.content
+    assert isinstance(content, Content)
+    options = task.plan.engine_options()
+    ends = None if job.max_seconds is None else begin + job.max_seconds
+    limit = _memory_limit(task, content)
+    before = peak_bytes(), resident_bytes()
+    begun: list[float] = []
+
+    def watch(initial: Mesh, run: Run) -> Optimized:
+        if not begun:
+            _check_early(task, initial, None)
+        check_space(job.output, CELL_BYTES * len(initial.cells))
+        begun.append(time.perf_counter())
+        note(_described(task, initial))
+        prepare(lambda say: prepare_kernels(
+            content, options["k_D"], "paper" if task.plan.mode == "paper" else "fast", task.plan.mode == "graded", say
+        ))  # fmt: skip
+        started("optimise", "optimising", options["iterations"])
+        result = watched(run, initial, options["iterations"], ends, stop, limit)
+        _say_search(task, len(begun), result)
+        if job.target_error is not None or job.order == 2:  # of which there may be a next run
+            started("start", START_WORDS)
+        return result
+
+    kind = task.plan.kind(content.image.ndim) if task.plan.mode in ("uniform", "paper") else None
+    started("start", START_WORDS)
+    result = mesh_image(
+        content, job.nodes, target_error=job.target_error, mode=task.plan.mode,
+        start=None if task.started is None else task.started.mesh, spacing=job.spacing, kind=kind, sizes=task.sizes,
+        order=job.order or 1, watch=watch, **options,
+    )  # fmt: skip
+    started("write")
+    assert result.initial is not None
+    seconds = {"load": begun[0] - begin, "optimize": time.perf_counter() - begun[0]}
+    n_nodes = max(result.nodes or 0, len(result.initial.points))
+    predicted = max(before[0], before[1] + bytes_of(content, n_nodes))
+    return Meshed(result, result.initial, seconds, predicted, None)
+
+
+def _meshed_in_parts(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
+    """The same in parts, which take the fields of their cells as well."""
+    loaded = time.perf_counter() - begin
+
+    def check(initial: Mesh) -> None:
+        early = {name: np.zeros(len(initial.cells)) for name in ("mean", "variance", "n_voxels", "min", "max")}
+        _check_early(task, initial, early | cell_fields(initial))
+        check_space(task.plan.job.output, CELL_BYTES * len(initial.cells))
+
+    parted, n_bytes = run_in_parts(task.plan, task.source, task.sizes, check, stop, begin)
+    assert parted.result.initial is not None
+    seconds = {"load": loaded, "optimize": time.perf_counter() - begin - loaded}
+    fields = {**parted.fields, **cell_fields(parted.result.mesh), "part": parted.part}
+    started("write")
+    return Meshed(parted.result, parted.result.initial, seconds, n_bytes, fields)
+
+
+def _check_early(task: Task, initial: Mesh, fields: dict[str, NDArray] | None) -> None:
+    """InputError for what the writer would refuse after the run, as far as the initial mesh can tell."""
+    job = task.plan.job
+    if not job.are_any() and job.output.suffix.lower() == ".vtu":
+        return
+
+    def build(early: SolverOptions) -> Model:
+        return model_with(task, initial, early, task.source.about, is_told=False, fields=fields)
+
+    check_early(job.output, job, initial.ndim, task.source.low, build)
+
+
+def _memory_limit(task: Task, content: Content) -> MemoryLimit | None:
+    """The user's; InputError if the image alone, or the mesh to begin with, needs more."""
+    job = task.plan.job
+    if job.max_gb is None:
+        return None
+    n_bytes = job.max_gb * BYTES_PER_GB
+    check_memory_of(content, 0, n_bytes)
+    return MemoryLimit(n_bytes, next_bytes(job.nodes or 0, content.image.ndim))
+
+
+def prepare(make: Callable[[Callable[[str], None]], Any]) -> None:
+    """Load the compiled kernels, or compile them, before the clock of the first iteration starts."""
+    begin = time.perf_counter()
+    started("kernels", "preparing the kernels (the first run compiles them, half a minute)")
+    make(lambda words: progress(words))
+    seconds = time.perf_counter() - begin
+    if seconds > LONG_SECONDS:
+        note(f"kernels compiled in {seconds:.0f} s; later runs on images of this kind load them from the cache")
+
+
+def watched(
+    run: Run, initial: Mesh, iterations: int, ends: float | None, stop: Callable[[], bool],
+    limit: MemoryLimit | None = None,
+) -> Optimized:  # fmt: skip
+    """A run whose records are told, ended in good order at a time, before a limit of memory, or when `stop` says so."""
+    max_seconds = None if ends is None else max(ends - time.perf_counter(), 1e-9)
+
+    def is_stopped() -> bool:
+        return stop() or (limit is not None and limit.is_reached())
+
+    def recorded(row: Record) -> None:
+        progress("", row)
+
+    result = run(max_seconds=max_seconds, callback=recorded, stop=is_stopped)
+    if iterations == 0:  # the initial mesh itself, not its nodes put on the sampling grid
+        result = result._replace(mesh=initial)
+    if result.ended == "stopped" and not stop():
+        result = result._replace(ended="max_gb")
+    if result.ended != "iterations":
+        started("optimised")
+        note(f"{ENDED_WORDS[result.ended]} (iteration {result.history[-1].iteration} of {iterations})")
+    return result
+
+
+def _say_search(task: Task, number: int, result: Optimized) -> None:
+    """A line for a run of several, which go on until one is near to an error, or to a number of nodes of order 2."""
+    job, content = task.plan.job, task.source.content
+    n_nodes = node_count(result.mesh.points, result.mesh.cells, job.order or 1)
+    if (target := job.target_error) is not None:
+        share = result.history[-1].E_D / (content.variance * content.volume or 1.0)
+        note(
+            f"run {number} of up to {ERROR_RUNS}: {n_nodes} nodes leave {share:.4g} of the variance in cells; "
+            f"{ERROR_REACHED * target:.4g} to {target:.4g} is near enough"
+        )
+    elif job.order == 2 and job.nodes is not None and task.plan.mode != "start":
+        note(
+            f"run {number} of up to {NODE_RUNS}: {n_nodes} nodes with those in the middle of edges, of "
+            f"{job.nodes}; {NODES_NEAR:.0%} off is near enough"
+        )
+
+
+def _described(task: Task, initial: Mesh) -> str:
+    source = task.source
+    assert isinstance(source, Source)
+    image = source.contrasts[0]
+    size = " x ".join(str(s) for s in image.shape)
+    spacing = " x ".join(f"{s:.4g}" for s in image.spacing)
+    start = f"{task.start_name} of {len(initial.points)} nodes, {len(initial.cells)} cells"
+    start += f", edges up to {np.sqrt(squared_edges(initial.points, initial.cells).max()):.3g} mm"
+    more = [f"and {len(source.paths) - 1} more"] if len(source.paths) > 1 else []
+    more += ["labels"] if source.labels is not None else []
+    if source.mask is not None:
+        more += [f"within a {source.mask_word} of {int((source.mask.data >= INSIDE_SHARE).sum())} voxels"]
+    return ", ".join([f"{source.paths[0]}: {size} voxels of {spacing} mm", *more]) + f"; {start}"

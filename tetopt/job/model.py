@@ -1,0 +1,354 @@
+"""From a mesh to a file for a solver: what runs, conversions and simulations have in common."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
+from itertools import chain
+from pathlib import Path
+from typing import Any, cast, get_args
+
+import numpy as np
+from numpy.typing import NDArray
+
+import tetopt
+from tetopt.errors import InputError, error_words
+from tetopt.image import Image
+from tetopt.io.files import kept_places
+from tetopt.io.formats import FORMATS, file_bytes, format_of, save_mesh, save_model
+from tetopt.io.vtk import VTK_SUFFIXES
+from tetopt.job.events import note, warning
+from tetopt.job.inputs import label_table
+from tetopt.job.options import ModelOptions, SolverOptions
+from tetopt.mesh import Mesh
+from tetopt.model.averages import DEFAULT_AVERAGE, parse_average
+from tetopt.model.build import model_of
+from tetopt.model.fields import is_result
+from tetopt.model.file import MATERIAL_FIELDS, MeshFile, loads_in, moduli_in, sets_beside
+from tetopt.model.file import completed as with_rest_of_file
+from tetopt.model.labels import TABLE_TEXT, labels_of, table_of_words, table_words
+from tetopt.model.laws import parse_any_law
+from tetopt.model.loads import FACET_FORCES, check_steps, known_set, other_orders, parse_load
+from tetopt.model.materials import DEFAULT_NU, Spacing
+from tetopt.model.model import SPACES, STRESS_UNITS, Model, odd_units
+from tetopt.model.sets import (
+    BOUNDARY_SET,
+    Box,
+    SetRequest,
+    Sets,
+    check_free_names,
+    interface_names,
+    label_set_names,
+    parse_set,
+    standard_names,
+)
+
+REACTIONS_TEXT = r"reactions(_step\d+)?"  # of a solved mesh's file: the forces that hold sets
+SET_GROUPS = ("labels", "interfaces", "boundary")  # of the sets that every mesh has
+# Each is an array more on the nodes of a VTU or VTK file; labels and their sets can be made anew of its cells.
+MANY_INTERFACES = 24
+INTERFACE_PREFIX = "interface_"  # of the names of facet sets between two labels
+SLOW_MATERIALS = 30_000  # CalculiX takes three times as long with as many as there are cells (tests/benchmarks)
+
+
+def check_solver_options(output: Path, solver: SolverOptions, has_materials: bool = False) -> None:
+    """InputError for what is wrong whatever the mesh may be, raised before the work starts.
+
+    Raises
+    ------
+    InputError
+        A suffix, law, number of bins, unit or convention that there is not; what needs moduli without any.
+    """
+    form = format_of(output)
+    if form.is_surface and (solver.young or solver.bins or solver.sets or solver.loads or solver.written_sets):
+        raise InputError(
+            f"{output}: holds the boundary alone; leave out `young`, `bins`, `sets`, `written_sets` and `loads`"
+        )
+    check_model_options(solver, has_materials)
+    if solver.average is not None and solver.young is None:
+        raise InputError("`average`: there is no `young`")
+    if solver.units not in STRESS_UNITS:
+        raise InputError(f"`units`: expected {' or '.join(STRESS_UNITS)}, got {solver.units}")
+    if solver.space not in SPACES:
+        raise InputError(f"`space`: expected {' or '.join(SPACES)}, got {solver.space}")
+    if solver.nonlinear and not form.has_large:
+        raise InputError(f"{output}: `nonlinear` is for {', '.join(s for s, f in FORMATS.items() if f.has_large)} only")
+    if solver.order == 2 and not form.has_quadratic:
+        raise InputError(
+            f"{output}: `order` 2 is for {', '.join(s for s, f in FORMATS.items() if f.has_quadratic)} only"
+        )
+
+
+def check_model_options(options: ModelOptions, has_materials: bool) -> None:
+    """InputError for what is wrong whatever mesh and file may be; `has_materials`: the mesh's file does, or an image.
+
+    Raises
+    ------
+    InputError
+        A law, average, number of bins or order that there is not; what needs moduli without any.
+    """
+    for name, law in (("young", options.young), ("nu", options.nu), ("density", options.density)):
+        if law is not None:
+            _check_law(law, name)
+            if options.young is None and not has_materials:
+                raise InputError(f"`{name}`: there is no `young`")
+    parse_average(options.average or DEFAULT_AVERAGE)
+    parsed_bins(options.bins)
+    parsed_groups(options.written_sets)
+    if options.order not in (None, 1, 2):
+        raise InputError(f"`order`: expected 1 or 2, got {options.order}")
+
+
+def _check_law(text: str, name: str) -> None:
+    """InputError that names the option, for a law that is none."""
+    try:
+        parse_any_law(text, name)
+    except InputError as error:
+        raise InputError(f"`{name}`: {str(error).removeprefix('law: ')}") from error
+
+
+def parsed_bins(text: str | None) -> tuple[int | None, Spacing]:
+    """Number and spacing of bins, from "K", "K:quantile" or "K:log"."""
+    if text is None:
+        return None, "equal"
+    count, _, spacing = text.partition(":")
+    spacing = spacing or "equal"
+    if re.fullmatch("0*[1-9][0-9]{0,8}", count) is None or spacing not in get_args(Spacing):
+        raise InputError(f'`bins`: expected K, K:quantile or K:log with K from 1 to 999999999, got "{text[:80]}"')
+    return int(count), cast(Spacing, spacing)
+
+
+def parsed_groups(text: str | None) -> tuple[str, ...]:
+    """Which of `SET_GROUPS` are to be written, from "labels,interfaces,boundary", "all", or "none"."""
+    if text in (None, "all"):
+        return SET_GROUPS
+    words = [] if text == "none" else [word.strip() for word in text.split(",")]
+    if unknown := [word for word in words if word not in SET_GROUPS]:
+        raise InputError(
+            f'`written_sets`: expected some of {", ".join(SET_GROUPS)}, or all, or none, got "{unknown[0]}"'
+        )
+    return tuple(words)
+
+
+def solver_model(
+    mesh: Mesh, image: Image | None, solver: ModelOptions, cell_data: dict[str, NDArray], about: dict[str, Any],
+    known_sets: Sets,
+) -> Model:  # fmt: skip
+    """The model that the options ask for, of a mesh with the sets `known_sets`."""
+    young, nu, density = moduli_in(cell_data, solver.young, solver.nu, solver.density)
+    is_of_file = solver.young is None and "young" in cell_data
+    if not is_of_file and nu is None and "nu" in cell_data:
+        note(f"nu: of `young` or {DEFAULT_NU:g}; what the mesh's file has is left")
+    fields = {name: values for name, values in cell_data.items() if name not in MATERIAL_FIELDS}
+    bins, spacing = parsed_bins(solver.bins)
+    model = model_of(
+        mesh, image, young=young, nu=nu, density=density, average=solver.average or DEFAULT_AVERAGE,
+        sets=solver.sets or (), loads=solver.loads or (), bins=bins, spacing=spacing, order=solver.order or 1,
+        cell_data=fields, known_sets=known_sets, about={"tetopt": tetopt.__version__, **about},
+    )  # fmt: skip
+    return model._replace(is_nonlinear=isinstance(solver, SolverOptions) and solver.nonlinear)
+
+
+def completed(model: Model, loaded: MeshFile, solver: ModelOptions) -> Model:
+    """The model with what the mesh's file alone has; see `tetopt.model.file.completed`."""
+    model, lost = with_rest_of_file(model, loaded, is_of_file=solver.young is None and solver.bins is None)
+    if lost:
+        note(lost)
+    return model
+
+
+def without_stale_results(loaded: MeshFile, solver: ModelOptions) -> MeshFile:
+    """The mesh's file without what a solver found on it, if moduli, densities or loads are to be others; a line."""
+    if not any((solver.young, solver.nu, solver.density, solver.bins, solver.loads)):
+        return loaded
+    names = [name for data in (loaded.cell_data, loaded.point_data) for name in data if is_result(name)]
+    texts = {name: text for name, text in loaded.field_data.items() if re.fullmatch(REACTIONS_TEXT, name) is None}
+    if not names and len(texts) == len(loaded.field_data):
+        return loaded
+    note(
+        f"left out, as they are of other moduli or loads: {', '.join(dict.fromkeys(names)) or 'reactions'}; tetopt fem "
+        "finds them anew"
+    )
+    cell_data, point_data = (
+        {name: rows for name, rows in data.items() if name not in names}
+        for data in (loaded.cell_data, loaded.point_data)
+    )
+    return loaded._replace(cell_data=cell_data, point_data=point_data, field_data=texts)
+
+
+def loads_of(loaded: MeshFile) -> list[str]:
+    """The loads that a file of ours holds, see `tetopt.model.file.loads_in`; a line where they are left out."""
+    loads, lost = loads_in(loaded)
+    if lost:
+        note(lost)
+    return loads
+
+
+def all_sets(
+    mesh: Mesh,
+    box: Box | None,
+    fields: dict[str, NDArray],
+    own: Sets,
+    names: Mapping[int, str],
+    former: Mapping[int, str] | None = None,
+    kept: Iterable[str] = (),
+    is_told: bool = True,
+) -> Sets:
+    """`tetopt.model.file.sets_beside`; a line for each of the mesh's own that had to be called otherwise."""
+    sets, renamed = sets_beside(mesh, box, fields, own, names, former, kept)
+    if is_told:
+        for old, new in renamed.items():
+            note(f'the mesh came with a set "{old}" of its own: it is {new} here')
+    return sets
+
+
+def with_chosen_sets(model: Model, output: Path, options: ModelOptions) -> Model:
+    """The model with those sets that its file is to get; a line if interfaces are left out unasked.
+
+    Of the sets that every mesh has those of `written_sets` are written, by default all, but into a file of VTK's no
+    more interfaces than `MANY_INTERFACES`. Others, and those that loads name, always are.
+    """
+    groups = set(parsed_groups(options.written_sets))
+    labels = labels_of(model.cell_data, len(model.mesh.cells))
+    names = table_of_words(model.about.get(TABLE_TEXT)).names
+    of_label = {} if labels is None else label_set_names(np.unique(labels).tolist(), names)
+    pairs = [(a, b) for a in of_label for b in of_label if a < b]
+    between = {*interface_names(pairs, of_label).values(), *(f"interface_{a}_{b}" for a, b in pairs)}
+    interfaces = between & set(model.sets.facets)
+    if options.written_sets is None and output.suffix.lower() in VTK_SUFFIXES and len(interfaces) > MANY_INTERFACES:
+        note(
+            f"{len(interfaces)} interfaces are not written as sets, which `written_sets` all does; convert, fem and "
+            "view have them anyway, from the cells' labels"
+        )
+        groups.discard("interfaces")
+    left = set()
+    for group, members in (
+        ("labels", set(of_label.values())), ("interfaces", interfaces), ("boundary", standard_names(model.mesh.ndim)),
+    ):  # fmt: skip
+        left |= set() if group in groups else members
+    left -= {load.set_name for load in model.loads}
+    facets, cells = ({name: rows for name, rows in kind.items() if name not in left} for kind in model.sets)
+    return model._replace(sets=Sets(facets, cells))
+
+
+def sets_and_table(
+    loaded: MeshFile, box: Box | None, fields: dict[str, NDArray], options: ModelOptions
+) -> tuple[Sets, dict[str, Any]]:
+    """The sets of a mesh's file, `all_sets`, and the texts of labels' names that go on into the next."""
+    table, former = label_table(options.label_names, loaded), label_table(None, loaded)
+    of_loads = {parse_load(text, loaded.mesh.ndim).set_name for text in options.loads or ()}
+    sets = all_sets(loaded.mesh, box, fields, loaded.sets, table.names, former.names, of_loads)
+    return sets, {TABLE_TEXT: table_words(table)} if table.names or table.colours else {}
+
+
+def check_early(
+    output: Path, solver: SolverOptions, ndim: int, low: float, build: Callable[[SolverOptions], Model]
+) -> None:
+    """InputError for what would be refused after the optimisation, as far as the initial mesh can tell.
+
+    `low` is the image's least intensity; `build` makes a model of the initial mesh. Further sets, and interfaces, may
+    have members in the final one alone: of them, and of loads on them, only the words and names are looked at.
+    """
+    requests = [parse_set(text, ndim) for text in solver.sets or ()]
+    for request in requests:
+        if request.kind == "below" and request.vectors[0][0] <= low:
+            raise InputError(
+                f"set {request.name}: no cell can have a mean below {request.vectors[0][0]:g}, the image begins at "
+                f"{low:g}"
+            )
+    names = {name for request in requests for name in request.names()}
+    loads = [parse_load(text, ndim) for text in solver.loads or ()]
+    check_steps(loads)
+    loaded = [load.set_name for load in loads]
+    is_certain = not any(name in names or name.startswith(INTERFACE_PREFIX) for name in loaded)
+    model = build(replace(solver, sets=None, loads=solver.loads if is_certain else None))
+    warn_of_units(model._replace(loads=tuple(loads)))
+    for request in requests:
+        check_free_names(request, model.sets)
+    for name in loaded:
+        may_come = name.startswith(INTERFACE_PREFIX) and not other_orders(name, model.sets)
+        if name and name not in names and not may_come:
+            known_set(name, model.sets)
+    for load in loads:
+        if load.kind in FACET_FORCES and load.set_name.startswith(INTERFACE_PREFIX) and load.set_name not in names:
+            raise InputError(
+                f'load: the facets of "{load.set_name}" lie between two cells, where nothing outside can act '
+                f"({load.kind}); take a set of the boundary, mesh one side alone (`mask`), or move the set"
+            )
+    file_bytes(output, _with_names(model, requests), space=solver.space, units=solver.units)
+
+
+def _with_names(model: Model, requests: Sequence[SetRequest]) -> Model:
+    """The model with a facet and a cell under each name of a set that is asked for, so that a writer refuses it now."""
+    facets, cells = dict(model.sets.facets), dict(model.sets.cells)
+    for request in requests:
+        *of_cells, of_facets = request.names()
+        facets[of_facets] = model.sets.facets[BOUNDARY_SET][:1]
+        cells |= {name: np.zeros(1, dtype=np.int64) for name in of_cells}
+    return model._replace(sets=Sets(facets, cells))
+
+
+def warn_of_units(model: Model) -> None:
+    """A line for each quantity that seems to be in another unit than is expected."""
+    for words in odd_units(model):
+        warning(words)
+
+
+def save_for_solver(output: Path, model: Model, solver: SolverOptions) -> None:
+    """Write the file."""
+    if model.materials is not None and len(model.materials.young) > SLOW_MATERIALS and output.suffix.lower() == ".inp":
+        note(f"{len(model.materials.young)} materials make CalculiX some three times slower; `bins` 32 groups them")
+    save_model(output, model, space=solver.space, units=solver.units)
+
+
+def keep_early(output: Path, mesh: Mesh, labels: NDArray[np.int64] | None) -> Path | None:
+    """Keep an optimised mesh beside its file until that is written, whatever may end the process before; the place."""
+    early = next(kept_places(output, ".vtu"))
+    try:
+        save_mesh(early, mesh, {} if labels is None else {"label": labels})
+    except (OSError, MemoryError) as error:
+        note(f"the optimised mesh cannot be kept before its file is written: {error_words(error)}")
+        return None
+    return early
+
+
+def drop_early(early: Path) -> None:
+    """Remove what `keep_early` kept, as the mesh is elsewhere by now."""
+    try:
+        early.unlink(missing_ok=True)
+    except OSError as error:
+        note(f"{early}: holds the nodes and cells of the mesh, too; it cannot be removed: {error.strerror}")
+
+
+def save_anyway(output: Path, mesh: Mesh, build: Callable[[], Model], error: Exception, early: Path | None) -> None:
+    """Keep an optimised mesh whose file was refused or failed, as VTU: beside it, else in a temporary folder.
+
+    `build` makes the model to keep; if that fails, too, the mesh is kept alone, as it is `early`, if that is a place.
+
+    Raises
+    ------
+    InputError
+        If `error` is one that the user can mend; it says where the mesh is.
+    """
+    places = chain([] if early is None else [early], kept_places(output, ".vtu"))
+    kept = _kept_mesh(places, (lambda path: save_model(path, build()), lambda path: save_mesh(path, mesh)))
+    where = "could not be kept anywhere" if kept is None else f"is in {kept}: go on from there with tetopt convert"
+    if isinstance(error, InputError | OSError | MemoryError):
+        raise InputError(f"{error_words(error)}; the optimised mesh {where}") from error
+    note(f"the optimised mesh {where}")
+
+
+def _kept_mesh(places: Iterable[Path], ways: Sequence[Callable[[Path], None]]) -> Path | None:
+    """The first place where one of the ways to save a mesh does so, or where it was saved before."""
+    for path in places:
+        for save in ways:
+            try:
+                save(path)
+            except Exception as error:  # told; what ended the run before is raised in the end
+                note(f"{path}: the optimised mesh cannot be kept here: {error_words(error)}")
+            else:
+                return path
+        if path.exists():
+            return path
+    return None

@@ -1,0 +1,269 @@
+"""What a run is to do: contradictions are refused, defaults are filled in, once and here."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+
+from tetopt.engine.fast import check_options
+from tetopt.engine.loop import MIN_DIHEDRAL, SHAPE_POWER
+from tetopt.engine.meshing import MODE_DEFAULTS, QUADRATIC_NODES, Mode, check_target_error, sizes_of_order
+from tetopt.engine.paper import default_n_t
+from tetopt.errors import InputError
+from tetopt.io.files import checked_output, results_folder
+from tetopt.io.formats import FORMATS
+from tetopt.io.images import parse_crop, parse_slice
+from tetopt.job.inputs import checked_outputs, number_of, read_companion, weights_of
+from tetopt.job.model import check_solver_options
+from tetopt.job.options import DEFAULT_NODES, JobOptions, Method
+from tetopt.start.lattice import KINDS
+from tetopt.start.octree import nodes_of_sizes
+from tetopt.start.sizes import Sizes
+from tetopt.target.content import SMOOTH_INTERFACES, Content, StoredContent, check_weights
+
+FEWEST_NODES = 5  # of the smallest mesh that there is, an octree in 2-D: a square's corners and its middle
+
+
+class Plan(NamedTuple):
+    """A run without contradictions: options whose default does not depend on the image have their value."""
+
+    mode: Mode
+    job: JobOptions
+    bare: JobOptions  # as they came, without defaults
+    n_parts: int | None = None  # at least so many, if it is made in parts
+    pictures: Sequence[Path] = ()  # slice, rho, energies, with a mask its boundary, with labels these, last a thumbnail
+
+    def kind(self, ndim: int) -> str:
+        """What the initial mesh is: a kind of lattice, octree or start."""
+        if self.mode == "start":
+            return "start"
+        if self.mode == "graded":
+            return "octree"
+        return self.job.lattice or KINDS[ndim][0]
+
+    def engine_options(self) -> dict[str, Any]:
+        """Options of `mesh_image` besides those of the mesh to begin with, in the order of run.json."""
+        job = self.job
+        options = {"k_D": job.k_D, "iterations": job.iterations, "boundary": job.boundary}
+        if self.mode == "paper":
+            return options | {"n_t": job.n_t, "retessellate": job.retessellate}
+        return options | {"shape_power": job.shape_power, "min_dihedral": job.min_dihedral}
+
+    def stated(self, ndim: int) -> dict[str, Any]:
+        """The options as the mesh's file and run.json state them; files by their names."""
+        job = self.job
+        return {
+            "nodes": job.nodes, "target_error": job.target_error, "spacing": job.spacing,
+            "lattice": self.kind(ndim), "size_min": job.size_min, "size_max": job.size_max,
+            "edge_max": job.edge_max, "gradation": job.gradation,
+            "sizing": None if job.sizing is None else job.sizing.name,
+            **job.stated(), "method": job.method, "max_seconds": job.max_seconds, "max_gb": job.max_gb,
+            "start": None if job.start is None else job.start.name, **self.engine_options(),
+        }  # fmt: skip
+
+    def with_job(self, **changes: Any) -> Plan:
+        """The same of other options."""
+        return self._replace(job=changed(self.job, **changes))
+
+    def with_files(self, images: Sequence[Path], files: Mapping[str, Path]) -> Plan:
+        """The same of other images and other files, as many and of the same options."""
+        return self._replace(
+            job=changed(self.job, images=list(images), **files), bare=changed(self.bare, images=list(images), **files)
+        )
+
+
+def planned(job: JobOptions) -> Plan:
+    """The run that a job asks for.
+
+    Raises
+    ------
+    InputError
+        As `resolved`; an output that may not be written.
+    """
+    checked_output(job.output, tuple(FORMATS), job.force)
+    if job.json_path is not None:
+        checked_output(job.json_path, (".json",), job.force)
+    return resolved(job)._replace(pictures=_pictures(job))
+
+
+def resolved(job: JobOptions) -> Plan:
+    """The same without a look at any file.
+
+    Raises
+    ------
+    InputError
+        Options that contradict each other or are out of range, as far as they tell without any file being read.
+    """
+    _check_source(job)
+    _check_numbers(job)
+    check_solver_options(job.output, job)
+    mode = _mode(job)
+    for name in ("size_min", "size_max", "edge_max", "gradation", "sizing", "target_error"):
+        if mode != "graded" and getattr(job, name) is not None:
+            raise InputError(
+                f"`{name}`: only on a graded mesh; leave out `uniform`, `spacing`, `lattice`, `method`, `start`"
+            )
+    completed = _completed(job, mode)
+    is_plain = len(job.images) == 1 and not (job.mask or job.background or job.labels)
+    if mode == "paper" and not is_plain:
+        raise InputError("`method` paper: takes one IMAGE and its whole box; leave out mask, labels and further ones")
+    return Plan(mode, completed, job)
+
+
+def changed(job: JobOptions, **values: Any) -> JobOptions:
+    """The options with other values, which are those of a plan, and not looked at."""
+    return JobOptions(**(vars(job) | values))
+
+
+def _check_source(job: JobOptions) -> None:
+    """InputError for what of mask and labels contradicts itself."""
+    if job.mask is not None and job.background is not None:
+        raise InputError("`mask` and `background`: give one of them")
+    if job.keep_components and job.mask is None and job.background is None:
+        raise InputError("`keep_components`: needs `mask` or `background`; leave it out")
+    if job.labels is None:
+        for name in ("label_names", "label_weight", "smooth_interfaces"):
+            if getattr(job, name) is not None:
+                raise InputError(f"`{name}`: there are no `labels`")
+
+
+def _check_numbers(job: JobOptions) -> None:
+    """InputError for numbers that are none of their options', whatever the image is."""
+    tension = SMOOTH_INTERFACES if job.smooth_interfaces is None else job.smooth_interfaces
+    check_weights(len(job.images), weights_of(job), job.label_weight or 0.0, tension)
+    if job.background not in (None, "auto"):
+        number_of("`background`", str(job.background))
+    if job.crop is not None:
+        parse_crop(job.crop)
+    if job.slice_ is not None:
+        parse_slice(job.slice_)
+    if job.nodes is not None and job.nodes < FEWEST_NODES:
+        raise InputError(f"`nodes`: expected a whole number, {FEWEST_NODES} or more, got {job.nodes}")
+    if job.spacing is not None and not 0.0 < job.spacing < np.inf:
+        raise InputError(f"`spacing`: expected a length above 0 mm, got {job.spacing}")
+    if job.target_error is not None:
+        check_target_error(job.target_error)
+    _limits(changed(job, sizing=None))
+
+
+def _mode(job: JobOptions) -> Mode:
+    """Which of the four ways the options ask for; a graded mesh is the default."""
+    numbers = {"`nodes`": job.nodes, "`spacing`": job.spacing, "`target_error`": job.target_error}
+    if len(names := [name for name, value in numbers.items() if value is not None]) > 1:
+        raise InputError(f"{' and '.join(names)}: give one of them")
+    is_paper = job.method == "paper"
+    if job.lattice == "octree":
+        if job.uniform:
+            raise InputError("`uniform` and `lattice` octree: give one of them")
+        if is_paper:
+            raise InputError("`lattice` octree: only with `method` fast, got `method` paper")
+        if job.spacing is not None:
+            raise InputError("`lattice` octree: has no one spacing; give `nodes` instead of `spacing`")
+    if job.start is not None:
+        others = {**numbers, "`lattice`": job.lattice, "`mask`": job.mask, "`background`": job.background}
+        others["`uniform`"] = job.uniform or None
+        if names := [name for name, value in others.items() if value is not None]:
+            raise InputError(
+                f"`start` and {names[0]}: {job.start} has its nodes and its boundary already; leave one out"
+            )
+        if is_paper:
+            raise InputError("`start`: only with `method` fast, whose moves keep a boundary that is not convex")
+        return "start"
+    if is_paper:
+        return "paper"
+    is_lattice = job.uniform or job.spacing is not None or job.lattice not in (None, "octree")
+    return "uniform" if is_lattice else "graded"
+
+
+def _completed(job: JobOptions, mode: Mode) -> JobOptions:
+    """The engine's options with the defaults of the mode; InputError where they cannot be."""
+    k_D, iterations = MODE_DEFAULTS[mode]
+    k_D = k_D if job.k_D is None else job.k_D
+    iterations = iterations if job.iterations is None else job.iterations
+    if not 0.0 <= k_D < 1.0:
+        raise InputError(f"`k_D`: expected 0 <= k_D < 1, got {k_D}")
+    if job.max_seconds is not None and not job.max_seconds > 0.0:
+        raise InputError(f"`max_seconds`: expected more than 0, got {job.max_seconds}")
+    if job.max_gb is not None and not job.max_gb > 0.0:
+        raise InputError(f"`max_gb`: expected more than 0, got {job.max_gb}")
+    boundary = job.boundary or ("fixed" if mode == "start" else "slide")
+    job = changed(job, k_D=k_D, iterations=iterations, boundary=boundary)
+    _check_method(job, "paper", ("n_t", "retessellate"))
+    _check_method(job, "fast", ("shape_power", "min_dihedral"))
+    if mode == "paper":
+        n_t = default_n_t(k_D, iterations) if job.n_t is None else job.n_t
+        return changed(job, n_t=n_t, retessellate=job.retessellate or "first")
+    shape_power = SHAPE_POWER if job.shape_power is None else job.shape_power
+    min_dihedral = MIN_DIHEDRAL if job.min_dihedral is None else job.min_dihedral
+    check_options(k_D, iterations, shape_power, min_dihedral, boundary)
+    return changed(job, shape_power=shape_power, min_dihedral=min_dihedral)
+
+
+def _check_method(job: JobOptions, method: Method, names: tuple[str, ...]) -> None:
+    """InputError for an option of the other method."""
+    wrong = [name for name in names if getattr(job, name) is not None]
+    if wrong and job.method != method:
+        raise InputError(f"`{wrong[0]}`: only with `method` {method}, got `method` {job.method}")
+
+
+def _pictures(job: JobOptions) -> list[Path]:
+    """The pictures to draw, as far as they may be written."""
+    if job.figures is None:
+        return []
+    names = ["slice.png", "rho.png", "energies.png"]
+    names += [] if job.mask is None and job.background is None else ["boundary.png"]
+    names += [] if job.labels is None else ["labels.png"]
+    names += ["thumbnail.png"]
+    return list(checked_outputs(results_folder(job.figures), names, job.force).values())
+
+
+def with_numbers(plan: Plan, content: Content | StoredContent) -> tuple[Plan, Sizes | None]:
+    """The plan with the defaults that depend on the image, and the sizes.
+
+    These are the number of nodes, as many as the sizes take or fewer on small images, and the longest edge, which holds
+    anyway and is stated.
+    """
+    image, job = content.image, plan.job
+    is_counted = job.nodes is not None or job.target_error is not None or job.spacing is not None
+    if plan.mode == "start":
+        return plan, None
+    if plan.mode != "graded":
+        nodes = job.nodes if is_counted else DEFAULT_NODES[image.ndim]
+        return plan.with_job(nodes=nodes), None
+    order, nodes, limits = job.order or 1, job.nodes, _limits(job)
+    if not is_counted:
+        nodes = _default_nodes(content, limits, QUADRATIC_NODES[image.ndim] if order == 2 else 1.0)
+    limits = sizes_of_order(content, nodes, limits, order)
+    longest = job.edge_max
+    if longest is None and nodes is not None:
+        longest = (limits or Sizes()).longest_edge(image, nodes, content.volume)
+        longest = longest if longest < np.inf else None
+    return plan.with_job(nodes=nodes, edge_max=longest), limits
+
+
+def _default_nodes(content: Content | StoredContent, limits: Sizes | None, many: float) -> int:
+    """As many nodes as the targets take, where there are any, and elsewhere their share of the usual number.
+
+    `many` are the nodes in all to a corner of cells.
+    """
+    corners = float(
+        np.clip(content.n_voxels // 8, 2 ** (content.image.ndim + 2), DEFAULT_NODES[content.image.ndim] / many)
+    )
+    if limits is not None and limits.has_target and isinstance(content, Content):
+        needed, share = nodes_of_sizes(content, limits)
+        corners = needed + (1.0 - share) * corners
+    return int(np.rint(many * corners))
+
+
+def _limits(job: JobOptions) -> Sizes | None:
+    """The limits on sizes, if the options ask for any."""
+    field = None if job.sizing is None else read_companion(job.sizing)
+    values = {
+        "smallest": job.size_min, "largest": job.size_max, "gradation": job.gradation, "field": field,
+        "longest": job.edge_max,
+    }  # fmt: skip
+    limits: dict[str, Any] = {name: value for name, value in values.items() if value is not None}
+    return Sizes(**limits) if limits else None

@@ -1,0 +1,130 @@
+"""How long a run takes and how much memory, by its sizes, before it begins."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from math import prod
+from typing import Any
+
+import numba
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.engine.cost import RunSize, predicted
+from tetopt.engine.meshing import QUADRATIC_NODES
+from tetopt.image import VoxelGrid
+from tetopt.io.images import file_shape, load_image, parse_crop, parse_slice
+from tetopt.io.zarr_images import is_zarr
+from tetopt.job.inputs import file_and_volume
+from tetopt.job.options import DEFAULT_NODES
+from tetopt.job.plan import Plan
+from tetopt.target.content import Content, StoredContent
+
+SEARCH_RUNS = 4  # towards an error, mostly, each of about the default number of nodes
+QUADRATIC_RUNS = 2  # towards a number of nodes of order 2: the second mostly meets it
+SAMPLED_VALUES = 10_000  # of an image: one that is no whole number tells that most are none
+
+
+def size_of_run(
+    plan: Plan, content: Content | StoredContent, whole: VoxelGrid, n_started: int | None = None
+) -> RunSize:
+    """The sizes of a run whose files have been read.
+
+    Parameters
+    ----------
+    plan : Plan
+        With the numbers that depend on the image (`tetopt.job.plan.with_numbers`).
+    content : Content
+        What is meshed.
+    whole : Image
+        The first contrast as it was read.
+    n_started : int, optional
+        Nodes, corners of cells, of a mesh to start from.
+    """
+    nodes, spacing = plan.job.nodes, plan.job.spacing
+    if nodes is None and spacing is not None:
+        per_block = 1 if plan.job.lattice == "five-tet" else 2
+        nodes = max(round(per_block * content.volume / spacing**content.image.ndim), 1)
+    size = _size(plan, whole.shape, nodes)
+    if isinstance(content, StoredContent):
+        elongation = _elongation(whole.spacing)
+        return size._replace(elongation=elongation, is_fractional=not content.statistics.is_whole)
+    return size._replace(
+        n_voxels=content.image.data.size,
+        n_nodes=size.n_nodes if n_started is None else n_started,
+        n_channels=len(content.values) + (content.region is not None),
+        elongation=_elongation(content.image.spacing),
+        has_memberships=content.memberships is not None,
+        is_fractional=content.is_plain and not np.array_equal(np.rint(some := _sample(content)), some),
+    )
+
+
+def size_by_headers(plan: Plan, like: RunSize | None = None) -> RunSize:
+    """The same, of files of which only the headers are read.
+
+    What shows only in the voxels is taken from a run with the same options, `like`, whose files have been read: the
+    share of the voxels that a mask leaves, the channels of labels, nodes where no number is asked for. Without one it
+    is all voxels, one channel for all labels, and the default number.
+
+    Raises
+    ------
+    InputError
+        As `tetopt.io.images.file_shape`, or `load_image` of a picture or DICOM, which is read.
+    """
+    job, path = plan.job, plan.job.images[0]
+    shape = cropped_shape(plan, (file_shape(path) or load_image(path, volume=job.volume).shape)[:3])
+    if job.slice_ is not None:
+        axis, _ = parse_slice(job.slice_)
+        shape = shape[:axis] + shape[axis + 1 :]
+    size = _size(plan, shape, plan.job.nodes)
+    if like is None:
+        return size
+    n_voxels = round(size.n_read * like.n_voxels / like.n_read)
+    n_nodes = like.n_nodes if plan.job.nodes is None else size.n_nodes
+    return size._replace(
+        n_voxels=n_voxels, n_nodes=n_nodes, n_channels=like.n_channels, elongation=like.elongation,
+        has_memberships=like.has_memberships, is_fractional=like.is_fractional,
+    )  # fmt: skip
+
+
+def cropped_shape(plan: Plan, shape: tuple[int, ...]) -> tuple[int, ...]:
+    """What the crop that is asked for leaves of voxels of this shape."""
+    if plan.job.crop is None:
+        return shape
+    bounds = zip(shape, parse_crop(plan.job.crop), strict=False)
+    return tuple(len(range(length)[slice(*ends)]) for length, ends in bounds)
+
+
+def _sample(content: Content) -> NDArray:
+    """Some of the image's voxels."""
+    return content.image.data.ravel()[:: max(content.image.data.size // SAMPLED_VALUES, 1)]
+
+
+def _elongation(spacing: Sequence[float] | NDArray[np.float64]) -> float:
+    """Of voxels with these edges, mm."""
+    *across, along = (float(edge) for edge in spacing)
+    return along / prod(across) ** (1.0 / len(across))
+
+
+def _size(plan: Plan, shape: tuple[int, ...], nodes: int | None) -> RunSize:
+    """What the options and headers tell of a run on voxels of this shape; each file is a channel."""
+    job, order, ndim = plan.job, plan.job.order or 1, len(shape)
+    files = [*job.images, *(path for path in (job.mask, job.labels) if path is not None)]
+    runs = SEARCH_RUNS if plan.job.target_error is not None else 1
+    corners = float(DEFAULT_NODES[ndim] if nodes is None else nodes)
+    if order == 2 and plan.mode != "start":
+        corners /= QUADRATIC_NODES[ndim] if nodes is not None else 1.0
+        runs = runs if plan.job.spacing is not None else max(runs, QUADRATIC_RUNS)
+    n_read = sum(prod(shape if is_zarr(path) else file_shape(file_and_volume(path)[0]) or shape) for path in files)
+    has_region = job.mask is not None or job.background is not None
+    return RunSize(
+        n_read=n_read, n_voxels=prod(shape), n_nodes=round(corners), iterations=plan.job.iterations or 0,
+        n_channels=len(job.images) + (job.labels is not None) + has_region, ndim=ndim, mode=plan.mode,
+        order=order, runs=runs, has_region=has_region, has_memberships=job.labels is not None,
+        is_drawn=job.figures is not None,
+    )  # fmt: skip
+
+
+def stated_prediction(size: RunSize) -> dict[str, Any]:
+    """The sizes and what they come to, on the machine of the fit, as run.json states them."""
+    return {"size": size, **predicted(size, numba.get_num_threads())._asdict()}

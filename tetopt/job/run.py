@@ -1,0 +1,151 @@
+"""A run: read, plan, mesh, measure, write."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import Any, NamedTuple
+
+from tetopt.engine.loop import Optimized
+from tetopt.geometry.quadratic import node_count
+from tetopt.io.files import save_json
+from tetopt.job.advice import tell_violated, warn_of_result, warn_of_sizes
+from tetopt.job.events import Listener, listened, started, violated
+from tetopt.job.in_parts import end_work, with_parts
+from tetopt.job.inputs import set_threads
+from tetopt.job.job import Job
+from tetopt.job.meshing import meshed
+from tetopt.job.plan import planned
+from tetopt.job.read import read
+from tetopt.job.task import Meshed, Shapes, Task
+from tetopt.job.write import draw, measured_of, numbers_of, saved
+from tetopt.measure.quality import quality
+from tetopt.mesh import Mesh
+from tetopt.model.model import Model
+from tetopt.report.summary import measured_each, model_summary
+
+
+class Result(NamedTuple):
+    """What came of a run.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        The optimised mesh, as its file has it.
+    model : Model
+        The mesh with its fields, sets, materials and loads.
+    numbers : dict
+        Every number of the run, as run.json has them.
+    violated : list of str
+        Requirements that the mesh does not meet, and what could not be measured, a sentence each; empty if it is all
+        that it should be.
+    task : Task
+        What was asked for, with all defaults, and the files as they were read.
+    came : Meshed
+        The optimisation: its history, the initial mesh, seconds.
+    shapes : tuple of Quality
+        Of the initial mesh and of the result; None for one that could not be measured.
+    measured : dict
+        How well mask, labels, contrasts and sizes are met.
+    """
+
+    mesh: Mesh
+    model: Model
+    numbers: dict[str, Any]
+    violated: list[str]
+    task: Task
+    came: Meshed
+    shapes: Shapes
+    measured: dict[str, Any]
+
+    @property
+    def optimized(self) -> Optimized:
+        """The result of the optimisation."""
+        return self.came.result
+
+
+def run(job: Job, on: Listener | None = None, stop: Callable[[], bool] | None = None) -> Result:
+    """Mesh images as a job asks for, and write its outputs: what `tetopt mesh` does, to the same bytes.
+
+    Parameters
+    ----------
+    job : Job
+        What is asked for.
+    on : callable, optional
+        Gets each `Event`; without one warnings and violated requirements are Python's warnings.
+    stop : callable, optional
+        Asked between colours of nodes; True ends the run there, with the mesh so far.
+
+    Returns
+    -------
+    Result
+        With mesh, model and numbers.
+
+    Raises
+    ------
+    InputError
+        As `Job`; files that cannot be read or do not belong together; an output that may not be written, or could not
+        be: the message says where the mesh is then.
+
+    See Also
+    --------
+    mesh_image : The same of an image in memory, without files.
+
+    Examples
+    --------
+    >>> tetopt.save_image("ball.nii.gz", tetopt.load_phantom("sphere").image(voxel_mm=4))
+    >>> result = tetopt.run(tetopt.Job(images="ball.nii.gz", output="ball.vtu", nodes=300, iterations=4))
+    >>> len(result.mesh.points), result.violated, result.numbers["ended"]
+    (300, [], 'iterations')
+    """
+    begin = time.perf_counter()
+    with listened(on):
+        plan = planned(job)
+        set_threads(job.threads)
+        started("read", "reading and preparing the image, with its mask and labels")
+        task = read(with_parts(plan))
+        came = meshed(task, stop or (lambda: False), begin)
+        failed: dict[str, str] = {}
+        model, about = saved(task, came, failed)
+        # Only from here on, as nothing may fail before the mesh is written.
+        shapes = _shapes(came, failed)
+        measured = measured_of(task, came.result, model, failed)
+        numbers = numbers_of(task, came, shapes, model, about, time.perf_counter() - begin)
+        missing = {name: None for name in (*failed, "cells_without_voxel") if name != "fields"}
+        numbers |= missing | measured | {"failed": failed} | model_summary(model)
+        if job.json_path is not None:
+            save_json(job.json_path, numbers)
+        if task.plan.pictures:
+            draw(task, came, model)
+        result = Result(came.result.mesh, model, numbers, [], task, came, shapes, measured)
+        result = result._replace(violated=_judged(result, failed))
+        if task.plan.n_parts is not None:
+            end_work(task.plan, came.result)
+        return result
+
+
+def _shapes(came: Meshed, failed: dict[str, str]) -> Shapes:
+    meshes = {"quality_initial": came.initial, "quality": came.result.mesh}
+    shapes = measured_each({name: partial(quality, each.points, each.cells) for name, each in meshes.items()}, failed)
+    return shapes.get("quality_initial"), shapes.get("quality")
+
+
+def _judged(result: Result, failed: dict[str, str]) -> list[str]:
+    """What the mesh should be and is not; all of it, and what is odd, is told."""
+    task, came, measured = result.task, result.came, result.measured
+    problems = tell_violated(came.result, measured, task.source.mask_word)
+    for name, reason in failed.items():
+        left = "the mesh's file has no means of its cells" if name == "fields" else "all other numbers are written"
+        problems.append(f"{name} could not be measured: {reason}; {left}")
+        violated(problems[-1])
+    if task.source.is_constant:
+        measured = {**measured, "cells_without_voxel": 0}  # whose values are right all the same
+    job, mode = task.plan.job, task.plan.mode
+    expected = job.nodes if mode == "graded" and job.target_error is None else None
+    n_nodes = node_count(result.model.mesh.points, result.model.mesh.cells, result.model.order)
+    spacing = task.source.contrasts[0].spacing
+    warn_of_result(came.result, job.method, mode, n_nodes, expected, measured, spacing)
+    if task.sizes is not None and (edges := result.shapes[1]) is not None:
+        warn_of_sizes(task.sizes, edges.min_edge, edges.max_edge, measured.get("edges_over_target"))
+    return problems

@@ -1,0 +1,193 @@
+"""What a run leaves: the mesh in its file, every number, pictures."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import partial
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from tetopt.budget import peak_bytes
+from tetopt.engine.interfaces import crowded_nodes
+from tetopt.engine.loop import Optimized
+from tetopt.engine.meshing import QUADRATIC_NODES
+from tetopt.io.files import TakenError
+from tetopt.job.events import note
+from tetopt.job.in_parts import StoredSource
+from tetopt.job.inputs import label_table
+from tetopt.job.model import (
+    all_sets,
+    drop_early,
+    keep_early,
+    save_anyway,
+    save_for_solver,
+    solver_model,
+    with_chosen_sets,
+)
+from tetopt.job.options import SolverOptions
+from tetopt.job.plan import changed
+from tetopt.job.predict import stated_prediction
+from tetopt.job.request import requested
+from tetopt.job.source import Source
+from tetopt.job.task import Meshed, Shapes, Task
+from tetopt.mesh import Mesh
+from tetopt.model.fields import cell_fields, is_result
+from tetopt.model.labels import TABLE_TEXT, LabelTable, coloured, table_of_labels, table_words
+from tetopt.model.model import Model
+from tetopt.model.sets import Sets, box_of, label_set_names, surviving_sets
+from tetopt.report.summary import fidelity, image_summary, measured_each, run_summary
+from tetopt.start.octree import nodes_of_sizes
+from tetopt.start.sizes import edge_ratios
+
+
+def model_with(
+    task: Task, mesh: Mesh, solver: SolverOptions, about: dict[str, Any], is_told: bool = True,
+    labels: NDArray[np.int64] | None = None, fields: dict[str, NDArray] | None = None,
+) -> Model:  # fmt: skip
+    """The mesh with all that the options say of it; `fields` of its cells are found, if they are not known."""
+    source, started = task.source, task.started
+    if fields is None:
+        assert isinstance(source, Source)
+        fields = source.fields(mesh, labels)
+    own = Sets({}, {}) if started is None else surviving_sets(started.mesh, started.sets, mesh)
+    if started is not None and is_told:
+        lost = [name for kind in (0, 1) for name in started.sets[kind] if name not in own[kind]]
+        if source.labels is not None:  # of which these are made anew
+            names = label_table(None, started).names
+            of_labels = label_set_names(names, names).values()
+            lost = [name for name in lost if not name.startswith(("label_", "interface_")) and name not in of_labels]
+        if lost:
+            note(f"not kept, as their cells or facets are others now: the sets {', '.join(lost)}")
+        has_results = any(is_result(name) for name in (*started.cell_data, *started.point_data))
+        if "young" in started.cell_data or started.text("loads") is not None or has_results:
+            note("moduli, loads and results of the mesh that is improved are not kept; give `young` and `loads`")
+    known_sets = all_sets(mesh, box_of(source.contrasts[0]), fields, own, source.table.names, is_told=is_told)
+    return solver_model(mesh, source.image, solver, fields, about, known_sets)
+
+
+def saved(task: Task, came: Meshed, failed: dict[str, str]) -> tuple[Model, dict[str, Any]]:
+    """Write the mesh, or keep it elsewhere; the model, and what files say about the run.
+
+    Until its file is there, the mesh is kept beside it, as what the file has of each cell is measured before. What of
+    that could not be is left out, and noted in `failed`. A run in parts has its folder of work.
+    """
+    plan, job, source, result, fields = task.plan, task.plan.job, task.source, came.result, came.fields
+    options = plan.stated(source.content.image.ndim)
+    if job.target_error is not None:
+        options["nodes"] = result.nodes
+    if plan.n_parts is not None:
+        options["parts"] = plan.n_parts
+    about = {**source.about, "options": options}
+    early = None if plan.n_parts is not None else keep_early(job.output, result.mesh, result.labels)
+    if fields is None:
+        fields = _measured_fields(source, result, failed)
+    try:
+        whole = model_with(task, result.mesh, job, about, labels=result.labels, fields=fields)
+        model = with_chosen_sets(whole, job.output, job)
+        save_for_solver(job.output, model, job)
+    except TakenError:  # it is kept beside its name
+        raise
+    except Exception as error:  # hours may have gone into the mesh
+
+        def bare() -> Model:
+            options = SolverOptions()
+            return model_with(task, result.mesh, options, about, is_told=False, labels=result.labels, fields=fields)
+
+        kept, early = early, None
+        save_anyway(job.output, result.mesh, bare, error, kept)
+        raise
+    finally:
+        if early is not None:
+            drop_early(early)
+    return model, about
+
+
+def _measured_fields(source: Source | StoredSource, result: Optimized, failed: dict[str, str]) -> dict[str, NDArray]:
+    """The fields of the result's cells; those of their shape and their labels alone, if the image's cannot be had."""
+    assert isinstance(source, Source)
+    if measured := measured_each({"fields": partial(source.fields, result.mesh, result.labels)}, failed):
+        return dict(measured["fields"])
+    return cell_fields(result.mesh) | ({} if result.labels is None else {"label": result.labels})
+
+
+def measured_of(task: Task, result: Optimized, model: Model, failed: dict[str, str]) -> dict[str, Any]:
+    """How well mask, labels, contrasts and sizes are met."""
+    source = task.source
+    measured = fidelity(source.labels, source.mask, result.mesh, model.cell_data.get("label"), failed)
+    if (table := _table_of(source)) is not None and table.names:
+        measured["label_names"] = table.names
+    counted = measured_each(_counts(task, result, model), failed)
+    return measured | {name: value for name, value in counted.items() if value is not None}
+
+
+def _table_of(source: Source | StoredSource) -> LabelTable | None:
+    """Names and colours of the labels that are there."""
+    if source.labels is None:
+        return None
+    labels = np.unique(source.labels.data).astype(np.int64)
+    return coloured(table_of_labels(source.table, labels.tolist()), labels)
+
+
+def numbers_of(
+    task: Task, came: Meshed, shapes: Shapes, model: Model, about: dict[str, Any], seconds: float
+) -> dict[str, Any]:  # fmt: skip
+    """Every number of a run but those that are measured: what run.json begins with."""
+    source = task.source
+    table = _table_of(source)
+    texts = about if table is None else about | {TABLE_TEXT: table_words(table)}
+    summary = run_summary(source.content, came.initial, came.result, texts, {**came.seconds, "all": seconds}, shapes)
+    if isinstance(source, Source) and source.image is not source.content.image:
+        summary["image_properties"] = image_summary(source.image)  # on its own voxels, not on divided ones
+    summary["request"] = requested(changed(task.plan.bare, parts=task.plan.n_parts))
+    summary["memory"] = {"peak_bytes": peak_bytes()}
+    if task.plan.n_parts is None:
+        summary["prediction"] = stated_prediction(task.size)
+        summary["memory"] |= {"predicted_bytes": came.predicted_bytes}
+    else:  # of each worker's largest task
+        summary["prediction"] = {"task_bytes": came.predicted_bytes}
+    return summary
+
+
+def _counts(task: Task, result: Optimized, model: Model) -> dict[str, Callable[[], Any]]:
+    """What else is measured of a mesh, by name; None where there is nothing to tell."""
+    source, sizes, mesh, fields = task.source, task.sizes, result.mesh, model.cell_data
+    measures: dict[str, Callable[[], Any]] = {}
+    has_image = "n_voxels" in fields
+    if has_image:
+        measures["cells_without_voxel"] = lambda: int((fields["n_voxels"] == 0).sum())
+    if has_image and isinstance(source, Source) and not (source.content.is_plain and source.content.region is None):
+        measures["contrasts"] = lambda: source.by_contrast(fields)
+    if sizes is not None and sizes.has_target:
+        assert isinstance(source, Source), "no targets for the voxels of others"
+        content, share = source.content, QUADRATIC_NODES[source.image.ndim] if model.order == 2 else 1.0
+        measures["edges_over_target"] = lambda: edge_ratios(mesh.points, mesh.cells, sizes)
+        measures["nodes_of_sizes"] = lambda: round(nodes_of_sizes(content, sizes)[0] * share)
+    if source.mask is not None:
+        measures["dropped_components"] = lambda: result.n_dropped
+    if (labels := result.labels) is not None:
+        measures["nodes_of_many_labels"] = lambda: crowded_nodes(mesh.cells, labels)
+    return measures
+
+
+def draw(task: Task, came: Meshed, model: Model) -> None:
+    """Draw the pictures."""
+    from tetopt.report import figures, thumbnail  # matplotlib is slow to load, and only needed here
+
+    pictures, mesh, source = task.plan.pictures, came.result.mesh, task.source
+    if isinstance(source, StoredSource):
+        image = source.coarse()
+        figures.save_run_figures(pictures[:3], image, came.initial, came.result, task.start_name, image)
+        thumbnail.save_thumbnail(pictures[-1], image, mesh)
+        return
+    image = source.contrasts[0]
+    figures.save_run_figures(pictures[:3], source.image, came.initial, came.result, task.start_name, image)
+    of_cell = model.cell_data.get("label")
+    if source.mask is not None:
+        figures.save_figure(figures.boundary_figure(image, source.mask, mesh, word=source.mask_word), pictures[3])
+    if source.labels is not None:
+        other = None if np.array_equal(image.data, source.labels.data) else image
+        figure = figures.label_figure(source.labels, mesh, of_cell, other, source.table)
+        figures.save_figure(figure, pictures[-2])
+    thumbnail.save_thumbnail(pictures[-1], image, mesh, source.mask, source.labels, of_cell, source.table)
