@@ -216,3 +216,18 @@ def test_every_public_module_is_on_the_page():
             if parts[1] not in words:
                 missing.append("/".join(parts))
     assert missing == []
+
+
+def test_only_the_command_names_options():
+    """Messages of the library name arguments, between backticks, which `tetopt.cli` turns into options."""
+    others = {"tetopt.cohort.run", "tetopt.cluster.jobs", "tetopt.cluster.crew"}  # start programs, or say how to
+    option = re.compile(r"(?<!\S)[`(]?--[a-z]")
+    named = [
+        f"{module_name(path)}:{node.lineno} {node.value[:60]!r}"
+        for path in SOURCES
+        if "cli" not in path.parts and path.name != "bids.py" and module_name(path) not in others
+        for node in ast.walk(tree_of(path))
+        if isinstance(node, ast.Constant) and isinstance(node.value, str)
+        if option.search(re.sub(r"(tetopt|cgal_mesh) [^:`]*", "", node.value))  # whole commands
+    ]
+    assert named == []

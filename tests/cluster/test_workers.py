@@ -192,16 +192,16 @@ def test_another_service_at_the_address_is_no_scheduler(folders, capfd):
         server.settimeout(10)
         pool.submit(answer)
         address = f"tcp://127.0.0.1:{server.getsockname()[1]}"
-        with pytest.raises(InputError, match=f"^--scheduler: {address} is not a dask scheduler") as refusal:
+        with pytest.raises(InputError, match=f"^`scheduler`: {address} is not a dask scheduler") as refusal:
             running(Need(1, 0.0, None), folders, scheduler=address).__enter__()
     assert "\n" not in str(refusal.value)
     assert capfd.readouterr() == ("", "")
 
 
 def test_contradictions_are_refused(folders, tmp_path):
-    with pytest.raises(InputError, match="--scheduler, --cluster: expected one of them"):
+    with pytest.raises(InputError, match="`scheduler`, `cluster`: expected one of them"):
         running(Need(1, 0.0, None), folders, scheduler="tcp://x:1", cluster=tmp_path).__enter__()
-    with pytest.raises(InputError, match="--workers: expected none with --scheduler"):
+    with pytest.raises(InputError, match="`workers`: expected none with `scheduler`"):
         running(Need(1, 0.0, None), folders, scheduler="tcp://x:1", count=2).__enter__()
 
 
@@ -220,7 +220,7 @@ def test_nothing_is_written_where_workers_are_refused(tmp_path, capsys):
     assert exit_code(*command, "--cluster", written(tmp_path, "jobqueue: {slum: {}}")) == 2
     assert "expected one of htcondor" in capsys.readouterr().err
     assert exit_code(*command, "--scheduler", "tcp://127.0.0.1:1", "--workers", 2) == 2
-    assert "--workers: expected none with --scheduler" in capsys.readouterr().err
+    assert "`workers`: expected none with `scheduler`" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

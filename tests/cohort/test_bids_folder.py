@@ -139,7 +139,7 @@ def test_folders_that_are_none(tmp_path):
     with pytest.raises(InputError, match="a table in JSON, got list"):
         bids_subjects(tmp_path)
     file.write_text("{}")
-    with pytest.raises(InputError, match=r"no image _T1w\.nii\.gz of any subject; --suffix"):
+    with pytest.raises(InputError, match=r"no image _T1w\.nii\.gz of any subject; `suffix`"):
         bids_subjects(tmp_path)
 
 

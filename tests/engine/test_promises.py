@@ -136,7 +136,7 @@ def test_labels_without_cells():
     assert "labels" not in result.missed
     none = result._replace(labels=np.where(np.isin(result.labels, (7, 9)), 0, result.labels))
     assert missed(target, none) == {
-        "labels": "no cell has label 7, of more than 200 voxels; allow more nodes, or a higher label_weight"
+        "labels": "no cell has label 7, of more than 200 voxels; allow more nodes, or a higher `label_weight`"
     }
     assert missed(target, result._replace(labels=None)) == {}
 

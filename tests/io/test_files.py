@@ -160,7 +160,7 @@ def test_what_another_program_wrote_meanwhile_stays(tmp_path, monkeypatch, has_l
             checked_output(path, NIFTI)
             path.write_text("theirs")
             kept = tmp_path / f"a_kept_{number}.nii.gz"
-            with pytest.raises(TakenError, match=f"without --force it stays.* is in {kept}"):
+            with pytest.raises(TakenError, match=f"without `force` it stays.* is in {kept}"):
                 save_bytes(path, b"ours")
         assert outputs.written == []
         assert path.read_text() == "theirs"

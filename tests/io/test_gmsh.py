@@ -429,7 +429,7 @@ def test_many_materials_are_views_only(monkeypatch):
     assert [read.views["young"][number] for number in cell_numbers(model)] == young
     assert "4 materials: in the views young, kPa, and nu; not groups" in read.comments
     with pytest.raises(
-        InputError, match="at most 3 materials, as each becomes a group, got 4; group them with --bins 32"
+        InputError, match="at most 3 materials, as each becomes a group, got 4; group them with `bins` 32"
     ):
         gmsh22(model)
 

@@ -85,7 +85,7 @@ def test_both_are_replaced_by_force_alone(path):
     with pytest.raises(InputError, match="exists already"):
         checked_output(path, (".pvtu",))
     path.unlink()
-    with pytest.raises(InputError, match=r"a: exists already, where the pieces of .*a\.pvtu go; pass --force"):
+    with pytest.raises(InputError, match=r"a: exists already, where the pieces of .*a\.pvtu go; pass `force`"):
         checked_output(path, (".pvtu",))
     path.write_bytes(before["a.pvtu"])
     os.chmod(path, 0o600)

@@ -127,7 +127,7 @@ def test_empty_space_in_a_cell():
     assert (cell_young(image, mesh, lambda h: 0.0 * h, "power:0.5") == 0.0).all()
     for each in ("geometric", "harmonic", "hill", "nodes", "gauss", "power:-2", "power:-0.5"):
         with pytest.raises(
-            InputError, match=rf"above 0 kPa for {each}, got 0 in \d+ voxels of the mesh.*--average mean"
+            InputError, match=rf"above 0 kPa for {each}, got 0 in \d+ voxels of the mesh.*`average` mean"
         ):
             cell_young(image, mesh, law, each)
 
@@ -229,7 +229,7 @@ def test_a_model_has_moduli_of_nodes():
     assert model_of(mesh, image, young="3", average="nodes").node_young is None  # nothing varies
     with pytest.raises(InputError, match=r"bins: moduli that vary in a cell.*another average than nodes"):
         model_of(mesh, image, young=law, average="nodes", bins=3)
-    with pytest.raises(InputError, match=r"average: nodes is over the image's voxels; give the image \(--image\)"):
+    with pytest.raises(InputError, match=r"average: nodes is over the image's voxels; give the image \(`image`\)"):
         model_of(mesh, young=law, average="nodes", cell_data={"mean": np.ones(len(mesh.cells))})
 
 

@@ -206,7 +206,7 @@ def test_cells_of_another_density_are_of_another_material():
 def test_densities_that_are_none(wrong):
     with pytest.raises(InputError, match="density: expected kg/m3 above 0, got 1 cells with others"):
         materials(1.0, 0.3, 2, [1000.0, wrong])
-    with pytest.raises(InputError, match="gravity: the cells have no density; give --density"):
+    with pytest.raises(InputError, match="gravity: the cells have no density; give `density`"):
         density_of(materials(1.0, 0.3, 2))
 
 
@@ -226,5 +226,5 @@ def test_density_by_law_by_label_and_from_the_moduli_s_file(tmp_path):
         table = model_of(mesh, young=young, density=density, cell_data=fields).materials
         np.testing.assert_allclose(table.density[table.of_cell], values, rtol=1e-14)
     assert model_of(mesh, young=2.0, cell_data=fields).materials.density is None
-    with pytest.raises(InputError, match="a material has a modulus, too; give --young"):
+    with pytest.raises(InputError, match="a material has a modulus, too; give `young`"):
         model_of(mesh, density=1000.0)

@@ -29,7 +29,7 @@ def test_lps_turns_points_and_loads_about_z():
     assert turned.space == "lps"
     assert in_space(model, "ras") is model
     np.testing.assert_array_equal(in_space(turned, "ras").mesh.points, model.mesh.points)
-    for wrong, match in (("las", "expected ras or lps"), ("lps", "leave out --space")):
+    for wrong, match in (("las", "expected ras or lps"), ("lps", "leave out `space`")):
         with pytest.raises(InputError, match=match):
             in_space(sample_model(2), wrong)
 

@@ -183,7 +183,7 @@ def test_without_a_display_it_is_said(monkeypatch, mesh, display):
         monkeypatch.delenv("DISPLAY", raising=False)
     else:
         monkeypatch.setenv("DISPLAY", display)
-    with pytest.raises(InputError, match="no display to open a window on; use --html") as caught:
+    with pytest.raises(InputError, match="no display to open a window on; use `html`") as caught:
         show(exhibit(mesh, {}))
     assert "\n" not in str(caught.value)
 

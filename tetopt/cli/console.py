@@ -31,7 +31,12 @@ PARAMETER_OPTIONS = {  # of the library's functions: what the command line calls
     },
     "smallest": "--size-min", "largest": "--size-max", "longest": "--edge-max", "field": "--sizing",
 }  # fmt: skip
-PARAMETER_PATTERN = re.compile(rf"(?:(?<=a lower )|(?<=a higher )|^(?=\w+:))(?:{'|'.join(PARAMETER_OPTIONS)})\b")
+PARAMETER_PATTERN = re.compile(rf"^(?:{'|'.join(PARAMETER_OPTIONS)})(?=:)")
+# Arguments that messages name, of options that no job has.
+OTHER_ARGUMENTS = (
+    "field", "html", "image", "participant_label", "pipeline", "reference_dofs", "screenshot", "session_label",
+    "suffix",
+)  # fmt: skip
 
 
 class _Stream:
@@ -132,17 +137,18 @@ def show_error(message: object) -> None:
 
 
 def in_options(message: str) -> str:
-    """A message of the library with the command's options for its parameters, at its head and in its advice."""
+    """A message of the library with the command's options for its arguments, at its head and between backticks."""
     return PARAMETER_PATTERN.sub(lambda name: PARAMETER_OPTIONS[name[0]], with_hyphens(message))
 
 
 def with_hyphens(message: str) -> str:
-    """A message with the command's options for the arguments of a job between backticks."""
+    """A message with the command's options for the arguments between backticks."""
     if "`" not in message:
         return message
     from tetopt.job.options import JobOptions, kinds_of, option_name
 
-    names = {name: f"--{option_name(name, kind)}" for name, kind in kinds_of(JobOptions).items()}
+    names = {name: f"--{name.replace('_', '-')}" for name in OTHER_ARGUMENTS}
+    names |= {name: f"--{option_name(name, kind)}" for name, kind in kinds_of(JobOptions).items()}
     return re.sub(r"`(\w+)`", lambda match: names.get(match[1], match[0]), message)
 
 

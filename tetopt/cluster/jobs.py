@@ -37,8 +37,8 @@ from tetopt.interpreter import SAFE_PATH_NAME, THREADS_NAME, python_command
 
 YAML_LETTERS = 20_000  # of a configuration: those that are known have a thousand
 YAML_BRACKETS = 500  # likewise: PyYAML's time grows with the square of brackets in one another, 4 s for 4000
-JOBS_AT_ONCE = 20  # where --workers does not say: a cluster's other users wait for as many cores
-JOB_CORES = 4  # of a job where neither its file nor --threads says
+JOBS_AT_ONCE = 20  # where `workers` does not say: a cluster's other users wait for as many cores
+JOB_CORES = 4  # of a job where neither its file nor `threads` says
 QUEUE_SECONDS = 5.0  # between two looks at the jobs: a scheduler starts them no faster
 IDLE_SECONDS = 60.0  # without a task to begin, after which jobs that run none are given back
 AGAIN_SECONDS = 60.0  # after a job that was refused when others were not, until the next is submitted
@@ -82,7 +82,7 @@ def submitted(stack: ExitStack, need: Need, folders: Folders, path: Path, count:
     for folder in folders:
         if not PLAIN_PATH.fullmatch(str(folder)):
             raise InputError(
-                f"{folder}: expected an output folder of letters, digits and ./+@=:,-_ alone with --cluster, "
+                f"{folder}: expected an output folder of letters, digits and ./+@=:,-_ alone with `cluster`, "
                 "as directives of jobs take no others"
             )
     # Its own keys on top of the user's configuration of dask, as if they stood there.
@@ -167,7 +167,7 @@ def request(path: Path, kind: str, settings: dict[str, Any], need: Need) -> Requ
     if threads * processes > cores or threads < 1:
         raise InputError(
             f"{path}: {kind}: cores: expected at least {max(threads, 1) * processes} for {processes} tasks "
-            f"of {max(threads, 1)} threads, got {cores}; lower processes or --threads"
+            f"of {max(threads, 1)} threads, got {cores}; lower processes or `threads`"
         )
     least = need.limit_for(need.task_bytes) * processes
     asked_for = need.limit_for(MEMORY_MARGIN * need.task_bytes) * processes
@@ -295,7 +295,7 @@ class Keeper:
         self.n_jobs = self.n_most
         slots = self.newcomers.slots()
         if slots == 0 and self.failure is not None:
-            raise InputError(f"--cluster: {self.failure}")
+            raise InputError(f"`cluster`: {self.failure}")
         return slots
 
     def stop(self) -> None:

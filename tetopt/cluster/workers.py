@@ -94,9 +94,9 @@ def check_choice(count: int | None, scheduler: str | None, cluster: Path | None,
     """
     check_installed(extra)
     if scheduler is not None and cluster is not None:
-        raise InputError("--scheduler, --cluster: expected one of them, got both")
+        raise InputError("`scheduler`, `cluster`: expected one of them, got both")
     if scheduler is not None and count is not None:
-        raise InputError("--workers: expected none with --scheduler, whose workers are there; start more of them")
+        raise InputError("`workers`: expected none with `scheduler`, whose workers are there; start more of them")
     if cluster is not None:
         configuration(cluster)
     if scheduler is not None:
@@ -204,7 +204,7 @@ def _connected(stack: ExitStack, need: Need, folders: Folders, address: str) -> 
     stack.callback(newcomers.probe.unlink, missing_ok=True)
     slots = newcomers.slots()
     if slots == 0:
-        raise InputError(f"--scheduler: {address} has no workers; start some: dask worker {address}")
+        raise InputError(f"`scheduler`: {address} has no workers; start some: dask worker {address}")
     threads = need.threads or _threads_each(list(newcomers.known.values()))
     n_bytes = min(map(newcomers.room_of, newcomers.known.values()), default=float("inf"))
     words = f"{counted(len(newcomers.known), 'worker')} at {address}, {counted(slots, 'task')} at a time of "
@@ -220,13 +220,13 @@ def _answering(address: str) -> Iterator[None]:
         yield
     except MemoryError as error:  # the first bytes of another service's answer, read as the length of a message
         raise InputError(
-            f"--scheduler: {address} is not a dask scheduler, another service answers there; expected the address of "
+            f"`scheduler`: {address} is not a dask scheduler, another service answers there; expected the address of "
             "a dask scheduler that runs, as tcp://host:8786"
         ) from error
     except (OSError, ValueError, TypeError, RuntimeError) as error:
         reason = " ".join(str(error).split()) or f"nothing within {CONNECT_SECONDS:g} s"
         raise InputError(
-            f"--scheduler: {address} does not answer ({reason[:200]}); expected the address of a dask scheduler that "
+            f"`scheduler`: {address} does not answer ({reason[:200]}); expected the address of a dask scheduler that "
             "runs, as tcp://host:8786"
         ) from error
 

@@ -96,7 +96,7 @@ def bids_subjects(
     if problems:
         raise Problems([f"{_shown(folder)}: {plain(problem)}" for problem in problems])
     if not chosen:
-        raise InputError(f"{_shown(folder)}: no image _{suffix}.nii.gz of any subject; --suffix names another kind")
+        raise InputError(f"{_shown(folder)}: no image _{suffix}.nii.gz of any subject; `suffix` names another kind")
     if not labels:
         what = f"_{suffix} in {', '.join(f'ses-{visit}' for visit in sorted(visits))}" if visits else f"_{suffix}"
         _warn_of_others(folder, what, {scan.subject for scan in chosen})
@@ -130,8 +130,8 @@ def _kind(suffix: str) -> Name:
     name = _name(suffix)
     if name is None or not re.fullmatch("[A-Za-z0-9]+", name.suffix) or {"sub", "ses"} & set(name.entities):
         raise InputError(
-            f"--suffix {plain(suffix)}: expected what a BIDS name ends in, as T1w or acq-mprage_T1w, without .nii.gz; "
-            "--participant-label and --session-label choose subjects and sessions"
+            f"`suffix` {plain(suffix)}: expected what a BIDS name ends in, as T1w or acq-mprage_T1w, without .nii.gz; "
+            "`participant_label` and `session_label` choose subjects and sessions"
         )
     return name
 
@@ -210,7 +210,7 @@ def _chosen(scans: list[Scan], kind: Name, folder: Path, problems: list[str]) ->
         own = [f"{key}-{value}" for key, value in first.name.entities.items()]
         problems.append(
             f"{len(places)} images for one row, {', '.join(places)}: choose by entities, "
-            f"as --suffix {'_'.join([*own, kind.suffix])}, or give a table of images"
+            f"as `suffix` {'_'.join([*own, kind.suffix])}, or give a table of images"
         )
     return first
 

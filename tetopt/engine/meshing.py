@@ -243,7 +243,7 @@ def check_memory_of(content: Content, nodes: int, limit: float | None = None) ->
     """InputError for more nodes than there is memory for, or than `limit` bytes in all allow."""
     shape = " x ".join(map(str, content.image.shape))
     what = f"an image of {shape} voxels" + (f" of {len(content.values)} channels" if len(content.values) > 1 else "")
-    check_memory(bytes_of(content, 0), what, "mesh a part of it (--crop), or allow more", limit)
+    check_memory(bytes_of(content, 0), what, "mesh a part of it (`crop`), or allow more", limit)
     check_memory(bytes_of(content, nodes), f"{nodes} nodes on {what}", "ask for fewer", limit)
 
 

@@ -100,7 +100,7 @@ def _missed_floor(result: Optimized, min_dihedral: float) -> dict[str, str]:
     angles = dihedral_angles(mesh.points, mesh.cells).min(axis=1)
     below = int((angles < min_dihedral - ANGLE_ROUNDING).sum())
     words = f"{below} of {len(angles)} cells have an angle under {min_dihedral:g} degrees, down to {angles.min():.2f}"
-    return {"floor": f"{words}; allow more nodes, a lower k_D, or a lower min_dihedral"} if below else {}
+    return {"floor": f"{words}; allow more nodes, a lower `k_D`, or a lower `min_dihedral`"} if below else {}
 
 
 def requested(result: Optimized, content: Content, target_error: float | None, is_filled: bool) -> Optimized:
@@ -184,7 +184,7 @@ def _missed_labels(content: Content, result: Optimized) -> dict[str, str]:
     if not lost:
         return {}
     words = f"no cell has label {', '.join(lost)}, of more than {LABEL_VOXELS} voxels"
-    return {"labels": f"{words}; allow more nodes, or a higher label_weight"}
+    return {"labels": f"{words}; allow more nodes, or a higher `label_weight`"}
 
 
 def _volume(mesh: Mesh) -> float:

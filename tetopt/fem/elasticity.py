@@ -272,7 +272,7 @@ def box_faces(image: Image, mesh: Mesh, axis: int | None = None) -> tuple[NDArra
         if not is_there.any():
             raise InputError(
                 f"mesh: no node lies on the image's face at index {side:g} of axis {axis}, the mesh runs from "
-                f"{place.min():g} to {place.max():g}; it must fill the image's box: same image, --crop and --slice?"
+                f"{place.min():g} to {place.max():g}; it must fill the image's box: same image, crop and slice?"
             )
     direction = image.affine[:n, axis]
     runs_up = direction[n - 1 if axis == upright else np.argmax(np.abs(direction))] > 0.0
@@ -304,7 +304,7 @@ def check_fills_box(image: Image, mesh: Mesh) -> None:
         inner = np.flatnonzero(~on_box)
         raise InputError(
             f"mesh: {len(inner)} of its boundary facets lie off the faces of the image's box, the first has nodes "
-            f"{outer[inner[0]].tolist()}: it has a crack, several pieces, or is not of this image (--crop, --slice?)"
+            f"{outer[inner[0]].tolist()}: it has a crack, several pieces, or is of another image, or crop"
         )
     filled = filled_share(mesh, image)
     if abs(filled - 1.0) > 1e-5:

@@ -99,7 +99,7 @@ def reference(modulus: Image, nu: float, percent: float = 1.0) -> Reference:
     if not -1.0 < nu < 0.5:
         raise InputError(f"nu: expected -1 < nu < 0.5, got {nu}")
     n_dofs = modulus.ndim * float(np.prod(np.array(modulus.shape) + 1))
-    check_memory(DOF_BYTES * n_dofs, f"reference: {n_dofs:.4g} degrees of freedom", "ask for fewer (--reference-dofs)")
+    check_memory(DOF_BYTES * n_dofs, f"reference: {n_dofs:.4g} degrees of freedom", "ask for fewer (`reference_dofs`)")
     grid = grid_of(modulus, nu)
     push = push_of(modulus, percent)
     half = grid.coarsened(tuple(max(1, s // 2) for s in grid.young.shape))

@@ -158,7 +158,7 @@ def solved_model(model: Model, step: int = 1, method: Method = "auto") -> Soluti
     if not 1 <= step <= n_steps:
         raise InputError(f"step: expected 1 to {n_steps}, got {step}")
     if model.materials is None:
-        raise InputError("model: its cells have no moduli; give --young")
+        raise InputError("model: its cells have no moduli; give `young`")
     task = _task(model, in_step(model.loads, step))
     young, nu = gauss_moduli(model), model.materials.nu[model.materials.of_cell]
     system = constrained(

@@ -121,7 +121,7 @@ def checked_output(
     if before is not None and is_ours is None and not stat.S_ISREG(before.st_mode):
         raise InputError(f"{path}: {through}expected a file to write, found a device, a pipe or a link in a circle")
     if os.path.lexists(path) and not force:
-        raise InputError(f"{path}: exists already; pass --force (force=True) to replace it")
+        raise InputError(f"{path}: exists already; pass `force` to replace it")
     if path.suffix.lower() == PIECES_SUFFIX:
         _check_pieces(path, force)
     _check_once(path, place)
@@ -168,7 +168,7 @@ def _check_pieces(path: Path, force: bool) -> None:
     if not os.path.lexists(folder):
         return
     if not force:
-        raise InputError(f"{folder}: exists already, where the pieces of {path} go; pass --force (force=True)")
+        raise InputError(f"{folder}: exists already, where the pieces of {path} go; pass `force`")
     if folder.is_symlink() or not folder.is_dir():
         raise InputError(f"{folder}: expected a folder of pieces to replace, found something else; remove it first")
     piece = re.compile(rf"{re.escape(path.stem)}_\d+\.vtu")
@@ -228,7 +228,7 @@ def written_whole(path: Path, n_bytes: int | None = None) -> Iterator[Path]:
         elif not _linked(temporary, place):
             kept = _beside(temporary, path)
             raise TakenError(
-                f"{path}: another program has written it in the meantime, and without --force it stays as it is; what "
+                f"{path}: another program has written it in the meantime, and without `force` it stays as it is; what "
                 f"was to be written is in {kept}"
             )
         _synchronise_folder(place.parent)
@@ -269,7 +269,7 @@ def folder_written_whole(path: Path) -> Iterator[Path]:
                 _on_disk(Path(folder) / name)
         _take_rights(temporary, place)
         if outputs is not None and not outputs.may_replace.get(key, True) and os.path.lexists(place):
-            raise TakenError(f"{path}: another program has written it in the meantime, and without --force it stays")
+            raise TakenError(f"{path}: another program has written it in the meantime, and without `force` it stays")
         if place.is_dir():
             aside = Path(tempfile.mkdtemp(prefix=start, dir=place.parent))
             os.rename(place, aside / "old")
@@ -321,7 +321,7 @@ def _moved_in(path: Path, new: Path, aside: Path) -> Iterator[None]:
     folder, old, outputs = pieces_folder(path), aside / "file", _OUTPUTS.get()
     may_replace = outputs is None or outputs.may_replace.get(_absolute(path), True)
     if not may_replace and (os.path.lexists(path) or os.path.lexists(folder)):
-        raise InputError(f"{path}: another program has written it in the meantime, and without --force it stays")
+        raise InputError(f"{path}: another program has written it in the meantime, and without `force` it stays")
     moves = [(a, b) for a, b in ((path, old), (folder, aside / "pieces"), (new, folder)) if os.path.lexists(a)]
     done: list[tuple[Path, Path]] = []
     try:

@@ -204,7 +204,7 @@ def _ready(path: Path, model: Model, space: str, units: str) -> Model:
         raise InputError(f"order: expected 1 or 2, got {model.order}")
     if model.order == 2 and not kind.has_quadratic:
         able = ", ".join(name for name, other in FORMATS.items() if other.has_quadratic)
-        raise InputError(f"{path}: only {able} take quadratic cells; leave out --order 2")
+        raise InputError(f"{path}: only {able} take quadratic cells; leave out `order` 2")
     return _named(path, in_units(in_space(model, space), units))
 
 

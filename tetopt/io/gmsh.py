@@ -165,7 +165,7 @@ def gmsh22(model: Model) -> bytes:
     if _n_materials(model) > MOST_MATERIAL_GROUPS:
         raise InputError(
             f"gmsh 2.2: expected at most {MOST_MATERIAL_GROUPS} materials, as each becomes a group, got "
-            f"{_n_materials(model)}; group them with --bins 32, or name the file .msh"
+            f"{_n_materials(model)}; group them with `bins` 32, or name the file .msh"
         )
     points, cells = _geometry(model)
     parts = _parts(model)

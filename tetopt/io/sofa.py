@@ -91,9 +91,9 @@ def _checked(model: Model) -> Materials:
     if model.mesh.ndim == 2:
         raise InputError("sofa: expected a mesh of tetrahedra, got triangles; .vtu holds them")
     if model.order != 1:
-        raise InputError("sofa: expected linear cells, got quadratic ones; leave out --order 2")
+        raise InputError("sofa: expected linear cells, got quadratic ones; leave out `order` 2")
     if model.materials is None:
-        raise InputError("sofa: a scene needs materials; give a law of the modulus (--young)")
+        raise InputError("sofa: a scene needs materials; give a law of the modulus (`young`)")
     if (model.materials.nu < 0.0).any():
         raise InputError(
             f"sofa: expected 0 <= nu < 0.5, got {model.materials.nu.min():g}, which SOFA would replace; give another"

@@ -92,7 +92,7 @@ def volume_index(trailing: Sequence[int], volume: int | None, axes: str = "") ->
     if volume is None and count > 1:
         raise InputError(
             f"the file holds {count} volumes{axes}; choose one, 0 to {count - 1}: `volume=k`, "
-            "`--volume K` for the first image of a command, `FILE:K` for others"
+            "`volume` K for the first image of a command, FILE:K for others"
         )
     volume = 0 if volume is None else volume
     if not 0 <= volume < count:

@@ -7,7 +7,7 @@ first among the points. What is on each cell is cell data, on each point point d
 `young`, `nu`, `material`, from 1, and, if there is one, `density`, kg/m3; of moduli that vary in a cell also
 `young_gauss`, a column for each Gauss point of quadratic cells, or point data `young_nodes`. Texts are field data, held
 as bytes of UTF-8: meshio refuses files with VTK's string arrays, and pyvista writes only ASCII into them. `loads` are
-the words of --load.
+the words of `loads`.
 
 A facet set is field data "facets:NAME", rows (cell, local node opposite), and its nodes are point data "on_NAME", 1 or
 0, to be seen in ParaView; a cell set is field data "cells:NAME", cell numbers from 0. Other programs keep field data

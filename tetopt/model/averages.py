@@ -136,7 +136,7 @@ def cell_values(image: Image, mesh: Mesh, law: Law) -> NDArray[np.float64]:
     if not np.isfinite(values).all():
         at = seen.data[~np.isfinite(values)].ravel()[0]
         raise InputError(
-            f"law: it has no value at intensity {at:g}; give one (--nu, --density) defined over all intensities within "
+            f"law: it has no value at intensity {at:g}; give one (`nu`, `density`) defined over all intensities within "
             "the mesh"
         )
     return _of_cells(Image(values, image.affine), mesh, owner, 1.0)
@@ -259,7 +259,7 @@ def _check_above_zero(average: Average, image: Image, field: Image, owner: NDArr
         raise InputError(
             f"average: expected moduli above 0 kPa for {average.words}, got 0 in {len(empty)} voxels of the mesh, as "
             f"at intensity {image.data.ravel()[empty[0]]:g}; give empty space a small modulus too, as "
-            '--young "0:0.1,255:6" does, or take --average mean'
+            '`young` "0:0.1,255:6" does, or take `average` mean'
         )
 
 

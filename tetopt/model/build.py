@@ -161,9 +161,9 @@ def model_of(
         table = _materials(cells, young, nu, density, average)
         table = table if bins is None else binned(table, volumes(mesh.points, mesh.cells), bins, spacing)
     elif bins is not None:
-        raise InputError("bins: there are no moduli to group; give --young")
+        raise InputError("bins: there are no moduli to group; give `young`")
     elif density is not None:
-        raise InputError("density: a material has a modulus, too; give --young")
+        raise InputError("density: a material has a modulus, too; give `young`")
     parsed = parse_loads(loads, mesh, all_sets)
     if any(load.kind == "gravity" for load in parsed):
         density_of(table)  # or it is refused
@@ -263,8 +263,8 @@ def _values(value: Any, name: str, cells: _Cells, average: str = "mean") -> NDAr
         by_voxel = (cells.image, cells.mesh, law)
         return cell_young(*by_voxel, average) if name == "young" else cell_values(*by_voxel)
     if cells.mean is None:
-        raise InputError(f"{name}: a law of the intensity, but the mesh has no means; give the image (--image)")
+        raise InputError(f"{name}: a law of the intensity, but the mesh has no means; give the image (`image`)")
     if name == "young" and average != DEFAULT_AVERAGE:
-        raise InputError(f"average: {average} is over the image's voxels; give the image (--image)")
+        raise InputError(f"average: {average} is over the image's voxels; give the image (`image`)")
     # The law of each cell's mean: the same only where the law is linear over the cell.
     return young_from(law, cells.mean) if name == "young" else law_values(law, cells.mean)

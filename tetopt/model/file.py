@@ -159,7 +159,7 @@ def sets_beside(
 
 
 def loads_in(loaded: MeshFile) -> tuple[list[str], str]:
-    """The loads that a file of ours holds, in the words of --load, in RAS+ and kPa, if their sets are there still; and
+    """The loads that a file of ours holds, in the words of `loads`, in RAS+ and kPa, if their sets are there still; and
     in words why there are none, if so."""
     try:
         words = json_of(loaded.text("loads") or "[]")

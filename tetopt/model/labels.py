@@ -73,7 +73,7 @@ def labels_named(text: str, names: Mapping[int, str]) -> list[int]:
             if labels := sorted(label for label, name in known.items() if same(name.strip()) == same(text)):
                 return labels
     if not names:
-        raise InputError(f'label "{text}": no label has a name; give a table of them (--label-names)')
+        raise InputError(f'label "{text}": no label has a name; give a table of them (`label_names`)')
     lower = {name.lower(): name for name in (*of_sets.values(), *names.values())}
     near = [lower[each] for each in difflib.get_close_matches(text.lower(), lower, 3)]
     first = ", ".join(list(names.values())[:8]) + (", ..." if len(names) > 8 else "")

@@ -100,7 +100,7 @@ def young_from(law: Law, intensities: ArrayLike) -> NDArray[np.float64]:
         first = ", ".join(f"{modulus:g} at intensity {intensity:g}" for modulus, intensity in pairs)
         raise InputError(
             f"modulus: expected 0 kPa or more, got {int(is_bad.sum())} others, such as {first}; "
-            "give a law (--young) that is positive over the image's range"
+            "give a law (`young`) that is positive over the image's range"
         )
     return young
 
@@ -320,7 +320,7 @@ def checked_young(young: NDArray[np.float64]) -> NDArray[np.float64]:
         first = ", ".join(f"{young[j]:g} in cell {j}" for j in bad[:3])
         raise InputError(
             f"young: expected moduli above 0 kPa, got {len(bad)} others, the first {first}; "
-            'give empty space a small modulus too, as --young "0:0.1,255:6" does'
+            'give empty space a small modulus too, as `young` "0:0.1,255:6" does'
         )
     return young
 

@@ -267,7 +267,7 @@ def _check_outer(load: Load, mesh: Mesh, sets: Sets) -> None:
     if inner := int((shared.n_cells[shared.of_cell[rows[:, 0], rows[:, 1]]] > 1).sum()):
         raise InputError(
             f'load: {inner} of the {len(rows)} facets of "{load.set_name}" lie between two cells, where nothing '
-            f"outside can act ({load.kind}); take a set of the boundary, mesh one side alone (--mask), or move the set"
+            f"outside can act ({load.kind}); take a set of the boundary, mesh one side alone (`mask`), or move the set"
         )
 
 
@@ -280,7 +280,7 @@ def _check_apart(loads: list[Load], mesh: Mesh, sets: Sets) -> None:
         if twice.any():
             raise InputError(
                 f'load: {int(twice.sum())} nodes of set "{load.set_name}" are in another loaded set, too, and '
-                "cannot go both ways; take sets apart, such as --set NAME=plane:X,Y,Z:NX,NY,NZ:D"
+                "cannot go both ways; take sets apart, such as `sets` NAME=plane:X,Y,Z:NX,NY,NZ:D"
             )
         is_prescribed[nodes] |= components
 

@@ -127,7 +127,7 @@ def without_moduli(table: Materials) -> Materials:
 def density_of(table: Materials | None) -> NDArray[np.float64]:
     """The density of each material, (K,) kg/m3; InputError if there is none, which gravity needs."""
     if table is None or table.density is None:
-        raise InputError("gravity: the cells have no density; give --density, kg/m3, such as 1000")
+        raise InputError("gravity: the cells have no density; give `density`, kg/m3, such as 1000")
     return table.density
 
 
@@ -164,7 +164,7 @@ def by_label(
         No labels, one that has no value or two, or a name that no label has.
     """
     if labels is None:
-        raise InputError("values by label: the mesh has no labels; give the label image (--labels)")
+        raise InputError("values by label: the mesh has no labels; give the label image (`labels`)")
     names = names or {}
     values: dict[int, float] = {}
     for key, value in law.values.items():

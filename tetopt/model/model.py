@@ -213,7 +213,7 @@ def in_space(model: Model, space: str) -> Model:
     if space == model.space:
         return model
     if model.mesh.ndim == 2:
-        raise InputError("space: a mesh of triangles has coordinates in its own plane; leave out --space")
+        raise InputError("space: a mesh of triangles has coordinates in its own plane; leave out `space`")
     loads = tuple(half_turned(load) for load in model.loads)
     mesh = Mesh(half_turn(model.mesh.points), model.mesh.cells)
     cell_data, point_data = (half_turned_fields(each) for each in (model.cell_data, model.point_data))
@@ -272,7 +272,7 @@ def odd_units(model: Model) -> Iterator[str]:
         elif high < MEGAPASCAL_MOST:
             yield (
                 f"young is up to {high:.4g} kPa, softer than any tissue (0.1 kPa and more): if it was meant in MPa, "
-                "multiply it by 1000; --units is of the file alone"
+                "multiply it by 1000; `units` is of the file alone"
             )
         if table.density is not None and (densest := float(table.density.max())) < GRAM_DENSITY_MOST:
             yield (

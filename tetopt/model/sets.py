@@ -391,7 +391,7 @@ def check_free_names(request: SetRequest, sets: Sets) -> None:
 def _cells_below(mesh: Mesh, request: SetRequest, mean: NDArray[np.float64] | None) -> NDArray[np.int64]:
     name, threshold = request.name, float(request.vectors[0][0])
     if mean is None:
-        raise InputError(f"set {name}: the mesh has no means; give the image they come from (--image)")
+        raise InputError(f"set {name}: the mesh has no means; give the image they come from (`image`)")
     chosen = largest_component(mesh.cells, mean < threshold)
     if len(chosen) == 0:
         raise InputError(f"set {name}: no cell has a mean below {threshold:g}, they go from {mean.min():g} up")

@@ -149,7 +149,7 @@ def opened_on(shown: Exhibit, name: str | None = None, limits: tuple[float, floa
         if not -np.inf < limits[0] < limits[1] < np.inf:
             raise InputError(f"range: expected LOW,HIGH with LOW below HIGH, got {limits[0]:g},{limits[1]:g}")
         if fields[0].categories:
-            raise InputError(f'range: "{fields[0].name}" are labels, which have a colour each; give a --field')
+            raise InputError(f'range: "{fields[0].name}" are labels, which have a colour each; give a `field`')
         first = fields[0].name
         fields = [field._replace(limits=limits) if field.name == first else field for field in fields]
     return shown._replace(fields=fields)

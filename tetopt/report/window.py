@@ -49,8 +49,8 @@ def show(shown: Exhibit) -> None:
     """
     if not has_display():
         raise InputError(
-            "view: no display to open a window on; use --html to write the same view as a page, or "
-            "--screenshot for a picture"
+            "view: no display to open a window on; use `html` to write the same view as a page, or "
+            "`screenshot` for a picture"
         )
     plotter(shown).show()
 

@@ -126,7 +126,7 @@ def default_law(image: Image) -> tuple[Law, str]:
     """A modulus from any image: 1 to 10 kPa between its 0.5th and 99.5th percentile, and the words for it."""
     low, high = (float(p) for p in np.percentile(image.data, [0.5, 99.5]))
     if high <= low:
-        raise InputError("image: hardly any contrast between its percentiles; give --young")
+        raise InputError("image: hardly any contrast between its percentiles; give `young`")
     words = f"1 kPa at intensity {low:g} and below, 10 kPa at {high:g} and above, linear between"
     return [(low, 1.0), (high, 10.0)], words
 
@@ -163,7 +163,7 @@ def reference_dofs(image: Image, law: Law, settings: Settings, say: Say) -> int:
     """Size of the reference that `reference_seconds` and the memory allow; another one in every run, by a little."""
     budget = affordable_dofs(young_image(image, law), settings.nus, settings.reference_seconds, settings.percent)
     limit = "the free memory" if budget.is_short_of_memory else f"{settings.reference_seconds:g} s"
-    say(f"reference: up to {budget.dofs} unknowns in {limit}; --reference-dofs {budget.dofs} repeats it")
+    say(f"reference: up to {budget.dofs} unknowns in {limit}; `reference_dofs` {budget.dofs} repeats it")
     return budget.dofs
 
 
@@ -413,7 +413,7 @@ def _check_resumable(folder: Path, comparison: Comparison) -> None:
     except (ValueError, KeyError, TypeError, RecursionError):
         earlier = None
     if earlier != (comparison.settings.nodes, comparison.image_source.sha256):
-        raise InputError(f"{path}: is of another comparison (image or --nodes); take another folder, or --force")
+        raise InputError(f"{path}: is of another comparison (image or `nodes`); take another folder, or `force`")
 
 
 def _peers() -> dict[str, str]:

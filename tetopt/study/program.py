@@ -68,10 +68,10 @@ def parse_program(text: str) -> Program:
     name, equals, command = text.partition("=")
     if not equals or not PROGRAM_NAME.fullmatch(name):
         raise InputError(
-            f"--pipeline: expected NAME='program {{image}} {{nodes}} {{output}}' with a name of letters, digits, - and "
+            f"`pipeline`: expected NAME='program {{image}} {{nodes}} {{output}}' with a name of letters, digits, - and "
             f'_, got "{text}"'
         )
-    where = f"--pipeline {name}"
+    where = f"`pipeline` {name}"
     try:
         words = shlex.split(command)
     except ValueError as error:

@@ -205,7 +205,7 @@ def foreground(image: Image, level: float | None = None) -> Image:
     low, high = float(image.data.min()), float(image.data.max())
     outcome = "every voxel is foreground" if share > 0.5 else "nothing is left"
     raise InputError(
-        f"--background {limit:g}: {outcome}; give a level between the background's and the tissue's values, the image "
+        f"`background` {limit:g}: {outcome}; give a level between the background's and the tissue's values, the image "
         f"holds {low:g} to {high:g}"
     )
 
@@ -242,7 +242,7 @@ def background_level(image: Image) -> float:
 
 
 def _no_background(reason: str) -> InputError:
-    return InputError(f"--background auto: no background found, {reason}; give a value, or leave it out")
+    return InputError(f"`background` auto: no background found, {reason}; give a value, or leave it out")
 
 
 def _check_axes(name: str, other: Image, image: Image) -> None:

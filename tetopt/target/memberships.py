@@ -23,7 +23,7 @@ from tetopt.kernel_cache import njit
 from tetopt.target.labels import check_labels, label_channels
 
 PARTITION_BYTES = 40.0  # at each voxel besides levels: which label, which is nearest, and as they are found
-NO_ROOM = "crop the image, or give smooth_interfaces=0 (--smooth-interfaces 0)"  # what to do then
+NO_ROOM = "crop the image, or give `smooth_interfaces` 0"  # what to do then
 FARTHEST_LEVEL = 6.0  # levels end there: nothing that moves by steps near an interface looks further
 FARTHEST_DISTANCE = 8  # voxels beyond which distances to a label do not count: more than levels and smoothing look at
 FINE_SIGMA, BROAD_SIGMA = 1.0, 3.0  # voxels: of the Gaussian where a label is thin, and where it and its gaps are not
