@@ -108,9 +108,9 @@ TASKS = {
     "image: 2 sums of 9 x 8 x 7 voxels: needs.*crop it": lambda: sampling_grid(IMAGE, LATTICE.points),
     "labels: 3 of them on 1512 .*divided by 1 x 1 x 3: needs.*smooth": lambda: memberships(IMAGE, (1, 1, 3)),
     "elasticity: the stiffness of .* cells of 10 nodes: needs.*coarser": lambda: stiffness(LATTICE, 1.0, 0.3, 2),
-    "reference: 2160 degrees of freedom: needs.*--reference-dofs": lambda: reference(IMAGE, 0.3),
+    "reference: 2160 degrees of freedom: needs.*`reference_dofs`": lambda: reference(IMAGE, 0.3),
     "^octree: 100 nodes: needs.*ask for fewer": lambda: tetopt.mesh_image(IMAGE, 100),
-    "^an image of 9 x 8 x 7 voxels: needs.*--crop": lambda: tetopt.mesh_image(IMAGE, start=LATTICE),
+    "^an image of 9 x 8 x 7 voxels: needs.*`crop`": lambda: tetopt.mesh_image(IMAGE, start=LATTICE),
 }
 
 
@@ -217,6 +217,7 @@ def test_compiling_and_long_iterations_are_told(monkeypatch):
         return Optimized(LATTICE, rows, "iterations")
 
     with cli_run.Display(lambda: None) as display, listened(display):
+        started("kernels")
         prepare(make)
         lines.clear()
         started("optimise", "optimising", 1)
@@ -242,6 +243,7 @@ def test_commands_hear_how_compiling_goes(command, monkeypatch, capsys):
 
     def mesh():
         with cli_run.Display(lambda: None) as display, listened(display):
+            started("kernels")
             prepare(lambda say: fast.prepare_kernels(plain(IMAGE), 0.5, is_graded=True, progress=say))
 
     with pytest.raises(Linked):

@@ -74,7 +74,7 @@ def test_entities_choose_among_several(tmp_path):
         bids_subjects(folder)
     message = str(caught.value)
     assert "run-01_T1w.nii.gz, sub-1/anat/sub-1_acq-mprage_run-02_T1w.nii.gz" in message
-    assert "--suffix acq-mprage_run-01_T1w" in message
+    assert "`suffix` acq-mprage_run-01_T1w" in message
     assert "sub-2" not in message  # of two images that without entities is what T1w says
     with pytest.warns(UserWarning, match=r"left out, without _run-2_T1w: 1 \(sub-2\)"):
         chosen = bids_subjects(folder, "run-2_T1w")

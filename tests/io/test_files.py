@@ -60,7 +60,7 @@ def test_other_suffixes_are_refused(tmp_path, name):
 def test_an_existing_file_is_refused_without_force(tmp_path):
     path = tmp_path / "mesh.vtu"
     path.write_text("old")
-    assert_refused(path, "exists already; pass --force")
+    assert_refused(path, "exists already; pass `force`")
     assert checked_output(path, VTU, force=True) == path
     assert path.read_text() == "old"
 
@@ -123,7 +123,7 @@ def test_a_link_is_written_through(tmp_path):
         link.symlink_to(Path("far") / name)
         if old is not None:
             target.write_text(old)
-        assert_refused(link, "exists already; pass --force")
+        assert_refused(link, "exists already; pass `force`")
         checked_output(link, VTU, force=True)
         save_bytes(link, b"new")
         assert link.is_symlink()

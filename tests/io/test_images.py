@@ -208,7 +208,7 @@ def test_one_volume_of_a_4d_file(data_dir, k):
 
 
 def test_4d_file_needs_a_volume(data_dir):
-    assert_refused(data_dir / "example4d.nii.gz", "holds 2 volumes; choose one, 0 to 1: `volume=k`, `--volume K`")
+    assert_refused(data_dir / "example4d.nii.gz", "holds 2 volumes; choose one, 0 to 1: `volume=k`, `volume` K")
 
 
 @pytest.mark.parametrize("k", [-1, 2])

@@ -69,17 +69,17 @@ def test_a_function_equal_to_a_table_gives_the_same():
         (
             [(0, -1), (10, 9)],
             "modulus: expected 0 kPa or more, got 1 others, such as -1 at intensity 0; "
-            "give a law (--young) that is positive over the image's range",
+            "give a law (`young`) that is positive over the image's range",
         ),
         (
             lambda h: 4.0 - h,
             "modulus: expected 0 kPa or more, got 2 others, such as -1 at intensity 5, -6 at intensity 10; "
-            "give a law (--young) that is positive over the image's range",
+            "give a law (`young`) that is positive over the image's range",
         ),
         (
             lambda h: np.where(h > 5, np.inf, 1.0),
             "modulus: expected 0 kPa or more, got 1 others, such as inf at intensity 10; "
-            "give a law (--young) that is positive over the image's range",
+            "give a law (`young`) that is positive over the image's range",
         ),
         (
             lambda h: h.sum(),

@@ -29,7 +29,7 @@ from tetopt.job.model import (
     warn_of_units,
     with_chosen_sets,
 )
-from tetopt.job.options import ImagePart, ModelOptions
+from tetopt.job.options import ImagePart, ModelOptions, stated_part
 from tetopt.model.averages import DEFAULT_AVERAGE
 from tetopt.model.fields import cell_fields, is_result
 from tetopt.model.file import MeshFile
@@ -107,7 +107,7 @@ def fem_command(
     _advise(task, solutions)
     _print(mesh_path.name, task, model, solutions, extremes)
     if json_path is not None:
-        options = {**asdict(model), "compress_percent": compress, **part.stated()}
+        options = {**asdict(model), "compress_percent": compress, **stated_part(part)}
         options["label_names"] = None if model.label_names is None else model.label_names.name
         files = {"mesh": mesh_path.name} | ({} if part.labels is None else {"labels": part.labels.name})
         if image_path is not None:
@@ -124,7 +124,7 @@ def _check_options(image_path: Path | None, compress: float | None, model: Model
         raise InputError(f"--compress: expected a percentage above 0 and up to {most}, got {compress:g}")
     if compress is not None and model.loads:
         raise InputError("--compress and --load: give one of them, as in --load compress:5% --load pressure:left:1.5")
-    if image_path is None and (lost := [name for name, value in part.stated().items() if value is not None]):
+    if image_path is None and (lost := [name for name, value in stated_part(part).items() if value is not None]):
         raise InputError(f"--{lost[0]}: there is no IMAGE, only a mesh")
     if image_path is None and model.average is not None:
         raise InputError("--average: it is over an image's voxels; give the IMAGE before the MESH")

@@ -19,7 +19,7 @@ from tetopt.job.events import listened, started
 from tetopt.job.in_parts import with_parts
 from tetopt.job.inputs import set_threads
 from tetopt.job.job import Job
-from tetopt.job.options import DEFAULT_NODES
+from tetopt.job.options import DEFAULT_NODES, has_model
 from tetopt.job.plan import planned
 from tetopt.job.read import read
 from tetopt.job.run import Result, run
@@ -63,7 +63,7 @@ def _print(result: Result) -> None:
     job = task.plan.job
     _print_comparison(result, 0 if task.source.is_constant else measured.get("cells_without_voxel", 0))
     print_fidelity(measured, model.mesh.ndim, task.source.mask_word)
-    if job.are_any() or job.output.suffix.lower() != ".vtu":
+    if has_model(job) or job.output.suffix.lower() != ".vtu":
         print_model(job.output, model, job)
     else:
         size = f"{nodes_in_words(model.mesh, model.order)}, {len(model.mesh.cells)} cells"
@@ -87,7 +87,7 @@ def _print_comparison(result: Result, n_empty: int) -> None:
         table.add_row(
             f"E_D, share of {whose_variance(content)}", f"{first.E_D / spread:.5f}", f"{last.E_D / spread:.5f}"
         )
-    meshes = (result.came.initial, result.mesh)
+    meshes = (result.meshed.initial, result.mesh)
     in_all = [size_summary(each, order)["n_nodes_in_all"] for each in meshes] if order == 2 else []
     first_shape, last_shape = result.shapes
     if first_shape is not None and last_shape is not None:

@@ -9,6 +9,7 @@ from typing import Any, Literal, NamedTuple
 
 from tetopt.errors import warn
 
+KERNEL_WORDS = "preparing the kernels (the first run compiles them, half a minute)"  # a stage of every run
 Kind = Literal["started", "progress", "note", "warning", "violated"]
 """A stage begins; how far it is; a line to know; what is odd; a requirement that the mesh does not meet."""
 

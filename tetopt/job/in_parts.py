@@ -24,13 +24,14 @@ from tetopt.engine.fast import prepare_kernels
 from tetopt.engine.loop import Optimized, Record
 from tetopt.errors import InputError
 from tetopt.image import Image, VoxelGrid
-from tetopt.io.images import file_shape, parse_crop, sha256
+from tetopt.io.images import file_shape, parse_crop
 from tetopt.io.label_tables import NO_TABLE, LabelTable
 from tetopt.io.stored_images import STORED_SUFFIXES, check_local, coarse_image, open_stored, stored_checksum
-from tetopt.job.events import note, progress, started, warning
-from tetopt.job.options import DEFAULT_NODES, PartsOptions
+from tetopt.job.events import KERNEL_WORDS, note, progress, started, warning
+from tetopt.job.options import DEFAULT_NODES, PartsOptions, stated_part
 from tetopt.job.plan import Plan
 from tetopt.job.predict import cropped_shape
+from tetopt.job.request import checksum
 from tetopt.job.source import Source
 from tetopt.mesh import Mesh
 from tetopt.model.averages import DEFAULT_AVERAGE
@@ -185,7 +186,7 @@ def read_stored(plan: Plan) -> StoredSource:
     image = open_stored(file.path, volume=file.volume, crop=file.crop)
     note(f"{path}: {' x '.join(map(str, image.shape))} voxels, which stay in the file")
     about = {
-        "image": path.name, "image_sha256": sha256(path), "box": box_text(box_of(image)),
+        "image": path.name, "image_sha256": checksum(path), "box": box_text(box_of(image)),
         "inputs": {"images": [path.name], "weights": [1.0], "mask": None, "background": None, "labels": None,
                    "label_weight": None, "sha256": {}},
     }  # fmt: skip
@@ -240,7 +241,7 @@ def run_in_parts(
         nonlocal task_bytes
         task_bytes = n_bytes
         note(f"{counted(n_parts, 'part')} or more in a round, each of up to {memory_words(n_bytes)}")
-        started("kernels", "preparing the kernels (the first run compiles them, half a minute)")
+        started("kernels", KERNEL_WORDS)
         prepare_kernels(Image(np.zeros((3, 3, 3)) + np.arange(3)), request.k_D, is_graded=True, progress=progress)
         started("parts")
         most = None if job.worker_gb is None else job.worker_gb * BYTES_PER_GB
@@ -309,7 +310,7 @@ def _request(plan: Plan, source: Source | StoredSource, sizes: Sizes | None) -> 
     }  # fmt: skip
     image = stored_checksum(path) if isinstance(source, StoredSource) else source.about["image_sha256"]
     whole = {
-        **values, "image": image, "part": plan.job.stated(), "tetopt": tetopt.__version__,
+        **values, "image": image, "part": stated_part(plan.job), "tetopt": tetopt.__version__,
         "sizes": None if sizes is None else [sizes.smallest, sizes.longest, sizes.gradation],
         "place": str(path.resolve()) if isinstance(source, StoredSource) else None,
     }  # fmt: skip

@@ -8,6 +8,7 @@ from dataclasses import MISSING, dataclass, fields
 from difflib import get_close_matches
 from numbers import Real
 from pathlib import Path
+from textwrap import wrap
 from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin
 
@@ -17,6 +18,7 @@ from tetopt.job.plan import resolved
 from tetopt.model.laws import LAW_OPTIONS
 
 MOST_SAID = 80  # letters of a value in a message
+UNIT_WORDS = {"MM": " in mm", "GB": " in GB", "S": " in seconds"}  # of a number, by what its value is called
 KIND_WORDS = {Path: "a path", float: "a number", int: "a whole number", str: "a text", bool: "True or False"}
 
 
@@ -24,16 +26,12 @@ KIND_WORDS = {Path: "a path", float: "a number", int: "a whole number", str: "a 
 class Job(JobOptions):
     """A run, from files to files: each option of `tetopt mesh` once, under its own name.
 
+    Laws and loads are the texts of the command line; a number may stand for a law of one value. None is the default,
+    which may depend on the image.
+
     Parameters
     ----------
-    images : path or list of paths
-        The image, and further contrasts, which are taken to its grid.
-    output : path
-        The mesh to write, in the format of its suffix.
-    **options
-        All others of `tetopt mesh`, with underscores; `help(tetopt.Job)` lists them. Files are paths, laws and loads
-        the texts of the command line; numbers may stand for laws of one value. None is the default, which may depend on
-        the image.
+    PARAMETERS
 
     Raises
     ------
@@ -132,6 +130,34 @@ class Job(JobOptions):
         if lost := [each.name for each in fields(cls) if each.default is MISSING and each.name not in table]:
             raise InputError(f"job: needs {' and '.join(lost)}")
         return cls(**table)
+
+
+def _parameters() -> str:
+    """The options of a job as its docstring lists them."""
+    lines = []
+    for field in fields(Job):
+        kind = kinds_of(Job)[field.name]
+        option = option_of(kind)
+        words = _kind_words(get_args(kind)[0]) + UNIT_WORDS.get(option.metavar or "", "")
+        if field.default is not MISSING:
+            words += ", optional" if field.default is None else f", default {field.default!r}"
+        lines += [
+            f"{field.name} : {words}",
+            *wrap(option.text, 108, initial_indent="    ", subsequent_indent="    "),
+        ]
+    return "\n    ".join(lines)
+
+
+def _kind_words(kind: Any) -> str:
+    """A kind of values as docstrings have it."""
+    own = get_args(kind)[0] if get_origin(kind) in (Union, UnionType) else kind
+    if get_origin(own) is Literal:
+        return "{" + ", ".join(map(repr, get_args(own))) + "}"
+    return f"list of {_kind_words(get_args(own)[0])}" if get_origin(own) is list else own.__name__.lower()
+
+
+if Job.__doc__:
+    Job.__doc__ = Job.__doc__.replace("PARAMETERS", _parameters())
 
 
 def _of_kind(name: str, kind: Any, value: Any) -> Any:

@@ -26,10 +26,10 @@ from tetopt.engine.meshing import (
 from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import squared_edges
 from tetopt.io.files import check_space
-from tetopt.job.events import note, progress, started
+from tetopt.job.events import KERNEL_WORDS, note, progress, started
 from tetopt.job.in_parts import run_in_parts
 from tetopt.job.model import check_early
-from tetopt.job.options import SolverOptions
+from tetopt.job.options import SolverOptions, has_model
 from tetopt.job.source import Source
 from tetopt.job.task import Meshed, Task
 from tetopt.job.write import model_with
@@ -67,6 +67,7 @@ def meshed(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
             _check_early(task, initial, None)
         check_space(job.output, CELL_BYTES * len(initial.cells))
         begun.append(time.perf_counter())
+        started("kernels", KERNEL_WORDS)
         note(_described(task, initial))
         prepare(lambda say: prepare_kernels(
             content, options["k_D"], "paper" if task.plan.mode == "paper" else "fast", task.plan.mode == "graded", say
@@ -113,7 +114,7 @@ def _meshed_in_parts(task: Task, stop: Callable[[], bool], begin: float) -> Mesh
 def _check_early(task: Task, initial: Mesh, fields: dict[str, NDArray] | None) -> None:
     """InputError for what the writer would refuse after the run, as far as the initial mesh can tell."""
     job = task.plan.job
-    if not job.are_any() and job.output.suffix.lower() == ".vtu":
+    if not has_model(job) and job.output.suffix.lower() == ".vtu":
         return
 
     def build(early: SolverOptions) -> Model:
@@ -135,7 +136,6 @@ def _memory_limit(task: Task, content: Content) -> MemoryLimit | None:
 def prepare(make: Callable[[Callable[[str], None]], Any]) -> None:
     """Load the compiled kernels, or compile them, before the clock of the first iteration starts."""
     begin = time.perf_counter()
-    started("kernels", "preparing the kernels (the first run compiles them, half a minute)")
     make(lambda words: progress(words))
     seconds = time.perf_counter() - begin
     if seconds > LONG_SECONDS:

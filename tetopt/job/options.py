@@ -78,10 +78,6 @@ class ImagePart(BoxPart):
 
     slice_: Annotated[str | None, Option("AXIS=INDEX", "One slice, in 2-D; for example k=90.", "slice")] = None
 
-    def stated(self) -> dict[str, int | str | None]:
-        """The part as files of numbers state it."""
-        return {"volume": self.volume, "crop": self.crop, "slice": self.slice_}
-
 
 WHOLE_BOX, WHOLE_IMAGE = BoxPart(), ImagePart()
 
@@ -322,11 +318,6 @@ class SolverOptions(ModelOptions):
     units: Annotated[str, Option("kPa|MPa", "Unit of stress in the file; `young` is in kPa.")] = "kPa"
     space: SpaceOption = "ras"
 
-    def are_any(self) -> bool:
-        """Whether the file is to hold more than the mesh and what labels are called."""
-        own = {field.name: getattr(self, field.name) for field in fields(SolverOptions) if field.name != "label_names"}
-        return SolverOptions(**own) != SolverOptions()
-
 
 @dataclass(frozen=True, kw_only=True)
 class OutputOptions:
@@ -349,6 +340,17 @@ class RunOptions(SolverOptions, EngineOptions, StartOptions, SizeOptions, Conten
 @dataclass(frozen=True, kw_only=True)
 class JobOptions(OutputOptions, SolverOptions, PartsOptions, EngineOptions, StartOptions, SizeOptions, SourceOptions):
     """Every option of a run; that they go together is for `tetopt.job.plan` to say."""
+
+
+def stated_part(part: ImagePart) -> dict[str, int | str | None]:
+    """The part of an image as files of numbers state it."""
+    return {"volume": part.volume, "crop": part.crop, "slice": part.slice_}
+
+
+def has_model(options: SolverOptions) -> bool:
+    """Whether a file is to hold more than the mesh and what labels are called."""
+    own = {each.name: getattr(options, each.name) for each in fields(SolverOptions) if each.name != "label_names"}
+    return SolverOptions(**own) != SolverOptions()
 
 
 def kinds_of(record: Any) -> dict[str, Any]:

@@ -18,7 +18,7 @@ from tetopt.io.formats import FORMATS
 from tetopt.io.images import parse_crop, parse_slice
 from tetopt.job.inputs import checked_outputs, number_of, read_companion, weights_of
 from tetopt.job.model import check_solver_options
-from tetopt.job.options import DEFAULT_NODES, JobOptions, Method
+from tetopt.job.options import DEFAULT_NODES, JobOptions, Method, stated_part
 from tetopt.start.lattice import KINDS
 from tetopt.start.octree import nodes_of_sizes
 from tetopt.start.sizes import Sizes
@@ -60,7 +60,7 @@ class Plan(NamedTuple):
             "lattice": self.kind(ndim), "size_min": job.size_min, "size_max": job.size_max,
             "edge_max": job.edge_max, "gradation": job.gradation,
             "sizing": None if job.sizing is None else job.sizing.name,
-            **job.stated(), "method": job.method, "max_seconds": job.max_seconds, "max_gb": job.max_gb,
+            **stated_part(job), "method": job.method, "max_seconds": job.max_seconds, "max_gb": job.max_gb,
             "start": None if job.start is None else job.start.name, **self.engine_options(),
         }  # fmt: skip
 

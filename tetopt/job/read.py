@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 
 from tetopt.errors import InputError
@@ -12,8 +14,9 @@ from tetopt.io.formats import format_of
 from tetopt.job.events import warning
 from tetopt.job.in_parts import is_left_stored, read_stored
 from tetopt.job.inputs import label_table, read_mesh
-from tetopt.job.plan import Plan, with_numbers
+from tetopt.job.plan import Plan, changed, with_numbers
 from tetopt.job.predict import size_of_run
+from tetopt.job.request import requested
 from tetopt.job.source import read_source
 from tetopt.job.task import Task
 from tetopt.mesh import Mesh
@@ -30,7 +33,8 @@ def read(plan: Plan) -> Task:
     if plan.n_parts is not None and is_left_stored(plan):
         stored = read_stored(plan)
         plan, sizes = with_numbers(plan, stored.content)
-        return Task(plan, stored, None, sizes, size_of_run(plan, stored.content, stored.content.image))
+        size = size_of_run(plan, stored.content, stored.content.image)
+        return Task(plan, stored, None, sizes, size, _request_of(plan))
     source = read_source(plan.job, plan.job.label_names)
     if plan.n_parts is not None and source.content.image.ndim != 3:
         raise InputError("`parts`: of a volume, and the image is a plane; leave it out")
@@ -44,7 +48,13 @@ def read(plan: Plan) -> Task:
             source = source.with_table(label_table(None, started))
     plan, sizes = with_numbers(plan, source.content)
     n_started = None if started is None else len(started.mesh.points)
-    return Task(plan, source, started, sizes, size_of_run(plan, source.content, source.contrasts[0], n_started))
+    size = size_of_run(plan, source.content, source.contrasts[0], n_started)
+    return Task(plan, source, started, sizes, size, _request_of(plan))
+
+
+def _request_of(plan: Plan) -> dict[str, Any]:
+    """What decides the outputs, with the checksums of the files as they are now."""
+    return requested(changed(plan.bare, parts=plan.n_parts))
 
 
 def _check_place(mesh: Mesh, image: Image, path: str) -> None:

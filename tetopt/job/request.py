@@ -45,7 +45,7 @@ def requested(job: JobOptions) -> dict[str, Any]:
     stated = {name: value for name, value in options.items() if name not in files}
     whole: dict[str, Any] = {
         "options": {**stated, "format": job.output.suffix.lower()},
-        "files": {name: [[path.name, _checksum(path)] for path in paths] for name, paths in files.items()},
+        "files": {name: [[path.name, checksum(path)] for path in paths] for name, paths in files.items()},
         "tetopt": tetopt.__version__,
     }
     return whole | {"sha256": hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()}
@@ -58,7 +58,8 @@ def _files(name: str, value: Any) -> list[Path]:
     return [each for each in (value if isinstance(value, list) else [value]) if isinstance(each, Path)]
 
 
-def _checksum(path: Path) -> str:
+def checksum(path: Path) -> str:
+    """SHA-256 of a file that an option names, as hexadecimal digits; taken once of a file that has not changed."""
     file, _ = file_and_volume(path)
     status = file.stat() if file.is_file() else None
     return sha256(file) if status is None else _kept_checksum(file, status.st_size, status.st_mtime_ns)

@@ -42,12 +42,19 @@ class Result(NamedTuple):
         that it should be.
     task : Task
         What was asked for, with all defaults, and the files as they were read.
-    came : Meshed
+    meshed : Meshed
         The optimisation: its history, the initial mesh, seconds.
     shapes : tuple of Quality
         Of the initial mesh and of the result; None for one that could not be measured.
     measured : dict
         How well mask, labels, contrasts and sizes are met.
+
+    Examples
+    --------
+    >>> tetopt.save_image("small.nii.gz", tetopt.load_phantom("sphere").image(voxel_mm=8))
+    >>> result = tetopt.run(tetopt.Job(images="small.nii.gz", output="small.vtu", nodes=60, iterations=1))
+    >>> result.model.mesh is result.mesh, result.numbers["size"]["n_nodes"] == len(result.mesh.points)
+    (True, True)
     """
 
     mesh: Mesh
@@ -55,14 +62,14 @@ class Result(NamedTuple):
     numbers: dict[str, Any]
     violated: list[str]
     task: Task
-    came: Meshed
+    meshed: Meshed
     shapes: Shapes
     measured: dict[str, Any]
 
     @property
     def optimized(self) -> Optimized:
         """The result of the optimisation."""
-        return self.came.result
+        return self.meshed.result
 
 
 def run(job: Job, on: Listener | None = None, stop: Callable[[], bool] | None = None) -> Result:
@@ -133,7 +140,7 @@ def _shapes(came: Meshed, failed: dict[str, str]) -> Shapes:
 
 def _judged(result: Result, failed: dict[str, str]) -> list[str]:
     """What the mesh should be and is not; all of it, and what is odd, is told."""
-    task, came, measured = result.task, result.came, result.measured
+    task, came, measured = result.task, result.meshed, result.measured
     problems = tell_violated(came.result, measured, task.source.mask_word)
     for name, reason in failed.items():
         left = "the mesh's file has no means of its cells" if name == "fields" else "all other numbers are written"

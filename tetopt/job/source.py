@@ -10,11 +10,11 @@ from numpy.typing import NDArray
 
 from tetopt.energy.sampling import cell_moments
 from tetopt.image import Image
-from tetopt.io.images import sha256
 from tetopt.io.label_tables import NO_TABLE, LabelTable
 from tetopt.job.events import note
-from tetopt.job.inputs import file_and_volume, image_and_others, label_table, number_of, weights_of
+from tetopt.job.inputs import image_and_others, label_table, number_of, weights_of
 from tetopt.job.options import SourceOptions
+from tetopt.job.request import checksum
 from tetopt.measure.fidelity import cell_labels
 from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields
@@ -123,9 +123,14 @@ def read_source(options: SourceOptions, label_names: Path | None = None) -> Sour
         "labels": None if options.labels is None else options.labels.name, "label_weight": options.label_weight,
         **({} if labels is None else {"smooth_interfaces": tension}),
         **({} if mask is None else {"keep_components": options.keep_components}),
-        "sha256": {path.name: sha256(file_and_volume(path)[0]) for path in files},
+        "sha256": {path.name: checksum(path) for path in files},
     }  # fmt: skip
-    about = {"image": paths[0].name, "image_sha256": sha256(paths[0]), "inputs": inputs, "box": box_text(box_of(image))}
+    about = {
+        "image": paths[0].name,
+        "image_sha256": checksum(paths[0]),
+        "inputs": inputs,
+        "box": box_text(box_of(image)),
+    }
     source = Source(paths, weights, represented, contrasts, labels, mask, about, NO_TABLE)
     return source.with_table(table)
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from numpy.typing import NDArray
 
@@ -28,6 +28,7 @@ class Task(NamedTuple):
     started: MeshFile | None  # the mesh to start from
     sizes: Sizes | None
     size: RunSize  # by which time and memory are predicted
+    request: dict[str, Any]  # what decides the outputs, as `requested` has it
 
     @property
     def start_name(self) -> str:

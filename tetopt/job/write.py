@@ -27,9 +27,7 @@ from tetopt.job.model import (
     with_chosen_sets,
 )
 from tetopt.job.options import SolverOptions
-from tetopt.job.plan import changed
 from tetopt.job.predict import stated_prediction
-from tetopt.job.request import requested
 from tetopt.job.source import Source
 from tetopt.job.task import Meshed, Shapes, Task
 from tetopt.mesh import Mesh
@@ -140,7 +138,7 @@ def numbers_of(
     summary = run_summary(source.content, came.initial, came.result, texts, {**came.seconds, "all": seconds}, shapes)
     if isinstance(source, Source) and source.image is not source.content.image:
         summary["image_properties"] = image_summary(source.image)  # on its own voxels, not on divided ones
-    summary["request"] = requested(changed(task.plan.bare, parts=task.plan.n_parts))
+    summary["request"] = task.request
     summary["memory"] = {"peak_bytes": peak_bytes()}
     if task.plan.n_parts is None:
         summary["prediction"] = stated_prediction(task.size)
