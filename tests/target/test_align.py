@@ -334,6 +334,10 @@ def test_images_without_background():
     for image, words in (
         (rng.normal(100.0, 20.0, (20, 20, 20)), r"the dark voxels on the faces of the box spread up to .*, not under"),
         (np.full((5, 5), 4.0), "every voxel has the value 4"),
+        (
+            np.where(ball((20, 20), 5), np.nextafter(1.0, 2.0), 1.0),
+            "classes: expected intensities that 256 bins can part",
+        ),
         (np.where(ball((20, 20), 5), 0.0, 9.0), "no voxel on the faces of the box is among the dark ones, up to 4.5"),
         (np.where(np.arange(8000).reshape(20, 20, 20) == 0, 0.0, 9.0), r"99\.99 % of the voxels would be foreground"),
         (np.where(np.arange(8000).reshape(20, 20, 20) == 3790, 9.0, 0.0), r"0\.0125 % of the voxels would be foreg"),

@@ -226,7 +226,10 @@ def background_level(image: Image) -> float:
     data = image.data
     if data.min() == data.max():
         raise _no_background(f"every voxel has the value {data.flat[0]:g}")
-    (threshold,) = class_thresholds(data.ravel(), 2)
+    try:
+        (threshold,) = class_thresholds(data.ravel(), 2)
+    except InputError as error:
+        raise _no_background(str(error)) from error
     values = _on_faces(data)
     dark = values[values <= threshold].astype(np.float64)
     if len(dark) == 0:

@@ -36,7 +36,7 @@ def class_thresholds(values: NDArray, classes: int, weights: NDArray | None = No
     Raises
     ------
     InputError
-        Fewer than 2 classes, or fewer different bins than classes.
+        Fewer than 2 classes, or fewer different bins than classes; values that bins cannot part.
     """
     if classes < 2:
         raise InputError(f"classes: expected 2 or more, got {classes}")
@@ -68,6 +68,13 @@ def class_thresholds(values: NDArray, classes: int, weights: NDArray | None = No
 
 def _histogram(values: NDArray, weights: NDArray | None) -> tuple[NDArray, NDArray[np.float64]]:
     """Counts and edges of the bins, see `class_thresholds`."""
+    low, high = values.min(), values.max()
+    steps = np.linspace(low, high, HISTOGRAM_BINS + 1, dtype=values.dtype)  # as numpy's bins are
+    if low < high and not (steps[:-1] < steps[1:]).all():
+        raise InputError(
+            f"classes: expected intensities that {HISTOGRAM_BINS} bins can part, got {low} to {high}; subtract what "
+            "all of them have"
+        )
     counts, edges = np.histogram(values, bins=HISTOGRAM_BINS, weights=weights)
     share = np.cumsum(counts) / counts.sum()
     first, last = np.searchsorted(share, [TAIL_SHARE, 1.0 - TAIL_SHARE])
