@@ -31,7 +31,7 @@ from tetopt.engine.loop import Record
 from tetopt.io.files import checked_output, save_json
 from tetopt.io.zarr_images import save_zarr
 from tetopt.parts.part import work_on
-from tetopt.parts.rounds import Request, Round, Runner, mesh_in_parts
+from tetopt.parts.rounds import PartsRequest, Round, Runner, mesh_in_parts
 from tetopt.parts.work import VolumeFile, save_volume
 from tetopt.stored import StoredImage
 
@@ -145,7 +145,7 @@ def measure(volume: Path, nodes: int, n_parts: int, n_workers: int, worker_bytes
             stage("join, cut")
 
     stage("statistics, octree")
-    request = Request(nodes, n_parts, 0.85, 16, 3.0, 12.0, 5e-4, None, "benchmark")
+    request = PartsRequest(nodes, n_parts, 0.85, 16, 3.0, 12.0, 5e-4, None, "benchmark")
     parted = mesh_in_parts(request, folder, crew=crew, watch=watch)
     stage("joined and checked")
     result, peaks = parted.result, dict.fromkeys((task.worker for task in done), 0)

@@ -5,6 +5,7 @@ import importlib
 import io
 import re
 import tokenize
+from collections import Counter
 from functools import cache
 from pathlib import Path
 
@@ -231,3 +232,8 @@ def test_only_the_command_names_options():
         if option.search(re.sub(r"(tetopt|cgal_mesh) [^:`]*", "", node.value))  # whole commands
     ]
     assert named == []
+
+
+def test_a_class_name_has_one_meaning():
+    names = Counter(node.name for path in SOURCES for node in ast.walk(tree_of(path)) if isinstance(node, ast.ClassDef))
+    assert {name: count for name, count in names.items() if count > 1} == {}

@@ -22,7 +22,7 @@ from tetopt.cli import cohort_plan
 from tetopt.cli.cohort import Estimate
 from tetopt.cli.options import CohortOptions
 from tetopt.cohort.layout import begin, description, locked
-from tetopt.cohort.state import State
+from tetopt.cohort.state import SubjectState
 from tetopt.cohort.subjects import read_table
 from tetopt.engine.cost import Prediction
 from tetopt.job.options import RunOptions
@@ -300,7 +300,9 @@ def test_each_subject_has_files_of_its_own(small, monkeypatch):
 @pytest.mark.parametrize(("only_failed", "keys"), [(False, ["b", "c", "d"]), (True, ["b"])])
 def test_what_is_chosen(only_failed, keys):
     states = {"a": "done", "b": "failed", "c": "changed", "d": "missing", "e": "missed"}
-    entries = [cohort_plan.Entry(None, key, None, None, State(status, "")) for key, status in states.items()]
+    entries = [
+        cohort_plan.PlannedSubject(None, key, None, None, SubjectState(status, "")) for key, status in states.items()
+    ]
     assert [each.key for each in cohort_plan.chosen(entries, only_failed)] == keys
 
 

@@ -6,7 +6,7 @@ import pytest
 from cohorts import save_failure, save_run
 
 from tetopt.cohort.layout import begin, description, mesh_name, numbers_path, subject_folder
-from tetopt.cohort.state import State, differences, state_of, strangers
+from tetopt.cohort.state import SubjectState, differences, state_of, strangers
 
 KEY = "sub-1"
 
@@ -31,23 +31,23 @@ def status(out, now=None, key=KEY):
 
 
 def test_each_status_has_its_reason(out):
-    assert status(out) == State("missing", "")
+    assert status(out) == SubjectState("missing", "")
     saved(out)
-    assert status(out) == State("done", "")
+    assert status(out) == SubjectState("done", "")
     other = request(options={"nodes": 70, "format": ".vtu"})
-    assert status(out, other) == State("changed", "nodes was 60, is 70")
-    assert state_of(out, KEY, ".vtu", None) == State("done", "")
+    assert status(out, other) == SubjectState("changed", "nodes was 60, is 70")
+    assert state_of(out, KEY, ".vtu", None) == SubjectState("done", "")
     saved(out, missed={"floor": "too flat", "mask": "too coarse"})
-    assert status(out) == State("missed", "too flat; too coarse")
+    assert status(out) == SubjectState("missed", "too flat; too coarse")
 
 
 def test_a_failure_counts_until_there_is_what_is_asked_for(out):
     save_failure(out, KEY, "cut short")
-    assert status(out) == State("failed", "cut short")
+    assert status(out) == SubjectState("failed", "cut short")
     saved(out, tetopt="0.0.9")
-    assert status(out) == State("failed", "cut short")
+    assert status(out) == SubjectState("failed", "cut short")
     saved(out)
-    assert status(out) == State("done", "")
+    assert status(out) == SubjectState("done", "")
 
 
 @pytest.mark.parametrize("harm", [
@@ -65,7 +65,7 @@ def test_what_is_damaged_is_made_again(out, harm):
 
 def test_a_mesh_of_another_format_is_a_change(out):
     saved(out, suffix=".inp", options={"nodes": 60, "format": ".inp"})
-    assert status(out) == State("changed", "format was .inp, is .vtu")
+    assert status(out) == SubjectState("changed", "format was .inp, is .vtu")
 
 
 def test_differences_are_said_and_the_line_is_short():

@@ -10,7 +10,7 @@ import tetopt
 from tetopt.check import check_unfolded, manifold_problems
 from tetopt.energy.sampling import overlap_of
 from tetopt.io.formats import file_bytes
-from tetopt.parts.rounds import Request, mesh_in_parts
+from tetopt.parts.rounds import PartsRequest, mesh_in_parts
 from tetopt.parts.work import save_volume
 from tetopt.report.summary import fidelity
 
@@ -55,7 +55,7 @@ def in_parts(folder, stop):
     folder.mkdir()
     image = KINDS["plain"][0][0]
     save_volume(folder, image)
-    asked_for = Request(400, 2, 0.85, 6, 3.0, 12.0, 5e-4, None, "of this test")
+    asked_for = PartsRequest(400, 2, 0.85, 6, 3.0, 12.0, 5e-4, None, "of this test")
     return mesh_in_parts(asked_for, folder, is_over=stop)
 
 

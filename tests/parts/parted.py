@@ -10,7 +10,7 @@ import numpy as np
 import tetopt
 from tetopt.engine.loop import GRADED_ITERATIONS, GRADED_K_D
 from tetopt.parts.part import work_on
-from tetopt.parts.rounds import Request, mesh_in_parts
+from tetopt.parts.rounds import PartsRequest, mesh_in_parts
 from tetopt.parts.work import done_path, load_arrays, save_volume
 
 # Oblique, sheared, anisotropic and mirrored.
@@ -35,7 +35,7 @@ class Recorded(NamedTuple):
 
 
 def request(nodes, n_parts, **changes):
-    asked_for = Request(nodes, n_parts, GRADED_K_D, GRADED_ITERATIONS, 3.0, 12.0, 5e-4, None, "of this test")
+    asked_for = PartsRequest(nodes, n_parts, GRADED_K_D, GRADED_ITERATIONS, 3.0, 12.0, 5e-4, None, "of this test")
     return asked_for._replace(**changes)
 
 

@@ -21,7 +21,7 @@ from tetopt.energy.sampling import cell_of_voxel
 from tetopt.engine.meshing import mesh_image
 from tetopt.geometry.simplex import rho
 from tetopt.parts.cut import ROUND_SHIFTS, Shared, counts_of, cut, joined, shared_nodes
-from tetopt.parts.part import Settings
+from tetopt.parts.part import PartSettings
 from tetopt.parts.rounds import _weights
 
 # Half-way between those of rounds.
@@ -49,7 +49,7 @@ def seam_layers(image, rounds):
 
 def other_layers(image, mesh, rounds):
     """Likewise of cells of the mesh along planes between those where parts met."""
-    settings = Settings(**rounds[0][0].text["settings"])
+    settings = PartSettings(**rounds[0][0].text["settings"])
     index = image.to_index(mesh.points)
     # As many along each axis as in the first round, which is not shifted.
     counts = counts_of(len(rounds[0]), tuple(image.spacing * image.shape))

@@ -14,7 +14,7 @@ from tetopt.engine.state import content_energies
 from tetopt.geometry.topology import boundary_facets
 from tetopt.model.fields import cell_fields
 from tetopt.parts.cut import Shared, joined, pieces
-from tetopt.parts.part import Settings, work_on
+from tetopt.parts.part import PartSettings, work_on
 from tetopt.parts.work import done_path, load_arrays, round_folder, save_arrays, save_volume
 from tetopt.target.content import plain
 
@@ -61,7 +61,7 @@ def measured_whole(image, mesh, settings):
 def slabs_done(folder, image, ticks, cells, kind, bits):
     """Three parts of a mesh, across the first axis: each, and what came of it."""
     save_volume(folder, image)
-    settings = Settings(0.85, 3.0, 12.0, 5e-4, 9, 4, 0.0, 99.0, None, image.shape, bits, 0.0)
+    settings = PartSettings(0.85, 3.0, 12.0, 5e-4, 9, 4, 0.0, 99.0, None, image.shape, bits, 0.0)
     place = ticks[cells].mean(axis=1)[:, 0] / 2.0**bits / image.shape[0]
     round_folder(folder, 0).mkdir()
     for number, piece in enumerate(pieces(Shared(ticks, cells, np.digitize(place, [0.3, 0.6])))):

@@ -15,7 +15,7 @@ from tetopt.measure.quality import Quality, QualityErrors
 from tetopt.report.figures import save_figure
 from tetopt.report.viewer import view_of
 from tetopt.study.compare import elementwise
-from tetopt.study.compare_criteria import Entry, criteria, entry, number_text, winners
+from tetopt.study.compare_criteria import CriterionEntry, criteria, entry, number_text, winners
 from tetopt.study.compare_figures import curves_figure, histograms_figure, slices_figure, timing_figure
 from tetopt.study.compare_headline import headline
 from tetopt.study.compare_page import save_compare_page
@@ -29,10 +29,10 @@ from tetopt.study.compare_report import (
     LabelSource,
     Measurement,
     PipelineResult,
+    PipelineRun,
     ReferenceEnergy,
     ReferenceGrid,
     Report,
-    Run,
     Settings,
     Simulation,
     Solved,
@@ -78,7 +78,7 @@ def fake_run(seed, scale, order=1):
         n_empty_cells=0, quality=quality, rho_histogram=Histogram(np.linspace(0, 1 / 3, 21).tolist(), rho.tolist()),
         dihedral_histogram=Histogram(list(range(0, 181, 5)), angles.tolist()), labels=labels, fem=fem,
     )  # fmt: skip
-    return Run({"kernels": 3.0, **seconds}, sum(seconds.values()), int(9e8 * scale), measurement)
+    return PipelineRun({"kernels": 3.0, **seconds}, sum(seconds.values()), int(9e8 * scale), measurement)
 
 
 def simulation_of(random, scale):
@@ -813,7 +813,7 @@ def test_without_labels_and_finite_elements(tmp_path):
             with_measured(report, number, labels=[], fem={})
     rows = measures(page_of(tmp_path, report))
     assert set(rows) == {title for title in PATHS if not title[0].startswith("Compression")}
-    assert entry(criteria(report)[0].value, report.pipelines[2]) == Entry(None, None, None)
+    assert entry(criteria(report)[0].value, report.pipelines[2]) == CriterionEntry(None, None, None)
 
 
 # --------------------------------------------------------------------------------------------------

@@ -18,7 +18,15 @@ from rich.markup import escape
 from rich.progress import BarColumn, MofNCompleteColumn, Progress, TextColumn
 
 from tetopt.budget import available_bytes, memory_words
-from tetopt.cli.cohort_plan import Entry, checked_suffix, chosen, entries_of, subjects_of, with_places, with_states
+from tetopt.cli.cohort_plan import (
+    PlannedSubject,
+    checked_suffix,
+    chosen,
+    entries_of,
+    subjects_of,
+    with_places,
+    with_states,
+)
 from tetopt.cli.console import log, out, show_error, show_warning
 from tetopt.cli.options import CohortOptions, SubjectsArgument
 from tetopt.cluster.crew import counted
@@ -148,7 +156,7 @@ def _collected(place: Path, subjects: Path, keys: list[str]) -> int:
         return _close(place, keys)
 
 
-def _say_plan(entries: Sequence[Entry], to_run: Sequence[Entry], only_failed: bool) -> None:
+def _say_plan(entries: Sequence[PlannedSubject], to_run: Sequence[PlannedSubject], only_failed: bool) -> None:
     """How many subjects there are of each kind, and why the ones are run that are there already."""
     counts = Counter[str](entry.state.status for entry in entries)
     words = {"done": "done", "missed": "done, but a promise missed", "failed": "failed", "changed": "changed"}
@@ -162,7 +170,7 @@ def _say_plan(entries: Sequence[Entry], to_run: Sequence[Entry], only_failed: bo
         show_warning(f"{counts['changed']} subjects stay as they are, of other options or inputs (--retry-failed)")
 
 
-def estimated(entries: Sequence[Entry]) -> Estimate:
+def estimated(entries: Sequence[PlannedSubject]) -> Estimate:
     """What subjects are predicted to take, each on one thread: by their headers, and some of each kind as they are.
 
     Of the same kind are those of as many files and the same options; of one whose images have several shapes, one of
@@ -190,7 +198,7 @@ def estimated(entries: Sequence[Entry]) -> Estimate:
     return Estimate(each)
 
 
-def _read_size(entry: Entry) -> RunSize | None:
+def _read_size(entry: PlannedSubject) -> RunSize | None:
     """The sizes of a run whose files are read; None if they cannot be, which its run will say."""
     try:
         with listened(lambda event: None), contextlib.redirect_stderr(StringIO()):
@@ -212,7 +220,9 @@ def _need(n_tasks: int, estimate: Estimate, cohort: CohortOptions, threads: int 
     return Need(n_tasks, max(sizes, default=0.0), threads)
 
 
-def _say_estimate(to_run: Sequence[Entry], estimate: Estimate, cohort: CohortOptions, threads: int | None) -> None:
+def _say_estimate(
+    to_run: Sequence[PlannedSubject], estimate: Estimate, cohort: CohortOptions, threads: int | None
+) -> None:
     """What would be run, and what it takes."""
     for entry in to_run:
         if (one := estimate.each.get(entry.key)) is None:
@@ -227,7 +237,9 @@ def _say_estimate(to_run: Sequence[Entry], estimate: Estimate, cohort: CohortOpt
     out.print(f"{whole}; on this machine {share.workers} at a time: about {_time(estimate.seconds() / share.workers)}")
 
 
-def _run(to_run: Sequence[Entry], estimate: Estimate, cohort: CohortOptions, suffix: str, threads: int | None) -> None:
+def _run(
+    to_run: Sequence[PlannedSubject], estimate: Estimate, cohort: CohortOptions, suffix: str, threads: int | None
+) -> None:
     """Run the subjects; what becomes of each is said."""
     place = cohort.output.absolute()
     work = place / WORK_NAME
@@ -272,7 +284,7 @@ def _refresher(place: Path) -> Callable[[], None]:
     return refresh
 
 
-def _job(entry: Entry, estimate: Estimate, place: Path, suffix: str, threads: int, run: str) -> SubjectTask:
+def _job(entry: PlannedSubject, estimate: Estimate, place: Path, suffix: str, threads: int, run: str) -> SubjectTask:
     one = estimate.each.get(entry.key, Prediction(0.0, 0.0, 0.0))
     return SubjectTask(entry.key, entry.words(), str(place), suffix, threads, one.peak_bytes, one.seconds, run)
 

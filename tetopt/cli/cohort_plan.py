@@ -11,7 +11,7 @@ from typing import Any, NamedTuple
 
 from tetopt.cli.options import CohortOptions, option_words, with_options
 from tetopt.cohort.layout import FIGURES_NAME, check_place, mesh_name, numbers_path
-from tetopt.cohort.state import State, state_of, strangers
+from tetopt.cohort.state import SubjectState, state_of, strangers
 from tetopt.cohort.subjects import FILE_OPTIONS, Problems, Subject, doubled, key, label_of, matching, read_table
 from tetopt.errors import InputError
 from tetopt.io.formats import FORMATS
@@ -22,14 +22,14 @@ from tetopt.job.request import requested
 from tetopt.model.laws import LAW_OPTIONS, law_file
 
 
-class Entry(NamedTuple):
+class PlannedSubject(NamedTuple):
     """A subject of the cohort, with all options of its run."""
 
     subject: Subject
     key: str
     options: RunOptions
     plan: Plan  # of its run, as far as it is known without its files
-    state: State
+    state: SubjectState
 
     @property
     def job(self) -> JobOptions:
@@ -79,7 +79,7 @@ def checked_suffix(text: str) -> str:
 
 def entries_of(
     subjects: Sequence[Subject], options: RunOptions, out: Path, suffix: str, say: Callable[[str], None]
-) -> list[Entry]:
+) -> list[PlannedSubject]:
     """The subjects with their options, and what there is of each.
 
     Raises
@@ -99,7 +99,7 @@ def entries_of(
         problems += [(subject.place, words) for words in _missing(plan.job)]
         if (stranger := strangers(out, key(subject))) is not None:
             problems.append(("", stranger))
-        entries.append(Entry(subject, key(subject), own, plan, State("missing", "")))
+        entries.append(PlannedSubject(subject, key(subject), own, plan, SubjectState("missing", "")))
     if problems:
         raise Problems(list(_lines(problems)))
     return with_states(entries, out, suffix, say)
@@ -164,10 +164,12 @@ def _missing(job: JobOptions) -> Iterator[str]:
             yield f"{name}: {path} cannot be opened: {error.strerror}"
 
 
-def with_states(entries: list[Entry], out: Path, suffix: str, say: Callable[[str], None]) -> list[Entry]:
+def with_states(
+    entries: list[PlannedSubject], out: Path, suffix: str, say: Callable[[str], None]
+) -> list[PlannedSubject]:
     """The subjects with what there is of each; files are summed up where there is a mesh to compare with."""
 
-    def state(entry: Entry) -> Entry:
+    def state(entry: PlannedSubject) -> PlannedSubject:
         request = None
         if numbers_path(out, entry.key).is_file():
             request = requested(changed(entry.plan.bare, output=Path(mesh_name(entry.key, suffix))))
@@ -179,7 +181,7 @@ def with_states(entries: list[Entry], out: Path, suffix: str, say: Callable[[str
         return list(pool.map(state, entries))
 
 
-def with_places(entries: list[Entry], out: Path) -> list[Entry]:
+def with_places(entries: list[PlannedSubject], out: Path) -> list[PlannedSubject]:
     """The subjects to be run; Problems for those whose folder a run cannot replace."""
     problems = []
     for entry in entries:
@@ -192,7 +194,7 @@ def with_places(entries: list[Entry], out: Path) -> list[Entry]:
     return entries
 
 
-def chosen(entries: Iterable[Entry], only_failed: bool) -> list[Entry]:
+def chosen(entries: Iterable[PlannedSubject], only_failed: bool) -> list[PlannedSubject]:
     """Those to be run."""
     statuses = ("failed",) if only_failed else ("missing", "failed", "changed")
     return [entry for entry in entries if entry.state.status in statuses]

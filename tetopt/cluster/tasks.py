@@ -33,7 +33,7 @@ class SchedulerLost(InputError):
     """The scheduler does not answer any more."""
 
 
-class Outcome(NamedTuple):
+class TaskOutcome(NamedTuple):
     """How a task ended."""
 
     number: int  # in the sequence of tasks
@@ -106,7 +106,7 @@ def outcomes(
     is_over: Callable[[], bool] = lambda: False,
     last_seconds: float = LAST_SECONDS,
     repeats: type[BaseException] | None = None,
-) -> Iterator[Outcome]:
+) -> Iterator[TaskOutcome]:
     """How each task ended, as they do; of `tasks` keys, unique to the scheduler, and what `task` is called with.
 
     Those whose worker ended are repeated, and those with an error of the type `repeats`, before others begin.
@@ -146,13 +146,13 @@ def outcomes(
                 _check_scheduler(client)  # a client that loses it cancels what it waits for
             del running[future]
             if future.status == "finished":
-                yield Outcome(number, _answer(future.result), None, attempt)
+                yield TaskOutcome(number, _answer(future.result), None, attempt)
                 continue
             error = CancelledError(future.key) if future.status == "cancelled" else future.exception()
             if attempt < attempts and (is_lost(error) or isinstance(error, repeats or ())):
                 waiting.appendleft((number, attempt + 1))
             else:
-                yield Outcome(number, None, error, attempt)
+                yield TaskOutcome(number, None, error, attempt)
 
 
 def is_lost(error: BaseException) -> bool:

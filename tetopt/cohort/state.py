@@ -12,14 +12,14 @@ Status = Literal["done", "missed", "failed", "changed", "missing"]  # "missed": 
 WORDS_LISTED = 4  # of what has changed: a line's worth
 
 
-class State(NamedTuple):
+class SubjectState(NamedTuple):
     """What there is of a subject."""
 
     status: Status
     why: str  # what has changed, why it failed; else empty
 
 
-def state_of(out: Path, key: str, suffix: str, request: dict[str, Any] | None) -> State:
+def state_of(out: Path, key: str, suffix: str, request: dict[str, Any] | None) -> SubjectState:
     """What there is of a subject.
 
     Parameters
@@ -37,12 +37,14 @@ def state_of(out: Path, key: str, suffix: str, request: dict[str, Any] | None) -
     mesh = subject_folder(out, key) / mesh_name(key, str(before["options"].get("format", suffix)))
     is_there = numbers is not None and mesh.is_file() and mesh.stat().st_size > 0
     if is_there and numbers is not None and (request is None or before.get("sha256") == request["sha256"]):
-        return State("missed" if numbers.get("missed") else "done", "; ".join((numbers.get("missed") or {}).values()))
+        return SubjectState(
+            "missed" if numbers.get("missed") else "done", "; ".join((numbers.get("missed") or {}).values())
+        )
     if failure is not None:
-        return State("failed", str(failure.get("reason", "")))
+        return SubjectState("failed", str(failure.get("reason", "")))
     if is_there and request is not None:
-        return State("changed", differences(before, request))
-    return State("missing", "")
+        return SubjectState("changed", differences(before, request))
+    return SubjectState("missing", "")
 
 
 def _request_of(numbers: dict[str, Any]) -> dict[str, Any]:

@@ -33,7 +33,7 @@ RGB_COLUMNS = (("r", "g", "b"), ("red", "green", "blue"), ("color_r", "color_g",
 NO_NAMES = ("", "(none)", "n/a")  # what stands for none: 3D Slicer's, BIDS'
 
 
-class Entry(NamedTuple):
+class LabelEntry(NamedTuple):
     """A label as a line of the file has it."""
 
     line: int  # from 1
@@ -79,7 +79,7 @@ def load_label_table(path: str | Path) -> LabelTable:
     if not lines:
         raise InputError(f"{path}: expected a label and its name on each line, found none")
     table = LabelTable({}, {})
-    of_label: dict[int, Entry] = {}
+    of_label: dict[int, LabelEntry] = {}
     for entry in _entries(path, lines):
         first = of_label.setdefault(entry.label, entry)
         if first._replace(line=entry.line) != entry:
@@ -96,7 +96,7 @@ def load_label_table(path: str | Path) -> LabelTable:
     return table
 
 
-def _entries(path: Path, lines: list[tuple[int, str]]) -> Iterator[Entry]:
+def _entries(path: Path, lines: list[tuple[int, str]]) -> Iterator[LabelEntry]:
     """The labels of the lines, all of the kind that the first line is of."""
     first = lines[0][1]
     if SNAP_LINE.fullmatch(first):
@@ -110,16 +110,16 @@ def _entries(path: Path, lines: list[tuple[int, str]]) -> Iterator[Entry]:
         yield from _of_columns(path, lines)
 
 
-def _matched(path: Path, lines: list[tuple[int, str]], pattern: re.Pattern[str], form: str) -> Iterator[Entry]:
+def _matched(path: Path, lines: list[tuple[int, str]], pattern: re.Pattern[str], form: str) -> Iterator[LabelEntry]:
     for number, line in lines:
         if (match := pattern.fullmatch(line)) is None:
             raise InputError(f'{path}, line {number}: expected {form}, got "{line}"')
         parts = match.groups()
         tones, name = (parts[1:4], parts[7]) if pattern is SNAP_LINE else (parts[2:5], parts[1].strip('"'))
-        yield Entry(number, int(parts[0]), _one_line(name), _colour(path, number, tones, 255.0))
+        yield LabelEntry(number, int(parts[0]), _one_line(name), _colour(path, number, tones, 255.0))
 
 
-def _of_columns(path: Path, lines: list[tuple[int, str]]) -> Iterator[Entry]:
+def _of_columns(path: Path, lines: list[tuple[int, str]]) -> Iterator[LabelEntry]:
     """The labels of a table with a first row of names."""
     head = lines[0][1]
     separator = max("\t,;", key=head.count)
@@ -153,7 +153,7 @@ def _of_columns(path: Path, lines: list[tuple[int, str]]) -> Iterator[Entry]:
             colour = hex_colour(text)
             if colour is None:
                 raise InputError(f'{path}, line {number}: expected a colour as #rrggbb, got "{text}"')
-        yield Entry(number, int(float(cells[label])), _one_line(cells[name]), colour)
+        yield LabelEntry(number, int(float(cells[label])), _one_line(cells[name]), colour)
 
 
 def _cells(path: Path, number: int, line: str, separator: str) -> list[str]:

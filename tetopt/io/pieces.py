@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from tetopt.conversions import VTK_KINDS
 from tetopt.errors import InputError
-from tetopt.io.raw import Grid
+from tetopt.io.raw import RawGrid
 from tetopt.io.read_vtk import plain_arrays
 from tetopt.io.text import free_text
 from tetopt.io.vtk import CELLS_PREFIX, FACETS_PREFIX, model_grid
@@ -24,7 +24,7 @@ MOST_PIECES = 2**16  # of a file: more than any cluster has cores for one job, a
 DUPLICATE_BIT = 1  # VTK's, of cells that are another piece's and only repeated here
 
 
-def model_pieces(model: Model) -> Iterator[Grid]:
+def model_pieces(model: Model) -> Iterator[RawGrid]:
     """All of a model, as `tetopt.io.vtk.model_grid` has it: a piece for each value of `part`, or one for all.
 
     Field data are in the first; its texts, which tell units and axes, in each of the others, too.
@@ -35,7 +35,7 @@ def model_pieces(model: Model) -> Iterator[Grid]:
         More than `MOST_PIECES` parts.
     """
     types = np.full(len(model.mesh.cells), VTK_KINDS[model.mesh.ndim, model.order], dtype=np.uint8)
-    grid = Grid(**plain_arrays(model_grid(model)), cell_types=types)
+    grid = RawGrid(**plain_arrays(model_grid(model)), cell_types=types)
     part = _whole_numbers(grid.cell_data.get(PART_FIELD))
     numbers, sizes = np.unique(np.zeros(1) if part is None else part, return_counts=True)
     if part is None or len(numbers) == 1:
@@ -64,11 +64,11 @@ def _freed(data: dict[str, NDArray], name: str) -> dict[str, NDArray]:
     return {free_text(name, data) if each == name else each: values for each, values in data.items()}
 
 
-def _piece(grid: Grid, chosen: NDArray[np.int64]) -> Grid:
+def _piece(grid: RawGrid, chosen: NDArray[np.int64]) -> RawGrid:
     """Some cells, all of one kind, and their points."""
     cells = grid.connectivity.reshape(len(grid.cell_types), -1)[chosen]
     nodes, local = np.unique(cells, return_inverse=True)
-    return Grid(
+    return RawGrid(
         grid.points[nodes],
         local.ravel(),
         np.arange(len(chosen) + 1) * cells.shape[1],
@@ -79,7 +79,7 @@ def _piece(grid: Grid, chosen: NDArray[np.int64]) -> Grid:
     )
 
 
-def joined(pieces: Sequence[Grid]) -> Grid:
+def joined(pieces: Sequence[RawGrid]) -> RawGrid:
     """One grid of all pieces; cells that a piece only repeats (VTK's ghosts) are left out.
 
     Points are the same where their GlobalPointIds are, if each of these lies at one place, else where their coordinates
@@ -87,7 +87,7 @@ def joined(pieces: Sequence[Grid]) -> Grid:
 
     Parameters
     ----------
-    pieces : sequence of Grid
+    pieces : sequence of RawGrid
         At least one. Data that not every piece has, of the same type, are left out, which a note tells.
 
     Raises
@@ -124,7 +124,7 @@ def joined(pieces: Sequence[Grid]) -> Grid:
     for piece in pieces:
         fields |= {name: values for name, values in piece.field_data.items() if name not in fields}
     lost = ", ".join(dict.fromkeys(lost_at_points + lost_in_cells))
-    return Grid(
+    return RawGrid(
         points[first],
         number[nodes[listed]],
         offsets,
@@ -136,7 +136,7 @@ def joined(pieces: Sequence[Grid]) -> Grid:
     )
 
 
-def _without_ghosts(piece: Grid) -> Grid:
+def _without_ghosts(piece: RawGrid) -> RawGrid:
     """The piece without the cells that another one has; their points stay, as nodes that no cell uses may."""
     marks = piece.cell_data.get(GHOST_FIELD)
     if marks is None or marks.ndim != 1 or marks.dtype.kind not in "iu":

@@ -18,7 +18,7 @@ from tetopt.errors import InputError
 from tetopt.incoming import regular_file, text_of
 from tetopt.io.apart import read_apart
 from tetopt.io.pieces import MOST_PIECES, joined, model_pieces
-from tetopt.io.raw import Grid
+from tetopt.io.raw import RawGrid
 from tetopt.io.read_vtk import arrays_of, check_counts, checked_grid
 from tetopt.io.text import plain
 from tetopt.io.vtk import name_in_xml, vtk_of, vtu_bytes
@@ -51,7 +51,7 @@ def pvtu_files(model: Model, stem: str) -> Iterator[tuple[str, bytes]]:
     yield f"{stem}.pvtu", _master(first, names)
 
 
-def _master(first: Grid, names: list[str]) -> bytes:
+def _master(first: RawGrid, names: list[str]) -> bytes:
     """What the pieces are called, and what each of them holds, which the first tells."""
     heads = [
         f"    <{tag}>\n{''.join(map(_declared, data, data.values()))}    </{tag}>\n"
@@ -71,7 +71,7 @@ def _declared(name: str, values: NDArray) -> str:
     return f'      <PDataArray type="{kind}" Name="{name_in_xml(name)}"{columns}/>\n'
 
 
-def read_pvtu(path: Path) -> Grid:
+def read_pvtu(path: Path) -> RawGrid:
     """The mesh in a PVTU file, its pieces joined, see `tetopt.io.pieces.joined`.
 
     Raises

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 from tetopt.conversions import CELL_DIMENSIONS, corner_kinds
 
 
-class Grid(NamedTuple):
+class RawGrid(NamedTuple):
     """An unstructured grid of VTK's as plain arrays."""
 
     points: NDArray[np.float64]  # (N, 3)

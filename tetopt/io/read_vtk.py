@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from tetopt.errors import InputError
 from tetopt.io.apart import DEFLATE_RATIO, read_apart
-from tetopt.io.raw import Grid
+from tetopt.io.raw import RawGrid
 
 if TYPE_CHECKING:
     from vtkmodules.vtkCommonDataModel import vtkUnstructuredGrid
@@ -28,7 +28,7 @@ LEGACY_COUNT = re.compile(
 ENTITIES = re.compile(rb"<!(?:DOCTYPE|ENTITY)", re.I)
 
 
-def read_vtk(path: Path) -> Grid:
+def read_vtk(path: Path) -> RawGrid:
     """The unstructured grid in a VTU or VTK file.
 
     Raises
@@ -41,7 +41,7 @@ def read_vtk(path: Path) -> Grid:
     return checked_grid(*read_apart(arrays_of, path, library="VTK"))
 
 
-def checked_grid(kind: str, errors: str, arrays: dict[str, Any]) -> Grid:
+def checked_grid(kind: str, errors: str, arrays: dict[str, Any]) -> RawGrid:
     """What `arrays_of` gives as a grid whose arrays fit one another.
 
     Raises
@@ -53,7 +53,7 @@ def checked_grid(kind: str, errors: str, arrays: dict[str, Any]) -> Grid:
         raise InputError(f"damaged, or not a VTK mesh ({errors})")
     if kind != "UnstructuredGrid" or not len(arrays.get("cell_types", ())):
         raise InputError(f"expected an unstructured grid with cells, found {kind}; damaged?")
-    grid = Grid(**arrays)
+    grid = RawGrid(**arrays)
     starts, n = grid.offsets, len(grid.cell_types)
     is_whole = len(starts) == n + 1 and starts[0] == 0 and starts[-1] <= len(grid.connectivity)
     is_whole &= all(len(each) == len(grid.points) for each in grid.point_data.values())

@@ -29,7 +29,7 @@ from numpy.typing import NDArray
 from tetopt.conversions import VTK_KINDS, add_array, vtk_grid
 from tetopt.image import Image
 from tetopt.incoming import json_of
-from tetopt.io.raw import Grid
+from tetopt.io.raw import RawGrid
 from tetopt.io.text import xml_attribute
 from tetopt.mesh import Mesh
 from tetopt.model.fields import is_stress
@@ -47,7 +47,7 @@ FACETS_PREFIX, CELLS_PREFIX, CHECKSUM_NAME = "facets:", "cells:", "cells_sha256"
 LEGACY_VERSION = 42  # version 4.2: 5.1 is not read by older programs, 3D Slicer among them
 
 
-def vtk_of(grid: Grid) -> vtkUnstructuredGrid:
+def vtk_of(grid: RawGrid) -> vtkUnstructuredGrid:
     """A grid of plain arrays, whose cells are all of one kind, as VTK's."""
     cells = grid.connectivity.reshape(len(grid.cell_types), -1)
     of_vtk = vtk_grid(grid.points, cells, int(grid.cell_types[0]), grid.cell_data, grid.point_data)

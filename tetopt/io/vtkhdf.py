@@ -20,7 +20,7 @@ from tetopt.errors import InputError
 from tetopt.extras import install_hint
 from tetopt.io.apart import DEFLATE_RATIO, read_apart
 from tetopt.io.pieces import MOST_PIECES, joined, model_pieces
-from tetopt.io.raw import Grid
+from tetopt.io.raw import RawGrid
 from tetopt.io.read_vtk import checked_grid
 from tetopt.io.text import plain, short_name
 from tetopt.model.model import Model
@@ -99,7 +99,7 @@ def _write(group: h5py.Group, name: str, values: NDArray) -> None:
     group.create_dataset(name, data=values, track_times=False, **options)
 
 
-def read_vtkhdf(path: Path) -> Grid:
+def read_vtkhdf(path: Path) -> RawGrid:
     """The mesh in a VTKHDF file, its pieces joined, see `tetopt.io.pieces.joined`.
 
     Raises

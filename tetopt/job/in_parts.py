@@ -37,7 +37,7 @@ from tetopt.mesh import Mesh
 from tetopt.model.averages import DEFAULT_AVERAGE
 from tetopt.model.sets import box_of, box_text
 from tetopt.parts.part import work_on
-from tetopt.parts.rounds import Parted, Request, Round, Runner, expected_parts, mesh_in_parts
+from tetopt.parts.rounds import Parted, PartsRequest, Round, Runner, expected_parts, mesh_in_parts
 from tetopt.parts.work import LOGS_NAME, STATE_NAME, VolumeFile, removed
 from tetopt.start.sizes import Sizes
 from tetopt.stored import StoredImage
@@ -298,7 +298,7 @@ def _check_room(need: Need, room: float) -> None:
         )
 
 
-def _request(plan: Plan, source: Source | StoredSource, sizes: Sizes | None) -> Request:
+def _request(plan: Plan, source: Source | StoredSource, sizes: Sizes | None) -> PartsRequest:
     """What is asked for, with a checksum of all on which the mesh depends."""
     engine, nodes = plan.engine_options(), plan.job.nodes
     assert nodes is not None, "filled in by `with_numbers`"
@@ -315,7 +315,7 @@ def _request(plan: Plan, source: Source | StoredSource, sizes: Sizes | None) -> 
         "place": str(path.resolve()) if isinstance(source, StoredSource) else None,
     }  # fmt: skip
     checksum = hashlib.sha256(json.dumps(whole, sort_keys=True).encode()).hexdigest()
-    return Request(**values, sizes=sizes, checksum=checksum)
+    return PartsRequest(**values, sizes=sizes, checksum=checksum)
 
 
 def end_work(plan: Plan, result: Optimized) -> None:

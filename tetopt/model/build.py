@@ -150,7 +150,7 @@ def model_of(
     about = _with_table_in_words(about or {}, labels)
     mean = cell_data.get("mean")
     mean = mean if mean is not None and mean.ndim == 1 else None
-    cells = _Cells(mesh, image, mean, labels, table_of_words(about.get(TABLE_TEXT)).names)
+    cells = _ModelCells(mesh, image, mean, labels, table_of_words(about.get(TABLE_TEXT)).names)
     if known_sets is None:
         box = box_of(image) if box is None and image is not None else box
         known_sets = _sets(cells, box, cell_data, loaded, loads)
@@ -201,7 +201,7 @@ def _with_table_in_words(about: dict[str, Any], labels: NDArray[np.int64] | None
 
 
 def _sets(
-    cells: _Cells, box: Box | None, cell_data: dict[str, NDArray], loaded: MeshFile | None, loads: Iterable[str]
+    cells: _ModelCells, box: Box | None, cell_data: dict[str, NDArray], loaded: MeshFile | None, loads: Iterable[str]
 ) -> Sets:
     """The standard sets, and those of the mesh's file beside them."""
     if loaded is None:
@@ -214,7 +214,7 @@ def _sets(
     return sets
 
 
-def _materials(cells: _Cells, young: Any, nu: Any, density: Any, average: str) -> Materials:
+def _materials(cells: _ModelCells, young: Any, nu: Any, density: Any, average: str) -> Materials:
     """The materials of laws; ratio and density by default of the columns of the file that the modulus names."""
     if nu is None:
         nu = young if isinstance(young, str) and has_column(young, "nu") else DEFAULT_NU
@@ -242,7 +242,7 @@ def _varying_moduli(
     )
 
 
-class _Cells(NamedTuple):
+class _ModelCells(NamedTuple):
     """What laws are of."""
 
     mesh: Mesh
@@ -252,7 +252,7 @@ class _Cells(NamedTuple):
     names: dict[int, str]  # of labels
 
 
-def _values(value: Any, name: str, cells: _Cells, average: str = "mean") -> NDArray[np.float64]:
+def _values(value: Any, name: str, cells: _ModelCells, average: str = "mean") -> NDArray[np.float64]:
     """The value of each cell, or one for all."""
     law: Any = parse_any_law(value, name) if isinstance(value, str) else value
     if not callable(law) and not isinstance(law, ByLabel) and np.ndim(law) < 2:

@@ -31,7 +31,7 @@ MARGIN_SIZE = (
 Kind = Literal["measure", "improve", "fields"]
 
 
-class Settings(NamedTuple):
+class PartSettings(NamedTuple):
     """What all parts of a run have in common."""
 
     k_D: float
@@ -65,7 +65,7 @@ class Numbers(NamedTuple):
 
 
 def box_of_ticks(
-    ticks: NDArray[np.int64], settings: Settings
+    ticks: NDArray[np.int64], settings: PartSettings
 ) -> tuple[tuple[int, ...], tuple[int, ...]]:  # fmt: skip
     """The voxels of a part, start to before stop (3,) each: those around its nodes, within the image."""
     index = ticks * 2.0**-settings.bits
@@ -87,7 +87,7 @@ def work_on(name: str) -> Numbers:
     of = checksum(arrays, text)
     if (before := numbers_in(done_path(path), of)) is not None:
         return before
-    settings = Settings(**text["settings"])
+    settings = PartSettings(**text["settings"])
     start, stop = box_of_ticks(arrays["ticks"], settings)
     stored = open_volume(path.parents[1])
     image = stored.box(start, stop)
@@ -130,7 +130,7 @@ def _fields(image: Image, mesh: Mesh, whole: Whole, nearest: NDArray[np.int64]) 
 
 
 def _improved(
-    image: Image, mesh: Mesh, whole: Whole, settings: Settings, text: dict[str, Any]
+    image: Image, mesh: Mesh, whole: Whole, settings: PartSettings, text: dict[str, Any]
 ) -> tuple[dict[str, NDArray], Numbers]:
     """The part after the iterations that are asked for, which may be none."""
     run = Run(plain(image), mesh, settings.k_D, settings.shape_power, is_graded=True, whole=whole)

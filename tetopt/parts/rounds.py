@@ -28,11 +28,11 @@ from tetopt.geometry.simplex import volumes
 from tetopt.image import Image, VoxelGrid
 from tetopt.mesh import Mesh
 from tetopt.parts.cut import ROUND_SHIFTS, Piece, Shared, counts_of, cut, joined, pieces
-from tetopt.parts.part import Kind, Numbers, Settings, box_of_ticks, work_on
+from tetopt.parts.part import Kind, Numbers, PartSettings, box_of_ticks, work_on
 from tetopt.parts.work import (
     INITIAL_NAME,
-    State,
     VolumeFile,
+    WorkState,
     done_path,
     gone_if_refused,
     load_arrays,
@@ -61,7 +61,7 @@ Runner = Callable[[Sequence[str]], Iterator[Any]]
 """Runs `work_on` for each of the files of parts, and yields as they end."""
 
 
-class Request(NamedTuple):
+class PartsRequest(NamedTuple):
     """What is asked of a run in parts."""
 
     nodes: int
@@ -103,7 +103,8 @@ def in_turn(names: Sequence[str]) -> Iterator[Any]:
 
 
 def mesh_in_parts(
-    request: Request, folder: Path, statistics: Statistics | None = None, *, volume: VolumeFile | Image | None = None,
+    request: PartsRequest, folder: Path, statistics: Statistics | None = None, *,
+    volume: VolumeFile | Image | None = None,
     crew: Callable[[int, float], AbstractContextManager[Runner]] = lambda n_parts, task_bytes: nullcontext(in_turn),
     is_over: Callable[[], bool] = lambda: False,
     watch: Callable[[Round, list[Record]], None] = lambda now, history: None,
@@ -113,7 +114,7 @@ def mesh_in_parts(
 
     Parameters
     ----------
-    request : Request
+    request : PartsRequest
     folder : Path
         Of work. All that is done stays in it, so that the same request goes on where it ended, whatever ended it;
         unless it is refused before a part begins.
@@ -168,7 +169,7 @@ def mesh_in_parts(
 
 
 class _Run(NamedTuple):
-    request: Request
+    request: PartsRequest
     folder: Path
     image: StoredImage
     begin: float
@@ -176,12 +177,12 @@ class _Run(NamedTuple):
     watch: Callable[[Round, list[Record]], None]
 
 
-def _n_rounds(request: Request) -> int:
+def _n_rounds(request: PartsRequest) -> int:
     """Rounds that improve the mesh."""
     return ceil(request.iterations / ROUND_SWEEPS)
 
 
-def _begun(request: Request, folder: Path, image: StoredImage, statistics: Statistics | None) -> State:
+def _begun(request: PartsRequest, folder: Path, image: StoredImage, statistics: Statistics | None) -> WorkState:
     """The state before the first round: the octree, on the grid of ticks."""
     begin = time.perf_counter()
     statistics = stored_statistics(image) if statistics is None else statistics
@@ -189,28 +190,28 @@ def _begun(request: Request, folder: Path, image: StoredImage, statistics: Stati
     bits = grid_bits(image, mesh.points)
     ticks = np.rint(image.to_index(mesh.points) * 2.0**bits).astype(np.int64)
     sizes = (Sizes() if request.sizes is None else request.sizes).prepared(3)
-    settings = Settings(
+    settings = PartSettings(
         request.k_D, request.shape_power, request.min_dihedral, request.tolerance,
         _n_rounds(request) * ROUND_SWEEPS, int(EXCHANGING_SHARE * request.iterations) if request.k_D > 0.0 else 0,
         sizes.smallest, sizes.longest_edge(image, request.nodes), sizes.gradation, image.shape, bits, statistics.noise,
     )  # fmt: skip
     known = {"settings": settings._asdict(), "statistics": statistics._asdict(), "history": []}
-    state = State(request.checksum, 0, known | {"seconds": time.perf_counter() - begin})
+    state = WorkState(request.checksum, 0, known | {"seconds": time.perf_counter() - begin})
     arrays = {"ticks": ticks, "cells": mesh.cells}
     save_arrays(folder / INITIAL_NAME, arrays, {})
     save_state(folder, state, arrays)
     return state
 
 
-def _settings(state: State) -> Settings:
-    return Settings(**state.known["settings"])
+def _settings(state: WorkState) -> PartSettings:
+    return PartSettings(**state.known["settings"])
 
 
-def _history(state: State) -> list[Record]:
+def _history(state: WorkState) -> list[Record]:
     return [Record(*row) for row in state.known["history"]]
 
 
-def _cut(run: _Run, state: State, counts: tuple[int, ...], shift: float) -> list[Piece]:
+def _cut(run: _Run, state: WorkState, counts: tuple[int, ...], shift: float) -> list[Piece]:
     """The parts of the mesh as it stands."""
     mesh = load_mesh_of(run.folder, state)
     index = mesh["ticks"] * 2.0 ** -_settings(state).bits
@@ -218,7 +219,7 @@ def _cut(run: _Run, state: State, counts: tuple[int, ...], shift: float) -> list
     return pieces(Shared(mesh["ticks"], mesh["cells"], part))
 
 
-def _initial(run: _Run, state: State) -> Mesh:
+def _initial(run: _Run, state: WorkState) -> Mesh:
     arrays = load_arrays(run.folder / INITIAL_NAME)[0]
     return Mesh(run.image.to_world(arrays["ticks"] * 2.0 ** -_settings(state).bits), arrays["cells"])
 
@@ -228,7 +229,7 @@ def _weights(index: NDArray[np.float64], cells: NDArray[np.int64]) -> NDArray[np
     return 1.0 / MOST_CELLS + np.abs(volumes(index, cells)) / MOST_VOXELS
 
 
-def _counts(run: _Run, state: State) -> tuple[int, ...]:
+def _counts(run: _Run, state: WorkState) -> tuple[int, ...]:
     """Shares along each axis: so many that no part holds too much, whatever machine it is."""
     mesh = load_arrays(run.folder / INITIAL_NAME)[0]
     index = mesh["ticks"] * 2.0 ** -_settings(state).bits
@@ -244,7 +245,7 @@ def expected_parts(grid: VoxelGrid, request_nodes: int, n_parts: int) -> tuple[i
     return number, part_bytes(int(BOX_EXCESS * n_voxels / number), n_cells // number)
 
 
-def _part_sizes(run: _Run, state: State, counts: tuple[int, ...]) -> Iterator[tuple[int, int]]:
+def _part_sizes(run: _Run, state: WorkState, counts: tuple[int, ...]) -> Iterator[tuple[int, int]]:
     """Voxels of the box and cells of each part, by the mesh as it stands."""
     for piece in _cut(run, state, counts, ROUND_SHIFTS[0]):
         start, stop = box_of_ticks(piece.ticks, _settings(state))
@@ -252,7 +253,7 @@ def _part_sizes(run: _Run, state: State, counts: tuple[int, ...]) -> Iterator[tu
         yield int(BOX_EXCESS * n_voxels), len(piece.cells)
 
 
-def _round(run: _Run, state: State, counts: tuple[int, ...], runner: Runner, task_bytes: float) -> State | None:
+def _round(run: _Run, state: WorkState, counts: tuple[int, ...], runner: Runner, task_bytes: float) -> WorkState | None:
     """One round; None if it was cut short."""
     number = state.n_rounds
     kind: Kind = "measure" if number == 0 else "improve"
@@ -265,7 +266,7 @@ def _round(run: _Run, state: State, counts: tuple[int, ...], runner: Runner, tas
     return _completed(run, state, mesh, [Numbers(**each) for each in numbers])
 
 
-def _completed(run: _Run, state: State, mesh: Shared, numbers: list[Numbers]) -> State:
+def _completed(run: _Run, state: WorkState, mesh: Shared, numbers: list[Numbers]) -> WorkState:
     """The state after a round, on disk."""
     number, settings, history = state.n_rounds, _settings(state), _history(state)
     E_G, squares = sum(each.E_G for each in numbers), sum(each.squares for each in numbers)
@@ -285,13 +286,13 @@ def _completed(run: _Run, state: State, mesh: Shared, numbers: list[Numbers]) ->
         )
     )  # fmt: skip
     known = state.known | {"settings": settings._asdict(), "history": [list(row) for row in history]}
-    after = State(state.request, number + 1, known | {"seconds": seconds})
+    after = WorkState(state.request, number + 1, known | {"seconds": seconds})
     save_state(run.folder, after, {"ticks": mesh.ticks, "cells": mesh.cells})
     return after
 
 
 def _ran(
-    run: _Run, state: State, parts: list[Piece], kind: Kind, runner: Runner, task_bytes: float
+    run: _Run, state: WorkState, parts: list[Piece], kind: Kind, runner: Runner, task_bytes: float
 ) -> list[tuple[dict[str, NDArray], dict[str, Any]]] | None:
     """What came of each part, in their order; None if the run was cut short before all were done."""
     folder, number = round_folder(run.folder, state.n_rounds), state.n_rounds
@@ -319,7 +320,7 @@ def _ran(
     return [load_arrays(done_path(path)) for path in paths]
 
 
-def _is_converged(request: Request, state: State) -> bool:
+def _is_converged(request: PartsRequest, state: WorkState) -> bool:
     """Whether E has fallen by too little in the last round, once nodes are exchanged no more."""
     history, settings = _history(state), _settings(state)
     if len(history) < 2 or history[-2].iteration < settings.n_early or history[-2].E <= 0.0:
@@ -328,7 +329,7 @@ def _is_converged(request: Request, state: State) -> bool:
 
 
 def _finished(
-    run: _Run, state: State, counts: tuple[int, ...], runner: Runner, ended: str, task_bytes: float
+    run: _Run, state: WorkState, counts: tuple[int, ...], runner: Runner, ended: str, task_bytes: float
 ) -> Parted:  # fmt: skip
     """The result of the rounds that are complete, its cells in the order of the parts that took their fields."""
     history = _history(state)

@@ -173,7 +173,7 @@ def checksum(arrays: dict[str, NDArray], text: dict[str, Any]) -> str:
     return digest.hexdigest()
 
 
-class State(NamedTuple):
+class WorkState(NamedTuple):
     """What is known after a round that is complete."""
 
     request: str  # checksum of what was asked
@@ -181,7 +181,7 @@ class State(NamedTuple):
     known: dict[str, Any]  # numbers by name
 
 
-def save_state(folder: Path, state: State, mesh: dict[str, NDArray]) -> None:
+def save_state(folder: Path, state: WorkState, mesh: dict[str, NDArray]) -> None:
     """Note that a round is complete: its mesh first, then the state, by which alone it counts, then the rest goes."""
     save_arrays(mesh_path(folder, state.n_rounds), mesh, {})
     save_json(folder / STATE_NAME, {"state": state._asdict(), "checksum": checksum({}, state._asdict())})
@@ -193,7 +193,7 @@ def save_state(folder: Path, state: State, mesh: dict[str, NDArray]) -> None:
             shutil.rmtree(old)
 
 
-def load_state(folder: Path, request: str) -> State | None:
+def load_state(folder: Path, request: str) -> WorkState | None:
     """What is known after the last complete round of a run of this request; None if there is none.
 
     Raises
@@ -206,7 +206,7 @@ def load_state(folder: Path, request: str) -> State | None:
         return None
     try:
         words = json_of(own_bytes(path).decode())
-        state = State(**words["state"])
+        state = WorkState(**words["state"])
         if words["checksum"] != checksum({}, state._asdict()):
             raise ValueError("its checksum is another one")
     except DAMAGE_ERRORS as error:
@@ -219,7 +219,7 @@ def load_state(folder: Path, request: str) -> State | None:
     return state
 
 
-def load_mesh_of(folder: Path, state: State) -> dict[str, NDArray]:
+def load_mesh_of(folder: Path, state: WorkState) -> dict[str, NDArray]:
     """The mesh after the last complete round."""
     return load_arrays(mesh_path(folder, state.n_rounds))[0]
 

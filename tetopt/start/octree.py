@@ -40,7 +40,7 @@ from tetopt.start.sizes import (
     Sizes,
     equilateral_nodes,
 )
-from tetopt.start.sums import BlockSums, Channels, Source, block_starts, block_sums, channels_of, halved, source_of
+from tetopt.start.sums import BlockSums, Channels, VoxelSource, block_starts, block_sums, channels_of, halved, source_of
 from tetopt.stored import StoredImage
 from tetopt.target.content import Content, plain
 from tetopt.target.statistics import READ_BYTES, Statistics
@@ -153,7 +153,7 @@ class _BlockLimits(NamedTuple):
     n_rings: int  # blocks of a divided block's size around it, in every direction
 
 
-def _block_limits(source: Source, nodes: int, sizes: Sizes | None) -> _BlockLimits:
+def _block_limits(source: VoxelSource, nodes: int, sizes: Sizes | None) -> _BlockLimits:
     """The limits that the number of nodes and the sizes set; InputError where they cannot be kept."""
     image = source.grid
     n = image.ndim
@@ -212,13 +212,13 @@ def nodes_of_sizes(image: Image | Content, sizes: Sizes) -> tuple[int, float]:
     return enough, float(np.mean(has_one if inside is None else has_one[inside]))
 
 
-def _fewest_nodes(source: Source, limits: _BlockLimits) -> float:
+def _fewest_nodes(source: VoxelSource, limits: _BlockLimits) -> float:
     """A lower bound of the nodes that the bounds need: two for each block as large as it may be."""
     with np.errstate(over="ignore"):  # a bound of 1e300 mm needs none
         return float(2.0 * source.volume / np.float64(limits.largest) ** source.grid.ndim)
 
 
-def _target_nodes(source: Source, limits: _BlockLimits) -> float:
+def _target_nodes(source: VoxelSource, limits: _BlockLimits) -> float:
     """The nodes of equilateral cells of the targets, where there are any."""
     if limits.target is None:
         return 0.0
@@ -247,7 +247,7 @@ def nearest_octree(
     return _octree_within(source, nodes, _block_limits(source, nodes, sizes))
 
 
-def _octree_within(source: Source, nodes: int, limits: _BlockLimits) -> Mesh:
+def _octree_within(source: VoxelSource, nodes: int, limits: _BlockLimits) -> Mesh:
     """The octree within the limits that has most nearly so many nodes, cut off at the mask's surface."""
     region = None if source.content is None else source.content.region
     if source.content is None or region is None:
@@ -273,7 +273,7 @@ def _octree_within(source: Source, nodes: int, limits: _BlockLimits) -> Mesh:
     return best
 
 
-def _octree_of_box(source: Source, nodes: int, limits: _BlockLimits) -> Mesh:
+def _octree_of_box(source: VoxelSource, nodes: int, limits: _BlockLimits) -> Mesh:
     """The octree of the whole box that has most nearly so many nodes."""
     image = source.grid
     _check_not_below_voxels(image, max(_fewest_nodes(source, limits), _target_nodes(source, limits)))
@@ -303,7 +303,7 @@ class _Blocks(NamedTuple):
 
 
 def _blocks_by_depth(
-    source: Source, channels: Channels, roots: tuple[int, ...], limits: _BlockLimits
+    source: VoxelSource, channels: Channels, roots: tuple[int, ...], limits: _BlockLimits
 ) -> list[_Blocks]:  # fmt: skip
     """The blocks of each depth, the coarsest first, with their errors and whether they exceed the limits."""
     image = source.grid
@@ -433,7 +433,9 @@ def _least_targets(data: NDArray, counts: NDArray[np.int64]) -> NDArray:
     return data
 
 
-def _best_division(source: Source, nodes: int, limits: _BlockLimits) -> tuple[tuple[int, ...], list[NDArray[np.bool_]]]:
+def _best_division(
+    source: VoxelSource, nodes: int, limits: _BlockLimits
+) -> tuple[tuple[int, ...], list[NDArray[np.bool_]]]:
     """Numbers of roots along each axis, and which blocks are divided, of the octree with most nearly so many nodes.
 
     Where many blocks are alike, they are all divided or none, and some numbers cannot be reached from one size of

@@ -31,7 +31,7 @@ from tetopt.target.statistics import (
 )
 
 
-class Source(NamedTuple):
+class VoxelSource(NamedTuple):
     """Where voxels come from; made by `source_of`. There is either a content or a stored image."""
 
     grid: VoxelGrid
@@ -55,12 +55,12 @@ class Source(NamedTuple):
         return None if self.content is None or self.content.region is None else self.content.region.inside
 
 
-def source_of(image: Image | Content | StoredImage, statistics: Statistics | None = None) -> Source:
+def source_of(image: Image | Content | StoredImage, statistics: Statistics | None = None) -> VoxelSource:
     """What an octree is made of; nothing is read yet."""
     if isinstance(image, StoredImage):
-        return Source(image, None, image, statistics)
+        return VoxelSource(image, None, image, statistics)
     content = plain(image)
-    return Source(content.image, content, None, None)
+    return VoxelSource(content.image, content, None, None)
 
 
 class Channels(NamedTuple):
@@ -80,7 +80,7 @@ class Channels(NamedTuple):
         return deviations
 
 
-def channels_of(source: Source) -> Channels:
+def channels_of(source: VoxelSource) -> Channels:
     """The channels of a source, from one pass over its voxels where their statistics are not known.
 
     Raises
@@ -164,7 +164,7 @@ def block_starts(size: int, count: int) -> NDArray[np.int64]:
     return np.ceil(np.arange(count) * (size / count) - 0.5).astype(np.int64)
 
 
-def block_sums(source: Source, channels: Channels, counts: NDArray[np.int64]) -> BlockSums:
+def block_sums(source: VoxelSource, channels: Channels, counts: NDArray[np.int64]) -> BlockSums:
     """Sums over so many equal blocks along each axis, from one pass over the voxels."""
     shape = source.grid.shape
     starts = [block_starts(size, count) for size, count in zip(shape, counts, strict=True)]
@@ -196,7 +196,7 @@ def block_sums(source: Source, channels: Channels, counts: NDArray[np.int64]) ->
     return BlockSums(lengths, inside, totals[0], firsts)
 
 
-def _boxes_of(source: Source) -> Iterator[tuple[Box, NDArray, NDArray[np.bool_] | None]]:
+def _boxes_of(source: VoxelSource) -> Iterator[tuple[Box, NDArray, NDArray[np.bool_] | None]]:
     """Boxes of whole rows, plane after plane: their voxels, (C, P, R, K), and which are inside, (P, R, K)."""
     if source.stored is not None:
         for box in stored_boxes(source.stored):

@@ -57,10 +57,10 @@ from tetopt.study.compare_report import (
     LabelSource,
     Measurement,
     PipelineResult,
+    PipelineRun,
     ReferenceEnergy,
     ReferenceGrid,
     Report,
-    Run,
     Settings,
     Simulation,
     Solved,
@@ -512,7 +512,7 @@ def _attempt(bench: Bench, name: str, order: int, nodes: int, repeat: int) -> At
     fields |= {} if outcome.labels is None else {"label": outcome.labels}
     save_mesh(mesh_path, outcome.mesh, fields)
     total = sum(seconds for step, seconds in outcome.seconds.items() if step not in UNTIMED_STEPS)
-    done = Run(outcome.seconds, total, outcome.peak_bytes, measurement)
+    done = PipelineRun(outcome.seconds, total, outcome.peak_bytes, measurement)
     _write_down(path, as_json(attempt._replace(run=done, mesh_file_sha256=sha256(mesh_path))))
     share = "none" if measurement.E_D_share is None else f"{measurement.E_D_share:.4f}"
     bench.say(f"{title}: {measurement.n_nodes} nodes, E_D share {share}, {total:.0f} s")

@@ -8,7 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from tetopt.study.compare_report import ORDER_WORDS, LabelRow, PipelineResult, Report, Run, averages_of
+from tetopt.study.compare_report import ORDER_WORDS, LabelRow, PipelineResult, PipelineRun, Report, averages_of
 
 GROUPS = ("Image", "Shape", "Simulation", "Cost")
 JUDGED_VOXELS = 500  # labels with more are judged; of smaller ones a mesh of few nodes can only keep some
@@ -28,7 +28,7 @@ class Criterion(NamedTuple):
     group: str  # of `GROUPS`
     part: str  # the heading that it stands under
     title: str
-    value: Callable[[Run], float | None]
+    value: Callable[[PipelineRun], float | None]
     better: int  # -1 if smaller is better, +1 if larger, 0 if neither
     order: int = 1  # of the cells whose meshes are compared
     is_detail: bool = False  # in the table that is folded away
@@ -39,7 +39,7 @@ class Criterion(NamedTuple):
     own_change: float | None = None  # of the reference, from its half resolution; None where that is not known
 
 
-class Entry(NamedTuple):
+class CriterionEntry(NamedTuple):
     """What a pipeline has for a criterion."""
 
     value: float | None  # median
@@ -66,10 +66,10 @@ def criteria(report: Report) -> list[Criterion]:
     ]  # fmt: skip
 
 
-def _at(*keys: str) -> Callable[[Run], float | None]:
+def _at(*keys: str) -> Callable[[PipelineRun], float | None]:
     """What stands at this place of a run's measurement; None where a table on the way has no such row."""
 
-    def value(run: Run) -> Any:
+    def value(run: PipelineRun) -> Any:
         item: Any = run.measurement
         for key in keys:
             if item is not None:
@@ -83,7 +83,7 @@ def _shape_criteria() -> list[Criterion]:
     def row(title: str, keys: tuple[str, ...], better: int, blind: str = "") -> Criterion:
         return Criterion("Shape", "Shape", title, _at("quality", *keys), better, is_detail=not blind, blind=blind)
 
-    def bad_percent(run: Run) -> float:
+    def bad_percent(run: PipelineRun) -> float:
         shape = run.measurement.quality
         return 100.0 * sum(shape.kinds.values()) / shape.n_cells
 
@@ -107,15 +107,17 @@ def _shape_criteria() -> list[Criterion]:
 def _label_criteria(report: Report) -> list[Criterion]:
     judged = judged_labels(report)
 
-    def over(of: Callable[[list[float]], float], value: Callable[[LabelRow], Any]) -> Callable[[Run], float | None]:
-        def of_run(run: Run) -> float | None:
+    def over(
+        of: Callable[[list[float]], float], value: Callable[[LabelRow], Any]
+    ) -> Callable[[PipelineRun], float | None]:
+        def of_run(run: PipelineRun) -> float | None:
             values = [value(row) for row in run.measurement.labels if row.label in judged]
             # Without a lost label, which has no surface, the mean over the others would flatter.
             return of(values) if values and None not in values else None
 
         return of_run
 
-    def by_voxels(value: Callable[[LabelRow], Any]) -> Callable[[Run], float | None]:
+    def by_voxels(value: Callable[[LabelRow], Any]) -> Callable[[PipelineRun], float | None]:
         weighed = over(sum, lambda row: None if value(row) is None else judged[row.label] * value(row))
         total = sum(judged.values())
         return lambda run: None if (whole := weighed(run)) is None else whole / total
@@ -126,7 +128,7 @@ def _label_criteria(report: Report) -> list[Criterion]:
     def largest_error(values: list[float]) -> float:
         return max(map(abs, values))
 
-    rows: list[tuple[str, Callable[[Run], float | None], int, str]] = [
+    rows: list[tuple[str, Callable[[PipelineRun], float | None], int, str]] = [
         ("mean label Dice", over(mean, attrgetter("dice")), 1, "thin parts, which weigh by their volume alone"),
         ("smallest label Dice", over(min, attrgetter("dice")), 1, "all labels but one"),
         ("mean label surface distance, mm", over(mean, attrgetter("surface_mean_mm")), -1, "single spikes and holes"),
@@ -179,7 +181,7 @@ def volume_error(row: LabelRow) -> float | None:
     return row.mesh_volume_mm3 / row.volume_mm3 - 1.0 if row.volume_mm3 else None
 
 
-def _n_lost(run: Run) -> int | None:
+def _n_lost(run: PipelineRun) -> int | None:
     labels = run.measurement.labels
     return sum(row.is_lost for row in labels) if labels else None
 
@@ -208,7 +210,7 @@ def _fem_criteria(report: Report, nu: str, order: int, is_first: bool) -> list[C
         if other != average
         for title, name in COMPRESSION_ERRORS
     ]  # fmt: skip
-    more: list[tuple[str, Callable[[Run], float | None], int]] = [
+    more: list[tuple[str, Callable[[PipelineRun], float | None], int]] = [
         ("λ max", _at("fem", nu, "lambda_max"), 0),
         ("condition number", _at("fem", nu, "cond"), -1),
         ("CG iterations", _at("fem", nu, "cg_iterations"), -1),
@@ -216,7 +218,7 @@ def _fem_criteria(report: Report, nu: str, order: int, is_first: bool) -> list[C
     return rows + [Criterion("Simulation", part, *each, order, is_detail=True) for each in more]
 
 
-def fem_error(nu: str, average: str, name: str) -> Callable[[Run], float | None]:
+def fem_error(nu: str, average: str, name: str) -> Callable[[PipelineRun], float | None]:
     """An error of the compression, by its field's name."""
     return _at("fem", nu, "averages", average, "errors", name)
 
@@ -231,15 +233,19 @@ def of_order(report: Report, order: int) -> list[PipelineResult]:
     return report.pipelines if order == 1 else report.quadratic
 
 
-def entries_of(criterion: Criterion, report: Report) -> list[Entry]:
+def entries_of(criterion: Criterion, report: Report) -> list[CriterionEntry]:
     """What each pipeline has for a criterion."""
     return [entry(criterion.value, pipeline) for pipeline in of_order(report, criterion.order)]
 
 
-def entry(value_of: Callable[[Run], float | None], pipeline: PipelineResult) -> Entry:
+def entry(value_of: Callable[[PipelineRun], float | None], pipeline: PipelineResult) -> CriterionEntry:
     """Median and range over a pipeline's runs; all None if no run has a value."""
     values = [value for run in pipeline.runs if (value := value_of(run)) is not None]
-    return Entry(float(np.median(values)), min(values), max(values)) if values else Entry(None, None, None)
+    return (
+        CriterionEntry(float(np.median(values)), min(values), max(values))
+        if values
+        else CriterionEntry(None, None, None)
+    )
 
 
 def undecided(criterion: Criterion, report: Report, one: int, other: int) -> str:

@@ -21,7 +21,7 @@ from tetopt.report.colours import grey_limits, plain_text
 from tetopt.report.figures import SliceView, draw_edges, fill_cells
 from tetopt.report.scene import cutaway, save_scenes
 from tetopt.report.viewer import view_of
-from tetopt.study.compare_report import ORDER_WORDS, Curve, CurvePoint, Measurement, PipelineResult, Report, Run
+from tetopt.study.compare_report import ORDER_WORDS, Curve, CurvePoint, Measurement, PipelineResult, PipelineRun, Report
 from tetopt.study.pipelines import UNTIMED_STEPS
 
 # Okabe and Ito's palette, told apart by the colour-blind, without its yellow, which vanishes on white.
@@ -348,7 +348,7 @@ def timing_figure(report: Report) -> Figure:
     return figure
 
 
-def _finished(report: Report) -> list[tuple[int, PipelineResult, Run]]:
+def _finished(report: Report) -> list[tuple[int, PipelineResult, PipelineRun]]:
     """The pipelines with a mesh: their places in the list, which give them their colours, and their median runs."""
     return [(number, each, each.median) for number, each in enumerate(report.pipelines) if each.median is not None]
 

@@ -13,7 +13,7 @@ from tetopt.study.compare_criteria import (
     EQUAL_SHARE,
     GROUPS,
     Criterion,
-    Entry,
+    CriterionEntry,
     criteria,
     entries_of,
     number_text,
@@ -36,8 +36,8 @@ class Claim(NamedTuple):
     group: str
     measure: str
     smaller_is_better: bool
-    ours: Entry
-    other: Entry
+    ours: CriterionEntry
+    other: CriterionEntry
     other_title: str
     other_kind: str  # "peer", "control", or "tetopt" for another of its own meshes
     ratio: float | None  # tetopt's over the other's; None where one is 0 or missing
@@ -161,7 +161,7 @@ def _undecided_remark(claims: list[Claim]) -> Iterator[str]:
         yield f"A peer's number is the better one, without a verdict: {'; '.join(lost)}."
 
 
-def _verdict(row: Criterion, own: Entry, other: Entry) -> Verdict:
+def _verdict(row: Criterion, own: CriterionEntry, other: CriterionEntry) -> Verdict:
     if own.value is None or own.low is None or own.high is None:
         return "worse"
     assert other.value is not None, "it was asked for"

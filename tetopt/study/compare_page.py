@@ -16,7 +16,7 @@ from tetopt.report.page import paragraph_html, picture_html, section_html, table
 from tetopt.report.viewer import View, views_html
 from tetopt.study.compare_criteria import (
     GROUPS,
-    Entry,
+    CriterionEntry,
     criteria,
     entry,
     fem_error,
@@ -139,7 +139,7 @@ def _claim_html(claim: Claim, is_first: bool) -> str:
     )
 
 
-def _range_html(each: Entry) -> str:
+def _range_html(each: CriterionEntry) -> str:
     return "" if each.low == each.high else f"<small>{short_text(each.low)} to {short_text(each.high)}</small>"
 
 

@@ -130,7 +130,7 @@ class Measurement(NamedTuple):
     not_compressed: str | None = None  # why
 
 
-class Run(NamedTuple):
+class PipelineRun(NamedTuple):
     """One execution of a pipeline that ended with a mesh; also the median, lowest or highest of several, by number."""
 
     seconds: dict[str, float]  # by step
@@ -145,7 +145,7 @@ class Attempt(NamedTuple):
     key: str  # of all that the numbers depend on
     failure: str | None
     notes: list[str]
-    run: Run | None  # None after a failure
+    run: PipelineRun | None  # None after a failure
     reason: str | None = None  # of the failure, as `tetopt.study.child.Reason`
     crashes: list[str] = []  # noqa: RUF012 - nobody changes it; of the run and of the one that it repeats
     mesh_file_sha256: str | None = None
@@ -162,10 +162,10 @@ class PipelineResult(NamedTuple):
     reason: str | None  # of it, as `tetopt.study.child.Reason`
     crashes: list[str]  # of all runs; each was run once more
     notes: list[str]
-    runs: list[Run]
-    median: Run | None = None  # None if no run ended with a mesh, as for the next two
-    low: Run | None = None
-    high: Run | None = None
+    runs: list[PipelineRun]
+    median: PipelineRun | None = None  # None if no run ended with a mesh, as for the next two
+    low: PipelineRun | None = None
+    high: PipelineRun | None = None
 
 
 class TradeoffRow(NamedTuple):

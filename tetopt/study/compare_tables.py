@@ -7,7 +7,7 @@ from collections.abc import Sequence
 
 from tetopt.study.compare_criteria import (
     Criterion,
-    Entry,
+    CriterionEntry,
     entries_of,
     loss_text,
     number_text,
@@ -68,7 +68,7 @@ def _absence(pipeline: PipelineResult) -> str:
     return "not installed" if pipeline.reason == "missing" else "failed"
 
 
-def _row_html(row: Criterion, report: Report, entries: Sequence[Entry]) -> str:
+def _row_html(row: Criterion, report: Report, entries: Sequence[CriterionEntry]) -> str:
     best = winners(row.better, [each.value for each in entries])
     open_words = _open_win(row, report, entries, best)
     cells = []
@@ -89,7 +89,7 @@ def _row_html(row: Criterion, report: Report, entries: Sequence[Entry]) -> str:
     return f'<tr><th scope="row">{html.escape(row.title)}{arrow}</th>{"".join(cells)}</tr>'
 
 
-def _open_win(row: Criterion, report: Report, entries: Sequence[Entry], best: Sequence[int]) -> str:
+def _open_win(row: Criterion, report: Report, entries: Sequence[CriterionEntry], best: Sequence[int]) -> str:
     """Why the best value of a row is no verdict over the one after it; "" where it is one, or shared."""
     others = [place for place, each in enumerate(entries) if each.value is not None and place not in best]
     if len(best) != 1 or not others:
@@ -98,7 +98,7 @@ def _open_win(row: Criterion, report: Report, entries: Sequence[Entry], best: Se
     return undecided(row, report, best[0], after)
 
 
-def _value_html(pipeline: PipelineResult, each: Entry) -> str:
+def _value_html(pipeline: PipelineResult, each: CriterionEntry) -> str:
     if pipeline.median is None:
         return f'<span class="failed">{_absence(pipeline)}</span>'
     text = f'<span class="value">{number_text(each.value)}</span>'
