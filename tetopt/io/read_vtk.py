@@ -84,7 +84,7 @@ def check_counts(path: Path) -> None:
 
 
 def arrays_of(path: str) -> tuple[str, str, dict[str, Any]]:
-    """The kind of data set, VTK's first complaint, and the arrays of a `Grid`."""
+    """The kind of data set, VTK's first complaint, and the arrays of a `RawGrid`."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
     from vtkmodules.vtkCommonCore import vtkOutputWindow, vtkStringOutputWindow, vtkUnsignedCharArray
     from vtkmodules.vtkIOLegacy import vtkDataSetReader
@@ -111,7 +111,7 @@ def arrays_of(path: str) -> tuple[str, str, dict[str, Any]]:
 
 
 def plain_arrays(grid: vtkUnstructuredGrid) -> dict[str, Any]:
-    """The arrays of a `Grid`, by name, of VTK's own, but for the types of cells."""
+    """The arrays of a `RawGrid`, by name, of VTK's own, but for the types of cells."""
     from vtkmodules.util.numpy_support import vtk_to_numpy
 
     cells = grid.GetCells()

@@ -119,7 +119,7 @@ def read_vtkhdf(path: Path) -> RawGrid:
 
 
 def hdf_pieces(path: str) -> list[dict[str, Any]]:
-    """The arrays of a `Grid` for each piece that has cells."""
+    """The arrays of a `RawGrid` for each piece that has cells."""
     import h5py
 
     try:
