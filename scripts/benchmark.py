@@ -184,7 +184,7 @@ def _cgal_command(program: str, labels: tetopt.Image, nodes: int, folder: Path) 
 
 def sampling(image: tetopt.Image, nodes: int) -> dict[str, Any]:
     """Voxels per second of the sampler and of scipy's find_simplex, on the same tessellation and volume."""
-    lattice = tetopt.lattice(image, nodes=nodes)
+    lattice = tetopt.lattice_mesh(image, nodes=nodes)
     index = image.to_index(lattice.points)
     inside = (index > -0.5 + 1e-9) & (index < np.array(image.shape) - 0.5 - 1e-9)
     shaken = image.to_world(index + inside * np.random.default_rng(0).normal(0.0, 0.3, index.shape))
@@ -220,7 +220,7 @@ def sampling(image: tetopt.Image, nodes: int) -> dict[str, Any]:
 
 def sampling_by_size(image: tetopt.Image, nodes: int) -> dict[str, float]:
     """The sampler alone on a mesh of that many nodes: tetrahedra a second, and beside numpy's two sums."""
-    mesh = tetopt.optimize(image, tetopt.lattice(image, nodes=nodes), k_D=0.0, iterations=1).mesh
+    mesh = tetopt.optimize(image, tetopt.lattice_mesh(image, nodes=nodes), k_D=0.0, iterations=1).mesh
     grid = sampling_grid(image, mesh.points)
     ticks, sides = to_ticks(image.to_index(mesh.points), grid), facets(mesh.cells)
     seconds = best_seconds(lambda: moment_sums(grid, ticks, mesh.cells, sides))
@@ -269,7 +269,7 @@ def graded_large(path: Path, nodes: int) -> dict[str, Any]:
 
 def paper(image: tetopt.Image, nodes: int, iterations: int) -> dict[str, Any]:
     """Seconds per iteration of the paper's scheme, and how much of one Delaunay takes."""
-    mesh = tetopt.lattice(image, nodes=nodes)
+    mesh = tetopt.lattice_mesh(image, nodes=nodes)
     fixed = tetopt.optimize_paper(image, mesh, k_D=0.2, iterations=iterations, retessellate="never")
     per_iteration = (fixed.history[-1].seconds - fixed.history[0].seconds) / iterations
     grid = sampling_grid(image, fixed.mesh.points)
@@ -285,7 +285,7 @@ def paper(image: tetopt.Image, nodes: int, iterations: int) -> dict[str, Any]:
 
 def bar(image: tetopt.Image, nodes: int) -> dict[str, Any]:
     """What 20 iterations at k_D = 0.2 reach."""
-    mesh = tetopt.lattice(image, nodes=nodes)
+    mesh = tetopt.lattice_mesh(image, nodes=nodes)
     result = tetopt.optimize_paper(image, mesh, k_D=0.2, iterations=20)
     last = result.history[-1]
     return {
@@ -298,7 +298,7 @@ def bar(image: tetopt.Image, nodes: int) -> dict[str, Any]:
 
 def engine(image: tetopt.Image, path: Path, sizes: Sequence[int]) -> dict[str, Any]:
     """The fast engine against the paper's scheme, at k_D = 0.5; how time and memory grow; a flip pass alone."""
-    mesh = tetopt.lattice(image, nodes=sizes[0])
+    mesh = tetopt.lattice_mesh(image, nodes=sizes[0])
     prepare_kernels(image, 0.5)
     reference = tetopt.optimize_paper(image, mesh, k_D=0.5, iterations=20).history
     same = tetopt.optimize(image, mesh, k_D=0.5, iterations=20, shape_power=1.0, min_dihedral=0.0).history
@@ -325,7 +325,7 @@ def in_a_child(path: Path, nodes: int) -> dict[str, Any]:
         "peak = lambda: resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6\n"
         "image = tetopt.load_image(sys.argv[1])\n"
         "prepare_kernels(image, 0.5)\n"
-        "mesh = tetopt.lattice(image, nodes=int(sys.argv[2]))\n"
+        "mesh = tetopt.lattice_mesh(image, nodes=int(sys.argv[2]))\n"
         "before = int(open('/proc/self/statm').read().split()[1]) * resource.getpagesize() / 1e9\n"
         "begin = time.perf_counter()\n"
         "result = tetopt.optimize(image, mesh, k_D=0.5)\n"
@@ -343,7 +343,7 @@ def in_a_child(path: Path, nodes: int) -> dict[str, Any]:
 
 def flip_pass(image: tetopt.Image, nodes: int) -> float:
     """Seconds per million tetrahedra to look at every facet and edge of a mesh that is good already."""
-    mesh = tetopt.optimize(image, tetopt.lattice(image, nodes=nodes), k_D=0.5).mesh
+    mesh = tetopt.optimize(image, tetopt.lattice_mesh(image, nodes=nodes), k_D=0.5).mesh
     state, _ = flip(Run(plain(image), mesh, 0.5).state)
     return best_seconds(lambda: flip(state)) / len(mesh.cells) * 1e6
 

@@ -27,7 +27,7 @@ from tetopt.budget import peak_bytes
 from tetopt.cluster.crew import Folders, Need
 from tetopt.cluster.tasks import Done, run_tasks
 from tetopt.cluster.workers import workers
-from tetopt.engine.loop import Record
+from tetopt.engine.loop import IterationRecord
 from tetopt.io.files import checked_output, save_json
 from tetopt.io.zarr_images import save_zarr
 from tetopt.parts.part import work_on
@@ -138,7 +138,7 @@ def measure(volume: Path, nodes: int, n_parts: int, n_workers: int, worker_bytes
             yield lambda names: _noted(run_tasks(crowd, work_on, names), done)
             stage("the end")
 
-    def watch(now: Round, history: list[Record]) -> None:
+    def watch(now: Round, history: list[IterationRecord]) -> None:
         if now.done == 0:
             stage(f"{now.kind} {now.number}, {now.n_parts} parts")
         elif now.done == now.n_parts:

@@ -53,7 +53,7 @@ def _run(options: argparse.Namespace) -> int:
         law, _ = default_law(image)
         standard = prepared(image, labels, law, settings, lambda text, name=name: print(f"{name}: {text}", flush=True))
         for nodes in options.nodes:
-            initial = tetopt.lattice(image, nodes=nodes)
+            initial = tetopt.lattice_mesh(image, nodes=nodes)
             for k_D in options.k_d:
                 mesh = tetopt.optimize(image, initial, k_D=k_D).mesh
                 numbers = measured(standard, mesh, settings.percent)

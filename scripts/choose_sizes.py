@@ -65,7 +65,7 @@ def _meshes(
     image: tetopt.Image, standard: Standard, nodes: int, largest: Sequence[float]
 ) -> Iterator[tuple[str, tetopt.Mesh]]:
     """Name and mesh, one after the other."""
-    lattice = tetopt.lattice(image, nodes=nodes)
+    lattice = tetopt.lattice_mesh(image, nodes=nodes)
     yield "lattice", lattice
     yield "uniform", tetopt.optimize(image, lattice).mesh
     edge = tetopt.Sizes().longest_edge(image, nodes) / COARSEST_SHARE
@@ -73,10 +73,10 @@ def _meshes(
         sizes = tetopt.Sizes(longest=factor * edge)
         yield f"graded, largest {factor:g}", tetopt.mesh_image(image, nodes, sizes=sizes).mesh
     strained = _strained(standard)
-    yield "uniform, by the strain", tetopt.optimize(strained, tetopt.lattice(strained, nodes=nodes)).mesh
+    yield "uniform, by the strain", tetopt.optimize(strained, tetopt.lattice_mesh(strained, nodes=nodes)).mesh
     for k_D in (0.5, 0.85):
         yield f"graded by the strain, k_D {k_D:g}", tetopt.mesh_image(strained, nodes, k_D=k_D).mesh
-        mesh = tetopt.optimize(strained, tetopt.lattice(strained, nodes=nodes), k_D=k_D, nodes=nodes).mesh
+        mesh = tetopt.optimize(strained, tetopt.lattice_mesh(strained, nodes=nodes), k_D=k_D, nodes=nodes).mesh
         yield f"lattice graded by the strain, k_D {k_D:g}", mesh
 
 

@@ -96,7 +96,7 @@ def shrink(source: Path, path: Path) -> None:
 def method_figure() -> Figure:
     """The paper's phantom: its lattice, after one iteration and after twenty, and with nodes exchanged; E beside it."""
     image = tetopt.load_phantom("fig2_2d").image()
-    lattice = tetopt.lattice(image, nodes=113)
+    lattice = tetopt.lattice_mesh(image, nodes=113)
     moved = {n: tetopt.optimize(image, lattice, k_D=0.5, iterations=n, tolerance=0.0) for n in (1, 20)}
     graded = tetopt.mesh_image(image, nodes=113)
     figure = Figure(figsize=(9.4, 5.9), layout="constrained")

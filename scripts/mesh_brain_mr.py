@@ -17,7 +17,7 @@ import numpy as np
 import trimesh
 
 import tetopt
-from tetopt.engine.loop import Record
+from tetopt.engine.loop import IterationRecord
 from tetopt.geometry.topology import boundary_facets, components, facets
 from tetopt.io.files import checked_output, save_json, written_whole
 from tetopt.io.images import sha256
@@ -87,7 +87,7 @@ def _run(options: argparse.Namespace) -> int:
     return 0
 
 
-def _say(row: Record) -> None:
+def _say(row: IterationRecord) -> None:
     print(f"iteration {row.iteration:3d}  E {row.E:.4f}  {row.seconds:.1f} s", file=sys.stderr)
 
 

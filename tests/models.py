@@ -35,7 +35,7 @@ def sample_image(n=3):
 @cache
 def ball_mesh(n=3):
     """A ball (a disk) of 40 mm around (30, 30, 30) mm: a lattice of a cube, each shell of it made round."""
-    cube = tetopt.lattice(tetopt.Image(np.zeros((20,) * n)), blocks=(8,) * n)
+    cube = tetopt.lattice_mesh(tetopt.Image(np.zeros((20,) * n)), blocks=(8,) * n)
     offset = cube.points - cube.points.mean(axis=0)
     length = np.sqrt((offset**2).sum(axis=1, keepdims=True))
     round_ = offset * np.abs(offset).max(axis=1, keepdims=True) / np.where(length > 0.0, length, 1.0)
@@ -46,7 +46,7 @@ def ball_mesh(n=3):
 def sample_model(n=3, bins=3):
     """A model in RAS and kPa with `bins` materials (None: as many as cells have), a compression by 5 %."""
     image = sample_image(n)
-    mesh = tetopt.lattice(image, nodes=60)
+    mesh = tetopt.lattice_mesh(image, nodes=60)
     fields = tetopt.cell_fields(mesh, image)
     labels = (fields["mean"] > 25.0).astype(np.int64)
     fields["label"] = labels

@@ -9,9 +9,9 @@ from models import sample_image
 
 import tetopt
 from tetopt import Mesh
-from tetopt.fem.solution import solved_model as tetopt_solution
+from tetopt.fem.solution import solve as tetopt_solution
 from tetopt.io.abaqus import abaqus
-from tetopt.model.build import model_of
+from tetopt.model.build import build_model
 from tetopt.model.model import in_space, in_units
 
 NU = 0.3
@@ -26,13 +26,13 @@ CASES = {
 @cache
 def solved_model(order):
     """An oblique lattice of 14 nodes, or a box of five quadratic cells; a modulus each cell, the bottom held."""
-    mesh = tetopt.lattice(sample_image(), nodes=14)
+    mesh = tetopt.lattice_mesh(sample_image(), nodes=14)
     if order == 2:
         points, cells = FIVE_TET_CUBE
         mesh = Mesh(points * [20.0, 25.0, 31.0] + [-31.7, 12.3, 101.1], cells)
     young = 1.0 + np.arange(len(mesh.cells)) % 5
     moves = [f"{k}/move:superior:{','.join(map(str, u))}" for k, u in enumerate(CASES[order][2], start=1)]
-    return model_of(mesh, young=young, nu=NU, loads=["hold:inferior", *moves], order=order)
+    return build_model(mesh, young=young, nu=NU, loads=["hold:inferior", *moves], order=order)
 
 
 def input_file(order):

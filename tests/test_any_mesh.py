@@ -39,7 +39,7 @@ def folded(mesh):
 
 def strange(n):
     """Meshes by name; all but "far" and "part" lie over themselves somewhere."""
-    mesh = tetopt.lattice(image_of(n), blocks=(2,) * n)
+    mesh = tetopt.lattice_mesh(image_of(n), blocks=(2,) * n)
     half = Mesh(mesh.points, mesh.cells[: len(mesh.cells) // 2])
     return {
         "shifted": joined(mesh, moved(mesh, 1.3)),
@@ -121,10 +121,10 @@ WITH_IMAGE = {
     ),
     "mask_fidelity": lambda image, mesh: tetopt.mask_fidelity(labels_of(image), mesh),
     "mesh_image": lambda image, mesh: tetopt.mesh_image(image, start=mesh, iterations=1),
-    "model_of": lambda image, mesh: tetopt.model_of(mesh, image, young=3.0),
+    "build_model": lambda image, mesh: tetopt.build_model(mesh, image, young=3.0),
     "optimize": lambda image, mesh: tetopt.optimize(image, mesh, iterations=1),
     "optimize_paper": lambda image, mesh: tetopt.optimize_paper(image, mesh, iterations=1),
-    "segmented": lambda image, mesh: tetopt.segmented(image, mesh, 2),
+    "segment": lambda image, mesh: tetopt.segment(image, mesh, 2),
 }
 MORE = {
     "labelled": lambda image, mesh: tetopt.optimize(

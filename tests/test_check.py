@@ -12,7 +12,7 @@ IMAGE = tetopt.Image(np.zeros((8, 9, 10)), np.diag([1.0, 2.0, 0.5, 1.0]))
 
 @pytest.fixture
 def mesh():
-    return tetopt.lattice(IMAGE, blocks=(3, 3, 3))
+    return tetopt.lattice_mesh(IMAGE, blocks=(3, 3, 3))
 
 
 def problems(points, cells, image=IMAGE):
@@ -22,7 +22,7 @@ def problems(points, cells, image=IMAGE):
 @pytest.mark.parametrize("n", [2, 3])
 def test_sound(n):
     image = tetopt.Image(np.zeros((8, 9, 10)[:n]))
-    assert tetopt.check_mesh(tetopt.lattice(image, nodes=60), image) == []
+    assert tetopt.check_mesh(tetopt.lattice_mesh(image, nodes=60), image) == []
 
 
 def test_faults(mesh):
@@ -62,7 +62,7 @@ def test_beyond_the_box(mesh):
 def cubes(labels):
     """A block of cells for each voxel, and which of them have label 1."""
     image = tetopt.Image(labels)
-    mesh = tetopt.lattice(image, "criss-cross" if image.ndim == 2 else "five-tet", blocks=image.shape)
+    mesh = tetopt.lattice_mesh(image, "criss-cross" if image.ndim == 2 else "five-tet", blocks=image.shape)
     return mesh, cell_labels(image, mesh)
 
 

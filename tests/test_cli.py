@@ -24,14 +24,14 @@ import tetopt
 import tetopt.cli.mesh
 import tetopt.cli.phantom
 import tetopt.engine.meshing
-from tetopt import Image, Mesh, lattice, load_image, load_mesh, load_phantom, quality, save_image, save_mesh
+from tetopt import Image, Mesh, lattice_mesh, load_image, load_mesh, load_phantom, quality, save_image, save_mesh
 from tetopt.cli.app import COMMANDS, loaded_command
 from tetopt.cli.console import show_error, show_event
-from tetopt.engine.loop import Optimized
+from tetopt.engine.loop import MeshingResult
 from tetopt.geometry.simplex import volumes
 from tetopt.job.advice import tell_violated
 from tetopt.job.events import listened
-from tetopt.measure.segmentation import dice, segmented
+from tetopt.measure.segmentation import dice, segment
 from tetopt.phantom import phantom_names
 from tetopt.report.summary import mesh_hash
 from tetopt.start.octree import nodes_of_sizes
@@ -69,7 +69,7 @@ def inputs(tmp_path_factory):
     assert exit_code("phantom", "sphere", "-o", folder / "sphere.nii.gz", "--voxel-mm", "4") == 0
     assert exit_code("phantom", "disc_2d", "-o", folder / "disc.nii", "--voxel-mm", "2") == 0
     save_image(folder / "flat.nii", Image(np.full((5, 6, 7), 3.0)))
-    save_mesh(folder / "lattice.vtu", lattice(load_image(folder / "sphere.nii.gz"), nodes=60))
+    save_mesh(folder / "lattice.vtu", lattice_mesh(load_image(folder / "sphere.nii.gz"), nodes=60))
     return folder
 
 
@@ -233,7 +233,7 @@ def test_a_slice_in_2d(tmp_path, inputs):
 )
 def test_no_iterations_write_the_lattice_itself(tmp_path, inputs, name, size):
     assert exit_code("mesh", inputs / name, "-o", tmp_path / "a.vtu", *size, "--iterations", "0") == 0
-    expected = lattice(load_image(inputs / name), **{size[0][2:]: int(size[1])})
+    expected = lattice_mesh(load_image(inputs / name), **{size[0][2:]: int(size[1])})
     mesh = load_mesh(tmp_path / "a.vtu").mesh
     assert mesh.points.tobytes() == expected.points.tobytes()
     np.testing.assert_array_equal(mesh.cells, expected.cells)
@@ -348,7 +348,7 @@ def test_max_seconds_leaves_a_valid_mesh(tmp_path, inputs, capsys):
 
 
 def test_what_is_violated_is_told_in_the_commands_options(capsys):
-    result = Optimized(None, [], "iterations")
+    result = MeshingResult(None, [], "iterations")
     missed = {"floor": "2 of 9 cells; allow a lower `k_D`, or a lower `min_dihedral`", "box": "k_D.nii lies beyond"}
     with listened(show_event):
         assert tell_violated(result, {}) == []
@@ -729,7 +729,7 @@ def test_quality_of_a_mesh_elsewhere(run, inputs, tmp_path, capfd):
 
 def test_quality_of_triangles(inputs, tmp_path, capsys):
     image = load_image(inputs / "disc.nii")
-    save_mesh(tmp_path / "a.vtu", lattice(image, nodes=60))
+    save_mesh(tmp_path / "a.vtu", lattice_mesh(image, nodes=60))
     assert exit_code("quality", tmp_path / "a.vtu", "--image", inputs / "disc.nii") == 0
     assert re.search(r"^area, mm2 +4096.00$", capsys.readouterr().out, re.M)
 
@@ -889,7 +889,7 @@ def test_a_reader_that_goes_away_loses_no_file(tmp_path, inputs):
 
 
 def test_quality_of_overlapping_cells(tmp_path, inputs, capsys):
-    mesh = lattice(load_image(inputs / "sphere.nii.gz"), nodes=60)
+    mesh = lattice_mesh(load_image(inputs / "sphere.nii.gz"), nodes=60)
     # Once more a few of them, and not all of the others: together they hold no more voxels than there are.
     save_mesh(tmp_path / "twice.vtu", Mesh(mesh.points, np.vstack([mesh.cells[3:], mesh.cells[4:5]])))
     words = [tmp_path / "twice.vtu", "--image", inputs / "sphere.nii.gz"]
@@ -1086,13 +1086,13 @@ def test_segment(tmp_path, inputs, capfd):
     tetopt.save_image(tmp_path / "image.nii.gz", phantom.image(voxel_mm=2.0))
     tetopt.save_image(tmp_path / "truth.nii.gz", phantom.label_image(voxel_mm=2.0))
     image = tetopt.load_image(tmp_path / "image.nii.gz")
-    mesh = tetopt.optimize(image, tetopt.lattice(image, nodes=400), k_D=0.5, iterations=4).mesh
+    mesh = tetopt.optimize(image, tetopt.lattice_mesh(image, nodes=400), k_D=0.5, iterations=4).mesh
     tetopt.save_mesh(tmp_path / "mesh.vtu", mesh)
     files = [tmp_path / name for name in ("image.nii.gz", "mesh.vtu")]
     options = ["-o", tmp_path / "labels.nii.gz", "--classes", "2", "--json", tmp_path / "s.json"]
     assert exit_code("segment", *files, *options, "--truth", tmp_path / "truth.nii.gz") == 0
     labels = tetopt.load_image(tmp_path / "labels.nii.gz")
-    np.testing.assert_array_equal(labels.data, segmented(image, mesh, 2).data)
+    np.testing.assert_array_equal(labels.data, segment(image, mesh, 2).data)
     np.testing.assert_allclose(labels.affine, image.affine)
     numbers = numbers_in(tmp_path / "s.json")
     overlaps = dice(labels, tetopt.load_image(tmp_path / "truth.nii.gz"))

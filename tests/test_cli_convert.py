@@ -498,7 +498,7 @@ def test_numbers_of_loads_are_printed_without_rounding_errors_and_kept_with_them
     options = ["--young", "3", "--load", "hold:inferior", "--load", f"move:superior:0,0,{0.1 * 3!r}"]
     assert exit_code("convert", folder / "a.vtu", tmp_path / "b.vtu", *options) == 0
     assert "\nload: move:superior:0.0,0.0,0.3\n" in capsys.readouterr().out
-    model = tetopt.model_of(tetopt.load_mesh(tmp_path / "b.vtu"))
+    model = tetopt.build_model(tetopt.load_mesh(tmp_path / "b.vtu"))
     assert model.loads[1].numbers.tolist() == [0.0, 0.0, 0.1 * 3]
     assert "move:superior:0.0,0.0,0.3<" in model._repr_html_()
 

@@ -341,7 +341,7 @@ def test_quality_of_a_mask_beside_the_mesh(tmp_path, capsys):
     """Exit 1, as of a run, and no distances of a boundary that is not there."""
     image = tetopt.Image(np.random.default_rng(0).uniform(0.0, 50.0, (10, 10, 10)))
     tetopt.save_image(tmp_path / "a.nii.gz", image)
-    tetopt.save_mesh(tmp_path / "a.vtu", tetopt.lattice(image, nodes=150))
+    tetopt.save_mesh(tmp_path / "a.vtu", tetopt.lattice_mesh(image, nodes=150))
     for first, last, expected in ((4, 6, 1), (0, 10, 0)):
         mask = np.zeros(image.shape)
         mask[first:last] = 1.0

@@ -1,4 +1,4 @@
-"""`tetopt fem` on models: what it prints and writes is what `solved_model` finds; bad input is one line."""
+"""`tetopt fem` on models: what it prints and writes is what `solve` finds; bad input is one line."""
 
 import json
 from dataclasses import fields
@@ -10,10 +10,10 @@ from models import sample_image, sample_model
 
 import tetopt
 from tetopt.cli.app import main
-from tetopt.fem.solution import solution_fields, solved_model
+from tetopt.fem.solution import solution_fields, solve
 from tetopt.io.formats import save_model
 from tetopt.job.options import ModelOptions
-from tetopt.model.build import model_of
+from tetopt.model.build import build_model
 from tetopt.model.loads import parse_loads
 
 STEP_2 = ["2/traction:left:0.1,0,0", "2/spring:right:0.4", "2/gravity:0,0,-9810"]
@@ -49,7 +49,7 @@ def test_a_file_with_moduli_and_loads_needs_no_options(order, path, tmp_path, ca
     written, grid = json.loads((tmp_path / "numbers.json").read_text()), meshio.read(solved)
     assert [each["iterations"] for each in written["steps"]] == [0, 0]
     for step in (1, 2):
-        solution = solved_model(model, step)
+        solution = solve(model, step)
         row, suffix = written["steps"][step - 1], "" if step == 1 else "_step2"
         for name in ("strain_energy", "spring_energy", "work"):
             assert row[name] == pytest.approx(getattr(solution, name), rel=1e-9, abs=1e-12)
@@ -88,7 +88,7 @@ def test_options_instead_of_what_the_file_holds(path, tmp_path, capsys):
     run(capsys, path, "--json", numbers, "--compress", "2", "--young", "3", "--nu", "0.3", "--no-conditioning")
     model = sample_model()
     loads = parse_loads(["compress:2%"], model.mesh, model.sets)
-    ours = solved_model(model_of(model.mesh, young=3.0, nu=0.3, known_sets=model.sets)._replace(loads=loads))
+    ours = solve(build_model(model.mesh, young=3.0, nu=0.3, known_sets=model.sets)._replace(loads=loads))
     written = json.loads((tmp_path / "numbers.json").read_text())
     assert written["strain_energy"] == pytest.approx(ours.strain_energy, rel=1e-10)
     assert "cond" not in written
@@ -101,8 +101,8 @@ def test_an_image_with_loads_of_the_user_s(path, tmp_path, capsys):
     numbers = str(tmp_path / "numbers.json")
     words = ["--load", "hold:left", "--load", "pressure:right:0.2", "--young", "1+0.02*h", "--average", "harmonic"]
     out, _ = run(capsys, str(tmp_path / "image.nii"), path, *words, "--json", numbers, "--conditioning", "--nu", "0.4")
-    ours = solved_model(
-        model_of(
+    ours = solve(
+        build_model(
             model.mesh,
             tetopt.load_image(tmp_path / "image.nii"),
             young="1+0.02*h",
@@ -217,7 +217,7 @@ def test_moduli_too_far_apart_are_one_line(tmp_path, capsys):
     """Stone on the softest of beds."""
     model = sample_model()
     loads = parse_loads(["spring:inferior:1e-6", "pressure:superior:1"], model.mesh, model.sets)
-    stone = model_of(model.mesh, young=1e12, known_sets=model.sets)._replace(loads=loads)
+    stone = build_model(model.mesh, young=1e12, known_sets=model.sets)._replace(loads=loads)
     save_model(tmp_path / "model.vtu", stone)
     assert main(["fem", str(tmp_path / "model.vtu"), "-o", str(tmp_path / "solved.vtu")]) == 2
     assert "the moduli differ too much, or nu is too near 0.5, for this mesh" in capsys.readouterr().err
@@ -234,12 +234,12 @@ def test_moduli_at_nodes_go_through_the_file(tmp_path, capsys):
     """A modulus that is linear between nodes, written by --average nodes and solved from the file."""
     image, model = sample_image(), sample_model()
     words = {"young": "1+0.02*h", "nu": 0.4, "average": "nodes", "loads": ["compress:5%"], "known_sets": model.sets}
-    nodal = model_of(model.mesh, image, **words)._replace(order=2)
+    nodal = build_model(model.mesh, image, **words)._replace(order=2)
     save_model(tmp_path / "nodal.vtu", nodal)
     run(capsys, str(tmp_path / "nodal.vtu"), "--json", str(tmp_path / "numbers.json"))
     written = json.loads((tmp_path / "numbers.json").read_text())["strain_energy"]
-    assert written == pytest.approx(solved_model(nodal).strain_energy, rel=1e-12)
-    assert abs(written / solved_model(nodal._replace(node_young=None)).strain_energy - 1.0) > 1e-4
+    assert written == pytest.approx(solve(nodal).strain_energy, rel=1e-12)
+    assert abs(written / solve(nodal._replace(node_young=None)).strain_energy - 1.0) > 1e-4
 
 
 @pytest.mark.parametrize("units", [["--space", "lps", "--units", "MPa"], []])

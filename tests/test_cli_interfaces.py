@@ -13,7 +13,7 @@ from tetopt.measure.fidelity import cell_labels
 def block_mesh(labels):
     """An image of labels, a mesh with a block of cells in each voxel, and the label of each cell."""
     image = tetopt.Image(labels)
-    mesh = tetopt.lattice(image, "five-tet", blocks=image.shape)
+    mesh = tetopt.lattice_mesh(image, "five-tet", blocks=image.shape)
     return image, mesh, cell_labels(image, mesh)
 
 
@@ -63,7 +63,7 @@ def slabs(tmp_path):
     """Slabs of labels 1, 2, 4 and 1 again, each 4 x 3 voxels wide and one or two thick, 2 mm a voxel."""
     labels = np.zeros((4, 3, 6))
     labels[:] = [1, 1, 2, 4, 4, 1]
-    mesh = tetopt.lattice(tetopt.Image(labels, np.diag([2.0, 2.0, 2.0, 1.0])), "five-tet", blocks=(4, 3, 6))
+    mesh = tetopt.lattice_mesh(tetopt.Image(labels, np.diag([2.0, 2.0, 2.0, 1.0])), "five-tet", blocks=(4, 3, 6))
     of_cell = cell_labels(tetopt.Image(labels, np.diag([2.0, 2.0, 2.0, 1.0])), mesh)
     tetopt.save_mesh(tmp_path / "slabs.vtu", mesh, {"label": of_cell})
     (tmp_path / "names.csv").write_text("label,name\n2,bone\n4,left lung\n")

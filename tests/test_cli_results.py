@@ -118,9 +118,9 @@ def test_stiff_linear_cells_are_warned_of_where_a_solver_s_file_is_written(tmp_p
     assert said.count("linear elements are too stiff") == is_said
     with warnings.catch_warnings(record=True) as caught:
         warnings.simplefilter("always")
-        tetopt.save_model(out, tetopt.model_of(mesh, young=2.0, nu=nu))
+        tetopt.save_model(out, tetopt.build_model(mesh, young=2.0, nu=nu))
         if suffix not in (".scn",):
-            tetopt.save_model(out, tetopt.model_of(mesh, young=2.0, nu=nu, order=2))
+            tetopt.save_model(out, tetopt.build_model(mesh, young=2.0, nu=nu, order=2))
     assert ["linear elements are too stiff" in str(each.message) for each in caught] == [True] * is_said
 
 

@@ -44,7 +44,7 @@ def photographed(monkeypatch, path, *arguments):
 
 def test_a_cutaway_is_without_background_and_its_octant(monkeypatch, tmp_path):
     labels = halves()
-    mesh = tetopt.lattice(labels, nodes=2000)
+    mesh = tetopt.lattice_mesh(labels, nodes=2000)
     (grey, coloured), figure = photographed(monkeypatch, tmp_path / "a.png", labels, mesh, labels)
     of_cell = cell_labels(labels, mesh)
     facets = np.sort(mesh.cells[:, [[0, 1, 2], [0, 1, 3], [0, 2, 3], [1, 2, 3]]], axis=2)
@@ -73,7 +73,7 @@ def test_a_cutaway_is_without_background_and_its_octant(monkeypatch, tmp_path):
 
 def test_a_cutaway_without_labels_shows_all_cells(monkeypatch, tmp_path):
     labels = halves()
-    mesh = tetopt.lattice(labels, nodes=200)
+    mesh = tetopt.lattice_mesh(labels, nodes=200)
     (grey,), figure = photographed(monkeypatch, tmp_path / "a.png", labels, mesh)
     np.testing.assert_allclose(np.ptp(np.asarray(grey.points), axis=0), np.ptp(mesh.points, axis=0), rtol=1e-5)
     assert len(figure.axes) == 1
@@ -82,7 +82,7 @@ def test_a_cutaway_without_labels_shows_all_cells(monkeypatch, tmp_path):
 
 def test_a_cutaway_is_photographed_without_margins(tmp_path, opengl):
     labels = halves()
-    cut_open.save_cutaway(tmp_path / "a.png", labels, tetopt.lattice(labels, nodes=2000), labels)
+    cut_open.save_cutaway(tmp_path / "a.png", labels, tetopt.lattice_mesh(labels, nodes=2000), labels)
     with PIL.Image.open(tmp_path / "a.png") as picture:
         assert picture.format == "PNG"
         pixels = np.asarray(picture.convert("RGB")).astype(float)
@@ -98,18 +98,18 @@ def test_a_cutaway_is_photographed_without_margins(tmp_path, opengl):
 
 def test_nothing_but_background_is_refused(tmp_path):
     labels = halves()
-    mesh = tetopt.lattice(labels, nodes=200)
+    mesh = tetopt.lattice_mesh(labels, nodes=200)
     with pytest.raises(tetopt.InputError, match="background alone"):
         cut_open.save_cutaway(tmp_path / "a.png", labels, mesh, tetopt.Image(np.zeros(labels.shape), TILTED))
     flat = tetopt.Image(np.zeros((6, 7)))
     with pytest.raises(tetopt.InputError, match="tetrahedra"):
-        cut_open.save_cutaway(tmp_path / "a.png", flat, tetopt.lattice(flat, nodes=20))
+        cut_open.save_cutaway(tmp_path / "a.png", flat, tetopt.lattice_mesh(flat, nodes=20))
 
 
 def test_the_script(tmp_path, capsys, opengl):
     labels = halves()
     tetopt.save_image(tmp_path / "a.nii.gz", labels)
-    tetopt.save_mesh(tmp_path / "a.vtu", tetopt.lattice(labels, nodes=200))
+    tetopt.save_mesh(tmp_path / "a.vtu", tetopt.lattice_mesh(labels, nodes=200))
     image, mesh, picture = (str(tmp_path / f"a.{suffix}") for suffix in ("nii.gz", "vtu", "png"))
     assert cut_open.main([mesh, "--image", image, "--labels", image, "-o", picture]) == 0
     assert capsys.readouterr().out == f"{picture}: a.vtu, cut open\n"

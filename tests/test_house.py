@@ -22,7 +22,7 @@ WIDE = {
     "tetopt.engine.fast.optimize": 13,
     "tetopt.engine.meshing.mesh_image": 13,
     "tetopt.engine.paper.optimize_paper": 12,
-    "tetopt.model.build.model_of": 15,
+    "tetopt.model.build.build_model": 15,
 }
 # Verbs that once stood for a dozen things each; a variable is a noun, see docs/glossary.md.
 VERBS = {"held", "wanted", "found", "given", "told", "asked"}

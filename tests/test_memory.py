@@ -18,7 +18,7 @@ from tetopt.cli import run as cli_run
 from tetopt.cli import warm_up
 from tetopt.energy.sampling import sampling_grid
 from tetopt.engine import cost, fast
-from tetopt.engine.loop import Optimized, Record
+from tetopt.engine.loop import IterationRecord, MeshingResult
 from tetopt.engine.meshing import bytes_of
 from tetopt.fem.elasticity import stiffness
 from tetopt.fem.reference import reference
@@ -97,10 +97,10 @@ def test_a_limit_counts_what_there_is(monkeypatch):
 
 
 IMAGE = tetopt.Image(np.random.default_rng(0).integers(1, 4, (9, 8, 7)).astype(float), np.diag([1.0, 1.0, 3.0, 1.0]))
-LATTICE = tetopt.lattice(IMAGE, blocks=(2, 2, 2))
+LATTICE = tetopt.lattice_mesh(IMAGE, blocks=(2, 2, 2))
 LIMITS = _block_limits(source_of(IMAGE), 100, None)
 TASKS = {
-    "lattice: .* nodes: needs.*ask for fewer": lambda: tetopt.lattice(IMAGE, spacing=0.1),
+    "lattice: .* nodes: needs.*ask for fewer": lambda: tetopt.lattice_mesh(IMAGE, spacing=0.1),
     "octree: .* blocks: needs.*allow longer edges, or crop": lambda: _blocks_by_depth(
         source_of(IMAGE), channels_of(source_of(IMAGE)), (4, 4, 4), LIMITS
     ),
@@ -206,7 +206,7 @@ def test_compiling_and_long_iterations_are_told(monkeypatch):
         say("compiling the kernels, 1 of 57")
         assert lines == ["compiling the kernels, 1 of 57 (of the first run only), 0 s"]
 
-    rows = [Record(number, 1.0 - 0.1 * number, 2.0, 1.0, 0.1, False, 48, 504, 3.0) for number in (0, 1)]
+    rows = [IterationRecord(number, 1.0 - 0.1 * number, 2.0, 1.0, 0.1, False, 48, 504, 3.0) for number in (0, 1)]
 
     def optimized(max_seconds, callback, stop):
         callback(rows[0])
@@ -214,7 +214,7 @@ def test_compiling_and_long_iterations_are_told(monkeypatch):
             clock[0] = float(second)
             assert not stop()
         callback(rows[1])
-        return Optimized(LATTICE, rows, "iterations")
+        return MeshingResult(LATTICE, rows, "iterations")
 
     with cli_run.Display(lambda: None) as display, listened(display):
         started("kernels")

@@ -11,7 +11,7 @@ from models import quadratic_model, sample_model
 
 import tetopt
 from tetopt import notebook
-from tetopt.engine.loop import Optimized
+from tetopt.engine.loop import MeshingResult
 from tetopt.report.colours import label_colours
 
 
@@ -45,7 +45,7 @@ def test_a_mesh_is_one_line_and_a_card(n):
 
 def test_a_section_is_grey_by_its_values():
     """The right half of a square is bright, the left one dark, and y points upwards."""
-    mesh = tetopt.lattice(tetopt.Image(np.zeros((8, 8))), blocks=(4, 4))
+    mesh = tetopt.lattice_mesh(tetopt.Image(np.zeros((8, 8))), blocks=(4, 4))
     where = mesh.points[mesh.cells].mean(axis=1)
     for axis, low, high in ((0, (50, 100), (270, 100)), (1, (100, 270), (100, 50))):
         picture = picture_in(notebook.section_html(mesh.points, mesh.cells, np.sign(where[:, axis] - 3.5)))
@@ -55,7 +55,7 @@ def test_a_section_is_grey_by_its_values():
 
 def test_pictures_are_small_however_many_cells_there_are():
     rng = np.random.default_rng(0)
-    mesh = tetopt.lattice(tetopt.Image(np.zeros((40, 40, 40))), nodes=5000)
+    mesh = tetopt.lattice_mesh(tetopt.Image(np.zeros((40, 40, 40))), nodes=5000)
     assert len(notebook.section_html(mesh.points, mesh.cells, rng.normal(size=len(mesh.cells)))) < 60_000
     assert len(mesh._repr_html_()) < 60_000
     assert len(tetopt.Image(rng.normal(size=(900, 700)))._repr_html_()) < 200_000
@@ -150,7 +150,7 @@ def test_runs_show_a_bar_in_a_notebook_alone(monkeypatch, capsys, ball):
     assert [words.split(",")[0] for words in shown[1:-1]] == [f"tetopt: iteration {k} of 1" for k in (0, 1)]
     assert re.fullmatch(r"tetopt: ended after 1 iterations \(\w+\), E [\d.]+, [\d.]+ s", shown[-1])
     del shown[:]
-    tetopt.optimize_paper(image, tetopt.lattice(image, blocks=(2, 2, 2)), iterations=1)
+    tetopt.optimize_paper(image, tetopt.lattice_mesh(image, blocks=(2, 2, 2)), iterations=1)
     assert shown[-1].startswith("tetopt: ended after 1 iterations")
     assert capsys.readouterr() == ("", "")
 
@@ -164,7 +164,9 @@ def test_a_mesh_is_plotted_off_screen(opengl, tmp_path):
     assert (np.asarray(PIL.Image.open(tmp_path / "a.png").convert("RGB")) == by_cells[..., :3]).all()
     assert np.ptp(mesh.plot(mesh.points[:, 0], off_screen=True, cmap="gray", show_edges=False)) > 0
     assert np.ptp(sample_model(2).mesh.plot(off_screen=True)) > 0
-    result = Optimized(mesh, [], "iterations", labels=(mesh.points[mesh.cells].mean(axis=(1, 2)) > 40.0).astype(int))
+    result = MeshingResult(
+        mesh, [], "iterations", labels=(mesh.points[mesh.cells].mean(axis=(1, 2)) > 40.0).astype(int)
+    )
     shown = result.plot(off_screen=True, show_edges=False, lighting=False).reshape(-1, 3)
     for colour in label_colours(tetopt.Image(result.labels[None]))[np.unique(result.labels)]:  # as in other pictures
         assert (shown == np.rint(255.0 * colour)).all(axis=1).sum() > 1000
@@ -187,7 +189,7 @@ def test_in_a_real_kernel():
     program = (
         "import numpy as np, tetopt\n"
         "image = tetopt.Image(np.random.default_rng(0).normal(size=(6, 7)))\n"
-        "result = tetopt.optimize(image, tetopt.lattice(image, blocks=(3, 3)), iterations=2)\nresult"
+        "result = tetopt.optimize(image, tetopt.lattice_mesh(image, blocks=(3, 3)), iterations=2)\nresult"
     )
     book = nbformat.v4.new_notebook(cells=[nbformat.v4.new_code_cell(program)])
     nbclient.NotebookClient(book, timeout=300, kernel_name="python3").execute()

@@ -14,25 +14,25 @@ from tetopt.public import check_arguments
 
 IMAGE = tetopt.Image(np.random.default_rng(0).normal(size=(6, 7, 8)))
 MESH = tetopt.Mesh([[0, 0, 0], [4, 0, 0], [0, 4, 0], [0, 0, 4]], [[0, 1, 2, 3]])
-MODEL = tetopt.model_of(MESH, young=3.0)
+MODEL = tetopt.build_model(MESH, young=3.0)
 LABELS = tetopt.Image(np.arange(6 * 7 * 8).reshape(6, 7, 8) % 3)
 # Right arguments of each function, by name; those of files are made by the tests of `tetopt.io`.
 RIGHT = {
     "E_D": {"image": IMAGE, "mesh": MESH},
     "E_G": {"points": MESH.points, "cells": MESH.cells},
-    "aligned_contrast": {"other": IMAGE, "image": IMAGE},
-    "aligned_labels": {"labels": LABELS, "image": IMAGE},
-    "aligned_mask": {"mask": LABELS, "image": IMAGE},
+    "resample_contrast": {"other": IMAGE, "image": IMAGE},
+    "resample_labels": {"labels": LABELS, "image": IMAGE},
+    "resample_mask": {"mask": LABELS, "image": IMAGE},
     "cell_fields": {"mesh": MESH, "image": IMAGE},
     "cell_labels": {"labels": LABELS, "mesh": MESH},
     "cell_moments": {"image": IMAGE, "mesh": MESH},
     "cell_of_voxel": {"image": IMAGE, "mesh": MESH},
     "check_mesh": {"mesh": MESH, "image": None},
     "content": {"images": [IMAGE], "weights": [1.0]},
-    "foreground": {"image": IMAGE, "level": 0.5},
+    "foreground_mask": {"image": IMAGE, "level": 0.5},
     "label_fidelity": {"labels": LABELS, "mesh": MESH},
     "label_interfaces": {"labels": LABELS, "mesh": MESH, "of_cell": [1]},
-    "lattice": {"image": IMAGE, "nodes": 100, "spacing": None},
+    "lattice_mesh": {"image": IMAGE, "nodes": 100, "spacing": None},
     "load_image": {"path": "a.nii", "volume": 0},
     "load_label_table": {"path": "a.txt"},
     "load_mesh": {"path": "a.vtu"},
@@ -47,8 +47,8 @@ RIGHT = {
         "sizes": None,
         "mode": "graded",
     },
-    "model_of": {"mesh": MESH, "image": IMAGE, "sets": ["a=x<1"], "bins": 3, "order": 1},
-    "octree": {"image": IMAGE, "nodes": 100, "sizes": None},
+    "build_model": {"mesh": MESH, "image": IMAGE, "sets": ["a=x<1"], "bins": 3, "order": 1},
+    "octree_mesh": {"image": IMAGE, "nodes": 100, "sizes": None},
     "open_stored": {"path": "a.nii", "volume": 0},
     "optimize": {"image": IMAGE, "mesh": MESH, "k_D": 0.2, "iterations": 1, "nodes": None, "boundary": "slide"},
     "optimize_paper": {"image": IMAGE, "mesh": MESH, "k_D": 0.2, "iterations": 1},
@@ -59,10 +59,10 @@ RIGHT = {
     "save_mesh": {"path": "a.vtu", "mesh": MESH, "cell_data": {}, "order": 1},
     "save_model": {"path": "a.inp", "model": MODEL, "space": "ras"},
     "save_surface": {"path": "a.stl", "about": "", "space": "ras"},
-    "segmented": {"image": IMAGE, "mesh": MESH, "classes": 2},
+    "segment": {"image": IMAGE, "mesh": MESH, "classes": 2},
     "solution_fields": {"mesh": MESH, "step": 1},
-    "solved_model": {"model": MODEL, "step": 1},
-    "surface_of": {"points": MESH.points, "cells": MESH.cells, "chosen": [True]},
+    "solve": {"model": MODEL, "step": 1},
+    "extract_surface": {"points": MESH.points, "cells": MESH.cells, "chosen": [True]},
 }
 WRONG = {
     "a text": "x.nii.gz",
@@ -145,7 +145,7 @@ def test_wrong_kinds_are_one_line(name, argument):
 
 @pytest.mark.parametrize("what", ["a text", "a path", "an array", "nibabel's", "None", "a number", "a bool"])
 def test_what_is_no_image_is_told_how_to_become_one(what):
-    for call in (tetopt.mesh_image, tetopt.octree, tetopt.cell_fields):
+    for call in (tetopt.mesh_image, tetopt.octree_mesh, tetopt.cell_fields):
         with pytest.raises(tetopt.InputError, match=r"expected (an )?(Image|Mesh).*, got .*; tetopt\.(load|Image)"):
             call(WRONG[what], 500) if call is not tetopt.cell_fields else call(WRONG[what])
 
@@ -154,7 +154,7 @@ def test_records_are_looked_into():
     with pytest.raises(tetopt.InputError, match=r"mesh_image: sizes\.largest: expected a number or None, got '5'"):
         tetopt.mesh_image(IMAGE, 100, sizes=tetopt.Sizes(largest="5"))
     with pytest.raises(tetopt.InputError, match=r"sizes\.field: expected Image or None, got 'a\.nii'"):
-        tetopt.octree(IMAGE, 100, tetopt.Sizes(field="a.nii"))
+        tetopt.octree_mesh(IMAGE, 100, tetopt.Sizes(field="a.nii"))
 
 
 @pytest.mark.parametrize(
@@ -172,8 +172,8 @@ def test_an_image_of_anything(what):
 
 
 def test_a_decorated_function_is_looked_at():
-    with pytest.raises(tetopt.InputError, match=r"^solved_model: model: expected Model, got .*; tetopt\.model_of"):
-        tetopt.solved_model("x.vtu")
+    with pytest.raises(tetopt.InputError, match=r"^solve: model: expected Model, got .*; tetopt\.build_model"):
+        tetopt.solve("x.vtu")
 
 
 def warning_calls(folder):
@@ -181,16 +181,16 @@ def warning_calls(folder):
     tetopt.save_image(folder / "even.nii", tetopt.Image(np.ones((3, 4, 5))))
     tetopt.save_image(folder / "large.nii", tetopt.Image(IMAGE.data, np.diag([900.0, 900.0, 900.0, 1.0])))
     sets, loads = ["low=plane:0,0,0:0,0,1:0.1"], ["hold:low"]
-    tetopt.save_model(folder / "a.vtu", tetopt.model_of(MESH, young=3.0, sets=sets, loads=loads))
+    tetopt.save_model(folder / "a.vtu", tetopt.build_model(MESH, young=3.0, sets=sets, loads=loads))
     loaded = tetopt.load_mesh(folder / "a.vtu")
     own = loaded._replace(sets=loaded.sets._replace(facets={}))
     return {
-        "save_model": lambda: tetopt.save_model(folder / "a.inp", tetopt.model_of(MESH, young=3.0, nu=0.46)),
+        "save_model": lambda: tetopt.save_model(folder / "a.inp", tetopt.build_model(MESH, young=3.0, nu=0.46)),
         "save_mesh": lambda: tetopt.save_mesh(folder / "b.vtk", MESH, {"a\nb": np.ones(1)}),
         "load_image": lambda: tetopt.load_image(folder / "even.nii"),
         "load_image, of a large one": lambda: tetopt.load_image(folder / "large.nii"),
         "open_stored": lambda: tetopt.open_stored(folder / "large.nii"),
-        "model_of": lambda: tetopt.model_of(own),
+        "build_model": lambda: tetopt.build_model(own),
     }
 
 

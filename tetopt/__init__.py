@@ -16,12 +16,12 @@ if TYPE_CHECKING:
     from tetopt.energy.geometric import E_G
     from tetopt.energy.sampling import CellMoments, cell_moments, cell_of_voxel
     from tetopt.engine.fast import optimize
-    from tetopt.engine.loop import Optimized, Record
+    from tetopt.engine.loop import IterationRecord, MeshingResult
     from tetopt.engine.meshing import mesh_image
     from tetopt.engine.paper import optimize_paper
     from tetopt.errors import InputError
-    from tetopt.fem.solution import Solution, SolutionFields, solution_fields, solved_model
-    from tetopt.geometry.surface import Surface, surface_of
+    from tetopt.fem.solution import Solution, SolutionFields, solution_fields, solve
+    from tetopt.geometry.surface import Surface, extract_surface
     from tetopt.image import Image, VoxelGrid
     from tetopt.io.formats import save_mesh, save_model
     from tetopt.io.frd import Results, read_frd
@@ -36,9 +36,9 @@ if TYPE_CHECKING:
     from tetopt.measure.fidelity import LabelFidelity, MaskFidelity, cell_labels, label_fidelity, mask_fidelity
     from tetopt.measure.interfaces import LabelInterface, label_interfaces
     from tetopt.measure.quality import Quality, QualityErrors, quality
-    from tetopt.measure.segmentation import segmented
+    from tetopt.measure.segmentation import segment
     from tetopt.mesh import Mesh
-    from tetopt.model.build import model_of
+    from tetopt.model.build import build_model
     from tetopt.model.fields import cell_fields
     from tetopt.model.file import MeshFile
     from tetopt.model.labels import LabelTable
@@ -48,11 +48,11 @@ if TYPE_CHECKING:
     from tetopt.model.model import Model
     from tetopt.model.sets import Box, Sets
     from tetopt.phantom import Phantom, Shape, load_phantom
-    from tetopt.start.lattice import lattice
-    from tetopt.start.octree import octree
+    from tetopt.start.lattice import lattice_mesh
+    from tetopt.start.octree import octree_mesh
     from tetopt.start.sizes import Sizes
     from tetopt.stored import StoredImage
-    from tetopt.target.align import aligned_contrast, aligned_labels, aligned_mask, foreground
+    from tetopt.target.align import foreground_mask, resample_contrast, resample_labels, resample_mask
     from tetopt.target.content import Content, content
     from tetopt.target.statistics import Statistics
 
@@ -62,12 +62,12 @@ _NAMES_OF = {  # by module
     "energy.geometric": ("E_G",),
     "energy.sampling": ("CellMoments", "cell_moments", "cell_of_voxel"),
     "engine.fast": ("optimize",),
-    "engine.loop": ("Optimized", "Record"),
+    "engine.loop": ("MeshingResult", "IterationRecord"),
     "engine.meshing": ("mesh_image",),
     "engine.paper": ("optimize_paper",),
     "errors": ("InputError",),
-    "fem.solution": ("Solution", "SolutionFields", "solution_fields", "solved_model"),
-    "geometry.surface": ("Surface", "surface_of"),
+    "fem.solution": ("Solution", "SolutionFields", "solution_fields", "solve"),
+    "geometry.surface": ("Surface", "extract_surface"),
     "image": ("Image", "VoxelGrid"),
     "io.formats": ("save_mesh", "save_model"),
     "io.frd": ("Results", "read_frd"),
@@ -82,9 +82,9 @@ _NAMES_OF = {  # by module
     "measure.fidelity": ("LabelFidelity", "MaskFidelity", "cell_labels", "label_fidelity", "mask_fidelity"),
     "measure.interfaces": ("LabelInterface", "label_interfaces"),
     "measure.quality": ("Quality", "QualityErrors", "quality"),
-    "measure.segmentation": ("segmented",),
+    "measure.segmentation": ("segment",),
     "mesh": ("Mesh",),
-    "model.build": ("model_of",),
+    "model.build": ("build_model",),
     "model.fields": ("cell_fields",),
     "model.file": ("MeshFile",),
     "model.labels": ("LabelTable",),
@@ -94,11 +94,11 @@ _NAMES_OF = {  # by module
     "model.model": ("Model",),
     "model.sets": ("Box", "Sets"),
     "phantom": ("Phantom", "Shape", "load_phantom"),
-    "start.lattice": ("lattice",),
-    "start.octree": ("octree",),
+    "start.lattice": ("lattice_mesh",),
+    "start.octree": ("octree_mesh",),
     "start.sizes": ("Sizes",),
     "stored": ("StoredImage",),
-    "target.align": ("aligned_contrast", "aligned_labels", "aligned_mask", "foreground"),
+    "target.align": ("resample_contrast", "resample_labels", "resample_mask", "foreground_mask"),
     "target.content": ("Content", "content"),
     "target.statistics": ("Statistics",),
 }
@@ -123,11 +123,11 @@ __all__ = [
     "Mesh",
     "MeshFile",
     "Model",
-    "Optimized",
+    "MeshingResult",
     "Phantom",
     "Quality",
     "QualityErrors",
-    "Record",
+    "IterationRecord",
     "Result",
     "Results",
     "Sets",
@@ -140,27 +140,27 @@ __all__ = [
     "Surface",
     "VoxelGrid",
     "__version__",
-    "aligned_contrast",
-    "aligned_labels",
-    "aligned_mask",
+    "resample_contrast",
+    "resample_labels",
+    "resample_mask",
     "cell_fields",
     "cell_labels",
     "cell_moments",
     "cell_of_voxel",
     "check_mesh",
     "content",
-    "foreground",
+    "foreground_mask",
     "label_fidelity",
     "label_interfaces",
-    "lattice",
+    "lattice_mesh",
     "load_image",
     "load_label_table",
     "load_mesh",
     "load_phantom",
     "mask_fidelity",
     "mesh_image",
-    "model_of",
-    "octree",
+    "build_model",
+    "octree_mesh",
     "open_stored",
     "optimize",
     "optimize_paper",
@@ -171,10 +171,10 @@ __all__ = [
     "save_mesh",
     "save_model",
     "save_surface",
-    "segmented",
+    "segment",
     "solution_fields",
-    "solved_model",
-    "surface_of",
+    "solve",
+    "extract_surface",
 ]
 
 

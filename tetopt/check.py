@@ -60,7 +60,7 @@ def check_mesh(
     Examples
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> mesh = tetopt.lattice_mesh(image, nodes=300)
     >>> tetopt.check_mesh(mesh, image)
     []
     >>> for line in tetopt.check_mesh(tetopt.Mesh(mesh.points, mesh.cells[1:]), image):

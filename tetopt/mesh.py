@@ -326,7 +326,7 @@ class Mesh:
     def to_trimesh(self) -> trimesh.Trimesh:
         """The boundary of a 3-D mesh for trimesh, as it is in the mesh.
 
-        Where cells touch in an edge or a node alone, this is no manifold; `tetopt.surface_of` parts them.
+        Where cells touch in an edge or a node alone, this is no manifold; `tetopt.extract_surface` parts them.
 
         Returns
         -------

@@ -23,9 +23,9 @@ TABLE_WORDS = ("Points", "Cells")  # of these, those of a row each, which are ta
 REMEDIES = {
     "Image": "tetopt.load_image(path) reads one, tetopt.Image(array, affine) makes one",
     "Mesh": "tetopt.load_mesh(path).mesh reads one, tetopt.mesh_image(...).mesh is one",
-    "Model": "tetopt.model_of(mesh, ...) makes one",
-    "Solution": "tetopt.solved_model(model) returns one",
-    "Surface": "tetopt.surface_of(points, cells, chosen) returns one",
+    "Model": "tetopt.build_model(mesh, ...) makes one",
+    "Solution": "tetopt.solve(model) returns one",
+    "Surface": "tetopt.extract_surface(points, cells, chosen) returns one",
 }
 NAMES_OF_KINDS = {
     "int": "a whole number",

@@ -22,7 +22,7 @@ import tetopt
 
 image = tetopt.load_phantom("two_spheres").image(voxel_mm=2.0)
 mesh = tetopt.mesh_image(image, nodes=400).mesh
-model = tetopt.model_of(mesh, image, young="h", nu=0.4, bins=12, loads=["compress:5%"])
+model = tetopt.build_model(mesh, image, young="h", nu=0.4, bins=12, loads=["compress:5%"])
 
 # %%
 # The input file is complete: ``ccx -i block`` needs no more. Where ``ccx`` is not installed, this program reads

@@ -17,8 +17,8 @@ import tetopt
 
 truth = tetopt.load_phantom("prostate_2d").image()
 fine = tetopt.mesh_image(truth, nodes=2500).mesh
-pressed = tetopt.model_of(fine, truth, young="h", nu=0.45, loads=["compress:1%"], order=2)
-fields = tetopt.solution_fields(fine, tetopt.solved_model(pressed))
+pressed = tetopt.build_model(fine, truth, young="h", nu=0.45, loads=["compress:1%"], order=2)
+fields = tetopt.solution_fields(fine, tetopt.solve(pressed))
 axial = -fields.cell_data["strain"][:, 3]  # rows are xx, xy, yx, yy
 noise = 1.0 + 0.02 * np.random.default_rng(0).standard_normal(truth.shape)
 strain = tetopt.Image(axial[tetopt.cell_of_voxel(truth, fine)] * noise, truth.affine)
@@ -28,7 +28,7 @@ strain = tetopt.Image(axial[tetopt.cell_of_voxel(truth, fine)] * noise, truth.af
 # Voxels are noisy, but a cell averages over many, and where the image varies by noise alone no nodes are spent.
 
 mesh = tetopt.mesh_image(strain, nodes=400).mesh
-model = tetopt.model_of(mesh, strain, young="0.1/max(abs(h), 0.001)", nu=0.45)
+model = tetopt.build_model(mesh, strain, young="0.1/max(abs(h), 0.001)", nu=0.45)
 young = model.materials.young[model.materials.of_cell]
 
 # %%

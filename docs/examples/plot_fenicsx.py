@@ -20,7 +20,7 @@ import tetopt
 
 image = tetopt.load_phantom("ellipsoids_brain").image(voxel_mm=4.0)
 mesh = tetopt.mesh_image(image, nodes=1500).mesh
-model = tetopt.model_of(mesh, image, young="0.5 + 0.05*h", nu=0.4, loads=["compress:5%"])
+model = tetopt.build_model(mesh, image, young="0.5 + 0.05*h", nu=0.4, loads=["compress:5%"])
 folder = tempfile.TemporaryDirectory()
 path = Path(folder.name) / "head.xdmf"
 tetopt.save_model(path, model)

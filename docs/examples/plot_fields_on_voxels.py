@@ -22,8 +22,8 @@ import tetopt
 
 image = tetopt.load_phantom("two_spheres").image(voxel_mm=2.0)
 mesh = tetopt.mesh_image(image, nodes=1000).mesh
-model = tetopt.model_of(mesh, image, young="h", nu=0.4, loads=["compress:5%"])
-solution = tetopt.solved_model(model)
+model = tetopt.build_model(mesh, image, young="h", nu=0.4, loads=["compress:5%"])
+solution = tetopt.solve(model)
 fields = tetopt.solution_fields(mesh, solution)
 
 # %%

@@ -14,7 +14,7 @@ import tetopt
 
 # %%
 # Every third voxel of the T1 in nilearn's wheel, to be quick. The mask is 1 in the brain and 0 around it; a mask on
-# another grid comes onto the image's by ``tetopt.aligned_mask``.
+# another grid comes onto the image's by ``tetopt.resample_mask``.
 
 template = load_mni152_template(resolution=1)
 image = tetopt.Image(template.get_fdata()[::3, ::3, ::3], template.affine @ np.diag([3, 3, 3, 1]))

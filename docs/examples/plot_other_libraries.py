@@ -42,10 +42,10 @@ print("there and back:", (again.points == mesh.points).all() and (again.cells ==
 
 # %%
 # trimesh holds surfaces. ``to_trimesh`` is the boundary of the whole mesh; the boundary of chosen cells comes from
-# ``tetopt.surface_of``, which is closed. A sphere of 20 mm radius has 33,510 mm3.
+# ``tetopt.extract_surface``, which is closed. A sphere of 20 mm radius has 33,510 mm3.
 
 chosen = tetopt.cell_moments(image, mesh).mean > 60
-closed = tetopt.surface_of(mesh.points, mesh.cells, chosen)
+closed = tetopt.extract_surface(mesh.points, mesh.cells, chosen)
 surface = trimesh.Trimesh(closed.points, closed.triangles, process=False)
 volume_mm3 = surface.volume
 print(f"trimesh: watertight {surface.is_watertight}, {volume_mm3:.1f} mm3")

@@ -19,8 +19,8 @@ image = tetopt.load_phantom("prostate_2d").image()
 
 def solution(mesh, order):
     """Displacements and energy of the compression, and the model that was solved."""
-    model = tetopt.model_of(mesh, image, young="h", nu=0.45, loads=["compress:1%"], order=order)
-    return tetopt.solved_model(model)
+    model = tetopt.build_model(mesh, image, young="h", nu=0.45, loads=["compress:1%"], order=order)
+    return tetopt.solve(model)
 
 
 # %%

@@ -18,7 +18,7 @@ import tetopt
 
 image = tetopt.load_phantom("sphere").image(voxel_mm=2.0)
 mesh = tetopt.mesh_image(image, nodes=900).mesh
-model = tetopt.model_of(mesh, image, young="h", nu=0.4, loads=["hold:inferior", "move:superior:6,0,-3"])
+model = tetopt.build_model(mesh, image, young="h", nu=0.4, loads=["hold:inferior", "move:superior:6,0,-3"])
 
 # %%
 # Boundaries have the names of the model's sets, and cells keep their order, so that the materials fit as they are.
@@ -40,7 +40,7 @@ u = skfem.solve(*skfem.condense(stiffness, x=u, D=np.concatenate([bottom.all(), 
 # The two solvers agree to rounding.
 
 energy = 0.5 * u @ stiffness @ u
-ours = tetopt.solved_model(model).strain_energy
+ours = tetopt.solve(model).strain_energy
 print(f"strain energy {energy:.2f} uJ by scikit-fem, {ours:.2f} uJ by tetopt")
 
 # %%

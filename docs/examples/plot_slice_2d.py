@@ -11,11 +11,11 @@ import matplotlib.pyplot as plt
 import tetopt
 
 # %%
-# ``tetopt.lattice`` makes the uniform mesh of the paper, and ``tetopt.optimize_paper`` is its scheme: nodes move down E
-# and are connected anew in the first iterations.
+# ``tetopt.lattice_mesh`` makes the uniform mesh of the paper, and ``tetopt.optimize_paper`` is its scheme: nodes move
+# down E and are connected anew in the first iterations.
 
 image = tetopt.load_phantom("fig2_2d").image(voxel_mm=1.0)
-start = tetopt.lattice(image, spacing=5.0)
+start = tetopt.lattice_mesh(image, spacing=5.0)
 shape_alone = tetopt.optimize_paper(image, start, k_D=0.0, iterations=15).mesh
 aligned = tetopt.optimize_paper(image, start, k_D=0.5, iterations=15).mesh
 

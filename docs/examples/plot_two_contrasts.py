@@ -13,7 +13,7 @@ import tetopt
 
 # %%
 # Two contrasts of one phantom on the same voxels. The disc and the ellipse show in the first alone, the box in the
-# second alone. A contrast on other voxels comes onto the first's by ``tetopt.aligned_contrast``.
+# second alone. A contrast on other voxels comes onto the first's by ``tetopt.resample_contrast``.
 
 labels = tetopt.load_phantom("fig2_2d").label_image()
 shape = labels.data.astype(int)

@@ -29,7 +29,7 @@ mesh = tetopt.mesh_image(image, nodes=3000).mesh
 # ``below:0.6`` names the largest set of cells that hang together and whose mean is below 0.6 (white matter has
 # 0.85, fluid 0.25). Its facets are a set, too, so that loads can name it, such as ``pressure:ventricles:1.5``.
 
-model = tetopt.model_of(mesh, image, sets=["ventricles=below:0.6"])
+model = tetopt.build_model(mesh, image, sets=["ventricles=below:0.6"])
 chosen = model.sets.cells["ventricles"]
 volume_ml = tetopt.cell_fields(mesh, image)["volume"][chosen].sum() / 1000.0
 print(f"{len(chosen)} cells, {volume_ml:.2f} ml")
@@ -38,7 +38,7 @@ print(f"{len(chosen)} cells, {volume_ml:.2f} ml")
 # The boundary of these cells is closed, and ``tetopt.save_surface`` writes it as STL or PLY. It is drawn in front of
 # the image's own slices.
 
-surface = tetopt.surface_of(mesh.points, mesh.cells, chosen)
+surface = tetopt.extract_surface(mesh.points, mesh.cells, chosen)
 ventricles = pyvista.PolyData.from_regular_faces(surface.points, surface.triangles)
 voxels = pyvista.ImageData(dimensions=image.shape, spacing=(step,) * 3, origin=affine[:3, 3])
 voxels["T1"] = image.data.ravel(order="F")

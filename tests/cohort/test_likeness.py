@@ -10,7 +10,7 @@ from tetopt.cohort.likeness import THUMBNAIL_BYTES, likenesses
 from tetopt.cohort.numbers import Row, collect
 from tetopt.image import Image
 from tetopt.report.thumbnail import thumbnail_png
-from tetopt.start.lattice import lattice
+from tetopt.start.lattice import lattice_mesh
 
 
 def saved(path, pixels):
@@ -94,7 +94,7 @@ def body(rng, x=1, y=1, z=1):
         data += 80.0 * (np.linalg.norm(world - centre, axis=-1) < 5 + rng.normal(0, 0.2))
     data = (data + rng.normal(0, 4, data.shape))[::x, ::y, ::z]
     image = Image(np.ascontiguousarray(data), np.eye(4))
-    return thumbnail_png(image, lattice(image, blocks=(2, 2, 2)))
+    return thumbnail_png(image, lattice_mesh(image, blocks=(2, 2, 2)))
 
 
 @pytest.mark.parametrize(

@@ -9,7 +9,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from meshes import TWO_TRIANGLES, delaunay_box, random_affine, split_box
 
-from tetopt import E_D, Image, Mesh, cell_moments, cell_of_voxel, lattice, load_phantom
+from tetopt import E_D, Image, Mesh, cell_moments, cell_of_voxel, lattice_mesh, load_phantom
 from tetopt.energy.discretization import cell_E_D, combined
 from tetopt.geometry.simplex import oriented, volumes
 
@@ -51,7 +51,7 @@ def test_E_D_of_a_constant_image_whose_mean_is_rounded_is_0():
     """The mean of 600 times this value is another float: 4e-16 less."""
     image = Image(np.full((10, 10, 6), 1.3509650502241122))
     assert np.mean(image.data) != image.data[0, 0, 0]
-    assert E_D(image, lattice(image, blocks=(1, 1, 1))) == 0
+    assert E_D(image, lattice_mesh(image, blocks=(1, 1, 1))) == 0
 
 
 @kernel
@@ -101,7 +101,7 @@ def test_E_D_of_a_linear_image_converges_with_the_voxels(n, kind, gradient, orde
         grid = Image(np.zeros((size,) * n, dtype=np.uint8), affine)
         centres = grid.to_world(np.moveaxis(np.indices(grid.shape), 0, -1))
         image = Image(centres @ np.array(gradient), affine)
-        mesh = lattice(image, kind, blocks=(1,) * n)
+        mesh = lattice_mesh(image, kind, blocks=(1,) * n)
         h = (mesh.points @ np.array(gradient))[mesh.cells]
         spread = ((h - h.mean(axis=1, keepdims=True)) ** 2).sum(axis=1) / ((n + 1) * (n + 2))
         exact = (volumes(mesh.points, mesh.cells) * spread).sum()
@@ -125,7 +125,7 @@ def test_E_D_of_the_sphere_is_the_analytic_one():
     image = load_phantom("sphere").image()
     assert image.volume == pytest.approx(64**3)
     r, contrast, V = 20.0, 80.0, 64.0**3
-    mesh = lattice(image, "bcc", blocks=(1, 1, 1))
+    mesh = lattice_mesh(image, "bcc", blocks=(1, 1, 1))
     assert len(mesh.cells) == 12
     f = 4 / 3 * pi * r**3 / V
     analytic = V * f * (1 - f) * contrast**2
@@ -170,7 +170,7 @@ def test_E_D_falls_with_the_block_and_is_0_with_one_voxel_a_cell(n, kind):
     """With a block a voxel no cell holds two centres: the mesh is the image."""
     rng = np.random.default_rng(0)
     image = Image(rng.normal(100.0, 10.0, (8, 4, 4)[:n]))
-    energies = [E_D(image, lattice(image, kind, blocks=tuple(b // s for b in image.shape))) for s in (4, 2, 1)]
+    energies = [E_D(image, lattice_mesh(image, kind, blocks=tuple(b // s for b in image.shape))) for s in (4, 2, 1)]
     assert energies[0] > 1.05 * energies[1] > 0
     assert energies[2] == pytest.approx(0, abs=1e-9)
 

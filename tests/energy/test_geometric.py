@@ -20,7 +20,7 @@ from meshes import (
     split_box,
 )
 
-from tetopt import E_G, Image, lattice
+from tetopt import E_G, Image, lattice_mesh
 from tetopt.energy.geometric import E_G_gradient, cell_E_G, ring_volumes, volume_and_E_G
 from tetopt.geometry.simplex import oriented, volumes
 from tetopt.geometry.topology import boundary_facets, rings
@@ -83,9 +83,9 @@ def test_E_G_is_the_interpolation_error_of_the_paraboloid(n):
 def test_E_G_of_a_lattice_is_that_of_its_blocks():
     """7 x 7 unit squares: 49 times SQUARE; halving the blocks divides the box's E_G by 4."""
     image = Image(np.zeros((7, 7)))
-    mesh = lattice(image, blocks=(7, 7))
+    mesh = lattice_mesh(image, blocks=(7, 7))
     assert E_G(mesh.points, mesh.cells) == pytest.approx(49 * E_G(*SQUARE), rel=1e-13)
-    finer = lattice(image, blocks=(14, 14))
+    finer = lattice_mesh(image, blocks=(14, 14))
     assert E_G(finer.points, finer.cells) == pytest.approx(49 * E_G(*SQUARE) / 4, rel=1e-13)
 
 
@@ -158,7 +158,7 @@ def test_inner_nodes_of_lattices_are_in_equilibrium(kind):
     n = 2 if kind == "criss-cross" else 3
     """All but those beside the box, where a lattice's cells are others."""
     image = Image(np.zeros((5,) * n))
-    mesh = lattice(image, kind, blocks=(5,) * n)
+    mesh = lattice_mesh(image, kind, blocks=(5,) * n)
     gradient = E_G_gradient(mesh.points, mesh.cells)
     inner = np.abs(mesh.points - 2).max(axis=1) < 1.8
     assert inner.sum() >= 4**n
@@ -170,7 +170,7 @@ def test_moving_a_node_to_the_weighted_circumcentres_lowers_E_G(seed, n):
     """It is the minimiser over one inner node, so the energy there is below that of any other place."""
     rng = np.random.default_rng(seed)
     image = Image(np.zeros((3,) * n))
-    mesh = lattice(image, blocks=(1,) * n)
+    mesh = lattice_mesh(image, blocks=(1,) * n)
     node = len(mesh.points) - 1
     start = mesh.points.copy()
     start[node] += rng.uniform(-0.8, 0.8, n)

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from meshes import TWO_TRIANGLES, delaunay_box, random_affine, random_rotation, split_box
 from scipy.spatial import Delaunay
 
-from tetopt import Image, InputError, Mesh, cell_moments, cell_of_voxel, lattice
+from tetopt import Image, InputError, Mesh, cell_moments, cell_of_voxel, lattice_mesh
 from tetopt.energy.sampling import (
     cell_moments_and_ranges,
     cell_ranges,
@@ -80,7 +80,7 @@ def test_centres_on_the_walls_of_a_cube_s_six_cells():
 def test_a_centre_on_a_node_goes_to_one_of_its_cells(n):
     """One voxel, one block, its middle node on the centre: the cell on the positive side of the last axis."""
     image = Image(np.zeros((1,) * n))
-    mesh = lattice(image, blocks=(1,) * n)
+    mesh = lattice_mesh(image, blocks=(1,) * n)
     counts = cell_moments(image, mesh).n_voxels
     assert counts.sum() == 1
     owner = int(cell_of_voxel(image, mesh).item())
@@ -120,7 +120,7 @@ def test_owners_on_random_meshes_are_the_twin_s(seed, n):
 )
 def test_owners_on_lattices_are_the_twin_s(shape, kind, blocks):
     image = Image(np.zeros(shape))
-    mesh = lattice(image, kind, blocks=blocks)
+    mesh = lattice_mesh(image, kind, blocks=blocks)
     owner = cell_of_voxel(image, mesh)
     np.testing.assert_array_equal(owner, naive.cell_of_voxel(image, mesh))
     assert (owner >= 0).all()
@@ -235,7 +235,7 @@ def test_counts_on_jittered_lattices(n, kind, seed):
     shape = tuple(int(s * SMALL) for s in (40, 36, 50))[:n] if n == 2 else tuple(int(s * SMALL) for s in (20, 18, 26))
     blocks = (6, 5) if n == 2 else (3, 3, 4)
     image = random_image(rng, shape, random_affine(rng, n))
-    mesh = lattice(image, kind, blocks=blocks)
+    mesh = lattice_mesh(image, kind, blocks=blocks)
     index = image.to_index(mesh.points)
     is_inside = ((index > -0.4) & (index < np.array(shape) - 0.6)).all(axis=1, keepdims=True)
     index = index + is_inside * rng.uniform(-0.1, 0.1, index.shape) * np.array(shape) / blocks
@@ -320,7 +320,7 @@ def test_moments_are_numpy_s_over_each_cell_s_voxels(seed, n, is_snapped):
 def test_variance_of_a_small_contrast_on_a_large_mean(offset, contrast):
     """Two values in turn, a 1e-8th or a millionth apart: sums of h^2 would lose most digits of the variance."""
     image = Image(offset + contrast * (np.indices((8, 8)).sum(axis=0) % 2))
-    mesh = lattice(image, blocks=(1, 1))
+    mesh = lattice_mesh(image, blocks=(1, 1))
     owner = cell_of_voxel(image, mesh)
     exact = [image.data[owner == cell].astype(np.float64).var() for cell in range(4)]
     assert cell_moments(image, mesh).variance == pytest.approx(exact, rel=1e-6, abs=0)
@@ -400,7 +400,7 @@ def test_a_mesh_partly_outside_counts_what_is_inside(seed, n):
 
 def test_a_mesh_beside_the_image_holds_nothing():
     image = Image(np.arange(27.0).reshape(3, 3, 3))
-    mesh = lattice(image, blocks=(1, 1, 1))
+    mesh = lattice_mesh(image, blocks=(1, 1, 1))
     moved = Mesh(mesh.points + np.array([10.0, 0, 0]), mesh.cells)
     moments = cell_moments(image, moved)
     assert moments.n_voxels.tolist() == [0] * 12
@@ -468,7 +468,7 @@ def test_a_flip_of_the_array_flips_the_owners_of_a_generic_mesh():
 def test_the_same_bits_on_one_and_two_threads():
     rng = np.random.default_rng(0)
     image = Image(rng.normal(size=(30, 31, 32)))
-    mesh = lattice(image, blocks=(6, 6, 6))
+    mesh = lattice_mesh(image, blocks=(6, 6, 6))
     assert len(mesh.cells) > 1000
     before = numba.get_num_threads()
     sums = []
@@ -487,7 +487,7 @@ def test_the_same_bits_on_one_and_two_threads():
 def test_the_grid_of_a_brain_is_a_millionth_of_a_voxel():
     """By its longest axis, of 218 voxels."""
     image = Image(np.zeros((3, 218, 2)))
-    grid = sampling_grid(image, lattice(image, blocks=(1, 1, 1)).points)
+    grid = sampling_grid(image, lattice_mesh(image, blocks=(1, 1, 1)).points)
     assert grid.bits == 20
     assert grid.shape == (3, 218, 2)
 
@@ -519,7 +519,7 @@ def test_mesh_and_image_of_different_dimension_are_refused():
         (square, cube, "a 3-D mesh and a 2-D image"),
         (cube, square, "a 2-D mesh and a 3-D image"),
     ]:
-        mesh = lattice(of_mesh, blocks=(1,) * of_mesh.ndim)
+        mesh = lattice_mesh(of_mesh, blocks=(1,) * of_mesh.ndim)
         for function in (cell_moments, cell_of_voxel):
             with pytest.raises(InputError, match=message):
                 function(of_image, mesh)
@@ -538,7 +538,7 @@ def test_cells_flat_or_inverted_at_the_grid_s_resolution_are_refused(function, h
 @pytest.mark.parametrize("function", [cell_moments, cell_of_voxel])
 def test_a_mesh_in_other_units_is_refused(function):
     image = Image(np.zeros((4, 4, 4)))
-    mesh = lattice(image, blocks=(1, 1, 1))
+    mesh = lattice_mesh(image, blocks=(1, 1, 1))
     assert function(image, Mesh(mesh.points + 2.0**20 - 8, mesh.cells)) is not None
     with pytest.raises(InputError, match=r"the mesh reaches 2\.1e\+06 voxels .* in the same mm\?"):
         function(image, Mesh(mesh.points + 2.0**21, mesh.cells))

@@ -245,7 +245,7 @@ def test_nodes_go_where_the_image_is():
     image = tetopt.Image(100.0 * (((index - 20) ** 2).sum(-1) < 49))
     E_D, nodes_near = {}, {}
     for does_exchange in (False, True):
-        engine = Engine(image, tetopt.lattice(image, blocks=(5, 5, 5)), 0.5, is_graded=True)
+        engine = Engine(image, tetopt.lattice_mesh(image, blocks=(5, 5, 5)), 0.5, is_graded=True)
         engine.keep_floor(10.0)
         N, geometry = len(engine.complex.ticks), engine.objective.geometry
         for _ in range(8):
@@ -275,7 +275,7 @@ def test_a_part_of_the_box_stays_what_it_is(part, boundary):
     index = np.stack(np.meshgrid(*[np.arange(24)] * 3, indexing="ij"), -1)
     noise = np.random.default_rng(1).normal(size=(24,) * 3)
     image = tetopt.Image(100.0 * (((index - 11) ** 2).sum(-1) < 50) + noise)
-    whole = tetopt.lattice(image, blocks=(4, 4, 4))
+    whole = tetopt.lattice_mesh(image, blocks=(4, 4, 4))
     centre = whole.points[whole.cells].mean(axis=1)
     kept = {
         "half": centre[:, 0] < 11.5,
@@ -297,12 +297,12 @@ def test_a_part_of_the_box_stays_what_it_is(part, boundary):
 def test_numbers_of_nodes_that_are_none(nodes):
     image = tetopt.Image(np.random.default_rng(1).normal(size=(10, 10, 10)))
     with pytest.raises(tetopt.InputError, match="nodes: expected a whole number"):
-        tetopt.optimize(image, tetopt.lattice(image, blocks=(2, 2, 2)), nodes=nodes)
+        tetopt.optimize(image, tetopt.lattice_mesh(image, blocks=(2, 2, 2)), nodes=nodes)
 
 
 def test_far_more_nodes():
     """From 35 nodes towards 8000: doubled at most at each exchange, none of them wrong."""
     image = tetopt.Image(np.random.default_rng(1).normal(size=(20, 20, 20)))
-    result = tetopt.optimize(image, tetopt.lattice(image, blocks=(2, 2, 2)), k_D=0.9, nodes=8000, iterations=6)
+    result = tetopt.optimize(image, tetopt.lattice_mesh(image, blocks=(2, 2, 2)), k_D=0.9, nodes=8000, iterations=6)
     assert 50 < len(result.mesh.points) < 8000
     assert tetopt.check_mesh(result.mesh, image) == []

@@ -38,7 +38,7 @@ KINDS = {
     "masked labels of two contrasts": (target(3, "labels", "mask", "contrasts"), {"nodes": 150}),
     "plane": (target(2, "labels"), {"nodes": 120}),
     "order 2": (target(3), {"nodes": 500, "order": 2}),
-    "start": (target(3, "labels"), {"start": tetopt.lattice(target(3)[0], nodes=150)}),
+    "start": (target(3, "labels"), {"start": tetopt.lattice_mesh(target(3)[0], nodes=150)}),
     "error": (target(3), {"target_error": 0.3}),
     "paper": (target(3), {"nodes": 150, "mode": "paper"}),
 }
@@ -94,7 +94,7 @@ def assert_sound(result, image, labels, mask, order=1):
         assert sum(row.n_cells for row in measured["labels"]) == len(mesh.cells)
         assert sum(row.mesh_volume for row in measured["labels"]) == pytest.approx(image.volume)
     assert all(len(values) == len(mesh.cells) for values in fields.values())
-    model = tetopt.model_of(mesh, image, young=3.0, order=order, cell_data=fields)
+    model = tetopt.build_model(mesh, image, young=3.0, order=order, cell_data=fields)
     assert len(file_bytes(Path("a.vtu"), model)) > 1000
 
 

@@ -133,7 +133,7 @@ def test_image_curvature_at_a_step():
     """Where the image steps across a facet that is nearly there already, E_D bends; in a uniform image it does not."""
     data = np.where(np.arange(40)[:, None, None] > 20, 100.0, 20.0) * np.ones((40, 36, 32))
     image = tetopt.Image(data)
-    mesh = tetopt.lattice(image, blocks=(2, 2, 2))
+    mesh = tetopt.lattice_mesh(image, blocks=(2, 2, 2))
     engine = Engine(image, mesh, 0.5)
     rings = node_rings(engine.state)
     for node in range(len(mesh.points)):
@@ -154,7 +154,7 @@ def test_image_gradient_on_smooth_images(n, turned):
     """
     shape, blocks, reach = ((2400, 2000), (3, 3), 16.0) if n == 2 else ((200, 180, 190), (3, 3, 3), 8.0)
     image = smooth_image(shape, None if not turned else np.diag([1.0, -0.5, 2.0, 1.0]))
-    mesh = tetopt.lattice(image, blocks=blocks)
+    mesh = tetopt.lattice_mesh(image, blocks=blocks)
     engine = Engine(image, mesh, 0.5)
     _, image_gradient = gradient(engine.state, node_rings(engine.state))
     inner = np.flatnonzero(~engine.complex.is_frozen[:, 3 - n : 3].any(axis=1))
@@ -178,7 +178,7 @@ def test_image_gradient_in_the_mean_on_noise():
     rng = np.random.default_rng(0)
     data = np.where(np.arange(60)[:, None, None] > 29, 100.0, 20.0) + rng.normal(0, 10, (60, 56, 52))
     image = tetopt.Image(data)
-    mesh = tetopt.lattice(image, blocks=(5, 5, 5))
+    mesh = tetopt.lattice_mesh(image, blocks=(5, 5, 5))
     engine = Engine(image, mesh, 0.5)
     _, image_gradient = gradient(engine.state, node_rings(engine.state))
     inner = np.flatnonzero(~engine.complex.is_frozen.any(axis=1))
@@ -250,7 +250,7 @@ def test_flips_at_k_D_0_tend_to_delaunay(n):
     if n == 2:
         points, cells = split_box(rng, shape, 120)
     else:
-        mesh = tetopt.lattice(image, nodes=800)
+        mesh = tetopt.lattice_mesh(image, nodes=800)
         frozen = Engine(image, mesh, 0.0, 1.0).complex.is_frozen[:, :3]
         step = 0.12 * image.volume ** (1 / 3) / 800 ** (1 / 3) * 1.5
         points = mesh.points + np.where(frozen, 0.0, rng.uniform(-step, step, mesh.points.shape))
@@ -292,7 +292,7 @@ def test_a_flip_is_worth_what_it_says():
 def test_laws(name, k_D, boundary):
     """A mesh of the box with every voxel; E falls but where the floor was lifted; the history is of the mesh."""
     image, blocks = CASES[name]
-    mesh = tetopt.lattice(image, blocks=blocks)
+    mesh = tetopt.lattice_mesh(image, blocks=blocks)
     result = tetopt.optimize(image, mesh, k_D=k_D, iterations=8, boundary=boundary)
     assert tetopt.check_mesh(result.mesh, image) == []
     assert all(row.n_voxels == image.data.size for row in result.history)
@@ -312,7 +312,7 @@ def test_laws(name, k_D, boundary):
 def test_reaches_lower_than_the_paper(name):
     """With the paper's own energy (p = 1, no floor) the same iterations end lower."""
     image, blocks = CASES[name]
-    mesh = tetopt.lattice(image, blocks=blocks)
+    mesh = tetopt.lattice_mesh(image, blocks=blocks)
     paper = tetopt.optimize_paper(image, mesh, k_D=0.5, iterations=20)
     fast = tetopt.optimize(image, mesh, k_D=0.5, iterations=20, shape_power=1.0, min_dihedral=0.0)
     assert fast.history[-1].E < paper.history[-1].E
@@ -320,7 +320,7 @@ def test_reaches_lower_than_the_paper(name):
 
 def test_same_bits_for_any_number_of_threads():
     image = ball((40, 44, 36))
-    mesh = tetopt.lattice(image, nodes=1500)
+    mesh = tetopt.lattice_mesh(image, nodes=1500)
     results = []
     for threads in (1, 2, 2):
         numba.set_num_threads(threads)
@@ -335,7 +335,7 @@ def test_same_bits_for_any_number_of_threads():
 def test_floor():
     """Higher floors are reached too, up to what a coarse ball allows; without one, worse cells are left."""
     image, _ = CASES["3-D"]
-    mesh = tetopt.lattice(image, nodes=400)
+    mesh = tetopt.lattice_mesh(image, nodes=400)
     worst = {}
     for floor in (0.0, 12.0, 20.0):
         made = tetopt.optimize(image, mesh, k_D=0.5, min_dihedral=floor).mesh
@@ -346,7 +346,7 @@ def test_floor():
 
 def squashed(image, blocks):
     """A lattice some of whose cells have been pressed flat: angles of about 2 degrees, at inner nodes."""
-    mesh = tetopt.lattice(image, blocks=blocks)
+    mesh = tetopt.lattice_mesh(image, blocks=blocks)
     points = mesh.points.copy()
     index = image.to_index(points)
     inner = ((index > 1.0) & (index < np.array(image.shape) - 2.0)).all(axis=1)
@@ -374,7 +374,7 @@ def test_flips_leave_nothing_to_gain():
     engine.flip()
     assert engine.flip() == 0
     image, blocks = CASES["3-D"]
-    run = Run(plain(image), tetopt.lattice(image, blocks=blocks), 0.5)
+    run = Run(plain(image), tetopt.lattice_mesh(image, blocks=blocks), 0.5)
     for _ in range(4):  # looked for only around the nodes that moved, little is left for a look at all of them
         run.sweep()
         run.flip()
@@ -466,7 +466,7 @@ def test_edges_with_many_cells_are_left_alone():
 
 def test_refuses_flat_and_folded_starts():
     image, blocks = CASES["3-D"]
-    mesh = tetopt.lattice(image, blocks=blocks)
+    mesh = tetopt.lattice_mesh(image, blocks=blocks)
     a, b, c, d = mesh.cells[0]
     points = np.vstack([mesh.points, mesh.points[[a, b, c]].mean(axis=0) * (1 - 1e-7) + 1e-7 * mesh.points[d]])
     e = len(mesh.points)
@@ -487,7 +487,7 @@ def test_refuses_flat_and_folded_starts():
 
 def test_stops_and_tells_why():
     image, blocks = CASES["3-D"]
-    mesh = tetopt.lattice(image, blocks=blocks)
+    mesh = tetopt.lattice_mesh(image, blocks=blocks)
     assert tetopt.optimize(image, mesh, iterations=1).ended == "iterations"
     late = tetopt.optimize(image, mesh, max_seconds=1e-9)
     assert late.ended == "max_seconds"
@@ -503,7 +503,7 @@ def test_stops_and_tells_why():
 
 def test_constant_image():
     image = tetopt.Image(np.full((9, 8, 7), 5.0))
-    mesh = tetopt.lattice(image, blocks=(3, 3, 3))
+    mesh = tetopt.lattice_mesh(image, blocks=(3, 3, 3))
     result = tetopt.optimize(image, mesh, k_D=0.5, iterations=4)
     assert result.history[0].E == pytest.approx(0.5)
     assert all(row.E_D == 0.0 and row.n_voxels == image.data.size for row in result.history)
@@ -512,7 +512,7 @@ def test_constant_image():
 def test_any_conforming_mesh(tmp_path):
     """A mesh of part of the box, with a reentrant corner: its outside nodes stay, E falls, it stays a mesh."""
     image, blocks = CASES["3-D"]
-    whole = tetopt.lattice(image, blocks=blocks)
+    whole = tetopt.lattice_mesh(image, blocks=blocks)
     centre = image.to_index(whole.points[whole.cells].mean(axis=1))
     cells = whole.cells[~(centre > np.array(image.shape) / 2).all(axis=1)]
     used, compact = np.unique(cells, return_inverse=True)
@@ -539,12 +539,12 @@ def test_any_conforming_mesh(tmp_path):
 def test_refuses(options, words):
     image, blocks = CASES["3-D"]
     with pytest.raises(tetopt.InputError, match=words):
-        tetopt.optimize(image, tetopt.lattice(image, blocks=blocks), **options)
+        tetopt.optimize(image, tetopt.lattice_mesh(image, blocks=blocks), **options)
 
 
 def test_refuses_doubled_cells():
     image, blocks = CASES["3-D"]
-    mesh = tetopt.lattice(image, blocks=blocks)
+    mesh = tetopt.lattice_mesh(image, blocks=blocks)
     with pytest.raises(tetopt.InputError, match="or more than two"):
         tetopt.optimize(image, tetopt.Mesh(mesh.points, np.vstack([mesh.cells, mesh.cells[:1]])))
 
@@ -552,7 +552,7 @@ def test_refuses_doubled_cells():
 def test_run_measures_what_it_has():
     """After iterations with floor and flips, the run's complex is what a fresh measurement finds."""
     image, blocks = CASES["oblique"]
-    run = Run(plain(image), tetopt.lattice(image, blocks=blocks), 0.5)
+    run = Run(plain(image), tetopt.lattice_mesh(image, blocks=blocks), 0.5)
     for _ in range(3):
         run.sweep()
         run.flip()

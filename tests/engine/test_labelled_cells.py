@@ -44,7 +44,7 @@ def labelled_state():
 
     def made(name, nodes=500):
         target = content(CASES[name], labels=CASES[name], weights=[0.0])
-        mesh = tetopt.octree(target, nodes)
+        mesh = tetopt.octree_mesh(target, nodes)
         grid = channel_grid(target, mesh.points)
         state = with_floor(state_of(target, mesh, grid, 0.85, is_graded=True), 12.0)
         return with_labels(state, target, mesh), target, grid
@@ -296,7 +296,7 @@ def test_collapses_keep_labels_as_small_as_a_cell(labelled_state):
     """Where labels are as small as cells: no cell between two interfaces goes with a node, nor one of five labels."""
     image = patches(27, 14, 6)
     target = content(image, labels=image, weights=[0.0])
-    mesh = tetopt.octree(target, 300)
+    mesh = tetopt.octree_mesh(target, 300)
     grid = channel_grid(target, mesh.points)
     state = with_labels(with_floor(state_of(target, mesh, grid, 0.85, is_graded=True), 12.0), target, mesh)
     before = None

@@ -36,7 +36,7 @@ def solved(points, cells, labels, n_labels=2, pieces=None, weight=None, counts=N
 
 def lattice(n, cubes):
     """A small lattice: cells numbered as they come."""
-    mesh = tetopt.lattice(tetopt.Image(np.zeros((cubes,) * n)), blocks=(cubes,) * n)
+    mesh = tetopt.lattice_mesh(tetopt.Image(np.zeros((cubes,) * n)), blocks=(cubes,) * n)
     return mesh.points, mesh.cells
 
 
@@ -154,7 +154,7 @@ def ball(n_blocks=7, radius=7.5, seed=None):
     """A lattice and the labels of a ball in it, with some cells of noise."""
     shape = (24, 24, 24)
     image = tetopt.Image(1.0 * (distance(shape, 11.5, 11.6, 11.7) < radius))
-    mesh = tetopt.lattice(image, blocks=(n_blocks,) * 3)
+    mesh = tetopt.lattice_mesh(image, blocks=(n_blocks,) * 3)
     owner, n_cells = cell_of_voxel(image, mesh).ravel(), len(mesh.cells)
     counts = np.zeros((n_cells, 2))
     np.add.at(counts, (owner, image.data.ravel().astype(int)), 1.0)
@@ -190,7 +190,7 @@ def test_tension_takes_half_of_a_label_at_most():
 def test_a_disc_in_the_plane():
     shape = (30, 28)
     image = tetopt.Image(1.0 * (distance(shape, 14.2, 13.1) < 8.0))
-    mesh = tetopt.lattice(image, blocks=(9, 9))
+    mesh = tetopt.lattice_mesh(image, blocks=(9, 9))
     counts = np.zeros((len(mesh.cells), 2))
     np.add.at(counts, (cell_of_voxel(image, mesh).ravel(), image.data.ravel().astype(int)), 1.0)
     loose = np.random.default_rng(2).random(len(counts)) < 0.05
@@ -238,7 +238,7 @@ def test_what_hangs_together_in_the_voxels_is_bridged():
 def test_cubes_that_touch_at_an_edge_or_a_corner_are_linked_or_parted():
     """A lattice of cubes, two of which have the label: what they share is no longer pinched."""
     image = tetopt.Image(np.zeros((4, 4, 4)))
-    mesh = tetopt.lattice(image, "five-tet", blocks=(4, 4, 4))
+    mesh = tetopt.lattice_mesh(image, "five-tet", blocks=(4, 4, 4))
     cube = np.floor(mesh.points[mesh.cells].mean(axis=1) + 0.5).astype(int)
     for other in ((2, 2, 1), (2, 2, 2)):
         labels = ((cube == 1).all(axis=1) | (cube == other).all(axis=1)).astype(np.int64)

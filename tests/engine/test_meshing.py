@@ -24,7 +24,7 @@ def assert_same(result, expected):
 
 
 def test_graded():
-    result, initial = tetopt.mesh_image(IMAGE, 200, iterations=4), tetopt.octree(IMAGE, 200)
+    result, initial = tetopt.mesh_image(IMAGE, 200, iterations=4), tetopt.octree_mesh(IMAGE, 200)
     assert_same(result, tetopt.optimize(IMAGE, initial, nodes=200, k_D=0.85, iterations=4))
     assert result.initial.points.tobytes() == initial.points.tobytes()
     assert result.nodes == 200
@@ -93,13 +93,13 @@ def test_longest_edge_of_order_2():
 
 def test_by_the_paper():
     result = tetopt.mesh_image(IMAGE, mode="paper", spacing=16.0, iterations=2, n_t=1)
-    lattice = tetopt.lattice(IMAGE, spacing=16.0)
+    lattice = tetopt.lattice_mesh(IMAGE, spacing=16.0)
     assert_same(result, tetopt.optimize_paper(IMAGE, lattice, k_D=0.2, iterations=2, n_t=1))
 
 
 def test_a_mesh_to_start_from():
     """Its boundary stays, unless it is told to slide."""
-    start = tetopt.lattice(IMAGE, nodes=100)
+    start = tetopt.lattice_mesh(IMAGE, nodes=100)
     assert_same(
         tetopt.mesh_image(IMAGE, start=start, iterations=2),
         tetopt.optimize(IMAGE, start, k_D=0.02, iterations=2, boundary="fixed"),
@@ -129,7 +129,7 @@ def test_runs_are_watched():
         ({"mode": "coarse"}, "expected a mode of graded, uniform, paper, start, got 'coarse'"),
         ({"nodes": 100, "kind": "bcc"}, "takes nodes, target_error, sizes, but no kind"),
         ({"nodes": 100, "mode": "uniform", "sizes": tetopt.Sizes()}, "takes nodes, spacing, kind, but no sizes"),
-        ({"nodes": 100, "start": tetopt.lattice(IMAGE, nodes=60)}, "takes start, but no nodes"),
+        ({"nodes": 100, "start": tetopt.lattice_mesh(IMAGE, nodes=60)}, "takes start, but no nodes"),
         ({"mode": "uniform"}, "a number of nodes or a spacing, one of them"),
         ({"mode": "paper", "nodes": 100, "spacing": 5.0}, "a number of nodes or a spacing, one of them"),
         ({"mode": "start"}, "needs a mesh to start from"),

@@ -60,7 +60,7 @@ def domain_problems(image, mesh):
 def test_laws(name, k_D, retessellate):
     """Every iteration holds every voxel; E never rises on a fixed connectivity, nor at all with "accept"."""
     image, blocks = CASES[name]
-    mesh = tetopt.lattice(image, blocks=blocks)
+    mesh = tetopt.lattice_mesh(image, blocks=blocks)
     result = optimize_paper(image, mesh, k_D=k_D, iterations=8, n_t=4, retessellate=retessellate)
     assert domain_problems(image, result.mesh) == []
     assert {row.n_voxels for row in result.history} == {image.data.size}
@@ -78,7 +78,7 @@ def test_laws(name, k_D, retessellate):
 def test_history_holds_the_energies_of_the_mesh(name):
     """The running totals of the last row are those of the returned mesh, measured afresh."""
     image, blocks = CASES[name]
-    result = optimize_paper(image, tetopt.lattice(image, blocks=blocks), k_D=0.4, iterations=5)
+    result = optimize_paper(image, tetopt.lattice_mesh(image, blocks=blocks), k_D=0.4, iterations=5)
     last, first = result.history[-1], result.history[0]
     assert last.E_G == pytest.approx(tetopt.E_G(result.mesh.points, result.mesh.cells), rel=1e-9)
     assert last.E_D == pytest.approx(tetopt.E_D(image, result.mesh), rel=1e-9)
@@ -90,7 +90,7 @@ def test_history_holds_the_energies_of_the_mesh(name):
 def test_the_image_pulls_the_mesh():
     """More weight for the image leaves less E_D and no less E_G; without weight E_D is not looked at."""
     image, blocks = CASES["3-D"]
-    mesh = tetopt.lattice(image, blocks=blocks)
+    mesh = tetopt.lattice_mesh(image, blocks=blocks)
     runs = [optimize_paper(image, mesh, k_D=k_D, iterations=10, retessellate="never") for k_D in (0.0, 0.05, 0.3, 0.8)]
     E_D = [run.history[-1].E_D / run.history[0].E_D for run in runs]
     E_G = [run.history[-1].E_G / run.history[0].E_G for run in runs]
@@ -105,7 +105,7 @@ def test_lloyd_reaches_a_stationary_mesh(name):
     image, blocks = CASES[name]
     n = image.ndim
     rng = np.random.default_rng(3)
-    mesh = tetopt.lattice(image, blocks=blocks)
+    mesh = tetopt.lattice_mesh(image, blocks=blocks)
     ticks = to_ticks(image.to_index(mesh.points), sampling_grid(image, mesh.points))
     frozen = frozen_axes(image, ticks, mesh.cells, sampling_grid(image, mesh.points), "slide")[:, 3 - n : 3]
     step = 0.12 * np.array(image.shape) / np.array(blocks)
@@ -155,7 +155,7 @@ def test_random_nodes_become_well_shaped():
 def test_boundary_nodes(name, boundary):
     """Fixed: none moves. Slide: each keeps the coordinates across its faces, corners keep all, some do move."""
     image, blocks = CASES[name]
-    mesh = tetopt.lattice(image, blocks=blocks)
+    mesh = tetopt.lattice_mesh(image, blocks=blocks)
     result = optimize_paper(image, mesh, k_D=0.5, iterations=4, retessellate="never", boundary=boundary)
     before, after = image.to_index(mesh.points), image.to_index(result.mesh.points)
     outer = np.unique(boundary_facets(mesh.cells))
@@ -170,7 +170,7 @@ def test_boundary_nodes(name, boundary):
 def test_nodes_inside_the_box_on_a_free_boundary_stay():
     """A mesh that ends inside the image keeps its boundary, sliding or not; it is not connected anew."""
     image = ball((24, 20, 22))
-    small = tetopt.lattice(tetopt.Image(np.zeros((10, 10, 10)) + np.arange(10), np.eye(4)), blocks=(3, 3, 3))
+    small = tetopt.lattice_mesh(tetopt.Image(np.zeros((10, 10, 10)) + np.arange(10), np.eye(4)), blocks=(3, 3, 3))
     mesh = tetopt.Mesh(small.points + 6.0, small.cells)
     result = optimize_paper(image, mesh, k_D=0.5, iterations=3, retessellate="never")
     outer = np.unique(boundary_facets(mesh.cells))
@@ -184,7 +184,7 @@ def test_nodes_inside_the_box_on_a_free_boundary_stay():
 @pytest.mark.parametrize("k_D", [0.0, 0.3])
 def test_same_bits_on_one_and_two_threads(k_D):
     image = ball((40, 44, 36))
-    mesh = tetopt.lattice(image, nodes=1500)
+    mesh = tetopt.lattice_mesh(image, nodes=1500)
     results = []
     for threads in (1, 2, 2):
         numba.set_num_threads(threads)
@@ -205,7 +205,7 @@ def test_turned_world_turned_mesh():
     turn[:3, 3] = (40.0, -25.0, 10.0)
     plain = ball(shape)
     turned = ball(shape, turn)
-    results = [optimize_paper(i, tetopt.lattice(i, blocks=blocks), k_D=0.3, iterations=6) for i in (plain, turned)]
+    results = [optimize_paper(i, tetopt.lattice_mesh(i, blocks=blocks), k_D=0.3, iterations=6) for i in (plain, turned)]
     np.testing.assert_allclose(turned.to_index(results[1].mesh.points), results[0].mesh.points, atol=1e-3)
     assert results[1].history[-1].E == pytest.approx(results[0].history[-1].E, rel=1e-6)
 
@@ -215,7 +215,7 @@ def test_scaled_world_scaled_mesh():
     shape, blocks = (24, 20, 22), (4, 3, 4)
     plain = ball(shape)
     scaled = tetopt.Image(plain.data * 0.5, np.diag([2.0, 2.0, 2.0, 1.0]))
-    results = [optimize_paper(i, tetopt.lattice(i, blocks=blocks), k_D=0.3, iterations=6) for i in (plain, scaled)]
+    results = [optimize_paper(i, tetopt.lattice_mesh(i, blocks=blocks), k_D=0.3, iterations=6) for i in (plain, scaled)]
     np.testing.assert_allclose(results[1].mesh.points, 2.0 * results[0].mesh.points, atol=1e-4)
     assert results[1].history[-1].E == pytest.approx(results[0].history[-1].E, rel=1e-9)
     assert results[1].history[-1].E_G == pytest.approx(2.0**5 * results[0].history[-1].E_G, rel=1e-9)
@@ -224,7 +224,7 @@ def test_scaled_world_scaled_mesh():
 def test_constant_image():
     """E_D is 0 all the way, and only the shapes move the nodes."""
     image = tetopt.Image(np.full((12, 12, 12), 20.1))
-    result = optimize_paper(image, tetopt.lattice(image, blocks=(3, 3, 3)), k_D=0.5, iterations=3)
+    result = optimize_paper(image, tetopt.lattice_mesh(image, blocks=(3, 3, 3)), k_D=0.5, iterations=3)
     assert [row.E_D for row in result.history] == [0.0] * len(result.history)
     assert result.history[0].E == 0.5
     assert result.history[-1].E <= 0.5
@@ -232,7 +232,7 @@ def test_constant_image():
 
 def test_no_iterations_returns_the_mesh():
     image, blocks = CASES["3-D"]
-    mesh = tetopt.lattice(image, blocks=blocks)
+    mesh = tetopt.lattice_mesh(image, blocks=blocks)
     result = optimize_paper(image, mesh, iterations=0)
     np.testing.assert_allclose(result.mesh.points, mesh.points, atol=1e-6)
     np.testing.assert_array_equal(result.mesh.cells, mesh.cells)
@@ -242,7 +242,9 @@ def test_no_iterations_returns_the_mesh():
 def test_converges():
     """It stops by itself once the nodes move less than the tolerance."""
     image, blocks = CASES["2-D"]
-    result = optimize_paper(image, tetopt.lattice(image, blocks=blocks), k_D=0.2, iterations=500, n_t=5, tolerance=1e-4)
+    result = optimize_paper(
+        image, tetopt.lattice_mesh(image, blocks=blocks), k_D=0.2, iterations=500, n_t=5, tolerance=1e-4
+    )
     assert result.ended == "converged"
     assert len(result.history) < 500
     assert result.history[-1].movement < 1e-4 <= result.history[-2].movement
@@ -250,7 +252,7 @@ def test_converges():
 
 def test_retessellation_ends_after_n_t():
     image, blocks = CASES["3-D"]
-    result = optimize_paper(image, tetopt.lattice(image, blocks=blocks), k_D=0.5, iterations=8, n_t=3)
+    result = optimize_paper(image, tetopt.lattice_mesh(image, blocks=blocks), k_D=0.5, iterations=8, n_t=3)
     anew = [row.iteration for row in result.history if row.is_retessellated]
     assert anew
     assert max(anew) <= 3
@@ -260,7 +262,7 @@ def test_retessellation_ends_after_n_t():
 def test_ended_early_with_a_valid_mesh(how):
     image, blocks = CASES["3-D"]
     options = {"max_seconds": 1e-6} if how == "max_seconds" else {"stop": lambda: True}
-    result = optimize_paper(image, tetopt.lattice(image, blocks=blocks), k_D=0.3, iterations=1000, **options)
+    result = optimize_paper(image, tetopt.lattice_mesh(image, blocks=blocks), k_D=0.3, iterations=1000, **options)
     assert result.ended == {"max_seconds": "max_seconds", "stop": "stopped"}[how]
     assert len(result.history) == 2
     assert domain_problems(image, result.mesh) == []
@@ -272,7 +274,7 @@ def test_stopped_in_the_middle_of_a_sweep():
     asked = []
     result = optimize_paper(
         image,
-        tetopt.lattice(image, blocks=blocks),
+        tetopt.lattice_mesh(image, blocks=blocks),
         k_D=0.3,
         iterations=50,
         stop=lambda: asked.append(1) or len(asked) > 2,
@@ -286,7 +288,9 @@ def test_stopped_in_the_middle_of_a_sweep():
 def test_callback_sees_every_record():
     image, blocks = CASES["2-D"]
     seen = []
-    result = optimize_paper(image, tetopt.lattice(image, blocks=blocks), k_D=0.2, iterations=3, callback=seen.append)
+    result = optimize_paper(
+        image, tetopt.lattice_mesh(image, blocks=blocks), k_D=0.2, iterations=3, callback=seen.append
+    )
     assert seen == result.history
 
 
@@ -306,18 +310,18 @@ def test_callback_sees_every_record():
 def test_bad_options(options, words):
     image, blocks = CASES["2-D"]
     with pytest.raises(tetopt.InputError, match=words):
-        optimize_paper(image, tetopt.lattice(image, blocks=blocks), **options)
+        optimize_paper(image, tetopt.lattice_mesh(image, blocks=blocks), **options)
 
 
 def test_dimensions_must_agree():
     with pytest.raises(tetopt.InputError, match="same dimension, got a 2-D mesh and a 3-D image"):
-        optimize_paper(CASES["3-D"][0], tetopt.lattice(CASES["2-D"][0], blocks=(2, 2)))
+        optimize_paper(CASES["3-D"][0], tetopt.lattice_mesh(CASES["2-D"][0], blocks=(2, 2)))
 
 
 def test_real_volume(data_dir):
     """Laws on the MNI152 T1: every voxel in one cell after every iteration, E never rises, E_D falls well."""
     image = tetopt.load_image(data_dir / "mni_icbm152_t1_tal_nlin_sym_09a_converted.nii.gz")
-    result = optimize_paper(image, tetopt.lattice(image, nodes=1000), k_D=0.2, iterations=6, n_t=2)
+    result = optimize_paper(image, tetopt.lattice_mesh(image, nodes=1000), k_D=0.2, iterations=6, n_t=2)
     assert {row.n_voxels for row in result.history} == {image.data.size}
     for before, after in zip(result.history, result.history[1:], strict=False):
         if not after.is_retessellated:
@@ -333,7 +337,7 @@ def test_reference_run(data_dir):
     In the first 6 of 20 iterations; the others lower E_D from 0.409 to 0.403.
     """
     image = tetopt.load_image(data_dir / "mni_icbm152_t1_tal_nlin_sym_09a_converted.nii.gz")
-    result = optimize_paper(image, tetopt.lattice(image, nodes=5000), k_D=0.2, iterations=6, n_t=6)
+    result = optimize_paper(image, tetopt.lattice_mesh(image, nodes=5000), k_D=0.2, iterations=6, n_t=6)
     assert result.history[-1].E_D < 0.42 * result.history[0].E_D
     assert rho(result.mesh.points, result.mesh.cells).mean() > 0.29
 
@@ -349,7 +353,7 @@ def test_reference_run(data_dir):
 def test_real_oblique_and_anisotropic(data_dir, name, nodes):
     """5.5 mm slices, an oblique prostate, a CT with negative values: the same laws in world millimetres."""
     image = tetopt.load_image(data_dir / name)
-    result = optimize_paper(image, tetopt.lattice(image, nodes=nodes), k_D=0.3, iterations=4, n_t=2)
+    result = optimize_paper(image, tetopt.lattice_mesh(image, nodes=nodes), k_D=0.3, iterations=4, n_t=2)
     assert {row.n_voxels for row in result.history} == {image.data.size}
     assert result.history[-1].E_D < 0.9 * result.history[0].E_D
     assert domain_problems(image, result.mesh) == []
@@ -365,7 +369,9 @@ def test_rounding_is_no_unit_of_E_D():
     for values in (data, np.where(data > 0.5, 7.0, 1.0)):
         image = tetopt.Image(values)
         histories.append(
-            optimize_paper(image, tetopt.lattice(image, "five-tet", blocks=(2, 2, 2)), k_D=0.2, iterations=4).history
+            optimize_paper(
+                image, tetopt.lattice_mesh(image, "five-tet", blocks=(2, 2, 2)), k_D=0.2, iterations=4
+            ).history
         )
     for fractions, whole in zip(*histories, strict=True):
         assert fractions.E == pytest.approx(whole.E, rel=1e-9)
@@ -376,7 +382,7 @@ def test_rounding_is_no_unit_of_E_D():
 def test_accept_takes_what_lowers_E():
     """Moved nodes, connected as before, are not Delaunay: "accept" takes Delaunay's cells where "never" may not."""
     image, blocks = CASES["3-D"]
-    mesh = tetopt.lattice(image, "five-tet", blocks=blocks)
+    mesh = tetopt.lattice_mesh(image, "five-tet", blocks=blocks)
     result = optimize_paper(image, mesh, k_D=0.05, iterations=6, retessellate="accept")
     taken = [row.iteration for row in result.history if row.is_retessellated]
     assert taken
@@ -387,7 +393,7 @@ def test_accept_takes_what_lowers_E():
 
 def test_accept_needs_a_full_box_for_any_n_t():
     image, blocks = CASES["3-D"]
-    mesh = tetopt.lattice(image, blocks=blocks)
+    mesh = tetopt.lattice_mesh(image, blocks=blocks)
     inner = np.flatnonzero(
         ~np.isin(np.arange(len(mesh.cells)), facets(mesh.cells).cells[facets(mesh.cells).n_cells == 1, 0])
     )
@@ -400,7 +406,7 @@ def test_accept_needs_a_full_box_for_any_n_t():
 def test_doubled_and_overlapping_cells_are_refused():
     """Each cell twice; two triangles on the same side of an edge."""
     image, blocks = CASES["2-D"]
-    mesh = tetopt.lattice(image, blocks=blocks)
+    mesh = tetopt.lattice_mesh(image, blocks=blocks)
     doubled = tetopt.Mesh(mesh.points, np.vstack([mesh.cells, mesh.cells]))
     folded = tetopt.Mesh([[2.0, 2.0], [30.0, 2.0], [10.0, 20.0], [20.0, 20.0]], [[0, 1, 2], [0, 1, 3]])
     for spoiled in (doubled, folded):
@@ -425,7 +431,7 @@ def turned_cell(cells):
 def test_spoiled_tessellations_are_not_taken(name, spoil, monkeypatch):
     """Delaunay cells with one left out, one twice or one turned: the old connectivity is kept."""
     image, blocks = CASES[name]
-    mesh = tetopt.lattice(image, blocks=blocks)
+    mesh = tetopt.lattice_mesh(image, blocks=blocks)
     good = delaunay(image.to_index(mesh.points), image.affine)
     monkeypatch.setattr(sys.modules["tetopt.engine.paper"], "delaunay", lambda *_: spoil(good))
     result = optimize_paper(image, mesh, k_D=0.3, iterations=1, n_t=1)
@@ -467,7 +473,7 @@ def test_default_n_t():
     """All iterations for Lloyd's alternation, half of them, rounded up, with an image; as with the number given."""
     assert [default_n_t(0.0, 7), default_n_t(0.2, 7), default_n_t(0.2, 6), default_n_t(0.2, 0)] == [7, 4, 3, 0]
     image, blocks = CASES["3-D"]
-    mesh = tetopt.lattice(image, blocks=blocks)
+    mesh = tetopt.lattice_mesh(image, blocks=blocks)
     plain, given = (
         optimize_paper(image, mesh, k_D=0.4, iterations=6),
         optimize_paper(image, mesh, k_D=0.4, iterations=6, n_t=3),
@@ -478,7 +484,7 @@ def test_default_n_t():
 def test_movement_is_measured_from_the_middle_of_the_box():
     """|x^t - x^(t-1)| / |x^(t-1)|, so the same wherever the image lies in the world."""
     image, blocks = CASES["3-D"]
-    mesh = tetopt.lattice(image, blocks=blocks)
+    mesh = tetopt.lattice_mesh(image, blocks=blocks)
     result = optimize_paper(image, mesh, k_D=0.4, iterations=1, retessellate="never")
     middle = image.to_world((np.array(image.shape) - 1.0) / 2.0)
     moved = np.linalg.norm(result.mesh.points - mesh.points)

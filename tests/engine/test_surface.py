@@ -222,7 +222,7 @@ def test_labels_that_meet_in_edges_and_points(is_graded):
     if is_graded:
         result = tetopt.mesh_image(target, 700)
     else:
-        result = tetopt.optimize(target, tetopt.lattice(labels, nodes=700), k_D=0.85)
+        result = tetopt.optimize(target, tetopt.lattice_mesh(labels, nodes=700), k_D=0.85)
     assert tetopt.check_mesh(result.mesh, labels) == []
     assert tetopt.quality(result.mesh.points, result.mesh.cells).min_dihedral >= 12.0 - 1e-9
     assert result.history[-1].E_D == pytest.approx(hard_E_D(target, result.mesh), rel=1e-9, abs=1e-9)

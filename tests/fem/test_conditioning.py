@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.sparse import csr_array, diags_array
 
-from tetopt import Image, InputError, Mesh, lattice
+from tetopt import Image, InputError, Mesh, lattice_mesh
 from tetopt.fem import conditioning as module
 from tetopt.fem.conditioning import cg_iterations, conditioning, lambda_max, lambda_min
 from tetopt.fem.elasticity import box_faces, compression
@@ -13,7 +13,7 @@ from tetopt.fem.elasticity import box_faces, compression
 def system(n, blocks, *, is_bonded=True, factor=1.0, size=1.0, contrast=10.0, nu=0.45):
     """A box of random moduli, its top fixed and its bottom pushed."""
     image = Image(np.zeros((4, 5, 6)[:n]))
-    mesh = lattice(image, blocks=blocks)
+    mesh = lattice_mesh(image, blocks=blocks)
     young = np.exp(np.random.default_rng(1).uniform(0.0, np.log(contrast), len(mesh.cells)))
     low, high = box_faces(image, mesh)
     push = np.zeros(n)
@@ -142,7 +142,7 @@ def test_finer_meshes_contrast_and_near_incompressibility_are_worse_conditioned(
 def test_a_flat_cell_raises_lambda_max():
     """The paper's reason to look at lambda: a node moved to 1/1000 of the way from its facet."""
     image = Image(np.zeros((4, 4, 4)))
-    mesh = lattice(image, blocks=(2, 2, 2))
+    mesh = lattice_mesh(image, blocks=(2, 2, 2))
     low, high = box_faces(image, mesh)
     options = {"fixed_nodes": high, "pushed_nodes": low, "displacement": [0.0, 0.0, 0.1]}
     before = conditioning(compression(mesh, 1.0, 0.3, **options).system)
@@ -188,7 +188,7 @@ def test_count_of_easy_systems():
 
 def test_nothing_to_solve():
     image = Image(np.zeros((2, 2, 2)))
-    mesh = lattice(image, "five-tet", blocks=(1, 1, 1))
+    mesh = lattice_mesh(image, "five-tet", blocks=(1, 1, 1))
     low, high = box_faces(image, mesh)
     pressed = compression(mesh, 1.0, 0.3, fixed_nodes=high, pushed_nodes=low, displacement=[0.0, 0.0, 0.1])
     with pytest.raises(InputError) as error:

@@ -13,7 +13,7 @@ from models import cell_energies
 from scipy.spatial import cKDTree
 from skfem.helpers import ddot, sym_grad, trace
 
-from tetopt import Image, InputError, Mesh, lattice
+from tetopt import Image, InputError, Mesh, lattice_mesh
 from tetopt.fem import elasticity
 from tetopt.fem.elasticity import (
     box_faces,
@@ -40,7 +40,7 @@ def block(sides, blocks, kind=None):
     affine[:n, :n] = np.diag(sides)
     affine[:n, n] = 0.5 * np.array(sides)
     image = Image(np.zeros((1,) * n), affine)
-    return image, lattice(image, kind, blocks=blocks)
+    return image, lattice_mesh(image, kind, blocks=blocks)
 
 
 def distorted(mesh, rng, share=0.2):
@@ -513,7 +513,7 @@ def test_faces_of_any_affine(seed, n):
     rng = np.random.default_rng(seed)
     image = Image(np.zeros(rng.integers(2, 9, n)), random_affine(rng, n))
     blocks = tuple(int(b) for b in rng.integers(1, 4, n))
-    mesh = lattice(image, blocks=blocks)
+    mesh = lattice_mesh(image, blocks=blocks)
     index = image.to_index(mesh.points)
     directions = image.affine[:n, :n] / image.spacing
     default = int(np.argmax(np.abs(directions[-1])))
@@ -533,7 +533,7 @@ def test_default_axis_is_the_one_along_z():
     """A sagittal scan: index axes go back, up and left; the second is z, and runs down."""
     affine = np.array([[0.0, 0, -2, 5], [-1, 0, 0, 9], [0, -1.5, 0, 3], [0, 0, 0, 1]])
     image = Image(np.zeros((6, 4, 5)), affine)
-    mesh = lattice(image, blocks=(2, 2, 2))
+    mesh = lattice_mesh(image, blocks=(2, 2, 2))
     low, high = box_faces(image, mesh)
     assert mesh.points[low, 2] == pytest.approx(3.0 - 1.5 * 3.5)
     assert mesh.points[high, 2] == pytest.approx(3.0 + 1.5 * 0.5)
@@ -546,7 +546,7 @@ def test_top_is_up_even_where_the_upright_axis_leans_more_than_it_rises():
     """Sheared: the third axis goes 0.9 to the left for every 0.4 up, and the others not up at all."""
     affine = np.array([[1.0, 0, -0.9, 0], [0, 1, 0, 0], [0, 0, 0.4, 0], [0, 0, 0, 1]])
     image = Image(np.zeros((3, 3, 3)), affine)
-    mesh = lattice(image, blocks=(1, 1, 1))
+    mesh = lattice_mesh(image, blocks=(1, 1, 1))
     for axis in (None, 2):
         low, high = box_faces(image, mesh, axis)
         np.testing.assert_allclose(mesh.points[low, 2], -0.2, rtol=1e-12)

@@ -83,7 +83,7 @@ def test_meshes_tend_to_it():
     exact = reference(image, 0.3)
     errors = []
     for nodes in (100, 700, 5000):
-        mesh = tetopt.lattice(image, nodes=nodes)
+        mesh = tetopt.lattice_mesh(image, nodes=nodes)
         bottom, top = box_faces(image, mesh)
         push = [0.0, 0.0, 0.01 * np.ptp(mesh.points[:, 2])]
         young = cell_young(image, mesh)
@@ -107,7 +107,7 @@ def test_errors_of_a_known_field():
     """The same linear field on the mesh has no error; one scaled by 1.1 has 0.1 in displacement and strain."""
     rng = np.random.default_rng(0)
     image = tetopt.Image(rng.uniform(1.0, 2.0, (7, 6, 5)), affine_of(SHEARED, 4.0))
-    mesh = tetopt.lattice(image, nodes=60)
+    mesh = tetopt.lattice_mesh(image, nodes=60)
     slope, shift = rng.normal(size=(3, 3)), rng.normal(size=3)
     labels = np.zeros(image.shape)
     labels[:3] = 1
@@ -123,7 +123,7 @@ def test_errors_of_quadratic_cells(n):
     """A quadratic field is that of cells of order 2: its error against itself is what the voxels leave out of it."""
     rng = np.random.default_rng(n)
     image = tetopt.Image(np.ones((9, 8, 7)[:n]), affine_of(SHEARED[:n, :n], 4.0))
-    mesh = tetopt.lattice(image, nodes=60)
+    mesh = tetopt.lattice_mesh(image, nodes=60)
     bend = rng.normal(size=(n, n, n))
 
     def field(x):
@@ -225,7 +225,7 @@ def test_refuses(value, nu, words):
 
 def test_homogeneous_block_has_no_displacement_error():
     image = tetopt.Image(np.full((6, 5, 4), 3.0))
-    mesh = tetopt.lattice(image, nodes=40)
+    mesh = tetopt.lattice_mesh(image, nodes=40)
     bottom, top = box_faces(image, mesh)
     exact = reference(image, 0.3)
     pressed = compression(mesh, 3.0, 0.3, fixed_nodes=top, pushed_nodes=bottom, displacement=[0.0, 0.0, 0.04])
@@ -238,7 +238,7 @@ def test_errors_are_relative_to_what_the_image_does():
     """Displacement over what sets it apart from the homogeneous one; strain over that near the interfaces alone."""
     rng = np.random.default_rng(4)
     image = tetopt.Image(rng.uniform(1.0, 2.0, (12, 6, 5)))
-    mesh = tetopt.lattice(image, nodes=60)
+    mesh = tetopt.lattice_mesh(image, nodes=60)
     slope, shift = rng.normal(size=(3, 3)), rng.normal(size=3)
     exact = linear_reference(image, slope, shift)
     labels = np.zeros(image.shape)
@@ -258,7 +258,7 @@ def test_work_is_done_in_pieces(monkeypatch):
     """However many voxels are compared at once, the errors are the same."""
     rng = np.random.default_rng(9)
     image = tetopt.Image(rng.uniform(1.0, 2.0, (7, 6, 5)), affine_of(SHEARED, 4.0))
-    mesh = tetopt.lattice(image, nodes=60)
+    mesh = tetopt.lattice_mesh(image, nodes=60)
     labels = rng.integers(0, 2, image.shape)
     exact = linear_reference(image, rng.normal(size=(3, 3)), rng.normal(size=3))
     u = rng.normal(size=mesh.points.shape)

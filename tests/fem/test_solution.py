@@ -12,14 +12,14 @@ from scipy.sparse import diags_array
 from scipy.spatial import cKDTree
 from skfem.helpers import ddot, dot, sym_grad, trace
 
-from tetopt import Image, InputError, Mesh, lattice
+from tetopt import Image, InputError, Mesh, lattice_mesh
 from tetopt.fem import solution as module
 from tetopt.fem.conditioning import conditioning
 from tetopt.fem.elasticity import compression, constrained, gauss_strains, multigrid, solved, strains
-from tetopt.fem.solution import node_means, solution_fields, solved_model, von_mises
+from tetopt.fem.solution import node_means, solution_fields, solve, von_mises
 from tetopt.geometry.quadratic import quadratic
 from tetopt.geometry.simplex import oriented, volumes
-from tetopt.model.build import model_of
+from tetopt.model.build import build_model
 from tetopt.model.loads import Load, facet_weights
 from tetopt.model.model import element_facets, in_units
 from tetopt.model.sets import Sets, boundary_rows, box_of, facet_triples, nodes_of, standard_sets
@@ -34,7 +34,7 @@ def bar(n, blocks=2, length=6.0):
     affine[:n, :n] = np.diag(sides)
     affine[:n, n] = 0.5 * sides
     image = Image(np.zeros((1,) * n), affine)
-    mesh = lattice(image, None if n == 2 else "five-tet", blocks=(blocks,) * (n - 1) + (2 * blocks,))
+    mesh = lattice_mesh(image, None if n == 2 else "five-tet", blocks=(blocks,) * (n - 1) + (2 * blocks,))
     return mesh, standard_sets(mesh, box_of(image))
 
 
@@ -155,7 +155,7 @@ def words_of(loads, n):
 
 
 def model_with(mesh, sets, loads, order, **values):
-    return model_of(mesh, **values, loads=words_of(loads, mesh.ndim), known_sets=sets)._replace(order=order)
+    return build_model(mesh, **values, loads=words_of(loads, mesh.ndim), known_sets=sets)._replace(order=order)
 
 
 @pytest.mark.parametrize(("n", "order"), BOTH)
@@ -163,7 +163,7 @@ def model_with(mesh, sets, loads, order, **values):
 def test_each_kind_of_load_as_scikit_fem_has_it(kind, n, order):
     mesh, sets, values = uneven(n)
     model = model_with(mesh, sets, LOADS[kind], order, **values)
-    solution = solved_model(model)
+    solution = solve(model)
     expected = skfem_solution(model)
     assert np.abs(solution.u - expected).max() < 1e-9 * np.abs(expected).max()
     assert np.abs(expected).max() > 1e-3
@@ -175,9 +175,9 @@ def test_moduli_at_the_nodes_as_scikit_fem_has_them(n, order):
     mesh, sets, values = uneven(n)
     model = model_with(mesh, sets, LOADS["pressure"], order, **values)
     model = model._replace(node_young=np.random.default_rng(1).uniform(1.0, 9.0, len(mesh.points)))
-    u, expected = solved_model(model).u, skfem_solution(model)
+    u, expected = solve(model).u, skfem_solution(model)
     assert np.abs(u - expected).max() < 1e-9 * np.abs(expected).max()
-    assert np.abs(u - solved_model(model._replace(node_young=None)).u).max() > 0.1 * np.abs(u).max()
+    assert np.abs(u - solve(model._replace(node_young=None)).u).max() > 0.1 * np.abs(u).max()
 
 
 # Closed forms
@@ -190,7 +190,7 @@ def test_a_bar_under_traction(n, order):
     at = mesh.points[:, : n - 1].min(axis=0)
     loads = ["move:inferior:free,free,0", "traction:superior:0,0,0.5", "move:left:0,free,free"]
     loads += ["move:posterior:free,0,free"] if n == 3 else []
-    solution = solved_model(model_with(mesh, sets, loads, order, young=4.0, nu=0.3))
+    solution = solve(model_with(mesh, sets, loads, order, young=4.0, nu=0.3))
     places = nodes_of_order(mesh, order)
     expected = np.column_stack([-0.3 * 0.125 * (places[:, : n - 1] - at), 0.125 * places[:, -1]])
     np.testing.assert_allclose(solution.u, expected, atol=1e-12)
@@ -212,7 +212,7 @@ def test_a_bar_under_its_own_weight(n, order):
     density, g, young, length = 1500.0, 9810.0, 0.5, 6.0
     mesh, sets = bar(n)
     loads = ["hold:inferior", f"gravity:0,0,{g}"]
-    solution = solved_model(model_with(mesh, sets, loads, order, young=young, nu=0.0, density=density))
+    solution = solve(model_with(mesh, sets, loads, order, young=young, nu=0.0, density=density))
     weight = 1e-9 * density * g
     z = nodes_of_order(mesh, order)[:, -1]
     error = np.abs(solution.u[:, -1] - weight * (length * z - 0.5 * z**2) / young).max()
@@ -234,7 +234,7 @@ def test_a_stiff_block_on_a_bed_of_springs(n, order):
     """It sinks by the force over area times stiffness, and the springs carry all of it."""
     mesh, sets = bar(n, length=2.0)
     loads = ["spring:inferior:2.0", "traction:superior:0.1,0,-0.5"]
-    solution = solved_model(model_with(mesh, sets, loads, order, young=1e5, nu=0.3))
+    solution = solve(model_with(mesh, sets, loads, order, young=1e5, nu=0.3))
     force = 2.0 ** (n - 1) * np.array([0.1, 0.0, -0.5])
     bed = words_of(["hold:inferior"], n)[0][5:]
     np.testing.assert_allclose(solution.reactions[bed], -force[[0, 2] if n == 2 else slice(3)], atol=1e-8)
@@ -264,8 +264,8 @@ def test_a_hollow_sphere_under_pressure_from_within(order):
     errors = []
     for blocks in (4, 8):
         mesh, sets = eighth_of_a_shell(inner, outer, blocks, blocks // 2)
-        model = model_of(mesh, young=young, nu=nu, loads=loads, known_sets=sets)._replace(order=order)
-        solution = solved_model(model)
+        model = build_model(mesh, young=young, nu=nu, loads=loads, known_sets=sets)._replace(order=order)
+        solution = solve(model)
         r = np.linalg.norm(mesh.points, axis=1)
         along = factor / young * ((1.0 - 2.0 * nu) * r + (1.0 + nu) * outer**3 / (2.0 * r**2))
         errors.append(np.abs((solution.u[: len(r)] * mesh.points).sum(axis=1) / r - along).max() / along.max())
@@ -311,7 +311,7 @@ def test_a_confined_plate_under_pressure(n, order):
     loads = ["move:left:0,free,free", "move:right:0,free,free", "move:inferior:free,free,0"]
     loads += ["move:posterior:free,0,free", "move:anterior:free,0,free"] if n == 3 else []
     model = model_with(mesh, sets, [*loads, f"pressure:superior:{pressure}"], order, young=young, nu=nu)
-    solution = solved_model(model)
+    solution = solve(model)
     compliance = (1.0 - nu**2) / young if n == 2 else (1.0 + nu) * (1.0 - 2.0 * nu) / (young * (1.0 - nu))
     expected = np.zeros_like(solution.u)
     expected[:, -1] = -compliance * pressure * nodes_of_order(mesh, order)[:, -1]
@@ -347,8 +347,8 @@ def test_steps_and_superposition(n, order):
     common = ["hold:inferior", "spring:right:0.7"]
     forces = ["pressure:left:0.3", "traction:superior:0.1,0.3,-0.2", "gravity:0,500,-9810"]
     model = model_with(mesh, sets, [*common, *(f"{k}/{words}" for k, words in enumerate(forces, 1))], order, **values)
-    steps = [solved_model(model, step) for step in (1, 2, 3)]
-    whole = solved_model(model_with(mesh, sets, [*common, *forces], order, **values))
+    steps = [solve(model, step) for step in (1, 2, 3)]
+    whole = solve(model_with(mesh, sets, [*common, *forces], order, **values))
     np.testing.assert_allclose(sum(s.u for s in steps), whole.u, atol=1e-10 * np.abs(whole.u).max())
     np.testing.assert_allclose(sum(s.applied for s in steps), whole.applied, atol=1e-10)
     for name, force in whole.reactions.items():
@@ -366,7 +366,7 @@ def test_the_work_of_what_is_moved(order):
     """Pushed faces: half of reaction times way; a free component has no reaction."""
     mesh, sets, values = uneven(3)
     model = model_with(mesh, sets, ["hold:inferior", "move:superior:0.2,free,-0.1"], order, **values)
-    solution = solved_model(model)
+    solution = solve(model)
     reaction = solution.reactions["superior"]
     assert solution.work == pytest.approx(0.5 * (0.2 * reaction[0] - 0.1 * reaction[2]), rel=1e-10)
     assert solution.strain_energy == pytest.approx(solution.work, rel=1e-10)
@@ -377,7 +377,7 @@ def test_the_work_of_what_is_moved(order):
 @pytest.mark.parametrize("order", [1, 2])
 def test_it_is_the_compression(order):
     mesh, sets, values = uneven(3)
-    ours = solved_model(model_with(mesh, sets, ["compress:5%"], order, **values))
+    ours = solve(model_with(mesh, sets, ["compress:5%"], order, **values))
     low, high = (nodes_of(mesh, sets.facets[name]) for name in ("inferior", "superior"))
     push = ours.u[low[0]]
     options = {"fixed_nodes": high, "pushed_nodes": low, "displacement": push, "order": order}
@@ -390,7 +390,7 @@ def test_it_is_the_compression(order):
 def test_units_do_not_matter():
     mesh, sets, values = uneven(3)
     model = model_with(mesh, sets, LOADS["all"], 1, **values)
-    ours, other = solved_model(model), solved_model(in_units(model, "MPa"))
+    ours, other = solve(model), solve(in_units(model, "MPa"))
     np.testing.assert_allclose(other.u, ours.u, rtol=1e-9, atol=1e-12)
     assert other.strain_energy == pytest.approx(ours.strain_energy, rel=1e-9)
 
@@ -402,7 +402,7 @@ def test_quadratic_cells_converge_faster(n):
 
     def energy(blocks, order):
         mesh, sets = bar(n, blocks)
-        return solved_model(model_with(mesh, sets, loads, order, young=4.0, nu=0.3)).strain_energy
+        return solve(model_with(mesh, sets, loads, order, young=4.0, nu=0.3)).strain_energy
 
     fine = energy(12 if n == 2 else 5, 2)
     errors = {order: [1.0 - energy(blocks, order) / fine for blocks in (1, 2)] for order in (1, 2)}
@@ -416,7 +416,7 @@ def test_near_incompressible_cells_of_order_1_lock():
     loads = ["hold:inferior", "traction:superior:0.1,0,0"]
     mesh, sets = bar(3)
     moved = {
-        (order, nu): np.abs(solved_model(model_with(mesh, sets, loads, order, young=4.0, nu=nu)).u).max()
+        (order, nu): np.abs(solve(model_with(mesh, sets, loads, order, young=4.0, nu=nu)).u).max()
         for order in (1, 2) for nu in (0.3, 0.499)
     }  # fmt: skip
     assert moved[2, 0.499] > 0.75 * moved[2, 0.3]
@@ -431,12 +431,12 @@ def test_any_number_of_free_pieces_on_springs():
     later, low, high = np.array([[len(mesh.cells), 0]]), sets.facets["y_min"], sets.facets["y_max"]
     both = {"first": low, "second": low + later, "top": high + later}
     loads = ["hold:first", "spring:second:3", "pressure:top:0.2"]
-    model = model_of(pair, young=2.0, nu=0.3, loads=loads, known_sets=Sets(both, {}))
-    solution = solved_model(model)
+    model = build_model(pair, young=2.0, nu=0.3, loads=loads, known_sets=Sets(both, {}))
+    solution = solve(model)
     assert np.abs(solution.u[: len(mesh.points)]).max() == 0.0
     np.testing.assert_allclose(solution.reactions["second"], [0.0, 0.4], atol=1e-12)
     with pytest.raises(InputError) as error:
-        solved_model(model._replace(loads=(model.loads[0], model.loads[2])))
+        solve(model._replace(loads=(model.loads[0], model.loads[2])))
     n_cells = len(mesh.cells)
     assert str(error.value) == (
         f"mesh: 1 pieces have no node that is held, pushed or on a spring, the first has {n_cells} cells around cell "
@@ -453,7 +453,7 @@ def test_multigrid_of_order_2_is_symmetric_and_positive(nu):
     rng = np.random.default_rng(0)
     young = np.exp(rng.uniform(0.0, np.log(1e3), len(mesh.cells)))
     model = model_with(mesh, sets, ["hold:inferior", "pressure:superior:0.1", "spring:left:0.1"], 2, young=young, nu=nu)
-    system = solved_model(model).system
+    system = solve(model).system
     cycle = multigrid(system)
     dense = np.column_stack([cycle @ unit for unit in np.eye(len(system.free))])
     np.testing.assert_allclose(dense, dense.T, atol=1e-12 * np.abs(dense).max())
@@ -467,7 +467,7 @@ def test_multigrid_and_factorisation_agree_with_order_2(n):
     young = np.exp(np.random.default_rng(0).uniform(0.0, np.log(1e3), len(mesh.cells)))
     loads = [words for words in LOADS["all"] if not words.startswith("gravity")]
     model = model_with(mesh, sets, loads, 2, young=young, nu=0.45)
-    direct, amg = (solved_model(model, method=method) for method in ("direct", "amg"))
+    direct, amg = (solve(model, method=method) for method in ("direct", "amg"))
     assert direct.n_iterations == 0
     assert 5 < amg.n_iterations < 80
     np.testing.assert_allclose(amg.u, direct.u, atol=1e-8 * np.abs(direct.u).max())
@@ -478,7 +478,7 @@ def test_multigrid_and_factorisation_agree_with_order_2(n):
 def test_conditioning_of_order_2(method):
     mesh, sets = bar(3, 1)
     model = model_with(mesh, sets, ["hold:inferior", "pressure:superior:0.1", "spring:left:0.1"], 2, young=3.0, nu=0.4)
-    system = solved_model(model).system
+    system = solve(model).system
     values = np.linalg.eigvalsh(system.K_ff.toarray())
     extremes = conditioning(system, method=method)
     assert extremes.lambda_max == pytest.approx(values[-1], rel=1e-9)
@@ -493,7 +493,7 @@ def test_fields(n, order):
     """Names, shapes and what they are: means of cells, and means by volume around nodes."""
     mesh, sets, values = uneven(n)
     model = model_with(mesh, sets, LOADS["all"], order, **values)
-    solution = solved_model(model)
+    solution = solve(model)
     fields = solution_fields(mesh, solution)
     n_nodes = len(nodes_of_order(mesh, order))
     assert {name: each.shape for name, each in fields.point_data.items()} == {
@@ -556,7 +556,7 @@ def test_von_mises():
 
 def refused(model, step=1):
     with pytest.raises(InputError) as error:
-        solved_model(model, step)
+        solve(model, step)
     return str(error.value)
 
 
@@ -594,7 +594,7 @@ def test_forces_that_do_not_balance_are_an_error(monkeypatch):
 
     monkeypatch.setattr(module, "constrained", with_leak)
     with pytest.raises(RuntimeError, match=r"^elasticity: forces and reactions do not balance, .* mN are left where"):
-        solved_model(model)
+        solve(model)
 
 
 # What a set's reaction is made of
@@ -605,7 +605,7 @@ def test_reactions_of_a_set_add_up():
     mesh, sets = bar(3)
     words = ["move:inferior:0,0,free", "move:inferior:free,free,0.1", "spring:inferior:2", "traction:superior:1,0,3"]
     for order in (1, 2):
-        solution = solved_model(model_of(mesh, young=10.0, known_sets=sets, loads=words, order=order))
+        solution = solve(build_model(mesh, young=10.0, known_sets=sets, loads=words, order=order))
         assert list(solution.reactions) == ["inferior"]
         # The springs pull by 2 kPa/mm * 0.1 mm on 4 mm2; the support's part is what is left.
         np.testing.assert_allclose(solution.reactions["inferior"], [-4.0, 0.0, -12.0], atol=1e-7)
@@ -615,12 +615,12 @@ CHILD = """
 import hashlib
 import numpy as np
 import tetopt
-from tetopt.fem.solution import solution_fields, solved_model
-from tetopt.model.build import model_of
+from tetopt.fem.solution import solution_fields, solve
+from tetopt.model.build import build_model
 
 image = tetopt.Image(np.random.default_rng(0).uniform(1.0, 50.0, (12, 12, 12)))
-model = model_of(tetopt.lattice(image, nodes=4200), image, young="1 + h", loads=["compress:5%"])
-solution = solved_model(model)
+model = build_model(tetopt.lattice_mesh(image, nodes=4200), image, young="1 + h", loads=["compress:5%"])
+solution = solve(model)
 fields = solution_fields(model.mesh, solution)
 assert solution.n_iterations > 5 and len(solution.system.free) > 10_000
 numbers = [solution.u, solution.stress, fields.point_data["stress_nodes"], *solution.reactions.values()]

@@ -13,7 +13,7 @@ from tetopt.geometry.simplex import volumes
 
 def box(n):
     """A criss-cross square, or a cube of five-tets, of 4 blocks an edge."""
-    return tetopt.lattice(tetopt.Image(np.zeros((8,) * n)), "five-tet" if n == 3 else None, blocks=(4,) * n)
+    return tetopt.lattice_mesh(tetopt.Image(np.zeros((8,) * n)), "five-tet" if n == 3 else None, blocks=(4,) * n)
 
 
 def part(mesh, is_kept):

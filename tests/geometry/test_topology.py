@@ -264,7 +264,7 @@ def test_largest_component_of_nothing_is_empty_and_of_equals_the_first():
 @pytest.mark.parametrize("n", [2, 3])
 def test_folded(n):
     """A conforming mesh has no fold; a node pulled through its ring makes one; a third cell at a facet is one."""
-    mesh = tetopt.lattice(tetopt.Image(np.zeros((4,) * n)), blocks=(2,) * n)
+    mesh = tetopt.lattice_mesh(tetopt.Image(np.zeros((4,) * n)), blocks=(2,) * n)
     assert folded(mesh.cells).shape == (0, 2)
     first = mesh.cells[0]
     flipped = mesh.cells.copy()

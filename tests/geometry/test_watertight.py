@@ -11,10 +11,10 @@ from shapes import n_pieces, volume_and_area
 
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import facet_areas, oriented, volumes
-from tetopt.geometry.surface import SHIFT_SHARE, surface_of
+from tetopt.geometry.surface import SHIFT_SHARE, extract_surface
 from tetopt.geometry.topology import boundary_facets
 from tetopt.image import Image
-from tetopt.start.lattice import lattice
+from tetopt.start.lattice import lattice_mesh
 
 # Cells 0 1 2 3 and 0 1 4 5 share the edge 0 1, on either side of the plane x = 0; the third shares the node 3 alone.
 TOUCHING = (
@@ -27,7 +27,7 @@ TOUCHING = (
 
 def grid(blocks, kind="five-tet", noise=0.0, seed=0):
     """A lattice of unit cubes, its nodes moved a little, so that neighbouring facets lie in no common plane."""
-    mesh = lattice(Image(np.zeros([2 * b for b in blocks]), np.diag([0.5, 0.5, 0.5, 1.0])), kind, blocks=blocks)
+    mesh = lattice_mesh(Image(np.zeros([2 * b for b in blocks]), np.diag([0.5, 0.5, 0.5, 1.0])), kind, blocks=blocks)
     points = mesh.points + np.random.default_rng(seed).normal(0.0, noise, mesh.points.shape)
     return points - points.min(axis=0), mesh.cells
 
@@ -97,7 +97,7 @@ def n_crossings(surface):
 @pytest.mark.parametrize("mesh", [CUBE_CORNER, REGULAR_TET])
 def test_a_single_cell_has_its_four_facets_turned_out(mesh):
     points, cells = mesh
-    surface = surface_of(points, cells, [0])
+    surface = extract_surface(points, cells, [0])
     assert_surface_of(surface, points, cells)
     assert surface.triangles.shape == (4, 3)
     assert surface.triangles.dtype == np.int64
@@ -110,7 +110,7 @@ def test_a_single_cell_has_its_four_facets_turned_out(mesh):
 @pytest.mark.parametrize("mesh", [FIVE_TET_CUBE, TWO_TETS, grid((3, 2, 2), "bcc")])
 def test_a_whole_mesh_has_its_boundary_facets(mesh):
     points, cells = mesh
-    surface = surface_of(points, cells, np.ones(len(cells), dtype=bool))
+    surface = extract_surface(points, cells, np.ones(len(cells), dtype=bool))
     assert_manifold(surface)
 
     def listed(places, triangles):  # by the places of their corners, the lowest first
@@ -123,9 +123,9 @@ def test_a_whole_mesh_has_its_boundary_facets(mesh):
 
 def test_volume_and_area_far_from_the_origin():
     points, cells = FIVE_TET_CUBE
-    assert volume_and_area(surface_of(points, cells, range(5))) == pytest.approx((1.0, 6.0), rel=1e-14)
+    assert volume_and_area(extract_surface(points, cells, range(5))) == pytest.approx((1.0, 6.0), rel=1e-14)
     moved = points * 0.7 + 1e7 / 3.0
-    volume, area = volume_and_area(surface_of(moved, cells, range(5)))
+    volume, area = volume_and_area(extract_surface(moved, cells, range(5)))
     assert volume == pytest.approx(volumes(moved, cells).sum(), rel=1e-13)
     assert area == pytest.approx(6.0 * 0.7**2, rel=1e-8)
 
@@ -133,8 +133,8 @@ def test_volume_and_area_far_from_the_origin():
 def test_mask_and_indices_in_any_order_mean_the_same():
     points, cells = grid((2, 2, 2))
     mask = np.arange(len(cells)) % 3 == 0
-    one = surface_of(points, cells, mask)
-    other = surface_of(points, cells, np.append(np.flatnonzero(mask)[::-1], 0))
+    one = extract_surface(points, cells, mask)
+    other = extract_surface(points, cells, np.append(np.flatnonzero(mask)[::-1], 0))
     for a, b in zip(one, other, strict=True):
         np.testing.assert_array_equal(a, b)
 
@@ -142,7 +142,7 @@ def test_mask_and_indices_in_any_order_mean_the_same():
 def test_the_wall_of_a_cavity_is_turned_into_it():
     points, cells = grid((3, 3, 3), "bcc")
     middle = np.abs(points[cells].mean(axis=1) - 1.5).max(axis=1).argmin()
-    surface = surface_of(points, cells, np.delete(np.arange(len(cells)), middle))
+    surface = extract_surface(points, cells, np.delete(np.arange(len(cells)), middle))
     assert_surface_of(surface, points, np.delete(cells, middle, axis=0))
     assert (n_pieces(surface), surface.n_parted) == (2, 0)
     is_wall = np.isin(surface.points, points[cells[middle]]).all(axis=1)[surface.triangles].all(axis=1)
@@ -158,7 +158,7 @@ def test_the_wall_of_a_cavity_is_turned_into_it():
 def test_cells_that_share_an_edge_or_a_node_come_apart(chosen, shared):
     points, cells = TOUCHING
     cells = oriented(points, cells)
-    surface = surface_of(points, cells, chosen)
+    surface = extract_surface(points, cells, chosen)
     assert_surface_of(surface, points, cells[chosen])
     assert (len(surface.points), len(surface.triangles)) == (8, 8)
     assert (surface.n_parted, n_pieces(surface)) == (len(shared), 2)
@@ -178,7 +178,7 @@ def test_a_ring_that_closes_in_an_edge_alone_opens(cubes, characteristic, parted
     points, cells = grid((3, 3, 1))
     x, y, _ = np.floor(points[cells].mean(axis=1)).T
     is_chosen = ((x != 1) | (y != 1)) & ((x != 0) | (y != 0) | (cubes == 8))
-    surface = surface_of(points, cells, is_chosen)
+    surface = extract_surface(points, cells, is_chosen)
     assert_surface_of(surface, points, cells[is_chosen])
     assert (euler(surface), n_pieces(surface), surface.n_parted) == (characteristic, 1, parted)
 
@@ -198,7 +198,7 @@ def test_an_edge_closed_at_both_ends_gets_two_middles():
     cell = cells[np.abs(points[cells].mean(axis=1) - points.mean(axis=0)).max(axis=1).argmin()]
     star = edge_star(cells.tolist(), *cell[:2].tolist())
     is_chosen = ~np.isin(np.arange(len(cells)), [star[0], star[2]])
-    surface = surface_of(points, cells, is_chosen)
+    surface = extract_surface(points, cells, is_chosen)
     assert_surface_of(surface, points, cells[is_chosen])
     outside = len(boundary_facets(cells))
     # Of the cavities' eight facets four are at the edge, each cut from its centroid into four.
@@ -215,7 +215,7 @@ def test_cavities_that_share_a_node_part_into_themselves():
     inner = ~np.isin(cells, boundary_facets(cells)).any(axis=1)
     for other in np.flatnonzero((common == 1) & inner):
         is_chosen = ~np.isin(np.arange(len(cells)), [cell, other])
-        surface = surface_of(points, cells, is_chosen)
+        surface = extract_surface(points, cells, is_chosen)
         assert_surface_of(surface, points, cells[is_chosen])
         assert (surface.n_parted, n_pieces(surface), euler(surface)) == (1, 3, 6)
         assert volume_and_area(surface)[0] > volumes(points, cells[is_chosen]).sum()
@@ -229,7 +229,7 @@ def test_many_cells_that_share_one_node_all_come_apart():
         [np.zeros((1, 3)), *[corner * scale for corner, scale in zip(corners, range(1, 5), strict=True)]]
     )
     cells = oriented(points, np.array([[0, 3 * k + 1, 3 * k + 2, 3 * k + 3] for k in range(4)]))
-    surface = surface_of(points, cells, range(4))
+    surface = extract_surface(points, cells, range(4))
     assert_surface_of(surface, points, cells)
     assert (surface.n_parted, n_pieces(surface)) == (1, 4)
     near = np.sort(np.linalg.norm(surface.points, axis=1))[:4]
@@ -241,7 +241,7 @@ def test_the_shift_is_felt_in_float32_and_turns_no_cell():
     cells = oriented(points, cells)
     for scale, place in ((1e-2, 500.0), (1e-3, 500.0), (1.0, 1e4)):
         moved = points * scale + place
-        surface = surface_of(moved, cells, [0, 1])
+        surface = extract_surface(moved, cells, [0, 1])
         assert len(np.unique(surface.points.astype(np.float32), axis=0)) == 8
         assert 16 * np.spacing(np.float32(place)) * 0.999 <= surface.largest_shift or scale == 1e-3
         heights = 3.0 * volumes(moved, cells[:2]) / facet_areas(moved, cells[:2]).max(axis=1)
@@ -258,9 +258,9 @@ def test_any_cells_of_a_lattice(seed, kind, share):
     points, cells = grid((3, 3, 2), kind, noise=0.05, seed=seed)
     is_chosen = np.random.default_rng(seed).random(len(cells)) < share
     is_chosen[0] = True
-    surface = surface_of(points, cells, is_chosen)
+    surface = extract_surface(points, cells, is_chosen)
     assert_surface_of(surface, points, cells[is_chosen])
-    again = surface_of(points, cells, is_chosen)
+    again = extract_surface(points, cells, is_chosen)
     assert surface.points.tobytes() == again.points.tobytes()
 
 
@@ -270,7 +270,7 @@ def test_any_cells_of_a_lattice(seed, kind, share):
 def test_parted_sheets_do_not_cross(kind, share, seed):
     """Nor do they in 999 of 1000 places of larger random sets; where fans wind around one another they may."""
     points, cells = grid((4, 4, 3), kind, noise=0.05, seed=seed)
-    surface = surface_of(points, cells, np.random.default_rng(seed).random(len(cells)) < share)
+    surface = extract_surface(points, cells, np.random.default_rng(seed).random(len(cells)) < share)
     assert surface.n_parted > 8
     assert n_crossings(surface) == 0
 
@@ -292,13 +292,13 @@ def test_parted_sheets_do_not_cross(kind, share, seed):
 )
 def test_cells_that_cannot_be_chosen(chosen, words):
     with pytest.raises(InputError, match=words):
-        surface_of(*FIVE_TET_CUBE, chosen)
+        extract_surface(*FIVE_TET_CUBE, chosen)
 
 
 def test_triangles_and_folded_cells_are_refused():
     with pytest.raises(InputError, match="expected tetrahedra in space, got cells of 3 nodes"):
-        surface_of(np.eye(3)[:, :2], np.array([[0, 1, 2]]), [0])
+        extract_surface(np.eye(3)[:, :2], np.array([[0, 1, 2]]), [0])
     points = np.vstack([CUBE_CORNER[0], [0.2, 0.2, 2.0], [0.1, 0.1, 3.0]])
     for cells in ([[0, 1, 2, 3], [0, 1, 2, 4]], [[0, 1, 2, 3], [0, 1, 2, 4], [0, 1, 2, 5]]):
         with pytest.raises(InputError, match="fold over one another"):
-            surface_of(points, np.array(cells), range(len(cells)))
+            extract_surface(points, np.array(cells), range(len(cells)))

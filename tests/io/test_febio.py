@@ -10,7 +10,7 @@ import pytest
 from models import LOAD_CASES, displaced, loaded_model, sample_model
 
 from tetopt.errors import InputError
-from tetopt.fem.solution import solved_model
+from tetopt.fem.solution import solve
 from tetopt.geometry.quadratic import quadratic, quadratic_facet_nodes
 from tetopt.io.febio import MOST_MATERIAL_PARTS, febio
 from tetopt.model.materials import materials
@@ -303,7 +303,7 @@ def test_what_the_file_says_is_what_fem_solves(case, order):
     n = len(elements(model)[0])
     np.testing.assert_allclose(springs, springs[:, :1, :1] * np.eye(3), atol=1e-12)  # the same in all directions
     u = displaced(model, is_prescribed[:n], prescribed[:n], forces[:n], springs[:n, 0, 0])
-    np.testing.assert_allclose(u, solved_model(model).u, atol=1e-9 * np.abs(u).max())
+    np.testing.assert_allclose(u, solve(model).u, atol=1e-9 * np.abs(u).max())
 
 
 def test_several_steps_are_several_files():

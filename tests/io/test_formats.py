@@ -14,7 +14,7 @@ from models import quadratic_model, sample_model
 
 import tetopt
 from tetopt import InputError
-from tetopt.geometry.surface import surface_of
+from tetopt.geometry.surface import extract_surface
 from tetopt.io import surfaces
 from tetopt.io.formats import FORMATS, file_bytes, save_mesh, save_model
 from tetopt.io.readback import OUTLINES, Outline, save_checked
@@ -217,7 +217,7 @@ def test_a_suffix_of_no_format_is_refused(name, tmp_path):
 
 def test_labels_of_a_surface_that_its_file_cannot_name_are_refused(tmp_path):
     mesh = sample_model().mesh
-    surface = surface_of(mesh.points, mesh.cells, np.arange(len(mesh.cells)))
+    surface = extract_surface(mesh.points, mesh.cells, np.arange(len(mesh.cells)))
     for suffix in (".ply", ".vtp", ".vtk"):
         with pytest.raises(InputError, match=r'got "a\\nproperty int b"'):
             save_surface(
@@ -246,7 +246,7 @@ def test_names_that_are_words_of_a_format(suffix, tmp_path):
 def outlines():
     """Each format with an outline, its bytes, and how many points and cells they hold; surfaces' own formats, too."""
     model = sample_model()
-    surface = surface_of(model.mesh.points, model.mesh.cells, np.arange(len(model.mesh.cells)))
+    surface = extract_surface(model.mesh.points, model.mesh.cells, np.arange(len(model.mesh.cells)))
     for order, suffix in itertools.product((1, 2), FORMATS):
         if order == 1 or FORMATS[suffix].has_quadratic:
             whole = quadratic_model() if order == 2 else model

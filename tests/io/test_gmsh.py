@@ -28,7 +28,7 @@ from tetopt.geometry.simplex import volumes
 from tetopt.io.formats import save_model
 from tetopt.io.gmsh import gmsh22, gmsh41, own_comments
 from tetopt.io.meshes import load_mesh
-from tetopt.model.build import model_of
+from tetopt.model.build import build_model
 from tetopt.model.loads import load_words
 from tetopt.model.materials import materials
 from tetopt.model.model import element_facets, elements, in_space, in_units
@@ -520,7 +520,7 @@ def test_what_was_read_can_be_written_again(tmp_path):
 def test_numbers_and_names_survive_a_round_trip(version, tmp_path):
     first, second = (tmp_path / f"{name}{SUFFIX[version]}" for name in "ab")
     save_model(first, labelled_model())
-    save_model(second, model_of(load_mesh(first), box=box_of(sample_image())))
+    save_model(second, build_model(load_mesh(first), box=box_of(sample_image())))
     told = [Read(path.read_bytes()) for path in (first, second)]
     assert told[0].names == told[1].names
     for name, members in told[0].groups.items():
@@ -542,7 +542,7 @@ def test_numbers_of_others_are_labels(names, tmp_path):
     back = load_mesh(tmp_path / "a.msh")
     assert np.unique(back.cell_data["label"]).tolist() == [2, 5, 7, 8]
     assert back.label_table.names[5] == ("grey matter" if names else "volume_5")
-    save_model(tmp_path / "b.msh2", model_of(back))
+    save_model(tmp_path / "b.msh2", build_model(back))
     read = Read((tmp_path / "b.msh2").read_bytes())
     of_cells = {number: name for (dim, number), name in read.names.items() if dim == 3}
     assert of_cells == {2: "volume_2", 5: "grey_matter" if names else "volume_5", 7: "volume_7", 8: "volume_8"}

@@ -26,7 +26,7 @@ from tetopt.io.meshes import load_mesh
 from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields
 from tetopt.model.sets import MOST_LETTERS
-from tetopt.start.lattice import lattice
+from tetopt.start.lattice import lattice_mesh
 
 OPTIONS = {"k_D": 0.2, "n_t": None, "crop": "ä"}
 ABOUT = {"tetopt": "0.1.0", "image": "Schädel [1].nii.gz", "image_sha256": "ab" * 32, "options": OPTIONS}
@@ -39,7 +39,7 @@ def image_of(n):
 
 def bent(n):
     """A lattice with every node moved to coordinates that use all 53 bits."""
-    mesh = lattice(image_of(n), blocks=(2, 2, 2)[:n])
+    mesh = lattice_mesh(image_of(n), blocks=(2, 2, 2)[:n])
     return Mesh(mesh.points + np.random.default_rng(1).normal(0.0, 0.05, mesh.points.shape), mesh.cells)
 
 
@@ -172,7 +172,7 @@ def test_fields_of_a_mesh_without_an_image():
 def test_fields_of_a_two_valued_image():
     """A square of four voxels, cut along the diagonal; each half of a block of two values."""
     data = np.array([[0.0, 0.0, 4.0, 4.0]] * 4).T  # 0 for x below 1.5, else 4
-    mesh = lattice(Image(data), blocks=(1, 1))
+    mesh = lattice_mesh(Image(data), blocks=(1, 1))
     fields = cell_fields(mesh, Image(data))
     assert fields["n_voxels"].sum() == 16
     assert (fields["n_voxels"] * fields["mean"]).sum() == data.sum()

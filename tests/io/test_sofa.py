@@ -8,7 +8,7 @@ import pytest
 from models import LOAD_CASES, displaced, loaded_model, sample_model
 
 from tetopt.errors import InputError
-from tetopt.fem.solution import solved_model
+from tetopt.fem.solution import solve
 from tetopt.io.sofa import REQUIRED_PLUGINS, sofa
 from tetopt.model.materials import materials
 from tetopt.model.model import described, in_space, in_units
@@ -188,7 +188,7 @@ def test_what_the_scene_says_is_what_fem_solves(case):
             is_prescribed[nodes] = True
             prescribed[nodes] = table(element, "movements", float, 3)[-1] if element.get("movements") else 0.0
     u = displaced(model, is_prescribed, prescribed, forces, springs)
-    np.testing.assert_allclose(u, solved_model(model).u, atol=1e-9 * np.abs(u).max())
+    np.testing.assert_allclose(u, solve(model).u, atol=1e-9 * np.abs(u).max())
     plugins = {element.get("name") for element in root.iter("RequiredPlugin")}
     assert plugins >= {PLUGIN_OF[element.tag] for element in root.iter()} - {None}
 

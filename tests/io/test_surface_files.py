@@ -15,11 +15,11 @@ from vtkmodules.vtkIOPLY import vtkPLYReader
 
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
-from tetopt.geometry.surface import Surface, surface_of
+from tetopt.geometry.surface import Surface, extract_surface
 from tetopt.geometry.topology import boundary_facets
 from tetopt.image import Image
 from tetopt.io.surfaces import checked_surface, save_surface
-from tetopt.start.lattice import lattice
+from tetopt.start.lattice import lattice_mesh
 
 # Two cells that share the edge 0 1, far from the origin
 EDGE = (
@@ -31,11 +31,11 @@ SUFFIXES = pytest.mark.parametrize("suffix", [".stl", ".ply", ".STL", ".vtp", ".
 
 def some_surface(seed, share=0.5):
     """The surface of some cells of a lattice out where coordinates have few bits left, and the cells' volume."""
-    mesh = lattice(Image(np.zeros((7, 8, 9)), np.diag([1.1, 0.9, 1.3, 1.0])), nodes=100)
+    mesh = lattice_mesh(Image(np.zeros((7, 8, 9)), np.diag([1.1, 0.9, 1.3, 1.0])), nodes=100)
     rng = np.random.default_rng(seed)
     points = mesh.points + rng.normal(0.0, 0.05, mesh.points.shape) + rng.uniform(-400.0, 400.0, 3)
     chosen = np.append(np.flatnonzero(rng.random(len(mesh.cells)) < share), 0)
-    return surface_of(points, mesh.cells, chosen), volumes(points, mesh.cells[np.unique(chosen)]).sum()
+    return extract_surface(points, mesh.cells, chosen), volumes(points, mesh.cells[np.unique(chosen)]).sum()
 
 
 @SUFFIXES
@@ -61,7 +61,7 @@ def test_cells_that_touch_are_closed_only_once_they_are_parted(tmp_path, suffix)
     points, cells = EDGE
     save_surface(tmp_path / f"raw{suffix}", Surface(points, boundary_facets(cells), 0, 0.0))
     assert not checked_surface(tmp_path / f"raw{suffix}").is_watertight
-    save_surface(tmp_path / f"a{suffix}", surface_of(points, cells, [0, 1]))
+    save_surface(tmp_path / f"a{suffix}", extract_surface(points, cells, [0, 1]))
     check = checked_surface(tmp_path / f"a{suffix}")
     assert (check.is_watertight, check.is_winding_consistent, check.n_pieces) == (True, True, 2)
     assert check.volume == pytest.approx(1 / 3, rel=3e-3)
@@ -69,7 +69,7 @@ def test_cells_that_touch_are_closed_only_once_they_are_parted(tmp_path, suffix)
 
 @SUFFIXES
 def test_a_triangle_turned_over_or_left_out_is_seen(tmp_path, suffix):
-    surface = surface_of(*TWO_TETS, [0, 1])
+    surface = extract_surface(*TWO_TETS, [0, 1])
     turned = surface.triangles.copy()
     turned[0] = turned[0, ::-1]
     save_surface(tmp_path / f"turned{suffix}", surface._replace(triangles=turned))
@@ -103,7 +103,7 @@ def test_stl_holds_the_nearest_float32_and_unit_normals(tmp_path):
 
 def test_the_header_says_ras_where_slicer_looks(tmp_path):
     """3D Slicer reads both with these classes of VTK, and looks in the STL's header and in each PLY comment."""
-    surface = surface_of(*CUBE_CORNER, [0])
+    surface = extract_surface(*CUBE_CORNER, [0])
     about = "solid.nii\nmean below 43, Schädel " + "x" * 90
     save_surface(tmp_path / "a.stl", surface, about)
     save_surface(tmp_path / "a.ply", surface, about)
@@ -140,7 +140,7 @@ def test_vtk_files_say_their_space_and_hold_every_bit(tmp_path, space):
 
 def test_stl_has_no_room_for_labels(tmp_path):
     with pytest.raises(InputError, match=r"STL holds no labels of triangles; take \.ply or \.vtp or \.vtk"):
-        save_surface(tmp_path / "a.stl", surface_of(*CUBE_CORNER, [0]), labels={"label": np.zeros(4, dtype=int)})
+        save_surface(tmp_path / "a.stl", extract_surface(*CUBE_CORNER, [0]), labels={"label": np.zeros(4, dtype=int)})
     assert list(tmp_path.iterdir()) == []
 
 
@@ -154,16 +154,16 @@ def test_whole_or_not_at_all(tmp_path, monkeypatch):
 
     monkeypatch.setattr(Path, "write_bytes", half)
     with pytest.raises(OSError, match="disk full"):
-        save_surface(tmp_path / "a.stl", surface_of(*CUBE_CORNER, [0]))
+        save_surface(tmp_path / "a.stl", extract_surface(*CUBE_CORNER, [0]))
     assert [(p.name, p.read_text()) for p in tmp_path.iterdir()] == [("a.stl", "before")]
 
 
 def test_one_line_for_every_bad_file(tmp_path):
     with pytest.raises(InputError, match=r"a\.obj: expected a surface named \.stl or \.ply or \.vtp or \.vtk"):
-        save_surface(tmp_path / "a.obj", surface_of(*CUBE_CORNER, [0]))
+        save_surface(tmp_path / "a.obj", extract_surface(*CUBE_CORNER, [0]))
     with pytest.raises(InputError, match="no such surface file"):
         checked_surface(tmp_path / "none.stl")
-    save_surface(tmp_path / "a.ply", surface_of(*CUBE_CORNER, [0]))
+    save_surface(tmp_path / "a.ply", extract_surface(*CUBE_CORNER, [0]))
     whole = (tmp_path / "a.ply").read_bytes()
     for name, content in {
         "cut.ply": whole[:-20],
@@ -179,5 +179,5 @@ def test_one_line_for_every_bad_file(tmp_path):
 @SUFFIXES
 def test_a_name_that_is_not_utf8_is_read_back(tmp_path, suffix):
     points, cells = TWO_TETS
-    save_surface(tmp_path / f"caf\udce9{suffix}", surface_of(points, cells, np.arange(2)), "two")
+    save_surface(tmp_path / f"caf\udce9{suffix}", extract_surface(points, cells, np.arange(2)), "two")
     assert checked_surface(tmp_path / f"caf\udce9{suffix}").is_watertight

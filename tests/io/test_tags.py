@@ -8,7 +8,7 @@ from models import sample_model
 from tetopt.io.abaqus import abaqus
 from tetopt.io.febio import febio
 from tetopt.io.tags import named_materials, tagged
-from tetopt.model.build import model_of
+from tetopt.model.build import build_model
 from tetopt.model.labels import TABLE_TEXT, LabelTable
 
 
@@ -31,7 +31,7 @@ def named_model(young, names):
     height = mesh.points[mesh.cells].mean(axis=1)[:, 2]
     labels = np.array([0, 2, 3, 5])[np.searchsorted(np.quantile(height, [0.25, 0.5, 0.75]), height)]
     about = {TABLE_TEXT: LabelTable(names, {})}
-    return model_of(mesh, young=young(labels), nu=0.3, cell_data={"label": labels}, about=about)
+    return build_model(mesh, young=young(labels), nu=0.3, cell_data={"label": labels}, about=about)
 
 
 def test_materials_are_called_as_their_labels_are():

@@ -81,7 +81,7 @@ def test_sizes_of_what_was_read(image_path, tmp_path, sizes):
     assert masked == whole._replace(n_read=2 * n_voxels, n_channels=2, has_region=True, elongation=masked.elongation)
     assert (quadratic.n_nodes, quadratic.runs, quadratic.order, quadratic.iterations) == (100, 2, 2, 3)
     assert (lattice.mode, lattice.is_drawn, lattice.iterations) == ("uniform", True, 20)
-    n_nodes = len(tetopt.lattice(image, spacing=8.0).points)
+    n_nodes = len(tetopt.lattice_mesh(image, spacing=8.0).points)
     assert 0.3 * n_nodes < lattice.n_nodes <= n_nodes
     assert (slice_.ndim, slice_.n_read, slice_.n_voxels) == (2, n_voxels, image.shape[0] * image.shape[1])
     assert labelled.has_memberships

@@ -28,7 +28,7 @@ from tetopt.measure.fidelity import (
 
 def blocky(image, blocks):
     """A lattice whose blocks' faces are planes of facets."""
-    return tetopt.lattice(image, "criss-cross" if image.ndim == 2 else "five-tet", blocks=blocks)
+    return tetopt.lattice_mesh(image, "criss-cross" if image.ndim == 2 else "five-tet", blocks=blocks)
 
 
 def slabs(n, affine=None):
@@ -76,7 +76,7 @@ def test_cell_labels_against_twin(n):
     """Counted voxel by voxel, on a mesh that leaves voxels out and has cells without voxels, and with many ties."""
     rng = np.random.default_rng(n)
     labels = tetopt.Image(rng.choice([0, 2, 7], (9, 8, 7)[:n]), random_affine(rng, n))
-    whole = tetopt.lattice(labels, blocks=((5, 4, 4) if n == 3 else (6, 5))[:n])
+    whole = tetopt.lattice_mesh(labels, blocks=((5, 4, 4) if n == 3 else (6, 5))[:n])
     mesh = tetopt.Mesh(whole.points, whole.cells[len(whole.cells) // 4 :])
     owner = tetopt.cell_of_voxel(labels, mesh)
     of_cell = cell_labels(labels, mesh)
@@ -316,7 +316,7 @@ def test_cells_without_a_voxel():
 
 
 def test_label_that_fills_the_box_has_no_distance():
-    (row,) = label_fidelity(tetopt.Image(np.ones((4, 4))), tetopt.lattice(tetopt.Image(np.ones((4, 4))), nodes=20))
+    (row,) = label_fidelity(tetopt.Image(np.ones((4, 4))), tetopt.lattice_mesh(tetopt.Image(np.ones((4, 4))), nodes=20))
     assert np.isnan(row.distance_mean)
     assert (row.label, row.dice, row.is_lost) == (1, 1.0, False)
 
@@ -376,14 +376,14 @@ def test_ball_of_labels(n):
 )
 def test_bad_cell_labels(of_cell, words):
     image = tetopt.Image(np.zeros((4, 2)))
-    mesh = tetopt.lattice(image, blocks=(2, 1))
+    mesh = tetopt.lattice_mesh(image, blocks=(2, 1))
     with pytest.raises(tetopt.InputError, match=words):
         label_fidelity(image, mesh, of_cell)
 
 
 def test_bad_labels():
     image = tetopt.Image(np.full((4, 2), 0.5))
-    mesh = tetopt.lattice(image, blocks=(2, 1))
+    mesh = tetopt.lattice_mesh(image, blocks=(2, 1))
     for function in (cell_labels, label_fidelity):
         with pytest.raises(tetopt.InputError, match="is it a label image"):
             function(image, mesh)
@@ -474,6 +474,6 @@ def test_volume_dice_does_not_depend_on_the_unit():
     dice = []
     for voxel in (1.0, 0.01):
         image = tetopt.Image(labels, np.diag([voxel] * 3 + [1.0]))
-        dice.append([row.volume_dice for row in label_fidelity(image, tetopt.lattice(image, blocks=(6, 6, 6)))])
+        dice.append([row.volume_dice for row in label_fidelity(image, tetopt.lattice_mesh(image, blocks=(6, 6, 6)))])
     np.testing.assert_allclose(dice[0], dice[1], rtol=1e-6)
     assert 0.5 < dice[0][1] < 1.0

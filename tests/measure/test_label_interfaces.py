@@ -26,7 +26,7 @@ from tetopt.report.tables import label_differences
 def blocky(labels, affine=None):
     """An image of labels, a mesh with a block of cells in each voxel, and the label of each cell."""
     image = tetopt.Image(labels, affine)
-    mesh = tetopt.lattice(image, "criss-cross" if image.ndim == 2 else "five-tet", blocks=image.shape)
+    mesh = tetopt.lattice_mesh(image, "criss-cross" if image.ndim == 2 else "five-tet", blocks=image.shape)
     return image, mesh, cell_labels(image, mesh)
 
 
@@ -218,7 +218,7 @@ def test_the_numbers_of_an_independent_program():
     affine = random_affine(rng, 3)
     coarse = rng.integers(0, 3, (4, 4, 4))
     image = tetopt.Image(np.kron(coarse, np.ones((5, 4, 6))), affine)
-    mesh = tetopt.lattice(image, nodes=900)
+    mesh = tetopt.lattice_mesh(image, nodes=900)
     mesh = tetopt.Mesh(mesh.points + rng.normal(0.0, 0.01, mesh.points.shape), mesh.cells)  # no angle of just 60
     of_cell = cell_labels(image, mesh)
     for row in label_interfaces(image, mesh, of_cell):

@@ -23,7 +23,7 @@ from meshes import (
     single,
 )
 
-from tetopt import Image, lattice
+from tetopt import Image, lattice_mesh
 from tetopt.geometry.simplex import dihedral_angles, rho, squared_edges, volumes
 from tetopt.measure.quality import bad_kinds, quality, quality_errors, rho_histogram
 
@@ -35,7 +35,7 @@ seeds = st.integers(0, 2**32 - 1)
 
 def test_third_row_of_table_1():
     """Fig. 2(a): 7 x 7 squares cut into four, 113 nodes and 196 triangles; every digit of the row."""
-    mesh = lattice(Image(np.zeros((70, 70))), blocks=(7, 7))
+    mesh = lattice_mesh(Image(np.zeros((70, 70))), blocks=(7, 7))
     assert (len(mesh.points), len(mesh.cells)) == (113, 196)
     errors = quality_errors(mesh.points, mesh.cells)
     assert [round(error, 4) for error in errors] == [0.0858, 0.0858, 1.4424, 0.0858]

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import tetopt
-from tetopt.measure.segmentation import dice, segmented, thresholded
+from tetopt.measure.segmentation import dice, segment, thresholded
 from tetopt.target import otsu
 from tetopt.target.otsu import class_thresholds
 
@@ -81,9 +81,9 @@ def test_optimising_the_mesh_improves_the_segmentation():
     """On the sphere phantom the painted classes come nearer to the true labels, in both label and background."""
     phantom = tetopt.load_phantom("sphere")
     image, truth = phantom.image(voxel_mm=2.0), phantom.label_image(voxel_mm=2.0)
-    mesh = tetopt.lattice(image, nodes=800)
+    mesh = tetopt.lattice_mesh(image, nodes=800)
     better = tetopt.optimize(image, mesh, k_D=0.5, iterations=8).mesh
-    before, after = (dice(segmented(image, m, 2), truth) for m in (mesh, better))
+    before, after = (dice(segment(image, m, 2), truth) for m in (mesh, better))
     assert after[1] > before[1] + 0.03
     assert after[0] > before[0]
     assert after[1] > 0.9
@@ -94,8 +94,8 @@ def test_mesh_that_resolves_every_voxel_thresholds_it():
     """Cells that each hold one voxel give the voxels' own classes."""
     rng = np.random.default_rng(0)
     image = tetopt.Image(rng.integers(0, 4, (6, 5)) * 10.0)
-    mesh = tetopt.lattice(image, blocks=(24, 20))
-    np.testing.assert_array_equal(segmented(image, mesh, 4).data, image.data / 10.0)
+    mesh = tetopt.lattice_mesh(image, blocks=(24, 20))
+    np.testing.assert_array_equal(segment(image, mesh, 4).data, image.data / 10.0)
 
 
 def test_dice_by_hand():

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 import tetopt
-from tetopt import Image, InputError, cell_moments, cell_of_voxel, lattice
-from tetopt.fem.solution import gauss_moduli, solved_model
+from tetopt import Image, InputError, cell_moments, cell_of_voxel, lattice_mesh
+from tetopt.fem.solution import gauss_moduli, solve
 from tetopt.geometry.quadratic import gauss_rule
 from tetopt.model.averages import (
     cell_values,
@@ -18,7 +18,7 @@ from tetopt.model.averages import (
     parse_average,
     young_image,
 )
-from tetopt.model.build import model_of
+from tetopt.model.build import build_model
 from tetopt.model.model import in_units
 
 
@@ -38,7 +38,7 @@ def test_the_modulus_image_keeps_its_place():
 def test_the_cell_s_modulus_is_the_mean_of_the_law_over_its_voxels(shape):
     """Eq. (2). For a linear law that is the law of the mean; for a convex one it is more, where h varies."""
     image = noise(shape)
-    mesh = lattice(image, blocks=(2,) * len(shape))
+    mesh = lattice_mesh(image, blocks=(2,) * len(shape))
     moments = cell_moments(image, mesh)
     assert moments.variance.min() > 0.0
     linear = cell_young(image, mesh, lambda h: 1.0 + h / 50.0)
@@ -56,7 +56,7 @@ def test_wide_fields_lose_no_digits():
     """Cell means of a field over twenty orders of magnitude against sums voxel by voxel; none is negative."""
     rng = np.random.default_rng(0)
     image = tetopt.Image(rng.uniform(0.0, 46.0, (14, 12, 13)))
-    mesh = tetopt.lattice(image, nodes=80)
+    mesh = tetopt.lattice_mesh(image, nodes=80)
     moduli = cell_young(image, mesh, np.exp)
     owner = tetopt.cell_of_voxel(image, mesh)
     for cell in range(len(mesh.cells)):
@@ -81,7 +81,7 @@ AVERAGES = {
 def test_averages_over_ten_orders_of_magnitude(average, shape):
     """Against each cell's voxels one cell after the other; a cell without any has the modulus at its centroid."""
     image = Image(np.random.default_rng(0).uniform(-11.5, 11.5, shape))
-    mesh = lattice(image, nodes=60 if len(shape) == 2 else 700)
+    mesh = lattice_mesh(image, nodes=60 if len(shape) == 2 else 700)
     young = cell_young(image, mesh, np.exp, average)
     owner = cell_of_voxel(image, mesh)
     n_empty = 0
@@ -100,7 +100,7 @@ def test_averages_over_ten_orders_of_magnitude(average, shape):
 def test_averages_are_in_the_order_of_their_powers():
     """The inequality of means of powers; Hill's is between its bounds, and all are one where the law is constant."""
     image = noise((14, 12, 13))
-    mesh = lattice(image, nodes=80)
+    mesh = lattice_mesh(image, nodes=80)
     words = ["power:-10", "harmonic", "power:-0.5", "geometric", "power:0.5", "mean", "power:3", "power:10"]
     moduli = [cell_young(image, mesh, lambda h: 1.0 + h, each) for each in words]
     for less, more in pairwise(moduli):
@@ -117,7 +117,7 @@ def test_averages_are_in_the_order_of_their_powers():
 def test_empty_space_in_a_cell():
     """A modulus of 0 counts in means of powers above 0; of others it would be all that counts, and is refused."""
     image = noise((10, 10, 10))
-    mesh = lattice(image, nodes=40)
+    mesh = lattice_mesh(image, nodes=40)
     owner = cell_of_voxel(image, mesh)
     law = [(99.0, 0.0), (199.0, 10.0)]
     assert (cell_young(image, mesh, law) > 0.0).all()
@@ -136,7 +136,7 @@ def test_empty_space_in_a_cell():
 def test_a_law_need_not_be_one_for_voxels_beside_the_mesh(average):
     """As of the air around an organ; within it everything is as with a law that holds everywhere."""
     image = noise((12, 12, 12))
-    mesh = lattice(image, nodes=200)
+    mesh = lattice_mesh(image, nodes=200)
     inner = mesh.cells[(mesh.points[mesh.cells].max(axis=1)[:, 0] < 7.0)]
     used, cells = np.unique(inner, return_inverse=True)
     part = tetopt.Mesh(mesh.points[used], cells.reshape(inner.shape))
@@ -153,7 +153,7 @@ def test_words_that_are_no_average(text):
     with pytest.raises(InputError, match=r'average: expected mean, .*power:P with P from -10 to 10.*got "'):
         parse_average(text)
     with pytest.raises(InputError, match="average: expected"):
-        model_of(lattice(noise((4, 4, 4)), blocks=(1, 1, 1)), average=text)
+        build_model(lattice_mesh(noise((4, 4, 4)), blocks=(1, 1, 1)), average=text)
 
 
 def test_words_of_averages():
@@ -168,7 +168,7 @@ def test_words_of_averages():
 def test_moduli_of_nodes(shape):
     """The weighted geometric mean, hat function by hat function; within the range of the voxels around."""
     image = noise(shape)
-    mesh = lattice(image, blocks=(2,) * len(shape))
+    mesh = lattice_mesh(image, blocks=(2,) * len(shape))
     young = node_young(image, mesh, lambda h: 1.0 + h)
     owner = cell_of_voxel(image, mesh)
     index = np.argwhere(owner >= 0)
@@ -187,7 +187,7 @@ def test_moduli_of_nodes(shape):
 
 def test_a_node_without_voxels_has_the_nearest_one_s_modulus():
     image = noise((3, 3, 3))
-    mesh = lattice(image, blocks=(9, 9, 9))
+    mesh = lattice_mesh(image, blocks=(9, 9, 9))
     young = node_young(image, mesh, lambda h: 1.0 + h)
     counts = np.bincount(cell_of_voxel(image, mesh).ravel(), minlength=len(mesh.cells))
     is_empty = np.bincount(mesh.cells.ravel(), np.repeat(counts, 4)) == 0
@@ -201,7 +201,7 @@ def test_a_node_without_voxels_has_the_nearest_one_s_modulus():
 def test_moduli_at_gauss_points_are_linear_in_the_cell(n, order):
     """Exact for a linear field; their weighted sum is the mean over the cell; equal corners give that very number."""
     image = noise((8,) * n)
-    mesh = lattice(image, blocks=(2,) * n)
+    mesh = lattice_mesh(image, blocks=(2,) * n)
     places, weights = gauss_rule(n, order)
     slope = np.array([0.3, -0.7, 0.2])[:n]
     young = 20.0 + mesh.points @ slope
@@ -214,23 +214,23 @@ def test_moduli_at_gauss_points_are_linear_in_the_cell(n, order):
 
 def test_a_model_has_moduli_of_nodes():
     image = noise((8, 9, 10))
-    mesh = lattice(image, blocks=(2, 2, 2))
+    mesh = lattice_mesh(image, blocks=(2, 2, 2))
     law = [(0.0, 1.0), (200.0, 10.0)]
-    model = model_of(mesh, image, young=law, average="nodes")
+    model = build_model(mesh, image, young=law, average="nodes")
     np.testing.assert_array_equal(model.node_young, node_young(image, mesh, law))
     np.testing.assert_array_equal(
         model.materials.young[model.materials.of_cell], gauss_young(model.node_young, mesh, 1)[:, 0]
     )
     np.testing.assert_array_equal(
-        model_of(mesh, image, young="1 + 0.045*h", average="nodes").node_young,
+        build_model(mesh, image, young="1 + 0.045*h", average="nodes").node_young,
         node_young(image, mesh, lambda h: 1.0 + 0.045 * h),
     )
-    assert model_of(mesh, image, young=law).node_young is None
-    assert model_of(mesh, image, young="3", average="nodes").node_young is None  # nothing varies
+    assert build_model(mesh, image, young=law).node_young is None
+    assert build_model(mesh, image, young="3", average="nodes").node_young is None  # nothing varies
     with pytest.raises(InputError, match=r"bins: moduli that vary in a cell.*another average than nodes"):
-        model_of(mesh, image, young=law, average="nodes", bins=3)
+        build_model(mesh, image, young=law, average="nodes", bins=3)
     with pytest.raises(InputError, match=r"average: nodes is over the image's voxels; give the image \(`image`\)"):
-        model_of(mesh, young=law, average="nodes", cell_data={"mean": np.ones(len(mesh.cells))})
+        build_model(mesh, young=law, average="nodes", cell_data={"mean": np.ones(len(mesh.cells))})
 
 
 @pytest.mark.parametrize("shape", [(24, 20), (14, 12, 10)])
@@ -238,7 +238,7 @@ def test_moduli_around_gauss_points(shape):
     """Each has the geometric mean of the cell's voxels nearest to its corner; empty ones that of the cell."""
     n = len(shape)
     image = noise(shape)
-    mesh = lattice(image, blocks=(12 - 2 * n,) * n)
+    mesh = lattice_mesh(image, blocks=(12 - 2 * n,) * n)
     young = element_young(image, mesh, lambda h: 1.0 + h, "gauss", 2)
     assert young.shape == (len(mesh.cells), n + 1)
     owner = cell_of_voxel(image, mesh)
@@ -270,25 +270,25 @@ def test_moduli_around_gauss_points(shape):
 def test_a_model_has_moduli_at_gauss_points():
     """Solved as they are; its materials, for files, have the geometric means; linear cells have no others."""
     image = noise((8, 9, 10))
-    mesh = lattice(image, blocks=(2, 2, 2))
+    mesh = lattice_mesh(image, blocks=(2, 2, 2))
     law = [(0.0, 1.0), (200.0, 10.0)]
-    model = model_of(mesh, image, young=law, average="gauss", order=2, loads=["compress:1%"])
+    model = build_model(mesh, image, young=law, average="gauss", order=2, loads=["compress:1%"])
     np.testing.assert_array_equal(gauss_moduli(model), element_young(image, mesh, law, "gauss", 2))
     np.testing.assert_array_equal(gauss_moduli(in_units(model, "MPa")), gauss_moduli(model) * 1e-3)
     of_cells = model.materials.young[model.materials.of_cell]
     np.testing.assert_array_equal(of_cells, cell_young(image, mesh, law, "geometric"))
-    assert model_of(mesh, image, young=law, average="gauss").gauss_young is None
-    one = solved_model(model)
-    other = solved_model(model._replace(gauss_young=None))
+    assert build_model(mesh, image, young=law, average="gauss").gauss_young is None
+    one = solve(model)
+    other = solve(model._replace(gauss_young=None))
     assert abs(one.strain_energy / other.strain_energy - 1.0) > 1e-4
-    groups = model_of(mesh, image, young=law, average="gauss", order=2, bins=3)
+    groups = build_model(mesh, image, young=law, average="gauss", order=2, bins=3)
     assert (groups.gauss_young, len(groups.materials.young)) == (None, 3)
 
 
 def test_voxels_are_taken_in_parts(monkeypatch):
     """Seven at a time, as a large image's are by the million: the same moduli."""
     image = Image(np.random.default_rng(5).uniform(1.0, 9.0, (6, 5, 7)), np.eye(4))
-    mesh = lattice(image, blocks=(2, 2, 2))
+    mesh = lattice_mesh(image, blocks=(2, 2, 2))
     whole = element_young(image, mesh, average="gauss", order=2), node_young(image, mesh)
     monkeypatch.setattr("tetopt.model.averages.VOXELS_PER_CHUNK", 7)
     parts = element_young(image, mesh, average="gauss", order=2), node_young(image, mesh)

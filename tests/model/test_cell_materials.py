@@ -7,7 +7,7 @@ from models import sample_image, sample_model, young_of
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
 from tetopt.model.averages import cell_values
-from tetopt.model.build import model_of
+from tetopt.model.build import build_model
 from tetopt.model.laws import ByLabel
 from tetopt.model.materials import binned, by_label, density_of, materials, without_moduli
 
@@ -126,7 +126,7 @@ def test_values_by_name():
 def test_a_model_s_table_names_laws_and_sets():
     model = sample_model(3)
     about = {"label_table": {"1": {"name": "bright/ball"}, "0": {"name": "rest"}, "9": {"name": "far"}}}
-    named = model_of(
+    named = build_model(
         model.mesh, young="bright/ball=5,*=2", nu="rest=0.3,far=0.1,*=0.4", cell_data=model.cell_data, about=about
     )
     is_bright = model.cell_data["label"] == 1
@@ -140,8 +140,8 @@ def test_a_model_s_table_names_laws_and_sets():
 def test_the_mean_of_the_law_and_the_law_of_the_mean():
     image, mesh = sample_image(3), sample_model(3).mesh
     fields = sample_model(3).cell_data
-    by_image = model_of(mesh, image, young="1 + h**2", average="mean")
-    by_mean = model_of(mesh, young="1 + h**2", cell_data=fields)
+    by_image = build_model(mesh, image, young="1 + h**2", average="mean")
+    by_mean = build_model(mesh, young="1 + h**2", cell_data=fields)
     young = young_of(by_image)
     np.testing.assert_allclose(young, cell_values(image, mesh, lambda h: 1.0 + h**2), rtol=1e-14)
     np.testing.assert_allclose(young, 1.0 + fields["mean"] ** 2 + fields["variance"], rtol=1e-9)
@@ -154,35 +154,35 @@ def test_constants_are_one_material():
     """Whatever the means over many voxels would round to; also where a law is constant in a cell."""
     image, mesh = sample_image(3), sample_model(3).mesh
     for young, nu in (("0.7", "0.49"), (0.7, 0.49), ("0.7 + 0*h", "0.49 + 0*h"), ([(0, 0.7), (1, 0.7)], 0.49)):
-        table = model_of(mesh, image, young=young, nu=nu).materials
+        table = build_model(mesh, image, young=young, nu=nu).materials
         assert (table.young.tolist(), table.nu.tolist()) == ([0.7], [0.49])
-    assert model_of(mesh, young="3").materials.young.tolist() == [3.0]  # needs no image
-    assert len(model_of(mesh, image, young="1 + h/7", nu="0.49", bins=4).materials.young) == 4
+    assert build_model(mesh, young="3").materials.young.tolist() == [3.0]  # needs no image
+    assert len(build_model(mesh, image, young="1 + h/7", nu="0.49", bins=4).materials.young) == 4
 
 
 def test_ratios_may_be_negative_and_laws():
     image, mesh = sample_image(3), sample_model(3).mesh
-    table = model_of(mesh, image, young=2.0, nu="-0.3 + h / 100").materials
+    table = build_model(mesh, image, young=2.0, nu="-0.3 + h / 100").materials
     assert table.nu.min() < 0.0 < table.nu.max()
     with pytest.raises(InputError, match=r"-1 < nu < 0\.5"):
-        model_of(mesh, image, young=2.0, nu="h")
+        build_model(mesh, image, young=2.0, nu="h")
     with pytest.raises(InputError, match="no value at intensity 0"):
-        model_of(mesh, image, young=2.0, nu="1 / h")
+        build_model(mesh, image, young=2.0, nu="1 / h")
     with pytest.raises(InputError, match="expected 0 kPa or more"):
-        model_of(mesh, image, young="h - 10")
+        build_model(mesh, image, young="h - 10")
     with pytest.raises(InputError, match="the mesh has no means"):
-        model_of(mesh, young="h")
+        build_model(mesh, young="h")
 
 
 def test_one_law_for_each_label_and_one_number_a_cell():
     model = sample_model(3)
     labels = model.cell_data["label"]
-    table = model_of(model.mesh, young="0=1.5,1=4", nu="0=0.45,1=0.3", cell_data=model.cell_data).materials
+    table = build_model(model.mesh, young="0=1.5,1=4", nu="0=0.45,1=0.3", cell_data=model.cell_data).materials
     np.testing.assert_array_equal(table.young[table.of_cell], np.where(labels == 1, 4.0, 1.5))
     np.testing.assert_array_equal(table.nu[table.of_cell], np.where(labels == 1, 0.3, 0.45))
     moduli = np.linspace(1.0, 2.0, len(labels))
     for values in (moduli, moduli.tolist()):
-        table = model_of(model.mesh, young=values, nu=np.float32(0.25)).materials
+        table = build_model(model.mesh, young=values, nu=np.float32(0.25)).materials
         np.testing.assert_array_equal(table.young[table.of_cell], moduli)
         assert set(table.nu) == {0.25}
 
@@ -223,8 +223,8 @@ def test_density_by_law_by_label_and_from_the_moduli_s_file(tmp_path):
         (2.0, "1000 + 2*h", 1000.0 + 2.0 * mean),
         (2.0, 1060, np.full(len(mean), 1060.0)),
     ):
-        table = model_of(mesh, young=young, density=density, cell_data=fields).materials
+        table = build_model(mesh, young=young, density=density, cell_data=fields).materials
         np.testing.assert_allclose(table.density[table.of_cell], values, rtol=1e-14)
-    assert model_of(mesh, young=2.0, cell_data=fields).materials.density is None
+    assert build_model(mesh, young=2.0, cell_data=fields).materials.density is None
     with pytest.raises(InputError, match="a material has a modulus, too; give `young`"):
-        model_of(mesh, density=1000.0)
+        build_model(mesh, density=1000.0)

@@ -19,7 +19,7 @@ def saved(folder, model, name="a.vtu"):
 def named(model):
     """The model with a table of its labels and sets by their names."""
     about = {"label_table": TABLE, "image": "T1.nii.gz"}
-    again = tetopt.model_of(
+    again = tetopt.build_model(
         model.mesh, young=3.0 + np.arange(len(model.mesh.cells)) % 2, nu=0.3, density=1100.0, order=model.order,
         cell_data=model.cell_data, about=about, sets=["tip=below:20"], loads=["hold:inferior", "pressure:superior:2"],
     )  # fmt: skip
@@ -29,7 +29,7 @@ def named(model):
 @pytest.mark.parametrize("model", [sample_model(3), quadratic_model(3)])
 def test_what_the_file_has_goes_on(tmp_path, model):
     first = named(model)
-    again = tetopt.model_of(saved(tmp_path, first))
+    again = tetopt.build_model(saved(tmp_path, first))
     assert again.order == first.order
     assert again.loads[0]._replace(numbers=None) == first.loads[0]._replace(numbers=None)
     assert [load.numbers.tolist() for load in again.loads] == [load.numbers.tolist() for load in first.loads]
@@ -51,24 +51,24 @@ def test_what_the_file_has_goes_on(tmp_path, model):
 
 def test_what_is_stated_takes_the_place_of_the_file_s(tmp_path):
     loaded = saved(tmp_path, named(sample_model(3)))
-    by_name = tetopt.model_of(loaded, young="skull=90,white_matter=2", loads=["hold:inferior"])
+    by_name = tetopt.build_model(loaded, young="skull=90,white_matter=2", loads=["hold:inferior"])
     assert set(by_name.materials.young.tolist()) == {2.0, 90.0}
     assert by_name.materials.density is None
     assert len(by_name.loads) == 1
     assert by_name.order == 1
-    assert tetopt.model_of(loaded, nu=0.4).materials.young.tolist() == [3.0, 4.0]
-    solved = tetopt.solution_fields(loaded.mesh, tetopt.solved_model(tetopt.model_of(loaded)))
+    assert tetopt.build_model(loaded, nu=0.4).materials.young.tolist() == [3.0, 4.0]
+    solved = tetopt.solution_fields(loaded.mesh, tetopt.solve(tetopt.build_model(loaded)))
     painted = loaded._replace(cell_data=loaded.cell_data | solved.cell_data, point_data=solved.point_data)
-    assert "von_mises" in tetopt.model_of(painted).cell_data
-    assert "displacement" not in tetopt.model_of(painted, young=2.0).point_data
-    assert "von_mises" not in tetopt.model_of(painted, young=2.0).cell_data
+    assert "von_mises" in tetopt.build_model(painted).cell_data
+    assert "displacement" not in tetopt.build_model(painted, young=2.0).point_data
+    assert "von_mises" not in tetopt.build_model(painted, young=2.0).cell_data
 
 
 def test_loads_whose_sets_are_gone_are_said_to_be_left_out(tmp_path):
     loaded = saved(tmp_path, named(sample_model(3)))
     facets = {name: rows for name, rows in loaded.sets.facets.items() if name != "inferior"}
     with pytest.warns(UserWarning, match="loads are left out: it no longer has the sets inferior"):
-        assert tetopt.model_of(loaded._replace(sets=loaded.sets._replace(facets=facets))).loads == ()
+        assert tetopt.build_model(loaded._replace(sets=loaded.sets._replace(facets=facets))).loads == ()
 
 
 @pytest.mark.parametrize("name", ["a.vtu", "b.inp"])
@@ -77,7 +77,7 @@ def test_as_convert_writes_it(tmp_path, monkeypatch, name):
     monkeypatch.chdir(tmp_path)
     loaded = saved(tmp_path, named(sample_model(3)), "first.vtu")
     assert main(["convert", "first.vtu", name, "--nu", "0.35"]) == 0
-    model = tetopt.model_of(loaded, nu=0.35, about={"tetopt": tetopt.__version__})
+    model = tetopt.build_model(loaded, nu=0.35, about={"tetopt": tetopt.__version__})
     tetopt.save_model("ours_" + name, model)
     if name.endswith(".inp"):
         assert (tmp_path / f"ours_{name}").read_text("utf-8") == (tmp_path / name).read_text("utf-8")

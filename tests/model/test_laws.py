@@ -5,7 +5,7 @@ import pytest
 from models import sample_model
 
 from tetopt import InputError
-from tetopt.model.build import model_of
+from tetopt.model.build import build_model
 from tetopt.model.laws import ByLabel, has_column, load_law, parse_any_law, parse_law, young_from
 
 TABLE = [(-50.0, 2.0), (0.0, 1.0), (100.0, 5.0)]
@@ -131,7 +131,7 @@ def test_labels_from_a_file(tmp_path):
     assert load_law(tmp_path / "b.csv") == ByLabel({3: 2.5}, 1.0)
     assert has_column(str(tmp_path / "b.csv"), "nu")
     assert not has_column(str(tmp_path / "a.csv"), "nu")
-    table = model_of(
+    table = build_model(
         sample_model(3).mesh, young=str(tmp_path / "b.csv"), cell_data={"label": np.full(192, 3)}
     ).materials
     assert (table.young.tolist(), table.nu.tolist()) == ([2.5], [0.3])

@@ -38,7 +38,7 @@ def test_a_compression_is_that_of_fem(n):
 def test_a_sheared_box_is_pressed_along_its_faces_normal():
     affine = np.array([[1.0, 0, 0.2, 0], [0, 1, 0.1, 0], [0.1, 0, 1, 0], [0, 0, 0, 1]])
     image = tetopt.Image(np.zeros((4, 4, 4)), affine)
-    mesh = tetopt.lattice(image, blocks=(1, 1, 1))
+    mesh = tetopt.lattice_mesh(image, blocks=(1, 1, 1))
     (_, moved) = parse_loads(["compress:2.5%"], mesh, standard_sets(mesh, box_of(image)))
     np.testing.assert_allclose(moved.numbers, push_of(image, 2.5), atol=1e-12)
 

@@ -6,7 +6,7 @@ from models import sample_model
 
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import QUADRATIC_EDGES, quadratic, quadratic_facet_nodes
-from tetopt.model.build import model_of
+from tetopt.model.build import build_model
 from tetopt.model.loads import parse_loads
 from tetopt.model.model import (
     described,
@@ -83,17 +83,17 @@ def test_quadratic_cells_have_their_nodes_in_the_middle_of_edges():
 @pytest.mark.parametrize("order", [0, 3])
 def test_orders_that_there_are_not(order):
     with pytest.raises(InputError, match="expected 1 or 2"):
-        model_of(sample_model(3).mesh, order=order)
+        build_model(sample_model(3).mesh, order=order)
 
 
 def test_bins_need_moduli():
     with pytest.raises(InputError, match="no moduli to group"):
-        model_of(sample_model(3).mesh, bins=3)
+        build_model(sample_model(3).mesh, bins=3)
 
 
 def test_a_model_of_a_mesh_alone():
     mesh = sample_model(3).mesh
-    model = model_of(mesh)
+    model = build_model(mesh)
     assert (model.materials, model.loads, model.order) == (None, (), 1)
     assert list(model.cell_data) == ["volume", "rho", "min_dihedral"]
     assert "boundary" in model.sets.facets

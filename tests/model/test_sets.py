@@ -75,7 +75,7 @@ def test_faces_are_named_by_the_world(order, signs):
         affine[world, axis] = 2.0 * sign
     affine[:3, 3] = (10.0, -20.0, 30.0)
     image = tetopt.Image(np.zeros((3, 4, 5)), affine)
-    mesh = tetopt.lattice(image, blocks=(2, 2, 2))
+    mesh = tetopt.lattice_mesh(image, blocks=(2, 2, 2))
     sets = standard_sets(mesh, box_of(image)).facets
     assert world_axes(affine) == order
     for axis, (low, high) in enumerate(NAMES):
@@ -110,7 +110,7 @@ def test_an_oblique_box_is_known_by_its_affine_alone():
 
 def test_the_surface_of_a_mask_is_the_boundary_off_the_box():
     image = tetopt.Image(np.zeros((4, 4, 4)))
-    mesh = tetopt.lattice(image, blocks=(2, 2, 2))
+    mesh = tetopt.lattice_mesh(image, blocks=(2, 2, 2))
     is_low = mesh.points[mesh.cells].mean(axis=1)[:, 2] < 1.5
     used, cells = np.unique(mesh.cells[is_low], return_inverse=True)
     lower = Mesh(mesh.points[used], cells.reshape(-1, 4))
@@ -174,7 +174,7 @@ def test_interfaces_are_held_by_the_smaller_label():
 
 
 def test_three_labels_have_an_interface_for_each_pair_that_touches():
-    mesh = tetopt.lattice(tetopt.Image(np.zeros((6, 4))), blocks=(3, 1))
+    mesh = tetopt.lattice_mesh(tetopt.Image(np.zeros((6, 4))), blocks=(3, 1))
     labels = np.floor((mesh.points[mesh.cells].mean(axis=1)[:, 0] + 0.5) / 2.0).astype(int) * 5
     sets = standard_sets(mesh, labels=labels)
     assert [name for name in sets.facets if "interface" in name] == ["interface_0_5", "interface_5_10"]
@@ -321,7 +321,7 @@ def test_top_and_bottom_are_those_of_fem(tilt):
     affine = np.eye(4)
     affine[:3, :3] = turn @ np.diag([1.0, 1.5, 2.0])
     image = tetopt.Image(np.zeros((4, 5, 6)), affine)
-    mesh = tetopt.lattice(image, blocks=(2, 2, 2))
+    mesh = tetopt.lattice_mesh(image, blocks=(2, 2, 2))
     low, high = box_faces(image, mesh)
     sets = standard_sets(mesh, box_of(image)).facets
     np.testing.assert_array_equal(nodes_of(mesh, sets["inferior"]), low)

@@ -76,7 +76,7 @@ def slabs_done(folder, image, ticks, cells, kind, bits):
 def test_ticks_of_a_part_are_those_of_the_whole_to_the_last_one(name, tmp_path):
     """Each part of a mesh is measured on its own box of voxels, and comes back as it went."""
     image, bits = balls((21, 17, 19), AFFINES[name]), 20
-    mesh = tetopt.octree(image, 300)
+    mesh = tetopt.octree_mesh(image, 300)
     ticks = np.rint(image.to_index(mesh.points) * 2.0**bits).astype(np.int64)
     # Not on a lattice: what a part's own origin and the world's mm leave of them has to be all.
     inner = ((ticks > 0) & (ticks < (np.array(image.shape) - 1) << bits)).all(axis=1)
@@ -94,7 +94,7 @@ def test_ticks_of_a_part_are_those_of_the_whole_to_the_last_one(name, tmp_path):
 def test_a_cell_without_a_voxel_has_the_value_that_it_has_in_the_whole(name, tmp_path):
     """Also where its middle lies between two voxels, and rounding to even numbers depends on the first one."""
     image = balls((12, 10, 11), AFFINES[name])
-    mesh = tetopt.lattice(image, blocks=(8, 8, 8))
+    mesh = tetopt.lattice_mesh(image, blocks=(8, 8, 8))
     bits = grid_bits(image, mesh.points)
     ticks = np.rint(image.to_index(mesh.points) * 2.0**bits).astype(np.int64)
     mesh = tetopt.Mesh(image.to_world(ticks * 2.0**-bits), mesh.cells)

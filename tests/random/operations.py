@@ -26,7 +26,7 @@ from tetopt.target.content import plain
 
 CHECKED_EVERY = 1000  # operations
 WORLD_OPERATIONS = 10_000  # then another world
-OVERLAP = "overlap within a mask"  # on the surface of details as small as cells: a run says so (`Optimized.missed`)
+OVERLAP = "overlap within a mask"  # on the surface of details as small as cells: a run says so (`MeshingResult.missed`)
 KINDS = ("moves", "flips", "splits and collapses", "lifts", "moves to interfaces", "labels")
 
 
@@ -35,7 +35,7 @@ def begun(rng):
     world = random_world(rng, largest=18)
     content = plain(world.content())
     try:
-        start = tetopt.octree(content, int(rng.integers(60, 200)))
+        start = tetopt.octree_mesh(content, int(rng.integers(60, 200)))
     except tetopt.InputError:
         return None
     run = Run(content, start, float(rng.choice([0.1, 0.5, 0.85])), float(rng.uniform(1.0, 4.0)), is_graded=True)

@@ -16,4 +16,4 @@ def image():
 
 @pytest.fixture(scope="session")
 def mesh(image):
-    return tetopt.lattice(image, nodes=300)
+    return tetopt.lattice_mesh(image, nodes=300)

@@ -11,7 +11,7 @@ from matplotlib.colors import to_rgb, to_rgba, to_rgba_array
 from matplotlib.figure import Figure
 
 from tetopt.energy.sampling import cell_moments, cell_of_voxel
-from tetopt.engine.loop import Optimized, Record
+from tetopt.engine.loop import IterationRecord, MeshingResult
 from tetopt.engine.paper import optimize_paper
 from tetopt.errors import InputError
 from tetopt.image import Image
@@ -38,7 +38,7 @@ from tetopt.report.figures import (
     slice_figure,
 )
 from tetopt.report.scene import save_scenes
-from tetopt.start.lattice import lattice
+from tetopt.start.lattice import lattice_mesh
 from tetopt.target.labels import BACKGROUND_COLOUR, LABEL_PALETTE
 
 DOLLARS = LabelTable({1: r"5 $\frac$ and a_b"}, {})
@@ -74,7 +74,7 @@ ORIENTATIONS = [(w, s) for w in permutations(range(3)) for s in product((1, -1),
 
 def bent(image, blocks):
     """A lattice of the image's box with its inner nodes moved; the box stays covered."""
-    mesh = lattice(image, blocks=blocks)
+    mesh = lattice_mesh(image, blocks=blocks)
     index = image.to_index(mesh.points)
     is_inside = ((index > -0.4) & (index < np.array(image.shape) - 0.6)).all(axis=1)
     index[is_inside] += np.random.default_rng(1).uniform(-0.2, 0.2, (is_inside.sum(), image.ndim))
@@ -203,7 +203,7 @@ def test_cells_and_pixels_share_their_places(worlds, signs):
 def test_a_section_tiles_the_slice(affine, kind, axis):
     image = noise((8, 9, 10), affine)
     # 9 voxels in 3 blocks: the planes of nodes at index 2.5 and 5.5; 8 and 10 in 2: at 3.5 and 4.5.
-    mesh = bent(image, (2, 3, 2)) if kind == "bent" else lattice(image, kind, blocks=(2, 3, 2))
+    mesh = bent(image, (2, 3, 2)) if kind == "bent" else lattice_mesh(image, kind, blocks=(2, 3, 2))
     for index in range(image.shape[axis]):
         polygons, cells = SliceView(image, axis, index).section(mesh)
         size = np.delete(image.spacing * image.shape, axis)
@@ -218,7 +218,7 @@ def test_a_section_through_a_plane_of_nodes_tiles_it_once(axis):
     """7 voxels in 2 blocks: the middle voxel's plane is a plane of nodes, and of facets."""
     image = noise((7, 7, 7))
     for kind in ("bcc", "five-tet"):
-        polygons, _ = SliceView(image, axis, 3).section(lattice(image, kind, blocks=(2, 2, 2)))
+        polygons, _ = SliceView(image, axis, 3).section(lattice_mesh(image, kind, blocks=(2, 2, 2)))
         assert areas(polygons).sum() == pytest.approx(49.0, rel=1e-12)
 
 
@@ -246,7 +246,7 @@ def corners(collection):
 @pytest.mark.parametrize("n", [2, 3])
 def test_slice_figure_holds_each_mesh_under_its_title(n):
     image = noise(SHAPE[:n], np.diag([*SPACING[:n], 1.0]))
-    first, second = lattice(image, blocks=(2, 2, 2)[:n]), bent(image, (2, 3, 2)[:n])
+    first, second = lattice_mesh(image, blocks=(2, 2, 2)[:n]), bent(image, (2, 3, 2)[:n])
     figure = slice_figure(image, [("first", first), ("second", second)])
     view = SliceView(image, None, None)
     grid = np.array(figure.axes).reshape(2, 2)
@@ -265,7 +265,7 @@ def test_slice_figure_holds_each_mesh_under_its_title(n):
 
 def test_letters_stand_on_their_sides():
     image = oriented_image((2, 0, 1), (-1, 1, -1))
-    figure = slice_figure(image, [("", lattice(image, blocks=(1, 1, 1)))])
+    figure = slice_figure(image, [("", lattice_mesh(image, blocks=(1, 1, 1)))])
     assert len(figure.axes) == 2
     for axes in figure.axes:
         sides = {text.get_text(): text.get_position() for text in axes.texts}
@@ -277,14 +277,14 @@ def test_letters_stand_on_their_sides():
 
 def test_a_constant_slice_can_be_drawn(tmp_path):
     image = Image(np.full((6, 7), 3.0))
-    save_figure(slice_figure(image, [("", lattice(image, blocks=(2, 2)))]), tmp_path / "a.png", dpi=40)
+    save_figure(slice_figure(image, [("", lattice_mesh(image, blocks=(2, 2)))]), tmp_path / "a.png", dpi=40)
     assert np.asarray(PIL.Image.open(tmp_path / "a.png").convert("L")).std() > 5.0
 
 
 def lower_part(image, axis, count):
     """A lattice that covers the first `count` voxels along an axis only."""
     part = np.take(image.data, range(count), axis=axis)
-    return lattice(Image(part, image.affine), blocks=(2, 2, 2)[: image.ndim])
+    return lattice_mesh(Image(part, image.affine), blocks=(2, 2, 2)[: image.ndim])
 
 
 @pytest.mark.parametrize("n", [2, 3])
@@ -367,7 +367,7 @@ def test_a_legend_lists_the_largest_and_counts_the_others():
     entries = legend_patches(colours, shown)
     assert [entry.get_label() for entry in entries] == [*(str(k) for k in (0, *range(4, 15))), "and 2 more"]
     assert entries[1].get_facecolor() == (*colours[4], 1.0)
-    dollars = label_figure(blocks_of_labels(2), lattice(blocks_of_labels(2), blocks=(2, 2, 2)), table=DOLLARS)
+    dollars = label_figure(blocks_of_labels(2), lattice_mesh(blocks_of_labels(2), blocks=(2, 2, 2)), table=DOLLARS)
     FigureCanvasAgg(dollars).draw()  # which would parse a formula
     named = legend_patches(colours, shown, {4: "left lung", 1: "not shown"})
     assert [entry.get_label() for entry in named[:3]] == ["0", "4 left lung", "5"]
@@ -405,7 +405,7 @@ def test_voxels_and_cells_have_the_same_colours(worlds, signs):
 def test_interfaces_are_drawn_over_the_image(worlds, signs):
     """Slabs whose borders the lattice's cells keep to: the lines lie on the borders, as long as these are."""
     labels = blocks_of_labels(4, worlds, signs)
-    mesh = lattice(labels, blocks=(4, 3, 3), kind="five-tet")  # whose cells lie in its blocks
+    mesh = lattice_mesh(labels, blocks=(4, 3, 3), kind="five-tet")  # whose cells lie in its blocks
     image, table = noise(labels.shape, labels.affine), LabelTable({2: "left lung"}, {2: (0.0, 1.0, 0.5)})
     figure = label_figure(labels, mesh, image=image, table=table)
     grid = np.array(figure.axes).reshape(3, 3)
@@ -430,7 +430,7 @@ def test_interfaces_are_drawn_over_the_image(worlds, signs):
 
 def test_interfaces_of_a_plane():
     labels = Image(np.repeat([0, 3], 4)[:, None] + np.zeros((1, 6)), np.diag([2.0, 1.0, 1.0]))
-    mesh = lattice(labels, blocks=(2, 2))
+    mesh = lattice_mesh(labels, blocks=(2, 2))
     lines, sides = SliceView(labels, None, None).interfaces(mesh, cell_labels(labels, mesh))
     np.testing.assert_allclose(lines[..., 0], 8.0)
     assert np.linalg.norm(lines[:, 1] - lines[:, 0], axis=1).sum() == pytest.approx(6.0)
@@ -443,12 +443,12 @@ def test_labels_of_a_part_and_of_a_plane():
     polygons = np.concatenate([path.vertices for path in collections(figure.axes[1])[0].get_paths()])
     assert polygons[:, 0].max() == pytest.approx(8.0)  # of 16 mm
     flat = Image(labels.data[:, :, 0], np.diag([2.0, 1.0, 1.0]))
-    assert len(label_figure(flat, lattice(flat, blocks=(2, 2))).axes) == 2
+    assert len(label_figure(flat, lattice_mesh(flat, blocks=(2, 2))).axes) == 2
 
 
 def test_numbers_stand_in_their_labels_where_a_legend_is_too_short():
     labels = blocks_of_labels(LISTED_LABELS + 3)
-    figure = label_figure(labels, lattice(labels, blocks=(4, 2, 2)))
+    figure = label_figure(labels, lattice_mesh(labels, blocks=(4, 2, 2)))
     assert figure.legends[0].get_texts()[-1].get_text() == "and 3 more"
     view, left = SliceView(labels, None, None), figure.axes[0]
     numbers = [text for text in left.texts if text.get_text().isdigit()]
@@ -458,7 +458,7 @@ def test_numbers_stand_in_their_labels_where_a_legend_is_too_short():
         assert view.pixels[tuple(pixel)] == int(text.get_text())
     # In slabs of 0.1 mm, beside 7 mm, a number has no room.
     thin = Image(labels.data[::2], labels.affine @ np.diag([0.05, 1.0, 1.0, 1.0]))
-    figure = label_figure(thin, lattice(thin, blocks=(4, 2, 2)))
+    figure = label_figure(thin, lattice_mesh(thin, blocks=(4, 2, 2)))
     numbers = [[text.get_text() for text in axes.texts if text.get_text().isdigit()] for axes in figure.axes]
     assert numbers == [[], [], [], [], ["7"], []]  # the sagittal slice is one label alone
 
@@ -503,7 +503,7 @@ def test_boundary_of_a_plane_mesh():
 def test_a_closed_boundary_is_closed_in_every_slice(index):
     """Also where nodes lie on the plane, as at index 3; and it holds what the cells' polygons hold."""
     image = Image(np.zeros((9, 9, 7)))
-    mesh = lattice(image, blocks=(3, 3, 2)) if index == 3 else bent(image, (3, 3, 2))
+    mesh = lattice_mesh(image, blocks=(3, 3, 2)) if index == 3 else bent(image, (3, 3, 2))
     on_box = (np.abs(image.to_index(mesh.points) - [4.0, 4.0, 3.0]) > [4.4, 4.4, 3.4]).any(axis=1)
     inner = Mesh(mesh.points, mesh.cells[~on_box[mesh.cells].any(axis=1)])
     view = SliceView(image, 2, index)
@@ -518,7 +518,7 @@ def test_a_closed_boundary_is_closed_in_every_slice(index):
 
 def test_what_lies_on_the_box_is_no_boundary():
     image = noise(SHAPE)
-    assert len(SliceView(image, None, None).boundary(lattice(image, blocks=(2, 2, 2)))) == 0
+    assert len(SliceView(image, None, None).boundary(lattice_mesh(image, blocks=(2, 2, 2)))) == 0
 
 
 def test_the_detail_is_where_the_outline_bends_most():
@@ -541,14 +541,14 @@ def test_the_slice_is_in_the_middle_of_the_mask():
     image = noise((6, 7, 20))
     mask = np.zeros(image.shape)
     mask[1:4, 2:6, 12:17] = 1.0
-    figure = boundary_figure(image, Image(mask), lattice(image, blocks=(2, 2, 2)))
+    figure = boundary_figure(image, Image(mask), lattice_mesh(image, blocks=(2, 2, 2)))
     np.testing.assert_array_equal(figure.axes[0].images[0].get_array(), image.data[:, :, 14].T)
 
 
 @pytest.mark.parametrize("value", [0.0, 1.0])
 def test_a_mask_without_outline_can_be_drawn(tmp_path, value):
     image = noise(SHAPE)
-    figure = boundary_figure(image, Image(np.full(SHAPE, value)), lattice(image, blocks=(1, 1, 1)))
+    figure = boundary_figure(image, Image(np.full(SHAPE, value)), lattice_mesh(image, blocks=(1, 1, 1)))
     assert [len(drawn) for drawn in lines(figure.axes[0])] == [0, 0]
     save_figure(figure, tmp_path / "a.png", dpi=40)
 
@@ -556,7 +556,7 @@ def test_a_mask_without_outline_can_be_drawn(tmp_path, value):
 def test_a_mask_of_another_shape_is_refused():
     image = Image(np.zeros(SHAPE))
     with pytest.raises(InputError, match="mask: expected the image's shape"):
-        boundary_figure(image, Image(np.zeros((5, 7, 8))), lattice(image, blocks=(1, 1, 1)))
+        boundary_figure(image, Image(np.zeros((5, 7, 8))), lattice_mesh(image, blocks=(1, 1, 1)))
 
 
 # --------------------------------------------------------------------------------------------------
@@ -566,7 +566,7 @@ def test_a_mask_of_another_shape_is_refused():
 @pytest.mark.parametrize("n", [2, 3])
 def test_histograms_are_shares(n):
     image = noise(SHAPE[:n], np.diag([*SPACING[:n], 1.0]))
-    meshes = [("first", lattice(image, blocks=(2, 2, 2)[:n])), ("second", bent(image, (2, 3, 2)[:n]))]
+    meshes = [("first", lattice_mesh(image, blocks=(2, 2, 2)[:n])), ("second", bent(image, (2, 3, 2)[:n]))]
     figure = histogram_figure(meshes)
     outlines = [p for p in figure.axes[0].patches if p.get_label()]
     assert [p.get_label().split(":")[0] for p in outlines] == ["first", "second"]
@@ -580,7 +580,7 @@ def test_histograms_are_shares(n):
 
 def history(*E_D):
     return [
-        Record(k, 1.0 - 0.1 * k, 2.0 + 0.1 * k, value, 0.0 if k == 0 else 0.1**k, k == 2, 50, 99, float(k))
+        IterationRecord(k, 1.0 - 0.1 * k, 2.0 + 0.1 * k, value, 0.0 if k == 0 else 0.1**k, k == 2, 50, 99, float(k))
         for k, value in enumerate(E_D)
     ]
 
@@ -619,7 +619,7 @@ def test_energies_of_the_lattice_alone(tmp_path):
 @pytest.fixture(scope="module")
 def run():
     image = Image(np.where(np.arange(12) > 4, 9.0, 1.0)[:, None] + np.zeros((12, 11)))
-    initial = lattice(image, blocks=(4, 4))
+    initial = lattice_mesh(image, blocks=(4, 4))
     return image, initial, optimize_paper(image, initial, iterations=2)
 
 
@@ -661,10 +661,10 @@ def test_pictures_are_written_and_not_blank(tmp_path, run):
 
 def test_a_constant_image_says_so(monkeypatch, tmp_path):
     image = Image(np.full((8, 9), 7.0))
-    initial = lattice(image, blocks=(2, 2))
+    initial = lattice_mesh(image, blocks=(2, 2))
     saved = []
     monkeypatch.setattr(figures, "save_figure", lambda figure, path: saved.append(figure))
-    save_run_figures([tmp_path / k for k in "abc"], image, initial, Optimized(initial, history(0.0), "iterations"))
+    save_run_figures([tmp_path / k for k in "abc"], image, initial, MeshingResult(initial, history(0.0), "iterations"))
     assert saved[0].axes[1].get_title() == "optimised, constant image"
 
 

@@ -44,7 +44,7 @@ def test_no_structure_is_an_empty_surface():
 
 def test_scenes_are_drawn_side_by_side(tmp_path, opengl):
     image, _ = dark_ball()
-    mesh = tetopt.lattice(image, nodes=300)
+    mesh = tetopt.lattice_mesh(image, nodes=300)
     cells = np.flatnonzero(tetopt.cell_moments(image, mesh).mean < 50.0)
     scenes = [("one", slices_in_mesh(image, mesh)), ("two", structure_before_slices(image, mesh, cells))]
     save_scenes(tmp_path / "a.png", scenes)

@@ -16,7 +16,7 @@ from tetopt.io.files import save_json
 from tetopt.measure.quality import quality
 from tetopt.mesh import Mesh
 from tetopt.report.summary import SHOWN_VERSIONS, image_summary, mesh_hash, run_summary, versions
-from tetopt.start.lattice import lattice
+from tetopt.start.lattice import lattice_mesh
 
 AFFINE = np.array([[0.0, 2.0, 5.0], [-1.5, 0.5, 7.0], [0.0, 0.0, 1.0]])  # 1.5 and sqrt(4.25) mm, 3 mm^2
 
@@ -28,7 +28,7 @@ def image():
 
 @pytest.fixture(scope="module")
 def initial(image):
-    return lattice(image, blocks=(3, 4))
+    return lattice_mesh(image, blocks=(3, 4))
 
 
 @pytest.fixture(scope="module")
@@ -103,7 +103,7 @@ def test_total_variation_is_E_D_of_one_cell_around_everything():
 
 def test_a_constant_image_has_no_shares(tmp_path):
     image = Image(np.full((8, 9), 7.0))
-    initial = lattice(image, blocks=(2, 2))
+    initial = lattice_mesh(image, blocks=(2, 2))
     summary = run_summary(image, initial, optimize_paper(image, initial, iterations=1), {}, {})
     shares = ["E_D_relative", "E_D_share_of_variance", "E_D_share_of_variance_initial"]
     assert [summary["energies"][name] for name in shares] == [None] * 3

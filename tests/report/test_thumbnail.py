@@ -12,7 +12,7 @@ from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.model.labels import LabelTable
 from tetopt.report.thumbnail import SIDE_PIXELS, save_thumbnail, thumbnail_png
-from tetopt.start.lattice import lattice
+from tetopt.start.lattice import lattice_mesh
 
 LETTER_ROWS = 12  # lowest, with the letters of the sides
 SHAPE, SPACING = (40, 50, 15), np.array([1.0, 1.0, 3.0])
@@ -40,7 +40,7 @@ def ball(centre=(20.0, 25.0, 21.0), radius=8.0):
 
 def coarse(image):
     """A mesh of the image's box of a few cells."""
-    return lattice(image, blocks=(1,) * image.ndim)
+    return lattice_mesh(image, blocks=(1,) * image.ndim)
 
 
 def reordered(image, order, signs):
@@ -133,7 +133,7 @@ def test_mesh_mask_and_labels_are_drawn():
 
 def test_two_lungs_are_cut_through_one():
     """Where the middle is hollow, the sagittal view is not empty."""
-    left = lattice(Image(np.zeros((10, 10, 10)), np.eye(4)), blocks=(1, 1, 1))
+    left = lattice_mesh(Image(np.zeros((10, 10, 10)), np.eye(4)), blocks=(1, 1, 1))
     points = np.concatenate([left.points, left.points + np.array([40.0, 0.0, 0.0])])
     mesh = Mesh(points, np.concatenate([left.cells, left.cells + len(left.points)]))
     rgb = pixels(Image(np.zeros((50, 10, 10)), np.eye(4)), mesh)
@@ -158,7 +158,7 @@ def test_a_mesh_beside_the_image_is_drawn_alone():
 def test_its_bytes_are_few_and_always_the_same(tmp_path):
     rng = np.random.default_rng(0)
     image = Image(rng.normal(size=(40, 50, 15)), np.diag([*SPACING, 1.0]))
-    mesh = lattice(image, nodes=2000)
+    mesh = lattice_mesh(image, nodes=2000)
     for name in "ab":
         save_thumbnail(tmp_path / f"{name}.png", image, mesh)
     assert (tmp_path / "a.png").read_bytes() == (tmp_path / "b.png").read_bytes()

@@ -19,7 +19,7 @@ from tetopt.report.viewer import VIEWS_STYLE, View, view_of, views_html
 @pytest.fixture(scope="module")
 def opened():
     image = tetopt.load_phantom("two_spheres").image(voxel_mm=4.0)
-    mesh = tetopt.lattice(image, nodes=400)
+    mesh = tetopt.lattice_mesh(image, nodes=400)
     means = np.random.default_rng(0).normal(size=len(mesh.cells))
     return mesh, means, view_of(mesh, means, "a lattice")
 

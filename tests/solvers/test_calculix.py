@@ -16,7 +16,7 @@ from skfem.helpers import ddot, sym_grad, trace
 import tetopt
 from tetopt import Mesh
 from tetopt.fem.elasticity import constrained, lame_constants, solved, stiffness
-from tetopt.fem.solution import solved_model
+from tetopt.fem.solution import solve
 from tetopt.geometry.quadratic import quadratic, quadratic_facet_nodes
 from tetopt.geometry.simplex import volumes
 from tetopt.io.abaqus import abaqus
@@ -73,7 +73,7 @@ def displacements(text):
 def pressed_model(loading="compression"):
     """Two stiff spheres in a soft block: some hundred nodes, 16 materials of one ratio."""
     image = tetopt.load_phantom("two_spheres").image(voxel_mm=4.0)
-    mesh = tetopt.lattice(image, nodes=400)
+    mesh = tetopt.lattice_mesh(image, nodes=400)
     fields = tetopt.cell_fields(mesh, image)
     sets = standard_sets(mesh, box_of(image), (fields["mean"] > 15.0).astype(np.int64))
     sets = with_requested(mesh, sets, ["dark-cells=below:20", "Patch=point:40,0,0:15"], fields["mean"])
@@ -241,7 +241,7 @@ def test_numbers_of_full_length_arrive(tmp_path):
 @pytest.mark.parametrize("case", LOAD_CASES)
 def test_each_load_is_what_fem_makes_of_it(case, order, moduli, tmp_path):
     model = loaded_model(case, order=order, moduli=moduli)
-    printed, own = answer(abaqus(model), tmp_path), solved_model(model)
+    printed, own = answer(abaqus(model), tmp_path), solve(model)
     np.testing.assert_allclose(energy(printed), own.strain_energy, rtol=PRINTED)
     assert own.strain_energy > 1.0
     assert_printed(printed.u, own.u, 6e-6)
@@ -268,7 +268,7 @@ def test_each_step_is_a_case_of_its_own(order, tmp_path):
     blocks = (tmp_path / "job.frd").read_text().split(" DISP ")[1:]
     assert len(totals) == len(blocks) == 5
     for step, (total, block) in enumerate(zip(totals, blocks, strict=True), 1):
-        own = solved_model(model, step)
+        own = solve(model, step)
         np.testing.assert_allclose(float(total), own.strain_energy, rtol=PRINTED)
         assert_printed(displacements(f" DISP {block}"), own.u, 6e-6)
 
@@ -284,7 +284,7 @@ def test_lps_and_megapascals_are_the_same_loads(tmp_path):
     """Displacements turned about z; energies in mJ."""
     model = loaded_model("all", order=2, moduli="nodes")
     printed = answer(abaqus(in_units(in_space(model, "lps"), "MPa")), tmp_path)
-    own = solved_model(model)
+    own = solve(model)
     np.testing.assert_allclose(1e3 * energy(printed), own.strain_energy, rtol=PRINTED)
     assert_printed(printed.u * [-1.0, -1.0, 1.0], own.u, 6e-6)
 
@@ -303,6 +303,6 @@ def test_large_deformation_begins_as_the_linear_step(kind, order, moduli, tmp_pa
         words = {"compress": [f"compress:{20.0 * share}%"], "pressure": pressed}
         model = loaded_model(words[kind], order=order, moduli=moduli)
         printed = answer(abaqus(model._replace(is_nonlinear=True)), tmp_path)
-        energies.append(energy(printed) / solved_model(model).strain_energy)
+        energies.append(energy(printed) / solve(model).strain_energy)
     assert abs(energies[0] - 1.0) < 0.01
     assert abs(energies[1] - 1.0) > 5.0 * abs(energies[0] - 1.0)

@@ -11,7 +11,7 @@ from models import LOAD_CASES, loaded_model, our_compression, sample_model, with
 from scipy.spatial import KDTree
 
 import tetopt.io.xdmf
-from tetopt.fem.solution import solved_model
+from tetopt.fem.solution import solve
 from tetopt.io.xdmf import xdmf
 from tetopt.model.model import elements
 from tetopt.model.sets import facet_triples
@@ -262,7 +262,7 @@ def solved_cases(tmp_path_factory):
 def test_each_load_is_what_fem_makes_of_it(solved_cases, number):
     """Displacements found by their places, which dolfinx orders otherwise."""
     case, n, order, moduli = CASES[number]
-    own = solved_model(model := loaded_model(case, n, order, moduli))
+    own = solve(model := loaded_model(case, n, order, moduli))
     with np.load(solved_cases / str(number) / "solved.npz") as answer:
         points, _ = elements(model)
         distance, node = KDTree(points).query(answer["places"])

@@ -5,7 +5,7 @@ import pytest
 from models import sample_model, with_one_ratio
 
 from tetopt.fem.elasticity import lame_constants
-from tetopt.fem.solution import solved_model
+from tetopt.fem.solution import solve
 from tetopt.io.mfem import mfem
 
 ser = pytest.importorskip("mfem.ser", reason="no PyMFEM (pip install mfem)")
@@ -53,7 +53,7 @@ def test_the_energy_is_that_of_our_own_solver(n, order, tmp_path):
     path = tmp_path / "model.mfem"
     path.write_bytes(mfem(model))
     u, energy = pressed(path, model)
-    ours = solved_model(model)
+    ours = solve(model)
     n_corners = len(model.mesh.points)  # MFEM has its own order of edges
     np.testing.assert_allclose(u[:n_corners], ours.u[:n_corners], rtol=0, atol=1e-10)
     assert len(u) == len(ours.u)

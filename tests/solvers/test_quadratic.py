@@ -11,7 +11,7 @@ from models import quadratic_model, with_one_ratio, with_two_sides
 from scipy.spatial import KDTree
 from test_dolfinx import BEFORE, environment, python_with_dolfinx, same_rows, snippet
 
-from tetopt.fem.solution import solved_model
+from tetopt.fem.solution import solve
 from tetopt.geometry.quadratic import quadratic
 from tetopt.io.formats import save_model
 from tetopt.io.meshes import load_mesh
@@ -95,7 +95,7 @@ def test_dolfinx(n, tmp_path):
             assert same_rows(read[f"facets {name}"], facet_triples(model.mesh.cells, rows)), name
         for name, members in model.sets.cells.items():
             assert np.array_equal(np.sort(read[f"cells {name}"]), members), name
-        ours = solved_model(model)
+        ours = solve(model)
         assert float(read["energy"]) == pytest.approx(ours.strain_energy, rel=1e-11)
     pressed = load_mesh(tmp_path / "pressed_p0_000000.vtu")  # of VTK's Lagrange cells, in dolfinx's order of nodes
     assert (pressed.order, list(pressed.point_data)) == (2, ["displacement"])
@@ -122,7 +122,7 @@ def test_scikit_fem_through_meshio(n, suffix, tmp_path):
     law = elasticity.lame_parameters if n == 3 else elasticity.plane_stress
     moduli = law(file.cell_data["young"][0].astype(float).ravel(), NU)
     K = elasticity.linear_elasticity(*(np.asarray(on_cells.interpolate(each)) for each in moduli)).assemble(basis)
-    ours = solved_model(model)
+    ours = solve(model)
     u, prescribed, of_node = basis.zeros(), [], []
     for d, dofs in enumerate(np.hstack([basis.nodal_dofs, basis.edge_dofs if n == 3 else basis.facet_dofs])):
         off, node = KDTree(file.points[:, :n]).query(basis.doflocs[:, dofs].T)

@@ -6,7 +6,7 @@ from models import LOAD_CASES, loaded_model, our_compression, sample_model, with
 from scipy.sparse import diags
 from scipy.spatial import KDTree
 
-from tetopt.fem.solution import solved_model
+from tetopt.fem.solution import solve
 from tetopt.model.model import elements, in_space, in_units, mass_densities
 
 skfem = pytest.importorskip("skfem", reason="no scikit-fem (pip install scikit-fem)")
@@ -110,7 +110,7 @@ def loaded(model):
 @pytest.mark.parametrize("case", LOAD_CASES)
 def test_each_load_is_what_fem_makes_of_it(case, n, order, moduli):
     model = loaded_model(case, n, order, moduli)
-    own, (places, u, energy) = solved_model(model), loaded(model)
+    own, (places, u, energy) = solve(model), loaded(model)
     distance, node = KDTree(elements(model)[0]).query(places)
     assert distance.max() < 1e-9
     assert len(np.unique(node)) == len(own.u)

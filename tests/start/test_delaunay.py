@@ -8,7 +8,7 @@ from meshes import box_corners, random_affine
 from naive import circumcentres
 from scipy.spatial import Delaunay
 
-from tetopt import Image, Mesh, check_mesh, lattice
+from tetopt import Image, Mesh, check_mesh, lattice_mesh
 from tetopt.geometry.simplex import oriented, squared_edges, volumes
 from tetopt.geometry.topology import facets
 from tetopt.start.delaunay import delaunay, without_flat
@@ -130,7 +130,7 @@ def test_scipy_alone_has_flat_cells_on_a_cubic_grid():
 @pytest.mark.parametrize(("n", "kind"), [(2, "criss-cross"), (3, "bcc"), (3, "five-tet")])
 def test_nodes_of_lattices(n, kind):
     image = Image(np.zeros((12, 9, 10)[:n]), np.diag([-1.0, 1.0, 1.0, 1.0])[-n - 1 :, -n - 1 :] * 1.0)
-    mesh = lattice(image, kind, blocks=(4, 3, 3)[:n])
+    mesh = lattice_mesh(image, kind, blocks=(4, 3, 3)[:n])
     index = image.to_index(mesh.points)
     cells = delaunay(index, image.affine)
     check_tiling(index, cells, (np.full(n, -0.5), np.array(image.shape) - 0.5))
@@ -145,7 +145,7 @@ def test_nodes_of_lattices(n, kind):
 def test_bcc_nodes_on_cubes_get_the_lattice_s_own_cells_inside():
     """Where the Delaunay tessellation is unique, between two centres; on the box the diagonals are free."""
     image = Image(np.zeros((4, 4, 4)))
-    mesh = lattice(image, "bcc", blocks=(4, 4, 4))
+    mesh = lattice_mesh(image, "bcc", blocks=(4, 4, 4))
     is_inside = (mesh.cells >= 125).sum(axis=1) == 2
     cells = delaunay(mesh.points, image.affine)
     assert as_set(mesh.cells[is_inside]) <= as_set(cells)

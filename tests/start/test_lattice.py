@@ -8,7 +8,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 from meshes import random_affine
 
-from tetopt import Image, InputError, lattice
+from tetopt import Image, InputError, lattice_mesh
 from tetopt.geometry.simplex import dihedral_angles, rho, volumes
 from tetopt.geometry.topology import facets
 
@@ -23,7 +23,7 @@ def random_lattice(seed, n, kind):
     shape = tuple(int(s) for s in rng.integers(1, 12, n))
     image = Image(np.zeros(shape), random_affine(rng, n))
     blocks = tuple(int(b) for b in rng.integers(1, 5, n))
-    return image, blocks, lattice(image, kind, blocks=blocks)
+    return image, blocks, lattice_mesh(image, kind, blocks=blocks)
 
 
 # The paper's meshes
@@ -36,7 +36,7 @@ def test_meshes_of_the_paper_s_figures():
         ((80, 70), (8, 7), "criss-cross", (128, 224)),
         ((130, 100, 60), (13, 10, 6), "five-tet", (1078, 3900)),
     ]:
-        mesh = lattice(Image(np.zeros(shape, dtype=np.uint8)), kind, blocks=blocks)
+        mesh = lattice_mesh(Image(np.zeros(shape, dtype=np.uint8)), kind, blocks=blocks)
         assert (len(mesh.points), len(mesh.cells)) == counts
 
 
@@ -49,7 +49,7 @@ def test_meshes_of_the_paper_s_figures():
     ],
 )
 def test_the_paper_s_node_counts_find_its_meshes(shape, kind, nodes, counts):
-    mesh = lattice(Image(np.zeros(shape, dtype=np.uint8)), kind, nodes=nodes)
+    mesh = lattice_mesh(Image(np.zeros(shape, dtype=np.uint8)), kind, nodes=nodes)
     assert (len(mesh.points), len(mesh.cells)) == counts
 
 
@@ -57,20 +57,20 @@ def test_the_paper_s_node_counts_find_its_meshes(shape, kind, nodes, counts):
 
 
 def test_one_square():
-    mesh = lattice(Image(np.zeros((3, 5))), blocks=(1, 1))
+    mesh = lattice_mesh(Image(np.zeros((3, 5))), blocks=(1, 1))
     assert mesh.points.tolist() == [[-0.5, -0.5], [-0.5, 4.5], [2.5, -0.5], [2.5, 4.5], [1, 2]]
     assert sorted(map(sorted, mesh.cells.tolist())) == [[0, 1, 4], [0, 2, 4], [1, 3, 4], [2, 3, 4]]
     assert volumes(mesh.points, mesh.cells) == pytest.approx([15 / 4] * 4)
 
 
 def test_one_cube_in_five():
-    mesh = lattice(Image(np.zeros((2, 2, 2))), "five-tet", blocks=(1, 1, 1))
+    mesh = lattice_mesh(Image(np.zeros((2, 2, 2))), "five-tet", blocks=(1, 1, 1))
     assert len(mesh.points) == 8
     assert np.sort(volumes(mesh.points, mesh.cells)) == pytest.approx(8 * np.array([1, 1, 1, 1, 2]) / 6)
 
 
 def test_one_cube_of_bcc_is_twelve_congruent_cells():
-    mesh = lattice(Image(np.zeros((2, 2, 2))), "bcc", blocks=(1, 1, 1))
+    mesh = lattice_mesh(Image(np.zeros((2, 2, 2))), "bcc", blocks=(1, 1, 1))
     assert (len(mesh.points), len(mesh.cells)) == (9, 12)
     assert volumes(mesh.points, mesh.cells) == pytest.approx([8 / 12] * 12)
     angles = np.sort(dihedral_angles(mesh.points, mesh.cells), axis=1)
@@ -124,7 +124,7 @@ def test_nodes_are_blocks_corners_and_centres(seed, dimension_and_kind):
 
 def test_shapes_of_bcc_on_cubes():
     """Inside every cell has angles 60 (4) and 90 (2) and rho sqrt(10)/10; at the box none is under 45 degrees."""
-    mesh = lattice(Image(np.zeros((6, 4, 5)), np.diag([2.0, 2, 2, 1])), "bcc", blocks=(6, 4, 5))
+    mesh = lattice_mesh(Image(np.zeros((6, 4, 5)), np.diag([2.0, 2, 2, 1])), "bcc", blocks=(6, 4, 5))
     is_centre = np.arange(len(mesh.points)) >= 7 * 5 * 6
     is_inside = is_centre[mesh.cells].sum(axis=1) == 2
     assert is_inside.sum() == 4 * (5 * 4 * 5 + 6 * 3 * 5 + 6 * 4 * 4)
@@ -139,7 +139,7 @@ def test_shapes_of_bcc_on_cubes():
 
 def test_diagonals_alternate_on_the_walls_of_bcc():
     """A corner within a wall has diagonals to all four squares around it or to none: 8 or 4 triangles there."""
-    mesh = lattice(Image(np.zeros((4, 5, 6))), "bcc", blocks=(4, 5, 6))
+    mesh = lattice_mesh(Image(np.zeros((4, 5, 6))), "bcc", blocks=(4, 5, 6))
     sides = facets(mesh.cells)
     walls = sides.nodes[sides.n_cells == 1]
     for axis in range(3):
@@ -154,14 +154,14 @@ def test_diagonals_alternate_on_the_walls_of_bcc():
 
 def test_shapes_of_five_tet_on_cubes():
     """A fifth of the cells is regular, the others are the cube's corners."""
-    mesh = lattice(Image(np.zeros((3, 2, 4))), "five-tet", blocks=(3, 2, 4))
+    mesh = lattice_mesh(Image(np.zeros((3, 2, 4))), "five-tet", blocks=(3, 2, 4))
     ratios = np.sort(rho(mesh.points, mesh.cells))
     assert ratios[:96] == pytest.approx([2 / (3 + 3 * sqrt(3))] * 96)
     assert ratios[96:] == pytest.approx([1 / 3] * 24)
 
 
 def test_shapes_of_criss_cross_on_squares():
-    mesh = lattice(Image(np.zeros((3, 2))), blocks=(3, 2))
+    mesh = lattice_mesh(Image(np.zeros((3, 2))), blocks=(3, 2))
     assert rho(mesh.points, mesh.cells) == pytest.approx([sqrt(2) - 1] * 24)
 
 
@@ -174,7 +174,7 @@ def test_shapes_of_criss_cross_on_squares():
 )
 def test_node_counts_on_a_brain(kind, nodes, share):
     """A few hundred nodes leave few lattices of cubes to choose from; from some thousands 3 % are kept."""
-    mesh = lattice(BRAIN, kind, nodes=nodes)
+    mesh = lattice_mesh(BRAIN, kind, nodes=nodes)
     assert abs(len(mesh.points) - nodes) <= share * nodes
 
 
@@ -185,7 +185,7 @@ def test_node_counts_on_boxes_like_brains(seed, nodes, kind):
     lengths = np.array([180.0, 218, 182]) * rng.uniform(0.85, 1.15, 3)
     shape = rng.integers(20, 40, 3)
     image = Image(np.zeros(shape, dtype=np.uint8), np.diag([*(lengths / shape), 1.0]))
-    mesh = lattice(image, kind, nodes=nodes)
+    mesh = lattice_mesh(image, kind, nodes=nodes)
     assert abs(len(mesh.points) - nodes) <= 0.06 * nodes
     number = len(mesh.points) if kind == "five-tet" else -(-len(mesh.points) // 2)
     corners = mesh.points[: number + 1]  # all are corners, the last ones may be left out
@@ -199,8 +199,8 @@ def test_the_count_asked_for_is_found_where_cubes_have_it(seed, dimension_and_ki
     n, kind = dimension_and_kind
     blocks = tuple(int(b) for b in np.random.default_rng(seed).integers(3, 12, n))
     image = Image(np.zeros(tuple(2 * b for b in blocks), dtype=np.uint8))
-    exact = lattice(image, kind, blocks=blocks)
-    mesh = lattice(image, kind, nodes=len(exact.points))
+    exact = lattice_mesh(image, kind, blocks=blocks)
+    mesh = lattice_mesh(image, kind, nodes=len(exact.points))
     assert abs(len(mesh.points) - len(exact.points)) <= 0.03 * len(exact.points)
     np.testing.assert_array_equal(mesh.points, exact.points)
 
@@ -209,23 +209,25 @@ def test_the_count_asked_for_is_found_where_cubes_have_it(seed, dimension_and_ki
 def test_fewest_nodes(n, kind):
     image = Image(np.zeros((5,) * n))
     fewest = {"criss-cross": 5, "bcc": 9, "five-tet": 8}[kind]
-    assert len(lattice(image, kind, nodes=fewest).points) == fewest
+    assert len(lattice_mesh(image, kind, nodes=fewest).points) == fewest
     with pytest.raises(InputError, match=f"nodes must lie between {fewest} and 50000000"):
-        lattice(image, kind, nodes=fewest - 1)
+        lattice_mesh(image, kind, nodes=fewest - 1)
 
 
 def test_spacing_is_in_mm_and_the_nearest_that_divides_the_box():
     image = Image(np.zeros((10, 20, 6)), np.diag([-2.0, 0.5, 5.0, 1.0]))  # 20 x 10 x 30 mm
     for spacing, blocks in [(5.0, (4, 2, 6)), (4.0, (5, 2, 8)), (7.0, (3, 1, 4)), (100.0, (1, 1, 1)), (9.9, (2, 1, 3))]:
-        mesh = lattice(image, "five-tet", spacing=spacing)
-        np.testing.assert_array_equal(mesh.points, lattice(image, "five-tet", blocks=blocks).points)
+        mesh = lattice_mesh(image, "five-tet", spacing=spacing)
+        np.testing.assert_array_equal(mesh.points, lattice_mesh(image, "five-tet", blocks=blocks).points)
 
 
 def test_default_kinds():
     cube, square = Image(np.zeros((4, 4, 4))), Image(np.zeros((4, 4)))
     for image, kind in ((cube, "bcc"), (square, "criss-cross")):
         blocks = (2,) * image.ndim
-        np.testing.assert_array_equal(lattice(image, blocks=blocks).cells, lattice(image, kind, blocks=blocks).cells)
+        np.testing.assert_array_equal(
+            lattice_mesh(image, blocks=blocks).cells, lattice_mesh(image, kind, blocks=blocks).cells
+        )
 
 
 # Messages
@@ -256,7 +258,7 @@ def test_default_kinds():
 )
 def test_sizes_and_kinds_that_no_lattice_has_are_refused(shape, kind, size, message):
     with pytest.raises(InputError, match=message):
-        lattice(Image(np.zeros(shape)), kind, **size)
+        lattice_mesh(Image(np.zeros(shape)), kind, **size)
 
 
 @pytest.mark.parametrize(
@@ -271,4 +273,4 @@ def test_sizes_and_kinds_that_no_lattice_has_are_refused(shape, kind, size, mess
 )
 def test_sizes_of_the_wrong_kind(size):
     with pytest.raises(InputError, match=f"lattice: {next(iter(size))}( must|: expected)"):
-        lattice(Image(np.zeros((5, 6, 7))), **size)
+        lattice_mesh(Image(np.zeros((5, 6, 7))), **size)

@@ -8,7 +8,7 @@ import pytest
 from scipy import ndimage
 
 import tetopt
-from tetopt.start.octree import octree
+from tetopt.start.octree import octree_mesh
 from tetopt.target.noise import noise_level
 
 OBLIQUE = np.array([[0.9, 0.3, 0.2, -7.0], [-0.25, 1.1, 0.1, 3.0], [0.0, 0.4, -1.5, 11.0], [0.0, 0.0, 0.0, 1.0]])
@@ -58,13 +58,13 @@ IMAGES = {
 @pytest.mark.parametrize("name", IMAGES)
 def test_octree_is_a_good_mesh_of_the_box(name):
     image, nodes = IMAGES[name]
-    mesh = octree(image, nodes)
+    mesh = octree_mesh(image, nodes)
     assert tetopt.check_mesh(mesh, image) == []
     assert abs(len(mesh.points) - nodes) <= 0.08 * nodes
     shape = tetopt.quality(mesh.points, mesh.cells)
     if image.ndim == 3:
         assert shape.min_dihedral > 10.0
-    again = octree(image, nodes)
+    again = octree_mesh(image, nodes)
     np.testing.assert_array_equal(again.points, mesh.points)
     np.testing.assert_array_equal(again.cells, mesh.cells)
 
@@ -89,7 +89,7 @@ def test_mesh_image(name):
 def test_less_error_than_a_uniform_mesh():
     """At the same number of nodes, from start to end, and at a comparable shape."""
     image = ball(60, 56, 52, noise=2.0)
-    uniform = tetopt.optimize(image, tetopt.lattice(image, nodes=2000), k_D=0.5).mesh
+    uniform = tetopt.optimize(image, tetopt.lattice_mesh(image, nodes=2000), k_D=0.5).mesh
     graded = tetopt.mesh_image(image, len(uniform.points)).mesh
     assert abs(len(graded.points) - len(uniform.points)) <= 2
     assert tetopt.E_D(image, graded) < 0.6 * tetopt.E_D(image, uniform)
@@ -104,7 +104,7 @@ def test_nodes_do_not_follow_noise(monkeypatch):
 
     def share_in_wave():
         image = tetopt.Image(data)
-        index = image.to_index(octree(image, 2000, tetopt.Sizes(longest=np.inf)).points)
+        index = image.to_index(octree_mesh(image, 2000, tetopt.Sizes(longest=np.inf)).points)
         return float((index[:, 0] < 31.5).sum()) / len(index)
 
     known = share_in_wave()
@@ -116,7 +116,7 @@ def test_nodes_do_not_follow_noise(monkeypatch):
 def test_noise_alone_gets_a_uniform_mesh():
     """Two sizes of blocks at most, and as many nodes in each half of the box."""
     image = IMAGES["noise only"][0]
-    mesh = octree(image, 1500)
+    mesh = octree_mesh(image, 1500)
     volume = np.abs(np.linalg.det(mesh.points[mesh.cells[:, 1:]] - mesh.points[mesh.cells[:, :1]]))
     assert volume.max() < 17.0 * np.median(volume)  # 8 times for a level; a block's corner is cut into unequal cells
     halves = (image.to_index(mesh.points) < 19.5).mean(axis=0)
@@ -149,7 +149,7 @@ def test_noise_level(shape, sigma):
 )
 def test_impossible_numbers_of_nodes(shape, nodes, words):
     with pytest.raises(tetopt.InputError, match=words):
-        octree(ball(*shape), nodes)
+        octree_mesh(ball(*shape), nodes)
 
 
 @pytest.mark.parametrize("nodes", [50, 100, 200, 300, 500, 700, 1000, 1500, 2500])
@@ -163,20 +163,20 @@ def test_every_number_of_nodes(kind, nodes):
         "noise": np.random.default_rng(0).normal(size=shape),
         "voxel": np.where((grid(*shape) == 9).all(-1), 50.0, 0.0),
     }[kind]
-    count = len(octree(tetopt.Image(data), nodes).points)
+    count = len(octree_mesh(tetopt.Image(data), nodes).points)
     assert abs(count - nodes) <= max(0.07 * nodes, 30)
 
 
 @pytest.mark.parametrize("scale", [1e-150, 1e-30, 1e100])
 def test_scale_of_intensities(scale):
     image = ball(30, 30, 30, noise=3.0)
-    expected = octree(image, 800).points
-    np.testing.assert_array_equal(octree(tetopt.Image(image.data * scale), 800).points, expected)
+    expected = octree_mesh(image, 800).points
+    np.testing.assert_array_equal(octree_mesh(tetopt.Image(image.data * scale), 800).points, expected)
 
 
 def test_intensities_that_overflow():
     with pytest.raises(tetopt.InputError, match="overflow"):
-        octree(tetopt.Image(ball(30, 30, 30, noise=1.0).data * 1e200), 800)
+        octree_mesh(tetopt.Image(ball(30, 30, 30, noise=1.0).data * 1e200), 800)
 
 
 def test_same_bits_for_any_number_of_threads():

@@ -11,7 +11,7 @@ from test_octree import OBLIQUE, ball, grid
 
 import tetopt
 from tetopt.engine.meshing import meshed_to_error
-from tetopt.start.octree import _Blocks, _divided, nodes_of_sizes, octree
+from tetopt.start.octree import _Blocks, _divided, nodes_of_sizes, octree_mesh
 from tetopt.start.sizes import EQUILATERAL_NODES, RATIO_BINS, Sizes, _around, edge_ratios, equilateral_nodes
 
 
@@ -31,10 +31,10 @@ def test_largest(shape, affine):
         affine = OBLIQUE[:3, :3].copy()
         affine[2] = 0, 0, 1
     image, nodes = ball(*shape, affine=affine), 1500 if len(shape) == 3 else 500
-    free = octree(image, nodes, Sizes(longest=np.inf))
+    free = octree_mesh(image, nodes, Sizes(longest=np.inf))
     largest = 0.65 * edges(free)[1].max()
     sizes = Sizes(longest=largest)
-    mesh = octree(image, nodes, sizes)
+    mesh = octree_mesh(image, nodes, sizes)
     slant = 1.3 if affine is not None else 1.0  # blocks are parallelepipeds, whose diagonals are longer
     assert edges(mesh)[1].max() <= largest * slant * (1 + 1e-9)
     assert edges(mesh)[1].max() > 0.6 * largest
@@ -47,16 +47,18 @@ def test_largest(shape, affine):
 def test_default_largest():
     """1.4 times the edges of a uniform mesh; larger where more nodes are not wanted."""
     image = ball(48, 40, 44)
-    uniform = edges(tetopt.lattice(image, nodes=1500))[1].max()
+    uniform = edges(tetopt.lattice_mesh(image, nodes=1500))[1].max()
     assert Sizes().longest_edge(image, 1500) == pytest.approx(1.4 * uniform, rel=0.05)
-    assert edges(octree(image, 1500))[1].max() <= 1.4 * 1.05 * uniform
+    assert edges(octree_mesh(image, 1500))[1].max() <= 1.4 * 1.05 * uniform
 
 
 def test_smallest():
     """No block is below it, and no edge is split below it."""
     image = ball(48, 40, 44)
-    sizes = Sizes(smallest=1.6 * edges(octree(image, 1000))[1].min())
-    assert edges(octree(image, 1000, sizes))[1].min() > 0.85 * sizes.smallest  # from a block's corner to its centre
+    sizes = Sizes(smallest=1.6 * edges(octree_mesh(image, 1000))[1].min())
+    assert (
+        edges(octree_mesh(image, 1000, sizes))[1].min() > 0.85 * sizes.smallest
+    )  # from a block's corner to its centre
     fine = edges(tetopt.mesh_image(image, 1000).mesh)[1]
     coarse = edges(tetopt.mesh_image(image, 1000, sizes=sizes).mesh)[1]
     assert np.percentile(coarse, 2) > 1.2 * np.percentile(fine, 2)
@@ -111,7 +113,7 @@ def test_targets_from_any_mesh(count):
     """A lattice with a fifth of the nodes, or five times as many, ends with the number and its edges."""
     image, sizes = ball(48, 40, 44), Sizes(largest=6.0)
     nodes = nodes_of_sizes(image, sizes)[0]
-    start = tetopt.lattice(image, nodes=count)
+    start = tetopt.lattice_mesh(image, nodes=count)
     mesh = tetopt.optimize(image, start, k_D=0.85, nodes=nodes, sizes=sizes, iterations=16).mesh
     assert len(mesh.points) == nodes
     assert tetopt.check_mesh(mesh, image) == []
@@ -189,7 +191,7 @@ def test_equilateral_nodes_of_a_mask(shape):
 def test_edge_ratios():
     """Each edge once, over the mean of the targets at its ends, and only where both have one."""
     image = ball(20, 20, 20)
-    mesh = tetopt.lattice(image, "five-tet", blocks=(4, 4, 4))
+    mesh = tetopt.lattice_mesh(image, "five-tet", blocks=(4, 4, 4))
     ratios = edge_ratios(mesh.points, mesh.cells, Sizes(largest=5.0))
     n_short, n_long = 3 * 4 * 25, 6 * 4 * 4 * 5 // 2
     assert ratios.mean == pytest.approx((n_short + 2.0**0.5 * n_long) / (n_short + n_long))
@@ -212,7 +214,9 @@ def test_gradation():
     spot = tetopt.Image(np.where(((grid(*shape) - 31.5) ** 2).sum(-1) < 9.0, 3.0, 0.0))
     far = {}
     for gradation in (1.0, 0.25):
-        mesh = octree(image, 3000 if gradation == 1.0 else 11000, Sizes(longest=40.0, gradation=gradation, field=spot))
+        mesh = octree_mesh(
+            image, 3000 if gradation == 1.0 else 11000, Sizes(longest=40.0, gradation=gradation, field=spot)
+        )
         ends, length = edges(mesh)
         distance = np.linalg.norm(mesh.points[ends].mean(axis=1) - 31.5, axis=1)
         assert length[distance < 2.0].mean() < 1.25 * 3.0
@@ -254,7 +258,7 @@ def test_field_is_lowered_to_its_gradation(shape):
 
 def test_sizes_around_are_the_twin_s():
     """The least of the other nodes' sizes + gradation x way along edges: against Dijkstra's algorithm."""
-    mesh = octree(ball(30, 30, 30), 300)
+    mesh = octree_mesh(ball(30, 30, 30), 300)
     ends, length = edges(mesh)
     n = len(mesh.points)
     own = np.random.default_rng(1).uniform(1.0, 10.0, n)
@@ -272,9 +276,9 @@ def test_sizes_around_are_the_twin_s():
 def test_a_refusal_names_a_number_that_will_do(sizes):
     image = tetopt.Image(100.0 * (np.indices((30, 30, 30)).sum(0) > 40))
     with pytest.raises(tetopt.InputError, match="ask for") as refusal:
-        tetopt.octree(image, 60, sizes)
+        tetopt.octree_mesh(image, 60, sizes)
     nodes = int(re.search(r"ask for (\d+)", str(refusal.value))[1])
-    assert len(tetopt.octree(image, nodes, sizes).points) > 0.5 * nodes
+    assert len(tetopt.octree_mesh(image, nodes, sizes).points) > 0.5 * nodes
 
 
 @pytest.mark.parametrize(
@@ -307,14 +311,14 @@ def test_a_refusal_names_a_number_that_will_do(sizes):
 def test_limits_that_cannot_be(sizes, words):
     image = ball(30, 30, 30)
     with pytest.raises(tetopt.InputError, match=words):
-        octree(image, 500, sizes)
+        octree_mesh(image, 500, sizes)
     with pytest.raises(tetopt.InputError, match=words):
         tetopt.mesh_image(image, 500, sizes=sizes)
 
 
 def test_smallest_before_largest():
     """Where not both can be, the smallest is kept."""
-    mesh = octree(ball(30, 30, 30), 320, Sizes(smallest=5.0, longest=5.0))
+    mesh = octree_mesh(ball(30, 30, 30), 320, Sizes(smallest=5.0, longest=5.0))
     assert edges(mesh)[1].min() >= 5.0 * (1 - 1e-9)
 
 
@@ -328,7 +332,7 @@ def waves_in_half():
 def test_runs_keep_to_the_largest():
     """From a uniform mesh: exchanges make edges no longer than allowed, and would."""
     image = waves_in_half()
-    start = tetopt.lattice(image, nodes=1000)
+    start = tetopt.lattice_mesh(image, nodes=1000)
     longest = edges(start)[1].max()
     bounded, free = (
         edges(tetopt.optimize(image, start, k_D=0.85, nodes=1000, iterations=10, sizes=Sizes(longest=largest)).mesh)[1]
@@ -341,7 +345,7 @@ def test_runs_keep_to_the_largest():
 def test_runs_keep_to_the_smallest(monkeypatch):
     """From a uniform mesh: edges whose halves would be shorter are not split, and would be."""
     image = waves_in_half()
-    start = tetopt.lattice(image, nodes=1000)
+    start = tetopt.lattice_mesh(image, nodes=1000)
     fast = sys.modules["tetopt.engine.fast"]
     plain, made = fast.exchange, []
 
@@ -364,7 +368,7 @@ def test_runs_keep_to_the_smallest(monkeypatch):
 def test_longest_at_nodes():
     """The least of the longest, sqrt 2 of the target, and what grows from the sizes around."""
     image = ball(30, 30, 30)
-    mesh = octree(image, 300)
+    mesh = octree_mesh(image, 300)
     own = np.full(len(mesh.points), 100.0)
     field = half_sized(image, 7.0, stretch=3.0)
     sizes = Sizes(longest=20.0, field=field).prepared(3)
@@ -456,7 +460,7 @@ def test_exchanges_do_not_follow_noise(monkeypatch):
     """In noise alone hardly a node is exchanged, if its level is known."""
     image = tetopt.Image(np.random.default_rng(1).normal(0.0, 10.0, (40, 40, 40)))
     fast = sys.modules["tetopt.engine.fast"]
-    start = octree(image, 1500)
+    start = octree_mesh(image, 1500)
     count = {}
     for known in (True, False):
         made = []

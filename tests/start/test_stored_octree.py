@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 import tetopt
-from tetopt.start.octree import nearest_octree, octree
+from tetopt.start.octree import nearest_octree, octree_mesh
 from tetopt.start.sums import _add_rows, block_sums, channels_of, source_of
 from tetopt.stored import StoredImage
 from tetopt.target.content import content, plain
@@ -54,17 +54,17 @@ def assert_same(mesh, expected):
 )
 def test_octree_is_that_of_voxels_in_memory(shape, dtype, affine, chunks, most, monkeypatch):
     image = tetopt.Image(noisy(shape, dtype), affine)
-    expected = octree(image, 700)
+    expected = octree_mesh(image, 700)
     statistics = sys.modules["tetopt.target.statistics"]
     monkeypatch.setattr(statistics, "READ_BYTES", most[0])
     monkeypatch.setattr(statistics, "PIECE_VOXELS", most[1])
     voxels = Recorded(noisy(shape, dtype), chunks)
     stored = StoredImage(voxels, affine)
-    assert_same(octree(stored, 700), expected)
-    assert_same(octree(image, 700), expected)
+    assert_same(octree_mesh(stored, 700), expected)
+    assert_same(octree_mesh(image, 700), expected)
     assert max(voxels.reads) <= most[0]
     n_reads = len(voxels.reads)
-    assert_same(octree(stored, 700, statistics=stored_statistics(stored)), expected)
+    assert_same(octree_mesh(stored, 700, statistics=stored_statistics(stored)), expected)
     assert len(voxels.reads) == 2 * n_reads  # its own statistics, which are the octree's
 
 
@@ -74,7 +74,7 @@ def test_layouts_are_the_same():
     stored = StoredImage(np.asfortranarray(data), OBLIQUE)
     boxes = list(stored_boxes(stored))
     assert [box[0] for box in boxes] == [slice(0, 20)] * len(boxes)
-    assert_same(octree(stored, 300), octree(tetopt.Image(data, OBLIQUE), 300))
+    assert_same(octree_mesh(stored, 300), octree_mesh(tetopt.Image(data, OBLIQUE), 300))
 
 
 @pytest.mark.parametrize(
@@ -173,9 +173,9 @@ def spoiled(value, dtype=np.float32):
 def test_voxels_that_no_image_takes(data, words, monkeypatch):
     monkeypatch.setattr(sys.modules["tetopt.target.statistics"], "READ_BYTES", 3 * 12 * data.itemsize)
     with pytest.raises(tetopt.InputError, match=words) as stored:
-        octree(StoredImage(Recorded(data, (12, 4, 12))), 100)
+        octree_mesh(StoredImage(Recorded(data, (12, 4, 12))), 100)
     with pytest.raises(tetopt.InputError) as in_memory:
-        octree(tetopt.Image(data), 100)
+        octree_mesh(tetopt.Image(data), 100)
     assert str(stored.value) == str(in_memory.value)
 
 
@@ -183,7 +183,7 @@ def test_voxels_that_no_image_takes(data, words, monkeypatch):
 def test_targets_take_voxels_in_memory(sizes):
     voxels = Recorded(noisy((12, 12, 12), np.uint8))
     with pytest.raises(tetopt.InputError, match=r"largest and field .* this one is stored; use smallest, longest"):
-        octree(StoredImage(voxels), 100, sizes)
+        octree_mesh(StoredImage(voxels), 100, sizes)
     assert voxels.reads == []
 
 

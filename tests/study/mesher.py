@@ -31,7 +31,7 @@ def main(kind, image_path, labels_path, nodes, output, log=None):
         sys.exit("warming up\nthe mesher's own words")
     Path(output).with_name("done").touch()
     image = tetopt.load_image(image_path)
-    mesh = tetopt.lattice(image, nodes=400 if kind == "stubborn" else round(2 / 3 * int(nodes)))
+    mesh = tetopt.lattice_mesh(image, nodes=400 if kind == "stubborn" else round(2 / 3 * int(nodes)))
     if kind == "flat":
         mesh = tetopt.Mesh([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]])
     if kind in ("wide", "rough", "rough-labelled", "small"):

@@ -98,4 +98,4 @@ def leave(job):
 
 
 def fine(job):
-    return Produced(tetopt.lattice(job.image, nodes=job.nodes), {"first": 1.5, "second": 0.25}, ["a note"])
+    return Produced(tetopt.lattice_mesh(job.image, nodes=job.nodes), {"first": 1.5, "second": 0.25}, ["a note"])

@@ -40,7 +40,7 @@ def test_job_arrives_whole():
     image = tetopt.Image(IMAGE.data + 0.1, np.array([[0, -2.0, 0, 5], [3, 0, 0.5, 1], [0, 0, 1.5, 2], [0, 0, 0, 1]]))
     labels = tetopt.Image((IMAGE.data > 50).astype(int), image.affine)
     outcome = run_in_child(pipes.fine, PipelineInput(image, labels, 200), max_seconds=60.0)
-    assert outcome.mesh.points.tobytes() == tetopt.lattice(image, nodes=200).points.tobytes()
+    assert outcome.mesh.points.tobytes() == tetopt.lattice_mesh(image, nodes=200).points.tobytes()
     assert list(outcome.seconds.items()) == [("first", 1.5), ("second", 0.25)]
     assert outcome.notes == ["a note"]
 

@@ -150,7 +150,7 @@ def fake_report():
 
 def meshes_of(image, nodes, iterations):
     """A lattice and an optimised mesh of the image."""
-    lattice = tetopt.lattice(image, nodes=nodes)
+    lattice = tetopt.lattice_mesh(image, nodes=nodes)
     mesh = tetopt.optimize(image, lattice, k_D=0.3, iterations=iterations).mesh
     return [("tetopt", mesh), ("BCC lattice", lattice)]
 

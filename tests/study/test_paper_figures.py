@@ -157,7 +157,7 @@ def test_row_6_elastography_mesh():
     assert [len(case.initial.points), len(case.initial.cells)] == PRINTED["meshes"]["fig3c"]
     assert paper.errors_of(case.initial).mean == pytest.approx(errors("fig3c")[0], abs=2e-4)
     box = tetopt.Image(np.zeros((100, 102)) + np.arange(102))
-    longer = paper.errors_of(tetopt.lattice(box, blocks=(7, 7)))
+    longer = paper.errors_of(tetopt.lattice_mesh(box, blocks=(7, 7)))
     assert longer.worst == pytest.approx(errors("fig3c")[3], abs=2e-3)
 
 

@@ -129,7 +129,7 @@ def block(tmp_path):
     tetopt.save_image(tmp_path / "block.nii", tetopt.Image(np.full((8, 8, 8), 50.0)))
     with pytest.warns(UserWarning, match="everywhere"):
         image = tetopt.load_image(tmp_path / "block.nii")
-    tetopt.save_mesh(tmp_path / "block.vtu", tetopt.lattice(image, blocks=(2, 2, 2)))
+    tetopt.save_mesh(tmp_path / "block.vtu", tetopt.lattice_mesh(image, blocks=(2, 2, 2)))
     return [str(tmp_path / "block.nii"), str(tmp_path / "block.vtu")]
 
 
@@ -174,7 +174,7 @@ def test_fem_averages(tmp_path, capsys):
     """Without a law, too: of the intensities. Around Gauss points it is another one for quadratic cells."""
     image = tetopt.Image(np.random.default_rng(0).uniform(1.0, 9.0, (8, 8, 8)))
     tetopt.save_image(tmp_path / "i.nii", image)
-    tetopt.save_mesh(tmp_path / "i.vtu", tetopt.lattice(image, blocks=(2, 2, 2)))
+    tetopt.save_mesh(tmp_path / "i.vtu", tetopt.lattice_mesh(image, blocks=(2, 2, 2)))
     files, energies = [str(tmp_path / "i.nii"), str(tmp_path / "i.vtu")], {}
     for average in ("mean", "geometric", "harmonic", "gauss"):
         for order in "12":
@@ -275,7 +275,7 @@ def test_simulate_is_the_compression_it_says(turn):
     c, s = np.cos(turn), np.sin(turn)
     affine = np.array([[1, 0, 0, 0], [0, c, -s, 0], [0, s, c, 0], [0, 0, 0, 1.0]]) @ affine
     image = tetopt.Image(rng.uniform(1.0, 5.0, (6, 9, 8)), affine)
-    mesh = tetopt.lattice(image, nodes=60)
+    mesh = tetopt.lattice_mesh(image, nodes=60)
     simulated, pressed = paper.simulate(image, mesh, nu=0.3, percent=2.0, law=lambda h: h**2)
     owner = tetopt.cell_of_voxel(image, mesh)
     means = [(image.data[owner == cell] ** 2).mean() for cell in range(len(mesh.cells)) if (owner == cell).any()]
@@ -298,5 +298,5 @@ def test_turning_the_world_changes_nothing():
         affine = np.eye(4)
         affine[1:3, 1:3] = [[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]]
         image = tetopt.Image(data, affine)
-        energies.append(paper.simulate(image, tetopt.lattice(image, blocks=(3, 3, 3)))[0].strain_energy)
+        energies.append(paper.simulate(image, tetopt.lattice_mesh(image, blocks=(3, 3, 3)))[0].strain_energy)
     np.testing.assert_allclose(energies, energies[0], rtol=1e-9)

@@ -23,7 +23,7 @@ EQUAL, AS_LABELS = (
 def test_labels_that_are_given_are_meshed(image, labels, content, notes):
     """Besides the image, alone if the image is the labels; without any the image alone."""
     made = PIPELINES["tetopt-uniform"].function(PipelineInput(image, labels, 200, iterations=2))
-    expected = tetopt.optimize(content, tetopt.lattice(image, nodes=200), k_D=0.2, iterations=2)
+    expected = tetopt.optimize(content, tetopt.lattice_mesh(image, nodes=200), k_D=0.2, iterations=2)
     assert made.mesh.points.tobytes() == expected.mesh.points.tobytes()
     assert made.mesh.cells.tobytes() == expected.mesh.cells.tobytes()
     assert made.notes == [f"ended by: {expected.ended}", *notes]

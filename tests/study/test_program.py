@@ -64,7 +64,7 @@ def test_sizes_instead_of_numbers(tmp_path):
     script.write_text(
         "import sys, tetopt\nimage = tetopt.load_image(sys.argv[1])\n"
         "assert sys.argv[2] == '$HOME;'\n"
-        "mesh = tetopt.lattice(image, nodes=round(image.volume / float(sys.argv[3]) ** 3))\n"
+        "mesh = tetopt.lattice_mesh(image, nodes=round(image.volume / float(sys.argv[3]) ** 3))\n"
         "tetopt.save_mesh(sys.argv[4], mesh)\n"
     )
     words = f"mine={PYTHON} '{script}' {{image}} '$HOME;' {{size}} {{output}}"
@@ -78,7 +78,7 @@ def test_other_suffixes(tmp_path):
     script.write_text(
         "import sys, tetopt\nimage = tetopt.load_image(sys.argv[1])\n"
         "assert sys.argv[2].endswith('/mesh.msh')\n"
-        "tetopt.save_model(sys.argv[2], tetopt.model_of(tetopt.lattice(image, nodes=400), image))\n"
+        "tetopt.save_model(sys.argv[2], tetopt.build_model(tetopt.lattice_mesh(image, nodes=400), image))\n"
     )
     made = by_program(JOB, parse_program(f"mine={PYTHON} {script} {{image}} {{output}}.msh"))
     n = len(made.mesh.points)

@@ -76,13 +76,13 @@ def test_facets_follow_the_interface():
     labels = PHANTOM.label_image(voxel_mm=4.0)
     mesh = PIPELINES["pytetwild"].function(PipelineInput(IMAGE, labels, 600)).mesh
     assert_fills(IMAGE, mesh)
-    assert tetopt.E_D(IMAGE, mesh) < 0.6 * tetopt.E_D(IMAGE, tetopt.lattice(IMAGE, nodes=600))
+    assert tetopt.E_D(IMAGE, mesh) < 0.6 * tetopt.E_D(IMAGE, tetopt.lattice_mesh(IMAGE, nodes=600))
 
 
 @needs_pytetwild
 def test_missed_count_is_told(monkeypatch):
     """Where no factor changes the number of nodes: all runs are made, the mesh is given, with a note."""
-    mesh = tetopt.lattice(IMAGE, nodes=600)
+    mesh = tetopt.lattice_mesh(IMAGE, nodes=600)
     points = IMAGE.to_index(mesh.points) * IMAGE.spacing
     monkeypatch.setattr(tetwild, "_run", lambda *_: (points, mesh.cells))
     result = tetwild.filled(IMAGE, interfaces(IMAGE, 8.0, classes=2), 900)
@@ -110,7 +110,7 @@ def test_missing_package(monkeypatch):
 
 def test_shaken_boundary_is_put_back():
     """A lattice whose boundary nodes were moved off the faces, in and out: the box again, all cells positive."""
-    mesh = tetopt.lattice(IMAGE, nodes=600)
+    mesh = tetopt.lattice_mesh(IMAGE, nodes=600)
     low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
     rng = np.random.default_rng(0)
     shaken = mesh.points + rng.uniform(-0.4, 0.4, mesh.points.shape)
@@ -124,7 +124,7 @@ def test_shaken_boundary_is_put_back():
 
 
 def test_hole_is_refused():
-    mesh = tetopt.lattice(IMAGE, nodes=600)
+    mesh = tetopt.lattice_mesh(IMAGE, nodes=600)
     low, high = mesh.points.min(axis=0), mesh.points.max(axis=0)
     middle = np.linalg.norm(mesh.points[mesh.cells].mean(axis=1) - 0.5 * (low + high), axis=1).argmin()
     with pytest.raises(tetopt.InputError, match=r"turn inside out|fill 0"):

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import tetopt
-from tetopt.target.align import aligned_contrast, aligned_labels, aligned_mask, background_level, foreground
+from tetopt.target.align import background_level, foreground_mask, resample_contrast, resample_labels, resample_mask
 
 SHAPE, OTHER = (7, 9, 6), (8, 6, 7)
 
@@ -86,21 +86,21 @@ def test_nearest_is_its_twin(which):
     image, labels = pair(which, lambda rng: rng.integers(1, 9, OTHER))
     expected = nearest_twin(labels, image)
     assert 0 < np.count_nonzero(expected == 0) < expected.size  # both inside and outside are tried
-    aligned = aligned_labels(labels, image, "l")
+    aligned = resample_labels(labels, image, "l")
     np.testing.assert_array_equal(aligned.data, expected)
     np.testing.assert_array_equal(aligned.affine, image.affine)
     mask = tetopt.Image(255 * (labels.data > 4), labels.affine)
-    aligned = aligned_mask(mask, image, "m")
+    aligned = resample_mask(mask, image, "m")
     np.testing.assert_array_equal(aligned.data, nearest_twin(mask, image) / 255)
     np.testing.assert_array_equal(aligned.affine, image.affine)
     chance = tetopt.Image(labels.data / 16, labels.affine)
-    np.testing.assert_array_equal(aligned_mask(chance, image, "m").data, nearest_twin(chance, image))
+    np.testing.assert_array_equal(resample_mask(chance, image, "m").data, nearest_twin(chance, image))
 
 
 @pytest.mark.parametrize("which", PAIRS)
 def test_linear_is_its_twin(which):
     image, other = pair(which, lambda rng: rng.normal(size=OTHER).astype(np.float32))
-    aligned = aligned_contrast(other, image, "c")
+    aligned = resample_contrast(other, image, "c")
     np.testing.assert_allclose(aligned.data, linear_twin(other, image), atol=1e-6)
     np.testing.assert_array_equal(aligned.affine, image.affine)
 
@@ -114,7 +114,7 @@ def test_linear_fields_survive_any_affine():
     other = tetopt.Image(other.to_world(grid) @ gradient, other.affine)
     image = tetopt.Image(np.zeros(SHAPE), image_affine)
     expected = image.to_world(np.moveaxis(np.indices(SHAPE), 0, -1)) @ gradient
-    np.testing.assert_allclose(aligned_contrast(other, image, "c").data, expected, atol=1e-5)
+    np.testing.assert_allclose(resample_contrast(other, image, "c").data, expected, atol=1e-5)
 
 
 def _translation(*shift):
@@ -128,12 +128,12 @@ def test_same_grid_is_taken_as_it_is():
     image = tetopt.Image(np.zeros(SHAPE), affine)
     data = rng.normal(size=SHAPE).astype(np.float32)
     near = tetopt.Image(data, affine @ _translation(9e-5, 0, 0))
-    np.testing.assert_array_equal(aligned_contrast(near, image, "c").data, data)
-    np.testing.assert_array_equal(aligned_contrast(near, image, "c").affine, affine)
+    np.testing.assert_array_equal(resample_contrast(near, image, "c").data, data)
+    np.testing.assert_array_equal(resample_contrast(near, image, "c").affine, affine)
     far = tetopt.Image(data, affine @ _translation(2e-3, 0, 0))
-    assert 1e-4 < np.abs(aligned_contrast(far, image, "c").data - data).max() < 2e-2
+    assert 1e-4 < np.abs(resample_contrast(far, image, "c").data - data).max() < 2e-2
     shape_only = tetopt.Image(np.arange(1, 1 + np.prod(SHAPE)).reshape(SHAPE), affine @ _translation(0, 2, 0))
-    moved = aligned_labels(shape_only, image, "l").data
+    moved = resample_labels(shape_only, image, "l").data
     np.testing.assert_array_equal(moved[:, 2:], shape_only.data[:, :-2])
     np.testing.assert_array_equal(moved[:, :2], 0)
 
@@ -146,7 +146,7 @@ def test_grid_shifted_by_half_a_voxel(spacing, sign):
     affine[:3, 3] = 17.3
     image = tetopt.Image(np.zeros((40, 3, 3)), affine)
     labels = tetopt.Image(np.arange(1, 361).reshape(40, 3, 3), affine @ _translation(-0.5 * sign, 0, 0))
-    aligned = aligned_labels(labels, image, "l").data
+    aligned = resample_labels(labels, image, "l").data
     if sign > 0:  # index i + 1/2: the upper is i + 1, the last is on the upper face, outside
         np.testing.assert_array_equal(aligned[:-1], labels.data[1:])
         np.testing.assert_array_equal(aligned[-1], 0)
@@ -159,11 +159,11 @@ def test_cropped_and_finer_masks():
     crop = tetopt.Image(np.ones((2, 3, 1)), image.affine @ _translation(1, 2, 5))
     expected = np.zeros(image.shape)
     expected[1:3, 2:5, 5] = 1
-    aligned = aligned_mask(crop, image, "m").data
+    aligned = resample_mask(crop, image, "m").data
     np.testing.assert_array_equal(aligned, expected)
     fine = tetopt.Image(expected.repeat(3, 0).repeat(3, 1).repeat(3, 2), np.diag([2 / 3] * 3 + [1.0]))
     fine = tetopt.Image(fine.data, fine.affine @ _translation(-1, -1, -1))
-    np.testing.assert_array_equal(aligned_mask(fine, image, "m").data, expected)
+    np.testing.assert_array_equal(resample_mask(fine, image, "m").data, expected)
 
 
 def test_two_dimensions():
@@ -173,8 +173,8 @@ def test_two_dimensions():
     other = tetopt.Image(rng.integers(1, 5, (6, 5)), affine)
     expected = nearest_twin(other, image)
     assert 0 < (expected == 0).sum() < expected.size
-    np.testing.assert_array_equal(aligned_labels(other, image, "l").data, expected)
-    np.testing.assert_allclose(aligned_contrast(other, image, "c").data, linear_twin(other, image), atol=1e-6)
+    np.testing.assert_array_equal(resample_labels(other, image, "l").data, expected)
+    np.testing.assert_allclose(resample_contrast(other, image, "c").data, linear_twin(other, image), atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -190,10 +190,10 @@ def test_two_dimensions():
 )
 def test_what_a_mask_may_hold(values, expected):
     mask = tetopt.Image(values)
-    aligned = aligned_mask(mask, tetopt.Image(np.zeros(mask.shape)), "m")
+    aligned = resample_mask(mask, tetopt.Image(np.zeros(mask.shape)), "m")
     np.testing.assert_array_equal(aligned.data, expected)
     assert aligned.data.dtype == np.float32
-    doubles = aligned_mask(tetopt.Image([[0.1, 0.7]]), tetopt.Image(np.zeros((1, 2))), "m").data
+    doubles = resample_mask(tetopt.Image([[0.1, 0.7]]), tetopt.Image(np.zeros((1, 2))), "m").data
     assert doubles.dtype == np.float32
 
 
@@ -201,9 +201,9 @@ def test_masks_that_are_none():
     image = tetopt.Image(np.zeros((4, 3, 2)), np.diag([2.0, 1.0, 1.0, 1.0]))
 
     def said(data, affine=image.affine):
-        return message(aligned_mask, "m.nii", tetopt.Image(data, affine), image)
+        return message(resample_mask, "m.nii", tetopt.Image(data, affine), image)
 
-    assert message(aligned_mask, "m.nii", tetopt.Image(np.ones((4, 3))), image) == (
+    assert message(resample_mask, "m.nii", tetopt.Image(np.ones((4, 3))), image) == (
         "m.nii: expected 3 axes like the image's (4, 3, 2), got shape (4, 3); pick one volume or slice"
     )
     labels = np.arange(24).reshape(4, 3, 2)
@@ -231,7 +231,7 @@ def test_labels_that_are_none():
     image = tetopt.Image(np.zeros((4, 3, 2)))
 
     def said(data, affine=None):
-        return message(aligned_labels, "l.nrrd", tetopt.Image(data, affine), image)
+        return message(resample_labels, "l.nrrd", tetopt.Image(data, affine), image)
 
     labels = np.arange(24).reshape(4, 3, 2)
     assert said(labels[0]) == (
@@ -252,22 +252,22 @@ def test_labels_that_are_none():
 
 def test_label_files_of_floats():
     labels = tetopt.Image(np.array([[0.0, 32_767.0], [2.0, 1.0]], dtype=np.float64))
-    np.testing.assert_array_equal(aligned_labels(labels, tetopt.Image(np.zeros((2, 2))), "l").data, labels.data)
+    np.testing.assert_array_equal(resample_labels(labels, tetopt.Image(np.zeros((2, 2))), "l").data, labels.data)
     # One value in its own box, but a box smaller than the image: label and background.
     crop = tetopt.Image([[4.0]])
-    np.testing.assert_array_equal(aligned_labels(crop, tetopt.Image(np.zeros((1, 2))), "l").data, [[4, 0]])
+    np.testing.assert_array_equal(resample_labels(crop, tetopt.Image(np.zeros((1, 2))), "l").data, [[4, 0]])
 
 
 def test_a_contrast_covers_half_of_the_image():
     image = tetopt.Image(np.zeros((4, 3, 2)))
     other = np.arange(24.0).reshape(4, 3, 2)
-    aligned = aligned_contrast(tetopt.Image(other, _translation(2, 0, 0)), image, "t2").data
+    aligned = resample_contrast(tetopt.Image(other, _translation(2, 0, 0)), image, "t2").data
     np.testing.assert_array_equal(aligned, other[[0, 0, 0, 1]])  # the border goes on
-    assert message(aligned_contrast, "t2", tetopt.Image(other, _translation(3, 0, 0)), image) == (
+    assert message(resample_contrast, "t2", tetopt.Image(other, _translation(3, 0, 0)), image) == (
         "t2: expected to cover half of the image's voxels or more, got 25.0 %; it spans 2.5..6.5 x -0.5..2.5 x "
         "-0.5..1.5 mm, the image -0.5..3.5 x -0.5..2.5 x -0.5..1.5 mm: do both lie in the same world mm?"
     )
-    assert message(aligned_contrast, "t2", tetopt.Image(other[0]), image) == (
+    assert message(resample_contrast, "t2", tetopt.Image(other[0]), image) == (
         "t2: expected 3 axes like the image's (4, 3, 2), got shape (3, 2); pick one volume or slice"
     )
 
@@ -289,20 +289,20 @@ def test_foreground_by_hand(shape):
     pocket[(-1, 15, *[14] * (n - 2))] = True
     bright = (body | piece | speck) & ~ball(shape, 4) & ~pocket
     image = tetopt.Image(np.where(bright, 50.0, 3.0), np.diag([2.0] * n + [1.0]))
-    front = foreground(image, 3.0)
+    front = foreground_mask(image, 3.0)
     np.testing.assert_array_equal(front.data, body | piece)
     np.testing.assert_array_equal(front.affine, image.affine)
-    np.testing.assert_array_equal(foreground(image).data, body | piece)
+    np.testing.assert_array_equal(foreground_mask(image).data, body | piece)
     assert background_level(image) == 3.0
     # A channel to the cavity: face neighbours leak, voxels that touch in an edge do not.
     channel = image.data.copy()
     middle = tuple((s - 1) // 2 for s in shape)
     channel[(slice(0, middle[0]), *middle[1:])] = 3.0
-    leaking = foreground(tetopt.Image(channel), 3.0).data
+    leaking = foreground_mask(tetopt.Image(channel), 3.0).data
     np.testing.assert_array_equal(leaking, (body | piece) & ~ball(shape, 4) & (channel > 3.0) | pocket)
     assert leaking[middle] == 0
     diagonal = tetopt.Image([[9.0, 9, 9, 9], [9, 9, 9, 9], [9, 9, 1, 9], [9, 9, 9, 1]])
-    np.testing.assert_array_equal(foreground(diagonal, 1.0).data == 0, np.diag([0, 0, 0, 1]))
+    np.testing.assert_array_equal(foreground_mask(diagonal, 1.0).data == 0, np.diag([0, 0, 0, 1]))
 
 
 @pytest.mark.parametrize("air", [-1000.0, 0.0, 20.0])
@@ -316,7 +316,7 @@ def test_level_of_noisy_air(air):
         data[0, start : start + 5] = air + 150.0  # all three 6 % of the dark voxels on the faces
     image = tetopt.Image(data)
     assert background_level(image) == pytest.approx(air + 42.0, abs=4.0)
-    np.testing.assert_array_equal(foreground(image).data, body)
+    np.testing.assert_array_equal(foreground_mask(image).data, body)
 
 
 def test_background_of_one_value_is_exact():
@@ -325,7 +325,7 @@ def test_background_of_one_value_is_exact():
     body = ball(data.shape, 7)
     data[body] = np.random.default_rng(2).uniform(1e-3, 100.0, body.sum())
     assert background_level(tetopt.Image(data)) == 0.0
-    np.testing.assert_array_equal(foreground(tetopt.Image(data)).data, body)
+    np.testing.assert_array_equal(foreground_mask(tetopt.Image(data)).data, body)
 
 
 def test_images_without_background():
@@ -342,15 +342,15 @@ def test_images_without_background():
         (np.where(np.arange(8000).reshape(20, 20, 20) == 0, 0.0, 9.0), r"99\.99 % of the voxels would be foreground"),
         (np.where(np.arange(8000).reshape(20, 20, 20) == 3790, 9.0, 0.0), r"0\.0125 % of the voxels would be foreg"),
     ):
-        assert re.search(auto + words + ".*" + todo, message(foreground, tetopt.Image(image)))
+        assert re.search(auto + words + ".*" + todo, message(foreground_mask, tetopt.Image(image)))
 
 
 def test_levels_that_leave_nothing():
     image = tetopt.Image(np.where(ball((20, 20), 5), 90.0, 10.0))
     todo = "; give a level between the background's and the tissue's values, the image holds 10 to 90"
-    assert message(foreground, image, 5) == "--background 5: every voxel is foreground" + todo
-    assert message(foreground, image, 90) == "--background 90: nothing is left" + todo
+    assert message(foreground_mask, image, 5) == "--background 5: every voxel is foreground" + todo
+    assert message(foreground_mask, image, 90) == "--background 90: nothing is left" + todo
     # A level given is taken at its word, however little it leaves.
     data = np.zeros((40, 40))
     data[20, 20] = 1.0
-    np.testing.assert_array_equal(foreground(tetopt.Image(data), 0.0).data, data)
+    np.testing.assert_array_equal(foreground_mask(tetopt.Image(data), 0.0).data, data)

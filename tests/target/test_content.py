@@ -102,7 +102,7 @@ def test_sums_of_a_rare_label():
     target = content(noise, labels=image, weights=[0.1])
     square = (target.values.astype(np.float64) ** 2).sum(axis=0)
     assert square.sum(axis=-1).max() > 2**31
-    prefix = channel_grid(target, tetopt.lattice(image, blocks=(1, 1, 1)).points).prefix
+    prefix = channel_grid(target, tetopt.lattice_mesh(image, blocks=(1, 1, 1)).points).prefix
     np.testing.assert_array_equal(np.diff(prefix[..., 1], axis=2), square)
 
 
@@ -116,7 +116,7 @@ def test_sums_of_channels(n):
     mask[2:9, 2:10] = 1.0
     whole_box = content(images, mask=tetopt.Image(mask))._replace(region=None)
     region = content(images, mask=tetopt.Image(mask)).region
-    mesh = tetopt.lattice(whole_box.image, nodes=120)
+    mesh = tetopt.lattice_mesh(whole_box.image, nodes=120)
     for target in (whole_box, whole_box._replace(region=region)):
         grid_ = channel_grid(target, mesh.points)
         sums = moment_sums(grid_, to_ticks(whole_box.image.to_index(mesh.points), grid_), mesh.cells)

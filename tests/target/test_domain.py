@@ -70,7 +70,7 @@ def test_fractions_have_their_own_surface():
 def test_all_inside_has_no_surface():
     image = tetopt.Image(np.ones((6, 7, 8)))
     region = region_of(image)
-    mesh = tetopt.lattice(image, nodes=100)
+    mesh = tetopt.lattice_mesh(image, nodes=100)
     assert clipped(mesh, image, region).cells.tolist() == mesh.cells.tolist()
 
 
@@ -99,7 +99,7 @@ def test_the_way_onto_the_surface_is_the_shortest_in_mm(n):
 
 def test_nodes_on_the_box_stay_on_it():
     image, mask = shaped("touching")
-    mesh = clipped(tetopt.lattice(image, nodes=900), image, region_of(mask))
+    mesh = clipped(tetopt.lattice_mesh(image, nodes=900), image, region_of(mask))
     index = image.to_index(mesh.points)
     assert (index >= -0.5).all()
     assert (index[:, 0] == -0.5).sum() > 20
@@ -133,7 +133,7 @@ def test_too_thin_for_its_cells():
     mask = np.zeros((30, 30, 30))
     mask[15, 15, 15] = 1.0
     image = tetopt.Image(mask)
-    mesh = tetopt.lattice(image, blocks=(1, 1, 1))
+    mesh = tetopt.lattice_mesh(image, blocks=(1, 1, 1))
     moved = tetopt.Mesh(mesh.points + np.where(mesh.points == 14.5, 3.0, 0.0), mesh.cells)
     with pytest.raises(tetopt.InputError, match="thinner than the cells, none is left inside; ask for more nodes"):
         clipped(moved, image, region_of(image))

@@ -40,7 +40,7 @@ from tetopt.model.fields import cell_fields, is_result, is_stress
 from tetopt.model.file import MATERIAL_FIELDS, TEXTS_KEPT, MeshFile
 from tetopt.model.sets import Sets, box_of, box_text, merged_sets
 from tetopt.report.summary import model_summary, versions
-from tetopt.target.align import aligned_mask
+from tetopt.target.align import resample_mask
 from tetopt.target.content import continued
 
 
@@ -167,4 +167,4 @@ def _images(path: Path, mask_path: Path | None, part: ImagePart, ndim: int) -> t
     whole, beside = image_and_others(path, part)
     if whole.ndim != ndim:
         raise InputError(f"{path}: expected a {ndim}-D image, as the mesh is, got a {whole.ndim}-D one")
-    return whole, continued(whole, None if mask_path is None else beside(mask_path, aligned_mask))
+    return whole, continued(whole, None if mask_path is None else beside(mask_path, resample_mask))

@@ -177,10 +177,10 @@ def _model(loaded: MeshFile, image: Image | None, options: ModelOptions) -> Mode
 def _solved(model: Model, is_conditioned: bool) -> tuple[list[Solution], Conditioning | None]:
     """Each step solved, and the conditioning of the first, if it is to be known."""
     from tetopt.fem.conditioning import conditioning
-    from tetopt.fem.solution import solved_model
+    from tetopt.fem.solution import solve
 
     try:
-        solutions = [solved_model(model, step) for step in range(1, count_of_steps(model.loads) + 1)]
+        solutions = [solve(model, step) for step in range(1, count_of_steps(model.loads) + 1)]
         return solutions, conditioning(solutions[0].system) if is_conditioned else None
     except RuntimeError as error:
         raise InputError(f"{error}; the moduli differ too much, or nu is too near 0.5, for this mesh") from error

@@ -17,7 +17,7 @@ from tetopt.check import manifold_problems
 from tetopt.cli.console import out, print_fidelity, show_error, show_warning
 from tetopt.cli.options import NumberOptions, option
 from tetopt.energy.sampling import Overlap, overlap_of
-from tetopt.engine.loop import Optimized
+from tetopt.engine.loop import MeshingResult
 from tetopt.incoming import json_of
 from tetopt.io.files import save_json
 from tetopt.job.advice import tell_violated
@@ -111,7 +111,7 @@ def _source(loaded: MeshFile, image: Path, mask: Path | None, labels: Path | Non
     return read_source(options)
 
 
-def _measured(loaded: MeshFile, source: Source) -> tuple[Fit, Optimized, dict[str, Any]]:
+def _measured(loaded: MeshFile, source: Source) -> tuple[Fit, MeshingResult, dict[str, Any]]:
     """How well the cells fit the image; the mesh as the result of a run; how well mask, labels and image are met."""
     mesh, of_cell = loaded.mesh, loaded.cell_data.get("label")
     fit = image_fit(source.image, mesh)

@@ -17,7 +17,7 @@ from tetopt.budget import memory_words, resident_bytes
 from tetopt.cli.console import log, show_event
 from tetopt.cli.ending import is_ended
 from tetopt.cluster.crew import counted
-from tetopt.engine.loop import Record
+from tetopt.engine.loop import IterationRecord
 from tetopt.job.events import Event, Stage
 from tetopt.job.in_parts import PartsProgress
 
@@ -35,7 +35,7 @@ class Display:
         self._shown = ExitStack()
         self._tell: Callable[[Event], None] = lambda event: None
         self._begin = 0.0
-        self._rows: list[Record] = []
+        self._rows: list[IterationRecord] = []
         self._say = rare_lines()
 
     def __enter__(self) -> Display:
@@ -144,11 +144,11 @@ def _spent(seconds: float) -> str:
 
 
 @contextlib.contextmanager
-def _bar(iterations: int) -> Iterator[Callable[[Record], None]]:
+def _bar(iterations: int) -> Iterator[Callable[[IterationRecord], None]]:
     """A function that shows each record: a bar with the remaining time on a terminal, else a line."""
-    first: list[Record] = []
+    first: list[IterationRecord] = []
 
-    def words(row: Record) -> str:
+    def words(row: IterationRecord) -> str:
         first.append(row)
         E_D = f"  E_D {row.E_D / first[0].E_D:.4f}" if first[0].E_D > 0.0 else ""
         return f"E {row.E:.4f}  E_G {row.E_G / first[0].E_G:.4f}{E_D}"

@@ -32,14 +32,14 @@ def segment_command(
     numbers: NumberOptions,
 ) -> int:
     """Segment an image by its mesh, fast and roughly: cells grouped by mean into K classes, painted to the voxels."""
-    from tetopt.measure.segmentation import dice, segmented, stands_for, thresholded
+    from tetopt.measure.segmentation import dice, segment, stands_for, thresholded
 
     output = checked_output(output, (".nii", ".nii.gz"), numbers.force)
     json_path = numbers.checked()
     image = read_image(image_path, part)
     truth = None if truth_path is None else read_labels(truth_path, image, part)
     mesh = _mesh_over(mesh_path, image, image_path)
-    labels = segmented(image, mesh, classes)
+    labels = segment(image, mesh, classes)
     shares = np.bincount(labels.data.astype(np.int64).ravel(), minlength=classes) / labels.data.size
     means = [float(image.data[labels.data == number].mean()) if share else None for number, share in enumerate(shares)]
     report: dict[str, Any] = {

@@ -15,7 +15,7 @@ from tetopt.cli.console import log, out, show_error, show_warning
 from tetopt.cli.options import MeshArgument, NumberOptions, SurfacePart, option
 from tetopt.geometry.manifold import OUTSIDE_LABEL, LabelSurfaces, label_surfaces, surface_ridges
 from tetopt.geometry.simplex import volumes
-from tetopt.geometry.surface import Surface, surface_of
+from tetopt.geometry.surface import Surface, extract_surface
 from tetopt.geometry.topology import facets, largest_component
 from tetopt.io.files import checked_output, save_json
 from tetopt.io.surfaces import LABELLED_SUFFIXES, SURFACE_SUFFIXES, SurfaceCheck, checked_surface, save_surface
@@ -78,7 +78,7 @@ def _write_closed(
         chosen = _with_label(loaded, path, labels_named(part.label, names), names)
     else:
         chosen = _chosen(loaded, path, part)
-    surface = surface_of(loaded.mesh.points, loaded.mesh.cells, chosen)
+    surface = extract_surface(loaded.mesh.points, loaded.mesh.cells, chosen)
     save_surface(output, surface, path.name, part.space)
     written = checked_surface(output)
     table = new_table("", escape(output.name))

@@ -59,7 +59,7 @@ def E_D(image: Image, mesh: Mesh) -> float:
     Examples
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> mesh = tetopt.lattice_mesh(image, nodes=300)
     >>> whole = float(image.data.var()) * image.volume  # what one cell for all would have
     >>> print(f"{tetopt.E_D(image, mesh) / whole:.2f}")
     0.07

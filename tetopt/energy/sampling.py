@@ -76,7 +76,7 @@ class CellMoments(NamedTuple):
     Examples
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> mesh = tetopt.lattice_mesh(image, nodes=300)
     >>> moments = tetopt.cell_moments(image, mesh)
     >>> energy = image.voxel_volume * float((moments.n_voxels * moments.variance).sum())
     >>> bool(np.isclose(energy, tetopt.E_D(image, mesh)))
@@ -115,7 +115,7 @@ def cell_moments(image: Image, mesh: Mesh) -> CellMoments:
     Examples
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> mesh = tetopt.lattice_mesh(image, nodes=300)
     >>> moments = tetopt.cell_moments(image, mesh)
     >>> int(moments.n_voxels.sum()) == image.data.size  # each voxel is in one cell
     True
@@ -195,7 +195,7 @@ def cell_of_voxel(image: Image, mesh: Mesh) -> NDArray[np.int64]:
     Examples
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> mesh = tetopt.lattice_mesh(image, nodes=300)
     >>> cell = tetopt.cell_of_voxel(image, mesh)
     >>> painted = tetopt.Image(tetopt.cell_moments(image, mesh).mean[cell], image.affine)
     >>> painted.shape

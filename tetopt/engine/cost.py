@@ -108,11 +108,11 @@ def calibration() -> float:
 
     from tetopt.energy.sampling import cell_moments
     from tetopt.image import Image
-    from tetopt.start.lattice import lattice
+    from tetopt.start.lattice import lattice_mesh
 
     voxels = np.arange(CALIBRATION_VOXELS**3, dtype=np.int64).reshape((CALIBRATION_VOXELS,) * 3)
     image = Image((voxels * voxels % 1009).astype(np.float32))  # as irregular as an image is
-    mesh = lattice(image, nodes=CALIBRATION_NODES)
+    mesh = lattice_mesh(image, nodes=CALIBRATION_NODES)
     threads, seconds = numba.get_num_threads(), []
     numba.set_num_threads(1)
     try:

@@ -28,8 +28,8 @@ from tetopt.engine.loop import (
     UNIFORM_ITERATIONS,
     UNIFORM_K_D,
     Boundary,
-    Optimized,
-    Record,
+    IterationRecord,
+    MeshingResult,
     Whole,
     deadline,
     relative_movement,
@@ -46,7 +46,7 @@ from tetopt.kernels import link, roots
 from tetopt.mesh import Mesh
 from tetopt.notebook import with_bar
 from tetopt.start.carve import carved
-from tetopt.start.lattice import lattice
+from tetopt.start.lattice import lattice_mesh
 from tetopt.start.sizes import Sizes
 from tetopt.target.content import Content, plain
 from tetopt.target.content import content as make_content
@@ -80,9 +80,9 @@ def optimize(
     sizes: Sizes | None = None,
     tolerance: float = 5e-4,
     max_seconds: float | None = None,
-    callback: Callable[[Record], None] | None = None,
+    callback: Callable[[IterationRecord], None] | None = None,
     stop: Callable[[], bool] | None = None,
-) -> Optimized:
+) -> MeshingResult:
     """Move the nodes of a mesh, and connect them anew, to lower E.
 
     E = (1 - k_D) E_G + k_D E_D is Eq. (4), with each energy over its value on the initial mesh.
@@ -109,7 +109,7 @@ def optimize(
         surface they are taken to lie on, slide on that; or the boundary stays as it is, node for node and facet for
         facet, to the last bit.
     nodes : int, optional
-        Put nodes where they lower E most, towards this number of them: on a graded mesh, such as `octree`. Every
+        Put nodes where they lower E most, towards this number of them: on a graded mesh, such as `octree_mesh`. Every
         cell's shape then counts the same, whatever its size (see `tetopt.engine.complex.shape_energy`), and nodes
         are exchanged in the first iterations, if k_D > 0 or `sizes` have a target. An exchange doubles them at most, so
         that few iterations, or a number far from that of `mesh`, may miss it; count them. By default the nodes of
@@ -122,14 +122,14 @@ def optimize(
         Stop at the next colour of nodes after this time; the mesh is valid, and its floor is seen to, which, like the
         flips of an iteration, takes its time besides.
     callback : callable, optional
-        Called with each `Record`; without one a notebook shows a bar. Its E_G is the weighted one, its
+        Called with each `IterationRecord`; without one a notebook shows a bar. Its E_G is the weighted one, its
         `is_retessellated` whether cells were exchanged.
     stop : callable, optional
         Asked between colours of nodes; True ends the run there.
 
     Returns
     -------
-    Optimized
+    MeshingResult
         Mesh, history, why it ended, and in `missed` which of its promises it does not keep (`tetopt.engine.promises`):
         a floor that cells are under, voxels in two cells, a mask or labels that cells are too large for. The mesh
         covers the same domain, every cell is positively oriented. E never rises from one record to the next, unless
@@ -150,7 +150,7 @@ def optimize(
     Examples
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> mesh = tetopt.lattice_mesh(image, nodes=300)
     >>> result = tetopt.optimize(image, mesh, k_D=0.5, iterations=5)
     >>> print(f"E_D falls to {tetopt.E_D(image, result.mesh) / tetopt.E_D(image, mesh):.0%}")
     E_D falls to 10%
@@ -173,7 +173,7 @@ def optimize(
         run.mend_surfaces(False, floor)
     if ended == "over":
         ended = "stopped" if stop is not None and stop() else "max_seconds"
-    result = Optimized(run.mesh(), history, ended, labels=run.labels(), n_dropped=run.n_dropped)
+    result = MeshingResult(run.mesh(), history, ended, labels=run.labels(), n_dropped=run.n_dropped)
     return promised(result, content, floor, mesh)
 
 
@@ -192,10 +192,14 @@ class Course(NamedTuple):
 
 
 def followed(
-    run: Run, course: Course, is_over: Callable[[], bool], begin: float, callback: Callable[[Record], None] | None
-) -> tuple[list[Record], str]:
+    run: Run,
+    course: Course,
+    is_over: Callable[[], bool],
+    begin: float,
+    callback: Callable[[IterationRecord], None] | None,
+) -> tuple[list[IterationRecord], str]:
     """Do the iterations of a course; the records, and why it ended: "iterations", "converged" or "over"."""
-    history: list[Record] = []
+    history: list[IterationRecord] = []
     floor, nodes = course.floor, course.nodes
 
     def record(iteration: int, movement: float, is_changed: bool) -> None:
@@ -264,7 +268,7 @@ def prepare_kernels(
     is_whole = not content.is_plain or np.array_equal(np.rint(image.data), image.data)
     step = 1.0 if is_whole else 0.1
     tiny = Image(np.zeros((3,) * image.ndim) + step * np.arange(3))
-    mesh = lattice(tiny, blocks=(1,) * image.ndim)
+    mesh = lattice_mesh(tiny, blocks=(1,) * image.ndim)
     if has_labels:
         halves = Image((np.arange(3) > 0) * np.ones(tiny.shape))
         optimize(make_content(tiny, halves), mesh, k_D=k_D, iterations=1)
@@ -494,14 +498,14 @@ class Run:
         """How far the nodes are from where they were, `before` (N, 3) in ticks; see `relative_movement`."""
         return relative_movement(before, self.state.complex.ticks, self.image, self.grid, self.state.objective.matrix)
 
-    def record(self, iteration: int, movement: float, is_changed: bool, seconds: float) -> Record:
+    def record(self, iteration: int, movement: float, is_changed: bool, seconds: float) -> IterationRecord:
         """The row of the history that tells how things stand."""
         if self.state.objective.image == 0.0:  # the moves have left the sums alone
             remeasure(self.state)
         E_G, squares = content_energies(self.state, self.content, len(self.content.values))
         n_voxels = int(self.state.complex.sums[: self.n_cells, 0].sum())
         E_D = squares * self.content.unit * self.image.voxel_volume
-        return Record(iteration, self.E(), E_G, E_D, movement, is_changed, self.n_cells, n_voxels, seconds)
+        return IterationRecord(iteration, self.E(), E_G, E_D, movement, is_changed, self.n_cells, n_voxels, seconds)
 
     def labels(self) -> NDArray[np.int64] | None:
         """The label of each cell, (M,), if they have any."""

@@ -37,7 +37,7 @@ E_D_ROUNDING = 1e-12  # of the image's own variance x volume: less E_D than this
 Boundary = Literal["slide", "fixed"]
 
 
-class Record(NamedTuple):
+class IterationRecord(NamedTuple):
     """One row of the history; row 0 is the initial mesh.
 
     Parameters
@@ -64,7 +64,7 @@ class Record(NamedTuple):
     Examples
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> mesh = tetopt.lattice_mesh(image, nodes=300)
     >>> result = tetopt.optimize(image, mesh, k_D=0.5, iterations=3)
     >>> [f"{record.iteration}: {record.E:.2f}" for record in result.history]
     ['0: 1.00', '1: 0.68', '2: 0.61', '3: 0.58']
@@ -92,7 +92,7 @@ class Whole(NamedTuple):
     noise: float  # variance of the image's noise, likewise
 
 
-class Optimized(NamedTuple):
+class MeshingResult(NamedTuple):
     """What `optimize` returns, and, with all fields, `mesh_image`.
 
     Parameters
@@ -131,7 +131,7 @@ class Optimized(NamedTuple):
     """
 
     mesh: Mesh
-    history: list[Record]
+    history: list[IterationRecord]
     ended: str
     initial: Mesh | None = None
     nodes: int | None = None
@@ -186,7 +186,7 @@ class Optimized(NamedTuple):
             *notebook.mesh_rows(mesh.points, mesh.cells),
             *(("misses", f"{name}: {words}") for name, words in self.missed.items()),
         ]
-        return notebook.card_html("Optimized", rows, notebook.section_html(mesh.points, mesh.cells))
+        return notebook.card_html("MeshingResult", rows, notebook.section_html(mesh.points, mesh.cells))
 
 
 def deadline(begin: float, max_seconds: float | None, stop: Callable[[], bool] | None) -> Callable[[], bool]:

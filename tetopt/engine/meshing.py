@@ -27,7 +27,7 @@ from tetopt.engine.loop import (
     START_K_D,
     UNIFORM_ITERATIONS,
     UNIFORM_K_D,
-    Optimized,
+    MeshingResult,
 )
 from tetopt.engine.paper import optimize_paper
 from tetopt.engine.promises import requested
@@ -37,12 +37,12 @@ from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.start.carve import carved, part_of
 from tetopt.start.clip import lattice_within
-from tetopt.start.octree import is_near, nearest_octree, nodes_of_sizes, octree
+from tetopt.start.octree import is_near, nearest_octree, nodes_of_sizes, octree_mesh
 from tetopt.start.sizes import Sizes
 from tetopt.target.content import Content, StoredContent, plain
 
 Mode = Literal["graded", "uniform", "paper", "start"]
-Run = Callable[..., Optimized]  # an optimisation that is ready to begin; takes further options of `optimize`
+Run = Callable[..., MeshingResult]  # an optimisation that is ready to begin; takes further options of `optimize`
 
 MODE_DEFAULTS: dict[Mode, tuple[float, int]] = {  # k_D and iterations
     "graded": (GRADED_K_D, GRADED_ITERATIONS),
@@ -79,9 +79,9 @@ def mesh_image(
     iterations: int | None = None,
     sizes: Sizes | None = None,
     order: int = 1,
-    watch: Callable[[Mesh, Run], Optimized] | None = None,
+    watch: Callable[[Mesh, Run], MeshingResult] | None = None,
     **options: Any,
-) -> Optimized:
+) -> MeshingResult:
     """A mesh of the image's box with its nodes where the image has content; or a uniform one, or yours made better.
 
     Parameters
@@ -98,15 +98,15 @@ def mesh_image(
         as many nodes as that takes, found in a few runs, each with its own `max_seconds`. A run that ends above it
         says so in `missed`.
     mode : {"graded", "uniform", "paper", "start"}
-        "graded", the default: `octree`, then `optimize` with exchanges of nodes. "uniform": `lattice`, cut off at a
-        mask, then `optimize`. "paper": `lattice`, then `optimize_paper`; of one image and its whole box. "start", the
+        "graded", the default: `octree_mesh`, then `optimize` with exchanges of nodes. "uniform": `lattice_mesh`, cut
+        off at a mask, then `optimize`. "paper": `lattice_mesh`, then `optimize_paper`; of one image and its whole box. "start", the
         default with a mesh to start from: `optimize` of that.
     start : Mesh
         The mesh to improve. Its boundary stays as it is, unless `boundary="slide"`.
     spacing : float
         Instead of `nodes`, of a lattice: edge length of a block, mm.
     kind : str
-        Of the lattice, as of `tetopt.lattice`.
+        Of the lattice, as of `tetopt.lattice_mesh`.
     k_D : float
         Weight of the image; by default 0.85 on a graded mesh, 0.2 on a uniform one, 0.02 on one to start from. On a
         graded mesh cells of all sizes share the shape energy, and the octree that normalises E_D has a small one
@@ -127,7 +127,7 @@ def mesh_image(
 
     Returns
     -------
-    Optimized
+    MeshingResult
         As `optimize`; its first record is of the initial mesh, which it holds, too. A run that could not keep all that
         it promises returns its mesh nevertheless, and says so in `missed`: empty if it did, else a sentence by name
         (`floor`, `box`, `cover`, `overlap`, `mask`, `labels`, `error`; see `tetopt.engine.promises`).
@@ -136,15 +136,15 @@ def mesh_image(
     ------
     InputError
         As `optimize` or `optimize_paper`; options that do not belong to the mode; neither or both of `nodes` and
-        `target_error`, or `spacing`; a number of nodes that the image is not worth (see `octree`), or that there is no
-        memory for; an error that its noise does not allow.
+        `target_error`, or `spacing`; a number of nodes that the image is not worth (see `octree_mesh`), or that there is
+        no memory for; an error that its noise does not allow.
     TypeError
         An option of another name.
 
     See Also
     --------
     content : Several contrasts, labels and a mask.
-    save_mesh, model_of : What follows.
+    save_mesh, build_model : What follows.
 
     Examples
     --------
@@ -163,7 +163,7 @@ def mesh_image(
 
     A mesh of yours, made better:
 
-    >>> result = tetopt.mesh_image(image, start=tetopt.lattice(image, nodes=300), iterations=3)
+    >>> result = tetopt.mesh_image(image, start=tetopt.lattice_mesh(image, nodes=300), iterations=3)
     >>> result.history[-1].E < 1
     True
     """
@@ -183,11 +183,11 @@ def mesh_image(
         sizes = sizes_of_order(content, nodes, sizes, order)
     seconds: list[float] = []
 
-    def run(initial: Mesh, nodes: int | None) -> Optimized:
+    def run(initial: Mesh, nodes: int | None) -> MeshingResult:
         initial, n_dropped = (initial, 0) if mode == "start" else _carved(initial, content)
         check_memory_of(content, max(nodes or 0, len(initial.points)))
 
-        def optimized(**more: Any) -> Optimized:
+        def optimized(**more: Any) -> MeshingResult:
             if mode == "paper":
                 return optimize_paper(content.image, initial, **options, **more)
             exchanged = nodes if mode == "graded" else None
@@ -198,11 +198,11 @@ def mesh_image(
         seconds.append(time.perf_counter() - begin)
         return result._replace(initial=initial, nodes=nodes, n_dropped=n_dropped + result.n_dropped)
 
-    def begun(corners: int | None) -> Optimized:
+    def begun(corners: int | None) -> MeshingResult:
         if mode == "graded":
             assert corners is not None
             # The longest edge of order 2 may leave no octree near to so few corners: exchanges take out what they can.
-            return run((octree if order == 1 else nearest_octree)(content, corners, sizes), corners)
+            return run((octree_mesh if order == 1 else nearest_octree)(content, corners, sizes), corners)
         return run(lattice_within(content.image, content.region, kind, nodes=corners, spacing=spacing), corners)
 
     begin = time.perf_counter()
@@ -302,13 +302,13 @@ def sizes_of_order(
     return sizes._replace(longest=sizes.longest_edge(content.image, corners, content.volume))
 
 
-def meshed_in_all(ndim: int, nodes: int, run: Callable[[int], Optimized]) -> Optimized:
+def meshed_in_all(ndim: int, nodes: int, run: Callable[[int], MeshingResult]) -> MeshingResult:
     """Run after run with other numbers of corners, until corners and midpoints of edges together are `nodes`.
 
     The result of the run that is nearest, or of one that was cut short.
     """
     corners, ratio = 0, QUADRATIC_NODES[ndim]
-    best: tuple[float, Optimized] | None = None
+    best: tuple[float, MeshingResult] | None = None
     for _ in range(NODE_RUNS):
         before, corners = corners, max(round(nodes / ratio), 2 ** (ndim + 1))
         if corners == before:
@@ -326,8 +326,8 @@ def meshed_in_all(ndim: int, nodes: int, run: Callable[[int], Optimized]) -> Opt
 
 
 def meshed_to_error(
-    image: Image | Content, target_error: float, sizes: Sizes | None, run: Callable[[Mesh, int], Optimized]
-) -> Optimized:
+    image: Image | Content, target_error: float, sizes: Sizes | None, run: Callable[[Mesh, int], MeshingResult]
+) -> MeshingResult:
     """Run after run with other numbers of nodes, until the share of the image's variance is just below a target.
 
     Returns the result, with the octree and the number of nodes, of the run with the fewest nodes that has the error; if
@@ -338,7 +338,7 @@ def meshed_to_error(
     Raises
     ------
     InputError
-        A share out of range, or one below that of the image's noise, which no mesh should follow; as `octree`.
+        A share out of range, or one below that of the image's noise, which no mesh should follow; as `octree_mesh`.
     """
     check_target_error(target_error)
     content = plain(image)
@@ -353,7 +353,7 @@ def meshed_to_error(
         )
     fewest = 0 if sizes is None else nodes_of_sizes(content, sizes)[0]
     nodes, shares = FIRST_NODES[content.image.ndim], dict[int, float]()  # what is left, by number of nodes
-    best: Optimized | None = None
+    best: MeshingResult | None = None
     requests: set[int] = set()
     for _ in range(ERROR_RUNS):
         nodes = max(nodes, fewest)

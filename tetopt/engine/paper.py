@@ -18,8 +18,8 @@ from tetopt.engine.loop import (
     UNIFORM_ITERATIONS,
     UNIFORM_K_D,
     Boundary,
-    Optimized,
-    Record,
+    IterationRecord,
+    MeshingResult,
     deadline,
     relative_movement,
     side_ticks,
@@ -53,9 +53,9 @@ def optimize_paper(
     step_ratio: float = 0.25,
     tolerance: float = 1e-5,
     max_seconds: float | None = None,
-    callback: Callable[[Record], None] | None = None,
+    callback: Callable[[IterationRecord], None] | None = None,
     stop: Callable[[], bool] | None = None,
-) -> Optimized:
+) -> MeshingResult:
     """Move the nodes of a mesh to lower E, by the paper's scheme.
 
     E = (1 - k_D) E_G + k_D E_D is Eq. (4), with each energy over its value on the initial mesh.
@@ -86,13 +86,13 @@ def optimize_paper(
     max_seconds : float, optional
         Stop at the next colour of nodes after this time; the mesh is valid.
     callback : callable, optional
-        Called with each `Record`.
+        Called with each `IterationRecord`.
     stop : callable, optional
         Asked between colours of nodes (several times a second on common meshes); True ends the run there.
 
     Returns
     -------
-    Optimized
+    MeshingResult
         Mesh, history and why it ended. The mesh covers the same domain and every cell is positively oriented.
         With the connectivity fixed E never rises, beyond rounding, from one record to the next.
 
@@ -109,7 +109,7 @@ def optimize_paper(
     Examples
     --------
     >>> image = tetopt.load_phantom("disc_2d").image(voxel_mm=4)
-    >>> mesh = tetopt.lattice(image, nodes=100)
+    >>> mesh = tetopt.lattice_mesh(image, nodes=100)
     >>> result = tetopt.optimize_paper(image, mesh, k_D=0.02, iterations=4)
     >>> [round(record.E, 2) for record in result.history]
     [1.0, 0.92, 0.91, 0.91, 0.91]
@@ -124,13 +124,13 @@ def optimize_paper(
     if iterations > 0 and (retessellate == "accept" or (retessellate == "first" and n_t > 0)):
         _check_fills_box(image, mesh)
     E_G0, E_D0 = _energies(state, image)
-    history: list[Record] = []
+    history: list[IterationRecord] = []
 
     def record(iteration: int, movement: float, is_new: bool) -> None:
         E_G, E_D = _energies(state, image)
         n_cells, seconds = len(_cells(state)), time.perf_counter() - begin
         E, n_voxels = combined(E_G, E_D, E_G0, E_D0, k_D), int(state.complex.sums[:n_cells, 0].sum())
-        history.append(Record(iteration, E, E_G, E_D, movement, is_new, n_cells, n_voxels, seconds))
+        history.append(IterationRecord(iteration, E, E_G, E_D, movement, is_new, n_cells, n_voxels, seconds))
         if callback is not None:
             callback(history[-1])
 
@@ -160,7 +160,7 @@ def optimize_paper(
             ended = "converged"
             break
     points = image.to_world(from_ticks(state.complex.ticks, grid, image.ndim))
-    return promised(Optimized(Mesh(points, _cells(state)), history, ended), plain(image), 0.0, mesh)
+    return promised(MeshingResult(Mesh(points, _cells(state)), history, ended), plain(image), 0.0, mesh)
 
 
 def _cells(state: State) -> NDArray[np.int64]:

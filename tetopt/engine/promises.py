@@ -13,7 +13,7 @@ import numpy as np
 
 from tetopt.check import beyond_box, manifold_problems
 from tetopt.energy.sampling import cell_of_voxel
-from tetopt.engine.loop import Optimized
+from tetopt.engine.loop import MeshingResult
 from tetopt.errors import InputError
 from tetopt.geometry.box import ON_SIDE_VOXELS
 from tetopt.geometry.simplex import dihedral_angles, volumes
@@ -31,12 +31,12 @@ BEYOND_WORDS = "nodes lie up to {:.3g} voxels beyond the image's box; please rep
 BOUNDARY_ROUNDING = 1e-6  # relative: likewise of cells within a boundary in the user's own digits
 
 
-def promised(result: Optimized, content: Content, min_dihedral: float, start: Mesh) -> Optimized:
+def promised(result: MeshingResult, content: Content, min_dihedral: float, start: Mesh) -> MeshingResult:
     """The result of a run with the promises that its mesh misses, each in a sentence.
 
     Parameters
     ----------
-    result : Optimized
+    result : MeshingResult
         The run; of it mesh, history and labels are asked.
     content : Content
         What the mesh represents.
@@ -47,7 +47,7 @@ def promised(result: Optimized, content: Content, min_dihedral: float, start: Me
 
     Returns
     -------
-    Optimized
+    MeshingResult
         With `missed`, empty if there is nothing. `floor`: cells with an angle under the floor, of tetrahedra that were
         moved at all. `box`: nodes further beyond the image's box than the initial mesh's. `cover`: voxels or volume of
         the initial mesh lost or won. Within a mask instead `overlap`: voxels that lie in two cells, `mask`: a Dice
@@ -84,7 +84,7 @@ def _beyond(mesh: Mesh, start: Mesh, image: Image) -> dict[str, str]:
     return {"box": BEYOND_WORDS.format(beyond)} if beyond > allowed else {}
 
 
-def promised_in_box(result: Optimized, grid: VoxelGrid, min_dihedral: float) -> Optimized:
+def promised_in_box(result: MeshingResult, grid: VoxelGrid, min_dihedral: float) -> MeshingResult:
     """As `promised`, of a mesh that fills the box of an image, whose voxels need not be in memory."""
     missed = _missed_floor(result, min_dihedral) | _missed_box(grid, result)
     beyond = float(beyond_box(result.mesh, grid).max())
@@ -93,7 +93,7 @@ def promised_in_box(result: Optimized, grid: VoxelGrid, min_dihedral: float) -> 
     return result._replace(missed=missed)
 
 
-def _missed_floor(result: Optimized, min_dihedral: float) -> dict[str, str]:
+def _missed_floor(result: MeshingResult, min_dihedral: float) -> dict[str, str]:
     mesh = result.mesh
     if mesh.ndim != 3 or result.history[-1].iteration == 0:
         return {}
@@ -103,7 +103,7 @@ def _missed_floor(result: Optimized, min_dihedral: float) -> dict[str, str]:
     return {"floor": f"{words}; allow more nodes, a lower `k_D`, or a lower `min_dihedral`"} if below else {}
 
 
-def requested(result: Optimized, content: Content, target_error: float | None, is_filled: bool) -> Optimized:
+def requested(result: MeshingResult, content: Content, target_error: float | None, is_filled: bool) -> MeshingResult:
     """The result of a run with what it misses of what was asked of `mesh_image`, beside its promises.
 
     `error`: more of the image's variance left in the cells than `target_error`. `cover`: if the mesh `is_filled`, which
@@ -120,7 +120,7 @@ def requested(result: Optimized, content: Content, target_error: float | None, i
     return result._replace(missed=missed, share=share)
 
 
-def _missed_box(image: VoxelGrid, result: Optimized) -> dict[str, str]:
+def _missed_box(image: VoxelGrid, result: MeshingResult) -> dict[str, str]:
     outside, volume = prod(image.shape) - result.history[-1].n_voxels, _volume(result.mesh)
     if outside == 0 and abs(volume / image.volume - 1.0) < VOLUME_ROUNDING:
         return {}
@@ -128,7 +128,7 @@ def _missed_box(image: VoxelGrid, result: Optimized) -> dict[str, str]:
     return {"cover": f"{words}{image.volume:.9g} mm^{image.ndim}; please report this"}
 
 
-def _missed_cover(result: Optimized, start: Mesh) -> dict[str, str]:
+def _missed_cover(result: MeshingResult, start: Mesh) -> dict[str, str]:
     before, volume = _volume(start), _volume(result.mesh)
     gained = result.history[-1].n_voxels - result.history[0].n_voxels
     if gained == 0 and abs(volume / before - 1.0) <= BOUNDARY_ROUNDING:
@@ -137,7 +137,7 @@ def _missed_cover(result: Optimized, start: Mesh) -> dict[str, str]:
     return {"cover": f"{words}{before:.9g} mm^{start.ndim}; please report this"}
 
 
-def _missed_mask(content: Content, result: Optimized) -> dict[str, str]:
+def _missed_mask(content: Content, result: MeshingResult) -> dict[str, str]:
     assert content.region is not None
     missed = {}
     is_covered, inside = cell_of_voxel(content.image, result.mesh) >= 0, content.region.inside
@@ -163,14 +163,14 @@ def _missed_components(content: Content, mesh: Mesh) -> dict[str, str]:
     return {"components": f"{words} {', '.join(map(str, n_cells[:-4:-1]))} cells; allow more nodes"}
 
 
-def _missed_manifold(content: Content, result: Optimized) -> dict[str, str]:
+def _missed_manifold(content: Content, result: MeshingResult) -> dict[str, str]:
     problems = [] if content.region is None else manifold_problems(result.mesh)
     if result.labels is not None and content.memberships is not None:
         problems += manifold_problems(result.mesh, result.labels)
     return {"manifold": "; ".join([*problems, "allow more nodes"])} if problems else {}
 
 
-def _missed_labels(content: Content, result: Optimized) -> dict[str, str]:
+def _missed_labels(content: Content, result: MeshingResult) -> dict[str, str]:
     members = content.memberships
     if members is None or result.labels is None:
         return {}

@@ -71,10 +71,10 @@ class Solution(NamedTuple):
     Examples
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> mesh = tetopt.lattice_mesh(image, nodes=300)
     >>> loads = ["hold:inferior", "pressure:superior:0.1"]
-    >>> model = tetopt.model_of(mesh, image, young="0.1*h", nu=0.45, loads=loads)
-    >>> solution = tetopt.solved_model(model)
+    >>> model = tetopt.build_model(mesh, image, young="0.1*h", nu=0.45, loads=loads)
+    >>> solution = tetopt.solve(model)
     >>> (solution.reactions["inferior"] + solution.applied).round(6).tolist()  # they balance
     [...0.0, ...0.0, ...0.0]
     """
@@ -103,7 +103,7 @@ class _Task(NamedTuple):
 
 
 @on_one_blas_thread
-def solved_model(model: Model, step: int = 1, method: Method = "auto") -> Solution:
+def solve(model: Model, step: int = 1, method: Method = "auto") -> Solution:
     """The displacements of one step, and what follows from them.
 
     Parameters
@@ -130,16 +130,16 @@ def solved_model(model: Model, step: int = 1, method: Method = "auto") -> Soluti
 
     See Also
     --------
-    model_of : Makes a model.
+    build_model : Makes a model.
     solution_fields : What goes into a mesh's file.
 
     Examples
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> mesh = tetopt.lattice_mesh(image, nodes=300)
     >>> loads = ["hold:inferior", "pressure:superior:0.1"]
-    >>> model = tetopt.model_of(mesh, image, young="0.1*h", nu=0.45, loads=loads)
-    >>> solution = tetopt.solved_model(model)
+    >>> model = tetopt.build_model(mesh, image, young="0.1*h", nu=0.45, loads=loads)
+    >>> solution = tetopt.solve(model)
     >>> print(f"The top sinks by {-solution.u[:, 2].min():.1f} mm under 0.1 kPa.")
     The top sinks by 2.7 mm under 0.1 kPa.
 
@@ -148,8 +148,8 @@ def solved_model(model: Model, step: int = 1, method: Method = "auto") -> Soluti
     >>> from tetopt.model.sets import standard_sets
     >>> bar = tetopt.Mesh([[0, 0], [2, 0], [2, 1], [0, 1]], [[0, 1, 2], [0, 2, 3]])
     >>> words = ["hold:x_min", "traction:x_max:1,0"]
-    >>> model = tetopt.model_of(bar, young=10.0, nu=0.0, known_sets=standard_sets(bar), loads=words)
-    >>> solution = tetopt.solved_model(model)
+    >>> model = tetopt.build_model(bar, young=10.0, nu=0.0, known_sets=standard_sets(bar), loads=words)
+    >>> solution = tetopt.solve(model)
     >>> [(each.round(12) + 0.0).tolist() for each in (solution.u[1], solution.reactions["x_min"])]
     [[0.2, 0.0], [-1.0, 0.0]]
     """
@@ -326,10 +326,10 @@ class SolutionFields(NamedTuple):
     Examples
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> mesh = tetopt.lattice_mesh(image, nodes=300)
     >>> loads = ["hold:inferior", "pressure:superior:0.1"]
-    >>> model = tetopt.model_of(mesh, image, young="0.1*h", nu=0.45, loads=loads)
-    >>> fields = tetopt.solution_fields(mesh, tetopt.solved_model(model))
+    >>> model = tetopt.build_model(mesh, image, young="0.1*h", nu=0.45, loads=loads)
+    >>> fields = tetopt.solution_fields(mesh, tetopt.solve(model))
     >>> fields.point_data["displacement"].shape
     (280, 3)
     """
@@ -367,10 +367,10 @@ def solution_fields(mesh: Mesh, solution: Solution, step: int = 1) -> SolutionFi
     Examples
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> mesh = tetopt.lattice_mesh(image, nodes=300)
     >>> loads = ["hold:inferior", "pressure:superior:0.1"]
-    >>> model = tetopt.model_of(mesh, image, young="0.1*h", nu=0.45, loads=loads)
-    >>> fields = tetopt.solution_fields(mesh, tetopt.solved_model(model))
+    >>> model = tetopt.build_model(mesh, image, young="0.1*h", nu=0.45, loads=loads)
+    >>> fields = tetopt.solution_fields(mesh, tetopt.solve(model))
     >>> tetopt.save_mesh("solved.vtu", mesh, fields.cell_data, point_data=fields.point_data)
     >>> sorted(fields.cell_data)
     ['strain', 'stress', 'von_mises']

@@ -55,8 +55,8 @@ class Surface(NamedTuple):
     Examples
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-    >>> mesh = tetopt.lattice(image, nodes=300)
-    >>> surface = tetopt.surface_of(mesh.points, mesh.cells, np.ones(len(mesh.cells), dtype=bool))
+    >>> mesh = tetopt.lattice_mesh(image, nodes=300)
+    >>> surface = tetopt.extract_surface(mesh.points, mesh.cells, np.ones(len(mesh.cells), dtype=bool))
     >>> surface.triangles.shape, surface.n_parted
     ((260, 3), 0)
     """
@@ -89,7 +89,7 @@ class _Sheets(NamedTuple):
     sheet: NDArray[np.int64]  # (C,), whose normal it is, ascending
 
 
-def surface_of(points: NDArray[np.float64], cells: NDArray[np.integer], chosen: ArrayLike) -> Surface:
+def extract_surface(points: NDArray[np.float64], cells: NDArray[np.integer], chosen: ArrayLike) -> Surface:
     """The boundary of the chosen tetrahedra: closed, two triangles at each edge, one fan at each node.
 
     Where chosen cells touch only in a node or an edge, the sheets of the surface are parted: the flattest keeps its
@@ -124,9 +124,9 @@ def surface_of(points: NDArray[np.float64], cells: NDArray[np.integer], chosen: 
     Examples
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> mesh = tetopt.lattice_mesh(image, nodes=300)
     >>> is_ball = tetopt.cell_moments(image, mesh).mean > 60.0
-    >>> surface = tetopt.surface_of(mesh.points, mesh.cells, is_ball)
+    >>> surface = tetopt.extract_surface(mesh.points, mesh.cells, is_ball)
     >>> tetopt.save_surface("ball.stl", surface)
     """
     skin = _skin(points, _chosen_cells(points, cells, chosen))

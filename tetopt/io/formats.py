@@ -89,7 +89,7 @@ def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str
     path : str or Path
         Its suffix decides the format, see `tetopt.io.formats.FORMATS`.
     model : Model
-        As `model_of` makes it.
+        As `build_model` makes it.
     space : {"ras", "lps"}
         Convention of the file's coordinates; NIfTI's is RAS+, DICOM's, ITK's and 3D Slicer's files' LPS+.
     units : {"kPa", "MPa"}
@@ -109,14 +109,14 @@ def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str
 
     See Also
     --------
-    model_of : Makes a model.
+    build_model : Makes a model.
 
     Examples
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> mesh = tetopt.lattice_mesh(image, nodes=300)
     >>> loads = ["hold:inferior", "pressure:superior:0.1"]
-    >>> model = tetopt.model_of(mesh, image, young="0.1*h", nu=0.45, loads=loads)
+    >>> model = tetopt.build_model(mesh, image, young="0.1*h", nu=0.45, loads=loads)
     >>> for name in ("ball.inp", "ball.feb", "ball.vtu"):  # CalculiX and Abaqus, FEBio, ParaView
     ...     tetopt.save_model(name, model)
     """
@@ -176,7 +176,7 @@ def save_mesh(
     Examples
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> mesh = tetopt.lattice_mesh(image, nodes=300)
     >>> tetopt.save_mesh("ball.vtu", mesh, tetopt.cell_fields(mesh, image))
     >>> sorted(tetopt.load_mesh("ball.vtu").cell_data)
     ['max', 'mean', 'min', 'min_dihedral', 'n_voxels', 'rho', 'variance', 'volume']

@@ -113,7 +113,7 @@ def read_frd(path: str | Path, mesh: Mesh) -> Results:
     See Also
     --------
     save_model : Writes the input file.
-    solved_model : Solves a model without CalculiX.
+    solve : Solves a model without CalculiX.
 
     Examples
     --------

@@ -54,7 +54,7 @@ def load_mesh(path: str | Path) -> MeshFile:
     Examples
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> mesh = tetopt.lattice_mesh(image, nodes=300)
     >>> tetopt.save_mesh("ball.vtu", mesh, tetopt.cell_fields(mesh, image))
     >>> file = tetopt.load_mesh("ball.vtu")
     >>> bool((file.mesh.points == mesh.points).all()), file.cell_data["mean"].shape

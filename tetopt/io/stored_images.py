@@ -76,7 +76,7 @@ def open_stored(path: str | Path, *, volume: int | None = None, crop: Bounds | N
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
     >>> tetopt.save_image("ball.nii", image)
     >>> stored = tetopt.open_stored("ball.nii")
-    >>> len(tetopt.octree(stored, 300).points) == len(tetopt.octree(image, 300).points)
+    >>> len(tetopt.octree_mesh(stored, 300).points) == len(tetopt.octree_mesh(image, 300).points)
     True
     """
     check_local(path)

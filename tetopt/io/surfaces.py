@@ -11,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.errors import InputError
-from tetopt.geometry.surface import Surface, surface_of
+from tetopt.geometry.surface import Surface, extract_surface
 from tetopt.io.readback import Outline, save_checked
 from tetopt.io.text import plain
 from tetopt.io.vtk import LEGACY_VERSION, written_bytes, xml_bytes
@@ -76,9 +76,9 @@ def save_surface(
     Examples
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> mesh = tetopt.lattice_mesh(image, nodes=300)
     >>> is_ball = tetopt.cell_moments(image, mesh).mean > 60.0
-    >>> surface = tetopt.surface_of(mesh.points, mesh.cells, is_ball)
+    >>> surface = tetopt.extract_surface(mesh.points, mesh.cells, is_ball)
     >>> tetopt.save_surface("ball.ply", surface, about="a ball", space="lps")
     """
     path = Path(path)
@@ -112,7 +112,7 @@ def _boundary(model: Model) -> tuple[Surface, str, str]:
     """The surface, what its file says of it, and the space of its points."""
     if model.mesh.ndim != 3:
         raise InputError("surface: expected tetrahedra, whose boundary is a surface, got triangles")
-    surface = surface_of(model.mesh.points, model.mesh.cells, np.arange(len(model.mesh.cells)))
+    surface = extract_surface(model.mesh.points, model.mesh.cells, np.arange(len(model.mesh.cells)))
     return surface, str(model.about.get("image", "")), model.space
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.engine.loop import Optimized
+from tetopt.engine.loop import MeshingResult
 from tetopt.engine.meshing import Mode
 from tetopt.engine.promises import LABEL_VOXELS
 from tetopt.engine.surface import MOST_MEETING
@@ -30,7 +30,7 @@ EMPTY_CELLS = 0.02  # of the cells: if more hold no voxel, they are too many for
 THICK_SLICES = 2.0  # times a voxel's shortest edge: where slices are so far apart, cells lie between them
 
 
-def tell_violated(result: Optimized, measured: dict[str, Any], word: str = "mask") -> list[str]:
+def tell_violated(result: MeshingResult, measured: dict[str, Any], word: str = "mask") -> list[str]:
     """The requirements that the mesh does not meet (`tetopt.engine.promises`), large labels without cells among them.
 
     Each is told, and lesser misses are warned of. Messages call what is meshed `word`.
@@ -93,7 +93,7 @@ def _warn_of_mask(mask: MaskFidelity | None, word: str) -> None:
 
 
 def warn_of_result(
-    result: Optimized, method: Method, mode: Mode, n_nodes: int, nodes: int | None, measured: dict[str, Any],
+    result: MeshingResult, method: Method, mode: Mode, n_nodes: int, nodes: int | None, measured: dict[str, Any],
     spacing: NDArray[np.float64],
 ) -> None:  # fmt: skip
     """Say what is allowed but hardly meant.

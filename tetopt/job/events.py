@@ -31,7 +31,7 @@ class Event(NamedTuple):
     text : str
         On one line. Arguments of the job stand between backticks: "`nodes`".
     data : object
-        Of "started" the `Stage`; of "progress" what that counts, such as a `Record`.
+        Of "started" the `Stage`; of "progress" what that counts, such as a `IterationRecord`.
 
     Examples
     --------

@@ -21,7 +21,7 @@ from tetopt.cluster.tasks import run_tasks
 from tetopt.cluster.workers import check_choice, local_share, workers
 from tetopt.engine.cost import meshing_bytes
 from tetopt.engine.fast import prepare_kernels
-from tetopt.engine.loop import Optimized, Record
+from tetopt.engine.loop import IterationRecord, MeshingResult
 from tetopt.errors import InputError
 from tetopt.image import Image, VoxelGrid
 from tetopt.io.images import file_shape, parse_crop
@@ -216,7 +216,7 @@ class PartsProgress(NamedTuple):
     """How far a run in parts is."""
 
     now: Round
-    history: list[Record]  # of the rounds that are done
+    history: list[IterationRecord]  # of the rounds that are done
 
 
 def run_in_parts(
@@ -318,7 +318,7 @@ def _request(plan: Plan, source: Source | StoredSource, sizes: Sizes | None) -> 
     return PartsRequest(**values, sizes=sizes, checksum=checksum)
 
 
-def end_work(plan: Plan, result: Optimized) -> None:
+def end_work(plan: Plan, result: MeshingResult) -> None:
     """Remove the work directory of a run that is complete; say what becomes of that of another."""
     folder = work_folder(plan)
     if result.ended in ("iterations", "converged"):

@@ -23,7 +23,7 @@ from tetopt.job.options import WHOLE_BOX, BoxPart, ImagePart, SourceOptions
 from tetopt.measure.fidelity import cell_labels
 from tetopt.model.file import MeshFile
 from tetopt.model.labels import NO_TABLE, labels_of
-from tetopt.target.align import aligned_contrast, is_same_grid
+from tetopt.target.align import is_same_grid, resample_contrast
 from tetopt.target.labels import check_labels
 
 IN_IMAGE_SHARE = 0.95  # of a mask's or labels' volume: less of it in the image is more than the grids' difference
@@ -75,7 +75,7 @@ def image_and_others(
         moved = aligned(original, whole, str(other))
         is_cropped = part.slice_ is None and part.crop is not None
         if not is_same_grid(original, whole, is_cropped=is_cropped):
-            _say_resampled(other, original, moved, is_contrast=aligned is aligned_contrast, is_cropped=is_cropped)
+            _say_resampled(other, original, moved, is_contrast=aligned is resample_contrast, is_cropped=is_cropped)
         if part.slice_ is None:
             return moved
         return part_of(moved, parse_slice(part.slice_), None if part.crop is None else parse_crop(part.crop))

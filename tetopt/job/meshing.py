@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from tetopt.budget import BYTES_PER_GB, MemoryLimit, peak_bytes, resident_bytes
 from tetopt.engine.cost import next_bytes
 from tetopt.engine.fast import prepare_kernels
-from tetopt.engine.loop import Optimized, Record
+from tetopt.engine.loop import IterationRecord, MeshingResult
 from tetopt.engine.meshing import (
     ERROR_REACHED,
     ERROR_RUNS,
@@ -62,7 +62,7 @@ def meshed(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
     before = peak_bytes(), resident_bytes()
     begun: list[float] = []
 
-    def watch(initial: Mesh, run: Run) -> Optimized:
+    def watch(initial: Mesh, run: Run) -> MeshingResult:
         if not begun:
             _check_early(task, initial, None)
         check_space(job.output, CELL_BYTES * len(initial.cells))
@@ -145,14 +145,14 @@ def prepare(make: Callable[[Callable[[str], None]], Any]) -> None:
 def watched(
     run: Run, initial: Mesh, iterations: int, ends: float | None, stop: Callable[[], bool],
     limit: MemoryLimit | None = None,
-) -> Optimized:  # fmt: skip
+) -> MeshingResult:  # fmt: skip
     """A run whose records are told, ended in good order at a time, before a limit of memory, or when `stop` says so."""
     max_seconds = None if ends is None else max(ends - time.perf_counter(), 1e-9)
 
     def is_stopped() -> bool:
         return stop() or (limit is not None and limit.is_reached())
 
-    def recorded(row: Record) -> None:
+    def recorded(row: IterationRecord) -> None:
         progress("", row)
 
     result = run(max_seconds=max_seconds, callback=recorded, stop=is_stopped)
@@ -166,7 +166,7 @@ def watched(
     return result
 
 
-def _say_search(task: Task, number: int, result: Optimized) -> None:
+def _say_search(task: Task, number: int, result: MeshingResult) -> None:
     """A line for a run of several, which go on until one is near to an error, or to a number of nodes of order 2."""
     job, content = task.plan.job, task.source.content
     n_nodes = node_count(result.mesh.points, result.mesh.cells, job.order or 1)

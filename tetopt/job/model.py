@@ -23,7 +23,7 @@ from tetopt.job.inputs import label_table
 from tetopt.job.options import ModelOptions, SolverOptions
 from tetopt.mesh import Mesh
 from tetopt.model.averages import DEFAULT_AVERAGE, parse_average
-from tetopt.model.build import model_of
+from tetopt.model.build import build_model
 from tetopt.model.fields import is_result
 from tetopt.model.file import MATERIAL_FIELDS, MeshFile, loads_in, moduli_in, sets_beside
 from tetopt.model.file import completed as with_rest_of_file
@@ -142,7 +142,7 @@ def solver_model(
         note(f"nu: of `young` or {DEFAULT_NU:g}; what the mesh's file has is left")
     fields = {name: values for name, values in cell_data.items() if name not in MATERIAL_FIELDS}
     bins, spacing = parsed_bins(solver.bins)
-    model = model_of(
+    model = build_model(
         mesh, image, young=young, nu=nu, density=density, average=solver.average or DEFAULT_AVERAGE,
         sets=solver.sets or (), loads=solver.loads or (), bins=bins, spacing=spacing, order=solver.order or 1,
         cell_data=fields, known_sets=known_sets, about={"tetopt": tetopt.__version__, **about},

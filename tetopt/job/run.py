@@ -7,7 +7,7 @@ from collections.abc import Callable
 from functools import partial
 from typing import Any, NamedTuple
 
-from tetopt.engine.loop import Optimized
+from tetopt.engine.loop import MeshingResult
 from tetopt.geometry.quadratic import node_count
 from tetopt.io.files import save_json
 from tetopt.job.advice import tell_violated, warn_of_result, warn_of_sizes
@@ -67,7 +67,7 @@ class Result(NamedTuple):
     measured: dict[str, Any]
 
     @property
-    def optimized(self) -> Optimized:
+    def optimized(self) -> MeshingResult:
         """The result of the optimisation."""
         return self.meshed.result
 

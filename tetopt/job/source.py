@@ -20,7 +20,7 @@ from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields
 from tetopt.model.labels import TABLE_TEXT, table_words
 from tetopt.model.sets import box_of, box_text
-from tetopt.target.align import aligned_contrast, aligned_labels, aligned_mask, background_level, foreground
+from tetopt.target.align import background_level, foreground_mask, resample_contrast, resample_labels, resample_mask
 from tetopt.target.content import SMOOTH_INTERFACES, Content, StoredContent, content, continued
 
 
@@ -95,14 +95,14 @@ def read_source(options: SourceOptions, label_names: Path | None = None) -> Sour
     paths = options.images
     table = label_table(label_names)
     image, beside = image_and_others(paths[0], options)
-    contrasts = [image, *(beside(path, aligned_contrast) for path in paths[1:])]
-    labels = None if options.labels is None else beside(options.labels, aligned_labels)
-    mask = None if options.mask is None else beside(options.mask, aligned_mask)
+    contrasts = [image, *(beside(path, resample_contrast) for path in paths[1:])]
+    labels = None if options.labels is None else beside(options.labels, resample_labels)
+    mask = None if options.mask is None else beside(options.mask, resample_mask)
     level = None
     if options.background is not None:
         is_auto = options.background == "auto"
         level = background_level(image) if is_auto else number_of("`background`", options.background)
-        mask = foreground(image, level)
+        mask = foreground_mask(image, level)
         note(
             f"background: up to {level:g}, as far as it reaches the box; {mask.data.mean():.1%} of the voxels are left"
         )

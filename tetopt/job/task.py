@@ -7,7 +7,7 @@ from typing import Any, NamedTuple
 from numpy.typing import NDArray
 
 from tetopt.engine.cost import RunSize
-from tetopt.engine.loop import Optimized
+from tetopt.engine.loop import MeshingResult
 from tetopt.job.in_parts import StoredSource
 from tetopt.job.plan import Plan
 from tetopt.job.source import Source
@@ -39,7 +39,7 @@ class Task(NamedTuple):
 class Meshed(NamedTuple):
     """What came of the optimisation."""
 
-    result: Optimized
+    result: MeshingResult
     initial: Mesh
     seconds: dict[str, float]  # up to the optimisation, and of it
     predicted_bytes: float  # of memory, at most, before it began; in parts of each worker's largest task

@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 
 from tetopt.budget import peak_bytes
 from tetopt.engine.interfaces import crowded_nodes
-from tetopt.engine.loop import Optimized
+from tetopt.engine.loop import MeshingResult
 from tetopt.engine.meshing import QUADRATIC_NODES
 from tetopt.io.files import TakenError
 from tetopt.job.events import note
@@ -102,7 +102,9 @@ def saved(task: Task, came: Meshed, failed: dict[str, str]) -> tuple[Model, dict
     return model, about
 
 
-def _measured_fields(source: Source | StoredSource, result: Optimized, failed: dict[str, str]) -> dict[str, NDArray]:
+def _measured_fields(
+    source: Source | StoredSource, result: MeshingResult, failed: dict[str, str]
+) -> dict[str, NDArray]:
     """The fields of the result's cells; those of their shape and their labels alone, if the image's cannot be had."""
     assert isinstance(source, Source)
     if measured := measured_each({"fields": partial(source.fields, result.mesh, result.labels)}, failed):
@@ -110,7 +112,7 @@ def _measured_fields(source: Source | StoredSource, result: Optimized, failed: d
     return cell_fields(result.mesh) | ({} if result.labels is None else {"label": result.labels})
 
 
-def measured_of(task: Task, result: Optimized, model: Model, failed: dict[str, str]) -> dict[str, Any]:
+def measured_of(task: Task, result: MeshingResult, model: Model, failed: dict[str, str]) -> dict[str, Any]:
     """How well mask, labels, contrasts and sizes are met."""
     source = task.source
     measured = fidelity(source.labels, source.mask, result.mesh, model.cell_data.get("label"), failed)
@@ -148,7 +150,7 @@ def numbers_of(
     return summary
 
 
-def _counts(task: Task, result: Optimized, model: Model) -> dict[str, Callable[[], Any]]:
+def _counts(task: Task, result: MeshingResult, model: Model) -> dict[str, Callable[[], Any]]:
     """What else is measured of a mesh, by name; None where there is nothing to tell."""
     source, sizes, mesh, fields = task.source, task.sizes, result.mesh, model.cell_data
     measures: dict[str, Callable[[], Any]] = {}

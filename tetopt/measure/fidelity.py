@@ -81,7 +81,7 @@ class LabelFidelity(NamedTuple):
     --------
     >>> phantom = tetopt.load_phantom("sphere")
     >>> labels = phantom.label_image(voxel_mm=4)
-    >>> ball = tetopt.label_fidelity(labels, tetopt.lattice(labels, nodes=300))[1]
+    >>> ball = tetopt.label_fidelity(labels, tetopt.lattice_mesh(labels, nodes=300))[1]
     >>> ball.label, ball.voxels, ball.components, ball.is_lost
     (1, 552, 1, False)
     """
@@ -138,7 +138,7 @@ class MaskFidelity(NamedTuple):
     >>> phantom = tetopt.load_phantom("sphere")
     >>> labels = phantom.label_image(voxel_mm=4)
     >>> mask = tetopt.Image(labels.data == 1, labels.affine)
-    >>> box = tetopt.mask_fidelity(mask, tetopt.lattice(labels, nodes=300))  # a mesh of the whole box
+    >>> box = tetopt.mask_fidelity(mask, tetopt.lattice_mesh(labels, nodes=300))  # a mesh of the whole box
     >>> round(box.dice, 2), box.components, box.euler
     (0.24, 1, 2)
     """
@@ -187,7 +187,7 @@ def cell_labels(labels: Image, mesh: Mesh) -> NDArray[np.int64]:
     --------
     >>> phantom = tetopt.load_phantom("sphere")
     >>> labels = phantom.label_image(voxel_mm=4)
-    >>> mesh = tetopt.lattice(labels, nodes=300)
+    >>> mesh = tetopt.lattice_mesh(labels, nodes=300)
     >>> of_cell = tetopt.cell_labels(labels, mesh)
     >>> np.bincount(of_cell).tolist()
     [1063, 137]

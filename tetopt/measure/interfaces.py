@@ -70,7 +70,7 @@ class LabelInterface(NamedTuple):
     --------
     >>> phantom = tetopt.load_phantom("sphere")
     >>> labels = phantom.label_image(voxel_mm=4)
-    >>> mesh = tetopt.lattice(labels, nodes=300)
+    >>> mesh = tetopt.lattice_mesh(labels, nodes=300)
     >>> background, ball = tetopt.label_interfaces(labels, mesh, tetopt.cell_labels(labels, mesh))
     >>> background.cavities, background.mesh_cavities, ball.euler
     (1, 1, 2)

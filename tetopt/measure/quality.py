@@ -32,7 +32,7 @@ class QualityErrors(NamedTuple):
 
     Examples
     --------
-    >>> mesh = tetopt.lattice(tetopt.Image(np.zeros((70, 70))), blocks=(7, 7))  # Table 1, third row
+    >>> mesh = tetopt.lattice_mesh(tetopt.Image(np.zeros((70, 70))), blocks=(7, 7))  # Table 1, third row
     >>> errors = tetopt.quality(mesh.points, mesh.cells).errors
     >>> f"{errors.mean:.4f} {errors.worst:.4f}"
     '0.0858 0.0858'
@@ -141,7 +141,7 @@ class Quality(NamedTuple):
 
     Examples
     --------
-    >>> mesh = tetopt.lattice(tetopt.Image(np.zeros((40, 40, 40))), nodes=300)
+    >>> mesh = tetopt.lattice_mesh(tetopt.Image(np.zeros((40, 40, 40))), nodes=300)
     >>> numbers = tetopt.quality(mesh.points, mesh.cells)
     >>> numbers.n_nodes, numbers.n_cells, numbers.kinds["sliver"]
     (280, 1200, 0)

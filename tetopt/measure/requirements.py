@@ -7,7 +7,7 @@ from numpy.typing import NDArray
 
 from tetopt.check import beyond_box
 from tetopt.energy.discretization import content_E_D
-from tetopt.engine.loop import Optimized, Record
+from tetopt.engine.loop import IterationRecord, MeshingResult
 from tetopt.engine.promises import BEYOND_WORDS, promised, requested
 from tetopt.geometry.box import ON_SIDE_VOXELS
 from tetopt.mesh import Mesh
@@ -22,7 +22,7 @@ def judged(
     min_dihedral: float = 0.0,
     target_error: float | None = None,
     is_filled: bool = False,
-) -> Optimized:
+) -> MeshingResult:
     """A mesh as the result of a run that ended with it: its `missed` and `share` are those of that run.
 
     Parameters
@@ -41,7 +41,7 @@ def judged(
 
     Returns
     -------
-    Optimized
+    MeshingResult
         Its history has one row, with E_D and the number of voxels.
 
     Raises
@@ -50,8 +50,8 @@ def judged(
         As `tetopt.energy.sampling.cell_moments`.
     """
     E_D, n_voxels = content_E_D(content, mesh)
-    row = Record(1, np.nan, np.nan, E_D, 0.0, False, len(mesh.cells), n_voxels, 0.0)
-    result = promised(Optimized(mesh, [row], "iterations", labels=labels), content, min_dihedral, mesh)
+    row = IterationRecord(1, np.nan, np.nan, E_D, 0.0, False, len(mesh.cells), n_voxels, 0.0)
+    result = promised(MeshingResult(mesh, [row], "iterations", labels=labels), content, min_dihedral, mesh)
     result = requested(result, content, target_error, is_filled)
     beyond = float(beyond_box(mesh, content.image).max())
     if (is_filled or content.region is not None) and beyond > ON_SIDE_VOXELS:

@@ -17,7 +17,7 @@ from tetopt.target.labels import check_labels
 from tetopt.target.otsu import class_thresholds
 
 
-def segmented(image: Image, mesh: Mesh, classes: int) -> Image:
+def segment(image: Image, mesh: Mesh, classes: int) -> Image:
     """Label image, 0 to classes - 1 by rising mean: the cells' classes painted back to their voxels.
 
     Parameters
@@ -42,7 +42,7 @@ def segmented(image: Image, mesh: Mesh, classes: int) -> Image:
     Examples
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-    >>> labels = tetopt.segmented(image, tetopt.mesh_image(image, 300, iterations=4).mesh, 2)
+    >>> labels = tetopt.segment(image, tetopt.mesh_image(image, 300, iterations=4).mesh, 2)
     >>> truth = tetopt.load_phantom("sphere").label_image(voxel_mm=4)
     >>> int((labels.data != truth.data).sum())  # voxels that are not as in the phantom
     11

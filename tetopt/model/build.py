@@ -32,7 +32,7 @@ from tetopt.model.model import Model
 from tetopt.model.sets import Box, Sets, box_of, box_text, standard_sets, with_requested
 
 
-def model_of(
+def build_model(
     mesh: Mesh | MeshFile,
     image: Image | None = None,
     *,
@@ -70,7 +70,7 @@ def model_of(
         needs it.
     average : str
         Of a law of Young's modulus over the voxels, see `tetopt.model.averages.parse_average`; "mean" is Eq. (2).
-        With "gauss" and quadratic cells moduli vary in a cell for `tetopt.fem.solution.solved_model`; files have one.
+        With "gauss" and quadratic cells moduli vary in a cell for `tetopt.fem.solution.solve`; files have one.
         Ratios and densities are always the mean.
     sets : iterable of str
         Further sets, see `tetopt.model.sets.with_requested`.
@@ -116,16 +116,16 @@ def model_of(
     Examples
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> mesh = tetopt.lattice_mesh(image, nodes=300)
     >>> loads = ["hold:inferior", "pressure:superior:0.1"]
-    >>> model = tetopt.model_of(mesh, image, young="0.1*h", nu=0.45, loads=loads)
+    >>> model = tetopt.build_model(mesh, image, young="0.1*h", nu=0.45, loads=loads)
     >>> tetopt.save_model("ball.inp", model)  # for CalculiX or Abaqus
 
     Moduli by label:
 
     >>> labels = tetopt.load_phantom("sphere").label_image(voxel_mm=4)
     >>> data = {"label": tetopt.cell_labels(labels, mesh)}
-    >>> tetopt.model_of(mesh, young="1=10,*=2", cell_data=data).materials.young.tolist()
+    >>> tetopt.build_model(mesh, young="1=10,*=2", cell_data=data).materials.young.tolist()
     [2.0, 10.0]
     """
     loaded, loads = None, tuple(loads)

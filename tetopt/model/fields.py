@@ -47,7 +47,7 @@ def cell_fields(mesh: Mesh, image: Image | None = None) -> dict[str, NDArray]:
     Examples
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> mesh = tetopt.lattice_mesh(image, nodes=300)
     >>> fields = tetopt.cell_fields(mesh, image)
     >>> sorted(fields)
     ['max', 'mean', 'min', 'min_dihedral', 'n_voxels', 'rho', 'variance', 'volume']

@@ -55,7 +55,7 @@ class MeshFile(NamedTuple):
     Examples
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> mesh = tetopt.lattice_mesh(image, nodes=300)
     >>> tetopt.save_mesh("ball.vtk", mesh)
     >>> file = tetopt.load_mesh("ball.vtk")
     >>> len(file.mesh.cells), file.n_turned, file.space, file.order
@@ -90,7 +90,7 @@ class MeshFile(NamedTuple):
         Examples
         --------
         >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-        >>> mesh = tetopt.lattice(image, nodes=300)
+        >>> mesh = tetopt.lattice_mesh(image, nodes=300)
         >>> tetopt.save_mesh("ball.vtu", mesh, about={"subject": "sub-01"})
         >>> tetopt.load_mesh("ball.vtu").text("subject")
         'sub-01'

@@ -36,9 +36,9 @@ class ByLabel(NamedTuple):
     --------
     >>> phantom = tetopt.load_phantom("sphere")
     >>> labels = phantom.label_image(voxel_mm=4)
-    >>> mesh = tetopt.lattice(labels, nodes=300)
+    >>> mesh = tetopt.lattice_mesh(labels, nodes=300)
     >>> data = {"label": tetopt.cell_labels(labels, mesh)}
-    >>> model = tetopt.model_of(mesh, young=tetopt.ByLabel({1: 10.0}, rest=2.0), cell_data=data)
+    >>> model = tetopt.build_model(mesh, young=tetopt.ByLabel({1: 10.0}, rest=2.0), cell_data=data)
     >>> model.materials.young.tolist()
     [2.0, 10.0]
     """

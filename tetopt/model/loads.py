@@ -59,9 +59,9 @@ class Load(NamedTuple):
     Examples
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> mesh = tetopt.lattice_mesh(image, nodes=300)
     >>> loads = ["hold:inferior", "pressure:superior:0.1"]
-    >>> model = tetopt.model_of(mesh, image, young="0.1*h", nu=0.45, loads=loads)
+    >>> model = tetopt.build_model(mesh, image, young="0.1*h", nu=0.45, loads=loads)
     >>> support, pressure = model.loads
     >>> support.kind, support.set_name, support.numbers.tolist()
     ('displacement', 'inferior', [0.0, 0.0, 0.0])

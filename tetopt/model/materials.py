@@ -34,8 +34,8 @@ class BinningError(NamedTuple):
     Examples
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-    >>> mesh = tetopt.lattice(image, nodes=300)
-    >>> error = tetopt.model_of(mesh, image, young="0.1*h", bins=3).materials.binning
+    >>> mesh = tetopt.lattice_mesh(image, nodes=300)
+    >>> error = tetopt.build_model(mesh, image, young="0.1*h", bins=3).materials.binning
     >>> error.mean < error.largest
     True
     """
@@ -63,8 +63,8 @@ class Materials(NamedTuple):
     Examples
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-    >>> mesh = tetopt.lattice(image, nodes=300)
-    >>> table = tetopt.model_of(mesh, image, young="0.1*h", bins=3).materials
+    >>> mesh = tetopt.lattice_mesh(image, nodes=300)
+    >>> table = tetopt.build_model(mesh, image, young="0.1*h", bins=3).materials
     >>> table.young.round(1).tolist(), table.of_cell.shape, f"{table.binning.mean:.1%}"
     ([2.1, 6.1, 9.5], (1200,), '6.8%')
     """

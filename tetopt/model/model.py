@@ -90,9 +90,9 @@ class Model(NamedTuple):
     Examples
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> mesh = tetopt.lattice_mesh(image, nodes=300)
     >>> loads = ["hold:inferior", "pressure:superior:0.1"]
-    >>> model = tetopt.model_of(mesh, image, young="0.1*h", nu=0.45, loads=loads)
+    >>> model = tetopt.build_model(mesh, image, young="0.1*h", nu=0.45, loads=loads)
     >>> len(model.materials.young), [load.kind for load in model.loads]
     (21, ['displacement', 'pressure'])
     """
@@ -141,9 +141,9 @@ class Model(NamedTuple):
         Examples
         --------
         >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-        >>> mesh = tetopt.lattice(image, nodes=300)
+        >>> mesh = tetopt.lattice_mesh(image, nodes=300)
         >>> loads = ["hold:inferior", "pressure:superior:0.1"]
-        >>> model = tetopt.model_of(mesh, image, young="0.1*h", nu=0.45, loads=loads)
+        >>> model = tetopt.build_model(mesh, image, young="0.1*h", nu=0.45, loads=loads)
         >>> skfem_mesh = model.to_skfem()
         >>> len(skfem_mesh.boundaries["superior"])
         40
@@ -168,7 +168,7 @@ class Model(NamedTuple):
         --------
         >>> import tetopt
         >>> mesh = tetopt.Mesh([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]])
-        >>> tetopt.model_of(mesh, young=3.0).to_pyvista().cell_data["young"].tolist()
+        >>> tetopt.build_model(mesh, young=3.0).to_pyvista().cell_data["young"].tolist()
         [3.0]
         """
         on_cells, on_nodes = grid_fields(self)
@@ -189,7 +189,7 @@ class Model(NamedTuple):
         --------
         >>> import tetopt
         >>> mesh = tetopt.Mesh([[0, 0], [1, 0], [0, 1]], [[0, 1, 2]])
-        >>> tetopt.model_of(mesh).to_meshio().point_sets["x_min"].tolist()
+        >>> tetopt.build_model(mesh).to_meshio().point_sets["x_min"].tolist()
         [0, 2]
         """
         on_cells, on_nodes = grid_fields(self)

@@ -49,8 +49,8 @@ class Sets(NamedTuple):
     Examples
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-    >>> mesh = tetopt.lattice(image, nodes=300)
-    >>> sets = tetopt.model_of(mesh, image).sets
+    >>> mesh = tetopt.lattice_mesh(image, nodes=300)
+    >>> sets = tetopt.build_model(mesh, image).sets
     >>> list(sets.facets)
     ['boundary', 'left', 'right', 'posterior', 'anterior', 'inferior', 'superior']
     >>> sets.facets["left"].shape
@@ -74,9 +74,9 @@ class Box(NamedTuple):
     Examples
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-    >>> mesh = tetopt.lattice(image, nodes=300)
+    >>> mesh = tetopt.lattice_mesh(image, nodes=300)
     >>> box = tetopt.Box(image.shape, image.affine)
-    >>> "left" in tetopt.model_of(mesh, box=box).sets.facets
+    >>> "left" in tetopt.build_model(mesh, box=box).sets.facets
     True
     """
 

@@ -60,7 +60,7 @@ class Numbers(NamedTuple):
     squares: float
     n_voxels: int
     n_nodes: int
-    movement: float  # of the last iteration, as in a `Record`
+    movement: float  # of the last iteration, as in a `IterationRecord`
     E_before: float  # its share to begin with
 
 

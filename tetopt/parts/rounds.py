@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from tetopt.energy.sampling import grid_bits
 from tetopt.engine.cost import CELLS_PER_NODE, part_bytes
 from tetopt.engine.fast import EXCHANGING_SHARE
-from tetopt.engine.loop import Optimized, Record
+from tetopt.engine.loop import IterationRecord, MeshingResult
 from tetopt.engine.promises import promised_in_box
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
@@ -45,7 +45,7 @@ from tetopt.parts.work import (
     save_state,
     save_volume,
 )
-from tetopt.start.octree import octree
+from tetopt.start.octree import octree_mesh
 from tetopt.start.sizes import Sizes
 from tetopt.stored import StoredImage
 from tetopt.target.statistics import Statistics, stored_statistics
@@ -89,7 +89,7 @@ class Round(NamedTuple):
 class Parted(NamedTuple):
     """What came of a run in parts."""
 
-    result: Optimized  # with a record for each round
+    result: MeshingResult  # with a record for each round
     fields: dict[str, NDArray]  # of each cell what the image is there: n_voxels, mean, variance, min, max
     part: NDArray[np.int64]  # (M,) of each cell, rising
     statistics: Statistics  # of the image
@@ -107,7 +107,7 @@ def mesh_in_parts(
     volume: VolumeFile | Image | None = None,
     crew: Callable[[int, float], AbstractContextManager[Runner]] = lambda n_parts, task_bytes: nullcontext(in_turn),
     is_over: Callable[[], bool] = lambda: False,
-    watch: Callable[[Round, list[Record]], None] = lambda now, history: None,
+    watch: Callable[[Round, list[IterationRecord]], None] = lambda now, history: None,
     check: Callable[[Mesh], None] = lambda initial: None,
 ) -> Parted:  # fmt: skip
     """A graded mesh of an image's box, optimised in parts, as `mesh_image` does in one piece.
@@ -140,8 +140,8 @@ def mesh_in_parts(
     Raises
     ------
     InputError
-        As `octree`; a folder of another request or of another run; what `crew` and the parts raise; an end before the
-        initial mesh is measured.
+        As `octree_mesh`; a folder of another request or of another run; what `crew` and the parts raise; an end before
+        the initial mesh is measured.
     """
     with locked(folder), gone_if_refused(folder) as keep:
         state = load_state(folder, request.checksum)
@@ -174,7 +174,7 @@ class _Run(NamedTuple):
     image: StoredImage
     begin: float
     is_over: Callable[[], bool]
-    watch: Callable[[Round, list[Record]], None]
+    watch: Callable[[Round, list[IterationRecord]], None]
 
 
 def _n_rounds(request: PartsRequest) -> int:
@@ -186,7 +186,7 @@ def _begun(request: PartsRequest, folder: Path, image: StoredImage, statistics: 
     """The state before the first round: the octree, on the grid of ticks."""
     begin = time.perf_counter()
     statistics = stored_statistics(image) if statistics is None else statistics
-    mesh = octree(image, request.nodes, request.sizes, statistics)
+    mesh = octree_mesh(image, request.nodes, request.sizes, statistics)
     bits = grid_bits(image, mesh.points)
     ticks = np.rint(image.to_index(mesh.points) * 2.0**bits).astype(np.int64)
     sizes = (Sizes() if request.sizes is None else request.sizes).prepared(3)
@@ -207,8 +207,8 @@ def _settings(state: WorkState) -> PartSettings:
     return PartSettings(**state.known["settings"])
 
 
-def _history(state: WorkState) -> list[Record]:
-    return [Record(*row) for row in state.known["history"]]
+def _history(state: WorkState) -> list[IterationRecord]:
+    return [IterationRecord(*row) for row in state.known["history"]]
 
 
 def _cut(run: _Run, state: WorkState, counts: tuple[int, ...], shift: float) -> list[Piece]:
@@ -280,7 +280,7 @@ def _completed(run: _Run, state: WorkState, mesh: Shared, numbers: list[Numbers]
     movement = np.sqrt(sum(each.n_nodes * each.movement**2 for each in numbers) / n_nodes)
     seconds, n_voxels = time.perf_counter() - run.begin, sum(each.n_voxels for each in numbers)
     history.append(
-        Record(
+        IterationRecord(
             number * ROUND_SWEEPS, float(E), float(E_G), float(E_D), float(movement), number > 0, len(mesh.cells),
             n_voxels, seconds,
         )
@@ -344,7 +344,7 @@ def _finished(
     mesh = joined([piece.ticks for piece in parts], [piece.cells for piece in parts])
     scale = 2.0 ** -_settings(state).bits
     fields = {name: np.concatenate([each[name] for each, _ in done]) for name in done[0][0]}
-    result = Optimized(
+    result = MeshingResult(
         Mesh(run.image.to_world(mesh.ticks * scale), mesh.cells), history, ended,
         initial=_initial(run, state), nodes=run.request.nodes,
         seconds_run=time.perf_counter() - run.begin,

@@ -17,7 +17,7 @@ from scipy.ndimage import distance_transform_edt, uniform_filter
 
 from tetopt.check import facets_on_box
 from tetopt.energy.sampling import cell_moments
-from tetopt.engine.loop import Optimized, Record
+from tetopt.engine.loop import IterationRecord, MeshingResult
 from tetopt.errors import InputError
 from tetopt.geometry.box import world_axes
 from tetopt.geometry.cut import plane_cut, triangle_cut
@@ -51,7 +51,7 @@ def save_figure(figure: Figure, path: str | Path, dpi: int = 150) -> None:
 
 
 def save_run_figures(
-    paths: Sequence[Path], image: Image, initial: Mesh, result: Optimized, start: str = "lattice",
+    paths: Sequence[Path], image: Image, initial: Mesh, result: MeshingResult, start: str = "lattice",
     whole: Image | None = None,
 ) -> None:  # fmt: skip
     """Three PNGs of a run: slice with mesh before and after, rho histograms before and after, energies.
@@ -403,7 +403,7 @@ def histogram_figure(meshes: Sequence[tuple[str, Mesh]]) -> Figure:
     return figure
 
 
-def energy_figure(history: Sequence[Record]) -> Figure:
+def energy_figure(history: Sequence[IterationRecord]) -> Figure:
     """E, E_G and E_D by iteration relative to the initial mesh, and the nodes' relative movement; Fig. 1(c)."""
     figure = Figure(figsize=(7.5, 5.6), layout="constrained")
     top, bottom = figure.subplots(2, 1, sharex=True, height_ratios=(2, 1))

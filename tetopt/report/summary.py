@@ -13,7 +13,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.engine.loop import Optimized
+from tetopt.engine.loop import MeshingResult
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import node_count
 from tetopt.image import Image, VoxelGrid
@@ -62,7 +62,7 @@ def image_summary(image: Image | StoredContent) -> dict[str, Any]:
 
 
 def run_summary(
-    image: Image | Content | StoredContent, initial: Mesh, result: Optimized, about: dict[str, Any],
+    image: Image | Content | StoredContent, initial: Mesh, result: MeshingResult, about: dict[str, Any],
     seconds: dict[str, float], shapes: tuple[Quality | None, Quality | None] | None = None,
 ) -> dict[str, Any]:  # fmt: skip
     """Every number of a run: options and file (`about`), versions, energies by iteration, quality before and after.

@@ -14,7 +14,7 @@ from tetopt.geometry.box import box_sides, is_on_sides
 from tetopt.geometry.simplex import squared_edges, volumes
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.start.lattice import lattice
+from tetopt.start.lattice import lattice_mesh
 from tetopt.target.domain import ON_SURFACE_VOXELS, Region, levels
 
 SNAP_SHARE = 0.3  # of an edge: a node that lies as near to the surface along it is put on the surface
@@ -52,19 +52,19 @@ def lattice_within(
     image: Image, region: Region | None, kind: str | None = None, *, nodes: int | None = None,
     spacing: float | None = None,
 ) -> Mesh:  # fmt: skip
-    """`tetopt.lattice` of the image's box, cut off at the region's surface, with about `nodes` nodes in it.
+    """`tetopt.lattice_mesh` of the image's box, cut off at the region's surface, with about `nodes` nodes in it.
 
     Raises
     ------
     InputError
-        As `tetopt.lattice` and `clipped`.
+        As `tetopt.lattice_mesh` and `clipped`.
     """
     if region is None or nodes is None:
-        mesh = lattice(image, kind, nodes=nodes, spacing=spacing)
+        mesh = lattice_mesh(image, kind, nodes=nodes, spacing=spacing)
         return mesh if region is None else clipped(mesh, image, region)
     in_box, best = nodes * region.inside.size / region.inside.sum(), None  # nodes of a lattice of the whole box
     for _ in range(LATTICE_TRIALS):
-        mesh = clipped(lattice(image, kind, nodes=int(in_box)), image, region)
+        mesh = clipped(lattice_mesh(image, kind, nodes=int(in_box)), image, region)
         if best is None or abs(len(mesh.points) - nodes) < abs(len(best.points) - nodes):
             best = mesh
         in_box *= nodes / len(mesh.points)

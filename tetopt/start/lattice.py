@@ -31,7 +31,7 @@ LATTICE_NODE_BYTES = 800.0  # six cells of four node numbers, and as they are pu
 MAX_NODES = 50_000_000  # six times as many cells, whose node numbers alone take 10 GB
 
 
-def lattice(
+def lattice_mesh(
     image: Image,
     kind: str | None = None,
     *,
@@ -66,17 +66,17 @@ def lattice(
 
     See Also
     --------
-    octree : A graded mesh.
+    octree_mesh : A graded mesh.
     mesh_image : Begins with one, in its mode "uniform".
 
     Examples
     --------
     >>> square = tetopt.Image(np.zeros((70, 70)))
-    >>> mesh = tetopt.lattice(square, blocks=(7, 7))  # Fig. 2(a)
+    >>> mesh = tetopt.lattice_mesh(square, blocks=(7, 7))  # Fig. 2(a)
     >>> len(mesh.points), len(mesh.cells)
     (113, 196)
     >>> cube = tetopt.Image(np.zeros((40, 40, 40)))
-    >>> [len(tetopt.lattice(cube, kind, nodes=1000).points) for kind in ("bcc", "five-tet")]
+    >>> [len(tetopt.lattice_mesh(cube, kind, nodes=1000).points) for kind in ("bcc", "five-tet")]
     [968, 1000]
     """
     n = image.ndim

@@ -76,7 +76,7 @@ TIE_BREAKS = (1e-5, 1e-4, 1e-3)  # see `delaunay`, tried in turn: with 1e-7, 2 o
 FLAT_VOLUME_SHARE = 1e-6  # of the mean volume: a cell with less is flat
 
 
-def octree(
+def octree_mesh(
     image: Image | Content | StoredImage, nodes: int, sizes: Sizes | None = None, statistics: Statistics | None = None
 ) -> Mesh:
     """A graded mesh of the image's box, or of the mask's region.
@@ -109,13 +109,13 @@ def octree(
 
     See Also
     --------
-    lattice : A uniform mesh.
+    lattice_mesh : A uniform mesh.
     optimize : Moves its nodes and exchanges them.
 
     Examples
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-    >>> mesh = tetopt.octree(image, 300)
+    >>> mesh = tetopt.octree_mesh(image, 300)
     >>> numbers = tetopt.quality(mesh.points, mesh.cells)
     >>> numbers.n_nodes, round(numbers.max_edge / numbers.min_edge, 1)
     (303, 3.3)
@@ -242,7 +242,7 @@ def is_near(count: int, nodes: int) -> bool:
 def nearest_octree(
     image: Image | Content | StoredImage, nodes: int, sizes: Sizes | None = None, statistics: Statistics | None = None
 ) -> Mesh:
-    """As `octree`, but with any number of nodes, if the image or the limits on sizes allow no nearer one."""
+    """As `octree_mesh`, but with any number of nodes, if the image or the limits on sizes allow no nearer one."""
     source = source_of(image, statistics)
     return _octree_within(source, nodes, _block_limits(source, nodes, sizes))
 

@@ -39,7 +39,7 @@ UNEVEN_SHARE = 1.5  # a cell's longest edge over the edge that gradation gives: 
 
 
 class Sizes(NamedTuple):
-    """Targets and limits for the edges of cells where `octree` and the exchanges of `optimize` put nodes in and out.
+    """Targets and limits for the edges of cells where `octree_mesh` and the exchanges of `optimize` put nodes.
 
     A target (`largest`, `field`) is for the usual edge: octrees begin near it, edges over sqrt 2 times it are split, as
     far as there are nodes, and no collapse makes one. Where the image is worth it, cells are smaller. That takes up to
@@ -257,7 +257,7 @@ class Sizes(NamedTuple):
         Examples
         --------
         >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-        >>> mesh = tetopt.lattice(image, nodes=300)
+        >>> mesh = tetopt.lattice_mesh(image, nodes=300)
         >>> field = tetopt.Image(np.where(image.data > 60.0, 6.0, 0.0), image.affine)
         >>> targets = tetopt.Sizes(field=field).around(mesh.points, mesh.cells)
         >>> float(targets.min()), bool(np.isfinite(targets).all())
@@ -297,7 +297,7 @@ class Sizes(NamedTuple):
         Examples
         --------
         >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-        >>> mesh = tetopt.lattice(image, nodes=300)
+        >>> mesh = tetopt.lattice_mesh(image, nodes=300)
         >>> sizes, own = tetopt.Sizes(largest=12.0), np.full(len(mesh.points), 16.0)
         >>> target = sizes.around(mesh.points, mesh.cells)
         >>> longest = sizes.longest_edges(image, 300, mesh.points, mesh.cells, own, target)

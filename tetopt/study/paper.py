@@ -16,7 +16,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from tetopt.energy.discretization import E_D, combined
 from tetopt.energy.geometric import E_G
-from tetopt.engine.loop import Optimized
+from tetopt.engine.loop import MeshingResult
 from tetopt.engine.paper import optimize_paper
 from tetopt.errors import InputError
 from tetopt.fem.conditioning import conditioning
@@ -31,7 +31,7 @@ from tetopt.model.laws import Law
 from tetopt.model.materials import DEFAULT_NU
 from tetopt.phantom import load_phantom
 from tetopt.start.delaunay import delaunay
-from tetopt.start.lattice import lattice
+from tetopt.start.lattice import lattice_mesh
 
 
 def printed() -> dict[str, Any]:
@@ -45,7 +45,7 @@ class Case(NamedTuple):
     title: str
     image: Image
     initial: Mesh
-    result: Optimized
+    result: MeshingResult
 
 
 def errors_of(mesh: Mesh) -> QualityErrors:
@@ -107,7 +107,7 @@ def figure_2(k_D: float) -> Case:
     nodes fixed as in the paper's Section 4.
     """
     image = load_phantom("fig2_2d").image()
-    mesh = lattice(image, blocks=(7, 7))
+    mesh = lattice_mesh(image, blocks=(7, 7))
     return Case(f"k_D = {k_D:g}", image, mesh, optimize_paper(image, mesh, k_D=k_D, iterations=20, boundary="fixed"))
 
 
@@ -128,7 +128,7 @@ def _energies_2b(n_places: int) -> tuple[Image, Mesh, NDArray[np.float64], NDArr
     size = 60
     index = np.stack(np.meshgrid(np.arange(size), np.arange(size), indexing="ij"), axis=-1)
     image = Image(np.where(index @ [1.0, 0.45] > 58.0, 200.0, 60.0))
-    mesh = lattice(image, blocks=(1, 1))
+    mesh = lattice_mesh(image, blocks=(1, 1))
     places = np.linspace(0.12, 0.88, n_places) * size - 0.5
     energies = np.empty((2, n_places, n_places))
     for i, x in enumerate(places):
@@ -164,7 +164,7 @@ def figure_3ab(volume: Image) -> Case:
     middle = image_slice(volume, axis, int(0.47 * volume.shape[axis]))
     image = _cropped_to_content(middle, (8, 7) if middle.shape[0] > middle.shape[1] else (7, 8))
     blocks = (8, 7) if image.spacing[0] * image.shape[0] > image.spacing[1] * image.shape[1] else (7, 8)
-    mesh = lattice(image, blocks=blocks)
+    mesh = lattice_mesh(image, blocks=blocks)
     result = optimize_paper(image, mesh, k_D=0.2, iterations=20, boundary="fixed")
     return Case("brain MR slice", image, mesh, result)
 
@@ -220,7 +220,7 @@ def elastography(snr_db: float | None, nu: float = DEFAULT_NU) -> Image:
     no noise), and is kept above a fifth of its median before it is inverted, as a strain imager would clip it.
     """
     stiffness = load_phantom("prostate_2d").image()
-    fine = lattice(stiffness, blocks=stiffness.shape)
+    fine = lattice_mesh(stiffness, blocks=stiffness.shape)
     young = cell_young(stiffness, fine, average="mean")
     bottom, top = box_faces(stiffness, fine)
     height = stiffness.shape[1] * stiffness.spacing[1]
@@ -239,7 +239,7 @@ def elastography(snr_db: float | None, nu: float = DEFAULT_NU) -> Image:
 def figure_3cd(snr_db: float | None) -> Case:
     """The approximate-stiffness image on 113 nodes, k_D = 0.3, 15 iterations (Fig. 3(c, d), Table 1 rows 6, 7)."""
     image = elastography(snr_db)
-    mesh = lattice(image, blocks=(7, 7))
+    mesh = lattice_mesh(image, blocks=(7, 7))
     result = optimize_paper(image, mesh, k_D=0.3, iterations=15, boundary="fixed")
     return Case("no noise" if snr_db is None else f"SNR {snr_db:g} dB", image, mesh, result)
 
@@ -258,7 +258,7 @@ def figure_3ef(volume: Image) -> Case:
     low = np.clip(np.rint(centre - half), 0, None)
     high = np.minimum(np.rint(centre + half), volume.shape)
     image = cropped(volume, [(int(a), int(b)) for a, b in zip(low, high, strict=True)])
-    mesh = lattice(image, "five-tet", blocks=tuple(int(b) for b in blocks))
+    mesh = lattice_mesh(image, "five-tet", blocks=tuple(int(b) for b in blocks))
     result = optimize_paper(image, mesh, k_D=0.3, iterations=15, boundary="slide")
     return Case("brain MR volume", image, mesh, result)
 
@@ -268,7 +268,7 @@ def figure_3ef(volume: Image) -> Case:
 
 def segmentation_case(volume: Image) -> Case:
     """The whole volume on about 5000 nodes, a cell to some 300 voxels; k_D = 0.3, 10 iterations."""
-    mesh = lattice(volume, nodes=5000)
+    mesh = lattice_mesh(volume, nodes=5000)
     return Case("brain MR volume", volume, mesh, optimize_paper(volume, mesh, k_D=0.3, iterations=10))
 
 

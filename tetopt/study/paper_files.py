@@ -15,7 +15,7 @@ from tetopt.geometry.simplex import rho
 from tetopt.geometry.topology import largest_component
 from tetopt.image import Image
 from tetopt.io.files import save_json
-from tetopt.measure.segmentation import dice, segmented, thresholded
+from tetopt.measure.segmentation import dice, segment, thresholded
 from tetopt.mesh import Mesh
 from tetopt.phantom import load_phantom
 from tetopt.report.figures import save_figure, slice_figure
@@ -139,8 +139,8 @@ def _figure_2(paths: dict[str, Path]) -> dict[str, Any]:
     truth = load_phantom("fig2_2d").label_image()
     overlaps = {
         "voxels": dice(thresholded(cases[1].image, 4), truth),
-        "initial mesh": dice(segmented(cases[1].image, initial, 4), truth),
-        "k_D = 0.3": dice(segmented(cases[1].image, cases[1].result.mesh, 4), truth),
+        "initial mesh": dice(segment(cases[1].image, initial, 4), truth),
+        "k_D = 0.3": dice(segment(cases[1].image, cases[1].result.mesh, 4), truth),
     }
     worst = cases[1].result.mesh
     flat = np.sort((0.5 - rho(worst.points, worst.cells)) ** 2)[-2:]
@@ -256,8 +256,8 @@ def _segmentation(volume: Image, tissue: Image) -> dict[str, Any]:
         for classes in (4, 8)
         for name, labels in (
             ("voxels", thresholded(volume, classes)),
-            ("lattice", segmented(volume, case.initial, classes)),
-            ("optimised", segmented(volume, case.result.mesh, classes)),
+            ("lattice", segment(volume, case.initial, classes)),
+            ("optimised", segment(volume, case.result.mesh, classes)),
         )
     }
     share = volume.data.size / len(case.initial.cells)

@@ -17,7 +17,7 @@ from tetopt.engine.meshing import MODE_DEFAULTS, Mode, mesh_image
 from tetopt.geometry.quadratic import node_count
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.start.lattice import lattice
+from tetopt.start.lattice import lattice_mesh
 from tetopt.study.cleaver import stuffed
 from tetopt.study.interfaces import OTSU_CLASSES, class_labels, interfaces
 from tetopt.study.search import LEAST_REQUEST, REQUEST_RESPONSE, corners_for, tries
@@ -74,7 +74,7 @@ def bcc(job: PipelineInput) -> Produced:
     with _timed(seconds, "lattice"):
         first = corners_for(job.nodes, job.order) / job.nodes
         runs = tries(
-            lambda factor: lattice(job.image, nodes=max(round(factor * job.nodes), LEAST_REQUEST)),
+            lambda factor: lattice_mesh(job.image, nodes=max(round(factor * job.nodes), LEAST_REQUEST)),
             lambda mesh: node_count(mesh.points, mesh.cells, job.order),
             job.nodes, REQUEST_RESPONSE, first=first, most=1 if job.order == 1 else LATTICE_RUNS,
         )  # fmt: skip

@@ -31,7 +31,7 @@ from tetopt.geometry.simplex import oriented, volumes
 from tetopt.geometry.topology import boundary_facets
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.start.lattice import lattice
+from tetopt.start.lattice import lattice_mesh
 from tetopt.study.endings import NotInstalled
 from tetopt.study.interfaces import Surfaces, compacted
 from tetopt.study.search import Response, corners_for, is_near, tries
@@ -163,7 +163,7 @@ def _sizing_field(surfaces: Surfaces, edge: float) -> tuple[NDArray, NDArray, ND
     """Lattice points, tetrahedra and edges to aim for: `edge` at the interfaces, longer with the distance from them."""
     size = surfaces.high - surfaces.low
     blocks = tuple(int(b) for b in np.clip(np.ceil(size / (0.75 * edge)), 2, 40))
-    unit = lattice(Image(np.zeros((2, 2, 2))), "five-tet", blocks=blocks)
+    unit = lattice_mesh(Image(np.zeros((2, 2, 2))), "five-tet", blocks=blocks)
     middle = 0.5 * (surfaces.low + surfaces.high)
     points = middle + 1.01 * ((unit.points + 0.5) / 2.0 - 0.5) * size  # a little over the box: no node may fall out
     facets = surfaces.points[surfaces.triangles[: -surfaces.n_box]]

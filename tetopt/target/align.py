@@ -27,7 +27,7 @@ SMALL_PIECE_SHARE = 0.01  # of the largest piece's voxels: pieces with fewer do 
 LEAST_CLASS_SHARE = 0.001  # of the voxels: a background or foreground with fewer, found without a level, is none
 
 
-def aligned_mask(mask: Image, image: Image, name: str = "mask") -> Image:
+def resample_mask(mask: Image, image: Image, name: str = "mask") -> Image:
     """The mask on the image's voxels; nearest neighbour by the affines where it is on another grid, 0 outside of it.
 
     Parameters
@@ -54,7 +54,7 @@ def aligned_mask(mask: Image, image: Image, name: str = "mask") -> Image:
     --------
     >>> phantom = tetopt.load_phantom("sphere")
     >>> image, fine = phantom.image(voxel_mm=4), phantom.label_image(voxel_mm=2)
-    >>> mask = tetopt.aligned_mask(tetopt.Image(fine.data == 1, fine.affine), image)
+    >>> mask = tetopt.resample_mask(tetopt.Image(fine.data == 1, fine.affine), image)
     >>> mask.shape, np.unique(mask.data).tolist()
     ((16, 16, 16), [0.0, 1.0])
     """
@@ -66,7 +66,7 @@ def aligned_mask(mask: Image, image: Image, name: str = "mask") -> Image:
     return Image(moved, image.affine)
 
 
-def aligned_labels(labels: Image, image: Image, name: str = "labels") -> Image:
+def resample_labels(labels: Image, image: Image, name: str = "labels") -> Image:
     """The labels on the image's voxels; nearest neighbour by the affines where they are on another grid, 0 outside.
 
     Parameters
@@ -92,7 +92,7 @@ def aligned_labels(labels: Image, image: Image, name: str = "labels") -> Image:
     Examples
     --------
     >>> phantom = tetopt.load_phantom("sphere")
-    >>> labels = tetopt.aligned_labels(phantom.label_image(voxel_mm=2), phantom.image(voxel_mm=4))
+    >>> labels = tetopt.resample_labels(phantom.label_image(voxel_mm=2), phantom.image(voxel_mm=4))
     >>> labels.shape, np.unique(labels.data).tolist()
     ((16, 16, 16), [0.0, 1.0])
     """
@@ -112,7 +112,7 @@ def aligned_labels(labels: Image, image: Image, name: str = "labels") -> Image:
     return Image(moved, image.affine)
 
 
-def aligned_contrast(other: Image, image: Image, name: str = "contrast") -> Image:
+def resample_contrast(other: Image, image: Image, name: str = "contrast") -> Image:
     """A further contrast on the image's voxels; linear by the affines where it is on another grid.
 
     Outside of its box the nearest value goes on.
@@ -144,7 +144,7 @@ def aligned_contrast(other: Image, image: Image, name: str = "contrast") -> Imag
     --------
     >>> phantom = tetopt.load_phantom("sphere")
     >>> t1, t2 = phantom.image(voxel_mm=4), phantom.image(voxel_mm=8)
-    >>> tetopt.aligned_contrast(t2, t1).shape
+    >>> tetopt.resample_contrast(t2, t1).shape
     (16, 16, 16)
     """
     _check_axes(name, other, image)
@@ -159,7 +159,7 @@ def aligned_contrast(other: Image, image: Image, name: str = "contrast") -> Imag
     return Image(_resampled(other.data, other, image, 1, "nearest"), image.affine)
 
 
-def foreground(image: Image, level: float | None = None) -> Image:
+def foreground_mask(image: Image, level: float | None = None) -> Image:
     """0/1 mask of what is not background.
 
     Background are the voxels not above the level that hang together, face to face, with the border of the box: dark
@@ -187,7 +187,7 @@ def foreground(image: Image, level: float | None = None) -> Image:
     Examples
     --------
     >>> image = tetopt.load_phantom("sphere").image(voxel_mm=4)
-    >>> mask = tetopt.foreground(image, 60.0)
+    >>> mask = tetopt.foreground_mask(image, 60.0)
     >>> int(mask.data.sum())  # voxels
     504
     >>> result = tetopt.mesh_image(tetopt.content(image, mask=mask), 200, iterations=4)

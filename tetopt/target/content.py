@@ -149,7 +149,7 @@ def content(
     weights: Sequence[float] | None = None, label_weight: float = 1.0, smooth_interfaces: float = SMOOTH_INTERFACES,
     keep_components: bool = False,
 ) -> Content:  # fmt: skip
-    """Contrasts, labels and a mask on the voxels of the first image, for `mesh_image`, `octree` or `optimize`.
+    """Contrasts, labels and a mask on the voxels of the first image, for `mesh_image`, `octree_mesh` or `optimize`.
 
     Parameters
     ----------
@@ -176,7 +176,7 @@ def content(
     Returns
     -------
     Content
-        For `mesh_image`, `octree` or `optimize`, in place of an image.
+        For `mesh_image`, `octree_mesh` or `optimize`, in place of an image.
 
     Raises
     ------
@@ -185,8 +185,8 @@ def content(
 
     See Also
     --------
-    aligned_contrast, aligned_labels, aligned_mask : What lies on other voxels.
-    foreground : A mask of what is not background.
+    resample_contrast, resample_labels, resample_mask : What lies on other voxels.
+    foreground_mask : A mask of what is not background.
 
     Examples
     --------
@@ -363,11 +363,13 @@ def _check(
     for name, image in named:
         if image.shape != first.shape:
             raise InputError(
-                f"{name}: expected all of shape {first.shape}, got {image.shape}; see tetopt.aligned_mask and the like"
+                f"{name}: expected all of shape {first.shape}, got {image.shape}; see tetopt.resample_mask and the like"
             )
         last = np.array(first.shape) - 1
         if np.abs(first.to_index(image.to_world([0 * last, last])) - [0 * last, last]).max() > SAME_PLACE_VOXELS:
-            raise InputError(f"{name}: expected voxels in the same place as the first image's; see tetopt.aligned_mask")
+            raise InputError(
+                f"{name}: expected voxels in the same place as the first image's; see tetopt.resample_mask"
+            )
     check_weights(len(images), weights, label_weight, smooth_interfaces)
     if others["labels"] is not None:
         check_labels("labels", others["labels"])

@@ -65,7 +65,7 @@ class Statistics(NamedTuple):
 
 
 def stored_statistics(image: StoredImage) -> Statistics:
-    """Statistics of a stored image from one pass, of which `octree` and parts need a few.
+    """Statistics of a stored image from one pass, of which `octree_mesh` and parts need a few.
 
     Parameters
     ----------
