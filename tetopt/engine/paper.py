@@ -66,7 +66,7 @@ def optimize_paper(
         The intensities h.
     mesh : Mesh
         The initial mesh, which also normalises the two energies; for re-tessellation it must fill the image's
-        box, as `tetopt.start.lattice.lattice` does.
+        box, as `tetopt.start.lattice.lattice_mesh` does.
     k_D : float
         Weight of the image, 0 <= k_D < 1. With 0 a node moves to the minimiser of E_G (Lloyd's relaxation),
         else by descent with numerical derivatives.

@@ -68,7 +68,7 @@ def bcc(job: PipelineInput) -> Produced:
     Raises
     ------
     InputError
-        As `tetopt.start.lattice.lattice`.
+        As `tetopt.start.lattice.lattice_mesh`.
     """
     seconds: dict[str, float] = {}
     with _timed(seconds, "lattice"):
