@@ -99,8 +99,8 @@ def mesh_image(
         says so in `missed`.
     mode : {"graded", "uniform", "paper", "start"}
         "graded", the default: `octree_mesh`, then `optimize` with exchanges of nodes. "uniform": `lattice_mesh`, cut
-        off at a mask, then `optimize`. "paper": `lattice_mesh`, then `optimize_paper`; of one image and its whole box. "start", the
-        default with a mesh to start from: `optimize` of that.
+        off at a mask, then `optimize`. "paper": `lattice_mesh`, then `optimize_paper`; of one image and its whole box.
+        "start", the default with a mesh to start from: `optimize` of that.
     start : Mesh
         The mesh to improve. Its boundary stays as it is, unless `boundary="slide"`.
     spacing : float
@@ -136,8 +136,8 @@ def mesh_image(
     ------
     InputError
         As `optimize` or `optimize_paper`; options that do not belong to the mode; neither or both of `nodes` and
-        `target_error`, or `spacing`; a number of nodes that the image is not worth (see `octree_mesh`), or that there is
-        no memory for; an error that its noise does not allow.
+        `target_error`, or `spacing`; a number of nodes that the image is not worth (see `octree_mesh`), or that there
+        is no memory for; an error that its noise does not allow.
     TypeError
         An option of another name.
 
