@@ -26,6 +26,7 @@ import numpy as np
 from scipy.spatial import Delaunay
 
 import tetopt
+from tetopt.contents.content import plain
 from tetopt.energy.sampling import from_ticks, moment_sums, sampling_grid, to_ticks
 from tetopt.engine.fast import Run, prepare_kernels
 from tetopt.engine.flips import flip
@@ -36,7 +37,6 @@ from tetopt.io.files import checked_output, save_json
 from tetopt.io.mni import mni_path, mni_tissue
 from tetopt.report.summary import versions
 from tetopt.start.delaunay import delaunay
-from tetopt.target.content import plain
 
 
 def main(argv: Sequence[str] | None = None) -> int:

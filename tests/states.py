@@ -5,13 +5,13 @@ from hypothesis import assume
 from meshes import delaunay_box
 
 import tetopt
+from tetopt.contents.content import plain
 from tetopt.energy.sampling import channel_grid, from_ticks
 from tetopt.engine.complex import build, energies, node_rings, remeasure
 from tetopt.engine.flips import flip
 from tetopt.engine.repair import repair
 from tetopt.engine.smooth import blocks, sweep
 from tetopt.engine.state import state_of, with_floor
-from tetopt.target.content import plain
 
 OBLIQUE = np.array([[0.9, 0.3, 0.2, -7.0], [-0.25, 1.1, 0.1, 3.0], [0.0, 0.4, -2.5, 11.0], [0.0, 0.0, 0.0, 1.0]])
 

@@ -9,8 +9,8 @@ import pyvista
 from commands import exit_code, labelled_lattice_words, numbers_in
 
 import tetopt
+from tetopt.contents.labels import BACKGROUND_COLOUR, LABEL_PALETTE, hex_colour
 from tetopt.job.model import MANY_INTERFACES
-from tetopt.target.labels import BACKGROUND_COLOUR, LABEL_PALETTE, hex_colour
 
 TABLE = "label,name,color\n0,soft tissue,\n1,bright/ball [é],#ff8000\n9,spleen,#00ff00\n"
 FACES = {"boundary", "left", "right", "posterior", "anterior", "inferior", "superior"}

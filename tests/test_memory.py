@@ -16,6 +16,8 @@ import tetopt
 from tetopt import budget
 from tetopt.cli import run as cli_run
 from tetopt.cli import warm_up
+from tetopt.contents.content import content, plain
+from tetopt.contents.memberships import memberships
 from tetopt.energy.sampling import sampling_grid
 from tetopt.engine import cost, fast
 from tetopt.engine.loop import IterationRecord, MeshingResult
@@ -26,8 +28,6 @@ from tetopt.job.events import listened, started
 from tetopt.job.meshing import prepare, watched
 from tetopt.start.octree import _block_limits, _blocks_by_depth
 from tetopt.start.sums import channels_of, source_of
-from tetopt.target.content import content, plain
-from tetopt.target.memberships import memberships
 
 GIB = 1 << 30
 

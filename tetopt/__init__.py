@@ -12,6 +12,9 @@ place_cache()  # before numba is loaded
 
 if TYPE_CHECKING:
     from tetopt.check import check_mesh
+    from tetopt.contents.align import foreground_mask, resample_contrast, resample_labels, resample_mask
+    from tetopt.contents.content import Content, content
+    from tetopt.contents.statistics import Statistics
     from tetopt.energy.discretization import E_D
     from tetopt.energy.geometric import E_G
     from tetopt.energy.sampling import CellMoments, cell_moments, cell_of_voxel
@@ -52,12 +55,12 @@ if TYPE_CHECKING:
     from tetopt.start.octree import octree_mesh
     from tetopt.start.sizes import Sizes
     from tetopt.stored import StoredImage
-    from tetopt.target.align import foreground_mask, resample_contrast, resample_labels, resample_mask
-    from tetopt.target.content import Content, content
-    from tetopt.target.statistics import Statistics
 
 _NAMES_OF = {  # by module
     "check": ("check_mesh",),
+    "contents.align": ("resample_contrast", "resample_labels", "resample_mask", "foreground_mask"),
+    "contents.content": ("Content", "content"),
+    "contents.statistics": ("Statistics",),
     "energy.discretization": ("E_D",),
     "energy.geometric": ("E_G",),
     "energy.sampling": ("CellMoments", "cell_moments", "cell_of_voxel"),
@@ -98,9 +101,6 @@ _NAMES_OF = {  # by module
     "start.octree": ("octree_mesh",),
     "start.sizes": ("Sizes",),
     "stored": ("StoredImage",),
-    "target.align": ("resample_contrast", "resample_labels", "resample_mask", "foreground_mask"),
-    "target.content": ("Content", "content"),
-    "target.statistics": ("Statistics",),
 }
 __all__ = [
     "E_D",

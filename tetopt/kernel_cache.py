@@ -51,7 +51,7 @@ NOT_KEPT = "compiled kernels cannot be kept, so that later runs compile them aga
 def checksum() -> str:
     """Of the sources of all kernels and of their constants: what is compiled of others is not taken from the cache."""
     folder, total = Path(__file__).parent, 0
-    patterns = ["kernel*.py", *(f"{room}/*.py" for room in ("geometry", "energy", "engine", "start", "target"))]
+    patterns = ["kernel*.py", *(f"{room}/*.py" for room in ("geometry", "energy", "engine", "start", "contents"))]
     for path in sorted(path for pattern in patterns for path in folder.glob(pattern)):
         total = zlib.crc32(path.read_bytes(), total)
     return f"{total:08x}"

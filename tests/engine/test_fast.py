@@ -10,6 +10,7 @@ from scipy.spatial import Delaunay
 from states import CASES, OBLIQUE, Engine, assumed_case, ball, random_case
 
 import tetopt
+from tetopt.contents.content import plain
 from tetopt.energy.discretization import cell_E_D
 from tetopt.energy.geometric import E_G_gradient, cell_E_G
 from tetopt.energy.sampling import from_ticks
@@ -21,7 +22,6 @@ from tetopt.engine.smooth import _add_image_gradient, _add_shape_gradient, gradi
 from tetopt.engine.state import floor_of
 from tetopt.geometry.simplex import dihedral_angles, oriented
 from tetopt.geometry.topology import boundary_facets
-from tetopt.target.content import plain
 
 seeds = st.integers(0, 2**32 - 1)
 dimensions = st.sampled_from([2, 3])

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 import tetopt
+from tetopt.contents.content import content
 from tetopt.energy.sampling import channel_grid, from_ticks
 from tetopt.engine.complex import cell_squares, energies, interface_energy, node_rings, remeasure
 from tetopt.engine.density import Limits, exchange
@@ -16,7 +17,6 @@ from tetopt.engine.state import state_of, with_floor
 from tetopt.engine.surface import combined_ways, constraint_values
 from tetopt.errors import InputError
 from tetopt.measure.interfaces import label_interfaces
-from tetopt.target.content import content
 
 
 def ball_in_ball(n=32, spacing=(1.0, 1.0, 1.0)):

@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 import tetopt
+from tetopt.contents.content import plain
 from tetopt.engine.meshing import sizes_of_order
 from tetopt.geometry.quadratic import quadratic
 from tetopt.start.clip import lattice_within
-from tetopt.target.content import plain
 
 IMAGE = tetopt.load_phantom("sphere").image(voxel_mm=4.0)
 MASK = tetopt.Image((IMAGE.data > 50).astype(np.uint8), IMAGE.affine)

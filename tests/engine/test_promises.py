@@ -6,8 +6,8 @@ from shapes import shaped
 
 import tetopt
 from tetopt.check import manifold_problems
+from tetopt.contents.content import content, plain
 from tetopt.engine.promises import promised, requested
-from tetopt.target.content import content, plain
 
 
 def missed(target, result, min_dihedral=0.0, start=None):

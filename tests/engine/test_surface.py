@@ -9,6 +9,8 @@ from shapes import OBLIQUE, distance, grid, shaped
 
 import tetopt
 from tetopt.check import manifold_problems
+from tetopt.contents.content import content
+from tetopt.contents.domain import levels, region_of
 from tetopt.energy.sampling import cell_of_voxel, channel_grid, moment_sums, overlap_of, to_ticks
 from tetopt.engine.complex import build
 from tetopt.engine.fast import Run
@@ -17,8 +19,6 @@ from tetopt.engine.surface import level_at, put_on_surface
 from tetopt.geometry.topology import boundary_facets, components
 from tetopt.measure.fidelity import cell_labels, label_fidelity, mask_fidelity
 from tetopt.start.clip import lattice_within
-from tetopt.target.content import content
-from tetopt.target.domain import levels, region_of
 
 
 def times_covered(image, mesh):

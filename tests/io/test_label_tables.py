@@ -4,12 +4,12 @@ import json
 
 import pytest
 
+from tetopt.contents.labels import hex_colour
 from tetopt.errors import InputError
 from tetopt.io.label_tables import NO_TABLE, LabelTable, load_label_table
 from tetopt.model.file import table_in
 from tetopt.model.labels import label_words, labels_named, table_of_labels, table_words
 from tetopt.model.sets import MOST_LETTERS, SET_NAME, interface_names, label_set_names
-from tetopt.target.labels import hex_colour
 
 FREESURFER = """#$Id: FreeSurferColorLUT.txt $
 #No. Label Name:                            R   G   B   A

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 
 import tetopt
+from tetopt.contents import otsu
+from tetopt.contents.otsu import class_thresholds
 from tetopt.measure.segmentation import dice, segment, thresholded
-from tetopt.target import otsu
-from tetopt.target.otsu import class_thresholds
 
 
 def within(values, weights, thresholds):

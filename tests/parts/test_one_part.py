@@ -7,6 +7,7 @@ import pytest
 from parted import SKEW, balls
 
 import tetopt
+from tetopt.contents.content import plain
 from tetopt.energy.sampling import grid_bits
 from tetopt.engine.fast import Run
 from tetopt.engine.loop import Whole
@@ -16,7 +17,6 @@ from tetopt.model.fields import cell_fields
 from tetopt.parts.cut import Shared, joined, pieces
 from tetopt.parts.part import PartSettings, work_on
 from tetopt.parts.work import done_path, load_arrays, round_folder, save_arrays, save_volume
-from tetopt.target.content import plain
 
 AFFINES = {
     "voxels of 1 mm": np.eye(4),

@@ -17,12 +17,12 @@ from worlds import random_world
 
 import tetopt
 from tetopt.check import manifold_problems
+from tetopt.contents.content import plain
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.engine.complex import build, remeasure
 from tetopt.engine.fast import FAR_TICKS, Run
 from tetopt.engine.interfaces import relabel
 from tetopt.start.sizes import Sizes
-from tetopt.target.content import plain
 
 CHECKED_EVERY = 1000  # operations
 WORLD_OPERATIONS = 10_000  # then another world

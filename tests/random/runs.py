@@ -19,10 +19,10 @@ import scipy
 from worlds import random_world, sharpest_edge
 
 import tetopt
+from tetopt.contents.content import plain
 from tetopt.measure.fidelity import mask_fidelity
 from tetopt.report.summary import mesh_hash
 from tetopt.start.octree import nearest_octree
-from tetopt.target.content import plain
 
 MODES = ("graded", "graded", "graded", "uniform", "paper", "start")
 LEAST_BOX_ANGLE = 24.0  # degrees, of labelled worlds: no mesh has larger angles at an edge of the box than the box

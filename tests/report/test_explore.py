@@ -10,6 +10,7 @@ import pytest
 from browser import BLIND, FRAMES, copied, document
 
 import tetopt
+from tetopt.contents.labels import LABEL_PALETTE
 from tetopt.errors import InputError
 from tetopt.geometry.cut import plane_cut
 from tetopt.geometry.simplex import centroids, volumes
@@ -18,7 +19,6 @@ from tetopt.model.labels import LabelTable
 from tetopt.report import explore
 from tetopt.report.exhibit import exhibit, first_axis, opened_on, warp_factors
 from tetopt.report.explore import colour_table, explorer_html, save_explorer
-from tetopt.target.labels import LABEL_PALETTE
 
 
 @pytest.fixture(scope="module")

@@ -10,6 +10,7 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.colors import to_rgb, to_rgba, to_rgba_array
 from matplotlib.figure import Figure
 
+from tetopt.contents.labels import BACKGROUND_COLOUR, LABEL_PALETTE
 from tetopt.energy.sampling import cell_moments, cell_of_voxel
 from tetopt.engine.loop import IterationRecord, MeshingResult
 from tetopt.engine.paper import optimize_paper
@@ -39,7 +40,6 @@ from tetopt.report.figures import (
 )
 from tetopt.report.scene import save_scenes
 from tetopt.start.lattice import lattice_mesh
-from tetopt.target.labels import BACKGROUND_COLOUR, LABEL_PALETTE
 
 DOLLARS = LabelTable({1: r"5 $\frac$ and a_b"}, {})
 SHAPE = (5, 7, 9)

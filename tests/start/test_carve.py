@@ -5,9 +5,9 @@ import pytest
 from shapes import distance, shaped
 
 import tetopt
+from tetopt.contents.content import content
 from tetopt.geometry.topology import components
 from tetopt.start.carve import carved, n_components, part_of
-from tetopt.target.content import content
 
 
 @pytest.fixture(scope="module")

@@ -8,8 +8,8 @@ import pytest
 from scipy import ndimage
 
 import tetopt
+from tetopt.contents.noise import noise_level
 from tetopt.start.octree import octree_mesh
-from tetopt.target.noise import noise_level
 
 OBLIQUE = np.array([[0.9, 0.3, 0.2, -7.0], [-0.25, 1.1, 0.1, 3.0], [0.0, 0.4, -1.5, 11.0], [0.0, 0.0, 0.0, 1.0]])
 

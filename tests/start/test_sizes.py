@@ -474,7 +474,7 @@ def test_exchanges_do_not_follow_noise(monkeypatch):
         with monkeypatch.context() as patched:
             patched.setattr(fast, "exchange", counted)
             if not known:
-                patched.setattr(sys.modules["tetopt.target.content"], "noise_level", lambda data, inside: 0.0)
+                patched.setattr(sys.modules["tetopt.contents.content"], "noise_level", lambda data, inside: 0.0)
             tetopt.optimize(image, start, k_D=0.85, nodes=len(start.points), iterations=8)
         count[known] = sum(made)
     assert count[False] > 100

@@ -7,11 +7,11 @@ import numpy as np
 import pytest
 
 import tetopt
+from tetopt.contents.content import content, plain
+from tetopt.contents.statistics import stored_boxes, stored_statistics
 from tetopt.start.octree import nearest_octree, octree_mesh
 from tetopt.start.sums import _add_rows, block_sums, channels_of, source_of
 from tetopt.stored import StoredImage
-from tetopt.target.content import content, plain
-from tetopt.target.statistics import stored_boxes, stored_statistics
 
 OBLIQUE = np.array([[0.9, 0.3, 0.2, -7.0], [-0.25, 1.1, 0.1, 3.0], [0.0, 0.4, -1.5, 11.0], [0.0, 0.0, 0.0, 1.0]])
 THICK = np.diag([0.7, 0.8, 2.5, 1.0])
@@ -55,7 +55,7 @@ def assert_same(mesh, expected):
 def test_octree_is_that_of_voxels_in_memory(shape, dtype, affine, chunks, most, monkeypatch):
     image = tetopt.Image(noisy(shape, dtype), affine)
     expected = octree_mesh(image, 700)
-    statistics = sys.modules["tetopt.target.statistics"]
+    statistics = sys.modules["tetopt.contents.statistics"]
     monkeypatch.setattr(statistics, "READ_BYTES", most[0])
     monkeypatch.setattr(statistics, "PIECE_VOXELS", most[1])
     voxels = Recorded(noisy(shape, dtype), chunks)
@@ -125,7 +125,7 @@ def test_statistics(dtype):
 @pytest.mark.parametrize("is_masked", [False, True])
 def test_sums_are_those_of_each_block_s_voxels(shape, counts, is_masked, monkeypatch):
     """Two contrasts, in whole numbers, with and without a mask; also where blocks are smaller than voxels."""
-    monkeypatch.setattr(sys.modules["tetopt.target.statistics"], "PIECE_VOXELS", 3 * shape[-1])
+    monkeypatch.setattr(sys.modules["tetopt.contents.statistics"], "PIECE_VOXELS", 3 * shape[-1])
     rng = np.random.default_rng(5)
     images = [tetopt.Image(rng.integers(0, 50, shape)) for _ in range(2)]
     mask = tetopt.Image(rng.random(shape) < 0.8) if is_masked else None
@@ -171,7 +171,7 @@ def spoiled(value, dtype=np.float32):
     ],
 )
 def test_voxels_that_no_image_takes(data, words, monkeypatch):
-    monkeypatch.setattr(sys.modules["tetopt.target.statistics"], "READ_BYTES", 3 * 12 * data.itemsize)
+    monkeypatch.setattr(sys.modules["tetopt.contents.statistics"], "READ_BYTES", 3 * 12 * data.itemsize)
     with pytest.raises(tetopt.InputError, match=words) as stored:
         octree_mesh(StoredImage(Recorded(data, (12, 4, 12))), 100)
     with pytest.raises(tetopt.InputError) as in_memory:

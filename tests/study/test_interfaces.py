@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import tetopt
+from tetopt.contents.otsu import class_thresholds
 from tetopt.study.interfaces import Surfaces, class_labels, interfaces
-from tetopt.target.otsu import class_thresholds
 
 PHANTOM = tetopt.load_phantom("sphere")  # radius 20 mm about the origin
 IMAGE, LABELS = PHANTOM.image(voxel_mm=2.0), PHANTOM.label_image(voxel_mm=2.0)

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 
 import tetopt
+from tetopt.contents.content import content
 from tetopt.study.pipelines import PIPELINES, PipelineInput
-from tetopt.target.content import content
 
 IMAGE = tetopt.load_phantom("sphere").image(voxel_mm=4.0)
 LABELS = tetopt.Image((IMAGE.data > 50) + 2 * (np.indices(IMAGE.shape)[0] > 12), IMAGE.affine)

@@ -16,6 +16,8 @@ from tetopt.check import check_unfolded
 from tetopt.cli.console import log, out
 from tetopt.cli.options import LabelledPart, MeshArgument, NumberOptions, option
 from tetopt.cli.solver import print_model
+from tetopt.contents.align import resample_mask
+from tetopt.contents.content import continued
 from tetopt.io.abaqus import input_sets
 from tetopt.io.files import checked_output, save_json
 from tetopt.io.formats import FORMATS, format_of
@@ -40,8 +42,6 @@ from tetopt.model.fields import cell_fields, is_result, is_stress
 from tetopt.model.file import MATERIAL_FIELDS, TEXTS_KEPT, MeshFile
 from tetopt.model.sets import Sets, box_of, box_text, merged_sets
 from tetopt.report.summary import model_summary, versions
-from tetopt.target.align import resample_mask
-from tetopt.target.content import continued
 
 
 def convert_command(

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt.contents.content import Content
 from tetopt.energy.sampling import cell_moments, channel_grid, check_orientations, moment_sums, to_ticks
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.target.content import Content
 
 
 def cell_E_D(image: Image, mesh: Mesh) -> NDArray[np.float64]:

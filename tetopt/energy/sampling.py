@@ -31,6 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.budget import check_memory
+from tetopt.contents.content import Content
 from tetopt.errors import InputError
 from tetopt.geometry.topology import Facets, facets
 from tetopt.geometry.vectors import cross, difference, dot, row
@@ -53,7 +54,6 @@ from tetopt.kernels import (
     unit,
 )
 from tetopt.mesh import Mesh
-from tetopt.target.content import Content
 
 EDGE_MARGIN = 0.5 - 1e-9  # voxels: between its ends an edge's cut is known to far less than the rest of 0.5
 SUM_BYTES = 12.0  # of each prefix sum at a voxel: 8, and temporary arrays

@@ -17,6 +17,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt.contents.content import Content, plain
+from tetopt.contents.content import content as make_content
 from tetopt.energy.sampling import cell_of_voxel, channel_grid, from_ticks
 from tetopt.engine.complex import State, copied, interface_energy, node_rings, remeasure, without_cells
 from tetopt.engine.density import Limits, compacted, exchange
@@ -48,8 +50,6 @@ from tetopt.notebook import with_bar
 from tetopt.start.carve import carved
 from tetopt.start.lattice import lattice_mesh
 from tetopt.start.sizes import Sizes
-from tetopt.target.content import Content, plain
-from tetopt.target.content import content as make_content
 
 FLIP_EDGES = 0.05  # edges: nodes that moved less need no new flips
 HOPE_SHARE = 0.003  # of E over the number of nodes: nodes whose next move may win less are not moved

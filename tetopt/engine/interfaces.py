@@ -11,6 +11,7 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from tetopt.contents.content import Content
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.engine.complex import NodeRings, State, facet_area, image_energy, node_rings, outward, pair_tension
 from tetopt.engine.labelling import keeps_topology, labelled, unpinched, voxel_pieces
@@ -20,7 +21,6 @@ from tetopt.geometry.simplex import centroids, volumes
 from tetopt.geometry.topology import facets
 from tetopt.kernels import Floats1, Ints1, entry, helper, unit
 from tetopt.mesh import Mesh
-from tetopt.target.content import Content
 
 RELABELLING_PASSES = 10  # at most; the third mostly changes nothing
 LEAST_RELABELLING_SHARE = 1e-9  # of the energies weighed: a smaller gain may be rounding

@@ -11,12 +11,12 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tetopt import notebook
+from tetopt.contents.labels import colours_by_number
 from tetopt.energy.sampling import SamplingGrid
 from tetopt.geometry.box import facets_on_sides
 from tetopt.geometry.topology import Facets, boundary_facets
 from tetopt.image import Image, transformed
 from tetopt.mesh import Mesh
-from tetopt.target.labels import colours_by_number
 
 # The defaults of every way in, and their evidence (docs/measured/k_d.md, docs/understand/sizes.md).
 UNIFORM_K_D = 0.2  # nearly all that the displacement gains by the image, at hardly any cost in shape

@@ -17,6 +17,7 @@ from typing import Any, Literal
 import numpy as np
 
 from tetopt.budget import check_memory
+from tetopt.contents.content import Content, StoredContent, plain
 from tetopt.engine.cost import meshing_bytes
 from tetopt.engine.fast import optimize
 from tetopt.engine.loop import (
@@ -39,7 +40,6 @@ from tetopt.start.carve import carved, part_of
 from tetopt.start.clip import lattice_within
 from tetopt.start.octree import is_near, nearest_octree, nodes_of_sizes, octree_mesh
 from tetopt.start.sizes import Sizes
-from tetopt.target.content import Content, StoredContent, plain
 
 Mode = Literal["graded", "uniform", "paper", "start"]
 Run = Callable[..., MeshingResult]  # an optimisation that is ready to begin; takes further options of `optimize`

@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.check import filled_share
+from tetopt.contents.content import plain
 from tetopt.energy.discretization import combined
 from tetopt.energy.geometric import cell_E_G
 from tetopt.energy.sampling import SamplingGrid, from_ticks, moment_sums, orientations, sampling_grid
@@ -35,7 +36,6 @@ from tetopt.kernels import packed
 from tetopt.mesh import Mesh
 from tetopt.notebook import with_bar
 from tetopt.start.delaunay import delaunay
-from tetopt.target.content import plain
 
 Retessellate = Literal["first", "accept", "never"]
 

@@ -12,6 +12,7 @@ from math import prod
 import numpy as np
 
 from tetopt.check import beyond_box, manifold_problems
+from tetopt.contents.content import Content
 from tetopt.energy.sampling import cell_of_voxel
 from tetopt.engine.loop import MeshingResult
 from tetopt.errors import InputError
@@ -21,7 +22,6 @@ from tetopt.geometry.topology import components
 from tetopt.image import Image, VoxelGrid
 from tetopt.mesh import Mesh
 from tetopt.start.carve import n_components
-from tetopt.target.content import Content
 
 MASK_DICE = 0.9  # of a mesh with its mask, at least: below it the cells are larger than parts of the mask
 LABEL_VOXELS = 200  # a label of more may not be without cells

@@ -1,14 +1,14 @@
-"""Nodes that slide on the surface of a mask: the zero level of the function of `tetopt.target.domain`."""
+"""Nodes that slide on the surface of a mask: the zero level of the function of `tetopt.contents.domain`."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt.contents.domain import ON_SURFACE_VOXELS
 from tetopt.engine.complex import NodeRings, State, has_node, outward, place
 from tetopt.geometry.vectors import cross, dot, row, scaled
 from tetopt.kernels import Floats2, Singles3, entry, helper, unit
-from tetopt.target.domain import ON_SURFACE_VOXELS
 
 NEAR_CURVE_VOXELS = 0.1  # where several surfaces meet, a place with levels as near to 0 lies on all of them
 CURVE_STEP_VOXELS = 0.7  # the longest step towards such a place: levels bend there

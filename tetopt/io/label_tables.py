@@ -16,10 +16,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import NamedTuple
 
+from tetopt.contents.labels import hex_colour
 from tetopt.errors import InputError
 from tetopt.incoming import text_of
 from tetopt.model.labels import NO_TABLE, LabelTable
-from tetopt.target.labels import hex_colour
 
 __all__ = ["NO_TABLE", "LabelTable", "load_label_table"]
 

@@ -19,6 +19,8 @@ from tetopt.budget import BYTES_PER_GB, available_bytes, memory_words
 from tetopt.cluster.crew import Folders, Need, counted
 from tetopt.cluster.tasks import run_tasks
 from tetopt.cluster.workers import check_choice, local_share, workers
+from tetopt.contents.content import StoredContent
+from tetopt.contents.statistics import stored_statistics
 from tetopt.engine.cost import meshing_bytes
 from tetopt.engine.fast import prepare_kernels
 from tetopt.engine.loop import IterationRecord, MeshingResult
@@ -41,8 +43,6 @@ from tetopt.parts.rounds import Parted, PartsRequest, Round, Runner, expected_pa
 from tetopt.parts.work import LOGS_NAME, STATE_NAME, VolumeFile, removed
 from tetopt.start.sizes import Sizes
 from tetopt.stored import StoredImage
-from tetopt.target.content import StoredContent
-from tetopt.target.statistics import stored_statistics
 
 MOST_LOADED = 2**28  # voxels of an image that a run in parts reads whole: with it all that one piece offers is there
 MOST_DRAWN = 2**27  # voxels of the level of an image that pictures are drawn of

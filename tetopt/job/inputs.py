@@ -12,6 +12,8 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt.contents.align import is_same_grid, resample_contrast
+from tetopt.contents.labels import check_labels
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.io.files import checked_output
@@ -23,8 +25,6 @@ from tetopt.job.options import WHOLE_BOX, BoxPart, ImagePart, SourceOptions
 from tetopt.measure.fidelity import cell_labels
 from tetopt.model.file import MeshFile
 from tetopt.model.labels import NO_TABLE, labels_of
-from tetopt.target.align import is_same_grid, resample_contrast
-from tetopt.target.labels import check_labels
 
 IN_IMAGE_SHARE = 0.95  # of a mask's or labels' volume: less of it in the image is more than the grids' difference
 UNNAMED_LISTED = 8  # of those that have no name: a line's worth

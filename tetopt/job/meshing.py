@@ -10,6 +10,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.budget import BYTES_PER_GB, MemoryLimit, peak_bytes, resident_bytes
+from tetopt.contents.content import Content
+from tetopt.contents.domain import INSIDE_SHARE
 from tetopt.engine.cost import next_bytes
 from tetopt.engine.fast import prepare_kernels
 from tetopt.engine.loop import IterationRecord, MeshingResult
@@ -36,8 +38,6 @@ from tetopt.job.write import model_with
 from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields
 from tetopt.model.model import Model
-from tetopt.target.content import Content
-from tetopt.target.domain import INSIDE_SHARE
 
 CELL_BYTES = 40  # of a file, at least: a VTU with a cell's usual fields takes 48, other formats more
 LONG_SECONDS = 3.0  # to make the kernels ready: they were compiled then, not loaded

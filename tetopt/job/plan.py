@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
+from tetopt.contents.content import SMOOTH_INTERFACES, Content, StoredContent, check_weights
 from tetopt.engine.fast import check_options
 from tetopt.engine.loop import MIN_DIHEDRAL, SHAPE_POWER
 from tetopt.engine.meshing import MODE_DEFAULTS, QUADRATIC_NODES, Mode, check_target_error, sizes_of_order
@@ -22,7 +23,6 @@ from tetopt.job.options import DEFAULT_NODES, JobOptions, Method, stated_part
 from tetopt.start.lattice import KINDS
 from tetopt.start.octree import nodes_of_sizes
 from tetopt.start.sizes import Sizes
-from tetopt.target.content import SMOOTH_INTERFACES, Content, StoredContent, check_weights
 
 FEWEST_NODES = 5  # of the smallest mesh that there is, an octree in 2-D: a square's corners and its middle
 

@@ -10,6 +10,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt.contents.content import Content, StoredContent
 from tetopt.engine.cost import RunSize, predicted
 from tetopt.engine.meshing import QUADRATIC_NODES
 from tetopt.image import VoxelGrid
@@ -18,7 +19,6 @@ from tetopt.io.zarr_images import is_zarr
 from tetopt.job.inputs import file_and_volume
 from tetopt.job.options import DEFAULT_NODES
 from tetopt.job.plan import Plan
-from tetopt.target.content import Content, StoredContent
 
 SEARCH_RUNS = 4  # towards an error, mostly, each of about the default number of nodes
 QUADRATIC_RUNS = 2  # towards a number of nodes of order 2: the second mostly meets it

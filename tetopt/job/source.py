@@ -8,6 +8,8 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt.contents.align import background_level, foreground_mask, resample_contrast, resample_labels, resample_mask
+from tetopt.contents.content import SMOOTH_INTERFACES, Content, StoredContent, content, continued
 from tetopt.energy.sampling import cell_moments
 from tetopt.image import Image
 from tetopt.io.label_tables import NO_TABLE, LabelTable
@@ -20,8 +22,6 @@ from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields
 from tetopt.model.labels import TABLE_TEXT, table_words
 from tetopt.model.sets import box_of, box_text
-from tetopt.target.align import background_level, foreground_mask, resample_contrast, resample_labels, resample_mask
-from tetopt.target.content import SMOOTH_INTERFACES, Content, StoredContent, content, continued
 
 
 class Source(NamedTuple):

@@ -18,14 +18,14 @@ import scipy
 from numpy.typing import ArrayLike, NDArray
 
 from tetopt.check import facets_on_box
+from tetopt.contents.domain import INSIDE_SHARE
+from tetopt.contents.labels import LARGEST_LABEL, check_labels
 from tetopt.energy.sampling import cell_of_voxel, nearest_values
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import centroids, volumes
 from tetopt.geometry.topology import components, facets
 from tetopt.image import Image, transformed
 from tetopt.mesh import Mesh
-from tetopt.target.domain import INSIDE_SHARE
-from tetopt.target.labels import LARGEST_LABEL, check_labels
 
 POINTS_PER_CELL = 24  # at which a cell is compared with the voxels
 MOST_POINTS = 20_000  # on a surface, from which distances are measured
@@ -169,7 +169,7 @@ def cell_labels(labels: Image, mesh: Mesh) -> NDArray[np.int64]:
     Parameters
     ----------
     labels : Image
-        Whole numbers from 0 to `tetopt.target.labels.LARGEST_LABEL`.
+        Whole numbers from 0 to `tetopt.contents.labels.LARGEST_LABEL`.
     mesh : Mesh
         Points in world mm.
 
@@ -205,7 +205,7 @@ def label_fidelity(labels: Image, mesh: Mesh, of_cell: ArrayLike | None = None) 
     Parameters
     ----------
     labels : Image
-        Whole numbers from 0 to `tetopt.target.labels.LARGEST_LABEL`.
+        Whole numbers from 0 to `tetopt.contents.labels.LARGEST_LABEL`.
     mesh : Mesh
         Points in world mm.
     of_cell : (M,) array of whole numbers, optional

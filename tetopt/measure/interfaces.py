@@ -18,13 +18,13 @@ import numpy as np
 import scipy
 from numpy.typing import ArrayLike, NDArray
 
+from tetopt.contents.labels import check_labels
 from tetopt.geometry.manifold import OUTSIDE_LABEL, LabelSurfaces, Ridges, label_surfaces, surface_fans, surface_ridges
 from tetopt.geometry.simplex import edge_pairs
 from tetopt.geometry.topology import Facets, facets
 from tetopt.image import Image, transformed
 from tetopt.measure.fidelity import FacetSurface, checked_cell_labels, surface_areas
 from tetopt.mesh import Mesh
-from tetopt.target.labels import check_labels
 
 FOLD_DEGREES = 60.0  # by which the normals at a ridge turn where it is folded; a dihedral angle under 120 degrees
 NET_ITERATIONS = 16  # of the relaxation of surface nets, and the next: VTK's own values
@@ -98,7 +98,7 @@ def label_interfaces(labels: Image, mesh: Mesh, of_cell: ArrayLike) -> list[Labe
     Parameters
     ----------
     labels : Image
-        Whole numbers from 0 to `tetopt.target.labels.LARGEST_LABEL`.
+        Whole numbers from 0 to `tetopt.contents.labels.LARGEST_LABEL`.
     mesh : Mesh
         A conforming one.
     of_cell : (M,) array of whole numbers

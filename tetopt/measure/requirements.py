@@ -6,12 +6,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.check import beyond_box
+from tetopt.contents.content import Content
 from tetopt.energy.discretization import content_E_D
 from tetopt.engine.loop import IterationRecord, MeshingResult
 from tetopt.engine.promises import BEYOND_WORDS, promised, requested
 from tetopt.geometry.box import ON_SIDE_VOXELS
 from tetopt.mesh import Mesh
-from tetopt.target.content import Content
 
 
 def judged(

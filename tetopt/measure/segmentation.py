@@ -9,12 +9,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt.contents.labels import check_labels
+from tetopt.contents.otsu import class_thresholds
 from tetopt.energy.sampling import cell_moments, cell_of_voxel
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.target.labels import check_labels
-from tetopt.target.otsu import class_thresholds
 
 
 def segment(image: Image, mesh: Mesh, classes: int) -> Image:

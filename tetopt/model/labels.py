@@ -10,9 +10,9 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt.contents.labels import colours_by_number, hex_colour
 from tetopt.errors import InputError
 from tetopt.model.sets import label_set_names
-from tetopt.target.labels import colours_by_number, hex_colour
 
 TABLE_TEXT = "label_table"  # of a mesh's file, and of a model's `about`: what `table_words` makes
 

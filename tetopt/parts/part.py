@@ -13,6 +13,7 @@ from typing import Any, Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt.contents.content import plain
 from tetopt.energy.sampling import cell_moments_and_ranges, nearest_voxels
 from tetopt.engine.fast import Course, Run, followed
 from tetopt.engine.loop import Whole
@@ -22,7 +23,6 @@ from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.parts.work import checksum, done_path, load_arrays, open_volume, save_arrays
 from tetopt.start.sizes import Sizes
-from tetopt.target.content import plain
 
 MARGIN_SIZE = (
     2  # voxels around a part's nodes: as far as the image is looked at to either side of a facet, and one more

@@ -18,6 +18,7 @@ from typing import Any, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt.contents.statistics import Statistics, stored_statistics
 from tetopt.energy.sampling import grid_bits
 from tetopt.engine.cost import CELLS_PER_NODE, part_bytes
 from tetopt.engine.fast import EXCHANGING_SHARE
@@ -48,7 +49,6 @@ from tetopt.parts.work import (
 from tetopt.start.octree import octree_mesh
 from tetopt.start.sizes import Sizes
 from tetopt.stored import StoredImage
-from tetopt.target.statistics import Statistics, stored_statistics
 
 MOST_CELLS = 100_000  # of a part: 17,000 nodes, of which a tenth to a fifth are shared, and some seconds of a round
 MOST_VOXELS = 2**25  # of the cells of a part, 34 million: with its sums below 1.5 GB

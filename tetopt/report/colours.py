@@ -8,9 +8,9 @@ import numpy as np
 from matplotlib.patches import Patch
 from numpy.typing import NDArray
 
+from tetopt.contents.labels import check_labels, colours_by_number
 from tetopt.image import Image
 from tetopt.io.text import plain
-from tetopt.target.labels import check_labels, colours_by_number
 
 UNCOVERED_COLOUR = "#cfe3f5"  # where a mesh leaves the image uncovered
 LISTED_LABELS = 12  # labels in a legend: more would not be told apart by their colours alone
@@ -20,13 +20,13 @@ def label_colours(labels: Image, own: Mapping[int, tuple[float, float, float]] |
     """Colour of each label, so that ``label_colours(labels)[label]`` paints an array of labels.
 
     A label has the same colour in all pictures: its `own`, such as `tetopt.model.labels.LabelTable.colours` has it, or
-    that of its number (`tetopt.target.labels.colours_by_number`). 0 is the background, always in light grey: tables
+    that of its number (`tetopt.contents.labels.colours_by_number`). 0 is the background, always in light grey: tables
     have it in black.
 
     Parameters
     ----------
     labels : Image
-        Whole numbers from 0 to `tetopt.target.labels.LARGEST_LABEL`.
+        Whole numbers from 0 to `tetopt.contents.labels.LARGEST_LABEL`.
     own : mapping of label to red, green and blue, 0 to 1, optional
 
     Returns

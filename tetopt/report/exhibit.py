@@ -9,13 +9,13 @@ import numpy as np
 from matplotlib.colors import to_hex
 from numpy.typing import NDArray
 
+from tetopt.contents.labels import LARGEST_LABEL
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.model.fields import cell_fields
 from tetopt.model.labels import NO_TABLE, LabelTable, table_of_labels
 from tetopt.report.colours import grey_limits, label_colours
-from tetopt.target.labels import LARGEST_LABEL
 
 COLOUR_MAP = "viridis"  # perceptually even
 MOST_CATEGORIES = 128  # Whole numbers with more values than this are a quantity: no list of colours that long is read.

@@ -129,7 +129,7 @@ def label_figure(
     Parameters
     ----------
     labels : Image
-        Whole numbers from 0 to `tetopt.target.labels.LARGEST_LABEL`.
+        Whole numbers from 0 to `tetopt.contents.labels.LARGEST_LABEL`.
     mesh : Mesh
     of_cell : (M,) int64, optional
         Each cell's label; by default that of most of its voxels (`tetopt.measure.fidelity.cell_labels`).

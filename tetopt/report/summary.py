@@ -13,6 +13,7 @@ import numba
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt.contents.content import Content, StoredContent, plain
 from tetopt.engine.loop import MeshingResult
 from tetopt.errors import InputError
 from tetopt.geometry.quadratic import node_count
@@ -23,7 +24,6 @@ from tetopt.measure.quality import Quality, quality
 from tetopt.mesh import Mesh
 from tetopt.model.loads import load_words
 from tetopt.model.model import Model
-from tetopt.target.content import Content, StoredContent, plain
 
 SHOWN_VERSIONS = ("numpy", "scipy", "numba", "nibabel", "pyvista")
 

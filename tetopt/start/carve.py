@@ -8,12 +8,12 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from tetopt.contents.domain import Region
 from tetopt.geometry.manifold import manifold_part
 from tetopt.geometry.simplex import centroids, volumes
 from tetopt.geometry.topology import components
 from tetopt.image import Image
 from tetopt.mesh import Mesh
-from tetopt.target.domain import Region
 
 DROPPED_SHARE = 0.1  # of the largest connected component of cells in one of voxels: smaller ones beside it are dropped
 

@@ -9,13 +9,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt.contents.domain import ON_SURFACE_VOXELS, Region, levels
 from tetopt.errors import InputError
 from tetopt.geometry.box import box_sides, is_on_sides
 from tetopt.geometry.simplex import squared_edges, volumes
 from tetopt.image import Image
 from tetopt.mesh import Mesh
 from tetopt.start.lattice import lattice_mesh
-from tetopt.target.domain import ON_SURFACE_VOXELS, Region, levels
 
 SNAP_SHARE = 0.3  # of an edge: a node that lies as near to the surface along it is put on the surface
 TOUCH_SHARE = 0.15  # of an edge: a node as near to the surface counts as on it, even if it cannot be put there

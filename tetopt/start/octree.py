@@ -24,6 +24,8 @@ import scipy
 from numpy.typing import NDArray
 
 from tetopt.budget import check_memory
+from tetopt.contents.content import Content, plain
+from tetopt.contents.statistics import READ_BYTES, Statistics
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import volumes
 from tetopt.image import Image, VoxelGrid
@@ -42,8 +44,6 @@ from tetopt.start.sizes import (
 )
 from tetopt.start.sums import BlockSums, Channels, VoxelSource, block_starts, block_sums, channels_of, halved, source_of
 from tetopt.stored import StoredImage
-from tetopt.target.content import Content, plain
-from tetopt.target.statistics import READ_BYTES, Statistics
 
 # Nodes of the undivided blocks, over the requested number: tried in turn, the largest blocks first.
 ROOT_SHARES = tuple(1.0 / k for k in (60, 45, 30, 20, 12, 8, 6, 4, 2.5, 1.6, 1))

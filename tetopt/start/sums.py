@@ -13,13 +13,9 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.errors import InputError
-from tetopt.image import Image, VoxelGrid
-from tetopt.kernel_cache import njit
-from tetopt.stored import StoredImage
-from tetopt.target.content import Content, plain
-from tetopt.target.noise import NoiseSample, noise_sample, sampled_noise
-from tetopt.target.statistics import (
+from tetopt.contents.content import Content, plain
+from tetopt.contents.noise import NoiseSample, noise_sample, sampled_noise
+from tetopt.contents.statistics import (
     Box,
     Statistics,
     mean_of,
@@ -29,6 +25,10 @@ from tetopt.target.statistics import (
     stored_boxes,
     stored_statistics,
 )
+from tetopt.errors import InputError
+from tetopt.image import Image, VoxelGrid
+from tetopt.kernel_cache import njit
+from tetopt.stored import StoredImage
 
 
 class VoxelSource(NamedTuple):

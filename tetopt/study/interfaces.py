@@ -14,10 +14,10 @@ import pyvista
 from numpy.typing import NDArray
 from scipy.ndimage import gaussian_filter
 
+from tetopt.contents.otsu import class_thresholds
 from tetopt.errors import InputError
 from tetopt.geometry.box import box_sides
 from tetopt.image import Image
-from tetopt.target.otsu import class_thresholds
 
 OTSU_CLASSES = 4  # of the segmentation where no labels are given: fewer lose interfaces (see `tetopt.study.tetwild`)
 SIGMA_VOXELS = 0.75  # of the Gaussian before thresholding: takes the noise, moves no interface wider than a voxel
@@ -66,7 +66,7 @@ def interfaces(image: Image, size: float, *, classes: int = OTSU_CLASSES, labels
     ------
     InputError
         An image that is not 3-D, labels of another shape or that are not whole numbers, a size that is not above 0,
-        or classes that the intensities do not have (see `tetopt.target.otsu.class_thresholds`).
+        or classes that the intensities do not have (see `tetopt.contents.otsu.class_thresholds`).
     """
     _check(image, size, labels)
     if labels is None:
@@ -88,7 +88,7 @@ def class_labels(image: Image, classes: int) -> Image:
     Raises
     ------
     InputError
-        As `tetopt.target.otsu.class_thresholds`.
+        As `tetopt.contents.otsu.class_thresholds`.
     """
     smooth, thresholds = _classes(image, classes)
     return Image(np.digitize(smooth, thresholds), image.affine)

@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from tetopt.contents.labels import check_labels
 from tetopt.energy.sampling import cell_moments, cell_of_voxel
 from tetopt.errors import InputError
 from tetopt.geometry.simplex import rho
@@ -30,7 +31,6 @@ from tetopt.report.scene import (
 from tetopt.report.summary import versions
 from tetopt.study import paper
 from tetopt.study.paper_figures import landscape_figure, relaxation_figure
-from tetopt.target.labels import check_labels
 
 PAPER_PICTURES = ("fig1.png", "fig2.png", "fig2b.png", "fig3ab.png", "fig3cd.png", "fig3e.png", "fig3f.png")
 PAPER_FILES = ("paper.json", "paper.html", *PAPER_PICTURES)

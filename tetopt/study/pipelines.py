@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from tetopt.contents.content import Content, content
 from tetopt.engine.fast import prepare_kernels
 from tetopt.engine.loop import UNIFORM_ITERATIONS, UNIFORM_K_D
 from tetopt.engine.meshing import MODE_DEFAULTS, Mode, mesh_image
@@ -22,7 +23,6 @@ from tetopt.study.cleaver import stuffed
 from tetopt.study.interfaces import OTSU_CLASSES, class_labels, interfaces
 from tetopt.study.search import LEAST_REQUEST, REQUEST_RESPONSE, corners_for, tries
 from tetopt.study.tetwild import Filled, filled, node_spacing
-from tetopt.target.content import Content, content
 
 LATTICE_RUNS = 4  # of the search for a lattice of order 2, at most; there are few so coarse, and it takes milliseconds
 
@@ -87,7 +87,7 @@ def ours(job: PipelineInput, mode: Mode) -> Produced:
     Raises
     ------
     InputError
-        As `tetopt.mesh_image` and `tetopt.target.content.content`.
+        As `tetopt.mesh_image` and `tetopt.contents.content.content`.
     """
     seconds: dict[str, float] = {}
     k_D, iterations = MODE_DEFAULTS[mode] if mode == "graded" else (job.k_D, job.iterations)

@@ -15,14 +15,14 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from tetopt.contents.domain import INSIDE_SHARE, Region, region_of
+from tetopt.contents.labels import check_labels, label_channels
+from tetopt.contents.memberships import Memberships, finer, memberships, supersampling
+from tetopt.contents.noise import noise_level
+from tetopt.contents.statistics import Statistics
 from tetopt.errors import InputError
 from tetopt.image import Image
 from tetopt.stored import StoredImage
-from tetopt.target.domain import INSIDE_SHARE, Region, region_of
-from tetopt.target.labels import check_labels, label_channels
-from tetopt.target.memberships import Memberships, finer, memberships, supersampling
-from tetopt.target.noise import noise_level
-from tetopt.target.statistics import Statistics
 
 RARITY_POWER = 0.5  # of a label's share of the voxels, by which each of its voxels counts less
 SAME_PLACE_VOXELS = 1e-2  # voxel centres that lie no further apart are in the same place
@@ -61,7 +61,7 @@ class Content(NamedTuple):
     region : Region or None
         What is to be covered; None for the image's box.
     continuation : Continuation, optional
-        Of the mask that the region is of; see `tetopt.target.content.continued`.
+        Of the mask that the region is of; see `tetopt.contents.content.continued`.
     memberships : Memberships, optional
         Of labels whose interfaces are to be smooth.
     smoothness : float
@@ -154,13 +154,13 @@ def content(
     Parameters
     ----------
     images : Image or sequence of Image
-        Contrasts, all on the voxels of the first (`tetopt.target.align` puts them there).
+        Contrasts, all on the voxels of the first (`tetopt.contents.align` puts them there).
     labels : Image, optional
         Whole numbers from 0, on the same voxels.
     mask : Image, optional
         0 to 1 on the same voxels: the mesh covers the region where it is a half or more, and its boundary follows that
-        region's surface (`tetopt.target.domain`). Outside, images and labels are continued by the nearest value inside,
-        so that what lies beyond the surface has no say.
+        region's surface (`tetopt.contents.domain`). Outside, images and labels are continued by the nearest value
+        inside, so that what lies beyond the surface has no say.
     weights : sequence of float, optional
         One for each image, 1 by default: with 1 an image's variance counts as much as the first's, whatever its scale.
         0.001 to 1000, or 0, which leaves an image out.
@@ -168,7 +168,7 @@ def content(
         Likewise for the labels altogether. Of the labels the rarer count more by voxel.
     smooth_interfaces : float
         Surface tension of interfaces, voxels: how far one would move to save itself. Labels are then smooth between
-        voxels (`tetopt.target.memberships`), which are divided where slices are thick; nodes between labels lie where
+        voxels (`tetopt.contents.memberships`), which are divided where slices are thick; nodes between labels lie where
         these meet. 0 leaves labels their stairs, and cells the label of most of their voxels.
     keep_components : bool
         Keep connected components of the mesh that the mask does not have. By default small ones are dropped.

@@ -13,9 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tetopt.budget import check_memory
+from tetopt.contents.noise import NoiseSample, noise_places, sampled_noise
 from tetopt.image import check_finite, check_intensities, check_kind
 from tetopt.stored import StoredImage
-from tetopt.target.noise import NoiseSample, noise_places, sampled_noise
 
 READ_BYTES = 2**28  # of a stored volume at a time, at most: 128 planes of 1024^2 voxels of 16 bits
 PIECE_VOXELS = 2**16  # computed with at a time: half a megabyte a field, which a processor's cache has room for
@@ -43,7 +43,7 @@ class Statistics(NamedTuple):
 
     Examples
     --------
-    >>> from tetopt.target.statistics import stored_statistics
+    >>> from tetopt.contents.statistics import stored_statistics
     >>> voxels = np.arange(4096, dtype=np.int16).reshape(16, 16, 16)
     >>> numbers = stored_statistics(tetopt.StoredImage(voxels))
     >>> numbers.low, numbers.high, numbers.mean, numbers.is_whole

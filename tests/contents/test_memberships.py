@@ -7,7 +7,7 @@ from scipy.ndimage import label as components
 from shapes import OBLIQUE, distance, grid
 
 import tetopt
-from tetopt.target.memberships import (
+from tetopt.contents.memberships import (
     FARTHEST_DISTANCE,
     finer,
     finer_affine,

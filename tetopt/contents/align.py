@@ -12,12 +12,12 @@ import numpy as np
 import scipy
 from numpy.typing import NDArray
 
+from tetopt.contents.domain import INSIDE_SHARE
+from tetopt.contents.labels import check_labels
+from tetopt.contents.otsu import class_thresholds
 from tetopt.errors import InputError
 from tetopt.geometry.box import box_sides
 from tetopt.image import Image
-from tetopt.target.domain import INSIDE_SHARE
-from tetopt.target.labels import check_labels
-from tetopt.target.otsu import class_thresholds
 
 SAME_GRID_VOXELS = 1e-4  # two grids whose corners differ by no more are the same: headers hold single precision
 LEAST_COVERED_SHARE = 0.5  # of the image's voxel centres, that a further contrast has to cover
@@ -72,7 +72,7 @@ def resample_labels(labels: Image, image: Image, name: str = "labels") -> Image:
     Parameters
     ----------
     labels : Image
-        Whole numbers from 0 to `tetopt.target.labels.LARGEST_LABEL`, 0 the background.
+        Whole numbers from 0 to `tetopt.contents.labels.LARGEST_LABEL`, 0 the background.
     image : Image
         Whose voxels are taken.
     name : str, optional

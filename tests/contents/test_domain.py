@@ -4,10 +4,10 @@ from scipy.ndimage import distance_transform_edt, gaussian_filter, map_coordinat
 from shapes import OBLIQUE, grid, shaped
 
 import tetopt
+from tetopt.contents.domain import Region, levels, region_of
 from tetopt.geometry.topology import boundary_facets
 from tetopt.measure.fidelity import mask_fidelity
 from tetopt.start.clip import clipped, lattice_within, onto_surface
-from tetopt.target.domain import Region, levels, region_of
 
 
 def test_a_sphere_has_no_stairs():

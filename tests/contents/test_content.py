@@ -3,9 +3,9 @@ import pytest
 from shapes import OBLIQUE, grid, shaped
 
 import tetopt
+from tetopt.contents.content import content, continued, plain
+from tetopt.contents.noise import noise_level
 from tetopt.energy.sampling import cell_of_voxel, channel_grid, moment_sums, to_ticks
-from tetopt.target.content import content, continued, plain
-from tetopt.target.noise import noise_level
 
 
 def contrasts(shape=(12, 13, 14)):
@@ -168,7 +168,7 @@ def test_noise_of_a_large_image_is_that_of_some_of_its_slices(monkeypatch, shape
     data = rng.normal(0.0, 3.0, shape) + 20.0 * (np.indices(shape)[0] > 25)
     inside = np.indices(shape)[1] > 6 if has_mask else None
     every = noise_level(data, inside)
-    monkeypatch.setattr("tetopt.target.noise.NOISE_VOXELS", data.size // 6)  # each fifth slice
+    monkeypatch.setattr("tetopt.contents.noise.NOISE_VOXELS", data.size // 6)  # each fifth slice
     some = noise_level(data, inside)
     assert some == pytest.approx(every, rel=0.05)
     assert some != every
@@ -225,5 +225,5 @@ def test_noise_needs_neighbours_within_the_mask_along_all_axes():
 def test_noise_of_few_slices_of_a_mask_is_noise(monkeypatch):
     """What is left of it is compared with the voxels of the mask in those slices, not in all."""
     data = np.random.default_rng(0).normal(size=(60, 20, 20))
-    monkeypatch.setattr("tetopt.target.noise.NOISE_VOXELS", 1000)  # one slice in 23
+    monkeypatch.setattr("tetopt.contents.noise.NOISE_VOXELS", 1000)  # one slice in 23
     assert noise_level(data, np.ones(data.shape, dtype=bool)) == pytest.approx(1.0, rel=0.2)

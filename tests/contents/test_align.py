@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 import tetopt
-from tetopt.target.align import background_level, foreground_mask, resample_contrast, resample_labels, resample_mask
+from tetopt.contents.align import background_level, foreground_mask, resample_contrast, resample_labels, resample_mask
 
 SHAPE, OTHER = (7, 9, 6), (8, 6, 7)
 
