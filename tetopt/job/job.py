@@ -13,9 +13,11 @@ from types import UnionType
 from typing import Any, Literal, Union, get_args, get_origin
 
 from tetopt.errors import InputError
+from tetopt.incoming import json_of
 from tetopt.job.options import JobOptions, kinds_of, option_of
 from tetopt.job.plan import resolved
 from tetopt.model.laws import LAW_OPTIONS
+from tetopt.public import LARGEST_INTEGER
 
 MOST_SAID = 80  # letters of a value in a message
 UNIT_WORDS = {"MM": " in mm", "GB": " in GB", "S": " in seconds"}  # of a number, by what its value is called
@@ -118,7 +120,7 @@ class Job(JobOptions):
         300
         """
         try:
-            table = json.loads(text)
+            table = json_of(text)
         except ValueError as error:
             raise InputError(f"job: expected JSON ({error})") from error
         if not isinstance(table, dict):
@@ -170,14 +172,14 @@ def _of_kind(name: str, kind: Any, value: Any) -> Any:
         (of_each,) = get_args(own)
         many = [value] if isinstance(value, str | Path) else value
         if not isinstance(many, list | tuple) or not many:
-            raise InputError(f"`{name}`: expected a list of {of_each.__name__}, got {_said(value)}")
+            raise InputError(f"`{name}`: expected {KIND_WORDS[of_each]} or a list of such, got {_said(value)}")
         return [_of_kind(name, of_each, each) for each in many]
     is_number = isinstance(value, Real) and not isinstance(value, bool)
-    if own is Path and isinstance(value, str | os.PathLike):
+    if own is Path and isinstance(value, str | os.PathLike) and str(value):
         return Path(value)
     if own is float and is_number:
         return float(value)
-    if own is int and is_number and float(value).is_integer():
+    if own is int and is_number and abs(value) <= LARGEST_INTEGER and float(value).is_integer():
         return int(value)
     if own is str and (isinstance(value, str) or (is_number and name in (*LAW_OPTIONS, "background", "bins"))):
         return value if isinstance(value, str) else f"{value!r}"

@@ -1,0 +1,82 @@
+"""A job: every option once, checked when it is made, in JSON and back."""
+
+import inspect
+from dataclasses import fields
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import tetopt
+from tetopt import InputError, Job
+from tetopt.job.options import JobOptions, RunOptions, given_options, kinds_of, option_of
+
+FILES = {"images": "a.nii", "output": "a.vtu"}
+
+
+def test_values_are_brought_to_the_kinds_of_their_options():
+    job = Job(
+        images=Path("a.nii"), output="a.vtu", nodes=np.int64(300), k_D=np.float32(0.5), young=3, background=0,
+        loads="compress:5%", iterations=4.0,
+    )  # fmt: skip
+    assert (job.images, job.output, job.loads) == ([Path("a.nii")], Path("a.vtu"), ["compress:5%"])
+    assert (job.nodes, job.k_D, job.young, job.background, job.iterations) == (300, 0.5, "3", "0", 4)
+    assert type(job.nodes) is type(job.iterations) is int
+
+
+@pytest.mark.parametrize(("options", "words"), [
+    ({"nodes": "30"}, "`nodes`: expected a whole number, got '30'"),
+    ({"nodes": 30.5}, "`nodes`: expected a whole number, got 30.5"),
+    ({"nodes": True}, "`nodes`: expected a whole number, got True"),
+    ({"nodes": 2**63}, "`nodes`: expected a whole number, got 9223372036854775808"),
+    ({"nodes": float("inf")}, "`nodes`: expected a whole number, got inf"),
+    ({"nodes": 3}, "`nodes`: expected a whole number, 5 or more, got 3"),
+    ({"k_D": 2}, "`k_D`: expected 0 <= k_D < 1, got 2.0"),
+    ({"iterations": -1}, "`iterations`: expected 0 or more, got -1"),
+    ({"images": []}, r"`images`: expected a path or a list of such, got \[\]"),
+    ({"mask": ""}, "`mask`: expected a path, got ''"),
+    ({"lattice": "x"}, "`lattice`: expected bcc or five-tet or criss-cross or octree, got 'x'"),
+    ({"force": "yes"}, "`force`: expected True or False, got 'yes'"),
+    ({"units": None}, "`units`: expected a text, got None"),
+    ({"nodes": 30, "spacing": 2.0}, "`nodes` and `spacing`: give one of them"),
+    ({"mask": "m.nii", "background": 3}, "`mask` and `background`: give one of them"),
+    ({"output": "a.docx"}, "a.docx: unknown suffix"),
+    ({"young": "x" * 5000}, "`young`: formula: expected numbers"),
+])  # fmt: skip
+def test_what_cannot_be_is_refused_by_name(options, words):
+    with pytest.raises(InputError, match=words) as caught:
+        Job(**{**FILES, **options})
+    assert "\n" not in str(caught.value)
+    assert len(str(caught.value)) < 600
+
+
+def test_json_gives_the_job_back():
+    job = Job(
+        images=["a.nii", "b.nii"], output="a.inp", weights=[1, 0.5], loads=["compress:5%", "hold:left"], young="1 + h",
+        labels="l.nii", json_path="a.json", slice_=None, nonlinear=True, nodes=300,
+    )  # fmt: skip
+    assert Job.from_json(job.to_json()) == job
+    assert "weights" in job.to_json()
+    assert "slice_" not in job.to_json()  # what is the default
+
+
+@pytest.mark.parametrize(("text", "words"), [
+    ("3", "expected an object of options, got int"), ("{", "expected JSON"), ("[" * 100_000, "nested too deeply"),
+    ('{"images": ["a"]}', "needs output"), ('{"images": ["a"], "output": "b.vtu", "nods": 3}', "is nodes meant"),
+    ('{"images": ["a"], "output": "b.vtu", "nodes": "3"}', "`nodes`: expected a whole number, got '3'"),
+])  # fmt: skip
+def test_json_that_is_no_job(text, words):
+    with pytest.raises(InputError, match=words) as caught:
+        Job.from_json(text)
+    assert len(str(caught.value)) < 300
+
+
+def test_every_option_has_its_kind_and_its_help():
+    for name, kind in kinds_of(JobOptions).items():
+        assert option_of(kind).text.endswith("."), name
+    shared = {field.name for field in fields(RunOptions)}
+    assert shared < {field.name for field in fields(JobOptions)} == set(inspect.signature(Job).parameters)
+    assert given_options(Job(**FILES)) == {"images": [Path("a.nii")], "output": Path("a.vtu")}
+    assert f"    nodes : int, optional\n        {option_of(kinds_of(Job)['nodes']).text[:40]}" in inspect.getdoc(
+        tetopt.Job
+    ).replace("\n", "\n    ")
