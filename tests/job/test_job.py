@@ -35,6 +35,7 @@ def test_values_are_brought_to_the_kinds_of_their_options():
     ({"iterations": -1}, "`iterations`: expected 0 or more, got -1"),
     ({"images": []}, r"`images`: expected a path or a list of such, got \[\]"),
     ({"mask": ""}, "`mask`: expected a path, got ''"),
+    ({"mask": "a\0b"}, "`mask`: expected a path, got"),
     ({"lattice": "x"}, "`lattice`: expected bcc or five-tet or criss-cross or octree, got 'x'"),
     ({"force": "yes"}, "`force`: expected True or False, got 'yes'"),
     ({"units": None}, "`units`: expected a text, got None"),

@@ -175,7 +175,7 @@ def _of_kind(name: str, kind: Any, value: Any) -> Any:
             raise InputError(f"`{name}`: expected {KIND_WORDS[of_each]} or a list of such, got {_said(value)}")
         return [_of_kind(name, of_each, each) for each in many]
     is_number = isinstance(value, Real) and not isinstance(value, bool)
-    if own is Path and isinstance(value, str | os.PathLike) and str(value):
+    if own is Path and isinstance(value, str | os.PathLike) and str(value) and "\0" not in str(value):
         return Path(value)
     if own is float and is_number:
         return float(value)
