@@ -291,7 +291,8 @@ def box_problem(points: np.ndarray, folder: Path, case: Case) -> str:
     is_whole = not any(word.startswith(("--crop", "--slice", "--space", "--volume", "--start")) for word in words)
     if words[0] != "mesh" or not is_whole or not words[1].endswith((".nii", ".nii.gz")):
         return ""
-    image = nibabel.load(folder / words[1])
+    near = folder / "cwd" / words[1]  # of what is written above the case's current folder
+    image = nibabel.load(near if near.is_file() else folder / words[1])
     matrix, unit = np.array(image.affine, dtype=np.float64), int(image.header["xyzt_units"]) & 7
     matrix[:3] *= {1: 1000.0, 3: 0.001}.get(unit, 1.0)  # metres and micrometres; others are taken for mm
     if len(image.shape) < 3 or np.linalg.cond(matrix[:3, :3]) > MOST_CONDITION:
