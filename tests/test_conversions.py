@@ -8,9 +8,11 @@ import pytest
 import pyvista
 import skfem
 from models import quadratic_model, sample_model
+from vtkmodules.vtkCommonDataModel import vtkUnstructuredGrid
 
 import tetopt
 from tetopt import InputError, Mesh
+from tetopt.conversions import add_array
 from tetopt.geometry.quadratic import quadratic
 from tetopt.geometry.simplex import volumes
 
@@ -210,3 +212,11 @@ def test_a_model_has_its_sets_and_materials_with_it(model, tmp_path):
         assert other.point_sets[name].tolist() == np.flatnonzero(saved.point_data[f"on_{name}"]).tolist()
     assert (other.cells[0].data == grid.cells_dict[VTK_NUMBERS[model.mesh.ndim][model.order - 1]]).all()
     assert (Mesh.from_meshio(other).cells == model.mesh.cells).all()
+
+
+def test_arrays_of_no_rows_keep_their_columns():
+    """As those of an empty set, which VTK's own conversion takes no width of."""
+    grid = vtkUnstructuredGrid()
+    add_array(grid.GetFieldData(), "none", np.empty((0, 2), dtype=np.int64))
+    array = grid.GetFieldData().GetArray("none")
+    assert (array.GetNumberOfTuples(), array.GetNumberOfComponents()) == (0, 2)

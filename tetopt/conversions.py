@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import importlib
 import importlib.util
+import math
 import os
 import sys
 from collections.abc import Collection, Mapping
@@ -292,7 +293,7 @@ def add_array(fields: vtkFieldData, name: str, values: NDArray) -> None:
     # VTK takes numbers in the machine's order of bytes, whatever their type says, and floats of four or eight bytes.
     is_odd = values.dtype.kind == "f" and values.dtype.itemsize not in (4, 8)
     values = values.astype(np.float64 if is_odd else values.dtype.newbyteorder("="), copy=False)
-    values = values.reshape(len(values), -1) if values.ndim > 1 else values
+    values = values.reshape(len(values), math.prod(values.shape[1:])) if values.ndim > 1 else values
     array = numpy_to_vtk(np.ascontiguousarray(values.view(np.uint8) if values.dtype == bool else values), deep=True)
     array.SetName(name)
     fields.AddArray(array)

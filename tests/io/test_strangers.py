@@ -20,6 +20,7 @@ from tetopt.incoming import json_of, text_of, toml_of
 from tetopt.io import apart
 from tetopt.io.apart import read_apart
 from tetopt.io.images import load_image, parse_crop, parse_slice, sha256
+from tetopt.io.itk_headers import checked_header
 from tetopt.io.meshes import load_mesh
 from tetopt.job.inputs import file_and_volume
 from tetopt.job.model import parsed_bins
@@ -369,6 +370,28 @@ def test_a_file_that_goes_on(tmp_path, name):
     """Only as much is unpacked, or read for the checksum, as the header tells of, and what may lie behind that."""
     path = nifti(tmp_path / name, data=bytes(2**25))
     refused(load_image, path, "it goes on far behind the last voxel")
+
+
+SKIPPED = {"a.mha": "", "a.mhd": f"HeaderSize = {2**25}\n", "a.nrrd": f"byte skip: {2**25}\n"}
+
+
+@pytest.mark.parametrize("name", SKIPPED)
+def test_voxels_after_a_header_that_go_on(tmp_path, name):
+    """A hole takes no place on the disk, and minutes in a checksum; what a header skips may be long."""
+    pytest.importorskip("SimpleITK")
+    path, data = tmp_path / name, tmp_path / ("a.raw" if name == "a.mhd" else name)
+    for more in {SKIPPED[name], ""}:
+        if name == "a.mhd":
+            data.write_bytes(bytes(60))
+        path.write_bytes(
+            nrrd(more=more) if name == "a.nrrd" else mha(file=data.name if name == "a.mhd" else "LOCAL", more=more)
+        )
+        assert checked_header(path)[1] == 60
+        os.truncate(data, 2**25 + 400)
+        if more:
+            assert checked_header(path)[1] == 60
+        else:
+            refused(load_image, path, "it goes on far behind the last voxel")
 
 
 def test_postscript_in_a_picture(tmp_path):

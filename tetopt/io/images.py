@@ -34,7 +34,15 @@ from tetopt.io.itk_headers import HEADED_SUFFIXES, data_files, header_sizes
 from tetopt.io.pictures import PICTURE_SUFFIXES, read_picture
 from tetopt.io.pvtu import piece_names
 from tetopt.io.read_itk import ITK_READERS, read_dicom_folder, read_itk
-from tetopt.io.volumes import DAMAGED_FILE, UNREADABLE_FILE, check_room, one_line, volume_index
+from tetopt.io.volumes import (
+    DAMAGED_FILE,
+    TOO_LONG,
+    TRAILING_BYTES,
+    UNREADABLE_FILE,
+    check_room,
+    one_line,
+    volume_index,
+)
 from tetopt.io.zarr_images import ZARR_SUFFIX, check_chunks, is_zarr, open_zarr, save_zarr, zarr_levels
 from tetopt.stored import StoredImage
 
@@ -51,8 +59,6 @@ _NIBABEL_HEADER_ERRORS = (*_READER_ERRORS, ImageFileError, HeaderDataError, Wrap
 MOST_OF_NIFTI_1 = 32767  # voxels along an axis, of 16 bits; NIfTI-2 has more
 HEAD_BYTES_NIFTI = 1024  # of a file: the longest of the headers has 540
 EXTENSION_BYTES = 2**26  # 67 MB before the voxels: a NIfTI file's extensions are texts
-TRAILING_BYTES = 2**24  # 17 MB behind the last voxel: MGH's tags
-TOO_LONG = f"{DAMAGED_FILE} (it goes on far behind the last voxel, beyond byte {{}})"
 MGH_FLAG = slice(28, 30)  # the bytes of an MGH header that are 0 where it has no sizes and directions
 # mm along the longest side of an image's box: a body is shorter than the one, micrometres and metres pass as mm beyond.
 LONGEST_BOX, SHORTEST_BOX = 3000.0, 1.0

@@ -17,12 +17,13 @@ import numpy as np
 from tetopt.errors import InputError
 from tetopt.incoming import irregular
 from tetopt.io.apart import DEFLATE_RATIO
-from tetopt.io.volumes import DAMAGED_FILE, UNREADABLE_FILE, check_room
+from tetopt.io.volumes import DAMAGED_FILE, TOO_LONG, TRAILING_BYTES, UNREADABLE_FILE, check_room
 
 HEADED_SUFFIXES = (".nrrd", ".nhdr", ".mha", ".mhd")  # of files whose headers are read here
 HEADER_BYTES = 2**20  # of a header: 3D Slicer's with all its words have 10,000
 MOST_AXES = 8  # of a file: more than space, time, and what is measured
 TEXT_RATIO = 4  # "0 " becomes 8 bytes
+TEXT_BYTES = 32  # of text for a byte of a value, at most
 BZIP2_RATIO = 50_000  # bzip2 packs zeros 45,000 times
 DTYPE_OF_TYPE = {
     "MET_CHAR": "i1", "MET_UCHAR": "u1", "MET_SHORT": "i2", "MET_USHORT": "u2", "MET_INT": "i4", "MET_UINT": "u4",
@@ -81,7 +82,7 @@ def checked_header(path: Path) -> tuple[int, int]:
 
 
 def _checked_bytes(path: Path, header: VoxelHeader) -> int:
-    """Bytes of all files of the image; InputError if its header tells of more."""
+    """Bytes of all files of the image; InputError if its header tells of more, or of far fewer."""
     n_bytes = sum(file.stat().st_size for file in (path, *_data_files(path, header)))
     if header.value_bytes > n_bytes * header.ratio:
         sizes = " x ".join(str(size) for size in header.sizes)
@@ -89,7 +90,16 @@ def _checked_bytes(path: Path, header: VoxelHeader) -> int:
             f"{DAMAGED_FILE} (its header tells of {sizes} voxels, "
             f"{header.value_bytes:.4g} bytes, the file has {n_bytes})"
         )
+    skip, longest = _skipped(header), TEXT_BYTES if header.ratio == TEXT_RATIO else 2  # packed ones may be longer
+    most = header.n_bytes + (int(skip) if skip.isdecimal() else 0) + longest * header.value_bytes + TRAILING_BYTES
+    if n_bytes > most:  # its checksum would be made of all of it
+        raise InputError(TOO_LONG.format(most))
     return n_bytes
+
+
+def _skipped(header: VoxelHeader) -> str:
+    """How many bytes lie before the voxels, as it is written; -1 if the voxels are the last."""
+    return header.fields.get("byte skip", header.fields.get("byteskip", header.fields.get("HeaderSize", "0")))
 
 
 def raw_voxels(path: Path) -> RawVoxels:
@@ -111,7 +121,7 @@ def raw_voxels(path: Path) -> RawVoxels:
         raise InputError("its voxels are in several files, and cannot be read in parts; convert it to one first")
     file = (_data_files(path, header) or [path])[0]
     _checked_bytes(path, header)
-    skip = header.fields.get("byte skip", header.fields.get("byteskip", header.fields.get("HeaderSize", "0")))
+    skip = _skipped(header)
     if re.fullmatch(r"-1|\d{1,18}", skip) is None or (not header.files and "HeaderSize" in header.fields):
         raise InputError(f"its voxels cannot be read in parts (they begin after {skip[:80]} bytes); write it again")
     n_bytes = file.stat().st_size

@@ -16,6 +16,8 @@ from tetopt.errors import InputError
 IMAGE_BYTES = 8  # of a voxel of an `Image`, at most
 # What to do about a file that ends too soon, and about one that may never have been an image.
 DAMAGED_FILE = "the file is truncated or damaged; copy it again"
+TRAILING_BYTES = 2**24  # 17 MB behind the last voxel: MGH's tags
+TOO_LONG = f"{DAMAGED_FILE} (it goes on far behind the last voxel, beyond byte {{}})"
 UNREADABLE_FILE = "truncated or damaged, or not an image of this kind; copy it again, or check its name"
 
 
