@@ -98,4 +98,4 @@ def test_the_lesson_runs(tmp_path, monkeypatch, capsys):
     assert "share of the variance in cells: 0." in printed
     written = {path.name for path in tmp_path.iterdir()} - {"T1.nii.gz"}
     pictures = {"slice.png", "rho.png", "energies.png", "thumbnail.png"}
-    assert written == {"brain.vtu", "brain_too.vtu", "run.json", "look.html"} | pictures
+    assert written == {"brain.vtu", "brain_too.vtu", "brain_job.inp", "run.json", "look.html"} | pictures

@@ -220,7 +220,7 @@ def test_nothing_is_written_where_workers_are_refused(tmp_path, capsys):
     assert exit_code(*command, "--cluster", written(tmp_path, "jobqueue: {slum: {}}")) == 2
     assert "expected one of htcondor" in capsys.readouterr().err
     assert exit_code(*command, "--scheduler", "tcp://127.0.0.1:1", "--workers", 2) == 2
-    assert "`workers`: expected none with `scheduler`" in capsys.readouterr().err
+    assert "--workers: expected none with --scheduler" in capsys.readouterr().err
     assert not (tmp_path / "out").exists()
 
 

@@ -330,7 +330,7 @@ def test_background_of_one_value_is_exact():
 
 def test_images_without_background():
     rng = np.random.default_rng(7)
-    auto, todo = r"^--background auto: no background found, ", "; give a value, or leave it out$"
+    auto, todo = r"^`background` auto: no background found, ", "; give a value, or leave it out$"
     for image, words in (
         (rng.normal(100.0, 20.0, (20, 20, 20)), r"the dark voxels on the faces of the box spread up to .*, not under"),
         (np.full((5, 5), 4.0), "every voxel has the value 4"),
@@ -348,8 +348,8 @@ def test_images_without_background():
 def test_levels_that_leave_nothing():
     image = tetopt.Image(np.where(ball((20, 20), 5), 90.0, 10.0))
     todo = "; give a level between the background's and the tissue's values, the image holds 10 to 90"
-    assert message(foreground_mask, image, 5) == "--background 5: every voxel is foreground" + todo
-    assert message(foreground_mask, image, 90) == "--background 90: nothing is left" + todo
+    assert message(foreground_mask, image, 5) == "`background` 5: every voxel is foreground" + todo
+    assert message(foreground_mask, image, 90) == "`background` 90: nothing is left" + todo
     # A level given is taken at its word, however little it leaves.
     data = np.zeros((40, 40))
     data[20, 20] = 1.0

@@ -655,17 +655,17 @@ PLATE = Mesh([[0.0, 0.0], [1.0, 0.0], [1.0, 2.0], [0.0, 2.0]], [[0, 1, 2], [0, 2
         (
             {"young": [1.0, 0.0]},
             "young: expected moduli above 0 kPa, got 1 others, the first 0 in cell 1; "
-            'give empty space a small modulus too, as --young "0:0.1,255:6" does',
+            'give empty space a small modulus too, as `young` "0:0.1,255:6" does',
         ),
         (
             {"young": [np.nan, -2.5]},
             "young: expected moduli above 0 kPa, got 2 others, the first nan in cell 0, -2.5 in cell 1; "
-            'give empty space a small modulus too, as --young "0:0.1,255:6" does',
+            'give empty space a small modulus too, as `young` "0:0.1,255:6" does',
         ),
         (
             {"young": np.inf},
             "young: expected moduli above 0 kPa, got 2 others, the first inf in cell 0, inf in cell 1; "
-            'give empty space a small modulus too, as --young "0:0.1,255:6" does',
+            'give empty space a small modulus too, as `young` "0:0.1,255:6" does',
         ),
         ({"young": [1.0, 2.0, 3.0]}, "young: expected one modulus for each of 2 cells, got shape (3,)"),
         ({"young": [[1.0, 1.0], [2.0, 1.0]]}, "young: expected one modulus for each of 2 cells, got shape (2, 2)"),
@@ -766,5 +766,5 @@ def test_messages_of_box_faces():
     assert (
         message_of(lambda: box_faces(image, shrunk, 1))
         == "mesh: no node lies on the image's face at index 0.5 of axis 1, the mesh runs from -0.5 to 0; "
-        "it must fill the image's box: same image, --crop and --slice?"
+        "it must fill the image's box: same image, crop and slice?"
     )

@@ -272,5 +272,5 @@ def test_sizes_and_kinds_that_no_lattice_has_are_refused(shape, kind, size, mess
     ],
 )
 def test_sizes_of_the_wrong_kind(size):
-    with pytest.raises(InputError, match=f"lattice: {next(iter(size))}( must|: expected)"):
+    with pytest.raises(InputError, match=f"lattice(_mesh)?: {next(iter(size))}( must|: expected)"):
         lattice_mesh(Image(np.zeros((5, 6, 7))), **size)

@@ -487,8 +487,8 @@ def test_the_reference_is_chosen_once(head, tmp_path, monkeypatch):
     assert chosen() == 6000
     assert chosen(reference_seconds=9.0) == 7000
     assert len(lines) == 3
-    assert "in 5 s; --reference-dofs 5000" in lines[0]
-    assert "in the free memory; --reference-dofs 6000" in lines[1]
+    assert "in 5 s; `reference_dofs` 5000" in lines[0]
+    assert "in the free memory; `reference_dofs` 6000" in lines[1]
     # Of another part of the image, and with other moduli, the grid that fits is another.
     assert chosen(comparison._replace(image_source=ImageSource("image", "ab", None, "0:5,:,:"))) == 8000
     assert chosen(comparison._replace(law=[(0.0, 1.0), (100.0, 20.0)])) == 9000

@@ -15,7 +15,7 @@ from rich.table import Table
 import tetopt
 from tetopt import Image, InputError, save_mesh
 from tetopt.budget import BYTES_PER_GB
-from tetopt.cli.console import log, out, print_wide
+from tetopt.cli.console import log, out, print_wide, say
 from tetopt.cli.options import (
     AverageOption,
     ForceOption,
@@ -129,7 +129,7 @@ def paper_command(
         log.print("no --labels: the section on approximate segmentation is left out")
     paths = checked_outputs(results_folder(output), paper_files.PAPER_FILES, force)
     about = {"image": source.name, "image_sha256": sha256(source), "labels": labels_name}
-    results = paper_files.run(paths, about, volume, tissue, seeds, lambda text: log.print(escape(text)))
+    results = paper_files.run(paths, about, volume, tissue, seeds, say)
     out.print(escape(f"{paths['paper.html']}: the paper's numbers beside ours, in {results['seconds']:.0f} s"))
     return 0
 
@@ -157,7 +157,7 @@ def baseline_command(
     image, labels = _image_and_labels(image_path, labels_path, part)
     title, function = PIPELINES[pipeline].title, PIPELINES[pipeline].function
     job = PipelineInput(image, labels, nodes, classes)
-    made = run_in_child(function, job, say=lambda line: log.print(escape(f"{title}: {line}")))
+    made = run_in_child(function, job, say=lambda line: say(f"{title}: {line}"))
     if made.mesh is None:
         raise InputError(f"{title}: {(made.failure or '').removeprefix(f'{title}: ')}")
     shape = quality(made.mesh.points, made.mesh.cells)
@@ -168,7 +168,7 @@ def baseline_command(
         fit = image_fit(image, made.mesh)
         save_json(json_path, about | {"seconds": made.seconds, "notes": made.notes, "fit": fit, "quality": shape})
     for note in made.notes:
-        log.print(escape(f"note: {note}"))
+        say(f"note: {note}")
     table = new_table("", escape(output.name))
     add_quality(table, shape)
     for step, seconds in made.seconds.items():
@@ -205,7 +205,7 @@ def compare_command(
     if (output / "runs").is_dir() and not (resume or force):
         raise InputError(f"{output / 'runs'}: finished runs are there; --resume keeps them, --force starts over")
     try:
-        report = compare_files.run(paths, comparison, lambda text: log.print(escape(text)), resume=resume)
+        report = compare_files.run(paths, comparison, say, resume=resume)
     except KeyboardInterrupt:
         log.print(f"interrupted: {escape(str(output / 'runs'))} keeps the finished runs, --resume goes on from there")
         return 130

@@ -152,10 +152,15 @@ def with_hyphens(message: str) -> str:
     return re.sub(r"`(\w+)`", lambda match: names.get(match[1], match[0]), message)
 
 
+def say(text: str) -> None:
+    """Say a line of the library."""
+    log.print(escape(with_hyphens(text)))
+
+
 def show_event(event: Event) -> None:
     """Say a note, a warning, or a requirement that is not met."""
     if event.kind == "note":
-        log.print(escape(with_hyphens(event.text)))
+        say(event.text)
     elif event.kind == "warning":
         show_warning(event.text)
     elif event.kind == "violated":
