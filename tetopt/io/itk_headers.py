@@ -23,7 +23,7 @@ HEADED_SUFFIXES = (".nrrd", ".nhdr", ".mha", ".mhd")  # of files whose headers a
 HEADER_BYTES = 2**20  # of a header: 3D Slicer's with all its words have 10,000
 MOST_AXES = 8  # of a file: more than space, time, and what is measured
 TEXT_RATIO = 4  # "0 " becomes 8 bytes
-TEXT_BYTES = 32  # of text for a byte of a value, at most
+VALUE_LETTERS = 32  # of text, for a byte of a value at most
 BZIP2_RATIO = 50_000  # bzip2 packs zeros 45,000 times
 DTYPE_OF_TYPE = {
     "MET_CHAR": "i1", "MET_UCHAR": "u1", "MET_SHORT": "i2", "MET_USHORT": "u2", "MET_INT": "i4", "MET_UINT": "u4",
@@ -90,7 +90,7 @@ def _checked_bytes(path: Path, header: VoxelHeader) -> int:
             f"{DAMAGED_FILE} (its header tells of {sizes} voxels, "
             f"{header.value_bytes:.4g} bytes, the file has {n_bytes})"
         )
-    skip, longest = _skipped(header), TEXT_BYTES if header.ratio == TEXT_RATIO else 2  # packed ones may be longer
+    skip, longest = _skipped(header), VALUE_LETTERS if header.ratio == TEXT_RATIO else 2  # packed ones may be longer
     most = header.n_bytes + (int(skip) if skip.isdecimal() else 0) + longest * header.value_bytes + TRAILING_BYTES
     if n_bytes > most:  # its checksum would be made of all of it
         raise InputError(TOO_LONG.format(most))
