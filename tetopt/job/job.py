@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 from dataclasses import MISSING, dataclass, fields
 from difflib import get_close_matches
 from numbers import Real
@@ -145,7 +146,9 @@ def _parameters() -> str:
             words += ", optional" if field.default is None else f", default {field.default!r}"
         lines += [
             f"{field.name} : {words}",
-            *wrap(option.text, 108, initial_indent="    ", subsequent_indent="    "),
+            *wrap(
+                re.sub(r"\w+://\S*\w", r"``\g<0>``", option.text), 108, initial_indent="    ", subsequent_indent="    "
+            ),
         ]
     return "\n    ".join(lines)
 
