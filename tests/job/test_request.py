@@ -10,8 +10,9 @@ from commands import exit_code, mesh_words, numbers_in
 import tetopt
 from tetopt import InputError, Job
 from tetopt.cli.options import from_records, option_words, with_options
+from tetopt.io.images import sha256
 from tetopt.job.options import RunOptions, given_options
-from tetopt.job.request import requested
+from tetopt.job.request import checksum, requested
 
 # Of each field of the options of `tetopt mesh` a value that is not its default.
 VALUES = {
@@ -119,3 +120,18 @@ def test_options_of_a_row_replace_those_of_all():
 def test_options_of_a_row_that_cannot_be(texts, words):
     with pytest.raises(InputError, match=words):
         with_options(RunOptions(), texts)
+
+
+def test_a_folder_is_read_once_for_its_checksum_and_files_beside_a_header_count(tmp_path, monkeypatch):
+    reads = []
+    monkeypatch.setattr("tetopt.job.request.sha256", lambda path: reads.append(path) or sha256(path))
+    (tmp_path / "a.zarr").mkdir()
+    (tmp_path / "a.zarr" / "0").write_bytes(b"voxels")
+    assert checksum(tmp_path / "a.zarr") == checksum(tmp_path / "a.zarr") == sha256(tmp_path / "a.zarr")
+    assert reads == [tmp_path / "a.zarr"]
+    header = "NDims = 3\nDimSize = 1 1 1\nElementType = MET_UCHAR\nElementDataFile = b.raw\n"
+    (tmp_path / "b.mhd").write_text(header)
+    (tmp_path / "b.raw").write_bytes(b"1")
+    first = checksum(tmp_path / "b.mhd")
+    (tmp_path / "b.raw").write_bytes(b"22")
+    assert checksum(tmp_path / "b.mhd") == sha256(tmp_path / "b.mhd") != first

@@ -15,13 +15,10 @@ from tetopt.cli.run import Display
 from tetopt.cli.solver import print_model
 from tetopt.io.files import results_folder
 from tetopt.io.mni import mni_path
-from tetopt.job.events import listened, started
-from tetopt.job.in_parts import with_parts
-from tetopt.job.inputs import set_threads
+from tetopt.job.events import listened
 from tetopt.job.job import Job
 from tetopt.job.options import DEFAULT_NODES, has_model
-from tetopt.job.plan import planned
-from tetopt.job.read import read
+from tetopt.job.read import task_of
 from tetopt.job.run import Result, run
 from tetopt.job.source import whose_variance
 from tetopt.report.summary import size_summary
@@ -42,10 +39,7 @@ def mesh_command(job: Job, predict: PredictOption = False) -> int:
 def _predict(job: Job, display: Display) -> int:
     """Say what the run will take."""
     with listened(display):
-        plan = planned(job)
-        set_threads(job.threads)
-        started("read", "reading and preparing the image, with its mask and labels")
-        task = read(with_parts(plan))
+        task = task_of(job)
         display.close()
     if task.plan.n_parts is not None:
         print_parts(task)

@@ -11,7 +11,6 @@ import re
 from collections.abc import Callable, Iterator
 from copy import copy
 from dataclasses import MISSING, dataclass, fields, is_dataclass, replace
-from difflib import get_close_matches
 from functools import cache, wraps
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, cast, get_args, get_type_hints
@@ -36,6 +35,7 @@ from tetopt.job.options import (
     SchedulerOption,
     SpaceOption,
     kinds_of,
+    near_hint,
     option_name,
 )
 from tetopt.public import LARGEST_INTEGER
@@ -190,8 +190,7 @@ def with_options(options: RunOptions, texts: dict[str, str]) -> RunOptions:
     words = []
     for name, text in texts.items():
         if name not in names:
-            near = get_close_matches(name, names, 1)
-            raise InputError(f"{name}: is no option of tetopt mesh" + (f"; is {near[0]} meant?" if near else ""))
+            raise InputError(f"{name}: is no option of tetopt mesh" + near_hint(name, names))
         if not names[name]:
             several = name in ("set", "load")
             parts = [part.strip() for part in text.split(";") if part.strip()] if several else [text]

@@ -35,7 +35,7 @@ class Display:
         self._shown = ExitStack()
         self._tell: Callable[[Event], None] = lambda event: None
         self._begin = 0.0
-        self._rows: list[IterationRecord] = []
+        self._n_rows = 0  # of the iterations so far; 0 while there are none
         self._say = rare_lines()
 
     def __enter__(self) -> Display:
@@ -62,8 +62,8 @@ class Display:
 
     def is_over(self) -> bool:
         """Whether a signal has asked for the end; between iterations, a line says from time to time how far it is."""
-        if self._rows:
-            self._say(f"  in iteration {len(self._rows)}, {_spent(time.perf_counter() - self._begin)}")
+        if self._n_rows:
+            self._say(f"  in iteration {self._n_rows}, {_spent(time.perf_counter() - self._begin)}")
         return is_ended()
 
     def _start(self, stage: Stage, text: str) -> None:
@@ -74,18 +74,18 @@ class Display:
             self._tell = lambda event: say(event.text)
         elif stage.name == "optimise":
             self._begin_keeping()
-            self._begin, self._rows, self._say = time.perf_counter(), [], rare_lines()
+            self._begin, self._n_rows, self._say = time.perf_counter(), 0, rare_lines()
             show = self._shown.enter_context(_bar(stage.number or 0))
 
             def recorded(event: Event) -> None:
-                self._rows.append(event.data)
+                self._n_rows += 1
                 show(event.data)
 
             self._tell = recorded
         elif stage.name == "parts":
             self._tell = self._shown.enter_context(_parts_bar(self._begin_keeping))
         if stage.name in ("optimised", "write"):
-            self._rows = []
+            self._n_rows = 0
 
 
 @contextlib.contextmanager

@@ -14,6 +14,9 @@ Kind = Literal["started", "progress", "note", "warning", "violated"]
 """A stage begins; how far it is; a line to know; what is odd; a requirement that the mesh does not meet."""
 
 
+ENDED_WORDS = {"max_seconds": "out of time", "max_gb": "no more memory is allowed", "stopped": "interrupted"}
+
+
 class Stage(NamedTuple):
     """What a run begins with now."""
 
@@ -31,7 +34,7 @@ class Event(NamedTuple):
     text : str
         On one line. Arguments of the job stand between backticks: "`nodes`".
     data : object
-        Of "started" the `Stage`; of "progress" what that counts, such as a `IterationRecord`.
+        Of "started" the `Stage`; of "progress" what that counts, such as an `IterationRecord`.
 
     Examples
     --------
@@ -64,6 +67,13 @@ def listened(listener: Listener | None) -> Iterator[None]:
         yield
     finally:
         _LISTENER.reset(token)
+
+
+def ended_words(ended: str, kept: str) -> str:
+    """Why a run has ended before its last iteration, and what is kept of it."""
+    if ended == "converged":
+        return "converged: hardly anything changes any more"
+    return f"{ENDED_WORDS[ended]}: {kept} is kept"
 
 
 def started(stage: str, text: str = "", number: int | None = None) -> None:

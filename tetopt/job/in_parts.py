@@ -29,7 +29,7 @@ from tetopt.image import Image, VoxelGrid
 from tetopt.io.images import file_shape, parse_crop
 from tetopt.io.label_tables import NO_TABLE, LabelTable
 from tetopt.io.stored_images import STORED_SUFFIXES, check_local, coarse_image, open_stored, stored_checksum
-from tetopt.job.events import KERNEL_WORDS, note, progress, started, warning
+from tetopt.job.events import KERNEL_WORDS, ended_words, note, progress, started, warning
 from tetopt.job.options import DEFAULT_NODES, PartsOptions, stated_part
 from tetopt.job.plan import Plan
 from tetopt.job.predict import cropped_shape
@@ -279,12 +279,7 @@ def run_in_parts(
     if result.ended == "stopped" and not stop():
         parted = parted._replace(result=result._replace(ended="max_seconds"))
     if parted.result.ended != "iterations":
-        words = {
-            "converged": "converged: hardly anything changes any more",
-            "max_seconds": "out of time: the mesh of the last complete round is kept",
-            "stopped": "interrupted: the mesh of the last complete round is kept",
-        }
-        note(words[parted.result.ended])
+        note(ended_words(parted.result.ended, "the mesh of the last complete round"))
     return parted, task_bytes
 
 

@@ -6,7 +6,6 @@ import json
 import os
 import re
 from dataclasses import MISSING, dataclass, fields
-from difflib import get_close_matches
 from numbers import Real
 from pathlib import Path
 from textwrap import wrap
@@ -15,7 +14,7 @@ from typing import Any, Literal, Union, get_args, get_origin
 
 from tetopt.errors import InputError
 from tetopt.incoming import json_of
-from tetopt.job.options import JobOptions, kinds_of, option_of
+from tetopt.job.options import JobOptions, kinds_of, near_hint, option_of
 from tetopt.job.plan import resolved
 from tetopt.model.laws import LAW_OPTIONS
 from tetopt.public import LARGEST_INTEGER
@@ -78,9 +77,8 @@ class Job(JobOptions):
         >>> tetopt.Job(images="T1.nii.gz", output="brain.vtu", nodes=5000).given()
         {'images': ['T1.nii.gz'], 'nodes': 5000, 'output': 'brain.vtu'}
         """
-        values = {field.name: getattr(self, field.name) for field in fields(self)}
-        defaults = {field.name: field.default for field in fields(self)}
-        return {name: _in_words(value) for name, value in values.items() if value != defaults[name]}
+        values = ((field, getattr(self, field.name)) for field in fields(self))
+        return {field.name: _in_words(value) for field, value in values if value != field.default}
 
     def to_json(self) -> str:
         """The options as JSON, which `from_json` reads.
@@ -128,8 +126,7 @@ class Job(JobOptions):
             raise InputError(f"job: expected an object of options, got {type(table).__name__}")
         for name in table:
             if name not in kinds_of(cls):
-                near = get_close_matches(name, kinds_of(cls), 1)
-                raise InputError(f"job: has no option {name[:80]!r}" + (f"; is {near[0]} meant?" if near else ""))
+                raise InputError(f"job: has no option {name[:80]!r}" + near_hint(name, kinds_of(cls)))
         if lost := [each.name for each in fields(cls) if each.default is MISSING and each.name not in table]:
             raise InputError(f"job: needs {' and '.join(lost)}")
         return cls(**table)

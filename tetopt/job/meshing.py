@@ -14,7 +14,7 @@ from tetopt.contents.content import Content
 from tetopt.contents.domain import INSIDE_SHARE
 from tetopt.engine.cost import next_bytes
 from tetopt.engine.fast import prepare_kernels
-from tetopt.engine.loop import IterationRecord, MeshingResult
+from tetopt.engine.loop import MeshingResult
 from tetopt.engine.meshing import (
     ERROR_REACHED,
     ERROR_RUNS,
@@ -28,7 +28,7 @@ from tetopt.engine.meshing import (
 from tetopt.geometry.quadratic import node_count
 from tetopt.geometry.simplex import squared_edges
 from tetopt.io.files import check_space
-from tetopt.job.events import KERNEL_WORDS, note, progress, started
+from tetopt.job.events import KERNEL_WORDS, ended_words, note, progress, started
 from tetopt.job.in_parts import run_in_parts
 from tetopt.job.model import check_early
 from tetopt.job.options import SolverOptions, has_model
@@ -42,12 +42,6 @@ from tetopt.model.model import Model
 CELL_BYTES = 40  # of a file, at least: a VTU with a cell's usual fields takes 48, other formats more
 LONG_SECONDS = 3.0  # to make the kernels ready: they were compiled then, not loaded
 START_WORDS = "making the initial mesh"
-ENDED_WORDS = {
-    "converged": "converged: hardly anything changes any more",
-    "max_seconds": "out of time: the mesh so far is kept",
-    "max_gb": "no more memory is allowed: the mesh so far is kept",
-    "stopped": "interrupted: the mesh so far is kept",
-}
 
 
 def meshed(task: Task, stop: Callable[[], bool], begin: float) -> Meshed:
@@ -136,7 +130,7 @@ def _memory_limit(task: Task, content: Content) -> MemoryLimit | None:
 def prepare(make: Callable[[Callable[[str], None]], Any]) -> None:
     """Load the compiled kernels, or compile them, before the clock of the first iteration starts."""
     begin = time.perf_counter()
-    make(lambda words: progress(words))
+    make(progress)
     seconds = time.perf_counter() - begin
     if seconds > LONG_SECONDS:
         note(f"kernels compiled in {seconds:.0f} s; later runs on images of this kind load them from the cache")
@@ -152,17 +146,15 @@ def watched(
     def is_stopped() -> bool:
         return stop() or (limit is not None and limit.is_reached())
 
-    def recorded(row: IterationRecord) -> None:
-        progress("", row)
-
-    result = run(max_seconds=max_seconds, callback=recorded, stop=is_stopped)
+    result = run(max_seconds=max_seconds, callback=lambda row: progress("", row), stop=is_stopped)
     if iterations == 0:  # the initial mesh itself, not its nodes put on the sampling grid
         result = result._replace(mesh=initial)
     if result.ended == "stopped" and not stop():
         result = result._replace(ended="max_gb")
     if result.ended != "iterations":
         started("optimised")
-        note(f"{ENDED_WORDS[result.ended]} (iteration {result.history[-1].iteration} of {iterations})")
+        words = ended_words(result.ended, "the mesh so far")
+        note(f"{words} (iteration {result.history[-1].iteration} of {iterations})")
     return result
 
 

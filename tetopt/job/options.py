@@ -7,7 +7,9 @@ what it calls it.
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, fields
+from difflib import get_close_matches
 from functools import cache
 from pathlib import Path
 from typing import Annotated, Any, ClassVar, Literal, NamedTuple, get_args, get_type_hints
@@ -351,6 +353,12 @@ def has_model(options: SolverOptions) -> bool:
     """Whether a file is to hold more than the mesh and what labels are called."""
     own = {each.name: getattr(options, each.name) for each in fields(SolverOptions) if each.name != "label_names"}
     return SolverOptions(**own) != SolverOptions()
+
+
+def near_hint(name: str, names: Iterable[str]) -> str:
+    """Words for the end of a message, if one of the names is near to the one that there is not."""
+    near = get_close_matches(name, names, 1)
+    return f"; is {near[0]} meant?" if near else ""
 
 
 def kinds_of(record: Any) -> dict[str, Any]:

@@ -11,15 +11,30 @@ from tetopt.geometry.box import box_sides
 from tetopt.geometry.simplex import centroids
 from tetopt.image import Image
 from tetopt.io.formats import format_of
-from tetopt.job.events import warning
-from tetopt.job.in_parts import is_left_stored, read_stored
-from tetopt.job.inputs import label_table, read_mesh
-from tetopt.job.plan import Plan, changed, with_numbers
+from tetopt.job.events import started, warning
+from tetopt.job.in_parts import is_left_stored, read_stored, with_parts
+from tetopt.job.inputs import label_table, read_mesh, set_threads
+from tetopt.job.job import Job
+from tetopt.job.plan import Plan, changed, planned, with_numbers
 from tetopt.job.predict import size_of_run
 from tetopt.job.request import requested
 from tetopt.job.source import read_source
 from tetopt.job.task import Task
 from tetopt.mesh import Mesh
+
+
+def task_of(job: Job) -> Task:
+    """What a job asks for, planned and read, with its threads set.
+
+    Raises
+    ------
+    InputError
+        As `planned`, `with_parts` and `read`.
+    """
+    plan = planned(job)
+    set_threads(job.threads)
+    started("read", "reading and preparing the image, with its mask and labels")
+    return read(with_parts(plan))
 
 
 def read(plan: Plan) -> Task:
@@ -38,18 +53,18 @@ def read(plan: Plan) -> Task:
     source = read_source(plan.job, plan.job.label_names)
     if plan.n_parts is not None and source.content.image.ndim != 3:
         raise InputError("`parts`: of a volume, and the image is a plane; leave it out")
-    started = None
+    begun = None
     if plan.job.start is not None:
-        started = read_mesh(plan.job.start)
-        _check_place(started.mesh, source.contrasts[0], str(plan.job.start))
-        if plan.job.order is None and started.order == 2 and format_of(plan.job.output).has_quadratic:
+        begun = read_mesh(plan.job.start)
+        _check_place(begun.mesh, source.contrasts[0], str(plan.job.start))
+        if plan.job.order is None and begun.order == 2 and format_of(plan.job.output).has_quadratic:
             plan = plan.with_job(order=2)
         if source.labels is not None and not source.table.names:
-            source = source.with_table(label_table(None, started))
+            source = source.with_table(label_table(None, begun))
     plan, sizes = with_numbers(plan, source.content)
-    n_started = None if started is None else len(started.mesh.points)
+    n_started = None if begun is None else len(begun.mesh.points)
     size = size_of_run(plan, source.content, source.contrasts[0], n_started)
-    return Task(plan, source, started, sizes, size, _request_of(plan))
+    return Task(plan, source, begun, sizes, size, _request_of(plan))
 
 
 def _request_of(plan: Plan) -> dict[str, Any]:

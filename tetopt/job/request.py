@@ -11,6 +11,7 @@ from typing import Any
 
 import tetopt
 from tetopt.io.images import sha256
+from tetopt.io.stored_images import stored_checksum
 from tetopt.job.inputs import file_and_volume
 from tetopt.job.options import JobOptions, OutputOptions, PartsOptions, given_options, kinds_of, option_name
 from tetopt.model.laws import LAW_OPTIONS, law_file
@@ -59,12 +60,11 @@ def _files(name: str, value: Any) -> list[Path]:
 
 
 def checksum(path: Path) -> str:
-    """SHA-256 of a file that an option names, as hexadecimal digits; taken once of a file that has not changed."""
+    """SHA-256 of a file, or folder, that an option names, as hexadecimal digits; taken once of what has not changed."""
     file, _ = file_and_volume(path)
-    status = file.stat() if file.is_file() else None
-    return sha256(file) if status is None else _kept_checksum(file, status.st_size, status.st_mtime_ns)
+    return _kept_checksum(file, stored_checksum(file))
 
 
 @cache  # an atlas's mask may go with each of a thousand subjects
-def _kept_checksum(path: Path, _size: int, _changed: int) -> str:
+def _kept_checksum(path: Path, _state: str) -> str:
     return sha256(path)

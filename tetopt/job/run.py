@@ -11,13 +11,11 @@ from tetopt.engine.loop import MeshingResult
 from tetopt.geometry.quadratic import node_count
 from tetopt.io.files import save_json
 from tetopt.job.advice import tell_violated, warn_of_result, warn_of_sizes
-from tetopt.job.events import Listener, listened, started, violated
-from tetopt.job.in_parts import end_work, with_parts
-from tetopt.job.inputs import set_threads
+from tetopt.job.events import Listener, listened, violated
+from tetopt.job.in_parts import end_work
 from tetopt.job.job import Job
 from tetopt.job.meshing import meshed
-from tetopt.job.plan import planned
-from tetopt.job.read import read
+from tetopt.job.read import task_of
 from tetopt.job.task import Meshed, Shapes, Task
 from tetopt.job.write import draw, measured_of, numbers_of, saved
 from tetopt.measure.quality import quality
@@ -108,10 +106,7 @@ def run(job: Job, on: Listener | None = None, stop: Callable[[], bool] | None = 
     """
     begin = time.perf_counter()
     with listened(on):
-        plan = planned(job)
-        set_threads(job.threads)
-        started("read", "reading and preparing the image, with its mask and labels")
-        task = read(with_parts(plan))
+        task = task_of(job)
         came = meshed(task, stop or (lambda: False), begin)
         failed: dict[str, str] = {}
         model, about = saved(task, came, failed)
