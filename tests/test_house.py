@@ -14,11 +14,9 @@ import pytest
 ROOT = Path(__file__).resolve().parents[1]
 SOURCES = sorted((ROOT / "tetopt").rglob("*.py"))
 DOCUMENTS = [ROOT / "README.md", *sorted((ROOT / "docs").glob("**/*.md")), ROOT / "tests" / "benchmarks" / "README.md"]
-# More than 8 parameters: public functions, whose signature is a contract, and fluxes of numbers with no common noun.
+# More than 8 parameters: public functions, whose signature is a contract.
 WIDE = {
     "tetopt.fem.elasticity.compression": 9,
-    "tetopt.energy.sampling.segment_flux": 9,
-    "tetopt.energy.sampling.triangle_flux": 10,
     "tetopt.engine.fast.optimize": 13,
     "tetopt.engine.meshing.mesh_image": 13,
     "tetopt.engine.paper.optimize_paper": 12,

@@ -617,15 +617,15 @@ def _by_first_axis(a: tuple, b: tuple, c: tuple) -> tuple:
 
 @njit(cache=True)
 def triangle_flux(
-    ticks: NDArray, node_a: int, node_b: int, node_c: int, bits: int, prefix: NDArray, scatter: tuple | None,
-    out: NDArray, p: int, q: int,
-) -> None:  # fmt: skip
+    ticks: NDArray, nodes: tuple, bits: int, prefix: NDArray, scatter: tuple | None, out: NDArray, place: tuple
+) -> None:
     """Flux of the triangle of three nodes: sums of k and of each P(k) over the rows that cross it.
 
-    It is positive where the triangle, its nodes as listed, faces up the last axis, and goes to out[p, q, :], one entry
-    more than `prefix` has. Or, where `scatter` is an array of steps and a change, the change, signed as the flux, is
+    It is positive where the triangle, its nodes as listed, faces up the last axis, and goes to out[p, q, :], where
+    `place` is (p, q), one entry more than `prefix` has. Or, where `scatter` is an array of steps and a change, the change, signed as the flux, is
     added to the steps at each crossing.
     """
+    (node_a, node_b, node_c), (p, q) = nodes, place
     n_more = out.shape[2] - 3
     out[p, q, :] = 0.0
     n = cross(difference(ticks, node_b, node_a), difference(ticks, node_c, node_a))
@@ -683,10 +683,10 @@ def triangle_flux(
 
 @njit(cache=True)
 def segment_flux(
-    ticks: NDArray, node_a: int, node_b: int, bits: int, prefix: NDArray, scatter: tuple | None, out: NDArray, p: int,
-    q: int,
-) -> None:  # fmt: skip
+    ticks: NDArray, nodes: tuple, bits: int, prefix: NDArray, scatter: tuple | None, out: NDArray, place: tuple
+) -> None:
     """Flux of the segment of two nodes of a 2-D mesh, which lies along axes 1 and 2; as `triangle_flux`."""
+    (node_a, node_b), (p, q) = nodes, place
     n_more = out.shape[2] - 3
     for d in range(3 + n_more):
         out[p, q, d] = 0.0
@@ -725,9 +725,9 @@ def facet_flux(
     """Flux of one of the facets `nodes` (F, n) to out[p, 0, :]; see `triangle_flux`."""
     a, b = nodes[facet, 0], nodes[facet, 1]
     if nodes.shape[1] == 2:
-        segment_flux(ticks, a, b, bits, prefix, scatter, out, p, 0)
+        segment_flux(ticks, (a, b), bits, prefix, scatter, out, (p, 0))
     else:
-        triangle_flux(ticks, a, b, nodes[facet, 2], bits, prefix, scatter, out, p, 0)
+        triangle_flux(ticks, (a, b, nodes[facet, 2]), bits, prefix, scatter, out, (p, 0))
 
 
 class _Fluxes(NamedTuple):
@@ -744,13 +744,13 @@ def put_flux(out: Floats3, p: int, q: int, ticks: Ints2, a: int, b: int, c: int,
     """Flux of the facet (a, b, c), or (a, b) with c < 0, to out[p, q, :]."""
     if c < 0:
         if volume.is_short:
-            segment_flux(ticks, a, b, volume.bits, volume.short, None, out, p, q)
+            segment_flux(ticks, (a, b), volume.bits, volume.short, None, out, (p, q))
         else:
-            segment_flux(ticks, a, b, volume.bits, volume.long, None, out, p, q)
+            segment_flux(ticks, (a, b), volume.bits, volume.long, None, out, (p, q))
     elif volume.is_short:
-        triangle_flux(ticks, a, b, c, volume.bits, volume.short, None, out, p, q)
+        triangle_flux(ticks, (a, b, c), volume.bits, volume.short, None, out, (p, q))
     else:
-        triangle_flux(ticks, a, b, c, volume.bits, volume.long, None, out, p, q)
+        triangle_flux(ticks, (a, b, c), volume.bits, volume.long, None, out, (p, q))
 
 
 @unit
