@@ -622,8 +622,8 @@ def triangle_flux(
     """Flux of the triangle of three nodes: sums of k and of each P(k) over the rows that cross it.
 
     It is positive where the triangle, its nodes as listed, faces up the last axis, and goes to out[p, q, :], where
-    `place` is (p, q), one entry more than `prefix` has. Or, where `scatter` is an array of steps and a change, the change, signed as the flux, is
-    added to the steps at each crossing.
+    `place` is (p, q), one entry more than `prefix` has. Or, where `scatter` is an array of steps and a change, the
+    change, signed as the flux, is added to the steps at each crossing.
     """
     (node_a, node_b, node_c), (p, q) = nodes, place
     n_more = out.shape[2] - 3

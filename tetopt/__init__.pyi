@@ -1,0 +1,64 @@
+"""The public names of tetopt, and the modules that they are loaded from."""
+
+from .check import check_mesh as check_mesh
+from .contents.align import (
+    foreground_mask as foreground_mask,
+    resample_contrast as resample_contrast,
+    resample_labels as resample_labels,
+    resample_mask as resample_mask,
+)
+from .contents.content import Content as Content, content as content
+from .contents.statistics import Statistics as Statistics
+from .energy.discretization import E_D as E_D
+from .energy.geometric import E_G as E_G
+from .energy.sampling import CellMoments as CellMoments, cell_moments as cell_moments, cell_of_voxel as cell_of_voxel
+from .engine.fast import optimize as optimize
+from .engine.loop import IterationRecord as IterationRecord, MeshingResult as MeshingResult
+from .engine.meshing import mesh_image as mesh_image
+from .engine.paper import optimize_paper as optimize_paper
+from .errors import InputError as InputError
+from .fem.solution import (
+    Solution as Solution,
+    SolutionFields as SolutionFields,
+    solution_fields as solution_fields,
+    solve as solve,
+)
+from .geometry.surface import Surface as Surface, extract_surface as extract_surface
+from .image import Image as Image, VoxelGrid as VoxelGrid
+from .io.formats import save_mesh as save_mesh, save_model as save_model
+from .io.frd import Results as Results, read_frd as read_frd
+from .io.images import load_image as load_image, save_image as save_image
+from .io.label_tables import load_label_table as load_label_table
+from .io.meshes import load_mesh as load_mesh
+from .io.stored_images import open_stored as open_stored
+from .io.surfaces import save_surface as save_surface
+from .job.events import Event as Event
+from .job.job import Job as Job
+from .job.run import Result as Result, run as run
+from .measure.fidelity import (
+    LabelFidelity as LabelFidelity,
+    MaskFidelity as MaskFidelity,
+    cell_labels as cell_labels,
+    label_fidelity as label_fidelity,
+    mask_fidelity as mask_fidelity,
+)
+from .measure.interfaces import LabelInterface as LabelInterface, label_interfaces as label_interfaces
+from .measure.quality import Quality as Quality, QualityErrors as QualityErrors, quality as quality
+from .measure.segmentation import segment as segment
+from .mesh import Mesh as Mesh
+from .model.build import build_model as build_model
+from .model.fields import cell_fields as cell_fields
+from .model.file import MeshFile as MeshFile
+from .model.labels import LabelTable as LabelTable
+from .model.laws import ByLabel as ByLabel
+from .model.loads import Load as Load
+from .model.materials import BinningError as BinningError, Materials as Materials
+from .model.model import Model as Model
+from .model.sets import Box as Box, Sets as Sets
+from .phantom import Phantom as Phantom, Shape as Shape, load_phantom as load_phantom
+from .start.lattice import lattice_mesh as lattice_mesh
+from .start.octree import octree_mesh as octree_mesh
+from .start.sizes import Sizes as Sizes
+from .stored import StoredImage as StoredImage
+
+__version__: str
