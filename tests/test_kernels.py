@@ -182,9 +182,8 @@ import numpy as np
 import some_kernels as k
 from tetopt import kernels
 os.cpu_count = lambda: 2
-started = []
-popen = kernels.subprocess.Popen
-kernels.subprocess.Popen = lambda *a, **b: started.append(1) or popen(*a, **b)
+started, start = [], kernels.started
+kernels.started = lambda *words: started.append(1) or start(*words)
 kernels.link([k.step_7])
 print(k.step_7(k.Row(np.ones(3)), 2), len(started), [f.was_cached for f in (k.step_0, k.step_3, k.step_7)])
 """
