@@ -470,15 +470,15 @@ def test_a_cache_that_goes_while_it_is_used_is_made_again(use):
 @compiled_only
 def test_what_another_run_compiles_is_waited_for(tmp_path, monkeypatch):
     """Else two first runs at once compile everything twice."""
-    pytest.importorskip("fcntl")
+    fcntl = pytest.importorskip("fcntl")
     words, clock = [], [0.0]
     with (tmp_path / kernels.LOCK_NAME).open("ab") as other:
-        kernels.fcntl.flock(other, kernels.fcntl.LOCK_EX)
+        fcntl.flock(other, fcntl.LOCK_EX)
 
         def sleep(seconds):
             clock[0] += 1
             if clock[0] == 3:
-                kernels.fcntl.flock(other, kernels.fcntl.LOCK_UN)
+                fcntl.flock(other, fcntl.LOCK_UN)
 
         monkeypatch.setattr(kernels.time, "sleep", sleep)
         with kernels._only_compiler(tmp_path, words.append) as has_waited:
