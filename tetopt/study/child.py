@@ -1,9 +1,9 @@
 """A pipeline in a process of its own: its memory is its own, and when it crashes or runs wild, only it ends.
 
 The child is ``python -m tetopt.study.child FOLDER``; job and result are files in a temporary folder. Its memory,
-with that of the processes it starts, is watched from the parent as resident pages (VmRSS in /proc), not limited by
-RLIMIT_AS: numba, VTK and the allocators reserve far more address space than they ever touch, so a limit on that would
-end runs that need little.
+with that of the processes it starts, is watched from the parent as resident pages, not limited by RLIMIT_AS: numba,
+VTK and the allocators reserve far more address space than they ever touch, so a limit on that would end runs that need
+little.
 """
 
 from __future__ import annotations
@@ -68,8 +68,8 @@ def run_in_child(
     max_seconds : float
         Wall time of one run, the child's start included, after which it is killed with all that it started.
     max_bytes : int, optional
-        Resident memory at which it is killed. It is looked at twenty times a second (Linux only: elsewhere there is
-        no limit), so a fast run may pass it by a little.
+        Resident memory at which it is killed. It is looked at twenty times a second, so a fast run may pass it by a
+        little.
     say : callable
         Called with a line when a run is repeated.
 
