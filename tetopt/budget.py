@@ -7,6 +7,7 @@ helps.
 
 from __future__ import annotations
 
+import os
 import re
 import sys
 from pathlib import Path
@@ -98,10 +99,15 @@ def resident_bytes() -> int:
 
 
 def address_bytes() -> int:
-    """Address space that this process has taken."""
-    import psutil
+    """Address space that this process has taken; 0 where the system does not say.
 
-    return psutil.Process().memory_info().vms
+    Children that read a file ask for it, so that psutil is not loaded for it: that takes a tenth of their time.
+    """
+    try:
+        pages = (PROC_FOLDER / "self" / "statm").read_text(encoding="ascii").split()[0]
+    except OSError:
+        return 0
+    return int(pages) * os.sysconf("SC_PAGE_SIZE")
 
 
 def peak_bytes(pid: int | None = None) -> int:
