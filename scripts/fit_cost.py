@@ -29,7 +29,7 @@ import numpy as np
 import scipy
 
 import tetopt
-from tetopt.budget import BYTES_PER_GB, PROC_FOLDER, status_bytes
+from tetopt.budget import BYTES_PER_GB, peak_bytes
 from tetopt.engine.cost import RunSize, calibration, memory_terms, once_terms, swept_terms
 from tetopt.interpreter import python_command
 from tetopt.io.files import checked_output, written_whole
@@ -236,7 +236,7 @@ def run(name: str, threads: int, words: list[str], base: Path) -> Row:
             if pid:
                 break
             # Not ru_maxrss, which begins at this process's memory; both only grow.
-            peak = max(peak, status_bytes("VmHWM", PROC_FOLDER / str(process.pid)))
+            peak = max(peak, peak_bytes(process.pid))
             main_seconds = max(main_seconds, thread_seconds(process.pid))
             time.sleep(POLL_SECONDS)
     process.returncode = code = os.waitstatus_to_exitcode(status)

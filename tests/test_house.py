@@ -235,3 +235,17 @@ def test_only_the_command_names_options():
 def test_a_class_name_has_one_meaning():
     names = Counter(node.name for path in SOURCES for node in ast.walk(tree_of(path)) if isinstance(node, ast.ClassDef))
     assert {name: count for name, count in names.items() if count > 1} == {}
+
+
+def test_only_the_command_prints():
+    """The library returns, warns, raises and sends events; `tetopt.cli` alone writes to the terminal."""
+    printing, streams = {"print", "pprint", "print_exc", "print_exception"}, {"stdout", "stderr"}
+    printed = [
+        f"{module_name(path)}:{node.lineno}"
+        for path in SOURCES
+        if "cli" not in path.parts
+        for node in ast.walk(tree_of(path))
+        if (isinstance(node, ast.Call) and getattr(node.func, "id", getattr(node.func, "attr", "")) in printing)
+        or (isinstance(node, ast.Attribute) and node.attr in streams and getattr(node.value, "id", "") == "sys")
+    ]
+    assert printed == []

@@ -182,9 +182,8 @@ import numpy as np
 import some_kernels as k
 from tetopt import kernels
 os.cpu_count = lambda: 2
-started = []
-popen = kernels.subprocess.Popen
-kernels.subprocess.Popen = lambda *a, **b: started.append(1) or popen(*a, **b)
+started, start = [], kernels.started
+kernels.started = lambda *words: started.append(1) or start(*words)
 kernels.link([k.step_7])
 print(k.step_7(k.Row(np.ones(3)), 2), len(started), [f.was_cached for f in (k.step_0, k.step_3, k.step_7)])
 """
@@ -471,15 +470,15 @@ def test_a_cache_that_goes_while_it_is_used_is_made_again(use):
 @compiled_only
 def test_what_another_run_compiles_is_waited_for(tmp_path, monkeypatch):
     """Else two first runs at once compile everything twice."""
-    pytest.importorskip("fcntl")
+    fcntl = pytest.importorskip("fcntl")
     words, clock = [], [0.0]
     with (tmp_path / kernels.LOCK_NAME).open("ab") as other:
-        kernels.fcntl.flock(other, kernels.fcntl.LOCK_EX)
+        fcntl.flock(other, fcntl.LOCK_EX)
 
         def sleep(seconds):
             clock[0] += 1
             if clock[0] == 3:
-                kernels.fcntl.flock(other, kernels.fcntl.LOCK_UN)
+                fcntl.flock(other, fcntl.LOCK_UN)
 
         monkeypatch.setattr(kernels.time, "sleep", sleep)
         with kernels._only_compiler(tmp_path, words.append) as has_waited:

@@ -10,6 +10,7 @@ import builtins
 import importlib
 import os
 import pkgutil
+import subprocess
 import sys
 import time
 import types
@@ -181,21 +182,24 @@ def main(folder):
 
 
 def _ends_children():
-    """A pipeline that takes too long is ended as on Windows, by a program that is put there for it; 0 if so."""
+    """A pipeline that takes too long is ended as on Windows, with what it started; 0 if so."""
     import numpy as np
+    import psutil
 
     import tetopt
     from tetopt.study.child import run_in_child
     from tetopt.study.pipelines import PipelineInput
 
-    Path("taskkill").write_text('#!/bin/sh\necho "$@" > ended.txt\nkill -9 "$4"\n', encoding="utf-8")
-    Path("taskkill").chmod(0o755)
-    os.environ["PATH"] = os.pathsep.join((os.getcwd(), os.environ["PATH"]))
-    outcome = run_in_child(_asleep, PipelineInput(tetopt.Image(np.zeros((4, 4)), np.eye(3)), None, 10), max_seconds=0.5)
-    return int(outcome.reason != "limit" or not Path("ended.txt").read_text(encoding="utf-8").startswith("/F /T /PID"))
+    job = PipelineInput(tetopt.Image(np.zeros((4, 4)), np.eye(3)), None, 10)
+    outcome = run_in_child(importlib.import_module("windows").asleep, job, max_seconds=10.0)
+    pid = int(Path("started.txt").read_text(encoding="utf-8"))
+    return int(outcome.reason != "limit" or (psutil.pid_exists(pid) and psutil.Process(pid).status() != "zombie"))
 
 
-def _asleep(_job):
+def asleep(_job):
+    """Start a process in a session of its own, and wait."""
+    below = subprocess.Popen([sys.executable, "-c", "import time; time.sleep(60)"], start_new_session=True)
+    Path("started.txt").write_text(str(below.pid), encoding="utf-8")
     time.sleep(60)
 
 

@@ -16,7 +16,6 @@ from __future__ import annotations
 
 import contextlib
 import os
-import subprocess
 import sys
 import tempfile
 import threading
@@ -38,16 +37,13 @@ from numba import types
 from numba.extending import overload, typeof_impl
 from numpy.typing import NDArray
 
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]
-
 from tetopt.budget import address_room
 from tetopt.cache import place_cache
 from tetopt.interpreter import python_command, python_environment
 from tetopt.kernel_cache import IS_PLAIN, PLAIN_NOTICE, NotKeptWarning, checksum, njit, plain_njit, warn
 from tetopt.kernel_types import by_value, cast, type_of
+from tetopt.system.child import started
+from tetopt.system.lock import lock_file
 
 # Arrays in the signatures of units and in records: of so many axes, the last one contiguous.
 Floats1 = Annotated[NDArray[np.float64], types.float64[::1]]
@@ -333,16 +329,11 @@ def _only_compiler(folder: Path, say: Callable[[str], None]) -> Iterator[bool]:
         return
     with lock:
         give_up = time.monotonic() + LONGEST_WAIT_SECONDS
-        while fcntl is not None and time.monotonic() < give_up:
-            try:
-                fcntl.flock(lock, fcntl.LOCK_EX | fcntl.LOCK_NB)  # the system ends it with the process
-                break
-            except BlockingIOError:
+        with contextlib.suppress(OSError):  # a file system without locks
+            while time.monotonic() < give_up and not lock_file(lock):
                 has_waited = True
                 say("waiting for another run, which compiles the kernels")
                 time.sleep(POLLED_SECONDS)
-            except OSError:  # a file system without locks
-                break
         yield has_waited
 
 
@@ -367,7 +358,6 @@ def _compile_apart(kernels: Sequence[Any], folder: Path, say: Callable[[str], No
     names = [
         f"{kernel.__module__}:{kernel.__name__}" for kernel in sorted(kernels, key=sizes.__getitem__, reverse=True)
     ]
-    processes: list[subprocess.Popen[bytes]] = []
     with contextlib.ExitStack() as stack:
         try:
             claims = stack.enter_context(tempfile.TemporaryDirectory(prefix="tetopt-", dir=folder))
@@ -378,16 +368,11 @@ def _compile_apart(kernels: Sequence[Any], folder: Path, say: Callable[[str], No
             "import signal; signal.signal(signal.SIGINT, signal.SIG_IGN); "
             f"from tetopt.kernels import compile_named; compile_named({names!r}, {claims!r}, {os.getpid()})"
         )
-        try:
-            command, environment = python_command("-c", code), python_environment()
-            processes.extend(subprocess.Popen(command, env=environment) for _ in range(n_processes))
-            while any(process.poll() is None for process in processes):
-                say(f"compiling the kernels, {len(os.listdir(claims))} of {len(kernels)}")
-                time.sleep(POLLED_SECONDS)
-        finally:
-            for process in processes:
-                process.kill()
-                process.wait()
+        command, environment = python_command("-c", code), python_environment()
+        processes = [stack.enter_context(started(command, environment)) for _ in range(n_processes)]
+        while any(process.poll() is None for process in processes):
+            say(f"compiling the kernels, {len(os.listdir(claims))} of {len(kernels)}")
+            time.sleep(POLLED_SECONDS)
 
 
 def compile_named(names: Sequence[str], claims: str, parent: int) -> None:

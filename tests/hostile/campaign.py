@@ -99,8 +99,8 @@ def limited(words: tuple[str, ...], temporary: Path) -> int:
     resource.setrlimit(resource.RLIMIT_CORE, (0, 0))
     sys.argv = ["tetopt", *words]
     with contextlib.suppress(ImportError):  # an older tetopt reads in its own process
-        apart: Any = import_module("tetopt.io.apart")
-        apart.subprocess = SimpleNamespace(Popen=ForkedReader, PIPE=None, DEVNULL=None)
+        child: Any = import_module("tetopt.system.child")
+        child.subprocess = SimpleNamespace(Popen=ForkedReader, PIPE=None, DEVNULL=None)
     return app.main(list(words))
 
 

@@ -10,8 +10,9 @@ from pathlib import Path
 import numpy as np
 
 import tetopt
-from tetopt.study.endings import Crashed, NotInstalled, signal_words
+from tetopt.study.endings import Crashed, NotInstalled
 from tetopt.study.pipelines import Produced
+from tetopt.system.child import signal_words
 
 
 def crash(job):

@@ -14,8 +14,9 @@ import pytest
 
 import tetopt
 from tetopt.study.child import run_in_child
-from tetopt.study.endings import last_line, signal_words
+from tetopt.study.endings import last_line
 from tetopt.study.pipelines import PIPELINES, PipelineInput
+from tetopt.system.child import signal_words
 
 IMAGE = tetopt.load_phantom("sphere").image(voxel_mm=4.0)
 JOB = PipelineInput(IMAGE, None, 300, classes=2, iterations=3)

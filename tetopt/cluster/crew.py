@@ -13,12 +13,7 @@ from typing import Any, NamedTuple
 
 from tetopt.budget import memory_words
 from tetopt.errors import InputError
-from tetopt.processes import end_with_parent
-
-try:
-    import resource
-except ImportError:  # Windows
-    resource = None  # type: ignore[assignment]
+from tetopt.system.child import end_with_parent, limit_self
 
 MEMORY_MARGIN = 1.35  # of a task's memory over its prediction, which may be 25 % too low: 1 / 0.75
 WORKER_BYTES = 1.5e8  # of a dask worker itself with its nanny: 65 MB each, and what they exchange
@@ -188,10 +183,8 @@ def limiter() -> Any:
         def setup(self, worker: Any) -> None:
             end_with_parent()
             limit = worker.memory_manager.memory_limit
-            if resource is not None and limit:
-                hard = resource.getrlimit(resource.RLIMIT_DATA)[1]
-                soft = limit if hard == resource.RLIM_INFINITY else min(limit, hard)
-                resource.setrlimit(resource.RLIMIT_DATA, (soft, hard))
+            if limit:
+                limit_self("RLIMIT_DATA", limit)
 
     return Limiter()
 

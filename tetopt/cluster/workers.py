@@ -145,8 +145,7 @@ def local_share(need: Need, count: int | None) -> Share:
     """How this machine, as affinity and containers leave it, is divided."""
     from dask.system import CPU_COUNT
 
-    free = available_bytes()
-    return shares(need, count, CPU_COUNT, float("inf") if free is None else float(free))
+    return shares(need, count, CPU_COUNT, float(available_bytes()))
 
 
 def _local(stack: ExitStack, need: Need, folders: Folders, count: int | None) -> Workers:

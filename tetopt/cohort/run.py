@@ -8,13 +8,11 @@ from __future__ import annotations
 import os
 import shlex
 import shutil
-import subprocess
 import time
-from contextlib import suppress
 from pathlib import Path
 from typing import Literal, NamedTuple
 
-from tetopt.budget import status_bytes
+from tetopt.budget import peak_bytes
 from tetopt.cohort.layout import (
     FIGURES_NAME,
     WORK_NAME,
@@ -27,8 +25,8 @@ from tetopt.cohort.layout import (
 )
 from tetopt.interpreter import python_command, python_environment
 from tetopt.io.files import save_json, save_text
-from tetopt.processes import started
-from tetopt.study.endings import last_line, signal_words
+from tetopt.study.endings import last_line
+from tetopt.system.child import signal_words, started, watched
 
 LOOK_SECONDS = 0.2  # between two looks at a run: a hundredth of the shortest that is meant
 MOST_ATTEMPTS = 2  # of a run that a signal ends: the second may find the memory that the first did not
@@ -98,22 +96,16 @@ def _attempt(job: SubjectTask, begin: float, attempt: int) -> tuple[Ended, bool]
     outputs = ["-o", str(mesh), "--json", str(mesh.with_suffix(".json")), "--figures", str(work / FIGURES_NAME)]
     command = python_command("-m", "tetopt", "mesh", *outputs, *job.words)
     environment = python_environment(**dict.fromkeys(THREAD_NAMES, str(job.threads)), COLUMNS="120")
-    peak, log, is_given_up = 0, log_path(out, job.key), False
+    log, run = log_path(out, job.key), out / WORK_NAME / job.run
     if attempt == 1:
         log.unlink(missing_ok=True)
     with (
         log.open("ab") as stream,
-        started(command, work, environment, stdout=stream, stderr=stream) as child,
+        started(command, environment, work, stdout=stream, stderr=stream) as child,
     ):
-        while child.poll() is None:
-            with suppress(subprocess.TimeoutExpired):
-                child.wait(LOOK_SECONDS)
-            peak = max(peak, status_bytes("VmHWM", Path("/proc", str(child.pid))))
-            if not (out / WORK_NAME / job.run).exists():
-                is_given_up = True
-                break
+        peak, given_up = watched(child, LOOK_SECONDS, peak_bytes, lambda _: None if run.exists() else "given up")
     seconds = time.monotonic() - begin
-    if is_given_up:
+    if given_up is not None:
         shutil.rmtree(work, ignore_errors=True)
         return Ended(job.key, "given up", "given up", seconds, peak), False
     numbers = numbers_of(mesh.with_suffix(".json"))

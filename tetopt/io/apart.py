@@ -16,6 +16,7 @@ import signal
 import subprocess
 import sys
 import threading
+import time
 from collections.abc import Callable
 from pathlib import Path
 from typing import IO, Any
@@ -26,6 +27,7 @@ from numpy.typing import NDArray
 from tetopt.budget import address_bytes
 from tetopt.errors import InputError
 from tetopt.interpreter import python_command, python_environment
+from tetopt.system.child import limit_self, signal_words, started
 
 LEAST_BYTES = 2**31  # of memory for any file, libraries loaded: their buffers and the largest small file
 BYTES_A_BYTE = 64  # of memory for each of the file, beyond: text grows eightfold, zlib on meshes tenfold
@@ -66,51 +68,36 @@ def read_apart(
     seconds = LEAST_SECONDS + SECONDS_A_BYTE * (size + value_bytes)
     name = f"{read.__module__}:{read.__qualname__}"
     job = {"read": name, "path": str(path), "rest": rest, "bytes": most_bytes, "seconds": int(seconds)}
-    child = subprocess.Popen(
+    deadline = time.monotonic() + seconds
+    with started(
         python_command("-m", "tetopt.io.apart"),
+        python_environment(),
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         stderr=subprocess.DEVNULL,
-        env=python_environment(),
-    )
-    assert child.stdin is not None
-    assert child.stdout is not None
-    is_late = threading.Event()
-
-    def end() -> None:
-        is_late.set()
-        child.kill()
-
-    timer = threading.Timer(seconds, end)
-    timer.start()
-    try:
-        with contextlib.suppress(BrokenPipeError):  # it ended before; its exit code says how
-            child.stdin.write(json.dumps(job).encode())
-            child.stdin.close()
-        answer = _received(child.stdout)
-        code = child.wait()
-    finally:
-        timer.cancel()
-        child.kill()
-        child.wait()
-        child.stdout.close()
+    ) as child:
+        assert child.stdin is not None
+        assert child.stdout is not None
+        timer = threading.Timer(seconds, child.kill)
+        timer.start()
+        with contextlib.closing(child.stdout), contextlib.ExitStack() as stack:
+            stack.callback(timer.cancel)
+            with contextlib.suppress(BrokenPipeError):  # it ended before; its exit code says how
+                child.stdin.write(json.dumps(job).encode())
+                child.stdin.close()
+            answer = _received(child.stdout)
+            code = child.wait()
     if answer is None:
-        if is_late.is_set() or code == -getattr(signal, "SIGXCPU", 0):
+        if time.monotonic() >= deadline or code == -getattr(signal, "SIGXCPU", 0):
             raise InputError(f"was not read within {seconds:.0f} s by {library}; damaged, or made to take for ever")
+        ending = (signal_words(code) or f"exit code {code}").rpartition(", ")[2]
         raise InputError(
-            f"{library} crashed at this file ({_ending(code)}; it may take {most_bytes / 1e9:.1f} GB); "
+            f"{library} crashed at this file ({ending}; it may take {most_bytes / 1e9:.1f} GB); "
             "the file is damaged: copy or export it again"
         )
     if "refused" in answer:
         raise InputError(answer["refused"])
     return answer["value"]
-
-
-def _ending(code: int) -> str:
-    """How the child ended, by its exit code."""
-    with contextlib.suppress(ValueError):
-        return signal.Signals(-code).name if code < 0 else f"exit code {code}"
-    return f"signal {-code}"
 
 
 # The way back: one line of JSON, in which arrays are numbers of those that follow.
@@ -182,20 +169,6 @@ def _unpacked(tree: Any, arrays: list[NDArray]) -> Any:
 # In the child
 
 
-def _limit(most_bytes: int, seconds: int) -> None:
-    """No more address space than what is taken already and `most_bytes`, where the system can; so much CPU time."""
-    try:
-        import resource
-    except ImportError:  # not on Windows
-        return
-    for limit, value in ((resource.RLIMIT_AS, address_bytes() + most_bytes), (resource.RLIMIT_CPU, seconds)):
-        _, hard = resource.getrlimit(limit)
-        with contextlib.suppress(ValueError, OSError):  # macOS has no such limit of memory
-            resource.setrlimit(limit, (value if hard == resource.RLIM_INFINITY else min(value, hard), hard))
-    with contextlib.suppress(ValueError, OSError):
-        resource.setrlimit(resource.RLIMIT_CORE, (0, 0))  # no core file of somebody's scan in the folder
-
-
 def main() -> None:
     """Do the job of standard input."""
     stream = os.fdopen(os.dup(1), "wb")
@@ -205,7 +178,9 @@ def main() -> None:
     module, _, name = job["read"].partition(":")
     try:
         read = getattr(importlib.import_module(module), name)
-        _limit(job["bytes"], job["seconds"])
+        limit_self("RLIMIT_AS", address_bytes() + job["bytes"])
+        limit_self("RLIMIT_CPU", job["seconds"])
+        limit_self("RLIMIT_CORE", 0)  # no core file of somebody's scan in the folder
         answer = {"value": read(job["path"], *job["rest"])}
     except InputError as error:
         answer = {"refused": str(error)}

@@ -14,7 +14,7 @@ import shutil
 import stat
 import tempfile
 from collections.abc import Callable, Iterable, Iterator
-from contextlib import AbstractContextManager, contextmanager, suppress
+from contextlib import AbstractContextManager, ExitStack, contextmanager, suppress
 from contextvars import ContextVar
 from itertools import chain, count
 from pathlib import Path
@@ -212,35 +212,54 @@ def written_whole(path: Path, n_bytes: int | None = None) -> Iterator[Path]:
     OSError
         Any other reason, with the path and, on a full disk, the number of bytes (`n_bytes`) if it is known.
     """
-    outputs, key = _OUTPUTS.get(), _absolute(path)
-    place = Path(os.path.realpath(path)) if outputs is None else outputs.places.get(key, Path(os.path.realpath(path)))
     # not `path.suffixes`, which passes over dots that lead: of "..nii.gz" it knows .gz alone
     suffix = "".join(f".{part}" for part in path.name.split(".")[1:][-2:])[-20:]
-    temporary = None
-    try:
-        handle, name = tempfile.mkstemp(prefix=f".{path.name[:TEMPORARY_LETTERS]}.", suffix=suffix, dir=place.parent)
-        temporary = Path(name)
+    with _output(path, n_bytes) as (place, may_replace):
+        handle, name = tempfile.mkstemp(prefix=_hidden(path), suffix=suffix, dir=place.parent)
         os.close(handle)
-        yield temporary
-        _synchronise(temporary, place)
-        if outputs is None or outputs.may_replace.get(key, True):
-            os.replace(temporary, place)
-        elif not _linked(temporary, place):
-            kept = _beside(temporary, path)
-            raise TakenError(
-                f"{path}: another program has written it in the meantime, and without `force` it stays as it is; what "
-                f"was to be written is in {kept}"
-            )
-        _synchronise_folder(place.parent)
-    except OSError as error:
-        raise OSError(error.errno or errno.EIO, _reason(error, place.parent, n_bytes), str(path)) from error
-    finally:
-        if temporary is not None:
+        temporary = Path(name)
+        try:
+            yield temporary
+            _on_disk(temporary, place)
+            if may_replace:
+                os.replace(temporary, place)
+            elif not _linked(temporary, place):
+                kept = _beside(temporary, path)
+                raise TakenError(
+                    f"{path}: another program has written it in the meantime, and without `force` it stays as it is; "
+                    f"what was to be written is in {kept}"
+                )
+            _synchronise_folder(place.parent)
+        finally:
             with suppress(OSError):  # then a hidden file stays, and what is told is what went wrong before
                 os.unlink(temporary)
+
+
+@contextmanager
+def _output(path: Path, n_bytes: int | None = None) -> Iterator[tuple[Path, bool]]:
+    """Where an output really lies, and whether it may replace what is there by now; noted as written after the block.
+
+    Errors of the system within it are those of writing `path`.
+    """
+    outputs, key = _OUTPUTS.get(), _absolute(path)
+    place = Path(os.path.realpath(path)) if outputs is None else outputs.places.get(key, Path(os.path.realpath(path)))
+    with telling(path, n_bytes, place.parent):
+        yield place, outputs is None or outputs.may_replace.get(key, True)
     if outputs is not None and key in outputs.places:
         outputs.may_replace[key] = True
         outputs.written.append(path)
+
+
+def _hidden(path: Path) -> str:
+    """The start of the names of an output's temporary files and folders."""
+    return f".{path.name[:TEMPORARY_LETTERS]}."
+
+
+def _temporary_folder(stack: ExitStack, path: Path, folder: Path, suffix: str = "") -> Path:
+    """A folder beside an output until the stack is unwound; what cannot be removed then stays, hidden."""
+    temporary = Path(tempfile.mkdtemp(prefix=_hidden(path), suffix=suffix, dir=folder))
+    stack.callback(shutil.rmtree, temporary, ignore_errors=True)
+    return temporary
 
 
 @contextmanager
@@ -257,35 +276,26 @@ def folder_written_whole(path: Path) -> Iterator[Path]:
     OSError
         As `written_whole`.
     """
-    outputs, key = _OUTPUTS.get(), _absolute(path)
-    place = Path(os.path.realpath(path)) if outputs is None else outputs.places.get(key, Path(os.path.realpath(path)))
-    start = f".{path.name[:TEMPORARY_LETTERS]}."
-    temporary, aside = None, None
-    try:
-        temporary = Path(tempfile.mkdtemp(prefix=start, suffix=path.suffix[-20:], dir=place.parent))
+    with ExitStack() as stack, _output(path) as (place, may_replace):
+        temporary = _temporary_folder(stack, path, place.parent, path.suffix[-20:])
         yield temporary
         for folder, _, names in os.walk(temporary):
             for name in names:
                 _on_disk(Path(folder) / name)
         _take_rights(temporary, place)
-        if outputs is not None and not outputs.may_replace.get(key, True) and os.path.lexists(place):
+        if not may_replace and os.path.lexists(place):
             raise TakenError(f"{path}: another program has written it in the meantime, and without `force` it stays")
+        old = None
         if place.is_dir():
-            aside = Path(tempfile.mkdtemp(prefix=start, dir=place.parent))
-            os.rename(place, aside / "old")
-        os.rename(temporary, place)
+            old = _temporary_folder(stack, path, place.parent) / "old"
+            os.rename(place, old)
+        try:
+            os.rename(temporary, place)
+        except OSError:
+            if old is not None and not os.path.lexists(place):
+                os.rename(old, place)
+            raise
         _synchronise_folder(place.parent)
-    except OSError as error:
-        if aside is not None and (aside / "old").exists() and not os.path.lexists(place):
-            os.rename(aside / "old", place)
-        raise OSError(error.errno or errno.EIO, _reason(error, place.parent, None), str(path)) from error
-    finally:
-        for each in (temporary, aside):
-            if each is not None:  # what cannot be removed stays, hidden: what is told is what went wrong before
-                shutil.rmtree(each, ignore_errors=True)
-    if outputs is not None and key in outputs.places:
-        outputs.may_replace[key] = True
-        outputs.written.append(path)
 
 
 @contextmanager
@@ -303,16 +313,10 @@ def pieces_written_whole(path: Path) -> Iterator[tuple[Path, Callable[[], Abstra
     OSError
         As `written_whole`.
     """
-    start = f".{path.name[:TEMPORARY_LETTERS]}."
-    temporaries: list[str] = []
-    try:
+    with ExitStack() as stack:
         with telling(path):
-            temporaries += (tempfile.mkdtemp(prefix=start, dir=path.parent) for _ in range(2))
-        new, aside = map(Path, temporaries)
+            new, aside = (_temporary_folder(stack, path, path.parent) for _ in range(2))
         yield new, lambda: _moved_in(path, new, aside)
-    finally:
-        for each in temporaries:
-            shutil.rmtree(each, ignore_errors=True)  # then a hidden folder stays
 
 
 @contextmanager
@@ -327,7 +331,7 @@ def _moved_in(path: Path, new: Path, aside: Path) -> Iterator[None]:
     try:
         with telling(path):
             for each in new.iterdir():
-                _synchronise(each, path)
+                _on_disk(each, path)
             _take_rights(new, folder)
             for here, there in moves:
                 os.rename(here, there)
@@ -348,12 +352,16 @@ def _moved_in(path: Path, new: Path, aside: Path) -> Iterator[None]:
 
 
 @contextmanager
-def telling(path: Path, n_bytes: int | None = None) -> Iterator[None]:
-    """Errors of the system as those of writing `path`, on a full disk with the number of bytes, if it is known."""
+def telling(path: Path, n_bytes: int | None = None, folder: Path | None = None) -> Iterator[None]:
+    """Errors of the system as those of writing `path`, on a full disk with the number of bytes, if it is known.
+
+    `folder` is where the file really lies, that of `path` by default.
+    """
     try:
         yield
     except OSError as error:
-        raise OSError(error.errno or errno.EIO, _reason(error, path.parent, n_bytes), str(path)) from error
+        reason = _reason(error, folder or path.parent, n_bytes)
+        raise OSError(error.errno or errno.EIO, reason, str(path)) from error
 
 
 def save_bytes(path: str | Path, whole: bytes) -> None:
@@ -412,16 +420,12 @@ def _take_rights(temporary: Path, place: Path) -> None:
     os.chmod(temporary, mode)
 
 
-def _synchronise(temporary: Path, place: Path) -> None:
-    """Have the file, with its rights, on the disk itself: a power cut after the renaming would else leave an empty one.
-
-    It is opened before it takes the rights, with which nobody may perhaps write it.
-    """
-    _on_disk(temporary, place)
-
-
 def _on_disk(path: Path, place: Path | None = None) -> None:
-    """Write out a file, which takes the rights of what is in its `place` once it is open."""
+    """Have a file on the disk itself, with the rights of what is in its `place`.
+
+    A power cut after the renaming would else leave an empty one. It is opened before it takes the rights, with which
+    nobody may perhaps write it.
+    """
     handle = os.open(path, os.O_RDWR)
     try:
         if place is not None:

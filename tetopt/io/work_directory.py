@@ -22,11 +22,7 @@ from typing import NamedTuple
 from tetopt.errors import InputError
 from tetopt.incoming import KINDS_OF_FILES, UNFOLLOWED, irregular, own_bytes
 from tetopt.io.files import TEMPORARY_LETTERS, save_json
-
-try:
-    import fcntl
-except ImportError:  # Windows
-    fcntl = None  # type: ignore[assignment]
+from tetopt.system.lock import HAS_LOCKS, lock_file
 
 HAS_DESCRIPTORS = hasattr(os, "O_DIRECTORY")  # of folders: Windows has none
 MANIFEST_NAME, LOCK_NAME = "tetopt-manifest", "lock"
@@ -128,17 +124,15 @@ class WorkDirectory(NamedTuple):
         InputError
             Another run has it, which is said of `what`; the file has a second name, under which it would be changed.
         """
-        if fcntl is None:
+        if not HAS_LOCKS:
             return
         handle = os.open(self._place(name), os.O_RDWR | os.O_CREAT | UNFOLLOWED, 0o600, dir_fd=self.descriptor)
         stream = stack.enter_context(os.fdopen(handle, "r+", encoding="utf-8", errors="replace"))
         if os.fstat(handle).st_nlink > 1:
             raise InputError(f"{self.path / name}: expected a file of one name, got one with a hard link; {ADVICE}")
-        try:
-            fcntl.flock(stream, (fcntl.LOCK_SH if is_shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)
-        except BlockingIOError:
+        if not lock_file(stream, is_shared=is_shared):
             whose = stream.read(200).strip() or "another process"
-            raise InputError(f"{what}: another run writes there ({whose}); wait for its end, or end it") from None
+            raise InputError(f"{what}: another run writes there ({whose}); wait for its end, or end it")
         if not is_shared:
             stream.truncate(0)
             stream.write(f"process {os.getpid()} on {socket.gethostname()}\n")

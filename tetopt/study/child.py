@@ -1,40 +1,36 @@
 """A pipeline in a process of its own: its memory is its own, and when it crashes or runs wild, only it ends.
 
 The child is ``python -m tetopt.study.child FOLDER``; job and result are files in a temporary folder. Its memory,
-with that of the processes it starts, is watched from the parent as resident pages (VmRSS in /proc), not limited by
-RLIMIT_AS: numba, VTK and the allocators reserve far more address space than they ever touch, so a limit on that would
-end runs that need little.
+with that of the processes it starts, is watched from the parent as resident pages, not limited by RLIMIT_AS: numba,
+VTK and the allocators reserve far more address space than they ever touch, so a limit on that would end runs that need
+little.
 """
 
 from __future__ import annotations
 
+import json
 import pickle
 import subprocess
 import sys
 import tempfile
-import traceback
+import time
 from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tetopt.budget import MAXRSS_UNIT_BYTES, peak_bytes
+from tetopt.budget import family_peak_bytes
 from tetopt.errors import InputError
 from tetopt.interpreter import python_command, python_environment
 from tetopt.mesh import Mesh
-from tetopt.processes import started, watched
-from tetopt.study.endings import Crashed, NotInstalled, last_line, signal_words
+from tetopt.study.endings import Crashed, NotInstalled, last_line
 from tetopt.study.pipelines import PipelineInput, Produced
-
-try:
-    import resource
-except ImportError:  # Windows
-    resource = None  # type: ignore[assignment]
+from tetopt.system.child import POLL_SECONDS, family_bytes, signal_words, started, watched
 
 Reason = Literal["crash", "limit", "missing", "error"]  # of a failure; "missing": it is not installed
-CRASH_CODE, MISSING_CODE = 93, 94  # of a child whose pipeline says so: codes that no program ends with by itself
 
 
 class Outcome(NamedTuple):
@@ -72,8 +68,8 @@ def run_in_child(
     max_seconds : float
         Wall time of one run, the child's start included, after which it is killed with all that it started.
     max_bytes : int, optional
-        Resident memory at which it is killed. It is looked at twenty times a second (Linux only: elsewhere there is
-        no limit), so a fast run may pass it by a little.
+        Resident memory at which it is killed. It is looked at twenty times a second, so a fast run may pass it by a
+        little.
     say : callable
         Called with a line when a run is repeated.
 
@@ -110,52 +106,51 @@ def _run_once(
         command = python_command("-m", "tetopt.study.child", str(folder))
         with open(folder / "stderr.txt", "wb") as errors:
             environment = python_environment(TMPDIR=name)
-            with started(command, folder, environment, stdout=subprocess.DEVNULL, stderr=errors) as child:
-                peak, limit = watched(child, max_seconds, max_bytes)
+            with started(command, environment, folder, stdout=subprocess.DEVNULL, stderr=errors) as child:
+                passed = partial(_passed, time.monotonic() + max_seconds, max_seconds, max_bytes)
+                peak, limit = watched(child, POLL_SECONDS, family_bytes, passed)
         return _outcome(folder, child.returncode, peak, limit)
 
 
-def _own_peak_bytes() -> int:
-    """Largest resident memory of this process or of one it has waited for."""
-    if resource is None:
-        return peak_bytes()
-    return max(resource.getrusage(resource.RUSAGE_CHILDREN).ru_maxrss * MAXRSS_UNIT_BYTES, peak_bytes())
+def _passed(deadline: float, max_seconds: float, max_bytes: int | None, peak: int) -> str | None:
+    """The limit that a run has passed, in words."""
+    if max_bytes is not None and peak > max_bytes:
+        return f"too much memory: {peak / 1e6:.0f} MB resident, {max_bytes / 1e6:.0f} MB allowed"
+    return f"out of time: killed after {max_seconds:g} s" if time.monotonic() >= deadline else None
 
 
 def _outcome(folder: Path, code: int, peak: int, limit: str | None) -> Outcome:
-    if limit is None and code == 0 and (folder / "result.pickle").is_file():
-        (mesh, seconds, notes, labels), own_peak = pickle.loads((folder / "result.pickle").read_bytes())
-        # Checked, and its arrays locked again: pickle does not keep that.
-        return Outcome(Mesh(mesh.points, mesh.cells), seconds, max(peak, own_peak), notes, None, labels=labels)
+    result, own_failure = folder / "result.pickle", folder / "failure.json"
     if limit is not None:
         return Outcome(None, {}, peak, [], limit, "limit")
+    if code == 0 and result.is_file():
+        (mesh, seconds, notes, labels), own_peak = pickle.loads(result.read_bytes())
+        # Checked, and its arrays locked again: pickle does not keep that.
+        return Outcome(Mesh(mesh.points, mesh.cells), seconds, max(peak, own_peak), notes, None, labels=labels)
+    reason: Reason = "error"
     if (words := signal_words(code)) is not None:
-        failure, code = f"crashed: {words}", CRASH_CODE
+        reason, failure = "crash", f"crashed: {words}"
     else:
-        line = last_line((folder / "stderr.txt").read_text(encoding="utf-8", errors="replace"))
-        failure = line or f"ended with exit code {code} and no message"
-    reason: Reason = "crash" if code == CRASH_CODE else "missing" if code == MISSING_CODE else "error"
+        text = (folder / "stderr.txt").read_text(encoding="utf-8", errors="replace")
+        if own_failure.is_file():
+            reason, text = json.loads(own_failure.read_text(encoding="ascii"))
+        failure = last_line(text) or f"ended with exit code {code} and no message"
     return Outcome(None, {}, peak, [], failure, reason, crashes=(failure,) if reason == "crash" else ())
 
 
-def main(folder: Path) -> int:
-    """Run the job in the folder; the exit code, and what went wrong as the last line on stderr.
-
-    0 with a result there, `CRASH_CODE`, `MISSING_CODE`, 2 for other bad input, 1 for any other exception.
-    """
+def main(folder: Path) -> None:
+    """Run the job in the folder, and leave its result there, or the reason of its failure."""
     try:
         pipeline, job = pickle.loads((folder / "job.pickle").read_bytes())
         produced = pipeline(job)
-        (folder / "result.pickle").write_bytes(pickle.dumps((produced, _own_peak_bytes())))
-    except InputError as error:
-        print(" ".join(str(error).split()), file=sys.stderr)
-        return CRASH_CODE if isinstance(error, Crashed) else MISSING_CODE if isinstance(error, NotInstalled) else 2
+        (folder / "result.pickle").write_bytes(pickle.dumps((produced, family_peak_bytes())))
     except Exception as error:
-        traceback.print_exc()
-        print(f"{type(error).__name__}: {' '.join(str(error).split())}", file=sys.stderr)
-        return 1
-    return 0
+        is_refusal = isinstance(error, InputError)
+        reason = "crash" if isinstance(error, Crashed) else "missing" if isinstance(error, NotInstalled) else "error"
+        words = " ".join(str(error).split())
+        failure = [reason, words if is_refusal else f"{type(error).__name__}: {words}"]
+        (folder / "failure.json").write_text(json.dumps(failure), encoding="ascii")
 
 
 if __name__ == "__main__":
-    sys.exit(main(Path(sys.argv[1])))
+    main(Path(sys.argv[1]))

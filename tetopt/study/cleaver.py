@@ -29,9 +29,10 @@ from tetopt.geometry.simplex import oriented
 from tetopt.image import Image
 from tetopt.interpreter import python_command
 from tetopt.mesh import Mesh
-from tetopt.study.endings import NotInstalled, last_line, signal_words
+from tetopt.study.endings import NotInstalled, last_line
 from tetopt.study.search import corners_for, is_near, tries
 from tetopt.study.tetwild import TETWILD_RESPONSE, Filled, inside_box, node_spacing, put_on_box
+from tetopt.system.child import signal_words
 
 CLEAVER_RUNS = 8  # of one search, at most; those that crash count, too
 FIRST_SCALING = 2.0  # of features, in the first run: on the coarse side, where runs take the least time

@@ -31,11 +31,12 @@ from tetopt.io.images import save_image, sha256
 from tetopt.io.meshes import MESH_SUFFIXES, load_mesh
 from tetopt.mesh import Mesh
 from tetopt.model.file import MeshFile
-from tetopt.study.endings import Crashed, last_line, signal_words
+from tetopt.study.endings import Crashed, last_line
 from tetopt.study.interfaces import class_labels
 from tetopt.study.pipelines import PIPELINES, Pipeline, PipelineInput, Produced
 from tetopt.study.search import LEAST_REQUEST, REQUEST_RESPONSE, corners_for, is_near, tries
 from tetopt.study.tetwild import node_spacing, put_on_box
+from tetopt.system.child import signal_words
 
 PROGRAM_RUNS = 5  # of one search, at most; the first asks for what is wanted, the second is seldom far off
 NEAR_BOX_VOXELS = 1.0  # how far off the box's sides a mesh's boundary may lie to be put on them
