@@ -80,7 +80,7 @@ def test_refusals_write_nothing(folder, capsys):
         assert {path.name for path in folder.iterdir()} == before
 
     refused(
-        "--results: expected OUT named .vtu or .vtk or .vtkhdf or .pvtu, got",
+        "--results: expected OUT named .vtu or .vtk or .vtkhdf, got",
         folder / "b.inp",
         "--results",
         folder / "a.frd",

@@ -201,11 +201,8 @@ def outside(draw):
         what = f"data outside: {draw.files[name][-60:]!r}"
         draw.files.pop("i.raw")
         return what, *with_image(draw, name, is_main=True)
-    name = draw.one("ascii.vtu", "m.vtu", "inline.vtu", "p.pvtu")
+    name = draw.one("ascii.vtu", "m.vtu", "inline.vtu")
     draw.good(name)
-    if name == "p.pvtu":
-        what, draw.files[name] = m.piece_outside(draw.rng, draw.files[name])
-        return what, *with_mesh(draw, name)
     what, draw.files[name] = m.xml_bomb(draw.rng, draw.files[name])
     return what, *with_mesh(draw, name)
 
@@ -285,15 +282,9 @@ def vtu(draw):
     return what, *with_mesh(draw, mesh)
 
 
-def pieces(draw):
-    """VTKHDF; a PVTU, one of whose files is damaged."""
-    names = ("h.vtkhdf",) if draw.rng.random() < 0.5 else ("p.pvtu", "p_0.vtu", "p_1.vtu")
-    for each in names:
-        draw.good(each)
-    name = draw.one(*names)
-    known = m.ANY if name == "h.vtkhdf" else (m.xml, m.xml, m.xml_depth, *m.ANY)
-    _, what = draw.bad(name, known)
-    return f"{name}: {what}", *with_mesh(draw, names[0])
+def vtkhdf(draw):
+    mesh, what = draw.bad("h.vtkhdf", m.ANY)
+    return what, *with_mesh(draw, mesh)
 
 
 def field_names(draw):
@@ -718,7 +709,7 @@ def lines(draw):
 KINDS: dict[str, tuple[int, Callable[[Draw], tuple]]] = {
     "NIfTI": (6, nifti), "odd images": (6, odd_images), "MGH": (2, mgh), "NRRD, MetaImage": (5, itk), "DICOM": (3,
     dicom), "Zarr": (4, zarr_volumes), "pictures": (2, pictures),
-    "VTU": (7, vtu), "meshes in pieces": (4, pieces), "legacy VTK": (4, vtk), "gmsh": (5, gmsh),
+    "VTU": (7, vtu), "VTKHDF": (4, vtkhdf), "legacy VTK": (4, vtk), "gmsh": (5, gmsh),
     "CalculiX's results": (2, results),
     "field names": (2, field_names),
     "texts in meshes": (3, texts_in_meshes), "label tables": (3, label_tables), "phantoms": (4, phantoms),

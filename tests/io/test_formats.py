@@ -24,7 +24,7 @@ from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.model.model import elements
 from tetopt.model.sets import Sets
 
-XML_SUFFIXES = (".vtu", ".pvtu", ".xdmf", ".feb", ".scn")
+XML_SUFFIXES = (".vtu", ".xdmf", ".feb", ".scn")
 # What every format with a place for names can hold, and what none can: by what that is called instead.
 KEPT = [
     "<x>",
@@ -103,7 +103,7 @@ def test_braces_in_names_end_no_process(name, tmp_path):
             assert any(each.ndim == 1 and sorted(each) == sorted(values[name]) for each in back.values())
 
 
-@pytest.mark.parametrize("suffix", [".vtu", ".vtk", ".vtkhdf", ".pvtu", ".msh"])
+@pytest.mark.parametrize("suffix", [".vtu", ".vtk", ".vtkhdf", ".msh"])
 def test_names_come_back(suffix, tmp_path):
     """As they were where they are printable text, else as Python escapes them; gmsh has no quotes, HDF5 no slashes."""
     model = hostile_model(suffix)
@@ -203,7 +203,7 @@ def test_a_mesh_is_written_by_its_suffix(suffix, tmp_path):
     heads = {
         ".vtu": b"<?xml", ".vtk": b"# vtk", ".xdmf": b"<?xml", ".msh": b"$MeshFormat\n4.1", ".inp": b"** tetopt",
         ".msh2": b"$MeshFormat\n2.2", ".mfem": b"MFEM", ".mesh": b"MeshVersion", ".stl": b"tetopt", ".ply": b"ply",
-        ".vtkhdf": b"\x89HDF", ".pvtu": b"<?xml",
+        ".vtkhdf": b"\x89HDF",
     }  # fmt: skip
     assert path.read_bytes().startswith(heads[suffix.lower()])
 
@@ -213,6 +213,15 @@ def test_a_suffix_of_no_format_is_refused(name, tmp_path):
     with pytest.raises(InputError, match=r"unknown suffix; known are \.vtu .*, \.inp"):
         save_mesh(tmp_path / name, sample_model().mesh)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_a_pvtu_is_refused_by_the_name_of_what_replaces_it(tmp_path):
+    with pytest.raises(InputError, match=r"a\.pvtu: \.pvtu is not written; use \.vtkhdf"):
+        save_mesh(tmp_path / "a.pvtu", sample_model().mesh)
+    assert list(tmp_path.iterdir()) == []
+    (tmp_path / "a.PVTU").write_text("<VTKFile/>")
+    with pytest.raises(InputError, match=r"a\.PVTU: \.pvtu is not read; save the mesh as \.vtkhdf"):
+        tetopt.load_mesh(tmp_path / "a.PVTU")
 
 
 def test_labels_of_a_surface_that_its_file_cannot_name_are_refused(tmp_path):
@@ -270,7 +279,7 @@ OUTLINED = [pytest.param(*each, id=f"{number}{each[0]}") for number, each in enu
 @pytest.mark.parametrize(("suffix", "whole", "n_points", "n_cells", "sets"), OUTLINED)
 def test_outlines_tell_what_a_file_holds(suffix, whole, n_points, n_cells, sets):
     outline = OUTLINES[suffix](whole)
-    if suffix in (".stl", ".ply", ".pvtu"):
+    if suffix in (".stl", ".ply"):
         return
     assert outline.n_points == n_points
     assert outline.n_cells == (None if suffix in (".msh", ".msh2") else n_cells)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -14,8 +14,7 @@ from tetopt.io.febio import febio
 from tetopt.io.gmsh import gmsh22, gmsh41
 from tetopt.io.medit import medit
 from tetopt.io.mfem import mfem
-from tetopt.io.pvtu import pvtu, pvtu_files
-from tetopt.io.readback import Outline, save_checked, save_pieces
+from tetopt.io.readback import Outline, save_checked
 from tetopt.io.sofa import sofa
 from tetopt.io.surfaces import boundary_ply, boundary_stl
 from tetopt.io.text import file_name, legacy_name, names_apart, plain, short_name
@@ -37,15 +36,12 @@ class Format(NamedTuple):
     is_surface: bool = False  # holds the boundary alone
     has_node_moduli: bool = False  # else a modulus that varies within cells is its mean over each
     has_large: bool = False  # whether a step can ask for large deformation
-    # Of a mesh in several files, of which `write` makes the one that lists them: all of them by name, that one last.
-    write_files: Callable[[Model, str], Iterator[tuple[str, bytes]]] | None = None
 
 
 FORMATS = {
     ".vtu": Format("VTK, ParaView", vtu, has_quadratic=True, has_node_moduli=True),
     ".vtk": Format("legacy VTK, 3D Slicer", vtk, has_quadratic=True, has_node_moduli=True),
     ".vtkhdf": Format("VTKHDF, ParaView", vtkhdf, has_quadratic=True, has_node_moduli=True),
-    ".pvtu": Format("VTU in pieces", pvtu, has_quadratic=True, has_node_moduli=True, write_files=pvtu_files),
     ".xdmf": Format("XDMF with tags, FEniCSx", xdmf, has_quadratic=True, has_node_moduli=True),
     ".msh": Format("gmsh 4.1", gmsh41, has_quadratic=True),
     ".msh2": Format("gmsh 2.2", gmsh22, has_quadratic=True),
@@ -70,6 +66,8 @@ def format_of(path: Path) -> Format:
         An unknown suffix, with the known ones.
     """
     suffix = path.suffix.lower()
+    if suffix == ".pvtu":
+        raise InputError(f"{path}: .pvtu is not written; use .vtkhdf, one file of any size that ParaView reads")
     if suffix not in FORMATS:
         known = ", ".join(f"{name} ({kind.what})" for name, kind in FORMATS.items())
         raise InputError(f"{path}: unknown suffix; known are {known}")
@@ -81,8 +79,8 @@ def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str
 
     Names of data, and that of the image, stand in the file as `tetopt.io.text.plain` shows them, escaped in XML; gmsh
     has apostrophes for their quotes, and gmsh, legacy VTK, VTKHDF and FEBio their first 240 characters. Those that
-    become the same are numbered, and a warning tells what changed. Replaces an existing file, of .pvtu with its folder
-    of pieces; ask `tetopt.io.files.checked_output` first.
+    become the same are numbered, and a warning tells what changed. Replaces an
+    existing file; ask `tetopt.io.files.checked_output` first.
 
     Parameters
     ----------
@@ -124,10 +122,7 @@ def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str
     kind, ready = format_of(path), _ready(path, model, space, units)
     sets = (frozenset(each) for each in model.sets)
     expected = Outline(len(elements(model)[0]), len(model.mesh.cells), *sets)
-    if kind.write_files is None:
-        save_checked(path, kind.write(ready), Outline() if kind.is_surface else expected)
-    else:
-        save_pieces(path, kind.write_files(ready, path.stem), expected)
+    save_checked(path, kind.write(ready), Outline() if kind.is_surface else expected)
     is_for_solver = not kind.is_surface and path.suffix.lower() not in VTK_SUFFIXES
     if is_for_solver and (words := locking_words(model)):
         warn(f"{path}: {words}")
@@ -187,7 +182,7 @@ def save_mesh(
 
 
 def file_bytes(path: Path, model: Model, *, space: str = "ras", units: str = "kPa") -> bytes:
-    """What `save_model` writes; of a format in several files that which lists the others, as if it were called "mesh".
+    """What `save_model` writes.
 
     Raises
     ------

@@ -16,7 +16,7 @@ from typing import NamedTuple
 from urllib.parse import unquote
 from xml.parsers import expat
 
-from tetopt.io.files import pieces_written_whole, telling, written_whole
+from tetopt.io.files import written_whole
 from tetopt.io.text import plain
 
 COMPARED_BYTES = 2**24  # of the file and of what was written, at a time: so much more memory
@@ -53,28 +53,6 @@ def save_checked(path: Path, whole: bytes, expected: Outline) -> None:
     with written_whole(path, len(whole)) as temporary:
         temporary.write_bytes(whole)
         check_written(temporary, path.suffix.lower(), whole, expected)
-
-
-def save_pieces(path: Path, files: Iterable[tuple[str, bytes]], expected: Outline) -> None:
-    """Write a file in pieces: VTU files in a folder of its name, the last of `files` beside it; whole or not at all.
-
-    Raises
-    ------
-    OSError
-        As `save_checked`.
-    """
-    outlines = []
-    with pieces_written_whole(path) as (folder, moved_in):
-        for name, whole in files:
-            if name.endswith(".vtu"):
-                place = folder / name.rpartition("/")[2]
-                with telling(path, len(whole)):
-                    place.write_bytes(whole)
-                outlines.append(check_written(place, ".vtu", whole, Outline()))
-        n_cells = sum(each.n_cells or 0 for each in outlines)
-        _check_outline(outlines[0]._replace(n_points=None, n_cells=n_cells), expected)
-        with moved_in():
-            save_checked(path, whole, Outline())
 
 
 def check_written(path: Path, suffix: str, whole: bytes, expected: Outline) -> Outline:
@@ -123,13 +101,6 @@ def vtk_xml_outline(whole: bytes) -> Outline:
     piece = next(attributes for tag, attributes in tags if tag == "Piece")
     names = [attributes["Name"] for tag, attributes in tags if tag == "DataArray" and "Name" in attributes]
     return _of_vtk(int(piece["NumberOfPoints"]), int(piece.get("NumberOfCells", piece.get("NumberOfPolys", -1))), names)
-
-
-def pvtu_outline(whole: bytes) -> Outline:
-    """Of the master of a PVTU file, which does not tell what its pieces hold."""
-    if not any(tag == "Piece" for tag, _ in _tags([whole])):
-        raise ValueError("it has no pieces")
-    return Outline()
 
 
 def febio_outline(whole: bytes) -> Outline:
@@ -391,7 +362,7 @@ def _listed(part: bytes) -> tuple[int, int]:
 
 
 OUTLINES = {  # by suffix
-    ".vtkhdf": vtkhdf_outline, ".pvtu": pvtu_outline,
+    ".vtkhdf": vtkhdf_outline,
     ".vtu": vtk_xml_outline, ".vtp": vtk_xml_outline, ".vtk": vtk_outline, ".xdmf": xdmf_outline,
     ".msh": gmsh_outline, ".msh2": gmsh_outline, ".inp": abaqus_outline, ".feb": febio_outline,
     ".scn": sofa_outline, ".mfem": mfem_outline, ".mesh": medit_outline, ".stl": stl_outline, ".ply": ply_outline,
