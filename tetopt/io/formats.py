@@ -14,7 +14,7 @@ from tetopt.io.febio import febio
 from tetopt.io.gmsh import gmsh22, gmsh41
 from tetopt.io.medit import medit
 from tetopt.io.mfem import mfem
-from tetopt.io.readback import Outline, save_checked
+from tetopt.io.readback import save_checked
 from tetopt.io.sofa import sofa
 from tetopt.io.surfaces import boundary_ply, boundary_stl
 from tetopt.io.text import file_name, legacy_name, names_apart, plain, short_name
@@ -22,7 +22,7 @@ from tetopt.io.vtk import VTK_SUFFIXES, vtk, vtu
 from tetopt.io.vtkhdf import hdf_name, vtkhdf
 from tetopt.io.xdmf import xdmf
 from tetopt.mesh import Mesh
-from tetopt.model.model import Model, elements, in_space, in_units, locking_words
+from tetopt.model.model import Model, in_space, in_units, locking_words
 from tetopt.model.sets import MOST_LETTERS, SET_NAME, Sets
 
 
@@ -75,7 +75,9 @@ def format_of(path: Path) -> Format:
 
 
 def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str = "kPa") -> None:
-    """Write a model in the format of the file's suffix, whole or not at all; it is read back before it takes its name.
+    """Write a model in the format of the file's suffix, whole or not at all.
+
+    What was written is compared with what reads back before the file takes its name.
 
     Names of data, and that of the image, stand in the file as `tetopt.io.text.plain` shows them, escaped in XML; gmsh
     has apostrophes for their quotes, and gmsh, legacy VTK, VTKHDF and FEBio their first 240 characters. Those that
@@ -120,9 +122,7 @@ def save_model(path: str | Path, model: Model, *, space: str = "ras", units: str
     """
     path = Path(path)
     kind, ready = format_of(path), _ready(path, model, space, units)
-    sets = (frozenset(each) for each in model.sets)
-    expected = Outline(len(elements(model)[0]), len(model.mesh.cells), *sets)
-    save_checked(path, kind.write(ready), Outline() if kind.is_surface else expected)
+    save_checked(path, kind.write(ready))
     is_for_solver = not kind.is_surface and path.suffix.lower() not in VTK_SUFFIXES
     if is_for_solver and (words := locking_words(model)):
         warn(f"{path}: {words}")
