@@ -23,7 +23,6 @@ VTK_BYTES = {  # of VTK's types of numbers, in its words
 # Where a block of lines of numbers begins in our files of XML; and in which element or attribute.
 FEBIO_BLOCK = re.compile(rb"<(\w+) [^<>]*>\n(?=<(?:node|elem|tri\d) )")
 XDMF_BLOCK = re.compile(rb'<(DataItem) [^<>]*Format="XML">\n')
-SOFA_BLOCK = re.compile(rb'\b(\w+)="\n')
 
 
 class Outline(NamedTuple):
@@ -88,16 +87,6 @@ def xdmf_outline(whole: bytes) -> Outline:
             names[grid].append(attributes["Name"])
     n_cells, n_points = lengths[:2]
     return Outline(n_points, n_cells, frozenset(names.get("facets", ())), frozenset(names.get("cells", ())))
-
-
-def sofa_outline(whole: bytes) -> Outline:
-    """Of a SOFA scene."""
-    skeleton, blocks = _without_blocks(whole, SOFA_BLOCK, b'"')
-    tags = _tags(skeleton)
-    first = dict(reversed(blocks))
-    names = [attributes.get("name", "") for tag, attributes in tags if tag == "Node"]
-    sets = frozenset(names[names.index("sets") + 1 :])
-    return Outline(first["position"], first["tetrahedra"], sets, sets)
 
 
 def _tags(pieces: Iterable[bytes]) -> list[tuple[str, dict[str, str]]]:
@@ -321,5 +310,5 @@ OUTLINES = {  # by suffix
     ".vtkhdf": vtkhdf_outline,
     ".vtu": vtk_xml_outline, ".vtp": vtk_xml_outline, ".vtk": vtk_outline, ".xdmf": xdmf_outline,
     ".msh": gmsh_outline, ".msh2": gmsh_outline, ".inp": abaqus_outline, ".feb": febio_outline,
-    ".scn": sofa_outline, ".mfem": mfem_outline, ".mesh": medit_outline, ".stl": stl_outline, ".ply": ply_outline,
+    ".mfem": mfem_outline, ".mesh": medit_outline, ".stl": stl_outline, ".ply": ply_outline,
 }  # fmt: skip

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from tetopt.fem.solution import Solution, SolutionFields, solution_fields, solve
     from tetopt.geometry.surface import Surface, extract_surface
     from tetopt.image import Image, VoxelGrid
-    from tetopt.io.formats import save_mesh, save_model
+    from tetopt.io.formats import register_format, save_mesh, save_model
     from tetopt.io.frd import Results, read_frd
     from tetopt.io.images import load_image, save_image
     from tetopt.io.label_tables import load_label_table
@@ -72,7 +72,7 @@ _NAMES_OF = {  # by module
     "fem.solution": ("Solution", "SolutionFields", "solution_fields", "solve"),
     "geometry.surface": ("Surface", "extract_surface"),
     "image": ("Image", "VoxelGrid"),
-    "io.formats": ("save_mesh", "save_model"),
+    "io.formats": ("register_format", "save_mesh", "save_model"),
     "io.frd": ("Results", "read_frd"),
     "io.images": ("load_image", "save_image"),
     "io.label_tables": ("load_label_table",),
@@ -164,6 +164,7 @@ __all__ = [
     "optimize_paper",
     "quality",
     "read_frd",
+    "register_format",
     "resample_contrast",
     "resample_labels",
     "resample_mask",

@@ -14,7 +14,7 @@ from hostile.seeds import VOXELS, Seeds, affine
 
 QUICK = ("--nodes", "50", "--iterations", "1")
 MESH_OUTPUTS = (
-    ".vtu", ".vtk", ".vtkhdf", ".xdmf", ".msh", ".msh2", ".inp", ".feb", ".scn", ".mfem", ".mesh", ".stl", ".ply",
+    ".vtu", ".vtk", ".vtkhdf", ".xdmf", ".msh", ".msh2", ".inp", ".feb", ".mfem", ".mesh", ".stl", ".ply",
 )  # fmt: skip
 # What a second mutation meets in a file whose format the first has damaged.
 LOST_FORMAT = (
@@ -340,7 +340,6 @@ def label_tables(draw):
         (("convert", draw.good("m.vtu"), "out.inp", "--label-names", name), ("out.inp",)),
         (("convert", draw.good("m.vtu"), "out.feb", "--label-names", name), ("out.feb",)),
         (("convert", draw.good("m.vtu"), "out.msh", "--label-names", name), ("out.msh",)),
-        (("convert", draw.good("m.vtu"), "out.scn", "--label-names", name), ("out.scn",)),
         (("view", draw.good("m.vtu"), "--html", "v.html", "--label-names", name), ("v.html",)),
         (("surface", draw.good("m.vtu"), "-o", "s.ply", "--interfaces", "--label-names", name), ("s.ply",)),
     )

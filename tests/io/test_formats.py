@@ -15,9 +15,10 @@ from outlines import Outline, check_outline
 
 import tetopt
 from tetopt import InputError
+from tetopt.cli import main
 from tetopt.geometry.surface import extract_surface
 from tetopt.geometry.topology import boundary_facets
-from tetopt.io import surfaces
+from tetopt.io import formats, surfaces
 from tetopt.io.formats import FORMATS, file_bytes, save_mesh, save_model
 from tetopt.io.surfaces import checked_surface, save_surface
 from tetopt.io.text import plain
@@ -25,7 +26,7 @@ from tetopt.io.vtk import VTK_SUFFIXES
 from tetopt.model.model import elements
 from tetopt.model.sets import Sets
 
-XML_SUFFIXES = (".vtu", ".xdmf", ".feb", ".scn")
+XML_SUFFIXES = (".vtu", ".xdmf", ".feb")
 # What every format with a place for names can hold, and what none can: by what that is called instead.
 KEPT = [
     "<x>",
@@ -197,7 +198,7 @@ def test_sets_that_differ_by_case_alone_are_refused(tmp_path):
 def test_a_mesh_is_written_by_its_suffix(suffix, tmp_path):
     """What `save_mesh` writes is what the suffix says, or nothing."""
     mesh, path = sample_model().mesh, tmp_path / f"a{suffix}"
-    if suffix in (".feb", ".scn"):
+    if suffix == ".feb":
         with pytest.raises(InputError, match="material"):
             save_mesh(path, mesh)
         assert not path.exists()
@@ -251,6 +252,59 @@ def test_names_that_are_words_of_a_format(suffix, tmp_path):
     if suffix in VTK_SUFFIXES:
         back = tetopt.load_mesh(tmp_path / f"a{suffix}").cell_data
         assert all(np.array_equal(back[name], values) for name, values in fields.items())
+
+
+# Formats of one's own
+
+
+@pytest.fixture
+def registered(monkeypatch):
+    """Points as text under `.pts`; formats are as they were afterwards."""
+    monkeypatch.setitem(FORMATS, ".pts", None)
+    tetopt.register_format(".PTS", lambda model: f"é {model.units} {model.mesh.points.tolist()}\n", "points")
+
+
+@pytest.mark.filterwarnings("ignore")  # of a mesh as coarse as this
+def test_a_registered_format_is_written_alike_by_all(registered, tmp_path, capsys):
+    mesh = sample_model().mesh
+    tetopt.save_mesh(tmp_path / "a.vtu", mesh)
+    tetopt.save_mesh(tmp_path / "a.pts", mesh)
+    whole = (tmp_path / "a.pts").read_text("utf-8")
+    assert whole == f"é kPa {mesh.points.tolist()}\n"
+    assert main(["convert", str(tmp_path / "a.vtu"), str(tmp_path / "b.pts")]) == 0
+    assert "points, RAS+ mm" in capsys.readouterr().out
+    assert (tmp_path / "b.pts").read_text("utf-8") == whole
+    tetopt.save_image(tmp_path / "a.nii.gz", tetopt.load_phantom("sphere").image(voxel_mm=8))
+    tetopt.run(tetopt.Job(images=tmp_path / "a.nii.gz", output=tmp_path / "c.pts", nodes=60, iterations=0))
+    tetopt.run(tetopt.Job(images=tmp_path / "a.nii.gz", output=tmp_path / "c.vtu", nodes=60, iterations=0))
+    points = tetopt.load_mesh(tmp_path / "c.vtu").mesh.points
+    assert (tmp_path / "c.pts").read_text("utf-8") == f"é kPa {points.tolist()}\n"
+
+
+def test_what_a_registered_format_does_not_hold_is_refused(registered, tmp_path):
+    with pytest.raises(InputError, match=r"a\.pts: only \.vtu, .* take quadratic cells"):
+        save_model(tmp_path / "a.pts", quadratic_model())
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_a_format_that_fails_leaves_the_old_file(registered, tmp_path):
+    (tmp_path / "a.pts").write_text("old")
+
+    def broken(model):
+        raise RuntimeError("broken")
+
+    tetopt.register_format(".pts", broken)
+    with pytest.raises(RuntimeError, match="broken"):
+        save_model(tmp_path / "a.pts", sample_model())
+    assert [path.read_text() for path in tmp_path.iterdir()] == ["old"]
+
+
+@pytest.mark.parametrize("suffix", [".vtu", ".INP", "pts", "", ".", ".a/b", ".nii.gz", ".p\n"])
+def test_suffixes_that_no_format_can_have(suffix):
+    with pytest.raises(InputError, match=r"^suffix: (tetopt writes \.\w+ itself|expected a dot)") as caught:
+        tetopt.register_format(suffix, str)
+    assert "\n" not in str(caught.value)
+    assert suffix not in FORMATS.keys() - formats.BUILT_IN
 
 
 # All that a file holds
