@@ -2,6 +2,9 @@
 
 import json
 import re
+import sys
+import tempfile
+import webbrowser
 
 import meshio
 import numpy as np
@@ -716,10 +719,24 @@ def test_what_is_refused_leaves_no_page(folder, tmp_path, capsys):
     assert not (tmp_path / "a.html").exists()
 
 
-def test_no_window_without_a_display(folder, monkeypatch, capsys):
-    monkeypatch.setattr("tetopt.report.window.has_display", lambda: False)
-    assert exit_code("view", folder / "a.vtu") == 2
-    assert "use --html" in capsys.readouterr().err
+@pytest.mark.parametrize(("display", "answer"), [("", True), (":0", False), (":0", True)])
+def test_the_page_is_opened_or_it_is_said_where_it_is(folder, tmp_path, monkeypatch, capsys, display, answer):
+    """Never a browser of the terminal's, which would take it over."""
+    opened = []
+    monkeypatch.setattr(tempfile, "tempdir", str(tmp_path))
+    monkeypatch.setattr(sys, "platform", "linux")
+    monkeypatch.setattr(webbrowser, "open", lambda address: [opened.append(address), answer][1])
+    monkeypatch.setenv("DISPLAY", display)
+    monkeypatch.delenv("WAYLAND_DISPLAY", raising=False)
+    assert exit_code("view", folder / "a.vtu") == 0
+    (page,) = tmp_path.rglob("*.html")
+    said = "".join(capsys.readouterr().out.split())
+    words = "opened in the browser" if display and answer else "open it in a browser"
+    assert f"{page}: {words};".replace(" ", "") in said
+    assert opened == ([page.as_uri()] if display else [])
+    monkeypatch.undo()
+    assert exit_code("view", folder / "a.vtu", "--html", tmp_path / "b.html") == 0
+    assert page.read_bytes() == (tmp_path / "b.html").read_bytes()
 
 
 def test_the_air_around_is_said_of_a_surface(folder, tmp_path, capsys):
